@@ -1,0 +1,1 @@
+"""How work runs: keys, artifacts, graph, executors, report and command line. No numerics."""

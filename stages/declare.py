@@ -1,0 +1,96 @@
+"""How a stage declares itself: parameters, inputs and the arrays it produces."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict
+
+AnyArray = NDArray[Any]
+
+
+class Params(BaseModel):
+    """Base of all parameter models: frozen, unknown keys refused, no infinities."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, validate_default=True)
+
+
+class NoParams(Params):
+    """For stages that have nothing to set."""
+
+
+@dataclass(frozen=True)
+class Array:
+    """One output array: what an artifact's reader needs to know.
+
+    ``name`` may end in ``*`` for a family (``level_*``). ``nodata`` is ``"nan"``, a number as text or empty.
+    """
+
+    name: str
+    dims: tuple[str, ...]
+    dtype: str
+    unit: str
+    long_name: str
+    nodata: str = ""
+    frame: str = ""
+    optional: bool = False
+
+    def matches(self, name: str) -> bool:
+        """Whether ``name`` is this array or one of its family."""
+        return name.startswith(self.name[:-1]) if self.name.endswith("*") else name == self.name
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """What a stage takes and gives: named arrays and JSON-able facts about them."""
+
+    arrays: Mapping[str, AnyArray]
+    meta: Mapping[str, Any]
+
+    def __getitem__(self, name: str) -> AnyArray:
+        return self.arrays[name]
+
+
+Inputs = Mapping[str, Any]
+"""Port name to a :class:`Bundle`, or to a list of them for a port declared with a trailing ``*``."""
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Declaration of one stage; every stage module holds one as ``STAGE``.
+
+    ``run(params, args, inputs)`` gets the tunable parameters, what identifies this task (JSON-able: frame numbers,
+    a rig ...), and the upstream bundles by port. A port ``name*`` takes a list, ``name?`` may be absent.
+    ``requires`` names the distributions whose exact version can change the result.
+    """
+
+    name: str
+    version: int
+    summary: str
+    params: type[Params]
+    inputs: tuple[str, ...]
+    outputs: tuple[Array, ...]
+    requires: tuple[str, ...]
+    run: Callable[[Any, Mapping[str, Any], Inputs], Bundle]
+
+
+def check_outputs(stage: Stage, bundle: Bundle) -> None:
+    """Raise ``TypeError`` where a bundle departs from its stage's declaration (a programming error)."""
+    for name, array in bundle.arrays.items():
+        spec = next((a for a in stage.outputs if a.matches(name)), None)
+        if spec is None:
+            raise TypeError(f"{stage.name}: array {name!r} is not declared")
+        if np.dtype(spec.dtype) != array.dtype or array.ndim != len(spec.dims):
+            raise TypeError(f"{stage.name}: {name} is {array.dtype} {array.ndim}-D, declared {spec.dtype} {spec.dims}")
+    missing = missing_outputs(stage, list(bundle.arrays))
+    if missing:
+        raise TypeError(f"{stage.name}: declared arrays are missing: {', '.join(missing)}")
+
+
+def missing_outputs(stage: Stage, names: Sequence[str]) -> list[str]:
+    """Declared, not optional arrays that ``names`` lacks."""
+    return [a.name for a in stage.outputs if not a.optional and not any(a.matches(n) for n in names)]
