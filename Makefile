@@ -1,0 +1,49 @@
+# Rille's commands. `make help` lists them.
+SHELL  := /bin/bash
+PYTHON ?= python3
+VENV   := .venv
+BIN    := $(VENV)/bin
+STAMP  := $(VENV)/.installed
+
+SEQ    ?= mockup
+FRAMES ?=
+JOBS   ?=
+SET    ?=
+ARGS   ?=
+
+.DEFAULT_GOAL := help
+.PHONY: help install reconstruct test check bench lint clean
+
+help: ## this list
+	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
+
+install: $(STAMP) ## make .venv with rille and everything it needs, pinned
+
+$(STAMP): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
+	  || { echo "rille needs Python 3.11 or newer; say which with PYTHON=..." >&2; exit 2; }
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	@touch $@
+
+reconstruct: $(STAMP) ## a sequence to terrain, trajectory, risk map, path and report: SEQ= FRAMES= JOBS= SET="key=value ..."
+	@$(BIN)/rille reconstruct "$(SEQ)" $(if $(FRAMES),--frames $(FRAMES)) $(if $(JOBS),--jobs $(JOBS)) \
+	  $(foreach s,$(SET),--set '$(s)') $(ARGS)
+
+test: $(STAMP) lint ## lint, types and the test suite (a few minutes on two cores)
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow" $(ARGS)
+
+check: $(STAMP) lint ## everything, the slow checks too
+	$(BIN)/python -m pytest $(ARGS)
+
+bench: $(STAMP) ## side-by-side measurements: every figure of the README
+	@for b in benchmarks/*.py; do echo "== $$b"; $(BIN)/python $$b $(ARGS) || exit 1; done
+
+lint: $(STAMP) ## ruff and mypy
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+clean: ## remove caches of tools and build leftovers; keeps .venv, runs and artifacts
+	rm -rf build dist .pytest_cache .mypy_cache .ruff_cache
+	find . -name __pycache__ -not -path './$(VENV)/*' -prune -exec rm -rf {} +

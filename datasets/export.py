@@ -1,0 +1,176 @@
+"""A sequence as plain files, so that other tools can run on it; Rille reads the folder back as a sequence."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tempfile
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from datasets.protocol import CAMERAS, Sequence, Source
+from stages.declare import Bundle
+from stages.errors import InputError
+from stages.geometry import Camera, RigidTransform, level_rotation
+
+Materialise = Callable[[Source], Bundle]
+
+README = """{name}: {frames} stereo pairs, {width} x {height} pixels.
+{notes}
+Conventions
+  Pixel centres are at integer (column, row); (0, 0) is the centre of the top left pixel. Lengths are metres.
+  Camera frames are optical: x right, y down, z forward. T_a_b maps coordinates of frame b to frame a: x_a = R x_b + t.
+  World ("truth") frame: z up; {truth_source}.
+  The pairs are not rectified: the cameras may converge. No lens distortion.
+
+Files
+  left/, right/           grey 8-bit images, one a frame, the same name left and right
+  valid/left, valid/right 255 = usable, 0 = background (only where something is masked)
+  rig.json                both cameras (fx, fy, cx, cy, width, height) and T_right_left (12 numbers, rows of [R | t]),
+                          as they are given to a reconstruction{rig_note}
+  calib.txt               the same as P = K [R | t], 3 x 4 row-major a line, left then right; the reference frame is the
+                          left camera's, so that the left one is K [I | 0] and the right one K [R_right_left | t]
+  poses.txt               T_truth_left, 3 x 4 row-major, a line a frame (KITTI's form)
+  times.txt               seconds, a line a frame
+  disparity/NAME.npz      column, row: float32 (row, col) pixels, right minus left, NaN without surface; occluded:
+                          0 both cameras see the point, 1 hidden from the right one, 2 outside its image, 3 no surface;
+                          depth: metres along the left optical axis
+  dem/NAME.npz            elevation: float32 (row, col) metres, exact at the cell centres, in the local frame of that
+                          pair: origin at its left camera, z up, y the horizontal projection of its optical axis, x
+                          right; seen: 1 = both cameras of the pair see the cell; x0, y0, cell, rows, cols:
+                          cell centres at x = x0 + col * cell, y = y0 - row * cell; T_truth_local: 3 x 4
+"""
+
+
+def export(sequence: Sequence, directory: Path, materialise: Materialise, pairs: Iterable[int] | None = None) -> Path:
+    """Write a sequence to a folder, wholly or not at all.
+
+    Parameters
+    ----------
+    sequence : what to write.
+    directory : folder to make; it must not exist yet, or be empty.
+    materialise : gives the arrays of a source (from a cache, or by running its stage).
+    pairs : frames whose true disparity and DEM are written, where the sequence has them; default: the basic pairs by
+        the sequence's own stride.
+
+    Raises
+    ------
+    InputError
+        The folder has something in it, or cannot be made.
+    """
+    if directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
+        raise InputError(f"{directory} is not empty", remedy="name a folder that does not exist yet")
+    chosen = tuple(
+        range(0, sequence.frames, int(sequence.defaults.get("select.stride", 1))) if pairs is None else pairs
+    )
+    try:
+        directory.parent.mkdir(parents=True, exist_ok=True)
+        part = Path(tempfile.mkdtemp(prefix=f".{directory.name}.", dir=directory.parent))
+    except OSError as error:
+        raise InputError(f"{directory} cannot be made: {error.strerror}", remedy="name another folder") from error
+    try:
+        _write(sequence, part, materialise, chosen)
+        part.chmod(0o755)
+        part.replace(directory)
+    except BaseException:
+        shutil.rmtree(part, ignore_errors=True)
+        raise
+    return directory
+
+
+def _write(sequence: Sequence, folder: Path, materialise: Materialise, pairs: tuple[int, ...]) -> None:
+    for camera in CAMERAS:
+        for frame, name in enumerate(sequence.frame_names):
+            _write_image(folder, camera, name, materialise(sequence.image(frame, camera)))
+    _write_rig(sequence, folder)
+    if sequence.truth is not None:
+        _write_rows(folder / "poses.txt", [pose.to_list() for pose in sequence.truth])
+    if sequence.times is not None:
+        _write_rows(folder / "times.txt", [[t] for t in sequence.times])
+    for frame in pairs:
+        if sequence.truth_disparity is not None:
+            _write_disparity(folder, sequence.frame_names[frame], materialise(sequence.truth_disparity(frame)))
+        if sequence.truth_dem is not None and sequence.truth is not None and sequence.evaluation_window is not None:
+            _write_dem(sequence, folder, frame, materialise)
+    camera_ = sequence.rig.left
+    text = README.format(
+        name=sequence.name,
+        frames=sequence.frames,
+        width=camera_.width,
+        height=camera_.height,
+        notes="\n".join(sequence.notes),
+        truth_source=sequence.truth_source or "no truth is known",
+        rig_note=" (it may err)",
+    )
+    (folder / "README.txt").write_text(text, encoding="utf-8")
+
+
+def _write_image(folder: Path, camera: str, name: str, bundle: Bundle) -> None:
+    _write_png(folder / camera / f"{name}.png", np.asarray(bundle["image"][:]))
+    valid = np.asarray(bundle["valid"][:])
+    if not valid.all():
+        _write_png(folder / "valid" / camera / f"{name}.png", (valid * 255).astype(np.uint8))
+
+
+def _write_png(path: Path, image: Any) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    done, data = cv2.imencode(".png", image)
+    if not done:
+        raise InputError(f"{path} cannot be encoded as PNG")
+    path.write_bytes(data.tobytes())
+
+
+def _write_rows(path: Path, rows: Iterable[Iterable[float]]) -> None:
+    path.write_text("".join(" ".join(f"{v:.17g}" for v in row) + "\n" for row in rows), encoding="utf-8")
+
+
+def projection(camera: Camera, T_camera_reference: RigidTransform) -> list[float]:
+    """Twelve numbers of P = K [R | t], row-major."""
+    return [float(v) for v in (camera.matrix @ T_camera_reference.matrix34).reshape(-1)]
+
+
+def _write_rig(sequence: Sequence, folder: Path) -> None:
+    rig = sequence.rig
+    (folder / "rig.json").write_text(json.dumps(rig.to_dict(), indent=1) + "\n", encoding="utf-8")
+    rows = [projection(rig.left, RigidTransform.identity()), projection(rig.right, rig.T_right_left)]
+    _write_rows(folder / "calib.txt", rows)
+
+
+def _write_disparity(folder: Path, name: str, truth: Bundle) -> None:
+    path = folder / "disparity" / f"{name}.npz"
+    path.parent.mkdir(exist_ok=True)
+    np.savez_compressed(
+        path,
+        column=np.asarray(truth["column_disparity"][:]),
+        row=np.asarray(truth["row_disparity"][:]),
+        occluded=np.asarray(truth["occluded"][:]),
+        depth=np.asarray(truth["depth"][:]),
+    )
+
+
+def _write_dem(sequence: Sequence, folder: Path, frame: int, materialise: Materialise) -> None:
+    """The exact DEM of the evaluation window, on cells at integer multiples of the cell size."""
+    assert sequence.truth is not None
+    assert sequence.truth_dem is not None
+    assert sequence.evaluation_window is not None
+    cell = float(sequence.defaults.get("locus.cell_size", 0.001))
+    x_min, y_min, x_max, y_max = (round(v / cell) for v in sequence.evaluation_window)
+    lattice: dict[str, Any] = {
+        "x0": x_min * cell,
+        "y0": y_max * cell,
+        "cell": cell,
+        "rows": y_max - y_min + 1,
+        "cols": x_max - x_min + 1,
+    }
+    T_truth_left = sequence.truth[frame]
+    local = RigidTransform(level_rotation(T_truth_left.rotation[2]), np.zeros(3))
+    T_truth_local = T_truth_left @ local.inverse()
+    truth = materialise(sequence.truth_dem(lattice, T_truth_local, (frame,)))
+    path = folder / "dem" / f"{sequence.frame_names[frame]}.npz"
+    path.parent.mkdir(exist_ok=True)
+    arrays: dict[str, Any] = {name: np.asarray(truth[name][:]) for name in ("elevation", "seen")}
+    np.savez_compressed(path, T_truth_local=T_truth_local.matrix34, **arrays, **lattice)

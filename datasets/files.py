@@ -1,0 +1,197 @@
+"""Stage ``image``: one image file, checked and grey. And what a reader of folders asks of files beforehand."""
+
+from __future__ import annotations
+
+import hashlib
+import struct
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from datasets.protocol import Source
+from stages.declare import Array, Bundle, Inputs, NoParams, Stage
+from stages.errors import InputError
+
+SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".pgm")
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+COPY_AGAIN = "copy the file again, or leave its frame out with --frames"
+
+Grey = NDArray[np.uint8] | NDArray[np.uint16]
+
+
+def _png_damage(data: bytes) -> str:
+    """What is wrong with the chunks of a PNG, or nothing: decoders may deliver a truncated one as partly black."""
+    at = len(PNG_SIGNATURE)
+    while at + 12 <= len(data):
+        (length,) = struct.unpack_from(">I", data, at)
+        kind, end = data[at + 4 : at + 8], at + 12 + length
+        if end > len(data):
+            break
+        if zlib.crc32(data[at + 4 : end - 4]) != struct.unpack_from(">I", data, end - 4)[0]:
+            return f"is damaged (checksum of chunk {kind.decode('latin-1')} at byte {at})"
+        if kind == b"IEND":
+            return ""
+        at = end
+    return f"is truncated (the PNG breaks off at byte {len(data)})"
+
+
+def _damage(data: bytes) -> str:
+    """Why a file cannot be whole, in words, or nothing."""
+    if not data:
+        return "is empty"
+    if data.startswith(PNG_SIGNATURE):
+        return _png_damage(data)
+    # the end marker may be followed by padding, but nothing else ends a JPEG
+    if data.startswith(b"\xff\xd8") and b"\xff\xd9" not in data[-4096:]:
+        return f"is truncated (the JPEG breaks off at byte {len(data)})"
+    return ""
+
+
+def decode(data: bytes, name: str) -> Grey:
+    """Grey image of an encoded file.
+
+    Colour becomes grey by ITU-R BT.601, 0.299 R + 0.587 G + 0.114 B; an alpha channel is dropped, an orientation tag
+    ignored (the calibration holds for the pixels as they are stored).
+
+    Parameters
+    ----------
+    data : the file's bytes.
+    name : what to call it in an error.
+
+    Returns
+    -------
+    ndarray (row, col), uint8 or uint16 as stored.
+
+    Raises
+    ------
+    InputError
+        The file is truncated, damaged, of another kind, or its samples are neither 8- nor 16-bit.
+    """
+    damage = _damage(data)
+    if damage:
+        raise InputError(f"{name} {damage}", remedy=COPY_AGAIN)
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    if image is None:
+        raise InputError(f"{name} cannot be read as an image", remedy=f"{COPY_AGAIN}; PNG, JPEG, TIFF and PGM are read")
+    if image.dtype not in (np.uint8, np.uint16):
+        raise InputError(f"{name} has samples of type {image.dtype}", remedy="save it with 8 or 16 bits a sample")
+    if image.ndim == 3 and image.shape[2] >= 3:
+        image = cv2.cvtColor(np.ascontiguousarray(image[:, :, :3]), cv2.COLOR_BGR2GRAY)
+    elif image.ndim == 3:
+        image = image[:, :, 0]
+    grey: Grey = np.ascontiguousarray(image)
+    return grey
+
+
+def read_grey(path: Path, name: str = "") -> Grey:
+    """Grey image (row, col), uint8 or uint16, of a file (see :func:`decode`)."""
+    return decode(_bytes(path), name or str(path))
+
+
+def _bytes(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}", remedy="check the path and its rights") from error
+
+
+def png_header(path: Path) -> tuple[int, int, int] | None:
+    """Width, height, bits a sample of a PNG from its first bytes; None for other kinds of file."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(26)
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}", remedy="check the path and its rights") from error
+    if len(head) < 26 or not head.startswith(PNG_SIGNATURE):
+        return None
+    width, height, bits = struct.unpack_from(">IIB", head, 16)
+    return width, height, 8 if bits <= 8 else bits
+
+
+class Digests:
+    """SHA-256 of files, remembered by (path, size, modification time in ns).
+
+    Where a file for it is given, each new digest is appended there as a line ``digest size mtime_ns path``: it is only
+    a memo, so that a line that does not parse is passed over.
+    """
+
+    def __init__(self, memory: Path | None = None) -> None:
+        self._memory = memory
+        self._known: dict[str, str] = {}
+        if memory is not None and memory.is_file():
+            for line in memory.read_text(encoding="utf-8", errors="replace").splitlines():
+                digest, _, key = line.partition(" ")
+                if len(digest) == 64:
+                    self._known[key] = digest
+
+    def sha256(self, path: Path) -> str:
+        """Hexadecimal digest of the file's bytes."""
+        try:
+            status = path.stat()
+        except OSError as error:
+            raise InputError(f"{path} cannot be read: {error.strerror}", remedy="check the path") from error
+        key = f"{status.st_size} {status.st_mtime_ns} {path.resolve()}"
+        if key not in self._known:
+            self._known[key] = hashlib.sha256(_bytes(path)).hexdigest()
+            if self._memory is not None:
+                self._memory.parent.mkdir(parents=True, exist_ok=True)
+                with self._memory.open("a", encoding="utf-8") as file:
+                    file.write(f"{self._known[key]} {key}\n")
+        return self._known[key]
+
+
+def image_source(path: Path, frame: int, camera: str, size: tuple[int, int, int], digests: Digests) -> Source:
+    """Source of one file; ``size`` is the width, height and bits that it must have."""
+    width, height, depth = size
+    args = {
+        "sha256": digests.sha256(path),
+        "camera": camera,
+        "frame": frame,
+        "width": width,
+        "height": height,
+        "depth": depth,
+    }
+    module = "datasets.files16" if depth == 16 else "datasets.files"
+    return Source(module, NoParams(), args, hints={"path": str(path.resolve())})
+
+
+def check_size(found: tuple[int, int, int], wanted: tuple[int, int, int], name: str) -> None:
+    """Refuse an image whose width, height or depth differs from the sequence's."""
+    if found != wanted:
+        words = [f"{w} x {h}, {d} bits" for w, h, d in (found, wanted)]
+        raise InputError(
+            f"{name} is {words[0]}; the sequence has {words[1]}",
+            remedy="all images of a sequence must have one size and depth; leave the frame out or convert it",
+        )
+
+
+def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+    name = f"frame {args['frame']}, {args['camera']} image {args['path']}"
+    data = _bytes(Path(args["path"]))
+    if hashlib.sha256(data).hexdigest() != args["sha256"]:
+        raise InputError(f"{name} has changed since the run began", remedy="run the same command again")
+    image = decode(data, name)
+    found = (image.shape[1], image.shape[0], image.dtype.itemsize * 8)
+    check_size(found, (args["width"], args["height"], args["depth"]), name)
+    meta = {"frame": args["frame"], "camera": args["camera"]}
+    return Bundle({"image": image, "valid": np.ones(image.shape, np.uint8)}, meta)
+
+
+STAGE = Stage(
+    name="image",
+    version=1,
+    summary="one image file, checked and grey",
+    params=NoParams,
+    inputs=(),
+    outputs=(
+        Array("image", ("row", "col"), "uint8", "grey level", "image"),
+        Array("valid", ("row", "col"), "uint8", "1", "1 = usable"),
+    ),
+    requires=("numpy", "opencv-python-headless"),
+    run=_run,
+)

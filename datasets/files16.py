@@ -1,0 +1,14 @@
+"""Stage ``image`` for files of 16 bits a sample: the same reader; a stage declares one type for an array."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from datasets import files
+from stages.declare import Array
+
+STAGE = replace(
+    files.STAGE,
+    summary="one image file of 16 bits a sample, checked and grey",
+    outputs=(Array("image", ("row", "col"), "uint16", "1/257 grey level", "image"), files.STAGE.outputs[1]),
+)

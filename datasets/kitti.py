@@ -1,0 +1,270 @@
+"""Folders of rectified or calibrated pairs in the manner of KITTI odometry (Geiger et al. 2012).
+
+Two layouts are recognised: the standard one, ``ROOT/sequences/NN`` with ``ROOT/poses/NN.txt`` (given as the sequence's
+folder, or as ``ROOT:NN``), and a self-contained folder with two image folders, ``calib.txt``, and optionally
+``poses.txt`` and ``times.txt``.
+
+``calib.txt`` has one 3 x 4 projection matrix a line, row-major, with or without a label (``P0: ...``): P = K [R | t]
+maps the reference frame, in which the poses are given, to pixels; KITTI's have R = 1. Pixel centres are at integers.
+``poses.txt`` has T_world_reference, 3 x 4 a line.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import rq
+
+from datasets import files
+from datasets.protocol import CAMERAS, Sequence, Source
+from stages.errors import InputError
+from stages.geometry import Camera, Rig, RigidTransform, orthonormal
+
+PAIRS = (("image_0", "image_1"), ("image_2", "image_3"), ("image_l", "image_r"), ("left", "right"))
+"""Names of the image folders, left and right; grey KITTI cameras before colour ones."""
+
+STREET = {"select.stride": 2, "locus.cell_size": 0.1}
+"""At street speed every fifth pair overlaps too little; 0.1 m resolves kerbs where the disparity does."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where the parts of a sequence lie."""
+
+    name: str
+    folder: Path
+    pair: tuple[str, str]
+    calib: Path
+    poses: Path | None
+    times: Path | None
+
+
+def image_folders(folder: Path) -> tuple[str, str] | None:
+    """The pair of image folders that a folder has."""
+    return next((p for p in PAIRS if all((folder / side).is_dir() for side in p)), None)
+
+
+def recognise(path: Path, number: str | None = None) -> Layout | None:
+    """Layout of a folder, or None where it is none of ours.
+
+    Raises
+    ------
+    InputError
+        The folder holds several sequences and none is chosen, or the chosen one is not there.
+    """
+    if (path / "sequences").is_dir():
+        there = sorted(d.name for d in (path / "sequences").iterdir() if d.is_dir() and image_folders(d))
+        if number is None and len(there) != 1:
+            raise InputError(f"{path} holds {len(there)} sequences", remedy=f"choose one, e.g. {path}:{_first(there)}")
+        number = number if number is not None else there[0]
+        if number not in there:
+            raise InputError(f"{path} has no sequence {number!r}", remedy=f"it has {', '.join(there) or 'none'}")
+        path = path / "sequences" / number
+    elif number is not None:
+        return None
+    path = path.resolve()
+    pair = image_folders(path)
+    if pair is None:
+        return None
+    beside = path.parent.parent / "poses" / f"{path.name}.txt"
+    standard = path.parent.name == "sequences"
+    poses = next((p for p in (path / "poses.txt", *([beside] if standard else [])) if p.is_file()), None)
+    times = path / "times.txt"
+    return Layout(
+        name=f"kitti-{path.name}" if standard else path.name,
+        folder=path,
+        pair=pair,
+        calib=path / "calib.txt",
+        poses=poses,
+        times=times if times.is_file() else None,
+    )
+
+
+def _first(names: list[str]) -> str:
+    return names[0] if names else "00"
+
+
+def _rows(path: Path, count: int, what: str) -> list[tuple[str, NDArray[np.float64]]]:
+    """Lines of a text file: (label or "", numbers); each must have ``count`` finite numbers."""
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{what} {path} cannot be read: {error}", remedy="check the file") from error
+    out = []
+    for k, line in enumerate(lines, start=1):
+        label, _, numbers = line.rpartition(":")
+        if not numbers.strip():
+            continue
+        try:
+            values = np.array([float(v) for v in numbers.split()])
+        except ValueError:
+            values = np.empty(0)
+        if values.size != count or not np.isfinite(values).all():
+            raise InputError(f"{path}, line {k}: not {count} numbers", remedy=f"correct that line of the {what}")
+        out.append((label.strip(), values))
+    return out
+
+
+def read_projections(path: Path, pair: tuple[str, str]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The 3 x 4 projection matrices of the two cameras.
+
+    With labels ``P0 ... P3`` the images' numbers choose; else the first two lines are left and right.
+    """
+    if not path.is_file():
+        raise InputError(
+            f"{path} is missing", remedy="put the calibration there: a 3 x 4 projection matrix a line, left and right"
+        )
+    rows = [(label, v.reshape(3, 4)) for label, v in _rows(path, 12, "calibration") if not label.startswith("Tr")]
+    labelled = {label: p for label, p in rows if label}
+    wanted = [f"P{side[-1]}" for side in pair]
+    if all(w in labelled for w in wanted):
+        return labelled[wanted[0]], labelled[wanted[1]]
+    numbered = pair[0][-1].isdigit()
+    if numbered and not labelled and len(rows) == 4:
+        return rows[int(pair[0][-1])][1], rows[int(pair[1][-1])][1]
+    if (numbered and labelled) or len(rows) < 2:
+        raise InputError(
+            f"{path} has no projection matrices of {pair[0]} and {pair[1]}",
+            remedy=f"give lines {wanted[0]}: and {wanted[1]}:" if labelled else "give two lines of 12 numbers",
+        )
+    return rows[0][1], rows[1][1]
+
+
+def decompose(projection: NDArray[np.float64], name: str) -> tuple[NDArray[np.float64], RigidTransform]:
+    """K (3, 3) and T_camera_reference of a projection matrix P = K [R | t]."""
+    m = projection[:, :3]
+    # written so that NaN-free but singular matrices are refused before anything divides by them
+    if abs(np.linalg.det(m)) < 1e-9:
+        raise InputError(f"calibration: {name} is singular", remedy="give P = K [R | t], 12 numbers, row-major")
+    if m[1, 0] == m[2, 0] == m[2, 1] == 0.0 and m[2, 2] > 0:
+        k, r = m / m[2, 2], np.eye(3)
+    else:
+        k, r = rq(m * np.sign(np.linalg.det(m)))
+        signs = np.sign(np.diag(k))
+        k, r = k * signs, signs[:, None] * r
+        k = k / k[2, 2]
+    scale = np.linalg.norm(m[2])
+    if abs(k[0, 1]) > 1e-4 * k[0, 0]:
+        raise InputError(f"calibration: {name} has skewed pixels", remedy="give a camera with perpendicular axes")
+    t = np.linalg.solve(k, projection[:, 3]) / scale * np.sign(np.linalg.det(m))
+    return k, RigidTransform(orthonormal(r), t)
+
+
+def read_rig(layout: Layout, width: int, height: int) -> tuple[Rig, RigidTransform]:
+    """The rig, and T_reference_left (poses are those of the reference frame)."""
+    cameras, poses = [], []
+    for projection, name in zip(read_projections(layout.calib, layout.pair), layout.pair, strict=True):
+        k, T_camera_reference = decompose(projection, name)
+        fx, fy, cx, cy = (float(v) for v in (k[0, 0], k[1, 1], k[0, 2], k[1, 2]))
+        cameras.append(Camera(fx, fy, cx, cy, width, height))
+        poses.append(T_camera_reference)
+    T_right_left = poses[1] @ poses[0].inverse()
+    rig = Rig(cameras[0], cameras[1], T_right_left)
+    if not rig.baseline > 0:
+        raise InputError(f"{layout.calib}: the two cameras stand in one place", remedy="check the fourth column of P")
+    if T_right_left.translation[0] > 0.5 * rig.baseline:
+        raise InputError(
+            f"{layout.calib}: the right camera stands {T_right_left.translation[0]:g} m to the left of the left one",
+            remedy="swap the two lines or the two folders",
+        )
+    return rig, poses[0].inverse()
+
+
+def _listing(folder: Path) -> dict[str, Path]:
+    """Image files of a folder by stem."""
+    out: dict[str, Path] = {}
+    for path in sorted(folder.iterdir()):
+        if path.suffix.lower() in files.SUFFIXES:
+            if path.stem in out:
+                raise InputError(f"{path} and {out[path.stem].name} are the same frame", remedy="remove one of them")
+            out[path.stem] = path
+    return out
+
+
+def list_pairs(layout: Layout) -> tuple[tuple[str, ...], dict[str, list[Path]]]:
+    """Frame names in order and the files of each camera, every left with its right."""
+    left, right = (_listing(layout.folder / side) for side in layout.pair)
+    for ours, others, side in ((left, right, layout.pair[1]), (right, left, layout.pair[0])):
+        alone = [stem for stem in ours if stem not in others]
+        if alone:
+            more = f" (and {len(alone) - 1} more)" if len(alone) > 1 else ""
+            raise InputError(
+                f"{ours[alone[0]]} has no partner in {layout.folder / side}{more}",
+                remedy="add the missing image or remove this one",
+            )
+    names = tuple(sorted(left, key=lambda s: (len(s), s) if s.isdigit() else (0, s)))
+    if not names:
+        raise InputError(
+            f"{layout.folder / layout.pair[0]} holds no images", remedy=f"put files there: {', '.join(files.SUFFIXES)}"
+        )
+    return names, {"left": [left[n] for n in names], "right": [right[n] for n in names]}
+
+
+def _sizes(paths: dict[str, list[Path]]) -> tuple[int, int, int]:
+    """Width, height and bits that all images share; those of PNG files are compared here, others when read."""
+    first = paths["left"][0]
+    wanted = files.png_header(first)
+    if wanted is None:
+        image = files.read_grey(first)
+        wanted = (image.shape[1], image.shape[0], image.dtype.itemsize * 8)
+    for path in [p for c in CAMERAS for p in paths[c]]:
+        found = files.png_header(path)
+        if found is not None:
+            files.check_size(found, wanted, str(path))
+    return wanted
+
+
+def _per_frame(path: Path, numbers: int, frames: int, what: str) -> list[NDArray[np.float64]]:
+    rows = [values for _, values in _rows(path, numbers, what)]
+    if len(rows) != frames:
+        raise InputError(
+            f"{path} has {len(rows)} {what} for {frames} pairs", remedy="give one line a pair, or remove the file"
+        )
+    return rows
+
+
+def open_kitti(layout: Layout, digests: files.Digests) -> Sequence:
+    """The sequence in a folder.
+
+    Raises
+    ------
+    InputError
+        A partner is missing, sizes or depths differ, a text file does not parse, or counts do not agree.
+    """
+    names, paths = list_pairs(layout)
+    size = _sizes(paths)
+    rig, T_reference_left = read_rig(layout, size[0], size[1])
+    truth = times = None
+    if layout.poses is not None:
+        rows = _per_frame(layout.poses, 12, len(names), "poses")
+        truth = tuple(_pose(row, k, layout.poses) @ T_reference_left for k, row in enumerate(rows, start=1))
+    if layout.times is not None:
+        times = tuple(float(row[0]) for row in _per_frame(layout.times, 1, len(names), "times"))
+
+    def image(frame: int, camera: str) -> Source:
+        return files.image_source(paths[camera][frame], frame, camera, size, digests)
+
+    return Sequence(
+        name=layout.name,
+        rig=rig,
+        frames=len(names),
+        image=image,
+        frame_names=names,
+        times=times,
+        truth=truth,
+        truth_source=f"poses of {layout.poses.name}, as recorded" if layout.poses is not None else "",
+        defaults=STREET,
+    )
+
+
+def _pose(row: NDArray[np.float64], line: int, path: Path) -> RigidTransform:
+    """One line of poses; written with few digits, so that its rotation is made orthonormal."""
+    m = row.reshape(3, 4)
+    try:
+        RigidTransform(m[:, :3], m[:, 3])
+    except InputError as error:
+        raise InputError(f"{path}, line {line}: {error.message}", remedy=error.remedy) from error
+    return RigidTransform(orthonormal(m[:, :3]), m[:, 3])

@@ -1,0 +1,222 @@
+"""Stage ``mockup.render``: one image of the bed by one camera.
+
+2 x 2 rays a pixel; McEwen's lunar-Lambert reflectance 2 L mu0 / (mu0 + mu) + (1 - L) mu0 (doi:10.1016/0019-1035(91)
+90038-7), the first term Lommel-Seeliger; anisotropic look-up of the albedo pyramid by footprint; then optics blur,
+vignetting, exposure, noise and quantisation.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from datasets.mockup.params import RenderParams
+from datasets.mockup.raycast import HeightField
+from datasets.mockup.scene import height_field
+from datasets.mockup.terrain import EMISSION
+from stages.declare import Array, Bundle, Inputs, Stage
+from stages.geometry import Camera, RigidTransform
+
+SUPERSAMPLING = 2
+LUNAR = 0.6
+"""McEwen's L near 70 degrees of phase angle, the usual one here."""
+AMBIENT = 0.05
+"""Stray light of the room, relative to the lamp on a surface that faces it."""
+BACKGROUND = 9.0
+"""Grey level of the dark room behind the bed."""
+LEVEL_GREY = 112.0
+"""Grey level of sunlit level ground; shadows and vignetting bring the mean of a picture to about 100."""
+CAMERA_INDEX = {"left": 0, "right": 1}
+
+
+def camera_rays(camera: Camera, T_bed_camera: RigidTransform, sampling: int = 1) -> NDArray[np.float64]:
+    """Directions (sampling * height * sampling * width, 3) in the bed frame, z = 1 in the camera frame, row-major."""
+    offset = (np.arange(sampling) + 0.5) / sampling - 0.5
+    x = (np.arange(camera.width)[:, None] + offset).ravel()
+    y = (np.arange(camera.height)[:, None] + offset).ravel()
+    columns, rows = np.meshgrid((x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy)
+    r = T_bed_camera.rotation
+    # written out, not as a matrix product: the same bits from any BLAS
+    return np.stack([columns * r[k, 0] + rows * r[k, 1] + r[k, 2] for k in range(3)], axis=-1).reshape(-1, 3)
+
+
+@njit(cache=True, nogil=True)
+def _shade(height, sunlit, tint, texture, offsets, shapes, grid, origin, directions, distance, pixel_angle, sun):  # type: ignore[no-untyped-def]
+    """Radiance (n,) of the hit points, NaN where a ray hit nothing; ``grid`` = x0, y0, cell."""
+    x0, y0, cell = grid
+    n = directions.shape[0]
+    out = np.full(n, np.nan, np.float32)
+    for i in range(n):
+        t = distance[i]
+        if not t >= 0.0:
+            continue
+        dx, dy, dz = directions[i, 0], directions[i, 1], directions[i, 2]
+        length = math.sqrt(dx * dx + dy * dy + dz * dz)
+        x, y = origin[0] + t * dx, origin[1] + t * dy
+        c, r = (x - x0) / cell, (y0 - y) / cell
+        vx, vy, vz = -dx / length, -dy / length, -dz / length
+        minor = t * length * pixel_angle
+        # slopes over the footprint, at least over one cell: what a pixel averages is not resolved
+        s = max(1.0, 0.5 * minor / cell)
+        gx = (_bilinear(height, r, c + s) - _bilinear(height, r, c - s)) / (2.0 * s * cell)
+        gy = (_bilinear(height, r - s, c) - _bilinear(height, r + s, c)) / (2.0 * s * cell)
+        norm = math.sqrt(1.0 + gx * gx + gy * gy)
+        mu0 = max((sun[2] - gx * sun[0] - gy * sun[1]) / norm, 0.0)
+        mu = max((vz - gx * vx - gy * vy) / norm, 0.05)
+        lit = _bilinear(sunlit, r, c) / 255.0
+        direct = lit * (2.0 * LUNAR * mu0 / (mu0 + mu) + (1.0 - LUNAR) * mu0) if mu0 > 0.0 else 0.0
+        # the grain is draped over rocks, not projected from above: walls that face the drive have it, too
+        drape = (origin[2] + t * dz) / cell
+        # footprint on the ground: an ellipse drawn out along the line of sight
+        stretch = min(1.0 / mu, 8.0)
+        taps = int(stretch + 0.5)
+        flat = math.sqrt(vx * vx + vy * vy) + 1e-12
+        ax, ay = vx / flat * minor * stretch, vy / flat * minor * stretch
+        level = math.log2(max(minor * stretch / taps / (0.5 * cell), 1.0))
+        level = min(level, offsets.shape[0] - 1.001)
+        low = int(level)
+        f = level - low
+        total = 0.0
+        for k in range(taps):
+            a = (k + 0.5) / taps - 0.5
+            tr = 2.0 * (r + drape - a * ay / cell)
+            tc = 2.0 * (c + a * ax / cell)
+            total += (1.0 - f) * _texel(texture, offsets, shapes, low, tr, tc)
+            total += f * _texel(texture, offsets, shapes, low + 1, tr, tc)
+        out[i] = total / taps / 128.0 * _bilinear(tint, r, c) / 100.0 * (direct + AMBIENT)
+    return out
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _bilinear(a, r, c):  # type: ignore[no-untyped-def]
+    """Bilinear value at (row, column), clamped to the grid."""
+    r = min(max(r, 0.0), a.shape[0] - 1.000001)
+    c = min(max(c, 0.0), a.shape[1] - 1.000001)
+    i, j = int(r), int(c)
+    u, v = r - i, c - j
+    top = (1.0 - v) * a[i, j] + v * a[i, j + 1]
+    return (1.0 - u) * top + u * ((1.0 - v) * a[i + 1, j] + v * a[i + 1, j + 1])
+
+
+@njit(cache=True, nogil=True)
+def _texel(texture, offsets, shapes, level, r, c):  # type: ignore[no-untyped-def]
+    """Bilinear value of one level of the albedo at (row, column) of level 0."""
+    size = float(1 << level)
+    rows, cols = shapes[level, 0], shapes[level, 1]
+    r = min(max((r + 0.5) / size - 0.5, 0.0), rows - 1.000001)
+    c = min(max((c + 0.5) / size - 0.5, 0.0), cols - 1.000001)
+    i, j = int(r), int(c)
+    u, v = r - i, c - j
+    at = offsets[level] + i * cols + j
+    top = (1.0 - v) * texture[at] + v * texture[at + 1]
+    return (1.0 - u) * top + u * ((1.0 - v) * texture[at + cols] + v * texture[at + cols + 1])
+
+
+def sun_direction(elevation_deg: float, azimuth_deg: float) -> NDArray[np.float64]:
+    """Unit vector (3,) towards the sun in the bed frame; azimuth clockwise from +y."""
+    e, a = math.radians(elevation_deg), math.radians(azimuth_deg)
+    return np.array([math.cos(e) * math.sin(a), math.cos(e) * math.cos(a), math.sin(e)])
+
+
+def radiance(
+    scene: Bundle, field: HeightField, camera: Camera, T_bed_camera: RigidTransform
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Radiance of every ray, float32 (row, 2, col, 2), NaN beside the bed; and the bed's mask, bool (row, col).
+
+    The mask is true where all rays of the pixel and of its eight neighbours hit the bed.
+    """
+    rays = camera_rays(camera, T_bed_camera, SUPERSAMPLING)
+    origin = T_bed_camera.translation
+    distance = field.cast(origin[None, :], rays)
+    mips = [np.asarray(scene[f"albedo_{k}"][:]) for k in range(sum(n.startswith("albedo_") for n in scene.arrays))]
+    light = scene.meta["scene"]
+    values = _shade(
+        field.height,
+        np.ascontiguousarray(scene["sunlit"][:]),
+        np.ascontiguousarray(scene["tint"][:]),
+        np.concatenate([m.ravel() for m in mips]),
+        np.concatenate([[0], np.cumsum([m.size for m in mips])[:-1]]).astype(np.int64),
+        np.array([m.shape for m in mips], dtype=np.int64),
+        (field.x0, field.y0, field.cell),
+        np.ascontiguousarray(origin),
+        rays,
+        distance,
+        1.0 / (SUPERSAMPLING * camera.fx),
+        sun_direction(light["sun_elevation_deg"], light["sun_azimuth_deg"]),
+    )
+    blocks = values.reshape(camera.height, SUPERSAMPLING, camera.width, SUPERSAMPLING)
+    hit = np.isfinite(blocks).all(axis=(1, 3))
+    mask = ndimage.binary_erosion(hit, np.ones((3, 3)), border_value=1)
+    return blocks, np.asarray(mask)
+
+
+def expose(blocks: NDArray[np.float32], p: RenderParams, flat: float, frame: int, camera: str) -> NDArray[np.uint8]:
+    """Grey image uint8 (row, col) from radiance samples (row, 2, col, 2); ``flat`` is the radiance of level ground."""
+    rng = np.random.default_rng([p.seed, 50, frame, CAMERA_INDEX[camera]])
+    gain = LEVEL_GREY / flat * p.exposure * (1.0 + p.exposure_jitter * float(rng.standard_normal()))
+    gain *= p.right_gain if camera == "right" else 1.0
+    samples = np.where(np.isnan(blocks), np.float32(BACKGROUND), blocks * np.float32(gain))
+    grey = samples.astype(np.float64).mean(axis=(1, 3))
+    if p.blur > 0:
+        grey = ndimage.gaussian_filter(grey, p.blur, mode="nearest")
+    y, x = np.ogrid[-1.0 : 1.0 : grey.shape[0] * 1j, -1.0 : 1.0 : grey.shape[1] * 1j]
+    grey = grey * (1.0 - p.vignetting * (x * x + y * y) / 2.0)
+    noisy = grey + p.noise * rng.standard_normal(grey.shape)
+    return np.asarray(np.clip(np.rint(noisy), 0, 255), dtype=np.uint8)
+
+
+def flat_radiance(sun_elevation_deg: float) -> float:
+    """Radiance of level ground of mean albedo, seen as the camera's axis sees it."""
+    mu0 = math.sin(math.radians(sun_elevation_deg))
+    return 2.0 * LUNAR * mu0 / (mu0 + EMISSION) + (1.0 - LUNAR) * mu0 + AMBIENT
+
+
+def render(
+    scene: Bundle, camera: Camera, T_bed_camera: RigidTransform, params: RenderParams, frame: int, name: str
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Image uint8 (row, col) of a scene and its mask (1 = bed, 0 = background beyond it).
+
+    Parameters
+    ----------
+    scene : bundle of ``mockup.scene``.
+    camera, T_bed_camera : the true camera and its pose.
+    params : the sensor.
+    frame, name : number of the pair and ``"left"`` or ``"right"``; with the seed they fix the noise.
+    """
+    field = height_field(scene)
+    blocks, mask = radiance(scene, field, camera, T_bed_camera)
+    flat = flat_radiance(scene.meta["scene"]["sun_elevation_deg"])
+    return expose(blocks, params, flat, frame, name), mask.astype(np.uint8)
+
+
+def _run(params: RenderParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+    image, valid = render(
+        inputs["scene"],
+        Camera.from_dict(args["geometry"]),
+        RigidTransform.from_matrix(args["T_bed_camera"]),
+        params,
+        args["frame"],
+        args["camera"],
+    )
+    return Bundle({"image": image, "valid": valid}, {"frame": args["frame"], "camera": args["camera"]})
+
+
+STAGE = Stage(
+    name="mockup.render",
+    version=1,
+    summary="one image of the simulated bed",
+    params=RenderParams,
+    inputs=("scene",),
+    outputs=(
+        Array("image", ("row", "col"), "uint8", "grey level", "image"),
+        Array("valid", ("row", "col"), "uint8", "1", "1 = usable, 0 = background beyond the bed"),
+    ),
+    requires=("numpy", "numba", "scipy"),
+    run=_run,
+)

@@ -1,0 +1,108 @@
+"""Stage ``mockup.truth``: the exact disparity of a pair, by ray casting from both cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from datasets.mockup.raycast import HeightField
+from datasets.mockup.render import camera_rays
+from datasets.mockup.scene import height_field
+from stages.declare import AnyArray, Array, Bundle, Inputs, NoParams, Stage
+from stages.geometry import Camera, Rig, RigidTransform
+
+TOLERANCE = 1e-5
+"""m: a point is hidden when its line of sight ends more than this in front of it; far below any truth's use."""
+
+SEEN, HIDDEN, OUTSIDE, NO_BED = 0, 1, 2, 3
+
+
+def visible(
+    field: HeightField, camera: Camera, T_bed_camera: RigidTransform, points: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_]]:
+    """Where a camera sees points of the surface.
+
+    Parameters
+    ----------
+    points : (n, 3) of the bed frame, metres; NaN rows are outside and hidden.
+
+    Returns
+    -------
+    pixels : (n, 2) column, row.
+    inside : (n,) the projection lies within the outermost pixel centres.
+    free : (n,) and nothing stands in between.
+    """
+    camera_points = T_bed_camera.inverse().apply(points)
+    pixels = camera.project(camera_points)
+    with np.errstate(invalid="ignore"):
+        inside = np.asarray(((pixels >= 0) & (pixels <= [camera.width - 1, camera.height - 1])).all(axis=1))
+    free = np.zeros(len(points), dtype=bool)
+    directions = points[inside] - T_bed_camera.translation
+    t = field.cast(T_bed_camera.translation[None, :], directions)
+    length = np.sqrt((directions**2).sum(axis=1))
+    # a ray that just misses the point it aims at has grazed it: seen
+    free[inside] = ~((1.0 - t) * length > TOLERANCE)
+    return pixels, inside, free
+
+
+def true_disparity(
+    field: HeightField, rig: Rig, T_bed_left: RigidTransform
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8], NDArray[np.float32]]:
+    """Disparity of each left pixel's central ray.
+
+    Returns
+    -------
+    column, row : float32 (row, col), pixels, right minus left; NaN where the left camera sees no bed. Given for points
+        that the right camera does not see, too.
+    occluded : uint8; 0 both cameras see the point, 1 hidden from the right one, 2 outside its image, 3 no bed.
+    depth : float32, metres along the left optical axis, NaN without bed.
+    """
+    rays = camera_rays(rig.left, T_bed_left)
+    depth = field.cast(T_bed_left.translation[None, :], rays)
+    points = T_bed_left.translation + depth[:, None] * rays
+    pixels, inside, free = visible(field, rig.right, T_bed_left @ rig.T_right_left.inverse(), points)
+    shape = (rig.left.height, rig.left.width)
+    rows, columns = np.mgrid[: shape[0], : shape[1]]
+    occluded = np.full(len(rays), SEEN, np.uint8)
+    occluded[~free] = HIDDEN
+    occluded[~inside] = OUTSIDE
+    occluded[np.isnan(depth)] = NO_BED
+    return (
+        (pixels[:, 0].reshape(shape) - columns).astype(np.float32),
+        (pixels[:, 1].reshape(shape) - rows).astype(np.float32),
+        occluded.reshape(shape),
+        depth.reshape(shape).astype(np.float32),
+    )
+
+
+def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+    column, row, occluded, depth = true_disparity(
+        height_field(inputs["scene"]), Rig.from_dict(args["rig"]), RigidTransform.from_matrix(args["T_bed_left"])
+    )
+    arrays: dict[str, AnyArray] = {
+        "column_disparity": column,
+        "row_disparity": row,
+        "occluded": occluded,
+        "depth": depth,
+    }
+    return Bundle(arrays, {"frame": args["frame"], "seen": int((occluded == SEEN).sum())})
+
+
+STAGE = Stage(
+    name="mockup.truth",
+    version=1,
+    summary="exact disparity of a simulated pair",
+    params=NoParams,
+    inputs=("scene",),
+    outputs=(
+        Array("column_disparity", ("row", "col"), "float32", "px", "exact column disparity", nodata="nan"),
+        Array("row_disparity", ("row", "col"), "float32", "px", "exact row disparity", nodata="nan"),
+        Array("occluded", ("row", "col"), "uint8", "1", "0 seen, 1 hidden, 2 outside the right image, 3 no bed"),
+        Array("depth", ("row", "col"), "float32", "m", "depth along the left optical axis", nodata="nan"),
+    ),
+    requires=("numpy", "numba"),
+    run=_run,
+)

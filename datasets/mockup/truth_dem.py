@@ -1,0 +1,79 @@
+"""Stage ``mockup.truth_dem``: the exact DEM on any lattice of any frame whose pose on the bed is known."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from datasets.mockup.raycast import HeightField
+from datasets.mockup.scene import height_field
+from datasets.mockup.truth import visible
+from stages.declare import Array, Bundle, Inputs, NoParams, Stage
+from stages.geometry import Rig, RigidTransform
+
+
+def true_dem(
+    field: HeightField, lattice: Mapping[str, Any], T_bed_world: RigidTransform
+) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+    """Elevations at the cell centres of a lattice: where the world's own vertical line meets the bed from above.
+
+    Parameters
+    ----------
+    lattice : x0, y0, cell, rows, cols; cell centres at x = x0 + col * cell, y = y0 - row * cell of the world frame.
+    T_bed_world : pose of the world frame on the bed; it need not be level.
+
+    Returns
+    -------
+    elevation : float32 (row, col), metres in the world frame; NaN outside the bed.
+    points : float64 (row * col, 3) the same surface points in the bed frame.
+    """
+    x = lattice["x0"] + lattice["cell"] * np.arange(lattice["cols"])
+    y = lattice["y0"] - lattice["cell"] * np.arange(lattice["rows"])
+    gx, gy = np.meshgrid(x, y)
+    # start above everything: as high over the camera as the bed's whole diagonal cannot lie
+    start = float(field.maxima[-1]) + 10.0
+    tops = T_bed_world.apply(np.stack([gx.ravel(), gy.ravel(), np.full(gx.size, start)], axis=1))
+    down = np.broadcast_to(-T_bed_world.rotation[:, 2], tops.shape)
+    t = field.cast(tops, np.ascontiguousarray(down))
+    return (start - t).reshape(gx.shape).astype(np.float32), tops + t[:, None] * down
+
+
+def seen_by(
+    field: HeightField, rig: Rig, lefts: Iterable[RigidTransform], points: NDArray[np.float64]
+) -> NDArray[np.bool_]:
+    """Whether both cameras of at least one pair see each surface point (n, 3) of the bed frame."""
+    seen = np.zeros(len(points), dtype=bool)
+    T_left_right = rig.T_right_left.inverse()
+    for T_bed_left in lefts:
+        todo = np.flatnonzero(~seen & np.isfinite(points[:, 0]))
+        left = visible(field, rig.left, T_bed_left, points[todo])[2]
+        todo = todo[left]
+        right = visible(field, rig.right, T_bed_left @ T_left_right, points[todo])[2]
+        seen[todo[right]] = True
+    return seen
+
+
+def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+    field = height_field(inputs["scene"])
+    elevation, points = true_dem(field, args["lattice"], RigidTransform.from_matrix(args["T_bed_world"]))
+    lefts = [RigidTransform.from_matrix(m) for m in args["pairs"]]
+    seen = seen_by(field, Rig.from_dict(args["rig"]), lefts, points).reshape(elevation.shape).astype(np.uint8)
+    return Bundle({"elevation": elevation, "seen": seen}, {"lattice": dict(args["lattice"])})
+
+
+STAGE = Stage(
+    name="mockup.truth_dem",
+    version=1,
+    summary="exact elevations of the simulated bed on a lattice",
+    params=NoParams,
+    inputs=("scene",),
+    outputs=(
+        Array("elevation", ("row", "col"), "float32", "m", "exact elevation", nodata="nan", frame="world"),
+        Array("seen", ("row", "col"), "uint8", "1", "1 = both cameras of a listed pair see the cell", frame="world"),
+    ),
+    requires=("numpy", "numba"),
+    run=_run,
+)

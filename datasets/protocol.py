@@ -1,0 +1,100 @@
+"""What a stereo sequence is, whoever recorded or rendered it.
+
+A sequence holds no pixels: it says by which stage each image comes (:class:`Source`), so that reading and rendering
+are cached tasks like all others. Truth is optional and only for assessment; no estimate may read it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Protocol
+
+from stages.declare import Params
+from stages.errors import InputError
+from stages.geometry import Rig, RigidTransform
+
+if TYPE_CHECKING:
+    from stages.vehicle import Vehicle
+
+CAMERAS = ("left", "right")
+
+
+@dataclass(frozen=True)
+class Source:
+    """How a task gets its data: a stage module resolved by name, with what identifies this task.
+
+    ``args`` enter the cache key. ``hints`` (paths) do not: they are merged into the arguments when the stage runs
+    (``args | hints``) and must not change its result. ``inputs`` are sources of the stage's input ports, resolved
+    recursively (the renderer's scene).
+    """
+
+    module: str
+    params: Params
+    args: Mapping[str, Any] = field(default_factory=dict)
+    hints: Mapping[str, Any] = field(default_factory=dict)
+    inputs: Mapping[str, Source] = field(default_factory=dict)
+
+
+class TruthDem(Protocol):
+    """Exact elevations on a lattice given in the frame of the reconstruction (see :class:`Sequence`)."""
+
+    def __call__(
+        self, lattice: Mapping[str, Any], T_truth_world: RigidTransform, pairs: tuple[int, ...] = ()
+    ) -> Source:
+        """Source of ``elevation`` and ``seen`` (the cell is visible in both cameras of one of ``pairs``)."""
+
+
+@dataclass(frozen=True)
+class Sequence:
+    """A calibrated stereo sequence.
+
+    Attributes
+    ----------
+    name : short name, used for folders.
+    rig : the rig as it was *given* (it may be wrong by a calibration error).
+    frames : number of stereo pairs.
+    image : ``image(frame, camera)`` with camera ``"left"`` or ``"right"``: source of ``image`` and ``valid``.
+    frame_names : one name a frame (file stem).
+    times : seconds, one a frame.
+    truth : T_truth_left of each frame, in any world frame, metres.
+    truth_source : what the truth is, in words.
+    up : direction of "up" in each left camera frame (attitude).
+    pitch : downward pitch of the left camera's optical axis, radians, stated with the rig; roll 0.
+    initial_pose : T_world_left of frame 0 handed in from outside.
+    vehicle : the vehicle whose limits suit the scale of the sequence.
+    truth_dem : exact elevations on any lattice of any frame whose pose in the truth frame is given.
+    truth_disparity : ``truth_disparity(frame)``: source of the exact disparity of a pair.
+    evaluation_window : (x_min, y_min, x_max, y_max), metres, local frame of a basic pair: where a DEM is judged.
+    defaults : dotted configuration that suits the sequence.
+    notes : facts that the report repeats.
+    """
+
+    name: str
+    rig: Rig
+    frames: int
+    image: Callable[[int, str], Source]
+    frame_names: tuple[str, ...]
+    times: tuple[float, ...] | None = None
+    truth: tuple[RigidTransform, ...] | None = None
+    truth_source: str = ""
+    up: tuple[tuple[float, float, float], ...] | None = None
+    pitch: float | None = None
+    initial_pose: RigidTransform | None = None
+    vehicle: Vehicle | None = None
+    truth_dem: TruthDem | None = None
+    truth_disparity: Callable[[int], Source] | None = None
+    evaluation_window: tuple[float, float, float, float] | None = None
+    defaults: Mapping[str, Any] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.frames < 1:
+            raise InputError(f"sequence {self.name} has no frames", remedy="give a folder with at least one pair")
+        for what in ("frame_names", "times", "truth", "up"):
+            values = getattr(self, what)
+            if values is not None and len(values) != self.frames:
+                raise InputError(
+                    f"sequence {self.name}: {len(values)} {what.replace('_', ' ')} for {self.frames} frames",
+                    remedy=f"give one entry of {what.replace('_', ' ')} a frame",
+                )

@@ -1,0 +1,208 @@
+"""Arrays of one artifact: their digest, and a zarr 3 group on local disk written once and read lazily.
+
+The output digest is taken over the *decoded* arrays (type, shape, little-endian bytes, one NaN) and the metadata: a
+change of codec or of chunking changes no key, and an upstream change that does not change a result stops there.
+
+Chunks are lz4-compressed with byte shuffle and carry a crc32c that is checked on every read; ``dimension_names``,
+``units`` and ``long_name`` are set, so ``xarray.open_zarr`` reads an artifact's folder as it is. Members of a family
+(``level_*``) differ in size, so their dimensions are told apart by the member's suffix (``row_0``, ``row_1`` ...).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import google_crc32c
+import numpy as np
+
+from pipeline.key import canonical, digest
+from stages.declare import AnyArray, Array, Bundle, Stage
+from stages.errors import RilleError
+
+CHUNK = 1024
+"""Greatest chunk edge, cells: 4 MB of float32, so that a usual image is a few files to write and to sync."""
+
+
+class DamagedError(RilleError):
+    """Files of an artifact are missing or do not have the recorded size or checksum."""
+
+
+def array_digests(arrays: Mapping[str, AnyArray]) -> dict[str, str]:
+    """SHA-256 of each array: type, shape and little-endian bytes in C order, every NaN made the same."""
+    return {name: _array_digest(name, np.asarray(arrays[name])) for name in sorted(arrays)}
+
+
+def _array_digest(name: str, array: AnyArray) -> str:
+    if array.dtype.kind not in "biuf":
+        raise TypeError(f"array {name} is {array.dtype}: store integers, floats or booleans")
+    little = array.dtype.newbyteorder("<")
+    plain = np.ascontiguousarray(array, dtype=little)
+    if array.dtype.kind == "f" and np.isnan(plain).any():
+        plain = np.where(np.isnan(plain), little.type(np.nan), plain)
+    total = hashlib.sha256(f"{little.str} {array.shape}\0".encode())
+    total.update(plain.data)
+    return total.hexdigest()
+
+
+def output_digest(digests: Mapping[str, str], meta: Mapping[str, Any]) -> str:
+    """Digest of a result: the digests of its arrays, and its metadata.
+
+    Raises
+    ------
+    TypeError
+        ``meta`` is not plain JSON (NaN and infinities are not either: use None).
+    """
+    _refuse_non_finite(meta, "meta")
+    return digest({"arrays": dict(digests), "meta": dict(meta)})
+
+
+def _refuse_non_finite(value: Any, where: str) -> None:
+    if isinstance(value, dict):
+        for key, item in value.items():
+            _refuse_non_finite(item, f"{where}.{key}")
+    elif isinstance(value, list | tuple):
+        for i, item in enumerate(value):
+            _refuse_non_finite(item, f"{where}[{i}]")
+    elif isinstance(value, set | frozenset):
+        raise TypeError(f"{where} is a set: give a sorted list")
+    elif isinstance(value, float) and not np.isfinite(value):
+        raise TypeError(f"{where} is {value}: metadata is JSON, use None for what is undefined")
+    else:
+        canonical(value, where)
+
+
+def write(folder: Path, stage: Stage, bundle: Bundle) -> dict[str, Any]:
+    """Write the arrays of a bundle as a zarr group; returns their description by name (for the manifest)."""
+    import zarr
+    from zarr.codecs import BloscCodec, Crc32cCodec
+    from zarr.storage import LocalStore
+
+    group = zarr.create_group(
+        store=LocalStore(folder), zarr_format=3, attributes={"stage": stage.name, "meta": dict(bundle.meta)}
+    )
+    described = {}
+    for name in sorted(bundle.arrays):
+        array = np.asarray(bundle.arrays[name])
+        spec = next(a for a in stage.outputs if a.matches(name))
+        described[name] = about = _describe(name, array, spec)
+        written = group.create_array(
+            name,
+            shape=array.shape,
+            dtype=array.dtype.newbyteorder("<"),
+            chunks=tuple(min(max(n, 1), CHUNK) for n in array.shape),
+            compressors=(BloscCodec(cname="lz4", clevel=5, shuffle="shuffle"), Crc32cCodec()),
+            fill_value=np.nan if array.dtype.kind == "f" else 0,
+            dimension_names=about["dims"],
+            attributes={k: about[k] for k in ("units", "long_name", "nodata", "frame") if about[k]},
+            config={"write_empty_chunks": True},  # a missing chunk would read as fill value, and -0.0 as 0.0
+        )
+        written[...] = array
+    return described
+
+
+def _describe(name: str, array: AnyArray, spec: Array) -> dict[str, Any]:
+    suffix = f"_{name[len(spec.name) - 1 :]}" if spec.name.endswith("*") else ""
+    return {
+        "dtype": array.dtype.newbyteorder("<").str,
+        "shape": list(array.shape),
+        "dims": [dim + suffix for dim in spec.dims],
+        "units": spec.unit,
+        "long_name": spec.long_name,
+        "nodata": spec.nodata,
+        "frame": spec.frame,
+    }
+
+
+def seal(folder: Path) -> dict[str, list[Any]]:
+    """Flush every file and folder to the disk; returns ``{relative path: [size, crc32c]}``."""
+    files = {}
+    for at, _, names in os.walk(folder, topdown=False):
+        for name in names:
+            path = Path(at, name)
+            files[path.relative_to(folder).as_posix()] = [path.stat().st_size, crc32c(path)]
+            fsync(path)
+        fsync(Path(at))
+    return files
+
+
+def fsync(path: Path) -> None:
+    """Flush a file, or the entries of a folder, to the disk."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def crc32c(path: Path) -> str:
+    """Checksum of a file, 8 hexadecimal digits."""
+    return f"{google_crc32c.value(path.read_bytes()):08x}"
+
+
+def damage(folder: Path, files: Mapping[str, list[Any]], checksums: Callable[[str], bool]) -> str:
+    """What is wrong with the files of an artifact, in words; empty if nothing.
+
+    Sizes are always compared, contents where ``checksums(relative path)`` says so.
+    """
+    for name, (size, crc) in files.items():
+        path = folder / name
+        try:
+            found = path.stat().st_size
+            if found != size:
+                return f"{name} has {found} bytes instead of {size}"
+            if checksums(name) and crc32c(path) != crc:
+                return f"{name} has another checksum"
+        except (FileNotFoundError, NotADirectoryError):
+            return f"{name} is missing"
+    return ""
+
+
+class LazyArrays(Mapping[str, AnyArray]):
+    """Arrays of an artifact, each read at its first access; ``damaged(reason)`` is called before the error."""
+
+    def __init__(self, folder: Path, manifest: Mapping[str, Any], damaged: Callable[[str], None]) -> None:
+        self._folder = folder
+        self._manifest = manifest
+        self._damaged = damaged
+        self._loaded: dict[str, AnyArray] = {}
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._manifest["arrays"])
+
+    def __len__(self) -> int:
+        return len(self._manifest["arrays"])
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._manifest["arrays"]
+
+    def __getitem__(self, name: str) -> AnyArray:
+        if name not in self._loaded:
+            if name not in self:
+                raise KeyError(f"{self._manifest['stage']} has no array {name!r}, only {', '.join(self) or 'metadata'}")
+            self._loaded[name] = self._read(name)
+        return self._loaded[name]
+
+    def _read(self, name: str) -> AnyArray:
+        import zarr
+        from zarr.storage import LocalStore
+
+        files = {f: v for f, v in self._manifest["files"].items() if f.startswith(f"{name}/")}
+        wrong = damage(self._folder, files, lambda file: file.endswith("zarr.json"))
+        if not wrong:
+            try:
+                array = zarr.open_array(store=LocalStore(self._folder / name, read_only=True), mode="r")
+                return np.asarray(array[...])
+            except (ValueError, RuntimeError) as error:  # a chunk's own checksum
+                wrong = damage(self._folder, files, lambda _: True)
+                if not wrong:
+                    raise
+                wrong = f"{wrong} ({type(error).__name__} on reading)"
+        self._damaged(wrong)
+        raise DamagedError(
+            f"artifact {self._manifest['label']} ({self._manifest['stage']}) is damaged, {wrong}; it was set aside",
+            remedy="run again: it will be recomputed",
+        )

@@ -1,0 +1,259 @@
+"""The command line: ``rille reconstruct | match | datasets | cache``.
+
+Exit codes: 0 complete; 1 failed; 2 usage, configuration or input; 3 finished with holes under ``--keep-going``;
+130 interrupted. Results go to stdout, progress and complaints to stderr. Heavy imports happen inside the commands, so
+that ``--help`` answers at once.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import traceback
+from importlib.metadata import version
+from pathlib import Path
+from typing import Annotated, Literal
+
+from cyclopts import App, CycloptsError, Parameter
+
+COMPLETE, FAILED, USAGE, HOLES, INTERRUPTED = 0, 1, 2, 3, 130
+
+app = App(
+    name="rille",
+    version=version("rille"),
+    help="Stereo image sequences to terrain, trajectory, risk map and safe path, without rectification.",
+)
+datasets_app = App(name="datasets", help="Sequences that Rille knows: list them, or export one for other tools.")
+cache_app = App(name="cache", help="Look after the cache of artifacts.")
+app.command(datasets_app)
+app.command(cache_app)
+
+Assignments = Annotated[list[str] | None, Parameter(name=["--set", "-s"], negative="", consume_multiple=False)]
+CacheFolder = Annotated[Path | None, Parameter(name="--cache")]
+Progress = Literal["auto", "bar", "plain", "json", "quiet"]
+
+
+def cache_folder(given: Path | None) -> Path:
+    """Folder of the artifact cache: ``--cache``, else ``RILLE_CACHE``, else ``.rille/cache`` here."""
+    return given or Path(os.environ.get("RILLE_CACHE") or ".rille/cache")
+
+
+@app.command
+def reconstruct(
+    seq: str = "mockup",
+    *,
+    assignments: Assignments = None,
+    config: Path | None = None,
+    frames: str | None = None,
+    jobs: int | None = None,
+    executor: Literal["processes", "threads", "inline"] = "processes",
+    keep_going: Annotated[bool, Parameter(negative="")] = False,
+    force: Annotated[list[str] | None, Parameter(negative="", consume_multiple=False)] = None,
+    runs: Path = Path("runs"),
+    cache: CacheFolder = None,
+    progress: Progress = "auto",
+    quiet: Annotated[bool, Parameter(name=["--quiet", "-q"], negative="")] = False,
+    debug: Annotated[bool, Parameter(negative="")] = False,
+) -> int:
+    """Reconstruct a sequence; the same command again resumes, and recomputes only what changed.
+
+    Parameters
+    ----------
+    seq
+        A name from `rille datasets`, or a folder whose layout is recognised.
+    assignments
+        A parameter, section.key=value, for example locus.cell_size=0.002; may be repeated.
+    config
+        TOML file of parameters; every run writes one with all defaults filled.
+    frames
+        Frame range START:STOP[:STEP], as in Python; all by default.
+    jobs
+        Worker processes; the number of cores by default.
+    executor
+        Where tasks run.
+    keep_going
+        Finish what does not depend on a failed task; the exit status is then 3.
+    force
+        Recompute this stage although it is cached; may be repeated.
+    runs
+        Folder of results; each run makes RUNS/sequence/run-id.
+    cache
+        Folder of cached artifacts; RILLE_CACHE or .rille/cache by default.
+    progress
+        How progress is shown on stderr.
+    quiet
+        No progress; complaints only.
+    debug
+        Show tracebacks.
+    """
+    from pipeline import run
+
+    options = run.Options(
+        sequence=seq,
+        assignments=tuple(assignments or ()),
+        config=config,
+        frames=frames,
+        jobs=jobs,
+        executor=executor,
+        keep_going=keep_going,
+        force=frozenset(force or ()),
+        runs=runs,
+        cache=cache_folder(cache),
+        progress="quiet" if quiet else progress,
+    )
+    return run.reconstruct(options)
+
+
+@app.command
+def match(
+    left: Path,
+    right: Path,
+    *,
+    output: Annotated[Path, Parameter(name=["--output", "-o"])] = Path("disparity.tif"),
+    preset: str | None = None,
+    dense: Annotated[bool, Parameter(negative="")] = False,
+    assignments: Assignments = None,
+    debug: Annotated[bool, Parameter(negative="")] = False,
+) -> int:
+    """Match any two images, without calibration or rectification, to a two-band disparity TIFF.
+
+    Band 1 is column_disparity and band 2 row_disparity, float32 pixels, right minus left (negative columns on a
+    rectified pair), NaN where undefined.
+
+    Parameters
+    ----------
+    left
+        Reference image.
+    right
+        Search image.
+    output
+        TIFF to write.
+    preset
+        Parameter set of the matcher: default or paper.
+    dense
+        Fill undefined disparities by interpolation.
+    assignments
+        A parameter of the matcher, hfvm.key=value; may be repeated.
+    debug
+        Show tracebacks.
+    """
+    from pipeline import match as command
+
+    return command.match_files(left, right, output, preset=preset, dense=dense, assignments=tuple(assignments or ()))
+
+
+@datasets_app.default
+def list_datasets() -> int:
+    """List the built-in sequences and the folder layouts that are recognised."""
+    from datasets.registry import catalogue
+
+    for name, words in catalogue():
+        print(f"{name:16s} {words}")
+    return COMPLETE
+
+
+@datasets_app.command
+def export(
+    seq: str,
+    directory: Path,
+    *,
+    assignments: Assignments = None,
+    cache: CacheFolder = None,
+    debug: Annotated[bool, Parameter(negative="")] = False,
+) -> int:
+    """Write a built-in sequence as plain files (PNG, rig, poses, disparity, DEM, times), for use by other tools.
+
+    Parameters
+    ----------
+    seq
+        Name of a built-in sequence.
+    directory
+        Folder to make; it must not exist yet or be empty.
+    assignments
+        A parameter of the sequence, for example mockup.seed=3; may be repeated.
+    cache
+        Folder of cached artifacts; RILLE_CACHE or .rille/cache by default.
+    debug
+        Show tracebacks.
+    """
+    from pipeline import run
+
+    return run.export_dataset(seq, directory, tuple(assignments or ()), cache_folder(cache))
+
+
+@cache_app.command
+def verify(*, cache: CacheFolder = None, debug: Annotated[bool, Parameter(negative="")] = False) -> int:
+    """Read every artifact and compare its checksums; damaged ones are named and recomputed by the next run.
+
+    Parameters
+    ----------
+    cache
+        Folder of cached artifacts; RILLE_CACHE or .rille/cache by default.
+    debug
+        Show tracebacks.
+    """
+    from pipeline import run
+
+    return run.verify_cache(cache_folder(cache))
+
+
+@cache_app.command
+def gc(
+    *,
+    cache: CacheFolder = None,
+    runs: Path = Path("runs"),
+    dry_run: Annotated[bool, Parameter(negative="")] = False,
+    debug: Annotated[bool, Parameter(negative="")] = False,
+) -> int:
+    """Remove artifacts that no kept run refers to, and leftovers of interrupted runs.
+
+    Parameters
+    ----------
+    cache
+        Folder of cached artifacts; RILLE_CACHE or .rille/cache by default.
+    runs
+        Folder of the runs that are kept.
+    dry_run
+        Say what would go, and keep it.
+    debug
+        Show tracebacks.
+    """
+    from pipeline import run
+
+    return run.collect_garbage(cache_folder(cache), runs, dry_run=dry_run)
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Entry point of ``rille``."""
+    tokens = list(sys.argv[1:] if argv is None else argv)
+    debug = "--debug" in tokens
+    try:
+        code = app(tokens, exit_on_error=False, print_error=False, result_action="return_value")
+        code = code if isinstance(code, int) else COMPLETE
+    except KeyboardInterrupt:
+        print("rille: interrupted; the same command resumes from here", file=sys.stderr)
+        code = INTERRUPTED
+    except CycloptsError as error:
+        print(f"rille: {error}", file=sys.stderr)
+        code = USAGE
+    except Exception as error:
+        code = _complain(error, debug)
+    sys.stdout.flush()
+    sys.exit(code)
+
+
+def _complain(error: Exception, debug: bool) -> int:
+    """One line that says what to change; the traceback on request."""
+    from stages.errors import ConfigError, InputError, RilleError
+
+    if debug:
+        traceback.print_exception(error)
+    known = isinstance(error, RilleError)
+    hint = "" if known or debug else " (run again with --debug for the traceback)"
+    name = "" if known else f"{type(error).__name__}: "
+    print(f"rille: {name}{' '.join(str(error).split())}{hint}", file=sys.stderr)
+    return USAGE if isinstance(error, ConfigError | InputError) else FAILED
+
+
+if __name__ == "__main__":
+    main()

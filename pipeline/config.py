@@ -1,0 +1,201 @@
+"""Configuration: one section a stage, layered, strictly validated, and written back with every default filled.
+
+Layers, later ones win: defaults of the code, what suits the sequence (``Sequence.defaults``), ``--config FILE.toml``,
+``--set section.key=value``. The sections and their fields are the parameter models of the stages themselves.
+"""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import tomllib
+from collections.abc import Iterable, Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import tomli_w
+from pydantic import ValidationError, create_model
+
+from stages.declare import Params, Stage
+from stages.errors import ConfigError
+
+STAGE_MODULES: dict[str, str] = {
+    "pyramid": "stages.pyramid",
+    "motion": "stages.motion",
+    "select": "stages.select",
+    "hfvm": "stages.hfvm",
+    "rig": "stages.rig",
+    "level": "stages.level",
+    "locus": "stages.locus",
+    "track": "stages.track",
+    "resect": "stages.resect",
+    "trajectory": "stages.trajectory",
+    "merge": "stages.merge",
+    "risk": "stages.risk",
+    "path": "stages.path",
+    "truth": "stages.truth",
+    "accuracy": "stages.accuracy",
+    "dem_accuracy": "stages.dem_accuracy",
+    "path_check": "stages.path_check",
+}
+"""Every stage of the chain by name; a section of the configuration where the stage has parameters."""
+
+DATASET_SECTIONS = ("mockup",)
+"""Sections that belong to a kind of sequence; the sequence validates them."""
+
+
+def stage(name: str) -> Stage:
+    """Declaration of a stage by its name."""
+    found: Stage = importlib.import_module(STAGE_MODULES[name]).STAGE
+    return found
+
+
+@cache
+def model() -> type[Params]:
+    """Model of the whole configuration, made of the stages' own parameter models."""
+    from stages.vehicle import DEFAULT_VEHICLE, Vehicle
+
+    fields: dict[str, Any] = {
+        name: (stage(name).params, stage(name).params()) for name in STAGE_MODULES if stage(name).params.model_fields
+    }
+    fields["vehicle"] = (Vehicle, DEFAULT_VEHICLE)
+    return create_model("Config", __base__=Params, **fields)
+
+
+def parse_assignments(assignments: Iterable[str]) -> dict[str, Any]:
+    """``["locus.cell_size=0.002", ...]`` to a nested mapping; values are TOML, bare words are text.
+
+    Raises
+    ------
+    ConfigError
+        There is no ``=``, or no dot in the key.
+    """
+    nested: dict[str, Any] = {}
+    for text in assignments:
+        key, sep, value = text.partition("=")
+        key = key.strip()
+        if not sep or "." not in key:
+            raise ConfigError(
+                f"--set {text!r} is not section.key=value", remedy="write e.g. --set locus.cell_size=0.002"
+            )
+        merge(nested, expand({key: _toml_value(value.strip())}))
+    return nested
+
+
+def _toml_value(text: str) -> Any:
+    try:
+        return tomllib.loads(f"v = {text}")["v"]
+    except tomllib.TOMLDecodeError:
+        return text
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Configuration file to a nested mapping."""
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"cannot read configuration {path}: {error.strerror}", remedy="check --config") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path} is not TOML: {error}", remedy="correct the file at that place") from error
+
+
+def expand(dotted: Mapping[str, Any]) -> dict[str, Any]:
+    """``{"a.b": 1}`` to ``{"a": {"b": 1}}``."""
+    nested: dict[str, Any] = {}
+    for key, value in dotted.items():
+        *sections, last = key.split(".")
+        at = nested
+        for part in sections:
+            at = at.setdefault(part, {})
+        at[last] = value
+    return nested
+
+
+def merge(into: dict[str, Any], layer: Mapping[str, Any]) -> dict[str, Any]:
+    """Lay a nested mapping over another one, in place."""
+    for key, value in layer.items():
+        if isinstance(value, Mapping) and isinstance(into.get(key), dict):
+            merge(into[key], value)
+        else:
+            into[key] = dict(value) if isinstance(value, Mapping) else value
+    return into
+
+
+def split_dataset(layers: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Part the sections of sequences from those of stages: ``(dataset sections, stage sections)``."""
+    ours = {k: v for k, v in layers.items() if k in DATASET_SECTIONS}
+    return ours, {k: v for k, v in layers.items() if k not in DATASET_SECTIONS}
+
+
+def build(*layers: Mapping[str, Any]) -> Params:
+    """Validated configuration of nested layers, later ones winning.
+
+    Raises
+    ------
+    ConfigError
+        A key is unknown or a value not permitted; the message has the dotted key, the value and what is permitted.
+    """
+    nested: dict[str, Any] = {}
+    for layer in layers:
+        merge(nested, layer)
+    built: Params = validate(model(), nested, (), DATASET_SECTIONS)
+    return built
+
+
+def validate(kind: type[Params], values: Mapping[str, Any], prefix: tuple[str, ...], also: Iterable[str] = ()) -> Any:
+    """``kind(**values)`` with pydantic's complaints turned into one :class:`ConfigError` line."""
+    try:
+        return kind.model_validate(dict(values))
+    except ValidationError as error:
+        lines = [_complaint(kind, prefix, dict(e), also) for e in error.errors()]
+        raise ConfigError("; ".join(lines)) from error
+
+
+def _complaint(kind: type[Params], prefix: tuple[str, ...], error: dict[str, Any], also: Iterable[str]) -> str:
+    loc = [str(part) for part in error["loc"]]
+    key = ".".join((*prefix, *loc))
+    if error["type"] == "extra_forbidden":
+        near = difflib.get_close_matches(key, [".".join((*prefix, k)) for k in known_keys(kind)] + list(also), n=1)
+        hint = f"did you mean {near[0]!r}?" if near else f"known here: {', '.join(_siblings(kind, loc))}"
+        return f"unknown key {key!r} (value {error['input']!r}): {hint}"
+    context = error.get("ctx", {})
+    reason = context["error"] if "error" in context else error["msg"]
+    where = key or "configuration"
+    return f"{where} = {error['input']!r} is not permitted: {str(reason)[0].lower() + str(reason)[1:]}"
+
+
+def _siblings(kind: type[Params], loc: list[str]) -> list[str]:
+    at: Any = kind
+    for part in loc[:-1]:
+        field = at.model_fields.get(part)
+        if field is None or not hasattr(field.annotation, "model_fields"):
+            break
+        at = field.annotation
+    return sorted(at.model_fields)
+
+
+def known_keys(kind: type[Params], prefix: str = "") -> list[str]:
+    """All dotted keys of a model, sections included."""
+    keys = []
+    for name, field in kind.model_fields.items():
+        keys.append(prefix + name)
+        if hasattr(field.annotation, "model_fields"):
+            keys += known_keys(field.annotation, f"{prefix}{name}.")  # type: ignore[arg-type]
+    return keys
+
+
+def to_toml(config: Params, extra: Mapping[str, Params] | None = None) -> str:
+    """Configuration as TOML with every default filled and each key explained; it can be given back by ``--config``."""
+    sections = {name: getattr(config, name) for name in type(config).model_fields} | dict(extra or {})
+    return "\n".join(_section(name, values) for name, values in sections.items())
+
+
+def _section(name: str, values: Params) -> str:
+    lines = [f"[{name}]"]
+    for key, value in values.model_dump(mode="json").items():
+        description = type(values).model_fields[key].description
+        if description:
+            lines.append("# " + " ".join(description.split()))
+        lines.append(f"# {key} is not set" if value is None else tomli_w.dumps({key: value}).strip())
+    return "\n".join(lines) + "\n"

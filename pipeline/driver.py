@@ -1,0 +1,328 @@
+"""Runs a graph: looks everything up on the client, submits only what is missing, expands as results arrive.
+
+>>> result = run(graph, Store("cache"), executor="processes", jobs=2, progress=progress.make("auto"))
+>>> result.check()                       # raises the first failure, with its stage and label
+>>> result.counts["locus"].cached
+8
+
+A run that finds everything starts no worker. With ``dry=True`` nothing is computed: ``status`` of the handles is
+``cached`` or ``planned``, and ``reason`` says why (``rille plan``).
+
+What a stage raises is not tried again. What depends on it is skipped; with ``keep_going`` everything else finishes,
+without it nothing new is begun. A task whose worker process dies is tried three times. In every case the ledger
+has one line for each node that is missing, with the reason.
+"""
+
+from __future__ import annotations
+
+import heapq
+import time
+from collections import defaultdict
+from collections.abc import Collection
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from pipeline import explain
+from pipeline.dag import Expansion, Graph, Handle
+from pipeline.environment import cores
+from pipeline.executor import Executor, Failed, make
+from pipeline.key import digest
+from pipeline.ledger import Ledger
+from pipeline.progress import Progress, Quiet, recall_seconds, remember_seconds
+from pipeline.store import Store
+from pipeline.task import Outcome, recipe
+from stages.errors import RilleError
+
+
+class TaskError(RilleError):
+    """A task failed; its own error is the cause (``__cause__``)."""
+
+
+@dataclass
+class Counts:
+    """What became of the nodes of one stage; ``seconds`` is the sum over those computed now."""
+
+    computed: int = 0
+    cached: int = 0
+    failed: int = 0
+    skipped: int = 0
+    planned: int = 0
+    seconds: float = 0.0
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A task that failed: its label and stage, the original exception and the text of its traceback."""
+
+    label: str
+    stage: str
+    error: BaseException
+    traceback: str
+
+
+@dataclass
+class Result:
+    """What became of a run. ``keys`` are the artifacts it used (roots for clearing the cache)."""
+
+    counts: dict[str, Counts] = field(default_factory=dict)
+    failures: list[Failure] = field(default_factory=list)
+    keys: set[str] = field(default_factory=set)
+    seconds: float = 0.0
+    executor_started: bool = False
+
+    @property
+    def ok(self) -> bool:
+        """Whether nothing failed and nothing was left out."""
+        return not self.failures and not any(c.skipped for c in self.counts.values())
+
+    def total(self) -> Counts:
+        """Counts over all stages."""
+        fields = ("computed", "cached", "failed", "skipped", "planned", "seconds")
+        return Counts(**{f: sum(getattr(c, f) for c in self.counts.values()) for f in fields})
+
+    def check(self) -> None:
+        """Raise the first failure as one line with its label: the original error of Rille, or what wraps another."""
+        if self.failures:
+            first = self.failures[0]
+            error = first.error
+            if isinstance(error, RilleError):
+                raise type(error)(f"{first.label}: {error.message}", remedy=error.remedy) from error
+            raise TaskError(f"{first.label} (stage {first.stage}): {type(error).__name__}: {error}") from error
+
+
+def run(
+    graph: Graph,
+    store: Store,
+    *,
+    executor: str = "processes",
+    jobs: int | None = None,
+    keep_going: bool = False,
+    force: Collection[str] = (),
+    dry: bool = False,
+    ledger: Path | None = None,
+    progress: Progress | None = None,
+) -> Result:
+    """Bring every node of a graph to an artifact.
+
+    Parameters
+    ----------
+    graph : its handles are filled in; expansions may add nodes during the run.
+    store : where artifacts are.
+    executor : ``inline``, ``threads``, ``processes`` or the address of a running dask scheduler (``tcp://...``).
+    jobs : worker processes; None is one a core.
+    keep_going : finish what does not depend on a failure.
+    force : names of stages to compute again though they are there; the digests must agree.
+    dry : look up only.
+    ledger : file of JSON lines, one a node, written as they resolve.
+    progress : told of every step.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        Interrupted; running tasks are killed, what is committed stays.
+    """
+    return _Run(graph, store, executor, jobs, keep_going, force, dry, ledger, progress or Quiet()).go()
+
+
+class _Run:
+    def __init__(
+        self,
+        graph: Graph,
+        store: Store,
+        executor: str,
+        jobs: int | None,
+        keep_going: bool,
+        force: Collection[str],
+        dry: bool,
+        ledger: Path | None,
+        progress: Progress,
+    ) -> None:
+        self.graph, self.store = graph, store
+        self.executor_kind, self.jobs = executor, jobs
+        self.keep_going, self.force, self.dry = keep_going, frozenset(force), dry
+        self.ledger, self.progress = Ledger(ledger), progress
+        self.executor: Executor | None = None
+        self.result = Result()
+        self.stopped = ""
+        self.admitted = self.expanded = 0
+        self.waits: dict[int, int] = {}
+        """How many distinct inputs of a node are not resolved yet."""
+        self.dependants: dict[int, list[Handle]] = defaultdict(list)
+        self.ready: list[int] = []
+        self.missing: list[int] = []
+        """Looked up, not found, not submitted: a heap by order of creation, as ``ready``."""
+        self.flying: dict[str, list[Handle]] = {}
+        """Submitted, by key; further nodes of the same key wait for the first."""
+        self.expansions: list[tuple[list[Handle], Expansion]] = []
+
+    def go(self) -> Result:
+        begin = time.perf_counter()
+        try:
+            self._loop()
+            self._leave_out()
+        except BaseException:
+            self._close(kill=True)
+            raise
+        else:
+            self._close(kill=False)
+            remember_seconds(self.store, self.result.counts)
+        finally:
+            self.result.seconds = time.perf_counter() - begin
+            self.progress.close(self.result)
+            self.ledger.close()
+        return self.result
+
+    def _close(self, kill: bool) -> None:
+        if self.executor is not None:
+            self.executor.close(kill=kill)
+
+    def _loop(self) -> None:
+        self.progress.open(self.graph, recall_seconds(self.store), self.jobs or cores())
+        while True:
+            self._settle()
+            self._submit()
+            if not self.flying:
+                return
+            assert self.executor is not None
+            for key, outcome in self.executor.wait():
+                self._land(key, outcome)
+
+    # -- what needs no worker -----------------------------------------------------------------------------------
+
+    def _settle(self) -> None:
+        """Admit, look up and expand until only what must be computed is left."""
+        while not self.stopped:
+            self._admit()
+            if self.ready:
+                self._look_up(self.graph.nodes[heapq.heappop(self.ready)])
+            elif not self._expand():
+                return
+
+    def _admit(self) -> None:
+        for handle in self.graph.nodes[self.admitted :]:
+            self.admitted += 1
+            upstream = {h.index: h for h in handle.upstream()}
+            broken = next((h for h in upstream.values() if h.status in ("failed", "skipped", "planned")), None)
+            self.waits[handle.index] = 0
+            for up in upstream.values():
+                if up.status in ("pending", "running"):
+                    self.waits[handle.index] += 1
+                    self.dependants[up.index].append(handle)
+            if broken is not None:
+                self._break(handle, broken)
+            elif not self.waits[handle.index]:
+                heapq.heappush(self.ready, handle.index)
+        self.expansions += self.graph.expansions[self.expanded :]
+        self.expanded = len(self.graph.expansions)
+
+    def _look_up(self, handle: Handle) -> None:
+        made = recipe(handle.spec, handle.refs())
+        handle.key = key = digest(made, handle.label)
+        forced = handle.stage in self.force
+        ref = None if forced else self.store.lookup(handle.stage, key)
+        if ref is not None:
+            handle.ref = ref
+            self._resolve(handle, "cached")
+            return
+        handle.reason = "forced" if forced else explain.reason(self.store, handle.stage, handle.label, key, made)
+        if self.dry:
+            self._resolve(handle, "planned")
+        elif key in self.flying:
+            self.flying[key].append(handle)
+        else:
+            self.flying[key] = [handle]
+            heapq.heappush(self.missing, handle.index)
+
+    def _expand(self) -> bool:
+        """Call the first expansion whose handles are done; whether there was one."""
+        for i, (handles, fn) in enumerate(self.expansions):
+            if all(h.done for h in handles):
+                del self.expansions[i]
+                try:
+                    fn(*(h.ref for h in handles))
+                except Exception as error:
+                    self._failed(Failure(f"plan after {_labels(handles)}", "", error, Failed.of(error).traceback))
+                return True
+        return False
+
+    # -- what does ----------------------------------------------------------------------------------------------
+
+    def _submit(self) -> None:
+        """Keep every worker busy, and no more: what is not begun can still be left out."""
+        if self.missing and not self.stopped and self.executor is None:
+            self.executor = make(self.executor_kind, self.jobs, self.store.root)
+            self.result.executor_started = True
+        while self.missing and not self.stopped and self.executor is not None and self.executor.idle():
+            handle = self.graph.nodes[heapq.heappop(self.missing)]
+            handle.status = "running"
+            self.progress.running(handle)
+            self.executor.submit(handle.key, self.store.root, handle.spec, handle.refs(), handle.stage in self.force)
+        if self.stopped:
+            for index in self.missing:
+                del self.flying[self.graph.nodes[index].key]
+            self.missing.clear()
+
+    def _land(self, key: str, outcome: Outcome | Failed) -> None:
+        first, *others = self.flying.pop(key)
+        if isinstance(outcome, Failed):
+            for handle in (first, *others):
+                handle.error = outcome.error
+                handle.reason = f"{type(outcome.error).__name__}: {outcome.error}"
+                self._resolve(handle, "failed")
+            self._failed(Failure(first.label, first.stage, outcome.error, outcome.traceback))
+            return
+        first.seconds, first.peak_rss = outcome.seconds, outcome.peak_rss
+        for handle in (first, *others):
+            handle.ref = outcome.ref
+            self._resolve(handle, "computed" if handle is first and not outcome.cached else "cached")
+
+    def _failed(self, failure: Failure) -> None:
+        self.result.failures.append(failure)
+        self.progress.failed(failure.label, failure.error)
+        if not self.keep_going:
+            self.stopped = f"stopped after {failure.label} failed"
+
+    # -- what became of it --------------------------------------------------------------------------------------
+
+    def _resolve(self, handle: Handle, status: str) -> None:
+        handle.status = status
+        counts = self.result.counts.setdefault(handle.stage, Counts())
+        setattr(counts, status, getattr(counts, status) + 1)
+        counts.seconds += handle.seconds
+        if handle.ref is not None:
+            self.result.keys.add(handle.key)
+        self.ledger.write(handle)
+        self.progress.resolved(handle)
+        for dependant in self.dependants.pop(handle.index, []):
+            self.waits[dependant.index] -= 1
+            if not handle.done:
+                self._break(dependant, handle)
+            elif not self.waits[dependant.index] and dependant.status == "pending":
+                heapq.heappush(self.ready, dependant.index)
+
+    def _break(self, handle: Handle, by: Handle) -> None:
+        """An input of ``handle`` will not come, or in a plan is still to come."""
+        if handle.status != "pending":
+            return
+        planned = by.status == "planned"
+        handle.reason = f"input {by.label} is to be computed" if planned else f"{by.label} {_FATE[by.status]}"
+        self._resolve(handle, "planned" if planned else "skipped")
+
+    def _leave_out(self) -> None:
+        """Account for everything that was not even begun."""
+        self._admit()
+        for handle in self.graph.nodes:
+            if handle.status == "pending":
+                handle.reason = self.stopped
+                self._resolve(handle, "skipped")
+        for handles, _ in self.expansions:
+            missing = [h for h in handles if not h.done]
+            self.ledger.note(f"plan after {_labels(handles)}", "planned" if self.dry else "skipped", _labels(missing))
+
+
+_FATE = {"failed": "failed", "skipped": "was skipped"}
+
+
+def _labels(handles: list[Handle]) -> str:
+    names = [h.label for h in handles[:3]]
+    return ", ".join(names) + (f" and {len(handles) - 3} more" if len(handles) > 3 else "")

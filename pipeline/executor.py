@@ -1,0 +1,295 @@
+"""Where tasks run: in this process, on its threads, on worker processes, or on a running dask cluster.
+
+:func:`make` is the one factory. All executors are the same three verbs: ``submit``, ``wait``, ``close``. Worker
+processes are spawned (never forked) with one thread each, for isolation: a crash takes one task with it, and a task
+that has taken three workers along is given up (:class:`WorkerDiedError`). A cluster given by address must see the
+store's folder; tasks refuse to run where source code or packages are not those of the client.
+
+Programs call :func:`pipeline.environment.prepare_environment` first thing, so that this process and the workers run
+alike.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import pickle
+import queue
+import traceback
+from concurrent.futures import Future
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from threading import Thread
+from typing import Any, Protocol
+
+from pipeline.environment import cores, prepare_environment, worker_environment
+from pipeline.task import Outcome, Refs, Spec, ensure
+from stages.errors import ConfigError, RilleError
+
+__all__ = ["Executor", "Failed", "WorkerDiedError", "make", "prepare_environment"]
+
+DEATHS = 3
+"""Worker processes that one task may take along."""
+
+WATCH = 0.5
+"""Seconds between looks at the memory of the workers."""
+
+GRACE = 2.0
+"""Seconds that workers get to leave at the end of a run before they are killed."""
+
+
+class WorkerDiedError(RilleError):
+    """A task took several worker processes along: out of memory, or a crash in native code."""
+
+
+@dataclass(frozen=True)
+class Failed:
+    """An exception that travels as a value, with the text of its traceback."""
+
+    error: BaseException
+    traceback: str
+
+    @staticmethod
+    def of(error: BaseException) -> Failed:
+        """Wrap an exception; one that cannot be pickled is replaced by its words."""
+        text = "".join(traceback.format_exception(error))
+        try:
+            pickle.loads(pickle.dumps(error))
+        except Exception:
+            error = RuntimeError(f"{type(error).__name__}: {error}")
+        return Failed(error, text)
+
+
+Landed = list[tuple[str, Outcome | Failed]]
+
+
+class Executor(Protocol):
+    """Runs :func:`~pipeline.task.ensure`; ``key`` names the task."""
+
+    def idle(self) -> bool:
+        """Whether one more task would start at once."""
+
+    def submit(self, key: str, root: Path, spec: Spec, refs: Refs, force: bool) -> None:
+        """Start a task."""
+
+    def wait(self) -> Landed:
+        """Block until at least one task has ended."""
+
+    def close(self, kill: bool = False) -> None:
+        """Leave nothing behind; ``kill`` does not wait for what is running."""
+
+
+def make(kind: str, jobs: int | None, cache: Path) -> Executor:
+    """``inline``, ``threads``, ``processes`` or a scheduler's address; ``jobs`` None is one a core.
+
+    Raises
+    ------
+    ConfigError
+        There is no such executor, or the cluster does not answer.
+    """
+    if jobs is not None and jobs < 1:
+        raise ConfigError(f"{jobs} jobs are not permitted", remedy="give 1 or more")
+    jobs = jobs or cores()
+    if kind == "inline":
+        return Inline()
+    if kind == "threads":
+        return Threads(jobs)
+    if kind == "processes":
+        return Processes(jobs, cache)
+    if "://" in kind:
+        return Cluster(kind)
+    raise ConfigError(f"executor {kind!r} is unknown", remedy="inline, threads, processes or tcp://host:port")
+
+
+def _attempt(key: str, root: Path, spec: Spec, refs: Refs, force: bool) -> Outcome | Failed:
+    try:
+        return ensure(root, spec, refs, key=key, force=force)
+    except Exception as error:
+        return Failed.of(error)
+
+
+class Inline:
+    """One task after the other in this process: for debugging, and where one core is all there is."""
+
+    def __init__(self) -> None:
+        self._task: tuple[Any, ...] | None = None
+
+    def idle(self) -> bool:
+        """Whether nothing waits to be run."""
+        return self._task is None
+
+    def submit(self, key: str, root: Path, spec: Spec, refs: Refs, force: bool) -> None:
+        """Remember the task; :meth:`wait` runs it."""
+        self._task = (key, root, spec, refs, force)
+
+    def wait(self) -> Landed:
+        """Run the task."""
+        assert self._task is not None
+        task, self._task = self._task, None
+        return [(task[0], _attempt(*task))]
+
+    def close(self, kill: bool = False) -> None:
+        """Nothing to leave."""
+
+
+class _Futures:
+    """Executors whose futures call back when they are done."""
+
+    def __init__(self, slots: int) -> None:
+        self._slots = slots
+        self._flying: dict[str, Any] = {}
+        self._done: queue.SimpleQueue[str] = queue.SimpleQueue()
+
+    def _start(self, key: str, *task: Any) -> Any:
+        raise NotImplementedError
+
+    def idle(self) -> bool:
+        """Whether a worker has nothing to do."""
+        return len(self._flying) < self._slots
+
+    def submit(self, key: str, root: Path, spec: Spec, refs: Refs, force: bool) -> None:
+        """Start the task."""
+        self._flying[key] = future = self._start(key, root, spec, refs, force)
+        future.add_done_callback(lambda _: self._done.put(key))
+
+    def wait(self) -> Landed:
+        """Block until a task has ended; all that have ended meanwhile are given."""
+        keys: list[str] = []
+        while not keys:
+            with suppress(queue.Empty):
+                keys.append(self._done.get(timeout=WATCH))
+            self._watch()
+        with suppress(queue.Empty):
+            while True:
+                keys.append(self._done.get_nowait())
+        return [(key, self._result(self._flying.pop(key))) for key in keys]
+
+    def _watch(self) -> None:
+        """Called now and then while tasks run."""
+
+    def _result(self, future: Any) -> Outcome | Failed:
+        try:
+            landed: Outcome | Failed = future.result()
+        except Exception as error:
+            return Failed.of(error)
+        return landed
+
+
+class Threads(_Futures):
+    """Threads of this process; kernels release the lock. What runs at an interruption ends with the process."""
+
+    def _start(self, key: str, *task: Any) -> Any:
+        future: Future[Outcome | Failed] = Future()
+        Thread(target=lambda: future.set_result(_attempt(key, *task)), daemon=True).start()
+        return future
+
+    def close(self, kill: bool = False) -> None:
+        """Nothing to leave."""
+
+
+class Cluster(_Futures):
+    """A dask scheduler that is running already."""
+
+    def __init__(self, address: str) -> None:
+        _quiet()
+        from distributed import Client
+
+        try:
+            self._client = Client(address, set_as_default=False, timeout=10)
+        except (OSError, TimeoutError, ValueError) as error:
+            raise ConfigError(f"no dask scheduler answers at {address}", remedy="check the address") from error
+        super().__init__(max(1, sum(self._client.nthreads().values())))
+        self._submitted = 0
+
+    def _start(self, key: str, *task: Any) -> Any:
+        self._submitted += 1
+        name = f"{task[1].label}-{key[:12]}-{os.getpid()}-{self._submitted}"
+        return self._client.submit(_attempt, key, *task, key=name, pure=False, priority=-self._submitted)
+
+    def _result(self, future: Any) -> Outcome | Failed:
+        from distributed import KilledWorker
+
+        if future.status == "error" and isinstance(error := future.exception(), KilledWorker):
+            return Failed(self._died(str(error.task)), "")
+        return super()._result(future)
+
+    def _died(self, task: str) -> WorkerDiedError:
+        return WorkerDiedError(
+            f"{DEATHS} worker processes died while they ran it{self._last_seen(task)}",
+            remedy="give it more memory with fewer --jobs, or run it with --executor inline to see the crash",
+        )
+
+    def _last_seen(self, task: str) -> str:
+        return ""
+
+    def close(self, kill: bool = False) -> None:
+        """Leave the cluster as it is."""
+        self._client.close(timeout=GRACE)
+
+
+class Processes(Cluster):
+    """Worker processes of our own, one thread each."""
+
+    def __init__(self, jobs: int, cache: Path) -> None:
+        _quiet()
+        import dask
+        from distributed import LocalCluster
+
+        self._memory: dict[str, int] = {}
+        settings = {
+            "distributed.nanny.pre-spawn-environ": worker_environment(cache)
+            | {"DASK_DISTRIBUTED__LOGGING__DISTRIBUTED": "critical"},
+            "distributed.scheduler.allowed-failures": DEATHS - 1,
+            "distributed.scheduler.work-stealing": False,
+            "distributed.worker.multiprocessing-method": "spawn",
+            "distributed.worker.profile.enabled": False,
+            "distributed.admin.system-monitor.gil.enabled": False,
+        }
+        with dask.config.set(settings):
+            self._cluster = LocalCluster(
+                n_workers=jobs,
+                threads_per_worker=1,
+                processes=True,
+                dashboard_address=None,
+                silence_logs=logging.CRITICAL,
+            )
+        super().__init__(self._cluster.scheduler_address)
+        self._slots = jobs  # all of them, though some may still be starting
+
+    def _watch(self) -> None:
+        with suppress(RuntimeError):  # the scheduler's own thread changes what is read here
+            for worker in self._cluster.scheduler.workers.values():
+                memory = int(worker.metrics.get("memory", 0))
+                self._memory |= {task.key: max(memory, self._memory.get(task.key, 0)) for task in worker.processing}
+
+    def _last_seen(self, task: str) -> str:
+        return f", last seen with {self._memory[task] / 1e6:.0f} MB" if self._memory.get(task) else ""
+
+    def close(self, kill: bool = False) -> None:
+        """End the workers, at once if ``kill``; none is left behind."""
+        nannies = list(self._cluster.workers.values())
+        processes = [n.process.process for n in nannies if n.process and n.process.process]
+        if kill:
+            _kill(nannies, processes)
+        for leave in (self._client.close, self._cluster.close):
+            with suppress(Exception):
+                leave(timeout=GRACE)
+        _kill(nannies, processes)
+
+
+def _kill(nannies: list[Any], processes: list[Any]) -> None:
+    for nanny in nannies:
+        nanny.auto_restart = False
+    for process in processes:
+        with suppress(Exception):
+            process._process.kill()
+
+
+def _quiet() -> None:
+    """Silence distributed's log: what matters comes back as an exception, the rest is noise at shutdown."""
+    import dask
+
+    dask.config.set({"distributed.logging": {"distributed": "critical"}})
+    for name in ("distributed", "distributed.nanny", "distributed.worker", "distributed.scheduler", "tornado"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)

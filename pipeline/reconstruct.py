@@ -1,0 +1,272 @@
+"""The dataflow, top to bottom: what is computed from what. Draw it from this file.
+
+::
+
+    image -> pyramid ----> motion (N, N+1) --------------> track (segment) --+
+                     \\                                                        +-> resect (segment) -> trajectory
+                      +--> hfvm (basic pair) -> level ----------------------- +                          |
+                      |         |                 |                          /                           |
+      rig ------------+---------+--> locus (local frame) -------------------+--> risk, path (local)      |
+                                |                                                                        |
+                                +--> locus (world lattice) <---------------------------------------------+
+                                         |
+                                         +-> merge (world tile) -> risk, path (mission)
+    leaves: accuracy (trajectory), dem_accuracy (local and merged DEM), path_check
+
+A segment needs landmarks only relative to its own basic pair, so all segments run at once; absolute poses are one
+cheap scan (``trajectory``), and Locus then runs a second time, straight on the shared world lattice: nothing is
+resampled. What depends on data (which pairs are basic, how far the world reaches) is expanded as results arrive.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from datasets.protocol import Sequence, Source
+from pipeline.config import STAGE_MODULES
+from pipeline.dag import Graph, Handle
+from pipeline.task import Ref
+from stages.declare import NoParams, Params
+from stages.geometry import RigidTransform
+from stages.lattice import Lattice, union
+
+TILE_CELLS = 512
+"""Side of a world tile, cells: 512 x 512 float32 is 1 MiB an array, small enough to recompute alone."""
+
+
+@dataclass
+class Products:
+    """Handles of what a run delivers; the report and the exporters read them once the graph has run."""
+
+    images: dict[int, Handle] = field(default_factory=dict)
+    disparity: dict[int, Handle] = field(default_factory=dict)
+    level: dict[int, Handle] = field(default_factory=dict)
+    local_dem: dict[int, Handle] = field(default_factory=dict)
+    local_risk: dict[int, Handle] = field(default_factory=dict)
+    local_path: dict[int, Handle] = field(default_factory=dict)
+    tracks: list[Handle] = field(default_factory=list)
+    resections: list[Handle] = field(default_factory=list)
+    world_dem: dict[int, Handle] = field(default_factory=dict)
+    tiles: list[Handle] = field(default_factory=list)
+    trajectory: Handle | None = None
+    risk: Handle | None = None
+    path: Handle | None = None
+    accuracy: Handle | None = None
+    local_dem_accuracy: dict[int, Handle] = field(default_factory=dict)
+    dem_accuracy: Handle | None = None
+    truth_risk: Handle | None = None
+    path_check: Handle | None = None
+
+
+class Reconstruction:
+    """Builds the graph of one sequence; ``frames`` are the chosen frame numbers in order."""
+
+    def __init__(self, graph: Graph, sequence: Sequence, config: Any, frames: tuple[int, ...]) -> None:
+        self.graph, self.sequence, self.config, self.frames = graph, sequence, config, frames
+        self.products = Products()
+        self._sources: dict[str, Handle] = {}
+
+    def build(self) -> Products:
+        """Lay out everything that is known beforehand; the rest follows by expansion."""
+        self.rig = self._node("rig", "rig", {"rig": self.sequence.rig.to_dict()})
+        self.left = {f: self._pyramid(f, "left") for f in self.frames}
+        self.motion = {
+            a: self._node("motion", f"motion/{a}-{b}", {"frames": [a, b]}, a=self.left[a], b=self.left[b])
+            for a, b in zip(self.frames, self.frames[1:], strict=False)
+        }
+        select = self._node("select", "select", {"frames": len(self.frames)})
+        self.graph.expand([select], self._after_select)
+        return self.products
+
+    def _after_select(self, select: Ref) -> None:
+        basic = [self.frames[i] for i in select.meta["basic"]]
+        segments = [[self.frames[i] for i in part] for part in select.meta["segments"]]
+        for pair in basic:
+            self._basic_pair(pair)
+        for segment in segments:
+            self._segment(segment)
+        p = self.products
+        p.trajectory = self._node(
+            "trajectory",
+            "trajectory",
+            {"frames": list(self.frames)},
+            segments=p.resections,
+            levels=[p.level[s[0]] for s in segments],
+        )
+        self._trajectory_accuracy()
+        for pair in basic:
+            p.world_dem[pair] = self._node(
+                "locus",
+                f"locus/world/{pair}",
+                {"pair": pair, "frame": "world", "row": self.frames.index(pair)},
+                disparity=p.disparity[pair],
+                rig=self.rig,
+                left=self.left[pair],
+                level=p.level[pair],
+                trajectory=p.trajectory,
+                local=p.local_dem[pair],
+            )
+        self.graph.expand([*p.world_dem.values(), p.trajectory], self._after_world)
+
+    def _basic_pair(self, pair: int) -> None:
+        """Stereo pair to local elevation model, risk map and path (stop and think)."""
+        p = self.products
+        right = self._pyramid(pair, "right")
+        p.disparity[pair] = self._node("hfvm", f"hfvm/{pair}", {"pair": pair}, left=self.left[pair], right=right)
+        p.level[pair] = self._node(
+            "level", f"level/{pair}", self._vertical(pair), disparity=p.disparity[pair], rig=self.rig
+        )
+        p.local_dem[pair] = self._node(
+            "locus",
+            f"locus/local/{pair}",
+            {"pair": pair, "frame": "local"},
+            disparity=p.disparity[pair],
+            rig=self.rig,
+            left=self.left[pair],
+            level=p.level[pair],
+        )
+        p.local_risk[pair] = self._risk(f"risk/local/{pair}", [p.local_dem[pair]])
+        p.local_path[pair] = self._node("path", f"path/local/{pair}", {"use": "local"}, risk=p.local_risk[pair])
+        if self.sequence.truth_dem is not None and self.sequence.truth is not None:
+            self.graph.expand([p.level[pair], p.local_dem[pair]], lambda *refs, k=pair: self._local_accuracy(k, *refs))
+
+    def _segment(self, segment: list[int]) -> None:
+        """Track and resect the left images between two basic pairs (path execution)."""
+        p, key = self.products, segment[0]
+        track = self._node(
+            "track",
+            f"track/{key}",
+            {"frames": segment},
+            frames=[self.left[f] for f in segment],
+            motions=[self.motion[f] for f in segment[:-1]],
+        )
+        p.tracks.append(track)
+        p.resections.append(
+            self._node(
+                "resect",
+                f"resect/{key}",
+                {"frames": segment},
+                track=track,
+                dem=p.local_dem[key],
+                disparity=p.disparity[key],
+                level=p.level[key],
+                rig=self.rig,
+            )
+        )
+
+    def _after_world(self, *refs: Ref) -> None:
+        """The extent is known: merge in world tiles, then hazards and the path over all of it."""
+        p = self.products
+        *dems, trajectory = refs
+        pairs = list(p.world_dem)
+        lattices = [Lattice.from_dict(ref.meta["lattice"]) for ref in dems]
+        whole = union(lattices)
+        for tile in whole.tiles(TILE_CELLS):
+            touching = [
+                pair for pair, lattice in zip(pairs, lattices, strict=True) if lattice.intersection(tile) is not None
+            ]
+            if touching:
+                p.tiles.append(
+                    self._node(
+                        "merge",
+                        f"merge/{tile.i0}_{tile.j0}",
+                        {"lattice": tile.to_dict()},
+                        dems=[p.world_dem[pair] for pair in touching],
+                    )
+                )
+        p.risk = self._risk("risk/world", p.tiles)
+        heading = _heading(trajectory.meta)
+        p.path = self._node("path", "path/world", {"use": "world", "heading": heading}, risk=p.risk)
+        if self.sequence.truth_dem is not None and self.sequence.truth is not None:
+            self.graph.expand([p.level[pairs[0]]], lambda level: self._world_accuracy(whole, pairs, level))
+
+    # -- assessment: the only readers of truth ------------------------------------------------------------------
+
+    def _trajectory_accuracy(self) -> None:
+        if self.sequence.truth is None or self.products.trajectory is None:
+            return
+        truth = self._node(
+            "truth",
+            "truth",
+            {
+                "poses": [self.sequence.truth[f].to_list() for f in self.frames],
+                "source": self.sequence.truth_source,
+            },
+        )
+        self.products.accuracy = self._node(
+            "accuracy", "accuracy", {}, trajectory=self.products.trajectory, truth=truth
+        )
+
+    def _local_accuracy(self, pair: int, level: Ref, dem: Ref) -> None:
+        truth = self._truth_dem(Lattice.from_dict(dem.meta["lattice"]), pair, level, (pair,))
+        args: dict[str, Any] = {"pair": pair}
+        if self.sequence.evaluation_window is not None:
+            args["window"] = list(self.sequence.evaluation_window)
+        self.products.local_dem_accuracy[pair] = self._node(
+            "dem_accuracy", f"dem_accuracy/local/{pair}", args, dem=[self.products.local_dem[pair]], truth=truth
+        )
+
+    def _world_accuracy(self, whole: Lattice, pairs: list[int], level: Ref) -> None:
+        p = self.products
+        truth = self._truth_dem(whole, pairs[0], level, tuple(pairs))
+        p.dem_accuracy = self._node("dem_accuracy", "dem_accuracy/world", {}, dem=p.tiles, truth=truth)
+        p.truth_risk = self._risk("risk/truth", [truth])
+        assert p.path is not None
+        p.path_check = self._node("path_check", "path_check", {}, path=p.path, risk=p.truth_risk)
+
+    def _truth_dem(self, lattice: Lattice, pair: int, level: Ref, seen_by: tuple[int, ...]) -> Handle:
+        """Exact elevations in the levelled frame of ``pair`` (for the first pair: the world)."""
+        assert self.sequence.truth is not None
+        assert self.sequence.truth_dem is not None
+        T_local_left = RigidTransform.from_matrix(level.meta["T_local_left"])
+        T_truth_local = self.sequence.truth[pair] @ T_local_left.inverse()
+        return self._source(
+            self.sequence.truth_dem(lattice.to_dict(), T_truth_local, seen_by), f"truth_dem/{pair}-{len(seen_by)}"
+        )
+
+    # -- small things ------------------------------------------------------------------------------------------
+
+    def _vertical(self, pair: int) -> dict[str, Any]:
+        """What is known of the vertical of a pair, most trusted first."""
+        s = self.sequence
+        args: dict[str, Any] = {"pair": pair}
+        if s.up is not None:
+            args["up"] = list(s.up[pair])
+        if s.initial_pose is not None and pair == self.frames[0]:
+            args["initial_up"] = [float(v) for v in s.initial_pose.rotation[2]]
+        if s.pitch is not None:
+            args["pitch"] = s.pitch
+        return args
+
+    def _risk(self, label: str, dems: list[Handle]) -> Handle:
+        return self._node("risk", label, {"vehicle": self.config.vehicle.model_dump(mode="json")}, dem=dems)
+
+    def _pyramid(self, frame: int, camera: str) -> Handle:
+        image = self._source(self.sequence.image(frame, camera), f"image/{camera}/{frame}")
+        if camera == "left":
+            self.products.images[frame] = image
+        return self._node("pyramid", f"pyramid/{camera}/{frame}", {}, image=image)
+
+    def _source(self, source: Source, label: str) -> Handle:
+        """Node of a source; one that several others need (a rendered scene) is made once."""
+        inputs = {port: self._shared(upstream) for port, upstream in source.inputs.items()}
+        return self.graph.node(source.module, label, source.params, dict(source.args), dict(source.hints), inputs)
+
+    def _shared(self, source: Source) -> Handle:
+        label = source.module.rsplit(".", 1)[-1]
+        if label not in self._sources:
+            self._sources[label] = self._source(source, label)
+        return self._sources[label]
+
+    def _node(self, name: str, label: str, args: Mapping[str, Any], **inputs: Handle | list[Handle]) -> Handle:
+        params: Params = getattr(self.config, name, NoParams())
+        return self.graph.node(STAGE_MODULES[name], label, params, dict(args), {}, inputs)
+
+
+def _heading(trajectory: Mapping[str, Any]) -> list[float]:
+    """Mean driving direction (dx, dy) in the world: from the first to the last position; ahead where it rests."""
+    (x0, y0, _), (x1, y1, _) = trajectory["positions"][0], trajectory["positions"][-1]
+    dx, dy = x1 - x0, y1 - y0
+    return [dx, dy] if dx * dx + dy * dy > 0 else [0.0, 1.0]

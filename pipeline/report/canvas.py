@@ -1,0 +1,183 @@
+"""Paper for the figures: axes of a known size without layout passes, colours, units, limits, encoding.
+
+Matplotlib is imported when the first figure is drawn. Every panel is one image, so that panels stand beside each other
+on a wide screen and below each other on a phone.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Image = NDArray[Any]
+Extent = tuple[float, float, float, float]
+"""x_min, x_max, y_min, y_max."""
+
+DPI = 160
+WIDTH = 4.6
+"""Inches; 736 pixels, about twice what a panel takes on the screen."""
+MAX_PIXELS = 700
+"""Longest side of an array that is drawn; larger ones are averaged first."""
+UNDEFINED = "#e9e9ec"
+SAFE, HAZARDOUS, UNKNOWN = "#a6d7c3", "#c8501e", "#8d8f98"
+"""Distinct for colour-blind eyes and in grey: light, dark, medium."""
+ESTIMATE, REFERENCE, MARK = "#0b4f8a", "#d1731a", "#111111"
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One encoded image: ``uri`` is a ``data:`` address, ``width`` and ``height`` are CSS pixels."""
+
+    uri: str
+    alt: str
+    width: int
+    height: int
+
+    @property
+    def size(self) -> int:
+        """Characters it takes in the page."""
+        return len(self.uri)
+
+
+def figure(width: float, height: float) -> Any:
+    """Empty figure on the Agg canvas, inches."""
+    import matplotlib
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    matplotlib.rcParams.update(
+        {"font.size": 9, "axes.edgecolor": "#555555", "axes.linewidth": 0.7, "xtick.color": "#444444"}
+        | {"ytick.color": "#444444", "axes.labelcolor": "#333333", "font.family": ["DejaVu Sans"]}
+    )
+    fig = Figure(figsize=(width, height), dpi=DPI, facecolor="white")
+    FigureCanvasAgg(fig)
+    return fig
+
+
+def map_axes(extent: Extent, *, bar: bool = False, max_height: float = 6.0) -> tuple[Any, Any, Any]:
+    """Figure, axes of equal scale (metres), and axes for a colour bar below them (None without ``bar``).
+
+    Maps of one extent are equally large with and without a bar, so that they compare side by side.
+    """
+    left, right, top, foot = 0.62, 0.15, 0.12, 0.5 + (0.62 if bar else 0.0)
+    dx, dy = max(extent[1] - extent[0], 1e-9), max(extent[3] - extent[2], 1e-9)
+    width = WIDTH - left - right
+    height = width * dy / dx
+    if height > max_height:
+        width, height = max_height * dx / dy, max_height
+    width, height = max(width, 2.0), max(height, 0.9)
+    fig_w, fig_h = left + width + right, foot + height + top
+    fig = figure(fig_w, fig_h)
+    ax = fig.add_axes((left / fig_w, foot / fig_h, width / fig_w, height / fig_h))
+    ax.set_xlim(extent[0], extent[1])
+    ax.set_ylim(extent[2], extent[3])
+    ax.set_aspect("equal", adjustable="datalim")
+    ax.set_xlabel("x, m", labelpad=1)
+    ax.set_ylabel("y, m", labelpad=1)
+    cax = fig.add_axes((left / fig_w, 0.43 / fig_h, width / fig_w, 0.12 / fig_h)) if bar else None
+    return fig, ax, cax
+
+
+def image_axes(shape: tuple[int, ...], *, bar: bool = False, width: float = WIDTH) -> tuple[Any, Any, Any]:
+    """Figure filled by an image of ``shape`` (rows, cols), axes in pixels, and axes for a colour bar below it."""
+    rows, cols = shape[:2]
+    height = width * rows / cols
+    foot = 0.6 if bar else 0.0
+    fig = figure(width, height + foot)
+    total = height + foot
+    ax = fig.add_axes((0.0, foot / total, 1.0, height / total))
+    ax.set_axis_off()
+    cax = fig.add_axes((0.04, 0.41 / total, 0.92, 0.12 / total)) if bar else None
+    return fig, ax, cax
+
+
+def color_bar(fig: Any, drawn: Any, cax: Any, label: str) -> None:
+    """Colour bar with its unit."""
+    bar = fig.colorbar(drawn, cax=cax, orientation="horizontal")
+    bar.outline.set_linewidth(0.4)
+    bar.set_label(label, labelpad=1)
+
+
+def scale_bar(ax: Any, extent: Extent) -> None:
+    """Bar of a round length near a quarter of the width, at the lower left."""
+    length = round_length(0.25 * (extent[1] - extent[0]))
+    x = extent[0] + 0.05 * (extent[1] - extent[0])
+    y = extent[2] + 0.04 * (extent[3] - extent[2])
+    ax.plot([x, x + length], [y, y], color="white", linewidth=5, solid_capstyle="butt", zorder=9)
+    ax.plot([x, x + length], [y, y], color=MARK, linewidth=2.5, solid_capstyle="butt", zorder=10)
+    words = f"{length:g} m" if length >= 1 else f"{100 * length:g} cm"
+    box = {"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": "none", "alpha": 0.8}
+    ax.annotate(words, (x, y), (0, 5), textcoords="offset points", fontsize=8, zorder=10, bbox=box)
+
+
+def round_length(value: float) -> float:
+    """Greatest of 1, 2, 5 times a power of ten that is not above ``value``."""
+    power: float = 10.0 ** math.floor(math.log10(value))
+    return max(step * power for step in (1.0, 2.0, 5.0) if step * power <= value * (1 + 1e-9))
+
+
+def polyline(ax: Any, points: Image, color: str = MARK, width: float = 1.8) -> None:
+    """Line with a white casing, seen on any ground; a ring at its start and a disk at its end."""
+    x, y = points[:, 0], points[:, 1]
+    ax.plot(x, y, color="white", linewidth=width + 1.8, zorder=6, solid_joinstyle="round")
+    ax.plot(x, y, color=color, linewidth=width, zorder=7, solid_joinstyle="round")
+    ax.plot(x[:1], y[:1], "o", markersize=6, markerfacecolor="white", markeredgecolor=color, zorder=8)
+    ax.plot(x[-1:], y[-1:], "o", markersize=6, markerfacecolor=color, markeredgecolor="white", zorder=8)
+
+
+def shrink(array: Image, limit: int = MAX_PIXELS) -> Image:
+    """Average blocks so that no side is above ``limit``; undefined values do not count in an average.
+
+    The array is trimmed to whole blocks (less than one drawn pixel).
+    """
+    step = max(1, math.ceil(max(array.shape[:2]) / limit))
+    if step == 1:
+        return np.asarray(array)
+    rows, cols = (n // step * step for n in array.shape[:2])
+    blocks = np.asarray(array[:rows, :cols], dtype=np.float32)
+    blocks = blocks.reshape(rows // step, step, cols // step, step, *array.shape[2:])
+    count = np.isfinite(blocks).sum(axis=(1, 3))
+    total = np.nansum(blocks, axis=(1, 3))
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan).astype(np.float32)
+
+
+def limits(values: Image, low: float = 2.0, high: float = 98.0) -> tuple[float, float]:
+    """Robust range of the finite values: percentiles, never empty."""
+    finite = values[np.isfinite(values)]
+    if finite.size == 0:
+        return 0.0, 1.0
+    a, b = (float(v) for v in np.percentile(finite, [low, high]))
+    pad = 1e-6 * max(abs(a), abs(b), 1e-6)
+    return (a, b) if b - a > pad else (a - 10 * pad, b + 10 * pad)
+
+
+def metres_or_mm(values: Image) -> tuple[float, str]:
+    """Factor and unit that suit lengths in metres: mm where nearly all are below 0.2 m."""
+    finite = np.abs(values[np.isfinite(values)])
+    return (1000.0, "mm") if finite.size and float(np.percentile(finite, 98)) < 0.2 else (1.0, "m")
+
+
+def encode(fig: Any, alt: str, *, photo: bool = False) -> Panel:
+    """Figure to a :class:`Panel`: PNG with at most 256 colours for drawings, JPEG for photographs."""
+    from PIL import Image as Pillow
+
+    fig.canvas.draw()
+    rgb = np.asarray(fig.canvas.buffer_rgba())[..., :3]
+    height, width = rgb.shape[:2]
+    picture = Pillow.fromarray(np.ascontiguousarray(rgb))
+    out = io.BytesIO()
+    if photo:
+        picture.save(out, "JPEG", quality=82, optimize=True)
+    else:
+        picture.quantize(256, method=Pillow.Quantize.FASTOCTREE, dither=Pillow.Dither.NONE).save(
+            out, "PNG", optimize=False
+        )
+    kind = "jpeg" if photo else "png"
+    uri = f"data:image/{kind};base64,{base64.b64encode(out.getvalue()).decode('ascii')}"
+    return Panel(uri, alt, round(width * 96 / DPI), round(height * 96 / DPI))

@@ -1,0 +1,246 @@
+"""The figures, one function each: plain arrays in, one encoded :class:`~pipeline.report.canvas.Panel` out.
+
+Maps have metres on both axes, row 0 at the greatest y; images have row 0 on top. What is undefined is light grey in
+maps of measured values and white in an ortho image (as in the paper). Large arrays are averaged before drawing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.report import canvas
+from pipeline.report.canvas import Extent, Panel
+
+Floats = NDArray[Any]
+Bytes = NDArray[np.uint8]
+
+SAFE, HAZARDOUS, UNKNOWN = 0, 1, 2
+
+
+def photo(image: Floats, alt: str) -> Panel:
+    """A camera image; ``image`` (row, col) grey or (row, col, 3), of 8 or 16 bits."""
+    fig, ax, _ = canvas.image_axes(image.shape)
+    ax.imshow(canvas.shrink(_grey(image)), cmap="gray", vmin=0, vmax=255, aspect="auto")
+    return canvas.encode(fig, alt, photo=True)
+
+
+def disparity(values: Floats, label: str, alt: str) -> Panel:
+    """One component of the disparity (row, col), pixels, NaN undefined, with its colour bar (Figure 6)."""
+    fig, ax, cax = canvas.image_axes(values.shape, bar=True)
+    low, high = canvas.limits(values)
+    drawn = ax.imshow(canvas.shrink(values), cmap=_map("viridis"), vmin=low, vmax=high, aspect="auto")
+    canvas.color_bar(fig, drawn, cax, label)
+    return canvas.encode(fig, alt, photo=True)
+
+
+def ortho(grey: Floats, extent: Extent, alt: str) -> Panel:
+    """Ortho image (row, col), grey 0..255, NaN white (Figure 7, left)."""
+    fig, ax, _ = canvas.map_axes(extent)
+    low, high = canvas.limits(grey, 0.5, 99.5)
+    _show(ax, grey, extent, cmap=_map("gray", "white"), vmin=low, vmax=high)
+    canvas.scale_bar(ax, extent)
+    return canvas.encode(fig, alt, photo=True)
+
+
+def elevation_with_path(elevation: Floats, risk: Bytes | None, path: Floats | None, extent: Extent, alt: str) -> Panel:
+    """Elevation (row, col) m, bright is high; unknown and hazardous black; the path on it (Figure 7, right)."""
+    fig, ax, cax = canvas.map_axes(extent, bar=True)
+    blocked = ~np.isfinite(elevation) if risk is None else risk != SAFE
+    low, high = canvas.limits(elevation)
+    factor, unit = canvas.metres_or_mm(elevation)
+    # The grey scale starts well above black, so that black means "not to be driven" only.
+    shown = np.where(blocked, np.nan, elevation * factor)
+    drawn = _show(ax, shown, extent, cmap=_greys(), vmin=low * factor, vmax=high * factor)
+    if path is not None and len(path):
+        canvas.polyline(ax, path, color=canvas.HAZARDOUS)
+    canvas.color_bar(fig, drawn, cax, f"elevation, {unit}")
+    canvas.scale_bar(ax, extent)
+    return canvas.encode(fig, alt, photo=True)
+
+
+def risk_map(risk: Bytes, path: Floats | None, extent: Extent, alt: str, *, far: Floats | None = None) -> Panel:
+    """Safe, hazardous and unknown cells, the path, and which targets of the far row can be reached.
+
+    ``far`` (n, 3): x, y of a cell of the far row, m, and 1 where a path leads there.
+    """
+    fig, ax, _ = canvas.map_axes(extent)
+    _show(ax, _classes(risk), extent)
+    if path is not None and len(path):
+        canvas.polyline(ax, path)
+    if far is not None and len(far):
+        size = max(2.0, min(12.0, 500.0 / len(far)))
+        yes, no = far[far[:, 2] > 0], far[far[:, 2] <= 0]
+        ax.scatter(no[:, 0], no[:, 1], s=size, marker="s", color="#3b3b3b", linewidths=0, zorder=5)
+        ax.scatter(yes[:, 0], yes[:, 1], s=size, marker="s", color=canvas.ESTIMATE, linewidths=0, zorder=5)
+    canvas.scale_bar(ax, extent)
+    return canvas.encode(fig, alt)
+
+
+def cost_to_go(cost: Floats, path: Floats | None, extent: Extent, alt: str) -> Panel:
+    """Summed height differences (row, col), m, of the best path to each cell; not reachable is grey (Figure 3)."""
+    fig, ax, cax = canvas.map_axes(extent, bar=True)
+    finite = np.where(np.isfinite(cost), cost, np.nan)
+    factor, unit = canvas.metres_or_mm(finite)
+    drawn = _show(ax, finite * factor, extent, cmap=_map("cividis"), vmin=0, vmax=canvas.limits(finite)[1] * factor)
+    if path is not None and len(path):
+        canvas.polyline(ax, path)
+    canvas.color_bar(fig, drawn, cax, f"summed height differences, {unit}")
+    return canvas.encode(fig, alt, photo=True)
+
+
+def tracks(image: Floats, trails: Sequence[Floats], inlier: Sequence[bool], alt: str) -> Panel:
+    """One frame with the trails of its landmarks: each (n, 2) column, row, ending in this frame (Figure 8)."""
+    from matplotlib.collections import LineCollection
+
+    rows, cols = image.shape[:2]
+    fig, ax, _ = canvas.image_axes(image.shape)
+    ax.imshow(
+        canvas.shrink(_grey(image)),
+        cmap="gray",
+        vmin=0,
+        vmax=255,
+        aspect="auto",
+        extent=(-0.5, cols - 0.5, rows - 0.5, -0.5),
+    )
+    colors = ["#ffd34d" if good else "#ff6a3d" for good in inlier]
+    ax.add_collection(LineCollection(list(trails), colors=colors, linewidths=1.1))
+    if trails:
+        ends = np.array([t[-1] for t in trails])
+        ax.scatter(ends[:, 0], ends[:, 1], s=9, c=colors, edgecolors="#222222", linewidths=0.4, zorder=3)
+    ax.set_xlim(-0.5, cols - 0.5)
+    ax.set_ylim(rows - 0.5, -0.5)
+    return canvas.encode(fig, alt, photo=True)
+
+
+def trajectory(left: Floats, right: Floats, truth: Floats | None, alt: str) -> Panel:
+    """Top view: left camera positions (n, 3) m, right ones at basic pairs (m, 3), truth (n, 3) (Figure 9, left)."""
+    everything = np.concatenate([p[:, :2] for p in (left, right, truth) if p is not None and len(p)])
+    everything = everything[np.isfinite(everything).all(axis=1)]
+    if not len(everything):
+        everything = np.zeros((1, 2))
+    centre, span = 0.5 * (everything.min(axis=0) + everything.max(axis=0)), np.ptp(everything, axis=0)
+    half = np.maximum(0.5 * span, 0.18 * max(float(span.max()), 1e-3)) * 1.12
+    extent = (centre[0] - half[0], centre[0] + half[0], centre[1] - half[1], centre[1] + half[1])
+    fig, ax, _ = canvas.map_axes(extent, max_height=5.0)
+    if truth is not None:
+        ax.plot(truth[:, 0], truth[:, 1], color=canvas.REFERENCE, linewidth=2.6, alpha=0.75, label="left camera, truth")
+    ax.plot(left[:, 0], left[:, 1], "o-", color=canvas.ESTIMATE, markersize=3, linewidth=0.8, label="left camera")
+    if len(right):
+        ax.plot(right[:, 0], right[:, 1], "^", color="#333333", markersize=4, label="right camera, basic pairs")
+    ax.grid(color="#dddddd", linewidth=0.5)
+    ax.set_axisbelow(True)
+    ax.legend(loc="best", fontsize=7.5, framealpha=0.9)
+    return canvas.encode(fig, alt)
+
+
+def displacements(estimate: Floats, truth: Floats | None, names: Sequence[int], alt: str) -> Panel:
+    """x, y, z components (n - 1, 3), m, of the displacement between successive positions (Figure 9, right)."""
+    factor, unit = canvas.metres_or_mm(estimate)
+    fig = canvas.figure(canvas.WIDTH, 4.9)
+    for i, axis in enumerate("xyz"):
+        ax = fig.add_axes((0.15, 0.70 - 0.295 * i, 0.82, 0.27))
+        if truth is not None:
+            ax.plot(names, truth[:, i] * factor, color=canvas.REFERENCE, linewidth=2.2, alpha=0.75, label="truth")
+        ax.plot(
+            names, estimate[:, i] * factor, "o-", color=canvas.ESTIMATE, markersize=3, linewidth=0.8, label="estimate"
+        )
+        ax.set_ylabel(f"{axis}, {unit}", labelpad=2)
+        ax.grid(color="#dddddd", linewidth=0.5)
+        ax.tick_params(labelbottom=i == 2)
+        ax.xaxis.get_major_locator().set_params(integer=True)
+        _not_narrower(ax, 0.02 * factor * float(np.nanmax(np.abs(estimate), initial=1e-6)))
+        if i == 0:
+            ax.legend(fontsize=7.5, loc="upper right", framealpha=0.9, ncols=2)
+    ax.set_xlabel("frame reached")
+    return canvas.encode(fig, alt)
+
+
+def hillshade(elevation: Floats, cell: float, extent: Extent, alt: str) -> Panel:
+    """Shaded relief of elevation (row, col) m, light from the upper left at 40 degrees, tinted by height."""
+    import matplotlib
+
+    fig, ax, cax = canvas.map_axes(extent, bar=True)
+    z = canvas.shrink(elevation).astype(np.float64)
+    step = cell * elevation.shape[1] / max(z.shape[1], 1)
+    shade = _shade(z, step)
+    factor, unit = canvas.metres_or_mm(elevation)
+    low, high = (v * factor for v in canvas.limits(elevation))
+    norm = matplotlib.colors.Normalize(low, high)
+    tint = matplotlib.colormaps["cividis"](norm(np.nan_to_num(z * factor)))[..., :3]
+    rgb = np.clip(tint * (0.35 + 0.9 * shade[..., None]), 0, 1)
+    rgb[~np.isfinite(z)] = matplotlib.colors.to_rgb(canvas.UNDEFINED)
+    ax.imshow(rgb, extent=extent, aspect="equal", zorder=1)
+    drawn = matplotlib.cm.ScalarMappable(norm, matplotlib.colormaps["cividis"])
+    canvas.color_bar(fig, drawn, cax, f"elevation, {unit}")
+    return canvas.encode(fig, alt, photo=True)
+
+
+def scalar_map(values: Floats, extent: Extent, label: str, alt: str, *, length: bool = True) -> Panel:
+    """A measured quantity (row, col); ``length``: metres, shown in mm where that fits; the unit is added."""
+    fig, ax, cax = canvas.map_axes(extent, bar=True)
+    factor, unit = canvas.metres_or_mm(values) if length else (1.0, "")
+    low, high = (v * factor for v in canvas.limits(values))
+    drawn = _show(ax, values * factor, extent, cmap=_map("viridis"), vmin=min(low, 0.0), vmax=high)
+    canvas.color_bar(fig, drawn, cax, f"{label}, {unit}" if unit else label)
+    return canvas.encode(fig, alt, photo=True)
+
+
+def error_map(error: Floats, extent: Extent, alt: str) -> Panel:
+    """Elevation minus truth (row, col), m, symmetric about zero."""
+    fig, ax, cax = canvas.map_axes(extent, bar=True)
+    factor, unit = canvas.metres_or_mm(error)
+    bound = canvas.limits(np.abs(error), 0, 97)[1] * factor
+    drawn = _show(ax, error * factor, extent, cmap=_map("PuOr"), vmin=-bound, vmax=bound)
+    canvas.color_bar(fig, drawn, cax, f"elevation minus truth, {unit}")
+    return canvas.encode(fig, alt, photo=True)
+
+
+def _show(ax: Any, values: Floats, extent: Extent, **style: Any) -> Any:
+    return ax.imshow(canvas.shrink(values), extent=extent, aspect="equal", zorder=1, **style)
+
+
+def _map(name: str, undefined: str = canvas.UNDEFINED) -> Any:
+    import matplotlib
+
+    return matplotlib.colormaps[name].with_extremes(bad=undefined)
+
+
+def _greys() -> Any:
+    from matplotlib.colors import LinearSegmentedColormap
+
+    return LinearSegmentedColormap.from_list("greys", ["#5a5a5a", "#ffffff"]).with_extremes(bad="black")
+
+
+def _grey(image: Floats) -> Floats:
+    return image / np.float32(257.0) if image.dtype == np.uint16 else image
+
+
+def _classes(risk: Bytes) -> Floats:
+    """Colours (row, col, 3) in 0..1 of the classes."""
+    from matplotlib.colors import to_rgb
+
+    table = np.array([to_rgb(c) for c in (canvas.SAFE, canvas.HAZARDOUS, canvas.UNKNOWN)], dtype=np.float32)
+    return table[np.minimum(risk, UNKNOWN)]
+
+
+def _shade(z: Floats, step: float) -> Floats:
+    """Cosine of the angle between the surface's normal and the light (row, col), 0..1; NaN where undefined."""
+    gy, gx = (np.gradient(z, step, axis=k) if z.shape[k] > 1 else np.zeros_like(z) for k in (0, 1))
+    # Rows run against y.
+    nx, ny, nz = -gx, gy, np.ones_like(z)
+    light = np.array([-0.54, 0.54, 0.64])
+    dot = (nx * light[0] + ny * light[1] + nz * light[2]) / np.sqrt(nx**2 + ny**2 + nz**2)
+    # A cell beside a hole has no gradient; it is shown as level ground.
+    return np.asarray(np.clip(np.where(np.isfinite(dot), dot, light[2]), 0, 1))
+
+
+def _not_narrower(ax: Any, span: float) -> None:
+    """Widen the y range so that numerical noise does not fill a panel."""
+    low, high = ax.get_ylim()
+    if high - low < span:
+        middle = 0.5 * (low + high)
+        ax.set_ylim(middle - 0.5 * span, middle + 0.5 * span)

@@ -1,0 +1,285 @@
+"""Which figures a report has: the paper's Figures 3 and 6-9 redrawn from the run, and what else shows its quality."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from pipeline.report import canvas, figures, gather
+from pipeline.report.canvas import Panel
+from pipeline.report.gather import Scene
+from stages.declare import Bundle
+
+
+@dataclass(frozen=True)
+class Block:
+    """One figure: panels side by side under a title, what one sees, and a legend of ``(colour, words)``."""
+
+    name: str
+    title: str
+    caption: str
+    panels: tuple[Panel, ...]
+    legend: tuple[tuple[str, str], ...] = ()
+
+    @property
+    def anchor(self) -> str:
+        """Where links lead."""
+        return self.name.lower().replace(" ", "-")
+
+
+@dataclass(frozen=True)
+class Gallery:
+    """The figures that could be drawn, and why others could not: ``(title, reason)``."""
+
+    blocks: tuple[Block, ...]
+    absent: tuple[tuple[str, str], ...]
+
+
+def draw(scene: Scene) -> Gallery:
+    """Draw every figure whose artifacts are there."""
+    blocks, absent = [], []
+    for title, maker in _FIGURES:
+        try:
+            block = maker(scene)
+        except Exception as error:  # a figure must not cost the run its report; the failure is shown in it
+            absent.append((title, f"drawing failed, {type(error).__name__}: {error}"))
+            continue
+        if block is not None:
+            blocks.append(block)
+        elif maker is not _dem_error:
+            absent.append((title, "what it shows was not computed"))
+    return Gallery(tuple(blocks), tuple(absent))
+
+
+def _disparities(scene: Scene) -> Block | None:
+    view = scene.view
+    pair = next((p for p, h in view.products.disparity.items() if view.bundle(h) is not None), None)
+    if pair is None:
+        return None
+    bundle, image = view.bundle(view.products.disparity[pair]), view.bundle(view.products.images.get(pair))
+    assert bundle is not None
+    row, column = np.asarray(bundle["row_disparity"]), np.asarray(bundle["column_disparity"])
+    name = f"frame {pair}"
+    panels = [
+        figures.disparity(row, "row disparity, px", f"Map of row disparities of {name}, {_range(row)} px"),
+        figures.disparity(column, "column disparity, px", f"Map of column disparities of {name}, {_range(column)} px"),
+    ]
+    if image is not None:
+        panels.insert(0, figures.photo(np.asarray(image["image"]), f"Left camera image of {name}"))
+    share = float(np.isfinite(column).mean())
+    caption = (
+        f"Left image of the first basic pair ({name}), and the disparity vector of each of its pixels: rows, then "
+        "columns, right minus left, in pixels. Nothing was rectified, so rows may differ too. "
+        f"{share:.0%} of the pixels have a disparity, interpolated ones included; undefined ones are light grey."
+    )
+    return Block("Figure 6", "Figure 6. Disparities of the first stereo pair", caption, tuple(panels))
+
+
+def _terrain(scene: Scene) -> Block | None:
+    world = scene.world
+    if world is None:
+        return None
+    pairs = len(scene.view.products.world_dem)
+    ortho, elevation = world.get("ortho"), world.get("elevation")
+    panels = []
+    if ortho is not None:
+        panels.append(
+            figures.ortho(ortho, world.extent, f"Ortho image merged from {pairs} stereo pairs, seen from above")
+        )
+    if elevation is not None:
+        risk = None if scene.risk is None or scene.risk.lattice != world.lattice else scene.risk.arrays["risk"]
+        alt = f"Elevation as grey values, {_range(elevation)} m, with the path over it"
+        panels.append(figures.elevation_with_path(elevation, risk, scene.path, world.extent, alt))
+    path = "the path is the orange line (ring: start, disk: target)" if scene.path is not None else "there is no path"
+    caption = (
+        f"First: ortho image merged from {pairs} basic pairs, cells of {_length(world.lattice.cell)}; undefined and "
+        "occluded cells are white. Second: elevation, bright is high; unknown and hazardous cells are black; "
+        f"{path}. World frame: x right and y ahead of the first left camera, which is at (0, 0)."
+    )
+    return Block(
+        "Figure 7", "Figure 7. Merged ortho image, and the path on the elevation model", caption, tuple(panels)
+    )
+
+
+def _risk(scene: Scene) -> Block | None:
+    if scene.risk is None:
+        return None
+    risk = scene.risk.arrays["risk"]
+    shares = [float((risk == k).mean()) for k in range(3)]
+    words = f"{shares[0]:.0%} safe, {shares[1]:.0%} hazardous, {shares[2]:.0%} unknown"
+    vehicle = scene.view.config.vehicle
+    panels = [figures.risk_map(risk, scene.path, scene.risk.extent, f"Risk map seen from above: {words}")]
+    slope = scene.risk.get("inclination")
+    if slope is not None:
+        degrees = np.degrees(slope)
+        alt = f"Local inclination, {_range(degrees)} degrees"
+        label = "local inclination, degrees"
+        panels.append(figures.scalar_map(degrees, scene.risk.extent, label, alt, length=False))
+    caption = (
+        f"Of all cells {words}. Limits of {vehicle.name}: slope {vehicle.max_slope_deg:g}°, "
+        f"step {_length(vehicle.max_step)}, roughness {_length(vehicle.max_roughness)}, judged in windows of one wheel "
+        f"diameter ({_length(vehicle.wheel_diameter)}). The path (black line, ring: start, disk: target) keeps "
+        f"{_length(vehicle.margin)} from hazardous cells and never enters unknown ones. Second: the local inclination, "
+        "which the slope's limit applies to."
+    )
+    return Block("Risk map", "Risk map and path of the whole run", caption, tuple(panels), _legend(shares))
+
+
+def _legend(shares: list[float]) -> tuple[tuple[str, str], ...]:
+    colors, names = (canvas.SAFE, canvas.HAZARDOUS, canvas.UNKNOWN), ("safe", "hazardous", "unknown")
+    return tuple((c, f"{name} {share:.0%}") for c, name, share in zip(colors, names, shares, strict=True))
+
+
+def _local(scene: Scene) -> Block | None:
+    """The stop whose local path is found and whose far row has most to choose from."""
+    view = scene.view
+    stops = []
+    for pair, handle in view.products.local_path.items():
+        path = view.bundle(handle)
+        if path is not None and view.bundle(view.products.local_risk.get(pair)) is not None:
+            stops.append((bool(path.meta.get("found")), int(np.sum(path["reachable"])), -pair, path))
+    if not stops:
+        return None
+    found, targets, minus_pair, path = max(stops, key=lambda s: s[:3])
+    pair = -minus_pair
+    risk = gather.terrain(view.bundle(view.products.local_risk[pair]), "risk")
+    assert risk is not None
+    points, cost = gather.vertices(path), np.asarray(path["cost_to_go"])
+    far = _far_row(path)
+    name = f"the stop at frame {pair}"
+    panels = [
+        figures.risk_map(risk.arrays["risk"], points, risk.extent, f"Local risk map of {name} with its path", far=far)
+    ]
+    if cost.shape == risk.lattice.shape:
+        panels.append(figures.cost_to_go(cost, points, risk.extent, f"Cost of the best path to each cell from {name}"))
+    outcome = (
+        f"{targets} cells of the far row can be reached (blue dots); the path to the middle one is drawn"
+        if found
+        else f"no path: {path.meta.get('reason') or 'the far row cannot be reached'}"
+    )
+    caption = (
+        f"Heading-aligned local map of {name}: each cell of a row leads to three cells of the next, so one sweep finds "
+        f"the best path to every cell; {outcome}. Second: height differences summed along the best path from the start "
+        "to each cell; grey cells cannot be reached."
+    )
+    title = f"Figure 3. Local risk map and reachable targets, frame {pair}"
+    legend = _legend([float((risk.arrays["risk"] == k).mean()) for k in range(3)])
+    return Block("Figure 3", title, caption, tuple(panels), legend)
+
+
+def _far_row(path: Bundle) -> Any:
+    """Cells (n, 3) of the target row: x, y, and whether a path leads there."""
+    grid, row = path.meta.get("grid"), path.meta.get("target_row")
+    reachable = np.asarray(path["reachable"])
+    if not grid or row is None or not path.meta.get("found"):
+        return None
+    right, ahead = (grid["i0"] + np.arange(len(reachable))) * grid["cell"], (grid["j0"] - row) * grid["cell"]
+    dx, dy = grid["ahead"]
+    far = np.column_stack([right * dy + ahead * dx, ahead * dy - right * dx, reachable])
+    return far[reachable > 0]
+
+
+def _tracks(scene: Scene) -> Block | None:
+    view = scene.view
+    frames = gather.consecutive(view)
+    trails = gather.trails(view, frames)
+    if not trails:
+        return None
+    panels = []
+    for frame in frames:
+        bundle = view.bundle(view.products.images[frame])
+        assert bundle is not None
+        lines, good = trails.get(frame, ([], []))
+        alt = f"Frame {frame} with {len(lines)} landmarks and the trails they left"
+        panels.append(figures.tracks(np.asarray(bundle["image"]), lines, good, alt))
+    counts = ", ".join(str(len(trails.get(f, ([], []))[0])) for f in frames)
+    caption = (
+        f"Frames {frames[0]} to {frames[-1]} with {counts} landmarks and the trails they left since their segment "
+        "began. Yellow: agrees with the pose of the frame; orange: removed as inconsistent."
+    )
+    return Block("Figure 8", "Figure 8. Four successive frames and the landmarks' tracks", caption, tuple(panels))
+
+
+def _trajectory(scene: Scene) -> Block | None:
+    track = scene.track
+    if not track.posed.any():
+        return None
+    n = int(track.posed.sum())
+    versus = " against the truth (orange)" if track.truth is not None else ""
+    panels = [figures.trajectory(track.left, track.right, track.truth, f"Top view of {n} camera positions{versus}")]
+    if n > 1:
+        step = np.diff(track.left, axis=0)
+        truth = None if track.truth is None else np.diff(track.truth, axis=0)
+        alt = f"x, y and z components of the displacement between successive frames{versus}"
+        panels.append(figures.displacements(step, truth, scene.view.frames[1:], alt))
+    source = (
+        f" Truth: {scene.view.sequence.truth_source}; aligned by the first frame alone." if versus else " No truth."
+    )
+    caption = (
+        f"First: positions of the left camera in {n} frames, and of the right camera at the basic pairs, seen from "
+        f"above. Second, from the top: x, y and z components of the displacement between successive positions{versus}."
+        f"{source}"
+    )
+    return Block("Figure 9", "Figure 9. Trajectory and displacements", caption, tuple(panels))
+
+
+def _quality(scene: Scene) -> Block | None:
+    world = scene.world
+    if world is None or world.get("elevation") is None:
+        return None
+    z, sigma, count = world.arrays["elevation"], world.get("elevation_std"), world.get("count")
+    panels = [figures.hillshade(z, world.lattice.cell, world.extent, f"Shaded relief of the terrain, {_range(z)} m")]
+    if sigma is not None:
+        alt = f"Standard deviation of the elevation, {_range(sigma)} m"
+        panels.append(figures.scalar_map(sigma, world.extent, "standard deviation", alt))
+    if count is not None:
+        seen = np.where(count > 0, count, np.nan).astype(np.float32)
+        alt = f"Number of elevation models per cell, up to {int(count.max())}"
+        panels.append(figures.scalar_map(seen, world.extent, "models per cell", alt, length=False))
+    caption = (
+        "Shaded relief (light from the upper left, tinted by elevation); standard deviation of the elevation as "
+        "predicted from the disparity's error and the rig's geometry; number of basic pairs that saw a cell. "
+        "Undefined: light grey."
+    )
+    return Block("Terrain", "Terrain, its standard deviation and its coverage", caption, tuple(panels))
+
+
+def _dem_error(scene: Scene) -> Block | None:
+    error = gather.terrain(scene.view.bundle(scene.view.products.dem_accuracy), "error")
+    if error is None or error.get("error") is None:
+        return None
+    values = error.arrays["error"]
+    panel = figures.error_map(values, error.extent, f"Elevation minus truth of the merged terrain, {_range(values)} m")
+    caption = (
+        f"Merged elevation minus the exact one ({scene.view.sequence.truth_source}), by cell. The world frame is that "
+        "of the first pair, so errors of the trajectory show here as well."
+    )
+    return Block("Elevation error", "Elevation error against truth", caption, (panel,))
+
+
+def _range(values: Any) -> str:
+    """``low to high`` of nearly all values, for alternative texts."""
+    finite = values[np.isfinite(values)]
+    if not finite.size:
+        return "nothing defined"
+    low, high = np.percentile(finite, [1, 99])
+    return f"{low:.3g} to {high:.3g}"
+
+
+def _length(metres: float) -> str:
+    return f"{metres * 1000:.4g} mm" if metres < 0.1 else f"{metres:.4g} m"
+
+
+_FIGURES: tuple[tuple[str, Callable[[Scene], Block | None]], ...] = (
+    ("Figure 6. Disparities", _disparities),
+    ("Figure 7. Ortho image and path", _terrain),
+    ("Risk map", _risk),
+    ("Figure 3. Local risk map", _local),
+    ("Figure 8. Tracks", _tracks),
+    ("Figure 9. Trajectory", _trajectory),
+    ("Terrain", _quality),
+    ("Elevation error", _dem_error),
+)

@@ -1,0 +1,188 @@
+"""Reads the artifacts of a run into the plain arrays and facts that figures and tables need."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.report.canvas import Extent
+from pipeline.report.view import RunView
+from stages.declare import Bundle
+from stages.geometry import RigidTransform
+from stages.lattice import Lattice, mosaic, union
+
+Floats = NDArray[Any]
+
+NODATA: Mapping[str, float] = {"count": 0, "source": -1}
+"""Of the arrays of merged terrain that are not floats."""
+
+
+@dataclass(frozen=True)
+class Terrain:
+    """Arrays (row, col) of an elevation model, and the lattice they lie on."""
+
+    lattice: Lattice
+    arrays: Mapping[str, Floats]
+
+    @property
+    def extent(self) -> Extent:
+        """x_min, x_max, y_min, y_max, metres."""
+        return self.lattice.bounds
+
+    def get(self, name: str) -> Floats | None:
+        """An array, None where there is none."""
+        return self.arrays.get(name)
+
+
+@dataclass(frozen=True)
+class Track:
+    """The trajectory: positions (frame, 3) m in the world, one row a chosen frame, NaN without a pose.
+
+    ``right`` (pair, 3): right cameras at basic pairs. ``truth`` (frame, 3): aligned by the first frame's pose only.
+    ``sigma`` (frame,): standard deviation of the position, m. ``segment`` (frame,): which segment posed it, -1 none.
+    """
+
+    left: Floats
+    right: Floats
+    truth: Floats | None
+    sigma: Floats
+    segment: NDArray[np.int64]
+
+    @property
+    def posed(self) -> NDArray[np.bool_]:
+        """Which frames have a pose."""
+        return np.asarray(np.isfinite(self.left).all(axis=1))
+
+
+class Scene:
+    """A run with what several figures and tables share, each read once."""
+
+    def __init__(self, view: RunView) -> None:
+        self.view = view
+
+    @cached_property
+    def world(self) -> Terrain | None:
+        """Merged terrain."""
+        return merged(self.view)
+
+    @cached_property
+    def risk(self) -> Terrain | None:
+        """Risk map of the merged terrain."""
+        return terrain(self.view.bundle(self.view.products.risk), "risk", "inclination")
+
+    @cached_property
+    def path(self) -> Floats | None:
+        """Vertices (n, 3) of the path over the merged terrain; None without a path."""
+        return vertices(self.view.bundle(self.view.products.path))
+
+    @cached_property
+    def track(self) -> Track:
+        """The trajectory."""
+        return trajectory(self.view)
+
+
+def vertices(path: Bundle | None) -> Floats | None:
+    """Vertices (n, 3), m, of a path artifact; None without a path."""
+    points = None if path is None else np.asarray(path["path"])
+    return points if points is not None and len(points) else None
+
+
+def merged(view: RunView) -> Terrain | None:
+    """World terrain assembled of its tiles."""
+    tiles = [b for b in map(view.bundle, view.products.tiles) if b is not None]
+    names = ("elevation", "elevation_std", "spread", "count", "ortho")
+    return assemble(tiles, names) if tiles else None
+
+
+def terrain(bundle: Bundle | None, *names: str) -> Terrain | None:
+    """Arrays of one artifact with a lattice."""
+    return None if bundle is None or "lattice" not in bundle.meta else assemble([bundle], names)
+
+
+def assemble(parts: list[Bundle], names: tuple[str, ...]) -> Terrain:
+    """Arrays of several artifacts put together on the union of their lattices."""
+    lattices = [Lattice.from_dict(b.meta["lattice"]) for b in parts]
+    whole = union(lattices)
+    arrays = {}
+    for name in names:
+        if all(name in b.arrays for b in parts):
+            pieces = [(at, np.asarray(b[name])) for at, b in zip(lattices, parts, strict=True)]
+            arrays[name] = pieces[0][1] if len(pieces) == 1 else mosaic(pieces, NODATA.get(name, np.nan), whole)
+    return Terrain(whole, arrays)
+
+
+def trajectory(view: RunView) -> Track:
+    """Positions of all chosen frames, of the right cameras at basic pairs, and of the truth."""
+    n = len(view.frames)
+    row = {frame: i for i, frame in enumerate(view.frames)}
+    left, sigma, segment = np.full((n, 3), np.nan), np.full(n, np.nan), np.full(n, -1, dtype=np.int64)
+    right, first = [], None
+    bundle = view.bundle(view.products.trajectory)
+    if bundle is not None:
+        poses = np.asarray(bundle["poses"])
+        T_left_right = view.sequence.rig.T_right_left.inverse()
+        for i, frame in enumerate(bundle.meta.get("frames", view.frames[: len(poses)])):
+            if frame not in row or not np.isfinite(poses[i]).all():
+                continue
+            pose = RigidTransform.from_matrix(poses[i])
+            first = first or (frame, pose)
+            left[row[frame]] = pose.translation
+            segment[row[frame]] = int(bundle["segment"][i]) if "segment" in bundle.arrays else -1
+            if "covariance" in bundle.arrays:
+                sigma[row[frame]] = np.sqrt(max(float(np.trace(bundle["covariance"][i][:3, :3])), 0.0))
+            if frame in view.products.disparity:
+                right.append((pose @ T_left_right).translation)
+    return Track(left, np.array(right).reshape(-1, 3), _truth(view, first), sigma, segment)
+
+
+def _truth(view: RunView, first: tuple[int, RigidTransform] | None) -> Floats | None:
+    """True positions brought to the world by the pose of the first posed frame alone."""
+    if view.sequence.truth is None or first is None:
+        return None
+    frame, pose = first
+    T_world_truth = pose @ view.sequence.truth[frame].inverse()
+    return T_world_truth.apply([view.sequence.truth[f].translation for f in view.frames])
+
+
+def frame_facts(view: RunView) -> dict[int, dict[str, Any]]:
+    """Facts of the resection of each frame; a key frame's come from the segment that posed it, the one before."""
+    facts: dict[int, dict[str, Any]] = {}
+    for bundle in map(view.bundle, view.products.resections):
+        for item in bundle.meta.get("per_frame", ()) if bundle is not None else ():
+            facts.setdefault(int(item["frame"]), dict(item))
+    return facts
+
+
+def trails(view: RunView, frames: tuple[int, ...]) -> dict[int, tuple[list[Floats], list[bool]]]:
+    """Trails (n, 2) column, row of the landmarks up to each of ``frames``, and whether each is an inlier there."""
+    found: dict[int, tuple[list[Floats], list[bool]]] = {}
+    resections = list(view.products.resections) + [None] * len(view.products.tracks)
+    for handle, other in zip(view.products.tracks, resections, strict=False):
+        track, resection = view.bundle(handle), view.bundle(other)
+        if track is None:
+            continue
+        points, names = np.asarray(track["points"], dtype=np.float64), list(track.meta.get("frames", ()))
+        inlier = None if resection is None else np.asarray(resection["inlier"])
+        for at, frame in enumerate(names):
+            if frame not in frames or (frame in found and at == 0):
+                continue
+            alive = [i for i in range(len(points)) if np.isfinite(points[i, at]).all()]
+            lines = [_finite(points[i, : at + 1]) for i in alive]
+            good = [inlier is None or bool(inlier[i, at]) for i in alive]
+            found[frame] = (lines, good)
+    return found
+
+
+def _finite(line: Floats) -> Floats:
+    return line[np.isfinite(line).all(axis=1)]
+
+
+def consecutive(view: RunView, count: int = 4) -> tuple[int, ...]:
+    """The first ``count`` successive frames whose images are there (fewer where there are fewer)."""
+    have = [f for f in view.frames if view.bundle(view.products.images.get(f)) is not None]
+    return tuple(have[:count])

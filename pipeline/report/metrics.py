@@ -1,0 +1,224 @@
+"""Key figures of a run by name: value, unit, how it was obtained, against which truth, and how complete."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from pipeline.report import tables
+from pipeline.report.gather import Scene
+from pipeline.report.view import RunView
+
+Metric = dict[str, Any]
+Rows = list[dict[str, Any]]
+
+LABELS: Mapping[str, str] = {
+    "drift": "Drift at the end",
+    "final_error": "Position error at the end",
+    "final_rotation_error": "Rotation error at the end",
+    "path_length": "True length of the drive",
+    "ate_rmse": "Absolute trajectory error, best fit",
+    "ate_first_frame_rmse": "Absolute trajectory error, first pose equal",
+    "ate_first_frame_max": "Largest position error",
+    "rpe_translation_rmse": "Relative error, translation",
+    "rpe_translation_median": "Relative error, translation, median",
+    "rpe_translation_max": "Relative error, translation, largest",
+    "rpe_rotation_rmse": "Relative error, rotation",
+    "displacement_x_rmse": "Error of displacement in x",
+    "displacement_y_rmse": "Error of displacement in y",
+    "displacement_z_rmse": "Error of displacement in z",
+    "kitti_translation": "KITTI translation error",
+    "kitti_rotation": "KITTI rotation error",
+    "frames": "Frames to be posed",
+    "frames_missing": "Frames without a pose",
+    "rmse": "Elevation error, RMS",
+    "nmad": "Elevation error, robust deviation (NMAD)",
+    "p95": "Elevation error, 95 %",
+    "bias": "Elevation error, mean",
+    "completeness": "Completeness",
+    "unseen": "Cells that not both cameras see",
+    "hazard_cells": "Hazardous cells crossed",
+    "unknown_cells": "Unknown cells crossed",
+    "crossed_cells": "Cells crossed",
+    "hazardous_share": "Truly hazardous cells",
+}
+"""Words for the names that the assessing stages use."""
+
+KEY = frozenset(
+    {
+        "trajectory_drift",
+        "trajectory_ate_rmse",
+        "trajectory_rpe_translation_rmse",
+        "trajectory_rpe_rotation_rmse",
+        "trajectory_kitti_translation",
+        "dem_pairs_rmse_median",
+        "dem_pairs_rmse_max",
+        "dem_pairs_completeness_min",
+        "dem_merged_rmse",
+        "dem_merged_nmad",
+        "path_check_hazard_cells",
+        "frames_posed",
+        "reprojection_rms",
+        "matched",
+        "mapped_area",
+        "elevation_sigma",
+        "safe",
+        "hazardous",
+        "unknown",
+        "path_length",
+    }
+)
+"""Those that stand in the first table; the others are folded."""
+
+
+def metrics(scene: Scene, frames: Rows, pairs: Rows) -> dict[str, Metric]:
+    """Every figure: ``group, label, value, unit, how, truth, completeness, key``, those against truth first."""
+    found = {**_trajectory(scene.view, frames), **_elevation(scene.view, pairs), **_path_check(scene.view)}
+    for group, more in (
+        ("Poses", _poses(frames)),
+        ("Matching and terrain", _matching(pairs) | _terrain(scene)),
+        ("Hazards and path", _hazards(scene) | _path(scene.view)),
+        ("Run", _run(scene.view)),
+    ):
+        found |= {name: {"group": group, "truth": None, **metric} for name, metric in more.items()}
+    return {name: {**metric, "key": name in KEY} for name, metric in found.items()}
+
+
+def _assessed(view: RunView, handle: Any, prefix: str, group: str) -> Iterator[tuple[str, Metric]]:
+    """Figures as an assessing stage gives them."""
+    bundle = view.bundle(handle)
+    for name, given in (bundle.meta["metrics"] if bundle is not None else {}).items():
+        label = LABELS.get(name, name.replace("_", " ").capitalize())
+        yield prefix + name, {**given, "group": group, "label": label, "truth": view.sequence.truth_source}
+
+
+def _trajectory(view: RunView, frames: Rows) -> dict[str, Metric]:
+    complete = f"{sum(r['posed'] for r in frames)} of {len(frames)} frames"
+    found = dict(_assessed(view, view.products.accuracy, "trajectory_", "Trajectory against truth"))
+    order = [f"trajectory_{name}" for name in LABELS]
+    ordered = sorted(found, key=lambda name: order.index(name) if name in order else len(order))
+    return {name: {**found[name], "completeness": complete} for name in ordered}
+
+
+def _elevation(view: RunView, pairs: Rows) -> dict[str, Metric]:
+    """Local models (over pairs), then the merged one; the error never without the completeness."""
+    group, truth = "Elevation against truth", view.sequence.truth_source
+    found: dict[str, Metric] = {}
+    rmse = [r["rmse_m"] for r in pairs if r["rmse_m"] is not None]
+    shares = [r["completeness"] for r in pairs if r["completeness"] is not None]
+    if rmse and shares:
+        where = "within the evaluation window" if view.sequence.evaluation_window else "over the whole model"
+        least = (
+            f"{len(rmse)} of {len(pairs)} pairs; {min(shares):.0%} to {max(shares):.0%} of the cells both cameras see"
+        )
+        for name, label, value, over in (
+            ("median", "Elevation error of a pair, RMS, median", statistics.median(rmse), "median over pairs"),
+            ("max", "Elevation error of a pair, RMS, worst", max(rmse), "worst pair"),
+        ):
+            how = f"RMS of local elevation minus exact elevation {where}, {over}"
+            found[f"dem_pairs_rmse_{name}"] = _metric(label, value, "m", how, least)
+        how = f"share of the cells that both cameras see which have an elevation, {where}, worst pair"
+        found["dem_pairs_completeness_min"] = _metric("Completeness of a pair, worst", min(shares), "1", how, least)
+    found = {name: {"group": group, "truth": truth, **metric} for name, metric in found.items()}
+    merged = dict(_assessed(view, view.products.dem_accuracy, "dem_merged_", group))
+    share = merged.get("dem_merged_completeness", {}).get("value")
+    complete = None if share is None else f"{share:.0%} of the cells that both cameras of a pair see"
+    for name, metric in merged.items():
+        found[name] = {**metric, "label": f"Merged: {metric['label'][0].lower()}{metric['label'][1:]}"}
+        found[name]["completeness"] = complete
+    return found
+
+
+def _path_check(view: RunView) -> dict[str, Metric]:
+    found = dict(_assessed(view, view.products.path_check, "path_check_", "Path against truth"))
+    if "path_check_path_length" in found:
+        found["path_check_path_length"]["label"] = "Length of the path"
+    return {name: {**metric, "completeness": None} for name, metric in found.items()}
+
+
+def _metric(label: str, value: Any, unit: str, how: str, completeness: str | None = None) -> Metric:
+    plain = value if isinstance(value, str | int) or value is None else tables.finite(value)
+    return {"label": label, "value": plain, "unit": unit, "how": how, "completeness": completeness}
+
+
+def _poses(frames: Rows) -> dict[str, Metric]:
+    posed = [r for r in frames if r["posed"]]
+    resected = [r for r in posed if r["rms_px"]]
+    every = f"{len(posed)} of {len(frames)} frames"
+    found = {"frames_posed": _metric("Frames with a pose", len(posed), "frames", "counted", every)}
+    if resected:
+        how = "root mean square over the landmarks that agree with the pose, then median over frames"
+        value = statistics.median(r["rms_px"] for r in resected)
+        found["reprojection_rms"] = _metric("Back-projection error", value, "px", how, every)
+        how = "landmarks left after removal of inconsistent ones: median over frames"
+        value = statistics.median(r["inliers"] for r in resected)
+        found["inliers"] = _metric("Landmarks a frame", value, "", how, every)
+    return found
+
+
+def _matching(pairs: Rows) -> dict[str, Metric]:
+    matched = [r["matched"] for r in pairs if r["matched"] is not None]
+    every = f"{len(matched)} of {len(pairs)} basic pairs"
+    found = {}
+    if matched:
+        how = "pixels of the left image with a measured, back-matched disparity (not interpolated): mean over pairs"
+        found["matched"] = _metric("Matched pixels", statistics.fmean(matched), "1", how, every)
+    sources = sorted({r["vertical"] for r in pairs if r["vertical"]})
+    if sources:
+        how = "the most trusted one at hand"
+        found["vertical"] = _metric("Source of the vertical", ", ".join(sources), "", how, every)
+    return found
+
+
+def _terrain(scene: Scene) -> dict[str, Metric]:
+    world = scene.world
+    if world is None or world.get("elevation") is None:
+        return {}
+    defined = np.isfinite(world.arrays["elevation"])
+    area = float(defined.sum()) * world.lattice.cell**2
+    of_map = f"{defined.mean():.0%} of the map's cells"
+    found = {
+        "cell_size": _metric("Cell size", world.lattice.cell, "m", "from the rig, or given (locus.cell_size)"),
+        "mapped_area": _metric("Mapped area", area, "m²", "cells with an elevation", of_map),
+    }
+    sigma = world.get("elevation_std")
+    if sigma is not None and np.isfinite(sigma).any():
+        how = "predicted from the disparity's error and the rig's geometry: median over cells"
+        value = float(np.nanmedian(sigma))
+        found["elevation_sigma"] = _metric("Standard deviation of elevation", value, "m", how, of_map)
+    return found
+
+
+def _hazards(scene: Scene) -> dict[str, Metric]:
+    if scene.risk is None:
+        return {}
+    risk, found = scene.risk.arrays["risk"], {}
+    for k, name in enumerate(("safe", "hazardous", "unknown")):
+        how = f"share of all cells of the risk map; limits of {scene.view.config.vehicle.name}"
+        found[name] = _metric(f"{name.capitalize()} cells", float((risk == k).mean()), "1", how)
+    return found
+
+
+def _path(view: RunView) -> dict[str, Metric]:
+    path = view.bundle(view.products.path)
+    if path is None or not path.meta.get("found"):
+        return {}
+    meta = path.meta
+    found = {"path_length": _metric("Path length", meta.get("length_m"), "m", "along its vertices in 3-D")}
+    if meta.get("climb_m") is not None:
+        found["path_climb"] = _metric("Climb of the path", meta["climb_m"], "m", "sum of its rises")
+    if meta.get("max_inclination") is not None:
+        value = float(np.degrees(meta["max_inclination"]))
+        found["path_inclination"] = _metric("Steepest ground on the path", value, "deg", "local inclination, largest")
+    return found
+
+
+def _run(view: RunView) -> dict[str, Metric]:
+    rig = view.sequence.rig
+    return {
+        "baseline": _metric("Stereo baseline", rig.baseline, "m", "given calibration; sets the scale"),
+        "wall_clock": _metric("Time of this run", view.seconds, "s", "wall clock; cached results cost no time"),
+    }

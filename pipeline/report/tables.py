@@ -1,0 +1,186 @@
+"""The report's tables as plain rows: Table 2 of the paper beside this run, frames, pairs, files."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.report import gather
+from pipeline.report.view import RunView, TaskRow
+
+TABLE_2: tuple[tuple[str, str, float, tuple[str, ...]], ...] = (
+    ("Stereo matching (HFVM)", "one stereo pair, every pixel", 40.0, ("hfvm",)),
+    ("Locus: elevation and ortho image", "one stereo pair", 20.0, ("locus/local",)),
+    ("Risk map", "one local elevation model", 1.0, ("risk/local",)),
+    ("Path", "one local risk map", 1.0, ("path/local",)),
+    ("Tracking of landmarks", "one segment between basic pairs", 5.0, ("track",)),
+    ("Calibration update (resection)", "one segment between basic pairs", 5.0, ("resect",)),
+)
+"""The paper's modules, our unit of work, seconds in 1999 on a Pentium 166 MHz, and the labels of our tasks."""
+
+FILES: dict[str, tuple[str, str]] = {
+    "report.html": ("this page", "any browser"),
+    "report.json": ("every number of this page, for programs", "any text editor, jq"),
+    "trajectory.kitti": (
+        "pose of each left camera, a 3 x 4 matrix a line, world from camera, m",
+        "evo, any text editor",
+    ),
+    "trajectory.tum": ("the same as time, position and quaternion x y z w", "evo, any text editor"),
+    "frames.json": ("names of the frames, their numbers and conventions of the trajectory files", "any text editor"),
+    "dem.tif": ("merged elevation, m, NaN undefined", "QGIS, GDAL"),
+    "dem_sigma.tif": ("standard deviation of the elevation, m", "QGIS, GDAL"),
+    "ortho.tif": ("merged ortho image, grey 0..255", "QGIS, GDAL"),
+    "risk.tif": ("risk map: 0 safe, 1 hazardous, 2 unknown", "QGIS, GDAL"),
+    "path.geojson": ("path over the merged terrain, metres in the world frame (not longitude and latitude)", "QGIS"),
+    "path.gpkg": ("the path with its engineering coordinate system", "QGIS"),
+    "config.toml": ("every parameter in force; give it back with --config", "any text editor"),
+    "ledger.jsonl": ("what became of every task, a JSON object a line", "any text editor, jq"),
+}
+"""What a run's folder holds: what each file is, and a free program that opens it."""
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Seconds of one kind of task; ``unit`` is the median of a task, None where none has a time."""
+
+    name: str
+    what: str
+    in_1999: float | None
+    unit: float | None
+    total: float | None
+    tasks: int
+    computed: int
+    cached: int
+
+
+def _timing(name: str, what: str, in_1999: float | None, rows: Sequence[TaskRow]) -> Timing:
+    seconds = [r.seconds for r in rows if r.seconds is not None]
+    return Timing(
+        name,
+        what,
+        in_1999,
+        statistics.median(seconds) if seconds else None,
+        sum(seconds) if seconds else None,
+        len(rows),
+        sum(r.status == "computed" for r in rows),
+        sum(r.status == "cached" for r in rows),
+    )
+
+
+def table_2(view: RunView) -> tuple[list[Timing], Timing]:
+    """The paper's Table 2 beside this run, and its last line ("together")."""
+    rows = [
+        _timing(name, what, then, [t for t in view.tasks if _belongs(t.label, labels)])
+        for name, what, then, labels in TABLE_2
+    ]
+    units = [r.unit for r in rows if r.unit is not None]
+    complete = len(units) == len(rows)
+    together = Timing(
+        "Together",
+        "one cycle",
+        sum(then for *_, then, _ in TABLE_2),
+        sum(units) if complete else None,
+        sum(r.total or 0.0 for r in rows),
+        sum(r.tasks for r in rows),
+        sum(r.computed for r in rows),
+        sum(r.cached for r in rows),
+    )
+    return rows, together
+
+
+def other_stages(view: RunView) -> list[Timing]:
+    """Seconds of what Table 2 does not list, by the first one or two parts of the label."""
+    paper = [label for *_, labels in TABLE_2 for label in labels]
+    kinds: dict[str, list[TaskRow]] = {}
+    for task in view.tasks:
+        if not _belongs(task.label, paper):
+            kinds.setdefault(_kind(task.label), []).append(task)
+    return [_timing(kind, "", None, rows) for kind, rows in kinds.items()]
+
+
+def _belongs(label: str, kinds: Sequence[str]) -> bool:
+    return any(label == kind or label.startswith(f"{kind}/") for kind in kinds)
+
+
+def _kind(label: str) -> str:
+    """``pyramid/left/3`` to ``pyramid``, ``locus/world/4`` to ``locus/world``."""
+    parts = label.split("/")
+    split = parts[0] in ("locus", "risk", "path", "dem_accuracy") and len(parts) > 1
+    return "/".join(parts[:2]) if split else parts[0]
+
+
+def frames(scene: gather.Scene) -> list[dict[str, Any]]:
+    """One row a chosen frame: how its pose was found, how well, and how far it is from the truth."""
+    view, track = scene.view, scene.track
+    facts = gather.frame_facts(view)
+    names = view.sequence.frame_names
+    rows = []
+    for i, frame in enumerate(view.frames):
+        fact = facts.get(frame, {})
+        error = None if track.truth is None else float(np.linalg.norm(track.left[i] - track.truth[i]))
+        rows.append(
+            {
+                "frame": frame,
+                "name": names[frame] if frame < len(names) else str(frame),
+                "posed": bool(track.posed[i]),
+                "segment": int(track.segment[i]) if track.segment[i] >= 0 else None,
+                "landmarks": fact.get("landmarks"),
+                "inliers": fact.get("inliers"),
+                "rms_px": fact.get("rms_px"),
+                "x_m": finite(track.left[i, 0]),
+                "y_m": finite(track.left[i, 1]),
+                "z_m": finite(track.left[i, 2]),
+                "sigma_m": finite(track.sigma[i]),
+                "error_m": finite(error),
+                "basic": frame in view.products.disparity,
+            }
+        )
+    if rows and rows[0]["posed"]:  # the first frame is the world's origin: nothing was resected
+        rows[0]["rms_px"] = rows[0]["segment"] = None
+    return rows
+
+
+def pairs(view: RunView) -> list[dict[str, Any]]:
+    """One row a basic pair: matching, levelling, elevation model, local hazards and path."""
+    return [_pair(view, pair) for pair in view.products.disparity]
+
+
+def _pair(view: RunView, pair: int) -> dict[str, Any]:
+    p = view.products
+    disparity, level = view.bundle(p.disparity[pair]), view.bundle(p.level.get(pair))
+    dem, risk, path = (view.bundle(d.get(pair)) for d in (p.local_dem, p.local_risk, p.local_path))
+    accuracy = view.bundle(p.local_dem_accuracy.get(pair))
+    assessed = {} if accuracy is None else accuracy.meta["metrics"]
+    shares = {} if risk is None else risk.meta.get("shares", {})
+    return {
+        "frame": pair,
+        "matched": None if disparity is None else float(np.mean(np.asarray(disparity["validity"]) & 1)),
+        "vertical": None if level is None else level.meta.get("source"),
+        "modelled": dem is not None,
+        "defined": None if dem is None else dem.meta.get("defined"),
+        "sigma_m": None if dem is None else dem.meta.get("median_elevation_std"),
+        "hazardous": shares.get("hazardous"),
+        "unknown": shares.get("unknown"),
+        "path": None if path is None else ("found" if path.meta["found"] else path.meta.get("reason") or "none"),
+        "path_m": None if path is None else path.meta.get("length_m"),
+        "rmse_m": assessed.get("rmse", {}).get("value"),
+        "completeness": assessed.get("completeness", {}).get("value"),
+    }
+
+
+def files(folder: Path) -> list[tuple[str, str, str]]:
+    """Name, meaning and program of each file of the run's folder, in the order of :data:`FILES`, others behind."""
+    there = {p.name for p in folder.iterdir() if p.is_file() and not p.name.startswith(".")}
+    there |= {"report.html", "report.json"}
+    known = [(name, *FILES[name]) for name in FILES if name in there]
+    return known + [(name, "", "") for name in sorted(there - set(FILES))]
+
+
+def finite(value: Any) -> float | None:
+    """A number that JSON can hold, or None."""
+    return float(value) if value is not None and np.isfinite(value) else None

@@ -1,0 +1,73 @@
+"""What the report is made from: one frozen view of a run, without the engine behind it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Literal
+
+from stages.declare import Bundle
+
+if TYPE_CHECKING:
+    from datasets.protocol import Sequence
+    from pipeline.reconstruct import Products
+
+Status = Literal["computed", "cached", "failed", "skipped"]
+
+
+@dataclass(frozen=True)
+class TaskRow:
+    """One task of the run.
+
+    Attributes
+    ----------
+    label : ``"locus/local/4"``; its first part groups it with its like.
+    stage : name of the stage, ``"locus"``.
+    status : what became of it in this run.
+    seconds : the time it took when it was computed, in this run or an earlier one; None where it never was.
+    reason : of a failed or skipped task: why, in one line.
+    """
+
+    label: str
+    stage: str
+    status: Status
+    seconds: float | None = None
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class RunView:
+    """Everything that the report reads.
+
+    Attributes
+    ----------
+    run_id : name of the run's folder.
+    sequence : what was reconstructed (:class:`datasets.protocol.Sequence`).
+    frames : chosen frame numbers, in order.
+    products : handles of what the run was to deliver; those of failed tasks lead to no bundle.
+    bundle : the artifact of a handle, None where there is none (also for None).
+    tasks : every task of the plan.
+    config : validated configuration with all defaults, one section a stage, and ``vehicle``.
+    config_toml : the same, as it was written to ``config.toml``.
+    seconds : wall-clock time of the run so far.
+    versions : distribution or program to version.
+    command : the command line that repeats this run.
+    vehicle_source : who stated the vehicle's limits, in words.
+    started : when, in words (ISO 8601, UTC).
+    notes : further facts to repeat.
+    """
+
+    run_id: str
+    sequence: Sequence
+    frames: tuple[int, ...]
+    products: Products
+    bundle: Callable[[Any], Bundle | None]
+    tasks: tuple[TaskRow, ...]
+    config: Any
+    config_toml: str = ""
+    seconds: float = 0.0
+    versions: Mapping[str, str] = field(default_factory=dict)
+    command: str = ""
+    vehicle_source: str = ""
+    started: str = ""
+    notes: tuple[str, ...] = ()

@@ -1,0 +1,259 @@
+"""One run from options to a folder of results: open, configure, run the graph, write products and report.
+
+Everything that takes time is a cached task; what this module writes (rasters, trajectory, path, report) is rendered
+anew by each run into ``RUNS/<sequence>/<run id>/``. ``latest`` moves last, and only to a folder that is complete
+or whose holes were accepted by ``--keep-going``.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from pipeline import config as configuration
+from pipeline.store import Store
+from stages.declare import Bundle, Params
+from stages.errors import ConfigError, RilleError
+
+COMPLETE, FAILED, HOLES = 0, 1, 3
+DISTRIBUTIONS = ("rille", "numpy", "numba", "scipy", "opencv-python-headless", "dask", "zarr", "rasterio")
+
+
+@dataclass(frozen=True)
+class Options:
+    """What the command line asks for."""
+
+    sequence: str
+    assignments: tuple[str, ...] = ()
+    config: Path | None = None
+    frames: str | None = None
+    jobs: int | None = None
+    executor: str = "processes"
+    keep_going: bool = False
+    force: frozenset[str] = frozenset()
+    runs: Path = Path("runs")
+    cache: Path = Path(".rille/cache")
+    progress: str = "auto"
+
+    def command(self) -> str:
+        """The command line that repeats this run."""
+        words = ["rille", "reconstruct", self.sequence]
+        words += [f"--config {self.config}"] if self.config else []
+        words += [f"--frames {self.frames}"] if self.frames else []
+        return " ".join(words + [f"--set {a}" for a in self.assignments])
+
+
+def choose_frames(text: str | None, count: int) -> tuple[int, ...]:
+    """Frame numbers of ``START:STOP[:STEP]``, or all.
+
+    Raises
+    ------
+    ConfigError
+        The range is no range, empty, or reaches beyond the sequence.
+    """
+    if text is None:
+        return tuple(range(count))
+    remedy = f"give START:STOP[:STEP] within 0:{count}"
+    try:
+        parts = [int(p) if p else None for p in text.split(":")]
+    except ValueError:
+        raise ConfigError(f"--frames {text!r} is not a range", remedy=remedy) from None
+    if not 2 <= len(parts) <= 3 or any(p is not None and p < 0 for p in parts) or parts[2:] == [0]:
+        raise ConfigError(f"--frames {text!r} is not a range", remedy=remedy)
+    if (parts[1] or 0) > count or (parts[0] or 0) >= count:
+        raise ConfigError(f"--frames {text!r} reaches beyond the sequence's {count} frames", remedy=remedy)
+    chosen = tuple(range(count)[slice(*parts)])
+    if len(chosen) < 2:
+        raise ConfigError(f"--frames {text!r} leaves {len(chosen)} frame", remedy="a trajectory needs at least two")
+    return chosen
+
+
+def settings(options: Options) -> tuple[Any, Params, dict[str, Any], str]:
+    """Sequence, configuration, dataset overrides, and who stated the vehicle's limits."""
+    from datasets.registry import open_sequence
+
+    given = configuration.read_toml(options.config) if options.config else {}
+    configuration.merge(given, configuration.parse_assignments(options.assignments))
+    for_dataset, for_stages = configuration.split_dataset(given)
+    sequence = open_sequence(options.sequence, for_dataset, options.cache / "files.json")
+    vehicle, source = {}, "default rover of the program (neither the sequence nor the user states one)"
+    if sequence.vehicle is not None:
+        vehicle, source = {"vehicle": sequence.vehicle.model_dump()}, f"sequence {sequence.name}"
+    if "vehicle" in for_stages:
+        source = "user"
+    config = configuration.build(vehicle, configuration.expand(sequence.defaults), for_stages)
+    return sequence, config, for_dataset, source
+
+
+def reconstruct(options: Options) -> int:
+    """Run the whole chain; gives the exit code. Running the same options again resumes."""
+    from pipeline.executor import prepare_environment
+
+    prepare_environment(options.cache)  # before anything imports numba
+
+    from pipeline import driver, progress
+    from pipeline.dag import Graph
+    from pipeline.reconstruct import Reconstruction
+
+    _known_stages(options.force)
+    started = datetime.now(UTC)
+    sequence, config, for_dataset, vehicle_source = settings(options)
+    frames = choose_frames(options.frames, sequence.frames)
+    text = _header(options, for_dataset) + configuration.to_toml(config)
+    folder = _make_folder(options.runs / sequence.name, started, text + repr(frames))
+    (folder / "config.toml").write_text(text, encoding="utf-8")
+
+    graph, store = Graph(), Store(options.cache)
+    products = Reconstruction(graph, sequence, config, frames).build()
+    result = driver.run(
+        graph,
+        store,
+        executor=options.executor,
+        jobs=options.jobs,
+        keep_going=options.keep_going,
+        force=options.force,
+        ledger=folder / "ledger.jsonl",
+        progress=progress.make(options.progress),
+    )
+    if not result.ok and not options.keep_going:
+        _list_missing(graph, folder)
+        result.check()
+
+    from pipeline import outputs
+    from pipeline.report import RunView
+
+    view = RunView(
+        run_id=folder.name,
+        sequence=sequence,
+        frames=frames,
+        products=products,
+        bundle=outputs.bundles(store),
+        tasks=outputs.task_rows(graph, store),
+        config=config,
+        config_toml=text,
+        seconds=result.seconds,
+        versions=_versions(),
+        command=options.command(),
+        vehicle_source=vehicle_source,
+        started=started.strftime("%Y-%m-%dT%H:%M:%SZ"),
+        notes=sequence.notes,
+    )
+    outputs.write(folder, view)
+    _point_latest(folder)
+    total = result.total()
+    print(f"{folder}  computed {total.computed}, cached {total.cached}, missing {total.failed + total.skipped}")
+    if result.ok:
+        return COMPLETE
+    _list_missing(graph, folder)
+    return HOLES
+
+
+def _known_stages(names: frozenset[str]) -> None:
+    known = {*configuration.STAGE_MODULES, "image", "scene", "render"}
+    for name in sorted(names - known):
+        raise ConfigError(f"--force {name!r} is no stage", remedy=f"one of {', '.join(sorted(known))}")
+
+
+def _header(options: Options, for_dataset: Mapping[str, Any]) -> str:
+    import tomli_w
+
+    lines = [f"# {options.command()}", "# rille reconstruct SEQ --config THIS_FILE uses the same parameters."]
+    return "\n".join(lines) + "\n\n" + (tomli_w.dumps(dict(for_dataset)) + "\n" if for_dataset else "")
+
+
+def _make_folder(parent: Path, started: datetime, plan: str) -> Path:
+    """New folder named by time and a short digest of the plan."""
+    name = f"{started:%Y%m%dT%H%M%SZ}-{hashlib.sha256(plan.encode()).hexdigest()[:8]}"
+    for suffix in ["", *(f"-{i}" for i in range(2, 100))]:
+        folder = parent / (name + suffix)
+        try:
+            folder.mkdir(parents=True)
+        except FileExistsError:
+            continue
+        except OSError as error:
+            raise RilleError(
+                f"cannot make {folder}: {error.strerror}", remedy="choose another --runs folder"
+            ) from error
+        return folder
+    raise RilleError(f"too many runs named {name}", remedy="remove some, or wait a second")
+
+
+def _point_latest(folder: Path) -> None:
+    """Move ``latest`` to a finished run in one step."""
+    link = folder.parent / f".latest-{os.getpid()}"
+    link.symlink_to(folder.name, target_is_directory=True)
+    link.replace(folder.parent / "latest")
+
+
+def _list_missing(graph: Any, folder: Path) -> None:
+    """Say on stderr what is missing and why: failures in full, what was skipped for them counted."""
+    failed = [h for h in graph.nodes if h.status == "failed"]
+    skipped = [h for h in graph.nodes if h.status == "skipped"]
+    for h in failed:
+        print(f"rille: missing {h.label}: {' '.join(str(h.error).split())}", file=sys.stderr)
+    print(f"rille: {len(failed)} failed, {len(skipped)} left out; ledger: {folder / 'ledger.jsonl'}", file=sys.stderr)
+
+
+def _versions() -> dict[str, str]:
+    from importlib.metadata import version
+
+    python = ".".join(str(v) for v in sys.version_info[:3])
+    return {"python": python} | {name: version(name) for name in DISTRIBUTIONS}
+
+
+def export_dataset(name: str, directory: Path, assignments: tuple[str, ...], cache: Path) -> int:
+    """Write a built-in sequence as plain files; rendering is cached like any other work."""
+    from pipeline.executor import prepare_environment
+
+    prepare_environment(cache)
+
+    from datasets.export import export
+    from datasets.protocol import Source
+    from datasets.registry import open_sequence
+    from pipeline.task import Ref, Spec, ensure
+
+    for_dataset, others = configuration.split_dataset(configuration.parse_assignments(assignments))
+    if others:
+        raise ConfigError(f"--set {next(iter(others))}: not a section of a sequence", remedy="set mockup.key=value")
+    store = Store(cache)
+
+    def materialise(source: Source) -> Bundle:
+        return store.open(artifact(source))
+
+    def artifact(source: Source) -> Ref:
+        refs = {port: artifact(upstream) for port, upstream in source.inputs.items()}
+        label = source.module.rsplit(".", 1)[-1]
+        return ensure(cache, Spec(source.module, label, source.params, source.args, source.hints), refs).ref
+
+    print(export(open_sequence(name, for_dataset), directory, materialise))
+    return COMPLETE
+
+
+def verify_cache(cache: Path) -> int:
+    """Compare checksums of all artifacts; exit code 1 where one is damaged."""
+    from pipeline.upkeep import verify
+
+    sound, damaged = verify(Store(cache))
+    for found in damaged:
+        print(f"rille: {found}", file=sys.stderr)
+    print(f"{sound} artifacts are sound, {len(damaged)} damaged")
+    return FAILED if damaged else COMPLETE
+
+
+def collect_garbage(cache: Path, runs: Path, *, dry_run: bool) -> int:
+    """Remove what no run in ``runs`` refers to."""
+    from pipeline import ledger, upkeep
+
+    kept: set[str] = set()
+    for path in sorted(runs.glob("*/*/ledger.jsonl")):
+        kept |= ledger.keys(path)
+    cleared = upkeep.gc(Store(cache), kept, dry_run=dry_run)
+    verb = "would remove" if dry_run else "removed"
+    print(f"{verb} {cleared.artifacts} artifacts and {cleared.orphans} leftovers, {cleared.bytes / 2**20:.1f} MiB")
+    return COMPLETE

@@ -1,0 +1,229 @@
+"""Content-addressed store of artifacts on local disk: look-up, commit, quarantine, verification and clearing up.
+
+Layout under the cache folder::
+
+    artifacts/<stage>/<key>/manifest.json    the only commit point
+    artifacts/<stage>/<key>/a-<unique>/      one attempt: an immutable zarr 3 group (xarray.open_zarr reads it)
+    quarantine/<stage>-<key>-<unique>/       damaged artifacts, set aside
+    labels/...  seconds.json                 hints for explanations and estimates; never a matter of correctness
+    numba/<digest>/                          compiled kernels by digest of all own code
+
+An attempt becomes an artifact when its manifest is linked into place, create-if-absent, after all its files are on
+the disk. Killed at any instant, a run leaves either a whole artifact or an orphan that nobody reads. Of two that
+commit one key the second is compared and thrown away: another digest is a :class:`NonDeterministicError`. A manifest
+lists each file with size and crc32c. Sizes are checked at each look-up, checksums of chunks on each read and all of
+them by :func:`pipeline.upkeep.verify`. What is damaged is set aside, counts as absent and is computed again.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import shutil
+import uuid
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import google_crc32c
+
+from pipeline.artifact import LazyArrays, array_digests, damage, fsync, output_digest, seal, write
+from stages.declare import Bundle, Stage
+from stages.errors import RilleError
+
+Manifest = dict[str, Any]
+_HEAD = b'{"crc32c": "%08x", "manifest": '
+_HEAD_SIZE = len(_HEAD % 0)
+
+
+class NonDeterministicError(RilleError):
+    """A stage gave two different results for one key."""
+
+
+class StoreError(RilleError):
+    """The cache folder cannot be read or written."""
+
+
+@dataclass(frozen=True)
+class Ref:
+    """A committed artifact: all that travels between tasks. ``path`` is relative to the store's root."""
+
+    key: str
+    stage: str
+    digest: str
+    path: str
+    meta: Mapping[str, Any]
+
+
+class Store:
+    """Artifacts under ``root`` (made at the first commit)."""
+
+    def __init__(self, root: Path | str) -> None:
+        self.root = Path(root).absolute()
+
+    def __fspath__(self) -> str:
+        return str(self.root)
+
+    def lookup(self, stage: str, key: str) -> Ref | None:
+        """The artifact of a key, its file sizes checked; a damaged one is set aside and counts as absent."""
+        try:
+            with self._clear_errors():
+                manifest = self._read_manifest(self.home(stage, key))
+        except (FileNotFoundError, NotADirectoryError):
+            return None
+        except ValueError:
+            self.set_aside(stage, key, None, "manifest.json is not readable")
+            return None
+        wrong = damage(self.root / manifest["path"], manifest["files"], lambda _: False)
+        if wrong:
+            self.set_aside(stage, key, manifest, wrong)
+            return None
+        return _ref(manifest)
+
+    def manifest(self, stage: str, key: str) -> Manifest | None:
+        """Manifest of a key as it was committed, no check of the files; None if absent or not readable."""
+        try:
+            return self._read_manifest(self.home(stage, key))
+        except (OSError, ValueError):
+            return None
+
+    def path(self, ref: Ref) -> Path:
+        """Folder of the zarr group, for ``xarray.open_zarr(path)``."""
+        return self.root / ref.path
+
+    def open(self, ref: Ref) -> Bundle:
+        """The bundle behind a reference; each array is read, and its chunks' checksums compared, at first access.
+
+        Raises
+        ------
+        StoreError
+            The artifact has gone since it was looked up.
+        """
+        manifest = self.manifest(ref.stage, ref.key)
+        if manifest is None or manifest["digest"] != ref.digest:
+            raise StoreError(f"artifact {ref.stage} {ref.key[:12]} has gone from {self.root}", remedy="run again")
+
+        def damaged(reason: str) -> None:
+            self.set_aside(ref.stage, ref.key, manifest, reason)
+
+        return Bundle(LazyArrays(self.root / manifest["path"], manifest, damaged), manifest["meta"])
+
+    def commit(
+        self, stage: Stage, key: str, bundle: Bundle, *, label: str = "", provenance: Mapping[str, Any] | None = None
+    ) -> Ref:
+        """Write a result and publish it under its key; what another one has published before stays.
+
+        Raises
+        ------
+        NonDeterministicError
+            The key is there already, with another digest.
+        StoreError
+            The disk is full or may not be written.
+        """
+        digests = array_digests(bundle.arrays)
+        digest = output_digest(digests, bundle.meta)
+        home = self.home(stage.name, key)
+        attempt = home / f"a-{uuid.uuid4().hex[:16]}"
+        with self._clear_errors():
+            try:
+                attempt.mkdir(parents=True)
+                arrays = write(attempt, stage, bundle)
+                manifest: Manifest = {
+                    "stage": stage.name,
+                    "label": label,
+                    "key": key,
+                    "digest": digest,
+                    "path": attempt.relative_to(self.root).as_posix(),
+                    "arrays": {name: {**about, "sha256": digests[name]} for name, about in arrays.items()},
+                    "meta": dict(bundle.meta),
+                    "files": seal(attempt),
+                    "provenance": dict(provenance or {}),
+                }
+                there = self._publish(home, manifest)
+            except BaseException:
+                shutil.rmtree(attempt, ignore_errors=True)
+                raise
+        if there is None:
+            return _ref(json.loads(json.dumps(manifest)))
+        shutil.rmtree(attempt, ignore_errors=True)
+        if there["digest"] != digest:
+            raise NonDeterministicError(_difference(label or key[:12], manifest, there))
+        return _ref(there)
+
+    def _publish(self, home: Path, manifest: Manifest) -> Manifest | None:
+        """Link the manifest into place; returns the sound one that was there before, if any."""
+        body = json.dumps(manifest, allow_nan=False).encode()
+        temporary = home / f"m-{uuid.uuid4().hex[:16]}.tmp"
+        try:
+            with temporary.open("wb") as file:
+                file.write(_HEAD % google_crc32c.value(body) + body + b"}\n")
+                file.flush()
+                os.fsync(file.fileno())
+            for _ in range(3):
+                try:
+                    os.link(temporary, home / "manifest.json")
+                except FileExistsError:
+                    if self.lookup(manifest["stage"], manifest["key"]) is not None:
+                        return self._read_manifest(home)
+                else:
+                    for folder in (home, *list(home.parents)[:2]):
+                        fsync(folder)
+                    return None
+            raise StoreError(f"cannot publish {home / 'manifest.json'}", remedy="remove that file and run again")
+        finally:
+            temporary.unlink(missing_ok=True)
+
+    def home(self, stage: str, key: str) -> Path:
+        """Folder of a key: its manifest and its attempts."""
+        return self.root / "artifacts" / stage / key
+
+    def _read_manifest(self, home: Path) -> Manifest:
+        """Raises ValueError where the content is not what was written."""
+        data = (home / "manifest.json").read_bytes()
+        body = data[_HEAD_SIZE:-2]
+        if data != _HEAD % google_crc32c.value(body) + body + b"}\n":
+            raise ValueError(f"{home / 'manifest.json'} is damaged")
+        manifest: Manifest = json.loads(body)
+        return manifest
+
+    def set_aside(self, stage: str, key: str, manifest: Manifest | None, reason: str) -> None:
+        """Move a damaged artifact out of the way, manifest first. Best effort: a cache may be read-only."""
+        aside = self.root / "quarantine" / f"{stage}-{key[:16]}-{uuid.uuid4().hex[:8]}"
+        home = self.home(stage, key)
+        with suppress(OSError):
+            aside.mkdir(parents=True)
+            (home / "manifest.json").rename(aside / "manifest.json")
+            if manifest is not None:
+                (self.root / manifest["path"]).rename(aside / Path(manifest["path"]).name)
+            (aside / "reason.txt").write_text(f"{reason}\n", encoding="utf-8")
+
+    @contextmanager
+    def _clear_errors(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            if error.errno in (errno.ENOSPC, errno.EDQUOT):
+                raise StoreError(
+                    f"no space left for the cache {self.root}",
+                    remedy="free space, clear the cache, or choose another folder with --cache",
+                ) from error
+            if error.errno in (errno.EROFS, errno.EACCES, errno.EPERM):
+                raise StoreError(
+                    f"the cache {self.root} may not be used ({os.strerror(error.errno)})",
+                    remedy="choose another folder with --cache",
+                ) from error
+            raise
+
+
+def _ref(manifest: Manifest) -> Ref:
+    return Ref(manifest["key"], manifest["stage"], manifest["digest"], manifest["path"], manifest["meta"])
+
+
+def _difference(label: str, new: Manifest, old: Manifest) -> str:
+    names = sorted({*new["arrays"], *old["arrays"]})
+    other = [n for n in names if new["arrays"].get(n, {}).get("sha256") != old["arrays"].get(n, {}).get("sha256")]
+    what = ", ".join(other + (["meta"] if new["meta"] != old["meta"] else []))
+    return f"stage {new['stage']} is not deterministic: {label} gave another {what or 'digest'} than before"

@@ -1,0 +1,165 @@
+"""The one body of every task: look up, and if absent compute, check, commit.
+
+A :class:`Spec` says what to compute: a stage module (its ``STAGE`` is taken), validated parameters, the arguments that
+identify the task, and hints (paths) that cannot change the result. The key is the digest of all of it but the hints
+and the label, of the code and packages behind the stage, and of the *output digests* of the inputs. Between
+tasks only :class:`~pipeline.store.Ref` travel.
+
+>>> spec = Spec("stages.select", "select", SelectParams(), {"frames": 9})
+>>> outcome = ensure(Path("cache"), spec, {})
+>>> Store("cache").open(outcome.ref).meta["basic"]
+[0, 4, 8]
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import platform
+import resource
+import sys
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from pipeline import explain
+from pipeline.code import environment, module_digests
+from pipeline.key import digest
+from pipeline.store import Ref, Store
+from stages.declare import Bundle, Params, Stage, check_outputs
+from stages.errors import RilleError
+
+__all__ = ["CodeChangedError", "Outcome", "Ref", "Refs", "Spec", "ensure", "recipe", "resolve"]
+
+FORMAT = 1
+"""Enters every key: raise it when the meaning of keys or artifacts changes."""
+
+TRIES = 3
+BACK_OFF = 0.2
+"""Seconds before the second try; four times as long before the third."""
+
+PERMANENT = (FileNotFoundError, PermissionError, IsADirectoryError, NotADirectoryError)
+
+Refs = Mapping[str, Ref | list[Ref]]
+"""Input port to the artifact given there, or to the list of them."""
+
+
+class CodeChangedError(RilleError):
+    """The source code or the packages of a worker are not those of the client."""
+
+
+@dataclass(frozen=True)
+class Spec:
+    """One task without its inputs. ``label`` names it to people (``locus/12``) and is not part of the key."""
+
+    module: str
+    label: str
+    params: Params
+    args: Mapping[str, Any] = field(default_factory=dict)
+    hints: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def stage(self) -> Stage:
+        """The declaration behind the module."""
+        return resolve(self.module)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a task: its artifact, whether it was there, seconds and peak memory (bytes) of the call."""
+
+    ref: Ref
+    cached: bool
+    seconds: float
+    peak_rss: int
+
+
+@cache
+def resolve(module: str) -> Stage:
+    """``STAGE`` of a module; its source is digested just before the import, so that both see the same files."""
+    module_digests(module)
+    stage = importlib.import_module(module).STAGE
+    if "cv2" in sys.modules:
+        sys.modules["cv2"].setNumThreads(1)
+    if not isinstance(stage, Stage):
+        raise TypeError(f"{module}.STAGE is a {type(stage).__name__}, not a Stage")
+    return stage
+
+
+def recipe(spec: Spec, refs: Refs) -> dict[str, Any]:
+    """All that determines a result; its digest is the key."""
+    stage = spec.stage
+    return {
+        "format": FORMAT,
+        "stage": stage.name,
+        "version": stage.version,
+        "code": module_digests(spec.module),
+        "env": environment(stage.requires),
+        "params": spec.params,
+        "args": dict(spec.args),
+        "inputs": {p: [r.digest for r in ref] if isinstance(ref, list) else ref.digest for p, ref in refs.items()},
+    }
+
+
+def ensure(root: Path | str, spec: Spec, refs: Refs, *, key: str | None = None, force: bool = False) -> Outcome:
+    """Give the artifact of a task, computing and committing it where it is absent (or ``force`` is set).
+
+    ``key`` is what the client expects; a worker that would compute another thing refuses. Failures of input and
+    output (``OSError``, ``TimeoutError``) are tried three times; what a stage raises otherwise is not tried again.
+    """
+    begin = time.perf_counter()
+    made = recipe(spec, refs)
+    own = digest(made, spec.label)
+    if key is not None and key != own:
+        raise CodeChangedError(
+            f"{spec.label}: source code or packages of the worker are not those the run began with",
+            remedy="run again, and edit nothing meanwhile",
+        )
+    store = Store(root)
+    for trial in range(TRIES):
+        try:
+            ref = None if force else store.lookup(spec.stage.name, own)
+            cached = ref is not None
+            if ref is None:
+                ref = _compute(store, spec, refs, own, made)
+            return Outcome(ref, cached, time.perf_counter() - begin, _peak_rss())
+        except RilleError:
+            raise
+        except (OSError, TimeoutError) as error:
+            if isinstance(error, PERMANENT) or trial == TRIES - 1:
+                raise
+            time.sleep(BACK_OFF * 4**trial)
+    raise AssertionError("unreachable")
+
+
+def _compute(store: Store, spec: Spec, refs: Refs, key: str, made: Mapping[str, Any]) -> Ref:
+    stage = spec.stage
+    inputs = {p: [store.open(r) for r in ref] if isinstance(ref, list) else store.open(ref) for p, ref in refs.items()}
+    started = time.time()
+    begin = time.perf_counter()
+    result = stage.run(spec.params, {**spec.args, **spec.hints}, inputs)
+    if not isinstance(result, Bundle):
+        raise TypeError(f"{stage.name}: run gave a {type(result).__name__}, not a Bundle")
+    check_outputs(stage, result)
+    provenance = {
+        **made,
+        "params": spec.params.model_dump(mode="json"),
+        "hints": {k: str(v) for k, v in spec.hints.items()},
+        "host": {"name": platform.node(), "machine": platform.machine(), "cpus": os.cpu_count()},
+        "python": platform.python_version(),
+        "started": started,
+        "seconds": time.perf_counter() - begin,
+        "peak_rss": _peak_rss(),
+    }
+    ref = store.commit(stage, key, result, label=spec.label, provenance=json.loads(json.dumps(provenance)))
+    explain.remember(store, stage.name, spec.label, key)
+    return ref
+
+
+def _peak_rss() -> int:
+    """Peak resident memory of this process, bytes."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)

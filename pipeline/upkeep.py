@@ -1,0 +1,116 @@
+"""Looking after a store: verification of every checksum, and clearing away what no kept run refers to."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Collection, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.artifact import damage
+from pipeline.code import tree_digest
+from pipeline.store import Store
+
+GRACE = 24 * 3600.0
+"""Seconds before an attempt without a manifest counts as an orphan: no single task takes a day."""
+
+
+@dataclass(frozen=True)
+class Damage:
+    """A damaged artifact, set aside."""
+
+    stage: str
+    key: str
+    label: str
+    reason: str
+
+
+@dataclass
+class Cleared:
+    """What was removed, or would be."""
+
+    artifacts: int = 0
+    orphans: int = 0
+    bytes: int = 0
+
+
+def verify(store: Store) -> tuple[int, list[Damage]]:
+    """Compare every file of every artifact with its recorded checksum; damaged ones are set aside.
+
+    Returns the number of sound artifacts, and the damaged ones.
+    """
+    sound, found = 0, []
+    for stage, key in _artifacts(store):
+        manifest = store.manifest(stage, key)
+        if manifest is None:
+            reason, label = "manifest.json is not readable", ""
+        else:
+            reason = damage(store.root / manifest["path"], manifest["files"], lambda _: True)
+            label = manifest["label"]
+        if reason:
+            store.set_aside(stage, key, manifest, reason)
+            found.append(Damage(stage, key, label, reason))
+        else:
+            sound += 1
+    return sound, found
+
+
+def gc(store: Store, keep: Collection[str], *, grace: float = GRACE, dry_run: bool = False) -> Cleared:
+    """Remove artifacts whose key is not in ``keep``, and orphans, quarantine and compiled kernels of other sources.
+
+    Only what is older than ``grace`` seconds goes (a run may be under way). The manifest goes first, so that an
+    interruption leaves an orphan and never half an artifact. ``keep`` are the keys of the kept runs
+    (:func:`pipeline.ledger.keys`).
+    """
+    cleared = Cleared()
+    limit = time.time() - grace
+    kept = set(keep)
+    for home in sorted(store.root.glob("artifacts/*/*")):
+        _clear_home(store, home, home.name in kept, limit, cleared, dry_run)
+    current = tree_digest()
+    for path in (*store.root.glob("quarantine/*"), *store.root.glob("numba/*")):
+        if _written(path) <= limit and not current.startswith(path.name):
+            _remove(path, cleared, dry_run)
+    return cleared
+
+
+def _clear_home(store: Store, home: Path, kept: bool, limit: float, cleared: Cleared, dry_run: bool) -> None:
+    published = home / "manifest.json"
+    manifest = store.manifest(home.parent.name, home.name)
+    mine = home / Path(manifest["path"]).name if manifest else None
+    if mine is not None and not kept and _written(published) <= limit:
+        cleared.artifacts += 1
+        _remove(published, cleared, dry_run)
+        _remove(mine, cleared, dry_run)
+    for path in (*home.glob("a-*"), *home.glob("m-*.tmp")):
+        if path != mine and _written(path) <= limit:
+            cleared.orphans += 1
+            _remove(path, cleared, dry_run)
+    if not dry_run:
+        with suppress(OSError):
+            home.rmdir()  # only where nothing is left
+
+
+def _artifacts(store: Store) -> Iterator[tuple[str, str]]:
+    for path in sorted(store.root.glob("artifacts/*/*/manifest.json")):
+        yield path.parent.parent.name, path.parent.name
+
+
+def _written(path: Path) -> float:
+    try:
+        return path.stat().st_mtime
+    except OSError:
+        return float("inf")
+
+
+def _remove(path: Path, cleared: Cleared, dry_run: bool) -> None:
+    files = [path] if path.is_file() else [p for p in path.rglob("*") if p.is_file()]
+    cleared.bytes += sum(p.stat().st_size for p in files)
+    if dry_run:
+        return
+    if path.is_file():
+        path.unlink(missing_ok=True)
+    else:
+        shutil.rmtree(path, ignore_errors=True)

@@ -1,0 +1,229 @@
+"""Trajectory against truth: absolute and relative errors, displacements, drift (section 7.4, Figure 9).
+
+``P_i`` are estimated, ``Q_i`` true poses of the left camera. Frames without an estimate are counted.
+
+* ATE: RMS distance of the positions after the best rotation and translation (Umeyama 1991,
+  doi:10.1109/34.88573, without scale), and after making the first poses equal;
+* RPE: ``(Q_i^-1 Q_i+1)^-1 (P_i^-1 P_i+1)`` of successive frames (Sturm et al. 2012, doi:10.1109/IROS.2012.6385773);
+* drift: error of the last position after making the first poses equal, over the true length of the path;
+* KITTI: relative error of all sections of 100, 200 ... 800 m that start every tenth frame, over their length
+  (Geiger et al. 2012, doi:10.1109/CVPR.2012.6248074, and its development kit).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.declare import Array, Bundle, Inputs, NoParams, Stage
+from stages.errors import InputError
+
+Floats = NDArray[np.float64]
+Metric = dict[str, Any]
+
+KITTI_LENGTHS = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
+KITTI_STEP = 10
+
+
+def metric(value: float | int | None, unit: str, how: str) -> Metric:
+    """One figure as the report prints it; ``None`` means not applicable, and ``how`` says why."""
+    sound = value is not None and math.isfinite(value)
+    return {"value": value if sound else None, "unit": unit, "how": how}
+
+
+def trajectory_accuracy(estimate: Floats, truth: Floats) -> tuple[dict[str, Floats], dict[str, Metric]]:
+    """Compare an estimated trajectory with the true one.
+
+    Parameters
+    ----------
+    estimate : (frame, 3, 4) T_world_left, metres; NaN where a frame has no pose.
+    truth : (frame, 3, 4) T_truth_left of the same frames.
+
+    Returns
+    -------
+    Arrays ``position``, ``position_truth`` (frame, xyz) and ``displacement``, ``displacement_truth`` (step, xyz), all
+    in the world frame (truth brought there by the first posed frame), and metrics by name.
+
+    Raises
+    ------
+    InputError
+        The numbers of frames differ or no frame has a pose.
+    """
+    if estimate.shape != truth.shape:
+        raise InputError(f"{len(estimate)} estimated and {len(truth)} true poses do not match")
+    posed = np.flatnonzero(np.isfinite(estimate).all(axis=(1, 2)))
+    if len(posed) == 0:
+        raise InputError("no frame has a pose", remedy="see why tracking or resection failed")
+    P, Q = _square(estimate), _square(truth)
+    aligned = P[posed[0]] @ _inverse(Q[posed[0]]) @ Q
+    arrays = {
+        "position": P[:, :3, 3].copy(),
+        "position_truth": aligned[:, :3, 3].copy(),
+        "displacement": np.diff(P[:, :3, 3], axis=0),
+        "displacement_truth": np.diff(aligned[:, :3, 3], axis=0),
+    }
+    metrics = {
+        "frames": metric(len(P), "frames", "frames that were to be posed"),
+        "frames_missing": metric(len(P) - len(posed), "frames", "of them without a pose"),
+    }
+    metrics |= _absolute(P[posed], Q[posed], aligned[posed])
+    metrics |= _drift(P, aligned, posed)
+    metrics |= _relative(P, Q)
+    metrics |= _displacement(arrays["displacement"], arrays["displacement_truth"])
+    return arrays, metrics | _kitti(P, Q)
+
+
+def umeyama(source: Floats, target: Floats) -> tuple[Floats, Floats]:
+    """Rotation (3, 3) and translation (3,) that bring points (n, 3) nearest to others in the least-squares sense."""
+    a, b = source.mean(axis=0), target.mean(axis=0)
+    u, _, vt = np.linalg.svd((target - b).T @ (source - a))
+    sign = np.diag([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
+    rotation = u @ sign @ vt
+    return rotation, b - rotation @ a
+
+
+def _absolute(P: Floats, Q: Floats, aligned: Floats) -> dict[str, Metric]:
+    rotation, translation = umeyama(P[:, :3, 3], Q[:, :3, 3])
+    best = P[:, :3, 3] @ rotation.T + translation - Q[:, :3, 3]
+    first = P[:, :3, 3] - aligned[:, :3, 3]
+    return {
+        "ate_rmse": metric(_rms(best), "m", "RMS position error after the best rotation and translation, no scale"),
+        "ate_first_frame_rmse": metric(_rms(first), "m", "RMS position error with the first poses made equal"),
+        "ate_first_frame_max": metric(
+            float(np.linalg.norm(first, axis=1).max()), "m", "largest position error with the first poses made equal"
+        ),
+    }
+
+
+def _drift(P: Floats, aligned: Floats, posed: NDArray[np.intp]) -> dict[str, Metric]:
+    last = posed[-1]
+    length = float(np.linalg.norm(np.diff(aligned[posed[0] : last + 1, :3, 3], axis=0), axis=1).sum())
+    error = float(np.linalg.norm(P[last, :3, 3] - aligned[last, :3, 3]))
+    turn = math.degrees(float(_angle(_inverse(aligned[last]) @ P[last])))
+    percent = 100.0 * error / length if length > 0 else None
+    how = "error of the last position with the first poses made equal"
+    return {
+        "path_length": metric(length, "m", "true length from the first to the last posed frame"),
+        "final_error": metric(error, "m", how),
+        "final_rotation_error": metric(turn, "deg", "rotation error of the last pose, first poses made equal"),
+        "drift": metric(percent, "%", f"{how}, over the true length" if length > 0 else "the camera did not move"),
+    }
+
+
+def _relative(P: Floats, Q: Floats) -> dict[str, Metric]:
+    E = _inverse(_inverse(Q[:-1]) @ Q[1:]) @ (_inverse(P[:-1]) @ P[1:])
+    E = E[np.isfinite(E).all(axis=(1, 2))]
+    if len(E) == 0:
+        none = "not applicable: no two successive frames have poses"
+        return {k: metric(None, u, none) for k, u in (("rpe_translation_rmse", "m"), ("rpe_rotation_rmse", "deg"))}
+    shift, turn = np.linalg.norm(E[:, :3, 3], axis=1), np.degrees(_angle(E))
+    how = f"of the motion between successive frames, {len(E)} pairs"
+    return {
+        "rpe_translation_rmse": metric(_rms(E[:, :3, 3]), "m", f"RMS error {how}"),
+        "rpe_translation_median": metric(float(np.median(shift)), "m", f"median error {how}"),
+        "rpe_translation_max": metric(float(shift.max()), "m", f"largest error {how}"),
+        "rpe_rotation_rmse": metric(float(np.sqrt(np.mean(turn**2))), "deg", f"RMS rotation error {how}"),
+    }
+
+
+def _displacement(estimate: Floats, truth: Floats) -> dict[str, Metric]:
+    """Figure 9: components of the displacement between successive frames in the first levelled camera frame."""
+    error = estimate - truth
+    error = error[np.isfinite(error).all(axis=1)]
+    return {
+        f"displacement_{axis}_rmse": metric(
+            float(np.sqrt(np.mean(error[:, k] ** 2))) if len(error) else None,
+            "m",
+            f"RMS error of the {axis} displacement between successive frames, {len(error)} pairs",
+        )
+        for k, axis in enumerate("xyz")
+    }
+
+
+def _kitti(P: Floats, Q: Floats) -> dict[str, Metric]:
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(Q[:, :3, 3], axis=0), axis=1))])
+    errors = []
+    for first in range(0, len(Q), KITTI_STEP):
+        for length in KITTI_LENGTHS:
+            last = int(np.searchsorted(along, along[first] + length, side="right"))
+            if last >= len(Q) or not np.isfinite(P[[first, last]]).all():
+                continue
+            E = _inverse(_inverse(P[first]) @ P[last]) @ (_inverse(Q[first]) @ Q[last])
+            errors.append((np.linalg.norm(E[:3, 3]) / length, _angle(E) / length))
+    if not errors:
+        why = f"not applicable: the true path is {along[-1]:.1f} m long, the shortest section 100 m"
+        if along[-1] > KITTI_LENGTHS[0]:
+            why = "not applicable: no section of 100 m has poses at both ends"
+        return {"kitti_translation": metric(None, "%", why), "kitti_rotation": metric(None, "deg/100 m", why)}
+    shift, turn = np.mean(np.array(errors), axis=0)
+    how = f"mean relative error of {len(errors)} sections of 100-800 m, one set every {KITTI_STEP} frames"
+    return {
+        "kitti_translation": metric(100.0 * float(shift), "%", how),
+        "kitti_rotation": metric(100.0 * math.degrees(float(turn)), "deg/100 m", how),
+    }
+
+
+def _rms(vectors: Floats) -> float:
+    return float(np.sqrt(np.mean(np.sum(vectors**2, axis=1))))
+
+
+def _square(poses: Floats) -> Floats:
+    out = np.zeros((len(poses), 4, 4))
+    out[:, :3], out[:, 3, 3] = poses, 1.0
+    return out
+
+
+def _inverse(T: Floats) -> Floats:
+    out = np.zeros_like(T)
+    R = np.swapaxes(T[..., :3, :3], -1, -2)
+    out[..., :3, :3] = R
+    out[..., :3, 3] = -(R @ T[..., :3, 3, None])[..., 0]
+    out[..., 3, 3] = 1.0
+    return out
+
+
+def _angle(T: Floats) -> Floats:
+    """Rotation angle, radians, of transforms (..., 4, 4); exact for small angles, unlike acos of the trace."""
+    R = T[..., :3, :3]
+    axis = np.stack([R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], axis=-1)
+    return np.asarray(np.arctan2(np.linalg.norm(axis, axis=-1), np.trace(R, axis1=-2, axis2=-1) - 1.0))
+
+
+def by_frame(poses: Floats, frames: list[int], wanted: list[int]) -> Floats:
+    """Poses (frame, 3, 4) of the wanted frames, NaN where there is none."""
+    row = {frame: k for k, frame in enumerate(frames)}
+    out = np.full((len(wanted), 3, 4), np.nan)
+    for k, frame in enumerate(wanted):
+        if frame in row:
+            out[k] = poses[row[frame]]
+    return out
+
+
+def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+    trajectory, truth = inputs["trajectory"], inputs["truth"]
+    given = list(trajectory.meta["frames"])
+    wanted = given if truth.meta["frames"] is None else list(truth.meta["frames"])
+    estimate = by_frame(np.asarray(trajectory["poses"]), given, wanted)
+    arrays, metrics = trajectory_accuracy(estimate, np.asarray(truth["poses"]))
+    return Bundle(arrays, {"metrics": metrics, "frames": wanted, "truth": truth.meta["source"]})
+
+
+STAGE = Stage(
+    name="accuracy",
+    version=1,
+    summary="trajectory against truth: ATE, RPE, displacements, drift, KITTI",
+    params=NoParams,
+    inputs=("trajectory", "truth"),
+    outputs=(
+        Array("position", ("frame", "xyz"), "float64", "m", "estimated position", "nan", "world"),
+        Array("position_truth", ("frame", "xyz"), "float64", "m", "true position, first poses equal", "nan", "world"),
+        Array("displacement", ("step", "xyz"), "float64", "m", "estimated displacement per frame", "nan", "world"),
+        Array("displacement_truth", ("step", "xyz"), "float64", "m", "true displacement per frame", "nan", "world"),
+    ),
+    requires=("numpy",),
+    run=_run,
+)

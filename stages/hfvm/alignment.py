@@ -1,0 +1,108 @@
+"""Pre-alignment of the right image by the homography of the dominant plane, fitted to coarse matches.
+
+Feature vectors compare upright windows. On ground seen obliquely the disparity changes by half a pixel from row to row,
+and a 13-pixel kernel shears by several pixels: the matcher then finds plateaus instead of a slope. So the images are
+first matched coarsely as they are; where one plane (and with it roll, row offset and toe-in) explains most of those
+matches and distorts windows noticeably, the right image is resampled by its homography and matching starts anew. Only
+matches say how: no calibration is used, and displacements are given in the original images.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from stages.declare import AnyArray
+from stages.hfvm.refine import _sample
+from stages.validity import Mask
+
+Matrix = NDArray[np.float64]
+
+ITERATIONS = 15
+SAMPLES = 4000
+LEAST_MATCHES = 60
+
+
+def fit_plane(u: AnyArray, v: AnyArray, consistent: AnyArray, tolerance: float) -> tuple[Matrix, float] | None:
+    """Homography of the dominant plane, and the share of matches within ``tolerance`` pixels of it; None: too few.
+
+    Parameters
+    ----------
+    u, v : (row, col) displacements of one level, pixels.
+    consistent : (row, col) bool, pixels to use.
+
+    Returns
+    -------
+    (3, 3) float64 H with ``(x + u, y + v, 1) ~ H (x, y, 1)``, and the share.
+    """
+    y, x = np.nonzero(consistent)
+    if len(y) < LEAST_MATCHES:
+        return None
+    keep = np.arange(0, len(y), max(1, len(y) // SAMPLES))
+    y, x = y[keep], x[keep]
+    scale = 0.5 * max(consistent.shape)
+    to_unit = np.array(
+        [[1 / scale, 0, -0.5 * consistent.shape[1] / scale], [0, 1 / scale, -0.5 * consistent.shape[0] / scale], [0, 0, 1]]
+    )
+    px, py = x * to_unit[0, 0] + to_unit[0, 2], y * to_unit[1, 1] + to_unit[1, 2]
+    qx = (x + u[y, x]) * to_unit[0, 0] + to_unit[0, 2]
+    qy = (y + v[y, x]) * to_unit[1, 1] + to_unit[1, 2]
+    one, nil = np.ones_like(px), np.zeros_like(px)
+    # qx (1 + g p) = ..., linear in the eight terms of H with H[2, 2] = 1; solved for H - I, weakly held at zero.
+    rows_x = np.stack([px, py, one, nil, nil, nil, -qx * px, -qx * py])
+    rows_y = np.stack([nil, nil, nil, px, py, one, -qy * px, -qy * py])
+    dx, dy = qx - px, qy - py
+    h = np.zeros(8)
+    spread = 0.0
+    tol = tolerance / scale
+    error = np.zeros_like(px)
+    for step in range(ITERATIONS):
+        error = np.hypot(dx - np.einsum("i,in->n", h, rows_x), dy - np.einsum("i,in->n", h, rows_y))
+        if step == 0:
+            weight = one
+        else:
+            spread = max(tol, min(1.5 * float(np.median(error)), spread * 0.7 if step > 1 else np.inf))
+            weight = 1.0 / (1.0 + (error / spread) ** 2) ** 2
+        normal = np.einsum("in,jn,n->ij", rows_x, rows_x, weight) + np.einsum("in,jn,n->ij", rows_y, rows_y, weight)
+        right_side = np.einsum("in,n,n->i", rows_x, dx, weight) + np.einsum("in,n,n->i", rows_y, dy, weight)
+        h = np.linalg.solve(normal + 1e-6 * len(px) * np.eye(8), right_side)
+    unit = np.append(h, 0.0).reshape(3, 3) + np.eye(3)
+    return np.linalg.inv(to_unit) @ unit @ to_unit, float(np.mean(error <= 2 * tol))
+
+
+def to_level_0(h: Matrix, level: int) -> Matrix:
+    """Homography of level ``level`` pixels as one of level 0 pixels."""
+    k = 0.5**level
+    s = np.array([[k, 0.0, 0.5 * k - 0.5], [0.0, k, 0.5 * k - 0.5], [0.0, 0.0, 1.0]])
+    return np.asarray(np.linalg.inv(s) @ h @ s, dtype=np.float64)
+
+
+def distortion(h: Matrix, shape: tuple[int, int]) -> float:
+    """Greatest departure of the homography's derivative from the identity over an image."""
+    y, x = np.meshgrid(np.linspace(0, shape[0] - 1, 5), np.linspace(0, shape[1] - 1, 5), indexing="ij")
+    w = h[2, 0] * x + h[2, 1] * y + h[2, 2]
+    if (w <= 0.1).any():
+        return np.inf
+    p, q = (h[0, 0] * x + h[0, 1] * y + h[0, 2]) / w, (h[1, 0] * x + h[1, 1] * y + h[1, 2]) / w
+    parts = [(h[0, 0] - p * h[2, 0]) / w - 1, (h[0, 1] - p * h[2, 1]) / w, (h[1, 0] - q * h[2, 0]) / w, (h[1, 1] - q * h[2, 1]) / w - 1]
+    return float(max(np.median(np.abs(d)) for d in parts))
+
+
+@njit(cache=True, nogil=True)
+def warp(image, valid, h, out, out_valid):  # type: ignore[no-untyped-def]
+    """``out(x, y) = image(H (x, y))``, Catmull-Rom; ``out_valid`` 0 where that is outside or masked."""
+    rows, cols = out.shape
+    irows, icols = image.shape
+    for y in range(rows):
+        for x in range(cols):
+            out[y, x], out_valid[y, x] = 0.0, 0
+            w = h[2, 0] * x + h[2, 1] * y + h[2, 2]
+            if w <= 1e-6:
+                continue
+            p, q = (h[0, 0] * x + h[0, 1] * y + h[0, 2]) / w, (h[1, 0] * x + h[1, 1] * y + h[1, 2]) / w
+            if not (p >= 1 and p < icols - 2 and q >= 1 and q < irows - 2):
+                continue
+            if valid[int(q + 0.5), int(p + 0.5)]:
+                out[y, x] = _sample(image, np.float32(p), np.float32(q))[0]
+                out_valid[y, x] = 1

@@ -1,0 +1,111 @@
+"""Median, back-matching, removal of isolated patches and interpolation of undefined disparities (paper, 4.3.3, 4.3.4)."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from stages.declare import AnyArray
+
+Map = NDArray[np.float32]
+
+FAILED = np.float32(1e9)
+"""Back-matching error where there is nothing to match back from."""
+
+
+def median(u: AnyArray, size: int) -> AnyArray:
+    """Plain median of ``size`` x ``size`` pixels (3 or 5; 1 = none) of an int16 map, its edge repeated."""
+    if size == 1:
+        return u
+    shifted = (u.astype(np.int32) + 32768).astype(np.uint16)
+    return (cv2.medianBlur(shifted, size).astype(np.int32) - 32768).astype(np.int16)
+
+
+@njit(cache=True, nogil=True)
+def backmatch(lu, lv, ru, rv, error):  # type: ignore[no-untyped-def]
+    """Distance |l - l'| of each left pixel after matching to the right and back (4.3.3), pixels; FAILED outside.
+
+    The right map is read bilinearly where its four pixels agree within a pixel, else at the nearest one.
+    """
+    rows, cols = lu.shape
+    rrows, rcols = ru.shape
+    for y in range(rows):
+        for x in range(cols):
+            error[y, x] = FAILED
+            xr = np.float32(x) + lu[y, x]
+            yr = np.float32(y) + lv[y, x]
+            if not (xr >= 0 and xr <= rcols - 1 and yr >= 0 and yr <= rrows - 1):
+                continue
+            i, j = int(xr), int(yr)
+            i1, j1 = min(i + 1, rcols - 1), min(j + 1, rrows - 1)
+            fx, fy = xr - np.float32(i), yr - np.float32(j)
+            a, b, c, d = ru[j, i], ru[j, i1], ru[j1, i], ru[j1, i1]
+            p, q, r, s = rv[j, i], rv[j, i1], rv[j1, i], rv[j1, i1]
+            one = np.float32(1.0)
+            if (
+                max(max(a, b), max(c, d)) - min(min(a, b), min(c, d)) <= one
+                and max(max(p, q), max(r, s)) - min(min(p, q), min(r, s)) <= one
+            ):
+                u = (a * (one - fx) + b * fx) * (one - fy) + (c * (one - fx) + d * fx) * fy
+                v = (p * (one - fx) + q * fx) * (one - fy) + (r * (one - fx) + s * fx) * fy
+            else:
+                i, j = int(xr + np.float32(0.5)), int(yr + np.float32(0.5))
+                u, v = ru[j, i], rv[j, i]
+            du, dv = lu[y, x] + u, lv[y, x] + v
+            e = np.sqrt(du * du + dv * dv)
+            if e < FAILED:
+                error[y, x] = e
+
+
+def isolated(u: AnyArray, v: AnyArray, keep: AnyArray, size: int) -> NDArray[np.bool_]:
+    """Pixels of ``keep`` in patches of fewer than ``size`` pixels whose neighbours differ by at most one pixel.
+
+    ``u, v``: (row, col) float32 or int16 map, pixels.
+    """
+    if size <= 1:
+        return np.zeros(keep.shape, dtype=bool)
+    gone = np.zeros(keep.shape, dtype=bool)
+    for plane in (u, v):
+        coded = np.where(keep & ~gone, np.rint(8.0 * np.where(keep, plane, 0)), -32768).astype(np.int16)
+        cv2.filterSpeckles(coded, -32768, size - 1, 8)
+        gone = keep & (coded == -32768)
+    return gone
+
+
+@njit(cache=True, nogil=True)
+def fill_rows(u, v, keep, reach, near_sign, filled):  # type: ignore[no-untyped-def]
+    """Interpolate undefined disparities along rows, in place; ``filled`` gets 1 where it happened.
+
+    A gap between values that agree within two pixels is a failed match and gets the line between them; another gap is
+    an occlusion and gets its background: the side of lesser ``near_sign * u`` (-1: near things lie left in the right
+    image). No value travels farther than ``reach`` pixels.
+    """
+    rows, cols = u.shape
+    for y in range(rows):
+        x = 0
+        while x < cols:
+            if keep[y, x]:
+                x += 1
+                continue
+            start = x
+            while x < cols and not keep[y, x]:
+                x += 1
+            a, b = start - 1, x
+            for i in range(start, x):
+                from_a = a >= 0 and i - a <= reach
+                from_b = b < cols and b - i <= reach
+                if not from_a and not from_b:
+                    continue
+                if from_a and from_b:
+                    if abs(u[y, a] - u[y, b]) <= 2 and abs(v[y, a] - v[y, b]) <= 2:
+                        t = np.float32(i - a) / np.float32(b - a)
+                        u[y, i] = u[y, a] + t * (u[y, b] - u[y, a])
+                        v[y, i] = v[y, a] + t * (v[y, b] - v[y, a])
+                        filled[y, i] = 1
+                        continue
+                    from_a = near_sign * u[y, a] <= near_sign * u[y, b]
+                s = a if from_a else b
+                u[y, i], v[y, i] = u[y, s], v[y, s]
+                filled[y, i] = 1

@@ -1,0 +1,94 @@
+"""Soft epipolar band: a fundamental matrix fitted robustly to the consistent matches of one level.
+
+A free two-dimensional search loses accuracy; knowing where matches lie in *any* geometry restores it. The matrix is
+only a help to the search: it is estimated anew at every level and never leaves the matcher.
+
+The constraint ``p'^T F p = 0`` is linear in F. Divided by the coefficient of ``y'`` it reads ``y' = y + small`` for a
+rig whose baseline lies along the rows, divided by that of ``x'`` likewise for one along the columns; both are fitted as
+a maximum a posteriori with a weak prior on the small terms (a few degrees of roll and toe-in), which decides what a
+flat scene leaves open, and the likelier one is taken.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.declare import AnyArray
+
+Matrix = NDArray[np.float64]
+
+NO_BAND: Matrix = np.zeros((3, 3))
+
+SIGMA = 0.5
+"""Pixels: deviation of an integer match from its line."""
+
+PRIOR = np.array([0.2, 0.1, 0.1, 0.1, 0.1, 0.2, 0.2, 0.5])
+"""Deviations of the eight free terms (x', x'x, x'y, y'x, y'y, x, y, 1) in half image sides."""
+
+SAMPLES = 4000
+LEAST_MATCHES = 40
+ITERATIONS = 12
+
+
+def fit(u: AnyArray, v: AnyArray, wanted: AnyArray, right_shape: tuple[int, int]) -> tuple[Matrix, float] | None:
+    """Fundamental matrix of one level's map, or None where it is not determined.
+
+    Parameters
+    ----------
+    u, v : (row, col) float32 displacements, pixels.
+    wanted : (row, col) bool, pixels to use.
+    right_shape : rows and columns of the other image.
+
+    Returns
+    -------
+    F : (3, 3) float64 with ``(x + u, y + v, 1) F (x, y, 1)^T = 0`` in pixels of this level.
+    spread : median distance of the matches from their lines, pixels.
+    """
+    y, x = np.nonzero(wanted)
+    if len(y) < LEAST_MATCHES:
+        return None
+    scale = 0.5 * max(wanted.shape)
+    left_mid = (0.5 * (wanted.shape[1] - 1), 0.5 * (wanted.shape[0] - 1))
+    right_mid = (0.5 * (right_shape[1] - 1), 0.5 * (right_shape[0] - 1))
+    p = np.stack([(x - left_mid[0]) / scale, (y - left_mid[1]) / scale])
+    q = np.stack([(x + u[y, x] - right_mid[0]) / scale, (y + v[y, x] - right_mid[1]) / scale])
+    rows = _solve(p, q, SIGMA / scale)
+    cols = _solve(p[::-1], q[::-1], SIGMA / scale)
+    swap = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    f, spread = (rows[0], rows[2]) if rows[1] <= cols[1] else (swap @ cols[0] @ swap, cols[2])
+    to_left = np.array([[1 / scale, 0.0, -left_mid[0] / scale], [0.0, 1 / scale, -left_mid[1] / scale], [0, 0, 1.0]])
+    to_right = np.array([[1 / scale, 0.0, -right_mid[0] / scale], [0.0, 1 / scale, -right_mid[1] / scale], [0, 0, 1.0]])
+    return np.asarray(to_right.T @ f @ to_left, dtype=np.float64), spread * scale
+
+
+def _solve(p: AnyArray, q: AnyArray, sigma: float) -> tuple[Matrix, float, float]:
+    """Robust fit (Cauchy weights) of ``y' + g . terms = 0``: matrix in normalised coordinates, cost, spread."""
+    x, y, xr, yr = p[0], p[1], q[0], q[1]
+    terms = np.stack([xr, xr * x, xr * y, yr * x, yr * y, x, y, np.ones_like(x)])
+    prior = np.zeros(8)
+    prior[6] = -1.0
+    precision = np.diag(PRIOR**-2.0)
+    g = prior
+    spread = math.inf
+    for step in range(ITERATIONS):
+        residual = yr + np.einsum("i,in->n", g, terms)
+        # Start as wide as the matches scatter about the prior, and narrow to what an integer match deserves.
+        spread = max(sigma, min(0.5 * spread, 1.5 * float(np.median(np.abs(residual))) + sigma)) if step else max(
+            sigma, 2.0 * float(np.median(np.abs(residual)))
+        )
+        weight = 1.0 / (1.0 + (residual / spread) ** 2) / sigma**2
+        normal = np.einsum("in,jn,n->ij", terms, terms, weight) + precision
+        g = np.linalg.solve(normal, -np.einsum("in,n,n->i", terms, yr, weight) + precision @ prior)
+    residual = yr + np.einsum("i,in->n", g, terms)
+    cost = float(np.sum(np.log1p((residual / sigma) ** 2)) + np.sum(((g - prior) / PRIOR) ** 2))
+    f = np.array([[g[1], g[2], g[0]], [g[3], g[4], 1.0], [g[5], g[6], g[7]]])
+    return f, cost, float(np.median(np.abs(residual)))
+
+
+def finer(f: Matrix) -> Matrix:
+    """The same constraint in pixels of the next finer level (``x_n = (x + 0.5) / 2 - 0.5``)."""
+    s = np.array([[0.5, 0.0, -0.25], [0.0, 0.5, -0.25], [0.0, 0.0, 1.0]])
+    return np.asarray(s.T @ f @ s, dtype=np.float64)

@@ -1,0 +1,169 @@
+"""Removal of the perspective bias: mean-free Lucas-Kanade steps against the right image warped by the disparities.
+
+Feature vectors compare upright windows; where the two views foreshorten a surface differently their best displacement
+is biased. Warping the right image by the smoothed disparities first makes the windows alike, and what is left is a
+small displacement, solved per window. A pixel keeps the step only if it makes its window fit better.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from stages.declare import AnyArray
+from stages.hfvm.subpixel import local_mean
+
+PLANES = 10
+
+
+@njit(cache=True, nogil=True, inline="never")
+def _sample(a, x, y):  # type: ignore[no-untyped-def]
+    """Catmull-Rom value and gradient of ``a`` at (x, y), two pixels or more inside."""
+    i, j = int(x), int(y)
+    t, s = x - np.float32(i), y - np.float32(j)
+    h, two, three = np.float32(0.5), np.float32(2.0), np.float32(3.0)
+    one, four, five = np.float32(1.0), np.float32(4.0), np.float32(5.0)
+    wx = (
+        h * t * (two * t - one - t * t),
+        h * (two + t * t * (three * t - five)),
+        h * t * (one + four * t - three * t * t),
+        h * t * t * (t - one),
+    )
+    wy = (
+        h * s * (two * s - one - s * s),
+        h * (two + s * s * (three * s - five)),
+        h * s * (one + four * s - three * s * s),
+        h * s * s * (s - one),
+    )
+    gx = (
+        h * (four * t - one - three * t * t),
+        h * t * (np.float32(9.0) * t - np.float32(10.0)),
+        h * (one + np.float32(8.0) * t - np.float32(9.0) * t * t),
+        h * t * (three * t - two),
+    )
+    gy = (
+        h * (four * s - one - three * s * s),
+        h * s * (np.float32(9.0) * s - np.float32(10.0)),
+        h * (one + np.float32(8.0) * s - np.float32(9.0) * s * s),
+        h * s * (three * s - two),
+    )
+    value = dx = dy = np.float32(0.0)
+    for k in range(4):
+        r0, r1, r2, r3 = a[j - 1 + k, i - 1], a[j - 1 + k, i], a[j - 1 + k, i + 1], a[j - 1 + k, i + 2]
+        row = r0 * wx[0] + r1 * wx[1] + r2 * wx[2] + r3 * wx[3]
+        value += wy[k] * row
+        dy += gy[k] * row
+        dx += wy[k] * (r0 * gx[0] + r1 * gx[1] + r2 * gx[2] + r3 * gx[3])
+    return value, dx, dy
+
+
+@njit(cache=True, nogil=True)
+def _products(left, right, right_valid, u, v, keep, y, out):  # type: ignore[no-untyped-def]
+    """Row ``y`` of the ten planes whose window sums the step needs."""
+    rows, cols = left.shape
+    rrows, rcols = right.shape
+    out[:] = 0.0
+    if y < 0 or y >= rows:
+        return
+    for x in range(cols):
+        if not keep[y, x]:
+            continue
+        xr, yr = np.float32(x) + u[y, x], np.float32(y) + v[y, x]
+        if not (xr >= 1 and xr < rcols - 2 and yr >= 1 and yr < rrows - 2):
+            continue
+        if not right_valid[int(yr + np.float32(0.5)), int(xr + np.float32(0.5))]:
+            continue
+        w, gx, gy = _sample(right, xr, yr)
+        r = left[y, x] - w
+        out[0, x] = 1.0
+        out[1, x] = gx
+        out[2, x] = gy
+        out[3, x] = r
+        out[4, x] = gx * gx
+        out[5, x] = gx * gy
+        out[6, x] = gy * gy
+        out[7, x] = gx * r
+        out[8, x] = gy * r
+        out[9, x] = r * r
+
+
+@njit(cache=True, nogil=True)
+def _step(left, right, right_valid, u, v, keep, radius, noise, new_u, new_v, energy):  # type: ignore[no-untyped-def]
+    """One step for every kept pixel; ``energy`` is its mean-free residual variance *before* the step (inf: none)."""
+    rows, cols = left.shape
+    size = 2 * radius + 1
+    ring = np.zeros((size, PLANES, cols))
+    column = np.zeros((PLANES, cols))
+    s = np.empty(PLANES)
+    fresh = np.zeros((PLANES, cols))
+    for y in range(-radius, rows):
+        _products(left, right, right_valid, u, v, keep, y + radius, fresh)
+        slot = (y + radius) % size
+        for k in range(PLANES):
+            for x in range(cols):
+                column[k, x] += fresh[k, x] - ring[slot, k, x]
+                ring[slot, k, x] = fresh[k, x]
+        if y < 0:
+            continue
+        s[:] = 0.0
+        for x in range(-radius, cols):
+            if x + radius < cols:
+                for k in range(PLANES):
+                    s[k] += column[k, x + radius]
+            if x - radius - 1 >= 0:
+                for k in range(PLANES):
+                    s[k] -= column[k, x - radius - 1]
+            if x < 0:
+                continue
+            new_u[y, x], new_v[y, x], energy[y, x] = u[y, x], v[y, x], np.inf
+            n = s[0]
+            if not keep[y, x] or n < 0.5 * size * size:
+                continue
+            a = s[4] - s[1] * s[1] / n + noise * n
+            b = s[5] - s[1] * s[2] / n
+            c = s[6] - s[2] * s[2] / n + noise * n
+            p = s[7] - s[1] * s[3] / n
+            q = s[8] - s[2] * s[3] / n
+            det = a * c - b * b
+            energy[y, x] = max(s[9] - s[3] * s[3] / n, 0.0) / n
+            new_u[y, x] += np.float32(min(max((c * p - b * q) / det, -1.0), 1.0))
+            new_v[y, x] += np.float32(min(max((a * q - b * p) / det, -1.0), 1.0))
+
+
+def refine(
+    left: AnyArray,
+    right: AnyArray,
+    right_valid: AnyArray,
+    u: AnyArray,
+    v: AnyArray,
+    keep: AnyArray,
+    *,
+    steps: int,
+    radius: int,
+    noise: float,
+) -> tuple[AnyArray, AnyArray]:
+    """Displacements without the perspective bias.
+
+    Parameters
+    ----------
+    left, right : (row, col) float32 grey values.
+    right_valid : (row, col) uint8, 1 = usable.
+    u, v : (row, col) float32, smoothed displacements, pixels.
+    keep : (row, col) bool, pixels that have one.
+    steps, radius : number of steps; window is 2 radius + 1 pixels wide.
+    noise : squared grey levels per pixel; regularises windows without texture.
+    """
+    start_u, start_v = u, v
+    first = None
+    for step in range(steps + 1):
+        new_u, new_v, energy = np.empty_like(u), np.empty_like(v), np.empty(u.shape, np.float32)
+        _step(left, right, right_valid, u, v, keep, radius, noise, new_u, new_v, energy)
+        if first is None:
+            first = energy
+        if step < steps:
+            u, v = np.empty_like(u), np.empty_like(v)
+            local_mean(new_u, new_v, keep, 1, u, v)
+    assert first is not None
+    moved = np.hypot(u - start_u, v - start_v)
+    better = (energy <= first) & (moved <= 1.5)
+    return np.where(better, u, start_u), np.where(better, v, start_v)

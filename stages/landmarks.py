@@ -1,0 +1,292 @@
+"""3-D coordinates of interest points of the key frame: from the disparity, or from the elevation model.
+
+Source: Kolesnik, Paar, Bauer, Ulm (1999), section 5.2.2: "the 3D coordinates of the Interest Points on Frame N are
+calculated from the DEM and the calibration matrix of Frame N". The triangulation of the matched point itself is our
+alternative: it skips one interpolation. Both give the local frame's coordinates and how uncertain they are along the
+ray, ``sigma_Z = sigma_d / |dp_r/dZ|`` (the familiar ``Z^2 / (f B) sigma_d`` of a parallel rig).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.geometry import Rig, RigidTransform
+from stages.lattice import Lattice
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+MATCHED = np.uint8(1)
+"""Bit of stages.validity: found by matching and consistent, not filled."""
+TEMPLATE = 5
+RELIEF=1.0
+CONSISTENT = 1.0
+"""Pixels: neighbours whose disparities differ by more lie on two surfaces; also the bound of back-matching (4.3.3)."""
+
+
+@dataclass(frozen=True)
+class Landmarks:
+    """``position`` (n, 3) in the local frame, m, NaN none; ``sigma`` (n, 3) one standard deviation along the ray, m.
+
+    ``lost`` says why the others have no coordinates: reason and count.
+    """
+
+    position: Floats
+    sigma: Floats
+    lost: dict[str, int]
+
+    def summary(self) -> str:
+        """The counts in words."""
+        return ", ".join(f"{count} {reason}" for reason, count in self.lost.items() if count) or "none lost"
+
+
+def landmarks_from_disparity(
+    points: Floats,
+    column_disparity: NDArray[np.float32],
+    row_disparity: NDArray[np.float32],
+    validity: NDArray[np.uint8],
+    rig: Rig,
+    T_local_left: RigidTransform,
+    *,
+    disparity_sigma: float,
+    max_depth_ratio: float,
+) -> Landmarks:
+    """Triangulate the stereo matches of points (n, 2) column, row of the left key image.
+
+    A point needs four matched (not filled) neighbours on one surface, rays that meet within a pixel in front of both
+    cameras, and a distance whose standard deviation is below ``max_depth_ratio`` of it.
+    """
+    disparity, matched = _disparity_at(points, column_disparity, row_disparity, validity)
+    rays = rig.left.rays(points)
+    depth = _triangulate(rays, points + disparity, rig)
+    right, slope = _right_image(rays, depth, rig)
+    miss = np.sqrt(((right - points - disparity) ** 2).sum(-1))
+    meets = matched & (depth > 0) & (miss <= CONSISTENT)
+    disparity_sigma=np.hypot(disparity_sigma, RELIEF*relief(points, column_disparity, row_disparity, validity))
+    return _landmarks(
+        rays,
+        depth,
+        slope,
+        meets,
+        T_local_left,
+        disparity_sigma,
+        max_depth_ratio,
+        len(points) - int(matched.sum()),
+        "without a consistent stereo match",
+    )
+
+
+def _disparity_at(
+    points: Floats, column: NDArray[np.float32], row: NDArray[np.float32], validity: NDArray[np.uint8]
+) -> tuple[Floats, Bools]:
+    """Disparity vectors (n, 2) by bilinear interpolation, and whether the four neighbours are matched and agree."""
+    rows, cols = column.shape
+    known = np.isfinite(points).all(1)
+    p = np.where(known[:, None], points, 0.0)
+    inside = known & (p >= 0).all(1) & (p[:, 0] <= cols - 1) & (p[:, 1] <= rows - 1)
+    x = np.clip(np.floor(p[:, 0]), 0, cols - 2).astype(np.intp)
+    y = np.clip(np.floor(p[:, 1]), 0, rows - 2).astype(np.intp)
+    fx, fy = p[:, 0] - x, p[:, 1] - y
+    weights = np.stack([(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy], -1)
+    y4, x4 = y[:, None] + np.array([0, 0, 1, 1]), x[:, None] + np.array([0, 1, 0, 1])
+    corners = np.stack([column[y4, x4], row[y4, x4]], -1).astype(np.float64)
+    # A corner of weight 0 (the point is on the pixel grid) may be anything.
+    needed = weights > 1e-9
+    good = (((validity[y4, x4] & MATCHED) != 0) & np.isfinite(corners).all(-1)) | ~needed
+    corners = np.where(needed[..., None] & good[..., None], corners, np.nan)
+    ok = inside & good.all(1)
+    corners[~ok] = 0.0
+    apart = np.nanmax(corners, axis=1) - np.nanmin(corners, axis=1)
+    value = np.einsum("nk,nki->ni", weights, np.where(np.isfinite(corners), corners, 0.0))
+    return value, ok & (apart <= CONSISTENT).all(1)
+
+
+def relief(
+    points: Floats, column: NDArray[np.float32], row: NDArray[np.float32], validity: NDArray[np.uint8]
+) -> Floats:
+    """How far the surface under a template departs from a plane: rms (n,) of the disparities about theirs, pixels.
+
+    A template on a rock's edge follows the rock or the ground, not the pixel at its centre; both the stereo match and
+    the track are then uncertain by the relief inside the template. NaN where less than half of it is matched.
+    """
+    rows, cols = column.shape
+    known = np.isfinite(points).all(1)
+    centre = np.floor(np.where(known[:, None], points, 0.0) + 0.5).astype(np.intp)
+    dy, dx = (o.ravel() for o in np.mgrid[-TEMPLATE : TEMPLATE + 1, -TEMPLATE : TEMPLATE + 1])
+    y, x = centre[:, 1:] + dy, centre[:, :1] + dx
+    inside = (y >= 0) & (y < rows) & (x >= 0) & (x < cols)
+    y, x = np.clip(y, 0, rows - 1), np.clip(x, 0, cols - 1)
+    disparity = np.stack([column[y, x], row[y, x]], -1).astype(np.float64)
+    good = inside & ((validity[y, x] & MATCHED) != 0) & np.isfinite(disparity).all(-1)
+    disparity = np.where(good[..., None], disparity, 0.0)
+    basis = np.stack([np.ones(len(dx)), dx / TEMPLATE, dy / TEMPLATE], -1)
+    normal = np.einsum("nk,ka,kb->nab", good, basis, basis) + 1e-9 * np.eye(3)
+    plane = np.linalg.solve(normal, np.einsum("nk,ka,nki->nai", good, basis, disparity))
+    apart = np.where(good, ((disparity - np.einsum("ka,nai->nki", basis, plane)) ** 2).sum(-1), 0.0)
+    count = good.sum(1)
+    return np.where(known & (2 * count >= len(dx)), np.sqrt(apart.sum(1) / np.maximum(count, 1)), np.nan)
+
+
+def _triangulate(rays: Floats, right: Floats, rig: Rig) -> Floats:
+    """Depth (n,) in the left camera, m, of least distance in the right image; NaN where the rays do not meet."""
+    a = rays @ rig.T_right_left.rotation.T
+    t = rig.T_right_left.translation
+    xy = rig.right.rays(right)[:, :2]
+    # (Z a + t) x (x, y, 1) = 0, two linear equations in Z; then Gauss-Newton on the pixel distance itself.
+    left_side = a[:, :2] - xy * a[:, 2:]
+    right_side = xy * t[2] - t[:2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depth = (left_side * right_side).sum(-1) / (left_side**2).sum(-1)
+        for _ in range(2):
+            p, slope = _right_image(rays, depth, rig)
+            depth = depth + ((right - p) * slope).sum(-1) / (slope**2).sum(-1)
+    return np.where(np.isfinite(depth), depth, np.nan)
+
+
+def _right_image(rays: Floats, depth: Floats, rig: Rig) -> tuple[Floats, Floats]:
+    """Right image (n, 2) of points at a depth on left rays, pixels, and its derivative, pixels/m."""
+    a = rays @ rig.T_right_left.rotation.T
+    x = depth[:, None] * a + rig.T_right_left.translation
+    with np.errstate(divide="ignore", invalid="ignore"):
+        z = np.where(x[:, 2] > 0, x[:, 2], np.nan)[:, None]
+        focal = np.array([rig.right.fx, rig.right.fy])
+        slope = focal * (a[:, :2] * z - x[:, :2] * a[:, 2:]) / z**2
+    return rig.right.project(x), slope
+
+
+def _landmarks(
+    rays: Floats,
+    depth: Floats,
+    slope: Floats,
+    found: Bools,
+    T_local_left: RigidTransform,
+    disparity_sigma: float,
+    max_depth_ratio: float,
+    unmatched: int,
+    word: str,
+) -> Landmarks:
+    with np.errstate(divide="ignore", invalid="ignore"):
+        spread = disparity_sigma / np.sqrt((slope**2).sum(-1))
+        near = found & (spread <= max_depth_ratio * depth)
+    keep = near[:, None]
+    position = np.where(keep, T_local_left.apply(rays * np.where(near, depth, 1.0)[:, None]), np.nan)
+    sigma = np.where(keep, np.where(near, spread, 0.0)[:, None] * (rays @ T_local_left.rotation.T), np.nan)
+    behind = len(rays) - unmatched - int(found.sum())
+    return Landmarks(
+        position,
+        sigma,
+        {
+            word: unmatched,
+            "whose rays do not meet": behind,
+            "too far for the baseline": int(found.sum()) - int(near.sum()),
+        },
+    )
+
+
+def landmarks_from_dem(
+    points: Floats,
+    elevation: NDArray[np.float32],
+    lattice: Lattice,
+    rig: Rig,
+    T_local_left: RigidTransform,
+    *,
+    disparity_sigma: float,
+    max_depth_ratio: float,
+) -> Landmarks:
+    """Meet the rays of points (n, 2) column, row of the left key image with its elevation model (rows, cols), m.
+
+    The uncertainty is that of the stereo pair which made the model.
+    """
+    known = np.isfinite(points).all(1)
+    rays = rig.left.rays(np.where(known[:, None], points, 0.0))
+    distance = intersect(elevation, lattice, T_local_left.translation, rays @ T_local_left.rotation.T)
+    found = known & np.isfinite(distance)
+    _, slope = _right_image(rays, np.where(found, distance, 1.0), rig)
+    return _landmarks(
+        rays,
+        distance,
+        slope,
+        found,
+        T_local_left,
+        disparity_sigma,
+        max_depth_ratio,
+        len(points) - int(found.sum()),
+        "whose ray misses the elevation model",
+    )
+
+
+def intersect(elevation: NDArray[np.float32], lattice: Lattice, origin: Floats, directions: Floats) -> Floats:
+    """Where rays first come down on a surface of bilinear cells, in units of their directions; NaN where they do not.
+
+    Starts above the highest cell, goes half a cell at a time and refines by bisection. A hole forgets what was
+    before it: a ray that comes out of one below the surface has passed under it and is rejected.
+
+    Parameters
+    ----------
+    elevation : (rows, cols), m; NaN undefined.
+    origin : (3,) common origin of the rays in the frame of the lattice, m.
+    directions : (n, 3) of any length.
+    """
+    out = np.full(len(directions), np.nan)
+    if not np.isfinite(elevation).any():
+        return out
+    for i, direction in enumerate(directions):
+        span = _span(elevation, lattice, origin, direction)
+        if span is None:
+            continue
+        first, last, step = span
+        s = np.arange(first, last + step, step)
+        height = _height(elevation, lattice, origin, direction, s)
+        known = np.isfinite(height)
+        below = np.flatnonzero(known & (height <= 0))
+        if below.size == 0 or below[0] == 0 or not known[below[0] - 1]:
+            continue
+        out[i] = _bisect(elevation, lattice, origin, direction, s[below[0] - 1], s[below[0]])
+    return out
+
+
+def _span(
+    elevation: NDArray[np.float32], lattice: Lattice, origin: Floats, direction: Floats
+) -> tuple[float, float, float] | None:
+    """First and last parameter of the ray inside the model's box, and the step of half a cell; None: it misses."""
+    low, high = float(np.nanmin(elevation)), float(np.nanmax(elevation))
+    x, y = lattice.xs(), lattice.ys()
+    box = np.array([[x[0], x[-1]], [y[-1], y[0]], [low - lattice.cell, high + lattice.cell]])
+    first, last = 0.0, np.inf
+    for axis in range(3):
+        if direction[axis] == 0.0:
+            if not box[axis, 0] <= origin[axis] <= box[axis, 1]:
+                return None
+            continue
+        a, b = sorted((box[axis] - origin[axis]) / direction[axis])
+        first, last = max(first, float(a)), min(last, float(b))
+    step = 0.5 * lattice.cell / float(np.sqrt((direction**2).sum()))
+    return (first, last, step) if first < last < np.inf else None
+
+
+def _height(elevation: NDArray[np.float32], lattice: Lattice, origin: Floats, direction: Floats, s: Floats) -> Floats:
+    """Height of the ray above the bilinear surface at parameters s (k,), m; NaN over holes."""
+    p = origin + s[:, None] * direction
+    index = lattice.index(p[:, :2])
+    row = np.clip(np.floor(index[:, 0]), 0, max(lattice.rows - 2, 0)).astype(np.intp)
+    col = np.clip(np.floor(index[:, 1]), 0, max(lattice.cols - 2, 0)).astype(np.intp)
+    fr, fc = index[:, 0] - row, index[:, 1] - col
+    below, right = np.minimum(row + 1, lattice.rows - 1), np.minimum(col + 1, lattice.cols - 1)
+    top = elevation[row, col] * (1 - fc) + elevation[row, right] * fc
+    bottom = elevation[below, col] * (1 - fc) + elevation[below, right] * fc
+    return np.asarray(p[:, 2] - (top * (1 - fr) + bottom * fr))
+
+
+def _bisect(
+    elevation: NDArray[np.float32], lattice: Lattice, origin: Floats, direction: Floats, above: float, below: float
+) -> float:
+    for _ in range(30):
+        middle = 0.5 * (above + below)
+        height = float(_height(elevation, lattice, origin, direction, np.array([middle]))[0])
+        if not np.isfinite(height):
+            return float("nan")
+        above, below = (middle, below) if height > 0 else (above, middle)
+    return 0.5 * (above + below)

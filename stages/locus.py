@@ -1,0 +1,307 @@
+"""Locus reconstruction: elevation model and ortho image straight from the disparity (paper, section 4.4).
+
+The cells come first, not the image points: for each cell of a reference surface the straight line perpendicular to it
+is projected into both images (the left and right *locus*); the left locus, mapped through the disparity, meets the
+right one at the elevation. Nothing is rectified and no point cloud is made: rows and columns are those of the original
+images, for any orientation of the cameras. The kernel and its equations are in :mod:`stages.locus_kernel`.
+
+The elevation's error is that of the disparity over its sensitivity: ``sigma_Z = sigma_d / |ds/dZ|``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import Field
+
+from stages.declare import Array, Bundle, Inputs, Params, Stage
+from stages.errors import ConfigError, DegenerateError, InputError
+from stages.geometry import Rig, RigidTransform
+from stages.ground import view_ground
+from stages.lattice import Lattice
+from stages.level import z_range as plane_z_range
+from stages.locus_kernel import search
+from stages.surface import Surface, plane
+from stages.validity import matched
+
+Floats = NDArray[np.float64]
+Float32 = NDArray[np.float32]
+
+COARSE = 8  # cells a coarse cell is wide: a 64th of the cells search the whole range
+BLOCK_ROWS = 64  # rows of cells in one kernel call, so that a large surface stays small in memory
+
+
+class LocusParams(Params):
+    """Parameters of the stage ``locus``."""
+
+    cell_size: float | None = Field(
+        None, gt=0, description="m; none: the pixel's size on the ground at twice the nearest distance, to 1, 2 or 5"
+    )
+    extent: tuple[float, float, float, float] | None = Field(
+        None, description="m; x_min, x_max, y_min, y_max of the local frame; none: the ground that both cameras see"
+    )
+    max_range_cells: float = Field(
+        6.0, gt=0, description="cells; the automatic extent ends where a pixel covers more of them along the range"
+    )
+    max_sigma: float | None = Field(
+        None, gt=0, description="m; cells of greater elevation_std are left undefined; none: one cell size"
+    )
+    sigma_disparity: float = Field(0.2, gt=0, description="pixels; error of a disparity after sub-pixel refinement")
+    max_residual: float = Field(
+        0.5, gt=0, description="pixels; greatest |p_l + d - p_r| at the solution: 2.5 sigma_disparity"
+    )
+    max_backmatch: float = Field(
+        0.5, gt=0, description="pixels; greatest error of back-matching: half the paper's, for elevations"
+    )
+    max_jump: float = Field(
+        2.0,
+        gt=0,
+        description="pixels; disparities around a solution that differ by more lie on two surfaces (one that both "
+        "cameras see in order changes by at most one pixel a pixel: two across the diagonal)",
+    )
+
+
+@dataclass(frozen=True)
+class Dem:
+    """Elevation model on a reference surface, arrays (rows, cols) float32, NaN undefined.
+
+    ``elevation`` and its standard deviation ``elevation_std`` in metres along the surface's normal, ``residual`` the
+    mismatch at the solution in pixels, ``ortho`` the grey value of the left image.
+    """
+
+    elevation: Float32
+    elevation_std: Float32
+    residual: Float32
+    ortho: Float32
+
+
+def reconstruct(
+    column_disparity: ArrayLike,
+    row_disparity: ArrayLike,
+    usable: NDArray[np.bool_],
+    image: ArrayLike,
+    rig: Rig,
+    T_surface_left: RigidTransform,
+    surface: Surface,
+    z_range: tuple[float, float],
+    params: LocusParams,
+) -> Dem:
+    """Elevation and ortho image of every cell of a reference surface.
+
+    Parameters
+    ----------
+    column_disparity, row_disparity : (rows, cols) right minus left, pixels, of the left image.
+    usable : (rows, cols) pixels whose disparity may be used; a cell needs all four around its projection.
+    image : (rows, cols) grey values of the left image.
+    T_surface_left : pose of the left camera in the frame of the surface.
+    surface : feet and normals of the cells, metres.
+    z_range : lowest and highest elevation searched, metres.
+    params : thresholds; ``cell_size`` and ``extent`` are not used here.
+
+    Returns
+    -------
+    Dem
+        A cell is undefined where a camera does not see it, where the disparity around it was not measured, jumps or
+        contradicts the calibration, or where ``elevation_std`` exceeds ``max_sigma``.
+
+    Raises
+    ------
+    InputError
+        An array's shape differs from the left camera's, or ``z_range`` is empty.
+    DegenerateError
+        The baseline is zero.
+    """
+    task = _Task(column_disparity, row_disparity, usable, image, rig, T_surface_left, z_range, params)
+    cells = [np.unique(np.append(np.arange(0, n, COARSE), n - 1)) for n in (surface.rows, surface.cols)]
+    coarse = task.solve(surface, cells[0], cells[1], np.float64(z_range[0]), np.float64(z_range[1]))[..., 0]
+    out = Dem(*(np.full((surface.rows, surface.cols), np.nan, np.float32) for _ in range(4)))
+    for start in range(0, surface.rows, BLOCK_ROWS):
+        rows = np.arange(start, min(start + BLOCK_ROWS, surface.rows))
+        low, high = _from_coarse(coarse, rows, np.arange(surface.cols))
+        found = task.solve(surface, rows, np.arange(surface.cols), low, high)
+        std = params.sigma_disparity / found[..., 2]
+        if params.max_sigma is not None:
+            found[~(std <= params.max_sigma)] = np.nan
+            std[np.isnan(found[..., 0])] = np.nan
+        block = slice(start, start + rows.size)
+        out.elevation[block], out.elevation_std[block] = found[..., 0], std
+        out.residual[block], out.ortho[block] = found[..., 1], found[..., 3]
+    return out
+
+
+class _Task:
+    """The arrays of one pair as the kernel wants them."""
+
+    def __init__(
+        self,
+        column_disparity: ArrayLike,
+        row_disparity: ArrayLike,
+        usable: NDArray[np.bool_],
+        image: ArrayLike,
+        rig: Rig,
+        T_surface_left: RigidTransform,
+        z_range: tuple[float, float],
+        params: LocusParams,
+    ) -> None:
+        if not rig.baseline > 0:
+            raise DegenerateError("the rig's baseline is 0 m", remedy="give T_right_left with a translation in metres")
+        if not z_range[0] < z_range[1]:
+            raise InputError(f"the range of elevations {z_range[0]}..{z_range[1]} m is empty")
+        shape = (rig.left.height, rig.left.width)
+        maps = [np.array(a, dtype=np.float32, order="C") for a in (column_disparity, row_disparity, image)]
+        for name, array in zip(("column disparity", "row disparity", "image"), maps, strict=True):
+            if array.shape != shape:
+                raise InputError(f"the {name} is {array.shape}, the left camera's image {shape}")
+        self.dcol, self.drow, self.image = maps
+        self.dcol[~usable] = np.nan
+        T_left_surface = T_surface_left.inverse()
+        T_right_surface = rig.T_right_left @ T_left_surface
+        self.left = np.ascontiguousarray(rig.left.matrix @ T_left_surface.matrix34)
+        self.right = np.ascontiguousarray(rig.right.matrix @ T_right_surface.matrix34)
+        self.epipole = rig.right.matrix @ rig.T_right_left.translation
+        self.sizes = np.array([rig.left.width, rig.left.height, rig.right.width, rig.right.height], dtype=np.float64)
+        self.z_range = float(z_range[0]), float(z_range[1])
+        self.limits = np.array([params.max_residual, params.max_jump])
+
+    def solve(self, surface: Surface, rows: ArrayLike, cols: ArrayLike, low: ArrayLike, high: ArrayLike) -> Floats:
+        """Kernel's output (r, c, 4) for the cells rows x cols, searched from low..high (NaN: left out)."""
+        feet, normals = surface.block(rows, cols)
+        shape = feet.shape[:2]
+        start = [np.array(np.broadcast_to(v, shape), dtype=np.float64, order="C") for v in (low, high)]
+        out = np.full((*shape, 4), np.nan)
+        search(
+            feet, normals, *start, *self.z_range, self.left, self.right, self.epipole, self.sizes,
+            self.dcol, self.drow, self.image, self.limits, out,
+        )  # fmt: skip
+        return out
+
+
+def _from_coarse(coarse: Floats, rows: NDArray[np.intp], cols: NDArray[np.intp]) -> tuple[Floats, Floats]:
+    """Lowest and highest elevation of the 4 x 4 coarse cells around each cell; NaN where none has one."""
+    padded = np.pad(coarse, 2, constant_values=np.nan)
+    low = np.full((rows.size, cols.size), np.nan)
+    high = low.copy()
+    for i in range(1, 5):
+        for j in range(1, 5):
+            near = padded[np.ix_(rows // COARSE + i, cols // COARSE + j)]
+            low, high = np.fmin(low, near), np.fmax(high, near)
+    return low, high
+
+
+def local_lattice(rig: Rig, level: Mapping[str, Any], cell: float, params: LocusParams) -> Lattice:
+    """Lattice of a pair's local model: the stated extent, else the ground that both cameras see well enough."""
+    if params.extent is not None:
+        x_min, x_max, y_min, y_max = params.extent
+        if not (x_min < x_max and y_min < y_max):
+            raise ConfigError(f"locus.extent={list(params.extent)} is empty", remedy="give x_min, x_max, y_min, y_max")
+        return Lattice.snap(params.extent, cell)
+    R = RigidTransform.from_matrix(level["T_local_left"]).rotation
+    view = view_ground(rig, R, level["plane"])
+    sigma = params.max_sigma if params.max_sigma is not None else cell
+    return Lattice.snap(view.footprint(cell, params.max_range_cells, params.sigma_disparity, sigma), cell)
+
+
+def world_lattice(elevation: Float32, lattice: Lattice, T_world_local: RigidTransform) -> tuple[Lattice, list[float]]:
+    """Lattice and range of elevations in the world frame that hold a local elevation model.
+
+    Raises
+    ------
+    DegenerateError
+        The local model has no cell.
+    """
+    seen = np.isfinite(elevation)
+    if not seen.any():
+        raise DegenerateError(
+            "the local elevation model is empty", remedy="look at the disparity's validity and at locus.max_residual"
+        )
+    points = T_world_local.apply(np.column_stack([lattice.xy()[seen], elevation[seen]]))
+    low, high = points.min(axis=0), points.max(axis=0)
+    margin = 0.05 * (high[2] - low[2]) + lattice.cell
+    bounds = (float(low[0]), float(high[0]), float(low[1]), float(high[1]))
+    return Lattice.snap(bounds, lattice.cell), [float(low[2] - margin), float(high[2] + margin)]
+
+
+def _run(params: LocusParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+    rig = Rig.from_dict(inputs["rig"].meta["rig"])
+    level = inputs["level"].meta
+    T_local_left = RigidTransform.from_matrix(level["T_local_left"])
+    if args["frame"] == "world":
+        T, lattice, z_range = _in_world(args, inputs, T_local_left)
+    else:
+        cell = params.cell_size or args.get("cell") or level["cell_size"]
+        T, lattice = T_local_left, local_lattice(rig, level, cell, params)
+        z_range = plane_z_range(level["plane"], level["relief"], list(lattice.bounds))
+    if params.max_sigma is None:
+        params = params.model_copy(update={"max_sigma": lattice.cell})
+    disparity = inputs["disparity"]
+    dem = reconstruct(
+        disparity["column_disparity"],
+        disparity["row_disparity"],
+        usable(disparity["validity"], disparity["backmatch_error"], params),
+        inputs["left"]["level_0"],
+        rig,
+        T,
+        plane(lattice),
+        (z_range[0], z_range[1]),
+        params,
+    )
+    meta = {
+        "lattice": lattice.to_dict(),
+        "frame": args["frame"],
+        "pair": args["pair"],
+        "z_range": z_range,
+        "T_frame_left": T.to_list(),
+        "defined": float(np.mean(np.isfinite(dem.elevation))),
+        "median_residual": _median(dem.residual),
+        "median_elevation_std": _median(dem.elevation_std),
+    }
+    return Bundle(vars(dem), meta)
+
+
+def usable(validity: ArrayLike, backmatch_error: ArrayLike, params: LocusParams) -> NDArray[np.bool_]:
+    """Pixels that were measured, not filled, and match back to within ``max_backmatch`` pixels."""
+    with np.errstate(invalid="ignore"):
+        return matched(np.asarray(validity)) & (np.asarray(backmatch_error) <= params.max_backmatch)
+
+
+def _in_world(
+    args: Mapping[str, Any], inputs: Inputs, T_local_left: RigidTransform
+) -> tuple[RigidTransform, Lattice, list[float]]:
+    poses = np.asarray(inputs["trajectory"]["poses"])
+    T_world_left = RigidTransform.from_matrix(poses[int(args["row"])])
+    local = inputs["local"]
+    T_world_local = T_world_left @ T_local_left.inverse()
+    lattice, z_range = world_lattice(
+        np.asarray(local["elevation"]), Lattice.from_dict(local.meta["lattice"]), T_world_local
+    )
+    return T_world_left, lattice, z_range
+
+
+def _median(array: Float32) -> float | None:
+    values = array[np.isfinite(array)]
+    return float(np.median(values)) if values.size else None
+
+
+def _array(name: str, unit: str, long_name: str) -> Array:
+    return Array(name, ("row", "col"), "float32", unit, long_name, nodata="nan", frame="local or world (meta: frame)")
+
+
+STAGE = Stage(
+    name="locus",
+    version=1,
+    summary="elevation model and ortho image of a basic pair",
+    params=LocusParams,
+    inputs=("disparity", "rig", "left", "level", "trajectory?", "local?"),
+    outputs=(
+        _array("elevation", "m", "elevation of the cell centre"),
+        _array("elevation_std", "m", "standard deviation of the elevation"),
+        _array("residual", "px", "mismatch of disparity and calibration at the elevation"),
+        _array("ortho", "grey", "grey value of the left image, 0..255"),
+    ),
+    requires=("numpy", "numba"),
+    run=_run,
+)

@@ -1,0 +1,363 @@
+"""Resection: pose of each frame of a segment from landmarks whose 3-D coordinates are known (section 5.2.2).
+
+Source: Kolesnik, Paar, Bauer, Ulm (1999), section 5.2.2, Eq. 4-8: the six extrinsics that minimise the back-projection
+errors, intrinsics fixed; then "the calibration is iterated with the most inconsistent interest points removed, until
+this error gets below a certain threshold for all interest points".
+
+Departures: the start need not be good (hypotheses from four landmarks each compete with the prediction); errors are
+weighted by how exactly the landmark itself is known (see :mod:`stages.reprojection`), and "error" in the rule above
+is that weighted one in units of ``pixel_sigma``; for exact landmarks it is the paper's.
+
+Covariances here are 6 x 6 of ``(dt, dtheta)`` in the destination frame: position error in metres, then the rotation
+vector ``R_true = exp(dtheta) R`` in radians.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from stages.declare import Array, Bundle, Inputs, Params, Stage
+from stages.errors import DegenerateError, InputError
+from stages.geometry import Camera, Rig, RigidTransform
+from stages.landmarks import Landmarks, landmarks_from_dem, landmarks_from_disparity
+from stages.lattice import Lattice
+from stages.reprojection import (
+    Observations,
+    Poses,
+    levenberg_marquardt,
+    linearise,
+    normal_matrix,
+)
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+MINIMUM = 6
+"""Fewest landmarks of a pose: twelve equations for six unknowns, so that one wrong landmark shows."""
+SAMPLE = 4
+"""Landmarks of one hypothesis: the fewest that fix a pose uniquely."""
+
+
+class ResectParams(Params):
+    """Parameters of the stage ``resect``."""
+
+    landmarks: Literal["disparity", "dem"] = Field(
+        "disparity",
+        description="source of the 3-D coordinates: the disparity (more exact) or, as in the paper, the DEM",
+    )
+    pixel_sigma: float = Field(
+        0.2, gt=0, description="pixels; expected error of a tracked position, feature vectors summed over 7 x 7"
+    )
+    disparity_sigma: float = Field(
+        0.2, ge=0, description="pixels; expected error of the disparity under a landmark, carried along its ray"
+    )
+    threshold: float = Field(
+        1.0, gt=0, description="pixels; the most inconsistent landmark is removed until all are below: 5 pixel_sigma"
+    )
+    max_depth_ratio: float = Field(
+        0.2, gt=0, description="std of a landmark's distance over its distance; beyond it first-order errors fail"
+    )
+    max_position_ratio: float = Field(
+        0.05, gt=0, description="std of the position over the median distance of landmarks; beyond it: degenerate"
+    )
+    hypotheses: int = Field(
+        150, ge=1, description="samples of four landmarks; finds a clean one at half outliers with p = 0.9999"
+    )
+    iterations: int = Field(50, ge=1, description="limit of Levenberg-Marquardt steps; about ten are needed")
+    seed: int = Field(1999, ge=0, description="seed of the samples; any")
+
+
+@dataclass(frozen=True)
+class Resection:
+    """Pose of one frame.
+
+    ``T_local_left``; ``covariance`` (6, 6) of (position m, rotation rad) in the local frame; ``inlier`` (n,);
+    ``residual`` (n,) back-projection error, pixels, of every landmark (NaN: behind the camera);
+    ``condition`` of the normal matrix with unit diagonal.
+    """
+
+    T_local_left: RigidTransform
+    covariance: Floats
+    inlier: Bools
+    residual: Floats
+    iterations: int
+    condition: float
+
+
+def resect(
+    landmarks: Floats,
+    sigmas: Floats,
+    pixels: Floats,
+    camera: Camera,
+    start: RigidTransform,
+    params: ResectParams,
+    rng: np.random.Generator,
+    *,
+    where: str = "this frame",
+) -> Resection:
+    """Pose of a camera from landmarks and their image positions (Eq. 4-8), robustly.
+
+    Parameters
+    ----------
+    landmarks, sigmas : (n, 3) coordinates in the local frame, m, and one standard deviation of each along its ray, m.
+    pixels : (n, 2) column, row.
+    start : prediction of T_local_left.
+    where : words for error messages ("frame 12").
+
+    Raises
+    ------
+    DegenerateError
+        Fewer than six landmarks (in all, or consistent), all on a line, or a pose that they do not determine.
+    """
+    _enough(len(landmarks), where, "have coordinates and were found", "set track.points higher or choose a nearer key")
+    _not_collinear(landmarks, where)
+    obs = Observations(landmarks[None], sigmas[None], pixels[None], camera, params.pixel_sigma)
+    poses, near = _robust_start(obs, _batch(start.inverse()), params, rng)
+    poses, active, steps = _remove_inconsistent(obs, poses, near, params, where)
+    _not_collinear(landmarks[active], where)
+    return _result(obs, poses, active, steps, params, where)
+
+
+def _batch(T: RigidTransform) -> Poses:
+    return Poses(T.rotation[None], T.translation[None])
+
+
+def _robust_start(
+    obs: Observations, prediction: Poses, params: ResectParams, rng: np.random.Generator
+) -> tuple[Poses, Bools]:
+    """The hypothesis that most landmarks agree with, adjusted to those; and which agree (n,).
+
+    Locally optimised RANSAC (Chum, Matas, Kittler 2003, doi:10.1007/978-3-540-45243-0_31) with truncated squares as
+    the score. The prediction competes with samples of four landmarks that are adjusted from it.
+    """
+    n = obs.landmarks.shape[1]
+    samples = np.argsort(rng.random((params.hypotheses, n)), axis=1, kind="stable")[:, :SAMPLE]
+    start = Poses(
+        np.repeat(prediction.R, params.hypotheses, axis=0), np.repeat(prediction.t, params.hypotheses, axis=0)
+    )
+    found, _ = levenberg_marquardt(obs.take(samples), start, np.ones(samples.shape, bool), 10, tolerance=1e-3)
+    candidates = Poses(np.concatenate([prediction.R, found.R]), np.concatenate([prediction.t, found.t]))
+    bound = 2.0 * params.threshold / params.pixel_sigma
+    scores = np.array([_score(obs, candidates.at(i), bound) for i in range(len(candidates.t))])
+    best = candidates.at(int(np.argmin(scores)))
+    for _ in range(2):
+        active = linearise(obs, best).norm <= bound
+        if active.sum() >= SAMPLE:
+            best, _ = levenberg_marquardt(obs, best, active, 10, tolerance=1e-6)
+    return best, linearise(obs, best).norm[0] <= bound
+
+
+def _score(obs: Observations, poses: Poses, bound: float) -> float:
+    norm = linearise(obs, poses).norm[0]
+    return float(np.minimum(norm, bound).dot(np.minimum(norm, bound)))
+
+
+def _remove_inconsistent(
+    obs: Observations, poses: Poses, active: Bools, params: ResectParams, where: str
+) -> tuple[Poses, Bools, int]:
+    """The paper's rule: adjust, remove the most inconsistent landmark, again until all are under the threshold."""
+    bound = params.threshold / params.pixel_sigma
+    steps = 0
+    while True:
+        _enough(int(active.sum()), where, "agree with one pose", "raise resect.threshold or choose basic pairs closer")
+        poses, done = levenberg_marquardt(obs, poses, active[None], params.iterations)
+        steps += done
+        norm = np.where(active, linearise(obs, poses).norm[0], -1.0)
+        worst = int(np.argmax(norm))
+        if norm[worst] <= bound:
+            return poses, active, steps
+        active = active.copy()
+        active[worst] = False
+
+
+def _result(obs: Observations, poses: Poses, active: Bools, steps: int, params: ResectParams, where: str) -> Resection:
+    lin = linearise(obs, poses)
+    normal, _, weight = normal_matrix(lin, active[None])
+    scale = np.sqrt(np.diag(normal[0]))
+    values, vectors = np.linalg.eigh(normal[0] / np.outer(scale, scale))
+    condition = float(values[-1] / max(values[0], 1e-300))
+    # A posteriori variance factor: the errors found, not the ones expected, set the scale.
+    factor = float((weight[0] * np.where(active, lin.norm[0], 0.0) ** 2).sum() / (2 * active.sum() - 6))
+    inverse = (vectors / np.maximum(values, 1e-300)) @ vectors.T / np.outer(scale, scale)
+    R = poses.R[0]
+    turn = np.zeros((6, 6))
+    turn[:3, :3] = turn[3:, 3:] = R.T
+    T = RigidTransform(R, poses.t[0]).inverse()
+    depth = float(np.median((obs.landmarks[0][active] @ R.T + poses.t[0])[:, 2]))
+    expected = float(np.sqrt(np.trace((turn @ inverse @ turn.T)[:3, :3])))
+    if expected > params.max_position_ratio * depth:
+        raise DegenerateError(
+            f"{where}: {int(active.sum())} landmarks at a median distance of {depth:.3g} m leave the position uncertain"
+            f" by {expected:.2g} m (condition {condition:.1e})",
+            remedy="they are too far, too few or in one direction: set track.points higher or use nearer texture",
+        )
+    residual = np.where(np.isfinite(lin.norm[0]), np.sqrt((lin.error[0] ** 2).sum(-1)), np.nan)
+    return Resection(T, factor * (turn @ inverse @ turn.T), active, residual, steps, condition)
+
+
+def _enough(count: int, where: str, what: str, remedy: str) -> None:
+    if count < MINIMUM:
+        raise DegenerateError(f"{where}: too few landmarks: {count} {what}, {MINIMUM} are needed", remedy=remedy)
+
+
+def _not_collinear(landmarks: Floats, where: str) -> None:
+    """A line of landmarks leaves the rotation about it free; below 1 % of their spread is a line in practice."""
+    spread = np.linalg.svd(landmarks - landmarks.mean(0), compute_uv=False)
+    if spread[1] < 0.01 * spread[0]:
+        raise DegenerateError(
+            f"{where}: the {len(landmarks)} landmarks are collinear, the rotation about their line is free",
+            remedy="set track.points higher so that landmarks cover the image",
+        )
+
+
+@dataclass(frozen=True)
+class SegmentPoses:
+    """Poses of a segment's frames; see the stage's outputs."""
+
+    poses: Floats
+    covariance: Floats
+    inlier: NDArray[np.uint8]
+    residual: NDArray[np.float32]
+    facts: list[dict[str, Any]]
+
+
+def resect_segment(
+    points: NDArray[np.float32],
+    landmarks: Landmarks,
+    camera: Camera,
+    T_local_key: RigidTransform,
+    frames: list[int],
+    params: ResectParams,
+) -> SegmentPoses:
+    """Poses of the frames of a segment, the key frame's given.
+
+    Parameters
+    ----------
+    points : (n, frames, 2) tracked column, row; NaN lost. Frame 0 is the key frame.
+    landmarks : of the same n points, in the local frame of the key; NaN none.
+    T_local_key : pose of the key frame's left camera.
+    frames : frame numbers, for messages and seeds.
+
+    Raises
+    ------
+    DegenerateError
+        A frame cannot be posed; named with the reason.
+    """
+    n, count = points.shape[:2]
+    out = SegmentPoses(
+        np.zeros((count, 3, 4)),
+        np.zeros((count, 6, 6)),
+        np.zeros((n, count), np.uint8),
+        np.full((n, count), np.nan, np.float32),
+        [],
+    )
+    known = np.isfinite(landmarks.position).all(1)
+    pose = T_local_key
+    out.poses[0] = pose.matrix34
+    for j in range(count):
+        use = np.flatnonzero(known & np.isfinite(points[:, j]).all(1))
+        if j == 0:
+            out.inlier[use, 0], out.residual[use, 0] = 1, 0.0
+            out.facts.append(_facts(frames[0], use.size, use.size, 0.0, 0, None))
+            continue
+        if use.size < MINIMUM:
+            _enough(
+                use.size,
+                f"frame {frames[j]}",
+                f"of {n} tracked points have coordinates and were found ({landmarks.summary()})",
+                "set track.points higher or choose basic pairs closer",
+            )
+        found = resect(
+            landmarks.position[use],
+            landmarks.sigma[use],
+            points[use, j].astype(np.float64),
+            camera,
+            pose,
+            params,
+            np.random.default_rng([params.seed, frames[j]]),
+            where=f"frame {frames[j]}",
+        )
+        pose = found.T_local_left
+        out.poses[j], out.covariance[j] = pose.matrix34, found.covariance
+        out.inlier[use, j], out.residual[use, j] = found.inlier, found.residual
+        rms = float(np.sqrt(np.mean(found.residual[found.inlier] ** 2)))
+        out.facts.append(_facts(frames[j], use.size, int(found.inlier.sum()), rms, found.iterations, found.condition))
+    return out
+
+
+def _facts(frame: int, seen: int, inliers: int, rms: float, iterations: int, condition: float | None) -> dict[str, Any]:
+    return {
+        "frame": frame,
+        "landmarks": seen,
+        "inliers": inliers,
+        "rms_px": rms,
+        "iterations": iterations,
+        "condition": condition,
+    }
+
+
+def _run(params: ResectParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+    track, rig = inputs["track"], Rig.from_dict(inputs["rig"].meta["rig"])
+    T_local_key = RigidTransform.from_matrix(inputs["level"].meta["T_local_left"])
+    points = np.asarray(track["points"])
+    landmarks = _coordinates(points[:, 0].astype(np.float64), inputs, rig, T_local_key, params)
+    frames = [int(f) for f in track.meta["frames"]]
+    found = resect_segment(points, landmarks, rig.left, T_local_key, frames, params)
+    arrays = {
+        "poses": found.poses,
+        "covariance": found.covariance,
+        "inlier": found.inlier,
+        "landmarks": landmarks.position,
+        "residual": found.residual,
+    }
+    return Bundle(
+        arrays, {"per_frame": found.facts, "landmark_source": params.landmarks, "without_coordinates": landmarks.lost}
+    )
+
+
+def _coordinates(
+    points: Floats, inputs: Inputs, rig: Rig, T_local_key: RigidTransform, params: ResectParams
+) -> Landmarks:
+    port = "dem" if params.landmarks == "dem" else "disparity"
+    source = inputs.get(port)
+    if source is None:
+        raise InputError(
+            f"resect.landmarks={params.landmarks!r} but no {port} was computed", remedy=f"connect the input {port!r}"
+        )
+    bounds = {"disparity_sigma": params.disparity_sigma, "max_depth_ratio": params.max_depth_ratio}
+    if port == "dem":
+        lattice = Lattice.from_dict(source.meta["lattice"])
+        return landmarks_from_dem(points, np.asarray(source["elevation"]), lattice, rig, T_local_key, **bounds)
+    maps = [np.asarray(source[name]) for name in ("column_disparity", "row_disparity", "validity")]
+    return landmarks_from_disparity(points, maps[0], maps[1], maps[2], rig, T_local_key, **bounds)
+
+
+STAGE = Stage(
+    name="resect",
+    version=1,
+    summary="poses of a segment's frames in the local frame of its basic pair",
+    params=ResectParams,
+    inputs=("track", "dem?", "disparity?", "level", "rig"),
+    outputs=(
+        Array("poses", ("frame", "row", "col"), "float64", "m", "pose [R | t] of the left camera", frame="local"),
+        Array(
+            "covariance",
+            ("frame", "parameter", "parameter"),
+            "float64",
+            "m^2, m rad, rad^2",
+            "covariance of position and rotation vector",
+            frame="local",
+        ),
+        Array("inlier", ("point", "frame"), "uint8", "1", "landmark agrees with the pose", nodata="0"),
+        Array("landmarks", ("point", "xyz"), "float64", "m", "coordinates of the landmarks", "nan", "local"),
+        Array("residual", ("point", "frame"), "float32", "pixel", "back-projection error", nodata="nan"),
+    ),
+    requires=("numpy",),
+    run=_run,
+)

@@ -1,0 +1,48 @@
+"""Validity of a pixel's disparity: a documented bit mask, never a magic value (paper, 4.3.1 and 4.3.3).
+
+A pixel's disparity is defined where ``MATCHED`` or ``INTERPOLATED`` is set, never both. The other bits say why a pixel
+is not ``MATCHED``; they stay set when it was interpolated.
+"""
+
+from __future__ import annotations
+
+from enum import IntFlag
+
+import numpy as np
+from numpy.typing import NDArray
+
+Mask = NDArray[np.uint8]
+
+
+class Validity(IntFlag):
+    """Bits of the ``validity`` arrays (uint8)."""
+
+    MATCHED = 1
+    """Found, and consistent under back-matching."""
+    INTERPOLATED = 2
+    """Filled from consistent neighbours; not a measurement."""
+    BACKMATCH_FAILED = 4
+    """Matching back from the other image does not return to this pixel."""
+    OVER_THRESHOLD = 8
+    """The least feature distance is too great: not matchable."""
+    OUT_OF_IMAGE = 16
+    """Masked here, or the search or its best match lies on a border or on masked pixels there."""
+    NO_TEXTURE = 32
+    """Too little grey value variation to match."""
+    SPECKLE = 64
+    """Removed as part of a small isolated patch."""
+
+
+def matched(validity: Mask) -> NDArray[np.bool_]:
+    """Pixels with a measured disparity."""
+    return (validity & Validity.MATCHED) != 0
+
+
+def defined(validity: Mask) -> NDArray[np.bool_]:
+    """Pixels with a disparity, interpolated ones included."""
+    return (validity & (Validity.MATCHED | Validity.INTERPOLATED)) != 0
+
+
+def counts(validity: Mask) -> dict[str, int]:
+    """Number of pixels with each bit, by its name in lower case."""
+    return {str(bit.name).lower(): int(np.count_nonzero(validity & bit)) for bit in Validity}

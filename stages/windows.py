@@ -1,0 +1,106 @@
+"""Moving windows over a raster: extrema, sums and fitted planes, each O(1) a cell whatever the window's size.
+
+Windows are square, centred and of odd side ``n``, clipped at the raster's border; unknown cells are left out.
+
+Sources: van Herk (1992), doi:10.1016/0167-8655(92)90069-C (running extrema); sums are differences of prefix sums.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Floats32 = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+
+def running_max(a: Floats32, n: int) -> Floats32:
+    """Largest value (row, col) in the window; NaN is left out, and -inf stands where all are NaN."""
+    filled = np.where(np.isnan(a), np.float32(-np.inf), a)
+    return np.ascontiguousarray(_max_down(np.ascontiguousarray(_max_down(filled, n).T), n).T)
+
+
+def running_min(a: Floats32, n: int) -> Floats32:
+    """Smallest value (row, col) in the window; NaN is left out, and inf stands where all are NaN."""
+    return -running_max(-a, n)
+
+
+def _max_down(a: Floats32, n: int) -> Floats32:
+    """Running maximum along the rows: of the block's suffix and the next block's prefix (van Herk)."""
+    rows, cols = a.shape
+    blocks = -(-(rows + n - 1) // n)
+    padded = np.full((blocks * n, cols), -np.inf, dtype=np.float32)
+    padded[n // 2 : n // 2 + rows] = a
+    split = padded.reshape(blocks, n, cols)
+    prefix = np.maximum.accumulate(split, axis=1).reshape(-1, cols)
+    suffix = np.maximum.accumulate(split[:, ::-1], axis=1)[:, ::-1].reshape(-1, cols)
+    return np.maximum(suffix[:rows], prefix[n - 1 : n - 1 + rows])
+
+
+def window_sum(a: NDArray, n: int) -> Floats:
+    """Sum (row, col), float64, over the window."""
+    return _sum_down(_sum_down(np.asarray(a, dtype=np.float64), n).T, n).T
+
+
+def _sum_down(a: Floats, n: int) -> Floats:
+    rows = a.shape[0]
+    prefix = np.zeros((rows + 1, a.shape[1]))
+    np.cumsum(a, axis=0, out=prefix[1:])
+    index = np.arange(rows)
+    return np.asarray(prefix[np.minimum(index + n // 2 + 1, rows)] - prefix[np.maximum(index - n // 2, 0)])
+
+
+def window_mean(a: Floats32, n: int) -> Floats:
+    """Mean (row, col) of the known cells in the window; NaN where there is none."""
+    known = ~np.isnan(a)
+    count = window_sum(known, n)
+    total = window_sum(np.where(known, a, 0.0), n)
+    return np.where(count > 0.5, total / np.maximum(count, 1.0), np.nan)
+
+
+@dataclass(frozen=True)
+class Planes:
+    """Least-squares planes of the known cells in each window.
+
+    ``slope`` = \\|gradient\\|, ``residual`` = standard deviation from the plane in the unit of the heights; both
+    (row, col) float64, NaN where fewer than three cells, or only cells on one line, are known.
+    """
+
+    slope: Floats
+    residual: Floats
+
+
+def fit_planes(height: Floats32, n: int, cell: float) -> Planes:
+    """Fit ``z = a + b x + c y`` to the known cells of each window.
+
+    Parameters
+    ----------
+    height : (row, col) float32, metres, NaN unknown.
+    n : side of the window, cells, odd.
+    cell : side of a cell, metres.
+    """
+    known = ~np.isnan(height)
+    mean = float(height[known].mean(dtype=np.float64)) if known.any() else 0.0
+    z = np.where(known, height.astype(np.float64) - mean, 0.0)
+    w, wz, wzz = known.astype(np.float64), z, z * z
+    rows, cols = height.shape
+    y, x = np.arange(rows)[:, None] - (rows - 1) / 2, np.arange(cols)[None] - (cols - 1) / 2
+    count = window_sum(w, n)
+    one = np.maximum(count, 1.0)
+    sx, sy, sz = (window_sum(v, n) / one for v in (w * x, w * y, wz))
+    cxx = window_sum(w * x * x, n) - one * sx * sx
+    cyy = window_sum(w * y * y, n) - one * sy * sy
+    cxy = window_sum(w * x * y, n) - one * sx * sy
+    cxz = window_sum(wz * x, n) - one * sx * sz
+    cyz = window_sum(wz * y, n) - one * sy * sz
+    czz = window_sum(wzz, n) - one * sz * sz
+    det = cxx * cyy - cxy * cxy
+    # In cells, three cells that are not on one line have a determinant of at least 1/3; less is rounding.
+    sound = (count > 2.5) & (det > 0.1)
+    det = np.where(sound, det, np.nan)
+    b, c = (cxz * cyy - cyz * cxy) / det, (cyz * cxx - cxz * cxy) / det
+    variance = np.maximum((czz - b * cxz - c * cyz) / one, 0.0)
+    return Planes(np.hypot(b, c) / cell, np.sqrt(variance))

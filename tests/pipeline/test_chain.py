@@ -1,0 +1,131 @@
+"""The whole chain on a small mockup: what is recomputed, what it leaves, and that it is the same for any executor."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import rasterio
+
+from pipeline import run
+from pipeline.ledger import read
+from stages.errors import ConfigError
+
+SMALL = (
+    "mockup.frames=5",
+    "mockup.image_width=285",
+    "mockup.image_height=260",
+    "mockup.focal_length=300.0",
+    "select.stride=2",
+    "locus.cell_size=0.004",
+)
+
+
+def options(folder: Path, *more: str, **kw: Any) -> run.Options:
+    defaults: dict[str, Any] = {"executor": "inline", "progress": "quiet", "cache": folder / "cache"}
+    return run.Options("mockup-short", assignments=(*SMALL, *more), runs=folder / "runs", **(defaults | kw))
+
+
+def latest(folder: Path) -> Path:
+    return (folder / "runs" / "mockup-short" / "latest").resolve()
+
+
+def computed(folder: Path) -> set[str]:
+    return {row["label"] for row in read(latest(folder) / "ledger.jsonl") if row["status"] == "computed"}
+
+
+def digests(folder: Path) -> dict[str, str]:
+    return {row["label"]: row["digest"] for row in read(latest(folder) / "ledger.jsonl")}
+
+
+@pytest.fixture(scope="module")
+def cold(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("chain")
+    assert run.reconstruct(options(folder)) == 0
+    return folder
+
+
+def test_outputs_are_all_there_and_sound(cold: Path) -> None:
+    folder = latest(cold)
+    wanted = {"trajectory.kitti", "trajectory.tum", "dem.tif", "dem_sigma.tif", "ortho.tif", "risk.tif"}
+    wanted |= {"path.geojson", "config.toml", "report.json", "report.html", "ledger.jsonl"}
+    assert wanted <= {p.name for p in folder.iterdir()}
+    assert np.loadtxt(folder / "trajectory.kitti").shape == (5, 12)
+    with rasterio.open(folder / "dem.tif") as dem, rasterio.open(folder / "risk.tif") as risk:
+        z = dem.read(1)
+        assert z.shape == risk.read(1).shape
+        # the camera stands 0.18 m above a bed whose relief is of some centimetres
+        assert -0.25 < np.nanmedian(z) < -0.11
+    report = json.loads((folder / "report.json").read_text())
+    assert report["missing"] == []
+    assert report["stages"]["hfvm"]["computed"] == 3
+
+
+def test_the_same_again_computes_nothing(cold: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_worker(*args: object, **kw: object) -> None:
+        raise AssertionError("a worker was started")
+
+    monkeypatch.setattr("pipeline.driver.make", no_worker)
+    before = digests(cold)
+    assert run.reconstruct(options(cold, executor="processes")) == 0
+    assert computed(cold) == set()
+    assert digests(cold) == before
+
+
+def test_one_risk_parameter_reruns_risk_path_and_what_reads_them(cold: Path) -> None:
+    assert run.reconstruct(options(cold, "risk.max_hole=0.25")) == 0
+    stages = {label.split("/")[0] for label in computed(cold)}
+    assert stages == {"risk", "path", "path_check"}
+
+
+def test_one_vehicle_limit_reruns_the_same(cold: Path) -> None:
+    assert run.reconstruct(options(cold, "vehicle.max_slope_deg=12")) == 0
+    assert {label.split("/")[0] for label in computed(cold)} == {"risk", "path", "path_check"}
+
+
+def test_written_configuration_repeats_the_run(cold: Path) -> None:
+    assert run.reconstruct(options(cold)) == 0
+    first = digests(cold)
+    again = run.Options(
+        "mockup-short",
+        config=latest(cold) / "config.toml",
+        runs=cold / "runs",
+        cache=cold / "cache",
+        executor="inline",
+        progress="quiet",
+    )
+    assert run.reconstruct(again) == 0
+    assert computed(cold) == set()
+    assert digests(cold) == first
+
+
+def test_two_workers_killed_on_the_way_give_the_same_bits(cold: Path, tmp_path: Path) -> None:
+    assert run.reconstruct(options(cold)) == 0
+    command = [sys.executable, "-m", "pipeline.cli", "reconstruct", "mockup-short", "--jobs", "2", "--quiet"]
+    command += [w for a in SMALL for w in ("--set", a)]
+    command += ["--cache", str(tmp_path / "cache"), "--runs", str(tmp_path / "runs")]
+    process = subprocess.Popen(command, start_new_session=True, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+    until = time.monotonic() + 120
+    while time.monotonic() < until and not list((tmp_path / "cache").glob("artifacts/hfvm/*/manifest.json")):
+        time.sleep(0.05)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    assert not (tmp_path / "runs" / "mockup-short" / "latest").exists()
+    assert subprocess.run(command, check=False, stdout=subprocess.DEVNULL).returncode == 0
+    assert digests(tmp_path) == digests(cold)
+
+
+def test_frames_are_chosen_strictly() -> None:
+    assert run.choose_frames("2:8:3", 9) == (2, 5)
+    assert run.choose_frames(None, 3) == (0, 1, 2)
+    for bad in ("3", "a:b", "0:10", "4:5", "-3:5", "0:9:0"):
+        with pytest.raises(ConfigError, match="--frames"):
+            run.choose_frames(bad, 9)

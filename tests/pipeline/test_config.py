@@ -1,0 +1,55 @@
+"""Configuration: layers, strictness, and the file that is written back."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from pipeline import config
+from stages.errors import ConfigError
+
+
+def test_layers_win_in_order() -> None:
+    built = config.build(
+        config.expand({"select.stride": 2}), {"select": {"stride": 3}}, config.parse_assignments(["select.stride=5"])
+    )
+    assert built.select.stride == 5
+
+
+def test_unknown_key_names_the_nearest() -> None:
+    with pytest.raises(ConfigError, match=r"unknown key 'select\.strid'.*did you mean 'select\.stride'"):
+        config.build(config.parse_assignments(["select.strid=2"]))
+    with pytest.raises(ConfigError, match=r"unknown key 'locsu'.*did you mean 'locus'"):
+        config.build({"locsu": {"cell_size": 1.0}})
+
+
+def test_value_out_of_range_says_what_is_permitted() -> None:
+    with pytest.raises(ConfigError, match=r"select\.stride = 0 is not permitted.*greater than or equal to 1"):
+        config.build(config.parse_assignments(["select.stride=0"]))
+    with pytest.raises(ConfigError, match=r"select\.stride = 'many' is not permitted.*integer"):
+        config.build(config.parse_assignments(["select.stride=many"]))
+
+
+def test_assignment_without_key_or_value() -> None:
+    for text in ("select.stride", "stride=3"):
+        with pytest.raises(ConfigError, match=r"section\.key=value"):
+            config.parse_assignments([text])
+
+
+def test_written_configuration_reads_back_as_the_same(tmp_path: Path) -> None:
+    built = config.build(config.parse_assignments(["select.stride=7", "vehicle.max_step=0.05"]))
+    path = tmp_path / "config.toml"
+    path.write_text(config.to_toml(built))
+    again = config.build(config.read_toml(path))
+    assert again == built
+    assert again.vehicle.max_step == 0.05
+
+
+def test_unreadable_files(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="cannot read"):
+        config.read_toml(tmp_path / "none.toml")
+    bad = tmp_path / "bad.toml"
+    bad.write_text("[select\nstride=1")
+    with pytest.raises(ConfigError, match="not TOML"):
+        config.read_toml(bad)

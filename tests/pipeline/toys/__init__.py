@@ -1,0 +1,1 @@
+"""Tiny stages for the tests of the engine."""

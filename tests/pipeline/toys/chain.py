@@ -1,0 +1,54 @@
+"""A small run as a program of its own: ``python -m toys.chain CACHE [executor] [what] [ledger]``; prints JSON."""
+
+import json
+import sys
+from pathlib import Path
+
+
+def build(graph, frames=4, seed=0, size=40, offset=0.0):
+    """Numbers -> scale (per frame) -> total, the parts by expansion."""
+    from stages.declare import NoParams
+    from toys.numbers import NumbersParams
+    from toys.scale import ScaleParams
+
+    first = [
+        graph.node("toys.numbers", f"numbers/{f}", NumbersParams(seed=seed, size=size), {"frame": f})
+        for f in range(frames)
+    ]
+
+    def rest(*refs):
+        parts = [
+            graph.node("toys.scale", f"scale/{f}", ScaleParams(offset=offset), inputs={"values": h})
+            for f, h in enumerate(first)
+        ]
+        graph.node("toys.total", "total", NoParams(), inputs={"parts": parts})
+
+    graph.expand(first, rest)
+
+
+def main(cache, executor="inline", what="", ledger=""):
+    """Run it, and say what became of it."""
+    from pipeline.executor import prepare_environment
+
+    prepare_environment(cache)
+    from pipeline import driver
+    from pipeline.dag import Graph
+    from pipeline.store import Store
+    from stages.declare import NoParams
+
+    graph = Graph()
+    build(graph, frames=12 if what == "many" else 4, size=400 if what == "many" else 40)
+    if what == "sleep":
+        for i in range(3):
+            graph.node("toys.mischief", f"sleep/{i}", NoParams(), {"what": "sleep", "seconds": 60, "i": i})
+    print("begun", flush=True)
+    result = driver.run(graph, Store(cache), executor=executor, jobs=2, ledger=Path(ledger) if ledger else None)
+    nodes = {h.label: [h.status, h.ref.digest if h.ref else None, h.reason] for h in graph.nodes}
+    print(json.dumps({"ok": result.ok, "workers": result.executor_started, "nodes": nodes}), flush=True)
+
+
+if __name__ == "__main__":
+    try:
+        main(*sys.argv[1:])
+    except KeyboardInterrupt:
+        sys.exit(130)

@@ -1,0 +1,53 @@
+"""Fails, dies, sleeps or answers at random, as its arguments say."""
+
+import os
+import signal
+import time
+from pathlib import Path
+
+import numpy as np
+
+from stages.declare import Array, Bundle, NoParams, Stage
+from stages.errors import DegenerateError
+
+
+class UnpicklableError(Exception):
+    """Its arguments are not those of its constructor."""
+
+    def __init__(self, a, b):
+        super().__init__(f"{a} and {b}")
+
+
+def _run(params, args, inputs):
+    what = args["what"]
+    count = 0
+    if "tally" in args:
+        with Path(args["tally"]).open("a") as file:
+            file.write("x")
+        count = Path(args["tally"]).stat().st_size
+    if what == "degenerate":
+        raise DegenerateError("no texture in frame 7", remedy="choose other frames")
+    if what == "value":
+        raise ValueError("negative depth")
+    if what == "unpicklable":
+        raise UnpicklableError(1, 2)
+    if what == "disk" and count < 3:
+        raise OSError(5, "Input/output error")
+    if what == "die":
+        os.kill(os.getpid(), signal.SIGKILL)
+    if what == "sleep":
+        time.sleep(args["seconds"])
+    value = time.time_ns() if what == "random" else 1
+    return Bundle({"value": np.array([value], dtype=np.int64)}, {"undeclared": float("nan")} if what == "nan" else {})
+
+
+STAGE = Stage(
+    name="mischief",
+    version=1,
+    summary="misbehaves",
+    params=NoParams,
+    inputs=("after?",),
+    outputs=(Array("value", ("one",), "int64", "1", "value"),),
+    requires=(),
+    run=_run,
+)

@@ -1,0 +1,165 @@
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from stages import merge as merge_stage
+from stages.declare import Bundle, check_outputs
+from stages.errors import InputError
+from stages.lattice import Lattice, mosaic
+from stages.merge import Layer, Merged, MergeParams, merge
+
+TILE = Lattice.at(0, 0, 0.1, 4, 5)
+PARAMS = MergeParams()
+
+
+def layer(
+    pair: int,
+    elevation: object,
+    std: object = 0.1,
+    residual: object = 0.0,
+    ortho: object = 100.0,
+    lattice: Lattice = TILE,
+) -> Layer:
+    arrays = (
+        np.broadcast_to(np.asarray(v, np.float32), lattice.shape).copy() for v in (elevation, std, residual, ortho)
+    )
+    return Layer(pair, lattice, *arrays)
+
+
+def noisy(count: int, seed: int = 0) -> list[Layer]:
+    rng = np.random.default_rng(seed)
+    out = []
+    for k in range(count):
+        z = rng.normal(0.0, 0.1, TILE.shape)
+        z[rng.random(TILE.shape) < 0.2] = np.nan
+        std = rng.uniform(0.05, 0.2, TILE.shape)
+        out.append(layer(k, z, std, rng.uniform(0, 0.3, TILE.shape), rng.uniform(0, 255, TILE.shape)))
+    return out
+
+
+def arrays(merged: Merged) -> list[np.ndarray]:
+    return list(vars(merged).values())
+
+
+def test_two_models_by_hand() -> None:
+    """Weights 1/0.1^2 = 100 and 1/0.1^2 / (1 + (0.2/0.1)^2) = 20: mean of 1.0 and 1.6 is 1.1."""
+    merged = merge([layer(0, 1.0), layer(4, 1.6, residual=0.2, ortho=200.0)], TILE, PARAMS)
+    np.testing.assert_allclose(merged.elevation, 1.1, rtol=1e-6)
+    np.testing.assert_allclose(merged.elevation_std, 0.1 * np.hypot(100, 20) / 120, rtol=1e-6)
+    np.testing.assert_allclose(merged.spread, np.sqrt((100 * 0.1**2 + 20 * 0.5**2) / 120), rtol=1e-6)
+    assert (merged.count == 2).all()
+    assert (merged.source == 0).all()
+    np.testing.assert_allclose(merged.ortho, 100.0, atol=0.01)  # the best image, not a double exposure
+
+
+def test_one_model_passes_through() -> None:
+    one = noisy(1)[0]
+    merged = merge([one], TILE, PARAMS)
+    assert np.array_equal(merged.elevation, one.elevation, equal_nan=True)
+    seen = np.isfinite(one.elevation)
+    np.testing.assert_allclose(merged.elevation_std[seen], one.elevation_std[seen], rtol=1e-6)
+    np.testing.assert_allclose(merged.ortho[seen], one.ortho[seen], rtol=1e-6)
+    assert (merged.spread[seen] == 0).all()
+    assert np.array_equal(merged.count, seen.astype(np.uint16))
+    assert np.array_equal(merged.source == -1, ~seen)
+
+
+@given(st.permutations(range(5)), st.integers(0, 5))
+def test_order_changes_no_bit(order: list[int], seed: int) -> None:
+    layers = noisy(5, seed)
+    for a, b in zip(
+        arrays(merge(layers, TILE, PARAMS)), arrays(merge([layers[i] for i in order], TILE, PARAMS)), strict=True
+    ):
+        assert a.tobytes() == b.tobytes()
+
+
+@given(st.integers(1, 6), st.integers(0, 20))
+def test_the_mean_lies_among_the_models(count: int, seed: int) -> None:
+    layers = noisy(count, seed)
+    merged = merge(layers, TILE, PARAMS)
+    stack = np.array([one.elevation for one in layers])
+    seen = np.isfinite(stack).any(axis=0)
+    assert np.array_equal(np.isfinite(merged.elevation), seen)
+    assert (merged.count <= np.isfinite(stack).sum(axis=0)).all()
+    low, high = np.nanmin(stack[:, seen], axis=0), np.nanmax(stack[:, seen], axis=0)
+    assert ((merged.elevation[seen] >= low - 1e-6) & (merged.elevation[seen] <= high + 1e-6)).all()
+
+
+@pytest.mark.parametrize("where", [0, 1, 2, 3])
+def test_one_model_that_contradicts_does_not_pull(where: int) -> None:
+    good = [0.00, 0.02, -0.02]
+    values = [*good[:where], 5.0, *good[where:]]
+    merged = merge([layer(k, z, 0.02) for k, z in enumerate(values)], TILE, PARAMS)
+    # With the outlier in the mean it would be 1.25; the rest agrees to 0.02.
+    assert np.abs(merged.elevation).max() < 0.02
+    assert (merged.count == 3).all()
+    assert (merged.source != where).all()
+
+
+def test_equal_models_have_no_spread() -> None:
+    merged = merge([layer(k, -0.7, 0.02 * (k + 1)) for k in range(4)], TILE, PARAMS)
+    np.testing.assert_allclose(merged.elevation, -0.7, rtol=1e-6)
+    np.testing.assert_allclose(merged.spread, 0.0, atol=1e-7)
+    assert (merged.source == 0).all()
+
+
+def test_std_of_normal_models_is_calibrated() -> None:
+    tile = Lattice.at(0, 0, 0.1, 100, 100)
+    rng = np.random.default_rng(3)
+    layers = []
+    for k in range(5):
+        std = rng.uniform(0.05, 0.2, tile.shape)
+        layers.append(layer(k, rng.normal(0.0, std), std, lattice=tile))
+    merged = merge(layers, tile, PARAMS)
+    assert 0.9 < (merged.elevation / merged.elevation_std).std() < 1.15
+
+
+def test_unusable_values_have_no_weight() -> None:
+    bad = layer(1, 9.0)
+    bad.elevation_std[0] = np.nan
+    bad.residual[1] = np.nan
+    bad.elevation[2] = np.nan
+    bad.elevation_std[3] = np.inf
+    merged = merge([layer(0, 1.0, ortho=50.0), bad], TILE, PARAMS)
+    np.testing.assert_allclose(merged.elevation, 1.0)
+    assert (merged.count == 1).all()
+    nothing = merge([layer(0, np.nan)], TILE, PARAMS)
+    assert not np.isfinite(nothing.elevation).any()
+    assert (nothing.source == -1).all()
+    far = merge([layer(0, 1.0, lattice=Lattice.at(90, 90, 0.1, 2, 2))], TILE, PARAMS)
+    assert not np.isfinite(far.ortho).any()
+    assert (far.count == 0).all()
+
+
+def test_what_is_refused() -> None:
+    with pytest.raises(InputError, match="one pair"):
+        merge([layer(1, 0.0), layer(1, 1.0)], TILE, PARAMS)
+    with pytest.raises(InputError, match="fit together"):
+        merge([layer(1, 0.0, lattice=Lattice.at(0, 0, 0.2, 4, 5))], TILE, PARAMS)
+
+
+def test_tiles_of_the_stage_equal_the_whole() -> None:
+    rng = np.random.default_rng(1)
+    dems, layers = [], []
+    for k in range(4):
+        lattice = Lattice.at(int(rng.integers(-20, 5)), int(rng.integers(5, 20)), 0.1, 25, 30)
+        names = ("elevation", "elevation_std", "residual", "ortho")
+        maps = {n: rng.uniform(0.05, 0.2, lattice.shape).astype(np.float32) for n in names}
+        dems.append(Bundle(maps, {"lattice": lattice.to_dict(), "pair": 4 * k, "frame": "world"}))
+        layers.append(Layer(4 * k, lattice, **maps))
+    whole = Lattice.at(-20, 20, 0.1, 45, 55)
+    at_once = merge(layers, whole, PARAMS)
+    parts = []
+    for tile in whole.tiles(16):
+        bundle = merge_stage.STAGE.run(PARAMS, {"lattice": tile.to_dict()}, {"dems": dems[::-1]})
+        check_outputs(merge_stage.STAGE, bundle)
+        json.dumps(bundle.meta, allow_nan=False)
+        parts.append((tile, bundle))
+    for name, nodata in (("elevation", np.nan), ("spread", np.nan), ("ortho", np.nan), ("count", 0), ("source", -1)):
+        got = mosaic([(tile, bundle[name]) for tile, bundle in parts], nodata, whole)
+        assert got.tobytes() == getattr(at_once, name).tobytes(), name

@@ -1,0 +1,42 @@
+"""One contract for all stages: what they declare of themselves."""
+
+from __future__ import annotations
+
+from importlib.metadata import version
+
+import numpy as np
+import pytest
+
+from pipeline.config import STAGE_MODULES, stage
+
+UNITS = {"1", "px", "m", "rad", "grey", "m, rad", ""}
+DATASET_STAGES = ["datasets.files", "datasets.mockup.scene", "datasets.mockup.render", "datasets.mockup.truth"]
+
+
+@pytest.mark.parametrize("name", STAGE_MODULES)
+def test_declaration(name: str) -> None:
+    s = stage(name)
+    assert s.name == name
+    assert s.version >= 1
+    assert s.summary
+    assert len(set(s.inputs)) == len(s.inputs)
+    for distribution in s.requires:
+        assert version(distribution)
+
+
+@pytest.mark.parametrize("name", STAGE_MODULES)
+def test_every_parameter_is_explained_and_has_a_default(name: str) -> None:
+    for key, field in stage(name).params.model_fields.items():
+        assert field.description, f"{name}.{key} has no description"
+        assert not field.is_required(), f"{name}.{key} has no default"
+    stage(name).params()
+
+
+@pytest.mark.parametrize("name", STAGE_MODULES)
+def test_every_array_has_dims_type_and_unit(name: str) -> None:
+    for array in stage(name).outputs:
+        assert array.long_name, f"{name}.{array.name}"
+        assert array.unit in UNITS, f"{name}.{array.name}: unit {array.unit!r}"
+        kind = np.dtype(array.dtype).kind
+        assert kind in "fui"
+        assert kind != "f" or array.nodata in {"nan", ""}
