@@ -31,7 +31,8 @@ Files
   left/, right/           grey 8-bit images, one a frame, the same name left and right
   valid/left, valid/right 255 = usable, 0 = background (only where something is masked)
   rig.json                both cameras (fx, fy, cx, cy, width, height) and T_right_left (12 numbers, rows of [R | t]),
-                          as they are given to a reconstruction{rig_note}
+                          as they are given to a reconstruction; a simulated
+                          calibration error is in it, while images and truth are those of the true cameras
   calib.txt               the same as P = K [R | t], 3 x 4 row-major a line, left then right; the reference frame is the
                           left camera's, so that the left one is K [I | 0] and the right one K [R_right_left | t]
   poses.txt               T_truth_left, 3 x 4 row-major, a line a frame (KITTI's form)
@@ -104,7 +105,6 @@ def _write(sequence: Sequence, folder: Path, materialise: Materialise, pairs: tu
         height=camera_.height,
         notes="\n".join(sequence.notes),
         truth_source=sequence.truth_source or "no truth is known",
-        rig_note=" (it may err)",
     )
     (folder / "README.txt").write_text(text, encoding="utf-8")
 

@@ -189,7 +189,7 @@ STAGE = Stage(
     params=NoParams,
     inputs=(),
     outputs=(
-        Array("image", ("row", "col"), "uint8", "grey level", "image"),
+        Array("image", ("row", "col"), "uint8", "grey", "image"),
         Array("valid", ("row", "col"), "uint8", "1", "1 = usable"),
     ),
     requires=("numpy", "opencv-python-headless"),

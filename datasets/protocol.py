@@ -68,6 +68,7 @@ class Sequence:
     evaluation_window : (x_min, y_min, x_max, y_max), metres, local frame of a basic pair: where a DEM is judged.
     defaults : dotted configuration that suits the sequence.
     notes : facts that the report repeats.
+    parameters : the sequence's own settings by configuration section, all defaults filled.
     """
 
     name: str
@@ -87,6 +88,7 @@ class Sequence:
     evaluation_window: tuple[float, float, float, float] | None = None
     defaults: Mapping[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    parameters: Mapping[str, Params] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.frames < 1:

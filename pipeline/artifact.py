@@ -13,6 +13,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,10 @@ from stages.errors import RilleError
 
 CHUNK = 1024
 """Greatest chunk edge, cells: 4 MB of float32, so that a usual image is a few files to write and to sync."""
+
+
+SYNCS = 8
+"""Files flushed at once."""
 
 
 class DamagedError(RilleError):
@@ -97,8 +102,9 @@ def write(folder: Path, stage: Stage, bundle: Bundle) -> dict[str, Any]:
             compressors=(BloscCodec(cname="lz4", clevel=5, shuffle="shuffle"), Crc32cCodec()),
             fill_value=np.nan if array.dtype.kind == "f" else 0,
             dimension_names=about["dims"],
+            chunk_key_encoding={"name": "default", "separator": "."},  # no folders within, which would need flushing
             attributes={k: about[k] for k in ("units", "long_name", "nodata", "frame") if about[k]},
-            config={"write_empty_chunks": True},  # a missing chunk would read as fill value, and -0.0 as 0.0
+            config={"write_empty_chunks": True},  # so that a missing chunk is always damage
         )
         written[...] = array
     return described
@@ -119,14 +125,10 @@ def _describe(name: str, array: AnyArray, spec: Array) -> dict[str, Any]:
 
 def seal(folder: Path) -> dict[str, list[Any]]:
     """Flush every file and folder to the disk; returns ``{relative path: [size, crc32c]}``."""
-    files = {}
-    for at, _, names in os.walk(folder, topdown=False):
-        for name in names:
-            path = Path(at, name)
-            files[path.relative_to(folder).as_posix()] = [path.stat().st_size, crc32c(path)]
-            fsync(path)
-        fsync(Path(at))
-    return files
+    paths = [folder, *folder.rglob("*")]
+    with ThreadPoolExecutor(SYNCS) as pool:  # the file system takes those that wait together
+        list(pool.map(fsync, paths))
+    return {p.relative_to(folder).as_posix(): [p.stat().st_size, crc32c(p)] for p in paths if p.is_file()}
 
 
 def fsync(path: Path) -> None:

@@ -22,6 +22,8 @@ def worker_environment(cache: Path | str) -> dict[str, str]:
     """
     return {f"{name}_NUM_THREADS": "1" for name in SINGLE} | {
         "OPENCV_FOR_THREADS_NUM": "1",
+        # a killed worker's semaphores are the tracker's business, not the user's
+        "PYTHONWARNINGS": os.environ.get("PYTHONWARNINGS") or "ignore:resource_tracker:UserWarning",
         "NUMBA_CACHE_DIR": str(Path(cache).absolute() / "numba" / tree_digest()[:32]),
     }
 

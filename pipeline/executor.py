@@ -15,12 +15,15 @@ import logging
 import os
 import pickle
 import queue
+import signal
+import threading
 import traceback
+from collections.abc import Iterator
 from concurrent.futures import Future
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from multiprocessing import resource_tracker
 from pathlib import Path
-from threading import Thread
 from typing import Any, Protocol
 
 from pipeline.environment import cores, prepare_environment, worker_environment
@@ -181,7 +184,7 @@ class Threads(_Futures):
 
     def _start(self, key: str, *task: Any) -> Any:
         future: Future[Outcome | Failed] = Future()
-        Thread(target=lambda: future.set_result(_attempt(key, *task)), daemon=True).start()
+        threading.Thread(target=lambda: future.set_result(_attempt(key, *task)), daemon=True).start()
         return future
 
     def close(self, kill: bool = False) -> None:
@@ -242,19 +245,25 @@ class Processes(Cluster):
             | {"DASK_DISTRIBUTED__LOGGING__DISTRIBUTED": "critical"},
             "distributed.scheduler.allowed-failures": DEATHS - 1,
             "distributed.scheduler.work-stealing": False,
+            "distributed.scheduler.http.routes": [],
             "distributed.worker.multiprocessing-method": "spawn",
             "distributed.worker.profile.enabled": False,
             "distributed.admin.system-monitor.gil.enabled": False,
         }
-        with dask.config.set(settings):
-            self._cluster = LocalCluster(
-                n_workers=jobs,
-                threads_per_worker=1,
-                processes=True,
-                dashboard_address=None,
-                silence_logs=logging.CRITICAL,
-            )
-        super().__init__(self._cluster.scheduler_address)
+        try:
+            with dask.config.set(settings), _interrupts_deferred():
+                self._cluster = LocalCluster(
+                    n_workers=jobs,
+                    threads_per_worker=1,
+                    processes=True,
+                    dashboard_address=None,
+                    scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},  # else port 8787, with a warning if taken
+                    silence_logs=logging.CRITICAL,
+                )
+                super().__init__(self._cluster.scheduler_address)
+        except KeyboardInterrupt:
+            self.close(kill=True)
+            raise
         self._slots = jobs  # all of them, though some may still be starting
 
     def _watch(self) -> None:
@@ -271,6 +280,7 @@ class Processes(Cluster):
         nannies = list(self._cluster.workers.values())
         processes = [n.process.process for n in nannies if n.process and n.process.process]
         if kill:
+            self._cluster.shutdown_on_close = False  # nor wait for it at exit
             _kill(nannies, processes)
         for leave in (self._client.close, self._cluster.close):
             with suppress(Exception):
@@ -278,9 +288,30 @@ class Processes(Cluster):
         _kill(nannies, processes)
 
 
+@contextmanager
+def _interrupts_deferred() -> Iterator[None]:
+    """Hold Ctrl-C back until the end of the block; processes that its new threads begin never see it.
+
+    Otherwise a cluster interrupted half-way could not be closed, and each worker would print a traceback of its own.
+    """
+    resource_tracker.ensure_running()  # it unblocks the signal in the thread that happens to start it
+    came: list[int] = []
+    main = threading.current_thread() is threading.main_thread()
+    previous = signal.signal(signal.SIGINT, lambda number, _: came.append(number)) if main else None
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # threads and processes inherit it
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+        if main:
+            signal.signal(signal.SIGINT, previous)
+    if came:
+        raise KeyboardInterrupt
+
+
 def _kill(nannies: list[Any], processes: list[Any]) -> None:
     for nanny in nannies:
-        nanny.auto_restart = False
+        nanny.close_gracefully()  # that is, do not restart its worker
     for process in processes:
         with suppress(Exception):
             process._process.kill()

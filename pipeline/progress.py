@@ -159,8 +159,7 @@ class Json(Quiet):
 
     def close(self, result: Result) -> None:
         """``{"event": "end", ...}``."""
-        total = result.total()
-        self._say(event="end", ok=result.ok, seconds=round(result.seconds, 3), **vars(total))
+        self._say(event="end", ok=result.ok, **vars(result.total()) | {"seconds": round(result.seconds, 3)})
 
     def _say(self, **facts: Any) -> None:
         print(json.dumps(facts), file=self.stream, flush=True)

@@ -105,6 +105,7 @@ class Reconstruction:
                 rig=self.rig,
                 left=self.left[pair],
                 level=p.level[pair],
+                reference=p.level[basic[0]],
                 trajectory=p.trajectory,
                 local=p.local_dem[pair],
             )
@@ -126,6 +127,7 @@ class Reconstruction:
             rig=self.rig,
             left=self.left[pair],
             level=p.level[pair],
+            reference=p.level[next(iter(p.level))],  # cells and extent of the first pair serve all, so that they merge
         )
         p.local_risk[pair] = self._risk(f"risk/local/{pair}", [p.local_dem[pair]])
         p.local_path[pair] = self._node("path", f"path/local/{pair}", {"use": "local"}, risk=p.local_risk[pair])
@@ -193,6 +195,7 @@ class Reconstruction:
             {
                 "poses": [self.sequence.truth[f].to_list() for f in self.frames],
                 "source": self.sequence.truth_source,
+                "frames": list(self.frames),
             },
         )
         self.products.accuracy = self._node(

@@ -10,15 +10,15 @@ from __future__ import annotations
 import hashlib
 import os
 import sys
-from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from datasets.protocol import Sequence
 from pipeline import config as configuration
 from pipeline.store import Store
-from stages.declare import Bundle, Params
+from stages.declare import Bundle
 from stages.errors import ConfigError, RilleError
 
 COMPLETE, FAILED, HOLES = 0, 1, 3
@@ -74,8 +74,8 @@ def choose_frames(text: str | None, count: int) -> tuple[int, ...]:
     return chosen
 
 
-def settings(options: Options) -> tuple[Any, Params, dict[str, Any], str]:
-    """Sequence, configuration, dataset overrides, and who stated the vehicle's limits."""
+def settings(options: Options) -> tuple[Sequence, Any, str]:
+    """Sequence, configuration, and who stated the vehicle's limits."""
     from datasets.registry import open_sequence
 
     given = configuration.read_toml(options.config) if options.config else {}
@@ -88,7 +88,7 @@ def settings(options: Options) -> tuple[Any, Params, dict[str, Any], str]:
     if "vehicle" in for_stages:
         source = "user"
     config = configuration.build(vehicle, configuration.expand(sequence.defaults), for_stages)
-    return sequence, config, for_dataset, source
+    return sequence, config, source
 
 
 def reconstruct(options: Options) -> int:
@@ -103,9 +103,9 @@ def reconstruct(options: Options) -> int:
 
     _known_stages(options.force)
     started = datetime.now(UTC)
-    sequence, config, for_dataset, vehicle_source = settings(options)
+    sequence, config, vehicle_source = settings(options)
     frames = choose_frames(options.frames, sequence.frames)
-    text = _header(options, for_dataset) + configuration.to_toml(config)
+    text = _header(options) + configuration.to_toml(config, sequence.parameters)
     folder = _make_folder(options.runs / sequence.name, started, text + repr(frames))
     (folder / "config.toml").write_text(text, encoding="utf-8")
 
@@ -160,11 +160,8 @@ def _known_stages(names: frozenset[str]) -> None:
         raise ConfigError(f"--force {name!r} is no stage", remedy=f"one of {', '.join(sorted(known))}")
 
 
-def _header(options: Options, for_dataset: Mapping[str, Any]) -> str:
-    import tomli_w
-
-    lines = [f"# {options.command()}", "# rille reconstruct SEQ --config THIS_FILE uses the same parameters."]
-    return "\n".join(lines) + "\n\n" + (tomli_w.dumps(dict(for_dataset)) + "\n" if for_dataset else "")
+def _header(options: Options) -> str:
+    return f"# {options.command()}\n# rille reconstruct SEQ --config THIS_FILE uses the same parameters.\n\n"
 
 
 def _make_folder(parent: Path, started: datetime, plan: str) -> Path:

@@ -72,7 +72,7 @@ class Store:
         try:
             with self._clear_errors():
                 manifest = self._read_manifest(self.home(stage, key))
-        except (FileNotFoundError, NotADirectoryError):
+        except FileNotFoundError:
             return None
         except ValueError:
             self.set_aside(stage, key, None, "manifest.json is not readable")
@@ -215,6 +215,8 @@ class Store:
                     f"the cache {self.root} may not be used ({os.strerror(error.errno)})",
                     remedy="choose another folder with --cache",
                 ) from error
+            if isinstance(error, NotADirectoryError):
+                raise StoreError(f"the cache {self.root} is not a folder", remedy="choose one with --cache") from error
             raise
 
 

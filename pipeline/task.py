@@ -127,8 +127,6 @@ def ensure(root: Path | str, spec: Spec, refs: Refs, *, key: str | None = None, 
             if ref is None:
                 ref = _compute(store, spec, refs, own, made)
             return Outcome(ref, cached, time.perf_counter() - begin, _peak_rss())
-        except RilleError:
-            raise
         except (OSError, TimeoutError) as error:
             if isinstance(error, PERMANENT) or trial == TRIES - 1:
                 raise

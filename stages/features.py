@@ -12,7 +12,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from llvmlite import ir
+from llvmlite import ir  # type: ignore[import-untyped]
 from numba import njit, types
 from numba.core import cgutils
 from numba.extending import intrinsic
@@ -119,7 +119,7 @@ def _byte(value, scale):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _pack(a, scale, words, deviation):  # type: ignore[no-untyped-def]
-    """Table 1 by fixed-order sums; ``a`` is padded by RADIUS. Fused multiply-add stays off: bytes must not depend on the CPU."""
+    """Table 1 by sums of fixed order; ``a`` is padded by RADIUS. No fast maths: bytes must not depend on the CPU."""
     count, rows, cols = words.shape
     width = cols + 2 * RADIUS
     sums = np.empty(width, np.float32)

@@ -21,10 +21,10 @@ Bools = NDArray[np.bool_]
 
 MATCHED = np.uint8(1)
 """Bit of stages.validity: found by matching and consistent, not filled."""
-TEMPLATE = 5
-RELIEF=1.0
 CONSISTENT = 1.0
 """Pixels: neighbours whose disparities differ by more lie on two surfaces; also the bound of back-matching (4.3.3)."""
+TEMPLATE = 5
+"""Half the side of a template, pixels (see stages.alignment): what its relief is taken over."""
 
 
 @dataclass(frozen=True)
@@ -50,33 +50,27 @@ def landmarks_from_disparity(
     validity: NDArray[np.uint8],
     rig: Rig,
     T_local_left: RigidTransform,
+    disparity_sigma: Floats,
     *,
-    disparity_sigma: float,
     max_depth_ratio: float,
 ) -> Landmarks:
     """Triangulate the stereo matches of points (n, 2) column, row of the left key image.
 
     A point needs four matched (not filled) neighbours on one surface, rays that meet within a pixel in front of both
-    cameras, and a distance whose standard deviation is below ``max_depth_ratio`` of it.
+    cameras, and a distance whose standard deviation is below ``max_depth_ratio`` of it. ``disparity_sigma`` (n,) is in
+    pixels; NaN refuses a point (see :func:`relief`).
     """
     disparity, matched = _disparity_at(points, column_disparity, row_disparity, validity)
     rays = rig.left.rays(points)
     depth = _triangulate(rays, points + disparity, rig)
-    right, slope = _right_image(rays, depth, rig)
+    right, _ = _right_image(rays, depth, rig)
     miss = np.sqrt(((right - points - disparity) ** 2).sum(-1))
     meets = matched & (depth > 0) & (miss <= CONSISTENT)
-    disparity_sigma=np.hypot(disparity_sigma, RELIEF*relief(points, column_disparity, row_disparity, validity))
-    return _landmarks(
-        rays,
-        depth,
-        slope,
-        meets,
-        T_local_left,
-        disparity_sigma,
-        max_depth_ratio,
-        len(points) - int(matched.sum()),
-        "without a consistent stereo match",
-    )
+    lost = {
+        "without a consistent stereo match": int((~matched).sum()),
+        "whose rays do not meet": int((matched & ~meets).sum()),
+    }
+    return _landmarks(rays, np.where(meets, depth, np.nan), rig, T_local_left, disparity_sigma, max_depth_ratio, lost)
 
 
 def _disparity_at(
@@ -110,7 +104,8 @@ def relief(
     """How far the surface under a template departs from a plane: rms (n,) of the disparities about theirs, pixels.
 
     A template on a rock's edge follows the rock or the ground, not the pixel at its centre; both the stereo match and
-    the track are then uncertain by the relief inside the template. NaN where less than half of it is matched.
+    the track are then uncertain by the relief inside the template. NaN where that is beyond :data:`CONSISTENT`, since
+    then there are two surfaces, or where less than half of the template is matched.
     """
     rows, cols = column.shape
     known = np.isfinite(points).all(1)
@@ -127,7 +122,8 @@ def relief(
     plane = np.linalg.solve(normal, np.einsum("nk,ka,nki->nai", good, basis, disparity))
     apart = np.where(good, ((disparity - np.einsum("ka,nai->nki", basis, plane)) ** 2).sum(-1), 0.0)
     count = good.sum(1)
-    return np.where(known & (2 * count >= len(dx)), np.sqrt(apart.sum(1) / np.maximum(count, 1)), np.nan)
+    rms = np.sqrt(apart.sum(1) / np.maximum(count, 1))
+    return np.where(known & (2 * count >= len(dx)) & (rms <= CONSISTENT), rms, np.nan)
 
 
 def _triangulate(rays: Floats, right: Floats, rig: Rig) -> Floats:
@@ -160,30 +156,25 @@ def _right_image(rays: Floats, depth: Floats, rig: Rig) -> tuple[Floats, Floats]
 def _landmarks(
     rays: Floats,
     depth: Floats,
-    slope: Floats,
-    found: Bools,
+    rig: Rig,
     T_local_left: RigidTransform,
-    disparity_sigma: float,
+    disparity_sigma: Floats,
     max_depth_ratio: float,
-    unmatched: int,
-    word: str,
+    lost: dict[str, int],
 ) -> Landmarks:
+    """Coordinates from depths (n,), NaN none, unless too uncertain."""
+    found = np.isfinite(depth)
+    _, slope = _right_image(rays, np.where(found, depth, 1.0), rig)
     with np.errstate(divide="ignore", invalid="ignore"):
         spread = disparity_sigma / np.sqrt((slope**2).sum(-1))
-        near = found & (spread <= max_depth_ratio * depth)
-    keep = near[:, None]
-    position = np.where(keep, T_local_left.apply(rays * np.where(near, depth, 1.0)[:, None]), np.nan)
-    sigma = np.where(keep, np.where(near, spread, 0.0)[:, None] * (rays @ T_local_left.rotation.T), np.nan)
-    behind = len(rays) - unmatched - int(found.sum())
-    return Landmarks(
-        position,
-        sigma,
-        {
-            word: unmatched,
-            "whose rays do not meet": behind,
-            "too far for the baseline": int(found.sum()) - int(near.sum()),
-        },
-    )
+    smooth = found & np.isfinite(disparity_sigma)
+    near = np.zeros(len(depth), bool)
+    near[smooth] = spread[smooth] <= max_depth_ratio * depth[smooth]
+    position = T_local_left.apply(rays * np.where(near, depth, np.nan)[:, None])
+    sigma = np.where(near, spread, np.nan)[:, None] * (rays @ T_local_left.rotation.T)
+    border = {"on a depth edge or the border of what was matched": int((found & ~smooth).sum())}
+    far = {"too far for the baseline": int((smooth & ~near).sum())}
+    return Landmarks(position, sigma, lost | border | far)
 
 
 def landmarks_from_dem(
@@ -192,30 +183,20 @@ def landmarks_from_dem(
     lattice: Lattice,
     rig: Rig,
     T_local_left: RigidTransform,
+    disparity_sigma: Floats,
     *,
-    disparity_sigma: float,
     max_depth_ratio: float,
 ) -> Landmarks:
     """Meet the rays of points (n, 2) column, row of the left key image with its elevation model (rows, cols), m.
 
-    The uncertainty is that of the stereo pair which made the model.
+    The uncertainty is that of the stereo pair which made the model: ``disparity_sigma`` (n,) pixels.
     """
     known = np.isfinite(points).all(1)
     rays = rig.left.rays(np.where(known[:, None], points, 0.0))
-    distance = intersect(elevation, lattice, T_local_left.translation, rays @ T_local_left.rotation.T)
-    found = known & np.isfinite(distance)
-    _, slope = _right_image(rays, np.where(found, distance, 1.0), rig)
-    return _landmarks(
-        rays,
-        distance,
-        slope,
-        found,
-        T_local_left,
-        disparity_sigma,
-        max_depth_ratio,
-        len(points) - int(found.sum()),
-        "whose ray misses the elevation model",
-    )
+    depth = intersect(elevation, lattice, T_local_left.translation, rays @ T_local_left.rotation.T)
+    depth = np.where(known, depth, np.nan)
+    lost = {"whose ray misses the elevation model": int((~np.isfinite(depth)).sum())}
+    return _landmarks(rays, depth, rig, T_local_left, disparity_sigma, max_depth_ratio, lost)
 
 
 def intersect(elevation: NDArray[np.float32], lattice: Lattice, origin: Floats, directions: Floats) -> Floats:

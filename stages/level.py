@@ -24,7 +24,10 @@ from stages.validity import matched
 
 Floats = NDArray[np.float64]
 
+DEFAULT_RANGE_CELLS = 6.0  # of the footprint in meta; the stage locus has its own parameter
 SAMPLES = 5000  # matched pixels that the plane is fitted to: three parameters need no more
+
+MARGIN = 0.05  # share of the camera's height that the range of elevations is widened by: a low rock, a kerb
 
 
 class LevelParams(Params):
@@ -40,7 +43,11 @@ class LevelParams(Params):
         75.0, gt=-90, lt=90, description="degrees; greatest downward pitch of a rig without attitude: nearly nadir"
     )
     relief: float = Field(
-        0.05, gt=0, lt=1, description="share of the camera's height; terrain this close to the plane counts as ground"
+        0.02,
+        gt=0,
+        lt=1,
+        description="share of the camera's height; terrain this close to the plane counts as ground (less than a kerb: "
+        "road and pavement must not make one tilted plane)",
     )
     ceiling: float = Field(
         1.0,
@@ -110,9 +117,6 @@ def level(
     }
 
 
-DEFAULT_RANGE_CELLS = 6.0
-
-
 def z_range(plane: list[float], relief: list[float], extent: list[float]) -> list[float]:
     """Lowest and highest elevation, m, of a plane with relief over an extent x_min, x_max, y_min, y_max."""
     corners = [plane[2] + plane[0] * x + plane[1] * y for x in extent[:2] for y in extent[2:]]
@@ -172,11 +176,11 @@ def _relief(points: Floats, plane: list[float], extent: list[float], height: flo
     x, y, z = points.T
     inside = (x >= extent[0]) & (x <= extent[1]) & (y >= extent[2]) & (y <= extent[3])
     above = z - (plane[2] + plane[0] * x + plane[1] * y)
-    low, high = -params.relief * height, params.relief * height
+    low, high = -MARGIN * height, MARGIN * height
     if np.count_nonzero(inside) >= 20:
         q = np.quantile(above[inside], [0.005, 0.995])
         low, high = min(low, float(q[0])), max(high, float(q[1]))
-    margin = 0.1 * (high - low) + params.relief * height
+    margin = 0.1 * (high - low) + MARGIN * height
     # Below, nothing is known that deep but mismatches; above, walls and crowns.
     return [max(low - margin, -height), min(high + margin, (1.0 + params.ceiling) * height)]
 

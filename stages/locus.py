@@ -55,7 +55,10 @@ class LocusParams(Params):
         0.5, gt=0, description="pixels; greatest |p_l + d - p_r| at the solution: 2.5 sigma_disparity"
     )
     max_backmatch: float = Field(
-        0.5, gt=0, description="pixels; greatest error of back-matching: half the paper's, for elevations"
+        0.7,
+        gt=0,
+        description="pixels; greatest error of back-matching: 2.5 sigma of two matches, sqrt(2) sigma_disparity; less "
+        "than the paper's 1, which serves the matching",
     )
     max_jump: float = Field(
         2.0,
@@ -232,7 +235,8 @@ def _run(params: LocusParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle
     if args["frame"] == "world":
         T, lattice, z_range = _in_world(args, inputs, T_local_left)
     else:
-        cell = params.cell_size or args.get("cell") or level["cell_size"]
+        # One cell for the whole run: that which suits the first basic pair, where that pair is connected.
+        cell = params.cell_size or inputs.get("reference", inputs["level"]).meta["cell_size"]
         T, lattice = T_local_left, local_lattice(rig, level, cell, params)
         z_range = plane_z_range(level["plane"], level["relief"], list(lattice.bounds))
     if params.max_sigma is None:
@@ -295,7 +299,7 @@ STAGE = Stage(
     version=1,
     summary="elevation model and ortho image of a basic pair",
     params=LocusParams,
-    inputs=("disparity", "rig", "left", "level", "trajectory?", "local?"),
+    inputs=("disparity", "rig", "left", "level", "reference?", "trajectory?", "local?"),
     outputs=(
         _array("elevation", "m", "elevation of the cell centre"),
         _array("elevation_std", "m", "standard deviation of the elevation"),

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float32]
+Bools = NDArray[np.bool_]
 DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
 HALF = 2
 """Half the window: 5 x 5 pixels hold a corner of the finest feature kernels."""
@@ -102,7 +103,7 @@ def interest_points(
     return np.stack([cols[best], rows[best]], axis=-1).astype(np.float32)
 
 
-def _peaks(response: Floats) -> NDArray[np.bool_]:
+def _peaks(response: Floats) -> Bools:
     """Greatest of its 5 x 5 neighbourhood; of equal ones the first in reading order."""
     rows, cols = response.shape
     peak = response > 0
@@ -117,7 +118,7 @@ def _peaks(response: Floats) -> NDArray[np.bool_]:
     return peak
 
 
-def _inside(valid: NDArray[np.uint8], border: int) -> NDArray[np.bool_]:
+def _inside(valid: NDArray[np.uint8], border: int) -> Bools:
     """Pixels at least ``border`` away from the image's edge and from anything unusable (Chebyshev distance)."""
     good = np.pad(valid != 0, border, constant_values=False).astype(np.int32)
     for axis in (0, 1):
@@ -127,3 +128,14 @@ def _inside(valid: NDArray[np.uint8], border: int) -> NDArray[np.bool_]:
         full = total.take(range(2 * border + 1, 2 * border + 1 + n), axis) - total.take(range(n), axis)
         good = (full == 2 * border + 1).astype(np.int32)
     return good.astype(bool)
+
+
+def clear_of_mask(valid: NDArray[np.uint8], points: NDArray[np.float64], border: int) -> Bools:
+    """Whether points (n, 2) are at least ``border`` pixels away from the image's edge and from anything unusable."""
+    rows, cols = valid.shape
+    p = np.floor(np.where(np.isfinite(points), points, -1.0) + 0.5).astype(np.intp)
+    inside = ((p >= border) & (p < np.array([cols, rows]) - border)).all(1)
+    p[~inside] = border
+    dy, dx = (o.ravel() for o in np.mgrid[-border : border + 1, -border : border + 1])
+    window = valid[np.clip(p[:, 1:] + dy, 0, rows - 1), np.clip(p[:, :1] + dx, 0, cols - 1)]
+    return np.asarray(inside & (window.min(axis=1) != 0))

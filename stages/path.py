@@ -4,7 +4,7 @@ Nodes are the free cells: safe, and farther than the vehicle's margin from every
 three nodes of the next row (same column and its neighbours). The weight of an edge is the absolute height difference
 between the places where a wheel would stand: means over the wheel's window, rounded to a step that means nothing to the
 vehicle. Rounded heights are integers, so sums are exact and ties are ties: among equals the path with fewest sideways
-moves wins, then straight, then left, then right.
+moves wins, then the one whose last move is straight, else to the left, else to the right.
 
 Since all edges lead from row to row, Dijkstra's algorithm is one sweep over the rows, O(N) in the number of cells, and
 yields all targets of the far row at once (Figure 3).
@@ -16,13 +16,17 @@ An elevation model is fan-shaped and ragged: the first and last rows with a free
 nowhere. So a start that is not given is, of the free cells within one vehicle length of the first row that lead on,
 the one nearest to that row's middle; the target likewise at the last row. A path counts as found when it comes within
 one vehicle length of the last row.
+
+An obstacle hides part of itself, so the rim of unknown ground is less certain than its elevations say: what lies in the
+dark belongs to the same wheel's window. A path that stays half a wheel away from unknown ground is preferred; where
+there is none, unknown ground may be passed closely, but never entered.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -33,7 +37,8 @@ from scipy.ndimage import distance_transform_edt
 from stages.declare import Array, Bundle, Inputs, Params, Stage
 from stages.errors import InputError
 from stages.lattice import Lattice
-from stages.risk import HAZARDOUS, SAFE, window_cells
+from stages.risk import HAZARDOUS, SAFE, UNKNOWN, window_cells
+from stages.row_grid import RowGrid
 from stages.vehicle import Vehicle
 from stages.windows import window_mean
 
@@ -64,68 +69,12 @@ class PathParams(Params):
 
 
 @dataclass(frozen=True)
-class RowGrid:
-    """Grid whose rows lie across a heading, row 0 farthest ahead; cell centres are at multiples of the cell.
-
-    ``ahead`` is the heading as a unit vector; row 0, column 0 lies ``i0`` cells right and ``j0`` cells ahead of (0, 0).
-    """
-
-    ahead: Point
-    i0: int
-    j0: int
-    cell: float
-    rows: int
-    cols: int
-
-    @staticmethod
-    def over(lattice: Lattice, heading: Point) -> RowGrid:
-        """The grid that covers a lattice; with heading (0, 1) the lattice itself."""
-        norm = math.hypot(*heading)
-        if not (math.isfinite(norm) and norm > 0):
-            raise InputError(f"heading {heading} has no direction", remedy="give start and target that differ")
-        dx, dy = heading[0] / norm, heading[1] / norm
-        x, y = lattice.xs()[[0, -1, 0, -1]], lattice.ys()[[0, 0, -1, -1]]
-        right, ahead = (x * dy - y * dx) / lattice.cell, (x * dx + y * dy) / lattice.cell
-        i0, i1 = math.ceil(right.min() - 1e-6), math.floor(right.max() + 1e-6)
-        j0, j1 = math.floor(ahead.max() + 1e-6), math.ceil(ahead.min() - 1e-6)
-        return RowGrid((dx, dy), i0, j0, lattice.cell, max(j0 - j1, 0) + 1, max(i1 - i0, 0) + 1)
-
-    def xy(self, row: NDArray[Any], col: NDArray[Any]) -> Floats:
-        """Cell centres (..., 2), metres."""
-        right, ahead = (self.i0 + col) * self.cell, (self.j0 - row) * self.cell
-        dx, dy = self.ahead
-        return np.stack([right * dy + ahead * dx, ahead * dy - right * dx], axis=-1)
-
-    def index(self, point: Point) -> tuple[int, int]:
-        """Row and column of the cell that holds a point, metres; it may be outside."""
-        dx, dy = self.ahead
-        right, ahead = point[0] * dy - point[1] * dx, point[0] * dx + point[1] * dy
-        return round(self.j0 - ahead / self.cell), round(right / self.cell - self.i0)
-
-    def sample(self, lattice: Lattice, array: NDArray[Any], outside: float) -> NDArray[Any]:
-        """An array on the lattice brought to this grid by nearest neighbour."""
-        row, col = np.indices((self.rows, self.cols))
-        at = np.rint(lattice.index(self.xy(row, col))).astype(np.int64)
-        inside = ((at >= 0) & (at < lattice.shape)).all(axis=-1)
-        out = np.full((self.rows, self.cols), outside, dtype=array.dtype)
-        out[inside] = array[at[inside, 0], at[inside, 1]]
-        return out
-
-    def to_dict(self) -> dict[str, Any]:
-        """JSON form."""
-        return {"ahead": list(self.ahead), "i0": self.i0, "j0": self.j0, "cell": self.cell} | {
-            "rows": self.rows,
-            "cols": self.cols,
-        }
-
-
-@dataclass(frozen=True)
 class Plan:
     """What the sweep found, in cells of its grid.
 
     ``cells`` (vertex, 2) row, column from start to target, empty where there is no path; ``cost`` (row, col) int64 of
     :func:`sweep`; ``reachable`` (col,) of ``target_row``; ``blocking_row`` the first row that cannot be entered and
-    ``reason`` in words, both empty where a path was found.
+    ``reason`` in words, both empty where a path was found. ``beside_unknown``: no path keeps half a wheel from unknown.
     """
 
     cells: Ints
@@ -134,14 +83,16 @@ class Plan:
     target_row: int
     blocking_row: int | None = None
     reason: str = ""
+    beside_unknown: bool = False
 
 
-def free_cells(risk: NDArray[np.uint8], cell: float, margin: float) -> Mask:
-    """Safe cells whose centre is farther than ``margin`` metres from that of every hazardous cell."""
+def free_cells(risk: NDArray[np.uint8], cell: float, margin: float, rim: float = 0.0) -> Mask:
+    """Safe cells farther (centre to centre) than ``margin`` metres from hazardous and ``rim`` from unknown ones."""
     free = risk == SAFE
-    hazard = risk == HAZARDOUS
-    if hazard.any():
-        free &= distance_transform_edt(~hazard) * cell > margin
+    for kind, distance in ((HAZARDOUS, margin), (UNKNOWN, rim)):
+        blocked = risk == kind
+        if distance > 0 and blocked.any():
+            free &= distance_transform_edt(~blocked) * cell > distance
     return np.asarray(free)
 
 
@@ -196,24 +147,29 @@ def plan(
     tolerance: int = 0,
     start: tuple[int, int] | None = None,
     target: tuple[int, int] | None = None,
+    span: tuple[int, int] | None = None,
 ) -> Plan:
     """Path from the nearest to the farthest row, or between given cells.
 
     Parameters
     ----------
     height : (row, col) int64 rounded heights. ``free`` : cells that may be entered. Row 0 is farthest.
-    tolerance : rows by which a start or target that is not given may miss the nearest or farthest row with a free cell.
+    tolerance : rows by which a start or target that is not given may miss the nearest or farthest row with a free cell;
+        at most a quarter of the rows between them.
     start, target : row and column, inside the grid.
+    span : the farthest and the nearest row that count; None: those with a free cell.
     """
     rows, cols = free.shape
-    occupied = np.flatnonzero(free.any(axis=1))
+    first_last = span or row_span(free)
     nothing = Plan(np.empty((0, 2), dtype=np.int64), np.full(free.shape, UNREACHED), np.zeros(cols, dtype=bool), 0)
     for name, cell in (("start", start), ("target", target)):
         if cell is not None and not free[cell]:
             return _blocked(nothing, cell[0], f"the {name} is not a free cell")
-    if len(occupied) == 0:
+    if first_last is None:
         return _blocked(nothing, rows - 1, "there is no free cell")
-    nearest, limit = int(occupied[-1]), int(occupied[0]) + tolerance
+    farthest, nearest = first_last
+    tolerance = min(tolerance, (nearest - farthest) // 4)
+    limit = farthest + tolerance
     candidates = np.zeros_like(free)
     if start is not None:
         candidates[start] = True
@@ -231,7 +187,7 @@ def plan(
     good = candidates & (far <= limit)
     if not good.any():
         cost, _ = sweep(height, allowed, candidates)
-        stop = int(far[candidates].min()) - 1
+        stop = int(far[candidates].min()) - 1 if candidates.any() else nearest
         return _blocked(
             Plan(nothing.cells, cost, nothing.reachable, limit), stop, "no free cell of this row can be entered"
         )
@@ -240,12 +196,18 @@ def plan(
     cost, move = sweep(height, allowed, source)
     ends = cost < UNREACHED
     ends[limit + 1 :] = False
-    row, col = _nearest_middle(ends, int(occupied[0]))
+    row, col = _nearest_middle(ends, farthest)
     return Plan(_trace(move, row, col), cost, cost[row] < UNREACHED, row)
 
 
+def row_span(free: Mask) -> tuple[int, int] | None:
+    """The farthest and the nearest row with a free cell."""
+    occupied = np.flatnonzero(free.any(axis=1))
+    return (int(occupied[0]), int(occupied[-1])) if len(occupied) else None
+
+
 def _blocked(at: Plan, row: int, reason: str) -> Plan:
-    return Plan(at.cells, at.cost, at.reachable, at.target_row, row, reason)
+    return replace(at, blocking_row=row, reason=reason)
 
 
 def _nearest_middle(cells: Mask, row: int) -> tuple[int, int]:
@@ -301,10 +263,14 @@ def find_path(
         for name, point in (("start", start), ("target", target))
     ]
     free = grid.sample(lattice, free_cells(risk, lattice.cell, vehicle.margin), False)
+    rim = 0.5 * vehicle.wheel_diameter
+    clear = free & grid.sample(lattice, free_cells(risk, lattice.cell, 0.0, rim), False)
     stand = grid.sample(lattice, window_mean(elevation, window_cells(vehicle.wheel_diameter, lattice.cell)), np.nan)
     height = np.rint(np.where(free, stand, 0.0) / (height_step * vehicle.max_step)).astype(np.int64)
     tolerance = math.ceil((vehicle.wheel_base + vehicle.wheel_diameter) / lattice.cell)
-    found = plan(height, free, tolerance, *ends)
+    found = plan(height, clear, tolerance, start=ends[0], target=ends[1], span=row_span(free))
+    if len(found.cells) == 0:
+        found = replace(plan(height, free, tolerance, start=ends[0], target=ends[1]), beside_unknown=True)
     row, col = found.cells[:, 0], found.cells[:, 1]
     return found, grid, np.column_stack([grid.xy(row, col), stand[row, col]])
 
@@ -352,6 +318,7 @@ def _meta(found: Plan, grid: RowGrid, xyz: Floats, inclination: NDArray[np.float
         "reason": found.reason,
         "blocking_row": found.blocking_row,
         "blocking_y": None if found.blocking_row is None else (grid.j0 - found.blocking_row) * grid.cell,
+        "beside_unknown": found.beside_unknown,
         "target_row": found.target_row,
         "reachable_targets": int(found.reachable.sum()),
         "vertices": len(xyz),

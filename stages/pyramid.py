@@ -25,8 +25,12 @@ Image = NDArray[np.float32]
 class PyramidParams(Params):
     """Parameters of the image pyramid."""
 
-    levels: int = Field(6, ge=1, le=10, description="images, level 0 included; three are too few beyond a megapixel")
-    min_side: int = Field(8, ge=1, description="pixels; no level has a side below this (13-tap features need context)")
+    levels: int = Field(
+        default=6, ge=1, le=10, description="images, level 0 included; three are too few beyond a megapixel"
+    )
+    min_side: int = Field(
+        default=8, ge=1, description="pixels; no level has a side below this (13-tap features need context)"
+    )
 
 
 @dataclass(frozen=True)
@@ -65,7 +69,9 @@ def grey(image: AnyArray) -> Image:
         return image.astype(np.float32) * np.float32(1.0 / 257.0)
     if image.dtype == np.uint8 or image.dtype.kind == "f":
         return np.ascontiguousarray(image, dtype=np.float32)
-    raise InputError(f"image of type {image.dtype} has no known grey scale", remedy="give uint8, uint16 or float 0..255")
+    raise InputError(
+        f"image of type {image.dtype} has no known grey scale", remedy="give uint8, uint16 or float 0..255"
+    )
 
 
 def build(image: AnyArray, params: PyramidParams, valid: AnyArray | None = None) -> Pyramid:

@@ -15,7 +15,8 @@ is the same as estimating the landmark along with the pose.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,13 +62,20 @@ class Poses:
 
 
 @dataclass(frozen=True)
-class Linearised:
-    """Errors at a pose: raw (b, n, 2) px; whitened ones and their Jacobian (b, n, 2[, 6]); Mahalanobis norm (b, n)."""
+class Errors:
+    """Back-projection errors at poses.
 
-    error: Floats
+    ``pixels`` (b, n, 2) raw, ``white`` (b, n, 2) whitened, ``norm`` (b, n) their Mahalanobis length (infinite behind
+    the camera), and what the derivatives need: camera coordinates ``x`` (b, n, 3), ``projection`` (b, n, 2, 3)
+    derivative of the image by them, ``along`` (b, n, 2) image of the landmark's standard deviation.
+    """
+
+    pixels: Floats
     white: Floats
-    jacobian: Floats
     norm: Floats
+    x: Floats
+    projection: Floats
+    along: Floats
 
 
 def exponential(w: Floats) -> Floats:
@@ -87,27 +95,28 @@ def cross_matrix(v: Floats) -> Floats:
     return np.stack([np.stack([z, -w, y], -1), np.stack([w, z, -x], -1), np.stack([-y, x, z], -1)], -2)
 
 
-def linearise(obs: Observations, poses: Poses) -> Linearised:
-    """Eq. 7 and 8 and their derivatives; a landmark behind the camera has infinite norm and no weight."""
-    camera = obs.camera
-    x = np.einsum("bij,bnj->bni", poses.R, obs.landmarks) + poses.t[:, None]
+def back_projection(obs: Observations, poses: Poses) -> Errors:
+    """Eq. 7 and 8 at each pose; observations of a batch of one serve any number of poses."""
+    camera, count = obs.camera, (len(poses.t), *obs.landmarks.shape[1:])
+    x = np.einsum("bij,bnj->bni", poses.R, np.broadcast_to(obs.landmarks, count)) + poses.t[:, None]
     behind = x[..., 2] < NEAREST
     z = np.where(behind, 1.0, x[..., 2])
     u, v = x[..., 0] / z, x[..., 1] / z
-    error = np.stack([camera.fx * u + camera.cx, camera.fy * v + camera.cy], -1) - obs.pixels
-    zero = np.zeros_like(z)
-    projection = np.stack(
-        [
-            np.stack([camera.fx / z, zero, -camera.fx * u / z], -1),
-            np.stack([zero, camera.fy / z, -camera.fy * v / z], -1),
-        ],
-        -2,
-    )
-    jacobian = np.concatenate([projection, np.einsum("bnij,bnjk->bnik", projection, -cross_matrix(x))], -1)
-    g = np.einsum("bnij,bjk,bnk->bni", projection, poses.R, obs.sigmas)
-    white = _whiten(error[..., None], g, obs.pixel_sigma)[..., 0]
+    pixels = np.stack([camera.fx * u + camera.cx, camera.fy * v + camera.cy], -1) - obs.pixels
+    projection = np.zeros((*z.shape, 2, 3))
+    projection[..., 0, 0], projection[..., 0, 2] = camera.fx / z, -camera.fx * u / z
+    projection[..., 1, 1], projection[..., 1, 2] = camera.fy / z, -camera.fy * v / z
+    turned = np.einsum("bij,bnj->bni", poses.R, np.broadcast_to(obs.sigmas, count))
+    along = np.einsum("bnij,bnj->bni", projection, turned)
+    white = _whiten(pixels[..., None], along, obs.pixel_sigma)[..., 0]
     norm = np.where(behind, np.inf, np.sqrt((white * white).sum(-1)))
-    return Linearised(error, white, _whiten(jacobian, g, obs.pixel_sigma), norm)
+    return Errors(pixels, white, norm, x, projection, along)
+
+
+def derivatives(errors: Errors, pixel_sigma: float) -> Floats:
+    """Whitened Jacobian (b, n, 2, 6) of the errors by ``xi``."""
+    turn = np.einsum("bnij,bnjk->bnik", errors.projection, -cross_matrix(errors.x))
+    return _whiten(np.concatenate([errors.projection, turn], -1), errors.along, pixel_sigma)
 
 
 def _whiten(a: Floats, g: Floats, sigma: float) -> Floats:
@@ -125,13 +134,14 @@ def robust_cost(norm: Floats, active: Bools) -> Floats:
     return np.asarray(np.where(active, cost, 0.0).sum(-1))
 
 
-def normal_matrix(lin: Linearised, active: Bools) -> tuple[Floats, Floats, Floats]:
+def normal_matrix(obs: Observations, errors: Errors, active: Bools) -> tuple[Floats, Floats, Floats]:
     """Weighted normal matrix (b, 6, 6), gradient (b, 6) and weights (b, n) of Huber's cost."""
-    usable = active & np.isfinite(lin.norm)
-    weight = np.where(usable, HUBER / np.maximum(np.where(usable, lin.norm, 1.0), HUBER), 0.0)
-    weighted = lin.jacobian * weight[..., None, None]
-    normal = np.einsum("bnik,bnil->bkl", weighted, lin.jacobian)
-    return normal, np.einsum("bnik,bni->bk", weighted, lin.white), weight
+    usable = active & np.isfinite(errors.norm)
+    weight = np.where(usable, HUBER / np.maximum(np.where(usable, errors.norm, 1.0), HUBER), 0.0)
+    jacobian = derivatives(errors, obs.pixel_sigma)
+    weighted = jacobian * weight[..., None, None]
+    normal = np.einsum("bnik,bnil->bkl", weighted, jacobian)
+    return normal, np.einsum("bnik,bni->bk", weighted, errors.white), weight
 
 
 def levenberg_marquardt(
@@ -139,27 +149,23 @@ def levenberg_marquardt(
 ) -> tuple[Poses, int]:
     """Minimise Eq. 6 (robust, weighted) from ``start`` over the active (b, n) observations; also iterations done.
 
-    Converged when no problem's step promises to lower its cost by more than ``tolerance`` of it. The damping is Marquardt's (scaled
-    by the diagonal), which also holds a singular problem still instead of letting it fly off.
+    Converged when no problem's step promises to lower its cost by more than ``tolerance`` of it. The damping is
+    Marquardt's (scaled by the diagonal), which also holds a singular problem still instead of letting it fly off.
     """
     poses, damping = start, np.full(len(start.t), 1e-4)
-    lin = linearise(obs, poses)
-    cost = robust_cost(lin.norm, active)
+    errors = back_projection(obs, poses)
+    cost = robust_cost(errors.norm, active)
     done = 0
     for _ in range(iterations):
         done += 1
-        normal, gradient, _ = normal_matrix(lin, active)
-        diagonal = np.einsum("bkk->bk", normal)
-        floor = 1e-12 * diagonal.max(-1, keepdims=True) + 1e-300
-        lhs = normal + (damping[:, None] * diagonal + floor)[..., None] * np.eye(6)
-        step = -np.linalg.solve(lhs, gradient[..., None])[..., 0]
+        normal, gradient, _ = normal_matrix(obs, errors, active)
+        step = _damped_step(normal, gradient, damping)
         turn = exponential(step[:, 3:])
         trial = Poses(turn @ poses.R, np.einsum("bij,bj->bi", turn, poses.t) + step[:, :3])
-        new = linearise(obs, trial)
+        new = back_projection(obs, trial)
         new_cost = robust_cost(new.norm, active)
         better = new_cost < cost
-        poses = Poses(np.where(better[:, None, None], trial.R, poses.R), np.where(better[:, None], trial.t, poses.t))
-        lin = _where(better, new, lin)
+        poses, errors = _choose(better, trial, poses), _choose(better, new, errors)
         promised = -0.5 * (gradient * step).sum(-1)
         finished = promised <= tolerance * np.where(np.isfinite(cost), cost, 0.0) + 1e-20
         cost = np.where(better, new_cost, cost)
@@ -169,10 +175,17 @@ def levenberg_marquardt(
     return poses, done
 
 
-def _where(choose: Bools, a: Linearised, b: Linearised) -> Linearised:
-    return Linearised(
-        np.where(choose[:, None, None], a.error, b.error),
-        np.where(choose[:, None, None], a.white, b.white),
-        np.where(choose[:, None, None, None], a.jacobian, b.jacobian),
-        np.where(choose[:, None], a.norm, b.norm),
-    )
+def _damped_step(normal: Floats, gradient: Floats, damping: Floats) -> Floats:
+    diagonal = np.einsum("bkk->bk", normal)
+    floor = 1e-12 * diagonal.max(-1, keepdims=True) + 1e-300
+    lhs = normal + (damping[:, None] * diagonal + floor)[..., None] * np.eye(6)
+    return np.asarray(-np.linalg.solve(lhs, gradient[..., None])[..., 0])
+
+
+Batch = TypeVar("Batch", Poses, Errors)
+
+
+def _choose(first: Bools, a: Batch, b: Batch) -> Batch:
+    """Problem by problem, ``a`` where ``first``, else ``b``."""
+    pairs = [(getattr(a, f.name), getattr(b, f.name)) for f in fields(a)]
+    return type(a)(*(np.where(first.reshape(-1, *[1] * (p.ndim - 1)), p, q) for p, q in pairs))

@@ -25,13 +25,13 @@ from pydantic import Field
 from stages.declare import Array, Bundle, Inputs, Params, Stage
 from stages.errors import DegenerateError, InputError
 from stages.geometry import Camera, Rig, RigidTransform
-from stages.landmarks import Landmarks, landmarks_from_dem, landmarks_from_disparity
+from stages.landmarks import Landmarks, landmarks_from_dem, landmarks_from_disparity, relief
 from stages.lattice import Lattice
 from stages.reprojection import (
     Observations,
     Poses,
+    back_projection,
     levenberg_marquardt,
-    linearise,
     normal_matrix,
 )
 
@@ -64,7 +64,7 @@ class ResectParams(Params):
         0.2, gt=0, description="std of a landmark's distance over its distance; beyond it first-order errors fail"
     )
     max_position_ratio: float = Field(
-        0.05, gt=0, description="std of the position over the median distance of landmarks; beyond it: degenerate"
+        0.02, gt=0, description="std of the position over the median distance of landmarks; beyond it: degenerate"
     )
     hypotheses: int = Field(
         150, ge=1, description="samples of four landmarks; finds a clean one at half outliers with p = 0.9999"
@@ -144,18 +144,13 @@ def _robust_start(
     found, _ = levenberg_marquardt(obs.take(samples), start, np.ones(samples.shape, bool), 10, tolerance=1e-3)
     candidates = Poses(np.concatenate([prediction.R, found.R]), np.concatenate([prediction.t, found.t]))
     bound = 2.0 * params.threshold / params.pixel_sigma
-    scores = np.array([_score(obs, candidates.at(i), bound) for i in range(len(candidates.t))])
-    best = candidates.at(int(np.argmin(scores)))
+    score = (np.minimum(back_projection(obs, candidates).norm, bound) ** 2).sum(1)
+    best = candidates.at(int(np.argmin(score)))
     for _ in range(2):
-        active = linearise(obs, best).norm <= bound
+        active = back_projection(obs, best).norm <= bound
         if active.sum() >= SAMPLE:
             best, _ = levenberg_marquardt(obs, best, active, 10, tolerance=1e-6)
-    return best, linearise(obs, best).norm[0] <= bound
-
-
-def _score(obs: Observations, poses: Poses, bound: float) -> float:
-    norm = linearise(obs, poses).norm[0]
-    return float(np.minimum(norm, bound).dot(np.minimum(norm, bound)))
+    return best, back_projection(obs, best).norm[0] <= bound
 
 
 def _remove_inconsistent(
@@ -168,7 +163,7 @@ def _remove_inconsistent(
         _enough(int(active.sum()), where, "agree with one pose", "raise resect.threshold or choose basic pairs closer")
         poses, done = levenberg_marquardt(obs, poses, active[None], params.iterations)
         steps += done
-        norm = np.where(active, linearise(obs, poses).norm[0], -1.0)
+        norm = np.where(active, back_projection(obs, poses).norm[0], -1.0)
         worst = int(np.argmax(norm))
         if norm[worst] <= bound:
             return poses, active, steps
@@ -177,13 +172,13 @@ def _remove_inconsistent(
 
 
 def _result(obs: Observations, poses: Poses, active: Bools, steps: int, params: ResectParams, where: str) -> Resection:
-    lin = linearise(obs, poses)
-    normal, _, weight = normal_matrix(lin, active[None])
+    errors = back_projection(obs, poses)
+    normal, _, weight = normal_matrix(obs, errors, active[None])
     scale = np.sqrt(np.diag(normal[0]))
     values, vectors = np.linalg.eigh(normal[0] / np.outer(scale, scale))
     condition = float(values[-1] / max(values[0], 1e-300))
     # A posteriori variance factor: the errors found, not the ones expected, set the scale.
-    factor = float((weight[0] * np.where(active, lin.norm[0], 0.0) ** 2).sum() / (2 * active.sum() - 6))
+    factor = float((weight[0] * np.where(active, errors.norm[0], 0.0) ** 2).sum() / (2 * active.sum() - 6))
     inverse = (vectors / np.maximum(values, 1e-300)) @ vectors.T / np.outer(scale, scale)
     R = poses.R[0]
     turn = np.zeros((6, 6))
@@ -197,7 +192,7 @@ def _result(obs: Observations, poses: Poses, active: Bools, steps: int, params: 
             f" by {expected:.2g} m (condition {condition:.1e})",
             remedy="they are too far, too few or in one direction: set track.points higher or use nearer texture",
         )
-    residual = np.where(np.isfinite(lin.norm[0]), np.sqrt((lin.error[0] ** 2).sum(-1)), np.nan)
+    residual = np.where(np.isfinite(errors.norm[0]), np.sqrt((errors.pixels[0] ** 2).sum(-1)), np.nan)
     return Resection(T, factor * (turn @ inverse @ turn.T), active, residual, steps, condition)
 
 
@@ -324,18 +319,27 @@ def _run(params: ResectParams, args: Mapping[str, Any], inputs: Inputs) -> Bundl
 def _coordinates(
     points: Floats, inputs: Inputs, rig: Rig, T_local_key: RigidTransform, params: ResectParams
 ) -> Landmarks:
-    port = "dem" if params.landmarks == "dem" else "disparity"
-    source = inputs.get(port)
+    """Landmarks of the key frame's points from the source that the parameters name."""
+    source, disparity = inputs.get(params.landmarks), inputs.get("disparity")
     if source is None:
         raise InputError(
-            f"resect.landmarks={params.landmarks!r} but no {port} was computed", remedy=f"connect the input {port!r}"
+            f"resect.landmarks={params.landmarks!r} but no {params.landmarks} was computed",
+            remedy=f"connect the input {params.landmarks!r}",
         )
-    bounds = {"disparity_sigma": params.disparity_sigma, "max_depth_ratio": params.max_depth_ratio}
-    if port == "dem":
-        lattice = Lattice.from_dict(source.meta["lattice"])
-        return landmarks_from_dem(points, np.asarray(source["elevation"]), lattice, rig, T_local_key, **bounds)
-    maps = [np.asarray(source[name]) for name in ("column_disparity", "row_disparity", "validity")]
-    return landmarks_from_disparity(points, maps[0], maps[1], maps[2], rig, T_local_key, **bounds)
+    sigma = np.full(len(points), params.disparity_sigma)
+    maps: list[Any] = []
+    if disparity is not None:
+        maps = [np.asarray(disparity[name]) for name in ("column_disparity", "row_disparity", "validity")]
+        sigma = np.hypot(sigma, relief(points, maps[0], maps[1], maps[2]))
+    if params.landmarks == "disparity":
+        return landmarks_from_disparity(
+            points, maps[0], maps[1], maps[2], rig, T_local_key, sigma, max_depth_ratio=params.max_depth_ratio
+        )
+    lattice = Lattice.from_dict(source.meta["lattice"])
+    elevation = np.asarray(source["elevation"])
+    return landmarks_from_dem(
+        points, elevation, lattice, rig, T_local_key, sigma, max_depth_ratio=params.max_depth_ratio
+    )
 
 
 STAGE = Stage(
@@ -356,7 +360,7 @@ STAGE = Stage(
         ),
         Array("inlier", ("point", "frame"), "uint8", "1", "landmark agrees with the pose", nodata="0"),
         Array("landmarks", ("point", "xyz"), "float64", "m", "coordinates of the landmarks", "nan", "local"),
-        Array("residual", ("point", "frame"), "float32", "pixel", "back-projection error", nodata="nan"),
+        Array("residual", ("point", "frame"), "float32", "px", "back-projection error", nodata="nan"),
     ),
     requires=("numpy",),
     run=_run,

@@ -37,7 +37,7 @@ def basic_pairs(frames: int, stride: int) -> list[int]:
 
 
 def segments(basic: list[int], frames: int) -> list[list[int]]:
-    """Positions of each segment: from a basic pair to the next one inclusive, the last one to the end (where it moves)."""
+    """Positions of each segment, from a basic pair to the next one inclusive; the last one reaches the end."""
     ends = [*basic[1:], frames - 1]
     return [list(range(a, b + 1)) for a, b in zip(basic, ends, strict=True) if b > a]
 

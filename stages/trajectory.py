@@ -95,7 +95,11 @@ def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
         facts += bundle.meta["per_frame"][1 if facts else 0 :]
     return Bundle(
         {"poses": poses, "covariance": covariance, "segment": segment},
-        {"frames": [f["frame"] for f in facts], "inliers": [f["inliers"] for f in facts]},
+        {
+            "frames": [f["frame"] for f in facts],
+            "inliers": [f["inliers"] for f in facts],
+            "positions": [[float(v) for v in pose[:, 3]] for pose in poses],
+        },
     )
 
 

@@ -33,16 +33,26 @@ class Validity(IntFlag):
     """Removed as part of a small isolated patch."""
 
 
+def mark(validity: Mask, where: NDArray[np.bool_], bit: Validity) -> None:
+    """Set a bit where ``where``, in place."""
+    validity[where] |= np.uint8(bit)
+
+
 def matched(validity: Mask) -> NDArray[np.bool_]:
     """Pixels with a measured disparity."""
-    return (validity & Validity.MATCHED) != 0
+    return has(validity, Validity.MATCHED)
 
 
 def defined(validity: Mask) -> NDArray[np.bool_]:
     """Pixels with a disparity, interpolated ones included."""
-    return (validity & (Validity.MATCHED | Validity.INTERPOLATED)) != 0
+    return has(validity, Validity.MATCHED | Validity.INTERPOLATED)
+
+
+def has(validity: Mask, bits: Validity) -> NDArray[np.bool_]:
+    """Pixels with any of the bits."""
+    return np.asarray((validity & np.uint8(bits)) != 0)
 
 
 def counts(validity: Mask) -> dict[str, int]:
     """Number of pixels with each bit, by its name in lower case."""
-    return {str(bit.name).lower(): int(np.count_nonzero(validity & bit)) for bit in Validity}
+    return {str(bit.name).lower(): int(np.count_nonzero(has(validity, bit))) for bit in Validity}

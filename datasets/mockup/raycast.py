@@ -98,6 +98,11 @@ def _cast(height, maxima, offsets, shapes, origins, directions):  # type: ignore
         o = i if origins.shape[0] > 1 else 0
         oc, orow, oz = origins[o, 0], origins[o, 1], origins[o, 2]
         dc, dr, dz = directions[i, 0], directions[i, 1], directions[i, 2]
+        # what drifts by less than a millionth of a cell on the way through the bed is vertical
+        if abs(dc) < 1e-7 * abs(dz):
+            dc = 0.0
+        if abs(dr) < 1e-7 * abs(dz):
+            dr = 0.0
         inv_c = 1.0 / dc if dc != 0.0 else np.inf
         inv_r = 1.0 / dr if dr != 0.0 else np.inf
         if (dc == 0.0 and not 0.0 <= oc <= edge_c) or (dr == 0.0 and not 0.0 <= orow <= edge_r):
@@ -118,7 +123,7 @@ def _cast(height, maxima, offsets, shapes, origins, directions):  # type: ignore
         eps = NUDGE / speed if speed > 0.0 else 0.0
         level = top
         first = True
-        while t <= end:
+        while t - (0.0 if first else eps) <= end:
             c = min(max(oc + t * dc, 0.0), edge_c)
             r = min(max(orow + t * dr, 0.0), edge_r)
             size = 1 << level
@@ -145,21 +150,23 @@ def _cast(height, maxima, offsets, shapes, origins, directions):  # type: ignore
             if level > 0:
                 level -= 1
                 continue
-            # the bilinear patch: gap(s) = f0 + f1 s + f2 s^2 along the ray from t
-            u, v = c - ic, r - ir
+            # the bilinear patch: gap(s) = f0 + f1 s + f2 s^2 along the ray
+            # (before the nudge that led here, lest a steep ray passes the surface within it)
+            at = t if first else t - eps
+            u, v = oc + at * dc - ic, orow + at * dr - ir
             h00, h01 = np.float64(height[ir, ic]), np.float64(height[ir, ic + 1])
             h10, h11 = np.float64(height[ir + 1, ic]), np.float64(height[ir + 1, ic + 1])
             bc, br, bcr = h01 - h00, h10 - h00, h11 - h10 - h01 + h00
-            f0 = oz + t * dz - (h00 + bc * u + br * v + bcr * u * v)
+            f0 = oz + at * dz - (h00 + bc * u + br * v + bcr * u * v)
             if f0 <= 0.0:
                 if not first or f0 > -1e-9:
-                    out[i] = t
+                    out[i] = at
                 break
             f1 = dz - bc * dc - br * dr - bcr * (u * dr + v * dc)
             f2 = -bcr * dc * dr
             s = _first_root(f0, f1, f2)
-            if s <= t_exit - t + eps:
-                out[i] = t + s
+            if s <= t_exit + eps - at:
+                out[i] = at + s
                 break
             t = t_exit + eps
             level = min(1, top)

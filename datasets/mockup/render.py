@@ -46,6 +46,13 @@ def camera_rays(camera: Camera, T_bed_camera: RigidTransform, sampling: int = 1)
     return np.stack([columns * r[k, 0] + rows * r[k, 1] + r[k, 2] for k in range(3)], axis=-1).reshape(-1, 3)
 
 
+def transform(T_dst_src: RigidTransform, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Points (n, 3) of the source frame in the destination frame; written out for the same reason."""
+    x, y, z = points[:, 0], points[:, 1], points[:, 2]
+    r, t = T_dst_src.rotation, T_dst_src.translation
+    return np.stack([x * r[k, 0] + y * r[k, 1] + z * r[k, 2] + t[k] for k in range(3)], axis=1)
+
+
 @njit(cache=True, nogil=True)
 def _shade(height, sunlit, tint, texture, offsets, shapes, grid, origin, directions, distance, pixel_angle, sun):  # type: ignore[no-untyped-def]
     """Radiance (n,) of the hit points, NaN where a ray hit nothing; ``grid`` = x0, y0, cell."""
@@ -71,7 +78,7 @@ def _shade(height, sunlit, tint, texture, offsets, shapes, grid, origin, directi
         mu = max((vz - gx * vx - gy * vy) / norm, 0.05)
         lit = _bilinear(sunlit, r, c) / 255.0
         direct = lit * (2.0 * LUNAR * mu0 / (mu0 + mu) + (1.0 - LUNAR) * mu0) if mu0 > 0.0 else 0.0
-        # the grain is draped over rocks, not projected from above: walls that face the drive have it, too
+        # grain is draped over rocks, not projected from above, so that walls that face the drive are not streaked
         drape = (origin[2] + t * dz) / cell
         # footprint on the ground: an ellipse drawn out along the line of sight
         stretch = min(1.0 / mu, 8.0)
@@ -85,7 +92,7 @@ def _shade(height, sunlit, tint, texture, offsets, shapes, grid, origin, directi
         total = 0.0
         for k in range(taps):
             a = (k + 0.5) / taps - 0.5
-            tr = 2.0 * (r + drape - a * ay / cell)
+            tr = 2.0 * (r - drape - a * ay / cell)
             tc = 2.0 * (c + a * ax / cell)
             total += (1.0 - f) * _texel(texture, offsets, shapes, low, tr, tc)
             total += f * _texel(texture, offsets, shapes, low + 1, tr, tc)
@@ -214,7 +221,7 @@ STAGE = Stage(
     params=RenderParams,
     inputs=("scene",),
     outputs=(
-        Array("image", ("row", "col"), "uint8", "grey level", "image"),
+        Array("image", ("row", "col"), "uint8", "grey", "image"),
         Array("valid", ("row", "col"), "uint8", "1", "1 = usable, 0 = background beyond the bed"),
     ),
     requires=("numpy", "numba", "scipy"),

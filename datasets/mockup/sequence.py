@@ -162,7 +162,11 @@ def mockup(p: MockupParams, name: str = "mockup") -> Sequence:
         truth_disparity=disparity,
         evaluation_window=WINDOW,
         defaults={"select.stride": 4, "locus.cell_size": 0.001},
-        notes=(f"simulated at 1:10 with seed {p.seed}; lengths are those of the model",),
+        notes=(
+            f"simulated at 1:10 with seed {p.seed}; lengths are those of the model",
+            "truth frame: z up, y along the bed, x right, origin in the middle of the near edge at mean height",
+        ),
+        parameters={"mockup": p},
     )
 
 

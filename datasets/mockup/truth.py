@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datasets.mockup.raycast import HeightField
-from datasets.mockup.render import camera_rays
+from datasets.mockup.render import camera_rays, transform
 from datasets.mockup.scene import height_field
 from stages.declare import AnyArray, Array, Bundle, Inputs, NoParams, Stage
 from stages.geometry import Camera, Rig, RigidTransform
@@ -35,7 +35,7 @@ def visible(
     inside : (n,) the projection lies within the outermost pixel centres.
     free : (n,) and nothing stands in between.
     """
-    camera_points = T_bed_camera.inverse().apply(points)
+    camera_points = transform(T_bed_camera.inverse(), points)
     pixels = camera.project(camera_points)
     with np.errstate(invalid="ignore"):
         inside = np.asarray(((pixels >= 0) & (pixels <= [camera.width - 1, camera.height - 1])).all(axis=1))

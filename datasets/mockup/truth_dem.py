@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datasets.mockup.raycast import HeightField
+from datasets.mockup.render import transform
 from datasets.mockup.scene import height_field
 from datasets.mockup.truth import visible
 from stages.declare import Array, Bundle, Inputs, NoParams, Stage
@@ -33,9 +34,8 @@ def true_dem(
     x = lattice["x0"] + lattice["cell"] * np.arange(lattice["cols"])
     y = lattice["y0"] - lattice["cell"] * np.arange(lattice["rows"])
     gx, gy = np.meshgrid(x, y)
-    # start above everything: as high over the camera as the bed's whole diagonal cannot lie
-    start = float(field.maxima[-1]) + 10.0
-    tops = T_bed_world.apply(np.stack([gx.ravel(), gy.ravel(), np.full(gx.size, start)], axis=1))
+    start = 10.0  # m, above every bed
+    tops = transform(T_bed_world, np.stack([gx.ravel(), gy.ravel(), np.full(gx.size, start)], axis=1))
     down = np.broadcast_to(-T_bed_world.rotation[:, 2], tops.shape)
     t = field.cast(tops, np.ascontiguousarray(down))
     return (start - t).reshape(gx.shape).astype(np.float32), tops + t[:, None] * down

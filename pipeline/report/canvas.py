@@ -27,6 +27,7 @@ MAX_PIXELS = 700
 UNDEFINED = "#e9e9ec"
 SAFE, HAZARDOUS, UNKNOWN = "#a6d7c3", "#c8501e", "#8d8f98"
 """Distinct for colour-blind eyes and in grey: light, dark, medium."""
+MEASURED, INTERPOLATED = "#2f6f9f", "#f0b84a"
 ESTIMATE, REFERENCE, MARK = "#0b4f8a", "#d1731a", "#111111"
 
 
@@ -75,9 +76,11 @@ def map_axes(extent: Extent, *, bar: bool = False, max_height: float = 6.0) -> t
     fig_w, fig_h = left + width + right, foot + height + top
     fig = figure(fig_w, fig_h)
     ax = fig.add_axes((left / fig_w, foot / fig_h, width / fig_w, height / fig_h))
-    ax.set_xlim(extent[0], extent[1])
-    ax.set_ylim(extent[2], extent[3])
-    ax.set_aspect("equal", adjustable="datalim")
+    scale = max(dx / width, dy / height)  # metres an inch, the same along both axes
+    x, y = 0.5 * (extent[0] + extent[1]), 0.5 * (extent[2] + extent[3])
+    ax.set_xlim(x - 0.5 * scale * width, x + 0.5 * scale * width)
+    ax.set_ylim(y - 0.5 * scale * height, y + 0.5 * scale * height)
+    ax.set_autoscale_on(False)
     ax.set_xlabel("x, m", labelpad=1)
     ax.set_ylabel("y, m", labelpad=1)
     cax = fig.add_axes((left / fig_w, 0.43 / fig_h, width / fig_w, 0.12 / fig_h)) if bar else None

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from pipeline.report import canvas
 from pipeline.report.canvas import Extent, Panel
+from stages.validity import defined, matched
 
 Floats = NDArray[Any]
 Bytes = NDArray[np.uint8]
@@ -35,6 +36,18 @@ def disparity(values: Floats, label: str, alt: str) -> Panel:
     drawn = ax.imshow(canvas.shrink(values), cmap=_map("viridis"), vmin=low, vmax=high, aspect="auto")
     canvas.color_bar(fig, drawn, cax, label)
     return canvas.encode(fig, alt, photo=True)
+
+
+def validity_classes(bits: Bytes) -> Bytes:
+    """Of the validity bits (row, col): 0 measured, 1 interpolated, 2 undefined."""
+    return np.where(matched(bits), 0, np.where(defined(bits), 1, 2)).astype(np.uint8)
+
+
+def validity(classes: Bytes, alt: str) -> Panel:
+    """Which disparities were measured; ``classes`` (row, col) of :func:`validity_classes`."""
+    fig, ax, _ = canvas.image_axes(classes.shape)
+    ax.imshow(canvas.shrink(_paint(classes, canvas.MEASURED, canvas.INTERPOLATED, canvas.UNDEFINED)), aspect="auto")
+    return canvas.encode(fig, alt)
 
 
 def ortho(grey: Floats, extent: Extent, alt: str) -> Panel:
@@ -68,7 +81,7 @@ def risk_map(risk: Bytes, path: Floats | None, extent: Extent, alt: str, *, far:
     ``far`` (n, 3): x, y of a cell of the far row, m, and 1 where a path leads there.
     """
     fig, ax, _ = canvas.map_axes(extent)
-    _show(ax, _classes(risk), extent)
+    _show(ax, _paint(risk, canvas.SAFE, canvas.HAZARDOUS, canvas.UNKNOWN), extent)
     if path is not None and len(path):
         canvas.polyline(ax, path)
     if far is not None and len(far):
@@ -125,7 +138,8 @@ def trajectory(left: Floats, right: Floats, truth: Floats | None, alt: str) -> P
     centre, span = 0.5 * (everything.min(axis=0) + everything.max(axis=0)), np.ptp(everything, axis=0)
     half = np.maximum(0.5 * span, 0.18 * max(float(span.max()), 1e-3)) * 1.12
     extent = (centre[0] - half[0], centre[0] + half[0], centre[1] - half[1], centre[1] + half[1])
-    fig, ax, _ = canvas.map_axes(extent, max_height=5.0)
+    fig, ax, foot = canvas.map_axes(extent, bar=True, max_height=5.0)
+    foot.set_axis_off()
     if truth is not None:
         ax.plot(truth[:, 0], truth[:, 1], color=canvas.REFERENCE, linewidth=2.6, alpha=0.75, label="left camera, truth")
     ax.plot(left[:, 0], left[:, 1], "o-", color=canvas.ESTIMATE, markersize=3, linewidth=0.8, label="left camera")
@@ -133,7 +147,7 @@ def trajectory(left: Floats, right: Floats, truth: Floats | None, alt: str) -> P
         ax.plot(right[:, 0], right[:, 1], "^", color="#333333", markersize=4, label="right camera, basic pairs")
     ax.grid(color="#dddddd", linewidth=0.5)
     ax.set_axisbelow(True)
-    ax.legend(loc="best", fontsize=7.5, framealpha=0.9)
+    fig.legend(loc="lower center", fontsize=7.5, frameon=False, borderaxespad=0.2, labelspacing=0.2)
     return canvas.encode(fig, alt)
 
 
@@ -173,7 +187,7 @@ def hillshade(elevation: Floats, cell: float, extent: Extent, alt: str) -> Panel
     tint = matplotlib.colormaps["cividis"](norm(np.nan_to_num(z * factor)))[..., :3]
     rgb = np.clip(tint * (0.35 + 0.9 * shade[..., None]), 0, 1)
     rgb[~np.isfinite(z)] = matplotlib.colors.to_rgb(canvas.UNDEFINED)
-    ax.imshow(rgb, extent=extent, aspect="equal", zorder=1)
+    ax.imshow(rgb, extent=extent, aspect="auto", zorder=1)
     drawn = matplotlib.cm.ScalarMappable(norm, matplotlib.colormaps["cividis"])
     canvas.color_bar(fig, drawn, cax, f"elevation, {unit}")
     return canvas.encode(fig, alt, photo=True)
@@ -186,6 +200,7 @@ def scalar_map(values: Floats, extent: Extent, label: str, alt: str, *, length: 
     low, high = (v * factor for v in canvas.limits(values))
     drawn = _show(ax, values * factor, extent, cmap=_map("viridis"), vmin=min(low, 0.0), vmax=high)
     canvas.color_bar(fig, drawn, cax, f"{label}, {unit}" if unit else label)
+    cax.xaxis.get_major_locator().set_params(integer=not length)
     return canvas.encode(fig, alt, photo=True)
 
 
@@ -200,7 +215,7 @@ def error_map(error: Floats, extent: Extent, alt: str) -> Panel:
 
 
 def _show(ax: Any, values: Floats, extent: Extent, **style: Any) -> Any:
-    return ax.imshow(canvas.shrink(values), extent=extent, aspect="equal", zorder=1, **style)
+    return ax.imshow(canvas.shrink(values), extent=extent, aspect="auto", zorder=1, **style)
 
 
 def _map(name: str, undefined: str = canvas.UNDEFINED) -> Any:
@@ -219,12 +234,12 @@ def _grey(image: Floats) -> Floats:
     return image / np.float32(257.0) if image.dtype == np.uint16 else image
 
 
-def _classes(risk: Bytes) -> Floats:
-    """Colours (row, col, 3) in 0..1 of the classes."""
+def _paint(classes: Bytes, *colors: str) -> Floats:
+    """Colours (row, col, 3) in 0..1 of classes 0, 1, 2 ..."""
     from matplotlib.colors import to_rgb
 
-    table = np.array([to_rgb(c) for c in (canvas.SAFE, canvas.HAZARDOUS, canvas.UNKNOWN)], dtype=np.float32)
-    return table[np.minimum(risk, UNKNOWN)]
+    table = np.array([to_rgb(c) for c in colors], dtype=np.float32)
+    return table[np.minimum(classes, len(colors) - 1)]
 
 
 def _shade(z: Floats, step: float) -> Floats:

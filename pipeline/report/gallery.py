@@ -69,13 +69,19 @@ def _disparities(scene: Scene) -> Block | None:
     ]
     if image is not None:
         panels.insert(0, figures.photo(np.asarray(image["image"]), f"Left camera image of {name}"))
-    share = float(np.isfinite(column).mean())
+    classes = figures.validity_classes(np.asarray(bundle["validity"]))
+    shares = [float((classes == k).mean()) for k in range(3)]
+    words = f"{shares[0]:.0%} measured, {shares[1]:.0%} interpolated, {shares[2]:.0%} undefined"
+    panels.append(figures.validity(classes, f"How the disparity of each pixel of {name} came about: {words}"))
     caption = (
-        f"Left image of the first basic pair ({name}), and the disparity vector of each of its pixels: rows, then "
-        "columns, right minus left, in pixels. Nothing was rectified, so rows may differ too. "
-        f"{share:.0%} of the pixels have a disparity, interpolated ones included; undefined ones are light grey."
+        f"Left image of the first basic pair ({name}); row and column disparities of its pixels, right minus left, in "
+        "pixels, light grey where undefined; and which of them were measured in both directions, which interpolated. "
+        "Nothing was rectified, so rows may differ too."
     )
-    return Block("Figure 6", "Figure 6. Disparities of the first stereo pair", caption, tuple(panels))
+    colors = (canvas.MEASURED, canvas.INTERPOLATED, canvas.UNDEFINED)
+    names = ("measured", "interpolated", "undefined")
+    legend = tuple((c, f"{n} {share:.0%}") for c, n, share in zip(colors, names, shares, strict=True))
+    return Block("Figure 6", "Figure 6. Disparities of the first stereo pair", caption, tuple(panels), legend)
 
 
 def _terrain(scene: Scene) -> Block | None:
@@ -121,11 +127,20 @@ def _risk(scene: Scene) -> Block | None:
     caption = (
         f"Of all cells {words}. Limits of {vehicle.name}: slope {vehicle.max_slope_deg:g}°, "
         f"step {_length(vehicle.max_step)}, roughness {_length(vehicle.max_roughness)}, judged in windows of one wheel "
-        f"diameter ({_length(vehicle.wheel_diameter)}). The path (black line, ring: start, disk: target) keeps "
-        f"{_length(vehicle.margin)} from hazardous cells and never enters unknown ones. Second: the local inclination, "
-        "which the slope's limit applies to."
+        f"diameter ({_length(vehicle.wheel_diameter)}). {_path_words(scene)} Second: the local inclination, which the "
+        "slope's limit applies to."
     )
     return Block("Risk map", "Risk map and path of the whole run", caption, tuple(panels), _legend(shares))
+
+
+def _path_words(scene: Scene) -> str:
+    if scene.path is None:
+        return "There is no path."
+    margin = _length(scene.view.config.vehicle.margin)
+    return (
+        f"The path (black line, ring: start, disk: target) keeps {margin} from hazardous cells and never enters "
+        "unknown ones."
+    )
 
 
 def _legend(shares: list[float]) -> tuple[tuple[str, str], ...]:
@@ -254,8 +269,8 @@ def _dem_error(scene: Scene) -> Block | None:
     values = error.arrays["error"]
     panel = figures.error_map(values, error.extent, f"Elevation minus truth of the merged terrain, {_range(values)} m")
     caption = (
-        f"Merged elevation minus the exact one ({scene.view.sequence.truth_source}), by cell. The world frame is that "
-        "of the first pair, so errors of the trajectory show here as well."
+        "Merged elevation minus the exact one, by cell. The world frame is that of the first pair, so errors of the "
+        "trajectory show here as well."
     )
     return Block("Elevation error", "Elevation error against truth", caption, (panel,))
 

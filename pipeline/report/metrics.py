@@ -87,17 +87,18 @@ def metrics(scene: Scene, frames: Rows, pairs: Rows) -> dict[str, Metric]:
     return {name: {**metric, "key": name in KEY} for name, metric in found.items()}
 
 
-def _assessed(view: RunView, handle: Any, prefix: str, group: str) -> Iterator[tuple[str, Metric]]:
+def _assessed(view: RunView, handle: Any, prefix: str, group: str, truth: str) -> Iterator[tuple[str, Metric]]:
     """Figures as an assessing stage gives them."""
     bundle = view.bundle(handle)
     for name, given in (bundle.meta["metrics"] if bundle is not None else {}).items():
         label = LABELS.get(name, name.replace("_", " ").capitalize())
-        yield prefix + name, {**given, "group": group, "label": label, "truth": view.sequence.truth_source}
+        yield prefix + name, {**given, "group": group, "label": label, "truth": truth}
 
 
 def _trajectory(view: RunView, frames: Rows) -> dict[str, Metric]:
     complete = f"{sum(r['posed'] for r in frames)} of {len(frames)} frames"
-    found = dict(_assessed(view, view.products.accuracy, "trajectory_", "Trajectory against truth"))
+    source = view.sequence.truth_source
+    found = dict(_assessed(view, view.products.accuracy, "trajectory_", "Trajectory against truth", source))
     order = [f"trajectory_{name}" for name in LABELS]
     ordered = sorted(found, key=lambda name: order.index(name) if name in order else len(order))
     return {name: {**found[name], "completeness": complete} for name in ordered}
@@ -105,7 +106,7 @@ def _trajectory(view: RunView, frames: Rows) -> dict[str, Metric]:
 
 def _elevation(view: RunView, pairs: Rows) -> dict[str, Metric]:
     """Local models (over pairs), then the merged one; the error never without the completeness."""
-    group, truth = "Elevation against truth", view.sequence.truth_source
+    group, truth = "Elevation against truth", "exact elevations of the scene"
     found: dict[str, Metric] = {}
     rmse = [r["rmse_m"] for r in pairs if r["rmse_m"] is not None]
     shares = [r["completeness"] for r in pairs if r["completeness"] is not None]
@@ -123,7 +124,7 @@ def _elevation(view: RunView, pairs: Rows) -> dict[str, Metric]:
         how = f"share of the cells that both cameras see which have an elevation, {where}, worst pair"
         found["dem_pairs_completeness_min"] = _metric("Completeness of a pair, worst", min(shares), "1", how, least)
     found = {name: {"group": group, "truth": truth, **metric} for name, metric in found.items()}
-    merged = dict(_assessed(view, view.products.dem_accuracy, "dem_merged_", group))
+    merged = dict(_assessed(view, view.products.dem_accuracy, "dem_merged_", group, truth))
     share = merged.get("dem_merged_completeness", {}).get("value")
     complete = None if share is None else f"{share:.0%} of the cells that both cameras of a pair see"
     for name, metric in merged.items():
@@ -133,7 +134,8 @@ def _elevation(view: RunView, pairs: Rows) -> dict[str, Metric]:
 
 
 def _path_check(view: RunView) -> dict[str, Metric]:
-    found = dict(_assessed(view, view.products.path_check, "path_check_", "Path against truth"))
+    truth = "risk map of the exact elevations"
+    found = dict(_assessed(view, view.products.path_check, "path_check_", "Path against truth", truth))
     if "path_check_path_length" in found:
         found["path_check_path_length"]["label"] = "Length of the path"
     return {name: {**metric, "completeness": None} for name, metric in found.items()}

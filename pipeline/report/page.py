@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+from pipeline.products import write_text
 from pipeline.report import gallery, summary, tables
 from pipeline.report.gather import Scene
 from pipeline.report.view import RunView
@@ -31,8 +31,8 @@ def write_report(folder: Path, view: RunView) -> None:
     scene = Scene(replace(view, bundle=lru_cache(maxsize=16)(view.bundle)))
     drawn = gallery.draw(scene)
     facts = summary.summarise(scene, drawn)
-    _publish(folder / "report.json", json.dumps(facts, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
-    _publish(folder / "report.html", render(scene, facts, drawn, tables.files(folder)))
+    write_text(folder / "report.json", json.dumps(facts, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
+    write_text(folder / "report.html", render(scene, facts, drawn, tables.files(folder)))
 
 
 def render(scene: Scene, facts: Mapping[str, Any], drawn: gallery.Gallery, files: list[tuple[str, str, str]]) -> str:
@@ -101,16 +101,3 @@ def seconds(value: Any) -> str:
     if value is None:
         return "–"
     return f"{value:.0f}" if value >= 100 else f"{value:.1f}" if value >= 1 else f"{value:.2f}"
-
-
-def _publish(path: Path, text: str) -> None:
-    """Write a file so that it is never seen in part."""
-    temporary = path.with_name(f".{path.name}-{os.getpid()}")
-    try:
-        with temporary.open("w", encoding="utf-8") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)

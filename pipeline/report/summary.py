@@ -46,14 +46,15 @@ def summarise(scene: Scene, gallery: Gallery) -> dict[str, Any]:
 def find_missing(view: RunView, frames: list[dict[str, Any]], gallery: Gallery) -> list[dict[str, str]]:
     """What a reader might take for granted and is not there: ``kind``, ``what``, ``why``."""
     found = [_missing("failed", t.label, t.reason) for t in view.tasks if t.status == "failed"]
-    skipped = [t for t in view.tasks if t.status == "skipped"]
+    skipped = [t for t in view.tasks if t.status not in ("computed", "cached", "failed")]
     for reason in dict.fromkeys(t.reason for t in skipped):
         labels = [t.label for t in skipped if t.reason == reason]
         more = f" and {len(labels) - 6} more" if len(labels) > 6 else ""
         found.append(_missing("skipped", ", ".join(labels[:6]) + more, reason or "something it depends on is missing"))
     lost = [r["frame"] for r in frames if not r["posed"]]
     if lost:
-        found.append(_missing("no pose", f"{len(lost)} of {len(frames)} frames have no pose", f"frames {_spans(lost)}"))
+        which = f"frame{'s' if len(lost) > 1 else ''} {_spans(lost)}"
+        found.append(_missing("no pose", f"{len(lost)} of {len(frames)} frames have no pose", which))
     found += _path_missing(view)
     if view.sequence.truth is None:
         found.append(_missing("no truth", "No truth", "the sequence has none, so accuracy is not assessed"))
@@ -116,7 +117,7 @@ def _stages(view: RunView) -> dict[str, dict[str, Any]]:
     for t in view.tasks:
         zero = {"computed": 0, "cached": 0, "failed": 0, "skipped": 0, "seconds": 0.0, "seconds_when_computed": 0.0}
         row = found.setdefault(t.stage, zero)
-        row[t.status] += 1
+        row[t.status] = row.get(t.status, 0) + 1
         row["seconds"] += (t.seconds or 0.0) if t.status == "computed" else 0.0
         row["seconds_when_computed"] += t.seconds or 0.0
     for row in found.values():

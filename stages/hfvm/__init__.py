@@ -1,0 +1,194 @@
+"""Hierarchical feature vector matching: dense two-dimensional disparities of any two images (paper, 4.3).
+
+Nothing is rectified and no calibration is used. ``match`` works on plain arrays; see :class:`HfvmParams` for the two
+presets. Modules, in the order of the dataflow: ``hierarchy`` (coarse to fine), ``search`` (one level, fast), ``paper``
+(one level, to the letter), ``epipolar`` (soft band), ``plane`` (pre-alignment), ``subpixel``, ``consistency``
+(back-matching, filling), ``refine``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages import pyramid
+from stages.declare import AnyArray, Array, Bundle, Inputs, Stage
+from stages.hfvm import consistency, hierarchy, plane, subpixel
+from stages.hfvm.params import HfvmParams
+from stages.hfvm.refine import refine
+from stages.pyramid import Pyramid, PyramidParams
+from stages.validity import Mask, Validity, counts, mark, matched
+
+__all__ = ["STAGE", "Disparity", "HfvmParams", "match", "match_pyramids"]
+
+Map = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Disparity:
+    """Disparity vectors of the left image, right minus left: ``x_right = x_left + column_disparity``.
+
+    All arrays are (row, col) of the left image. ``column_disparity, row_disparity``: float32 pixels, NaN undefined;
+    interpolated ones included. ``validity``: bits of :class:`~stages.validity.Validity`. ``backmatch_error``: float32
+    pixels, NaN where the match leaves the right image. ``distance``: float32 mean feature distance at the whole-pixel
+    match (byte steps; preset ``paper``: Eq. 1, grey levels), NaN where back-matching failed by far. ``aligned``:
+    whether the right image was pre-aligned by a plane.
+    """
+
+    column_disparity: Map
+    row_disparity: Map
+    validity: Mask
+    backmatch_error: Map
+    distance: Map
+    aligned: bool
+
+
+def match(
+    left: AnyArray,
+    right: AnyArray,
+    params: HfvmParams | None = None,
+    *,
+    left_valid: AnyArray | None = None,
+    right_valid: AnyArray | None = None,
+) -> Disparity:
+    """Dense disparity vectors from ``left`` to ``right``, searched in two dimensions.
+
+    Parameters
+    ----------
+    left, right : (row, col) grey images, uint8, uint16 or floating point 0..255; sizes may differ.
+    params : matcher's parameters; None: preset ``default``.
+    left_valid, right_valid : (row, col), not zero where usable; None: everywhere.
+
+    Raises
+    ------
+    InputError
+        An image is not grey or empty, or a mask has another shape.
+
+    Notes
+    -----
+    Kolesnik, Paar, Bauer, Ulm (1999), section 4.3. Images without texture or overlap give no error: nothing is
+    ``MATCHED``, and the other bits say why.
+    """
+    levels = PyramidParams()
+    return match_pyramids(
+        pyramid.build(left, levels, left_valid), pyramid.build(right, levels, right_valid), params or HfvmParams()
+    )
+
+
+def match_pyramids(left: Pyramid, right: Pyramid, params: HfvmParams) -> Disparity:
+    """As :func:`match`, of two image pyramids."""
+    pair = hierarchy.prepare(left, right, params)
+    if params.preset == "paper":
+        return _finish(left, right, pair, hierarchy.run(pair, params, 0), params, None)
+    coarse = hierarchy.run(pair, params, params.plane_level)
+    alignment = plane.find(pair, coarse, params)
+    if alignment is None:
+        state = hierarchy.run(pair, params, 0, coarse) if coarse.level > 0 else coarse
+        return _finish(left, right, pair, state, params, None)
+    warped = plane.align(right, alignment, left.images[0].shape, PyramidParams(levels=left.levels))
+    pair = hierarchy.prepare(left, warped, params)
+    state = hierarchy.run(pair, params, 0, near_sign=coarse.near_sign)
+    return _finish(left, right, pair, state, params, alignment)
+
+
+def _finish(
+    left: Pyramid,
+    right: Pyramid,
+    pair: hierarchy.Prepared,
+    state: hierarchy.State,
+    params: HfvmParams,
+    alignment: plane.Matrix | None,
+) -> Disparity:
+    """Sub-pixel, validity, refinement and filling at level 0."""
+    # Sub-pixel work pays only where the whole-pixel maps nearly agree.
+    reach = params.backmatch + 1.0
+    near = hierarchy.integer_error(state.left, state.right, pair.right_valid[0]) <= reach
+    near_right = hierarchy.integer_error(state.right, state.left, pair.left_valid[0]) <= reach
+    forward = pair.solver.fine(0, state.left, near)
+    backward = pair.solver.reverse().fine(0, state.right, near_right)
+    error = np.empty(forward.u.shape, np.float32)
+    consistency.backmatch(forward.u, forward.v, backward.u, backward.v, pair.right_valid[0], error)
+    validity = _validity(pair, forward, error, params)
+    u, v = forward.u, forward.v
+    if alignment is not None:
+        u, v = plane.compose(alignment, u, v)
+    keep = matched(validity)
+    if params.preset == "default":
+        mean_u, mean_v = np.empty_like(u), np.empty_like(v)
+        subpixel.local_mean(u, v, keep, hierarchy.SUM_RADIUS, mean_u, mean_v)
+        u, v = mean_u, mean_v
+    if params.refine:
+        u, v = refine(left.images[0], right.images[0], right.valid[0], u, v, keep, params)
+    interpolated = np.zeros(keep.shape, np.uint8)
+    consistency.fill_rows(u, v, keep, params.fill_reach, state.near_sign or -1.0, interpolated)
+    interpolated[left.valid[0] == 0] = 0
+    validity |= interpolated * np.uint8(Validity.INTERPOLATED)
+    nothing = ~(keep | (interpolated != 0))
+    u[nothing] = v[nothing] = np.nan
+    error[error >= consistency.FAILED] = np.nan
+    distance = np.where(forward.distance < 0, np.float32(np.nan), forward.distance)
+    return Disparity(u, v, validity, error, distance, alignment is not None)
+
+
+def _validity(pair: hierarchy.Prepared, fine: hierarchy.Fine, error: AnyArray, params: HfvmParams) -> Mask:
+    """Bits of every pixel, MATCHED or the reasons against it."""
+    bits = np.zeros(error.shape, np.uint8)
+    outside = (error >= consistency.FAILED) | (pair.left_valid[0] == 0)
+    mark(bits, outside, Validity.OUT_OF_IMAGE)
+    mark(bits, fine.distance > params.threshold, Validity.OVER_THRESHOLD)
+    mark(bits, pair.deviation[0] < params.texture, Validity.NO_TEXTURE)
+    mark(bits, ~outside & (error > params.backmatch), Validity.BACKMATCH_FAILED)
+    keep = bits == 0
+    gone = consistency.isolated(fine.u, fine.v, keep, params.speckle)
+    mark(bits, gone, Validity.SPECKLE)
+    mark(bits, keep & ~gone, Validity.MATCHED)
+    return bits
+
+
+def _run(params: HfvmParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+    found = match_pyramids(Pyramid.from_bundle(inputs["left"]), Pyramid.from_bundle(inputs["right"]), params)
+    arrays: dict[str, AnyArray] = {
+        "column_disparity": found.column_disparity,
+        "row_disparity": found.row_disparity,
+        "validity": found.validity,
+        "backmatch_error": found.backmatch_error,
+        "distance": found.distance,
+    }
+    usable = int(np.count_nonzero(Pyramid.from_bundle(inputs["left"]).valid[0]))
+    bits = counts(found.validity)
+    ok = matched(found.validity)
+    meta = {
+        "preset": params.preset,
+        "aligned": found.aligned,
+        "usable": usable,
+        "match_rate": bits["matched"] / usable if usable else None,
+        "counts": bits,
+        "median_column_disparity": float(np.median(found.column_disparity[ok])) if ok.any() else None,
+        "median_row_disparity": float(np.median(found.row_disparity[ok])) if ok.any() else None,
+    }
+    return Bundle(arrays, meta)
+
+
+_GRID = ("row", "col")
+STAGE = Stage(
+    name="hfvm",
+    version=1,
+    summary="dense two-dimensional disparities of a stereo pair by hierarchical feature vector matching",
+    params=HfvmParams,
+    inputs=("left", "right"),
+    outputs=(
+        Array(
+            "column_disparity", _GRID, "float32", "pixel", "column in the right image minus column", "nan", "left image"
+        ),
+        Array("row_disparity", _GRID, "float32", "pixel", "row in the right image minus row", "nan", "left image"),
+        Array("validity", _GRID, "uint8", "1", "bit mask, see stages.validity", "", "left image"),
+        Array("backmatch_error", _GRID, "float32", "pixel", "error of matching there and back", "nan", "left image"),
+        Array("distance", _GRID, "float32", "1", "least feature distance", "nan", "left image"),
+    ),
+    requires=("numpy", "numba", "opencv-python-headless"),
+    run=_run,
+)

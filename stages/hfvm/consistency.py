@@ -1,4 +1,4 @@
-"""Median, back-matching, removal of isolated patches and interpolation of undefined disparities (paper, 4.3.3, 4.3.4)."""
+"""Median, back-matching, isolated patches, interpolation of undefined disparities (paper, 4.3.3 and 4.3.4)."""
 
 from __future__ import annotations
 
@@ -20,12 +20,13 @@ def median(u: AnyArray, size: int) -> AnyArray:
     if size == 1:
         return u
     shifted = (u.astype(np.int32) + 32768).astype(np.uint16)
-    return (cv2.medianBlur(shifted, size).astype(np.int32) - 32768).astype(np.int16)
+    return np.asarray((cv2.medianBlur(shifted, size).astype(np.int32) - 32768).astype(np.int16))
 
 
 @njit(cache=True, nogil=True)
-def backmatch(lu, lv, ru, rv, error):  # type: ignore[no-untyped-def]
-    """Distance |l - l'| of each left pixel after matching to the right and back (4.3.3), pixels; FAILED outside.
+def backmatch(lu, lv, ru, rv, right_valid, error):  # type: ignore[no-untyped-def]
+    """Distance |l - l'| of each left pixel after matching to the right and back (4.3.3), pixels; FAILED outside
+    the right image and on its masked pixels.
 
     The right map is read bilinearly where its four pixels agree within a pixel, else at the nearest one.
     """
@@ -37,6 +38,8 @@ def backmatch(lu, lv, ru, rv, error):  # type: ignore[no-untyped-def]
             xr = np.float32(x) + lu[y, x]
             yr = np.float32(y) + lv[y, x]
             if not (xr >= 0 and xr <= rcols - 1 and yr >= 0 and yr <= rrows - 1):
+                continue
+            if not right_valid[int(yr + np.float32(0.5)), int(xr + np.float32(0.5))]:
                 continue
             i, j = int(xr), int(yr)
             i1, j1 = min(i + 1, rcols - 1), min(j + 1, rrows - 1)

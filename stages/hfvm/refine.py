@@ -11,50 +11,14 @@ import numpy as np
 from numba import njit
 
 from stages.declare import AnyArray
+from stages.hfvm.params import HfvmParams
+from stages.hfvm.resample import sample_cubic
 from stages.hfvm.subpixel import local_mean
 
 PLANES = 10
 
-
-@njit(cache=True, nogil=True, inline="never")
-def _sample(a, x, y):  # type: ignore[no-untyped-def]
-    """Catmull-Rom value and gradient of ``a`` at (x, y), two pixels or more inside."""
-    i, j = int(x), int(y)
-    t, s = x - np.float32(i), y - np.float32(j)
-    h, two, three = np.float32(0.5), np.float32(2.0), np.float32(3.0)
-    one, four, five = np.float32(1.0), np.float32(4.0), np.float32(5.0)
-    wx = (
-        h * t * (two * t - one - t * t),
-        h * (two + t * t * (three * t - five)),
-        h * t * (one + four * t - three * t * t),
-        h * t * t * (t - one),
-    )
-    wy = (
-        h * s * (two * s - one - s * s),
-        h * (two + s * s * (three * s - five)),
-        h * s * (one + four * s - three * s * s),
-        h * s * s * (s - one),
-    )
-    gx = (
-        h * (four * t - one - three * t * t),
-        h * t * (np.float32(9.0) * t - np.float32(10.0)),
-        h * (one + np.float32(8.0) * t - np.float32(9.0) * t * t),
-        h * t * (three * t - two),
-    )
-    gy = (
-        h * (four * s - one - three * s * s),
-        h * s * (np.float32(9.0) * s - np.float32(10.0)),
-        h * (one + np.float32(8.0) * s - np.float32(9.0) * s * s),
-        h * s * (three * s - two),
-    )
-    value = dx = dy = np.float32(0.0)
-    for k in range(4):
-        r0, r1, r2, r3 = a[j - 1 + k, i - 1], a[j - 1 + k, i], a[j - 1 + k, i + 1], a[j - 1 + k, i + 2]
-        row = r0 * wx[0] + r1 * wx[1] + r2 * wx[2] + r3 * wx[3]
-        value += wy[k] * row
-        dy += gy[k] * row
-        dx += wy[k] * (r0 * gx[0] + r1 * gx[1] + r2 * gx[2] + r3 * gx[3])
-    return value, dx, dy
+FARTHEST = 1.5
+"""Pixels: a correction beyond this is a jump to something else."""
 
 
 @njit(cache=True, nogil=True)
@@ -62,18 +26,17 @@ def _products(left, right, right_valid, u, v, keep, y, out):  # type: ignore[no-
     """Row ``y`` of the ten planes whose window sums the step needs."""
     rows, cols = left.shape
     rrows, rcols = right.shape
-    out[:] = 0.0
-    if y < 0 or y >= rows:
-        return
     for x in range(cols):
-        if not keep[y, x]:
+        for k in range(PLANES):
+            out[k, x] = 0.0
+        if y < 0 or y >= rows or not keep[y, x]:
             continue
         xr, yr = np.float32(x) + u[y, x], np.float32(y) + v[y, x]
         if not (xr >= 1 and xr < rcols - 2 and yr >= 1 and yr < rrows - 2):
             continue
         if not right_valid[int(yr + np.float32(0.5)), int(xr + np.float32(0.5))]:
             continue
-        w, gx, gy = _sample(right, xr, yr)
+        w, gx, gy = sample_cubic(right, xr, yr)
         r = left[y, x] - w
         out[0, x] = 1.0
         out[1, x] = gx
@@ -88,14 +51,14 @@ def _products(left, right, right_valid, u, v, keep, y, out):  # type: ignore[no-
 
 
 @njit(cache=True, nogil=True)
-def _step(left, right, right_valid, u, v, keep, radius, noise, new_u, new_v, energy):  # type: ignore[no-untyped-def]
-    """One step for every kept pixel; ``energy`` is its mean-free residual variance *before* the step (inf: none)."""
+def _step(left, right, right_valid, u, v, keep, radius, noise, ring, column, fresh, new_u, new_v, energy):  # type: ignore[no-untyped-def]
+    """One step for every kept pixel; ``energy`` is its mean-free residual variance *before* the step (inf: none).
+
+    ``ring`` (size, planes, col), ``column`` and ``fresh`` (planes, col): zeros, room for running window sums.
+    """
     rows, cols = left.shape
     size = 2 * radius + 1
-    ring = np.zeros((size, PLANES, cols))
-    column = np.zeros((PLANES, cols))
     s = np.empty(PLANES)
-    fresh = np.zeros((PLANES, cols))
     for y in range(-radius, rows):
         _products(left, right, right_valid, u, v, keep, y + radius, fresh)
         slot = (y + radius) % size
@@ -105,7 +68,8 @@ def _step(left, right, right_valid, u, v, keep, radius, noise, new_u, new_v, ene
                 ring[slot, k, x] = fresh[k, x]
         if y < 0:
             continue
-        s[:] = 0.0
+        for k in range(PLANES):
+            s[k] = 0.0
         for x in range(-radius, cols):
             if x + radius < cols:
                 for k in range(PLANES):
@@ -137,10 +101,7 @@ def refine(
     u: AnyArray,
     v: AnyArray,
     keep: AnyArray,
-    *,
-    steps: int,
-    radius: int,
-    noise: float,
+    params: HfvmParams,
 ) -> tuple[AnyArray, AnyArray]:
     """Displacements without the perspective bias.
 
@@ -150,20 +111,20 @@ def refine(
     right_valid : (row, col) uint8, 1 = usable.
     u, v : (row, col) float32, smoothed displacements, pixels.
     keep : (row, col) bool, pixels that have one.
-    steps, radius : number of steps; window is 2 radius + 1 pixels wide.
-    noise : squared grey levels per pixel; regularises windows without texture.
     """
     start_u, start_v = u, v
-    first = None
-    for step in range(steps + 1):
-        new_u, new_v, energy = np.empty_like(u), np.empty_like(v), np.empty(u.shape, np.float32)
-        _step(left, right, right_valid, u, v, keep, radius, noise, new_u, new_v, energy)
-        if first is None:
-            first = energy
-        if step < steps:
+    first = last = np.empty(u.shape, np.float32)
+    for step in range(params.refine_steps + 1):
+        new_u, new_v, last = np.empty_like(u), np.empty_like(v), np.empty(u.shape, np.float32)
+        size, cols = 2 * params.refine_radius + 1, u.shape[1]
+        room = (np.zeros((size, PLANES, cols)), np.zeros((PLANES, cols)), np.zeros((PLANES, cols)))
+        _step(
+            left, right, right_valid, u, v, keep, params.refine_radius, params.refine_noise, *room, new_u, new_v, last
+        )
+        if step == 0:
+            first = last
+        if step < params.refine_steps:
             u, v = np.empty_like(u), np.empty_like(v)
             local_mean(new_u, new_v, keep, 1, u, v)
-    assert first is not None
-    moved = np.hypot(u - start_u, v - start_v)
-    better = (energy <= first) & (moved <= 1.5)
+    better = (last <= first) & (np.hypot(u - start_u, v - start_v) <= FARTHEST)
     return np.where(better, u, start_u), np.where(better, v, start_v)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -20,6 +21,7 @@ from stages.accuracy import metric as figure
 from stages.accuracy import trajectory_accuracy
 from stages.declare import Bundle
 from stages.dem_accuracy import dem_accuracy
+from stages.errors import RilleError
 from stages.geometry import Camera, Rig, RigidTransform
 from stages.lattice import Lattice
 from stages.path_check import path_check
@@ -246,7 +248,7 @@ def test_a_whole_run_has_every_figure_and_nothing_missing(whole: Written) -> Non
         "elevation-error",
     ):
         assert anchor in page_.ids
-    assert len(page_.images) == 3 + 2 + 2 + 2 + 4 + 2 + 3 + 1
+    assert len(page_.images) == 4 + 2 + 2 + 2 + 4 + 2 + 3 + 1
     assert all(image["alt"] for image in page_.images)
     assert len(html) < 5_000_000
     assert {p.name for p in folder.iterdir()} == {"report.html", "report.json"}
@@ -407,14 +409,14 @@ def test_table_2_sums_the_units_of_a_cycle() -> None:
 def test_a_failed_write_leaves_the_old_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "report.html").write_text("old")
 
-    def broken(descriptor: int) -> None:
+    def broken(source: object, target: object) -> None:
         raise OSError("disk full")
 
-    monkeypatch.setattr(page.os, "fsync", broken)
-    with pytest.raises(OSError, match="disk full"):
-        page._publish(tmp_path / "report.html", "new")
+    monkeypatch.setattr(os, "replace", broken)
+    with pytest.raises((OSError, RilleError), match="disk full"):
+        write_report(tmp_path, view({}, tasks=(), products=Products()))
+    assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
     assert (tmp_path / "report.html").read_text() == "old"
-    assert len(list(tmp_path.iterdir())) == 1
 
 
 @pytest.mark.parametrize(
@@ -450,6 +452,11 @@ def test_limits_are_robust_and_never_empty() -> None:
     for constant in (np.full(5, np.nan), np.zeros(5), np.full(5, 3.0)):
         low, high = canvas.limits(constant)
         assert high > low
+
+
+def test_measured_and_interpolated_are_told_apart() -> None:
+    bits = np.array([[1, 2, 2 | 4, 8, 0]], dtype=np.uint8)
+    np.testing.assert_array_equal(figures.validity_classes(bits), [[0, 1, 1, 2, 2]])
 
 
 def test_shading_is_bright_towards_the_light() -> None:

@@ -93,13 +93,27 @@ def test_street_with_more_walls_than_road() -> None:
     low, high = facts["z_range"]
     assert low < -1.65 - 0.05
     assert high > -0.2
-    assert high <= 1.65 + 1e-9 + abs(facts["footprint"][3]) * math.tan(facts["tilt"])
+    assert high <= 1.652 + abs(facts["footprint"][3]) * math.tan(facts["tilt"])
     x_min, x_max, y_min, y_max = facts["footprint"]
     assert x_min < -4.0
     assert x_max > 4.0
     nearest_row = math.atan(139 / 700) + math.radians(1.0)  # below the horizon
     assert y_min == pytest.approx(1.65 / math.tan(nearest_row), rel=0.05)
     assert y_max > 15.0
+
+
+def test_the_far_background_is_not_ground() -> None:
+    ground, wall = plane(0.0, 0.0, -0.6), box((-900.0, 100.0, -900.0), (900.0, 200.0, 900.0))
+    T = pitched(3.0)
+    column, row, usable = disparity(RIG, T, nearest(ground, wall))
+    column = column + smooth_noise(column.shape, 0.2, np.random.default_rng(0))
+    facts = level(column, row, usable, RIG, PARAMS)
+    cols, rows = np.meshgrid(np.arange(RIG.left.width), np.arange(RIG.left.height))
+    v = RIG.left.rays(np.stack([cols, rows], -1)[usable]) @ T.rotation.T
+    # Ground beyond 5 sigma of inverse depth, 5 * 0.2 px / (f B), cannot be told from the background.
+    on_ground = ground(np.zeros(3), v) < RIG.left.fx * RIG.baseline
+    assert facts["ground_share"] == pytest.approx(on_ground.mean(), abs=0.05)
+    assert facts["ground_height"] == pytest.approx(-0.6, rel=0.02)
 
 
 def test_relief_holds_the_rocks() -> None:
@@ -115,6 +129,13 @@ def test_no_ground_is_said_with_a_remedy() -> None:
     wall = disparity(RIG, pitched(0.0), box((-9.0, 1.0, -9.0), (9.0, 2.0, 9.0)))
     with pytest.raises(DegenerateError, match="pitch"):
         level(*wall, RIG, PARAMS)
+    far = disparity(RIG, pitched(0.0), box((-900.0, 100.0, -900.0), (900.0, 200.0, 900.0)))
+    patch = np.zeros_like(far[2])
+    patch[150:190, 150:190] = True
+    for seed in range(5):
+        noisy = far[0] + smooth_noise(far[0].shape, 0.2, np.random.default_rng(seed))
+        with pytest.raises(DegenerateError, match="pitch"):  # so far away every plane fits, chance sets its tilt
+            level(noisy, far[1], patch, RIG, PARAMS)
     with pytest.raises(DegenerateError, match="pitch"):
         level(FLAT[0], FLAT[1], np.zeros_like(FLAT[2]), RIG, PARAMS)
     swapped = Rig(RIG.right, RIG.left, RIG.T_right_left)

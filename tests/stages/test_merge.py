@@ -78,6 +78,12 @@ def test_order_changes_no_bit(order: list[int], seed: int) -> None:
         assert a.tobytes() == b.tobytes()
 
 
+def test_of_equal_weights_the_first_pair_is_the_source() -> None:
+    for order in (1, -1):
+        merged = merge([layer(8, 0.1), layer(4, 0.2)][::order], TILE, PARAMS)
+        assert (merged.source == 4).all()
+
+
 @given(st.integers(1, 6), st.integers(0, 20))
 def test_the_mean_lies_among_the_models(count: int, seed: int) -> None:
     layers = noisy(count, seed)

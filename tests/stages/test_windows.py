@@ -19,9 +19,7 @@ def holed(seed: int, shape: tuple[int, int], share: float = 0.2) -> np.ndarray:
 
 
 @settings(max_examples=40, deadline=None)
-@given(
-    seed=st.integers(0, 999), rows=st.integers(1, 30), cols=st.integers(1, 30), half=st.integers(0, 20)
-)
+@given(seed=st.integers(0, 999), rows=st.integers(1, 30), cols=st.integers(1, 30), half=st.integers(0, 20))
 def test_extrema_equal_scipy(seed: int, rows: int, cols: int, half: int) -> None:
     a, n = holed(seed, (rows, cols)), 2 * half + 1
     low, high = np.where(np.isnan(a), -np.inf, a), np.where(np.isnan(a), np.inf, a)

@@ -13,15 +13,69 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from stages import pyramid
 from stages.declare import AnyArray
-from stages.hfvm.refine import _sample
-from stages.validity import Mask
+from stages.hfvm.hierarchy import FIT_SAMPLES, Prepared, State, sample
+from stages.hfvm.params import HfvmParams
+from stages.hfvm.resample import sample_cubic
+from stages.pyramid import Pyramid, PyramidParams
 
 Matrix = NDArray[np.float64]
 
 ITERATIONS = 15
-SAMPLES = 4000
+
+MOST_DISTORTION = 2.0
+"""Beyond this the plane is no ground but a bad fit."""
 LEAST_MATCHES = 60
+
+TOLERANCE = 1.0
+"""Pixels of the coarse level: a match this near the plane belongs to it (half weight)."""
+
+MARGIN = 1.0 / 16.0
+"""Share of the width added around the aligned image, for what stands out of the plane."""
+
+
+def find(pair: Prepared, state: State, params: HfvmParams) -> Matrix | None:
+    """Homography from aligned pixels to right image pixels (level 0), or None where alignment would not help."""
+    wanted = sample(state.left_ok, FIT_SAMPLES)
+    fine = pair.solver.fine(state.level, state.left, wanted)
+    found = fit_plane(fine.u, fine.v, wanted, TOLERANCE)
+    if found is None or found[1] < params.plane_share:
+        return None
+    h = to_level_0(found[0], state.level)
+    shape = pair.left_valid[0].shape
+    shear = distortion(h, (shape[0], shape[1]))
+    return h if params.plane_distortion <= shear < MOST_DISTORTION else None
+
+
+def align(right: Pyramid, h: Matrix, left_shape: tuple[int, ...], params: PyramidParams) -> Pyramid:
+    """Pyramid of the right image resampled to the left one's geometry, with a margin (see :func:`margin`)."""
+    m = margin(left_shape)
+    image = np.empty((left_shape[0] + 2 * m, left_shape[1] + 2 * m), np.float32)
+    valid = np.empty(image.shape, np.uint8)
+    warp(pyramid.filled(right)[0], right.valid[0], h @ translation(-m), image, valid)
+    return pyramid.build(image, params, valid)
+
+
+def compose(h: Matrix, u: AnyArray, v: AnyArray) -> tuple[AnyArray, AnyArray]:
+    """Displacements to the original right image of displacements to the aligned one (margin included)."""
+    g = h @ translation(-margin(u.shape))
+    y, x = np.indices(u.shape, dtype=np.float64)
+    p, q = x + u, y + v
+    w = g[2, 0] * p + g[2, 1] * q + g[2, 2]
+    xr = (g[0, 0] * p + g[0, 1] * q + g[0, 2]) / w
+    yr = (g[1, 0] * p + g[1, 1] * q + g[1, 2]) / w
+    return (xr - x).astype(np.float32), (yr - y).astype(np.float32)
+
+
+def margin(left_shape: tuple[int, ...]) -> int:
+    """Pixels added on every side of the aligned image."""
+    return int(np.ceil(MARGIN * left_shape[1]))
+
+
+def translation(by: float) -> Matrix:
+    """Homography that adds ``by`` pixels to both coordinates."""
+    return np.array([[1.0, 0.0, by], [0.0, 1.0, by], [0.0, 0.0, 1.0]])
 
 
 def fit_plane(u: AnyArray, v: AnyArray, consistent: AnyArray, tolerance: float) -> tuple[Matrix, float] | None:
@@ -39,11 +93,13 @@ def fit_plane(u: AnyArray, v: AnyArray, consistent: AnyArray, tolerance: float) 
     y, x = np.nonzero(consistent)
     if len(y) < LEAST_MATCHES:
         return None
-    keep = np.arange(0, len(y), max(1, len(y) // SAMPLES))
-    y, x = y[keep], x[keep]
     scale = 0.5 * max(consistent.shape)
     to_unit = np.array(
-        [[1 / scale, 0, -0.5 * consistent.shape[1] / scale], [0, 1 / scale, -0.5 * consistent.shape[0] / scale], [0, 0, 1]]
+        [
+            [1 / scale, 0, -0.5 * consistent.shape[1] / scale],
+            [0, 1 / scale, -0.5 * consistent.shape[0] / scale],
+            [0, 0, 1],
+        ]
     )
     px, py = x * to_unit[0, 0] + to_unit[0, 2], y * to_unit[1, 1] + to_unit[1, 2]
     qx = (x + u[y, x]) * to_unit[0, 0] + to_unit[0, 2]
@@ -85,7 +141,12 @@ def distortion(h: Matrix, shape: tuple[int, int]) -> float:
     if (w <= 0.1).any():
         return np.inf
     p, q = (h[0, 0] * x + h[0, 1] * y + h[0, 2]) / w, (h[1, 0] * x + h[1, 1] * y + h[1, 2]) / w
-    parts = [(h[0, 0] - p * h[2, 0]) / w - 1, (h[0, 1] - p * h[2, 1]) / w, (h[1, 0] - q * h[2, 0]) / w, (h[1, 1] - q * h[2, 1]) / w - 1]
+    parts = [
+        (h[0, 0] - p * h[2, 0]) / w - 1,
+        (h[0, 1] - p * h[2, 1]) / w,
+        (h[1, 0] - q * h[2, 0]) / w,
+        (h[1, 1] - q * h[2, 1]) / w - 1,
+    ]
     return float(max(np.median(np.abs(d)) for d in parts))
 
 
@@ -104,5 +165,5 @@ def warp(image, valid, h, out, out_valid):  # type: ignore[no-untyped-def]
             if not (p >= 1 and p < icols - 2 and q >= 1 and q < irows - 2):
                 continue
             if valid[int(q + 0.5), int(p + 0.5)]:
-                out[y, x] = _sample(image, np.float32(p), np.float32(q))[0]
+                out[y, x] = sample_cubic(image, np.float32(p), np.float32(q))[0]
                 out_valid[y, x] = 1

@@ -1,0 +1,60 @@
+"""One-level matching to the letter of section 4.3: Eq. 1 to 3 on floating-point features, one centre, no smoothness."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from stages.declare import AnyArray
+from stages.hfvm.subpixel import linear
+
+
+def weighted(planes: AnyArray, weights: tuple[float, ...]) -> AnyArray:
+    """Feature planes (8, row, col) as (row, col, 8) float32 vectors whose Euclidean distance is Eq. 1, grey levels."""
+    w = np.asarray(weights, dtype=np.float32)
+    w = w / np.sqrt(np.sum(w * w))
+    return np.ascontiguousarray(np.moveaxis(planes * w[:, None, None], 0, -1), dtype=np.float32)
+
+
+@njit(cache=True, nogil=True)
+def _eq1(f, g):  # type: ignore[no-untyped-def]
+    total = np.float32(0.0)
+    for k in range(f.shape[0]):
+        d = f[k] - g[k]
+        total += d * d
+    return np.sqrt(total)
+
+
+@njit(cache=True, nogil=True)
+def search(left, right, centre_u, centre_v, reach_x, reach_y, out_u, out_v, out_distance, out_offset):  # type: ignore[no-untyped-def]
+    """Best match of every pixel in the search area around its centre (Eq. 2, Eq. 3).
+
+    Of equal distances the first in row, column order wins. ``out_distance``: Eq. 1 of the best, -1 where nothing lies
+    inside. ``out_offset`` (row, col, 2): linear sub-pixel offsets (column, row), 4.3.2; 0 at the border of the image.
+    """
+    rows, cols = left.shape[:2]
+    rrows, rcols = right.shape[:2]
+    for y in range(rows):
+        for x in range(cols):
+            cu, cv = np.int64(centre_u[y, x]), np.int64(centre_v[y, x])
+            best = np.float32(-1.0)
+            bu, bv = cu, cv
+            for v in range(max(cv - reach_y, -y), min(cv + reach_y, rrows - 1 - y) + 1):
+                for u in range(max(cu - reach_x, -x), min(cu + reach_x, rcols - 1 - x) + 1):
+                    d = _eq1(left[y, x], right[y + v, x + u])
+                    if best < 0 or d < best:
+                        best = d
+                        bu, bv = np.int64(u), np.int64(v)
+            out_u[y, x], out_v[y, x], out_distance[y, x] = bu, bv, best
+            out_offset[y, x, 0], out_offset[y, x, 1] = 0.0, 0.0
+            xr, yr = x + bu, y + bv
+            if best < 0:
+                continue
+            if xr > 0 and xr < rcols - 1:
+                out_offset[y, x, 0] = linear(
+                    _eq1(left[y, x], right[yr, xr - 1]), best, _eq1(left[y, x], right[yr, xr + 1])
+                )
+            if yr > 0 and yr < rrows - 1:
+                out_offset[y, x, 1] = linear(
+                    _eq1(left[y, x], right[yr - 1, xr]), best, _eq1(left[y, x], right[yr + 1, xr])
+                )

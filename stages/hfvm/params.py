@@ -1,0 +1,113 @@
+"""Parameters of the dense matcher, and its two presets."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Literal
+
+from pydantic import Field, model_validator
+
+from stages.declare import Params
+from stages.features import PAPER_WEIGHTS
+
+Weights = tuple[float, float, float, float, float, float, float, float]
+
+PAPER: Mapping[str, Any] = {
+    "weights": PAPER_WEIGHTS,
+    "search_columns": 2,
+    "median": 3,
+    "threshold": 25.0,
+    "texture": 0.0,
+    "speckle": 1,
+    "fill_reach": 100000,
+    "refine": False,
+}
+"""What preset ``paper`` sets differently; a value given by the user wins. Preset-only machinery ignores the rest."""
+
+
+class HfvmParams(Params):
+    """Parameters of hierarchical feature vector matching.
+
+    ``preset = "paper"`` follows section 4.3 to the letter: floating-point Table 1 features and Eq. 1, one search
+    centre, no epipolar band, no propagation, no smoothness, no pre-alignment, sub-pixel by linear interpolation and
+    look-up table.
+    """
+
+    preset: Literal["default", "paper"] = Field(
+        default="default",
+        description="default: the measured recipe; paper: section 4.3 to the letter, its values where not given",
+    )
+    weights: Weights = Field(
+        default=(4.0, 4.0, 2.0, 2.0, 0.5, 0.5, 2.0, 1.0),
+        description="factors of the eight features (Table 1); measured best on square-root features",
+    )
+    top_columns: float = Field(
+        default=0.5,
+        gt=0,
+        le=1,
+        description="share of the image width searched to either side at the top level: any overlap",
+    )
+    top_rows: float = Field(
+        default=0.25, ge=0, le=1, description="the same of the height: roll, toe-in and row offsets"
+    )
+    search_columns: int = Field(
+        default=1, ge=1, le=8, description="pixels to either side of a centre: doubling errs by one"
+    )
+    search_rows: int = Field(default=1, ge=0, le=8, description="pixels; never 0 on a rig that is not rectified")
+    band: float = Field(
+        default=8.0,
+        ge=0,
+        description="cost (byte steps) a pixel off the epipolar line; 0 = free two-dimensional search",
+    )
+    smoothness: int = Field(
+        default=5, ge=0, description="byte steps a pixel of difference to each neighbour; kept weak"
+    )
+    rounds: int = Field(
+        default=4, ge=0, le=32, description="propagation rounds a level; they recover what the coarse level lost"
+    )
+    median: Literal[1, 3, 5] = Field(default=5, description="pixels; side of the median filter of each level, 1 = none")
+    threshold: float = Field(
+        default=90.0,
+        gt=0,
+        description="least distance above which a pixel is not matchable: byte steps (paper: grey levels)",
+    )
+    texture: float = Field(
+        default=0.5, ge=0, description="grey levels; least local deviation, just above 8-bit rounding (.29)"
+    )
+    backmatch: float = Field(
+        default=1.0, gt=0, description="pixels; greatest error after matching there and back (4.3.3)"
+    )
+    speckle: int = Field(
+        default=40, ge=1, description="pixels; smaller isolated patches are removed, chance matches are so small"
+    )
+    fill_reach: int = Field(
+        default=120,
+        ge=0,
+        description="pixels; reach of interpolation along a row, about the widest occlusion of a close stereo rig",
+    )
+    plane_level: int = Field(
+        default=2, ge=1, le=6, description="pyramid level whose matches decide on pre-alignment by a plane"
+    )
+    plane_distortion: float = Field(
+        default=0.2,
+        ge=0,
+        description="pixels a pixel; pre-align beyond this shear (a 13-tap kernel then errs by a pixel)",
+    )
+    plane_share: float = Field(
+        default=0.6, ge=0, le=1, description="share of the coarse matches that the plane must explain"
+    )
+    refine: bool = Field(default=True, description="remove the perspective bias by mean-free Lucas-Kanade steps")
+    refine_steps: int = Field(default=2, ge=1, le=8, description="steps; the second one settles the first")
+    refine_radius: int = Field(
+        default=2, ge=1, le=8, description="pixels; 5 x 5 windows: wider ones smooth relief away"
+    )
+    refine_noise: float = Field(
+        default=8.0, gt=0, description="squared grey levels a pixel; holds windows with weak texture"
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _preset(cls, values: Any) -> Any:
+        if isinstance(values, Mapping) and values.get("preset") == "paper":
+            return {**PAPER, **values}
+        return values

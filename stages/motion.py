@@ -1,0 +1,127 @@
+"""Coarse displacement of all points from one left frame to the next (paper, 5.2.1, first iteration).
+
+The hierarchical matcher of stage ``hfvm``, stopped at a coarse level. There is no epipolar band: a camera that moves
+forward has radial flow, whose epipolar lines meet inside the image, where a band says nothing about the way along it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from stages.declare import AnyArray, Array, Bundle, Inputs, Params, Stage
+from stages.hfvm import consistency, hierarchy
+from stages.hfvm.params import HfvmParams
+from stages.pyramid import Pyramid
+from stages.validity import Mask, Validity, defined, mark, matched
+
+
+class MotionParams(Params):
+    """Parameters of the coarse displacements between successive frames."""
+
+    level: int = Field(
+        default=2, ge=0, le=6, description="pyramid level of the result; 2 = a quarter of the resolution"
+    )
+    top_columns: float = Field(default=0.25, gt=0, le=1, description="share of the width searched at the top level")
+    top_rows: float = Field(default=0.25, gt=0, le=1, description="share of the height searched at the top level")
+    smoothness: int = Field(default=5, ge=0, description="byte steps a pixel of difference to each neighbour")
+    rounds: int = Field(default=4, ge=0, le=32, description="propagation rounds a level")
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Displacements of the grid of pyramid level ``level`` of frame a, in pixels of **level 0**.
+
+    Grid pixel (row, col) stands for level-0 position ``(col + 0.5) * 2**level - 0.5`` (rows likewise). All arrays are
+    (row, col): ``column_disparity, row_disparity`` float32, b minus a, NaN undefined, interpolated ones
+    included; ``validity`` bits of :class:`~stages.validity.Validity`.
+    """
+
+    level: int
+    column_disparity: NDArray[np.float32]
+    row_disparity: NDArray[np.float32]
+    validity: Mask
+
+
+def coarse_motion(a: Pyramid, b: Pyramid, params: MotionParams) -> Motion:
+    """Displacements from frame ``a`` to frame ``b``; of a shallower pyramid its top level."""
+    hp = HfvmParams(
+        band=0.0,
+        top_columns=params.top_columns,
+        top_rows=params.top_rows,
+        smoothness=params.smoothness,
+        rounds=params.rounds,
+    )
+    pair = hierarchy.prepare(a, b, hp)
+    state = hierarchy.run(pair, hp, params.level)
+    fine = pair.solver.fine(state.level, state.left, np.ones(state.left.u.shape, bool))
+    scale = np.float32(2.0**state.level)
+    validity = np.zeros(state.left.u.shape, np.uint8)
+    textured = pair.deviation[state.level] >= hp.texture
+    mark(validity, pair.left_valid[state.level] == 0, Validity.OUT_OF_IMAGE)
+    mark(validity, ~textured, Validity.NO_TEXTURE)
+    mark(validity, ~state.left_ok, Validity.BACKMATCH_FAILED)
+    mark(validity, fine.distance > hp.threshold, Validity.OVER_THRESHOLD)
+    good = validity == 0
+    u, v, interpolated = fine.u.copy(), fine.v.copy(), np.zeros(good.shape, np.uint8)
+    consistency.fill_rows(u, v, good, hp.fill_reach, state.near_sign or -1.0, interpolated)
+    mark(validity, good, Validity.MATCHED)
+    mark(validity, interpolated != 0, Validity.INTERPOLATED)
+    u[~defined(validity)] = v[~defined(validity)] = np.nan
+    return Motion(state.level, u * scale, v * scale, validity)
+
+
+def _run(params: MotionParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+    found = coarse_motion(Pyramid.from_bundle(inputs["a"]), Pyramid.from_bundle(inputs["b"]), params)
+    ok = matched(found.validity)
+    rows, cols = ok.shape
+    y, x = np.indices(ok.shape)
+    scale = 2.0**found.level
+    xb, yb = x + found.column_disparity / scale, y + found.row_disparity / scale
+    seen = ok & (xb >= 0) & (xb <= cols - 1) & (yb >= 0) & (yb <= rows - 1)
+    u, v = found.column_disparity[ok], found.row_disparity[ok]
+    usable = int(np.count_nonzero(found.validity & np.uint8(Validity.OUT_OF_IMAGE) == 0))
+    meta = {
+        "level": found.level,
+        "median_column": float(np.median(u)) if u.size else None,
+        "median_row": float(np.median(v)) if u.size else None,
+        "median_length": float(np.median(np.hypot(u, v))) if u.size else None,
+        "match_rate": int(np.count_nonzero(ok)) / usable if usable else None,
+        "overlap": int(np.count_nonzero(seen)) / usable if usable else None,
+    }
+    arrays: dict[str, AnyArray] = {
+        "column_disparity": found.column_disparity,
+        "row_disparity": found.row_disparity,
+        "validity": found.validity,
+    }
+    return Bundle(arrays, meta)
+
+
+_GRID = ("row", "col")
+STAGE = Stage(
+    name="motion",
+    version=1,
+    summary="coarse displacements of all points from one left frame to the next",
+    params=MotionParams,
+    inputs=("a", "b"),
+    outputs=(
+        Array(
+            "column_disparity",
+            _GRID,
+            "float32",
+            "pixel",
+            "level-0 columns, frame b minus a",
+            "nan",
+            "coarse level of a",
+        ),
+        Array("row_disparity", _GRID, "float32", "pixel", "level-0 rows, frame b minus a", "nan", "coarse level of a"),
+        Array("validity", _GRID, "uint8", "1", "bit mask, see stages.validity", "", "coarse level of a"),
+    ),
+    requires=("numpy", "numba", "opencv-python-headless"),
+    run=_run,
+)

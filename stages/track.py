@@ -1,0 +1,264 @@
+"""Tracking of interest points through the left frames of a segment (section 5.2.1).
+
+Source: Kolesnik, Paar, Bauer, Ulm (1999), section 5.2.1. Two iterations as there: coarse displacements of all pixels
+between successive frames (stage ``motion``) predict where an interest point went; feature vectors find it at full
+resolution. Two steps of ours follow: the affinity by which the surroundings of a point changed is fitted to the
+displacements of its neighbours, and the template of the frame in which the point was *born* is aligned under it
+(:mod:`stages.alignment`). Errors do not accumulate along the chain, since each frame is measured against the first.
+
+A point that is lost keeps its predicted position and may be found again. Buckets of the image that have run empty get
+new points at intermediate frames; such a point is looked up backwards in the key frame, where its coordinates are
+known, and dropped if it is not found there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from stages.alignment import HALF, align
+from stages.declare import Array, Bundle, Inputs, Params, Stage
+from stages.errors import InputError
+from stages.moravec import clear_of_mask, interest_points
+from stages.points import match_points
+from stages.pyramid import Pyramid
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+BORDER = 8
+"""Pixels between an interest point and the image's edge: template, cubic interpolation and a search step."""
+NEIGHBOURS = 12
+"""Tracks that an affinity of six numbers is fitted to: twice as many as needed, still local."""
+
+
+class TrackParams(Params):
+    """Parameters of the stage ``track``."""
+
+    points: int = Field(
+        400, ge=6, description="interest points of the key frame; the paper: about 200, the error falls with the root"
+    )
+    noise: float = Field(1.5, gt=0, description="grey levels; noise of one image, no texture below thrice its effect")
+    radius: int = Field(4, ge=1, description="pixels; search around the prediction: one pixel of the coarse level")
+    affinity_sigma: float = Field(
+        0.1, gt=0, description="expected departure of a template's affinity from its neighbours', per element"
+    )
+    max_scale: float = Field(
+        2.0, gt=1, description="change of scale since birth up to which its template is used; then the last frame's"
+    )
+    reseed: bool = Field(True, description="new points in empty buckets of intermediate frames")
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Coarse displacements (rows, cols) of a pyramid level, in level 0 pixels, NaN undefined."""
+
+    column: NDArray[np.float32]
+    row: NDArray[np.float32]
+    level: int
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """``points`` (n, frames, 2) column, row, NaN lost; ``birth`` (n,) frame index; ``distance`` (n, frames), NaN."""
+
+    points: NDArray[np.float32]
+    birth: NDArray[np.int16]
+    distance: NDArray[np.float32]
+
+
+def track(frames: Sequence[Pyramid], motions: Sequence[Motion], params: TrackParams) -> Tracks:
+    """Follow interest points of the first frame, and later ones, through all frames.
+
+    Parameters
+    ----------
+    frames : pyramids of the left images of a segment, key frame first.
+    motions : displacements from each frame to the next, one fewer than frames.
+
+    Raises
+    ------
+    InputError
+        Not one motion between each two frames.
+    """
+    if len(motions) != len(frames) - 1:
+        raise InputError(f"{len(frames)} frames need {len(frames) - 1} motions, not {len(motions)}")
+    first = frames[0]
+    seeds = interest_points(first.images[0], first.valid[0], params.points, noise=params.noise, border=BORDER)
+    state = _State.born(seeds.astype(np.float64), 0, len(frames))
+    for j in range(1, len(frames)):
+        _advance(state, frames, motions[j - 1], j, params)
+        if params.reseed and j < len(frames) - 1:
+            state = _reseed(state, frames, j, params)
+    return Tracks(state.points.astype(np.float32), state.birth, state.distance.astype(np.float32))
+
+
+@dataclass
+class _State:
+    """Tracks in the making; ``expected`` (n, 2) is where each point is thought to be in the present frame."""
+
+    points: Floats
+    birth: NDArray[np.int16]
+    distance: Floats
+    expected: Floats
+
+    @staticmethod
+    def born(points: Floats, frame: int, frames: int) -> _State:
+        n = len(points)
+        state = _State(
+            np.full((n, frames, 2), np.nan), np.full(n, frame, np.int16), np.full((n, frames), np.nan), points.copy()
+        )
+        state.points[:, frame], state.distance[:, frame] = points, 0.0
+        return state
+
+    def and_also(self, other: _State, keep: Bools) -> _State:
+        return _State(
+            *(
+                np.concatenate([getattr(self, name), getattr(other, name)[keep]])
+                for name in ("points", "birth", "distance", "expected")
+            )
+        )
+
+
+def _advance(state: _State, frames: Sequence[Pyramid], motion: Motion, j: int, params: TrackParams) -> None:
+    """Find all points of frame j - 1 in frame j."""
+    predicted = state.expected + displacement_at(motion, state.expected)
+    smooth = local_affinity(state.expected, predicted, np.isfinite(predicted).all(1), state.expected)
+    matched = _match(frames[j - 1], frames[j], state.expected, predicted, smooth, params)
+    found = np.isfinite(matched).all(1)
+    state.expected = np.where(found[:, None], matched, predicted)
+    for birth in np.unique(state.birth):
+        group = np.flatnonzero((state.birth == birth) & found)
+        origin = state.points[group, birth]
+        affinity = local_affinity(origin, matched[group], np.ones(group.size, bool), origin)
+        scale = np.linalg.svd(affinity, compute_uv=False)
+        near = (scale[:, 0] < params.max_scale) & (scale[:, 1] > 1.0 / params.max_scale)
+        for source, chosen in ((int(birth), near), (j - 1, ~near & np.isfinite(state.points[group, j - 1]).all(1))):
+            who = group[chosen]
+            if who.size == 0:
+                continue
+            template = affinity[chosen] if source == birth else smooth[who]
+            place, error = _align(frames[source], frames[j], state.points[who, source], matched[who], template, params)
+            state.points[who, j], state.distance[who, j] = place, error
+            state.expected[who] = np.where(np.isfinite(place), place, state.expected[who])
+
+
+def _reseed(state: _State, frames: Sequence[Pyramid], j: int, params: TrackParams) -> _State:
+    """Add points of frame j in empty buckets, as far as they are found in the key frame."""
+    alive = np.isfinite(state.points[:, j]).all(1) & np.isfinite(state.points[:, 0]).all(1)
+    here, there = state.points[alive, j], state.points[alive, 0]
+    seeds = interest_points(
+        frames[j].images[0], frames[j].valid[0], params.points, noise=params.noise, border=BORDER, occupied=here
+    ).astype(np.float64)
+    if len(seeds) == 0 or len(here) < NEIGHBOURS:
+        return state
+    affinity, shift = fit_affinity(here, there, np.ones(len(here), bool), seeds)
+    start = seeds + shift
+    matched = _match(frames[j], frames[0], seeds, start, affinity, params)
+    place, error = _align(frames[j], frames[0], seeds, matched, affinity, params)
+    new = _State.born(seeds, j, len(frames))
+    new.points[:, 0], new.distance[:, 0] = place, error
+    return state.and_also(new, np.isfinite(place).all(1))
+
+
+def _match(a: Pyramid, b: Pyramid, points: Floats, predicted: Floats, affinity: Floats, params: TrackParams) -> Floats:
+    """Feature-vector matches (n, 2) at full resolution; NaN not found, or the neighbourhood in b is masked."""
+    return match_points(a, b, points, predicted, affinity, params.radius)
+
+
+def _align(
+    a: Pyramid, b: Pyramid, points: Floats, start: Floats, affinity: Floats, params: TrackParams
+) -> tuple[Floats, Floats]:
+    place, error = align(
+        a.images[0],
+        b.images[0],
+        points,
+        start,
+        affinity,
+        noise=params.noise * 2.0**0.5,
+        spread=params.affinity_sigma,
+        reach=2.0,
+    )
+    good = clear_of_mask(b.valid[0], place, HALF)
+    return np.where(good[:, None], place, np.nan), np.where(good, error, np.nan)
+
+
+def displacement_at(motion: Motion, points: Floats) -> Floats:
+    """Coarse displacement (n, 2) at points (n, 2), pixels: median of the defined ones among 3 x 3; NaN none."""
+    k = 0.5**motion.level
+    rows, cols = motion.column.shape
+    centre = np.floor((np.nan_to_num(points) + 0.5) * k).astype(np.intp)
+    dy, dx = (o.ravel() for o in np.mgrid[-1:2, -1:2])
+    y, x = np.clip(centre[:, 1:] + dy, 0, rows - 1), np.clip(centre[:, :1] + dx, 0, cols - 1)
+    both = np.stack([motion.column[y, x], motion.row[y, x]], -1).astype(np.float64)
+    known = np.isfinite(both).all(-1)
+    any_known = known.any(1)
+    both[~any_known] = 0.0
+    value = np.nanmedian(np.where(known[..., None] | ~any_known[:, None, None], both, np.nan), axis=1)
+    return np.where(any_known[:, None] & np.isfinite(points), value, np.nan)
+
+
+def local_affinity(origin: Floats, moved: Floats, use: Bools, at: Floats) -> Floats:
+    """Only the affinities (n, 2, 2) of :func:`fit_affinity`."""
+    return fit_affinity(origin, moved, use, at)[0]
+
+
+def fit_affinity(origin: Floats, moved: Floats, use: Bools, at: Floats) -> tuple[Floats, Floats]:
+    """Affinity (n, 2, 2) and displacement (n, 2) at points ``at`` (n, 2) from the nearest pairs ``origin -> moved``.
+
+    Least squares, reweighted by Cauchy's weights of one pixel, so that a neighbour on another surface counts little. A
+    weak pull towards no change of shape keeps neighbours on a line from inventing one. Too few pairs: no change.
+    """
+    n = len(at)
+    identity, nothing = np.tile(np.eye(2), (n, 1, 1)), np.zeros((n, 2))
+    p, q = origin[use], moved[use]
+    if len(p) < 6 or n == 0:
+        return identity, nothing
+    far = ((np.nan_to_num(at)[:, None] - p[None]) ** 2).sum(-1)
+    nearest = np.argsort(far, axis=1, kind="stable")[:, :NEIGHBOURS]
+    offset = p[nearest] - np.nan_to_num(at)[:, None]
+    shift = (q - p)[nearest]
+    basis = np.concatenate([offset, np.ones((*offset.shape[:2], 1))], -1)
+    ridge = np.diag([25.0 * nearest.shape[1], 25.0 * nearest.shape[1], 1e-6])
+    weight = np.ones(nearest.shape)
+    solution = np.zeros((n, 3, 2))
+    for _ in range(4):
+        weighted = basis * weight[..., None]
+        normal = np.einsum("nka,nkb->nab", weighted, basis) + ridge
+        solution = np.linalg.solve(normal, np.einsum("nka,nki->nai", weighted, shift))
+        rest = shift - np.einsum("nka,nai->nki", basis, solution)
+        weight = 1.0 / (1.0 + (rest**2).sum(-1))
+    return identity + np.swapaxes(solution[:, :2], 1, 2), solution[:, 2]
+
+
+def _run(params: TrackParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+    frames = [Pyramid.from_bundle(b) for b in inputs["frames"]]
+    motions = [
+        Motion(np.asarray(b["column_disparity"]), np.asarray(b["row_disparity"]), int(b.meta["level"]))
+        for b in inputs["motions"]
+    ]
+    found = track(frames, motions, params)
+    return Bundle(
+        {"points": found.points, "birth": found.birth, "distance": found.distance},
+        {"frames": list(args["frames"]), "tracked": [int(v) for v in np.isfinite(found.distance).sum(0)]},
+    )
+
+
+STAGE = Stage(
+    name="track",
+    version=1,
+    summary="interest points followed through the left frames of a segment",
+    params=TrackParams,
+    inputs=("frames*", "motions*"),
+    outputs=(
+        Array("points", ("point", "frame", "uv"), "float32", "pixel", "column and row of the point", nodata="nan"),
+        Array("birth", ("point",), "int16", "1", "index of the frame that the template is from"),
+        Array("distance", ("point", "frame"), "float32", "grey level", "rms difference to the template", nodata="nan"),
+    ),
+    requires=("numpy", "numba"),
+    run=_run,
+)

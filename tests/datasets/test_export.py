@@ -1,0 +1,95 @@
+"""A sequence written as plain files is the same sequence when read back."""
+
+from __future__ import annotations
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+from scipy.ndimage import map_coordinates
+
+from datasets.export import export
+from datasets.mockup import sequence as seq
+from datasets.registry import open_sequence
+from stages.errors import InputError
+from stages.geometry import Rig, RigidTransform
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory, tiny, materialise):
+    folder = tmp_path_factory.mktemp("export") / "bed"
+    sequence = seq.mockup(tiny.model_copy(update={"rig_error_deg": (0.0, 0.2, 0.0)}))
+    return sequence, export(sequence, folder, materialise, pairs=(0, 2))
+
+
+def test_round_trip(exported, materialise):
+    sequence, folder = exported
+    back = open_sequence(str(folder))
+    assert back.frame_names == sequence.frame_names
+    assert back.times == sequence.times
+    for a, b in ((back.rig.left, sequence.rig.left), (back.rig.right, sequence.rig.right)):
+        np.testing.assert_allclose(a.matrix, b.matrix, rtol=1e-12)
+        assert (a.width, a.height) == (b.width, b.height)
+    np.testing.assert_allclose(back.rig.T_right_left.matrix34, sequence.rig.T_right_left.matrix34, atol=1e-12)
+    for a, b in zip(back.truth, sequence.truth, strict=True):
+        np.testing.assert_allclose(a.matrix34, b.matrix34, atol=1e-12)
+    for frame in range(sequence.frames):
+        for camera in ("left", "right"):
+            np.testing.assert_array_equal(
+                materialise(back.image(frame, camera))["image"], materialise(sequence.image(frame, camera))["image"]
+            )
+
+
+def test_plain_files_say_the_same(exported, materialise):
+    sequence, folder = exported
+    assert Rig.from_dict(json.loads((folder / "rig.json").read_text())).to_dict() == sequence.rig.to_dict()
+    mask = cv2.imread(str(folder / "valid" / "left" / "000000.png"), cv2.IMREAD_UNCHANGED)
+    np.testing.assert_array_equal(mask // 255, materialise(sequence.image(0, "left"))["valid"])
+    truth = np.load(folder / "disparity" / "000002.npz")
+    np.testing.assert_array_equal(truth["column"], materialise(sequence.truth_disparity(2))["column_disparity"])
+    assert sorted(p.stem for p in (folder / "dem").iterdir()) == ["000000", "000002"]
+    text = (folder / "README.txt").read_text()
+    assert "right minus left" in text
+    assert "T_truth_left" in text
+
+
+def test_dem_cells_project_onto_the_true_disparity(exported, tiny):
+    """The exported figures agree with one another: DEM, poses, rig of the pictures, disparity."""
+    _, folder = exported
+    dem, disparity = np.load(folder / "dem" / "000000.npz"), np.load(folder / "disparity" / "000000.npz")
+    rig = seq.true_rig(tiny)
+    rows, cols = np.nonzero(dem["seen"])
+    assert len(rows) > 1000
+    points = np.stack(
+        [dem["x0"] + cols * dem["cell"], dem["y0"] - rows * dem["cell"], dem["elevation"][rows, cols]], axis=1
+    )
+    T_truth_left = RigidTransform.from_matrix(np.loadtxt(folder / "poses.txt")[0])
+    in_left = T_truth_left.inverse().apply(RigidTransform.from_matrix(dem["T_truth_local"]).apply(points))
+    left, right = rig.left.project(in_left), rig.right.project(rig.T_right_left.apply(in_left))
+    found = np.stack([map_coordinates(disparity[k], left.T[::-1], order=1) for k in ("column", "row")], axis=1)
+    # between pixels of 5 mm the bed is not linear: millimetres of relief, f B / Z^2 = 40 px a metre, make 0.04 px
+    error = np.abs(found - (right - left)).max(axis=1)
+    assert np.median(error) < 0.04
+
+
+def test_existing_files_are_left_alone(tmp_path, tiny, materialise):
+    (tmp_path / "mine.txt").write_text("mine")
+    with pytest.raises(InputError, match="is not empty"):
+        export(seq.mockup(tiny), tmp_path, materialise)
+    assert [p.name for p in tmp_path.iterdir()] == ["mine.txt"]
+
+
+def test_interrupted_export_leaves_nothing(tmp_path, tiny, materialise):
+    asked = 0
+
+    def breaks_off(source):
+        nonlocal asked
+        asked += 1
+        if asked == 4:
+            raise KeyboardInterrupt
+        return materialise(source)
+
+    with pytest.raises(KeyboardInterrupt):
+        export(seq.mockup(tiny), tmp_path / "bed", breaks_off)
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,121 @@
+"""Every bad file is one clear line; good ones come out grey and as they were stored."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from datasets import files, files16
+from datasets.files import Digests
+from stages.declare import NoParams, check_outputs
+from stages.errors import InputError
+
+
+@pytest.fixture
+def grey():
+    return np.random.default_rng(0).integers(0, 256, (40, 50), dtype=np.uint8)
+
+
+def encoded(image, kind=".png") -> bytes:
+    return cv2.imencode(kind, image)[1].tobytes()
+
+
+@pytest.mark.parametrize("kind", [".png", ".tif", ".pgm"])
+def test_lossless_kinds_round_trip(tmp_path, grey, kind):
+    for image in (grey, grey.astype(np.uint16) * 257):
+        path = tmp_path / f"a{kind}"
+        path.write_bytes(encoded(image, kind))
+        back = files.read_grey(path)
+        assert back.dtype == image.dtype
+        np.testing.assert_array_equal(back, image)
+
+
+def test_jpeg_is_read(tmp_path):
+    path = tmp_path / "a.jpg"
+    path.write_bytes(encoded(np.full((40, 50), 90, np.uint8), ".jpg"))
+    assert np.abs(files.read_grey(path).astype(int) - 90).max() <= 2
+
+
+def test_colour_becomes_grey_by_the_stated_rule():
+    bgr = np.zeros((1, 4, 3), np.uint8)
+    bgr[0, 0], bgr[0, 1], bgr[0, 2], bgr[0, 3] = (200, 0, 0), (0, 200, 0), (0, 0, 200), (9, 9, 9)
+    expected = np.rint([0.114 * 200, 0.587 * 200, 0.299 * 200, 9])
+    for image in (bgr, np.dstack([bgr, np.full((1, 4), 7, np.uint8)])):  # with and without alpha
+        np.testing.assert_array_equal(files.decode(encoded(image), "x")[0], expected)
+
+
+@pytest.mark.parametrize("kept", [0, 4, 20, 60, 0.5, -13, -12, -4, -1])
+def test_truncated_png_is_named(tmp_path, grey, kept):
+    data = encoded(grey)
+    path = tmp_path / "000007.png"
+    path.write_bytes(data[: int(kept * len(data)) if isinstance(kept, float) else kept])
+    with pytest.raises(InputError, match=r"000007\.png (is truncated|is empty|cannot be read as an image)") as caught:
+        files.read_grey(path)
+    assert caught.value.remedy
+    assert "\n" not in str(caught.value)
+
+
+def test_damaged_and_foreign_files_are_named(tmp_path, grey):
+    data = bytearray(encoded(grey))
+    data[len(data) // 2] ^= 0xFF
+    with pytest.raises(InputError, match=r"x is damaged \(checksum of chunk IDAT"):
+        files.decode(bytes(data), "x")
+    jpeg = encoded(grey, ".jpg")
+    with pytest.raises(InputError, match="x is truncated"):
+        files.decode(jpeg[: len(jpeg) // 2], "x")
+    with pytest.raises(InputError, match="x cannot be read as an image"):
+        files.decode(b"not an image at all", "x")
+    with pytest.raises(InputError, match="samples of type float32"):
+        files.decode(encoded(grey.astype(np.float32), ".tif"), "x")
+    with pytest.raises(InputError, match="cannot be read: No such file"):
+        files.read_grey(tmp_path / "absent.png")
+
+
+def run(source):
+    stage = files16.STAGE if source.module.endswith("16") else files.STAGE
+    bundle = stage.run(NoParams(), source.args | source.hints, {})
+    check_outputs(stage, bundle)
+    return bundle
+
+
+def test_stage_gives_the_image_whole_and_declared(tmp_path, grey):
+    for image, depth in ((grey, 8), (grey.astype(np.uint16) * 100, 16)):
+        path = tmp_path / f"{depth}.png"
+        path.write_bytes(encoded(image))
+        bundle = run(files.image_source(path, 3, "right", (50, 40, depth), Digests()))
+        np.testing.assert_array_equal(bundle["image"], image)
+        assert bundle["valid"].all()
+        assert bundle.meta == {"frame": 3, "camera": "right"}
+
+
+def test_stage_refuses_other_sizes_and_changed_files(tmp_path, grey):
+    path = tmp_path / "a.png"
+    path.write_bytes(encoded(grey))
+    with pytest.raises(InputError, match=r"frame 3, left image .*a\.png is 50 x 40, 8 bits; the sequence has 51 x 40"):
+        run(files.image_source(path, 3, "left", (51, 40, 8), Digests()))
+    source = files.image_source(path, 3, "left", (50, 40, 8), Digests())
+    path.write_bytes(encoded(grey[::-1]))
+    with pytest.raises(InputError, match="has changed"):
+        run(source)
+
+
+def test_paths_are_hints_and_content_is_the_identity(tmp_path, grey):
+    for name in ("a.png", "b.png"):
+        (tmp_path / name).write_bytes(encoded(grey))
+    a, b = (files.image_source(tmp_path / n, 0, "left", (50, 40, 8), Digests()) for n in ("a.png", "b.png"))
+    assert a.args == b.args
+    assert a.hints != b.hints
+
+
+def test_digests_are_remembered_until_the_file_changes(tmp_path, grey, monkeypatch):
+    path, memory = tmp_path / "a.png", tmp_path / "cache" / "digests"
+    path.write_bytes(encoded(grey))
+    first = Digests(memory).sha256(path)
+    with monkeypatch.context() as patch:
+        patch.setattr(files, "_bytes", lambda p: pytest.fail("read again"))
+        assert Digests(memory).sha256(path) == first
+    path.write_bytes(encoded(grey[:20]))
+    assert Digests(memory).sha256(path) != first
+    memory.write_text("rubbish\n" + memory.read_text())
+    assert Digests(memory).sha256(path) != first

@@ -1,0 +1,220 @@
+"""Folders in the manner of KITTI: both layouts, and each thing that can be wrong with one."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from datasets.registry import open_sequence
+from stages.errors import InputError
+from stages.geometry import rotation_exp
+
+K = np.array([[100.0, 0.0, 31.5], [0.0, 100.0, 23.5], [0.0, 0.0, 1.0]])
+P_LEFT = np.hstack([K, np.zeros((3, 1))])
+P_RIGHT = np.hstack([K, K @ [[-0.5], [0.0], [0.0]]])
+
+
+def line(matrix) -> str:
+    return " ".join(f"{v:.12e}" for v in np.asarray(matrix).reshape(-1))
+
+
+def picture(path, shape=(48, 64), dtype=np.uint8):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    rng = np.random.default_rng(len(str(path.name)))
+    cv2.imwrite(str(path), rng.integers(0, 255, shape).astype(dtype))
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Self-contained, bare rows, no newline at the end, as some are."""
+    root = tmp_path / "street"
+    for side in ("image_l", "image_r"):
+        for k in range(3):
+            picture(root / side / f"{k:06d}.png")
+    (root / "calib.txt").write_text(line(P_LEFT) + "\n" + line(P_RIGHT))
+    poses = [np.hstack([np.eye(3), [[0.0], [0.0], [1.2 * k]]]) for k in range(3)]
+    (root / "poses.txt").write_text("\n".join(line(p) for p in poses) + "\n")
+    return root
+
+
+@pytest.fixture
+def root(tmp_path):
+    """The standard layout with grey and colour cameras."""
+    seq = tmp_path / "kitti" / "sequences" / "06"
+    for side in range(4):
+        for k in range(2):
+            picture(seq / f"image_{side}" / f"{k:06d}.png")
+    matrices = [np.hstack([K, K @ [[x], [0.0], [0.0]]]) for x in (0.0, -0.5, 0.06, -0.44)]
+    (seq / "calib.txt").write_text("".join(f"P{k}: {line(p)}\n" for k, p in enumerate(matrices)))
+    (seq / "times.txt").write_text("0.0\n0.1\n")
+    poses = tmp_path / "kitti" / "poses" / "06.txt"
+    poses.parent.mkdir()
+    poses.write_text("".join(line(np.hstack([np.eye(3), [[0.0], [0.0], [k]]])) + "\n" for k in (0.0, 1.0)))
+    return tmp_path / "kitti"
+
+
+def test_self_contained_folder(folder):
+    s = open_sequence(str(folder))
+    assert (s.name, s.frames, s.frame_names) == ("street", 3, ("000000", "000001", "000002"))
+    assert s.rig.baseline == pytest.approx(0.5)
+    np.testing.assert_allclose(s.rig.T_right_left.translation, [-0.5, 0.0, 0.0])
+    np.testing.assert_allclose(s.truth[2].translation, [0.0, 0.0, 2.4])
+    assert s.times is None
+    assert s.defaults["select.stride"] == 2
+    assert s.image(1, "right").hints["path"].endswith("image_r/000001.png")
+
+
+def test_standard_layout_by_folder_and_by_number(root):
+    by_folder = open_sequence(str(root / "sequences" / "06"))
+    by_number = open_sequence(f"{root}:06")
+    only_one = open_sequence(str(root))
+    for s in (by_folder, by_number, only_one):
+        assert s.name == "kitti-06"
+        assert s.times == (0.0, 0.1)
+        assert s.truth[1].translation[2] == 1.0
+        assert s.rig.baseline == pytest.approx(0.5)
+        assert s.image(0, "left").hints["path"].endswith("image_0/000000.png")
+    with pytest.raises(InputError, match="has no sequence '07'"):
+        open_sequence(f"{root}:07")
+
+
+def test_poses_are_those_of_camera_0_also_for_the_colour_pair(root):
+    seq = root / "sequences" / "06"
+    for side in ("image_0", "image_1"):
+        (seq / side).rename(seq / f"unused_{side}")
+    s = open_sequence(str(seq))
+    assert s.image(0, "left").hints["path"].endswith("image_2/000000.png")
+    assert s.rig.baseline == pytest.approx(0.5)
+    # P2 = K [I | 0.06]: camera 2 stands 0.06 m to the left of camera 0
+    np.testing.assert_allclose(s.truth[1].translation, [-0.06, 0.0, 1.0], atol=1e-12)
+
+
+def test_general_projection_matrices_are_taken_apart(folder):
+    R = rotation_exp([0.02, 0.15, -0.01])
+    t = np.array([-0.4, 0.02, 0.05])
+    P = K @ np.hstack([R, t[:, None]])
+    for factor in (1.0, -2.5):  # a projection matrix has no scale
+        (folder / "calib.txt").write_text(line(P_LEFT) + "\n" + line(factor * P))
+        rig = open_sequence(str(folder)).rig
+        np.testing.assert_allclose(rig.T_right_left.rotation, R, atol=1e-9)
+        np.testing.assert_allclose(rig.T_right_left.translation, t, atol=1e-9)
+        np.testing.assert_allclose(rig.right.matrix, K, rtol=1e-9)
+
+
+def test_folders_are_left_and_right_whatever_the_case_of_numbers(folder):
+    for side in ("image_l", "image_r"):
+        (folder / side / "000002.png").rename(folder / side / "10.png")
+        (folder / side / "000001.png").rename(folder / side / "9.png")
+        (folder / side / "000000.png").rename(folder / side / "8.png")
+    assert open_sequence(str(folder)).frame_names == ("8", "9", "10")
+
+
+def breaks(name):
+    """Register a way to spoil a folder, with the message it must give."""
+    return pytest.param(*name[1:], id=name[0])
+
+
+def _drop_right(f):
+    (f / "image_r" / "000001.png").unlink()
+
+
+def _drop_left(f):
+    (f / "image_l" / "000001.png").unlink()
+
+
+def _resize(f):
+    picture(f / "image_r" / "000002.png", (48, 60))
+
+
+def _deepen(f):
+    picture(f / "image_l" / "000001.png", dtype=np.uint16)
+
+
+def _fewer_poses(f):
+    text = (f / "poses.txt").read_text().splitlines()
+    (f / "poses.txt").write_text("\n".join(text[:2]))
+
+
+def _times(f):
+    (f / "times.txt").write_text("0\n1\n2\n3\n")
+
+
+def _no_calib(f):
+    (f / "calib.txt").unlink()
+
+
+def _one_row(f):
+    (f / "calib.txt").write_text(line(P_LEFT))
+
+
+def _short_row(f):
+    (f / "calib.txt").write_text(line(P_LEFT) + "\n1 2 3\n")
+
+
+def _swapped(f):
+    (f / "calib.txt").write_text(line(P_RIGHT) + "\n" + line(P_LEFT))
+
+
+def _same_place(f):
+    (f / "calib.txt").write_text(line(P_LEFT) + "\n" + line(P_LEFT))
+
+
+def _singular(f):
+    (f / "calib.txt").write_text(line(P_LEFT) + "\n" + line(np.zeros((3, 4))))
+
+
+def _no_rotation(f):
+    (f / "poses.txt").write_text("\n".join([line(P_LEFT)] * 3))
+
+
+def _empty(f):
+    for side in ("image_l", "image_r"):
+        for path in (f / side).iterdir():
+            path.unlink()
+
+
+def _not_an_image(f):
+    (f / "image_l" / "000000.png").write_bytes(b"")
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        breaks(("right missing", _drop_right, r"image_l/000001\.png has no partner in .*image_r")),
+        breaks(("left missing", _drop_left, r"image_r/000001\.png has no partner in .*image_l")),
+        breaks(("size", _resize, r"image_r/000002\.png is 60 x 48, 8 bits; the sequence has 64 x 48, 8 bits")),
+        breaks(("depth", _deepen, r"image_l/000001\.png is 64 x 48, 16 bits; the sequence has 64 x 48, 8 bits")),
+        breaks(("pose count", _fewer_poses, r"poses\.txt has 2 poses for 3 pairs")),
+        breaks(("time count", _times, r"times\.txt has 4 times for 3 pairs")),
+        breaks(("no calibration", _no_calib, r"calib\.txt is missing")),
+        breaks(("one camera", _one_row, r"calib\.txt has no projection matrices of image_l and image_r")),
+        breaks(("short row", _short_row, r"calib\.txt, line 2: not 12 numbers")),
+        breaks(("swapped", _swapped, r"stands 0\.5 m to the left of the left one")),
+        breaks(("one place", _same_place, r"stand in one place")),
+        breaks(("singular", _singular, r"image_r is singular")),
+        breaks(("no rotation", _no_rotation, r"poses\.txt, line 1: .*not a rotation")),
+        breaks(("no images", _empty, r"image_l holds no images")),
+        breaks(("empty file", _not_an_image, r"image_l/000000\.png is empty")),
+    ],
+)
+def test_what_is_wrong_is_one_line_with_a_remedy(folder, spoil, message):
+    spoil(folder)
+    with pytest.raises(InputError, match=message) as caught:
+        open_sequence(str(folder))
+    assert "\n" not in str(caught.value)
+    assert caught.value.remedy
+
+
+@pytest.mark.data
+def test_real_street(data_dir, materialise):
+    s = open_sequence(str(data_dir / "kitti06_51"))
+    assert s.frames == 51
+    assert s.rig.baseline == pytest.approx(0.5372, abs=1e-4)
+    length = sum(
+        float(np.linalg.norm(b.translation - a.translation)) for a, b in zip(s.truth, s.truth[1:], strict=False)
+    )
+    assert length == pytest.approx(59.9, abs=0.1)
+    image = materialise(s.image(50, "left"))["image"]
+    assert image.shape == (370, 1226)
+    assert image.dtype == np.uint8

@@ -1,0 +1,315 @@
+"""The simulated experiment: geometry exact, light plausible, bits reproducible."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy.ndimage import binary_erosion, map_coordinates
+
+from datasets.mockup import sequence as seq
+from datasets.mockup import terrain
+from datasets.mockup.params import MockupParams, SceneParams
+from datasets.mockup.scene import build_scene, height_field
+from datasets.mockup.truth import HIDDEN, NO_BED, OUTSIDE, SEEN, true_disparity
+from datasets.mockup.truth_dem import seen_by, true_dem
+from stages.errors import ConfigError
+from stages.geometry import RigidTransform, level_rotation, rotation_exp
+
+
+@pytest.fixture(scope="module")
+def field(tiny):
+    return height_field(build_scene(tiny.scene()))
+
+
+def flat(p: MockupParams) -> MockupParams:
+    return p.model_copy(update={"relief": 0.0, "rocks": 0.0, "craters": 0.0})
+
+
+# -- rig and poses ---------------------------------------------------------------------------------------------------
+
+
+def test_rig_is_the_papers():
+    p = MockupParams()
+    rig = seq.true_rig(p)
+    assert rig.baseline == pytest.approx(0.097, abs=1e-12)
+    left, right = seq.mount(p, "left"), seq.mount(p, "right")
+    for pose, inward in ((left, 1.0), (right, -1.0)):
+        axis, across = pose.rotation[:, 2], pose.rotation[:, 0]
+        assert math.asin(-axis[2]) == pytest.approx(math.radians(18.0), abs=1e-12)  # the stated pitch, exactly
+        assert across[2] == pytest.approx(0.0, abs=1e-15)  # no roll
+        assert math.atan2(axis[0], axis[1]) == pytest.approx(inward * math.radians(5.0), abs=1e-12)
+    # the axes cross in plan at half the baseline over the tangent of the toe-in
+    x = np.array([0.0, 0.0485 / math.tan(math.radians(5.0))])
+    np.testing.assert_allclose(
+        (x - left.translation[:2]) @ [math.cos(0.0872664626), -math.sin(0.0872664626)], 0, atol=1e-9
+    )
+
+
+def test_stated_pitch_levels_the_left_camera():
+    p = MockupParams(frames=2)
+    sequence = seq.mockup(p)
+    pitch = sequence.pitch
+    assert pitch is not None
+    up_from_pitch = [0.0, -math.cos(pitch), -math.sin(pitch)]
+    for pose in sequence.truth:
+        np.testing.assert_allclose(pose.rotation[2], up_from_pitch, atol=1e-12)
+
+
+def test_steps_are_30_mm_ahead_and_15_mm_to_the_right():
+    poses = seq.body_poses(MockupParams())
+    steps = np.diff([b.translation for b in poses], axis=0)
+    np.testing.assert_allclose(steps, np.tile([0.015, 0.03, 0.0], (39, 1)), atol=1e-12)
+
+
+def test_turn_goes_to_the_right_and_steps_follow_the_heading():
+    poses = seq.body_poses(MockupParams(frames=3, turn_deg=10.0, forward=0.03, sideways=0.0))
+    ahead = poses[1].rotation[:, 1]
+    assert ahead[0] == pytest.approx(math.sin(math.radians(10.0)))
+    step = poses[2].translation - poses[1].translation
+    np.testing.assert_allclose(step, 0.03 * ahead, atol=1e-12)
+
+
+def test_drive_beyond_the_bed_is_refused():
+    with pytest.raises(ConfigError, match=r"frame \d+ stands at .* outside the bed"):
+        seq.mockup(MockupParams(frames=200))
+
+
+def test_given_rig_errs_only_as_stated():
+    p = MockupParams(rig_error_deg=(0.0, 0.1, 0.0), focal_error=0.01)
+    given, true = seq.given_rig(p), seq.true_rig(p)
+    assert given.left.fx == pytest.approx(606.0)
+    relative = given.T_right_left.rotation @ true.T_right_left.rotation.T
+    np.testing.assert_allclose(relative, rotation_exp([0.0, math.radians(0.1), 0.0]), atol=1e-12)
+    assert given.baseline == pytest.approx(true.baseline)
+    image = seq.mockup(p).image(0, "right")
+    assert image.args["geometry"]["fx"] == 600.0  # the pictures are those of the true rig
+
+
+def test_unlevel_rig_states_no_pitch_and_a_sensor_gives_up():
+    shaken = seq.mockup(MockupParams(frames=3, jitter_deg=1.0, attitude_noise_deg=0.0))
+    assert shaken.pitch is None
+    for up, pose in zip(shaken.up, shaken.truth, strict=True):
+        np.testing.assert_allclose(pose.rotation @ up, [0.0, 0.0, 1.0], atol=1e-12)
+    assert seq.mockup(MockupParams(frames=3, roll_deg=3.0)).pitch is None
+
+
+# -- truth -------------------------------------------------------------------------------------------------------------
+
+
+def test_disparity_of_a_flat_bed_is_the_planes_homography(tiny):
+    p = flat(tiny)
+    rig, left = seq.true_rig(p), seq.body_poses(p)[0] @ seq.mount(p, "left")
+    column, row, occluded, depth = true_disparity(height_field(build_scene(p.scene())), rig, left)
+    # plane z = 0 of the bed in the left camera: n . X = h
+    n, h = -left.rotation[2], left.translation[2]
+    T = rig.T_right_left
+    H = rig.right.matrix @ (T.rotation + np.outer(T.translation, n) / h) @ np.linalg.inv(rig.left.matrix)
+    rows, cols = np.mgrid[: p.image_height, : p.image_width]
+    q = np.stack([cols, rows, np.ones_like(cols)], axis=-1) @ H.T
+    seen = occluded != NO_BED
+    assert 0.3 < seen.mean() < 0.95
+    # 1e-4 px: float32 of a few hundred pixels
+    np.testing.assert_allclose(column[seen], (q[..., 0] / q[..., 2] - cols)[seen], atol=1e-4)
+    np.testing.assert_allclose(row[seen], (q[..., 1] / q[..., 2] - rows)[seen], atol=1e-4)
+    assert not (occluded == HIDDEN).any()
+    assert np.isnan(column[~seen]).all()
+    assert np.isnan(depth[~seen]).all()
+    inside = (cols + column >= 0) & (cols + column <= p.image_width - 1)
+    inside &= (rows + row >= 0) & (rows + row <= p.image_height - 1)
+    np.testing.assert_array_equal((occluded == SEEN)[seen], inside[seen])
+    assert (occluded == OUTSIDE).any()
+
+
+def test_disparity_obeys_the_epipolar_constraint(tiny, field):
+    rig, left = seq.true_rig(tiny), seq.body_poses(tiny)[1] @ seq.mount(tiny, "left")
+    column, row, _, _ = true_disparity(field, rig, left)
+    rows, cols = np.nonzero(np.isfinite(column))
+    T = rig.T_right_left
+    tx, ty, tz = T.translation
+    E = np.array([[0, -tz, ty], [tz, 0, -tx], [-ty, tx, 0]]) @ T.rotation
+    F = np.linalg.inv(rig.right.matrix).T @ E @ np.linalg.inv(rig.left.matrix)
+    a = np.stack([cols, rows, np.ones_like(cols)], axis=1).astype(float)
+    b = a.copy()
+    b[:, 0] += column[rows, cols]
+    b[:, 1] += row[rows, cols]
+    line = a @ F.T
+    distance = (b * line).sum(axis=1) / np.hypot(line[:, 0], line[:, 1])
+    assert np.abs(distance).max() < 1e-4
+
+
+def test_hidden_points_are_those_with_terrain_in_the_way(tiny, field):
+    rig, left = seq.true_rig(tiny), seq.body_poses(tiny)[0] @ seq.mount(tiny, "left")
+    right = left @ rig.T_right_left.inverse()
+    _, _, occluded, depth = true_disparity(field, rig, left)
+    assert (occluded == HIDDEN).sum() > 10
+    checked = 0
+    for code in (SEEN, HIDDEN):
+        rows, cols = np.nonzero(occluded == code)
+        for r, c in list(zip(rows, cols, strict=True))[:: max(1, len(rows) // 150)]:
+            point = left.apply(depth[r, c] * rig.left.rays([c, r]).astype(float))
+            s = np.linspace(0.0, 1.0, 2000)[:-1, None]
+            p = right.translation + s * (point - right.translation)
+            on = (np.abs(p[:, 0]) < 0.45) & (p[:, 1] > 0) & (p[:, 1] < 0.8)
+            j = np.clip((p[:, 0] - field.x0) / field.cell, 0, field.height.shape[1] - 1.001)
+            i = np.clip((field.y0 - p[:, 1]) / field.cell, 0, field.height.shape[0] - 1.001)
+
+            gap = np.where(on, p[:, 2] - map_coordinates(field.height.astype(float), [i, j], order=1), np.inf)
+            if code == SEEN:
+                assert gap.min() > -2e-5  # depth is stored as float32, and a point on the surface has gap 0
+            else:
+                # by more than the tolerance somewhere, unless between two steps of the march
+                checked += gap.min() < 1e-5
+    assert checked > 0.95 * min(150, (occluded == HIDDEN).sum())
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.03])
+def test_dem_agrees_with_what_the_renderer_hits(tiny, field, tilt):
+    rig, left = seq.true_rig(tiny), seq.body_poses(tiny)[0] @ seq.mount(tiny, "left")
+    level = rotation_exp([tilt, -tilt, 0.0]) @ level_rotation(left.rotation[2])
+    T_bed_world = left @ RigidTransform(level, np.zeros(3)).inverse()
+    _, _, _, depth = true_disparity(field, rig, left)
+    compared = 0
+    for r, c in [(60, 20), (70, 48), (50, 60), (75, 80), (45, 30)]:
+        point = T_bed_world.inverse().apply(left.apply(float(depth[r, c]) * rig.left.rays([c, r])))
+        lattice = {"x0": point[0], "y0": point[1], "cell": 0.001, "rows": 1, "cols": 1}
+        elevation, surface = true_dem(field, lattice, T_bed_world)
+        np.testing.assert_allclose(T_bed_world.inverse().apply(surface)[0, :2], point[:2], atol=1e-9)
+        # depth is float32; a rock's wall (slope up to 5) turns its error sideways into height
+        compared += abs(elevation[0, 0] - point[2]) < 1e-6
+        assert elevation[0, 0] > point[2] - 1e-6  # the first surface from above is never below a visible one
+    assert compared >= 4
+
+
+def test_dem_at_the_nodes_of_the_bed_is_the_height_itself(field):
+    lattice = {"x0": field.x0, "y0": field.y0, "cell": field.cell, "rows": 401, "cols": 451}
+    elevation, _ = true_dem(field, lattice, RigidTransform.identity())
+    np.testing.assert_allclose(elevation, field.height, atol=1e-7)
+    beyond, _ = true_dem(field, lattice | {"x0": 2.0}, RigidTransform.identity())
+    assert np.isnan(beyond).all()
+
+
+def test_seen_is_both_cameras_of_any_listed_pair(tiny, field):
+    rig = seq.true_rig(tiny)
+    lefts = [b @ seq.mount(tiny, "left") for b in seq.body_poses(tiny)]
+    lattice = {"x0": -0.3, "y0": 0.6, "cell": 0.01, "rows": 60, "cols": 60}
+    _, points = true_dem(field, lattice, RigidTransform.identity())
+    each = [seen_by(field, rig, [pose], points) for pose in lefts]
+    assert not seen_by(field, rig, [], points).any()
+    np.testing.assert_array_equal(seen_by(field, rig, lefts, points), np.any(each, axis=0))
+    assert 0.1 < each[0].mean() < 0.95
+    # what is seen projects into both images
+    for camera, pose in ((rig.left, lefts[0]), (rig.right, lefts[0] @ rig.T_right_left.inverse())):
+        pixels = camera.project(pose.inverse().apply(points[each[0]]))
+        assert (pixels >= 0).all()
+        assert (pixels <= [camera.width - 1, camera.height - 1]).all()
+
+
+# -- pictures ----------------------------------------------------------------------------------------------------------
+
+
+def test_right_picture_is_the_left_one_displaced_by_the_disparity(materialise):
+
+    # near enough, and sharp enough, for the pixel to be finer than the bed's cell
+    p = MockupParams(frames=1, bed_width=0.6, bed_length=0.6, image_width=160, image_height=140, focal_length=170.0)
+    s = seq.mockup(p)
+    left = materialise(s.image(0, "left"))["image"].astype(float)
+    right = materialise(s.image(0, "right"))["image"].astype(float)
+    truth = materialise(s.truth_disparity(0))
+    rows, cols = np.nonzero(truth["occluded"] == SEEN)
+    at = [rows + truth["row_disparity"][rows, cols], cols + truth["column_disparity"][rows, cols]]
+    there = map_coordinates(right, at, order=1)
+    assert np.corrcoef(left[rows, cols], there)[0, 1] > 0.9
+    off = map_coordinates(right, [at[0], at[1] + 3.0], order=1)
+    assert np.corrcoef(left[rows, cols], off)[0, 1] < 0.7
+
+
+def test_mask_is_the_bed(tiny, materialise):
+    s = seq.mockup(tiny)
+    bundle = materialise(s.image(0, "left"))
+    bed = materialise(s.truth_disparity(0))["occluded"] != NO_BED
+    valid = bundle["valid"] == 1
+    assert not (valid & ~bed).any()
+    # the mask keeps one pixel away from the edge
+
+    assert (binary_erosion(bed, np.ones((5, 5)), border_value=1) <= valid).all()
+    image = bundle["image"]
+    background = ~binary_erosion(bed, np.ones((3, 3)), border_value=1) & ~bed
+    assert np.median(image[background]) < 20
+    assert 70 < image[valid].mean() < 130
+
+
+def test_bits_depend_on_seed_frame_and_camera_alone(tiny):
+    from tests.datasets.conftest import Materialiser
+
+    first, second = Materialiser(), Materialiser()
+    s = seq.mockup(tiny)
+    images = {k: first(s.image(*k))["image"] for k in [(0, "left"), (0, "right"), (1, "left")]}
+    for k in [(1, "left"), (0, "right"), (0, "left")]:  # another order, another process's cache
+        np.testing.assert_array_equal(second(s.image(*k))["image"], images[k])
+    other = seq.mockup(tiny.model_copy(update={"seed": 2}))
+    assert (second(other.image(0, "left"))["image"] != images[(0, "left")]).mean() > 0.5
+    still = seq.mockup(tiny.model_copy(update={"forward": 0.0, "sideways": 0.0}))
+    noise = second(still.image(0, "left"))["image"].astype(float) - second(still.image(1, "left"))["image"]
+    assert 0.8 * math.sqrt(2) * 1.5 < noise.std() < 1.2 * math.sqrt(2) * 1.5
+
+
+def test_noise_does_not_make_another_bed(tiny):
+    quiet, loud = seq.mockup(tiny), seq.mockup(tiny.model_copy(update={"noise": 5.0, "exposure": 0.5}))
+    assert quiet.image(0, "left").inputs["scene"] == loud.image(0, "left").inputs["scene"]
+    assert quiet.image(0, "left").params != loud.image(0, "left").params
+
+
+# -- light and terrain -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("azimuth", [-90.0, 0.0, 90.0, 180.0, -60.0])
+def test_shadow_is_as_long_as_the_sun_is_low_and_falls_away_from_it(azimuth):
+    p = SceneParams(sun_elevation_deg=20.0, sun_azimuth_deg=azimuth, sun_diameter_deg=0.5)
+    height = np.zeros((301, 301), np.float32)
+    height[145:156, 145:156] = 0.03
+    lit = terrain.sunlit(height, p)
+    a = math.radians(azimuth)
+    away = np.array([math.cos(a), -math.sin(a)])  # rows, cols: rows grow towards the viewer
+    length = 30.0 / math.tan(math.radians(20.0))  # cells, from the top's edge
+    # half of the block's width along the ray, as a ray through its middle leaves it
+    half = 5.5 / max(abs(away))
+    samples = np.arange(0.0, 140.0)
+    r, c = np.rint(150 + samples * away[0]).astype(int), np.rint(150 + samples * away[1]).astype(int)
+    dark = lit[r, c] < 128
+    end = samples[np.flatnonzero(dark).max()]
+    assert abs(end - (half + length)) < 3.0
+    assert (lit[np.rint(150 - samples * away[0]).astype(int), np.rint(150 - samples * away[1]).astype(int)] > 250).all()
+
+
+def test_soft_edges_widen_with_the_distance():
+    p = SceneParams(sun_azimuth_deg=-90.0, sun_diameter_deg=2.0)
+    widths = []
+    for top in (0.01, 0.04):
+        height = np.zeros((5, 301), np.float32)
+        height[:, :20] = top
+        row = terrain.sunlit(height, p)[2].astype(int)
+        widths.append(int(((row > 20) & (row < 235)).sum()))
+    assert widths[1] > 2 * widths[0] > 0
+
+
+def test_rocks_and_craters_change_only_their_own_part():
+    bare = SceneParams(bed_width=0.3, bed_length=0.3, rocks=0.0, craters=0.0)
+    stony = bare.model_copy(update={"rocks": 30.0})
+    a, b = build_scene(bare), build_scene(stony)
+    rise = b["height"] - a["height"]
+    assert rise.min() > -1e-6
+    assert 0.0 < (rise > 1e-4).mean() < 0.5
+    assert rise.max() < 0.04 * 1.2
+    np.testing.assert_array_equal(a["albedo_0"], b["albedo_0"])
+
+
+def test_bed_challenges_the_rover():
+    from stages.risk import risk_map
+
+    for kind in ({}, {"seed": 7}):
+        p = SceneParams(bed_width=1.0, bed_length=1.0, **kind)
+        height = build_scene(p)["height"]
+        risk = risk_map(height, np.zeros_like(height), p.cell, seq.mockup(MockupParams(frames=1)).vehicle)["risk"]
+        assert 0.05 < (risk == 1).mean() < 0.40

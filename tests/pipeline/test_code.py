@@ -1,0 +1,113 @@
+"""Digest of the code behind a module: what can change a result changes it, what cannot does not."""
+
+from __future__ import annotations
+
+import sys
+
+import pytest
+
+from pipeline import code
+from stages.errors import RilleError
+
+FILES = {
+    "__init__.py": '"""Package."""\n',
+    "main.py": '"""Main."""\nimport numpy\nfrom own_toy.near import half\n'
+    'def run(x):\n    """Run."""\n    return half(x)\n',
+    "near.py": "def half(x):\n    from .deep import inner\n    return inner.third(x) / 2\n",
+    "deep/__init__.py": "",
+    "deep/inner.py": "from ..sibling import LIMIT\ndef third(x):\n    return min(x / 3, LIMIT)\n",
+    "sibling.py": "LIMIT = 5\n",
+    "typed.py": "X = 1\n",
+    "stranger.py": "Y = 1\n",
+}
+
+
+@pytest.fixture
+def package(tmp_path, monkeypatch):
+    """Gives ``change(file, old, new)``, which edits and returns the digest as a new process would see it."""
+    root = tmp_path / "own_toy"
+    for name, text in FILES.items():
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_text(text)
+    monkeypatch.syspath_prepend(tmp_path)
+
+    def change(name="main.py", old="", new=""):
+        text = (root / name).read_text()
+        assert old in text
+        (root / name).write_text(text.replace(old, new) if old else text + new)
+        for cached in (code._read, code._file, code._roots, code._reachable):
+            cached.cache_clear()
+        return code.code_digest("own_toy.main")
+
+    yield change
+    for cached in (code._read, code._file, code._roots, code._reachable):
+        cached.cache_clear()
+    assert not any(name.startswith("own_toy.") for name in sys.modules), "digesting must not import"
+
+
+def test_reaches_helpers_at_any_depth_and_no_strangers(package):
+    package()
+    assert set(code.module_digests("own_toy.main")) == {
+        "own_toy", "own_toy.main", "own_toy.near", "own_toy.deep", "own_toy.deep.inner", "own_toy.sibling",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new"),
+    [
+        ("main.py", "", "\n# a comment\n"),
+        ("main.py", '"""Run."""', '"""Runs it, with other words."""'),
+        ("main.py", '    """Run."""\n', ""),
+        ("main.py", "return half(x)", "return (  half( x ) )"),
+        ("__init__.py", '"""Package."""', '"""Other."""'),
+        ("sibling.py", "5", "5  # metres"),
+        ("stranger.py", "1", "2"),
+        ("main.py", "", "\nfrom typing import TYPE_CHECKING\n"),
+    ],
+)
+def test_what_cannot_change_a_result(package, name, old, new):
+    before = package()
+    after = package(name, old, new)
+    assert (after == before) == ("TYPE_CHECKING" not in new), "an import that runs counts, all else does not"
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new"),
+    [
+        ("main.py", "half(x)", "half(x + 0)"),
+        ("near.py", "/ 2", "/ 2.0"),
+        ("deep/inner.py", "x / 3", "x / 4"),
+        ("sibling.py", "5", "6"),
+        ("deep/__init__.py", "", "SWITCH = 1\n"),
+        ("main.py", "", "\nimport own_toy.stranger\n"),
+    ],
+)
+def test_what_can_change_a_result(package, name, old, new):
+    before = package()
+    assert package(name, old, new) != before
+    if old:
+        assert package(name, new, old) == before
+
+
+def test_imports_for_type_checkers_do_not_count(package):
+    before = package("main.py", "import numpy\n", "from typing import TYPE_CHECKING\nimport numpy\n")
+    assert package("main.py", "import numpy\n", "import numpy\nif TYPE_CHECKING:\n    import own_toy.typed\n") == before
+
+
+def test_a_running_process_keeps_what_it_read(package, tmp_path):
+    before = package()
+    (tmp_path / "own_toy" / "sibling.py").write_text("LIMIT = 7\n")
+    assert code.code_digest("own_toy.main") == before
+
+
+def test_every_stage_reaches_the_declarations():
+    assert {"stages", "stages.declare", "stages.select", "stages.errors"} <= set(code.module_digests("stages.select"))
+    assert not any(name.startswith("pipeline") for name in code.module_digests("stages.select"))
+
+
+def test_unknown_module_and_missing_distribution_are_named():
+    with pytest.raises(ModuleNotFoundError, match=r"stages\.nowhere"):
+        code.code_digest("stages.nowhere")
+    with pytest.raises(RilleError, match="no-such-distribution"):
+        code.environment(["no-such-distribution"])
+    assert code.environment(["zarr", "numpy"]) == {"numpy": code.version("numpy"), "zarr": code.version("zarr")}

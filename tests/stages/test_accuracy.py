@@ -1,0 +1,197 @@
+"""Trajectory accuracy: evo as the oracle, KITTI's development kit written out, and cases by hand."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+from evo.core import metrics as evo_metrics
+from evo.core.metrics import PoseRelation, StatisticsType
+from evo.core.trajectory import PosePath3D
+from scipy.spatial.transform import Rotation
+
+from stages import truth
+from stages.accuracy import STAGE, by_frame, trajectory_accuracy
+from stages.declare import Bundle, NoParams, check_outputs
+from stages.errors import InputError
+from stages.geometry import rotation_exp
+
+
+def walk(seed: int, n: int, step: float = 1.0, turn: float = 0.02) -> np.ndarray:
+    """A drive with gentle turns, optical axes (z forward)."""
+    rng = np.random.default_rng(seed)
+    pose, poses = np.eye(4), []
+    for _ in range(n):
+        poses.append(pose[:3].copy())
+        motion = np.eye(4)
+        motion[:3, :3] = rotation_exp(rng.normal(scale=turn, size=3))
+        motion[:3, 3] = [*rng.normal(scale=0.02 * step, size=2), step]
+        pose = pose @ motion
+    return np.array(poses)
+
+
+def disturbed(poses: np.ndarray, seed: int, shift: float = 0.02, turn: float = 0.003) -> np.ndarray:
+    """Another frame of reference, and an error that accumulates."""
+    rng = np.random.default_rng(seed)
+    drift = np.eye(4)
+    drift[:3, :3] = rotation_exp([0.3, -0.2, 0.5])
+    drift[:3, 3] = [3.0, -2.0, 0.7]
+    out = []
+    for pose in poses:
+        error = np.eye(4)
+        error[:3, :3], error[:3, 3] = rotation_exp(rng.normal(scale=turn, size=3)), rng.normal(scale=shift, size=3)
+        drift = drift @ error
+        full = np.vstack([pose, [0, 0, 0, 1]])
+        out.append((drift @ full)[:3])
+    return np.array(out)
+
+
+def evo_path(poses: np.ndarray) -> PosePath3D:
+    return PosePath3D(poses_se3=[np.vstack([p, [0, 0, 0, 1]]) for p in poses])
+
+
+def evo_value(metric: object, reference: PosePath3D, estimate: PosePath3D, kind: StatisticsType) -> float:
+    metric.process_data((reference, estimate))  # type: ignore[attr-defined]
+    return float(metric.get_statistic(kind))  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_ate_and_rpe_equal_evo(seed: int) -> None:
+    true = walk(seed, 60)
+    estimate = disturbed(true, seed)
+    _, ours = trajectory_accuracy(estimate, true)
+    reference, aligned, first = evo_path(true), evo_path(estimate), evo_path(estimate)
+    aligned.align(reference)
+    first.align_origin(reference)
+    ape = evo_metrics.APE(PoseRelation.translation_part)
+    shift, turn = (
+        evo_metrics.RPE(kind, delta=1, delta_unit=evo_metrics.Unit.frames)
+        for kind in (PoseRelation.translation_part, PoseRelation.rotation_angle_deg)
+    )
+    rmse, largest, median = StatisticsType.rmse, StatisticsType.max, StatisticsType.median
+    expected = {
+        "ate_rmse": evo_value(ape, reference, aligned, rmse),
+        "ate_first_frame_rmse": evo_value(ape, reference, first, rmse),
+        "ate_first_frame_max": evo_value(ape, reference, first, largest),
+        "rpe_translation_rmse": evo_value(shift, reference, evo_path(estimate), rmse),
+        "rpe_translation_median": evo_value(shift, reference, evo_path(estimate), median),
+        "rpe_translation_max": evo_value(shift, reference, evo_path(estimate), largest),
+        "rpe_rotation_rmse": evo_value(turn, reference, evo_path(estimate), rmse),
+        "path_length": reference.path_length,
+    }
+    assert {name: ours[name]["value"] for name in expected} == pytest.approx(expected, rel=1e-9, abs=1e-9)
+    end = np.linalg.norm(first.positions_xyz[-1] - reference.positions_xyz[-1])
+    assert ours["final_error"]["value"] == pytest.approx(end, abs=1e-9)
+    assert ours["drift"]["value"] == pytest.approx(100 * end / reference.path_length, abs=1e-9)
+
+
+def devkit(true: list[np.ndarray], estimate: list[np.ndarray]) -> tuple[float, float]:
+    """KITTI's ``evaluate_odometry.cpp``, line by line: mean translation (1) and rotation (rad/m) error."""
+    dist = [0.0]
+    for a, b in itertools.pairwise(true):
+        dist.append(dist[-1] + float(np.linalg.norm(b[:3, 3] - a[:3, 3])))
+    shifts, turns = [], []
+    for first in range(0, len(true), 10):
+        for length in (100, 200, 300, 400, 500, 600, 700, 800):
+            last = next((i for i in range(first, len(dist)) if dist[i] > dist[first] + length), -1)
+            if last == -1:
+                continue
+            delta_true = np.linalg.inv(true[first]) @ true[last]
+            delta = np.linalg.inv(estimate[first]) @ estimate[last]
+            error = np.linalg.inv(delta) @ delta_true
+            turns.append(math.acos(max(min(0.5 * (np.trace(error[:3, :3]) - 1), 1.0), -1.0)) / length)
+            shifts.append(np.linalg.norm(error[:3, 3]) / length)
+    return float(np.mean(shifts)), float(np.mean(turns))
+
+
+def test_kitti_equals_the_development_kit() -> None:
+    true = walk(4, 260)
+    estimate = disturbed(true, 4)
+    _, ours = trajectory_accuracy(estimate, true)
+    shift, turn = devkit(*([np.vstack([p, [0, 0, 0, 1]]) for p in poses] for poses in (true, estimate)))
+    assert ours["kitti_translation"]["value"] == pytest.approx(100 * shift, rel=1e-9)
+    # acos near 1 loses half the digits: 1e-16 / angle, of angles near 0.05
+    assert ours["kitti_rotation"]["value"] == pytest.approx(math.degrees(100 * turn), rel=1e-9)
+
+
+def test_kitti_is_not_applicable_to_a_short_path() -> None:
+    true = walk(0, 50)
+    _, ours = trajectory_accuracy(true, true)
+    assert ours["kitti_translation"]["value"] is None
+    assert "not applicable" in ours["kitti_translation"]["how"]
+    assert "49.0 m" in ours["kitti_translation"]["how"]
+    straight = np.tile(np.eye(3, 4), (102, 1, 1))
+    straight[:, 2, 3] = np.arange(102)
+    # the development kit takes the first frame beyond 100 m, not the one at it
+    assert trajectory_accuracy(straight[:101], straight[:101])[1]["kitti_translation"]["value"] is None
+    assert trajectory_accuracy(straight, straight)[1]["kitti_translation"]["value"] == 0.0
+
+
+def test_two_frames_by_hand() -> None:
+    """One step of 3 m along y in truth, of (0, 3.3, 0.4) m in the estimate: error 0.5 m, drift 16.7 %."""
+    true = np.stack([np.eye(3, 4), np.eye(3, 4)])
+    true[1, :, 3] = [0.0, 3.0, 0.0]
+    estimate = true.copy()
+    estimate[1, :, 3] = [0.0, 3.3, 0.4]
+    arrays, ours = trajectory_accuracy(estimate, true)
+    value = {name: m["value"] for name, m in ours.items()}
+    assert value["final_error"] == pytest.approx(0.5)
+    assert value["drift"] == pytest.approx(100 / 6)
+    assert value["rpe_translation_rmse"] == pytest.approx(0.5)
+    assert value["displacement_x_rmse"] == 0.0
+    assert value["displacement_y_rmse"] == pytest.approx(0.3)
+    assert value["displacement_z_rmse"] == pytest.approx(0.4)
+    # the best alignment turns one line onto the other: half the difference in length at each end
+    assert value["ate_rmse"] == pytest.approx((math.hypot(3.3, 0.4) - 3.0) / 2)
+    np.testing.assert_allclose(arrays["displacement_truth"], [[0.0, 3.0, 0.0]], atol=1e-12)
+
+
+def test_truth_in_another_frame_of_reference_changes_nothing() -> None:
+    true = walk(7, 30)
+    estimate = disturbed(true, 8)
+    turn = Rotation.from_rotvec([0.4, 1.0, -2.0]).as_matrix()
+    moved = turn @ true
+    moved[:, :, 3] += [10.0, -20.0, 5.0]
+    a, b = trajectory_accuracy(estimate, true), trajectory_accuracy(estimate, moved)
+    np.testing.assert_allclose(a[0]["displacement_truth"], b[0]["displacement_truth"], atol=1e-12)
+    for name in a[1]:
+        assert a[1][name]["value"] == pytest.approx(b[1][name]["value"], abs=1e-9)
+
+
+def test_missing_frames_are_counted_and_bridged() -> None:
+    true = walk(1, 20)
+    estimate = true.copy()
+    estimate[[0, 7, 19]] = np.nan
+    arrays, ours = trajectory_accuracy(estimate, true)
+    assert ours["frames_missing"]["value"] == 3
+    assert ours["path_length"]["value"] == pytest.approx(
+        np.linalg.norm(np.diff(true[1:19, :, 3], axis=0), axis=1).sum()
+    )
+    assert ours["drift"]["value"] == pytest.approx(0.0, abs=1e-9)
+    assert "15 pairs" in ours["rpe_translation_rmse"]["how"]
+    assert np.isnan(arrays["displacement"][[0, 6, 7, 18]]).all()
+    with pytest.raises(InputError, match="no frame has a pose"):
+        trajectory_accuracy(np.full_like(true, np.nan), true)
+    with pytest.raises(InputError, match="do not match"):
+        trajectory_accuracy(true[1:], true)
+
+
+def test_a_camera_at_rest_has_no_drift_figure() -> None:
+    true = np.tile(np.eye(3, 4), (4, 1, 1))
+    _, ours = trajectory_accuracy(true, true)
+    assert ours["drift"]["value"] is None
+    assert "did not move" in ours["drift"]["how"]
+
+
+def test_the_stage_matches_frames_by_number() -> None:
+    true = walk(3, 6)
+    source = truth.STAGE.run(NoParams(), {"poses": true.reshape(6, 12).tolist(), "frames": [4, 5, 6, 7, 8, 9]}, {})
+    check_outputs(truth.STAGE, source)
+    trajectory = Bundle({"poses": true[[0, 1, 2, 4]]}, {"frames": [4, 5, 6, 8]})
+    out = STAGE.run(NoParams(), {}, {"trajectory": trajectory, "truth": source})
+    check_outputs(STAGE, out)
+    assert out.meta["metrics"]["frames_missing"]["value"] == 2
+    assert out.meta["metrics"]["ate_rmse"]["value"] == pytest.approx(0.0, abs=1e-9)
+    assert np.isnan(by_frame(true, [0, 1, 2, 3, 4, 5], [5, 6])[1]).all()

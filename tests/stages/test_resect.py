@@ -1,0 +1,267 @@
+"""Resection: Eq. 4, 5, 7, 8; Jacobian; exact, noisy and contaminated data; covariance; degenerate cases by name."""
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+from scipy.stats import chi2
+
+from stages.errors import DegenerateError
+from stages.geometry import Camera, RigidTransform, angles_from_rotation, rotation_exp, rotation_from_angles
+from stages.landmarks import Landmarks
+from stages.reprojection import (
+    Observations,
+    Poses,
+    back_projection,
+    derivatives,
+    exponential,
+    levenberg_marquardt,
+)
+from stages.resect import ResectParams, resect, resect_segment
+
+CAMERA = Camera(600.0, 610.0, 300.0, 250.0, 600, 500)
+PARAMS = ResectParams()
+
+
+def scene(rng, n=60, near=4.0, far=12.0):
+    """Landmarks in the field of view of a pose near the identity (camera frame = local frame)."""
+    pixels = rng.uniform([20, 20], [580, 480], (n, 2))
+    return CAMERA.rays(pixels) * rng.uniform(near, far, (n, 1))
+
+
+def true_pose(rng):
+    return RigidTransform(rotation_exp(rng.normal(0, 0.05, 3)), rng.normal(0, 0.3, 3))
+
+
+def seen(T_local_left, landmarks):
+    return CAMERA.project(T_local_left.inverse().apply(landmarks))
+
+
+def solve(landmarks, pixels, *, sigmas=None, params=PARAMS, start=None, seed=0):
+    sigmas = np.zeros_like(landmarks) if sigmas is None else sigmas
+    start = RigidTransform.identity() if start is None else start
+    return resect(landmarks, sigmas, pixels, CAMERA, start, params, np.random.default_rng(seed), where="frame 7")
+
+
+def test_projection_is_eq_4_with_t_the_translation_and_the_position_minus_rt_t():
+    omega, phi, kappa = 0.1, -0.2, 0.3
+    R, t = rotation_from_angles(omega, phi, kappa), np.array([0.1, -0.2, 0.5])
+    T = CAMERA.matrix @ np.column_stack([R, t])  # Eq. 4
+    X = np.array([[0.3, 0.4, 6.0], [-1.0, 0.5, 5.0]])
+    h = np.column_stack([X, np.ones(2)]) @ T.T
+    by_eq_7_and_8 = h[:, :2] / h[:, 2:]
+    obs = Observations(X[None], np.zeros((1, 2, 3)), np.zeros((1, 2, 2)), CAMERA, 1.0)
+    np.testing.assert_allclose(back_projection(obs, Poses(R[None], t[None])).pixels[0], by_eq_7_and_8, rtol=1e-12)
+    rng = np.random.default_rng(0)
+    landmarks = scene(rng)
+    h = np.column_stack([landmarks, np.ones(len(landmarks))]) @ T.T
+    found = solve(landmarks, h[:, :2] / h[:, 2:])
+    np.testing.assert_allclose(found.T_local_left.translation, -R.T @ t, atol=1e-9)
+    np.testing.assert_allclose(angles_from_rotation(found.T_local_left.rotation.T), (omega, phi, kappa), atol=1e-9)
+
+
+def test_jacobian_against_central_differences():
+    rng = np.random.default_rng(1)
+    landmarks = scene(rng, 5)
+    sigmas = 0.02 * landmarks * rng.uniform(0.5, 2.0, (5, 1))
+    T = true_pose(rng).inverse()
+    poses = Poses(T.rotation[None], T.translation[None])
+    obs = Observations(landmarks[None], sigmas[None], rng.uniform(0, 500, (1, 5, 2)), CAMERA, 0.3)
+    errors = back_projection(obs, poses)
+    analytic = derivatives(errors, 0.3)[0]
+    h = 1e-6
+    for k in range(6):
+        xi = np.zeros((1, 6))
+        xi[0, k] = h
+        ends = []
+        for s in (1, -1):
+            turn = exponential(s * xi[:, 3:])
+            moved = Poses(turn @ poses.R, np.einsum("bij,bj->bi", turn, poses.t) + s * xi[:, :3])
+            ends.append(back_projection(obs, moved).pixels)
+        numeric = (ends[0] - ends[1]) / (2 * h)
+        # The whitening is held fixed within a step, as in iteratively reweighted least squares.
+        S = 0.3**2 * np.eye(2) + errors.along[0, :, :, None] * errors.along[0, :, None, :]
+        for i in range(5):
+            values, vectors = np.linalg.eigh(S[i])
+            root = vectors / np.sqrt(values) @ vectors.T
+            np.testing.assert_allclose(analytic[i, :, k], root @ numeric[0, i], rtol=1e-5, atol=1e-4)
+
+
+def test_exact_data_give_the_exact_pose():
+    rng = np.random.default_rng(2)
+    for _ in range(5):
+        T, landmarks = true_pose(rng), scene(rng)
+        found = solve(landmarks, seen(T, landmarks))
+        np.testing.assert_allclose(found.T_local_left.matrix34, T.matrix34, atol=1e-9)
+        assert found.inlier.all()
+        assert found.residual.max() < 1e-6
+
+
+def test_large_motion_needs_no_good_start():
+    rng = np.random.default_rng(3)
+    T = RigidTransform(rotation_exp(np.array([0.1, 0.5, -0.2])), np.array([1.0, -0.5, 1.5]))
+    landmarks = T.apply(scene(rng))
+    pixels = seen(T, landmarks)
+    pixels[:18] = rng.uniform([0, 0], [600, 500], (18, 2))
+    found = solve(landmarks, pixels)
+    np.testing.assert_allclose(found.T_local_left.matrix34, T.matrix34, atol=1e-8)
+
+
+def test_thirty_percent_outliers_are_removed_and_no_more():
+    rng = np.random.default_rng(4)
+    T, landmarks = true_pose(rng), scene(rng, 200)
+    pixels = seen(T, landmarks) + 0.2 * rng.standard_normal((200, 2))
+    wrong = rng.permutation(200)[:60]
+    pixels[wrong] += rng.choice([-1, 1], (60, 2)) * rng.uniform(3, 40, (60, 2))
+    found = solve(landmarks, pixels)
+    good = np.ones(200, bool)
+    good[wrong] = False
+    np.testing.assert_array_equal(found.inlier, good)  # threshold: 5 sigma
+    error = found.T_local_left.translation - T.translation
+    assert error @ np.linalg.solve(found.covariance[:3, :3], error) < chi2.ppf(0.999, 3)
+
+
+def test_same_minimum_as_scipy():
+    rng = np.random.default_rng(5)
+    T, landmarks = true_pose(rng), scene(rng, 40)
+    pixels = seen(T, landmarks) + 0.2 * rng.standard_normal((40, 2))
+    # Threshold and Huber bound far away: plain least squares of Eq. 6 in both.
+    found = solve(landmarks, pixels, params=ResectParams(pixel_sigma=5.0, threshold=50.0))
+
+    def errors(x):
+        T_cam_local = RigidTransform(rotation_from_angles(*x[:3]), x[3:])
+        return (CAMERA.project(T_cam_local.apply(landmarks)) - pixels).ravel()
+
+    best = least_squares(errors, np.zeros(6), xtol=1e-14, ftol=1e-14, gtol=1e-14)
+    expected = RigidTransform(rotation_from_angles(*best.x[:3]), best.x[3:]).inverse()
+    np.testing.assert_allclose(found.T_local_left.matrix34, expected.matrix34, atol=1e-7)
+    factor = 2 * best.cost / (2 * 40 - 6)
+    J = best.jac
+    # The angles and (v, w) parametrise the same pose: the position's covariance is the same.
+    numeric = np.zeros((3, 6))
+    for k in range(6):
+        h = np.zeros(6)
+        h[k] = 1e-6
+        ends = [
+            RigidTransform(rotation_from_angles(*(best.x + s * h)[:3]), (best.x + s * h)[3:]).inverse().translation
+            for s in (1, -1)
+        ]
+        numeric[:, k] = (ends[0] - ends[1]) / 2e-6
+    np.testing.assert_allclose(
+        found.covariance[:3, :3], numeric @ np.linalg.inv(J.T @ J) @ numeric.T * factor, rtol=1e-3, atol=1e-12
+    )
+
+
+def test_covariance_is_calibrated():
+    """Normalised squared error of 200 noisy resections: chi-square of 6 degrees of freedom each."""
+    rng = np.random.default_rng(6)
+    pixel_sigma, trials, total = 0.3, 200, 0.0
+    params = ResectParams(pixel_sigma=pixel_sigma, threshold=2.0, hypotheses=20)
+    for trial in range(trials):
+        T, landmarks = true_pose(rng), scene(rng, 50)
+        sigmas = 0.01 * landmarks * np.linalg.norm(landmarks, axis=1, keepdims=True) / 6.0  # grows with the square
+        pixels = seen(T, landmarks) + pixel_sigma * rng.standard_normal((50, 2))
+        wrong = landmarks + sigmas * rng.standard_normal((50, 1))
+        found = solve(wrong, pixels, sigmas=sigmas, params=params, seed=trial)
+        turn = T.rotation @ found.T_local_left.rotation.T
+        w = 0.5 * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
+        x = np.concatenate([T.translation - found.T_local_left.translation, w])
+        total += float(x @ np.linalg.solve(found.covariance, x))
+    # Huber's weights cost 2 % and the variance factor is itself estimated (94 degrees of freedom: +2 %).
+    low, high = chi2.ppf([0.001, 0.999], 6 * trials)
+    assert low < total / 1.04 < high * 1.04
+
+
+def test_uncertain_landmarks_count_less():
+    rng = np.random.default_rng(7)
+    T, landmarks = RigidTransform(np.eye(3), np.array([0.0, 0.0, 1.0])), scene(rng, 100)
+    sigmas = landmarks * np.where(np.arange(100)[:, None] < 50, 0.05, 0.001)
+    noisy = landmarks + sigmas * rng.standard_normal((100, 1))
+    pixels = seen(T, landmarks)
+    weighted = solve(noisy, pixels, sigmas=sigmas)
+    plain = solve(noisy, pixels, params=ResectParams(threshold=100.0))
+    assert np.linalg.norm(weighted.T_local_left.translation - T.translation) < 0.2 * np.linalg.norm(
+        plain.T_local_left.translation - T.translation
+    )
+
+
+def test_same_seed_same_bits():
+    rng = np.random.default_rng(8)
+    T, landmarks = true_pose(rng), scene(rng)
+    pixels = seen(T, landmarks) + 0.3 * rng.standard_normal((60, 2))
+    a, b = solve(landmarks, pixels), solve(landmarks, pixels)
+    assert a.T_local_left.to_list() == b.T_local_left.to_list()
+    np.testing.assert_array_equal(a.covariance, b.covariance)
+
+
+def test_too_few_landmarks_are_named_with_frame_and_remedy():
+    rng = np.random.default_rng(9)
+    landmarks = scene(rng, 5)
+    with pytest.raises(DegenerateError, match=r"frame 7: too few landmarks: 5 .*track\.points"):
+        solve(landmarks, seen(RigidTransform.identity(), landmarks))
+
+
+def test_no_common_pose_is_named():
+    rng = np.random.default_rng(10)
+    landmarks = scene(rng, 12)
+    with pytest.raises(DegenerateError, match=r"frame 7: too few landmarks: \d+ agree with one pose"):
+        solve(landmarks, rng.uniform([0, 0], [600, 500], (12, 2)))
+
+
+def test_collinear_landmarks_are_named():
+    landmarks = np.linspace([-2.0, -1.0, 5.0], [2.0, 1.5, 9.0], 30)
+    with pytest.raises(DegenerateError, match="frame 7.*collinear"):
+        solve(landmarks, seen(RigidTransform.identity(), landmarks))
+
+
+def test_landmarks_too_far_for_a_position_are_named():
+    rng = np.random.default_rng(11)
+    landmarks = CAMERA.rays(rng.uniform([298, 248], [302, 252], (40, 2))) * rng.uniform(1000, 1002, (40, 1))
+    pixels = seen(RigidTransform.identity(), landmarks) + 0.2 * rng.standard_normal((40, 2))
+    with pytest.raises(DegenerateError, match="frame 7.*uncertain by"):
+        solve(landmarks, pixels)
+
+
+def test_a_landmark_behind_the_camera_is_no_inlier():
+    rng = np.random.default_rng(12)
+    landmarks = scene(rng, 40)
+    pixels = seen(RigidTransform.identity(), landmarks)
+    landmarks[0] = -landmarks[0]
+    found = solve(landmarks, pixels)
+    assert not found.inlier[0]
+    assert found.inlier[1:].all()
+    assert np.isnan(found.residual[0])
+
+
+def test_segment_keeps_the_key_pose_and_poses_each_frame():
+    rng = np.random.default_rng(13)
+    key = RigidTransform(rotation_exp(np.array([-1.8, 0.1, 0.0])), np.zeros(3))
+    steps = [
+        RigidTransform(rotation_exp(np.array([0, 0.02 * i, 0])), np.array([0.02 * i, 0, 0.3 * i])) for i in range(4)
+    ]
+    truth = [key @ s for s in steps]
+    landmarks = key.apply(scene(rng, 80))
+    points = np.stack([seen(T, landmarks) for T in truth], 1).astype(np.float32)
+    points[:30, 2] = np.nan  # lost
+    position = landmarks.copy()
+    position[75:] = np.nan  # without coordinates
+    found = resect_segment(points, Landmarks(position, np.zeros_like(position), {}), CAMERA, key, [4, 5, 6, 7], PARAMS)
+    np.testing.assert_array_equal(found.poses[0], key.matrix34)
+    np.testing.assert_allclose(found.poses, [T.matrix34 for T in truth], atol=1e-5)  # float32 pixels: 3e-5 px
+    assert not found.covariance[0].any()
+    assert found.inlier.sum(0).tolist() == [75, 75, 45, 75]
+    assert [f["landmarks"] for f in found.facts] == [75, 75, 45, 75]
+    points[:, 3] = np.nan
+    with pytest.raises(DegenerateError, match=r"frame 7: too few landmarks: 0 .*3 too far"):
+        resect_segment(
+            points, Landmarks(position, np.zeros_like(position), {"too far": 3}), CAMERA, key, [4, 5, 6, 7], PARAMS
+        )
+
+
+def test_solver_stands_still_on_singular_data():
+    """One landmark seen many times: the damping keeps the step finite."""
+    obs = Observations(
+        np.tile([[[0.0, 0.0, 5.0]]], (1, 8, 1)), np.zeros((1, 8, 3)), np.full((1, 8, 2), 300.0), CAMERA, 1.0
+    )
+    poses, _ = levenberg_marquardt(obs, Poses(np.eye(3)[None], np.zeros((1, 3))), np.ones((1, 8), bool), 20)
+    assert np.isfinite(poses.t).all()
+    assert np.abs(poses.t).max() < 5.0
