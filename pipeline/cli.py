@@ -38,6 +38,13 @@ def cache_folder(given: Path | None) -> Path:
     return given or Path(os.environ.get("RILLE_CACHE") or ".rille/cache")
 
 
+def _prepare(cache: Path | None) -> None:
+    """Threads and the place of compiled kernels, before NumPy and numba are imported."""
+    from pipeline.environment import prepare_environment
+
+    prepare_environment(cache_folder(cache))
+
+
 @app.command
 def reconstruct(
     seq: str = "mockup",
@@ -86,6 +93,7 @@ def reconstruct(
     debug
         Show tracebacks.
     """
+    _prepare(cache)
     from pipeline import run
 
     options = run.Options(
@@ -137,6 +145,7 @@ def match(
     debug
         Show tracebacks.
     """
+    _prepare(None)
     from pipeline import match as command
 
     return command.match_files(left, right, output, preset=preset, dense=dense, assignments=tuple(assignments or ()))
@@ -176,6 +185,7 @@ def export(
     debug
         Show tracebacks.
     """
+    _prepare(cache)
     from pipeline import run
 
     return run.export_dataset(seq, directory, tuple(assignments or ()), cache_folder(cache))

@@ -93,10 +93,6 @@ def settings(options: Options) -> tuple[Sequence, Any, str]:
 
 def reconstruct(options: Options) -> int:
     """Run the whole chain; gives the exit code. Running the same options again resumes."""
-    from pipeline.executor import prepare_environment
-
-    prepare_environment(options.cache)  # before anything imports numba
-
     from pipeline import driver, progress
     from pipeline.dag import Graph
     from pipeline.reconstruct import Reconstruction
@@ -206,10 +202,6 @@ def _versions() -> dict[str, str]:
 
 def export_dataset(name: str, directory: Path, assignments: tuple[str, ...], cache: Path) -> int:
     """Write a built-in sequence as plain files; rendering is cached like any other work."""
-    from pipeline.executor import prepare_environment
-
-    prepare_environment(cache)
-
     from datasets.export import export
     from datasets.protocol import Source
     from datasets.registry import open_sequence

@@ -29,18 +29,25 @@ TEMPLATE = 5
 
 @dataclass(frozen=True)
 class Landmarks:
-    """``position`` (n, 3) in the local frame, m, NaN none; ``sigma`` (n, 3) one standard deviation along the ray, m.
+    """Coordinates and what they hang on.
 
+    ``position`` (n, 3) in the local frame, m, NaN none; ``per_pixel`` (n, 3) how it moves along its ray as the depth
+    grows by what one pixel of disparity is worth, m/pixel; ``sigma`` (n,) standard deviation of the disparity, pixels.
     ``lost`` says why the others have no coordinates: reason and count.
     """
 
     position: Floats
+    per_pixel: Floats
     sigma: Floats
     lost: dict[str, int]
 
     def summary(self) -> str:
         """The counts in words."""
         return ", ".join(f"{count} {reason}" for reason, count in self.lost.items() if count) or "none lost"
+
+    def take(self, which: NDArray[np.intp]) -> Landmarks:
+        """Some of them."""
+        return Landmarks(self.position[which], self.per_pixel[which], self.sigma[which], self.lost)
 
 
 def landmarks_from_disparity(
@@ -73,12 +80,16 @@ def landmarks_from_disparity(
     return _landmarks(rays, np.where(meets, depth, np.nan), rig, T_local_left, disparity_sigma, max_depth_ratio, lost)
 
 
+def _known(points: Floats) -> Bools:
+    return np.asarray(np.isfinite(points).all(axis=1))
+
+
 def _disparity_at(
     points: Floats, column: NDArray[np.float32], row: NDArray[np.float32], validity: NDArray[np.uint8]
 ) -> tuple[Floats, Bools]:
     """Disparity vectors (n, 2) by bilinear interpolation, and whether the four neighbours are matched and agree."""
     rows, cols = column.shape
-    known = np.isfinite(points).all(1)
+    known = _known(points)
     p = np.where(known[:, None], points, 0.0)
     inside = known & (p >= 0).all(1) & (p[:, 0] <= cols - 1) & (p[:, 1] <= rows - 1)
     x = np.clip(np.floor(p[:, 0]), 0, cols - 2).astype(np.intp)
@@ -108,7 +119,7 @@ def relief(
     then there are two surfaces, or where less than half of the template is matched.
     """
     rows, cols = column.shape
-    known = np.isfinite(points).all(1)
+    known = _known(points)
     centre = np.floor(np.where(known[:, None], points, 0.0) + 0.5).astype(np.intp)
     dy, dx = (o.ravel() for o in np.mgrid[-TEMPLATE : TEMPLATE + 1, -TEMPLATE : TEMPLATE + 1])
     y, x = centre[:, 1:] + dy, centre[:, :1] + dx
@@ -166,15 +177,16 @@ def _landmarks(
     found = np.isfinite(depth)
     _, slope = _right_image(rays, np.where(found, depth, 1.0), rig)
     with np.errstate(divide="ignore", invalid="ignore"):
-        spread = disparity_sigma / np.sqrt((slope**2).sum(-1))
+        per_pixel = 1.0 / np.sqrt((slope**2).sum(-1))
+        spread = disparity_sigma * per_pixel
     smooth = found & np.isfinite(disparity_sigma)
     near = np.zeros(len(depth), bool)
     near[smooth] = spread[smooth] <= max_depth_ratio * depth[smooth]
     position = T_local_left.apply(rays * np.where(near, depth, np.nan)[:, None])
-    sigma = np.where(near, spread, np.nan)[:, None] * (rays @ T_local_left.rotation.T)
+    along = np.where(near, per_pixel, np.nan)[:, None] * (rays @ T_local_left.rotation.T)
     border = {"on a depth edge or the border of what was matched": int((found & ~smooth).sum())}
     far = {"too far for the baseline": int((smooth & ~near).sum())}
-    return Landmarks(position, sigma, lost | border | far)
+    return Landmarks(position, along, np.where(near, disparity_sigma, np.nan), lost | border | far)
 
 
 def landmarks_from_dem(
@@ -191,7 +203,7 @@ def landmarks_from_dem(
 
     The uncertainty is that of the stereo pair which made the model: ``disparity_sigma`` (n,) pixels.
     """
-    known = np.isfinite(points).all(1)
+    known = _known(points)
     rays = rig.left.rays(np.where(known[:, None], points, 0.0))
     depth = intersect(elevation, lattice, T_local_left.translation, rays @ T_local_left.rotation.T)
     depth = np.where(known, depth, np.nan)

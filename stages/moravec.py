@@ -66,7 +66,7 @@ def interest_points(
     *,
     noise: float,
     border: int,
-    occupied: NDArray[np.float32] | None = None,
+    occupied: NDArray[np.floating] | None = None,
 ) -> NDArray[np.float32]:
     """At most ``count`` interest points, the strongest of each bucket first.
 

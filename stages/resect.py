@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from stages.declare import Array, Bundle, Inputs, Params, Stage
+from stages.declare import AnyArray, Array, Bundle, Inputs, Params, Stage
 from stages.errors import DegenerateError, InputError
 from stages.geometry import Camera, Rig, RigidTransform
 from stages.landmarks import Landmarks, landmarks_from_dem, landmarks_from_disparity, relief
@@ -40,6 +40,7 @@ Bools = NDArray[np.bool_]
 
 MINIMUM = 6
 """Fewest landmarks of a pose: twelve equations for six unknowns, so that one wrong landmark shows."""
+FEW = "set track.points higher or choose basic pairs closer"
 SAMPLE = 4
 """Landmarks of one hypothesis: the fewest that fix a pose uniquely."""
 
@@ -56,6 +57,9 @@ class ResectParams(Params):
     )
     disparity_sigma: float = Field(
         0.2, ge=0, description="pixels; expected error of the disparity under a landmark, carried along its ray"
+    )
+    bias_sigma: float = Field(
+        0.1, ge=0, description="pixels; prior of the error that all disparities share (toe-in of the rig); 0: none"
     )
     threshold: float = Field(
         1.0, gt=0, description="pixels; the most inconsistent landmark is removed until all are below: 5 pixel_sigma"
@@ -78,7 +82,8 @@ class Resection:
     """Pose of one frame.
 
     ``T_local_left``; ``covariance`` (6, 6) of (position m, rotation rad) in the local frame; ``inlier`` (n,);
-    ``residual`` (n,) back-projection error, pixels, of every landmark (NaN: behind the camera);
+    ``residual`` (n,) back-projection error, pixels, of every landmark (NaN: behind the camera); ``bias`` of the
+    disparities, pixels;
     ``condition`` of the normal matrix with unit diagonal.
     """
 
@@ -86,13 +91,13 @@ class Resection:
     covariance: Floats
     inlier: Bools
     residual: Floats
+    bias: float
     iterations: int
     condition: float
 
 
 def resect(
-    landmarks: Floats,
-    sigmas: Floats,
+    landmarks: Landmarks,
     pixels: Floats,
     camera: Camera,
     start: RigidTransform,
@@ -105,7 +110,7 @@ def resect(
 
     Parameters
     ----------
-    landmarks, sigmas : (n, 3) coordinates in the local frame, m, and one standard deviation of each along its ray, m.
+    landmarks : n of them, in the local frame; all finite.
     pixels : (n, 2) column, row.
     start : prediction of T_local_left.
     where : words for error messages ("frame 12").
@@ -115,17 +120,21 @@ def resect(
     DegenerateError
         Fewer than six landmarks (in all, or consistent), all on a line, or a pose that they do not determine.
     """
-    _enough(len(landmarks), where, "have coordinates and were found", "set track.points higher or choose a nearer key")
-    _not_collinear(landmarks, where)
-    obs = Observations(landmarks[None], sigmas[None], pixels[None], camera, params.pixel_sigma)
-    poses, near = _robust_start(obs, _batch(start.inverse()), params, rng)
+    _enough(len(pixels), where, "have coordinates and were found", FEW)
+    _not_collinear(landmarks.position, where)
+    obs = Observations(
+        landmarks.position[None],
+        landmarks.per_pixel[None],
+        landmarks.sigma[None],
+        pixels[None],
+        camera,
+        params.pixel_sigma,
+        params.bias_sigma,
+    )
+    poses, near = _robust_start(obs, Poses.of(start.inverse()), params, rng)
     poses, active, steps = _remove_inconsistent(obs, poses, near, params, where)
-    _not_collinear(landmarks[active], where)
+    _not_collinear(landmarks.position[active], where)
     return _result(obs, poses, active, steps, params, where)
-
-
-def _batch(T: RigidTransform) -> Poses:
-    return Poses(T.rotation[None], T.translation[None])
 
 
 def _robust_start(
@@ -138,11 +147,13 @@ def _robust_start(
     """
     n = obs.landmarks.shape[1]
     samples = np.argsort(rng.random((params.hypotheses, n)), axis=1, kind="stable")[:, :SAMPLE]
-    start = Poses(
-        np.repeat(prediction.R, params.hypotheses, axis=0), np.repeat(prediction.t, params.hypotheses, axis=0)
-    )
+    start = _repeat(prediction, params.hypotheses)
     found, _ = levenberg_marquardt(obs.take(samples), start, np.ones(samples.shape, bool), 10, tolerance=1e-3)
-    candidates = Poses(np.concatenate([prediction.R, found.R]), np.concatenate([prediction.t, found.t]))
+    candidates = Poses(
+        np.concatenate([prediction.R, found.R]),
+        np.concatenate([prediction.t, found.t]),
+        np.concatenate([prediction.bias, found.bias]),
+    )
     bound = 2.0 * params.threshold / params.pixel_sigma
     score = (np.minimum(back_projection(obs, candidates).norm, bound) ** 2).sum(1)
     best = candidates.at(int(np.argmin(score)))
@@ -151,6 +162,10 @@ def _robust_start(
         if active.sum() >= SAMPLE:
             best, _ = levenberg_marquardt(obs, best, active, 10, tolerance=1e-6)
     return best, back_projection(obs, best).norm[0] <= bound
+
+
+def _repeat(poses: Poses, count: int) -> Poses:
+    return Poses(*(np.repeat(a, count, axis=0) for a in (poses.R, poses.t, poses.bias)))
 
 
 def _remove_inconsistent(
@@ -174,26 +189,37 @@ def _remove_inconsistent(
 def _result(obs: Observations, poses: Poses, active: Bools, steps: int, params: ResectParams, where: str) -> Resection:
     errors = back_projection(obs, poses)
     normal, _, weight = normal_matrix(obs, errors, active[None])
-    scale = np.sqrt(np.diag(normal[0]))
-    values, vectors = np.linalg.eigh(normal[0] / np.outer(scale, scale))
-    condition = float(values[-1] / max(values[0], 1e-300))
     # A posteriori variance factor: the errors found, not the ones expected, set the scale.
-    factor = float((weight[0] * np.where(active, errors.norm[0], 0.0) ** 2).sum() / (2 * active.sum() - 6))
-    inverse = (vectors / np.maximum(values, 1e-300)) @ vectors.T / np.outer(scale, scale)
+    squares = (weight[0] * np.where(active, errors.norm[0], 0.0) ** 2).sum()
+    factor = max(float(squares / (2 * active.sum() - 6)), 1e-12)
     R = poses.R[0]
-    turn = np.zeros((6, 6))
-    turn[:3, :3] = turn[3:, 3:] = R.T
     T = RigidTransform(R, poses.t[0]).inverse()
+    expected, condition = _covariance(normal[0], obs.prior, R)
     depth = float(np.median((obs.landmarks[0][active] @ R.T + poses.t[0])[:, 2]))
-    expected = float(np.sqrt(np.trace((turn @ inverse @ turn.T)[:3, :3])))
-    if expected > params.max_position_ratio * depth:
+    position_sigma = float(np.sqrt(np.trace(expected[:3, :3])))
+    if position_sigma > params.max_position_ratio * depth:
         raise DegenerateError(
             f"{where}: {int(active.sum())} landmarks at a median distance of {depth:.3g} m leave the position uncertain"
-            f" by {expected:.2g} m (condition {condition:.1e})",
+            f" by {position_sigma:.2g} m (condition {condition:.1e})",
             remedy="they are too far, too few or in one direction: set track.points higher or use nearer texture",
         )
+    covariance, _ = _covariance(normal[0] / factor, obs.prior, R)
     residual = np.where(np.isfinite(errors.norm[0]), np.sqrt((errors.pixels[0] ** 2).sum(-1)), np.nan)
-    return Resection(T, factor * (turn @ inverse @ turn.T), active, residual, steps, condition)
+    return Resection(T, covariance, active, residual, float(poses.bias[0]), steps, condition)
+
+
+def _covariance(normal: Floats, prior: float, R_cam_local: Floats) -> tuple[Floats, float]:
+    """Covariance (6, 6) of position and rotation in the local frame, the bias included; condition with unit diagonal.
+
+    ``C = -R^T t`` and ``R^T`` change by ``-R^T v`` and ``-R^T w`` under a step (v, w).
+    """
+    full = normal + np.diag([0.0] * 6 + [prior])
+    scale = np.sqrt(np.maximum(np.diag(full), 1e-300))
+    values, vectors = np.linalg.eigh(full / np.outer(scale, scale))
+    inverse = (vectors / np.maximum(values, 1e-300)) @ vectors.T / np.outer(scale, scale)
+    turn = np.zeros((6, 6))
+    turn[:3, :3] = turn[3:, 3:] = R_cam_local.T
+    return turn @ inverse[:6, :6] @ turn.T, float(values[-1] / max(values[0], 1e-300))
 
 
 def _enough(count: int, where: str, what: str, remedy: str) -> None:
@@ -259,18 +285,17 @@ def resect_segment(
         use = np.flatnonzero(known & np.isfinite(points[:, j]).all(1))
         if j == 0:
             out.inlier[use, 0], out.residual[use, 0] = 1, 0.0
-            out.facts.append(_facts(frames[0], use.size, use.size, 0.0, 0, None))
+            out.facts.append(_facts(frames[0], use.size, use.size, 0.0, None))
             continue
         if use.size < MINIMUM:
             _enough(
                 use.size,
                 f"frame {frames[j]}",
                 f"of {n} tracked points have coordinates and were found ({landmarks.summary()})",
-                "set track.points higher or choose basic pairs closer",
+                FEW,
             )
         found = resect(
-            landmarks.position[use],
-            landmarks.sigma[use],
+            landmarks.take(use),
             points[use, j].astype(np.float64),
             camera,
             pose,
@@ -282,18 +307,19 @@ def resect_segment(
         out.poses[j], out.covariance[j] = pose.matrix34, found.covariance
         out.inlier[use, j], out.residual[use, j] = found.inlier, found.residual
         rms = float(np.sqrt(np.mean(found.residual[found.inlier] ** 2)))
-        out.facts.append(_facts(frames[j], use.size, int(found.inlier.sum()), rms, found.iterations, found.condition))
+        out.facts.append(_facts(frames[j], use.size, int(found.inlier.sum()), rms, found))
     return out
 
 
-def _facts(frame: int, seen: int, inliers: int, rms: float, iterations: int, condition: float | None) -> dict[str, Any]:
+def _facts(frame: int, seen: int, inliers: int, rms: float, found: Resection | None) -> dict[str, Any]:
     return {
         "frame": frame,
         "landmarks": seen,
         "inliers": inliers,
         "rms_px": rms,
-        "iterations": iterations,
-        "condition": condition,
+        "iterations": found.iterations if found else 0,
+        "condition": found.condition if found else None,
+        "disparity_bias_px": found.bias if found else None,
     }
 
 
@@ -304,7 +330,7 @@ def _run(params: ResectParams, args: Mapping[str, Any], inputs: Inputs) -> Bundl
     landmarks = _coordinates(points[:, 0].astype(np.float64), inputs, rig, T_local_key, params)
     frames = [int(f) for f in track.meta["frames"]]
     found = resect_segment(points, landmarks, rig.left, T_local_key, frames, params)
-    arrays = {
+    arrays: dict[str, AnyArray] = {
         "poses": found.poses,
         "covariance": found.covariance,
         "inlier": found.inlier,

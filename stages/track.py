@@ -127,9 +127,9 @@ class _State:
 def _advance(state: _State, frames: Sequence[Pyramid], motion: Motion, j: int, params: TrackParams) -> None:
     """Find all points of frame j - 1 in frame j."""
     predicted = state.expected + displacement_at(motion, state.expected)
-    smooth = local_affinity(state.expected, predicted, np.isfinite(predicted).all(1), state.expected)
+    smooth = local_affinity(state.expected, predicted, _known(predicted), state.expected)
     matched = _match(frames[j - 1], frames[j], state.expected, predicted, smooth, params)
-    found = np.isfinite(matched).all(1)
+    found = _known(matched)
     state.expected = np.where(found[:, None], matched, predicted)
     for birth in np.unique(state.birth):
         group = np.flatnonzero((state.birth == birth) & found)
@@ -137,7 +137,7 @@ def _advance(state: _State, frames: Sequence[Pyramid], motion: Motion, j: int, p
         affinity = local_affinity(origin, matched[group], np.ones(group.size, bool), origin)
         scale = np.linalg.svd(affinity, compute_uv=False)
         near = (scale[:, 0] < params.max_scale) & (scale[:, 1] > 1.0 / params.max_scale)
-        for source, chosen in ((int(birth), near), (j - 1, ~near & np.isfinite(state.points[group, j - 1]).all(1))):
+        for source, chosen in ((int(birth), near), (j - 1, ~near & _known(state.points[group, j - 1]))):
             who = group[chosen]
             if who.size == 0:
                 continue
@@ -149,7 +149,7 @@ def _advance(state: _State, frames: Sequence[Pyramid], motion: Motion, j: int, p
 
 def _reseed(state: _State, frames: Sequence[Pyramid], j: int, params: TrackParams) -> _State:
     """Add points of frame j in empty buckets, as far as they are found in the key frame."""
-    alive = np.isfinite(state.points[:, j]).all(1) & np.isfinite(state.points[:, 0]).all(1)
+    alive = _known(state.points[:, j]) & _known(state.points[:, 0])
     here, there = state.points[alive, j], state.points[alive, 0]
     seeds = interest_points(
         frames[j].images[0], frames[j].valid[0], params.points, noise=params.noise, border=BORDER, occupied=here
@@ -162,7 +162,12 @@ def _reseed(state: _State, frames: Sequence[Pyramid], j: int, params: TrackParam
     place, error = _align(frames[j], frames[0], seeds, matched, affinity, params)
     new = _State.born(seeds, j, len(frames))
     new.points[:, 0], new.distance[:, 0] = place, error
-    return state.and_also(new, np.isfinite(place).all(1))
+    return state.and_also(new, _known(place))
+
+
+def _known(points: Floats) -> Bools:
+    """Which rows (n, 2) are not NaN."""
+    return np.asarray(np.isfinite(points).all(axis=1))
 
 
 def _match(a: Pyramid, b: Pyramid, points: Floats, predicted: Floats, affinity: Floats, params: TrackParams) -> Floats:
@@ -195,8 +200,8 @@ def displacement_at(motion: Motion, points: Floats) -> Floats:
     dy, dx = (o.ravel() for o in np.mgrid[-1:2, -1:2])
     y, x = np.clip(centre[:, 1:] + dy, 0, rows - 1), np.clip(centre[:, :1] + dx, 0, cols - 1)
     both = np.stack([motion.column[y, x], motion.row[y, x]], -1).astype(np.float64)
-    known = np.isfinite(both).all(-1)
-    any_known = known.any(1)
+    known: Bools = np.asarray(np.isfinite(both).all(axis=-1))
+    any_known: Bools = np.asarray(known.any(axis=1))
     both[~any_known] = 0.0
     value = np.nanmedian(np.where(known[..., None] | ~any_known[:, None, None], both, np.nan), axis=1)
     return np.where(any_known[:, None] & np.isfinite(points), value, np.nan)

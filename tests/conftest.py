@@ -7,6 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from pipeline.environment import prepare_environment
+
+prepare_environment(Path(__file__).resolve().parent.parent / ".rille" / "cache")  # before NumPy and numba
+
 
 @pytest.fixture(scope="session")
 def data_dir() -> Path:

@@ -10,6 +10,7 @@ import base64
 import io
 import math
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -46,16 +47,30 @@ class Panel:
         return len(self.uri)
 
 
+@cache
+def _style() -> None:
+    """Set fonts and colours, once."""
+    import matplotlib
+
+    matplotlib.rcParams.update(
+        {
+            "font.size": 9,
+            "font.family": ["DejaVu Sans"],
+            "axes.edgecolor": "#555555",
+            "axes.linewidth": 0.7,
+            "axes.labelcolor": "#333333",
+            "xtick.color": "#444444",
+            "ytick.color": "#444444",
+        }
+    )
+
+
 def figure(width: float, height: float) -> Any:
     """Empty figure on the Agg canvas, inches."""
-    import matplotlib
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    matplotlib.rcParams.update(
-        {"font.size": 9, "axes.edgecolor": "#555555", "axes.linewidth": 0.7, "xtick.color": "#444444"}
-        | {"ytick.color": "#444444", "axes.labelcolor": "#333333", "font.family": ["DejaVu Sans"]}
-    )
+    _style()
     fig = Figure(figsize=(width, height), dpi=DPI, facecolor="white")
     FigureCanvasAgg(fig)
     return fig
@@ -81,6 +96,7 @@ def map_axes(extent: Extent, *, bar: bool = False, max_height: float = 6.0) -> t
     ax.set_xlim(x - 0.5 * scale * width, x + 0.5 * scale * width)
     ax.set_ylim(y - 0.5 * scale * height, y + 0.5 * scale * height)
     ax.set_autoscale_on(False)
+    ax.locator_params(nbins=6)
     ax.set_xlabel("x, m", labelpad=1)
     ax.set_ylabel("y, m", labelpad=1)
     cax = fig.add_axes((left / fig_w, 0.43 / fig_h, width / fig_w, 0.12 / fig_h)) if bar else None
@@ -100,9 +116,12 @@ def image_axes(shape: tuple[int, ...], *, bar: bool = False, width: float = WIDT
     return fig, ax, cax
 
 
-def color_bar(fig: Any, drawn: Any, cax: Any, label: str) -> None:
+def color_bar(fig: Any, drawn: Any, cax: Any, label: str, *, integer: bool = False) -> None:
     """Colour bar with its unit."""
-    bar = fig.colorbar(drawn, cax=cax, orientation="horizontal")
+    from matplotlib.ticker import MaxNLocator
+
+    ticks = MaxNLocator(nbins=6, integer=integer)
+    bar = fig.colorbar(drawn, cax=cax, orientation="horizontal", ticks=ticks)
     bar.outline.set_linewidth(0.4)
     bar.set_label(label, labelpad=1)
 
@@ -150,9 +169,17 @@ def shrink(array: Image, limit: int = MAX_PIXELS) -> Image:
     return np.where(count > 0, total / np.maximum(count, 1), np.nan).astype(np.float32)
 
 
+def sample(values: Image) -> Image:
+    """Finite values, about fifty thousand of them, evenly spread: enough for a percentile."""
+    step = max(1, math.isqrt(values.size // 50_000)) if values.ndim == 2 else 1
+    part = values[::step, ::step] if step > 1 else values
+    finite = part[np.isfinite(part)]
+    return finite if finite.size or step == 1 else values[np.isfinite(values)]
+
+
 def limits(values: Image, low: float = 2.0, high: float = 98.0) -> tuple[float, float]:
     """Robust range of the finite values: percentiles, never empty."""
-    finite = values[np.isfinite(values)]
+    finite = sample(values)
     if finite.size == 0:
         return 0.0, 1.0
     a, b = (float(v) for v in np.percentile(finite, [low, high]))
@@ -160,9 +187,20 @@ def limits(values: Image, low: float = 2.0, high: float = 98.0) -> tuple[float, 
     return (a, b) if b - a > pad else (a - 10 * pad, b + 10 * pad)
 
 
+def ground_limits(elevation: Image) -> tuple[float, float]:
+    """Range of elevations that shows the ground where crowns and walls rise above it: five robust deviations."""
+    finite = sample(elevation)
+    low, high = limits(elevation)
+    if finite.size == 0:
+        return low, high
+    middle = float(np.median(finite))
+    reach = max(5 * 1.4826 * float(np.median(np.abs(finite - middle))), 1e-3 * (high - low))
+    return max(low, middle - reach), min(high, middle + reach)
+
+
 def metres_or_mm(values: Image) -> tuple[float, str]:
     """Factor and unit that suit lengths in metres: mm where nearly all are below 0.2 m."""
-    finite = np.abs(values[np.isfinite(values)])
+    finite = np.abs(sample(values))
     return (1000.0, "mm") if finite.size and float(np.percentile(finite, 98)) < 0.2 else (1.0, "m")
 
 

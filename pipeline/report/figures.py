@@ -63,11 +63,11 @@ def elevation_with_path(elevation: Floats, risk: Bytes | None, path: Floats | No
     """Elevation (row, col) m, bright is high; unknown and hazardous black; the path on it (Figure 7, right)."""
     fig, ax, cax = canvas.map_axes(extent, bar=True)
     blocked = ~np.isfinite(elevation) if risk is None else risk != SAFE
-    low, high = canvas.limits(elevation)
     factor, unit = canvas.metres_or_mm(elevation)
     # The grey scale starts well above black, so that black means "not to be driven" only.
     shown = np.where(blocked, np.nan, elevation * factor)
-    drawn = _show(ax, shown, extent, cmap=_greys(), vmin=low * factor, vmax=high * factor)
+    low, high = canvas.ground_limits(shown)
+    drawn = _show(ax, shown, extent, cmap=_greys(), vmin=low, vmax=high)
     if path is not None and len(path):
         canvas.polyline(ax, path, color=canvas.HAZARDOUS)
     canvas.color_bar(fig, drawn, cax, f"elevation, {unit}")
@@ -182,7 +182,7 @@ def hillshade(elevation: Floats, cell: float, extent: Extent, alt: str) -> Panel
     step = cell * elevation.shape[1] / max(z.shape[1], 1)
     shade = _shade(z, step)
     factor, unit = canvas.metres_or_mm(elevation)
-    low, high = (v * factor for v in canvas.limits(elevation))
+    low, high = (v * factor for v in canvas.ground_limits(elevation))
     norm = matplotlib.colors.Normalize(low, high)
     tint = matplotlib.colormaps["cividis"](norm(np.nan_to_num(z * factor)))[..., :3]
     rgb = np.clip(tint * (0.35 + 0.9 * shade[..., None]), 0, 1)
@@ -199,8 +199,7 @@ def scalar_map(values: Floats, extent: Extent, label: str, alt: str, *, length: 
     factor, unit = canvas.metres_or_mm(values) if length else (1.0, "")
     low, high = (v * factor for v in canvas.limits(values))
     drawn = _show(ax, values * factor, extent, cmap=_map("viridis"), vmin=min(low, 0.0), vmax=high)
-    canvas.color_bar(fig, drawn, cax, f"{label}, {unit}" if unit else label)
-    cax.xaxis.get_major_locator().set_params(integer=not length)
+    canvas.color_bar(fig, drawn, cax, f"{label}, {unit}" if unit else label, integer=not length)
     return canvas.encode(fig, alt, photo=True)
 
 

@@ -277,7 +277,7 @@ def _dem_error(scene: Scene) -> Block | None:
 
 def _range(values: Any) -> str:
     """``low to high`` of nearly all values, for alternative texts."""
-    finite = values[np.isfinite(values)]
+    finite = canvas.sample(values)
     if not finite.size:
         return "nothing defined"
     low, high = np.percentile(finite, [1, 99])

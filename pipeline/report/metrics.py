@@ -222,5 +222,10 @@ def _run(view: RunView) -> dict[str, Metric]:
     rig = view.sequence.rig
     return {
         "baseline": _metric("Stereo baseline", rig.baseline, "m", "given calibration; sets the scale"),
-        "wall_clock": _metric("Time of this run", view.seconds, "s", "wall clock; cached results cost no time"),
+        "wall_clock": _metric(
+            "Time of this run's tasks",
+            view.seconds,
+            "s",
+            "wall clock, without writing files; what is cached costs no time",
+        ),
     }

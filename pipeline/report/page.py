@@ -46,7 +46,14 @@ def render(scene: Scene, facts: Mapping[str, Any], drawn: gallery.Gallery, files
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    env.filters |= {"quantity": quantity, "seconds": seconds, "number": number, "share": share, "metres": metres}
+    env.filters |= {
+        "quantity": quantity,
+        "seconds": seconds,
+        "number": number,
+        "share": share,
+        "metres": metres,
+        "coordinate": coordinate,
+    }
     rows, together = tables.table_2(scene.view)
     return env.get_template("template.html").render(
         facts=facts,
@@ -76,6 +83,8 @@ def number(value: Any, digits: int = 3) -> str:
 
 def quantity(value: Any, unit: str) -> str:
     """Value with its unit, small lengths and areas in mm and cm²."""
+    if isinstance(value, float) and unit in SMALL and abs(value) < 1e-9:
+        value = 0  # rounding
     if isinstance(value, int | float) and unit in SMALL and value != 0 and abs(value) < SMALL[unit][2]:
         unit, factor, _ = SMALL[unit]
         value = value * factor
@@ -89,6 +98,11 @@ def quantity(value: Any, unit: str) -> str:
 def metres(value: Any) -> str:
     """Metres with a unit that fits."""
     return quantity(value, "m")
+
+
+def coordinate(value: Any) -> str:
+    """Coordinate in metres to a tenth of a millimetre."""
+    return "–" if value is None else f"{round(value, 4) + 0.0:.4f}".replace("-", "−")
 
 
 def share(value: Any) -> str:

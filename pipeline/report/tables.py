@@ -36,7 +36,10 @@ FILES: dict[str, tuple[str, str]] = {
     "dem.tif": ("merged elevation, m, NaN undefined", "QGIS, GDAL"),
     "dem_sigma.tif": ("standard deviation of the elevation, m", "QGIS, GDAL"),
     "ortho.tif": ("merged ortho image, grey 0..255", "QGIS, GDAL"),
-    "risk.tif": ("risk map: 0 safe, 1 hazardous, 2 unknown", "QGIS, GDAL"),
+    "risk.tif": (
+        "risk map; bands: class (0 safe, 1 hazardous, 2 unknown), reason (bits), filled (1: closed hole)",
+        "QGIS, GDAL",
+    ),
     "path.geojson": ("path over the merged terrain, metres in the world frame (not longitude and latitude)", "QGIS"),
     "path.gpkg": ("the path with its engineering coordinate system", "QGIS"),
     "config.toml": ("every parameter in force; give it back with --config", "any text editor"),
@@ -47,7 +50,7 @@ FILES: dict[str, tuple[str, str]] = {
 
 @dataclass(frozen=True)
 class Timing:
-    """Seconds of one kind of task; ``unit`` is the median of a task and its share of preparation, None without a time."""
+    """Seconds of one kind of task; ``unit`` is the median of a task with its share of preparation, or None."""
 
     name: str
     what: str
@@ -63,13 +66,14 @@ def _timing(
     name: str, what: str, in_1999: float | None, rows: Sequence[TaskRow], preparation: Sequence[TaskRow] = ()
 ) -> Timing:
     seconds = [r.seconds for r in rows if r.seconds is not None]
-    before = sum(r.seconds or 0.0 for r in preparation)
+    before = [r.seconds for r in preparation if r.seconds is not None]
+    share = statistics.median(before) * len(before) if before else 0.0
     return Timing(
         name,
         what,
         in_1999,
-        statistics.median(seconds) + before / len(seconds) if seconds else None,
-        sum(seconds) + before if seconds else None,
+        statistics.median(seconds) + share / len(seconds) if seconds else None,
+        sum(seconds) + sum(before) if seconds else None,
         len(rows),
         sum(r.status == "computed" for r in rows),
         sum(r.status == "cached" for r in rows),

@@ -19,7 +19,7 @@ from stages import pyramid
 from stages.declare import AnyArray, Array, Bundle, Inputs, Stage
 from stages.hfvm import consistency, hierarchy, plane, subpixel
 from stages.hfvm.params import HfvmParams
-from stages.hfvm.refine import refine
+from stages.hfvm.refine import correlation, refine
 from stages.pyramid import Pyramid, PyramidParams
 from stages.validity import Mask, Validity, counts, mark, matched
 
@@ -104,25 +104,25 @@ def _finish(
     alignment: plane.Matrix | None,
 ) -> Disparity:
     """Sub-pixel, validity, refinement and filling at level 0."""
-    # Sub-pixel work pays only where the whole-pixel maps nearly agree.
-    reach = params.backmatch + 1.0
-    near = hierarchy.integer_error(state.left, state.right, pair.right_valid[0]) <= reach
-    near_right = hierarchy.integer_error(state.right, state.left, pair.left_valid[0]) <= reach
-    forward = pair.solver.fine(0, state.left, near)
-    backward = pair.solver.reverse().fine(0, state.right, near_right)
-    error = np.empty(forward.u.shape, np.float32)
-    consistency.backmatch(forward.u, forward.v, backward.u, backward.v, pair.right_valid[0], error)
-    validity = _validity(pair, forward, error, params)
+    forward, error = _fine(pair, state, params)
+    validity = _reasons(pair, forward, error, params)
     u, v = forward.u, forward.v
     if alignment is not None:
         u, v = plane.compose(alignment, u, v)
-    keep = matched(validity)
+    keep = validity == 0
     if params.preset == "default":
         mean_u, mean_v = np.empty_like(u), np.empty_like(v)
         subpixel.local_mean(u, v, keep, hierarchy.SUM_RADIUS, mean_u, mean_v)
         u, v = mean_u, mean_v
     if params.refine:
-        u, v = refine(left.images[0], right.images[0], right.valid[0], u, v, keep, params)
+        u, v, rest = refine(left.images[0], right.images[0], right.valid[0], u, v, keep, params)
+        alike = correlation(rest, pair.deviation[0], keep)
+        mark(validity, keep & (alike < params.correlation), Validity.OVER_THRESHOLD)
+        keep = validity == 0
+    gone = consistency.isolated(forward.u, forward.v, keep, params.speckle)
+    mark(validity, gone, Validity.SPECKLE)
+    keep &= ~gone
+    mark(validity, keep, Validity.MATCHED)
     interpolated = np.zeros(keep.shape, np.uint8)
     consistency.fill_rows(u, v, keep, params.fill_reach, state.near_sign or -1.0, interpolated)
     interpolated[left.valid[0] == 0] = 0
@@ -134,18 +134,27 @@ def _finish(
     return Disparity(u, v, validity, error, distance, alignment is not None)
 
 
-def _validity(pair: hierarchy.Prepared, fine: hierarchy.Fine, error: AnyArray, params: HfvmParams) -> Mask:
-    """Bits of every pixel, MATCHED or the reasons against it."""
+def _fine(pair: hierarchy.Prepared, state: hierarchy.State, params: HfvmParams) -> tuple[hierarchy.Fine, Map]:
+    """Sub-pixel left map, and its sub-pixel back-matching error."""
+    # Sub-pixel work pays only where the whole-pixel maps nearly agree.
+    reach = params.backmatch + 1.0
+    near = hierarchy.integer_error(state.left, state.right, pair.right_valid[0]) <= reach
+    near_right = hierarchy.integer_error(state.right, state.left, pair.left_valid[0]) <= reach
+    forward = pair.solver.fine(0, state.left, near)
+    backward = pair.solver.reverse().fine(0, state.right, near_right)
+    error = np.empty(forward.u.shape, np.float32)
+    consistency.backmatch(forward.u, forward.v, backward.u, backward.v, pair.right_valid[0], error)
+    return forward, error
+
+
+def _reasons(pair: hierarchy.Prepared, fine: hierarchy.Fine, error: AnyArray, params: HfvmParams) -> Mask:
+    """Bits that speak against each pixel, none where it is consistent."""
     bits = np.zeros(error.shape, np.uint8)
     outside = (error >= consistency.FAILED) | (pair.left_valid[0] == 0)
     mark(bits, outside, Validity.OUT_OF_IMAGE)
     mark(bits, fine.distance > params.threshold, Validity.OVER_THRESHOLD)
     mark(bits, pair.deviation[0] < params.texture, Validity.NO_TEXTURE)
     mark(bits, ~outside & (error > params.backmatch), Validity.BACKMATCH_FAILED)
-    keep = bits == 0
-    gone = consistency.isolated(fine.u, fine.v, keep, params.speckle)
-    mark(bits, gone, Validity.SPECKLE)
-    mark(bits, keep & ~gone, Validity.MATCHED)
     return bits
 
 

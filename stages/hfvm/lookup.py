@@ -11,8 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 
 BINS = 16
 
-DEFAULT_TABLE: tuple[float, ...] = tuple(i / BINS - 0.5 for i in range(BINS + 1))
-"""Learnt by matching textured noise displaced evenly: even offset at each sixteenth of the found one."""
+_HALF = (0.0, 0.0587, 0.1219, 0.1889, 0.2573, 0.3222, 0.3799, 0.4265, 0.5)
+DEFAULT_TABLE: tuple[float, ...] = (*(-v for v in _HALF[:0:-1]), *_HALF)
+"""Even offset at each sixteenth of the found one; learnt on noise of spectrum 1 / f^1.3, displaced by all fractions."""
 
 
 def learn(offsets: ArrayLike) -> tuple[float, ...]:
@@ -21,9 +22,12 @@ def learn(offsets: ArrayLike) -> tuple[float, ...]:
     The histogram is made symmetric: the sign of an offset is a matter of which image is the left one.
     """
     found = np.clip(np.asarray(offsets, dtype=np.float64).ravel(), -0.5, 0.5)
-    counts, _ = np.histogram(np.concatenate([found, -found]), bins=BINS, range=(-0.5, 0.5))
-    share = np.cumsum(counts) / max(1, counts.sum())
-    return (-0.5, *(float(s) - 0.5 for s in share))
+    counts, _ = np.histogram(found, bins=BINS, range=(-0.5, 0.5))
+    counts = counts + counts[::-1]
+    if counts.sum() == 0:
+        return tuple(i / BINS - 0.5 for i in range(BINS + 1))
+    share = np.cumsum(counts) / counts.sum()
+    return (-0.5, *(round(float(s) - 0.5, 4) for s in share))
 
 
 def even(offsets: ArrayLike, table: tuple[float, ...] = DEFAULT_TABLE) -> NDArray[np.float32]:

@@ -15,8 +15,7 @@ Weights = tuple[float, float, float, float, float, float, float, float]
 PAPER: Mapping[str, Any] = {
     "weights": PAPER_WEIGHTS,
     "search_columns": 2,
-    "median": 3,
-    "threshold": 25.0,
+    "threshold": 15.0,
     "texture": 0.0,
     "speckle": 1,
     "fill_reach": 100000,
@@ -97,6 +96,12 @@ class HfvmParams(Params):
         default=0.6, ge=0, le=1, description="share of the coarse matches that the plane must explain"
     )
     refine: bool = Field(default=True, description="remove the perspective bias by mean-free Lucas-Kanade steps")
+    correlation: float = Field(
+        default=0.6,
+        ge=-1,
+        le=1,
+        description="least correlation of both images after refinement; below, noise met noise",
+    )
     refine_steps: int = Field(default=2, ge=1, le=8, description="steps; the second one settles the first")
     refine_radius: int = Field(
         default=2, ge=1, le=8, description="pixels; 5 x 5 windows: wider ones smooth relief away"

@@ -24,9 +24,10 @@ Matrix = NDArray[np.float64]
 
 ITERATIONS = 15
 
+LEAST_MATCHES = 60
+
 MOST_DISTORTION = 2.0
 """Beyond this the plane is no ground but a bad fit."""
-LEAST_MATCHES = 60
 
 TOLERANCE = 1.0
 """Pixels of the coarse level: a match this near the plane belongs to it (half weight)."""
@@ -94,37 +95,36 @@ def fit_plane(u: AnyArray, v: AnyArray, consistent: AnyArray, tolerance: float) 
     if len(y) < LEAST_MATCHES:
         return None
     scale = 0.5 * max(consistent.shape)
-    to_unit = np.array(
+    middle = (0.5 * consistent.shape[1] / scale, 0.5 * consistent.shape[0] / scale)
+    to_unit = np.array([[1 / scale, 0.0, -middle[0]], [0.0, 1 / scale, -middle[1]], [0.0, 0.0, 1.0]])
+    p = np.stack([x / scale - middle[0], y / scale - middle[1]])
+    d = np.stack([u[y, x], v[y, x]]).astype(np.float64) / scale
+    unit, error = _solve(p, d, tolerance / scale)
+    return np.linalg.inv(to_unit) @ unit @ to_unit, float(np.mean(error <= 2 * tolerance / scale))
+
+
+def _solve(p: AnyArray, d: AnyArray, tolerance: float) -> tuple[Matrix, AnyArray]:
+    """Homography of points (2, n) moved by ``d`` (2, n), robustly, and each point's error.
+
+    ``q = p + d`` with q ~ H p is linear in the eight terms of H - I where H[2, 2] = 1; they are weakly held at zero.
+    """
+    one, nil, q = np.ones_like(p[0]), np.zeros_like(p[0]), p + d
+    terms = np.stack(
         [
-            [1 / scale, 0, -0.5 * consistent.shape[1] / scale],
-            [0, 1 / scale, -0.5 * consistent.shape[0] / scale],
-            [0, 0, 1],
+            np.stack([p[0], p[1], one, nil, nil, nil, -q[0] * p[0], -q[0] * p[1]]),
+            np.stack([nil, nil, nil, p[0], p[1], one, -q[1] * p[0], -q[1] * p[1]]),
         ]
     )
-    px, py = x * to_unit[0, 0] + to_unit[0, 2], y * to_unit[1, 1] + to_unit[1, 2]
-    qx = (x + u[y, x]) * to_unit[0, 0] + to_unit[0, 2]
-    qy = (y + v[y, x]) * to_unit[1, 1] + to_unit[1, 2]
-    one, nil = np.ones_like(px), np.zeros_like(px)
-    # qx (1 + g p) = ..., linear in the eight terms of H with H[2, 2] = 1; solved for H - I, weakly held at zero.
-    rows_x = np.stack([px, py, one, nil, nil, nil, -qx * px, -qx * py])
-    rows_y = np.stack([nil, nil, nil, px, py, one, -qy * px, -qy * py])
-    dx, dy = qx - px, qy - py
-    h = np.zeros(8)
-    spread = 0.0
-    tol = tolerance / scale
-    error = np.zeros_like(px)
-    for step in range(ITERATIONS):
-        error = np.hypot(dx - np.einsum("i,in->n", h, rows_x), dy - np.einsum("i,in->n", h, rows_y))
-        if step == 0:
-            weight = one
-        else:
-            spread = max(tol, min(1.5 * float(np.median(error)), spread * 0.7 if step > 1 else np.inf))
-            weight = 1.0 / (1.0 + (error / spread) ** 2) ** 2
-        normal = np.einsum("in,jn,n->ij", rows_x, rows_x, weight) + np.einsum("in,jn,n->ij", rows_y, rows_y, weight)
-        right_side = np.einsum("in,n,n->i", rows_x, dx, weight) + np.einsum("in,n,n->i", rows_y, dy, weight)
-        h = np.linalg.solve(normal + 1e-6 * len(px) * np.eye(8), right_side)
-    unit = np.append(h, 0.0).reshape(3, 3) + np.eye(3)
-    return np.linalg.inv(to_unit) @ unit @ to_unit, float(np.mean(error <= 2 * tol))
+    h, weight, spread = np.zeros(8), one, np.inf
+    for _ in range(ITERATIONS):
+        weighted = terms * weight
+        normal = np.einsum("ain,ajn->ij", weighted, terms) + 1e-6 * len(one) * np.eye(8)
+        h = np.linalg.solve(normal, np.einsum("ain,an->i", weighted, d))
+        error = np.hypot(*(d - np.einsum("i,ain->an", h, terms)))
+        # Start as wide as the matches scatter about the first fit, and narrow onto the dominant plane.
+        spread = max(tolerance, min(1.5 * float(np.median(error)), 0.7 * spread))
+        weight = 1.0 / (1.0 + (error / spread) ** 2) ** 2
+    return np.append(h, 0.0).reshape(3, 3) + np.eye(3), error
 
 
 def to_level_0(h: Matrix, level: int) -> Matrix:
@@ -135,7 +135,7 @@ def to_level_0(h: Matrix, level: int) -> Matrix:
 
 
 def distortion(h: Matrix, shape: tuple[int, int]) -> float:
-    """Greatest departure of the homography's derivative from the identity over an image."""
+    """Departure of the homography's derivative from the identity: its greatest element, each the median over an image."""
     y, x = np.meshgrid(np.linspace(0, shape[0] - 1, 5), np.linspace(0, shape[1] - 1, 5), indexing="ij")
     w = h[2, 0] * x + h[2, 1] * y + h[2, 2]
     if (w <= 0.1).any():

@@ -14,8 +14,12 @@ from stages.declare import AnyArray
 from stages.hfvm.params import HfvmParams
 from stages.hfvm.resample import sample_cubic
 from stages.hfvm.subpixel import local_mean
+from stages.windows import window_sum
 
 PLANES = 10
+
+CORRELATION_SIDE = 9
+"""Pixels: fewer do not tell correlated noise from texture."""
 
 FARTHEST = 1.5
 """Pixels: a correction beyond this is a jump to something else."""
@@ -102,7 +106,7 @@ def refine(
     v: AnyArray,
     keep: AnyArray,
     params: HfvmParams,
-) -> tuple[AnyArray, AnyArray]:
+) -> tuple[AnyArray, AnyArray, AnyArray]:
     """Displacements without the perspective bias.
 
     Parameters
@@ -111,6 +115,11 @@ def refine(
     right_valid : (row, col) uint8, 1 = usable.
     u, v : (row, col) float32, smoothed displacements, pixels.
     keep : (row, col) bool, pixels that have one.
+
+    Returns
+    -------
+    u, v : (row, col) float32, refined where that lowered the residual.
+    rest : (row, col) float32, mean-free residual variance of the window, squared grey levels; inf where not known.
     """
     start_u, start_v = u, v
     first = last = np.empty(u.shape, np.float32)
@@ -127,4 +136,16 @@ def refine(
             u, v = np.empty_like(u), np.empty_like(v)
             local_mean(new_u, new_v, keep, 1, u, v)
     better = (last <= first) & (np.hypot(u - start_u, v - start_v) <= FARTHEST)
-    return np.where(better, u, start_u), np.where(better, v, start_v)
+    return np.where(better, u, start_u), np.where(better, v, start_v), np.where(better, last, first)
+
+
+def correlation(rest: AnyArray, deviation: AnyArray, keep: AnyArray) -> AnyArray:
+    """Correlation (row, col) of the left image with the warped right one over a wider window; 1 where not known.
+
+    From the residual variance ``rest`` and the left image's local ``deviation``: two signals of equal variance s^2 and
+    correlation r differ by 2 s^2 (1 - r). Noise that found noise to match, in a shadow or the sky, gives itself away.
+    """
+    known = keep & np.isfinite(rest)
+    differ = window_sum(np.where(known, rest, 0.0), CORRELATION_SIDE)
+    power = window_sum(np.where(known, deviation * deviation, 0.0), CORRELATION_SIDE)
+    return np.where(power > 0, 1.0 - differ / np.maximum(2.0 * power, 1e-6), 1.0)

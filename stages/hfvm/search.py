@@ -50,7 +50,7 @@ def descend(left, right, up_u, up_v, reach_x, reach_y, lines, mu, out_u, out_v):
 
     ``reach_x, reach_y``: search to either side of each; ``lines`` (row, col, 3) float32: epipolar line of each pixel
     (:func:`stages.hfvm.epipolar.lines`); ``mu``: cost per pixel off it, 0 = no band (``lines`` is not read). With a
-    band, each centre is first moved to the nearest point of the line.
+    band, each centre is first moved towards its line, by a pixel at most: a coarse fit may be wrong by more than that.
     """
     rows, cols = left.shape
     rrows, rcols = right.shape
@@ -73,6 +73,7 @@ def descend(left, right, up_u, up_v, reach_x, reach_y, lines, mu, out_u, out_v):
                 if mu > 0:
                     a, b = lines[2 * cy, 2 * cx, 0], lines[2 * cy, 2 * cx, 1]
                     e = a * pu + b * pv + lines[2 * cy, 2 * cx, 2]
+                    e = min(max(e, np.float32(-1.0)), np.float32(1.0))
                     pu -= np.int64(np.rint(e * a))
                     pv -= np.int64(np.rint(e * b))
                 if k == 0:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stages.geometry import Camera, RigidTransform, Rig, rotation_exp
+from stages.geometry import Camera, Rig, RigidTransform, rotation_exp
 from stages.landmarks import intersect, landmarks_from_dem, landmarks_from_disparity, relief
 from stages.lattice import Lattice
 
@@ -51,10 +51,10 @@ def test_disparity_and_elevation_model_give_the_same_landmarks_on_a_plane():
     np.testing.assert_allclose(a.position[:, 2], GROUND + 0.1 * a.position[:, 1], atol=5e-5)
     np.testing.assert_allclose(b.position[:, 2], GROUND + 0.1 * b.position[:, 1], atol=1e-6)
     np.testing.assert_allclose(a.position, b.position, atol=1e-4)
-    np.testing.assert_allclose(a.sigma, b.sigma, rtol=1e-3)
+    np.testing.assert_allclose(a.per_pixel, b.per_pixel, rtol=1e-3)
 
 
-def test_sigma_is_the_depth_change_that_one_sigma_of_disparity_makes():
+def test_a_pixel_of_disparity_moves_a_landmark_by_z_squared_over_f_b():
     rig = Rig(CAMERA, CAMERA, RigidTransform(np.eye(3), np.array([-0.1, 0.0, 0.0])))
     d = np.full((240, 320), -20.0, np.float32)  # Z = f B / 20 = 2 m
     zero, valid = np.zeros_like(d), np.ones(d.shape, np.uint8)
@@ -63,7 +63,8 @@ def test_sigma_is_the_depth_change_that_one_sigma_of_disparity_makes():
         point, d, zero, valid, rig, RigidTransform.identity(), np.array([0.25]), max_depth_ratio=0.2
     )
     np.testing.assert_allclose(found.position[0], CAMERA.rays(point)[0] * 2.0, rtol=1e-9)
-    np.testing.assert_allclose(found.sigma[0], CAMERA.rays(point)[0] * 2.0**2 / (400 * 0.1) * 0.25, rtol=1e-9)
+    np.testing.assert_allclose(found.per_pixel[0], CAMERA.rays(point)[0] * 2.0**2 / (400 * 0.1), rtol=1e-9)
+    assert found.sigma[0] == 0.25
     far = landmarks_from_disparity(
         point, d, zero, valid, rig, RigidTransform.identity(), np.array([5.0]), max_depth_ratio=0.2
     )
@@ -100,11 +101,12 @@ def test_relief_is_the_departure_from_a_plane():
     flat = relief(at, ramp, np.zeros_like(ramp), valid)
     assert flat[0] == pytest.approx(0.0, abs=1e-5)
     assert np.isnan(flat[1])
-    # A step of 2 px through the middle: of the +-1 about the mean, a plane through 11 columns explains a part.
-    step = np.where(x > 20, 2.0, 0.0).astype(np.float32)
-    columns = np.where(np.arange(-5, 6) > 0, 2.0, 0.0)
+    # A step of 1 px through the middle: of the +-0.5 about the mean, a plane through 11 columns explains a part.
+    step = np.where(x > 20, 1.0, 0.0).astype(np.float32)
+    columns = np.where(np.arange(-5, 6) > 0, 1.0, 0.0)
     expected = np.polyval(np.polyfit(np.arange(-5, 6), columns, 1), np.arange(-5, 6)) - columns
     assert relief(at[:1], step, np.zeros_like(step), valid)[0] == pytest.approx(np.sqrt(np.mean(expected**2)), rel=1e-5)
+    assert np.isnan(relief(at[:1], 8 * step, np.zeros_like(step), valid)[0])  # two surfaces
     valid[:, 18:] = 0
     assert np.isnan(relief(at[:1], step, np.zeros_like(step), valid)[0])
 

@@ -13,7 +13,6 @@ from stages.reprojection import (
     Poses,
     back_projection,
     derivatives,
-    exponential,
     levenberg_marquardt,
 )
 from stages.resect import ResectParams, resect, resect_segment
@@ -36,10 +35,12 @@ def seen(T_local_left, landmarks):
     return CAMERA.project(T_local_left.inverse().apply(landmarks))
 
 
-def solve(landmarks, pixels, *, sigmas=None, params=PARAMS, start=None, seed=0):
-    sigmas = np.zeros_like(landmarks) if sigmas is None else sigmas
-    start = RigidTransform.identity() if start is None else start
-    return resect(landmarks, sigmas, pixels, CAMERA, start, params, np.random.default_rng(seed), where="frame 7")
+def solve(landmarks, pixels, *, per_pixel=None, sigma=0.0, params=PARAMS, seed=0):
+    """Resect from the identity; landmarks are exact unless told how they move with their disparity."""
+    per_pixel = np.zeros_like(landmarks) if per_pixel is None else per_pixel
+    known = Landmarks(landmarks, per_pixel, np.broadcast_to(sigma, len(landmarks)).astype(float), {})
+    start = RigidTransform.identity()
+    return resect(known, pixels, CAMERA, start, params, np.random.default_rng(seed), where="frame 7")
 
 
 def test_projection_is_eq_4_with_t_the_translation_and_the_position_minus_rt_t():
@@ -49,8 +50,9 @@ def test_projection_is_eq_4_with_t_the_translation_and_the_position_minus_rt_t()
     X = np.array([[0.3, 0.4, 6.0], [-1.0, 0.5, 5.0]])
     h = np.column_stack([X, np.ones(2)]) @ T.T
     by_eq_7_and_8 = h[:, :2] / h[:, 2:]
-    obs = Observations(X[None], np.zeros((1, 2, 3)), np.zeros((1, 2, 2)), CAMERA, 1.0)
-    np.testing.assert_allclose(back_projection(obs, Poses(R[None], t[None])).pixels[0], by_eq_7_and_8, rtol=1e-12)
+    obs = Observations(X[None], np.zeros((1, 2, 3)), np.zeros((1, 2)), np.zeros((1, 2, 2)), CAMERA, 1.0, 0.1)
+    by_us = back_projection(obs, Poses.of(RigidTransform(R, t))).pixels[0]
+    np.testing.assert_allclose(by_us, by_eq_7_and_8, rtol=1e-12)
     rng = np.random.default_rng(0)
     landmarks = scene(rng)
     h = np.column_stack([landmarks, np.ones(len(landmarks))]) @ T.T
@@ -62,28 +64,24 @@ def test_projection_is_eq_4_with_t_the_translation_and_the_position_minus_rt_t()
 def test_jacobian_against_central_differences():
     rng = np.random.default_rng(1)
     landmarks = scene(rng, 5)
-    sigmas = 0.02 * landmarks * rng.uniform(0.5, 2.0, (5, 1))
+    per_pixel = 0.1 * landmarks * rng.uniform(0.5, 2.0, (5, 1))
+    sigma = np.array([0.0, 0.1, 0.2, 0.3, 0.5])
     T = true_pose(rng).inverse()
-    poses = Poses(T.rotation[None], T.translation[None])
-    obs = Observations(landmarks[None], sigmas[None], rng.uniform(0, 500, (1, 5, 2)), CAMERA, 0.3)
+    poses = Poses(T.rotation[None], T.translation[None], np.array([0.05]))
+    obs = Observations(landmarks[None], per_pixel[None], sigma[None], rng.uniform(0, 500, (1, 5, 2)), CAMERA, 0.3, 0.1)
     errors = back_projection(obs, poses)
-    analytic = derivatives(errors, 0.3)[0]
+    analytic = derivatives(obs, errors)[0]
     h = 1e-6
-    for k in range(6):
-        xi = np.zeros((1, 6))
-        xi[0, k] = h
-        ends = []
-        for s in (1, -1):
-            turn = exponential(s * xi[:, 3:])
-            moved = Poses(turn @ poses.R, np.einsum("bij,bj->bi", turn, poses.t) + s * xi[:, :3])
-            ends.append(back_projection(obs, moved).pixels)
-        numeric = (ends[0] - ends[1]) / (2 * h)
-        # The whitening is held fixed within a step, as in iteratively reweighted least squares.
-        S = 0.3**2 * np.eye(2) + errors.along[0, :, :, None] * errors.along[0, :, None, :]
+    along = errors.per_pixel[0] * sigma[:, None]
+    S = 0.3**2 * np.eye(2) + along[:, :, None] * along[:, None, :]
+    for k in range(7):
+        step = np.zeros((1, 7))
+        step[0, k] = h
+        numeric = (back_projection(obs, poses.moved(step)).pixels - back_projection(obs, poses.moved(-step)).pixels)[0]
         for i in range(5):
             values, vectors = np.linalg.eigh(S[i])
-            root = vectors / np.sqrt(values) @ vectors.T
-            np.testing.assert_allclose(analytic[i, :, k], root @ numeric[0, i], rtol=1e-5, atol=1e-4)
+            root = vectors / np.sqrt(values) @ vectors.T  # held fixed within a step, as in reweighted least squares
+            np.testing.assert_allclose(analytic[i, :, k], root @ numeric[i] / (2 * h), rtol=1e-5, atol=1e-4)
 
 
 def test_exact_data_give_the_exact_pose():
@@ -151,33 +149,67 @@ def test_same_minimum_as_scipy():
     )
 
 
-def test_covariance_is_calibrated():
+def stereo(landmarks, f_times_baseline):
+    """How landmarks move with their disparity: Z^2 / (f B) along the ray, per pixel."""
+    return landmarks * landmarks[:, 2:] / f_times_baseline
+
+
+def normalised_square(T, found):
+    turn = T.rotation @ found.T_local_left.rotation.T
+    w = 0.5 * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
+    x = np.concatenate([T.translation - found.T_local_left.translation, w])
+    return float(x @ np.linalg.solve(found.covariance, x))
+
+
+@pytest.mark.parametrize("bias_sigma", [0.0, 0.3])
+def test_covariance_is_calibrated(bias_sigma):
     """Normalised squared error of 200 noisy resections: chi-square of 6 degrees of freedom each."""
     rng = np.random.default_rng(6)
-    pixel_sigma, trials, total = 0.3, 200, 0.0
-    params = ResectParams(pixel_sigma=pixel_sigma, threshold=2.0, hypotheses=20)
+    trials, total = 200, 0.0
+    params = ResectParams(pixel_sigma=0.3, threshold=2.0, hypotheses=20, bias_sigma=bias_sigma)
     for trial in range(trials):
         T, landmarks = true_pose(rng), scene(rng, 50)
-        sigmas = 0.01 * landmarks * np.linalg.norm(landmarks, axis=1, keepdims=True) / 6.0  # grows with the square
-        pixels = seen(T, landmarks) + pixel_sigma * rng.standard_normal((50, 2))
-        wrong = landmarks + sigmas * rng.standard_normal((50, 1))
-        found = solve(wrong, pixels, sigmas=sigmas, params=params, seed=trial)
-        turn = T.rotation @ found.T_local_left.rotation.T
-        w = 0.5 * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
-        x = np.concatenate([T.translation - found.T_local_left.translation, w])
-        total += float(x @ np.linalg.solve(found.covariance, x))
+        per_pixel = stereo(landmarks, 100.0)
+        pixels = seen(T, landmarks) + 0.3 * rng.standard_normal((50, 2))
+        wrong = landmarks + per_pixel * (0.2 * rng.standard_normal((50, 1)) + bias_sigma * rng.standard_normal())
+        total += normalised_square(T, solve(wrong, pixels, per_pixel=per_pixel, sigma=0.2, params=params, seed=trial))
     # Huber's weights cost 2 % and the variance factor is itself estimated (94 degrees of freedom: +2 %).
     low, high = chi2.ppf([0.001, 0.999], 6 * trials)
-    assert low < total / 1.04 < high * 1.04
+    assert low < total / 1.04 < high
+
+
+def test_an_error_that_all_disparities_share_is_found():
+    rng = np.random.default_rng(14)
+    T = RigidTransform(np.eye(3), np.array([0.0, 0.0, 2.0]))
+    landmarks = scene(rng, 150, near=5.0, far=30.0)
+    per_pixel = stereo(landmarks, 300.0)
+    pixels = seen(T, landmarks) + 0.05 * rng.standard_normal((150, 2))
+    wrong = landmarks + 0.2 * per_pixel  # all disparities 0.2 pixel short
+    held = solve(wrong, pixels, per_pixel=per_pixel, sigma=0.05, params=ResectParams(bias_sigma=0.0))
+    free = solve(wrong, pixels, per_pixel=per_pixel, sigma=0.05, params=ResectParams(bias_sigma=0.3))
+    assert free.bias == pytest.approx(-0.2, abs=0.03)
+    assert held.bias == pytest.approx(0.0, abs=1e-4)
+    error = [np.linalg.norm(f.T_local_left.translation - T.translation) for f in (free, held)]
+    assert error[0] < 0.3 * error[1]
+
+
+def test_without_motion_the_bias_stays_at_its_prior():
+    rng = np.random.default_rng(15)
+    landmarks = scene(rng, 100)
+    pixels = seen(RigidTransform.identity(), landmarks) + 0.2 * rng.standard_normal((100, 2))
+    found = solve(landmarks, pixels, per_pixel=stereo(landmarks, 100.0), sigma=0.2)
+    assert abs(found.bias) < 0.05
+    assert np.linalg.norm(found.T_local_left.translation) < 4 * np.sqrt(np.trace(found.covariance[:3, :3]))
 
 
 def test_uncertain_landmarks_count_less():
     rng = np.random.default_rng(7)
     T, landmarks = RigidTransform(np.eye(3), np.array([0.0, 0.0, 1.0])), scene(rng, 100)
-    sigmas = landmarks * np.where(np.arange(100)[:, None] < 50, 0.05, 0.001)
-    noisy = landmarks + sigmas * rng.standard_normal((100, 1))
+    sigma = np.where(np.arange(100) < 50, 5.0, 0.1)
+    per_pixel = 0.01 * landmarks
+    noisy = landmarks + per_pixel * (sigma * rng.standard_normal(100))[:, None]
     pixels = seen(T, landmarks)
-    weighted = solve(noisy, pixels, sigmas=sigmas)
+    weighted = solve(noisy, pixels, per_pixel=per_pixel, sigma=sigma)
     plain = solve(noisy, pixels, params=ResectParams(threshold=100.0))
     assert np.linalg.norm(weighted.T_local_left.translation - T.translation) < 0.2 * np.linalg.norm(
         plain.T_local_left.translation - T.translation
@@ -209,7 +241,7 @@ def test_no_common_pose_is_named():
 
 def test_collinear_landmarks_are_named():
     landmarks = np.linspace([-2.0, -1.0, 5.0], [2.0, 1.5, 9.0], 30)
-    with pytest.raises(DegenerateError, match="frame 7.*collinear"):
+    with pytest.raises(DegenerateError, match=r"frame 7.*collinear"):
         solve(landmarks, seen(RigidTransform.identity(), landmarks))
 
 
@@ -217,7 +249,7 @@ def test_landmarks_too_far_for_a_position_are_named():
     rng = np.random.default_rng(11)
     landmarks = CAMERA.rays(rng.uniform([298, 248], [302, 252], (40, 2))) * rng.uniform(1000, 1002, (40, 1))
     pixels = seen(RigidTransform.identity(), landmarks) + 0.2 * rng.standard_normal((40, 2))
-    with pytest.raises(DegenerateError, match="frame 7.*uncertain by"):
+    with pytest.raises(DegenerateError, match=r"frame 7.*uncertain by"):
         solve(landmarks, pixels)
 
 
@@ -244,7 +276,8 @@ def test_segment_keeps_the_key_pose_and_poses_each_frame():
     points[:30, 2] = np.nan  # lost
     position = landmarks.copy()
     position[75:] = np.nan  # without coordinates
-    found = resect_segment(points, Landmarks(position, np.zeros_like(position), {}), CAMERA, key, [4, 5, 6, 7], PARAMS)
+    known = Landmarks(position, np.zeros_like(position), np.zeros(80), {"too far": 3})
+    found = resect_segment(points, known, CAMERA, key, [4, 5, 6, 7], PARAMS)
     np.testing.assert_array_equal(found.poses[0], key.matrix34)
     np.testing.assert_allclose(found.poses, [T.matrix34 for T in truth], atol=1e-5)  # float32 pixels: 3e-5 px
     assert not found.covariance[0].any()
@@ -253,15 +286,19 @@ def test_segment_keeps_the_key_pose_and_poses_each_frame():
     points[:, 3] = np.nan
     with pytest.raises(DegenerateError, match=r"frame 7: too few landmarks: 0 .*3 too far"):
         resect_segment(
-            points, Landmarks(position, np.zeros_like(position), {"too far": 3}), CAMERA, key, [4, 5, 6, 7], PARAMS
+            points,
+            Landmarks(position, np.zeros_like(position), np.zeros(80), {"too far": 3}),
+            CAMERA,
+            key,
+            [4, 5, 6, 7],
+            PARAMS,
         )
 
 
 def test_solver_stands_still_on_singular_data():
     """One landmark seen many times: the damping keeps the step finite."""
-    obs = Observations(
-        np.tile([[[0.0, 0.0, 5.0]]], (1, 8, 1)), np.zeros((1, 8, 3)), np.full((1, 8, 2), 300.0), CAMERA, 1.0
-    )
-    poses, _ = levenberg_marquardt(obs, Poses(np.eye(3)[None], np.zeros((1, 3))), np.ones((1, 8), bool), 20)
+    one = np.tile([[[0.0, 0.0, 5.0]]], (1, 8, 1))
+    obs = Observations(one, 0.1 * one, np.zeros((1, 8)), np.full((1, 8, 2), 300.0), CAMERA, 1.0, 0.1)
+    poses, _ = levenberg_marquardt(obs, Poses.of(RigidTransform.identity()), np.ones((1, 8), bool), 20)
     assert np.isfinite(poses.t).all()
     assert np.abs(poses.t).max() < 5.0

@@ -14,7 +14,7 @@ def pose(rng, scale=1.0):
 
 def level(rng):
     """T_local_left: a rotation only, another tilt for every pair."""
-    return RigidTransform(rotation_exp(rng.normal(0, 0.3, 3) + [-1.9, 0, 0]), np.zeros(3))
+    return RigidTransform(rotation_exp(rng.normal([-1.9, 0, 0], 0.3)), np.zeros(3))
 
 
 def test_scan_equals_composition_by_hand_whatever_the_tilt_of_the_local_frames():
