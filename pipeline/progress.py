@@ -123,7 +123,7 @@ class Plain(Quiet):
 
     def failed(self, label: str, error: BaseException) -> None:
         """Say so at once."""
-        self._say(f"{label} failed: {' '.join(str(error).split())}")
+        self._say(f"{label} failed ({type(error).__name__})")
 
     def close(self, result: Result) -> None:
         """One closing line."""

@@ -117,8 +117,7 @@ def reconstruct(options: Options) -> int:
         ledger=folder / "ledger.jsonl",
         progress=progress.make(options.progress),
     )
-    if not result.ok and not options.keep_going:
-        _list_missing(graph, folder)
+    if not options.keep_going:
         result.check()
 
     from pipeline import outputs

@@ -74,8 +74,8 @@ def fit_plane(
     """
     if rays.shape[0] < MIN_POINTS:
         raise DegenerateError(
-            f"{rays.shape[0]} sampled pixels are matched, too few for a ground plane",
-            remedy="give the rig's pitch or an attitude, or check the images' texture and the match threshold",
+            f"only {rays.shape[0]} sampled pixels of the stereo pair are matched: no texture in common, too few for a ground",
+            remedy="check exposure and focus, and that left and right show one scene; or lower hfvm.texture",
         )
     # dh of height changes 1/Z by the share dh/h.
     tolerance = np.sqrt((2.0 * sigma) ** 2 + (relief * rho) ** 2)

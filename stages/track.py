@@ -127,14 +127,14 @@ class _State:
 def _advance(state: _State, frames: Sequence[Pyramid], motion: Motion, j: int, params: TrackParams) -> None:
     """Find all points of frame j - 1 in frame j."""
     predicted = state.expected + displacement_at(motion, state.expected)
-    smooth = local_affinity(state.expected, predicted, _known(predicted), state.expected)
-    matched = _match(frames[j - 1], frames[j], state.expected, predicted, smooth, params)
+    smooth, _ = fit_affinity(state.expected, predicted, _known(predicted), state.expected)
+    matched = match_points(frames[j - 1], frames[j], state.expected, predicted, smooth, params.radius)
     found = _known(matched)
     state.expected = np.where(found[:, None], matched, predicted)
     for birth in np.unique(state.birth):
         group = np.flatnonzero((state.birth == birth) & found)
-        origin = state.points[group, birth]
-        affinity = local_affinity(origin, matched[group], np.ones(group.size, bool), origin)
+        then = state.points[:, birth]
+        affinity, _ = fit_affinity(then, matched, found & _known(then), then[group])
         scale = np.linalg.svd(affinity, compute_uv=False)
         near = (scale[:, 0] < params.max_scale) & (scale[:, 1] > 1.0 / params.max_scale)
         for source, chosen in ((int(birth), near), (j - 1, ~near & _known(state.points[group, j - 1]))):
@@ -157,8 +157,7 @@ def _reseed(state: _State, frames: Sequence[Pyramid], j: int, params: TrackParam
     if len(seeds) == 0 or len(here) < NEIGHBOURS:
         return state
     affinity, shift = fit_affinity(here, there, np.ones(len(here), bool), seeds)
-    start = seeds + shift
-    matched = _match(frames[j], frames[0], seeds, start, affinity, params)
+    matched = match_points(frames[j], frames[0], seeds, seeds + shift, affinity, params.radius)
     place, error = _align(frames[j], frames[0], seeds, matched, affinity, params)
     new = _State.born(seeds, j, len(frames))
     new.points[:, 0], new.distance[:, 0] = place, error
@@ -168,11 +167,6 @@ def _reseed(state: _State, frames: Sequence[Pyramid], j: int, params: TrackParam
 def _known(points: Floats) -> Bools:
     """Which rows (n, 2) are not NaN."""
     return np.asarray(np.isfinite(points).all(axis=1))
-
-
-def _match(a: Pyramid, b: Pyramid, points: Floats, predicted: Floats, affinity: Floats, params: TrackParams) -> Floats:
-    """Feature-vector matches (n, 2) at full resolution; NaN not found, or the neighbourhood in b is masked."""
-    return match_points(a, b, points, predicted, affinity, params.radius)
 
 
 def _align(
@@ -204,12 +198,7 @@ def displacement_at(motion: Motion, points: Floats) -> Floats:
     any_known: Bools = np.asarray(known.any(axis=1))
     both[~any_known] = 0.0
     value = np.nanmedian(np.where(known[..., None] | ~any_known[:, None, None], both, np.nan), axis=1)
-    return np.where(any_known[:, None] & np.isfinite(points), value, np.nan)
-
-
-def local_affinity(origin: Floats, moved: Floats, use: Bools, at: Floats) -> Floats:
-    """Only the affinities (n, 2, 2) of :func:`fit_affinity`."""
-    return fit_affinity(origin, moved, use, at)[0]
+    return np.where((any_known & _known(points))[:, None], value, np.nan)
 
 
 def fit_affinity(origin: Floats, moved: Floats, use: Bools, at: Floats) -> tuple[Floats, Floats]:

@@ -98,7 +98,8 @@ def map_axes(extent: Extent, *, bar: bool = False, max_height: float = 6.0) -> t
     ax.set_autoscale_on(False)
     ax.locator_params(nbins=6)
     ax.set_xlabel("x, m", labelpad=1)
-    ax.set_ylabel("y, m", labelpad=1)
+    ax.set_ylabel("y, m")
+    ax.yaxis.set_label_coords(-0.5 / width, 0.5)
     cax = fig.add_axes((left / fig_w, 0.43 / fig_h, width / fig_w, 0.12 / fig_h)) if bar else None
     return fig, ax, cax
 

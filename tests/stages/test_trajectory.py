@@ -51,7 +51,7 @@ def test_covariance_is_that_of_sampled_trajectories():
     covs = [np.array([np.zeros((6, 6)), spread])] * 3
     mean, covariance, _ = chain(list(zip(local, covs, strict=True)), levels)
     samples = []
-    for _ in range(3000):
+    for _ in range(1500):
         noisy = []
         for poses in local:
             d = np.sqrt(np.diag(spread)) * rng.standard_normal(6)
@@ -63,5 +63,5 @@ def test_covariance_is_that_of_sampled_trajectories():
         samples.append(np.concatenate([end[:, 3] - mean[-1][:, 3], w]))
     measured = np.cov(np.array(samples).T)
     scale = np.sqrt(np.outer(np.diag(covariance[-1]), np.diag(covariance[-1])))
-    # The standard error of a correlation from 3000 samples is 0.018, of a variance 0.026.
-    np.testing.assert_allclose(measured / scale, covariance[-1] / scale, atol=0.1)
+    # The standard error of a correlation from 1500 samples is 0.026, of a variance 0.037.
+    np.testing.assert_allclose(measured / scale, covariance[-1] / scale, atol=0.13)
