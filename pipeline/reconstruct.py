@@ -2,13 +2,13 @@
 
 ::
 
-    image -> pyramid ----> motion (N, N+1) --------------> track (segment) --+
-                     \\                                                        +-> resect (segment) -> trajectory
-                      +--> hfvm (basic pair) -> level ----------------------- +                          |
-                      |         |                 |                          /                           |
-      rig ------------+---------+--> locus (local frame) -------------------+--> risk, path (local)      |
-                                |                                                                        |
-                                +--> locus (world lattice) <---------------------------------------------+
+    image -> pyramid ----> motion (N, N+1) -------------> track (segment) --+
+                     \\                                                       +--> resect (segment) -> trajectory
+                      +--> hfvm (basic pair) -> level ----------------------+                           |
+                      |         |                 |                         : (landmarks = "dem")       |
+      rig ------------+---------+--> locus (local frame) -------------------+--> risk, path (local)     |
+                                |                                                                       |
+                                +--> locus (world lattice) <--------------------------------------------+
                                          |
                                          +-> merge (world tile) -> risk, path (mission)
     leaves: accuracy (trajectory), dem_accuracy (local and merged DEM), path_check
@@ -145,16 +145,18 @@ class Reconstruction:
             motions=[self.motion[f] for f in segment[:-1]],
         )
         p.tracks.append(track)
+        # landmarks come from the disparity, or (resect.landmarks = "dem") where rays meet the local elevation model
+        surface = {"dem": p.local_dem[key]} if self.config.resect.landmarks == "dem" else {}
         p.resections.append(
             self._node(
                 "resect",
                 f"resect/{key}",
                 {"frames": segment},
                 track=track,
-                dem=p.local_dem[key],
                 disparity=p.disparity[key],
                 level=p.level[key],
                 rig=self.rig,
+                **surface,
             )
         )
 

@@ -74,7 +74,7 @@ def fit_plane(
     """
     if rays.shape[0] < MIN_POINTS:
         raise DegenerateError(
-            f"only {rays.shape[0]} sampled pixels of the stereo pair are matched: no texture in common, too few for a ground",
+            f"only {rays.shape[0]} sampled pixels are matched: left and right have no texture in common",
             remedy="check exposure and focus, and that left and right show one scene; or lower hfvm.texture",
         )
     # dh of height changes 1/Z by the share dh/h.

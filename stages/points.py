@@ -85,7 +85,7 @@ def find_points(
     good = np.isfinite(there_cost) & (there_cost <= threshold)
     good &= _on_valid(a_valid, points[who]) & _on_valid(b_valid, there)
     who, there, there_cost = who[good], there[good], there_cost[good]
-    back, _ = _search(b_image, a_image, there, points[who], np.asarray(np.linalg.inv(shape[who])), 2, weights)
+    back, _ = _search(b_image, a_image, there, points[who], np.asarray(np.linalg.inv(shape[who])), radius, weights)
     good = np.hypot(*(back - points[who]).T) <= BACKMATCH
     who = who[good]
     found[who], cost[who], ok[who] = there[good], there_cost[good], True

@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 
 from stages import pyramid
 from stages.declare import AnyArray, Array, Bundle, Inputs, Stage
-from stages.hfvm import consistency, hierarchy, plane, subpixel
+from stages.hfvm import consistency, hierarchy, plane, refine, subpixel
 from stages.hfvm.params import HfvmParams
-from stages.hfvm.refine import correlation, refine
 from stages.pyramid import Pyramid, PyramidParams
 from stages.validity import Mask, Validity, counts, mark, matched
 
@@ -115,10 +114,11 @@ def _finish(
         subpixel.local_mean(u, v, keep, hierarchy.SUM_RADIUS, mean_u, mean_v)
         u, v = mean_u, mean_v
     if params.refine:
-        u, v, rest = refine(left.images[0], right.images[0], right.valid[0], u, v, keep, params)
-        alike = correlation(rest, pair.deviation[0], keep)
+        u, v, rest = refine.refine(left.images[0], right.images[0], right.valid[0], u, v, keep, params)
+        alike = refine.correlation(rest, pair.deviation[0], keep)
         mark(validity, keep & (alike < params.correlation), Validity.OVER_THRESHOLD)
-        keep = validity == 0
+    mark(validity, keep & ~consistency.lands(u, v, keep, right.valid[0]), Validity.OUT_OF_IMAGE)
+    keep = validity == 0
     gone = consistency.isolated(forward.u, forward.v, keep, params.speckle)
     mark(validity, gone, Validity.SPECKLE)
     keep &= ~gone

@@ -62,6 +62,18 @@ def backmatch(lu, lv, ru, rv, right_valid, error):  # type: ignore[no-untyped-de
                 error[y, x] = e
 
 
+def lands(u: AnyArray, v: AnyArray, keep: AnyArray, right_valid: AnyArray) -> NDArray[np.bool_]:
+    """Pixels of ``keep`` whose displacement ends on a usable pixel inside the right image."""
+    y, x = np.nonzero(keep)
+    xr, yr = x + u[y, x], y + v[y, x]
+    rows, cols = right_valid.shape
+    good = (xr >= 0) & (xr <= cols - 1) & (yr >= 0) & (yr <= rows - 1)
+    good[good] = right_valid[np.rint(yr[good]).astype(np.int64), np.rint(xr[good]).astype(np.int64)] != 0
+    found = np.zeros(keep.shape, dtype=bool)
+    found[y[good], x[good]] = True
+    return found
+
+
 def isolated(u: AnyArray, v: AnyArray, keep: AnyArray, size: int) -> NDArray[np.bool_]:
     """Pixels of ``keep`` in patches of fewer than ``size`` pixels whose neighbours differ by at most one pixel.
 

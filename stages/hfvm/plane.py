@@ -135,7 +135,7 @@ def to_level_0(h: Matrix, level: int) -> Matrix:
 
 
 def distortion(h: Matrix, shape: tuple[int, int]) -> float:
-    """Departure of the homography's derivative from the identity: its greatest element, each the median over an image."""
+    """Greatest element of the derivative's departure from the identity, each taken as the median over an image."""
     y, x = np.meshgrid(np.linspace(0, shape[0] - 1, 5), np.linspace(0, shape[1] - 1, 5), indexing="ij")
     w = h[2, 0] * x + h[2, 1] * y + h[2, 2]
     if (w <= 0.1).any():

@@ -1,0 +1,91 @@
+import cv2
+import numpy as np
+import pytest
+from matching_scenes import pair
+
+from stages import motion
+from stages.declare import Bundle, check_outputs
+from stages.motion import MotionParams, coarse_motion
+from stages.pyramid import PyramidParams, build
+from stages.validity import defined, matched
+
+
+def forward_flow(x, y):
+    """Radial flow of a camera that moves forward over a plane, 40 pixels at the edge, and some rotation."""
+    return 0.2 * (x - 200) + 6.0, 0.2 * (y - 140) - 4.0
+
+
+@pytest.mark.parametrize("level", [1, 2])
+def test_radial_flow_in_pixels_of_level_0_on_the_grid_of_its_level(level):
+    a, b, *_ = pair(forward_flow, (280, 400))
+    found = coarse_motion(build(a, PyramidParams()), build(b, PyramidParams()), MotionParams(level=level))
+    scale = 2**level
+    assert found.level == level
+    assert found.column_disparity.shape == (280 // scale, 400 // scale)
+    row, col = np.indices(found.validity.shape)
+    x, y = (col + 0.5) * scale - 0.5, (row + 0.5) * scale - 0.5
+    u, v = forward_flow(x, y)
+    ok = matched(found.validity)
+    inside = (x + u > 16) & (x + u < 383) & (y + v > 16) & (y + v < 263)
+    assert ok[inside].mean() > 0.85
+    error = np.hypot(found.column_disparity - u, found.row_disparity - v)
+    # Sub-pixel at the coarse level: half of its pixel, as far as windows tell it.
+    assert np.percentile(error[ok & inside], 95) < 0.5 * scale
+    np.testing.assert_array_equal(np.isnan(found.column_disparity), ~defined(found.validity))
+
+
+def test_shallow_pyramids_answer_at_their_top():
+    a, b, *_ = pair(lambda x, y: (3.0, 0.0), (20, 30))
+    found = coarse_motion(build(a, PyramidParams()), build(b, PyramidParams()), MotionParams(level=3))
+    assert found.level == 1
+    assert found.validity.shape == (10, 15)
+
+
+def test_black_frames_have_no_motion():
+    black = build(np.zeros((64, 64), np.uint8), PyramidParams())
+    assert not defined(coarse_motion(black, black, MotionParams()).validity).any()
+
+
+def run(a, b, **params):
+    bundles = []
+    for image in (a, b):
+        p = build(image, PyramidParams())
+        arrays = {f"level_{n}": i for n, i in enumerate(p.images)} | {f"valid_{n}": i for n, i in enumerate(p.valid)}
+        bundles.append(Bundle(arrays, {"levels": p.levels}))
+    out = motion.STAGE.run(MotionParams(**params), {}, {"a": bundles[0], "b": bundles[1]})
+    check_outputs(motion.STAGE, out)
+    return out
+
+
+def test_overlap_of_a_frame_that_moved_by_a_quarter():
+    a, b, *_ = pair(lambda x, y: (50.0, 0.0), (160, 200))
+    out = run(a, b)
+    assert out.meta["level"] == 2
+    assert out.meta["median_column"] == pytest.approx(50, abs=1)
+    assert out.meta["overlap"] == pytest.approx(0.75, abs=0.05)
+    assert out.meta["overlap"] <= out.meta["match_rate"]
+
+
+def test_meta_of_nothing_is_none():
+    out = run(np.zeros((40, 40), np.uint8), np.zeros((40, 40), np.uint8))
+    assert out.meta["median_column"] is None
+    assert out.meta["match_rate"] == 0
+
+
+@pytest.mark.data
+def test_street_with_motion_of_tens_of_pixels(data_dir):
+    images = [cv2.imread(str(data_dir / "kitti06_51" / "image_l" / f"{n:06d}.png"), 0) for n in (20, 21)]
+    found = coarse_motion(*(build(i, PyramidParams()) for i in images), MotionParams())
+    corners = cv2.goodFeaturesToTrack(images[0], 400, 0.01, 10)
+    # An independent witness: Lucas-Kanade there and back.
+    options = {"winSize": (15, 15), "maxLevel": 4}
+    there, _, _ = cv2.calcOpticalFlowPyrLK(*images, corners, None, **options)
+    back, _, _ = cv2.calcOpticalFlowPyrLK(*images[::-1], there, None, **options)
+    good = np.hypot(*(back - corners).reshape(-1, 2).T) < 0.3
+    p, flow = corners.reshape(-1, 2)[good], (there - corners).reshape(-1, 2)[good]
+    col, row = np.rint((p.T + 0.5) / 4 - 0.5).astype(int)
+    row, col = row.clip(0, found.validity.shape[0] - 1), col.clip(0, found.validity.shape[1] - 1)
+    error = np.hypot(found.column_disparity[row, col] - flow[:, 0], found.row_disparity[row, col] - flow[:, 1])
+    assert np.hypot(*flow.T).max() > 50
+    assert np.mean(error < 4) > 0.95
+    assert matched(found.validity).mean() > 0.6
