@@ -61,10 +61,10 @@ class LocusParams(Params):
         "than the paper's 1, which serves the matching",
     )
     max_jump: float = Field(
-        2.0,
+        3.0,
         gt=0,
-        description="pixels; disparities around a solution that differ by more lie on two surfaces (one that both "
-        "cameras see in order changes by at most one pixel a pixel: two across the diagonal)",
+        description="pixels; range of the four disparities around a cell that is still one surface: relief seen at a "
+        "grazing angle changes by 1.5 px a pixel, twice that across the diagonal",
     )
 
 

@@ -45,6 +45,15 @@ def test_points_are_spread_even_where_one_corner_is_much_stronger():
     assert min(quarters.values()) >= 8  # 12 each if spread perfectly; by strength alone nearly all are in one
 
 
+def test_the_strongest_of_a_bucket_is_taken():
+    image = np.full((60, 60), 100.0, np.float32)
+    for row, col, step in ((12, 12, 20.0), (22, 22, 40.0), (12, 45, 20.0)):
+        image[row, col] += step
+    points = interest_points(image, np.ones(image.shape, np.uint8), 4, noise=0.5, border=8)  # buckets of 30 x 30
+    # A single pixel gives a plateau of windows that hold it; the third is the second of its bucket.
+    assert np.abs(points - [[22, 22], [45, 12], [12, 12]]).max() <= 2
+
+
 def test_noise_alone_gives_no_points():
     rng = np.random.default_rng(2)
     image = (100 + 1.5 * rng.standard_normal((200, 200))).astype(np.float32)

@@ -118,6 +118,17 @@ def test_thirty_percent_outliers_are_removed_and_no_more():
     assert error @ np.linalg.solve(found.covariance[:3, :3], error) < chi2.ppf(0.999, 3)
 
 
+def test_landmarks_just_over_the_threshold_go_one_by_one():
+    rng = np.random.default_rng(16)
+    T, landmarks = true_pose(rng), scene(rng, 80)
+    pixels = seen(T, landmarks) + 0.05 * rng.standard_normal((80, 2))
+    pixels[:16] += [1.4, 0.0]  # within reach of the robust start, and pulling all one way
+    found = solve(landmarks, pixels)
+    assert not found.inlier[:16].any()
+    assert found.inlier[16:].all()
+    assert found.residual[found.inlier].max() <= PARAMS.threshold
+
+
 def test_same_minimum_as_scipy():
     rng = np.random.default_rng(5)
     T, landmarks = true_pose(rng), scene(rng, 40)
