@@ -9,7 +9,8 @@ weighted by how exactly the landmark itself is known (see :mod:`stages.reproject
 is that weighted one in units of ``pixel_sigma``; for exact landmarks it is the paper's.
 
 Covariances here are 6 x 6 of ``(dt, dtheta)`` in the destination frame: position error in metres, then the rotation
-vector ``R_true = exp(dtheta) R`` in radians.
+vector ``R_true = exp(dtheta) R`` in radians. They tell of the measurements and of a shared error of the disparities;
+errors of the calibration (focal length, direction of the camera in the vehicle) are not in them.
 """
 
 from __future__ import annotations

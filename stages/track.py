@@ -249,7 +249,7 @@ STAGE = Stage(
     params=TrackParams,
     inputs=("frames*", "motions*"),
     outputs=(
-        Array("points", ("point", "frame", "uv"), "float32", "pixel", "column and row of the point", nodata="nan"),
+        Array("points", ("point", "frame", "uv"), "float32", "px", "column and row of the point", nodata="nan"),
         Array("birth", ("point",), "int16", "1", "index of the frame that the template is from"),
         Array("distance", ("point", "frame"), "float32", "grey level", "rms difference to the template", nodata="nan"),
     ),

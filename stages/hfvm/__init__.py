@@ -191,11 +191,11 @@ STAGE = Stage(
     inputs=("left", "right"),
     outputs=(
         Array(
-            "column_disparity", _GRID, "float32", "pixel", "column in the right image minus column", "nan", "left image"
+            "column_disparity", _GRID, "float32", "px", "column in the right image minus column", "nan", "left image"
         ),
-        Array("row_disparity", _GRID, "float32", "pixel", "row in the right image minus row", "nan", "left image"),
+        Array("row_disparity", _GRID, "float32", "px", "row in the right image minus row", "nan", "left image"),
         Array("validity", _GRID, "uint8", "1", "bit mask, see stages.validity", "", "left image"),
-        Array("backmatch_error", _GRID, "float32", "pixel", "error of matching there and back", "nan", "left image"),
+        Array("backmatch_error", _GRID, "float32", "px", "error of matching there and back", "nan", "left image"),
         Array("distance", _GRID, "float32", "1", "least feature distance", "nan", "left image"),
     ),
     requires=("numpy", "numba", "opencv-python-headless"),
