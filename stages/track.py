@@ -251,7 +251,7 @@ STAGE = Stage(
     outputs=(
         Array("points", ("point", "frame", "uv"), "float32", "px", "column and row of the point", nodata="nan"),
         Array("birth", ("point",), "int16", "1", "index of the frame that the template is from"),
-        Array("distance", ("point", "frame"), "float32", "grey level", "rms difference to the template", nodata="nan"),
+        Array("distance", ("point", "frame"), "float32", "grey", "rms difference to the template", nodata="nan"),
     ),
     requires=("numpy", "numba"),
     run=_run,
