@@ -92,6 +92,8 @@ def write_raster(
         "transform": from_origin(lattice.x0 - half, lattice.y0 + half, lattice.cell, lattice.cell),
         "nodata": nodata,
         "compress": "deflate",
+        "level": 1,
+        "num_threads": "all_cpus",
         "predictor": "yes",
         "blocksize": 256,
         "overview_resampling": "mode" if nodata is None else "average",
