@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import argparse
 import json
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +48,8 @@ def main() -> None:
     parser.add_argument("run", nargs="?", type=Path, default=Path("runs/mockup/latest"))
     parser.add_argument("--output", type=Path, default=Path("docs/overview.jpg"))
     given = parser.parse_args()
+    if not given.run.exists():
+        subprocess.run([sys.executable, "-m", "pipeline.cli", "reconstruct", given.run.parent.name], check=True)
     run = given.run.resolve()
 
     z, extent = raster(run / "dem.tif")
