@@ -89,7 +89,7 @@ def _write(sequence: Sequence, folder: Path, materialise: Materialise, pairs: tu
             _write_image(folder, camera, name, materialise(sequence.image(frame, camera)))
     _write_rig(sequence, folder)
     if sequence.truth is not None:
-        _write_rows(folder / "poses.txt", [pose.to_list() for pose in sequence.truth])
+        _write_rows(folder / "poses.txt", [_known(pose).to_list() for pose in sequence.truth])
     if sequence.times is not None:
         _write_rows(folder / "times.txt", [[t] for t in sequence.times])
     for frame in pairs:
@@ -166,7 +166,7 @@ def _write_dem(sequence: Sequence, folder: Path, frame: int, materialise: Materi
         "rows": y_max - y_min + 1,
         "cols": x_max - x_min + 1,
     }
-    T_truth_left = sequence.truth[frame]
+    T_truth_left = _known(sequence.truth[frame])
     local = RigidTransform(level_rotation(T_truth_left.rotation[2]), np.zeros(3))
     T_truth_local = T_truth_left @ local.inverse()
     truth = materialise(sequence.truth_dem(lattice, T_truth_local, (frame,)))
@@ -174,3 +174,9 @@ def _write_dem(sequence: Sequence, folder: Path, frame: int, materialise: Materi
     path.parent.mkdir(exist_ok=True)
     arrays: dict[str, Any] = {name: np.asarray(truth[name][:]) for name in ("elevation", "seen")}
     np.savez_compressed(path, T_truth_local=T_truth_local.matrix34, **arrays, **lattice)
+
+
+def _known(pose: RigidTransform | None) -> RigidTransform:
+    """A simulated pose: none has a gap."""
+    assert pose is not None
+    return pose

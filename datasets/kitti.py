@@ -26,8 +26,8 @@ from stages.geometry import Camera, Rig, RigidTransform, orthonormal
 PAIRS = (("image_0", "image_1"), ("image_2", "image_3"), ("image_l", "image_r"), ("left", "right"))
 """Names of the image folders, left and right; grey KITTI cameras before colour ones."""
 
-STREET = {"select.stride": 2, "locus.cell_size": 0.1}
-"""At street speed every fifth pair overlaps too little; 0.1 m resolves kerbs where the disparity does."""
+STREET = {"locus.cell_size": 0.1}
+"""0.1 m resolves kerbs where the disparity does."""
 
 
 @dataclass(frozen=True)

@@ -13,11 +13,15 @@ from typing import TYPE_CHECKING, Any, Protocol
 from stages.declare import Params
 from stages.errors import InputError
 from stages.geometry import Rig, RigidTransform
+from stages.lens import Lens
 
 if TYPE_CHECKING:
     from stages.vehicle import Vehicle
 
 CAMERAS = ("left", "right")
+
+Rows = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
+"""A 3 x 3 rotation, row by row."""
 
 
 @dataclass(frozen=True)
@@ -52,14 +56,19 @@ class Sequence:
     Attributes
     ----------
     name : short name, used for folders.
-    rig : the rig as it was *given* (it may be wrong by a calibration error).
+    rig : the rig as it was *given* (it may be wrong by a calibration error); its cameras are ideal: those that the
+        images have once their distortion is removed.
     frames : number of stereo pairs.
     image : ``image(frame, camera)`` with camera ``"left"`` or ``"right"``: source of ``image`` and ``valid``.
+    lenses : real optics by camera, where the images are distorted.
     frame_names : one name a frame (file stem).
     times : seconds, one a frame.
-    truth : T_truth_left of each frame, in any world frame, metres.
+    truth : T_truth_left of each frame, in any world frame, metres; None where the truth has a gap.
     truth_source : what the truth is, in words.
-    up : direction of "up" in each left camera frame (attitude).
+    up : direction of "up" in each left camera frame (attitude); None where it is not known.
+    attitude : R_reference_left of each frame from a sensor (gyroscope, compass); the reference is any inertial frame,
+        the same for all frames, and only differences between frames are used. None where it is not known.
+    odometry : T_odometry_left of each frame by dead reckoning, metres; predicts, and is never part of the result.
     pitch : downward pitch of the left camera's optical axis, radians, stated with the rig; roll 0.
     initial_pose : T_world_left of frame 0 handed in from outside.
     vehicle : the vehicle whose limits suit the scale of the sequence.
@@ -68,6 +77,7 @@ class Sequence:
     evaluation_window : (x_min, y_min, x_max, y_max), metres, local frame of a basic pair: where a DEM is judged.
     defaults : dotted configuration that suits the sequence.
     notes : facts that the report repeats.
+    warnings : what is suspicious but possible, one line each with the figure; a run prints them and goes on.
     parameters : the sequence's own settings by configuration section, all defaults filled.
     """
 
@@ -76,10 +86,13 @@ class Sequence:
     frames: int
     image: Callable[[int, str], Source]
     frame_names: tuple[str, ...]
+    lenses: Mapping[str, Lens] | None = None
     times: tuple[float, ...] | None = None
-    truth: tuple[RigidTransform, ...] | None = None
+    truth: tuple[RigidTransform | None, ...] | None = None
     truth_source: str = ""
-    up: tuple[tuple[float, float, float], ...] | None = None
+    up: tuple[tuple[float, float, float] | None, ...] | None = None
+    attitude: tuple[Rows | None, ...] | None = None
+    odometry: tuple[RigidTransform | None, ...] | None = None
     pitch: float | None = None
     initial_pose: RigidTransform | None = None
     vehicle: Vehicle | None = None
@@ -88,12 +101,13 @@ class Sequence:
     evaluation_window: tuple[float, float, float, float] | None = None
     defaults: Mapping[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
     parameters: Mapping[str, Params] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.frames < 1:
             raise InputError(f"sequence {self.name} has no frames", remedy="give a folder with at least one pair")
-        for what in ("frame_names", "times", "truth", "up"):
+        for what in ("frame_names", "times", "truth", "up", "attitude", "odometry"):
             values = getattr(self, what)
             if values is not None and len(values) != self.frames:
                 raise InputError(

@@ -1,4 +1,4 @@
-"""Sequences by name or by folder."""
+"""Sequences by name, by folder or by manifest."""
 
 from __future__ import annotations
 
@@ -9,11 +9,14 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from datasets import euroc, kitti
 from datasets.files import Digests
-from datasets.kitti import open_kitti, recognise
+from datasets.manifest import open_manifest
+from datasets.misalign import MisalignParams, misalign
 from datasets.mockup.params import SHORT, MockupParams
 from datasets.mockup.sequence import mockup
 from datasets.protocol import Sequence
+from stages.declare import Params
 from stages.errors import ConfigError, InputError
 
 BUILT_IN: dict[str, tuple[str, Mapping[str, Any]]] = {
@@ -21,15 +24,24 @@ BUILT_IN: dict[str, tuple[str, Mapping[str, Any]]] = {
     "mockup-short": ("the same in small: 9 pairs over a bed of 1.2 x 1.2 m", SHORT),
 }
 
+MANIFESTS: dict[str, str] = {
+    "devon_island": "10 pairs of a rover in a Mars-like desert, colour; its files lie in ${RILLE_DATA}/devon_island",
+    "nasa_k10": "one pair of NASA's K10 rover, raw and not rectified; its files lie in ${RILLE_DATA}/nasa_k10",
+}
+"""Manifests that come with the program, in the folder beside this module."""
+
 LAYOUTS = (
+    ("FILE.toml", "a manifest of any folder of stereo images; `rille init FOLDER` writes one"),
+    ("FOLDER", "with a manifest (NAME.rille.toml or manifest.toml) in it"),
     ("FOLDER", "two image folders (image_0/1, image_2/3, image_l/r or left/right), calib.txt; poses.txt, times.txt"),
+    ("FOLDER", "EuRoC: mav0/cam0, mav0/cam1, each with sensor.yaml and data; imu0, state_groundtruth_estimate0"),
     ("ROOT:NN", "KITTI odometry: ROOT/sequences/NN and ROOT/poses/NN.txt"),
 )
 
 
 def catalogue() -> list[tuple[str, str]]:
-    """Name and description of each built-in sequence and each folder layout."""
-    return [(name, words) for name, (words, _) in BUILT_IN.items()] + list(LAYOUTS)
+    """Name and description of each built-in sequence and each form that a path may have."""
+    return [(name, words) for name, (words, _) in BUILT_IN.items()] + [*MANIFESTS.items(), *LAYOUTS]
 
 
 def open_sequence(
@@ -39,8 +51,9 @@ def open_sequence(
 
     Parameters
     ----------
-    name_or_path : built-in name, folder, or ``ROOT:NN``.
-    overrides : parameters by section, e.g. ``{"mockup": {"seed": 3}}``; only the mockups have any.
+    name_or_path : built-in name, manifest, folder, or ``ROOT:NN``.
+    overrides : parameters by section: ``{"mockup": {"seed": 3}}`` for the mockups, ``{"misalign": {"rows": 3}}`` for
+        any sequence.
     memory : file that keeps the digests of image files from run to run.
 
     Raises
@@ -51,36 +64,92 @@ def open_sequence(
         An override is unknown, not permitted, or of another kind of sequence.
     """
     sections = dict(overrides or {})
+    warp = validated(MisalignParams, "misalign", sections.pop("misalign", {}))
     if name_or_path in BUILT_IN:
-        given = sections.pop("mockup", {})
+        preset, given = BUILT_IN[name_or_path][1], sections.pop("mockup", {})
         _none_left(sections, name_or_path)
-        return mockup(mockup_params(BUILT_IN[name_or_path][1], given), name_or_path)
-    _none_left(sections, name_or_path)
+        sequence = mockup(validated(MockupParams, "mockup", {**preset, **given}), name_or_path)
+    else:
+        _none_left(sections, name_or_path)
+        sequence = _of_files(name_or_path, Digests(memory))
+    return misalign(sequence, warp)
+
+
+def _of_files(name_or_path: str, digests: Digests) -> Sequence:
+    if name_or_path in MANIFESTS:
+        return open_manifest(Path(__file__).parent / "manifests" / f"{name_or_path}.toml", digests)
     path, number = _split(name_or_path)
+    if path.is_file() and path.suffix == ".toml":
+        return open_manifest(path, digests)
     if not path.is_dir():
         raise InputError(f"no sequence {name_or_path!r}", remedy=_suggestion(name_or_path))
-    layout = recognise(path, number)
+    layout = _recognised(path, number)
     if layout is None:
+        forms = "; or ".join(f"{form}: {words}" for form, words in LAYOUTS)
         raise InputError(
             f"{name_or_path} has no layout that is recognised",
-            remedy="; or ".join(f"{form}: {words}" for form, words in LAYOUTS),
+            remedy=f"try `rille init {name_or_path}`; forms: {forms}",
         )
-    return open_kitti(layout, Digests(memory))
+    if isinstance(layout, Path):
+        return open_manifest(layout, digests)
+    if isinstance(layout, euroc.Layout):
+        return euroc.open_euroc(layout, digests)
+    if not layout.calib.is_file():
+        raise InputError(
+            f"{name_or_path} has image folders {' and '.join(layout.pair)}, but no {layout.calib.name}",
+            remedy=f"`rille init {name_or_path}` writes a manifest that says what is needed",
+        )
+    return kitti.open_kitti(layout, digests)
 
 
-def mockup_params(preset: Mapping[str, Any], given: Mapping[str, Any]) -> MockupParams:
-    """Validated parameters of a mockup."""
+def _recognised(path: Path, number: str | None) -> Path | euroc.Layout | kitti.Layout | None:
+    """The manifest in a folder, else the layout that it has; a number asks for one of several sequences."""
+    if number is not None:
+        return kitti.recognise(path, number)
+    return folder_manifest(path) or euroc.recognise(path) or kitti.recognise(path)
+
+
+def opens_as_it_is(folder: Path) -> bool:
+    """Whether a folder needs no manifest: it has one, or a layout that says everything."""
+    layout = _recognised(folder, None)
+    return layout is not None and (not isinstance(layout, kitti.Layout) or layout.calib.is_file())
+
+
+def folder_manifest(folder: Path) -> Path | None:
+    """The one manifest in a folder, or None.
+
+    Raises
+    ------
+    InputError
+        There are several.
+    """
+    found = sorted(folder.glob("*.rille.toml")) or [p for p in (folder / "manifest.toml",) if p.is_file()]
+    if len(found) > 1:
+        names = ", ".join(path.name for path in found)
+        raise InputError(f"{folder} holds {len(found)} manifests: {names}", remedy=f"choose one, e.g. {found[0]}")
+    return found[0] if found else None
+
+
+def validated(kind: type[Params], section: str, values: Mapping[str, Any]) -> Any:
+    """``kind(**values)`` with complaints as one line that names the dotted key.
+
+    Raises
+    ------
+    ConfigError
+        A key is unknown or a value not permitted.
+    """
     try:
-        return MockupParams.model_validate({**preset, **given})
+        return kind.model_validate(dict(values))
     except ValidationError as error:
-        raise ConfigError("; ".join(_complaint(dict(e)) for e in error.errors()), remedy="") from error
+        lines = [_complaint(kind, section, dict(e)) for e in error.errors()]
+        raise ConfigError("; ".join(lines), remedy="") from error
 
 
-def _complaint(error: dict[str, Any]) -> str:
-    key = ".".join(str(part) for part in ("mockup", *error["loc"]))
+def _complaint(kind: type[Params], section: str, error: dict[str, Any]) -> str:
+    key = ".".join(str(part) for part in (section, *error["loc"]))
     if error["type"] == "extra_forbidden":
-        near = difflib.get_close_matches(str(error["loc"][0]), list(MockupParams.model_fields), n=1)
-        hint = f"did you mean 'mockup.{near[0]}'?" if near else f"known: {', '.join(sorted(MockupParams.model_fields))}"
+        near = difflib.get_close_matches(str(error["loc"][0]), list(kind.model_fields), n=1)
+        hint = f"did you mean '{section}.{near[0]}'?" if near else f"known: {', '.join(sorted(kind.model_fields))}"
         return f"unknown key {key!r} (value {error['input']!r}): {hint}"
     return f"{key} = {error['input']!r} is not permitted: {error['msg'][0].lower()}{error['msg'][1:]}"
 
@@ -100,6 +169,6 @@ def _split(name_or_path: str) -> tuple[Path, str | None]:
 
 
 def _suggestion(name: str) -> str:
-    near = difflib.get_close_matches(name, list(BUILT_IN), n=1, cutoff=0.5)
-    known = f"known names: {', '.join(BUILT_IN)}; or give a folder"
+    near = difflib.get_close_matches(name, [*BUILT_IN, *MANIFESTS], n=1, cutoff=0.5)
+    known = f"known names: {', '.join([*BUILT_IN, *MANIFESTS])}; or give a folder or a manifest"
     return f"did you mean {near[0]!r}? {known}" if near else known

@@ -1,4 +1,4 @@
-"""The command line: ``rille reconstruct | match | datasets | cache``.
+"""The command line: ``rille reconstruct | plan | check | init | calibrate | match | datasets | cache``.
 
 Exit codes: 0 complete; 1 failed; 2 usage, configuration or input; 3 finished with holes under ``--keep-going``;
 130 interrupted. Results go to stdout, progress and complaints to stderr. Heavy imports happen inside the commands, so
@@ -110,6 +110,158 @@ def reconstruct(
         progress="quiet" if quiet else progress,
     )
     return run.reconstruct(options)
+
+
+@app.command
+def plan(
+    seq: str = "mockup",
+    *,
+    assignments: Assignments = None,
+    config: Path | None = None,
+    frames: str | None = None,
+    jobs: int | None = None,
+    force: Annotated[list[str] | None, Parameter(negative="", consume_multiple=False)] = None,
+    cache: CacheFolder = None,
+    verbose: Annotated[bool, Parameter(name=["--verbose", "-v"], negative="")] = False,
+    debug: Annotated[bool, Parameter(negative="")] = False,
+) -> int:
+    """Say what `reconstruct` would compute, what is cached, and why each miss; nothing is computed.
+
+    Parameters
+    ----------
+    seq
+        As for reconstruct.
+    assignments
+        A parameter, section.key=value; may be repeated.
+    config
+        TOML file of parameters.
+    frames
+        Frame range START:STOP[:STEP]; all by default.
+    jobs
+        Workers that the estimate of the time is for; the number of cores by default.
+    force
+        Stage that would be recomputed although it is cached; may be repeated.
+    cache
+        Folder of cached artifacts; RILLE_CACHE or .rille/cache by default.
+    verbose
+        Each task with its reason.
+    debug
+        Show tracebacks.
+    """
+    _prepare(cache)
+    from pipeline import plan as command
+    from pipeline.run import Options
+
+    options = Options(
+        sequence=seq,
+        assignments=tuple(assignments or ()),
+        config=config,
+        frames=frames,
+        jobs=jobs,
+        force=frozenset(force or ()),
+        cache=cache_folder(cache),
+    )
+    return command.plan(options, verbose=verbose)
+
+
+@app.command
+def check(
+    seq: str,
+    *,
+    output: Annotated[Path | None, Parameter(name=["--output", "-o"])] = None,
+    assignments: Assignments = None,
+    frames: str | None = None,
+    cache: CacheFolder = None,
+    debug: Annotated[bool, Parameter(negative="")] = False,
+) -> int:
+    """Open everything of a sequence and judge it, one line each; a picture shows the first pair's epipolar residuals.
+
+    Parameters
+    ----------
+    seq
+        As for reconstruct.
+    output
+        PNG to write; SEQUENCE-check.png by default.
+    assignments
+        A parameter of the sequence, section.key=value; may be repeated.
+    frames
+        Frame range START:STOP[:STEP]; all by default.
+    cache
+        Folder of cached artifacts; RILLE_CACHE or .rille/cache by default.
+    debug
+        Show tracebacks.
+    """
+    _prepare(cache)
+    from pipeline import check as command
+    from pipeline.run import Options, choose_frames, settings
+
+    options = Options(sequence=seq, assignments=tuple(assignments or ()), frames=frames, cache=cache_folder(cache))
+    sequence, _, _ = settings(options)
+    return command.check(sequence, output=output, frames=choose_frames(frames, sequence.frames), cache=options.cache)
+
+
+@app.command
+def init(
+    directory: Path,
+    *,
+    output: Annotated[Path | None, Parameter(name=["--output", "-o"])] = None,
+    force: Annotated[bool, Parameter(negative="")] = False,
+    debug: Annotated[bool, Parameter(negative="")] = False,
+) -> int:
+    """Look at a folder of stereo images and write a commented manifest: what was found, and what is still needed.
+
+    Parameters
+    ----------
+    directory
+        Folder with the images, and with whatever is known of the cameras.
+    output
+        Manifest to write; by default DIRECTORY's name with .rille.toml, in the present folder.
+    force
+        Replace a manifest that is there.
+    debug
+        Show tracebacks.
+    """
+    from pipeline import init as command
+
+    return command.init(directory, output, force)
+
+
+@app.command
+def calibrate(
+    left: Path,
+    right: Path,
+    *,
+    square: float,
+    corners: str | None = None,
+    model: Literal["radtan", "radtan4", "rational", "fisheye"] = "radtan",
+    output: Annotated[Path, Parameter(name=["--output", "-o"])] = Path("rig.yaml"),
+    keep_bad: Annotated[bool, Parameter(negative="")] = False,
+    debug: Annotated[bool, Parameter(negative="")] = False,
+) -> int:
+    """Calibrate a stereo rig from pictures of a chessboard; prints the residual of each view.
+
+    Parameters
+    ----------
+    left
+        Folder or glob of the left camera's images.
+    right
+        The same of the right camera; views are paired by number.
+    square
+        Side of a square, metres.
+    corners
+        Inner corners, COLUMNSxROWS, for example 9x6; found by itself if not given.
+    model
+        Distortion model.
+    output
+        YAML file to write.
+    keep_bad
+        Use views too whose residuals are far above the others'.
+    debug
+        Show tracebacks.
+    """
+    from pipeline import calibrate as command
+
+    return command.calibrate(left, right, square=square, corners=corners, model=model, output=output, keep_bad=keep_bad)
 
 
 @app.command

@@ -21,11 +21,14 @@ from stages.declare import Params, Stage
 from stages.errors import ConfigError
 
 STAGE_MODULES: dict[str, str] = {
+    "undistort": "stages.undistort",
     "pyramid": "stages.pyramid",
     "motion": "stages.motion",
     "select": "stages.select",
     "hfvm": "stages.hfvm",
+    "orientation": "stages.orientation",
     "rig": "stages.rig",
+    "calibration": "stages.calibration",
     "level": "stages.level",
     "locus": "stages.locus",
     "track": "stages.track",
@@ -34,6 +37,9 @@ STAGE_MODULES: dict[str, str] = {
     "merge": "stages.merge",
     "risk": "stages.risk",
     "path": "stages.path",
+    "crosscheck": "stages.crosscheck",
+    "crosscheck_join": "stages.crosscheck_join",
+    "agreement": "stages.agreement",
     "truth": "stages.truth",
     "accuracy": "stages.accuracy",
     "dem_accuracy": "stages.dem_accuracy",
@@ -41,7 +47,7 @@ STAGE_MODULES: dict[str, str] = {
 }
 """Every stage of the chain by name; a section of the configuration where the stage has parameters."""
 
-DATASET_SECTIONS = ("mockup",)
+DATASET_SECTIONS = ("mockup", "misalign")
 """Sections that belong to a kind of sequence; the sequence validates them."""
 
 

@@ -29,7 +29,8 @@ class Handle:
     """A node of the graph and what became of it.
 
     ``status`` is ``pending``, ``running``, ``computed``, ``cached``, ``failed``, ``skipped`` or, when dry, ``planned``.
-    ``reason`` says in words why it was not found in the cache, or why it was skipped.
+    ``reason`` says in words why it was not found in the cache, or why it was skipped. ``earlier``, of a planned node,
+    is what the same label led to before: a plan takes its facts for what is to come.
     """
 
     index: int
@@ -37,6 +38,7 @@ class Handle:
     inputs: dict[str, Handle | list[Handle]]
     status: str = "pending"
     ref: Ref | None = None
+    earlier: Ref | None = None
     reason: str = ""
     key: str = ""
     seconds: float = 0.0

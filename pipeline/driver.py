@@ -6,7 +6,8 @@
 8
 
 A run that finds everything starts no worker. With ``dry=True`` nothing is computed: ``status`` of the handles is
-``cached`` or ``planned``, and ``reason`` says why (``rille plan``).
+``cached`` or ``planned``, and ``reason`` says why (``rille plan``). What depends on results still to come is laid out
+by those of an earlier run where there was one (``Result.assumed``), else it is not known (``Result.unknown``).
 
 What a stage raises is not tried again. What depends on it is skipped; with ``keep_going`` everything else finishes,
 without it nothing new is begun. A task whose worker process dies is tried three times. In every case the ledger
@@ -62,11 +63,17 @@ class Failure:
 
 @dataclass
 class Result:
-    """What became of a run. ``keys`` are the artifacts it used (roots for clearing the cache)."""
+    """What became of a run. ``keys`` are the artifacts it used (roots for clearing the cache).
+
+    Of a dry run: ``assumed`` are labels whose earlier result served to lay out what follows, ``unknown`` those that
+    hide it.
+    """
 
     counts: dict[str, Counts] = field(default_factory=dict)
     failures: list[Failure] = field(default_factory=list)
     keys: set[str] = field(default_factory=set)
+    assumed: list[str] = field(default_factory=list)
+    unknown: list[str] = field(default_factory=list)
     seconds: float = 0.0
     executor_started: bool = False
 
@@ -236,10 +243,11 @@ class _Run:
     def _expand(self) -> bool:
         """Call the first expansion whose handles are done; whether there was one."""
         for i, (handles, fn) in enumerate(self.expansions):
-            if all(h.done for h in handles):
+            if all(h.done or h.earlier for h in handles):
                 del self.expansions[i]
+                self.result.assumed += [h.label for h in handles if not h.done]
                 try:
-                    fn(*(h.ref for h in handles))
+                    fn(*(h.ref or h.earlier for h in handles))
                 except Exception as error:
                     self._failed(Failure(f"plan after {_labels(handles)}", "", error, Failed.of(error).traceback))
                 return True
@@ -286,6 +294,8 @@ class _Run:
 
     def _resolve(self, handle: Handle, status: str) -> None:
         handle.status = status
+        if status == "planned":
+            handle.earlier = explain.latest(self.store, handle.stage, handle.label)
         counts = self.result.counts.setdefault(handle.stage, Counts())
         setattr(counts, status, getattr(counts, status) + 1)
         counts.seconds += handle.seconds
@@ -317,6 +327,7 @@ class _Run:
                 self._resolve(handle, "skipped")
         for handles, _ in self.expansions:
             missing = [h for h in handles if not h.done]
+            self.result.unknown += [h.label for h in missing]
             self.ledger.note(f"plan after {_labels(handles)}", "planned" if self.dry else "skipped", _labels(missing))
 
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 if TYPE_CHECKING:
-    from pipeline.store import Store
+    from pipeline.store import Ref, Store
 
 KEPT = 4
 """Earlier keys remembered per label: enough for a user who goes back and forth between a few settings."""
@@ -49,6 +49,11 @@ def reason(store: Store, stage: str, label: str, key: str, recipe: Mapping[str, 
     found = min((differences(then, now) for then in earlier), key=len)
     told = found[:SHOWN] + ([f"and {len(found) - SHOWN} more"] if len(found) > SHOWN else [])
     return "; ".join(told) or "the key has another format"
+
+
+def latest(store: Store, stage: str, label: str) -> Ref | None:
+    """The latest artifact of a stage and label that is still there, whatever it was made from."""
+    return next((ref for k in _recall(_index(store, stage, label)) if (ref := store.lookup(stage, k))), None)
 
 
 def differences(then: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:

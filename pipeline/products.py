@@ -1,15 +1,20 @@
-"""Files for other programs: GeoTIFFs, the path as GeoJSON, the trajectory in KITTI's and TUM's formats.
+"""Files for other programs: GeoTIFFs with their QGIS styles, the path, the trajectory in KITTI's and TUM's formats.
 
 Every file is written beside its final name and moved there, so that a reader finds a whole file or none.
 """
 
 from __future__ import annotations
 
+import csv
+import io
 import json
 import os
+import struct
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from importlib import resources
 from pathlib import Path
+from string import Template
 from typing import Any
 
 import numpy as np
@@ -30,6 +35,11 @@ ENGINEERING_CRS = (
     'AXIS["x",east,ORDER[1]],AXIS["y",north,ORDER[2]],LENGTHUNIT["metre",1]]'
 )
 """WKT 2. GDAL keeps it, but rasterio's ``crs.is_valid`` is False for every engineering CRS: do not test that."""
+
+LINE_Z, POINT_Z = 1002, 1001
+"""Geometry types of ISO 19125 well-known binary."""
+GPKG_DATE = "2000-01-01T00:00:00.000Z"
+"""Written as time of change into every GeoPackage, so that equal paths make equal files."""
 
 
 @contextmanager
@@ -130,6 +140,65 @@ def write_path_geojson(path: Path, vertices: NDArray[np.float64], facts: Mapping
 
 def _feature(geometry: Mapping[str, Any] | None, properties: Mapping[str, Any]) -> dict[str, Any]:
     return {"type": "Feature", "geometry": geometry, "properties": dict(properties)}
+
+
+def write_path_gpkg(path: Path, vertices: NDArray[np.float64], facts: Mapping[str, Any]) -> None:
+    """Write the path as GeoPackage in the engineering CRS: layers ``path`` (line) and ``ends`` (start, target).
+
+    Parameters
+    ----------
+    vertices : (vertex, xyz) metres, world frame; where no path was found they are empty, ``path`` holds a feature
+        without geometry, and there is no layer ``ends``.
+    facts : properties of the line; those that are no text, number or truth value are left out.
+    """
+    import pyogrio
+    from pyogrio.raw import write
+
+    pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": GPKG_DATE})
+    given = {"name": "path", "frame": FRAME, "unit": "m"} | dict(facts)
+    kept = {name: value for name, value in given.items() if isinstance(value, str | int | float)}
+    columns = [np.array([value], dtype=object if isinstance(value, str) else None) for value in kept.values()]
+    common = {"driver": "GPKG", "crs": ENGINEERING_CRS}
+    line = _wkb(LINE_Z, vertices) if len(vertices) > 1 else None
+    with replacing(path) as temporary:
+        lines = np.array([line], dtype=object)
+        write(temporary, lines, columns, list(kept), layer="path", geometry_type="LineString Z", **common)
+        if len(vertices):
+            ends = np.array([_wkb(POINT_Z, vertices[at]) for at in (0, -1)], dtype=object)
+            names = [np.array(["start", "target"], dtype=object)]
+            write(temporary, ends, names, ["name"], layer="ends", geometry_type="Point Z", append=True, **common)
+
+
+def _wkb(kind: int, points: NDArray[np.float64]) -> bytes:
+    """Well-known binary, little-endian, of a point (3,) or a line (n, 3)."""
+    count = struct.pack("<I", len(points)) if kind == LINE_Z else b""
+    return struct.pack("<BI", 1, kind) + count + np.ascontiguousarray(points, dtype="<f8").tobytes()
+
+
+def write_style(path: Path, name: str, values: Mapping[str, float] | None = None) -> None:
+    """Write the QGIS style ``name``; beside a raster of the same stem QGIS applies it on opening.
+
+    Parameters
+    ----------
+    values : numbers to fill in by the names that the style has for them.
+    """
+    text = resources.files("pipeline").joinpath("styles", f"{name}.qml").read_text(encoding="utf-8")
+    write_text(path, Template(text).substitute({key: f"{value:.6g}" for key, value in (values or {}).items()}))
+
+
+def write_table(path: Path, columns: Mapping[str, Sequence[Any]]) -> None:
+    """Write columns of equal length as CSV (RFC 4180, but lines end in a line feed); what is not known stays empty."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows([_cell(value) for value in row] for row in zip(*columns.values(), strict=True))
+    write_text(path, out.getvalue())
+
+
+def _cell(value: Any) -> str:
+    if value is None or (isinstance(value, float) and not np.isfinite(value)):
+        return ""
+    return f"{value:.9g}" if isinstance(value, float) else str(value)
 
 
 def write_trajectory_kitti(path: Path, poses: NDArray[np.float64]) -> None:

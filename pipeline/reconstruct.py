@@ -2,16 +2,18 @@
 
 ::
 
-    image -> pyramid ----> motion (N, N+1) -------------> track (segment) --+
-                     \\                                                       +--> resect (segment) -> trajectory
-                      +--> hfvm (basic pair) -> level ----------------------+                           |
-                      |         |                 |                         : (landmarks = "dem")       |
-      rig ------------+---------+--> locus (local frame) -------------------+--> risk, path (local)     |
-                                |                                                                       |
-                                +--> locus (world lattice) <--------------------------------------------+
-                                         |
-                                         +-> merge (world tile) -> risk, path (mission)
-    leaves: accuracy (trajectory), dem_accuracy (local and merged DEM), path_check
+    image -> undistort -> pyramid -+-> motion (N, N+1) -+-> select: which pairs are basic
+             (if needed)           |                    +-> track (segment) --+
+                                   |                                          |
+                                   +-> hfvm (basic pair) -+-> level ----------+-> resect (segment) -> trajectory
+                                                          |     |               (landmarks)               |
+        given rig --+-> orientation (basic pair) <--------+     |                                         |
+                    |       +-> rig -> calibration -------+-----+-> locus (local frame)                   |
+                    |           (pooled; into level,      |           +-> risk, path (local)              |
+                    |            locus and resect)        +-> locus (world lattice) <---------------------+
+                    |                                           +-> merge (world tile) -> risk, path (mission)
+                    +-> crosscheck (window; images of both cameras) -> crosscheck_join -> agreement <- trajectory
+    leaves: accuracy (trajectory, crosscheck), dem_accuracy (local and merged DEM), path_check
 
 A segment needs landmarks only relative to its own basic pair, so all segments run at once; absolute poses are one
 cheap scan (``trajectory``), and Locus then runs a second time, straight on the shared world lattice: nothing is
@@ -24,10 +26,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
 from datasets.protocol import Sequence, Source
 from pipeline.config import STAGE_MODULES
 from pipeline.dag import Graph, Handle
 from pipeline.task import Ref
+from stages.crosscheck import windows
 from stages.declare import NoParams, Params
 from stages.geometry import RigidTransform
 from stages.lattice import Lattice, union
@@ -41,6 +46,14 @@ class Products:
     """Handles of what a run delivers; the report and the exporters read them once the graph has run."""
 
     images: dict[int, Handle] = field(default_factory=dict)
+    undistorted: dict[int, Handle] = field(default_factory=dict)
+    select: Handle | None = None
+    orientations: dict[int, Handle] = field(default_factory=dict)
+    rigs: dict[int, Handle] = field(default_factory=dict)
+    crosschecks: list[Handle] = field(default_factory=list)
+    crosscheck: Handle | None = None
+    agreement: Handle | None = None
+    crosscheck_accuracy: Handle | None = None
     disparity: dict[int, Handle] = field(default_factory=dict)
     level: dict[int, Handle] = field(default_factory=dict)
     local_dem: dict[int, Handle] = field(default_factory=dict)
@@ -67,42 +80,57 @@ class Reconstruction:
         self.graph, self.sequence, self.config, self.frames = graph, sequence, config, frames
         self.products = Products()
         self._sources: dict[str, Handle] = {}
+        self._images: dict[tuple[int, str], Handle] = {}
 
     def build(self) -> Products:
         """Lay out everything that is known beforehand; the rest follows by expansion."""
-        self.rig = self._node("rig", "rig", {"rig": self.sequence.rig.to_dict()})
         self.left = {f: self._pyramid(f, "left") for f in self.frames}
         self.motion = {
-            a: self._node("motion", f"motion/{a}-{b}", {"frames": [a, b]}, a=self.left[a], b=self.left[b])
+            a: self._node("motion", f"motion/{a}-{b}", self._turn(a, b), a=self.left[a], b=self.left[b])
             for a, b in zip(self.frames, self.frames[1:], strict=False)
         }
-        select = self._node("select", "select", {"frames": len(self.frames)})
-        self.graph.expand([select], self._after_select)
+        if self.config.crosscheck.enabled and len(self.frames) > 1:
+            self._crosscheck()
+        self.products.select = self._node(
+            "select", "select", {"frames": len(self.frames)}, motions=list(self.motion.values())
+        )
+        self.graph.expand([self.products.select], self._after_select)
         return self.products
 
     def _after_select(self, select: Ref) -> None:
+        p = self.products
         basic = [self.frames[i] for i in select.meta["basic"]]
         segments = [[self.frames[i] for i in part] for part in select.meta["segments"]]
+        for pair in basic:
+            p.disparity[pair] = self._node(
+                "hfvm", f"hfvm/{pair}", {"pair": pair}, left=self.left[pair], right=self._pyramid(pair, "right")
+            )
+            p.orientations[pair] = self._node(
+                "orientation",
+                f"orientation/{pair}",
+                {"pair": pair, "rig": self.sequence.rig.to_dict()},
+                disparity=p.disparity[pair],
+            )
+        self._rigs(basic)
         for pair in basic:
             self._basic_pair(pair)
         for segment in segments:
             self._segment(segment)
-        p = self.products
         p.trajectory = self._node(
             "trajectory",
             "trajectory",
             {"frames": list(self.frames)},
             segments=p.resections,
-            levels=[p.level[s[0]] for s in segments],
+            levels=[p.level[s[0]] for s in segments] or [p.level[basic[0]]],
         )
-        self._trajectory_accuracy()
+        self._assess_trajectory()
         for pair in basic:
             p.world_dem[pair] = self._node(
                 "locus",
                 f"locus/world/{pair}",
                 {"pair": pair, "frame": "world", "row": self.frames.index(pair)},
                 disparity=p.disparity[pair],
-                rig=self.rig,
+                rig=self.calibration[pair],
                 left=self.left[pair],
                 level=p.level[pair],
                 reference=p.level[basic[0]],
@@ -111,27 +139,40 @@ class Reconstruction:
             )
         self.graph.expand([*p.world_dem.values(), p.trajectory], self._after_world)
 
+    def _rigs(self, basic: list[int]) -> None:
+        """The rig that each basic pair is reconstructed with: one for all, or one each."""
+        p = self.products
+        if self.config.rig.mode == "per_pair":
+            p.rigs = {k: self._rig([k], f"/{k}") for k in basic}
+            self.calibration = {k: self._node("calibration", f"calibration/{k}", {}, rig=p.rigs[k]) for k in basic}
+            return
+        rig = self._rig(basic, "")
+        p.rigs = dict.fromkeys(basic, rig)
+        self.calibration = dict.fromkeys(basic, self._node("calibration", "calibration", {}, rig=rig))
+
+    def _rig(self, pairs: list[int], which: str) -> Handle:
+        orientations = [self.products.orientations[k] for k in pairs]
+        return self._node("rig", f"rig{which}", {"rig": self.sequence.rig.to_dict()}, orientations=orientations)
+
     def _basic_pair(self, pair: int) -> None:
         """Stereo pair to local elevation model, risk map and path (stop and think)."""
         p = self.products
-        right = self._pyramid(pair, "right")
-        p.disparity[pair] = self._node("hfvm", f"hfvm/{pair}", {"pair": pair}, left=self.left[pair], right=right)
         p.level[pair] = self._node(
-            "level", f"level/{pair}", self._vertical(pair), disparity=p.disparity[pair], rig=self.rig
+            "level", f"level/{pair}", self._vertical(pair), disparity=p.disparity[pair], rig=self.calibration[pair]
         )
         p.local_dem[pair] = self._node(
             "locus",
             f"locus/local/{pair}",
             {"pair": pair, "frame": "local"},
             disparity=p.disparity[pair],
-            rig=self.rig,
+            rig=self.calibration[pair],
             left=self.left[pair],
             level=p.level[pair],
             reference=p.level[next(iter(p.level))],  # cells and extent of the first pair serve all, so that they merge
         )
         p.local_risk[pair] = self._risk(f"risk/local/{pair}", [p.local_dem[pair]])
         p.local_path[pair] = self._node("path", f"path/local/{pair}", {"use": "local"}, risk=p.local_risk[pair])
-        if self.sequence.truth_dem is not None and self.sequence.truth is not None:
+        if self.sequence.truth_dem is not None and self._truth(pair) is not None:
             self.graph.expand([p.level[pair], p.local_dem[pair]], lambda *refs, k=pair: self._local_accuracy(k, *refs))
 
     def _segment(self, segment: list[int]) -> None:
@@ -151,13 +192,30 @@ class Reconstruction:
             self._node(
                 "resect",
                 f"resect/{key}",
-                {"frames": segment},
+                {"frames": segment} | self._prediction(segment),
                 track=track,
                 disparity=p.disparity[key],
                 level=p.level[key],
-                rig=self.rig,
+                rig=self.calibration[key],
                 **surface,
             )
+        )
+
+    def _crosscheck(self) -> None:
+        """Structure from motion by another program, in windows; it knows nothing of our trajectory, nor we of its."""
+        p, rig = self.products, self.sequence.rig.to_dict()
+        for window in windows(self.frames, self.config.crosscheck):
+            p.crosschecks.append(
+                self._node(
+                    "crosscheck",
+                    f"crosscheck/{window[0]}-{window[-1]}",
+                    {"frames": window, "rig": rig},
+                    left=[self._image(f, "left") for f in window],
+                    right=[self._image(f, "right") for f in window],
+                )
+            )
+        p.crosscheck = self._node(
+            "crosscheck_join", "crosscheck_join", {"frames": list(self.frames)}, windows=p.crosschecks
         )
 
     def _after_world(self, *refs: Ref) -> None:
@@ -183,29 +241,47 @@ class Reconstruction:
         p.risk = self._risk("risk/world", p.tiles)
         heading = _heading(trajectory.meta)
         p.path = self._node("path", "path/world", {"use": "world", "heading": heading}, risk=p.risk)
-        if self.sequence.truth_dem is not None and self.sequence.truth is not None:
+        if self.sequence.truth_dem is not None and self._truth(pairs[0]) is not None:
             self.graph.expand([p.level[pairs[0]]], lambda level: self._world_accuracy(whole, pairs, level))
 
     # -- assessment: the only readers of truth ------------------------------------------------------------------
 
-    def _trajectory_accuracy(self) -> None:
-        if self.sequence.truth is None or self.products.trajectory is None:
+    def _truth(self, frame: int) -> RigidTransform | None:
+        return None if self.sequence.truth is None else self.sequence.truth[frame]
+
+    def _assess_trajectory(self) -> None:
+        """Against the other program's, and both against truth where there is one."""
+        p = self.products
+        assert p.trajectory is not None
+        if p.crosscheck is not None:
+            p.agreement = self._node("agreement", "agreement", {}, trajectory=p.trajectory, crosscheck=p.crosscheck)
+        true = [self._truth(f) for f in self.frames]
+        if all(pose is None for pose in true):
             return
         truth = self._node(
             "truth",
             "truth",
             {
-                "poses": [self.sequence.truth[f].to_list() for f in self.frames],
+                "poses": [None if pose is None else pose.to_list() for pose in true],
                 "source": self.sequence.truth_source,
                 "frames": list(self.frames),
             },
         )
-        self.products.accuracy = self._node(
-            "accuracy", "accuracy", {}, trajectory=self.products.trajectory, truth=truth
-        )
+        p.accuracy = self._node("accuracy", "accuracy", {}, trajectory=p.trajectory, truth=truth)
+        if p.crosscheck is not None:
+            self.graph.expand([p.crosscheck], lambda found: self._crosscheck_accuracy(found, truth))
+
+    def _crosscheck_accuracy(self, found: Ref, truth: Handle) -> None:
+        """The other program's trajectory against truth, where it has one there."""
+        p, positions = self.products, found.meta["positions"]
+        judged = [self._truth(f) for f, position in zip(found.meta["frames"], positions, strict=True) if position]
+        if p.crosscheck is not None and any(pose is not None for pose in judged):
+            p.crosscheck_accuracy = self._node(
+                "accuracy", "accuracy/crosscheck", {}, trajectory=p.crosscheck, truth=truth
+            )
 
     def _local_accuracy(self, pair: int, level: Ref, dem: Ref) -> None:
-        truth = self._truth_dem(Lattice.from_dict(dem.meta["lattice"]), pair, level, (pair,))
+        truth = self._truth_dem(Lattice.from_dict(dem.meta["lattice"]), pair, level, (pair,), "local")
         args: dict[str, Any] = {"pair": pair}
         if self.sequence.evaluation_window is not None:
             args["window"] = list(self.sequence.evaluation_window)
@@ -215,21 +291,21 @@ class Reconstruction:
 
     def _world_accuracy(self, whole: Lattice, pairs: list[int], level: Ref) -> None:
         p = self.products
-        truth = self._truth_dem(whole, pairs[0], level, tuple(pairs))
+        truth = self._truth_dem(whole, pairs[0], level, tuple(pairs), "world")
         p.dem_accuracy = self._node("dem_accuracy", "dem_accuracy/world", {}, dem=p.tiles, truth=truth)
         p.truth_risk = self._risk("risk/truth", [truth])
         assert p.path is not None
         p.path_check = self._node("path_check", "path_check", {}, path=p.path, risk=p.truth_risk)
 
-    def _truth_dem(self, lattice: Lattice, pair: int, level: Ref, seen_by: tuple[int, ...]) -> Handle:
+    def _truth_dem(self, lattice: Lattice, pair: int, level: Ref, seen_by: tuple[int, ...], scope: str) -> Handle:
         """Exact elevations in the levelled frame of ``pair`` (for the first pair: the world)."""
-        assert self.sequence.truth is not None
+        T_truth_left = self._truth(pair)
+        assert T_truth_left is not None
         assert self.sequence.truth_dem is not None
         T_local_left = RigidTransform.from_matrix(level.meta["T_local_left"])
-        T_truth_local = self.sequence.truth[pair] @ T_local_left.inverse()
-        return self._source(
-            self.sequence.truth_dem(lattice.to_dict(), T_truth_local, seen_by), f"truth_dem/{pair}-{len(seen_by)}"
-        )
+        T_truth_local = T_truth_left @ T_local_left.inverse()
+        source = self.sequence.truth_dem(lattice.to_dict(), T_truth_local, seen_by)
+        return self._source(source, f"truth_dem/{scope}/{pair}")
 
     # -- small things ------------------------------------------------------------------------------------------
 
@@ -237,26 +313,65 @@ class Reconstruction:
         """What is known of the vertical of a pair, most trusted first."""
         s = self.sequence
         args: dict[str, Any] = {"pair": pair}
-        if s.up is not None:
-            args["up"] = list(s.up[pair])
+        up = None if s.up is None else s.up[pair]
+        if up is not None:
+            args["up"] = list(up)
         if s.initial_pose is not None and pair == self.frames[0]:
             args["initial_up"] = [float(v) for v in s.initial_pose.rotation[2]]
         if s.pitch is not None:
             args["pitch"] = s.pitch
         return args
 
+    def _turn(self, a: int, b: int) -> dict[str, Any]:
+        """What is known of the rotation of the left camera from frame to frame."""
+        args: dict[str, Any] = {"frames": [a, b]}
+        before, after = (None if self.sequence.attitude is None else self.sequence.attitude[f] for f in (a, b))
+        if before is None or after is None:
+            return args
+        rotation = np.array(after).T @ np.array(before)
+        return args | {"rotation": rotation.tolist(), "camera": self.sequence.rig.left.to_dict()}
+
+    def _prediction(self, segment: list[int]) -> dict[str, Any]:
+        """Poses of a segment's frames in its key frame by dead reckoning."""
+        known = self.sequence.odometry
+        key = None if known is None else known[segment[0]]
+        if known is None or key is None:
+            return {}
+        poses = [known[f] for f in segment]
+        return {"prediction": [None if T is None else (key.inverse() @ T).to_list() for T in poses]}
+
     def _risk(self, label: str, dems: list[Handle]) -> Handle:
         return self._node("risk", label, {"vehicle": self.config.vehicle.model_dump(mode="json")}, dem=dems)
 
     def _pyramid(self, frame: int, camera: str) -> Handle:
+        return self._node("pyramid", f"pyramid/{camera}/{frame}", {}, image=self._image(frame, camera))
+
+    def _image(self, frame: int, camera: str) -> Handle:
+        """One image as an ideal camera would have taken it."""
+        if (frame, camera) not in self._images:
+            self._images[frame, camera] = self._undistorted(frame, camera)
+        return self._images[frame, camera]
+
+    def _undistorted(self, frame: int, camera: str) -> Handle:
         image = self._source(self.sequence.image(frame, camera), f"image/{camera}/{frame}")
         if camera == "left":
             self.products.images[frame] = image
-        return self._node("pyramid", f"pyramid/{camera}/{frame}", {}, image=image)
+        lens = (self.sequence.lenses or {}).get(camera)
+        if lens is None:
+            return image
+        ideal = self.sequence.rig.left if camera == "left" else self.sequence.rig.right
+        args = {"lens": lens.to_dict(), "camera": ideal.to_dict(), "frame": frame, "camera_name": camera}
+        image = self._node("undistort", f"undistort/{camera}/{frame}", args, image=image)
+        if camera == "left":
+            self.products.undistorted[frame] = image
+        return image
 
     def _source(self, source: Source, label: str) -> Handle:
-        """Node of a source; one that several others need (a rendered scene) is made once."""
-        inputs = {port: self._shared(upstream) for port, upstream in source.inputs.items()}
+        """Node of a source, and of what it needs; what is the same for all frames (a rendered scene) is made once."""
+        inputs = {
+            port: self._source(upstream, f"{label}/{port}") if upstream.args else self._shared(upstream)
+            for port, upstream in source.inputs.items()
+        }
         return self.graph.node(source.module, label, source.params, dict(source.args), dict(source.hints), inputs)
 
     def _shared(self, source: Source) -> Handle:

@@ -17,12 +17,15 @@ from typing import Any
 
 from datasets.protocol import Sequence
 from pipeline import config as configuration
+from pipeline.dag import Graph
 from pipeline.store import Store
 from stages.declare import Bundle
 from stages.errors import ConfigError, RilleError
 
 COMPLETE, FAILED, HOLES = 0, 1, 3
-DISTRIBUTIONS = ("rille", "numpy", "numba", "scipy", "opencv-python-headless", "dask", "zarr", "rasterio")
+DISTRIBUTIONS = (
+    *("rille", "numpy", "numba", "scipy", "opencv-python-headless", "dask", "zarr", "rasterio", "pyogrio", "pycolmap"),
+)
 
 
 @dataclass(frozen=True)
@@ -69,8 +72,8 @@ def choose_frames(text: str | None, count: int) -> tuple[int, ...]:
     if (parts[1] or 0) > count or (parts[0] or 0) >= count:
         raise ConfigError(f"--frames {text!r} reaches beyond the sequence's {count} frames", remedy=remedy)
     chosen = tuple(range(count)[slice(*parts)])
-    if len(chosen) < 2:
-        raise ConfigError(f"--frames {text!r} leaves {len(chosen)} frame", remedy="a trajectory needs at least two")
+    if not chosen:
+        raise ConfigError(f"--frames {text!r} leaves no frame", remedy="widen the range")
     return chosen
 
 
@@ -91,15 +94,27 @@ def settings(options: Options) -> tuple[Sequence, Any, str]:
     return sequence, config, source
 
 
+def warn(sequence: Sequence) -> None:
+    """Say on stderr what is suspicious but possible in the input."""
+    for line in sequence.warnings:
+        print(f"rille: warning: {' '.join(line.split())}", file=sys.stderr)
+
+
+def warn_of_results(graph: Graph) -> None:
+    """Say on stderr what stages found suspicious, each thing once."""
+    for line in dict.fromkeys(w for h in graph.nodes if h.ref is not None for w in h.ref.meta.get("warnings", ())):
+        print(f"rille: warning: {' '.join(line.split())}", file=sys.stderr)
+
+
 def reconstruct(options: Options) -> int:
     """Run the whole chain; gives the exit code. Running the same options again resumes."""
     from pipeline import driver, progress
-    from pipeline.dag import Graph
     from pipeline.reconstruct import Reconstruction
 
     _known_stages(options.force)
     started = datetime.now(UTC)
     sequence, config, vehicle_source = settings(options)
+    warn(sequence)
     frames = choose_frames(options.frames, sequence.frames)
     text = _header(options) + configuration.to_toml(config, sequence.parameters)
     folder = _make_folder(options.runs / sequence.name, started, text + repr(frames))
@@ -141,6 +156,7 @@ def reconstruct(options: Options) -> int:
     )
     outputs.write(folder, view)
     _point_latest(folder)
+    warn_of_results(graph)
     total = result.total()
     print(f"{folder}  computed {total.computed}, cached {total.cached}, missing {total.failed + total.skipped}")
     if result.ok:
@@ -183,7 +199,7 @@ def _point_latest(folder: Path) -> None:
     link.replace(folder.parent / "latest")
 
 
-def _list_missing(graph: Any, folder: Path) -> None:
+def _list_missing(graph: Graph, folder: Path) -> None:
     """Say on stderr what is missing and why: failures in full, what was skipped for them counted."""
     failed = [h for h in graph.nodes if h.status == "failed"]
     skipped = [h for h in graph.nodes if h.status == "skipped"]

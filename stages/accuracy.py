@@ -1,13 +1,14 @@
 """Trajectory against truth: absolute and relative errors, displacements, drift (section 7.4, Figure 9).
 
-``P_i`` are estimated, ``Q_i`` true poses of the left camera. Frames without an estimate are counted.
+``P_i`` are estimated, ``Q_i`` true poses of the left camera. Frames without an estimate, and frames without truth, are
+counted and left out. Where truth has a gap, its path is taken to be straight, which is the least that it can be.
 
 * ATE: RMS distance of the positions after the best rotation and translation (Umeyama 1991,
   doi:10.1109/34.88573, without scale), and after making the first poses equal;
 * RPE: ``(Q_i^-1 Q_i+1)^-1 (P_i^-1 P_i+1)`` of successive frames (Sturm et al. 2012, doi:10.1109/IROS.2012.6385773);
 * drift: error of the last position after making the first poses equal, over the true length of the path;
 * KITTI: relative error of all sections of 100, 200 ... 800 m that start every tenth frame, over their length
-  (Geiger et al. 2012, doi:10.1109/CVPR.2012.6248074, and its development kit).
+  (Geiger et al. 2012, doi:10.1109/CVPR.2012.6248074, and its development kit); not over a gap of the truth.
 """
 
 from __future__ import annotations
@@ -41,40 +42,54 @@ def trajectory_accuracy(estimate: Floats, truth: Floats) -> tuple[dict[str, Floa
     Parameters
     ----------
     estimate : (frame, 3, 4) T_world_left, metres; NaN where a frame has no pose.
-    truth : (frame, 3, 4) T_truth_left of the same frames.
+    truth : (frame, 3, 4) T_truth_left of the same frames; NaN where there is no truth.
 
     Returns
     -------
     Arrays ``position``, ``position_truth`` (frame, xyz) and ``displacement``, ``displacement_truth`` (step, xyz), all
-    in the world frame (truth brought there by the first posed frame), and metrics by name.
+    in the world frame (truth brought there by the first frame that has both), and metrics by name.
 
     Raises
     ------
     InputError
-        The numbers of frames differ or no frame has a pose.
+        The numbers of frames differ, no frame has a pose, or none that has one has truth.
     """
     if estimate.shape != truth.shape:
         raise InputError(f"{len(estimate)} estimated and {len(truth)} true poses do not match")
-    posed = np.flatnonzero(np.isfinite(estimate).all(axis=(1, 2)))
-    if len(posed) == 0:
+    has_pose, has_truth = posed(estimate), posed(truth)
+    if not has_pose.any():
         raise InputError("no frame has a pose", remedy="see why tracking or resection failed")
+    judged = np.flatnonzero(has_pose & has_truth)
+    if len(judged) == 0:
+        raise InputError("no frame with a pose has truth", remedy="give truth that covers the chosen frames")
     P, Q = _square(estimate), _square(truth)
-    aligned = P[posed[0]] @ _inverse(Q[posed[0]]) @ Q
+    aligned = P[judged[0]] @ _inverse(Q[judged[0]]) @ Q
     arrays = {
         "position": P[:, :3, 3].copy(),
         "position_truth": aligned[:, :3, 3].copy(),
         "displacement": np.diff(P[:, :3, 3], axis=0),
         "displacement_truth": np.diff(aligned[:, :3, 3], axis=0),
     }
-    metrics = {
-        "frames": metric(len(P), "frames", "frames that were to be posed"),
-        "frames_missing": metric(len(P) - len(posed), "frames", "of them without a pose"),
-    }
-    metrics |= _absolute(P[posed], Q[posed], aligned[posed])
-    metrics |= _drift(P, aligned, posed)
+    metrics = _counts(has_pose, has_truth)
+    metrics |= _absolute(P[judged], Q[judged], aligned[judged])
+    metrics |= _drift(P, aligned, judged)
     metrics |= _relative(P, Q)
     metrics |= _displacement(arrays["displacement"], arrays["displacement_truth"])
     return arrays, metrics | _kitti(P, Q)
+
+
+def posed(poses: Floats) -> NDArray[np.bool_]:
+    """Which of the poses (frame, 3, 4) are there, i.e. without NaN."""
+    return np.asarray(np.isfinite(poses).all(axis=(1, 2)))
+
+
+def _counts(has_pose: NDArray[np.bool_], has_truth: NDArray[np.bool_]) -> dict[str, Metric]:
+    return {
+        "frames": metric(len(has_pose), "frames", "frames that were to be posed"),
+        "frames_missing": metric(int((~has_pose).sum()), "frames", "of them without a pose"),
+        "frames_without_truth": metric(int((~has_truth).sum()), "frames", "of them without truth, left out"),
+        "frames_judged": metric(int((has_pose & has_truth).sum()), "frames", "of them with a pose and truth"),
+    }
 
 
 def umeyama(source: Floats, target: Floats) -> tuple[Floats, Floats]:
@@ -99,18 +114,22 @@ def _absolute(P: Floats, Q: Floats, aligned: Floats) -> dict[str, Metric]:
     }
 
 
-def _drift(P: Floats, aligned: Floats, posed: NDArray[np.intp]) -> dict[str, Metric]:
-    last = posed[-1]
-    length = float(np.linalg.norm(np.diff(aligned[posed[0] : last + 1, :3, 3], axis=0), axis=1).sum())
+def _drift(P: Floats, aligned: Floats, judged: NDArray[np.intp]) -> dict[str, Metric]:
+    last = judged[-1]
+    along, gaps = _along(aligned[judged[0] : last + 1])
+    length = float(along[-1])
     error = float(np.linalg.norm(P[last, :3, 3] - aligned[last, :3, 3]))
     turn = math.degrees(float(_angle(_inverse(aligned[last]) @ P[last])))
     percent = 100.0 * error / length if length > 0 else None
     how = "error of the last position with the first poses made equal"
+    bridged = f", straight over {gaps} gap{'s' if gaps > 1 else ''} of the truth" if gaps else ""
     return {
-        "path_length": metric(length, "m", "true length from the first to the last posed frame"),
+        "path_length": metric(length, "m", f"true length from the first to the last posed frame{bridged}"),
         "final_error": metric(error, "m", how),
         "final_rotation_error": metric(turn, "deg", "rotation error of the last pose, first poses made equal"),
-        "drift": metric(percent, "%", f"{how}, over the true length" if length > 0 else "the camera did not move"),
+        "drift": metric(
+            percent, "%", f"{how}, over the true length{bridged}" if length > 0 else "the camera did not move"
+        ),
     }
 
 
@@ -145,19 +164,20 @@ def _displacement(estimate: Floats, truth: Floats) -> dict[str, Metric]:
 
 
 def _kitti(P: Floats, Q: Floats) -> dict[str, Metric]:
-    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(Q[:, :3, 3], axis=0), axis=1))])
+    along, _ = _along(Q)
+    has_truth = np.isfinite(Q[:, 0, 0])
     errors = []
     for first in range(0, len(Q), KITTI_STEP):
         for length in KITTI_LENGTHS:
             last = int(np.searchsorted(along, along[first] + length, side="right"))
-            if last >= len(Q) or not np.isfinite(P[[first, last]]).all():
+            if last >= len(Q) or not np.isfinite(P[[first, last]]).all() or not has_truth[first : last + 1].all():
                 continue
             E = _inverse(_inverse(P[first]) @ P[last]) @ (_inverse(Q[first]) @ Q[last])
             errors.append((np.linalg.norm(E[:3, 3]) / length, _angle(E) / length))
     if not errors:
         why = f"not applicable: the true path is {along[-1]:.1f} m long, the shortest section 100 m"
         if along[-1] > KITTI_LENGTHS[0]:
-            why = "not applicable: no section of 100 m has poses at both ends"
+            why = "not applicable: no section of 100 m has poses at both ends and truth throughout"
         return {"kitti_translation": metric(None, "%", why), "kitti_rotation": metric(None, "deg/100 m", why)}
     shift, turn = np.mean(np.array(errors), axis=0)
     how = f"mean relative error of {len(errors)} sections of 100-800 m, one set every {KITTI_STEP} frames"
@@ -165,6 +185,14 @@ def _kitti(P: Floats, Q: Floats) -> dict[str, Metric]:
         "kitti_translation": metric(100.0 * float(shift), "%", how),
         "kitti_rotation": metric(100.0 * math.degrees(float(turn)), "deg/100 m", how),
     }
+
+
+def _along(poses: Floats) -> tuple[Floats, int]:
+    """Way (frame,) from the first frame along positions, m, straight over frames without any; how many such gaps."""
+    there = np.isfinite(poses[:, :3, 3]).all(axis=1)
+    rows = np.flatnonzero(there)
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(poses[rows, :3, 3], axis=0), axis=1))])
+    return np.interp(np.arange(len(poses)), rows, way), int((np.diff(rows) > 1).sum())
 
 
 def _rms(vectors: Floats) -> float:
@@ -193,6 +221,11 @@ def _angle(T: Floats) -> Floats:
     return np.asarray(np.arctan2(np.linalg.norm(axis, axis=-1), np.trace(R, axis1=-2, axis2=-1) - 1.0))
 
 
+def angles_between(a: Floats, b: Floats) -> Floats:
+    """Rotation angle (n,), radians, between the orientations of poses (n, 3, 4) and (n, 3, 4)."""
+    return _angle(np.swapaxes(a[:, :, :3], 1, 2) @ b[:, :, :3])
+
+
 def by_frame(poses: Floats, frames: list[int], wanted: list[int]) -> Floats:
     """Poses (frame, 3, 4) of the wanted frames, NaN where there is none."""
     row = {frame: k for k, frame in enumerate(frames)}
@@ -203,18 +236,35 @@ def by_frame(poses: Floats, frames: list[int], wanted: list[int]) -> Floats:
     return out
 
 
+def _nothing(estimate: Floats) -> dict[str, Floats]:
+    """What is drawn where no frame can be judged: the estimate alone."""
+    position = estimate[:, :, 3].copy()
+    none = np.full_like(position, np.nan)
+    displacement = np.diff(position, axis=0)
+    return {
+        "position": position,
+        "position_truth": none,
+        "displacement": displacement,
+        "displacement_truth": none[1:].copy(),
+    }
+
+
 def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     trajectory, truth = inputs["trajectory"], inputs["truth"]
     given = list(trajectory.meta["frames"])
     wanted = given if truth.meta["frames"] is None else list(truth.meta["frames"])
-    estimate = by_frame(np.asarray(trajectory["poses"]), given, wanted)
-    arrays, metrics = trajectory_accuracy(estimate, np.asarray(truth["poses"]))
+    estimate, true = by_frame(np.asarray(trajectory["poses"]), given, wanted), np.asarray(truth["poses"])
+    has_pose, has_truth = posed(estimate), posed(true)
+    if len(estimate) == len(true) and not (has_pose & has_truth).any():
+        arrays, metrics = _nothing(estimate), _counts(has_pose, has_truth)
+    else:
+        arrays, metrics = trajectory_accuracy(estimate, true)
     return Bundle(arrays, {"metrics": metrics, "frames": wanted, "truth": truth.meta["source"]})
 
 
 STAGE = Stage(
     name="accuracy",
-    version=1,
+    version=2,
     summary="trajectory against truth: ATE, RPE, displacements, drift, KITTI",
     params=NoParams,
     inputs=("trajectory", "truth"),

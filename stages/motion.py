@@ -2,6 +2,9 @@
 
 The hierarchical matcher of stage ``hfvm``, stopped at a coarse level. There is no epipolar band: a camera that moves
 forward has radial flow, whose epipolar lines meet inside the image, where a band says nothing about the way along it.
+
+Where the rotation between the frames is known from a sensor, it is undone before matching (:mod:`stages.attitude`);
+the displacements are those of the frames as they were taken all the same.
 """
 
 from __future__ import annotations
@@ -14,7 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from stages.attitude import Derotation
 from stages.declare import AnyArray, Array, Bundle, Inputs, Params, Stage
+from stages.geometry import Camera
 from stages.hfvm import consistency, hierarchy
 from stages.hfvm.params import HfvmParams
 from stages.pyramid import Pyramid
@@ -48,8 +53,19 @@ class Motion:
     validity: Mask
 
 
-def coarse_motion(a: Pyramid, b: Pyramid, params: MotionParams) -> Motion:
-    """Displacements from frame ``a`` to frame ``b``; of a shallower pyramid its top level."""
+STILL = 2.0
+"""Pixels of the result's level: a rotation that moves no corner farther is left to the matcher."""
+
+
+def coarse_motion(a: Pyramid, b: Pyramid, params: MotionParams, turn: Derotation | None = None) -> Motion:
+    """Displacements from frame ``a`` to frame ``b``; of a shallower pyramid its top level.
+
+    Parameters
+    ----------
+    turn : the known rotation between the frames, undone before matching.
+    """
+    if turn is not None:
+        b = turn.apply(b)
     hp = HfvmParams(
         band=0.0,
         top_columns=params.top_columns,
@@ -73,11 +89,29 @@ def coarse_motion(a: Pyramid, b: Pyramid, params: MotionParams) -> Motion:
     mark(validity, good, Validity.MATCHED)
     mark(validity, interpolated != 0, Validity.INTERPOLATED)
     u[~defined(validity)] = v[~defined(validity)] = np.nan
-    return Motion(state.level, u * scale, v * scale, validity)
+    u, v = u * scale, v * scale
+    if turn is not None:
+        u, v = turn.compose(u, v, state.level)
+        validity[np.isnan(u)] &= ~np.uint8(Validity.MATCHED | Validity.INTERPOLATED)
+    return Motion(state.level, u, v, validity)
+
+
+def known_turn(args: Mapping[str, Any], level: int) -> Derotation | None:
+    """The rotation among a task's arguments, where there is one and it moves the image noticeably.
+
+    Parameters
+    ----------
+    args : ``rotation`` (3 x 3 rows of R_b_a) and ``camera``, both or neither.
+    """
+    if "rotation" not in args:
+        return None
+    turn = Derotation.of(args["rotation"], Camera.from_dict(args["camera"]))
+    return turn if turn.reach > STILL * 2.0**level else None
 
 
 def _run(params: MotionParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
-    found = coarse_motion(Pyramid.from_bundle(inputs["a"]), Pyramid.from_bundle(inputs["b"]), params)
+    turn = known_turn(args, params.level)
+    found = coarse_motion(Pyramid.from_bundle(inputs["a"]), Pyramid.from_bundle(inputs["b"]), params, turn)
     ok = matched(found.validity)
     rows, cols = ok.shape
     y, x = np.indices(ok.shape)
@@ -93,6 +127,7 @@ def _run(params: MotionParams, args: Mapping[str, Any], inputs: Inputs) -> Bundl
         "median_length": float(np.median(np.hypot(u, v))) if u.size else None,
         "match_rate": int(np.count_nonzero(ok)) / usable if usable else None,
         "overlap": int(np.count_nonzero(seen)) / usable if usable else None,
+        "derotated": turn is not None,
     }
     arrays: dict[str, AnyArray] = {
         "column_disparity": found.column_disparity,

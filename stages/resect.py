@@ -15,7 +15,7 @@ errors of the calibration (focal length, direction of the camera in the vehicle)
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -105,6 +105,7 @@ def resect(
     params: ResectParams,
     rng: np.random.Generator,
     *,
+    reckoned: RigidTransform | None = None,
     where: str = "this frame",
 ) -> Resection:
     """Pose of a camera from landmarks and their image positions (Eq. 4-8), robustly.
@@ -114,6 +115,7 @@ def resect(
     landmarks : n of them, in the local frame; all finite.
     pixels : (n, 2) column, row.
     start : prediction of T_local_left.
+    reckoned : another prediction, by dead reckoning; decides nothing but where the search starts.
     where : words for error messages ("frame 12").
 
     Raises
@@ -132,32 +134,36 @@ def resect(
         params.pixel_sigma,
         params.bias_sigma,
     )
-    poses, near = _robust_start(obs, Poses.of(start.inverse()), params, rng)
+    predictions = [Poses.of(T.inverse()) for T in (start, reckoned) if T is not None]
+    poses, near = _robust_start(obs, predictions, params, rng)
     poses, active, steps = _remove_inconsistent(obs, poses, near, params, where)
     _not_collinear(landmarks.position[active], where)
     return _result(obs, poses, active, steps, params, where)
 
 
 def _robust_start(
-    obs: Observations, prediction: Poses, params: ResectParams, rng: np.random.Generator
+    obs: Observations, predictions: list[Poses], params: ResectParams, rng: np.random.Generator
 ) -> tuple[Poses, Bools]:
     """The hypothesis that most landmarks agree with, adjusted to those; and which agree (n,).
 
     Locally optimised RANSAC (Chum, Matas, Kittler 2003, doi:10.1007/978-3-540-45243-0_31) with truncated squares as
-    the score. The prediction competes with samples of four landmarks that are adjusted from it.
+    the score. Each prediction competes with samples of four landmarks that are adjusted from it.
     """
     n = obs.landmarks.shape[1]
     samples = np.argsort(rng.random((params.hypotheses, n)), axis=1, kind="stable")[:, :SAMPLE]
-    start = _repeat(prediction, params.hypotheses)
-    found, _ = levenberg_marquardt(obs.take(samples), start, np.ones(samples.shape, bool), 10, tolerance=1e-3)
-    candidates = Poses(
-        np.concatenate([prediction.R, found.R]),
-        np.concatenate([prediction.t, found.t]),
-        np.concatenate([prediction.bias, found.bias]),
+    every, sampled = np.ones(samples.shape, bool), obs.take(samples)
+    candidates = []
+    for prediction in predictions:
+        start = _repeat(prediction, params.hypotheses)
+        candidates += [prediction, levenberg_marquardt(sampled, start, every, 10, tolerance=1e-3)[0]]
+    hypotheses = Poses(
+        np.concatenate([c.R for c in candidates]),
+        np.concatenate([c.t for c in candidates]),
+        np.concatenate([c.bias for c in candidates]),
     )
     bound = 2.0 * params.threshold / params.pixel_sigma
-    score = (np.minimum(back_projection(obs, candidates).norm, bound) ** 2).sum(1)
-    best = candidates.at(int(np.argmin(score)))
+    score = (np.minimum(back_projection(obs, hypotheses).norm, bound) ** 2).sum(1)
+    best = hypotheses.at(int(np.argmin(score)))
     for _ in range(2):
         active = back_projection(obs, best).norm <= bound
         if active.sum() >= SAMPLE:
@@ -256,6 +262,7 @@ def resect_segment(
     T_local_key: RigidTransform,
     frames: list[int],
     params: ResectParams,
+    reckoned: Sequence[RigidTransform | None] | None = None,
 ) -> SegmentPoses:
     """Poses of the frames of a segment, the key frame's given.
 
@@ -265,6 +272,7 @@ def resect_segment(
     landmarks : of the same n points, in the local frame of the key; NaN none.
     T_local_key : pose of the key frame's left camera.
     frames : frame numbers, for messages and seeds.
+    reckoned : T_key_left of each frame by dead reckoning, where there is one; competes as a start.
 
     Raises
     ------
@@ -302,6 +310,7 @@ def resect_segment(
             pose,
             params,
             np.random.default_rng([params.seed, frames[j]]),
+            reckoned=None if reckoned is None or (T := reckoned[j]) is None else T_local_key @ T,
             where=f"frame {frames[j]}",
         )
         pose = found.T_local_left
@@ -330,7 +339,12 @@ def _run(params: ResectParams, args: Mapping[str, Any], inputs: Inputs) -> Bundl
     points = np.asarray(track["points"])
     landmarks = _coordinates(points[:, 0].astype(np.float64), inputs, rig, T_local_key, params)
     frames = [int(f) for f in track.meta["frames"]]
-    found = resect_segment(points, landmarks, rig.left, T_local_key, frames, params)
+    reckoned = None
+    if "prediction" in args:
+        reckoned = [None if T is None else RigidTransform.from_matrix(T) for T in args["prediction"]]
+        if len(reckoned) != len(frames):
+            raise InputError(f"{len(frames)} frames need {len(frames)} predicted poses, not {len(reckoned)}")
+    found = resect_segment(points, landmarks, rig.left, T_local_key, frames, params, reckoned)
     arrays: dict[str, AnyArray] = {
         "poses": found.poses,
         "covariance": found.covariance,

@@ -1,47 +1,236 @@
-"""The rig that a run reconstructs with: here the given calibration, held fixed.
+"""The rig that a run reconstructs with: the given calibration, repaired only where the images contradict it.
 
-The relative orientation enters every later stage through this one artifact, so that a refined orientation replaces the
-given one in one place (paper, section 5.2.2: relative orientation with the baseline length held fixed).
+The relative orientation enters every later stage through this one artifact (paper, section 5.2.2: relative orientation
+with the baseline's length held fixed). The correspondences of all pairs are pooled; what they do not observe, do not
+contradict, or would change by too little to matter stays as given, to the last bit (:mod:`stages.observability`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
 
-from stages.declare import Bundle, Inputs, NoParams, Stage
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from stages.adjustment import LEAST_MATCHES, RIG, Matches, adjust, rms, solution
+from stages.declare import Bundle, Inputs, Stage
+from stages.epipolar import NAMES, corrected, distances
 from stages.errors import InputError
 from stages.geometry import Rig
+from stages.observability import (
+    BEYOND_SHARE,
+    Decision,
+    Parameter,
+    RelativeParams,
+    decide,
+    impossible_share,
+    row_sensitivity,
+)
+from stages.orientation import misalignment
+
+Floats = NDArray[np.float64]
+
+MOST_MATCHES = 20_000
+"""Of all pairs together: beyond, systematic errors rule."""
+
+LEAST_OF_A_PAIR = 200
+
+BAD_ROWS = 1.0
+"""Pixels RMS of what no rig explains: an image whose lens distortion was not removed, or a wrong camera."""
 
 
-def fixed(rig: Rig) -> dict[str, Any]:
-    """Facts of a given rig.
+class RigParams(RelativeParams):
+    """Parameters of the stage ``rig``."""
+
+    mode: Literal["pooled", "per_pair", "fixed"] = Field(
+        "pooled",
+        description="pooled: one rig from all pairs; per_pair: each pair its own (a rig that bends); fixed: as given, "
+        "contradictions are only told",
+    )
+
+
+def orient_rig(given: Rig, pairs: Sequence[Matches], params: RigParams) -> dict[str, Any]:
+    """Facts of the rig to be used.
 
     Returns
     -------
     dict
-        ``rig`` (:meth:`Rig.to_dict`), ``mode`` "fixed", ``baseline`` in metres, ``source`` in words.
+        ``rig`` (:meth:`Rig.to_dict`) to be used, ``given``; ``mode``; ``baseline`` (m); ``source`` in words;
+        ``changed``; ``parameters`` (name, value, asked, sigma, unit, observed, freed, why), ``held`` (name and reason
+        in words); ``per_pair`` (pair, values and sigma by name, degrees, of what is observed);
+        ``residual_before_px``, ``residual_after_px`` (RMS of inliers) and ``median_before_px``, ``median_after_px``,
+        of the same points; ``pairs``, ``matches``; ``warnings`` (lines). In mode ``fixed`` ``parameters`` say what
+        would be changed. Without a pair that can be used, there are only the first six and ``warnings``.
 
     Raises
     ------
     InputError
         The cameras share one projection centre.
     """
-    if not rig.baseline > 0:
+    if not given.baseline > 0:
         raise InputError("the rig's baseline is 0 m", remedy="give T_right_left with a translation in metres")
-    return {"rig": rig.to_dict(), "mode": "fixed", "baseline": rig.baseline, "source": "given calibration"}
+    facts: dict[str, Any] = {
+        "rig": given.to_dict(),
+        "given": given.to_dict(),
+        "mode": params.mode,
+        "baseline": given.baseline,
+        "source": "given calibration",
+        "changed": False,
+        "warnings": [],
+    }
+    usable = [m for m in pairs if len(m.left) >= LEAST_MATCHES]
+    if usable:
+        facts |= _judged(given, _share(usable), params)
+        if len(usable) < len(pairs):
+            few = len(pairs) - len(usable)
+            facts["warnings"].insert(0, f"{few} of {len(pairs)} pairs have too few matches for the rig")
+    elif pairs:
+        facts["warnings"] = ["no pair has enough matches to check the calibration; it is used as given"]
+    return facts
 
 
-def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
-    return Bundle({}, fixed(Rig.from_dict(args["rig"])))
+def _judged(given: Rig, pairs: list[Matches], params: RigParams) -> dict[str, Any]:
+    """What the pairs say on the given rig, and the rig that follows."""
+    decision = decide(given, pairs, params)
+    applied = params.mode != "fixed" and decision.changed
+    rig = corrected(given, decision.correction) if applied else given
+    per_pair = [_alone(given, m, decision, params) for m in pairs]
+    residuals = _residuals(given, rig, pairs, decision)
+    warnings = _contradiction(given, pairs, decision, params.mode)
+    warnings += _doubts(rig, pairs, decision, residuals["residual_after_px"])
+    warnings += _drift(given, pairs, per_pair, params)
+    return {
+        "rig": rig.to_dict(),
+        "source": _source(decision, applied, len(pairs)),
+        "changed": applied,
+        "parameters": [p.to_dict() for p in decision.parameters],
+        "held": [f"{_word(p)}: {p.why}" for p in decision.parameters if not p.freed],
+        "per_pair": per_pair,
+        "pairs": len(pairs),
+        "matches": sum(len(m.left) for m in pairs),
+        "warnings": warnings,
+        **residuals,
+    }
+
+
+def _share(pairs: list[Matches]) -> list[Matches]:
+    """Every so manieth match of each pair, so that many pairs together stay affordable."""
+    most = max(LEAST_OF_A_PAIR, MOST_MATCHES // len(pairs))
+    steps = [max(1, math.ceil(len(m.left) / most)) for m in pairs]
+    return [Matches(m.pair, m.left[::s], m.right[::s]) for m, s in zip(pairs, steps, strict=True)]
+
+
+def _alone(given: Rig, matches: Matches, decision: Decision, params: RigParams) -> dict[str, Any]:
+    """One pair's own values and sigmas, degrees, of all that the sequence observes."""
+    names = [p.name for p in decision.parameters if p.observed]
+    free = [p.observed for p in decision.parameters]
+    beliefs = params.beliefs(given)
+    fit = adjust(given, [matches], free, beliefs, rival=False)
+    sigma = np.sqrt(np.diag(solution(fit, free, beliefs, rival=False)[1]))
+    return {
+        "pair": matches.pair,
+        "values": {n: math.degrees(fit.x[NAMES.index(n)]) for n in names},
+        "sigma": {n: math.degrees(sigma[NAMES.index(n)]) for n in names},
+    }
+
+
+def _residuals(given: Rig, rig: Rig, pairs: Sequence[Matches], decision: Decision) -> dict[str, float]:
+    weights = np.concatenate(decision.fit.weights)
+    found = {}
+    for name, used in (("before", given), ("after", rig)):
+        d = np.concatenate([distances(used, np.zeros(RIG), m.left, m.right)[0] for m in pairs])
+        found[f"residual_{name}_px"] = rms(d, weights)
+        found[f"median_{name}_px"] = float(np.median(np.abs(d[weights > 0])))
+    return found
+
+
+def _word(p: Parameter) -> str:
+    return p.name.replace("_", " ")
+
+
+def _source(decision: Decision, applied: bool, pairs: int) -> str:
+    if not applied:
+        return "given calibration"
+    names = " and ".join(_word(p) for p in decision.parameters if p.freed)
+    return f"given calibration, {names} repaired from {pairs} pair{'s' if pairs > 1 else ''}"
+
+
+def _contradiction(given: Rig, pairs: Sequence[Matches], decision: Decision, mode: str) -> list[str]:
+    """What a user should know of a calibration that the images contradict."""
+    if not decision.changed:
+        return []
+    signed = [distances(given, np.zeros(RIG), m.left, m.right)[0] for m in pairs]
+    inlier = np.concatenate(decision.fit.weights) > 0
+    words = misalignment(float(np.median(np.concatenate(signed)[inlier])), decision)
+    done = "kept because rig.mode = fixed" if mode == "fixed" else "repaired"
+    lines = [f"the calibration contradicts the images: {words}; {done}"]
+    hidden = [p for p in decision.parameters if not p.observed]
+    if hidden:
+        names = ", ".join(f"{_word(p)} (taken alone they ask for {math.degrees(p.asked):+.2f} degrees)" for p in hidden)
+        lines.append(
+            f"what these images cannot tell is held: {names}; if the camera was turned there, too, depth is wrong: "
+            "calibrate anew, or compare a known length"
+        )
+    return lines
+
+
+def _doubts(rig: Rig, pairs: Sequence[Matches], decision: Decision, residual: float) -> list[str]:
+    """Signs that something other than the rig's orientation is wrong."""
+    lines = []
+    if residual > BAD_ROWS:
+        lines.append(
+            f"matches lie {residual:.1f} px RMS off their epipolar lines: is lens distortion left in the images, or "
+            "the wrong calibration given?"
+        )
+    share = impossible_share(rig, pairs, decision.fit)
+    if share > BEYOND_SHARE:
+        lines.append(
+            f"{100 * share:.0f} % of the matches lie beyond infinity: the toe-in is wrong, or left and right are "
+            "swapped"
+        )
+    return lines
+
+
+def _drift(given: Rig, pairs: Sequence[Matches], per_pair: list[dict[str, Any]], params: RigParams) -> list[str]:
+    """Parameters that change from pair to pair by more than their errors, and by enough to matter."""
+    lines = []
+    rows = dict(zip(NAMES, row_sensitivity(given, pairs), strict=True))
+    for name in per_pair[0]["values"] if len(per_pair) > 2 else ():
+        values = np.array([p["values"][name] for p in per_pair])
+        sigma = np.array([p["sigma"][name] for p in per_pair])
+        away = np.abs(values - np.median(values))
+        moved = np.radians(away) * rows[name]
+        odd = (away > params.significance * sigma) & (moved > params.least_rows)
+        if odd.any():
+            worst = int(np.argmax(np.where(odd, away, 0.0)))
+            lines.append(
+                f"the rig moves: {name.replace('_', ' ')} of {int(odd.sum())} of {len(values)} pairs departs from the "
+                f"others', by {away[worst]:.2f} degrees at pair {per_pair[worst]['pair']}; try rig.mode = per_pair"
+            )
+    return lines
+
+
+def _run(params: RigParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+    pairs = [
+        Matches(
+            int(found.meta["pair"]),
+            np.asarray(found["left"], dtype=np.float64),
+            np.asarray(found["right"], dtype=np.float64),
+        )
+        for found in inputs.get("orientations", [])
+    ]
+    return Bundle({}, orient_rig(Rig.from_dict(args["rig"]), pairs, params))
 
 
 STAGE = Stage(
     name="rig",
-    version=1,
-    summary="the rig's calibration",
-    params=NoParams,
-    inputs=(),
+    version=2,
+    summary="the rig: the given calibration, repaired where the images contradict it",
+    params=RigParams,
+    inputs=("orientations*?",),
     outputs=(),
     requires=("numpy",),
     run=_run,

@@ -2,38 +2,136 @@
 
 Successive basic pairs bound a *segment*: the left images from one to the next are tracked and resected against the
 elevation model of the first. Positions behind the last basic pair are an open last segment.
+
+The paper takes every fourth pair of a camera that moves evenly. Here the next basic pair is the last one whose image
+still shows the wanted share of what the one before shows (:mod:`stages.overlap`): poses are not known yet, the coarse
+displacements are. A camera that rests needs no new elevation model, one that turns needs them often.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from stages.declare import Bundle, Inputs, Params, Stage
-from stages.errors import ConfigError
+from stages.errors import ConfigError, InputError
+from stages.overlap import Seen, Step
+
+LEAST_BLOCKS = 12
+"""Blocks of the image with a displacement, below which the whole is not told by them."""
+
+LITTLE = 0.4
+"""Overlap below which a stride, which asks for none, is warned of: most landmarks of a segment leave the image."""
 
 
 class SelectParams(Params):
     """Parameters of the choice of basic pairs."""
 
+    rule: Literal["overlap", "stride"] = Field(
+        "overlap", description="overlap: as far apart as the wanted overlap permits; stride: evenly, as in the paper"
+    )
+    overlap: float = Field(
+        0.7,
+        gt=0,
+        lt=1,
+        description="share of what one basic pair sees that the next one sees too (rule overlap); below, landmarks and"
+        " common ground run out",
+    )
     stride: int = Field(
-        4, ge=1, description="frames; every stride-th pair is basic (the paper's fourth intermediate frame, 7.4)"
+        4,
+        ge=1,
+        description="frames; every stride-th pair is basic (the paper's fourth intermediate frame, 7.4); given"
+        " alone, it sets the rule",
+    )
+    max_gap: int = Field(
+        16, ge=1, description="frames; most between two basic pairs under rule overlap: light and shadows change"
+    )
+    min_matches: float = Field(
+        0.2,
+        ge=0,
+        le=1,
+        description="share of the pixels with texture that found a coarse displacement; below, the displacement is not"
+        " trusted and both frames are basic",
     )
 
+    @model_validator(mode="before")
+    @classmethod
+    def _stride_alone(cls, values: Any) -> Any:
+        """Who sets a stride and no rule wants the stride."""
+        if isinstance(values, Mapping) and "stride" in values and "rule" not in values:
+            return {"rule": "stride", **values}
+        return values
 
-def basic_pairs(frames: int, stride: int) -> list[int]:
-    """Positions 0, stride, 2 stride ... below ``frames``.
 
-    Raises
-    ------
-    ConfigError
-        Fewer than two frames: there is no motion to resect.
+@dataclass(frozen=True)
+class Choice:
+    """``basic`` positions; ``why`` each is basic (first frame, stride, overlap, max_gap, few matches); ``overlap``.
+
+    ``overlap`` is that with the basic pair before, None for the first and where too few coarse matches tell of it.
     """
-    if frames < 2:
-        raise ConfigError(f"{frames} frame chosen", remedy="choose at least two with --frames")
-    return list(range(0, frames, stride))
+
+    basic: list[int]
+    why: list[str]
+    overlap: list[float | None]
+
+
+def by_stride(steps: Sequence[Step], params: SelectParams) -> Choice:
+    """Positions 0, stride, 2 stride ... of one more frame than there are steps."""
+    basic = list(range(0, len(steps) + 1, params.stride))
+    overlap = [_overlap(steps[a:b], params) for a, b in itertools.pairwise(basic)]
+    return Choice(basic, ["first frame"] + ["stride"] * len(overlap), [None, *overlap])
+
+
+def by_overlap(steps: Sequence[Step], params: SelectParams) -> Choice:
+    """Basic pairs as far apart as the wanted overlap permits; at least one frame apart.
+
+    Parameters
+    ----------
+    steps : coarse displacements from each frame to the next.
+    """
+    choice = Choice([0], ["first frame"], [None])
+    seen = Seen.all_of(steps[0]) if steps else None
+    for k, step in enumerate(steps):
+        assert seen is not None
+        ahead = seen.after(step)
+        key = choice.basic[-1]
+        reason = _why(steps, k, key, ahead, params)
+        if reason and k > key:
+            known = not any(doubtful(s, params) for s in steps[key:k])
+            choice.basic.append(k)
+            choice.why.append(reason)
+            choice.overlap.append(seen.overlap if known else None)
+            ahead = Seen.all_of(step).after(step)
+        seen = ahead
+    return choice
+
+
+def _why(steps: Sequence[Step], k: int, key: int, ahead: Seen, params: SelectParams) -> str:
+    """Why position ``k`` should be basic, given what ``ahead`` would still be seen one frame on; empty: it need not."""
+    if any(doubtful(step, params) for step in steps[max(k - 1, key) : k + 1]):
+        return "few matches"
+    if ahead.overlap < params.overlap:
+        return "overlap"
+    return "max_gap" if k + 1 - key > params.max_gap else ""
+
+
+def doubtful(step: Step, params: SelectParams) -> bool:
+    """Whether a step has too few matches to be believed."""
+    return step.match_rate < params.min_matches or int(step.known.sum()) < LEAST_BLOCKS
+
+
+def _overlap(steps: Sequence[Step], params: SelectParams) -> float | None:
+    """Overlap of the frames before and behind some steps; None where one of them is doubtful."""
+    if any(doubtful(step, params) for step in steps):
+        return None
+    seen = Seen.all_of(steps[0])
+    for step in steps:
+        seen = seen.after(step)
+    return seen.overlap
 
 
 def segments(basic: list[int], frames: int) -> list[list[int]]:
@@ -43,19 +141,54 @@ def segments(basic: list[int], frames: int) -> list[list[int]]:
 
 
 def _run(params: SelectParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
-    basic = basic_pairs(int(args["frames"]), params.stride)
-    return Bundle(
-        {}, {"basic": basic, "segments": segments(basic, int(args["frames"])), "rule": f"every {params.stride}"}
-    )
+    frames = int(args["frames"])
+    if frames < 1:
+        raise ConfigError("no frame is chosen", remedy="choose at least one with --frames")
+    steps = [Step.from_bundle(b) for b in inputs.get("motions") or []]
+    if len(steps) != frames - 1:
+        raise InputError(f"{frames} frames need {frames - 1} motions, not {len(steps)}")
+    stride = params.rule == "stride"
+    choice = (by_stride if stride else by_overlap)(steps, params)
+    meta = {
+        "basic": choice.basic,
+        "segments": segments(choice.basic, frames),
+        "rule": f"every {params.stride}" if stride else f"overlap {params.overlap:g}",
+        "overlap": choice.overlap,
+        "why": choice.why,
+        "displacement": [step.displacement for step in steps],
+        "match_rate": [step.match_rate for step in steps],
+        "warnings": _warnings(steps, choice.overlap, params),
+    }
+    return Bundle({}, meta)
+
+
+def _warnings(steps: Sequence[Step], overlap: Sequence[float | None], params: SelectParams) -> list[str]:
+    """What the choice could not give."""
+    lines = []
+    blind = [k for k, step in enumerate(steps) if doubtful(step, params)]
+    if blind:
+        lines.append(
+            f"{len(blind)} of {len(steps)} steps between frames have too few coarse matches (at least"
+            f" {min(steps[k].match_rate for k in blind):.0%}), first behind the frame at position {blind[0]}: the"
+            " overlap there is not known, and the frames are tracked on a poor prediction"
+        )
+    least = min((v for v in overlap if v is not None), default=1.0)
+    wanted = params.overlap if params.rule == "overlap" else LITTLE
+    if least < wanted:
+        lines.append(
+            f"successive basic pairs overlap by as little as {least:.0%}, {wanted:.0%} are wanted:"
+            + (" set select.stride lower" if params.rule == "stride" else " the camera moves that far in one frame")
+        )
+    return lines
 
 
 STAGE = Stage(
     name="select",
-    version=1,
+    version=2,
     summary="which stereo pairs become elevation models, and the segments between them",
     params=SelectParams,
-    inputs=(),
+    inputs=("motions*",),
     outputs=(),
-    requires=(),
+    requires=("numpy", "numba"),
     run=_run,
 )

@@ -35,6 +35,8 @@ BORDER = 8
 """Pixels between an interest point and the image's edge: template, cubic interpolation and a search step."""
 NEIGHBOURS = 12
 """Tracks that an affinity of six numbers is fitted to: twice as many as needed, still local."""
+PULL = 5.0
+"""Pixels: neighbours that spread less than this do not tell of a change of shape."""
 
 
 class TrackParams(Params):
@@ -205,28 +207,48 @@ def fit_affinity(origin: Floats, moved: Floats, use: Bools, at: Floats) -> tuple
     """Affinity (n, 2, 2) and displacement (n, 2) at points ``at`` (n, 2) from the nearest pairs ``origin -> moved``.
 
     Least squares, reweighted by Cauchy's weights of one pixel, so that a neighbour on another surface counts little. A
-    weak pull towards no change of shape keeps neighbours on a line from inventing one. Too few pairs: no change.
+    weak pull towards the rotation and scale that all pairs share keeps neighbours on a line from inventing a change of
+    shape. Too few pairs: no change.
     """
     n = len(at)
     identity, nothing = np.tile(np.eye(2), (n, 1, 1)), np.zeros((n, 2))
     p, q = origin[use], moved[use]
     if len(p) < 6 or n == 0:
         return identity, nothing
+    common = common_similarity(p, q)
     far = ((np.nan_to_num(at)[:, None] - p[None]) ** 2).sum(-1)
     nearest = np.argsort(far, axis=1, kind="stable")[:, :NEIGHBOURS]
     offset = p[nearest] - np.nan_to_num(at)[:, None]
-    shift = (q - p)[nearest]
+    shift = (q - p)[nearest] - offset @ (common - np.eye(2)).T
     basis = np.concatenate([offset, np.ones((*offset.shape[:2], 1))], -1)
-    ridge = np.diag([25.0 * nearest.shape[1], 25.0 * nearest.shape[1], 1e-6])
     weight = np.ones(nearest.shape)
     solution = np.zeros((n, 3, 2))
     for _ in range(4):
         weighted = basis * weight[..., None]
-        normal = np.einsum("nka,nkb->nab", weighted, basis) + ridge
+        normal = np.einsum("nka,nkb->nab", weighted, basis)
+        pull = PULL**2 * weight.sum(1)
+        normal[:, 0, 0] += pull
+        normal[:, 1, 1] += pull
+        normal[:, 2, 2] += 1e-6
         solution = np.linalg.solve(normal, np.einsum("nka,nki->nai", weighted, shift))
         rest = shift - np.einsum("nka,nai->nki", basis, solution)
         weight = 1.0 / (1.0 + (rest**2).sum(-1))
-    return identity + np.swapaxes(solution[:, :2], 1, 2), solution[:, 2]
+    return common + np.swapaxes(solution[:, :2], 1, 2), solution[:, 2]
+
+
+def common_similarity(origin: Floats, moved: Floats) -> Floats:
+    """Rotation and scale (2, 2) in the image that pairs (n, 2) share.
+
+    The mean turn and the median stretch of the lines between pairs, all lines counting alike.
+    """
+    p, q = ((a - np.roll(a, len(a) // 2, axis=0)) @ np.array([1.0, 1.0j]) for a in (origin, moved))
+    long = (np.abs(p) > 0) & (np.abs(q) > 0)
+    ratio = q[long] / p[long]
+    mean = (ratio / np.abs(ratio)).sum()
+    if np.abs(mean) == 0:
+        return np.eye(2)
+    turn = np.median(np.abs(ratio)) * mean / np.abs(mean)
+    return np.array([[turn.real, -turn.imag], [turn.imag, turn.real]])
 
 
 def _run(params: TrackParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:

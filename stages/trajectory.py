@@ -33,8 +33,9 @@ def chain(
 
     Parameters
     ----------
-    segments : poses (frames, 3, 4) T_local_left and covariances (frames, 6, 6) of each, key frame first.
-    levels : T_local_left of each segment's key frame by its own level stage.
+    segments : poses (frames, 3, 4) T_local_left and covariances (frames, 6, 6) of each, key frame first; none for a
+        sequence of one pair.
+    levels : T_local_left of each segment's key frame by its own level stage; of the only pair without segments.
 
     Returns
     -------
@@ -45,13 +46,13 @@ def chain(
     Raises
     ------
     InputError
-        No segment, or a segment whose key pose is not its level's.
+        Not one level a segment, or a segment whose key pose is not its level's.
     """
-    if not segments or len(levels) != len(segments):
+    if len(levels) != max(len(segments), 1):
         raise InputError(f"{len(segments)} segments and {len(levels)} levels do not make a trajectory")
     world, cov = levels[0], np.zeros((6, 6))
     poses, covariances, owner = [world.matrix34], [cov], [0]
-    for number, ((local, local_cov), level) in enumerate(zip(segments, levels, strict=True)):
+    for number, ((local, local_cov), level) in enumerate(zip(segments, levels, strict=False)):
         if np.abs(local[0] - level.matrix34).max() > 1e-9 * max(1.0, float(np.abs(local[0]).max())):
             raise InputError(f"segment {number} was not resected in the local frame of its own basic pair")
         T_world_local = _clean(world @ level.inverse())
@@ -93,6 +94,8 @@ def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     facts: list[dict[str, Any]] = []
     for bundle in inputs["segments"]:
         facts += bundle.meta["per_frame"][1 if facts else 0 :]
+    if not facts:
+        facts = [{"frame": int(f), "inliers": 0} for f in args["frames"]]
     return Bundle(
         {"poses": poses, "covariance": covariance, "segment": segment},
         {

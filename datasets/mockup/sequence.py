@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datasets.mockup.params import MockupParams
-from datasets.protocol import CAMERAS, Sequence, Source
+from datasets.protocol import CAMERAS, Rows, Sequence, Source
 from stages.declare import NoParams
 from stages.errors import ConfigError
 from stages.geometry import Camera, Rig, RigidTransform, rotation_exp
@@ -98,16 +98,16 @@ def _check_on_bed(p: MockupParams, poses: list[RigidTransform]) -> None:
             )
 
 
-def _attitude(p: MockupParams, truth: list[RigidTransform]) -> tuple[tuple[float, float, float], ...] | None:
-    """Direction of "up" in each left camera, as a sensor with the stated error gives it."""
+def _attitude(p: MockupParams, truth: list[RigidTransform]) -> tuple[Rows, ...] | None:
+    """R_bed_left of each frame, as a sensor with the stated error gives it."""
     if p.attitude_noise_deg is None:
         return None
     rng = np.random.default_rng([p.seed, 61])
     out = []
     for pose in truth:
         error = rotation_exp(np.deg2rad(p.attitude_noise_deg) * rng.standard_normal(3))
-        x, y, z = error @ pose.rotation.T[:, 2]
-        out.append((float(x), float(y), float(z)))
+        a, b, c = ((float(x), float(y), float(z)) for x, y, z in (error @ pose.rotation.T).T)
+        out.append((a, b, c))
     return tuple(out)
 
 
@@ -145,6 +145,7 @@ def mockup(p: MockupParams, name: str = "mockup") -> Sequence:
         }
         return Source("datasets.mockup.truth_dem", NoParams(), args, inputs={"scene": scene})
 
+    attitude = _attitude(p, poses["left"])
     level = p.roll_deg == 0.0 and p.jitter_deg == 0.0
     return Sequence(
         name=name,
@@ -155,13 +156,14 @@ def mockup(p: MockupParams, name: str = "mockup") -> Sequence:
         times=tuple(float(k) for k in range(p.frames)),
         truth=tuple(poses["left"]),
         truth_source="the simulator's own poses: exact",
-        up=_attitude(p, poses["left"]),
+        up=None if attitude is None else tuple(rows[2] for rows in attitude),
+        attitude=attitude,
         pitch=math.radians(p.pitch_deg) if level else None,
         vehicle=_vehicle(),
         truth_dem=dem,
         truth_disparity=disparity,
         evaluation_window=WINDOW,
-        defaults={"select.stride": 4, "locus.cell_size": 0.001},
+        defaults={"select.rule": "stride", "select.stride": 4, "locus.cell_size": 0.001},
         notes=(
             f"simulated at 1:10 with seed {p.seed}; lengths are those of the model",
             "truth frame: z up, y along the bed, x right, origin in the middle of the near edge at mean height",

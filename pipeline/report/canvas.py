@@ -10,7 +10,7 @@ import base64
 import io
 import math
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from typing import Any
 
 import numpy as np
@@ -30,6 +30,8 @@ SAFE, HAZARDOUS, UNKNOWN = "#a6d7c3", "#c8501e", "#8d8f98"
 """Distinct for colour-blind eyes and in grey: light, dark, medium."""
 MEASURED, INTERPOLATED = "#2f6f9f", "#f0b84a"
 ESTIMATE, REFERENCE, MARK = "#0b4f8a", "#d1731a", "#111111"
+OTHER, RIGHT = "#2c8a5b", "#333333"
+"""Another program's answer, the right camera."""
 
 
 @dataclass(frozen=True)
@@ -79,8 +81,14 @@ def figure(width: float, height: float) -> Any:
 def map_axes(extent: Extent, *, bar: bool = False, max_height: float = 6.0) -> tuple[Any, Any, Any]:
     """Figure, axes of equal scale (metres), and axes for a colour bar below them (None without ``bar``).
 
-    Maps of one extent are equally large with and without a bar, so that they compare side by side.
+    Maps of one extent are equally large with and without a bar, so that they compare side by side. They share one
+    sheet, wiped by each call: making axes with their ticks takes matplotlib longer than painting the map.
     """
+    return _wiped(_map_sheet(tuple(float(v) for v in extent), bar, max_height))
+
+
+@lru_cache(maxsize=8)
+def _map_sheet(extent: Extent, bar: bool, max_height: float) -> tuple[Any, Any, Any]:
     left, right, top, foot = 0.62, 0.15, 0.12, 0.5 + (0.62 if bar else 0.0)
     dx, dy = max(extent[1] - extent[0], 1e-9), max(extent[3] - extent[2], 1e-9)
     width = WIDTH - left - right
@@ -104,12 +112,19 @@ def map_axes(extent: Extent, *, bar: bool = False, max_height: float = 6.0) -> t
     return fig, ax, cax
 
 
-def image_axes(shape: tuple[int, ...], *, bar: bool = False, width: float = WIDTH) -> tuple[Any, Any, Any]:
-    """Figure filled by an image of ``shape`` (rows, cols), axes in pixels, and axes for a colour bar below it."""
-    rows, cols = shape[:2]
-    height = width * rows / cols
+def image_axes(shape: tuple[int, ...], *, bar: bool = False) -> tuple[Any, Any, Any]:
+    """Figure filled by an image of ``shape`` (rows, cols), axes in pixels, and axes for a colour bar below it.
+
+    Images of one shape share one sheet, see :func:`map_axes`.
+    """
+    return _wiped(_image_sheet(shape[0], shape[1], bar))
+
+
+@lru_cache(maxsize=4)
+def _image_sheet(rows: int, cols: int, bar: bool) -> tuple[Any, Any, Any]:
+    height = WIDTH * rows / cols
     foot = 0.6 if bar else 0.0
-    fig = figure(width, height + foot)
+    fig = figure(WIDTH, height + foot)
     total = height + foot
     ax = fig.add_axes((0.0, foot / total, 1.0, height / total))
     ax.set_axis_off()
@@ -117,14 +132,31 @@ def image_axes(shape: tuple[int, ...], *, bar: bool = False, width: float = WIDT
     return fig, ax, cax
 
 
-def color_bar(fig: Any, drawn: Any, cax: Any, label: str, *, integer: bool = False) -> None:
-    """Colour bar with its unit."""
+def _wiped(sheet: tuple[Any, Any, Any]) -> tuple[Any, Any, Any]:
+    """Take off what the last figure has drawn; the axes with their limits and ticks stay."""
+    for ax in sheet[1:]:
+        for artist in [] if ax is None else [*ax.images, *ax.lines, *ax.collections, *ax.texts]:
+            artist.remove()
+    return sheet
+
+
+def color_bar(drawn: Any, cax: Any, label: str, *, integer: bool = False) -> None:
+    """Colour bar with its unit: a strip of the map's colours, which draws faster than matplotlib's own."""
     from matplotlib.ticker import MaxNLocator
 
-    ticks = MaxNLocator(nbins=6, integer=integer)
-    bar = fig.colorbar(drawn, cax=cax, orientation="horizontal", ticks=ticks)
-    bar.outline.set_linewidth(0.4)
-    bar.set_label(label, labelpad=1)
+    low, high = drawn.get_clim()
+    strip = np.linspace(low, high, 256)[None]
+    cax.imshow(strip, cmap=drawn.cmap, vmin=low, vmax=high, extent=(low, high, 0, 1), aspect="auto")
+    cax.set_yticks([])
+    cax.xaxis.set_major_locator(MaxNLocator(nbins=6, integer=integer))
+    cax.set_xlabel(label, labelpad=1)
+
+
+def color_map(name: str, undefined: str = UNDEFINED) -> Any:
+    """Colour map of matplotlib, with a colour for what is undefined."""
+    import matplotlib
+
+    return matplotlib.colormaps[name].with_extremes(bad=undefined)
 
 
 def scale_bar(ax: Any, extent: Extent) -> None:
@@ -207,15 +239,19 @@ def metres_or_mm(values: Image) -> tuple[float, str]:
 
 def encode(fig: Any, alt: str, *, photo: bool = False) -> Panel:
     """Figure to a :class:`Panel`: PNG with at most 256 colours for drawings, JPEG for photographs."""
+    fig.canvas.draw()
+    return panel(np.ascontiguousarray(np.asarray(fig.canvas.buffer_rgba())[..., :3]), alt, photo=photo)
+
+
+def panel(rgb: Image, alt: str, *, photo: bool = False) -> Panel:
+    """Picture (row, col, 3) or (row, col) uint8 to a :class:`Panel`, pixel by pixel."""
     from PIL import Image as Pillow
 
-    fig.canvas.draw()
-    rgb = np.asarray(fig.canvas.buffer_rgba())[..., :3]
     height, width = rgb.shape[:2]
-    picture = Pillow.fromarray(np.ascontiguousarray(rgb))
+    picture = Pillow.fromarray(rgb)
     out = io.BytesIO()
     if photo:
-        picture.save(out, "JPEG", quality=82, optimize=True)
+        picture.save(out, "JPEG", quality=82)
     else:
         picture.quantize(256, method=Pillow.Quantize.FASTOCTREE, dither=Pillow.Dither.NONE).save(
             out, "PNG", optimize=False
@@ -223,3 +259,13 @@ def encode(fig: Any, alt: str, *, photo: bool = False) -> Panel:
     kind = "jpeg" if photo else "png"
     uri = f"data:image/{kind};base64,{base64.b64encode(out.getvalue()).decode('ascii')}"
     return Panel(uri, alt, round(width * 96 / DPI), round(height * 96 / DPI))
+
+
+def fitted(pixels: Image, *, scale: int = 1) -> Image:
+    """Picture (row, col) or (row, col, 3) uint8 as wide as a panel (times ``scale``), without axes around it."""
+    from PIL import Image as Pillow
+
+    width = scale * round(WIDTH * DPI)
+    size = (width, max(1, round(width * pixels.shape[0] / pixels.shape[1])))
+    how = Pillow.Resampling.BOX if pixels.shape[1] > width else Pillow.Resampling.BICUBIC
+    return np.asarray(Pillow.fromarray(np.ascontiguousarray(pixels)).resize(size, how))

@@ -23,18 +23,17 @@ SAFE, HAZARDOUS, UNKNOWN = 0, 1, 2
 
 
 def photo(image: Floats, alt: str) -> Panel:
-    """A camera image; ``image`` (row, col) grey or (row, col, 3), of 8 or 16 bits."""
-    fig, ax, _ = canvas.image_axes(image.shape)
-    ax.imshow(canvas.shrink(_grey(image)), cmap="gray", vmin=0, vmax=255, aspect="auto")
-    return canvas.encode(fig, alt, photo=True)
+    """A camera image; ``image`` (row, col) grey or (row, col, 3), of 8 or 16 bits or float 0..255."""
+    return canvas.panel(canvas.fitted(_grey(image)), alt, photo=True)
 
 
 def disparity(values: Floats, label: str, alt: str) -> Panel:
     """One component of the disparity (row, col), pixels, NaN undefined, with its colour bar (Figure 6)."""
     fig, ax, cax = canvas.image_axes(values.shape, bar=True)
     low, high = canvas.limits(values)
-    drawn = ax.imshow(canvas.shrink(values), cmap=_map("viridis"), vmin=low, vmax=high, aspect="auto")
-    canvas.color_bar(fig, drawn, cax, label)
+    style = {"cmap": canvas.color_map("viridis"), "vmin": low, "vmax": high, "interpolation": "nearest"}
+    drawn = ax.imshow(canvas.shrink(values), aspect="auto", **style)
+    canvas.color_bar(drawn, cax, label)
     return canvas.encode(fig, alt, photo=True)
 
 
@@ -45,16 +44,15 @@ def validity_classes(bits: Bytes) -> Bytes:
 
 def validity(classes: Bytes, alt: str) -> Panel:
     """Which disparities were measured; ``classes`` (row, col) of :func:`validity_classes`."""
-    fig, ax, _ = canvas.image_axes(classes.shape)
-    ax.imshow(canvas.shrink(_paint(classes, canvas.MEASURED, canvas.INTERPOLATED, canvas.UNDEFINED)), aspect="auto")
-    return canvas.encode(fig, alt)
+    colors = _paint(classes, canvas.MEASURED, canvas.INTERPOLATED, canvas.UNDEFINED)
+    return canvas.panel(canvas.fitted((255 * colors).round().astype(np.uint8)), alt)
 
 
 def ortho(grey: Floats, extent: Extent, alt: str) -> Panel:
     """Ortho image (row, col), grey 0..255, NaN white (Figure 7, left)."""
     fig, ax, _ = canvas.map_axes(extent)
     low, high = canvas.limits(grey, 0.5, 99.5)
-    _show(ax, grey, extent, cmap=_map("gray", "white"), vmin=low, vmax=high)
+    _show(ax, grey, extent, cmap=canvas.color_map("gray", "white"), vmin=low, vmax=high)
     canvas.scale_bar(ax, extent)
     return canvas.encode(fig, alt, photo=True)
 
@@ -70,7 +68,7 @@ def elevation_with_path(elevation: Floats, risk: Bytes | None, path: Floats | No
     drawn = _show(ax, shown, extent, cmap=_greys(), vmin=low, vmax=high)
     if path is not None and len(path):
         canvas.polyline(ax, path, color=canvas.HAZARDOUS)
-    canvas.color_bar(fig, drawn, cax, f"elevation, {unit}")
+    canvas.color_bar(drawn, cax, f"elevation, {unit}")
     canvas.scale_bar(ax, extent)
     return canvas.encode(fig, alt, photo=True)
 
@@ -98,56 +96,67 @@ def cost_to_go(cost: Floats, path: Floats | None, extent: Extent, alt: str) -> P
     fig, ax, cax = canvas.map_axes(extent, bar=True)
     finite = np.where(np.isfinite(cost), cost, np.nan)
     factor, unit = canvas.metres_or_mm(finite)
-    drawn = _show(ax, finite * factor, extent, cmap=_map("cividis"), vmin=0, vmax=canvas.limits(finite)[1] * factor)
+    drawn = _show(
+        ax, finite * factor, extent, cmap=canvas.color_map("cividis"), vmin=0, vmax=canvas.limits(finite)[1] * factor
+    )
     if path is not None and len(path):
         canvas.polyline(ax, path)
-    canvas.color_bar(fig, drawn, cax, f"summed height differences, {unit}")
+    canvas.color_bar(drawn, cax, f"summed height differences, {unit}")
     return canvas.encode(fig, alt, photo=True)
 
 
 def tracks(image: Floats, trails: Sequence[Floats], inlier: Sequence[bool], alt: str) -> Panel:
     """One frame with the trails of its landmarks: each (n, 2) column, row, ending in this frame (Figure 8)."""
-    from matplotlib.collections import LineCollection
+    from PIL import Image as Pillow
+    from PIL import ImageDraw
 
-    rows, cols = image.shape[:2]
-    fig, ax, _ = canvas.image_axes(image.shape)
-    ax.imshow(
-        canvas.shrink(_grey(image)),
-        cmap="gray",
-        vmin=0,
-        vmax=255,
-        aspect="auto",
-        extent=(-0.5, cols - 0.5, rows - 0.5, -0.5),
-    )
-    colors = ["#ffd34d" if good else "#ff6a3d" for good in inlier]
-    ax.add_collection(LineCollection(list(trails), colors=colors, linewidths=1.1))
-    if trails:
-        ends = np.array([t[-1] for t in trails])
-        ax.scatter(ends[:, 0], ends[:, 1], s=9, c=colors, edgecolors="#222222", linewidths=0.4, zorder=3)
-    ax.set_xlim(-0.5, cols - 0.5)
-    ax.set_ylim(rows - 0.5, -0.5)
-    return canvas.encode(fig, alt, photo=True)
+    fine = 2  # drawn twice as large and averaged, for smooth lines
+    ground = canvas.fitted(_grey(image), scale=fine)
+    picture = Pillow.fromarray(ground).convert("RGB")
+    pen, factor = ImageDraw.Draw(picture), ground.shape[1] / image.shape[1]
+    for trail, good in zip(trails, inlier, strict=True):
+        color = "#ffd34d" if good else "#ff6a3d"
+        points = [(float(c), float(r)) for c, r in (trail + 0.5) * factor - 0.5]
+        pen.line(points, fill=color, width=2 * fine)
+        x, y = points[-1]
+        size = 2.6 * fine
+        pen.ellipse((x - size, y - size, x + size, y + size), fill=color, outline="#222222", width=fine // 2)
+    return canvas.panel(np.asarray(picture.reduce(fine)), alt, photo=True)
 
 
-def trajectory(left: Floats, right: Floats, truth: Floats | None, alt: str) -> Panel:
-    """Top view: left camera positions (n, 3) m, right ones at basic pairs (m, 3), truth (n, 3) (Figure 9, left)."""
-    everything = np.concatenate([p[:, :2] for p in (left, right, truth) if p is not None and len(p)])
+def trajectory(
+    left: Floats,
+    right: Floats,
+    truth: Floats | None,
+    alt: str,
+    *,
+    other: Floats | None = None,
+    flagged: Floats | None = None,
+) -> Panel:
+    """Top view of left camera positions (n, 3) m, right ones at basic pairs (m, 3), truth (n, 3) (Figure 9, left).
+
+    ``other`` (n, 3): another program's; ``flagged`` (k, 3): positions that are marked.
+    """
+    everything = np.concatenate([p[:, :2] for p in (left, right, truth, other) if p is not None and len(p)])
     everything = everything[np.isfinite(everything).all(axis=1)]
     if not len(everything):
         everything = np.zeros((1, 2))
     centre, span = 0.5 * (everything.min(axis=0) + everything.max(axis=0)), np.ptp(everything, axis=0)
     half = np.maximum(0.5 * span, 0.18 * max(float(span.max()), 1e-3)) * 1.12
     extent = (centre[0] - half[0], centre[0] + half[0], centre[1] - half[1], centre[1] + half[1])
-    fig, ax, foot = canvas.map_axes(extent, bar=True, max_height=5.0)
-    foot.set_axis_off()
+    fig, ax, _ = canvas.map_axes(extent, max_height=5.0)
     if truth is not None:
-        ax.plot(truth[:, 0], truth[:, 1], color=canvas.REFERENCE, linewidth=2.6, alpha=0.75, label="left camera, truth")
-    ax.plot(left[:, 0], left[:, 1], "o-", color=canvas.ESTIMATE, markersize=3, linewidth=0.8, label="left camera")
+        ax.plot(truth[:, 0], truth[:, 1], color=canvas.REFERENCE, linewidth=2.6, alpha=0.75)
+    if other is not None:
+        ax.plot(other[:, 0], other[:, 1], color=canvas.OTHER, linewidth=1.4)
+    ax.plot(left[:, 0], left[:, 1], "o-", color=canvas.ESTIMATE, markersize=3, linewidth=0.8)
     if len(right):
-        ax.plot(right[:, 0], right[:, 1], "^", color="#333333", markersize=4, label="right camera, basic pairs")
+        ax.plot(right[:, 0], right[:, 1], "^", color=canvas.RIGHT, markersize=4)
+    if flagged is not None and len(flagged):
+        ring = {"markerfacecolor": "none", "markeredgecolor": canvas.HAZARDOUS, "markersize": 8, "linewidth": 0}
+        ax.plot(flagged[:, 0], flagged[:, 1], "o", **ring)
     ax.grid(color="#dddddd", linewidth=0.5)
     ax.set_axisbelow(True)
-    fig.legend(loc="lower center", fontsize=7.5, frameon=False, borderaxespad=0.2, labelspacing=0.2)
     return canvas.encode(fig, alt)
 
 
@@ -187,9 +196,9 @@ def hillshade(elevation: Floats, cell: float, extent: Extent, alt: str) -> Panel
     tint = matplotlib.colormaps["cividis"](norm(np.nan_to_num(z * factor)))[..., :3]
     rgb = np.clip(tint * (0.35 + 0.9 * shade[..., None]), 0, 1)
     rgb[~np.isfinite(z)] = matplotlib.colors.to_rgb(canvas.UNDEFINED)
-    ax.imshow(rgb, extent=extent, aspect="auto", zorder=1)
+    ax.imshow(rgb, extent=extent, aspect="auto", zorder=1, interpolation="nearest")
     drawn = matplotlib.cm.ScalarMappable(norm, matplotlib.colormaps["cividis"])
-    canvas.color_bar(fig, drawn, cax, f"elevation, {unit}")
+    canvas.color_bar(drawn, cax, f"elevation, {unit}")
     return canvas.encode(fig, alt, photo=True)
 
 
@@ -198,8 +207,8 @@ def scalar_map(values: Floats, extent: Extent, label: str, alt: str, *, length: 
     fig, ax, cax = canvas.map_axes(extent, bar=True)
     factor, unit = canvas.metres_or_mm(values) if length else (1.0, "")
     low, high = (v * factor for v in canvas.limits(values))
-    drawn = _show(ax, values * factor, extent, cmap=_map("viridis"), vmin=min(low, 0.0), vmax=high)
-    canvas.color_bar(fig, drawn, cax, f"{label}, {unit}" if unit else label, integer=not length)
+    drawn = _show(ax, values * factor, extent, cmap=canvas.color_map("viridis"), vmin=min(low, 0.0), vmax=high)
+    canvas.color_bar(drawn, cax, f"{label}, {unit}" if unit else label, integer=not length)
     return canvas.encode(fig, alt, photo=True)
 
 
@@ -208,19 +217,13 @@ def error_map(error: Floats, extent: Extent, alt: str) -> Panel:
     fig, ax, cax = canvas.map_axes(extent, bar=True)
     factor, unit = canvas.metres_or_mm(error)
     bound = canvas.limits(np.abs(error), 0, 97)[1] * factor
-    drawn = _show(ax, error * factor, extent, cmap=_map("PuOr"), vmin=-bound, vmax=bound)
-    canvas.color_bar(fig, drawn, cax, f"elevation minus truth, {unit}")
+    drawn = _show(ax, error * factor, extent, cmap=canvas.color_map("PuOr"), vmin=-bound, vmax=bound)
+    canvas.color_bar(drawn, cax, f"elevation minus truth, {unit}")
     return canvas.encode(fig, alt, photo=True)
 
 
 def _show(ax: Any, values: Floats, extent: Extent, **style: Any) -> Any:
-    return ax.imshow(canvas.shrink(values), extent=extent, aspect="auto", zorder=1, **style)
-
-
-def _map(name: str, undefined: str = canvas.UNDEFINED) -> Any:
-    import matplotlib
-
-    return matplotlib.colormaps[name].with_extremes(bad=undefined)
+    return ax.imshow(canvas.shrink(values), extent=extent, aspect="auto", zorder=1, interpolation="nearest", **style)
 
 
 def _greys() -> Any:
@@ -229,8 +232,12 @@ def _greys() -> Any:
     return LinearSegmentedColormap.from_list("greys", ["#5a5a5a", "#ffffff"]).with_extremes(bad="black")
 
 
-def _grey(image: Floats) -> Floats:
-    return image / np.float32(257.0) if image.dtype == np.uint16 else image
+def _grey(image: Floats) -> Bytes:
+    """8 bits of an image of 8 or 16 bits, or of float 0..255 (NaN black)."""
+    if image.dtype == np.uint8:
+        return np.asarray(image)
+    values = image / np.float32(257.0) if image.dtype == np.uint16 else np.nan_to_num(image)
+    return np.asarray(np.clip(np.rint(values), 0, 255), dtype=np.uint8)
 
 
 def _paint(classes: Bytes, *colors: str) -> Floats:

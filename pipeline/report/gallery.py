@@ -3,45 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from pipeline.report import canvas, figures, gather
-from pipeline.report.canvas import Panel
+from pipeline.report import artifacts, canvas, checks, figures, gather
+from pipeline.report.block import Block, Gallery
 from pipeline.report.gather import Scene
+from pipeline.report.words import length, spread
 from stages.declare import Bundle
-
-
-@dataclass(frozen=True)
-class Block:
-    """One figure: panels side by side under a title, what one sees, and a legend of ``(colour, words)``."""
-
-    name: str
-    title: str
-    caption: str
-    panels: tuple[Panel, ...]
-    legend: tuple[tuple[str, str], ...] = ()
-
-    @property
-    def anchor(self) -> str:
-        """Where links lead."""
-        return self.name.lower().replace(" ", "-")
-
-
-@dataclass(frozen=True)
-class Gallery:
-    """The figures that could be drawn, and why others could not: ``(title, reason)``."""
-
-    blocks: tuple[Block, ...]
-    absent: tuple[tuple[str, str], ...]
 
 
 def draw(scene: Scene) -> Gallery:
     """Draw every figure whose artifacts are there."""
     blocks, absent = [], []
-    for title, maker in _FIGURES:
+    for title, maker, expected in _FIGURES:
         try:
             block = maker(scene)
         except Exception as error:  # a figure must not cost the run its report; the failure is shown in it
@@ -49,7 +25,7 @@ def draw(scene: Scene) -> Gallery:
             continue
         if block is not None:
             blocks.append(block)
-        elif maker is not _dem_error:
+        elif expected(scene):
             absent.append((title, "what it shows was not computed"))
     return Gallery(tuple(blocks), tuple(absent))
 
@@ -59,13 +35,13 @@ def _disparities(scene: Scene) -> Block | None:
     pair = next((p for p, h in view.products.disparity.items() if view.bundle(h) is not None), None)
     if pair is None:
         return None
-    bundle, image = view.bundle(view.products.disparity[pair]), view.bundle(view.products.images.get(pair))
+    bundle, image = view.bundle(view.products.disparity[pair]), artifacts.image(view, pair)
     assert bundle is not None
     row, column = np.asarray(bundle["row_disparity"]), np.asarray(bundle["column_disparity"])
     name = f"frame {pair}"
     panels = [
-        figures.disparity(row, "row disparity, px", f"Map of row disparities of {name}, {_range(row)} px"),
-        figures.disparity(column, "column disparity, px", f"Map of column disparities of {name}, {_range(column)} px"),
+        figures.disparity(row, "row disparity, px", f"Map of row disparities of {name}, {spread(row)} px"),
+        figures.disparity(column, "column disparity, px", f"Map of column disparities of {name}, {spread(column)} px"),
     ]
     if image is not None:
         panels.insert(0, figures.photo(np.asarray(image["image"]), f"Left camera image of {name}"))
@@ -97,11 +73,11 @@ def _terrain(scene: Scene) -> Block | None:
         )
     if elevation is not None:
         risk = None if scene.risk is None or scene.risk.lattice != world.lattice else scene.risk.arrays["risk"]
-        alt = f"Elevation as grey values, {_range(elevation)} m, with the path over it"
+        alt = f"Elevation as grey values, {spread(elevation)} m, with the path over it"
         panels.append(figures.elevation_with_path(elevation, risk, scene.path, world.extent, alt))
     path = "the path is the orange line (ring: start, disk: target)" if scene.path is not None else "there is no path"
     caption = (
-        f"First: ortho image merged from {pairs} basic pairs, cells of {_length(world.lattice.cell)}; undefined and "
+        f"First: ortho image merged from {pairs} basic pairs, cells of {length(world.lattice.cell)}; undefined and "
         "occluded cells are white. Second: elevation, bright is high; unknown and hazardous cells are black; "
         f"{path}. World frame: x right and y ahead of the first left camera, which is at (0, 0)."
     )
@@ -121,13 +97,13 @@ def _risk(scene: Scene) -> Block | None:
     slope = scene.risk.get("inclination")
     if slope is not None:
         degrees = np.degrees(slope)
-        alt = f"Local inclination, {_range(degrees)} degrees"
+        alt = f"Local inclination, {spread(degrees)} degrees"
         label = "local inclination, degrees"
         panels.append(figures.scalar_map(degrees, scene.risk.extent, label, alt, length=False))
     caption = (
         f"Of all cells {words}. Limits of {vehicle.name}: slope {vehicle.max_slope_deg:g}°, "
-        f"step {_length(vehicle.max_step)}, roughness {_length(vehicle.max_roughness)}, judged in windows of one wheel "
-        f"diameter ({_length(vehicle.wheel_diameter)}). {_path_words(scene)} Second: the local inclination, which the "
+        f"step {length(vehicle.max_step)}, roughness {length(vehicle.max_roughness)}, judged in windows of one wheel "
+        f"diameter ({length(vehicle.wheel_diameter)}). {_path_words(scene)} Second: the local inclination, which the "
         "slope's limit applies to."
     )
     return Block("Risk map", "Risk map and path of the whole run", caption, tuple(panels), _legend(shares))
@@ -136,7 +112,7 @@ def _risk(scene: Scene) -> Block | None:
 def _path_words(scene: Scene) -> str:
     if scene.path is None:
         return "There is no path."
-    margin = _length(scene.view.config.vehicle.margin)
+    margin = length(scene.view.config.vehicle.margin)
     return (
         f"The path (black line, ring: start, disk: target) keeps {margin} from hazardous cells and never enters "
         "unknown ones."
@@ -205,7 +181,7 @@ def _tracks(scene: Scene) -> Block | None:
         return None
     panels = []
     for frame in frames:
-        bundle = view.bundle(view.products.images[frame])
+        bundle = artifacts.image(view, frame)
         assert bundle is not None
         lines, good = trails.get(frame, ([], []))
         alt = f"Frame {frame} with {len(lines)} landmarks and the trails they left"
@@ -219,26 +195,37 @@ def _tracks(scene: Scene) -> Block | None:
 
 
 def _trajectory(scene: Scene) -> Block | None:
-    track = scene.track
-    if not track.posed.any():
-        return None
+    track, other = scene.track, scene.comparison
     n = int(track.posed.sum())
-    versus = " against the truth (orange)" if track.truth is not None else ""
-    panels = [figures.trajectory(track.left, track.right, track.truth, f"Top view of {n} camera positions{versus}")]
-    if n > 1:
-        step = np.diff(track.left, axis=0)
-        truth = None if track.truth is None else np.diff(track.truth, axis=0)
-        alt = f"x, y and z components of the displacement between successive frames{versus}"
-        panels.append(figures.displacements(step, truth, scene.view.frames[1:], alt))
+    if n < 2:
+        return None
+    known = track.truth is not None
+    versus = " against the truth (orange)" if known else ""
+    theirs = None if other is None or not other.registered.any() else other.poses[:, :, 3]
+    flagged = None if other is None else track.left[other.flagged]
+    alt = f"Top view of {n} camera positions{versus}"
+    panels = [figures.trajectory(track.left, track.right, track.truth, alt, other=theirs, flagged=flagged)]
+    step = np.diff(track.left, axis=0)
+    truth = None if track.truth is None else np.diff(track.truth, axis=0)
+    alt = f"x, y and z components of the displacement between successive frames{versus}"
+    panels.append(figures.displacements(step, truth, scene.view.frames[1:], alt))
+    gaps = 0 if track.truth is None else int(np.isnan(track.truth).any(axis=1).sum())
     source = (
-        f" Truth: {scene.view.sequence.truth_source}; aligned by the first frame alone." if versus else " No truth."
+        f" Truth: {scene.view.sequence.truth_source}; aligned by the first frame that has it alone"
+        + (f"; {gaps} of {len(track.truth)} frames have none." if gaps else ".")
+        if track.truth is not None
+        else " No truth."
     )
     caption = (
         f"First: positions of the left camera in {n} frames, and of the right camera at the basic pairs, seen from "
-        f"above. Second, from the top: x, y and z components of the displacement between successive positions{versus}."
-        f"{source}"
+        f"above{'; the positions by COLMAP are laid on ours without a change of scale' if theirs is not None else ''}. "
+        f"Second, from the top: x, y and z components of the displacement between successive positions{versus}.{source}"
     )
-    return Block("Figure 9", "Figure 9. Trajectory and displacements", caption, tuple(panels))
+    legend = [(canvas.ESTIMATE, "left camera (dots: frames)"), (canvas.RIGHT, "right camera (triangles: basic pairs)")]
+    legend += [(canvas.REFERENCE, "left camera, truth")] if known else []
+    legend += [(canvas.OTHER, "left camera by COLMAP")] if theirs is not None else []
+    legend += [(canvas.HAZARDOUS, "flagged frames (rings)")] if flagged is not None and len(flagged) else []
+    return Block("Figure 9", "Figure 9. Trajectory and displacements", caption, tuple(panels), tuple(legend))
 
 
 def _quality(scene: Scene) -> Block | None:
@@ -246,9 +233,9 @@ def _quality(scene: Scene) -> Block | None:
     if world is None or world.get("elevation") is None:
         return None
     z, sigma, count = world.arrays["elevation"], world.get("elevation_std"), world.get("count")
-    panels = [figures.hillshade(z, world.lattice.cell, world.extent, f"Shaded relief of the terrain, {_range(z)} m")]
+    panels = [figures.hillshade(z, world.lattice.cell, world.extent, f"Shaded relief of the terrain, {spread(z)} m")]
     if sigma is not None:
-        alt = f"Standard deviation of the elevation, {_range(sigma)} m"
+        alt = f"Standard deviation of the elevation, {spread(sigma)} m"
         panels.append(figures.scalar_map(sigma, world.extent, "standard deviation", alt))
     if count is not None:
         seen = np.where(count > 0, count, np.nan).astype(np.float32)
@@ -267,7 +254,7 @@ def _dem_error(scene: Scene) -> Block | None:
     if error is None or error.get("error") is None:
         return None
     values = error.arrays["error"]
-    panel = figures.error_map(values, error.extent, f"Elevation minus truth of the merged terrain, {_range(values)} m")
+    panel = figures.error_map(values, error.extent, f"Elevation minus truth of the merged terrain, {spread(values)} m")
     caption = (
         "Merged elevation minus the exact one, by cell. The world frame is that of the first pair, so errors of the "
         "trajectory show here as well."
@@ -275,26 +262,26 @@ def _dem_error(scene: Scene) -> Block | None:
     return Block("Elevation error", "Elevation error against truth", caption, (panel,))
 
 
-def _range(values: Any) -> str:
-    """``low to high`` of nearly all values, for alternative texts."""
-    finite = canvas.sample(values)
-    if not finite.size:
-        return "nothing defined"
-    low, high = np.percentile(finite, [1, 99])
-    return f"{low:.3g} to {high:.3g}"
+def _several(scene: Scene) -> bool:
+    return len(scene.view.frames) > 1
 
 
-def _length(metres: float) -> str:
-    return f"{metres * 1000:.4g} mm" if metres < 0.1 else f"{metres:.4g} m"
+def _always(scene: Scene) -> bool:
+    return True
 
 
-_FIGURES: tuple[tuple[str, Callable[[Scene], Block | None]], ...] = (
-    ("Figure 6. Disparities", _disparities),
-    ("Figure 7. Ortho image and path", _terrain),
-    ("Risk map", _risk),
-    ("Figure 3. Local risk map", _local),
-    ("Figure 8. Tracks", _tracks),
-    ("Figure 9. Trajectory", _trajectory),
-    ("Terrain", _quality),
-    ("Elevation error", _dem_error),
+_FIGURES: tuple[tuple[str, Callable[[Scene], Block | None], Callable[[Scene], bool]], ...] = (
+    ("Figure 6. Disparities", _disparities, _always),
+    ("Rig", checks.rig, lambda scene: bool(scene.view.products.rigs)),
+    ("Figure 7. Ortho image and path", _terrain, _always),
+    ("Risk map", _risk, _always),
+    ("Figure 3. Local risk map", _local, _always),
+    ("Figure 8. Tracks", _tracks, _several),
+    ("Figure 9. Trajectory", _trajectory, _several),
+    ("Crosscheck", checks.crosscheck, lambda scene: scene.view.products.agreement is not None),
+    ("Basic pairs", checks.basic_pairs, lambda scene: _several(scene) and scene.view.products.select is not None),
+    ("Terrain", _quality, _always),
+    ("Overlap", checks.overlaps, lambda scene: len(scene.view.products.world_dem) > 1),
+    ("Elevation error", _dem_error, lambda scene: False),
 )
+"""Title, how it is drawn, and whether a run lacks something without it."""

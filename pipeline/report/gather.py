@@ -10,13 +10,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.report.artifacts import Floats, image, used_rig
+from pipeline.report.calibration import Calibration, calibration
 from pipeline.report.canvas import Extent
+from pipeline.report.comparison import Comparison, compare
+from pipeline.report.overlap import Difference, differences
 from pipeline.report.view import RunView
 from stages.declare import Bundle
 from stages.geometry import RigidTransform
 from stages.lattice import Lattice, mosaic, union
-
-Floats = NDArray[Any]
 
 NODATA: Mapping[str, float] = {"count": 0, "source": -1}
 """Of the arrays of merged terrain that are not floats."""
@@ -43,7 +45,8 @@ class Terrain:
 class Track:
     """The trajectory: positions (frame, 3) m in the world, one row a chosen frame, NaN without a pose.
 
-    ``right`` (pair, 3): right cameras at basic pairs. ``truth`` (frame, 3): aligned by the first frame's pose only.
+    ``right`` (pair, 3): right cameras at basic pairs. ``truth`` (frame, 3): aligned by the first frame that has both,
+    NaN where the truth has a gap.
     ``sigma`` (frame,): standard deviation of the position, m. ``segment`` (frame,): which segment posed it, -1 none.
     """
 
@@ -85,6 +88,21 @@ class Scene:
         """The trajectory."""
         return trajectory(self.view)
 
+    @cached_property
+    def comparison(self) -> Comparison | None:
+        """The trajectory against that of another program."""
+        return compare(self.view)
+
+    @cached_property
+    def differences(self) -> list[Difference]:
+        """What successive elevation models say of the same ground."""
+        return differences(self.view)
+
+    @cached_property
+    def calibration(self) -> Calibration | None:
+        """The rig, as it was given and as it was used."""
+        return calibration(self.view)
+
 
 def vertices(path: Bundle | None) -> Floats | None:
     """Vertices (n, 3), m, of a path artifact; None without a path."""
@@ -121,32 +139,34 @@ def trajectory(view: RunView) -> Track:
     n = len(view.frames)
     row = {frame: i for i, frame in enumerate(view.frames)}
     left, sigma, segment = np.full((n, 3), np.nan), np.full(n, np.nan), np.full(n, -1, dtype=np.int64)
-    right, first = [], None
+    right, posed = [], {}
     bundle = view.bundle(view.products.trajectory)
     if bundle is not None:
         poses = np.asarray(bundle["poses"])
-        T_left_right = view.sequence.rig.T_right_left.inverse()
         for i, frame in enumerate(bundle.meta.get("frames", view.frames[: len(poses)])):
             if frame not in row or not np.isfinite(poses[i]).all():
                 continue
-            pose = RigidTransform.from_matrix(poses[i])
-            first = first or (frame, pose)
+            posed[frame] = pose = RigidTransform.from_matrix(poses[i])
             left[row[frame]] = pose.translation
             segment[row[frame]] = int(bundle["segment"][i]) if "segment" in bundle.arrays else -1
             if "covariance" in bundle.arrays:
                 sigma[row[frame]] = np.sqrt(max(float(np.trace(bundle["covariance"][i][:3, :3])), 0.0))
             if frame in view.products.disparity:
-                right.append((pose @ T_left_right).translation)
-    return Track(left, np.array(right).reshape(-1, 3), _truth(view, first), sigma, segment)
+                right.append((pose @ used_rig(view, frame).T_right_left.inverse()).translation)
+    return Track(left, np.array(right).reshape(-1, 3), _truth(view, posed), sigma, segment)
 
 
-def _truth(view: RunView, first: tuple[int, RigidTransform] | None) -> Floats | None:
-    """True positions brought to the world by the pose of the first posed frame alone."""
-    if view.sequence.truth is None or first is None:
+def _truth(view: RunView, posed: Mapping[int, RigidTransform]) -> Floats | None:
+    """True positions brought to the world by the pose of the first frame that has both alone; NaN in gaps."""
+    truth = view.sequence.truth
+    if truth is None:
         return None
-    frame, pose = first
-    T_world_truth = pose @ view.sequence.truth[frame].inverse()
-    return T_world_truth.apply([view.sequence.truth[f].translation for f in view.frames])
+    true = {frame: pose for frame in view.frames if (pose := truth[frame]) is not None}
+    first = next((frame for frame in view.frames if frame in true and frame in posed), None)
+    if first is None:
+        return None
+    T_world_truth = posed[first] @ true[first].inverse()
+    return np.array([(T_world_truth @ true[f]).translation if f in true else [np.nan] * 3 for f in view.frames])
 
 
 def frame_facts(view: RunView) -> dict[int, dict[str, Any]]:
@@ -184,5 +204,5 @@ def _finite(line: Floats) -> Floats:
 
 def consecutive(view: RunView, count: int = 4) -> tuple[int, ...]:
     """The first ``count`` successive frames whose images are there (fewer where there are fewer)."""
-    have = [f for f in view.frames if view.bundle(view.products.images.get(f)) is not None]
+    have = [f for f in view.frames[: 4 * count] if image(view, f) is not None]
     return tuple(have[:count])

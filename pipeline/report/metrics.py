@@ -34,6 +34,7 @@ LABELS: Mapping[str, str] = {
     "kitti_rotation": "KITTI rotation error",
     "frames": "Frames to be posed",
     "frames_missing": "Frames without a pose",
+    "frames_without_truth": "Frames without truth",
     "rmse": "Elevation error, RMS",
     "nmad": "Elevation error, robust deviation (NMAD)",
     "p95": "Elevation error, 95 %",
@@ -46,6 +47,17 @@ LABELS: Mapping[str, str] = {
     "hazardous_share": "Truly hazardous cells",
 }
 """Words for the names that the assessing stages use."""
+
+AGREEMENT: Mapping[str, str] = {
+    "rmse": "Disagreement of position, RMS",
+    "share": "Disagreement of position over the length",
+    "rmse_rotation": "Disagreement of rotation, RMS",
+    "step_rmse": "Disagreement of the motion between frames, RMS",
+    "step_rmse_rotation": "The same, rotation",
+    "length": "Length of our trajectory where both have poses",
+    "rmse_scaled": "Disagreement of position with a free scale, RMS",
+}
+"""Words for the figures of the comparison with the other program."""
 
 KEY = frozenset(
     {
@@ -69,6 +81,11 @@ KEY = frozenset(
         "hazardous",
         "unknown",
         "path_length",
+        "agreement_rmse",
+        "agreement_share",
+        "agreement_flagged",
+        "rig_residual",
+        "overlap_median",
     }
 )
 """Those that stand in the first table; the others are folded."""
@@ -79,7 +96,9 @@ def metrics(scene: Scene, frames: Rows, pairs: Rows) -> dict[str, Metric]:
     found = {**_trajectory(scene.view, frames), **_elevation(scene.view, pairs), **_path_check(scene.view)}
     for group, more in (
         ("Poses", _poses(frames)),
-        ("Matching and terrain", _matching(pairs) | _terrain(scene)),
+        ("Agreement with COLMAP", _agreement(scene)),
+        ("Rig", _rig(scene)),
+        ("Matching and terrain", _matching(pairs) | _terrain(scene) | _overlap(scene)),
         ("Hazards and path", _hazards(scene) | _path(scene.view)),
         ("Run", _run(scene.view)),
     ):
@@ -96,12 +115,83 @@ def _assessed(view: RunView, handle: Any, prefix: str, group: str, truth: str) -
 
 
 def _trajectory(view: RunView, frames: Rows) -> dict[str, Metric]:
+    """Ours, then the other program's, both against the truth."""
     complete = f"{sum(r['posed'] for r in frames)} of {len(frames)} frames"
-    source = view.sequence.truth_source
-    found = dict(_assessed(view, view.products.accuracy, "trajectory_", "Trajectory against truth", source))
-    order = [f"trajectory_{name}" for name in LABELS]
-    ordered = sorted(found, key=lambda name: order.index(name) if name in order else len(order))
-    return {name: {**found[name], "completeness": complete} for name in ordered}
+    found: dict[str, Metric] = {}
+    if len(frames) < 2:
+        return found
+    for prefix, handle, group in (
+        ("trajectory_", view.products.accuracy, "Trajectory against truth"),
+        ("crosscheck_", view.products.crosscheck_accuracy, "COLMAP against truth"),
+    ):
+        given = dict(_assessed(view, handle, prefix, group, view.sequence.truth_source))
+        order = [f"{prefix}{name}" for name in LABELS]
+        ordered = sorted(given, key=lambda name: order.index(name) if name in order else len(order))
+        share = complete if prefix == "trajectory_" else _posed(given, prefix)
+        found |= {name: {**given[name], "completeness": share} for name in ordered}
+    return found
+
+
+def _posed(given: Mapping[str, Metric], prefix: str) -> str:
+    frames, lost = (given.get(prefix + name, {}).get("value") for name in ("frames", "frames_missing"))
+    return "frames that COLMAP posed" if frames is None or lost is None else f"{frames - lost} of {frames} frames"
+
+
+def _agreement(scene: Scene) -> dict[str, Metric]:
+    """Two trajectories that share the given calibration alone."""
+    found = scene.comparison
+    if found is None or not found.registered.any():
+        return {}
+    every = f"{int(np.isfinite(found.distance).sum())} of {len(found.distance)} frames"
+    given = found.meta.get("metrics") or {}
+    metrics = {
+        f"agreement_{name}": {**given[name], "label": label, "completeness": every}
+        for name, label in AGREEMENT.items()
+        if name in given
+    }
+    scale = given.get("scale_ratio", {}).get("value")
+    if scale is not None:
+        how = "scale that would fit COLMAP's trajectory to ours best, less 1: a hint only"
+        metrics["agreement_scale"] = _metric("Difference of scale", scale - 1.0, "1", how, every)
+    flagged = int(found.flagged.sum())
+    metrics["agreement_flagged"] = _metric(
+        "Frames flagged", flagged, "frames", str(found.meta.get("rule") or "by their disagreement"), every
+    )
+    return metrics
+
+
+def _rig(scene: Scene) -> dict[str, Metric]:
+    """Epipolar residuals under the given and the used rig."""
+    found = scene.calibration
+    if found is None or not len(found.before):
+        return {}
+    every = f"{len(scene.view.products.orientations)} basic pairs, {len(found.before)} matches"
+    rms = [float(np.sqrt(np.mean(d**2))) for d in (found.before, found.after)]
+    how = "RMS distance of matched points from their epipolar lines, outliers left out, under the "
+    metrics = {"rig_residual_given": _metric("Epipolar residual, given rig", rms[0], "px", how + "given rig", every)}
+    metrics["rig_residual"] = _metric("Epipolar residual, used rig", rms[1], "px", how + "rig that was used", every)
+    words = "repaired" if found.changed else "as given"
+    metrics["rig_state"] = _metric("Rig used", words, "", str(found.facts[0].get("source", "")), None)
+    return metrics
+
+
+def _overlap(scene: Scene) -> dict[str, Metric]:
+    """Disagreement of elevation models that see the same ground."""
+    found = scene.differences
+    if not found:
+        return {}
+    every = f"{len(found)} of {max(len(scene.view.products.world_dem) - 1, 0)} successive models"
+    median = statistics.median(abs(d.median) for d in found)
+    deviation = statistics.median(d.deviation for d in found)
+    how = "elevation of a model minus that of the one before in their common cells: "
+    return {
+        "overlap_median": _metric(
+            "Offset of overlapping models", median, "m", how + "size of its median, median over pairs", every
+        ),
+        "overlap_deviation": _metric(
+            "Deviation of overlapping models", deviation, "m", how + "robust deviation, median over pairs", every
+        ),
+    }
 
 
 def _elevation(view: RunView, pairs: Rows) -> dict[str, Metric]:

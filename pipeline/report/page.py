@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
@@ -12,11 +11,10 @@ from typing import Any
 
 from pipeline.products import write_text
 from pipeline.report import gallery, summary, tables
+from pipeline.report.block import Gallery
 from pipeline.report.gather import Scene
 from pipeline.report.view import RunView
-
-SMALL = {"m": ("mm", 1000.0, 0.1), "m²": ("cm²", 10000.0, 0.01)}
-"""Unit for small values: its name, the factor and the bound below which it is used."""
+from pipeline.report.words import coordinate, metres, number, quantity, seconds, share
 
 
 def write_report(folder: Path, view: RunView) -> None:
@@ -35,7 +33,7 @@ def write_report(folder: Path, view: RunView) -> None:
     write_text(folder / "report.html", render(scene, facts, drawn, tables.files(folder)))
 
 
-def render(scene: Scene, facts: Mapping[str, Any], drawn: gallery.Gallery, files: list[tuple[str, str, str]]) -> str:
+def render(scene: Scene, facts: Mapping[str, Any], drawn: Gallery, files: list[tuple[str, str, str]]) -> str:
     """The page as text."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
@@ -63,55 +61,6 @@ def render(scene: Scene, facts: Mapping[str, Any], drawn: gallery.Gallery, files
         together=together,
         others=tables.other_stages(scene.view),
         config_toml=scene.view.config_toml,
-        true_mean=scene.view.sequence.truth is not None,
+        true_mean=facts["truth"]["used"],
+        compared=scene.comparison is not None,
     )
-
-
-def number(value: Any, digits: int = 3) -> str:
-    """Value with a sensible number of digits; a dash where there is none."""
-    if value is None:
-        return "–"
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return str(value)
-    if isinstance(value, int) or (value == int(value) and abs(value) < 1e6):
-        return f"{int(value)}"
-    if abs(value) < 1e-6:
-        return f"{value:.0e}".replace("-", "−")
-    decimals = max(0, digits - 1 - math.floor(math.log10(abs(value))))
-    return f"{value:.{decimals}f}".replace("-", "−")
-
-
-def quantity(value: Any, unit: str) -> str:
-    """Value with its unit, small lengths and areas in mm and cm²."""
-    if isinstance(value, float) and unit in SMALL and abs(value) < 1e-9:
-        value = 0  # rounding
-    if isinstance(value, int | float) and unit in SMALL and value != 0 and abs(value) < SMALL[unit][2]:
-        unit, factor, _ = SMALL[unit]
-        value = value * factor
-    elif isinstance(value, int | float) and unit == "deg":
-        return f"{number(value)}°"
-    elif isinstance(value, int | float) and unit == "1":
-        return f"{number(100 * value)} %"
-    return f"{number(value)} {unit}".strip() if value is not None else "–"
-
-
-def metres(value: Any) -> str:
-    """Metres with a unit that fits."""
-    return quantity(value, "m")
-
-
-def coordinate(value: Any) -> str:
-    """Coordinate in metres to a tenth of a millimetre."""
-    return "–" if value is None else f"{round(value, 4) + 0.0:.4f}".replace("-", "−")
-
-
-def share(value: Any) -> str:
-    """Share as per cent."""
-    return "–" if value is None else f"{100 * value:.0f} %"
-
-
-def seconds(value: Any) -> str:
-    """Seconds with two or three digits."""
-    if value is None:
-        return "–"
-    return f"{value:.0f}" if value >= 100 else f"{value:.1f}" if value >= 1 else f"{value:.2f}"

@@ -5,21 +5,26 @@ from __future__ import annotations
 from typing import Any
 
 from pipeline.report import tables
-from pipeline.report.gallery import Gallery
+from pipeline.report.block import Gallery
 from pipeline.report.gather import Scene
 from pipeline.report.metrics import metrics
 from pipeline.report.view import RunView
+from pipeline.report.words import spans
 
 FORMAT = 1
 """Raised when the meaning of a key of report.json changes."""
+
+NO_HOLES = ("no truth", "no path", "crosscheck")
+"""Kinds of what is missing that are answers, or lie outside of the reconstruction: the run is complete with them."""
 
 
 def summarise(scene: Scene, gallery: Gallery) -> dict[str, Any]:
     """Everything that ``report.json`` holds; the page is rendered from the same numbers."""
     view = scene.view
-    frames, pairs = tables.frames(scene), tables.pairs(view)
-    missing = find_missing(view, frames, gallery)
-    holes = [m for m in missing if m["kind"] not in ("no truth", "no path")]
+    frames, pairs = tables.frames(scene), tables.pairs(scene)
+    missing = find_missing(scene, frames, gallery)
+    holes = [m for m in missing if m["kind"] not in NO_HOLES]
+    assessed = any(_truth(view))
     rows, together = tables.table_2(view)
     return {
         "format": FORMAT,
@@ -29,8 +34,9 @@ def summarise(scene: Scene, gallery: Gallery) -> dict[str, Any]:
         "complete": not holes,
         "verdict": _verdict(view, frames, pairs, missing),
         "missing": missing,
+        "warnings": find_warnings(scene),
         "sequence": _sequence(view),
-        "truth": {"used": view.sequence.truth is not None, "source": view.sequence.truth_source or "no truth"},
+        "truth": {"used": assessed, "source": view.sequence.truth_source if assessed else "no truth"},
         "metrics": metrics(scene, frames, pairs),
         "stages": _stages(view),
         "table_2": [vars(t) for t in (*rows, together)],
@@ -43,8 +49,9 @@ def summarise(scene: Scene, gallery: Gallery) -> dict[str, Any]:
     }
 
 
-def find_missing(view: RunView, frames: list[dict[str, Any]], gallery: Gallery) -> list[dict[str, str]]:
+def find_missing(scene: Scene, frames: list[dict[str, Any]], gallery: Gallery) -> list[dict[str, str]]:
     """What a reader might take for granted and is not there: ``kind``, ``what``, ``why``."""
+    view = scene.view
     found = [_missing("failed", t.label, t.reason) for t in view.tasks if t.status == "failed"]
     skipped = [t for t in view.tasks if t.status not in ("computed", "cached", "failed")]
     for reason in dict.fromkeys(t.reason for t in skipped):
@@ -53,13 +60,74 @@ def find_missing(view: RunView, frames: list[dict[str, Any]], gallery: Gallery) 
         found.append(_missing("skipped", ", ".join(labels[:6]) + more, reason or "something it depends on is missing"))
     lost = [r["frame"] for r in frames if not r["posed"]]
     if lost:
-        which = f"frame{'s' if len(lost) > 1 else ''} {_spans(lost)}"
-        found.append(_missing("no pose", f"{len(lost)} of {len(frames)} frames have no pose", which))
+        found.append(_missing("no pose", f"{len(lost)} of {len(frames)} frames have no pose", _which(lost)))
     found += _path_missing(view)
-    if view.sequence.truth is None:
-        found.append(_missing("no truth", "No truth", "the sequence has none, so accuracy is not assessed"))
+    found += _truth_missing(view)
+    found += _crosscheck_missing(scene)
     found += [_missing("figure", title, reason) for title, reason in gallery.absent]
     return found
+
+
+def _which(frames: list[int]) -> str:
+    return f"frame{'s' if len(frames) > 1 else ''} {spans(frames)}"
+
+
+def _truth(view: RunView) -> list[bool]:
+    """Whether each chosen frame has a true pose."""
+    truth = view.sequence.truth
+    return [truth is not None and truth[frame] is not None for frame in view.frames]
+
+
+def _truth_missing(view: RunView) -> list[dict[str, str]]:
+    known = _truth(view)
+    if view.sequence.truth is None:
+        return [_missing("no truth", "No truth", "the sequence has none, so accuracy is not assessed")]
+    gaps = [frame for frame, there in zip(view.frames, known, strict=True) if not there]
+    if not any(known):
+        return [_missing("no truth", "No truth", "it has none for the chosen frames, so accuracy is not assessed")]
+    return [_missing("no truth", f"{len(gaps)} of {len(known)} frames have no truth", _which(gaps))] if gaps else []
+
+
+def _crosscheck_missing(scene: Scene) -> list[dict[str, str]]:
+    """Frames that the other program could not pose, or that nothing was compared at all."""
+    view, compared = scene.view, scene.comparison
+    if len(view.frames) < 2:
+        return []
+    if view.products.crosscheck is None:
+        params = getattr(view.config, "crosscheck", None)
+        off = params is not None and not params.enabled
+        why = "the crosscheck is switched off (crosscheck.enabled = false)"
+        return [_missing("crosscheck", "No second opinion on the trajectory", why)] if off else []
+    if compared is None:
+        return []  # the task that failed or was skipped says why
+    lost = [frame for frame, there in zip(view.frames, compared.registered, strict=True) if not there]
+    if not lost:
+        return []
+    joined = view.bundle(view.products.crosscheck)
+    meta = {} if joined is None else joined.meta
+    reasons = [f"COLMAP has no pose of {_which(lost)}"]
+    if len(meta.get("pieces") or ()) > 1:
+        reasons.append(f"its trajectory falls into {len(meta['pieces'])} pieces, each laid on ours by itself")
+    reasons += [str(w["reason"]) for w in meta.get("windows") or () if w.get("reason")]
+    what = f"{len(lost)} of {len(view.frames)} frames are not compared with another program"
+    return [_missing("crosscheck", what, "; ".join(dict.fromkeys(reasons)))]
+
+
+def find_warnings(scene: Scene) -> list[str]:
+    """What is suspicious but possible, one line each: of the input, the rig, the choice of pairs, the comparison."""
+    view = scene.view
+    lines = list(view.sequence.warnings)
+    lines += scene.calibration.collected("warnings") if scene.calibration is not None else []
+    p = view.products
+    for handle in (p.select, *p.crosschecks, p.crosscheck, p.agreement, p.trajectory, p.accuracy):
+        bundle = view.bundle(handle)
+        lines += (bundle.meta.get("warnings") or []) if bundle is not None else []
+    compared = scene.comparison
+    if compared is not None and compared.flagged.any():
+        bad = [frame for frame, flagged in zip(view.frames, compared.flagged, strict=True) if flagged]
+        share = f"{len(bad)} of {len(view.frames)} frames"
+        lines.append(f"trajectory and COLMAP disagree more than elsewhere at {share}: {_which(bad)}")
+    return list(dict.fromkeys(" ".join(str(line).split()) for line in lines))
 
 
 def _path_missing(view: RunView) -> list[dict[str, str]]:
@@ -85,10 +153,10 @@ def _verdict(
     path = view.bundle(view.products.path)
     length = None if path is None else path.meta.get("length_m")
     parts = [
-        f"{posed} of {len(frames)} frames posed",
+        "one stereo pair" if len(frames) == 1 else f"{posed} of {len(frames)} frames posed",
         f"{models} of {len(pairs)} elevation models",
         "no path" if length is None else f"a path of {length:.3g} m",
-        *(["not assessed against truth"] if view.sequence.truth is None else []),
+        *([] if any(_truth(view)) else ["not assessed against truth"]),
     ]
     failures = sum(m["kind"] in ("failed", "skipped") for m in missing)
     return ("Incomplete: " if failures or posed < len(frames) else "Complete: ") + ", ".join(parts) + "."
@@ -123,14 +191,3 @@ def _stages(view: RunView) -> dict[str, dict[str, Any]]:
     for row in found.values():
         row["seconds"], row["seconds_when_computed"] = round(row["seconds"], 3), round(row["seconds_when_computed"], 3)
     return found
-
-
-def _spans(numbers: list[int]) -> str:
-    """``[1, 2, 3, 7]`` to ``1-3, 7``."""
-    spans: list[list[int]] = []
-    for n in numbers:
-        if spans and n == spans[-1][1] + 1:
-            spans[-1][1] = n
-        else:
-            spans.append([n, n])
-    return ", ".join(f"{a}" if a == b else f"{a}-{b}" for a, b in spans)

@@ -29,19 +29,32 @@ FILES: dict[str, tuple[str, str]] = {
     "report.json": ("every number of this page, for programs", "any text editor, jq"),
     "trajectory.kitti": (
         "pose of each left camera, a 3 x 4 matrix a line, world from camera, m",
-        "evo, any text editor",
+        "evo (evo_traj kitti), any text editor",
     ),
-    "trajectory.tum": ("the same as time, position and quaternion x y z w", "evo, any text editor"),
-    "frames.json": ("names of the frames, their numbers and conventions of the trajectory files", "any text editor"),
+    "trajectory.tum": ("the same as time, position and quaternion x y z w", "evo (evo_traj tum), CloudCompare"),
+    "crosscheck.tum": (
+        "the trajectory by COLMAP in the same form, laid on ours without a change of scale",
+        "evo (evo_ape tum trajectory.tum crosscheck.tum)",
+    ),
+    "agreement.csv": (
+        "each frame: our position, COLMAP's, their disagreement, whether it is flagged, errors where there is truth",
+        "LibreOffice Calc, any text editor",
+    ),
+    "frames.json": (
+        "frames, handedness, quaternion order and units of every file; the frames' names",
+        "any text editor",
+    ),
     "dem.tif": ("merged elevation, m, NaN undefined", "QGIS, GDAL"),
+    "dem.qml": ("colours of dem.tif, which QGIS applies by itself", "QGIS"),
     "dem_sigma.tif": ("standard deviation of the elevation, m", "QGIS, GDAL"),
     "ortho.tif": ("merged ortho image, grey 0..255", "QGIS, GDAL"),
     "risk.tif": (
         "risk map; bands: class (0 safe, 1 hazardous, 2 unknown), reason (bits), filled (1: closed hole)",
         "QGIS, GDAL",
     ),
-    "path.geojson": ("path over the merged terrain, metres in the world frame (not longitude and latitude)", "QGIS"),
-    "path.gpkg": ("the path with its engineering coordinate system", "QGIS"),
+    "risk.qml": ("colours and names of the classes of risk.tif, which QGIS applies by itself", "QGIS"),
+    "path.gpkg": ("path over the merged terrain, its start and target, with their coordinate system", "QGIS, GDAL"),
+    "path.geojson": ("the same in metres of the world frame (not longitude and latitude)", "any text editor, QGIS"),
     "config.toml": ("every parameter in force; give it back with --config", "any text editor"),
     "ledger.jsonl": ("what became of every task, a JSON object a line", "any text editor, jq"),
 }
@@ -132,7 +145,7 @@ def frames(scene: gather.Scene) -> list[dict[str, Any]]:
     """One row a chosen frame: how its pose was found, how well, and how far it is from the truth."""
     view, track = scene.view, scene.track
     facts = gather.frame_facts(view)
-    names = view.sequence.frame_names
+    names, compared = view.sequence.frame_names, scene.comparison
     rows = []
     for i, frame in enumerate(view.frames):
         fact = facts.get(frame, {})
@@ -151,6 +164,9 @@ def frames(scene: gather.Scene) -> list[dict[str, Any]]:
                 "z_m": finite(track.left[i, 2]),
                 "sigma_m": finite(track.sigma[i]),
                 "error_m": finite(error),
+                "disagreement_m": None if compared is None else finite(compared.distance[i]),
+                "disagreement_deg": None if compared is None else finite(np.degrees(compared.angle[i])),
+                "flagged": compared is not None and bool(compared.flagged[i]),
                 "basic": frame in view.products.disparity,
             }
         )
@@ -159,9 +175,28 @@ def frames(scene: gather.Scene) -> list[dict[str, Any]]:
     return rows
 
 
-def pairs(view: RunView) -> list[dict[str, Any]]:
-    """One row a basic pair: matching, levelling, elevation model, local hazards and path."""
-    return [_pair(view, pair) for pair in view.products.disparity]
+def pairs(scene: gather.Scene) -> list[dict[str, Any]]:
+    """One row a basic pair: choice, matching, rig, levelling, elevation model, local hazards and path."""
+    view = scene.view
+    select = view.bundle(view.products.select)
+    meta = {} if select is None else select.meta
+    numbers = [view.frames[i] for i in meta.get("basic", ())]
+    overlap = dict(zip(numbers, meta.get("overlap") or (), strict=False))
+    why = dict(zip(numbers, meta.get("why") or (), strict=False))
+    different = {d.pair: d for d in scene.differences}
+    rows = []
+    for pair in view.products.disparity:
+        orientation = view.bundle(view.products.orientations.get(pair))
+        difference = different.get(pair)
+        more = {
+            "why_basic": why.get(pair),
+            "overlap": overlap.get(pair),
+            "epipolar_px": None if orientation is None else orientation.meta.get("residual_before_px"),
+            "difference_m": None if difference is None else difference.median,
+            "difference_deviation_m": None if difference is None else difference.deviation,
+        }
+        rows.append(_pair(view, pair) | more)
+    return rows
 
 
 def _pair(view: RunView, pair: int) -> dict[str, Any]:

@@ -61,7 +61,7 @@ def test_self_contained_folder(folder):
     np.testing.assert_allclose(s.rig.T_right_left.translation, [-0.5, 0.0, 0.0])
     np.testing.assert_allclose(s.truth[2].translation, [0.0, 0.0, 2.4])
     assert s.times is None
-    assert s.defaults["select.stride"] == 2
+    assert s.defaults["locus.cell_size"] == 0.1
     assert s.image(1, "right").hints["path"].endswith("image_r/000001.png")
 
 
@@ -187,7 +187,7 @@ def _not_an_image(f):
         breaks(("depth", _deepen, r"image_l/000001\.png is 64 x 48, 16 bits; the sequence has 64 x 48, 8 bits")),
         breaks(("pose count", _fewer_poses, r"poses\.txt has 2 poses for 3 pairs")),
         breaks(("time count", _times, r"times\.txt has 4 times for 3 pairs")),
-        breaks(("no calibration", _no_calib, r"calib\.txt is missing")),
+        breaks(("no calibration", _no_calib, r"no calib\.txt: `rille init")),
         breaks(("one camera", _one_row, r"calib\.txt has no projection matrices of image_l and image_r")),
         breaks(("short row", _short_row, r"calib\.txt, line 2: not 12 numbers")),
         breaks(("swapped", _swapped, r"stands 0\.5 m to the left of the left one")),

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
+from folders import write_lines, write_sequence
 
-from datasets.registry import catalogue, open_sequence
+from datasets.registry import MANIFESTS, catalogue, open_sequence
+from pipeline import config as configuration
 from stages.errors import ConfigError, InputError
 
 
 def test_every_listed_name_opens():
     names = [name for name, _ in catalogue()]
-    assert names[:2] == ["mockup", "mockup-short"]
+    assert names[:4] == ["mockup", "mockup-short", "devon_island", "nasa_k10"]
     full, short = open_sequence("mockup"), open_sequence("mockup-short")
     assert (full.frames, short.frames) == (40, 9)
-    assert full.defaults == {"select.stride": 4, "locus.cell_size": 0.001}
+    assert full.defaults == {"select.rule": "stride", "select.stride": 4, "locus.cell_size": 0.001}
     assert full.evaluation_window == (-0.3, 0.4, 0.3, 0.7)
     assert (full.rig.left.width, full.rig.left.height) == (570, 520)
     assert full.vehicle is not None
@@ -70,3 +73,96 @@ def test_unknown_folder_names_the_layouts(tmp_path):
         open_sequence(str(tmp_path))
     with pytest.raises(InputError, match="no sequence 'no/such/folder': known names: mockup"):
         open_sequence("no/such/folder")
+    with pytest.raises(InputError, match=r"no sequence 'nasa-k10': did you mean 'nasa_k10'\?"):
+        open_sequence("nasa-k10")
+
+
+def test_a_manifest_or_the_folder_that_holds_it(tmp_path):
+    path = write_sequence(tmp_path / "rover")
+    assert open_sequence(str(path)).name == open_sequence(str(path.parent)).name == "rover"
+    path.rename(path.parent / "manifest.toml")
+    assert open_sequence(str(path.parent)).frames == 3
+    for name in ("a", "b"):
+        (path.parent / f"{name}.rille.toml").write_text("")
+    with pytest.raises(
+        InputError, match=r"holds 2 manifests: a\.rille\.toml, b\.rille\.toml: choose one, e\.g\. .*/a\."
+    ):
+        open_sequence(str(path.parent))
+
+
+def test_a_manifest_goes_before_the_layout_of_its_folder(tmp_path):
+    path = write_sequence(tmp_path, head='name = "chosen"')
+    write_lines(tmp_path / "calib.txt", ["60 0 31.5 0 0 60 23.5 0 0 0 1 0", "60 0 31.5 -12 0 60 23.5 0 0 0 1 0"])
+    assert open_sequence(str(tmp_path)).rig.baseline == pytest.approx(0.1)
+    path.unlink()
+    assert open_sequence(str(tmp_path)).rig.baseline == pytest.approx(0.2)
+
+
+def test_image_folders_without_calibration_are_sent_to_init(tmp_path):
+    write_sequence(tmp_path).unlink()
+    with pytest.raises(InputError, match=r"image folders left and right, but no calib\.txt: `rille init .* writes"):
+        open_sequence(str(tmp_path))
+
+
+def test_misalignment_is_for_any_sequence(tmp_path, materialise):
+    path = str(write_sequence(tmp_path))
+    plain, moved = open_sequence(path), open_sequence(path, {"misalign": {"rows": 3.0}})
+    assert moved.rig.to_dict() == plain.rig.to_dict()
+    assert moved.image(0, "left") == plain.image(0, "left")
+    valid = materialise(moved.image(0, "right"))["valid"]
+    assert not valid.all()
+    assert valid.any()
+    assert open_sequence("mockup-short", {"misalign": {"rows": 3.0}, "mockup": {"frames": 2}}).frames == 2
+    with pytest.raises(ConfigError, match=r"unknown key 'misalign\.row' .*did you mean 'misalign\.rows'\?"):
+        open_sequence(path, {"misalign": {"row": 3.0}})
+    with pytest.raises(ConfigError, match=r"\[mockup\] does not belong to"):
+        open_sequence(path, {"misalign": {"rows": 3.0}, "mockup": {}})
+
+
+def test_manifests_of_the_program_need_their_data(monkeypatch):
+    monkeypatch.delenv("RILLE_DATA", raising=False)
+    for name in MANIFESTS:
+        with pytest.raises(InputError, match=r"needs the environment variable RILLE_DATA, which is not set"):
+            open_sequence(name)
+
+
+@pytest.mark.data
+def test_devon_island(data_dir):
+    s = open_sequence("devon_island")
+    assert (s.name, s.frames, s.frame_names[0]) == ("devon_island", 10, "048978")
+    assert s.rig.baseline == pytest.approx(226.746 / 968.999694824)
+    assert (s.rig.left.fx, s.rig.left.cx, s.rig.left.width) == (968.999694824, 635.139038086, 1280)
+    assert s.lenses is None
+    assert not s.warnings
+
+
+@pytest.mark.data
+def test_nasa_k10_as_it_was_calibrated(data_dir):
+    """Rows of the two cameras differ by 15 px far away, which the rig says too."""
+    s = open_sequence("nasa_k10")
+    assert (s.name, s.frames, s.rig.left.width, s.rig.left.height) == ("nasa_k10", 1, 1024, 768)
+    assert s.lenses is not None
+    assert s.lenses["left"].coefficients[0] == pytest.approx(-0.331998556852341)
+    assert s.rig.baseline == pytest.approx(0.1058, abs=2e-4)
+    far = np.array([0.0, 0.0, 50.0])
+    rows = [s.rig.left.project(far)[1], s.rig.right.project(s.rig.T_right_left.apply(far))[1]]
+    assert rows[1] - rows[0] == pytest.approx(-15, abs=4)
+
+
+@pytest.mark.data
+def test_up_of_the_calibrations_frame_is_turned_into_the_cameras(data_dir, tmp_path):
+    """The K10 cameras are calibrated in the rover's frame, z down: the third row of R (camera to rover) is down."""
+    path = tmp_path / "k10.toml"
+    path.write_text(
+        f'root = "{data_dir}/nasa_k10"\n[images]\nleft = "left4.png"\nright = "right4.png"\n'
+        '[cameras]\nleft = "black_left.tsai"\nright = "black_right.tsai"\n[world]\nup = [0, 0, -1]\n'
+    )
+    s = open_sequence(str(path))
+    assert s.up is not None
+    assert s.up[0] == pytest.approx((-0.0699, -0.9261, -0.3707), abs=2e-4)
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("name", list(MANIFESTS))
+def test_defaults_of_the_programs_manifests_are_parameters(data_dir, name):
+    configuration.build(configuration.expand(open_sequence(name).defaults))

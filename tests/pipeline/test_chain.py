@@ -56,6 +56,7 @@ def cold(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_outputs_are_all_there_and_sound(cold: Path) -> None:
     folder = latest(cold)
     wanted = {"trajectory.kitti", "trajectory.tum", "dem.tif", "dem_sigma.tif", "ortho.tif", "risk.tif"}
+    wanted |= {"path.gpkg", "frames.json", "dem.qml", "risk.qml", "crosscheck.tum", "agreement.csv"}
     wanted |= {"path.geojson", "config.toml", "report.json", "report.html", "ledger.jsonl"}
     assert wanted <= {p.name for p in folder.iterdir()}
     assert np.loadtxt(folder / "trajectory.kitti").shape == (5, 12)
@@ -126,6 +127,7 @@ def test_two_workers_killed_on_the_way_give_the_same_bits(cold: Path, tmp_path: 
 def test_frames_are_chosen_strictly() -> None:
     assert run.choose_frames("2:8:3", 9) == (2, 5)
     assert run.choose_frames(None, 3) == (0, 1, 2)
-    for bad in ("3", "a:b", "0:10", "4:5", "-3:5", "0:9:0"):
+    assert run.choose_frames("4:5", 9) == (4,)
+    for bad in ("3", "a:b", "0:10", "5:5", "-3:5", "0:9:0"):
         with pytest.raises(ConfigError, match="--frames"):
             run.choose_frames(bad, 9)

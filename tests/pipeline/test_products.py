@@ -2,21 +2,32 @@
 
 from __future__ import annotations
 
+import csv
+import hashlib
 import json
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
+import pyogrio
 import pytest
 import rasterio
 from evo.tools import file_interface
+from toys.finished import FRAMES, bundles, checked, checks, view
 
+from pipeline import outputs
+from pipeline.conventions import FILES, describe
 from pipeline.products import (
     replacing,
     write_path_geojson,
+    write_path_gpkg,
     write_raster,
+    write_style,
+    write_table,
     write_trajectory_kitti,
     write_trajectory_tum,
 )
+from stages.declare import Bundle
 from stages.errors import InputError
 from stages.geometry import rotation_exp
 from stages.lattice import Lattice
@@ -115,3 +126,96 @@ def test_evo_reads_the_trajectories(tmp_path: Path) -> None:
     np.testing.assert_array_equal(tum.timestamps, [0.5 * k for k in kept])
     # seven digits of time and place would not do: quaternions are written with fifteen
     np.testing.assert_allclose(np.array(tum.poses_se3)[:, :3], P[kept], atol=1e-13)
+
+
+VERTICES = np.array([[0.1, 0.2, -0.18], [0.1, 0.3, -0.181], [0.11, 0.4, -0.18]])
+
+
+def test_gdal_reads_the_path_in_its_own_coordinate_system(tmp_path: Path) -> None:
+    facts = {"found": True, "length_m": 0.2, "reason": None, "grid": {"cell": 1}}
+    write_path_gpkg(tmp_path / "path.gpkg", VERTICES, facts)
+    meta, _, geometry, values = pyogrio.raw.read(tmp_path / "path.gpkg", layer="path")
+    assert meta["geometry_type"] == "LineString Z"
+    assert "local metres" in meta["crs"]
+    assert "WGS" not in meta["crs"]
+    np.testing.assert_array_equal(np.frombuffer(geometry[0][9:], "<f8").reshape(-1, 3), VERTICES)
+    fields = dict(zip(meta["fields"], values, strict=True))
+    assert fields["length_m"][0] == 0.2
+    assert fields["found"][0]
+    assert {"reason", "grid"}.isdisjoint(fields)
+    _, _, ends, (names,) = pyogrio.raw.read(tmp_path / "path.gpkg", layer="ends")
+    assert list(names) == ["start", "target"]
+    np.testing.assert_array_equal([np.frombuffer(p[5:], "<f8") for p in ends], VERTICES[[0, -1]])
+
+
+def test_no_path_is_a_layer_without_geometry(tmp_path: Path) -> None:
+    write_path_gpkg(tmp_path / "path.gpkg", np.empty((0, 3)), {"found": False, "reason": "blocked"})
+    meta, _, geometry, values = pyogrio.raw.read(tmp_path / "path.gpkg")
+    assert geometry[0] is None
+    assert dict(zip(meta["fields"], values, strict=True))["reason"][0] == "blocked"
+    assert [name for name, _ in pyogrio.list_layers(tmp_path / "path.gpkg")] == ["path"]
+
+
+def test_equal_paths_make_equal_files(tmp_path: Path) -> None:
+    for name in "ab":
+        write_path_gpkg(tmp_path / name / "path.gpkg", VERTICES, {"found": True})
+    digests = {hashlib.sha256((tmp_path / name / "path.gpkg").read_bytes()).hexdigest() for name in "ab"}
+    assert len(digests) == 1
+    assert [p.name for p in (tmp_path / "a").iterdir()] == ["path.gpkg"]
+
+
+def test_styles_name_the_classes_and_span_the_elevations(tmp_path: Path) -> None:
+    write_style(tmp_path / "risk.qml", "risk")
+    entries = ElementTree.parse(tmp_path / "risk.qml").findall(".//paletteEntry")
+    assert [(e.get("value"), (e.get("label") or "").split()[0]) for e in entries] == [
+        ("0", "safe"),
+        ("1", "hazardous"),
+        ("2", "unknown"),
+    ]
+    write_style(tmp_path / "dem.qml", "dem", {f"e{k}": -1.0 + k / 4 for k in range(9)})
+    style = ElementTree.parse(tmp_path / "dem.qml")
+    assert [float(e.get("value") or "nan") for e in style.findall(".//item")] == [-1.0 + k / 4 for k in range(9)]
+    shader = style.find(".//colorrampshader")
+    assert shader is not None
+    assert (shader.get("minimumValue"), shader.get("maximumValue")) == ("-1", "1")
+
+
+def test_tables_leave_empty_what_is_not_known(tmp_path: Path) -> None:
+    write_table(
+        tmp_path / "a.csv", {"frame": [1, 2], "name": ["a,b", "c"], "x_m": [0.25, float("nan")], "y": [None, 3]}
+    )
+    rows = list(csv.DictReader((tmp_path / "a.csv").open()))
+    assert rows == [
+        {"frame": "1", "name": "a,b", "x_m": "0.25", "y": ""},
+        {"frame": "2", "name": "c", "x_m": "", "y": "3"},
+    ]
+
+
+def test_a_run_writes_the_files_that_it_describes(tmp_path: Path) -> None:
+    made = bundles() | checks()
+    risk = made["risk"]
+    more = dict.fromkeys(("reason", "filled"), risk["risk"])
+    made["risk"] = Bundle({**risk.arrays, **more}, risk.meta)
+    outputs.write(tmp_path, view(made, products=checked()))
+    facts = json.loads((tmp_path / "frames.json").read_text())
+    assert set(facts["files"]) == set(FILES) == {p.name for p in tmp_path.iterdir()} & set(FILES)
+    assert [f["frame"] for f in facts["frames"]] == list(FRAMES)
+    assert facts["frames"][4] == {"frame": 4, "name": "left004", "time": 4.0}
+    assert facts["units"]["time"] == "frame number"
+    assert facts["frames_of_reference"]["world"]["handedness"] == "right"
+    assert "scalar last" in facts["files"]["trajectory.tum"]["quaternion"]
+    rows = list(csv.DictReader((tmp_path / "agreement.csv").open()))
+    assert [row["flagged"] for row in rows] == ["0", "0", "0", "1", "0", "0"]
+    assert [row["flagged_for"] for row in rows] == ["", "", "", "position; rotation", "", ""]
+    assert float(rows[3]["disagreement_m"]) == 0.002
+    assert float(rows[3]["crosscheck_x_m"]) - float(rows[3]["x_m"]) == pytest.approx(0.002)
+    assert float(rows[4]["y_m"]) == pytest.approx(0.12)
+    assert (rows[5]["disagreement_m"], rows[5]["crosscheck_error_m"]) == ("", "")
+    crosscheck = file_interface.read_tum_trajectory_file(tmp_path / "crosscheck.tum")
+    np.testing.assert_array_equal(crosscheck.timestamps, range(5))
+
+
+def test_only_what_was_written_is_described() -> None:
+    facts = describe(["dem.tif", "notes.txt"], [3], ["left003"], [0.5], clock=True)
+    assert list(facts["files"]) == ["dem.tif"]
+    assert facts["units"]["time"] == "s"

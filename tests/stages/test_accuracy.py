@@ -195,3 +195,65 @@ def test_the_stage_matches_frames_by_number() -> None:
     assert out.meta["metrics"]["frames_missing"]["value"] == 2
     assert out.meta["metrics"]["ate_rmse"]["value"] == pytest.approx(0.0, abs=1e-9)
     assert np.isnan(by_frame(true, [0, 1, 2, 3, 4, 5], [5, 6])[1]).all()
+
+
+def test_gaps_in_truth_are_counted_left_out_and_bridged() -> None:
+    """What is left must be what evo says of the frames that have both."""
+    true = walk(5, 40)
+    estimate = disturbed(true, 5)
+    gappy = true.copy()
+    gappy[[0, 10, 11, 12, 39]] = np.nan
+    estimate[20] = np.nan
+    arrays, ours = trajectory_accuracy(estimate, gappy)
+    value = {name: m["value"] for name, m in ours.items()}
+    assert (value["frames"], value["frames_missing"], value["frames_without_truth"], value["frames_judged"]) == (
+        40,
+        1,
+        5,
+        34,
+    )
+    rows = [k for k in range(1, 39) if k not in (10, 11, 12, 20)]
+    reference, aligned, first = evo_path(true[rows]), evo_path(estimate[rows]), evo_path(estimate[rows])
+    aligned.align(reference)
+    first.align_origin(reference)
+    ape = evo_metrics.APE(PoseRelation.translation_part)
+    rmse = StatisticsType.rmse
+    assert value["ate_rmse"] == pytest.approx(evo_value(ape, reference, aligned, rmse), rel=1e-9)
+    assert value["ate_first_frame_rmse"] == pytest.approx(evo_value(ape, reference, first, rmse), rel=1e-9)
+    # frame 20 has truth: only frames 10-12 are bridged by a straight line
+    steps = np.linalg.norm(np.diff(np.delete(true[1:39, :, 3], [9, 10, 11], axis=0), axis=0), axis=1)
+    assert value["path_length"] == pytest.approx(steps.sum())
+    assert "straight over 1 gap of the truth" in ours["path_length"]["how"]
+    assert "straight over 1 gap of the truth" in ours["drift"]["how"]
+    assert "31 pairs" in ours["rpe_translation_rmse"]["how"]
+    assert np.isnan(arrays["position_truth"][[0, 10, 39]]).all()
+    assert np.isfinite(arrays["position"][[0, 10, 39]]).all()
+    with pytest.raises(InputError, match="no frame with a pose has truth"):
+        trajectory_accuracy(estimate, np.full_like(true, np.nan))
+
+
+def test_kitti_sections_do_not_cross_a_gap_of_the_truth() -> None:
+    """Sections start at frames 0, 10, 20 ... and 100 m end 101 frames on; a gap at frame 105 leaves 110 and later."""
+    straight = np.tile(np.eye(3, 4), (240, 1, 1))
+    straight[:, 2, 3] = np.arange(240)
+    gappy = straight.copy()
+    gappy[105] = np.nan
+    full, some = (trajectory_accuracy(straight, t)[1]["kitti_translation"] for t in (straight, gappy))
+    # 100 m from 0 ... 130, 200 m from 0 ... 30; with the gap 100 m from 0 and from 110, 120, 130
+    assert "18 sections" in full["how"]
+    assert "4 sections" in some["how"]
+    assert some["value"] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_truth_with_gaps_and_a_trajectory_without_poses_as_artifacts() -> None:
+    true = walk(3, 4)
+    poses = [None if k == 2 else p.reshape(12).tolist() for k, p in enumerate(true)]
+    source = truth.STAGE.run(NoParams(), {"poses": poses, "frames": [4, 5, 6, 7]}, {})
+    check_outputs(truth.STAGE, source)
+    assert source.meta["without_truth"] == [6]
+    assert np.isnan(source["poses"][2]).all()
+    nothing = Bundle({"poses": np.full((4, 3, 4), np.nan)}, {"frames": [4, 5, 6, 7]})
+    out = STAGE.run(NoParams(), {}, {"trajectory": nothing, "truth": source})
+    check_outputs(STAGE, out)
+    value = {name: m["value"] for name, m in out.meta["metrics"].items()}
+    assert value == {"frames": 4, "frames_missing": 4, "frames_without_truth": 1, "frames_judged": 0}

@@ -1,10 +1,13 @@
 import cv2
 import numpy as np
 import pytest
-from matching_scenes import pair
+from matching_scenes import Texture, pair
 
 from stages import motion
+from stages.attitude import Derotation
 from stages.declare import Bundle, check_outputs
+from stages.errors import InputError
+from stages.geometry import Camera, rotation_exp
 from stages.motion import MotionParams, coarse_motion
 from stages.pyramid import PyramidParams, build
 from stages.validity import defined, matched
@@ -46,13 +49,13 @@ def test_black_frames_have_no_motion():
     assert not defined(coarse_motion(black, black, MotionParams()).validity).any()
 
 
-def run(a, b, **params):
+def run(a, b, *, args=None, **params):
     bundles = []
     for image in (a, b):
         p = build(image, PyramidParams())
         arrays = {f"level_{n}": i for n, i in enumerate(p.images)} | {f"valid_{n}": i for n, i in enumerate(p.valid)}
         bundles.append(Bundle(arrays, {"levels": p.levels}))
-    out = motion.STAGE.run(MotionParams(**params), {}, {"a": bundles[0], "b": bundles[1]})
+    out = motion.STAGE.run(MotionParams(**params), args or {}, {"a": bundles[0], "b": bundles[1]})
     check_outputs(motion.STAGE, out)
     return out
 
@@ -89,3 +92,87 @@ def test_street_with_motion_of_tens_of_pixels(data_dir):
     assert np.hypot(*flow.T).max() > 50
     assert np.mean(error < 4) > 0.95
     assert matched(found.validity).mean() > 0.6
+
+
+CAMERA = Camera(350.0, 350.0, 199.5, 139.5, 400, 280)
+
+
+def taken(flow):
+    """Frames a and b of a flow, with waves up to 360 pixels: natural images have texture on every pyramid level."""
+    texture = Texture()
+    texture.kx[::2] /= 6.0
+    texture.ky[::2] /= 6.0
+    y, x = np.indices((CAMERA.height, CAMERA.width), dtype=np.float64)
+    u, v = flow(x, y)
+    return texture(x + u, y + v), texture(x, y)
+
+
+def held(rotation, du=3.0, dv=-2.0):
+    """Flow of a camera that turns by R_b_a and of some shift behind it."""
+    h = CAMERA.matrix @ rotation @ np.linalg.inv(CAMERA.matrix)
+
+    def flow(x, y):
+        p = np.einsum("ij,jrc->irc", h, np.stack([x + du, y + dv, np.ones_like(x)]))
+        return p[0] / p[2] - x, p[1] / p[2] - y
+
+    return flow
+
+
+def judge(found, flow):
+    """Shares of the pixels whose match is in the image that are matched, and of those that are wrong by a pixel."""
+    scale = 2**found.level
+    row, col = np.indices(found.validity.shape)
+    x, y = (col + 0.5) * scale - 0.5, (row + 0.5) * scale - 0.5
+    u, v = flow(x, y)
+    inside = (x + u > 24) & (x + u < 375) & (y + v > 24) & (y + v < 255)
+    ok = matched(found.validity) & inside
+    wrong = np.hypot(found.column_disparity - u, found.row_disparity - v)[ok] > scale
+    return ok.sum() / inside.sum(), wrong.mean() if wrong.size else 0.0
+
+
+@pytest.mark.parametrize("axis", [(0, 0, 1), (0, 0, -1), (0.15, -0.2, 0.9)])
+def test_a_turn_of_thirty_degrees_is_undone_by_an_attitude(axis):
+    rotation = rotation_exp(np.radians(30.0) * np.array(axis))
+    flow = held(rotation)
+    a, b = taken(flow)
+    pyramids = build(a, PyramidParams()), build(b, PyramidParams())
+    share, wrong = judge(coarse_motion(*pyramids, MotionParams()), flow)
+    assert share < 0.4  # upright windows do not match
+    # An attitude that is off by three degrees leaves 18 pixels to the search.
+    for error in ((0.0, 0.0, 0.0), (0.03, -0.03, 0.03)):
+        turn = Derotation.of(rotation_exp(error) @ rotation, CAMERA)
+        share, wrong = judge(coarse_motion(*pyramids, MotionParams(), turn), flow)
+        assert share > 0.85
+        assert wrong < 0.03
+
+
+def test_masked_pixels_of_a_turned_frame_match_nothing():
+    rotation = rotation_exp([0.0, 0.0, 0.4])
+    flow = held(rotation, 0.0, 0.0)
+    a, b = taken(flow)
+    valid = np.ones(b.shape, np.uint8)
+    valid[:, 250:] = 0
+    found = coarse_motion(
+        build(a, PyramidParams()), build(b, PyramidParams(), valid), MotionParams(), Derotation.of(rotation, CAMERA)
+    )
+    x = (np.indices(found.validity.shape)[1] + 0.5) * 4 - 0.5 + found.column_disparity
+    ok = matched(found.validity)
+    assert ok.mean() > 0.3
+    assert x[ok].max() < 250 + 4
+
+
+def test_stage_takes_the_attitude_from_its_arguments_and_leaves_small_turns_to_the_matcher():
+    rotation = rotation_exp([0.0, 0.0, np.radians(25.0)])
+    a, b = taken(held(rotation))
+    plain = run(a, b)
+    assert not plain.meta["derotated"]
+    turned = run(a, b, args={"rotation": rotation.tolist(), "camera": CAMERA.to_dict()})
+    assert turned.meta["derotated"]
+    assert turned.meta["match_rate"] > 2 * plain.meta["match_rate"]
+    # 8 pixels at level 2; the corner is 243 pixels off the centre, 0.03 radians move it by 7.3.
+    small = run(a, b, args={"rotation": rotation_exp([0, 0, 0.03]).tolist(), "camera": CAMERA.to_dict()})
+    assert not small.meta["derotated"]
+    for name, array in plain.arrays.items():
+        np.testing.assert_array_equal(array, small[name])
+    with pytest.raises(InputError, match="not a 3 x 3 rotation"):
+        run(a, b, args={"rotation": (1.1 * rotation).tolist(), "camera": CAMERA.to_dict()})

@@ -313,3 +313,57 @@ def test_solver_stands_still_on_singular_data():
     poses, _ = levenberg_marquardt(obs, Poses.of(RigidTransform.identity()), np.ones((1, 8), bool), 20)
     assert np.isfinite(poses.t).all()
     assert np.abs(poses.t).max() < 5.0
+
+
+def test_dead_reckoning_finds_a_pose_that_the_last_one_does_not():
+    """The camera has turned about: from the last pose all landmarks lie behind the image."""
+    rng = np.random.default_rng(14)
+    truth = RigidTransform(rotation_exp([0.0, 2.9, 0.0]), np.array([0.2, -0.1, 0.3]))
+    landmarks = truth.apply(scene(rng, 80))
+    pixels = seen(truth, landmarks)
+    pixels[:16] += rng.uniform(-60, 60, (16, 2))
+    reckoned = truth @ RigidTransform(rotation_exp([0.05, -0.05, 0.05]), np.array([0.1, 0.1, -0.1]))
+    known = Landmarks(landmarks, np.zeros_like(landmarks), np.zeros(80), {})
+
+    def from_identity(**kw):
+        start = RigidTransform.identity()
+        return resect(known, pixels, CAMERA, start, PARAMS, np.random.default_rng(0), where="frame 7", **kw)
+
+    with pytest.raises(DegenerateError, match="frame 7"):
+        from_identity()
+    found = from_identity(reckoned=reckoned)
+    np.testing.assert_allclose(found.T_local_left.matrix34, truth.matrix34, atol=1e-6)
+    assert not found.inlier[:16].any()
+
+
+def test_wrong_dead_reckoning_does_no_harm():
+    rng = np.random.default_rng(15)
+    truth = true_pose(rng)
+    landmarks = scene(rng)
+    pixels = seen(truth, landmarks) + rng.normal(0, 0.2, (60, 2))
+    known = Landmarks(landmarks, np.zeros_like(landmarks), np.zeros(60), {})
+    astray = RigidTransform(rotation_exp([0.0, 1.5, 0.0]), np.array([3.0, 2.0, -4.0]))
+    plain, misled = (
+        resect(known, pixels, CAMERA, RigidTransform.identity(), PARAMS, np.random.default_rng(0), reckoned=r)
+        for r in (None, astray)
+    )
+    np.testing.assert_allclose(misled.T_local_left.matrix34, plain.T_local_left.matrix34, atol=1e-9)
+    np.testing.assert_array_equal(misled.inlier, plain.inlier)
+
+
+def test_a_segment_takes_predictions_relative_to_its_key_frame():
+    rng = np.random.default_rng(16)
+    key = RigidTransform(rotation_exp([0.2, 2.5, 0.1]), np.array([1.0, 2.0, 3.0]))
+    about = RigidTransform(rotation_exp([0.0, 2.9, 0.0]), np.array([0.1, 0.0, 0.2]))
+    near = RigidTransform(rotation_exp([0.0, 0.02, 0.0]), np.array([0.0, 0.0, 0.1]))
+    steps = [RigidTransform.identity(), near, about]
+    groups = [(key @ step).apply(scene(rng, 40)) for step in (near, about)]  # what each way of looking shows
+    landmarks = np.concatenate(groups)
+    points = np.full((80, 3, 2), np.nan, np.float32)
+    points[:, 0] = 100.0
+    points[:40, 1], points[40:, 2] = seen(key @ near, groups[0]), seen(key @ about, groups[1])
+    known = Landmarks(landmarks, np.zeros_like(landmarks), np.zeros(80), {})
+    with pytest.raises(DegenerateError, match="frame 2"):
+        resect_segment(points, known, CAMERA, key, [0, 1, 2], PARAMS)
+    found = resect_segment(points, known, CAMERA, key, [0, 1, 2], PARAMS, [None, None, about])
+    np.testing.assert_allclose(found.poses, [(key @ step).matrix34 for step in steps], atol=1e-5)

@@ -1,23 +1,170 @@
+"""The rig of a sequence: pooled over its pairs, repaired or kept, with words for both."""
+
 from __future__ import annotations
 
+import json
+
+import numpy as np
 import pytest
+from rig_scenes import bed_depth, bed_rig, knocked, matches, street_depth, street_rig
 from terrain_scenes import toed_in_rig
 
 from stages import rig as rig_stage
-from stages.declare import NoParams
+from stages.adjustment import Matches
+from stages.declare import Bundle
 from stages.errors import InputError
 from stages.geometry import Rig, RigidTransform
+from stages.rig import RigParams, orient_rig
 
 
-def test_given_rig_passes_through() -> None:
+def facts(rig: Rig, pairs, **params):
+    found = orient_rig(rig, pairs, RigParams(**params))
+    json.dumps(found, allow_nan=False)
+    return found
+
+
+def street(count=4, noise=0.2, **knock):
+    true = knocked(street_rig(), **knock)
+    return [matches(true, street_depth, pair=10 * k, noise=noise, samples=800) for k in range(count)]
+
+
+@pytest.mark.parametrize("inputs", [{}, {"orientations": []}])
+def test_without_pairs_the_given_rig_passes_through(inputs):
     rig = toed_in_rig()
-    meta = rig_stage.STAGE.run(NoParams(), {"rig": rig.to_dict()}, {}).meta
-    assert Rig.from_dict(meta["rig"]).to_dict() == rig.to_dict()
-    assert meta["mode"] == "fixed"
+    meta = rig_stage.STAGE.run(RigParams(), {"rig": rig.to_dict()}, inputs).meta
+    assert meta["rig"] == rig.to_dict()
+    assert (meta["changed"], meta["warnings"], meta["mode"]) == (False, [], "pooled")
     assert meta["baseline"] == pytest.approx((0.1**2 + 0.004**2 + 0.003**2) ** 0.5)
 
 
-def test_no_baseline_is_refused() -> None:
+def test_no_baseline_is_refused():
     rig = toed_in_rig()
     with pytest.raises(InputError, match="baseline"):
-        rig_stage.fixed(Rig(rig.left, rig.right, RigidTransform.identity()))
+        facts(Rig(rig.left, rig.right, RigidTransform.identity()), [])
+
+
+def test_stage_reads_what_orientation_writes():
+    rig = street_rig()
+    bundles = [
+        Bundle({"left": m.left.astype(np.float32), "right": m.right.astype(np.float32)}, {"pair": m.pair})
+        for m in street(pitch_deg=0.3)
+    ]
+    meta = rig_stage.STAGE.run(RigParams(), {"rig": rig.to_dict()}, {"orientations": bundles}).meta
+    assert meta["changed"]
+    assert [p["pair"] for p in meta["per_pair"]] == [0, 10, 20, 30]
+
+
+def test_a_sound_rig_stays_to_the_bit_and_nothing_is_warned_of():
+    rig = street_rig()
+    found = facts(rig, street())
+    assert found["rig"] == found["given"] == rig.to_dict()
+    assert (found["changed"], found["source"], found["warnings"]) == (False, "given calibration", [])
+    assert found["residual_before_px"] == found["residual_after_px"] == pytest.approx(0.2, rel=0.1)
+    assert len(found["held"]) == 5
+
+
+def test_a_knock_is_repaired_and_told():
+    found = facts(street_rig(), street(pitch_deg=-0.24, roll_deg=0.3))
+    assert found["source"] == "given calibration, pitch and roll repaired from 4 pairs"
+    used = Rig.from_dict(found["rig"])
+    true = knocked(street_rig(), pitch_deg=-0.24, roll_deg=0.3)
+    np.testing.assert_allclose(used.T_right_left.rotation, true.T_right_left.rotation, atol=2e-4)  # 0.01 degrees
+    assert used.baseline == pytest.approx(0.54, rel=1e-12)
+    assert found["residual_after_px"] < 0.25 < 2.0 < found["residual_before_px"]
+    first, second = found["warnings"]
+    assert "contradicts the images" in first
+    assert "turned by 0.30 degrees clockwise; repaired" in first
+    assert "held: yaw" in second
+    assert found["held"][0].startswith("yaw: not observed")
+
+
+def test_mode_fixed_only_tells():
+    rig = street_rig()
+    found = facts(rig, street(pitch_deg=-0.24), mode="fixed")
+    assert found["rig"] == rig.to_dict()
+    assert not found["changed"]
+    assert found["warnings"][0].endswith("kept because rig.mode = fixed")
+    assert found["parameters"][0]["value"] == pytest.approx(-0.24, abs=0.01)
+
+
+def test_convergent_rig_with_a_wrong_toe_in():
+    rig = bed_rig()
+    pairs = [matches(knocked(rig, 0.5, 0.5, 0.5), bed_depth, noise=0.1, pair=k) for k in range(4)]
+    found = facts(rig, pairs)
+    values = {p["name"]: p["value"] for p in found["parameters"]}
+    np.testing.assert_allclose([values[n] for n in ("pitch", "yaw", "roll")], 0.5, atol=0.035)
+    for p in found["per_pair"]:
+        for name, value in p["values"].items():
+            expected = 0.5 if name in ("pitch", "yaw", "roll") else 0.0
+            assert abs(value - expected) < 4 * p["sigma"][name]
+
+
+def test_one_bad_pair_among_good_ones_does_not_pull():
+    pairs = street(5, pitch_deg=-0.24)
+    rng = np.random.default_rng(0)
+    pairs[2] = Matches(20, pairs[2].left, pairs[2].right + rng.uniform(-20, 20, pairs[2].right.shape))
+    found = facts(street_rig(), pairs)
+    assert found["parameters"][0]["value"] == pytest.approx(-0.24, abs=0.01)
+
+
+def test_a_rig_that_moves_is_told():
+    rig = street_rig()
+    pairs = street(4)
+    pairs.append(matches(knocked(rig, roll_deg=0.4), street_depth, pair=99, samples=800))
+    lines = [line for line in facts(rig, pairs)["warnings"] if "the rig moves" in line]
+    assert len(lines) == 1
+    assert "roll" in lines[0]
+    assert "pair 99" in lines[0]
+
+
+def test_swapped_images_lie_beyond_infinity():
+    pairs = [Matches(m.pair, m.right, m.left) for m in street(2)]
+    assert any("left and right are swapped" in line for line in facts(street_rig(), pairs)["warnings"])
+
+
+def test_distortion_that_was_left_is_told():
+    rig = street_rig()
+
+    def barrel(u, v):
+        return 12.0 * v * (u**2 + 0.1 * v**2)
+
+    pairs = [matches(rig, street_depth, pair=k, field=barrel) for k in range(2)]
+    assert any("lens distortion" in line for line in facts(rig, pairs)["warnings"])
+
+
+def test_pairs_with_few_matches_are_passed_over_and_told():
+    pairs = street(2)
+    few = Matches(5, pairs[0].left[:20], pairs[0].right[:20])
+    found = facts(street_rig(), [*pairs, few])
+    assert found["pairs"] == 2
+    assert found["warnings"] == ["1 of 3 pairs have too few matches for the rig"]
+    alone = facts(street_rig(), [few])
+    assert "used as given" in alone["warnings"][0]
+    assert "parameters" not in alone
+
+
+@pytest.mark.data
+def test_street_of_kitti_is_left_alone_and_repaired_when_knocked(data_dir):
+    from datasets.misalign import MisalignParams, warp
+    from datasets.registry import open_sequence
+    from stages.hfvm import match
+    from stages.lens import Lens
+    from stages.orientation import thin
+    from stages.validity import matched
+
+    sequence = open_sequence(str(data_dir / "kitti06_51"))
+    left, right = (_image(sequence.image(20, camera)) for camera in ("left", "right"))
+    knock = MisalignParams(rows=3.0, roll_deg=0.3)
+    bent, valid = warp(right, np.ones_like(right), Lens(sequence.rig.right), knock)
+    for image, mask, repaired in ((right, None, []), (bent, valid, ["pitch", "roll"])):
+        d = match(left, image, right_valid=mask)
+        points = thin(d.column_disparity, d.row_disparity, matched(d.validity), d.backmatch_error, 1500)
+        found = facts(sequence.rig, [Matches(20, *points)])
+        assert [p["name"] for p in found["parameters"] if p["freed"]] == repaired
+        assert found["residual_after_px"] < 0.7
+
+
+def _image(source):
+    import cv2
+
+    return cv2.imread(source.hints["path"], cv2.IMREAD_GRAYSCALE)

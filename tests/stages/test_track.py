@@ -8,7 +8,7 @@ import pytest
 from stages.declare import Bundle, check_outputs
 from stages.errors import InputError
 from stages.pyramid import PyramidParams, build
-from stages.track import STAGE, Motion, TrackParams, displacement_at, fit_affinity, track
+from stages.track import STAGE, Motion, TrackParams, common_similarity, displacement_at, fit_affinity, track
 
 ROWS, COLS = 200, 260
 PARAMS = TrackParams(points=80)
@@ -180,3 +180,63 @@ def test_stage_writes_what_it_declares_and_the_same_bits_twice():
     assert first.meta["frames"] == [4, 5, 6]
     for name, array in first.arrays.items():
         np.testing.assert_array_equal(array, second[name])
+
+
+def in_plane(angle):
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s], [s, c]])
+
+
+def turning(angles):
+    """Pyramids of a texture that turns about the image's middle, and where points of the first frame go."""
+    x, y = np.meshgrid(np.arange(float(COLS)), np.arange(float(ROWS)))
+    centre = np.array([COLS / 2, ROWS / 2])
+    rng = np.random.default_rng(2)
+    frames, places = [], []
+    for angle in angles:
+        c, s = np.cos(angle), np.sin(angle)
+        dx, dy = x - centre[0], y - centre[1]
+        image = texture(c * dx + s * dy + centre[0], -s * dx + c * dy + centre[1]) + rng.standard_normal(x.shape)
+        frames.append(build(image.astype(np.float32), PyramidParams(levels=4)))
+        places.append(lambda p, a=angle: (p - centre) @ in_plane(a).T + centre)
+    return frames, places
+
+
+def test_a_turn_that_goes_on_does_not_lose_the_points():
+    """25 degrees a frame, 100 in all; motions as an attitude and a search give them, off by a pixel."""
+    angles = np.radians([0.0, 25.0, 50.0, 75.0, 100.0])
+    frames, places = turning(angles)
+    cols, rows = np.meshgrid((np.arange(COLS // 4) + 0.5) * 4 - 0.5, (np.arange(ROWS // 4) + 0.5) * 4 - 0.5)
+    grid = np.stack([cols, rows], -1).reshape(-1, 2)
+    steps = []
+    for a, b in itertools.pairwise(angles):
+        middle = np.array([COLS / 2, ROWS / 2])
+        d = ((grid - middle) @ in_plane(b - a).T + middle - grid + 1.0).reshape(*cols.shape, 2)
+        steps.append(Motion(d[..., 0].astype(np.float32), d[..., 1].astype(np.float32), 2))
+    found = track(frames, steps, PARAMS)
+    off = errors(found, places)
+    first = found.birth == 0
+    true = np.stack([place(found.points[:, 0].astype(float)) for place in places], 1)
+    inside = ((true > 20) & (true < [COLS - 20, ROWS - 20])).all((1, 2))  # in view all the time
+    assert (first & inside).sum() > 20
+    assert np.isfinite(off[first & inside, 4]).mean() > 0.85
+    assert np.nanmedian(off[:, 4]) < 0.06
+
+
+@pytest.mark.parametrize("scale", [1.0, 1.4, 0.6])
+def test_affinity_of_a_large_turn_and_zoom_is_not_pulled_towards_none(scale):
+    rng = np.random.default_rng(5)
+    p = rng.uniform(0, 200, (60, 2))
+    A = scale * in_plane(1.2)
+    q = p @ A.T + [8.0, -5.0]
+    affinity, shift = fit_affinity(p, q, np.ones(60, bool), p)
+    np.testing.assert_allclose(affinity, np.tile(A, (60, 1, 1)), atol=1e-5)
+    np.testing.assert_allclose(shift, q - p, atol=1e-4)
+    q[::6] += 40.0  # on another surface
+    assert np.abs(common_similarity(p, q) - A).max() < 0.15
+    affinity, _ = fit_affinity(p, q, np.ones(60, bool), p)
+    assert np.median(np.abs(affinity - A)) < 0.02
+
+
+def test_pairs_in_one_place_share_no_change():
+    np.testing.assert_array_equal(common_similarity(np.ones((9, 2)), np.ones((9, 2))), np.eye(2))

@@ -43,6 +43,14 @@ def test_a_segment_of_another_local_frame_is_refused():
         chain([], [])
 
 
+def test_one_pair_alone_stands_at_its_own_level():
+    T = level(np.random.default_rng(8))
+    poses, covariance, segment = chain([], [T])
+    np.testing.assert_array_equal(poses, [T.matrix34])
+    assert covariance.shape == (1, 6, 6)
+    assert segment.tolist() == [0]
+
+
 def test_covariance_is_that_of_sampled_trajectories():
     rng = np.random.default_rng(7)
     levels = [level(rng) for _ in range(3)]

@@ -1,0 +1,61 @@
+"""Calibration files of other programs: cameras with their lenses and where they stand, recognised by content."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from datasets.cameras import boofcv, colmap, middlebury, opencv, slam, tsai
+from datasets.cameras.fields import Fields
+from datasets.cameras.model import UNKNOWN_SIZE, CalibratedCamera
+from datasets.cameras.pair import rig_of
+from datasets.cameras.text import parse_xml, parse_yaml, read_text
+from stages.errors import InputError
+
+__all__ = ["UNKNOWN_SIZE", "CalibratedCamera", "read_cameras", "rig_of"]
+
+KNOWN = (
+    "OpenCV (YAML, XML), ROS camera_info, Kalibr, EuRoC sensor.yaml, ORB-SLAM, BoofCV, COLMAP, Middlebury calib.txt "
+    "and ASP .tsai are read"
+)
+
+PLAIN: tuple[tuple[Callable[[str], bool], Callable[[str, Path], list[CalibratedCamera]]], ...] = (
+    (tsai.is_tsai, tsai.tsai),
+    (middlebury.is_middlebury, middlebury.middlebury),
+    (colmap.is_colmap, colmap.colmap),
+)
+"""Text formats: how each is recognised, and its reader."""
+
+NESTED: tuple[tuple[Callable[[Fields], bool], Callable[[Fields, Path], list[CalibratedCamera]]], ...] = (
+    (opencv.is_stereo, opencv.stereo),
+    (slam.is_orbslam, slam.orbslam),
+    (slam.is_kalibr, slam.kalibr),
+    (slam.is_sensor, slam.sensor),
+    (boofcv.is_boofcv, boofcv.boofcv),
+    (opencv.is_single, opencv.single),
+)
+"""Formats of nested entries. ORB-SLAM2 files that also hold unrectified cameras are read as those: the images are."""
+
+
+def read_cameras(path: Path) -> list[CalibratedCamera]:
+    """Cameras of a calibration file, whatever program wrote it: it is recognised by its content.
+
+    Returns
+    -------
+    In the order of the file; of a stereo calibration ``left`` and ``right``.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read or holds no camera, or an entry is missing or wrong; then the line names the key.
+    """
+    text = read_text(path)
+    for recognises, read in PLAIN:
+        if recognises(text):
+            return read(text, path)
+    parse = parse_xml if text.lstrip().startswith("<") else parse_yaml
+    fields = Fields(parse(text, str(path)), str(path))
+    for knows, read_fields in NESTED:
+        if knows(fields):
+            return read_fields(fields, path)
+    raise InputError(f"{path} holds no camera that is known", remedy=KNOWN)

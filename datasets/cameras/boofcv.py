@@ -1,0 +1,53 @@
+"""Calibrations of BoofCV: one pinhole camera with radial and tangential distortion, or a stereo pair."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from datasets.cameras.fields import Fields
+from datasets.cameras.model import CalibratedCamera
+from stages.geometry import RigidTransform
+from stages.lens import Lens
+
+MODELS = ("pinhole", "pinhole_radial_tangential")
+MOST_RADIAL = 3
+
+
+def is_boofcv(f: Fields) -> bool:
+    """Whether these are the entries of one of BoofCV's cameras."""
+    return "pinhole" in f or ("rightToLeft" in f and "left" in f)
+
+
+def boofcv(f: Fields, path: Path) -> list[CalibratedCamera]:
+    """Cameras; ``rightToLeft`` maps the right camera to the left, in the unit of the target (often millimetres)."""
+    if "pinhole" in f:
+        return [CalibratedCamera(path.stem, _lens(f))]
+    pose = f.sub("rightToLeft")
+    shift = np.array([pose.number(key) for key in ("x", "y", "z")])
+    T_left_right = pose.rigid("rotation", pose.matrix("rotation", 3, 3), shift)
+    return [
+        CalibratedCamera("left", _lens(f.sub("left")), RigidTransform.identity()),
+        CalibratedCamera("right", _lens(f.sub("right")), T_left_right.inverse()),
+    ]
+
+
+def _lens(f: Fields) -> Lens:
+    model = f.text("model", "pinhole")
+    if model not in MODELS:
+        raise f.error("model", f"= {model!r} is not read", f"calibrate as {MODELS[1]}")
+    p = f.sub("pinhole")
+    if abs(p.number("skew", 0.0)) > 1e-6 * p.number("fx"):
+        raise p.error("skew", f"= {p.number('skew'):g} is not 0", "calibrate without skew")
+    values = (p.number("fx"), p.number("fy"), p.number("cx"), p.number("cy"))
+    camera = p.camera("fx", values, p.size("width", "height"))
+    if "radial_tangential" not in f:
+        return Lens(camera)
+    bent = f.sub("radial_tangential")
+    radial = bent.numbers("radial") if "radial" in bent else ()
+    if len(radial) > MOST_RADIAL:
+        raise bent.error("radial", f"has {len(radial)} numbers, at most {MOST_RADIAL} are read", "calibrate with fewer")
+    k1, k2, k3 = (*radial, *(0.0,) * (MOST_RADIAL - len(radial)))
+    coefficients = (k1, k2, bent.number("t1", 0.0), bent.number("t2", 0.0), k3)
+    return bent.lens("radial", camera, "radtan", coefficients if k3 else coefficients[:4])

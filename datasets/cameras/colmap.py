@@ -1,0 +1,98 @@
+"""Cameras of COLMAP's text models (``cameras.txt``, with ``rigs.txt`` beside it).
+
+Its pixel coordinates begin at the corner of the top left pixel, so that half a pixel is taken off.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from datasets.cameras.fields import Fields
+from datasets.cameras.model import CalibratedCamera
+from datasets.cameras.text import read_text
+from stages.geometry import RigidTransform
+from stages.lens import Lens
+
+PARAMETERS = {
+    "SIMPLE_PINHOLE": "f cx cy",
+    "PINHOLE": "fx fy cx cy",
+    "SIMPLE_RADIAL": "f cx cy k1",
+    "RADIAL": "f cx cy k1 k2",
+    "OPENCV": "fx fy cx cy k1 k2 p1 p2",
+    "FULL_OPENCV": "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6",
+    "OPENCV_FISHEYE": "fx fy cx cy k1 k2 k3 k4",
+    "SIMPLE_RADIAL_FISHEYE": "f cx cy k1",
+    "RADIAL_FISHEYE": "f cx cy k1 k2",
+}
+"""Its camera models that are read, and the order of their parameters."""
+
+ORDER = {
+    "none": (),
+    "radtan": ("k1", "k2", "p1", "p2"),
+    "rational": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    "fisheye": ("k1", "k2", "k3", "k4"),
+}
+
+
+def is_colmap(text: str) -> bool:
+    """Whether every line is a camera (or a comment)."""
+    lines = _lines(text)
+    return bool(lines) and all(
+        len(words) >= 5 and words[0].isdigit() and words[1].isupper() and words[2].isdigit() for words in lines
+    )
+
+
+def colmap(text: str, path: Path) -> list[CalibratedCamera]:
+    """Cameras, named by their numbers; poses in the rig's frame where ``rigs.txt`` has exactly one rig."""
+    poses = _rig(path.with_name("rigs.txt"))
+    found = []
+    for number, model, width, height, *values in _lines(text):
+        at = f"camera {number} "
+        if model not in PARAMETERS:
+            raise Fields({}, str(path), at).error("model", f"{model} is not read", f"one of {', '.join(PARAMETERS)}")
+        names = PARAMETERS[model].split()
+        if len(values) != len(names):
+            f = Fields({}, str(path), at)
+            raise f.error("parameters", f"are {len(values)}, {model} takes {len(names)}: {' '.join(names)}")
+        f = Fields(dict(zip(names, values, strict=True)) | {"width": width, "height": height}, str(path), at)
+        found.append(CalibratedCamera(number, _lens(f, model), poses.get(number)))
+    return found
+
+
+def _lens(f: Fields, model: str) -> Lens:
+    fx, fy = (f.number("f"), f.number("f")) if "f" in f else (f.number("fx"), f.number("fy"))
+    values = (fx, fy, f.number("cx") - 0.5, f.number("cy") - 0.5)
+    camera = f.camera("fx" if "fx" in f else "f", values, f.size("width", "height"))
+    kind = "fisheye" if "FISHEYE" in model else "rational" if model == "FULL_OPENCV" else "radtan"
+    if "k1" not in f:
+        kind = "none"
+    return f.lens("k1", camera, kind, tuple(f.number(key, 0.0) for key in ORDER[kind]))
+
+
+def _rig(path: Path) -> dict[str, RigidTransform]:
+    """T_camera_rig by camera number; nothing where there is no rig, or more than one."""
+    lines = _lines(read_text(path)) if path.is_file() else []
+    if len(lines) != 1 or len(lines[0]) < 4 or lines[0][2] != "CAMERA":
+        return {}
+    _, _, _, reference, *rest = lines[0]
+    poses = {reference: RigidTransform.identity()}
+    while len(rest) >= 3:
+        kind, number, known = rest[:3]
+        rest = rest[3:]
+        if known == "0":
+            continue
+        f = Fields({"pose": rest[:7]}, str(path), f"sensor {number} ")
+        w, x, y, z, *t = f.numbers("pose", 7)
+        if not np.hypot(np.hypot(w, x), np.hypot(y, z)) > 0:
+            raise f.error("pose", "has a quaternion of length 0")
+        rest = rest[7:]
+        if kind == "CAMERA":
+            poses[number] = RigidTransform(Rotation.from_quat([x, y, z, w]).as_matrix(), np.array(t))
+    return poses
+
+
+def _lines(text: str) -> list[list[str]]:
+    return [line.split() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]

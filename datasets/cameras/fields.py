@@ -1,0 +1,209 @@
+"""Typed access to the entries of a calibration file, with errors that name the file and the key."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from datasets.cameras.model import UNKNOWN_SIZE
+from stages.errors import InputError
+from stages.geometry import Camera, RigidTransform
+from stages.lens import Lens
+
+Floats = NDArray[np.float64]
+
+CORRECT = "correct the calibration file"
+
+MODELS: Mapping[str, str] = {
+    "none": "none",
+    "null": "none",
+    "radtan": "radtan",
+    "radial-tangential": "radtan",
+    "radialtangential": "radtan",
+    "plumb-bob": "radtan",
+    "brown": "radtan",
+    "opencv": "radtan",
+    "rational": "rational",
+    "rational-polynomial": "rational",
+    "equidistant": "fisheye",
+    "equi": "fisheye",
+    "fisheye": "fisheye",
+    "opencv-fisheye": "fisheye",
+    "kannalabrandt8": "fisheye",
+    "kannala-brandt": "fisheye",
+    "kb4": "fisheye",
+}
+"""Names that programs have for the lens models of :mod:`stages.lens`, in lower case with hyphens."""
+
+
+class Fields:
+    """Entries of a calibration file by key; ``file`` is its name for errors, ``at`` the way to a nested part."""
+
+    def __init__(self, values: Mapping[Any, Any], file: str, at: str = "") -> None:
+        self.values, self.file, self.at = {str(k): v for k, v in values.items()}, file, at
+
+    def __contains__(self, key: str) -> bool:
+        return self.values.get(key) is not None
+
+    def error(self, key: str, what: str, remedy: str = CORRECT) -> InputError:
+        """One line with the file and the full key."""
+        return InputError(f"{self.file}: {self.at}{key} {what}", remedy=remedy)
+
+    def get(self, key: str) -> Any:
+        """An entry that must be there."""
+        if key not in self:
+            raise self.error(key, "is missing")
+        return self.values[key]
+
+    def sub(self, key: str) -> Fields:
+        """A nested part."""
+        value = self.get(key)
+        if not isinstance(value, Mapping):
+            raise self.error(key, f"is {_shown(value)}, it should hold entries of its own")
+        return Fields(value, self.file, f"{self.at}{key}.")
+
+    def text(self, key: str, default: str | None = None) -> str:
+        """A word; ``default`` where the key is missing."""
+        if key not in self and default is not None:
+            return default
+        return str(self.get(key)).strip()
+
+    def number(self, key: str, default: float | None = None) -> float:
+        """A finite number; ``default`` where the key is missing."""
+        if key not in self and default is not None:
+            return default
+        return self._number(key, self.get(key))
+
+    def numbers(self, key: str, count: int | None = None) -> tuple[float, ...]:
+        """A list of finite numbers, row by row where it is a matrix; ``count`` of them."""
+        flat = _flat(self.get(key))
+        if flat is None:
+            raise self.error(key, f"is {_shown(self.values[key])}, it should be a list of numbers")
+        if count is not None and len(flat) != count:
+            raise self.error(key, f"has {len(flat)} numbers, it takes {count}")
+        return tuple(self._number(key, v) for v in flat)
+
+    def matrix(self, key: str, rows: int, columns: int) -> Floats:
+        """A matrix of finite numbers."""
+        return np.array(self.numbers(key, rows * columns)).reshape(rows, columns)
+
+    def size(self, width: str, height: str) -> tuple[int, int]:
+        """Image size from two keys, pixels; ``UNKNOWN_SIZE`` where both are missing."""
+        if width not in self and height not in self:
+            return UNKNOWN_SIZE
+        return self._pixels(width, self.number(width)), self._pixels(height, self.number(height))
+
+    def pair_of_pixels(self, key: str) -> tuple[int, int]:
+        """Image size from one key with width and height; ``UNKNOWN_SIZE`` where it is missing."""
+        if key not in self:
+            return UNKNOWN_SIZE
+        width, height = self.numbers(key, 2)
+        return self._pixels(key, width), self._pixels(key, height)
+
+    def transform(self, rotation: str, translation: str) -> RigidTransform:
+        """Rigid transform from a 3 x 3 matrix and three numbers."""
+        return self.rigid(rotation, self.matrix(rotation, 3, 3), np.array(self.numbers(translation, 3)))
+
+    def pose(self, key: str) -> RigidTransform:
+        """Rigid transform from a 4 x 4 or 3 x 4 matrix."""
+        if len(self.numbers(key)) not in (12, 16):
+            raise self.error(key, f"has {len(self.numbers(key))} numbers, it takes a 4 x 4 matrix")
+        m = np.array(self.numbers(key)).reshape(-1, 4)
+        if len(m) == 4 and np.abs(m[3] - [0, 0, 0, 1]).max() > 1e-9:
+            raise self.error(key, f"has the last row {m[3].tolist()}, it should be 0 0 0 1")
+        return self.rigid(key, m[:3, :3], m[:3, 3])
+
+    def pinhole(self, key: str, size: tuple[int, int]) -> Camera:
+        """Camera from a 3 x 3 matrix K."""
+        k = self.matrix(key, 3, 3)
+        if abs(k[0, 1]) > 1e-6 * abs(k[0, 0]) or abs(k[1, 0]) > 0 or np.abs(k[2] - [0, 0, 1]).max() > 1e-9:
+            raise self.error(key, f"is {k.tolist()}, no matrix fx 0 cx, 0 fy cy, 0 0 1", "calibrate without skew")
+        return self.camera(key, (k[0, 0], k[1, 1], k[0, 2], k[1, 2]), size)
+
+    def camera(self, key: str, values: tuple[float, float, float, float], size: tuple[int, int]) -> Camera:
+        """Camera from fx, fy, cx, cy, pixels; ``key`` is where they stand."""
+        try:
+            return Camera(values[0], values[1], values[2], values[3], size[0], size[1])
+        except InputError as error:
+            raise self.error(key, f"gives no camera: {error.message}", error.remedy) from error
+
+    def lens(self, key: str, camera: Camera, model: str, coefficients: tuple[float, ...]) -> Lens:
+        """Lens with a model of :mod:`stages.lens`; ``key`` is where the coefficients stand."""
+        try:
+            return Lens(camera, model, coefficients)
+        except InputError as error:
+            raise self.error(key, f"is wrong: {error.message}", error.remedy) from error
+
+    def model(self, key: str, default: str) -> str:
+        """Lens model of :mod:`stages.lens` by the name that the file has for it."""
+        stated = self.text(key, default)
+        word = stated.lower().replace("_", "-").replace(" ", "-")
+        if word not in MODELS:
+            raise self.error(
+                key, f"= {stated!r} is a lens model that is not read", "calibrate as radial-tangential or equidistant"
+            )
+        return MODELS[word]
+
+    def _number(self, key: str, value: Any) -> float:
+        try:
+            number = math.nan if isinstance(value, bool) else float(value)
+        except (TypeError, ValueError):
+            number = math.nan
+        if not math.isfinite(number):
+            raise self.error(key, f"is {_shown(value)}, it should be a number")
+        return number
+
+    def _pixels(self, key: str, value: float) -> int:
+        if value < 2 or value != int(value):
+            raise self.error(key, f"= {value:g} is no image size in pixels")
+        return int(value)
+
+    def rigid(self, key: str, rotation: Floats, translation: Floats) -> RigidTransform:
+        """Rigid transform of numbers that stand at ``key``."""
+        try:
+            return RigidTransform(rotation, translation)
+        except InputError as error:
+            raise self.error(key, f"is no pose: {error.message}") from error
+
+
+def by_count(coefficients: tuple[float, ...]) -> tuple[str, tuple[float, ...]]:
+    """Model that OpenCV takes for so many coefficients, and the coefficients without what is zero by default."""
+    k = coefficients
+    if len(k) == 14 and not any(k[12:]):
+        k = k[:12]
+    if len(k) == 12 and not any(k[8:]):
+        k = k[:8]
+    if not k:
+        return "none", k
+    return ("radtan", k) if len(k) <= 5 else ("rational", k)
+
+
+def _flat(value: Any) -> list[Any] | None:
+    """Numbers of a list, of lists in a list, or of a matrix that has ``data``; None for anything else."""
+    if isinstance(value, Mapping) and "data" in value:
+        return _matrix_data(value)
+    if isinstance(value, np.ndarray):
+        return list(value.reshape(-1).tolist())
+    if not isinstance(value, list | tuple):
+        return None
+    flat: list[Any] = []
+    for one in value:
+        part = _flat(one) if isinstance(one, list | tuple) else [one]
+        flat += part or []
+    return flat
+
+
+def _matrix_data(value: Mapping[Any, Any]) -> list[Any] | None:
+    data, rows, columns = _flat(value["data"]), value.get("rows"), value.get("cols")
+    if data is not None and isinstance(rows, int) and isinstance(columns, int) and rows * columns != len(data):
+        return None
+    return data
+
+
+def _shown(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."

@@ -1,0 +1,35 @@
+"""One calibrated camera, whoever calibrated it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from stages.geometry import RigidTransform
+from stages.lens import Lens
+
+UNKNOWN_SIZE = (1, 1)
+"""Width and height, pixels, of a camera whose file does not say how large its images are."""
+
+
+@dataclass(frozen=True)
+class CalibratedCamera:
+    """One camera of a calibration file.
+
+    Attributes
+    ----------
+    name : what the file calls it.
+    lens : its optics; the image size is ``UNKNOWN_SIZE`` where the file does not say it.
+    T_camera_reference : maps the file's reference frame (first camera, body, world ...), the same for all cameras of
+        one calibration, to the optical frame of this camera, in the file's unit of length (metres where the format
+        fixes it); None where the file does not say where the camera stands.
+    """
+
+    name: str
+    lens: Lens
+    T_camera_reference: RigidTransform | None = None
+
+    @property
+    def size(self) -> tuple[int, int] | None:
+        """Width and height of its images, pixels; None where the file does not say."""
+        size = (self.lens.camera.width, self.lens.camera.height)
+        return None if size == UNKNOWN_SIZE else size

@@ -1,0 +1,129 @@
+"""Calibrations in the words of OpenCV, and of ROS, which took them over."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from datasets.cameras.fields import Fields, by_count
+from datasets.cameras.model import CalibratedCamera
+from datasets.cameras.text import parse_xml, parse_yaml, read_text
+from stages.errors import InputError
+from stages.geometry import RigidTransform
+from stages.lens import Lens
+
+SIDES = (
+    (("M1", "D1"), ("M2", "D2")),
+    (("K1", "D1"), ("K2", "D2")),
+    (("K1", "dist1"), ("K2", "dist2")),
+    (("cameraMatrix1", "distCoeffs1"), ("cameraMatrix2", "distCoeffs2")),
+    (("camera_matrix_1", "distortion_coefficients_1"), ("camera_matrix_2", "distortion_coefficients_2")),
+    (("camera_matrix_left", "dist_coeffs_left"), ("camera_matrix_right", "dist_coeffs_right")),
+    (("left_camera_matrix", "left_distortion_coefficients"), ("right_camera_matrix", "right_distortion_coefficients")),
+    (("LEFT.K", "LEFT.D"), ("RIGHT.K", "RIGHT.D")),
+)
+"""Keys of camera matrix and distortion of the left and of the right camera, as programs name them."""
+
+SINGLE = ("camera_matrix", "Camera_Matrix", "cameraMatrix", "K")
+DISTORTION = ("distortion_coefficients", "Distortion_Coefficients", "distCoeffs", "dist_coeffs", "D")
+WIDTHS = ("image_width", "image_Width", "width", "LEFT.width", "Camera.width")
+HEIGHTS = ("image_height", "image_Height", "height", "LEFT.height", "Camera.height")
+ROTATIONS, TRANSLATIONS = ("R", "rotation_matrix"), ("T", "translation_vector")
+
+
+def is_stereo(f: Fields) -> bool:
+    """Whether the entries hold two camera matrices."""
+    return any(left[0] in f and right[0] in f for left, right in SIDES)
+
+
+def stereo(f: Fields, path: Path) -> list[CalibratedCamera]:
+    """Both cameras of OpenCV's stereo samples: M1 D1 M2 D2, R T with ``x_right = R x_left + T``.
+
+    R and T may stand in ``extrinsics.yml`` beside ``intrinsics.yml``, as the sample program writes them. Files with
+    LEFT.R and RIGHT.P (rectification, as ORB-SLAM2 keeps it) are read too.
+    """
+    sides = next((left, right) for left, right in SIDES if left[0] in f and right[0] in f)
+    size = _size(f)
+    lenses = [_lens(f, matrix, distortion, size) for matrix, distortion in sides]
+    poses: tuple[RigidTransform | None, RigidTransform | None]
+    if "RIGHT.P" in f and "LEFT.R" in f:
+        poses = _unrectified(f, "LEFT.R", "LEFT.P"), _unrectified(f, "RIGHT.R", "RIGHT.P")
+    else:
+        T_right_left = _relative(f) or _beside(path)
+        poses = (None if T_right_left is None else RigidTransform.identity()), T_right_left
+    return [CalibratedCamera(name, lens, T) for name, lens, T in zip(("left", "right"), lenses, poses, strict=True)]
+
+
+def is_single(f: Fields) -> bool:
+    """Whether the entries hold one camera matrix."""
+    return any(key in f for key in SINGLE)
+
+
+def single(f: Fields, path: Path) -> list[CalibratedCamera]:
+    """One camera of OpenCV's calibration sample, or of ROS' camera_info.
+
+    The pose of the latter refers to the rectified left camera: ``x_rectified = R x_camera``, and P holds the baseline.
+    """
+    matrix = next(key for key in SINGLE if key in f)
+    distortion = next((key for key in DISTORTION if key in f), "")
+    T = None
+    if "projection_matrix" in f and "rectification_matrix" in f:
+        T = _unrectified(f, "rectification_matrix", "projection_matrix")
+    name = f.text("camera_name", path.stem)
+    return [CalibratedCamera(name, _lens(f, matrix, distortion, _size(f)), T)]
+
+
+def _lens(f: Fields, matrix: str, distortion: str, size: tuple[int, int]) -> Lens:
+    camera = f.pinhole(matrix, size)
+    coefficients = f.numbers(distortion) if distortion in f else ()
+    model, coefficients = by_count(coefficients)
+    if "distortion_model" in f:
+        stated = f.model("distortion_model", model)
+        # ROS writes five zeros for cameras without distortion, whatever the model
+        if stated == "fisheye" or any(coefficients):
+            model = stated
+    elif f.text("fisheye_model", "0") not in ("0", "False", "false"):
+        model = "fisheye"
+    return f.lens(distortion or matrix, camera, model, coefficients)
+
+
+def _size(f: Fields) -> tuple[int, int]:
+    for key in ("image_size", "imageSize", "resolution"):
+        if key in f:
+            return f.pair_of_pixels(key)
+    width = next((key for key in WIDTHS if key in f), WIDTHS[0])
+    height = next((key for key in HEIGHTS if key in f), HEIGHTS[0])
+    return f.size(width, height)
+
+
+def _relative(f: Fields) -> RigidTransform | None:
+    rotation = next((key for key in ROTATIONS if key in f), None)
+    translation = next((key for key in TRANSLATIONS if key in f), None)
+    if rotation is None and translation is None:
+        return None
+    return f.transform(rotation or ROTATIONS[0], translation or TRANSLATIONS[0])
+
+
+def _beside(path: Path) -> RigidTransform | None:
+    """Relative pose of ``extrinsics.yml`` beside ``intrinsics.yml``."""
+    if "intrinsic" not in path.name:
+        return None
+    other = path.with_name(path.name.replace("intrinsic", "extrinsic"))
+    if not other.is_file():
+        return None
+    text = read_text(other)
+    parse = parse_xml if text.lstrip().startswith("<") else parse_yaml
+    return _relative(Fields(parse(text, str(other)), str(other)))
+
+
+def _unrectified(f: Fields, rotation: str, projection: str) -> RigidTransform:
+    """T_camera_reference, where the reference is the rectified left camera."""
+    R, P = f.matrix(rotation, 3, 3), f.matrix(projection, 3, 4)
+    if not P[0, 0] > 0:
+        raise f.error(projection, f"has the focal length {P[0, 0]:g}")
+    T = RigidTransform(np.eye(3), np.array([P[0, 3] / P[0, 0], P[1, 3] / P[0, 0], 0.0]))
+    try:
+        return RigidTransform(R, np.zeros(3)).inverse() @ T
+    except InputError as error:
+        raise f.error(rotation, f"is no pose: {error.message}") from error

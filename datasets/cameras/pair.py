@@ -1,0 +1,79 @@
+"""Two calibrated cameras as a rig."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from datasets.cameras.model import CalibratedCamera
+from stages.errors import InputError
+from stages.geometry import Rig
+from stages.lens import Lens
+
+LEAST_BASELINE = 1e-6
+"""Below this, in any unit of length in use, both cameras stand in one place."""
+
+SIDEWAYS = 0.5
+"""Share of the baseline along the left camera's columns from which it has a side (a vertical rig has none)."""
+
+
+def rig_of(
+    left: CalibratedCamera, right: CalibratedCamera, size: tuple[int, int] | None = None
+) -> tuple[Rig, dict[str, Lens] | None]:
+    """Ideal rig, and the real lenses of its cameras.
+
+    Parameters
+    ----------
+    left, right : cameras whose poses refer to one frame.
+    size : width and height of the images, pixels; needed where the calibration does not say.
+
+    Returns
+    -------
+    rig : with ideal cameras (:meth:`stages.lens.Lens.ideal_camera`), in the calibration's unit of length.
+    lenses : by camera, ``"left"`` and ``"right"``, only where there is distortion; None where there is none at all.
+
+    Raises
+    ------
+    InputError
+        The image size or the relative pose is not known, the cameras stand in one place, or are swapped.
+    """
+    lenses = {"left": _sized(left, size), "right": _sized(right, size)}
+    if left.T_camera_reference is None or right.T_camera_reference is None:
+        lacking = left if left.T_camera_reference is None else right
+        raise InputError(
+            f"cameras {left.name} and {right.name} have no relative pose: the calibration does not say where "
+            f"{lacking.name} stands",
+            remedy="give the baseline in metres, or a stereo calibration",
+        )
+    T_right_left = right.T_camera_reference @ left.T_camera_reference.inverse()
+    rig = Rig(lenses["left"].ideal_camera(), lenses["right"].ideal_camera(), T_right_left)
+    if rig.baseline < LEAST_BASELINE:
+        raise InputError(
+            f"cameras {left.name} and {right.name} stand in one place: the baseline is 0 m",
+            remedy="give the baseline in metres, or the calibration of both cameras",
+        )
+    to_the_right = float(T_right_left.inverse().translation[0])
+    if to_the_right < -SIDEWAYS * rig.baseline:
+        raise InputError(
+            f"swapped cameras: the right camera {right.name} stands {-to_the_right:.4g} m to the left of the left "
+            f"camera {left.name}",
+            remedy="exchange left and right, of the images too if they are swapped as well",
+        )
+    distorted = {side: lens for side, lens in lenses.items() if not lens.ideal}
+    return rig, distorted or None
+
+
+def _sized(camera: CalibratedCamera, size: tuple[int, int] | None) -> Lens:
+    if camera.size is not None and size is not None and camera.size != size:
+        raise InputError(
+            f"camera {camera.name} is calibrated for {camera.size[0]} x {camera.size[1]} pixels, "
+            f"the images are {size[0]} x {size[1]}",
+            remedy="give the images as they were calibrated, or the calibration of images of this size",
+        )
+    if camera.size is None and size is None:
+        raise InputError(
+            f"the calibration of camera {camera.name} does not say how large its images are",
+            remedy="give the size of the images",
+        )
+    width, height = camera.size or size or (0, 0)
+    lens = camera.lens
+    return replace(lens, camera=replace(lens.camera, width=width, height=height))

@@ -1,0 +1,75 @@
+"""Pinhole cameras of the Ames Stereo Pipeline (``.tsai``).
+
+Source: its manual, "Frame camera models" (https://stereopipeline.readthedocs.io, pinholemodels): a point Q of the
+camera frame is at R Q + C in the world, so that R is camera to world and C the projection centre; focal length and
+principal point divided by ``pitch`` are pixels, with pixel centres at integers; ``u_direction``, ``v_direction`` and
+``w_direction`` are the directions in the camera frame of columns, rows and depth. TSAI distortion, which older files
+do not name, is OpenCV's radial and tangential one; it acts on coordinates divided by the focal length.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from datasets.cameras.fields import Fields
+from datasets.cameras.model import UNKNOWN_SIZE, CalibratedCamera
+from stages.geometry import Camera
+from stages.lens import Lens
+
+ENTRY = re.compile(r"^\s*([A-Za-z]\w*)\s*=\s*(.*?)\s*$")
+FIRST = re.compile(r"^\s*fu\s*=", re.MULTILINE)
+HEADER = re.compile(r"\s*(VERSION_\d+|PINHOLE)?\s*")
+
+
+def is_tsai(text: str) -> bool:
+    """Whether this is the text of a pinhole camera."""
+    return FIRST.search(text) is not None
+
+
+def tsai(text: str, path: Path) -> list[CalibratedCamera]:
+    """The camera, named by its file; its pose refers to the file's world. The image size is unknown."""
+    f, lens = _entries(text, str(path))
+    pitch = f.number("pitch", 1.0)
+    if not pitch > 0:
+        raise f.error("pitch", f"= {pitch:g} is not positive")
+    fu, fv, cu, cv = (f.number(key) / pitch for key in ("fu", "fv", "cu", "cv"))
+    camera = f.camera("fu", (fu, fv, cu, cv), UNKNOWN_SIZE)
+    # with the directions as rows, the projection is K axes R^T (P - C)
+    keys = ("u_direction", "v_direction", "w_direction")
+    axes = np.array([f.numbers(key, 3) if key in f else row for key, row in zip(keys, np.eye(3), strict=True)])
+    if np.linalg.det(axes) < 0:
+        raise f.error("u_direction", "and the other two directions mirror the image", "give a model without mirroring")
+    T_world_body = f.rigid("R", f.matrix("R", 3, 3), np.array(f.numbers("C", 3)))
+    T_camera_body = f.rigid("u_direction", axes, np.zeros(3))
+    return [CalibratedCamera(path.stem, _lens(f, lens, camera), T_camera_body @ T_world_body.inverse())]
+
+
+def _entries(text: str, file: str) -> tuple[Fields, str]:
+    """Entries ``key = numbers``, and the name of the lens model, which stands alone on its line."""
+    values: dict[str, object] = {}
+    lens = ""
+    for line in text.splitlines():
+        entry = ENTRY.match(line)
+        if entry:
+            words = entry[2].split()
+            values[entry[1]] = words[0] if len(words) == 1 else words
+        elif not HEADER.fullmatch(line) and not lens:
+            lens = line.strip()
+    return Fields(values, file), lens
+
+
+def _lens(f: Fields, kind: str, camera: Camera) -> Lens:
+    name = kind.lower()
+    if name == "null" or (not name and "k1" not in f):
+        return Lens(camera)
+    if name == "fisheye":
+        return f.lens("k1", camera, "fisheye", tuple(f.number(key) for key in ("k1", "k2", "k3", "k4")))
+    if name not in ("", "tsai"):
+        raise f.error(
+            f"lens model {kind}", "is not read", "convert it by convert_pinhole_model --output-type TsaiLensDistortion"
+        )
+    k3 = (f.number("k3"),) if "k3" in f else ()
+    return f.lens("k1", camera, "radtan", (*(f.number(key) for key in ("k1", "k2", "p1", "p2")), *k3))

@@ -1,0 +1,309 @@
+"""Inertial sensors: rotation between frames from the gyroscope, the vertical from the accelerometer.
+
+Rates are integrated exactly for a rate that is constant between two samples (their mean): R <- R exp(w dt), Savage
+(1998), doi:10.2514/2.4228, without the coning terms, which matter to inertial navigation and not to frames of a tenth
+of a second. The gyroscope's bias is what it reads where the sensor rests. An accelerometer measures specific force, in
+rest the reaction to gravity: it points **up**. Single samples of a sensor on a running engine are worthless (1 m/s^2 of
+vibration), so that the force is averaged over two seconds around each frame, turned by the gyroscope into the
+frame's moment, and believed only where it is steady, as large as gravity, and the sensor hardly turns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from datasets.poses import coverage
+from datasets.protocol import Rows
+from datasets.tables import Table, read_table
+from datasets.times import GAP, seconds
+from stages.errors import InputError
+from stages.geometry import RigidTransform, orthonormal, rotation_exp
+
+Floats = NDArray[np.float64]
+Up = tuple[float, float, float] | None
+
+GRAVITY = 9.81
+"""m/s^2; on the ground it is 9.78 to 9.83."""
+
+FORCE_MARGIN = 0.2
+"""m/s^2, of the mean force off gravity: accelerometers of drones are biased by up to 0.1."""
+
+STEADY_FORCE = 0.2
+"""m/s^2, greatest standard deviation, on any axis, of means over 0.1 s: an accelerated body's force wanders."""
+
+STEADY_RATE = 0.02
+"""rad/s, likewise of the rate, where the sensor rests; rotors that idle shake it by 0.007."""
+
+LARGEST_BIAS = 0.15
+"""rad/s; the mean rate of a resting sensor. Cheap gyroscopes have 0.08, faster ones turn indeed."""
+
+SLOW = 0.15
+"""rad/s; while it turns faster, the mean force is not trusted: the sensor stands off the axis."""
+
+BIN = 0.1
+"""s; means over it are free of vibration."""
+
+REST = 1.0
+"""s; shortest stretch that counts as rest."""
+
+ENOUGH_REST = 5.0
+"""s; more does not make a better bias, only an older one."""
+
+HALF_WINDOW = 1.0
+"""s; the force is averaged over as much before and after a frame, at an end of the record over one side. In a drone's
+flight one frame in twenty passes, 0.6 degrees off in the median and 2 at most; half the window triples that."""
+
+BRIDGE = 0.1
+"""s; longest gap in the samples over which the rate is interpolated."""
+
+
+@dataclass(frozen=True)
+class Imu:
+    """A record: times (n,), s; rates (n, 3), rad/s, and specific forces (n, 3), m/s^2, along the sensor's axes."""
+
+    times: Floats
+    rates: Floats
+    forces: Floats
+    name: str = "imu"
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Inertial:
+    """What an IMU says of each frame.
+
+    Attributes
+    ----------
+    attitude : R_reference_left row by row, the reference being the sensor's frame at its first sample in use; None
+        where the record does not reach or is cut off from the longest unbroken part by a gap.
+    up : unit vector of up in the left camera's frame; None where the force is not gravity's reaction.
+    bias : rad/s, what the gyroscope reads in rest; None where the record has no rest.
+    warnings : what is missing or suspicious, one line each.
+    notes : what was assumed.
+    """
+
+    attitude: tuple[Rows | None, ...]
+    up: tuple[Up, ...]
+    bias: tuple[float, float, float] | None = None
+    warnings: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+
+
+# -- reading -----------------------------------------------------------------------------------------------------------
+
+
+def read_imu(path: Path, *, unit: str = "auto") -> Imu:
+    """Table of time, rates about x y z and specific forces along them.
+
+    Columns are told by their names (``w_RS_S_x [rad s^-1]``, ``gyro_x``, ``acc_x`` ...), else they stand in this
+    order. Names that say ``deg`` are converted.
+
+    Parameters
+    ----------
+    unit : of the times, see :func:`datasets.times.seconds`.
+
+    Raises
+    ------
+    InputError
+        Columns are missing, exchanged, or in multiples of gravity; a row or a time cannot be used.
+    """
+    table = read_table(path, "IMU record")
+    if table.columns < 7:
+        raise InputError(
+            f"{path}, line {table.lines[0]}: {table.columns} columns are no IMU record",
+            remedy="give time, three rates (rad/s) and three accelerations (m/s^2) a row",
+        )
+    gyro = _named(table, ("gyr", "w_", "ang", "omega", "rate")) or [1, 2, 3]
+    accelerometer = _named(table, ("acc", "a_", "lin", "force")) or [4, 5, 6]
+    times, warnings = seconds(table.text(0), table.name, unit=unit, lines=table.lines)
+    rates, forces = table.numbers(gyro), table.numbers(accelerometer)
+    if any("deg" in table.header[k] for k in gyro if table.header):
+        rates = np.deg2rad(rates)
+    _plausible(rates, forces, table.name)
+    return Imu(np.array(times), rates, forces, table.name, warnings)
+
+
+def _named(table: Table, starts: tuple[str, ...]) -> list[int]:
+    """The three columns whose names begin so, x y z; none where there are not just three."""
+    found = [k for k, name in enumerate(table.header) if name.startswith(starts)]
+    return found if len(found) == 3 else []
+
+
+def _plausible(rates: Floats, forces: Floats, name: str) -> None:
+    turn, force = (float(np.median(np.linalg.norm(v, axis=1))) for v in (rates, forces))
+    if turn > 8 and force < 6:
+        raise InputError(
+            f"{name}: the rates are {turn:.3g} and the accelerations {force:.3g}: they look exchanged",
+            remedy="order the columns time, rates, accelerations, or name them gyro_x ... acc_x ...",
+        )
+    if 0.8 < force < 1.2:
+        raise InputError(
+            f"{name}: accelerations of {force:.3g} look like multiples of gravity",
+            remedy="give them in m/s^2: 9.81 at rest",
+        )
+
+
+# -- frames ------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Samples without a gap, their bias removed; ``turned`` (n, 3, 3) is R_reference_imu, identity at the first one."""
+
+    times: Floats
+    rates: Floats
+    forces: Floats
+    turned: Floats
+    slack: float
+
+    def holds(self, moment: float) -> bool:
+        """Whether a moment lies within, or beyond an end by no more than the usual spacing."""
+        return bool(self.times[0] - self.slack <= moment <= self.times[-1] + self.slack)
+
+    def attitude(self, moment: float) -> Floats:
+        """R_reference_imu at a moment, by the mean rate of the samples around it."""
+        k = int(np.clip(np.searchsorted(self.times, moment, side="right") - 1, 0, len(self.times) - 2))
+        rate = 0.5 * (self.rates[k] + self.rates[k + 1])
+        return np.asarray(self.turned[k] @ rotation_exp(rate * (moment - self.times[k])), dtype=np.float64)
+
+    def up(self, moment: float) -> Floats | None:
+        """Up in the sensor's frame at a moment, not normalised; None where the force is not gravity's reaction."""
+        first, last = np.searchsorted(self.times, (moment - HALF_WINDOW, moment + HALF_WINDOW))
+        chosen = slice(int(first), int(last))
+        if last - first < 2 or self.times[last - 1] - self.times[first] < HALF_WINDOW - self.slack:
+            return None
+        turns = self.attitude(moment).T @ self.turned[chosen]
+        force = np.einsum("nij,nj->ni", turns, self.forces[chosen])
+        mean = force.mean(axis=0)
+        steady = bins(force, self.times[chosen]).std(axis=0).max() <= STEADY_FORCE
+        slow = np.linalg.norm(self.rates[chosen].mean(axis=0)) <= SLOW
+        return mean if steady and slow and abs(np.linalg.norm(mean) - GRAVITY) <= FORCE_MARGIN else None
+
+
+def at_frames(imu: Imu, at: Sequence[float], T_imu_left: RigidTransform) -> Inertial:
+    """Attitude and vertical of the left camera at the moments of the frames.
+
+    Parameters
+    ----------
+    at : seconds, increasing, of the sensor's clock.
+    T_imu_left : pose of the left camera in the sensor's frame; its rotation alone matters.
+
+    Raises
+    ------
+    InputError
+        The record and the frames have no time in common, or the record has less than two samples.
+    """
+    _overlap(imu, at)
+    bias, notes = resting_bias(imu, at[0], at[-1])
+    parts = stretches(imu, bias, at[0] - HALF_WINDOW, at[-1] + HALF_WINDOW)
+    part = [next((p for p, s in enumerate(parts) if s.holds(moment)), None) for moment in at]
+    # rotations across a gap are not known: one reference holds only for the part with most frames
+    longest = max(range(len(parts)), key=lambda p: (part.count(p), -p), default=None)
+    R_imu_left = T_imu_left.rotation
+    attitude: list[Rows | None] = []
+    up: list[Up] = []
+    for p, moment in zip(part, at, strict=True):
+        R_reference_imu = parts[p].attitude(moment) if p is not None and p == longest else None
+        force = parts[p].up(moment) if p is not None else None
+        attitude.append(None if R_reference_imu is None else _rows(R_reference_imu @ R_imu_left))
+        up.append(None if force is None else _unit(R_imu_left.T @ force))
+    warnings = coverage(attitude, at, f"attitude from {imu.name}")
+    known = None if bias is None else (float(bias[0]), float(bias[1]), float(bias[2]))
+    return Inertial(tuple(attitude), tuple(up), known, warnings, notes)
+
+
+def stretches(imu: Imu, bias: Floats | None, start: float, end: float) -> list[Stretch]:
+    """The parts of a record from ``start`` to ``end`` (s) without gaps, each of two samples at least."""
+    usual = float(np.median(np.diff(imu.times)))
+    bridge = max(BRIDGE, GAP * usual)
+    near = np.flatnonzero((imu.times >= start - bridge) & (imu.times <= end + bridge))
+    out = []
+    for part in np.split(near, np.flatnonzero(np.diff(imu.times[near]) > bridge) + 1):
+        if part.size >= 2:
+            times, rates = imu.times[part], imu.rates[part] - (0.0 if bias is None else bias)
+            out.append(Stretch(times, rates, imu.forces[part], integrate(times, rates), GAP * usual))
+    return out
+
+
+def integrate(times: Floats, rates: Floats) -> Floats:
+    """R_first_now (n, 3, 3) of the sensor at each sample, from rates (n, 3), rad/s, in its own axes."""
+    steps = 0.5 * (rates[1:] + rates[:-1]) * np.diff(times)[:, None]
+    out = np.empty((len(times), 3, 3))
+    out[0] = np.eye(3)
+    for k, step in enumerate(Rotation.from_rotvec(steps).as_matrix()):
+        out[k + 1] = out[k] @ step
+    return out
+
+
+def resting_bias(imu: Imu, start: float, end: float) -> tuple[Floats | None, tuple[str, ...]]:
+    """What the gyroscope reads in rest (3,), rad/s, and a note on how it was found; None without rest.
+
+    Rest is a second in which means over 0.1 s of rate and force are steady, the force is as large as gravity and the
+    rate no larger than a bias can be. A steady slow turn about the vertical looks the same; where resting seconds
+    disagree, those count that agree with the quietest one. A bias wanders (0.1 degrees a second in two minutes), so
+    that of all rest the five seconds nearest to the frames count, which last from ``start`` to ``end``.
+    """
+    rate, force = bins(imu.rates, imu.times), bins(imu.forces, imu.times)
+    count = round(REST / BIN)
+    if len(rate) < count:
+        return None, (NO_BIAS,)
+    rates, forces = (np.lib.stride_tricks.sliding_window_view(v, count, axis=0) for v in (rate, force))
+    shaken = rates.std(axis=-1).max(axis=-1)
+    mean = rates.mean(axis=-1)
+    rest = (
+        (shaken <= STEADY_RATE)
+        & (forces.std(axis=-1).max(axis=-1) <= STEADY_FORCE)
+        & (np.abs(np.linalg.norm(forces.mean(axis=-1), axis=-1) - GRAVITY) <= FORCE_MARGIN)
+        & (np.linalg.norm(mean, axis=-1) <= LARGEST_BIAS)
+    )
+    if not rest.any():
+        return None, (NO_BIAS,)
+    quietest = int(np.flatnonzero(rest)[np.argmin(shaken[rest])])
+    rest &= np.linalg.norm(mean - mean[quietest], axis=-1) <= STEADY_RATE
+    covered = np.zeros(len(rate), bool)
+    for k in np.flatnonzero(rest):
+        covered[k : k + count] = True
+    times = bins(imu.times[:, None], imu.times)[covered, 0]
+    away = np.maximum(start - times, 0) + np.maximum(times - end, 0)
+    nearest = np.argsort(away, kind="stable")[: round(ENOUGH_REST / BIN)]
+    bias = np.median(rate[covered][nearest], axis=0)  # seconds at the ends of a rest may have some movement
+    words = ", ".join(f"{v:.4f}" for v in bias)
+    return bias, (f"gyroscope bias ({words}) rad/s from {len(nearest) * BIN:.1f} s of rest",)
+
+
+NO_BIAS = "the gyroscope's bias is not known (no second of rest in its record): rotations drift with it"
+
+
+def bins(values: Floats, times: Floats) -> Floats:
+    """Means (m, 3) of successive samples over 0.1 s; a remainder is left out, unless it is all there is."""
+    size = max(1, round(BIN / float(np.median(np.diff(times)))))
+    count = max(1, len(values) // size)
+    return np.asarray(values[: count * size].reshape(count, -1, values.shape[1]).mean(axis=1), dtype=np.float64)
+
+
+def _overlap(imu: Imu, at: Sequence[float]) -> None:
+    if len(imu.times) < 2:
+        raise InputError(f"{imu.name} has one sample", remedy="give the whole record")
+    first, last = float(imu.times[0]), float(imu.times[-1])
+    if at[-1] < first or at[0] > last:
+        raise InputError(
+            f"{imu.name} reaches from {first:.3f} to {last:.3f} s, the frames from {at[0]:.3f} to {at[-1]:.3f} s: "
+            "no common time",
+            remedy="check that both have the same clock and unit; a constant offset can be stated",
+        )
+
+
+def _rows(rotation: Floats) -> Rows:
+    return cast(Rows, tuple(tuple(float(v) for v in row) for row in orthonormal(rotation)))
+
+
+def _unit(vector: Floats) -> Up:
+    x, y, z = (float(v) for v in vector / np.linalg.norm(vector))
+    return x, y, z

@@ -1,0 +1,259 @@
+"""What a folder of stereo images holds: pairs, calibration, times, poses, told from names and content alone.
+
+Nothing is decided silently: what is found is written into a manifest with the reason beside it, what is missing is
+written as a comment that says what to fill in. Opening the manifest before that fails with the line that is missing.
+"""
+
+from __future__ import annotations
+
+import glob
+import os
+import re
+from collections import defaultdict
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from datasets.cameras import CalibratedCamera, read_cameras
+from datasets.pairing import SIDES, SUFFIXES, common_size, natural, pair_up, side_of
+from stages.errors import InputError, RilleError
+
+DEPTH = 4
+"""Folders below the given one that are looked into; more is another data set."""
+
+CALIBRATIONS = (".yaml", ".yml", ".xml", ".tsai", ".txt", ".toml", ".ini", ".cfg", ".json")
+TABLES = (".txt", ".csv", ".tum", ".dat")
+LARGEST_CALIBRATION = 1_000_000
+"""bytes; a text of calibration is a few kilobytes."""
+
+STAMP = re.compile(r"\d{10,}")
+"""Seconds since 1970 have ten digits, their fractions more; frame numbers have fewer."""
+
+NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
+
+
+@dataclass(frozen=True)
+class Views:
+    """The images: patterns relative to the folder, number of pairs, image size, and why they are taken so.
+
+    ``trouble`` says what does not fit; ``stamped`` whether the names are times since an epoch.
+    """
+
+    left: str
+    right: str
+    pairs: int
+    size: tuple[int, int]
+    why: str
+    trouble: str = ""
+    stamped: bool = False
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Calibration files that suit: one for both cameras or one each, relative to the folder."""
+
+    files: tuple[str, ...]
+    size: tuple[int, int] | None
+    baseline: float | None
+    cameras: int
+
+
+@dataclass
+class Findings:
+    """Everything that was found in a folder; paths are relative to it."""
+
+    folder: Path
+    views: Views
+    calibration: Calibration | None = None
+    others: list[str] = field(default_factory=list)
+    tables: dict[str, list[str]] = field(default_factory=dict)
+    unread: list[str] = field(default_factory=list)
+
+
+def inspect(folder: Path) -> Findings:
+    """Look at a folder.
+
+    Raises
+    ------
+    InputError
+        It is no folder, or no two sets of images in it belong to a left and a right camera.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{folder} is no folder", remedy="name a folder that holds images of two cameras")
+    paths = list(_files(folder))
+    found = Findings(folder, find_views(folder, [p for p in paths if p.suffix.lower() in SUFFIXES]))
+    texts = [p for p in paths if p.suffix.lower() in CALIBRATIONS and p.stat().st_size <= LARGEST_CALIBRATION]
+    _find_calibration(found, texts)
+    used = set(found.calibration.files if found.calibration else ()) | set(found.others)
+    for path in paths:
+        relative = _relative(path, folder)
+        kind = table_kind(path, found.views.pairs) if path.suffix.lower() in TABLES and relative not in used else ""
+        if kind:
+            found.tables.setdefault(kind, []).append(relative)
+    return found
+
+
+def _files(folder: Path) -> Iterable[Path]:
+    """Files below a folder in natural order, hidden ones left out."""
+    for at, folders, names in os.walk(folder):
+        here = Path(at)
+        deep = len(here.relative_to(folder).parts) >= DEPTH
+        folders[:] = [] if deep else sorted((d for d in folders if not d.startswith(".")), key=natural)
+        yield from (here / n for n in sorted(names, key=natural) if not n.startswith("."))
+
+
+def _relative(path: Path, folder: Path) -> str:
+    return path.relative_to(folder).as_posix()
+
+
+# -- images ------------------------------------------------------------------------------------------------------------
+
+
+def find_views(folder: Path, images: list[Path]) -> Views:
+    """The two sets of images, by the tokens in their names that make most pairs.
+
+    Raises
+    ------
+    InputError
+        No token tells a left image from a right one.
+    """
+    groups: dict[tuple[int, str], tuple[list[Path], list[Path]]] = defaultdict(lambda: ([], []))
+    for path in images:
+        at = side_of(_relative(path.with_suffix(""), folder))
+        if at is not None:
+            groups[at[0], _place(path, folder, at[2])][at[1]].append(path)
+    both = {key: sides for key, sides in groups.items() if all(sides)}
+    if not both:
+        raise InputError(
+            f"{folder} holds {len(images)} images, but none are told apart as left and right",
+            remedy="name files or folders left and right (or _l and _r, cam0 and cam1), or write a manifest by hand",
+        )
+    key = max(both, key=lambda k: (min(len(s) for s in both[k]), -k[0]))
+    left, right = both[key]
+    size, trouble, pairs = (0, 0), "", 0
+    try:
+        matched = pair_up(left, right)
+        pairs = len(matched)
+        size = common_size(matched)[:2]
+    except InputError as error:
+        trouble = str(error)
+    tokens = SIDES[key[0]]
+    return Views(
+        pattern(left, folder),
+        pattern(right, folder),
+        pairs,
+        size,
+        f"{len(left)} left and {len(right)} right images, told apart by {tokens[0]!r} and {tokens[1]!r}",
+        trouble,
+        all(STAMP.search(path.stem) for path in left),
+    )
+
+
+def _place(path: Path, folder: Path, without: str) -> str:
+    """Where a file of a set lies: its folder with the side's token taken out, and its kind."""
+    return f"{without.rpartition('/')[0]} {path.suffix.lower()}"
+
+
+def pattern(paths: list[Path], folder: Path) -> str:
+    """The narrowest simple pattern of a set of files in one folder (or in one folder a side)."""
+    names = [path.name for path in paths]
+    below = {_relative(path.parent, folder) for path in paths}
+    place = "" if below == {"."} else (glob.escape(min(below)) if len(below) == 1 else "**") + "/"
+    if len(names) == 1:
+        return place + glob.escape(names[0])
+    head = _common_start(names).rstrip("0123456789")
+    tail = _common_start([name[len(head) :][::-1] for name in names])[::-1].lstrip("0123456789")
+    return f"{place}{glob.escape(head)}*{glob.escape(tail)}"
+
+
+def _common_start(words: list[str]) -> str:
+    """Letters that all words begin with; all lie between the first and the last in alphabetical order."""
+    first, last = min(words), max(words)
+    return first[: next((k for k, (a, b) in enumerate(zip(first, last, strict=False)) if a != b), len(first))]
+
+
+# -- calibration -------------------------------------------------------------------------------------------------------
+
+
+def _find_calibration(found: Findings, texts: list[Path]) -> None:
+    """Of all files that are calibrations, the one or the two that serve this rig best."""
+    read: dict[str, list[CalibratedCamera]] = {}
+    for path in texts:
+        relative = _relative(path, found.folder)
+        try:
+            cameras = read_cameras(path)
+        except (RilleError, OSError, ValueError) as error:
+            if path.suffix.lower() == ".tsai" or "calib" in path.stem.lower():
+                found.unread.append(" ".join(str(error).split()))
+            continue
+        if cameras:
+            read[relative] = cameras
+    candidates = [_calibration((name,), cameras) for name, cameras in read.items() if len(cameras) == 2]
+    single = {name: cameras[0] for name, cameras in read.items() if len(cameras) == 1}
+    candidates += [
+        _calibration((left, right), [single[left], single[right]]) for left, right in _two_sides(list(single))
+    ]
+    candidates += [_calibration((name,), [camera]) for name, camera in single.items()]
+    if candidates:
+        size = found.views.size
+        found.calibration = max(
+            candidates, key=lambda c: (c.size in (None, size), c.cameras, c.baseline is not None, -len(c.files))
+        )
+        found.others = [name for name in read if name not in found.calibration.files]
+
+
+def _two_sides(names: list[str]) -> Iterable[tuple[str, str]]:
+    """Names that differ in the side's token alone."""
+    sides: dict[tuple[int, str], dict[int, str]] = defaultdict(dict)
+    for name in names:
+        at = side_of(name.rpartition(".")[0])
+        if at is not None:
+            sides[at[0], at[2]][at[1]] = name
+    return [(pair[0], pair[1]) for pair in sides.values() if len(pair) == 2]
+
+
+def _calibration(names: tuple[str, ...], cameras: list[CalibratedCamera]) -> Calibration:
+    poses = [camera.T_camera_reference for camera in cameras]
+    baseline = None
+    if len(poses) == 2 and poses[0] is not None and poses[1] is not None:
+        baseline = float(np.linalg.norm((poses[1] @ poses[0].inverse()).translation))
+    return Calibration(names, cameras[0].size, baseline, len(cameras))
+
+
+# -- tables ------------------------------------------------------------------------------------------------------------
+
+
+def table_kind(path: Path, pairs: int) -> str:
+    """What a table of numbers holds, by its header and first row: truth, imu, attitude, times, or nothing."""
+    try:
+        with path.open(encoding="utf-8") as file:
+            lines = [line.strip() for line in file if line.strip()]
+    except (OSError, UnicodeDecodeError):
+        return ""
+    comments = [line for line in lines if not NUMBER.match(line)]
+    rows = [line for line in lines if NUMBER.match(line)]
+    if not rows:
+        return ""
+    header = comments[0].lower() if comments else ""
+    words = [word for word in re.split(r"[,;\s]+", rows[0]) if word]
+    numbers = [float(word) for word in words if NUMBER.fullmatch(word)]
+    if len(numbers) < len(words):
+        return ""
+    if any(word in header for word in ("gyro", "w_rs", "ang_vel", "angular", "accel")) and len(numbers) >= 7:
+        return "imu"
+    if "yaw" in header and "roll" in header:
+        return "attitude"
+    return _kind_of_row(np.array(numbers), len(rows), pairs, "times" if "time" in path.stem.lower() else "")
+
+
+def _kind_of_row(row: np.ndarray, rows: int, pairs: int, named: str) -> str:
+    if row.size == 12:
+        rotation = row.reshape(3, 4)[:, :3]
+        return "truth" if np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-3 else ""
+    if row.size >= 8 and abs(np.linalg.norm(row[4:8]) - 1) < 1e-3:
+        return "truth"
+    if row.size == 1 and (rows == pairs or named):
+        return "times"
+    return ""

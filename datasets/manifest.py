@@ -1,0 +1,136 @@
+"""Any folder of stereo images as a sequence, described by a manifest (TOML, see :mod:`datasets.manifest_model`).
+
+The manifest says which files are the pairs, what the cameras are, and what else is known: times, truth, attitude,
+odometry, IMU, vehicle. Nothing is repaired silently: what cannot be is an error with the key, what is merely suspicious
+is a warning with its figure, which a run prints and carries on.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from datasets import files
+from datasets.manifest_model import Images, read_manifest
+from datasets.manifest_motion import read_motion
+from datasets.manifest_rig import read_optics
+from datasets.pairing import Pair, common_size, pair_up
+from datasets.protocol import Sequence, Source
+from stages.errors import InputError
+
+VARIABLE = re.compile(r"\$\{(\w+)\}")
+
+
+def open_manifest(path: Path, digests: files.Digests) -> Sequence:
+    """The sequence that a manifest describes.
+
+    Raises
+    ------
+    InputError
+        The manifest or a file that it names cannot be used; the message names the file and the key.
+    """
+    manifest, name = read_manifest(path), str(path)
+    root = root_folder(manifest.root, path)
+    pairs = find_pairs(manifest.images, root, name)
+    size = common_size(pairs)
+    optics = read_optics(manifest, root, name, size[:2])
+    motion = read_motion(manifest, root, name, pairs)
+    up = motion.up
+    if up is None and optics.up is not None:
+        up = (optics.up,) * len(pairs)
+
+    def image(frame: int, camera: str) -> Source:
+        pair = pairs[frame]
+        return files.image_source(pair.left if camera == "left" else pair.right, frame, camera, size, digests)
+
+    pitch = manifest.world.pitch_deg
+    return Sequence(
+        name=manifest.name or default_name(path),
+        rig=optics.rig,
+        frames=len(pairs),
+        image=image,
+        frame_names=tuple(pair.name for pair in pairs),
+        lenses=optics.lenses,
+        times=motion.times,
+        truth=motion.truth,
+        truth_source=motion.truth_source,
+        up=up,
+        attitude=motion.attitude,
+        odometry=motion.odometry,
+        pitch=None if pitch is None else math.radians(pitch),
+        vehicle=manifest.vehicle,
+        defaults=dict(dotted(manifest.defaults)),
+        notes=manifest.notes,
+        warnings=(*optics.warnings, *motion.warnings),
+    )
+
+
+def default_name(path: Path) -> str:
+    """Name of a sequence whose manifest states none: that of the file, or of its folder for ``manifest.toml``."""
+    stem = path.name.removesuffix(".toml").removesuffix(".rille")
+    return path.resolve().parent.name if stem == "manifest" else stem
+
+
+def root_folder(text: str, path: Path) -> Path:
+    """Folder that a manifest's files are relative to.
+
+    Raises
+    ------
+    InputError
+        A variable of the environment is not set, or there is no such folder.
+    """
+
+    def value(match: re.Match[str]) -> str:
+        if not os.environ.get(match[1]):
+            raise InputError(
+                f"{path}: root = {text!r} needs the environment variable {match[1]}, which is not set",
+                remedy=f"export {match[1]}=FOLDER",
+            )
+        return os.environ[match[1]]
+
+    root = path.resolve().parent / Path(VARIABLE.sub(value, text)).expanduser()
+    if not root.is_dir():
+        raise InputError(f"{path}: root = {text!r}: there is no folder {root}", remedy="correct root, or its variable")
+    return root
+
+
+def find_pairs(images: Images, root: Path, name: str) -> tuple[Pair, ...]:
+    """The pairs that the patterns find.
+
+    Raises
+    ------
+    InputError
+        A pattern finds nothing, both find the same files, or an image has no partner.
+    """
+    found = {}
+    for side, pattern in (("left", images.left), ("right", images.right)):
+        try:
+            paths = [path for path in root.glob(pattern) if path.is_file()]
+        except (ValueError, NotImplementedError) as error:
+            raise InputError(
+                f"{name}: images.{side} = {pattern!r} is no pattern: {error}", remedy="give one relative to root"
+            ) from error
+        if not paths:
+            raise InputError(
+                f"{name}: images.{side} = {pattern!r} finds no file in {root}", remedy="correct the pattern or root"
+            )
+        found[side] = paths
+    both = sorted(set(found["left"]) & set(found["right"]))
+    if both:
+        raise InputError(f"{name}: images.left and images.right both find {both[0]}", remedy="narrow the patterns")
+    try:
+        return pair_up(found["left"], found["right"], images.pair)
+    except InputError as error:
+        raise InputError(f"{name}: {error.message}", remedy=error.remedy) from error
+
+
+def dotted(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
+    """``{"locus": {"cell_size": 0.1}}`` as ``[("locus.cell_size", 0.1)]``; keys may be dotted already."""
+    flat: list[tuple[str, Any]] = []
+    for key, value in values.items():
+        flat += dotted(value, f"{prefix}{key}.") if isinstance(value, Mapping) else [(prefix + key, value)]
+    return flat

@@ -1,0 +1,295 @@
+"""What a manifest may say: one model a table, strictly read, so that a misspelt key is named with its neighbour."""
+
+from __future__ import annotations
+
+import difflib
+import tomllib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import BeforeValidator, Discriminator, Field, Tag, ValidationError, model_validator
+
+from stages.declare import Params
+from stages.errors import InputError
+from stages.geometry import RigidTransform
+from stages.vehicle import Vehicle
+
+
+def _pose(value: Any) -> tuple[float, ...]:
+    """Twelve numbers, rows of [R | t], of a 3 x 4 or 4 x 4 matrix, flat or in rows."""
+    try:
+        matrix = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        matrix = np.empty(0)
+    if matrix.size not in (12, 16):
+        raise ValueError("give rows of [R | t], 3 x 4 numbers")
+    return tuple(RigidTransform.from_matrix(matrix).to_list())
+
+
+Pose = Annotated[tuple[float, ...], BeforeValidator(_pose)]
+Direction = tuple[float, float, float]
+PoseFormat = Literal["auto", "kitti", "tum", "euroc", "csv"]
+TimeUnit = Literal["auto", "s", "ms", "us", "ns"]
+
+
+class Images(Params):
+    """``[images]``: which files are the pairs."""
+
+    left: str = Field(description="pattern of the left images below the root, e.g. left/*.png; ** is any folder")
+    right: str = Field(description="pattern of the right images")
+    pair: Literal["auto", "name", "number", "order"] = Field(
+        default="auto",
+        description="how images are paired: by name (left/right aside), by the last number in the name, or by order; "
+        "auto: by name, and by number where no names agree",
+    )
+
+
+class PinholeLens(Params):
+    """One camera stated in the manifest."""
+
+    fx: float | None = Field(default=None, gt=0, description="px, focal length in columns")
+    fy: float | None = Field(
+        default=None, gt=0, description="px, focal length in rows; that in columns where it is not given"
+    )
+    cx: float | None = Field(
+        default=None, description="px, column of the principal point; centre of the first pixel is 0"
+    )
+    cy: float | None = Field(default=None, description="px, row of the principal point")
+    width: int | None = Field(
+        default=None, ge=1, description="px, of the images that were calibrated; those given by default"
+    )
+    height: int | None = Field(default=None, ge=1, description="px, of the images that were calibrated")
+    model: Literal["none", "radtan", "rational", "fisheye"] | None = Field(
+        default=None, description="distortion model; radtan where there are coefficients"
+    )
+    distortion: tuple[float, ...] = Field(
+        default=(), description="coefficients in OpenCV's order, e.g. k1 k2 p1 p2 [k3]"
+    )
+
+    @model_validator(mode="after")
+    def _whole(self) -> PinholeLens:
+        given = [name for name in PinholeLens.model_fields if getattr(self, name) not in (None, ())]
+        missing = [name for name in ("fx", "cx", "cy") if getattr(self, name) is None]
+        if given and missing:
+            raise ValueError(f"{', '.join(missing)} is missing (px); {', '.join(given)} alone make no camera")
+        return self
+
+    @property
+    def stated(self) -> bool:
+        """Whether there is a camera at all."""
+        return self.fx is not None
+
+
+def _kind(value: Any) -> str:
+    return "file" if isinstance(value, str) else "camera"
+
+
+OneCamera = Annotated[Annotated[str, Tag("file")] | Annotated[PinholeLens, Tag("camera")], Discriminator(_kind)]
+
+
+class Cameras(PinholeLens):
+    """``[cameras]``: one file, a file or a table each, or figures that hold for both cameras."""
+
+    file: str | None = Field(default=None, description="calibration file of both cameras")
+    left: OneCamera | None = Field(default=None, description="calibration file of the left camera, or its figures")
+    right: OneCamera | None = Field(default=None, description="calibration file of the right camera, or its figures")
+    names: tuple[str, str] | None = Field(
+        default=None,
+        description="names of the left and the right camera within the file, where it has more or other ones",
+    )
+
+    @model_validator(mode="after")
+    def _one_form(self) -> Cameras:
+        forms = [self.stated, self.file is not None, self.left is not None or self.right is not None]
+        if sum(forms) > 1:
+            raise ValueError("give fx, fy ... for both, or file, or left and right; not several of them")
+        if (self.left is None) != (self.right is None):
+            raise ValueError(f"{'right' if self.right is None else 'left'} is missing")
+        for one in (self.left, self.right):
+            if isinstance(one, PinholeLens) and not one.stated:
+                raise ValueError("left and right need fx, cx and cy (px), or a file each")
+        return self
+
+
+class RigSection(Params):
+    """``[rig]``: where the right camera stands, unless the calibration files say it."""
+
+    baseline: float | None = Field(
+        default=None, description="m; the right camera stands that far along the left one's x axis"
+    )
+    T_right_left: Pose | None = Field(default=None, description="rows of [R | t], m: x_right = R x_left + t")
+    unit: float = Field(
+        default=1.0, gt=0, description="m; length of one unit of the calibration files, 0.001 where they say mm"
+    )
+
+
+class Times(Params):
+    """``[times]``: when the pairs were taken."""
+
+    file: str | None = Field(
+        default=None, description="one time a line for each pair, or a table of time and file name"
+    )
+    names: bool = Field(default=False, description="the left images' names are time stamps")
+    rate_hz: float | None = Field(default=None, gt=0, description="1/s; pairs at a constant rate")
+    unit: TimeUnit = Field(default="auto", description="unit of file or names; auto: by magnitude")
+
+    @model_validator(mode="after")
+    def _one_source(self) -> Times:
+        given = [self.file is not None, self.names, self.rate_hz is not None]
+        if sum(given) != 1:
+            raise ValueError("give one of file, names = true or rate_hz")
+        return self
+
+
+class PoseFile(Params):
+    """``[truth]`` and ``[odometry]``: poses of the left camera or of a body that carries it."""
+
+    file: str = Field(description="poses, one a pair, or with times")
+    format: PoseFormat = Field(default="auto", description="kitti 3 x 4, tum, euroc or csv")
+    T_body_left: Pose | None = Field(
+        default=None,
+        description="rows of [R | t], m: from the left camera's frame to the body's whose poses the file has",
+    )
+    max_gap: float = Field(default=0.5, gt=0, description="s; poses are interpolated over no longer gap")
+    time_offset: float = Field(
+        default=0.0, description="s; added to the file's times so that they are those of the images"
+    )
+    source: str = Field(default="", description="words: where the poses come from")
+
+
+class Attitude(Params):
+    """``[attitude]``: rotation from a sensor."""
+
+    file: str = Field(description="table of time and roll, pitch, yaw or a quaternion; or poses, of which R is taken")
+    format: PoseFormat = Field(default="auto", description="as for poses")
+    T_body_left: Pose | None = Field(
+        default=None, description="rows of [R | t]: from the left camera's frame to the sensor's"
+    )
+    up: Direction | None = Field(
+        default=None, description="direction of up in the sensor's reference; none: not used as such"
+    )
+    max_gap: float = Field(default=0.5, gt=0, description="s; attitudes are interpolated over no longer gap")
+    time_offset: float = Field(
+        default=0.0, description="s; added to the file's times so that they are those of the images"
+    )
+
+
+class Imu(Params):
+    """``[imu]``: angular rates and accelerations."""
+
+    file: str = Field(description="table of time, rates (rad/s) about x y z and accelerations (m/s2) along them")
+    T_imu_left: Pose = Field(description="rows of [R | t]: from the left camera's frame to the IMU's")
+    time_offset: float = Field(
+        default=0.0, description="s; added to the file's times so that they are those of the images"
+    )
+
+
+class World(Params):
+    """``[world]``: what is known of the vertical."""
+
+    pitch_deg: float | None = Field(
+        default=None,
+        gt=-90,
+        lt=90,
+        description="degrees; downward pitch of the left camera's axis over the ground, roll 0",
+    )
+    up: Direction | None = Field(
+        default=None,
+        description="direction of up in the reference frame of the calibration files (the left camera's where they "
+        "state none), the same for all pairs",
+    )
+
+
+class Manifest(Params):
+    """A stereo sequence in a folder of any form."""
+
+    name: str = Field(default="", description="short name, used for folders; the manifest's folder by default")
+    root: str = Field(default=".", description="folder of all files, relative to the manifest; ${VARIABLE} is allowed")
+    images: Images
+    cameras: Cameras = Cameras()
+    rig: RigSection = RigSection()
+    times: Times | None = None
+    truth: PoseFile | None = None
+    odometry: PoseFile | None = None
+    attitude: Attitude | None = None
+    imu: Imu | None = None
+    world: World = World()
+    vehicle: Vehicle | None = None
+    defaults: dict[str, Any] = Field(
+        default={}, description="parameters that suit the sequence, e.g. locus.cell_size = 0.05"
+    )
+    notes: tuple[str, ...] = Field(default=(), description="facts that the report repeats")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _notes_in_a_table(cls, value: Any) -> Any:
+        """``notes`` may stand last, as ``[notes]`` with ``text = [...]``, where a bare key would join another table."""
+        if isinstance(value, dict) and isinstance(value.get("notes"), dict) and set(value["notes"]) == {"text"}:
+            return value | {"notes": value["notes"]["text"]}
+        return value
+
+
+def read_manifest(path: Path) -> Manifest:
+    """Manifest of a TOML file.
+
+    Raises
+    ------
+    InputError
+        It cannot be read, is not TOML, or a key is unknown, missing or not permitted; the message names the key.
+    """
+    try:
+        values = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"manifest {path} cannot be read: {error.strerror}", remedy="check the path") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path} is not TOML: {error}", remedy="correct the file at that place") from error
+    try:
+        return Manifest.model_validate(values)
+    except ValidationError as error:
+        lines = [_complaint(dict(e)) for e in error.errors()]
+        raise InputError(
+            f"{path}: {'; '.join(lines)}", remedy="`rille init FOLDER` writes one to begin with"
+        ) from error
+
+
+def _complaint(error: Mapping[str, Any]) -> str:
+    """One of pydantic's complaints as dotted key, value and reason."""
+    loc = [str(part) for part in error["loc"] if part not in ("file", "camera") or part == error["loc"][-1]]
+    key = ".".join(loc)
+    if error["type"] == "extra_forbidden":
+        return f"unknown key {key!r} (value {error['input']!r}){_nearest(loc)}"
+    if error["type"] == "missing":
+        return f"{key} is missing"
+    reason = str(error.get("ctx", {}).get("error", error["msg"]))
+    value = "" if isinstance(error["input"], dict) else f" = {error['input']!r} is not permitted"
+    return f"{key or 'manifest'}{value}: {reason[0].lower() + reason[1:]}"
+
+
+def _nearest(loc: list[str]) -> str:
+    """The key that may have been meant: of the same table, or of the same name in another one."""
+    known = list(known_keys())
+    key, last = ".".join(loc), loc[-1]
+    elsewhere = [k for k in known if k.rpartition(".")[2] == last]
+    near = elsewhere[:1] or difflib.get_close_matches(key, known, n=1)
+    if near:
+        return f": did you mean {near[0]!r}?"
+    table = key.rpartition(".")[0]
+    return f": known here are {', '.join(k.rpartition('.')[2] for k in known if k.rpartition('.')[0] == table)}"
+
+
+def known_keys(kind: type[Params] = Manifest, prefix: str = "") -> Iterable[str]:
+    """All dotted keys of a manifest, tables included."""
+    for name, field in kind.model_fields.items():
+        yield prefix + name
+        for table in tables(field.annotation):
+            yield from known_keys(table, f"{prefix}{name}.")
+
+
+def tables(annotation: Any) -> Iterable[type[Params]]:
+    """The models that a field's annotation allows."""
+    if isinstance(annotation, type):
+        return [annotation] if issubclass(annotation, Params) else []
+    found = [table for part in getattr(annotation, "__args__", ()) for table in tables(part)]
+    return list(dict.fromkeys(found))

@@ -1,0 +1,167 @@
+"""What a manifest knows of time and movement: time stamps, true poses, odometry, attitude and vertical of each pair."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+
+from datasets.imu import at_frames, read_imu
+from datasets.manifest_model import Attitude, Imu, Manifest, PoseFile, Times
+from datasets.manifest_rig import direction
+from datasets.pairing import Pair
+from datasets.poses import coverage, interpolate, read_poses
+from datasets.protocol import Rows
+from datasets.times import seconds
+from stages.errors import InputError
+from stages.geometry import RigidTransform
+
+Poses = tuple[RigidTransform | None, ...]
+Ups = tuple[tuple[float, float, float] | None, ...]
+Seconds = tuple[float, ...]
+
+NEEDS_TIMES = "give [times] with file, names = true or rate_hz"
+
+
+@dataclass
+class Motion:
+    """One entry a pair, as in :class:`datasets.protocol.Sequence`; ``warnings`` collects what is suspicious."""
+
+    times: Seconds | None
+    truth: Poses | None = None
+    truth_source: str = ""
+    odometry: Poses | None = None
+    attitude: tuple[Rows | None, ...] | None = None
+    up: Ups | None = None
+    warnings: tuple[str, ...] = ()
+
+
+def read_motion(manifest: Manifest, root: Path, name: str, pairs: Sequence[Pair]) -> Motion:
+    """Everything that the manifest's tables ``times``, ``truth``, ``odometry``, ``attitude`` and ``imu`` state.
+
+    Raises
+    ------
+    InputError
+        A file cannot be used, does not belong to these pairs, or needs times where the pairs have none.
+    """
+    motion = Motion(None)
+    if manifest.times is not None:
+        motion.times, motion.warnings = pair_times(manifest.times, root, name, pairs)
+    if manifest.truth is not None:
+        motion.truth = _poses(manifest.truth, "truth", root, name, motion, len(pairs))
+        motion.truth_source = manifest.truth.source or f"poses of {manifest.truth.file}, as recorded"
+    if manifest.odometry is not None:
+        motion.odometry = _poses(manifest.odometry, "odometry", root, name, motion, len(pairs))
+    if manifest.attitude is not None and manifest.imu is not None:
+        raise InputError(f"{name}: [attitude] and [imu] both state the rotation", remedy="remove one of them")
+    if manifest.attitude is not None:
+        _attitude(manifest.attitude, root, name, motion, len(pairs))
+    if manifest.imu is not None:
+        _imu(manifest.imu, root, name, motion)
+    return motion
+
+
+# -- times -------------------------------------------------------------------------------------------------------------
+
+
+def pair_times(section: Times, root: Path, name: str, pairs: Sequence[Pair]) -> tuple[Seconds, tuple[str, ...]]:
+    """Time of each pair, s, and warning lines.
+
+    Raises
+    ------
+    InputError
+        The times do not parse, are not one a pair, do not increase, or mix units.
+    """
+    if section.rate_hz is not None:
+        return tuple(k / section.rate_hz for k in range(len(pairs))), ()
+    if section.names:
+        return seconds([_stamp(pair, name) for pair in pairs], "times of the image names", unit=section.unit)
+    assert section.file is not None
+    path = root / section.file
+    stamps, lines = _times_of_file(path, [pair.left.name for pair in pairs])
+    return seconds(stamps, str(path), unit=section.unit, lines=lines)
+
+
+def _stamp(pair: Pair, name: str) -> str:
+    """The time stamp in an image's name: its last number, with its decimals."""
+    found = re.findall(r"\d+(?:\.\d+)?", pair.left.stem)
+    if not found:
+        raise InputError(f"{name}: times.names: {pair.left} has no number in its name", remedy=NEEDS_TIMES)
+    return str(found[-1])
+
+
+def _times_of_file(path: Path, names: Sequence[str]) -> tuple[list[str], list[int]]:
+    """Time stamps as text, in the order of the pairs, and the lines that they stand in."""
+    try:
+        text = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"times {path} cannot be read: {error}", remedy="check the file") from error
+    rows = [(k, re.split(r"[,;\s]+", line.strip().strip(","))) for k, line in enumerate(text, start=1)]
+    rows = [(k, words) for k, words in rows if words[0] and words[0][0] in "0123456789.+-"]
+    by_name = {Path(words[1]).stem: (words[0], k) for k, words in rows if len(words) > 1}
+    stems = [Path(n).stem for n in names]
+    if by_name and all(stem in by_name for stem in stems):
+        return [by_name[stem][0] for stem in stems], [by_name[stem][1] for stem in stems]
+    if len(rows) != len(names):
+        absent = next((n for n, stem in zip(names, stems, strict=True) if stem not in by_name), "")
+        raise InputError(
+            f"{path} has {len(rows)} times for {len(names)} pairs" + (f", none of {absent}" if by_name else ""),
+            remedy="give one line a pair, or lines of time and file name",
+        )
+    return [words[0] for _, words in rows], [k for k, _ in rows]
+
+
+# -- poses -------------------------------------------------------------------------------------------------------------
+
+
+def _poses(
+    section: PoseFile | Attitude, table: str, root: Path, name: str, motion: Motion, count: int
+) -> tuple[RigidTransform | None, ...]:
+    """T_reference_left of each pair from a file of poses of a body; warnings go to ``motion``."""
+    path = root / section.file
+    timed = read_poses(path, section.format)
+    motion.warnings += timed.warnings
+    poses: Poses = timed.poses
+    if timed.times is None:
+        if len(timed.poses) != count:
+            raise InputError(
+                f"{name}: {table}.file: {path} has {len(timed.poses)} poses for {count} pairs",
+                remedy="give one a pair, or poses with times",
+            )
+    else:
+        if motion.times is None:
+            raise InputError(f"{name}: the poses of {path} have times, but the pairs have none", remedy=NEEDS_TIMES)
+        moved = replace(timed, times=tuple(t + section.time_offset for t in timed.times))
+        poses = interpolate(moved, motion.times, section.max_gap)
+        motion.warnings += coverage(poses, motion.times, f"{table} ({path.name})")
+    if section.T_body_left is None:
+        return poses
+    T_body_left = RigidTransform.from_matrix(section.T_body_left)
+    return tuple(None if pose is None else pose @ T_body_left for pose in poses)
+
+
+def _attitude(section: Attitude, root: Path, name: str, motion: Motion, count: int) -> None:
+    poses = _poses(section, "attitude", root, name, motion, count)
+    motion.attitude = tuple(None if pose is None else _rows(pose) for pose in poses)
+    if section.up is not None:
+        what = f"{name}: attitude.up"
+        motion.up = tuple(None if p is None else direction(section.up, p.inverse(), what) for p in poses)
+
+
+def _rows(pose: RigidTransform) -> Rows:
+    return cast(Rows, tuple(tuple(float(v) for v in row) for row in np.asarray(pose.rotation)))
+
+
+def _imu(section: Imu, root: Path, name: str, motion: Motion) -> None:
+    if motion.times is None:
+        raise InputError(f"{name}: [imu] needs times, but the pairs have none", remedy=NEEDS_TIMES)
+    imu = read_imu(root / section.file)
+    shifted = replace(imu, times=imu.times + section.time_offset)
+    inertial = at_frames(shifted, motion.times, RigidTransform.from_matrix(section.T_imu_left))
+    motion.attitude = inertial.attitude
+    motion.up = inertial.up if any(up is not None for up in inertial.up) else None
+    motion.warnings += (*imu.warnings, *inertial.warnings)

@@ -1,0 +1,229 @@
+"""The rig of a manifest: from calibration files, from figures in the manifest, or from both; and what looks wrong."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from datasets.cameras import CalibratedCamera, read_cameras, rig_of
+from datasets.manifest_model import Cameras, Manifest, PinholeLens, RigSection
+from stages.errors import InputError
+from stages.geometry import Camera, Rig, RigidTransform
+from stages.lens import Lens
+
+LONGEST_BASELINE = 20.0
+"""m; no vehicle carries a longer one, but 97 (mm) is a common slip."""
+
+USUAL_BASELINE = (0.02, 2.0)
+"""m; from an endoscope's to a large vehicle's: beyond it a line says so."""
+
+USUAL_VIEW_DEG = (5.0, 175.0)
+"""degrees; horizontal angle of view."""
+
+SAME = 0.01
+"""Relative difference of two stated baselines that is no contradiction."""
+
+
+@dataclass(frozen=True)
+class Optics:
+    """What a reconstruction needs of the cameras.
+
+    ``up`` is the stated direction of up in the left camera's frame; ``warnings`` are lines on what is unusual.
+    """
+
+    rig: Rig
+    lenses: dict[str, Lens] | None
+    up: tuple[float, float, float] | None
+    warnings: tuple[str, ...]
+
+
+def read_optics(manifest: Manifest, root: Path, name: str, size: tuple[int, int]) -> Optics:
+    """Rig and lenses of a manifest.
+
+    Parameters
+    ----------
+    root : folder that calibration files are relative to.
+    name : what to call the manifest in an error.
+    size : width and height of the images, pixels.
+
+    Raises
+    ------
+    InputError
+        The cameras or their relative pose are not stated, contradict the images, or cannot be.
+    """
+    left, right = _cameras(manifest.cameras, root, name, size)
+    left, right = (_scaled(camera, manifest.rig.unit) for camera in (left, right))
+    up = _up(manifest, left, name)
+    left, right, lines = _placed(left, right, manifest.rig, name)
+    try:
+        rig, lenses = rig_of(left, right, size)
+    except InputError as error:
+        raise InputError(f"{name}: {error.message}", remedy=error.remedy) from error
+    lines += _check_baseline(rig.baseline, manifest.rig, name)
+    lines += [line for c, side in ((left, "left"), (right, "right")) for line in _unusual(c.lens.camera, side, size)]
+    return Optics(rig, lenses, up, tuple(lines))
+
+
+def _cameras(section: Cameras, root: Path, name: str, size: tuple[int, int]) -> tuple[CalibratedCamera, ...]:
+    if section.left is not None and section.right is not None:
+        stated = {"left": section.left, "right": section.right}
+        return tuple(_one(value, side, root, name, size) for side, value in stated.items())
+    if section.file is not None:
+        return _of_file(section, root / section.file, name)
+    if section.stated:
+        return tuple(_one(section, side, root, name, size) for side in ("left", "right"))
+    raise InputError(
+        f"{name}: the cameras are not known",
+        remedy="give cameras.file, cameras.left and cameras.right, or cameras.fx, cx and cy (px)",
+    )
+
+
+def _one(value: str | PinholeLens, side: str, root: Path, name: str, size: tuple[int, int]) -> CalibratedCamera:
+    """The camera of one side: of a file with one camera, or of figures."""
+    if isinstance(value, str):
+        found = read_cameras(root / value)
+        if len(found) != 1:
+            raise InputError(
+                f"{name}: cameras.{side}: {root / value} has {len(found)} cameras",
+                remedy="give it as cameras.file, and name the two by cameras.names",
+            )
+        return found[0]
+    assert value.fx is not None
+    assert value.cx is not None
+    assert value.cy is not None
+    camera = Camera(value.fx, value.fy or value.fx, value.cx, value.cy, value.width or size[0], value.height or size[1])
+    model = value.model or ("radtan" if value.distortion else "none")
+    try:
+        return CalibratedCamera(side, Lens(camera, model, value.distortion), None)
+    except InputError as error:
+        raise InputError(f"{name}: cameras: {error.message}", remedy=error.remedy) from error
+
+
+def _of_file(section: Cameras, path: Path, name: str) -> tuple[CalibratedCamera, ...]:
+    """Left and right camera of one file; a single camera is taken for both."""
+    found = read_cameras(path)
+    if section.names is not None:
+        by_name = {camera.name: camera for camera in found}
+        missing = [wanted for wanted in section.names if wanted not in by_name]
+        if missing:
+            raise InputError(
+                f"{name}: cameras.names: {path} has no camera {missing[0]!r}", remedy=f"it has {', '.join(by_name)}"
+            )
+        return tuple(by_name[wanted] for wanted in section.names)
+    if len(found) > 2:
+        raise InputError(
+            f"{name}: {path} has {len(found)} cameras: {', '.join(camera.name for camera in found)}",
+            remedy="say which two by cameras.names = [left, right]",
+        )
+    if len(found) == 1:
+        return found[0], replace(found[0], name="right", T_camera_reference=None)
+    return found[0], found[1]
+
+
+def _scaled(camera: CalibratedCamera, unit: float) -> CalibratedCamera:
+    """With lengths in metres."""
+    pose = camera.T_camera_reference
+    if pose is None or unit == 1.0:
+        return camera
+    return replace(camera, T_camera_reference=RigidTransform(pose.rotation, pose.translation * unit))
+
+
+def _up(manifest: Manifest, left: CalibratedCamera, name: str) -> tuple[float, float, float] | None:
+    stated = manifest.world.up
+    if stated is None:
+        return None
+    if manifest.world.pitch_deg is not None:
+        raise InputError(f"{name}: world.up and world.pitch_deg both state the vertical", remedy="remove one of them")
+    return direction(stated, left.T_camera_reference, f"{name}: world.up")
+
+
+def direction(
+    stated: tuple[float, float, float], T_camera_reference: RigidTransform | None, what: str
+) -> tuple[float, float, float]:
+    """A unit direction of the reference frame in the camera's frame."""
+    length = math.hypot(*stated)
+    if not length > 0:
+        raise InputError(f"{what} = {list(stated)} has no direction", remedy="e.g. [0, 0, 1] where z is up")
+    turned = np.array(stated) / length
+    if T_camera_reference is not None:
+        turned = T_camera_reference.rotation @ turned
+    x, y, z = (float(v) for v in turned)
+    return x, y, z
+
+
+def _placed(
+    left: CalibratedCamera, right: CalibratedCamera, section: RigSection, name: str
+) -> tuple[CalibratedCamera, CalibratedCamera, list[str]]:
+    """Both cameras with poses in the left camera's frame: what the manifest says goes before what a file says."""
+    of_files = None
+    if left.T_camera_reference is not None and right.T_camera_reference is not None:
+        of_files = right.T_camera_reference @ left.T_camera_reference.inverse()
+    stated = _stated(section, name)
+    if stated is None and of_files is None:
+        raise InputError(
+            f"{name}: the rig is not known: nothing says where the right camera stands",
+            remedy="give rig.baseline (m; parallel cameras) or rig.T_right_left, or calibration files that have it",
+        )
+    chosen = stated if stated is not None else of_files
+    lines = []
+    if stated is not None and of_files is not None:
+        ours, theirs = (float(np.linalg.norm(T.translation)) for T in (stated, of_files))
+        if theirs > 0 and abs(ours - theirs) > SAME * theirs:
+            lines.append(f"baseline {ours:g} m of the manifest is used; the calibration file says {theirs:g} m")
+    placed = replace(left, T_camera_reference=RigidTransform.identity())
+    return placed, replace(right, T_camera_reference=chosen), lines
+
+
+def _stated(section: RigSection, name: str) -> RigidTransform | None:
+    if section.T_right_left is not None and section.baseline is not None:
+        raise InputError(
+            f"{name}: rig.baseline and rig.T_right_left both state the baseline", remedy="remove one of them"
+        )
+    if section.T_right_left is not None:
+        return RigidTransform.from_matrix(section.T_right_left)
+    if section.baseline is None:
+        return None
+    if section.baseline <= 0:
+        raise InputError(
+            f"{name}: rig.baseline = {section.baseline:g} m is not positive",
+            remedy="give the distance of the cameras; where the left one stands to the right, "
+            "they are swapped: exchange images.left and images.right",
+        )
+    return RigidTransform(np.eye(3), np.array([-section.baseline, 0.0, 0.0]))
+
+
+def _check_baseline(baseline: float, section: RigSection, name: str) -> list[str]:
+    """Refuse what cannot be metres; say what is unusual."""
+    from_files = section.baseline is None and section.T_right_left is None
+    if baseline > LONGEST_BASELINE:
+        unit = section.unit / 1000
+        hint = f"set rig.unit = {unit:g}, if the calibration is in millimetres" if from_files else "lengths are metres"
+        raise InputError(
+            f"{name}: the baseline is {baseline:g} m, which looks like millimetres",
+            remedy=f"did you mean {baseline / 1000:g}? {hint}",
+        )
+    low, high = USUAL_BASELINE
+    if not low <= baseline <= high:
+        return [f"baseline {baseline:g} m is unusual ({low:g} to {high:g} m is common): lengths are in metres"]
+    return []
+
+
+def _unusual(camera: Camera, side: str, size: tuple[int, int]) -> list[str]:
+    """Lines on a camera that is possible but strange."""
+    lines = []
+    view = math.degrees(2 * math.atan(size[0] / 2 / camera.fx))
+    if not USUAL_VIEW_DEG[0] <= view <= USUAL_VIEW_DEG[1]:
+        lines.append(
+            f"{side} camera: fx = {camera.fx:g} px gives an angle of view of {view:.3g} degrees; is it in pixels?"
+        )
+    if abs(camera.cx - size[0] / 2) > size[0] / 4 or abs(camera.cy - size[1] / 2) > size[1] / 4:
+        lines.append(
+            f"{side} camera: principal point ({camera.cx:g}, {camera.cy:g}) px is far from the centre of "
+            f"{size[0]} x {size[1]} images"
+        )
+    if not 0.8 < camera.fx / camera.fy < 1.25:
+        lines.append(f"{side} camera: fx = {camera.fx:g} and fy = {camera.fy:g} px differ much: no square pixels")
+    return lines

@@ -1,0 +1,147 @@
+"""Any sequence as if its right camera had been knocked: for trying out what a wrong calibration does.
+
+The right images are warped as the turned camera would have taken them, while the rig that is *given* stays. So the
+turn is what stage ``rig`` should find (its corrections pitch, yaw, roll have these signs), and truth stays true.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+from scipy import ndimage
+
+from datasets.protocol import Sequence, Source
+from stages.declare import AnyArray, Array, Bundle, Inputs, Params, Stage
+from stages.geometry import rotation_exp
+from stages.lens import Lens
+
+Floats = NDArray[np.float64]
+
+KERNEL = 4
+"""Pixels along either side that cubic interpolation reads."""
+
+
+class MisalignParams(Params):
+    """How the right camera is knocked; all 0: not at all."""
+
+    rows: float = Field(
+        0.0, ge=-200, le=200, description="pixels that the right image is shifted down (a sensor shift)"
+    )
+    roll_deg: float = Field(0.0, ge=-45, le=45, description="degrees that the right image is turned clockwise")
+    pitch_deg: float = Field(
+        0.0, ge=-20, le=20, description="degrees about the right camera's x axis: contents move up"
+    )
+    yaw_deg: float = Field(
+        0.0, ge=-20, le=20, description="degrees about the right camera's y axis: contents move right"
+    )
+
+    @property
+    def none(self) -> bool:
+        """Whether nothing is changed."""
+        return not any((self.rows, self.roll_deg, self.pitch_deg, self.yaw_deg))
+
+    def words(self) -> str:
+        """What is done to the right images."""
+        return (
+            f"right images are misaligned on purpose: {self.rows:g} px in the row, {self.roll_deg:g} degrees of roll, "
+            f"{self.pitch_deg:g} of pitch, {self.yaw_deg:g} of yaw; the given rig does not say so"
+        )
+
+
+def misalign(sequence: Sequence, params: MisalignParams) -> Sequence:
+    """The sequence with its right images warped; the same object where nothing is to be changed.
+
+    It has no exact disparity any more.
+    """
+    if params.none:
+        return sequence
+    lens = (sequence.lenses or {}).get("right", Lens(sequence.rig.right))
+
+    def image(frame: int, camera: str) -> Source:
+        source = sequence.image(frame, camera)
+        if camera != "right":
+            return source
+        args = {"frame": frame, "camera": camera, "lens": lens.to_dict()}
+        return Source(_module(source), params, args, inputs={"image": source})
+
+    return replace(
+        sequence,
+        image=image,
+        truth_disparity=None,
+        notes=(*sequence.notes, params.words()),
+        parameters={**sequence.parameters, "misalign": params},
+    )
+
+
+def _module(source: Source) -> str:
+    """A stage declares one type for an array, so there is one for each depth of images."""
+    outputs: tuple[Array, ...] = importlib.import_module(source.module).STAGE.outputs
+    deep = next(a.dtype for a in outputs if a.name == "image") == "uint16"
+    return "datasets.misalign16" if deep else "datasets.misalign"
+
+
+def origins(lens: Lens, params: MisalignParams) -> tuple[Floats, Floats]:
+    """Column and row (height, width) of the original image that each pixel of the knocked one shows; NaN: none."""
+    camera = lens.camera
+    columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height) - params.rows)
+    pixels = np.stack([columns, rows], axis=-1).reshape(-1, 2).astype(np.float64)
+    turn = rotation_exp(np.deg2rad([params.pitch_deg, params.yaw_deg, params.roll_deg]))
+    if not np.array_equal(turn, np.eye(3)):
+        # Row vectors times R: the inverse turn.
+        rays = camera.rays(lens.undistort(pixels, camera)) @ turn
+        pixels = lens.distort(camera.project(rays), camera)
+    shape = (camera.height, camera.width)
+    return pixels[:, 0].reshape(shape), pixels[:, 1].reshape(shape)
+
+
+def warp(image: AnyArray, valid: AnyArray, lens: Lens, params: MisalignParams) -> tuple[AnyArray, AnyArray]:
+    """Knocked image and its mask, (row, col), of the types of the original ones.
+
+    Cubic splines (SciPy's, not OpenCV's remap, which rounds positions to a 32nd of a pixel). A pixel is valid where
+    all that the kernel reads is.
+    """
+    column, row = origins(lens, params)
+    there = np.isfinite(column) & np.isfinite(row)
+    at = np.stack([np.where(there, row, -1e6), np.where(there, column, -1e6)])
+    values = ndimage.map_coordinates(image.astype(np.float64), at, order=3, mode="nearest")
+    top = np.iinfo(image.dtype).max if np.issubdtype(image.dtype, np.integer) else np.inf
+    values = np.clip(np.rint(values) if np.isfinite(top) else values, 0, top)
+    kernel = np.ones((KERNEL, KERNEL), np.uint8)
+    whole = cv2.erode(
+        (valid != 0).astype(np.uint8), kernel, anchor=(1, 1), borderType=cv2.BORDER_CONSTANT, borderValue=0
+    )
+    # The kernel begins one pixel before the position, and reads less of it where that is a whole pixel.
+    near = np.floor(at).astype(np.int64)
+    inside = (near >= 0).all(0) & (near[0] < image.shape[0]) & (near[1] < image.shape[1])
+    mask = np.zeros(image.shape, np.uint8)
+    mask[inside] = whole[near[0][inside], near[1][inside]]
+    return np.where(mask != 0, values, 0).astype(image.dtype), mask
+
+
+def _run(params: MisalignParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+    source = inputs["image"]
+    lens = Lens.from_dict(args["lens"])
+    image, valid = warp(np.asarray(source["image"]), np.asarray(source["valid"]), lens, params)
+    return Bundle({"image": image, "valid": valid}, {"frame": args["frame"], "camera": args["camera"]})
+
+
+STAGE = Stage(
+    name="misalign",
+    version=1,
+    summary="right image as a knocked camera would have taken it",
+    params=MisalignParams,
+    inputs=("image",),
+    outputs=(
+        Array("image", ("row", "col"), "uint8", "grey", "image"),
+        Array("valid", ("row", "col"), "uint8", "1", "1 = usable"),
+    ),
+    requires=("numpy", "scipy", "opencv-python-headless"),
+    run=_run,
+)

@@ -1,0 +1,174 @@
+"""Which left image belongs to which right one: by name, by number or by order; and the tokens that tell sides apart."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from datasets import files
+from stages.errors import InputError
+
+SUFFIXES = (*files.SUFFIXES, ".ppm", ".bmp")
+"""Kinds of image that are looked for where no pattern is given."""
+
+SIDES: tuple[tuple[str, str], ...] = (
+    ("left", "right"),
+    ("cam0", "cam1"),
+    ("camera0", "camera1"),
+    ("camera_0", "camera_1"),
+    ("image_0", "image_1"),
+    ("image_2", "image_3"),
+    ("image_00", "image_01"),
+    ("image_02", "image_03"),
+    ("im0", "im1"),
+    ("view0", "view1"),
+    ("l", "r"),
+)
+"""Tokens that name the left and the right camera in file and folder names, the surest first."""
+
+
+@dataclass(frozen=True)
+class Pair:
+    """One stereo pair: its name and both files."""
+
+    name: str
+    left: Path
+    right: Path
+
+
+def natural(text: str) -> tuple[tuple[int, int | str], ...]:
+    """Sorting key in which numbers count as numbers: ``a2`` before ``a10``."""
+    return tuple((0, int(part)) if part.isdigit() else (1, part) for part in re.split(r"(\d+)", text) if part)
+
+
+def _token(word: str) -> re.Pattern[str]:
+    """A side's token; a single letter must stand alone, ``left`` must not be part of a longer word."""
+    digits = r"(?!\d)" if word[-1].isdigit() else ""
+    return re.compile(rf"(?<![a-z]){re.escape(word)}(?![a-z]){digits}", re.IGNORECASE)
+
+
+TOKENS = tuple(tuple(_token(word) for word in sides) for sides in SIDES)
+
+
+def side_of(name: str) -> tuple[int, int, str] | None:
+    """Which token a name has: (row of ``SIDES``, 0 left or 1 right, name with the token taken out), or None."""
+    for row, patterns in enumerate(TOKENS):
+        for side, pattern in enumerate(patterns):
+            neutral, count = pattern.subn("*", name)
+            if count:
+                return row, side, neutral
+    return None
+
+
+def without_side(stem: str, side: int) -> str:
+    """A file's stem without its side's token: ``cam_left_07`` and ``cam_right_07`` are both ``cam_*_07``."""
+    found = side_of(stem)
+    return found[2] if found is not None and found[1] == side else stem
+
+
+def _number(stem: str) -> int | None:
+    digits = re.findall(r"\d+", stem)
+    return int(digits[-1]) if digits else None
+
+
+def pair_up(left: Sequence[Path], right: Sequence[Path], rule: str = "auto") -> tuple[Pair, ...]:
+    """Pairs in the natural order of the left names.
+
+    Parameters
+    ----------
+    left, right : image files of each camera.
+    rule : ``name`` (equal stems, sides' tokens aside), ``number`` (the last number in the stem), ``order`` (sorted
+        names), or ``auto``: name, and number where the names of the two cameras have nothing in common.
+
+    Raises
+    ------
+    InputError
+        An image has no partner, two images make the same pair, or the counts differ.
+    """
+    left, right = (sorted(paths, key=lambda p: natural(p.name)) for paths in (left, right))
+    if rule == "order" or (rule == "auto" and len(left) == len(right) == 1):
+        if len(left) != len(right):
+            raise InputError(
+                f"{len(left)} left images and {len(right)} right ones cannot be paired by order",
+                remedy="remove what is too many, or pair by name or number",
+            )
+        return _named(list(zip(left, right, strict=True)))
+    keys = {"name": _names, "number": _numbers}
+    if rule == "auto":
+        rule = "name" if set(_names(left, 0)) & set(_names(right, 1)) else "number"
+    by_key = [dict(zip(keys[rule](paths, side), paths, strict=True)) for side, paths in enumerate((left, right))]
+    for side, paths in enumerate((left, right)):
+        _unique(keys[rule](paths, side), paths, rule)
+    _all_partnered(by_key, rule, (len(left), len(right)))
+    return _named([(path, by_key[1][key]) for key, path in by_key[0].items()])
+
+
+def _names(paths: Iterable[Path], side: int) -> list[str]:
+    return [without_side(path.stem, side) for path in paths]
+
+
+def _numbers(paths: Iterable[Path], side: int) -> list[str]:
+    found = []
+    for path in paths:
+        number = _number(path.stem)
+        if number is None:
+            raise InputError(
+                f"{path} has no number in its name and no partner of its name",
+                remedy='say how images are paired: images.pair = "order", or narrow the patterns',
+            )
+        found.append(str(number))
+    return found
+
+
+def _unique(keys: list[str], paths: Sequence[Path], rule: str) -> None:
+    key, count = Counter(keys).most_common(1)[0]
+    if count > 1:
+        first, second = [p for k, p in zip(keys, paths, strict=True) if k == key][:2]
+        raise InputError(
+            f"{first} and {second.name} are the same frame by {rule}",
+            remedy="narrow the patterns, or choose another images.pair",
+        )
+
+
+def _all_partnered(by_key: list[dict[str, Path]], rule: str, counts: tuple[int, int]) -> None:
+    for ours, others, side in ((by_key[0], by_key[1], "right"), (by_key[1], by_key[0], "left")):
+        alone = [path for key, path in ours.items() if key not in others]
+        if alone:
+            more = f" (and {len(alone) - 1} more)" if len(alone) > 1 else ""
+            raise InputError(
+                f"{alone[0]} has no partner by {rule} among the {side} images{more}; "
+                f"{counts[0]} left, {counts[1]} right",
+                remedy="add the missing image, narrow the patterns, or choose another images.pair",
+            )
+
+
+def _named(pairs: list[tuple[Path, Path]]) -> tuple[Pair, ...]:
+    """Name each pair by what its files share; by the left file where that would not be unique."""
+    names = [without_side(path.stem, 0).replace("*", "").strip("_-. ") for path, _ in pairs]
+    if len(set(names)) < len(names) or not all(names):
+        names = [path.stem for path, _ in pairs]
+    if len(set(names)) < len(names):
+        names = [str(k) for k in range(len(pairs))]
+    return tuple(Pair(name, *pair) for name, pair in zip(names, pairs, strict=True))
+
+
+def common_size(pairs: Sequence[Pair]) -> tuple[int, int, int]:
+    """Width, height and bits that all images share; those of PNG files are compared here, others when read.
+
+    Raises
+    ------
+    InputError
+        The first image cannot be read, or another one has a different size or depth.
+    """
+    wanted = files.png_header(pairs[0].left)
+    if wanted is None:
+        image = files.read_grey(pairs[0].left)
+        wanted = (image.shape[1], image.shape[0], image.dtype.itemsize * 8)
+    for path in [path for pair in pairs for path in (pair.left, pair.right)]:
+        found = files.png_header(path)
+        if found is not None:
+            files.check_size(found, wanted, str(path))
+    return wanted

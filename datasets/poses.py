@@ -1,0 +1,245 @@
+"""Trajectories and attitudes of other programs and sensors, and their poses at other times.
+
+Forms of a file, one pose T_reference_body a row:
+
+* ``kitti``: 3 x 4 (or 4 x 4) numbers, row-major, without times;
+* ``tum``: time, x y z, quaternion x y z w;
+* ``euroc``: time, x y z, quaternion w x y z, and whatever follows;
+* ``csv``: columns by name in any order: a time (``t``, ``time``, ``timestamp``), quaternion ``qw qx qy qz`` or angles
+  ``roll pitch yaw`` with their unit (``roll_deg``, ``yaw [rad]``), and perhaps a position ``x y z`` (``px``, ``tx``).
+
+Angles are those of vehicles: R_reference_body = Rz(yaw) Ry(pitch) Rx(roll). Rows without position stand at 0.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation, Slerp
+
+from datasets.tables import Table, read_table
+from datasets.times import seconds
+from stages.errors import InputError
+from stages.geometry import RigidTransform, orthonormal
+
+Floats = NDArray[np.float64]
+
+FORMATS = ("auto", "kitti", "tum", "euroc", "csv")
+QUATERNION, POSITION, ANGLES = ("qw", "qx", "qy", "qz"), ("x", "y", "z"), ("roll", "pitch", "yaw")
+ORDERED: Mapping[str, tuple[str, ...]] = {
+    "tum": ("time", *POSITION, "qx", "qy", "qz", "qw"),
+    "euroc": ("time", *POSITION, *QUATERNION),
+}
+
+NORM = 0.01
+"""Of a quaternion, off 1: text keeps three digits at least; more is another column."""
+
+WITHIN = 1e-6
+"""s; times that agree to this are the same."""
+
+WORDS = (
+    (re.compile(r"(t|time|timestamp|stamp|secs?|seconds|nanoseconds)"), lambda m: "time"),
+    (re.compile(r"(?:q|quat|quaternion|orientation|rot|q_rs)[_. ]?([wxyz])"), lambda m: "q" + m[1]),
+    (re.compile(r"(?:p|t|pos|position|trans|translation|p_rs_r|p_rs)?[_. ]?([xyz])"), lambda m: m[1]),
+    (re.compile(r"(roll|pitch|yaw)"), lambda m: m[1]),
+)
+
+
+@dataclass(frozen=True)
+class TimedPoses:
+    """Poses of a file.
+
+    Attributes
+    ----------
+    times : seconds, increasing; None where the file has none, and rows are frames.
+    poses : T_reference_body, metres, one a row.
+    name : the file, for messages.
+    warnings : what is suspicious, one line each.
+    """
+
+    times: tuple[float, ...] | None
+    poses: tuple[RigidTransform, ...]
+    name: str = "poses"
+    warnings: tuple[str, ...] = ()
+
+
+def read_poses(path: Path, format: str = "auto", *, unit: str = "auto") -> TimedPoses:
+    """Poses of a file (forms: see module).
+
+    Parameters
+    ----------
+    format : one of the forms; ``auto`` takes the columns' names where there are any, else 12 or 16 numbers a row for
+        ``kitti``, commas for ``euroc`` and blanks for ``tum``.
+    unit : of the times, see :func:`datasets.times.seconds`.
+
+    Raises
+    ------
+    InputError
+        The form is not recognised, or a row is not a time and a pose; the message names the line.
+    """
+    if format not in FORMATS:
+        raise InputError(f"format {format!r} of poses is unknown", remedy=f"one of {', '.join(FORMATS)}")
+    table = read_table(path, "pose file")
+    if format == "kitti" or (format == "auto" and table.columns in (12, 16) and not _named(table)):
+        return TimedPoses(None, _matrices(table), table.name)
+    columns = _columns(table, format)
+    angles = None if "qw" in columns else _angle_unit(table, columns)
+    at = None
+    warnings: tuple[str, ...] = ()
+    if "time" in columns:
+        at, warnings = seconds(table.text(columns["time"]), table.name, unit=unit, lines=table.lines)
+    if angles is None:
+        rotations = _quaternions(table, columns)
+    else:
+        values = table.numbers([columns[a] for a in ANGLES])
+        rotations = Rotation.from_euler("ZYX", values[:, ::-1], degrees=angles == "deg").as_matrix()
+    with_position = all(axis in columns for axis in POSITION)
+    positions = table.numbers([columns[a] for a in POSITION]) if with_position else np.zeros((len(table.rows), 3))
+    poses = tuple(RigidTransform(R, t) for R, t in zip(rotations, positions, strict=True))
+    return TimedPoses(at, poses, table.name, warnings)
+
+
+def _named(table: Table) -> dict[str, int]:
+    """Columns by what their names mean; a unit in brackets or at the end is no part of a name."""
+    found: dict[str, int] = {}
+    for k, name in enumerate(table.header):
+        bare = re.sub(r"[\[(].*?[\])]|[_ ](deg|rad|m|s|ns|us|ms)$", "", name).strip()
+        for pattern, meaning in WORDS:
+            match = pattern.fullmatch(bare)
+            if match:
+                found.setdefault(meaning(match), k)
+                break
+    return found if _complete(found) else {}
+
+
+def _complete(columns: Mapping[str, int]) -> bool:
+    return all(q in columns for q in QUATERNION) or all(a in columns for a in ANGLES)
+
+
+def _columns(table: Table, format: str) -> dict[str, int]:
+    named = _named(table)
+    if format == "csv" and not named:
+        raise InputError(
+            f"{table.name} does not name its columns",
+            remedy="begin with a line such as time,qw,qx,qy,qz or time,roll_deg,pitch_deg,yaw_deg",
+        )
+    if format == "csv" or (format == "auto" and named):
+        return named
+    chosen = format if format != "auto" else "euroc" if table.commas else "tum"
+    order = ORDERED[chosen]
+    if table.columns < len(order) or (chosen == "tum" and table.columns > len(order)):
+        raise InputError(
+            f"{table.name}, line {table.lines[0]}: {table.columns} numbers are no pose of format {chosen}",
+            remedy="3 x 4 numbers (kitti), time and 7 numbers (tum, euroc), or columns with names (csv)",
+        )
+    return {name: k for k, name in enumerate(order)}
+
+
+def _angle_unit(table: Table, columns: Mapping[str, int]) -> str:
+    """``deg`` or ``rad``: as the names say, or degrees where the figures can be nothing else."""
+    said = {unit for a in ANGLES for unit in ("deg", "rad") if unit in table.header[columns[a]]}
+    if len(said) == 1:
+        return said.pop()
+    values = np.abs(table.numbers([columns[a] for a in ANGLES]))
+    if not said and values.max() > 2 * np.pi:
+        return "deg"
+    raise InputError(
+        f"{table.name}: roll, pitch and yaw have {'two units' if said else 'no unit'}",
+        remedy="name the columns roll_deg, pitch_deg, yaw_deg or roll_rad, pitch_rad, yaw_rad",
+    )
+
+
+def _quaternions(table: Table, columns: Mapping[str, int]) -> Floats:
+    """Rotation matrices (n, 3, 3) of unit quaternions."""
+    q = table.numbers([columns[name] for name in ("qx", "qy", "qz", "qw")])
+    norms = np.linalg.norm(q, axis=1)
+    bad = np.flatnonzero(np.abs(norms - 1) > NORM)
+    if bad.size:
+        k = int(bad[0])
+        raise InputError(
+            f"{table.name}, line {table.lines[k]}: a quaternion of length {norms[k]:.4g}",
+            remedy="give unit quaternions, and the format whose order of columns the file has",
+        )
+    return np.asarray(Rotation.from_quat(q).as_matrix(), dtype=np.float64)
+
+
+def _matrices(table: Table) -> tuple[RigidTransform, ...]:
+    """Poses of rows of [R | t]; written with few digits, so that their rotations are made orthonormal."""
+    if table.columns not in (12, 16):
+        raise InputError(
+            f"{table.name}, line {table.lines[0]}: {table.columns} numbers are no 3 x 4 pose",
+            remedy="give 12 numbers a line, or state the format",
+        )
+    values = table.numbers(range(table.columns)).reshape(len(table.rows), -1, 4)[:, :3]
+    out = []
+    for m, line in zip(values, table.lines, strict=True):
+        try:
+            RigidTransform(m[:, :3], m[:, 3])
+        except InputError as error:
+            raise InputError(f"{table.name}, line {line}: {error.message}", remedy=error.remedy) from error
+        out.append(RigidTransform(orthonormal(m[:, :3]), m[:, 3]))
+    return tuple(out)
+
+
+def interpolate(timed: TimedPoses, at: Sequence[float], max_gap: float) -> tuple[RigidTransform | None, ...]:
+    """Poses at other times: positions on the straight line, rotations on the shortest arc between two rows.
+
+    Parameters
+    ----------
+    at : seconds, of the same clock.
+    max_gap : seconds; between rows farther apart nothing is interpolated.
+
+    Returns
+    -------
+    tuple
+        One entry a time; None in longer gaps and beyond the first and last row (:func:`coverage` says how many).
+
+    Raises
+    ------
+    InputError
+        The poses have no times, or none of ``at`` lies between the first and the last.
+    """
+    if timed.times is None:
+        raise InputError(f"{timed.name} has no times", remedy="give one pose a frame, or a file with times")
+    t, wanted = np.array(timed.times), np.asarray(at, dtype=np.float64)
+    inside = (wanted >= t[0] - WITHIN) & (wanted <= t[-1] + WITHIN)
+    if not inside.any():
+        raise InputError(
+            f"{timed.name} reaches from {t[0]:.3f} to {t[-1]:.3f} s, the frames from {wanted[0]:.3f} to "
+            f"{wanted[-1]:.3f} s: no common time",
+            remedy="check that both have the same clock and unit; a constant offset can be stated",
+        )
+    before = np.clip(np.searchsorted(t, wanted, side="right") - 1, 0, max(len(t) - 2, 0))
+    after = np.minimum(before + 1, len(t) - 1)
+    distance = np.minimum(np.abs(wanted - t[before]), np.abs(wanted - t[after]))
+    known = inside & ((t[after] - t[before] <= max_gap) | (distance <= WITHIN))
+    moment = np.clip(wanted, t[0], t[-1])
+    positions = np.array([p.translation for p in timed.poses])
+    rotations = Rotation.from_matrix([p.rotation for p in timed.poses])
+    turned = Slerp(t, rotations)(moment).as_matrix() if len(t) > 1 else [timed.poses[0].rotation] * len(wanted)
+    moved = np.stack([np.interp(moment, t, axis) for axis in positions.T], axis=1)
+    return tuple(RigidTransform(turned[k], moved[k]) if known[k] else None for k in range(len(wanted)))
+
+
+def coverage(found: Sequence[object | None], at: Sequence[float], what: str) -> tuple[str, ...]:
+    """A warning line on the frames without an entry: how many, and when; nothing where all have one.
+
+    Parameters
+    ----------
+    at : seconds, one a frame.
+    what : what is missing, e.g. ``truth``.
+    """
+    without = [k for k, entry in enumerate(found) if entry is None]
+    if not without:
+        return ()
+    runs = 1 + sum(b - a > 1 for a, b in pairwise(without))
+    start = at[0]
+    spans = f"first at {at[without[0]] - start:.2f} s, last at {at[without[-1]] - start:.2f} s of the sequence"
+    stretches = "1 stretch" if runs == 1 else f"{runs} stretches"
+    return (f"no {what} for {len(without)} of {len(found)} frames, in {stretches}: {spans}",)

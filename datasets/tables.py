@@ -1,0 +1,118 @@
+"""Tables of numbers in text files, as sensors and other programs write them: cells as text, lines remembered.
+
+Columns are parted by commas, semicolons or blanks. The last line of words before the first row names the columns,
+with or without a leading ``#``; later comments are passed over.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.errors import InputError
+
+NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$|[-+]?(nan|inf)$", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of equal length; ``header`` is empty where the file has no names, ``lines`` are the rows' line numbers."""
+
+    name: str
+    header: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    lines: tuple[int, ...]
+    commas: bool
+
+    @property
+    def columns(self) -> int:
+        """How many columns each row has."""
+        return len(self.rows[0])
+
+    def text(self, column: int) -> list[str]:
+        """One column as it is written: exact, where a float would lose the last digits of a time stamp."""
+        return [row[column] for row in self.rows]
+
+    def numbers(self, columns: Sequence[int]) -> NDArray[np.float64]:
+        """Columns as finite numbers, (rows, columns).
+
+        Raises
+        ------
+        InputError
+            A cell is not a finite number; the message names the line.
+        """
+        out = np.empty((len(self.rows), len(columns)))
+        for k, row in enumerate(self.rows):
+            for j, column in enumerate(columns):
+                out[k, j] = number(row[column], self.name, self.lines[k])
+        return out
+
+
+def number(cell: str, name: str, line: int) -> float:
+    """A finite number of a cell."""
+    try:
+        value = float(cell)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise InputError(f"{name}, line {line}: {cell!r} is not a finite number", remedy="correct or remove that line")
+    return value
+
+
+def read_table(path: Path, what: str) -> Table:
+    """Table in a text file.
+
+    Parameters
+    ----------
+    what : what the file should hold, for errors.
+
+    Raises
+    ------
+    InputError
+        It cannot be read, has no rows, or rows differ in length.
+    """
+    lines = _lines(path, what)
+    names, separator = "", None
+    rows: list[tuple[str, ...]] = []
+    at: list[int] = []
+    for k, line in enumerate(lines, start=1):
+        text = line.strip()
+        if not text or (rows and text.startswith("#")):
+            continue
+        if not rows:
+            separator = next((s for s in (",", ";") if s in text), None)
+        row = split(text, separator)
+        if not rows and not NUMBER.match(row[0]):
+            names = text.lstrip("#").strip()
+            continue
+        if rows and len(row) != len(rows[0]):
+            raise InputError(
+                f"{path}, line {k}: {len(row)} columns where the first row has {len(rows[0])}",
+                remedy="correct or remove that line",
+            )
+        rows.append(row)
+        at.append(k)
+    if not rows:
+        raise InputError(f"{what} {path} has no rows of numbers", remedy="check that it is the right file")
+    header = split(names, separator) if names else ()
+    header = header if len(header) == len(rows[0]) else ()
+    return Table(str(path), tuple(name.lower() for name in header), tuple(rows), tuple(at), separator is not None)
+
+
+def _lines(path: Path, what: str) -> list[str]:
+    try:
+        return path.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{what} {path} cannot be read: {error}", remedy="check the file") from error
+
+
+def split(text: str, separator: str | None) -> tuple[str, ...]:
+    """Cells of a line; a separator at its end makes no cell."""
+    cells = [cell.strip() for cell in text.split(separator)]
+    return tuple(cells[:-1] if separator and len(cells) > 1 and not cells[-1] else cells)

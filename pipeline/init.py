@@ -1,0 +1,73 @@
+"""``rille init``: a commented manifest of what a folder of stereo images holds, and the commands that come next."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from datasets.inspection import Findings, inspect
+from datasets.manifest_text import counted, manifest_text, needs, short_name
+from datasets.registry import opens_as_it_is
+from stages.errors import ConfigError, InputError
+
+COMPLETE = 0
+
+
+def init(directory: Path, output: Path | None = None, force: bool = False) -> int:
+    """Write a manifest for a folder and say what it still needs; a folder that opens as it is gets none unasked.
+
+    Parameters
+    ----------
+    directory : folder that holds the images, in it or below.
+    output : file to write; ``NAME.rille.toml`` in the present folder by default (data are often read-only).
+    force : whether an existing file may be overwritten.
+
+    Raises
+    ------
+    ConfigError
+        The file exists and ``force`` is not given.
+    InputError
+        The folder holds no stereo images, or the file cannot be written.
+    """
+    if output is None and not force and directory.is_dir() and opens_as_it_is(directory):
+        print(f"{directory} opens as it is; --output or --force writes a manifest nevertheless")
+        print(f"\nnext:\n  rille check {directory}\n  rille reconstruct {directory}")
+        return COMPLETE
+    found = inspect(directory)
+    path = output if output is not None else Path(f"{short_name(directory)}.rille.toml")
+    if path.suffix != ".toml":
+        raise ConfigError(f"--output {path} is no .toml file", remedy=f"e.g. {short_name(directory)}.rille.toml")
+    if path.exists() and not force:
+        raise ConfigError(f"{path} exists", remedy="name another file by --output, or overwrite it by --force")
+    text = manifest_text(found, _root(directory, path))
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise InputError(
+            f"{path} cannot be written: {error.strerror}",
+            remedy=f"name another file, e.g. --output {short_name(directory)}.rille.toml",
+        ) from error
+    print("\n".join(_report(found, path, needs(text))))
+    return COMPLETE
+
+
+def _root(directory: Path, path: Path) -> str:
+    """The folder as seen from the manifest: relative where the manifest lies in or beside it."""
+    relative = os.path.relpath(directory.resolve(), path.resolve().parent)
+    return str(directory.resolve()) if relative.startswith(os.path.join("..", "..")) else Path(relative).as_posix()
+
+
+def _report(found: Findings, path: Path, needed: list[str]) -> list[str]:
+    """What was found, what is needed, and what to type next."""
+    views, calibration = found.views, found.calibration
+    size = f", {views.size[0]} x {views.size[1]} pixels" if views.pairs else ""
+    lines = [f"images       {counted(views.pairs, 'pair')}{size}: {views.left} and {views.right}"]
+    if calibration is not None:
+        baseline = f", baseline {calibration.baseline:.6g}" if calibration.baseline is not None else ""
+        lines.append(f"calibration  {' and '.join(calibration.files)}{baseline}")
+    lines += [f"{kind:12s} {', '.join(files)}" for kind, files in found.tables.items()]
+    lines += [f"wrote        {path}"]
+    lines += [f"needed       {line}" for line in needed]
+    first = [f"edit {path}"] if needed else []
+    steps = [*first, f"rille check {path}", f"rille reconstruct {path}"]
+    return lines + ["", "next:"] + [f"  {step}" for step in steps]

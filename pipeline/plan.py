@@ -1,0 +1,88 @@
+"""``rille plan``: what a run would compute, what it would take from the cache, and why; no work is done.
+
+What follows from results that are still to come (which pairs are basic, how far the world reaches) is laid out by the
+same results of the last run. A task behind one that is to be computed counts as to be computed; where its input turns
+out as before, to the bit, the run will find it in the cache all the same. The plan is thus an upper bound.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Iterable
+
+from pipeline import driver
+from pipeline.dag import Graph, Handle
+from pipeline.driver import Result
+from pipeline.environment import cores
+from pipeline.progress import recall_seconds
+from pipeline.reconstruct import Reconstruction
+from pipeline.run import Options, choose_frames, settings, warn
+from pipeline.store import Store
+
+REASONS = 3
+"""Different reasons told a stage; ``verbose`` tells each task's."""
+
+BEHIND = "input "
+"""Begin of the reason of a task that only follows from another one."""
+
+
+def plan(options: Options, *, verbose: bool = False) -> int:
+    """Print what ``reconstruct`` with the same options would do; gives the exit code."""
+    sequence, config, _ = settings(options)
+    warn(sequence)
+    frames = choose_frames(options.frames, sequence.frames)
+    graph, store = Graph(), Store(options.cache)
+    Reconstruction(graph, sequence, config, frames).build()
+    result = driver.run(graph, store, dry=True, force=options.force)
+    result.check()
+    for line in describe(graph, result, recall_seconds(store), options.jobs or cores(), verbose=verbose):
+        print(line)
+    return 0
+
+
+def describe(
+    graph: Graph, result: Result, seconds: dict[str, float], jobs: int, *, verbose: bool = False
+) -> Iterable[str]:
+    """Lines of the plan: a table by stage with reasons, totals, and what it rests on."""
+    by_stage: dict[str, list[Handle]] = defaultdict(list)
+    for handle in graph.nodes:
+        by_stage[handle.stage].append(handle)
+    yield f"{'stage':16s} {'cached':>7s} {'to do':>7s}  why"
+    for stage, handles in by_stage.items():
+        planned = [h for h in handles if h.status == "planned"]
+        told = [] if verbose else _reasons(planned)
+        yield f"{stage:16s} {len(handles) - len(planned):7d} {len(planned):7d}  {'; '.join(told)}".rstrip()
+        if verbose:
+            yield from (f"    {h.label}: {h.reason}" for h in planned)
+    yield from _totals(graph, result, seconds, jobs)
+
+
+def _reasons(planned: list[Handle]) -> list[str]:
+    """The reasons of a stage's tasks, own ones first, the most frequent first, with their number."""
+    own = Counter(h.reason for h in planned if not h.reason.startswith(BEHIND))
+    told = [f"{reason} ({n})" for reason, n in own.most_common(REASONS)]
+    if len(own) > REASONS:
+        told.append(f"{len(own) - REASONS} other reasons")
+    follow = len(planned) - own.total()
+    return told + ([f"an input is to be computed ({follow})"] if follow else [])
+
+
+def _totals(graph: Graph, result: Result, seconds: dict[str, float], jobs: int) -> Iterable[str]:
+    planned = [h for h in graph.nodes if h.status == "planned"]
+    cached = len(graph.nodes) - len(planned)
+    line = f"{len(graph.nodes)} tasks known: {cached} cached, {len(planned)} to do"
+    untimed = sorted({h.stage for h in planned if h.stage not in seconds})
+    work = sum(seconds.get(h.stage, 0.0) for h in planned)
+    if planned and len(untimed) < len({h.stage for h in planned}):
+        line += f", about {work / jobs:.0f} s with {jobs} workers by earlier runs"
+        line += f" (never timed: {', '.join(untimed)})" if untimed else ""
+    yield line
+    if result.assumed:
+        yield f"laid out by the last run's {_some(result.assumed)}, which will be computed anew: the layout may change"
+    if result.unknown:
+        yield f"more tasks follow, known only after {_some(result.unknown)}"
+
+
+def _some(labels: list[str]) -> str:
+    names = list(dict.fromkeys(labels))
+    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")

@@ -1,0 +1,37 @@
+"""Small readers of artifacts that several parts of the report share."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.report.view import RunView
+from stages.declare import Bundle
+from stages.geometry import Rig
+
+Floats = NDArray[Any]
+
+
+def used_rig(view: RunView, pair: int) -> Rig:
+    """The rig that a basic pair was reconstructed with: as given, where nothing else is known."""
+    bundle = view.bundle(view.products.rigs.get(pair))
+    return view.sequence.rig if bundle is None or "rig" not in bundle.meta else Rig.from_dict(bundle.meta["rig"])
+
+
+def image(view: RunView, frame: int) -> Bundle | None:
+    """The left image that was matched and tracked: free of distortion."""
+    ideal = view.bundle(view.products.undistorted.get(frame))
+    return ideal if ideal is not None else view.bundle(view.products.images.get(frame))
+
+
+def by_frame(view: RunView, bundle: Bundle, name: str) -> Floats:
+    """An array of an artifact with one row for each chosen frame, NaN where it has none."""
+    values = np.asarray(bundle[name], dtype=np.float64)
+    row = {frame: i for i, frame in enumerate(bundle.meta.get("frames") or view.frames[: len(values)])}
+    out = np.full((len(view.frames), *values.shape[1:]), np.nan)
+    for i, frame in enumerate(view.frames):
+        if frame in row:
+            out[i] = values[row[frame]]
+    return out

@@ -1,0 +1,80 @@
+"""Our trajectory beside that of the crosscheck, frame by frame: for the report and for the exported files."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.report.artifacts import Floats, by_frame
+from pipeline.report.view import RunView
+from stages.declare import Bundle
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Our trajectory and that of the crosscheck, one row a chosen frame, NaN where either has no pose.
+
+    ``poses`` (frame, 3, 4): the crosscheck's left cameras in our world. ``distance`` m, ``angle`` rad: disagreement of
+    the poses; ``step_distance``, ``step_angle``: of the motion since the frame before. ``error``, ``error_crosscheck``
+    m: distance of either from the truth, first poses equal. ``flagged``: not to be trusted without a look.
+    """
+
+    frames: tuple[int, ...]
+    poses: Floats
+    distance: Floats
+    angle: Floats
+    step_distance: Floats
+    step_angle: Floats
+    flagged: NDArray[np.bool_]
+    error: Floats
+    error_crosscheck: Floats
+    meta: Mapping[str, Any]
+
+    @property
+    def registered(self) -> NDArray[np.bool_]:
+        """Which frames the crosscheck has posed."""
+        return np.asarray(np.isfinite(self.poses).all(axis=(1, 2)))
+
+    def reasons(self) -> list[str]:
+        """Why each frame is flagged, in words; empty where it is not."""
+        why = {int(f["frame"]): "; ".join(f["why"]) for f in self.meta.get("flagged") or ()}
+        return [why.get(frame, "") for frame in self.frames]
+
+    def columns(self) -> dict[str, list[Any]]:
+        """Columns of ``agreement.csv`` behind the positions; distances from the truth where there is any."""
+        found = {
+            "disagreement_m": self.distance,
+            "disagreement_deg": np.degrees(self.angle),
+            "step_disagreement_m": self.step_distance,
+            "step_disagreement_deg": np.degrees(self.step_angle),
+            "flagged": self.flagged.astype(np.int64),
+            "flagged_for": np.array(self.reasons(), dtype=object),
+        }
+        errors = {"error_m": self.error, "crosscheck_error_m": self.error_crosscheck}
+        found |= {name: values for name, values in errors.items() if np.isfinite(values).any()}
+        return {name: values.tolist() for name, values in found.items()}
+
+
+def compare(view: RunView) -> Comparison | None:
+    """Frame by frame against the crosscheck; None where there is no comparison."""
+    bundle = view.bundle(view.products.agreement)
+    if bundle is None:
+        return None
+    names = ("poses", "distance", "angle", "step_distance", "step_angle")
+    found = {name: by_frame(view, bundle, name) for name in names}
+    flagged = np.nan_to_num(by_frame(view, bundle, "flagged").astype(np.float64)) > 0
+    p = view.products
+    error, theirs = (_error(view, view.bundle(handle)) for handle in (p.accuracy, p.crosscheck_accuracy))
+    return Comparison(view.frames, **found, flagged=flagged, error=error, error_crosscheck=theirs, meta=bundle.meta)
+
+
+def _error(view: RunView, accuracy: Bundle | None) -> Floats:
+    """Distance (frame,) from the truth, m, first poses equal."""
+    if accuracy is None or "position_truth" not in accuracy.arrays:
+        return np.full(len(view.frames), np.nan)
+    found, true = (by_frame(view, accuracy, name) for name in ("position", "position_truth"))
+    return np.asarray(np.linalg.norm(found - true, axis=1))

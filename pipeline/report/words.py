@@ -1,0 +1,90 @@
+"""Numbers in words: sensible digits, units that fit."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from pipeline.report import canvas
+
+SMALL = {"m": ("mm", 1000.0, 0.1), "m²": ("cm²", 10000.0, 0.01)}
+"""Unit for small values: its name, the factor and the bound below which it is used."""
+
+
+def number(value: Any, digits: int = 3) -> str:
+    """Value with a sensible number of digits; a dash where there is none."""
+    if value is None:
+        return "–"
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return str(value)
+    if isinstance(value, int) or (value == int(value) and abs(value) < 1e6):
+        return f"{int(value)}"
+    if abs(value) < 1e-6:
+        return f"{value:.0e}".replace("-", "−")
+    decimals = max(0, digits - 1 - math.floor(math.log10(abs(value))))
+    return f"{value:.{decimals}f}".replace("-", "−")
+
+
+def quantity(value: Any, unit: str) -> str:
+    """Value with its unit, small lengths and areas in mm and cm²."""
+    if isinstance(value, float) and unit in SMALL and abs(value) < 1e-9:
+        value = 0  # rounding
+    if isinstance(value, int | float) and unit in SMALL and value != 0 and abs(value) < SMALL[unit][2]:
+        unit, factor, _ = SMALL[unit]
+        value = value * factor
+    elif isinstance(value, int | float) and unit == "deg":
+        return f"{number(value)}°"
+    elif isinstance(value, int | float) and unit == "1":
+        return f"{number(100 * value)} %"
+    if value == 1 and unit in ("frames", "cells"):
+        unit = unit[:-1]
+    return f"{number(value)} {unit}".strip() if value is not None else "–"
+
+
+def metres(value: Any) -> str:
+    """Metres with a unit that fits."""
+    return quantity(value, "m")
+
+
+def coordinate(value: Any) -> str:
+    """Coordinate in metres to a tenth of a millimetre."""
+    return "–" if value is None else f"{round(value, 4) + 0.0:.4f}".replace("-", "−")
+
+
+def share(value: Any) -> str:
+    """Share as per cent."""
+    return "–" if value is None else f"{100 * value:.0f} %"
+
+
+def seconds(value: Any) -> str:
+    """Seconds with two or three digits."""
+    if value is None:
+        return "–"
+    return f"{value:.0f}" if value >= 100 else f"{value:.1f}" if value >= 1 else f"{value:.2f}"
+
+
+def spread(values: Any) -> str:
+    """``low to high`` of nearly all values, for alternative texts."""
+    finite = canvas.sample(np.asarray(values))
+    if not finite.size:
+        return "nothing defined"
+    low, high = np.percentile(finite, [1, 99])
+    return f"{low:.3g} to {high:.3g}"
+
+
+def length(metres: float) -> str:
+    """Metres, or millimetres where that reads better."""
+    return f"{metres * 1000:.4g} mm" if abs(metres) < 0.1 else f"{metres:.4g} m"
+
+
+def spans(numbers: list[int]) -> str:
+    """``[1, 2, 3, 7]`` to ``1-3, 7``."""
+    found: list[list[int]] = []
+    for n in numbers:
+        if found and n == found[-1][1] + 1:
+            found[-1][1] = n
+        else:
+            found.append([n, n])
+    return ", ".join(f"{a}" if a == b else f"{a}-{b}" for a, b in found)

@@ -1,0 +1,255 @@
+"""Robust adjustment of a rig to correspondences of one or several pairs, with what no rig explains beside it.
+
+Beside the five parameters of the rig (:mod:`stages.epipolar`) the images hold errors that no number of matches averages
+out, and a fit without them claims a precision it does not have. They are estimated with a prior and then dropped:
+
+* ``principal``: the right principal point is off, and the calibration's rotation made up for it, so that the disparity
+  at infinity is right. On a parallel rig its rows look like toe-in, though the depth is right: without it a fit
+  "repairs" the toe-in of a sound calibration. Only a rig that converges (or a wide angle) can tell the two apart;
+* ``smooth``: a low polynomial of the row over the image: what lens model and rectification leave.
+
+Both are the same in all pairs. The noise of the matches is measured, pair by pair, with its correlation between
+neighbours. Weights are Tukey's, narrowed from the scatter about the given rig.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.epipolar import NAMES, distances, normals
+from stages.geometry import Rig
+
+Floats = NDArray[np.float64]
+
+RIG = len(NAMES)
+PRINCIPAL = 2
+DEGREE = 3
+TERMS = tuple((i, j) for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i))
+"""Degrees of the column and the row of the smooth error's polynomials."""
+
+SIZE = RIG + PRINCIPAL + len(TERMS)
+SMOOTH = slice(RIG + PRINCIPAL, SIZE)
+
+PARTNERS = ((NAMES.index("yaw"), 0), (NAMES.index("pitch"), 1))
+"""Angles, and the coordinate of the principal point that looks like each."""
+
+NO_SHIFT = 1e-3
+"""Pixels: deviation of a principal point that is taken as given."""
+
+EXACT = 1e-7
+"""Radians: deviation of a parameter that is held exactly."""
+
+LEAST_SMOOTH = 1e-3
+"""Pixels: deviation of a term of the smooth error, at least."""
+
+LEAST_MATCHES = 50
+LEAST_NOISE = 0.02
+"""Pixels: no match is better."""
+
+TUKEY = 4.685
+BLOCKS = 6
+"""Blocks along either side of the image whose means show how far errors of neighbours go together."""
+
+ITERATIONS = 30
+CONVERGED = 1e-3
+"""Share of a parameter's sigma."""
+
+
+@dataclass(frozen=True)
+class Matches:
+    """Corresponding points (n, 2) of one pair: column and row in the left and in the right image, pixels."""
+
+    pair: int
+    left: Floats
+    right: Floats
+
+
+@dataclass(frozen=True)
+class Beliefs:
+    """Deviations that the calibration is believed to have.
+
+    ``rotation``, ``baseline`` (radians): of an intact calibration's three angles and of its baseline's direction.
+    ``principal``: pixels, of the principal point. ``systematic``: pixels, RMS of the smooth error, at least.
+    """
+
+    rotation: float
+    baseline: float
+    principal: float
+    systematic: float
+
+    def held(self) -> Floats:
+        """Deviations (5,) of the rig's parameters, radians."""
+        return np.array([self.rotation] * 3 + [self.baseline] * 2)
+
+    @property
+    def term(self) -> float:
+        """Deviation of each term of the smooth error, pixels."""
+        return self.systematic / math.sqrt(len(TERMS))
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Result of :func:`adjust`.
+
+    ``x`` (SIZE,): the five corrections (radians), principal point (2, pixels), smooth error (pixels). ``normal`` and
+    ``pull``: the data's part of the normal equations ``normal @ x = pull``, linear about ``x``. ``smooth``: deviation
+    of each term of the smooth error, pixels. ``noise``: of each pair's matches, pixels. ``weights``: (n,) a pair.
+    """
+
+    x: Floats
+    normal: Floats
+    pull: Floats
+    smooth: float
+    noise: tuple[float, ...]
+    weights: tuple[Floats, ...]
+
+
+def adjust(rig: Rig, pairs: Sequence[Matches], free: Sequence[bool], beliefs: Beliefs, *, rival: bool) -> Fit:
+    """Adjust a rig to pairs, everything that no rig explains allowed for.
+
+    ``free`` says which of the five parameters the images alone decide. The others are held by what the calibration is
+    believed to be good for: they take up their share of the error, so that the free ones do not have to. ``rival``: see
+    :func:`precision`. The smooth error's size is estimated, too (expectation maximisation, starting from the belief).
+    """
+    return _adjust(
+        rig, pairs, lambda smooth: precision(free, beliefs, smooth, rival=rival), beliefs.term, estimate=True
+    )
+
+
+def settle(rig: Rig, pairs: Sequence[Matches], free: Sequence[bool], beliefs: Beliefs) -> Fit:
+    """Adjust the free parameters to the smallest residuals of the rig that results.
+
+    In that rig the others are exactly as given and smooth errors stay in the images, so neither takes a share here.
+    """
+    nil = replace(beliefs, rotation=EXACT, baseline=EXACT)
+    return _adjust(rig, pairs, lambda smooth: precision(free, nil, smooth, rival=False), LEAST_SMOOTH, estimate=False)
+
+
+def considered(fit: Fit, free: Sequence[bool], beliefs: Beliefs, smooth: float, held: Floats) -> Floats:
+    """Covariance (5, 5) of a settled fit's free parameters; zero for the others.
+
+    What took no share is an error of the result (a consider covariance: Bierman 1977, chapter 8): held parameters with
+    deviations ``held`` (5,), radians; the smooth error with ``smooth`` pixels a term, but no less than is believed.
+    """
+    prior = precision(free, beliefs, max(beliefs.term, smooth), rival=False)
+    for i in np.flatnonzero(~np.asarray(free)):
+        prior[i, i] = held[i] ** -2.0
+    solved = np.array([*free, *[True] * PRINCIPAL, *[False] * len(TERMS)])
+    inverse = np.linalg.inv(fit.normal[np.ix_(solved, solved)] + prior[np.ix_(solved, solved)])
+    gain = -inverse @ fit.normal[np.ix_(solved, ~solved)]
+    covariance = np.zeros((SIZE, SIZE))
+    covariance[np.ix_(solved, solved)] = inverse + gain @ np.diag(1.0 / np.diag(prior)[~solved]) @ gain.T
+    return np.asarray(covariance[:RIG, :RIG], dtype=np.float64)
+
+
+def _adjust(
+    rig: Rig, pairs: Sequence[Matches], prior: Callable[[float], Floats], smooth: float, *, estimate: bool
+) -> Fit:
+    """Gauss-Newton with weights from the scatter; ``prior`` of the smooth error's size, ``estimate`` it or keep it."""
+    x, scales = np.zeros(SIZE), [np.inf] * len(pairs)
+    bases = [_smooth_terms(rig, m) for m in pairs]
+    for _ in range(ITERATIONS):
+        parts = [_pair(rig, *given, x) for given in zip(pairs, bases, scales, strict=True)]
+        scales = [p.noise for p in parts]
+        normal = np.sum([p.normal for p in parts], axis=0)
+        pull = np.sum([p.pull for p in parts], axis=0)
+        total = normal + prior(smooth)
+        last, x, variance = x, np.linalg.solve(total, pull), np.diag(np.linalg.inv(total))
+        if bool(np.all(np.abs(x - last)[:RIG] < CONVERGED * np.sqrt(variance[:RIG]))):
+            break
+        if estimate:
+            smooth = max(LEAST_SMOOTH, float(np.sqrt(np.mean(x[SMOOTH] ** 2 + variance[SMOOTH]))))
+    return Fit(x, normal, pull, smooth, tuple(scales), tuple(p.weights for p in parts))
+
+
+def precision(free: Sequence[bool], beliefs: Beliefs, smooth: float, *, rival: bool) -> Floats:
+    """The priors' part (SIZE, SIZE) of the normal matrix.
+
+    ``rival``: a principal point that is off may stand in for a free angle, as it always may for a held one. With it,
+    what is knowable shows; without it, the angle takes all (lenses stay on their cameras when a mount turns).
+    """
+    sigma = np.concatenate(
+        [beliefs.held(), np.full(PRINCIPAL, beliefs.principal), np.full(len(TERMS), smooth)], dtype=np.float64
+    )
+    # Free means: anywhere within a radian, which keeps the matrix regular where a scene says nothing at all.
+    sigma[:RIG] = np.where(np.asarray(free), 1.0, sigma[:RIG])
+    for angle, coordinate in PARTNERS:
+        if free[angle] and not rival:
+            sigma[RIG + coordinate] = NO_SHIFT
+    return np.diag(sigma**-2.0)
+
+
+def solution(fit: Fit, free: Sequence[bool], beliefs: Beliefs, *, rival: bool) -> tuple[Floats, Floats, float]:
+    """Values (SIZE,), covariance and gain (half the drop of chi-square) of a fit's quadratic for another choice.
+
+    The smooth error counts with no less than is believed of it.
+    """
+    total = fit.normal + precision(free, beliefs, max(beliefs.term, fit.smooth), rival=rival)
+    x = np.asarray(np.linalg.solve(total, fit.pull), dtype=np.float64)
+    covariance = np.asarray(np.linalg.inv(total), dtype=np.float64)
+    return x, covariance, 0.5 * float(np.sum(fit.pull * x))
+
+
+@dataclass(frozen=True)
+class _Part:
+    normal: Floats
+    pull: Floats
+    noise: float
+    weights: Floats
+
+
+def _pair(rig: Rig, matches: Matches, basis: Floats, last: float, x: Floats) -> _Part:
+    """One pair's part of the normal equations, with weights from its own scatter (at most ``last``, pixels)."""
+    distance, design = _design(rig, matches, basis, x[:RIG])
+    rest = distance + np.einsum("ni,i->n", design[:, RIG:], x[RIG:])
+    noise = max(LEAST_NOISE, min(last, 1.4826 * float(np.median(np.abs(rest)))))
+    weights = np.maximum(0.0, 1.0 - (rest / (TUKEY * noise)) ** 2) ** 2
+    information = weights / (noise**2 * _correlation(rig, matches, rest, weights, noise))
+    normal = np.einsum("ni,nj->ij", design, design * information[:, None])
+    pull = np.einsum("ni,n->i", design, information * (np.einsum("ni,i->n", design, x) - rest))
+    return _Part(normal, pull, noise, weights)
+
+
+def _design(rig: Rig, matches: Matches, basis: Floats, correction: Floats) -> tuple[Floats, Floats]:
+    """Distances (n,) of a corrected rig, and derivatives (n, SIZE) of distances with systematic errors."""
+    distance, by_rig = distances(rig, correction, matches.left, matches.right)
+    # A principal point further right (down) by a pixel, its rotation made up for by yaw (pitch).
+    made_up = by_rig[:, [1, 0]] * [-1.0 / rig.right.fx, 1.0 / rig.right.fy]
+    shifts = made_up - normals(rig, correction, matches.left)
+    return distance, np.column_stack([by_rig, shifts, basis])
+
+
+def _smooth_terms(rig: Rig, matches: Matches) -> Floats:
+    """Normalised Legendre polynomials (n, terms) of the left pixel: RMS 1 over the image."""
+    u = 2.0 * matches.left[:, 0] / max(rig.left.width - 1, 1) - 1.0
+    v = 2.0 * matches.left[:, 1] / max(rig.left.height - 1, 1) - 1.0
+    columns = [math.sqrt((2 * i + 1) * (2 * j + 1)) * _legendre(u, i) * _legendre(v, j) for i, j in TERMS]
+    return np.column_stack(columns)
+
+
+def _legendre(x: Floats, degree: int) -> Floats:
+    return np.asarray(np.polynomial.legendre.legval(x, np.eye(DEGREE + 1)[degree]), dtype=np.float64)
+
+
+def _correlation(rig: Rig, matches: Matches, rest: Floats, weights: Floats, noise: float) -> float:
+    """How many times as far block means scatter (variance) as means of independent errors would; at least 1."""
+    column = np.minimum(matches.left[:, 0] * BLOCKS / rig.left.width, BLOCKS - 1).astype(np.int64)
+    row = np.minimum(matches.left[:, 1] * BLOCKS / rig.left.height, BLOCKS - 1).astype(np.int64)
+    block = row * BLOCKS + column
+    count = np.bincount(block, weights, BLOCKS**2)
+    total = np.bincount(block, weights * rest, BLOCKS**2)
+    used = count >= 5.0
+    if not used.any():
+        return 1.0
+    return max(1.0, float(np.mean(total[used] ** 2 / count[used])) / noise**2)
+
+
+def rms(distance: Floats, weights: Floats) -> float:
+    """RMS of the distances that are no outliers, pixels; NaN where all are."""
+    used = weights > 0
+    return float(np.sqrt(np.mean(distance[used] ** 2))) if used.any() else float("nan")

@@ -1,0 +1,246 @@
+"""What a folder holds, told from names and content; and that the manifest written from it says the same."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+
+import pytest
+from folders import SIZE, write_images, write_lines
+
+from datasets.files import Digests
+from datasets.inspection import find_views, inspect, pattern, table_kind
+from datasets.manifest import open_manifest
+from datasets.manifest_text import manifest_text, needs, short_name
+from stages.errors import InputError
+
+ORB_SETTINGS = """%YAML:1.0
+Camera.fx: 60.0
+Camera.fy: 60.0
+Camera.cx: 31.5
+Camera.cy: 23.5
+Camera.k1: 0.0
+Camera.k2: 0.0
+Camera.p1: 0.0
+Camera.p2: 0.0
+Camera.width: {0}
+Camera.height: {1}
+Camera.bf: {bf}
+"""
+
+TSAI = """fu = 60
+fv = 60
+cu = 31.5
+cv = 23.5
+u_direction = 1 0 0
+v_direction = 0 1 0
+w_direction = 0 0 1
+C = {x} 0 0
+R = 1 0 0 0 1 0 0 0 1
+k1 = -0.3
+k2 = 0.1
+p1 = 0
+p2 = 0
+"""
+
+
+def both(template: str, names: list[str]) -> list[str]:
+    return [template.format(side=side, name=name) for name in names for side in ("left", "right")]
+
+
+@pytest.mark.parametrize(
+    ("files", "left", "right", "pairs"),
+    [
+        (["left4.png", "right4.png"], "left4.png", "right4.png", 1),
+        (both("{side}{name}.jpg", ["01", "02", "13"]), "left*.jpg", "right*.jpg", 3),
+        (both("{side}/{name}.png", ["000", "001"]), "left/*.png", "right/*.png", 2),
+        (both("run/{side}/{side}_{name}.png", ["1", "2"]), "run/left/left_*.png", "run/right/right_*.png", 2),
+        (["a1_l.png", "a1_r.png", "a2_l.png", "a2_r.png"], "a*_l.png", "a*_r.png", 2),
+        (["mav0/cam0/data/5.png", "mav0/cam1/data/5.png"], "mav0/cam0/data/5.png", "mav0/cam1/data/5.png", 1),
+        ([f"image_{c}/{k}.png" for c in range(4) for k in (1, 2)], "image_0/*.png", "image_1/*.png", 2),
+        (["im0.png", "im1.png"], "im0.png", "im1.png", 1),
+        ([*both("{side}/{name}.png", ["1", "2"]), "left/9.jpg", "right/9.jpg"], "left/*.png", "right/*.png", 2),
+    ],
+)
+def test_pairs_are_told_from_names(tmp_path, files, left, right, pairs):
+    write_images(tmp_path, files)
+    views = inspect(tmp_path).views
+    assert (views.left, views.right, views.pairs, views.trouble) == (left, right, pairs, "")
+    assert views.size == (SIZE if files[0].endswith("png") else views.size)
+
+
+def test_names_that_are_time_stamps(tmp_path):
+    write_images(tmp_path, both("{side}/{name}.png", ["1403715273262142976", "1403715273312143104"]))
+    found = inspect(tmp_path)
+    assert found.views.stamped
+    assert tomllib.loads(manifest_text(found, "."))["times"] == {"names": True}
+    write_images(tmp_path / "b", both("{side}/{name}.png", ["000048978", "000048979"]))
+    assert not inspect(tmp_path / "b").views.stamped
+
+
+def test_patterns_escape_what_is_special(tmp_path):
+    assert pattern([tmp_path / "a[1]" / "x1.png", tmp_path / "a[1]" / "x2.png"], tmp_path) == "a[[]1]/x*.png"
+
+
+def test_images_that_cannot_be_told_apart(tmp_path):
+    write_images(tmp_path, ["1.png", "2.png"])
+    with pytest.raises(InputError, match=r"2 images, but none are told apart as left and right: name files or folders"):
+        inspect(tmp_path)
+    with pytest.raises(InputError, match="is no folder"):
+        inspect(tmp_path / "nothing")
+    with pytest.raises(InputError, match="0 images"):
+        find_views(tmp_path, [])
+
+
+def test_an_image_without_partner_is_marked(tmp_path):
+    write_images(tmp_path, [*both("{side}/{name}.png", ["1", "2"]), "left/3.png"])
+    found = inspect(tmp_path)
+    assert "3.png has no partner" in found.views.trouble
+    assert any("3.png has no partner" in line for line in needs(manifest_text(found, ".")))
+
+
+@pytest.mark.parametrize(
+    ("lines", "kind"),
+    [
+        (["1 0 0 0 0 1 0 0 0 0 1 0"] * 2, "truth"),
+        (["700 0 30 0 0 700 20 0 0 0 1 0"] * 2, ""),
+        (["# time x y z qx qy qz qw", "0.1 0 0 0 0 0 0.6 0.8"], "truth"),
+        (["#timestamp, p_x, p_y, p_z, q_w, q_x, q_y, q_z", "1403,0.9,2.2,0.9,0.8,0.6,0.0,0.0,0.1,0.2"], "truth"),
+        (["#timestamp [ns],w_RS_S_x [rad s^-1],y,z,a,b,c", "140,0,0,0,9.8,0.1,-3.6"], "imu"),
+        (["time,roll_deg,pitch_deg,yaw_deg", "0,1,2,3"], "attitude"),
+        (["0.0", "0.5"], "times"),
+        (["0.0", "0.5", "1.0"], ""),
+        (["hello", "1 of these"], ""),
+        ([], ""),
+    ],
+)
+def test_tables_are_told_by_content(tmp_path, lines, kind):
+    write_lines(tmp_path / "table.txt", lines)
+    assert table_kind(tmp_path / "table.txt", 2) == kind
+
+
+def test_single_numbers_are_times_whatever_their_count_where_the_name_says_so(tmp_path):
+    write_lines(tmp_path / "times.txt", ["0.0", "0.5", "1.0"])
+    assert table_kind(tmp_path / "times.txt", 2) == "times"
+
+
+def test_calibration_of_both_cameras_is_preferred(tmp_path):
+    write_images(tmp_path, both("{side}/{name}.png", ["1", "2"]))
+    (tmp_path / "rig.yaml").write_text(ORB_SETTINGS.format(*SIZE, bf=6.0))
+    (tmp_path / "notes.yaml").write_text("weather: dusty\n")
+    calibration = inspect(tmp_path).calibration
+    assert calibration is not None
+    assert calibration.files == ("rig.yaml",)
+    assert calibration.baseline == pytest.approx(0.1)
+
+
+def test_calibration_of_the_images_size_is_preferred(tmp_path):
+    write_images(tmp_path, both("{side}/{name}.png", ["1", "2"]))
+    for name, size in (("a", (640, 480)), ("b", SIZE), ("c", (128, 96))):
+        (tmp_path / f"{name}.yaml").write_text(ORB_SETTINGS.format(*size, bf=6.0))
+    found = inspect(tmp_path)
+    assert found.calibration is not None
+    assert found.calibration.files == ("b.yaml",)
+    assert found.others == ["a.yaml", "c.yaml"]
+
+
+def test_a_calibration_in_millimetres_opens_once_its_unit_is_said(tmp_path):
+    write_images(tmp_path, both("{side}/{name}.png", ["1", "2"]))
+    (tmp_path / "calib.yaml").write_text(ORB_SETTINGS.format(*SIZE, bf=7200.0))
+    path = tmp_path / "m.rille.toml"
+    path.write_text(manifest_text(inspect(tmp_path), ".").replace("# unit = 0.001", "unit = 0.001"))
+    assert open_manifest(path, Digests()).rig.baseline == pytest.approx(0.12)
+
+
+def test_two_files_are_left_and_right(tmp_path):
+    write_images(tmp_path, ["left4.png", "right4.png"])
+    for side, x in (("left", 0.0), ("right", 0.1)):
+        (tmp_path / f"cam_{side}.tsai").write_text(TSAI.format(x=x))
+    found = inspect(tmp_path)
+    assert found.calibration is not None
+    assert found.calibration.files == ("cam_left.tsai", "cam_right.tsai")
+    assert found.calibration.baseline == pytest.approx(0.1)
+    text = manifest_text(found, ".")
+    assert needs(text) == []
+    (tmp_path / "m.rille.toml").write_text(text)
+    s = open_manifest(tmp_path / "m.rille.toml", Digests())
+    assert s.lenses is not None
+    assert s.lenses["left"].coefficients[:2] == (-0.3, 0.1)
+    assert s.rig.baseline == pytest.approx(0.1)
+
+
+def test_a_whole_folder_opens_at_once(tmp_path):
+    write_images(tmp_path, both("{side}/{name}.png", ["1", "2", "3"]))
+    (tmp_path / "rig.yaml").write_text(ORB_SETTINGS.format(*SIZE, bf=-6.0))
+    write_lines(tmp_path / "times.txt", ["0.0", "0.5", "1.0"])
+    write_lines(tmp_path / "poses.txt", [f"1 0 0 {k} 0 1 0 0 0 0 1 0" for k in range(3)])
+    write_lines(tmp_path / "imu.csv", ["#t,gyro_x,gyro_y,gyro_z,ax,ay,az", "0,0,0,0,0,-9.81,0"])
+    found = inspect(tmp_path)
+    assert found.tables == {"times": ["times.txt"], "truth": ["poses.txt"], "imu": ["imu.csv"]}
+    (tmp_path / "m.rille.toml").write_text(manifest_text(found, "."))
+    s = open_manifest(tmp_path / "m.rille.toml", Digests())
+    assert (s.name, s.frames, s.times) == (short_name(tmp_path), 3, (0.0, 0.5, 1.0))
+    assert s.truth is not None
+    assert s.truth[2] is not None
+    assert s.truth[2].translation[0] == 2.0
+    assert s.attitude is None
+
+
+@pytest.mark.parametrize(
+    ("settings", "marked", "message"),
+    [
+        ("", ["no calibration was found", "nothing says where the right camera stands"], "the cameras are not known"),
+        (ORB_SETTINGS.format(640, 480, bf=6.0), ["this calibration is of 640 x 480"], "calibrated for 640 x 480"),
+        (
+            ORB_SETTINGS.format(*SIZE, bf=7200.0),
+            ["the baseline of the calibration is 120,"],
+            r"120 m.*rig\.unit = 0\.001",
+        ),
+    ],
+)
+def test_what_is_missing_is_marked_and_fails_with_its_line(tmp_path, settings, marked, message):
+    write_images(tmp_path, both("{side}/{name}.png", ["1", "2"]))
+    if settings:
+        (tmp_path / "calib.yaml").write_text(settings)
+    text = manifest_text(inspect(tmp_path), ".")
+    found = needs(text)
+    assert len(found) == len(marked)
+    assert all(line.startswith(start) for line, start in zip(found, marked, strict=True))
+    path = tmp_path / "m.rille.toml"
+    path.write_text(text)
+    with pytest.raises(InputError, match=message):
+        open_manifest(path, Digests())
+
+
+def test_filling_in_what_is_needed_is_enough(tmp_path):
+    write_images(tmp_path, both("{side}/{name}.png", ["1", "2"]))
+    text = manifest_text(inspect(tmp_path), ".")
+    for key in ("fx", "fy", "cx", "cy", "baseline"):
+        text = text.replace(f"# {key} = ", f"{key} = ")
+    tomllib.loads(text)
+    path = tmp_path / "m.rille.toml"
+    path.write_text(text.replace("cx = 320.0", "cx = 30.0").replace("cy = 240.0", "cy = 20.0"))
+    assert open_manifest(path, Digests()).rig.baseline == 0.1
+
+
+@pytest.mark.parametrize("name", ["a b/", "x", "späte Fahrt!"])
+def test_short_names_are_fit_for_files(tmp_path, name):
+    assert short_name(tmp_path / name).isascii()
+    assert " " not in short_name(tmp_path / name)
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(
+    ("folder", "pairs", "files", "needed"),
+    [
+        ("nasa_k10", 1, ("black_left.tsai", "black_right.tsai"), 0),
+        ("devon_island", 10, ("source_config.yaml",), 0),
+        ("chessboard_bumblebee2", 11, ("stereo.yaml",), 1),
+    ],
+)
+def test_real_folders(data_dir: Path, folder, pairs, files, needed):
+    found = inspect(data_dir / folder)
+    assert found.views.pairs == pairs
+    assert found.calibration is not None
+    assert found.calibration.files == files
+    assert len(needs(manifest_text(found, "."))) == needed

@@ -1,0 +1,110 @@
+"""Pairing of images: by name, number and order, and what has no partner."""
+
+from __future__ import annotations
+
+import random
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from datasets.pairing import common_size, natural, pair_up, side_of
+from stages.errors import InputError
+
+
+def paths(*names: str) -> list[Path]:
+    return [Path(name) for name in names]
+
+
+def found(left: list[Path], right: list[Path], rule: str = "auto") -> list[tuple[str, str, str]]:
+    return [(p.name, p.left.name, p.right.name) for p in pair_up(left, right, rule)]
+
+
+@pytest.mark.parametrize(
+    ("left", "right", "names"),
+    [
+        (["l/000.png", "l/001.png"], ["r/000.png", "r/001.png"], ["000", "001"]),
+        (["left01.jpg", "left02.jpg"], ["right01.jpg", "right02.jpg"], ["01", "02"]),
+        (["a_l.png", "b_l.png"], ["a_r.png", "b_r.png"], ["a", "b"]),
+        (["s_cam0_7.png", "s_cam0_8.png"], ["s_cam1_7.png", "s_cam1_8.png"], ["s__7", "s__8"]),
+    ],
+)
+def test_names_pair_with_the_sides_token_aside(left, right, names):
+    pairs = pair_up(paths(*reversed(left)), paths(*right))
+    assert [p.name for p in pairs] == names
+    assert [p.left for p in pairs] == paths(*left)
+    assert [p.right for p in pairs] == paths(*right)
+
+
+def test_numbers_pair_where_no_names_agree():
+    assert found(paths("x10.png", "x9.png"), paths("y09.png", "y010.png")) == [
+        ("x9", "x9.png", "y09.png"),
+        ("x10", "x10.png", "y010.png"),
+    ]
+
+
+def test_order_pairs_whatever_the_names():
+    assert found(paths("b.png", "a.png"), paths("z.png", "y.png"), "order") == [
+        ("a", "a.png", "y.png"),
+        ("b", "b.png", "z.png"),
+    ]
+    assert found(paths("im7.png"), paths("im9.png")) == [("im7", "im7.png", "im9.png")]
+
+
+@pytest.mark.parametrize(
+    ("left", "right", "rule", "message"),
+    [
+        (["1.png", "2.png"], ["1.png"], "auto", r"2\.png has no partner by name among the right images; 2 left, 1 rig"),
+        (["1.png"], ["1.png", "2.png", "3.png"], "auto", r"2\.png has no partner .* left images \(and 1 more\)"),
+        (["1.png", "2.png"], ["3.png"], "order", "2 left images and 1 right ones cannot be paired by order"),
+        (["a1.png", "b1.png"], ["c1.png", "c2.png"], "number", r"a1\.png and b1\.png are the same frame by number"),
+        (["a.png", "b.png"], ["c.png", "d.png"], "auto", r"a\.png has no number .*no partner .*images\.pair = .order"),
+    ],
+)
+def test_what_has_no_partner_is_named(left, right, rule, message):
+    with pytest.raises(InputError, match=message):
+        pair_up(paths(*left), paths(*right), rule)
+
+
+def test_numbers_in_names_sort_as_numbers():
+    names = [f"a{k}b{j}" for k in (1, 2, 10) for j in (3, 20)]
+    shuffled = random.Random(4).sample(names, len(names))
+    assert sorted(shuffled, key=natural) == names
+
+
+@pytest.mark.parametrize(
+    ("name", "side"),
+    [
+        ("left/0001", (0, "*/0001")),
+        ("Left07", (0, "*07")),
+        ("mav0/cam1/data/17", (1, "mav0/*/data/17")),
+        ("left/left_3", (0, "*/*_3")),
+        ("x_R_4", (1, "x_*_4")),
+        ("image_2/000", (0, "*/000")),
+    ],
+)
+def test_tokens_of_sides(name, side):
+    at = side_of(name)
+    assert at is not None
+    assert at[1:] == side
+
+
+@pytest.mark.parametrize("name", ["leftover", "cam01/3", "aright", "real", "image_25/3", "123"])
+def test_words_that_only_look_like_a_side(name):
+    assert side_of(name) is None
+
+
+def test_sizes_are_compared(tmp_path):
+    for name, shape in (("a_l", (4, 6)), ("a_r", (4, 6)), ("b_l", (4, 6)), ("b_r", (5, 6))):
+        cv2.imwrite(str(tmp_path / f"{name}.png"), np.zeros(shape, np.uint8))
+    pairs = pair_up(sorted(tmp_path.glob("*_l.png")), sorted(tmp_path.glob("*_r.png")))
+    assert common_size(pairs[:1]) == (6, 4, 8)
+    with pytest.raises(InputError, match=r"b_r\.png is 6 x 5, 8 bits; the sequence has 6 x 4, 8 bits"):
+        common_size(pairs)
+
+
+def test_size_of_another_kind_of_file_is_read(tmp_path):
+    for side in "lr":
+        cv2.imwrite(str(tmp_path / f"a_{side}.pgm"), np.zeros((4, 6), np.uint16))
+    assert common_size(pair_up([tmp_path / "a_l.pgm"], [tmp_path / "a_r.pgm"])) == (6, 4, 16)

@@ -1,0 +1,161 @@
+"""Poses of files, and between their rows."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from datasets.poses import TimedPoses, coverage, interpolate, read_poses
+from stages.errors import InputError
+from stages.geometry import RigidTransform, rotation_exp
+
+TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+"""90 degrees about z: quaternion w = z = sqrt(1/2)."""
+
+H = "0.7071068"
+
+
+def read(tmp_path, text, **kwargs):
+    path = tmp_path / "poses.txt"
+    path.write_text(text)
+    return read_poses(path, **kwargs)
+
+
+@pytest.mark.parametrize(
+    ("text", "format"),
+    [
+        (f"1 1 2 3 0 0 {H} {H}\n2 1 2 3 0 0 0 1\n", "auto"),
+        (f"# timestamp tx ty tz qx qy qz qw\n1 1 2 3 0 0 {H} {H}\n2 1 2 3 0 0 0 1\n", "auto"),
+        (f"1,1,2,3,{H},0,0,{H},9,9,9\n2,1,2,3,1,0,0,0,9,9,9\n", "auto"),
+        (f"#time(s),px,py,pz,qw,qx,qy,qz,vx,vy,vz,bwx\n1,1,2,3,{H},0,0,{H},9,9,9,9\n2,1,2,3,1,0,0,0,9,9,9,9", "auto"),
+        (
+            "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z []\n"
+            f"1,1,2,3,{H},0,0,{H}\n2,1,2,3,1,0,0,0\n",
+            "auto",
+        ),
+        (f"qx,qy,qz,qw,z,y,x,time\n0,0,{H},{H},3,2,1,1\n0,0,0,1,3,2,1,2\n", "csv"),
+        (f"1 1 2 3 {H} 0 0 {H}\n2 1 2 3 1 0 0 0\n", "euroc"),
+        (f"1,1,2,3,0,0,{H},{H}\n2,1,2,3,0,0,0,1\n", "tum"),
+    ],
+    ids=["tum", "tum named", "euroc", "euroc named", "vicon", "csv in any order", "as euroc", "as tum"],
+)
+def test_forms_of_one_pose(tmp_path, text, format):
+    found = read(tmp_path, text, format=format)
+    assert found.times == (1.0, 2.0)
+    np.testing.assert_allclose(found.poses[0].rotation, TURN, atol=1e-7)
+    np.testing.assert_allclose(found.poses[1].rotation, np.eye(3), atol=1e-12)
+    np.testing.assert_array_equal(found.poses[0].translation, [1, 2, 3])
+
+
+def test_matrices_have_no_times_and_become_rotations(tmp_path):
+    rows = "0 -1 0 1 1 0 0 2 0 0 1 3\n0.99995 0.01 0 4 -0.01 0.99995 0 5 0 0 1 6\n"
+    found = read(tmp_path, rows)
+    assert found.times is None
+    np.testing.assert_array_equal(found.poses[0].matrix34, np.column_stack([TURN, [1, 2, 3]]))
+    R = found.poses[1].rotation
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-15)
+    square = "0 -1 0 1 1 0 0 2 0 0 1 3 0 0 0 1\n"
+    np.testing.assert_array_equal(read(tmp_path, square).poses[0].matrix34, found.poses[0].matrix34)
+
+
+@pytest.mark.parametrize("unit", ["deg", "rad"])
+def test_angles_are_those_of_vehicles(tmp_path, unit):
+    roll, pitch, yaw = 10.0, 20.0, 30.0
+    scale = 1.0 if unit == "deg" else np.pi / 180
+    text = f"time,yaw [{unit}],pitch_{unit},roll_{unit}\n5,{yaw * scale},{pitch * scale},{roll * scale}\n"
+    found = read(tmp_path, text)
+    Rx, Ry, Rz = (rotation_exp(np.deg2rad(a) * np.eye(3)[k]) for k, a in enumerate((roll, pitch, yaw)))
+    np.testing.assert_allclose(found.poses[0].rotation, Rz @ Ry @ Rx, atol=1e-12)
+    np.testing.assert_array_equal(found.poses[0].translation, 0)
+    assert found.times == (5.0,)
+
+
+def test_angles_beyond_a_turn_can_only_be_degrees(tmp_path):
+    found = read(tmp_path, "time,roll,pitch,yaw\n0,0,0,0\n1,0,0,90\n")
+    np.testing.assert_allclose(found.poses[1].rotation, TURN, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("text", "format", "message"),
+    [
+        ("time,roll,pitch,yaw\n0,0.1,0,0\n", "auto", "roll, pitch and yaw have no unit"),
+        ("time,roll_deg,pitch_rad,yaw_deg\n0,0.1,0,0\n", "auto", "roll, pitch and yaw have two units"),
+        (f"1 1 2 3 0 0 {H} {H}\n2 1 2 3 0 0 0 2\n", "tum", r"line 2: a quaternion of length 2"),
+        ("1 0 0 0 0 1 0 0 0 0 1 0\n2 0 0 0 0 2 0 0 0 0 2 0\n", "kitti", r"line 2: .*not a rotation"),
+        ("1 2 3 4\n", "auto", "4 numbers are no pose of format tum"),
+        ("1 2 3 4\n", "kitti", "4 numbers are no 3 x 4 pose"),
+        ("1 2 3 4\n", "csv", "does not name its columns"),
+        ("1 2 3 4\n", "bag", "format 'bag' of poses is unknown"),
+        (f"2 1 2 3 0 0 {H} {H}\n1 1 2 3 0 0 0 1\n", "auto", "line 2: time 1 goes back from 2"),
+    ],
+)
+def test_what_is_wrong_is_one_line_with_a_remedy(tmp_path, text, format, message):
+    with pytest.raises(InputError, match=message) as caught:
+        read(tmp_path, text, format=format)
+    assert "\n" not in str(caught.value)
+    assert caught.value.remedy
+
+
+# -- between rows ------------------------------------------------------------------------------------------------------
+
+QUARTER = TimedPoses(
+    (10.0, 12.0), (RigidTransform.identity(), RigidTransform(TURN, np.array([4.0, 0.0, 2.0]))), "quarter"
+)
+
+
+def test_half_way_is_half_the_turn_and_half_the_way():
+    (found,) = interpolate(QUARTER, [11.0], 2.0)
+    s = np.sqrt(0.5)
+    np.testing.assert_allclose(found.rotation, [[s, -s, 0], [s, s, 0], [0, 0, 1]], atol=1e-12)
+    np.testing.assert_allclose(found.translation, [2.0, 0.0, 1.0], atol=1e-12)
+
+
+@given(
+    rate=st.tuples(*[st.floats(-1.5, 1.5)] * 3),
+    velocity=st.tuples(*[st.floats(-3, 3)] * 3),
+    moments=st.lists(st.floats(0, 4), min_size=1, max_size=8),
+)
+@settings(max_examples=40, deadline=None)
+def test_a_steady_movement_is_met_exactly(rate, velocity, moments):
+    def pose(t):
+        return RigidTransform(rotation_exp(np.array(rate) * t), np.array(velocity) * t)
+
+    rows = (0.0, 0.7, 1.0, 2.2, 3.0, 4.0)
+    timed = TimedPoses(rows, tuple(pose(t) for t in rows))
+    for t, found in zip(moments, interpolate(timed, moments, 1.3), strict=True):
+        np.testing.assert_allclose(found.matrix34, pose(t).matrix34, atol=1e-9)
+
+
+def test_the_sign_of_a_quaternion_does_not_turn_the_long_way(tmp_path):
+    q = Rotation.from_rotvec([0, 0, np.deg2rad([10])[0]]).as_quat()
+    text = "0 0 0 0 0 0 0 1\n1 0 0 0 {} {} {} {}\n".format(*(-q))
+    (found,) = interpolate(read(tmp_path, text), [0.5], 1.0)
+    assert np.degrees(np.arctan2(found.rotation[1, 0], found.rotation[0, 0])) == pytest.approx(5.0)
+
+
+def test_gaps_and_ends_have_no_pose():
+    still = RigidTransform.identity()
+    timed = TimedPoses((0.0, 1.0, 4.0, 5.0), (still,) * 4)
+    at = (-0.1, 0.0, 0.5, 1.0, 1.1, 3.9, 4.0, 4.5, 5.0, 5.1)
+    found = interpolate(timed, at, 1.0)
+    assert [f is not None for f in found] == [False, True, True, True, False, False, True, True, True, False]
+    assert coverage(found, at, "truth") == (
+        "no truth for 4 of 10 frames, in 3 stretches: first at 0.00 s, last at 5.20 s of the sequence",
+    )
+    assert coverage(found[1:4], at[1:4], "truth") == ()
+
+
+def test_no_common_time_names_both_ranges():
+    with pytest.raises(InputError, match=r"from 10\.000 to 12\.000 s, the frames from 0\.000 to 9\.000 s") as caught:
+        interpolate(QUARTER, [0.0, 9.0], 1.0)
+    assert caught.value.remedy
+
+
+def test_one_row_and_no_times():
+    alone = TimedPoses((1.0,), QUARTER.poses[1:])
+    assert [f is not None for f in interpolate(alone, [0.5, 1.0], 1.0)] == [False, True]
+    with pytest.raises(InputError, match="has no times"):
+        interpolate(TimedPoses(None, QUARTER.poses), [0.0], 1.0)

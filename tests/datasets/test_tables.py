@@ -1,0 +1,66 @@
+"""Tables in text files: columns, names, lines."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from datasets.tables import read_table
+from stages.errors import InputError
+
+
+def table(tmp_path, text, encoding="utf-8"):
+    path = tmp_path / "t.csv"
+    path.write_bytes(text.encode(encoding))
+    return read_table(path, "table")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "#time [s], a ,B\n1,2,3\n4,5,6\n",
+        "time [s],a,B\r\n1,2,3\r\n\r\n4,5,6",
+        "# a file\n# by a program\ntime [s];a;B\n1;2;3\n4;5;6\n",
+        "time [s],a,B\n1,2,3,\n# a remark\n4,5,6,\n",
+    ],
+)
+def test_commas_semicolons_and_remarks(tmp_path, text):
+    t = table(tmp_path, text)
+    assert t.header == ("time [s]", "a", "b")
+    np.testing.assert_array_equal(t.numbers([0, 2]), [[1, 3], [4, 6]])
+    assert t.commas
+
+
+def test_blanks_and_a_byte_order_mark(tmp_path):
+    t = table(tmp_path, "# t x y\n1.5  -2e3 .5\n\n2.5 0 1\n", "utf-8-sig")
+    assert t.header == ("t", "x", "y")
+    assert t.lines == (2, 4)
+    assert t.text(1) == ["-2e3", "0"]
+    np.testing.assert_array_equal(t.numbers([0, 1, 2]), [[1.5, -2000, 0.5], [2.5, 0, 1]])
+
+
+def test_names_that_do_not_fit_the_columns_are_none(tmp_path):
+    assert table(tmp_path, "# recorded in the yard\n1 2 3\n").header == ()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("1,2,3\n4,5\n", r"t\.csv, line 2: 2 columns where the first row has 3"),
+        ("1,2,3\n4,five,6\n", r"t\.csv, line 2: 'five' is not a finite number"),
+        ("1,2,3\n4,nan,6\n", r"t\.csv, line 2: 'nan' is not a finite number"),
+        ("time,x\n", r"t\.csv has no rows of numbers"),
+    ],
+)
+def test_what_is_wrong_names_the_line(tmp_path, text, message):
+    with pytest.raises(InputError, match=message) as caught:
+        table(tmp_path, text).numbers([0, 1])
+    assert caught.value.remedy
+
+
+def test_a_missing_or_binary_file(tmp_path):
+    with pytest.raises(InputError, match="cannot be read"):
+        read_table(tmp_path / "none.csv", "table")
+    (tmp_path / "b.csv").write_bytes(b"\xff\xfe\x00\x80")
+    with pytest.raises(InputError, match="cannot be read"):
+        read_table(tmp_path / "b.csv", "table")

@@ -1,0 +1,107 @@
+"""Time stamps: unit, order, gaps."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from datasets.times import UNITS, gaps, seconds
+from stages.errors import InputError
+
+
+@pytest.mark.parametrize(
+    ("first", "step"),
+    [
+        ("1403715273262142976", 50_000_000),
+        ("1403715273262142", 50_000),
+        ("1403715273262", 50),
+        ("1403715273", 1),
+    ],
+    ids=["ns", "us", "ms", "s"],
+)
+def test_stamps_since_1970_tell_their_unit(first, step):
+    stamps = [str(int(first) + k * step) for k in range(4)]
+    times, warnings = seconds(stamps, "stamps")
+    assert int(times[0]) == 1403715273
+    np.testing.assert_allclose(np.diff(times), 1.0 if step == 1 else 0.05, atol=3e-7)
+    assert warnings == ()
+
+
+def test_digits_survive_until_the_division():
+    # as a float64 the stamp itself would already be 64 ns off
+    times, _ = seconds(["1403715273262142977", "1403715274262142977"], "stamps")
+    assert times[0] == float(Fraction(1403715273262142977, 10**9))
+
+
+def test_small_stamps_are_seconds_unless_stated():
+    assert seconds([0, 0.1, np.float64(0.2)], "t")[0] == (0.0, 0.1, 0.2)
+    assert seconds([0, 100, 200], "t", unit="ms")[0] == (0.0, 0.1, 0.2)
+    assert seconds([np.int64(0), np.int64(10**8)], "t", unit="ns")[0] == (0.0, 0.1)
+    assert seconds([], "t") == ((), ())
+
+
+def test_small_stamps_in_a_larger_unit_are_conspicuous():
+    _, warnings = seconds([0, 50_000_000, 100_000_000], "t")
+    assert warnings == ("times of t are 5e+07 s apart, taken for s: state the unit if they are not",)
+
+
+def test_a_gap_is_a_line_with_its_figure():
+    t = [0.0, 0.1, 0.2, 1.7, 1.8, 2.3, 2.4, 2.5]
+    _, warnings = seconds(t, "times.txt", lines=range(11, 19))
+    assert warnings == ("times of times.txt: 2 gaps, the longest of 1.5 s after line 13 where 0.1 s is usual",)
+    # one missing frame is common
+    assert gaps([0, 1, 2, 4, 5], "t") == ()
+    assert gaps([0, 1, 2, 5, 6], "t") == ("times of t: 1 gap of 3 s where 1 s is usual",)
+
+
+@pytest.mark.parametrize(
+    ("stamps", "message"),
+    [
+        (["1403715273262142976", "1403715273312"], r"line 22: .*mixed units \(by magnitude ns and ms\)"),
+        (
+            ["0.00", "0.05", "0.10", "150", "200"],
+            r"line 24: time 150 after 0\.10: mixed units \(spacing 0\.05, then 50",
+        ),
+        (["1", "2", "2", "3"], r"line 23: time 2 is there twice"),
+        (["1", "2", "1.5"], r"line 23: time 1\.5 goes back from 2"),
+        (["1", "two"], r"line 22: 'two' is not a time"),
+        (["1", "nan"], r"line 22: 'nan' is not a time"),
+    ],
+)
+def test_what_is_wrong_names_the_line(stamps, message):
+    with pytest.raises(InputError, match=message) as caught:
+        seconds(stamps, "t.csv", lines=range(21, 21 + len(stamps)))
+    assert str(caught.value).startswith("t.csv")
+    assert caught.value.remedy
+
+
+def test_an_unknown_unit():
+    with pytest.raises(InputError, match="unit 'min' of time is unknown"):
+        seconds([1, 2], "t", unit="min")
+
+
+def test_a_pause_is_not_a_change_of_unit():
+    # the jump is large, but what follows is spaced as before
+    times, warnings = seconds([0.0, 0.1, 0.2, 200.0, 200.1, 200.2], "t")
+    assert times[3] == 200.0
+    assert len(warnings) == 1
+
+
+@given(
+    steps=st.lists(st.integers(1, 10**12), min_size=1, max_size=20),
+    start=st.integers(0, 2 * 10**18),
+    unit=st.sampled_from(sorted(UNITS)),
+)
+@settings(max_examples=50, deadline=None)
+def test_any_increasing_stamps_of_a_stated_unit(steps, start, unit):
+    stamps = [start + int(v) for v in np.cumsum(steps)]
+    try:
+        times, _ = seconds(stamps, "t", unit=unit)
+    except InputError as error:
+        assert "mixed units" in str(error)  # noqa: PT017 - random steps may look like it
+        return
+    assert times == tuple(float(Fraction(s, UNITS[unit])) for s in stamps)

@@ -1,0 +1,319 @@
+"""A finished run made of synthetic artifacts, and a reader of its page."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from datasets.protocol import Sequence
+from pipeline.reconstruct import Products
+from pipeline.report import RunView, TaskRow, canvas, write_report
+from stages.accuracy import metric as figure
+from stages.accuracy import trajectory_accuracy
+from stages.declare import Bundle
+from stages.dem_accuracy import dem_accuracy
+from stages.epipolar import corrected
+from stages.geometry import Camera, Rig, RigidTransform
+from stages.lattice import Lattice
+from stages.path_check import path_check
+from stages.vehicle import Vehicle
+
+CELL, ROWS, COLS = 0.01, 60, 80
+LATTICE = {"x0": -0.4, "y0": 0.8, "cell": CELL, "rows": ROWS, "cols": COLS}
+FRAMES = tuple(range(6))
+BASIC = (0, 4)
+STEP = np.array([0.015, 0.030, 0.0])
+
+
+def level_pose(position: np.ndarray) -> RigidTransform:
+    """Optical camera at ``position``, looking along y."""
+    return RigidTransform(np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]]), position)
+
+
+CAMERA = Camera(60.0, 60.0, 31.5, 23.5, 64, 48)
+RIG = Rig(CAMERA, CAMERA, RigidTransform(np.eye(3), np.array([-0.097, 0.0, 0.0])))
+REPAIRED = corrected(RIG, np.array([0.01, 0, 0, 0, 0]))
+"""Pitch of 0.01 rad: 0.6 px of 60 px of focal length at the image's centre."""
+
+
+def sequence(*, truth: bool) -> Sequence:
+    # The truth's own world is turned and shifted: only alignment by the first frame brings it here.
+    turn = RigidTransform(np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1.0]]), np.array([5.0, 6.0, 7.0]))
+    poses = tuple(turn @ level_pose(i * STEP) for i in FRAMES) if truth else None
+    return Sequence(
+        name="bed <1>",
+        rig=RIG,
+        frames=len(FRAMES),
+        image=lambda frame, camera: None,  # type: ignore[arg-type,return-value]
+        frame_names=tuple(f"left{i:03d}" for i in FRAMES),
+        truth=poses,
+        truth_source="exact poses" if truth else "",
+        notes=("Rendered for a test.",),
+    )
+
+
+def bundles() -> dict[str, Bundle]:
+    """Artifacts of a run of six frames and two basic pairs, by the name of their handle."""
+    rng = np.random.default_rng(7)
+    y, x = np.mgrid[0:ROWS, 0:COLS]
+    z = (-0.18 + 0.01 * np.sin(x / 9.0) * np.cos(y / 7.0)).astype(np.float32)
+    z[:5, :9] = np.nan
+    risk = np.zeros((ROWS, COLS), dtype=np.uint8)
+    risk[20:30, 50:60] = 1
+    risk[:5, :9] = 2
+    rows = np.arange(ROWS - 1, 9, -1)
+    path = np.column_stack([np.zeros(len(rows)), 0.8 - CELL * rows, np.full(len(rows), -0.18)])
+    cost = np.where(risk == 0, 0.001 * (ROWS - y), np.nan).astype(np.float32)
+    sigma = np.where(np.isfinite(z), 5e-4, np.nan).astype(np.float32)
+    dem = {"elevation": z, "elevation_std": sigma, "ortho": (z - z[30, 30] + 0.5) * 100}
+    lattice = {"lattice": LATTICE}
+    path_meta = {
+        "found": True,
+        "reason": "",
+        "blocking_row": None,
+        "blocking_y": None,
+        "target_row": 10,
+        "length_m": 0.49,
+        "climb_m": 0.004,
+        "max_inclination": 0.1,
+        "grid": {"ahead": [0.0, 1.0], "i0": -40, "j0": 80, "cell": CELL, "rows": ROWS, "cols": COLS},
+    }
+    poses = np.array([level_pose(i * STEP).matrix34 for i in FRAMES])
+    count = np.where(np.isfinite(z), 2, 0).astype(np.uint16)
+    made = {
+        "tile": Bundle({**dem, "count": count, "spread": sigma}, lattice),
+        "risk": Bundle({"risk": risk, "inclination": np.full((ROWS, COLS), 0.1, dtype=np.float32)}, lattice),
+        "path": Bundle({"path": path, "cost_to_go": cost, "reachable": (risk[10] == 0).astype(np.uint8)}, path_meta),
+        "trajectory": Bundle(
+            {
+                "poses": poses,
+                "covariance": np.tile(1e-8 * np.eye(6), (6, 1, 1)),
+                "segment": np.array([0, 0, 0, 0, 0, 1], dtype=np.int16),
+            },
+            {"frames": list(FRAMES)},
+        ),
+    }
+    error = np.where(np.isfinite(z), 4e-4, np.nan).astype(np.float32)
+    judged = dem_accuracy(z, z - error, np.ones(z.shape, dtype=bool))
+    made["dem_accuracy"] = Bundle({"error": error}, {**lattice, "metrics": judged})
+    _, assessed = trajectory_accuracy(poses, poses)
+    made["accuracy"] = Bundle({}, {"metrics": assessed})
+    _, checked = path_check(path, risk, Lattice.from_dict(LATTICE))
+    made["path_check"] = Bundle({}, {"metrics": checked})
+    for frame in FRAMES:
+        image = rng.integers(0, 255, (48, 64)).astype(np.uint8)
+        made[f"image{frame}"] = Bundle({"image": image}, {"frame": frame})
+    for number, segment in enumerate(((0, 1, 2, 3, 4), (4, 5))):
+        points = rng.uniform(5, 40, (12, 1, 2)) + 2.0 * np.arange(len(segment))[None, :, None]
+        points[3, 2:] = np.nan
+        facts = [{"frame": f, "landmarks": 12, "inliers": 11, "rms_px": 0.2 + 0.01 * f} for f in segment]
+        made[f"track{number}"] = Bundle({"points": points.astype(np.float32)}, {"frames": list(segment)})
+        made[f"resect{number}"] = Bundle(
+            {"inlier": np.ones((12, len(segment)), dtype=np.uint8)},
+            {"per_frame": facts, "landmark_source": "disparity"},
+        )
+    column = np.full((48, 64), -8.0, dtype=np.float32)
+    column[:4] = np.nan
+    validity = np.where(np.isfinite(column), 1, 16).astype(np.uint8)
+    for pair in BASIC:
+        made[f"disparity{pair}"] = Bundle(
+            {"column_disparity": column, "row_disparity": 0.1 * column, "validity": validity}, {}
+        )
+        made[f"level{pair}"] = Bundle({}, {"source": "pitch"})
+        # The second model lies 3 mm above the first.
+        made[f"world_dem{pair}"] = Bundle({"elevation": z + np.float32(7.5e-4 * pair), "elevation_std": sigma}, lattice)
+        made[f"orientation{pair}"] = orientation()
+        made[f"local_dem{pair}"] = Bundle(dem, {**lattice, "defined": 0.9, "median_elevation_std": 5e-4})
+        metrics = {"rmse": figure(1e-3 * (1 + pair), "m", "x"), "completeness": figure(0.9 - 0.05 * pair, "1", "x")}
+        made[f"local_dem_accuracy{pair}"] = Bundle({}, {"metrics": metrics})
+        made[f"local_risk{pair}"] = made["risk"]
+        made[f"local_path{pair}"] = made["path"]
+    return made
+
+
+def orientation() -> Bundle:
+    """Points at infinity whose right images fit the repaired rig exactly, and one outlier."""
+    left = np.array([[x, y] for x in range(4, 60, 8) for y in range(4, 44, 8)], dtype=np.float32)
+    rays = CAMERA.rays(left.astype(np.float64)) @ REPAIRED.T_right_left.rotation.T
+    right = (rays[:, :2] / rays[:, 2:] * 60.0 + [31.5, 23.5]).astype(np.float32)
+    right[0, 1] += 40
+    weight = np.ones(len(left), dtype=np.float32)
+    weight[0] = 0
+    return Bundle({"left": left, "right": right, "weight": weight}, {"residual_before_px": 0.6})
+
+
+def checks() -> dict[str, Bundle]:
+    """Artifacts by which a run checks itself: the rig repaired, the other program's poses, the choice of pairs."""
+    names = ("pitch", "yaw", "roll")
+    parameter = {"unit": "deg", "sigma": 0.001, "asked": 0.573}
+    freed = {"name": "pitch", "value": 0.573, "freed": True, "why": "contradicted"}
+    held = {"name": "yaw", "value": 0.0, "freed": False, "why": "not observed <>"}
+    rig = {
+        "rig": REPAIRED.to_dict(),
+        "given": RIG.to_dict(),
+        "changed": True,
+        "mode": "pooled",
+        "source": "given calibration, pitch repaired from 2 pairs",
+        "parameters": [parameter | freed, parameter | held],
+        "per_pair": [
+            {"pair": k, "values": dict.fromkeys(names, 0.5), "sigma": dict.fromkeys(names, 0.1)} for k in BASIC
+        ],
+        "residual_before_px": 0.6,
+        "residual_after_px": 0.0,
+        "warnings": ["the calibration contradicts the images: rows are off by 0.60 px; repaired"],
+    }
+    theirs = np.array([level_pose(i * STEP + [0.002 * (i == 3), 0, 0]).matrix34 for i in FRAMES])
+    theirs[5] = np.nan
+    distance = np.array([0, 0, 0, 0.002, 0, np.nan])
+    agreement = {
+        "poses": theirs,
+        "distance": distance,
+        "angle": np.radians([0, 0, 0, 0.5, 0, np.nan]),
+        "step_distance": np.array([np.nan, 0, 0, 0.002, 0.002, np.nan]),
+        "step_angle": np.zeros(6),
+        "flagged": np.array([0, 0, 0, 1, 0, 0], dtype=np.uint8),
+    }
+    compared = {
+        "frames": list(FRAMES),
+        "metrics": {"rmse": figure(9e-4, "m", "RMS"), "scale_ratio": figure(1.002, "1", "scale")},
+        "rule": "disagreement above the median",
+        "limits": {"distance": 0.001, "angle": 0.1, "step_distance": None, "step_angle": None},
+        "flagged": [{"frame": 3, "why": ["position", "rotation"]}],
+        "pieces": 1,
+    }
+    exact = np.array([i * STEP for i in FRAMES])
+    _, assessed = trajectory_accuracy(theirs, np.array([level_pose(p).matrix34 for p in exact]))
+    judged = {"position": theirs[:, :, 3], "position_truth": exact}
+    select = {
+        "basic": list(BASIC),
+        "overlap": [None, 0.72],
+        "why": ["first frame", "overlap"],
+        "rule": "overlap 0.7",
+        "displacement": [3.0, 3.5, None, 4.0, 4.5],
+        "warnings": [],
+    }
+    return {
+        "rig": Bundle({}, rig),
+        "agreement": Bundle(agreement, compared),
+        "crosscheck": Bundle({"poses": theirs}, {"frames": list(FRAMES)}),
+        "crosscheck_accuracy": Bundle(judged, {"metrics": assessed, "frames": list(FRAMES)}),
+        "select": Bundle({}, select),
+    }
+
+
+def checked() -> Products:
+    """Handles of a run that also checks itself."""
+    found: Any = products()
+    found.rigs, found.orientations = dict.fromkeys(BASIC, "rig"), {k: f"orientation{k}" for k in BASIC}
+    found.agreement, found.crosscheck, found.crosscheck_accuracy = "agreement", "crosscheck", "crosscheck_accuracy"
+    found.select = "select"
+    return found  # type: ignore[no-any-return]
+
+
+def products() -> Products:
+    def each(name: str, numbers: tuple[int, ...]) -> dict[int, Any]:
+        return {n: f"{name}{n}" for n in numbers}
+
+    found: Any = Products(
+        images=each("image", FRAMES),
+        disparity=each("disparity", BASIC),
+        level=each("level", BASIC),
+        local_dem=each("local_dem", BASIC),
+        local_risk=each("local_risk", BASIC),
+        local_path=each("local_path", BASIC),
+        world_dem=each("world_dem", BASIC),
+        local_dem_accuracy=each("local_dem_accuracy", BASIC),
+    )
+    found.tracks, found.resections, found.tiles = ["track0", "track1"], ["resect0", "resect1"], ["tile"]
+    found.trajectory, found.risk, found.path, found.dem_accuracy = "trajectory", "risk", "path", "dem_accuracy"
+    found.accuracy, found.path_check = "accuracy", "path_check"
+    return found  # type: ignore[no-any-return]
+
+
+TASKS = (
+    TaskRow("hfvm/0", "hfvm", "computed", 2.0),
+    TaskRow("hfvm/4", "hfvm", "cached", 4.0),
+    TaskRow("locus/local/0", "locus", "computed", 1.0),
+    TaskRow("locus/local/4", "locus", "computed", 1.0),
+    TaskRow("locus/world/0", "locus", "cached", 0.5),
+    TaskRow("risk/local/0", "risk", "computed", 0.1),
+    TaskRow("path/local/0", "path", "computed", 0.1),
+    TaskRow("track/0", "track", "computed", 0.3),
+    TaskRow("resect/0", "resect", "computed", 0.2),
+    TaskRow("pyramid/left/0", "pyramid", "cached", 0.05),
+)
+
+
+def view(made: dict[str, Bundle] | None = None, *, truth: bool = True, **changes: Any) -> RunView:
+    store = bundles() if made is None else made
+    base = RunView(
+        run_id="20260101T000000Z-abcdef12",
+        sequence=sequence(truth=truth),
+        frames=FRAMES,
+        products=products(),
+        bundle=lambda handle: store.get(handle) if isinstance(handle, str) else None,
+        tasks=TASKS,
+        config=SimpleNamespace(vehicle=Vehicle()),
+        config_toml="[locus]\ncell_size = 0.01  # <m>\n",
+        seconds=12.3,
+        versions={"rille": "0.1.0", "numpy": "2.4"},
+        command="rille reconstruct bed",
+        vehicle_source="sequence",
+    )
+    return replace(base, **changes)
+
+
+class Page(HTMLParser):
+    """Text in reading order, addresses, identifiers, images."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.words: list[str] = []
+        self.addresses: list[str] = []
+        self.ids: list[str] = []
+        self.images: list[dict[str, Any]] = []
+        self._hidden = False
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        found = dict(attrs)
+        self._hidden = tag == "style"
+        self.addresses += [str(found[k]) for k in ("src", "href", "srcset", "action", "data", "poster") if k in found]
+        self.ids += [str(found["id"])] if "id" in found else []
+        self.images += [found] if tag == "img" else []
+        assert tag not in {"script", "link", "iframe", "object", "embed"}
+
+    def handle_endtag(self, tag: str) -> None:
+        self._hidden = self._hidden and tag != "style"
+
+    def handle_data(self, data: str) -> None:
+        if not self._hidden:
+            self.words.append(data)
+
+    @property
+    def text(self) -> str:
+        return " ".join(" ".join(self.words).split())
+
+
+def _blank(fig: object, alt: str, *, photo: bool = False) -> canvas.Panel:
+    return canvas.Panel("data:image/png;base64,", alt, 1, 1)
+
+
+Written = tuple[dict[str, Any], Page, str, Path]
+
+
+def written(folder: Path, run: RunView, *, pictures: bool = False) -> Written:
+    """The report's facts, page and text; without ``pictures`` the figures are laid out, but not painted."""
+    with pytest.MonkeyPatch.context() as patch:
+        if not pictures:
+            patch.setattr(canvas, "encode", _blank)
+        write_report(folder, run)
+    html = (folder / "report.html").read_text(encoding="utf-8")
+    return json.loads((folder / "report.json").read_text(encoding="utf-8")), Page(html), html, folder
