@@ -17,12 +17,15 @@ from pydantic import Field
 
 from stages.accuracy import Metric, angles_between, by_frame, metric, posed
 from stages.declare import AnyArray, Array, Bundle, Inputs, Params, Stage
-from stages.pose_alignment import align, moved
+from stages.pose_alignment import align, moved, spread
 
 Floats = NDArray[np.float64]
 
 ORIENTATION_SHARE = 0.1
 """Positions decide the alignment, as in an absolute trajectory error; orientations only where positions cannot."""
+
+REST = 10.0
+"""Spread of the positions over the noise of a step, below which a camera rests: its positions tell no direction."""
 
 REASONS: Mapping[str, tuple[int, str]] = {
     "distance": (1, "position"),
@@ -64,7 +67,7 @@ def compare(ours: Floats, theirs: Floats, piece: NDArray[np.integer[Any]]) -> tu
     Arrays ``poses`` (frame, 3, 4): theirs in the world; ``distance`` m, ``angle`` rad of each frame; ``step_distance``
     m, ``step_angle`` rad of the motion since the frame before. NaN where not both have poses, or a piece shares fewer
     than two frames with us. Facts: ``scale_ratio``, the scale that would fit theirs to ours best (None for a camera
-    at rest), and ``rmse_scaled_m`` with it.
+    at rest, whose orientations alone align it), and ``rmse_scaled_m`` with it.
     """
     n = len(ours)
     arrays = {name: np.full(n, np.nan) for name in REASONS} | {"poses": np.full((n, 3, 4), np.nan)}
@@ -73,18 +76,26 @@ def compare(ours: Floats, theirs: Floats, piece: NDArray[np.integer[Any]]) -> tu
         rows = np.flatnonzero(there & (piece == number))
         if len(rows) < 2:
             continue
-        laid = moved(theirs, *align(theirs[rows], ours[rows], ORIENTATION_SHARE))
+        _steps(arrays, ours, theirs, rows)
+        rests = _at_rest(ours[rows], arrays["step_distance"][rows])
+        laid = moved(theirs, *align(theirs[rows], ours[rows], math.inf if rests else ORIENTATION_SHARE))
         arrays["poses"][piece == number] = laid[piece == number]
         arrays["distance"][rows] = np.linalg.norm(laid[rows, :, 3] - ours[rows, :, 3], axis=1)
         arrays["angle"][rows] = angles_between(laid[rows], ours[rows])
         a, b = (p[rows, :, 3] - p[rows, :, 3].mean(axis=0) for p in (laid, ours))
-        cross, square = cross + float(np.sum(a * b)), square + float(np.sum(a * a))
-        left.append((a, b))
-        _steps(arrays, ours, laid, rows)
+        if not rests:
+            cross, square = cross + float(np.sum(a * b)), square + float(np.sum(a * a))
+            left.append((a, b))
     scale = cross / square if square > 0 and cross > 0 else None
     rest = np.concatenate([b - scale * a for a, b in left]) if scale is not None else None
     scaled = None if rest is None else float(np.sqrt(np.mean(np.sum(rest**2, axis=1))))
     return arrays, {"scale_ratio": scale, "rmse_scaled_m": scaled}
+
+
+def _at_rest(poses: Floats, step_distance: Floats) -> bool:
+    """Whether all positions lie within what the two trajectories differ by from step to step."""
+    known = step_distance[np.isfinite(step_distance)]
+    return bool(known.size and spread(poses) < REST * np.sqrt(np.mean(known**2)))
 
 
 def _steps(arrays: dict[str, Floats], ours: Floats, laid: Floats, rows: NDArray[np.intp]) -> None:

@@ -14,6 +14,9 @@ from stages.accuracy import umeyama
 
 Floats = NDArray[np.float64]
 
+REST_LEVER = 1.0
+"""m, lever of a camera at rest: far beyond the millimetres of its positions."""
+
 
 def spread(poses: Floats) -> float:
     """RMS distance of the positions of poses (n, 3, 4) from their mean, metres."""
@@ -25,11 +28,11 @@ def align(source: Floats, target: Floats, share: float) -> tuple[Floats, Floats]
     """Rotation (3, 3) and translation (3,) that bring poses (n, 3, 4) nearest to others of the same frames.
 
     ``share`` is the lever over the spread of the target's positions: how much orientations count beside positions.
-    A camera at rest has no spread; its lever is 1 m, which changes nothing, since then the orientations alone decide.
+    A camera at rest has no spread but noise; infinity lets the orientations alone decide.
     """
     lever = share * spread(target)
-    if lever < 1e-6:
-        lever = 1.0
+    if lever < 1e-6 or not np.isfinite(lever):
+        lever = REST_LEVER
     return umeyama(_points(source, lever), _points(target, lever))
 
 

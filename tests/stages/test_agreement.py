@@ -171,3 +171,13 @@ def test_nothing_to_compare_is_a_fact() -> None:
     arrays, facts = compare(ours, ours, np.full(4, -1))
     assert np.isnan(arrays["distance"]).all()
     assert facts["scale_ratio"] is None
+
+
+def test_a_resting_camera_is_aligned_by_its_orientations() -> None:
+    rest = np.tile(np.eye(4)[:3], (20, 1, 1))
+    ours = noisy(rest, 1, shift=2e-4, turn=1e-4)
+    theirs = moved(noisy(rest, 2, shift=2e-4, turn=1e-4), rotation_exp([0.4, -1.0, 2.0]), np.zeros(3))
+    out = run(ours, theirs)
+    # the mean of 20 noisy orientations on either side: a few 1e-4 rad in all, not the chance of the noise's shape
+    assert out.meta["metrics"]["rmse_rotation"]["value"] < math.degrees(5e-4)
+    assert out.meta["scale_ratio"] is None
