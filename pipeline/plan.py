@@ -22,6 +22,9 @@ from pipeline.store import Store
 REASONS = 3
 """Different reasons told a stage; ``verbose`` tells each task's."""
 
+WIDTH = 80
+"""Characters of a reason in the table."""
+
 BEHIND = "input "
 """Begin of the reason of a task that only follows from another one."""
 
@@ -60,11 +63,15 @@ def describe(
 def _reasons(planned: list[Handle]) -> list[str]:
     """The reasons of a stage's tasks, own ones first, the most frequent first, with their number."""
     own = Counter(h.reason for h in planned if not h.reason.startswith(BEHIND))
-    told = [f"{reason} ({n})" for reason, n in own.most_common(REASONS)]
+    told = [f"{_short(reason)} ({n})" for reason, n in own.most_common(REASONS)]
     if len(own) > REASONS:
         told.append(f"{len(own) - REASONS} other reasons")
     follow = len(planned) - own.total()
     return told + ([f"an input is to be computed ({follow})"] if follow else [])
+
+
+def _short(reason: str) -> str:
+    return reason if len(reason) <= WIDTH else reason[: WIDTH - 3] + "..."
 
 
 def _totals(graph: Graph, result: Result, seconds: dict[str, float], jobs: int) -> Iterable[str]:

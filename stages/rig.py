@@ -41,6 +41,9 @@ LEAST_OF_A_PAIR = 200
 BAD_ROWS = 1.0
 """Pixels RMS of what no rig explains: an image whose lens distortion was not removed, or a wrong camera."""
 
+SWAPPED = 0.5
+"""Share of the matches beyond infinity that no error of a calibration explains."""
+
 
 class RigParams(RelativeParams):
     """Parameters of the stage ``rig``."""
@@ -68,7 +71,7 @@ def orient_rig(given: Rig, pairs: Sequence[Matches], params: RigParams) -> dict[
     Raises
     ------
     InputError
-        The cameras share one projection centre.
+        The cameras share one projection centre, or their images are swapped.
     """
     if not given.baseline > 0:
         raise InputError("the rig's baseline is 0 m", remedy="give T_right_left with a translation in metres")
@@ -98,9 +101,16 @@ def _judged(given: Rig, pairs: list[Matches], params: RigParams) -> dict[str, An
     applied = params.mode != "fixed" and decision.changed
     rig = corrected(given, decision.correction) if applied else given
     per_pair = [_alone(given, m, decision, params) for m in pairs]
+    share = impossible_share(rig, pairs, decision.fit)
+    if share > SWAPPED:
+        raise InputError(
+            f"{100 * share:.0f} % of the matches lie beyond infinity: left and right are swapped, or the baseline "
+            "points the other way",
+            remedy="exchange the left and the right images, or the sign of the baseline",
+        )
     residuals = _residuals(given, rig, pairs, decision)
     warnings = _contradiction(given, pairs, decision, params.mode)
-    warnings += _doubts(rig, pairs, decision, residuals["residual_after_px"])
+    warnings += _doubts(share, residuals["residual_after_px"])
     warnings += _drift(given, pairs, per_pair, params)
     return {
         "rig": rig.to_dict(),
@@ -177,7 +187,7 @@ def _contradiction(given: Rig, pairs: Sequence[Matches], decision: Decision, mod
     return lines
 
 
-def _doubts(rig: Rig, pairs: Sequence[Matches], decision: Decision, residual: float) -> list[str]:
+def _doubts(share: float, residual: float) -> list[str]:
     """Signs that something other than the rig's orientation is wrong."""
     lines = []
     if residual > BAD_ROWS:
@@ -185,12 +195,8 @@ def _doubts(rig: Rig, pairs: Sequence[Matches], decision: Decision, residual: fl
             f"matches lie {residual:.1f} px RMS off their epipolar lines: is lens distortion left in the images, or "
             "the wrong calibration given?"
         )
-    share = impossible_share(rig, pairs, decision.fit)
     if share > BEYOND_SHARE:
-        lines.append(
-            f"{100 * share:.0f} % of the matches lie beyond infinity: the toe-in is wrong, or left and right are "
-            "swapped"
-        )
+        lines.append(f"{100 * share:.0f} % of the matches lie beyond infinity: the toe-in is wrong")
     return lines
 
 

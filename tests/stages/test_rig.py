@@ -119,7 +119,8 @@ def test_a_rig_that_moves_is_told():
 
 def test_swapped_images_lie_beyond_infinity():
     pairs = [Matches(m.pair, m.right, m.left) for m in street(2)]
-    assert any("left and right are swapped" in line for line in facts(street_rig(), pairs)["warnings"])
+    with pytest.raises(InputError, match="left and right are swapped"):
+        facts(street_rig(), pairs)
 
 
 def test_distortion_that_was_left_is_told():
