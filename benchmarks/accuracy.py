@@ -19,6 +19,9 @@ COLUMNS = (
     ("trajectory_drift", "drift"),
     ("trajectory_rpe_translation_rmse", "RPE a frame"),
     ("trajectory_ate_rmse", "ATE"),
+    ("crosscheck_drift", "COLMAP's drift"),
+    ("crosscheck_ate_rmse", "COLMAP's ATE"),
+    ("agreement_share", "RMS distance to COLMAP"),
     ("dem_pairs_rmse_max", "DEM RMSE, worst pair"),
     ("dem_pairs_completeness_min", "completeness, worst pair"),
     ("dem_merged_rmse", "merged DEM RMSE"),
@@ -32,10 +35,11 @@ def sequences() -> list[str]:
     return [*found, str(street)] if street.is_dir() else found
 
 
-def report(sequence: str, cold: bool) -> dict[str, Any]:
+def report(sequence: str, settings: list[str], cold: bool) -> dict[str, Any]:
     with tempfile.TemporaryDirectory(prefix="rille-bench-") as folder:
         cache = ["--cache", f"{folder}/cache"] if cold else []
         command = [sys.executable, "-m", "pipeline.cli", "reconstruct", sequence, "--runs", f"{folder}/runs", *cache]
+        command += [word for setting in settings for word in ("--set", setting)]
         subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
         path = next(Path(folder).glob("runs/*/latest/report.json"))
         found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
@@ -52,10 +56,11 @@ def cell(metric: dict[str, Any] | None) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("sequences", nargs="*", help="names or folders; the mockup and the street by default")
+    parser.add_argument("--set", action="append", default=[], help="a parameter, section.key=value, of every run")
     parser.add_argument("--cold", action="store_true", help="start from an empty cache")
     parser.add_argument("--json", type=Path, help="write the metrics there too")
     given = parser.parse_args()
-    found = {s: report(s, given.cold) for s in given.sequences or sequences()}
+    found = {s: report(s, given.set, given.cold) for s in given.sequences or sequences()}
     print("| sequence | frames | seconds | " + " | ".join(words for _, words in COLUMNS) + " |")
     print("|---" * (3 + len(COLUMNS)) + "|")
     for r in found.values():
