@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from pipeline import run
@@ -13,8 +14,10 @@ from pipeline import run
 pytestmark = pytest.mark.slow
 
 
-def metrics(sequence: str, folder: Path) -> dict[str, Any]:
-    options = run.Options(sequence, runs=folder / "runs", cache=folder / "cache", progress="quiet")
+def metrics(sequence: str, folder: Path, *settings: str) -> dict[str, Any]:
+    options = run.Options(
+        sequence, assignments=settings, runs=folder / "runs", cache=folder / "cache", progress="quiet"
+    )
     assert run.reconstruct(options) == 0
     report = json.loads(next(folder.glob("runs/*/latest/report.json")).read_text())
     assert report["complete"]
@@ -32,8 +35,44 @@ def test_mockup(tmp_path: Path) -> None:
     assert m["path_check_path_length"] >= 0.6
 
 
+def test_mockup_with_a_rig_that_is_half_a_degree_off(tmp_path: Path) -> None:
+    m = metrics("mockup", tmp_path, "mockup.rig_error_deg=[0.5,0.5,0.5]", "crosscheck.enabled=false")
+    assert m["rig_residual_given"] > 5.0
+    assert m["rig_residual"] < 0.2
+    assert m["trajectory_drift"] <= 0.25
+
+
+def test_mockup_that_creeps(tmp_path: Path) -> None:
+    creeping = ("mockup.forward=0.0005", "mockup.sideways=0", "mockup.frames=12", "crosscheck.enabled=false")
+    metrics("mockup", tmp_path, *creeping)
+    poses = np.loadtxt(next(tmp_path.glob("runs/*/latest/trajectory.kitti"))).reshape(-1, 3, 4)
+    steps = np.linalg.norm(np.diff(poses[:, :, 3], axis=0), axis=1)
+    np.testing.assert_allclose(steps, 0.0005, rtol=0.2)
+
+
 @pytest.mark.data
 def test_street(data_dir: Path, tmp_path: Path) -> None:
-    m = metrics(str(data_dir / "kitti06_51"), tmp_path)
+    street = str(data_dir / "kitti06_51")
+    m = metrics(street, tmp_path)
     assert m["frames_posed"] == 51
     assert m["trajectory_drift"] <= 1.2
+    assert m["agreement_share"] <= 2.0
+    knocked = metrics(street, tmp_path, "misalign.rows=3", "misalign.roll_deg=0.3", "crosscheck.enabled=false")
+    assert knocked["trajectory_drift"] <= 1.5 * m["trajectory_drift"]
+    assert knocked["rig_residual"] < 0.25 * knocked["rig_residual_given"]
+
+
+@pytest.mark.data
+def test_rover(data_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("RILLE_DATA", str(data_dir))
+    m = metrics("devon_island", tmp_path)
+    assert m["frames_posed"] == 10
+    assert m["agreement_share"] <= 2.0
+    assert m["safe"] > 0.3
+
+
+@pytest.mark.data
+def test_resting_drone(data_dir: Path, tmp_path: Path) -> None:
+    metrics(str(data_dir / "euroc_still"), tmp_path)
+    poses = np.loadtxt(next(tmp_path.glob("runs/*/latest/trajectory.kitti"))).reshape(-1, 3, 4)
+    assert np.linalg.norm(np.diff(poses[:, :, 3], axis=0), axis=1).sum() < 0.02
