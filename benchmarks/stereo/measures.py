@@ -25,6 +25,11 @@ class Truth:
     u: Map
     v: Map
 
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """Pixels with truth."""
+        return np.isfinite(self.u) & np.isfinite(self.v)
+
 
 @dataclass(frozen=True)
 class Found:
@@ -69,7 +74,7 @@ def judge(found: Found, truth: Truth) -> dict[str, Any]:
     lies in an image of this size; ``bad1..3_matched``, ``median``: of what was matched; ``completeness``: share of the
     pixels with truth that were matched; ``locking``: see :func:`locking`.
     """
-    known = np.isfinite(truth.u) & np.isfinite(truth.v)
+    known = truth.known
     if not known.any():
         raise ValueError("the truth has no valid pixel")
     filled = fill(found)

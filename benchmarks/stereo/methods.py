@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import importlib.util
 import inspect
 import json
+import logging
+import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, get_args
@@ -26,7 +29,6 @@ class Method:
     name: str
     run: Callable[[Pair], Any]
     read: Callable[[Any, Pair], Found]
-    note: str = ""
 
     def __call__(self, pair: Pair) -> Found:
         """Match a pair."""
@@ -95,9 +97,59 @@ def _read_opencv(raw: Any, pair: Pair) -> Found:
 
 
 def pandora() -> list[Method]:
-    """Pandora's census and semi-global matching, where it is installed."""
-    print("Pandora is not installed: left out")
-    return []
+    """Census and semi-global matching of CNES's Pandora, where it and its plugin libsgm are installed.
+
+    The pipeline of its documentation: census 5 x 5, SGM, V-fit, median, accurate cross-check, median. Its own
+    interpolation is left out, since all are filled alike.
+    """
+    missing = [n for n in ("pandora", "pandora_plugin_libsgm") if importlib.util.find_spec(n) is None]
+    if missing:
+        print(f"Pandora is left out: {' and '.join(missing)} not installed (pip install 'pandora[sgm]')")
+        return []
+    return [Method("Pandora", _run_pandora, _read_pandora)]
+
+
+PANDORA = {
+    "matching_cost": {"matching_cost_method": "census", "window_size": 5, "subpix": 1},
+    "optimization": {"optimization_method": "sgm"},
+    "disparity": {"disparity_method": "wta", "invalid_disparity": "NaN"},
+    "refinement": {"refinement_method": "vfit"},
+    "filter.before": {"filter_method": "median"},
+    "validation": {"validation_method": "cross_checking_accurate"},
+    "filter.after": {"filter_method": "median"},
+}
+
+
+def _run_pandora(pair: Pair) -> Any:
+    import pandora
+    from pandora.check_configuration import check_conf
+    from pandora.img_tools import create_dataset_from_inputs
+    from pandora.state_machine import PandoraMachine
+
+    logging.getLogger("transitions").setLevel(logging.ERROR)
+    low, count = pair.range
+    high = low + count - 1
+    with tempfile.TemporaryDirectory() as folder:
+        inputs = {}
+        for side, image, limits in zip(("left", "right"), _padded(pair), ([-high, -low], [low, high]), strict=True):
+            path = f"{folder}/{side}.tif"
+            cv2.imwrite(path, image.astype(np.float32))
+            inputs[side] = {"img": path, "nodata": -9999, "disp": limits}
+        pandora.import_plugin()
+        machine = PandoraMachine()
+        configuration = check_conf({"input": inputs, "pipeline": PANDORA}, machine)
+        images = [create_dataset_from_inputs(configuration["input"][side]) for side in ("left", "right")]
+        return pandora.run(machine, *images, configuration)[0]
+
+
+def _read_pandora(raw: Any, pair: Pair) -> Found:
+    from pandora.constants import Criteria
+
+    before, _ = _margins(pair)
+    cut = np.s_[:, before : before + pair.left.shape[1]]
+    u = raw["disparity_map"].data[cut].astype(np.float64)
+    good = ((raw["validity_mask"].data[cut] & int(Criteria.PANDORA_MSK_PIXEL_INVALID)) == 0) & np.isfinite(u)
+    return Found(np.where(good, u, np.nan), np.where(good, 0.0, np.nan), good, rows=False)
 
 
 def hfvm(variants: list[str], threads: int) -> list[Method]:

@@ -53,7 +53,8 @@ def knocked(pair: Pair, params: MisalignParams) -> Pair:
     pixels = np.stack([x + pair.truth.u, y + pair.truth.v], axis=-1).reshape(-1, 2)
     known = np.isfinite(pixels).all(axis=1)
     moved = np.full(pixels.shape, np.nan)
-    moved[known] = camera.project(camera.rays(pixels[known]) @ turn.T) + [0.0, params.rows]
+    moved[known] = camera.project(camera.rays(pixels[known]) @ turn.T)
+    moved[known, 1] += params.rows
     truth = Truth(moved[:, 0].reshape(x.shape) - x, moved[:, 1].reshape(x.shape) - y)
     return measured(f"{pair.name}, {label(params)}", pair.left, np.asarray(right), truth)
 
@@ -112,7 +113,7 @@ def picture(found: list[dict[str, Any]], path: Path) -> None:
             axis.set_title(pair, fontsize=9)
             axis.grid(alpha=0.3)
             axis.set_ylim(bottom=0)
-            if axis_row is axes[-1]:
+            if pair == pairs[-1]:
                 axis.set_xlabel(words + " of the right image")
         axis_row[0].set_ylabel("off by more than 2 px, %")
     axes[0][0].legend(fontsize=8)

@@ -38,9 +38,19 @@ class Pair:
         """Least disparity and number of disparities, widened to OpenCV's steps."""
         return self.low, -(-(self.high - self.low + 1) // STEP) * STEP
 
+    @property
+    def parallel(self) -> bool:
+        """Whether the truth is known and has no row disparities."""
+        return self.truth is not None and not self.truth.v[self.truth.known].any()
+
+    @property
+    def size(self) -> str:
+        """Width and height in words."""
+        return f"{self.left.shape[1]} x {self.left.shape[0]}"
+
     def searching(self, count: int) -> Pair:
-        """The same pair with ``count`` disparities to search."""
-        return replace(self, high=self.low + count - 1)
+        """The same pair with the disparities 0 to ``count`` - 1 to search."""
+        return replace(self, low=0, high=count - 1)
 
 
 def measured(name: str, left: Grey, right: Grey, truth: Truth, high: int | None = None) -> Pair:
