@@ -72,6 +72,8 @@ def arguments() -> argparse.Namespace:
         parser.error("give --left, --right and --truth together")
     if given.threads < 1 or given.rounds < 1:
         parser.error("--threads and --rounds are at least 1")
+    if given.picture and given.only and "misalignment" not in given.only:
+        parser.error("--picture is drawn by the part misalignment")
     return given
 
 
@@ -204,6 +206,18 @@ def chosen_methods(given: argparse.Namespace) -> list[Any]:
 def main() -> None:
     given = arguments()
     start_process(given.threads)
+    from pydantic import ValidationError
+
+    from stages.errors import RilleError
+
+    try:
+        measure(given)
+    except (RilleError, ValidationError, OSError) as error:
+        raise SystemExit(f"matching.py: {' '.join(str(error).split())}") from None
+
+
+def measure(given: argparse.Namespace) -> None:
+    """All parts that were asked for."""
     from stereo.methods import set_threads
 
     set_threads(given.threads)

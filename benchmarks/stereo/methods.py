@@ -172,7 +172,7 @@ def _hfvm(name: str, values: dict[str, Any], threads: int) -> Method:
     from stages.validity import matched
 
     params = HfvmParams(**values)
-    extra = {"threads": threads} if "threads" in inspect.signature(match).parameters else {}
+    extra: dict[str, Any] = {"threads": threads} if "threads" in inspect.signature(match).parameters else {}
 
     def read(raw: Any, pair: Pair) -> Found:
         good = matched(raw.validity)

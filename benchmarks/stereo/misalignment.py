@@ -96,7 +96,11 @@ def picture(found: list[dict[str, Any]], path: Path) -> None:
     )
     for axis_row, pair in zip(axes, pairs, strict=True):
         for axis, key, other, words in zip(
-            axis_row, ("rows", "roll_deg"), ("roll_deg", "rows"), ("vertical shift, px", "roll, degrees"), strict=True
+            axis_row,
+            ("rows", "roll_deg"),
+            ("roll_deg", "rows"),
+            ("vertical shift of the right image, px", "roll of the right image, degrees"),
+            strict=True,
         ):
             for i, name in enumerate(names):
                 points = [f for f in found if (f["pair"], f["method"], f[other]) == (pair, name, 0.0)]
@@ -114,7 +118,7 @@ def picture(found: list[dict[str, Any]], path: Path) -> None:
             axis.grid(alpha=0.3)
             axis.set_ylim(bottom=0)
             if pair == pairs[-1]:
-                axis.set_xlabel(words + " of the right image")
+                axis.set_xlabel(words)
         axis_row[0].set_ylabel("off by more than 2 px, %")
     axes[0][0].legend(fontsize=8)
     path.parent.mkdir(parents=True, exist_ok=True)
