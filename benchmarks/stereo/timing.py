@@ -18,7 +18,7 @@ def timings(pair: Pair, methods: Iterable[Method], repeats: int, budget: float) 
 
     ``min_ratio``: of the least times; ``median_ratio``: median of the rounds' own ratios; ``cpu_ratio``: of the least
     processor times (all threads added up), which other programs disturb least. One untimed round compiles and warms
-    up. A method that has used up ``budget`` seconds stops after three rounds, or after one that alone took them.
+    up. A method that has used up ``budget`` seconds stops after three rounds, or after one that alone took twice that.
     """
     methods = list(methods)
     for method in methods:
@@ -52,5 +52,5 @@ def timings(pair: Pair, methods: Iterable[Method], repeats: int, budget: float) 
 
 
 def _enough(seconds: list[float], budget: float) -> bool:
-    least = 1 if max(seconds, default=0.0) > budget else LEAST
+    least = 1 if max(seconds, default=0.0) > 2.0 * budget else LEAST
     return len(seconds) >= least and sum(seconds) > budget
