@@ -99,7 +99,7 @@ def _read_opencv(raw: Any, pair: Pair) -> Found:
 def pandora() -> list[Method]:
     """Census and semi-global matching of CNES's Pandora, where it and its plugin libsgm are installed.
 
-    The pipeline of its documentation: census 5 x 5, SGM, V-fit, median, accurate cross-check, median. Its own
+    Census 5 x 5, SGM with the default penalties, V-fit, median, accurate cross-check, median. Its own
     interpolation is left out, since all are filled alike.
     """
     missing = [n for n in ("pandora", "pandora_plugin_libsgm") if importlib.util.find_spec(n) is None]
