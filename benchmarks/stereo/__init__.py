@@ -1,0 +1,1 @@
+"""Parts of ``benchmarks/matching.py``: pairs with truth, matchers behind one interface, measures, misalignment."""

@@ -1,0 +1,114 @@
+"""What a disparity map is worth: filled alike, then compared with the truth.
+
+Disparities are displacements of the left image's pixels, right minus left: column ``u``, row ``v``, float64 (row, col),
+NaN where there is none. On a parallel rig ``u`` is negative and nearer things have the lesser one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Map = NDArray[np.float64]
+
+THRESHOLDS = (1, 2, 3)
+BINS = 10
+
+
+@dataclass(frozen=True)
+class Truth:
+    """True displacements, NaN unknown."""
+
+    u: Map
+    v: Map
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """Pixels with truth."""
+        return np.isfinite(self.u) & np.isfinite(self.v)
+
+
+@dataclass(frozen=True)
+class Found:
+    """A matcher's claim: displacements, and where they were measured. ``rows``: whether it searches rows, too."""
+
+    u: Map
+    v: Map
+    matched: NDArray[np.bool_]
+    rows: bool
+
+
+def fill(found: Found) -> Found:
+    """Every pixel without a match takes the vector of the nearest match in its row, of the two the background's.
+
+    Rows without any match stay NaN.
+    """
+    rows, cols = found.matched.shape
+    here = np.arange(cols)
+    before = np.maximum.accumulate(np.where(found.matched, here, -1), axis=1)
+    after = np.minimum.accumulate(np.where(found.matched, here, cols)[:, ::-1], axis=1)[:, ::-1]
+    row = np.arange(rows)[:, None]
+    u_before = np.where(before >= 0, found.u[row, np.maximum(before, 0)], -np.inf)
+    u_after = np.where(after < cols, found.u[row, np.minimum(after, cols - 1)], -np.inf)
+    source = np.where(u_before >= u_after, before, after)
+    there = (source >= 0) & (source < cols)
+    source = np.clip(source, 0, cols - 1)
+    u, v = (np.where(there, m[row, source], np.nan) for m in (found.u, found.v))
+    return Found(u, v, found.matched, found.rows)
+
+
+def error(found: Found, truth: Truth) -> Map:
+    """Pixels: length of the difference of the vectors; of a matcher that knows no rows, of the columns."""
+    du = found.u - truth.u
+    return np.hypot(du, found.v - truth.v) if found.rows else np.abs(du)
+
+
+def judge(found: Found, truth: Truth) -> dict[str, Any]:
+    """Figures of one map.
+
+    ``bad1..3``: share of all pixels with truth that are off by more than 1, 2, 3 px after :func:`fill`, missing ones
+    counted; ``bad1..3_column``: the same of the columns alone; ``bad2_inside``: of the pixels whose true counterpart
+    lies in an image of this size; ``bad1..3_matched``, ``median``: of what was matched; ``completeness``: share of the
+    pixels with truth that were matched; ``locking``: see :func:`locking`.
+    """
+    known = truth.known
+    if not known.any():
+        raise ValueError("the truth has no valid pixel")
+    filled = fill(found)
+    off = error(filled, truth)[known]
+    off_column = np.abs(filled.u - truth.u)[known]
+    both = known & found.matched
+    off_matched = error(found, truth)[both]
+    rows, cols = known.shape
+    y, x = np.nonzero(known)
+    xr, yr = x + truth.u[known], y + truth.v[known]
+    inside = (xr >= 0) & (xr <= cols - 1) & (yr >= 0) & (yr <= rows - 1)
+    figures: dict[str, Any] = {f"bad{t}": _bad(off, t) for t in THRESHOLDS}
+    figures |= {f"bad{t}_column": _bad(off_column, t) for t in THRESHOLDS}
+    figures |= {f"bad{t}_matched": _bad(off_matched, t) for t in THRESHOLDS}
+    figures["bad2_inside"] = _bad(off[inside], 2)
+    figures["median"] = float(np.median(off_matched)) if off_matched.size else None
+    figures["completeness"] = off_matched.size / off.size
+    figures["locking"], figures["histogram"] = locking(found.u[both])
+    return figures
+
+
+def _bad(off: Map, threshold: float) -> float | None:
+    """Share beyond the threshold; NaN is beyond it."""
+    return float(np.mean(~(off <= threshold))) if off.size else None
+
+
+def locking(u: Map) -> tuple[float | None, list[float]]:
+    """Fullest of ten bins of the fractional part relative to a uniform histogram, and all bins.
+
+    The bins are 0.1 px wide and the first one is centred on whole pixels, where matchers lock. Matchers that give
+    sixteenths of a pixel cannot come below 1.25: some bins hold two of the sixteen values, others one.
+    """
+    if not u.size:
+        return None, []
+    tenth = np.floor(np.mod(u, 1.0) * BINS + 0.5).astype(np.int64) % BINS
+    histogram = np.bincount(tenth, minlength=BINS) * (BINS / u.size)
+    return float(histogram.max()), [float(h) for h in histogram]

@@ -1,0 +1,189 @@
+"""The benchmark of dense matching: figures, filling, truth files, and the truth of a knocked camera."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from benchmarks.stereo import methods, pairs
+from benchmarks.stereo.measures import Found, Truth, fill, judge, locking
+from benchmarks.stereo.misalignment import camera_of, conditions, knocked
+from benchmarks.stereo.pairs import Pair, measured, parallel, read_truth
+from datasets.misalign import MisalignParams
+
+NONE = np.nan
+
+
+def found(u: Any, rows: bool = True, v: Any = None) -> Found:
+    column = np.asarray(u, np.float64)
+    row = np.zeros_like(column) if v is None else np.asarray(v, np.float64)
+    return Found(column, row, np.isfinite(column), rows)
+
+
+def texture(shape: tuple[int, int], smooth: float, seed: int = 3) -> NDArray[np.float64]:
+    grey = ndimage.gaussian_filter(np.random.default_rng(seed).standard_normal(shape), smooth, mode="wrap")
+    return 128.0 + 40.0 * grey / grey.std()
+
+
+class TestMeasures:
+    def test_the_truth_itself_has_no_error(self) -> None:
+        truth = parallel(np.random.default_rng(0).uniform(1, 40, (20, 30)))
+        figures = judge(found(truth.u), truth)
+        wrong = [figures[k] for k in figures if k.startswith("bad")]
+        assert wrong == [0.0] * len(wrong)
+        assert figures["median"] == 0.0
+        assert figures["completeness"] == 1.0
+
+    def test_figures_of_a_hand_made_row(self) -> None:
+        truth = parallel(np.array([[10.0, 10.0, 10.0, 10.0, 10.0, 10.0, 10.0, NONE]]))
+        # off by 0, 0.5, 1.5, 2.5, 3.5; then two holes that the background (9) fills; the last one has no truth
+        figures = judge(found([[-10.0, -10.5, -11.5, -12.5, -13.5, NONE, NONE, -9.0]]), truth)
+        assert [figures[f"bad{t}"] for t in (1, 2, 3)] == pytest.approx([3 / 7, 2 / 7, 1 / 7])
+        assert [figures[f"bad{t}_matched"] for t in (1, 2, 3)] == pytest.approx([3 / 5, 2 / 5, 1 / 5])
+        assert figures["median"] == 1.5
+        assert figures["completeness"] == pytest.approx(5 / 7)
+
+    def test_rows_without_any_match_are_bad(self) -> None:
+        truth = parallel(np.full((2, 4), 5.0))
+        figures = judge(found([[-5.0] * 4, [NONE] * 4]), truth)
+        assert [figures[f"bad{t}"] for t in (1, 2, 3)] == [0.5] * 3
+        assert figures["bad2_matched"] == 0.0
+
+    def test_nothing_matched_is_all_bad(self) -> None:
+        figures = judge(found(np.full((2, 4), NONE)), parallel(np.full((2, 4), 5.0)))
+        assert figures["bad3"] == 1.0
+        assert figures["median"] is None
+        assert figures["completeness"] == 0.0
+
+    def test_rows_count_for_those_that_search_them_only(self) -> None:
+        truth = parallel(np.full((1, 4), 5.0))
+        u, v = np.full((1, 4), -5.0), np.full((1, 4), 4.0)
+        assert judge(found(u, True, v), truth)["bad3"] == 1.0
+        assert judge(found(u, True, v), truth)["bad3_column"] == 0.0
+        assert judge(found(u, False, v), truth)["bad3"] == 0.0
+
+    def test_counterparts_outside_the_image_are_told_apart(self) -> None:
+        truth = parallel(np.full((1, 10), 4.0))
+        assert judge(found([[NONE, NONE, NONE, NONE, *[-4.0] * 6]]), truth)["bad2_inside"] == 0.0
+        assert judge(found([[-9.0, -9.0, -9.0, -9.0, *[-4.0] * 6]]), truth)["bad2"] == 0.4
+        assert judge(found([[-9.0, -9.0, -9.0, -9.0, *[-4.0] * 6]]), truth)["bad2_inside"] == 0.0
+
+    def test_filling_takes_the_background_and_its_row(self) -> None:
+        filled = fill(found([[NONE, -8.0, NONE, NONE, -3.0, NONE]], v=[[0.0, 1.0, 0.0, 0.0, 2.0, 0.0]]))
+        assert filled.u.tolist() == [[-8.0, -8.0, -3.0, -3.0, -3.0, -3.0]]
+        assert filled.v.tolist() == [[1.0, 1.0, 2.0, 2.0, 2.0, 2.0]]
+
+    def test_locking(self) -> None:
+        assert locking(np.arange(-50, 50) / 10.0)[0] == pytest.approx(1.0)
+        assert locking(np.array([-3.0, -2.96, 4.04, 7.0]))[1] == [10.0, *[0.0] * 9]
+        assert locking(-np.arange(160) / 16.0)[0] == pytest.approx(1.25)
+
+
+class TestTruthFiles:
+    def expected(self) -> NDArray[np.float64]:
+        return np.array([[-1.5, NONE, -3.0], [-4.0, -5.25, NONE]])
+
+    def stored(self, scale: float) -> NDArray[np.float64]:
+        return np.nan_to_num(-self.expected() * scale)
+
+    def test_arrays(self, tmp_path: Path) -> None:
+        np.save(tmp_path / "a.npy", np.where(self.stored(1) == 0, np.inf, self.stored(1)).astype(np.float32))
+        np.savez(tmp_path / "a.npz", self.stored(1))
+        for name in ("a.npy", "a.npz"):
+            np.testing.assert_array_equal(read_truth(tmp_path / name).u, self.expected())
+
+    def test_png(self, tmp_path: Path) -> None:
+        cv2.imwrite(str(tmp_path / "sixteen.png"), self.stored(256).astype(np.uint16))
+        cv2.imwrite(str(tmp_path / "eight.png"), self.stored(4).astype(np.uint8))
+        np.testing.assert_array_equal(read_truth(tmp_path / "sixteen.png").u, self.expected())
+        np.testing.assert_array_equal(read_truth(tmp_path / "eight.png", 4.0).u, self.expected())
+
+    @pytest.mark.parametrize(("scale", "order"), [("-1.0", "<f4"), ("1.0", ">f4")])
+    def test_pfm(self, tmp_path: Path, scale: str, order: str) -> None:
+        bottom_up = np.where(self.stored(1) == 0, np.inf, self.stored(1))[::-1].astype(order)
+        (tmp_path / "a.pfm").write_bytes(f"Pf\n3 2\n{scale}\n".encode() + bottom_up.tobytes())
+        np.testing.assert_array_equal(read_truth(tmp_path / "a.pfm").u, self.expected())
+
+    def test_vectors(self, tmp_path: Path) -> None:
+        np.savez(tmp_path / "a.npz", column=self.expected(), row=2 * self.expected(), occluded=self.expected())
+        truth = read_truth(tmp_path / "a.npz")
+        np.testing.assert_array_equal(truth.v, 2 * self.expected())
+
+
+class TestKnockedCamera:
+    """Left image: a smooth pattern; right image: the same, 6 to 9 px to the left."""
+
+    def pair(self) -> Pair:
+        shape = (90, 120)
+        grey = texture(shape, 4.0)
+        y, x = np.mgrid[: shape[0], : shape[1]].astype(np.float64)
+        # x_right = 0.97 x - 6: invert to sample the left image
+        right = ndimage.map_coordinates(grey, [y, (x + 6.0) / 0.97], order=3, mode="nearest")
+        images = [np.rint(i).clip(0, 255).astype(np.uint8) for i in (grey, right)]
+        return measured("pattern", *images, parallel(6.0 + 0.03 * x))
+
+    @pytest.mark.parametrize("params", conditions(), ids=str)
+    def test_the_truth_leads_to_the_same_grey_values(self, params: MisalignParams) -> None:
+        case = knocked(self.pair(), params)
+        assert case.truth is not None
+        y, x = np.mgrid[: case.left.shape[0], : case.left.shape[1]].astype(np.float64)
+        at = np.stack([y + case.truth.v, x + case.truth.u])
+        seen = ndimage.map_coordinates(case.right.astype(np.float64), at, order=3, mode="nearest")
+        inner = np.s_[12:-12, 20:-12]
+        # rounding to whole grey values, up to three times
+        assert np.abs(seen - case.left)[inner].max() < 2.0
+        assert np.abs(seen - case.left)[inner].mean() < 0.5
+
+    def test_values_of_shift_and_roll(self) -> None:
+        pair = self.pair()
+        down = knocked(pair, MisalignParams(rows=3.0)).truth
+        assert pair.truth is not None
+        assert down is not None
+        np.testing.assert_allclose(down.u, pair.truth.u, atol=1e-9)
+        np.testing.assert_allclose(down.v, 3.0, atol=1e-9)
+        rolled = knocked(pair, MisalignParams(roll_deg=2.0)).truth
+        assert rolled is not None
+        camera, x, y = camera_of(pair), 80, 30
+        angle = np.deg2rad(2.0)
+        dx, dy = x + pair.truth.u[y, x] - camera.cx, y - camera.cy
+        # clockwise on the screen, where y points down
+        wanted = (
+            camera.cx + np.cos(angle) * dx - np.sin(angle) * dy,
+            camera.cy + np.sin(angle) * dx + np.cos(angle) * dy,
+        )
+        assert (x + rolled.u[y, x], y + rolled.v[y, x]) == pytest.approx(wanted, abs=1e-9)
+
+    def test_the_range_follows(self) -> None:
+        case = knocked(self.pair(), MisalignParams(roll_deg=20.0))
+        assert case.truth is not None
+        assert case.low <= -np.nanmax(case.truth.u)
+        assert case.range[0] + case.range[1] > -np.nanmin(case.truth.u)
+
+
+class TestMethods:
+    @pytest.mark.parametrize("disparity", [7, -5])
+    @pytest.mark.parametrize("method", methods.opencv(), ids=lambda m: m.name)
+    def test_opencv_finds_a_known_shift(self, method: methods.Method, disparity: int) -> None:
+        grey = np.rint(texture((80, 160), 1.0)).clip(0, 255).astype(np.uint8)
+        left, right = grey[:, 20:-20].copy(), grey[:, 20 + disparity : 140 + disparity].copy()
+        pair = measured("shift", left, right, Truth(np.full(left.shape, -disparity * 1.0), np.zeros(left.shape)))
+        result = method(pair)
+        inner = np.s_[10:-10, 20:-20]
+        assert result.matched[inner].all()
+        assert np.abs(result.u + disparity)[inner].max() < 0.5
+
+    def test_every_preset_is_there(self) -> None:
+        names = [m.name for m in methods.hfvm(["rounds=2 refine=false"], 1)]
+        assert {"HFVM default", "HFVM paper", "HFVM rounds=2 refine=false"} <= set(names)
+
+    def test_sizes_for_timing(self) -> None:
+        pair = measured("p", *[np.zeros((50, 74), np.uint8)] * 2, parallel(np.full((50, 74), 9.0)))
+        large = pairs.enlarged(pair, 14000.0)
+        assert abs(large.left.size / 14000.0 - 1.0) < 0.02
+        assert large.searching(224).range == (0, 224)
