@@ -9,7 +9,7 @@ import os
 import sys
 from pathlib import Path
 
-from pipeline.code import tree_digest
+from pipeline.code import remember_in, tree_digest
 
 SINGLE = ("OMP", "OPENBLAS", "MKL", "NUMBA", "BLIS", "VECLIB_MAXIMUM", "NUMEXPR")
 
@@ -30,6 +30,7 @@ def worker_environment(cache: Path | str) -> dict[str, str]:
 
 def prepare_environment(cache: Path | str) -> None:
     """Set this process up to run stages itself, and to start workers."""
+    remember_in(Path(cache) / "sources.json")
     environment = worker_environment(cache)
     os.environ.update(environment)
     if "numba" in sys.modules:
