@@ -161,7 +161,9 @@ class Store:
                 }
                 there = self._publish(home, manifest)
             except BaseException:
-                shutil.rmtree(attempt, ignore_errors=True)
+                published = self.manifest(stage.name, key)  # an interruption may come just after the link
+                if published is None or published["path"] != attempt.relative_to(self.root).as_posix():
+                    shutil.rmtree(attempt, ignore_errors=True)
                 raise
         if there is None:
             return _ref(json.loads(json.dumps(manifest)))
@@ -187,8 +189,9 @@ class Store:
                     if there is not None:
                         return there
                 else:
-                    for folder in (home, *list(home.parents)[:2]):
-                        fsync(folder)
+                    with suppress(OSError):  # it is published: at worst a power failure takes it back as a whole
+                        for folder in (home, *list(home.parents)[:2]):
+                            fsync(folder)
                     return None
             raise StoreError(f"cannot publish {home / 'manifest.json'}", remedy="remove that file and run again")
         finally:

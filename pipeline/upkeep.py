@@ -62,8 +62,8 @@ def verify(store: Store) -> tuple[int, list[Damage]]:
 def gc(store: Store, keep: Collection[str], *, grace: float = GRACE, dry_run: bool = False) -> Cleared:
     """Remove artifacts whose key is not in ``keep``, and orphans, quarantine and compiled kernels of other sources.
 
-    Only what was neither made nor used within ``grace`` seconds goes (a run may be under way). The manifest goes first, so that an
-    interruption leaves an orphan and never half an artifact. ``keep`` are the keys of the kept runs
+    Only what was neither made nor used within ``grace`` seconds goes (a run may be under way). The manifest goes first,
+    so that an interruption leaves an orphan and never half an artifact. ``keep`` are the keys of the kept runs
     (:func:`pipeline.ledger.keys`).
     """
     cleared = Cleared()
