@@ -20,11 +20,12 @@ import shutil
 import signal
 import tempfile
 import threading
+import time
 import traceback
 from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import Future
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing import resource_tracker
 from pathlib import Path
@@ -43,6 +44,15 @@ DEATHS = 3
 
 INNOCENT = 30
 """Worker processes that may die before they even begin a task that was sent to them."""
+
+LOST = 4.0
+"""Seconds without a process after which a worker is replaced: its keeper gives up if it dies while it starts."""
+
+START = 60.0
+"""Seconds more for one that has not begun yet."""
+
+REPLACED = 12
+"""Workers replaced without a single task done before the run is given up."""
 
 WATCH = 0.5
 """Seconds between looks at the memory of the workers."""
@@ -248,7 +258,12 @@ class Processes(Cluster):
         self._strays: Counter[str] = Counter()
         self._tasks: dict[str, tuple[Any, ...]] = {}
         self._marks = Path(tempfile.mkdtemp(prefix="rille-"))
+        self._alive: dict[Any, float] = {}
+        """When each worker was last seen with a process."""
+        self._replaced = 0
+        self._settings = ExitStack()
         settings = {
+            "distributed.deploy.lost-worker-timeout": "10 days",  # it takes workers away that are just restarting
             "distributed.nanny.pre-spawn-environ": worker_environment(cache)
             | {"DASK_DISTRIBUTED__LOGGING__DISTRIBUTED": "critical"},
             "distributed.scheduler.allowed-failures": 0,  # it would blame what only waited on a worker that died
@@ -259,7 +274,8 @@ class Processes(Cluster):
             "distributed.admin.system-monitor.gil.enabled": False,
         }
         try:
-            with dask.config.set(settings), _interrupts_deferred():
+            self._settings.enter_context(dask.config.set(settings))  # workers that replace others need them too
+            with _interrupts_deferred():
                 self._cluster = LocalCluster(
                     n_workers=jobs,
                     threads_per_worker=1,
@@ -273,6 +289,7 @@ class Processes(Cluster):
             self.close(kill=True)
             raise
         except BaseException:
+            self._settings.close()
             shutil.rmtree(self._marks, ignore_errors=True)
             raise
         self._slots = jobs  # all of them, though some may still be starting
@@ -298,15 +315,39 @@ class Processes(Cluster):
         self.submit(key, *self._tasks[key])
         return None
 
+    def _result(self, key: str, future: Any) -> Outcome | Failed | None:
+        outcome = super()._result(key, future)
+        if outcome is not None:
+            self._replaced = 0
+        return outcome
+
     def _watch(self) -> None:
+        self._replace_lost()
         for mark in self._marks.iterdir():
             with suppress(OSError, ValueError, psutil.Error):  # it ends as we look
                 memory = int(psutil.Process(int(mark.read_text())).memory_info().rss)
                 self._memory[mark.name] = max(memory, self._memory.get(mark.name, 0))
 
+    def _replace_lost(self) -> None:
+        now, lost = time.monotonic(), []
+        for name in list(self._cluster.worker_spec):
+            nanny = self._cluster.workers.get(name)
+            process = nanny and nanny.process and nanny.process.process
+            if process is not None and process.is_alive():
+                self._alive[name] = now
+            elif now - self._alive.setdefault(name, now + START) > LOST:
+                lost.append(name)
+        if lost:
+            self._replaced += len(lost)
+            if self._replaced > REPLACED:
+                raise _died(f"{REPLACED} worker processes died as they started")
+            for name in lost:
+                del self._cluster.worker_spec[name]
+            self._cluster.scale(self._slots)
+
     def close(self, kill: bool = False) -> None:
         """End the workers, at once if ``kill``; none is left behind."""
-        nannies = list(self._cluster.workers.values())
+        nannies = list({*self._cluster.workers.values(), *self._cluster._created})
         processes = [n.process.process for n in nannies if n.process and n.process.process]
         if kill:
             self._cluster.shutdown_on_close = False  # nor wait for it at exit
@@ -315,6 +356,7 @@ class Processes(Cluster):
             with suppress(Exception):
                 leave(timeout=GRACE)
         _kill(nannies, processes)
+        self._settings.close()
         shutil.rmtree(self._marks, ignore_errors=True)
 
 

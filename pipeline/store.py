@@ -163,7 +163,7 @@ class Store:
             except BaseException:
                 published = self.manifest(stage.name, key)  # an interruption may come just after the link
                 if published is None or published["path"] != attempt.relative_to(self.root).as_posix():
-                    shutil.rmtree(attempt, ignore_errors=True)
+                    _discard(attempt)
                 raise
         if there is None:
             return _ref(json.loads(json.dumps(manifest)))
@@ -262,6 +262,15 @@ def _make(attempt: Path) -> None:
             attempt.mkdir(parents=True)
             return
     attempt.mkdir(parents=True)
+
+
+def _discard(attempt: Path) -> None:
+    """Remove an attempt; where one write failed, others of zarr's may be under way still."""
+    for pause in (0.0, 0.02, 0.1, 0.5):
+        time.sleep(pause)
+        shutil.rmtree(attempt, ignore_errors=True)
+        if not attempt.exists():
+            return
 
 
 def _ref(manifest: Manifest) -> Ref:

@@ -149,7 +149,7 @@ def steps_of(monkeypatch, cache):
 @pytest.mark.parametrize(("code", "every"), [(errno.ENOSPC, 29), pytest.param(errno.ENOSPC, 1, marks=pytest.mark.slow)])
 def test_disk_full_at_a_step(small, tmp_path, row, monkeypatch, code, every):
     total = steps_of(monkeypatch, tmp_path / "counted")
-    lost, wrong, recomputed, expected, tries = [], [], 0, 0, 0
+    lost, wrong, recomputed, expected, tries, orphans = [], [], 0, 0, 0, 0
     for onwards in (False, True):
         for step in range(1, total + 1, every):
             tries, cache = tries + 1, tmp_path / f"{step}-{onwards}"
@@ -162,10 +162,12 @@ def test_disk_full_at_a_step(small, tmp_path, row, monkeypatch, code, every):
             assert onwards or result.failures or len(found) == len(small["digests"])
             lost += sorted(look.manifests(cache) - set(found)) + sorted({*digests(graph)} - {*found})
             wrong += look.wrong(found, small["digests"])
-            if not onwards:
-                leftovers = [p for p in cache.glob("artifacts/*/*/*") if p.suffix == ".tmp"]
-                leftovers += [p.parent for p in cache.glob("artifacts/*/*/a-*") if p.parent.name not in found]
-                assert not leftovers, (faults.steps[step - 1], leftovers)
+            cleared = upkeep.gc(Store(cache), found, grace=-1.0)
+            orphans += cleared.orphans
+            assert cleared.artifacts == 0
+            left = [p for p in cache.rglob("*") if p.suffix == ".tmp" or ".partial" in p.name]
+            left += [p for p in cache.glob("artifacts/*/*/a-*") if p.parent.name not in found]
+            assert not left, (faults.steps[step - 1], left)
             graph, result = run(cache)
             wrong += look.wrong(digests(graph), small["digests"])
             recomputed += result.total().computed

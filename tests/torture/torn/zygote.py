@@ -19,7 +19,7 @@ import zarr.storage  # noqa: F401
 import pipeline.code
 import pipeline.driver
 import pipeline.ledger
-import pipeline.upkeep  # noqa: F401
+import pipeline.upkeep
 import torn.saboteur  # noqa: F401
 from torn import chain
 
