@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 from pipeline.code import remember_in, tree_digest
+from pipeline.kernels import guard
 
 SINGLE = ("OMP", "OPENBLAS", "MKL", "NUMBA", "BLIS", "VECLIB_MAXIMUM", "NUMEXPR")
 
@@ -33,6 +34,7 @@ def prepare_environment(cache: Path | str) -> None:
     remember_in(Path(cache) / "sources.json")
     environment = worker_environment(cache)
     os.environ.update(environment)
+    guard()
     if "numba" in sys.modules:
         sys.modules["numba"].config.CACHE_DIR = environment["NUMBA_CACHE_DIR"]
 

@@ -114,6 +114,19 @@ def test_where_nothing_is_new_the_latest_run_stands(
     draws("another version of a package")
 
 
+def test_what_is_found_damaged_when_it_is_drawn_is_computed_again(
+    cold: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run.reconstruct(options(cold)) == 0
+    before = digests(cold)
+    chunk = next((cold / "cache").glob("artifacts/merge/*/a-*/ortho/c.0.0"))
+    chunk.write_bytes(bytes(chunk.stat().st_size))
+    assert run.reconstruct(options(cold, fresh=True)) == 0
+    assert "is damaged" in capsys.readouterr().err
+    assert {label.split("/")[0] for label in computed(cold)} == {"merge"}
+    assert digests(cold) == before
+
+
 def test_a_stamp_sees_what_no_key_sees(cold: Path) -> None:
     sequence = open_sequence("mockup-short")
     stamps = {
