@@ -173,14 +173,9 @@ def test_disk_full_at_a_step(small, tmp_path, row, monkeypatch, code, every):
             recomputed += result.total().computed
             expected += len(small["digests"]) - len(found)
             shutil.rmtree(cache, ignore_errors=True)
-    row(
-        f"disk full at each {f'{every}th ' if every > 1 else ''}of {total} steps",
-        tries,
-        lost,
-        wrong,
-        recomputed,
-        expected,
-    )
+    every_one = "each step" if every == 1 else f"each {every}th step"
+    remark = f"{orphans} orphans, which gc clears away"
+    row(f"disk full at {every_one} of {total}", tries, lost, wrong, recomputed, expected, remark)
 
 
 QUOTA = """

@@ -24,11 +24,13 @@ import torn.saboteur  # noqa: F401
 from torn import chain
 
 
-def _child(line):
+def _child(line, alone):
     """Become the program; never comes back."""
     code = 1
     try:
         os.setsid()
+        os.write(alone, b"x")
+        os.close(alone)
         task = json.loads(line)
         log = os.open(task.pop("log"), os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
         os.dup2(log, 1)
@@ -55,9 +57,13 @@ def main():
     """Say the process id, wait for its end, say how it ended."""
     pipeline.code.tree_digest()  # reads all sources, once for all
     for line in sys.stdin:
+        seen, alone = os.pipe()
         pid = os.fork()
         if pid == 0:
-            _child(line)
+            _child(line, alone)
+        os.close(alone)
+        os.read(seen, 1)  # until it has a group of its own, which may be killed
+        os.close(seen)
         print(pid, flush=True)
         _, status = os.waitpid(pid, 0)
         print(os.waitstatus_to_exitcode(status), flush=True)
