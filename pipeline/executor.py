@@ -22,6 +22,7 @@ import tempfile
 import threading
 import time
 import traceback
+import warnings
 from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import Future
@@ -59,6 +60,10 @@ WATCH = 0.5
 
 GRACE = 2.0
 """Seconds that workers get to leave at the end of a run before they are killed."""
+
+
+HURRY = 0.5
+"""The same for the client and the scheduler of an interrupted run, whose workers are killed already."""
 
 
 class WorkerDiedError(RilleError):
@@ -153,6 +158,8 @@ class Inline:
 
     def close(self, kill: bool = False) -> None:
         """Nothing to leave."""
+        if kill:
+            _leave_unsaid()
 
 
 class _Futures:
@@ -208,6 +215,8 @@ class Threads(_Futures):
 
     def close(self, kill: bool = False) -> None:
         """Nothing to leave."""
+        if kill:
+            _leave_unsaid()
 
 
 class Cluster(_Futures):
@@ -354,7 +363,7 @@ class Processes(Cluster):
             _kill(nannies, processes)
         for leave in (self._client.close, self._cluster.close):
             with suppress(Exception):
-                leave(timeout=GRACE)
+                leave(timeout=HURRY if kill else GRACE)
         _kill(nannies, processes)
         self._settings.close()
         shutil.rmtree(self._marks, ignore_errors=True)
@@ -401,6 +410,11 @@ def _kill(nannies: list[Any], processes: list[Any]) -> None:
     for process in processes:
         with suppress(Exception):
             process._process.kill()
+
+
+def _leave_unsaid() -> None:
+    """Python would warn at exit of each read or write of zarr's that an interruption caught before it began."""
+    warnings.filterwarnings("ignore", message="coroutine .* was never awaited", category=RuntimeWarning)
 
 
 def _quiet() -> None:

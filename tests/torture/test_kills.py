@@ -97,6 +97,7 @@ def test_killed_at_random_moments(programs, calm, tmp_path, row, executor, tries
 def test_interrupted_at_random_moments(programs, calm, tmp_path, row, executor, tries):
     (program,) = programs(1)
     rng, slowest, lost, wrong, recomputed, expected = random.Random(tries), 0.0, [], [], 0, 0
+    within = WITHIN * max(1.0, os.getloadavg()[0] / len(os.sched_getaffinity(0)))  # others may have the processors
     for trial in range(tries):
         cache = tmp_path / str(trial)
         span = 1.2 * calm["seconds"] if executor != "processes" else 5.0
@@ -109,9 +110,9 @@ def test_interrupted_at_random_moments(programs, calm, tmp_path, row, executor, 
         took = time.monotonic() - begin
         slowest = max(slowest, took)
         assert code == 130, f"{code} after {said}"
-        assert took < WITHIN
+        assert took < within
         assert said == ""
-        assert gone(children, WITHIN)
+        assert gone(children, within)
         found = look.published(cache)
         lost += sorted(look.manifests(cache) - set(found))
         resumed = program.run(cache=str(cache))
