@@ -12,7 +12,7 @@ SET    ?=
 ARGS   ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help install reconstruct test check bench lint clean
+.PHONY: help install reconstruct test check torture bench lint clean
 
 help: ## this list
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
@@ -35,6 +35,9 @@ test: $(STAMP) lint ## lint, types and the test suite (a few minutes on two core
 
 check: $(STAMP) lint ## everything, the slow checks too
 	$(BIN)/python -m pytest $(ARGS)
+
+torture: $(STAMP) ## kills, damage, full disks, races: what the engine endures, as a table (also part of check)
+	$(BIN)/python -m pytest tests/torture $(ARGS)
 
 bench: $(STAMP) ## side-by-side measurements: every figure of the README
 	@for b in benchmarks/*.py; do echo "== $$b"; $(BIN)/python $$b $(ARGS) || exit 1; done

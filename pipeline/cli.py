@@ -56,6 +56,7 @@ def reconstruct(
     executor: Literal["processes", "threads", "inline"] = "processes",
     keep_going: Annotated[bool, Parameter(negative="")] = False,
     force: Annotated[list[str] | None, Parameter(negative="", consume_multiple=False)] = None,
+    fresh: Annotated[bool, Parameter(negative="")] = False,
     runs: Path = Path("runs"),
     cache: CacheFolder = None,
     progress: Progress = "auto",
@@ -82,6 +83,8 @@ def reconstruct(
         Finish what does not depend on a failed task; the exit status is then 3.
     force
         Recompute this stage although it is cached; may be repeated.
+    fresh
+        Write a new folder of results even if nothing is new and the latest run stands.
     runs
         Folder of results; each run makes RUNS/sequence/run-id.
     cache
@@ -108,6 +111,7 @@ def reconstruct(
         runs=runs,
         cache=cache_folder(cache),
         progress="quiet" if quiet else progress,
+        fresh=fresh,
     )
     return run.reconstruct(options)
 

@@ -6,7 +6,8 @@ docstrings, so comments, docstrings and formatting change nothing. Own are ``sta
 package of the module itself. Imports under ``if TYPE_CHECKING:`` never run and do not count; modules loaded by a
 computed name are not seen, and neither are data files beside the code: keep tables in modules.
 
-A file is read once a process: what is digested is what was imported, even while somebody edits.
+A file is read once a process: what is digested is what was imported, even while somebody edits. Parsing all of them
+takes most of a second, so what was found in a file is remembered by the bytes of the file (:func:`remember_in`).
 """
 
 from __future__ import annotations
@@ -15,15 +16,23 @@ import ast
 import hashlib
 import importlib.metadata
 import importlib.util
+import json
+import os
+import sys
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 from pipeline.key import digest
 from stages.errors import RilleError
 
 OWN = ("stages", "datasets")
+
+FORGET = 8
+"""States of the sources that are remembered, before those not in use are forgotten."""
 
 
 class MissingPackageError(RilleError):
@@ -35,6 +44,52 @@ class _Source:
     sha256: str
     imports: tuple[str, ...]
     """Absolute dotted names that the module may import (attributes among them)."""
+
+
+class _Memory:
+    """What was found in source files, by the bytes of each and of this module; a damaged file counts as none."""
+
+    def __init__(self) -> None:
+        self.path: Path | None = None
+        self.known: dict[str, list[Any]] = {}
+        self.used: set[str] = set()
+        self.new = False
+        self._reader = hashlib.sha256(f"{sys.version}\0".encode() + Path(__file__).read_bytes()).digest()
+
+    def load(self, path: Path) -> None:
+        self.path, self.known, self.new = path, {}, False
+        with suppress(OSError, ValueError, KeyError, TypeError, AttributeError):
+            found = json.loads(path.read_text(encoding="utf-8"))
+            self.known = found["sources"] if found["digest"] == digest(found["sources"]) else {}
+
+    def name(self, module: str, path: Path, data: bytes) -> str:
+        return hashlib.sha256(self._reader + f"{module}\0{path.name}\0".encode() + data).hexdigest()
+
+    def save(self) -> None:
+        """Best effort, as all hints are."""
+        if self.path is None or not self.new:
+            return
+        if len(self.known) > FORGET * len(self.used):
+            self.known = {name: self.known[name] for name in self.used}
+        temporary = self.path.with_name(f"{self.path.name}.{os.getpid()}.tmp")
+        with suppress(OSError):
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            temporary.write_text(json.dumps({"digest": digest(self.known), "sources": self.known}), encoding="utf-8")
+            temporary.replace(self.path)
+            self.new = False
+
+
+_memory = _Memory()
+
+
+def remember_in(path: Path) -> None:
+    """File that keeps from process to process what was found in source files; a hint, never a matter of correctness."""
+    _memory.load(path)
+
+
+def remember() -> None:
+    """Write that file, if there is anything new."""
+    _memory.save()
 
 
 def module_digests(module: str, own: Iterable[str] = OWN) -> dict[str, str]:
@@ -66,6 +121,7 @@ def tree_digest(own: Iterable[str] = OWN) -> str:
                     found[name] = _read(name, path).sha256
                 except SyntaxError:  # somebody is editing; it matters only to who imports it
                     found[name] = hashlib.sha256(path.read_bytes()).hexdigest()
+    remember()
     return digest(found)
 
 
@@ -127,10 +183,17 @@ def _file(module: str) -> Path | None:
 
 @cache
 def _read(name: str, path: Path) -> _Source:
-    tree = _Strip().visit(ast.parse(path.read_bytes()))
-    package = name if path.name == "__init__.py" else name.rpartition(".")[0]
-    text = ast.dump(tree)
-    return _Source(hashlib.sha256(text.encode()).hexdigest(), tuple(sorted(set(_imports(tree, package)))))
+    data = path.read_bytes()
+    known = _memory.name(name, path, data)
+    _memory.used.add(known)
+    if known not in _memory.known:
+        tree = _Strip().visit(ast.parse(data))
+        package = name if path.name == "__init__.py" else name.rpartition(".")[0]
+        text = hashlib.sha256(ast.dump(tree).encode()).hexdigest()
+        _memory.known[known] = [text, sorted(set(_imports(tree, package)))]
+        _memory.new = True
+    sha256, imports = _memory.known[known]
+    return _Source(sha256, tuple(imports))
 
 
 def _imports(tree: ast.AST, package: str) -> Iterator[str]:

@@ -9,7 +9,8 @@ A run that finds everything starts no worker. With ``dry=True`` nothing is compu
 ``cached`` or ``planned``, and ``reason`` says why (``rille plan``). What depends on results still to come is laid out
 by those of an earlier run where there was one (``Result.assumed``), else it is not known (``Result.unknown``).
 
-What a stage raises is not tried again. What depends on it is skipped; with ``keep_going`` everything else finishes,
+What a stage raises is not tried again. An artifact that is found damaged, or gone, when a task reads it is computed
+again, and the task after it. What depends on it is skipped; with ``keep_going`` everything else finishes,
 without it nothing new is begun. A task whose worker process dies is tried three times. In every case the ledger
 has one line for each node that is missing, with the reason.
 """
@@ -24,15 +25,19 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from pipeline import explain
+from pipeline.artifact import DamagedError
 from pipeline.dag import Expansion, Graph, Handle
 from pipeline.environment import cores
 from pipeline.executor import Executor, Failed, make
 from pipeline.key import digest
 from pipeline.ledger import Ledger
 from pipeline.progress import Progress, Quiet, recall_seconds, remember_seconds
-from pipeline.store import Store
+from pipeline.store import GoneError, NonDeterministicError, Store
 from pipeline.task import Outcome, recipe
 from stages.errors import RilleError
+
+HEALS = 3
+"""Times that a task is put back because its input has gone."""
 
 
 class TaskError(RilleError):
@@ -160,6 +165,10 @@ class _Run:
         """Looked up, not found, not submitted: a heap by order of creation, as ``ready``."""
         self.flying: dict[str, list[Handle]] = {}
         """Submitted, by key; further nodes of the same key wait for the first."""
+        self.patients: dict[str, set[str]] = {}
+        """Keys that must be computed again before the task of a key can be."""
+        self.put_back: dict[str, int] = defaultdict(int)
+        self.fates: dict[int, str] = {}
         self.expansions: list[tuple[list[Handle], Expansion]] = []
 
     def go(self) -> Result:
@@ -266,23 +275,64 @@ class _Run:
             self.progress.running(handle)
             self.executor.submit(handle.key, self.store.root, handle.spec, handle.refs(), handle.stage in self.force)
         if self.stopped:
-            for index in self.missing:
-                del self.flying[self.graph.nodes[index].key]
+            for key in (*(self.graph.nodes[index].key for index in self.missing), *self.patients):
+                for handle in self.flying.pop(key, ()):
+                    handle.status = self.fates.get(handle.index, "pending")
             self.missing.clear()
+            self.patients.clear()
 
     def _land(self, key: str, outcome: Outcome | Failed) -> None:
-        first, *others = self.flying.pop(key)
+        first, *others = self.flying[key]
+        if isinstance(outcome, Failed) and self._heal(first, outcome.error):
+            return
+        del self.flying[key]
+        if not isinstance(outcome, Failed) and first.ref is not None and first.ref.digest != outcome.ref.digest:
+            error = NonDeterministicError(f"stage {first.stage} is not deterministic: another digest when healed")
+            outcome = Failed(error, "")
         if isinstance(outcome, Failed):
             for handle in (first, *others):
-                handle.error = outcome.error
+                handle.error, handle.ref = outcome.error, None
                 handle.reason = f"{type(outcome.error).__name__}: {outcome.error}"
                 self._resolve(handle, "failed")
             self._failed(Failure(first.label, first.stage, outcome.error, outcome.traceback))
-            return
-        first.seconds, first.peak_rss = outcome.seconds, outcome.peak_rss
-        for handle in (first, *others):
-            handle.ref = outcome.ref
-            self._resolve(handle, "computed" if handle is first and not outcome.cached else "cached")
+        else:
+            first.seconds, first.peak_rss = outcome.seconds, outcome.peak_rss
+            for handle in (first, *others):
+                handle.ref = outcome.ref
+                self._resolve(handle, "computed" if handle is first and not outcome.cached else "cached")
+        self._discharge(key, first)
+
+    def _heal(self, handle: Handle, error: BaseException) -> bool:
+        """Put a task back whose input was damaged or gone when it was read, behind what must be computed again."""
+        if not isinstance(error, DamagedError | GoneError) or self.put_back[handle.key] >= HEALS or self.stopped:
+            return False
+        self.put_back[handle.key] += 1
+        absent = {h.key: h for h in handle.upstream() if self.store.lookup(h.stage, h.key) is None}
+        for key, source in absent.items():
+            source.reason = "its artifact was found damaged, or gone, when it was read"
+            if key not in self.flying:
+                self.flying[key] = [source]
+                heapq.heappush(self.missing, source.index)
+        if absent:
+            self.patients[handle.key] = set(absent)
+        else:
+            heapq.heappush(self.missing, handle.index)
+        return True
+
+    def _discharge(self, key: str, source: Handle) -> None:
+        """Send on what waited for a key to be computed again."""
+        for patient in [p for p, keys in self.patients.items() if key in keys]:
+            first = self.flying[patient][0]
+            if not source.done:
+                del self.patients[patient]
+                for handle in self.flying.pop(patient):
+                    handle.status = "pending"
+                    self._break(handle, source)
+                continue
+            self.patients[patient].discard(key)
+            if not self.patients[patient]:
+                del self.patients[patient]
+                heapq.heappush(self.missing, first.index)
 
     def _failed(self, failure: Failure) -> None:
         self.result.failures.append(failure)
@@ -302,7 +352,12 @@ class _Run:
         if handle.ref is not None:
             self.result.keys.add(handle.key)
         self.ledger.write(handle)
-        self.progress.resolved(handle)
+        before = self.fates.get(handle.index)
+        self.fates[handle.index] = status
+        if before is None:
+            self.progress.resolved(handle)
+        else:  # healed: it counts once, as what became of it last
+            setattr(counts, before, getattr(counts, before) - 1)
         for dependant in self.dependants.pop(handle.index, []):
             self.waits[dependant.index] -= 1
             if not handle.done:

@@ -9,7 +9,8 @@ import os
 import sys
 from pathlib import Path
 
-from pipeline.code import tree_digest
+from pipeline.code import remember_in, tree_digest
+from pipeline.kernels import guard
 
 SINGLE = ("OMP", "OPENBLAS", "MKL", "NUMBA", "BLIS", "VECLIB_MAXIMUM", "NUMEXPR")
 
@@ -30,8 +31,10 @@ def worker_environment(cache: Path | str) -> dict[str, str]:
 
 def prepare_environment(cache: Path | str) -> None:
     """Set this process up to run stages itself, and to start workers."""
+    remember_in(Path(cache) / "sources.json")
     environment = worker_environment(cache)
     os.environ.update(environment)
+    guard()
     if "numba" in sys.modules:
         sys.modules["numba"].config.CACHE_DIR = environment["NUMBA_CACHE_DIR"]
 

@@ -2,7 +2,8 @@
 
 :func:`make` is the one factory. All executors are the same three verbs: ``submit``, ``wait``, ``close``. Worker
 processes are spawned (never forked) with one thread each, for isolation: a crash takes one task with it, and a task
-that has taken three workers along is given up (:class:`WorkerDiedError`). A cluster given by address must see the
+that has taken three workers along is given up (:class:`WorkerDiedError`). Who ran when a worker died is told by a mark
+on the disk; tasks that only waited there begin elsewhere, as often as it takes. A cluster given by address must see the
 store's folder; tasks refuse to run where source code or packages are not those of the client.
 
 Programs call :func:`pipeline.environment.prepare_environment` first thing, so that this process and the workers run
@@ -15,16 +16,23 @@ import logging
 import os
 import pickle
 import queue
+import shutil
 import signal
+import tempfile
 import threading
+import time
 import traceback
+import warnings
+from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import Future
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any, Protocol
+
+import psutil
 
 from pipeline.environment import cores, prepare_environment, worker_environment
 from pipeline.task import Outcome, Refs, Spec, ensure
@@ -35,11 +43,27 @@ __all__ = ["Executor", "Failed", "WorkerDiedError", "make", "prepare_environment
 DEATHS = 3
 """Worker processes that one task may take along."""
 
+INNOCENT = 30
+"""Worker processes that may die before they even begin a task that was sent to them."""
+
+LOST = 4.0
+"""Seconds without a process after which a worker is replaced: its keeper gives up if it dies while it starts."""
+
+START = 60.0
+"""Seconds more for one that has not begun yet."""
+
+REPLACED = 12
+"""Workers replaced without a single task done before the run is given up."""
+
 WATCH = 0.5
 """Seconds between looks at the memory of the workers."""
 
 GRACE = 2.0
 """Seconds that workers get to leave at the end of a run before they are killed."""
+
+
+HURRY = 0.5
+"""The same for the client and the scheduler of an interrupted run, whose workers are killed already."""
 
 
 class WorkerDiedError(RilleError):
@@ -134,6 +158,8 @@ class Inline:
 
     def close(self, kill: bool = False) -> None:
         """Nothing to leave."""
+        if kill:
+            _leave_unsaid()
 
 
 class _Futures:
@@ -158,20 +184,20 @@ class _Futures:
 
     def wait(self) -> Landed:
         """Block until a task has ended; all that have ended meanwhile are given."""
-        keys: list[str] = []
-        while not keys:
+        landed: Landed = []
+        while not landed or not self._done.empty():
             with suppress(queue.Empty):
-                keys.append(self._done.get(timeout=WATCH))
+                key = self._done.get(timeout=WATCH)
+                outcome = self._result(key, self._flying.pop(key))
+                landed += [] if outcome is None else [(key, outcome)]
             self._watch()
-        with suppress(queue.Empty):
-            while True:
-                keys.append(self._done.get_nowait())
-        return [(key, self._result(self._flying.pop(key))) for key in keys]
+        return landed
 
     def _watch(self) -> None:
         """Called now and then while tasks run."""
 
-    def _result(self, future: Any) -> Outcome | Failed:
+    def _result(self, key: str, future: Any) -> Outcome | Failed | None:
+        """What became of a task; None if it was begun anew."""
         try:
             landed: Outcome | Failed = future.result()
         except Exception as error:
@@ -189,6 +215,8 @@ class Threads(_Futures):
 
     def close(self, kill: bool = False) -> None:
         """Nothing to leave."""
+        if kill:
+            _leave_unsaid()
 
 
 class Cluster(_Futures):
@@ -210,21 +238,15 @@ class Cluster(_Futures):
         name = f"{task[1].label}-{key[:12]}-{os.getpid()}-{self._submitted}"
         return self._client.submit(_attempt, key, *task, key=name, pure=False, priority=-self._submitted)
 
-    def _result(self, future: Any) -> Outcome | Failed:
+    def _result(self, key: str, future: Any) -> Outcome | Failed | None:
         from distributed import KilledWorker
 
         if future.status == "error" and isinstance(error := future.exception(), KilledWorker):
-            return Failed(self._died(str(error.task)), "")
-        return super()._result(future)
+            return self._killed(key, str(error.task))
+        return super()._result(key, future)
 
-    def _died(self, task: str) -> WorkerDiedError:
-        return WorkerDiedError(
-            f"{DEATHS} worker processes died while they ran it{self._last_seen(task)}",
-            remedy="give it more memory with fewer --jobs, or run it with --executor inline to see the crash",
-        )
-
-    def _last_seen(self, task: str) -> str:
-        return ""
+    def _killed(self, key: str, task: str) -> Failed | None:
+        return Failed(_died("worker processes died that had it"), "")
 
     def close(self, kill: bool = False) -> None:
         """Leave the cluster as it is."""
@@ -240,10 +262,20 @@ class Processes(Cluster):
         from distributed import LocalCluster
 
         self._memory: dict[str, int] = {}
+        """Greatest memory of a worker that ran a task, bytes, by the task's key."""
+        self._deaths: Counter[str] = Counter()
+        self._strays: Counter[str] = Counter()
+        self._tasks: dict[str, tuple[Any, ...]] = {}
+        self._marks = Path(tempfile.mkdtemp(prefix="rille-"))
+        self._alive: dict[Any, float] = {}
+        """When each worker was last seen with a process."""
+        self._replaced = 0
+        self._settings = ExitStack()
         settings = {
+            "distributed.deploy.lost-worker-timeout": "10 days",  # it takes workers away that are just restarting
             "distributed.nanny.pre-spawn-environ": worker_environment(cache)
             | {"DASK_DISTRIBUTED__LOGGING__DISTRIBUTED": "critical"},
-            "distributed.scheduler.allowed-failures": DEATHS - 1,
+            "distributed.scheduler.allowed-failures": 0,  # it would blame what only waited on a worker that died
             "distributed.scheduler.work-stealing": False,
             "distributed.scheduler.http.routes": [],
             "distributed.worker.multiprocessing-method": "spawn",
@@ -251,7 +283,8 @@ class Processes(Cluster):
             "distributed.admin.system-monitor.gil.enabled": False,
         }
         try:
-            with dask.config.set(settings), _interrupts_deferred():
+            self._settings.enter_context(dask.config.set(settings))  # workers that replace others need them too
+            with _interrupts_deferred():
                 self._cluster = LocalCluster(
                     n_workers=jobs,
                     threads_per_worker=1,
@@ -264,28 +297,90 @@ class Processes(Cluster):
         except KeyboardInterrupt:
             self.close(kill=True)
             raise
+        except BaseException:
+            self._settings.close()
+            shutil.rmtree(self._marks, ignore_errors=True)
+            raise
         self._slots = jobs  # all of them, though some may still be starting
 
-    def _watch(self) -> None:
-        with suppress(RuntimeError):  # the scheduler's own thread changes what is read here
-            for worker in self._cluster.scheduler.workers.values():
-                memory = int(worker.metrics.get("memory", 0))
-                self._memory |= {task.key: max(memory, self._memory.get(task.key, 0)) for task in worker.processing}
+    def _start(self, key: str, *task: Any) -> Any:
+        self._submitted += 1
+        self._tasks[key] = task
+        name = f"{task[1].label}-{key[:12]}-{os.getpid()}-{self._submitted}"
+        mark = self._marks / key
+        return self._client.submit(_marked, mark, key, *task, key=name, pure=False, priority=-self._submitted)
 
-    def _last_seen(self, task: str) -> str:
-        return f", last seen with {self._memory[task] / 1e6:.0f} MB" if self._memory.get(task) else ""
+    def _killed(self, key: str, task: str) -> Failed | None:
+        """Begin it anew, unless it ran on too many workers that died."""
+        mark = self._marks / key
+        ran = mark.exists()
+        mark.unlink(missing_ok=True)
+        (self._deaths if ran else self._strays)[key] += 1
+        if self._deaths[key] >= DEATHS:
+            seen = f", last seen with {self._memory[key] / 1e6:.0f} MB" if self._memory.get(key) else ""
+            return Failed(_died(f"{DEATHS} worker processes died while they ran it{seen}"), "")
+        if self._strays[key] >= INNOCENT:
+            return Failed(_died(f"{INNOCENT} worker processes died before they began it"), "")
+        self.submit(key, *self._tasks[key])
+        return None
+
+    def _result(self, key: str, future: Any) -> Outcome | Failed | None:
+        outcome = super()._result(key, future)
+        if outcome is not None:
+            self._replaced = 0
+        return outcome
+
+    def _watch(self) -> None:
+        self._replace_lost()
+        for mark in self._marks.iterdir():
+            with suppress(OSError, ValueError, psutil.Error):  # it ends as we look
+                memory = int(psutil.Process(int(mark.read_text())).memory_info().rss)
+                self._memory[mark.name] = max(memory, self._memory.get(mark.name, 0))
+
+    def _replace_lost(self) -> None:
+        now, lost = time.monotonic(), []
+        for name in list(self._cluster.worker_spec):
+            nanny = self._cluster.workers.get(name)
+            process = nanny and nanny.process and nanny.process.process
+            if process is not None and process.is_alive():
+                self._alive[name] = now
+            elif now - self._alive.setdefault(name, now + START) > LOST:
+                lost.append(name)
+        if lost:
+            self._replaced += len(lost)
+            if self._replaced > REPLACED:
+                raise _died(f"{REPLACED} worker processes died as they started")
+            for name in lost:
+                del self._cluster.worker_spec[name]
+            self._cluster.scale(self._slots)
 
     def close(self, kill: bool = False) -> None:
         """End the workers, at once if ``kill``; none is left behind."""
-        nannies = list(self._cluster.workers.values())
+        nannies = list({*self._cluster.workers.values(), *self._cluster._created})
         processes = [n.process.process for n in nannies if n.process and n.process.process]
         if kill:
             self._cluster.shutdown_on_close = False  # nor wait for it at exit
             _kill(nannies, processes)
         for leave in (self._client.close, self._cluster.close):
             with suppress(Exception):
-                leave(timeout=GRACE)
+                leave(timeout=HURRY if kill else GRACE)
         _kill(nannies, processes)
+        self._settings.close()
+        shutil.rmtree(self._marks, ignore_errors=True)
+
+
+def _marked(mark: Path, key: str, root: Path, spec: Spec, refs: Refs, force: bool) -> Outcome | Failed:
+    """Run a task under a mark that outlives the process."""
+    mark.write_text(str(os.getpid()))
+    try:
+        return _attempt(key, root, spec, refs, force)
+    finally:
+        mark.unlink(missing_ok=True)
+
+
+def _died(what: str) -> WorkerDiedError:
+    remedy = "give it more memory with fewer --jobs, or run it with --executor inline to see the crash"
+    return WorkerDiedError(what, remedy=remedy)
 
 
 @contextmanager
@@ -315,6 +410,11 @@ def _kill(nannies: list[Any], processes: list[Any]) -> None:
     for process in processes:
         with suppress(Exception):
             process._process.kill()
+
+
+def _leave_unsaid() -> None:
+    """Python would warn at exit of each read or write of zarr's that an interruption caught before it began."""
+    warnings.filterwarnings("ignore", message="coroutine .* was never awaited", category=RuntimeWarning)
 
 
 def _quiet() -> None:

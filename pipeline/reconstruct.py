@@ -341,7 +341,9 @@ class Reconstruction:
         return {"prediction": [None if T is None else (key.inverse() @ T).to_list() for T in poses]}
 
     def _risk(self, label: str, dems: list[Handle]) -> Handle:
-        return self._node("risk", label, {"vehicle": self.config.vehicle.model_dump(mode="json")}, dem=dems)
+        return self._node(
+            "risk", label, {"vehicle": self.config.vehicle.model_dump(mode="json", exclude={"name"})}, dem=dems
+        )
 
     def _pyramid(self, frame: int, camera: str) -> Handle:
         return self._node("pyramid", f"pyramid/{camera}/{frame}", {}, image=self._image(frame, camera))

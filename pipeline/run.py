@@ -2,13 +2,15 @@
 
 Everything that takes time is a cached task; what this module writes (rasters, trajectory, path, report) is rendered
 anew by each run into ``RUNS/<sequence>/<run id>/``. ``latest`` moves last, and only to a folder that is complete
-or whose holes were accepted by ``--keep-going``.
+or whose holes were accepted by ``--keep-going``. A run that computes nothing, and would write what ``latest`` holds
+already, leaves no folder of its own: that one stands (:mod:`pipeline.standing`).
 """
 
 from __future__ import annotations
 
 import hashlib
 import os
+import shutil
 import sys
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -17,14 +19,17 @@ from typing import Any
 
 from datasets.protocol import Sequence
 from pipeline import config as configuration
+from pipeline.artifact import DamagedError
+from pipeline.code import remember
 from pipeline.dag import Graph
-from pipeline.store import Store
+from pipeline.store import GoneError, Store
 from stages.declare import Bundle
 from stages.errors import ConfigError, RilleError
 
 COMPLETE, FAILED, HOLES = 0, 1, 3
 DISTRIBUTIONS = (
     *("rille", "numpy", "numba", "scipy", "opencv-python-headless", "dask", "zarr", "rasterio", "pyogrio", "pycolmap"),
+    *("matplotlib", "jinja2"),
 )
 
 
@@ -43,6 +48,7 @@ class Options:
     runs: Path = Path("runs")
     cache: Path = Path(".rille/cache")
     progress: str = "auto"
+    fresh: bool = False
 
     def command(self) -> str:
         """The command line that repeats this run."""
@@ -108,6 +114,14 @@ def warn_of_results(graph: Graph) -> None:
 
 def reconstruct(options: Options) -> int:
     """Run the whole chain; gives the exit code. Running the same options again resumes."""
+    try:
+        return _reconstruct(options)
+    except (DamagedError, GoneError) as error:  # found when the results were drawn; it is set aside by now
+        print(f"rille: warning: {error.message}; computing it again", file=sys.stderr)
+        return _reconstruct(options)
+
+
+def _reconstruct(options: Options) -> int:
     from pipeline import driver, progress
     from pipeline.reconstruct import Reconstruction
 
@@ -135,6 +149,19 @@ def reconstruct(options: Options) -> int:
     if not options.keep_going:
         result.check()
 
+    from pipeline import standing
+
+    versions = _versions()
+    facts = {"config": text, "frames": frames, "vehicle": vehicle_source, "command": options.command()}
+    stamped = standing.stamp(graph, sequence, versions, **facts)
+    remember()
+    earlier = folder.parent / "latest"
+    if result.ok and not result.total().computed and not options.fresh and standing.stands(earlier, stamped):
+        shutil.rmtree(folder)
+        warn_of_results(graph)
+        print(f"{earlier.parent / earlier.readlink()}  cached {result.total().cached}, nothing new: that run stands")
+        return COMPLETE
+
     from pipeline import outputs
     from pipeline.report import RunView
 
@@ -148,13 +175,19 @@ def reconstruct(options: Options) -> int:
         config=config,
         config_toml=text,
         seconds=result.seconds,
-        versions=_versions(),
+        versions=versions,
         command=options.command(),
         vehicle_source=vehicle_source,
         started=started.strftime("%Y-%m-%dT%H:%M:%SZ"),
         notes=sequence.notes,
     )
-    outputs.write(folder, view)
+    try:
+        outputs.write(folder, view)
+    except (DamagedError, GoneError):
+        shutil.rmtree(folder)
+        raise
+    if result.ok:
+        standing.seal(folder, stamped)
     _point_latest(folder)
     warn_of_results(graph)
     total = result.total()

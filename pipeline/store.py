@@ -21,6 +21,7 @@ import errno
 import json
 import os
 import shutil
+import time
 import uuid
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -35,6 +36,10 @@ from stages.declare import Bundle, Stage
 from stages.errors import RilleError
 
 Manifest = dict[str, Any]
+
+USED = 3600.0
+"""Seconds after which a use is noted again: clearing up spares what was used within its grace."""
+
 _HEAD = b'{"crc32c": "%08x", "manifest": '
 _HEAD_SIZE = len(_HEAD % 0)
 
@@ -45,6 +50,10 @@ class NonDeterministicError(RilleError):
 
 class StoreError(RilleError):
     """The cache folder cannot be read or written."""
+
+
+class GoneError(StoreError):
+    """An artifact that was there has gone: cleared away, or set aside as damaged by another run."""
 
 
 @dataclass(frozen=True)
@@ -69,9 +78,17 @@ class Store:
 
     def lookup(self, stage: str, key: str) -> Ref | None:
         """The artifact of a key, its file sizes checked; a damaged one is set aside and counts as absent."""
+        manifest = self._sound(stage, key)
+        return None if manifest is None else _ref(manifest)
+
+    def _sound(self, stage: str, key: str) -> Manifest | None:
+        published = self.home(stage, key) / "manifest.json"
         try:
             with self._clear_errors():
-                manifest = self._read_manifest(self.home(stage, key))
+                if published.stat().st_mtime < time.time() - USED:
+                    with suppress(OSError):  # a cache may be read-only
+                        os.utime(published)
+                manifest = self._read_manifest(published.parent)
         except FileNotFoundError:
             return None
         except ValueError:
@@ -81,7 +98,7 @@ class Store:
         if wrong:
             self.set_aside(stage, key, manifest, wrong)
             return None
-        return _ref(manifest)
+        return manifest
 
     def manifest(self, stage: str, key: str) -> Manifest | None:
         """Manifest of a key as it was committed, no check of the files; None if absent or not readable."""
@@ -99,12 +116,12 @@ class Store:
 
         Raises
         ------
-        StoreError
+        GoneError
             The artifact has gone since it was looked up.
         """
         manifest = self.manifest(ref.stage, ref.key)
         if manifest is None or manifest["digest"] != ref.digest:
-            raise StoreError(f"artifact {ref.stage} {ref.key[:12]} has gone from {self.root}", remedy="run again")
+            raise GoneError(f"artifact {ref.stage} {ref.key[:12]} has gone from {self.root}", remedy="run again")
 
         def damaged(reason: str) -> None:
             self.set_aside(ref.stage, ref.key, manifest, reason)
@@ -129,7 +146,7 @@ class Store:
         attempt = home / f"a-{uuid.uuid4().hex[:16]}"
         with self._clear_errors():
             try:
-                attempt.mkdir(parents=True)
+                _make(attempt)
                 arrays = write(attempt, stage, bundle)
                 manifest: Manifest = {
                     "stage": stage.name,
@@ -144,7 +161,9 @@ class Store:
                 }
                 there = self._publish(home, manifest)
             except BaseException:
-                shutil.rmtree(attempt, ignore_errors=True)
+                published = self.manifest(stage.name, key)  # an interruption may come just after the link
+                if published is None or published["path"] != attempt.relative_to(self.root).as_posix():
+                    _discard(attempt)
                 raise
         if there is None:
             return _ref(json.loads(json.dumps(manifest)))
@@ -166,11 +185,13 @@ class Store:
                 try:
                     os.link(temporary, home / "manifest.json")
                 except FileExistsError:
-                    if self.lookup(manifest["stage"], manifest["key"]) is not None:
-                        return self._read_manifest(home)
+                    there = self._sound(manifest["stage"], manifest["key"])
+                    if there is not None:
+                        return there
                 else:
-                    for folder in (home, *list(home.parents)[:2]):
-                        fsync(folder)
+                    with suppress(OSError):  # it is published: at worst a power failure takes it back as a whole
+                        for folder in (home, *list(home.parents)[:2]):
+                            fsync(folder)
                     return None
             raise StoreError(f"cannot publish {home / 'manifest.json'}", remedy="remove that file and run again")
         finally:
@@ -190,12 +211,26 @@ class Store:
         return manifest
 
     def set_aside(self, stage: str, key: str, manifest: Manifest | None, reason: str) -> None:
-        """Move a damaged artifact out of the way, manifest first. Best effort: a cache may be read-only."""
+        """Move a damaged artifact out of the way, manifest first. Best effort: a cache may be read-only.
+
+        Another run may have done so before, and have published a sound one meanwhile: that one is put back.
+        """
         aside = self.root / "quarantine" / f"{stage}-{key[:16]}-{uuid.uuid4().hex[:8]}"
         home = self.home(stage, key)
         with suppress(OSError):
             aside.mkdir(parents=True)
-            (home / "manifest.json").rename(aside / "manifest.json")
+            try:
+                (home / "manifest.json").rename(aside / "manifest.json")
+            except FileNotFoundError:
+                aside.rmdir()
+                return
+            with suppress(ValueError):
+                moved = self._read_manifest(aside)
+                if manifest is None or moved["path"] != manifest["path"]:
+                    with suppress(FileExistsError):
+                        os.link(aside / "manifest.json", home / "manifest.json")
+                    shutil.rmtree(aside)
+                    return
             if manifest is not None:
                 (self.root / manifest["path"]).rename(aside / Path(manifest["path"]).name)
             (aside / "reason.txt").write_text(f"{reason}\n", encoding="utf-8")
@@ -218,6 +253,24 @@ class Store:
             if isinstance(error, NotADirectoryError):
                 raise StoreError(f"the cache {self.root} is not a folder", remedy="choose one with --cache") from error
             raise
+
+
+def _make(attempt: Path) -> None:
+    """New folder of an attempt; clearing up may take an empty home away just as it is made."""
+    for _ in range(100):
+        with suppress(FileNotFoundError):
+            attempt.mkdir(parents=True)
+            return
+    attempt.mkdir(parents=True)
+
+
+def _discard(attempt: Path) -> None:
+    """Remove an attempt; where one write failed, others of zarr's may be under way still."""
+    for pause in (0.0, 0.02, 0.1, 0.5):
+        time.sleep(pause)
+        shutil.rmtree(attempt, ignore_errors=True)
+        if not attempt.exists():
+            return
 
 
 def _ref(manifest: Manifest) -> Ref:

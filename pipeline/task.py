@@ -28,6 +28,7 @@ from typing import Any
 
 from pipeline import explain
 from pipeline.code import environment, module_digests
+from pipeline.kernels import guard
 from pipeline.key import digest
 from pipeline.store import Ref, Store
 from stages.declare import Bundle, Params, Stage, check_outputs
@@ -82,6 +83,7 @@ class Outcome:
 def resolve(module: str) -> Stage:
     """``STAGE`` of a module; its source is digested just before the import, so that both see the same files."""
     module_digests(module)
+    guard()
     stage = importlib.import_module(module).STAGE
     if "cv2" in sys.modules:
         sys.modules["cv2"].setNumThreads(1)

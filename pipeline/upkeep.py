@@ -44,6 +44,8 @@ def verify(store: Store) -> tuple[int, list[Damage]]:
     sound, found = 0, []
     for stage, key in _artifacts(store):
         manifest = store.manifest(stage, key)
+        if manifest is None and not (store.home(stage, key) / "manifest.json").exists():
+            continue  # cleared away, or set aside by a run, just now
         if manifest is None:
             reason, label = "manifest.json is not readable", ""
         else:
@@ -60,8 +62,8 @@ def verify(store: Store) -> tuple[int, list[Damage]]:
 def gc(store: Store, keep: Collection[str], *, grace: float = GRACE, dry_run: bool = False) -> Cleared:
     """Remove artifacts whose key is not in ``keep``, and orphans, quarantine and compiled kernels of other sources.
 
-    Only what is older than ``grace`` seconds goes (a run may be under way). The manifest goes first, so that an
-    interruption leaves an orphan and never half an artifact. ``keep`` are the keys of the kept runs
+    Only what was neither made nor used within ``grace`` seconds goes (a run may be under way). The manifest goes first,
+    so that an interruption leaves an orphan and never half an artifact. ``keep`` are the keys of the kept runs
     (:func:`pipeline.ledger.keys`).
     """
     cleared = Cleared()
@@ -69,6 +71,10 @@ def gc(store: Store, keep: Collection[str], *, grace: float = GRACE, dry_run: bo
     kept = set(keep)
     for home in sorted(store.root.glob("artifacts/*/*")):
         _clear_home(store, home, home.name in kept, limit, cleared, dry_run)
+    for path in (*store.root.glob("*.tmp"), *store.root.glob("labels/*/*.tmp")):
+        if _written(path) <= limit:
+            cleared.orphans += 1
+            _remove(path, cleared, dry_run)
     current = tree_digest()
     for path in (*store.root.glob("quarantine/*"), *store.root.glob("numba/*")):
         if _written(path) <= limit and not current.startswith(path.name):
@@ -106,8 +112,10 @@ def _written(path: Path) -> float:
 
 
 def _remove(path: Path, cleared: Cleared, dry_run: bool) -> None:
-    files = [path] if path.is_file() else [p for p in path.rglob("*") if p.is_file()]
-    cleared.bytes += sum(p.stat().st_size for p in files)
+    with suppress(OSError):  # somebody else clears away too
+        for file in [path] if path.is_file() else path.rglob("*"):
+            with suppress(OSError):
+                cleared.bytes += file.stat().st_size if file.is_file() else 0
     if dry_run:
         return
     if path.is_file():

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,9 @@ import numpy as np
 import pytest
 import rasterio
 
-from pipeline import run
+from datasets.registry import open_sequence
+from pipeline import run, standing
+from pipeline.dag import Graph
 from pipeline.ledger import read
 from stages.errors import ConfigError
 
@@ -76,9 +79,63 @@ def test_the_same_again_computes_nothing(cold: Path, monkeypatch: pytest.MonkeyP
 
     monkeypatch.setattr("pipeline.driver.make", no_worker)
     before = digests(cold)
-    assert run.reconstruct(options(cold, executor="processes")) == 0
+    assert run.reconstruct(options(cold, executor="processes", fresh=True)) == 0
     assert computed(cold) == set()
     assert digests(cold) == before
+
+
+def test_where_nothing_is_new_the_latest_run_stands(
+    cold: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run.reconstruct(options(cold)) == 0
+    stands = latest(cold)
+    written = {p.name: p.read_bytes() for p in stands.iterdir()}
+    folders = set(stands.parent.iterdir())
+    capsys.readouterr()
+    with monkeypatch.context() as patch:
+        patch.setattr("pipeline.outputs.write", lambda *_: pytest.fail("something was drawn"))
+        assert run.reconstruct(options(cold)) == 0
+    assert capsys.readouterr().out.split()[0] == str(stands)
+    assert set(stands.parent.iterdir()) == folders
+    assert {p.name: p.read_bytes() for p in stands.iterdir()} == written
+
+    def draws(why: str, **options_: Any) -> None:
+        before = latest(cold)
+        assert run.reconstruct(options(cold, **options_)) == 0
+        assert latest(cold) != before, why
+
+    (stands / "path.geojson").write_text("edited")
+    draws("a file was edited")
+    (latest(cold) / "dem.qml").unlink()
+    draws("a file has gone")
+    draws("it was asked for", fresh=True)
+    draws("a stage was forced", force=frozenset({"select"}))
+    monkeypatch.setattr("pipeline.run._versions", lambda: {"matplotlib": "0"})
+    draws("another version of a package")
+
+
+def test_what_is_found_damaged_when_it_is_drawn_is_computed_again(
+    cold: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run.reconstruct(options(cold)) == 0
+    before = digests(cold)
+    chunk = next((cold / "cache").glob("artifacts/merge/*/a-*/ortho/c.0.0"))
+    chunk.write_bytes(bytes(chunk.stat().st_size))
+    assert run.reconstruct(options(cold, fresh=True)) == 0
+    assert "is damaged" in capsys.readouterr().err
+    assert {label.split("/")[0] for label in computed(cold)} == {"merge"}
+    assert digests(cold) == before
+
+
+def test_a_stamp_sees_what_no_key_sees(cold: Path) -> None:
+    sequence = open_sequence("mockup-short")
+    stamps = {
+        standing.stamp(Graph(), s, {}, command="a")
+        for s in (sequence, replace(sequence, notes=("other",)), replace(sequence, times=(0.0,) * 9))
+    }
+    stamps |= {standing.stamp(Graph(), sequence, {}, command="b"), standing.stamp(Graph(), sequence, {"x": "1"})}
+    assert len(stamps) == 5
+    assert standing.stamp(Graph(), open_sequence("mockup-short"), {}, command="a") in stamps
 
 
 def test_one_risk_parameter_reruns_risk_path_and_what_reads_them(cold: Path) -> None:
@@ -102,6 +159,7 @@ def test_written_configuration_repeats_the_run(cold: Path) -> None:
         cache=cold / "cache",
         executor="inline",
         progress="quiet",
+        fresh=True,
     )
     assert run.reconstruct(again) == 0
     assert computed(cold) == set()

@@ -111,3 +111,32 @@ def test_unknown_module_and_missing_distribution_are_named():
     with pytest.raises(RilleError, match="no-such-distribution"):
         code.environment(["no-such-distribution"])
     assert code.environment(["zarr", "numpy"]) == {"numpy": code.version("numpy"), "zarr": code.version("zarr")}
+
+
+def test_what_was_found_in_sources_is_remembered_by_their_bytes(package, tmp_path, monkeypatch):
+    monkeypatch.setattr(code, "_memory", code._Memory())
+    file = tmp_path / "cache" / "sources.json"
+    code.remember_in(file)
+    first, edited = package(), package("sibling.py", "5", "6")
+    code.remember()
+    monkeypatch.setattr(code.ast, "parse", lambda _: pytest.fail("a file was parsed again"))
+    code.remember_in(file)
+    assert package() == edited
+    assert package("sibling.py", "6", "5") == first
+
+
+def test_a_damaged_memory_of_sources_is_none(package, tmp_path, monkeypatch):
+    monkeypatch.setattr(code, "_memory", code._Memory())
+    file = tmp_path / "cache" / "sources.json"
+    code.remember_in(file)
+    first = package()
+    code.remember()
+    whole = file.read_bytes()
+    for damaged in (b"", whole[:-20], b"[]", b"{}", whole.replace(b"own_toy.near.half", b"own_toy.near.hall")):
+        file.write_bytes(damaged)
+        code.remember_in(file)
+        assert code._memory.known == {}
+        assert package() == first
+    file.write_bytes(whole)
+    code.remember_in(file)
+    assert code._memory.known

@@ -1,0 +1,258 @@
+"""What each parameter and each edit makes stale: every parameter of every stage against a table written by hand.
+
+Nothing is computed: the dry driver lays the whole chain out over a store that has everything, and then tells what it
+would compute once a parameter or a source file is another.
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+import typing
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from datasets.protocol import Sequence
+from datasets.registry import open_sequence
+from pipeline import code, driver, explain
+from pipeline import config as configuration
+from pipeline.dag import Graph
+from pipeline.environment import worker_environment
+from pipeline.key import digest
+from pipeline.reconstruct import Reconstruction
+from pipeline.store import Ref, Store
+from stages.errors import RilleError
+from stages.lens import Lens
+
+ROOT = Path(__file__).resolve().parent.parent
+FRAMES = (0, 1, 2, 3, 4)
+LATTICE = {"x0": -0.2, "y0": 0.4, "cell": 0.004, "rows": 60, "cols": 80}
+IDENTITY = [1.0, 0, 0, 0, 0, 1.0, 0, 0, 0, 0, 1.0, 0]
+
+META: dict[str, dict[str, Any]] = {
+    "select": {"basic": [0, 2, 4], "segments": [[0, 1, 2], [2, 3, 4]]},
+    "level": {"T_local_left": IDENTITY},
+    "locus": {"lattice": LATTICE},
+    "trajectory": {"positions": [[0.0, 0.0, 0.0]] * 5},
+    "crosscheck_join": {"frames": list(FRAMES), "positions": [[0.0, 0.0, 0.0]] * 5},
+}
+"""What the layout of the chain reads of results."""
+
+# -- the table: what must be computed again; a group of tasks is a label without its numbers ------------------------
+
+MISSION = {"locus/world", "merge", "risk/world", "path/world", "dem_accuracy/world", "path_check"}
+LOCAL = {"locus/local", "risk/local", "path/local", "dem_accuracy/local"}
+POSES = {"resect", "trajectory", "agreement", "accuracy"} | MISSION
+LEVELLED = {"level"} | LOCAL | POSES
+RIG = {"rig", "calibration"} | LEVELLED
+MATCHED = {"hfvm", "orientation"} | RIG
+MOVED = {"motion", "select", "track"} | POSES
+COUNTERCHECK = {"crosscheck", "crosscheck_join", "agreement", "accuracy/crosscheck"}
+PYRAMIDS = {"pyramid/left", "pyramid/right"} | MATCHED | MOVED
+RISK = {"risk/local", "risk/world", "risk/truth", "path/local", "path/world", "path_check"}
+
+STALE: dict[str, set[str]] = {
+    "undistort": {"undistort/left", "undistort/right"} | PYRAMIDS | COUNTERCHECK,
+    "pyramid": PYRAMIDS,
+    "motion": MOVED,
+    "select": {"select"},  # what follows hangs on its result, not on it
+    "hfvm": MATCHED,
+    "orientation": {"orientation"} | RIG,
+    "rig": RIG,
+    "level": LEVELLED,
+    "locus": LOCAL | MISSION,
+    "track": {"track"} | POSES,
+    "resect": POSES,
+    "merge": MISSION - {"locus/world"},
+    "risk": RISK,
+    "path": {"path/local", "path/world", "path_check"},
+    "crosscheck": COUNTERCHECK,
+    "agreement": {"agreement"},
+    "vehicle": RISK,
+}
+EXCEPTIONS: dict[str, set[str]] = {
+    "crosscheck.enabled": set(),  # without it there is less to compute
+    "vehicle.name": set(),  # a name changes no risk
+}
+
+
+class Everything(Store):
+    """Has every artifact that it is asked for while it learns, and later only those."""
+
+    def __init__(self, root: Path) -> None:
+        super().__init__(root)
+        self.known: dict[str, Ref] = {}
+        self.labels: dict[str, Ref] = {}
+        self.learning = True
+
+    def lookup(self, stage: str, key: str) -> Ref | None:
+        if self.learning:
+            self.known[key] = Ref(key, stage, digest([stage, key]), "", META.get(stage, {}))
+        return self.known.get(key)
+
+
+class Chain:
+    """Plans of one sequence over one store."""
+
+    def __init__(self, sequence: Sequence, root: Path) -> None:
+        self.sequence, self.store = sequence, Everything(root)
+        graph = self.plan({})
+        assert all(h.done for h in graph.nodes)
+        self.store.labels = {h.label: h.ref for h in graph.nodes if h.ref is not None}
+        self.store.learning = False
+        self.groups = {group(label) for label in self.store.labels}
+
+    def plan(self, given: dict[str, Any]) -> Graph:
+        graph = Graph()
+        config = configuration.build(configuration.expand(self.sequence.defaults), given)
+        Reconstruction(graph, self.sequence, config, FRAMES).build()
+        result = driver.run(graph, self.store, dry=True)
+        assert not result.failures
+        return graph
+
+    def stale(self, given: dict[str, Any]) -> set[str]:
+        """Groups of which something would be computed; of each, all must be."""
+        graph = self.plan(given)
+        fates: dict[str, set[str]] = {}
+        for h in graph.nodes:
+            fates.setdefault(group(h.label), set()).add(h.status)
+        return {name for name, found in fates.items() if "planned" in found}
+
+
+def group(label: str) -> str:
+    return re.sub(r"[/_-]-?\d+", "", label)
+
+
+@pytest.fixture(scope="module")
+def chain(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chain]:
+    sequence = open_sequence("mockup-short", {"mockup": {"frames": len(FRAMES)}})
+    lens = {c: Lens(getattr(sequence.rig, c), "radtan", (-0.1, 0.01, 0.0, 0.0)) for c in ("left", "right")}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(explain, "reason", lambda *_: "")
+        patch.setattr(explain, "latest", lambda store, stage, label: store.labels.get(label))
+        yield Chain(replace(sequence, lenses=lens), tmp_path_factory.mktemp("store"))
+
+
+PARAMETERS = [
+    f"{section}.{name}"
+    for section, field in configuration.model().model_fields.items()
+    for name in field.annotation.model_fields  # type: ignore[union-attr]
+]
+
+
+def candidates(kind: Any, value: Any) -> Iterator[Any]:
+    """Other values of a parameter, the nearest first."""
+    if typing.get_origin(kind) is typing.Literal:
+        yield from (v for v in typing.get_args(kind) if v != value)
+    elif isinstance(value, bool):
+        yield not value
+    elif isinstance(value, int):
+        yield from (value + 1, value - 1, value + 2, 1, 2)
+    elif isinstance(value, float):
+        yield from (value * 1.01, value * 0.99, value + 1e-6, 0.1)
+    elif isinstance(value, str):
+        yield f"{value}x"
+    elif isinstance(value, tuple):
+        yield tuple(v * 1.01 for v in value)
+    elif value is None:
+        yield from (0.0123, (0.1, 0.2), (-1.0, 0.5, 1.0, 2.0))
+
+
+def changes(parameter: str, defaults: Any) -> dict[str, Any]:
+    section, name = parameter.split(".")
+    kind = configuration.model().model_fields[section].annotation
+    assert kind is not None
+    now = getattr(getattr(configuration.build(defaults), section), name)
+    for value in candidates(kind.model_fields[name].annotation, now):
+        given = {section: {name: value}}
+        try:
+            if getattr(getattr(configuration.build(defaults, given), section), name) != now:
+                return given
+        except RilleError:
+            continue
+    raise AssertionError(f"{parameter}: find another value than {now}")
+
+
+def test_the_table_is_whole(chain: Chain) -> None:
+    assert set(STALE) == {p.split(".")[0] for p in PARAMETERS}
+    assert set(EXCEPTIONS) <= set(PARAMETERS)
+    assert set().union(*STALE.values()) <= chain.groups
+    sources = {"scene", "image/left", "image/right", "truth", "truth_dem/local", "truth_dem/world"}
+    assert chain.groups - set().union(*STALE.values()) == sources, "they hang on the sequence alone"
+
+
+def test_the_same_again_is_stale_nowhere(chain: Chain) -> None:
+    assert chain.stale({}) == set()
+
+
+@pytest.mark.parametrize("parameter", PARAMETERS)
+def test_a_parameter_makes_stale_exactly(chain: Chain, parameter: str) -> None:
+    given = changes(parameter, configuration.expand(chain.sequence.defaults))
+    expected = EXCEPTIONS.get(parameter, STALE[parameter.split(".")[0]])
+    assert chain.stale(given) == expected, given
+
+
+# -- edits of the sources: a module counts with all that it reaches ---------------------------------------------------
+
+WORDS = "\n# only words\n"
+
+EDITS: dict[str, tuple[str, str, str, set[str]]] = {
+    "a comment, in what all reach": ("stages/geometry.py", "", WORDS, set()),
+    "a docstring, in what all reach": ("stages/declare.py", '"""What a stage takes', '"""What any stage takes', set()),
+    "a docstring of a kernel": ("stages/hfvm/search.py", '"""', '"""Said otherwise. ', set()),
+    "the engine": ("pipeline/driver.py", "HEALS = 3", "HEALS = 4", set()),
+    "the report": ("pipeline/report/words.py", "", "\nMORE = 1\n", set()),
+    "a stage itself": ("stages/merge.py", "", "\nMORE = 1\n", {"merge"}),
+    "a helper of one stage": ("stages/row_grid.py", "", "\nMORE = 1\n", {"path/local", "path/world"}),
+    "a njit callee of one stage": ("stages/locus_kernel.py", "", "\nMORE = 1\n", {"locus/local", "locus/world"}),
+    "a njit callee of several": ("stages/features.py", "", "\nMORE = 1\n", {"motion", "hfvm", "track"}),
+    "a helper's helper": ("stages/epipolar.py", "", "\nMORE = 1\n", {"orientation", "rig"}),
+    "a helper of two stages": ("stages/pose_alignment.py", "", "\nMORE = 1\n", {"agreement", "crosscheck_join"}),
+}
+"""File, what in it becomes what (at its end, if nothing), and the groups whose *own* code it is part of."""
+
+
+@pytest.fixture
+def edited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """``edited(file, old, new)``: the sources as a new process would find them after that edit."""
+    for package in ("stages", "datasets", "pipeline"):
+        shutil.copytree(ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__"))
+    caches = (code._read, code._file, code._reachable)
+
+    def edit(file: str, old: str, new: str) -> None:
+        path = tmp_path / file
+        text = path.read_text()
+        assert old in text
+        path.write_text(text.replace(old, new, 1) if old else text + new)
+        monkeypatch.setattr(code, "_roots", lambda package: (tmp_path / package,))
+        for cached in caches:
+            cached.cache_clear()
+
+    yield edit
+    monkeypatch.undo()
+    for cached in caches:
+        cached.cache_clear()
+
+
+def downstream(chain: Chain, own: set[str]) -> set[str]:
+    """Groups that are fed by a task of one of these, themselves included."""
+    found = set()
+    for h in chain.plan({}).nodes:
+        if group(h.label) in own or any(group(up.label) in found for up in h.upstream()):
+            found.add(group(h.label))
+    return found
+
+
+@pytest.mark.parametrize("what", EDITS)
+def test_an_edit_makes_stale_exactly_what_depends_on_it(chain: Chain, edited: Any, what: str) -> None:
+    file, old, new, own = EDITS[what]
+    expected = downstream(chain, {g for g in chain.groups if g in own or g.split("/")[0] in own})
+    compiled = worker_environment("cache")["NUMBA_CACHE_DIR"]
+    edited(file, old, new)
+    assert chain.stale({}) == expected
+    numba = worker_environment("cache")["NUMBA_CACHE_DIR"]
+    assert (numba != compiled) == bool(own), "kernels are compiled anew when any source of theirs can be another"

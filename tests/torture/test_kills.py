@@ -1,0 +1,184 @@
+"""Programs killed and interrupted at random moments; what they published stays, only the rest is computed."""
+
+from __future__ import annotations
+
+import os
+import random
+import shutil
+import signal
+import time
+
+import psutil
+import pytest
+from torn import look
+
+from pipeline import upkeep
+from pipeline.store import Store
+
+WITHIN = 5.0
+"""Seconds that an interrupted program may take to leave."""
+
+
+def gone(children, within):
+    left = psutil.wait_procs(children, timeout=within)[1]
+    return not [p for p in left if p.is_running() and p.status() != psutil.STATUS_ZOMBIE]
+
+
+def statuses(found, status):
+    return sum(node["status"] == status for node in found["nodes"].values())
+
+
+def torment(program, calm, folder, executor, tries, seed):
+    """Kill runs on a cache that lives on for a few of them; finish each cache, and compare."""
+    rng = random.Random(seed)
+    lost, wrong, recomputed, expected, ended, half = [], [], 0, 0, 0, 0
+    right, total = calm["digests"], len(calm["digests"])
+    cache, known = folder / "cache", {}
+    begin = time.monotonic()
+    program.run(cache=str(folder / "timed"), executor=executor)
+    span, first = time.monotonic() - begin, 0.0 if executor == "inline" else 0.4  # workers take their time to start
+
+    def finish():
+        nonlocal recomputed, expected
+        expected += total - len(known)
+        found = program.run(cache=str(cache), executor="inline")
+        recomputed += statuses(found, "computed")
+        wrong.extend(look.wrong({n["key"]: n["digest"] for n in found["nodes"].values()}, right))
+        wrong.extend(look.wrong(look.decoded(cache), right))
+        shutil.rmtree(cache)
+        known.clear()
+
+    for _ in range(tries):
+        begin, limit = time.monotonic(), rng.uniform(first, 1.1) * span
+        pid = program.start(cache=str(cache), executor=executor)
+        while time.monotonic() - begin < limit and program.running():
+            time.sleep(0.001)
+        over = not program.running()
+        os.killpg(pid, signal.SIGKILL)
+        program.wait()
+        if over:
+            ended += 1
+            span = 0.5 * span + 0.5 * (time.monotonic() - begin)
+        else:
+            span = max(span, 0.9 * limit)  # a busy machine is slower than the undisturbed run was
+        found = look.published(cache)
+        half += 0 < len(found) < total
+        if not found:
+            span *= 1.05
+        lost += sorted(set(known) - set(found)) + sorted(look.manifests(cache) - set(found))
+        wrong += look.wrong(found, right)
+        known.clear()
+        known.update(found)
+        if over or rng.random() < 0.4:
+            finish()
+    finish()
+    return lost, wrong, recomputed, expected, f"{half} left a part behind, {ended} had ended"
+
+
+@pytest.mark.parametrize(
+    ("executor", "tries"),
+    [
+        ("inline", 8),
+        pytest.param("inline", 50, marks=pytest.mark.slow),
+        pytest.param("processes", 50, marks=pytest.mark.slow),
+    ],
+)
+def test_killed_at_random_moments(programs, calm, tmp_path, row, executor, tries):
+    (program,) = programs(1)
+    lost, wrong, recomputed, expected, remark = torment(program, calm, tmp_path, executor, tries, seed=tries)
+    row(f"SIGKILL of the group, {executor}", tries, lost, wrong, recomputed, expected, remark)
+
+
+@pytest.mark.parametrize(
+    ("executor", "tries"),
+    [
+        ("inline", 3),
+        ("threads", 2),
+        pytest.param("inline", 20, marks=pytest.mark.slow),
+        pytest.param("threads", 20, marks=pytest.mark.slow),
+        pytest.param("processes", 20, marks=pytest.mark.slow),
+    ],
+)
+def test_interrupted_at_random_moments(programs, calm, tmp_path, row, executor, tries):
+    (program,) = programs(1)
+    rng, slowest, lost, wrong, recomputed, expected = random.Random(tries), 0.0, [], [], 0, 0
+    within = WITHIN * max(1.0, os.getloadavg()[0] / len(os.sched_getaffinity(0)))  # others may have the processors
+    for trial in range(tries):
+        cache = tmp_path / str(trial)
+        span = 1.2 * calm["seconds"] if executor != "processes" else 5.0
+        pid = program.start(cache=str(cache), executor=executor, sleepers=3)
+        time.sleep(rng.uniform(0.0, span))
+        children = psutil.Process(pid).children(recursive=True)
+        os.killpg(pid, signal.SIGINT)
+        begin = time.monotonic()
+        code, said = program.wait(), program.log.read_text()
+        took = time.monotonic() - begin
+        slowest = max(slowest, took)
+        assert code == 130, f"{code} after {said}"
+        assert took < within
+        assert said == ""
+        assert gone(children, within)
+        found = look.published(cache)
+        lost += sorted(look.manifests(cache) - set(found))
+        resumed = program.run(cache=str(cache))
+        recomputed += statuses(resumed, "computed")
+        expected += len(set(calm["digests"]) - set(found))
+        wrong += look.wrong({n["key"]: n["digest"] for n in resumed["nodes"].values()}, calm["digests"])
+    row(f"Ctrl-C, {executor}", tries, lost, wrong, recomputed, expected, f"left within {slowest:.1f} s")
+
+
+DEATHS = ("task", "fsync:1", "fsync:5", "link:1", "linked:1", "replace:2")
+
+
+@pytest.mark.slow
+def test_workers_that_die_at_their_work_and_in_their_commit(programs, calm, tmp_path, row):
+    (program,) = programs(1)
+    cache, tally = tmp_path / "cache", tmp_path / "tally"
+    found = program.run(cache=str(cache), executor="processes", sabotage=DEATHS, tally=str(tally))
+    assert found["ok"], found["nodes"]
+    assert {p.name: p.stat().st_size for p in tally.iterdir()} == {
+        d.replace(":", "-"): 1 if d == "linked:1" else 2 for d in DEATHS
+    }, "what was published before the worker died is not computed again"
+    again = program.run(cache=str(cache), sabotage=DEATHS, tally=str(tally))
+    right = calm["digests"] | {
+        n["key"]: n["digest"] for n in found["nodes"].values() if n["key"] not in calm["digests"]
+    }
+    lost = [label for label, n in again["nodes"].items() if n["status"] != "cached"]
+    wrong = [n for n, digest in calm["labels"].items() if found["nodes"][n]["digest"] != digest]
+    wrong += look.wrong(look.decoded(cache), right)
+    total = len(calm["digests"]) + len(DEATHS)
+    computed = statuses(found, "computed") + statuses(found, "cached")  # published, but the worker could not say so
+    row("a worker dies at work, in its commit", len(DEATHS), lost, wrong, computed, total, ", ".join(DEATHS))
+
+
+@pytest.mark.slow
+def test_poison_takes_three_workers_each_and_nothing_else_along(programs, calm, tmp_path, row):
+    (program,) = programs(1)
+    cache, tally = tmp_path / "cache", tmp_path / "tally"
+    poison = ("poison#1", "poison#2", "poison#3")
+    found = program.run(cache=str(cache), executor="processes", sabotage=poison, tally=str(tally))
+    failed = {label: n["why"] for label, n in found["nodes"].items() if n["status"] == "failed"}
+    assert set(failed) == {f"saboteur/{p}" for p in poison}
+    assert all(why.startswith("WorkerDiedError: 3 worker processes died") for why in failed.values())
+    assert {p.name: p.stat().st_size for p in tally.iterdir()} == dict.fromkeys(poison, 3)
+    wrong = [n for n, digest in calm["labels"].items() if found["nodes"][n]["digest"] != digest]
+    computed = statuses(found, "computed")
+    row("poison: a task kills each worker", 3, [], wrong, computed, len(calm["digests"]), "9 workers died")
+
+
+@pytest.mark.slow
+def test_a_worker_out_of_memory_is_named_with_its_memory(programs, calm, tmp_path, row):
+    (program,) = programs(1)
+    cache = tmp_path / "cache"
+    found = program.run(
+        cache=str(cache), executor="processes", sabotage=("memory",), tally=str(tmp_path / "tally"), memory=800_000_000
+    )
+    hog = found["nodes"]["saboteur/memory"]
+    assert hog["status"] == "failed"
+    assert hog["why"].startswith("WorkerDiedError: 3 worker processes died")
+    wrong = [n for n, digest in calm["labels"].items() if found["nodes"][n]["digest"] != digest]
+    computed = statuses(found, "computed")
+    row(
+        "a worker runs out of memory", 1, [], wrong, computed, len(calm["digests"]), hog["why"].split(":", 1)[1].strip()
+    )
+    assert upkeep.verify(Store(cache))[1] == []

@@ -1,0 +1,151 @@
+"""Several runs on one cache, with clearing up beside them; and the whole chain on a small mockup, killed on its way."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from torn import look
+
+from pipeline import ledger
+
+RUNS = 3
+
+
+def together(programs, cache, runs, executors, grace, **options):
+    """Three runs at once, and one that clears up until they have ended."""
+    *three, cleaner = programs(RUNS + 1)
+    until = runs / "until"
+    runs.mkdir(parents=True, exist_ok=True)
+    cleaner.start(do="clear", cache=str(cache), runs=str(runs), until=str(until), grace=grace)
+    for i, (program, executor) in enumerate(zip(three, executors, strict=True)):
+        file = runs / "seq" / str(i) / "ledger.jsonl"
+        program.start(cache=str(cache), executor=executor, ledger=str(file), **options)
+    codes = [program.wait() for program in three]
+    until.touch()
+    codes.append(cleaner.wait())
+    assert codes == [0] * (RUNS + 1), [p.log.read_text() for p in programs(RUNS + 1)]
+    return [program.found() for program in three], cleaner.found()
+
+
+EXECUTORS = ("inline", "threads", "inline")
+
+
+@pytest.mark.parametrize("tries", [1, pytest.param(12, marks=pytest.mark.slow)])
+def test_three_runs_on_one_cold_cache_with_clearing_beside(programs, calm, tmp_path, row, tries):
+    lost, wrong, computed, sweeps, total = [], [], 0, 0, len(calm["digests"])
+    for trial in range(tries):
+        cache = tmp_path / f"cache-{trial}"
+        found, cleared = together(programs, cache, tmp_path / f"runs-{trial}", EXECUTORS, grace=3600)
+        sweeps += cleared["times"]
+        assert cleared["removed"] == 0
+        for run in found:
+            assert run["ok"], [n["why"] for n in run["nodes"].values() if n["digest"] is None]
+            computed += sum(n["status"] == "computed" for n in run["nodes"].values())
+            wrong += look.wrong({n["key"]: n["digest"] for n in run["nodes"].values()}, calm["digests"])
+        wrong += look.wrong(look.decoded(cache), calm["digests"])
+        lost += sorted(set(calm["digests"]) ^ set(look.published(cache)))
+        for home in cache.glob("artifacts/*/*"):
+            assert len(list(home.iterdir())) == 2, "one manifest, one attempt"
+        shutil.rmtree(cache)
+    expected = range(tries * total, RUNS * tries * total + 1)
+    row("three runs on one cold cache, with gc", tries, lost, wrong, computed, expected, f"{sweeps} sweeps of gc")
+
+
+@pytest.mark.parametrize("tries", [1, pytest.param(12, marks=pytest.mark.slow)])
+def test_clearing_takes_old_artifacts_from_under_runs(programs, calm, tmp_path, row, tries):
+    """What no kept run names and nobody used for long is fair game until the moment it is looked up."""
+    lost, wrong, computed, removed, total = [], [], 0, 0, len(calm["digests"])
+    for trial in range(tries):
+        cache, runs = tmp_path / f"cache-{trial}", tmp_path / f"runs-{trial}"
+        shutil.copytree(calm["cache"], cache)
+        rng = random.Random(trial)
+        old = time.time() - 1e6
+        for path in [*cache.glob("artifacts/*/*/*"), *cache.glob("artifacts/*/*")]:
+            os.utime(path, (old, old))
+        for home in cache.glob("artifacts/scale/*"):  # so that some must be computed from what may go
+            if rng.random() < 0.7:
+                shutil.rmtree(home)
+        found, cleared = together(programs, cache, runs, EXECUTORS, grace=3600)
+        removed += cleared["removed"]
+        for run in found:
+            assert run["ok"], [n["why"] for n in run["nodes"].values() if n["digest"] is None]
+            computed += sum(n["status"] == "computed" for n in run["nodes"].values())
+            wrong += look.wrong({n["key"]: n["digest"] for n in run["nodes"].values()}, calm["digests"])
+        wrong += look.wrong(look.decoded(cache), calm["digests"])
+        named = {key for file in runs.glob("*/*/ledger.jsonl") for key in ledger.keys(file)}
+        lost += sorted(named - set(look.published(cache)))
+        shutil.rmtree(cache)
+    expected = range(RUNS * tries * total + 1)
+    row("gc of old artifacts beside three runs", tries, lost, wrong, computed, expected, f"{removed} were cleared away")
+
+
+def test_a_race_finds_a_stage_that_is_not_deterministic(programs, tmp_path, row):
+    """Two that commit one key at once: the second is compared, and refused."""
+    first, second = programs(2)
+    tally = str(tmp_path / "tally")
+    for program in (first, second):
+        program.start(cache=str(tmp_path / "cache"), sabotage=["random"], tally=tally)
+    codes = [first.wait(), second.wait()]
+    assert codes == [0, 0]
+    whys = [p.found()["nodes"]["saboteur/random"]["why"] for p in (first, second)]
+    caught = sum("NonDeterministicError" in why for why in whys)
+    row("planted non-deterministic stage, raced", 1, [], [], caught, 1, "detected: compared at the commit")
+
+
+SMALL = (
+    *("mockup.frames=5", "mockup.image_width=285", "mockup.image_height=260", "mockup.focal_length=300.0"),
+    *("select.stride=2", "locus.cell_size=0.004"),
+)
+
+
+@pytest.mark.slow
+def test_small_mockup_killed_on_its_way(tmp_path, row):
+    rng, tries = random.Random(5), 4
+
+    def command(where):
+        words = [sys.executable, "-m", "pipeline.cli", "reconstruct", "mockup-short", "--jobs", "2", "--quiet"]
+        words += [w for a in SMALL for w in ("--set", a)]
+        return [*words, "--cache", str(where / "cache"), "--runs", str(where / "runs")]
+
+    def rows(where):
+        latest = where / "runs" / "mockup-short" / "latest"
+        return {r["label"]: r for r in ledger.read(latest / "ledger.jsonl")}
+
+    calm, torn = tmp_path / "calm", tmp_path / "torn"
+    begin = time.monotonic()
+    subprocess.run(command(calm), check=True, stdout=subprocess.DEVNULL)
+    span = time.monotonic() - begin
+    right = {r["key"]: r["digest"] for r in rows(calm).values()}
+    lost, wrong, known = [], [], {}
+    for _ in range(tries):
+        process = subprocess.Popen(command(torn), start_new_session=True, stdout=subprocess.DEVNULL)
+        time.sleep(rng.uniform(0.15, 0.35) * span)
+        with_latest = (torn / "runs" / "mockup-short" / "latest").exists()
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+            assert not with_latest, "latest moves last"
+        process.wait()
+        found = look.published(torn / "cache")
+        lost += sorted(set(known) - set(found)) + sorted(look.manifests(torn / "cache") - set(found))
+        wrong += look.wrong(found, right)
+        known = found
+    shutil.rmtree(torn / "runs")
+    subprocess.run(command(torn), check=True, stdout=subprocess.DEVNULL)
+    resumed = rows(torn)
+    wrong += [label for label, r in rows(calm).items() if resumed[label]["digest"] != r["digest"]]
+    for name in ("trajectory.kitti", "agreement.csv", "path.geojson"):
+        calm_file, torn_file = (Path(w) / "runs" / "mockup-short" / "latest" / name for w in (calm, torn))
+        wrong += [] if calm_file.read_bytes() == torn_file.read_bytes() else [name]
+    report = json.loads((torn / "runs" / "mockup-short" / "latest" / "report.json").read_text())
+    assert report["complete"]
+    computed = sum(r["status"] == "computed" for r in resumed.values())
+    row("small mockup, SIGKILL", tries, lost, wrong, computed, len(right) - len(known), f"{len(right)} artifacts")

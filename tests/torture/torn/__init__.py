@@ -1,0 +1,1 @@
+"""Programs and stages that the torture of the engine runs on."""
