@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from stages import features
 from stages.declare import AnyArray
-from stages.hfvm import consistency, epipolar, lookup, paper, search, subpixel
+from stages.hfvm import consistency, epipolar, lookup, paper, propagation, search, subpixel
 from stages.hfvm.params import HfvmParams
 from stages.pyramid import Pyramid, filled
 
@@ -93,13 +93,25 @@ class FastSolver:
         """Integer map of a level."""
         p, a, b = self.params, self.left[level], self.right[level]
         u, v = np.zeros(a.shape, np.int16), np.zeros(a.shape, np.int16)
+        packed, data = np.empty(a.shape, np.int32), np.empty(a.shape, np.int32)
         lines = band.lines(a.shape)
         if up is None:
             reach_x, reach_y = top_reach(p, a.shape, b.shape)
             search.exhaustive(a, b, reach_x, reach_y, 1, u, v)
+            propagation.pack_map(u, v, packed)
+            propagation.costs(a, b, lines, band.mu, packed, data)
         else:
-            search.descend(a, b, up.u, up.v, p.search_columns, p.search_rows, lines, band.mu, u, v)
-        u, v = search.propagate(a, b, u, v, lines, band.mu, p.smoothness, p.rounds)
+            propagation.descend(
+                a, b, up.u, up.v, p.search_columns, p.search_rows, lines, band.mu, packed, data
+            )
+        import os
+        mode=os.environ.get("MODE","j4").split(",")
+        mode=mode[min(level,len(mode)-1)]
+        if mode[0]=="j":
+            propagation.propagate(a, b, packed, data, lines, band.mu, p.smoothness, int(mode[1:]))
+        else:
+            propagation.checkerboard(a, b, packed, data, np.empty(a.shape,np.uint8), lines, band.mu, p.smoothness, int(mode[1:]))
+        propagation.unpack(packed, u, v)
         return Map(u, v, np.zeros(a.shape, bool))
 
     def fine(self, level: int, m: Map, wanted: AnyArray) -> Fine:

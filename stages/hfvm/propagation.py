@@ -1,0 +1,292 @@
+"""Search of one level with eight candidates at once; same results as the plain loops of ``search``.
+
+A map is one array of packed displacements, v << 16 | u (int32), beside the cost of each without smoothness.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from stages.features import distance
+from stages.hfvm import lanes
+from stages.hfvm.lanes import COST, LANES, NOTHING, ORDER, TRUNCATION
+
+FAR = 1 << 25
+"""Cost above every cost."""
+
+
+@njit(cache=True, nogil=True, inline="always")
+def pack(u, v):  # type: ignore[no-untyped-def]
+    """One 32-bit word of two 16-bit displacements."""
+    return np.int32((v << 16) | (u & 0xFFFF))
+
+
+@njit(cache=True, nogil=True, inline="always")
+def columns(packed):  # type: ignore[no-untyped-def]
+    """Column displacement."""
+    return np.int64(np.int16(packed))
+
+
+@njit(cache=True, nogil=True, inline="always")
+def rows_of(packed):  # type: ignore[no-untyped-def]
+    """Row displacement."""
+    return np.int64(packed) >> 16
+
+
+@njit(cache=True, nogil=True)
+def own_cost(word, right, x, y, packed, line, mu):  # type: ignore[no-untyped-def]
+    """Distance and band at one displacement, FAR outside the image."""
+    u, v = columns(packed), rows_of(packed)
+    rows, cols = right.shape
+    if x + u < 0 or x + u >= cols or y + v < 0 or y + v >= rows:
+        return np.int64(FAR)
+    cost = distance(word, right[y + v, x + u])
+    if mu > 0:
+        cost += np.int64(mu * abs(line[0] * u + line[1] * v + line[2]))
+    return cost
+
+
+@njit(cache=True, nogil=True)
+def descend(left, right, up_u, up_v, reach_x, reach_y, lines, mu, packed, data):  # type: ignore[no-untyped-def]
+    """As :func:`stages.hfvm.search.descend`; ``packed, data`` (row, col) int32: displacements and their costs."""
+    rows, cols = left.shape
+    rrows, rcols = right.shape
+    crows, ccols = up_u.shape
+    words = right.reshape(-1)
+    box = np.empty((9, 4), np.int64)
+    area = (2 * reach_x + 1) * (2 * reach_y + 1)
+    nil = np.float32(0.0)
+    for cy in range(crows):
+        for cx in range(ccols):
+            n = 0
+            own_u, own_v = np.int64(0), np.int64(0)
+            u0, v0 = np.int64(1 << 20), np.int64(1 << 20)
+            u1, v1 = -u0, -v0
+            for k in range(9):
+                j = cy + (k + 4) % 9 // 3 - 1
+                i = cx + (k + 4) % 3 - 1
+                if j < 0 or j >= crows or i < 0 or i >= ccols:
+                    continue
+                pu = 2 * np.int64(up_u[j, i])
+                pv = 2 * np.int64(up_v[j, i])
+                if mu > 0:
+                    a, b = lines[2 * cy, 2 * cx, 0], lines[2 * cy, 2 * cx, 1]
+                    e = a * pu + b * pv + lines[2 * cy, 2 * cx, 2]
+                    e = min(max(e, np.float32(-1.0)), np.float32(1.0))
+                    pu -= np.int64(np.rint(e * a))
+                    pv -= np.int64(np.rint(e * b))
+                if k == 0:
+                    own_u, own_v = pu, pv
+                known = False
+                for m in range(n):
+                    if box[m, 0] == pu - reach_x and box[m, 2] == pv - reach_y:
+                        known = True
+                if not known:
+                    box[n, 0], box[n, 1] = pu - reach_x, pu + reach_x
+                    box[n, 2], box[n, 3] = pv - reach_y, pv + reach_y
+                    u0, u1 = min(u0, pu - reach_x), max(u1, pu + reach_x)
+                    v0, v1 = min(v0, pv - reach_y), max(v1, pv + reach_y)
+                    n += 1
+            if (u1 - u0 + 1) * (v1 - v0 + 1) <= area * n:
+                box[0, 0], box[0, 1], box[0, 2], box[0, 3] = u0, u1, v0, v1
+                n = 1
+            for y in range(2 * cy, min(2 * cy + 2, rows)):
+                for x in range(2 * cx, min(2 * cx + 2, cols)):
+                    word = left[y, x]
+                    a = b = c = nil
+                    if mu > 0:
+                        a, b, c = lines[y, x, 0], lines[y, x, 1], lines[y, x, 2]
+                    best = np.int64(NOTHING)
+                    first = np.int64(0)
+                    bu, bv = own_u, own_v
+                    for m in range(n):
+                        ua, ub = max(box[m, 0], -x), min(box[m, 1], rcols - 1 - x)
+                        for v in range(max(box[m, 2], -y), min(box[m, 3], rrows - 1 - y) + 1):
+                            for u in range(ua, ub + 1, LANES):
+                                start = (y + v) * rcols + x + u
+                                key = lanes.run(word, words, start, min(ub - u + 1, LANES), u, v, a, b, c, mu, first)
+                                if key < best:
+                                    best = key
+                                    bu, bv = u + (key & ((1 << ORDER) - 1)) - first, v
+                                first += LANES
+                    packed[y, x] = pack(bu, bv)
+                    data[y, x] = best >> ORDER if best < NOTHING else FAR
+
+
+@njit(cache=True, nogil=True)
+def costs(left, right, lines, mu, packed, data):  # type: ignore[no-untyped-def]
+    """Costs of a map without smoothness."""
+    line = np.zeros(3, np.float32)
+    for y in range(left.shape[0]):
+        for x in range(left.shape[1]):
+            data[y, x] = own_cost(left[y, x], right, x, y, packed[y, x], lines[y, x] if mu > 0 else line, mu)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _step(a, b):  # type: ignore[no-untyped-def]
+    return min(abs(columns(a) - columns(b)) + abs(rows_of(a) - rows_of(b)), TRUNCATION)
+
+
+@njit(cache=True, nogil=True)
+def _border(left, right, packed, x, y, data, smoothness, line, mu):  # type: ignore[no-untyped-def]
+    """Decision at a pixel that lacks a neighbour: displacement and its cost."""
+    rows, cols = left.shape
+    near = np.empty(4, np.int32)
+    n = 0
+    for k in range(4):
+        j, i = y + (k == 3) - (k == 0), x + (k == 2) - (k == 1)
+        if j >= 0 and j < rows and i >= 0 and i < cols:
+            near[n] = packed[j, i]
+            n += 1
+    own = packed[y, x]
+    best, found = np.int64(FAR), own
+    for k in range(-1, 4 + n):
+        tried = own
+        if k >= 4:
+            tried = near[k - 4]
+        elif k >= 0:
+            tried = pack(columns(own) + (k == 1) - (k == 0), rows_of(own) + (k == 3) - (k == 2))
+        rough = np.int64(0)
+        for m in range(n):
+            rough += _step(near[m], tried)
+        cost = own_cost(left[y, x], right, x, y, tried, line, mu)
+        if cost < FAR and cost + smoothness * rough < best:
+            best, found = cost + smoothness * rough, tried
+    return found, best
+
+
+@njit(cache=True, nogil=True)
+def _roughness(flat, rows, cols, p, tried):  # type: ignore[no-untyped-def]
+    y = p // cols
+    x = p - y * cols
+    rough = np.int64(0)
+    if y > 0:
+        rough += _step(flat[p - cols], tried)
+    if x > 0:
+        rough += _step(flat[p - 1], tried)
+    if x < cols - 1:
+        rough += _step(flat[p + 1], tried)
+    if y < rows - 1:
+        rough += _step(flat[p + cols], tried)
+    return rough
+
+
+@njit(cache=True, nogil=True)
+def propagate(left, right, packed, data, lines, mu, smoothness, rounds):  # type: ignore[no-untyped-def]
+    """Jacobi rounds of :func:`stages.hfvm.search.propagate`, in place.
+
+    From the second round on only the neighbourhoods of what changed are looked at.
+    """
+    rows, cols = left.shape
+    rrows, rcols = right.shape
+    words, here, flat, cost = right.reshape(-1), left.reshape(-1), packed.reshape(-1), data.reshape(-1)
+    work = np.empty(rows * cols if rounds > 1 else 1, np.int32)
+    where = np.empty(rows * cols + 1, np.int32)
+    what = np.empty(rows * cols + 1, np.int32)
+    cheap = np.empty(rows * cols + 1, np.int32)
+    stamp = np.zeros(rows * cols, np.uint8)
+    nil = np.zeros(3, np.float32)
+    count = rows * cols
+    for turn in range(rounds):
+        changed = 0
+        for k in range(count):
+            p = np.int64(k if turn == 0 else work[k])
+            y = p // cols
+            x = p - y * cols
+            own = flat[p]
+            if y > 0 and y < rows - 1 and x > 0 and x < cols - 1:
+                a = b = c = np.float32(0.0)
+                if mu > 0:
+                    a, b, c = lines[y, x, 0], lines[y, x, 1], lines[y, x, 2]
+                up, west, east, down, d = flat[p - cols], flat[p - 1], flat[p + 1], flat[p + cols], np.int64(cost[p])
+                key = lanes.around(
+                    here[p], words, rrows, rcols, x, y, own, d, up, west, east, down, smoothness, a, b, c, mu
+                )
+                new = np.int32(key)
+                cheap[changed] = key >> COST
+            else:
+                new, total = _border(left, right, packed, x, y, data, smoothness, lines[y, x] if mu > 0 else nil, mu)
+                cheap[changed] = total
+            # Written always, kept by counting: whether a pixel changes cannot be predicted.
+            where[changed], what[changed] = p, new
+            changed += np.int64(new != own)
+        for k in range(changed):
+            cheap[k] -= smoothness * _roughness(flat, rows, cols, np.int64(where[k]), what[k])
+        for k in range(changed):
+            flat[where[k]], cost[where[k]] = what[k], cheap[k]
+        if turn == rounds - 1 or changed == 0:
+            break
+        # The same pixels in the order of the image would be nicer to the cache; the result does not depend on it.
+        count = 0
+        for k in range(changed):
+            p = np.int64(where[k])
+            y = p // cols
+            x = p - y * cols
+            for m in range(5):
+                if (m == 0 and y == 0) or (m == 1 and x == 0) or (m == 3 and x == cols - 1) or (m == 4 and y == rows - 1):
+                    continue
+                q = p + (m == 3) - (m == 1) + ((m == 4) - np.int64(m == 0)) * cols
+                if stamp[q] != turn + 1:
+                    stamp[q] = turn + 1
+                    work[count] = q
+                    count += 1
+
+
+@njit(cache=True, nogil=True)
+def checkerboard(left, right, packed, data, dirty, lines, mu, smoothness, rounds):  # type: ignore[no-untyped-def]
+    """Rounds of propagation in place, the two colours of a checkerboard in turn: they settle in half of Jacobi's.
+
+    ``dirty`` (row, col) uint8: room. From the second round on only the neighbourhoods of what changed are looked at.
+    """
+    rows, cols = left.shape
+    rrows, rcols = right.shape
+    words = right.reshape(-1)
+    nil = np.zeros(3, np.float32)
+    dirty[:] = 1
+    for turn in range(2 * rounds):
+        for y in range(rows):
+            for x in range((y + turn) & 1, cols, 2):
+                if not dirty[y, x]:
+                    continue
+                own = packed[y, x]
+                inner = y > 0 and y < rows - 1 and x > 0 and x < cols - 1
+                if inner:
+                    a = b = c = np.float32(0.0)
+                    if mu > 0:
+                        a, b, c = lines[y, x, 0], lines[y, x, 1], lines[y, x, 2]
+                    up, west, east, down = packed[y - 1, x], packed[y, x - 1], packed[y, x + 1], packed[y + 1, x]
+                    d = np.int64(data[y, x])
+                    key = lanes.around(
+                        left[y, x], words, rrows, rcols, x, y, own, d, up, west, east, down, smoothness, a, b, c, mu
+                    )
+                    new, total = np.int32(key), key >> COST
+                else:
+                    new, total = _border(left, right, packed, x, y, data, smoothness, lines[y, x] if mu > 0 else nil, mu)
+                dirty[y, x] = 0
+                if new == own:
+                    continue
+                packed[y, x] = new
+                data[y, x] = total - smoothness * _roughness(packed.reshape(-1), rows, cols, y * cols + x, new)
+                dirty[y, x] = 1
+                if inner:
+                    dirty[y - 1, x] = dirty[y, x - 1] = dirty[y, x + 1] = dirty[y + 1, x] = 1
+                else:
+                    dirty[max(y - 1, 0), x] = dirty[y, max(x - 1, 0)] = 1
+                    dirty[y, min(x + 1, cols - 1)] = dirty[min(y + 1, rows - 1), x] = 1
+
+
+@njit(cache=True, nogil=True)
+def unpack(packed, u, v):  # type: ignore[no-untyped-def]
+    """Displacements as two int16 maps."""
+    for y in range(packed.shape[0]):
+        for x in range(packed.shape[1]):
+            u[y, x], v[y, x] = columns(packed[y, x]), rows_of(packed[y, x])
+
+
+@njit(cache=True, nogil=True)
+def pack_map(u, v, packed):  # type: ignore[no-untyped-def]
+    """The reverse of :func:`unpack`."""
+    for y in range(packed.shape[0]):
+        for x in range(packed.shape[1]):
+            packed[y, x] = pack(np.int64(u[y, x]), np.int64(v[y, x]))
