@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from stages import pyramid
 from stages.declare import AnyArray, Array, Bundle, Inputs, Stage
-from stages.hfvm import consistency, hierarchy, plane, refine, subpixel
+from stages.hfvm import consistency, hierarchy, plane, refine, rowwise
 from stages.hfvm.params import HfvmParams
 from stages.pyramid import Pyramid, PyramidParams
 from stages.validity import Mask, Validity, counts, mark, matched
@@ -111,7 +111,7 @@ def _finish(
     keep = validity == 0
     if params.preset == "default":
         mean_u, mean_v = np.empty_like(u), np.empty_like(v)
-        subpixel.local_mean(u, v, keep, hierarchy.SUM_RADIUS, mean_u, mean_v)
+        rowwise.local_mean(u, v, keep, hierarchy.SUM_RADIUS, mean_u, mean_v)
         u, v = mean_u, mean_v
     if params.refine:
         u, v, rest = refine.refine(left.images[0], right.images[0], right.valid[0], u, v, keep, params)

@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from stages.declare import AnyArray
@@ -84,12 +85,28 @@ def _solve(p: AnyArray, q: AnyArray, sigma: float) -> tuple[Matrix, float, float
             else max(sigma, 2.0 * float(np.median(np.abs(residual))))
         )
         weight = 1.0 / (1.0 + (residual / spread) ** 2) / sigma**2
-        normal = np.einsum("in,jn,n->ij", terms, terms, weight) + precision
-        g = np.linalg.solve(normal, -np.einsum("in,n,n->i", terms, yr, weight) + precision @ prior)
+        normal, side = _normal(terms, yr, weight)
+        g = np.linalg.solve(normal + precision, precision @ prior - side)
     residual = yr + np.einsum("i,in->n", g, terms)
     cost = float(np.sum(np.log1p((residual / sigma) ** 2)) + np.sum(((g - prior) / PRIOR) ** 2))
     f = np.array([[g[1], g[2], g[0]], [g[3], g[4], 1.0], [g[5], g[6], g[7]]])
     return f, cost, float(np.median(np.abs(residual)))
+
+
+@njit(cache=True, nogil=True)
+def _normal(terms, target, weight):  # type: ignore[no-untyped-def]
+    """Weighted normal matrix and right-hand side, summed in the order of the points."""
+    count = terms.shape[0]
+    normal, side, row = np.zeros((count, count)), np.zeros(count), np.empty(count)
+    for n in range(target.size):
+        for i in range(count):
+            row[i] = terms[i, n]
+        for i in range(count):
+            w = row[i] * weight[n]
+            side[i] += w * target[n]
+            for j in range(count):
+                normal[i, j] += w * row[j]
+    return normal, side
 
 
 def finer(f: Matrix) -> Matrix:
@@ -119,10 +136,19 @@ def near_sign(f: Matrix, u: AnyArray, wanted: AnyArray, right_shape: tuple[int, 
 
 def lines(f: Matrix, shape: tuple[int, ...]) -> NDArray[np.float32]:
     """Epipolar line of every left pixel: unit normal and offset (row, col, 3) with n . displacement + c = 0."""
-    y = np.arange(shape[0], dtype=np.float64)[:, None]
-    x = np.arange(shape[1], dtype=np.float64)[None, :]
-    a, b, c = (f[i, 0] * x + f[i, 1] * y + f[i, 2] for i in range(3))
-    scale = 1.0 / np.maximum(np.sqrt(a * a + b * b), 1e-12)
     found = np.empty((shape[0], shape[1], 3), np.float32)
-    found[..., 0], found[..., 1], found[..., 2] = a * scale, b * scale, (c + a * x + b * y) * scale
+    _lines(f, found)
     return found
+
+
+@njit(cache=True, nogil=True)
+def _lines(f, found):  # type: ignore[no-untyped-def]
+    for j in range(found.shape[0]):
+        y = np.float64(j)
+        for i in range(found.shape[1]):
+            x = np.float64(i)
+            a = f[0, 0] * x + f[0, 1] * y + f[0, 2]
+            b = f[1, 0] * x + f[1, 1] * y + f[1, 2]
+            c = f[2, 0] * x + f[2, 1] * y + f[2, 2]
+            scale = 1.0 / max(np.sqrt(a * a + b * b), 1e-12)
+            found[j, i, 0], found[j, i, 1], found[j, i, 2] = a * scale, b * scale, (c + a * x + b * y) * scale

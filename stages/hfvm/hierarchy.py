@@ -259,8 +259,7 @@ def _level(pair: Prepared, params: HfvmParams, level: int, above: State | None, 
 def integer_error(a: Map, b: Map, b_valid: AnyArray) -> AnyArray:
     """Back-matching error of an integer map, pixels."""
     error = np.empty(a.u.shape, np.float32)
-    maps = (m.astype(np.float32) for m in (a.u, a.v, b.u, b.v))
-    consistency.backmatch(*maps, b_valid, error)
+    consistency.integer_error(a.u, a.v, b.u, b.v, b_valid, error)
     return error
 
 

@@ -262,6 +262,10 @@ Returns ``cost << COST | order << 32 | packed``.
 """
 
 
+SUM_RADIUS = 2
+"""Pixels: reach of the windows of ``sums``."""
+
+
 def make_sums(width: int) -> Any:
     """Intrinsic ``sums``, see :data:`sums`."""
 
@@ -303,3 +307,58 @@ sums = make_sums(widest())
 Around word ``at_left`` of the left image and ``at_right`` of the right one, displaced by nothing, one to the west,
 east, north, south. The windows must lie inside.
 """
+
+_FLOATS = ir.VectorType(ir.FloatType(), 4)
+_CUBIC = ((0.0, 1.0, 0.0, 0.0), (-0.5, 0.0, 0.5, 0.0), (1.0, -2.5, 2.0, -0.5), (-0.5, 1.5, -1.5, 0.5))
+"""Catmull-Rom weights of four samples: coefficients of 1, t, t^2, t^3."""
+_SLOPE = (_CUBIC[1], (2.0, -5.0, 4.0, -1.0), (-1.5, 4.5, -4.5, 1.5))
+"""Of their derivatives: coefficients of 1, t, t^2."""
+
+GREY = types.Array(types.float32, 1, "C")
+
+
+def _polynomial(builder: Any, coefficients: Any, t: Any) -> Any:
+    """Vector polynomial of a vector that holds ``t`` four times."""
+    total = _vector(_FLOATS, coefficients[-1])
+    for c in reversed(coefficients[:-1]):
+        total = builder.fadd(builder.fmul(total, t), _vector(_FLOATS, c))
+    return total
+
+
+def _dot(builder: Any, a: Any, b: Any) -> Any:
+    """Sum of four products, in pairs."""
+    product = builder.fmul(a, b)
+    for pick in ([2, 3, 2, 3], [1, 1, 1, 1]):
+        moved = builder.shuffle_vector(product, product, ir.Constant(ir.VectorType(_I32, 4), pick))
+        product = builder.fadd(product, moved)
+    return builder.extract_element(product, ir.Constant(_I32, 0))
+
+
+@intrinsic
+def cubic(typingctx, image, at, width, t, s):  # type: ignore[no-untyped-def]
+    """Catmull-Rom value and gradient (x, y) of a flat float32 image of ``width`` columns.
+
+    ``at``: index of the pixel above and left of the point's own; ``t, s``: the point's distance right of and below it,
+    within a pixel. 4 x 4 pixels from ``at - width - 1`` on are read.
+    """
+    f32, i64 = types.float32, types.int64
+    signature = types.UniTuple(f32, 3)(GREY, i64, i64, f32, f32)
+
+    def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        image, at, width, t, s = args
+        across, down = _splat(builder, t, 4), _splat(builder, s, 4)
+        start = builder.sub(builder.sub(at, width), ir.Constant(_I64, 1))
+        weights, slopes = _polynomial(builder, _CUBIC, down), _polynomial(builder, _SLOPE, down)
+        column = gradient = ir.Constant(_FLOATS, [0.0] * 4)
+        for k in range(4):
+            pointer = _as(builder, _pointer(context, builder, sig.args[0], image, start), _FLOATS)
+            row = builder.load(pointer, align=4)
+            each = ir.Constant(ir.VectorType(_I32, 4), [k] * 4)
+            column = builder.fadd(column, builder.fmul(builder.shuffle_vector(weights, weights, each), row))
+            gradient = builder.fadd(gradient, builder.fmul(builder.shuffle_vector(slopes, slopes, each), row))
+            start = builder.add(start, width)
+        w = _polynomial(builder, _CUBIC, across)
+        found = [_dot(builder, w, column), _dot(builder, _polynomial(builder, _SLOPE, across), column)]
+        return context.make_tuple(builder, sig.return_type, [*found, _dot(builder, w, gradient)])
+
+    return signature, codegen

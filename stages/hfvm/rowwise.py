@@ -9,7 +9,9 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-PLANES = 9
+from stages.hfvm import lanes
+
+PLANES = 10
 
 
 @njit(cache=True, nogil=True)
@@ -39,81 +41,34 @@ def local_mean(u, v, keep, radius, out_u, out_v):  # type: ignore[no-untyped-def
             out_v[y, x] = v[y, x] + (sv[x] / n if keep[y, x] else nil)
 
 
-@njit(cache=True, nogil=True, inline="always")
-def _cubic(t):  # type: ignore[no-untyped-def]
-    """Catmull-Rom weights of four samples, and of their derivative."""
-    h, two, three = np.float32(0.5), np.float32(2.0), np.float32(3.0)
-    one, four, five = np.float32(1.0), np.float32(4.0), np.float32(5.0)
-    return (
-        h * t * (two * t - one - t * t),
-        h * (two + t * t * (three * t - five)),
-        h * t * (one + four * t - three * t * t),
-        h * t * t * (t - one),
-        h * (four * t - one - three * t * t),
-        h * t * (np.float32(9.0) * t - np.float32(10.0)),
-        h * (one + np.float32(8.0) * t - np.float32(9.0) * t * t),
-        h * t * (three * t - two),
-    )
-
-
 @njit(cache=True, nogil=True)
-def sample_row(image, x, y, value, gx, gy):  # type: ignore[no-untyped-def]
-    """Catmull-Rom values and gradients at float32 points, each two pixels or more inside the image."""
-    flat = image.reshape(-1)
-    width = np.uint64(image.shape[1])
-    one = np.uint64(1)
-    nil = np.float32(0.0)
-    for k in range(x.size):
-        i, j = np.int32(x[k]), np.int32(y[k])
-        a0, a1, a2, a3, d0, d1, d2, d3 = _cubic(x[k] - np.float32(i))
-        b0, b1, b2, b3, e0, e1, e2, e3 = _cubic(y[k] - np.float32(j))
-        at = np.uint64(j - 1) * width + np.uint64(i - 1)
-        total, dx, dy = nil, nil, nil
-        for w, e in ((b0, e0), (b1, e1), (b2, e2), (b3, e3)):
-            r0, r1, r2, r3 = flat[at], flat[at + one], flat[at + one + one], flat[at + one + one + one]
-            row = r0 * a0 + r1 * a1 + r2 * a2 + r3 * a3
-            total += w * row
-            dy += e * row
-            dx += w * (r0 * d0 + r1 * d1 + r2 * d2 + r3 * d3)
-            at += width
-        value[k], gx[k], gy[k] = total, dx, dy
-
-
-@njit(cache=True, nogil=True)
-def _products(left, right, right_valid, u, v, keep, y, room, out):  # type: ignore[no-untyped-def]
+def _products(left, right, right_valid, u, v, keep, y, out):  # type: ignore[no-untyped-def]
     """Row ``y`` of the planes whose window sums a step needs, zero where a pixel takes no part.
 
-    ``room`` (6, col) float32; ``out`` (PLANES + 1, col): count, gx, gy, r, gx gx, gx gy, gy gy, gx r, gy r, r r.
+    ``out`` (PLANES, col): count, gx, gy, r, gx gx, gx gy, gy gy, gx r, gy r, r r.
     """
     rows, cols = left.shape
     rrows, rcols = right.shape
     out[:] = np.float32(0.0)
     if y < 0 or y >= rows:
         return
-    px, py, value, gx, gy, used = room[0], room[1], room[2], room[3], room[4], room[5]
     one, half = np.float32(1.0), np.float32(0.5)
     last_x, last_y = np.float32(rcols - 2), np.float32(rrows - 2)
-    lu, lv, lk, n = u[y], v[y], keep[y], out[0]
-    count = 0
-    valid = right_valid.reshape(-1)
+    lu, lv, grey, n, gx, gy, rest = u[y], v[y], left[y], out[0], out[1], out[2], out[3]
+    flat, taking = right.reshape(-1), keep[y]
     for x in range(cols):
         xr, yr = np.float32(x) + lu[x], np.float32(y) + lv[x]
-        inside = lk[x] & (xr >= one) & (xr < last_x) & (yr >= one) & (yr < last_y)
-        at = np.uint64(yr + half) * np.uint64(rcols) + np.uint64(xr + half) if inside else np.uint64(0)
-        inside &= valid[at] != 0
-        n[x] = one if inside else np.float32(0.0)
-        # The points of the pixels that take part, close together.
-        px[count], py[count], used[count] = xr, yr, np.float32(x)
-        count += np.int64(inside)
-    sample_row(right, px[:count], py[:count], value, gx, gy)
-    grey = left[y]
-    for k in range(count):
-        x = np.int64(used[k])
-        r = grey[x] - value[k]
-        a, b = gx[k], gy[k]
-        out[1, x], out[2, x], out[3, x] = a, b, r
-        out[4, x], out[5, x], out[6, x] = a * a, a * b, b * b
-        out[7, x], out[8, x], out[9, x] = a * r, b * r, r * r
+        if not (taking[x] and xr >= one and xr < last_x and yr >= one and yr < last_y):
+            continue
+        if not right_valid[np.uint64(yr + half), np.uint64(xr + half)]:
+            continue
+        i, j = np.int64(xr), np.int64(yr)
+        value, a, b = lanes.cubic(flat, j * rcols + i, rcols, xr - np.float32(i), yr - np.float32(j))
+        n[x], gx[x], gy[x], rest[x] = one, a, b, grey[x] - value
+    for k, (p, q) in enumerate(((gx, gx), (gx, gy), (gy, gy), (gx, rest), (gy, rest), (rest, rest))):
+        product = out[4 + k]
+        for x in range(cols):
+            product[x] = p[x] * q[x]
 
 
 @njit(cache=True, nogil=True)
@@ -140,16 +95,15 @@ def lucas_kanade(left, right, right_valid, u, v, keep, radius, noise, new_u, new
     """
     rows, cols = left.shape
     size = 2 * radius + 1
-    room = np.empty((6, cols + 1), np.float32)
-    fresh = np.empty((PLANES + 1, cols), np.float32)
-    ring = np.zeros((size, PLANES + 1, cols), np.float32)
-    s = np.empty((PLANES + 1, cols), np.float32)
+    fresh = np.empty((PLANES, cols), np.float32)
+    ring = np.zeros((size, PLANES, cols), np.float32)
+    s = np.empty((PLANES, cols), np.float32)
     for y in range(-radius, rows):
-        _products(left, right, right_valid, u, v, keep, y + radius, room, fresh)
+        _products(left, right, right_valid, u, v, keep, y + radius, fresh)
         _across(fresh, radius, ring[(y + radius) % size])
         if y < 0:
             continue
-        for k in range(PLANES + 1):
+        for k in range(PLANES):
             total = s[k]
             total[:] = ring[(y + radius + 1) % size, k]
             for j in range(1, size):
