@@ -55,34 +55,39 @@ def descend(left, right, up_u, up_v, reach_x, reach_y, lines, mu, packed, data):
     crows, ccols = up_u.shape
     words = right.reshape(-1)
     box = np.empty((9, 4), np.int64)
+    centres = np.empty((crows, ccols), np.int32)
     area = (2 * reach_x + 1) * (2 * reach_y + 1)
     nil = np.float32(0.0)
     for cy in range(crows):
         for cx in range(ccols):
-            n = 0
-            own_u, own_v = np.int64(0), np.int64(0)
-            u0, v0 = np.int64(1 << 20), np.int64(1 << 20)
-            u1, v1 = -u0, -v0
-            for k in range(9):
-                j = cy + (k + 4) % 9 // 3 - 1
-                i = cx + (k + 4) % 3 - 1
-                if j < 0 or j >= crows or i < 0 or i >= ccols:
-                    continue
-                pu = 2 * np.int64(up_u[j, i])
-                pv = 2 * np.int64(up_v[j, i])
-                if mu > 0:
-                    a, b = lines[2 * cy, 2 * cx, 0], lines[2 * cy, 2 * cx, 1]
-                    e = a * pu + b * pv + lines[2 * cy, 2 * cx, 2]
-                    e = min(max(e, np.float32(-1.0)), np.float32(1.0))
-                    pu -= np.int64(np.rint(e * a))
-                    pv -= np.int64(np.rint(e * b))
-                if k == 0:
-                    own_u, own_v = pu, pv
-                known = False
-                for m in range(n):
-                    if box[m, 0] == pu - reach_x and box[m, 2] == pv - reach_y:
-                        known = True
-                if not known:
+            pu, pv = 2 * np.int64(up_u[cy, cx]), 2 * np.int64(up_v[cy, cx])
+            if mu > 0:
+                y, x = min(2 * cy, rows - 1), min(2 * cx, cols - 1)
+                a, b = lines[y, x, 0], lines[y, x, 1]
+                e = min(max(a * pu + b * pv + lines[y, x, 2], np.float32(-1.0)), np.float32(1.0))
+                pu -= np.int64(np.rint(e * a))
+                pv -= np.int64(np.rint(e * b))
+            centres[cy, cx] = pack(pu, pv)
+    for cy in range(crows):
+        for cx in range(ccols):
+            own = centres[cy, cx]
+            own_u, own_v = columns(own), rows_of(own)
+            u0, u1, v0, v1 = own_u - reach_x, own_u + reach_x, own_v - reach_y, own_v + reach_y
+            box[0, 0], box[0, 1], box[0, 2], box[0, 3] = u0, u1, v0, v1
+            n = 1
+            last = own
+            for j in range(max(cy - 1, 0), min(cy + 2, crows)):
+                for i in range(max(cx - 1, 0), min(cx + 2, ccols)):
+                    other = centres[j, i]
+                    if other == own or other == last:
+                        continue
+                    last = other
+                    pu, pv = columns(other), rows_of(other)
+                    known = False
+                    for m in range(1, n):
+                        known |= (box[m, 0] == pu - reach_x) & (box[m, 2] == pv - reach_y)
+                    if known:
+                        continue
                     box[n, 0], box[n, 1] = pu - reach_x, pu + reach_x
                     box[n, 2], box[n, 3] = pv - reach_y, pv + reach_y
                     u0, u1 = min(u0, pu - reach_x), max(u1, pu + reach_x)
@@ -243,37 +248,63 @@ def checkerboard(left, right, packed, data, dirty, lines, mu, smoothness, rounds
     rrows, rcols = right.shape
     words = right.reshape(-1)
     nil = np.zeros(3, np.float32)
+    todo, moved, keys = np.empty(cols + 1, np.int32), np.empty(cols + 1, np.int32), np.empty(cols + 1, np.int64)
     dirty[:] = 1
     for turn in range(2 * rounds):
         for y in range(rows):
-            for x in range((y + turn) & 1, cols, 2):
-                if not dirty[y, x]:
-                    continue
-                own = packed[y, x]
-                inner = y > 0 and y < rows - 1 and x > 0 and x < cols - 1
-                if inner:
-                    a = b = c = np.float32(0.0)
-                    if mu > 0:
-                        a, b, c = lines[y, x, 0], lines[y, x, 1], lines[y, x, 2]
-                    up, west, east, down = packed[y - 1, x], packed[y, x - 1], packed[y, x + 1], packed[y + 1, x]
-                    d = np.int64(data[y, x])
-                    key = lanes.around(
-                        left[y, x], words, rrows, rcols, x, y, own, d, up, west, east, down, smoothness, a, b, c, mu
-                    )
-                    new, total = np.int32(key), key >> COST
-                else:
-                    new, total = _border(left, right, packed, x, y, data, smoothness, lines[y, x] if mu > 0 else nil, mu)
-                dirty[y, x] = 0
-                if new == own:
-                    continue
-                packed[y, x] = new
-                data[y, x] = total - smoothness * _roughness(packed.reshape(-1), rows, cols, y * cols + x, new)
-                dirty[y, x] = 1
-                if inner:
-                    dirty[y - 1, x] = dirty[y, x - 1] = dirty[y, x + 1] = dirty[y + 1, x] = 1
-                else:
-                    dirty[max(y - 1, 0), x] = dirty[y, max(x - 1, 0)] = 1
-                    dirty[y, min(x + 1, cols - 1)] = dirty[min(y + 1, rows - 1), x] = 1
+            first = (y + turn) & 1
+            if y == 0 or y == rows - 1:
+                for x in range(first, cols, 2):
+                    _edge(left, right, packed, x, y, data, dirty, smoothness, lines[y, x] if mu > 0 else nil, mu)
+                continue
+            if first == 0:
+                _edge(left, right, packed, 0, y, data, dirty, smoothness, lines[y, 0] if mu > 0 else nil, mu)
+            if (cols - 1) & 1 == first:
+                x = cols - 1
+                _edge(left, right, packed, x, y, data, dirty, smoothness, lines[y, x] if mu > 0 else nil, mu)
+            # What to look at and what changes cannot be predicted: lists, written always and kept by counting.
+            flags, here, over, under, cost = dirty[y], packed[y], packed[y - 1], packed[y + 1], data[y]
+            n = 0
+            for x in range(2 - first, cols - 1, 2):
+                todo[n] = x
+                n += np.int64(flags[x])
+                flags[x] = 0
+            m = 0
+            for k in range(n):
+                x = np.int64(todo[k])
+                a = b = c = np.float32(0.0)
+                if mu > 0:
+                    a, b, c = lines[y, x, 0], lines[y, x, 1], lines[y, x, 2]
+                own = here[x]
+                key = lanes.around(
+                    left[y, x], words, rrows, rcols, x, y, own, np.int64(cost[x]), over[x], here[x - 1], here[x + 1],
+                    under[x], smoothness, a, b, c, mu,
+                )  # fmt: skip
+                moved[m], keys[m] = x, key
+                m += np.int64(np.int32(key) != own)
+            for k in range(m):
+                x = np.int64(moved[k])
+                new = np.int32(keys[k])
+                rough = _step(over[x], new) + _step(here[x - 1], new) + _step(here[x + 1], new) + _step(under[x], new)
+                here[x] = new
+                cost[x] = (keys[k] >> COST) - smoothness * rough
+                flags[x] = flags[x - 1] = flags[x + 1] = dirty[y - 1, x] = dirty[y + 1, x] = 1
+
+
+@njit(cache=True, nogil=True)
+def _edge(left, right, packed, x, y, data, dirty, smoothness, line, mu):  # type: ignore[no-untyped-def]
+    """A pixel of ``checkerboard`` that lacks a neighbour."""
+    rows, cols = left.shape
+    if not dirty[y, x]:
+        return
+    dirty[y, x] = 0
+    new, total = _border(left, right, packed, x, y, data, smoothness, line, mu)
+    if new == packed[y, x]:
+        return
+    packed[y, x] = new
+    data[y, x] = total - smoothness * _roughness(packed.reshape(-1), rows, cols, y * cols + x, new)
+    dirty[y, x] = dirty[max(y - 1, 0), x] = dirty[y, max(x - 1, 0)] = 1
+    dirty[y, min(x + 1, cols - 1)] = dirty[min(y + 1, rows - 1), x] = 1
 
 
 @njit(cache=True, nogil=True)
