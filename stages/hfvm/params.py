@@ -64,6 +64,9 @@ class HfvmParams(Params):
     rounds: int = Field(
         default=4, ge=0, le=32, description="propagation rounds a level; they recover what the coarse level lost"
     )
+    fine_rounds: int | None = Field(
+        default=2, ge=0, le=32, description="the same at the finest level, which costs most; null: as at the others"
+    )
     median: Literal[1, 3, 5] = Field(default=5, description="pixels; side of the median filter of each level, 1 = none")
     threshold: float = Field(
         default=90.0,

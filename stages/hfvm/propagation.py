@@ -55,45 +55,28 @@ def descend(left, right, up_u, up_v, reach_x, reach_y, lines, mu, packed, data):
     crows, ccols = up_u.shape
     words = right.reshape(-1)
     box = np.empty((9, 4), np.int64)
-    centres = np.empty((crows, ccols), np.int32)
     area = (2 * reach_x + 1) * (2 * reach_y + 1)
     nil = np.float32(0.0)
+    # Centres with their edge repeated: that adds none.
+    us, vs = np.empty((crows + 2, ccols + 2), np.int32), np.empty((crows + 2, ccols + 2), np.int32)
+    _centres(up_u, up_v, lines, mu, rows, cols, us, vs)
+    low_u, high_u = np.empty(ccols + 2, np.int32), np.empty(ccols + 2, np.int32)
+    low_v, high_v = np.empty(ccols + 2, np.int32), np.empty(ccols + 2, np.int32)
     for cy in range(crows):
+        _range(us[cy : cy + 3], low_u, high_u)
+        _range(vs[cy : cy + 3], low_v, high_v)
         for cx in range(ccols):
-            pu, pv = 2 * np.int64(up_u[cy, cx]), 2 * np.int64(up_v[cy, cx])
-            if mu > 0:
-                y, x = min(2 * cy, rows - 1), min(2 * cx, cols - 1)
-                a, b = lines[y, x, 0], lines[y, x, 1]
-                e = min(max(a * pu + b * pv + lines[y, x, 2], np.float32(-1.0)), np.float32(1.0))
-                pu -= np.int64(np.rint(e * a))
-                pv -= np.int64(np.rint(e * b))
-            centres[cy, cx] = pack(pu, pv)
-    for cy in range(crows):
-        for cx in range(ccols):
-            own = centres[cy, cx]
-            own_u, own_v = columns(own), rows_of(own)
-            u0, u1, v0, v1 = own_u - reach_x, own_u + reach_x, own_v - reach_y, own_v + reach_y
-            box[0, 0], box[0, 1], box[0, 2], box[0, 3] = u0, u1, v0, v1
+            own_u, own_v = np.int64(us[cy + 1, cx + 1]), np.int64(vs[cy + 1, cx + 1])
+            u0 = np.int64(min(low_u[cx], low_u[cx + 1], low_u[cx + 2])) - reach_x
+            u1 = np.int64(max(high_u[cx], high_u[cx + 1], high_u[cx + 2])) + reach_x
+            v0 = np.int64(min(low_v[cx], low_v[cx + 1], low_v[cx + 2])) - reach_y
+            v1 = np.int64(max(high_v[cx], high_v[cx + 1], high_v[cx + 2])) + reach_y
+            # Where the centres lie close together one rectangle holds them all and costs less than n areas.
             n = 1
-            last = own
-            for j in range(max(cy - 1, 0), min(cy + 2, crows)):
-                for i in range(max(cx - 1, 0), min(cx + 2, ccols)):
-                    other = centres[j, i]
-                    if other == own or other == last:
-                        continue
-                    last = other
-                    pu, pv = columns(other), rows_of(other)
-                    known = False
-                    for m in range(1, n):
-                        known |= (box[m, 0] == pu - reach_x) & (box[m, 2] == pv - reach_y)
-                    if known:
-                        continue
-                    box[n, 0], box[n, 1] = pu - reach_x, pu + reach_x
-                    box[n, 2], box[n, 3] = pv - reach_y, pv + reach_y
-                    u0, u1 = min(u0, pu - reach_x), max(u1, pu + reach_x)
-                    v0, v1 = min(v0, pv - reach_y), max(v1, pv + reach_y)
-                    n += 1
-            if (u1 - u0 + 1) * (v1 - v0 + 1) <= area * n:
+            size = (u1 - u0 + 1) * (v1 - v0 + 1)
+            if size > 2 * area:
+                n = _areas(us[cy : cy + 3, cx : cx + 3], vs[cy : cy + 3, cx : cx + 3], reach_x, reach_y, box)
+            if size <= area * max(n, 2):
                 box[0, 0], box[0, 1], box[0, 2], box[0, 3] = u0, u1, v0, v1
                 n = 1
             for y in range(2 * cy, min(2 * cy + 2, rows)):
@@ -107,16 +90,69 @@ def descend(left, right, up_u, up_v, reach_x, reach_y, lines, mu, packed, data):
                     bu, bv = own_u, own_v
                     for m in range(n):
                         ua, ub = max(box[m, 0], -x), min(box[m, 1], rcols - 1 - x)
-                        for v in range(max(box[m, 2], -y), min(box[m, 3], rrows - 1 - y) + 1):
-                            for u in range(ua, ub + 1, LANES):
-                                start = (y + v) * rcols + x + u
-                                key = lanes.run(word, words, start, min(ub - u + 1, LANES), u, v, a, b, c, mu, first)
-                                if key < best:
-                                    best = key
-                                    bu, bv = u + (key & ((1 << ORDER) - 1)) - first, v
+                        if ub < ua:
+                            continue
+                        v, last_v = max(box[m, 2], -y), min(box[m, 3], rrows - 1 - y)
+                        while v <= last_v:
+                            start = (y + v) * rcols + x
+                            u = ua
+                            while u <= ub:
+                                key = lanes.run(
+                                    word, words, start + u, min(ub - u + 1, LANES), u, v, a, b, c, mu, first
+                                )
+                                better = key < best
+                                best = key if better else best
+                                bu = u + (key & ((1 << ORDER) - 1)) - first if better else bu
+                                bv = v if better else bv
                                 first += LANES
+                                u += LANES
+                            v += 1
                     packed[y, x] = pack(bu, bv)
                     data[y, x] = best >> ORDER if best < NOTHING else FAR
+
+
+@njit(cache=True, nogil=True)
+def _centres(up_u, up_v, lines, mu, rows, cols, us, vs):  # type: ignore[no-untyped-def]
+    """Doubled displacements, each moved towards its epipolar line by a pixel at most; a border repeats the edge."""
+    crows, ccols = up_u.shape
+    one = np.float32(1.0)
+    for j in range(crows + 2):
+        cy = min(max(j - 1, 0), crows - 1)
+        y = min(2 * cy, rows - 1)
+        for i in range(ccols + 2):
+            cx = min(max(i - 1, 0), ccols - 1)
+            pu, pv = 2 * np.int64(up_u[cy, cx]), 2 * np.int64(up_v[cy, cx])
+            if mu > 0:
+                x = min(2 * cx, cols - 1)
+                a, b = lines[y, x, 0], lines[y, x, 1]
+                e = min(max(a * pu + b * pv + lines[y, x, 2], -one), one)
+                pu -= np.int64(np.rint(e * a))
+                pv -= np.int64(np.rint(e * b))
+            us[j, i], vs[j, i] = pu, pv
+
+
+@njit(cache=True, nogil=True)
+def _range(three, low, high):  # type: ignore[no-untyped-def]
+    """Least and greatest of three rows, column by column."""
+    a, b, c = three[0], three[1], three[2]
+    for x in range(low.size):
+        low[x] = min(a[x], b[x], c[x])
+        high[x] = max(a[x], b[x], c[x])
+
+
+@njit(cache=True, nogil=True)
+def _areas(us, vs, reach_x, reach_y, box):  # type: ignore[no-untyped-def]
+    """Different search areas among nine centres, the middle one first: least and greatest column and row."""
+    n = 0
+    for k in range(9):
+        u, v = np.int64(us[(k + 4) % 9 // 3, (k + 4) % 3]), np.int64(vs[(k + 4) % 9 // 3, (k + 4) % 3])
+        known = False
+        for m in range(n):
+            known |= (box[m, 0] == u - reach_x) & (box[m, 2] == v - reach_y)
+        if not known:
+            box[n, 0], box[n, 1], box[n, 2], box[n, 3] = u - reach_x, u + reach_x, v - reach_y, v + reach_y
+            n += 1
+    return n
 
 
 @njit(cache=True, nogil=True)
