@@ -80,6 +80,8 @@ def match(
 
 def match_pyramids(left: Pyramid, right: Pyramid, params: HfvmParams) -> Disparity:
     """As :func:`match`, of two image pyramids."""
+    if params.finest and min(left.levels, right.levels) > params.finest:
+        return _enlarged(left, right, params)
     pair = hierarchy.prepare(left, right, params)
     if params.preset == "paper":
         return _finish(left, right, pair, hierarchy.run(pair, params, 0), params, None)
@@ -92,6 +94,32 @@ def match_pyramids(left: Pyramid, right: Pyramid, params: HfvmParams) -> Dispari
     pair = hierarchy.prepare(left, warped, params)
     state = hierarchy.run(pair, params, 0, near_sign=coarse.near_sign)
     return _finish(left, right, pair, state, params, alignment)
+
+
+def _enlarged(left: Pyramid, right: Pyramid, params: HfvmParams) -> Disparity:
+    """Matched at half the resolution; displacements, twice as great, stand for 2 x 2 pixels each."""
+    half = params.model_copy(
+        update={"finest": 0, "speckle": max(params.speckle // 4, 1), "fill_reach": params.fill_reach // 2}
+    )
+    left_half, right_half = (Pyramid(p.images[1:], p.valid[1:]) for p in (left, right))
+    found = match_pyramids(left_half, right_half, half)
+    rows, cols = left.images[0].shape
+    u, v, validity, error, distance = (
+        np.ascontiguousarray(a.repeat(2, axis=0)[:rows].repeat(2, axis=1)[:, :cols])
+        for a in (found.column_disparity, found.row_disparity, found.validity, found.backmatch_error, found.distance)
+    )
+    u, v, error = 2 * u, 2 * v, 2 * error
+    y, x = np.indices(u.shape, sparse=True)
+    xr, yr = x + u, y + v
+    right_rows, right_cols = right.images[0].shape
+    with np.errstate(invalid="ignore"):
+        outside = (xr < 0) | (xr > right_cols - 1) | (yr < 0) | (yr > right_rows - 1)
+    masked = left.valid[0] == 0
+    mark(validity, outside | masked, Validity.OUT_OF_IMAGE)
+    validity[(outside & matched(validity)) | masked] &= ~np.uint8(Validity.MATCHED | Validity.INTERPOLATED)
+    gone = (validity & np.uint8(Validity.MATCHED | Validity.INTERPOLATED)) == 0
+    u[gone] = v[gone] = np.nan
+    return Disparity(u, v, validity, error, distance, found.aligned)
 
 
 def _finish(
@@ -109,7 +137,7 @@ def _finish(
     if alignment is not None:
         u, v = plane.compose(alignment, u, v)
     keep = validity == 0
-    if params.preset == "default":
+    if params.preset != "paper":
         mean_u, mean_v = np.empty_like(u), np.empty_like(v)
         rowwise.local_mean(u, v, keep, hierarchy.SUM_RADIUS, mean_u, mean_v)
         u, v = mean_u, mean_v
