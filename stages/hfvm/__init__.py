@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from stages import pyramid
 from stages.declare import AnyArray, Array, Bundle, Inputs, Stage
-from stages.hfvm import consistency, hierarchy, plane, refine, rowwise
+from stages.hfvm import consistency, hierarchy, plane, refine, resample, rowwise
 from stages.hfvm.params import HfvmParams
 from stages.pyramid import Pyramid, PyramidParams
 from stages.validity import Mask, Validity, counts, mark, matched
@@ -103,22 +103,11 @@ def _enlarged(left: Pyramid, right: Pyramid, params: HfvmParams) -> Disparity:
     )
     left_half, right_half = (Pyramid(p.images[1:], p.valid[1:]) for p in (left, right))
     found = match_pyramids(left_half, right_half, half)
-    rows, cols = left.images[0].shape
-    u, v, validity, error, distance = (
-        np.ascontiguousarray(a.repeat(2, axis=0)[:rows].repeat(2, axis=1)[:, :cols])
-        for a in (found.column_disparity, found.row_disparity, found.validity, found.backmatch_error, found.distance)
-    )
-    u, v, error = 2 * u, 2 * v, 2 * error
-    y, x = np.indices(u.shape, sparse=True)
-    xr, yr = x + u, y + v
-    right_rows, right_cols = right.images[0].shape
-    with np.errstate(invalid="ignore"):
-        outside = (xr < 0) | (xr > right_cols - 1) | (yr < 0) | (yr > right_rows - 1)
-    masked = left.valid[0] == 0
-    mark(validity, outside | masked, Validity.OUT_OF_IMAGE)
-    validity[(outside & matched(validity)) | masked] &= ~np.uint8(Validity.MATCHED | Validity.INTERPOLATED)
-    gone = (validity & np.uint8(Validity.MATCHED | Validity.INTERPOLATED)) == 0
-    u[gone] = v[gone] = np.nan
+    shape = left.images[0].shape
+    u, v, error, distance = (np.empty(shape, np.float32) for _ in range(4))
+    validity = np.empty(shape, np.uint8)
+    maps = (found.column_disparity, found.row_disparity, found.validity, found.backmatch_error, found.distance)
+    resample.enlarge(*maps, left.valid[0], right.images[0].shape, u, v, validity, error, distance)
     return Disparity(u, v, validity, error, distance, found.aligned)
 
 

@@ -77,23 +77,24 @@ def _solve(p: AnyArray, q: AnyArray, sigma: float) -> tuple[Matrix, float, float
     g = prior
     spread = math.inf
     for step in range(ITERATIONS):
-        residual = _residuals(terms, yr, g)
+        residual = residuals(terms, yr, g)
         # Start as wide as the matches scatter about the prior, and narrow to what an integer match deserves.
         spread = (
             max(sigma, min(0.5 * spread, 1.5 * float(np.median(np.abs(residual))) + sigma))
             if step
             else max(sigma, 2.0 * float(np.median(np.abs(residual))))
         )
-        normal, side = _normal(terms, yr, 1.0 / (1.0 + (residual / spread) ** 2) / sigma**2)
+        normal, side = weighted_normal(terms, yr, 1.0 / (1.0 + (residual / spread) ** 2) / sigma**2)
         g = np.linalg.solve(normal + precision, precision @ prior - side)
-    residual = _residuals(terms, yr, g)
+    residual = residuals(terms, yr, g)
     cost = float(np.sum(np.log1p((residual / sigma) ** 2)) + np.sum(((g - prior) / PRIOR) ** 2))
     f = np.array([[g[1], g[2], g[0]], [g[3], g[4], 1.0], [g[5], g[6], g[7]]])
     return f, cost, float(np.median(np.abs(residual)))
 
 
 @njit(cache=True, nogil=True)
-def _residuals(terms, target, g):  # type: ignore[no-untyped-def]
+def residuals(terms, target, g):  # type: ignore[no-untyped-def]
+    """``target + g . terms`` of points (n,), ``terms`` (i, n)."""
     found = target.copy()
     for i in range(g.size):
         for n in range(target.size):
@@ -102,7 +103,7 @@ def _residuals(terms, target, g):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _normal(terms, target, weight):  # type: ignore[no-untyped-def]
+def weighted_normal(terms, target, weight):  # type: ignore[no-untyped-def]
     """Weighted normal matrix and right-hand side; in eight interleaved sums each, which run side by side."""
     count, n = terms.shape
     normal, side = np.zeros((count, count)), np.zeros(count)

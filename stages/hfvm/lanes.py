@@ -91,18 +91,6 @@ def _band(builder: Any, u: Any, v: Any, line: Any, mu: Any) -> Any:
     return builder.fptosi(builder.fmul(_splat(builder, mu), _call(builder, "llvm.fabs.v8f64", _DOUBLES, e)), _WORDS)
 
 
-def _run_band(builder: Any, u: Any, v: Any, line: Any, mu: Any) -> Any:
-    """The same for neighbouring columns from ``u`` on, single precision within the run."""
-    double, single = ir.DoubleType(), ir.VectorType(ir.FloatType(), LANES)
-    a, b, c = (builder.fpext(x, double) for x in line)
-    e = builder.fadd(builder.fmul(a, builder.sitofp(u, double)), builder.fmul(b, builder.sitofp(v, double)))
-    start = builder.fptrunc(builder.fmul(mu, builder.fadd(e, c)), ir.FloatType())
-    slope = builder.fptrunc(builder.fmul(mu, a), ir.FloatType())
-    steps = builder.fmul(_splat(builder, slope), _vector(single, [float(i) for i in range(LANES)]))
-    size = _call(builder, "llvm.fabs.v8f32", single, builder.fadd(_splat(builder, start), steps))
-    return builder.zext(builder.fptosi(size, _INTS), _WORDS)
-
-
 def _pointer(context: Any, builder: Any, kind: Any, array: Any, index: Any) -> Any:
     data = context.make_array(kind)(context, builder, array).data
     return builder.gep(data, [index])
@@ -145,7 +133,9 @@ def make_run(width: int) -> Any:
             with_band = builder.fcmp_ordered(">", mu, ir.Constant(ir.DoubleType(), 0.0))
             slot = cgutils.alloca_once_value(builder, cost)
             with builder.if_then(with_band):
-                builder.store(builder.add(cost, _run_band(builder, u, v, (a, b, c), mu)), slot)
+                us = builder.add(_splat(builder, builder.trunc(u, _I32)), _vector(_INTS, range(LANES)))
+                vs = _splat(builder, builder.trunc(v, _I32))
+                builder.store(builder.add(cost, _band(builder, us, vs, (a, b, c), mu)), slot)
             keys = builder.shl(builder.load(slot), _vector(_WORDS, [ORDER] * LANES))
             keys = builder.add(keys, builder.add(_splat(builder, order), steps))
             return _least(builder, builder.select(inside, keys, _vector(_WORDS, [NOTHING] * LANES)))
@@ -266,9 +256,9 @@ around = make_around(widest())
 """``around(word, right, rows, cols, x, y, own, data, up, west, east, down, smooth, a, b, c, mu)``: the best
 displacement among a pixel's own, that +-1, and those of its four neighbours, in the image ``right`` (rows x cols).
 
-Displacements are packed, v << 16 | u; ``data`` is the cost of ``own`` without smoothness. In this order: own, own u - 1,
-u + 1, v - 1, v + 1, up, west, east, down; the first of equal ones wins. Costs have ``smooth`` times the roughness added.
-Returns ``cost << COST | order << 32 | packed``.
+Displacements are packed, v << 16 | u; ``data`` is the cost of ``own`` without smoothness. In this order: own, own
+u - 1, u + 1, v - 1, v + 1, up, west, east, down; the first of equal ones wins. Costs have ``smooth`` times the
+roughness added. Returns ``cost << COST | order << 32 | packed``.
 """
 
 

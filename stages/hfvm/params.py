@@ -40,7 +40,7 @@ class HfvmParams(Params):
 
     preset: Literal["default", "fast", "paper"] = Field(
         default="default",
-        description="default: the measured recipe; fast: less of it; paper: section 4.3 to the letter, its values where not given",
+        description="default: the measured recipe; fast: half its resolution; paper: section 4.3 to the letter",
     )
     weights: Weights = Field(
         default=(4.0, 4.0, 2.0, 2.0, 0.5, 0.5, 2.0, 1.0),

@@ -1,6 +1,8 @@
-"""Search of one level with eight candidates at once; same results as the plain loops of ``search``.
+"""Search of one level: several centres, a soft epipolar band, propagation with weak smoothness.
 
-A map is one array of packed displacements, v << 16 | u (int32), beside the cost of each without smoothness.
+A map is one array of packed displacements, v << 16 | u (int32), beside the cost of each without smoothness. All costs
+are integers, candidates come in a fixed order and only a strictly lower cost wins, so that results do not depend on
+the machine. Eight candidates are looked at together (``lanes``).
 """
 
 from __future__ import annotations
@@ -49,7 +51,14 @@ def own_cost(word, right, x, y, packed, line, mu):  # type: ignore[no-untyped-de
 
 @njit(cache=True, nogil=True)
 def descend(left, right, up_u, up_v, reach_x, reach_y, lines, mu, packed, data):  # type: ignore[no-untyped-def]
-    """As :func:`stages.hfvm.search.descend`; ``packed, data`` (row, col) int32: displacements and their costs."""
+    """Search around the doubled displacements of the coarse parent and its eight neighbours.
+
+    ``reach_x, reach_y``: search to either side of each; ``lines`` (row, col, 3) float32: epipolar line of each pixel
+    (:func:`stages.hfvm.epipolar.lines`); ``mu``: cost per pixel off it, 0 = no band (``lines`` is not read). With a
+    band, each centre is first moved towards its line, by a pixel at most: a coarse fit may be wrong by more than that.
+    ``packed, data`` (row, col) int32 get the displacements and their costs. With nothing inside the other image the
+    prediction stays: it leads out of it.
+    """
     rows, cols = left.shape
     rrows, rcols = right.shape
     crows, ccols = up_u.shape
@@ -214,71 +223,12 @@ def _roughness(flat, rows, cols, p, tried):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def propagate(left, right, packed, data, lines, mu, smoothness, rounds):  # type: ignore[no-untyped-def]
-    """Jacobi rounds of :func:`stages.hfvm.search.propagate`, in place.
-
-    From the second round on only the neighbourhoods of what changed are looked at.
-    """
-    rows, cols = left.shape
-    rrows, rcols = right.shape
-    words, here, flat, cost = right.reshape(-1), left.reshape(-1), packed.reshape(-1), data.reshape(-1)
-    work = np.empty(rows * cols if rounds > 1 else 1, np.int32)
-    where = np.empty(rows * cols + 1, np.int32)
-    what = np.empty(rows * cols + 1, np.int32)
-    cheap = np.empty(rows * cols + 1, np.int32)
-    stamp = np.zeros(rows * cols, np.uint8)
-    nil = np.zeros(3, np.float32)
-    count = rows * cols
-    for turn in range(rounds):
-        changed = 0
-        for k in range(count):
-            p = np.int64(k if turn == 0 else work[k])
-            y = p // cols
-            x = p - y * cols
-            own = flat[p]
-            if y > 0 and y < rows - 1 and x > 0 and x < cols - 1:
-                a = b = c = np.float32(0.0)
-                if mu > 0:
-                    a, b, c = lines[y, x, 0], lines[y, x, 1], lines[y, x, 2]
-                up, west, east, down, d = flat[p - cols], flat[p - 1], flat[p + 1], flat[p + cols], np.int64(cost[p])
-                key = lanes.around(
-                    here[p], words, rrows, rcols, x, y, own, d, up, west, east, down, smoothness, a, b, c, mu
-                )
-                new = np.int32(key)
-                cheap[changed] = key >> COST
-            else:
-                new, total = _border(left, right, packed, x, y, data, smoothness, lines[y, x] if mu > 0 else nil, mu)
-                cheap[changed] = total
-            # Written always, kept by counting: whether a pixel changes cannot be predicted.
-            where[changed], what[changed] = p, new
-            changed += np.int64(new != own)
-        for k in range(changed):
-            cheap[k] -= smoothness * _roughness(flat, rows, cols, np.int64(where[k]), what[k])
-        for k in range(changed):
-            flat[where[k]], cost[where[k]] = what[k], cheap[k]
-        if turn == rounds - 1 or changed == 0:
-            break
-        # The same pixels in the order of the image would be nicer to the cache; the result does not depend on it.
-        count = 0
-        for k in range(changed):
-            p = np.int64(where[k])
-            y = p // cols
-            x = p - y * cols
-            for m in range(5):
-                if (m == 0 and y == 0) or (m == 1 and x == 0) or (m == 3 and x == cols - 1) or (m == 4 and y == rows - 1):
-                    continue
-                q = p + (m == 3) - (m == 1) + ((m == 4) - np.int64(m == 0)) * cols
-                if stamp[q] != turn + 1:
-                    stamp[q] = turn + 1
-                    work[count] = q
-                    count += 1
-
-
-@njit(cache=True, nogil=True)
 def checkerboard(left, right, packed, data, dirty, lines, mu, smoothness, rounds):  # type: ignore[no-untyped-def]
-    """Rounds of propagation in place, the two colours of a checkerboard in turn: they settle in half of Jacobi's.
+    """Rounds of propagation in place: each pixel tries its neighbours' displacements and its own +-1.
 
-    ``dirty`` (row, col) uint8: room. From the second round on only the neighbourhoods of what changed are looked at.
+    Cost: that of the displacement + ``smoothness`` times the sum over the four neighbours of min(|du| + |dv|, 2). The
+    two colours of a checkerboard take turns, which settles in half the rounds of all at once. ``dirty`` (row, col)
+    uint8: room; from the second round on only the neighbourhoods of what changed are looked at.
     """
     rows, cols = left.shape
     rrows, rcols = right.shape

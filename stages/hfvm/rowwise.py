@@ -27,7 +27,13 @@ def local_mean(u, v, keep, radius, out_u, out_v):  # type: ignore[no-untyped-def
                 a, b = max(0, -i), min(cols, cols - i)
                 if a >= b:
                     continue
-                cu, cv, ou, ov, ok = u[y, a:b], v[y, a:b], u[j, a + i : b + i], v[j, a + i : b + i], keep[j, a + i : b + i]
+                cu, cv, ou, ov, ok = (
+                    u[y, a:b],
+                    v[y, a:b],
+                    u[j, a + i : b + i],
+                    v[j, a + i : b + i],
+                    keep[j, a + i : b + i],
+                )
                 tu, tv, tn = su[a:b], sv[a:b], count[a:b]
                 for x in range(b - a):
                     du, dv = ou[x] - cu[x], ov[x] - cv[x]
