@@ -279,7 +279,7 @@ def make_sums(width: int) -> Any:
             left, right, at_left, at_right, left_cols, right_cols = args
             five = ir.Constant(_MASK, [1] * 5 + [0] * (LANES - 5))
 
-            def row(kind, array, at, cols, j, i):  # type: ignore[no-untyped-def]
+            def row(kind: Any, array: Any, at: Any, cols: Any, j: int, i: int) -> Any:
                 shift = builder.add(builder.mul(cols, ir.Constant(_I64, j)), ir.Constant(_I64, i - 2))
                 pointer = _pointer(context, builder, kind, array, builder.add(at, shift))
                 return _load(builder, _as(builder, pointer, _WORDS), five)

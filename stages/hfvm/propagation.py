@@ -253,28 +253,28 @@ def checkerboard(left, right, packed, data, dirty, lines, mu, smoothness, rounds
             n = 0
             for x in range(2 - first, cols - 1, 2):
                 todo[n] = x
-                n += np.int64(flags[x])
+                n += 1 if flags[x] else 0
                 flags[x] = 0
             m = 0
             for k in range(n):
-                x = np.int64(todo[k])
+                i = np.int64(todo[k])
                 a = b = c = np.float32(0.0)
                 if mu > 0:
-                    a, b, c = lines[y, x, 0], lines[y, x, 1], lines[y, x, 2]
-                own = here[x]
+                    a, b, c = lines[y, i, 0], lines[y, i, 1], lines[y, i, 2]
+                own = here[i]
                 key = lanes.around(
-                    left[y, x], words, rrows, rcols, x, y, own, np.int64(cost[x]), over[x], here[x - 1], here[x + 1],
-                    under[x], smoothness, a, b, c, mu,
+                    left[y, i], words, rrows, rcols, i, y, own, np.int64(cost[i]), over[i], here[i - 1], here[i + 1],
+                    under[i], smoothness, a, b, c, mu,
                 )  # fmt: skip
-                moved[m], keys[m] = x, key
-                m += np.int64(np.int32(key) != own)
+                moved[m], keys[m] = i, key
+                m += 1 if np.int32(key) != own else 0
             for k in range(m):
-                x = np.int64(moved[k])
+                i = np.int64(moved[k])
                 new = np.int32(keys[k])
-                rough = _step(over[x], new) + _step(here[x - 1], new) + _step(here[x + 1], new) + _step(under[x], new)
-                here[x] = new
-                cost[x] = (keys[k] >> COST) - smoothness * rough
-                flags[x] = flags[x - 1] = flags[x + 1] = dirty[y - 1, x] = dirty[y + 1, x] = 1
+                rough = _step(over[i], new) + _step(here[i - 1], new) + _step(here[i + 1], new) + _step(under[i], new)
+                here[i] = new
+                cost[i] = (keys[k] >> COST) - smoothness * rough
+                flags[i] = flags[i - 1] = flags[i + 1] = dirty[y - 1, i] = dirty[y + 1, i] = 1
 
 
 @njit(cache=True, nogil=True)
