@@ -35,7 +35,7 @@ class Validity(IntFlag):
 
 def mark(validity: Mask, where: NDArray[np.bool_], bit: Validity) -> None:
     """Set a bit where ``where``, in place."""
-    validity[where] |= np.uint8(bit)
+    validity |= where * np.uint8(bit)
 
 
 def matched(validity: Mask) -> NDArray[np.bool_]:

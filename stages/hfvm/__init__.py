@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from stages import pyramid
 from stages.declare import AnyArray, Array, Bundle, Inputs, Stage
-from stages.hfvm import consistency, hierarchy, plane, refine, subpixel
+from stages.hfvm import consistency, hierarchy, plane, refine, resample, rowwise
 from stages.hfvm.params import HfvmParams
 from stages.pyramid import Pyramid, PyramidParams
 from stages.validity import Mask, Validity, counts, mark, matched
@@ -80,6 +80,8 @@ def match(
 
 def match_pyramids(left: Pyramid, right: Pyramid, params: HfvmParams) -> Disparity:
     """As :func:`match`, of two image pyramids."""
+    if params.finest and min(left.levels, right.levels) > params.finest:
+        return _enlarged(left, right, params)
     pair = hierarchy.prepare(left, right, params)
     if params.preset == "paper":
         return _finish(left, right, pair, hierarchy.run(pair, params, 0), params, None)
@@ -92,6 +94,21 @@ def match_pyramids(left: Pyramid, right: Pyramid, params: HfvmParams) -> Dispari
     pair = hierarchy.prepare(left, warped, params)
     state = hierarchy.run(pair, params, 0, near_sign=coarse.near_sign)
     return _finish(left, right, pair, state, params, alignment)
+
+
+def _enlarged(left: Pyramid, right: Pyramid, params: HfvmParams) -> Disparity:
+    """Matched at half the resolution; displacements, twice as great, stand for 2 x 2 pixels each."""
+    half = params.model_copy(
+        update={"finest": 0, "speckle": max(params.speckle // 4, 1), "fill_reach": params.fill_reach // 2}
+    )
+    left_half, right_half = (Pyramid(p.images[1:], p.valid[1:]) for p in (left, right))
+    found = match_pyramids(left_half, right_half, half)
+    shape = left.images[0].shape
+    u, v, error, distance = (np.empty(shape, np.float32) for _ in range(4))
+    validity = np.empty(shape, np.uint8)
+    maps = (found.column_disparity, found.row_disparity, found.validity, found.backmatch_error, found.distance)
+    resample.enlarge(*maps, left.valid[0], right.images[0].shape, u, v, validity, error, distance)
+    return Disparity(u, v, validity, error, distance, found.aligned)
 
 
 def _finish(
@@ -109,9 +126,9 @@ def _finish(
     if alignment is not None:
         u, v = plane.compose(alignment, u, v)
     keep = validity == 0
-    if params.preset == "default":
+    if params.preset != "paper":
         mean_u, mean_v = np.empty_like(u), np.empty_like(v)
-        subpixel.local_mean(u, v, keep, hierarchy.SUM_RADIUS, mean_u, mean_v)
+        rowwise.local_mean(u, v, keep, hierarchy.SUM_RADIUS, mean_u, mean_v)
         u, v = mean_u, mean_v
     if params.refine:
         u, v, rest = refine.refine(left.images[0], right.images[0], right.valid[0], u, v, keep, params)

@@ -19,8 +19,22 @@ def median(u: AnyArray, size: int) -> AnyArray:
     """Plain median of ``size`` x ``size`` pixels (3 or 5; 1 = none) of an int16 map, its edge repeated."""
     if size == 1:
         return u
-    shifted = (u.astype(np.int32) + 32768).astype(np.uint16)
-    return np.asarray((cv2.medianBlur(shifted, size).astype(np.int32) - 32768).astype(np.int16))
+    return np.asarray(cv2.medianBlur(u, size))
+
+
+@njit(cache=True, nogil=True)
+def integer_error(au, av, bu, bv, b_valid, error):  # type: ignore[no-untyped-def]
+    """As :func:`backmatch`, of integer maps."""
+    rows, cols = au.shape
+    brows, bcols = bu.shape
+    for y in range(rows):
+        for x in range(cols):
+            i, j = x + np.int64(au[y, x]), y + np.int64(av[y, x])
+            e = FAILED
+            if i >= 0 and i < bcols and j >= 0 and j < brows and b_valid[j, i]:
+                du, dv = np.int64(au[y, x]) + bu[j, i], np.int64(av[y, x]) + bv[j, i]
+                e = np.sqrt(np.float32(du * du + dv * dv))
+            error[y, x] = e
 
 
 @njit(cache=True, nogil=True)
@@ -64,14 +78,28 @@ def backmatch(lu, lv, ru, rv, right_valid, error):  # type: ignore[no-untyped-de
 
 def lands(u: AnyArray, v: AnyArray, keep: AnyArray, right_valid: AnyArray) -> NDArray[np.bool_]:
     """Pixels of ``keep`` whose displacement ends on a usable pixel inside the right image."""
-    y, x = np.nonzero(keep)
-    xr, yr = x + u[y, x], y + v[y, x]
-    rows, cols = right_valid.shape
-    good = (xr >= 0) & (xr <= cols - 1) & (yr >= 0) & (yr <= rows - 1)
-    good[good] = right_valid[np.rint(yr[good]).astype(np.int64), np.rint(xr[good]).astype(np.int64)] != 0
     found = np.zeros(keep.shape, dtype=bool)
-    found[y[good], x[good]] = True
+    _lands(u, v, keep, right_valid, found)
     return found
+
+
+@njit(cache=True, nogil=True)
+def _lands(u, v, keep, right_valid, found):  # type: ignore[no-untyped-def]
+    rows, cols = right_valid.shape
+    for y in range(u.shape[0]):
+        for x in range(u.shape[1]):
+            xr, yr = x + np.float64(u[y, x]), y + np.float64(v[y, x])
+            if keep[y, x] and xr >= 0 and xr <= cols - 1 and yr >= 0 and yr <= rows - 1:
+                found[y, x] = right_valid[np.int64(np.rint(yr)), np.int64(np.rint(xr))] != 0
+
+
+@njit(cache=True, nogil=True)
+def _eighths(plane, keep, gone, coded):  # type: ignore[no-untyped-def]
+    """Eighths of a pixel as int16, -32768 where there is no value."""
+    for y in range(keep.shape[0]):
+        for x in range(keep.shape[1]):
+            use = keep[y, x] and not gone[y, x]
+            coded[y, x] = np.int16(np.rint(8.0 * plane[y, x])) if use else np.int16(-32768)
 
 
 def isolated(u: AnyArray, v: AnyArray, keep: AnyArray, size: int) -> NDArray[np.bool_]:
@@ -83,7 +111,8 @@ def isolated(u: AnyArray, v: AnyArray, keep: AnyArray, size: int) -> NDArray[np.
         return np.zeros(keep.shape, dtype=bool)
     gone = np.zeros(keep.shape, dtype=bool)
     for plane in (u, v):
-        coded = np.where(keep & ~gone, np.rint(8.0 * np.where(keep, plane, 0)), -32768).astype(np.int16)
+        coded = np.empty(keep.shape, np.int16)
+        _eighths(plane, keep, gone, coded)
         cv2.filterSpeckles(coded, -32768, size - 1, 8)
         gone = keep & (coded == -32768)
     return gone

@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from stages.declare import AnyArray
@@ -76,20 +77,54 @@ def _solve(p: AnyArray, q: AnyArray, sigma: float) -> tuple[Matrix, float, float
     g = prior
     spread = math.inf
     for step in range(ITERATIONS):
-        residual = yr + np.einsum("i,in->n", g, terms)
+        residual = residuals(terms, yr, g)
         # Start as wide as the matches scatter about the prior, and narrow to what an integer match deserves.
         spread = (
             max(sigma, min(0.5 * spread, 1.5 * float(np.median(np.abs(residual))) + sigma))
             if step
             else max(sigma, 2.0 * float(np.median(np.abs(residual))))
         )
-        weight = 1.0 / (1.0 + (residual / spread) ** 2) / sigma**2
-        normal = np.einsum("in,jn,n->ij", terms, terms, weight) + precision
-        g = np.linalg.solve(normal, -np.einsum("in,n,n->i", terms, yr, weight) + precision @ prior)
-    residual = yr + np.einsum("i,in->n", g, terms)
+        normal, side = weighted_normal(terms, yr, 1.0 / (1.0 + (residual / spread) ** 2) / sigma**2)
+        g = np.linalg.solve(normal + precision, precision @ prior - side)
+    residual = residuals(terms, yr, g)
     cost = float(np.sum(np.log1p((residual / sigma) ** 2)) + np.sum(((g - prior) / PRIOR) ** 2))
     f = np.array([[g[1], g[2], g[0]], [g[3], g[4], 1.0], [g[5], g[6], g[7]]])
     return f, cost, float(np.median(np.abs(residual)))
+
+
+@njit(cache=True, nogil=True)
+def residuals(terms, target, g):  # type: ignore[no-untyped-def]
+    """``target + g . terms`` of points (n,), ``terms`` (i, n)."""
+    found = target.copy()
+    for i in range(g.size):
+        for n in range(target.size):
+            found[n] += g[i] * terms[i, n]
+    return found
+
+
+@njit(cache=True, nogil=True)
+def weighted_normal(terms, target, weight):  # type: ignore[no-untyped-def]
+    """Weighted normal matrix and right-hand side; in eight interleaved sums each, which run side by side."""
+    count, n = terms.shape
+    normal, side = np.zeros((count, count)), np.zeros(count)
+    row, part = np.empty(n), np.empty(8)
+    for i in range(count):
+        for k in range(n):
+            row[k] = terms[i, k] * weight[k]
+        for j in range(i, count + 1):
+            other = terms[j] if j < count else target
+            part[:] = 0.0
+            for k in range(0, n - 7, 8):
+                for m in range(8):
+                    part[m] += row[k + m] * other[k + m]
+            for k in range(n // 8 * 8, n):
+                part[0] += row[k] * other[k]
+            total = ((part[0] + part[1]) + (part[2] + part[3])) + ((part[4] + part[5]) + (part[6] + part[7]))
+            if j == count:
+                side[i] = total
+            else:
+                normal[i, j] = normal[j, i] = total
+    return normal, side
 
 
 def finer(f: Matrix) -> Matrix:
@@ -119,10 +154,20 @@ def near_sign(f: Matrix, u: AnyArray, wanted: AnyArray, right_shape: tuple[int, 
 
 def lines(f: Matrix, shape: tuple[int, ...]) -> NDArray[np.float32]:
     """Epipolar line of every left pixel: unit normal and offset (row, col, 3) with n . displacement + c = 0."""
-    y = np.arange(shape[0], dtype=np.float64)[:, None]
-    x = np.arange(shape[1], dtype=np.float64)[None, :]
-    a, b, c = (f[i, 0] * x + f[i, 1] * y + f[i, 2] for i in range(3))
-    scale = 1.0 / np.maximum(np.sqrt(a * a + b * b), 1e-12)
     found = np.empty((shape[0], shape[1], 3), np.float32)
-    found[..., 0], found[..., 1], found[..., 2] = a * scale, b * scale, (c + a * x + b * y) * scale
+    write_lines(f, found)
     return found
+
+
+@njit(cache=True, nogil=True)
+def write_lines(f, found):  # type: ignore[no-untyped-def]
+    """As :func:`lines`, into ``found``."""
+    for j in range(found.shape[0]):
+        y = np.float64(j)
+        for i in range(found.shape[1]):
+            x = np.float64(i)
+            a = f[0, 0] * x + f[0, 1] * y + f[0, 2]
+            b = f[1, 0] * x + f[1, 1] * y + f[1, 2]
+            c = f[2, 0] * x + f[2, 1] * y + f[2, 2]
+            scale = 1.0 / max(np.sqrt(a * a + b * b), 1e-12)
+            found[j, i, 0], found[j, i, 1], found[j, i, 2] = a * scale, b * scale, (c + a * x + b * y) * scale

@@ -7,7 +7,7 @@ is fitted anew to the consistent matches, where the solver uses one.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from stages import features
 from stages.declare import AnyArray
-from stages.hfvm import consistency, epipolar, lookup, paper, search, subpixel
+from stages.hfvm import consistency, epipolar, lookup, paper, propagation, search, subpixel
 from stages.hfvm.params import HfvmParams
 from stages.pyramid import Pyramid, filled
 
@@ -80,6 +80,9 @@ class Solver(Protocol):
         """The matcher from right to left."""
 
 
+ROOM = (("packed", np.int32), ("data", np.int32), ("dirty", np.uint8))
+
+
 @dataclass(frozen=True)
 class FastSolver:
     """Packed features, several centres, band, propagation (preset ``default``)."""
@@ -88,19 +91,36 @@ class FastSolver:
     right: tuple[features.Words, ...]
     params: HfvmParams
     uses_band: bool = True
+    room: dict[str, AnyArray] = field(default_factory=dict)
 
     def match(self, level: int, up: Map | None, band: Band) -> Map:
         """Integer map of a level."""
         p, a, b = self.params, self.left[level], self.right[level]
         u, v = np.zeros(a.shape, np.int16), np.zeros(a.shape, np.int16)
-        lines = band.lines(a.shape)
+        packed, data, dirty = (self._room(name, a.shape, kind) for name, kind in ROOM)
+        lines = self._room("lines", (*(a.shape if band.mu > 0 else (1, 1)), 3), np.float32)
+        epipolar.write_lines(band.f, lines)
         if up is None:
             reach_x, reach_y = top_reach(p, a.shape, b.shape)
             search.exhaustive(a, b, reach_x, reach_y, 1, u, v)
+            propagation.pack_map(u, v, packed)
+            propagation.costs(a, b, lines, band.mu, packed, data)
         else:
-            search.descend(a, b, up.u, up.v, p.search_columns, p.search_rows, lines, band.mu, u, v)
-        u, v = search.propagate(a, b, u, v, lines, band.mu, p.smoothness, p.rounds)
+            propagation.descend(a, b, up.u, up.v, p.search_columns, p.search_rows, lines, band.mu, packed, data)
+        rounds = p.rounds if level > 0 or p.fine_rounds is None else p.fine_rounds
+        propagation.checkerboard(a, b, packed, data, dirty, lines, band.mu, p.smoothness, rounds)
+        propagation.unpack(packed, u, v)
         return Map(u, v, np.zeros(a.shape, bool))
+
+    def _room(self, name: str, shape: tuple[int, ...], kind: type) -> AnyArray:
+        """Array to write to, for both directions and all levels: fresh memory costs more than filling it."""
+        size = int(np.prod(shape))
+        held = self.room.get(name)
+        if held is None or held.size < size:
+            # The finest level is the largest one.
+            most = max(w.size for w in (*self.left, *self.right)) * (3 if name == "lines" else 1)
+            held = self.room[name] = np.empty(most, kind)
+        return held[:size].reshape(shape)
 
     def fine(self, level: int, m: Map, wanted: AnyArray) -> Fine:
         """Sub-pixel map from summed distances."""
@@ -110,7 +130,7 @@ class FastSolver:
 
     def reverse(self) -> FastSolver:
         """The matcher from right to left."""
-        return FastSolver(self.right, self.left, self.params)
+        return FastSolver(self.right, self.left, self.params, room=self.room)
 
 
 @dataclass(frozen=True)
@@ -247,8 +267,7 @@ def _level(pair: Prepared, params: HfvmParams, level: int, above: State | None, 
 def integer_error(a: Map, b: Map, b_valid: AnyArray) -> AnyArray:
     """Back-matching error of an integer map, pixels."""
     error = np.empty(a.u.shape, np.float32)
-    maps = (m.astype(np.float32) for m in (a.u, a.v, b.u, b.v))
-    consistency.backmatch(*maps, b_valid, error)
+    consistency.integer_error(a.u, a.v, b.u, b.v, b_valid, error)
     return error
 
 

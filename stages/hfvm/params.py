@@ -1,4 +1,4 @@
-"""Parameters of the dense matcher, and its two presets."""
+"""Parameters of the dense matcher, and its presets."""
 
 from __future__ import annotations
 
@@ -24,6 +24,12 @@ PAPER: Mapping[str, Any] = {
 """What preset ``paper`` sets differently; a value given by the user wins. Preset-only machinery ignores the rest."""
 
 
+FAST: Mapping[str, Any] = {"finest": 1, "rounds": 3, "fine_rounds": None, "refine": False}
+"""What preset ``fast`` sets differently: half the resolution, less propagation, no removal of the perspective bias."""
+
+PRESETS: Mapping[str, Mapping[str, Any]] = {"default": {}, "fast": FAST, "paper": PAPER}
+
+
 class HfvmParams(Params):
     """Parameters of hierarchical feature vector matching.
 
@@ -32,9 +38,9 @@ class HfvmParams(Params):
     look-up table.
     """
 
-    preset: Literal["default", "paper"] = Field(
+    preset: Literal["default", "fast", "paper"] = Field(
         default="default",
-        description="default: the measured recipe; paper: section 4.3 to the letter, its values where not given",
+        description="default: the measured recipe; fast: half its resolution; paper: section 4.3 to the letter",
     )
     weights: Weights = Field(
         default=(4.0, 4.0, 2.0, 2.0, 0.5, 0.5, 2.0, 1.0),
@@ -63,6 +69,12 @@ class HfvmParams(Params):
     )
     rounds: int = Field(
         default=4, ge=0, le=32, description="propagation rounds a level; they recover what the coarse level lost"
+    )
+    fine_rounds: int | None = Field(
+        default=2, ge=0, le=32, description="the same at the finest level, which costs most; null: as at the others"
+    )
+    finest: Literal[0, 1] = Field(
+        default=0, description="pyramid level matched last; 1 = half the resolution, a quarter of the work"
     )
     median: Literal[1, 3, 5] = Field(default=5, description="pixels; side of the median filter of each level, 1 = none")
     threshold: float = Field(
@@ -113,6 +125,6 @@ class HfvmParams(Params):
     @model_validator(mode="before")
     @classmethod
     def _preset(cls, values: Any) -> Any:
-        if isinstance(values, Mapping) and values.get("preset") == "paper":
-            return {**PAPER, **values}
+        if isinstance(values, Mapping) and values.get("preset") in PRESETS:
+            return {**PRESETS[values["preset"]], **values}
         return values

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from stages import pyramid
 from stages.declare import AnyArray
+from stages.hfvm.epipolar import residuals, weighted_normal
 from stages.hfvm.hierarchy import FIT_SAMPLES, Prepared, State, sample
 from stages.hfvm.params import HfvmParams
 from stages.hfvm.resample import sample_cubic
@@ -117,10 +118,10 @@ def _solve(p: AnyArray, d: AnyArray, tolerance: float) -> tuple[Matrix, AnyArray
     )
     h, weight, spread = np.zeros(8), one, np.inf
     for _ in range(ITERATIONS):
-        weighted = terms * weight
-        normal = np.einsum("ain,ajn->ij", weighted, terms) + 1e-6 * len(one) * np.eye(8)
-        h = np.linalg.solve(normal, np.einsum("ain,an->i", weighted, d))
-        error = np.hypot(*(d - np.einsum("i,ain->an", h, terms)))
+        halves = [weighted_normal(t, e, weight) for t, e in zip(terms, d, strict=True)]
+        normal = halves[0][0] + halves[1][0] + 1e-6 * len(one) * np.eye(8)
+        h = np.linalg.solve(normal, halves[0][1] + halves[1][1])
+        error = np.hypot(*(residuals(t, e, -h) for t, e in zip(terms, d, strict=True)))
         # Start as wide as the matches scatter about the first fit, and narrow onto the dominant plane.
         spread = max(tolerance, min(1.5 * float(np.median(error)), 0.7 * spread))
         weight = 1.0 / (1.0 + (error / spread) ** 2) ** 2

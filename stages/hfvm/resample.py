@@ -5,6 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from stages.validity import Validity
+
+MATCHED, OUT_OF_IMAGE = np.uint8(Validity.MATCHED), np.uint8(Validity.OUT_OF_IMAGE)
+FOUND = np.uint8(Validity.MATCHED | Validity.INTERPOLATED)
+
 
 @njit(cache=True, nogil=True)
 def sample_cubic(a, x, y):  # type: ignore[no-untyped-def]
@@ -45,3 +50,25 @@ def sample_cubic(a, x, y):  # type: ignore[no-untyped-def]
         dy += gy[k] * row
         dx += wy[k] * (r0 * gx[0] + r1 * gx[1] + r2 * gx[2] + r3 * gx[3])
     return value, dx, dy
+
+
+@njit(cache=True, nogil=True)
+def enlarge(u, v, bits, error, distance, valid, right_shape, out_u, out_v, out_bits, out_error, out_distance):  # type: ignore[no-untyped-def]
+    """Displacements of the next finer level: each doubled, for 2 x 2 pixels.
+
+    Both images' pixel centres shift alike, so nothing is to be added. A masked pixel (``valid`` 0) is undefined, and
+    so is one whose displacement then leaves the right image; both are marked.
+    """
+    two, nan = np.float32(2.0), np.float32(np.nan)
+    for y in range(out_u.shape[0]):
+        for x in range(out_u.shape[1]):
+            j, i = y >> 1, x >> 1
+            a, b, bit = two * u[j, i], two * v[j, i], bits[j, i]
+            xr, yr = x + a, y + b
+            outside = not (xr >= 0 and xr <= right_shape[1] - 1 and yr >= 0 and yr <= right_shape[0] - 1)
+            if not valid[y, x] or (outside and bit & MATCHED):
+                bit = (bit & ~FOUND) | OUT_OF_IMAGE
+            if not bit & FOUND:
+                a = b = nan
+            out_u[y, x], out_v[y, x], out_bits[y, x] = a, b, bit
+            out_error[y, x], out_distance[y, x] = two * error[j, i], distance[j, i]

@@ -10,6 +10,7 @@ import numpy as np
 from numba import njit
 
 from stages.features import distance
+from stages.hfvm import lanes
 
 
 @njit(cache=True, nogil=True)
@@ -34,6 +35,7 @@ def summed(left, right, u_map, v_map, wanted, radius, out_u, out_v, out_distance
     rrows, rcols = right.shape
     count = np.float32((2 * radius + 1) * (2 * radius + 1))
     far = radius + 1
+    here, there = left.reshape(-1), right.reshape(-1)
     for y in range(rows):
         for x in range(cols):
             u, v = np.int64(u_map[y, x]), np.int64(v_map[y, x])
@@ -48,6 +50,12 @@ def summed(left, right, u_map, v_map, wanted, radius, out_u, out_v, out_distance
             ):
                 out_distance[y, x] = distance(left[y, x], right[yr, xr])
                 continue
+            if radius == lanes.SUM_RADIUS:
+                five = lanes.sums(here, there, y * cols + x, yr * rcols + xr, cols, rcols)
+                out_u[y, x] += linear(five[1], five[0], five[2])
+                out_v[y, x] += linear(five[3], five[0], five[4])
+                out_distance[y, x] = np.float32(five[0]) / count
+                continue
             at = west = east = north = south = np.int64(0)
             for j in range(-radius, radius + 1):
                 for i in range(-radius, radius + 1):
@@ -60,25 +68,3 @@ def summed(left, right, u_map, v_map, wanted, radius, out_u, out_v, out_distance
             out_u[y, x] += linear(west, at, east)
             out_v[y, x] += linear(north, at, south)
             out_distance[y, x] = np.float32(at) / count
-
-
-@njit(cache=True, nogil=True)
-def local_mean(u, v, keep, radius, out_u, out_v):  # type: ignore[no-untyped-def]
-    """Mean over (2 radius + 1)^2 kept pixels whose displacement lies within one pixel of the centre's."""
-    rows, cols = u.shape
-    one = np.float32(1.0)
-    for y in range(rows):
-        for x in range(cols):
-            out_u[y, x], out_v[y, x] = u[y, x], v[y, x]
-            if not keep[y, x]:
-                continue
-            su, sv, n = np.float32(0.0), np.float32(0.0), 0
-            for j in range(max(0, y - radius), min(rows, y + radius + 1)):
-                for i in range(max(0, x - radius), min(cols, x + radius + 1)):
-                    du, dv = u[j, i] - u[y, x], v[j, i] - v[y, x]
-                    if keep[j, i] and abs(du) <= one and abs(dv) <= one:
-                        su += du
-                        sv += dv
-                        n += 1
-            out_u[y, x] += su / np.float32(n)
-            out_v[y, x] += sv / np.float32(n)

@@ -120,7 +120,7 @@ def test_images_of_different_size():
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 40), (40, 1), (3, 3), (2, 300), (33, 17), (64, 64)])
-@pytest.mark.parametrize("preset", ["default", "paper"])
+@pytest.mark.parametrize("preset", ["default", "fast", "paper"])
 def test_black_images_of_any_size_match_nowhere(shape, preset):
     found = match(np.zeros(shape, np.uint8), np.zeros(shape, np.uint8), HfvmParams(preset=preset, texture=0.5))
     assert found.column_disparity.shape == shape
@@ -219,6 +219,38 @@ def test_preset_paper_matches_and_its_values_yield_to_the_users():
     assert HfvmParams(preset="paper", threshold=3.0).threshold == 3.0
     strict = match(left, right, HfvmParams(preset="paper", threshold=1.0))
     assert has(strict.validity, Validity.OVER_THRESHOLD).mean() > 0.5
+
+
+def test_preset_fast_matches_at_half_the_resolution():
+    shape = (151, 203)
+    left, right, u, v = pair(lambda x, y: (-6.4, 1.3), shape=shape, right_shape=shape, noise=1.0)
+    valid = np.ones(left.shape, np.uint8)
+    valid[40:50, 60:81] = 0
+    found = match(left, right, HfvmParams(preset="fast"), left_valid=valid)
+    median, good, complete = score(found, u, v, right.shape)
+    assert found.column_disparity.shape == shape
+    # The shortest wavelengths, 5 pixels, are 2.5 at half the resolution: a tenth of a pixel there, two tenths here.
+    assert median < 0.3
+    assert good > 0.9
+    assert complete > 0.85
+    assert not defined(found.validity)[valid == 0].any()
+    y, x = np.nonzero(matched(found.validity))
+    xr, yr = x + found.column_disparity[y, x], y + found.row_disparity[y, x]
+    assert xr.min() >= 0
+    assert yr.min() >= 0
+    assert xr.max() <= shape[1] - 1
+    assert yr.max() <= shape[0] - 1
+
+
+@pytest.mark.parametrize("preset", ["default", "fast"])
+def test_matches_in_two_threads_are_those_of_one(preset):
+    pairs = [pair(lambda x, y: (-5.3, 0.7), seed=seed)[:2] for seed in (1, 2, 3)]
+    alone = [match(*p, HfvmParams(preset=preset)) for p in pairs]
+    with ThreadPoolExecutor(2) as pool:
+        together = list(pool.map(lambda p: match(*p, HfvmParams(preset=preset)), pairs))
+    for a, b in zip(alone, together, strict=True):
+        for name in ("column_disparity", "row_disparity", "validity", "backmatch_error", "distance"):
+            np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
 
 
 def test_refuses_colour():

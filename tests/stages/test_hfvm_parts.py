@@ -6,7 +6,7 @@ from matching_scenes import convergent_rig, pair, rig_displacement
 from scipy import ndimage
 
 from stages.geometry import Rig
-from stages.hfvm import consistency, epipolar, hierarchy, lookup, plane, refine, subpixel
+from stages.hfvm import consistency, epipolar, hierarchy, lookup, plane, refine, rowwise
 from stages.hfvm.params import HfvmParams
 from stages.pyramid import PyramidParams, build
 
@@ -221,7 +221,7 @@ def test_local_mean_takes_only_like_neighbours():
     keep = np.ones((5, 5), bool)
     keep[0, 0] = False
     out_u, out_v = np.empty((2, 5, 5), np.float32)
-    subpixel.local_mean(u, v, keep, 1, out_u, out_v)
+    rowwise.local_mean(u, v, keep, 1, out_u, out_v)
     assert out_u[2, 2] == pytest.approx(0.9 / 6)
     assert out_u[2, 3] == 10
     assert out_u[0, 0] == 0

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stages.hfvm import epipolar, paper, search, subpixel
+from stages.hfvm import epipolar, paper, propagation, search, subpixel
 
 ROWS, COLS = 11, 13
 
@@ -33,7 +33,9 @@ def test_descend_never_loses_to_any_single_centre(mu):
     up_u, up_v = rng.integers(-2, 3, (2, 6, 7)).astype(np.int16)
     lines = some_lines(4)
     u, v = np.zeros((2, ROWS, COLS), np.int16)
-    search.descend(left, right, up_u, up_v, 1, 1, lines, mu, u, v)
+    packed, data = np.zeros((2, ROWS, COLS), np.int32)
+    propagation.descend(left, right, up_u, up_v, 1, 1, lines, mu, packed, data)
+    propagation.unpack(packed, u, v)
 
     def cost(y, x, du, dv):
         if not (0 <= x + du < 15 and 0 <= y + dv < 9):
@@ -48,7 +50,7 @@ def test_descend_never_loses_to_any_single_centre(mu):
                     if 0 <= j < 6 and 0 <= i < 7:
                         cu, cv = 2 * int(up_u[j, i]), 2 * int(up_v[j, i])
                         if mu:
-                            a, b, c = lines[y // 2 * 2, x // 2 * 2]
+                            a, b, c = lines[2 * j, 2 * i]
                             e = np.float32(np.clip(a * cu + b * cv + c, -1, 1))
                             cu, cv = cu - int(np.rint(e * a)), cv - int(np.rint(e * b))
                         areas.append((cu, cv))
@@ -56,30 +58,32 @@ def test_descend_never_loses_to_any_single_centre(mu):
             tried = [t for t in tried if t is not None]
             if tried:
                 assert cost(y, x, int(u[y, x]), int(v[y, x])) <= min(tried)
+                assert cost(y, x, int(u[y, x]), int(v[y, x])) == data[y, x]
             near = np.array(areas)
             # Nothing outside the rectangle around all centres is ever taken.
             assert near[:, 0].min() - 1 <= u[y, x] <= near[:, 0].max() + 1
             assert near[:, 1].min() - 1 <= v[y, x] <= near[:, 1].max() + 1
 
 
-def slow_jacobi(left, right, u, v, lines, mu, smoothness):
-    new_u, new_v = u.copy(), v.copy()
-    for y in range(ROWS):
-        for x in range(COLS):
-            around = [(y - 1, x), (y, x - 1), (y, x + 1), (y + 1, x)]
-            near = [(int(u[p]), int(v[p])) for p in around if 0 <= p[0] < ROWS and 0 <= p[1] < COLS]
-            a, b = int(u[y, x]), int(v[y, x])
-            best = None
-            for du, dv in [(a, b), (a - 1, b), (a + 1, b), (a, b - 1), (a, b + 1), *near]:
-                if not (0 <= x + du < right.shape[1] and 0 <= y + dv < right.shape[0]):
-                    continue
-                cost = sad(left[y, x], right[y + dv, x + du]) + off_line(lines, y, x, du, dv, mu)
-                cost += smoothness * sum(min(abs(p - du) + abs(q - dv), 2) for p, q in near)
-                if best is None or cost < best[0]:
-                    best = (cost, du, dv)
-            if best:
-                new_u[y, x], new_v[y, x] = best[1:]
-    return new_u, new_v
+def slow_checkerboard(left, right, u, v, lines, mu, smoothness, rounds):
+    u, v = u.copy(), v.copy()
+    for turn in range(2 * rounds):
+        for y in range(ROWS):
+            for x in range((y + turn) % 2, COLS, 2):
+                around = [(y - 1, x), (y, x - 1), (y, x + 1), (y + 1, x)]
+                near = [(int(u[p]), int(v[p])) for p in around if 0 <= p[0] < ROWS and 0 <= p[1] < COLS]
+                a, b = int(u[y, x]), int(v[y, x])
+                best = None
+                for du, dv in [(a, b), (a - 1, b), (a + 1, b), (a, b - 1), (a, b + 1), *near]:
+                    if not (0 <= x + du < right.shape[1] and 0 <= y + dv < right.shape[0]):
+                        continue
+                    cost = sad(left[y, x], right[y + dv, x + du]) + off_line(lines, y, x, du, dv, mu)
+                    cost += smoothness * sum(min(abs(p - du) + abs(q - dv), 2) for p, q in near)
+                    if best is None or cost < best[0]:
+                        best = (cost, du, dv)
+                if best:
+                    u[y, x], v[y, x] = best[1:]
+    return u, v
 
 
 @pytest.mark.parametrize("mu", [0.0, 3.0])
@@ -87,12 +91,18 @@ def test_propagation_equals_slow_numpy_over_several_rounds(mu):
     left, right = words((ROWS, COLS), 5), words((ROWS, COLS + 2), 6)
     u, v = np.random.default_rng(7).integers(-3, 4, (2, ROWS, COLS)).astype(np.int16)
     lines = some_lines(8)
-    expected = u, v
-    for _ in range(3):
-        expected = slow_jacobi(left, right, *expected, lines, mu, 2)
-    found = search.propagate(left, right, u, v, lines, mu, 2, 3)
+    expected = slow_checkerboard(left, right, u, v, lines, mu, 2, 3)
+    packed, data = np.empty((2, ROWS, COLS), np.int32)
+    propagation.pack_map(u, v, packed)
+    propagation.costs(left, right, lines, mu, packed, data)
+    propagation.checkerboard(left, right, packed, data, np.empty((ROWS, COLS), np.uint8), lines, mu, 2, 3)
+    found = np.empty((2, ROWS, COLS), np.int16)
+    propagation.unpack(packed, *found)
     np.testing.assert_array_equal(found, expected)
     assert (found[0] != u).any()
+    again = np.empty_like(data)
+    propagation.costs(left, right, lines, mu, packed, again)
+    np.testing.assert_array_equal(data, again)
 
 
 def test_exhaustive_search_finds_a_two_dimensional_shift_and_prefers_the_short_one():
