@@ -3,7 +3,8 @@
 Nothing is rectified and no calibration is used. ``match`` works on plain arrays; see :class:`HfvmParams` for the two
 presets. Modules, in the order of the dataflow: ``hierarchy`` (coarse to fine), ``search`` (one level, fast), ``paper``
 (one level, to the letter), ``epipolar`` (soft band), ``plane`` (pre-alignment), ``subpixel``, ``consistency``
-(back-matching, filling), ``refine``.
+(back-matching, filling), ``refine``. Preset ``accurate``: ``paths`` and ``compact`` (propagation along paths),
+``relief`` (sub-pixel), ``guided`` (filling).
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 
 from stages import pyramid
 from stages.declare import AnyArray, Array, Bundle, Inputs, Stage
-from stages.hfvm import consistency, hierarchy, plane, refine, subpixel
+from stages.hfvm import accurate, consistency, guided, hierarchy, plane, refine, relief, subpixel
 from stages.hfvm.params import HfvmParams
 from stages.pyramid import Pyramid, PyramidParams
 from stages.validity import Mask, Validity, counts, mark, matched
@@ -80,7 +81,7 @@ def match(
 
 def match_pyramids(left: Pyramid, right: Pyramid, params: HfvmParams) -> Disparity:
     """As :func:`match`, of two image pyramids."""
-    pair = hierarchy.prepare(left, right, params)
+    pair = accurate.extend(hierarchy.prepare(left, right, params), left, right, params)
     if params.preset == "paper":
         return _finish(left, right, pair, hierarchy.run(pair, params, 0), params, None)
     coarse = hierarchy.run(pair, params, params.plane_level)
@@ -89,7 +90,7 @@ def match_pyramids(left: Pyramid, right: Pyramid, params: HfvmParams) -> Dispari
         state = hierarchy.run(pair, params, 0, coarse) if coarse.level > 0 else coarse
         return _finish(left, right, pair, state, params, None)
     warped = plane.align(right, alignment, left.images[0].shape, PyramidParams(levels=left.levels))
-    pair = hierarchy.prepare(left, warped, params)
+    pair = accurate.extend(hierarchy.prepare(left, warped, params), left, warped, params)
     state = hierarchy.run(pair, params, 0, near_sign=coarse.near_sign)
     return _finish(left, right, pair, state, params, alignment)
 
@@ -109,7 +110,7 @@ def _finish(
     if alignment is not None:
         u, v = plane.compose(alignment, u, v)
     keep = validity == 0
-    if params.preset == "default":
+    if params.preset != "paper":
         mean_u, mean_v = np.empty_like(u), np.empty_like(v)
         subpixel.local_mean(u, v, keep, hierarchy.SUM_RADIUS, mean_u, mean_v)
         u, v = mean_u, mean_v
@@ -117,15 +118,20 @@ def _finish(
         u, v, rest = refine.refine(left.images[0], right.images[0], right.valid[0], u, v, keep, params)
         alike = refine.correlation(rest, pair.deviation[0], keep)
         mark(validity, keep & (alike < params.correlation), Validity.OVER_THRESHOLD)
+    if params.relief_steps:
+        u, v = relief.fit(left.images[0], right.images[0], right.valid[0], u, v, validity == 0, params)
     mark(validity, keep & ~consistency.lands(u, v, keep, right.valid[0]), Validity.OUT_OF_IMAGE)
     keep = validity == 0
     gone = consistency.isolated(forward.u, forward.v, keep, params.speckle)
+    gone |= consistency.lonely(keep & ~gone, params.crowd)
     mark(validity, gone, Validity.SPECKLE)
     keep &= ~gone
     mark(validity, keep, Validity.MATCHED)
     interpolated = np.zeros(keep.shape, np.uint8)
     consistency.fill_rows(u, v, keep, params.fill_reach, state.near_sign or -1.0, interpolated)
     interpolated[left.valid[0] == 0] = 0
+    if params.guided_fill:
+        u, v = guided.median(u, v, keep, interpolated, left.images[0])
     validity |= interpolated * np.uint8(Validity.INTERPOLATED)
     nothing = ~(keep | (interpolated != 0))
     u[nothing] = v[nothing] = np.nan

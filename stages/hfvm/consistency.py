@@ -8,11 +8,16 @@ from numba import njit
 from numpy.typing import NDArray
 
 from stages.declare import AnyArray
+from stages.windows import window_sum
 
 Map = NDArray[np.float32]
 
 FAILED = np.float32(1e9)
 """Back-matching error where there is nothing to match back from."""
+
+
+CROWD = 9
+"""Pixels: side of the neighbourhood in which matches support each other, about that of the features."""
 
 
 def median(u: AnyArray, size: int) -> AnyArray:
@@ -87,6 +92,15 @@ def isolated(u: AnyArray, v: AnyArray, keep: AnyArray, size: int) -> NDArray[np.
         cv2.filterSpeckles(coded, -32768, size - 1, 8)
         gone = keep & (coded == -32768)
     return gone
+
+
+def lonely(keep: AnyArray, share: float) -> NDArray[np.bool_]:
+    """Pixels of ``keep`` in whose neighbourhood (CROWD x CROWD, clipped at the border) less than ``share`` is kept."""
+    if share <= 0:
+        return np.zeros(keep.shape, dtype=bool)
+    around = window_sum(keep.astype(np.float32), CROWD)
+    room = window_sum(np.ones(keep.shape, np.float32), CROWD)
+    return np.asarray(keep & (around < share * room))
 
 
 @njit(cache=True, nogil=True)
