@@ -123,12 +123,13 @@ def _finish(
     mark(validity, keep & ~consistency.lands(u, v, keep, right.valid[0]), Validity.OUT_OF_IMAGE)
     keep = validity == 0
     gone = consistency.isolated(forward.u, forward.v, keep, params.speckle)
-    gone |= consistency.lonely(keep & ~gone, params.crowd)
-    mark(validity, gone, Validity.SPECKLE)
-    keep &= ~gone
+    # Lonely matches are too uncertain to count as measured, but still the best guess where they are.
+    lonely = consistency.lonely(keep & ~gone, params.crowd)
+    mark(validity, gone | lonely, Validity.SPECKLE)
+    interpolated = lonely.astype(np.uint8)
+    consistency.fill_rows(u, v, keep & ~gone, params.fill_reach, state.near_sign or -1.0, interpolated)
+    keep &= ~gone & ~lonely
     mark(validity, keep, Validity.MATCHED)
-    interpolated = np.zeros(keep.shape, np.uint8)
-    consistency.fill_rows(u, v, keep, params.fill_reach, state.near_sign or -1.0, interpolated)
     interpolated[left.valid[0] == 0] = 0
     if params.guided_fill:
         u, v = guided.median(u, v, keep, interpolated, left.images[0])

@@ -72,7 +72,8 @@ def lands(u: AnyArray, v: AnyArray, keep: AnyArray, right_valid: AnyArray) -> ND
     y, x = np.nonzero(keep)
     xr, yr = x + u[y, x], y + v[y, x]
     rows, cols = right_valid.shape
-    good = (xr >= 0) & (xr <= cols - 1) & (yr >= 0) & (yr <= rows - 1)
+    # Half a pixel beyond the outermost centres is still on the image.
+    good = (xr > -0.5) & (xr < cols - 0.5) & (yr > -0.5) & (yr < rows - 0.5)
     good[good] = right_valid[np.rint(yr[good]).astype(np.int64), np.rint(xr[good]).astype(np.int64)] != 0
     found = np.zeros(keep.shape, dtype=bool)
     found[y[good], x[good]] = True
