@@ -139,7 +139,9 @@ class HfvmParams(Params):
     path_grey: float = Field(
         default=10.0, gt=0, description="grey levels: step between two pixels that halves path_large, above noise"
     )
-    relief_steps: int = Field(default=0, ge=0, le=20, description="steps of fitting a piecewise smooth relief, 0 = none")
+    relief_steps: int = Field(
+        default=0, ge=0, le=20, description="steps of fitting a piecewise smooth relief, 0 = none"
+    )
     relief_stiffness: float = Field(
         default=2000.0,
         gt=0,

@@ -140,7 +140,7 @@ def _gather(  # type: ignore[no-untyped-def]
                     c = UNIT * distance(left[y, x], right[yr, xr])
                     c += share * distance(near[y, x], right_near[yr, xr])
                 if mu > 0:
-                    c += np.int64(UNIT * mu * abs(lines[y, x, 0] * u + lines[y, x, 1] * v + lines[y, x, 2]))
+                    c += np.int64((UNIT + share) * mu * abs(lines[y, x, 0] * u + lines[y, x, 1] * v + lines[y, x, 2]))
                 cu[y, x, n], cv[y, x, n], cost[y, x, n] = u, v, min(c, 2 * OUTSIDE)
                 n += 1
             for m in range(n, MOST):

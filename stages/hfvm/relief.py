@@ -93,9 +93,7 @@ def _all_products(left, right, right_valid, u, v, keep, out):  # type: ignore[no
         _products(left, right, right_valid, u, v, keep, y, out[:, y])
 
 
-def _hold_to_lines(
-    u: AnyArray, v: AnyArray, keep: AnyArray, right_shape: tuple[int, int], *terms: AnyArray
-) -> None:
+def _hold_to_lines(u: AnyArray, v: AnyArray, keep: AnyArray, right_shape: tuple[int, int], *terms: AnyArray) -> None:
     """Add the squared distance from the epipolar lines to the normal equations, in place."""
     found = epipolar.fit(u, v, sample(keep, FIT_SAMPLES), right_shape)
     if found is None:
