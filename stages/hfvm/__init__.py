@@ -3,7 +3,8 @@
 Nothing is rectified and no calibration is used. ``match`` works on plain arrays; see :class:`HfvmParams` for the two
 presets. Modules, in the order of the dataflow: ``hierarchy`` (coarse to fine), ``search`` (one level, fast), ``paper``
 (one level, to the letter), ``epipolar`` (soft band), ``plane`` (pre-alignment), ``subpixel``, ``consistency``
-(back-matching, filling), ``refine``.
+(back-matching, filling), ``refine``. Preset ``accurate``: ``paths`` and ``compact`` (propagation along paths),
+``relief`` (sub-pixel), ``guided`` (filling).
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 
 from stages import pyramid
 from stages.declare import AnyArray, Array, Bundle, Inputs, Stage
-from stages.hfvm import consistency, hierarchy, plane, refine, resample, rowwise
+from stages.hfvm import accurate, consistency, guided, hierarchy, plane, refine, relief, resample, rowwise
 from stages.hfvm.params import HfvmParams
 from stages.pyramid import Pyramid, PyramidParams
 from stages.validity import Mask, Validity, counts, mark, matched
@@ -82,7 +83,7 @@ def match_pyramids(left: Pyramid, right: Pyramid, params: HfvmParams) -> Dispari
     """As :func:`match`, of two image pyramids."""
     if params.finest and min(left.levels, right.levels) > params.finest:
         return _enlarged(left, right, params)
-    pair = hierarchy.prepare(left, right, params)
+    pair = accurate.extend(hierarchy.prepare(left, right, params), left, right, params)
     if params.preset == "paper":
         return _finish(left, right, pair, hierarchy.run(pair, params, 0), params, None)
     coarse = hierarchy.run(pair, params, params.plane_level)
@@ -91,7 +92,7 @@ def match_pyramids(left: Pyramid, right: Pyramid, params: HfvmParams) -> Dispari
         state = hierarchy.run(pair, params, 0, coarse) if coarse.level > 0 else coarse
         return _finish(left, right, pair, state, params, None)
     warped = plane.align(right, alignment, left.images[0].shape, PyramidParams(levels=left.levels))
-    pair = hierarchy.prepare(left, warped, params)
+    pair = accurate.extend(hierarchy.prepare(left, warped, params), left, warped, params)
     state = hierarchy.run(pair, params, 0, near_sign=coarse.near_sign)
     return _finish(left, right, pair, state, params, alignment)
 
@@ -134,15 +135,21 @@ def _finish(
         u, v, rest = refine.refine(left.images[0], right.images[0], right.valid[0], u, v, keep, params)
         alike = refine.correlation(rest, pair.deviation[0], keep)
         mark(validity, keep & (alike < params.correlation), Validity.OVER_THRESHOLD)
+    if params.relief_steps:
+        u, v = relief.fit(left.images[0], right.images[0], right.valid[0], u, v, validity == 0, params)
     mark(validity, keep & ~consistency.lands(u, v, keep, right.valid[0]), Validity.OUT_OF_IMAGE)
     keep = validity == 0
     gone = consistency.isolated(forward.u, forward.v, keep, params.speckle)
-    mark(validity, gone, Validity.SPECKLE)
-    keep &= ~gone
+    # Lonely matches are too uncertain to count as measured, but still the best guess where they are.
+    lonely = consistency.lonely(keep & ~gone, params.crowd)
+    mark(validity, gone | lonely, Validity.SPECKLE)
+    interpolated = lonely.astype(np.uint8)
+    consistency.fill_rows(u, v, keep & ~gone, params.fill_reach, state.near_sign or -1.0, interpolated)
+    keep &= ~gone & ~lonely
     mark(validity, keep, Validity.MATCHED)
-    interpolated = np.zeros(keep.shape, np.uint8)
-    consistency.fill_rows(u, v, keep, params.fill_reach, state.near_sign or -1.0, interpolated)
     interpolated[left.valid[0] == 0] = 0
+    if params.guided_fill:
+        u, v = guided.median(u, v, keep, interpolated, left.images[0])
     validity |= interpolated * np.uint8(Validity.INTERPOLATED)
     nothing = ~(keep | (interpolated != 0))
     u[nothing] = v[nothing] = np.nan

@@ -8,11 +8,16 @@ from numba import njit
 from numpy.typing import NDArray
 
 from stages.declare import AnyArray
+from stages.windows import window_sum
 
 Map = NDArray[np.float32]
 
 FAILED = np.float32(1e9)
 """Back-matching error where there is nothing to match back from."""
+
+
+CROWD = 9
+"""Pixels: side of the neighbourhood in which matches support each other, about that of the features."""
 
 
 def median(u: AnyArray, size: int) -> AnyArray:
@@ -89,7 +94,8 @@ def _lands(u, v, keep, right_valid, found):  # type: ignore[no-untyped-def]
     for y in range(u.shape[0]):
         for x in range(u.shape[1]):
             xr, yr = x + np.float64(u[y, x]), y + np.float64(v[y, x])
-            if keep[y, x] and xr >= 0 and xr <= cols - 1 and yr >= 0 and yr <= rows - 1:
+            # half a pixel beyond the outermost centres is still on the image
+            if keep[y, x] and -0.5 < xr < cols - 0.5 and -0.5 < yr < rows - 0.5:
                 found[y, x] = right_valid[np.int64(np.rint(yr)), np.int64(np.rint(xr))] != 0
 
 
@@ -116,6 +122,15 @@ def isolated(u: AnyArray, v: AnyArray, keep: AnyArray, size: int) -> NDArray[np.
         cv2.filterSpeckles(coded, -32768, size - 1, 8)
         gone = keep & (coded == -32768)
     return gone
+
+
+def lonely(keep: AnyArray, share: float) -> NDArray[np.bool_]:
+    """Pixels of ``keep`` in whose neighbourhood (CROWD x CROWD, clipped at the border) less than ``share`` is kept."""
+    if share <= 0:
+        return np.zeros(keep.shape, dtype=bool)
+    around = window_sum(keep.astype(np.float32), CROWD)
+    room = window_sum(np.ones(keep.shape, np.float32), CROWD)
+    return np.asarray(keep & (around < share * room))
 
 
 @njit(cache=True, nogil=True)

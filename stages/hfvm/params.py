@@ -23,11 +23,21 @@ PAPER: Mapping[str, Any] = {
 }
 """What preset ``paper`` sets differently; a value given by the user wins. Preset-only machinery ignores the rest."""
 
+ACCURATE: Mapping[str, Any] = {
+    "fine_rounds": None,
+    "median": 3,
+    "path_rounds": 3,
+    "relief_steps": 6,
+    "crowd": 0.5,
+    "guided_fill": True,
+}
+"""What preset ``accurate`` sets differently; a value given by the user wins."""
+
 
 FAST: Mapping[str, Any] = {"finest": 1, "rounds": 3, "fine_rounds": None, "refine": False}
 """What preset ``fast`` sets differently: half the resolution, less propagation, no removal of the perspective bias."""
 
-PRESETS: Mapping[str, Mapping[str, Any]] = {"default": {}, "fast": FAST, "paper": PAPER}
+PRESETS: Mapping[str, Mapping[str, Any]] = {"default": {}, "fast": FAST, "accurate": ACCURATE, "paper": PAPER}
 
 
 class HfvmParams(Params):
@@ -35,12 +45,15 @@ class HfvmParams(Params):
 
     ``preset = "paper"`` follows section 4.3 to the letter: floating-point Table 1 features and Eq. 1, one search
     centre, no epipolar band, no propagation, no smoothness, no pre-alignment, sub-pixel by linear interpolation and
-    look-up table.
+    look-up table. ``preset = "accurate"`` adds to the default propagation along paths with compact features, a
+    relief fitted to all matches along their epipolar lines, and an edge-keeping median of what was interpolated; it
+    takes several times as long.
     """
 
-    preset: Literal["default", "fast", "paper"] = Field(
+    preset: Literal["default", "fast", "accurate", "paper"] = Field(
         default="default",
-        description="default: the measured recipe; fast: half its resolution; paper: section 4.3 to the letter",
+        description="default: the measured recipe; fast: half its resolution; accurate: slower; paper: section 4.3 to "
+        "the letter",
     )
     weights: Weights = Field(
         default=(4.0, 4.0, 2.0, 2.0, 0.5, 0.5, 2.0, 1.0),
@@ -122,9 +135,51 @@ class HfvmParams(Params):
         default=8.0, gt=0, description="squared grey levels a pixel; holds windows with weak texture"
     )
 
+    path_rounds: int = Field(
+        default=0, ge=0, le=8, description="rounds of propagation along paths a level; the third still helps, 0 = none"
+    )
+    path_compact: int = Field(
+        default=8,
+        ge=0,
+        le=64,
+        description="quarters: weight of the compact features' byte steps; twice Table 1's, which fatten edges",
+    )
+    path_small: int = Field(
+        default=36,
+        ge=1,
+        le=1000,
+        description="quarters of a byte step: cost of a pixel's difference to the pixel before, a tenth of a match's",
+    )
+    path_large: int = Field(
+        default=240, ge=1, le=10000, description="quarters of a byte step: the most that a difference costs"
+    )
+    path_grey: float = Field(
+        default=10.0, gt=0, description="grey levels: step between two pixels that halves path_large, above noise"
+    )
+    relief_steps: int = Field(
+        default=0, ge=0, le=20, description="steps of fitting a piecewise smooth relief, 0 = none"
+    )
+    relief_stiffness: float = Field(
+        default=2000.0,
+        gt=0,
+        description="squared grey levels for a bend of a pixel: strong against noise, weak against texture of 5 x 5",
+    )
+    relief_bend: float = Field(
+        default=0.05, gt=0, description="pixels: bend (second difference) beyond which stiffness gives way to an edge"
+    )
+    crowd: float = Field(
+        default=0.0,
+        ge=0,
+        le=1,
+        description="least share of matched pixels in 9 x 9 around a matched one; lonely ones are errors by the edge",
+    )
+    guided_fill: bool = Field(
+        default=False, description="edge-keeping median of interpolated pixels, which streak along rows"
+    )
+
     @model_validator(mode="before")
     @classmethod
     def _preset(cls, values: Any) -> Any:
-        if isinstance(values, Mapping) and values.get("preset") in PRESETS:
-            return {**PRESETS[values["preset"]], **values}
+        if isinstance(values, Mapping):
+            return {**PRESETS.get(str(values.get("preset")), {}), **values}
         return values

@@ -1,0 +1,176 @@
+"""Relief: sub-pixel displacements of all matches at once, piecewise smooth and along epipolar lines.
+
+Windows trade noise against relief, and each solves for a row displacement that the geometry of the rig already knows.
+Here the displacements (u, v) of all matched pixels minimise
+
+    sum w (r - g . (du, dv))^2  +  k (distance from the epipolar line)^2  +  stiffness sum s |second difference|^2
+
+with r the difference of the left image and the right one warped by the last step, free of its local mean; g the warped
+gradient; w falling with r and s with the second difference found, so that neither a wrong pixel nor an edge drags its
+neighbours along. The lines are fitted to the matches themselves (:mod:`stages.hfvm.epipolar`); k gives way where they
+do not lie on lines. Solved by a fixed number of Gauss-Seidel sweeps in reading order.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from stages.declare import AnyArray
+from stages.hfvm import epipolar
+from stages.hfvm.hierarchy import sample
+from stages.hfvm.params import HfvmParams
+from stages.hfvm.refine import FARTHEST
+from stages.hfvm.rowwise import PLANES, _products
+from stages.windows import window_sum
+
+MEAN_SIDE = 9
+"""Pixels: window of the local mean; brightness varies more slowly."""
+
+RESIDUAL = 10.0
+"""Grey levels: residual that halves a pixel's weight, well above camera noise."""
+
+LINE = 1000.0
+"""Squared grey levels for a pixel off the line: more than the strongest texture says."""
+
+SHARP = 0.05
+"""Pixels: median distance from the lines up to which they are trusted fully; beyond it by its inverse square."""
+
+FIT_SAMPLES = 4000
+SWEEPS = 20
+OVERSHOOT = 1.3
+"""Factor on each Gauss-Seidel step (successive over-relaxation), which stays convergent below 2."""
+
+
+def fit(
+    left: AnyArray,
+    right: AnyArray,
+    right_valid: AnyArray,
+    u: AnyArray,
+    v: AnyArray,
+    keep: AnyArray,
+    params: HfvmParams,
+) -> tuple[AnyArray, AnyArray]:
+    """Displacements of the relief that fits best.
+
+    Parameters
+    ----------
+    left, right : (row, col) float32 grey values.
+    right_valid : (row, col) uint8, 1 = usable.
+    u, v : (row, col) float32 displacements to start from, pixels.
+    keep : (row, col) bool, pixels to use and to improve; the others are returned as they are.
+    """
+    start_u, start_v = u, v
+    u, v = np.where(keep, u, np.float32(0)), np.where(keep, v, np.float32(0))
+    for _ in range(params.relief_steps):
+        a, b, c, p, q = _normal(left, right, right_valid, u, v, keep)
+        _hold_to_lines(u, v, keep, right.shape, a, b, c, p, q)
+        across, down = np.zeros(u.shape, np.float32), np.zeros(u.shape, np.float32)
+        _stiffness(u, v, keep, np.float32(params.relief_bend), np.float32(params.relief_stiffness), across, down)
+        new_u, new_v = u.copy(), v.copy()
+        _solve(a, b, c, p, q, keep, across, down, SWEEPS, np.float32(OVERSHOOT), u, v, new_u, new_v)
+        u, v = new_u, new_v
+    good = keep & (np.hypot(u - start_u, v - start_v) <= FARTHEST)
+    return np.where(good, u, start_u), np.where(good, v, start_v)
+
+
+def _normal(
+    left: AnyArray, right: AnyArray, right_valid: AnyArray, u: AnyArray, v: AnyArray, keep: AnyArray
+) -> tuple[AnyArray, ...]:
+    """Terms a, b, c, p, q of each pixel's normal equations (a b; b c) (du, dv) = (p, q) of the grey values."""
+    planes = np.zeros((PLANES, *u.shape), np.float32)
+    _all_products(left, right, right_valid, u, v, keep, planes)
+    known, gx, gy, rest = planes[0], planes[1], planes[2], planes[3]
+    mean = window_sum(rest, MEAN_SIDE) / np.maximum(window_sum(known, MEAN_SIDE), 1.0)
+    rest = np.where(known > 0, rest - mean, 0.0).astype(np.float32)
+    weight = np.float32(1.0) / (np.float32(1.0) + (rest / np.float32(RESIDUAL)) ** 2)
+    wx, wy = weight * gx, weight * gy
+    return wx * gx, wx * gy, wy * gy, wx * rest, wy * rest
+
+
+@njit(cache=True, nogil=True)
+def _all_products(left, right, right_valid, u, v, keep, out):  # type: ignore[no-untyped-def]
+    for y in range(left.shape[0]):
+        _products(left, right, right_valid, u, v, keep, y, out[:, y])
+
+
+def _hold_to_lines(u: AnyArray, v: AnyArray, keep: AnyArray, right_shape: tuple[int, int], *terms: AnyArray) -> None:
+    """Add the squared distance from the epipolar lines to the normal equations, in place."""
+    found = epipolar.fit(u, v, sample(keep, FIT_SAMPLES), right_shape)
+    if found is None:
+        return
+    a, b, c, p, q = terms
+    lines = epipolar.lines(found[0], u.shape)
+    x, y, e = lines[..., 0], lines[..., 1], lines[..., 0] * u + lines[..., 1] * v + lines[..., 2]
+    k = np.where(keep, np.float32(LINE * min(1.0, (SHARP / max(found[1], 1e-9)) ** 2)), np.float32(0))
+    a += k * x * x
+    b += k * x * y
+    c += k * y * y
+    p -= k * x * e
+    q -= k * y * e
+
+
+@njit(cache=True, nogil=True)
+def _stiffness(u, v, keep, bend, stiffness, across, down):  # type: ignore[no-untyped-def]
+    """Weight of the second difference at each pixel along its row and column, 0 where a neighbour is unknown."""
+    rows, cols = u.shape
+    for y in range(rows):
+        for x in range(cols):
+            if not keep[y, x]:
+                continue
+            if x > 0 and x < cols - 1 and keep[y, x - 1] and keep[y, x + 1]:
+                d = u[y, x - 1] - u[y, x] + u[y, x + 1] - u[y, x]
+                e = v[y, x - 1] - v[y, x] + v[y, x + 1] - v[y, x]
+                across[y, x] = stiffness / (np.float32(1.0) + (d * d + e * e) / (bend * bend))
+            if y > 0 and y < rows - 1 and keep[y - 1, x] and keep[y + 1, x]:
+                d = u[y - 1, x] - u[y, x] + u[y + 1, x] - u[y, x]
+                e = v[y - 1, x] - v[y, x] + v[y + 1, x] - v[y, x]
+                down[y, x] = stiffness / (np.float32(1.0) + (d * d + e * e) / (bend * bend))
+
+
+@njit(cache=True, nogil=True)
+def _solve(a, b, c, p, q, keep, across, down, sweeps, overshoot, u0, v0, u, v):  # type: ignore[no-untyped-def]
+    """Gauss-Seidel sweeps on ``u, v`` in place; the grey values' terms are those at ``u0, v0``.
+
+    A pixel takes part in three second differences of its row and three of its column: as their middle, where it counts
+    twice, and as either end. ``s``, ``su``, ``sv``: their weights, and weighted values they want.
+    """
+    rows, cols = u.shape
+    two, four = np.float32(2.0), np.float32(4.0)
+    for _ in range(sweeps):
+        for y in range(rows):
+            for x in range(cols):
+                if not keep[y, x]:
+                    continue
+                s = su = sv = np.float32(0.0)
+                k = across[y, x]
+                if k > 0:
+                    s += four * k
+                    su += two * k * (u[y, x - 1] + u[y, x + 1])
+                    sv += two * k * (v[y, x - 1] + v[y, x + 1])
+                k = down[y, x]
+                if k > 0:
+                    s += four * k
+                    su += two * k * (u[y - 1, x] + u[y + 1, x])
+                    sv += two * k * (v[y - 1, x] + v[y + 1, x])
+                for side in (-1, 1):
+                    i, j = x + side, y + side
+                    if i > 0 and i < cols - 1:
+                        k = across[y, i]
+                        if k > 0:
+                            s += k
+                            su += k * (two * u[y, i] - u[y, i + side])
+                            sv += k * (two * v[y, i] - v[y, i + side])
+                    if j > 0 and j < rows - 1:
+                        k = down[j, x]
+                        if k > 0:
+                            s += k
+                            su += k * (two * u[j, x] - u[j + side, x])
+                            sv += k * (two * v[j, x] - v[j + side, x])
+                m, n, o = a[y, x] + s, b[y, x], c[y, x] + s
+                right_u = a[y, x] * u0[y, x] + n * v0[y, x] + p[y, x] + su
+                right_v = n * u0[y, x] + c[y, x] * v0[y, x] + q[y, x] + sv
+                det = m * o - n * n
+                if det > np.float32(1.0):
+                    u[y, x] += overshoot * ((o * right_u - n * right_v) / det - u[y, x])
+                    v[y, x] += overshoot * ((m * right_v - n * right_u) / det - v[y, x])
