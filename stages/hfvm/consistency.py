@@ -14,6 +14,9 @@ Map = NDArray[np.float32]
 FAILED = np.float32(1e9)
 """Back-matching error where there is nothing to match back from."""
 
+CHANCE = 16
+"""Times the size of an isolated patch: none of chance is as large (measured on blurred noise: up to 8 times)."""
+
 
 def median(u: AnyArray, size: int) -> AnyArray:
     """Plain median of ``size`` x ``size`` pixels (3 or 5; 1 = none) of an int16 map, its edge repeated."""
@@ -87,6 +90,20 @@ def isolated(u: AnyArray, v: AnyArray, keep: AnyArray, size: int) -> NDArray[np.
         cv2.filterSpeckles(coded, -32768, size - 1, 8)
         gone = keep & (coded == -32768)
     return gone
+
+
+def unsupported(u: AnyArray, v: AnyArray, keep: AnyArray, size: int) -> NDArray[np.bool_]:
+    """As :func:`isolated`; where most of what remains lies in patches that are still small, those too.
+
+    Images that have nothing to do with each other match by chance in patches up to some hundred pixels. Of a pair that
+    shows one scene nearly everything lies in patches of thousands: there small ones are believed.
+    """
+    gone = isolated(u, v, keep, size)
+    if size <= 1:
+        return gone
+    rest = keep & ~gone
+    small = isolated(u, v, rest, min(CHANCE * size, keep.size // 8))
+    return gone | small if np.count_nonzero(small) > 0.5 * np.count_nonzero(rest) else gone
 
 
 @njit(cache=True, nogil=True)
