@@ -86,9 +86,11 @@ def match_files(
 
 def warnings(found: Disparity) -> list[str]:
     """What is suspicious about two matched images, one line each with the figure."""
+    from stages.hfvm.order import swapped
     from stages.validity import Validity, has, matched
 
-    share = float(matched(found.validity).mean())
+    ok = matched(found.validity)
+    share = float(ok.mean())
     if share < FEW:
         reasons = (
             (Validity.NO_TEXTURE, "have no texture (black, saturated or blank)"),
@@ -100,11 +102,11 @@ def warnings(found: Disparity) -> list[str]:
         shares = sorted(((float(has(found.validity, bit).mean()), words) for bit, words in reasons), reverse=True)
         told = ", ".join(f"{100 * s:.0f} % {words}" for s, words in shares[:2] if s >= 0.005)
         return [f"only {100 * share:.1f} % of the pixels match ({told}): do both images show one scene?"]
-    if found.near_sign > 0:
-        median = float(np.median(found.column_disparity[matched(found.validity)]))
+    if swapped(found.column_disparity, found.row_disparity, ok):
+        median = float(np.median(found.column_disparity[ok]))
         return [
-            f"disparities have the sign of swapped images (median {median:+.1f} px, near things to the right): if this "
-            "is a pair of a left and a right camera, give them in the other order"
+            f"disparities have the sign of swapped images (median {median:+.1f} px, right minus left): if this is "
+            "a pair of a left and a right camera, give them in the other order"
         ]
     return []
 

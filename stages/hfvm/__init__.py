@@ -43,8 +43,7 @@ class Disparity:
     pixels, NaN where the match leaves the right image. ``distance``: float32 mean feature distance at the whole-pixel
     match (byte steps; preset ``paper``: Eq. 1, grey levels), NaN where back-matching failed by far. ``disparity_std``:
     float32 pixels, standard deviation of the column disparity (see :mod:`~stages.hfvm.uncertainty`), NaN where not
-    ``MATCHED``. ``aligned``: whether the right image was pre-aligned by a plane. ``near_sign``: sign of the column
-    displacement of near things against far ones: -1 on a usual rig, +1 where left and right seem swapped, 0 unknown.
+    ``MATCHED``. ``aligned``: whether the right image was pre-aligned by a plane.
     """
 
     column_disparity: Map
@@ -54,7 +53,6 @@ class Disparity:
     distance: Map
     disparity_std: Map
     aligned: bool
-    near_sign: float
 
 
 def match(
@@ -166,7 +164,7 @@ def _finish(
     u[nothing] = v[nothing] = np.nan
     error[error >= consistency.FAILED] = np.nan
     distance = np.where(forward.distance < 0, np.float32(np.nan), forward.distance)
-    return Disparity(u, v, validity, error, distance, std, alignment is not None, state.near_sign)
+    return Disparity(u, v, validity, error, distance, std, alignment is not None)
 
 
 def _fine(pair: hierarchy.Prepared, state: hierarchy.State, params: HfvmParams) -> tuple[hierarchy.Fine, Map]:
