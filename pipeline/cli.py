@@ -274,8 +274,10 @@ def match(
     right: Path,
     *,
     output: Annotated[Path, Parameter(name=["--output", "-o"])] = Path("disparity.tif"),
-    preset: str | None = None,
+    preset: Literal["default", "paper"] | None = None,
     dense: Annotated[bool, Parameter(negative="")] = False,
+    prior_disparity: Path | None = None,
+    confidence: Path | None = None,
     assignments: Assignments = None,
     debug: Annotated[bool, Parameter(negative="")] = False,
 ) -> int:
@@ -296,6 +298,12 @@ def match(
         Parameter set of the matcher: default or paper.
     dense
         Fill undefined disparities by interpolation.
+    prior_disparity
+        Disparity TIFF of this left image to start from, as this command writes it; where it is undefined the search
+        starts as without it. It may err by some pixels: three and a few more from neighbours.
+    confidence
+        TIFF to write with the bands disparity_std (pixels, standard deviation of the column), validity (bits) and
+        backmatch_error (pixels).
     assignments
         A parameter of the matcher, hfvm.key=value; may be repeated.
     debug
@@ -304,7 +312,16 @@ def match(
     _prepare(None)
     from pipeline import match as command
 
-    return command.match_files(left, right, output, preset=preset, dense=dense, assignments=tuple(assignments or ()))
+    return command.match_files(
+        left,
+        right,
+        output,
+        preset=preset,
+        dense=dense,
+        assignments=tuple(assignments or ()),
+        prior=prior_disparity,
+        confidence=confidence,
+    )
 
 
 @datasets_app.default

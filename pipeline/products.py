@@ -240,19 +240,72 @@ def write_disparity(path: Path, column: NDArray[Any], row: NDArray[Any], tags: M
     column, row : (row, col) float32 pixels on the left image, right minus left, NaN undefined.
     tags : more metadata.
     """
+    bands = {"column_disparity": (column, "pixel"), "row_disparity": (row, "pixel")}
+    _write_image(path, bands, {"CONVENTION": "right minus left, pixels of the left image, NaN undefined"} | dict(tags))
+
+
+def write_confidence(
+    path: Path, std: NDArray[Any], validity: NDArray[Any], backmatch_error: NDArray[Any], tags: Mapping[str, str]
+) -> None:
+    """Write what is known about a disparity as a float32 TIFF: ``disparity_std``, ``validity``, ``backmatch_error``.
+
+    Parameters
+    ----------
+    std, backmatch_error : (row, col) float32 pixels, NaN undefined.
+    validity : (row, col) uint8, bits of :class:`stages.validity.Validity`; written as whole numbers, and as the tag
+        ``VALIDITY`` says.
+    tags : more metadata.
+    """
+    from stages.validity import Validity
+
+    bits = ", ".join(f"{bit.value} {str(bit.name).lower()}" for bit in Validity)
+    bands = {"disparity_std": (std, "pixel"), "validity": (validity, ""), "backmatch_error": (backmatch_error, "pixel")}
+    _write_image(path, bands, {"VALIDITY": f"sum of {bits}"} | dict(tags))
+
+
+def _write_image(path: Path, bands: Mapping[str, tuple[NDArray[Any], str]], tags: Mapping[str, str]) -> None:
+    """Write arrays (row, col) on image pixels, with their units, as bands of a float32 TIFF, NaN undefined."""
     import warnings
 
     import rasterio
     from rasterio.errors import NotGeoreferencedWarning
 
-    height, width = column.shape
-    profile = {"driver": "GTiff", "height": height, "width": width, "count": 2, "dtype": "float32"}
+    height, width = next(iter(bands.values()))[0].shape
+    profile = {"driver": "GTiff", "height": height, "width": width, "count": len(bands), "dtype": "float32"}
     profile |= {"nodata": float("nan"), "compress": "deflate", "predictor": 3}
     with replacing(path) as temporary, warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)  # an image has no place on the ground
         with rasterio.open(temporary, "w", **profile) as file:
-            for number, (name, values) in enumerate((("column_disparity", column), ("row_disparity", row)), start=1):
+            for number, (name, (values, _)) in enumerate(bands.items(), start=1):
                 file.write(np.asarray(values, dtype=np.float32), number)
                 file.set_band_description(number, name)
-            file.units = ("pixel", "pixel")
-            file.update_tags(CONVENTION="right minus left, pixels of the left image, NaN undefined", **dict(tags))
+            file.units = tuple(unit for _, unit in bands.values())
+            file.update_tags(**dict(tags))
+
+
+def read_disparity(path: Path) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Column and row disparity (row, col), float32 pixels, NaN undefined, of a TIFF as :func:`write_disparity` makes.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read, or its two bands are not those.
+    """
+    import warnings
+
+    import rasterio
+    from rasterio.errors import NotGeoreferencedWarning, RasterioError
+
+    remedy = "give a TIFF with the bands column_disparity and row_disparity, as rille match writes"
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", NotGeoreferencedWarning)
+            with rasterio.open(path) as file:
+                names = tuple(name for name in file.descriptions if name)
+                if file.count != 2 or names not in ((), ("column_disparity", "row_disparity")):
+                    told = ", ".join(names) or "without names"
+                    raise InputError(f"{path} has {file.count} bands ({told}), no disparity", remedy=remedy)
+                column, row = file.read(out_dtype="float32", masked=True).filled(np.nan)
+    except RasterioError as error:
+        raise InputError(f"{path} cannot be read as a TIFF ({error})", remedy=remedy) from error
+    return np.ascontiguousarray(column), np.ascontiguousarray(row)

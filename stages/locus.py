@@ -5,7 +5,8 @@ is projected into both images (the left and right *locus*); the left locus, mapp
 right one at the elevation. Nothing is rectified and no point cloud is made: rows and columns are those of the original
 images, for any orientation of the cameras. The kernel and its equations are in :mod:`stages.locus_kernel`.
 
-The elevation's error is that of the disparity over its sensitivity: ``sigma_Z = sigma_d / |ds/dZ|``.
+The elevation's error is that of the disparity over its sensitivity: ``sigma_Z = sigma_d / |ds/dZ|``, with the
+disparity's own standard deviation at the pixel where the matcher gives one.
 """
 
 from __future__ import annotations
@@ -48,9 +49,17 @@ class LocusParams(Params):
         6.0, gt=0, description="cells; the automatic extent ends where a pixel covers more of them along the range"
     )
     max_sigma: float | None = Field(
-        None, gt=0, description="m; cells of greater elevation_std are left undefined; none: one cell size"
+        None,
+        gt=0,
+        description="m; cells where sigma_disparity makes a greater elevation error are left undefined: a bound on the "
+        "geometry, not on the single disparity; none: one cell size",
     )
-    sigma_disparity: float = Field(0.2, gt=0, description="pixels; error of a disparity after sub-pixel refinement")
+    sigma_disparity: float = Field(
+        0.2,
+        gt=0,
+        description="pixels; error of a typical disparity: bounds the automatic extent, and stands for each pixel's "
+        "own standard deviation where the matcher gives none",
+    )
     max_residual: float = Field(
         0.5, gt=0, description="pixels; greatest |p_l + d - p_r| at the solution: 2.5 sigma_disparity"
     )
@@ -92,6 +101,8 @@ def reconstruct(
     surface: Surface,
     z_range: tuple[float, float],
     params: LocusParams,
+    *,
+    disparity_std: ArrayLike | None = None,
 ) -> Dem:
     """Elevation and ortho image of every cell of a reference surface.
 
@@ -104,12 +115,14 @@ def reconstruct(
     surface : feet and normals of the cells, metres.
     z_range : lowest and highest elevation searched, metres.
     params : thresholds; ``cell_size`` and ``extent`` are not used here.
+    disparity_std : (rows, cols) standard deviation of the usable disparities, pixels; None:
+        ``params.sigma_disparity`` everywhere.
 
     Returns
     -------
     Dem
         A cell is undefined where a camera does not see it, where the disparity around it was not measured, jumps or
-        contradicts the calibration, or where ``elevation_std`` exceeds ``max_sigma``.
+        contradicts the calibration, or where ``sigma_disparity`` makes an elevation error beyond ``max_sigma``.
 
     Raises
     ------
@@ -126,10 +139,12 @@ def reconstruct(
         rows = np.arange(start, min(start + BLOCK_ROWS, surface.rows))
         low, high = _from_coarse(coarse, rows, np.arange(surface.cols))
         found = task.solve(surface, rows, np.arange(surface.cols), low, high)
-        std = params.sigma_disparity / found[..., 2]
         if params.max_sigma is not None:
-            found[~(std <= params.max_sigma)] = np.nan
-            std[np.isnan(found[..., 0])] = np.nan
+            found[~(params.sigma_disparity / found[..., 2] <= params.max_sigma)] = np.nan
+        sigma: float | Floats = params.sigma_disparity
+        if disparity_std is not None:
+            sigma = task.at_left_pixel(np.asarray(disparity_std), surface, rows, found[..., 0])
+        std = sigma / found[..., 2]
         block = slice(start, start + rows.size)
         out.elevation[block], out.elevation_std[block] = found[..., 0], std
         out.residual[block], out.ortho[block] = found[..., 1], found[..., 3]
@@ -180,6 +195,19 @@ class _Task:
             feet, normals, *start, *self.z_range, self.left, self.right, self.epipole, self.sizes,
             self.dcol, self.drow, self.image, self.limits, out,
         )  # fmt: skip
+        return out
+
+    def at_left_pixel(
+        self, values: NDArray[Any], surface: Surface, rows: NDArray[np.intp], elevation: Floats
+    ) -> Floats:
+        """Value of the left pixel nearest to each solved cell (r, c) of ``rows``; NaN elsewhere."""
+        feet, normals = surface.block(rows, np.arange(surface.cols))
+        out = np.full(elevation.shape, np.nan)
+        solved = np.isfinite(elevation)
+        points = (feet + elevation[..., None] * normals)[solved]
+        p = points @ self.left[:, :3].T + self.left[:, 3]
+        x, y = (np.rint(p[:, k] / p[:, 2]).astype(np.intp) for k in (0, 1))
+        out[solved] = values[y, x]
         return out
 
 
@@ -252,6 +280,7 @@ def _run(params: LocusParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle
         plane(lattice),
         (z_range[0], z_range[1]),
         params,
+        disparity_std=disparity.arrays.get("disparity_std"),
     )
     meta = {
         "lattice": lattice.to_dict(),

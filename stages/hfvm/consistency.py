@@ -15,6 +15,9 @@ Map = NDArray[np.float32]
 FAILED = np.float32(1e9)
 """Back-matching error where there is nothing to match back from."""
 
+CHANCE = 16
+"""Times the size of an isolated patch: none of chance is as large (measured on blurred noise: up to 8 times)."""
+
 
 CROWD = 9
 """Pixels: side of the neighbourhood in which matches support each other, about that of the features."""
@@ -131,6 +134,20 @@ def lonely(keep: AnyArray, share: float) -> NDArray[np.bool_]:
     around = window_sum(keep.astype(np.float32), CROWD)
     room = window_sum(np.ones(keep.shape, np.float32), CROWD)
     return np.asarray(keep & (around < share * room))
+
+
+def unsupported(u: AnyArray, v: AnyArray, keep: AnyArray, size: int) -> NDArray[np.bool_]:
+    """As :func:`isolated`; where most of what remains lies in patches that are still small, those too.
+
+    Images that have nothing to do with each other match by chance in patches up to some hundred pixels. Of a pair that
+    shows one scene nearly everything lies in patches of thousands: there small ones are believed.
+    """
+    gone = isolated(u, v, keep, size)
+    if size <= 1:
+        return gone
+    rest = keep & ~gone
+    small = isolated(u, v, rest, min(CHANCE * size, keep.size // 8))
+    return gone | small if np.count_nonzero(small) > 0.5 * np.count_nonzero(rest) else gone
 
 
 @njit(cache=True, nogil=True)

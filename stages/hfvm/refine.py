@@ -21,6 +21,13 @@ CORRELATION_SIDE = 9
 FARTHEST = 1.5
 """Pixels: a correction beyond this is a jump to something else."""
 
+SAME_CONTRAST = 1.3
+"""Ratio of contrasts up to which residuals hardly tell it from noise: less than a tenth of the signal's variance."""
+STRIDE, SAMPLES, LEAST = 3, 20000, 100
+"""Pixels between the two of a difference, and how many differences the ratio of contrasts is taken from."""
+SATURATED = 250.0
+"""Grey level from which on an image may be clipped."""
+
 
 def refine(
     left: AnyArray,
@@ -58,6 +65,27 @@ def refine(
             rowwise.local_mean(new_u, new_v, keep, 1, u, v)
     better = (last <= first) & (np.hypot(u - start_u, v - start_v) <= FARTHEST)
     return np.where(better, u, start_u), np.where(better, v, start_v), np.where(better, last, first)
+
+
+def level_contrast(left: AnyArray, right: AnyArray, u: AnyArray, v: AnyArray, keep: AnyArray) -> AnyArray:
+    """The right image, its contrast made that of the left one where they differ grossly (:data:`SAME_CONTRAST`).
+
+    Steps and residuals are mean-free, not free of gain: an exposure ratio of two would pass for noise. The ratio is
+    that of the median differences over three columns, at matches that are not saturated.
+    """
+    y, x = np.nonzero(keep[:, :-STRIDE])
+    y, x = y[:: 1 + len(y) // SAMPLES], x[:: 1 + len(x) // SAMPLES]
+    xr, yr = np.rint(x + u[y, x]).astype(np.intp), np.rint(y + v[y, x]).astype(np.intp)
+    inside = (xr >= 0) & (xr + STRIDE < right.shape[1]) & (yr >= 0) & (yr < right.shape[0])
+    y, x, yr, xr = y[inside], x[inside], yr[inside], xr[inside]
+    a, b = np.stack([left[y, x], left[y, x + STRIDE]]), np.stack([right[yr, xr], right[yr, xr + STRIDE]])
+    good = (np.maximum(a, b) < SATURATED).all(axis=0)
+    if np.count_nonzero(good) < LEAST:
+        return right
+    there, here = (float(np.median(np.abs(np.diff(c[:, good], axis=0)))) for c in (b, a))
+    if min(here, there) <= 0 or max(here / there, there / here) < SAME_CONTRAST:
+        return right
+    return right * np.float32(here / there)
 
 
 def correlation(rest: AnyArray, deviation: AnyArray, keep: AnyArray) -> AnyArray:

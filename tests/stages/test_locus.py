@@ -314,6 +314,24 @@ def test_stage_in_both_frames() -> None:
     assert np.nanmin(p[..., 0]) >= 40
 
 
+def test_each_cell_has_the_error_of_its_own_pixel_where_the_matcher_gives_one() -> None:
+    inputs = bundles(RIG, HEIGHT, np.random.default_rng(2))
+    args, params = {"pair": 0, "frame": "local"}, LocusParams(cell_size=0.01)
+    plain = locus.STAGE.run(params, args, inputs)
+    shape = inputs["disparity"]["column_disparity"].shape
+    std = np.full(shape, 0.1, np.float32)
+    std[:, shape[1] // 2 :] = 0.6
+    disparity = Bundle({**inputs["disparity"].arrays, "disparity_std": std}, {})
+    own = locus.STAGE.run(params, args, inputs | {"disparity": disparity})
+    np.testing.assert_array_equal(own["elevation"], plain["elevation"])
+    lattice = Lattice.from_dict(own.meta["lattice"])
+    pixels = RIG.left.project(T_LOCAL_LEFT.inverse().apply(np.dstack([lattice.xy(), own["elevation"]])))
+    ratio = own["elevation_std"] / plain["elevation_std"] * LocusParams().sigma_disparity
+    for side, expected in ((pixels[..., 0] < shape[1] // 2 - 1, 0.1), (pixels[..., 0] > shape[1] // 2, 0.6)):
+        assert np.isfinite(ratio[side]).sum() > 100
+        np.testing.assert_allclose(ratio[side & np.isfinite(ratio)], expected, rtol=1e-5)
+
+
 def test_stage_parameters_of_the_lattice() -> None:
     inputs = bundles(RIG, HEIGHT, np.random.default_rng(2))
     args = {"pair": 0, "frame": "local"}
