@@ -33,7 +33,8 @@ def stamp(graph: Graph, sequence: Sequence, versions: Mapping[str, str], **facts
     beside = [p for p in sorted(here.rglob("*")) if p.is_file() and p.suffix not in (".py", ".pyc")]
     return digest(
         {
-            "tasks": [[h.label, h.key, "" if h.ref is None else h.ref.digest] for h in graph.nodes],
+            # the order in which tasks were laid out depends on the order of results
+            "tasks": sorted([h.label, h.key, "" if h.ref is None else h.ref.digest] for h in graph.nodes),
             "sequence": {f.name: _plain(getattr(sequence, f.name)) for f in fields(sequence)},
             "code": module_digests("pipeline.run"),
             "data": {p.relative_to(here).as_posix(): hashlib.sha256(p.read_bytes()).hexdigest() for p in beside},
