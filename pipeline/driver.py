@@ -161,6 +161,9 @@ class _Run:
         """How many distinct inputs of a node are not resolved yet."""
         self.dependants: dict[int, list[Handle]] = defaultdict(list)
         self.ready: list[int] = []
+        self.begun: set[str] = set()
+        self.warm: set[str] = set()
+        """Stages of which a task was submitted, and of which one has come back."""
         self.missing: list[int] = []
         """Looked up, not found, not submitted: a heap by order of creation, as ``ready``."""
         self.flying: dict[str, list[Handle]] = {}
@@ -270,7 +273,8 @@ class _Run:
             self.executor = make(self.executor_kind, self.jobs, self.store.root)
             self.result.executor_started = True
         while self.missing and not self.stopped and self.executor is not None and self.executor.idle():
-            handle = self.graph.nodes[heapq.heappop(self.missing)]
+            handle = self.graph.nodes[self._next()]
+            self.begun.add(handle.stage)
             handle.status = "running"
             self.progress.running(handle)
             self.executor.submit(handle.key, self.store.root, handle.spec, handle.refs(), handle.stage in self.force)
@@ -281,8 +285,25 @@ class _Run:
             self.missing.clear()
             self.patients.clear()
 
+    def _next(self) -> int:
+        """Take the first of what is missing, but while a stage's first task compiles its kernels, rather another stage.
+
+        A second process would compile the same ones; a moment later it finds them on disk.
+        """
+        cold = self.begun - self.warm
+        at = heapq.heappop(self.missing)
+        if self.graph.nodes[at].stage not in cold:
+            return at
+        other = min((i for i in self.missing if self.graph.nodes[i].stage not in cold), default=None)
+        if other is None:
+            return at
+        self.missing[self.missing.index(other)] = at
+        heapq.heapify(self.missing)
+        return other
+
     def _land(self, key: str, outcome: Outcome | Failed) -> None:
         first, *others = self.flying[key]
+        self.warm.add(first.stage)
         if isinstance(outcome, Failed) and self._heal(first, outcome.error):
             return
         del self.flying[key]
