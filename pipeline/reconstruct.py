@@ -89,6 +89,7 @@ class Reconstruction:
             a: self._node("motion", f"motion/{a}-{b}", self._turn(a, b), a=self.left[a], b=self.left[b])
             for a, b in zip(self.frames, self.frames[1:], strict=False)
         }
+        self._match(self.frames[0])  # basic by any rule, so that its matching need not wait for the choice
         if self.config.crosscheck.enabled and len(self.frames) > 1:
             self._crosscheck()
         self.products.select = self._node(
@@ -102,15 +103,7 @@ class Reconstruction:
         basic = [self.frames[i] for i in select.meta["basic"]]
         segments = [[self.frames[i] for i in part] for part in select.meta["segments"]]
         for pair in basic:
-            p.disparity[pair] = self._node(
-                "hfvm", f"hfvm/{pair}", {"pair": pair}, left=self.left[pair], right=self._pyramid(pair, "right")
-            )
-            p.orientations[pair] = self._node(
-                "orientation",
-                f"orientation/{pair}",
-                {"pair": pair, "rig": self.sequence.rig.to_dict()},
-                disparity=p.disparity[pair],
-            )
+            self._match(pair)
         self._rigs(basic)
         for pair in basic:
             self._basic_pair(pair)
@@ -138,6 +131,20 @@ class Reconstruction:
                 local=p.local_dem[pair],
             )
         self.graph.expand([*p.world_dem.values(), p.trajectory], self._after_world)
+
+    def _match(self, pair: int) -> None:
+        """Disparity of a pair, and the relative orientation that it asks for."""
+        p = self.products
+        if pair in p.disparity:
+            return
+        right = self._pyramid(pair, "right")
+        p.disparity[pair] = self._node("hfvm", f"hfvm/{pair}", {"pair": pair}, left=self.left[pair], right=right)
+        p.orientations[pair] = self._node(
+            "orientation",
+            f"orientation/{pair}",
+            {"pair": pair, "rig": self.sequence.rig.to_dict()},
+            disparity=p.disparity[pair],
+        )
 
     def _rigs(self, basic: list[int]) -> None:
         """The rig that each basic pair is reconstructed with: one for all, or one each."""
