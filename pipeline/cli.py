@@ -57,6 +57,7 @@ def reconstruct(
     keep_going: Annotated[bool, Parameter(negative="")] = False,
     force: Annotated[list[str] | None, Parameter(negative="", consume_multiple=False)] = None,
     fresh: Annotated[bool, Parameter(negative="")] = False,
+    memory_limit: str | None = None,
     runs: Path = Path("runs"),
     cache: CacheFolder = None,
     progress: Progress = "auto",
@@ -85,6 +86,8 @@ def reconstruct(
         Recompute this stage although it is cached; may be repeated.
     fresh
         Write a new folder of results even if nothing is new and the latest run stands.
+    memory_limit
+        Memory that the run may take in all, for example 6GB or 75%; nine tenths of what is free by default.
     runs
         Folder of results; each run makes RUNS/sequence/run-id.
     cache
@@ -112,6 +115,7 @@ def reconstruct(
         cache=cache_folder(cache),
         progress="quiet" if quiet else progress,
         fresh=fresh,
+        memory_limit=memory_limit,
     )
     return run.reconstruct(options)
 
@@ -124,7 +128,9 @@ def plan(
     config: Path | None = None,
     frames: str | None = None,
     jobs: int | None = None,
+    executor: Literal["processes", "threads", "inline"] = "processes",
     force: Annotated[list[str] | None, Parameter(negative="", consume_multiple=False)] = None,
+    memory_limit: str | None = None,
     cache: CacheFolder = None,
     verbose: Annotated[bool, Parameter(name=["--verbose", "-v"], negative="")] = False,
     debug: Annotated[bool, Parameter(negative="")] = False,
@@ -142,9 +148,13 @@ def plan(
     frames
         Frame range START:STOP[:STEP]; all by default.
     jobs
-        Workers that the estimate of the time is for; the number of cores by default.
+        Workers that the estimates are for; the number of cores by default.
+    executor
+        Where tasks would run.
     force
         Stage that would be recomputed although it is cached; may be repeated.
+    memory_limit
+        Memory that the run may take in all, for example 6GB or 75%; nine tenths of what is free by default.
     cache
         Folder of cached artifacts; RILLE_CACHE or .rille/cache by default.
     verbose
@@ -162,7 +172,9 @@ def plan(
         config=config,
         frames=frames,
         jobs=jobs,
+        executor=executor,
         force=frozenset(force or ()),
+        memory_limit=memory_limit,
         cache=cache_folder(cache),
     )
     return command.plan(options, verbose=verbose)

@@ -49,6 +49,7 @@ class Options:
     cache: Path = Path(".rille/cache")
     progress: str = "auto"
     fresh: bool = False
+    memory_limit: str | None = None
 
     def command(self) -> str:
         """The command line that repeats this run."""
@@ -122,7 +123,7 @@ def reconstruct(options: Options) -> int:
 
 
 def _reconstruct(options: Options) -> int:
-    from pipeline import driver, progress
+    from pipeline import driver, memory, progress
     from pipeline.reconstruct import Reconstruction
 
     _known_stages(options.force)
@@ -145,6 +146,8 @@ def _reconstruct(options: Options) -> int:
         force=options.force,
         ledger=folder / "ledger.jsonl",
         progress=progress.make(options.progress),
+        memory_limit=None if options.memory_limit is None else memory.parse(options.memory_limit),
+        survey=lambda: lay_out(sequence, config, frames),
     )
     if not options.keep_going:
         result.check()
@@ -196,6 +199,15 @@ def _reconstruct(options: Options) -> int:
         return COMPLETE
     _list_missing(graph, folder)
     return HOLES
+
+
+def lay_out(sequence: Sequence, config: Any, frames: tuple[int, ...]) -> Graph:
+    """The graph of a reconstruction as far as it is known beforehand."""
+    from pipeline.reconstruct import Reconstruction
+
+    graph = Graph()
+    Reconstruction(graph, sequence, config, frames).build()
+    return graph
 
 
 def _known_stages(names: frozenset[str]) -> None:

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import errno
 import json
+import math
 import os
 import shutil
 import time
@@ -58,13 +59,18 @@ class GoneError(StoreError):
 
 @dataclass(frozen=True)
 class Ref:
-    """A committed artifact: all that travels between tasks. ``path`` is relative to the store's root."""
+    """A committed artifact: all that travels between tasks. ``path`` is relative to the store's root.
+
+    ``nbytes`` are bytes of the decoded arrays, ``stored`` those of the files.
+    """
 
     key: str
     stage: str
     digest: str
     path: str
     meta: Mapping[str, Any]
+    nbytes: int = 0
+    stored: int = 0
 
 
 class Store:
@@ -274,7 +280,10 @@ def _discard(attempt: Path) -> None:
 
 
 def _ref(manifest: Manifest) -> Ref:
-    return Ref(manifest["key"], manifest["stage"], manifest["digest"], manifest["path"], manifest["meta"])
+    nbytes = sum(int(a["dtype"][2:]) * math.prod(a["shape"]) for a in manifest["arrays"].values())
+    stored = sum(size for size, _ in manifest["files"].values())
+    m = manifest
+    return Ref(m["key"], m["stage"], m["digest"], m["path"], m["meta"], nbytes, stored)
 
 
 def _difference(label: str, new: Manifest, old: Manifest) -> str:

@@ -30,6 +30,7 @@ from pipeline import explain
 from pipeline.code import environment, module_digests
 from pipeline.kernels import guard
 from pipeline.key import digest
+from pipeline.memory import Meter
 from pipeline.store import Ref, Store
 from stages.declare import Bundle, Params, Stage, check_outputs
 from stages.errors import RilleError
@@ -71,12 +72,20 @@ class Spec:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a task: its artifact, whether it was there, seconds and peak memory (bytes) of the call."""
+    """What became of a task: its artifact, whether it was there, seconds and peak memory (bytes) of the call.
+
+    ``kernel`` are the seconds of the stage itself, ``started`` is when the call began (seconds since 1970); ``memory``
+    and ``rest`` are a :class:`~pipeline.memory.Meter`'s figures.
+    """
 
     ref: Ref
     cached: bool
     seconds: float
     peak_rss: int
+    started: float = 0.0
+    kernel: float = 0.0
+    memory: int | None = None
+    rest: int | None = None
 
 
 @cache
@@ -113,7 +122,7 @@ def ensure(root: Path | str, spec: Spec, refs: Refs, *, key: str | None = None, 
     ``key`` is what the client expects; a worker that would compute another thing refuses. Failures of input and
     output (``OSError``, ``TimeoutError``) are tried three times; what a stage raises otherwise is not tried again.
     """
-    begin = time.perf_counter()
+    begin, started = time.perf_counter(), time.time()
     made = recipe(spec, refs)
     own = digest(made, spec.label)
     if key is not None and key != own:
@@ -125,10 +134,12 @@ def ensure(root: Path | str, spec: Spec, refs: Refs, *, key: str | None = None, 
     for trial in range(TRIES):
         try:
             ref = None if force else store.lookup(spec.stage.name, own)
-            cached = ref is not None
-            if ref is None:
-                ref = _compute(store, spec, refs, own, made)
-            return Outcome(ref, cached, time.perf_counter() - begin, _peak_rss())
+            if ref is not None:
+                return Outcome(ref, True, time.perf_counter() - begin, _peak_rss(), started)
+            with Meter() as meter:
+                ref, kernel = _compute(store, spec, refs, own, made)
+            seconds = time.perf_counter() - begin
+            return Outcome(ref, False, seconds, _peak_rss(), started, kernel, meter.memory, meter.rest)
         except (OSError, TimeoutError) as error:
             if isinstance(error, PERMANENT) or trial == TRIES - 1:
                 raise
@@ -136,12 +147,13 @@ def ensure(root: Path | str, spec: Spec, refs: Refs, *, key: str | None = None, 
     raise AssertionError("unreachable")
 
 
-def _compute(store: Store, spec: Spec, refs: Refs, key: str, made: Mapping[str, Any]) -> Ref:
+def _compute(store: Store, spec: Spec, refs: Refs, key: str, made: Mapping[str, Any]) -> tuple[Ref, float]:
     stage = spec.stage
     inputs = {p: [store.open(r) for r in ref] if isinstance(ref, list) else store.open(ref) for p, ref in refs.items()}
     started = time.time()
     begin = time.perf_counter()
     result = stage.run(spec.params, {**spec.args, **spec.hints}, inputs)
+    kernel = time.perf_counter() - begin
     if not isinstance(result, Bundle):
         raise TypeError(f"{stage.name}: run gave a {type(result).__name__}, not a Bundle")
     check_outputs(stage, result)
@@ -152,12 +164,12 @@ def _compute(store: Store, spec: Spec, refs: Refs, key: str, made: Mapping[str, 
         "host": {"name": platform.node(), "machine": platform.machine(), "cpus": os.cpu_count()},
         "python": platform.python_version(),
         "started": started,
-        "seconds": time.perf_counter() - begin,
+        "seconds": kernel,
         "peak_rss": _peak_rss(),
     }
     ref = store.commit(stage, key, result, label=spec.label, provenance=json.loads(json.dumps(provenance)))
     explain.remember(store, stage.name, spec.label, key)
-    return ref
+    return ref, kernel
 
 
 def _peak_rss() -> int:
