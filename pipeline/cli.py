@@ -1,4 +1,4 @@
-"""The command line: ``rille reconstruct | plan | check | init | calibrate | match | datasets | cache``.
+"""The command line: ``rille reconstruct | plan | why | timing | check | init | calibrate | match | datasets | cache``.
 
 Exit codes: 0 complete; 1 failed; 2 usage, configuration or input; 3 finished with holes under ``--keep-going``;
 130 interrupted. Results go to stdout, progress and complaints to stderr. Heavy imports happen inside the commands, so
@@ -178,6 +178,55 @@ def plan(
         cache=cache_folder(cache),
     )
     return command.plan(options, verbose=verbose)
+
+
+@app.command
+def why(
+    run: str,
+    task: str,
+    *,
+    runs: Path = Path("runs"),
+    cache: CacheFolder = None,
+    debug: Annotated[bool, Parameter(negative="")] = False,
+) -> int:
+    """Say of one task of a run where its inputs come from, why it was computed or not, with what, and what has changed.
+
+    Parameters
+    ----------
+    run
+        SEQUENCE (its latest run), SEQUENCE/ID, or the run's folder.
+    task
+        The task's label, as in the run's ledger.jsonl: hfvm/12, locus/world/12, trajectory.
+    runs
+        Folder of runs.
+    cache
+        Folder of cached artifacts; RILLE_CACHE or .rille/cache by default.
+    debug
+        Show tracebacks.
+    """
+    from pipeline import why as command
+
+    return command.why(run, task, folder=runs, cache=cache_folder(cache))
+
+
+@app.command
+def timing(
+    run: str = "latest", *, runs: Path = Path("runs"), debug: Annotated[bool, Parameter(negative="")] = False
+) -> int:
+    """Say where the time of a run went, and how far it is from what its tasks allow.
+
+    Parameters
+    ----------
+    run
+        SEQUENCE (its latest run), SEQUENCE/ID, or the run's folder; the latest of all by default.
+    runs
+        Folder of runs.
+    debug
+        Show tracebacks.
+    """
+    from pipeline import timing as command
+
+    return command.show(run, runs)
 
 
 @app.command
@@ -377,11 +426,18 @@ def export(
 
 
 @cache_app.command
-def verify(*, cache: CacheFolder = None, debug: Annotated[bool, Parameter(negative="")] = False) -> int:
+def verify(
+    *,
+    deep: Annotated[bool, Parameter(negative="")] = False,
+    cache: CacheFolder = None,
+    debug: Annotated[bool, Parameter(negative="")] = False,
+) -> int:
     """Read every artifact and compare its checksums; damaged ones are named and recomputed by the next run.
 
     Parameters
     ----------
+    deep
+        Decode every chunk too, and compare the digests of the arrays.
     cache
         Folder of cached artifacts; RILLE_CACHE or .rille/cache by default.
     debug
@@ -389,7 +445,7 @@ def verify(*, cache: CacheFolder = None, debug: Annotated[bool, Parameter(negati
     """
     from pipeline import run
 
-    return run.verify_cache(cache_folder(cache))
+    return run.verify_cache(cache_folder(cache), deep=deep)
 
 
 @cache_app.command
@@ -400,7 +456,7 @@ def gc(
     dry_run: Annotated[bool, Parameter(negative="")] = False,
     debug: Annotated[bool, Parameter(negative="")] = False,
 ) -> int:
-    """Remove artifacts that no kept run refers to, and leftovers of interrupted runs.
+    """Remove artifacts that no kept and no pinned run refers to, and leftovers of interrupted runs.
 
     Parameters
     ----------
@@ -409,13 +465,83 @@ def gc(
     runs
         Folder of the runs that are kept.
     dry_run
-        Say what would go, and keep it.
+        Say what would go, by stage, and keep it.
     debug
         Show tracebacks.
     """
     from pipeline import run
 
     return run.collect_garbage(cache_folder(cache), runs, dry_run=dry_run)
+
+
+@cache_app.command
+def ls(
+    *,
+    as_json: Annotated[bool, Parameter(name="--json", negative="")] = False,
+    cache: CacheFolder = None,
+    runs: Path = Path("runs"),
+    debug: Annotated[bool, Parameter(negative="")] = False,
+) -> int:
+    """Say what the cache holds, by sequence and stage: number, sizes, age, and the run that used it last.
+
+    Parameters
+    ----------
+    as_json
+        As JSON.
+    cache
+        Folder of cached artifacts; RILLE_CACHE or .rille/cache by default.
+    runs
+        Folder of the runs that are kept.
+    debug
+        Show tracebacks.
+    """
+    from pipeline import inventory
+
+    return inventory.ls(cache_folder(cache), runs, as_json=as_json)
+
+
+@cache_app.command
+def pin(
+    run: str,
+    *,
+    cache: CacheFolder = None,
+    runs: Path = Path("runs"),
+    debug: Annotated[bool, Parameter(negative="")] = False,
+) -> int:
+    """Keep all artifacts of a run, whatever is cleared away, even if the run's folder is removed.
+
+    Parameters
+    ----------
+    run
+        SEQUENCE (its latest run), SEQUENCE/ID, or the run's folder.
+    cache
+        Folder of cached artifacts; RILLE_CACHE or .rille/cache by default.
+    runs
+        Folder of runs.
+    debug
+        Show tracebacks.
+    """
+    from pipeline import run as commands
+
+    return commands.pin(cache_folder(cache), run, runs)
+
+
+@cache_app.command
+def unpin(run: str, *, cache: CacheFolder = None, debug: Annotated[bool, Parameter(negative="")] = False) -> int:
+    """Take the pin of a run away; its artifacts stay until they are cleared away.
+
+    Parameters
+    ----------
+    run
+        SEQUENCE/ID, or ID.
+    cache
+        Folder of cached artifacts; RILLE_CACHE or .rille/cache by default.
+    debug
+        Show tracebacks.
+    """
+    from pipeline import run as commands
+
+    return commands.unpin(cache_folder(cache), run)
 
 
 def main(argv: list[str] | None = None) -> None:

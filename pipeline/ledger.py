@@ -91,6 +91,12 @@ def facts(path: Path) -> dict[str, Any]:
     return found
 
 
+def add_facts(path: Path, **facts: Any) -> None:
+    """Add a line about the run as a whole to a ledger that is closed."""
+    with path.open("a", encoding="utf-8") as file:
+        file.write(json.dumps({"run": facts}) + "\n")
+
+
 def expansions(path: Path) -> list[tuple[list[str], list[str]]]:
     """Labels of the nodes that were waited for, and of those laid out then."""
     return [(e["after"], e["nodes"]) for row in _lines(path) if (e := row.get("expansion"))]

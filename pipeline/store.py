@@ -280,10 +280,14 @@ def _discard(attempt: Path) -> None:
 
 
 def _ref(manifest: Manifest) -> Ref:
-    nbytes = sum(int(a["dtype"][2:]) * math.prod(a["shape"]) for a in manifest["arrays"].values())
-    stored = sum(size for size, _ in manifest["files"].values())
     m = manifest
-    return Ref(m["key"], m["stage"], m["digest"], m["path"], m["meta"], nbytes, stored)
+    return Ref(m["key"], m["stage"], m["digest"], m["path"], m["meta"], *sizes(m))
+
+
+def sizes(manifest: Manifest) -> tuple[int, int]:
+    """Bytes of an artifact: its arrays decoded, and its files."""
+    nbytes = sum(int(a["dtype"][2:]) * math.prod(a["shape"]) for a in manifest["arrays"].values())
+    return nbytes, sum(size for size, _ in manifest["files"].values())
 
 
 def _difference(label: str, new: Manifest, old: Manifest) -> str:
