@@ -132,11 +132,14 @@ class Costs:
     def learn(self, handles: Iterable[Handle]) -> None:
         """Take in what was computed now."""
         new: dict[tuple[str, str], list[Sample]] = defaultdict(list)
-        for h in handles:
-            if h.status == "computed" and h.ref is not None:
-                sample = (input_bytes(h), h.memory, float(h.ref.nbytes), float(h.ref.stored))
-                new[h.stage, self._name(h.spec.params)].append(sample)
-                self.rests += [] if h.rest is None else [float(h.rest)]
+        computed = [h for h in handles if h.status == "computed" and h.ref is not None]
+        warm = {(h.stage, self._name(h.spec.params)) for h in computed if not h.first and h.memory is not None}
+        for h in computed:
+            assert h.ref is not None
+            name = h.stage, self._name(h.spec.params)
+            measured = h.memory if not h.first or name not in warm else None  # imports and compiling are not its own
+            new[name].append((input_bytes(h), measured, float(h.ref.nbytes), float(h.ref.stored)))
+            self.rests += [] if h.rest is None else [float(h.rest)]
         self.rests = self.rests[-KEPT:]
         for (stage, params), samples in new.items():
             groups = self.groups.setdefault(stage, {})
@@ -151,7 +154,7 @@ class Costs:
 
 def _thinned(samples: list[Sample]) -> list[Sample]:
     """A few of them, from the least to the greatest memory."""
-    ranked = sorted(samples, key=lambda s: (s[1] is not None, s[1] or 0.0, s))
+    ranked = sorted(samples, key=lambda s: (s[1] is not None, s[1] or 0.0))
     if len(ranked) <= EACH_RUN:
         return ranked
     return [ranked[round(k * (len(ranked) - 1) / (EACH_RUN - 1))] for k in range(EACH_RUN)]
@@ -198,13 +201,12 @@ def input_bytes(handle: Handle, expected: Mapping[int, float] | None = None) -> 
 
     ``expected`` are bytes of results still to come, by index of the node.
     """
-    ready = {h.index: h.ref or h.earlier for h in handle.upstream()}
     parts = (float(ref.nbytes) if (ref := h.ref) else (expected or {}).get(h.index, 0.0) for h in handle.upstream())
     size = handle.expect + sum(parts)
     more = handle.spec.stage.memory.size
-    if more is not None and all(ready.values()):
+    if more is not None:
         metas = {p: [_meta(h) for h in g] if isinstance(g, list) else _meta(g) for p, g in handle.inputs.items()}
-        with suppress(Exception):  # an estimate only: what is wrong the stage itself will say
+        with suppress(Exception):  # an estimate only, and facts may be still to come
             size += more(handle.spec.params, handle.spec.args, metas)
     return size
 

@@ -32,7 +32,8 @@ class Handle:
     ``reason`` says in words why it was not found in the cache, or why it was skipped. ``earlier``, of a planned node,
     is what the same label led to before: a plan takes its facts for what is to come. ``expect`` are bytes (decoded)
     that it reads from outside. Of a computed node: ``seconds`` of the call and of the stage's own ``kernel``, when it
-    ``started`` (seconds since 1970), and the figures of a :class:`pipeline.memory.Meter`.
+    ``started`` (seconds since 1970), and the figures of a :class:`pipeline.memory.Meter` (``first``: with imports
+    and kernels).
     """
 
     index: int
@@ -50,6 +51,7 @@ class Handle:
     peak_rss: int = 0
     memory: int | None = None
     rest: int | None = None
+    first: bool = False
     error: BaseException | None = None
 
     @property

@@ -17,6 +17,7 @@ has one line for each node that is missing, with the reason.
 
 from __future__ import annotations
 
+import gc
 import heapq
 import math
 import time
@@ -32,11 +33,10 @@ from pipeline.costs import input_bytes
 from pipeline.dag import Expansion, Graph, Handle
 from pipeline.environment import cores
 from pipeline.executor import Executor, Failed, make
-from pipeline.key import digest
 from pipeline.ledger import Ledger
 from pipeline.progress import Progress, Quiet, recall_seconds, remember_seconds
 from pipeline.store import GoneError, NonDeterministicError, Store
-from pipeline.task import Outcome, recipe
+from pipeline.task import Outcome, key_of, recipe
 from stages.errors import RilleError
 
 HEALS = 3
@@ -191,6 +191,7 @@ class _Run:
 
     def go(self) -> Result:
         begin = time.perf_counter()
+        gc.freeze()  # what is there need not be searched for garbage again and again as the graph grows
         try:
             self._loop()
             self._leave_out()
@@ -202,6 +203,7 @@ class _Run:
             remember_seconds(self.store, self.result.counts)
             costs.remember(self.store, self.graph.nodes)
         finally:
+            gc.unfreeze()
             self.result.seconds = time.perf_counter() - begin
             self.ledger.run(seconds=round(self.result.seconds, 3), ok=self.result.ok)
             self.progress.close(self.result)
@@ -253,7 +255,7 @@ class _Run:
 
     def _look_up(self, handle: Handle) -> None:
         made = recipe(handle.spec, handle.refs())
-        handle.key = key = digest(made, handle.label)
+        handle.key = key = key_of(handle.spec, made)
         forced = handle.stage in self.force
         ref = None if forced else self.store.lookup(handle.stage, key)
         if ref is not None:
@@ -314,6 +316,8 @@ class _Run:
     def _begin(self) -> None:
         """Look ahead, share the memory out, and start the workers that it leaves room for."""
         known, jobs = costs.recall(self.store), self.jobs or cores()
+        if self.executor_kind == "processes":
+            import distributed  # noqa: F401 (what it takes is this process's own)
         ahead = Graph() if self.survey is None else self.survey()
         run(ahead, self.store, dry=True, force=self.force)
         most = max(largest(ahead, known), *(known.foresee(h.spec, input_bytes(h)).most for h in self.missing))
@@ -346,6 +350,7 @@ class _Run:
         else:
             first.seconds, first.peak_rss, first.kernel = outcome.seconds, outcome.peak_rss, outcome.kernel
             first.started, first.memory, first.rest = outcome.started, outcome.memory, outcome.rest
+            first.first = outcome.first
             for handle in (first, *others):
                 handle.ref = outcome.ref
                 self._resolve(handle, "computed" if handle is first and not outcome.cached else "cached")

@@ -72,6 +72,7 @@ def _took(handle: Handle) -> dict[str, Any]:
         "peak_rss": handle.peak_rss,
         "memory": handle.memory,
         "rest": handle.rest,
+        "first": handle.first,
         "input_bytes": round(input_bytes(handle)),
         "bytes": handle.ref.nbytes,
         "stored": handle.ref.stored,

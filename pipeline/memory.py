@@ -15,6 +15,7 @@ import resource
 import threading
 from collections.abc import Iterator
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -24,9 +25,6 @@ from stages.errors import ConfigError
 
 SHARE = 0.9
 """Part of what is free that a run takes by itself: page cache for its files, and others that grow, need the rest."""
-
-TRIM = 64_000_000
-"""Bytes above which what a task has freed is given back to the system at once."""
 
 UNITS = {"": 1, "k": 1e3, "m": 1e6, "g": 1e9, "t": 1e12, "ki": 2**10, "mi": 2**20, "gi": 2**30, "ti": 2**40}
 
@@ -120,7 +118,9 @@ def resident() -> int:
 class Meter:
     """Measures one task: ``memory`` is what it took beyond what the process holds before or after it, ``rest``.
 
-    Both are None where the system cannot tell, or where another task ran in the process meanwhile.
+    What earlier tasks have freed is given back to the system first, and what this one has freed at its end: a heap
+    that is kept for later would hide what a task takes, and workers would hold it for nothing. Both figures are None
+    where the system cannot tell, or where another task ran in the process meanwhile.
 
     >>> with Meter() as meter:
     ...     array = np.ones(10**7)
@@ -140,14 +140,17 @@ class Meter:
             self._alone = len(Meter._running) == 1
             for other in Meter._running if not self._alone else ():
                 other._alone = False
-        self._before = _status()[0] if self._alone and _set_back() else 0
+        self._before = 0
+        if self._alone:
+            _trim()
+            self._before = _status()[0] if _set_back() else 0
         return self
 
     def __exit__(self, *_: object) -> None:
-        now, peak = _status() if self._before else (0, 0)
-        if peak - now > TRIM:
+        peak = _status()[1] if self._before else 0
+        if self._alone:
             _trim()
-            now = _status()[0]
+        now = _status()[0] if self._before else 0
         with Meter._lock:
             Meter._running.remove(self)
             alone = self._alone
@@ -173,7 +176,11 @@ def _status() -> tuple[int, int]:
 
 
 def _trim() -> None:
-    """Give freed memory back, where the C library can (glibc)."""
+    """Give freed memory back, where the C library can (glibc); some 0.1 ms where there is little."""
     with suppress(OSError, AttributeError):
-        library: Any = ctypes.CDLL(None)
-        library.malloc_trim(0)
+        _library().malloc_trim(0)
+
+
+@cache
+def _library() -> Any:
+    return ctypes.CDLL(None)

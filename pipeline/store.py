@@ -2,11 +2,12 @@
 
 Layout under the cache folder::
 
-    artifacts/<stage>/<key>/manifest.json    the only commit point
-    artifacts/<stage>/<key>/a-<unique>/      one attempt: an immutable zarr 3 group (xarray.open_zarr reads it)
-    quarantine/<stage>-<key>-<unique>/       damaged artifacts, set aside
-    labels/...  seconds.json                 hints for explanations and estimates; never a matter of correctness
-    numba/<digest>/                          compiled kernels by digest of all own code
+    artifacts/<stage>/<k>/<key>/manifest.json    the only commit point; <k> are the key's first two digits
+    artifacts/<stage>/<k>/<key>/a-<unique>/      one attempt: an immutable zarr 3 group (xarray.open_zarr reads it)
+    quarantine/<stage>-<key>-<unique>/           damaged artifacts, set aside
+    labels/...  seconds.json  costs.json         hints for explanations and estimates; never a matter of correctness
+    pins/<run>.json                              keys that clearing up leaves alone
+    numba/<digest>/                              compiled kernels by digest of all own code
 
 An attempt becomes an artifact when its manifest is linked into place, create-if-absent, after all its files are on
 the disk. Killed at any instant, a run leaves either a whole artifact or an orphan that nobody reads. Of two that
@@ -196,7 +197,7 @@ class Store:
                         return there
                 else:
                     with suppress(OSError):  # it is published: at worst a power failure takes it back as a whole
-                        for folder in (home, *list(home.parents)[:2]):
+                        for folder in (home, *list(home.parents)[:3]):
                             fsync(folder)
                     return None
             raise StoreError(f"cannot publish {home / 'manifest.json'}", remedy="remove that file and run again")
@@ -205,7 +206,7 @@ class Store:
 
     def home(self, stage: str, key: str) -> Path:
         """Folder of a key: its manifest and its attempts."""
-        return self.root / "artifacts" / stage / key
+        return Path(f"{self.root}/artifacts/{stage}/{key[:2]}/{key}")
 
     def _read_manifest(self, home: Path) -> Manifest:
         """Raises ValueError where the content is not what was written."""

@@ -29,7 +29,7 @@ from typing import Any
 from pipeline import explain
 from pipeline.code import environment, module_digests
 from pipeline.kernels import guard
-from pipeline.key import digest
+from pipeline.key import Fixed, digest_of
 from pipeline.memory import Meter
 from pipeline.store import Ref, Store
 from stages.declare import Bundle, Params, Stage, check_outputs
@@ -75,7 +75,8 @@ class Outcome:
     """What became of a task: its artifact, whether it was there, seconds and peak memory (bytes) of the call.
 
     ``kernel`` are the seconds of the stage itself, ``started`` is when the call began (seconds since 1970); ``memory``
-    and ``rest`` are a :class:`~pipeline.memory.Meter`'s figures.
+    and ``rest`` are a :class:`~pipeline.memory.Meter`'s figures, ``first`` says that the process had not run the stage
+    before (it imports, and compiles or loads kernels).
     """
 
     ref: Ref
@@ -86,6 +87,17 @@ class Outcome:
     kernel: float = 0.0
     memory: int | None = None
     rest: int | None = None
+    first: bool = False
+
+
+MANY = 4096
+"""Parameter models whose canonical form is kept."""
+
+_kept: dict[int, tuple[Params, Fixed]] = {}
+"""By the id of the model, which is held so that the id stays its own."""
+
+_run: set[str] = set()
+"""Modules of the stages that this process has run."""
 
 
 @cache
@@ -116,6 +128,22 @@ def recipe(spec: Spec, refs: Refs) -> dict[str, Any]:
     }
 
 
+def key_of(spec: Spec, made: Mapping[str, Any]) -> str:
+    """Key of a recipe: ``digest(made)``, with what many tasks share put into its canonical form only once."""
+    kept = _kept.get(id(spec.params))
+    if kept is None or kept[0] is not spec.params:
+        kept = _kept[id(spec.params)] = (spec.params, Fixed(spec.params, f"{spec.label}.params"))
+        if len(_kept) > MANY:
+            _kept.clear()
+    return digest_of({**made, "params": kept[1], **_shared(spec.module)}, spec.label)
+
+
+@cache
+def _shared(module: str) -> dict[str, Fixed]:
+    """What all tasks of a stage have in common."""
+    return {"code": Fixed(module_digests(module)), "env": Fixed(environment(resolve(module).requires))}
+
+
 def ensure(root: Path | str, spec: Spec, refs: Refs, *, key: str | None = None, force: bool = False) -> Outcome:
     """Give the artifact of a task, computing and committing it where it is absent (or ``force`` is set).
 
@@ -124,7 +152,7 @@ def ensure(root: Path | str, spec: Spec, refs: Refs, *, key: str | None = None, 
     """
     begin, started = time.perf_counter(), time.time()
     made = recipe(spec, refs)
-    own = digest(made, spec.label)
+    own = key_of(spec, made)
     if key is not None and key != own:
         raise CodeChangedError(
             f"{spec.label}: source code or packages of the worker are not those the run began with",
@@ -136,10 +164,12 @@ def ensure(root: Path | str, spec: Spec, refs: Refs, *, key: str | None = None, 
             ref = None if force else store.lookup(spec.stage.name, own)
             if ref is not None:
                 return Outcome(ref, True, time.perf_counter() - begin, _peak_rss(), started)
+            first = spec.module not in _run
             with Meter() as meter:
                 ref, kernel = _compute(store, spec, refs, own, made)
             seconds = time.perf_counter() - begin
-            return Outcome(ref, False, seconds, _peak_rss(), started, kernel, meter.memory, meter.rest)
+            _run.add(spec.module)
+            return Outcome(ref, False, seconds, _peak_rss(), started, kernel, meter.memory, meter.rest, first)
         except (OSError, TimeoutError) as error:
             if isinstance(error, PERMANENT) or trial == TRIES - 1:
                 raise

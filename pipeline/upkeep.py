@@ -86,9 +86,9 @@ def gc(store: Store, keep: Collection[str], *, grace: float = GRACE, dry_run: bo
     cleared = Cleared()
     limit = time.time() - grace
     kept = set(keep)
-    for home in sorted(store.root.glob("artifacts/*/*")):
+    for home in sorted(store.root.glob("artifacts/*/*/*")):
         _clear_home(store, home, home.name in kept, limit, cleared, dry_run)
-    for path in (*store.root.glob("*.tmp"), *store.root.glob("labels/*/*.tmp")):
+    for path in (*store.root.glob("*.tmp"), *store.root.glob("labels/*/*/*.tmp")):
         if _written(path) <= limit:
             cleared.orphans += 1
             _remove(path, cleared, dry_run)
@@ -101,14 +101,14 @@ def gc(store: Store, keep: Collection[str], *, grace: float = GRACE, dry_run: bo
 
 def _clear_home(store: Store, home: Path, kept: bool, limit: float, cleared: Cleared, dry_run: bool) -> None:
     published = home / "manifest.json"
-    manifest = store.manifest(home.parent.name, home.name)
+    manifest = store.manifest(home.parents[1].name, home.name)
     mine = home / Path(manifest["path"]).name if manifest else None
     if mine is not None and not kept and _written(published) <= limit:
         cleared.artifacts += 1
         before = cleared.bytes
         _remove(published, cleared, dry_run)
         _remove(mine, cleared, dry_run)
-        stage = cleared.stages.setdefault(home.parent.name, [0, 0])
+        stage = cleared.stages.setdefault(home.parents[1].name, [0, 0])
         stage[0], stage[1] = stage[0] + 1, stage[1] + cleared.bytes - before
     for path in (*home.glob("a-*"), *home.glob("m-*.tmp")):
         if path != mine and _written(path) <= limit:
@@ -121,8 +121,8 @@ def _clear_home(store: Store, home: Path, kept: bool, limit: float, cleared: Cle
 
 def artifacts(store: Store) -> Iterator[tuple[str, str]]:
     """Stage and key of everything committed."""
-    for path in sorted(store.root.glob("artifacts/*/*/manifest.json")):
-        yield path.parent.parent.name, path.parent.name
+    for path in sorted(store.root.glob("artifacts/*/*/*/manifest.json")):
+        yield path.parents[2].name, path.parent.name
 
 
 def _written(path: Path) -> float:

@@ -119,7 +119,7 @@ def test_what_is_found_damaged_when_it_is_drawn_is_computed_again(
 ) -> None:
     assert run.reconstruct(options(cold)) == 0
     before = digests(cold)
-    chunk = next((cold / "cache").glob("artifacts/merge/*/a-*/ortho/c.0.0"))
+    chunk = next((cold / "cache").glob("artifacts/merge/*/*/a-*/ortho/c.0.0"))
     chunk.write_bytes(bytes(chunk.stat().st_size))
     assert run.reconstruct(options(cold, fresh=True)) == 0
     assert "is damaged" in capsys.readouterr().err
@@ -173,7 +173,7 @@ def test_two_workers_killed_on_the_way_give_the_same_bits(cold: Path, tmp_path: 
     command += ["--cache", str(tmp_path / "cache"), "--runs", str(tmp_path / "runs")]
     process = subprocess.Popen(command, start_new_session=True, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
     until = time.monotonic() + 120
-    while time.monotonic() < until and not list((tmp_path / "cache").glob("artifacts/hfvm/*/manifest.json")):
+    while time.monotonic() < until and not list((tmp_path / "cache").glob("artifacts/hfvm/*/*/manifest.json")):
         time.sleep(0.05)
     os.killpg(process.pid, signal.SIGKILL)
     process.wait()
