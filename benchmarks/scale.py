@@ -9,7 +9,7 @@ an empty cache, then is planned by another process, warm. Printed are, a node or
 - plan: laying out and looking up when all is cached, as ``rille plan`` does; wall and processor time
 - overhead: wall time of the cold run in which no worker was in a task, ``(wall - in tasks / workers) / tasks``
 - client: processor time of the process that holds graph and scheduler
-- in task: look-up, commit and flushing to the disk, by a worker
+- in task: look-up and commit by a worker, without flushing to the disk unless ``--flush``
 - memory: resident memory of the client, and of a worker, at the end
 
 Wall times are those of the machine as it is: on one that others use too, look at the processor times.
@@ -52,7 +52,11 @@ STAGE = image_stage()
 SPACING = 0.5
 """Metres from pair to pair; elevation models of 1.6 m then overlap."""
 
-FILLED_BY = "RILLE_SCALE_STAGES"
+UNFLUSHED = "RILLE_SCALE_UNFLUSHED"
+
+
+if os.environ.get(UNFLUSHED):  # in the workers, as they import their first stage
+    os.fsync = lambda _: None  # type: ignore[assignment]
 
 
 def nothing(name: str) -> Any:
@@ -146,7 +150,7 @@ def graph_of(pairs: int) -> Any:
     return graph
 
 
-def measure(pairs: int, cache: Path, jobs: int, what: str) -> dict[str, float]:
+def measure(pairs: int, cache: Path, executor: str, jobs: int, what: str) -> dict[str, float]:
     """One cold run, or one plan of what is cached, in this process."""
     from pipeline import driver
     from pipeline.memory import resident
@@ -162,7 +166,8 @@ def measure(pairs: int, cache: Path, jobs: int, what: str) -> dict[str, float]:
     if what == "plan":
         result = driver.run(graph, Store(cache), dry=True)
     else:
-        result = driver.run(graph, Store(cache), jobs=jobs, ledger=cache.parent / "run" / "ledger.jsonl")
+        ledger = cache.parent / "run" / "ledger.jsonl"
+        result = driver.run(graph, Store(cache), executor=executor, jobs=jobs, ledger=ledger)
     result.check()
     spent = time.perf_counter() - wall
     n = len(graph.nodes)
@@ -191,14 +196,14 @@ def entries(folder: Path) -> tuple[int, Path]:
     return most, path.relative_to(folder)
 
 
-def child(pairs: int, folder: Path, jobs: int, what: str) -> dict[str, float]:
+def child(pairs: int, folder: Path, how: list[str], what: str, *, flush: bool) -> dict[str, float]:
     """:func:`measure` in a process of its own."""
     here = Path(__file__).resolve().parent.parent
     path = os.pathsep.join([str(folder / "stages"), str(here), os.environ.get("PYTHONPATH", "")])
-    command = [sys.executable, str(Path(__file__).resolve()), "--pairs", str(pairs), "--jobs", str(jobs)]
+    command = [sys.executable, str(Path(__file__).resolve()), "--pairs", str(pairs), *how]
     done = subprocess.run(
         [*command, "--folder", str(folder), "--what", what],
-        env={**os.environ, "PYTHONPATH": path},
+        env={**os.environ, "PYTHONPATH": path, UNFLUSHED: "" if flush else "1"},
         stdout=subprocess.PIPE,
         check=True,
         text=True,
@@ -207,7 +212,7 @@ def child(pairs: int, folder: Path, jobs: int, what: str) -> dict[str, float]:
     return found
 
 
-def table(sizes: list[int], jobs: int, within: Path) -> Iterator[str]:
+def table(sizes: list[int], how: list[str], within: Path, *, flush: bool) -> Iterator[str]:
     """Lines of the figures of several sizes, each as soon as it is known."""
     yield (
         f"{'pairs':>6s} {'nodes':>7s} {'plan':>9s} {'its cpu':>9s} {'overhead':>9s} {'client':>9s} {'in task':>9s} "
@@ -216,15 +221,16 @@ def table(sizes: list[int], jobs: int, within: Path) -> Iterator[str]:
     for pairs in sizes:
         folder = within / str(pairs)
         write_stages(folder / "stages")
-        cold = child(pairs, folder, jobs, "run")
+        cold = child(pairs, folder, how, "run", flush=flush)
         assert cold["computed"] == cold["nodes"]
-        warm = child(pairs, folder, jobs, "plan")
+        warm = child(pairs, folder, how, "plan", flush=flush)
         assert (warm["computed"], warm["nodes"]) == (0, cold["nodes"])
         most, where = entries(folder)
         yield (
-            f"{pairs:6d} {cold['nodes']:7.0f} {warm['wall']:6.3f} ms {warm['cpu']:6.3f} ms {cold['overhead']:6.2f} ms {cold['cpu']:6.2f} ms "
-            f"{cold['inside']:6.2f} ms {cold['client'] / 1e6:6.0f} MB ({cold['grown'] / 1e3:4.1f} kB/n) "
-            f"{cold['worker'] / 1e6:5.0f} MB {most:6d} {where}"
+            f"{pairs:6d} {cold['nodes']:7.0f} {warm['wall']:6.3f} ms {warm['cpu']:6.3f} ms "
+            f"{cold['overhead']:6.2f} ms {cold['cpu']:6.2f} ms {cold['inside']:6.2f} ms "
+            f"{cold['client'] / 1e6:6.0f} MB ({cold['grown'] / 1e3:4.1f} kB/n) {cold['worker'] / 1e6:5.0f} MB "
+            f"{most:6d} {where}"
         )
 
 
@@ -232,17 +238,21 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--pairs", type=int, default=2000, help="of the largest size; a quarter of it comes first")
     parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--executor", choices=("processes", "threads", "inline"), default="processes")
     parser.add_argument("--folder", type=Path, help="where to work (kept); a temporary one by default")
+    parser.add_argument("--flush", action="store_true", help="flush to the disk, as a real run does")
     parser.add_argument("--what", choices=("all", "run", "plan"), default="all", help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.what != "all":
         from pipeline.environment import prepare_environment
 
         prepare_environment(given.folder / "cache")
-        print(json.dumps(measure(given.pairs, given.folder / "cache", given.jobs, given.what)))
+        print(json.dumps(measure(given.pairs, given.folder / "cache", given.executor, given.jobs, given.what)))
         return
+    sizes = [max(2, given.pairs // 4), given.pairs]
     with tempfile.TemporaryDirectory() as temporary:
-        for line in table([max(2, given.pairs // 4), given.pairs], given.jobs, given.folder or Path(temporary)):
+        how = ["--executor", given.executor, "--jobs", str(given.jobs)]
+        for line in table(sizes, how, given.folder or Path(temporary), flush=given.flush):
             print(line, flush=True)
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import heapq
 import math
+import time
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 
@@ -21,6 +22,10 @@ from stages.errors import ConfigError
 
 PATIENCE = 8
 """Tasks that may pass one that waits for memory."""
+
+
+FRESH = 0.2
+"""Seconds that a look at the machine's free memory holds."""
 
 
 class MemoryRefusedError(ConfigError):
@@ -66,10 +71,14 @@ class Admission:
     def __init__(self, costs: Costs, shares: Account, *, automatic: bool) -> None:
         self.costs, self.shares, self.automatic = costs, shares, automatic
         self._running: dict[str, float] = {}
+        self._foreseen: dict[int, Foreseen] = {}
+        self._free, self._asked = 0.0, -math.inf
 
     def foresee(self, handle: Handle) -> Foreseen:
         """What a task whose inputs are there will take."""
-        return self.costs.foresee(handle.spec, input_bytes(handle))
+        if handle.index not in self._foreseen:
+            self._foreseen[handle.index] = self.costs.foresee(handle.spec, input_bytes(handle))
+        return self._foreseen[handle.index]
 
     def fits(self, handle: Handle) -> bool:
         """Whether a task may begin now; alone it always may."""
@@ -78,11 +87,18 @@ class Admission:
         most = self.foresee(handle).most
         if sum(self._running.values()) + most > self.shares.budget:
             return False
-        return not self.automatic or memory.free() > most
+        return not self.automatic or self._now() > most
+
+    def _now(self) -> float:
+        """What is free on the machine, by a look that is fresh enough."""
+        if time.monotonic() - self._asked > FRESH:
+            self._free, self._asked = memory.free(), time.monotonic()
+        return self._free
 
     def begin(self, handle: Handle) -> None:
         """A task has begun."""
         self._running[handle.key] = self.foresee(handle).most
+        del self._foreseen[handle.index]
 
     def end(self, key: str) -> None:
         """It has ended."""

@@ -23,7 +23,7 @@ import math
 import time
 from collections import defaultdict
 from collections.abc import Callable, Collection
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from pipeline import costs, explain
@@ -35,7 +35,7 @@ from pipeline.environment import cores
 from pipeline.executor import Executor, Failed, make
 from pipeline.ledger import Ledger
 from pipeline.progress import Progress, Quiet, recall_seconds, remember_seconds
-from pipeline.store import GoneError, NonDeterministicError, Store
+from pipeline.store import GoneError, NonDeterministicError, Ref, Store
 from pipeline.task import Outcome, key_of, recipe
 from stages.errors import RilleError
 
@@ -305,7 +305,8 @@ class _Run:
             self.admission.begin(handle)
             handle.status = "running"
             self.progress.running(handle)
-            self.executor.submit(handle.key, self.store.root, handle.spec, handle.refs(), handle.stage in self.force)
+            refs = {p: [_light(r) for r in g] if isinstance(g, list) else _light(g) for p, g in handle.refs().items()}
+            self.executor.submit(handle.key, self.store.root, handle.spec, refs, handle.stage in self.force)
         if self.stopped:
             for key in (*(handle.key for handle in self.missing), *self.patients):
                 for handle in self.flying.pop(key, ()):
@@ -438,6 +439,11 @@ class _Run:
             missing = [h for h in handles if not h.done]
             self.result.unknown += [h.label for h in missing]
             self.ledger.note(f"plan after {_labels(handles)}", "planned" if self.dry else "skipped", _labels(missing))
+
+
+def _light(ref: Ref) -> Ref:
+    """Without its facts, which a task reads from the store: those of a long trajectory would travel to every pair."""
+    return replace(ref, meta={})
 
 
 _FATE = {"failed": "failed", "skipped": "was skipped"}
