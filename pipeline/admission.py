@@ -112,8 +112,9 @@ class Admission:
         lower = handle.spec.stage.memory.lower
         change = f"change {' or '.join(lower)}, or " if lower else ""
         return MemoryRefusedError(
-            f"{handle.label} would need about {words(foreseen.memory)} ({foreseen.source}), and "
-            f"{words(self.shares.alone)} are left for a task of the limit of {words(self.shares.limit)}",
+            f"would need about {words(foreseen.memory)} ({foreseen.source}), and "
+            f"{words(self.shares.alone)} are left for a task of the limit of {words(self.shares.limit)} "
+            f"(the program itself and a worker hold {words(self.shares.own + self.shares.rest)})",
             remedy=f"{change}give more with --memory-limit",
         )
 
@@ -122,7 +123,7 @@ class Admission:
         for index, foreseen in forecast(graph, self.costs).items():
             error = self.refusal(graph.nodes[index], foreseen)
             if error is not None:
-                raise error
+                raise MemoryRefusedError(f"{graph.nodes[index].label} {error.message}", remedy=error.remedy)
 
 
 def forecast(graph: Graph, costs: Costs) -> dict[int, Foreseen]:

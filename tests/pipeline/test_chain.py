@@ -15,11 +15,14 @@ from typing import Any
 import numpy as np
 import pytest
 import rasterio
+import xarray
 
 from datasets.registry import open_sequence
 from pipeline import run, standing
 from pipeline.dag import Graph
 from pipeline.ledger import read
+from pipeline.store import Store
+from pipeline.upkeep import artifacts
 from stages.errors import ConfigError
 
 SMALL = (
@@ -71,6 +74,26 @@ def test_outputs_are_all_there_and_sound(cold: Path) -> None:
     report = json.loads((folder / "report.json").read_text())
     assert report["missing"] == []
     assert report["stages"]["hfvm"]["computed"] == 3
+
+
+@pytest.mark.filterwarnings("ignore:Failed to open Zarr store with consolidated metadata:RuntimeWarning")
+def test_xarray_opens_the_artifact_of_every_stage_with_dimensions_and_units(cold: Path) -> None:
+    store = Store(cold / "cache")
+    opened: set[str] = set()
+    for stage, key in artifacts(store):
+        manifest = store.manifest(stage, key)
+        if manifest is None or stage in opened:
+            continue
+        opened.add(stage)
+        arrays = manifest["arrays"]
+        with xarray.open_zarr(store.root / manifest["path"]) as data:
+            assert set(data.variables) == set(arrays), stage
+            for name, about in arrays.items():
+                assert data[name].attrs["units"] == about["units"] != "", (stage, name)
+                assert data[name].attrs["long_name"] == about["long_name"] != "", (stage, name)
+                assert list(data[name].dims) == about["dims"], (stage, name)
+                assert list(data[name].shape) == about["shape"], (stage, name)
+    assert opened == {row["stage"] for row in read(latest(cold) / "ledger.jsonl")}
 
 
 def test_the_same_again_computes_nothing(cold: Path, monkeypatch: pytest.MonkeyPatch) -> None:
