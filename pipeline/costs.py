@@ -41,6 +41,9 @@ LIKE = 1.25
 SPREAD = 0.1
 """Least relative uncertainty stated: allocators and the system do not repeat themselves better."""
 
+FEW = 0.4
+"""Added to it, over the number of like tasks that were measured."""
+
 GUESS = 0.5
 """Relative uncertainty of a guess."""
 
@@ -115,7 +118,7 @@ class Costs:
             memory, spread = _at(measured, size)
             result, _ = _at([(s[0], s[2]) for s in group.samples], size)
             stored, _ = _at([(s[0], s[3]) for s in group.samples], size)
-            source = f"from {_count(group.tasks, 'task')} of {_count(group.runs, 'run')}{remark}"
+            source = f"from {count(group.tasks, 'task')} of {count(group.runs, 'run')}{remark}"
             if remark:
                 spread = max(spread, GUESS)
             return Foreseen(memory, spread, result, stored, source, not remark)
@@ -172,7 +175,11 @@ def _at(samples: list[tuple[float, float]], size: float) -> tuple[float, float]:
     near = [y for x, y in samples if x == size or (x and size and 1 / LIKE <= x / size <= LIKE)]
     if near:
         middle = median(near)
-        return middle, max(SPREAD, max(abs(y - middle) for y in near) / middle if middle else 0.0)
+        off = max(abs(y - middle) for y in near) / middle if middle else 0.0
+        return middle, max(SPREAD + FEW / len(near), off)
+    sizes = [x for x, _ in samples]
+    if size > max(sizes) < 2 * min(sizes):  # too much of a kind to tell a slope: in proportion, which is safe
+        return median(y for _, y in samples) * size / median(sizes), GUESS
     intercept, slope = _line(samples)
     off = max((abs(y - intercept - slope * x) / y for x, y in samples if y), default=0.0)
     typical = median(x for x, _ in samples)
@@ -192,7 +199,8 @@ def _line(samples: list[tuple[float, float]]) -> tuple[float, float]:
     return 0.0, sum(x * y for x, y in samples) / sum(x * x for x, _ in samples)
 
 
-def _count(n: int, what: str) -> str:
+def count(n: int, what: str) -> str:
+    """``1 task``, ``3 tasks``."""
     return f"{n} {what}{'' if n == 1 else 's'}"
 
 

@@ -12,7 +12,7 @@ from collections.abc import Iterable
 
 from pipeline import costs, driver, memory
 from pipeline.admission import Account, Admission, account, forecast, largest
-from pipeline.costs import Costs, Foreseen
+from pipeline.costs import Costs, Foreseen, count
 from pipeline.dag import Graph, Handle
 from pipeline.driver import Result
 from pipeline.environment import cores
@@ -71,7 +71,7 @@ def needs(graph: Graph, known: Costs, shares: Account) -> Iterable[str]:
     tasks_most = min(sum(together), shares.budget)
     peak = shares.own + shares.workers * shares.rest + tasks_most
     parts = [f"this process {words(shares.own)}", f"running tasks {words(tasks_most)}"]
-    parts += [f"{shares.workers} workers {words(shares.rest)} each"] if shares.rest else []
+    parts += [f"{count(shares.workers, 'worker')} {words(shares.rest)} each"] if shares.rest else []
     yield f"about {words(sum(f.stored for f in foreseen.values()))} will be added to the cache"
     yield f"memory at most {words(peak)} of {words(shares.limit)}: {', '.join(parts)}"
     if sum(together) > shares.budget:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline import ledger, runs
+from pipeline.costs import count
 
 FACTOR, START = 1.15, 5.0
 """A good cold run: this factor over the least possible time, and these seconds to start workers and draw results."""
@@ -109,7 +110,8 @@ def _in_order(waits: Mapping[str, list[str]], labels: list[str]) -> Iterable[str
 def describe(run: Path) -> Iterable[str]:
     """Lines on the time of a run."""
     t = timing(run / runs.LEDGER)
-    yield f"run {runs.name(run)}: {t.wall:.1f} s, {t.computed} tasks computed with {t.workers} workers"
+    done = f"{count(t.computed, 'task')} computed with {count(t.workers, 'worker')}"
+    yield f"run {runs.name(run)}: {t.wall:.1f} s, {done}"
     if not t.computed:
         yield "nothing was computed"
         return

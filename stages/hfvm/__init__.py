@@ -278,5 +278,5 @@ STAGE = Stage(
     ),
     requires=("numpy", "numba", "opencv-python-headless"),
     run=_run,
-    memory=Memory(factor=30.0, result=1.6, lower=("hfvm.preset", "hfvm.finest")),
+    memory=Memory(fixed=30e6, factor=10.0, result=1.6, lower=("hfvm.preset", "hfvm.finest")),
 )

@@ -120,6 +120,8 @@ def test_tasks_of_like_size_are_foreseen_by_their_median_and_its_spread():
         SPEC, 11.0
     )
     assert (found.memory, found.spread) == (100 * MB, pytest.approx(0.3))
+    alone = known([(10.0, 80 * MB, 5.0, 2.0)]).foresee(SPEC, 10.0)
+    assert (alone.memory, alone.spread) == (80 * MB, 0.5), "one task tells little"
     assert (found.result, found.stored) == (5.0, 2.0)
     assert found.source == "from 3 tasks of 3 runs"
     assert found.most == pytest.approx(130 * MB + costs.SLACK)
@@ -132,8 +134,8 @@ def test_other_sizes_follow_a_line_and_are_less_certain():
     assert found.spread > 0.5
     near = known(samples).foresee(SPEC, 5.2 * MB)
     assert 0.1 < near.spread < found.spread
-    one_size = known([(2 * MB, 10 * MB, 1.0, 1.0)]).foresee(SPEC, 8 * MB)
-    assert one_size.memory == pytest.approx(40 * MB)
+    one_size = known([(2 * MB, 10 * MB, 1.0, 1.0), (2.2 * MB, 9 * MB, 1.0, 1.0)]).foresee(SPEC, 8 * MB)
+    assert one_size.memory == pytest.approx(9.5 * MB * 8 / 2.1), "no slope is to be told from these"
 
 
 def test_other_parameters_serve_where_there_is_nothing_better():

@@ -48,7 +48,7 @@ def test_a_real_ledger_is_told_in_words(tmp_path):
     first, second = run(tmp_path, "1"), run(tmp_path, "2")
     told = list(timing.describe(first))
     assert told[0].startswith("run toy/1: ")
-    assert "9 tasks computed with 1 workers" in told[0]
+    assert "9 tasks computed with 1 worker" in told[0]
     assert told[2].startswith("longest chain ")
     assert "1.15 of it and 5 s are" in told[4]
     assert list(timing.describe(second))[1] == "nothing was computed"
