@@ -145,7 +145,7 @@ def crc32c(path: Path) -> str:
     return f"{google_crc32c.value(path.read_bytes()):08x}"
 
 
-def damage(folder: Path, files: Mapping[str, list[Any]], checksums: Callable[[str], bool]) -> str:
+def damage(folder: Path | str, files: Mapping[str, list[Any]], checksums: Callable[[str], bool]) -> str:
     """What is wrong with the files of an artifact, in words; empty if nothing.
 
     Sizes are always compared, contents where ``checksums(relative path)`` says so.

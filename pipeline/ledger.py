@@ -22,6 +22,8 @@ class Ledger:
 
     def write(self, handle: Handle) -> None:
         """What became of a node: where its inputs come from, why it was missed, what it took."""
+        if self._file is None:
+            return
         row: dict[str, Any] = {"label": handle.label, "stage": handle.stage, "status": handle.status}
         if handle.inputs:
             row["inputs"] = {
