@@ -145,18 +145,19 @@ def crc32c(path: Path) -> str:
     return f"{google_crc32c.value(path.read_bytes()):08x}"
 
 
-def damage(folder: Path, files: Mapping[str, list[Any]], checksums: Callable[[str], bool]) -> str:
+def damage(folder: Path | str, files: Mapping[str, list[Any]], checksums: Callable[[str], bool]) -> str:
     """What is wrong with the files of an artifact, in words; empty if nothing.
 
     Sizes are always compared, contents where ``checksums(relative path)`` says so.
     """
+    base = str(folder)
     for name, (size, crc) in files.items():
-        path = folder / name
+        path = f"{base}/{name}"
         try:
-            found = path.stat().st_size
+            found = os.stat(path).st_size
             if found != size:
                 return f"{name} has {found} bytes instead of {size}"
-            if checksums(name) and crc32c(path) != crc:
+            if checksums(name) and crc32c(Path(path)) != crc:
                 return f"{name} has another checksum"
         except (FileNotFoundError, NotADirectoryError):
             return f"{name} is missing"

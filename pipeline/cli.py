@@ -1,4 +1,4 @@
-"""The command line: ``rille reconstruct | plan | check | init | calibrate | match | datasets | cache``.
+"""The command line: ``rille reconstruct | plan | why | timing | check | init | calibrate | match | datasets | cache``.
 
 Exit codes: 0 complete; 1 failed; 2 usage, configuration or input; 3 finished with holes under ``--keep-going``;
 130 interrupted. Results go to stdout, progress and complaints to stderr. Heavy imports happen inside the commands, so
@@ -57,6 +57,7 @@ def reconstruct(
     keep_going: Annotated[bool, Parameter(negative="")] = False,
     force: Annotated[list[str] | None, Parameter(negative="", consume_multiple=False)] = None,
     fresh: Annotated[bool, Parameter(negative="")] = False,
+    memory_limit: str | None = None,
     runs: Path = Path("runs"),
     cache: CacheFolder = None,
     progress: Progress = "auto",
@@ -85,6 +86,8 @@ def reconstruct(
         Recompute this stage although it is cached; may be repeated.
     fresh
         Write a new folder of results even if nothing is new and the latest run stands.
+    memory_limit
+        Memory that the run may take in all, for example 6GB or 75%; nine tenths of what is free by default.
     runs
         Folder of results; each run makes RUNS/sequence/run-id.
     cache
@@ -112,6 +115,7 @@ def reconstruct(
         cache=cache_folder(cache),
         progress="quiet" if quiet else progress,
         fresh=fresh,
+        memory_limit=memory_limit,
     )
     return run.reconstruct(options)
 
@@ -124,7 +128,9 @@ def plan(
     config: Path | None = None,
     frames: str | None = None,
     jobs: int | None = None,
+    executor: Literal["processes", "threads", "inline"] = "processes",
     force: Annotated[list[str] | None, Parameter(negative="", consume_multiple=False)] = None,
+    memory_limit: str | None = None,
     cache: CacheFolder = None,
     verbose: Annotated[bool, Parameter(name=["--verbose", "-v"], negative="")] = False,
     debug: Annotated[bool, Parameter(negative="")] = False,
@@ -142,9 +148,13 @@ def plan(
     frames
         Frame range START:STOP[:STEP]; all by default.
     jobs
-        Workers that the estimate of the time is for; the number of cores by default.
+        Workers that the estimates are for; the number of cores by default.
+    executor
+        Where tasks would run.
     force
         Stage that would be recomputed although it is cached; may be repeated.
+    memory_limit
+        Memory that the run may take in all, for example 6GB or 75%; nine tenths of what is free by default.
     cache
         Folder of cached artifacts; RILLE_CACHE or .rille/cache by default.
     verbose
@@ -162,10 +172,61 @@ def plan(
         config=config,
         frames=frames,
         jobs=jobs,
+        executor=executor,
         force=frozenset(force or ()),
+        memory_limit=memory_limit,
         cache=cache_folder(cache),
     )
     return command.plan(options, verbose=verbose)
+
+
+@app.command
+def why(
+    run: str,
+    task: str,
+    *,
+    runs: Path = Path("runs"),
+    cache: CacheFolder = None,
+    debug: Annotated[bool, Parameter(negative="")] = False,
+) -> int:
+    """Say of one task of a run where its inputs come from, why it was computed or not, with what, and what has changed.
+
+    Parameters
+    ----------
+    run
+        SEQUENCE (its latest run), SEQUENCE/ID, or the run's folder.
+    task
+        The task's label, as in the run's ledger.jsonl: hfvm/12, locus/world/12, trajectory.
+    runs
+        Folder of runs.
+    cache
+        Folder of cached artifacts; RILLE_CACHE or .rille/cache by default.
+    debug
+        Show tracebacks.
+    """
+    from pipeline import why as command
+
+    return command.why(run, task, folder=runs, cache=cache_folder(cache))
+
+
+@app.command
+def timing(
+    run: str = "latest", *, runs: Path = Path("runs"), debug: Annotated[bool, Parameter(negative="")] = False
+) -> int:
+    """Say where the time of a run went, and how far it is from what its tasks allow.
+
+    Parameters
+    ----------
+    run
+        SEQUENCE (its latest run), SEQUENCE/ID, or the run's folder; the latest of all by default.
+    runs
+        Folder of runs.
+    debug
+        Show tracebacks.
+    """
+    from pipeline import timing as command
+
+    return command.show(run, runs)
 
 
 @app.command
@@ -365,11 +426,18 @@ def export(
 
 
 @cache_app.command
-def verify(*, cache: CacheFolder = None, debug: Annotated[bool, Parameter(negative="")] = False) -> int:
+def verify(
+    *,
+    deep: Annotated[bool, Parameter(negative="")] = False,
+    cache: CacheFolder = None,
+    debug: Annotated[bool, Parameter(negative="")] = False,
+) -> int:
     """Read every artifact and compare its checksums; damaged ones are named and recomputed by the next run.
 
     Parameters
     ----------
+    deep
+        Decode every chunk too, and compare the digests of the arrays.
     cache
         Folder of cached artifacts; RILLE_CACHE or .rille/cache by default.
     debug
@@ -377,7 +445,7 @@ def verify(*, cache: CacheFolder = None, debug: Annotated[bool, Parameter(negati
     """
     from pipeline import run
 
-    return run.verify_cache(cache_folder(cache))
+    return run.verify_cache(cache_folder(cache), deep=deep)
 
 
 @cache_app.command
@@ -388,7 +456,7 @@ def gc(
     dry_run: Annotated[bool, Parameter(negative="")] = False,
     debug: Annotated[bool, Parameter(negative="")] = False,
 ) -> int:
-    """Remove artifacts that no kept run refers to, and leftovers of interrupted runs.
+    """Remove artifacts that no kept and no pinned run refers to, and leftovers of interrupted runs.
 
     Parameters
     ----------
@@ -397,13 +465,83 @@ def gc(
     runs
         Folder of the runs that are kept.
     dry_run
-        Say what would go, and keep it.
+        Say what would go, by stage, and keep it.
     debug
         Show tracebacks.
     """
     from pipeline import run
 
     return run.collect_garbage(cache_folder(cache), runs, dry_run=dry_run)
+
+
+@cache_app.command
+def ls(
+    *,
+    as_json: Annotated[bool, Parameter(name="--json", negative="")] = False,
+    cache: CacheFolder = None,
+    runs: Path = Path("runs"),
+    debug: Annotated[bool, Parameter(negative="")] = False,
+) -> int:
+    """Say what the cache holds, by sequence and stage: number, sizes, age, and the run that used it last.
+
+    Parameters
+    ----------
+    as_json
+        As JSON.
+    cache
+        Folder of cached artifacts; RILLE_CACHE or .rille/cache by default.
+    runs
+        Folder of the runs that are kept.
+    debug
+        Show tracebacks.
+    """
+    from pipeline import inventory
+
+    return inventory.ls(cache_folder(cache), runs, as_json=as_json)
+
+
+@cache_app.command
+def pin(
+    run: str,
+    *,
+    cache: CacheFolder = None,
+    runs: Path = Path("runs"),
+    debug: Annotated[bool, Parameter(negative="")] = False,
+) -> int:
+    """Keep all artifacts of a run, whatever is cleared away, even if the run's folder is removed.
+
+    Parameters
+    ----------
+    run
+        SEQUENCE (its latest run), SEQUENCE/ID, or the run's folder.
+    cache
+        Folder of cached artifacts; RILLE_CACHE or .rille/cache by default.
+    runs
+        Folder of runs.
+    debug
+        Show tracebacks.
+    """
+    from pipeline import run as commands
+
+    return commands.pin(cache_folder(cache), run, runs)
+
+
+@cache_app.command
+def unpin(run: str, *, cache: CacheFolder = None, debug: Annotated[bool, Parameter(negative="")] = False) -> int:
+    """Take the pin of a run away; its artifacts stay until they are cleared away.
+
+    Parameters
+    ----------
+    run
+        SEQUENCE/ID, or ID.
+    cache
+        Folder of cached artifacts; RILLE_CACHE or .rille/cache by default.
+    debug
+        Show tracebacks.
+    """
+    from pipeline import run as commands
+
+    return commands.unpin(cache_folder(cache), run)
 
 
 def main(argv: list[str] | None = None) -> None:

@@ -30,7 +30,10 @@ class Handle:
 
     ``status`` is ``pending``, ``running``, ``computed``, ``cached``, ``failed``, ``skipped`` or, when dry, ``planned``.
     ``reason`` says in words why it was not found in the cache, or why it was skipped. ``earlier``, of a planned node,
-    is what the same label led to before: a plan takes its facts for what is to come.
+    is what the same label led to before: a plan takes its facts for what is to come. ``expect`` are bytes (decoded)
+    that it reads from outside. Of a computed node: ``seconds`` of the call and of the stage's own ``kernel``, when it
+    ``started`` (seconds since 1970), and the figures of a :class:`pipeline.memory.Meter` (``first``: with imports
+    and kernels).
     """
 
     index: int
@@ -41,8 +44,14 @@ class Handle:
     earlier: Ref | None = None
     reason: str = ""
     key: str = ""
+    expect: float = 0.0
     seconds: float = 0.0
+    kernel: float = 0.0
+    started: float = 0.0
     peak_rss: int = 0
+    memory: int | None = None
+    rest: int | None = None
+    first: bool = False
     error: BaseException | None = None
 
     @property
@@ -85,10 +94,12 @@ class Graph:
         args: Mapping[str, Any] | None = None,
         hints: Mapping[str, Any] | None = None,
         inputs: Mapping[str, Handle | Sequence[Handle]] | None = None,
+        expect: float = 0.0,
     ) -> Handle:
         """Add a task and give its handle.
 
-        ``inputs`` maps each port of the stage to a handle, or to a list of them for a port declared ``name*``.
+        ``inputs`` maps each port of the stage to a handle, or to a list of them for a port declared ``name*``;
+        ``expect`` are decoded bytes of what it reads from outside, for estimates.
 
         Raises
         ------
@@ -102,7 +113,7 @@ class Graph:
         spec = Spec(module, label, params, dict(args or {}), dict(hints or {}))
         given = {p: h if isinstance(h, Handle) else list(h) for p, h in (inputs or {}).items()}
         _check_ports(spec, given)
-        handle = Handle(len(self.nodes), spec, given)
+        handle = Handle(len(self.nodes), spec, given, expect=expect)
         self._labels.add(label)
         self.nodes.append(handle)
         return handle

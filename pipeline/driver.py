@@ -17,23 +17,26 @@ has one line for each node that is missing, with the reason.
 
 from __future__ import annotations
 
+import gc
 import heapq
+import math
 import time
 from collections import defaultdict
-from collections.abc import Collection
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from pipeline import explain
+from pipeline import costs, explain
+from pipeline.admission import Admission, Waiting, account, largest
 from pipeline.artifact import DamagedError
+from pipeline.costs import input_bytes
 from pipeline.dag import Expansion, Graph, Handle
 from pipeline.environment import cores
 from pipeline.executor import Executor, Failed, make
-from pipeline.key import digest
 from pipeline.ledger import Ledger
 from pipeline.progress import Progress, Quiet, recall_seconds, remember_seconds
-from pipeline.store import GoneError, NonDeterministicError, Store
-from pipeline.task import Outcome, recipe
+from pipeline.store import GoneError, NonDeterministicError, Ref, Store
+from pipeline.task import Outcome, key_of, recipe
 from stages.errors import RilleError
 
 HEALS = 3
@@ -113,6 +116,8 @@ def run(
     dry: bool = False,
     ledger: Path | None = None,
     progress: Progress | None = None,
+    memory_limit: float | None = None,
+    survey: Callable[[], Graph] | None = None,
 ) -> Result:
     """Bring every node of a graph to an artifact.
 
@@ -127,13 +132,19 @@ def run(
     dry : look up only.
     ledger : file of JSON lines, one a node, written as they resolve.
     progress : told of every step.
+    memory_limit : bytes that this process and its workers may take together; None is what is free here.
+    survey : lays the same graph out anew, to look ahead: what cannot fit into memory is refused before anything runs.
 
     Raises
     ------
+    MemoryRefusedError
+        A task that can be foreseen does not fit, even alone.
     KeyboardInterrupt
         Interrupted; running tasks are killed, what is committed stays.
     """
-    return _Run(graph, store, executor, jobs, keep_going, force, dry, ledger, progress or Quiet()).go()
+    return _Run(
+        graph, store, executor, jobs, keep_going, force, dry, ledger, progress or Quiet(), memory_limit, survey
+    ).go()
 
 
 class _Run:
@@ -148,8 +159,12 @@ class _Run:
         dry: bool,
         ledger: Path | None,
         progress: Progress,
+        memory_limit: float | None,
+        survey: Callable[[], Graph] | None,
     ) -> None:
         self.graph, self.store = graph, store
+        self.memory_limit, self.survey = memory_limit, survey
+        self.admission: Admission | None = None
         self.executor_kind, self.jobs = executor, jobs
         self.keep_going, self.force, self.dry = keep_going, frozenset(force), dry
         self.ledger, self.progress = Ledger(ledger), progress
@@ -164,8 +179,8 @@ class _Run:
         self.begun: set[str] = set()
         self.warm: set[str] = set()
         """Stages of which a task was submitted, and of which one has come back."""
-        self.missing: list[int] = []
-        """Looked up, not found, not submitted: a heap by order of creation, as ``ready``."""
+        self.missing = Waiting()
+        """Looked up, not found, not submitted."""
         self.flying: dict[str, list[Handle]] = {}
         """Submitted, by key; further nodes of the same key wait for the first."""
         self.patients: dict[str, set[str]] = {}
@@ -176,6 +191,7 @@ class _Run:
 
     def go(self) -> Result:
         begin = time.perf_counter()
+        gc.freeze()  # what is there need not be searched for garbage again and again as the graph grows
         try:
             self._loop()
             self._leave_out()
@@ -185,8 +201,11 @@ class _Run:
         else:
             self._close(kill=False)
             remember_seconds(self.store, self.result.counts)
+            costs.remember(self.store, self.graph.nodes)
         finally:
+            gc.unfreeze()
             self.result.seconds = time.perf_counter() - begin
+            self.ledger.run(seconds=round(self.result.seconds, 3), ok=self.result.ok)
             self.progress.close(self.result)
             self.ledger.close()
         return self.result
@@ -236,7 +255,7 @@ class _Run:
 
     def _look_up(self, handle: Handle) -> None:
         made = recipe(handle.spec, handle.refs())
-        handle.key = key = digest(made, handle.label)
+        handle.key = key = key_of(handle.spec, made)
         forced = handle.stage in self.force
         ref = None if forced else self.store.lookup(handle.stage, key)
         if ref is not None:
@@ -250,7 +269,7 @@ class _Run:
             self.flying[key].append(handle)
         else:
             self.flying[key] = [handle]
-            heapq.heappush(self.missing, handle.index)
+            self.missing.push(handle)
 
     def _expand(self) -> bool:
         """Call the first expansion whose handles are done; whether there was one."""
@@ -258,10 +277,12 @@ class _Run:
             if all(h.done or h.earlier for h in handles):
                 del self.expansions[i]
                 self.result.assumed += [h.label for h in handles if not h.done]
+                before = len(self.graph.nodes)
                 try:
                     fn(*(h.ref or h.earlier for h in handles))
                 except Exception as error:
                     self._failed(Failure(f"plan after {_labels(handles)}", "", error, Failed.of(error).traceback))
+                self.ledger.expansion([h.label for h in handles], [h.label for h in self.graph.nodes[before:]])
                 return True
         return False
 
@@ -270,38 +291,49 @@ class _Run:
     def _submit(self) -> None:
         """Keep every worker busy, and no more: what is not begun can still be left out."""
         if self.missing and not self.stopped and self.executor is None:
-            self.executor = make(self.executor_kind, self.jobs, self.store.root)
-            self.result.executor_started = True
+            self._begin()
         while self.missing and not self.stopped and self.executor is not None and self.executor.idle():
-            handle = self.graph.nodes[self._next()]
+            assert self.admission is not None
+            handle = self.missing.take(self.begun - self.warm, self.admission.fits)
+            if handle is None:
+                break
+            refused = self.admission.refusal(handle)
+            if refused is not None:
+                self._land(handle.key, Failed(refused, ""))
+                continue
             self.begun.add(handle.stage)
+            self.admission.begin(handle)
             handle.status = "running"
             self.progress.running(handle)
-            self.executor.submit(handle.key, self.store.root, handle.spec, handle.refs(), handle.stage in self.force)
+            refs = {p: [_light(r) for r in g] if isinstance(g, list) else _light(g) for p, g in handle.refs().items()}
+            self.executor.submit(handle.key, self.store.root, handle.spec, refs, handle.stage in self.force)
         if self.stopped:
-            for key in (*(self.graph.nodes[index].key for index in self.missing), *self.patients):
+            for key in (*(handle.key for handle in self.missing), *self.patients):
                 for handle in self.flying.pop(key, ()):
                     handle.status = self.fates.get(handle.index, "pending")
             self.missing.clear()
             self.patients.clear()
 
-    def _next(self) -> int:
-        """Take the first of what is missing, but while a stage's first task compiles its kernels, rather another stage.
-
-        A second process would compile the same ones; a moment later it finds them on disk.
-        """
-        cold = self.begun - self.warm
-        at = heapq.heappop(self.missing)
-        if self.graph.nodes[at].stage not in cold:
-            return at
-        other = min((i for i in self.missing if self.graph.nodes[i].stage not in cold), default=None)
-        if other is None:
-            return at
-        self.missing[self.missing.index(other)] = at
-        heapq.heapify(self.missing)
-        return other
+    def _begin(self) -> None:
+        """Look ahead, share the memory out, and start the workers that it leaves room for."""
+        known, jobs = costs.recall(self.store), self.jobs or cores()
+        if self.executor_kind == "processes":
+            import distributed  # noqa: F401 (what it takes is this process's own)
+        ahead = Graph() if self.survey is None else self.survey()
+        run(ahead, self.store, dry=True, force=self.force)
+        most = max(largest(ahead, known), *(known.foresee(h.spec, input_bytes(h)).most for h in self.missing))
+        shares = account(known, self.memory_limit, self.executor_kind, jobs, most)
+        self.admission = Admission(known, shares, automatic=self.memory_limit is None)
+        self.admission.check(ahead)
+        few = shares.workers < jobs and self.executor_kind == "processes"
+        amounts = {k: round(v) for k, v in vars(shares).items() if math.isfinite(v)}
+        self.ledger.run(executor=self.executor_kind, jobs=shares.workers, **amounts)
+        self.executor = make(self.executor_kind, shares.workers if few else self.jobs, self.store.root, shares.limit)
+        self.result.executor_started = True
 
     def _land(self, key: str, outcome: Outcome | Failed) -> None:
+        assert self.admission is not None
+        self.admission.end(key)
         first, *others = self.flying[key]
         self.warm.add(first.stage)
         if isinstance(outcome, Failed) and self._heal(first, outcome.error):
@@ -317,7 +349,9 @@ class _Run:
                 self._resolve(handle, "failed")
             self._failed(Failure(first.label, first.stage, outcome.error, outcome.traceback))
         else:
-            first.seconds, first.peak_rss = outcome.seconds, outcome.peak_rss
+            first.seconds, first.peak_rss, first.kernel = outcome.seconds, outcome.peak_rss, outcome.kernel
+            first.started, first.memory, first.rest = outcome.started, outcome.memory, outcome.rest
+            first.first = outcome.first
             for handle in (first, *others):
                 handle.ref = outcome.ref
                 self._resolve(handle, "computed" if handle is first and not outcome.cached else "cached")
@@ -333,11 +367,11 @@ class _Run:
             source.reason = "its artifact was found damaged, or gone, when it was read"
             if key not in self.flying:
                 self.flying[key] = [source]
-                heapq.heappush(self.missing, source.index)
+                self.missing.push(source)
         if absent:
             self.patients[handle.key] = set(absent)
         else:
-            heapq.heappush(self.missing, handle.index)
+            self.missing.push(handle)
         return True
 
     def _discharge(self, key: str, source: Handle) -> None:
@@ -353,7 +387,7 @@ class _Run:
             self.patients[patient].discard(key)
             if not self.patients[patient]:
                 del self.patients[patient]
-                heapq.heappush(self.missing, first.index)
+                self.missing.push(first)
 
     def _failed(self, failure: Failure) -> None:
         self.result.failures.append(failure)
@@ -405,6 +439,11 @@ class _Run:
             missing = [h for h in handles if not h.done]
             self.result.unknown += [h.label for h in missing]
             self.ledger.note(f"plan after {_labels(handles)}", "planned" if self.dry else "skipped", _labels(missing))
+
+
+def _light(ref: Ref) -> Ref:
+    """Without its facts, which a task reads from the store: those of a long trajectory would travel to every pair."""
+    return replace(ref, meta={})
 
 
 _FATE = {"failed": "failed", "skipped": "was skipped"}

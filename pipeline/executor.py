@@ -13,6 +13,7 @@ alike.
 from __future__ import annotations
 
 import logging
+import math
 import os
 import pickle
 import queue
@@ -107,8 +108,10 @@ class Executor(Protocol):
         """Leave nothing behind; ``kill`` does not wait for what is running."""
 
 
-def make(kind: str, jobs: int | None, cache: Path) -> Executor:
+def make(kind: str, jobs: int | None, cache: Path, memory: float = math.inf) -> Executor:
     """``inline``, ``threads``, ``processes`` or a scheduler's address; ``jobs`` None is one a core.
+
+    A worker process of our own that takes more than ``memory`` bytes by itself is ended, before the system ends others.
 
     Raises
     ------
@@ -123,7 +126,7 @@ def make(kind: str, jobs: int | None, cache: Path) -> Executor:
     if kind == "threads":
         return Threads(jobs)
     if kind == "processes":
-        return Processes(jobs, cache)
+        return Processes(jobs, cache, memory)
     if "://" in kind:
         return Cluster(kind)
     raise ConfigError(f"executor {kind!r} is unknown", remedy="inline, threads, processes or tcp://host:port")
@@ -256,7 +259,7 @@ class Cluster(_Futures):
 class Processes(Cluster):
     """Worker processes of our own, one thread each."""
 
-    def __init__(self, jobs: int, cache: Path) -> None:
+    def __init__(self, jobs: int, cache: Path, memory: float = math.inf) -> None:
         _quiet()
         import dask
         from distributed import LocalCluster
@@ -280,6 +283,8 @@ class Processes(Cluster):
             "distributed.scheduler.http.routes": [],
             "distributed.worker.multiprocessing-method": "spawn",
             "distributed.worker.profile.enabled": False,
+            # tasks were admitted by their memory: a worker must not refuse one that the others left room for
+            **{f"distributed.worker.memory.{step}": False for step in ("target", "spill", "pause")},
             "distributed.admin.system-monitor.gil.enabled": False,
         }
         try:
@@ -289,6 +294,7 @@ class Processes(Cluster):
                     n_workers=jobs,
                     threads_per_worker=1,
                     processes=True,
+                    memory_limit=round(memory) if math.isfinite(memory) else "auto",
                     dashboard_address=None,
                     scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},  # else port 8787, with a warning if taken
                     silence_logs=logging.CRITICAL,

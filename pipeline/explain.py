@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 import uuid
+import zlib
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -110,7 +111,8 @@ def _change(name: str, old: Mapping[str, str], new: Mapping[str, str]) -> str:
 
 
 def _index(store: Store, stage: str, label: str) -> Path:
-    return store.root / "labels" / stage / f"{quote(label, safe='')}.json"
+    name = quote(label, safe="")
+    return store.root / "labels" / stage / f"{zlib.crc32(name.encode()) & 0xFF:02x}" / f"{name}.json"
 
 
 def _recall(path: Path) -> list[str]:

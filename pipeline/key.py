@@ -52,5 +52,26 @@ def digest(value: Any, where: str = "value") -> str:
     return hashlib.sha256(_text(canonical(value, where)).encode()).hexdigest()
 
 
+class Fixed:
+    """A part of what is digested whose canonical form is kept: the same code, packages, parameters of many tasks.
+
+    >>> digest_of({"a": Fixed([1.0]), "b": 2}) == digest({"a": [1.0], "b": 2})
+    True
+    """
+
+    def __init__(self, value: Any, where: str = "value") -> None:
+        self.value = value
+        self.text = _text(canonical(value, where))
+
+
+def digest_of(parts: dict[str, Any], where: str = "value") -> str:
+    """:func:`digest` of a dictionary, some of whose values are :class:`Fixed`."""
+    texts = (
+        f"{json.dumps(name)}:{part.text if isinstance(part, Fixed) else _text(canonical(part, f'{where}.{name}'))}"
+        for name, part in sorted(parts.items())
+    )
+    return hashlib.sha256(f"{{{','.join(texts)}}}".encode()).hexdigest()
+
+
 def _text(tree: Any) -> str:
     return json.dumps(tree, sort_keys=True, separators=(",", ":"), ensure_ascii=True)

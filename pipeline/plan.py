@@ -10,10 +10,13 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Iterable
 
-from pipeline import driver
+from pipeline import costs, driver, memory
+from pipeline.admission import Account, Admission, account, forecast, largest
+from pipeline.costs import Costs, Foreseen, count
 from pipeline.dag import Graph, Handle
 from pipeline.driver import Result
 from pipeline.environment import cores
+from pipeline.memory import words
 from pipeline.progress import recall_seconds
 from pipeline.reconstruct import Reconstruction
 from pipeline.run import Options, choose_frames, settings, warn
@@ -38,9 +41,41 @@ def plan(options: Options, *, verbose: bool = False) -> int:
     Reconstruction(graph, sequence, config, frames).build()
     result = driver.run(graph, store, dry=True, force=options.force)
     result.check()
-    for line in describe(graph, result, recall_seconds(store), options.jobs or cores(), verbose=verbose):
+    jobs = options.jobs or cores()
+    for line in describe(graph, result, recall_seconds(store), jobs, verbose=verbose):
         print(line)
+    known = costs.recall(store)
+    limit = None if options.memory_limit is None else memory.parse(options.memory_limit)
+    shares = account(known, limit, options.executor, jobs, largest(graph, known))
+    for line in needs(graph, known, shares):
+        print(line)
+    Admission(known, shares, automatic=limit is None).check(graph)
     return 0
+
+
+def needs(graph: Graph, known: Costs, shares: Account) -> Iterable[str]:
+    """Lines on memory and bytes of what is to be computed; nothing where nothing is."""
+    foreseen = forecast(graph, known)
+    by_stage: dict[str, list[Foreseen]] = defaultdict(list)
+    for index, f in foreseen.items():
+        by_stage[graph.nodes[index].stage].append(f)
+    if not by_stage:
+        return
+    yield f"{'stage':16s} {'memory a task':>20s} {'results on disk':>16s}  how this is known"
+    for stage, tasks in by_stage.items():
+        most = max(tasks, key=lambda f: f.memory)
+        need = f"{words(most.memory)} +-{100 * most.spread:.0f} %"
+        sources = dict.fromkeys(f.source for f in tasks)
+        yield f"{stage:16s} {need:>20s} {words(sum(f.stored for f in tasks)):>16s}  {'; '.join(sources)}"
+    together = sorted((f.most for f in foreseen.values()), reverse=True)[: shares.workers]
+    tasks_most = min(sum(together), shares.budget)
+    peak = shares.own + shares.workers * shares.rest + tasks_most
+    parts = [f"this process {words(shares.own)}", f"running tasks {words(tasks_most)}"]
+    parts += [f"{count(shares.workers, 'worker')} {words(shares.rest)} each"] if shares.rest else []
+    yield f"about {words(sum(f.stored for f in foreseen.values()))} will be added to the cache"
+    yield f"memory at most {words(peak)} of {words(shares.limit)}: {', '.join(parts)}"
+    if sum(together) > shares.budget:
+        yield "the largest tasks will wait for one another: together they would exceed the limit"
 
 
 def describe(

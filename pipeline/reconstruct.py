@@ -362,26 +362,29 @@ class Reconstruction:
         return self._images[frame, camera]
 
     def _undistorted(self, frame: int, camera: str) -> Handle:
-        image = self._source(self.sequence.image(frame, camera), f"image/{camera}/{frame}")
+        ideal = self.sequence.rig.left if camera == "left" else self.sequence.rig.right
+        grey = 4.0 * ideal.width * ideal.height  # float32
+        image = self._source(self.sequence.image(frame, camera), f"image/{camera}/{frame}", grey)
         if camera == "left":
             self.products.images[frame] = image
         lens = (self.sequence.lenses or {}).get(camera)
         if lens is None:
             return image
-        ideal = self.sequence.rig.left if camera == "left" else self.sequence.rig.right
         args = {"lens": lens.to_dict(), "camera": ideal.to_dict(), "frame": frame, "camera_name": camera}
         image = self._node("undistort", f"undistort/{camera}/{frame}", args, image=image)
         if camera == "left":
             self.products.undistorted[frame] = image
         return image
 
-    def _source(self, source: Source, label: str) -> Handle:
+    def _source(self, source: Source, label: str, expect: float = 0.0) -> Handle:
         """Node of a source, and of what it needs; what is the same for all frames (a rendered scene) is made once."""
         inputs = {
             port: self._source(upstream, f"{label}/{port}") if upstream.args else self._shared(upstream)
             for port, upstream in source.inputs.items()
         }
-        return self.graph.node(source.module, label, source.params, dict(source.args), dict(source.hints), inputs)
+        return self.graph.node(
+            source.module, label, source.params, dict(source.args), dict(source.hints), inputs, expect
+        )
 
     def _shared(self, source: Source) -> Handle:
         label = source.module.rsplit(".", 1)[-1]

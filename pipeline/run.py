@@ -49,6 +49,7 @@ class Options:
     cache: Path = Path(".rille/cache")
     progress: str = "auto"
     fresh: bool = False
+    memory_limit: str | None = None
 
     def command(self) -> str:
         """The command line that repeats this run."""
@@ -122,7 +123,7 @@ def reconstruct(options: Options) -> int:
 
 
 def _reconstruct(options: Options) -> int:
-    from pipeline import driver, progress
+    from pipeline import driver, memory, progress
     from pipeline.reconstruct import Reconstruction
 
     _known_stages(options.force)
@@ -145,6 +146,8 @@ def _reconstruct(options: Options) -> int:
         force=options.force,
         ledger=folder / "ledger.jsonl",
         progress=progress.make(options.progress),
+        memory_limit=None if options.memory_limit is None else memory.parse(options.memory_limit),
+        survey=lambda: lay_out(sequence, config, frames),
     )
     if not options.keep_going:
         result.check()
@@ -162,7 +165,7 @@ def _reconstruct(options: Options) -> int:
         print(f"{earlier.parent / earlier.readlink()}  cached {result.total().cached}, nothing new: that run stands")
         return COMPLETE
 
-    from pipeline import outputs
+    from pipeline import ledger, outputs
     from pipeline.report import RunView
 
     view = RunView(
@@ -183,6 +186,7 @@ def _reconstruct(options: Options) -> int:
     )
     try:
         outputs.write(folder, view)
+        ledger.add_facts(folder / "ledger.jsonl", total=(datetime.now(UTC) - started).total_seconds())
     except (DamagedError, GoneError):
         shutil.rmtree(folder)
         raise
@@ -196,6 +200,15 @@ def _reconstruct(options: Options) -> int:
         return COMPLETE
     _list_missing(graph, folder)
     return HOLES
+
+
+def lay_out(sequence: Sequence, config: Any, frames: tuple[int, ...]) -> Graph:
+    """The graph of a reconstruction as far as it is known beforehand."""
+    from pipeline.reconstruct import Reconstruction
+
+    graph = Graph()
+    Reconstruction(graph, sequence, config, frames).build()
+    return graph
 
 
 def _known_stages(names: frozenset[str]) -> None:
@@ -272,25 +285,48 @@ def export_dataset(name: str, directory: Path, assignments: tuple[str, ...], cac
     return COMPLETE
 
 
-def verify_cache(cache: Path) -> int:
+def verify_cache(cache: Path, *, deep: bool = False) -> int:
     """Compare checksums of all artifacts; exit code 1 where one is damaged."""
     from pipeline.upkeep import verify
 
-    sound, damaged = verify(Store(cache))
+    sound, damaged = verify(Store(cache), deep=deep)
     for found in damaged:
-        print(f"rille: {found}", file=sys.stderr)
+        print(f"rille: {found.label or found.key[:12]} ({found.stage}): {found.reason}; set aside", file=sys.stderr)
     print(f"{sound} artifacts are sound, {len(damaged)} damaged")
     return FAILED if damaged else COMPLETE
 
 
 def collect_garbage(cache: Path, runs: Path, *, dry_run: bool) -> int:
-    """Remove what no run in ``runs`` refers to."""
-    from pipeline import ledger, upkeep
+    """Remove what no run in ``runs`` and no pinned run refers to; a dry run says what that is."""
+    from pipeline import ledger, pins, upkeep
+    from pipeline.memory import words
 
-    kept: set[str] = set()
-    for path in sorted(runs.glob("*/*/ledger.jsonl")):
+    store = Store(cache)
+    kept, ledgers = pins.keys(store), sorted(runs.glob("*/*/ledger.jsonl"))
+    for path in ledgers:
         kept |= ledger.keys(path)
-    cleared = upkeep.gc(Store(cache), kept, dry_run=dry_run)
+    cleared = upkeep.gc(store, kept, dry_run=dry_run)
+    if dry_run:
+        for stage, (count, amount) in sorted(cleared.stages.items(), key=lambda item: -item[1][1]):
+            print(f"{stage:18s} {count:6d} {words(amount):>8s}")
     verb = "would remove" if dry_run else "removed"
     print(f"{verb} {cleared.artifacts} artifacts and {cleared.orphans} leftovers, {cleared.bytes / 2**20:.1f} MiB")
+    return COMPLETE
+
+
+def pin(cache: Path, text: str, runs: Path) -> int:
+    """Keep the artifacts of a run."""
+    from pipeline import pins
+    from pipeline import runs as kept
+
+    run = kept.find(text, runs)
+    print(f"pinned {kept.name(run)}: {pins.pin(Store(cache), run)} artifacts")
+    return COMPLETE
+
+
+def unpin(cache: Path, text: str) -> int:
+    """Keep them no longer."""
+    from pipeline import pins
+
+    print(f"unpinned {pins.unpin(Store(cache), text)}")
     return COMPLETE

@@ -2,11 +2,12 @@
 
 Layout under the cache folder::
 
-    artifacts/<stage>/<key>/manifest.json    the only commit point
-    artifacts/<stage>/<key>/a-<unique>/      one attempt: an immutable zarr 3 group (xarray.open_zarr reads it)
-    quarantine/<stage>-<key>-<unique>/       damaged artifacts, set aside
-    labels/...  seconds.json                 hints for explanations and estimates; never a matter of correctness
-    numba/<digest>/                          compiled kernels by digest of all own code
+    artifacts/<stage>/<k>/<key>/manifest.json    the only commit point; <k> are the key's first two digits
+    artifacts/<stage>/<k>/<key>/a-<unique>/      one attempt: an immutable zarr 3 group (xarray.open_zarr reads it)
+    quarantine/<stage>-<key>-<unique>/           damaged artifacts, set aside
+    labels/...  seconds.json  costs.json         hints for explanations and estimates; never a matter of correctness
+    pins/<run>.json                              keys that clearing up leaves alone
+    numba/<digest>/                              compiled kernels by digest of all own code
 
 An attempt becomes an artifact when its manifest is linked into place, create-if-absent, after all its files are on
 the disk. Killed at any instant, a run leaves either a whole artifact or an orphan that nobody reads. Of two that
@@ -19,6 +20,7 @@ from __future__ import annotations
 
 import errno
 import json
+import math
 import os
 import shutil
 import time
@@ -58,13 +60,18 @@ class GoneError(StoreError):
 
 @dataclass(frozen=True)
 class Ref:
-    """A committed artifact: all that travels between tasks. ``path`` is relative to the store's root."""
+    """A committed artifact: all that travels between tasks. ``path`` is relative to the store's root.
+
+    ``nbytes`` are bytes of the decoded arrays, ``stored`` those of the files.
+    """
 
     key: str
     stage: str
     digest: str
     path: str
     meta: Mapping[str, Any]
+    nbytes: int = 0
+    stored: int = 0
 
 
 class Store:
@@ -82,19 +89,20 @@ class Store:
         return None if manifest is None else _ref(manifest)
 
     def _sound(self, stage: str, key: str) -> Manifest | None:
-        published = self.home(stage, key) / "manifest.json"
+        home = self._home(stage, key)  # no Path: a plan looks tens of thousands up
+        published = f"{home}/manifest.json"
         try:
             with self._clear_errors():
-                if published.stat().st_mtime < time.time() - USED:
+                if os.stat(published).st_mtime < time.time() - USED:
                     with suppress(OSError):  # a cache may be read-only
                         os.utime(published)
-                manifest = self._read_manifest(published.parent)
+                manifest = self._read_manifest(home)
         except FileNotFoundError:
             return None
         except ValueError:
             self.set_aside(stage, key, None, "manifest.json is not readable")
             return None
-        wrong = damage(self.root / manifest["path"], manifest["files"], lambda _: False)
+        wrong = damage(f"{self.root}/{manifest['path']}", manifest["files"], lambda _: False)
         if wrong:
             self.set_aside(stage, key, manifest, wrong)
             return None
@@ -190,7 +198,7 @@ class Store:
                         return there
                 else:
                     with suppress(OSError):  # it is published: at worst a power failure takes it back as a whole
-                        for folder in (home, *list(home.parents)[:2]):
+                        for folder in (home, *list(home.parents)[:3]):
                             fsync(folder)
                     return None
             raise StoreError(f"cannot publish {home / 'manifest.json'}", remedy="remove that file and run again")
@@ -199,14 +207,18 @@ class Store:
 
     def home(self, stage: str, key: str) -> Path:
         """Folder of a key: its manifest and its attempts."""
-        return self.root / "artifacts" / stage / key
+        return Path(self._home(stage, key))
 
-    def _read_manifest(self, home: Path) -> Manifest:
+    def _home(self, stage: str, key: str) -> str:
+        return f"{self.root}/artifacts/{stage}/{key[:2]}/{key}"
+
+    def _read_manifest(self, home: Path | str) -> Manifest:
         """Raises ValueError where the content is not what was written."""
-        data = (home / "manifest.json").read_bytes()
+        with open(f"{home}/manifest.json", "rb") as file:
+            data = file.read()
         body = data[_HEAD_SIZE:-2]
         if data != _HEAD % google_crc32c.value(body) + body + b"}\n":
-            raise ValueError(f"{home / 'manifest.json'} is damaged")
+            raise ValueError(f"{home}/manifest.json is damaged")
         manifest: Manifest = json.loads(body)
         return manifest
 
@@ -274,7 +286,14 @@ def _discard(attempt: Path) -> None:
 
 
 def _ref(manifest: Manifest) -> Ref:
-    return Ref(manifest["key"], manifest["stage"], manifest["digest"], manifest["path"], manifest["meta"])
+    m = manifest
+    return Ref(m["key"], m["stage"], m["digest"], m["path"], m["meta"], *sizes(m))
+
+
+def sizes(manifest: Manifest) -> tuple[int, int]:
+    """Bytes of an artifact: its arrays decoded, and its files."""
+    nbytes = sum(int(a["dtype"][2:]) * math.prod(a["shape"]) for a in manifest["arrays"].values())
+    return nbytes, sum(size for size, _ in manifest["files"].values())
 
 
 def _difference(label: str, new: Manifest, old: Manifest) -> str:

@@ -29,7 +29,8 @@ from typing import Any
 from pipeline import explain
 from pipeline.code import environment, module_digests
 from pipeline.kernels import guard
-from pipeline.key import digest
+from pipeline.key import Fixed, digest_of
+from pipeline.memory import Meter
 from pipeline.store import Ref, Store
 from stages.declare import Bundle, Params, Stage, check_outputs
 from stages.errors import RilleError
@@ -71,12 +72,32 @@ class Spec:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a task: its artifact, whether it was there, seconds and peak memory (bytes) of the call."""
+    """What became of a task: its artifact, whether it was there, seconds and peak memory (bytes) of the call.
+
+    ``kernel`` are the seconds of the stage itself, ``started`` is when the call began (seconds since 1970); ``memory``
+    and ``rest`` are a :class:`~pipeline.memory.Meter`'s figures, ``first`` says that the process had not run the stage
+    before (it imports, and compiles or loads kernels).
+    """
 
     ref: Ref
     cached: bool
     seconds: float
     peak_rss: int
+    started: float = 0.0
+    kernel: float = 0.0
+    memory: int | None = None
+    rest: int | None = None
+    first: bool = False
+
+
+MANY = 4096
+"""Parameter models whose canonical form is kept."""
+
+_kept: dict[int, tuple[Params, Fixed]] = {}
+"""By the id of the model, which is held so that the id stays its own."""
+
+_run: set[str] = set()
+"""Modules of the stages that this process has run."""
 
 
 @cache
@@ -107,15 +128,31 @@ def recipe(spec: Spec, refs: Refs) -> dict[str, Any]:
     }
 
 
+def key_of(spec: Spec, made: Mapping[str, Any]) -> str:
+    """Key of a recipe: ``digest(made)``, with what many tasks share put into its canonical form only once."""
+    kept = _kept.get(id(spec.params))
+    if kept is None or kept[0] is not spec.params:
+        kept = _kept[id(spec.params)] = (spec.params, Fixed(spec.params, f"{spec.label}.params"))
+        if len(_kept) > MANY:
+            _kept.clear()
+    return digest_of({**made, "params": kept[1], **_shared(spec.module)}, spec.label)
+
+
+@cache
+def _shared(module: str) -> dict[str, Fixed]:
+    """What all tasks of a stage have in common."""
+    return {"code": Fixed(module_digests(module)), "env": Fixed(environment(resolve(module).requires))}
+
+
 def ensure(root: Path | str, spec: Spec, refs: Refs, *, key: str | None = None, force: bool = False) -> Outcome:
     """Give the artifact of a task, computing and committing it where it is absent (or ``force`` is set).
 
     ``key`` is what the client expects; a worker that would compute another thing refuses. Failures of input and
     output (``OSError``, ``TimeoutError``) are tried three times; what a stage raises otherwise is not tried again.
     """
-    begin = time.perf_counter()
+    begin, started = time.perf_counter(), time.time()
     made = recipe(spec, refs)
-    own = digest(made, spec.label)
+    own = key_of(spec, made)
     if key is not None and key != own:
         raise CodeChangedError(
             f"{spec.label}: source code or packages of the worker are not those the run began with",
@@ -125,10 +162,14 @@ def ensure(root: Path | str, spec: Spec, refs: Refs, *, key: str | None = None, 
     for trial in range(TRIES):
         try:
             ref = None if force else store.lookup(spec.stage.name, own)
-            cached = ref is not None
-            if ref is None:
-                ref = _compute(store, spec, refs, own, made)
-            return Outcome(ref, cached, time.perf_counter() - begin, _peak_rss())
+            if ref is not None:
+                return Outcome(ref, True, time.perf_counter() - begin, _peak_rss(), started)
+            first = spec.module not in _run
+            with Meter() as meter:
+                ref, kernel = _compute(store, spec, refs, own, made)
+            seconds = time.perf_counter() - begin
+            _run.add(spec.module)
+            return Outcome(ref, False, seconds, _peak_rss(), started, kernel, meter.memory, meter.rest, first)
         except (OSError, TimeoutError) as error:
             if isinstance(error, PERMANENT) or trial == TRIES - 1:
                 raise
@@ -136,12 +177,13 @@ def ensure(root: Path | str, spec: Spec, refs: Refs, *, key: str | None = None, 
     raise AssertionError("unreachable")
 
 
-def _compute(store: Store, spec: Spec, refs: Refs, key: str, made: Mapping[str, Any]) -> Ref:
+def _compute(store: Store, spec: Spec, refs: Refs, key: str, made: Mapping[str, Any]) -> tuple[Ref, float]:
     stage = spec.stage
     inputs = {p: [store.open(r) for r in ref] if isinstance(ref, list) else store.open(ref) for p, ref in refs.items()}
     started = time.time()
     begin = time.perf_counter()
     result = stage.run(spec.params, {**spec.args, **spec.hints}, inputs)
+    kernel = time.perf_counter() - begin
     if not isinstance(result, Bundle):
         raise TypeError(f"{stage.name}: run gave a {type(result).__name__}, not a Bundle")
     check_outputs(stage, result)
@@ -152,12 +194,12 @@ def _compute(store: Store, spec: Spec, refs: Refs, key: str, made: Mapping[str, 
         "host": {"name": platform.node(), "machine": platform.machine(), "cpus": os.cpu_count()},
         "python": platform.python_version(),
         "started": started,
-        "seconds": time.perf_counter() - begin,
+        "seconds": kernel,
         "peak_rss": _peak_rss(),
     }
     ref = store.commit(stage, key, result, label=spec.label, provenance=json.loads(json.dumps(provenance)))
     explain.remember(store, stage.name, spec.label, key)
-    return ref
+    return ref, kernel
 
 
 def _peak_rss() -> int:

@@ -6,12 +6,12 @@ import shutil
 import time
 from collections.abc import Collection, Iterator
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
-from pipeline.artifact import damage
+from pipeline.artifact import DamagedError, LazyArrays, array_digests, damage, output_digest
 from pipeline.code import tree_digest
-from pipeline.store import Store
+from pipeline.store import Manifest, Store
 
 GRACE = 24 * 3600.0
 """Seconds before an attempt without a manifest counts as an orphan: no single task takes a day."""
@@ -34,15 +34,19 @@ class Cleared:
     artifacts: int = 0
     orphans: int = 0
     bytes: int = 0
+    stages: dict[str, list[int]] = field(default_factory=dict)
+    """Number and bytes of the artifacts, by stage."""
 
 
-def verify(store: Store) -> tuple[int, list[Damage]]:
+def verify(store: Store, *, deep: bool = False) -> tuple[int, list[Damage]]:
     """Compare every file of every artifact with its recorded checksum; damaged ones are set aside.
+
+    ``deep`` decodes every chunk as well and compares the digests (SHA-256) of what was computed.
 
     Returns the number of sound artifacts, and the damaged ones.
     """
     sound, found = 0, []
-    for stage, key in _artifacts(store):
+    for stage, key in artifacts(store):
         manifest = store.manifest(stage, key)
         if manifest is None and not (store.home(stage, key) / "manifest.json").exists():
             continue  # cleared away, or set aside by a run, just now
@@ -50,6 +54,7 @@ def verify(store: Store) -> tuple[int, list[Damage]]:
             reason, label = "manifest.json is not readable", ""
         else:
             reason = damage(store.root / manifest["path"], manifest["files"], lambda _: True)
+            reason = reason or (_decoded(store, manifest) if deep else "")
             label = manifest["label"]
         if reason:
             store.set_aside(stage, key, manifest, reason)
@@ -57,6 +62,18 @@ def verify(store: Store) -> tuple[int, list[Damage]]:
         else:
             sound += 1
     return sound, found
+
+
+def _decoded(store: Store, manifest: Manifest) -> str:
+    """What is wrong with the decoded arrays or the metadata of an artifact; empty if nothing."""
+    try:
+        digests = array_digests(LazyArrays(store.root / manifest["path"], manifest, lambda _: None))
+    except DamagedError as error:
+        return error.message
+    wrong = [name for name, found in digests.items() if found != manifest["arrays"][name]["sha256"]]
+    if wrong:
+        return f"{', '.join(wrong)} decoded to another digest"
+    return "" if output_digest(digests, manifest["meta"]) == manifest["digest"] else "the metadata have another digest"
 
 
 def gc(store: Store, keep: Collection[str], *, grace: float = GRACE, dry_run: bool = False) -> Cleared:
@@ -69,9 +86,9 @@ def gc(store: Store, keep: Collection[str], *, grace: float = GRACE, dry_run: bo
     cleared = Cleared()
     limit = time.time() - grace
     kept = set(keep)
-    for home in sorted(store.root.glob("artifacts/*/*")):
+    for home in sorted(store.root.glob("artifacts/*/*/*")):
         _clear_home(store, home, home.name in kept, limit, cleared, dry_run)
-    for path in (*store.root.glob("*.tmp"), *store.root.glob("labels/*/*.tmp")):
+    for path in (*store.root.glob("*.tmp"), *store.root.glob("labels/*/*/*.tmp")):
         if _written(path) <= limit:
             cleared.orphans += 1
             _remove(path, cleared, dry_run)
@@ -84,12 +101,15 @@ def gc(store: Store, keep: Collection[str], *, grace: float = GRACE, dry_run: bo
 
 def _clear_home(store: Store, home: Path, kept: bool, limit: float, cleared: Cleared, dry_run: bool) -> None:
     published = home / "manifest.json"
-    manifest = store.manifest(home.parent.name, home.name)
+    manifest = store.manifest(home.parents[1].name, home.name)
     mine = home / Path(manifest["path"]).name if manifest else None
     if mine is not None and not kept and _written(published) <= limit:
         cleared.artifacts += 1
+        before = cleared.bytes
         _remove(published, cleared, dry_run)
         _remove(mine, cleared, dry_run)
+        stage = cleared.stages.setdefault(home.parents[1].name, [0, 0])
+        stage[0], stage[1] = stage[0] + 1, stage[1] + cleared.bytes - before
     for path in (*home.glob("a-*"), *home.glob("m-*.tmp")):
         if path != mine and _written(path) <= limit:
             cleared.orphans += 1
@@ -99,9 +119,10 @@ def _clear_home(store: Store, home: Path, kept: bool, limit: float, cleared: Cle
             home.rmdir()  # only where nothing is left
 
 
-def _artifacts(store: Store) -> Iterator[tuple[str, str]]:
-    for path in sorted(store.root.glob("artifacts/*/*/manifest.json")):
-        yield path.parent.parent.name, path.parent.name
+def artifacts(store: Store) -> Iterator[tuple[str, str]]:
+    """Stage and key of everything committed."""
+    for path in sorted(store.root.glob("artifacts/*/*/*/manifest.json")):
+        yield path.parents[2].name, path.parent.name
 
 
 def _written(path: Path) -> float:

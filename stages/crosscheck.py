@@ -20,7 +20,7 @@ import pycolmap
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from stages.declare import Array, Bundle, Inputs, Params, Stage
+from stages.declare import Array, Bundle, Inputs, Memory, Params, Stage
 from stages.geometry import Camera, Rig
 
 PIXEL_CENTRE = 0.5
@@ -305,4 +305,5 @@ STAGE = Stage(
     ),
     requires=("numpy", "pycolmap", "opencv-python-headless"),
     run=_run,
+    memory=Memory(factor=10.0, result=0.0, lower=("crosscheck.window", "crosscheck.max_image_size")),
 )

@@ -59,13 +59,34 @@ Inputs = Mapping[str, Any]
 """Port name to a :class:`Bundle`, or to a list of them for a port declared with a trailing ``*``."""
 
 
+Size = Callable[[Any, Mapping[str, Any], Mapping[str, Any]], float]
+"""``size(params, args, metas)``: bytes of work that the inputs' own bytes do not show (``metas``: meta by port)."""
+
+
+@dataclass(frozen=True)
+class Memory:
+    """What a task is guessed to need while none was measured, what it grows with, and what makes it smaller.
+
+    The guess is ``fixed`` bytes, and ``factor`` more for each byte of input (decoded arrays of all inputs, and what
+    ``size`` adds); ``result`` is the guess of decoded bytes of result a byte of input. ``lower`` names the parameters
+    to change where a task is too large, as the user writes them (``hfvm.preset``).
+    """
+
+    fixed: float = 50e6
+    factor: float = 6.0
+    result: float = 1.0
+    lower: tuple[str, ...] = ()
+    size: Size | None = None
+
+
 @dataclass(frozen=True)
 class Stage:
     """Declaration of one stage; every stage module holds one as ``STAGE``.
 
     ``run(params, args, inputs)`` gets the tunable parameters, what identifies this task (JSON-able: frame numbers,
     a rig ...), and the upstream bundles by port. A port ``name*`` takes a list, ``name?`` may be absent.
-    ``requires`` names the distributions whose exact version can change the result.
+    ``requires`` names the distributions whose exact version can change the result. ``memory`` never enters a key by
+    itself: it serves the plan and the admission of tasks.
     """
 
     name: str
@@ -76,6 +97,7 @@ class Stage:
     outputs: tuple[Array, ...]
     requires: tuple[str, ...]
     run: Callable[[Any, Mapping[str, Any], Inputs], Bundle]
+    memory: Memory = Memory()
 
 
 def check_outputs(stage: Stage, bundle: Bundle) -> None:

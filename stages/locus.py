@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
-from stages.declare import Array, Bundle, Inputs, Params, Stage
+from stages.declare import Array, Bundle, Inputs, Memory, Params, Stage
 from stages.errors import ConfigError, DegenerateError, InputError
 from stages.geometry import Rig, RigidTransform
 from stages.ground import view_ground
@@ -314,6 +314,16 @@ def _in_world(
     return T_world_left, lattice, z_range
 
 
+def _size(params: LocusParams, args: Mapping[str, Any], metas: Mapping[str, Any]) -> float:
+    """Bytes of the surface's arrays: four of float32."""
+    if args["frame"] == "world":
+        lattice = Lattice.from_dict(metas["local"]["lattice"])
+    else:
+        cell = params.cell_size or metas.get("reference", metas["level"])["cell_size"]
+        lattice = local_lattice(Rig.from_dict(metas["rig"]["rig"]), metas["level"], cell, params)
+    return 16.0 * lattice.rows * lattice.cols
+
+
 def _median(array: Float32) -> float | None:
     values = array[np.isfinite(array)]
     return float(np.median(values)) if values.size else None
@@ -337,4 +347,5 @@ STAGE = Stage(
     ),
     requires=("numpy", "numba"),
     run=_run,
+    memory=Memory(lower=("locus.cell_size", "locus.extent"), size=_size),
 )

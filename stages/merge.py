@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from stages.declare import Array, Bundle, Inputs, Params, Stage
+from stages.declare import Array, Bundle, Inputs, Memory, Params, Stage
 from stages.errors import InputError
 from stages.lattice import Lattice
 
@@ -200,4 +200,5 @@ STAGE = Stage(
     ),
     requires=("numpy",),
     run=_run,
+    memory=Memory(lower=("locus.cell_size",)),
 )

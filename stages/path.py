@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 from scipy.ndimage import distance_transform_edt
 
-from stages.declare import Array, Bundle, Inputs, Params, Stage
+from stages.declare import Array, Bundle, Inputs, Memory, Params, Stage
 from stages.errors import InputError
 from stages.lattice import Lattice
 from stages.risk import HAZARDOUS, SAFE, UNKNOWN, window_cells
@@ -349,4 +349,5 @@ STAGE = Stage(
     ),
     requires=("numpy", "scipy"),
     run=_run,
+    memory=Memory(factor=12.0, lower=("locus.cell_size",)),
 )

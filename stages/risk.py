@@ -36,7 +36,7 @@ from numba import njit
 from numpy.typing import NDArray
 from pydantic import Field
 
-from stages.declare import Array, Bundle, Inputs, Params, Stage
+from stages.declare import Array, Bundle, Inputs, Memory, Params, Stage
 from stages.holes import close_holes
 from stages.lattice import Lattice, mosaic, union
 from stages.vehicle import DEFAULT_VEHICLE, Vehicle
@@ -229,4 +229,5 @@ STAGE = Stage(
     ),
     requires=("numpy", "numba"),
     run=_run,
+    memory=Memory(factor=12.0, lower=("locus.cell_size",)),
 )

@@ -116,7 +116,7 @@ STAGE = Stage(
         Array("poses", ("frame", "row", "col"), "float64", "m", "pose [R | t] of the left camera", frame="world"),
         Array(
             "covariance",
-            ("frame", "parameter", "parameter"),
+            ("frame", "parameter", "parameter_b"),
             "float64",
             "m^2, m rad, rad^2",
             "covariance of position and rotation vector",

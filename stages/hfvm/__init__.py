@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages import pyramid
-from stages.declare import AnyArray, Array, Bundle, Inputs, Stage
+from stages.declare import AnyArray, Array, Bundle, Inputs, Memory, Stage
 from stages.hfvm import (
     accurate,
     consistency,
@@ -278,4 +278,5 @@ STAGE = Stage(
     ),
     requires=("numpy", "numba", "opencv-python-headless"),
     run=_run,
+    memory=Memory(fixed=30e6, factor=10.0, result=1.6, lower=("hfvm.preset", "hfvm.finest")),
 )

@@ -15,11 +15,14 @@ from typing import Any
 import numpy as np
 import pytest
 import rasterio
+import xarray
 
 from datasets.registry import open_sequence
 from pipeline import run, standing
 from pipeline.dag import Graph
 from pipeline.ledger import read
+from pipeline.store import Store
+from pipeline.upkeep import artifacts
 from stages.errors import ConfigError
 
 SMALL = (
@@ -73,6 +76,26 @@ def test_outputs_are_all_there_and_sound(cold: Path) -> None:
     assert report["stages"]["hfvm"]["computed"] == 3
 
 
+@pytest.mark.filterwarnings("ignore:Failed to open Zarr store with consolidated metadata:RuntimeWarning")
+def test_xarray_opens_the_artifact_of_every_stage_with_dimensions_and_units(cold: Path) -> None:
+    store = Store(cold / "cache")
+    opened: set[str] = set()
+    for stage, key in artifacts(store):
+        manifest = store.manifest(stage, key)
+        if manifest is None or stage in opened:
+            continue
+        opened.add(stage)
+        arrays = manifest["arrays"]
+        with xarray.open_zarr(store.root / manifest["path"]) as data:
+            assert set(data.variables) == set(arrays), stage
+            for name, about in arrays.items():
+                assert data[name].attrs["units"] == about["units"] != "", (stage, name)
+                assert data[name].attrs["long_name"] == about["long_name"] != "", (stage, name)
+                assert list(data[name].dims) == about["dims"] == list(dict.fromkeys(about["dims"])), (stage, name)
+                assert list(data[name].shape) == about["shape"], (stage, name)
+    assert opened == {row["stage"] for row in read(latest(cold) / "ledger.jsonl")}
+
+
 def test_the_same_again_computes_nothing(cold: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def no_worker(*args: object, **kw: object) -> None:
         raise AssertionError("a worker was started")
@@ -119,7 +142,7 @@ def test_what_is_found_damaged_when_it_is_drawn_is_computed_again(
 ) -> None:
     assert run.reconstruct(options(cold)) == 0
     before = digests(cold)
-    chunk = next((cold / "cache").glob("artifacts/merge/*/a-*/ortho/c.0.0"))
+    chunk = next((cold / "cache").glob("artifacts/merge/*/*/a-*/ortho/c.0.0"))
     chunk.write_bytes(bytes(chunk.stat().st_size))
     assert run.reconstruct(options(cold, fresh=True)) == 0
     assert "is damaged" in capsys.readouterr().err
@@ -173,7 +196,7 @@ def test_two_workers_killed_on_the_way_give_the_same_bits(cold: Path, tmp_path: 
     command += ["--cache", str(tmp_path / "cache"), "--runs", str(tmp_path / "runs")]
     process = subprocess.Popen(command, start_new_session=True, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
     until = time.monotonic() + 120
-    while time.monotonic() < until and not list((tmp_path / "cache").glob("artifacts/hfvm/*/manifest.json")):
+    while time.monotonic() < until and not list((tmp_path / "cache").glob("artifacts/hfvm/*/*/manifest.json")):
         time.sleep(0.05)
     os.killpg(process.pid, signal.SIGKILL)
     process.wait()

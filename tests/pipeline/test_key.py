@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.key import canonical, digest
+from pipeline.key import Fixed, canonical, digest, digest_of
 from stages.declare import Params
 
 scalars = st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5)
@@ -113,3 +113,12 @@ def test_models_count_with_their_defaults_filled():
     assert digest(Outer()) == digest(Outer(count=3, inner=Inner(step=0.5)))
     assert digest(Outer()) != digest(Outer(inner=Inner(step=0.25)))
     assert digest(Outer()) != digest(Twin())
+
+
+def test_parts_kept_in_canonical_form_change_no_digest():
+    parts = {"b": [1.0, {"z": 1, "a": (2, None)}], 'a"': "x", "c": {"k": float("nan")}}
+    kept = {name: Fixed(part) if name != "b" else part for name, part in parts.items()}
+    assert digest_of(kept) == digest_of(parts) == digest(parts)
+    assert digest_of({**parts, "c": {"k": 1}}) != digest(parts)
+    with pytest.raises(TypeError, match=r"value\.d is a object"):
+        digest_of({"d": object()})

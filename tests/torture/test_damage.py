@@ -29,12 +29,12 @@ WAYS = {
 }
 
 KINDS = {
-    "manifest": "artifacts/numbers/{key}/manifest.json",
-    "group": "artifacts/numbers/{key}/a-*/zarr.json",
-    "array": "artifacts/numbers/{key}/a-*/values/zarr.json",
-    "chunk": "artifacts/numbers/{key}/a-*/values/c.0.0",
-    "other chunk": "artifacts/numbers/{key}/a-*/mask/c.0.0",
-    "label": "labels/numbers/numbers%2F1.json",
+    "manifest": "artifacts/numbers/*/{key}/manifest.json",
+    "group": "artifacts/numbers/*/{key}/a-*/zarr.json",
+    "array": "artifacts/numbers/*/{key}/a-*/values/zarr.json",
+    "chunk": "artifacts/numbers/*/{key}/a-*/values/c.0.0",
+    "other chunk": "artifacts/numbers/*/{key}/a-*/mask/c.0.0",
+    "label": "labels/numbers/*/numbers%2F1.json",
     "seconds": "seconds.json",
 }
 READ = ("manifest", "array", "chunk")
@@ -166,7 +166,7 @@ def test_disk_full_at_a_step(small, tmp_path, row, monkeypatch, code, every):
             orphans += cleared.orphans
             assert cleared.artifacts == 0
             left = [p for p in cache.rglob("*") if p.suffix == ".tmp" or ".partial" in p.name]
-            left += [p for p in cache.glob("artifacts/*/*/a-*") if p.parent.name not in found]
+            left += [p for p in cache.glob("artifacts/*/*/*/a-*") if p.parent.name not in found]
             assert not left, (faults.steps[step - 1], left)
             graph, result = run(cache)
             wrong += look.wrong(digests(graph), small["digests"])
@@ -217,7 +217,7 @@ def test_read_only_cache(small, tmp_path, row, monkeypatch):
     shutil.copytree(small["cache"], warm)
     shutil.copytree(small["cache"], part)
     missing = small["nodes"]["total/1"]["key"]
-    shutil.rmtree(part / "artifacts" / "total" / missing)
+    shutil.rmtree(part / "artifacts" / "total" / missing[:2] / missing)
     before = {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()}
     with monkeypatch.context() as patch:
         Faults(patch, tmp_path, code=errno.EROFS, fail_at=1, onwards=True)

@@ -53,7 +53,7 @@ def test_three_runs_on_one_cold_cache_with_clearing_beside(programs, calm, tmp_p
             wrong += look.wrong({n["key"]: n["digest"] for n in run["nodes"].values()}, calm["digests"])
         wrong += look.wrong(look.decoded(cache), calm["digests"])
         lost += sorted(set(calm["digests"]) ^ set(look.published(cache)))
-        for home in cache.glob("artifacts/*/*"):
+        for home in cache.glob("artifacts/*/*/*"):
             assert len(list(home.iterdir())) == 2, "one manifest, one attempt"
         shutil.rmtree(cache)
     expected = range(tries * total, RUNS * tries * total + 1)
@@ -69,9 +69,9 @@ def test_clearing_takes_old_artifacts_from_under_runs(programs, calm, tmp_path, 
         shutil.copytree(calm["cache"], cache)
         rng = random.Random(trial)
         old = time.time() - 1e6
-        for path in [*cache.glob("artifacts/*/*/*"), *cache.glob("artifacts/*/*")]:
+        for path in [*cache.glob("artifacts/*/*/*/*"), *cache.glob("artifacts/*/*/*")]:
             os.utime(path, (old, old))
-        for home in cache.glob("artifacts/scale/*"):  # so that some must be computed from what may go
+        for home in cache.glob("artifacts/scale/*/*"):  # so that some must be computed from what may go
             if rng.random() < 0.7:
                 shutil.rmtree(home)
         found, cleared = together(programs, cache, runs, EXECUTORS, grace=3600)

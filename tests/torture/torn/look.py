@@ -16,8 +16,8 @@ def published(cache):
     """Digest by key of every artifact whose manifest and files are whole."""
     store = Store(cache)
     found = {}
-    for path in Path(cache).glob("artifacts/*/*/manifest.json"):
-        manifest = store.manifest(path.parent.parent.name, path.parent.name)
+    for path in Path(cache).glob("artifacts/*/*/*/manifest.json"):
+        manifest = store.manifest(path.parents[2].name, path.parent.name)
         if manifest and not damage(store.root / manifest["path"], manifest["files"], lambda _: True):
             found[manifest["key"]] = manifest["digest"]
     return found
@@ -25,15 +25,15 @@ def published(cache):
 
 def manifests(cache):
     """Keys that have a manifest, sound or not."""
-    return {path.parent.name for path in Path(cache).glob("artifacts/*/*/manifest.json")}
+    return {path.parent.name for path in Path(cache).glob("artifacts/*/*/*/manifest.json")}
 
 
 def decoded(cache):
     """Digest by key, taken over what is really read from the disk."""
     store = Store(cache)
     found = {}
-    for path in Path(cache).glob("artifacts/*/*/manifest.json"):
-        ref = store.lookup(path.parent.parent.name, path.parent.name)
+    for path in Path(cache).glob("artifacts/*/*/*/manifest.json"):
+        ref = store.lookup(path.parents[2].name, path.parent.name)
         if ref is not None:
             bundle = store.open(ref)
             found[ref.key] = output_digest(array_digests(bundle.arrays), bundle.meta)
