@@ -184,6 +184,7 @@ class _Run:
             raise
         else:
             self._close(kill=False)
+            self.store.note(h.ref for h in self.graph.nodes if h.ref is not None)
             remember_seconds(self.store, self.result.counts)
         finally:
             self.result.seconds = time.perf_counter() - begin
@@ -197,6 +198,7 @@ class _Run:
 
     def _loop(self) -> None:
         self.progress.open(self.graph, recall_seconds(self.store), self.jobs or cores())
+        self.store.survey()
         while True:
             self._settle()
             self._submit()
@@ -270,14 +272,16 @@ class _Run:
     def _submit(self) -> None:
         """Keep every worker busy, and no more: what is not begun can still be left out."""
         if self.missing and not self.stopped and self.executor is None:
-            self.executor = make(self.executor_kind, self.jobs, self.store.root)
+            self.executor = make(self.executor_kind, self.jobs, self.store.location)
             self.result.executor_started = True
         while self.missing and not self.stopped and self.executor is not None and self.executor.idle():
             handle = self.graph.nodes[self._next()]
             self.begun.add(handle.stage)
             handle.status = "running"
             self.progress.running(handle)
-            self.executor.submit(handle.key, self.store.root, handle.spec, handle.refs(), handle.stage in self.force)
+            self.executor.submit(
+                handle.key, self.store.location, handle.spec, handle.refs(), handle.stage in self.force
+            )
         if self.stopped:
             for key in (*(self.graph.nodes[index].key for index in self.missing), *self.patients):
                 for handle in self.flying.pop(key, ()):
@@ -328,7 +332,7 @@ class _Run:
         if not isinstance(error, DamagedError | GoneError) or self.put_back[handle.key] >= HEALS or self.stopped:
             return False
         self.put_back[handle.key] += 1
-        absent = {h.key: h for h in handle.upstream() if self.store.lookup(h.stage, h.key) is None}
+        absent = {h.key: h for h in handle.upstream() if self.store.lookup(h.stage, h.key, fresh=True) is None}
         for key, source in absent.items():
             source.reason = "its artifact was found damaged, or gone, when it was read"
             if key not in self.flying:

@@ -22,7 +22,8 @@ from pipeline import config as configuration
 from pipeline.artifact import DamagedError
 from pipeline.code import remember
 from pipeline.dag import Graph
-from pipeline.store import GoneError, Store
+from pipeline.location import Location, hints_folder, locate
+from pipeline.store import GoneError, at
 from stages.declare import Bundle
 from stages.errors import ConfigError, RilleError
 
@@ -46,7 +47,7 @@ class Options:
     keep_going: bool = False
     force: frozenset[str] = frozenset()
     runs: Path = Path("runs")
-    cache: Path = Path(".rille/cache")
+    cache: Location = Path(".rille/cache")
     progress: str = "auto"
     fresh: bool = False
 
@@ -90,7 +91,7 @@ def settings(options: Options) -> tuple[Sequence, Any, str]:
     given = configuration.read_toml(options.config) if options.config else {}
     configuration.merge(given, configuration.parse_assignments(options.assignments))
     for_dataset, for_stages = configuration.split_dataset(given)
-    sequence = open_sequence(options.sequence, for_dataset, options.cache / "files.json")
+    sequence = open_sequence(options.sequence, for_dataset, hints_folder(locate(options.cache)) / "files.json")
     vehicle, source = {}, "default rover of the program (neither the sequence nor the user states one)"
     if sequence.vehicle is not None:
         vehicle, source = {"vehicle": sequence.vehicle.model_dump()}, f"sequence {sequence.name}"
@@ -123,9 +124,11 @@ def reconstruct(options: Options) -> int:
 
 def _reconstruct(options: Options) -> int:
     from pipeline import driver, progress
+    from pipeline.executor import known
     from pipeline.reconstruct import Reconstruction
 
     _known_stages(options.force)
+    known(options.executor)
     started = datetime.now(UTC)
     sequence, config, vehicle_source = settings(options)
     warn(sequence)
@@ -134,7 +137,7 @@ def _reconstruct(options: Options) -> int:
     folder = _make_folder(options.runs / sequence.name, started, text + repr(frames))
     (folder / "config.toml").write_text(text, encoding="utf-8")
 
-    graph, store = Graph(), Store(options.cache)
+    graph, store = Graph(), at(options.cache)
     products = Reconstruction(graph, sequence, config, frames).build()
     result = driver.run(
         graph,
@@ -248,7 +251,7 @@ def _versions() -> dict[str, str]:
     return {"python": python} | {name: version(name) for name in DISTRIBUTIONS}
 
 
-def export_dataset(name: str, directory: Path, assignments: tuple[str, ...], cache: Path) -> int:
+def export_dataset(name: str, directory: Path, assignments: tuple[str, ...], cache: Location) -> int:
     """Write a built-in sequence as plain files; rendering is cached like any other work."""
     from datasets.export import export
     from datasets.protocol import Source
@@ -258,7 +261,7 @@ def export_dataset(name: str, directory: Path, assignments: tuple[str, ...], cac
     for_dataset, others = configuration.split_dataset(configuration.parse_assignments(assignments))
     if others:
         raise ConfigError(f"--set {next(iter(others))}: not a section of a sequence", remedy="set mockup.key=value")
-    store = Store(cache)
+    store = at(cache)
 
     def materialise(source: Source) -> Bundle:
         return store.open(artifact(source))
@@ -272,25 +275,25 @@ def export_dataset(name: str, directory: Path, assignments: tuple[str, ...], cac
     return COMPLETE
 
 
-def verify_cache(cache: Path) -> int:
+def verify_cache(cache: Location) -> int:
     """Compare checksums of all artifacts; exit code 1 where one is damaged."""
     from pipeline.upkeep import verify
 
-    sound, damaged = verify(Store(cache))
+    sound, damaged = verify(at(cache))
     for found in damaged:
         print(f"rille: {found}", file=sys.stderr)
     print(f"{sound} artifacts are sound, {len(damaged)} damaged")
     return FAILED if damaged else COMPLETE
 
 
-def collect_garbage(cache: Path, runs: Path, *, dry_run: bool) -> int:
+def collect_garbage(cache: Location, runs: Path, *, dry_run: bool) -> int:
     """Remove what no run in ``runs`` refers to."""
     from pipeline import ledger, upkeep
 
     kept: set[str] = set()
     for path in sorted(runs.glob("*/*/ledger.jsonl")):
         kept |= ledger.keys(path)
-    cleared = upkeep.gc(Store(cache), kept, dry_run=dry_run)
+    cleared = upkeep.gc(at(cache), kept, dry_run=dry_run)
     verb = "would remove" if dry_run else "removed"
     print(f"{verb} {cleared.artifacts} artifacts and {cleared.orphans} leftovers, {cleared.bytes / 2**20:.1f} MiB")
     return COMPLETE
