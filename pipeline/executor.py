@@ -61,6 +61,9 @@ REPLACED = 12
 WATCH = 0.5
 """Seconds between looks at the memory of the workers."""
 
+CONNECT = 10.0
+"""Seconds until a scheduler must have answered."""
+
 LOOK = 2.0
 """Seconds between looks at the scheduler of others."""
 
@@ -247,7 +250,7 @@ class _Client(_Futures):
         from distributed import Client
 
         try:
-            self._client = Client(address, set_as_default=False, timeout=10)
+            self._client = Client(address, set_as_default=False, timeout=CONNECT)
         except (OSError, TimeoutError, ValueError) as error:
             raise ConfigError(f"no dask scheduler answers at {address}", remedy="check the address") from error
         super().__init__(max(1, sum(self._client.nthreads().values())))

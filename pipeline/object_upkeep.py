@@ -20,7 +20,7 @@ AT_ONCE = 200
 
 def verify(store: ObjectStore) -> Iterator[tuple[str, str, str, str]]:
     """Stage, key, label and reason of each artifact; the reason is empty if it is sound, else it was set aside."""
-    for entry in list(store.bucket.list("manifests")):
+    for entry in store.bucket.list("manifests"):
         stage, key = _stage_and_key(entry.path)
         found = store.bucket.get(entry.path)
         if found is None:
@@ -56,7 +56,7 @@ def gc(store: ObjectStore, keep: Collection[str], *, grace: float, dry_run: bool
             doomed.append(entry)
     manifests: list[Entry] = []
     live, gone = {}, set()
-    for entry in list(store.bucket.list("manifests")):
+    for entry in store.bucket.list("manifests"):
         stage, key = _stage_and_key(entry.path)
         manifest = store.manifest(stage, key)
         if key in kept or entry.modified > limit:

@@ -47,8 +47,8 @@ def s3():
 class Proxy:
     """Passes requests on to a server, but for what ``trouble(method, path, count)`` says.
 
-    It says ``refuse`` (503, not passed on), ``deafen`` (passed on, but 503 is answered), ``blind`` (``If-None-Match`` is
-    taken away), ``cut`` (the connection is closed within the answer), or nothing.
+    It says ``refuse`` (503, not passed on), ``deafen`` (passed on, but 503 is answered), ``blind`` (``If-None-Match``
+    is taken away), ``cut`` (the connection is closed within the answer), or nothing.
     """
 
     def __init__(self, port, trouble):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import json
+import os
 import random
 import subprocess
 import sys
@@ -122,12 +123,13 @@ def test_a_damaged_index_is_no_matter(url, right):
         assert result.total().cached == NODES
 
 
-@pytest.mark.parametrize("how", ["refuse", "deafen", "cut"])
+@pytest.mark.parametrize("how", ["refuse", "deafen", pytest.param("cut", marks=pytest.mark.slow)])
 def test_servers_in_trouble_change_nothing(url, right, proxied, how, monkeypatch):
     monkeypatch.setattr(bucket, "BACK_OFF", {**bucket.BACK_OFF, "init_backoff": bucket.timedelta(milliseconds=5)})
     rng = random.Random(how)
     methods = {"refuse": ("GET", "PUT", "POST"), "deafen": ("PUT",), "cut": ("GET",)}[how]
-    proxy = proxied(lambda method, path, count: how if method in methods and rng.random() < 0.25 else "")
+    share = 0.08 if how == "cut" else 0.2
+    proxy = proxied(lambda method, path, count: how if method in methods and rng.random() < share else "")
     for _ in range(2):
         graph, _ = run(url)
         assert digests(graph) == right
@@ -140,7 +142,7 @@ def test_servers_in_trouble_change_nothing(url, right, proxied, how, monkeypatch
 
 def test_a_server_that_ignores_conditions_is_refused(url, proxied):
     proxied(lambda *_: "blind")
-    with pytest.raises(BucketError, match="ignores If-None-Match: of two runs .* one could overwrite"):
+    with pytest.raises(BucketError, match=r"ignores If-None-Match: of two runs .* one could overwrite"):
         at(url)
     with pytest.raises(BucketError, match="ignores If-None-Match"):
         at(url)  # nothing was noted
@@ -162,9 +164,8 @@ def test_of_a_race_one_is_published(url):
         thread.join()
     assert len(refs) == 4
     assert len({r.path for r in refs}) == 1
-    assert {
-        e.path.rsplit("/", 2)[0].split("/a-")[1][:16] for e in store.bucket.list("data") if "values/" in e.path
-    } == {refs[0].path.split("/a-")[1]}
+    attempts = {"/".join(e.path.split("/")[:4]) for e in store.bucket.list("data")}
+    assert attempts == {refs[0].path}, "the losers have cleared up"
     with pytest.raises(NonDeterministicError, match=r"another values than before"):
         commit(store, value=2.0)
 
@@ -207,7 +208,7 @@ def test_a_task_heals_its_damaged_input(url, right):
     store = at(url)
     total = next(h for h in graph.nodes if h.stage == "total")
     scaled = next(h for h in graph.nodes if h.stage == "scale")
-    store.bucket.delete([manifest_path("total", total.key), f"{scaled.ref.path}/values/c.0.0"])
+    store.bucket.delete([manifest_path("total", total.key), f"{scaled.ref.path}/level_0/c.0.0"])
     store.bucket.delete(e.path for e in store.bucket.list("index"))
     healed, result = run(url)
     assert digests(healed) == right
@@ -226,7 +227,7 @@ def test_verify_and_gc(url):
     assert (cleared.artifacts, cleared.orphans) == (1, 1)
     assert not list(store.bucket.list(total.ref.path))
     assert upkeep.verify(store) == (NODES - 1, [])
-    chunk = next(e for e in store.bucket.list("data/scale") if "/values/c" in e.path)
+    chunk = next(e for e in store.bucket.list("data/scale") if "/c.0" in e.path)
     store.bucket.put(chunk.path, b"0" * chunk.size)
     sound, damaged = upkeep.verify(store)
     assert sound == NODES - 2
@@ -244,7 +245,7 @@ def test_no_secret_is_written_anywhere(url, tmp_path, capfd, proxied):
     run(url, ledger=tmp_path / "ledger.jsonl")
     with pytest.raises(BucketError) as wrong:
         at("s3://no-such-bucket/x")
-    said = str(wrong.value) + repr(wrong.value) + capfd.readouterr().err + capfd.readouterr().out
+    said = str(wrong.value) + repr(wrong.value) + "".join(capfd.readouterr())
     stored = at(url).bucket
     contents = [stored.get(e.path)[0] for e in stored.list("")]
     contents += [gzip.decompress(c) for c in contents if c[:2] == b"\x1f\x8b"]
@@ -262,7 +263,7 @@ def rille(url, environment, *words):
 
 def test_each_mistake_is_one_line(port, tmp_path, monkeypatch, proxied, url):
     monkeypatch.setattr(bucket, "HASTY", {**bucket.HASTY, "max_retries": 1})
-    with pytest.raises(BucketError, match=r"bucket missing does not exist at 127\.0\.0\.1:\d+; make it"):
+    with pytest.raises(BucketError, match=r"bucket missing does not exist at 127\.0\.0\.1:\d+: make it"):
         at("s3://missing/x")
     proxied(lambda *_: "refuse")
     with pytest.raises(BucketError, match=r"127\.0\.0\.1:\d+ answers 503 .*SlowDown.* for s3://bucket"):
@@ -270,9 +271,9 @@ def test_each_mistake_is_one_line(port, tmp_path, monkeypatch, proxied, url):
     monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")
     with pytest.raises(BucketError, match=r"no object store answers at 127\.0\.0\.1:9 for .*AWS_ENDPOINT_URL"):
         at(url)
-    assert rille("s3://Bad_Bucket/x", dict(__import__("os").environ)) == (
+    assert rille("s3://Bad_Bucket/x", dict(os.environ)) == (
         2,
-        "rille: 'Bad_Bucket' is no name of a bucket; give --cache s3://bucket/prefix, and credentials in the"
+        "rille: 'Bad_Bucket' is no name of a bucket: give --cache s3://bucket/prefix, and credentials in the"
         " environment (AWS_ACCESS_KEY_ID ...)",
     )
 
