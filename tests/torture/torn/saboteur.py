@@ -1,8 +1,8 @@
 """Kills the process that runs it: while it computes, in its commit, or by its memory; the first times only.
 
 ``what`` is ``task``, ``fsync:3``, ``link:1`` ... (the process dies before that call of the commit), ``linked:1`` (after
-it), ``put:2``, ``create:1``, ``created:1`` (the same of a commit to a bucket), ``poison`` (each time), ``memory`` (it takes more than the worker may have), ``random`` (no death, but another
-result in each process, once two of them are there).
+it), ``put:2``, ``create:1``, ``created:1`` (the same of a commit to a bucket), ``poison`` (each time), ``memory`` (it
+takes more than the worker may have), ``random`` (no death, but another result in each process, once two are there).
 """
 
 import os
