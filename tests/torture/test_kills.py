@@ -7,6 +7,7 @@ import random
 import shutil
 import signal
 import time
+from contextlib import suppress
 
 import psutil
 import pytest
@@ -58,7 +59,8 @@ def torment(program, calm, folder, executor, tries, seed, environment=None):
         while time.monotonic() - begin < limit and program.running():
             time.sleep(0.001)
         over = not program.running()
-        os.killpg(pid, signal.SIGKILL)
+        with suppress(ProcessLookupError):  # it has just ended
+            os.killpg(pid, signal.SIGKILL)
         program.wait()
         if over:
             ended += 1
