@@ -47,8 +47,8 @@ def s3():
 class Proxy:
     """Passes requests on to a server, but for what ``trouble(method, path, count)`` says.
 
-    It says ``refuse`` (503, not passed on), ``deafen`` (passed on, but 503 is answered), ``blind`` (``If-None-Match``
-    is taken away), ``cut`` (the connection is closed within the answer), or nothing.
+    It says ``refuse`` (503, not passed on), ``forbid`` (403), ``deafen`` (passed on, but 503 is answered), ``blind``
+    (``If-None-Match`` is taken away), ``cut`` (the connection is closed within the answer), or nothing.
     """
 
     def __init__(self, port, trouble):
@@ -87,7 +87,9 @@ class Proxy:
         if what == "blind":
             headers = {k: v for k, v in headers.items() if k.lower() != "if-none-match"}
         status, answered, data = 503, {}, b"<Error><Code>SlowDown</Code></Error>"
-        if what != "refuse":
+        if what == "forbid":
+            status, data = 403, b"<Error><Code>InvalidAccessKeyId</Code></Error>"
+        elif what != "refuse":
             upstream = http.client.HTTPConnection("127.0.0.1", self.upstream, timeout=30)
             upstream.request(handler.command, handler.path, body, headers)
             response = upstream.getresponse()

@@ -268,6 +268,9 @@ def test_each_mistake_is_one_line(port, tmp_path, monkeypatch, proxied, url):
     proxied(lambda *_: "refuse")
     with pytest.raises(BucketError, match=r"127\.0\.0\.1:\d+ answers 503 .*SlowDown.* for s3://bucket"):
         at(url)
+    proxied(lambda *_: "forbid")
+    with pytest.raises(BucketError, match=r"127\.0\.0\.1:\d+ refuses the credentials for s3://.*InvalidAccessKeyId"):
+        at(url)
     monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")
     with pytest.raises(BucketError, match=r"no object store answers at 127\.0\.0\.1:9 for .*AWS_ENDPOINT_URL"):
         at(url)
