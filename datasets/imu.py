@@ -17,7 +17,6 @@ from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from datasets.poses import coverage
 from datasets.protocol import Rows
@@ -234,6 +233,8 @@ def stretches(imu: Imu, bias: Floats | None, start: float, end: float) -> list[S
 
 def integrate(times: Floats, rates: Floats) -> Floats:
     """R_first_now (n, 3, 3) of the sensor at each sample, from rates (n, 3), rad/s, in its own axes."""
+    from scipy.spatial.transform import Rotation
+
     steps = 0.5 * (rates[1:] + rates[:-1]) * np.diff(times)[:, None]
     out = np.empty((len(times), 3, 3))
     out[0] = np.eye(3)

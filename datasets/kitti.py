@@ -16,7 +16,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import rq
 
 from datasets import files
 from datasets.protocol import CAMERAS, Sequence, Source
@@ -135,6 +134,8 @@ def read_projections(path: Path, pair: tuple[str, str]) -> tuple[NDArray[np.floa
 
 def decompose(projection: NDArray[np.float64], name: str) -> tuple[NDArray[np.float64], RigidTransform]:
     """K (3, 3) and T_camera_reference of a projection matrix P = K [R | t]."""
+    from scipy.linalg import rq
+
     m = projection[:, :3]
     # written so that NaN-free but singular matrices are refused before anything divides by them
     if abs(np.linalg.det(m)) < 1e-9:

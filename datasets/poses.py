@@ -21,7 +21,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation, Slerp
 
 from datasets.tables import Table, read_table
 from datasets.times import seconds
@@ -83,6 +82,8 @@ def read_poses(path: Path, format: str = "auto", *, unit: str = "auto") -> Timed
     InputError
         The form is not recognised, or a row is not a time and a pose; the message names the line.
     """
+    from scipy.spatial.transform import Rotation
+
     if format not in FORMATS:
         raise InputError(f"format {format!r} of poses is unknown", remedy=f"one of {', '.join(FORMATS)}")
     table = read_table(path, "pose file")
@@ -157,6 +158,8 @@ def _angle_unit(table: Table, columns: Mapping[str, int]) -> str:
 
 def _quaternions(table: Table, columns: Mapping[str, int]) -> Floats:
     """Rotation matrices (n, 3, 3) of unit quaternions."""
+    from scipy.spatial.transform import Rotation
+
     q = table.numbers([columns[name] for name in ("qx", "qy", "qz", "qw")])
     norms = np.linalg.norm(q, axis=1)
     bad = np.flatnonzero(np.abs(norms - 1) > NORM)
@@ -205,6 +208,8 @@ def interpolate(timed: TimedPoses, at: Sequence[float], max_gap: float) -> tuple
     InputError
         The poses have no times, or none of ``at`` lies between the first and the last.
     """
+    from scipy.spatial.transform import Rotation, Slerp
+
     if timed.times is None:
         raise InputError(f"{timed.name} has no times", remedy="give one pose a frame, or a file with times")
     t, wanted = np.array(timed.times), np.asarray(at, dtype=np.float64)

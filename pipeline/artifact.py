@@ -1,4 +1,4 @@
-"""Arrays of one artifact: their digest, and a zarr 3 group on local disk written once and read lazily.
+"""Arrays of one artifact: their digest, and a zarr 3 group written once and read lazily.
 
 The output digest is taken over the *decoded* arrays (type, shape, little-endian bytes, one NaN) and the metadata: a
 change of codec or of chunking changes no key, and an upstream change that does not change a result stops there.
@@ -80,14 +80,19 @@ def _refuse_non_finite(value: Any, where: str) -> None:
         canonical(value, where)
 
 
-def write(folder: Path, stage: Stage, bundle: Bundle) -> dict[str, Any]:
-    """Write the arrays of a bundle as a zarr group; returns their description by name (for the manifest)."""
+def write(place: Any, stage: Stage, bundle: Bundle) -> dict[str, Any]:
+    """Write the arrays of a bundle as a zarr group; returns their description by name (for the manifest).
+
+    ``place`` is a folder, or a store of zarr's.
+    """
     import zarr
     from zarr.codecs import BloscCodec, Crc32cCodec
     from zarr.storage import LocalStore
 
     group = zarr.create_group(
-        store=LocalStore(folder), zarr_format=3, attributes={"stage": stage.name, "meta": dict(bundle.meta)}
+        store=LocalStore(place) if isinstance(place, Path) else place,
+        zarr_format=3,
+        attributes={"stage": stage.name, "meta": dict(bundle.meta)},
     )
     described = {}
     for name in sorted(bundle.arrays):
@@ -190,25 +195,31 @@ class LazyArrays(Mapping[str, AnyArray]):
         return self._loaded[name]
 
     def _read(self, name: str) -> AnyArray:
-        import zarr
-        from zarr.storage import LocalStore
-
         files = {f: v for f, v in self._manifest["files"].items() if f.startswith(f"{name}/")}
-        wrong = damage(self._folder, files, lambda file: file.endswith("zarr.json"))
+        values, wrong = self._load(name, files)
         if not wrong:
-            try:
-                array = zarr.open_array(store=LocalStore(self._folder / name, read_only=True), mode="r")
-                values = np.asarray(array[...])
-                # zarr fills in for a chunk that has gone while it read (by clearing up, say) without a word
-                if not (wrong := damage(self._folder, files, lambda _: False)):
-                    return values
-            except Exception as error:  # a chunk's own checksum, and whatever a vanishing file leads to
-                wrong = damage(self._folder, files, lambda _: True)
-                if not wrong:
-                    raise
-                wrong = f"{wrong} ({type(error).__name__} on reading)"
+            return values
         self._damaged(wrong)
         raise DamagedError(
             f"artifact {self._manifest['label']} ({self._manifest['stage']}) is damaged, {wrong}; it was set aside",
             remedy="run again: it will be recomputed",
         )
+
+    def _load(self, name: str, files: Mapping[str, list[Any]]) -> tuple[AnyArray, str]:
+        """Values of an array, and what is wrong with its files, in words."""
+        import zarr
+        from zarr.storage import LocalStore
+
+        nothing: AnyArray = np.empty(0)
+        if wrong := damage(self._folder, files, lambda file: file.endswith("zarr.json")):
+            return nothing, wrong
+        try:
+            array = zarr.open_array(store=LocalStore(self._folder / name, read_only=True), mode="r")
+            values = np.asarray(array[...])
+            # zarr fills in for a chunk that has gone while it read (by clearing up, say) without a word
+            return values, damage(self._folder, files, lambda _: False)
+        except Exception as error:  # a chunk's own checksum, and whatever a vanishing file leads to
+            wrong = damage(self._folder, files, lambda _: True)
+            if not wrong:
+                raise
+            return nothing, f"{wrong} ({type(error).__name__} on reading)"

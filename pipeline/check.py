@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from datasets.protocol import CAMERAS, Sequence, Source
 from pipeline import config as configuration
 from pipeline import verdicts
-from pipeline.store import Ref, Store
+from pipeline.location import Location
+from pipeline.store import Ref, Store, at
 from pipeline.task import Refs, Spec, ensure
 from pipeline.verdicts import Look, Verdict
 from stages.declare import NoParams
@@ -49,7 +50,7 @@ def check(
     *,
     output: Path | None = None,
     frames: tuple[int, ...] | None = None,
-    cache: Path = Path(".rille/cache"),
+    cache: Location = Path(".rille/cache"),
 ) -> int:
     """Judge a sequence: prints a line for each finding, and draws the first pair's epipolar residuals.
 
@@ -70,7 +71,7 @@ def check(
         The picture cannot be written.
     """
     chosen = frames if frames is not None else tuple(range(sequence.frames))
-    inspection = Inspection(sequence, chosen, Store(cache))
+    inspection = Inspection(sequence, chosen, at(cache))
     path = output if output is not None else Path(f"{sequence.name}-check.png")
     found = []
     for verdict in inspection.verdicts():
@@ -244,7 +245,9 @@ class Inspection:
 
     def _source(self, source: Source, label: str) -> Ref:
         refs: Refs = {port: self._shared_source(upstream) for port, upstream in source.inputs.items()}
-        return ensure(self.store.root, Spec(source.module, label, source.params, source.args, source.hints), refs).ref
+        return ensure(
+            self.store.location, Spec(source.module, label, source.params, source.args, source.hints), refs
+        ).ref
 
     def _shared_source(self, source: Source) -> Ref:
         """What is the same for all frames (a rendered scene) is looked up once."""
@@ -257,7 +260,7 @@ class Inspection:
 
     def _node(self, name: str, label: str, args: Mapping[str, Any], **inputs: Ref) -> Ref:
         params = getattr(self.config, name, NoParams())
-        return ensure(self.store.root, Spec(configuration.STAGE_MODULES[name], label, params, args), inputs).ref
+        return ensure(self.store.location, Spec(configuration.STAGE_MODULES[name], label, params, args), inputs).ref
 
 
 def draw(path: Path, name: str, frame: str, match: Match) -> None:

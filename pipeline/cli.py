@@ -29,20 +29,23 @@ app.command(datasets_app)
 app.command(cache_app)
 
 Assignments = Annotated[list[str] | None, Parameter(name=["--set", "-s"], negative="", consume_multiple=False)]
-CacheFolder = Annotated[Path | None, Parameter(name="--cache")]
+CacheFolder = Annotated[str | None, Parameter(name="--cache")]
 Progress = Literal["auto", "bar", "plain", "json", "quiet"]
 
 
-def cache_folder(given: Path | None) -> Path:
-    """Folder of the artifact cache: ``--cache``, else ``RILLE_CACHE``, else ``.rille/cache`` here."""
-    return given or Path(os.environ.get("RILLE_CACHE") or ".rille/cache")
+def cache_folder(given: str | Path | None) -> Path | str:
+    """Where the artifact cache is: ``--cache``, else ``RILLE_CACHE``, else ``.rille/cache`` here."""
+    from pipeline.location import locate
+
+    return locate(given or os.environ.get("RILLE_CACHE") or Path(".rille/cache"))
 
 
-def _prepare(cache: Path | None) -> None:
+def _prepare(cache: str | None) -> None:
     """Threads and the place of compiled kernels, before NumPy and numba are imported."""
     from pipeline.environment import prepare_environment
+    from pipeline.location import hints_folder
 
-    prepare_environment(cache_folder(cache))
+    prepare_environment(hints_folder(cache_folder(cache)))
 
 
 @app.command
@@ -53,7 +56,7 @@ def reconstruct(
     config: Path | None = None,
     frames: str | None = None,
     jobs: int | None = None,
-    executor: Literal["processes", "threads", "inline"] = "processes",
+    executor: str = "processes",
     keep_going: Annotated[bool, Parameter(negative="")] = False,
     force: Annotated[list[str] | None, Parameter(negative="", consume_multiple=False)] = None,
     fresh: Annotated[bool, Parameter(negative="")] = False,
@@ -79,7 +82,7 @@ def reconstruct(
     jobs
         Worker processes; the number of cores by default.
     executor
-        Where tasks run.
+        Where tasks run: processes, threads, inline, or the address of a dask scheduler, tcp://host:port.
     keep_going
         Finish what does not depend on a failed task; the exit status is then 3.
     force
@@ -91,7 +94,7 @@ def reconstruct(
     runs
         Folder of results; each run makes RUNS/sequence/run-id.
     cache
-        Folder of cached artifacts; RILLE_CACHE or .rille/cache by default.
+        Folder of cached artifacts, or s3://bucket/prefix; RILLE_CACHE or .rille/cache by default.
     progress
         How progress is shown on stderr.
     quiet
@@ -156,7 +159,7 @@ def plan(
     memory_limit
         Memory that the run may take in all, for example 6GB or 75%; nine tenths of what is free by default.
     cache
-        Folder of cached artifacts; RILLE_CACHE or .rille/cache by default.
+        Folder of cached artifacts, or s3://bucket/prefix; RILLE_CACHE or .rille/cache by default.
     verbose
         Each task with its reason.
     debug
@@ -252,7 +255,7 @@ def check(
     frames
         Frame range START:STOP[:STEP]; all by default.
     cache
-        Folder of cached artifacts; RILLE_CACHE or .rille/cache by default.
+        Folder of cached artifacts, or s3://bucket/prefix; RILLE_CACHE or .rille/cache by default.
     debug
         Show tracebacks.
     """
@@ -415,7 +418,7 @@ def export(
     assignments
         A parameter of the sequence, for example mockup.seed=3; may be repeated.
     cache
-        Folder of cached artifacts; RILLE_CACHE or .rille/cache by default.
+        Folder of cached artifacts, or s3://bucket/prefix; RILLE_CACHE or .rille/cache by default.
     debug
         Show tracebacks.
     """
@@ -439,7 +442,7 @@ def verify(
     deep
         Decode every chunk too, and compare the digests of the arrays.
     cache
-        Folder of cached artifacts; RILLE_CACHE or .rille/cache by default.
+        Folder of cached artifacts, or s3://bucket/prefix; RILLE_CACHE or .rille/cache by default.
     debug
         Show tracebacks.
     """
@@ -461,7 +464,7 @@ def gc(
     Parameters
     ----------
     cache
-        Folder of cached artifacts; RILLE_CACHE or .rille/cache by default.
+        Folder of cached artifacts, or s3://bucket/prefix; RILLE_CACHE or .rille/cache by default.
     runs
         Folder of the runs that are kept.
     dry_run

@@ -200,6 +200,7 @@ class _Run:
             raise
         else:
             self._close(kill=False)
+            self.store.note(h.ref for h in self.graph.nodes if h.ref is not None)
             remember_seconds(self.store, self.result.counts)
             costs.remember(self.store, self.graph.nodes)
         finally:
@@ -216,6 +217,7 @@ class _Run:
 
     def _loop(self) -> None:
         self.progress.open(self.graph, recall_seconds(self.store), self.jobs or cores())
+        self.store.survey()
         while True:
             self._settle()
             self._submit()
@@ -306,7 +308,7 @@ class _Run:
             handle.status = "running"
             self.progress.running(handle)
             refs = {p: [_light(r) for r in g] if isinstance(g, list) else _light(g) for p, g in handle.refs().items()}
-            self.executor.submit(handle.key, self.store.root, handle.spec, refs, handle.stage in self.force)
+            self.executor.submit(handle.key, self.store.location, handle.spec, refs, handle.stage in self.force)
         if self.stopped:
             for key in (*(handle.key for handle in self.missing), *self.patients):
                 for handle in self.flying.pop(key, ()):
@@ -328,7 +330,8 @@ class _Run:
         few = shares.workers < jobs and self.executor_kind == "processes"
         amounts = {k: round(v) for k, v in vars(shares).items() if math.isfinite(v)}
         self.ledger.run(executor=self.executor_kind, jobs=shares.workers, **amounts)
-        self.executor = make(self.executor_kind, shares.workers if few else self.jobs, self.store.root, shares.limit)
+        workers = shares.workers if few else self.jobs
+        self.executor = make(self.executor_kind, workers, self.store.location, shares.limit)
         self.result.executor_started = True
 
     def _land(self, key: str, outcome: Outcome | Failed) -> None:
@@ -362,7 +365,7 @@ class _Run:
         if not isinstance(error, DamagedError | GoneError) or self.put_back[handle.key] >= HEALS or self.stopped:
             return False
         self.put_back[handle.key] += 1
-        absent = {h.key: h for h in handle.upstream() if self.store.lookup(h.stage, h.key) is None}
+        absent = {h.key: h for h in handle.upstream() if self.store.lookup(h.stage, h.key, fresh=True) is None}
         for key, source in absent.items():
             source.reason = "its artifact was found damaged, or gone, when it was read"
             if key not in self.flying:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from pipeline.code import remember_in, tree_digest
 from pipeline.kernels import guard
+from pipeline.location import hints_folder, locate
 
 SINGLE = ("OMP", "OPENBLAS", "MKL", "NUMBA", "BLIS", "VECLIB_MAXIMUM", "NUMEXPR")
 
@@ -21,17 +22,19 @@ def worker_environment(cache: Path | str) -> dict[str, str]:
     Numba does not notice that a callee in another file has changed (numba#1833), hence a folder for each state of
     the sources.
     """
+    cache = hints_folder(locate(cache))
     return {f"{name}_NUM_THREADS": "1" for name in SINGLE} | {
         "OPENCV_FOR_THREADS_NUM": "1",
         # a killed worker's semaphores are the tracker's business, not the user's
         "PYTHONWARNINGS": os.environ.get("PYTHONWARNINGS") or "ignore:resource_tracker:UserWarning",
-        "NUMBA_CACHE_DIR": str(Path(cache).absolute() / "numba" / tree_digest()[:32]),
+        "NUMBA_CACHE_DIR": str(cache.absolute() / "numba" / tree_digest()[:32]),
     }
 
 
 def prepare_environment(cache: Path | str) -> None:
     """Set this process up to run stages itself, and to start workers."""
-    remember_in(Path(cache) / "sources.json")
+    cache = hints_folder(locate(cache))
+    remember_in(cache / "sources.json")
     environment = worker_environment(cache)
     os.environ.update(environment)
     guard()

@@ -3,8 +3,8 @@
 :func:`make` is the one factory. All executors are the same three verbs: ``submit``, ``wait``, ``close``. Worker
 processes are spawned (never forked) with one thread each, for isolation: a crash takes one task with it, and a task
 that has taken three workers along is given up (:class:`WorkerDiedError`). Who ran when a worker died is told by a mark
-on the disk; tasks that only waited there begin elsewhere, as often as it takes. A cluster given by address must see the
-store's folder; tasks refuse to run where source code or packages are not those of the client.
+on the disk; tasks that only waited there begin elsewhere, as often as it takes. A cluster given by address is examined
+first (:mod:`pipeline.cluster`).
 
 Programs call :func:`pipeline.environment.prepare_environment` first thing, so that this process and the workers run
 alike.
@@ -17,6 +17,7 @@ import math
 import os
 import pickle
 import queue
+import re
 import shutil
 import signal
 import tempfile
@@ -35,7 +36,9 @@ from typing import Any, Protocol
 
 import psutil
 
+from pipeline import cluster
 from pipeline.environment import cores, prepare_environment, worker_environment
+from pipeline.location import Location
 from pipeline.task import Outcome, Refs, Spec, ensure
 from stages.errors import ConfigError, RilleError
 
@@ -58,6 +61,12 @@ REPLACED = 12
 
 WATCH = 0.5
 """Seconds between looks at the memory of the workers."""
+
+CONNECT = 10.0
+"""Seconds until a scheduler must have answered."""
+
+LOOK = 2.0
+"""Seconds between looks at the scheduler of others."""
 
 GRACE = 2.0
 """Seconds that workers get to leave at the end of a run before they are killed."""
@@ -98,7 +107,7 @@ class Executor(Protocol):
     def idle(self) -> bool:
         """Whether one more task would start at once."""
 
-    def submit(self, key: str, root: Path, spec: Spec, refs: Refs, force: bool) -> None:
+    def submit(self, key: str, root: Location, spec: Spec, refs: Refs, force: bool) -> None:
         """Start a task."""
 
     def wait(self) -> Landed:
@@ -108,7 +117,22 @@ class Executor(Protocol):
         """Leave nothing behind; ``kill`` does not wait for what is running."""
 
 
-def make(kind: str, jobs: int | None, cache: Path, memory: float = math.inf) -> Executor:
+KINDS = ("processes", "threads", "inline")
+
+
+def known(kind: str) -> None:
+    """Refuse an executor that there is not, before any work.
+
+    Raises
+    ------
+    ConfigError
+        It is neither one of the kinds nor an address.
+    """
+    if kind not in KINDS and not re.fullmatch(r"(tcp|tls)://[^/\s]+:\d+", kind):
+        raise ConfigError(f"executor {kind!r} is unknown", remedy=f"{', '.join(KINDS)} or tcp://host:port")
+
+
+def make(kind: str, jobs: int | None, cache: Location, memory: float = math.inf) -> Executor:
     """``inline``, ``threads``, ``processes`` or a scheduler's address; ``jobs`` None is one a core.
 
     A worker process of our own that takes more than ``memory`` bytes by itself is ended, before the system ends others.
@@ -118,6 +142,7 @@ def make(kind: str, jobs: int | None, cache: Path, memory: float = math.inf) -> 
     ConfigError
         There is no such executor, or the cluster does not answer.
     """
+    known(kind)
     if jobs is not None and jobs < 1:
         raise ConfigError(f"{jobs} jobs are not permitted", remedy="give 1 or more")
     jobs = jobs or cores()
@@ -127,12 +152,10 @@ def make(kind: str, jobs: int | None, cache: Path, memory: float = math.inf) -> 
         return Threads(jobs)
     if kind == "processes":
         return Processes(jobs, cache, memory)
-    if "://" in kind:
-        return Cluster(kind)
-    raise ConfigError(f"executor {kind!r} is unknown", remedy="inline, threads, processes or tcp://host:port")
+    return Cluster(kind, cache)
 
 
-def _attempt(key: str, root: Path, spec: Spec, refs: Refs, force: bool) -> Outcome | Failed:
+def _attempt(key: str, root: Location, spec: Spec, refs: Refs, force: bool) -> Outcome | Failed:
     try:
         return ensure(root, spec, refs, key=key, force=force)
     except Exception as error:
@@ -149,7 +172,7 @@ class Inline:
         """Whether nothing waits to be run."""
         return self._task is None
 
-    def submit(self, key: str, root: Path, spec: Spec, refs: Refs, force: bool) -> None:
+    def submit(self, key: str, root: Location, spec: Spec, refs: Refs, force: bool) -> None:
         """Remember the task; :meth:`wait` runs it."""
         self._task = (key, root, spec, refs, force)
 
@@ -180,7 +203,7 @@ class _Futures:
         """Whether a worker has nothing to do."""
         return len(self._flying) < self._slots
 
-    def submit(self, key: str, root: Path, spec: Spec, refs: Refs, force: bool) -> None:
+    def submit(self, key: str, root: Location, spec: Spec, refs: Refs, force: bool) -> None:
         """Start the task."""
         self._flying[key] = future = self._start(key, root, spec, refs, force)
         future.add_done_callback(lambda _: self._done.put(key))
@@ -222,24 +245,24 @@ class Threads(_Futures):
             _leave_unsaid()
 
 
-class Cluster(_Futures):
-    """A dask scheduler that is running already."""
+class _Client(_Futures):
+    """Tasks on workers of a dask scheduler."""
 
     def __init__(self, address: str) -> None:
         _quiet()
         from distributed import Client
 
         try:
-            self._client = Client(address, set_as_default=False, timeout=10)
+            self._client = Client(address, set_as_default=False, timeout=CONNECT)
         except (OSError, TimeoutError, ValueError) as error:
             raise ConfigError(f"no dask scheduler answers at {address}", remedy="check the address") from error
         super().__init__(max(1, sum(self._client.nthreads().values())))
         self._submitted = 0
 
-    def _start(self, key: str, *task: Any) -> Any:
+    def _send(self, task: tuple[Any, ...], key: str, run: Any, *first: Any) -> Any:
         self._submitted += 1
         name = f"{task[1].label}-{key[:12]}-{os.getpid()}-{self._submitted}"
-        return self._client.submit(_attempt, key, *task, key=name, pure=False, priority=-self._submitted)
+        return self._client.submit(run, *first, key, *task, key=name, pure=False, priority=-self._submitted)
 
     def _result(self, key: str, future: Any) -> Outcome | Failed | None:
         from distributed import KilledWorker
@@ -253,13 +276,55 @@ class Cluster(_Futures):
 
     def close(self, kill: bool = False) -> None:
         """Leave the cluster as it is."""
-        self._client.close(timeout=GRACE)
+        with suppress(Exception):
+            self._client.close(timeout=HURRY if kill else GRACE)
 
 
-class Processes(Cluster):
+class Cluster(_Client):
+    """A dask scheduler that is running already, with workers like this process (:mod:`pipeline.cluster`)."""
+
+    def __init__(self, address: str, cache: Location) -> None:
+        super().__init__(address)
+        self._identity, self._cache = tuple(cluster.identity().items()), cache
+        self._presence, self._looked = cluster.Presence(self._client, address), time.monotonic()
+        try:
+            while not (threads := self._presence.threads()):
+                time.sleep(WATCH)
+            cluster.examine(self._client, cache)
+        except BaseException:
+            self.close(kill=True)
+            raise
+        self._slots = threads
+
+    def _start(self, key: str, *task: Any) -> Any:
+        return self._send(task, key, _elsewhere, self._identity)
+
+    def _result(self, key: str, future: Any) -> Outcome | Failed | None:
+        if future.status in ("cancelled", "lost"):
+            raise self._presence.gone()
+        return super()._result(key, future)
+
+    def _watch(self) -> None:
+        if time.monotonic() - self._looked > LOOK:
+            self._slots = self._presence.threads() or self._slots
+            self._looked = time.monotonic()
+
+
+def _elsewhere(
+    identity: tuple[tuple[str, str], ...], key: str, root: Location, spec: Spec, refs: Refs, force: bool
+) -> Outcome | Failed:
+    """Run a task on a worker that somebody else has started."""
+    try:
+        cluster.ready(identity, root)
+    except Exception as error:
+        return Failed.of(error)
+    return _attempt(key, root, spec, refs, force)
+
+
+class Processes(_Client):
     """Worker processes of our own, one thread each."""
 
-    def __init__(self, jobs: int, cache: Path, memory: float = math.inf) -> None:
+    def __init__(self, jobs: int, cache: Location, memory: float = math.inf) -> None:
         _quiet()
         import dask
         from distributed import LocalCluster
@@ -310,11 +375,8 @@ class Processes(Cluster):
         self._slots = jobs  # all of them, though some may still be starting
 
     def _start(self, key: str, *task: Any) -> Any:
-        self._submitted += 1
         self._tasks[key] = task
-        name = f"{task[1].label}-{key[:12]}-{os.getpid()}-{self._submitted}"
-        mark = self._marks / key
-        return self._client.submit(_marked, mark, key, *task, key=name, pure=False, priority=-self._submitted)
+        return self._send(task, key, _marked, self._marks / key)
 
     def _killed(self, key: str, task: str) -> Failed | None:
         """Begin it anew, unless it ran on too many workers that died."""
@@ -375,7 +437,7 @@ class Processes(Cluster):
         shutil.rmtree(self._marks, ignore_errors=True)
 
 
-def _marked(mark: Path, key: str, root: Path, spec: Spec, refs: Refs, force: bool) -> Outcome | Failed:
+def _marked(mark: Path, key: str, root: Location, spec: Spec, refs: Refs, force: bool) -> Outcome | Failed:
     """Run a task under a mark that outlives the process."""
     mark.write_text(str(os.getpid()))
     try:

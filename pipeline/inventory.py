@@ -9,8 +9,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from pipeline import pins, runs
+from pipeline.location import Location
 from pipeline.memory import words
-from pipeline.store import Store, sizes
+from pipeline.store import Store, at, sizes
 from pipeline.upkeep import artifacts
 
 NOBODY = "-"
@@ -69,9 +70,9 @@ def describe(rows: list[Holding], pinned: Iterable[str]) -> Iterable[str]:
     yield from (f"pinned: {name}" for name in pinned)
 
 
-def ls(cache: Path, folder: Path, *, as_json: bool) -> int:
+def ls(cache: Location, folder: Path, *, as_json: bool) -> int:
     """Print what the cache holds."""
-    store = Store(cache)
+    store = at(cache)
     rows = holdings(store, folder)
     if as_json:
         print(json.dumps([asdict(r) for r in rows], indent=1))

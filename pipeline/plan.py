@@ -20,7 +20,7 @@ from pipeline.memory import words
 from pipeline.progress import recall_seconds
 from pipeline.reconstruct import Reconstruction
 from pipeline.run import Options, choose_frames, settings, warn
-from pipeline.store import Store
+from pipeline.store import at
 
 REASONS = 3
 """Different reasons told a stage; ``verbose`` tells each task's."""
@@ -37,7 +37,7 @@ def plan(options: Options, *, verbose: bool = False) -> int:
     sequence, config, _ = settings(options)
     warn(sequence)
     frames = choose_frames(options.frames, sequence.frames)
-    graph, store = Graph(), Store(options.cache)
+    graph, store = Graph(), at(options.cache)
     Reconstruction(graph, sequence, config, frames).build()
     result = driver.run(graph, store, dry=True, force=options.force)
     result.check()

@@ -22,7 +22,8 @@ from pipeline import config as configuration
 from pipeline.artifact import DamagedError
 from pipeline.code import remember
 from pipeline.dag import Graph
-from pipeline.store import GoneError, Store
+from pipeline.location import Location, hints_folder, locate
+from pipeline.store import GoneError, at
 from stages.declare import Bundle
 from stages.errors import ConfigError, RilleError
 
@@ -46,7 +47,7 @@ class Options:
     keep_going: bool = False
     force: frozenset[str] = frozenset()
     runs: Path = Path("runs")
-    cache: Path = Path(".rille/cache")
+    cache: Location = Path(".rille/cache")
     progress: str = "auto"
     fresh: bool = False
     memory_limit: str | None = None
@@ -91,7 +92,7 @@ def settings(options: Options) -> tuple[Sequence, Any, str]:
     given = configuration.read_toml(options.config) if options.config else {}
     configuration.merge(given, configuration.parse_assignments(options.assignments))
     for_dataset, for_stages = configuration.split_dataset(given)
-    sequence = open_sequence(options.sequence, for_dataset, options.cache / "files.json")
+    sequence = open_sequence(options.sequence, for_dataset, hints_folder(locate(options.cache)) / "files.json")
     vehicle, source = {}, "default rover of the program (neither the sequence nor the user states one)"
     if sequence.vehicle is not None:
         vehicle, source = {"vehicle": sequence.vehicle.model_dump()}, f"sequence {sequence.name}"
@@ -124,9 +125,11 @@ def reconstruct(options: Options) -> int:
 
 def _reconstruct(options: Options) -> int:
     from pipeline import driver, memory, progress
+    from pipeline.executor import known
     from pipeline.reconstruct import Reconstruction
 
     _known_stages(options.force)
+    known(options.executor)
     started = datetime.now(UTC)
     sequence, config, vehicle_source = settings(options)
     warn(sequence)
@@ -135,7 +138,7 @@ def _reconstruct(options: Options) -> int:
     folder = _make_folder(options.runs / sequence.name, started, text + repr(frames))
     (folder / "config.toml").write_text(text, encoding="utf-8")
 
-    graph, store = Graph(), Store(options.cache)
+    graph, store = Graph(), at(options.cache)
     products = Reconstruction(graph, sequence, config, frames).build()
     result = driver.run(
         graph,
@@ -261,7 +264,7 @@ def _versions() -> dict[str, str]:
     return {"python": python} | {name: version(name) for name in DISTRIBUTIONS}
 
 
-def export_dataset(name: str, directory: Path, assignments: tuple[str, ...], cache: Path) -> int:
+def export_dataset(name: str, directory: Path, assignments: tuple[str, ...], cache: Location) -> int:
     """Write a built-in sequence as plain files; rendering is cached like any other work."""
     from datasets.export import export
     from datasets.protocol import Source
@@ -271,7 +274,7 @@ def export_dataset(name: str, directory: Path, assignments: tuple[str, ...], cac
     for_dataset, others = configuration.split_dataset(configuration.parse_assignments(assignments))
     if others:
         raise ConfigError(f"--set {next(iter(others))}: not a section of a sequence", remedy="set mockup.key=value")
-    store = Store(cache)
+    store = at(cache)
 
     def materialise(source: Source) -> Bundle:
         return store.open(artifact(source))
@@ -285,23 +288,23 @@ def export_dataset(name: str, directory: Path, assignments: tuple[str, ...], cac
     return COMPLETE
 
 
-def verify_cache(cache: Path, *, deep: bool = False) -> int:
+def verify_cache(cache: Location, *, deep: bool = False) -> int:
     """Compare checksums of all artifacts; exit code 1 where one is damaged."""
     from pipeline.upkeep import verify
 
-    sound, damaged = verify(Store(cache), deep=deep)
+    sound, damaged = verify(at(cache), deep=deep)
     for found in damaged:
         print(f"rille: {found.label or found.key[:12]} ({found.stage}): {found.reason}; set aside", file=sys.stderr)
     print(f"{sound} artifacts are sound, {len(damaged)} damaged")
     return FAILED if damaged else COMPLETE
 
 
-def collect_garbage(cache: Path, runs: Path, *, dry_run: bool) -> int:
+def collect_garbage(cache: Location, runs: Path, *, dry_run: bool) -> int:
     """Remove what no run in ``runs`` and no pinned run refers to; a dry run says what that is."""
     from pipeline import ledger, pins, upkeep
     from pipeline.memory import words
 
-    store = Store(cache)
+    store = at(cache)
     kept, ledgers = pins.keys(store), sorted(runs.glob("*/*/ledger.jsonl"))
     for path in ledgers:
         kept |= ledger.keys(path)
@@ -314,19 +317,19 @@ def collect_garbage(cache: Path, runs: Path, *, dry_run: bool) -> int:
     return COMPLETE
 
 
-def pin(cache: Path, text: str, runs: Path) -> int:
+def pin(cache: Location, text: str, runs: Path) -> int:
     """Keep the artifacts of a run."""
     from pipeline import pins
     from pipeline import runs as kept
 
     run = kept.find(text, runs)
-    print(f"pinned {kept.name(run)}: {pins.pin(Store(cache), run)} artifacts")
+    print(f"pinned {kept.name(run)}: {pins.pin(at(cache), run)} artifacts")
     return COMPLETE
 
 
-def unpin(cache: Path, text: str) -> int:
+def unpin(cache: Location, text: str) -> int:
     """Keep them no longer."""
     from pipeline import pins
 
-    print(f"unpinned {pins.unpin(Store(cache), text)}")
+    print(f"unpinned {pins.unpin(at(cache), text)}")
     return COMPLETE

@@ -25,7 +25,7 @@ import os
 import shutil
 import time
 import uuid
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,6 +34,7 @@ from typing import Any
 import google_crc32c
 
 from pipeline.artifact import LazyArrays, array_digests, damage, fsync, output_digest, seal, write
+from pipeline.location import Location, locate
 from stages.declare import Bundle, Stage
 from stages.errors import RilleError
 
@@ -75,18 +76,34 @@ class Ref:
 
 
 class Store:
-    """Artifacts under ``root`` (made at the first commit)."""
+    """Artifacts under ``root`` (made at the first commit).
+
+    ``location`` is what another process opens the store by (:func:`at`). Of a store in a bucket ``root`` is the local
+    folder of its hints.
+    """
+
+    location: Location
 
     def __init__(self, root: Path | str) -> None:
         self.root = Path(root).absolute()
+        self.location = self.root
 
     def __fspath__(self) -> str:
         return str(self.root)
 
-    def lookup(self, stage: str, key: str) -> Ref | None:
-        """The artifact of a key, its file sizes checked; a damaged one is set aside and counts as absent."""
+    def survey(self) -> None:
+        """Before many look-ups: a store far away finds out at once what is there, with few requests."""
+
+    def note(self, refs: Iterable[Ref]) -> None:
+        """At the end of a run: what it used, for later surveys."""
+
+    def lookup(self, stage: str, key: str, *, fresh: bool = False) -> Ref | None:
+        """The artifact of a key, its file sizes checked; a damaged one is set aside and counts as absent.
+
+        ``fresh`` does not rely on a survey.
+        """
         manifest = self._sound(stage, key)
-        return None if manifest is None else _ref(manifest)
+        return None if manifest is None else reference(manifest)
 
     def _sound(self, stage: str, key: str) -> Manifest | None:
         home = self._home(stage, key)  # no Path: a plan looks tens of thousands up
@@ -174,19 +191,19 @@ class Store:
                     _discard(attempt)
                 raise
         if there is None:
-            return _ref(json.loads(json.dumps(manifest)))
+            return reference(json.loads(json.dumps(manifest)))
         shutil.rmtree(attempt, ignore_errors=True)
         if there["digest"] != digest:
-            raise NonDeterministicError(_difference(label or key[:12], manifest, there))
-        return _ref(there)
+            raise NonDeterministicError(difference(label or key[:12], manifest, there))
+        return reference(there)
 
     def _publish(self, home: Path, manifest: Manifest) -> Manifest | None:
         """Link the manifest into place; returns the sound one that was there before, if any."""
-        body = json.dumps(manifest, allow_nan=False).encode()
+        data = frame(manifest)
         temporary = home / f"m-{uuid.uuid4().hex[:16]}.tmp"
         try:
             with temporary.open("wb") as file:
-                file.write(_HEAD % google_crc32c.value(body) + body + b"}\n")
+                file.write(data)
                 file.flush()
                 os.fsync(file.fileno())
             for _ in range(3):
@@ -215,12 +232,7 @@ class Store:
     def _read_manifest(self, home: Path | str) -> Manifest:
         """Raises ValueError where the content is not what was written."""
         with open(f"{home}/manifest.json", "rb") as file:
-            data = file.read()
-        body = data[_HEAD_SIZE:-2]
-        if data != _HEAD % google_crc32c.value(body) + body + b"}\n":
-            raise ValueError(f"{home}/manifest.json is damaged")
-        manifest: Manifest = json.loads(body)
-        return manifest
+            return unframe(file.read())
 
     def set_aside(self, stage: str, key: str, manifest: Manifest | None, reason: str) -> None:
         """Move a damaged artifact out of the way, manifest first. Best effort: a cache may be read-only.
@@ -267,6 +279,38 @@ class Store:
             raise
 
 
+def at(cache: Path | str) -> Store:
+    """The store at a location, a folder or ``s3://bucket/prefix``.
+
+    Raises
+    ------
+    RilleError
+        There is no such place, or it may not be used.
+    """
+    where = locate(cache)
+    if isinstance(where, Path):
+        return Store(where)
+    from pipeline.objects import ObjectStore
+
+    return ObjectStore(where)
+
+
+def frame(manifest: Manifest) -> bytes:
+    """A manifest as it is stored, with its checksum."""
+    body = json.dumps(manifest, allow_nan=False).encode()
+    head: bytes = _HEAD % google_crc32c.value(body)
+    return head + body + b"}\n"
+
+
+def unframe(data: bytes) -> Manifest:
+    """Raises ValueError where it is not what was written."""
+    body = data[_HEAD_SIZE:-2]
+    if data != _HEAD % google_crc32c.value(body) + body + b"}\n":
+        raise ValueError("the manifest is damaged")
+    manifest: Manifest = json.loads(body)
+    return manifest
+
+
 def _make(attempt: Path) -> None:
     """New folder of an attempt; clearing up may take an empty home away just as it is made."""
     for _ in range(100):
@@ -285,7 +329,8 @@ def _discard(attempt: Path) -> None:
             return
 
 
-def _ref(manifest: Manifest) -> Ref:
+def reference(manifest: Manifest) -> Ref:
+    """What a manifest is referred to by."""
     m = manifest
     return Ref(m["key"], m["stage"], m["digest"], m["path"], m["meta"], *sizes(m))
 
@@ -296,7 +341,8 @@ def sizes(manifest: Manifest) -> tuple[int, int]:
     return nbytes, sum(size for size, _ in manifest["files"].values())
 
 
-def _difference(label: str, new: Manifest, old: Manifest) -> str:
+def difference(label: str, new: Manifest, old: Manifest) -> str:
+    """What two results of one key differ in, in words."""
     names = sorted({*new["arrays"], *old["arrays"]})
     other = [n for n in names if new["arrays"].get(n, {}).get("sha256") != old["arrays"].get(n, {}).get("sha256")]
     what = ", ".join(other + (["meta"] if new["meta"] != old["meta"] else []))

@@ -31,7 +31,7 @@ from pipeline.code import environment, module_digests
 from pipeline.kernels import guard
 from pipeline.key import Fixed, digest_of
 from pipeline.memory import Meter
-from pipeline.store import Ref, Store
+from pipeline.store import Ref, Store, at
 from stages.declare import Bundle, Params, Stage, check_outputs
 from stages.errors import RilleError
 
@@ -158,7 +158,7 @@ def ensure(root: Path | str, spec: Spec, refs: Refs, *, key: str | None = None, 
             f"{spec.label}: source code or packages of the worker are not those the run began with",
             remedy="run again, and edit nothing meanwhile",
         )
-    store = Store(root)
+    store = at(root)
     for trial in range(TRIES):
         try:
             ref = None if force else store.lookup(spec.stage.name, own)

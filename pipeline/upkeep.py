@@ -9,8 +9,10 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from pipeline import object_upkeep
 from pipeline.artifact import DamagedError, LazyArrays, array_digests, damage, output_digest
 from pipeline.code import tree_digest
+from pipeline.objects import ObjectStore
 from pipeline.store import Manifest, Store
 
 GRACE = 24 * 3600.0
@@ -45,6 +47,9 @@ def verify(store: Store, *, deep: bool = False) -> tuple[int, list[Damage]]:
 
     Returns the number of sound artifacts, and the damaged ones.
     """
+    if isinstance(store, ObjectStore):
+        judged = list(object_upkeep.verify(store))
+        return sum(not reason for *_, reason in judged), [Damage(*found) for found in judged if found[-1]]
     sound, found = 0, []
     for stage, key in artifacts(store):
         manifest = store.manifest(stage, key)
@@ -83,6 +88,8 @@ def gc(store: Store, keep: Collection[str], *, grace: float = GRACE, dry_run: bo
     so that an interruption leaves an orphan and never half an artifact. ``keep`` are the keys of the kept runs
     (:func:`pipeline.ledger.keys`).
     """
+    if isinstance(store, ObjectStore):
+        return Cleared(*object_upkeep.gc(store, keep, grace=grace, dry_run=dry_run))
     cleared = Cleared()
     limit = time.time() - grace
     kept = set(keep)
@@ -121,6 +128,9 @@ def _clear_home(store: Store, home: Path, kept: bool, limit: float, cleared: Cle
 
 def artifacts(store: Store) -> Iterator[tuple[str, str]]:
     """Stage and key of everything committed."""
+    if isinstance(store, ObjectStore):
+        yield from object_upkeep.artifacts(store)
+        return
     for path in sorted(store.root.glob("artifacts/*/*/*/manifest.json")):
         yield path.parents[2].name, path.parent.name
 

@@ -11,8 +11,9 @@ from typing import Any
 from pipeline import explain, ledger, runs
 from pipeline.config import STAGE_MODULES, stage
 from pipeline.key import digest
+from pipeline.location import Location
 from pipeline.memory import words
-from pipeline.store import Store
+from pipeline.store import Store, at
 
 SHORT = 12
 """Hexadecimal digits of a digest that are shown."""
@@ -21,10 +22,10 @@ INPUTS = 8
 """Inputs of one port that are listed; more are counted."""
 
 
-def why(text: str, label: str, *, folder: Path, cache: Path) -> int:
+def why(text: str, label: str, *, folder: Path, cache: Location) -> int:
     """Print all that is known of one task of a run."""
     run = runs.find(text, folder)
-    for line in describe(run, label, Store(cache)):
+    for line in describe(run, label, at(cache)):
         print(line)
     return 0
 

@@ -16,7 +16,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
@@ -102,6 +101,8 @@ def grey_bytes(image: NDArray[Any]) -> NDArray[np.uint8]:
 
 def extract(image: NDArray[Any], valid: NDArray[Any], params: CrosscheckParams) -> Features:
     """SIFT features of an image (row, col) where ``valid`` (row, col) is not 0."""
+    import pycolmap
+
     height, width = image.shape
     grey = grey_bytes(image)
     reduction = max(width, height) / params.max_image_size
@@ -120,6 +121,8 @@ def extract(image: NDArray[Any], valid: NDArray[Any], params: CrosscheckParams) 
 
 
 def _extractor(params: CrosscheckParams) -> Any:
+    import pycolmap
+
     options = pycolmap.FeatureExtractionOptions()
     options.use_gpu, options.num_threads = False, 1
     options.sift.max_num_features, options.sift.first_octave = params.max_features, params.first_octave
@@ -178,6 +181,8 @@ def image_pairs(frames: int, span: int) -> list[tuple[int, int]]:
 
 
 def _run(params: CrosscheckParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+    import pycolmap
+
     frames, rig = [int(f) for f in args["frames"]], Rig.from_dict(args["rig"])
     pycolmap.logging.minloglevel = 3  # fatal: what goes wrong is said by the result
     bundles = itertools.chain.from_iterable(zip(inputs["left"], inputs["right"], strict=True))
@@ -216,6 +221,8 @@ def _why(meta: Mapping[str, Any]) -> str:
 
 
 def _write_rig(database: Any, rig: Rig) -> list[Any]:
+    import pycolmap
+
     cameras = [_camera(number, camera) for number, camera in ((1, rig.left), (2, rig.right))]
     for camera in cameras:
         database.write_camera(camera, use_camera_id=True)
@@ -230,6 +237,8 @@ def _write_rig(database: Any, rig: Rig) -> list[Any]:
 
 
 def _camera(number: int, camera: Camera) -> Any:
+    import pycolmap
+
     values = [camera.fx, camera.fy, camera.cx + PIXEL_CENTRE, camera.cy + PIXEL_CENTRE]
     out = pycolmap.Camera(model="PINHOLE", width=camera.width, height=camera.height, params=values, camera_id=number)
     out.has_prior_focal_length = True
@@ -238,6 +247,8 @@ def _camera(number: int, camera: Camera) -> Any:
 
 def _write_frames(database: Any, cameras: list[Any], features: list[Features], params: CrosscheckParams) -> int:
     """Features and verified matches to the database; the number of image pairs that match."""
+    import pycolmap
+
     for k in range(len(features) // 2):
         frame = pycolmap.Frame(frame_id=k + 1, rig_id=1)
         for side, camera in enumerate(cameras):
@@ -267,6 +278,8 @@ def _write_frames(database: Any, cameras: list[Any], features: list[Features], p
 
 def _map(database: Any, params: CrosscheckParams) -> list[Any]:
     """Incremental mapping with the rig and all intrinsics held."""
+    import pycolmap
+
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = options.mapper.num_threads = 1
     options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = params.seed

@@ -8,7 +8,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from datasets.cameras.fields import Fields
 from datasets.cameras.model import CalibratedCamera
@@ -74,6 +73,8 @@ def _lens(f: Fields, model: str) -> Lens:
 
 def _rig(path: Path) -> dict[str, RigidTransform]:
     """T_camera_rig by camera number; nothing where there is no rig, or more than one."""
+    from scipy.spatial.transform import Rotation
+
     lines = _lines(read_text(path)) if path.is_file() else []
     if len(lines) != 1 or len(lines[0]) < 4 or lines[0][2] != "CAMERA":
         return {}

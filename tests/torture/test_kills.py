@@ -7,6 +7,7 @@ import random
 import shutil
 import signal
 import time
+from contextlib import suppress
 
 import psutil
 import pytest
@@ -28,33 +29,38 @@ def statuses(found, status):
     return sum(node["status"] == status for node in found["nodes"].values())
 
 
-def torment(program, calm, folder, executor, tries, seed):
-    """Kill runs on a cache that lives on for a few of them; finish each cache, and compare."""
+def torment(program, calm, folder, executor, tries, seed, environment=None):
+    """Kill runs on a cache that lives on for a few of them; finish each cache, and compare.
+
+    ``folder`` may be a prefix in a bucket, with the environment to reach it.
+    """
     rng = random.Random(seed)
     lost, wrong, recomputed, expected, ended, half = [], [], 0, 0, 0, 0
     right, total = calm["digests"], len(calm["digests"])
-    cache, known = folder / "cache", {}
+    cache, known, there = f"{folder}/cache-0", {}, {"environment": environment or {}}
     begin = time.monotonic()
-    program.run(cache=str(folder / "timed"), executor=executor)
+    program.run(cache=f"{folder}/timed", executor=executor, **there)
     span, first = time.monotonic() - begin, 0.0 if executor == "inline" else 0.4  # workers take their time to start
 
     def finish():
-        nonlocal recomputed, expected
+        nonlocal recomputed, expected, cache
         expected += total - len(known)
-        found = program.run(cache=str(cache), executor="inline")
+        found = program.run(cache=cache, executor="inline", **there)
         recomputed += statuses(found, "computed")
         wrong.extend(look.wrong({n["key"]: n["digest"] for n in found["nodes"].values()}, right))
         wrong.extend(look.wrong(look.decoded(cache), right))
-        shutil.rmtree(cache)
+        shutil.rmtree(cache, ignore_errors=True)
+        cache = f"{folder}/cache-{int(cache.rpartition('-')[2]) + 1}"
         known.clear()
 
     for _ in range(tries):
         begin, limit = time.monotonic(), rng.uniform(first, 1.1) * span
-        pid = program.start(cache=str(cache), executor=executor)
+        pid = program.start(cache=cache, executor=executor, **there)
         while time.monotonic() - begin < limit and program.running():
             time.sleep(0.001)
         over = not program.running()
-        os.killpg(pid, signal.SIGKILL)
+        with suppress(ProcessLookupError):  # it has just ended
+            os.killpg(pid, signal.SIGKILL)
         program.wait()
         if over:
             ended += 1
@@ -87,6 +93,14 @@ def test_killed_at_random_moments(programs, calm, tmp_path, row, executor, tries
     (program,) = programs(1)
     lost, wrong, recomputed, expected, remark = torment(program, calm, tmp_path, executor, tries, seed=tries)
     row(f"SIGKILL of the group, {executor}", tries, lost, wrong, recomputed, expected, remark)
+
+
+@pytest.mark.parametrize("tries", [3, pytest.param(30, marks=pytest.mark.slow)])
+def test_killed_at_random_moments_with_the_cache_in_a_bucket(programs, calm, bucket, row, tries):
+    (program,) = programs(1)
+    prefix, environment = bucket
+    lost, wrong, recomputed, expected, remark = torment(program, calm, prefix, "inline", tries, tries, environment)
+    row("SIGKILL of the group, bucket", tries, lost, wrong, recomputed, expected, remark)
 
 
 @pytest.mark.parametrize(
@@ -128,27 +142,52 @@ def test_interrupted_at_random_moments(programs, calm, tmp_path, row, executor, 
 
 
 DEATHS = ("task", "fsync:1", "fsync:5", "link:1", "linked:1", "replace:2")
+DEATHS_IN_A_BUCKET = ("task", "put:1", "put:3", "create:1", "created:1")
 
 
-@pytest.mark.slow
-def test_workers_that_die_at_their_work_and_in_their_commit(programs, calm, tmp_path, row):
-    (program,) = programs(1)
-    cache, tally = tmp_path / "cache", tmp_path / "tally"
-    found = program.run(cache=str(cache), executor="processes", sabotage=DEATHS, tally=str(tally))
+def die(program, calm, cache, tally, row, deaths, executor, environment=None):
+    """Workers that die at their work and in their commit, each once; another one goes on."""
+    common = {"cache": str(cache), "sabotage": deaths, "tally": str(tally), "environment": environment or {}}
+    found = program.run(executor=executor, **common)
     assert found["ok"], found["nodes"]
     assert {p.name: p.stat().st_size for p in tally.iterdir()} == {
-        d.replace(":", "-"): 1 if d == "linked:1" else 2 for d in DEATHS
+        d.replace(":", "-"): 1 if d in ("linked:1", "created:1") else 2 for d in deaths
     }, "what was published before the worker died is not computed again"
-    again = program.run(cache=str(cache), sabotage=DEATHS, tally=str(tally))
+    again = program.run(**common)
     right = calm["digests"] | {
         n["key"]: n["digest"] for n in found["nodes"].values() if n["key"] not in calm["digests"]
     }
     lost = [label for label, n in again["nodes"].items() if n["status"] != "cached"]
     wrong = [n for n, digest in calm["labels"].items() if found["nodes"][n]["digest"] != digest]
     wrong += look.wrong(look.decoded(cache), right)
-    total = len(calm["digests"]) + len(DEATHS)
+    total = len(calm["digests"]) + len(deaths)
     computed = statuses(found, "computed") + statuses(found, "cached")  # published, but the worker could not say so
-    row("a worker dies at work, in its commit", len(DEATHS), lost, wrong, computed, total, ", ".join(DEATHS))
+    where = "tcp" if "://" in executor else "bucket" if environment else executor
+    row(f"a worker dies at work, in its commit, {where}", len(deaths), lost, wrong, computed, total, ", ".join(deaths))
+
+
+@pytest.mark.slow
+def test_workers_that_die_at_their_work_and_in_their_commit(programs, calm, tmp_path, row):
+    (program,) = programs(1)
+    die(program, calm, tmp_path / "cache", tmp_path / "tally", row, DEATHS, "processes")
+
+
+@pytest.mark.slow
+def test_workers_that_die_with_the_cache_in_a_bucket(programs, calm, tmp_path, bucket, row):
+    (program,) = programs(1)
+    prefix, environment = bucket
+    die(program, calm, f"{prefix}/cache", tmp_path / "tally", row, DEATHS_IN_A_BUCKET, "processes", environment)
+
+
+@pytest.mark.slow
+def test_workers_of_a_cluster_that_die(programs, calm, tmp_path, row):
+    from hands import by_hand
+
+    (program,) = programs(1)
+    with by_hand(tmp_path) as hands:
+        for name in ("first", "second"):
+            hands.worker(name, nanny="--nanny")
+        die(program, calm, tmp_path / "cache", tmp_path / "tally", row, DEATHS, hands.address)
 
 
 @pytest.mark.slow

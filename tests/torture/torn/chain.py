@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import random
 import resource
 import sys
@@ -44,18 +45,19 @@ def build(graph, *, frames=FRAMES, size=150, shuffle=None, sleepers=0, sabotage=
         graph.node("toys.mischief", f"sleep/{i}", NoParams(), {"what": "sleep", "seconds": 60, "i": i})
 
 
-def run(cache, executor="inline", ledger=None, jobs=2, memory=None, **options):
+def run(cache, executor="inline", ledger=None, jobs=2, memory=None, environment=None, **options):
     """One run; what became of it, as plain values. ``memory`` is what all workers together may have, bytes."""
     if memory is not None:
         resource.setrlimit(resource.RLIMIT_RSS, (memory, memory))  # distributed heeds it, the kernel does not
+    os.environ.update(environment or {})
     from pipeline import driver
     from pipeline.dag import Graph
-    from pipeline.store import Store
+    from pipeline.store import at
 
     graph = Graph()
     build(graph, **options)
     made = driver.run(
-        graph, Store(cache), executor=executor, jobs=jobs, keep_going=True, ledger=Path(ledger) if ledger else None
+        graph, at(cache), executor=executor, jobs=jobs, keep_going=True, ledger=Path(ledger) if ledger else None
     )
     nodes = {
         h.label: {
@@ -69,17 +71,18 @@ def run(cache, executor="inline", ledger=None, jobs=2, memory=None, **options):
     return {"ok": made.ok, "nodes": nodes}
 
 
-def clear(cache, runs, until, grace):
+def clear(cache, runs, until, grace, environment=None):
     """Clear the cache again and again beside the runs, as ``rille cache gc`` does; how often, and what went."""
+    os.environ.update(environment or {})
     from pipeline import ledger, upkeep
-    from pipeline.store import Store
+    from pipeline.store import at
 
     times = removed = 0
     while not Path(until).exists():
         kept = set()
         for path in Path(runs).glob("*/*/ledger.jsonl"):
             kept |= ledger.keys(path)
-        removed += upkeep.gc(Store(cache), kept, grace=grace).artifacts
+        removed += upkeep.gc(at(cache), kept, grace=grace).artifacts
         times += 1
         time.sleep(0.002)
     return {"times": times, "removed": removed}

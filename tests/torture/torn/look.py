@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from pipeline.artifact import array_digests, damage, output_digest
-from pipeline.store import Store
+from pipeline.object_upkeep import _damage
+from pipeline.store import Store, at, unframe
 
 HERE = Path(__file__).parent.parent
 PLACES = [str(HERE), str(HERE.parent / "pipeline"), str(HERE.parent.parent)]
@@ -14,6 +15,10 @@ PLACES = [str(HERE), str(HERE.parent / "pipeline"), str(HERE.parent.parent)]
 
 def published(cache):
     """Digest by key of every artifact whose manifest and files are whole."""
+    if str(cache).startswith("s3://"):
+        bucket = at(cache).bucket
+        made = [unframe(bucket.get(entry.path)[0]) for entry in bucket.list("manifests")]
+        return {manifest["key"]: manifest["digest"] for manifest in made if not _damage(at(cache), manifest)}
     store = Store(cache)
     found = {}
     for path in Path(cache).glob("artifacts/*/*/*/manifest.json"):
@@ -25,15 +30,20 @@ def published(cache):
 
 def manifests(cache):
     """Keys that have a manifest, sound or not."""
+    if str(cache).startswith("s3://"):
+        return {Path(entry.path).stem for entry in at(cache).bucket.list("manifests")}
     return {path.parent.name for path in Path(cache).glob("artifacts/*/*/*/manifest.json")}
 
 
 def decoded(cache):
-    """Digest by key, taken over what is really read from the disk."""
-    store = Store(cache)
-    found = {}
-    for path in Path(cache).glob("artifacts/*/*/*/manifest.json"):
-        ref = store.lookup(path.parents[2].name, path.parent.name)
+    """Digest by key, taken over what is really read."""
+    store, found = at(cache), {}
+    if str(cache).startswith("s3://"):
+        there = [(Path(e.path).parent.name, Path(e.path).stem) for e in store.bucket.list("manifests")]
+    else:
+        there = [(p.parents[2].name, p.parent.name) for p in Path(cache).glob("artifacts/*/*/*/manifest.json")]
+    for stage, key in there:
+        ref = store.lookup(stage, key)
         if ref is not None:
             bundle = store.open(ref)
             found[ref.key] = output_digest(array_digests(bundle.arrays), bundle.meta)

@@ -1,8 +1,8 @@
 """Kills the process that runs it: while it computes, in its commit, or by its memory; the first times only.
 
 ``what`` is ``task``, ``fsync:3``, ``link:1`` ... (the process dies before that call of the commit), ``linked:1`` (after
-it), ``poison`` (each time), ``memory`` (it takes more than the worker may have), ``random`` (no death, but another
-result in each process, once two of them are there).
+it), ``put:2``, ``create:1``, ``created:1`` (the same of a commit to a bucket), ``poison`` (each time), ``memory`` (it
+takes more than the worker may have), ``random`` (no death, but another result in each process, once two are there).
 """
 
 import os
@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from pipeline.bucket import Bucket
 from stages.declare import Array, Bundle, NoParams, Stage
 
 
@@ -20,8 +21,9 @@ def _die():
 
 
 def _trap(name, count, after):
-    """Let the ``count``-th call of ``os.name`` be the last thing that this process does."""
-    real, calls = getattr(os, name), []
+    """Let the ``count``-th call of ``os.name``, or of the bucket's, be the last thing that this process does."""
+    place = os if hasattr(os, name) else Bucket
+    real, calls = getattr(place, name), []
 
     def trapped(*args, **kwargs):
         calls.append(1)
@@ -31,7 +33,7 @@ def _trap(name, count, after):
             real(*args, **kwargs)
         return _die()
 
-    setattr(os, name, trapped)
+    setattr(place, name, trapped)
 
 
 def _run(params, args, inputs):
@@ -53,7 +55,8 @@ def _run(params, args, inputs):
             time.sleep(0.001)
         return Bundle({"value": np.array([float(os.getpid())])}, {"what": what})
     elif first and count:
-        _trap(kind.removesuffix("ed"), int(count), kind.endswith("ed"))
+        after = kind in ("linked", "created")
+        _trap({"linked": "link", "created": "create"}.get(kind, kind), int(count), after)
     return Bundle({"value": np.arange(50.0)}, {"what": what})
 
 

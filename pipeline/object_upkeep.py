@@ -1,0 +1,95 @@
+"""Verification and clearing up of a store in a bucket; :mod:`pipeline.upkeep` says what the words mean.
+
+What a run used within the grace is told by its index (:meth:`pipeline.objects.ObjectStore.note`): a bucket has no time
+of last use. Ages are by the server's clock against this machine's: keep the grace well above their difference.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import defaultdict
+from collections.abc import Collection, Iterator
+
+from pipeline.bucket import Entry
+from pipeline.objects import ObjectStore, damaged_objects, manifest_path
+from pipeline.store import Manifest, unframe
+
+AT_ONCE = 200
+"""Objects deleted in one go."""
+
+
+def verify(store: ObjectStore) -> Iterator[tuple[str, str, str, str]]:
+    """Stage, key, label and reason of each artifact; the reason is empty if it is sound, else it was set aside."""
+    for entry in store.bucket.list("manifests"):
+        stage, key = _stage_and_key(entry.path)
+        found = store.bucket.get(entry.path)
+        if found is None:
+            continue  # cleared away, or set aside by a run, just now
+        try:
+            manifest = unframe(found[0])
+        except ValueError:
+            reason = "the manifest is not readable"
+            store.set_aside(stage, key, None, reason)
+            yield stage, key, "", reason
+            continue
+        reason = _damage(store, manifest)
+        if reason:
+            store.set_aside(stage, key, manifest, reason)
+        yield stage, key, manifest["label"], reason
+
+
+def artifacts(store: ObjectStore) -> Iterator[tuple[str, str]]:
+    """Stage and key of everything committed."""
+    for entry in store.bucket.list("manifests"):
+        yield _stage_and_key(entry.path)
+
+
+def _damage(store: ObjectStore, manifest: Manifest) -> str:
+    place, files = manifest["path"], manifest["files"]
+    found = store.bucket.get_all(f"{place}/{name}" for name in files)
+    return damaged_objects(files, {n: None if (c := found[f"{place}/{n}"]) is None else c[0] for n in files})
+
+
+def gc(store: ObjectStore, keep: Collection[str], *, grace: float, dry_run: bool) -> tuple[int, int, int]:
+    """Numbers of artifacts and of orphans removed, and their bytes; a manifest goes before its objects."""
+    limit, kept = time.time() - grace, set(keep)
+    store.survey()
+    doomed: list[Entry] = []
+    for entry in store.bucket.list("index"):
+        if entry.modified > limit:
+            kept |= {_stage_and_key(path)[1] for path in store._index(entry.path)}
+        else:
+            doomed.append(entry)
+    manifests: list[Entry] = []
+    live, gone = {}, set()
+    for entry in store.bucket.list("manifests"):
+        stage, key = _stage_and_key(entry.path)
+        manifest = store.manifest(stage, key)
+        if key in kept or entry.modified > limit:
+            live[entry.path] = None if manifest is None else manifest["path"]
+        else:
+            manifests.append(entry)
+            gone.add(None if manifest is None else manifest["path"])
+    objects = defaultdict(list)
+    for entry in store.bucket.list("data"):
+        objects["/".join(entry.path.split("/")[:4])].append(entry)
+    orphans = 0
+    for attempt, entries in objects.items():
+        _, stage, key, _ = attempt.split("/")
+        path = manifest_path(stage, key)
+        if path in live and live[path] in (None, attempt):
+            continue
+        if attempt in gone or max(e.modified for e in entries) <= limit:
+            orphans += attempt not in gone
+            doomed += entries
+    doomed += [e for area in ("quarantine", "probe") for e in store.bucket.list(area) if e.modified <= limit]
+    if not dry_run:
+        for chosen in (manifests, doomed):
+            for start in range(0, len(chosen), AT_ONCE):
+                store.bucket.delete(e.path for e in chosen[start : start + AT_ONCE])
+    return len(manifests), orphans, sum(e.size for e in (*manifests, *doomed))
+
+
+def _stage_and_key(path: str) -> tuple[str, str]:
+    _, stage, name = path.split("/")
+    return stage, name.removesuffix(".json")

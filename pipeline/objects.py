@@ -1,0 +1,326 @@
+"""Artifacts in a bucket of an S3-compatible server: the same commit as on disk, with few requests.
+
+Objects below the prefix::
+
+    manifests/<stage>/<key>.json        the only commit point: written with If-None-Match: *
+    data/<stage>/<key>/a-<unique>/      one attempt: an immutable zarr 3 group
+    index/<digest>.json.gz              manifests that a run used: what it read, and that it used them
+    quarantine/...                      manifests of damaged artifacts, with the reason
+    rille.json                          the server was tried (pipeline.bucket)
+
+All objects of an attempt are there before its manifest is written, and a manifest names each with size and crc32c,
+which are compared with every object read. Killed at any instant, a run leaves a whole artifact or an orphan that nobody
+reads. A writer that does not know whether its manifest arrived leaves its attempt to clearing up. A look-up trusts the
+manifest and does not ask for each object: an object store writes whole objects only, and what was deleted from outside
+is found when it is read, set aside and computed again, or by :func:`pipeline.object_upkeep.verify`.
+
+A survey lists the manifests (a request a thousand) and takes what they say from the indices of the last runs, where the
+ETag is the same: a run that finds everything asks four times, however many artifacts there are.
+"""
+
+from __future__ import annotations
+
+import gzip
+import hashlib
+import json
+import os
+import time
+import uuid
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import google_crc32c
+import numpy as np
+
+from pipeline.artifact import LazyArrays, array_digests, output_digest, write
+from pipeline.bucket import Bucket, BucketError, Entry, connect
+from pipeline.location import hints_folder
+from pipeline.store import (
+    USED,
+    GoneError,
+    Manifest,
+    NonDeterministicError,
+    Ref,
+    Store,
+    StoreError,
+    difference,
+    frame,
+    reference,
+    unframe,
+)
+from stages.declare import AnyArray, Bundle, Stage
+
+INDICES = 8
+"""Indices read by a survey, the newest."""
+
+
+class ObjectStore(Store):
+    """Artifacts at ``s3://bucket/prefix``; see :class:`~pipeline.store.Store`."""
+
+    def __init__(self, url: str) -> None:
+        super().__init__(hints_folder(url))
+        self.location = url
+        self.bucket = connect(url)
+        self._listed: dict[str, str] | None = None
+        """ETags of the manifests that were there at the survey."""
+        self._known: dict[str, tuple[str, Manifest]] = {}
+        """Manifests with their ETags, by path."""
+        self._indices: dict[str, Entry] = {}
+
+    # -- looking up ---------------------------------------------------------------------------------------------
+
+    def survey(self) -> None:
+        """List the manifests, and read the newest indices (a copy of each is kept on this machine)."""
+        self._listed = {e.path: e.etag for e in self.bucket.list("manifests")}
+        self._indices = {e.path: e for e in self.bucket.list("index")}
+        for entry in sorted(self._indices.values(), key=lambda e: -e.modified)[:INDICES]:
+            for path, (etag, manifest) in self._index(entry.path).items():
+                if self._listed.get(path) == etag:
+                    self._known.setdefault(path, (etag, manifest))
+
+    def _index(self, path: str) -> dict[str, tuple[str, Manifest]]:
+        """A damaged index counts as empty, as does a damaged copy."""
+        copy = self.root / path
+        with suppress(OSError, ValueError):
+            return _unpack(path, copy.read_bytes())
+        found = self.bucket.get(path)
+        with suppress(OSError, ValueError):
+            if found is not None:
+                index = _unpack(path, found[0])
+                _keep(copy, found[0])
+                return index
+        return {}
+
+    def _fetch(self, path: str) -> Manifest | None:
+        """Read a manifest. Raises ValueError where its content is not what was written."""
+        found = self.bucket.get(path)
+        if found is None:
+            self._known.pop(path, None)
+            return None
+        manifest = unframe(found[0])
+        self._known[path] = (found[1], manifest)
+        return manifest
+
+    def _find(self, path: str, fresh: bool = False) -> Manifest | None:
+        if not fresh and path in self._known:
+            return self._known[path][1]
+        if not fresh and self._listed is not None and path not in self._listed:
+            return None
+        return self._fetch(path)
+
+    def lookup(self, stage: str, key: str, *, fresh: bool = False) -> Ref | None:
+        """The artifact of a key, as of the survey if there was one and not ``fresh``."""
+        try:
+            manifest = self._find(manifest_path(stage, key), fresh)
+        except ValueError:
+            self.set_aside(stage, key, None, "the manifest is not readable")
+            return None
+        return None if manifest is None else reference(manifest)
+
+    def manifest(self, stage: str, key: str) -> Manifest | None:
+        """Manifest of a key; None if absent or not readable."""
+        try:
+            return self._find(manifest_path(stage, key))
+        except ValueError:
+            return None
+
+    def note(self, refs: Iterable[Ref]) -> None:
+        """Write an index of what a run used, unless the same was written within the hour. Best effort."""
+        paths = sorted({manifest_path(ref.stage, ref.key) for ref in refs})
+        with suppress(BucketError, ValueError):  # the credentials may permit reading alone
+            for path, found in self.bucket.get_all(p for p in paths if p not in self._known).items():
+                if found is not None:
+                    self._known[path] = (found[1], unframe(found[0]))
+            name, data = _pack({p: self._known[p] for p in paths if p in self._known})
+            before = self._indices.get(name)
+            if before is None or before.modified < time.time() - USED:
+                self.bucket.put(name, data)
+                with suppress(OSError):
+                    _keep(self.root / name, data)
+
+    # -- reading ------------------------------------------------------------------------------------------------
+
+    def path(self, ref: Ref) -> Path:
+        """Artifacts here are not files."""
+        raise StoreError(f"{ref.path} is in {self.location}, not in a folder", remedy="open it with zarr and obstore")
+
+    def open(self, ref: Ref) -> Bundle:
+        """The bundle behind a reference; each array is fetched, its objects compared, at first access."""
+        path = manifest_path(ref.stage, ref.key)
+        try:
+            manifest = self._known[path][1] if path in self._known else self._fetch(path)
+        except ValueError:
+            manifest = None
+        if manifest is None or manifest["digest"] != ref.digest:
+            raise GoneError(f"artifact {ref.stage} {ref.key[:12]} has gone from {self.location}", remedy="run again")
+
+        def damaged(reason: str) -> None:
+            self.set_aside(ref.stage, ref.key, manifest, reason)
+
+        return Bundle(RemoteArrays(self.bucket, manifest, damaged), manifest["meta"])
+
+    # -- writing ------------------------------------------------------------------------------------------------
+
+    def commit(
+        self, stage: Stage, key: str, bundle: Bundle, *, label: str = "", provenance: Mapping[str, Any] | None = None
+    ) -> Ref:
+        """Write a result and publish it under its key; what another one has published before stays.
+
+        Raises
+        ------
+        NonDeterministicError
+            The key is there already, with another digest.
+        BucketError
+            The server does not answer, or refuses.
+        """
+        digests = array_digests(bundle.arrays)
+        digest = output_digest(digests, bundle.meta)
+        attempt = f"data/{stage.name}/{key}/a-{uuid.uuid4().hex[:16]}"
+        files, arrays = _encoded(stage, bundle)
+        manifest: Manifest = {
+            "stage": stage.name,
+            "label": label,
+            "key": key,
+            "digest": digest,
+            "path": attempt,
+            "arrays": {name: {**about, "sha256": digests[name]} for name, about in arrays.items()},
+            "meta": dict(bundle.meta),
+            "files": {name: [len(data), _crc32c(data)] for name, data in files.items()},
+            "provenance": dict(provenance or {}),
+        }
+        framed = frame(manifest)
+        objects = {f"{attempt}/{name}": data for name, data in files.items()}
+        try:
+            self.bucket.put_all(objects)
+        except BaseException:
+            self._discard(objects)
+            raise
+        there = self._create(manifest, framed)
+        if there is None:
+            return reference(json.loads(json.dumps(manifest)))
+        self._discard(objects)
+        if there["digest"] != digest:
+            raise NonDeterministicError(difference(label or key[:12], manifest, there))
+        return reference(there)
+
+    def _create(self, manifest: Manifest, framed: bytes) -> Manifest | None:
+        """Write the manifest unless there is one; returns the one that was there before, if any."""
+        stage, key = manifest["stage"], manifest["key"]
+        path = manifest_path(stage, key)
+        for _ in range(3):
+            if self.bucket.create(path, framed):
+                return None
+            try:
+                there = self._fetch(path)
+            except ValueError:
+                self.set_aside(stage, key, None, "the manifest is not readable")
+                continue
+            if there is not None:  # it may be this one, whose first answer was lost
+                return None if there["path"] == manifest["path"] else there
+        raise StoreError(f"cannot publish {path} in {self.location}", remedy="remove that object and run again")
+
+    def _discard(self, objects: Iterable[str]) -> None:
+        with suppress(BucketError):
+            self.bucket.delete(objects)
+
+    def set_aside(self, stage: str, key: str, manifest: Manifest | None, reason: str) -> None:
+        """Take the manifest of a damaged artifact away; its objects stay as an orphan. Best effort.
+
+        Another run may have done so before, and have published a sound one meanwhile: that one stays.
+        """
+        path = manifest_path(stage, key)
+        self._known.pop(path, None)
+        if self._listed is not None:
+            self._listed.pop(path, None)
+        with suppress(BucketError):
+            found = self.bucket.get(path)
+            if found is None:
+                return
+            with suppress(ValueError):
+                if manifest is None or unframe(found[0])["path"] != manifest["path"]:
+                    return
+            name = f"quarantine/{stage}-{key[:16]}-{uuid.uuid4().hex[:8]}"
+            self.bucket.put_all({f"{name}/manifest.json": found[0], f"{name}/reason.txt": f"{reason}\n".encode()})
+            self.bucket.delete([path])
+
+
+class RemoteArrays(LazyArrays):
+    """Arrays of an artifact in a bucket."""
+
+    def __init__(self, bucket: Bucket, manifest: Mapping[str, Any], damaged: Callable[[str], None]) -> None:
+        super().__init__(Path(manifest["path"]), manifest, damaged)
+        self._bucket = bucket
+
+    def _load(self, name: str, files: Mapping[str, list[Any]]) -> tuple[AnyArray, str]:
+        import zarr
+        from zarr.core.buffer import cpu
+        from zarr.storage import MemoryStore
+
+        place = self._manifest["path"]
+        found = self._bucket.get_all(f"{place}/{file}" for file in files)
+        contents = {file: found[f"{place}/{file}"] for file in files}
+        if wrong := damaged_objects(files, {f: None if c is None else c[0] for f, c in contents.items()}):
+            return np.empty(0), wrong
+        chunks: Any = {
+            f.removeprefix(f"{name}/"): cpu.Buffer.from_bytes(c[0]) for f, c in contents.items() if c is not None
+        }
+        array = zarr.open_array(store=MemoryStore(chunks, read_only=True), mode="r")
+        return np.asarray(array[...]), ""
+
+
+def manifest_path(stage: str, key: str) -> str:
+    """Object whose being there makes an artifact."""
+    return f"manifests/{stage}/{key}.json"
+
+
+def damaged_objects(files: Mapping[str, list[Any]], contents: Mapping[str, bytes | None]) -> str:
+    """What is wrong with the objects of an artifact, in words; empty if nothing."""
+    for name, (size, crc) in files.items():
+        data = contents[name]
+        if data is None:
+            return f"{name} is missing"
+        if len(data) != size:
+            return f"{name} has {len(data)} bytes instead of {size}"
+        if _crc32c(data) != crc:
+            return f"{name} has another checksum"
+    return ""
+
+
+def _encoded(stage: Stage, bundle: Bundle) -> tuple[dict[str, bytes], dict[str, Any]]:
+    """The zarr group of a bundle as objects by relative name, and the description of its arrays."""
+    from zarr.storage import MemoryStore
+
+    chunks: dict[str, Any] = {}
+    arrays = write(MemoryStore(chunks), stage, bundle)
+    return {name: chunk.to_bytes() for name, chunk in chunks.items()}, arrays
+
+
+def _crc32c(data: bytes) -> str:
+    return f"{google_crc32c.value(data):08x}"
+
+
+def _pack(index: dict[str, tuple[str, Manifest]]) -> tuple[str, bytes]:
+    """Name and content of an index; equal ones have one name."""
+    name = hashlib.sha256(json.dumps([[path, etag] for path, (etag, _) in index.items()]).encode()).hexdigest()[:32]
+    data = json.dumps(index).encode()
+    return f"index/{name}.json.gz", gzip.compress(hashlib.sha256(data).digest() + data, 5, mtime=0)
+
+
+def _unpack(path: str, packed: bytes) -> dict[str, tuple[str, Manifest]]:
+    """Raises ValueError or OSError where it is damaged."""
+    try:
+        data = gzip.decompress(packed)
+    except EOFError:
+        raise ValueError(f"{path} is cut short") from None
+    if hashlib.sha256(data[32:]).digest() != data[:32]:
+        raise ValueError(f"{path} is damaged")
+    return {name: (etag, manifest) for name, (etag, manifest) in json.loads(data[32:]).items()}
+
+
+def _keep(copy: Path, data: bytes) -> None:
+    copy.parent.mkdir(parents=True, exist_ok=True)
+    temporary = copy.with_name(f"{copy.name}.{os.getpid()}.tmp")
+    temporary.write_bytes(data)
+    temporary.replace(copy)

@@ -1,0 +1,319 @@
+"""The store in a bucket, against an S3 server on loopback and one that misbehaves."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import os
+import random
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+import servers
+from toys import chain
+
+from pipeline import bucket, driver, upkeep
+from pipeline.artifact import DamagedError
+from pipeline.bucket import BucketError
+from pipeline.dag import Graph
+from pipeline.location import hints_folder, locate
+from pipeline.objects import ObjectStore, manifest_path
+from pipeline.store import NonDeterministicError, Store, at
+from stages.declare import Bundle
+from stages.errors import ConfigError
+
+from toys import numbers  # isort: skip
+
+FRAMES = 4
+NODES = 2 * FRAMES + 1
+
+
+@pytest.fixture(scope="module")
+def port():
+    with servers.s3() as port:
+        yield port
+
+
+@pytest.fixture
+def url(port, tmp_path, monkeypatch, request):
+    """A prefix of its own, and the environment to reach it."""
+    for name, value in servers.environment(port, tmp_path / "local").items():
+        monkeypatch.setenv(name, value)
+    return f"s3://bucket/{tmp_path.name}"
+
+
+@pytest.fixture
+def proxied(port, monkeypatch):
+    """``proxied(trouble)`` puts a proxy in between."""
+    made = []
+
+    def start(trouble):
+        made.append(servers.Proxy(port, trouble))
+        monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{made[-1].port}")
+        return made[-1]
+
+    yield start
+    for proxy in made:
+        proxy.close()
+
+
+@pytest.fixture(scope="module")
+def right(tmp_path_factory):
+    """Digests of the same run on a folder."""
+    return digests(run(tmp_path_factory.mktemp("disk") / "cache")[0])
+
+
+def run(cache, **options):
+    graph = Graph()
+    chain.build(graph, frames=FRAMES)
+    result = driver.run(graph, at(cache), executor="inline", **options)
+    result.check()
+    return graph, result
+
+
+def digests(graph):
+    return {h.key: h.ref.digest for h in graph.nodes}
+
+
+def bundle(value=1.0):
+    return Bundle({"values": np.full((3, 4), value), "mask": np.zeros((3, 4), dtype=np.uint8)}, {"frame": 0})
+
+
+def commit(store, key="k" * 64, value=1.0):
+    return store.commit(numbers.STAGE, key, bundle(value), label="numbers/0")
+
+
+def test_cold_and_warm_give_what_a_folder_gives(url, right, proxied):
+    proxy = proxied(lambda *_: "")
+    cold, _ = run(url)
+    assert digests(cold) == right
+    del proxy.requests[:]
+    bucket._connect.cache_clear()  # as in a process of its own
+    warm, result = run(url)
+    assert digests(warm) == right
+    assert result.total().cached == NODES
+    assert not result.executor_started
+    assert len(proxy.requests) <= 4, "the mark, two listings: not one request an artifact"
+    values = at(url).open(warm.nodes[0].ref)["values"]
+    assert values.shape == (40, 40)
+
+
+def test_another_machine_reads_the_index_once(url, right, proxied, tmp_path, monkeypatch):
+    run(url)
+    monkeypatch.setenv("RILLE_LOCAL", str(tmp_path / "elsewhere"))
+    proxy = proxied(lambda *_: "")
+    warm, _ = run(url)
+    assert digests(warm) == right
+    assert sum("/index/" in path for _, path in proxy.requests) == 1
+
+
+def test_a_damaged_index_is_no_matter(url, right):
+    run(url)
+    store = at(url)
+    (entry,) = store.bucket.list("index")
+    for data in (b"", b"no gzip", gzip.compress(b"x" * 50), store.bucket.get(entry.path)[0][:-9]):
+        store.bucket.put(entry.path, data)
+        (hints_folder(url) / entry.path).unlink(missing_ok=True)
+        warm, result = run(url)
+        assert digests(warm) == right
+        assert result.total().cached == NODES
+
+
+@pytest.mark.parametrize("how", ["refuse", "deafen", pytest.param("cut", marks=pytest.mark.slow)])
+def test_servers_in_trouble_change_nothing(url, right, proxied, how, monkeypatch):
+    monkeypatch.setattr(bucket, "BACK_OFF", {**bucket.BACK_OFF, "init_backoff": bucket.timedelta(milliseconds=5)})
+    rng = random.Random(how)
+    methods = {"refuse": ("GET", "PUT", "POST"), "deafen": ("PUT",), "cut": ("GET",)}[how]
+    share = 0.08 if how == "cut" else 0.2
+    proxy = proxied(lambda method, path, count: how if method in methods and rng.random() < share else "")
+    for _ in range(2):
+        graph, _ = run(url)
+        assert digests(graph) == right
+    assert proxy.troubled >= 3
+    store = at(url)
+    attempts = {e.path.split("/")[3] for e in store.bucket.list("data")}
+    assert len(attempts) == NODES, "a commit whose answer was lost is one's own"
+    assert upkeep.verify(store) == (NODES, [])
+
+
+def test_a_server_that_ignores_conditions_is_refused(url, proxied):
+    proxied(lambda *_: "blind")
+    with pytest.raises(BucketError, match=r"ignores If-None-Match: of two runs .* one could overwrite"):
+        at(url)
+    with pytest.raises(BucketError, match="ignores If-None-Match"):
+        at(url)  # nothing was noted
+
+
+def test_a_bucket_moved_to_another_server_is_tried_again(url, proxied):
+    commit(at(url))
+    proxied(lambda *_: "blind")
+    with pytest.raises(BucketError, match="ignores If-None-Match"):
+        at(url)
+
+
+def test_of_a_race_one_is_published(url):
+    store, refs = at(url), []
+    threads = [threading.Thread(target=lambda: refs.append(commit(at(url)))) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(refs) == 4
+    assert len({r.path for r in refs}) == 1
+    attempts = {"/".join(e.path.split("/")[:4]) for e in store.bucket.list("data")}
+    assert attempts == {refs[0].path}, "the losers have cleared up"
+    with pytest.raises(NonDeterministicError, match=r"another values than before"):
+        commit(store, value=2.0)
+
+
+def test_nothing_is_read_before_the_manifest_is_there(url, proxied):
+    store = at(url)
+    proxy = proxied(lambda method, path, count: "")
+    commit(at(url))
+    puts = [path for method, path in proxy.requests if method == "PUT" and ("/data/" in path or "/manifests/" in path)]
+    assert "/manifests/" in puts[-1]
+    assert sum("/manifests/" in p for p in puts) == 1
+    store.bucket.delete([manifest_path("numbers", "k" * 64)])
+    assert store.lookup("numbers", "k" * 64) is None
+
+
+@pytest.mark.parametrize("way", ["delete", "truncate", "flip"])
+def test_damage_is_seen_when_read_and_healed(url, right, way):
+    run(url)
+    store = at(url)
+    entry = next(e for e in store.bucket.list("data/numbers") if "/values/c" in e.path)
+    data = bytearray(store.bucket.get(entry.path)[0])
+    data[len(data) // 2] ^= 4
+    if way == "delete":
+        store.bucket.delete([entry.path])
+    else:
+        store.bucket.put(entry.path, bytes(data) if way == "flip" else bytes(data[:-3]))
+    store.survey()
+    ref = store.lookup("numbers", entry.path.split("/")[2])
+    with pytest.raises(DamagedError, match="values/c"):
+        store.open(ref)["values"]
+    assert store.lookup("numbers", ref.key) is None
+    assert any("reason.txt" in e.path for e in store.bucket.list("quarantine"))
+    graph, result = run(url)
+    assert digests(graph) == right
+    assert result.total().computed == 1
+
+
+def test_a_task_heals_its_damaged_input(url, right):
+    graph, _ = run(url)
+    store = at(url)
+    total = next(h for h in graph.nodes if h.stage == "total")
+    scaled = next(h for h in graph.nodes if h.stage == "scale")
+    store.bucket.delete([manifest_path("total", total.key), f"{scaled.ref.path}/level_0/c.0.0"])
+    store.bucket.delete(e.path for e in store.bucket.list("index"))
+    healed, result = run(url)
+    assert digests(healed) == right
+    assert result.total().computed == 2
+
+
+def test_verify_and_gc(url):
+    graph, _ = run(url)
+    store = at(url)
+    kept = {h.key for h in graph.nodes if h.stage != "total"}
+    total = next(h for h in graph.nodes if h.stage == "total")
+    assert upkeep.gc(store, kept).artifacts == 0, "it was made within the grace"
+    assert upkeep.gc(store, kept, grace=-60, dry_run=True).artifacts == 1
+    store.bucket.put("data/numbers/abc/a-orphan/zarr.json", b"{}")
+    cleared = upkeep.gc(store, kept, grace=-60)
+    assert (cleared.artifacts, cleared.orphans) == (1, 1)
+    assert not list(store.bucket.list(total.ref.path))
+    assert upkeep.verify(store) == (NODES - 1, [])
+    chunk = next(e for e in store.bucket.list("data/scale") if "/c.0" in e.path)
+    store.bucket.put(chunk.path, b"0" * chunk.size)
+    sound, damaged = upkeep.verify(store)
+    assert sound == NODES - 2
+    assert damaged[0].stage == "scale"
+    assert "another checksum" in damaged[0].reason
+
+
+def test_what_a_run_used_lately_is_spared(url):
+    run(url)
+    assert upkeep.gc(at(url), set(), grace=0.0, dry_run=True).artifacts in (0, NODES)  # the clock of a whole second
+    assert upkeep.gc(at(url), set(), grace=3600).artifacts == 0
+
+
+def test_no_secret_is_written_anywhere(url, tmp_path, capfd, proxied):
+    run(url, ledger=tmp_path / "ledger.jsonl")
+    with pytest.raises(BucketError) as wrong:
+        at("s3://no-such-bucket/x")
+    said = str(wrong.value) + repr(wrong.value) + "".join(capfd.readouterr())
+    stored = at(url).bucket
+    contents = [stored.get(e.path)[0] for e in stored.list("")]
+    contents += [gzip.decompress(c) for c in contents if c[:2] == b"\x1f\x8b"]
+    contents += [p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()] + [said.encode()]
+    assert len(contents) > 20
+    for secret in (servers.SECRET, servers.KEY):
+        assert not [c for c in contents if secret.encode() in c]
+
+
+def rille(url, environment, *words):
+    command = [sys.executable, "-m", "pipeline.cli", "cache", "verify", "--cache", url, *words]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60)
+    return done.returncode, done.stderr.strip()
+
+
+def test_each_mistake_is_one_line(port, tmp_path, monkeypatch, proxied, url):
+    monkeypatch.setattr(bucket, "HASTY", {**bucket.HASTY, "max_retries": 1})
+    with pytest.raises(BucketError, match=r"bucket missing does not exist at 127\.0\.0\.1:\d+: make it"):
+        at("s3://missing/x")
+    proxied(lambda *_: "refuse")
+    with pytest.raises(BucketError, match=r"127\.0\.0\.1:\d+ answers 503 .*SlowDown.* for s3://bucket"):
+        at(url)
+    proxied(lambda *_: "forbid")
+    with pytest.raises(BucketError, match=r"127\.0\.0\.1:\d+ refuses the credentials for s3://.*InvalidAccessKeyId"):
+        at(url)
+    monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")
+    with pytest.raises(BucketError, match=r"no object store answers at 127\.0\.0\.1:9 for .*AWS_ENDPOINT_URL"):
+        at(url)
+    assert rille("s3://Bad_Bucket/x", dict(os.environ)) == (
+        2,
+        "rille: 'Bad_Bucket' is no name of a bucket: give --cache s3://bucket/prefix, and credentials in the"
+        " environment (AWS_ACCESS_KEY_ID ...)",
+    )
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ("gs://bucket/x", "a cache at gs:// is not supported"),
+        ("s3://key:hunter2@bucket/x", "has more than bucket and prefix"),
+        ("s3://bucket/x?secret=hunter2", "has more than bucket and prefix"),
+        ("s3:///x", "'' is no name of a bucket"),
+        ("s3://bucket/a b", "is no prefix"),
+        ("s3://bucket/a/../b", "is no prefix"),
+    ],
+)
+def test_bad_urls(given, message):
+    with pytest.raises(ConfigError, match=message) as wrong:
+        locate(given)
+    assert "hunter2" not in str(wrong.value)
+
+
+def test_locations():
+    assert locate("s3://bucket//a/b/") == "s3://bucket/a/b"
+    assert locate(Path("s3://bucket/a")) == "s3://bucket/a", "a path has lost a slash"
+    assert locate("folder/x") == Path("folder/x")
+    assert hints_folder(Path("c")) == Path("c")
+    assert hints_folder("s3://bucket/a/b").name == "bucket+a+b"
+    assert isinstance(at("some/folder"), Store)
+    assert not isinstance(at("some/folder"), ObjectStore)
+
+
+def test_arrays_are_read_by_zarr_as_they_are(url):
+    zarr = pytest.importorskip("zarr")
+    from zarr.storage import ObjectStore as Remote
+
+    store = at(url)
+    ref = commit(store)
+    group = zarr.open_group(Remote(store.bucket._store, read_only=True), path=ref.path, mode="r")
+    assert (group["values"][...] == 1.0).all()
+    assert json.dumps(group.attrs["meta"]) == '{"frame": 0}'
