@@ -117,11 +117,9 @@ def write_glb(path: Path, terrain: Raster, ortho: NDArray[np.float64] | None, si
     visual = trimesh.visual.TextureVisuals(uv=uv, material=look) if look is not None else None
     mesh = trimesh.Trimesh(vertices=shown, faces=faces, visual=visual, process=False)
     scene = trimesh.Scene({"terrain": mesh})
-    scene.metadata["extras"] = {
-        "origin_m": middle.tolist(),
-        "axes": "x = x, y = z, z = -y of the terrain's frame, metres from origin_m",
-        "crs_wkt": terrain.crs,
-    }
+    scene.metadata["origin_m"] = middle.tolist()
+    scene.metadata["axes"] = "x = x, y = z, z = -y of the terrain's frame, metres from origin_m"
+    scene.metadata["crs_wkt"] = terrain.crs
     with replacing(path) as temporary:
         temporary.write_bytes(scene.export(file_type="glb", include_normals=True))
     every = "" if step == 1 else f", every {step}. cell (of more than {MAX_FACES} triangles)"

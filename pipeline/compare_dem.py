@@ -201,12 +201,10 @@ def _line(f: dict[str, float]) -> str:
 
 def draw(path: Path, found: dict[str, Any], error: Floats, slope: Floats, distance: Floats | None) -> None:
     """Picture of the errors: map, histogram, and against range and slope."""
-    import matplotlib
+    from matplotlib.figure import Figure
 
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(2, 2, figsize=(11, 8.5), layout="constrained")
+    figure = Figure(figsize=(11, 8.5))
+    axes = figure.subplots(2, 2, gridspec_kw={"left": 0.07, "right": 0.97, "bottom": 0.07, "top": 0.95, "hspace": 0.25})
     f = found["figures"]
     most = 1e3 * max(f["p95"], 1e-9)
     shown = axes[0, 0].imshow(1e3 * error, cmap="RdBu_r", vmin=-most, vmax=most, interpolation="nearest")
@@ -227,4 +225,3 @@ def draw(path: Path, found: dict[str, Any], error: Floats, slope: Floats, distan
         axis.legend(fontsize=8)
     with replacing(path) as temporary:
         figure.savefig(temporary, dpi=110, metadata={"Software": None})
-    plt.close(figure)

@@ -128,7 +128,7 @@ def raster_transform(lattice: Lattice, place: Georeference | None) -> Any:
     if place is None:
         return corner
     (a, b), (c, d) = place.rotation
-    return Affine(a, b, place.origin[0], c, d, place.origin[1]) * corner
+    return Affine(a, b, place.origin[0], c, d, place.origin[1]) @ corner
 
 
 def _axes(place: Georeference | None) -> str:

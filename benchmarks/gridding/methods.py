@@ -42,7 +42,7 @@ class Method:
 
 def locus(scene: Scene, max_backmatch: float, bounded: bool) -> Model:
     """Cells first: :mod:`stages.locus`."""
-    params = DEFAULT.model_copy(update={"max_sigma": scene.lattice.cell if bounded else None})
+    params = DEFAULT.model_copy(update={"max_sigma": scene.max_sigma if bounded else None})
     d = scene.disparities
     dem = reconstruct(
         d.column, d.row, d.usable(max_backmatch), scene.left, scene.rig, scene.T_surface_left, plane(scene.lattice),
@@ -76,7 +76,7 @@ def triangulate(scene: Scene, max_backmatch: float, bounded: bool) -> Cloud:
     own = sigma * (DEFAULT.sigma_disparity if d.std is None else d.std[usable])
     good &= (found[:, 2] >= scene.z_range[0]) & (found[:, 2] <= scene.z_range[1])
     if bounded:
-        good &= sigma * DEFAULT.sigma_disparity <= scene.lattice.cell
+        good &= sigma * DEFAULT.sigma_disparity <= scene.max_sigma
     points, sigmas = np.full((*usable.shape, 3), np.nan), np.full(usable.shape, np.nan)
     points[usable], sigmas[usable] = found, own
     kept = usable.copy()

@@ -19,6 +19,8 @@ from .mesh import rasterise, without_jumps
 
 Floats = NDArray[np.float64]
 
+SIGMA_PX = 0.2
+"""Error of a disparity that the bound on the geometry stands for: that of Locus."""
 NEAREST_CELLS_PX = 1.0
 """Pixels that a cell of the fronto-parallel plane spans at the plane."""
 
@@ -49,6 +51,7 @@ class Scene:
     """One pair, where its cells are, and the truth on them.
 
     ``judged``: the cells (row, col) that count, seen by both cameras. ``z_range``: elevations that are searched, m.
+    ``max_sigma``: bound on the geometry's error, m.
     """
 
     name: str
@@ -58,6 +61,7 @@ class Scene:
     T_surface_left: RigidTransform
     lattice: Lattice
     z_range: tuple[float, float]
+    max_sigma: float
     truth: NDArray[np.float32]
     judged: NDArray[np.bool_]
     disparities: Disparities
@@ -106,7 +110,7 @@ def _simulated(sequence: Any, fetch: Any, frame: int) -> Scene:
     z_range = _searched(sequence.rig, true, pose.rotation[2], lattice)
     valid = tuple(np.asarray(i["valid"]) != 0 for i in images)
     judged = seen & np.isfinite(truth)
-    place = T_local_left, lattice, z_range
+    place = T_local_left, lattice, z_range, cell
     return Scene(f"mockup {frame}", left, right, sequence.rig, *place, truth, judged, true, valid)
 
 
@@ -142,6 +146,7 @@ def motorcycle() -> Scene | None:
     bounds = [float(v) for k in (0, 1) for v in np.nanpercentile(points[..., k], [1, 99])]
     lattice = Lattice.snap(bounds, cell)
     z_range = (float(np.nanmin(points[..., 2])) - 0.05, float(np.nanmax(points[..., 2])) + 0.05)
+    max_sigma = SIGMA_PX * far**2 / (f * baseline)  # at the plane: the depth's error is far above a cell everywhere
     both = known & ~_hidden(truth.u)
     smooth = without_jumps(truth.u, truth.v, known, 1.0)
     surface = rasterise(points, smooth, lattice)
@@ -149,10 +154,9 @@ def motorcycle() -> Scene | None:
     judged = np.isfinite(surface) & (np.abs(seen - surface) < 1e-9)
     true = Disparities(truth.u.astype(np.float32), truth.v.astype(np.float32), both)
     everywhere = np.ones(left.shape, bool)
-    return Scene(
-        "motorcycle", left, right, rig, T_surface_left, lattice, z_range, surface.astype(np.float32), judged, true,
-        (everywhere, everywhere),
-    )  # fmt: skip
+    place = T_surface_left, lattice, z_range, max_sigma
+    valid = everywhere, everywhere
+    return Scene("motorcycle", left, right, rig, *place, surface.astype(np.float32), judged, true, valid)
 
 
 def pixels_of(shape: tuple[int, ...]) -> Floats:
