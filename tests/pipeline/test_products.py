@@ -69,7 +69,7 @@ def test_the_engineering_crs_is_in_metres_and_says_how_axes_lie(tmp_path: Path) 
         crs = pyproj.CRS.from_wkt(file.crs.to_wkt(version="WKT2_2019"))
         assert "x and y are the world frame's" in file.tags()["AXES"]
     assert crs.is_engineering
-    assert [(a.abbrev, a.direction, a.unit_name) for a in crs.axis_info] == [
+    assert [(a.name, a.direction, a.unit_name) for a in crs.axis_info] == [
         ("x", "east", "metre"),
         ("y", "north", "metre"),
     ]
