@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from datasets import files
+from datasets.georeference import georeference
 from datasets.manifest_model import Images, read_manifest
 from datasets.manifest_motion import read_motion
 from datasets.manifest_rig import read_optics
@@ -47,7 +48,8 @@ def open_manifest(path: Path, digests: files.Digests) -> Sequence:
         pair = pairs[frame]
         return files.image_source(pair.left if camera == "left" else pair.right, frame, camera, size, digests)
 
-    pitch = manifest.world.pitch_deg
+    world = manifest.world
+    pitch = world.pitch_deg
     return Sequence(
         name=manifest.name or default_name(path),
         rig=optics.rig,
@@ -62,6 +64,7 @@ def open_manifest(path: Path, digests: files.Digests) -> Sequence:
         attitude=motion.attitude,
         odometry=motion.odometry,
         pitch=None if pitch is None else math.radians(pitch),
+        georeference=georeference(world.crs, world.origin, world.azimuth_deg, name),
         vehicle=manifest.vehicle,
         defaults=dict(dotted(manifest.defaults)),
         notes=manifest.notes,

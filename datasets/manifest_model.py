@@ -187,7 +187,7 @@ class Imu(Params):
 
 
 class World(Params):
-    """``[world]``: what is known of the vertical."""
+    """``[world]``: what is known of the vertical, and of the place."""
 
     pitch_deg: float | None = Field(
         default=None,
@@ -199,6 +199,20 @@ class World(Params):
         default=None,
         description="direction of up in the reference frame of the calibration files (the left camera's where they "
         "state none), the same for all pairs",
+    )
+    crs: str | None = Field(
+        default=None,
+        description='projected CRS in metres of the results, e.g. "EPSG:32633"; with origin and azimuth_deg',
+    )
+    origin: Direction | None = Field(
+        default=None, description="m; easting, northing and height of the first left camera's centre in that CRS"
+    )
+    azimuth_deg: float | None = Field(
+        default=None,
+        ge=-360,
+        le=360,
+        description="degrees clockwise from grid north; heading of the first left camera's optical axis, which is the "
+        "world's y axis",
     )
 
 

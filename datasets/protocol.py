@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
+from datasets.georeference import Georeference
 from stages.declare import Params
 from stages.errors import InputError
 from stages.geometry import Rig, RigidTransform
@@ -71,6 +72,7 @@ class Sequence:
     odometry : T_odometry_left of each frame by dead reckoning, metres; predicts, and is never part of the result.
     pitch : downward pitch of the left camera's optical axis, radians, stated with the rig; roll 0.
     initial_pose : T_world_left of frame 0 handed in from outside.
+    georeference : where the world frame lies, where that is known.
     vehicle : the vehicle whose limits suit the scale of the sequence.
     truth_dem : exact elevations on any lattice of any frame whose pose in the truth frame is given.
     truth_disparity : ``truth_disparity(frame)``: source of the exact disparity of a pair.
@@ -95,6 +97,7 @@ class Sequence:
     odometry: tuple[RigidTransform | None, ...] | None = None
     pitch: float | None = None
     initial_pose: RigidTransform | None = None
+    georeference: Georeference | None = None
     vehicle: Vehicle | None = None
     truth_dem: TruthDem | None = None
     truth_disparity: Callable[[int], Source] | None = None

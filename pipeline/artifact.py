@@ -20,6 +20,7 @@ from typing import Any
 import google_crc32c
 import numpy as np
 
+from pipeline import coordinates
 from pipeline.key import canonical, digest
 from stages.declare import AnyArray, Array, Bundle, Stage
 from stages.errors import RilleError
@@ -89,12 +90,12 @@ def write(place: Any, stage: Stage, bundle: Bundle) -> dict[str, Any]:
     from zarr.codecs import BloscCodec, Crc32cCodec
     from zarr.storage import LocalStore
 
+    attributes = {"stage": stage.name, "source": coordinates.source(stage), "meta": dict(bundle.meta)}
     group = zarr.create_group(
-        store=LocalStore(place) if isinstance(place, Path) else place,
-        zarr_format=3,
-        attributes={"stage": stage.name, "meta": dict(bundle.meta)},
+        store=LocalStore(place) if isinstance(place, Path) else place, zarr_format=3, attributes=attributes
     )
     described = {}
+    lattice = coordinates.lattice_of(bundle.meta)
     for name in sorted(bundle.arrays):
         array = np.asarray(bundle.arrays[name])
         spec = next(a for a in stage.outputs if a.matches(name))
@@ -108,10 +109,18 @@ def write(place: Any, stage: Stage, bundle: Bundle) -> dict[str, Any]:
             fill_value=np.nan if array.dtype.kind == "f" else 0,
             dimension_names=about["dims"],
             chunk_key_encoding={"name": "default", "separator": "."},  # no folders within, which would need flushing
-            attributes={k: about[k] for k in ("units", "long_name", "nodata", "frame") if about[k]},
+            attributes={k: about[k] for k in ("units", "long_name", "nodata", "frame") if about[k]}
+            | coordinates.attributes(name, about, bundle.arrays, lattice),
             config={"write_empty_chunks": True},  # so that a missing chunk is always damage
         )
         written[...] = array
+    if lattice is not None and bundle.arrays:
+        for name, (values, dims, attrs) in coordinates.coordinates(lattice, str(bundle.meta.get("frame", ""))).items():
+            at = group.create_array(
+                name, shape=values.shape, dtype="<f8", dimension_names=dims, attributes={**attrs},
+                chunk_key_encoding={"name": "default", "separator": "."},
+            )  # fmt: skip
+            at[...] = values
     return described
 
 

@@ -1,4 +1,4 @@
-"""The command line: ``rille reconstruct | plan | why | timing | check | init | calibrate | match | datasets | cache``.
+"""The command line: ``rille reconstruct | plan | why | timing | check | init | calibrate | match | export | ...``.
 
 Exit codes: 0 complete; 1 failed; 2 usage, configuration or input; 3 finished with holes under ``--keep-going``;
 130 interrupted. Results go to stdout, progress and complaints to stderr. Heavy imports happen inside the commands, so
@@ -386,6 +386,71 @@ def match(
         prior=prior_disparity,
         confidence=confidence,
     )
+
+
+@app.command(name="export")
+def export_run(
+    run: Path,
+    *,
+    to: Annotated[list[Literal["laz", "glb"]], Parameter(negative="")],
+    output: Annotated[Path | None, Parameter(name=["--output", "-o"])] = None,
+    debug: Annotated[bool, Parameter(negative="")] = False,
+) -> int:
+    """Write the terrain of a run for other programs: cloud.laz (a point a cell) or terrain.glb (textured mesh).
+
+    Parameters
+    ----------
+    run
+        Folder of a run, for example runs/mockup/latest.
+    to
+        laz: CloudCompare, PDAL, QGIS; glb: any glTF viewer, Blender. May be repeated.
+    output
+        File to write, for one form only; by default cloud.laz or terrain.glb in the run's folder.
+    debug
+        Show tracebacks.
+    """
+    from pipeline import cloud
+    from stages.errors import ConfigError
+
+    if output is not None and len(to) > 1:
+        raise ConfigError(f"--output names one file for {len(to)} forms", remedy="give one --to, or leave --output out")
+    for kind in to:
+        path, words = cloud.export(run, kind, output)
+        print(f"{path}  {words}")
+    return COMPLETE
+
+
+@app.command(name="compare-dem")
+def compare_dem(
+    a: Path,
+    b: Path,
+    *,
+    align: Literal["none", "shift", "tilt", "rigid"] = "none",
+    output: Annotated[Path, Parameter(name=["--output", "-o"])] = Path("dem_comparison"),
+    debug: Annotated[bool, Parameter(negative="")] = False,
+) -> int:
+    """Compare elevation model A with reference B: errors, completeness, error against range and slope.
+
+    The finer one is brought to the coarser one's cells (means of the known cells inside, or bilinear between four known
+    ones); only cells that both know are compared. Prints the figures; writes OUTPUT.png and OUTPUT.json.
+
+    Parameters
+    ----------
+    a
+        GeoTIFF, folder of a run, or zarr group with elevation, x and y.
+    b
+        Reference, likewise.
+    align
+        Move A onto B first: shift (x, y, z), tilt (z and two inclinations) or rigid (all six); what was moved is told.
+    output
+        Files to write, without ending.
+    debug
+        Show tracebacks.
+    """
+    _prepare(None)
+    from pipeline import compare_dem as command
+
+    return command.compare(a, b, align=align, output=output)
 
 
 @datasets_app.default

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from datasets.georeference import Georeference
 from pipeline.products import FRAME
 
 FORMAT = 1
@@ -37,6 +38,13 @@ _RASTER = {
     "raster": "row 0 at the greatest y; the geotransform gives the corner of the first cell; north is y",
 }
 
+IN_PLACE = (".tif", ".gpkg")
+"""Endings of the files whose coordinates are those of the sequence's CRS where it has one."""
+_PLACED = {
+    "frame": "georeference",
+    "crs": "that of georeference: easting, northing, height; metres; rasters are turned by the azimuth, not resampled",
+}
+
 FILES: dict[str, dict[str, str]] = {
     "trajectory.kitti": {
         **_POSES,
@@ -60,6 +68,14 @@ FILES: dict[str, dict[str, str]] = {
     "dem.tif": {**_RASTER, "values": "elevation z of the cell centre, m", "missing": "nan"},
     "dem_sigma.tif": {**_RASTER, "values": "standard deviation of the elevation, m", "missing": "nan"},
     "ortho.tif": {**_RASTER, "values": "grey value 0..255", "missing": "nan"},
+    "slope.tif": {**_RASTER, "values": "inclination of the terrain, degrees", "missing": "nan"},
+    "hillshade.tif": {**_RASTER, "values": "shaded relief 1..255, light from the upper left", "missing": "0"},
+    "terrain.zarr": {
+        "frame": "world",
+        "crs": "engineering CRS, metres; easting and northing beside x and y where the sequence has a place on Earth",
+        "values": "all merged arrays as one zarr 3 group, by the CF conventions; units with each",
+        "opens_with": "xarray.open_zarr",
+    },
     "risk.tif": {**_RASTER, "values": "class 0 safe, 1 hazardous, 2 unknown; reason bits; filled 0 or 1"},
     "path.gpkg": {"frame": "world", "crs": "engineering CRS, metres", "coordinates": "x y z, m"},
     "path.geojson": {"frame": "world", "crs": "none: local metres, not WGS 84", "coordinates": "x y z, m"},
@@ -68,7 +84,13 @@ FILES: dict[str, dict[str, str]] = {
 
 
 def describe(
-    written: Sequence[str], frames: Sequence[int], names: Sequence[str], stamps: Sequence[float], *, clock: bool
+    written: Sequence[str],
+    frames: Sequence[int],
+    names: Sequence[str],
+    stamps: Sequence[float],
+    *,
+    clock: bool,
+    place: Georeference | None = None,
 ) -> dict[str, Any]:
     """What ``frames.json`` holds.
 
@@ -77,12 +99,17 @@ def describe(
     written : names of the files that the run has written; only these are described.
     frames, names, stamps : number, name and time stamp (as in the trajectory files) of each frame.
     clock : the stamps are seconds; otherwise they are the frames' numbers.
+    place : of the world frame, where it is known; rasters and ``path.gpkg`` are then in its CRS.
     """
+    known = {name: FILES[name] for name in FILES if name in written}
+    if place is not None:
+        known = {name: facts | _PLACED if name.endswith(IN_PLACE) else facts for name, facts in known.items()}
     return {
         "format": FORMAT,
         "units": {"length": "m", "angle": "rad, deg where the name says so", "time": "s" if clock else "frame number"},
         "frames_of_reference": FRAMES,
-        "files": {name: FILES[name] for name in FILES if name in written},
+        "files": known,
+        "georeference": None if place is None else place.to_dict(),
         "frames": [
             {"frame": frame, "name": name, "time": stamp}
             for frame, name, stamp in zip(frames, names, stamps, strict=True)

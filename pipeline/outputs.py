@@ -17,10 +17,14 @@ from pipeline.report.artifacts import by_frame
 from pipeline.report.canvas import ground_limits
 from pipeline.report.comparison import compare
 from pipeline.store import Store
-from stages.declare import Bundle
+from pipeline.terrain_zarr import write_terrain
+from stages import merge
+from stages.declare import Array, Bundle
 from stages.lattice import Lattice, mosaic, union
 from stages.risk import REASONS
+from stages.shading import hillshade, slope_deg
 
+SLOPE = Array("slope", ("row", "col"), "float32", "degree", "inclination of the terrain", "nan", "world")
 Lookup = Callable[[Any], Bundle | None]
 
 
@@ -48,23 +52,23 @@ def task_rows(graph: Graph, store: Store) -> tuple[TaskRow, ...]:
 
 def write(folder: Path, view: RunView) -> None:
     """All files of a run; what has no artifact is left out (the report says so)."""
-    find, p = view.bundle, view.products
+    find, p, place = view.bundle, view.products, view.sequence.georeference
     tiles = [find(tile) for tile in p.tiles]
     if tiles and all(tiles):  # a hole in the run must not look like unknown terrain
-        _write_terrain(folder, [t for t in tiles if t is not None])
+        _write_terrain(folder, view, [t for t in tiles if t is not None])
     risk = find(p.risk)
     if risk is not None:
         bands = {"class": risk["risk"], "reason": risk["reason"], "filled": risk["filled"]}
         reasons = ", ".join(f"{bit} {name}" for name, bit in REASONS.items())
         tags = {"classes": "0 safe, 1 hazardous, 2 unknown (never safe)", "reason_bits": reasons}
         lattice = Lattice.from_dict(risk.meta["lattice"])
-        files.write_raster(folder / "risk.tif", bands, lattice, unit="", nodata=None, tags=tags)
+        files.write_raster(folder / "risk.tif", bands, lattice, unit="", nodata=None, tags=tags, place=place)
         files.write_style(folder / "risk.qml", "risk")
     path = find(p.path)
     if path is not None:
         facts = {k: v for k, v in path.meta.items() if not isinstance(v, dict)}
         files.write_path_geojson(folder / "path.geojson", np.asarray(path["path"]), facts)
-        files.write_path_gpkg(folder / "path.gpkg", np.asarray(path["path"]), facts)
+        files.write_path_gpkg(folder / "path.gpkg", np.asarray(path["path"]), facts, place)
     _write_trajectories(folder, view)
     write_report(folder, view)
 
@@ -87,19 +91,45 @@ def _write_trajectories(folder: Path, view: RunView) -> None:
         files.write_table(folder / "agreement.csv", columns | compared.columns())
     written = [file.name for file in folder.iterdir()]
     chosen = [names[f] for f in view.frames]
-    facts = describe(written, view.frames, chosen, stamps, clock=times is not None)
+    facts = describe(written, view.frames, chosen, stamps, clock=times is not None, place=view.sequence.georeference)
     files.write_text(folder / "frames.json", json.dumps(facts, indent=1) + "\n")
 
 
-def _write_terrain(folder: Path, tiles: list[Bundle]) -> None:
-    """Merged rasters, assembled from world tiles, and the style of the elevation."""
-    lattices = [Lattice.from_dict(t.meta["lattice"]) for t in tiles]
+def _write_terrain(folder: Path, view: RunView, tiles: list[Bundle]) -> None:
+    """Merged rasters, assembled from world tiles, what is derived of the elevation, its style, and all as zarr."""
+    lattices, place = [Lattice.from_dict(t.meta["lattice"]) for t in tiles], view.sequence.georeference
     whole = union(lattices)
-    for file, array, unit in (("dem", "elevation", "m"), ("dem_sigma", "elevation_std", "m"), ("ortho", "ortho", "")):
-        values = mosaic([(part, t[array]) for part, t in zip(lattices, tiles, strict=True)], np.nan, whole)
-        bands = {array: values.astype(np.float32)}
-        files.write_raster(folder / f"{file}.tif", bands, whole, unit=unit, nodata=float("nan"))
-        if file == "dem":
-            low, high = ground_limits(values)
-            steps = {f"e{k}": low + (high - low) * k / 8 for k in range(9)}
-            files.write_style(folder / "dem.qml", "dem", steps)
+    arrays = {}
+    for spec in merge.STAGE.outputs:
+        if spec.dims == ("row", "col") and all(spec.name in t.arrays for t in tiles):
+            parts = [(part, np.asarray(t[spec.name])) for part, t in zip(lattices, tiles, strict=True)]
+            arrays[spec.name] = (
+                spec,
+                mosaic(parts, np.nan if spec.nodata == "nan" else float(spec.nodata or 0), whole),
+            )
+    elevation = arrays["elevation"][1]
+    height = elevation if place is None else (elevation.astype(np.float64) + place.origin[2])
+    slope = slope_deg(elevation, whole.cell)
+    rasters = {
+        "dem": ("elevation", height, "m"),
+        "dem_sigma": ("elevation_std", arrays["elevation_std"][1], "m"),
+        "ortho": ("ortho", arrays["ortho"][1], ""),
+        "slope": ("slope", slope, "degree"),
+    }
+    for file, (name, values, unit) in rasters.items():
+        bands = {name: np.asarray(values, np.float32)}
+        files.write_raster(folder / f"{file}.tif", bands, whole, unit=unit, nodata=float("nan"), place=place)
+    shade, light = hillshade(elevation, whole.cell), {"light": "from the upper left (315 degrees), 45 degrees high"}
+    files.write_raster(
+        folder / "hillshade.tif", {"hillshade": shade}, whole, unit="", nodata=0, tags=light, place=place
+    )
+    low, high = ground_limits(height)
+    files.write_style(folder / "dem.qml", "dem", {f"e{k}": low + (high - low) * k / 8 for k in range(9)})
+    arrays["slope"] = (SLOPE, slope)
+    about = {
+        "title": f"Merged terrain of the sequence {view.sequence.name}",
+        "source": "stereo images: disparity by HFVM, elevation models by Locus, merged; Rille "
+        + view.versions.get("rille", ""),
+        "history": view.command,
+    }
+    write_terrain(folder / "terrain.zarr", arrays, whole, place, about)

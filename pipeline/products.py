@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from datasets.georeference import Georeference
 from stages.errors import InputError
 from stages.lattice import Lattice
 
@@ -68,8 +69,9 @@ def write_raster(
     unit: str,
     nodata: float | None,
     tags: Mapping[str, str] | None = None,
+    place: Georeference | None = None,
 ) -> None:
-    """Write a cloud-optimised GeoTIFF in the engineering CRS.
+    """Write a cloud-optimised GeoTIFF in the engineering CRS, or in that of ``place``.
 
     Parameters
     ----------
@@ -79,6 +81,8 @@ def write_raster(
     nodata : value of unknown cells (NaN for floats). None where every value means something; the overviews then take
         the most frequent value, since classes have no mean.
     tags : more metadata; the frame, the unit and the cell size are always there.
+    place : of the world frame. The raster is not resampled: its geotransform is turned by the azimuth. Elevations have
+        to be heights in its system already.
 
     Raises
     ------
@@ -86,20 +90,18 @@ def write_raster(
         An array does not fit the lattice.
     """
     import rasterio
-    from rasterio.transform import from_origin
 
     for name, values in bands.items():
         if values.shape != lattice.shape:
             raise InputError(f"band {name} of {values.shape} cells does not fit its lattice {lattice.shape}")
-    half = 0.5 * lattice.cell
     profile = {
         "driver": "COG",
         "height": lattice.rows,
         "width": lattice.cols,
         "count": len(bands),
         "dtype": next(iter(bands.values())).dtype.name,
-        "crs": rasterio.crs.CRS.from_wkt(ENGINEERING_CRS),
-        "transform": from_origin(lattice.x0 - half, lattice.y0 + half, lattice.cell, lattice.cell),
+        "crs": rasterio.crs.CRS.from_user_input(ENGINEERING_CRS if place is None else place.crs),
+        "transform": raster_transform(lattice, place),
         "nodata": nodata,
         "compress": "deflate",
         "level": 1,
@@ -108,13 +110,35 @@ def write_raster(
         "blocksize": 256,
         "overview_resampling": "mode" if nodata is None else "average",
     }
-    facts = {"FRAME": FRAME, "UNIT": unit, "CELL_SIZE_M": f"{lattice.cell:.12g}"}
+    facts = {"FRAME": FRAME, "AXES": _axes(place), "UNIT": unit, "CELL_SIZE_M": f"{lattice.cell:.12g}"}
     with replacing(path) as temporary, rasterio.open(temporary, "w", **profile) as file:
         for number, (name, values) in enumerate(bands.items(), start=1):
             file.write(np.asarray(values), number)
             file.set_band_description(number, name)
         file.units = ("metre" if unit == "m" else unit,) * len(bands)
         file.update_tags(**facts, **{key.upper(): value for key, value in dict(tags or {}).items()})
+
+
+def raster_transform(lattice: Lattice, place: Georeference | None) -> Any:
+    """Affine transform from (column, row) of a raster, corners of cells at integers, to its CRS."""
+    from affine import Affine
+
+    half = 0.5 * lattice.cell
+    corner = Affine(lattice.cell, 0.0, lattice.x0 - half, 0.0, -lattice.cell, lattice.y0 + half)
+    if place is None:
+        return corner
+    (a, b), (c, d) = place.rotation
+    return Affine(a, b, place.origin[0], c, d, place.origin[1]) @ corner
+
+
+def _axes(place: Georeference | None) -> str:
+    if place is None:
+        return "the CRS's x and y are the world frame's; rows fall with y"
+    e, n, h = place.origin
+    return (
+        f"easting = {e:.3f} + x cos a + y sin a, northing = {n:.3f} - x sin a + y cos a, height = {h:.3f} + z with x, "
+        f"y, z of the frame and a = {np.degrees(place.azimuth):.6g} degrees, clockwise from grid north"
+    )
 
 
 def write_path_geojson(path: Path, vertices: NDArray[np.float64], facts: Mapping[str, Any]) -> None:
@@ -142,23 +166,27 @@ def _feature(geometry: Mapping[str, Any] | None, properties: Mapping[str, Any]) 
     return {"type": "Feature", "geometry": geometry, "properties": dict(properties)}
 
 
-def write_path_gpkg(path: Path, vertices: NDArray[np.float64], facts: Mapping[str, Any]) -> None:
-    """Write the path as GeoPackage in the engineering CRS: layers ``path`` (line) and ``ends`` (start, target).
+def write_path_gpkg(
+    path: Path, vertices: NDArray[np.float64], facts: Mapping[str, Any], place: Georeference | None = None
+) -> None:
+    """Write the path as GeoPackage: layers ``path`` (line) and ``ends`` (start, target).
 
     Parameters
     ----------
     vertices : (vertex, xyz) metres, world frame; where no path was found they are empty, ``path`` holds a feature
         without geometry, and there is no layer ``ends``.
     facts : properties of the line; those that are no text, number or truth value are left out.
+    place : of the world frame; the coordinates are then those of its CRS, else of the engineering CRS.
     """
     import pyogrio
     from pyogrio.raw import write
 
     pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": GPKG_DATE})
-    given = {"name": "path", "frame": FRAME, "unit": "m"} | dict(facts)
+    given = {"name": "path", "frame": FRAME, "axes": _axes(place), "unit": "m"} | dict(facts)
     kept = {name: value for name, value in given.items() if isinstance(value, str | int | float)}
     columns = [np.array([value], dtype=object if isinstance(value, str) else None) for value in kept.values()]
-    common = {"driver": "GPKG", "crs": ENGINEERING_CRS}
+    common = {"driver": "GPKG", "crs": ENGINEERING_CRS if place is None else place.crs}
+    vertices = vertices if place is None else place.apply(vertices)
     line = _wkb(LINE_Z, vertices) if len(vertices) > 1 else None
     with replacing(path) as temporary:
         lines = np.array([line], dtype=object)

@@ -60,7 +60,8 @@ def _plain(value: Any) -> Any:
 
 def seal(folder: Path, stamped: str) -> None:
     """Write the stamp of a finished run over the files that are there."""
-    files = {p.name: [p.stat().st_size, crc32c(p)] for p in sorted(folder.iterdir()) if p.is_file()}
+    written = [p for p in sorted(folder.rglob("*")) if p.is_file()]
+    files = {p.relative_to(folder).as_posix(): [p.stat().st_size, crc32c(p)] for p in written}
     temporary = folder / f".{FILE}.tmp"
     temporary.write_text(json.dumps({"stamp": stamped, "files": files}, indent=1) + "\n", encoding="utf-8")
     os.replace(temporary, folder / FILE)

@@ -25,6 +25,7 @@ from stages.geometry import Rig, RigidTransform
 from stages.ground import view_ground
 from stages.lattice import Lattice
 from stages.level import z_range as plane_z_range
+from stages.locus_empty import explain
 from stages.locus_kernel import search
 from stages.surface import Surface, plane
 from stages.validity import matched
@@ -270,10 +271,11 @@ def _run(params: LocusParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle
     if params.max_sigma is None:
         params = params.model_copy(update={"max_sigma": lattice.cell})
     disparity = inputs["disparity"]
+    good = usable(disparity["validity"], disparity["backmatch_error"], params)
     dem = reconstruct(
         disparity["column_disparity"],
         disparity["row_disparity"],
-        usable(disparity["validity"], disparity["backmatch_error"], params),
+        good,
         inputs["left"]["level_0"],
         rig,
         T,
@@ -282,6 +284,8 @@ def _run(params: LocusParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle
         params,
         disparity_std=disparity.arrays.get("disparity_std"),
     )
+    if not np.isfinite(dem.elevation).any():
+        raise explain(rig, T, plane(lattice), (z_range[0], z_range[1]), good)
     meta = {
         "lattice": lattice.to_dict(),
         "frame": args["frame"],

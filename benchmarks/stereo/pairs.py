@@ -115,7 +115,7 @@ def mockup() -> Pair:
     from datasets.registry import open_sequence
     from pipeline.cli import cache_folder
 
-    sequence, fetch = open_sequence("mockup"), _fetch(cache_folder(None))
+    sequence, fetch = open_sequence("mockup"), fetcher(cache_folder(None))
     assert sequence.truth_disparity is not None
     left, right = (np.asarray(fetch(sequence.image(0, c))["image"]) for c in ("left", "right"))
     exact = fetch(sequence.truth_disparity(0))
@@ -157,7 +157,7 @@ def _data(name: str) -> Path | None:
     return folder if folder.is_dir() else None
 
 
-def _fetch(cache: Path) -> Callable[[Any], Any]:
+def fetcher(cache: Path) -> Callable[[Any], Any]:
     """Function that computes a source once and then reads it from the cache."""
     from pipeline.store import Store
     from pipeline.task import Spec, ensure

@@ -47,6 +47,9 @@ FILES: dict[str, tuple[str, str]] = {
     "dem.tif": ("merged elevation, m, NaN undefined", "QGIS, GDAL"),
     "dem.qml": ("colours of dem.tif, which QGIS applies by itself", "QGIS"),
     "dem_sigma.tif": ("standard deviation of the elevation, m", "QGIS, GDAL"),
+    "slope.tif": ("inclination of the terrain, degrees", "QGIS, GDAL"),
+    "hillshade.tif": ("shaded relief of the terrain", "QGIS, GDAL"),
+    "terrain.zarr": ("all merged arrays with units and coordinates", "xarray.open_zarr"),
     "ortho.tif": ("merged ortho image, grey 0..255", "QGIS, GDAL"),
     "risk.tif": (
         "risk map; bands: class (0 safe, 1 hazardous, 2 unknown), reason (bits), filled (1: closed hole)",

@@ -11,6 +11,7 @@ import pytest
 from folders import CAMERAS, write_images, write_lines, write_sequence
 
 from datasets.files import Digests
+from datasets.georeference import Georeference
 from datasets.manifest import dotted, open_manifest
 from datasets.manifest_model import Manifest, known_keys, read_manifest, tables
 from datasets.protocol import Sequence
@@ -110,6 +111,13 @@ def test_cameras_may_differ(tmp_path):
 def test_direction_of_up_is_that_of_the_left_camera_where_no_file_states_another(tmp_path):
     s = opened(write_sequence(tmp_path, "[world]\nup = [0, -2, 0]\n"))
     assert s.up == ((0.0, -1.0, 0.0),) * 3
+    assert s.georeference is None
+
+
+def test_place_on_earth(tmp_path):
+    place = 'crs = "EPSG:32633"\norigin = [500100.0, 5200200.0, 1800.0]\nazimuth_deg = 90.0\n'
+    s = opened(write_sequence(tmp_path, f"[world]\n{place}"))
+    assert s.georeference == Georeference("EPSG:32633", (500100.0, 5200200.0, 1800.0), math.pi / 2)
 
 
 # -- times -------------------------------------------------------------------------------------------------------------
@@ -276,6 +284,7 @@ def test_sensors_need_times(tmp_path):
         ({"text": "[images.more]\n"}, r"unknown key 'images\.more'"),
         ({"text": "[times]\nrate_hz = 1.0\nnames = true\n"}, "times: give one of file, names = true or rate_hz"),
         ({"text": "[world]\npitch_deg = 3.0\nup = [0, 0, 1]\n"}, r"world\.up and world\.pitch_deg both state"),
+        ({"text": '[world]\ncrs = "EPSG:32633"\n'}, r"world\.origin and world\.azimuth_deg missing"),
         ({"text": "[world]\nup = [0, 0, 0]\n"}, r"world\.up = \[0\.0, 0\.0, 0\.0\] has no direction"),
         ({"text": "[vehicle]\nmax_step = 0.5\n"}, r"vehicle: max_step 0\.5 m is higher than clearance 0\.2 m"),
         ({"text": "[vehicle]\nmax_steps = 0.5\n"}, r"unknown key 'vehicle\.max_steps'.*'vehicle\.max_step'"),

@@ -63,6 +63,7 @@ def test_outputs_are_all_there_and_sound(cold: Path) -> None:
     folder = latest(cold)
     wanted = {"trajectory.kitti", "trajectory.tum", "dem.tif", "dem_sigma.tif", "ortho.tif", "risk.tif"}
     wanted |= {"path.gpkg", "frames.json", "dem.qml", "risk.qml", "crosscheck.tum", "agreement.csv"}
+    wanted |= {"slope.tif", "hillshade.tif", "terrain.zarr"}
     wanted |= {"path.geojson", "config.toml", "report.json", "report.html", "ledger.jsonl"}
     assert wanted <= {p.name for p in folder.iterdir()}
     assert np.loadtxt(folder / "trajectory.kitti").shape == (5, 12)

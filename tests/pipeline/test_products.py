@@ -10,11 +10,13 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pyogrio
+import pyproj
 import pytest
 import rasterio
 from evo.tools import file_interface
 from toys.finished import FRAMES, bundles, checked, checks, view
 
+from datasets.georeference import Georeference
 from pipeline import outputs
 from pipeline.conventions import FILES, describe
 from pipeline.products import (
@@ -59,6 +61,34 @@ def test_an_elevation_raster_keeps_values_place_and_crs(tmp_path: Path) -> None:
         assert "z up" in file.tags()["FRAME"]
         assert file.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"
         assert file.overviews(1)
+
+
+def test_the_engineering_crs_is_in_metres_and_says_how_axes_lie(tmp_path: Path) -> None:
+    write_raster(tmp_path / "a.tif", {"a": np.zeros(LATTICE.shape, np.uint8)}, LATTICE, unit="1", nodata=None)
+    with rasterio.open(tmp_path / "a.tif") as file:
+        crs = pyproj.CRS.from_wkt(file.crs.to_wkt(version="WKT2_2019"))
+        assert "x and y are the world frame's" in file.tags()["AXES"]
+    assert crs.is_engineering
+    assert [(a.name, a.direction, a.unit_name) for a in crs.axis_info] == [
+        ("x", "east", "metre"),
+        ("y", "north", "metre"),
+    ]
+
+
+def test_a_raster_with_a_place_is_turned_and_not_resampled(tmp_path: Path) -> None:
+    place = Georeference("EPSG:32633", (500100.0, 5200200.0, 1800.0), 0.7)
+    z = np.random.default_rng(0).normal(size=LATTICE.shape).astype(np.float32)
+    write_raster(tmp_path / "dem.tif", {"elevation": z}, LATTICE, unit="m", nodata=float("nan"), place=place)
+    with rasterio.open(tmp_path / "dem.tif") as file:
+        assert file.crs.to_epsg() == 32633
+        np.testing.assert_array_equal(file.read(1), z)
+        at = LATTICE.xs()[123], LATTICE.ys()[45], 0.0
+        assert file.xy(45, 123) == pytest.approx(tuple(place.apply(at)[:2]), abs=1e-6)
+        assert "clockwise from grid north" in file.tags()["AXES"]
+    write_path_gpkg(tmp_path / "path.gpkg", VERTICES, {"found": True}, place)
+    meta, _, geometry, _ = pyogrio.raw.read(tmp_path / "path.gpkg", layer="path")
+    assert meta["crs"] == "EPSG:32633"
+    np.testing.assert_allclose(np.frombuffer(geometry[0][9:], "<f8").reshape(-1, 3), place.apply(VERTICES), atol=1e-9)
 
 
 def test_classes_are_not_averaged_in_overviews(tmp_path: Path) -> None:
@@ -219,3 +249,9 @@ def test_only_what_was_written_is_described() -> None:
     facts = describe(["dem.tif", "notes.txt"], [3], ["left003"], [0.5], clock=True)
     assert list(facts["files"]) == ["dem.tif"]
     assert facts["units"]["time"] == "s"
+    assert facts["georeference"] is None
+    place = Georeference("EPSG:32633", (1.0, 2.0, 3.0), 0.5)
+    placed = describe(["dem.tif", "path.geojson"], [3], ["left003"], [0.5], clock=True, place=place)
+    assert placed["files"]["dem.tif"]["frame"] == "georeference"
+    assert placed["files"]["path.geojson"]["frame"] == "world"
+    assert placed["georeference"]["origin"] == [1.0, 2.0, 3.0]

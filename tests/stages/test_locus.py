@@ -342,9 +342,10 @@ def test_stage_parameters_of_the_lattice() -> None:
     assert shared.meta["lattice"]["cell"] == 0.02
     extent = locus.STAGE.run(LocusParams(cell_size=0.01, extent=(-0.1, 0.1, 0.6, 0.9)), args, inputs)
     assert Lattice.from_dict(extent.meta["lattice"]) == Lattice.snap((-0.1, 0.1, 0.6, 0.9), 0.01)
-    strict = locus.STAGE.run(LocusParams(max_sigma=1e-6, extent=(-0.1, 0.1, 0.6, 0.9)), args, inputs)
-    assert strict.meta["defined"] == 0.0
-    assert strict.meta["median_residual"] is None
+    with pytest.raises(DegenerateError, match=r"raise .* locus\.max_sigma"):
+        locus.STAGE.run(LocusParams(max_sigma=1e-6, extent=(-0.1, 0.1, 0.6, 0.9)), args, inputs)
+    with pytest.raises(DegenerateError, match=r"behind the left camera: -.*locus\.extent"):
+        locus.STAGE.run(LocusParams(cell_size=0.01, extent=(-0.3, 0.3, -5.0, -4.0)), args, inputs)
     with pytest.raises(ConfigError, match=r"locus\.cell_size"):
         locus.STAGE.run(LocusParams(cell_size=1e-5, extent=(-1, 1, 0, 1)), args, inputs)
     with pytest.raises(ConfigError, match="extent"):
