@@ -183,12 +183,16 @@ class LazyArrays(Mapping[str, AnyArray]):
 
     def __getitem__(self, name: str) -> AnyArray:
         if name not in self._loaded:
-            if name not in self:
-                raise KeyError(f"{self._manifest['stage']} has no array {name!r}, only {', '.join(self) or 'metadata'}")
-            self._loaded[name] = self._read(name)
+            self._loaded[name] = self._read(name, (...,))
         return self._loaded[name]
 
-    def _read(self, name: str) -> AnyArray:
+    def part(self, name: str, window: tuple[Any, ...]) -> AnyArray:
+        """Part of an array, which is not kept: only the chunks that hold it are read."""
+        return self._read(name, window)
+
+    def _read(self, name: str, window: tuple[Any, ...]) -> AnyArray:
+        if name not in self:
+            raise KeyError(f"{self._manifest['stage']} has no array {name!r}, only {', '.join(self) or 'metadata'}")
         import zarr
         from zarr.storage import LocalStore
 
@@ -197,7 +201,7 @@ class LazyArrays(Mapping[str, AnyArray]):
         if not wrong:
             try:
                 array = zarr.open_array(store=LocalStore(self._folder / name, read_only=True), mode="r")
-                values = np.asarray(array[...])
+                values = np.asarray(array[window])
                 # zarr fills in for a chunk that has gone while it read (by clearing up, say) without a word
                 if not (wrong := damage(self._folder, files, lambda _: False)):
                     return values
