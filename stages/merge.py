@@ -173,9 +173,8 @@ def _stacked(layers: Sequence[Layer | _Stored], strip: Lattice, name: str) -> Fl
 
 def _close(merged: Merged, params: MergeParams) -> None:
     """Close the small holes in place; their grey value stays undefined, nobody took it."""
-    z, sigma, filled = close_holes(
-        merged.elevation, merged.elevation_std, float(params.max_hole), params.hole_window, params.hole_known
-    )
+    gap, window = float(params.max_hole), params.hole_window
+    z, sigma, filled = close_holes(merged.elevation, merged.elevation_std, gap, window, params.hole_known, judged=True)
     merged.elevation[...], merged.elevation_std[...], merged.filled[...] = z, sigma, filled
 
 

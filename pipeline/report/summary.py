@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from pipeline.report import tables
+from pipeline.report import seams, tables
 from pipeline.report.block import Gallery
 from pipeline.report.gather import Scene
 from pipeline.report.metrics import metrics
@@ -35,6 +35,7 @@ def summarise(scene: Scene, gallery: Gallery) -> dict[str, Any]:
         "verdict": _verdict(view, frames, pairs, missing),
         "missing": missing,
         "warnings": find_warnings(scene),
+        "seams": seams.facts(scene),
         "sequence": _sequence(view),
         "truth": {"used": assessed, "source": view.sequence.truth_source if assessed else "no truth"},
         "metrics": metrics(scene, frames, pairs),
