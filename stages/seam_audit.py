@@ -4,7 +4,8 @@ A seam says that one of two models is off, not which. A model that is off itself
 its neighbours each in one of theirs. So for every model the bias and tilt that explain its seams best, its neighbours
 held, are found by least squares; the one that explains most (Baarda's data snooping, one model at a time) is noted and
 taken out of its seams, and so on. Seams differ by more than matching noise wherever poses have errors: a variance
-factor, the median over the seams, says by how much, and a model is *found* only if it stands out beyond that.
+factor, the median over the seams that neither it nor a model found before has a part in, says by how much, and a model is
+*found* only if it stands out beyond that.
 """
 
 from __future__ import annotations
@@ -26,6 +27,8 @@ Facts = Mapping[str, Any]
 
 MEDIAN, STANDS_OUT = 2.366, 21.11
 """Of chi-square with three degrees of freedom: median, and what chance exceeds once in ten thousand."""
+LEAST_OTHERS = 3
+"""Seams without a model that tell what is usual; with fewer, all seams have to."""
 NAMED = 3
 """Models that a warning names."""
 
@@ -76,23 +79,30 @@ def audit(seams: Sequence[Facts], centres: Mapping[int, Sequence[float]]) -> tup
     (``chi2`` over the variance factor), ``found``, ``neighbours`` and ``either``: nothing tells it from its only one.
     """
     every = [_Seam.of(s) for s in sorted(seams, key=lambda s: (s["pair"], s["other"]))]
-    sizes = [float(s.left @ s.weight @ s.left) for s in every]
-    factor = max(1.0, float(np.median(sizes)) / MEDIAN) if sizes else 1.0
+    sizes = [(float(s.left @ s.weight @ s.left), {s.facts["pair"], s.facts["other"]}) for s in every]
     of: dict[int, list[_Seam]] = defaultdict(list)
     for s in every:
         of[s.facts["pair"]].append(s)
         of[s.facts["other"]].append(s)
     solved = {pair: _explain(pair, mine, centres[pair]) for pair, mine in sorted(of.items())}
-    listed = []
+    listed: list[dict[str, Any]] = []
     while solved:
         worst = max(solved, key=lambda pair: solved[pair][2])
         plane, covariance, chi2 = solved.pop(worst)
+        factor = _factor(sizes, {worst, *(m["pair"] for m in listed if m["found"])})
         listed.append(_entry(worst, (plane, covariance, chi2), factor, of, centres[worst]))
         for s in of[worst]:
             s.left = s.left - s.design(worst, centres[worst]) @ plane
         for pair in {s.facts[end] for s in of[worst] for end in ("pair", "other")} & set(solved):
             solved[pair] = _explain(pair, of[pair], centres[pair])
-    return factor, listed
+    return _factor(sizes, set()), listed
+
+
+def _factor(sizes: Sequence[tuple[float, set[int]]], without: set[int]) -> float:
+    """How much more than noise seams differ: the median of those that some models have no part in, if there are any."""
+    others = [size for size, pairs in sizes if not pairs & without]
+    chosen = others if len(others) >= LEAST_OTHERS else [size for size, _ in sizes]
+    return max(1.0, float(np.median(chosen)) / MEDIAN) if chosen else 1.0
 
 
 def _explain(pair: int, seams: Sequence[_Seam], centre: Sequence[float]) -> tuple[Floats, Floats, float]:

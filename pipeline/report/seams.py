@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pipeline.report import canvas, figures
 from pipeline.report.block import Block, Table
 from pipeline.report.gather import Scene
-from pipeline.report.words import length, number, spread
+from pipeline.report.words import number, spread
 
 Facts = Mapping[str, Any]
 
@@ -90,10 +90,10 @@ def models(scene: Scene) -> Block | None:
     rows = tuple(
         (
             str(m["pair"]),
-            f"{_signed(m['bias'])} ± {length(m['sigma'][0])}",
+            f"{_signed(m['bias'])} ± {_size(m['sigma'][0])}",
             *(f"{_degrees(t)} ± {number(math.degrees(s), 2)}°" for t, s in zip(m["tilt"], m["sigma"][1:], strict=True)),
-            length(m["systematic"]),
-            length(m["expected"]),
+            _size(m["systematic"]),
+            _size(m["expected"]),
             ", ".join(word for word in ("found", "contradicts") if m[word]) or "–",
         )
         for m in listed[:MOST_ROWS]
@@ -119,18 +119,23 @@ def _seam_table(found: Facts) -> Table:
             (
                 f"{s['pair']} – {s['other']}",
                 str(s["cells"]),
-                f"{_signed(s['bias'])} ± {length(sigma[0])}",
+                f"{_signed(s['bias'])} ± {_size(sigma[0])}",
                 *(f"{_degrees(t)} ± {number(math.degrees(e), 2)}°" for t, e in zip(s["tilt"], sigma[1:], strict=True)),
-                length(s["noise"]),
-                length(s["expected"]),
+                _size(s["noise"]),
+                _size(s["expected"]),
             )
         )
     head = ("Seam", "cells", "bias", "tilt along x", "tilt along y", "noise", "expected noise")
     return Table(head, tuple(rows), frozenset(range(1, 7)))
 
 
+def _size(metres: float) -> str:
+    """Millimetres with two digits: finer is beyond what the scatter of blocks tells."""
+    return f"{number(1000 * metres, 2)} mm"
+
+
 def _signed(metres: float) -> str:
-    return ("+" if metres > 0 else "") + length(metres).replace("-", "−")
+    return ("+" if metres > 0 else "") + _size(metres)
 
 
 def _degrees(radians: float) -> str:
