@@ -4,8 +4,8 @@ A seam says that one of two models is off, not which. A model that is off itself
 its neighbours each in one of theirs. So for every model the bias and tilt that explain its seams best, its neighbours
 held, are found by least squares; the one that explains most (Baarda's data snooping, one model at a time) is noted and
 taken out of its seams, and so on. Seams differ by more than matching noise wherever poses have errors: a variance
-factor, the median over the seams that neither it nor a model found before has a part in, says by how much, and a model is
-*found* only if it stands out beyond that.
+factor, the median over the seams that the worst model has no part in, says by how much, and a model is *found* only if
+it stands out beyond that.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ def audit(seams: Sequence[Facts], centres: Mapping[int, Sequence[float]]) -> tup
     while solved:
         worst = max(solved, key=lambda pair: solved[pair][2])
         plane, covariance, chi2 = solved.pop(worst)
-        factor = _factor(sizes, {worst, *(m["pair"] for m in listed if m["found"])})
+        factor = _factor(sizes, {m["pair"] for m in listed if m["found"]} or {worst})
         listed.append(_entry(worst, (plane, covariance, chi2), factor, of, centres[worst]))
         for s in of[worst]:
             s.left = s.left - s.design(worst, centres[worst]) @ plane
