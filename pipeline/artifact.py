@@ -198,14 +198,18 @@ class LazyArrays(Mapping[str, AnyArray]):
 
     def __getitem__(self, name: str) -> AnyArray:
         if name not in self._loaded:
-            if name not in self:
-                raise KeyError(f"{self._manifest['stage']} has no array {name!r}, only {', '.join(self) or 'metadata'}")
-            self._loaded[name] = self._read(name)
+            self._loaded[name] = self._read(name, (...,))
         return self._loaded[name]
 
-    def _read(self, name: str) -> AnyArray:
+    def part(self, name: str, window: tuple[Any, ...]) -> AnyArray:
+        """Part of an array, which is not kept: only the chunks that hold it are read."""
+        return self._read(name, window)
+
+    def _read(self, name: str, window: tuple[Any, ...]) -> AnyArray:
+        if name not in self:
+            raise KeyError(f"{self._manifest['stage']} has no array {name!r}, only {', '.join(self) or 'metadata'}")
         files = {f: v for f, v in self._manifest["files"].items() if f.startswith(f"{name}/")}
-        values, wrong = self._load(name, files)
+        values, wrong = self._load(name, files, window)
         if not wrong:
             return values
         self._damaged(wrong)
@@ -214,8 +218,8 @@ class LazyArrays(Mapping[str, AnyArray]):
             remedy="run again: it will be recomputed",
         )
 
-    def _load(self, name: str, files: Mapping[str, list[Any]]) -> tuple[AnyArray, str]:
-        """Values of an array, and what is wrong with its files, in words."""
+    def _load(self, name: str, files: Mapping[str, list[Any]], window: tuple[Any, ...]) -> tuple[AnyArray, str]:
+        """Values of a part of an array, and what is wrong with its files, in words."""
         import zarr
         from zarr.storage import LocalStore
 
@@ -224,7 +228,7 @@ class LazyArrays(Mapping[str, AnyArray]):
             return nothing, wrong
         try:
             array = zarr.open_array(store=LocalStore(self._folder / name, read_only=True), mode="r")
-            values = np.asarray(array[...])
+            values = np.asarray(array[window])
             # zarr fills in for a chunk that has gone while it read (by clearing up, say) without a word
             return values, damage(self._folder, files, lambda _: False)
         except Exception as error:  # a chunk's own checksum, and whatever a vanishing file leads to

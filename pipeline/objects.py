@@ -253,7 +253,7 @@ class RemoteArrays(LazyArrays):
         super().__init__(Path(manifest["path"]), manifest, damaged)
         self._bucket = bucket
 
-    def _load(self, name: str, files: Mapping[str, list[Any]]) -> tuple[AnyArray, str]:
+    def _load(self, name: str, files: Mapping[str, list[Any]], window: tuple[Any, ...]) -> tuple[AnyArray, str]:
         import zarr
         from zarr.core.buffer import cpu
         from zarr.storage import MemoryStore
@@ -267,7 +267,7 @@ class RemoteArrays(LazyArrays):
             f.removeprefix(f"{name}/"): cpu.Buffer.from_bytes(c[0]) for f, c in contents.items() if c is not None
         }
         array = zarr.open_array(store=MemoryStore(chunks, read_only=True), mode="r")
-        return np.asarray(array[...]), ""
+        return np.asarray(array[window]), ""
 
 
 def manifest_path(stage: str, key: str) -> str:

@@ -10,7 +10,9 @@
         given rig --+-> orientation (basic pair) <--------+     |                                         |
                     |       +-> rig -> calibration -------+-----+-> locus (local frame)                   |
                     |           (pooled; into level,      |           +-> risk, path (local)              |
-                    |            locus and resect)        +-> locus (world lattice) <---------------------+
+                    |            locus and resect)        +-> locus (world lattice) <- pose (pair) <------+
+                    |                                           +-> footprint (pair): which world tiles it touches
+                    |                                           +-> seam (pair, earlier ones) -> seam_audit, exposure
                     |                                           +-> merge (world tile) -> risk, path (mission)
                     +-> crosscheck (window; images of both cameras) -> crosscheck_join -> agreement <- trajectory
     leaves: accuracy (trajectory, crosscheck), dem_accuracy (local and merged DEM), path_check
@@ -18,11 +20,16 @@
 A segment needs landmarks only relative to its own basic pair, so all segments run at once; absolute poses are one
 cheap scan (``trajectory``), and Locus then runs a second time, straight on the shared world lattice: nothing is
 resampled. What depends on data (which pairs are basic, how far the world reaches) is expanded as results arrive.
+
+The world is cut into tiles once and for all; a tile's task has those models alone as inputs that have a cell in it. A
+pair that is added, or moved by another pose, is thus merged anew in the tiles that it touches and touched, no others:
+world models depend on their own pose only, and what comes out as before is not followed any further.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from collections.abc import Sequence as Series
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -34,6 +41,8 @@ from pipeline.dag import Graph, Handle
 from pipeline.task import Ref
 from stages.crosscheck import windows
 from stages.declare import NoParams, Params
+from stages.errors import DegenerateError
+from stages.footprint import Box, tile_lattice
 from stages.geometry import RigidTransform
 from stages.lattice import Lattice, union
 
@@ -62,6 +71,8 @@ class Products:
     tracks: list[Handle] = field(default_factory=list)
     resections: list[Handle] = field(default_factory=list)
     world_dem: dict[int, Handle] = field(default_factory=dict)
+    seams: dict[int, Handle] = field(default_factory=dict)
+    seam_audit: Handle | None = None
     tiles: list[Handle] = field(default_factory=list)
     trajectory: Handle | None = None
     risk: Handle | None = None
@@ -118,19 +129,30 @@ class Reconstruction:
         )
         self._assess_trajectory()
         for pair in basic:
-            p.world_dem[pair] = self._node(
-                "locus",
-                f"locus/world/{pair}",
-                {"pair": pair, "frame": "world", "row": self.frames.index(pair)},
-                disparity=p.disparity[pair],
-                rig=self.calibration[pair],
-                left=self.left[pair],
-                level=p.level[pair],
-                reference=p.level[basic[0]],
-                trajectory=p.trajectory,
-                local=p.local_dem[pair],
-            )
-        self.graph.expand([*p.world_dem.values(), p.trajectory], self._after_world)
+            p.world_dem[pair] = self._world_dem(pair, basic[0], p.trajectory)
+        side, margin = TILE_CELLS, self.config.merge.margin
+        footprints = [
+            self._node("footprint", f"footprint/{pair}", {"side": side, "margin": margin}, dem=dem)
+            for pair, dem in p.world_dem.items()
+        ]
+        self.graph.expand([*footprints, p.trajectory], self._after_world)
+
+    def _world_dem(self, pair: int, first: int, trajectory: Handle) -> Handle:
+        """Locus straight on the world lattice, by this pair's own pose."""
+        p = self.products
+        pose = self._node("pose", f"pose/{pair}", {"row": self.frames.index(pair)}, trajectory=trajectory)
+        return self._node(
+            "locus",
+            f"locus/world/{pair}",
+            {"pair": pair, "frame": "world", "row": 0},
+            disparity=p.disparity[pair],
+            rig=self.calibration[pair],
+            left=self.left[pair],
+            level=p.level[pair],
+            reference=p.level[first],
+            trajectory=pose,
+            local=p.local_dem[pair],
+        )
 
     def _match(self, pair: int) -> None:
         """Disparity of a pair, and the relative orientation that it asks for."""
@@ -226,29 +248,43 @@ class Reconstruction:
         )
 
     def _after_world(self, *refs: Ref) -> None:
-        """The extent is known: merge in world tiles, then hazards and the path over all of it."""
+        """Where the models lie is known: audit their seams, and level exposures before they are merged."""
+        *found, trajectory = refs
+        footprints = [ref.meta for ref in found if ref.meta["tiles"]]
+        if not footprints:
+            raise DegenerateError(
+                "no elevation model has a cell in the world", remedy="look at the disparities' validity"
+            )
+        centres = {str(f["pair"]): _centre(f["box"]) for f in footprints}
+        seams = self._seams(footprints)
+        self.products.seam_audit = self._node("seam_audit", "seam_audit", {"centres": centres}, seams=seams)
+        exposure = self._node("exposure", "exposure", {"centres": centres}, seams=seams)
+        self.graph.expand([exposure], lambda levelled: self._after_exposure(footprints, trajectory, levelled))
+
+    def _seams(self, footprints: list[Mapping[str, Any]]) -> list[Handle]:
+        """Each model against the earlier ones with which it shares a tile."""
         p = self.products
-        *dems, trajectory = refs
-        pairs = list(p.world_dem)
-        lattices = [Lattice.from_dict(ref.meta["lattice"]) for ref in dems]
-        whole = union(lattices)
-        for tile in whole.tiles(TILE_CELLS):
-            touching = [
-                pair for pair, lattice in zip(pairs, lattices, strict=True) if lattice.intersection(tile) is not None
-            ]
-            if touching:
-                p.tiles.append(
-                    self._node(
-                        "merge",
-                        f"merge/{tile.i0}_{tile.j0}",
-                        {"lattice": tile.to_dict()},
-                        dems=[p.world_dem[pair] for pair in touching],
-                    )
-                )
+        present: dict[tuple[int, int], list[int]] = {}
+        for meta in footprints:
+            pair, near = meta["pair"], set[int]()
+            for tx, ty, *_ in meta["tiles"]:
+                near.update(present.get((tx, ty), ()))
+                present.setdefault((tx, ty), []).append(pair)
+            if near:
+                others = [p.world_dem[other] for other in sorted(near)]
+                p.seams[pair] = self._node("seam", f"seam/{pair}", {}, dem=p.world_dem[pair], others=others)
+        return list(p.seams.values())
+
+    def _after_exposure(self, footprints: list[Mapping[str, Any]], trajectory: Ref, levelled: Ref) -> None:
+        """Merge in world tiles, then hazards and the path over all of it."""
+        p = self.products
+        p.tiles = merge_tiles(self._node, footprints, p.world_dem, levelled.meta["steps"])
         p.risk = self._risk("risk/world", p.tiles)
         heading = _heading(trajectory.meta)
         p.path = self._node("path", "path/world", {"use": "world", "heading": heading}, risk=p.risk)
+        pairs = list(p.world_dem)
         if self.sequence.truth_dem is not None and self._truth(pairs[0]) is not None:
+            whole = union(Lattice.from_dict(tile.spec.args["lattice"]) for tile in p.tiles)
             self.graph.expand([p.level[pairs[0]]], lambda level: self._world_accuracy(whole, pairs, level))
 
     # -- assessment: the only readers of truth ------------------------------------------------------------------
@@ -395,6 +431,41 @@ class Reconstruction:
     def _node(self, name: str, label: str, args: Mapping[str, Any], **inputs: Handle | list[Handle]) -> Handle:
         params: Params = getattr(self.config, name, NoParams())
         return self.graph.node(STAGE_MODULES[name], label, params, dict(args), {}, inputs)
+
+
+def merge_tiles(
+    node: Callable[..., Handle],
+    footprints: Series[Mapping[str, Any]],
+    dems: Mapping[int, Handle],
+    steps: Mapping[str, int],
+) -> list[Handle]:
+    """One task for each world tile that a model touches; all that enters it is of the models that do.
+
+    Parameters
+    ----------
+    node : ``node(stage, label, args, **inputs)`` adds a task.
+    footprints : facts of stage ``footprint``, one a model.
+    dems : world models by pair.
+    steps : exposure of the pairs whose grey values are levelled, as stage ``exposure`` gives them.
+    """
+    touching: dict[tuple[int, int], list[tuple[int, Box]]] = {}
+    for meta in footprints:
+        for tx, ty, *box in meta["tiles"]:
+            touching.setdefault((ty, tx), []).append((meta["pair"], (box[0], box[1], box[2], box[3])))
+    tiles = []
+    for (ty, tx), here in sorted(touching.items()):
+        here.sort()
+        args: dict[str, Any] = {"lattice": tile_lattice([box for _, box in here], footprints[0]["cell"]).to_dict()}
+        exposure = {str(pair): steps[str(pair)] for pair, _ in here if str(pair) in steps}
+        args |= {"exposure": exposure} if exposure else {}
+        tiles.append(node("merge", f"merge/{tx}_{ty}", args, dems=[dems[pair] for pair, _ in here]))
+    return tiles
+
+
+def _centre(box: Mapping[str, Any]) -> list[float]:
+    """Centre x, y of a lattice, metres."""
+    half = 0.5 * box["cell"]
+    return [box["x0"] + half * (box["cols"] - 1), box["y0"] - half * (box["rows"] - 1)]
 
 
 def _heading(trajectory: Mapping[str, Any]) -> list[float]:

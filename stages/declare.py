@@ -54,6 +54,12 @@ class Bundle:
     def __getitem__(self, name: str) -> AnyArray:
         return self.arrays[name]
 
+    def part(self, name: str, window: tuple[slice, ...]) -> AnyArray:
+        """Part of an array; of an artifact only that part is read, and nothing of it is kept."""
+        read = getattr(self.arrays, "part", None)
+        found: AnyArray = self.arrays[name][window] if read is None else read(name, window)
+        return found
+
 
 Inputs = Mapping[str, Any]
 """Port name to a :class:`Bundle`, or to a list of them for a port declared with a trailing ``*``."""

@@ -13,9 +13,12 @@ from stages.windows import window_sum
 Floats32 = NDArray[np.float32]
 Flags = NDArray[np.uint8]
 
+LEAST_TRIALS = 8
+"""Known cells nearby that must tell the error of an interpolation; with fewer, half the range of its rim stands in."""
+
 
 def close_holes(
-    elevation: Floats32, elevation_std: Floats32, max_gap: float, n: int, min_known: float
+    elevation: Floats32, elevation_std: Floats32, max_gap: float, n: int, min_known: float, *, judged: bool = False
 ) -> tuple[Floats32, Floats32, Flags]:
     """Interpolate unknown cells that lie between known ones.
 
@@ -29,10 +32,12 @@ def close_holes(
     elevation, elevation_std : (row, col) float32, metres, NaN unknown.
     max_gap : widest gap, cells.
     n, min_known : side of the window, cells, odd, and the share of its n x n cells that must be known.
+    judged : whether the standard deviation has the error of the interpolation too. It is found where the answer is
+        known: the same lines, laid through known cells of the window, tell by how much they miss them.
 
     Returns
     -------
-    Closed elevation, its standard deviation (the larger one of the rim's), and flags (uint8, 1 = closed here).
+    Closed elevation, its standard deviation (not below the largest of the rim's), and flags (uint8, 1 = closed here).
     """
     known = ~np.isnan(elevation)
     candidate = ~known & (window_sum(known, n) >= min_known * n * n)
@@ -40,19 +45,23 @@ def close_holes(
     filled = np.zeros(elevation.shape, dtype=np.uint8)
     cells = np.argwhere(candidate)
     if len(cells) and max_gap > 0:
-        _close(elevation, elevation_std, cells, float(max_gap), z, s, filled)
+        _close(elevation, elevation_std, cells, float(max_gap), n // 2 if judged else 0, z, s, filled)
     return z, s, filled
 
 
 @njit(cache=True, nogil=True)
-def _close(z_in, s_in, cells, max_gap, z, s, filled):  # type: ignore[no-untyped-def]
+def _close(z_in, s_in, cells, max_gap, window, z, s, filled):  # type: ignore[no-untyped-def]
     rows, cols = z_in.shape
     steps = ((0, 1), (1, 0), (1, 1), (1, -1))
+    lines = np.empty((4, 4), dtype=np.int64)
+    weights = np.empty((4, 2))
     for i in range(cells.shape[0]):
         r, c = cells[i, 0], cells[i, 1]
         total = 0.0
         weight = 0.0
         worst = 0.0
+        low, high = np.inf, -np.inf
+        used = 0
         for dr, dc in steps:
             unit = math.sqrt(float(dr * dr + dc * dc))
             reach = int(max_gap / unit + 1e-9)
@@ -79,7 +88,38 @@ def _close(z_in, s_in, cells, max_gap, z, s, filled):  # type: ignore[no-untyped
             total += wa * z_in[ra, ca] + wb * z_in[rb, cb]
             weight += wa + wb
             worst = max(worst, s_in[ra, ca], s_in[rb, cb])
+            low, high = min(low, z_in[ra, ca], z_in[rb, cb]), max(high, z_in[ra, ca], z_in[rb, cb])
+            lines[used, 0], lines[used, 1], lines[used, 2], lines[used, 3] = dr, dc, a, b
+            weights[used, 0], weights[used, 1] = wa, wb
+            used += 1
         if weight > 0.0:
             z[r, c] = total / weight
             s[r, c] = worst
             filled[r, c] = 1
+            if window > 0:
+                missed = _missed(z_in, r, c, window, lines, weights, used, weight)
+                s[r, c] = max(worst, 0.5 * (high - low) if math.isnan(missed) else missed)
+
+
+@njit(cache=True, nogil=True)
+def _missed(z, r, c, window, lines, weights, used, weight):  # type: ignore[no-untyped-def]
+    """RMS by which the lines of a cell miss the known cells around it; NaN where too few of them tell."""
+    rows, cols = z.shape
+    square = 0.0
+    trials = 0
+    for p in range(max(r - window, 0), min(r + window + 1, rows)):
+        for q in range(max(c - window, 0), min(c + window + 1, cols)):
+            if math.isnan(z[p, q]):
+                continue
+            total = 0.0
+            for k in range(used):
+                dr, dc, a, b = lines[k, 0], lines[k, 1], lines[k, 2], lines[k, 3]
+                pa, qa, pb, qb = p - a * dr, q - a * dc, p + b * dr, q + b * dc
+                if min(pa, qa, qb) < 0 or max(qa, qb) >= cols or pb >= rows:
+                    total = math.nan
+                    break
+                total += weights[k, 0] * z[pa, qa] + weights[k, 1] * z[pb, qb]
+            if not math.isnan(total):
+                square += (total / weight - z[p, q]) ** 2
+                trials += 1
+    return math.sqrt(square / trials) if trials >= LEAST_TRIALS else math.nan

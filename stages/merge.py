@@ -6,11 +6,15 @@ deviation and r its residual, a model's weight is
     w = 1 / (sigma^2 (1 + (r / r0)^2))        (sigma^-2 is (ds/dZ)^2 but for the disparity's error, equal for all)
 
 Where three or more models meet, one re-weighting about their weighted median takes out the one that contradicts.
+
+A tile is merged in strips of lines, of each model only the strip is read: what is in memory at once is bounded by
+:data:`STRIP_BYTES`, however many models meet and however large they are.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,13 +24,17 @@ from pydantic import Field
 
 from stages.declare import Array, Bundle, Inputs, Memory, Params, Stage
 from stages.errors import InputError
+from stages.exposure import STEP
+from stages.holes import close_holes
 from stages.lattice import Lattice
+from stages.merge_kernel import merge_cells
 
-Floats = NDArray[np.float64]
 Float32 = NDArray[np.float32]
 
-BICUBIC = 4.685  # Tukey's constant: 95 % efficiency where the errors are normal
 SHARPNESS = 8  # exponent of the ortho image's weights: the best image, but without a visible seam
+STRIP_BYTES = 1 << 26
+"""Bytes of the models that are in memory at once: 64 MiB are all of a usual tile, and a part where dozens meet."""
+MAPS = ("elevation", "elevation_std", "residual", "ortho")
 
 
 class MergeParams(Params):
@@ -35,11 +43,34 @@ class MergeParams(Params):
     residual_scale: float = Field(
         0.1, gt=0, description="pixels; residual that halves a model's weight: the disparity's error when it is good"
     )
+    max_hole: int = Field(
+        0,
+        ge=0,
+        le=64,
+        description="cells; widest hole that is closed by interpolation and flagged; none by default: what nobody saw "
+        "is not known",
+    )
+    hole_known: float = Field(
+        0.5, gt=0, le=1, description="share of the ground around a cell that must be known for it to be closed"
+    )
+
+    @property
+    def hole_window(self) -> int:
+        """Side of the window, cells, odd, that a hole's surroundings are judged by: a hole's width to either side."""
+        return 2 * self.max_hole + 3
+
+    @property
+    def margin(self) -> int:
+        """Cells around a tile that its closed holes depend on."""
+        return self.hole_window // 2 + self.max_hole + 1 if self.max_hole else 0
 
 
 @dataclass(frozen=True)
 class Layer:
-    """One pair's elevation model: arrays (rows, cols) on ``lattice``, NaN undefined, see :class:`stages.locus.Dem`."""
+    """One pair's elevation model: arrays (rows, cols) on ``lattice``, NaN undefined, see :class:`stages.locus.Dem`.
+
+    ``gain``: factor of its grey values that levels its exposure with that of its neighbours.
+    """
 
     pair: int
     lattice: Lattice
@@ -47,6 +78,22 @@ class Layer:
     elevation_std: Float32
     residual: Float32
     ortho: Float32
+    gain: float = 1.0
+
+    def part(self, name: str, window: tuple[slice, slice]) -> Float32:
+        """Part of an array."""
+        found: Float32 = getattr(self, name)[window]
+        return found
+
+
+@dataclass(frozen=True)
+class _Stored:
+    """The same of an artifact, read part by part."""
+
+    pair: int
+    lattice: Lattice
+    part: Callable[[str, tuple[slice, slice]], Any]
+    gain: float
 
 
 @dataclass(frozen=True)
@@ -55,7 +102,7 @@ class Merged:
 
     ``elevation``, ``elevation_std`` (of the weighted mean, as the models say), ``spread`` (standard deviation of the
     models about it; 0 for one model) in metres, NaN undefined; ``count`` of models; ``source`` pair of the greatest
-    weight, -1 none; ``ortho`` grey value.
+    weight, -1 none; ``ortho`` grey value; ``filled`` 1 where a small hole was closed (count 0, source -1).
     """
 
     elevation: Float32
@@ -64,12 +111,13 @@ class Merged:
     count: NDArray[np.uint16]
     source: NDArray[np.int16]
     ortho: Float32
+    filled: NDArray[np.uint8]
 
 
-def merge(layers: Sequence[Layer], tile: Lattice, params: MergeParams) -> Merged:
+def merge(layers: Sequence[Layer | _Stored], tile: Lattice, params: MergeParams) -> Merged:
     """Merge elevation models on a tile of their common lattice.
 
-    The result does not depend, in any bit, on the order of the layers.
+    The result does not depend, in any bit, on the order of the layers, nor on where tiles begin.
 
     Raises
     ------
@@ -80,71 +128,54 @@ def merge(layers: Sequence[Layer], tile: Lattice, params: MergeParams) -> Merged
     pairs = [layer.pair for layer in ordered]
     if len(set(pairs)) != len(pairs):
         raise InputError(f"two elevation models of one pair among {pairs}", remedy="merge each pair once")
-    ordered = [layer for layer in ordered if tile.intersection(layer.lattice) is not None]
-    if not ordered:
-        return _empty(tile)
-    stack = [_stacked(ordered, tile, name) for name in ("elevation", "elevation_std", "residual", "ortho")]
-    z, sigma, residual, ortho = stack
-    weight = 1.0 / (sigma**2 * (1.0 + (residual / params.residual_scale) ** 2))
-    weight[~(np.isfinite(z) & np.isfinite(weight))] = 0.0
-    weight *= _agreement(z, sigma, weight)
-    total = weight.sum(axis=0)
-    seen = total > 0
-    share = weight / np.where(seen, total, 1.0)
-    mean = _mean(share, z)
-    variance = _mean(share**2, sigma**2)
-    spread = np.sqrt(_mean(share, (z - mean) ** 2))
-    sharp = share / np.where(seen, share.max(axis=0), 1.0)
-    sharp **= SHARPNESS
-    grey = _mean(sharp / np.where(seen, sharp.sum(axis=0), 1.0), ortho)
-    best = np.array([layer.pair for layer in ordered])[np.argmax(weight, axis=0)]
-    return Merged(
-        elevation=_where(seen, mean),
-        elevation_std=_where(seen, np.sqrt(variance)),
-        spread=_where(seen, spread),
-        count=(weight > 0).sum(axis=0).astype(np.uint16),
-        source=np.where(seen, best, -1).astype(np.int16),
-        ortho=_where(seen, grey),
-    )
-
-
-def _where(seen: NDArray[np.bool_], values: Floats) -> Float32:
-    return np.where(seen, values, np.nan).astype(np.float32)
-
-
-def _stacked(layers: Sequence[Layer], tile: Lattice, name: str) -> Floats:
-    out = np.full((len(layers), *tile.shape), np.nan)
-    for target, layer in zip(out, layers, strict=True):
-        common = tile.intersection(layer.lattice)
-        if common is not None:
-            target[tile.window(common)] = getattr(layer, name)[layer.lattice.window(common)]
+    m = params.margin
+    grown = Lattice.at(tile.i0 - m, tile.j0 + m, tile.cell, tile.rows + 2 * m, tile.cols + 2 * m) if m else tile
+    ordered = [layer for layer in ordered if grown.intersection(layer.lattice) is not None]
+    out = _empty(grown)
+    lines = max(1, STRIP_BYTES // (16 * max(len(ordered), 1) * grown.cols))
+    for start in range(0, grown.rows if ordered else 0, lines):
+        rows = slice(start, min(start + lines, grown.rows))
+        strip = Lattice.at(grown.i0, grown.j0 - start, grown.cell, rows.stop - start, grown.cols)
+        _merge_strip(ordered, strip, params, out, rows)
+    if m:
+        _close(out, params)
+        inside = grown.window(tile)
+        out = Merged(**{name: values[inside].copy() for name, values in vars(out).items()})
     return out
 
 
-def _mean(share: Floats, values: Floats) -> Floats:
-    """Sum of share * value over the models, those without a share left out (their values may be NaN)."""
-    return np.asarray((share * np.where(share > 0, values, 0.0)).sum(axis=0), dtype=np.float64)
+def _merge_strip(
+    layers: Sequence[Layer | _Stored], strip: Lattice, params: MergeParams, out: Merged, rows: slice
+) -> None:
+    """Merge the lines of one strip into ``out``."""
+    present = [layer for layer in layers if strip.intersection(layer.lattice) is not None]
+    if not present:
+        return
+    stacks = [_stacked(present, strip, name) for name in MAPS]
+    gain = np.array([layer.gain for layer in present])
+    floats = np.empty((4, *strip.shape), dtype=np.float32)
+    best = np.empty(strip.shape, dtype=np.int64)
+    merge_cells(*stacks, gain, params.residual_scale, SHARPNESS, floats, out.count[rows], best)
+    for name, values in zip(("elevation", "elevation_std", "spread", "ortho"), floats, strict=True):
+        getattr(out, name)[rows] = values
+    pairs = np.array([*(layer.pair for layer in present), -1])
+    out.source[rows] = pairs[best]
 
 
-def _agreement(z: Floats, sigma: Floats, weight: Floats) -> Floats:
-    """Tukey's biweight about the weighted median (n, rows, cols); 1 where fewer than three models meet.
-
-    The scale is the greater of a model's own sigma and the models' median deviation: errors of pose are not in sigma.
-    """
-    centre = _weighted_median(z, weight)
-    deviation = np.where(weight > 0, np.abs(z - centre), np.nan)
-    scale = np.fmax(1.4826 * _weighted_median(deviation, (weight > 0).astype(np.float64)), sigma)
-    factor = np.maximum(0.0, 1.0 - (np.nan_to_num(deviation) / (BICUBIC * np.where(weight > 0, scale, 1.0))) ** 2) ** 2
-    return np.where((weight > 0).sum(axis=0) >= 3, factor, 1.0)
+def _stacked(layers: Sequence[Layer | _Stored], strip: Lattice, name: str) -> Float32:
+    out = np.full((len(layers), *strip.shape), np.nan, dtype=np.float32)
+    for target, layer in zip(out, layers, strict=True):
+        common = strip.intersection(layer.lattice)
+        assert common is not None
+        target[strip.window(common)] = layer.part(name, layer.lattice.window(common))
+    return out
 
 
-def _weighted_median(values: Floats, weight: Floats) -> Floats:
-    """Lower weighted median over the first axis: the least value that half of the weight does not exceed."""
-    order = np.argsort(np.where(weight > 0, values, np.inf), axis=0, kind="stable")
-    running = np.cumsum(np.take_along_axis(weight, order, axis=0), axis=0)
-    middle = np.argmax(running >= 0.5 * running[-1], axis=0)
-    picked = np.take_along_axis(order, middle[None], axis=0)
-    return np.asarray(np.take_along_axis(values, picked, axis=0)[0], dtype=np.float64)
+def _close(merged: Merged, params: MergeParams) -> None:
+    """Close the small holes in place; their grey value stays undefined, nobody took it."""
+    gap, window = float(params.max_hole), params.hole_window
+    z, sigma, filled = close_holes(merged.elevation, merged.elevation_std, gap, window, params.hole_known, judged=True)
+    merged.elevation[...], merged.elevation_std[...], merged.filled[...] = z, sigma, filled
 
 
 def _empty(tile: Lattice) -> Merged:
@@ -156,26 +187,25 @@ def _empty(tile: Lattice) -> Merged:
         count=np.zeros(tile.shape, np.uint16),
         source=np.full(tile.shape, -1, np.int16),
         ortho=nan.copy(),
+        filled=np.zeros(tile.shape, np.uint8),
     )
 
 
 def _run(params: MergeParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     tile = Lattice.from_dict(args["lattice"])
+    steps = args.get("exposure", {})
     layers = []
     for dem in inputs["dems"]:
-        lattice = Lattice.from_dict(dem.meta["lattice"])
-        common = tile.intersection(lattice)
-        if common is None:
-            continue
-        window = lattice.window(common)
-        parts = (np.asarray(dem[name][window]) for name in ("elevation", "elevation_std", "residual", "ortho"))
-        layers.append(Layer(int(dem.meta["pair"]), common, *parts))
+        pair = int(dem.meta["pair"])
+        gain = math.exp(STEP * int(steps.get(str(pair), 0)))
+        layers.append(_Stored(pair, Lattice.from_dict(dem.meta["lattice"]), dem.part, gain))
     merged = merge(layers, tile, params)
     meta = {
         "lattice": tile.to_dict(),
         "frame": "world",
         "pairs": sorted(layer.pair for layer in layers),
         "defined": float(np.mean(merged.count > 0)),
+        "filled": int(merged.filled.sum()),
     }
     return Bundle(vars(merged), meta)
 
@@ -186,7 +216,7 @@ def _array(name: str, dtype: str, unit: str, long_name: str, nodata: str) -> Arr
 
 STAGE = Stage(
     name="merge",
-    version=1,
+    version=2,
     summary="merged elevation model and ortho image of one tile of the world",
     params=MergeParams,
     inputs=("dems*",),
@@ -197,8 +227,9 @@ STAGE = Stage(
         _array("count", "uint16", "1", "number of merged models", "0"),
         _array("source", "int16", "1", "pair of the greatest weight", "-1"),
         _array("ortho", "float32", "grey", "grey value, 0..255", "nan"),
+        _array("filled", "uint8", "1", "1 where a small hole was closed by interpolation", ""),
     ),
-    requires=("numpy",),
+    requires=("numpy", "numba"),
     run=_run,
     memory=Memory(lower=("locus.cell_size",)),
 )

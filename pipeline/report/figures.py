@@ -212,13 +212,15 @@ def scalar_map(values: Floats, extent: Extent, label: str, alt: str, *, length: 
     return canvas.encode(fig, alt, photo=True)
 
 
-def error_map(error: Floats, extent: Extent, alt: str) -> Panel:
-    """Elevation minus truth (row, col), m, symmetric about zero."""
+def error_map(
+    error: Floats, extent: Extent, alt: str, *, label: str = "elevation minus truth", bound: float | None = None
+) -> Panel:
+    """Difference of elevations (row, col), m, symmetric about zero; colours end at ``bound``, m, or where 3 % lie."""
     fig, ax, cax = canvas.map_axes(extent, bar=True)
     factor, unit = canvas.metres_or_mm(error)
-    bound = canvas.limits(np.abs(error), 0, 97)[1] * factor
+    bound = factor * (canvas.limits(np.abs(error), 0, 97)[1] if bound is None else bound)
     drawn = _show(ax, error * factor, extent, cmap=canvas.color_map("PuOr"), vmin=-bound, vmax=bound)
-    canvas.color_bar(drawn, cax, f"elevation minus truth, {unit}")
+    canvas.color_bar(drawn, cax, f"{label}, {unit}")
     return canvas.encode(fig, alt, photo=True)
 
 

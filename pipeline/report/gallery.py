@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.report import artifacts, canvas, checks, figures, gather
+from pipeline.report import artifacts, canvas, checks, figures, gather, seams
 from pipeline.report.block import Block, Gallery
 from pipeline.report.gather import Scene
 from pipeline.report.words import length, spread
@@ -282,6 +282,8 @@ _FIGURES: tuple[tuple[str, Callable[[Scene], Block | None], Callable[[Scene], bo
     ("Basic pairs", checks.basic_pairs, lambda scene: _several(scene) and scene.view.products.select is not None),
     ("Terrain", _quality, _always),
     ("Overlap", checks.overlaps, lambda scene: len(scene.view.products.world_dem) > 1),
+    ("Seams", seams.worst, lambda scene: bool(scene.view.products.seams)),
+    ("Seam audit", seams.models, lambda scene: bool(scene.view.products.seams)),
     ("Elevation error", _dem_error, lambda scene: False),
 )
 """Title, how it is drawn, and whether a run lacks something without it."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from pipeline.report import tables
+from pipeline.report import seams, tables
 from pipeline.report.block import Gallery
 from pipeline.report.gather import Scene
 from pipeline.report.metrics import metrics
@@ -35,6 +35,7 @@ def summarise(scene: Scene, gallery: Gallery) -> dict[str, Any]:
         "verdict": _verdict(view, frames, pairs, missing),
         "missing": missing,
         "warnings": find_warnings(scene),
+        "seams": seams.facts(scene),
         "sequence": _sequence(view),
         "truth": {"used": assessed, "source": view.sequence.truth_source if assessed else "no truth"},
         "metrics": metrics(scene, frames, pairs),
@@ -119,7 +120,7 @@ def find_warnings(scene: Scene) -> list[str]:
     lines = list(view.sequence.warnings)
     lines += scene.calibration.collected("warnings") if scene.calibration is not None else []
     p = view.products
-    for handle in (p.select, *p.crosschecks, p.crosscheck, p.agreement, p.trajectory, p.accuracy):
+    for handle in (p.select, *p.crosschecks, p.crosscheck, p.agreement, p.trajectory, p.accuracy, p.seam_audit):
         bundle = view.bundle(handle)
         lines += (bundle.meta.get("warnings") or []) if bundle is not None else []
     compared = scene.comparison

@@ -169,3 +169,66 @@ def test_tiles_of_the_stage_equal_the_whole() -> None:
     for name, nodata in (("elevation", np.nan), ("spread", np.nan), ("ortho", np.nan), ("count", 0), ("source", -1)):
         got = mosaic([(tile, bundle[name]) for tile, bundle in parts], nodata, whole)
         assert got.tobytes() == getattr(at_once, name).tobytes(), name
+
+
+@pytest.mark.parametrize("lines", [1, 7, 1000])
+def test_strips_of_any_height_give_the_same_bits(monkeypatch: pytest.MonkeyPatch, lines: int) -> None:
+    tile = Lattice.at(0, 0, 0.1, 40, 30)
+    rng = np.random.default_rng(5)
+    layers = [
+        Layer(k, at, *(rng.uniform(0.05, 0.2, at.shape).astype(np.float32) for _ in range(4)))
+        for k, at in enumerate(Lattice.at(3 * k - 9, 4 * k - 12, 0.1, 25, 20) for k in range(7))
+    ]
+    whole = merge(layers, tile, PARAMS)
+    monkeypatch.setattr(merge_stage, "STRIP_BYTES", 16 * len(layers) * tile.cols * lines)
+    for a, b in zip(arrays(whole), arrays(merge(layers, tile, PARAMS)), strict=True):
+        assert a.tobytes() == b.tobytes()
+
+
+def test_of_a_stored_model_the_tile_alone_is_read() -> None:
+    class Watched(dict):
+        """Arrays that are read part by part, as those of an artifact."""
+
+        cells = 0
+
+        def part(self, name: str, window: tuple[slice, slice]) -> np.ndarray:
+            Watched.cells = max(Watched.cells, self[name][window].size)
+            return self[name][window]
+
+    lattice = Lattice.at(-500, 500, 0.1, 1000, 1000)
+    maps = {n: np.full(lattice.shape, 0.5, np.float32) for n in ("elevation", "elevation_std", "residual", "ortho")}
+    dem = Bundle(Watched(maps), {"lattice": lattice.to_dict(), "pair": 4, "frame": "world"})
+    merged = merge_stage.STAGE.run(PARAMS, {"lattice": TILE.to_dict()}, {"dems": [dem]})
+    assert Watched.cells == TILE.rows * TILE.cols
+    assert (merged["elevation"] == 0.5).all()
+
+
+def test_exposures_are_levelled_and_stay_grey_values() -> None:
+    layers = [layer(0, 1.0, ortho=100.0), layer(4, 1.0, ortho=100.0), layer(8, np.nan)]
+    bundles = [
+        Bundle({n: getattr(one, n) for n in ("elevation", "elevation_std", "residual", "ortho")},
+               {"lattice": TILE.to_dict(), "pair": one.pair})
+        for one in layers
+    ]  # fmt: skip
+    args = {"lattice": TILE.to_dict(), "exposure": {"4": 20}}
+    merged = merge_stage.STAGE.run(PARAMS, args, {"dems": bundles})
+    np.testing.assert_allclose(merged["ortho"], 50 * (1 + np.exp(0.2)), rtol=1e-5)
+    merged = merge_stage.STAGE.run(PARAMS, args | {"exposure": {"0": 99, "4": 99}}, {"dems": bundles})
+    np.testing.assert_allclose(merged["ortho"], 255.0)
+
+
+def test_small_holes_are_closed_on_request_only_and_large_ones_stay() -> None:
+    tile = Lattice.at(0, 0, 0.1, 30, 40)
+    one = layer(0, 1.0, lattice=tile)
+    one.elevation[5:7, 5:7] = np.nan
+    one.elevation[12:24, 20:34] = np.nan
+    plain = merge([one], tile, PARAMS)
+    assert not plain.filled.any()
+    closed = merge([one], tile, MergeParams(max_hole=3))
+    assert closed.filled[5:7, 5:7].all()
+    assert not closed.filled[15:21, 24:30].any()
+    np.testing.assert_allclose(closed.elevation[5:7, 5:7], 1.0)
+    assert (closed.count[closed.filled == 1] == 0).all()
+    assert (closed.source[closed.filled == 1] == -1).all()
+    known = np.isfinite(plain.elevation)
+    assert np.array_equal(closed.elevation[known], plain.elevation[known])

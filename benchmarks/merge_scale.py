@@ -1,0 +1,138 @@
+"""Merge of many elevation models over a large world: peak memory of the workers, and what a moved model costs.
+
+``python benchmarks/merge_scale.py [--side 10000] [--models 100] [--jobs 2] [--cache FOLDER]``. Models of 1500 x 1500
+cells are laid evenly over a square lattice, and merged in world tiles by the chain's own stages and engine. Then
+one model is moved and the same run made again: recomputed must be the tiles that it touches and touched, no others.
+Exit status 1 if memory exceeds 1 GiB, or other tiles are recomputed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import tempfile
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from stages.declare import Array, Bundle, Inputs, NoParams, Stage
+from stages.lattice import Lattice
+
+HERE = Path(__file__).parent
+CELLS = 1500
+LIMIT = 1 << 30
+
+
+def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+    """A model: waves, noise of its own, and a border that is not straight."""
+    lattice = Lattice.at(args["i0"], args["j0"], 0.01, args["cells"], args["cells"])
+    rng = np.random.default_rng(args["pair"])
+    x, y = lattice.xs().astype(np.float32)[None], lattice.ys().astype(np.float32)[:, None]
+    z = np.sin(x) * np.cos(y) + rng.normal(0, 0.01, lattice.shape).astype(np.float32)
+    z[np.abs(x - x.mean()) + 0.2 * np.abs(y - y.mean()) > 0.5 * np.ptp(x)] = np.nan
+    even = np.ones(lattice.shape, np.float32)
+    maps = {"elevation": z, "elevation_std": 0.01 * even, "residual": 0.05 * even, "ortho": np.rint(100 + 50 * z)}
+    return Bundle(maps, {"pair": args["pair"], "lattice": lattice.to_dict(), "frame": "world"})
+
+
+STAGE = Stage(
+    name="synthetic_dem",
+    version=1,
+    summary="synthetic elevation model",
+    params=NoParams,
+    inputs=(),
+    outputs=tuple(
+        Array(name, ("row", "col"), "float32", "m", name, "nan")
+        for name in ("elevation", "elevation_std", "residual", "ortho")
+    ),
+    requires=("numpy",),
+    run=_run,
+)
+
+
+def places(side: int, models: int, cells: int) -> list[tuple[int, int]]:
+    """First column and line of each model, on a square grid that reaches from border to border."""
+    n = round(models**0.5)
+    step = [round(k * (side - cells) / max(n - 1, 1)) for k in range(n)]
+    return [(i, j) for j in step for i in step]
+
+
+def merged(cache: Path, where: list[tuple[int, int]], cells: int, jobs: int, ledger: Path) -> dict[str, str]:
+    """Run the merge of models at ``where``; label to digest of every tile."""
+    from pipeline import driver
+    from pipeline.config import STAGE_MODULES
+    from pipeline.dag import Graph
+    from pipeline.reconstruct import TILE_CELLS, merge_tiles
+    from pipeline.store import Store
+    from stages.merge import MergeParams
+
+    graph = Graph()
+
+    def node(stage: str, label: str, args: dict[str, Any], **inputs: Any) -> Any:
+        params = MergeParams() if stage == "merge" else NoParams()
+        return graph.node(STAGE_MODULES.get(stage, "benchmarks.merge_scale"), label, params, args, {}, inputs)
+
+    dems = {k: node("", f"dem/{k}", {"pair": k, "i0": i, "j0": -j, "cells": cells}) for k, (i, j) in enumerate(where)}
+    prints = [node("footprint", f"footprint/{k}", {"side": TILE_CELLS, "margin": 0}, dem=d) for k, d in dems.items()]
+    graph.expand(prints, lambda *found: merge_tiles(node, [ref.meta for ref in found], dems, {}) and None)
+    begin = time.perf_counter()
+    result = driver.run(graph, Store(cache), jobs=jobs, ledger=ledger)
+    result.check()
+    counts = {name: (c.computed, c.cached) for name, c in result.counts.items()}
+    print(f"{time.perf_counter() - begin:.0f} s, computed and cached: {counts}", flush=True)
+    return {h.label: h.ref.digest for h in graph.nodes if h.stage == "merge" and h.ref is not None}
+
+
+def tiles_of(cells: int, at: tuple[int, int], cache: Path) -> set[str]:
+    """Labels of the tiles that a model's cells touch, cell by cell."""
+    from pipeline.reconstruct import TILE_CELLS
+
+    z = _run(NoParams(), {"pair": 0, "i0": at[0], "j0": -at[1], "cells": cells}, {})["elevation"]
+    rows, cols = np.nonzero(np.isfinite(z))
+    index = np.unique(np.column_stack([(cols + at[0]) // TILE_CELLS, (rows + at[1]) // TILE_CELLS]), axis=0)
+    return {f"merge/{tx}_{ty}" for tx, ty in index}
+
+
+def main() -> int:
+    """Run it twice and judge."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--side", type=int, default=10_000)
+    parser.add_argument("--models", type=int, default=100)
+    parser.add_argument("--cells", type=int, default=CELLS)
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--cache", type=Path)
+    args = parser.parse_args()
+    sys.path.insert(0, str(HERE.parent))
+    os.environ["PYTHONPATH"] = str(HERE.parent)
+    with tempfile.TemporaryDirectory() as temporary:
+        from pipeline import ledger
+        from pipeline.executor import prepare_environment
+
+        cache = args.cache or Path(temporary) / "cache"
+        prepare_environment(cache)
+        where = places(args.side, args.models, args.cells)
+        print(f"{len(where)} models of {args.cells} x {args.cells} cells over {args.side} x {args.side}")
+        before = merged(cache, where, args.cells, args.jobs, Path(temporary) / "first.jsonl")
+        peak = max(row["peak_rss"] for row in ledger.read(Path(temporary) / "first.jsonl") if "peak_rss" in row)
+        print(f"{len(before)} tiles; peak resident memory of a worker {peak / 2**20:.0f} MiB, of all at most "
+              f"{args.jobs * peak / 2**20:.0f} MiB")  # fmt: skip
+        middle = len(where) // 2
+        moved = [*where]
+        moved[middle] = (where[middle][0] + 700, where[middle][1] + 30)
+        merged(cache, moved, args.cells, args.jobs, Path(temporary) / "second.jsonl")
+        again = {
+            row["label"]
+            for row in ledger.read(Path(temporary) / "second.jsonl")
+            if row["stage"] == "merge" and row["status"] == "computed"
+        }
+        wanted = tiles_of(args.cells, where[middle], cache) | tiles_of(args.cells, moved[middle], cache)
+        print(f"one model moved: {len(again)} tiles merged again, {len(wanted)} are touched, before or after")
+        return int(again != wanted or args.jobs * peak > LIMIT)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

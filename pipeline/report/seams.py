@@ -1,0 +1,143 @@
+"""Page of the seam audit: the seams, worst first, with a picture of the worst; and which models are to blame."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.report import canvas, figures
+from pipeline.report.block import Block, Table
+from pipeline.report.gather import Scene
+from pipeline.report.words import number, spread
+
+Facts = Mapping[str, Any]
+
+MOST_ROWS = 12
+"""Seams and models in a table; report.json has all of them."""
+
+
+def audit(scene: Scene) -> Facts | None:
+    """Facts of the audit; None without one, or without a seam."""
+    bundle = scene.view.bundle(scene.view.products.seam_audit)
+    return bundle.meta if bundle is not None and bundle.meta["seams"] else None
+
+
+def facts(scene: Scene) -> dict[str, Any] | None:
+    """The audit for report.json: variance factor, models and seams, the worst first."""
+    found = audit(scene)
+    return None if found is None else {name: found[name] for name in ("variance_factor", "models", "seams")}
+
+
+def worst(scene: Scene) -> Block | None:
+    """The seam whose bias and tilt are greatest against what sigma allows: its map, and the map without its plane."""
+    found = audit(scene)
+    if found is None:
+        return None
+    first = found["seams"][0]
+    bundle = scene.view.bundle(scene.view.products.seams.get(first["pair"]))
+    if bundle is None:
+        return None
+    at = next(s for s in bundle.meta["seams"] if s["other"] == first["other"])
+    difference = np.asarray(bundle[f"difference_{first['other']}"], dtype=np.float64)
+    x_min, _, _, y_max = at["map"]["bounds"]
+    step = at["map"]["step"]
+    extent = (x_min, x_min + step * difference.shape[1], y_max - step * difference.shape[0], y_max)
+    left = difference - _plane(at, extent, difference.shape)
+    bound = canvas.limits(np.abs(difference), 0, 97)[1]
+    name = f"pair {first['pair']} minus pair {first['other']}"
+    panels = (
+        figures.error_map(difference, extent, f"Elevation of {name}, {spread(difference)} m", label=name, bound=bound),
+        figures.error_map(
+            left,
+            extent,
+            f"The same without bias and tilt, {spread(left)} m",
+            label="without bias and tilt",
+            bound=bound,
+        ),
+    )
+    caption = (
+        f"The worst of {len(found['seams'])} seams: elevation of {name} where both are known, and what is left of it "
+        f"without its bias of {_signed(first['bias'])} and tilt of {_degrees(first['tilt'][0])} along x and "
+        f"{_degrees(first['tilt'][1])} along y. A plane is an error of pose (or rig); what is left is noise of the "
+        "matching, and edges that two views see apart. In the table noise is compared with what both models' own "
+        f"standard deviations let expect. ± is one standard deviation, from the scatter of blocks of cells. Seams are "
+        f"off by {math.sqrt(found['variance_factor']):.2g} times what noise alone lets expect (median): where that is "
+        "far above 1, poses are less exact than elevations."
+    )
+    return Block("Seams", "Seams between elevation models, the worst first", caption, panels, table=_seam_table(found))
+
+
+def models(scene: Scene) -> Block | None:
+    """What of the seams is each model's own."""
+    found = audit(scene)
+    if found is None:
+        return None
+    listed = found["models"]
+    named = [m for m in listed if m["found"] or m["contradicts"]]
+    words = [
+        "Bias (at the middle of a model) and tilt that explain the seams of a model best, its neighbours held; the "
+        "worst model was taken out of the seams before the next one was judged. A model is found when chance, and the "
+        "poses of the others, lead to as much once in ten thousand; it contradicts when the error is more than its "
+        "sigma allows."
+    ]
+    words.append(
+        f"Named: {', '.join('pair ' + str(m['pair']) for m in named[:MOST_ROWS])}." if named else "No model stands out."
+    )
+    rows = tuple(
+        (
+            str(m["pair"]),
+            f"{_signed(m['bias'])} ± {_size(m['sigma'][0])}",
+            *(f"{_degrees(t)} ± {number(math.degrees(s), 2)}°" for t, s in zip(m["tilt"], m["sigma"][1:], strict=True)),
+            _size(m["systematic"]),
+            _size(m["expected"]),
+            ", ".join(word for word in ("found", "contradicts") if m[word]) or "–",
+        )
+        for m in listed[:MOST_ROWS]
+    )
+    head = ("Pair", "bias", "tilt along x", "tilt along y", "RMS of both", "sigma of a cell's difference", "verdict")
+    table = Table(head, rows, frozenset(range(1, 6)))
+    return Block("Seam audit", "Elevation models by their own error", " ".join(words), (), table=table)
+
+
+def _plane(at: Facts, extent: canvas.Extent, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    """Height of a seam's plane on the cells of its map."""
+    step = at["map"]["step"]
+    x = extent[0] + step * (np.arange(shape[1]) + 0.5) - at["centre"][0]
+    y = extent[3] - step * (np.arange(shape[0]) + 0.5) - at["centre"][1]
+    return np.asarray(at["bias"] + at["tilt"][0] * x[None] + at["tilt"][1] * y[:, None])
+
+
+def _seam_table(found: Facts) -> Table:
+    rows = []
+    for s in found["seams"][:MOST_ROWS]:
+        sigma = np.sqrt(np.maximum(np.diag(np.array(s["covariance"])), 0.0))
+        rows.append(
+            (
+                f"{s['pair']} – {s['other']}",
+                str(s["cells"]),
+                f"{_signed(s['bias'])} ± {_size(sigma[0])}",
+                *(f"{_degrees(t)} ± {number(math.degrees(e), 2)}°" for t, e in zip(s["tilt"], sigma[1:], strict=True)),
+                _size(s["noise"]),
+                _size(s["expected"]),
+            )
+        )
+    head = ("Seam", "cells", "bias", "tilt along x", "tilt along y", "noise", "expected noise")
+    return Table(head, tuple(rows), frozenset(range(1, 7)))
+
+
+def _size(metres: float) -> str:
+    """Millimetres with two digits: finer is beyond what the scatter of blocks tells."""
+    return f"{number(1000 * metres, 2)} mm"
+
+
+def _signed(metres: float) -> str:
+    return ("+" if metres > 0 else "") + _size(metres)
+
+
+def _degrees(radians: float) -> str:
+    value = math.degrees(radians)
+    return ("+" if value > 0 else "") + f"{number(value, 2)}°"

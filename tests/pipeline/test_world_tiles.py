@@ -1,0 +1,109 @@
+"""World tiles in the engine: what a model that moves or is added costs, and that nothing else changes a bit."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline import driver, ledger
+from pipeline.config import STAGE_MODULES
+from pipeline.dag import Graph
+from pipeline.reconstruct import merge_tiles
+from pipeline.store import Store
+from stages.declare import NoParams
+from stages.merge import MergeParams
+
+SIDE = 16
+PLACES = {0: (0, 0), 4: (9, 3), 8: (22, -5), 12: (40, 2), 16: (-14, -30), 20: (33, -28)}
+
+
+def run(
+    cache: Path,
+    places: dict[int, tuple[int, int]],
+    *,
+    steps: dict[str, int] | None = None,
+    params: MergeParams | None = None,
+    executor: str = "inline",
+) -> tuple[set[str], dict[str, str], dict[str, Any]]:
+    """Labels of the tiles merged by this run, digest of each tile, and all nodes by label."""
+    graph, merging = Graph(), params or MergeParams()
+
+    def node(stage: str, label: str, args: dict[str, Any], **inputs: Any) -> Any:
+        module = "toys.dem" if stage == "dem" else STAGE_MODULES[stage]
+        return graph.node(module, label, merging if stage == "merge" else NoParams(), args, {}, inputs)
+
+    dems = {k: node("dem", f"dem/{k}", {"pair": k, "i0": i, "j0": j}) for k, (i, j) in places.items()}
+    cut = {"side": SIDE, "margin": merging.margin}
+    prints = [node("footprint", f"footprint/{k}", cut, dem=dem) for k, dem in dems.items()]
+    graph.expand(prints, lambda *found: merge_tiles(node, [f.meta for f in found], dems, steps or {}) and None)
+    driver.run(graph, Store(cache), executor=executor, jobs=2, ledger=cache / "ledger.jsonl").check()
+    rows = ledger.read(cache / "ledger.jsonl")
+    again = {r["label"] for r in rows if r["stage"] == "merge" and r["status"] == "computed"}
+    return again, {r["label"]: r["digest"] for r in rows if r["stage"] == "merge"}, {h.label: h for h in graph.nodes}
+
+
+def touched(place: tuple[int, int]) -> set[str]:
+    """Tiles that the disk of a model touches, cell by cell."""
+    r, c = np.mgrid[:20, :20]
+    seen = (r - 9.5) ** 2 + (c - 9.5) ** 2 <= 81
+    columns, lines = place[0] + c[seen], r[seen] - place[1]
+    return {f"merge/{x}_{y}" for x, y in zip(columns // SIDE, lines // SIDE, strict=True)}
+
+
+def test_a_moved_model_costs_the_tiles_that_it_touches_and_touched(cache: Path) -> None:
+    first, before, _ = run(cache, PLACES)
+    assert first == set(before) == set().union(*map(touched, PLACES.values()))
+    assert run(cache, PLACES)[0] == set()
+    moved = PLACES | {8: (52, -20)}  # partly beyond what the world was
+    again, after, nodes = run(cache, moved)
+    assert again | {t for t in before if t not in after} == touched(PLACES[8]) | touched(moved[8])
+    assert again & touched(PLACES[0])  # a neighbour's tile is among them
+    assert {t for t in after if after[t] != before.get(t)} <= again
+    reasons = {nodes[label].reason for label in again if label in before}
+    assert all("dems" in reason or "lattice" in reason for reason in reasons), reasons
+
+
+def test_an_added_model_costs_its_own_tiles(cache: Path) -> None:
+    run(cache, PLACES)
+    again, _, _ = run(cache, PLACES | {24: (5, 5)})
+    assert again == touched((5, 5))
+
+
+def test_an_exposure_costs_the_tiles_of_its_model(cache: Path) -> None:
+    run(cache, PLACES)
+    again, _, _ = run(cache, PLACES, steps={"12": 5})
+    assert again == touched(PLACES[12])
+
+
+@pytest.mark.parametrize("hole", [0, 2])
+def test_order_of_models_and_number_of_workers_change_no_bit(tmp_path: Path, hole: int) -> None:
+    params = MergeParams(max_hole=hole)
+    first = run(tmp_path / "a", PLACES, params=params)[1]
+    backwards = dict(reversed(PLACES.items()))
+    assert run(tmp_path / "b", backwards, params=params, executor="threads")[1] == first
+
+
+def test_closed_holes_do_not_see_the_cut_into_tiles(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same world cut otherwise is the same, to the bit, though holes lie across the cuts."""
+    from stages.lattice import Lattice, mosaic
+
+    all_ = Lattice.at(-20, 10, 0.5, 70, 90)
+
+    def world(side: int) -> dict[str, np.ndarray]:
+        monkeypatch.setattr(f"{__name__}.SIDE", side)
+        _, digests, nodes = run(cache / str(side), PLACES, params=MergeParams(max_hole=3))
+        bundles = [Store(cache / str(side)).open(nodes[label].ref) for label in digests]
+        lattices = [Lattice.from_dict(b.meta["lattice"]) for b in bundles]
+        none = {"count": 0, "source": -1, "filled": 0}
+        return {
+            name: mosaic([(at, b[name]) for at, b in zip(lattices, bundles, strict=True)], none.get(name, np.nan), all_)
+            for name in ("elevation", "elevation_std", "count", "filled")
+        }
+
+    small, large = world(16), world(400)
+    assert large["filled"].sum() > 0
+    for name, values in large.items():
+        assert small[name].tobytes() == values.tobytes(), name
