@@ -93,10 +93,21 @@ def build(image: AnyArray, params: PyramidParams, valid: AnyArray | None = None)
     mask = np.isfinite(level)
     if valid is not None:
         mask &= valid != 0
-    images, masks = [np.where(mask, level, np.float32(0.0))], [mask.astype(np.uint8)]
-    while len(images) < params.levels and min(images[-1].shape) >= 2 * params.min_side:
-        coarse, mask = _halve(images[-1], masks[-1])
-        images.append(coarse)
+    levels, side = 1, min(level.shape)
+    while levels < params.levels and side >= 2 * params.min_side:
+        levels, side = levels + 1, (side + 1) // 2
+    return halved(np.where(mask, level, np.float32(0.0)), mask.astype(np.uint8), levels)
+
+
+def halved(image: Image, mask: Mask, levels: int) -> Pyramid:
+    """Pyramid of so many levels of a float32 image (0 where masked) and its mask.
+
+    Of a window that starts and ends where a pixel of the top level does, it is a part of the image's pyramid.
+    """
+    images, masks = [image], [mask]
+    for _ in range(levels - 1):
+        image, mask = _halve(image, mask)
+        images.append(image)
         masks.append(mask)
     return Pyramid(tuple(images), tuple(masks))
 

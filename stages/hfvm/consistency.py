@@ -31,41 +31,47 @@ def median(u: AnyArray, size: int) -> AnyArray:
 
 
 @njit(cache=True, nogil=True)
-def integer_error(au, av, bu, bv, b_valid, error):  # type: ignore[no-untyped-def]
-    """As :func:`backmatch`, of integer maps."""
+def integer_error(au, av, bu, bv, b_valid, error, ox=0, oy=0):  # type: ignore[no-untyped-def]
+    """As :func:`backmatch`, of integer maps; only pixels that land in the window of ``b`` are written.
+
+    ``ox, oy``: where the first pixel of ``a`` lies in the window of ``b``.
+    """
     rows, cols = au.shape
     brows, bcols = bu.shape
     for y in range(rows):
         for x in range(cols):
-            i, j = x + np.int64(au[y, x]), y + np.int64(av[y, x])
-            e = FAILED
+            i, j = x + ox + np.int64(au[y, x]), y + oy + np.int64(av[y, x])
             if i >= 0 and i < bcols and j >= 0 and j < brows and b_valid[j, i]:
                 du, dv = np.int64(au[y, x]) + bu[j, i], np.int64(av[y, x]) + bv[j, i]
-                e = np.sqrt(np.float32(du * du + dv * dv))
-            error[y, x] = e
+                error[y, x] = np.sqrt(np.float32(du * du + dv * dv))
 
 
 @njit(cache=True, nogil=True)
-def backmatch(lu, lv, ru, rv, right_valid, error):  # type: ignore[no-untyped-def]
+def backmatch(lu, lv, ru, rv, right_valid, error, x0, y0, rx0, ry0, rrows, rcols):  # type: ignore[no-untyped-def]
     """Distance |l - l'| of each left pixel after matching to the right and back (4.3.3), pixels; FAILED outside
     the right image and on its masked pixels.
 
-    The right map is read bilinearly where its four pixels agree within a pixel, else at the nearest one.
+    The right map is read bilinearly where its four pixels agree within a pixel, else at the nearest one. ``x0, y0`` and
+    ``rx0, ry0``: first column and row of the left and the right window; ``rrows, rcols``: size of the right image. Only
+    pixels are written whose four right pixels lie in the right window.
     """
     rows, cols = lu.shape
-    rrows, rcols = ru.shape
+    wrows, wcols = ru.shape
     for y in range(rows):
         for x in range(cols):
-            error[y, x] = FAILED
-            xr = np.float32(x) + lu[y, x]
-            yr = np.float32(y) + lv[y, x]
+            xr = np.float32(x + x0) + lu[y, x]
+            yr = np.float32(y + y0) + lv[y, x]
             if not (xr >= 0 and xr <= rcols - 1 and yr >= 0 and yr <= rrows - 1):
                 continue
-            if not right_valid[int(yr + np.float32(0.5)), int(xr + np.float32(0.5))]:
-                continue
             i, j = int(xr), int(yr)
-            i1, j1 = min(i + 1, rcols - 1), min(j + 1, rrows - 1)
+            i1, j1 = min(i + 1, rcols - 1) - rx0, min(j + 1, rrows - 1) - ry0
             fx, fy = xr - np.float32(i), yr - np.float32(j)
+            i, j = i - rx0, j - ry0
+            if i < 0 or j < 0 or i1 >= wcols or j1 >= wrows:
+                continue
+            i2, j2 = int(xr + np.float32(0.5)) - rx0, int(yr + np.float32(0.5)) - ry0
+            if not right_valid[j2, i2]:
+                continue
             a, b, c, d = ru[j, i], ru[j, i1], ru[j1, i], ru[j1, i1]
             p, q, r, s = rv[j, i], rv[j, i1], rv[j1, i], rv[j1, i1]
             one = np.float32(1.0)
@@ -76,30 +82,25 @@ def backmatch(lu, lv, ru, rv, right_valid, error):  # type: ignore[no-untyped-de
                 u = (a * (one - fx) + b * fx) * (one - fy) + (c * (one - fx) + d * fx) * fy
                 v = (p * (one - fx) + q * fx) * (one - fy) + (r * (one - fx) + s * fx) * fy
             else:
-                i, j = int(xr + np.float32(0.5)), int(yr + np.float32(0.5))
-                u, v = ru[j, i], rv[j, i]
+                u, v = ru[j2, i2], rv[j2, i2]
             du, dv = lu[y, x] + u, lv[y, x] + v
             e = np.sqrt(du * du + dv * dv)
             if e < FAILED:
                 error[y, x] = e
 
 
-def lands(u: AnyArray, v: AnyArray, keep: AnyArray, right_valid: AnyArray) -> NDArray[np.bool_]:
-    """Pixels of ``keep`` whose displacement ends on a usable pixel inside the right image."""
-    found = np.zeros(keep.shape, dtype=bool)
-    _lands(u, v, keep, right_valid, found)
-    return found
-
-
 @njit(cache=True, nogil=True)
-def _lands(u, v, keep, right_valid, found):  # type: ignore[no-untyped-def]
-    rows, cols = right_valid.shape
+def lands(u, v, keep, right_valid, found, x0, y0, rx0, ry0, rrows, rcols):  # type: ignore[no-untyped-def]
+    """Mark in ``found`` (bool) pixels of ``keep`` whose displacement ends on a usable pixel of the right image.
+
+    Windows as in :func:`backmatch`; the right one must hold every end that lies in the image.
+    """
     for y in range(u.shape[0]):
         for x in range(u.shape[1]):
-            xr, yr = x + np.float64(u[y, x]), y + np.float64(v[y, x])
+            xr, yr = x + x0 + np.float64(u[y, x]), y + y0 + np.float64(v[y, x])
             # half a pixel beyond the outermost centres is still on the image
-            if keep[y, x] and -0.5 < xr < cols - 0.5 and -0.5 < yr < rows - 0.5:
-                found[y, x] = right_valid[np.int64(np.rint(yr)), np.int64(np.rint(xr))] != 0
+            if keep[y, x] and -0.5 < xr < rcols - 0.5 and -0.5 < yr < rrows - 0.5:
+                found[y, x] = right_valid[np.int64(np.rint(yr)) - ry0, np.int64(np.rint(xr)) - rx0] != 0
 
 
 @njit(cache=True, nogil=True)

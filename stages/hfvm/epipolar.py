@@ -51,13 +51,20 @@ def fit(u: AnyArray, v: AnyArray, wanted: AnyArray, right_shape: tuple[int, int]
     spread : median distance of the matches from their lines, pixels.
     """
     y, x = np.nonzero(wanted)
+    return fit_points(x, y, u[y, x], v[y, x], wanted.shape, right_shape)
+
+
+def fit_points(
+    x: AnyArray, y: AnyArray, u: AnyArray, v: AnyArray, left_shape: tuple[int, ...], right_shape: tuple[int, ...]
+) -> tuple[Matrix, float] | None:
+    """As :func:`fit`, of matches (n,) of images of these shapes."""
     if len(y) < LEAST_MATCHES:
         return None
-    scale = 0.5 * max(wanted.shape)
-    left_mid = (0.5 * (wanted.shape[1] - 1), 0.5 * (wanted.shape[0] - 1))
+    scale = 0.5 * max(left_shape)
+    left_mid = (0.5 * (left_shape[1] - 1), 0.5 * (left_shape[0] - 1))
     right_mid = (0.5 * (right_shape[1] - 1), 0.5 * (right_shape[0] - 1))
     p = np.stack([(x - left_mid[0]) / scale, (y - left_mid[1]) / scale])
-    q = np.stack([(x + u[y, x] - right_mid[0]) / scale, (y + v[y, x] - right_mid[1]) / scale])
+    q = np.stack([(x + u - right_mid[0]) / scale, (y + v - right_mid[1]) / scale])
     rows = _solve(p, q, SIGMA / scale)
     cols = _solve(p[::-1], q[::-1], SIGMA / scale)
     swap = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
@@ -133,13 +140,14 @@ def finer(f: Matrix) -> Matrix:
     return np.asarray(s.T @ f @ s, dtype=np.float64)
 
 
-def near_sign(f: Matrix, u: AnyArray, wanted: AnyArray, right_shape: tuple[int, int]) -> float:
+def near_sign(f: Matrix, u: AnyArray, left_shape: tuple[int, ...], right_shape: tuple[int, ...]) -> float:
     """Sign of the column displacement of near things against far ones: -1 on a usual rig, +1 with images swapped.
 
     On a convergent rig the displacement of far things is not zero; the toe-in shows in the terms ``y'x`` and ``x'y``
-    (keystone), which give it for a focal length of about the image width. A vote: only the filling of gaps hangs on it.
+    (keystone), which give it for a focal length of about the image width. A vote: only the filling of gaps hangs on it. ``u``: column
+    displacements of matches (n,).
     """
-    rows, cols = wanted.shape
+    rows, cols = left_shape
     to_left = np.array([[1.0, 0.0, 0.5 * (cols - 1)], [0.0, 1.0, 0.5 * (rows - 1)], [0.0, 0.0, 1.0]])
     to_right = np.array(
         [[1.0, 0.0, 0.5 * (right_shape[1] - 1)], [0.0, 1.0, 0.5 * (right_shape[0] - 1)], [0.0, 0.0, 1.0]]
@@ -149,23 +157,26 @@ def near_sign(f: Matrix, u: AnyArray, wanted: AnyArray, right_shape: tuple[int, 
         return -1.0
     shift = 0.5 * (right_shape[1] - cols)
     far = -(g[1, 0] + g[0, 1]) / g[1, 2] * float(cols) ** 2 + shift
-    return -1.0 if np.median(u[wanted]) <= far else 1.0
+    return -1.0 if np.median(u) <= far else 1.0
 
 
-def lines(f: Matrix, shape: tuple[int, ...]) -> NDArray[np.float32]:
-    """Epipolar line of every left pixel: unit normal and offset (row, col, 3) with n . displacement + c = 0."""
+def lines(f: Matrix, shape: tuple[int, ...], x0: int = 0, y0: int = 0) -> NDArray[np.float32]:
+    """Epipolar line of every left pixel: unit normal and offset (row, col, 3) with n . displacement + c = 0.
+
+    ``x0, y0``: first column and row of a window.
+    """
     found = np.empty((shape[0], shape[1], 3), np.float32)
-    write_lines(f, found)
+    write_lines(f, found, x0, y0)
     return found
 
 
 @njit(cache=True, nogil=True)
-def write_lines(f, found):  # type: ignore[no-untyped-def]
+def write_lines(f, found, x0=0, y0=0):  # type: ignore[no-untyped-def]
     """As :func:`lines`, into ``found``."""
     for j in range(found.shape[0]):
-        y = np.float64(j)
+        y = np.float64(j + y0)
         for i in range(found.shape[1]):
-            x = np.float64(i)
+            x = np.float64(i + x0)
             a = f[0, 0] * x + f[0, 1] * y + f[0, 2]
             b = f[1, 0] * x + f[1, 1] * y + f[1, 2]
             c = f[2, 0] * x + f[2, 1] * y + f[2, 2]

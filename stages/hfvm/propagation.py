@@ -38,7 +38,7 @@ def rows_of(packed):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def own_cost(word, right, x, y, packed, line, mu):  # type: ignore[no-untyped-def]
-    """Distance and band at one displacement, FAR outside the image."""
+    """Distance and band at one displacement, FAR outside the image; ``x, y``: the pixel's place in ``right``."""
     u, v = columns(packed), rows_of(packed)
     rows, cols = right.shape
     if x + u < 0 or x + u >= cols or y + v < 0 or y + v >= rows:
@@ -50,14 +50,14 @@ def own_cost(word, right, x, y, packed, line, mu):  # type: ignore[no-untyped-de
 
 
 @njit(cache=True, nogil=True)
-def descend(left, right, up_u, up_v, reach_x, reach_y, lines, mu, packed, data):  # type: ignore[no-untyped-def]
+def descend(left, right, up_u, up_v, reach_x, reach_y, lines, mu, packed, data, ox=0, oy=0):  # type: ignore[no-untyped-def]
     """Search around the doubled displacements of the coarse parent and its eight neighbours.
 
     ``reach_x, reach_y``: search to either side of each; ``lines`` (row, col, 3) float32: epipolar line of each pixel
     (:func:`stages.hfvm.epipolar.lines`); ``mu``: cost per pixel off it, 0 = no band (``lines`` is not read). With a
     band, each centre is first moved towards its line, by a pixel at most: a coarse fit may be wrong by more than that.
     ``packed, data`` (row, col) int32 get the displacements and their costs. With nothing inside the other image the
-    prediction stays: it leads out of it.
+    prediction stays: it leads out of it. ``ox, oy``: where the left window's first pixel lies in the right window.
     """
     rows, cols = left.shape
     rrows, rcols = right.shape
@@ -98,12 +98,12 @@ def descend(left, right, up_u, up_v, reach_x, reach_y, lines, mu, packed, data):
                     first = np.int64(0)
                     bu, bv = own_u, own_v
                     for m in range(n):
-                        ua, ub = max(box[m, 0], -x), min(box[m, 1], rcols - 1 - x)
+                        ua, ub = max(box[m, 0], -x - ox), min(box[m, 1], rcols - 1 - x - ox)
                         if ub < ua:
                             continue
-                        v, last_v = max(box[m, 2], -y), min(box[m, 3], rrows - 1 - y)
+                        v, last_v = max(box[m, 2], -y - oy), min(box[m, 3], rrows - 1 - y - oy)
                         while v <= last_v:
-                            start = (y + v) * rcols + x
+                            start = (y + oy + v) * rcols + x + ox
                             u = ua
                             while u <= ub:
                                 key = lanes.run(
@@ -165,12 +165,13 @@ def _areas(us, vs, reach_x, reach_y, box):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def costs(left, right, lines, mu, packed, data):  # type: ignore[no-untyped-def]
+def costs(left, right, lines, mu, packed, data, ox=0, oy=0):  # type: ignore[no-untyped-def]
     """Costs of a map without smoothness."""
     line = np.zeros(3, np.float32)
     for y in range(left.shape[0]):
         for x in range(left.shape[1]):
-            data[y, x] = own_cost(left[y, x], right, x, y, packed[y, x], lines[y, x] if mu > 0 else line, mu)
+            at = lines[y, x] if mu > 0 else line
+            data[y, x] = own_cost(left[y, x], right, x + ox, y + oy, packed[y, x], at, mu)
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -179,7 +180,7 @@ def _step(a, b):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _border(left, right, packed, x, y, data, smoothness, line, mu):  # type: ignore[no-untyped-def]
+def _border(left, right, packed, x, y, data, smoothness, line, mu, ox, oy):  # type: ignore[no-untyped-def]
     """Decision at a pixel that lacks a neighbour: displacement and its cost."""
     rows, cols = left.shape
     near = np.empty(4, np.int32)
@@ -200,7 +201,7 @@ def _border(left, right, packed, x, y, data, smoothness, line, mu):  # type: ign
         rough = np.int64(0)
         for m in range(n):
             rough += _step(near[m], tried)
-        cost = own_cost(left[y, x], right, x, y, tried, line, mu)
+        cost = own_cost(left[y, x], right, x + ox, y + oy, tried, line, mu)
         if cost < FAR and cost + smoothness * rough < best:
             best, found = cost + smoothness * rough, tried
     return found, best
@@ -223,12 +224,14 @@ def _roughness(flat, rows, cols, p, tried):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def checkerboard(left, right, packed, data, dirty, lines, mu, smoothness, rounds):  # type: ignore[no-untyped-def]
+def checkerboard(left, right, packed, data, dirty, lines, mu, smoothness, rounds, ox=0, oy=0):  # type: ignore[no-untyped-def]
     """Rounds of propagation in place: each pixel tries its neighbours' displacements and its own +-1.
 
     Cost: that of the displacement + ``smoothness`` times the sum over the four neighbours of min(|du| + |dv|, 2). The
     two colours of a checkerboard take turns, which settles in half the rounds of all at once. ``dirty`` (row, col)
-    uint8: room; from the second round on only the neighbourhoods of what changed are looked at.
+    uint8: room; from the second round on only the neighbourhoods of what changed are looked at. ``ox, oy``: as in
+    :func:`descend`; a window of an image must start at even rows and columns, so that the colours are the image's.
+    Reach: two pixels a round.
     """
     rows, cols = left.shape
     rrows, rcols = right.shape
@@ -241,13 +244,16 @@ def checkerboard(left, right, packed, data, dirty, lines, mu, smoothness, rounds
             first = (y + turn) & 1
             if y == 0 or y == rows - 1:
                 for x in range(first, cols, 2):
-                    _edge(left, right, packed, x, y, data, dirty, smoothness, lines[y, x] if mu > 0 else nil, mu)
+                    line = lines[y, x] if mu > 0 else nil
+                    _edge(left, right, packed, x, y, data, dirty, smoothness, line, mu, ox, oy)
                 continue
             if first == 0:
-                _edge(left, right, packed, 0, y, data, dirty, smoothness, lines[y, 0] if mu > 0 else nil, mu)
+                line = lines[y, 0] if mu > 0 else nil
+                _edge(left, right, packed, 0, y, data, dirty, smoothness, line, mu, ox, oy)
             if (cols - 1) & 1 == first:
                 x = cols - 1
-                _edge(left, right, packed, x, y, data, dirty, smoothness, lines[y, x] if mu > 0 else nil, mu)
+                line = lines[y, x] if mu > 0 else nil
+                _edge(left, right, packed, x, y, data, dirty, smoothness, line, mu, ox, oy)
             # What to look at and what changes cannot be predicted: lists, written always and kept by counting.
             flags, here, over, under, cost = dirty[y], packed[y], packed[y - 1], packed[y + 1], data[y]
             n = 0
@@ -263,8 +269,8 @@ def checkerboard(left, right, packed, data, dirty, lines, mu, smoothness, rounds
                     a, b, c = lines[y, i, 0], lines[y, i, 1], lines[y, i, 2]
                 own = here[i]
                 key = lanes.around(
-                    left[y, i], words, rrows, rcols, i, y, own, np.int64(cost[i]), over[i], here[i - 1], here[i + 1],
-                    under[i], smoothness, a, b, c, mu,
+                    left[y, i], words, rrows, rcols, i + ox, y + oy, own, np.int64(cost[i]), over[i], here[i - 1],
+                    here[i + 1], under[i], smoothness, a, b, c, mu,
                 )  # fmt: skip
                 moved[m], keys[m] = i, key
                 m += 1 if np.int32(key) != own else 0
@@ -278,13 +284,13 @@ def checkerboard(left, right, packed, data, dirty, lines, mu, smoothness, rounds
 
 
 @njit(cache=True, nogil=True)
-def _edge(left, right, packed, x, y, data, dirty, smoothness, line, mu):  # type: ignore[no-untyped-def]
+def _edge(left, right, packed, x, y, data, dirty, smoothness, line, mu, ox, oy):  # type: ignore[no-untyped-def]
     """A pixel of ``checkerboard`` that lacks a neighbour."""
     rows, cols = left.shape
     if not dirty[y, x]:
         return
     dirty[y, x] = 0
-    new, total = _border(left, right, packed, x, y, data, smoothness, line, mu)
+    new, total = _border(left, right, packed, x, y, data, smoothness, line, mu, ox, oy)
     if new == packed[y, x]:
         return
     packed[y, x] = new

@@ -7,13 +7,16 @@ small displacement, solved per window. A pixel keeps the step only if it makes i
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from numba import njit
 
 from stages.declare import AnyArray
 from stages.hfvm import rowwise
 from stages.hfvm.params import HfvmParams
+from stages.hfvm.window import Raster, pick
+
+Place = tuple[int, int, int, int, int, int]
+"""First column and row of the left and of the right window, rows and columns of the whole right image."""
 
 CORRELATION_SIDE = 9
 """Pixels: fewer do not tell correlated noise from texture."""
@@ -37,6 +40,7 @@ def refine(
     v: AnyArray,
     keep: AnyArray,
     params: HfvmParams,
+    place: Place | None = None,
 ) -> tuple[AnyArray, AnyArray, AnyArray]:
     """Displacements without the perspective bias.
 
@@ -46,6 +50,7 @@ def refine(
     right_valid : (row, col) uint8, 1 = usable.
     u, v : (row, col) float32, smoothed displacements, pixels.
     keep : (row, col) bool, pixels that have one.
+    place : where both windows lie; None: they are the images. Pixels nearer than :func:`reach` to a cut are not sound.
 
     Returns
     -------
@@ -53,11 +58,12 @@ def refine(
     rest : (row, col) float32, mean-free residual variance of the window, squared grey levels; inf where not known.
     """
     start_u, start_v = u, v
+    at = place or (0, 0, 0, 0, *right.shape)
     first = last = np.empty(u.shape, np.float32)
     for step in range(params.refine_steps + 1):
         new_u, new_v, last = np.empty_like(u), np.empty_like(v), np.empty(u.shape, np.float32)
         radius, noise = params.refine_radius, params.refine_noise
-        rowwise.lucas_kanade(left, right, right_valid, u, v, keep, radius, noise, new_u, new_v, last)
+        rowwise.lucas_kanade(left, right, right_valid, u, v, keep, radius, noise, new_u, new_v, last, *at)
         if step == 0:
             first = last
         if step < params.refine_steps:
@@ -67,25 +73,39 @@ def refine(
     return np.where(better, u, start_u), np.where(better, v, start_v), np.where(better, last, first)
 
 
-def level_contrast(left: AnyArray, right: AnyArray, u: AnyArray, v: AnyArray, keep: AnyArray) -> AnyArray:
-    """The right image, its contrast made that of the left one where they differ grossly (:data:`SAME_CONTRAST`).
+def contrast(left: Raster, right: Raster, u: Raster, v: Raster, chosen: AnyArray) -> float | None:
+    """Ratio of the left image's contrast to the right one's where they differ grossly (:data:`SAME_CONTRAST`), or None.
 
     Steps and residuals are mean-free, not free of gain: an exposure ratio of two would pass for noise. The ratio is
     that of the median differences over three columns, at matches that are not saturated.
+
+    Parameters
+    ----------
+    left, right, u, v : whole images and displacements.
+    chosen : flat indices of matched pixels, about :data:`SAMPLES`; none in the last columns (:data:`STRIDE`).
     """
-    y, x = np.nonzero(keep[:, :-STRIDE])
-    y, x = y[:: 1 + len(y) // SAMPLES], x[:: 1 + len(x) // SAMPLES]
-    xr, yr = np.rint(x + u[y, x]).astype(np.intp), np.rint(y + v[y, x]).astype(np.intp)
+    y, x = np.divmod(chosen, u.shape[1])
+    xr, yr = np.rint(x + pick(u, y, x)).astype(np.intp), np.rint(y + pick(v, y, x)).astype(np.intp)
     inside = (xr >= 0) & (xr + STRIDE < right.shape[1]) & (yr >= 0) & (yr < right.shape[0])
     y, x, yr, xr = y[inside], x[inside], yr[inside], xr[inside]
-    a, b = np.stack([left[y, x], left[y, x + STRIDE]]), np.stack([right[yr, xr], right[yr, xr + STRIDE]])
+    a, b = (np.stack([pick(c, j, i), pick(c, j, i + STRIDE)]) for c, j, i in ((left, y, x), (right, yr, xr)))
     good = (np.maximum(a, b) < SATURATED).all(axis=0)
     if np.count_nonzero(good) < LEAST:
-        return right
+        return None
     there, here = (float(np.median(np.abs(np.diff(c[:, good], axis=0)))) for c in (b, a))
     if min(here, there) <= 0 or max(here / there, there / here) < SAME_CONTRAST:
-        return right
-    return right * np.float32(here / there)
+        return None
+    return here / there
+
+
+def reach(params: HfvmParams) -> int:
+    """Pixels that a refined displacement and its correlation depend on to either side."""
+    return params.refine_steps * (params.refine_radius + 1) + params.refine_radius + CORRELATION_SIDE // 2
+
+
+def drift(params: HfvmParams) -> int:
+    """Pixels of the right image beyond the start's that refinement may read: a step and a mean each move by one."""
+    return 2 * params.refine_steps + 3
 
 
 def correlation(rest: AnyArray, deviation: AnyArray, keep: AnyArray) -> AnyArray:
@@ -96,8 +116,9 @@ def correlation(rest: AnyArray, deviation: AnyArray, keep: AnyArray) -> AnyArray
     """
     both = np.empty((2, *rest.shape), np.float32)
     _known(rest, deviation, keep, both[0], both[1])
-    side = (CORRELATION_SIDE, CORRELATION_SIDE)
-    differ, power = (cv2.boxFilter(a, cv2.CV_32F, side, normalize=False, borderType=cv2.BORDER_CONSTANT) for a in both)
+    differ, power = np.empty_like(both)
+    rowwise.box_sum(both[0], CORRELATION_SIDE // 2, differ)
+    rowwise.box_sum(both[1], CORRELATION_SIDE // 2, power)
     found = np.empty_like(rest)
     _correlation(differ, power, found)
     return found

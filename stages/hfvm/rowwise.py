@@ -48,28 +48,56 @@ def local_mean(u, v, keep, radius, out_u, out_v):  # type: ignore[no-untyped-def
 
 
 @njit(cache=True, nogil=True)
-def _products(left, right, right_valid, u, v, keep, y, out):  # type: ignore[no-untyped-def]
+def box_sum(a, radius, out):  # type: ignore[no-untyped-def]
+    """Sums in float64 over (2 radius + 1)^2 pixels, clipped at the border.
+
+    Each is added up afresh in one order, so that it does not depend on where the array begins; a running sum would.
+    """
+    rows, cols = a.shape
+    down, total = np.empty(cols), np.empty(cols)
+    for y in range(rows):
+        down[:] = 0.0
+        for j in range(max(0, y - radius), min(rows, y + radius + 1)):
+            row = a[j]
+            for x in range(cols):
+                down[x] += row[x]
+        total[:] = 0.0
+        for i in range(-radius, radius + 1):
+            first, last = max(0, -i), min(cols, cols - i)
+            if first >= last:
+                continue
+            here, there = total[first:last], down[first + i : last + i]
+            for x in range(last - first):
+                here[x] += there[x]
+        out[y] = total
+
+
+@njit(cache=True, nogil=True)
+def _products(left, right, right_valid, u, v, keep, y, out, x0=0, y0=0, rx0=0, ry0=0, rrows=-1, rcols=-1):  # type: ignore[no-untyped-def]
     """Row ``y`` of the planes whose window sums a step needs, zero where a pixel takes no part.
 
-    ``out`` (PLANES, col): count, gx, gy, r, gx gx, gx gy, gy gy, gx r, gy r, r r.
+    ``out`` (PLANES, col): count, gx, gy, r, gx gx, gx gy, gy gy, gx r, gy r, r r. Windows as in
+    :func:`stages.hfvm.consistency.backmatch`; ``rrows`` negative: the right window is the whole image.
     """
     rows, cols = left.shape
-    rrows, rcols = right.shape
+    width = right.shape[1]
+    height, length = right.shape if rrows < 0 else (rrows, rcols)
     out[:] = np.float32(0.0)
     if y < 0 or y >= rows:
         return
     one, half = np.float32(1.0), np.float32(0.5)
-    last_x, last_y = np.float32(rcols - 2), np.float32(rrows - 2)
+    last_x, last_y = np.float32(length - 2), np.float32(height - 2)
     lu, lv, grey, n, gx, gy, rest = u[y], v[y], left[y], out[0], out[1], out[2], out[3]
     flat, taking = right.reshape(-1), keep[y]
     for x in range(cols):
-        xr, yr = np.float32(x) + lu[x], np.float32(y) + lv[x]
+        xr, yr = np.float32(x + x0) + lu[x], np.float32(y + y0) + lv[x]
         if not (taking[x] and xr >= one and xr < last_x and yr >= one and yr < last_y):
             continue
-        if not right_valid[np.uint64(yr + half), np.uint64(xr + half)]:
+        if not right_valid[np.uint64(np.int64(yr + half) - ry0), np.uint64(np.int64(xr + half) - rx0)]:
             continue
         i, j = np.int64(xr), np.int64(yr)
-        value, a, b = lanes.cubic(flat, j * rcols + i, rcols, xr - np.float32(i), yr - np.float32(j))
+        at = (j - ry0) * width + i - rx0
+        value, a, b = lanes.cubic(flat, at, width, xr - np.float32(i), yr - np.float32(j))
         n[x], gx[x], gy[x], rest[x] = one, a, b, grey[x] - value
     for k, (p, q) in enumerate(((gx, gx), (gx, gy), (gy, gy), (gx, rest), (gy, rest), (rest, rest))):
         product = out[4 + k]
@@ -94,10 +122,13 @@ def _across(fresh, radius, out):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def lucas_kanade(left, right, right_valid, u, v, keep, radius, noise, new_u, new_v, energy):  # type: ignore[no-untyped-def]
+def lucas_kanade(  # type: ignore[no-untyped-def]
+    left, right, right_valid, u, v, keep, radius, noise, new_u, new_v, energy, x0, y0, rx0, ry0, rrows, rcols
+):
     """One mean-free step for every kept pixel; ``energy``: residual variance *before* the step (inf: none).
 
-    float32 throughout: the planes are summed afresh for every window, so nothing adds up.
+    float32 throughout: the planes are summed afresh for every window, so nothing adds up. Windows as in
+    :func:`stages.hfvm.consistency.backmatch`.
     """
     rows, cols = left.shape
     size = 2 * radius + 1
@@ -105,7 +136,7 @@ def lucas_kanade(left, right, right_valid, u, v, keep, radius, noise, new_u, new
     ring = np.zeros((size, PLANES, cols), np.float32)
     s = np.empty((PLANES, cols), np.float32)
     for y in range(-radius, rows):
-        _products(left, right, right_valid, u, v, keep, y + radius, fresh)
+        _products(left, right, right_valid, u, v, keep, y + radius, fresh, x0, y0, rx0, ry0, rrows, rcols)
         _across(fresh, radius, ring[(y + radius) % size])
         if y < 0:
             continue

@@ -26,6 +26,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from stages.declare import AnyArray
+from stages.hfvm import rowwise
 from stages.hfvm.params import HfvmParams
 from stages.windows import window_sum
 
@@ -97,7 +98,8 @@ def parts(
         return params.refine_noise * per_noise, relief, border
     # One window's residual is itself uncertain; that of its surroundings is not.
     known = keep & np.isfinite(rest)
-    total = window_sum(np.where(known, rest, 0.0), SURROUNDINGS)
+    total = np.empty(keep.shape)
+    rowwise.box_sum(np.where(known, rest, 0.0), SURROUNDINGS // 2, total)
     return per_noise * total / np.maximum(window_sum(known, SURROUNDINGS), 1.0), relief, border
 
 

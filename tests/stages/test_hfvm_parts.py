@@ -8,6 +8,7 @@ from scipy import ndimage
 from stages.geometry import Rig
 from stages.hfvm import consistency, epipolar, hierarchy, lookup, plane, refine, rowwise
 from stages.hfvm.params import HfvmParams
+from stages.hfvm.window import whole
 from stages.pyramid import PyramidParams, build
 
 
@@ -17,9 +18,9 @@ def zeros(*shape):
 
 class TestConsistency:
     def backmatch(self, lu, lv, ru, rv, valid=None):
-        error = np.empty(lu.shape, np.float32)
+        error = np.full(lu.shape, consistency.FAILED, np.float32)
         valid = np.ones(ru.shape, np.uint8) if valid is None else valid
-        consistency.backmatch(lu, lv, ru, rv, valid, error)
+        consistency.backmatch(lu, lv, ru, rv, valid, error, 0, 0, 0, 0, *ru.shape)
         return error
 
     def test_by_hand(self):
@@ -125,11 +126,11 @@ class TestEpipolar:
         u, v, wanted, *_ = rig_matches(rig, outliers=0.0)
         assert np.median(u[wanted]) > 0  # beyond the crossing of the axes: the sign of u alone would mislead
         f, _ = epipolar.fit(u, v, wanted, wanted.shape)
-        assert epipolar.near_sign(f, u, wanted, wanted.shape) == -1.0
+        assert epipolar.near_sign(f, u[wanted], wanted.shape, wanted.shape) == -1.0
         swapped = Rig(rig.right, rig.left, rig.T_right_left.inverse())
         u, v, wanted, *_ = rig_matches(swapped, outliers=0.0)
         f, _ = epipolar.fit(u, v, wanted, wanted.shape)
-        assert epipolar.near_sign(f, u, wanted, wanted.shape) == 1.0
+        assert epipolar.near_sign(f, u[wanted], wanted.shape, wanted.shape) == 1.0
 
 
 class TestPlane:
@@ -262,7 +263,8 @@ class TestLookup:
         single = [build(a, PyramidParams(levels=1)) for a in images]
         prepared = hierarchy.prepare(*single, p)
         state = hierarchy.run(prepared, p, 0)
-        _, _, _, offset = prepared.solver._search(0, state.left.u, state.left.v, 0, 0)
+        patches = [seen.patch(0, whole(images[0].shape)) for seen in (prepared.left, prepared.right)]
+        _, _, _, offset = prepared.solver.search(*patches, state.left.u, state.left.v, 0, 0)
         table = lookup.learn(offset[..., 0][state.left_ok])
         # One of six images of the lesson: a few hundredths.
         np.testing.assert_allclose(table, lookup.DEFAULT_TABLE, atol=0.03)
