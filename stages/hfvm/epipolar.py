@@ -154,20 +154,21 @@ def near_sign(f: Matrix, u: AnyArray, wanted: AnyArray, right_shape: tuple[int, 
 
 def lines(f: Matrix, shape: tuple[int, ...]) -> NDArray[np.float32]:
     """Epipolar line of every left pixel: unit normal and offset (row, col, 3) with n . displacement + c = 0."""
-    found = np.empty((shape[0], shape[1], 3), np.float32)
+    found = np.empty((3, shape[0], shape[1]), np.float32)
     write_lines(f, found)
-    return found
+    return np.ascontiguousarray(np.moveaxis(found, 0, 2))
 
 
 @njit(cache=True, nogil=True)
 def write_lines(f, found):  # type: ignore[no-untyped-def]
-    """As :func:`lines`, into ``found``."""
-    for j in range(found.shape[0]):
+    """As :func:`lines`, into the planes ``found`` (3, row, col); zeros where ``f`` is zero."""
+    for j in range(found.shape[1]):
         y = np.float64(j)
-        for i in range(found.shape[1]):
+        first, second, third = found[0, j], found[1, j], found[2, j]
+        for i in range(found.shape[2]):
             x = np.float64(i)
             a = f[0, 0] * x + f[0, 1] * y + f[0, 2]
             b = f[1, 0] * x + f[1, 1] * y + f[1, 2]
             c = f[2, 0] * x + f[2, 1] * y + f[2, 2]
             scale = 1.0 / max(np.sqrt(a * a + b * b), 1e-12)
-            found[j, i, 0], found[j, i, 1], found[j, i, 2] = a * scale, b * scale, (c + a * x + b * y) * scale
+            first[i], second[i], third[i] = a * scale, b * scale, (c + a * x + b * y) * scale

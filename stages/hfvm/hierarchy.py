@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from stages import features
 from stages.declare import AnyArray
-from stages.hfvm import consistency, epipolar, lookup, paper, propagation, search, subpixel
+from stages.hfvm import consistency, epipolar, lanes, lookup, paper, propagation, search, subpixel
 from stages.hfvm.params import HfvmParams
 from stages.pyramid import Pyramid, filled
 
@@ -98,17 +98,17 @@ class FastSolver:
         p, a, b = self.params, self.left[level], self.right[level]
         u, v = np.zeros(a.shape, np.int16), np.zeros(a.shape, np.int16)
         packed, data, dirty = (self._room(name, a.shape, kind) for name, kind in ROOM)
-        lines = self._room("lines", (*(a.shape if band.mu > 0 else (1, 1)), 3), np.float32)
+        lines, mu = self._room("lines", (3, *a.shape), np.float32), np.float32(band.mu)
         epipolar.write_lines(band.f, lines)
         if up is None:
             reach_x, reach_y = top_reach(p, a.shape, b.shape)
             search.exhaustive(a, b, reach_x, reach_y, 1, u, v)
             propagation.pack_map(u, v, packed)
-            propagation.costs(a, b, lines, band.mu, packed, data)
+            data[:] = lanes.FAR
         else:
-            propagation.descend(a, b, up.u, up.v, p.search_columns, p.search_rows, lines, band.mu, packed, data)
+            propagation.descend(a, b, up.u, up.v, p.search_columns, p.search_rows, 4, lines, mu, packed, data)
         rounds = p.rounds if level > 0 or p.fine_rounds is None else p.fine_rounds
-        propagation.checkerboard(a, b, packed, data, dirty, lines, band.mu, p.smoothness, rounds)
+        propagation.checkerboard(a, b, packed, data, dirty, lines, mu, p.smoothness, rounds)
         propagation.unpack(packed, u, v)
         return Map(u, v, np.zeros(a.shape, bool))
 
