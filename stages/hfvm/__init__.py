@@ -119,6 +119,7 @@ def match_pyramids(
     pair = accurate.extend(hierarchy.prepare(left, right, params), left, right, params)
     coarse = start.impose(pair, params, hierarchy.run(pair, params, params.plane_level), prior)
     alignment = plane.find(pair, coarse, params) if params.preset != "paper" else None
+    warped = right
     if alignment is not None:
         tell(COARSE_SHARE, "alignment")
         warped = plane.align(right, alignment, left.images[0].shape, PyramidParams(levels=left.levels))
@@ -126,9 +127,11 @@ def match_pyramids(
         moved = start.align(prior, alignment)
         coarse = hierarchy.run(pair, params, params.plane_level, near_sign=coarse.near_sign)
         coarse = start.impose(pair, params, coarse, moved)
+    n = coarse.level
+    contrast = refine.contrast(left.images[n], warped.images[n], coarse.left.u, coarse.left.v, coarse.left_ok)
     state = _descend(pair, params, coarse, tell)
     tell(FINE_SHARE, "sub-pixel and refinement")
-    return _finish(left, right, pair, state, params, alignment)
+    return _finish(left, right, pair, state, params, alignment, contrast)
 
 
 def _descend(pair: hierarchy.Prepared, params: HfvmParams, state: hierarchy.State, tell: Tell) -> hierarchy.State:
@@ -164,30 +167,26 @@ def _finish(
     state: hierarchy.State,
     params: HfvmParams,
     alignment: plane.Matrix | None,
+    contrast: float,
 ) -> Disparity:
     """Sub-pixel, validity, refinement and filling at level 0."""
-    forward, error = _fine(pair, state, params)
-    validity = _reasons(pair, forward, error, params)
-    u, v = forward.u, forward.v
+    u, v, distance, error = _smooth(pair, state, params)
+    validity = _reasons(pair, distance, error, params)
     if alignment is not None:
         u, v = plane.compose(alignment, u, v)
     keep = validity == 0
-    if params.preset != "paper":
-        mean_u, mean_v = np.empty_like(u), np.empty_like(v)
-        rowwise.local_mean(u, v, keep, hierarchy.SUM_RADIUS, mean_u, mean_v)
-        u, v = mean_u, mean_v
-    rest: AnyArray | None = None
-    image = right.images[0]
+    noise: AnyArray
+    image = right.images[0] if contrast == 1.0 else right.images[0] * np.float32(contrast)
+    u, v, rest, noise = refine.refine(left.images[0], image, right.valid[0], u, v, keep, params)
+    alike, around = refine.surroundings(rest, pair.deviation[0], keep)
     if params.refine:
-        image = refine.level_contrast(left.images[0], right.images[0], u, v, keep)
-        u, v, rest = refine.refine(left.images[0], image, right.valid[0], u, v, keep, params)
-        alike = refine.correlation(rest, pair.deviation[0], keep)
         mark(validity, keep & (alike < params.correlation), Validity.OVER_THRESHOLD)
+    noise *= around
     if params.relief_steps:
         u, v = relief.fit(left.images[0], image, right.valid[0], u, v, validity == 0, params)
     mark(validity, keep & ~consistency.lands(u, v, keep, right.valid[0]), Validity.OUT_OF_IMAGE)
     keep = validity == 0
-    gone = consistency.unsupported(forward.u, forward.v, keep, params.speckle)
+    gone = consistency.unsupported(state.left.u, state.left.v, keep, params.speckle)
     # Lonely matches are too uncertain to count as measured, but still the best guess where they are.
     lonely = consistency.lonely(keep & ~gone, params.crowd)
     mark(validity, gone | lonely, Validity.SPECKLE)
@@ -195,7 +194,7 @@ def _finish(
     consistency.fill_rows(u, v, keep & ~gone, params.fill_reach, state.near_sign or -1.0, interpolated)
     keep &= ~gone & ~lonely
     mark(validity, keep, Validity.MATCHED)
-    std = uncertainty.standard_deviation(left.images[0], rest, u, keep, params)
+    std = uncertainty.standard_deviation(noise, u, keep, params)
     interpolated[left.valid[0] == 0] = 0
     if params.guided_fill:
         u, v = guided.median(u, v, keep, interpolated, left.images[0])
@@ -203,29 +202,40 @@ def _finish(
     nothing = ~(keep | (interpolated != 0))
     u[nothing] = v[nothing] = np.nan
     error[error >= consistency.FAILED] = np.nan
-    distance = np.where(forward.distance < 0, np.float32(np.nan), forward.distance)
+    distance[distance < 0] = np.nan
     return Disparity(u, v, validity, error, distance, std, alignment is not None)
 
 
-def _fine(pair: hierarchy.Prepared, state: hierarchy.State, params: HfvmParams) -> tuple[hierarchy.Fine, Map]:
-    """Sub-pixel left map, and its sub-pixel back-matching error."""
-    # Sub-pixel work pays only where the whole-pixel maps nearly agree.
-    reach = params.backmatch + 1.0
-    near = hierarchy.integer_error(state.left, state.right, pair.right_valid[0]) <= reach
-    near_right = hierarchy.integer_error(state.right, state.left, pair.left_valid[0]) <= reach
-    forward = pair.solver.fine(0, state.left, near)
-    backward = pair.solver.reverse().fine(0, state.right, near_right)
-    error = np.empty(forward.u.shape, np.float32)
-    consistency.backmatch(forward.u, forward.v, backward.u, backward.v, pair.right_valid[0], error)
-    return forward, error
+def _smooth(pair: hierarchy.Prepared, state: hierarchy.State, params: HfvmParams) -> tuple[Map, Map, Map, Map]:
+    """Left map with fractions of a pixel, feature distance (-1: outside), and back-matching error."""
+    maps = [_fractions(pair.solver, state.left, params), _fractions(pair.solver.reverse(), state.right, params)]
+    error = np.empty(maps[0].u.shape, np.float32)
+    consistency.backmatch(maps[0].u, maps[0].v, maps[1].u, maps[1].v, pair.right_valid[0], error)
+    return maps[0].u, maps[0].v, maps[0].distance, error
 
 
-def _reasons(pair: hierarchy.Prepared, fine: hierarchy.Fine, error: AnyArray, params: HfvmParams) -> Mask:
+def _fractions(solver: hierarchy.Solver, m: hierarchy.Map, params: HfvmParams) -> hierarchy.Fine:
+    """Means of like neighbours: of the whole displacements where steps refine them, else of sub-pixel ones."""
+    everywhere = np.ones(m.u.shape, bool)
+    if params.preset == "paper":
+        return solver.fine(0, m, everywhere)
+    if params.refine:
+        distance = solver.distances(0, m)
+        u, v = m.u.astype(np.float32), m.v.astype(np.float32)
+    else:
+        fine = solver.fine(0, m, everywhere)
+        u, v, distance = fine.u, fine.v, fine.distance
+    mean_u, mean_v = np.empty_like(u), np.empty_like(v)
+    rowwise.local_mean(u, v, everywhere, hierarchy.SUM_RADIUS, 2, mean_u, mean_v)
+    return hierarchy.Fine(mean_u, mean_v, distance)
+
+
+def _reasons(pair: hierarchy.Prepared, distance: AnyArray, error: AnyArray, params: HfvmParams) -> Mask:
     """Bits that speak against each pixel, none where it is consistent."""
     bits = np.zeros(error.shape, np.uint8)
     outside = (error >= consistency.FAILED) | (pair.left_valid[0] == 0)
     mark(bits, outside, Validity.OUT_OF_IMAGE)
-    mark(bits, fine.distance > params.threshold, Validity.OVER_THRESHOLD)
+    mark(bits, distance > params.threshold, Validity.OVER_THRESHOLD)
     mark(bits, pair.deviation[0] < params.texture, Validity.NO_TEXTURE)
     mark(bits, ~outside & (error > params.backmatch), Validity.BACKMATCH_FAILED)
     return bits

@@ -76,6 +76,9 @@ class Solver(Protocol):
     def fine(self, level: int, m: Map, wanted: AnyArray) -> Fine:
         """Sub-pixel map where ``wanted`` is not zero."""
 
+    def distances(self, level: int, m: Map) -> AnyArray:
+        """Mean feature distances at an integer map, -1 outside."""
+
     def reverse(self) -> Solver:
         """The matcher from right to left."""
 
@@ -128,6 +131,10 @@ class FastSolver:
         subpixel.summed(self.left[level], self.right[level], m.u, m.v, wanted.astype(np.uint8), SUM_RADIUS, u, v, d)
         return Fine(u, v, d)
 
+    def distances(self, level: int, m: Map) -> AnyArray:
+        """Mean feature distances at an integer map, see :func:`stages.hfvm.subpixel.distances`."""
+        return subpixel.distances(self.left[level], self.right[level], m.u, m.v, SUM_RADIUS)
+
     def reverse(self) -> FastSolver:
         """The matcher from right to left."""
         return FastSolver(self.right, self.left, self.params, room=self.room)
@@ -160,6 +167,10 @@ class PaperSolver:
         _, _, distance, offset = self._search(level, m.u, m.v, 0, 0)
         offset = lookup.even(offset)
         return Fine(m.u + offset[..., 0], m.v + offset[..., 1], distance)
+
+    def distances(self, level: int, m: Map) -> AnyArray:
+        """Distance of each pixel at an integer map."""
+        return np.asarray(self._search(level, m.u, m.v, 0, 0)[2])
 
     def _search(self, level: int, cu: AnyArray, cv: AnyArray, reach_x: int, reach_y: int) -> tuple[AnyArray, ...]:
         a, b = self.left[level], self.right[level]
@@ -250,25 +261,20 @@ def _level(pair: Prepared, params: HfvmParams, level: int, above: State | None, 
     a, b = (
         Map(consistency.median(m.u, params.median), consistency.median(m.v, params.median), m.undefined) for m in (a, b)
     )
-    left_ok = (
-        ~a.undefined
-        & (pair.left_valid[level] != 0)
-        & (integer_error(a, b, pair.right_valid[level]) <= params.backmatch)
-    )
-    right_ok = (
-        ~b.undefined
-        & (pair.right_valid[level] != 0)
-        & (integer_error(b, a, pair.left_valid[level]) <= params.backmatch)
-    )
+    if level == 0 and above:  # _finish checks sub-pixel maps
+        nothing = np.zeros((1, 1), bool)
+        return State(level, a, b, nothing, nothing, FREE, sign)
+    left_ok = _agree(a, b, pair.left_valid[level], pair.right_valid[level], params.backmatch)
+    right_ok = _agree(b, a, pair.right_valid[level], pair.left_valid[level], params.backmatch)
     state = State(level, a, b, left_ok, right_ok, FREE, sign)
     return _with_band(pair, params, state) if forward.uses_band and params.band > 0 and level > 0 else state
 
 
-def integer_error(a: Map, b: Map, b_valid: AnyArray) -> AnyArray:
-    """Back-matching error of an integer map, pixels."""
-    error = np.empty(a.u.shape, np.float32)
-    consistency.integer_error(a.u, a.v, b.u, b.v, b_valid, error)
-    return error
+def _agree(a: Map, b: Map, a_valid: AnyArray, b_valid: AnyArray, limit: float) -> NDArray[np.bool_]:
+    """Usable pixels of an integer map that the other one confirms."""
+    found = np.empty(a.u.shape, bool)
+    consistency.agree(a.u, a.v, b.u, b.v, a_valid, b_valid, limit, found)
+    return found & ~a.undefined
 
 
 def _hand_down(m: Map, ok: AnyArray, near_sign: float, params: HfvmParams) -> Map:

@@ -415,8 +415,6 @@ east, north, south. The windows must lie inside.
 _FLOATS = ir.VectorType(ir.FloatType(), 4)
 _CUBIC = ((0.0, 1.0, 0.0, 0.0), (-0.5, 0.0, 0.5, 0.0), (1.0, -2.5, 2.0, -0.5), (-0.5, 1.5, -1.5, 0.5))
 """Catmull-Rom weights of four samples: coefficients of 1, t, t^2, t^3."""
-_SLOPE = (_CUBIC[1], (2.0, -5.0, 4.0, -1.0), (-1.5, 4.5, -4.5, 1.5))
-"""Of their derivatives: coefficients of 1, t, t^2."""
 
 GREY = types.Array(types.float32, 1, "C")
 
@@ -440,29 +438,24 @@ def _dot(builder: Any, a: Any, b: Any) -> Any:
 
 @intrinsic
 def cubic(typingctx, image, at, width, t, s):  # type: ignore[no-untyped-def]
-    """Catmull-Rom value and gradient (x, y) of a flat float32 image of ``width`` columns.
+    """Catmull-Rom value of a flat float32 image of ``width`` columns.
 
     ``at``: index of the pixel above and left of the point's own; ``t, s``: the point's distance right of and below it,
     within a pixel. 4 x 4 pixels from ``at - width - 1`` on are read.
     """
     f32, i64 = types.float32, types.int64
-    signature = types.UniTuple(f32, 3)(GREY, i64, i64, f32, f32)
+    signature = f32(GREY, i64, i64, f32, f32)
 
     def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
         image, at, width, t, s = args
-        across, down = _splat(builder, t, 4), _splat(builder, s, 4)
         start = builder.sub(builder.sub(at, width), ir.Constant(_I64, 1))
-        weights, slopes = _polynomial(builder, _CUBIC, down), _polynomial(builder, _SLOPE, down)
-        column = gradient = ir.Constant(_FLOATS, [0.0] * 4)
+        weights = _polynomial(builder, _CUBIC, _splat(builder, s, 4))
+        column = ir.Constant(_FLOATS, [0.0] * 4)
         for k in range(4):
             pointer = _as(builder, _pointer(context, builder, sig.args[0], image, start), _FLOATS)
-            row = builder.load(pointer, align=4)
-            each = ir.Constant(ir.VectorType(_I32, 4), [k] * 4)
-            column = builder.fadd(column, builder.fmul(builder.shuffle_vector(weights, weights, each), row))
-            gradient = builder.fadd(gradient, builder.fmul(builder.shuffle_vector(slopes, slopes, each), row))
+            each = builder.shuffle_vector(weights, weights, ir.Constant(ir.VectorType(_I32, 4), [k] * 4))
+            column = builder.fadd(column, builder.fmul(each, builder.load(pointer, align=4)))
             start = builder.add(start, width)
-        w = _polynomial(builder, _CUBIC, across)
-        found = [_dot(builder, w, column), _dot(builder, _polynomial(builder, _SLOPE, across), column)]
-        return context.make_tuple(builder, sig.return_type, [*found, _dot(builder, w, gradient)])
+        return _dot(builder, _polynomial(builder, _CUBIC, _splat(builder, t, 4)), column)
 
     return signature, codegen

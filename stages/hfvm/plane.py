@@ -61,13 +61,20 @@ def align(right: Pyramid, h: Matrix, left_shape: tuple[int, ...], params: Pyrami
 
 def compose(h: Matrix, u: AnyArray, v: AnyArray) -> tuple[AnyArray, AnyArray]:
     """Displacements to the original right image of displacements to the aligned one (margin included)."""
-    g = h @ translation(-margin(u.shape))
-    y, x = np.indices(u.shape, dtype=np.float64)
-    p, q = x + u, y + v
-    w = g[2, 0] * p + g[2, 1] * q + g[2, 2]
-    xr = (g[0, 0] * p + g[0, 1] * q + g[0, 2]) / w
-    yr = (g[1, 0] * p + g[1, 1] * q + g[1, 2]) / w
-    return (xr - x).astype(np.float32), (yr - y).astype(np.float32)
+    out_u, out_v = np.empty(u.shape, np.float32), np.empty(v.shape, np.float32)
+    _compose(h @ translation(-margin(u.shape)), u, v, out_u, out_v)
+    return out_u, out_v
+
+
+@njit(cache=True, nogil=True)
+def _compose(g, u, v, out_u, out_v):  # type: ignore[no-untyped-def]
+    for y in range(u.shape[0]):
+        a, b, c = g[0, 1] * y + g[0, 2], g[1, 1] * y + g[1, 2], g[2, 1] * y + g[2, 2]
+        for x in range(u.shape[1]):
+            p, dv = np.float64(x) + u[y, x], np.float64(v[y, x])
+            w = 1.0 / (g[2, 0] * p + g[2, 1] * dv + c)
+            out_u[y, x] = (g[0, 0] * p + g[0, 1] * dv + a) * w - x
+            out_v[y, x] = (g[1, 0] * p + g[1, 1] * dv + b) * w - y
 
 
 def margin(left_shape: tuple[int, ...]) -> int:
