@@ -11,7 +11,7 @@ fine), ``search`` (one level, fast), ``paper`` (one level, to the letter), ``epi
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -101,8 +101,8 @@ def match_pyramids(
 ) -> Disparity:
     """As :func:`match`, of two image pyramids. ``side``: pixels of a tile; None: the images are matched whole."""
     found = tiled.match(Plain.of(left), Plain.of(right), params, prior, tell or (lambda share, step: None), side)
-    names = [f.name for f in fields(Disparity) if f.name != "aligned"]
-    return Disparity(*(found.arrays[name] for name in names), aligned=found.aligned)
+    arrays: dict[str, Any] = found.arrays
+    return Disparity(**arrays, aligned=found.aligned)
 
 
 def _run(params: HfvmParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:

@@ -46,6 +46,10 @@ class AccurateSolver:
         """Sub-pixel map from summed distances."""
         return self.fast.fine(a, b, m, wanted)
 
+    def distances(self, a: Patch, b: Patch, m: Map) -> AnyArray:
+        """Mean feature distances at an integer map, -1 outside."""
+        return self.fast.distances(a, b, m)
+
 
 def choose(params: HfvmParams) -> Solver:
     """The solver of a preset: with propagation along paths where there are rounds of it."""

@@ -144,8 +144,8 @@ def near_sign(f: Matrix, u: AnyArray, left_shape: tuple[int, ...], right_shape: 
     """Sign of the column displacement of near things against far ones: -1 on a usual rig, +1 with images swapped.
 
     On a convergent rig the displacement of far things is not zero; the toe-in shows in the terms ``y'x`` and ``x'y``
-    (keystone), which give it for a focal length of about the image width. A vote: only the filling of gaps hangs on it. ``u``: column
-    displacements of matches (n,).
+    (keystone), which give it for a focal length of about the image width. A vote: only the filling of gaps hangs on it.
+    ``u``: column displacements of matches (n,).
     """
     rows, cols = left_shape
     to_left = np.array([[1.0, 0.0, 0.5 * (cols - 1)], [0.0, 1.0, 0.5 * (rows - 1)], [0.0, 0.0, 1.0]])
@@ -165,20 +165,21 @@ def lines(f: Matrix, shape: tuple[int, ...], x0: int = 0, y0: int = 0) -> NDArra
 
     ``x0, y0``: first column and row of a window.
     """
-    found = np.empty((shape[0], shape[1], 3), np.float32)
+    found = np.empty((3, shape[0], shape[1]), np.float32)
     write_lines(f, found, x0, y0)
-    return found
+    return np.ascontiguousarray(np.moveaxis(found, 0, 2))
 
 
 @njit(cache=True, nogil=True)
 def write_lines(f, found, x0=0, y0=0):  # type: ignore[no-untyped-def]
-    """As :func:`lines`, into ``found``."""
-    for j in range(found.shape[0]):
+    """As :func:`lines`, into the planes ``found`` (3, row, col); zeros where ``f`` is zero."""
+    for j in range(found.shape[1]):
         y = np.float64(j + y0)
-        for i in range(found.shape[1]):
+        first, second, third = found[0, j], found[1, j], found[2, j]
+        for i in range(found.shape[2]):
             x = np.float64(i + x0)
             a = f[0, 0] * x + f[0, 1] * y + f[0, 2]
             b = f[1, 0] * x + f[1, 1] * y + f[1, 2]
             c = f[2, 0] * x + f[2, 1] * y + f[2, 2]
             scale = 1.0 / max(np.sqrt(a * a + b * b), 1e-12)
-            found[j, i, 0], found[j, i, 1], found[j, i, 2] = a * scale, b * scale, (c + a * x + b * y) * scale
+            first[i], second[i], third[i] = a * scale, b * scale, (c + a * x + b * y) * scale

@@ -13,13 +13,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stages.declare import AnyArray
-from stages.hfvm import consistency, epipolar, lookup, paper, propagation, search, subpixel
+from stages.hfvm import consistency, epipolar, lanes, lookup, paper, propagation, search, subpixel
 from stages.hfvm.params import HfvmParams
 from stages.hfvm.views import Patch, Plain, Seen
 from stages.hfvm.window import (
@@ -32,7 +32,6 @@ from stages.hfvm.window import (
     bounded,
     cut,
     gather,
-    pick,
     thinned,
     tiles,
     whole,
@@ -48,11 +47,14 @@ FIT_SAMPLES = 2000
 
 @dataclass(frozen=True)
 class Map:
-    """Displacements of one direction at one level: int16 columns and rows; bool, where nothing was matchable."""
+    """Displacements of one direction at one level: int16 columns and rows; bool, where nothing was matchable.
 
-    u: Raster
-    v: Raster
-    undefined: Raster
+    Arrays, or other rasters.
+    """
+
+    u: Any
+    v: Any
+    undefined: Any
 
     def cut(self, window: Window) -> Map:
         """The map of a window."""
@@ -107,11 +109,17 @@ class Solver(Protocol):
     def fine(self, a: Patch, b: Patch, m: Map, wanted: AnyArray) -> Fine:
         """Sub-pixel map where ``wanted`` is not zero, sound a pixel farther in than :data:`SUM_RADIUS`."""
 
+    def distances(self, a: Patch, b: Patch, m: Map) -> AnyArray:
+        """Mean feature distances at an integer map, -1 outside, sound :data:`SUM_RADIUS` pixels farther in."""
+
 
 def offset(a: Patch, b: Patch) -> tuple[int, int]:
     """Column and row of the first pixel of ``a`` in the window of ``b``."""
     return a.window.x0 - b.window.x0, a.window.y0 - b.window.y0
 
+
+CENTRES = 4
+"""Coarse pixels whose displacements are searched around, see :data:`stages.hfvm.lanes.seek`."""
 
 ROOM = (("packed", np.int32), ("data", np.int32), ("dirty", np.uint8))
 
@@ -135,18 +143,18 @@ class FastSolver:
         p, at, shape = self.params, offset(a, b), a.window.shape
         u, v = np.zeros(shape, np.int16), np.zeros(shape, np.int16)
         packed, data, dirty = (self._room(name, shape, kind) for name, kind in ROOM)
-        lines = self._room("lines", (*(shape if band.mu > 0 else (1, 1)), 3), np.float32)
+        lines, mu = self._room("lines", (3, *shape), np.float32), np.float32(band.mu)
         epipolar.write_lines(band.f, lines, a.window.x0, a.window.y0)
         if up is None:
             reach_x, reach_y = top_reach(p, *shapes)
             search.exhaustive(a.words, b.words, reach_x, reach_y, 1, u, v)
             propagation.pack_map(u, v, packed)
-            propagation.costs(a.words, b.words, lines, band.mu, packed, data, *at)
+            data[:] = lanes.FAR
         else:
             reach = p.search_columns, p.search_rows
-            propagation.descend(a.words, b.words, up.u, up.v, *reach, lines, band.mu, packed, data, *at)
+            propagation.descend(a.words, b.words, up.u, up.v, *reach, CENTRES, lines, mu, packed, data, *at)
         rounds = self.rounds(level)
-        propagation.checkerboard(a.words, b.words, packed, data, dirty, lines, band.mu, p.smoothness, rounds, *at)
+        propagation.checkerboard(a.words, b.words, packed, data, dirty, lines, mu, p.smoothness, rounds, *at)
         propagation.unpack(packed, u, v)
         return Map(u, v, np.zeros(shape, bool))
 
@@ -164,6 +172,10 @@ class FastSolver:
         at = offset(a, b)
         subpixel.summed(a.words, b.words, m.u, m.v, wanted.astype(np.uint8), SUM_RADIUS, u, v, d, *at)
         return Fine(u, v, d)
+
+    def distances(self, a: Patch, b: Patch, m: Map) -> AnyArray:
+        """Mean feature distances at an integer map, see :func:`stages.hfvm.subpixel.distances`."""
+        return subpixel.distances(a.words, b.words, m.u, m.v, SUM_RADIUS, *offset(a, b))
 
 
 @dataclass(frozen=True)
@@ -195,6 +207,10 @@ class PaperSolver:
         _, _, distance, found = self.search(a, b, np.asarray(m.u), np.asarray(m.v), 0, 0)
         found = lookup.even(found)
         return Fine(m.u + found[..., 0], m.v + found[..., 1], distance)
+
+    def distances(self, a: Patch, b: Patch, m: Map) -> AnyArray:
+        """Distance of each pixel at an integer map."""
+        return np.asarray(self.search(a, b, np.asarray(m.u), np.asarray(m.v), 0, 0)[2])
 
     def search(
         self, a: Patch, b: Patch, cu: AnyArray, cv: AnyArray, reach_x: int, reach_y: int
@@ -265,8 +281,8 @@ class State:
     level: int
     left: Map
     right: Map
-    left_ok: Raster
-    right_ok: Raster
+    left_ok: Any
+    right_ok: Any
     band: Band
     near_sign: float
 
@@ -300,7 +316,13 @@ def _level(pair: Prepared, level: int, above: State | None, near_sign: float) ->
 
 
 def settle(pair: Prepared, level: int, left: Map, right: Map, near_sign: float) -> State:
-    """The state of a level whose maps are in memory, with the band for the next finer one."""
+    """The state of a level whose maps are in memory, with the band for the next finer one.
+
+    At the finest level, below others, sub-pixel maps are checked instead.
+    """
+    if level == 0 and pair.levels > 1:
+        nothing = np.zeros((1, 1), bool)
+        return State(level, left, right, nothing, nothing, FREE, near_sign)
     both = []
     for way, a, b in ((pair, left, right), (pair.reverse(), right, left)):
         shape = way.shapes(level)[0]
@@ -342,22 +364,14 @@ def level_tile(pair: Prepared, level: int, window: Window, above: State | None) 
 
 
 def consistent(pair: Prepared, level: int, a: Map, b: Map, window: Window) -> NDArray[np.bool_]:
-    """Left pixels of a window that match back."""
-    own = a.cut(window)
-    error = integer_error(pair, level, own, b, window)
-    usable = pair.left.view.valid(level, window) != 0
-    return np.asarray(~np.asarray(own.undefined, bool) & usable & (error <= pair.params.backmatch))
-
-
-def integer_error(pair: Prepared, level: int, own: Map, b: Map, window: Window) -> AnyArray:
-    """Back-matching error of the integer map ``own`` of a left window, pixels."""
-    error = np.full(window.shape, consistency.FAILED, np.float32)
-    for block in _landing(np.asarray(own.u), np.asarray(own.v), window, b.u):
-        bu, bv = cut(b.u, block), cut(b.v, block)
-        valid = pair.right.view.valid(level, block)
+    """Usable left pixels of a window whose integer displacement the other map confirms."""
+    own, found = a.cut(window), np.zeros(window.shape, bool)
+    usable = pair.left.view.valid(level, window)
+    for block in _landing(own.u, own.v, window, b.u):
+        bu, bv, valid = cut(b.u, block), cut(b.v, block), pair.right.view.valid(level, block)
         at = window.x0 - block.x0, window.y0 - block.y0
-        consistency.integer_error(own.u, own.v, bu, bv, valid, error, *at)
-    return error
+        consistency.agree(own.u, own.v, bu, bv, usable, valid, pair.params.backmatch, found, *at)
+    return np.asarray(found & (own.undefined == 0))
 
 
 def _landing(u: AnyArray, v: AnyArray, window: Window, raster: Raster) -> Iterable[Window]:
@@ -381,23 +395,41 @@ def hand_down(state: State, window: Window, params: HfvmParams) -> Map:
     )
 
 
-def fine_tile(pair: Prepared, level: int, a: Map, window: Window, wanted: AnyArray | None) -> Results:
-    """Sub-pixel map of a left window: ``u``, ``v``, ``distance`` (-1: outside, or not ``wanted``); None: everywhere."""
+def fine_tile(pair: Prepared, level: int, a: Map, window: Window, wanted: AnyArray | None) -> Fine:
+    """Sub-pixel map of a left window, distance -1 outside or where not ``wanted`` (None: everywhere).
+
+    Reach: :data:`SUM_RADIUS`.
+    """
     shape, other = pair.shapes(level)
     outer = window.grow(SUM_RADIUS, SUM_RADIUS, shape)
     own = a.cut(outer)
     use = np.zeros(outer.shape, bool)
     use[window.inside(outer)] = True if wanted is None else wanted
-    y, x = np.indices(outer.shape, np.int32)
-    y, x = y + (outer.y0 + np.asarray(own.v)), x + (outer.x0 + np.asarray(own.u))
-    target = around(y, x, other, SUM_RADIUS + 1, None if pair.params.preset == "paper" else use)
+    target = landing(own, outer, other, SUM_RADIUS + 1, None if pair.params.preset == "paper" else use)
     found = pair.solver.fine(pair.left.patch(level, outer), pair.right.patch(level, target), own, use)
-    return {name: np.ascontiguousarray(getattr(found, name)[window.inside(outer)]) for name in ("u", "v", "distance")}
+    inner = window.inside(outer)
+    return Fine(*(np.ascontiguousarray(plane[inner]) for plane in (found.u, found.v, found.distance)))
+
+
+def distance_tile(pair: Prepared, level: int, a: Map, window: Window) -> AnyArray:
+    """Mean feature distance at the integer map of a left window, -1 outside. Reach: :data:`SUM_RADIUS`."""
+    shape, other = pair.shapes(level)
+    outer = window.grow(SUM_RADIUS, SUM_RADIUS, shape)
+    own = a.cut(outer)
+    target = landing(own, outer, other, 1, None)
+    found = pair.solver.distances(pair.left.patch(level, outer), pair.right.patch(level, target), own)
+    return np.ascontiguousarray(found[window.inside(outer)])
+
+
+def landing(m: Map, window: Window, shape: Shape, margin: int, wanted: AnyArray | None) -> Window:
+    """Window of the other image, of ``shape``, on which the ``wanted`` pixels (None: all) of a window land."""
+    y, x = np.indices(window.shape, np.int32)
+    return around(y + (window.y0 + m.v), x + (window.x0 + m.u), shape, margin, wanted)
 
 
 def fine(pair: Prepared, state: State) -> Fine:
     """Sub-pixel map of a whole level in memory."""
-    return Fine(**fine_tile(pair, state.level, state.left, whole(state.left.u.shape), None))
+    return fine_tile(pair, state.level, state.left, whole(state.left.u.shape), None)
 
 
 @dataclass(frozen=True)
@@ -425,7 +457,7 @@ def sample(pair: Prepared, state: State) -> Sample:
         at = y[here] - w.y0, x[here] - w.x0
         wanted[at] = True
         found = fine_tile(pair, state.level, state.left, w, wanted)
-        u[here], v[here] = found["u"][at], found["v"][at]
+        u[here], v[here] = found.u[at], found.v[at]
     return Sample(places, x, y, u, v)
 
 

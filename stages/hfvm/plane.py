@@ -74,27 +74,33 @@ def source(h: Matrix, window: Window, shape: Shape) -> Window:
     if (w <= 1e-3).any():  # the horizon crosses it: a quadrangle does not hold it
         return whole(shape)
     p, q = (h[0, 0] * x + h[0, 1] * y + h[0, 2]) / w, (h[1, 0] * x + h[1, 1] * y + h[1, 2]) / w
-    top, bottom, first, last = (
-        int(np.clip(f(c), -4, 1 << 30)) for c, f in ((q, np.min), (q, np.max), (p, np.min), (p, np.max))
-    )
+    top, bottom, first, last = (int(np.clip(a, -4, 1 << 30)) for a in (q.min(), q.max(), p.min(), p.max()))
     return bounded(top, bottom, first, last, shape, 4)
 
 
 def compose(
-    h: Matrix, u: AnyArray, v: AnyArray, left_shape: tuple[int, ...] = (), x0: int = 0, y0: int = 0
+    h: Matrix, u: AnyArray, v: AnyArray, left_shape: Shape = (), x0: int = 0, y0: int = 0
 ) -> tuple[AnyArray, AnyArray]:
     """Displacements to the original right image of displacements to the aligned one (margin included).
 
     ``x0, y0``: first column and row of a window of the left image, which has ``left_shape``.
     """
-    g = h @ translation(-margin(left_shape or u.shape))
-    y, x = np.indices(u.shape, dtype=np.float64)
-    y, x = y + y0, x + x0
-    p, q = x + u, y + v
-    w = g[2, 0] * p + g[2, 1] * q + g[2, 2]
-    xr = (g[0, 0] * p + g[0, 1] * q + g[0, 2]) / w
-    yr = (g[1, 0] * p + g[1, 1] * q + g[1, 2]) / w
-    return (xr - x).astype(np.float32), (yr - y).astype(np.float32)
+    out_u, out_v = np.empty(u.shape, np.float32), np.empty(v.shape, np.float32)
+    _compose(h @ translation(-margin(left_shape or u.shape)), u, v, out_u, out_v, x0, y0)
+    return out_u, out_v
+
+
+@njit(cache=True, nogil=True)
+def _compose(g, u, v, out_u, out_v, x0, y0):  # type: ignore[no-untyped-def]
+    for row in range(u.shape[0]):
+        y = np.float64(row + y0)
+        a, b, c = g[0, 1] * y + g[0, 2], g[1, 1] * y + g[1, 2], g[2, 1] * y + g[2, 2]
+        for col in range(u.shape[1]):
+            x = np.float64(col + x0)
+            p, dv = x + u[row, col], np.float64(v[row, col])
+            w = 1.0 / (g[2, 0] * p + g[2, 1] * dv + c)
+            out_u[row, col] = (g[0, 0] * p + g[0, 1] * dv + a) * w - x
+            out_v[row, col] = (g[1, 0] * p + g[1, 1] * dv + b) * w - y
 
 
 def margin(left_shape: tuple[int, ...]) -> int:

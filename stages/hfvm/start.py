@@ -82,7 +82,7 @@ def impose(pair: hierarchy.Prepared, state: hierarchy.State, prior: Prior | None
     return hierarchy.State(state.level, left, right, left_ok, right_ok, state.band, state.near_sign)
 
 
-def _coarse(prior: Prior, level: int, shape: tuple[int, int]) -> tuple[AnyArray, AnyArray, NDArray[np.bool_]]:
+def _coarse(prior: Prior, level: int, shape: tuple[int, ...]) -> tuple[AnyArray, AnyArray, NDArray[np.bool_]]:
     """Displacements of a level: medians of the known ones of each block, whole pixels of that level."""
     side = 2**level
     maps = []

@@ -3,7 +3,7 @@
 ::
 
     coarse (levels down to plane_level, pre-alignment) -> level (each finer one, both ways; band between them)
-      -> fine (both ways) -> check -> contrast -> refine -> patches -> final
+      -> fine (both ways) -> check -> refine -> patches -> final
 
 Tiles are matched in any order and of any size with the same result, bit for bit; whole images are one tile.
 """
@@ -16,12 +16,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from stages.declare import AnyArray
-from stages.hfvm import accurate, hierarchy, plane, resample, start
+from stages.hfvm import accurate, hierarchy, plane, refine, resample, start
 from stages.hfvm.finish import Finish
 from stages.hfvm.hierarchy import Prepared, State
 from stages.hfvm.params import HfvmParams
 from stages.hfvm.views import Aligned, Plain, Seen, View
-from stages.hfvm.window import Results, Shape, Window, cut, gather, tiles
+from stages.hfvm.window import Results, Shape, Window, cut, gather, tiles, whole
 from stages.validity import matched
 
 Tell = Callable[[float, str], None]
@@ -49,6 +49,7 @@ class Coarse:
     state: State
     alignment: plane.Matrix | None
     aligned: Aligned | None
+    contrast: float
 
 
 def is_whole(params: HfvmParams) -> bool:
@@ -79,15 +80,22 @@ def coarse(left: View, right: View, params: HfvmParams, side: int | None, prior:
     pair = prepare(left, right, params, side)
     state = start.impose(pair, hierarchy.run(pair, params, params.plane_level), prior)
     if params.preset == "paper":
-        return Coarse(state, None, None)
+        return Coarse(state, None, None, contrast(pair, state))
     s = hierarchy.sample(pair, state)
     h = plane.find(s.places, s.u, s.v, state.level, left.shapes, params)
     if h is None:
-        return Coarse(state, None, None)
+        return Coarse(state, None, None, contrast(pair, state))
     aligned = Aligned.of(right, h, left, 0 if side is None else params.plane_level, side)
     pair = prepare(left, aligned, params, side)
     again = hierarchy.run(pair, params, params.plane_level, near_sign=state.near_sign)
-    return Coarse(start.impose(pair, again, start.align(prior, h)), h, aligned)
+    state = start.impose(pair, again, start.align(prior, h))
+    return Coarse(state, h, aligned, contrast(pair, state))
+
+
+def contrast(pair: Prepared, state: State) -> float:
+    """Factor for the right image, see :func:`stages.hfvm.refine.contrast`."""
+    images = (seen.view.grey(state.level, whole(seen.view.shapes[state.level])) for seen in (pair.left, pair.right))
+    return refine.contrast(*images, state.left.u, state.left.v, state.left_ok)
 
 
 def match(
@@ -112,7 +120,7 @@ def match(
         tell(COARSE_SHARE + (FINE_SHARE - COARSE_SHARE) * 0.25 ** (level + 1), f"level {level}")
         state = hierarchy.run(pair, params, level, state)
     tell(FINE_SHARE, "sub-pixel and refinement")
-    steps = Finish(pair, right, params, begun.alignment, state.near_sign)
+    steps = Finish(pair, right, params, begun.alignment, state.near_sign, begun.contrast)
     return Found(_finish(steps, state, side, order), begun.alignment is not None)
 
 
@@ -122,12 +130,11 @@ def _finish(steps: Finish, state: State, side: int | None, order: Order) -> Resu
     def over(shape: Shape, step: Callable[[Window], Results]) -> Results:
         return gather(shape, ((w, step(w)) for w in order(tiles(shape, side))))
 
-    fine = over(shape, lambda w: steps.fine(w, state.left, state.right))
-    back = over(other, lambda w: steps.fine(w, state.right, state.left, backward=True))
+    fine = over(shape, lambda w: steps.fine(w, state.left))
+    back = over(other, lambda w: steps.fine(w, state.right, backward=True))
     checked = over(shape, lambda w: steps.check(w, fine, back))
-    factor = steps.contrast(checked)
-    refined = over(shape, lambda w: steps.refine(w, checked, factor))
-    gone = steps.patches(fine, refined)
+    refined = over(shape, lambda w: steps.refine(w, checked))
+    gone = steps.patches(state.left, refined)
     return over(shape, lambda w: steps.final(w, fine, checked, refined, gone))
 
 
