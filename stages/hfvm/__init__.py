@@ -208,26 +208,25 @@ def _finish(
 
 def _smooth(pair: hierarchy.Prepared, state: hierarchy.State, params: HfvmParams) -> tuple[Map, Map, Map, Map]:
     """Left map with fractions of a pixel, feature distance (-1: outside), and back-matching error."""
-    maps = [_fractions(pair.solver, state.left, params), _fractions(pair.solver.reverse(), state.right, params)]
-    error = np.empty(maps[0].u.shape, np.float32)
-    consistency.backmatch(maps[0].u, maps[0].v, maps[1].u, maps[1].v, pair.right_valid[0], error)
-    return maps[0].u, maps[0].v, maps[0].distance, error
-
-
-def _fractions(solver: hierarchy.Solver, m: hierarchy.Map, params: HfvmParams) -> hierarchy.Fine:
-    """Means of like neighbours: of the whole displacements where steps refine them, else of sub-pixel ones."""
-    everywhere = np.ones(m.u.shape, bool)
+    fine = pair.solver.fine(0, state.left, np.ones(state.left.u.shape, bool))
+    u, v = fine.u, fine.v
     if params.preset == "paper":
-        return solver.fine(0, m, everywhere)
-    if params.refine:
-        distance = solver.distances(0, m)
-        u, v = m.u.astype(np.float32), m.v.astype(np.float32)
+        back = pair.solver.reverse().fine(0, state.right, np.ones(state.right.u.shape, bool))
+        back_u, back_v = back.u, back.v
     else:
-        fine = solver.fine(0, m, everywhere)
-        u, v, distance = fine.u, fine.v, fine.distance
+        # Whole displacements, averaged, check fractions well enough.
+        u, v = _mean(u, v)
+        back_u, back_v = _mean(state.right.u.astype(np.float32), state.right.v.astype(np.float32))
+    error = np.empty(u.shape, np.float32)
+    consistency.backmatch(u, v, back_u, back_v, pair.right_valid[0], error)
+    return u, v, fine.distance, error
+
+
+def _mean(u: Map, v: Map) -> tuple[Map, Map]:
+    """Means of like neighbours."""
     mean_u, mean_v = np.empty_like(u), np.empty_like(v)
-    rowwise.local_mean(u, v, everywhere, hierarchy.SUM_RADIUS, 2, mean_u, mean_v)
-    return hierarchy.Fine(mean_u, mean_v, distance)
+    rowwise.local_mean(u, v, np.ones(u.shape, bool), hierarchy.SUM_RADIUS, 2, mean_u, mean_v)
+    return mean_u, mean_v
 
 
 def _reasons(pair: hierarchy.Prepared, distance: AnyArray, error: AnyArray, params: HfvmParams) -> Mask:

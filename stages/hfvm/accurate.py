@@ -40,10 +40,6 @@ class AccurateSolver:
         """Sub-pixel map from summed distances."""
         return self.fast.fine(level, m, wanted)
 
-    def distances(self, level: int, m: Map) -> AnyArray:
-        """Mean feature distances at an integer map, -1 outside."""
-        return self.fast.distances(level, m)
-
     def reverse(self) -> AccurateSolver:
         """The matcher from right to left."""
         return AccurateSolver(self.fast.reverse(), self.right, self.left, self.params)

@@ -22,7 +22,7 @@ from stages.pyramid import Pyramid, filled
 SUM_RADIUS = 2
 """Pixels: sub-pixel distances are summed over 5 x 5."""
 
-FIT_SAMPLES = 2000
+FIT_SAMPLES = 1000
 """Matches that a band or plane is fitted to; more change nothing that matters and cost time."""
 
 
@@ -76,9 +76,6 @@ class Solver(Protocol):
     def fine(self, level: int, m: Map, wanted: AnyArray) -> Fine:
         """Sub-pixel map where ``wanted`` is not zero."""
 
-    def distances(self, level: int, m: Map) -> AnyArray:
-        """Mean feature distances at an integer map, -1 outside."""
-
     def reverse(self) -> Solver:
         """The matcher from right to left."""
 
@@ -94,6 +91,7 @@ class FastSolver:
     right: tuple[features.Words, ...]
     params: HfvmParams
     uses_band: bool = True
+    back: bool = False
     room: dict[str, AnyArray] = field(default_factory=dict)
 
     def match(self, level: int, up: Map | None, band: Band) -> Map:
@@ -109,8 +107,10 @@ class FastSolver:
             propagation.pack_map(u, v, packed)
             data[:] = lanes.FAR
         else:
-            propagation.descend(a, b, up.u, up.v, p.search_columns, p.search_rows, 4, lines, mu, packed, data)
+            propagation.descend(a, b, up.u, up.v, p.search_columns, p.search_rows, p.centres, lines, mu, packed, data)
         rounds = p.rounds if level > 0 or p.fine_rounds is None else p.fine_rounds
+        if level == 0 and self.back:
+            rounds = min(rounds, p.back_rounds)
         propagation.checkerboard(a, b, packed, data, dirty, lines, mu, p.smoothness, rounds)
         propagation.unpack(packed, u, v)
         return Map(u, v, np.zeros(a.shape, bool))
@@ -131,13 +131,9 @@ class FastSolver:
         subpixel.summed(self.left[level], self.right[level], m.u, m.v, wanted.astype(np.uint8), SUM_RADIUS, u, v, d)
         return Fine(u, v, d)
 
-    def distances(self, level: int, m: Map) -> AnyArray:
-        """Mean feature distances at an integer map, see :func:`stages.hfvm.subpixel.distances`."""
-        return subpixel.distances(self.left[level], self.right[level], m.u, m.v, SUM_RADIUS)
-
     def reverse(self) -> FastSolver:
         """The matcher from right to left."""
-        return FastSolver(self.right, self.left, self.params, room=self.room)
+        return FastSolver(self.right, self.left, self.params, room=self.room, back=not self.back)
 
 
 @dataclass(frozen=True)
@@ -167,10 +163,6 @@ class PaperSolver:
         _, _, distance, offset = self._search(level, m.u, m.v, 0, 0)
         offset = lookup.even(offset)
         return Fine(m.u + offset[..., 0], m.v + offset[..., 1], distance)
-
-    def distances(self, level: int, m: Map) -> AnyArray:
-        """Distance of each pixel at an integer map."""
-        return np.asarray(self._search(level, m.u, m.v, 0, 0)[2])
 
     def _search(self, level: int, cu: AnyArray, cv: AnyArray, reach_x: int, reach_y: int) -> tuple[AnyArray, ...]:
         a, b = self.left[level], self.right[level]

@@ -9,9 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from stages.declare import AnyArray
 from stages.features import distance
-from stages.hfvm import lanes, rowwise
+from stages.hfvm import lanes
 
 
 @njit(cache=True, nogil=True)
@@ -70,36 +69,3 @@ def summed(left, right, u_map, v_map, wanted, radius, out_u, out_v, out_distance
             out_v[y, x] += linear(north, at, south)
             out_distance[y, x] = np.float32(at) / count
 
-
-def distances(left: AnyArray, right: AnyArray, u: AnyArray, v: AnyArray, radius: int) -> AnyArray:
-    """Mean feature distance (row, col) float32 at integer displacements over (2 radius + 1)^2 pixels, -1 outside.
-
-    Each pixel counts at its own displacement; those that lead out of the right image are left out.
-    """
-    planes, sums = np.empty((2, 2, *left.shape), np.float32)
-    _distances(left, right, u, v, planes)
-    rowwise.box(planes, radius, sums)
-    _means(planes, sums)
-    return sums[0]
-
-
-@njit(cache=True, nogil=True)
-def _distances(left, right, u, v, planes):  # type: ignore[no-untyped-def]
-    rows, cols = right.shape
-    one, nil = np.float32(1.0), np.float32(0.0)
-    for y in range(left.shape[0]):
-        found, count = planes[0, y], planes[1, y]
-        for x in range(left.shape[1]):
-            i, j = x + np.int64(u[y, x]), y + np.int64(v[y, x])
-            inside = i >= 0 and i < cols and j >= 0 and j < rows
-            found[x] = np.float32(distance(left[y, x], right[np.uint64(j), np.uint64(i)])) if inside else nil
-            count[x] = one if inside else nil
-
-
-@njit(cache=True, nogil=True)
-def _means(planes, sums):  # type: ignore[no-untyped-def]
-    one = np.float32(1.0)
-    for y in range(planes.shape[1]):
-        inside, total, count = planes[1, y], sums[0, y], sums[1, y]
-        for x in range(planes.shape[2]):
-            total[x] = total[x] / max(count[x], one) if inside[x] > 0 else -one
