@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from pydantic import Field
 
@@ -114,14 +115,25 @@ def halved(image: Image, mask: Mask, levels: int) -> Pyramid:
 
 def _halve(image: Image, mask: Mask) -> tuple[Image, Mask]:
     rows, cols = image.shape
-    if rows % 2 or cols % 2:
-        image = np.pad(image, ((0, rows % 2), (0, cols % 2)), mode="edge")
-        mask = np.pad(mask, ((0, rows % 2), (0, cols % 2)), mode="edge")
-    total = image[::2, ::2] + image[::2, 1::2] + image[1::2, ::2] + image[1::2, 1::2]
-    count = mask[::2, ::2] + mask[::2, 1::2] + mask[1::2, ::2] + mask[1::2, 1::2]
-    valid = count >= 3
-    mean = np.where(valid, total / np.maximum(count, 1).astype(np.float32), np.float32(0.0))
-    return mean, valid.astype(np.uint8)
+    coarse = np.empty(((rows + 1) // 2, (cols + 1) // 2), np.float32)
+    valid = np.empty(coarse.shape, np.uint8)
+    _means(image, mask, coarse, valid)
+    return coarse, valid
+
+
+@njit(cache=True, nogil=True)
+def _means(image, mask, coarse, valid):  # type: ignore[no-untyped-def]
+    rows, cols = image.shape
+    nil, one = np.float32(0.0), np.float32(1.0)
+    for y in range(coarse.shape[0]):
+        a, b = image[2 * y], image[min(2 * y + 1, rows - 1)]
+        p, q = mask[2 * y], mask[min(2 * y + 1, rows - 1)]
+        for x in range(coarse.shape[1]):
+            i = min(2 * x + 1, cols - 1)
+            total = a[2 * x] + a[i] + b[2 * x] + b[i]
+            count = p[2 * x] + p[i] + q[2 * x] + q[i]
+            coarse[y, x] = total / max(np.float32(count), one) if count >= 3 else nil
+            valid[y, x] = count >= 3
 
 
 def filled(pyramid: Pyramid) -> tuple[Image, ...]:
@@ -158,6 +170,6 @@ STAGE = Stage(
         Array("level_*", ("row", "col"), "float32", "1", "grey value 0..255, 0 where masked"),
         Array("valid_*", ("row", "col"), "uint8", "1", "1 = usable"),
     ),
-    requires=("numpy",),
+    requires=("numpy", "numba"),
     run=_run,
 )

@@ -46,9 +46,9 @@ class AccurateSolver:
         """Sub-pixel map from summed distances."""
         return self.fast.fine(a, b, m, wanted)
 
-    def distances(self, a: Patch, b: Patch, m: Map) -> AnyArray:
-        """Mean feature distances at an integer map, -1 outside."""
-        return self.fast.distances(a, b, m)
+    def reverse(self) -> AccurateSolver:
+        """The matcher from right to left."""
+        return AccurateSolver(self.fast.reverse(), self.params)
 
 
 def choose(params: HfvmParams) -> Solver:

@@ -6,7 +6,7 @@ only a help to the search: it is estimated anew at every level and never leaves 
 The constraint ``p'^T F p = 0`` is linear in F. Divided by the coefficient of ``y'`` it reads ``y' = y + small`` for a
 rig whose baseline lies along the rows, divided by that of ``x'`` likewise for one along the columns; both are fitted as
 a maximum a posteriori with a weak prior on the small terms (a few degrees of roll and toe-in), which decides what a
-flat scene leaves open, and the likelier one is taken.
+flat scene leaves open. The first one is taken where most matches lie on its lines, else the likelier one.
 """
 
 from __future__ import annotations
@@ -33,7 +33,8 @@ SHARP = 0.2
 """Pixels: median distance of sub-pixel matches from their lines in an ideal rig; beyond it the band is softened."""
 
 LEAST_MATCHES = 40
-ITERATIONS = 10
+ITERATIONS, SETTLED = 10, 1e-4
+"""At most so many; fewer once no term changes by more than this share of its prior deviation."""
 
 
 def fit(u: AnyArray, v: AnyArray, wanted: AnyArray, right_shape: tuple[int, int]) -> tuple[Matrix, float] | None:
@@ -66,9 +67,11 @@ def fit_points(
     p = np.stack([(x - left_mid[0]) / scale, (y - left_mid[1]) / scale])
     q = np.stack([(x + u - right_mid[0]) / scale, (y + v - right_mid[1]) / scale])
     rows = _solve(p, q, SIGMA / scale)
-    cols = _solve(p[::-1], q[::-1], SIGMA / scale)
-    swap = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    f, spread = (rows[0], rows[2]) if rows[1] <= cols[1] else (swap @ cols[0] @ swap, cols[2])
+    f, _, spread = rows
+    if spread * scale > SIGMA:
+        cols = _solve(p[::-1], q[::-1], SIGMA / scale)
+        swap = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+        f, spread = (rows[0], rows[2]) if rows[1] <= cols[1] else (swap @ cols[0] @ swap, cols[2])
     to_left = np.array([[1 / scale, 0.0, -left_mid[0] / scale], [0.0, 1 / scale, -left_mid[1] / scale], [0, 0, 1.0]])
     to_right = np.array([[1 / scale, 0.0, -right_mid[0] / scale], [0.0, 1 / scale, -right_mid[1] / scale], [0, 0, 1.0]])
     return np.asarray(to_right.T @ f @ to_left, dtype=np.float64), spread * scale
@@ -81,22 +84,29 @@ def _solve(p: AnyArray, q: AnyArray, sigma: float) -> tuple[Matrix, float, float
     prior = np.zeros(8)
     prior[6] = -1.0
     precision = np.diag(PRIOR**-2.0)
-    g = prior
+    g, change = prior, math.inf
     spread = math.inf
     for step in range(ITERATIONS):
         residual = residuals(terms, yr, g)
         # Start as wide as the matches scatter about the prior, and narrow to what an integer match deserves.
-        spread = (
-            max(sigma, min(0.5 * spread, 1.5 * float(np.median(np.abs(residual))) + sigma))
-            if step
-            else max(sigma, 2.0 * float(np.median(np.abs(residual))))
-        )
+        middle = typical(residual)
+        wide = max(sigma, min(0.5 * spread, 1.5 * middle + sigma)) if step else max(sigma, 2.0 * middle)
+        if wide == spread and change < SETTLED:
+            break
+        spread = wide
         normal, side = weighted_normal(terms, yr, 1.0 / (1.0 + (residual / spread) ** 2) / sigma**2)
-        g = np.linalg.solve(normal + precision, precision @ prior - side)
+        new = np.linalg.solve(normal + precision, precision @ prior - side)
+        g, change = new, float(np.max(np.abs(new - g) / PRIOR))
     residual = residuals(terms, yr, g)
     cost = float(np.sum(np.log1p((residual / sigma) ** 2)) + np.sum(((g - prior) / PRIOR) ** 2))
     f = np.array([[g[1], g[2], g[0]], [g[3], g[4], 1.0], [g[5], g[6], g[7]]])
-    return f, cost, float(np.median(np.abs(residual)))
+    return f, cost, typical(residual)
+
+
+def typical(residual: AnyArray) -> float:
+    """Median magnitude (the upper one of two)."""
+    size = np.abs(residual)
+    return float(np.partition(size, size.size // 2)[size.size // 2])
 
 
 @njit(cache=True, nogil=True)

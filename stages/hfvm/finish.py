@@ -38,32 +38,25 @@ class Finish:
         """Rows and columns of the left image."""
         return self.pair.shapes(0)[0]
 
-    def fine(self, window: Window, a: Map, backward: bool = False) -> Results:
-        """Map of a window of the left (``backward``: right) image with fractions of a pixel, and feature distances.
+    def fine(self, window: Window, a: Map) -> Results:
+        """Map of a window of the left image with fractions of a pixel, means of like neighbours; feature distances.
 
-        ``u, v``: means of like neighbours: of the whole displacements where steps refine them, else of sub-pixel ones.
-        Reach: the mean's, and that of the distances.
+        Reach: those of the sub-pixel search and of the mean.
         """
-        p, pair = self.params, self.pair.reverse() if backward else self.pair
-        shape = pair.shapes(0)[0]
-        if p.preset == "paper":
-            found = hierarchy.fine_tile(pair, 0, a, window, None)
-            return {"u": found.u, "v": found.v, "distance": found.distance}
-        outer = window.grow(SUM_RADIUS, SUM_RADIUS, shape)
-        inner = window.inside(outer)
-        if p.refine:
-            own, distance = a.cut(outer), hierarchy.distance_tile(pair, 0, a, window)
-            u, v = own.u.astype(np.float32), own.v.astype(np.float32)
-        else:
-            found = hierarchy.fine_tile(pair, 0, a, outer, None)
-            u, v, distance = found.u, found.v, np.ascontiguousarray(found.distance[inner])
-        mean_u, mean_v = np.empty_like(u), np.empty_like(v)
-        rowwise.local_mean(u, v, np.ones(outer.shape, bool), SUM_RADIUS, 2, mean_u, mean_v)
-        return {
-            "u": np.ascontiguousarray(mean_u[inner]),
-            "v": np.ascontiguousarray(mean_v[inner]),
-            "distance": distance,
-        }
+        outer = window.grow(SUM_RADIUS, SUM_RADIUS, self.shape) if self.params.preset != "paper" else window
+        found, inner = hierarchy.fine_tile(self.pair, 0, a, outer, None), window.inside(outer)
+        u, v = (found.u, found.v) if self.params.preset == "paper" else _mean(found.u, found.v)
+        return {name: np.ascontiguousarray(p[inner]) for name, p in (("u", u), ("v", v), ("distance", found.distance))}
+
+    def back(self, window: Window, b: Map) -> Results:
+        """The same of the right image, for the check alone, which whole displacements, averaged, do well enough."""
+        if self.params.preset == "paper":
+            found = hierarchy.fine_tile(self.pair.reverse(), 0, b, window, None)
+            return {"u": found.u, "v": found.v}
+        outer = window.grow(SUM_RADIUS, SUM_RADIUS, self.pair.shapes(0)[1])
+        own = b.cut(outer)
+        u, v = _mean(own.u.astype(np.float32), own.v.astype(np.float32))
+        return {name: np.ascontiguousarray(p[window.inside(outer)]) for name, p in (("u", u), ("v", v))}
 
     def check(self, window: Window, fine: Rasters, back: Rasters) -> Results:
         """Back-matching error, validity bits against each pixel, and displacements in the original right image."""
@@ -185,3 +178,10 @@ class Finish:
             "disparity_std": std,
         }
         return {name: np.ascontiguousarray(a[window.inside(outer)]) for name, a in arrays.items()}
+
+
+def _mean(u: AnyArray, v: AnyArray) -> tuple[AnyArray, AnyArray]:
+    """Means of like neighbours."""
+    mean_u, mean_v = np.empty_like(u), np.empty_like(v)
+    rowwise.local_mean(u, v, np.ones(u.shape, bool), SUM_RADIUS, 2, mean_u, mean_v)
+    return mean_u, mean_v

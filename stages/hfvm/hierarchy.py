@@ -41,7 +41,7 @@ from stages.pyramid import Pyramid
 SUM_RADIUS = 2
 """Pixels: sub-pixel distances are summed over 5 x 5."""
 
-FIT_SAMPLES = 2000
+FIT_SAMPLES = 1000
 """Matches that a band or plane is fitted to; more change nothing that matters and cost time."""
 
 
@@ -103,23 +103,20 @@ class Solver(Protocol):
     def rounds(self, level: int) -> int:
         """Rounds of propagation at a level; a displacement travels, and changes by, two pixels a round."""
 
+    def reverse(self) -> Solver:
+        """The matcher from right to left."""
+
     def match(self, level: int, a: Patch, b: Patch, shapes: tuple[Shape, Shape], up: Map | None, band: Band) -> Map:
         """Integer map of ``a`` from the filled map of the level above, of the windows' parents; None: top level."""
 
     def fine(self, a: Patch, b: Patch, m: Map, wanted: AnyArray) -> Fine:
         """Sub-pixel map where ``wanted`` is not zero, sound a pixel farther in than :data:`SUM_RADIUS`."""
 
-    def distances(self, a: Patch, b: Patch, m: Map) -> AnyArray:
-        """Mean feature distances at an integer map, -1 outside, sound :data:`SUM_RADIUS` pixels farther in."""
-
 
 def offset(a: Patch, b: Patch) -> tuple[int, int]:
     """Column and row of the first pixel of ``a`` in the window of ``b``."""
     return a.window.x0 - b.window.x0, a.window.y0 - b.window.y0
 
-
-CENTRES = 4
-"""Coarse pixels whose displacements are searched around, see :data:`stages.hfvm.lanes.seek`."""
 
 ROOM = (("packed", np.int32), ("data", np.int32), ("dirty", np.uint8))
 
@@ -131,12 +128,18 @@ class FastSolver:
     params: HfvmParams
     uses_band: bool = True
     whole: bool = False
+    back: bool = False
     room: dict[str, AnyArray] = field(default_factory=dict)
 
     def rounds(self, level: int) -> int:
         """Rounds of propagation at a level."""
         p = self.params
-        return p.rounds if level > 0 or p.fine_rounds is None else p.fine_rounds
+        rounds = p.rounds if level > 0 or p.fine_rounds is None else p.fine_rounds
+        return min(rounds, p.back_rounds) if level == 0 and self.back else rounds
+
+    def reverse(self) -> FastSolver:
+        """The matcher from right to left, in the same room."""
+        return FastSolver(self.params, back=not self.back, room=self.room)
 
     def match(self, level: int, a: Patch, b: Patch, shapes: tuple[Shape, Shape], up: Map | None, band: Band) -> Map:
         """Integer map of a level."""
@@ -152,7 +155,7 @@ class FastSolver:
             data[:] = lanes.FAR
         else:
             reach = p.search_columns, p.search_rows
-            propagation.descend(a.words, b.words, up.u, up.v, *reach, CENTRES, lines, mu, packed, data, *at)
+            propagation.descend(a.words, b.words, up.u, up.v, *reach, p.centres, lines, mu, packed, data, *at)
         rounds = self.rounds(level)
         propagation.checkerboard(a.words, b.words, packed, data, dirty, lines, mu, p.smoothness, rounds, *at)
         propagation.unpack(packed, u, v)
@@ -173,10 +176,6 @@ class FastSolver:
         subpixel.summed(a.words, b.words, m.u, m.v, wanted.astype(np.uint8), SUM_RADIUS, u, v, d, *at)
         return Fine(u, v, d)
 
-    def distances(self, a: Patch, b: Patch, m: Map) -> AnyArray:
-        """Mean feature distances at an integer map, see :func:`stages.hfvm.subpixel.distances`."""
-        return subpixel.distances(a.words, b.words, m.u, m.v, SUM_RADIUS, *offset(a, b))
-
 
 @dataclass(frozen=True)
 class PaperSolver:
@@ -189,6 +188,10 @@ class PaperSolver:
     def rounds(self, level: int) -> int:
         """There is no propagation."""
         return 0
+
+    def reverse(self) -> PaperSolver:
+        """The same: both ways are alike."""
+        return self
 
     def match(self, level: int, a: Patch, b: Patch, shapes: tuple[Shape, Shape], up: Map | None, band: Band) -> Map:
         """Integer map of a level; undefined where the least distance exceeds the threshold."""
@@ -207,10 +210,6 @@ class PaperSolver:
         _, _, distance, found = self.search(a, b, np.asarray(m.u), np.asarray(m.v), 0, 0)
         found = lookup.even(found)
         return Fine(m.u + found[..., 0], m.v + found[..., 1], distance)
-
-    def distances(self, a: Patch, b: Patch, m: Map) -> AnyArray:
-        """Distance of each pixel at an integer map."""
-        return np.asarray(self.search(a, b, np.asarray(m.u), np.asarray(m.v), 0, 0)[2])
 
     def search(
         self, a: Patch, b: Patch, cu: AnyArray, cv: AnyArray, reach_x: int, reach_y: int
@@ -246,7 +245,7 @@ class Prepared:
 
     def reverse(self) -> Prepared:
         """The matcher from right to left."""
-        return Prepared(self.right, self.left, self.solver, self.params, self.side)
+        return Prepared(self.right, self.left, self.solver.reverse(), self.params, self.side)
 
     def shapes(self, level: int) -> tuple[Shape, Shape]:
         """Rows and columns of both images."""
@@ -409,16 +408,6 @@ def fine_tile(pair: Prepared, level: int, a: Map, window: Window, wanted: AnyArr
     found = pair.solver.fine(pair.left.patch(level, outer), pair.right.patch(level, target), own, use)
     inner = window.inside(outer)
     return Fine(*(np.ascontiguousarray(plane[inner]) for plane in (found.u, found.v, found.distance)))
-
-
-def distance_tile(pair: Prepared, level: int, a: Map, window: Window) -> AnyArray:
-    """Mean feature distance at the integer map of a left window, -1 outside. Reach: :data:`SUM_RADIUS`."""
-    shape, other = pair.shapes(level)
-    outer = window.grow(SUM_RADIUS, SUM_RADIUS, shape)
-    own = a.cut(outer)
-    target = landing(own, outer, other, 1, None)
-    found = pair.solver.distances(pair.left.patch(level, outer), pair.right.patch(level, target), own)
-    return np.ascontiguousarray(found[window.inside(outer)])
 
 
 def landing(m: Map, window: Window, shape: Shape, margin: int, wanted: AnyArray | None) -> Window:

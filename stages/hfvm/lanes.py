@@ -398,12 +398,19 @@ def make_sums(width: int) -> Any:
             rights = [row(sig.args[1], right, at_right, right_cols, j, 0) for j in range(-3, 4)]
             wests = [row(sig.args[1], right, at_right, right_cols, j, -1) for j in range(-2, 3)]
             easts = [row(sig.args[1], right, at_right, right_cols, j, 1) for j in range(-2, 3)]
-            found = []
+            totals = []
             for others in (rights[1:6], wests, easts, rights[:5], rights[2:]):
                 total = _vector(_WORDS, [0] * LANES)
                 for p, q in zip(lefts, others, strict=True):
                     total = builder.add(total, _distances(builder, p, q, width))
-                found.append(_call(builder, "llvm.vector.reduce.add.v8i64", _I64, total))
+                totals.append(total)
+            # A sum of 25 distances has 16 bits: four of them are added up in one word.
+            packed = totals[0]
+            for k in range(1, 4):
+                packed = builder.or_(packed, builder.shl(totals[k], _vector(_WORDS, [16 * k] * LANES)))
+            four, last = (_call(builder, "llvm.vector.reduce.add.v8i64", _I64, t) for t in (packed, totals[4]))
+            low = ir.Constant(_I64, 0xFFFF)
+            found = [builder.and_(builder.lshr(four, ir.Constant(_I64, 16 * k)), low) for k in range(4)] + [last]
             return context.make_tuple(builder, sig.return_type, found)
 
         return signature, codegen

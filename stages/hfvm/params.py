@@ -25,7 +25,8 @@ PAPER: Mapping[str, Any] = {
 
 ACCURATE: Mapping[str, Any] = {
     "fine_rounds": None,
-    "median": 3,
+    "back_rounds": 4,
+    "centres": 5,
     "path_rounds": 3,
     "relief_steps": 6,
     "crowd": 0.5,
@@ -86,10 +87,19 @@ class HfvmParams(Params):
     fine_rounds: int | None = Field(
         default=2, ge=0, le=32, description="the same at the finest level, which costs most; null: as at the others"
     )
+    back_rounds: int = Field(
+        default=1, ge=0, le=32, description="at most so many at the finest level from right to left, for the check"
+    )
+    centres: int = Field(
+        default=4,
+        ge=1,
+        le=5,
+        description="coarse pixels to search around: the parent, its nearest along row, column and diagonal, far side",
+    )
     finest: Literal[0, 1] = Field(
         default=0, description="pyramid level matched last; 1 = half the resolution, a quarter of the work"
     )
-    median: Literal[1, 3, 5] = Field(default=5, description="pixels; side of the median filter of each level, 1 = none")
+    median: Literal[1, 3, 5] = Field(default=3, description="pixels; side of the median filter of each level, 1 = none")
     threshold: float = Field(
         default=90.0,
         gt=0,
@@ -127,7 +137,9 @@ class HfvmParams(Params):
         le=1,
         description="least correlation of both images after refinement; below, noise met noise",
     )
-    refine_steps: int = Field(default=2, ge=1, le=8, description="steps; the second one settles the first")
+    refine_steps: int = Field(
+        default=1, ge=1, le=8, description="steps; from sub-pixel displacements a second one changes nothing"
+    )
     refine_radius: int = Field(
         default=2, ge=1, le=8, description="pixels; 5 x 5 windows: wider ones smooth relief away"
     )

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from stages import pyramid
 from stages.declare import AnyArray
-from stages.hfvm.epipolar import residuals, weighted_normal
+from stages.hfvm.epipolar import residuals, typical, weighted_normal
 from stages.hfvm.params import HfvmParams
 from stages.hfvm.resample import sample_cubic
 from stages.hfvm.window import Shape, Window, bounded, whole
@@ -163,7 +163,7 @@ def _solve(p: AnyArray, d: AnyArray, tolerance: float) -> tuple[Matrix, AnyArray
         h = np.linalg.solve(normal, halves[0][1] + halves[1][1])
         error = np.hypot(*(residuals(t, e, -h) for t, e in zip(terms, d, strict=True)))
         # Start as wide as the matches scatter about the first fit, and narrow onto the dominant plane.
-        spread = max(tolerance, min(1.5 * float(np.median(error)), 0.7 * spread))
+        spread = max(tolerance, min(1.5 * typical(error), 0.7 * spread))
         weight = 1.0 / (1.0 + (error / spread) ** 2) ** 2
     return np.append(h, 0.0).reshape(3, 3) + np.eye(3), error
 

@@ -9,9 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from stages.declare import AnyArray
 from stages.features import distance
-from stages.hfvm import lanes, rowwise
+from stages.hfvm import lanes
 
 
 @njit(cache=True, nogil=True)
@@ -25,13 +24,12 @@ def linear(before, at, after):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def summed(left, right, u_map, v_map, wanted, radius, out_u, out_v, out_distance, ox=0, oy=0):  # type: ignore[no-untyped-def]
+def summed(left, right, u_map, v_map, wanted, radius, out_u, out_v, out_distance):  # type: ignore[no-untyped-def]
     """Sub-pixel displacements of an integer map from distances summed over (2 radius + 1)^2 pixels.
 
     Only where ``wanted`` is not zero and the window, shifted by a pixel, lies inside both images; elsewhere the integer
     map is copied. ``out_distance``: mean distance per pixel at the integer displacement, or the pixel's own where the
-    window is not inside; -1 outside the other image and where not wanted. ``ox, oy``: where the left window's first
-    pixel lies in the right window; both windows must reach ``radius`` (right: and one) pixels farther than what counts.
+    window is not inside; -1 outside the other image and where not wanted.
     """
     rows, cols = left.shape
     rrows, rcols = right.shape
@@ -41,7 +39,7 @@ def summed(left, right, u_map, v_map, wanted, radius, out_u, out_v, out_distance
     for y in range(rows):
         for x in range(cols):
             u, v = np.int64(u_map[y, x]), np.int64(v_map[y, x])
-            xr, yr = x + ox + u, y + oy + v
+            xr, yr = x + u, y + v
             out_u[y, x], out_v[y, x], out_distance[y, x] = u, v, -1.0
             if not wanted[y, x] or xr < 0 or xr >= rcols or yr < 0 or yr >= rrows:
                 continue
@@ -70,40 +68,3 @@ def summed(left, right, u_map, v_map, wanted, radius, out_u, out_v, out_distance
             out_u[y, x] += linear(west, at, east)
             out_v[y, x] += linear(north, at, south)
             out_distance[y, x] = np.float32(at) / count
-
-
-def distances(
-    left: AnyArray, right: AnyArray, u: AnyArray, v: AnyArray, radius: int, ox: int = 0, oy: int = 0
-) -> AnyArray:
-    """Mean feature distance (row, col) float32 at integer displacements over (2 radius + 1)^2 pixels, -1 outside.
-
-    Each pixel counts at its own displacement; those that lead out of the right image are left out. ``ox, oy``: as in
-    :func:`summed`.
-    """
-    planes, sums = np.empty((2, 2, *left.shape), np.float32)
-    _distances(left, right, u, v, planes, ox, oy)
-    rowwise.box(planes, radius, sums)
-    _means(planes, sums)
-    return sums[0]
-
-
-@njit(cache=True, nogil=True)
-def _distances(left, right, u, v, planes, ox, oy):  # type: ignore[no-untyped-def]
-    rows, cols = right.shape
-    one, nil = np.float32(1.0), np.float32(0.0)
-    for y in range(left.shape[0]):
-        found, count = planes[0, y], planes[1, y]
-        for x in range(left.shape[1]):
-            i, j = x + ox + np.int64(u[y, x]), y + oy + np.int64(v[y, x])
-            inside = i >= 0 and i < cols and j >= 0 and j < rows
-            found[x] = np.float32(distance(left[y, x], right[np.uint64(j), np.uint64(i)])) if inside else nil
-            count[x] = one if inside else nil
-
-
-@njit(cache=True, nogil=True)
-def _means(planes, sums):  # type: ignore[no-untyped-def]
-    one = np.float32(1.0)
-    for y in range(planes.shape[1]):
-        inside, total, count = planes[1, y], sums[0, y], sums[1, y]
-        for x in range(planes.shape[2]):
-            total[x] = total[x] / max(count[x], one) if inside[x] > 0 else -one

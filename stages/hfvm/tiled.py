@@ -3,7 +3,7 @@
 ::
 
     coarse (levels down to plane_level, pre-alignment) -> level (each finer one, both ways; band between them)
-      -> fine (both ways) -> check -> refine -> patches -> final
+      -> fine, back -> check -> refine -> patches -> final
 
 Tiles are matched in any order and of any size with the same result, bit for bit; whole images are one tile.
 """
@@ -131,7 +131,7 @@ def _finish(steps: Finish, state: State, side: int | None, order: Order) -> Resu
         return gather(shape, ((w, step(w)) for w in order(tiles(shape, side))))
 
     fine = over(shape, lambda w: steps.fine(w, state.left))
-    back = over(other, lambda w: steps.fine(w, state.right, backward=True))
+    back = over(other, lambda w: steps.back(w, state.right))
     checked = over(shape, lambda w: steps.check(w, fine, back))
     refined = over(shape, lambda w: steps.refine(w, checked))
     gone = steps.patches(state.left, refined)

@@ -224,7 +224,8 @@ class Seen:
             words, local, grey = self._strip(level, window)
             # Only propagation along paths needs grey values, and it is done whole.
             return Patch(window, words, grey if self.held is not None else None, local)
-        words = local = None
+        words: AnyArray | None = None
+        local: AnyArray | None = None
         for y in range(window.y0, window.y1, STRIP):
             part = Window(y, min(y + STRIP, window.y1), window.x0, window.x1)
             some, some_local, _ = self._strip(level, part)
