@@ -14,6 +14,7 @@ import hashlib
 import os
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -163,6 +164,19 @@ def damage(folder: Path, files: Mapping[str, list[Any]], checksums: Callable[[st
     return ""
 
 
+@dataclass(frozen=True)
+class LazyRaster:
+    """An array of an artifact of which only the chunks are read that a window touches."""
+
+    arrays: LazyArrays
+    name: str
+    shape: tuple[int, ...]
+
+    def __getitem__(self, at: tuple[slice, ...]) -> AnyArray:
+        """Values of slices."""
+        return self.arrays._read(self.name, at)
+
+
 class LazyArrays(Mapping[str, AnyArray]):
     """Arrays of an artifact, each read at its first access; ``damaged(reason)`` is called before the error."""
 
@@ -188,7 +202,13 @@ class LazyArrays(Mapping[str, AnyArray]):
             self._loaded[name] = self._read(name)
         return self._loaded[name]
 
-    def _read(self, name: str) -> AnyArray:
+    def raster(self, name: str) -> LazyRaster:
+        """An array that is read by window, each time anew."""
+        if name not in self:
+            raise KeyError(f"{self._manifest['stage']} has no array {name!r}")
+        return LazyRaster(self, name, tuple(self._manifest["arrays"][name]["shape"]))
+
+    def _read(self, name: str, at: Any = ...) -> AnyArray:
         import zarr
         from zarr.storage import LocalStore
 
@@ -197,7 +217,7 @@ class LazyArrays(Mapping[str, AnyArray]):
         if not wrong:
             try:
                 array = zarr.open_array(store=LocalStore(self._folder / name, read_only=True), mode="r")
-                values = np.asarray(array[...])
+                values = np.asarray(array[at])
                 # zarr fills in for a chunk that has gone while it read (by clearing up, say) without a word
                 if not (wrong := damage(self._folder, files, lambda _: False)):
                     return values

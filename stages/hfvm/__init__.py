@@ -26,7 +26,7 @@ from stages.hfvm.views import Plain
 from stages.pyramid import Pyramid, PyramidParams
 from stages.validity import Mask, counts, matched
 
-__all__ = ["STAGE", "Disparity", "HfvmParams", "match", "match_pyramids"]
+__all__ = ["OUTPUTS", "STAGE", "Disparity", "HfvmParams", "facts", "match", "match_pyramids"]
 
 Map = NDArray[np.float32]
 
@@ -106,50 +106,42 @@ def match_pyramids(
 
 
 def _run(params: HfvmParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
-    found = match_pyramids(Pyramid.from_bundle(inputs["left"]), Pyramid.from_bundle(inputs["right"]), params)
-    arrays: dict[str, AnyArray] = {
-        "column_disparity": found.column_disparity,
-        "row_disparity": found.row_disparity,
-        "validity": found.validity,
-        "backmatch_error": found.backmatch_error,
-        "distance": found.distance,
-        "disparity_std": found.disparity_std,
-    }
-    usable = int(np.count_nonzero(Pyramid.from_bundle(inputs["left"]).valid[0]))
-    bits = counts(found.validity)
-    ok = matched(found.validity)
+    left, right = (Pyramid.from_bundle(inputs[port]) for port in ("left", "right"))
+    found = tiled.match(Plain.of(left), Plain.of(right), params, None, lambda share, step: None, None)
+    return Bundle(found.arrays, facts(found.arrays, params, found.aligned, int(np.count_nonzero(left.valid[0]))))
+
+
+def facts(arrays: Mapping[str, AnyArray], params: HfvmParams, aligned: bool, usable: int) -> dict[str, Any]:
+    """Metadata of disparities; ``usable``: how many pixels of the left image are."""
+    bits, ok = counts(arrays["validity"]), matched(arrays["validity"])
     meta = {
         "preset": params.preset,
-        "aligned": found.aligned,
+        "aligned": aligned,
         "usable": usable,
         "match_rate": bits["matched"] / usable if usable else None,
         "counts": bits,
-        "median_column_disparity": float(np.median(found.column_disparity[ok])) if ok.any() else None,
-        "median_row_disparity": float(np.median(found.row_disparity[ok])) if ok.any() else None,
-        "median_disparity_std": float(np.median(found.disparity_std[ok])) if ok.any() else None,
     }
-    return Bundle(arrays, meta)
+    for name in ("column_disparity", "row_disparity", "disparity_std"):
+        meta[f"median_{name}"] = float(np.median(arrays[name][ok])) if ok.any() else None
+    return meta
 
 
 _GRID = ("row", "col")
+OUTPUTS = (
+    Array("column_disparity", _GRID, "float32", "px", "column in the right image minus column", "nan", "left image"),
+    Array("row_disparity", _GRID, "float32", "px", "row in the right image minus row", "nan", "left image"),
+    Array("validity", _GRID, "uint8", "1", "bit mask, see stages.validity", "", "left image"),
+    Array("backmatch_error", _GRID, "float32", "px", "error of matching there and back", "nan", "left image"),
+    Array("distance", _GRID, "float32", "1", "least feature distance", "nan", "left image"),
+    Array("disparity_std", _GRID, "float32", "px", "standard deviation of the column disparity", "nan", "left image"),
+)
 STAGE = Stage(
     name="hfvm",
     version=2,
     summary="dense two-dimensional disparities of a stereo pair by hierarchical feature vector matching",
     params=HfvmParams,
     inputs=("left", "right"),
-    outputs=(
-        Array(
-            "column_disparity", _GRID, "float32", "px", "column in the right image minus column", "nan", "left image"
-        ),
-        Array("row_disparity", _GRID, "float32", "px", "row in the right image minus row", "nan", "left image"),
-        Array("validity", _GRID, "uint8", "1", "bit mask, see stages.validity", "", "left image"),
-        Array("backmatch_error", _GRID, "float32", "px", "error of matching there and back", "nan", "left image"),
-        Array("distance", _GRID, "float32", "1", "least feature distance", "nan", "left image"),
-        Array(
-            "disparity_std", _GRID, "float32", "px", "standard deviation of the column disparity", "nan", "left image"
-        ),
-    ),
+    outputs=OUTPUTS,
     requires=("numpy", "numba", "opencv-python-headless"),
     run=_run,
 )

@@ -389,9 +389,8 @@ def hand_down(state: State, window: Window, params: HfvmParams) -> Map:
     u, v = (np.asarray(a).astype(np.float32) for a in (own.u, own.v))
     consistency.fill_rows(u, v, ok, params.fill_reach, state.near_sign or -1.0, np.zeros(ok.shape, np.uint8))
     inner = window.inside(outer)
-    return Map(
-        *(np.ascontiguousarray(np.rint(a[inner]).astype(np.int16)) for a in (u, v)), np.asarray(own.undefined)[inner]
-    )
+    columns, rows = (np.ascontiguousarray(np.rint(a[inner]).astype(np.int16)) for a in (u, v))
+    return Map(columns, rows, np.asarray(own.undefined)[inner])
 
 
 def fine_tile(pair: Prepared, level: int, a: Map, window: Window, wanted: AnyArray | None) -> Fine:

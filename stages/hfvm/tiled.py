@@ -21,7 +21,7 @@ from stages.hfvm.finish import Finish
 from stages.hfvm.hierarchy import Prepared, State
 from stages.hfvm.params import HfvmParams
 from stages.hfvm.views import Aligned, Plain, Seen, View
-from stages.hfvm.window import Results, Shape, Window, cut, gather, tiles, whole
+from stages.hfvm.window import Raster, Results, Shape, Window, cut, gather, tiles, whole
 from stages.validity import matched
 
 Tell = Callable[[float, str], None]
@@ -94,8 +94,8 @@ def coarse(left: View, right: View, params: HfvmParams, side: int | None, prior:
 
 def contrast(pair: Prepared, state: State) -> float:
     """Factor for the right image, see :func:`stages.hfvm.refine.contrast`."""
-    images = (seen.view.grey(state.level, whole(seen.view.shapes[state.level])) for seen in (pair.left, pair.right))
-    return refine.contrast(*images, state.left.u, state.left.v, state.left_ok)
+    a, b = (seen.view.grey(state.level, whole(seen.view.shapes[state.level])) for seen in (pair.left, pair.right))
+    return refine.contrast(a, b, state.left.u, state.left.v, state.left_ok)
 
 
 def match(
@@ -155,19 +155,19 @@ def _enlarged(
     def parts() -> Iterator[tuple[Window, Results]]:
         for w in tiles(half[0].shapes[0], side):
             window = w.child(shapes[0])
-            yield window, enlarged({k: cut(a, w) for k, a in found.arrays.items()}, left, window, shapes[1])
+            yield window, enlarged({k: cut(a, w) for k, a in found.arrays.items()}, left.masks[0], window, shapes[1])
 
     return Found(gather(shapes[0], parts()), found.aligned)
 
 
-def enlarged(found: Results, left: View, window: Window, right_shape: Shape) -> Results:
+def enlarged(found: Results, mask: Raster, window: Window, right_shape: Shape) -> Results:
     """Results at half the resolution as those of a window of full resolution; displacements, twice as great, stand for
-    2 x 2 pixels each."""
+    2 x 2 pixels each. ``mask``: of the left image, at full resolution."""
     names = "column_disparity", "row_disparity", "validity", "backmatch_error", "distance"
     out: Results = {name: np.empty(window.shape, np.uint8 if name == "validity" else np.float32) for name in names}
     maps: list[AnyArray] = [found[name] for name in names]
     size = right_shape[0], right_shape[1]
-    resample.enlarge(*maps, left.valid(0, window), size, *(out[name] for name in names), window.x0, window.y0)
+    resample.enlarge(*maps, cut(mask, window), size, *(out[name] for name in names), window.x0, window.y0)
     std = (2.0 * found["disparity_std"]).repeat(2, axis=0)[: window.shape[0]].repeat(2, axis=1)[:, : window.shape[1]]
     std = np.where(matched(out["validity"]), std, np.float32(np.nan)).astype(np.float32)
     return {**out, "disparity_std": std}

@@ -180,10 +180,10 @@ class Aligned:
         return pyramid.halved(image, mask, len(self.shapes))
 
 
-def pyramid_shapes(shape: Shape, levels: int) -> list[Shape]:
+def pyramid_shapes(shape: Shape, levels: int, min_side: int = pyramid.PyramidParams().min_side) -> list[Shape]:
     """Rows and columns of the levels of :func:`stages.pyramid.build` for at most so many levels."""
     found = [shape]
-    while len(found) < levels and min(found[-1]) >= 2 * pyramid.PyramidParams().min_side:
+    while len(found) < levels and min(found[-1]) >= 2 * min_side:
         found.append(((found[-1][0] + 1) // 2, (found[-1][1] + 1) // 2))
     return found
 
@@ -224,20 +224,17 @@ class Seen:
             words, local, grey = self._strip(level, window)
             # Only propagation along paths needs grey values, and it is done whole.
             return Patch(window, words, grey if self.held is not None else None, local)
-        words: AnyArray | None = None
-        local: AnyArray | None = None
-        for y in range(window.y0, window.y1, STRIP):
-            part = Window(y, min(y + STRIP, window.y1), window.x0, window.x1)
-            some, some_local, _ = self._strip(level, part)
-            if words is None:
-                words = np.empty((window.shape[0], *some.shape[1:]), some.dtype)
-                local = np.empty(window.shape, np.float32) if deviation else None
+        parts = [Window(y, min(y + STRIP, window.y1), window.x0, window.x1) for y in range(window.y0, window.y1, STRIP)]
+        first = self._strip(level, parts[0])
+        words = np.empty((window.shape[0], *first[0].shape[1:]), first[0].dtype)
+        room = np.empty(window.shape, np.float32) if deviation else None
+        for part in parts:
+            some, local, _ = first if part is parts[0] else self._strip(level, part)
             rows = slice(part.y0 - window.y0, part.y1 - window.y0)
             words[rows] = some
-            if local is not None:
-                local[rows] = some_local
-        assert words is not None
-        return Patch(window, words, None, local)
+            if room is not None:
+                room[rows] = local
+        return Patch(window, words, None, room)
 
     def _strip(self, level: int, window: Window) -> tuple[AnyArray, AnyArray, AnyArray]:
         outer = window.grow(features.RADIUS, features.RADIUS, self.view.shapes[level])
