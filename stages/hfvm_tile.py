@@ -119,11 +119,7 @@ class Task:
             return State(level, maps[0], maps[1], oks[0], oks[1], band(coarse.meta), coarse.meta["near_sign"])
         a, b = (self.map(f"{way}_map", shape) for way, shape in zip(("left", "right"), pair.shapes(level), strict=True))
         ok = Agreeing(pair, level, a, b), Agreeing(pair.reverse(), level, b, a)
-        meta = (
-            self.inputs["band"].meta
-            if "band" in self.inputs
-            else {"f": None, "mu": 0.0} | {"near_sign": coarse.meta["near_sign"]}
-        )
+        meta = self.inputs["band"].meta if "band" in self.inputs else {**coarse.meta, "f": None}
         return State(level, a, b, ok[0], ok[1], band(meta), meta["near_sign"])
 
     def finish(self) -> Finish:
