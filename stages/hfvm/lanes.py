@@ -116,17 +116,18 @@ _HALVES = ir.VectorType(_I16, 2 * LANES)
 _ALL = ir.Constant(_MASK, [1] * LANES)
 
 
-def _gather(builder: Any, data: Any, index: Any, kind: Any, inside: Any = _ALL) -> Any:
-    """Elements of vector type ``kind`` at eight 32-bit indices where ``inside``, else 0."""
-    size = {_WORDS: 3, _INTS: 2, _FLOATS8: 2}[kind]
-    offset = builder.shl(builder.sext(index, _WORDS), _vector(_WORDS, [size] * LANES))
-    address = builder.add(_splat(builder, builder.ptrtoint(data, _I64)), offset)
-    pointers = builder.inttoptr(address, ir.VectorType(ir.PointerType(), LANES))
-    name = {_WORDS: "v8i64", _INTS: "v8i32", _FLOATS8: "v8f32"}[kind]
-    f = ir.FunctionType(kind, [pointers.type, _I32, _MASK, kind])
-    gather = cgutils.get_or_insert_function(builder.module, f, f"llvm.masked.gather.{name}.v8p0")
-    nothing = ir.Constant(kind, [0] * LANES) if kind != _FLOATS8 else ir.Constant(kind, [0.0] * LANES)
-    return builder.call(gather, [pointers, ir.Constant(_I32, 1 << size), inside, nothing])
+def _gather(builder: Any, data: Any, index: Any, kind: Any, inside: Any = None) -> Any:
+    """Elements of vector type ``kind`` at eight 32-bit indices; anything where not ``inside``.
+
+    Eight single loads: gather instructions take three times as long on processors with their mitigation.
+    """
+    if inside is not None:
+        index = builder.select(inside, index, _vector(_INTS, [0] * LANES))
+    found = ir.Constant(kind, ir.Undefined)
+    for lane in range(LANES):
+        i = builder.sext(builder.extract_element(index, ir.Constant(_I32, lane)), _I64)
+        found = builder.insert_element(found, builder.load(builder.gep(data, [i])), ir.Constant(_I32, lane))
+    return found
 
 
 @dataclass
@@ -144,15 +145,22 @@ class _Pixels:
     rows: Any
     cols: Any
 
-    def cost(self, tried: Any) -> tuple[Any, Any]:
-        """Distance + trunc(mu |a u + b v + c|) at packed displacements, and which of them lie in the image."""
+    def cost(self, tried: Any, alike: bool = False) -> tuple[Any, Any]:
+        """Distance + trunc(mu |a u + b v + c|) at packed displacements, and which of them lie in the image.
+
+        ``alike``: all displacements are equal and the pixels lie side by side, so that their words do, too.
+        """
         builder, sixteen = self.builder, _vector(_INTS, [16] * LANES)
         u, v = builder.ashr(builder.shl(tried, sixteen), sixteen), builder.ashr(tried, sixteen)
         xr, yr = builder.add(self.x, u), builder.add(self.y, v)
         # Compared without sign: below zero is beyond the end.
         inside = builder.and_(builder.icmp_unsigned("<", xr, self.cols), builder.icmp_unsigned("<", yr, self.rows))
         index = builder.add(builder.mul(yr, self.cols), xr)
-        found = _gather(builder, self.image, index, _WORDS, inside)
+        if alike:
+            first = builder.sext(builder.extract_element(index, ir.Constant(_I32, 0)), _I64)
+            found = _load(builder, _as(builder, builder.gep(self.image, [first]), _WORDS), inside)
+        else:
+            found = _gather(builder, self.image, index, _WORDS, inside)
         distance = builder.trunc(_distances(builder, self.words, found, self.width), _INTS)
         a, b, c = self.line
         across = builder.fmul(a, builder.sitofp(u, _FLOATS8))
@@ -172,12 +180,6 @@ def _rough(builder: Any, tried: Any, near: list[Any]) -> Any:
         both = builder.add(builder.and_(size, low), builder.lshr(size, sixteen))
         total = builder.add(total, _call(builder, "llvm.umin.v8i32", _INTS, both, most))
     return total
-
-
-def _moved(builder: Any, packed: Any, du: int, dv: int) -> Any:
-    """Packed displacements, each half changed by itself."""
-    step = _vector(_HALVES, [du, dv] * LANES)
-    return builder.bitcast(builder.add(builder.bitcast(packed, _HALVES), step), _INTS)
 
 
 def _any(builder: Any, mask: Any) -> Any:
@@ -242,8 +244,6 @@ def make_settle(width: int) -> Any:
                 for slot, value in ((best, tried), (found, cost), (least, total)):
                     builder.store(builder.select(better, value, builder.load(slot)), slot)
 
-            for du, dv in ((-1, 0), (1, 0), (0, -1), (0, 1)):
-                attempt(_moved(builder, own, du, dv))
             for tried in near:
                 with builder.if_then(_any(builder, builder.icmp_signed("!=", tried, own))):
                     attempt(tried)
@@ -259,14 +259,14 @@ def make_settle(width: int) -> Any:
 
 settle = make_settle(widest())
 """``settle(left, right, packed, data, lines, todo, at, here, above, below, y, shape, smooth, mu, new, cost)``: the best
-displacement of eight pixels of row ``y`` among each one's own, that +-1, and those of its four neighbours.
+displacement of eight pixels of row ``y`` among each one's own and those of its four neighbours.
 
 ``todo[at : at + 8]``: columns of the pixels, no two of them neighbours. All arrays are flat: words of both images;
 ``packed`` displacements, v << 16 | u, and their costs without smoothness; ``lines``: three planes of the left image's
 size. ``here, above, below``: index at which the row and its neighbours begin. ``shape``: rows and columns of the right
 image, columns and size of the left one, and the column of the left one's first pixel in the right one, as ``y`` is the
-row there: both may be windows. In this order: own, own u - 1, u + 1, v - 1, v + 1, up, west, east, down; the
-first of equal ones wins. Costs have ``smooth`` times the roughness added. ``new[at : at + 8]`` gets the best ones and
+row there: both may be windows. In this order: own, up, west, east, down; the first of equal ones wins. Costs have
+``smooth`` times the roughness added. ``new[at : at + 8]`` gets the best ones and
 ``cost`` their costs without smoothness.
 """
 
@@ -313,14 +313,15 @@ def make_seek(width: int) -> Any:
             )  # fmt: skip
             one = _vector(_INTS, [1] * LANES)
             middle = builder.ashr(x, one)
+            middle_0 = builder.ashr(narrow(start), one)
             odd = builder.and_(x, one)
             side = builder.sub(builder.add(middle, builder.add(odd, odd)), one)
             away = builder.sub(builder.add(middle, middle), side)
             places = [(parents, middle), (parents, side), (beside, middle), (beside, side), (parents, away)]
             held = cgutils.alloca_once(builder, _INTS, size=len(places))
             for k, (row, i) in enumerate(places):
-                index = builder.add(builder.add(i, one), narrow(row))
-                builder.store(_gather(builder, centres, index, _INTS, valid), builder.gep(held, [ir.Constant(_I32, k)]))
+                index = builder.add(builder.add(builder.select(valid, i, middle_0), one), narrow(row))
+                builder.store(_gather(builder, centres, index, _INTS), builder.gep(held, [ir.Constant(_I32, k)]))
             own = builder.load(held)
             cost, inside = pixels.cost(own)
             far = _vector(_INTS, [FAR] * LANES)
@@ -331,22 +332,30 @@ def make_seek(width: int) -> Any:
                 is_own = builder.icmp_signed("==", loop.index, ir.Constant(_I64, 0))
                 new = builder.or_(is_own, _any(builder, builder.icmp_signed("!=", centre, own)))
                 with builder.if_then(new):
-                    up = builder.select(is_own, reach_y, ir.Constant(_I64, 0))
-                    tall = builder.add(builder.add(up, up), one_more)
-                    broad = builder.add(builder.add(reach_x, reach_x), one_more)
-                    with cgutils.for_range(builder, tall) as down:
-                        dv = builder.sub(down.index, up)
-                        with cgutils.for_range(builder, broad) as across:
-                            du = builder.sub(across.index, reach_x)
-                            both = builder.or_(
-                                builder.shl(dv, ir.Constant(_I64, 16)), builder.and_(du, ir.Constant(_I64, 0xFFFF))
-                            )
-                            step = builder.bitcast(narrow(both), _HALVES)
-                            tried = builder.bitcast(builder.add(builder.bitcast(centre, _HALVES), step), _INTS)
-                            cost, inside = pixels.cost(tried)
-                            better = builder.and_(inside, builder.icmp_signed("<", cost, builder.load(least)))
-                            for slot, value in ((best, tried), (least, cost)):
-                                builder.store(builder.select(better, value, builder.load(slot)), slot)
+                    sideways = (ir.Constant(_I64, 0), reach_x)
+                    upright = (builder.select(is_own, reach_y, ir.Constant(_I64, 0)), ir.Constant(_I64, 0))
+
+                    def around(alike: bool) -> None:
+                        for up, aside in (sideways, upright):
+                            reach = builder.add(up, aside)
+                            with cgutils.for_range(builder, builder.add(builder.add(reach, reach), one_more)) as loop:
+                                step = builder.sub(loop.index, reach)
+                                low = builder.and_(step, ir.Constant(_I64, 0xFFFF))
+                                moved = low if up is sideways[0] else builder.shl(step, ir.Constant(_I64, 16))
+                                moved = builder.bitcast(narrow(moved), _HALVES)
+                                tried = builder.bitcast(builder.add(builder.bitcast(centre, _HALVES), moved), _INTS)
+                                cost, inside = pixels.cost(tried, alike)
+                                better = builder.and_(inside, builder.icmp_signed("<", cost, builder.load(least)))
+                                for slot, value in ((best, tried), (least, cost)):
+                                    builder.store(builder.select(better, value, builder.load(slot)), slot)
+
+                    lane_0 = _splat(builder, builder.extract_element(centre, ir.Constant(_I32, 0)))
+                    mixed = _any(builder, builder.icmp_signed("!=", centre, lane_0))
+                    with builder.if_else(mixed) as (differing, equal):
+                        with differing:
+                            around(False)
+                        with equal:
+                            around(True)
             for k, slot in ((12, best), (13, least)):
                 pointer = _as(
                     builder, _pointer(context, builder, sig.args[k], args[k], builder.add(here, start)), _INTS
@@ -368,7 +377,7 @@ displacement of the eight pixels from (``x``, ``y``) on around the displacements
 ``centres``: flat, packed, a border of one all round; ``parents``: where the row of the parents begins, ``beside``: the
 coarse row next to this one's other side. ``reach``: columns and rows to either side, and the number of centres: of the
 parent, the coarse pixels nearest along the row, the column and the diagonal, and the one at the parent's other side.
-Rows are searched about the parent alone. The other arrays as in :data:`settle`; ``packed, data`` are written.
+A search reaches along the row, about the parent also along the column. The other arrays as in :data:`settle`; ``packed, data`` are written.
 """
 
 

@@ -14,7 +14,6 @@ Weights = tuple[float, float, float, float, float, float, float, float]
 
 PAPER: Mapping[str, Any] = {
     "weights": PAPER_WEIGHTS,
-    "search_columns": 2,
     "threshold": 15.0,
     "texture": 0.0,
     "speckle": 1,
@@ -24,6 +23,8 @@ PAPER: Mapping[str, Any] = {
 """What preset ``paper`` sets differently; a value given by the user wins. Preset-only machinery ignores the rest."""
 
 ACCURATE: Mapping[str, Any] = {
+    "smoothness": 5,
+    "rounds": 4,
     "fine_rounds": None,
     "back_rounds": 4,
     "centres": 5,
@@ -35,8 +36,8 @@ ACCURATE: Mapping[str, Any] = {
 """What preset ``accurate`` sets differently; a value given by the user wins."""
 
 
-FAST: Mapping[str, Any] = {"finest": 1, "rounds": 3, "fine_rounds": None, "refine": False}
-"""What preset ``fast`` sets differently: half the resolution, less propagation, no removal of the perspective bias."""
+FAST: Mapping[str, Any] = {"finest": 1, "rounds": 2, "fine_rounds": None, "back_rounds": 2}
+"""What preset ``fast`` sets differently: half the resolution, less propagation."""
 
 PRESETS: Mapping[str, Mapping[str, Any]] = {"default": {}, "fast": FAST, "accurate": ACCURATE, "paper": PAPER}
 
@@ -70,7 +71,7 @@ class HfvmParams(Params):
         default=0.25, ge=0, le=1, description="the same of the height: roll, toe-in and row offsets"
     )
     search_columns: int = Field(
-        default=1, ge=1, le=8, description="pixels to either side of a centre: doubling errs by one"
+        default=2, ge=1, le=8, description="pixels to either side of a centre: doubling errs by one, parents by more"
     )
     search_rows: int = Field(default=1, ge=0, le=8, description="pixels; never 0 on a rig that is not rectified")
     band: float = Field(
@@ -79,19 +80,19 @@ class HfvmParams(Params):
         description="cost (byte steps) a pixel off the epipolar line; 0 = free two-dimensional search",
     )
     smoothness: int = Field(
-        default=5, ge=0, description="byte steps a pixel of difference to each neighbour; kept weak"
+        default=4, ge=0, description="byte steps a pixel of difference to each neighbour; kept weak"
     )
     rounds: int = Field(
-        default=4, ge=0, le=32, description="propagation rounds a level; they recover what the coarse level lost"
+        default=3, ge=0, le=32, description="propagation rounds a level; they recover what the coarse level lost"
     )
     fine_rounds: int | None = Field(
-        default=2, ge=0, le=32, description="the same at the finest level, which costs most; null: as at the others"
+        default=1, ge=0, le=32, description="the same at the finest level, which costs most; null: as at the others"
     )
     back_rounds: int = Field(
         default=1, ge=0, le=32, description="at most so many at the finest level from right to left, for the check"
     )
     centres: int = Field(
-        default=4,
+        default=3,
         ge=1,
         le=5,
         description="coarse pixels to search around: the parent, its nearest along row, column and diagonal, far side",

@@ -83,7 +83,7 @@ def _centres(up_u, up_v, lines, mu, centres):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def checkerboard(left, right, packed, data, dirty, lines, mu, smoothness, rounds, ox=0, oy=0):  # type: ignore[no-untyped-def]
-    """Rounds of propagation in place: each pixel tries its neighbours' displacements and its own +-1.
+    """Rounds of propagation in place: each pixel tries its neighbours' displacements.
 
     Cost: that of the displacement + ``smoothness`` times the sum over the four neighbours of min(|du| + |dv|, 2);
     beyond the border the neighbour on the other side stands in. The two colours of a checkerboard take turns, which
