@@ -116,14 +116,15 @@ def match_pyramids(
     if params.finest and min(left.levels, right.levels) > params.finest:
         return _enlarged(left, right, params, prior, tell)
     tell(0.0, "features")
-    pair = accurate.extend(hierarchy.prepare(left, right, params), left, right, params)
+    known = hierarchy.find_features(left, params)
+    pair = accurate.extend(hierarchy.prepare(left, right, params, known), left, right, params)
     coarse = start.impose(pair, params, hierarchy.run(pair, params, params.plane_level), prior)
     alignment = plane.find(pair, coarse, params) if params.preset != "paper" else None
     warped = right
     if alignment is not None:
         tell(COARSE_SHARE, "alignment")
         warped = plane.align(right, alignment, left.images[0].shape, PyramidParams(levels=left.levels))
-        pair = accurate.extend(hierarchy.prepare(left, warped, params), left, warped, params)
+        pair = accurate.extend(hierarchy.prepare(left, warped, params, known), left, warped, params)
         moved = start.align(prior, alignment)
         coarse = hierarchy.run(pair, params, params.plane_level, near_sign=coarse.near_sign)
         coarse = start.impose(pair, params, coarse, moved)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from stages.declare import AnyArray
@@ -53,6 +54,6 @@ def extend(pair: Prepared, left: Pyramid, right: Pyramid, params: HfvmParams) ->
     return Prepared(AccurateSolver(pair.solver, *views, params), pair.left_valid, pair.right_valid, pair.deviation)
 
 
-def _views(pyramid: Pyramid, words: tuple[AnyArray, ...]) -> tuple[paths.View, ...]:
+def _views(pyramid: Pyramid, words: Sequence[AnyArray]) -> tuple[paths.View, ...]:
     images = filled(pyramid)
     return tuple(paths.View(w, compact.pack(image), image) for w, image in zip(words, images, strict=False))

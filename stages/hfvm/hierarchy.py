@@ -7,6 +7,7 @@ is fitted anew to the consistent matches, where the solver uses one.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -87,8 +88,8 @@ ROOM = (("packed", np.int32), ("data", np.int32), ("dirty", np.uint8))
 class FastSolver:
     """Packed features, several centres, band, propagation (preset ``default``)."""
 
-    left: tuple[features.Words, ...]
-    right: tuple[features.Words, ...]
+    left: Sequence[features.Words]
+    right: Sequence[features.Words]
     params: HfvmParams
     uses_band: bool = True
     back: bool = False
@@ -120,9 +121,7 @@ class FastSolver:
         size = int(np.prod(shape))
         held = self.room.get(name)
         if held is None or held.size < size:
-            # The finest level is the largest one.
-            most = max(w.size for w in (*self.left, *self.right)) * (3 if name == "lines" else 1)
-            held = self.room[name] = np.empty(most, kind)
+            held = self.room[name] = np.empty(size, kind)
         return held[:size].reshape(shape)
 
     def fine(self, level: int, m: Map, wanted: AnyArray) -> Fine:
@@ -140,8 +139,8 @@ class FastSolver:
 class PaperSolver:
     """Floating-point features, one centre (preset ``paper``)."""
 
-    left: tuple[AnyArray, ...]
-    right: tuple[AnyArray, ...]
+    left: Sequence[AnyArray]
+    right: Sequence[AnyArray]
     params: HfvmParams
     uses_band: bool = False
 
@@ -194,27 +193,56 @@ class Prepared:
     solver: Solver
     left_valid: tuple[AnyArray, ...]
     right_valid: tuple[AnyArray, ...]
-    deviation: tuple[AnyArray, ...]
+    deviation: Sequence[AnyArray]
 
 
-def left_features(pyramid: Pyramid, params: HfvmParams) -> tuple[list[AnyArray], list[AnyArray]]:
-    """Features of every level, and local deviations (grey levels)."""
-    images = filled(pyramid)
+class Levels(Sequence[AnyArray]):
+    """Something of every level of a pyramid, made when it is first asked for."""
+
+    def __init__(self, count: int, make: Callable[[int], AnyArray]) -> None:
+        self._made: list[AnyArray | None] = [None] * count
+        self._make = make
+
+    def __len__(self) -> int:
+        return len(self._made)
+
+    def __getitem__(self, level: int) -> AnyArray:  # type: ignore[override]
+        found = self._made[level]
+        if found is None:
+            found = self._made[level] = self._make(level)
+        return found
+
+
+@dataclass(frozen=True)
+class Features:
+    """Features of every level of an image, and local deviations (grey levels)."""
+
+    words: Levels
+    deviation: Levels
+
+
+def find_features(pyramid: Pyramid, params: HfvmParams) -> Features:
+    """Features of a pyramid, as the solver of a preset wants them."""
+    images, n = filled(pyramid), pyramid.levels
     if params.preset == "paper":
-        planes = [features.planes(image) for image in images]
-        return [paper.weighted(p, params.weights) for p in planes], [p[6] for p in planes]
-    packed = [features.pack(image, params.weights) for image in images]
-    return [words for words, _ in packed], [deviation for _, deviation in packed]
+        planes = Levels(n, lambda level: features.planes(images[level]))
+        return Features(Levels(n, lambda k: paper.weighted(planes[k], params.weights)), Levels(n, lambda k: planes[k][6]))
+    both: dict[int, tuple[AnyArray, AnyArray]] = {}
+
+    def packed(level: int, which: int) -> AnyArray:
+        if level not in both:
+            both[level] = features.pack(images[level], params.weights)
+        return both[level][which]
+
+    return Features(Levels(n, lambda level: packed(level, 0)), Levels(n, lambda level: packed(level, 1)))
 
 
-def prepare(left: Pyramid, right: Pyramid, params: HfvmParams) -> Prepared:
-    """Features of two pyramids; of the levels that both have."""
-    n = min(left.levels, right.levels)
-    a, deviation = left_features(left, params)
-    b, _ = left_features(right, params)
+def prepare(left: Pyramid, right: Pyramid, params: HfvmParams, known: Features | None = None) -> Prepared:
+    """Features of two pyramids; ``known``: those of the left one, where they are known already."""
+    a, b = known or find_features(left, params), find_features(right, params)
     kind: type[PaperSolver] | type[FastSolver] = PaperSolver if params.preset == "paper" else FastSolver
-    solver: Solver = kind(tuple(a[:n]), tuple(b[:n]), params)
-    return Prepared(solver, left.valid, right.valid, tuple(deviation))
+    solver: Solver = kind(a.words, b.words, params)
+    return Prepared(solver, left.valid, right.valid, a.deviation)
 
 
 @dataclass(frozen=True)

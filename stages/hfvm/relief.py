@@ -91,7 +91,7 @@ def _normal(
 @njit(cache=True, nogil=True)
 def _all_products(left, right, right_valid, u, v, keep, out):  # type: ignore[no-untyped-def]
     for y in range(left.shape[0]):
-        _products(left, right, right_valid, u, v, keep, y, out[:, y])
+        _products(left, right, right_valid, u, v, keep, y, 0, out[:, y])
 
 
 def _hold_to_lines(u: AnyArray, v: AnyArray, keep: AnyArray, right_shape: tuple[int, int], *terms: AnyArray) -> None:
