@@ -226,7 +226,9 @@ def find_features(pyramid: Pyramid, params: HfvmParams) -> Features:
     images, n = filled(pyramid), pyramid.levels
     if params.preset == "paper":
         planes = Levels(n, lambda level: features.planes(images[level]))
-        return Features(Levels(n, lambda k: paper.weighted(planes[k], params.weights)), Levels(n, lambda k: planes[k][6]))
+        return Features(
+            Levels(n, lambda k: paper.weighted(planes[k], params.weights)), Levels(n, lambda k: planes[k][6])
+        )
     both: dict[int, tuple[AnyArray, AnyArray]] = {}
 
     def packed(level: int, which: int) -> AnyArray:

@@ -1,4 +1,4 @@
-"""Eight feature distances at once: vector code for the search kernels (numba intrinsics written in LLVM IR).
+"""Eight pixels at once: vector code for the search kernels (numba intrinsics written in LLVM IR).
 
 A feature vector is one 64-bit word, so eight of them fill a 512-bit register, and x86 adds the absolute differences of
 the bytes of each word in one instruction (``psadbw``, in 512, 256 or 128 bits). Elsewhere the same sums come from
@@ -96,6 +96,8 @@ def _as(builder: Any, pointer: Any, kind: Any) -> Any:
 WORDS = types.Array(types.uint64, 1, "C")
 PAIRS = types.Array(types.int32, 1, "C")
 LINES = types.Array(types.float32, 1, "C")
+
+
 def _load(builder: Any, pointer: Any, inside: Any) -> Any:
     """Masked load of eight words."""
     kind = ir.FunctionType(_WORDS, [pointer.type, _I32, _MASK, _WORDS])
@@ -199,7 +201,8 @@ def make_settle(width: int) -> Any:
 
         def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
             left, right, packed, data, lines = (
-                context.make_array(kind)(context, builder, a).data for kind, a in zip(sig.args[:5], args[:5], strict=True)
+                context.make_array(kind)(context, builder, a).data
+                for kind, a in zip(sig.args[:5], args[:5], strict=True)
             )
             at, here, above, below, y = args[6:11]
             rows, cols, left_cols, size = (builder.trunc(n, _I32) for n in cgutils.unpack_tuple(builder, args[11]))
@@ -277,7 +280,8 @@ def make_seek(width: int) -> Any:
 
         def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
             _, right, centres = (
-                context.make_array(kind)(context, builder, a).data for kind, a in zip(sig.args[:3], args[:3], strict=True)
+                context.make_array(kind)(context, builder, a).data
+                for kind, a in zip(sig.args[:3], args[:3], strict=True)
             )
             start, y, here, parents, beside = args[4:9]
             rows, cols, left_cols, size = cgutils.unpack_tuple(builder, args[9])
@@ -317,9 +321,7 @@ def make_seek(width: int) -> Any:
             own = builder.load(held)
             cost, inside = pixels.cost(own)
             far = _vector(_INTS, [FAR] * LANES)
-            best, least = (
-                cgutils.alloca_once_value(builder, a) for a in (own, builder.select(inside, cost, far))
-            )
+            best, least = (cgutils.alloca_once_value(builder, a) for a in (own, builder.select(inside, cost, far)))
             one_more = ir.Constant(_I64, 1)
             with cgutils.for_range(builder, count) as loop:
                 centre = builder.load(builder.gep(held, [loop.index]))
@@ -371,7 +373,8 @@ displacement of the eight pixels from (``x``, ``y``) on around the displacements
 ``centres``: flat, packed, a border of one all round; ``parents``: where the row of the parents begins, ``beside``: the
 coarse row next to this one's other side. ``reach``: columns and rows to either side, and the number of centres: of the
 parent, the coarse pixels nearest along the row, the column and the diagonal, and the one at the parent's other side.
-A search reaches along the row, about the parent also along the column. The other arrays as in :data:`settle`; ``packed, data`` are written.
+A search reaches along the row, about the parent also along the column. The other arrays as in :data:`settle`;
+``packed, data`` are written.
 """
 
 

@@ -73,7 +73,10 @@ def _centres(up_u, up_v, lines, mu, centres):  # type: ignore[no-untyped-def]
                 pu -= np.int64(np.rint(e * a))
                 pv -= np.int64(np.rint(e * b))
             centres[j + 1, i + 1] = pack(pu, pv)
-    centres[1 : crows + 1, 0], centres[1 : crows + 1, ccols + 1] = centres[1 : crows + 1, 1], centres[1 : crows + 1, ccols]
+    centres[1 : crows + 1, 0], centres[1 : crows + 1, ccols + 1] = (
+        centres[1 : crows + 1, 1],
+        centres[1 : crows + 1, ccols],
+    )
     centres[0], centres[crows + 1] = centres[1], centres[crows]
 
 
@@ -90,7 +93,11 @@ def checkerboard(left, right, packed, data, dirty, lines, mu, smoothness, rounds
     here, there, flat, cost = left.reshape(-1), right.reshape(-1), packed.reshape(-1), data.reshape(-1)
     normals = lines.reshape(-1)
     shape = (right.shape[0], right.shape[1], cols, rows * cols)
-    todo, new, found = (np.empty(cols + LANES, np.int32), np.empty(cols + LANES, np.int32), np.empty(cols + LANES, np.int32))
+    todo, new, found = (
+        np.empty(cols + LANES, np.int32),
+        np.empty(cols + LANES, np.int32),
+        np.empty(cols + LANES, np.int32),
+    )
     moved = np.empty(cols + LANES, np.int32)
     dirty[:] = 1
     for turn in range(2 * rounds):

@@ -7,6 +7,7 @@ from numba import njit
 
 from stages.features import distance
 
+
 @njit(cache=True, nogil=True)
 def exhaustive(left, right, reach_x, reach_y, radius, out_u, out_v):  # type: ignore[no-untyped-def]
     """Null prediction and large search area (4.3.4), for the top level: least distance summed over a window.

@@ -68,4 +68,3 @@ def summed(left, right, u_map, v_map, wanted, radius, out_u, out_v, out_distance
             out_u[y, x] += linear(west, at, east)
             out_v[y, x] += linear(north, at, south)
             out_distance[y, x] = np.float32(at) / count
-

@@ -6,8 +6,8 @@ The error of a disparity is taken as the sum of independent parts, so that varia
 
 N: variance of the least-squares displacement of the 5 x 5 window (the Cramer-Rao bound: residual variance after
 refinement, times the column element of the inverse structure tensor). A window along a column edge has a small one,
-a window along a row edge a large one. R: variance of the matched disparities of the 5 x 5 window about their plane;
-errors of neighbours differ, and a window on relief or a depth edge answers for a part of each surface. M: share of
+a window along a row edge a large one. R: mean square, in the 5 x 5 window, of how far a
+disparity lies from the mean of the four two pixels away (0 on a plane); errors of neighbours differ, and a window on relief or a depth edge answers for a part of each surface. M: share of
 unmatched pixels in 9 x 9; beside occlusions and failed matches a match leans on the wrong surface. The floor is what
 no pixel shows: sampling, lenses, the matcher's own sub-pixel bias.
 
@@ -105,7 +105,13 @@ def _bends(column, keep, planes):  # type: ignore[no-untyped-def]
         if y < r or y >= rows - r or cols <= 2 * r:
             continue
         end = cols - r
-        d, up, down, west, east = column[y, r:end], column[y - r, r:end], column[y + r, r:end], column[y, : end - r], column[y, 2 * r :]
+        d, up, down, west, east = (
+            column[y, r:end],
+            column[y - r, r:end],
+            column[y + r, r:end],
+            column[y, : end - r],
+            column[y, 2 * r :],
+        )
         k, ku, kd, kw, ke = keep[y, r:end], keep[y - r, r:end], keep[y + r, r:end], keep[y, : end - r], keep[y, 2 * r :]
         square, count = planes[0, y, r:end], planes[1, y, r:end]
         for x in range(end - r):

@@ -190,7 +190,9 @@ class TestRefine:
         left, right, u, v = pair(lambda x, y: (-6.0 + 0.05 * y, 1.3 + 0.02 * x), noise=noise)
         start_u, start_v = (u + 0.3).astype(np.float32), (v - 0.3).astype(np.float32)
         keep, valid = np.ones(u.shape, bool), np.ones(right.shape, np.uint8)
-        found_u, found_v, rest, _ = refine.refine(left, right, valid, start_u, start_v, keep, HfvmParams(refine_steps=2))
+        found_u, found_v, rest, _ = refine.refine(
+            left, right, valid, start_u, start_v, keep, HfvmParams(refine_steps=2)
+        )
         inner = np.s_[12:-12, 12:-12]
         gradient = np.sqrt(np.mean(np.gradient(right)[1] ** 2))
         # Least squares over the window: sqrt(2) noise / (gradient * window); the median of |error| is .67 of it, and
