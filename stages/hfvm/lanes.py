@@ -4,7 +4,7 @@ A feature vector is one 64-bit word, so eight of them fill a 512-bit register, a
 the bytes of each word in one instruction (``psadbw``, in 512, 256 or 128 bits). Elsewhere the same sums come from
 generic vector code; both give the same integers.
 
-Costs: distance + trunc(mu * |a u + b v + c|), with the epipolar line (a, b, c) in float32 and the sum in float64.
+Costs: distance + trunc(mu * |a u + b v + c|), with the epipolar line (a, b, c) and the sum in float32.
 """
 
 from __future__ import annotations

@@ -6,8 +6,9 @@ The error of a disparity is taken as the sum of independent parts, so that varia
 
 N: variance of the least-squares displacement of the 5 x 5 window (the Cramer-Rao bound: residual variance after
 refinement, times the column element of the inverse structure tensor). A window along a column edge has a small one,
-a window along a row edge a large one. R: mean square, in the 5 x 5 window, of how far a
-disparity lies from the mean of the four two pixels away (0 on a plane); errors of neighbours differ, and a window on relief or a depth edge answers for a part of each surface. M: share of
+a window along a row edge a large one. R: mean square, in the 5 x 5 window, of how far a disparity
+lies from the mean of the four two pixels away (0 on a plane); errors of neighbours differ, and a window on relief or a
+depth edge answers for a part of each surface. M: share of
 unmatched pixels in 9 x 9; beside occlusions and failed matches a match leans on the wrong surface. The floor is what
 no pixel shows: sampling, lenses, the matcher's own sub-pixel bias.
 
