@@ -1,10 +1,10 @@
-"""Eight feature distances at once: vector code for the search kernels (numba intrinsics written in LLVM IR).
+"""Eight pixels at once: vector code for the search kernels (numba intrinsics written in LLVM IR).
 
 A feature vector is one 64-bit word, so eight of them fill a 512-bit register, and x86 adds the absolute differences of
 the bytes of each word in one instruction (``psadbw``, in 512, 256 or 128 bits). Elsewhere the same sums come from
 generic vector code; both give the same integers.
 
-Costs: distance + trunc(mu * |a u + b v + c|), with the epipolar line (a, b, c) in float32 and the sum in float64.
+Costs: distance + trunc(mu * |a u + b v + c|), with the epipolar line (a, b, c) and the sum in float32.
 """
 
 from __future__ import annotations
@@ -290,7 +290,10 @@ def make_seek(width: int) -> Any:
             start, y, here, parents, beside = args[4:9]
             rows, cols, left_cols, size, ahead = cgutils.unpack_tuple(builder, args[9])
             reach_x, reach_y, count = cgutils.unpack_tuple(builder, args[10])
-            narrow = lambda n: _splat(builder, builder.trunc(n, _I32))  # noqa: E731
+
+            def narrow(n: Any) -> Any:
+                return _splat(builder, builder.trunc(n, _I32))
+
             x = builder.add(narrow(start), _vector(_INTS, range(LANES)))
             valid = builder.icmp_signed("<", x, narrow(left_cols))
             first = builder.add(here, start)
@@ -308,7 +311,8 @@ def make_seek(width: int) -> Any:
                 line.append(read(3, first, _FLOATS8, "v8f32"))
                 first = builder.add(first, size)
             pixels = _Pixels(
-                builder, width, builder.add(x, narrow(ahead)), narrow(y), words, (line[0], line[1], line[2]), _splat(builder, args[11]), right,
+                builder, width, builder.add(x, narrow(ahead)), narrow(y), words, (line[0], line[1], line[2]),
+                _splat(builder, args[11]), right,
                 narrow(rows), narrow(cols),
             )  # fmt: skip
             one = _vector(_INTS, [1] * LANES)
@@ -377,7 +381,8 @@ displacement of the eight pixels from (``x``, ``y``) on around the displacements
 ``centres``: flat, packed, a border of one all round; ``parents``: where the row of the parents begins, ``beside``: the
 coarse row next to this one's other side. ``reach``: columns and rows to either side, and the number of centres: of the
 parent, the coarse pixels nearest along the row, the column and the diagonal, and the one at the parent's other side.
-A search reaches along the row, about the parent also along the column. The other arrays as in :data:`settle`; ``packed, data`` are written.
+A search reaches along the row, about the parent also along the column. The other arrays as in :data:`settle`;
+``packed, data`` are written.
 """
 
 

@@ -117,8 +117,8 @@ def checkerboard(left, right, packed, data, dirty, lines, mu, smoothness, rounds
             start = y * cols
             for k in range(0, n, LANES):
                 lanes.settle(
-                    here, there, flat, cost, normals, todo, k, start, above * cols, below * cols, y + oy, shape, smoothness,
-                    mu, new, found,
+                    here, there, flat, cost, normals, todo, k, start, above * cols, below * cols, y + oy, shape,
+                    smoothness, mu, new, found,
                 )  # fmt: skip
             m = 0
             for k in range(n):

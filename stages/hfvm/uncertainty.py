@@ -6,8 +6,9 @@ The error of a disparity is taken as the sum of independent parts, so that varia
 
 N: variance of the least-squares displacement of the 5 x 5 window (the Cramer-Rao bound: residual variance after
 refinement, times the column element of the inverse structure tensor). A window along a column edge has a small one,
-a window along a row edge a large one. R: variance of the matched disparities of the 5 x 5 window about their plane;
-errors of neighbours differ, and a window on relief or a depth edge answers for a part of each surface. M: share of
+a window along a row edge a large one. R: mean square, in the 5 x 5 window, of how far a disparity
+lies from the mean of the four two pixels away (0 on a plane); errors of neighbours differ, and a window on relief or a
+depth edge answers for a part of each surface. M: share of
 unmatched pixels in 9 x 9; beside occlusions and failed matches a match leans on the wrong surface. The floor is what
 no pixel shows: sampling, lenses, the matcher's own sub-pixel bias.
 
@@ -89,7 +90,7 @@ def neighbours(column: AnyArray, keep: NDArray[np.bool_]) -> AnyArray:
     rowwise.box(planes[:2], RADIUS, sums[:2])
     rowwise.box(planes[2:], SURROUNDINGS // 2, sums[2:])
     _shares(sums, SURROUNDINGS // 2, planes)
-    return planes[:2]
+    return np.asarray(planes[:2])
 
 
 @njit(cache=True, nogil=True)
