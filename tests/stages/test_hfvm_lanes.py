@@ -46,7 +46,7 @@ def test_all_widths_search_alike():
 
         @njit
         def call(centres, packed, data, new, cost):
-            shape = (20, 30, 21, 12 * 21)
+            shape = (20, 30, 21, 12 * 21, 3)
             mu = np.float32(8.0)
             for y in range(12):
                 for x in range(0, 21, 8):
