@@ -119,23 +119,24 @@ def match(
     for level in range(state.level - 1, -1, -1):
         tell(COARSE_SHARE + (FINE_SHARE - COARSE_SHARE) * 0.25 ** (level + 1), f"level {level}")
         state = hierarchy.run(pair, params, level, state)
-    tell(FINE_SHARE, "sub-pixel and refinement")
     steps = Finish(pair, right, params, begun.alignment, state.near_sign, begun.contrast)
-    return Found(_finish(steps, state, side, order), begun.alignment is not None)
+    return Found(_finish(steps, state, side, order, tell), begun.alignment is not None)
 
 
-def _finish(steps: Finish, state: State, side: int | None, order: Order) -> Results:
+def _finish(steps: Finish, state: State, side: int | None, order: Order, tell: Tell) -> Results:
     shape, other = steps.pair.shapes(0)
 
-    def over(shape: Shape, step: Callable[[Window], Results]) -> Results:
+    def over(shape: Shape, done: float, words: str, step: Callable[[Window], Results]) -> Results:
+        tell(FINE_SHARE + (1.0 - FINE_SHARE) * done, words)
         return gather(shape, ((w, step(w)) for w in order(tiles(shape, side))))
 
-    fine = over(shape, lambda w: steps.fine(w, state.left))
-    back = over(other, lambda w: steps.back(w, state.right))
-    checked = over(shape, lambda w: steps.check(w, fine, back))
-    refined = over(shape, lambda w: steps.refine(w, checked))
+    fine = over(shape, 0.0, "sub-pixel", lambda w: steps.fine(w, state.left))
+    back = over(other, 0.35, "sub-pixel", lambda w: steps.back(w, state.right))
+    checked = over(shape, 0.45, "refinement", lambda w: steps.check(w, fine, back))
+    refined = over(shape, 0.5, "refinement", lambda w: steps.refine(w, checked))
+    tell(FINE_SHARE + (1.0 - FINE_SHARE) * 0.85, "filling")
     gone = steps.patches(state.left, refined)
-    return over(shape, lambda w: steps.final(w, fine, checked, refined, gone))
+    return over(shape, 0.9, "filling", lambda w: steps.final(w, fine, checked, refined, gone))
 
 
 def _enlarged(
