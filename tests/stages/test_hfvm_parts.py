@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from matching_scenes import convergent_rig, pair, rig_displacement
 from scipy import ndimage
@@ -54,6 +54,7 @@ class TestConsistency:
         assert sizes[7, 7] == 1
         assert np.count_nonzero(sizes == 95) == 95
 
+    @settings(max_examples=30, deadline=None)
     @given(st.integers(0, 10**6))
     def test_patches_against_scipy(self, seed):
         rng = np.random.default_rng(seed)
