@@ -91,9 +91,9 @@ def judged(
     parts: list[Any] = []
     original = uncertainty.standard_deviation
 
-    def recording(*args: Any) -> Any:
-        parts.extend(uncertainty.parts(*args))
-        return original(*args)
+    def recording(noise: Any, column: Any, keep: Any, params: Any) -> Any:
+        parts.extend([noise.copy(), *uncertainty.neighbours(column, keep)])
+        return original(noise, column, keep, params)
 
     uncertainty.standard_deviation = recording
     try:

@@ -14,6 +14,7 @@ import hashlib
 import os
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -178,6 +179,19 @@ def damage(folder: Path | str, files: Mapping[str, list[Any]], checksums: Callab
     return ""
 
 
+@dataclass(frozen=True)
+class LazyRaster:
+    """An array of an artifact of which only the chunks are read that a window touches."""
+
+    arrays: LazyArrays
+    name: str
+    shape: tuple[int, ...]
+
+    def __getitem__(self, at: tuple[slice, ...]) -> AnyArray:
+        """Values of slices."""
+        return self.arrays.part(self.name, at)
+
+
 class LazyArrays(Mapping[str, AnyArray]):
     """Arrays of an artifact, each read at its first access; ``damaged(reason)`` is called before the error."""
 
@@ -204,6 +218,12 @@ class LazyArrays(Mapping[str, AnyArray]):
     def part(self, name: str, window: tuple[Any, ...]) -> AnyArray:
         """Part of an array, which is not kept: only the chunks that hold it are read."""
         return self._read(name, window)
+
+    def raster(self, name: str) -> LazyRaster:
+        """An array that is read by window, each time anew."""
+        if name not in self:
+            raise KeyError(f"{self._manifest['stage']} has no array {name!r}")
+        return LazyRaster(self, name, tuple(self._manifest["arrays"][name]["shape"]))
 
     def _read(self, name: str, window: tuple[Any, ...]) -> AnyArray:
         if name not in self:

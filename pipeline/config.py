@@ -65,11 +65,13 @@ def stage(name: str) -> Stage:
 @cache
 def model() -> type[Params]:
     """Model of the whole configuration, made of the stages' own parameter models."""
+    from pipeline.tiling import Tiling
     from stages.vehicle import DEFAULT_VEHICLE, Vehicle
 
     fields: dict[str, Any] = {
         name: (stage(name).params, stage(name).params()) for name in STAGE_MODULES if stage(name).params.model_fields
     }
+    fields["tiling"] = (Tiling, Tiling())
     fields["vehicle"] = (Vehicle, DEFAULT_VEHICLE)
     return create_model("Config", __base__=Params, **fields)
 

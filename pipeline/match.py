@@ -63,11 +63,13 @@ def match_files(
     images = read_grey(left), read_grey(right)
     given = _prior(prior, images[0].shape) if prior is not None else None
 
+    from pipeline import tiling
     from stages.hfvm import match
     from stages.validity import matched
 
+    side = tiling.side(tiling.Tiling(), params, (images[0].shape, images[1].shape))
     with _progress(max(image.size for image in images), sys.stderr) as tell:
-        found = match(*images, params, prior=given, tell=tell)
+        found = match(*images, params, prior=given, tell=tell, side=side)
     kept = np.isfinite(found.column_disparity) if dense else matched(found.validity)
     column = np.where(kept, found.column_disparity, np.nan)
     row = np.where(kept, found.row_disparity, np.nan)

@@ -36,6 +36,7 @@ from typing import Any
 import numpy as np
 
 from datasets.protocol import Sequence, Source
+from pipeline import tiling
 from pipeline.config import STAGE_MODULES
 from pipeline.dag import Graph, Handle
 from pipeline.task import Ref
@@ -160,13 +161,23 @@ class Reconstruction:
         if pair in p.disparity:
             return
         right = self._pyramid(pair, "right")
-        p.disparity[pair] = self._node("hfvm", f"hfvm/{pair}", {"pair": pair}, left=self.left[pair], right=right)
+        p.disparity[pair] = self._disparity(pair, right)
         p.orientations[pair] = self._node(
             "orientation",
             f"orientation/{pair}",
             {"pair": pair, "rig": self.sequence.rig.to_dict()},
             disparity=p.disparity[pair],
         )
+
+    def _disparity(self, pair: int, right: Handle) -> Handle:
+        """One task, or for a large pair tasks per level and tile that give the same artifact."""
+        rig, images = self.sequence.rig, {"left": self.left[pair], "right": right}
+        shapes = (rig.left.height, rig.left.width), (rig.right.height, rig.right.width)
+        side = tiling.side(self.config.tiling, self.config.hfvm, shapes)
+        if side is None:
+            return self._node("hfvm", f"hfvm/{pair}", {"pair": pair}, left=images["left"], right=right)
+        given = self.config.hfvm, self.config.pyramid, images, shapes, side
+        return tiling.Tiles(self.graph, *given, f"hfvm/{pair}").build()
 
     def _rigs(self, basic: list[int]) -> None:
         """The rig that each basic pair is reconstructed with: one for all, or one each."""

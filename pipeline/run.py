@@ -215,7 +215,7 @@ def lay_out(sequence: Sequence, config: Any, frames: tuple[int, ...]) -> Graph:
 
 
 def _known_stages(names: frozenset[str]) -> None:
-    known = {*configuration.STAGE_MODULES, "image", "scene", "render"}
+    known = {*configuration.STAGE_MODULES, "hfvm_tile", "hfvm_join", "image", "scene", "render"}
     for name in sorted(names - known):
         raise ConfigError(f"--force {name!r} is no stage", remedy=f"one of {', '.join(sorted(known))}")
 

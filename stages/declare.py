@@ -60,6 +60,11 @@ class Bundle:
         found: AnyArray = self.arrays[name][window] if read is None else read(name, window)
         return found
 
+    def raster(self, name: str) -> Any:
+        """The array as something with ``shape`` that is read by window, ``raster[rows, columns]`` (slices)."""
+        opened = getattr(self.arrays, "raster", None)
+        return self.arrays[name] if opened is None else opened(name)
+
 
 Inputs = Mapping[str, Any]
 """Port name to a :class:`Bundle`, or to a list of them for a port declared with a trailing ``*``."""

@@ -22,6 +22,7 @@ from stages.declare import AnyArray, Array, Bundle, Inputs, Params, Stage
 from stages.geometry import Camera
 from stages.hfvm import consistency, hierarchy
 from stages.hfvm.params import HfvmParams
+from stages.hfvm.window import whole
 from stages.pyramid import Pyramid
 from stages.validity import Mask, Validity, defined, mark, matched
 
@@ -75,13 +76,13 @@ def coarse_motion(a: Pyramid, b: Pyramid, params: MotionParams, turn: Derotation
     )
     pair = hierarchy.prepare(a, b, hp)
     state = hierarchy.run(pair, hp, params.level)
-    fine = pair.solver.fine(state.level, state.left, np.ones(state.left.u.shape, bool))
+    fine = hierarchy.fine(pair, state)
     scale = np.float32(2.0**state.level)
     validity = np.zeros(state.left.u.shape, np.uint8)
-    textured = pair.deviation[state.level] >= hp.texture
-    mark(validity, pair.left_valid[state.level] == 0, Validity.OUT_OF_IMAGE)
+    textured = pair.deviation(state.level, whole(validity.shape)) >= hp.texture
+    mark(validity, a.valid[state.level] == 0, Validity.OUT_OF_IMAGE)
     mark(validity, ~textured, Validity.NO_TEXTURE)
-    mark(validity, ~state.left_ok, Validity.BACKMATCH_FAILED)
+    mark(validity, ~np.asarray(state.left_ok), Validity.BACKMATCH_FAILED)
     mark(validity, fine.distance > hp.threshold, Validity.OVER_THRESHOLD)
     good = validity == 0
     u, v, interpolated = fine.u.copy(), fine.v.copy(), np.zeros(good.shape, np.uint8)

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from pydantic import Field
 
@@ -93,24 +94,46 @@ def build(image: AnyArray, params: PyramidParams, valid: AnyArray | None = None)
     mask = np.isfinite(level)
     if valid is not None:
         mask &= valid != 0
-    images, masks = [np.where(mask, level, np.float32(0.0))], [mask.astype(np.uint8)]
-    while len(images) < params.levels and min(images[-1].shape) >= 2 * params.min_side:
-        coarse, mask = _halve(images[-1], masks[-1])
-        images.append(coarse)
+    levels, side = 1, min(level.shape)
+    while levels < params.levels and side >= 2 * params.min_side:
+        levels, side = levels + 1, (side + 1) // 2
+    return halved(np.where(mask, level, np.float32(0.0)), mask.astype(np.uint8), levels)
+
+
+def halved(image: Image, mask: Mask, levels: int) -> Pyramid:
+    """Pyramid of so many levels of a float32 image (0 where masked) and its mask.
+
+    Of a window that starts and ends where a pixel of the top level does, it is a part of the image's pyramid.
+    """
+    images, masks = [image], [mask]
+    for _ in range(levels - 1):
+        image, mask = _halve(image, mask)
+        images.append(image)
         masks.append(mask)
     return Pyramid(tuple(images), tuple(masks))
 
 
 def _halve(image: Image, mask: Mask) -> tuple[Image, Mask]:
     rows, cols = image.shape
-    if rows % 2 or cols % 2:
-        image = np.pad(image, ((0, rows % 2), (0, cols % 2)), mode="edge")
-        mask = np.pad(mask, ((0, rows % 2), (0, cols % 2)), mode="edge")
-    total = image[::2, ::2] + image[::2, 1::2] + image[1::2, ::2] + image[1::2, 1::2]
-    count = mask[::2, ::2] + mask[::2, 1::2] + mask[1::2, ::2] + mask[1::2, 1::2]
-    valid = count >= 3
-    mean = np.where(valid, total / np.maximum(count, 1).astype(np.float32), np.float32(0.0))
-    return mean, valid.astype(np.uint8)
+    coarse = np.empty(((rows + 1) // 2, (cols + 1) // 2), np.float32)
+    valid = np.empty(coarse.shape, np.uint8)
+    _means(image, mask, coarse, valid)
+    return coarse, valid
+
+
+@njit(cache=True, nogil=True)
+def _means(image, mask, coarse, valid):  # type: ignore[no-untyped-def]
+    rows, cols = image.shape
+    nil, one = np.float32(0.0), np.float32(1.0)
+    for y in range(coarse.shape[0]):
+        a, b = image[2 * y], image[min(2 * y + 1, rows - 1)]
+        p, q = mask[2 * y], mask[min(2 * y + 1, rows - 1)]
+        for x in range(coarse.shape[1]):
+            i = min(2 * x + 1, cols - 1)
+            total = a[2 * x] + a[i] + b[2 * x] + b[i]
+            count = p[2 * x] + p[i] + q[2 * x] + q[i]
+            coarse[y, x] = total / max(np.float32(count), one) if count >= 3 else nil
+            valid[y, x] = count >= 3
 
 
 def filled(pyramid: Pyramid) -> tuple[Image, ...]:
@@ -147,6 +170,6 @@ STAGE = Stage(
         Array("level_*", ("row", "col"), "float32", "1", "grey value 0..255, 0 where masked"),
         Array("valid_*", ("row", "col"), "uint8", "1", "1 = usable"),
     ),
-    requires=("numpy",),
+    requires=("numpy", "numba"),
     run=_run,
 )

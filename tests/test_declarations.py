@@ -12,9 +12,12 @@ from pipeline.config import STAGE_MODULES, stage
 
 UNITS = {"1", "px", "m", "rad", "grey", "m^2, m rad, rad^2"}
 DATASET_STAGES = ("files", "files16", "mockup.scene", "mockup.render", "mockup.truth", "mockup.truth_dem")
-DECLARED = {name: stage(name) for name in STAGE_MODULES} | {
-    name: importlib.import_module(f"datasets.{name}").STAGE for name in DATASET_STAGES
-}
+TILE_STAGES = ("hfvm_tile", "hfvm_join")
+DECLARED = (
+    {name: stage(name) for name in STAGE_MODULES}
+    | {name: importlib.import_module(f"stages.{name}").STAGE for name in TILE_STAGES}
+    | {name: importlib.import_module(f"datasets.{name}").STAGE for name in DATASET_STAGES}
+)
 
 
 @pytest.mark.parametrize("name", DECLARED)

@@ -4,55 +4,61 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from stages.declare import AnyArray
 from stages.hfvm import compact, paths
-from stages.hfvm.hierarchy import Band, FastSolver, Fine, Map, Prepared
+from stages.hfvm.hierarchy import Band, FastSolver, Fine, Map, Solver, solver
 from stages.hfvm.params import HfvmParams
-from stages.pyramid import Pyramid, filled
+from stages.hfvm.views import Patch
+from stages.hfvm.window import Shape
 
 
 @dataclass(frozen=True)
 class AccurateSolver:
-    """A :class:`FastSolver` whose maps are improved along paths; ``left, right``: every level of both images."""
+    """A :class:`FastSolver` whose maps are improved along paths, which cross the whole image."""
 
     fast: FastSolver
-    left: tuple[paths.View, ...]
-    right: tuple[paths.View, ...]
     params: HfvmParams
     uses_band: bool = True
+    whole: bool = True
 
-    def match(self, level: int, up: Map | None, band: Band) -> Map:
+    def rounds(self, level: int) -> int:
+        """Rounds of propagation at a level."""
+        return self.fast.rounds(level)
+
+    def match(self, level: int, a: Patch, b: Patch, shapes: tuple[Shape, Shape], up: Map | None, band: Band) -> Map:
         """Integer map of a level."""
-        p, found = self.params, self.fast.match(level, up, band)
+        p, found = self.params, self.fast.match(level, a, b, shapes, up, band)
         u, v = paths.propagate(
-            self.left[level],
-            self.right[level],
-            (found.u, found.v),
-            None if up is None else (up.u, up.v),
-            band.lines(found.u.shape),
+            _view(a),
+            _view(b),
+            (np.asarray(found.u), np.asarray(found.v)),
+            None if up is None else (np.asarray(up.u), np.asarray(up.v)),
+            band.lines(a.window),
             band.mu,
             paths.Weights(p.path_compact, p.path_small, p.path_large, p.path_grey),
             p.path_rounds,
         )
         return Map(u, v, found.undefined)
 
-    def fine(self, level: int, m: Map, wanted: AnyArray) -> Fine:
+    def fine(self, a: Patch, b: Patch, m: Map, wanted: AnyArray) -> Fine:
         """Sub-pixel map from summed distances."""
-        return self.fast.fine(level, m, wanted)
+        return self.fast.fine(a, b, m, wanted)
 
     def reverse(self) -> AccurateSolver:
         """The matcher from right to left."""
-        return AccurateSolver(self.fast.reverse(), self.right, self.left, self.params)
+        return AccurateSolver(self.fast.reverse(), self.params)
 
 
-def extend(pair: Prepared, left: Pyramid, right: Pyramid, params: HfvmParams) -> Prepared:
-    """The pair with the accurate solver in place of the fast one, where there are rounds along paths."""
-    if params.path_rounds == 0 or not isinstance(pair.solver, FastSolver):
-        return pair
-    views = (_views(left, pair.solver.left), _views(right, pair.solver.right))
-    return Prepared(AccurateSolver(pair.solver, *views, params), pair.left_valid, pair.right_valid, pair.deviation)
+def choose(params: HfvmParams) -> Solver:
+    """The solver of a preset: with propagation along paths where there are rounds of it."""
+    plain = solver(params)
+    if params.path_rounds == 0 or not isinstance(plain, FastSolver):
+        return plain
+    return AccurateSolver(plain, params)
 
 
-def _views(pyramid: Pyramid, words: tuple[AnyArray, ...]) -> tuple[paths.View, ...]:
-    images = filled(pyramid)
-    return tuple(paths.View(w, compact.pack(image), image) for w, image in zip(words, images, strict=False))
+def _view(patch: Patch) -> paths.View:
+    assert patch.grey is not None
+    return paths.View(patch.words, compact.pack(patch.grey), np.ascontiguousarray(patch.grey))

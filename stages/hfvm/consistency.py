@@ -31,100 +31,115 @@ def median(u: AnyArray, size: int) -> AnyArray:
 
 
 @njit(cache=True, nogil=True)
-def integer_error(au, av, bu, bv, b_valid, error):  # type: ignore[no-untyped-def]
-    """As :func:`backmatch`, of integer maps."""
+def agree(au, av, bu, bv, own_valid, b_valid, limit, found, ox, oy):  # type: ignore[no-untyped-def]
+    """Mark in ``found`` pixels of ``own_valid`` whose integer displacement is undone by the other map within ``limit``.
+
+    ``ox, oy``: where the first pixel of ``a`` lies in the window of ``b``; only pixels that land in it are looked at.
+    """
     rows, cols = au.shape
     brows, bcols = bu.shape
+    most = np.float32(limit) * np.float32(limit)
     for y in range(rows):
         for x in range(cols):
-            i, j = x + np.int64(au[y, x]), y + np.int64(av[y, x])
-            e = FAILED
-            if i >= 0 and i < bcols and j >= 0 and j < brows and b_valid[j, i]:
+            i, j = x + ox + np.int64(au[y, x]), y + oy + np.int64(av[y, x])
+            if own_valid[y, x] and i >= 0 and i < bcols and j >= 0 and j < brows and b_valid[j, i]:
                 du, dv = np.int64(au[y, x]) + bu[j, i], np.int64(av[y, x]) + bv[j, i]
-                e = np.sqrt(np.float32(du * du + dv * dv))
-            error[y, x] = e
+                found[y, x] = du * du + dv * dv <= most
 
 
 @njit(cache=True, nogil=True)
-def backmatch(lu, lv, ru, rv, right_valid, error):  # type: ignore[no-untyped-def]
-    """Distance |l - l'| of each left pixel after matching to the right and back (4.3.3), pixels; FAILED outside
-    the right image and on its masked pixels.
+def backmatch(lu, lv, ru, rv, right_valid, error, x0, y0, rx0, ry0, rrows, rcols):  # type: ignore[no-untyped-def]
+    """Distance |l - l'| of each left pixel after matching to the right and back (4.3.3), pixels.
 
-    The right map is read bilinearly where its four pixels agree within a pixel, else at the nearest one.
+    ``error`` comes as FAILED and stays so outside the right image and on its masked pixels. The right map is read at
+    the nearest pixel. ``x0, y0`` and ``rx0, ry0``: first column and row of the left and the right window; ``rrows,
+    rcols``: size of the right image. Only pixels that land in the right window are looked at.
     """
     rows, cols = lu.shape
-    rrows, rcols = ru.shape
+    wrows, wcols = ru.shape
+    half, nil = np.float32(0.5), np.float32(0.0)
+    last_x, last_y = np.float32(rcols - 1), np.float32(rrows - 1)
     for y in range(rows):
         for x in range(cols):
-            error[y, x] = FAILED
-            xr = np.float32(x) + lu[y, x]
-            yr = np.float32(y) + lv[y, x]
-            if not (xr >= 0 and xr <= rcols - 1 and yr >= 0 and yr <= rrows - 1):
+            xr = np.float32(x + x0) + lu[y, x]
+            yr = np.float32(y + y0) + lv[y, x]
+            if not (xr >= nil and xr <= last_x and yr >= nil and yr <= last_y):
                 continue
-            if not right_valid[int(yr + np.float32(0.5)), int(xr + np.float32(0.5))]:
+            i, j = np.int64(xr + half) - rx0, np.int64(yr + half) - ry0
+            if i < 0 or j < 0 or i >= wcols or j >= wrows or not right_valid[j, i]:
                 continue
-            i, j = int(xr), int(yr)
-            i1, j1 = min(i + 1, rcols - 1), min(j + 1, rrows - 1)
-            fx, fy = xr - np.float32(i), yr - np.float32(j)
-            a, b, c, d = ru[j, i], ru[j, i1], ru[j1, i], ru[j1, i1]
-            p, q, r, s = rv[j, i], rv[j, i1], rv[j1, i], rv[j1, i1]
-            one = np.float32(1.0)
-            if (
-                max(max(a, b), max(c, d)) - min(min(a, b), min(c, d)) <= one
-                and max(max(p, q), max(r, s)) - min(min(p, q), min(r, s)) <= one
-            ):
-                u = (a * (one - fx) + b * fx) * (one - fy) + (c * (one - fx) + d * fx) * fy
-                v = (p * (one - fx) + q * fx) * (one - fy) + (r * (one - fx) + s * fx) * fy
-            else:
-                i, j = int(xr + np.float32(0.5)), int(yr + np.float32(0.5))
-                u, v = ru[j, i], rv[j, i]
-            du, dv = lu[y, x] + u, lv[y, x] + v
+            du, dv = lu[y, x] + ru[j, i], lv[y, x] + rv[j, i]
             e = np.sqrt(du * du + dv * dv)
             if e < FAILED:
                 error[y, x] = e
 
 
-def lands(u: AnyArray, v: AnyArray, keep: AnyArray, right_valid: AnyArray) -> NDArray[np.bool_]:
-    """Pixels of ``keep`` whose displacement ends on a usable pixel inside the right image."""
-    found = np.zeros(keep.shape, dtype=bool)
-    _lands(u, v, keep, right_valid, found)
-    return found
-
-
 @njit(cache=True, nogil=True)
-def _lands(u, v, keep, right_valid, found):  # type: ignore[no-untyped-def]
-    rows, cols = right_valid.shape
+def lands(u, v, keep, right_valid, found, x0, y0, rx0, ry0, rrows, rcols):  # type: ignore[no-untyped-def]
+    """Mark in ``found`` (bool) pixels of ``keep`` whose displacement ends on a usable pixel of the right image.
+
+    Windows as in :func:`backmatch`; the right one must hold every end that lies in the image.
+    """
+    half, nil = np.float32(0.5), np.float32(0.0)
     for y in range(u.shape[0]):
         for x in range(u.shape[1]):
-            xr, yr = x + np.float64(u[y, x]), y + np.float64(v[y, x])
             # half a pixel beyond the outermost centres is still on the image
-            if keep[y, x] and -0.5 < xr < cols - 0.5 and -0.5 < yr < rows - 0.5:
-                found[y, x] = right_valid[np.int64(np.rint(yr)), np.int64(np.rint(xr))] != 0
+            xr, yr = np.float32(x + x0) + u[y, x] + half, np.float32(y + y0) + v[y, x] + half
+            if keep[y, x] and nil < xr < np.float32(rcols) and nil < yr < np.float32(rrows):
+                found[y, x] = right_valid[np.uint64(np.int64(yr) - ry0), np.uint64(np.int64(xr) - rx0)] != 0
+
+
+def patches(u: AnyArray, v: AnyArray, keep: AnyArray) -> NDArray[np.int32]:
+    """Size in pixels of the patch of ``keep`` that each pixel belongs to, 0 outside.
+
+    Patches hang together along rows and columns where both displacements differ by at most one pixel. Room: 4 bytes a
+    pixel and 8 a run of pixels.
+    """
+    sizes, parent, count = np.empty(keep.shape, np.int32), *np.empty((2, keep.size), np.int32)
+    _patches(u, v, keep, sizes, parent, count)
+    return sizes
 
 
 @njit(cache=True, nogil=True)
-def _eighths(plane, keep, gone, coded):  # type: ignore[no-untyped-def]
-    """Eighths of a pixel as int16, -32768 where there is no value."""
-    for y in range(keep.shape[0]):
-        for x in range(keep.shape[1]):
-            use = keep[y, x] and not gone[y, x]
-            coded[y, x] = np.int16(np.rint(8.0 * plane[y, x])) if use else np.int16(-32768)
+def _root(parent, i):  # type: ignore[no-untyped-def]
+    while parent[i] != i:
+        parent[i] = parent[parent[i]]
+        i = parent[i]
+    return i
 
 
-def isolated(u: AnyArray, v: AnyArray, keep: AnyArray, size: int) -> NDArray[np.bool_]:
-    """Pixels of ``keep`` in patches of fewer than ``size`` pixels whose neighbours differ by at most one pixel.
-
-    ``u, v``: (row, col) float32 or int16 map, pixels.
-    """
-    if size <= 1:
-        return np.zeros(keep.shape, dtype=bool)
-    gone = np.zeros(keep.shape, dtype=bool)
-    for plane in (u, v):
-        coded = np.empty(keep.shape, np.int16)
-        _eighths(plane, keep, gone, coded)
-        cv2.filterSpeckles(coded, -32768, size - 1, 8)
-        gone = keep & (coded == -32768)
-    return gone
+@njit(cache=True, nogil=True)
+def _patches(u, v, keep, label, parent, count):  # type: ignore[no-untyped-def]
+    """Runs of a row are numbered, those of two rows that touch united, pixels counted, numbers replaced by sizes."""
+    rows, cols = keep.shape
+    n = 0
+    for y in range(rows):
+        above = max(y - 1, 0)
+        own, other = -1, -1
+        for x in range(cols):
+            if not keep[y, x]:
+                label[y, x] = own = -1
+                continue
+            if own < 0 or abs(u[y, x] - u[y, x - 1]) > 1 or abs(v[y, x] - v[y, x - 1]) > 1:
+                own, other = n, -1
+                parent[n], count[n] = n, 0
+                n += 1
+            label[y, x] = own
+            count[own] += 1
+            if y == 0 or label[above, x] == other or label[above, x] < 0:
+                continue
+            if abs(u[y, x] - u[above, x]) <= 1 and abs(v[y, x] - v[above, x]) <= 1:
+                other = label[above, x]
+                a, b = _root(parent, own), _root(parent, other)
+                parent[max(a, b)] = min(a, b)
+    for i in range(n - 1, -1, -1):
+        if parent[i] != i:
+            count[parent[i]] += count[i]
+    for i in range(n):
+        count[i] = count[parent[i]]
+    for y in range(rows):
+        for x in range(cols):
+            label[y, x] = count[label[y, x]] if label[y, x] >= 0 else 0
 
 
 def lonely(keep: AnyArray, share: float) -> NDArray[np.bool_]:
@@ -137,17 +152,18 @@ def lonely(keep: AnyArray, share: float) -> NDArray[np.bool_]:
 
 
 def unsupported(u: AnyArray, v: AnyArray, keep: AnyArray, size: int) -> NDArray[np.bool_]:
-    """As :func:`isolated`; where most of what remains lies in patches that are still small, those too.
+    """Pixels of ``keep`` in patches of fewer than ``size``; where most of the rest lies in small ones, those too.
 
     Images that have nothing to do with each other match by chance in patches up to some hundred pixels. Of a pair that
     shows one scene nearly everything lies in patches of thousands: there small ones are believed.
     """
-    gone = isolated(u, v, keep, size)
     if size <= 1:
-        return gone
-    rest = keep & ~gone
-    small = isolated(u, v, rest, min(CHANCE * size, keep.size // 8))
-    return gone | small if np.count_nonzero(small) > 0.5 * np.count_nonzero(rest) else gone
+        return np.zeros(keep.shape, dtype=bool)
+    sizes = patches(u, v, keep)
+    rest = np.count_nonzero(sizes >= size)
+    wanted = max(size, min(CHANCE * size, keep.size // 8))
+    chance = np.count_nonzero(sizes >= wanted) < 0.5 * rest
+    return np.asarray(keep & (sizes < (wanted if chance else size)))
 
 
 @njit(cache=True, nogil=True)

@@ -6,7 +6,7 @@ only a help to the search: it is estimated anew at every level and never leaves 
 The constraint ``p'^T F p = 0`` is linear in F. Divided by the coefficient of ``y'`` it reads ``y' = y + small`` for a
 rig whose baseline lies along the rows, divided by that of ``x'`` likewise for one along the columns; both are fitted as
 a maximum a posteriori with a weak prior on the small terms (a few degrees of roll and toe-in), which decides what a
-flat scene leaves open, and the likelier one is taken.
+flat scene leaves open. The first one is taken where most matches lie on its lines, else the likelier one.
 """
 
 from __future__ import annotations
@@ -33,7 +33,8 @@ SHARP = 0.2
 """Pixels: median distance of sub-pixel matches from their lines in an ideal rig; beyond it the band is softened."""
 
 LEAST_MATCHES = 40
-ITERATIONS = 10
+ITERATIONS, SETTLED = 10, 1e-4
+"""At most so many; fewer once no term changes by more than this share of its prior deviation."""
 
 
 def fit(u: AnyArray, v: AnyArray, wanted: AnyArray, right_shape: tuple[int, int]) -> tuple[Matrix, float] | None:
@@ -51,17 +52,26 @@ def fit(u: AnyArray, v: AnyArray, wanted: AnyArray, right_shape: tuple[int, int]
     spread : median distance of the matches from their lines, pixels.
     """
     y, x = np.nonzero(wanted)
+    return fit_points(x, y, u[y, x], v[y, x], wanted.shape, right_shape)
+
+
+def fit_points(
+    x: AnyArray, y: AnyArray, u: AnyArray, v: AnyArray, left_shape: tuple[int, ...], right_shape: tuple[int, ...]
+) -> tuple[Matrix, float] | None:
+    """As :func:`fit`, of matches (n,) of images of these shapes."""
     if len(y) < LEAST_MATCHES:
         return None
-    scale = 0.5 * max(wanted.shape)
-    left_mid = (0.5 * (wanted.shape[1] - 1), 0.5 * (wanted.shape[0] - 1))
+    scale = 0.5 * max(left_shape)
+    left_mid = (0.5 * (left_shape[1] - 1), 0.5 * (left_shape[0] - 1))
     right_mid = (0.5 * (right_shape[1] - 1), 0.5 * (right_shape[0] - 1))
     p = np.stack([(x - left_mid[0]) / scale, (y - left_mid[1]) / scale])
-    q = np.stack([(x + u[y, x] - right_mid[0]) / scale, (y + v[y, x] - right_mid[1]) / scale])
+    q = np.stack([(x + u - right_mid[0]) / scale, (y + v - right_mid[1]) / scale])
     rows = _solve(p, q, SIGMA / scale)
-    cols = _solve(p[::-1], q[::-1], SIGMA / scale)
-    swap = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    f, spread = (rows[0], rows[2]) if rows[1] <= cols[1] else (swap @ cols[0] @ swap, cols[2])
+    f, _, spread = rows
+    if spread * scale > SIGMA:
+        cols = _solve(p[::-1], q[::-1], SIGMA / scale)
+        swap = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+        f, spread = (rows[0], rows[2]) if rows[1] <= cols[1] else (swap @ cols[0] @ swap, cols[2])
     to_left = np.array([[1 / scale, 0.0, -left_mid[0] / scale], [0.0, 1 / scale, -left_mid[1] / scale], [0, 0, 1.0]])
     to_right = np.array([[1 / scale, 0.0, -right_mid[0] / scale], [0.0, 1 / scale, -right_mid[1] / scale], [0, 0, 1.0]])
     return np.asarray(to_right.T @ f @ to_left, dtype=np.float64), spread * scale
@@ -74,22 +84,29 @@ def _solve(p: AnyArray, q: AnyArray, sigma: float) -> tuple[Matrix, float, float
     prior = np.zeros(8)
     prior[6] = -1.0
     precision = np.diag(PRIOR**-2.0)
-    g = prior
+    g, change = prior, math.inf
     spread = math.inf
     for step in range(ITERATIONS):
         residual = residuals(terms, yr, g)
         # Start as wide as the matches scatter about the prior, and narrow to what an integer match deserves.
-        spread = (
-            max(sigma, min(0.5 * spread, 1.5 * float(np.median(np.abs(residual))) + sigma))
-            if step
-            else max(sigma, 2.0 * float(np.median(np.abs(residual))))
-        )
+        middle = typical(residual)
+        wide = max(sigma, min(0.5 * spread, 1.5 * middle + sigma)) if step else max(sigma, 2.0 * middle)
+        if wide == spread and change < SETTLED:
+            break
+        spread = wide
         normal, side = weighted_normal(terms, yr, 1.0 / (1.0 + (residual / spread) ** 2) / sigma**2)
-        g = np.linalg.solve(normal + precision, precision @ prior - side)
+        new = np.linalg.solve(normal + precision, precision @ prior - side)
+        g, change = new, float(np.max(np.abs(new - g) / PRIOR))
     residual = residuals(terms, yr, g)
     cost = float(np.sum(np.log1p((residual / sigma) ** 2)) + np.sum(((g - prior) / PRIOR) ** 2))
     f = np.array([[g[1], g[2], g[0]], [g[3], g[4], 1.0], [g[5], g[6], g[7]]])
-    return f, cost, float(np.median(np.abs(residual)))
+    return f, cost, typical(residual)
+
+
+def typical(residual: AnyArray) -> float:
+    """Median magnitude (the upper one of two)."""
+    size = np.abs(residual)
+    return float(np.partition(size, size.size // 2)[size.size // 2])
 
 
 @njit(cache=True, nogil=True)
@@ -133,13 +150,14 @@ def finer(f: Matrix) -> Matrix:
     return np.asarray(s.T @ f @ s, dtype=np.float64)
 
 
-def near_sign(f: Matrix, u: AnyArray, wanted: AnyArray, right_shape: tuple[int, int]) -> float:
+def near_sign(f: Matrix, u: AnyArray, left_shape: tuple[int, ...], right_shape: tuple[int, ...]) -> float:
     """Sign of the column displacement of near things against far ones: -1 on a usual rig, +1 with images swapped.
 
     On a convergent rig the displacement of far things is not zero; the toe-in shows in the terms ``y'x`` and ``x'y``
     (keystone), which give it for a focal length of about the image width. A vote: only the filling of gaps hangs on it.
+    ``u``: column displacements of matches (n,).
     """
-    rows, cols = wanted.shape
+    rows, cols = left_shape
     to_left = np.array([[1.0, 0.0, 0.5 * (cols - 1)], [0.0, 1.0, 0.5 * (rows - 1)], [0.0, 0.0, 1.0]])
     to_right = np.array(
         [[1.0, 0.0, 0.5 * (right_shape[1] - 1)], [0.0, 1.0, 0.5 * (right_shape[0] - 1)], [0.0, 0.0, 1.0]]
@@ -149,25 +167,29 @@ def near_sign(f: Matrix, u: AnyArray, wanted: AnyArray, right_shape: tuple[int, 
         return -1.0
     shift = 0.5 * (right_shape[1] - cols)
     far = -(g[1, 0] + g[0, 1]) / g[1, 2] * float(cols) ** 2 + shift
-    return -1.0 if np.median(u[wanted]) <= far else 1.0
+    return -1.0 if np.median(u) <= far else 1.0
 
 
-def lines(f: Matrix, shape: tuple[int, ...]) -> NDArray[np.float32]:
-    """Epipolar line of every left pixel: unit normal and offset (row, col, 3) with n . displacement + c = 0."""
-    found = np.empty((shape[0], shape[1], 3), np.float32)
-    write_lines(f, found)
-    return found
+def lines(f: Matrix, shape: tuple[int, ...], x0: int = 0, y0: int = 0) -> NDArray[np.float32]:
+    """Epipolar line of every left pixel: unit normal and offset (row, col, 3) with n . displacement + c = 0.
+
+    ``x0, y0``: first column and row of a window.
+    """
+    found = np.empty((3, shape[0], shape[1]), np.float32)
+    write_lines(f, found, x0, y0)
+    return np.ascontiguousarray(np.moveaxis(found, 0, 2))
 
 
 @njit(cache=True, nogil=True)
-def write_lines(f, found):  # type: ignore[no-untyped-def]
-    """As :func:`lines`, into ``found``."""
-    for j in range(found.shape[0]):
-        y = np.float64(j)
-        for i in range(found.shape[1]):
-            x = np.float64(i)
+def write_lines(f, found, x0=0, y0=0):  # type: ignore[no-untyped-def]
+    """As :func:`lines`, into the planes ``found`` (3, row, col); zeros where ``f`` is zero."""
+    for j in range(found.shape[1]):
+        y = np.float64(j + y0)
+        first, second, third = found[0, j], found[1, j], found[2, j]
+        for i in range(found.shape[2]):
+            x = np.float64(i + x0)
             a = f[0, 0] * x + f[0, 1] * y + f[0, 2]
             b = f[1, 0] * x + f[1, 1] * y + f[1, 2]
             c = f[2, 0] * x + f[2, 1] * y + f[2, 2]
             scale = 1.0 / max(np.sqrt(a * a + b * b), 1e-12)
-            found[j, i, 0], found[j, i, 1], found[j, i, 2] = a * scale, b * scale, (c + a * x + b * y) * scale
+            first[i], second[i], third[i] = a * scale, b * scale, (c + a * x + b * y) * scale

@@ -3,36 +3,62 @@
 Top level: null prediction, large search. At each level: match left to right and right to left, median-filter both,
 back-match, interpolate what failed, and hand the doubled map down as search centres. Between levels the epipolar band
 is fitted anew to the consistent matches, where the solver uses one.
+
+A level is matched window by window (:func:`level_tile`), each wider than what is kept of it by as much as its steps
+reach: two pixels a round of propagation, the median's half side, and one pixel of the coarser level for the parents.
+So the result does not depend on how the image is cut up; one window that is the whole image is one way among others.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stages import features
 from stages.declare import AnyArray
-from stages.hfvm import consistency, epipolar, lookup, paper, propagation, search, subpixel
+from stages.hfvm import consistency, epipolar, lanes, lookup, paper, propagation, search, subpixel
 from stages.hfvm.params import HfvmParams
-from stages.pyramid import Pyramid, filled
+from stages.hfvm.views import Patch, Plain, Seen
+from stages.hfvm.window import (
+    Raster,
+    Results,
+    Shape,
+    Window,
+    around,
+    blocks,
+    bounded,
+    cut,
+    gather,
+    thinned,
+    tiles,
+    whole,
+)
+from stages.pyramid import Pyramid
 
 SUM_RADIUS = 2
 """Pixels: sub-pixel distances are summed over 5 x 5."""
 
-FIT_SAMPLES = 2000
+FIT_SAMPLES = 1000
 """Matches that a band or plane is fitted to; more change nothing that matters and cost time."""
 
 
 @dataclass(frozen=True)
 class Map:
-    """Displacements of one direction at one level: int16 columns and rows; bool, where nothing was matchable."""
+    """Displacements of one direction at one level: int16 columns and rows; bool, where nothing was matchable.
 
-    u: AnyArray
-    v: AnyArray
-    undefined: NDArray[np.bool_]
+    Arrays, or other rasters.
+    """
+
+    u: Any
+    v: Any
+    undefined: Any
+
+    def cut(self, window: Window) -> Map:
+        """The map of a window."""
+        return Map(*(cut(a, window) for a in (self.u, self.v, self.undefined)))
 
 
 @dataclass(frozen=True)
@@ -51,9 +77,9 @@ class Band:
     f: epipolar.Matrix
     mu: float
 
-    def lines(self, shape: tuple[int, ...]) -> AnyArray:
-        """Line of every pixel, nothing where there is no band."""
-        return epipolar.lines(self.f, shape if self.mu > 0 else (1, 1))
+    def lines(self, window: Window) -> AnyArray:
+        """Line of every pixel of a window, nothing where there is no band."""
+        return epipolar.lines(self.f, window.shape if self.mu > 0 else (1, 1), window.x0, window.y0)
 
     def reverse(self) -> Band:
         """The band of the right image."""
@@ -64,20 +90,32 @@ FREE = Band(epipolar.NO_BAND, 0.0)
 
 
 class Solver(Protocol):
-    """One-level matcher of a pyramid onto another one; ``match`` with ``up`` None is the top level."""
+    """One-level matcher of a window of one image onto another one; the other window holds all that can be reached."""
 
     @property
     def uses_band(self) -> bool:
         """Whether ``match`` heeds the band."""
 
-    def match(self, level: int, up: Map | None, band: Band) -> Map:
-        """Integer map of a level from the filled map of the level above."""
+    @property
+    def whole(self) -> bool:
+        """Whether it can match whole images only."""
 
-    def fine(self, level: int, m: Map, wanted: AnyArray) -> Fine:
-        """Sub-pixel map where ``wanted`` is not zero."""
+    def rounds(self, level: int) -> int:
+        """Rounds of propagation at a level; a displacement travels, and changes by, two pixels a round."""
 
     def reverse(self) -> Solver:
         """The matcher from right to left."""
+
+    def match(self, level: int, a: Patch, b: Patch, shapes: tuple[Shape, Shape], up: Map | None, band: Band) -> Map:
+        """Integer map of ``a`` from the filled map of the level above, of the windows' parents; None: top level."""
+
+    def fine(self, a: Patch, b: Patch, m: Map, wanted: AnyArray) -> Fine:
+        """Sub-pixel map where ``wanted`` is not zero, sound a pixel farther in than :data:`SUM_RADIUS`."""
+
+
+def offset(a: Patch, b: Patch) -> tuple[int, int]:
+    """Column and row of the first pixel of ``a`` in the window of ``b``."""
+    return a.window.x0 - b.window.x0, a.window.y0 - b.window.y0
 
 
 ROOM = (("packed", np.int32), ("data", np.int32), ("dirty", np.uint8))
@@ -87,90 +125,101 @@ ROOM = (("packed", np.int32), ("data", np.int32), ("dirty", np.uint8))
 class FastSolver:
     """Packed features, several centres, band, propagation (preset ``default``)."""
 
-    left: tuple[features.Words, ...]
-    right: tuple[features.Words, ...]
     params: HfvmParams
     uses_band: bool = True
+    whole: bool = False
+    back: bool = False
     room: dict[str, AnyArray] = field(default_factory=dict)
 
-    def match(self, level: int, up: Map | None, band: Band) -> Map:
-        """Integer map of a level."""
-        p, a, b = self.params, self.left[level], self.right[level]
-        u, v = np.zeros(a.shape, np.int16), np.zeros(a.shape, np.int16)
-        packed, data, dirty = (self._room(name, a.shape, kind) for name, kind in ROOM)
-        lines = self._room("lines", (*(a.shape if band.mu > 0 else (1, 1)), 3), np.float32)
-        epipolar.write_lines(band.f, lines)
-        if up is None:
-            reach_x, reach_y = top_reach(p, a.shape, b.shape)
-            search.exhaustive(a, b, reach_x, reach_y, 1, u, v)
-            propagation.pack_map(u, v, packed)
-            propagation.costs(a, b, lines, band.mu, packed, data)
-        else:
-            propagation.descend(a, b, up.u, up.v, p.search_columns, p.search_rows, lines, band.mu, packed, data)
+    def rounds(self, level: int) -> int:
+        """Rounds of propagation at a level."""
+        p = self.params
         rounds = p.rounds if level > 0 or p.fine_rounds is None else p.fine_rounds
-        propagation.checkerboard(a, b, packed, data, dirty, lines, band.mu, p.smoothness, rounds)
+        return min(rounds, p.back_rounds) if level == 0 and self.back else rounds
+
+    def reverse(self) -> FastSolver:
+        """The matcher from right to left, in the same room."""
+        return FastSolver(self.params, back=not self.back, room=self.room)
+
+    def match(self, level: int, a: Patch, b: Patch, shapes: tuple[Shape, Shape], up: Map | None, band: Band) -> Map:
+        """Integer map of a level."""
+        p, at, shape = self.params, offset(a, b), a.window.shape
+        u, v = np.zeros(shape, np.int16), np.zeros(shape, np.int16)
+        packed, data, dirty = (self._room(name, shape, kind) for name, kind in ROOM)
+        lines, mu = self._room("lines", (3, *shape), np.float32), np.float32(band.mu)
+        epipolar.write_lines(band.f, lines, a.window.x0, a.window.y0)
+        if up is None:
+            reach_x, reach_y = top_reach(p, *shapes)
+            search.exhaustive(a.words, b.words, reach_x, reach_y, 1, u, v)
+            propagation.pack_map(u, v, packed)
+            data[:] = lanes.FAR
+        else:
+            reach = p.search_columns, p.search_rows
+            propagation.descend(a.words, b.words, up.u, up.v, *reach, p.centres, lines, mu, packed, data, *at)
+        rounds = self.rounds(level)
+        propagation.checkerboard(a.words, b.words, packed, data, dirty, lines, mu, p.smoothness, rounds, *at)
         propagation.unpack(packed, u, v)
-        return Map(u, v, np.zeros(a.shape, bool))
+        return Map(u, v, np.zeros(shape, bool))
 
     def _room(self, name: str, shape: tuple[int, ...], kind: type) -> AnyArray:
         """Array to write to, for both directions and all levels: fresh memory costs more than filling it."""
         size = int(np.prod(shape))
         held = self.room.get(name)
         if held is None or held.size < size:
-            # The finest level is the largest one.
-            most = max(w.size for w in (*self.left, *self.right)) * (3 if name == "lines" else 1)
-            held = self.room[name] = np.empty(most, kind)
+            held = self.room[name] = np.empty(size, kind)
         return held[:size].reshape(shape)
 
-    def fine(self, level: int, m: Map, wanted: AnyArray) -> Fine:
-        """Sub-pixel map from summed distances."""
-        u, v, d = (np.empty(m.u.shape, np.float32) for _ in range(3))
-        subpixel.summed(self.left[level], self.right[level], m.u, m.v, wanted.astype(np.uint8), SUM_RADIUS, u, v, d)
+    def fine(self, a: Patch, b: Patch, m: Map, wanted: AnyArray) -> Fine:
+        """Sub-pixel map from distances summed over :data:`SUM_RADIUS`."""
+        u, v, d = (np.empty(a.window.shape, np.float32) for _ in range(3))
+        at = offset(a, b)
+        subpixel.summed(a.words, b.words, m.u, m.v, wanted.astype(np.uint8), SUM_RADIUS, u, v, d, *at)
         return Fine(u, v, d)
-
-    def reverse(self) -> FastSolver:
-        """The matcher from right to left."""
-        return FastSolver(self.right, self.left, self.params, room=self.room)
 
 
 @dataclass(frozen=True)
 class PaperSolver:
     """Floating-point features, one centre (preset ``paper``)."""
 
-    left: tuple[AnyArray, ...]
-    right: tuple[AnyArray, ...]
     params: HfvmParams
     uses_band: bool = False
+    whole: bool = False
 
-    def match(self, level: int, up: Map | None, band: Band) -> Map:
+    def rounds(self, level: int) -> int:
+        """There is no propagation."""
+        return 0
+
+    def reverse(self) -> PaperSolver:
+        """The same: both ways are alike."""
+        return self
+
+    def match(self, level: int, a: Patch, b: Patch, shapes: tuple[Shape, Shape], up: Map | None, band: Band) -> Map:
         """Integer map of a level; undefined where the least distance exceeds the threshold."""
-        p, a, b = self.params, self.left[level], self.right[level]
-        shape = a.shape[:2]
+        p, shape = self.params, a.window.shape
         if up is None:
-            reach = top_reach(p, shape, b.shape[:2])
+            reach = top_reach(p, *shapes)
             centre = (np.zeros(shape, np.int16), np.zeros(shape, np.int16))
         else:
             reach = (p.search_columns, p.search_rows)
-            centre = (double(up.u, shape), double(up.v, shape))
-        u, v, distance, _ = self._search(level, *centre, *reach)
+            centre = (double(np.asarray(up.u), shape), double(np.asarray(up.v), shape))
+        u, v, distance, _ = self.search(a, b, *centre, *reach)
         return Map(u, v, (distance < 0) | (distance > p.threshold))
 
-    def fine(self, level: int, m: Map, wanted: AnyArray) -> Fine:
+    def fine(self, a: Patch, b: Patch, m: Map, wanted: AnyArray) -> Fine:
         """Linear sub-pixel interpolation around the median-filtered map, evened by the look-up table."""
-        _, _, distance, offset = self._search(level, m.u, m.v, 0, 0)
-        offset = lookup.even(offset)
-        return Fine(m.u + offset[..., 0], m.v + offset[..., 1], distance)
+        _, _, distance, found = self.search(a, b, np.asarray(m.u), np.asarray(m.v), 0, 0)
+        found = lookup.even(found)
+        return Fine(m.u + found[..., 0], m.v + found[..., 1], distance)
 
-    def _search(self, level: int, cu: AnyArray, cv: AnyArray, reach_x: int, reach_y: int) -> tuple[AnyArray, ...]:
-        a, b = self.left[level], self.right[level]
-        u, v = np.empty(a.shape[:2], np.int16), np.empty(a.shape[:2], np.int16)
-        distance, offset = np.empty(a.shape[:2], np.float32), np.empty((*a.shape[:2], 2), np.float32)
-        paper.search(a, b, cu, cv, reach_x, reach_y, u, v, distance, offset)
-        return u, v, distance, offset
-
-    def reverse(self) -> PaperSolver:
-        """The matcher from right to left."""
-        return PaperSolver(self.right, self.left, self.params)
+    def search(
+        self, a: Patch, b: Patch, cu: AnyArray, cv: AnyArray, reach_x: int, reach_y: int
+    ) -> tuple[AnyArray, ...]:
+        """Displacements, distance, and sub-pixel offsets (row, col, 2) of :func:`stages.hfvm.paper.search`."""
+        shape = a.window.shape
+        u, v = np.empty(shape, np.int16), np.empty(shape, np.int16)
+        distance, found = np.empty(shape, np.float32), np.empty((*shape, 2), np.float32)
+        paper.search(a.words, b.words, cu, cv, reach_x, reach_y, u, v, distance, found, *offset(a, b))
+        return u, v, distance, found
 
 
 def top_reach(p: HfvmParams, a: tuple[int, ...], b: tuple[int, ...]) -> tuple[int, int]:
@@ -186,32 +235,42 @@ def double(up: AnyArray, shape: tuple[int, ...]) -> AnyArray:
 
 @dataclass(frozen=True)
 class Prepared:
-    """Features of both images, as the solver of a preset wants them, and the local deviation of the left one."""
+    """Two images and what matches the first one onto the second one. ``side``: pixels of a tile; None: whole."""
 
+    left: Seen
+    right: Seen
     solver: Solver
-    left_valid: tuple[AnyArray, ...]
-    right_valid: tuple[AnyArray, ...]
-    deviation: tuple[AnyArray, ...]
+    params: HfvmParams
+    side: int | None = None
 
+    def reverse(self) -> Prepared:
+        """The matcher from right to left."""
+        return Prepared(self.right, self.left, self.solver.reverse(), self.params, self.side)
 
-def left_features(pyramid: Pyramid, params: HfvmParams) -> tuple[list[AnyArray], list[AnyArray]]:
-    """Features of every level, and local deviations (grey levels)."""
-    images = filled(pyramid)
-    if params.preset == "paper":
-        planes = [features.planes(image) for image in images]
-        return [paper.weighted(p, params.weights) for p in planes], [p[6] for p in planes]
-    packed = [features.pack(image, params.weights) for image in images]
-    return [words for words, _ in packed], [deviation for _, deviation in packed]
+    def shapes(self, level: int) -> tuple[Shape, Shape]:
+        """Rows and columns of both images."""
+        return self.left.view.shapes[level], self.right.view.shapes[level]
+
+    @property
+    def levels(self) -> int:
+        """Levels that both have."""
+        return min(len(self.left.view.shapes), len(self.right.view.shapes))
+
+    def deviation(self, level: int, window: Window) -> AnyArray:
+        """Local deviation of the left image, grey levels."""
+        patch = self.left.patch(level, window, deviation=True)
+        assert patch.deviation is not None
+        return patch.deviation[window.inside(patch.window)]
 
 
 def prepare(left: Pyramid, right: Pyramid, params: HfvmParams) -> Prepared:
-    """Features of two pyramids; of the levels that both have."""
-    n = min(left.levels, right.levels)
-    a, deviation = left_features(left, params)
-    b, _ = left_features(right, params)
-    kind: type[PaperSolver] | type[FastSolver] = PaperSolver if params.preset == "paper" else FastSolver
-    solver: Solver = kind(tuple(a[:n]), tuple(b[:n]), params)
-    return Prepared(solver, left.valid, right.valid, tuple(deviation))
+    """The matcher of two pyramids in memory."""
+    return Prepared(Seen(Plain.of(left), params), Seen(Plain.of(right), params), solver(params), params)
+
+
+def solver(params: HfvmParams) -> Solver:
+    """One-level matcher of a preset; without propagation along paths."""
+    return PaperSolver(params) if params.preset == "paper" else FastSolver(params)
 
 
 @dataclass(frozen=True)
@@ -221,80 +280,192 @@ class State:
     level: int
     left: Map
     right: Map
-    left_ok: NDArray[np.bool_]
-    right_ok: NDArray[np.bool_]
+    left_ok: Any
+    right_ok: Any
     band: Band
     near_sign: float
 
+    def reverse(self) -> State:
+        """The same from right to left."""
+        return State(
+            self.level, self.right, self.left, self.right_ok, self.left_ok, self.band.reverse(), -self.near_sign
+        )
+
 
 def run(pair: Prepared, params: HfvmParams, stop: int, start: State | None = None, near_sign: float = 0.0) -> State:
-    """Match from the top level (or below ``start``) down to level ``stop``.
+    """Match from the top level (or below ``start``) down to level ``stop``, all in memory.
 
     ``near_sign``: -1 where nearer things have lesser column displacements, +1 greater; 0 = find out.
     """
     state = start
-    top = len(pair.deviation) - 1 if start is None else start.level - 1
-    top = min(top, len(pair.right_valid) - 1)
+    top = pair.levels - 1 if start is None else start.level - 1
     for level in range(top, min(stop, top) - 1, -1):
-        state = _level(pair, params, level, state, near_sign)
+        state = _level(pair, level, state, near_sign)
     assert state is not None
     return state
 
 
-def _level(pair: Prepared, params: HfvmParams, level: int, above: State | None, near_sign: float) -> State:
-    forward, backward = pair.solver, pair.solver.reverse()
-    band = above.band if above else FREE
-    sign = above.near_sign if above else near_sign
-    a = forward.match(level, _hand_down(above.left, above.left_ok, sign, params) if above else None, band)
-    b = backward.match(level, _hand_down(above.right, above.right_ok, -sign, params) if above else None, band.reverse())
-    a, b = (
-        Map(consistency.median(m.u, params.median), consistency.median(m.v, params.median), m.undefined) for m in (a, b)
-    )
-    left_ok = (
-        ~a.undefined
-        & (pair.left_valid[level] != 0)
-        & (integer_error(a, b, pair.right_valid[level]) <= params.backmatch)
-    )
-    right_ok = (
-        ~b.undefined
-        & (pair.right_valid[level] != 0)
-        & (integer_error(b, a, pair.left_valid[level]) <= params.backmatch)
-    )
-    state = State(level, a, b, left_ok, right_ok, FREE, sign)
-    return _with_band(pair, params, state) if forward.uses_band and params.band > 0 and level > 0 else state
+def _level(pair: Prepared, level: int, above: State | None, near_sign: float) -> State:
+    maps = []
+    for way, up in ((pair, above), (pair.reverse(), above.reverse() if above else None)):
+        shape = way.shapes(level)[0]
+        found = gather(shape, ((w, level_tile(way, level, w, up)) for w in level_tiles(way, level)))
+        maps.append(Map(found["u"], found["v"], found["undefined"]))
+    return settle(pair, level, maps[0], maps[1], above.near_sign if above else near_sign)
 
 
-def integer_error(a: Map, b: Map, b_valid: AnyArray) -> AnyArray:
-    """Back-matching error of an integer map, pixels."""
-    error = np.empty(a.u.shape, np.float32)
-    consistency.integer_error(a.u, a.v, b.u, b.v, b_valid, error)
-    return error
+def settle(pair: Prepared, level: int, left: Map, right: Map, near_sign: float) -> State:
+    """The state of a level whose maps are in memory, with the band for the next finer one.
+
+    At the finest level, below others, sub-pixel maps are checked instead.
+    """
+    if level == 0 and pair.levels > 1:
+        nothing = np.zeros((1, 1), bool)
+        return State(level, left, right, nothing, nothing, FREE, near_sign)
+    both = []
+    for way, a, b in ((pair, left, right), (pair.reverse(), right, left)):
+        shape = way.shapes(level)[0]
+        windows = tiles(shape, way.side)
+        both.append(gather(shape, ((w, {"ok": consistent(way, level, a, b, w)}) for w in windows))["ok"])
+    state = State(level, left, right, both[0], both[1], FREE, near_sign)
+    return with_band(pair, state)
 
 
-def _hand_down(m: Map, ok: AnyArray, near_sign: float, params: HfvmParams) -> Map:
-    """Map whose inconsistent pixels are interpolated along their row (4.3.4)."""
-    u, v = m.u.astype(np.float32), m.v.astype(np.float32)
-    consistency.fill_rows(u, v, ok, params.fill_reach, near_sign or -1.0, np.zeros(ok.shape, np.uint8))
-    return Map(np.rint(u).astype(np.int16), np.rint(v).astype(np.int16), m.undefined)
+def level_tiles(pair: Prepared, level: int) -> list[Window]:
+    """Tiles that a level is matched in; the top level, whose search is exhaustive, is one."""
+    top = level == pair.levels - 1
+    return tiles(pair.shapes(level)[0], None if top or pair.solver.whole else pair.side)
 
 
-def sample(ok: AnyArray, count: int) -> NDArray[np.bool_]:
+def level_tile(pair: Prepared, level: int, window: Window, above: State | None) -> Results:
+    """Map of the left image's window: ``u``, ``v`` int16, ``undefined`` bool."""
+    p, rounds, (shape, other) = pair.params, pair.solver.rounds(level), pair.shapes(level)
+    reach = 2 * rounds + p.median // 2 + 2
+    outer = window.grow(reach, reach, shape).align(2, shape)
+    a = pair.left.patch(level, outer)
+    if above is None:
+        found = pair.solver.match(level, a, pair.right.patch(level, whole(other)), (shape, other), None, FREE)
+    else:
+        up = hand_down(above, outer.parent(), p)
+        # A centre is moved by a pixel at most, searched around, and changed by one in each half round.
+        x, y = p.search_columns + 1 + 2 * rounds, p.search_rows + 1 + 2 * rounds
+        target = bounded(
+            outer.y0 + 2 * int(np.min(up.v)) - y,
+            outer.y1 + 2 * int(np.max(up.v)) + y,
+            outer.x0 + 2 * int(np.min(up.u)) - x,
+            outer.x1 + 2 * int(np.max(up.u)) + x,
+            other,
+        )
+        found = pair.solver.match(level, a, pair.right.patch(level, target), (shape, other), up, above.band)
+    inner = window.inside(outer)
+    u, v = (consistency.median(np.asarray(plane), p.median)[inner] for plane in (found.u, found.v))
+    return {"u": u, "v": v, "undefined": np.asarray(found.undefined)[inner]}
+
+
+def consistent(pair: Prepared, level: int, a: Map, b: Map, window: Window) -> NDArray[np.bool_]:
+    """Usable left pixels of a window whose integer displacement the other map confirms."""
+    own, found = a.cut(window), np.zeros(window.shape, bool)
+    usable = pair.left.view.valid(level, window)
+    for block in _landing(own.u, own.v, window, b.u):
+        bu, bv, valid = cut(b.u, block), cut(b.v, block), pair.right.view.valid(level, block)
+        at = window.x0 - block.x0, window.y0 - block.y0
+        consistency.agree(own.u, own.v, bu, bv, usable, valid, pair.params.backmatch, found, *at)
+    return np.asarray(found & (own.undefined == 0))
+
+
+def _landing(u: AnyArray, v: AnyArray, window: Window, raster: Raster) -> Iterable[Window]:
+    """Pieces of the other image's raster on which the pixels of a window land."""
+    if isinstance(raster, np.ndarray):
+        return [whole(raster.shape)]
+    y, x = np.indices(window.shape, np.int32)
+    y, x = y + (window.y0 + v.astype(np.int32)), x + (window.x0 + u.astype(np.int32))
+    return blocks(raster, y, x, (y >= 0) & (y < raster.shape[0]) & (x >= 0) & (x < raster.shape[1]))
+
+
+def hand_down(state: State, window: Window, params: HfvmParams) -> Map:
+    """Map of a left window whose inconsistent pixels are interpolated along their row (4.3.4)."""
+    outer = window.grow(0, params.fill_reach, state.left.u.shape)
+    own, ok = state.left.cut(outer), cut(state.left_ok, outer)
+    u, v = (np.asarray(a).astype(np.float32) for a in (own.u, own.v))
+    consistency.fill_rows(u, v, ok, params.fill_reach, state.near_sign or -1.0, np.zeros(ok.shape, np.uint8))
+    inner = window.inside(outer)
+    columns, rows = (np.ascontiguousarray(np.rint(a[inner]).astype(np.int16)) for a in (u, v))
+    return Map(columns, rows, np.asarray(own.undefined)[inner])
+
+
+def fine_tile(pair: Prepared, level: int, a: Map, window: Window, wanted: AnyArray | None) -> Fine:
+    """Sub-pixel map of a left window, distance -1 outside or where not ``wanted`` (None: everywhere).
+
+    Reach: :data:`SUM_RADIUS`.
+    """
+    shape, other = pair.shapes(level)
+    outer = window.grow(SUM_RADIUS, SUM_RADIUS, shape)
+    own = a.cut(outer)
+    use = np.zeros(outer.shape, bool)
+    use[window.inside(outer)] = True if wanted is None else wanted
+    target = landing(own, outer, other, SUM_RADIUS + 1, None if pair.params.preset == "paper" else use)
+    found = pair.solver.fine(pair.left.patch(level, outer), pair.right.patch(level, target), own, use)
+    inner = window.inside(outer)
+    return Fine(*(np.ascontiguousarray(plane[inner]) for plane in (found.u, found.v, found.distance)))
+
+
+def landing(m: Map, window: Window, shape: Shape, margin: int, wanted: AnyArray | None) -> Window:
+    """Window of the other image, of ``shape``, on which the ``wanted`` pixels (None: all) of a window land."""
+    y, x = np.indices(window.shape, np.int32)
+    return around(y + (window.y0 + m.v), x + (window.x0 + m.u), shape, margin, wanted)
+
+
+def fine(pair: Prepared, state: State) -> Fine:
+    """Sub-pixel map of a whole level in memory."""
+    return fine_tile(pair, state.level, state.left, whole(state.left.u.shape), None)
+
+
+@dataclass(frozen=True)
+class Sample:
+    """Sub-pixel matches of a level, in reading order: flat indices, columns, rows, displacements (n,)."""
+
+    places: NDArray[np.int64]
+    x: AnyArray
+    y: AnyArray
+    u: AnyArray
+    v: AnyArray
+
+
+def sample(pair: Prepared, state: State) -> Sample:
+    """About :data:`FIT_SAMPLES` evenly strided consistent matches of a level."""
+    shape = state.left.u.shape
+    places = thinned(state.left_ok, FIT_SAMPLES, lambda ok: ok != 0)
+    y, x = np.divmod(places, shape[1])
+    u, v = np.empty(len(y), np.float32), np.empty(len(y), np.float32)
+    for w in tiles(shape, pair.side):
+        here = (y >= w.y0) & (y < w.y1) & (x >= w.x0) & (x < w.x1)
+        if not here.any():
+            continue
+        wanted = np.zeros(w.shape, bool)
+        at = y[here] - w.y0, x[here] - w.x0
+        wanted[at] = True
+        found = fine_tile(pair, state.level, state.left, w, wanted)
+        u[here], v[here] = found.u[at], found.v[at]
+    return Sample(places, x, y, u, v)
+
+
+def evenly(ok: AnyArray, count: int) -> NDArray[np.bool_]:
     """About ``count`` evenly strided pixels of a mask."""
-    found = np.flatnonzero(ok)
     chosen = np.zeros(ok.shape, dtype=bool)
-    chosen.reshape(-1)[found[:: max(1, len(found) // count)]] = True
+    chosen.reshape(-1)[thinned(ok, count, lambda a: a != 0)] = True
     return chosen
 
 
-def _with_band(pair: Prepared, params: HfvmParams, state: State) -> State:
-    wanted = sample(state.left_ok, FIT_SAMPLES)
-    fine = pair.solver.fine(state.level, state.left, wanted)
-    right_shape = state.right.u.shape
-    found = epipolar.fit(fine.u, fine.v, wanted, right_shape)
+def with_band(pair: Prepared, state: State) -> State:
+    """The state with the epipolar band for the next finer level, where there is one and it can be fitted."""
+    if not (pair.solver.uses_band and pair.params.band > 0 and state.level > 0):
+        return state
+    s, (shape, other) = sample(pair, state), pair.shapes(state.level)
+    found = epipolar.fit_points(s.x, s.y, s.u, s.v, shape, other)
     if found is None:
         return state
     f, spread = found
     # Where lenses bend the lines, or the fit is poor, the band gives way.
-    mu = params.band * min(1.0, epipolar.SHARP / max(spread, 1e-9))
-    sign = state.near_sign or epipolar.near_sign(f, fine.u, wanted, right_shape)
+    mu = pair.params.band * min(1.0, epipolar.SHARP / max(spread, 1e-9))
+    sign = state.near_sign or epipolar.near_sign(f, s.u, shape, other)
     return State(state.level, state.left, state.right, state.left_ok, state.right_ok, Band(epipolar.finer(f), mu), sign)

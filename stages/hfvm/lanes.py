@@ -1,14 +1,15 @@
-"""Eight feature distances at once: vector code for the search kernels (numba intrinsics written in LLVM IR).
+"""Eight pixels at once: vector code for the search kernels (numba intrinsics written in LLVM IR).
 
 A feature vector is one 64-bit word, so eight of them fill a 512-bit register, and x86 adds the absolute differences of
 the bytes of each word in one instruction (``psadbw``, in 512, 256 or 128 bits). Elsewhere the same sums come from
 generic vector code; both give the same integers.
 
-Costs: distance + trunc(mu * |a u + b v + c|), with the epipolar line (a, b, c) in float32 and the sum in float64.
+Costs: distance + trunc(mu * |a u + b v + c|), with the epipolar line (a, b, c) and the sum in float32.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import llvmlite.binding as llvm  # type: ignore[import-untyped]
@@ -83,14 +84,6 @@ def _distances(builder: Any, a: Any, b: Any, width: int) -> Any:
     return builder.lshr(total, _vector(_WORDS, [48] * LANES))
 
 
-def _band(builder: Any, u: Any, v: Any, line: Any, mu: Any) -> Any:
-    """trunc(mu |a u + b v + c|) as eight 64-bit integers; ``u, v`` vectors of 32-bit integers."""
-    a, b, c = (_splat(builder, builder.fpext(x, ir.DoubleType())) for x in line)
-    x, y = builder.sitofp(u, _DOUBLES), builder.sitofp(v, _DOUBLES)
-    e = builder.fadd(builder.fadd(builder.fmul(a, x), builder.fmul(b, y)), c)
-    return builder.fptosi(builder.fmul(_splat(builder, mu), _call(builder, "llvm.fabs.v8f64", _DOUBLES, e)), _WORDS)
-
-
 def _pointer(context: Any, builder: Any, kind: Any, array: Any, index: Any) -> Any:
     data = context.make_array(kind)(context, builder, array).data
     return builder.gep(data, [index])
@@ -100,49 +93,9 @@ def _as(builder: Any, pointer: Any, kind: Any) -> Any:
     return builder.bitcast(pointer, ir.PointerType(kind))
 
 
-def _least(builder: Any, keys: Any) -> Any:
-    return _call(builder, "llvm.vector.reduce.smin.v8i64", _I64, keys)
-
-
 WORDS = types.Array(types.uint64, 1, "C")
 PAIRS = types.Array(types.int32, 1, "C")
 LINES = types.Array(types.float32, 1, "C")
-ORDER = 20
-"""Bits of a key below the cost: which candidate it was, so that of equal costs the first one wins."""
-
-NOTHING = (1 << 62) - 1
-"""Key above every key."""
-
-
-def make_run(width: int) -> Any:
-    """Intrinsic ``run(word, right, start, count, u, v, a, b, c, mu, order)``, see :data:`run`."""
-
-    @intrinsic
-    def run(typingctx, word, right, start, count, u, v, a, b, c, mu, order):  # type: ignore[no-untyped-def]
-        f32, i64 = types.float32, types.int64
-        signature = types.int64(types.uint64, WORDS, i64, i64, i64, i64, f32, f32, f32, types.float64, i64)
-
-        def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
-            word, right, start, count, u, v, a, b, c, mu, order = args
-            steps = _vector(_WORDS, range(LANES))
-            inside = builder.icmp_signed("<", steps, _splat(builder, count))
-            p = _as(builder, _pointer(context, builder, sig.args[1], right, start), _WORDS)
-            # Lanes beyond ``count`` are not read: they may lie behind the image.
-            words = _load(builder, p, inside)
-            cost = _distances(builder, _splat(builder, word), words, width)
-            with_band = builder.fcmp_ordered(">", mu, ir.Constant(ir.DoubleType(), 0.0))
-            slot = cgutils.alloca_once_value(builder, cost)
-            with builder.if_then(with_band):
-                us = builder.add(_splat(builder, builder.trunc(u, _I32)), _vector(_INTS, range(LANES)))
-                vs = _splat(builder, builder.trunc(v, _I32))
-                builder.store(builder.add(cost, _band(builder, us, vs, (a, b, c), mu)), slot)
-            keys = builder.shl(builder.load(slot), _vector(_WORDS, [ORDER] * LANES))
-            keys = builder.add(keys, builder.add(_splat(builder, order), steps))
-            return _least(builder, builder.select(inside, keys, _vector(_WORDS, [NOTHING] * LANES)))
-
-        return signature, codegen
-
-    return run
 
 
 def _load(builder: Any, pointer: Any, inside: Any) -> Any:
@@ -152,113 +105,284 @@ def _load(builder: Any, pointer: Any, inside: Any) -> Any:
     return builder.call(f, [pointer, ir.Constant(_I32, 8), inside, _vector(_WORDS, [0] * LANES)])
 
 
-run = make_run(widest())
-"""``run(word, right, start, count, u, v, a, b, c, mu, order)``: the best of ``count`` <= 8 candidates side by side.
-
-Candidate i is word ``right[start + i]`` at displacement (u + i, v). Returns the least ``cost << ORDER | order + i``.
-"""
-
-
-def make_around(width: int) -> Any:
-    """Intrinsic ``around``, see :data:`around`."""
-
-    @intrinsic
-    def around(typingctx, word, right, rows, cols, x, y, own, data, up, west, east, down, smooth, a, b, c, mu):  # type: ignore[no-untyped-def]
-        f32, i64, i32 = types.float32, types.int64, types.int32
-        signature = types.int64(
-            types.uint64, WORDS, i64, i64, i64, i64, i32, i64, i32, i32, i32, i32, i64, f32, f32, f32, types.float64
-        )
-
-        def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
-            word, right, rows, cols, x, y, own, data, up, west, east, down, smooth, a, b, c, mu = args
-            halves = ir.VectorType(_I16, 2 * LANES)
-            near = [up, west, east, down]
-            packed = _splat(builder, own)
-            for lane, value in enumerate(near, 4):
-                packed = builder.insert_element(packed, value, ir.Constant(_I32, lane))
-            mine = _own_roughness(builder, packed, own)
-            steps = [-1, 0, 1, 0, 0, -1, 0, 1] + [0] * 8
-            tried = builder.add(builder.bitcast(packed, halves), _vector(halves, steps))
-            cost = _roughness(builder, tried, near)
-            cost = builder.zext(builder.mul(cost, _splat(builder, builder.trunc(smooth, _I32))), _WORDS)
-            pairs = builder.bitcast(tried, _INTS)
-            sixteen = _vector(_INTS, [16] * LANES)
-            u, v = builder.ashr(builder.shl(pairs, sixteen), sixteen), builder.ashr(pairs, sixteen)
-            rows, cols, x, y = (_splat(builder, builder.trunc(n, _I32)) for n in (rows, cols, x, y))
-            xr, yr = builder.add(x, u), builder.add(y, v)
-            # Compared without sign: below zero is beyond the end.
-            inside = builder.and_(builder.icmp_unsigned("<", xr, cols), builder.icmp_unsigned("<", yr, rows))
-            index = builder.add(builder.mul(yr, cols), xr)
-            image = context.make_array(sig.args[1])(context, builder, right).data
-            words = _gather(builder, image, index, inside)
-            cost = builder.add(cost, _distances(builder, _splat(builder, word), words, width))
-            slot = cgutils.alloca_once_value(builder, cost)
-            with builder.if_then(builder.fcmp_ordered(">", mu, ir.Constant(ir.DoubleType(), 0.0))):
-                builder.store(builder.add(cost, _band(builder, u, v, (a, b, c), mu)), slot)
-            keys = builder.shl(builder.load(slot), _vector(_WORDS, [COST] * LANES))
-            keys = builder.or_(keys, _vector(_WORDS, [(i + 1) << 32 for i in range(LANES)]))
-            keys = builder.or_(keys, builder.zext(pairs, _WORDS))
-            best = _least(builder, builder.select(inside, keys, _vector(_WORDS, [NOTHING] * LANES)))
-            total = builder.add(data, builder.mul(smooth, builder.zext(mine, _I64)))
-            stay = builder.or_(builder.shl(total, ir.Constant(_I64, COST)), builder.zext(own, _I64))
-            return builder.select(builder.icmp_signed("<", best, stay), best, stay)
-
-        return signature, codegen
-
-    return around
-
-
-COST = 36
-"""Bits of a key of ``around`` below the cost: four for the order, 32 for the packed displacement."""
-
 TRUNCATION = 2
 """Pixels: beyond this a step to a neighbour costs no more, so that depth edges stay."""
 
+FAR = 1 << 25
+"""Cost above every cost."""
 
-def _roughness(builder: Any, tried: Any, near: list[Any]) -> Any:
+_FLOATS8 = ir.VectorType(ir.FloatType(), LANES)
+_HALVES = ir.VectorType(_I16, 2 * LANES)
+_ALL = ir.Constant(_MASK, [1] * LANES)
+
+
+def _gather(builder: Any, data: Any, index: Any, kind: Any, inside: Any = None) -> Any:
+    """Elements of vector type ``kind`` at eight 32-bit indices; anything where not ``inside``.
+
+    Eight single loads: gather instructions take three times as long on processors with their mitigation.
+    """
+    if inside is not None:
+        index = builder.select(inside, index, _vector(_INTS, [0] * LANES))
+    found = ir.Constant(kind, ir.Undefined)
+    for lane in range(LANES):
+        i = builder.sext(builder.extract_element(index, ir.Constant(_I32, lane)), _I64)
+        found = builder.insert_element(found, builder.load(builder.gep(data, [i])), ir.Constant(_I32, lane))
+    return found
+
+
+@dataclass
+class _Pixels:
+    """Eight pixels of a row in a kernel under construction: columns, words, lines, and the image to search."""
+
+    builder: Any
+    width: int
+    x: Any
+    y: Any
+    words: Any
+    line: tuple[Any, Any, Any]
+    mu: Any
+    image: Any
+    rows: Any
+    cols: Any
+
+    def cost(self, tried: Any, alike: bool = False) -> tuple[Any, Any]:
+        """Distance + trunc(mu |a u + b v + c|) at packed displacements, and which of them lie in the image.
+
+        ``alike``: all displacements are equal and the pixels lie side by side, so that their words do, too.
+        """
+        builder, sixteen = self.builder, _vector(_INTS, [16] * LANES)
+        u, v = builder.ashr(builder.shl(tried, sixteen), sixteen), builder.ashr(tried, sixteen)
+        xr, yr = builder.add(self.x, u), builder.add(self.y, v)
+        # Compared without sign: below zero is beyond the end.
+        inside = builder.and_(builder.icmp_unsigned("<", xr, self.cols), builder.icmp_unsigned("<", yr, self.rows))
+        index = builder.add(builder.mul(yr, self.cols), xr)
+        if alike:
+            first = builder.sext(builder.extract_element(index, ir.Constant(_I32, 0)), _I64)
+            found = _load(builder, _as(builder, builder.gep(self.image, [first]), _WORDS), inside)
+        else:
+            found = _gather(builder, self.image, index, _WORDS, inside)
+        distance = builder.trunc(_distances(builder, self.words, found, self.width), _INTS)
+        a, b, c = self.line
+        across = builder.fmul(a, builder.sitofp(u, _FLOATS8))
+        off = builder.fadd(builder.fadd(across, builder.fmul(b, builder.sitofp(v, _FLOATS8))), c)
+        band = builder.fmul(self.mu, _call(builder, "llvm.fabs.v8f32", _FLOATS8, off))
+        return builder.add(distance, builder.fptosi(band, _INTS)), inside
+
+
+def _rough(builder: Any, tried: Any, near: list[Any]) -> Any:
     """Sum over the neighbours of min(|du| + |dv|, TRUNCATION), eight 32-bit integers."""
-    halves = ir.VectorType(_I16, 2 * LANES)
     low, sixteen = _vector(_INTS, [0xFFFF] * LANES), _vector(_INTS, [16] * LANES)
-    most = _vector(_INTS, [TRUNCATION] * LANES)
-    total = _vector(_INTS, [0] * LANES)
+    most, total = _vector(_INTS, [TRUNCATION] * LANES), _vector(_INTS, [0] * LANES)
     no_poison = ir.Constant(ir.IntType(1), 0)
     for n in near:
-        d = builder.sub(builder.bitcast(_splat(builder, n), halves), tried)
-        size = builder.bitcast(_call(builder, "llvm.abs.v16i16", halves, d, no_poison), _INTS)
+        d = builder.sub(builder.bitcast(n, _HALVES), builder.bitcast(tried, _HALVES))
+        size = builder.bitcast(_call(builder, "llvm.abs.v16i16", _HALVES, d, no_poison), _INTS)
         both = builder.add(builder.and_(size, low), builder.lshr(size, sixteen))
         total = builder.add(total, _call(builder, "llvm.umin.v8i32", _INTS, both, most))
     return total
 
 
-def _own_roughness(builder: Any, packed: Any, own: Any) -> Any:
-    """Roughness of a pixel's own displacement, its neighbours being lanes 4 to 7 of ``packed``."""
-    four, eight = ir.VectorType(_I32, 4), ir.VectorType(_I16, 8)
-    last = ir.Constant(four, [4, 5, 6, 7])
-    near = builder.bitcast(builder.shuffle_vector(packed, packed, last), eight)
-    d = builder.sub(near, builder.bitcast(_splat(builder, own, 4), eight))
-    size = builder.bitcast(_call(builder, "llvm.abs.v8i16", eight, d, ir.Constant(ir.IntType(1), 0)), four)
-    both = builder.add(builder.and_(size, _vector(four, [0xFFFF] * 4)), builder.lshr(size, _vector(four, [16] * 4)))
-    steps = _call(builder, "llvm.umin.v4i32", four, both, _vector(four, [TRUNCATION] * 4))
-    return _call(builder, "llvm.vector.reduce.add.v4i32", _I32, steps)
+def _any(builder: Any, mask: Any) -> Any:
+    return builder.icmp_unsigned("!=", builder.bitcast(mask, _I8), ir.Constant(_I8, 0))
 
 
-def _gather(builder: Any, data: Any, index: Any, inside: Any) -> Any:
-    """Words at eight indices where ``inside``, else 0."""
-    offset = builder.shl(builder.sext(index, _WORDS), _vector(_WORDS, [3] * LANES))
-    address = builder.add(_splat(builder, builder.ptrtoint(data, _I64)), offset)
-    pointers = builder.inttoptr(address, ir.VectorType(ir.PointerType(), LANES))
-    kind = ir.FunctionType(_WORDS, [pointers.type, _I32, _MASK, _WORDS])
-    f = cgutils.get_or_insert_function(builder.module, kind, "llvm.masked.gather.v8i64.v8p0")
-    return builder.call(f, [pointers, ir.Constant(_I32, 8), inside, _vector(_WORDS, [0] * LANES)])
+def make_settle(width: int) -> Any:
+    """Intrinsic ``settle``, see :data:`settle`."""
+
+    @intrinsic
+    def settle(  # type: ignore[no-untyped-def]
+        typingctx, left, right, packed, data, lines, todo, at, here, above, below, y, shape, smooth, mu, new, cost
+    ):
+        i64 = types.int64
+        sizes = types.UniTuple(i64, 5)
+        signature = types.void(
+            WORDS, WORDS, PAIRS, PAIRS, LINES, PAIRS, i64, i64, i64, i64, i64, sizes, i64, types.float32, PAIRS, PAIRS
+        )
+
+        def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
+            left, right, packed, data, lines = (
+                context.make_array(kind)(context, builder, a).data
+                for kind, a in zip(sig.args[:5], args[:5], strict=True)
+            )
+            at, here, above, below, y = args[6:11]
+            rows, cols, left_cols, size, ahead = (
+                builder.trunc(n, _I32) for n in cgutils.unpack_tuple(builder, args[11])
+            )
+            x = builder.load(_as(builder, _pointer(context, builder, sig.args[5], args[5], at), _INTS), align=4)
+            one, nil = _vector(_INTS, [1] * LANES), _vector(_INTS, [0] * LANES)
+            last = _splat(builder, builder.sub(left_cols, ir.Constant(_I32, 1)))
+            # Beyond the border the pixel on the other side stands in.
+            first, final = builder.icmp_signed("==", x, nil), builder.icmp_signed("==", x, last)
+            west = builder.select(first, _call(builder, "llvm.smin.v8i32", _INTS, one, last), builder.sub(x, one))
+            back = _call(builder, "llvm.smax.v8i32", _INTS, builder.sub(last, one), nil)
+            east = builder.select(final, back, builder.add(x, one))
+
+            def read(array: Any, row: Any, column: Any, kind: Any) -> Any:
+                return _gather(builder, array, builder.add(column, _splat(builder, builder.trunc(row, _I32))), kind)
+
+            own, stay = read(packed, here, x, _INTS), read(data, here, x, _INTS)
+            near = [read(packed, row, i, _INTS) for row, i in ((above, x), (here, west), (here, east), (below, x))]
+            place = builder.add(x, _splat(builder, builder.trunc(here, _I32)))
+            line = []
+            for _ in range(3):
+                line.append(_gather(builder, lines, place, _FLOATS8))
+                place = builder.add(place, _splat(builder, size))
+            pixels = _Pixels(
+                builder, width, builder.add(x, _splat(builder, ahead)), _splat(builder, builder.trunc(y, _I32)),
+                read(left, here, x, _WORDS),
+                (line[0], line[1], line[2]), _splat(builder, args[13]), right, _splat(builder, rows),
+                _splat(builder, cols),
+            )  # fmt: skip
+            smooth = _splat(builder, builder.trunc(args[12], _I32))
+            total = builder.add(stay, builder.mul(smooth, _rough(builder, own, near)))
+            best, found, least = (cgutils.alloca_once_value(builder, a) for a in (own, stay, total))
+
+            def attempt(tried: Any) -> None:
+                cost, inside = pixels.cost(tried)
+                total = builder.add(cost, builder.mul(smooth, _rough(builder, tried, near)))
+                better = builder.and_(inside, builder.icmp_signed("<", total, builder.load(least)))
+                for slot, value in ((best, tried), (found, cost), (least, total)):
+                    builder.store(builder.select(better, value, builder.load(slot)), slot)
+
+            for tried in near:
+                with builder.if_then(_any(builder, builder.icmp_signed("!=", tried, own))):
+                    attempt(tried)
+            for kind, array, slot in ((sig.args[14], args[14], best), (sig.args[15], args[15], found)):
+                pointer = _as(builder, _pointer(context, builder, kind, array, at), _INTS)
+                builder.store(builder.load(slot), pointer, align=4)
+            return context.get_dummy_value()
+
+        return signature, codegen
+
+    return settle
 
 
-around = make_around(widest())
-"""``around(word, right, rows, cols, x, y, own, data, up, west, east, down, smooth, a, b, c, mu)``: the best
-displacement among a pixel's own, that +-1, and those of its four neighbours, in the image ``right`` (rows x cols).
+settle = make_settle(widest())
+"""``settle(left, right, packed, data, lines, todo, at, here, above, below, y, shape, smooth, mu, new, cost)``: the best
+displacement of eight pixels of row ``y`` among each one's own and those of its four neighbours.
 
-Displacements are packed, v << 16 | u; ``data`` is the cost of ``own`` without smoothness. In this order: own, own
-u - 1, u + 1, v - 1, v + 1, up, west, east, down; the first of equal ones wins. Costs have ``smooth`` times the
-roughness added. Returns ``cost << COST | order << 32 | packed``.
+``todo[at : at + 8]``: columns of the pixels, no two of them neighbours. All arrays are flat: words of both images;
+``packed`` displacements, v << 16 | u, and their costs without smoothness; ``lines``: three planes of the left image's
+size. ``here, above, below``: index at which the row and its neighbours begin. ``shape``: rows and columns of the right
+image, columns and size of the left one, and the column of the left one's first pixel in the right one, as ``y`` is the
+row there: both may be windows. In this order: own, up, west, east, down; the first of equal ones wins. Costs have
+``smooth`` times the roughness added. ``new[at : at + 8]`` gets the best ones and
+``cost`` their costs without smoothness.
+"""
+
+
+def make_seek(width: int) -> Any:
+    """Intrinsic ``seek``, see :data:`seek`."""
+
+    @intrinsic
+    def seek(typingctx, left, right, centres, lines, x, y, here, parents, beside, shape, reach, mu, packed, data):  # type: ignore[no-untyped-def]
+        i64 = types.int64
+        signature = types.void(
+            WORDS, WORDS, PAIRS, LINES, i64, i64, i64, i64, i64, types.UniTuple(i64, 5), types.UniTuple(i64, 3),
+            types.float32, PAIRS, PAIRS,
+        )  # fmt: skip
+
+        def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
+            _, right, centres = (
+                context.make_array(kind)(context, builder, a).data
+                for kind, a in zip(sig.args[:3], args[:3], strict=True)
+            )
+            start, y, here, parents, beside = args[4:9]
+            rows, cols, left_cols, size, ahead = cgutils.unpack_tuple(builder, args[9])
+            reach_x, reach_y, count = cgutils.unpack_tuple(builder, args[10])
+
+            def narrow(n: Any) -> Any:
+                return _splat(builder, builder.trunc(n, _I32))
+
+            x = builder.add(narrow(start), _vector(_INTS, range(LANES)))
+            valid = builder.icmp_signed("<", x, narrow(left_cols))
+            first = builder.add(here, start)
+
+            def read(k: int, at: Any, kind: Any, name: str) -> Any:
+                pointer = _as(builder, _pointer(context, builder, sig.args[k], args[k], at), kind)
+                f = ir.FunctionType(kind, [pointer.type, _I32, _MASK, kind])
+                load = cgutils.get_or_insert_function(builder.module, f, f"llvm.masked.load.{name}.p0")
+                nothing = ir.Constant(kind, [0.0 if kind == _FLOATS8 else 0] * LANES)
+                return builder.call(load, [pointer, ir.Constant(_I32, 8 if kind == _WORDS else 4), valid, nothing])
+
+            words = read(0, first, _WORDS, "v8i64")
+            line = []
+            for _ in range(3):
+                line.append(read(3, first, _FLOATS8, "v8f32"))
+                first = builder.add(first, size)
+            pixels = _Pixels(
+                builder, width, builder.add(x, narrow(ahead)), narrow(y), words, (line[0], line[1], line[2]),
+                _splat(builder, args[11]), right,
+                narrow(rows), narrow(cols),
+            )  # fmt: skip
+            one = _vector(_INTS, [1] * LANES)
+            middle = builder.ashr(x, one)
+            middle_0 = builder.ashr(narrow(start), one)
+            odd = builder.and_(x, one)
+            side = builder.sub(builder.add(middle, builder.add(odd, odd)), one)
+            away = builder.sub(builder.add(middle, middle), side)
+            places = [(parents, middle), (parents, side), (beside, middle), (beside, side), (parents, away)]
+            held = cgutils.alloca_once(builder, _INTS, size=len(places))
+            for k, (row, i) in enumerate(places):
+                index = builder.add(builder.add(builder.select(valid, i, middle_0), one), narrow(row))
+                builder.store(_gather(builder, centres, index, _INTS), builder.gep(held, [ir.Constant(_I32, k)]))
+            own = builder.load(held)
+            cost, inside = pixels.cost(own)
+            far = _vector(_INTS, [FAR] * LANES)
+            best, least = (cgutils.alloca_once_value(builder, a) for a in (own, builder.select(inside, cost, far)))
+            one_more = ir.Constant(_I64, 1)
+            with cgutils.for_range(builder, count) as loop:
+                centre = builder.load(builder.gep(held, [loop.index]))
+                is_own = builder.icmp_signed("==", loop.index, ir.Constant(_I64, 0))
+                new = builder.or_(is_own, _any(builder, builder.icmp_signed("!=", centre, own)))
+                with builder.if_then(new):
+                    sideways = (ir.Constant(_I64, 0), reach_x)
+                    upright = (builder.select(is_own, reach_y, ir.Constant(_I64, 0)), ir.Constant(_I64, 0))
+
+                    def around(alike: bool) -> None:
+                        for up, aside in (sideways, upright):
+                            reach = builder.add(up, aside)
+                            with cgutils.for_range(builder, builder.add(builder.add(reach, reach), one_more)) as loop:
+                                step = builder.sub(loop.index, reach)
+                                low = builder.and_(step, ir.Constant(_I64, 0xFFFF))
+                                moved = low if up is sideways[0] else builder.shl(step, ir.Constant(_I64, 16))
+                                moved = builder.bitcast(narrow(moved), _HALVES)
+                                tried = builder.bitcast(builder.add(builder.bitcast(centre, _HALVES), moved), _INTS)
+                                cost, inside = pixels.cost(tried, alike)
+                                better = builder.and_(inside, builder.icmp_signed("<", cost, builder.load(least)))
+                                for slot, value in ((best, tried), (least, cost)):
+                                    builder.store(builder.select(better, value, builder.load(slot)), slot)
+
+                    lane_0 = _splat(builder, builder.extract_element(centre, ir.Constant(_I32, 0)))
+                    mixed = _any(builder, builder.icmp_signed("!=", centre, lane_0))
+                    with builder.if_else(mixed) as (differing, equal):
+                        with differing:
+                            around(False)
+                        with equal:
+                            around(True)
+            for k, slot in ((12, best), (13, least)):
+                pointer = _as(
+                    builder, _pointer(context, builder, sig.args[k], args[k], builder.add(here, start)), _INTS
+                )
+                f = ir.FunctionType(ir.VoidType(), [_INTS, pointer.type, _I32, _MASK])
+                store = cgutils.get_or_insert_function(builder.module, f, "llvm.masked.store.v8i32.p0")
+                builder.call(store, [builder.load(slot), pointer, ir.Constant(_I32, 4), valid])
+            return context.get_dummy_value()
+
+        return signature, codegen
+
+    return seek
+
+
+seek = make_seek(widest())
+"""``seek(left, right, centres, lines, x, y, here, parents, beside, shape, reach, mu, packed, data)``: the best
+displacement of the eight pixels from (``x``, ``y``) on around the displacements of their coarse parents.
+
+``centres``: flat, packed, a border of one all round; ``parents``: where the row of the parents begins, ``beside``: the
+coarse row next to this one's other side. ``reach``: columns and rows to either side, and the number of centres: of the
+parent, the coarse pixels nearest along the row, the column and the diagonal, and the one at the parent's other side.
+A search reaches along the row, about the parent also along the column. The other arrays as in :data:`settle`;
+``packed, data`` are written.
 """
 
 
@@ -288,12 +412,19 @@ def make_sums(width: int) -> Any:
             rights = [row(sig.args[1], right, at_right, right_cols, j, 0) for j in range(-3, 4)]
             wests = [row(sig.args[1], right, at_right, right_cols, j, -1) for j in range(-2, 3)]
             easts = [row(sig.args[1], right, at_right, right_cols, j, 1) for j in range(-2, 3)]
-            found = []
+            totals = []
             for others in (rights[1:6], wests, easts, rights[:5], rights[2:]):
                 total = _vector(_WORDS, [0] * LANES)
                 for p, q in zip(lefts, others, strict=True):
                     total = builder.add(total, _distances(builder, p, q, width))
-                found.append(_call(builder, "llvm.vector.reduce.add.v8i64", _I64, total))
+                totals.append(total)
+            # A sum of 25 distances has 16 bits: four of them are added up in one word.
+            packed = totals[0]
+            for k in range(1, 4):
+                packed = builder.or_(packed, builder.shl(totals[k], _vector(_WORDS, [16 * k] * LANES)))
+            four, last = (_call(builder, "llvm.vector.reduce.add.v8i64", _I64, t) for t in (packed, totals[4]))
+            low = ir.Constant(_I64, 0xFFFF)
+            found = [builder.and_(builder.lshr(four, ir.Constant(_I64, 16 * k)), low) for k in range(4)] + [last]
             return context.make_tuple(builder, sig.return_type, found)
 
         return signature, codegen
@@ -311,8 +442,6 @@ east, north, south. The windows must lie inside.
 _FLOATS = ir.VectorType(ir.FloatType(), 4)
 _CUBIC = ((0.0, 1.0, 0.0, 0.0), (-0.5, 0.0, 0.5, 0.0), (1.0, -2.5, 2.0, -0.5), (-0.5, 1.5, -1.5, 0.5))
 """Catmull-Rom weights of four samples: coefficients of 1, t, t^2, t^3."""
-_SLOPE = (_CUBIC[1], (2.0, -5.0, 4.0, -1.0), (-1.5, 4.5, -4.5, 1.5))
-"""Of their derivatives: coefficients of 1, t, t^2."""
 
 GREY = types.Array(types.float32, 1, "C")
 
@@ -336,29 +465,24 @@ def _dot(builder: Any, a: Any, b: Any) -> Any:
 
 @intrinsic
 def cubic(typingctx, image, at, width, t, s):  # type: ignore[no-untyped-def]
-    """Catmull-Rom value and gradient (x, y) of a flat float32 image of ``width`` columns.
+    """Catmull-Rom value of a flat float32 image of ``width`` columns.
 
     ``at``: index of the pixel above and left of the point's own; ``t, s``: the point's distance right of and below it,
     within a pixel. 4 x 4 pixels from ``at - width - 1`` on are read.
     """
     f32, i64 = types.float32, types.int64
-    signature = types.UniTuple(f32, 3)(GREY, i64, i64, f32, f32)
+    signature = f32(GREY, i64, i64, f32, f32)
 
     def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
         image, at, width, t, s = args
-        across, down = _splat(builder, t, 4), _splat(builder, s, 4)
         start = builder.sub(builder.sub(at, width), ir.Constant(_I64, 1))
-        weights, slopes = _polynomial(builder, _CUBIC, down), _polynomial(builder, _SLOPE, down)
-        column = gradient = ir.Constant(_FLOATS, [0.0] * 4)
+        weights = _polynomial(builder, _CUBIC, _splat(builder, s, 4))
+        column = ir.Constant(_FLOATS, [0.0] * 4)
         for k in range(4):
             pointer = _as(builder, _pointer(context, builder, sig.args[0], image, start), _FLOATS)
-            row = builder.load(pointer, align=4)
-            each = ir.Constant(ir.VectorType(_I32, 4), [k] * 4)
-            column = builder.fadd(column, builder.fmul(builder.shuffle_vector(weights, weights, each), row))
-            gradient = builder.fadd(gradient, builder.fmul(builder.shuffle_vector(slopes, slopes, each), row))
+            each = builder.shuffle_vector(weights, weights, ir.Constant(ir.VectorType(_I32, 4), [k] * 4))
+            column = builder.fadd(column, builder.fmul(each, builder.load(pointer, align=4)))
             start = builder.add(start, width)
-        w = _polynomial(builder, _CUBIC, across)
-        found = [_dot(builder, w, column), _dot(builder, _polynomial(builder, _SLOPE, across), column)]
-        return context.make_tuple(builder, sig.return_type, [*found, _dot(builder, w, gradient)])
+        return _dot(builder, _polynomial(builder, _CUBIC, _splat(builder, t, 4)), column)
 
     return signature, codegen

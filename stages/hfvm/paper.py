@@ -26,11 +26,14 @@ def _eq1(f, g):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def search(left, right, centre_u, centre_v, reach_x, reach_y, out_u, out_v, out_distance, out_offset):  # type: ignore[no-untyped-def]
+def search(  # type: ignore[no-untyped-def]
+    left, right, centre_u, centre_v, reach_x, reach_y, out_u, out_v, out_distance, out_offset, ox=0, oy=0
+):
     """Best match of every pixel in the search area around its centre (Eq. 2, Eq. 3).
 
     Of equal distances the first in row, column order wins. ``out_distance``: Eq. 1 of the best, -1 where nothing lies
     inside. ``out_offset`` (row, col, 2): linear sub-pixel offsets (column, row), 4.3.2; 0 at the border of the image.
+    ``ox, oy``: where the left window's first pixel lies in the right window.
     """
     rows, cols = left.shape[:2]
     rrows, rcols = right.shape[:2]
@@ -39,15 +42,15 @@ def search(left, right, centre_u, centre_v, reach_x, reach_y, out_u, out_v, out_
             cu, cv = np.int64(centre_u[y, x]), np.int64(centre_v[y, x])
             best = np.float32(-1.0)
             bu, bv = cu, cv
-            for v in range(max(cv - reach_y, -y), min(cv + reach_y, rrows - 1 - y) + 1):
-                for u in range(max(cu - reach_x, -x), min(cu + reach_x, rcols - 1 - x) + 1):
-                    d = _eq1(left[y, x], right[y + v, x + u])
+            for v in range(max(cv - reach_y, -y - oy), min(cv + reach_y, rrows - 1 - y - oy) + 1):
+                for u in range(max(cu - reach_x, -x - ox), min(cu + reach_x, rcols - 1 - x - ox) + 1):
+                    d = _eq1(left[y, x], right[y + oy + v, x + ox + u])
                     if best < 0 or d < best:
                         best = d
                         bu, bv = np.int64(u), np.int64(v)
             out_u[y, x], out_v[y, x], out_distance[y, x] = bu, bv, best
             out_offset[y, x, 0], out_offset[y, x, 1] = 0.0, 0.0
-            xr, yr = x + bu, y + bv
+            xr, yr = x + ox + bu, y + oy + bv
             if best < 0:
                 continue
             if xr > 0 and xr < rcols - 1:

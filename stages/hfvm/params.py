@@ -14,7 +14,6 @@ Weights = tuple[float, float, float, float, float, float, float, float]
 
 PAPER: Mapping[str, Any] = {
     "weights": PAPER_WEIGHTS,
-    "search_columns": 2,
     "threshold": 15.0,
     "texture": 0.0,
     "speckle": 1,
@@ -24,8 +23,11 @@ PAPER: Mapping[str, Any] = {
 """What preset ``paper`` sets differently; a value given by the user wins. Preset-only machinery ignores the rest."""
 
 ACCURATE: Mapping[str, Any] = {
+    "smoothness": 5,
+    "rounds": 4,
     "fine_rounds": None,
-    "median": 3,
+    "back_rounds": 4,
+    "centres": 5,
     "path_rounds": 3,
     "relief_steps": 6,
     "crowd": 0.5,
@@ -34,8 +36,8 @@ ACCURATE: Mapping[str, Any] = {
 """What preset ``accurate`` sets differently; a value given by the user wins."""
 
 
-FAST: Mapping[str, Any] = {"finest": 1, "rounds": 3, "fine_rounds": None, "refine": False}
-"""What preset ``fast`` sets differently: half the resolution, less propagation, no removal of the perspective bias."""
+FAST: Mapping[str, Any] = {"finest": 1, "rounds": 2, "fine_rounds": None, "back_rounds": 2}
+"""What preset ``fast`` sets differently: half the resolution, less propagation."""
 
 PRESETS: Mapping[str, Mapping[str, Any]] = {"default": {}, "fast": FAST, "accurate": ACCURATE, "paper": PAPER}
 
@@ -69,7 +71,7 @@ class HfvmParams(Params):
         default=0.25, ge=0, le=1, description="the same of the height: roll, toe-in and row offsets"
     )
     search_columns: int = Field(
-        default=1, ge=1, le=8, description="pixels to either side of a centre: doubling errs by one"
+        default=2, ge=1, le=8, description="pixels to either side of a centre: doubling errs by one, parents by more"
     )
     search_rows: int = Field(default=1, ge=0, le=8, description="pixels; never 0 on a rig that is not rectified")
     band: float = Field(
@@ -78,18 +80,27 @@ class HfvmParams(Params):
         description="cost (byte steps) a pixel off the epipolar line; 0 = free two-dimensional search",
     )
     smoothness: int = Field(
-        default=5, ge=0, description="byte steps a pixel of difference to each neighbour; kept weak"
+        default=4, ge=0, description="byte steps a pixel of difference to each neighbour; kept weak"
     )
     rounds: int = Field(
-        default=4, ge=0, le=32, description="propagation rounds a level; they recover what the coarse level lost"
+        default=3, ge=0, le=32, description="propagation rounds a level; they recover what the coarse level lost"
     )
     fine_rounds: int | None = Field(
-        default=2, ge=0, le=32, description="the same at the finest level, which costs most; null: as at the others"
+        default=1, ge=0, le=32, description="the same at the finest level, which costs most; null: as at the others"
+    )
+    back_rounds: int = Field(
+        default=1, ge=0, le=32, description="at most so many at the finest level from right to left, for the check"
+    )
+    centres: int = Field(
+        default=3,
+        ge=1,
+        le=5,
+        description="coarse pixels to search around: the parent, its nearest along row, column and diagonal, far side",
     )
     finest: Literal[0, 1] = Field(
         default=0, description="pyramid level matched last; 1 = half the resolution, a quarter of the work"
     )
-    median: Literal[1, 3, 5] = Field(default=5, description="pixels; side of the median filter of each level, 1 = none")
+    median: Literal[1, 3, 5] = Field(default=3, description="pixels; side of the median filter of each level, 1 = none")
     threshold: float = Field(
         default=90.0,
         gt=0,
@@ -127,7 +138,9 @@ class HfvmParams(Params):
         le=1,
         description="least correlation of both images after refinement; below, noise met noise",
     )
-    refine_steps: int = Field(default=2, ge=1, le=8, description="steps; the second one settles the first")
+    refine_steps: int = Field(
+        default=1, ge=1, le=8, description="steps; from sub-pixel displacements a second one changes nothing"
+    )
     refine_radius: int = Field(
         default=2, ge=1, le=8, description="pixels; 5 x 5 windows: wider ones smooth relief away"
     )

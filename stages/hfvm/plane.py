@@ -9,16 +9,18 @@ matches say how: no calibration is used, and displacements are given in the orig
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from stages import pyramid
 from stages.declare import AnyArray
-from stages.hfvm.epipolar import residuals, weighted_normal
-from stages.hfvm.hierarchy import FIT_SAMPLES, Prepared, State, sample
+from stages.hfvm.epipolar import residuals, typical, weighted_normal
 from stages.hfvm.params import HfvmParams
 from stages.hfvm.resample import sample_cubic
+from stages.hfvm.window import Shape, Window, bounded, whole
 from stages.pyramid import Pyramid, PyramidParams
 
 Matrix = NDArray[np.float64]
@@ -37,16 +39,22 @@ MARGIN = 1.0 / 16.0
 """Share of the width added around the aligned image, for what stands out of the plane."""
 
 
-def find(pair: Prepared, state: State, params: HfvmParams) -> Matrix | None:
-    """Homography from aligned pixels to right image pixels (level 0), or None where alignment would not help."""
-    wanted = sample(state.left_ok, FIT_SAMPLES)
-    fine = pair.solver.fine(state.level, state.left, wanted)
-    found = fit_plane(fine.u, fine.v, wanted, TOLERANCE)
+def find(
+    places: AnyArray, u: AnyArray, v: AnyArray, level: int, shapes: Sequence[Shape], params: HfvmParams
+) -> Matrix | None:
+    """Homography from aligned pixels to right image pixels (level 0), or None where alignment would not help.
+
+    Parameters
+    ----------
+    places : flat indices of matches of a level; ``u, v``: their displacements, pixels.
+    shapes : of the left image's levels.
+    """
+    y, x = np.divmod(places, shapes[level][1])
+    found = fit_points(x, y, u, v, shapes[level], TOLERANCE)
     if found is None or found[1] < params.plane_share:
         return None
-    h = to_level_0(found[0], state.level)
-    shape = pair.left_valid[0].shape
-    shear = distortion(h, (shape[0], shape[1]))
+    h = to_level_0(found[0], level)
+    shear = distortion(h, (shapes[0][0], shapes[0][1]))
     return h if params.plane_distortion <= shear < MOST_DISTORTION else None
 
 
@@ -59,15 +67,40 @@ def align(right: Pyramid, h: Matrix, left_shape: tuple[int, ...], params: Pyrami
     return pyramid.build(image, params, valid)
 
 
-def compose(h: Matrix, u: AnyArray, v: AnyArray) -> tuple[AnyArray, AnyArray]:
-    """Displacements to the original right image of displacements to the aligned one (margin included)."""
-    g = h @ translation(-margin(u.shape))
-    y, x = np.indices(u.shape, dtype=np.float64)
-    p, q = x + u, y + v
-    w = g[2, 0] * p + g[2, 1] * q + g[2, 2]
-    xr = (g[0, 0] * p + g[0, 1] * q + g[0, 2]) / w
-    yr = (g[1, 0] * p + g[1, 1] * q + g[1, 2]) / w
-    return (xr - x).astype(np.float32), (yr - y).astype(np.float32)
+def source(h: Matrix, window: Window, shape: Shape) -> Window:
+    """Window of an image of ``shape`` that :func:`warp` reads for a window of its result."""
+    y, x = np.meshgrid([window.y0, window.y1 - 1], [window.x0, window.x1 - 1], indexing="ij")
+    w = h[2, 0] * x + h[2, 1] * y + h[2, 2]
+    if (w <= 1e-3).any():  # the horizon crosses it: a quadrangle does not hold it
+        return whole(shape)
+    p, q = (h[0, 0] * x + h[0, 1] * y + h[0, 2]) / w, (h[1, 0] * x + h[1, 1] * y + h[1, 2]) / w
+    top, bottom, first, last = (int(np.clip(a, -4, 1 << 30)) for a in (q.min(), q.max(), p.min(), p.max()))
+    return bounded(top, bottom, first, last, shape, 4)
+
+
+def compose(
+    h: Matrix, u: AnyArray, v: AnyArray, left_shape: Shape = (), x0: int = 0, y0: int = 0
+) -> tuple[AnyArray, AnyArray]:
+    """Displacements to the original right image of displacements to the aligned one (margin included).
+
+    ``x0, y0``: first column and row of a window of the left image, which has ``left_shape``.
+    """
+    out_u, out_v = np.empty(u.shape, np.float32), np.empty(v.shape, np.float32)
+    _compose(h @ translation(-margin(left_shape or u.shape)), u, v, out_u, out_v, x0, y0)
+    return out_u, out_v
+
+
+@njit(cache=True, nogil=True)
+def _compose(g, u, v, out_u, out_v, x0, y0):  # type: ignore[no-untyped-def]
+    for row in range(u.shape[0]):
+        y = np.float64(row + y0)
+        a, b, c = g[0, 1] * y + g[0, 2], g[1, 1] * y + g[1, 2], g[2, 1] * y + g[2, 2]
+        for col in range(u.shape[1]):
+            x = np.float64(col + x0)
+            p, dv = x + u[row, col], np.float64(v[row, col])
+            w = 1.0 / (g[2, 0] * p + g[2, 1] * dv + c)
+            out_u[row, col] = (g[0, 0] * p + g[0, 1] * dv + a) * w - x
+            out_v[row, col] = (g[1, 0] * p + g[1, 1] * dv + b) * w - y
 
 
 def margin(left_shape: tuple[int, ...]) -> int:
@@ -93,13 +126,20 @@ def fit_plane(u: AnyArray, v: AnyArray, consistent: AnyArray, tolerance: float) 
     (3, 3) float64 H with ``(x + u, y + v, 1) ~ H (x, y, 1)``, and the share.
     """
     y, x = np.nonzero(consistent)
+    return fit_points(x, y, u[y, x], v[y, x], consistent.shape, tolerance)
+
+
+def fit_points(
+    x: AnyArray, y: AnyArray, u: AnyArray, v: AnyArray, shape: Shape, tolerance: float
+) -> tuple[Matrix, float] | None:
+    """As :func:`fit_plane`, of matches (n,) of an image of ``shape``."""
     if len(y) < LEAST_MATCHES:
         return None
-    scale = 0.5 * max(consistent.shape)
-    middle = (0.5 * consistent.shape[1] / scale, 0.5 * consistent.shape[0] / scale)
+    scale = 0.5 * max(shape)
+    middle = (0.5 * shape[1] / scale, 0.5 * shape[0] / scale)
     to_unit = np.array([[1 / scale, 0.0, -middle[0]], [0.0, 1 / scale, -middle[1]], [0.0, 0.0, 1.0]])
     p = np.stack([x / scale - middle[0], y / scale - middle[1]])
-    d = np.stack([u[y, x], v[y, x]]).astype(np.float64) / scale
+    d = np.stack([u, v]).astype(np.float64) / scale
     unit, error = _solve(p, d, tolerance / scale)
     return np.linalg.inv(to_unit) @ unit @ to_unit, float(np.mean(error <= 2 * tolerance / scale))
 
@@ -123,7 +163,7 @@ def _solve(p: AnyArray, d: AnyArray, tolerance: float) -> tuple[Matrix, AnyArray
         h = np.linalg.solve(normal, halves[0][1] + halves[1][1])
         error = np.hypot(*(residuals(t, e, -h) for t, e in zip(terms, d, strict=True)))
         # Start as wide as the matches scatter about the first fit, and narrow onto the dominant plane.
-        spread = max(tolerance, min(1.5 * float(np.median(error)), 0.7 * spread))
+        spread = max(tolerance, min(1.5 * typical(error), 0.7 * spread))
         weight = 1.0 / (1.0 + (error / spread) ** 2) ** 2
     return np.append(h, 0.0).reshape(3, 3) + np.eye(3), error
 
@@ -152,19 +192,24 @@ def distortion(h: Matrix, shape: tuple[int, int]) -> float:
 
 
 @njit(cache=True, nogil=True)
-def warp(image, valid, h, out, out_valid):  # type: ignore[no-untyped-def]
-    """``out(x, y) = image(H (x, y))``, Catmull-Rom; ``out_valid`` 0 where that is outside or masked."""
+def warp(image, valid, h, out, out_valid, x0=0, y0=0, ix0=0, iy0=0, irows=-1, icols=-1):  # type: ignore[no-untyped-def]
+    """``out(x, y) = image(H (x, y))``, Catmull-Rom; ``out_valid`` 0 where that is outside or masked.
+
+    ``x0, y0`` and ``ix0, iy0``: first column and row of the window of the result and of the image, which has ``irows``
+    and ``icols`` (negative: the window is all of it).
+    """
     rows, cols = out.shape
-    irows, icols = image.shape
-    for y in range(rows):
-        for x in range(cols):
-            out[y, x], out_valid[y, x] = 0.0, 0
+    height, width = image.shape if irows < 0 else (irows, icols)
+    for row in range(rows):
+        for col in range(cols):
+            y, x = row + y0, col + x0
+            out[row, col], out_valid[row, col] = 0.0, 0
             w = h[2, 0] * x + h[2, 1] * y + h[2, 2]
             if w <= 1e-6:
                 continue
             p, q = (h[0, 0] * x + h[0, 1] * y + h[0, 2]) / w, (h[1, 0] * x + h[1, 1] * y + h[1, 2]) / w
-            if not (p >= 1 and p < icols - 2 and q >= 1 and q < irows - 2):
+            if not (p >= 1 and p < width - 2 and q >= 1 and q < height - 2):
                 continue
-            if valid[int(q + 0.5), int(p + 0.5)]:
-                out[y, x] = sample_cubic(image, np.float32(p), np.float32(q))[0]
-                out_valid[y, x] = 1
+            if valid[int(q + 0.5) - iy0, int(p + 0.5) - ix0]:
+                out[row, col] = sample_cubic(image, np.float32(p), np.float32(q), ix0, iy0)[0]
+                out_valid[row, col] = 1

@@ -7,13 +7,15 @@ small displacement, solved per window. A pixel keeps the step only if it makes i
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from numba import njit
 
 from stages.declare import AnyArray
 from stages.hfvm import rowwise
 from stages.hfvm.params import HfvmParams
+
+Place = tuple[int, int, int, int, int, int]
+"""First column and row of the left and of the right window, rows and columns of the whole right image."""
 
 CORRELATION_SIDE = 9
 """Pixels: fewer do not tell correlated noise from texture."""
@@ -37,7 +39,8 @@ def refine(
     v: AnyArray,
     keep: AnyArray,
     params: HfvmParams,
-) -> tuple[AnyArray, AnyArray, AnyArray]:
+    place: Place | None = None,
+) -> tuple[AnyArray, AnyArray, AnyArray, AnyArray]:
     """Displacements without the perspective bias.
 
     Parameters
@@ -46,77 +49,107 @@ def refine(
     right_valid : (row, col) uint8, 1 = usable.
     u, v : (row, col) float32, smoothed displacements, pixels.
     keep : (row, col) bool, pixels that have one.
+    place : where both windows lie; None: they are the images. Pixels nearer than :func:`reach` to a cut are not sound.
 
     Returns
     -------
-    u, v : (row, col) float32, refined where that lowered the residual.
+    u, v : (row, col) float32, refined where that lowered the residual; as given with ``params.refine`` off.
     rest : (row, col) float32, mean-free residual variance of the window, squared grey levels; inf where not known.
+    per_noise : (row, col) float32, variance of the column displacement for a unit of variance of the grey levels.
     """
-    start_u, start_v = u, v
-    first = last = np.empty(u.shape, np.float32)
-    for step in range(params.refine_steps + 1):
-        new_u, new_v, last = np.empty_like(u), np.empty_like(v), np.empty(u.shape, np.float32)
-        radius, noise = params.refine_radius, params.refine_noise
-        rowwise.lucas_kanade(left, right, right_valid, u, v, keep, radius, noise, new_u, new_v, last)
-        if step == 0:
-            first = last
-        if step < params.refine_steps:
-            u, v = np.empty_like(u), np.empty_like(v)
-            rowwise.local_mean(new_u, new_v, keep, 1, u, v)
-    better = (last <= first) & (np.hypot(u - start_u, v - start_v) <= FARTHEST)
-    return np.where(better, u, start_u), np.where(better, v, start_v), np.where(better, last, first)
+    step_u, step_v, first, per_noise = (np.empty(u.shape, np.float32) for _ in range(4))
+    now_u, now_v, last = u, v, first
+    at = place or (0, 0, 0, 0, *right.shape)
+    for step in range(params.refine_steps):
+        last = first if step == 0 else np.empty(u.shape, np.float32)
+        args = (keep, params.refine_radius, params.refine_noise, step_u, step_v, last, per_noise)
+        rowwise.lucas_kanade(left, right, right_valid, now_u, now_v, *args, *at)
+        if not params.refine:
+            break
+        now_u, now_v = np.empty_like(u), np.empty_like(v)
+        rowwise.local_mean(step_u, step_v, keep, 1, 1, now_u, now_v)
+    if not params.refine:
+        return u, v, first, per_noise
+    _take_back(u, v, first, np.float32(FARTHEST), now_u, now_v, last)
+    return now_u, now_v, last, per_noise
 
 
-def level_contrast(left: AnyArray, right: AnyArray, u: AnyArray, v: AnyArray, keep: AnyArray) -> AnyArray:
-    """The right image, its contrast made that of the left one where they differ grossly (:data:`SAME_CONTRAST`).
+@njit(cache=True, nogil=True)
+def _take_back(u, v, first, farthest, new_u, new_v, last):  # type: ignore[no-untyped-def]
+    """Start displacements and residuals where steps led far or away from a fit."""
+    for y in range(u.shape[0]):
+        for x in range(u.shape[1]):
+            du, dv = new_u[y, x] - u[y, x], new_v[y, x] - v[y, x]
+            better = (last[y, x] <= first[y, x]) & (du * du + dv * dv <= farthest * farthest)
+            new_u[y, x] = new_u[y, x] if better else u[y, x]
+            new_v[y, x] = new_v[y, x] if better else v[y, x]
+            last[y, x] = last[y, x] if better else first[y, x]
+
+
+def contrast(left: AnyArray, right: AnyArray, u: AnyArray, v: AnyArray, keep: AnyArray) -> float:
+    """What makes the right image's contrast that of the left one: a factor where they differ grossly, else 1.
 
     Steps and residuals are mean-free, not free of gain: an exposure ratio of two would pass for noise. The ratio is
-    that of the median differences over three columns, at matches that are not saturated.
+    that of the median differences over three columns, at matches that are not saturated (:data:`SAME_CONTRAST`).
+    ``u, v``: whole pixels.
     """
     y, x = np.nonzero(keep[:, :-STRIDE])
     y, x = y[:: 1 + len(y) // SAMPLES], x[:: 1 + len(x) // SAMPLES]
-    xr, yr = np.rint(x + u[y, x]).astype(np.intp), np.rint(y + v[y, x]).astype(np.intp)
+    xr, yr = x + u[y, x].astype(np.intp), y + v[y, x].astype(np.intp)
     inside = (xr >= 0) & (xr + STRIDE < right.shape[1]) & (yr >= 0) & (yr < right.shape[0])
     y, x, yr, xr = y[inside], x[inside], yr[inside], xr[inside]
     a, b = np.stack([left[y, x], left[y, x + STRIDE]]), np.stack([right[yr, xr], right[yr, xr + STRIDE]])
     good = (np.maximum(a, b) < SATURATED).all(axis=0)
     if np.count_nonzero(good) < LEAST:
-        return right
+        return 1.0
     there, here = (float(np.median(np.abs(np.diff(c[:, good], axis=0)))) for c in (b, a))
     if min(here, there) <= 0 or max(here / there, there / here) < SAME_CONTRAST:
-        return right
-    return right * np.float32(here / there)
+        return 1.0
+    return here / there
 
 
-def correlation(rest: AnyArray, deviation: AnyArray, keep: AnyArray) -> AnyArray:
-    """Correlation (row, col) of the left image with the warped right one over a wider window; 1 where not known.
+def reach(params: HfvmParams) -> int:
+    """Pixels that a refined displacement and its surroundings depend on to either side."""
+    steps = params.refine_steps if params.refine else 1
+    return steps * (params.refine_radius + 1) + 1 + CORRELATION_SIDE // 2
 
-    From the residual variance ``rest`` and the left image's local ``deviation``: two signals of equal variance s^2 and
-    correlation r differ by 2 s^2 (1 - r). Noise that found noise to match, in a shadow or the sky, gives itself away.
+
+def drift(params: HfvmParams) -> int:
+    """Pixels of the right image beyond the start's that refinement may read: a step and a mean each move by one."""
+    return 2 * params.refine_steps + 3
+
+
+def surroundings(rest: AnyArray, deviation: AnyArray, keep: AnyArray) -> tuple[AnyArray, AnyArray]:
+    """Correlation of the left image with the warped right one over a wider window, and the residual variance there.
+
+    Both (row, col) float32; correlation 1 and residual 0 where not known. From the residual variance ``rest`` and the
+    left image's local ``deviation``: two signals of equal variance s^2 and correlation r differ by 2 s^2 (1 - r).
+    Noise that found noise to match, in a shadow or the sky, gives itself away.
     """
-    both = np.empty((2, *rest.shape), np.float32)
-    _known(rest, deviation, keep, both[0], both[1])
-    side = (CORRELATION_SIDE, CORRELATION_SIDE)
-    differ, power = (cv2.boxFilter(a, cv2.CV_32F, side, normalize=False, borderType=cv2.BORDER_CONSTANT) for a in both)
-    found = np.empty_like(rest)
-    _correlation(differ, power, found)
-    return found
+    planes, sums = np.empty((2, 3, *rest.shape), np.float32)
+    _known(rest, deviation, keep, planes)
+    rowwise.box(planes, CORRELATION_SIDE // 2, sums)
+    _correlation(sums, planes[0], planes[1])
+    return planes[0], planes[1]
 
 
 @njit(cache=True, nogil=True)
-def _known(rest, deviation, keep, differ, power):  # type: ignore[no-untyped-def]
-    nil = np.float32(0.0)
+def _known(rest, deviation, keep, planes):  # type: ignore[no-untyped-def]
+    nil, one = np.float32(0.0), np.float32(1.0)
     for y in range(rest.shape[0]):
+        differ, power, count = planes[0, y], planes[1, y], planes[2, y]
         for x in range(rest.shape[1]):
             use = keep[y, x] & (rest[y, x] < np.inf)
-            differ[y, x] = rest[y, x] if use else nil
-            power[y, x] = deviation[y, x] * deviation[y, x] if use else nil
+            differ[x] = rest[y, x] if use else nil
+            power[x] = deviation[y, x] * deviation[y, x] if use else nil
+            count[x] = one if use else nil
 
 
 @njit(cache=True, nogil=True)
-def _correlation(differ, power, found):  # type: ignore[no-untyped-def]
+def _correlation(sums, found, around):  # type: ignore[no-untyped-def]
     one, two, least = np.float32(1.0), np.float32(2.0), np.float32(1e-6)
     for y in range(found.shape[0]):
+        differ, power, count = sums[0, y], sums[1, y], sums[2, y]
         for x in range(found.shape[1]):
-            p = power[y, x]
-            found[y, x] = one - differ[y, x] / max(two * p, least) if p > 0 else one
+            found[y, x] = one - differ[x] / max(two * power[x], least) if power[x] > 0 else one
+            around[y, x] = differ[x] / max(count[x], one)

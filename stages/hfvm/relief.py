@@ -18,7 +18,7 @@ from numba import njit
 
 from stages.declare import AnyArray
 from stages.hfvm import epipolar
-from stages.hfvm.hierarchy import sample
+from stages.hfvm.hierarchy import evenly
 from stages.hfvm.params import HfvmParams
 from stages.hfvm.refine import FARTHEST
 from stages.hfvm.rowwise import PLANES, _products
@@ -91,12 +91,12 @@ def _normal(
 @njit(cache=True, nogil=True)
 def _all_products(left, right, right_valid, u, v, keep, out):  # type: ignore[no-untyped-def]
     for y in range(left.shape[0]):
-        _products(left, right, right_valid, u, v, keep, y, out[:, y])
+        _products(left, right, right_valid, u, v, keep, y, 0, out[:, y])
 
 
 def _hold_to_lines(u: AnyArray, v: AnyArray, keep: AnyArray, right_shape: tuple[int, int], *terms: AnyArray) -> None:
     """Add the squared distance from the epipolar lines to the normal equations, in place."""
-    found = epipolar.fit(u, v, sample(keep, FIT_SAMPLES), right_shape)
+    found = epipolar.fit(u, v, evenly(keep, FIT_SAMPLES), right_shape)
     if found is None:
         return
     a, b, c, p, q = terms

@@ -12,10 +12,11 @@ FOUND = np.uint8(Validity.MATCHED | Validity.INTERPOLATED)
 
 
 @njit(cache=True, nogil=True)
-def sample_cubic(a, x, y):  # type: ignore[no-untyped-def]
-    """Catmull-Rom value and gradient of ``a`` at (x, y), two pixels or more inside."""
+def sample_cubic(a, x, y, x0=0, y0=0):  # type: ignore[no-untyped-def]
+    """Catmull-Rom value and gradient at (x, y), two pixels or more inside, of an image that ``a`` shows from x0, y0."""
     i, j = int(x), int(y)
     t, s = x - np.float32(i), y - np.float32(j)
+    i, j = i - x0, j - y0
     h, two, three = np.float32(0.5), np.float32(2.0), np.float32(3.0)
     one, four, five = np.float32(1.0), np.float32(4.0), np.float32(5.0)
     wx = (
@@ -53,18 +54,21 @@ def sample_cubic(a, x, y):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def enlarge(u, v, bits, error, distance, valid, right_shape, out_u, out_v, out_bits, out_error, out_distance):  # type: ignore[no-untyped-def]
+def enlarge(  # type: ignore[no-untyped-def]
+    u, v, bits, error, distance, valid, right_shape, out_u, out_v, out_bits, out_error, out_distance, x0=0, y0=0
+):
     """Displacements of the next finer level: each doubled, for 2 x 2 pixels.
 
     Both images' pixel centres shift alike, so nothing is to be added. A masked pixel (``valid`` 0) is undefined, and
-    so is one whose displacement then leaves the right image; both are marked.
+    so is one whose displacement then leaves the right image; both are marked. ``x0, y0``: first column and row of a
+    window (even).
     """
     two, nan = np.float32(2.0), np.float32(np.nan)
     for y in range(out_u.shape[0]):
         for x in range(out_u.shape[1]):
             j, i = y >> 1, x >> 1
             a, b, bit = two * u[j, i], two * v[j, i], bits[j, i]
-            xr, yr = x + a, y + b
+            xr, yr = x + x0 + a, y + y0 + b
             outside = not (xr >= 0 and xr <= right_shape[1] - 1 and yr >= 0 and yr <= right_shape[0] - 1)
             if not valid[y, x] or (outside and bit & MATCHED):
                 bit = (bit & ~FOUND) | OUT_OF_IMAGE

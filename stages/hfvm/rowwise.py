@@ -15,15 +15,20 @@ PLANES = 10
 
 
 @njit(cache=True, nogil=True)
-def local_mean(u, v, keep, radius, out_u, out_v):  # type: ignore[no-untyped-def]
-    """Mean over (2 radius + 1)^2 kept pixels whose displacement lies within one pixel of the centre's."""
+def local_mean(u, v, keep, radius, stride, out_u, out_v):  # type: ignore[no-untyped-def]
+    """Mean of the kept pixels in a window whose displacement lies within one pixel of the centre's.
+
+    The window reaches ``radius`` pixels, of which each ``stride``-th from its border on takes part.
+    """
     rows, cols = u.shape
     su, sv, count = np.empty(cols, np.float32), np.empty(cols, np.float32), np.empty(cols, np.float32)
     one, nil = np.float32(1.0), np.float32(0.0)
     for y in range(rows):
         su[:], sv[:], count[:] = nil, nil, nil
-        for j in range(max(0, y - radius), min(rows, y + radius + 1)):
-            for i in range(-radius, radius + 1):
+        for j in range(y - radius, y + radius + 1, stride):
+            if j < 0 or j >= rows:
+                continue
+            for i in range(-radius, radius + 1, stride):
                 a, b = max(0, -i), min(cols, cols - i)
                 if a >= b:
                     continue
@@ -48,79 +53,119 @@ def local_mean(u, v, keep, radius, out_u, out_v):  # type: ignore[no-untyped-def
 
 
 @njit(cache=True, nogil=True)
-def _products(left, right, right_valid, u, v, keep, y, out):  # type: ignore[no-untyped-def]
+def _add_up(parts, cols, out):  # type: ignore[no-untyped-def]
+    """Add to ``out`` its neighbours: sums over as many columns as ``parts`` (plane, col + 2 radius) is wider."""
+    for k in range(parts.shape[0]):
+        part, total = parts[k], out[k]
+        for x in range(cols):
+            total[x] = part[x]
+        for i in range(1, part.size - cols, 2):
+            one, two = part[i : i + cols], part[i + 1 : i + 1 + cols]
+            for x in range(cols):
+                total[x] += one[x] + two[x]
+
+
+@njit(cache=True, nogil=True)
+def box(planes, radius, out):  # type: ignore[no-untyped-def]
+    """Sums of float32 planes (plane, row, col) over (2 radius + 1)^2 pixels, clipped at the border.
+
+    Every window is summed afresh, so that it does not depend on where the array begins.
+    """
+    count, rows, cols = planes.shape
+    wide = np.zeros((1, cols + 2 * radius), np.float32)
+    middle = wide[0, radius : radius + cols]
+    for k in range(count):
+        for y in range(rows):
+            first, last = max(0, y - radius), min(rows, y + radius + 1)
+            row = planes[k, first]
+            for x in range(cols):
+                middle[x] = row[x]
+            for j in range(first + 1, last):
+                row = planes[k, j]
+                for x in range(cols):
+                    middle[x] += row[x]
+            _add_up(wide, cols, out[k, y : y + 1])
+
+
+@njit(cache=True, nogil=True)
+def _products(  # type: ignore[no-untyped-def]
+    left, right, right_valid, u, v, keep, y, radius, out, x0=0, y0=0, rx0=0, ry0=0, rrows=-1, rcols=-1
+):
     """Row ``y`` of the planes whose window sums a step needs, zero where a pixel takes no part.
 
-    ``out`` (PLANES, col): count, gx, gy, r, gx gx, gx gy, gy gy, gx r, gy r, r r.
+    ``out`` (PLANES, radius + col + radius): count, gx, gy, r, gx gx, gx gy, gy gy, gx r, gy r, r r, with the gradient
+    of the left image. Windows as in :func:`stages.hfvm.consistency.backmatch`; ``rrows`` negative: the right window is
+    the whole image. Reach: a pixel.
     """
     rows, cols = left.shape
-    rrows, rcols = right.shape
-    out[:] = np.float32(0.0)
+    height, length = right.shape if rrows < 0 else (rrows, rcols)
+    width = right.shape[1]
     if y < 0 or y >= rows:
+        out[:] = np.float32(0.0)
         return
-    one, half = np.float32(1.0), np.float32(0.5)
-    last_x, last_y = np.float32(rcols - 2), np.float32(rrows - 2)
-    lu, lv, grey, n, gx, gy, rest = u[y], v[y], left[y], out[0], out[1], out[2], out[3]
+    one, half, nil = np.float32(1.0), np.float32(0.5), np.float32(0.0)
+    last_x, last_y = np.float32(length - 2), np.float32(height - 2)
+    end = radius + cols
+    n, gx, gy, rest = out[0, radius:end], out[1, radius:end], out[2, radius:end], out[3, radius:end]
+    lu, lv, grey = u[y], v[y], left[y]
     flat, taking = right.reshape(-1), keep[y]
     for x in range(cols):
-        xr, yr = np.float32(x) + lu[x], np.float32(y) + lv[x]
+        xr, yr = np.float32(x + x0) + lu[x], np.float32(y + y0) + lv[x]
+        n[x] = rest[x] = nil
         if not (taking[x] and xr >= one and xr < last_x and yr >= one and yr < last_y):
             continue
-        if not right_valid[np.uint64(yr + half), np.uint64(xr + half)]:
+        if not right_valid[np.uint64(np.int64(yr + half) - ry0), np.uint64(np.int64(xr + half) - rx0)]:
             continue
         i, j = np.int64(xr), np.int64(yr)
-        value, a, b = lanes.cubic(flat, j * rcols + i, rcols, xr - np.float32(i), yr - np.float32(j))
-        n[x], gx[x], gy[x], rest[x] = one, a, b, grey[x] - value
+        at = (j - ry0) * width + i - rx0
+        value = lanes.cubic(flat, at, width, xr - np.float32(i), yr - np.float32(j))
+        n[x], rest[x] = one, grey[x] - value
+    above, below = left[max(y - 1, 0)], left[min(y + 1, rows - 1)]
+    gx[0], gx[cols - 1] = half * (grey[min(1, cols - 1)] - grey[0]), half * (grey[cols - 1] - grey[max(cols - 2, 0)])
+    inner, west, east = gx[1 : cols - 1], grey[: cols - 2], grey[2:]
+    for x in range(cols - 2):
+        inner[x] = half * (east[x] - west[x])
+    for x in range(cols):
+        gx[x] *= n[x]
+        gy[x] = half * n[x] * (below[x] - above[x])
     for k, (p, q) in enumerate(((gx, gx), (gx, gy), (gy, gy), (gx, rest), (gy, rest), (rest, rest))):
-        product = out[4 + k]
+        product = out[4 + k, radius:end]
         for x in range(cols):
             product[x] = p[x] * q[x]
 
 
 @njit(cache=True, nogil=True)
-def _across(fresh, radius, out):  # type: ignore[no-untyped-def]
-    """Sums over 2 radius + 1 columns, clipped at the ends."""
-    cols = fresh.shape[1]
-    for k in range(fresh.shape[0]):
-        total = out[k]
-        total[:] = np.float32(0.0)
-        for i in range(-radius, radius + 1):
-            a, b = max(0, -i), min(cols, cols - i)
-            if a >= b:
-                continue
-            here, there = total[a:b], fresh[k, a + i : b + i]
-            for x in range(b - a):
-                here[x] += there[x]
-
-
-@njit(cache=True, nogil=True)
-def lucas_kanade(left, right, right_valid, u, v, keep, radius, noise, new_u, new_v, energy):  # type: ignore[no-untyped-def]
+def lucas_kanade(  # type: ignore[no-untyped-def]
+    left, right, right_valid, u, v, keep, radius, noise, new_u, new_v, energy, per_noise, x0, y0, rx0, ry0, rrows, rcols
+):
     """One mean-free step for every kept pixel; ``energy``: residual variance *before* the step (inf: none).
 
-    float32 throughout: the planes are summed afresh for every window, so nothing adds up.
+    The gradient is the left image's (inverse compositional form). ``per_noise``: variance of the column displacement
+    for a unit of variance of the grey levels. float32 throughout: every window is summed afresh, so nothing adds up.
+    Windows as in :func:`stages.hfvm.consistency.backmatch`. Reach: ``radius``, and of the left image a pixel more.
     """
     rows, cols = left.shape
     size = 2 * radius + 1
-    fresh = np.empty((PLANES, cols), np.float32)
-    ring = np.zeros((size, PLANES, cols), np.float32)
+    fresh = np.zeros((PLANES, cols + 2 * radius), np.float32)
+    ring = np.zeros((size, PLANES * cols), np.float32)
     s = np.empty((PLANES, cols), np.float32)
+    total = s.reshape(-1)
     for y in range(-radius, rows):
-        _products(left, right, right_valid, u, v, keep, y + radius, fresh)
-        _across(fresh, radius, ring[(y + radius) % size])
+        _products(left, right, right_valid, u, v, keep, y + radius, radius, fresh, x0, y0, rx0, ry0, rrows, rcols)
+        _add_up(fresh, cols, ring[(y + radius) % size].reshape((PLANES, cols)))
         if y < 0:
             continue
-        for k in range(PLANES):
-            total = s[k]
-            total[:] = ring[(y + radius + 1) % size, k]
-            for j in range(1, size):
-                row = ring[(y + radius + 1 + j) % size, k]
-                for x in range(cols):
-                    total[x] += row[x]
-        _solve(s, np.float32(0.5 * size * size), np.float32(noise), keep[y], u[y], v[y], new_u[y], new_v[y], energy[y])
+        total[:] = ring[(y + radius + 1) % size]
+        for j in range(1, size, 2):
+            one, two = ring[(y + radius + 1 + j) % size], ring[(y + radius + 2 + j) % size]
+            for x in range(total.size):
+                total[x] += one[x] + two[x]
+        least = np.float32(0.5 * size * size)
+        _solve(s, least, np.float32(noise), keep[y], u[y], v[y], new_u[y], new_v[y], energy[y], per_noise[y])
 
 
 @njit(cache=True, nogil=True)
-def _solve(s, least, noise, keep, u, v, new_u, new_v, energy):  # type: ignore[no-untyped-def]
+def _solve(s, least, noise, keep, u, v, new_u, new_v, energy, per_noise):  # type: ignore[no-untyped-def]
     """Steps of one row from the window sums."""
     one, nil, far = np.float32(1.0), np.float32(0.0), np.float32(np.inf)
     s0, s1, s2, s3, s4, s5, s6, s7, s8, s9 = s[0], s[1], s[2], s[3], s[4], s[5], s[6], s[7], s[8], s[9]
@@ -136,9 +181,10 @@ def _solve(s, least, noise, keep, u, v, new_u, new_v, energy):  # type: ignore[n
         q = s8[x] - s2[x] * m3
         # A window of noise alone has a determinant of at least (noise n)^2.
         det = a * c - b * b
+        good = use & (det > nil)
         inverse_det = one / (det if det > nil else one)
         du, dv = (c * p - b * q) * inverse_det, (a * q - b * p) * inverse_det
-        good = use & (det > nil)
         energy[x] = max(s9[x] - s3[x] * m3, nil) * inverse if use else far
+        per_noise[x] = c * inverse_det if good else nil
         new_u[x] = u[x] + (min(max(du, -one), one) if good else nil)
         new_v[x] = v[x] + (min(max(dv, -one), one) if good else nil)

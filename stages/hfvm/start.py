@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from stages.declare import AnyArray
 from stages.errors import InputError
 from stages.hfvm import hierarchy, plane
-from stages.hfvm.params import HfvmParams
+from stages.hfvm.window import whole
 
 MOST = 16000
 """Pixels: displacements of a level are 16-bit and doubled from level to level."""
@@ -65,9 +65,7 @@ def align(prior: Prior | None, h: plane.Matrix) -> Prior | None:
     return Prior(u.astype(np.float32), v.astype(np.float32))
 
 
-def impose(
-    pair: hierarchy.Prepared, params: HfvmParams, state: hierarchy.State, prior: Prior | None
-) -> hierarchy.State:
+def impose(pair: hierarchy.Prepared, state: hierarchy.State, prior: Prior | None) -> hierarchy.State:
     """State of the same level with the prior's displacements in both directions where they are known.
 
     At level 0 (images too small for coarser ones) the whole range has been searched, and nothing is imposed.
@@ -78,12 +76,13 @@ def impose(
     left = _overlay(state.left, u, v, known)
     ru, rv, hit = _reverse(u, v, known, state.right.u.shape, state.near_sign or -1.0)
     right = _overlay(state.right, ru, rv, hit)
-    left_ok = (state.left_ok | known) & (pair.left_valid[state.level] != 0)
-    right_ok = (state.right_ok | hit) & (pair.right_valid[state.level] != 0)
+    masks = [side.view.valid(state.level, whole(side.view.shapes[state.level])) for side in (pair.left, pair.right)]
+    left_ok = (np.asarray(state.left_ok) | known) & (masks[0] != 0)
+    right_ok = (np.asarray(state.right_ok) | hit) & (masks[1] != 0)
     return hierarchy.State(state.level, left, right, left_ok, right_ok, state.band, state.near_sign)
 
 
-def _coarse(prior: Prior, level: int, shape: tuple[int, int]) -> tuple[AnyArray, AnyArray, NDArray[np.bool_]]:
+def _coarse(prior: Prior, level: int, shape: tuple[int, ...]) -> tuple[AnyArray, AnyArray, NDArray[np.bool_]]:
     """Displacements of a level: medians of the known ones of each block, whole pixels of that level."""
     side = 2**level
     maps = []
@@ -115,4 +114,4 @@ def _reverse(
 
 
 def _overlay(m: hierarchy.Map, u: AnyArray, v: AnyArray, known: NDArray[np.bool_]) -> hierarchy.Map:
-    return hierarchy.Map(np.where(known, u, m.u), np.where(known, v, m.v), m.undefined & ~known)
+    return hierarchy.Map(np.where(known, u, m.u), np.where(known, v, m.v), np.asarray(m.undefined) & ~known)

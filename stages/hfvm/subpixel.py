@@ -24,12 +24,13 @@ def linear(before, at, after):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def summed(left, right, u_map, v_map, wanted, radius, out_u, out_v, out_distance):  # type: ignore[no-untyped-def]
+def summed(left, right, u_map, v_map, wanted, radius, out_u, out_v, out_distance, ox=0, oy=0):  # type: ignore[no-untyped-def]
     """Sub-pixel displacements of an integer map from distances summed over (2 radius + 1)^2 pixels.
 
     Only where ``wanted`` is not zero and the window, shifted by a pixel, lies inside both images; elsewhere the integer
     map is copied. ``out_distance``: mean distance per pixel at the integer displacement, or the pixel's own where the
-    window is not inside; -1 outside the other image and where not wanted.
+    window is not inside; -1 outside the other image and where not wanted. ``ox, oy``: where the left window's first
+    pixel lies in the right window; both windows must reach ``radius`` (right: and one) pixels farther than what counts.
     """
     rows, cols = left.shape
     rrows, rcols = right.shape
@@ -39,7 +40,7 @@ def summed(left, right, u_map, v_map, wanted, radius, out_u, out_v, out_distance
     for y in range(rows):
         for x in range(cols):
             u, v = np.int64(u_map[y, x]), np.int64(v_map[y, x])
-            xr, yr = x + u, y + v
+            xr, yr = x + ox + u, y + oy + v
             out_u[y, x], out_v[y, x], out_distance[y, x] = u, v, -1.0
             if not wanted[y, x] or xr < 0 or xr >= rcols or yr < 0 or yr >= rrows:
                 continue

@@ -6,8 +6,9 @@ The error of a disparity is taken as the sum of independent parts, so that varia
 
 N: variance of the least-squares displacement of the 5 x 5 window (the Cramer-Rao bound: residual variance after
 refinement, times the column element of the inverse structure tensor). A window along a column edge has a small one,
-a window along a row edge a large one. R: variance of the matched disparities of the 5 x 5 window about their plane;
-errors of neighbours differ, and a window on relief or a depth edge answers for a part of each surface. M: share of
+a window along a row edge a large one. R: mean square, in the 5 x 5 window, of how far a disparity
+lies from the mean of the four two pixels away (0 on a plane); errors of neighbours differ, and a window on relief or a
+depth edge answers for a part of each surface. M: share of
 unmatched pixels in 9 x 9; beside occlusions and failed matches a match leans on the wrong surface. The floor is what
 no pixel shows: sampling, lenses, the matcher's own sub-pixel bias.
 
@@ -26,13 +27,11 @@ from numba import njit
 from numpy.typing import NDArray
 
 from stages.declare import AnyArray
+from stages.hfvm import rowwise
 from stages.hfvm.params import HfvmParams
-from stages.windows import window_sum
 
 RADIUS = 2
 """Pixels: the windows of sub-pixel search and refinement are 5 x 5."""
-
-PLANES = 12
 
 SURROUNDINGS = 9
 """Pixels: side of the window in which unmatched pixels count; about the reach of features and windows together."""
@@ -62,15 +61,13 @@ PAPER = Factors(floor=0.2, noise=0.0, relief=1.05, border=1.7)
 
 
 def standard_deviation(
-    left: AnyArray, rest: AnyArray | None, column: AnyArray, keep: NDArray[np.bool_], params: HfvmParams
+    noise: AnyArray, column: AnyArray, keep: NDArray[np.bool_], params: HfvmParams
 ) -> NDArray[np.float32]:
     """Standard deviation of matched column disparities.
 
     Parameters
     ----------
-    left : (row, col) float32 grey values.
-    rest : (row, col) mean-free residual variance of each window, squared grey levels, inf where not known; None:
-        disparities were not refined.
+    noise : (row, col) float32, part N of every pixel, squared pixels.
     column : (row, col) float32 column disparities, pixels.
     keep : (row, col) bool, matched pixels.
 
@@ -78,87 +75,72 @@ def standard_deviation(
     -------
     (row, col) float32 pixels, NaN where not matched.
     """
-    unrefined = PAPER if params.preset == "paper" else UNREFINED
-    f = unrefined if rest is None else REFINED
-    noise, relief, border = parts(left, rest, column, keep, params)
-    variance = f.floor**2 + f.noise**2 * noise + f.relief**2 * relief + f.border**2 * border
-    return np.where(keep, np.sqrt(variance), np.nan).astype(np.float32)
+    f = REFINED if params.refine else PAPER if params.preset == "paper" else UNREFINED
+    parts = neighbours(column, keep)
+    found = np.empty(keep.shape, np.float32)
+    squares = (np.float32(a * a) for a in (f.floor, f.noise, f.relief, f.border))
+    _add(noise, parts[0], parts[1], keep, *squares, found)
+    return found
 
 
-def parts(
-    left: AnyArray, rest: AnyArray | None, column: AnyArray, keep: NDArray[np.bool_], params: HfvmParams
-) -> tuple[AnyArray, AnyArray, AnyArray]:
-    """N, R and M of every pixel (see the module); 0 where not matched."""
-    per_noise, relief = (np.zeros(keep.shape, np.float32) for _ in range(2))
-    _window(np.asarray(left, np.float32), column, keep, np.float32(params.refine_noise), per_noise, relief)
-    count = window_sum(keep, SURROUNDINGS)
-    border = np.where(keep, 1.0 - count / window_sum(np.ones(keep.shape), SURROUNDINGS), 0.0)
-    if rest is None:
-        return params.refine_noise * per_noise, relief, border
-    # One window's residual is itself uncertain; that of its surroundings is not.
-    known = keep & np.isfinite(rest)
-    total = window_sum(np.where(known, rest, 0.0), SURROUNDINGS)
-    return per_noise * total / np.maximum(window_sum(known, SURROUNDINGS), 1.0), relief, border
+def neighbours(column: AnyArray, keep: NDArray[np.bool_]) -> AnyArray:
+    """Parts R and M of every pixel (2, row, col), see the module; meaningless where not matched."""
+    planes, sums = np.zeros((2, 3, *keep.shape), np.float32)
+    _bends(column, keep, planes)
+    rowwise.box(planes[:2], RADIUS, sums[:2])
+    rowwise.box(planes[2:], SURROUNDINGS // 2, sums[2:])
+    _shares(sums, SURROUNDINGS // 2, planes)
+    return np.asarray(planes[:2])
 
 
 @njit(cache=True, nogil=True)
-def _window(left, column, keep, noise, per_noise, relief):  # type: ignore[no-untyped-def]
-    """Column variance per unit of noise variance, and variance of the disparities about their plane, of each window."""
-    rows, cols = left.shape
-    c, s = np.zeros((PLANES, cols + 2 * RADIUS)), np.empty(PLANES)
+def _bends(column, keep, planes):  # type: ignore[no-untyped-def]
+    """Squared departure from the mean of four pixels ``RADIUS`` away, where all are kept; its count; the kept ones."""
+    rows, cols = keep.shape
+    r = RADIUS
+    one, nil, quarter = np.float32(1.0), np.float32(0.0), np.float32(0.25)
     for y in range(rows):
-        _columns(left, column, keep, y, c)
+        kept, own = planes[2, y], keep[y]
         for x in range(cols):
-            if not keep[y, x]:
-                continue
-            mx = mxx = mxy = zx = 0.0
-            s[:] = 0.0
-            for i in range(2 * RADIUS + 1):
-                for k in range(PLANES):
-                    s[k] += c[k, x + i]
-                dx = np.float64(i - RADIUS)
-                mx += dx * c[6, x + i]
-                mxx += dx * dx * c[6, x + i]
-                mxy += dx * c[7, x + i]
-                zx += dx * c[9, x + i]
-            n, m, my, z = s[0], s[6], s[7], s[9]
-            # The same noise term that holds the refinement's windows holds this one.
-            gxx, gyy = s[3] - s[1] * s[1] / n + noise * n, s[5] - s[2] * s[2] / n + noise * n
-            gxy = s[4] - s[1] * s[2] / n
-            per_noise[y, x] = gyy / (gxx * gyy - gxy * gxy)
-            mxx, myy, mxy = mxx - mx * mx / m, s[8] - my * my / m, mxy - mx * my / m
-            zx, zy, zz = zx - z * mx / m, s[10] - z * my / m, s[11] - z * z / m
-            det = mxx * myy - mxy * mxy
-            if det > 0.1:  # three pixels off a line have at least 1/3
-                zz -= (zx * (zx * myy - zy * mxy) + zy * (zy * mxx - zx * mxy)) / det
-            relief[y, x] = max(zz, 0.0) / m
+            kept[x] = one if own[x] else nil
+        if y < r or y >= rows - r or cols <= 2 * r:
+            continue
+        end = cols - r
+        d, up, down, west, east = (
+            column[y, r:end],
+            column[y - r, r:end],
+            column[y + r, r:end],
+            column[y, : end - r],
+            column[y, 2 * r :],
+        )
+        k, ku, kd, kw, ke = keep[y, r:end], keep[y - r, r:end], keep[y + r, r:end], keep[y, : end - r], keep[y, 2 * r :]
+        square, count = planes[0, y, r:end], planes[1, y, r:end]
+        for x in range(end - r):
+            use = k[x] & ku[x] & kd[x] & kw[x] & ke[x]
+            e = d[x] - quarter * ((up[x] + down[x]) + (west[x] + east[x]))
+            square[x] = e * e if use else nil
+            count[x] = one if use else nil
 
 
 @njit(cache=True, nogil=True)
-def _columns(left, column, keep, y, c):  # type: ignore[no-untyped-def]
-    """Sums ``c`` (plane, RADIUS + col) over the window's rows about row ``y``.
-
-    Planes: count, products of the left image's gradient; of kept pixels count, moments of dy, of the disparity.
-    """
-    rows, cols = left.shape
-    c[:] = 0.0
-    for j in range(max(0, y - RADIUS), min(rows, y + RADIUS + 1)):
-        above, below, dy = max(j - 1, 0), min(j + 1, rows - 1), np.float64(j - y)
+def _shares(sums, radius, parts):  # type: ignore[no-untyped-def]
+    """Mean of the squares, and share of the window inside the image that is not kept."""
+    rows, cols = sums.shape[1:]
+    one = np.float32(1.0)
+    for y in range(rows):
+        tall = min(rows, y + radius + 1) - max(0, y - radius)
+        square, count, kept, relief, border = sums[0, y], sums[1, y], sums[2, y], parts[0, y], parts[1, y]
         for x in range(cols):
-            a = 0.5 * (left[j, min(x + 1, cols - 1)] - left[j, max(x - 1, 0)])
-            b = 0.5 * (left[below, x] - left[above, x])
-            i = x + RADIUS
-            c[0, i] += 1.0
-            c[1, i] += a
-            c[2, i] += b
-            c[3, i] += a * a
-            c[4, i] += a * b
-            c[5, i] += b * b
-            if keep[j, x]:
-                d = np.float64(column[j, x])
-                c[6, i] += 1.0
-                c[7, i] += dy
-                c[8, i] += dy * dy
-                c[9, i] += d
-                c[10, i] += d * dy
-                c[11, i] += d * d
+            room = np.float32(tall * (min(cols, x + radius + 1) - max(0, x - radius)))
+            relief[x] = square[x] / max(count[x], one)
+            border[x] = one - kept[x] / room
+
+
+@njit(cache=True, nogil=True)
+def _add(noise, relief, border, keep, floor, by_noise, by_relief, by_border, found):  # type: ignore[no-untyped-def]
+    nan = np.float32(np.nan)
+    for y in range(keep.shape[0]):
+        n, r, m, own, out = noise[y], relief[y], border[y], keep[y], found[y]
+        for x in range(keep.shape[1]):
+            std = np.sqrt(floor + by_noise * n[x] + by_relief * r[x] + by_border * m[x])
+            out[x] = std if own[x] else nan

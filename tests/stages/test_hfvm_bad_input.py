@@ -7,9 +7,9 @@ from matching_scenes import convergent_rig, pair, rig_displacement, seen
 
 from stages.errors import InputError
 from stages.hfvm import HfvmParams, match
-from stages.hfvm.consistency import isolated, unsupported
+from stages.hfvm.consistency import patches, unsupported
 from stages.hfvm.order import swapped
-from stages.hfvm.refine import level_contrast
+from stages.hfvm.refine import contrast
 from stages.validity import Validity, defined, has, matched
 
 BORDER = 8
@@ -70,13 +70,11 @@ def test_exposure_ratio_of_two(ratio):
 
 def test_contrast_is_levelled_only_where_it_differs_grossly():
     left, right, u, v = pair(lambda x, y: (-7.0, 1.0))
-    maps = np.float32(u), np.float32(v), np.ones(u.shape, bool)
-    assert level_contrast(left, right, *maps) is right
-    nearly = right * np.float32(0.85)
-    assert level_contrast(left, nearly, *maps) is nearly
-    np.testing.assert_allclose(level_contrast(left, 0.4 * right + 90, *maps), right + 225, rtol=0.02)
-    nothing = np.zeros(u.shape, bool)
-    assert level_contrast(left, right, u, v, nothing) is right
+    maps = np.int16(u), np.int16(v), np.ones(u.shape, bool)
+    assert contrast(left, right, *maps) == 1
+    assert contrast(left, right * np.float32(0.85), *maps) == 1
+    assert contrast(left, 0.4 * right + 90, *maps) == pytest.approx(2.5, rel=0.02)
+    assert contrast(left, 0.4 * right + 90, u, v, np.zeros(u.shape, bool)) == 1
 
 
 @pytest.mark.parametrize("shapes", [((97, 141), (60, 300)), ((40, 40), (200, 220)), ((150, 33), (33, 150))])
@@ -176,7 +174,7 @@ def test_patches_of_chance_go_where_nearly_all_are_small_and_stay_beside_a_large
     u = np.zeros((160, 200), np.float32)
     keep = np.zeros(u.shape, bool)
     keep[10:20, 10:20] = keep[40:48, 100:110] = keep[90:101, 30:40] = True
-    assert not isolated(u, u, keep, 40).any()
+    assert patches(u, u, keep)[keep].min() >= 40
     np.testing.assert_array_equal(unsupported(u, u, keep, 40), keep)
     keep[110:150, 60:160] = True
     assert not unsupported(u, u, keep, 40).any()

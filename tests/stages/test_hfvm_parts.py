@@ -2,12 +2,15 @@
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from matching_scenes import convergent_rig, pair, rig_displacement
 from scipy import ndimage
 
 from stages.geometry import Rig
 from stages.hfvm import consistency, epipolar, hierarchy, lookup, plane, refine, rowwise
 from stages.hfvm.params import HfvmParams
+from stages.hfvm.window import whole
 from stages.pyramid import PyramidParams, build
 
 
@@ -17,9 +20,9 @@ def zeros(*shape):
 
 class TestConsistency:
     def backmatch(self, lu, lv, ru, rv, valid=None):
-        error = np.empty(lu.shape, np.float32)
+        error = np.full(lu.shape, consistency.FAILED, np.float32)
         valid = np.ones(ru.shape, np.uint8) if valid is None else valid
-        consistency.backmatch(lu, lv, ru, rv, valid, error)
+        consistency.backmatch(lu, lv, ru, rv, valid, error, 0, 0, 0, 0, *ru.shape)
         return error
 
     def test_by_hand(self):
@@ -27,14 +30,9 @@ class TestConsistency:
         lu[0] = [1, 1, 0.5, 1]
         ru[0] = [0, -1, -3, -1]
         error = self.backmatch(lu, lv, ru, rv)
-        # 0 -> 1 -> 0; 1 -> 2 -> -1: two off; 2.5 between -3 and -1: nearest is 3 (half rounds up), -1 + 0.5; 3 leaves
+        # 0 -> 1 -> 0; 1 -> 2 -> -1: two off; 2.5: nearest is 3 (half rounds up), -1 + 0.5; 3 leaves
         np.testing.assert_allclose(error[0, :3], [0, 2, 0.5])
         assert error[0, 3] == consistency.FAILED
-
-    def test_reads_the_other_map_between_its_pixels(self):
-        x = np.arange(20, dtype=np.float32)[None]
-        # right = 1.04 left: a slope of four percent leaves no error when read bilinearly.
-        assert self.backmatch(0.04 * x, zeros(1, 20), -x + x / np.float32(1.04), zeros(1, 20))[0, :18].max() < 1e-4
 
     def test_rows_count_and_masked_targets_fail(self):
         lu, lv = zeros(2, 2), zeros(2, 2)
@@ -51,11 +49,22 @@ class TestConsistency:
         v[2:4, 2:4] = 5
         u[7, 7] = -3
         keep = np.ones((10, 10), bool)
-        gone = consistency.isolated(u, v, keep, 5)
-        assert gone[2:4, 2:4].all()
-        assert gone[7, 7]
-        assert gone.sum() == 5
-        assert consistency.isolated(u, v, keep, 4).sum() == 1
+        sizes = consistency.patches(u, v, keep)
+        assert (sizes[2:4, 2:4] == 4).all()
+        assert sizes[7, 7] == 1
+        assert np.count_nonzero(sizes == 95) == 95
+
+    @settings(max_examples=30, deadline=None)
+    @given(st.integers(0, 10**6))
+    def test_patches_against_scipy(self, seed):
+        rng = np.random.default_rng(seed)
+        shape = rng.integers(1, 14, 2)
+        u, keep = 5 * rng.integers(0, 2, shape).astype(np.int16), rng.random(shape) < 0.7
+        expected = np.zeros(shape, int)
+        for value in (0, 5):
+            label, _ = ndimage.label(keep & (u == value))
+            expected += np.where(label > 0, np.bincount(label.ravel())[label], 0)
+        np.testing.assert_array_equal(consistency.patches(np.zeros_like(u), u, keep), expected)
 
     @pytest.mark.parametrize(("near_sign", "expected"), [(-1.0, -2), (1.0, -20)])
     def test_an_occlusion_gets_its_background(self, near_sign, expected):
@@ -125,11 +134,11 @@ class TestEpipolar:
         u, v, wanted, *_ = rig_matches(rig, outliers=0.0)
         assert np.median(u[wanted]) > 0  # beyond the crossing of the axes: the sign of u alone would mislead
         f, _ = epipolar.fit(u, v, wanted, wanted.shape)
-        assert epipolar.near_sign(f, u, wanted, wanted.shape) == -1.0
+        assert epipolar.near_sign(f, u[wanted], wanted.shape, wanted.shape) == -1.0
         swapped = Rig(rig.right, rig.left, rig.T_right_left.inverse())
         u, v, wanted, *_ = rig_matches(swapped, outliers=0.0)
         f, _ = epipolar.fit(u, v, wanted, wanted.shape)
-        assert epipolar.near_sign(f, u, wanted, wanted.shape) == 1.0
+        assert epipolar.near_sign(f, u[wanted], wanted.shape, wanted.shape) == 1.0
 
 
 class TestPlane:
@@ -183,7 +192,9 @@ class TestRefine:
         left, right, u, v = pair(lambda x, y: (-6.0 + 0.05 * y, 1.3 + 0.02 * x), noise=noise)
         start_u, start_v = (u + 0.3).astype(np.float32), (v - 0.3).astype(np.float32)
         keep, valid = np.ones(u.shape, bool), np.ones(right.shape, np.uint8)
-        found_u, found_v, rest = refine.refine(left, right, valid, start_u, start_v, keep, HfvmParams())
+        found_u, found_v, rest, _ = refine.refine(
+            left, right, valid, start_u, start_v, keep, HfvmParams(refine_steps=2)
+        )
         inner = np.s_[12:-12, 12:-12]
         gradient = np.sqrt(np.mean(np.gradient(right)[1] ** 2))
         # Least squares over the window: sqrt(2) noise / (gradient * window); the median of |error| is .67 of it, and
@@ -196,7 +207,7 @@ class TestRefine:
     def test_keeps_what_it_cannot_improve(self):
         left, right, *_ = pair(lambda x, y: (-6.0, 0.0))
         wrong = np.full(left.shape, 20.0, np.float32)
-        found_u, _, _ = refine.refine(
+        found_u, _, _, _ = refine.refine(
             left, right, np.ones(right.shape, np.uint8), wrong, wrong, np.zeros(left.shape, bool), HfvmParams()
         )
         np.testing.assert_array_equal(found_u, wrong)
@@ -207,11 +218,15 @@ class TestRefine:
         keep = np.ones((60, 60), bool)
         mean = lambda z: ndimage.uniform_filter(z, 5)  # noqa: E731
         variance = lambda z: mean(z * z) - mean(z) ** 2  # noqa: E731
-        same = refine.correlation(variance(0.1 * a - 0.1 * b), np.sqrt(variance(signal + 0.1 * a)), keep)
-        none = refine.correlation(variance(a - b), np.sqrt(variance(a)), keep)
+        found = [
+            refine.surroundings(variance(d).astype(np.float32), np.sqrt(variance(s)).astype(np.float32), keep)
+            for d, s in ((0.1 * a - 0.1 * b, signal + 0.1 * a), (a - b, a))
+        ]
+        (same, _), (none, around) = found
         assert same.min() > 0.9
         # 81 overlapping windows of 25 noise values each: the deviation of a correlation is about a tenth.
         assert np.abs(none[8:-8, 8:-8]).max() < 0.5
+        assert around[30, 30] == pytest.approx(variance(a - b)[26:35, 26:35].mean(), rel=1e-5)
 
 
 def test_local_mean_takes_only_like_neighbours():
@@ -221,10 +236,22 @@ def test_local_mean_takes_only_like_neighbours():
     keep = np.ones((5, 5), bool)
     keep[0, 0] = False
     out_u, out_v = np.empty((2, 5, 5), np.float32)
-    rowwise.local_mean(u, v, keep, 1, out_u, out_v)
+    rowwise.local_mean(u, v, keep, 1, 1, out_u, out_v)
     assert out_u[2, 2] == pytest.approx(0.9 / 6)
     assert out_u[2, 3] == 10
     assert out_u[0, 0] == 0
+
+
+@pytest.mark.parametrize("radius", [1, 4])
+def test_window_sums_do_not_depend_on_where_the_array_begins(radius):
+    planes = np.random.default_rng(0).uniform(0, 1e4, (2, 17, 23)).astype(np.float32)
+    sums, part = np.empty_like(planes), np.empty((2, 14, 18), np.float32)
+    rowwise.box(planes, radius, sums)
+    size = 2 * radius + 1
+    expected = ndimage.uniform_filter(planes.astype(np.float64), (1, size, size), mode="constant") * size**2
+    np.testing.assert_allclose(sums, expected, rtol=1e-5)
+    rowwise.box(np.ascontiguousarray(planes[:, 3:, 5:]), radius, part)
+    np.testing.assert_array_equal(part[:, radius:, radius:], sums[:, 3 + radius :, 5 + radius :])
 
 
 class TestLookup:
@@ -262,7 +289,8 @@ class TestLookup:
         single = [build(a, PyramidParams(levels=1)) for a in images]
         prepared = hierarchy.prepare(*single, p)
         state = hierarchy.run(prepared, p, 0)
-        _, _, _, offset = prepared.solver._search(0, state.left.u, state.left.v, 0, 0)
+        patches = [seen.patch(0, whole(images[0].shape)) for seen in (prepared.left, prepared.right)]
+        _, _, _, offset = prepared.solver.search(*patches, state.left.u, state.left.v, 0, 0)
         table = lookup.learn(offset[..., 0][state.left_ok])
         # One of six images of the lesson: a few hundredths.
         np.testing.assert_allclose(table, lookup.DEFAULT_TABLE, atol=0.03)

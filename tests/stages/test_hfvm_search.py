@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stages.hfvm import epipolar, paper, propagation, search, subpixel
+from stages.hfvm import epipolar, lanes, paper, propagation, search, subpixel
 
 ROWS, COLS = 11, 13
 
@@ -19,62 +19,68 @@ def sad(a, b):
 
 def some_lines(seed):
     f = np.array([[1e-4, 0.02, 0.1], [0.01, 1e-3, 1.0], [0.03, -1.0, 0.4]])
-    return epipolar.lines(f + np.random.default_rng(seed).normal(0, 1e-3, (3, 3)), (ROWS, COLS))
+    planes = np.empty((3, ROWS, COLS), np.float32)
+    epipolar.write_lines(f + np.random.default_rng(seed).normal(0, 1e-3, (3, 3)), planes)
+    return planes
 
 
 def off_line(lines, y, x, u, v, mu):
-    return int(mu * abs(lines[y, x, 0] * u + lines[y, x, 1] * v + lines[y, x, 2])) if mu else 0
+    a, b, c = lines[:, y, x]
+    return int(np.float32(mu) * abs(a * np.float32(u) + b * np.float32(v) + c)) if mu else 0
+
+
+def centre(up_u, up_v, lines, j, i, mu):
+    """Doubled displacement of a coarse pixel, the border repeated, moved to its line by a pixel at most."""
+    j, i = min(max(j, 0), 5), min(max(i, 0), 6)
+    u, v = 2 * int(up_u[j, i]), 2 * int(up_v[j, i])
+    if mu:
+        a, b, c = lines[:, 2 * j, 2 * i]
+        e = np.float32(np.clip(a * np.float32(u) + b * np.float32(v) + c, -1, 1))
+        u, v = u - int(np.rint(e * a)), v - int(np.rint(e * b))
+    return u, v
 
 
 @pytest.mark.parametrize("mu", [0.0, 3.0])
-def test_descend_never_loses_to_any_single_centre(mu):
+@pytest.mark.parametrize(("reach_x", "reach_y", "count"), [(1, 1, 5), (2, 1, 3), (1, 0, 1)])
+def test_descend_finds_the_first_of_the_best_around_its_centres(mu, reach_x, reach_y, count):
     left, right = words((ROWS, COLS), 1), words((9, 15), 2)
-    rng = np.random.default_rng(3)
-    up_u, up_v = rng.integers(-2, 3, (2, 6, 7)).astype(np.int16)
+    up_u, up_v = np.random.default_rng(3).integers(-2, 3, (2, 6, 7)).astype(np.int16)
+    # Equal parents side by side: their children's words are read in one piece.
+    up_u[:, :4], up_v[:, :4] = 1, 0
     lines = some_lines(4)
-    u, v = np.zeros((2, ROWS, COLS), np.int16)
     packed, data = np.zeros((2, ROWS, COLS), np.int32)
-    propagation.descend(left, right, up_u, up_v, 1, 1, lines, mu, packed, data)
-    propagation.unpack(packed, u, v)
-
-    def cost(y, x, du, dv):
-        if not (0 <= x + du < 15 and 0 <= y + dv < 9):
-            return None
-        return sad(left[y, x], right[y + dv, x + du]) + off_line(lines, y, x, du, dv, mu)
-
-    for y in range(ROWS):
-        for x in range(COLS):
-            areas = []
-            for j in range(y // 2 - 1, y // 2 + 2):
-                for i in range(x // 2 - 1, x // 2 + 2):
-                    if 0 <= j < 6 and 0 <= i < 7:
-                        cu, cv = 2 * int(up_u[j, i]), 2 * int(up_v[j, i])
-                        if mu:
-                            a, b, c = lines[2 * j, 2 * i]
-                            e = np.float32(np.clip(a * cu + b * cv + c, -1, 1))
-                            cu, cv = cu - int(np.rint(e * a)), cv - int(np.rint(e * b))
-                        areas.append((cu, cv))
-            tried = [cost(y, x, cu + du, cv + dv) for cu, cv in areas for du in (-1, 0, 1) for dv in (-1, 0, 1)]
-            tried = [t for t in tried if t is not None]
-            if tried:
-                assert cost(y, x, int(u[y, x]), int(v[y, x])) <= min(tried)
-                assert cost(y, x, int(u[y, x]), int(v[y, x])) == data[y, x]
-            near = np.array(areas)
-            # Nothing outside the rectangle around all centres is ever taken.
-            assert near[:, 0].min() - 1 <= u[y, x] <= near[:, 0].max() + 1
-            assert near[:, 1].min() - 1 <= v[y, x] <= near[:, 1].max() + 1
+    propagation.descend(left, right, up_u, up_v, reach_x, reach_y, count, lines, np.float32(mu), packed, data)
+    for y, x in np.ndindex(ROWS, COLS):
+        j, i, above, aside = y // 2, x // 2, 2 * (y % 2) - 1, 2 * (x % 2) - 1
+        places = [(j, i), (j, i + aside), (j + above, i), (j + above, i + aside), (j, i - aside)][:count]
+        centres = [centre(up_u, up_v, lines, *p, mu) for p in places]
+        tried = [centres[0]]
+        for m, (u, v) in enumerate(centres):
+            tried += [(u + du, v) for du in range(-reach_x, reach_x + 1)]
+            tried += [(u, v + dv) for dv in range(-reach_y, reach_y + 1) if m == 0]
+        best = (*centres[0], lanes.FAR)
+        for u, v in tried:
+            if 0 <= x + u < 15 and 0 <= y + v < 9:
+                cost = sad(left[y, x], right[y + v, x + u]) + off_line(lines, y, x, u, v, mu)
+                best = (u, v, cost) if cost < best[2] else best
+        found = propagation.columns(packed[y, x]), propagation.rows_of(packed[y, x]), data[y, x]
+        assert found == best
 
 
 def slow_checkerboard(left, right, u, v, lines, mu, smoothness, rounds):
     u, v = u.copy(), v.copy()
+
+    def at(y, x):
+        return min(y, 2 * (ROWS - 1) - y) if y >= ROWS else abs(y), min(x, 2 * (COLS - 1) - x) if x >= COLS else abs(x)
+
     for turn in range(2 * rounds):
         for y in range(ROWS):
             for x in range((y + turn) % 2, COLS, 2):
                 around = [(y - 1, x), (y, x - 1), (y, x + 1), (y + 1, x)]
-                near = [(int(u[p]), int(v[p])) for p in around if 0 <= p[0] < ROWS and 0 <= p[1] < COLS]
+                near = [(int(u[at(*p)]), int(v[at(*p)])) for p in around]
                 a, b = int(u[y, x]), int(v[y, x])
                 best = None
-                for du, dv in [(a, b), (a - 1, b), (a + 1, b), (a, b - 1), (a, b + 1), *near]:
+                for du, dv in [(a, b), *near]:
                     if not (0 <= x + du < right.shape[1] and 0 <= y + dv < right.shape[0]):
                         continue
                     cost = sad(left[y, x], right[y + dv, x + du]) + off_line(lines, y, x, du, dv, mu)
@@ -94,15 +100,24 @@ def test_propagation_equals_slow_numpy_over_several_rounds(mu):
     expected = slow_checkerboard(left, right, u, v, lines, mu, 2, 3)
     packed, data = np.empty((2, ROWS, COLS), np.int32)
     propagation.pack_map(u, v, packed)
-    propagation.costs(left, right, lines, mu, packed, data)
-    propagation.checkerboard(left, right, packed, data, np.empty((ROWS, COLS), np.uint8), lines, mu, 2, 3)
+    data[:] = costs(left, right, u, v, lines, mu)
+    dirty = np.empty((ROWS, COLS), np.uint8)
+    propagation.checkerboard(left, right, packed, data, dirty, lines, np.float32(mu), 2, 3)
     found = np.empty((2, ROWS, COLS), np.int16)
     propagation.unpack(packed, *found)
     np.testing.assert_array_equal(found, expected)
     assert (found[0] != u).any()
-    again = np.empty_like(data)
-    propagation.costs(left, right, lines, mu, packed, again)
-    np.testing.assert_array_equal(data, again)
+    np.testing.assert_array_equal(data, costs(left, right, *found, lines, mu))
+
+
+def costs(left, right, u, v, lines, mu):
+    """Cost of every pixel's displacement without smoothness."""
+    found = np.full((ROWS, COLS), lanes.FAR, np.int32)
+    for y, x in np.ndindex(ROWS, COLS):
+        i, j = x + int(u[y, x]), y + int(v[y, x])
+        if 0 <= i < right.shape[1] and 0 <= j < right.shape[0]:
+            found[y, x] = sad(left[y, x], right[j, i]) + off_line(lines, y, x, int(u[y, x]), int(v[y, x]), mu)
+    return found
 
 
 def test_exhaustive_search_finds_a_two_dimensional_shift_and_prefers_the_short_one():

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from matching_scenes import pair
 
-from stages.hfvm import HfvmParams, match
-from stages.hfvm.uncertainty import REFINED, parts, standard_deviation
+from stages.hfvm import HfvmParams, match, refine
+from stages.hfvm.uncertainty import REFINED, neighbours, standard_deviation
 from stages.validity import matched
 
 PARAMS = HfvmParams()
@@ -13,36 +13,35 @@ PARAMS = HfvmParams()
 
 def test_noise_part_is_the_inverse_structure_tensor_of_the_window():
     image = np.random.default_rng(0).uniform(0, 255, (15, 17)).astype(np.float32)
-    keep = np.ones(image.shape, bool)
-    rest = np.full(image.shape, 4.0, np.float32)
-    noise, relief, border = parts(image, rest, np.zeros(image.shape, np.float32), keep, PARAMS)
+    keep, valid = np.ones(image.shape, bool), np.ones(image.shape, np.uint8)
+    nothing = np.zeros(image.shape, np.float32)
+    per_noise = refine.refine(image, image, valid, nothing, nothing, keep, PARAMS)[3]
     y, x = 7, 8
     window = np.s_[y - 2 : y + 3, x - 2 : x + 3]
     gy, gx = np.gradient(image.astype(np.float64))
     g = np.stack([gx[window].ravel(), gy[window].ravel()])
     tensor = 25 * np.cov(g, bias=True) + 25 * PARAMS.refine_noise * np.eye(2)
-    assert noise[y, x] == pytest.approx(4.0 * np.linalg.inv(tensor)[0, 0], rel=1e-5)
-    np.testing.assert_array_equal(relief, 0)
-    np.testing.assert_array_equal(border, 0)
+    assert per_noise[y, x] == pytest.approx(np.linalg.inv(tensor)[0, 0], rel=1e-4)
 
 
-def test_relief_part_is_the_variance_about_a_plane():
+def test_relief_and_border_parts_by_their_definition():
     rng = np.random.default_rng(1)
     y, x = np.indices((12, 14), dtype=np.float64)
-    bumps = rng.normal(0, 0.3, x.shape)
-    keep = rng.random(x.shape) < 0.8
-    keep[6, 7] = True
-    tilted = (bumps + 0.4 * x - 0.7 * y - 50).astype(np.float32)
-    image = np.zeros(x.shape, np.float32)
-    _, relief, border = parts(image, None, tilted, keep, PARAMS)
-    window = np.s_[4:9, 5:10]
-    kept = keep[window]
-    basis = np.stack([np.ones(kept.sum()), x[window][kept], y[window][kept]], -1)
-    d = tilted[window][kept].astype(np.float64)
-    expected = np.mean((d - basis @ np.linalg.lstsq(basis, d, rcond=None)[0]) ** 2)
-    assert relief[6, 7] == pytest.approx(expected, rel=1e-4)
-    assert border[6, 7] == pytest.approx(1 - keep[2:11, 3:12].mean())
-    assert relief[~keep].max() == 0
+    keep = rng.random(x.shape) < 0.9
+    tilted = (rng.normal(0, 0.3, x.shape) + 0.4 * x - 0.7 * y - 50).astype(np.float32)
+    relief, border = neighbours(tilted, keep)
+    squares = []
+    for j, i in np.ndindex(5, 5):
+        cross = [(4 + j, 5 + i), (2 + j, 5 + i), (6 + j, 5 + i), (4 + j, 3 + i), (4 + j, 7 + i)]
+        if all(keep[p] for p in cross):
+            squares.append((tilted[cross[0]] - np.mean([tilted[p] for p in cross[1:]])) ** 2)
+    assert 3 < len(squares) < 25
+    assert relief[6, 7] == pytest.approx(np.mean(squares), rel=1e-4)
+    assert border[6, 7] == pytest.approx(1 - keep[2:11, 3:12].mean(), abs=1e-6)
+    plane = (0.4 * x - 0.7 * y - 50).astype(np.float32)
+    relief, border = neighbours(plane, np.ones(x.shape, bool))
+    assert relief.max() < 1e-9
+    np.testing.assert_array_equal(border, 0)
 
 
 def test_undefined_exactly_where_nothing_was_matched():
@@ -54,16 +53,18 @@ def test_undefined_exactly_where_nothing_was_matched():
 
 def test_no_kept_pixel_gives_no_number_and_no_warning():
     image = np.zeros((6, 7), np.float32)
-    std = standard_deviation(image, image, image, np.zeros(image.shape, bool), PARAMS)
+    std = standard_deviation(image, image, np.zeros(image.shape, bool), PARAMS)
     assert np.isnan(std).all()
 
 
 def test_edges_along_the_rows_leave_the_column_uncertain():
     x = np.indices((60, 60), dtype=np.float64)[1]
-    keep, rest = np.ones(x.shape, bool), np.full(x.shape, 50.0, np.float32)
-    flat = np.zeros(x.shape, np.float32)
-    across = (128 + 60 * np.sin(x)).astype(np.float32)
-    up, along = (standard_deviation(a, rest, flat, keep, PARAMS)[30, 30] for a in (across, across.T.copy()))
+    keep, valid, flat = np.ones(x.shape, bool), np.ones(x.shape, np.uint8), np.zeros(x.shape, np.float32)
+    found = []
+    for image in (across := (128 + 60 * np.sin(x)).astype(np.float32), across.T.copy()):
+        noise = 50.0 * refine.refine(image, image, valid, flat, flat, keep, PARAMS)[3]
+        found.append(standard_deviation(noise, flat, keep, PARAMS)[30, 30])
+    up, along = found
     assert along > 3 * up
 
 

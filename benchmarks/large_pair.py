@@ -1,0 +1,165 @@
+"""A pair of 25 megapixels matched as tasks per tile: memory of each worker process, time, and error.
+
+``python benchmarks/large_pair.py`` makes the pair (a texture of all wavelengths, displaced by relief with steps, rows
+shifted), matches it in tiles and prints one line a step. ``--whole`` matches it untiled too and compares digests.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import tempfile
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+COLS, ROWS = 5800, 4300
+NEAR, FAR, SHIFT = -240.0, -90.0, 6.0
+"""Pixels: column displacements of the nearest and the farthest thing, row displacement."""
+
+STRIP = 512
+
+
+def texture(rng: np.random.Generator, rows: int, cols: int) -> NDArray[np.uint8]:
+    """Noise of all wavelengths from two pixels on, the longer the stronger."""
+    import cv2
+
+    total = np.zeros((rows, cols), np.float32)
+    for octave in range(1, 7):
+        step = 2**octave
+        noise = rng.normal(0.0, 5.0 * step**0.35, (rows // step + 2, cols // step + 2)).astype(np.float32)
+        total += cv2.resize(noise, (cols, rows), interpolation=cv2.INTER_CUBIC)
+    return np.clip(total + 128.0, 0, 255).astype(np.uint8)
+
+
+def displacement(y: NDArray[Any], x: NDArray[Any], shape: tuple[int, int]) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Ground that rises towards the viewer, waves on it, and boxes that stand out."""
+    t = y / shape[0]
+    u = FAR + (NEAR - FAR) * t + 12.0 * np.sin(x / 310.0) * np.cos(y / 270.0)
+    box = ((x // 700) + (y // 650)) % 3 == 0
+    return np.where(box & (x % 700 > 200) & (y % 650 > 200), u - 40.0, u), np.full_like(u, SHIFT) + 3.0 * x / shape[1]
+
+
+def make_pair(folder: Path, shape: tuple[int, int]) -> dict[str, Path]:
+    """PNG files of the left and the right image, ``left(x) = right(x + d(x))``."""
+    import cv2
+
+    rng = np.random.default_rng(0)
+    right = texture(rng, *shape)
+    left = np.empty(shape, np.uint8)
+    for start in range(0, shape[0], STRIP):
+        y, x = np.mgrid[start : min(start + STRIP, shape[0]), : shape[1]].astype(np.float32)
+        u, v = displacement(y, x, shape)
+        moved = cv2.remap(
+            right,
+            (x + u).astype(np.float32),
+            (y + v).astype(np.float32),
+            cv2.INTER_CUBIC,
+            borderMode=cv2.BORDER_REFLECT,
+        )
+        noisy = moved + rng.normal(0.0, 1.0, moved.shape)
+        left[start : start + STRIP] = np.clip(noisy, 0, 255).astype(np.uint8)
+    paths = {"left": folder / "left.png", "right": folder / "right.png"}
+    for name, image in (("left", left), ("right", right)):
+        cv2.imwrite(str(paths[name]), image)
+    return paths
+
+
+def lay_out(graph: Any, paths: dict[str, Path], shape: tuple[int, int]) -> dict[str, Any]:
+    """Nodes of both pyramids."""
+    from stages.declare import NoParams
+    from stages.pyramid import PyramidParams
+
+    pyramids = {}
+    for camera, path in paths.items():
+        args = {"path": str(path), "sha256": hashlib.sha256(path.read_bytes()).hexdigest(), "frame": 0}
+        args |= {"camera": camera, "width": shape[1], "height": shape[0], "depth": 8}
+        image = graph.node("datasets.files", f"image/{camera}", NoParams(), args)
+        pyramids[camera] = graph.node("stages.pyramid", f"pyramid/{camera}", PyramidParams(), inputs={"image": image})
+    return pyramids
+
+
+def table(graph: Any, seconds: float) -> None:
+    """One line a step: tasks, processor seconds, greatest memory of a process until its end."""
+    steps = defaultdict(list)
+    for handle in graph.nodes:
+        if handle.status == "computed":
+            steps[handle.spec.args.get("step", handle.stage)].append(handle)
+    for step, handles in steps.items():
+        peak, total = max(h.peak_rss for h in handles) / 1e6, sum(h.seconds for h in handles)
+        print(f"{step:12s} {len(handles):4d} tasks {total:8.1f} s   process {peak:6.0f} MB", flush=True)
+    print(f"elapsed {seconds:.0f} s", flush=True)
+
+
+def judge(store: Any, ref: Any, shape: tuple[int, int]) -> None:
+    """Errors against the displacements that the pair was made with."""
+    from stages.validity import matched
+
+    bundle = store.open(ref)
+    u, ok = bundle["column_disparity"], matched(bundle["validity"])
+    errors = []
+    for start in range(0, shape[0], STRIP):
+        part = slice(start, min(start + STRIP, shape[0]))
+        y, x = np.mgrid[part, : shape[1]].astype(np.float32)
+        errors.append(np.abs(u[part] - displacement(y, x, shape)[0])[ok[part]])
+    error = np.concatenate(errors)
+    print(
+        f"matched {100 * ok.mean():.1f} %, median error {np.median(error):.3f} px, beyond 2 px {np.mean(error > 2):.4f}"
+    )
+
+
+def run(graph: Any, store: Any, jobs: int) -> float:
+    from pipeline import driver
+
+    result = driver.run(graph, store, executor="processes", jobs=jobs)
+    result.check()
+    return float(result.seconds)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n", 1)[0])
+    parser.add_argument("--preset", default="default")
+    parser.add_argument("--tile", type=int, help="pixels; by memory where it is left out")
+    parser.add_argument("--memory", type=int, default=1000, help="MB that a task may take")
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--scale", type=float, default=1.0, help="of the image's sides")
+    parser.add_argument("--whole", action="store_true", help="match it untiled too, and compare")
+    options = parser.parse_args()
+
+    from pipeline import tiling
+    from pipeline.dag import Graph
+    from pipeline.environment import prepare_environment
+    from pipeline.store import Store
+    from stages.hfvm import HfvmParams
+    from stages.pyramid import PyramidParams
+
+    with tempfile.TemporaryDirectory(prefix="rille-large-") as folder:
+        prepare_environment(Path(folder) / "cache")
+        shape = int(ROWS * options.scale), int(COLS * options.scale)
+        store, params = Store(Path(folder) / "cache"), HfvmParams(preset=options.preset)
+        paths = make_pair(Path(folder), shape)
+        graph = Graph()
+        lay_out(graph, paths, shape)
+        table(graph, run(graph, store, options.jobs))
+        side = tiling.side(tiling.Tiling(tile=options.tile, memory=options.memory), params, (shape, shape))
+        print(f"{shape[1]} x {shape[0]}, preset {options.preset}, tiles of {side}", flush=True)
+        graph = Graph()
+        pyramids = lay_out(graph, paths, shape)
+        whole = graph.node("stages.hfvm", "whole", params, inputs=pyramids) if options.whole or side is None else None
+        if side is not None:
+            other = Graph()
+            args = (params, PyramidParams(), lay_out(other, paths, shape), (shape, shape), side, "hfvm")
+            tiled = tiling.Tiles(other, *args).build()
+            table(other, run(other, store, options.jobs))
+            judge(store, tiled.ref, shape)
+        if whole is not None:
+            table(graph, run(graph, store, 1))
+            same = side is None or whole.ref.digest == tiled.ref.digest
+            print("digests are equal" if same else "DIGESTS DIFFER")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,187 @@
+"""The finest level, step by step and window by window: sub-pixel, validity, refinement, isolated patches, filling.
+
+Each step reads rasters of the step before in a window wider than its own by as much as it reaches, which is stated with
+it. Steps of a preset that reach over the whole image (propagation along paths, relief) are done whole.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from stages.declare import AnyArray
+from stages.hfvm import consistency, guided, hierarchy, plane, refine, relief, rowwise, uncertainty
+from stages.hfvm.hierarchy import SUM_RADIUS, Map, Prepared
+from stages.hfvm.params import HfvmParams
+from stages.hfvm.views import View
+from stages.hfvm.window import Raster, Results, Window, around, blocks, cut, strips, whole
+from stages.validity import Validity, mark
+
+Rasters = Mapping[str, Raster]
+
+
+@dataclass(frozen=True)
+class Finish:
+    """What all steps know: the pair that was matched (its right image aligned or not), and the original right image."""
+
+    pair: Prepared
+    right: View
+    params: HfvmParams
+    alignment: plane.Matrix | None
+    near_sign: float
+    contrast: float = 1.0
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Rows and columns of the left image."""
+        return self.pair.shapes(0)[0]
+
+    def fine(self, window: Window, a: Map) -> Results:
+        """Map of a window of the left image with fractions of a pixel, means of like neighbours; feature distances.
+
+        Reach: those of the sub-pixel search and of the mean.
+        """
+        outer = window.grow(SUM_RADIUS, SUM_RADIUS, self.shape) if self.params.preset != "paper" else window
+        found, inner = hierarchy.fine_tile(self.pair, 0, a, outer, None), window.inside(outer)
+        u, v = (found.u, found.v) if self.params.preset == "paper" else _mean(found.u, found.v)
+        return {name: np.ascontiguousarray(p[inner]) for name, p in (("u", u), ("v", v), ("distance", found.distance))}
+
+    def back(self, window: Window, b: Map) -> Results:
+        """The same of the right image, for the check alone, which whole displacements, averaged, do well enough."""
+        if self.params.preset == "paper":
+            found = hierarchy.fine_tile(self.pair.reverse(), 0, b, window, None)
+            return {"u": found.u, "v": found.v}
+        outer = window.grow(SUM_RADIUS, SUM_RADIUS, self.pair.shapes(0)[1])
+        own = b.cut(outer)
+        u, v = _mean(own.u.astype(np.float32), own.v.astype(np.float32))
+        return {name: np.ascontiguousarray(p[window.inside(outer)]) for name, p in (("u", u), ("v", v))}
+
+    def check(self, window: Window, fine: Rasters, back: Rasters) -> Results:
+        """Back-matching error, validity bits against each pixel, and displacements in the original right image."""
+        u, v, distance = (cut(fine[name], window) for name in ("u", "v", "distance"))
+        error = self._backmatch(window, u, v, back)
+        bits = self._reasons(window, distance, error)
+        if self.alignment is not None:
+            u, v = plane.compose(self.alignment, u, v, self.shape, window.x0, window.y0)
+        return {"u": u, "v": v, "validity": bits, "error": error}
+
+    def _backmatch(self, window: Window, u: AnyArray, v: AnyArray, back: Rasters) -> AnyArray:
+        error = np.full(window.shape, consistency.FAILED, np.float32)
+        shape = self.pair.shapes(0)[1]
+        pieces: Iterable[Window] = [whole(shape)]
+        if not isinstance(back["u"], np.ndarray):
+            y, x = self._ends(window, u, v, 0.5)
+            inside = (x >= 0) & (x < shape[1]) & (y >= 0) & (y < shape[0])
+            pieces = blocks(back["u"], y, x, inside)
+        for block in pieces:
+            args = cut(back["u"], block), cut(back["v"], block), self.pair.right.view.valid(0, block)
+            place = window.x0, window.y0, block.x0, block.y0, shape[0], shape[1]
+            consistency.backmatch(u, v, *args, error, *place)
+        return error
+
+    def _ends(self, window: Window, u: AnyArray, v: AnyArray, ahead: float = 0.0) -> tuple[AnyArray, AnyArray]:
+        """Row and column (int64) of where each displacement of a window leads, rounded down after adding ``ahead``."""
+        y, x = np.indices(window.shape, np.float32)
+        y, x = y + np.float32(window.y0) + v + np.float32(ahead), x + np.float32(window.x0) + u + np.float32(ahead)
+        return np.floor(y).astype(np.int64), np.floor(x).astype(np.int64)
+
+    def _reasons(self, window: Window, distance: AnyArray, error: AnyArray) -> AnyArray:
+        """Bits that speak against each pixel, none where it is consistent."""
+        p, bits = self.params, np.zeros(window.shape, np.uint8)
+        outside = (error >= consistency.FAILED) | (self.pair.left.view.valid(0, window) == 0)
+        mark(bits, outside, Validity.OUT_OF_IMAGE)
+        mark(bits, distance > p.threshold, Validity.OVER_THRESHOLD)
+        mark(bits, self.pair.deviation(0, window) < p.texture, Validity.NO_TEXTURE)
+        mark(bits, ~outside & (error > p.backmatch), Validity.BACKMATCH_FAILED)
+        return bits
+
+    def refine(self, window: Window, checked: Rasters) -> Results:
+        """Refined ``u, v``, ``validity``, and the variance ``noise`` that the grey values' noise makes.
+
+        Reach: :func:`stages.hfvm.refine.reach`.
+        """
+        p, shape, reach = self.params, self.right.shapes[0], refine.reach(self.params)
+        outer = window.grow(reach, reach, self.shape)
+        u, v, bits = (cut(checked[name], outer) for name in ("u", "v", "validity"))
+        bits = bits.copy()
+        keep = bits == 0
+        # The relief's windows are not bounded: it is given the whole image.
+        target = whole(shape) if p.relief_steps else around(*self._ends(outer, u, v), shape, refine.drift(p), keep)
+        place = outer.x0, outer.y0, target.x0, target.y0, shape[0], shape[1]
+        left, valid = self.pair.left.view.grey(0, outer), self.right.valid(0, target)
+        image = self.right.grey(0, target)
+        if self.contrast != 1.0:
+            image = image * np.float32(self.contrast)
+        u, v, rest, noise = refine.refine(left, image, valid, u, v, keep, p, place)
+        alike, variance = refine.surroundings(rest, self.pair.deviation(0, outer), keep)
+        if p.refine:
+            mark(bits, keep & (alike < p.correlation), Validity.OVER_THRESHOLD)
+        noise *= variance
+        if p.relief_steps:
+            u, v = relief.fit(left, image, valid, u, v, bits == 0, p)
+        keep, found = bits == 0, np.zeros(outer.shape, bool)
+        consistency.lands(u, v, keep, valid, found, *place)
+        mark(bits, keep & ~found, Validity.OUT_OF_IMAGE)
+        arrays = {"u": u, "v": v, "validity": bits, "noise": noise}
+        return {name: np.ascontiguousarray(a[window.inside(outer)]) for name, a in arrays.items()}
+
+    def patches(self, a: Map, refined: Rasters) -> AnyArray:
+        """Isolated pixels, uint8 (row, col) of the whole image: how far a patch reaches nobody knows beforehand.
+
+        Room: 11 bytes a pixel.
+        """
+        u, v = np.empty(self.shape, np.int16), np.empty(self.shape, np.int16)
+        keep = np.empty(self.shape, bool)
+        for w in strips(refined["validity"]):
+            keep[w.slices] = cut(refined["validity"], w) == 0
+            u[w.slices], v[w.slices] = cut(a.u, w), cut(a.v, w)
+        return consistency.unsupported(u, v, keep, self.params.speckle).view(np.uint8)
+
+    def final(self, window: Window, fine: Rasters, checked: Rasters, refined: Rasters, gone: Raster) -> Results:
+        """Everything that :class:`~stages.hfvm.Disparity` has.
+
+        Reach: that of filling along rows, of the uncertainty and of what counts as lonely.
+        """
+        p, near = self.params, uncertainty.SURROUNDINGS // 2 + consistency.CROWD // 2
+        extra = guided.RADIUS if p.guided_fill else 0
+        outer = window.grow(near + extra, max(near, p.fill_reach) + extra, self.shape)
+        u, v, noise = (cut(refined[name], outer).copy() for name in ("u", "v", "noise"))
+        validity, removed = cut(refined["validity"], outer).copy(), cut(gone, outer) != 0
+        left, valid = self.pair.left.view.grey(0, outer), self.pair.left.view.valid(0, outer)
+        keep = validity == 0
+        removed &= keep
+        # Lonely matches are too uncertain to count as measured, but still the best guess where they are.
+        lonely = consistency.lonely(keep & ~removed, p.crowd)
+        mark(validity, removed | lonely, Validity.SPECKLE)
+        interpolated = lonely.astype(np.uint8)
+        consistency.fill_rows(u, v, keep & ~removed, p.fill_reach, self.near_sign or -1.0, interpolated)
+        keep &= ~removed & ~lonely
+        mark(validity, keep, Validity.MATCHED)
+        std = uncertainty.standard_deviation(noise, u, keep, p)
+        interpolated[valid == 0] = 0
+        if p.guided_fill:
+            u, v = guided.median(u, v, keep, interpolated, left)
+        validity |= interpolated * np.uint8(Validity.INTERPOLATED)
+        nothing = ~(keep | (interpolated != 0))
+        u[nothing] = v[nothing] = np.nan
+        error, distance = cut(checked["error"], outer).copy(), cut(fine["distance"], outer)
+        error[error >= consistency.FAILED] = np.nan
+        distance = np.where(distance < 0, np.float32(np.nan), distance)
+        arrays = {
+            "column_disparity": u,
+            "row_disparity": v,
+            "validity": validity,
+            "backmatch_error": error,
+            "distance": distance,
+            "disparity_std": std,
+        }
+        return {name: np.ascontiguousarray(a[window.inside(outer)]) for name, a in arrays.items()}
+
+
+def _mean(u: AnyArray, v: AnyArray) -> tuple[AnyArray, AnyArray]:
+    """Means of like neighbours."""
+    mean_u, mean_v = np.empty_like(u), np.empty_like(v)
+    rowwise.local_mean(u, v, np.ones(u.shape, bool), SUM_RADIUS, 2, mean_u, mean_v)
+    return mean_u, mean_v

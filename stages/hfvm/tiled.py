@@ -1,0 +1,174 @@
+"""The matcher as a composition of windows: of images in memory here, as tasks of the engine in ``stages.hfvm_tile``.
+
+::
+
+    coarse (levels down to plane_level, pre-alignment) -> level (each finer one, both ways; band between them)
+      -> fine, back -> check -> refine -> patches -> final
+
+Tiles are matched in any order and of any size with the same result, bit for bit; whole images are one tile.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from stages.declare import AnyArray
+from stages.hfvm import accurate, hierarchy, plane, refine, resample, start
+from stages.hfvm.finish import Finish
+from stages.hfvm.hierarchy import Prepared, State
+from stages.hfvm.params import HfvmParams
+from stages.hfvm.views import Aligned, Plain, Seen, View
+from stages.hfvm.window import Raster, Results, Shape, Window, cut, gather, tiles, whole
+from stages.validity import matched
+
+Tell = Callable[[float, str], None]
+"""Called with the share of the work done, 0..1, and what comes next in words."""
+
+COARSE_SHARE, FINE_SHARE = 0.15, 0.65
+"""Share of the time when the coarse levels are done, and when all whole-pixel maps are; a level costs four times the
+one above."""
+
+Order = Callable[[list[Window]], list[Window]]
+
+
+@dataclass(frozen=True)
+class Found:
+    """Arrays of :class:`stages.hfvm.Disparity` by name, and whether the right image was pre-aligned."""
+
+    arrays: Results
+    aligned: bool
+
+
+@dataclass(frozen=True)
+class Coarse:
+    """What the coarse levels decide: their maps, and the plane that the right image is aligned by, if it is."""
+
+    state: State
+    alignment: plane.Matrix | None
+    aligned: Aligned | None
+    contrast: float
+
+
+def is_whole(params: HfvmParams) -> bool:
+    """Whether a preset reaches over whole images: propagation along paths and the relief do."""
+    return params.path_rounds > 0 or params.relief_steps > 0
+
+
+def halves(left: View, right: View, params: HfvmParams) -> bool:
+    """Whether images are matched at half their resolution."""
+    return params.finest > 0 and min(len(left.shapes), len(right.shapes)) > params.finest
+
+
+def halved_params(params: HfvmParams) -> HfvmParams:
+    """Parameters of a match at half the resolution."""
+    return params.model_copy(
+        update={"finest": 0, "speckle": max(params.speckle // 4, 1), "fill_reach": params.fill_reach // 2}
+    )
+
+
+def prepare(left: View, right: View, params: HfvmParams, side: int | None) -> Prepared:
+    """The matcher of two views; features of whole levels are held where the images are matched whole."""
+    seen = [Seen(view, params, {} if side is None else None) for view in (left, right)]
+    return Prepared(seen[0], seen[1], accurate.choose(params), params, side)
+
+
+def coarse(left: View, right: View, params: HfvmParams, side: int | None, prior: start.Prior | None = None) -> Coarse:
+    """Match down to ``plane_level``; where a plane explains what is found, align the right image and match anew."""
+    pair = prepare(left, right, params, side)
+    state = start.impose(pair, hierarchy.run(pair, params, params.plane_level), prior)
+    if params.preset == "paper":
+        return Coarse(state, None, None, contrast(pair, state))
+    s = hierarchy.sample(pair, state)
+    h = plane.find(s.places, s.u, s.v, state.level, left.shapes, params)
+    if h is None:
+        return Coarse(state, None, None, contrast(pair, state))
+    aligned = Aligned.of(right, h, left, 0 if side is None else params.plane_level, side)
+    pair = prepare(left, aligned, params, side)
+    again = hierarchy.run(pair, params, params.plane_level, near_sign=state.near_sign)
+    state = start.impose(pair, again, start.align(prior, h))
+    return Coarse(state, h, aligned, contrast(pair, state))
+
+
+def contrast(pair: Prepared, state: State) -> float:
+    """Factor for the right image, see :func:`stages.hfvm.refine.contrast`."""
+    a, b = (seen.view.grey(state.level, whole(seen.view.shapes[state.level])) for seen in (pair.left, pair.right))
+    return refine.contrast(a, b, state.left.u, state.left.v, state.left_ok)
+
+
+def match(
+    left: Plain,
+    right: Plain,
+    params: HfvmParams,
+    prior: start.Prior | None,
+    tell: Tell,
+    side: int | None,
+    order: Order = lambda windows: windows,
+) -> Found:
+    """All steps, one tile after the other in this process. ``order``: in which tiles are taken."""
+    if is_whole(params):
+        side = None
+    if halves(left, right, params):
+        return _enlarged(left, right, params, prior, tell, side, order)
+    tell(0.0, "features")
+    begun = coarse(left, right, params, side, prior)
+    pair = prepare(left, begun.aligned or right, params, side)
+    state = begun.state
+    for level in range(state.level - 1, -1, -1):
+        tell(COARSE_SHARE + (FINE_SHARE - COARSE_SHARE) * 0.25 ** (level + 1), f"level {level}")
+        state = hierarchy.run(pair, params, level, state)
+    steps = Finish(pair, right, params, begun.alignment, state.near_sign, begun.contrast)
+    return Found(_finish(steps, state, side, order, tell), begun.alignment is not None)
+
+
+def _finish(steps: Finish, state: State, side: int | None, order: Order, tell: Tell) -> Results:
+    shape, other = steps.pair.shapes(0)
+
+    def over(shape: Shape, done: float, words: str, step: Callable[[Window], Results]) -> Results:
+        tell(FINE_SHARE + (1.0 - FINE_SHARE) * done, words)
+        return gather(shape, ((w, step(w)) for w in order(tiles(shape, side))))
+
+    fine = over(shape, 0.0, "sub-pixel", lambda w: steps.fine(w, state.left))
+    back = over(other, 0.35, "sub-pixel", lambda w: steps.back(w, state.right))
+    checked = over(shape, 0.45, "refinement", lambda w: steps.check(w, fine, back))
+    refined = over(shape, 0.5, "refinement", lambda w: steps.refine(w, checked))
+    tell(FINE_SHARE + (1.0 - FINE_SHARE) * 0.85, "filling")
+    gone = steps.patches(state.left, refined)
+    return over(shape, 0.9, "filling", lambda w: steps.final(w, fine, checked, refined, gone))
+
+
+def _enlarged(
+    left: Plain,
+    right: Plain,
+    params: HfvmParams,
+    prior: start.Prior | None,
+    tell: Tell,
+    side: int | None,
+    order: Order,
+) -> Found:
+    half = [Plain(view.images[1:], view.masks[1:], view.blank) for view in (left, right)]
+    coarser = None if prior is None else start.Prior(0.5 * prior.u[::2, ::2], 0.5 * prior.v[::2, ::2])
+    found = match(half[0], half[1], halved_params(params), coarser, tell, side, order)
+    shapes = left.shapes[0], right.shapes[0]
+
+    def parts() -> Iterator[tuple[Window, Results]]:
+        for w in tiles(half[0].shapes[0], side):
+            window = w.child(shapes[0])
+            yield window, enlarged({k: cut(a, w) for k, a in found.arrays.items()}, left.masks[0], window, shapes[1])
+
+    return Found(gather(shapes[0], parts()), found.aligned)
+
+
+def enlarged(found: Results, mask: Raster, window: Window, right_shape: Shape) -> Results:
+    """Results at half the resolution as those of a window of full resolution; displacements, twice as great, stand for
+    2 x 2 pixels each. ``mask``: of the left image, at full resolution."""
+    names = "column_disparity", "row_disparity", "validity", "backmatch_error", "distance"
+    out: Results = {name: np.empty(window.shape, np.uint8 if name == "validity" else np.float32) for name in names}
+    maps: list[AnyArray] = [found[name] for name in names]
+    size = right_shape[0], right_shape[1]
+    resample.enlarge(*maps, cut(mask, window), size, *(out[name] for name in names), window.x0, window.y0)
+    std = (2.0 * found["disparity_std"]).repeat(2, axis=0)[: window.shape[0]].repeat(2, axis=1)[:, : window.shape[1]]
+    std = np.where(matched(out["validity"]), std, np.float32(np.nan)).astype(np.float32)
+    return {**out, "disparity_std": std}

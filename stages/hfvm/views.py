@@ -1,0 +1,247 @@
+"""Images as the matcher sees them: grey values, masks and features of a window at any level of a pyramid."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+
+from stages import features, pyramid
+from stages.declare import AnyArray
+from stages.hfvm import paper, plane
+from stages.hfvm.params import HfvmParams
+from stages.hfvm.window import Raster, Shape, Window, cut, tiles, whole
+from stages.pyramid import Pyramid
+
+STRIP = 256
+"""Rows whose features are computed at once where many are wanted: their room is small beside the result."""
+
+
+class View(Protocol):
+    """One image."""
+
+    @property
+    def shapes(self) -> Sequence[Shape]:
+        """Rows and columns of each level."""
+
+    @property
+    def blank(self) -> float:
+        """Grey level where no level is valid."""
+
+    def grey(self, level: int, window: Window) -> AnyArray:
+        """Grey values, float32, 0 where masked."""
+
+    def valid(self, level: int, window: Window) -> AnyArray:
+        """Mask, uint8, 1 = usable."""
+
+    def filled(self, level: int, window: Window) -> AnyArray:
+        """As ``grey``; masked pixels carry the grey of the next valid level above (:func:`stages.pyramid.filled`)."""
+
+
+@dataclass(frozen=True)
+class Plain:
+    """A pyramid of rasters."""
+
+    images: Sequence[Raster]
+    masks: Sequence[Raster]
+    blank: float
+
+    @staticmethod
+    def of(pyramid: Pyramid) -> Plain:
+        """View of a pyramid in memory."""
+        return Plain.open(pyramid.images, pyramid.valid)
+
+    @staticmethod
+    def open(images: Sequence[Raster], masks: Sequence[Raster]) -> Plain:
+        """View of levels that are read by window."""
+        top = whole(images[-1].shape)
+        return Plain(images, masks, mean_grey(cut(images[-1], top), cut(masks[-1], top)))
+
+    @property
+    def shapes(self) -> Sequence[Shape]:
+        """Rows and columns of each level."""
+        return tuple(image.shape for image in self.images)
+
+    def grey(self, level: int, window: Window) -> AnyArray:
+        """Grey values, 0 where masked."""
+        return cut(self.images[level], window)
+
+    def valid(self, level: int, window: Window) -> AnyArray:
+        """Mask."""
+        return cut(self.masks[level], window)
+
+    def filled(self, level: int, window: Window) -> AnyArray:
+        """Grey values, those of masked pixels from above."""
+        return fill(self, level, window)
+
+
+def mean_grey(image: AnyArray, mask: AnyArray) -> float:
+    """Mean of the valid pixels, 0 without any."""
+    mask = mask != 0
+    return float(image[mask].mean()) if mask.any() else 0.0
+
+
+def fill(view: View, level: int, window: Window) -> AnyArray:
+    """Grey values of a window, those of masked pixels from the next valid level above."""
+    image, mask = view.grey(level, window), view.valid(level, window) != 0
+    if mask.all():
+        return image
+    if level + 1 == len(view.shapes):
+        return np.where(mask, image, np.float32(view.blank))
+    outer = window.parent()
+    above = view.filled(level + 1, outer)
+    rows = np.arange(window.y0, window.y1) // 2 - outer.y0
+    cols = np.arange(window.x0, window.x1) // 2 - outer.x0
+    return np.where(mask, image, above[rows[:, None], cols])
+
+
+@dataclass(frozen=True)
+class Aligned:
+    """The right image resampled to the left one's geometry by a plane, a window at a time.
+
+    ``h``: homography from aligned to right pixels (level 0). Levels from ``kept`` on are held in memory, the finer
+    ones resampled whenever they are asked for.
+    """
+
+    right: View
+    h: plane.Matrix
+    left_shape: Shape
+    shapes: Sequence[Shape]
+    images: Sequence[AnyArray]
+    masks: Sequence[AnyArray]
+    kept: int
+    blank: float
+
+    @staticmethod
+    def of(right: View, h: plane.Matrix, left: View, kept: int, side: int | None) -> Aligned:
+        """View whose levels from ``kept`` on are computed here and now, ``side`` pixels of level 0 at a time."""
+        m = plane.margin(left.shapes[0])
+        shape: Shape = (left.shapes[0][0] + 2 * m, left.shapes[0][1] + 2 * m)
+        shapes = pyramid_shapes(shape, len(left.shapes))
+        bare = Aligned(right, h, left.shapes[0], shapes, (), (), len(shapes), 0.0)
+        images, masks = ([np.empty(s, k) for s in shapes[kept:]] for k in (np.float32, np.uint8))
+        step = 2 ** (len(shapes) - 1)
+        for window in tiles(shape, None if side is None else -(-side // step) * step):
+            part = bare.part(window)
+            for n in range(kept, len(shapes)):
+                y, x = window.y0 >> n, window.x0 >> n
+                rows, cols = part.images[n].shape
+                images[n - kept][y : y + rows, x : x + cols] = part.images[n]
+                masks[n - kept][y : y + rows, x : x + cols] = part.valid[n]
+        blank = mean_grey(images[-1], masks[-1])
+        return Aligned(right, h, left.shapes[0], shapes, images, masks, kept, blank)
+
+    @staticmethod
+    def again(right: View, h: plane.Matrix, left: View, blank: float) -> Aligned:
+        """View that holds nothing, of an image whose ``blank`` is known."""
+        m = plane.margin(left.shapes[0])
+        shapes = pyramid_shapes((left.shapes[0][0] + 2 * m, left.shapes[0][1] + 2 * m), len(left.shapes))
+        return Aligned(right, h, left.shapes[0], shapes, (), (), len(shapes), blank)
+
+    def grey(self, level: int, window: Window) -> AnyArray:
+        """Grey values, 0 where masked."""
+        if level >= self.kept:
+            return cut(self.images[level - self.kept], window)
+        part, inner = self._around(level, window)
+        return cut(part.images[level], inner)
+
+    def valid(self, level: int, window: Window) -> AnyArray:
+        """Mask."""
+        if level >= self.kept:
+            return cut(self.masks[level - self.kept], window)
+        part, inner = self._around(level, window)
+        return cut(part.valid[level], inner)
+
+    def filled(self, level: int, window: Window) -> AnyArray:
+        """Grey values, those of masked pixels from above."""
+        if level >= self.kept:
+            return fill(self, level, window)
+        part, inner = self._around(level, window)
+        return fill(Plain(part.images, part.valid, self.blank), level, inner)
+
+    def _around(self, level: int, window: Window) -> tuple[Pyramid, Window]:
+        """Pyramid of the surroundings of a window, which start where a pixel of the top level does; and the window."""
+        outer = window.align(2 ** (len(self.shapes) - 1 - level), self.shapes[level])
+        base = Window(outer.y0 << level, outer.y1 << level, outer.x0 << level, outer.x1 << level)
+        part = self.part(base.grow(0, 0, self.shapes[0]))
+        rows, cols = window.inside(outer)
+        return part, Window(rows.start, rows.stop, cols.start, cols.stop)
+
+    def part(self, window: Window) -> Pyramid:
+        """Pyramid of a window of level 0 that starts and ends where a pixel of the top level does."""
+        h = self.h @ plane.translation(-plane.margin(self.left_shape))
+        image, mask = np.empty(window.shape, np.float32), np.empty(window.shape, np.uint8)
+        shape = self.right.shapes[0]
+        source = plane.source(h, window, shape)
+        grey, valid = self.right.filled(0, source), self.right.valid(0, source)
+        plane.warp(grey, valid, h, image, mask, window.x0, window.y0, source.x0, source.y0, shape[0], shape[1])
+        return pyramid.halved(image, mask, len(self.shapes))
+
+
+def pyramid_shapes(shape: Shape, levels: int, min_side: int = pyramid.PyramidParams().min_side) -> list[Shape]:
+    """Rows and columns of the levels of :func:`stages.pyramid.build` for at most so many levels."""
+    found = [shape]
+    while len(found) < levels and min(found[-1]) >= 2 * min_side:
+        found.append(((found[-1][0] + 1) // 2, (found[-1][1] + 1) // 2))
+    return found
+
+
+@dataclass(frozen=True)
+class Patch:
+    """A window of an image at one level as the solver wants it.
+
+    ``words``: features; ``grey``: filled grey values; ``deviation``: local deviation, grey levels, or None. The window
+    may be wider than what was asked for.
+    """
+
+    window: Window
+    words: AnyArray
+    grey: AnyArray | None
+    deviation: AnyArray | None
+
+
+@dataclass(frozen=True)
+class Seen:
+    """A view and its features. ``held``: features of whole levels, computed once; None: of each window anew."""
+
+    view: View
+    params: HfvmParams
+    held: dict[int, Patch] | None = field(default_factory=dict)
+
+    def patch(self, level: int, window: Window, deviation: bool = False) -> Patch:
+        """Features of a window of a level."""
+        if self.held is None:
+            return self._compute(level, window, deviation)
+        if level not in self.held:
+            self.held[level] = self._compute(level, whole(self.view.shapes[level]), True)
+        return self.held[level]
+
+    def _compute(self, level: int, window: Window, deviation: bool) -> Patch:
+        """In strips of rows where not the whole is held: their room is small beside the features."""
+        if self.held is not None or window.shape[0] <= STRIP:
+            words, local, grey = self._strip(level, window)
+            # Only propagation along paths needs grey values, and it is done whole.
+            return Patch(window, words, grey if self.held is not None else None, local)
+        parts = [Window(y, min(y + STRIP, window.y1), window.x0, window.x1) for y in range(window.y0, window.y1, STRIP)]
+        first = self._strip(level, parts[0])
+        words = np.empty((window.shape[0], *first[0].shape[1:]), first[0].dtype)
+        room = np.empty(window.shape, np.float32) if deviation else None
+        for part in parts:
+            some, local, _ = first if part is parts[0] else self._strip(level, part)
+            rows = slice(part.y0 - window.y0, part.y1 - window.y0)
+            words[rows] = some
+            if room is not None:
+                room[rows] = local
+        return Patch(window, words, None, room)
+
+    def _strip(self, level: int, window: Window) -> tuple[AnyArray, AnyArray, AnyArray]:
+        outer = window.grow(features.RADIUS, features.RADIUS, self.view.shapes[level])
+        grey = self.view.filled(level, outer)
+        inner = window.inside(outer)
+        if self.params.preset == "paper":
+            planes = features.planes(grey)[(slice(None), *inner)]
+            return paper.weighted(planes, self.params.weights), planes[6], grey[inner]
+        words, deviation = features.pack(grey, self.params.weights)
+        return np.ascontiguousarray(words[inner]), np.ascontiguousarray(deviation[inner]), grey[inner]
