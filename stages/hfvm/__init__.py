@@ -194,8 +194,12 @@ def _finish(
     interpolated = lonely.astype(np.uint8)
     consistency.fill_rows(u, v, keep & ~gone, params.fill_reach, state.near_sign or -1.0, interpolated)
     keep &= ~gone & ~lonely
-    mark(validity, keep, Validity.MATCHED)
     std = uncertainty.standard_deviation(left.images[0], rest, u, keep, params)
+    unsure = keep & (std > params.greatest_std) if params.greatest_std is not None else np.zeros_like(keep)
+    mark(validity, unsure, Validity.OVER_THRESHOLD)
+    interpolated[unsure], std[unsure] = 1, np.nan
+    keep &= ~unsure
+    mark(validity, keep, Validity.MATCHED)
     interpolated[left.valid[0] == 0] = 0
     if params.guided_fill:
         u, v = guided.median(u, v, keep, interpolated, left.images[0])

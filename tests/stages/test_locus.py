@@ -178,6 +178,29 @@ def test_elevation_std_is_calibrated() -> None:
     assert abs(z.mean()) < 0.2
 
 
+def test_cells_of_a_great_standard_deviation_of_their_own_are_left_out() -> None:
+    column, row, usable = disparity(RIG, T_LOCAL_LEFT, plane(0.0, 0.0, -HEIGHT))
+    noisy = np.zeros(column.shape, bool)
+    noisy[100:140, 140:180] = True
+    std = np.where(noisy, 1.0, 0.1).astype(np.float32)
+
+    def dem(**limits: float) -> Dem:
+        params = LocusParams(**limits)
+        surface = reference_plane(LATTICE)
+        return reconstruct(
+            column, row, usable, IMAGE, RIG, T_LOCAL_LEFT, surface, (-1.0, -0.3), params, disparity_std=std
+        )
+
+    whole = dem()
+    seen = np.isfinite(whole.elevation)
+    # Ten times the disparity's standard deviation is ten times the elevation's; the bound lies between both.
+    low = np.nanmax(whole.elevation_std[whole.elevation_std < 5.0 * np.nanmin(whole.elevation_std)])
+    for name, bound in (("max_std", float(low) * 1.0001), ("max_sigma", float(low) * 1.0001 / locus.OWN_STD)):
+        kept = np.isfinite(dem(**{name: bound}).elevation)
+        assert np.array_equal(kept, seen & (whole.elevation_std <= low)), name
+        assert 0 < np.count_nonzero(seen & ~kept) < 0.5 * np.count_nonzero(seen)
+
+
 def test_an_unusable_pixel_takes_the_cells_around_it_and_no_others() -> None:
     column, row, usable = disparity(RIG, T_LOCAL_LEFT, plane(0.0, 0.0, -HEIGHT))
     whole = solve((column, row, usable), (-1.0, -0.3))
@@ -278,7 +301,7 @@ def bundles(rig: Rig, height: float, noise: np.random.Generator) -> dict[str, Bu
         "validity": np.where(usable, Validity.MATCHED, Validity.INTERPOLATED).astype(np.uint8),
         "backmatch_error": np.where(usable, 0.1, np.nan).astype(np.float32),
     }
-    arrays["backmatch_error"][:, :40] = 0.9
+    arrays["backmatch_error"][:, :40] = 1.2
     inputs = {"disparity": Bundle(arrays, {}), "rig": Bundle({}, {"rig": rig.to_dict()})}
     up = T_LOCAL_LEFT.rotation[2].tolist()
     level = level_stage.STAGE.run(level_stage.LevelParams(), {"up": up}, inputs)
@@ -309,7 +332,7 @@ def test_stage_in_both_frames() -> None:
     assert np.isfinite(found).mean() > 0.99
     solved = locus_kernel.SOLVED_PX / LocusParams().sigma_disparity * local["elevation_std"][rows, cols]
     assert np.nanmean(np.abs(found - xyz[:, 2]) <= 2.0 * solved + 1e-6) > 0.99
-    # Pixels that fail back-matching by 0.9 px are not used.
+    # Pixels that fail back-matching by 1.2 px are not used.
     p = RIG.left.project(T_LOCAL_LEFT.inverse().apply(np.dstack([lattice.xy(), local["elevation"]])))
     assert np.nanmin(p[..., 0]) >= 40
 
