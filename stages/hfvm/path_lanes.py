@@ -83,9 +83,9 @@ def _costs(context: Any, builder: Any, sig: Any, views: Any, place: Any, found: 
 def gather(
     typingctx, left, right, near, right_near, share, rows, cols, x, y, at, maps, up, places, a, b, c, mu, cu, cv, cost
 ):  # type: ignore[no-untyped-def]
-    """Candidates of one pixel, and what each costs by itself; written to ``cu, cv, cost`` (:data:`MOST` values).
+    """Candidates of one pixel, and what each costs by itself; written to ``cu, cv, cost`` (MOST values).
 
-    Candidates in this order, each once: the pixel's own displacement and :data:`OWN` steps from it, those of ``maps`` at
+    Candidates in this order, each once: the pixel's own displacement, :data:`OWN` steps from it, those of ``maps`` at
     ``places[:12]``, those of ``up`` at ``places[12:]``; all but the first must lead into the right image (rows x cols).
     ``maps``, ``up``: packed displacements, v << 16 | u. ``at``: index of the pixel in the left image and in ``maps``.
     """

@@ -14,7 +14,7 @@ from stages.errors import ConfigError, DegenerateError, InputError
 from stages.geometry import Rig, RigidTransform
 from stages.lattice import Lattice
 from stages.locus import Dem, LocusParams, reconstruct
-from stages.surface import Surface, cylinder, sphere
+from stages.surface import Surface, cylinder, inclined, sphere
 from stages.surface import plane as reference_plane
 from stages.validity import Validity
 
@@ -236,6 +236,33 @@ def test_the_scene_scales_with_the_baseline() -> None:
     np.testing.assert_allclose(large.elevation, 2.0 * small.elevation, rtol=1e-5)
     np.testing.assert_allclose(large.elevation_std, 2.0 * small.elevation_std, rtol=1e-3)
     np.testing.assert_allclose(large.ortho, small.ortho, rtol=1e-4)
+
+
+def test_an_inclined_reference_plane_and_a_callable_of_ones_own() -> None:
+    """A slope seen from its own parallel plane 4 cm below it; and the same cells by a function written out."""
+    a, b, below = 0.2, -0.15, 0.04
+    maps = disparity(RIG, T_LOCAL_LEFT, plane(a, b, -HEIGHT))
+    normal = np.array([-a, -b, 1.0]) / math.sqrt(1.0 + a * a + b * b)
+    across = np.cross([0.0, 1.0, 0.0], normal)
+    across /= np.linalg.norm(across)
+    along = np.cross(normal, across)
+    foot = np.array([0.0, 0.9, -HEIGHT + 0.9 * b]) - below * normal
+    T = RigidTransform(np.column_stack([across, along, normal]), foot)
+    lattice = Lattice.snap((-0.2, 0.2, -0.2, 0.3), 0.01)
+
+    def own(rows: np.ndarray, cols: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        x, y = lattice.xs()[cols.astype(int)], lattice.ys()[rows.astype(int)]
+        return foot + np.outer(x, across) + np.outer(y, along), np.tile(normal, (rows.size, 1))
+
+    found = [
+        reconstruct(*maps, IMAGE, RIG, T_LOCAL_LEFT, surface, (-0.1, 0.2), PARAMS)
+        for surface in (inclined(lattice, T), Surface(lattice.rows, lattice.cols, own))
+    ]
+    seen = np.isfinite(found[0].elevation)
+    assert seen.mean() > 0.9
+    points = T.apply(np.dstack([lattice.xy(), np.full(lattice.shape, below)]).reshape(-1, 3)).reshape(*lattice.shape, 3)
+    assert (np.abs(found[0].elevation - below) <= tolerance(maps, points))[seen].all()
+    np.testing.assert_allclose(found[0].elevation, found[1].elevation, atol=1e-5)
 
 
 def test_other_reference_surfaces() -> None:
