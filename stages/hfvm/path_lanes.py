@@ -80,9 +80,9 @@ def _costs(context: Any, builder: Any, sig: Any, views: Any, place: Any, found: 
 
 
 @intrinsic
-def gather(
+def gather(  # type: ignore[no-untyped-def]
     typingctx, left, right, near, right_near, share, rows, cols, x, y, at, maps, up, places, a, b, c, mu, cu, cv, cost
-):  # type: ignore[no-untyped-def]
+):
     """Candidates of one pixel, and what each costs by itself; written to ``cu, cv, cost`` (MOST values).
 
     Candidates in this order, each once: the pixel's own displacement, :data:`OWN` steps from it, those of ``maps`` at
