@@ -34,6 +34,7 @@ Floats = NDArray[np.float64]
 Float32 = NDArray[np.float32]
 
 COARSE = 8  # cells a coarse cell is wide: a 64th of the cells search the whole range
+OWN_STD = 1.5  # times max_sigma: a cell's own standard deviation scatters about the typical one
 BLOCK_ROWS = 64  # rows of cells in one kernel call, so that a large surface stays small in memory
 
 
@@ -52,8 +53,14 @@ class LocusParams(Params):
     max_sigma: float | None = Field(
         None,
         gt=0,
-        description="m; cells where sigma_disparity makes a greater elevation error are left undefined: a bound on the "
-        "geometry, not on the single disparity; none: one cell size",
+        description="m; the automatic extent ends where sigma_disparity makes a greater elevation error, and where the "
+        "matcher gives no standard deviations such cells are left undefined; none: one cell size",
+    )
+    max_std: float | None = Field(
+        None,
+        gt=0,
+        description="m; cells whose own standard deviation of elevation is greater are left undefined, where the "
+        "matcher gives one: most gross errors are among them; none: 1.5 max_sigma, which 5 % of the cells exceed",
     )
     sigma_disparity: float = Field(
         0.2,
@@ -65,10 +72,10 @@ class LocusParams(Params):
         0.5, gt=0, description="pixels; greatest |p_l + d - p_r| at the solution: 2.5 sigma_disparity"
     )
     max_backmatch: float = Field(
-        0.7,
+        1.0,
         gt=0,
-        description="pixels; greatest error of back-matching: 2.5 sigma of two matches, sqrt(2) sigma_disparity; less "
-        "than the paper's 1, which serves the matching",
+        description="pixels; greatest error of back-matching (4.3.3); a stricter one leaves out more good cells than "
+        "bad ones, which max_std tells apart",
     )
     max_jump: float = Field(
         3.0,
@@ -123,7 +130,8 @@ def reconstruct(
     -------
     Dem
         A cell is undefined where a camera does not see it, where the disparity around it was not measured, jumps or
-        contradicts the calibration, or where ``sigma_disparity`` makes an elevation error beyond ``max_sigma``.
+        contradicts the calibration, or where its standard deviation is beyond ``max_std`` (``max_sigma`` without
+        ``disparity_std``).
 
     Raises
     ------
@@ -140,16 +148,26 @@ def reconstruct(
         rows = np.arange(start, min(start + BLOCK_ROWS, surface.rows))
         low, high = _from_coarse(coarse, rows, np.arange(surface.cols))
         found = task.solve(surface, rows, np.arange(surface.cols), low, high)
-        if params.max_sigma is not None:
-            found[~(params.sigma_disparity / found[..., 2] <= params.max_sigma)] = np.nan
         sigma: float | Floats = params.sigma_disparity
         if disparity_std is not None:
             sigma = task.at_left_pixel(np.asarray(disparity_std), surface, rows, found[..., 0])
         std = sigma / found[..., 2]
+        greatest = _greatest_std(params, disparity_std is not None)
+        if greatest is not None:
+            found[~(std <= greatest)] = std[~(std <= greatest)] = np.nan
         block = slice(start, start + rows.size)
         out.elevation[block], out.elevation_std[block] = found[..., 0], std
         out.residual[block], out.ortho[block] = found[..., 1], found[..., 3]
     return out
+
+
+def _greatest_std(params: LocusParams, measured: bool) -> float | None:
+    """Standard deviation of elevation, m, up to which a cell is accepted; None: any."""
+    if measured and params.max_std is not None:
+        return params.max_std
+    if params.max_sigma is None:
+        return None
+    return OWN_STD * params.max_sigma if measured else params.max_sigma
 
 
 class _Task:
@@ -339,7 +357,7 @@ def _array(name: str, unit: str, long_name: str) -> Array:
 
 STAGE = Stage(
     name="locus",
-    version=1,
+    version=2,
     summary="elevation model and ortho image of a basic pair",
     params=LocusParams,
     inputs=("disparity", "rig", "left", "level", "reference?", "trajectory?", "local?"),

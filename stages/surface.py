@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stages.errors import InputError
+from stages.geometry import RigidTransform
 from stages.lattice import Lattice
 
 Floats = NDArray[np.float64]
@@ -46,6 +47,20 @@ def plane(lattice: Lattice) -> Surface:
     def locate(rows: Floats, cols: Floats) -> tuple[Floats, Floats]:
         feet = np.stack([xs[cols.astype(np.intp)], ys[rows.astype(np.intp)], np.zeros(rows.size)], axis=-1)
         return feet, np.broadcast_to([0.0, 0.0, 1.0], feet.shape)
+
+    return Surface(lattice.rows, lattice.cols, locate)
+
+
+def inclined(lattice: Lattice, T_frame_plane: RigidTransform) -> Surface:
+    """A plane of any pose: cells of ``lattice`` in its own x and y, elevation along its own z.
+
+    ``T_frame_plane``: pose of the plane in the frame of the feet.
+    """
+    level = plane(lattice)
+
+    def locate(rows: Floats, cols: Floats) -> tuple[Floats, Floats]:
+        feet, normals = level.locate(rows, cols)
+        return T_frame_plane.apply(feet), normals @ T_frame_plane.rotation.T
 
     return Surface(lattice.rows, lattice.cols, locate)
 

@@ -158,8 +158,12 @@ class Finish:
         interpolated = lonely.astype(np.uint8)
         consistency.fill_rows(u, v, keep & ~removed, p.fill_reach, self.near_sign or -1.0, interpolated)
         keep &= ~removed & ~lonely
-        mark(validity, keep, Validity.MATCHED)
         std = uncertainty.standard_deviation(noise, u, keep, p)
+        unsure = keep & (std > p.greatest_std) if p.greatest_std is not None else np.zeros_like(keep)
+        mark(validity, unsure, Validity.OVER_THRESHOLD)
+        interpolated[unsure], std[unsure] = 1, np.nan
+        keep &= ~unsure
+        mark(validity, keep, Validity.MATCHED)
         interpolated[valid == 0] = 0
         if p.guided_fill:
             u, v = guided.median(u, v, keep, interpolated, left)

@@ -29,8 +29,9 @@ ACCURATE: Mapping[str, Any] = {
     "back_rounds": 4,
     "centres": 5,
     "path_rounds": 3,
-    "relief_steps": 6,
+    "relief_steps": 7,
     "crowd": 0.5,
+    "greatest_std": 1.0,
     "guided_fill": True,
 }
 """What preset ``accurate`` sets differently; a value given by the user wins."""
@@ -149,7 +150,10 @@ class HfvmParams(Params):
     )
 
     path_rounds: int = Field(
-        default=0, ge=0, le=8, description="rounds of propagation along paths a level; the third still helps, 0 = none"
+        default=0,
+        ge=0,
+        le=8,
+        description="rounds of propagation along paths a level; a third changes bad-2 by .001, 0 = none",
     )
     path_compact: int = Field(
         default=8,
@@ -185,6 +189,11 @@ class HfvmParams(Params):
         ge=0,
         le=1,
         description="least share of matched pixels in 9 x 9 around a matched one; lonely ones are errors by the edge",
+    )
+    greatest_std: float | None = Field(
+        default=None,
+        gt=0,
+        description="pixels; matches of a greater standard deviation count as not matched; none: any",
     )
     guided_fill: bool = Field(
         default=False, description="edge-keeping median of interpolated pixels, which streak along rows"

@@ -7,8 +7,9 @@ Here the displacements (u, v) of all matched pixels minimise
 
 with r the difference of the left image and the right one warped by the last step, free of its local mean; g the warped
 gradient; w falling with r and s with the second difference found, so that neither a wrong pixel nor an edge drags its
-neighbours along. The lines are fitted to the matches themselves (:mod:`stages.hfvm.epipolar`); k gives way where they
-do not lie on lines. Solved by a fixed number of Gauss-Seidel sweeps in reading order.
+neighbours along. Stiffness starts weak and tolerant of bends: from the first, it would take the errors that windows
+make beside edges for relief. The lines are fitted to the matches themselves (:mod:`stages.hfvm.epipolar`); k gives way
+where they do not lie on lines. Solved by a fixed number of Gauss-Seidel sweeps in reading order.
 """
 
 from __future__ import annotations
@@ -37,9 +38,14 @@ SHARP = 0.05
 """Pixels: median distance from the lines up to which they are trusted fully; beyond it by its inverse square."""
 
 FIT_SAMPLES = 4000
-SWEEPS = 20
-OVERSHOOT = 1.3
+SWEEPS = 12
+OVERSHOOT = 1.7
 """Factor on each Gauss-Seidel step (successive over-relaxation), which stays convergent below 2."""
+
+SOFT_STEPS, SOFT_STIFFNESS, SOFT_BEND = 3, 0.15, 2.0
+"""Number of the first, soft steps, and their factors on stiffness and bend."""
+FULL_STEPS = 4
+"""Steps with full stiffness after them; where there are fewer steps in all, soft ones are left out first."""
 
 
 def fit(
@@ -62,11 +68,14 @@ def fit(
     """
     start_u, start_v = u, v
     u, v = np.where(keep, u, np.float32(0)), np.where(keep, v, np.float32(0))
-    for _ in range(params.relief_steps):
+    for step in range(params.relief_steps):
+        soft = step < min(SOFT_STEPS, params.relief_steps - FULL_STEPS)
+        stiffness = params.relief_stiffness * (SOFT_STIFFNESS if soft else 1.0)
+        bend = params.relief_bend * (SOFT_BEND if soft else 1.0)
         a, b, c, p, q = _normal(left, right, right_valid, u, v, keep)
         _hold_to_lines(u, v, keep, right.shape, a, b, c, p, q)
         across, down = np.zeros(u.shape, np.float32), np.zeros(u.shape, np.float32)
-        _stiffness(u, v, keep, np.float32(params.relief_bend), np.float32(params.relief_stiffness), across, down)
+        _stiffness(u, v, keep, np.float32(bend), np.float32(stiffness), across, down)
         new_u, new_v = u.copy(), v.copy()
         _solve(a, b, c, p, q, keep, across, down, SWEEPS, np.float32(OVERSHOOT), u, v, new_u, new_v)
         u, v = new_u, new_v

@@ -7,8 +7,9 @@ from hypothesis import strategies as st
 from matching_scenes import Texture, pair, seen
 
 from stages.errors import RilleError
-from stages.hfvm import HfvmParams, compact, consistency, guided, match, paths, relief
+from stages.hfvm import HfvmParams, compact, consistency, guided, match, path_lanes, paths, relief
 from stages.hfvm.params import ACCURATE
+from stages.hfvm.propagation import pack_map
 from stages.pyramid import PyramidParams, build
 from stages.validity import Validity, has, matched
 
@@ -102,12 +103,90 @@ def test_path_costs_are_those_of_the_definition(seed):
     rng = np.random.default_rng(seed)
     shape = (4, 5, paths.MOST)
     cu, cv = rng.integers(-9, 9, (2, *shape)).astype(np.int16)
-    cost = rng.integers(0, 4000, shape).astype(np.int32)
+    cost = rng.integers(0, 16001, shape).astype(np.int16)
+    cost[rng.random(shape) < 0.2] = paths.NONE
+    cost[..., 0] = np.minimum(cost[..., 0], 16000)  # a pixel has one candidate at least: its own
     grey = rng.uniform(0, 255, shape[:2]).astype(np.float32)
     total = np.zeros(shape, np.int32)
     for backward in (False, True):
         paths._sweep(cu, cv, cost, grey, 36, 240, 10.0, backward, total)
-    np.testing.assert_array_equal(total, brute_force(cu, cv, cost, grey, 36, 240, 10.0))
+    there = cost != paths.NONE
+    np.testing.assert_array_equal(total[there], brute_force(cu, cv, cost, grey, 36, 240, 10.0)[there])
+
+
+def listed(maps, up, y, x, right_shape):
+    """Candidates (u, v) of a pixel by their definition."""
+    u, v = maps
+    rows, cols = u.shape
+    found = [(int(u[y, x]), int(v[y, x]))]
+    more = [(u[y, x] + i, v[y, x] + j) for j, i in ((0, -1), (0, 1), (-1, 0), (1, 0))]
+    for j, i in paths.OFFSETS:
+        near = min(max(y + j, 0), rows - 1), min(max(x + i, 0), cols - 1)
+        more.append((u[near], v[near]))
+    for k in range(9 if up is not None else 0):
+        above = (
+            min(max(y // 2 + k // 3 - 1, 0), up[0].shape[0] - 1),
+            min(max(x // 2 + k % 3 - 1, 0), up[0].shape[1] - 1),
+        )
+        more.append((2 * up[0][above], 2 * up[1][above]))
+    for a, b in more:
+        inside = 0 <= x + a < right_shape[1] and 0 <= y + b < right_shape[0]
+        if inside and (int(a), int(b)) not in found and len(found) < paths.MOST:
+            found.append((int(a), int(b)))
+    return found
+
+
+@pytest.mark.parametrize("mu", [0.0, 3.0])
+@pytest.mark.parametrize("with_up", [False, True])
+def test_candidates_and_their_costs_are_those_of_the_definition(mu, with_up):
+    rng = np.random.default_rng(3)
+    left, right = (rng.uniform(0, 255, shape).astype(np.float32) for shape in ((11, 14), (12, 17)))
+    a, b = view(left), view(right)
+    maps = rng.integers(-6, 6, (2, *left.shape)).astype(np.int16)
+    up = rng.integers(-3, 3, (2, 6, 7)).astype(np.int16) if with_up else None
+    lines = rng.normal(0, 1, (*left.shape, 3)).astype(np.float32)
+    cu, cv, cost = (np.empty((*left.shape, paths.MOST), np.int16) for _ in range(3))
+    packed = np.empty(left.shape, np.int32)
+    pack_map(*maps, packed)
+    above = packed if up is None else paths._doubled(*up)
+    places = np.empty(len(paths.OFFSETS) + paths.UP, np.int64)
+    paths._gather(
+        a.words,
+        b.words,
+        a.compact,
+        b.compact,
+        8,
+        packed,
+        above,
+        with_up,
+        paths.OFFSETS,
+        lines,
+        mu,
+        places,
+        cu,
+        cv,
+        cost,
+    )
+
+    def apart(word, other):
+        return int(np.abs(bytes_of(word).astype(int) - bytes_of(other)).sum())
+
+    for y, x in np.ndindex(left.shape):
+        want = listed(maps, up, y, x, right.shape)
+        there = cost[y, x] != paths.NONE
+        assert list(zip(cu[y, x, there].tolist(), cv[y, x, there].tolist(), strict=True)) == want
+        for k, (i, j) in enumerate(want):
+            expected = path_lanes.OUTSIDE
+            if 0 <= x + i < right.shape[1] and 0 <= y + j < right.shape[0]:
+                other = y + j, x + i
+                expected = 4 * apart(a.words[y, x], b.words[other]) + 8 * apart(a.compact[y, x], b.compact[other])
+            n = lines[y, x].astype(np.float64)
+            expected += int(12 * mu * abs(n[0] * i + n[1] * j + n[2]))
+            assert cost[y, x, k] == min(expected, 2 * path_lanes.OUTSIDE)
+
+
+def bytes_of(word):
+    return np.array([word], np.uint64).view(np.uint8)
 
 
 def test_paths_find_both_sides_of_a_step_from_a_poor_start():
@@ -250,6 +329,17 @@ def test_accurate_is_better_than_default_on_a_slanted_step_with_occlusion():
         assert ok.sum() / both.sum() > 0.85
     assert bad["accurate"] <= bad["default"]
     assert error["accurate"] < error["default"]
+
+
+def test_unsure_matches_do_not_count_as_matched():
+    left, right, *_ = pair(lambda x, y: (-8.0 - 4.0 * (x > 80), 1.0), noise=3.0)
+    free = match(left, right, HfvmParams(preset="accurate", greatest_std=None))
+    found = match(left, right, HfvmParams(preset="accurate", greatest_std=0.2))
+    unsure = free.disparity_std > 0.2
+    assert 0 < unsure.sum() < 0.5 * unsure.size
+    np.testing.assert_array_equal(matched(found.validity), matched(free.validity) & ~unsure)
+    assert has(found.validity, Validity.OVER_THRESHOLD)[unsure].all()
+    assert has(found.validity, Validity.INTERPOLATED)[unsure].all()  # still the best guess
 
 
 def test_unrelated_images_give_few_matches():

@@ -14,7 +14,7 @@ from stages.errors import ConfigError, DegenerateError, InputError
 from stages.geometry import Rig, RigidTransform
 from stages.lattice import Lattice
 from stages.locus import Dem, LocusParams, reconstruct
-from stages.surface import Surface, cylinder, sphere
+from stages.surface import Surface, cylinder, inclined, sphere
 from stages.surface import plane as reference_plane
 from stages.validity import Validity
 
@@ -178,6 +178,29 @@ def test_elevation_std_is_calibrated() -> None:
     assert abs(z.mean()) < 0.2
 
 
+def test_cells_of_a_great_standard_deviation_of_their_own_are_left_out() -> None:
+    column, row, usable = disparity(RIG, T_LOCAL_LEFT, plane(0.0, 0.0, -HEIGHT))
+    noisy = np.zeros(column.shape, bool)
+    noisy[100:140, 140:180] = True
+    std = np.where(noisy, 1.0, 0.1).astype(np.float32)
+
+    def dem(**limits: float) -> Dem:
+        params = LocusParams(**limits)
+        surface = reference_plane(LATTICE)
+        return reconstruct(
+            column, row, usable, IMAGE, RIG, T_LOCAL_LEFT, surface, (-1.0, -0.3), params, disparity_std=std
+        )
+
+    whole = dem()
+    seen = np.isfinite(whole.elevation)
+    # Ten times the disparity's standard deviation is ten times the elevation's; the bound lies between both.
+    low = np.nanmax(whole.elevation_std[whole.elevation_std < 5.0 * np.nanmin(whole.elevation_std)])
+    for name, bound in (("max_std", float(low) * 1.0001), ("max_sigma", float(low) * 1.0001 / locus.OWN_STD)):
+        kept = np.isfinite(dem(**{name: bound}).elevation)
+        assert np.array_equal(kept, seen & (whole.elevation_std <= low)), name
+        assert 0 < np.count_nonzero(seen & ~kept) < 0.5 * np.count_nonzero(seen)
+
+
 def test_an_unusable_pixel_takes_the_cells_around_it_and_no_others() -> None:
     column, row, usable = disparity(RIG, T_LOCAL_LEFT, plane(0.0, 0.0, -HEIGHT))
     whole = solve((column, row, usable), (-1.0, -0.3))
@@ -213,6 +236,33 @@ def test_the_scene_scales_with_the_baseline() -> None:
     np.testing.assert_allclose(large.elevation, 2.0 * small.elevation, rtol=1e-5)
     np.testing.assert_allclose(large.elevation_std, 2.0 * small.elevation_std, rtol=1e-3)
     np.testing.assert_allclose(large.ortho, small.ortho, rtol=1e-4)
+
+
+def test_an_inclined_reference_plane_and_a_callable_of_ones_own() -> None:
+    """A slope seen from its own parallel plane 4 cm below it; and the same cells by a function written out."""
+    a, b, below = 0.2, -0.15, 0.04
+    maps = disparity(RIG, T_LOCAL_LEFT, plane(a, b, -HEIGHT))
+    normal = np.array([-a, -b, 1.0]) / math.sqrt(1.0 + a * a + b * b)
+    across = np.cross([0.0, 1.0, 0.0], normal)
+    across /= np.linalg.norm(across)
+    along = np.cross(normal, across)
+    foot = np.array([0.0, 0.9, -HEIGHT + 0.9 * b]) - below * normal
+    T = RigidTransform(np.column_stack([across, along, normal]), foot)
+    lattice = Lattice.snap((-0.2, 0.2, -0.2, 0.3), 0.01)
+
+    def own(rows: np.ndarray, cols: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        x, y = lattice.xs()[cols.astype(int)], lattice.ys()[rows.astype(int)]
+        return foot + np.outer(x, across) + np.outer(y, along), np.tile(normal, (rows.size, 1))
+
+    found = [
+        reconstruct(*maps, IMAGE, RIG, T_LOCAL_LEFT, surface, (-0.1, 0.2), PARAMS)
+        for surface in (inclined(lattice, T), Surface(lattice.rows, lattice.cols, own))
+    ]
+    seen = np.isfinite(found[0].elevation)
+    assert seen.mean() > 0.9
+    points = T.apply(np.dstack([lattice.xy(), np.full(lattice.shape, below)]).reshape(-1, 3)).reshape(*lattice.shape, 3)
+    assert (np.abs(found[0].elevation - below) <= tolerance(maps, points))[seen].all()
+    np.testing.assert_allclose(found[0].elevation, found[1].elevation, atol=1e-5)
 
 
 def test_other_reference_surfaces() -> None:
@@ -278,7 +328,7 @@ def bundles(rig: Rig, height: float, noise: np.random.Generator) -> dict[str, Bu
         "validity": np.where(usable, Validity.MATCHED, Validity.INTERPOLATED).astype(np.uint8),
         "backmatch_error": np.where(usable, 0.1, np.nan).astype(np.float32),
     }
-    arrays["backmatch_error"][:, :40] = 0.9
+    arrays["backmatch_error"][:, :40] = 1.2
     inputs = {"disparity": Bundle(arrays, {}), "rig": Bundle({}, {"rig": rig.to_dict()})}
     up = T_LOCAL_LEFT.rotation[2].tolist()
     level = level_stage.STAGE.run(level_stage.LevelParams(), {"up": up}, inputs)
@@ -309,7 +359,7 @@ def test_stage_in_both_frames() -> None:
     assert np.isfinite(found).mean() > 0.99
     solved = locus_kernel.SOLVED_PX / LocusParams().sigma_disparity * local["elevation_std"][rows, cols]
     assert np.nanmean(np.abs(found - xyz[:, 2]) <= 2.0 * solved + 1e-6) > 0.99
-    # Pixels that fail back-matching by 0.9 px are not used.
+    # Pixels that fail back-matching by 1.2 px are not used.
     p = RIG.left.project(T_LOCAL_LEFT.inverse().apply(np.dstack([lattice.xy(), local["elevation"]])))
     assert np.nanmin(p[..., 0]) >= 40
 
@@ -322,8 +372,9 @@ def test_each_cell_has_the_error_of_its_own_pixel_where_the_matcher_gives_one() 
     std = np.full(shape, 0.1, np.float32)
     std[:, shape[1] // 2 :] = 0.6
     disparity = Bundle({**inputs["disparity"].arrays, "disparity_std": std}, {})
-    own = locus.STAGE.run(params, args, inputs | {"disparity": disparity})
-    np.testing.assert_array_equal(own["elevation"], plain["elevation"])
+    own = locus.STAGE.run(params.model_copy(update={"max_std": 1.0}), args, inputs | {"disparity": disparity})
+    both = np.isfinite(plain["elevation"])  # which the typical error bounds, and here a metre does not
+    np.testing.assert_array_equal(own["elevation"][both], plain["elevation"][both])
     lattice = Lattice.from_dict(own.meta["lattice"])
     pixels = RIG.left.project(T_LOCAL_LEFT.inverse().apply(np.dstack([lattice.xy(), own["elevation"]])))
     ratio = own["elevation_std"] / plain["elevation_std"] * LocusParams().sigma_disparity
