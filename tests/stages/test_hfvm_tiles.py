@@ -47,7 +47,8 @@ def test_tiles_of_any_size_and_order_give_the_bits_of_the_whole(scene, aligned, 
     views, params = both(scene), HfvmParams(preset=preset)
     once = tiled.match(*views, params, None, quiet, None)
     assert once.aligned == (aligned and preset != "paper")
-    assert np.mean(once.arrays["validity"] & 1) > 0.03
+    # the paper compares grey levels as they are: of half the contrast little matches
+    assert np.mean(once.arrays["validity"] & 1) > (0.005 if preset == "paper" else 0.5)
     for side in (64, 100, 37):
         found = in_tiles(views, params, side, side)
         assert found.aligned == once.aligned
