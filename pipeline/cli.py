@@ -1,4 +1,4 @@
-"""The command line: ``rille reconstruct | plan | check | init | calibrate | match | datasets | cache``.
+"""The command line: ``rille reconstruct | plan | check | init | calibrate | match | export | datasets | cache``.
 
 Exit codes: 0 complete; 1 failed; 2 usage, configuration or input; 3 finished with holes under ``--keep-going``;
 130 interrupted. Results go to stdout, progress and complaints to stderr. Heavy imports happen inside the commands, so
@@ -322,6 +322,38 @@ def match(
         prior=prior_disparity,
         confidence=confidence,
     )
+
+
+@app.command(name="export")
+def export_run(
+    run: Path,
+    *,
+    to: Literal["colmap"],
+    output: Annotated[Path | None, Parameter(name=["--output", "-o"])] = None,
+    cache: CacheFolder = None,
+    debug: Annotated[bool, Parameter(negative="")] = False,
+) -> int:
+    """Write a finished run for another program: a COLMAP model with cameras, rig, poses and tracked points.
+
+    Parameters
+    ----------
+    run
+        Folder of the run, for example runs/mockup/latest.
+    to
+        The program.
+    output
+        Folder to make; RUN/colmap by default.
+    cache
+        Folder of cached artifacts; RILLE_CACHE or .rille/cache by default.
+    debug
+        Show tracebacks.
+    """
+    _prepare(cache)
+    from pipeline import colmap
+    from pipeline.store import Store
+
+    print(colmap.export_run(run, output or run / to, Store(cache_folder(cache))))
+    return COMPLETE
 
 
 @datasets_app.default
