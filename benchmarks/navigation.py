@@ -94,11 +94,11 @@ def compare(name: str, given: argparse.Namespace) -> list[dict[str, Any]]:
     methods = [("OpenCV odometry", lambda: opencv.Odometry(images).run(), given.rounds)]
     methods += [(f"Rille {p}", lambda p=p: rille(p), given.rounds) for p in given.preset or PRESETS]
     if not given.no_colmap:
-        methods.append(("COLMAP", lambda: colmap.run(images, chain.settings(sequence, given.set)), 1))
+        methods.append(("COLMAP", lambda: colmap.run(images, chain.settings(sequence, given.set)), 0))
     found: dict[str, dict[str, Any]] = {}
     for number in range(given.rounds + 1):
         for method, run, rounds in methods:
-            if number >= rounds + (rounds > 1):
+            if number > rounds:
                 continue
             say(f"{name}: {method}, round {number}")
             done = run()
