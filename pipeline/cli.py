@@ -392,32 +392,50 @@ def match(
 def export_run(
     run: Path,
     *,
-    to: Annotated[list[Literal["laz", "glb"]], Parameter(negative="")],
+    to: Annotated[list[Literal["laz", "glb", "colmap"]], Parameter(negative="")],
     output: Annotated[Path | None, Parameter(name=["--output", "-o"])] = None,
+    cache: CacheFolder = None,
     debug: Annotated[bool, Parameter(negative="")] = False,
 ) -> int:
-    """Write the terrain of a run for other programs: cloud.laz (a point a cell) or terrain.glb (textured mesh).
+    """Write a run for other programs: cloud.laz (a point a cell), terrain.glb (textured mesh) or a COLMAP model.
 
     Parameters
     ----------
     run
         Folder of a run, for example runs/mockup/latest.
     to
-        laz: CloudCompare, PDAL, QGIS; glb: any glTF viewer, Blender. May be repeated.
+        laz: CloudCompare, PDAL, QGIS; glb: any glTF viewer, Blender; colmap: cameras, rig, poses and tracked points.
+        May be repeated.
     output
-        File to write, for one form only; by default cloud.laz or terrain.glb in the run's folder.
+        What to write, for one form only; by default cloud.laz, terrain.glb or the folder colmap in the run's folder.
+    cache
+        Folder of cached artifacts (colmap); RILLE_CACHE or .rille/cache by default.
     debug
         Show tracebacks.
     """
-    from pipeline import cloud
     from stages.errors import ConfigError
 
     if output is not None and len(to) > 1:
-        raise ConfigError(f"--output names one file for {len(to)} forms", remedy="give one --to, or leave --output out")
+        raise ConfigError(
+            f"--output names one place for {len(to)} forms", remedy="give one --to, or leave --output out"
+        )
+    _prepare(cache)
     for kind in to:
-        path, words = cloud.export(run, kind, output)
-        print(f"{path}  {words}")
+        print(_export(run, kind, output, cache))
     return COMPLETE
+
+
+def _export(run: Path, kind: Literal["laz", "glb", "colmap"], output: Path | None, cache: str | None) -> str:
+    """Write one form; what was written, in words."""
+    if kind == "colmap":
+        from pipeline import colmap
+        from pipeline.store import at
+
+        return str(colmap.export_run(run, output or run / kind, at(cache_folder(cache))))
+    from pipeline import cloud
+
+    path, words = cloud.export(run, kind, output)
+    return f"{path}  {words}"
 
 
 @app.command(name="compare-dem")

@@ -9,6 +9,8 @@ counted and left out. Where truth has a gap, its path is taken to be straight, w
 * drift: error of the last position after making the first poses equal, over the true length of the path;
 * KITTI: relative error of all sections of 100, 200 ... 800 m that start every tenth frame, over their length
   (Geiger et al. 2012, doi:10.1109/CVPR.2012.6248074, and its development kit); not over a gap of the truth.
+
+Relative errors over longer stretches, their causes and the claimed covariances: :mod:`stages.trajectory_error`.
 """
 
 from __future__ import annotations
@@ -20,29 +22,27 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.accuracy_parts import Metric, along, angle, inverse, metric, posed, rms, square
 from stages.declare import Array, Bundle, Inputs, NoParams, Stage
 from stages.errors import InputError
+from stages.trajectory_error import against_claims, by_cause, by_shares, by_steps
 
 Floats = NDArray[np.float64]
-Metric = dict[str, Any]
 
 KITTI_LENGTHS = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 KITTI_STEP = 10
 
 
-def metric(value: float | int | None, unit: str, how: str) -> Metric:
-    """One figure as the report prints it; ``None`` means not applicable, and ``how`` says why."""
-    sound = value is not None and math.isfinite(value)
-    return {"value": value if sound else None, "unit": unit, "how": how}
-
-
-def trajectory_accuracy(estimate: Floats, truth: Floats) -> tuple[dict[str, Floats], dict[str, Metric]]:
+def trajectory_accuracy(
+    estimate: Floats, truth: Floats, covariance: Floats | None = None
+) -> tuple[dict[str, Floats], dict[str, Metric]]:
     """Compare an estimated trajectory with the true one.
 
     Parameters
     ----------
     estimate : (frame, 3, 4) T_world_left, metres; NaN where a frame has no pose.
     truth : (frame, 3, 4) T_truth_left of the same frames; NaN where there is no truth.
+    covariance : (frame, 6, 6) of the estimate in the world, where it claims one; see :mod:`stages.resect`.
 
     Returns
     -------
@@ -62,8 +62,8 @@ def trajectory_accuracy(estimate: Floats, truth: Floats) -> tuple[dict[str, Floa
     judged = np.flatnonzero(has_pose & has_truth)
     if len(judged) == 0:
         raise InputError("no frame with a pose has truth", remedy="give truth that covers the chosen frames")
-    P, Q = _square(estimate), _square(truth)
-    aligned = P[judged[0]] @ _inverse(Q[judged[0]]) @ Q
+    P, Q = square(estimate), square(truth)
+    aligned = P[judged[0]] @ inverse(Q[judged[0]]) @ Q
     arrays = {
         "position": P[:, :3, 3].copy(),
         "position_truth": aligned[:, :3, 3].copy(),
@@ -75,12 +75,10 @@ def trajectory_accuracy(estimate: Floats, truth: Floats) -> tuple[dict[str, Floa
     metrics |= _drift(P, aligned, judged)
     metrics |= _relative(P, Q)
     metrics |= _displacement(arrays["displacement"], arrays["displacement_truth"])
-    return arrays, metrics | _kitti(P, Q)
-
-
-def posed(poses: Floats) -> NDArray[np.bool_]:
-    """Which of the poses (frame, 3, 4) are there, i.e. without NaN."""
-    return np.asarray(np.isfinite(poses).all(axis=(1, 2)))
+    metrics |= _kitti(P, Q) | by_steps(P, Q) | by_shares(P[judged], Q[judged]) | by_cause(P, Q)
+    if covariance is not None:
+        metrics |= against_claims(P, aligned, covariance)
+    return arrays, metrics
 
 
 def _counts(has_pose: NDArray[np.bool_], has_truth: NDArray[np.bool_]) -> dict[str, Metric]:
@@ -106,8 +104,8 @@ def _absolute(P: Floats, Q: Floats, aligned: Floats) -> dict[str, Metric]:
     best = P[:, :3, 3] @ rotation.T + translation - Q[:, :3, 3]
     first = P[:, :3, 3] - aligned[:, :3, 3]
     return {
-        "ate_rmse": metric(_rms(best), "m", "RMS position error after the best rotation and translation, no scale"),
-        "ate_first_frame_rmse": metric(_rms(first), "m", "RMS position error with the first poses made equal"),
+        "ate_rmse": metric(rms(best), "m", "RMS position error after the best rotation and translation, no scale"),
+        "ate_first_frame_rmse": metric(rms(first), "m", "RMS position error with the first poses made equal"),
         "ate_first_frame_max": metric(
             float(np.linalg.norm(first, axis=1).max()), "m", "largest position error with the first poses made equal"
         ),
@@ -116,10 +114,10 @@ def _absolute(P: Floats, Q: Floats, aligned: Floats) -> dict[str, Metric]:
 
 def _drift(P: Floats, aligned: Floats, judged: NDArray[np.intp]) -> dict[str, Metric]:
     last = judged[-1]
-    along, gaps = _along(aligned[judged[0] : last + 1])
-    length = float(along[-1])
+    way, gaps = along(aligned[judged[0] : last + 1])
+    length = float(way[-1])
     error = float(np.linalg.norm(P[last, :3, 3] - aligned[last, :3, 3]))
-    turn = math.degrees(float(_angle(_inverse(aligned[last]) @ P[last])))
+    turn = math.degrees(float(angle(inverse(aligned[last]) @ P[last])))
     percent = 100.0 * error / length if length > 0 else None
     how = "error of the last position with the first poses made equal"
     bridged = f", straight over {gaps} gap{'s' if gaps > 1 else ''} of the truth" if gaps else ""
@@ -134,15 +132,15 @@ def _drift(P: Floats, aligned: Floats, judged: NDArray[np.intp]) -> dict[str, Me
 
 
 def _relative(P: Floats, Q: Floats) -> dict[str, Metric]:
-    E = _inverse(_inverse(Q[:-1]) @ Q[1:]) @ (_inverse(P[:-1]) @ P[1:])
+    E = inverse(inverse(Q[:-1]) @ Q[1:]) @ (inverse(P[:-1]) @ P[1:])
     E = E[np.isfinite(E).all(axis=(1, 2))]
     if len(E) == 0:
         none = "not applicable: no two successive frames have poses"
         return {k: metric(None, u, none) for k, u in (("rpe_translation_rmse", "m"), ("rpe_rotation_rmse", "deg"))}
-    shift, turn = np.linalg.norm(E[:, :3, 3], axis=1), np.degrees(_angle(E))
+    shift, turn = np.linalg.norm(E[:, :3, 3], axis=1), np.degrees(angle(E))
     how = f"of the motion between successive frames, {len(E)} pairs"
     return {
-        "rpe_translation_rmse": metric(_rms(E[:, :3, 3]), "m", f"RMS error {how}"),
+        "rpe_translation_rmse": metric(rms(E[:, :3, 3]), "m", f"RMS error {how}"),
         "rpe_translation_median": metric(float(np.median(shift)), "m", f"median error {how}"),
         "rpe_translation_max": metric(float(shift.max()), "m", f"largest error {how}"),
         "rpe_rotation_rmse": metric(float(np.sqrt(np.mean(turn**2))), "deg", f"RMS rotation error {how}"),
@@ -164,19 +162,19 @@ def _displacement(estimate: Floats, truth: Floats) -> dict[str, Metric]:
 
 
 def _kitti(P: Floats, Q: Floats) -> dict[str, Metric]:
-    along, _ = _along(Q)
+    way, _ = along(Q)
     has_truth = np.isfinite(Q[:, 0, 0])
     errors = []
     for first in range(0, len(Q), KITTI_STEP):
         for length in KITTI_LENGTHS:
-            last = int(np.searchsorted(along, along[first] + length, side="right"))
+            last = int(np.searchsorted(way, way[first] + length, side="right"))
             if last >= len(Q) or not np.isfinite(P[[first, last]]).all() or not has_truth[first : last + 1].all():
                 continue
-            E = _inverse(_inverse(P[first]) @ P[last]) @ (_inverse(Q[first]) @ Q[last])
-            errors.append((np.linalg.norm(E[:3, 3]) / length, _angle(E) / length))
+            E = inverse(inverse(P[first]) @ P[last]) @ (inverse(Q[first]) @ Q[last])
+            errors.append((np.linalg.norm(E[:3, 3]) / length, angle(E) / length))
     if not errors:
-        why = f"not applicable: the true path is {along[-1]:.1f} m long, the shortest section 100 m"
-        if along[-1] > KITTI_LENGTHS[0]:
+        why = f"not applicable: the true path is {way[-1]:.1f} m long, the shortest section 100 m"
+        if way[-1] > KITTI_LENGTHS[0]:
             why = "not applicable: no section of 100 m has poses at both ends and truth throughout"
         return {"kitti_translation": metric(None, "%", why), "kitti_rotation": metric(None, "deg/100 m", why)}
     shift, turn = np.mean(np.array(errors), axis=0)
@@ -187,43 +185,9 @@ def _kitti(P: Floats, Q: Floats) -> dict[str, Metric]:
     }
 
 
-def _along(poses: Floats) -> tuple[Floats, int]:
-    """Way (frame,) from the first frame along positions, m, straight over frames without any; how many such gaps."""
-    there = np.isfinite(poses[:, :3, 3]).all(axis=1)
-    rows = np.flatnonzero(there)
-    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(poses[rows, :3, 3], axis=0), axis=1))])
-    return np.interp(np.arange(len(poses)), rows, way), int((np.diff(rows) > 1).sum())
-
-
-def _rms(vectors: Floats) -> float:
-    return float(np.sqrt(np.mean(np.sum(vectors**2, axis=1))))
-
-
-def _square(poses: Floats) -> Floats:
-    out = np.zeros((len(poses), 4, 4))
-    out[:, :3], out[:, 3, 3] = poses, 1.0
-    return out
-
-
-def _inverse(T: Floats) -> Floats:
-    out = np.zeros_like(T)
-    R = np.swapaxes(T[..., :3, :3], -1, -2)
-    out[..., :3, :3] = R
-    out[..., :3, 3] = -(R @ T[..., :3, 3, None])[..., 0]
-    out[..., 3, 3] = 1.0
-    return out
-
-
-def _angle(T: Floats) -> Floats:
-    """Rotation angle, radians, of transforms (..., 4, 4); exact for small angles, unlike acos of the trace."""
-    R = T[..., :3, :3]
-    axis = np.stack([R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], axis=-1)
-    return np.asarray(np.arctan2(np.linalg.norm(axis, axis=-1), np.trace(R, axis1=-2, axis2=-1) - 1.0))
-
-
 def angles_between(a: Floats, b: Floats) -> Floats:
     """Rotation angle (n,), radians, between the orientations of poses (n, 3, 4) and (n, 3, 4)."""
-    return _angle(np.swapaxes(a[:, :, :3], 1, 2) @ b[:, :, :3])
+    return angle(np.swapaxes(a[:, :, :3], 1, 2) @ b[:, :, :3])
 
 
 def by_frame(poses: Floats, frames: list[int], wanted: list[int]) -> Floats:
@@ -249,6 +213,16 @@ def _nothing(estimate: Floats) -> dict[str, Floats]:
     }
 
 
+def _claimed(trajectory: Bundle, given: list[int], wanted: list[int]) -> Floats | None:
+    """Covariances of the wanted frames, NaN where there is none; None of a trajectory that claims nothing."""
+    if "covariance" not in trajectory.arrays:
+        return None
+    row = {frame: k for k, frame in enumerate(given)}
+    none = np.full((6, 6), np.nan)
+    covariance = np.asarray(trajectory["covariance"])
+    return np.array([covariance[row[f]] if f in row else none for f in wanted])
+
+
 def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     trajectory, truth = inputs["trajectory"], inputs["truth"]
     given = list(trajectory.meta["frames"])
@@ -258,13 +232,14 @@ def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     if len(estimate) == len(true) and not (has_pose & has_truth).any():
         arrays, metrics = _nothing(estimate), _counts(has_pose, has_truth)
     else:
-        arrays, metrics = trajectory_accuracy(estimate, true)
+        claimed = _claimed(trajectory, given, wanted)
+        arrays, metrics = trajectory_accuracy(estimate, true, claimed)
     return Bundle(arrays, {"metrics": metrics, "frames": wanted, "truth": truth.meta["source"]})
 
 
 STAGE = Stage(
     name="accuracy",
-    version=2,
+    version=3,
     summary="trajectory against truth: ATE, RPE, displacements, drift, KITTI",
     params=NoParams,
     inputs=("trajectory", "truth"),

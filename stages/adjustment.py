@@ -206,12 +206,12 @@ class _Part:
 def _pair(rig: Rig, matches: Matches, basis: Floats, last: float, x: Floats) -> _Part:
     """One pair's part of the normal equations, with weights from its own scatter (at most ``last``, pixels)."""
     distance, design = _design(rig, matches, basis, x[:RIG])
-    rest = distance + np.einsum("ni,i->n", design[:, RIG:], x[RIG:])
+    rest = distance + design[:, RIG:] @ x[RIG:]
     noise = max(LEAST_NOISE, min(last, 1.4826 * float(np.median(np.abs(rest)))))
     weights = np.maximum(0.0, 1.0 - (rest / (TUKEY * noise)) ** 2) ** 2
     information = weights / (noise**2 * _correlation(rig, matches, rest, weights, noise))
-    normal = np.einsum("ni,nj->ij", design, design * information[:, None])
-    pull = np.einsum("ni,n->i", design, information * (np.einsum("ni,i->n", design, x) - rest))
+    normal = design.T @ (design * information[:, None])
+    pull = design.T @ (information * (design @ x - rest))
     return _Part(normal, pull, noise, weights)
 
 

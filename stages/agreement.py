@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from stages.accuracy import Metric, angles_between, by_frame, metric, posed
+from stages.accuracy import angles_between, by_frame
+from stages.accuracy_parts import Metric, metric, posed
 from stages.declare import AnyArray, Array, Bundle, Inputs, Params, Stage
 from stages.pose_alignment import align, moved, spread
 

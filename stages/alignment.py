@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from stages.hfvm.resample import sample_cubic
+from stages.cubic import cubic
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -66,16 +66,17 @@ def align(
 def _align_all(a, b, points, start, affinity, ridge, reach, position, error):  # type: ignore[no-untyped-def]
     patch, template = np.empty((SIDE + 2) ** 2), np.empty(SIDE * SIDE)
     descent = np.empty((SIDE * SIDE, UNKNOWNS))
-    normal, step = np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS)
+    gram, normal, step = np.empty((UNKNOWNS, UNKNOWNS)), np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS)
     for n in range(points.shape[0]):
         if not _descent(a, points[n, 0], points[n, 1], patch, template, descent):
             continue
+        _gram(descent, ridge, gram)
         m = affinity[n].copy()
         x, y = start[n, 0], start[n, 1]
         for _ in range(STEPS):
             square = _right_side(b, x, y, m, template, descent, step)
             _prior(affinity[n], m, ridge, step)
-            _gram(descent, ridge, normal)
+            normal[:] = gram
             if not _solve(normal, step):
                 break
             dx, dy = _compose(m, step)
@@ -143,8 +144,11 @@ def _gram(descent, ridge, out):  # type: ignore[no-untyped-def]
     out[:] = 0.0
     for i in range(SIDE * SIDE):
         for j in range(UNKNOWNS):
-            for k in range(UNKNOWNS):
+            for k in range(j, UNKNOWNS):
                 out[j, k] += descent[i, j] * descent[i, k]
+    for j in range(UNKNOWNS):
+        for k in range(j):
+            out[j, k] = out[k, j]
     for k in range(2, 6):
         out[k, k] += ridge
 
@@ -184,4 +188,4 @@ def _grey(image, x, y):  # type: ignore[no-untyped-def]
     """Grey value between pixels by cubic convolution; NaN outside."""
     if not (1.0 <= x < image.shape[1] - 2.0 and 1.0 <= y < image.shape[0] - 2.0):
         return np.float32(np.nan)
-    return sample_cubic(image, np.float32(x), np.float32(y))[0]
+    return cubic(image, x, y)

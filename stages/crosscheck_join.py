@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.accuracy import angles_between, posed
+from stages.accuracy import angles_between
+from stages.accuracy_parts import posed
 from stages.declare import Array, Bundle, Inputs, NoParams, Stage
 from stages.geometry import orthonormal
 from stages.pose_alignment import align, moved

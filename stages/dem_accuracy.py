@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.accuracy import Metric, metric
+from stages.accuracy_parts import Metric, metric
 from stages.declare import Array, Bundle, Inputs, NoParams, Stage
 from stages.errors import InputError
 from stages.lattice import Lattice, mosaic

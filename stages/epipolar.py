@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from stages.geometry import Rig, RigidTransform, rotation_exp
@@ -53,20 +54,35 @@ def distances(rig: Rig, correction: Floats, left: Floats, right: Floats) -> tupl
     centre, swings = _centre(rig, correction)
     rotation = rotation_exp(correction[:3]) @ rig.T_right_left.rotation
     # A line of the image with matrix K is K^-T times the normal R (c x ray) of the plane of sight.
-    to_line = np.linalg.inv(rig.right.matrix).T
+    to_line, to_ray = np.linalg.inv(rig.right.matrix).T, np.linalg.inv(rig.left.matrix)
     turns = _left_jacobian(correction[:3])
     upright = rotation @ _skew(centre)
-    to_slopes = [to_line @ _skew(turns[:, i]) @ upright for i in range(3)]
-    to_slopes += [to_line @ rotation @ _skew(swings[:, i]) for i in range(2)]
-    rays = rig.left.rays(left)
-    line = np.einsum("nk,ik->ni", rays, to_line @ upright)
-    slopes = np.einsum("nk,pik->pin", rays, np.array(to_slopes))
-    q = np.column_stack([right, np.ones(len(right))])
-    length = _signed_length(line)
-    distance = (q * line).sum(1) / length
-    across = np.einsum("ni,pin->np", q, slopes) / length[:, None]
-    along = np.einsum("ni,pin->np", line[:, :2], slopes[:, :2]) * (distance / length**2)[:, None]
-    return distance, across - along
+    to_slopes = [to_line @ _skew(turns[:, i]) @ upright @ to_ray for i in range(3)]
+    to_slopes += [to_line @ rotation @ _skew(swings[:, i]) @ to_ray for i in range(2)]
+    distance, slopes = np.empty(len(left)), np.empty((len(left), 5))
+    _distances(to_line @ upright @ to_ray, np.array(to_slopes), left, right, distance, slopes)
+    return distance, slopes
+
+
+@njit(cache=True, nogil=True)
+def _distances(to_line, to_slopes, left, right, distance, slopes):  # type: ignore[no-untyped-def]
+    """Distances (n,) from the lines ``to_line @ p`` of left pixels p, and their derivatives (n, 5)."""
+    line = np.empty(3)
+    for n in range(len(left)):
+        x, y, u, v = left[n, 0], left[n, 1], right[n, 0], right[n, 1]
+        for i in range(3):
+            line[i] = to_line[i, 0] * x + to_line[i, 1] * y + to_line[i, 2]
+        length = np.sqrt(line[0] ** 2 + line[1] ** 2)
+        if (line[0] if abs(line[0]) > abs(line[1]) else line[1]) < 0:
+            length = -length
+        d = (u * line[0] + v * line[1] + line[2]) / length
+        distance[n] = d
+        for p in range(5):
+            m = to_slopes[p]
+            a = m[0, 0] * x + m[0, 1] * y + m[0, 2]
+            b = m[1, 0] * x + m[1, 1] * y + m[1, 2]
+            c = m[2, 0] * x + m[2, 1] * y + m[2, 2]
+            slopes[n, p] = (u * a + v * b + c) / length - (line[0] * a + line[1] * b) * d / length**2
 
 
 def normals(rig: Rig, correction: Floats, left: Floats) -> Floats:

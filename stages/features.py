@@ -109,6 +109,15 @@ def pack_batch(images: AnyArray, weights: tuple[float, ...]) -> tuple[Words, Pla
     return words, deviation
 
 
+def pack_inner(images: AnyArray, weights: tuple[float, ...]) -> Words:
+    """Words of :func:`pack_batch` of those pixels whose whole kernel lies in the image: RADIUS fewer on each side."""
+    count, rows, cols = images.shape
+    words = np.empty((count, rows - 2 * RADIUS, cols - 2 * RADIUS), dtype=np.uint64)
+    scale = np.asarray(weights, np.float32) * np.float32(STEPS_PER_UNIT)
+    _pack(np.ascontiguousarray(images, dtype=np.float32), scale, words, np.empty(words.shape, np.float32))
+    return words
+
+
 @njit(cache=True, nogil=True)
 def _byte(value, scale):  # type: ignore[no-untyped-def]
     root = np.sqrt(abs(value)) * scale

@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from stages.errors import DegenerateError
@@ -83,8 +84,8 @@ def fit_plane(
     if theta is not None:
         for _ in range(20):
             weight = np.maximum(0.0, 1.0 - ((rho - rays @ theta) / (2.0 * tolerance)) ** 2) ** 2 / tolerance**2
-            normal = np.einsum("n,ni,nj->ij", weight, rays, rays)
-            theta = np.linalg.solve(normal, np.einsum("n,ni,n->i", weight, rays, rho))
+            weighted = rays * weight[:, None]
+            theta = np.linalg.solve(weighted.T @ rays, weighted.T @ rho)
         share = float(np.mean(_score(theta[None], rays, rho, sigma, tolerance) > 0))
         length = float(np.linalg.norm(theta))
         if share >= MIN_SHARE and bool(allowed(-theta[None] / length)[0]):
@@ -125,8 +126,24 @@ def _consensus(
     theta = theta[allowed(-theta / length)]
     if not len(theta):
         return None
-    totals = [float(_score(t[None], rays, rho, sigma, tolerance).sum()) for t in theta]
+    totals = np.empty(len(theta))
+    _totals(theta, rays, rho, 5.0 * sigma, tolerance**-2.0, totals)
     return np.asarray(theta[int(np.argmax(totals))], dtype=np.float64)
+
+
+@njit(cache=True, nogil=True)
+def _totals(theta, rays, rho, horizon, information, out):  # type: ignore[no-untyped-def]
+    """Sums (m,) of :func:`_score` over the points."""
+    for m in range(len(theta)):
+        a, b, c = theta[m]
+        total = 0.0
+        for n in range(len(rays)):
+            expected = a * rays[n, 0] + b * rays[n, 1] + c * rays[n, 2]
+            off = rho[n] - expected
+            agreement = 1.0 - off * off * information[n]
+            if expected > horizon[n] and agreement > 0.0:
+                total += agreement
+        out[m] = total
 
 
 @dataclass(frozen=True)

@@ -207,6 +207,6 @@ STAGE = Stage(
     params=LevelParams,
     inputs=("disparity", "rig"),
     outputs=(),
-    requires=("numpy",),
+    requires=("numpy", "numba"),
     run=_run,
 )

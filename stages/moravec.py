@@ -12,7 +12,9 @@ from __future__ import annotations
 
 import math
 
+import cv2
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float32]
@@ -32,31 +34,27 @@ def interest_operator(image: Floats) -> Floats:
     reach = HALF + 1
     if min(rows, cols) <= 2 * reach:
         return out
-    least: Floats | None = None
-    for dr, dc in DIRECTIONS:
-        square = np.zeros((rows, cols), np.float32)
-        for sr, sc in ((dr, dc), (-dr, -dc)):
-            a = image[1:-1, 1:-1]
-            b = image[1 + sr : rows - 1 + sr, 1 + sc : cols - 1 + sc]
-            square[1:-1, 1:-1] += (b - a) ** 2
-        ssd = _window_sum(square) * np.float32(0.5)
-        least = ssd if least is None else np.minimum(least, ssd)
-    assert least is not None
-    out[reach:-reach, reach:-reach] = least[reach - HALF : -(reach - HALF), reach - HALF : -(reach - HALF)]
+    _operator(np.ascontiguousarray(image, dtype=np.float32), np.array(DIRECTIONS), out)
     return out
 
 
-def _window_sum(a: Floats) -> Floats:
-    """Sums (rows - 4, cols - 4) over 5 x 5 windows, in a fixed order."""
-    n = 2 * HALF + 1
-    rows, cols = a.shape
-    tall = a[: rows - n + 1].copy()
-    for i in range(1, n):
-        tall += a[i : rows - n + 1 + i]
-    wide = tall[:, : cols - n + 1].copy()
-    for i in range(1, n):
-        wide += tall[:, i : cols - n + 1 + i]
-    return wide
+@njit(cache=True, nogil=True)
+def _operator(image, directions, out):  # type: ignore[no-untyped-def]
+    rows, cols = image.shape
+    square = np.zeros((rows, cols), np.float32)
+    tall = np.empty(cols, np.float32)
+    for d in range(len(directions)):
+        dr, dc = directions[d]
+        for y in range(1, rows - 1):
+            for x in range(1, cols - 1):
+                ahead, behind = image[y + dr, x + dc] - image[y, x], image[y - dr, x - dc] - image[y, x]
+                square[y, x] = ahead * ahead + behind * behind
+        for y in range(HALF + 1, rows - HALF - 1):
+            for x in range(cols):
+                tall[x] = square[y - 2, x] + square[y - 1, x] + square[y, x] + square[y + 1, x] + square[y + 2, x]
+            for x in range(HALF + 1, cols - HALF - 1):
+                ssd = np.float32(0.5) * (tall[x - 2] + tall[x - 1] + tall[x] + tall[x + 1] + tall[x + 2])
+                out[y, x] = ssd if d == 0 else min(out[y, x], ssd)
 
 
 def interest_points(
@@ -83,10 +81,10 @@ def interest_points(
     (n, 2) column, row, whole pixels; by bucket rank, then strength.
     """
     response = interest_operator(image)
-    usable = _peaks(response) & _inside(valid, border)
     # The expected sum of squared differences of pure noise is 2 sigma^2 for each of the 25 pixels.
-    usable &= response > 3.0 * 2.0 * (2 * HALF + 1) ** 2 * noise**2
-    rows, cols = np.nonzero(usable)
+    usable = np.empty(response.shape, np.bool_)
+    _peaks(response, 3.0 * 2.0 * (2 * HALF + 1) ** 2 * noise**2, usable)
+    rows, cols = np.nonzero(usable & _inside(valid, border))
     side = max(math.sqrt(image.shape[0] * image.shape[1] / max(count, 1)), 1.0)
     across = math.ceil(image.shape[1] / side)
     bucket = (rows // side).astype(np.int64) * across + (cols // side).astype(np.int64)
@@ -103,31 +101,33 @@ def interest_points(
     return np.stack([cols[best], rows[best]], axis=-1).astype(np.float32)
 
 
-def _peaks(response: Floats) -> Bools:
-    """Greatest of its 5 x 5 neighbourhood; of equal ones the first in reading order."""
+@njit(cache=True, nogil=True)
+def _peaks(response, least, out):  # type: ignore[no-untyped-def]
+    """Above ``least``, and greatest of the 5 x 5 neighbourhood; of equal ones the first in reading order."""
     rows, cols = response.shape
-    peak = response > 0
-    padded = np.pad(response, HALF, constant_values=-1.0)
-    for dr in range(-HALF, HALF + 1):
-        for dc in range(-HALF, HALF + 1):
-            other = padded[HALF + dr : HALF + dr + rows, HALF + dc : HALF + dc + cols]
-            if (dr, dc) < (0, 0):
-                peak &= response > other
-            elif (dr, dc) > (0, 0):
-                peak &= response >= other
-    return peak
+    for y in range(rows):
+        for x in range(cols):
+            r = response[y, x]
+            peak = r > least
+            if peak:
+                for j in range(max(y - HALF, 0), min(y + HALF + 1, rows)):
+                    for i in range(max(x - HALF, 0), min(x + HALF + 1, cols)):
+                        other = response[j, i]
+                        before = j < y or (j == y and i < x)
+                        if other > r or (before and other == r):
+                            peak = False
+                            break
+                    if not peak:
+                        break
+            out[y, x] = peak
 
 
 def _inside(valid: NDArray[np.uint8], border: int) -> Bools:
     """Pixels at least ``border`` away from the image's edge and from anything unusable (Chebyshev distance)."""
-    good = np.pad(valid != 0, border, constant_values=False).astype(np.int32)
-    for axis in (0, 1):
-        total = np.cumsum(good, axis=axis)
-        total = np.concatenate([np.zeros_like(total.take([0], axis)), total], axis=axis)
-        n = total.shape[axis] - (2 * border + 1)
-        full = total.take(range(2 * border + 1, 2 * border + 1 + n), axis) - total.take(range(n), axis)
-        good = (full == 2 * border + 1).astype(np.int32)
-    return good.astype(bool)
+    side = 2 * border + 1
+    usable = (np.asarray(valid) != 0).astype(np.uint8)
+    eroded = cv2.erode(usable, np.ones((side, side), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0)
+    return np.asarray(eroded != 0)
 
 
 def clear_of_mask(valid: NDArray[np.uint8], points: NDArray[np.float64], border: int) -> Bools:

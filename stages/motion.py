@@ -4,7 +4,8 @@ The hierarchical matcher of stage ``hfvm``, stopped at a coarse level. There is 
 forward has radial flow, whose epipolar lines meet inside the image, where a band says nothing about the way along it.
 
 Where the rotation between the frames is known from a sensor, it is undone before matching (:mod:`stages.attitude`);
-the displacements are those of the frames as they were taken all the same.
+where the matches show a large in-plane rotation, or are too few and it has to be looked for, that is undone
+(:mod:`stages.roll`). The displacements are those of the frames as they were taken all the same.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from stages import roll
 from stages.attitude import Derotation
 from stages.declare import AnyArray, Array, Bundle, Inputs, Params, Stage
 from stages.geometry import Camera
@@ -37,6 +39,17 @@ class MotionParams(Params):
     top_rows: float = Field(default=0.25, gt=0, le=1, description="share of the height searched at the top level")
     smoothness: int = Field(default=5, ge=0, description="byte steps a pixel of difference to each neighbour")
     rounds: int = Field(default=4, ge=0, le=32, description="propagation rounds a level")
+    turn_below: float = Field(
+        default=0.5,
+        ge=0,
+        le=1,
+        description="share of the pixels with texture that match, below which a rotation about the optical axis is"
+        " looked for; upright windows match three quarters of a street and a third at 30 degrees; 0: no rotation is"
+        " undone but an attitude's",
+    )
+    turn_range_deg: float = Field(
+        default=60.0, gt=0, le=180, description="degrees to either side; greatest rotation that is looked for"
+    )
 
 
 @dataclass(frozen=True)
@@ -67,20 +80,24 @@ def coarse_motion(a: Pyramid, b: Pyramid, params: MotionParams, turn: Derotation
     """
     if turn is not None:
         b = turn.apply(b)
+    level = min(params.level, a.levels - 1, b.levels - 1)
+    a, b = _above(a, level), _above(b, level)
     hp = HfvmParams(
         band=0.0,
+        fine_rounds=None if level else HfvmParams().fine_rounds,
+        back_rounds=params.rounds if level else HfvmParams().back_rounds,
         top_columns=params.top_columns,
         top_rows=params.top_rows,
         smoothness=params.smoothness,
         rounds=params.rounds,
     )
     pair = hierarchy.prepare(a, b, hp)
-    state = hierarchy.run(pair, hp, params.level)
+    state = hierarchy.run(pair, hp, 0)
     fine = hierarchy.fine(pair, state)
-    scale = np.float32(2.0**state.level)
+    scale = np.float32(2.0**level)
     validity = np.zeros(state.left.u.shape, np.uint8)
-    textured = pair.deviation(state.level, whole(validity.shape)) >= hp.texture
-    mark(validity, a.valid[state.level] == 0, Validity.OUT_OF_IMAGE)
+    textured = pair.deviation(0, whole(validity.shape)) >= hp.texture
+    mark(validity, a.valid[0] == 0, Validity.OUT_OF_IMAGE)
     mark(validity, ~textured, Validity.NO_TEXTURE)
     mark(validity, ~np.asarray(state.left_ok), Validity.BACKMATCH_FAILED)
     mark(validity, fine.distance > hp.threshold, Validity.OVER_THRESHOLD)
@@ -92,9 +109,54 @@ def coarse_motion(a: Pyramid, b: Pyramid, params: MotionParams, turn: Derotation
     u[~defined(validity)] = v[~defined(validity)] = np.nan
     u, v = u * scale, v * scale
     if turn is not None:
-        u, v = turn.compose(u, v, state.level)
+        u, v = turn.compose(u, v, level)
         validity[np.isnan(u)] &= ~np.uint8(Validity.MATCHED | Validity.INTERPOLATED)
-    return Motion(state.level, u, v, validity)
+    return Motion(level, u, v, validity)
+
+
+def _above(pyramid: Pyramid, level: int) -> Pyramid:
+    """The pyramid from a level up: finer ones need no features."""
+    return Pyramid(pyramid.images[level:], pyramid.valid[level:])
+
+
+def match_share(found: Motion) -> float:
+    """Share of the pixels with texture that match; 0 where nothing has texture."""
+    textured = (found.validity & np.uint8(Validity.OUT_OF_IMAGE | Validity.NO_TEXTURE)) == 0
+    count = int(np.count_nonzero(textured))
+    return int(np.count_nonzero(matched(found.validity) & textured)) / count if count else 0.0
+
+
+def _rolled(
+    a: Pyramid, b: Pyramid, plain: Motion, params: MotionParams, turn: Derotation | None
+) -> tuple[Motion, Derotation, float] | None:
+    """Displacements after undoing a rotation found in the images, that rotation, and degrees; None: none is needed."""
+    share = match_share(plain)
+    if params.turn_below == 0 or not matched_texture(plain):
+        return None
+    shape = (a.images[0].shape[0], a.images[0].shape[1])
+
+    def attempt(homography: roll.Floats, which: MotionParams) -> tuple[Motion, Derotation]:
+        upright = Derotation(homography if turn is None else turn.homography @ homography, shape)
+        return coarse_motion(a, b, which, upright), upright
+
+    best, needed = plain, 1.0
+    if share < params.turn_below:
+        coarse, needed = params.model_copy(update={"level": params.level + 1}), roll.GAIN
+        for degrees in roll.candidates(params.turn_range_deg):
+            found, _ = attempt(roll.similarity(degrees, 1.0, shape), coarse)
+            best = max(best, found, key=match_share)
+    fitted = roll.fit(best.column_disparity, best.row_disparity, matched(best.validity), best.level)
+    if fitted is not None and turn is not None:  # what the attitude left over
+        fitted = roll.relative(fitted, turn.homography, shape)
+    if fitted is None or abs(fitted[0]) < roll.LEAST_DEG:
+        return None
+    found, upright = attempt(roll.similarity(fitted[0], fitted[1], shape), params)
+    return (found, upright, fitted[0]) if match_share(found) > needed * share else None
+
+
+def matched_texture(found: Motion) -> bool:
+    """Whether enough of the image has texture for a rotation to show."""
+    return int(np.count_nonzero((found.validity & np.uint8(Validity.NO_TEXTURE)) == 0)) >= roll.LEAST
 
 
 def known_turn(args: Mapping[str, Any], level: int) -> Derotation | None:
@@ -112,7 +174,12 @@ def known_turn(args: Mapping[str, Any], level: int) -> Derotation | None:
 
 def _run(params: MotionParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     turn = known_turn(args, params.level)
-    found = coarse_motion(Pyramid.from_bundle(inputs["a"]), Pyramid.from_bundle(inputs["b"]), params, turn)
+    a, b = Pyramid.from_bundle(inputs["a"]), Pyramid.from_bundle(inputs["b"])
+    found = coarse_motion(a, b, params, turn)
+    rolled = _rolled(a, b, found, params, turn)
+    roll_deg = 0.0
+    if rolled is not None:
+        found, turn, roll_deg = rolled
     ok = matched(found.validity)
     rows, cols = ok.shape
     y, x = np.indices(ok.shape)
@@ -129,6 +196,7 @@ def _run(params: MotionParams, args: Mapping[str, Any], inputs: Inputs) -> Bundl
         "match_rate": int(np.count_nonzero(ok)) / usable if usable else None,
         "overlap": int(np.count_nonzero(seen)) / usable if usable else None,
         "derotated": turn is not None,
+        "turn_found_deg": roll_deg,
     }
     arrays: dict[str, AnyArray] = {
         "column_disparity": found.column_disparity,

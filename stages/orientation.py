@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from numba import njit
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
@@ -53,15 +54,30 @@ def thin(
     """
     u, v = np.asarray(column), np.asarray(row)
     side = max(1, round(math.sqrt(usable.size / samples)))
-    r, c = np.nonzero(usable)
-    error = np.nan_to_num(np.asarray(quality, dtype=np.float64)[r, c], nan=np.inf)
-    cell = (r // side) * (usable.shape[1] // side + 1) + c // side
-    order = np.lexsort((np.arange(len(cell)), error, cell))
-    first = np.ones(len(order), bool)
-    first[1:] = cell[order][1:] != cell[order][:-1]
-    r, c = r[order][first], c[order][first]
+    best = _best_of_cells(usable, np.asarray(quality), side)
+    r, c = np.divmod(best[best >= 0], usable.shape[1])
     left = np.stack([c, r], axis=-1).astype(np.float64)
     return left, left + np.stack([u[r, c], v[r, c]], axis=-1).astype(np.float64)
+
+
+@njit(cache=True, nogil=True)
+def _best_of_cells(usable, quality, side):  # type: ignore[no-untyped-def]
+    """Flat index of the usable pixel of least error in each cell, the first of equals; -1 none. Cells in order."""
+    rows, cols = usable.shape
+    across = cols // side + 1
+    best = np.full((rows // side + 1) * across, -1, np.int64)
+    least = np.empty(len(best))
+    for r in range(rows):
+        for c in range(cols):
+            if not usable[r, c]:
+                continue
+            cell = (r // side) * across + c // side
+            error = quality[r, c]
+            if error != error:
+                error = np.inf
+            if best[cell] < 0 or error < least[cell]:
+                best[cell], least[cell] = r * cols + c, error
+    return best
 
 
 def orient(rig: Rig, matches: Matches, params: RelativeParams) -> tuple[dict[str, AnyArray], dict[str, Any]]:
@@ -151,6 +167,6 @@ STAGE = Stage(
         Array("residual_after", _MATCH, "float32", "px", "the same, rig adjusted to this pair"),
         Array("weight", _MATCH, "float32", "1", "robust weight in the adjustment, 0 = outlier"),
     ),
-    requires=("numpy",),
+    requires=("numpy", "numba"),
     run=_run,
 )

@@ -14,9 +14,9 @@ from numba import njit
 from numpy.typing import NDArray
 
 from stages import features
+from stages.cubic import cubic
 from stages.features import distance
 from stages.hfvm.params import HfvmParams
-from stages.hfvm.resample import sample_cubic
 from stages.hfvm.subpixel import linear
 from stages.pyramid import Pyramid, filled
 
@@ -116,12 +116,11 @@ def _search(
     template = np.zeros((len(points), side, side), np.float32)
     area = np.zeros((len(points), wide, wide), np.float32)
     whole = np.rint(predicted)
-    eye = np.tile(np.eye(2), (len(points), 1, 1))
     inside = np.empty((2, len(points)), np.uint8)
     _cut(a, points, np.linalg.inv(affinity), template, inside[0])
-    _cut(b, whole, eye, area, inside[1])
-    words = features.pack_batch(template, weights)[0]
-    searched = features.pack_batch(area, weights)[0]
+    _copy(b, whole.astype(np.int64), area, inside[1])
+    words = features.pack_inner(template, weights)
+    searched = features.pack_inner(area, weights)
     offset, cost = np.empty((len(points), 2)), np.empty(len(points))
     _best(words, searched, radius, offset, cost)
     lost = (inside == 0).any(0) | (cost < 0)
@@ -148,7 +147,23 @@ def _cut(image, points, shape, out, inside):  # type: ignore[no-untyped-def]
                 x = px + shape[k, 0, 0] * dx + shape[k, 0, 1] * dy
                 y = py + shape[k, 1, 0] * dx + shape[k, 1, 1] * dy
                 x, y = min(max(x, 1.0), cols - 2.001), min(max(y, 1.0), rows - 2.001)
-                out[k, j, i] = sample_cubic(image, np.float32(x), np.float32(y))[0]
+                out[k, j, i] = cubic(image, x, y)
+
+
+@njit(cache=True, nogil=True)
+def _copy(image, points, out, inside):  # type: ignore[no-untyped-def]
+    """As :func:`_cut`, around whole pixels and without a change of shape."""
+    rows, cols = image.shape
+    half = out.shape[1] // 2
+    for k in range(len(points)):
+        px, py = points[k, 0], points[k, 1]
+        inside[k] = px >= 0 and px <= cols - 1 and py >= 0 and py <= rows - 1 and rows >= 4 and cols >= 4
+        if not inside[k]:
+            continue
+        for j in range(out.shape[1]):
+            y = min(max(py + j - half, 1), rows - 2)
+            for i in range(out.shape[2]):
+                out[k, j, i] = image[y, min(max(px + i - half, 1), cols - 2)]
 
 
 @njit(cache=True, nogil=True)
@@ -156,7 +171,6 @@ def _best(words, area, radius, offset, cost):  # type: ignore[no-untyped-def]
     """Least summed distance of each template in its area; offsets with linear sub-pixel parts, mean distance or -1."""
     n = 2 * SUM_RADIUS + 1
     side = 2 * radius + 3
-    first = features.RADIUS
     sums = np.empty((side, side), np.int64)
     for k in range(len(words)):
         for v in range(side):
@@ -164,7 +178,7 @@ def _best(words, area, radius, offset, cost):  # type: ignore[no-untyped-def]
                 total = np.int64(0)
                 for j in range(n):
                     for i in range(n):
-                        total += distance(words[k, first + j, first + i], area[k, first + v + j, first + u + i])
+                        total += distance(words[k, j, i], area[k, v + j, u + i])
                 sums[v, u] = total
         bu, bv = 1, 1
         for v in range(side):

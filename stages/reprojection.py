@@ -18,12 +18,13 @@ the covariance contains it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
-from typing import TypeVar
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from stages import reprojection_kernel as kernel
 from stages.geometry import Camera, RigidTransform
 
 Floats = NDArray[np.float64]
@@ -161,13 +162,6 @@ def _whiten(a: Floats, g: Floats, sigma: float) -> Floats:
     return np.asarray(a / sigma - (shrink[..., None] * unit)[..., None] * along[..., None, :])
 
 
-def robust_cost(obs: Observations, poses: Poses, errors: Errors, active: Bools) -> Floats:
-    """Huber's cost (b,) of the active (b, n) errors and of the prior; infinite if one is behind the camera."""
-    norm = errors.norm
-    cost = np.where(norm <= HUBER, 0.5 * norm**2, HUBER * norm - 0.5 * HUBER**2)
-    return np.asarray(np.where(active, cost, 0.0).sum(-1) + 0.5 * obs.prior * poses.bias**2)
-
-
 def normal_matrix(obs: Observations, errors: Errors, active: Bools) -> tuple[Floats, Floats, Floats]:
     """Weighted normal matrix (b, 7, 7), gradient (b, 7) and weights (b, n) of Huber's cost, without the prior."""
     usable = active & np.isfinite(errors.norm)
@@ -178,49 +172,39 @@ def normal_matrix(obs: Observations, errors: Errors, active: Bools) -> tuple[Flo
     return normal, np.einsum("bnik,bni->bk", weighted, errors.white), weight
 
 
+def norms(obs: Observations, poses: Poses) -> Floats:
+    """Mahalanobis lengths (b, n) of the errors, as :func:`back_projection` has them, and nothing else."""
+    out = np.empty((len(poses.t), obs.landmarks.shape[1]))
+    kernel.norms(*_data(obs), *_pose_arrays(poses), out)
+    return out
+
+
 def levenberg_marquardt(
     obs: Observations, start: Poses, active: Bools, iterations: int, tolerance: float = 1e-10
 ) -> tuple[Poses, int]:
-    """Minimise Eq. 6 (robust, weighted) from ``start`` over the active (b, n) observations; also iterations done.
+    """Minimise Eq. 6 (robust, weighted) from ``start`` over the active (b, n) observations; also most iterations done.
 
-    Converged when no problem's step promises to lower its cost by more than ``tolerance`` of it. The damping is
+    Each problem converges when its step promises to lower its cost by no more than ``tolerance`` of it. The damping is
     Marquardt's (scaled by the diagonal), which also holds a singular problem still instead of letting it fly off.
     """
-    poses, damping = start, np.full(len(start.t), 1e-4)
-    errors = back_projection(obs, poses)
-    cost = robust_cost(obs, poses, errors, active)
-    done = 0
-    for _ in range(iterations):
-        done += 1
-        normal, gradient, _ = normal_matrix(obs, errors, active)
-        normal[:, 6, 6] += obs.prior
-        gradient[:, 6] += obs.prior * poses.bias
-        step = _damped_step(normal, gradient, damping)
-        trial = poses.moved(step)
-        new = back_projection(obs, trial)
-        new_cost = robust_cost(obs, trial, new, active)
-        better = new_cost < cost
-        poses, errors = _choose(better, trial, poses), _choose(better, new, errors)
-        promised = -0.5 * (gradient * step).sum(-1)
-        finished = promised <= tolerance * np.where(np.isfinite(cost), cost, 0.0) + 1e-20
-        cost = np.where(better, new_cost, cost)
-        damping = np.where(better, np.maximum(damping * 0.1, 1e-12), damping * 10.0)
-        if finished.all():
-            break
-    return poses, done
+    poses = _pose_arrays(start)
+    done = kernel.minimise(*_data(obs), HUBER, obs.prior, np.ascontiguousarray(active), iterations, tolerance, *poses)
+    return Poses(*poses), int(done)
 
 
-def _damped_step(normal: Floats, gradient: Floats, damping: Floats) -> Floats:
-    diagonal = np.einsum("bkk->bk", normal)
-    floor = 1e-12 * diagonal.max(-1, keepdims=True) + 1e-300
-    lhs = normal + (damping[:, None] * diagonal + floor)[..., None] * np.eye(7)
-    return np.asarray(-np.linalg.solve(lhs, gradient[..., None])[..., 0])
+def _data(obs: Observations) -> tuple[Any, ...]:
+    """What the compiled loops want of observations."""
+    camera = obs.camera
+    arrays = (obs.landmarks, obs.per_pixel, obs.sigma, obs.pixels)
+    return (
+        *(np.ascontiguousarray(a, dtype=np.float64) for a in arrays),
+        (float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy)),
+        float(obs.pixel_sigma),
+        NEAREST,
+    )
 
 
-Batch = TypeVar("Batch", Poses, Errors)
-
-
-def _choose(first: Bools, a: Batch, b: Batch) -> Batch:
-    """Problem by problem, ``a`` where ``first``, else ``b``."""
-    pairs = [(getattr(a, f.name), getattr(b, f.name)) for f in fields(a)]
-    return type(a)(*(np.where(first.reshape(-1, *[1] * (p.ndim - 1)), p, q) for p, q in pairs))
+def _pose_arrays(poses: Poses) -> tuple[Floats, Floats, Floats]:
+    """Copies that may be written to."""
+    R, t, bias = (np.array(a, dtype=np.float64, order="C") for a in (poses.R, poses.t, poses.bias))
+    return R, t, bias

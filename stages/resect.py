@@ -10,11 +10,13 @@ is that weighted one in units of ``pixel_sigma``; for exact landmarks it is the 
 
 Covariances here are 6 x 6 of ``(dt, dtheta)`` in the destination frame: position error in metres, then the rotation
 vector ``R_true = exp(dtheta) R`` in radians. They tell of the measurements and of a shared error of the disparities;
-errors of the calibration (focal length, direction of the camera in the vehicle) are not in them.
+errors of the calibration (focal length, direction of the camera in the vehicle) are not in them. They are those of
+independent errors times what the errors of a segment's frames go together by (:func:`scatter_of_blocks`).
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -34,6 +36,7 @@ from stages.reprojection import (
     back_projection,
     levenberg_marquardt,
     normal_matrix,
+    norms,
 )
 
 Floats = NDArray[np.float64]
@@ -42,6 +45,10 @@ Bools = NDArray[np.bool_]
 MINIMUM = 6
 """Fewest landmarks of a pose: twelve equations for six unknowns, so that one wrong landmark shows."""
 FEW = "set track.points higher or choose basic pairs closer"
+MOST_BLOCKS = 6
+"""Blocks along either side of the image whose mean errors show how far neighbours' errors go together."""
+PER_BLOCK = 6
+"""Landmarks a block, at least on average."""
 SAMPLE = 4
 """Landmarks of one hypothesis: the fewest that fix a pose uniquely."""
 
@@ -85,7 +92,8 @@ class Resection:
     ``T_local_left``; ``covariance`` (6, 6) of (position m, rotation rad) in the local frame; ``inlier`` (n,);
     ``residual`` (n,) back-projection error, pixels, of every landmark (NaN: behind the camera); ``bias`` of the
     disparities, pixels;
-    ``condition`` of the normal matrix with unit diagonal.
+    ``condition`` of the normal matrix with unit diagonal; ``together``: how many times as far as independent errors the
+    mean errors of image blocks scatter (variance), see :func:`scatter_of_blocks`.
     """
 
     T_local_left: RigidTransform
@@ -95,6 +103,7 @@ class Resection:
     bias: float
     iterations: int
     condition: float
+    together: float
 
 
 def resect(
@@ -162,13 +171,13 @@ def _robust_start(
         np.concatenate([c.bias for c in candidates]),
     )
     bound = 2.0 * params.threshold / params.pixel_sigma
-    score = (np.minimum(back_projection(obs, hypotheses).norm, bound) ** 2).sum(1)
+    score = (np.minimum(norms(obs, hypotheses), bound) ** 2).sum(1)
     best = hypotheses.at(int(np.argmin(score)))
     for _ in range(2):
-        active = back_projection(obs, best).norm <= bound
+        active = norms(obs, best) <= bound
         if active.sum() >= SAMPLE:
             best, _ = levenberg_marquardt(obs, best, active, 10, tolerance=1e-6)
-    return best, back_projection(obs, best).norm[0] <= bound
+    return best, norms(obs, best)[0] <= bound
 
 
 def _repeat(poses: Poses, count: int) -> Poses:
@@ -185,7 +194,7 @@ def _remove_inconsistent(
         _enough(int(active.sum()), where, "agree with one pose", "raise resect.threshold or choose basic pairs closer")
         poses, done = levenberg_marquardt(obs, poses, active[None], params.iterations)
         steps += done
-        norm = np.where(active, back_projection(obs, poses).norm[0], -1.0)
+        norm = np.where(active, norms(obs, poses)[0], -1.0)
         worst = int(np.argmax(norm))
         if norm[worst] <= bound:
             return poses, active, steps
@@ -212,7 +221,32 @@ def _result(obs: Observations, poses: Poses, active: Bools, steps: int, params: 
         )
     covariance, _ = _covariance(normal[0] / factor, obs.prior, R)
     residual = np.where(np.isfinite(errors.norm[0]), np.sqrt((errors.pixels[0] ** 2).sum(-1)), np.nan)
-    return Resection(T, covariance, active, residual, float(poses.bias[0]), steps, condition)
+    together = scatter_of_blocks(obs.pixels[0][active], errors.white[0][active], weight[0][active], obs.camera)
+    return Resection(T, covariance, active, residual, float(poses.bias[0]), steps, condition, together)
+
+
+def scatter_of_blocks(pixels: Floats, white: Floats, weight: Floats, camera: Camera) -> float:
+    """How many times as far (variance) block means of errors scatter as means of independent errors would; 1: as far.
+
+    Neighbouring landmarks share matches, texture and relief, so their errors go together, and many of them do not tell
+    as much as their number says. ``white`` (n, 2) whitened errors after adjustment at ``pixels`` (n, 2), ``weight``
+    (n,). The six unknowns of the pose take up as many degrees of freedom of the means.
+    """
+    side = min(MOST_BLOCKS, int(math.sqrt(len(pixels) / PER_BLOCK)))
+    if side < 3:
+        return 1.0
+    col = np.clip(pixels[:, 0] * side / camera.width, 0, side - 1).astype(np.intp)
+    row = np.clip(pixels[:, 1] * side / camera.height, 0, side - 1).astype(np.intp)
+    block = row * side + col
+    root = np.sqrt(weight)
+    count = np.bincount(block, minlength=side * side)
+    sums = np.stack([np.bincount(block, root * white[:, k], side * side) for k in range(2)])
+    used = count > 0
+    freedom = 2 * int(used.sum()) - 6
+    spread = float((weight[:, None] * white**2).sum()) / max(2 * len(pixels) - 6, 1)
+    if freedom < 6 or spread <= 0.0:
+        return 1.0
+    return float((sums[:, used] ** 2 / count[used]).sum()) / spread / freedom
 
 
 def _covariance(normal: Floats, prior: float, R_cam_local: Floats) -> tuple[Floats, float]:
@@ -288,7 +322,7 @@ def resect_segment(
         [],
     )
     known = np.isfinite(landmarks.position).all(1)
-    pose = T_local_key
+    pose, together = T_local_key, list[float]()
     out.poses[0] = pose.matrix34
     for j in range(count):
         use = np.flatnonzero(known & np.isfinite(points[:, j]).all(1))
@@ -318,6 +352,9 @@ def resect_segment(
         out.inlier[use, j], out.residual[use, j] = found.inlier, found.residual
         rms = float(np.sqrt(np.mean(found.residual[found.inlier] ** 2)))
         out.facts.append(_facts(frames[j], use.size, int(found.inlier.sum()), rms, found))
+        together.append(found.together)
+    # One frame's figure scatters by a fifth, a segment's frames share their landmarks.
+    out.covariance[:] *= max(1.0, float(np.mean(together))) if together else 1.0
     return out
 
 
@@ -330,6 +367,7 @@ def _facts(frame: int, seen: int, inliers: int, rms: float, found: Resection | N
         "iterations": found.iterations if found else 0,
         "condition": found.condition if found else None,
         "disparity_bias_px": found.bias if found else None,
+        "errors_together": found.together if found else None,
     }
 
 
@@ -403,6 +441,6 @@ STAGE = Stage(
         Array("landmarks", ("point", "xyz"), "float64", "m", "coordinates of the landmarks", "nan", "local"),
         Array("residual", ("point", "frame"), "float32", "px", "back-projection error", nodata="nan"),
     ),
-    requires=("numpy",),
+    requires=("numpy", "numba"),
     run=_run,
 )

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from pydantic import Field
 
@@ -216,24 +217,92 @@ def fit_affinity(origin: Floats, moved: Floats, use: Bools, at: Floats) -> tuple
     if len(p) < 6 or n == 0:
         return identity, nothing
     common = common_similarity(p, q)
-    far = ((np.nan_to_num(at)[:, None] - p[None]) ** 2).sum(-1)
-    nearest = np.argsort(far, axis=1, kind="stable")[:, :NEIGHBOURS]
-    offset = p[nearest] - np.nan_to_num(at)[:, None]
-    shift = (q - p)[nearest] - offset @ (common - np.eye(2)).T
-    basis = np.concatenate([offset, np.ones((*offset.shape[:2], 1))], -1)
-    weight = np.ones(nearest.shape)
-    solution = np.zeros((n, 3, 2))
-    for _ in range(4):
-        weighted = basis * weight[..., None]
-        normal = np.einsum("nka,nkb->nab", weighted, basis)
-        pull = PULL**2 * weight.sum(1)
-        normal[:, 0, 0] += pull
-        normal[:, 1, 1] += pull
-        normal[:, 2, 2] += 1e-6
-        solution = np.linalg.solve(normal, np.einsum("nka,nki->nai", weighted, shift))
-        rest = shift - np.einsum("nka,nai->nki", basis, solution)
-        weight = 1.0 / (1.0 + (rest**2).sum(-1))
-    return common + np.swapaxes(solution[:, :2], 1, 2), solution[:, 2]
+    affinity, shift = identity, nothing
+    _fit_all(
+        np.ascontiguousarray(p, dtype=np.float64),
+        np.ascontiguousarray(q - p, dtype=np.float64),
+        common,
+        np.nan_to_num(at),
+        affinity,
+        shift,
+    )
+    return affinity, shift
+
+
+@njit(cache=True, nogil=True)
+def _fit_all(origin, moved_by, common, at, affinity, displacement):  # type: ignore[no-untyped-def]
+    """:func:`fit_affinity` of every point ``at``; the nearest are taken in the order of distance, then of number."""
+    count = min(NEIGHBOURS, len(origin))
+    who, far = np.empty(count, np.int64), np.empty(count)
+    offset, shift, weight = np.empty((count, 3)), np.empty((count, 2)), np.empty(count)
+    normal, right = np.empty((3, 3)), np.empty((3, 2))
+    offset[:, 2] = 1.0
+    for n in range(len(at)):
+        _nearest(origin, at[n, 0], at[n, 1], who, far)
+        for k in range(count):
+            x, y = origin[who[k], 0] - at[n, 0], origin[who[k], 1] - at[n, 1]
+            offset[k, 0], offset[k, 1] = x, y
+            shift[k, 0] = moved_by[who[k], 0] - (common[0, 0] - 1.0) * x - common[0, 1] * y
+            shift[k, 1] = moved_by[who[k], 1] - common[1, 0] * x - (common[1, 1] - 1.0) * y
+            weight[k] = 1.0
+        for _ in range(4):
+            normal[:], right[:] = 0.0, 0.0
+            total = 0.0
+            for k in range(count):
+                total += weight[k]
+                for i in range(3):
+                    a = weight[k] * offset[k, i]
+                    for j in range(3):
+                        normal[i, j] += a * offset[k, j]
+                    right[i, 0] += a * shift[k, 0]
+                    right[i, 1] += a * shift[k, 1]
+            normal[0, 0] += PULL**2 * total
+            normal[1, 1] += PULL**2 * total
+            normal[2, 2] += 1e-6
+            _solve_3(normal, right)
+            for k in range(count):
+                square = 0.0
+                for i in range(2):
+                    fitted = right[0, i] * offset[k, 0] + right[1, i] * offset[k, 1] + right[2, i]
+                    square += (shift[k, i] - fitted) ** 2
+                weight[k] = 1.0 / (1.0 + square)
+        for i in range(2):
+            affinity[n, i, 0], affinity[n, i, 1] = common[i, 0] + right[0, i], common[i, 1] + right[1, i]
+            displacement[n, i] = right[2, i]
+
+
+@njit(cache=True, nogil=True)
+def _nearest(points, x, y, who, far):  # type: ignore[no-untyped-def]
+    """Numbers and squared distances of the points nearest to (x, y), nearest first, by insertion."""
+    count = len(who)
+    far[:] = np.inf
+    who[:] = 0
+    for m in range(len(points)):
+        d = (points[m, 0] - x) ** 2 + (points[m, 1] - y) ** 2
+        if d >= far[count - 1]:
+            continue
+        k = count - 1
+        while k > 0 and far[k - 1] > d:
+            far[k], who[k] = far[k - 1], who[k - 1]
+            k -= 1
+        far[k], who[k] = d, m
+
+
+@njit(cache=True, nogil=True)
+def _solve_3(a, b):  # type: ignore[no-untyped-def]
+    """Solve a x = b (3, 2) in place for a symmetric positive matrix."""
+    for i in range(3):
+        for j in range(i + 1, 3):
+            f = a[j, i] / a[i, i]
+            for k in range(i, 3):
+                a[j, k] -= f * a[i, k]
+            b[j, 0] -= f * b[i, 0]
+            b[j, 1] -= f * b[i, 1]
+    for i in range(2, -1, -1):
+        for c in range(2):
+            for k in range(i + 1, 3):
+                b[i, c] -= a[i, k] * b[k, c]
+            b[i, c] /= a[i, i]
 
 
 def common_similarity(origin: Floats, moved: Floats) -> Floats:
@@ -275,6 +344,6 @@ STAGE = Stage(
         Array("birth", ("point",), "int16", "1", "index of the frame that the template is from"),
         Array("distance", ("point", "frame"), "float32", "grey", "rms difference to the template", nodata="nan"),
     ),
-    requires=("numpy", "numba"),
+    requires=("numpy", "numba", "opencv-python-headless"),
     run=_run,
 )

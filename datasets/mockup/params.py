@@ -61,6 +61,9 @@ class MockupParams(SceneParams, RenderParams):
     sideways: float = Field(0.015, ge=-0.5, le=0.5, description="m a frame, to the right (section 7.4)")
     turn_deg: float = Field(0.0, ge=-45.0, le=45.0, description="degrees a frame, heading change to the right")
     roll_deg: float = Field(0.0, ge=-30.0, le=30.0, description="degrees, constant roll to the right")
+    roll_swing_deg: float = Field(
+        0.0, ge=0.0, le=60.0, description="degrees, roll from each frame to the next, to the right and back in turn"
+    )
     jitter_deg: float = Field(
         0.0, ge=0.0, le=10.0, description="degrees, standard deviation of pitch, roll and heading from frame to frame"
     )

@@ -53,8 +53,9 @@ def body_poses(p: MockupParams) -> list[RigidTransform]:
     offsets[:, 1] += START - min(offsets[:, 1].min(), 0.0)
     shakes = np.deg2rad(p.jitter_deg) * rng.standard_normal((p.frames, 3))
     poses = []
-    for heading, offset, shake in zip(headings, offsets, shakes, strict=True):
-        roll = math.radians(p.roll_deg) + shake[1]
+    swings = np.deg2rad(p.roll_swing_deg) * (np.arange(p.frames) % 2 - 0.5)
+    for heading, offset, shake, swing in zip(headings, offsets, shakes, swings, strict=True):
+        roll = math.radians(p.roll_deg) + shake[1] + swing
         rotation = (
             rotation_exp([0.0, 0.0, heading + shake[2]])
             @ rotation_exp([shake[0], 0.0, 0.0])
@@ -146,7 +147,7 @@ def mockup(p: MockupParams, name: str = "mockup") -> Sequence:
         return Source("datasets.mockup.truth_dem", NoParams(), args, inputs={"scene": scene})
 
     attitude = _attitude(p, poses["left"])
-    level = p.roll_deg == 0.0 and p.jitter_deg == 0.0
+    level = p.roll_deg == 0.0 and p.jitter_deg == 0.0 and p.roll_swing_deg == 0.0
     return Sequence(
         name=name,
         rig=given_rig(p),

@@ -11,6 +11,7 @@ import numpy as np
 from pipeline.report import tables
 from pipeline.report.gather import Scene
 from pipeline.report.view import RunView
+from stages.trajectory_error import STEPS
 
 Metric = dict[str, Any]
 Rows = list[dict[str, Any]]
@@ -32,6 +33,13 @@ LABELS: Mapping[str, str] = {
     "displacement_z_rmse": "Error of displacement in z",
     "kitti_translation": "KITTI translation error",
     "kitti_rotation": "KITTI rotation error",
+    "sections_translation": "Relative error over 10-80 % of the path",
+    "sections_rotation": "The same, rotation",
+    "scale_error": "Scale",
+    "direction_error": "Direction of the motion in the camera",
+    "rotation_bias": "Rotation, the same in every frame",
+    "scatter": "Motion of a frame, what remains",
+    "nees": "Squared error over the claimed one (NEES)",
     "frames": "Frames to be posed",
     "frames_missing": "Frames without a pose",
     "frames_without_truth": "Frames without truth",
@@ -47,6 +55,11 @@ LABELS: Mapping[str, str] = {
     "hazardous_share": "Truly hazardous cells",
 }
 """Words for the names that the assessing stages use."""
+LABELS = {
+    **LABELS,
+    **{f"rpe_{n}_translation_rmse": f"Relative error over {n} frames, translation" for n in STEPS[1:]},
+    **{f"rpe_{n}_rotation_rmse": f"Relative error over {n} frames, rotation" for n in STEPS[1:]},
+}
 
 AGREEMENT: Mapping[str, str] = {
     "rmse": "Disagreement of position, RMS",

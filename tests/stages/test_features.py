@@ -95,3 +95,10 @@ def test_distance_of_words_is_the_sum_of_absolute_byte_differences():
     each(a.view(np.uint64).ravel(), b.view(np.uint64).ravel(), out)
     np.testing.assert_array_equal(out, np.abs(a.astype(int) - b.astype(int)).sum(1))
     assert out[0] == 8 * 255
+
+
+def test_words_of_inner_pixels_are_those_of_the_whole():
+    batch = (255 * np.random.default_rng(4).random((3, 20, 22))).astype(np.float32)
+    inner = features.pack_inner(batch, WEIGHTS)
+    r = features.RADIUS
+    np.testing.assert_array_equal(inner, features.pack_batch(batch, WEIGHTS)[0][:, r:-r, r:-r])

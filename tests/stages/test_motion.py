@@ -164,13 +164,15 @@ def test_masked_pixels_of_a_turned_frame_match_nothing():
 def test_stage_takes_the_attitude_from_its_arguments_and_leaves_small_turns_to_the_matcher():
     rotation = rotation_exp([0.0, 0.0, np.radians(25.0)])
     a, b = taken(held(rotation))
-    plain = run(a, b)
+    plain = run(a, b, turn_below=0.0)  # an attitude alone
     assert not plain.meta["derotated"]
-    turned = run(a, b, args={"rotation": rotation.tolist(), "camera": CAMERA.to_dict()})
+    turned = run(a, b, args={"rotation": rotation.tolist(), "camera": CAMERA.to_dict()}, turn_below=0.0)
     assert turned.meta["derotated"]
     assert turned.meta["match_rate"] > 2 * plain.meta["match_rate"]
     # 8 pixels at level 2; the corner is 243 pixels off the centre, 0.03 radians move it by 7.3.
-    small = run(a, b, args={"rotation": rotation_exp([0, 0, 0.03]).tolist(), "camera": CAMERA.to_dict()})
+    small = run(
+        a, b, args={"rotation": rotation_exp([0, 0, 0.03]).tolist(), "camera": CAMERA.to_dict()}, turn_below=0.0
+    )
     assert not small.meta["derotated"]
     for name, array in plain.arrays.items():
         np.testing.assert_array_equal(array, small[name])

@@ -14,6 +14,8 @@ from stages.reprojection import (
     back_projection,
     derivatives,
     levenberg_marquardt,
+    normal_matrix,
+    norms,
 )
 from stages.resect import ResectParams, resect, resect_segment
 
@@ -367,3 +369,34 @@ def test_a_segment_takes_predictions_relative_to_its_key_frame():
         resect_segment(points, known, CAMERA, key, [0, 1, 2], PARAMS)
     found = resect_segment(points, known, CAMERA, key, [0, 1, 2], PARAMS, [None, None, about])
     np.testing.assert_allclose(found.poses, [(key @ step).matrix34 for step in steps], atol=1e-5)
+
+
+def test_compiled_errors_are_those_of_the_arrays():
+    rng = np.random.default_rng(12)
+    n = 30
+    landmarks = rng.uniform([-2, -2, 2], [2, 2, 9], (n, 3))
+    landmarks[0, 2] = -1.0  # behind
+    obs = Observations(
+        landmarks[None],
+        rng.normal(0, 0.1, (1, n, 3)),
+        np.where(np.arange(n) % 3 == 0, 0.0, rng.uniform(0.1, 1.0, n))[None],
+        rng.uniform(0, 400, (1, n, 2)),
+        Camera(300.0, 310.0, 200.0, 150.0, 400, 300),
+        0.2,
+        0.1,
+    )
+    steps = np.concatenate([np.zeros((1, 7)), rng.normal(0, 0.05, (4, 7))])
+    one = Poses.of(RigidTransform.identity())
+    poses = Poses(*(np.repeat(a, 5, axis=0) for a in (one.R, one.t, one.bias))).moved(steps)
+    np.testing.assert_allclose(norms(obs, poses), back_projection(obs, poses).norm, rtol=1e-9)
+    # Newton's step of the arrays' normal equations is what one undamped compiled step does.
+    active = np.arange(n)[None] > 0
+    normal, gradient, _ = normal_matrix(obs, back_projection(obs, one), active)
+    normal[:, 6, 6] += obs.prior
+    expected = -np.linalg.solve(normal[0] + 1e-4 * np.diag(np.diag(normal[0])), gradient[0])
+    moved, done = levenberg_marquardt(obs, one, active, 1)
+    by_arrays = one.moved(expected[None])
+    assert done == 1
+    np.testing.assert_allclose(moved.t, by_arrays.t, rtol=1e-6)
+    np.testing.assert_allclose(moved.R, by_arrays.R, atol=1e-9)
+    np.testing.assert_allclose(moved.bias, by_arrays.bias, rtol=1e-6)

@@ -240,3 +240,25 @@ def test_affinity_of_a_large_turn_and_zoom_is_not_pulled_towards_none(scale):
 
 def test_pairs_in_one_place_share_no_change():
     np.testing.assert_array_equal(common_similarity(np.ones((9, 2)), np.ones((9, 2))), np.eye(2))
+
+
+def test_affinity_of_the_nearest_by_arrays():
+    """The same estimate, point by point, from the formulas as they are written."""
+    rng = np.random.default_rng(21)
+    p = rng.uniform(0, 400, (50, 2))
+    q = p @ np.array([[1.02, -0.1], [0.1, 1.02]]).T + 5.0 + rng.normal(0, 0.3, p.shape)
+    q[:5] += 20.0
+    at = rng.uniform(0, 400, (7, 2))
+    common = common_similarity(p, q)
+    affinity, shift = fit_affinity(p, q, np.ones(50, bool), at)
+    for k in range(7):
+        near = np.argsort(((p - at[k]) ** 2).sum(1), kind="stable")[:12]
+        offset = p[near] - at[k]
+        rest = (q - p)[near] - offset @ (common - np.eye(2)).T
+        basis, weight = np.column_stack([offset, np.ones(12)]), np.ones(12)
+        for _ in range(4):
+            pull = np.diag([25.0 * weight.sum(), 25.0 * weight.sum(), 1e-6])
+            x = np.linalg.solve(basis.T @ (basis * weight[:, None]) + pull, basis.T @ (rest * weight[:, None]))
+            weight = 1.0 / (1.0 + ((rest - basis @ x) ** 2).sum(1))
+        np.testing.assert_allclose(affinity[k], common + x[:2].T, atol=1e-10)
+        np.testing.assert_allclose(shift[k], x[2], atol=1e-8)

@@ -15,8 +15,8 @@ import pytest
 from datasets.protocol import Sequence
 from pipeline.reconstruct import Products
 from pipeline.report import RunView, TaskRow, canvas, write_report
-from stages.accuracy import metric as figure
 from stages.accuracy import trajectory_accuracy
+from stages.accuracy_parts import metric as figure
 from stages.declare import Bundle
 from stages.dem_accuracy import dem_accuracy
 from stages.epipolar import corrected

@@ -1,0 +1,1 @@
+"""Parts of ``benchmarks/navigation.py``: odometry by Rille, by OpenCV and by COLMAP behind one interface."""

@@ -1,0 +1,188 @@
+"""Rille's navigation in one process: the stages that a trajectory needs, called one after the other, each timed.
+
+The same stages, with the same parameters and inputs, as in ``pipeline/reconstruct.py``; left out is what no pose
+depends on (elevation models, risk, path, cross-check), and the cache of artifacts.
+"""
+
+from __future__ import annotations
+
+import importlib
+import itertools
+import time
+from collections import defaultdict
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from datasets.protocol import Sequence, Source
+from pipeline import config as configuration
+from stages.declare import Bundle, NoParams
+
+MATCHING = ("hfvm", "orientation", "rig", "calibration", "level")
+"""Stages of the basic pairs; all others see every frame."""
+
+
+@dataclass
+class Clock:
+    """Seconds (wall, processor) by name."""
+
+    wall: dict[str, float] = field(default_factory=lambda: defaultdict(float))
+    cpu: dict[str, float] = field(default_factory=lambda: defaultdict(float))
+
+    def timed(self, name: str, call: Any, *args: Any) -> Any:
+        """What ``call`` returns, its time added."""
+        start, start_cpu = time.perf_counter(), time.process_time()
+        found = call(*args)
+        self.wall[name] += time.perf_counter() - start
+        self.cpu[name] += time.process_time() - start_cpu
+        return found
+
+
+class Images:
+    """Decoded images of a sequence, read (or rendered) once and before any clock runs."""
+
+    def __init__(self, sequence: Sequence, frames: range) -> None:
+        self.sequence, self.frames = sequence, frames
+        self._made: dict[Any, Bundle] = {}
+        self.bundle = {(f, c): self._take(sequence.image(f, c)) for f in frames for c in ("left", "right")}
+
+    def _take(self, source: Source) -> Bundle:
+        shared = None if source.args else (source.module, source.params)
+        if shared in self._made:
+            return self._made[shared]
+        inputs = {port: self._take(upstream) for port, upstream in source.inputs.items()}
+        stage = importlib.import_module(source.module).STAGE
+        found: Bundle = stage.run(source.params, {**source.args, **source.hints}, inputs)
+        if shared is not None:
+            self._made[shared] = found
+        return found
+
+    def ideal(self, frame: int, camera: str) -> Bundle:
+        """As an ideal camera would have taken it."""
+        bundle, lens = self.bundle[frame, camera], (self.sequence.lenses or {}).get(camera)
+        if lens is None:
+            return bundle
+        pinhole = self.sequence.rig.left if camera == "left" else self.sequence.rig.right
+        args = {"lens": lens.to_dict(), "camera": pinhole.to_dict(), "frame": frame, "camera_name": camera}
+        stage = configuration.stage("undistort")
+        found: Bundle = stage.run(stage.params(), args, {"image": bundle})
+        return found
+
+
+@dataclass(frozen=True)
+class Navigated:
+    """Poses (frame, 3, 4) of the left camera, NaN none; covariance where there is one; facts; seconds by stage."""
+
+    poses: Any
+    covariance: Any
+    facts: Mapping[str, Any]
+    clock: Clock
+
+
+def settings(sequence: Sequence, assignments: list[str]) -> Any:
+    """Configuration of a run with these ``--set`` assignments."""
+    _, ours = configuration.split_dataset(configuration.parse_assignments(assignments))
+    return configuration.build(configuration.expand(sequence.defaults), ours)
+
+
+class Chain:
+    """One run of the stages."""
+
+    def __init__(self, images: Images, config: Any) -> None:
+        self.images, self.sequence, self.config = images, images.sequence, config
+        self.frames = list(images.frames)
+        self.clock = Clock()
+        self._pyramids: dict[tuple[int, str], Bundle] = {}
+
+    def run(self) -> Navigated:
+        """Poses of all frames."""
+        frames = self.frames
+        self.motion = {a: self._motion(a, b) for a, b in itertools.pairwise(frames)}
+        select = self._stage("select", {"frames": len(frames)}, motions=list(self.motion.values()))
+        basic = [frames[i] for i in select.meta["basic"]]
+        parts = [[frames[i] for i in part] for part in select.meta["segments"]]
+        self.disparity = {k: self._match(k) for k in basic}
+        self.calibration = self._calibration(basic)
+        resections, levels = [], []
+        for part in parts:
+            resection, level = self._segment(part)
+            resections.append(resection)
+            levels.append(level)
+        trajectory = self._stage("trajectory", {"frames": frames}, segments=resections, levels=levels)
+        facts = {"basic": basic, "select": select.meta, "resect": [r.meta for r in resections]}
+        facts["rig"] = self.rig_facts
+        return Navigated(trajectory["poses"], trajectory["covariance"], facts, self.clock)
+
+    def _motion(self, a: int, b: int) -> Bundle:
+        s, args = self.sequence, {"frames": [a, b]}
+        before, after = (None if s.attitude is None else s.attitude[f] for f in (a, b))
+        if before is not None and after is not None:
+            args |= {"rotation": (np.array(after).T @ np.array(before)).tolist(), "camera": s.rig.left.to_dict()}
+        return self._stage("motion", args, a=self._pyramid(a, "left"), b=self._pyramid(b, "left"))
+
+    def _match(self, pair: int) -> Bundle:
+        left, right = (self._pyramid(pair, c) for c in ("left", "right"))
+        return self._stage("hfvm", {"pair": pair}, left=left, right=right)
+
+    def _calibration(self, basic: list[int]) -> Bundle:
+        rig = self.sequence.rig.to_dict()
+        orientations = [self._stage("orientation", {"pair": k, "rig": rig}, disparity=self.disparity[k]) for k in basic]
+        found = self._stage("rig", {"rig": rig}, orientations=orientations)
+        self.rig_facts = found.meta
+        return self._stage("calibration", {}, rig=found)
+
+    def _segment(self, part: list[int]) -> tuple[Bundle, Bundle]:
+        key, s = part[0], self.sequence
+        args: dict[str, Any] = {"pair": key}
+        if s.up is not None and s.up[key] is not None:
+            args["up"] = list(s.up[key])
+        if s.initial_pose is not None and key == self.frames[0]:
+            args["initial_up"] = [float(v) for v in s.initial_pose.rotation[2]]
+        if s.pitch is not None:
+            args["pitch"] = s.pitch
+        level = self._stage("level", args, disparity=self.disparity[key], rig=self.calibration)
+        track = self._stage(
+            "track",
+            {"frames": part},
+            frames=[self._pyramid(f, "left") for f in part],
+            motions=[self.motion[f] for f in part[:-1]],
+        )
+        found = self._stage(
+            "resect",
+            {"frames": part},
+            track=track,
+            disparity=self.disparity[key],
+            level=level,
+            rig=self.calibration,
+        )
+        return found, level
+
+    def _pyramid(self, frame: int, camera: str) -> Bundle:
+        if (frame, camera) not in self._pyramids:
+            image = self.clock.timed("undistort", self.images.ideal, frame, camera)
+            self._pyramids[frame, camera] = self._stage("pyramid", {}, image=image)
+        return self._pyramids[frame, camera]
+
+    def _stage(self, name: str, args: Mapping[str, Any], **inputs: Any) -> Bundle:
+        stage = configuration.stage(name)
+        params = getattr(self.config, name, NoParams())
+        found: Bundle = self.clock.timed(name, stage.run, params, args, inputs)
+        return found
+
+
+def truth(images: Images) -> Any:
+    """True poses (frame, 3, 4); NaN where there is none."""
+    given = images.sequence.truth or ()
+    none = np.full((3, 4), np.nan)
+    return np.array([none if (pose := given[f]) is None else pose.matrix34 for f in images.frames])
+
+
+def times(found: Navigated, frames: int) -> dict[str, float]:
+    """Milliseconds a frame: ``wall``, ``processor``, and of the latter what basic pairs and what tracking took."""
+    matching = sum(seconds for name, seconds in found.clock.cpu.items() if name in MATCHING)
+    whole = sum(found.clock.cpu.values())
+    parts = {"wall": sum(found.clock.wall.values()), "processor": whole, "matching": matching}
+    parts["tracking"] = whole - matching
+    return {"frames": frames} | {name: 1e3 * seconds / frames for name, seconds in parts.items()}

@@ -1,0 +1,60 @@
+"""Small parts of judging trajectories: figures as the report prints them, inverses, angles, lengths."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Metric = dict[str, Any]
+
+
+def metric(value: float | int | None, unit: str, how: str) -> Metric:
+    """One figure as the report prints it; ``None`` means not applicable, and ``how`` says why."""
+    sound = value is not None and math.isfinite(value)
+    return {"value": value if sound else None, "unit": unit, "how": how}
+
+
+def posed(poses: Floats) -> NDArray[np.bool_]:
+    """Which of the poses (frame, 3, 4) are there, i.e. without NaN."""
+    return np.asarray(np.isfinite(poses).all(axis=(1, 2)))
+
+
+def square(poses: Floats) -> Floats:
+    """Poses (n, 3, 4) as (n, 4, 4)."""
+    out = np.zeros((len(poses), 4, 4))
+    out[:, :3], out[:, 3, 3] = poses, 1.0
+    return out
+
+
+def inverse(T: Floats) -> Floats:
+    """Inverses of rigid transforms (..., 4, 4)."""
+    out = np.zeros_like(T)
+    R = np.swapaxes(T[..., :3, :3], -1, -2)
+    out[..., :3, :3] = R
+    out[..., :3, 3] = -(R @ T[..., :3, 3, None])[..., 0]
+    out[..., 3, 3] = 1.0
+    return out
+
+
+def angle(T: Floats) -> Floats:
+    """Rotation angle, radians, of transforms (..., 4, 4); exact for small angles, unlike acos of the trace."""
+    R = T[..., :3, :3]
+    axis = np.stack([R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], axis=-1)
+    return np.asarray(np.arctan2(np.linalg.norm(axis, axis=-1), np.trace(R, axis1=-2, axis2=-1) - 1.0))
+
+
+def rms(vectors: Floats) -> float:
+    """Root of the mean squared length of vectors (n, k)."""
+    return float(np.sqrt(np.mean(np.sum(vectors**2, axis=1))))
+
+
+def along(poses: Floats) -> tuple[Floats, int]:
+    """Way (frame,) from the first frame along positions, m, straight over frames without any; how many such gaps."""
+    there = np.isfinite(poses[:, :3, 3]).all(axis=1)
+    rows = np.flatnonzero(there)
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(poses[rows, :3, 3], axis=0), axis=1))])
+    return np.interp(np.arange(len(poses)), rows, way), int((np.diff(rows) > 1).sum())
