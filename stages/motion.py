@@ -96,10 +96,11 @@ def coarse_motion(a: Pyramid, b: Pyramid, params: MotionParams, turn: Derotation
     fine = hierarchy.fine(pair, state)
     scale = np.float32(2.0**level)
     validity = np.zeros(state.left.u.shape, np.uint8)
-    textured = pair.deviation(0, whole(validity.shape)) >= hp.texture
+    everywhere = whole(validity.shape)
+    textured = pair.deviation(0, everywhere) >= hp.texture
     mark(validity, a.valid[0] == 0, Validity.OUT_OF_IMAGE)
     mark(validity, ~textured, Validity.NO_TEXTURE)
-    mark(validity, ~np.asarray(state.left_ok), Validity.BACKMATCH_FAILED)
+    mark(validity, ~hierarchy.consistent(pair, 0, state.left, state.right, everywhere), Validity.BACKMATCH_FAILED)
     mark(validity, fine.distance > hp.threshold, Validity.OVER_THRESHOLD)
     good = validity == 0
     u, v, interpolated = fine.u.copy(), fine.v.copy(), np.zeros(good.shape, np.uint8)

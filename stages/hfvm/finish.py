@@ -108,7 +108,8 @@ class Finish:
         bits = bits.copy()
         keep = bits == 0
         # The relief's windows are not bounded: it is given the whole image.
-        target = whole(shape) if p.relief_steps else around(*self._ends(outer, u, v), shape, refine.drift(p), keep)
+        all_of_it = p.relief_steps or outer == whole(self.shape)
+        target = whole(shape) if all_of_it else around(*self._ends(outer, u, v), shape, refine.drift(p), keep)
         place = outer.x0, outer.y0, target.x0, target.y0, shape[0], shape[1]
         left, valid = self.pair.left.view.grey(0, outer), self.right.valid(0, target)
         image = self.right.grey(0, target)

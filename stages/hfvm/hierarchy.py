@@ -403,7 +403,9 @@ def fine_tile(pair: Prepared, level: int, a: Map, window: Window, wanted: AnyArr
     own = a.cut(outer)
     use = np.zeros(outer.shape, bool)
     use[window.inside(outer)] = True if wanted is None else wanted
-    target = landing(own, outer, other, SUM_RADIUS + 1, None if pair.params.preset == "paper" else use)
+    target = whole(other)
+    if outer != whole(shape):
+        target = landing(own, outer, other, SUM_RADIUS + 1, None if pair.params.preset == "paper" else use)
     found = pair.solver.fine(pair.left.patch(level, outer), pair.right.patch(level, target), own, use)
     inner = window.inside(outer)
     return Fine(*(np.ascontiguousarray(plane[inner]) for plane in (found.u, found.v, found.distance)))
@@ -466,6 +468,6 @@ def with_band(pair: Prepared, state: State) -> State:
         return state
     f, spread = found
     # Where lenses bend the lines, or the fit is poor, the band gives way.
-    mu = pair.params.band * min(1.0, epipolar.SHARP / max(spread, 1e-9))
+    mu = pair.params.band * min(1.0, epipolar.SHARP / max(spread, 1e-9)) ** 2
     sign = state.near_sign or epipolar.near_sign(f, s.u, shape, other)
     return State(state.level, state.left, state.right, state.left_ok, state.right_ok, Band(epipolar.finer(f), mu), sign)

@@ -244,6 +244,10 @@ def make_settle(width: int) -> Any:
                 for slot, value in ((best, tried), (found, cost), (least, total)):
                     builder.store(builder.select(better, value, builder.load(slot)), slot)
 
+            for du, dv in ((-1, 0), (1, 0), (0, -1), (0, 1)):
+                step = _vector(_INTS, [((dv & 0xFFFF) << 16) | (du & 0xFFFF)] * LANES)
+                moved = builder.add(builder.bitcast(own, _HALVES), builder.bitcast(step, _HALVES))
+                attempt(builder.bitcast(moved, _INTS))
             for tried in near:
                 with builder.if_then(_any(builder, builder.icmp_signed("!=", tried, own))):
                     attempt(tried)
@@ -259,13 +263,15 @@ def make_settle(width: int) -> Any:
 
 settle = make_settle(widest())
 """``settle(left, right, packed, data, lines, todo, at, here, above, below, y, shape, smooth, mu, new, cost)``: the best
-displacement of eight pixels of row ``y`` among each one's own and those of its four neighbours.
+displacement of eight pixels of row ``y`` among each one's own, those a pixel beside it, and those of its four
+neighbours.
 
 ``todo[at : at + 8]``: columns of the pixels, no two of them neighbours. All arrays are flat: words of both images;
 ``packed`` displacements, v << 16 | u, and their costs without smoothness; ``lines``: three planes of the left image's
 size. ``here, above, below``: index at which the row and its neighbours begin. ``shape``: rows and columns of the right
 image, columns and size of the left one, and the column of the left one's first pixel in the right one, as ``y`` is the
-row there: both may be windows. In this order: own, up, west, east, down; the first of equal ones wins. Costs have
+row there: both may be windows. In this order: own, own a column less, more, a row less, more, then up, west, east,
+down; the first of equal ones wins. Costs have
 ``smooth`` times the roughness added. ``new[at : at + 8]`` gets the best ones and
 ``cost`` their costs without smoothness.
 """

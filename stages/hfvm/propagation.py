@@ -13,6 +13,9 @@ from numba import njit
 from stages.hfvm import lanes
 from stages.hfvm.lanes import LANES
 
+PULLS = 3.0
+"""Byte steps a pixel: a softer band's lines are too uncertain to move a centre towards them."""
+
 
 @njit(cache=True, nogil=True, inline="always")
 def pack(u, v):  # type: ignore[no-untyped-def]
@@ -38,8 +41,8 @@ def descend(left, right, up_u, up_v, reach_x, reach_y, count, lines, mu, packed,
 
     ``reach_x, reach_y``: search to either side (rows: of the parent's alone); ``count``: centres, see ``lanes.seek``;
     ``lines`` (3, row, col) float32: epipolar line of each pixel (:func:`stages.hfvm.epipolar.write_lines`), zeros
-    without a band; ``mu``: cost per pixel off it. Each centre is first moved towards its line, by a pixel at most: a
-    coarse fit may be wrong by more than that. ``packed, data`` (row, col) int32 get the displacements and their costs.
+    without a band; ``mu``: cost per pixel off it. Where the band is sharp each centre is first moved towards its line,
+    by a pixel at most: a coarse fit may be wrong by more than that. ``packed, data`` (row, col) int32 get the displacements and their costs.
     With nothing inside the other image the prediction stays: it leads out of it. ``ox, oy``: where the left window's
     first pixel lies in the right window; a window starts at even rows and columns. Reach: a coarse pixel.
     """
@@ -68,7 +71,7 @@ def _centres(up_u, up_v, lines, mu, centres):  # type: ignore[no-untyped-def]
         normal = lines[:, 2 * j]
         for i in range(ccols):
             pu, pv = 2 * np.int64(up_u[j, i]), 2 * np.int64(up_v[j, i])
-            if mu > 0:
+            if mu >= PULLS:
                 a, b = normal[0, 2 * i], normal[1, 2 * i]
                 e = min(max(a * np.float32(pu) + b * np.float32(pv) + normal[2, 2 * i], -one), one)
                 pu -= np.int64(np.rint(e * a))
@@ -83,7 +86,7 @@ def _centres(up_u, up_v, lines, mu, centres):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def checkerboard(left, right, packed, data, dirty, lines, mu, smoothness, rounds, ox=0, oy=0):  # type: ignore[no-untyped-def]
-    """Rounds of propagation in place: each pixel tries its neighbours' displacements.
+    """Rounds of propagation in place: each pixel tries its neighbours' displacements and its own +-1.
 
     Cost: that of the displacement + ``smoothness`` times the sum over the four neighbours of min(|du| + |dv|, 2);
     beyond the border the neighbour on the other side stands in. The two colours of a checkerboard take turns, which

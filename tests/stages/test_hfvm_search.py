@@ -33,14 +33,14 @@ def centre(up_u, up_v, lines, j, i, mu):
     """Doubled displacement of a coarse pixel, the border repeated, moved to its line by a pixel at most."""
     j, i = min(max(j, 0), 5), min(max(i, 0), 6)
     u, v = 2 * int(up_u[j, i]), 2 * int(up_v[j, i])
-    if mu:
+    if mu >= propagation.PULLS:
         a, b, c = lines[:, 2 * j, 2 * i]
         e = np.float32(np.clip(a * np.float32(u) + b * np.float32(v) + c, -1, 1))
         u, v = u - int(np.rint(e * a)), v - int(np.rint(e * b))
     return u, v
 
 
-@pytest.mark.parametrize("mu", [0.0, 3.0])
+@pytest.mark.parametrize("mu", [0.0, 2.0, 3.0])
 @pytest.mark.parametrize(("reach_x", "reach_y", "count"), [(1, 1, 5), (2, 1, 3), (1, 0, 1)])
 def test_descend_finds_the_first_of_the_best_around_its_centres(mu, reach_x, reach_y, count):
     left, right = words((ROWS, COLS), 1), words((9, 15), 2)
@@ -80,7 +80,8 @@ def slow_checkerboard(left, right, u, v, lines, mu, smoothness, rounds):
                 near = [(int(u[at(*p)]), int(v[at(*p)])) for p in around]
                 a, b = int(u[y, x]), int(v[y, x])
                 best = None
-                for du, dv in [(a, b), *near]:
+                own = [(a, b), (a - 1, b), (a + 1, b), (a, b - 1), (a, b + 1)]
+                for du, dv in [*own, *near]:
                     if not (0 <= x + du < right.shape[1] and 0 <= y + dv < right.shape[0]):
                         continue
                     cost = sad(left[y, x], right[y + dv, x + du]) + off_line(lines, y, x, du, dv, mu)
