@@ -38,7 +38,7 @@ class MotionParams(Params):
     top_columns: float = Field(default=0.25, gt=0, le=1, description="share of the width searched at the top level")
     top_rows: float = Field(default=0.25, gt=0, le=1, description="share of the height searched at the top level")
     smoothness: int = Field(default=5, ge=0, description="byte steps a pixel of difference to each neighbour")
-    rounds: int = Field(default=4, ge=0, le=32, description="propagation rounds a level")
+    rounds: int = Field(default=6, ge=0, le=32, description="propagation rounds a level; more help little")
     turn_below: float = Field(
         default=0.5,
         ge=0,
@@ -88,6 +88,9 @@ def coarse_motion(a: Pyramid, b: Pyramid, params: MotionParams, turn: Derotation
         back_rounds=params.rounds if level else HfvmParams().back_rounds,
         top_columns=params.top_columns,
         top_rows=params.top_rows,
+        search_columns=1,
+        median=3,
+        centres=5,
         smoothness=params.smoothness,
         rounds=params.rounds,
     )

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.declare import AnyArray
-from stages.hfvm import consistency, epipolar, lanes, lookup, paper, propagation, search, subpixel
+from stages.hfvm import consistency, epipolar, lookup, paper, propagation, search, subpixel
 from stages.hfvm.params import HfvmParams
 from stages.hfvm.views import Patch, Plain, Seen
 from stages.hfvm.window import (
@@ -150,9 +150,8 @@ class FastSolver:
         epipolar.write_lines(band.f, lines, a.window.x0, a.window.y0)
         if up is None:
             reach_x, reach_y = top_reach(p, *shapes)
-            search.exhaustive(a.words, b.words, reach_x, reach_y, 1, u, v)
+            search.exhaustive(a.words, b.words, reach_x, reach_y, 1, u, v, data)
             propagation.pack_map(u, v, packed)
-            data[:] = lanes.FAR
         else:
             reach = p.search_columns, p.search_rows
             propagation.descend(a.words, b.words, up.u, up.v, *reach, p.centres, lines, mu, packed, data, *at)

@@ -111,6 +111,9 @@ TRUNCATION = 2
 FAR = 1 << 25
 """Cost above every cost."""
 
+SHARP = 3.0
+"""Byte steps a pixel: a softer band hardly says in which row to search."""
+
 _FLOATS8 = ir.VectorType(ir.FloatType(), LANES)
 _HALVES = ir.VectorType(_I16, 2 * LANES)
 _ALL = ir.Constant(_MASK, [1] * LANES)
@@ -337,22 +340,23 @@ def make_seek(width: int) -> Any:
             far = _vector(_INTS, [FAR] * LANES)
             best, least = (cgutils.alloca_once_value(builder, a) for a in (own, builder.select(inside, cost, far)))
             one_more = ir.Constant(_I64, 1)
+            square = builder.fcmp_ordered("<", args[11], ir.Constant(ir.FloatType(), SHARP))
             with cgutils.for_range(builder, count) as loop:
                 centre = builder.load(builder.gep(held, [loop.index]))
                 is_own = builder.icmp_signed("==", loop.index, ir.Constant(_I64, 0))
                 new = builder.or_(is_own, _any(builder, builder.icmp_signed("!=", centre, own)))
                 with builder.if_then(new):
-                    sideways = (ir.Constant(_I64, 0), reach_x)
-                    upright = (builder.select(is_own, reach_y, ir.Constant(_I64, 0)), ir.Constant(_I64, 0))
+                    up_reach = builder.select(builder.or_(is_own, square), reach_y, ir.Constant(_I64, 0))
 
                     def around(alike: bool) -> None:
-                        for up, aside in (sideways, upright):
-                            reach = builder.add(up, aside)
+                        with cgutils.for_range(builder, builder.add(builder.add(up_reach, up_reach), one_more)) as loop:
+                            up = builder.sub(loop.index, up_reach)
+                            level = builder.icmp_signed("==", up, ir.Constant(_I64, 0))
+                            reach = builder.select(builder.or_(level, square), reach_x, ir.Constant(_I64, 0))
+                            upward = builder.shl(up, ir.Constant(_I64, 16))
                             with cgutils.for_range(builder, builder.add(builder.add(reach, reach), one_more)) as loop:
-                                step = builder.sub(loop.index, reach)
-                                low = builder.and_(step, ir.Constant(_I64, 0xFFFF))
-                                moved = low if up is sideways[0] else builder.shl(step, ir.Constant(_I64, 16))
-                                moved = builder.bitcast(narrow(moved), _HALVES)
+                                step = builder.and_(builder.sub(loop.index, reach), ir.Constant(_I64, 0xFFFF))
+                                moved = builder.bitcast(narrow(builder.or_(upward, step)), _HALVES)
                                 tried = builder.bitcast(builder.add(builder.bitcast(centre, _HALVES), moved), _INTS)
                                 cost, inside = pixels.cost(tried, alike)
                                 better = builder.and_(inside, builder.icmp_signed("<", cost, builder.load(least)))
@@ -387,7 +391,8 @@ displacement of the eight pixels from (``x``, ``y``) on around the displacements
 ``centres``: flat, packed, a border of one all round; ``parents``: where the row of the parents begins, ``beside``: the
 coarse row next to this one's other side. ``reach``: columns and rows to either side, and the number of centres: of the
 parent, the coarse pixels nearest along the row, the column and the diagonal, and the one at the parent's other side.
-A search reaches along the row, about the parent also along the column. The other arrays as in :data:`settle`;
+A search reaches along the row, about the parent also along the column; where the band is not sharp, over the whole
+rectangle about each. The other arrays as in :data:`settle`;
 ``packed, data`` are written.
 """
 

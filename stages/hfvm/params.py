@@ -29,6 +29,7 @@ ACCURATE: Mapping[str, Any] = {
     "back_rounds": 4,
     "centres": 5,
     "refine_steps": 1,
+    "median": 3,
     "path_rounds": 3,
     "relief_steps": 7,
     "crowd": 0.5,
@@ -102,7 +103,7 @@ class HfvmParams(Params):
     finest: Literal[0, 1] = Field(
         default=0, description="pyramid level matched last; 1 = half the resolution, a quarter of the work"
     )
-    median: Literal[1, 3, 5] = Field(default=3, description="pixels; side of the median filter of each level, 1 = none")
+    median: Literal[1, 3, 5] = Field(default=5, description="pixels; side of the median filter of each level, 1 = none")
     threshold: float = Field(
         default=90.0,
         gt=0,

@@ -11,10 +11,7 @@ import numpy as np
 from numba import njit
 
 from stages.hfvm import lanes
-from stages.hfvm.lanes import LANES
-
-PULLS = 3.0
-"""Byte steps a pixel: a softer band's lines are too uncertain to move a centre towards them."""
+from stages.hfvm.lanes import LANES, SHARP
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -41,10 +38,11 @@ def descend(left, right, up_u, up_v, reach_x, reach_y, count, lines, mu, packed,
 
     ``reach_x, reach_y``: search to either side (rows: of the parent's alone); ``count``: centres, see ``lanes.seek``;
     ``lines`` (3, row, col) float32: epipolar line of each pixel (:func:`stages.hfvm.epipolar.write_lines`), zeros
-    without a band; ``mu``: cost per pixel off it. Where the band is sharp each centre is first moved towards its line,
-    by a pixel at most: a coarse fit may be wrong by more than that. ``packed, data`` (row, col) int32 get the displacements and their costs.
-    With nothing inside the other image the prediction stays: it leads out of it. ``ox, oy``: where the left window's
-    first pixel lies in the right window; a window starts at even rows and columns. Reach: a coarse pixel.
+    without a band; ``mu``: cost per pixel off it. Where the band is sharp each centre is first moved towards its
+    line, by a pixel at most: a coarse fit may be wrong by more than that. ``packed, data`` (row, col) int32 get the
+    displacements and their costs. With nothing inside the other image the prediction stays: it leads out of it. ``ox,
+    oy``: where the left window's first pixel lies in the right window; a window starts at even rows and columns.
+    Reach: a coarse pixel.
     """
     rows, cols = left.shape
     crows, ccols = up_u.shape
@@ -71,7 +69,7 @@ def _centres(up_u, up_v, lines, mu, centres):  # type: ignore[no-untyped-def]
         normal = lines[:, 2 * j]
         for i in range(ccols):
             pu, pv = 2 * np.int64(up_u[j, i]), 2 * np.int64(up_v[j, i])
-            if mu >= PULLS:
+            if mu >= SHARP:
                 a, b = normal[0, 2 * i], normal[1, 2 * i]
                 e = min(max(a * np.float32(pu) + b * np.float32(pv) + normal[2, 2 * i], -one), one)
                 pu -= np.int64(np.rint(e * a))

@@ -6,17 +6,22 @@ import numpy as np
 from numba import njit
 
 from stages.features import distance
+from stages.hfvm.lanes import FAR
+
+NONE = 1 << 40
+"""Cost above every cost."""
 
 
 @njit(cache=True, nogil=True)
-def exhaustive(left, right, reach_x, reach_y, radius, out_u, out_v):  # type: ignore[no-untyped-def]
+def exhaustive(left, right, reach_x, reach_y, radius, out_u, out_v, out_cost):  # type: ignore[no-untyped-def]
     """Null prediction and large search area (4.3.4), for the top level: least distance summed over a window.
 
-    Mean over the window's pixels that both images show; of equal ones the shorter displacement wins.
+    Mean over the window's pixels that both images show; of equal ones the shorter displacement wins. ``out_cost``:
+    the distance of each pixel alone, which is what ``propagation`` counts with.
     """
     rows, cols = left.shape
     rrows, rcols = right.shape
-    best = np.full((rows, cols), np.int64(1) << 40)
+    best = np.full((rows, cols), NONE)
     out_u[:], out_v[:] = 0, 0
     single, across = np.zeros((rows, cols + 2 * radius), np.int64), np.zeros((rows, cols), np.int64)
     for v in range(-reach_y, reach_y + 1):
@@ -43,3 +48,6 @@ def exhaustive(left, right, reach_x, reach_y, radius, out_u, out_v):  # type: ig
                     if cost < best[y, x]:
                         best[y, x] = cost
                         out_u[y, x], out_v[y, x] = u, v
+    for y in range(rows):
+        for x in range(cols):
+            out_cost[y, x] = distance(left[y, x], right[y + out_v[y, x], x + out_u[y, x]]) if best[y, x] < NONE else FAR

@@ -33,7 +33,7 @@ def centre(up_u, up_v, lines, j, i, mu):
     """Doubled displacement of a coarse pixel, the border repeated, moved to its line by a pixel at most."""
     j, i = min(max(j, 0), 5), min(max(i, 0), 6)
     u, v = 2 * int(up_u[j, i]), 2 * int(up_v[j, i])
-    if mu >= propagation.PULLS:
+    if mu >= lanes.SHARP:
         a, b, c = lines[:, 2 * j, 2 * i]
         e = np.float32(np.clip(a * np.float32(u) + b * np.float32(v) + c, -1, 1))
         u, v = u - int(np.rint(e * a)), v - int(np.rint(e * b))
@@ -56,8 +56,9 @@ def test_descend_finds_the_first_of_the_best_around_its_centres(mu, reach_x, rea
         centres = [centre(up_u, up_v, lines, *p, mu) for p in places]
         tried = [centres[0]]
         for m, (u, v) in enumerate(centres):
-            tried += [(u + du, v) for du in range(-reach_x, reach_x + 1)]
-            tried += [(u, v + dv) for dv in range(-reach_y, reach_y + 1) if m == 0]
+            for dv in range(-reach_y, reach_y + 1) if m == 0 or mu < lanes.SHARP else [0]:
+                wide = reach_x if dv == 0 or mu < lanes.SHARP else 0
+                tried += [(u + du, v + dv) for du in range(-wide, wide + 1)]
         best = (*centres[0], lanes.FAR)
         for u, v in tried:
             if 0 <= x + u < 15 and 0 <= y + v < 9:
@@ -125,12 +126,15 @@ def test_exhaustive_search_finds_a_two_dimensional_shift_and_prefers_the_short_o
     big = words((20, 24), 9)
     left, right = big[4:16, 6:18], big[2:14, 3:15]
     u, v = np.full((2, 12, 12), 99, np.int16)
-    search.exhaustive(left, right, 6, 6, 1, u, v)
+    cost = np.zeros((12, 12), np.int32)
+    search.exhaustive(left, right, 6, 6, 1, u, v, cost)
     assert (u[:9, :8] == 3).all()
     assert (v[:9, :8] == 2).all()
+    for y, x in np.ndindex(12, 12):
+        assert cost[y, x] == sad(left[y, x], right[y + v[y, x], x + u[y, x]])
     flat = np.zeros((5, 5), np.uint64)
     u, v = np.full((2, 5, 5), 99, np.int16)
-    search.exhaustive(flat, flat, 3, 3, 1, u, v)
+    search.exhaustive(flat, flat, 3, 3, 1, u, v, np.zeros((5, 5), np.int32))
     assert (u == 0).all()
     assert (v == 0).all()
 

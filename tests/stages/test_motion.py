@@ -162,7 +162,7 @@ def test_masked_pixels_of_a_turned_frame_match_nothing():
 
 
 def test_stage_takes_the_attitude_from_its_arguments_and_leaves_small_turns_to_the_matcher():
-    rotation = rotation_exp([0.0, 0.0, np.radians(25.0)])
+    rotation = rotation_exp([0.0, 0.0, np.radians(35.0)])
     a, b = taken(held(rotation))
     plain = run(a, b, turn_below=0.0)  # an attitude alone
     assert not plain.meta["derotated"]
