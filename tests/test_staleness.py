@@ -19,7 +19,7 @@ import pytest
 
 from datasets.protocol import Sequence
 from datasets.registry import open_sequence
-from pipeline import code, driver, explain
+from pipeline import code, driver, explain, task
 from pipeline import config as configuration
 from pipeline.dag import Graph
 from pipeline.environment import worker_environment
@@ -241,7 +241,6 @@ EDITS: dict[str, tuple[str, str, str, set[str]]] = {
     "a njit callee of several": ("stages/features.py", "", "\nMORE = 1\n", {"motion", "hfvm", "track"}),
     "a helper of the seams": ("stages/seam_fit.py", "", "\nMORE = 1\n", {"seam"}),
     "a stage that others hang on by its result": ("stages/footprint.py", "", "\nMORE = 1\n", {"footprint"}),
-    "what small pairs do not need": ("stages/hfvm_tile.py", "", "\nMORE = 1\n", set()),
     "a helper's helper": ("stages/epipolar.py", "", "\nMORE = 1\n", {"orientation", "rig"}),
     "a helper of two stages": ("stages/pose_alignment.py", "", "\nMORE = 1\n", {"agreement", "crosscheck_join"}),
 }
@@ -253,7 +252,7 @@ def edited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     """``edited(file, old, new)``: the sources as a new process would find them after that edit."""
     for package in ("stages", "datasets", "pipeline"):
         shutil.copytree(ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__"))
-    caches = (code._read, code._file, code._reachable)
+    caches = (code._read, code._file, code._reachable, task._shared)
 
     def edit(file: str, old: str, new: str) -> None:
         path = tmp_path / file
