@@ -88,7 +88,12 @@ def test_xarray_opens_the_artifact_of_every_stage_with_dimensions_and_units(cold
         opened.add(stage)
         arrays = manifest["arrays"]
         with xarray.open_zarr(store.root / manifest["path"]) as data:
-            assert set(data.variables) == set(arrays), stage
+            assert set(data.data_vars) == set(arrays), stage
+            lattice = manifest["meta"].get("lattice")
+            assert set(data.coords) == ({"x", "y"} if lattice else set()), stage
+            if lattice:
+                assert [data.x.units, data.x.dims, data.y.units, data.y.dims] == ["m", ("col",), "m", ("row",)], stage
+                assert data.y[0] - data.y[1] == pytest.approx(lattice["cell"], rel=1e-6), (stage, "row 0 is farthest")
             for name, about in arrays.items():
                 assert data[name].attrs["units"] == about["units"] != "", (stage, name)
                 assert data[name].attrs["long_name"] == about["long_name"] != "", (stage, name)
