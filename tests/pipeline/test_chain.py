@@ -52,6 +52,10 @@ def digests(folder: Path) -> dict[str, str]:
     return {row["label"]: row["digest"] for row in read(latest(folder) / "ledger.jsonl")}
 
 
+def contents(folder: Path) -> dict[str, bytes]:
+    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
 @pytest.fixture(scope="module")
 def cold(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("chain")
@@ -118,7 +122,7 @@ def test_where_nothing_is_new_the_latest_run_stands(
 ) -> None:
     assert run.reconstruct(options(cold)) == 0
     stands = latest(cold)
-    written = {p.name: p.read_bytes() for p in stands.iterdir()}
+    written = contents(stands)
     folders = set(stands.parent.iterdir())
     capsys.readouterr()
     with monkeypatch.context() as patch:
@@ -126,7 +130,7 @@ def test_where_nothing_is_new_the_latest_run_stands(
         assert run.reconstruct(options(cold)) == 0
     assert capsys.readouterr().out.split()[0] == str(stands)
     assert set(stands.parent.iterdir()) == folders
-    assert {p.name: p.read_bytes() for p in stands.iterdir()} == written
+    assert contents(stands) == written
 
     def draws(why: str, **options_: Any) -> None:
         before = latest(cold)
@@ -137,6 +141,8 @@ def test_where_nothing_is_new_the_latest_run_stands(
     draws("a file was edited")
     (latest(cold) / "dem.qml").unlink()
     draws("a file has gone")
+    (latest(cold) / "terrain.zarr" / "elevation" / "zarr.json").unlink()
+    draws("a file in a folder of the run has gone")
     draws("it was asked for", fresh=True)
     draws("a stage was forced", force=frozenset({"select"}))
     monkeypatch.setattr("pipeline.run._versions", lambda: {"matplotlib": "0"})
