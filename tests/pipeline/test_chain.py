@@ -32,6 +32,7 @@ SMALL = (
     "mockup.focal_length=300.0",
     "select.stride=2",
     "locus.cell_size=0.004",
+    "hfvm.preset=default",  # the mockup's own, accurate, has more to compile
 )
 
 
