@@ -16,7 +16,13 @@ def test_every_listed_name_opens():
     assert names[:4] == ["mockup", "mockup-short", "devon_island", "nasa_k10"]
     full, short = open_sequence("mockup"), open_sequence("mockup-short")
     assert (full.frames, short.frames) == (40, 9)
-    assert full.defaults == {"select.rule": "stride", "select.stride": 4, "locus.cell_size": 0.001}
+    assert full.defaults == {
+        "hfvm.preset": "accurate",
+        "select.rule": "stride",
+        "select.stride": 4,
+        "locus.cell_size": 0.001,
+    }
+    configuration.build(configuration.expand(full.defaults))
     assert full.evaluation_window == (-0.3, 0.4, 0.3, 0.7)
     assert (full.rig.left.width, full.rig.left.height) == (570, 520)
     assert full.vehicle is not None
