@@ -42,7 +42,8 @@ def descend(left, right, up_u, up_v, reach_x, reach_y, count, lines, mu, packed,
     ``reach_x, reach_y``: search to either side (rows: of the parent's alone); ``count``: centres, see ``lanes.seek``;
     ``lines`` (3, row, col) float32: epipolar line of each pixel (:func:`stages.hfvm.epipolar.write_lines`), zeros
     without a band; ``mu``: cost per pixel off it. Where the band is sharp each centre is first moved towards its line,
-    by a pixel at most: a coarse fit may be wrong by more than that. ``packed, data`` (row, col) int32 get the displacements and their costs.
+    by a pixel at most: a coarse fit may be wrong by more than that. ``packed, data`` (row, col) int32 get the
+    displacements and their costs.
     With nothing inside the other image the prediction stays: it leads out of it. ``ox, oy``: where the left window's
     first pixel lies in the right window; a window starts at even rows and columns. Reach: a coarse pixel.
     """
