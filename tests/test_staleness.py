@@ -37,6 +37,8 @@ META: dict[str, dict[str, Any]] = {
     "select": {"basic": [0, 2, 4], "segments": [[0, 1, 2], [2, 3, 4]]},
     "level": {"T_local_left": IDENTITY},
     "locus": {"lattice": LATTICE},
+    "footprint": {"cell": 0.004, "box": LATTICE, "tiles": [[0, 0, -50, 100, 60, 80]]},
+    "exposure": {"steps": {}},
     "trajectory": {"positions": [[0.0, 0.0, 0.0]] * 5},
     "crosscheck_join": {"frames": list(FRAMES), "positions": [[0.0, 0.0, 0.0]] * 5},
 }
@@ -44,9 +46,11 @@ META: dict[str, dict[str, Any]] = {
 
 # -- the table: what must be computed again; a group of tasks is a label without its numbers ------------------------
 
-MISSION = {"locus/world", "merge", "risk/world", "path/world", "dem_accuracy/world", "path_check"}
+SEAMS = {"seam", "seam_audit", "exposure"}
+MERGED = {"merge", "risk/world", "path/world", "dem_accuracy/world", "path_check"}
+MISSION = {"locus/world", "footprint"} | SEAMS | MERGED
 LOCAL = {"locus/local", "risk/local", "path/local", "dem_accuracy/local"}
-POSES = {"resect", "trajectory", "agreement", "accuracy"} | MISSION
+POSES = {"resect", "pose", "trajectory", "agreement", "accuracy"} | MISSION
 LEVELLED = {"level"} | LOCAL | POSES
 RIG = {"rig", "calibration"} | LEVELLED
 MATCHED = {"hfvm", "orientation"} | RIG
@@ -67,7 +71,10 @@ STALE: dict[str, set[str]] = {
     "locus": LOCAL | MISSION,
     "track": {"track"} | POSES,
     "resect": POSES,
-    "merge": MISSION - {"locus/world"},
+    "tiling": set(),  # tiles change no bit, and these images are matched whole
+    "seam_audit": {"seam_audit"},
+    "exposure": {"exposure"},  # what follows hangs on its result, not on it
+    "merge": MERGED,
     "risk": RISK,
     "path": {"path/local", "path/world", "path_check"},
     "crosscheck": COUNTERCHECK,
@@ -75,6 +82,7 @@ STALE: dict[str, set[str]] = {
     "vehicle": RISK,
 }
 EXCEPTIONS: dict[str, set[str]] = {
+    "merge.max_hole": MERGED | {"footprint"},  # how far around a tile matters
     "crosscheck.enabled": set(),  # without it there is less to compute
     "vehicle.name": set(),  # a name changes no risk
 }
@@ -88,10 +96,15 @@ class Everything(Store):
         self.known: dict[str, Ref] = {}
         self.labels: dict[str, Ref] = {}
         self.learning = True
+        self.pairs = list(META["select"]["basic"])
 
     def lookup(self, stage: str, key: str) -> Ref | None:
         if self.learning:
-            self.known[key] = Ref(key, stage, digest([stage, key]), "", META.get(stage, {}))
+            meta = META.get(stage, {})
+            if stage == "footprint" and key not in self.known:
+                meta = {**meta, "pair": self.pairs.pop(0)}
+                self.known[key] = Ref(key, stage, digest([stage, key]), "", meta)
+            self.known.setdefault(key, Ref(key, stage, digest([stage, key]), "", meta))
         return self.known.get(key)
 
 
@@ -159,7 +172,7 @@ def candidates(kind: Any, value: Any) -> Iterator[Any]:
     elif isinstance(value, tuple):
         yield tuple(v * 1.01 for v in value)
     elif value is None:
-        yield from (0.0123, (0.1, 0.2), (-1.0, 0.5, 1.0, 2.0))
+        yield from (2, 0.0123, (0.1, 0.2), (-1.0, 0.5, 1.0, 2.0))
 
 
 def changes(parameter: str, defaults: Any) -> dict[str, Any]:
