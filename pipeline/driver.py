@@ -200,9 +200,10 @@ class _Run:
             raise
         else:
             self._close(kill=False)
-            self.store.note(h.ref for h in self.graph.nodes if h.ref is not None)
-            remember_seconds(self.store, self.result.counts)
-            costs.remember(self.store, self.graph.nodes)
+            if not self.dry:
+                self.store.note(h.ref for h in self.graph.nodes if h.ref is not None)
+                remember_seconds(self.store, self.result.counts)
+                costs.remember(self.store, self.graph.nodes)
         finally:
             gc.unfreeze()
             self.result.seconds = time.perf_counter() - begin
@@ -321,8 +322,7 @@ class _Run:
         known, jobs = costs.recall(self.store), self.jobs or cores()
         if self.executor_kind == "processes":
             import distributed  # noqa: F401 (what it takes is this process's own)
-        ahead = Graph() if self.survey is None else self.survey()
-        run(ahead, self.store, dry=True, force=self.force)
+        ahead = self._look_ahead()
         most = max(largest(ahead, known), *(known.foresee(h.spec, input_bytes(h)).most for h in self.missing))
         shares = account(known, self.memory_limit, self.executor_kind, jobs, most)
         self.admission = Admission(known, shares, automatic=self.memory_limit is None)
@@ -333,6 +333,14 @@ class _Run:
         workers = shares.workers if few else self.jobs
         self.executor = make(self.executor_kind, workers, self.store.location, shares.limit)
         self.result.executor_started = True
+
+    def _look_ahead(self) -> Graph:
+        """The graph laid out anew and looked up, by what this run's survey of the store has found."""
+        ahead = Graph() if self.survey is None else self.survey()
+        dry = _Run(ahead, self.store, "inline", None, False, self.force, True, None, Quiet(), None, None)
+        dry._settle()
+        dry._leave_out()
+        return ahead
 
     def _land(self, key: str, outcome: Outcome | Failed) -> None:
         assert self.admission is not None

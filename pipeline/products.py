@@ -35,7 +35,9 @@ ENGINEERING_CRS = (
     'ENGCRS["Rille world frame (local metres)",EDATUM["centre of the first left camera"],CS[Cartesian,2],'
     'AXIS["x",east,ORDER[1]],AXIS["y",north,ORDER[2]],LENGTHUNIT["metre",1]]'
 )
-"""WKT 2. GDAL keeps it, but rasterio's ``crs.is_valid`` is False for every engineering CRS: do not test that."""
+"""WKT 2. A GeoPackage keeps it whole, a GeoTIFF its name, unit and directions: GDAL reads the axes of every local
+system back as easting and northing, so the tag AXES says what they are. rasterio's ``crs.is_valid`` is False for every
+engineering CRS: do not test that."""
 
 LINE_Z, POINT_Z = 1002, 1001
 """Geometry types of ISO 19125 well-known binary."""

@@ -309,7 +309,7 @@ def test_estimate_weighs_stages_by_their_earlier_seconds(cache):
 def test_unknown_modes_and_executors_are_refused(cache):
     with pytest.raises(RilleError, match="one of auto, bar"):
         progress.make("loud")
-    with pytest.raises(RilleError, match="inline, threads, processes"):
+    with pytest.raises(RilleError, match="executor 'cloud' is unknown: processes, threads, inline or tcp://host:port"):
         run(cache, executor="cloud")
     with pytest.raises(RilleError, match="give 1 or more"):
         run(cache, jobs=0)
