@@ -89,7 +89,6 @@ def coarse_motion(a: Pyramid, b: Pyramid, params: MotionParams, turn: Derotation
         top_columns=params.top_columns,
         top_rows=params.top_rows,
         search_columns=1,
-        median=3,
         centres=5,
         smoothness=params.smoothness,
         rounds=params.rounds,

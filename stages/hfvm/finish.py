@@ -38,6 +38,12 @@ class Finish:
         """Rows and columns of the left image."""
         return self.pair.shapes(0)[0]
 
+    @property
+    def refining(self) -> HfvmParams:
+        """Parameters of the refinement: an image that a plane has aligned is sheared, and takes a step more."""
+        p = self.params
+        return p if self.alignment is None else p.model_copy(update={"refine_steps": p.refine_steps + 1})
+
     def fine(self, window: Window, a: Map) -> Results:
         """Map of a window of the left image with fractions of a pixel, means of like neighbours; feature distances.
 
@@ -102,7 +108,8 @@ class Finish:
 
         Reach: :func:`stages.hfvm.refine.reach`.
         """
-        p, shape, reach = self.params, self.right.shapes[0], refine.reach(self.params)
+        p, shape = self.refining, self.right.shapes[0]
+        reach = refine.reach(p)
         outer = window.grow(reach, reach, self.shape)
         u, v, bits = (cut(checked[name], outer) for name in ("u", "v", "validity"))
         bits = bits.copy()

@@ -23,13 +23,13 @@ PAPER: Mapping[str, Any] = {
 """What preset ``paper`` sets differently; a value given by the user wins. Preset-only machinery ignores the rest."""
 
 ACCURATE: Mapping[str, Any] = {
+    "band": 8.0,
     "smoothness": 5,
     "rounds": 4,
     "fine_rounds": None,
     "back_rounds": 4,
     "centres": 5,
     "refine_steps": 1,
-    "median": 3,
     "path_rounds": 3,
     "relief_steps": 7,
     "crowd": 0.5,
@@ -78,7 +78,7 @@ class HfvmParams(Params):
     )
     search_rows: int = Field(default=1, ge=0, le=8, description="pixels; never 0 on a rig that is not rectified")
     band: float = Field(
-        default=8.0,
+        default=6.0,
         ge=0,
         description="cost (byte steps) a pixel off the epipolar line; 0 = free two-dimensional search",
     )
@@ -103,7 +103,7 @@ class HfvmParams(Params):
     finest: Literal[0, 1] = Field(
         default=0, description="pyramid level matched last; 1 = half the resolution, a quarter of the work"
     )
-    median: Literal[1, 3, 5] = Field(default=5, description="pixels; side of the median filter of each level, 1 = none")
+    median: Literal[1, 3, 5] = Field(default=3, description="pixels; side of the median filter of each level, 1 = none")
     threshold: float = Field(
         default=90.0,
         gt=0,

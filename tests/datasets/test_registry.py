@@ -17,7 +17,6 @@ def test_every_listed_name_opens():
     full, short = open_sequence("mockup"), open_sequence("mockup-short")
     assert (full.frames, short.frames) == (40, 9)
     assert full.defaults == {
-        "hfvm.preset": "accurate",
         "select.rule": "stride",
         "select.stride": 4,
         "locus.cell_size": 0.001,
