@@ -50,8 +50,8 @@ class Factors:
 REFINED = Factors(floor=0.1, noise=0.52, relief=1.4, border=0.67)
 """Refined disparities. Fitted by ``benchmarks/disparity_std.py`` (rounded) to four mockup pairs: seeds 1, 2 and 6, and
 seed 7 with noise of 4 grey levels. There 65-73 % of the errors are below std and 91-93 % below twice that, on other
-seeds 71-73 and 92-93 %, on two photographed pairs whose truth errs by .1 px itself 62/86 and 58/84. The floor is set, not fitted: what smooth textured
-surfaces show."""
+seeds 71-73 and 92-93 %, on two photographed pairs whose truth errs by .1 px itself 62/86 and 58/84. The floor is set,
+not fitted: what smooth textured surfaces show."""
 
 UNREFINED = Factors(floor=0.1, noise=0.7, relief=2.5, border=1.1)
 """Disparities as the sub-pixel search and local mean left them; N is then that of the fixed noise ``refine_noise``."""
