@@ -33,7 +33,6 @@ ACCURATE: Mapping[str, Any] = {
     "path_rounds": 3,
     "relief_steps": 7,
     "crowd": 0.5,
-    "greatest_std": 1.0,
     "guided_fill": True,
 }
 """What preset ``accurate`` sets differently; a value given by the user wins."""

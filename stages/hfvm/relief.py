@@ -22,7 +22,6 @@ from stages.hfvm import epipolar
 from stages.hfvm.hierarchy import evenly
 from stages.hfvm.params import HfvmParams
 from stages.hfvm.refine import FARTHEST
-from stages.hfvm.rowwise import PLANES, _products
 from stages.windows import window_sum
 
 MEAN_SIDE = 9
@@ -87,9 +86,9 @@ def _normal(
     left: AnyArray, right: AnyArray, right_valid: AnyArray, u: AnyArray, v: AnyArray, keep: AnyArray
 ) -> tuple[AnyArray, ...]:
     """Terms a, b, c, p, q of each pixel's normal equations (a b; b c) (du, dv) = (p, q) of the grey values."""
-    planes = np.zeros((PLANES, *u.shape), np.float32)
-    _all_products(left, right, right_valid, u, v, keep, planes)
-    known, gx, gy, rest = planes[0], planes[1], planes[2], planes[3]
+    planes = np.zeros((4, *u.shape), np.float32)
+    _warped(left, right, right_valid, u, v, keep, planes)
+    known, gx, gy, rest = planes
     mean = window_sum(rest, MEAN_SIDE) / np.maximum(window_sum(known, MEAN_SIDE), 1.0)
     rest = np.where(known > 0, rest - mean, 0.0).astype(np.float32)
     weight = np.float32(1.0) / (np.float32(1.0) + (rest / np.float32(RESIDUAL)) ** 2)
@@ -98,9 +97,46 @@ def _normal(
 
 
 @njit(cache=True, nogil=True)
-def _all_products(left, right, right_valid, u, v, keep, out):  # type: ignore[no-untyped-def]
-    for y in range(left.shape[0]):
-        _products(left, right, right_valid, u, v, keep, y, 0, out[:, y])
+def _warped(left, right, right_valid, u, v, keep, out):  # type: ignore[no-untyped-def]
+    """Planes: 1 where a pixel takes part, gradient (x, y) of the warped right image, left minus right; else zero."""
+    rows, cols = left.shape
+    last_x, last_y, half = right.shape[1] - 2, right.shape[0] - 2, np.float32(0.5)
+    w, slope = np.empty((2, 4), np.float32), np.empty((2, 4), np.float32)
+    for y in range(rows):
+        for x in range(cols):
+            xr, yr = np.float32(x) + u[y, x], np.float32(y) + v[y, x]
+            if not (keep[y, x] and xr >= 1 and xr < last_x and yr >= 1 and yr < last_y):
+                continue
+            if not right_valid[np.int64(yr + half), np.int64(xr + half)]:
+                continue
+            i, j = np.int64(xr), np.int64(yr)
+            _weights(xr - np.float32(i), w[0], slope[0])
+            _weights(yr - np.float32(j), w[1], slope[1])
+            value = gx = gy = np.float32(0.0)
+            for k in range(4):
+                across = along = np.float32(0.0)
+                for m in range(4):
+                    grey = right[j - 1 + k, i - 1 + m]
+                    across += w[0, m] * grey
+                    along += slope[0, m] * grey
+                value += w[1, k] * across
+                gx += w[1, k] * along
+                gy += slope[1, k] * across
+            out[0, y, x], out[1, y, x], out[2, y, x], out[3, y, x] = 1, gx, gy, left[y, x] - value
+
+
+@njit(cache=True, nogil=True)
+def _weights(t, w, slope):  # type: ignore[no-untyped-def]
+    """Catmull-Rom weights of four samples at -1, 0, 1, 2 for a point at ``t``, and their derivatives."""
+    half, one, two, three = np.float32(0.5), np.float32(1.0), np.float32(2.0), np.float32(3.0)
+    four, five = np.float32(4.0), np.float32(5.0)
+    w[0], w[3] = half * t * (two * t - one - t * t), half * t * t * (t - one)
+    w[1], w[2] = half * (two + t * t * (three * t - five)), half * t * (one + four * t - three * t * t)
+    slope[0], slope[3] = half * (four * t - one - three * t * t), half * t * (three * t - two)
+    slope[1], slope[2] = (
+        half * t * (three * three * t - five * two),
+        half * (one + two * four * t - three * three * t * t),
+    )
 
 
 def _hold_to_lines(u: AnyArray, v: AnyArray, keep: AnyArray, right_shape: tuple[int, int], *terms: AnyArray) -> None:
