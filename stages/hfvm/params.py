@@ -24,6 +24,7 @@ PAPER: Mapping[str, Any] = {
 
 ACCURATE: Mapping[str, Any] = {
     "band": 8.0,
+    "search_columns": 1,
     "smoothness": 5,
     "rounds": 4,
     "fine_rounds": None,
