@@ -89,22 +89,20 @@ def box(planes, radius, out):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _products(  # type: ignore[no-untyped-def]
-    left, right, right_valid, u, v, keep, y, radius, out, x0=0, y0=0, rx0=0, ry0=0, rrows=-1, rcols=-1
+    left, right, right_valid, u, v, keep, y, radius, out, x0, y0, rx0, ry0, rrows, rcols
 ):
     """Row ``y`` of the planes whose window sums a step needs, zero where a pixel takes no part.
 
     ``out`` (PLANES, radius + col + radius): count, gx, gy, r, gx gx, gx gy, gy gy, gx r, gy r, r r, with the gradient
-    of the left image. Windows as in :func:`stages.hfvm.consistency.backmatch`; ``rrows`` negative: the right window is
-    the whole image. Reach: a pixel.
+    of the left image. Windows as in :func:`stages.hfvm.consistency.backmatch`. Reach: a pixel.
     """
     rows, cols = left.shape
-    height, length = right.shape if rrows < 0 else (rrows, rcols)
     width = right.shape[1]
     if y < 0 or y >= rows:
         out[:] = np.float32(0.0)
         return
     one, half, nil = np.float32(1.0), np.float32(0.5), np.float32(0.0)
-    last_x, last_y = np.float32(length - 2), np.float32(height - 2)
+    last_x, last_y = np.float32(rcols - 2), np.float32(rrows - 2)
     end = radius + cols
     n, gx, gy, rest = out[0, radius:end], out[1, radius:end], out[2, radius:end], out[3, radius:end]
     lu, lv, grey = u[y], v[y], left[y]
