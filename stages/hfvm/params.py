@@ -35,6 +35,7 @@ ACCURATE: Mapping[str, Any] = {
     "relief_steps": 7,
     "crowd": 0.5,
     "guided_fill": True,
+    "greatest_std": 1.2,
 }
 """What preset ``accurate`` sets differently; a value given by the user wins."""
 
