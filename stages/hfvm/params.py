@@ -35,7 +35,7 @@ ACCURATE: Mapping[str, Any] = {
     "relief_steps": 7,
     "crowd": 0.5,
     "guided_fill": True,
-    "greatest_std": 1.2,
+    "greatest_std": 1.1,
 }
 """What preset ``accurate`` sets differently; a value given by the user wins."""
 
