@@ -13,7 +13,8 @@ import numpy as np
 
 from stages.declare import AnyArray
 from stages.hfvm import consistency, guided, hierarchy, plane, refine, relief, rowwise, uncertainty
-from stages.hfvm.hierarchy import SUM_RADIUS, Map, Prepared
+from stages.hfvm.hierarchy import Map, Prepared
+from stages.hfvm.lanes import SUM_RADIUS
 from stages.hfvm.params import HfvmParams
 from stages.hfvm.views import View
 from stages.hfvm.window import Raster, Results, Window, around, blocks, cut, strips, whole

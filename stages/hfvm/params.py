@@ -95,10 +95,10 @@ class HfvmParams(Params):
         default=1, ge=0, le=32, description="at most so many at the finest level from right to left, for the check"
     )
     centres: int = Field(
-        default=3,
+        default=5,
         ge=1,
-        le=5,
-        description="coarse pixels to search around: the parent, its nearest along row, column and diagonal, far side",
+        le=9,
+        description="coarse pixels to search around: the parent, its neighbours along row, column and diagonals",
     )
     finest: Literal[0, 1] = Field(
         default=0, description="pyramid level matched last; 1 = half the resolution, a quarter of the work"
