@@ -8,12 +8,16 @@ from numba import njit
 from numpy.typing import NDArray
 
 from stages.declare import AnyArray
+from stages.validity import Validity
 from stages.windows import window_sum
 
 Map = NDArray[np.float32]
 
 FAILED = np.float32(1e9)
 """Back-matching error where there is nothing to match back from."""
+
+OUT_OF_IMAGE, BACKMATCH_FAILED = np.uint8(Validity.OUT_OF_IMAGE), np.uint8(Validity.BACKMATCH_FAILED)
+OVER_THRESHOLD, NO_TEXTURE = np.uint8(Validity.OVER_THRESHOLD), np.uint8(Validity.NO_TEXTURE)
 
 CHANCE = 16
 """Times the size of an isolated patch: none of chance is as large (measured on blurred noise: up to 8 times)."""
@@ -72,6 +76,19 @@ def backmatch(lu, lv, ru, rv, right_valid, error, x0, y0, rx0, ry0, rrows, rcols
             e = np.sqrt(du * du + dv * dv)
             if e < FAILED:
                 error[y, x] = e
+
+
+@njit(cache=True, nogil=True)
+def reasons(distance, deviation, valid, error, threshold, texture, backmatch, bits):  # type: ignore[no-untyped-def]
+    """Bits of :class:`~stages.validity.Validity` that speak against each pixel, 0 where it is consistent."""
+    nil = np.uint8(0)
+    for y in range(bits.shape[0]):
+        d, local, usable, e, found = distance[y], deviation[y], valid[y], error[y], bits[y]
+        for x in range(bits.shape[1]):
+            outside = (e[x] >= FAILED) | (usable[x] == 0)
+            bit = OUT_OF_IMAGE if outside else BACKMATCH_FAILED if e[x] > backmatch else nil
+            bit |= OVER_THRESHOLD if d[x] > threshold else nil
+            found[x] = bit | (NO_TEXTURE if local[x] < texture else nil)
 
 
 @njit(cache=True, nogil=True)

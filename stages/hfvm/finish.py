@@ -96,12 +96,10 @@ class Finish:
 
     def _reasons(self, window: Window, distance: AnyArray, error: AnyArray) -> AnyArray:
         """Bits that speak against each pixel, none where it is consistent."""
-        p, bits = self.params, np.zeros(window.shape, np.uint8)
-        outside = (error >= consistency.FAILED) | (self.pair.left.view.valid(0, window) == 0)
-        mark(bits, outside, Validity.OUT_OF_IMAGE)
-        mark(bits, distance > p.threshold, Validity.OVER_THRESHOLD)
-        mark(bits, self.pair.deviation(0, window) < p.texture, Validity.NO_TEXTURE)
-        mark(bits, ~outside & (error > p.backmatch), Validity.BACKMATCH_FAILED)
+        p, bits = self.params, np.empty(window.shape, np.uint8)
+        deviation, valid = self.pair.deviation(0, window), self.pair.left.view.valid(0, window)
+        limits = (np.float32(a) for a in (p.threshold, p.texture, p.backmatch))
+        consistency.reasons(distance, deviation, valid, error, *limits, bits)
         return bits
 
     def refine(self, window: Window, checked: Rasters) -> Results:

@@ -30,7 +30,6 @@ ACCURATE: Mapping[str, Any] = {
     "fine_rounds": None,
     "back_rounds": 4,
     "centres": 5,
-    "refine_steps": 1,
     "path_rounds": 3,
     "relief_steps": 7,
     "crowd": 0.5,
@@ -39,7 +38,7 @@ ACCURATE: Mapping[str, Any] = {
 """What preset ``accurate`` sets differently; a value given by the user wins."""
 
 
-FAST: Mapping[str, Any] = {"finest": 1, "rounds": 2, "fine_rounds": None, "back_rounds": 2, "refine_steps": 1}
+FAST: Mapping[str, Any] = {"finest": 1, "rounds": 2, "fine_rounds": None, "back_rounds": 2}
 """What preset ``fast`` sets differently: half the resolution, less propagation."""
 
 PRESETS: Mapping[str, Mapping[str, Any]] = {"default": {}, "fast": FAST, "accurate": ACCURATE, "paper": PAPER}
@@ -142,7 +141,7 @@ class HfvmParams(Params):
         description="least correlation of both images after refinement; below, noise met noise",
     )
     refine_steps: int = Field(
-        default=2, ge=1, le=8, description="steps; the second one serves sheared surfaces, which the first one nears"
+        default=1, ge=1, le=8, description="steps; a second one gains nothing; a pre-aligned image takes one more"
     )
     refine_radius: int = Field(
         default=2, ge=1, le=8, description="pixels; 5 x 5 windows: wider ones smooth relief away"

@@ -150,12 +150,13 @@ def make_four(width: int) -> Any:
 
 
 four = make_four(lanes.widest())
-"""``four(left, right, lines, here, there, (cols, size, right cols), mu, (u, centre, v), (count, cross))``: the best
-candidate, cost << 4 | rank, of each pixel of a square of two by two.
+"""``four(left, right, lines, here, there, (cols, size, right cols), mu, (u, centre, v), (count, cross), best, least)``:
+the best candidate, cost << 4 | rank, of each pixel of a square of two by two.
 
-``left[here]``: word of the first pixel; ``right[there]``: the one it meets at column displacement ``u``, row displacement
-``v``. Candidates are the column displacements ``u + k`` for k < ``count``, at most eight; where ``cross``, also
-``centre`` a row less and a row more. Eight words from the first one on are read for each pixel, whatever ``count``.
-``cols, size``: columns and pixels of the left image; ``lines, mu`` as in ``lanes``. Rank 0 is the candidate of column
-``centre``, 1 + k the others; ABOVE and BELOW those of the other rows. Of equal ones the least rank wins.
+``left[here]``: word of the first pixel; ``right[there]``: the one it meets at column displacement ``u``, row
+displacement ``v``. Candidates are the column displacements ``u + k`` for k < ``count``, at most eight; where ``cross``,
+also ``centre`` a row less and a row more. Eight words from the first one on are read for each pixel, whatever
+``count``. ``cols, size``: columns and pixels of the left image; ``lines, mu`` as in ``lanes``. Rank 0 is the candidate
+of column ``centre``, 1 + k the others; ABOVE and BELOW those of the other rows. Of equal ones the least rank wins.
+``best, least``: packed displacement and cost of the best so far, replaced where this one costs less.
 """
