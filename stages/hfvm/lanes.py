@@ -23,7 +23,6 @@ LANES = 8
 _I8, _I16, _I32, _I64 = (ir.IntType(n) for n in (8, 16, 32, 64))
 _WORDS = ir.VectorType(_I64, LANES)
 _INTS = ir.VectorType(_I32, LANES)
-_DOUBLES = ir.VectorType(ir.DoubleType(), LANES)
 _MASK = ir.VectorType(ir.IntType(1), LANES)
 
 
@@ -119,7 +118,6 @@ SHARP = 3.0
 
 _FLOATS8 = ir.VectorType(ir.FloatType(), LANES)
 _HALVES = ir.VectorType(_I16, 2 * LANES)
-_ALL = ir.Constant(_MASK, [1] * LANES)
 
 
 def _gather(builder: Any, data: Any, index: Any, kind: Any, inside: Any = None) -> Any:
@@ -285,10 +283,9 @@ neighbours.
 ``packed`` displacements, v << 16 | u, and their costs without smoothness; ``lines``: three planes of the left image's
 size. ``here, above, below``: index at which the row and its neighbours begin. ``shape``: rows and columns of the right
 image, columns and size of the left one, and the column of the left one's first pixel in the right one, as ``y`` is the
-row there: both may be windows. In this order: own, own a column less, more, a row less, more, then up, west, east,
-down; the first of equal ones wins. Costs have
-``smooth`` times the roughness added. ``new[at : at + 8]`` gets the best ones and
-``cost`` their costs without smoothness.
+row there: both may be windows. In this order: own, own a column less, more, where ``mu`` is below :data:`SHARP` a row
+less, more, then up, west, east, down; the first of equal ones wins. Costs have ``smooth`` times the roughness added.
+``new[at : at + 8]`` gets the best ones and ``cost`` their costs without smoothness.
 """
 
 

@@ -2,7 +2,7 @@
 
 A map is one array of packed displacements, v << 16 | u (int32), beside the cost of each without smoothness. All costs
 are integers, candidates come in a fixed order and only a strictly lower cost wins, so that results do not depend on
-the machine. Eight candidates are looked at together (``lanes``).
+the machine. Eight candidates are looked at together (``strip_lanes`` one pixel's, ``lanes`` eight pixels').
 """
 
 from __future__ import annotations
@@ -14,7 +14,8 @@ from stages.features import distance
 from stages.hfvm import lanes, strip_lanes
 from stages.hfvm.lanes import LANES, SHARP
 
-MOST_STRIPS = 400
+MOST_STRIPS = 512
+"""Room for the strips that a pixel searches: 9 centres, 17 rows each, 17 columns in three pieces."""
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -39,8 +40,8 @@ def rows_of(packed):  # type: ignore[no-untyped-def]
 def descend(left, right, up_u, up_v, reach_x, reach_y, count, lines, mu, packed, data, ox=0, oy=0):  # type: ignore[no-untyped-def]
     """Search around the doubled displacements of the coarse parent and of its nearest neighbours.
 
-    ``count``: centres, of the parent, the coarse pixels nearest along the row, the column and the diagonal, and the one
-    at the parent's other side. ``reach_x, reach_y``: search to either side, along the row, and about the parent also
+    The four pixels of a parent try the same. ``count``: centres, of the parent, its neighbours along the row, along the
+    column and on the diagonals. ``reach_x, reach_y``: search to either side, along the row, and about the parent also
     along its column; where the band is not sharp, over the whole rectangle about each. Of equal ones the parent's own
     wins. ``lines`` (3, row, col) float32: epipolar line of each pixel (:func:`stages.hfvm.epipolar.write_lines`), zeros
     without a band; ``mu``: cost per pixel off it. Where the band is sharp each centre is first moved towards its
@@ -200,7 +201,9 @@ def _centres(up_u, up_v, lines, mu, centres):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def checkerboard(left, right, packed, data, dirty, lines, mu, smoothness, rounds, ox=0, oy=0):  # type: ignore[no-untyped-def]
-    """Rounds of propagation in place: each pixel tries its neighbours' displacements and its own +-1.
+    """Rounds of propagation in place: each pixel tries its neighbours' displacements and its own a column beside.
+
+    Where the band is not sharp, which then does not say in which row to search, also its own a row beside.
 
     Cost: that of the displacement + ``smoothness`` times the sum over the four neighbours of min(|du| + |dv|, 2);
     beyond the border the neighbour on the other side stands in. The two colours of a checkerboard take turns, which
@@ -217,7 +220,7 @@ def checkerboard(left, right, packed, data, dirty, lines, mu, smoothness, rounds
         np.empty(cols + LANES, np.int32),
     )
     moved = np.empty(cols + LANES, np.int32)
-    _rough(packed, dirty)
+    dirty[:] = 1
     for turn in range(2 * rounds):
         for y in range(rows):
             above, below = (y - 1 if y > 0 else min(1, rows - 1)), (y + 1 if y < rows - 1 else max(rows - 2, 0))
@@ -245,23 +248,6 @@ def checkerboard(left, right, packed, data, dirty, lines, mu, smoothness, rounds
                 i = np.int64(todo[moved[k]])
                 flat[start + i], cost[start + i] = new[moved[k]], found[moved[k]]
                 before[i] = after[i] = flags[i] = flags[max(i - 1, 0)] = flags[min(i + 1, cols - 1)] = 1
-
-
-@njit(cache=True, nogil=True)
-def _rough(packed, dirty):  # type: ignore[no-untyped-def]
-    """Mark in ``dirty`` the pixels that differ from one of their four neighbours."""
-    rows, cols = packed.shape
-    for y in range(rows):
-        own, flags = packed[y], dirty[y]
-        above, below = packed[max(y - 1, 0)], packed[min(y + 1, rows - 1)]
-        for x in range(cols):
-            flags[x] = (own[x] != above[x]) | (own[x] != below[x])
-        inner, west, east, middle = flags[1 : cols - 1], own[: cols - 2], own[2:], own[1 : cols - 1]
-        for x in range(cols - 2):
-            inner[x] |= (middle[x] != west[x]) | (middle[x] != east[x])
-        if cols > 1:
-            flags[0] |= own[0] != own[1]
-            flags[cols - 1] |= own[cols - 1] != own[cols - 2]
 
 
 @njit(cache=True, nogil=True)
