@@ -17,6 +17,7 @@ FAILED = np.float32(1e9)
 """Back-matching error where there is nothing to match back from."""
 
 OUT_OF_IMAGE, BACKMATCH_FAILED = np.uint8(Validity.OUT_OF_IMAGE), np.uint8(Validity.BACKMATCH_FAILED)
+MATCHED, INTERPOLATED = np.uint8(Validity.MATCHED), np.uint8(Validity.INTERPOLATED)
 OVER_THRESHOLD, NO_TEXTURE = np.uint8(Validity.OVER_THRESHOLD), np.uint8(Validity.NO_TEXTURE)
 
 CHANCE = 16
@@ -181,6 +182,21 @@ def unsupported(u: AnyArray, v: AnyArray, keep: AnyArray, size: int) -> NDArray[
     wanted = max(size, min(CHANCE * size, keep.size // 8))
     chance = np.count_nonzero(sizes >= wanted) < 0.5 * rest
     return np.asarray(keep & (sizes < (wanted if chance else size)))
+
+
+@njit(cache=True, nogil=True)
+def conclude(validity, keep, interpolated, u, v, error, distance):  # type: ignore[no-untyped-def]
+    """Mark matched and interpolated pixels in ``validity``, and put NaN where nothing is known, in place."""
+    nan, nil = np.float32(np.nan), np.uint8(0)
+    for y in range(validity.shape[0]):
+        bits, own, filled, a, b, e, d = validity[y], keep[y], interpolated[y], u[y], v[y], error[y], distance[y]
+        for x in range(validity.shape[1]):
+            known = own[x] | (filled[x] != 0)
+            bits[x] |= (MATCHED if own[x] else nil) | (INTERPOLATED if filled[x] else nil)
+            a[x] = a[x] if known else nan
+            b[x] = b[x] if known else nan
+            e[x] = nan if e[x] >= FAILED else e[x]
+            d[x] = nan if d[x] < 0 else d[x]
 
 
 @njit(cache=True, nogil=True)

@@ -170,16 +170,11 @@ class Finish:
         mark(validity, unsure, Validity.OVER_THRESHOLD)
         interpolated[unsure], std[unsure] = 1, np.nan
         keep &= ~unsure
-        mark(validity, keep, Validity.MATCHED)
         interpolated[valid == 0] = 0
         if p.guided_fill:
             u, v = guided.median(u, v, keep, interpolated, left)
-        validity |= interpolated * np.uint8(Validity.INTERPOLATED)
-        nothing = ~(keep | (interpolated != 0))
-        u[nothing] = v[nothing] = np.nan
-        error, distance = cut(checked["error"], outer).copy(), cut(fine["distance"], outer)
-        error[error >= consistency.FAILED] = np.nan
-        distance = np.where(distance < 0, np.float32(np.nan), distance)
+        error, distance = cut(checked["error"], outer).copy(), cut(fine["distance"], outer).copy()
+        consistency.conclude(validity, keep, interpolated, u, v, error, distance)
         arrays = {
             "column_disparity": u,
             "row_disparity": v,

@@ -91,7 +91,7 @@ class HfvmParams(Params):
         default=1, ge=0, le=32, description="the same at the finest level, which costs most; null: as at the others"
     )
     back_rounds: int = Field(
-        default=1, ge=0, le=32, description="at most so many at the finest level from right to left, for the check"
+        default=0, ge=0, le=32, description="at most so many at the finest level from right to left, for the check"
     )
     centres: int = Field(
         default=5,

@@ -25,7 +25,7 @@ FARTHEST = 1.5
 
 SAME_CONTRAST = 1.3
 """Ratio of contrasts up to which residuals hardly tell it from noise: less than a tenth of the signal's variance."""
-STRIDE, SAMPLES, LEAST = 3, 20000, 100
+STRIDE, SAMPLES, LEAST = 3, 8000, 100
 """Pixels between the two of a difference, and how many differences the ratio of contrasts is taken from."""
 SATURATED = 250.0
 """Grey level from which on an image may be clipped."""

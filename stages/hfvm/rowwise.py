@@ -85,8 +85,12 @@ def box(planes, radius, out):  # type: ignore[no-untyped-def]
             row = planes[k, first]
             for x in range(cols):
                 middle[x] = row[x]
-            for j in range(first + 1, last):
-                row = planes[k, j]
+            for j in range(first + 1, last - 1, 2):
+                one, two = planes[k, j], planes[k, j + 1]
+                for x in range(cols):
+                    middle[x] += one[x] + two[x]
+            if (last - first) % 2 == 0:
+                row = planes[k, last - 1]
                 for x in range(cols):
                     middle[x] += row[x]
             _add_up(wide, cols, out[k, y : y + 1])
