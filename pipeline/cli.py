@@ -338,7 +338,7 @@ def match(
     right: Path,
     *,
     output: Annotated[Path, Parameter(name=["--output", "-o"])] = Path("disparity.tif"),
-    preset: Literal["default", "paper"] | None = None,
+    preset: Literal["default", "fast", "accurate", "paper"] | None = None,
     dense: Annotated[bool, Parameter(negative="")] = False,
     prior_disparity: Path | None = None,
     confidence: Path | None = None,
@@ -359,7 +359,8 @@ def match(
     output
         TIFF to write.
     preset
-        Parameter set of the matcher: default or paper.
+        Parameter set of the matcher: fast matches at half the resolution, accurate takes several times as long, paper
+        follows the publication to the letter.
     dense
         Fill undefined disparities by interpolation.
     prior_disparity

@@ -27,6 +27,9 @@ INTERVAL = 5.0
 FEW = 0.05
 """Share of matched pixels at which two images have little to do with each other; unrelated ones stay below."""
 
+BLANK = 0.5
+"""Share of pixels without texture of which a user should hear, however well the others match."""
+
 Tell = Callable[[float, str], None]
 
 
@@ -104,6 +107,9 @@ def warnings(found: Disparity) -> list[str]:
         shares = sorted(((float(has(found.validity, bit).mean()), words) for bit, words in reasons), reverse=True)
         told = ", ".join(f"{100 * s:.0f} % {words}" for s, words in shares[:2] if s >= 0.005)
         return [f"only {100 * share:.1f} % of the pixels match ({told}): do both images show one scene?"]
+    blank = float(has(found.validity, Validity.NO_TEXTURE).mean())
+    if blank > BLANK:
+        return [f"{100 * blank:.0f} % of the pixels have no texture (black, saturated or blank) and cannot match"]
     if swapped(found.column_disparity, found.row_disparity, ok):
         median = float(np.median(found.column_disparity[ok]))
         return [

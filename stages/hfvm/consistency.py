@@ -8,12 +8,17 @@ from numba import njit
 from numpy.typing import NDArray
 
 from stages.declare import AnyArray
+from stages.validity import Validity
 from stages.windows import window_sum
 
 Map = NDArray[np.float32]
 
 FAILED = np.float32(1e9)
 """Back-matching error where there is nothing to match back from."""
+
+OUT_OF_IMAGE, BACKMATCH_FAILED = np.uint8(Validity.OUT_OF_IMAGE), np.uint8(Validity.BACKMATCH_FAILED)
+MATCHED, INTERPOLATED = np.uint8(Validity.MATCHED), np.uint8(Validity.INTERPOLATED)
+OVER_THRESHOLD, NO_TEXTURE = np.uint8(Validity.OVER_THRESHOLD), np.uint8(Validity.NO_TEXTURE)
 
 CHANCE = 16
 """Times the size of an isolated patch: none of chance is as large (measured on blurred noise: up to 8 times)."""
@@ -72,6 +77,19 @@ def backmatch(lu, lv, ru, rv, right_valid, error, x0, y0, rx0, ry0, rrows, rcols
             e = np.sqrt(du * du + dv * dv)
             if e < FAILED:
                 error[y, x] = e
+
+
+@njit(cache=True, nogil=True)
+def reasons(distance, deviation, valid, error, threshold, texture, backmatch, bits):  # type: ignore[no-untyped-def]
+    """Bits of :class:`~stages.validity.Validity` that speak against each pixel, 0 where it is consistent."""
+    nil = np.uint8(0)
+    for y in range(bits.shape[0]):
+        d, local, usable, e, found = distance[y], deviation[y], valid[y], error[y], bits[y]
+        for x in range(bits.shape[1]):
+            outside = (e[x] >= FAILED) | (usable[x] == 0)
+            bit = OUT_OF_IMAGE if outside else BACKMATCH_FAILED if e[x] > backmatch else nil
+            bit |= OVER_THRESHOLD if d[x] > threshold else nil
+            found[x] = bit | (NO_TEXTURE if local[x] < texture else nil)
 
 
 @njit(cache=True, nogil=True)
@@ -164,6 +182,21 @@ def unsupported(u: AnyArray, v: AnyArray, keep: AnyArray, size: int) -> NDArray[
     wanted = max(size, min(CHANCE * size, keep.size // 8))
     chance = np.count_nonzero(sizes >= wanted) < 0.5 * rest
     return np.asarray(keep & (sizes < (wanted if chance else size)))
+
+
+@njit(cache=True, nogil=True)
+def conclude(validity, keep, interpolated, u, v, error, distance):  # type: ignore[no-untyped-def]
+    """Mark matched and interpolated pixels in ``validity``, and put NaN where nothing is known, in place."""
+    nan, nil = np.float32(np.nan), np.uint8(0)
+    for y in range(validity.shape[0]):
+        bits, own, filled, a, b, e, d = validity[y], keep[y], interpolated[y], u[y], v[y], error[y], distance[y]
+        for x in range(validity.shape[1]):
+            known = own[x] | (filled[x] != 0)
+            bits[x] |= (MATCHED if own[x] else nil) | (INTERPOLATED if filled[x] else nil)
+            a[x] = a[x] if known else nan
+            b[x] = b[x] if known else nan
+            e[x] = nan if e[x] >= FAILED else e[x]
+            d[x] = nan if d[x] < 0 else d[x]
 
 
 @njit(cache=True, nogil=True)

@@ -13,7 +13,8 @@ import numpy as np
 
 from stages.declare import AnyArray
 from stages.hfvm import consistency, guided, hierarchy, plane, refine, relief, rowwise, uncertainty
-from stages.hfvm.hierarchy import SUM_RADIUS, Map, Prepared
+from stages.hfvm.hierarchy import Map, Prepared
+from stages.hfvm.lanes import SUM_RADIUS
 from stages.hfvm.params import HfvmParams
 from stages.hfvm.views import View
 from stages.hfvm.window import Raster, Results, Window, around, blocks, cut, strips, whole
@@ -95,12 +96,10 @@ class Finish:
 
     def _reasons(self, window: Window, distance: AnyArray, error: AnyArray) -> AnyArray:
         """Bits that speak against each pixel, none where it is consistent."""
-        p, bits = self.params, np.zeros(window.shape, np.uint8)
-        outside = (error >= consistency.FAILED) | (self.pair.left.view.valid(0, window) == 0)
-        mark(bits, outside, Validity.OUT_OF_IMAGE)
-        mark(bits, distance > p.threshold, Validity.OVER_THRESHOLD)
-        mark(bits, self.pair.deviation(0, window) < p.texture, Validity.NO_TEXTURE)
-        mark(bits, ~outside & (error > p.backmatch), Validity.BACKMATCH_FAILED)
+        p, bits = self.params, np.empty(window.shape, np.uint8)
+        deviation, valid = self.pair.deviation(0, window), self.pair.left.view.valid(0, window)
+        limits = (np.float32(a) for a in (p.threshold, p.texture, p.backmatch))
+        consistency.reasons(distance, deviation, valid, error, *limits, bits)
         return bits
 
     def refine(self, window: Window, checked: Rasters) -> Results:
@@ -171,16 +170,11 @@ class Finish:
         mark(validity, unsure, Validity.OVER_THRESHOLD)
         interpolated[unsure], std[unsure] = 1, np.nan
         keep &= ~unsure
-        mark(validity, keep, Validity.MATCHED)
         interpolated[valid == 0] = 0
         if p.guided_fill:
             u, v = guided.median(u, v, keep, interpolated, left)
-        validity |= interpolated * np.uint8(Validity.INTERPOLATED)
-        nothing = ~(keep | (interpolated != 0))
-        u[nothing] = v[nothing] = np.nan
-        error, distance = cut(checked["error"], outer).copy(), cut(fine["distance"], outer)
-        error[error >= consistency.FAILED] = np.nan
-        distance = np.where(distance < 0, np.float32(np.nan), distance)
+        error, distance = cut(checked["error"], outer).copy(), cut(fine["distance"], outer).copy()
+        consistency.conclude(validity, keep, interpolated, u, v, error, distance)
         arrays = {
             "column_disparity": u,
             "row_disparity": v,

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from stages.declare import AnyArray
 from stages.hfvm import consistency, epipolar, lookup, paper, propagation, search, subpixel
+from stages.hfvm.lanes import SUM_RADIUS
 from stages.hfvm.params import HfvmParams
 from stages.hfvm.views import Patch, Plain, Seen
 from stages.hfvm.window import (
@@ -37,9 +38,6 @@ from stages.hfvm.window import (
     whole,
 )
 from stages.pyramid import Pyramid
-
-SUM_RADIUS = 2
-"""Pixels: sub-pixel distances are summed over 5 x 5."""
 
 FIT_SAMPLES = 1000
 """Matches that a band or plane is fitted to; more change nothing that matters and cost time."""
@@ -172,7 +170,7 @@ class FastSolver:
         """Sub-pixel map from distances summed over :data:`SUM_RADIUS`."""
         u, v, d = (np.empty(a.window.shape, np.float32) for _ in range(3))
         at = offset(a, b)
-        subpixel.summed(a.words, b.words, m.u, m.v, wanted.astype(np.uint8), SUM_RADIUS, u, v, d, *at)
+        subpixel.summed(a.words, b.words, m.u, m.v, wanted.astype(np.uint8), u, v, d, *at)
         return Fine(u, v, d)
 
 

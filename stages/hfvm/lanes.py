@@ -4,7 +4,7 @@ A feature vector is one 64-bit word, so eight of them fill a 512-bit register, a
 the bytes of each word in one instruction (``psadbw``, in 512, 256 or 128 bits). Elsewhere the same sums come from
 generic vector code; both give the same integers.
 
-Costs: distance + trunc(mu * |a u + b v + c|), with the epipolar line (a, b, c) and the sum in float32.
+Costs: distance + min(trunc(mu * |a u + b v + c|), 2047), with the epipolar line (a, b, c) and the sum in float32.
 """
 
 from __future__ import annotations
@@ -23,7 +23,6 @@ LANES = 8
 _I8, _I16, _I32, _I64 = (ir.IntType(n) for n in (8, 16, 32, 64))
 _WORDS = ir.VectorType(_I64, LANES)
 _INTS = ir.VectorType(_I32, LANES)
-_DOUBLES = ir.VectorType(ir.DoubleType(), LANES)
 _MASK = ir.VectorType(ir.IntType(1), LANES)
 
 
@@ -111,12 +110,14 @@ TRUNCATION = 2
 FAR = 1 << 25
 """Cost above every cost."""
 
+FARTHEST_OFF = 2047
+"""Most that the band costs: as much as the greatest distance, so that a cost has twelve bits."""
+
 SHARP = 3.0
 """Byte steps a pixel: a softer band hardly says in which row to search."""
 
 _FLOATS8 = ir.VectorType(ir.FloatType(), LANES)
 _HALVES = ir.VectorType(_I16, 2 * LANES)
-_ALL = ir.Constant(_MASK, [1] * LANES)
 
 
 def _gather(builder: Any, data: Any, index: Any, kind: Any, inside: Any = None) -> Any:
@@ -148,28 +149,27 @@ class _Pixels:
     rows: Any
     cols: Any
 
-    def cost(self, tried: Any, alike: bool = False) -> tuple[Any, Any]:
-        """Distance + trunc(mu |a u + b v + c|) at packed displacements, and which of them lie in the image.
-
-        ``alike``: all displacements are equal and the pixels lie side by side, so that their words do, too.
-        """
+    def cost(self, tried: Any) -> tuple[Any, Any]:
+        """Distance and band cost at packed displacements, and which of them lie in the image."""
         builder, sixteen = self.builder, _vector(_INTS, [16] * LANES)
         u, v = builder.ashr(builder.shl(tried, sixteen), sixteen), builder.ashr(tried, sixteen)
         xr, yr = builder.add(self.x, u), builder.add(self.y, v)
         # Compared without sign: below zero is beyond the end.
         inside = builder.and_(builder.icmp_unsigned("<", xr, self.cols), builder.icmp_unsigned("<", yr, self.rows))
         index = builder.add(builder.mul(yr, self.cols), xr)
-        if alike:
-            first = builder.sext(builder.extract_element(index, ir.Constant(_I32, 0)), _I64)
-            found = _load(builder, _as(builder, builder.gep(self.image, [first]), _WORDS), inside)
-        else:
-            found = _gather(builder, self.image, index, _WORDS, inside)
+        found = _gather(builder, self.image, index, _WORDS, inside)
         distance = builder.trunc(_distances(builder, self.words, found, self.width), _INTS)
         a, b, c = self.line
         across = builder.fmul(a, builder.sitofp(u, _FLOATS8))
         off = builder.fadd(builder.fadd(across, builder.fmul(b, builder.sitofp(v, _FLOATS8))), c)
-        band = builder.fmul(self.mu, _call(builder, "llvm.fabs.v8f32", _FLOATS8, off))
-        return builder.add(distance, builder.fptosi(band, _INTS)), inside
+        return builder.add(distance, band_cost(builder, off, self.mu)), inside
+
+
+def band_cost(builder: Any, off: Any, mu: Any) -> Any:
+    """trunc(mu |off|) of eight pixels off their lines, at most :data:`FARTHEST_OFF`."""
+    band = builder.fmul(mu, _call(builder, "llvm.fabs.v8f32", _FLOATS8, off))
+    most = _vector(_FLOATS8, [float(FARTHEST_OFF)] * LANES)
+    return builder.fptosi(builder.select(builder.fcmp_ordered("<", band, most), band, most), _INTS)
 
 
 def _rough(builder: Any, tried: Any, near: list[Any]) -> Any:
@@ -247,12 +247,22 @@ def make_settle(width: int) -> Any:
                 for slot, value in ((best, tried), (found, cost), (least, total)):
                     builder.store(builder.select(better, value, builder.load(slot)), slot)
 
-            for du, dv in ((-1, 0), (1, 0), (0, -1), (0, 1)):
+            def beside(du: int, dv: int) -> None:
                 step = _vector(_INTS, [((dv & 0xFFFF) << 16) | (du & 0xFFFF)] * LANES)
                 moved = builder.add(builder.bitcast(own, _HALVES), builder.bitcast(step, _HALVES))
                 attempt(builder.bitcast(moved, _INTS))
+
+            beside(-1, 0)
+            beside(1, 0)
+            free = builder.fcmp_ordered("<", args[13], ir.Constant(ir.FloatType(), SHARP))
+            with builder.if_then(free):
+                beside(0, -1)
+                beside(0, 1)
             for tried in near:
-                with builder.if_then(_any(builder, builder.icmp_signed("!=", tried, own))):
+                # What lies a column beside the own one has been tried.
+                away = builder.sub(builder.bitcast(tried, _HALVES), builder.bitcast(own, _HALVES))
+                columns = builder.bitcast(builder.add(away, _vector(_HALVES, [1, 0] * LANES)), _INTS)
+                with builder.if_then(_any(builder, builder.icmp_unsigned(">", columns, _vector(_INTS, [2] * LANES)))):
                     attempt(tried)
             for kind, array, slot in ((sig.args[14], args[14], best), (sig.args[15], args[15], found)):
                 pointer = _as(builder, _pointer(context, builder, kind, array, at), _INTS)
@@ -273,127 +283,9 @@ neighbours.
 ``packed`` displacements, v << 16 | u, and their costs without smoothness; ``lines``: three planes of the left image's
 size. ``here, above, below``: index at which the row and its neighbours begin. ``shape``: rows and columns of the right
 image, columns and size of the left one, and the column of the left one's first pixel in the right one, as ``y`` is the
-row there: both may be windows. In this order: own, own a column less, more, a row less, more, then up, west, east,
-down; the first of equal ones wins. Costs have
-``smooth`` times the roughness added. ``new[at : at + 8]`` gets the best ones and
-``cost`` their costs without smoothness.
-"""
-
-
-def make_seek(width: int) -> Any:
-    """Intrinsic ``seek``, see :data:`seek`."""
-
-    @intrinsic
-    def seek(typingctx, left, right, centres, lines, x, y, here, parents, beside, shape, reach, mu, packed, data):  # type: ignore[no-untyped-def]
-        i64 = types.int64
-        signature = types.void(
-            WORDS, WORDS, PAIRS, LINES, i64, i64, i64, i64, i64, types.UniTuple(i64, 5), types.UniTuple(i64, 3),
-            types.float32, PAIRS, PAIRS,
-        )  # fmt: skip
-
-        def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
-            _, right, centres = (
-                context.make_array(kind)(context, builder, a).data
-                for kind, a in zip(sig.args[:3], args[:3], strict=True)
-            )
-            start, y, here, parents, beside = args[4:9]
-            rows, cols, left_cols, size, ahead = cgutils.unpack_tuple(builder, args[9])
-            reach_x, reach_y, count = cgutils.unpack_tuple(builder, args[10])
-
-            def narrow(n: Any) -> Any:
-                return _splat(builder, builder.trunc(n, _I32))
-
-            x = builder.add(narrow(start), _vector(_INTS, range(LANES)))
-            valid = builder.icmp_signed("<", x, narrow(left_cols))
-            first = builder.add(here, start)
-
-            def read(k: int, at: Any, kind: Any, name: str) -> Any:
-                pointer = _as(builder, _pointer(context, builder, sig.args[k], args[k], at), kind)
-                f = ir.FunctionType(kind, [pointer.type, _I32, _MASK, kind])
-                load = cgutils.get_or_insert_function(builder.module, f, f"llvm.masked.load.{name}.p0")
-                nothing = ir.Constant(kind, [0.0 if kind == _FLOATS8 else 0] * LANES)
-                return builder.call(load, [pointer, ir.Constant(_I32, 8 if kind == _WORDS else 4), valid, nothing])
-
-            words = read(0, first, _WORDS, "v8i64")
-            line = []
-            for _ in range(3):
-                line.append(read(3, first, _FLOATS8, "v8f32"))
-                first = builder.add(first, size)
-            pixels = _Pixels(
-                builder, width, builder.add(x, narrow(ahead)), narrow(y), words, (line[0], line[1], line[2]),
-                _splat(builder, args[11]), right,
-                narrow(rows), narrow(cols),
-            )  # fmt: skip
-            one = _vector(_INTS, [1] * LANES)
-            middle = builder.ashr(x, one)
-            middle_0 = builder.ashr(narrow(start), one)
-            odd = builder.and_(x, one)
-            side = builder.sub(builder.add(middle, builder.add(odd, odd)), one)
-            away = builder.sub(builder.add(middle, middle), side)
-            places = [(parents, middle), (parents, side), (beside, middle), (beside, side), (parents, away)]
-            held = cgutils.alloca_once(builder, _INTS, size=len(places))
-            for k, (row, i) in enumerate(places):
-                index = builder.add(builder.add(builder.select(valid, i, middle_0), one), narrow(row))
-                builder.store(_gather(builder, centres, index, _INTS), builder.gep(held, [ir.Constant(_I32, k)]))
-            own = builder.load(held)
-            cost, inside = pixels.cost(own)
-            far = _vector(_INTS, [FAR] * LANES)
-            best, least = (cgutils.alloca_once_value(builder, a) for a in (own, builder.select(inside, cost, far)))
-            one_more = ir.Constant(_I64, 1)
-            square = builder.fcmp_ordered("<", args[11], ir.Constant(ir.FloatType(), SHARP))
-            with cgutils.for_range(builder, count) as loop:
-                centre = builder.load(builder.gep(held, [loop.index]))
-                is_own = builder.icmp_signed("==", loop.index, ir.Constant(_I64, 0))
-                new = builder.or_(is_own, _any(builder, builder.icmp_signed("!=", centre, own)))
-                with builder.if_then(new):
-                    up_reach = builder.select(builder.or_(is_own, square), reach_y, ir.Constant(_I64, 0))
-
-                    def around(alike: bool) -> None:
-                        with cgutils.for_range(builder, builder.add(builder.add(up_reach, up_reach), one_more)) as loop:
-                            up = builder.sub(loop.index, up_reach)
-                            level = builder.icmp_signed("==", up, ir.Constant(_I64, 0))
-                            reach = builder.select(builder.or_(level, square), reach_x, ir.Constant(_I64, 0))
-                            upward = builder.shl(up, ir.Constant(_I64, 16))
-                            with cgutils.for_range(builder, builder.add(builder.add(reach, reach), one_more)) as loop:
-                                step = builder.and_(builder.sub(loop.index, reach), ir.Constant(_I64, 0xFFFF))
-                                moved = builder.bitcast(narrow(builder.or_(upward, step)), _HALVES)
-                                tried = builder.bitcast(builder.add(builder.bitcast(centre, _HALVES), moved), _INTS)
-                                cost, inside = pixels.cost(tried, alike)
-                                better = builder.and_(inside, builder.icmp_signed("<", cost, builder.load(least)))
-                                for slot, value in ((best, tried), (least, cost)):
-                                    builder.store(builder.select(better, value, builder.load(slot)), slot)
-
-                    lane_0 = _splat(builder, builder.extract_element(centre, ir.Constant(_I32, 0)))
-                    mixed = _any(builder, builder.icmp_signed("!=", centre, lane_0))
-                    with builder.if_else(mixed) as (differing, equal):
-                        with differing:
-                            around(False)
-                        with equal:
-                            around(True)
-            for k, slot in ((12, best), (13, least)):
-                pointer = _as(
-                    builder, _pointer(context, builder, sig.args[k], args[k], builder.add(here, start)), _INTS
-                )
-                f = ir.FunctionType(ir.VoidType(), [_INTS, pointer.type, _I32, _MASK])
-                store = cgutils.get_or_insert_function(builder.module, f, "llvm.masked.store.v8i32.p0")
-                builder.call(store, [builder.load(slot), pointer, ir.Constant(_I32, 4), valid])
-            return context.get_dummy_value()
-
-        return signature, codegen
-
-    return seek
-
-
-seek = make_seek(widest())
-"""``seek(left, right, centres, lines, x, y, here, parents, beside, shape, reach, mu, packed, data)``: the best
-displacement of the eight pixels from (``x``, ``y``) on around the displacements of their coarse parents.
-
-``centres``: flat, packed, a border of one all round; ``parents``: where the row of the parents begins, ``beside``: the
-coarse row next to this one's other side. ``reach``: columns and rows to either side, and the number of centres: of the
-parent, the coarse pixels nearest along the row, the column and the diagonal, and the one at the parent's other side.
-A search reaches along the row, about the parent also along the column; where the band is not sharp, over the whole
-rectangle about each. The other arrays as in :data:`settle`;
-``packed, data`` are written.
+row there: both may be windows. In this order: own, own a column less, more, where ``mu`` is below :data:`SHARP` a row
+less, more, then up, west, east, down; the first of equal ones wins. Costs have ``smooth`` times the roughness added.
+``new[at : at + 8]`` gets the best ones and ``cost`` their costs without smoothness.
 """
 
 
@@ -401,23 +293,27 @@ SUM_RADIUS = 2
 """Pixels: reach of the windows of ``sums``."""
 
 
+SIDE_BY_SIDE = 4
+"""Pixels of a row whose windows are summed together."""
+
+
 def make_sums(width: int) -> Any:
     """Intrinsic ``sums``, see :data:`sums`."""
 
     @intrinsic
-    def sums(typingctx, left, right, at_left, at_right, left_cols, right_cols):  # type: ignore[no-untyped-def]
+    def sums(typingctx, left, right, at_left, at_right, left_cols, right_cols, count, four, last, at):  # type: ignore[no-untyped-def]
         i64 = types.int64
-        result = types.UniTuple(i64, 5)
-        signature = result(WORDS, WORDS, i64, i64, i64, i64)
+        signature = types.void(WORDS, WORDS, i64, i64, i64, i64, i64, WORDS, WORDS, i64)
 
         def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
-            left, right, at_left, at_right, left_cols, right_cols = args
-            five = ir.Constant(_MASK, [1] * 5 + [0] * (LANES - 5))
+            left, right, at_left, at_right, left_cols, right_cols, count = args[:7]
+            reach = builder.add(count, ir.Constant(_I64, 2 * SUM_RADIUS))
+            inside = builder.icmp_signed("<", _vector(_WORDS, range(LANES)), _splat(builder, reach))
 
             def row(kind: Any, array: Any, at: Any, cols: Any, j: int, i: int) -> Any:
-                shift = builder.add(builder.mul(cols, ir.Constant(_I64, j)), ir.Constant(_I64, i - 2))
+                shift = builder.add(builder.mul(cols, ir.Constant(_I64, j)), ir.Constant(_I64, i - SUM_RADIUS))
                 pointer = _pointer(context, builder, kind, array, builder.add(at, shift))
-                return _load(builder, _as(builder, pointer, _WORDS), five)
+                return _load(builder, _as(builder, pointer, _WORDS), inside)
 
             lefts = [row(sig.args[0], left, at_left, left_cols, j, 0) for j in range(-2, 3)]
             rights = [row(sig.args[1], right, at_right, right_cols, j, 0) for j in range(-3, 4)]
@@ -433,10 +329,23 @@ def make_sums(width: int) -> Any:
             packed = totals[0]
             for k in range(1, 4):
                 packed = builder.or_(packed, builder.shl(totals[k], _vector(_WORDS, [16 * k] * LANES)))
-            four, last = (_call(builder, "llvm.vector.reduce.add.v8i64", _I64, t) for t in (packed, totals[4]))
-            low = ir.Constant(_I64, 0xFFFF)
-            found = [builder.and_(builder.lshr(four, ir.Constant(_I64, 16 * k)), low) for k in range(4)] + [last]
-            return context.make_tuple(builder, sig.return_type, found)
+            nothing = _vector(_WORDS, [0] * LANES)
+
+            def moved(value: Any, n: int) -> Any:
+                pick = ir.Constant(_INTS, list(range(n, n + LANES)))
+                return builder.shuffle_vector(value, nothing, pick)
+
+            for total, k in ((packed, 7), (totals[4], 8)):
+                pairs = builder.add(total, moved(total, 1))
+                found = builder.add(builder.add(pairs, moved(pairs, 2)), moved(total, 4))
+                first = ir.Constant(ir.VectorType(_I32, SIDE_BY_SIDE), list(range(SIDE_BY_SIDE)))
+                pointer = _as(
+                    builder,
+                    _pointer(context, builder, sig.args[k], args[k], args[9]),
+                    ir.VectorType(_I64, SIDE_BY_SIDE),
+                )
+                builder.store(builder.shuffle_vector(found, nothing, first), pointer, align=8)
+            return context.get_dummy_value()
 
         return signature, codegen
 
@@ -444,10 +353,12 @@ def make_sums(width: int) -> Any:
 
 
 sums = make_sums(widest())
-"""``sums(left, right, at_left, at_right, left_cols, right_cols)``: five distances summed over 5 x 5 pixels.
+"""``sums(left, right, at_left, at_right, left_cols, right_cols, count, four, last, at)``: five distances summed over
+5 x 5 pixels, of ``count`` pixels side by side, at most four.
 
-Around word ``at_left`` of the left image and ``at_right`` of the right one, displaced by nothing, one to the west,
-east, north, south. The windows must lie inside.
+Around word ``at_left`` of the left image, and those after it, and ``at_right`` of the right one, displaced by nothing,
+one to the west, east, north, south. The windows must lie inside. ``four[at + k]``: the first four sums, 16 bits each,
+the first one lowest; ``last[at + k]``: the fifth one; four elements are written whatever ``count``.
 """
 
 _FLOATS = ir.VectorType(ir.FloatType(), 4)

@@ -30,7 +30,6 @@ ACCURATE: Mapping[str, Any] = {
     "fine_rounds": None,
     "back_rounds": 4,
     "centres": 5,
-    "refine_steps": 1,
     "path_rounds": 3,
     "relief_steps": 7,
     "crowd": 0.5,
@@ -40,7 +39,7 @@ ACCURATE: Mapping[str, Any] = {
 """What preset ``accurate`` sets differently; a value given by the user wins."""
 
 
-FAST: Mapping[str, Any] = {"finest": 1, "rounds": 2, "fine_rounds": None, "back_rounds": 2, "refine_steps": 1}
+FAST: Mapping[str, Any] = {"finest": 1, "rounds": 2, "fine_rounds": None, "back_rounds": 2}
 """What preset ``fast`` sets differently: half the resolution, less propagation."""
 
 PRESETS: Mapping[str, Mapping[str, Any]] = {"default": {}, "fast": FAST, "accurate": ACCURATE, "paper": PAPER}
@@ -93,13 +92,13 @@ class HfvmParams(Params):
         default=1, ge=0, le=32, description="the same at the finest level, which costs most; null: as at the others"
     )
     back_rounds: int = Field(
-        default=1, ge=0, le=32, description="at most so many at the finest level from right to left, for the check"
+        default=0, ge=0, le=32, description="at most so many at the finest level from right to left, for the check"
     )
     centres: int = Field(
-        default=3,
+        default=5,
         ge=1,
-        le=5,
-        description="coarse pixels to search around: the parent, its nearest along row, column and diagonal, far side",
+        le=9,
+        description="coarse pixels to search around: the parent, its neighbours along row, column and diagonals",
     )
     finest: Literal[0, 1] = Field(
         default=0, description="pyramid level matched last; 1 = half the resolution, a quarter of the work"
@@ -143,7 +142,7 @@ class HfvmParams(Params):
         description="least correlation of both images after refinement; below, noise met noise",
     )
     refine_steps: int = Field(
-        default=2, ge=1, le=8, description="steps; the second one serves sheared surfaces, which the first one nears"
+        default=1, ge=1, le=8, description="steps; a second one gains nothing; a pre-aligned image takes one more"
     )
     refine_radius: int = Field(
         default=2, ge=1, le=8, description="pixels; 5 x 5 windows: wider ones smooth relief away"

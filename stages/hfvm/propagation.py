@@ -2,7 +2,7 @@
 
 A map is one array of packed displacements, v << 16 | u (int32), beside the cost of each without smoothness. All costs
 are integers, candidates come in a fixed order and only a strictly lower cost wins, so that results do not depend on
-the machine. Eight candidates are looked at together (``lanes``).
+the machine. Eight candidates are looked at together (``strip_lanes`` one pixel's, ``lanes`` eight pixels').
 """
 
 from __future__ import annotations
@@ -10,8 +10,12 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from stages.hfvm import lanes
+from stages.features import distance
+from stages.hfvm import lanes, strip_lanes
 from stages.hfvm.lanes import LANES, SHARP
+
+MOST_STRIPS = 512
+"""Room for the strips that a pixel searches: 9 centres, 17 rows each, 17 columns in three pieces."""
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -36,8 +40,10 @@ def rows_of(packed):  # type: ignore[no-untyped-def]
 def descend(left, right, up_u, up_v, reach_x, reach_y, count, lines, mu, packed, data, ox=0, oy=0):  # type: ignore[no-untyped-def]
     """Search around the doubled displacements of the coarse parent and of its nearest neighbours.
 
-    ``reach_x, reach_y``: search to either side (rows: of the parent's alone); ``count``: centres, see ``lanes.seek``;
-    ``lines`` (3, row, col) float32: epipolar line of each pixel (:func:`stages.hfvm.epipolar.write_lines`), zeros
+    The four pixels of a parent try the same. ``count``: centres, of the parent, its neighbours along the row, along the
+    column and on the diagonals. ``reach_x, reach_y``: search to either side, along the row, and about the parent also
+    along its column; where the band is not sharp, over the whole rectangle about each. Of equal ones the parent's own
+    wins. ``lines`` (3, row, col) float32: epipolar line of each pixel (:func:`stages.hfvm.epipolar.write_lines`), zeros
     without a band; ``mu``: cost per pixel off it. Where the band is sharp each centre is first moved towards its
     line, by a pixel at most: a coarse fit may be wrong by more than that. ``packed, data`` (row, col) int32 get the
     displacements and their costs. With nothing inside the other image the prediction stays: it leads out of it. ``ox,
@@ -46,18 +52,129 @@ def descend(left, right, up_u, up_v, reach_x, reach_y, count, lines, mu, packed,
     """
     rows, cols = left.shape
     crows, ccols = up_u.shape
-    wide = ccols + 2
-    centres = np.empty((crows + 2, wide), np.int32)
+    centres = np.empty((crows + 2, ccols + 2), np.int32)
     _centres(up_u, up_v, lines, mu, centres)
-    here, there, flat, normals = left.reshape(-1), right.reshape(-1), centres.reshape(-1), lines.reshape(-1)
-    out, cost = packed.reshape(-1), data.reshape(-1)
-    shape = (right.shape[0], right.shape[1], cols, rows * cols, ox)
-    reach = (reach_x, reach_y, count)
-    for y in range(rows):
-        parents = ((y >> 1) + 1) * wide
-        beside = parents + wide * (2 * (y & 1) - 1)
-        for x in range(0, cols, LANES):
-            lanes.seek(here, there, flat, normals, x, y + oy, y * cols, parents, beside, shape, reach, mu, out, cost)
+    wide = ccols + 2
+    plan, best, least = np.empty((MOST_STRIPS, 5), np.int64), np.empty(4, np.int32), np.empty(4, np.int32)
+    here, there, near, normals = left.reshape(-1), right.reshape(-1), centres.reshape(-1), lines.reshape(-1)
+    rrows, rcols = right.shape
+    sizes = cols, rows * cols, rcols
+    in_rows = mu >= SHARP and 2 * reach_x < LANES and reach_y <= 1
+    for j in range(crows):
+        for i in range(ccols):
+            at = (j + 1) * wide + i + 1
+            if in_rows:
+                planned = _rows(near, at, wide, count, reach_x, reach_y, plan)
+            else:
+                planned = _rectangles(near, at, wide, count, reach_x, reach_y, mu < SHARP, plan)
+            x, y = 2 * i, 2 * j
+            whole = x + 1 < cols and y + 1 < rows
+            best[:], least[:] = near[at], lanes.FAR
+            for k in range(planned):
+                u, size, centre, v, cross = plan[k, 0], plan[k, 1], plan[k, 2], plan[k, 3], plan[k, 4]
+                xr, yr = x + ox + u, y + oy + v
+                if whole and xr >= 0 and xr + LANES < rcols and yr >= cross and yr + 1 + cross < rrows:
+                    start, target, place = y * cols + x, yr * rcols + xr, (u, centre, v)
+                    strip_lanes.four(here, there, normals, start, target, sizes, mu, place, (size, cross), best, least)
+                else:
+                    _singly(here, there, normals, x, y, (rows, cols), (rrows, rcols), ox, oy, mu, plan, k, best, least)
+            packed[y, x], data[y, x] = best[0], least[0]
+            if whole:
+                packed[y, x + 1], data[y, x + 1] = best[1], least[1]
+                packed[y + 1, x], data[y + 1, x] = best[2], least[2]
+                packed[y + 1, x + 1], data[y + 1, x + 1] = best[3], least[3]
+            elif x + 1 < cols:
+                packed[y, x + 1], data[y, x + 1] = best[1], least[1]
+            elif y + 1 < rows:
+                packed[y + 1, x], data[y + 1, x] = best[2], least[2]
+
+
+@njit(cache=True, nogil=True)
+def _singly(here, there, normals, x0, y0, shape, other, ox, oy, mu, plan, at, best, least):  # type: ignore[no-untyped-def]
+    """What ``strip_lanes.four`` does, candidate by candidate: near the borders."""
+    u, count, centre, v, cross = plan[at, 0], plan[at, 1], plan[at, 2], plan[at, 3], plan[at, 4]
+    rows, cols = shape
+    rrows, rcols = other
+    most = np.float32(lanes.FARTHEST_OFF)
+    for n in range(4):
+        x, y = x0 + (n & 1), y0 + (n >> 1)
+        if x >= cols or y >= rows:
+            continue
+        i = y * cols + x
+        word, a, b, c = here[i], normals[i], normals[i + rows * cols], normals[i + 2 * rows * cols]
+        first, last = max(u, -x - ox) - u, min(u + count, rcols - x - ox) - u
+        own = centre - u
+        for k in range(-1, count + 2 * cross):
+            du, dv = (centre, v) if k < 0 else (u + k, v) if k < count else (centre, v + 2 * (k - count) - 1)
+            lane, yr = du - u, y + oy + dv
+            if first <= lane < last and 0 <= yr < rrows and (k >= 0 or 0 <= own < count):
+                off = mu * abs((a * np.float32(du) + b * np.float32(dv)) + c)
+                cost = distance(word, there[yr * rcols + x + ox + du]) + np.int64(min(off, most))
+                if cost < least[n]:
+                    best[n], least[n] = pack(du, dv), cost
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _neighbour(near, at, wide, k):  # type: ignore[no-untyped-def]
+    """Centre k of a coarse pixel: its own, those along the row, along the column, the others."""
+    if k < 3:
+        return near[at + (0 if k == 0 else 2 * k - 3)]
+    if k < 5:
+        return near[at + (2 * k - 7) * wide]
+    return near[at + (wide if k > 6 else -wide) + 1 - 2 * (k & 1)]
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _put(plan, at, u, size, centre, v, cross):  # type: ignore[no-untyped-def]
+    """Write strip ``at`` of a plan: ``size`` displacements from column ``u`` on, row ``v``; ``cross``: see ``four``."""
+    plan[at, 0], plan[at, 1], plan[at, 2], plan[at, 3], plan[at, 4] = u, size, centre, v, cross
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _rows(near, at, wide, count, reach_x, reach_y, plan):  # type: ignore[no-untyped-def]
+    """Strips to search: along the rows through the centres, and the column through the parent's; how many.
+
+    Centres of the parent's row whose strips touch are searched together, where they fit.
+    """
+    own = near[at]
+    u, v = columns(own), rows_of(own)
+    low = high = u
+    planned = 1
+    reach = 2 * reach_x + 1
+    if near[at - 1] == own and near[at + 1] == own and near[at - wide] == own and near[at + wide] == own and count <= 5:
+        count = 1
+    widest = min(reach, LANES - reach)
+    for k in range(1, count):
+        other = _neighbour(near, at, wide, k)
+        if other == own:
+            continue
+        cu, cv = columns(other), rows_of(other)
+        if cv == v and high - cu <= widest and cu - low <= widest:
+            low, high = min(low, cu), max(high, cu)
+        else:
+            _put(plan, planned, cu - reach_x, reach, cu, cv, 0)
+            planned += 1
+    _put(plan, 0, low - reach_x, high - low + reach, u, v, reach_y)
+    return planned
+
+
+@njit(cache=True, nogil=True)
+def _rectangles(near, at, wide, count, reach_x, reach_y, square, plan):  # type: ignore[no-untyped-def]
+    """The same for any reach: rows and column about each centre, or where ``square`` the whole rectangle."""
+    planned = 0
+    for k in range(count):
+        other = _neighbour(near, at, wide, k)
+        if k > 0 and other == near[at]:
+            continue
+        u, v = columns(other), rows_of(other)
+        for dv in range(-reach_y, reach_y + 1):
+            if not (square or k == 0 or dv == 0):
+                continue
+            side = reach_x if square or dv == 0 else 0
+            for first in range(-side, side + 1, LANES):
+                _put(plan, planned, u + first, min(LANES, side + 1 - first), u, v + dv, 0)
+                planned += 1
+    return planned
 
 
 @njit(cache=True, nogil=True)
@@ -84,7 +201,9 @@ def _centres(up_u, up_v, lines, mu, centres):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def checkerboard(left, right, packed, data, dirty, lines, mu, smoothness, rounds, ox=0, oy=0):  # type: ignore[no-untyped-def]
-    """Rounds of propagation in place: each pixel tries its neighbours' displacements and its own +-1.
+    """Rounds of propagation in place: each pixel tries its neighbours' displacements and its own a column beside.
+
+    Where the band is not sharp, which then does not say in which row to search, also its own a row beside.
 
     Cost: that of the displacement + ``smoothness`` times the sum over the four neighbours of min(|du| + |dv|, 2);
     beyond the border the neighbour on the other side stands in. The two colours of a checkerboard take turns, which

@@ -25,7 +25,7 @@ FARTHEST = 1.5
 
 SAME_CONTRAST = 1.3
 """Ratio of contrasts up to which residuals hardly tell it from noise: less than a tenth of the signal's variance."""
-STRIDE, SAMPLES, LEAST = 3, 20000, 100
+STRIDE, SAMPLES, LEAST = 3, 8000, 100
 """Pixels between the two of a difference, and how many differences the ratio of contrasts is taken from."""
 SATURATED = 250.0
 """Grey level from which on an image may be clipped."""
@@ -126,7 +126,7 @@ def surroundings(rest: AnyArray, deviation: AnyArray, keep: AnyArray) -> tuple[A
     left image's local ``deviation``: two signals of equal variance s^2 and correlation r differ by 2 s^2 (1 - r).
     Noise that found noise to match, in a shadow or the sky, gives itself away.
     """
-    planes, sums = np.empty((2, 3, *rest.shape), np.float32)
+    planes, sums = (np.empty((3, *rest.shape), np.float32) for _ in range(2))
     _known(rest, deviation, keep, planes)
     rowwise.box(planes, CORRELATION_SIDE // 2, sums)
     _correlation(sums, planes[0], planes[1])

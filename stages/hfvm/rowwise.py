@@ -57,6 +57,11 @@ def _add_up(parts, cols, out):  # type: ignore[no-untyped-def]
     """Add to ``out`` its neighbours: sums over as many columns as ``parts`` (plane, col + 2 radius) is wider."""
     for k in range(parts.shape[0]):
         part, total = parts[k], out[k]
+        if part.size == cols + 4:
+            one, two, three, four = part[1 : 1 + cols], part[2 : 2 + cols], part[3 : 3 + cols], part[4:]
+            for x in range(cols):
+                total[x] = (part[x] + (one[x] + two[x])) + (three[x] + four[x])
+            continue
         for x in range(cols):
             total[x] = part[x]
         for i in range(1, part.size - cols, 2):
@@ -80,8 +85,12 @@ def box(planes, radius, out):  # type: ignore[no-untyped-def]
             row = planes[k, first]
             for x in range(cols):
                 middle[x] = row[x]
-            for j in range(first + 1, last):
-                row = planes[k, j]
+            for j in range(first + 1, last - 1, 2):
+                one, two = planes[k, j], planes[k, j + 1]
+                for x in range(cols):
+                    middle[x] += one[x] + two[x]
+            if (last - first) % 2 == 0:
+                row = planes[k, last - 1]
                 for x in range(cols):
                     middle[x] += row[x]
             _add_up(wide, cols, out[k, y : y + 1])
@@ -153,13 +162,26 @@ def lucas_kanade(  # type: ignore[no-untyped-def]
         _add_up(fresh, cols, ring[(y + radius) % size].reshape((PLANES, cols)))
         if y < 0:
             continue
-        total[:] = ring[(y + radius + 1) % size]
-        for j in range(1, size, 2):
-            one, two = ring[(y + radius + 1 + j) % size], ring[(y + radius + 2 + j) % size]
-            for x in range(total.size):
-                total[x] += one[x] + two[x]
+        _add_rows(ring, y + radius + 1, total)
         least = np.float32(0.5 * size * size)
         _solve(s, least, np.float32(noise), keep[y], u[y], v[y], new_u[y], new_v[y], energy[y], per_noise[y])
+
+
+@njit(cache=True, nogil=True)
+def _add_rows(ring, first, total):  # type: ignore[no-untyped-def]
+    """Sum of the rows of a ring, from its row ``first`` on."""
+    size = ring.shape[0]
+    if size == 5:
+        one, two, three = ring[first % size], ring[(first + 1) % size], ring[(first + 2) % size]
+        four, five = ring[(first + 3) % size], ring[(first + 4) % size]
+        for x in range(total.size):
+            total[x] = (one[x] + (two[x] + three[x])) + (four[x] + five[x])
+        return
+    total[:] = ring[first % size]
+    for j in range(1, size, 2):
+        one, two = ring[(first + j) % size], ring[(first + 1 + j) % size]
+        for x in range(total.size):
+            total[x] += one[x] + two[x]
 
 
 @njit(cache=True, nogil=True)

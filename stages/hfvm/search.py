@@ -8,8 +8,20 @@ from numba import njit
 from stages.features import distance
 from stages.hfvm.lanes import FAR
 
-NONE = 1 << 40
+NONE = np.iinfo(np.int32).max
 """Cost above every cost."""
+
+
+@njit(cache=True, nogil=True)
+def _keep_least(total, tall, first, last, radius, u, v, best, out_u, out_v):  # type: ignore[no-untyped-def]
+    """Take a displacement where the mean of ``total``, in sixteenths, then its own length, is less than ``best``."""
+    length = np.int32(abs(u) + abs(v))
+    for x in range(first, last):
+        inner = first + radius <= x < last - radius
+        wide = 2 * radius + 1 if inner else min(last, x + radius + 1) - max(first, x - radius)
+        cost = np.int32(np.float64(total[x]) * 16.0 / np.float64(tall * wide)) * np.int32(4096) + length
+        if cost < best[x]:
+            best[x], out_u[x], out_v[x] = cost, u, v
 
 
 @njit(cache=True, nogil=True)
@@ -21,33 +33,34 @@ def exhaustive(left, right, reach_x, reach_y, radius, out_u, out_v, out_cost):  
     """
     rows, cols = left.shape
     rrows, rcols = right.shape
-    best = np.full((rows, cols), NONE)
+    side = 2 * radius + 1
+    best = np.full((rows, cols), NONE, np.int32)
     out_u[:], out_v[:] = 0, 0
-    single, across = np.zeros((rows, cols + 2 * radius), np.int64), np.zeros((rows, cols), np.int64)
+    single = np.zeros((rows + 2 * radius, cols + 2 * radius), np.int32)
+    total = np.zeros(cols, np.int32)
     for v in range(-reach_y, reach_y + 1):
         top, bottom = max(0, -v), min(rows, rrows - v)
         for u in range(-reach_x, reach_x + 1):
             first, last = max(0, -u), min(cols, rcols - u)
             if top >= bottom or first >= last:
                 continue
-            single[top:bottom] = 0
+            # A frame of nothing stands for pixels that not both images show.
+            single[top : top + radius] = 0
             for y in range(top, bottom):
+                row, words, others = single[y + radius], left[y], right[y + v]
+                row[:] = 0
                 for x in range(first, last):
-                    single[y, x + radius] = distance(left[y, x], right[y + v, x + u])
-                across[y] = single[y, :cols]
-                for i in range(1, 2 * radius + 1):
-                    across[y] += single[y, i : i + cols]
+                    row[x + radius] = distance(words[x], others[x + u])
+            single[bottom + radius : bottom + 2 * radius] = 0
             for y in range(top, bottom):
-                a, b = max(top, y - radius), min(bottom, y + radius + 1)
-                for x in range(first, last):
-                    total = np.int64(0)
-                    for j in range(a, b):
-                        total += across[j, x]
-                    n = (b - a) * (min(last, x + radius + 1) - max(first, x - radius))
-                    cost = (total * 16 // n) * 4096 + abs(u) + abs(v)
-                    if cost < best[y, x]:
-                        best[y, x] = cost
-                        out_u[y, x], out_v[y, x] = u, v
+                total[:] = 0
+                for j in range(y, y + side):
+                    for i in range(side):
+                        part = single[j, i : i + cols]
+                        for x in range(cols):
+                            total[x] += part[x]
+                tall = min(bottom, y + radius + 1) - max(top, y - radius)
+                _keep_least(total, tall, first, last, radius, u, v, best[y], out_u[y], out_v[y])
     for y in range(rows):
         for x in range(cols):
             out_cost[y, x] = distance(left[y, x], right[y + out_v[y, x], x + out_u[y, x]]) if best[y, x] < NONE else FAR

@@ -11,6 +11,10 @@ from numba import njit
 
 from stages.features import distance
 from stages.hfvm import lanes
+from stages.hfvm.lanes import SUM_RADIUS
+
+NOTHING, ALONE, SUMMED = 0, 1, 2
+"""What a pixel has: no distance, its own, those of its window."""
 
 
 @njit(cache=True, nogil=True)
@@ -24,48 +28,60 @@ def linear(before, at, after):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def summed(left, right, u_map, v_map, wanted, radius, out_u, out_v, out_distance, ox=0, oy=0):  # type: ignore[no-untyped-def]
-    """Sub-pixel displacements of an integer map from distances summed over (2 radius + 1)^2 pixels.
+def summed(left, right, u_map, v_map, wanted, out_u, out_v, out_distance, ox=0, oy=0):  # type: ignore[no-untyped-def]
+    """Sub-pixel displacements of an integer map from distances summed over 5 x 5 pixels.
 
     Only where ``wanted`` is not zero and the window, shifted by a pixel, lies inside both images; elsewhere the integer
     map is copied. ``out_distance``: mean distance per pixel at the integer displacement, or the pixel's own where the
     window is not inside; -1 outside the other image and where not wanted. ``ox, oy``: where the left window's first
-    pixel lies in the right window; both windows must reach ``radius`` (right: and one) pixels farther than what counts.
+    pixel lies in the right window; both windows must reach SUM_RADIUS (right: and one) pixels farther than what counts.
     """
     rows, cols = left.shape
-    rrows, rcols = right.shape
-    count = np.float32((2 * radius + 1) * (2 * radius + 1))
-    far = radius + 1
+    shapes = rows, cols, right.shape[0], right.shape[1]
     here, there = left.reshape(-1), right.reshape(-1)
+    four, last, state = np.zeros(cols + 4, np.uint64), np.zeros(cols + 4, np.uint64), np.zeros(cols, np.int8)
+    count = np.float32((2 * SUM_RADIUS + 1) * (2 * SUM_RADIUS + 1))
     for y in range(rows):
+        _windows(here, there, y, u_map[y], v_map[y], wanted[y], shapes, ox, oy, four, last, state)
+        us, vs, first, second, third = u_map[y], v_map[y], out_u[y], out_v[y], out_distance[y]
+        low = np.uint64(0xFFFF)
         for x in range(cols):
-            u, v = np.int64(u_map[y, x]), np.int64(v_map[y, x])
-            xr, yr = x + ox + u, y + oy + v
-            out_u[y, x], out_v[y, x], out_distance[y, x] = u, v, -1.0
-            if not wanted[y, x] or xr < 0 or xr >= rcols or yr < 0 or yr >= rrows:
-                continue
-            if (
-                min(x, cols - 1 - x, y, rows - 1 - y) < radius
-                or min(xr, rcols - 1 - xr) < far
-                or min(yr, rrows - 1 - yr) < far
-            ):
-                out_distance[y, x] = distance(left[y, x], right[yr, xr])
-                continue
-            if radius == lanes.SUM_RADIUS:
-                five = lanes.sums(here, there, y * cols + x, yr * rcols + xr, cols, rcols)
-                out_u[y, x] += linear(five[1], five[0], five[2])
-                out_v[y, x] += linear(five[3], five[0], five[4])
-                out_distance[y, x] = np.float32(five[0]) / count
-                continue
-            at = west = east = north = south = np.int64(0)
-            for j in range(-radius, radius + 1):
-                for i in range(-radius, radius + 1):
-                    word = left[y + j, x + i]
-                    at += distance(word, right[yr + j, xr + i])
-                    west += distance(word, right[yr + j, xr + i - 1])
-                    east += distance(word, right[yr + j, xr + i + 1])
-                    north += distance(word, right[yr + j - 1, xr + i])
-                    south += distance(word, right[yr + j + 1, xr + i])
-            out_u[y, x] += linear(west, at, east)
-            out_v[y, x] += linear(north, at, south)
-            out_distance[y, x] = np.float32(at) / count
+            at = np.int64(four[x] & low)
+            west, east = np.int64((four[x] >> np.uint64(16)) & low), np.int64((four[x] >> np.uint64(32)) & low)
+            north, south = np.int64(four[x] >> np.uint64(48)), np.int64(last[x])
+            summed_up = state[x] == SUMMED
+            first[x] = np.float32(us[x]) + (linear(west, at, east) if summed_up else np.float32(0.0))
+            second[x] = np.float32(vs[x]) + (linear(north, at, south) if summed_up else np.float32(0.0))
+            third[x] = (
+                np.float32(at) / count if summed_up else np.float32(at) if state[x] == ALONE else np.float32(-1.0)
+            )
+
+
+@njit(cache=True, nogil=True)
+def _windows(here, there, y, us, vs, wanted, shapes, ox, oy, four, last, state):  # type: ignore[no-untyped-def]
+    """Sums of the windows of a row: ``four, last`` as in ``lanes.sums``, and what they are worth, ``state``.
+
+    Neighbours of equal displacement are summed together. A pixel's own distance stands where its window is not inside.
+    """
+    rows, cols, rrows, rcols = shapes
+    far = SUM_RADIUS + 1
+    x = 0
+    while x < cols:
+        u, v = np.int64(us[x]), np.int64(vs[x])
+        xr, yr = x + ox + u, y + oy + v
+        state[x] = NOTHING
+        if not wanted[x] or xr < 0 or xr >= rcols or yr < 0 or yr >= rrows:
+            x += 1
+            continue
+        inside = min(x, y, rows - 1 - y) >= SUM_RADIUS and min(xr, yr, rrows - 1 - yr) >= far
+        most = min(lanes.SIDE_BY_SIDE, cols - SUM_RADIUS - x, rcols - far - xr) if inside else 0
+        if most <= 0:
+            state[x], four[x] = ALONE, distance(here[y * cols + x], there[yr * rcols + xr])
+            x += 1
+            continue
+        n = 1
+        while n < most and us[x + n] == u and vs[x + n] == v and wanted[x + n]:
+            n += 1
+        lanes.sums(here, there, y * cols + x, yr * rcols + xr, cols, rcols, n, four, last, x)
+        state[x : x + n] = SUMMED
+        x += n

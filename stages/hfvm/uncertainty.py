@@ -97,7 +97,7 @@ def _factors(params: HfvmParams) -> Factors:
 
 def neighbours(column: AnyArray, keep: NDArray[np.bool_]) -> AnyArray:
     """Parts R and M of every pixel (2, row, col), see the module; meaningless where not matched."""
-    planes, sums = np.zeros((2, 3, *keep.shape), np.float32)
+    planes, sums = np.zeros((3, *keep.shape), np.float32), np.empty((3, *keep.shape), np.float32)
     _bends(column, keep, planes)
     rowwise.box(planes[:2], RADIUS, sums[:2])
     rowwise.box(planes[2:], SURROUNDINGS // 2, sums[2:])

@@ -122,6 +122,18 @@ def test_swapped_images_are_said_to_be(folder, capsys):
     assert err.count("\n") == 1
 
 
+def test_a_mostly_blank_pair_says_why_little_matches(folder, capsys):
+    for side in ("left", "right"):
+        image = cv2.imread(str(folder / f"{side}.png"), cv2.IMREAD_GRAYSCALE)
+        image[40:] = 255
+        cv2.imwrite(str(folder / f"{side}.png"), image)
+    assert run(folder) == 0
+    out, err = capsys.readouterr()
+    assert err.startswith("rille: warning: ")
+    assert "% of the pixels have no texture" in err
+    assert float(out.split("matched ")[1].split(" ")[0]) > 20
+
+
 @pytest.mark.parametrize("what", ["other", "black", "white", "noise"])
 def test_unrelated_images_give_an_almost_empty_file_and_one_warning(folder, capsys, what):
     image = {
@@ -162,7 +174,7 @@ def test_command_line_has_it_all(folder, capsys):
     for arguments, code in (
         (line, 0),
         ([*line, "--prior-disparity", files[2]], 0),
-        (["match", *files[:2], "-o", files[2], "--preset", "fast"], 2),
+        (["match", *files[:2], "-o", files[2], "--preset", "quick"], 2),
         (["match", files[0], str(folder / "gone.png"), "-o", files[2]], 2),
     ):
         with pytest.raises(SystemExit) as end:

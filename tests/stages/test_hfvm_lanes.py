@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numba import njit
 
-from stages.hfvm import lanes
+from stages.hfvm import lanes, strip_lanes
 from stages.hfvm.resample import sample_cubic
 
 WIDTHS = sorted({0, lanes.widest()})
@@ -23,49 +23,51 @@ def test_sums_over_windows(width):
     sums = lanes.make_sums(width)
 
     @njit
-    def call(left, right, at_left, at_right):
-        return sums(left, right, at_left, at_right, np.int64(11), np.int64(13))
+    def call(left, right, at_left, at_right, count, four, last):
+        sums(left, right, at_left, at_right, np.int64(13), np.int64(15), count, four, last, np.int64(1))
 
-    left, right = words(99, 2).reshape(9, 11), words(143, 3).reshape(11, 13)
-    found = call(left.ravel(), right.ravel(), 4 * 11 + 5, 5 * 13 + 6)
-    here = left[2:7, 3:8].ravel()
-    moves = [(0, 0), (0, -1), (0, 1), (-1, 0), (1, 0)]
-    expected = [sad(here, right[3 + j : 8 + j, 4 + i : 9 + i].ravel()).sum() for j, i in moves]
-    assert list(found) == expected
+    left, right = words(117, 2).reshape(9, 13), words(165, 3).reshape(11, 15)
+    for count in (1, 4):
+        four, last = np.zeros((2, 5), np.uint64)
+        call(left.ravel(), right.ravel(), 4 * 13 + 5, 5 * 15 + 6, count, four, last)
+        for k in range(count):
+            here = left[2:7, 3 + k : 8 + k].ravel()
+            moves = [(0, 0), (0, -1), (0, 1), (-1, 0), (1, 0)]
+            expected = [sad(here, right[3 + j : 8 + j, 4 + k + i : 9 + k + i].ravel()).sum() for j, i in moves]
+            assert [*four[1 + k : 2 + k].view(np.uint16), last[1 + k]] == expected
 
 
 def test_all_widths_search_alike():
     left, right = words(12 * 21, 5), words(20 * 30, 6)
     rng = np.random.default_rng(7)
-    centres = ((rng.integers(-2, 3, 8 * 13) << 16) | (rng.integers(-4, 5, 8 * 13) & 0xFFFF)).astype(np.int32)
     lines = rng.normal(size=3 * 12 * 21).astype(np.float32)
     todo = np.array([1, 3, 5, 7, 11, 13, 19, 19], np.int32)
+    start = ((rng.integers(-2, 3, 12 * 21) << 16) | (rng.integers(-4, 5, 12 * 21) & 0xFFFF)).astype(np.int32)
     found = []
     for width in WIDTHS:
-        seek, settle = lanes.make_seek(width), lanes.make_settle(width)
+        four, settle = strip_lanes.make_four(width), lanes.make_settle(width)
 
         @njit
-        def call(centres, packed, data, new, cost):
-            shape = (20, 30, 21, 12 * 21, 3)
+        def call(packed, data, new, cost, best, least):
             mu = np.float32(8.0)
-            for y in range(12):
-                for x in range(0, 21, 8):
-                    parents = ((y >> 1) + 1) * 13
-                    seek(  # noqa: B023 (called before the next turn)
-                        left, right, centres, lines, x, y, y * 21, parents, parents + 13, shape, (1, 1, 5), mu, packed,
-                        data,
-                    )  # fmt: skip
+            for k in range(6):
+                place, counts = (np.int64(-2), np.int64(k - 2), np.int64(-1)), (np.int64(8 - k), np.int64(k % 2))
+                at = np.int64(4 * 21 + 2 * k), np.int64(5 * 30 + 2 * k)
+                sizes = np.int64(21), np.int64(12 * 21), np.int64(30)
+                four(left, right, lines, at[0], at[1], sizes, mu, place, counts, best[4 * k :], least[4 * k :])  # noqa: B023 (called before the next turn)
+            shape = (20, 30, 21, 12 * 21, 3)
             settle(  # noqa: B023
                 left, right, packed, data, lines, todo, 0, 4 * 21, 3 * 21, 5 * 21, 4, shape, 5, mu, new, cost
             )
 
-        results = [np.zeros(n, np.int32) for n in (12 * 21, 12 * 21, 8, 8)]
-        call(centres, *results)
+        results = [np.zeros(8, np.int32), np.zeros(8, np.int32), np.zeros(24, np.int32), np.full(24, 9999, np.int32)]
+        call(start, np.full(12 * 21, 900, np.int32), *results)
         found.append(results)
     for other in found[1:]:
         for a, b in zip(found[0], other, strict=True):
             np.testing.assert_array_equal(a, b)
-    assert len(np.unique(found[0][0])) > 10
+    assert len(np.unique(found[0][2])) > 5
+    assert (found[0][3] < 9999).all()
 
 
 def test_cubic_interpolation_equals_the_plain_form():

@@ -40,28 +40,49 @@ def centre(up_u, up_v, lines, j, i, mu):
     return u, v
 
 
+def candidates(centres, reach_x, reach_y, mu):
+    """Displacements that a pixel tries, in the order in which equal ones win."""
+    (u, v), sharp = centres[0], mu >= lanes.SHARP
+    if not sharp or reach_x > 3:
+        for m, (cu, cv) in enumerate(dict.fromkeys(centres)):
+            for dv in range(-reach_y, reach_y + 1) if not sharp or m == 0 else [0]:
+                wide = reach_x if not sharp or dv == 0 else 0
+                for first in range(-wide, wide + 1, 8):
+                    piece = list(range(first, min(first + 8, wide + 1)))
+                    yield from ((cu + du, cv + dv) for du in sorted(piece, key=lambda du: (du != 0, du)))
+        return
+    low = high = u
+    apart = []
+    for cu, cv in centres[1:]:
+        if cv == v and max(high - cu, cu - low) <= min(2 * reach_x + 1, 7 - 2 * reach_x):
+            low, high = min(low, cu), max(high, cu)
+        else:
+            apart.append((cu, cv))
+    yield u, v
+    yield from ((du, v) for du in range(low - reach_x, high + reach_x + 1))
+    yield from ((u, v + dv) for dv in range(-reach_y, reach_y + 1))
+    for cu, cv in apart:
+        yield cu, cv
+        yield from ((cu + du, cv) for du in range(-reach_x, reach_x + 1))
+
+
 @pytest.mark.parametrize("mu", [0.0, 2.0, 3.0])
-@pytest.mark.parametrize(("reach_x", "reach_y", "count"), [(1, 1, 5), (2, 1, 3), (1, 0, 1)])
+@pytest.mark.parametrize(("reach_x", "reach_y", "count"), [(1, 1, 5), (2, 1, 3), (1, 0, 1), (2, 1, 9), (5, 1, 3)])
 def test_descend_finds_the_first_of_the_best_around_its_centres(mu, reach_x, reach_y, count):
-    left, right = words((ROWS, COLS), 1), words((9, 15), 2)
+    left, right = words((ROWS, COLS), 1), words((12, 24), 2)
     up_u, up_v = np.random.default_rng(3).integers(-2, 3, (2, 6, 7)).astype(np.int16)
-    # Equal parents side by side: their children's words are read in one piece.
-    up_u[:, :4], up_v[:, :4] = 1, 0
+    # Equal parents side by side, and inside: their children are searched in one piece, four at once.
+    up_u[2:], up_v[2:] = up_u[2:] // 2 + 1, 0
     lines = some_lines(4)
     packed, data = np.zeros((2, ROWS, COLS), np.int32)
     propagation.descend(left, right, up_u, up_v, reach_x, reach_y, count, lines, np.float32(mu), packed, data)
     for y, x in np.ndindex(ROWS, COLS):
-        j, i, above, aside = y // 2, x // 2, 2 * (y % 2) - 1, 2 * (x % 2) - 1
-        places = [(j, i), (j, i + aside), (j + above, i), (j + above, i + aside), (j, i - aside)][:count]
-        centres = [centre(up_u, up_v, lines, *p, mu) for p in places]
-        tried = [centres[0]]
-        for m, (u, v) in enumerate(centres):
-            for dv in range(-reach_y, reach_y + 1) if m == 0 or mu < lanes.SHARP else [0]:
-                wide = reach_x if dv == 0 or mu < lanes.SHARP else 0
-                tried += [(u + du, v + dv) for du in range(-wide, wide + 1)]
+        j, i = y // 2, x // 2
+        near = [(0, 0), (0, -1), (0, 1), (-1, 0), (1, 0), (-1, -1), (-1, 1), (1, -1), (1, 1)][:count]
+        centres = [centre(up_u, up_v, lines, j + dj, i + di, mu) for dj, di in near]
         best = (*centres[0], lanes.FAR)
-        for u, v in tried:
-            if 0 <= x + u < 15 and 0 <= y + v < 9:
+        for u, v in candidates(centres, reach_x, reach_y, mu):
+            if 0 <= x + u < 24 and 0 <= y + v < 12:
                 cost = sad(left[y, x], right[y + v, x + u]) + off_line(lines, y, x, u, v, mu)
                 best = (u, v, cost) if cost < best[2] else best
         found = propagation.columns(packed[y, x]), propagation.rows_of(packed[y, x]), data[y, x]
@@ -81,7 +102,8 @@ def slow_checkerboard(left, right, u, v, lines, mu, smoothness, rounds):
                 near = [(int(u[at(*p)]), int(v[at(*p)])) for p in around]
                 a, b = int(u[y, x]), int(v[y, x])
                 best = None
-                own = [(a, b), (a - 1, b), (a + 1, b), (a, b - 1), (a, b + 1)]
+                own = [(a, b), (a - 1, b), (a + 1, b)]
+                own += [(a, b - 1), (a, b + 1)] if mu < lanes.SHARP else []
                 for du, dv in [*own, *near]:
                     if not (0 <= x + du < right.shape[1] and 0 <= y + dv < right.shape[0]):
                         continue
@@ -142,10 +164,12 @@ def test_exhaustive_search_finds_a_two_dimensional_shift_and_prefers_the_short_o
 def test_summed_distances_against_numpy():
     left, right = words((12, 14), 10), words((12, 14), 11)
     u, v = np.random.default_rng(12).integers(-1, 2, (2, 12, 14)).astype(np.int16)
+    # Equal displacements side by side are summed together.
+    u[5:7], v[5:7] = 1, 0
     fine_u, fine_v, d = np.empty((3, 12, 14), np.float32)
     wanted = np.ones((12, 14), np.uint8)
     wanted[5, 5] = 0
-    subpixel.summed(left, right, u, v, wanted, 2, fine_u, fine_v, d)
+    subpixel.summed(left, right, u, v, wanted, fine_u, fine_v, d)
 
     def total(y, x, du, dv):
         return sum(sad(left[y + j, x + i], right[y + j + dv, x + i + du]) for j in range(-2, 3) for i in range(-2, 3))
