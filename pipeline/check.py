@@ -22,11 +22,12 @@ from pipeline import verdicts
 from pipeline.location import Location
 from pipeline.store import Ref, Store, at
 from pipeline.task import Refs, Spec, ensure
-from pipeline.verdicts import Look, Verdict
+from pipeline.verdicts import Verdict
 from stages.declare import NoParams
 from stages.epipolar import beyond_infinity
 from stages.errors import RilleError
 from stages.ground import inverse_depth
+from stages.sight import Look, look
 
 Floats = NDArray[np.float64]
 
@@ -146,7 +147,7 @@ class Inspection:
                     continue
                 image = np.asarray(bundle["image"])
                 sizes.add((image.shape[1], image.shape[0], str(image.dtype)))
-                looks[camera][frame] = verdicts.look(image, np.asarray(bundle["valid"]))
+                looks[camera][frame] = look(image, np.asarray(bundle["valid"]))
                 digests[camera][frame] = hashlib.sha256(image.tobytes()).hexdigest()
         for damage in list(self.broken.values())[:FIRST_NAMED]:
             yield Verdict("FAIL", "images", damage.message, damage.remedy)

@@ -23,7 +23,10 @@ from stages.errors import ConfigError
 STAGE_MODULES: dict[str, str] = {
     "undistort": "stages.undistort",
     "pyramid": "stages.pyramid",
+    "sight": "stages.sight",
     "motion": "stages.motion",
+    "sides": "stages.sides",
+    "continuity": "stages.continuity",
     "select": "stages.select",
     "hfvm": "stages.hfvm",
     "orientation": "stages.orientation",

@@ -78,6 +78,13 @@ class ResectParams(Params):
     max_position_ratio: float = Field(
         0.02, gt=0, description="std of the position over the median distance of landmarks; beyond it: degenerate"
     )
+    min_share: float = Field(
+        0.15,
+        ge=0,
+        le=1,
+        description="share of a frame's landmarks that must agree with one pose; a twentieth agrees with a wrong one by"
+        " chance, since all are searched near their predictions",
+    )
     hypotheses: int = Field(
         150, ge=1, description="samples of four landmarks; finds a clean one at half outliers with p = 0.9999"
     )
@@ -146,6 +153,11 @@ def resect(
     predictions = [Poses.of(T.inverse()) for T in (start, reckoned) if T is not None]
     poses, near = _robust_start(obs, predictions, params, rng)
     poses, active, steps = _remove_inconsistent(obs, poses, near, params, where)
+    if active.sum() < params.min_share * len(active):
+        raise DegenerateError(
+            f"{where}: only {int(active.sum())} of {len(active)} landmarks agree with one pose",
+            remedy="look at the image; or lower resect.min_share",
+        )
     _not_collinear(landmarks.position[active], where)
     return _result(obs, poses, active, steps, params, where)
 
@@ -280,7 +292,7 @@ def _not_collinear(landmarks: Floats, where: str) -> None:
 
 @dataclass(frozen=True)
 class SegmentPoses:
-    """Poses of a segment's frames; see the stage's outputs."""
+    """Poses of a segment's frames; see the stage's outputs. A lost frame has NaN, and its fact ``lost`` says why."""
 
     poses: Floats
     covariance: Floats
@@ -298,7 +310,7 @@ def resect_segment(
     params: ResectParams,
     reckoned: Sequence[RigidTransform | None] | None = None,
 ) -> SegmentPoses:
-    """Poses of the frames of a segment, the key frame's given.
+    """Poses of the frames of a segment, the key frame's given. A frame that cannot be posed is lost, the others go on.
 
     Parameters
     ----------
@@ -307,46 +319,32 @@ def resect_segment(
     T_local_key : pose of the key frame's left camera.
     frames : frame numbers, for messages and seeds.
     reckoned : T_key_left of each frame by dead reckoning, where there is one; competes as a start.
-
-    Raises
-    ------
-    DegenerateError
-        A frame cannot be posed; named with the reason.
     """
     n, count = points.shape[:2]
     out = SegmentPoses(
-        np.zeros((count, 3, 4)),
-        np.zeros((count, 6, 6)),
+        np.full((count, 3, 4), np.nan),
+        np.full((count, 6, 6), np.nan),
         np.zeros((n, count), np.uint8),
         np.full((n, count), np.nan, np.float32),
         [],
     )
     known = np.isfinite(landmarks.position).all(1)
     pose, together = T_local_key, list[float]()
-    out.poses[0] = pose.matrix34
+    out.poses[0], out.covariance[0] = pose.matrix34, 0.0
     for j in range(count):
         use = np.flatnonzero(known & np.isfinite(points[:, j]).all(1))
         if j == 0:
             out.inlier[use, 0], out.residual[use, 0] = 1, 0.0
             out.facts.append(_facts(frames[0], use.size, use.size, 0.0, None))
             continue
-        if use.size < MINIMUM:
-            _enough(
-                use.size,
-                f"frame {frames[j]}",
-                f"of {n} tracked points have coordinates and were found ({landmarks.summary()})",
-                FEW,
+        try:
+            found = _resect_one(
+                landmarks, points[:, j], use, camera, pose, params, frames[j], _reckoned(T_local_key, reckoned, j)
             )
-        found = resect(
-            landmarks.take(use),
-            points[use, j].astype(np.float64),
-            camera,
-            pose,
-            params,
-            np.random.default_rng([params.seed, frames[j]]),
-            reckoned=None if reckoned is None or (T := reckoned[j]) is None else T_local_key @ T,
-            where=f"frame {frames[j]}",
-        )
+        except DegenerateError as error:
+            cause = error.message.removeprefix(f"frame {frames[j]}: ")
+            out.facts.append(_facts(frames[j], use.size, 0, None, None) | {"lost": cause})
+            continue
         pose = found.T_local_left
         out.poses[j], out.covariance[j] = pose.matrix34, found.covariance
         out.inlier[use, j], out.residual[use, j] = found.inlier, found.residual
@@ -358,7 +356,33 @@ def resect_segment(
     return out
 
 
-def _facts(frame: int, seen: int, inliers: int, rms: float, found: Resection | None) -> dict[str, Any]:
+def _reckoned(
+    T_local_key: RigidTransform, reckoned: Sequence[RigidTransform | None] | None, j: int
+) -> RigidTransform | None:
+    return None if reckoned is None or (T := reckoned[j]) is None else T_local_key @ T
+
+
+def _resect_one(
+    landmarks: Landmarks,
+    points: NDArray[np.float32],
+    use: NDArray[np.intp],
+    camera: Camera,
+    start: RigidTransform,
+    params: ResectParams,
+    frame: int,
+    reckoned: RigidTransform | None,
+) -> Resection:
+    """One frame of a segment, by those of its points (n, 2) that are used."""
+    where = f"frame {frame}"
+    if use.size < MINIMUM:
+        what = f"of {len(points)} tracked points have coordinates and were found ({landmarks.summary()})"
+        _enough(use.size, where, what, FEW)
+    rng = np.random.default_rng([params.seed, frame])
+    pixels = points[use].astype(np.float64)
+    return resect(landmarks.take(use), pixels, camera, start, params, rng, reckoned=reckoned, where=where)
+
+
+def _facts(frame: int, seen: int, inliers: int, rms: float | None, found: Resection | None) -> dict[str, Any]:
     return {
         "frame": frame,
         "landmarks": seen,
@@ -423,19 +447,20 @@ def _coordinates(
 
 STAGE = Stage(
     name="resect",
-    version=1,
+    version=2,
     summary="poses of a segment's frames in the local frame of its basic pair",
     params=ResectParams,
     inputs=("track", "dem?", "disparity?", "level", "rig"),
     outputs=(
-        Array("poses", ("frame", "row", "col"), "float64", "m", "pose [R | t] of the left camera", frame="local"),
+        Array("poses", ("frame", "row", "col"), "float64", "m", "pose [R | t] of the left camera", "nan", "local"),
         Array(
             "covariance",
             ("frame", "parameter", "parameter_b"),
             "float64",
             "m^2, m rad, rad^2",
             "covariance of position and rotation vector",
-            frame="local",
+            "nan",
+            "local",
         ),
         Array("inlier", ("point", "frame"), "uint8", "1", "landmark agrees with the pose", nodata="0"),
         Array("landmarks", ("point", "xyz"), "float64", "m", "coordinates of the landmarks", "nan", "local"),

@@ -297,15 +297,25 @@ def test_segment_keeps_the_key_pose_and_poses_each_frame():
     assert found.inlier.sum(0).tolist() == [75, 75, 45, 75]
     assert [f["landmarks"] for f in found.facts] == [75, 75, 45, 75]
     points[:, 3] = np.nan
-    with pytest.raises(DegenerateError, match=r"frame 7: too few landmarks: 0 .*3 too far"):
-        resect_segment(
-            points,
-            Landmarks(position, np.zeros_like(position), np.zeros(80), {"too far": 3}),
-            CAMERA,
-            key,
-            [4, 5, 6, 7],
-            PARAMS,
-        )
+
+
+def test_a_frame_that_cannot_be_posed_is_lost_and_the_next_one_is_posed():
+    rng = np.random.default_rng(17)
+    steps = [RigidTransform(rotation_exp([0, 0.02 * i, 0]), np.array([0.02 * i, 0, 0.3 * i])) for i in range(4)]
+    landmarks = scene(rng, 80)
+    points = np.stack([seen(T, landmarks) for T in steps], 1).astype(np.float32)
+    points[:, 1] = np.nan  # nothing found
+    points[:, 2] = rng.uniform([0, 0], [600, 500], (80, 2))  # nothing but chance
+    known = Landmarks(landmarks, np.zeros_like(landmarks), np.zeros(80), {"too far": 3})
+    found = resect_segment(points, known, CAMERA, steps[0], [4, 5, 6, 7], PARAMS)
+    assert np.isnan(found.poses[1:3]).all()
+    assert np.isnan(found.covariance[1:3]).all()
+    assert "too few landmarks: 0 of 80 tracked points" in found.facts[1]["lost"]
+    assert "3 too far" in found.facts[1]["lost"]
+    assert "agree with one pose" in found.facts[2]["lost"]
+    assert not found.inlier[:, 1:3].any()
+    assert "lost" not in found.facts[3]
+    np.testing.assert_allclose(found.poses[3], steps[3].matrix34, atol=1e-5)
 
 
 def test_solver_stands_still_on_singular_data():
@@ -365,8 +375,7 @@ def test_a_segment_takes_predictions_relative_to_its_key_frame():
     points[:, 0] = 100.0
     points[:40, 1], points[40:, 2] = seen(key @ near, groups[0]), seen(key @ about, groups[1])
     known = Landmarks(landmarks, np.zeros_like(landmarks), np.zeros(80), {})
-    with pytest.raises(DegenerateError, match="frame 2"):
-        resect_segment(points, known, CAMERA, key, [0, 1, 2], PARAMS)
+    assert resect_segment(points, known, CAMERA, key, [0, 1, 2], PARAMS).facts[2]["lost"]
     found = resect_segment(points, known, CAMERA, key, [0, 1, 2], PARAMS, [None, None, about])
     np.testing.assert_allclose(found.poses, [(key @ step).matrix34 for step in steps], atol=1e-5)
 
