@@ -36,6 +36,7 @@ STAGE_MODULES: dict[str, str] = {
     "locus": "stages.locus",
     "track": "stages.track",
     "resect": "stages.resect",
+    "refine": "stages.refine",
     "trajectory": "stages.trajectory",
     "pose": "stages.pose",
     "footprint": "stages.footprint",

@@ -6,7 +6,7 @@
              (if needed)           |                    +-> track (segment) --+
                                    |                                          |
                                    +-> hfvm (basic pair) -+-> level ----------+-> resect (segment) -> trajectory
-                                                          |     |               (landmarks)               |
+                                                          |     |               (landmarks)  (refine)     |
         given rig --+-> orientation (basic pair) <--------+     |                                         |
                     |       +-> rig -> calibration -------+-----+-> locus (local frame)                   |
                     |           (pooled; into level,      |           +-> risk, path (local)              |
@@ -77,6 +77,7 @@ class Products:
     local_path: dict[int, Handle] = field(default_factory=dict)
     tracks: list[Handle] = field(default_factory=list)
     resections: list[Handle] = field(default_factory=list)
+    refined: Handle | None = None
     world_dem: dict[int, Handle] = field(default_factory=dict)
     seams: dict[int, Handle] = field(default_factory=dict)
     seam_audit: Handle | None = None
@@ -184,6 +185,7 @@ class Reconstruction:
             {"frames": list(self.frames)} | ({"lost": self.lost} if self.lost else {}),
             segments=p.resections,
             levels=[p.level[s[0]] for s in segments] or [p.level[self.basic[0]]],
+            **self._refined([s[0] for s in segments]),
         )
         self._assess_trajectory()
         self.graph.expand([p.trajectory], self._after_trajectory)
@@ -305,6 +307,24 @@ class Reconstruction:
                 **surface,
             )
         )
+
+    def _refined(self, keys: list[int]) -> dict[str, Handle]:
+        """All segments adjusted jointly with their landmarks, where that is wanted."""
+        p = self.products
+        if not (self.config.refine.enabled and keys):
+            return {}
+        args = {"pairs": self.basic, "resect": self.config.resect.model_dump(mode="json")}
+        p.refined = self._node(
+            "refine",
+            "refine",
+            args,
+            tracks=p.tracks,
+            resections=p.resections,
+            levels=[p.level[k] for k in keys],
+            disparities=[p.disparity[k] for k in self.basic],
+            rigs=[self.calibration[k] for k in self.basic],
+        )
+        return {"refined": p.refined}
 
     def _crosscheck(self) -> None:
         """Structure from motion by another program, in windows; it knows nothing of our trajectory, nor we of its."""

@@ -35,6 +35,8 @@ Steps = Mapping[tuple[int, int], float]
 Asks = dict[str, list[Any]]
 
 SIDES = ("left", "right")
+QUIET = 0.25
+"""Quantile of the changes that is usual: one exchanged frame changes three steps, of a short sequence the half."""
 
 
 class ContinuityParams(Params):
@@ -60,8 +62,8 @@ class ContinuityParams(Params):
     jump: float = Field(
         4.0,
         gt=0,
-        description="pixels, and multiple of what is usual: median change of the displacements from one step to the"
-        " next at which the sides of the frames there are looked at",
+        description="pixels, and multiple of what is usual (lower quartile): median change of the displacements from"
+        " one step to the next at which the sides of the frames there are looked at",
     )
 
 
@@ -121,16 +123,18 @@ def _see(
     out: Judgement, frames: Sequence[int], sights: Mapping[int, Mapping[str, Any]], params: ContinuityParams
 ) -> None:
     """What the images alone say."""
-    usual = {side: _usual([sights[f][side]["sharpness"] for f in frames]) for side in SIDES}
+    usual = {(s, what): _usual([sights[f][s][what] for f in frames]) for s in SIDES for what in ("sharpness", "detail")}
     for f in frames:
         for side in SIDES:
             seen = sights[f][side]
             if seen["deviation"] < params.uniform:
                 words = _uniform(seen, side)
                 (out.lost if side == "left" else out.unfit).setdefault(f, words)
-            elif seen["sharpness"] is not None and seen["sharpness"] < params.blurred * usual[side]:
-                share = seen["sharpness"] / usual[side]
-                out.unfit.setdefault(f, f"blurred {side} image ({share:.0%} of the usual sharpness)")
+                continue
+            for what, limit in (("sharpness", params.blurred), ("detail", 0.5 * params.blurred)):
+                share = seen[what] / usual[side, what] if seen[what] is not None and usual[side, what] > 0 else 1.0
+                if share < limit:
+                    out.unfit.setdefault(f, f"blurred {side} image ({share:.0%} of the usual {what})")
         if sights[f]["left"]["digest"] == sights[f]["right"]["digest"] and f not in out.lost:
             out.unfit[f] = "left and right are one image"
     for a, b in pairwise(frames):
@@ -215,7 +219,7 @@ def _jumps(frames: Sequence[int], changes: Sequence[float], params: ContinuityPa
     """Frames at the abrupt changes; ``changes`` has one value a frame but the first and the last."""
     if not changes:
         return []
-    limit = max(params.jump, params.jump * float(np.median(changes)))
+    limit = max(params.jump, params.jump * float(np.quantile(changes, QUIET)))
     found = {n for k, value in enumerate(changes) if value > limit for n in frames[k : k + 3]}
     return [f for f in frames if f in found]
 

@@ -30,13 +30,18 @@ STRIP = 48
 
 @dataclass(frozen=True)
 class Look:
-    """One image in figures: mean grey 0..255, deviation, shares of dark and bright clipped pixels, sharpness."""
+    """One image in figures: mean grey 0..255, deviation, shares of dark and bright clipped pixels, sharpness.
+
+    ``detail`` is what lies between two and four pixels, RMS over the deviation: where even that is gone, noise alone
+    decides on the sharpness.
+    """
 
     mean: float
     deviation: float
     dark: float
     bright: float
     sharpness: float
+    detail: float = 0.0
 
 
 def look(image: NDArray[Any], valid: NDArray[np.uint8]) -> Look:
@@ -55,26 +60,30 @@ def look(image: NDArray[Any], valid: NDArray[np.uint8]) -> Look:
     inner = cv2.erode(usable.astype(np.uint8), np.ones((13, 13), np.uint8)) != 0
     coarse = float(np.sqrt(((once - twice)[inner] ** 2).mean())) if inner.any() else 0.0
     fine = float(np.sqrt(((level - once)[inner] ** 2).mean())) if inner.any() else 0.0
+    deviation = float(values.std())
     return Look(
         float(values.mean()),
-        float(values.std()),
+        deviation,
         float((values <= LOW).mean()),
         float((values >= HIGH).mean()),
         fine / coarse if coarse > 0 else math.nan,
+        coarse / deviation if deviation > 0 else 0.0,
     )
 
 
 def glance(image: NDArray[Any], valid: NDArray[np.uint8]) -> dict[str, Any]:
-    """Mean and deviation (grey), sharpness (None: none to tell) of strips of an image (row, col), and its digest."""
+    """Mean and deviation (grey), sharpness (None: none to tell) and detail of strips of an image, and its digest."""
     rows = image.shape[0]
     first = sorted({int(np.clip(share * rows - STRIP / 2, 0, max(rows - STRIP, 0))) for share in BANDS})
     found = [look(image[r : r + STRIP], valid[r : r + STRIP]) for r in first]
     sharp = [f.sharpness for f in found if math.isfinite(f.sharpness)]
+    rough = [f.detail for f in found]
     values = grey(np.ascontiguousarray(image[::2, ::2]))[valid[::2, ::2] != 0]
     return {
         "mean": float(values.mean()) if values.size else None,
         "deviation": float(values.std()) if values.size else 0.0,
         "sharpness": float(np.median(sharp)) if sharp else None,
+        "detail": float(np.median(rough)),
         "digest": hashlib.sha256(np.ascontiguousarray(image).tobytes()).hexdigest(),
     }
 

@@ -9,6 +9,9 @@ frame of a segment and ``i`` another of its frames,
 so that ``T_world_local(k) = T_world_left(k) T_local_left(k)^-1`` whatever the levelling of pair k is. The next
 segment's key frame is the last frame of this one. Where that frame is lost the trajectory breaks: what follows is a
 piece of its own, in the local frame of its first basic pair.
+
+Of the covariances, what each segment has for itself adds up; of what all segments share, the errors add up, which grows
+with the length of the way and not with its root (:mod:`stages.resect`).
 """
 
 from __future__ import annotations
@@ -26,6 +29,7 @@ from stages.geometry import RigidTransform, orthonormal
 from stages.reprojection import cross_matrix
 
 Floats = NDArray[np.float64]
+Segment = tuple[Floats, Floats, Floats]
 
 
 @dataclass(frozen=True)
@@ -43,15 +47,15 @@ class Chained:
     piece: NDArray[np.int16]
 
 
-def chain(segments: Sequence[tuple[Floats, Floats]], levels: Sequence[RigidTransform]) -> Chained:
+def chain(segments: Sequence[Segment], levels: Sequence[RigidTransform]) -> Chained:
     """Compose the poses of segments into one trajectory.
 
     Where the last frame of a segment is lost, the next segment begins a new piece in the local frame of its own key.
 
     Parameters
     ----------
-    segments : poses (frames, 3, 4) T_local_left and covariances (frames, 6, 6) of each, key frame first, NaN of a lost
-        frame; none for a sequence of one pair.
+    segments : poses (frames, 3, 4) T_local_left, covariances (frames, 6, 6) and the root (frames, 6, k) of the part of
+        them that all segments share, key frame first, NaN of a lost frame; none for a sequence of one pair.
     levels : T_local_left of each segment's key frame by its own level stage; of the only pair without segments.
 
     Raises
@@ -61,23 +65,28 @@ def chain(segments: Sequence[tuple[Floats, Floats]], levels: Sequence[RigidTrans
     """
     if len(levels) != max(len(segments), 1):
         raise InputError(f"{len(segments)} segments and {len(levels)} levels do not make a trajectory")
-    world, cov, broken, piece = levels[0], np.zeros((6, 6)), False, 0
-    poses, covariances, owner, pieces = [world.matrix34], [cov], [0], [0]
-    for number, ((local, local_cov), level) in enumerate(zip(segments, levels, strict=False)):
+    kinds = segments[0][2].shape[2] if segments else 0
+    nothing = np.zeros((6, 6)), np.zeros((6, kinds))
+    world, (own, common), broken, piece = levels[0], nothing, False, 0
+    poses, covariances, owner, pieces = [world.matrix34], [own], [0], [0]
+    for number, ((local, local_cov, shared), level) in enumerate(zip(segments, levels, strict=False)):
         if np.abs(local[0] - level.matrix34).max() > 1e-9 * max(1.0, float(np.abs(local[0]).max())):
             raise InputError(f"segment {number} was not resected in the local frame of its own basic pair")
         if broken:
-            world, cov, piece = level, np.zeros((6, 6)), piece + 1
-            poses[-1], covariances[-1], owner[-1], pieces[-1] = world.matrix34, cov, number, piece
+            world, (own, common), piece = level, nothing, piece + 1
+            poses[-1], covariances[-1], owner[-1], pieces[-1] = world.matrix34, own, number, piece
         T_world_local = _clean(world @ level.inverse())
-        key, key_cov = world, cov
-        for pose, pose_cov in zip(local[1:], local_cov[1:], strict=True):
+        key, key_own, key_common = world, own, common
+        for pose, pose_cov, pose_shared in zip(local[1:], local_cov[1:], shared[1:], strict=True):
             broken = not np.isfinite(pose).all()
             if not broken:
                 world = T_world_local @ RigidTransform.from_matrix(pose)
-                cov = propagate(key, key_cov, T_world_local, pose_cov, world)
+                lever, turn = propagation(key, T_world_local, world)
+                alone = pose_cov - pose_shared @ pose_shared.T
+                own = _symmetric(lever @ key_own @ lever.T + turn @ alone @ turn.T)
+                common = lever @ key_common + turn @ pose_shared
             poses.append(np.full((3, 4), np.nan) if broken else world.matrix34)
-            covariances.append(np.full((6, 6), np.nan) if broken else cov)
+            covariances.append(np.full((6, 6), np.nan) if broken else own + common @ common.T)
             owner.append(-1 if broken else number)
             pieces.append(-1 if broken else piece)
     return _without_single_frames(
@@ -97,10 +106,8 @@ def _without_single_frames(found: Chained) -> Chained:
     return Chained(poses, covariance, segment, number[found.piece])
 
 
-def propagate(
-    key: RigidTransform, key_cov: Floats, T_world_local: RigidTransform, local_cov: Floats, world: RigidTransform
-) -> Floats:
-    """Covariance (6, 6) in the world of a frame that was resected against the key frame.
+def propagation(key: RigidTransform, T_world_local: RigidTransform, world: RigidTransform) -> tuple[Floats, Floats]:
+    """How errors (6,) of the key frame in the world, and of a pose against it in the local frame, enter that pose.
 
     The key's rotation error swings the frame about the key's position (first order): with the lever
     ``r = C_frame - C_key``, ``dC = dC_key + dtheta_key x r + R dC_local`` and ``dtheta = dtheta_key + R dtheta_local``.
@@ -109,8 +116,11 @@ def propagate(
     lever[:3, 3:] = -cross_matrix(world.translation - key.translation)
     turn = np.zeros((6, 6))
     turn[:3, :3] = turn[3:, 3:] = T_world_local.rotation
-    total = lever @ key_cov @ lever.T + turn @ local_cov @ turn.T
-    return np.asarray(0.5 * (total + total.T))
+    return lever, turn
+
+
+def _symmetric(a: Floats) -> Floats:
+    return np.asarray(0.5 * (a + a.T))
 
 
 def _clean(T: RigidTransform) -> RigidTransform:
@@ -180,7 +190,13 @@ def _facts(segments: Sequence[Bundle]) -> list[dict[str, Any]]:
 
 def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     levels = [RigidTransform.from_matrix(b.meta["T_local_left"]) for b in inputs["levels"]]
-    segments = [(np.asarray(b["poses"]), np.asarray(b["covariance"])) for b in inputs["segments"]]
+    segments = [
+        (np.asarray(b["poses"]), np.asarray(b["covariance"]), np.asarray(b["shared"])) for b in inputs["segments"]
+    ]
+    if "refined" in inputs:
+        ends = np.cumsum([len(poses) for poses, _, _ in segments])
+        better = np.split(np.asarray(inputs["refined"]["poses"]), ends[:-1])
+        segments = [(new, cov, shared) for new, (_, cov, shared) in zip(better, segments, strict=True)]
     frames = [int(f) for f in args["frames"]]
     facts = _facts(inputs["segments"]) or [{"frame": frames[0], "inliers": 0}]
     causes = {int(f["frame"]): str(f["cause"]) for f in args.get("lost", ())}
@@ -205,7 +221,7 @@ STAGE = Stage(
     version=2,
     summary="poses of all left frames in the world frame",
     params=NoParams,
-    inputs=("segments*", "levels*"),
+    inputs=("segments*", "levels*", "refined?"),
     outputs=(
         Array("poses", ("frame", "row", "col"), "float64", "m", "pose [R | t] of the left camera", "nan", "world"),
         Array(

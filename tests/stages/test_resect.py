@@ -117,7 +117,7 @@ def test_thirty_percent_outliers_are_removed_and_no_more():
     good[wrong] = False
     np.testing.assert_array_equal(found.inlier, good)  # threshold: 5 sigma
     error = found.T_local_left.translation - T.translation
-    assert error @ np.linalg.solve(found.covariance[:3, :3], error) < chi2.ppf(0.999, 3)
+    assert error @ np.linalg.solve(found.total[:3, :3], error) < chi2.ppf(0.999, 3)
 
 
 def test_landmarks_just_over_the_threshold_go_one_by_one():
@@ -171,7 +171,7 @@ def normalised_square(T, found):
     turn = T.rotation @ found.T_local_left.rotation.T
     w = 0.5 * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
     x = np.concatenate([T.translation - found.T_local_left.translation, w])
-    return float(x @ np.linalg.solve(found.covariance, x))
+    return float(x @ np.linalg.solve(found.total, x))
 
 
 @pytest.mark.parametrize("bias_sigma", [0.0, 0.3])
@@ -186,9 +186,10 @@ def test_covariance_is_calibrated(bias_sigma):
         pixels = seen(T, landmarks) + 0.3 * rng.standard_normal((50, 2))
         wrong = landmarks + per_pixel * (0.2 * rng.standard_normal((50, 1)) + bias_sigma * rng.standard_normal())
         total += normalised_square(T, solve(wrong, pixels, per_pixel=per_pixel, sigma=0.2, params=params, seed=trial))
-    # Huber's weights cost 2 % and the variance factor is itself estimated (94 degrees of freedom: +2 %).
+    # Huber's weights cost 2 %, and a variance factor below 1 (it has 94 degrees of freedom: 1 +- 0.15) is not believed:
+    # -6 %.
     low, high = chi2.ppf([0.001, 0.999], 6 * trials)
-    assert low < total / 1.04 < high
+    assert low < total / 0.96 < high
 
 
 def test_an_error_that_all_disparities_share_is_found():
@@ -212,7 +213,7 @@ def test_without_motion_the_bias_stays_at_its_prior():
     pixels = seen(RigidTransform.identity(), landmarks) + 0.2 * rng.standard_normal((100, 2))
     found = solve(landmarks, pixels, per_pixel=stereo(landmarks, 100.0), sigma=0.2)
     assert abs(found.bias) < 0.05
-    assert np.linalg.norm(found.T_local_left.translation) < 4 * np.sqrt(np.trace(found.covariance[:3, :3]))
+    assert np.linalg.norm(found.T_local_left.translation) < 4 * np.sqrt(np.trace(found.total[:3, :3]))
 
 
 def test_uncertain_landmarks_count_less():
@@ -409,3 +410,17 @@ def test_compiled_errors_are_those_of_the_arrays():
     np.testing.assert_allclose(moved.t, by_arrays.t, rtol=1e-6)
     np.testing.assert_allclose(moved.R, by_arrays.R, atol=1e-9)
     np.testing.assert_allclose(moved.bias, by_arrays.bias, rtol=1e-6)
+
+
+@pytest.mark.parametrize("common", [0.0, 1.0])
+def test_errors_smaller_than_stated_leave_what_residuals_do_not_show_to_the_shared_part(common):
+    """Tracks twice as good as stated, or as stated but half of their variance common to all: residuals are the same."""
+    rng = np.random.default_rng(21)
+    params = ResectParams(pixel_sigma=0.4, threshold=2.0, hypotheses=20, bias_sigma=0.0)
+    T, landmarks = true_pose(rng), scene(rng, 400)
+    off = rng.standard_normal((400, 2)) * 0.2 + common * 0.2 * rng.standard_normal(2)
+    found = solve(landmarks, seen(T, landmarks) + off, params=params)
+    own, shared = found.covariance, found.shared @ found.shared.T
+    # a quarter of the stated variance is seen; the rest, three times as much, is not
+    np.testing.assert_allclose(np.diag(shared), 3 * np.diag(own), rtol=0.3)
+    assert normalised_square(T, found) < chi2.ppf(0.999, 6)

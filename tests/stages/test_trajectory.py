@@ -8,6 +8,9 @@ from stages.errors import InputError
 from stages.geometry import RigidTransform, rotation_exp
 from stages.trajectory import STAGE, chain
 
+NONE = np.zeros((9, 6, 2))
+"""Nothing is shared."""
+
 
 def pose(rng, scale=1.0):
     return RigidTransform(rotation_exp(rng.normal(0, 0.4, 3)), scale * rng.normal(0, 1, 3))
@@ -26,7 +29,7 @@ def test_scan_equals_composition_by_hand_whatever_the_tilt_of_the_local_frames()
     segments = []
     for (a, b), T_local_key in zip(cuts, levels, strict=True):
         local = [T_local_key @ truth[a].inverse() @ truth[i] for i in range(a, b + 1)]
-        segments.append((np.array([T.matrix34 for T in local]), np.zeros((b - a + 1, 6, 6))))
+        segments.append((np.array([T.matrix34 for T in local]), np.zeros((b - a + 1, 6, 6)), NONE[: b - a + 1]))
     found = chain(segments, levels)
     poses, covariance, segment = found.poses, found.covariance, found.segment
     assert not found.piece.any()
@@ -41,7 +44,7 @@ def test_a_segment_of_another_local_frame_is_refused():
     rng = np.random.default_rng(6)
     T = level(rng)
     with pytest.raises(InputError, match="segment 0"):
-        chain([(np.array([level(rng).matrix34, pose(rng).matrix34]), np.zeros((2, 6, 6)))], [T])
+        chain([(np.array([level(rng).matrix34, pose(rng).matrix34]), np.zeros((2, 6, 6)), NONE[:2])], [T])
     with pytest.raises(InputError, match="0 segments"):
         chain([], [])
 
@@ -60,7 +63,7 @@ def test_covariance_is_that_of_sampled_trajectories():
     local = [np.array([T.matrix34, (T @ pose(rng, 0.5)).matrix34]) for T in levels]
     spread = np.diag([2e-3, 1e-3, 3e-3, 1e-3, 2e-3, 5e-4]) ** 2
     covs = [np.array([np.zeros((6, 6)), spread])] * 3
-    found = chain(list(zip(local, covs, strict=True)), levels)
+    found = chain([(p, c, NONE[:2]) for p, c in zip(local, covs, strict=True)], levels)
     mean, covariance = found.poses, found.covariance
     samples = []
     for _ in range(1500):
@@ -68,7 +71,7 @@ def test_covariance_is_that_of_sampled_trajectories():
         for poses in local:
             d = np.sqrt(np.diag(spread)) * rng.standard_normal(6)
             T = RigidTransform(rotation_exp(d[3:]) @ poses[1][:, :3], poses[1][:, 3] + d[:3])
-            noisy.append((np.array([poses[0], T.matrix34]), covs[0]))
+            noisy.append((np.array([poses[0], T.matrix34]), covs[0], NONE[:2]))
         end = chain(noisy, levels).poses[-1]
         turn = end[:, :3] @ mean[-1][:, :3].T
         w = 0.5 * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
@@ -91,7 +94,7 @@ def broken_run(lost_rows, frames=8, cuts=((0, 3), (3, 6), (6, 7))):
         for i in range(a + 1, b + 1):
             if i in lost_rows:
                 local[i - a], facts[i - a] = np.nan, {"frame": i, "inliers": 0, "lost": "too few landmarks"}
-        arrays = {"poses": local, "covariance": np.zeros((b - a + 1, 6, 6))}
+        arrays = {"poses": local, "covariance": np.zeros((b - a + 1, 6, 6)), "shared": NONE[: b - a + 1]}
         segments.append(Bundle(arrays, {"per_frame": facts}))
     inputs = {"segments": segments, "levels": [Bundle({}, {"T_local_left": T.to_list()}) for T in levels]}
     out = STAGE.run(NoParams(), {"frames": list(range(frames))}, inputs)
@@ -129,3 +132,16 @@ def test_a_frame_that_is_a_piece_alone_is_lost():
     assert all(f["bridged"] is None for f in out.meta["lost"])
     _, _, nothing = broken_run({1, 2, 3, 4, 5, 6, 7})
     assert nothing["piece"].tolist() == [0] + [-1] * 7
+
+
+def test_what_segments_share_adds_up_and_what_they_do_not_adds_squared():
+    """Four equal segments straight ahead, one frame each: one kind of error along the way, 2 mm shared, 3 mm not."""
+    step = np.hstack([np.eye(3), [[0.0], [0.0], [1.0]]])
+    start = np.hstack([np.eye(3), np.zeros((3, 1))])
+    shared = np.zeros((2, 6, 1))
+    shared[1, 2, 0] = 2e-3
+    own = np.zeros((2, 6, 6))
+    own[1, 2, 2] = 3e-3**2
+    one = (np.array([start, step]), own + shared @ np.swapaxes(shared, 1, 2), shared)
+    found = chain([one] * 4, [RigidTransform.identity()] * 4)
+    np.testing.assert_allclose(found.covariance[:, 2, 2], [k * 3e-3**2 + (k * 2e-3) ** 2 for k in range(5)], atol=1e-15)
