@@ -55,6 +55,8 @@ MOST_BLOCKS = 6
 """Blocks along either side of the image whose mean errors show how far neighbours' errors go together."""
 PER_BLOCK = 6
 """Landmarks a block, at least on average."""
+MOVING = 0.3
+"""Share of the landmarks that agree with no pose, from which on it is warned of."""
 SHARED = 7
 """Errors that segments share: as many as the pose has parameters, and that of all disparities."""
 SAMPLE = 4
@@ -446,9 +448,33 @@ def _run(params: ResectParams, args: Mapping[str, Any], inputs: Inputs) -> Bundl
         "landmarks": landmarks.position,
         "residual": found.residual,
     }
-    return Bundle(
-        arrays, {"per_frame": found.facts, "landmark_source": params.landmarks, "without_coordinates": landmarks.lost}
-    )
+    tracks, moving = moving_tracks(points, landmarks, found)
+    meta = {"per_frame": found.facts, "landmark_source": params.landmarks, "without_coordinates": landmarks.lost}
+    meta |= {"tracks": tracks, "moving_tracks": moving, "warnings": _moving_words(frames, tracks, moving)}
+    return Bundle(arrays, meta)
+
+
+def moving_tracks(points: NDArray[np.float32], landmarks: Landmarks, found: SegmentPoses) -> tuple[int, int]:
+    """How many landmarks were found in two posed frames or more, and how many of them agree with no pose.
+
+    What is followed well from frame to frame and never agrees does not stand on the ground: the vehicle's own shadow,
+    its wheels, other things that move; or its coordinates are wrong (a match on the edge of a rock).
+    """
+    posed = np.isfinite(found.poses).all(axis=(1, 2))
+    posed[0] = False
+    seen = np.isfinite(points).all(axis=2) & posed & np.isfinite(landmarks.position).all(axis=1)[:, None]
+    often = seen.sum(axis=1) >= 2
+    agrees = (found.inlier != 0) & seen
+    return int(often.sum()), int((often & ~agrees.any(axis=1)).sum())
+
+
+def _moving_words(frames: list[int], tracks: int, moving: int) -> list[str]:
+    if tracks == 0 or moving < MOVING * tracks:
+        return []
+    return [
+        f"frames {frames[0]}-{frames[-1]}: {moving} of {tracks} tracked landmarks agree with no pose: does something"
+        " move in view (a shadow, a wheel)?"
+    ]
 
 
 def coordinates(

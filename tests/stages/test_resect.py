@@ -17,7 +17,7 @@ from stages.reprojection import (
     normal_matrix,
     norms,
 )
-from stages.resect import ResectParams, resect, resect_segment
+from stages.resect import ResectParams, moving_tracks, resect, resect_segment
 
 CAMERA = Camera(600.0, 610.0, 300.0, 250.0, 600, 500)
 PARAMS = ResectParams()
@@ -424,3 +424,16 @@ def test_errors_smaller_than_stated_leave_what_residuals_do_not_show_to_the_shar
     # a quarter of the stated variance is seen; the rest, three times as much, is not
     np.testing.assert_allclose(np.diag(shared), 3 * np.diag(own), rtol=0.3)
     assert normalised_square(T, found) < chi2.ppf(0.999, 6)
+
+
+def test_what_moves_by_itself_is_counted():
+    """Twelve of eighty landmarks are carried along with the camera; five are lost behind the key frame."""
+    rng = np.random.default_rng(22)
+    steps = [RigidTransform(rotation_exp([0, 0.01 * i, 0]), np.array([0.0, 0, 0.3 * i])) for i in range(4)]
+    landmarks = scene(rng, 80)
+    points = np.stack([seen(T, landmarks) for T in steps], 1).astype(np.float32)
+    points[:12] = points[:12, :1]
+    points[75:, 1:] = np.nan
+    known = Landmarks(landmarks, np.zeros_like(landmarks), np.zeros(80), {})
+    found = resect_segment(points, known, CAMERA, steps[0], [0, 1, 2, 3], PARAMS)
+    assert moving_tracks(points, known, found) == (75, 12)
