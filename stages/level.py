@@ -30,10 +30,6 @@ SAMPLES = 5000  # matched pixels that the plane is fitted to: three parameters n
 MARGIN = 0.05  # share of the camera's height that the range of elevations is widened by: a low rock, a kerb
 
 
-BEYOND = 3.0  # standard deviations that a match lies beyond infinity, which no noise explains
-SWAPPED = 0.5  # share of such matches: nearly all where left and right are swapped
-
-
 class LevelParams(Params):
     """Parameters of the stage ``level``."""
 
@@ -98,12 +94,6 @@ def level(
     """
     rays, rho, sigma = _samples(np.asarray(column_disparity), np.asarray(row_disparity), usable, rig, params)
     vertical, source = _given_vertical(up, initial_up, pitch)
-    beyond = float(np.mean(rho < -BEYOND * sigma)) if rho.size else 0.0
-    if beyond > SWAPPED:
-        raise DegenerateError(
-            f"{beyond:.0%} of the matches lie beyond infinity",
-            remedy="left and right are swapped, or the baseline has the wrong sign",
-        )
     rng = np.random.default_rng(params.seed)
     ground = fit_plane(rays, rho, sigma, lambda n: _allowed(n, vertical, params), params.relief, rng)
     R_local_left = level_rotation(ground.up if vertical is None else vertical)
@@ -212,7 +202,7 @@ def _run(params: LevelParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle
 
 STAGE = Stage(
     name="level",
-    version=2,
+    version=1,
     summary="vertical and ground plane of a basic pair",
     params=LevelParams,
     inputs=("disparity", "rig"),

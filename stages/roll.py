@@ -23,8 +23,10 @@ LEAST_DEG = 10.0
 """Degrees below which a rotation is left to the matcher: one to three per cent of the tracks are wrong up to there."""
 MOST = 3000
 """Matches that a plane is fitted to; eight numbers need no more."""
-ROUNDS = 10
+ROUNDS = 12
 """Of reweighting."""
+WIDE = 16.0
+"""Coarse pixels of the first weights; halved each round down to one, since a similarity is no more than a start."""
 LEAST = 100
 """Coarse pixels, or matches, below which nothing is said of a rotation."""
 
@@ -90,17 +92,26 @@ def plane(
             np.stack([none, none, none, x, y, one, -v * x, -v * y], -1),
         ]
     )
-    wanted, weight = np.concatenate([u, v]), np.ones(2 * len(x))
-    h = np.zeros(8)
-    for _ in range(ROUNDS):
-        h = np.linalg.lstsq(rows * weight[:, None], wanted * weight, rcond=None)[0]
+    wanted, h = np.concatenate([u, v]), _start(p, q)
+    for k in range(ROUNDS):
         off = ((rows @ h - wanted).reshape(2, -1) * unit / scale) ** 2
-        weight = np.tile(1.0 / np.sqrt(1.0 + off.sum(0)), 2)
+        weight = np.tile(1.0 / np.sqrt(1.0 + off.sum(0) / max(1.0, WIDE / 2.0**k) ** 2), 2)
+        h = np.linalg.lstsq(rows * weight[:, None], wanted * weight, rcond=None)[0]
     H = np.append(h, 1.0).reshape(3, 3)
     if not 0.25 < abs(float(np.linalg.det(H[:2, :2]))) < 4.0:
         return None
     to = np.array([[1 / unit, 0, -centre[0] / unit], [0, 1 / unit, -centre[1] / unit], [0, 0, 1.0]])
     return np.asarray(np.linalg.inv(to) @ H @ to)
+
+
+def _start(p: Floats, q: Floats) -> Floats:
+    """Eight numbers of the similarity that most points (n, 2) agree with, by medians."""
+    a, b, half = p @ [1.0, 1.0j], q @ [1.0, 1.0j], len(p) // 2
+    ratio = (b[half:] - b[: len(b) - half]) / (a[half:] - a[: len(a) - half])
+    turn = np.median(ratio.real) + 1j * np.median(ratio.imag)
+    shift = b - turn * a
+    x, y = float(np.median(shift.real)), float(np.median(shift.imag))
+    return np.array([turn.real, -turn.imag, x, turn.imag, turn.real, y, 0.0, 0.0])
 
 
 def relative(found: tuple[float, float], known: Floats, shape: tuple[int, int]) -> tuple[float, float]:
