@@ -149,6 +149,6 @@ def test_sides_swapped_throughout_are_refused_with_one_line(place: Path, capsys:
         for frame in range(8):
             swap(frame)(folder)
 
-    with pytest.raises(RilleError, match="swapped") as caught:
+    with pytest.raises(RilleError, match="left/right order") as caught:
         reconstruct(place, "all-swapped", both, capsys)
     assert "\n" not in str(caught.value)
