@@ -101,6 +101,7 @@ class Reconstruction:
         self.products = Products()
         self._sources: dict[str, Handle] = {}
         self._images: dict[tuple[int, str], Handle] = {}
+        self._pyramids: dict[tuple[int, str], Handle] = {}
 
     def build(self) -> Products:
         """Lay out everything that is known beforehand; the rest follows by expansion."""
@@ -311,7 +312,7 @@ class Reconstruction:
     def _refined(self, keys: list[int]) -> dict[str, Handle]:
         """All segments adjusted jointly with their landmarks, where that is wanted."""
         p = self.products
-        if not (self.config.refine.enabled and keys):
+        if not (self.config.refine.enabled and keys and self.config.resect.landmarks == "disparity"):
             return {}
         args = {"pairs": self.basic, "resect": self.config.resect.model_dump(mode="json")}
         p.refined = self._node(
@@ -496,7 +497,10 @@ class Reconstruction:
         )
 
     def _pyramid(self, frame: int, camera: str) -> Handle:
-        return self._node("pyramid", f"pyramid/{camera}/{frame}", {}, image=self._image(frame, camera))
+        if (frame, camera) not in self._pyramids:
+            image = self._image(frame, camera)
+            self._pyramids[frame, camera] = self._node("pyramid", f"pyramid/{camera}/{frame}", {}, image=image)
+        return self._pyramids[frame, camera]
 
     def _image(self, frame: int, camera: str) -> Handle:
         """One image as an ideal camera would have taken it."""

@@ -460,9 +460,10 @@ def moving_tracks(points: NDArray[np.float32], landmarks: Landmarks, found: Segm
     What is followed well from frame to frame and never agrees does not stand on the ground: the vehicle's own shadow,
     its wheels, other things that move; or its coordinates are wrong (a match on the edge of a rock).
     """
-    posed = np.isfinite(found.poses).all(axis=(1, 2))
+    posed = np.asarray(np.isfinite(found.poses).all(axis=(1, 2)))
     posed[0] = False
-    seen = np.isfinite(points).all(axis=2) & posed & np.isfinite(landmarks.position).all(axis=1)[:, None]
+    known = np.asarray(np.isfinite(landmarks.position).all(axis=1))
+    seen = np.asarray(np.isfinite(points).all(axis=2)) & posed & known[:, None]
     often = seen.sum(axis=1) >= 2
     agrees = (found.inlier != 0) & seen
     return int(often.sum()), int((often & ~agrees.any(axis=1)).sum())

@@ -116,7 +116,7 @@ class Chain:
         self.calibration = self._calibration(basic)
         segments = [self._segment(part) for part in parts]
         given = {"segments": [r for r, _, _ in segments], "levels": [level for _, level, _ in segments]}
-        if self.config.refine.enabled:
+        if self.config.refine.enabled and self.config.resect.landmarks == "disparity":
             given["refined"] = self._refined(basic, segments)
         trajectory = self._stage("trajectory", {"frames": self.frames, "lost": lost}, **given)
         facts = {"basic": basic, "select": select.meta, "resect": [r.meta for r, _, _ in segments]}

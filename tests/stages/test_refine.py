@@ -14,7 +14,7 @@ from stages.resect import ResectParams
 
 CAMERA = Camera(500.0, 500.0, 299.5, 199.5, 600, 400)
 RIG = Rig(CAMERA, CAMERA, RigidTransform(np.eye(3), np.array([-0.2, 0.0, 0.0])))
-PARAMS = RefineParams()
+PARAMS = RefineParams(stereo=True)
 
 
 def scene(seed, n=150, frames=4, bias=0.0, noise=0.2, stereo=True):
@@ -104,14 +104,14 @@ def test_stereo_at_the_end_and_shared_depths_lower_the_error():
 
 def test_a_bias_of_all_disparities_is_found_by_many_segments():
     parts = [scene(30 + k, bias=0.3) for k in range(5)]
-    _, bias, _, _ = adjust([(v, s) for v, s, _ in parts], RefineParams(bias_sigma=1.0))
+    _, bias, _, _ = adjust([(v, s) for v, s, _ in parts], RefineParams(bias_sigma=1.0, stereo=True))
     assert bias == pytest.approx(0.3, abs=0.1)
 
 
 def test_the_cost_never_rises_and_an_optimum_stays():
     views, start, _ = scene(3)
     (state,), *_ = adjust([(views, start)], PARAMS)
-    (again,), _, before, after = adjust([(views, state)], RefineParams(iterations=1))
+    (again,), _, before, after = adjust([(views, state)], RefineParams(iterations=1, stereo=True))
     assert after <= before
     np.testing.assert_allclose(again.t, state.t, atol=1e-4)
 
@@ -145,7 +145,7 @@ def bundles(tracks_of_last=True):
 def test_the_stage_gives_the_poses_of_all_segments(window):
     inputs = bundles()
     args = {"pairs": [0, 2], "resect": ResectParams().model_dump(mode="json")}
-    out = STAGE.run(RefineParams(window=window), args, inputs)
+    out = STAGE.run(RefineParams(window=window, stereo=True), args, inputs)
     check_outputs(STAGE, out)
     assert out.meta["frames"] == [3]
     np.testing.assert_allclose(out["poses"][:, :, 3], [[0, 0, 0], [0, 0, 0.1], [0, 0, 0.2]], atol=2e-4)
