@@ -449,7 +449,11 @@ def _run(params: ResectParams, args: Mapping[str, Any], inputs: Inputs) -> Bundl
         "residual": found.residual,
     }
     tracks, moving = moving_tracks(points, landmarks, found)
-    meta = {"per_frame": found.facts, "landmark_source": params.landmarks, "without_coordinates": landmarks.lost}
+    meta: dict[str, Any] = {
+        "per_frame": found.facts,
+        "landmark_source": params.landmarks,
+        "without_coordinates": landmarks.lost,
+    }
     meta |= {"tracks": tracks, "moving_tracks": moving, "warnings": _moving_words(frames, tracks, moving)}
     return Bundle(arrays, meta)
 
