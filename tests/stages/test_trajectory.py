@@ -145,3 +145,21 @@ def test_what_segments_share_adds_up_and_what_they_do_not_adds_squared():
     one = (np.array([start, step]), own + shared @ np.swapaxes(shared, 1, 2), shared)
     found = chain([one] * 4, [RigidTransform.identity()] * 4)
     np.testing.assert_allclose(found.covariance[:, 2, 2], [k * 3e-3**2 + (k * 2e-3) ** 2 for k in range(5)], atol=1e-15)
+
+
+def test_refined_poses_take_the_place_of_resected_ones():
+    truth, levels, _ = broken_run(set())
+    segments, better = [], []
+    for (a, b), T_local_key in zip(((0, 3), (3, 6), (6, 7)), levels, strict=True):
+        local = np.array([(T_local_key @ truth[a].inverse() @ truth[i]).matrix34 for i in range(a, b + 1)])
+        better.append(local)
+        rough = local.copy()
+        rough[1:, :, 3] += 0.01
+        n = b - a + 1
+        arrays = {"poses": rough, "covariance": np.zeros((n, 6, 6)), "shared": NONE[:n]}
+        segments.append(Bundle(arrays, {"per_frame": [{"frame": i, "inliers": 9} for i in range(a, b + 1)]}))
+    inputs = {"segments": segments, "levels": [Bundle({}, {"T_local_left": T.to_list()}) for T in levels]}
+    inputs["refined"] = Bundle({"poses": np.concatenate(better)}, {})
+    out = STAGE.run(NoParams(), {"frames": list(range(8))}, inputs)
+    expected = [(levels[0] @ truth[0].inverse() @ T).matrix34 for T in truth]
+    np.testing.assert_allclose(out["poses"], expected, atol=1e-12)
