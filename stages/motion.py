@@ -154,20 +154,7 @@ def _rolled(
     if fitted is None or abs(fitted[0]) < roll.LEAST_DEG:
         return None
     found, upright = attempt(roll.similarity(fitted[0], fitted[1], shape), params)
-    if match_share(found) <= needed * share:
-        return None
-    return (*_level(a, b, found, upright, params), fitted[0])
-
-
-def _level(
-    a: Pyramid, b: Pyramid, found: Motion, upright: Derotation, params: MotionParams
-) -> tuple[Motion, Derotation]:
-    """A second pass: what of the motion a plane explains (the rest of the rotation, ground ahead) is undone, too."""
-    plane = roll.plane(found.column_disparity, found.row_disparity, matched(found.validity), found.level)
-    if plane is None or not np.isfinite((turn := Derotation(plane, upright.shape)).reach):
-        return found, upright
-    again = coarse_motion(a, b, params, turn)
-    return (again, turn) if match_share(again) > match_share(found) else (found, upright)
+    return (found, upright, fitted[0]) if match_share(found) > needed * share else None
 
 
 def matched_texture(found: Motion) -> bool:
@@ -225,7 +212,7 @@ def _run(params: MotionParams, args: Mapping[str, Any], inputs: Inputs) -> Bundl
 _GRID = ("row", "col")
 STAGE = Stage(
     name="motion",
-    version=2,
+    version=1,
     summary="coarse displacements of all points from one left frame to the next",
     params=MotionParams,
     inputs=("a", "b"),

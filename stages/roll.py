@@ -21,12 +21,6 @@ GAIN = 1.2
 """A rotation is believed if it raises the share of matches by a fifth; chance matches do not."""
 LEAST_DEG = 10.0
 """Degrees below which a rotation is left to the matcher: one to three per cent of the tracks are wrong up to there."""
-MOST = 3000
-"""Matches that a plane is fitted to; eight numbers need no more."""
-ROUNDS = 12
-"""Of reweighting."""
-WIDE = 16.0
-"""Coarse pixels of the first weights; halved each round down to one, since a similarity is no more than a start."""
 LEAST = 100
 """Coarse pixels, or matches, below which nothing is said of a rotation."""
 
@@ -65,53 +59,6 @@ def fit(
         return None
     turned = np.angle(ratio / (middle / abs(middle)))
     return math.degrees(float(np.angle(middle) + np.median(turned))), float(np.median(np.abs(ratio)))
-
-
-def plane(
-    column: NDArray[np.float32], row: NDArray[np.float32], matched: NDArray[np.bool_], level: int
-) -> Floats | None:
-    """Homography (3, 3) nearest to the displacements (row, col) of a coarse level: what a plane across the view does.
-
-    Least squares, reweighted by Cauchy's weights of a coarse pixel, so that what stands out of the plane counts little.
-    None where they are too few, or where it would stretch the image beyond twice its size.
-    """
-    if np.count_nonzero(matched) < LEAST:
-        return None
-    r, c = np.nonzero(matched)
-    step, scale = max(1, len(r) // MOST), 2.0**level
-    r, c = r[::step], c[::step]
-    p = np.stack([(c + 0.5) * scale - 0.5, (r + 0.5) * scale - 0.5], -1)
-    q = p + np.stack([column[r, c], row[r, c]], -1).astype(np.float64)
-    centre, unit = p.mean(0), max(float(np.ptp(p, axis=0).max()) / 2.0, 1.0)
-    p, q = (p - centre) / unit, (q - centre) / unit
-    (x, y), (u, v) = p.T, q.T
-    one, none = np.ones(len(x)), np.zeros(len(x))
-    rows = np.concatenate(
-        [
-            np.stack([x, y, one, none, none, none, -u * x, -u * y], -1),
-            np.stack([none, none, none, x, y, one, -v * x, -v * y], -1),
-        ]
-    )
-    wanted, h = np.concatenate([u, v]), _start(p, q)
-    for k in range(ROUNDS):
-        off = ((rows @ h - wanted).reshape(2, -1) * unit / scale) ** 2
-        weight = np.tile(1.0 / np.sqrt(1.0 + off.sum(0) / max(1.0, WIDE / 2.0**k) ** 2), 2)
-        h = np.linalg.lstsq(rows * weight[:, None], wanted * weight, rcond=None)[0]
-    H = np.append(h, 1.0).reshape(3, 3)
-    if not 0.25 < abs(float(np.linalg.det(H[:2, :2]))) < 4.0:
-        return None
-    to = np.array([[1 / unit, 0, -centre[0] / unit], [0, 1 / unit, -centre[1] / unit], [0, 0, 1.0]])
-    return np.asarray(np.linalg.inv(to) @ H @ to)
-
-
-def _start(p: Floats, q: Floats) -> Floats:
-    """Eight numbers of the similarity that most points (n, 2) agree with, by medians."""
-    a, b, half = p @ [1.0, 1.0j], q @ [1.0, 1.0j], len(p) // 2
-    ratio = (b[half:] - b[: len(b) - half]) / (a[half:] - a[: len(a) - half])
-    turn = np.median(ratio.real) + 1j * np.median(ratio.imag)
-    shift = b - turn * a
-    x, y = float(np.median(shift.real)), float(np.median(shift.imag))
-    return np.array([turn.real, -turn.imag, x, turn.imag, turn.real, y, 0.0, 0.0])
 
 
 def relative(found: tuple[float, float], known: Floats, shape: tuple[int, int]) -> tuple[float, float]:
