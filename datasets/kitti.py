@@ -18,7 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datasets import files
+from datasets.manifest_rig import LONGEST_BASELINE
 from datasets.protocol import CAMERAS, Sequence, Source
+from datasets.times import seconds
 from stages.errors import InputError
 from stages.geometry import Camera, Rig, RigidTransform, orthonormal
 
@@ -86,8 +88,8 @@ def _first(names: list[str]) -> str:
     return names[0] if names else "00"
 
 
-def _rows(path: Path, count: int, what: str) -> list[tuple[str, NDArray[np.float64]]]:
-    """Lines of a text file: (label or "", numbers); each must have ``count`` finite numbers."""
+def _rows(path: Path, count: int, what: str, gaps: bool = False) -> list[tuple[str, NDArray[np.float64]]]:
+    """Lines of a text file: (label or "", numbers); each must have ``count`` finite numbers, or only NaN for a gap."""
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
@@ -101,7 +103,8 @@ def _rows(path: Path, count: int, what: str) -> list[tuple[str, NDArray[np.float
             values = np.array([float(v) for v in numbers.split()])
         except ValueError:
             values = np.empty(0)
-        if values.size != count or not np.isfinite(values).all():
+        gap = gaps and np.isnan(values).all()
+        if values.size != count or not (gap or np.isfinite(values).all()):
             raise InputError(f"{path}, line {k}: not {count} numbers", remedy=f"correct that line of the {what}")
         out.append((label.strip(), values))
     return out
@@ -166,6 +169,11 @@ def read_rig(layout: Layout, width: int, height: int) -> tuple[Rig, RigidTransfo
     rig = Rig(cameras[0], cameras[1], T_right_left)
     if not rig.baseline > 0:
         raise InputError(f"{layout.calib}: the two cameras stand in one place", remedy="check the fourth column of P")
+    if rig.baseline > LONGEST_BASELINE:
+        raise InputError(
+            f"{layout.calib}: the baseline is {rig.baseline:g} m, which looks like millimetres",
+            remedy=f"did you mean {rig.baseline / 1000:g} m? the fourth column of P is focal length times metres",
+        )
     if T_right_left.translation[0] > 0.5 * rig.baseline:
         raise InputError(
             f"{layout.calib}: the right camera stands {T_right_left.translation[0]:g} m to the left of the left one",
@@ -185,46 +193,99 @@ def _listing(folder: Path) -> dict[str, Path]:
     return out
 
 
-def list_pairs(layout: Layout) -> tuple[tuple[str, ...], dict[str, list[Path]]]:
-    """Frame names in order and the files of each camera, every left with its right."""
-    left, right = (_listing(layout.folder / side) for side in layout.pair)
-    for ours, others, side in ((left, right, layout.pair[1]), (right, left, layout.pair[0])):
-        alone = [stem for stem in ours if stem not in others]
-        if alone:
-            more = f" (and {len(alone) - 1} more)" if len(alone) > 1 else ""
-            raise InputError(
-                f"{ours[alone[0]]} has no partner in {layout.folder / side}{more}",
-                remedy="add the missing image or remove this one",
-            )
-    names = tuple(sorted(left, key=lambda s: (len(s), s) if s.isdigit() else (0, s)))
+@dataclass(frozen=True)
+class Listing:
+    """Frame names in order, files of each camera by frame, and which lack a file, with the cause."""
+
+    names: tuple[str, ...]
+    paths: dict[str, dict[int, Path]]
+    lost: dict[int, str]
+
+
+def list_pairs(layout: Layout) -> Listing:
+    """The frames of both folders.
+
+    A frame of which one image is missing is lost, and so is a number that is left out of a running count. Where more
+    is missing than there, the folders do not belong together.
+    """
+    sides = {c: _listing(layout.folder / side) for c, side in zip(CAMERAS, layout.pair, strict=True)}
+    left, right = sides["left"], sides["right"]
+    present = {*left, *right}
+    alone = sorted(set(left) ^ set(right))
+    if len(alone) > len(present) - len(alone):
+        ours, side = (left, layout.pair[1]) if alone[0] in left else (right, layout.pair[0])
+        raise InputError(
+            f"{ours[alone[0]]} has no partner in {layout.folder / side} (and {len(alone) - 1} more)",
+            remedy="add the missing images or remove these",
+        )
+    names = sorted(present, key=lambda s: (len(s), s) if s.isdigit() else (0, s))
     if not names:
         raise InputError(
             f"{layout.folder / layout.pair[0]} holds no images", remedy=f"put files there: {', '.join(files.SUFFIXES)}"
         )
-    return names, {"left": [left[n] for n in names], "right": [right[n] for n in names]}
+    names = _counted(names)
+    lost, suffix = {}, next(iter({**left, **right}.values())).suffix
+    for k, name in enumerate(names):
+        absent = [
+            f"{side}/{name}{suffix}" for c, side in zip(CAMERAS, layout.pair, strict=True) if name not in sides[c]
+        ]
+        if absent:
+            lost[k] = f"{' and '.join(absent)} {'is' if len(absent) == 1 else 'are'} missing"
+    paths = {c: {k: sides[c][n] for k, n in enumerate(names) if k not in lost} for c in CAMERAS}
+    return Listing(tuple(names), paths, lost)
 
 
-def _sizes(paths: dict[str, list[Path]]) -> tuple[int, int, int]:
+def _counted(names: list[str]) -> list[str]:
+    """Names with the numbers that a running count leaves out; as they are where most do not count on by one."""
+    if len(names) < 3 or not all(name.isdigit() for name in names):
+        return names
+    numbers = [int(name) for name in names]
+    steps = np.diff(numbers)
+    if np.median(steps) != 1 or numbers[-1] - numbers[0] + 1 > 2 * len(names):
+        return names
+    given = dict(zip(numbers, names, strict=True))
+    return [given.get(k, f"{k:0{len(names[0])}d}") for k in range(numbers[0], numbers[-1] + 1)]
+
+
+def _sizes(paths: dict[str, dict[int, Path]]) -> tuple[int, int, int]:
     """Width, height and bits that all images share; those of PNG files are compared here, others when read."""
-    first = paths["left"][0]
+    first = next(iter(paths["left"].values()))
     wanted = files.png_header(first)
     if wanted is None:
         image = files.read_grey(first)
         wanted = (image.shape[1], image.shape[0], image.dtype.itemsize * 8)
-    for path in [p for c in CAMERAS for p in paths[c]]:
+    for path in [p for c in CAMERAS for p in paths[c].values()]:
         found = files.png_header(path)
         if found is not None:
             files.check_size(found, wanted, str(path))
     return wanted
 
 
-def _per_frame(path: Path, numbers: int, frames: int, what: str) -> list[NDArray[np.float64]]:
-    rows = [values for _, values in _rows(path, numbers, what)]
-    if len(rows) != frames:
+def _per_frame(
+    path: Path, numbers: int, listing: Listing, what: str
+) -> tuple[list[NDArray[np.float64] | None], list[int]]:
+    """A row a frame, and the lines they stand in; rows of the frames with images alone leave None for the others."""
+    rows = [values for _, values in _rows(path, numbers, what, gaps=what == "poses")]
+    frames, there = len(listing.names), [k for k in range(len(listing.names)) if k not in listing.lost]
+    if len(rows) == frames:
+        return list(rows), list(range(1, frames + 1))
+    if len(rows) != len(there):
+        missing = f" ({len(listing.lost)} of {frames} frames lack an image)" if listing.lost else ""
         raise InputError(
-            f"{path} has {len(rows)} {what} for {frames} pairs", remedy="give one line a pair, or remove the file"
+            f"{path} has {len(rows)} {what} for {len(there)} pairs{missing}",
+            remedy="give one line a pair, or remove the file",
         )
-    return rows
+    by_frame = dict(zip(there, rows, strict=True))
+    return [by_frame.get(k) for k in range(frames)], list(range(1, len(rows) + 1))
+
+
+def _times(path: Path, listing: Listing) -> tuple[tuple[float, ...], tuple[str, ...]]:
+    """Time of each frame, s, and warnings; between its neighbours where a frame without images has none."""
+    rows, lines = _per_frame(path, 1, listing, "times")
+    known = [k for k, row in enumerate(rows) if row is not None]
+    given = [float(row[0]) for row in rows if row is not None]
+    found, warnings = seconds(given, str(path), lines=lines)
+    return tuple(float(t) for t in np.interp(np.arange(len(rows)), known, found)), warnings
 
 
 def open_kitti(layout: Layout, digests: files.Digests) -> Sequence:
@@ -235,15 +296,20 @@ def open_kitti(layout: Layout, digests: files.Digests) -> Sequence:
     InputError
         A partner is missing, sizes or depths differ, a text file does not parse, or counts do not agree.
     """
-    names, paths = list_pairs(layout)
-    size = _sizes(paths)
+    listing = list_pairs(layout)
+    paths, size = listing.paths, _sizes(listing.paths)
     rig, T_reference_left = read_rig(layout, size[0], size[1])
-    truth = times = None
+    truth: tuple[RigidTransform | None, ...] | None = None
+    times: tuple[float, ...] | None = None
+    warnings: tuple[str, ...] = ()
     if layout.poses is not None:
-        rows = _per_frame(layout.poses, 12, len(names), "poses")
-        truth = tuple(_pose(row, k, layout.poses) @ T_reference_left for k, row in enumerate(rows, start=1))
+        rows, _ = _per_frame(layout.poses, 12, listing, "poses")
+        truth = tuple(
+            None if row is None or np.isnan(row).all() else _pose(row, k, layout.poses) @ T_reference_left
+            for k, row in enumerate(rows, start=1)
+        )
     if layout.times is not None:
-        times = tuple(float(row[0]) for row in _per_frame(layout.times, 1, len(names), "times"))
+        times, warnings = _times(layout.times, listing)
 
     def image(frame: int, camera: str) -> Source:
         return files.image_source(paths[camera][frame], frame, camera, size, digests)
@@ -251,13 +317,15 @@ def open_kitti(layout: Layout, digests: files.Digests) -> Sequence:
     return Sequence(
         name=layout.name,
         rig=rig,
-        frames=len(names),
+        frames=len(listing.names),
         image=image,
-        frame_names=names,
+        frame_names=listing.names,
         times=times,
         truth=truth,
         truth_source=f"poses of {layout.poses.name}, as recorded" if layout.poses is not None else "",
+        lost=listing.lost,
         defaults=STREET,
+        warnings=warnings,
     )
 
 

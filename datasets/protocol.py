@@ -77,6 +77,7 @@ class Sequence:
     truth_dem : exact elevations on any lattice of any frame whose pose in the truth frame is given.
     truth_disparity : ``truth_disparity(frame)``: source of the exact disparity of a pair.
     evaluation_window : (x_min, y_min, x_max, y_max), metres, local frame of a basic pair: where a DEM is judged.
+    lost : frames that have no pair of images, and why; nothing asks for their images.
     defaults : dotted configuration that suits the sequence.
     notes : facts that the report repeats.
     warnings : what is suspicious but possible, one line each with the figure; a run prints them and goes on.
@@ -102,6 +103,7 @@ class Sequence:
     truth_dem: TruthDem | None = None
     truth_disparity: Callable[[int], Source] | None = None
     evaluation_window: tuple[float, float, float, float] | None = None
+    lost: Mapping[int, str] = field(default_factory=dict)
     defaults: Mapping[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()

@@ -22,11 +22,12 @@ from pipeline import verdicts
 from pipeline.location import Location
 from pipeline.store import Ref, Store, at
 from pipeline.task import Refs, Spec, ensure
-from pipeline.verdicts import Look, Verdict
+from pipeline.verdicts import Verdict
 from stages.declare import NoParams
 from stages.epipolar import beyond_infinity
 from stages.errors import RilleError
 from stages.ground import inverse_depth
+from stages.sight import Look, look
 
 Floats = NDArray[np.float64]
 
@@ -78,7 +79,7 @@ def check(
         print(verdict, flush=True)
         found.append(verdict)
     if inspection.match is not None and len(inspection.match.left):
-        draw(path, sequence.name, sequence.frame_names[chosen[0]], inspection.match)
+        draw(path, sequence.name, sequence.frame_names[inspection.frames[0]], inspection.match)
         print(f"picture       {path}")
     counts = {level: sum(v.level == level for v in found) for level in ("OK", "WARN", "FAIL")}
     print(f"{sequence.name}: {counts['FAIL']} fail, {counts['WARN']} to look at, {counts['OK']} fine")
@@ -110,12 +111,16 @@ class Inspection:
 
     def __post_init__(self) -> None:
         self.config = configuration.build(configuration.expand(self.sequence.defaults))
+        self.lost = {f: why for f, why in self.sequence.lost.items() if f in self.frames}
+        self.frames = tuple(f for f in self.frames if f not in self.lost)
         self._shared: dict[str, Ref] = {}
 
     def verdicts(self) -> Any:
         """All verdicts, the cheap ones first."""
         s = self.sequence
         yield Verdict("OK", "sequence", f"{s.name}, {len(self.frames)} of {s.frames} pairs")
+        for frame, why in self.lost.items():
+            yield Verdict("WARN", "images", f"frame {s.frame_names[frame]}: {why}", "it will have no pose; bridged")
         yield from (Verdict("WARN", "input", line) for line in s.warnings)
         yield from verdicts.judge_rig(s.rig)
         yield from verdicts.judge_times(None if s.times is None else [s.times[k] for k in self.frames])
@@ -146,7 +151,7 @@ class Inspection:
                     continue
                 image = np.asarray(bundle["image"])
                 sizes.add((image.shape[1], image.shape[0], str(image.dtype)))
-                looks[camera][frame] = verdicts.look(image, np.asarray(bundle["valid"]))
+                looks[camera][frame] = look(image, np.asarray(bundle["valid"]))
                 digests[camera][frame] = hashlib.sha256(image.tobytes()).hexdigest()
         for damage in list(self.broken.values())[:FIRST_NAMED]:
             yield Verdict("FAIL", "images", damage.message, damage.remedy)

@@ -19,6 +19,7 @@ from stages.crosscheck import PIXEL_CENTRE
 from stages.declare import Bundle
 from stages.errors import InputError
 from stages.geometry import Camera, Rig, RigidTransform
+from stages.trajectory import world_poses
 
 LEFT, RIGHT = 1, 2
 """Numbers of the two cameras; the rig has number 1, too, and the left camera is its origin."""
@@ -52,7 +53,7 @@ def build(
 
     Parameters
     ----------
-    trajectory : result of that stage; frames without a pose (NaN) are left out.
+    trajectory : result of that stage; frames without a pose in the world are left out.
     names : image name of each frame, written as ``left/NAME`` and ``right/NAME``.
     segments : results of ``track`` and ``resect`` of each segment.
     """
@@ -61,7 +62,7 @@ def build(
     model = pycolmap.Reconstruction()
     poses = {
         int(f): RigidTransform.from_matrix(pose)
-        for f, pose in zip(trajectory.meta["frames"], np.asarray(trajectory["poses"]), strict=True)
+        for f, pose in zip(trajectory.meta["frames"], world_poses(trajectory), strict=True)
         if np.isfinite(pose).all()
     }
     cameras = [_camera(pycolmap, number, camera) for number, camera in ((LEFT, rig.left), (RIGHT, rig.right))]

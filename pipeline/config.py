@@ -23,7 +23,10 @@ from stages.errors import ConfigError
 STAGE_MODULES: dict[str, str] = {
     "undistort": "stages.undistort",
     "pyramid": "stages.pyramid",
+    "sight": "stages.sight",
     "motion": "stages.motion",
+    "sides": "stages.sides",
+    "continuity": "stages.continuity",
     "select": "stages.select",
     "hfvm": "stages.hfvm",
     "orientation": "stages.orientation",
@@ -33,6 +36,7 @@ STAGE_MODULES: dict[str, str] = {
     "locus": "stages.locus",
     "track": "stages.track",
     "resect": "stages.resect",
+    "refine": "stages.refine",
     "trajectory": "stages.trajectory",
     "pose": "stages.pose",
     "footprint": "stages.footprint",

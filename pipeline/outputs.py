@@ -13,7 +13,6 @@ from pipeline import products as files
 from pipeline.conventions import describe
 from pipeline.dag import Graph, Handle
 from pipeline.report import RunView, TaskRow, write_report
-from pipeline.report.artifacts import by_frame
 from pipeline.report.canvas import ground_limits
 from pipeline.report.comparison import compare
 from pipeline.store import Store
@@ -23,6 +22,7 @@ from stages.declare import Array, Bundle
 from stages.lattice import Lattice, mosaic, union
 from stages.risk import REASONS
 from stages.shading import hillshade, slope_deg
+from stages.trajectory import world_poses
 
 SLOPE = Array("slope", ("row", "col"), "float32", "degree", "inclination of the terrain", "nan", "world")
 Lookup = Callable[[Any], Bundle | None]
@@ -79,11 +79,14 @@ def _write_trajectories(folder: Path, view: RunView) -> None:
     stamps = [float(f) if times is None else times[f] for f in view.frames]
     trajectory, compared = view.bundle(view.products.trajectory), compare(view)
     if trajectory is not None:
-        poses = np.asarray(trajectory["poses"])
-        files.write_trajectory_kitti(folder / "trajectory.kitti", poses)
-        files.write_trajectory_tum(folder / "trajectory.tum", poses, stamps)
+        files.write_trajectory_kitti(folder / "trajectory.kitti", world_poses(trajectory))
+        files.write_trajectory_tum(folder / "trajectory.tum", world_poses(trajectory), stamps)
+        for number in range(len(trajectory.meta.get("pieces", ()))):
+            if number != trajectory.meta["main"]:
+                path = folder / f"trajectory.piece{number + 1}.tum"
+                files.write_trajectory_tum(path, world_poses(trajectory, number), stamps)
     if compared is not None:
-        positions = by_frame(view, trajectory, "poses")[:, :, 3] if trajectory is not None else None
+        positions = world_poses(trajectory)[:, :, 3] if trajectory is not None else None
         columns = {"frame": view.frames, "name": [names[f] for f in view.frames], "time_s": stamps}
         columns |= {} if positions is None else {f"{a}_m": positions[:, k].tolist() for k, a in enumerate("xyz")}
         columns |= {f"crosscheck_{a}_m": compared.poses[:, k, 3].tolist() for k, a in enumerate("xyz")}

@@ -2,11 +2,11 @@
 
 ::
 
-    image -> undistort -> pyramid -+-> motion (N, N+1) -+-> select: which pairs are basic
+    image -> undistort -> pyramid -+-> motion (N, N+1) -+-> continuity -> select: which pairs are basic
              (if needed)           |                    +-> track (segment) --+
                                    |                                          |
                                    +-> hfvm (basic pair) -+-> level ----------+-> resect (segment) -> trajectory
-                                                          |     |               (landmarks)               |
+                                                          |     |               (landmarks)  (refine)     |
         given rig --+-> orientation (basic pair) <--------+     |                                         |
                     |       +-> rig -> calibration -------+-----+-> locus (local frame)                   |
                     |           (pooled; into level,      |           +-> risk, path (local)              |
@@ -16,6 +16,10 @@
                     |                                           +-> merge (world tile) -> risk, path (mission)
                     +-> crosscheck (window; images of both cameras) -> crosscheck_join -> agreement <- trajectory
     leaves: accuracy (trajectory, crosscheck), dem_accuracy (local and merged DEM), path_check
+
+Frames that show no motion (black, foreign, sides exchanged) are lost: ``continuity`` finds them by ``sight`` (what
+each pair looks like), the motions, and where it asks for them bridges (motions over a lost frame) and ``sides`` (left
+against right).
 
 A segment needs landmarks only relative to its own basic pair, so all segments run at once; absolute poses are one
 cheap scan (``trajectory``), and Locus then runs a second time, straight on the shared world lattice: nothing is
@@ -31,6 +35,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from collections.abc import Sequence as Series
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -42,7 +47,7 @@ from pipeline.dag import Graph, Handle
 from pipeline.task import Ref
 from stages.crosscheck import windows
 from stages.declare import NoParams, Params
-from stages.errors import DegenerateError
+from stages.errors import DegenerateError, InputError
 from stages.footprint import Box, tile_lattice
 from stages.geometry import RigidTransform
 from stages.lattice import Lattice, union
@@ -57,6 +62,7 @@ class Products:
 
     images: dict[int, Handle] = field(default_factory=dict)
     undistorted: dict[int, Handle] = field(default_factory=dict)
+    continuity: Handle | None = None
     select: Handle | None = None
     orientations: dict[int, Handle] = field(default_factory=dict)
     rigs: dict[int, Handle] = field(default_factory=dict)
@@ -71,6 +77,7 @@ class Products:
     local_path: dict[int, Handle] = field(default_factory=dict)
     tracks: list[Handle] = field(default_factory=list)
     resections: list[Handle] = field(default_factory=list)
+    refined: Handle | None = None
     world_dem: dict[int, Handle] = field(default_factory=dict)
     seams: dict[int, Handle] = field(default_factory=dict)
     seam_audit: Handle | None = None
@@ -79,6 +86,7 @@ class Products:
     risk: Handle | None = None
     path: Handle | None = None
     accuracy: Handle | None = None
+    accuracy_pieces: dict[int, Handle] = field(default_factory=dict)
     local_dem_accuracy: dict[int, Handle] = field(default_factory=dict)
     dem_accuracy: Handle | None = None
     truth_risk: Handle | None = None
@@ -93,44 +101,104 @@ class Reconstruction:
         self.products = Products()
         self._sources: dict[str, Handle] = {}
         self._images: dict[tuple[int, str], Handle] = {}
+        self._pyramids: dict[tuple[int, str], Handle] = {}
 
     def build(self) -> Products:
         """Lay out everything that is known beforehand; the rest follows by expansion."""
-        self.left = {f: self._pyramid(f, "left") for f in self.frames}
-        self.motion = {
-            a: self._node("motion", f"motion/{a}-{b}", self._turn(a, b), a=self.left[a], b=self.left[b])
-            for a, b in zip(self.frames, self.frames[1:], strict=False)
-        }
-        self._match(self.frames[0])  # basic by any rule, so that its matching need not wait for the choice
-        if self.config.crosscheck.enabled and len(self.frames) > 1:
+        self.whole = [f for f in self.frames if f not in self.sequence.lost]
+        if not self.whole:
+            raise InputError("no chosen frame has both images", remedy="choose others with --frames")
+        self.left = {f: self._pyramid(f, "left") for f in self.whole}
+        self.motion: dict[tuple[int, int], Handle] = {}
+        for a, b in pairwise(self.whole):
+            self._motion(a, b)
+        self._match(self.whole[0])  # basic unless it is lost, so that its matching need not wait for the choice
+        if self.config.crosscheck.enabled and len(self.whole) > 1:
             self._crosscheck()
-        self.products.select = self._node(
-            "select", "select", {"frames": len(self.frames)}, motions=list(self.motion.values())
-        )
-        self.graph.expand([self.products.select], self._after_select)
+        self.sights = [
+            self._node("sight", f"sight/{f}", {"frame": f}, left=self._image(f, "left"), right=self._image(f, "right"))
+            for f in self.whole
+        ]
+        self._continuity({}, {}, 0)
         return self.products
+
+    def _continuity(self, bridges: Mapping[tuple[int, int], Handle], sides: Mapping[int, Handle], turn: int) -> None:
+        """Ask which frames are lost; while more is to be known for the answer, find that and ask again."""
+        found = self._node(
+            "continuity",
+            f"continuity/{turn}" if turn else "continuity",
+            {"frames": self.whole} | ({"bridges": list(bridges)} if bridges else {}),
+            sights=self.sights,
+            motions=[self.motion[step] for step in pairwise(self.whole)],
+            bridges=list(bridges.values()),
+            sides=list(sides.values()),
+        )
+
+        def answer(ref: Ref) -> None:
+            asks = ref.meta["asks"]
+            if not any(asks.values()):
+                self.products.continuity = found
+                self._after_continuity(ref)
+                return
+            more = {(a, b): self._motion(a, b) for a, b in asks["bridges"]}
+            looked = {f: self._sides(f) for f in asks["sides"]}
+            self._continuity({**bridges, **more}, {**sides, **looked}, turn + 1)
+
+        self.graph.expand([found], answer)
+
+    def _motion(self, a: int, b: int) -> Handle:
+        if (a, b) not in self.motion:
+            ports = {"a": self.left[a], "b": self.left[b]}
+            self.motion[a, b] = self._node("motion", f"motion/{a}-{b}", self._turn(a, b), **ports)
+        return self.motion[a, b]
+
+    def _sides(self, frame: int) -> Handle:
+        args = {"frame": frame, "rig": self.sequence.rig.to_dict()}
+        return self._node("sides", f"sides/{frame}", args, left=self.left[frame], right=self._pyramid(frame, "right"))
+
+    def _after_continuity(self, continuity: Ref) -> None:
+        """Frames that the trajectory goes through are known: choose the basic pairs among them."""
+        p, meta = self.products, continuity.meta
+        self.chain: list[int] = list(meta["chain"])
+        missing = [{"frame": f, "cause": why} for f, why in self.sequence.lost.items() if f in self.frames]
+        self.lost = sorted([*missing, *meta["lost"]], key=lambda item: item["frame"])
+        for frame in [f for f in p.disparity if f not in self.chain]:
+            del p.disparity[frame], p.orientations[frame]
+        unfit = {"unfit": [self.chain.index(f) for f in meta["unfit"]]} if meta["unfit"] else {}
+        steps = [self._motion(a, b) for a, b in pairwise(self.chain)]
+        p.select = self._node("select", "select", {"frames": len(self.chain)} | unfit, motions=steps)
+        self.graph.expand([p.select], self._after_select)
 
     def _after_select(self, select: Ref) -> None:
         p = self.products
-        basic = [self.frames[i] for i in select.meta["basic"]]
-        segments = [[self.frames[i] for i in part] for part in select.meta["segments"]]
-        for pair in basic:
+        self.basic = [self.chain[i] for i in select.meta["basic"]]
+        segments = [[self.chain[i] for i in part] for part in select.meta["segments"]]
+        for pair in self.basic:
             self._match(pair)
-        self._rigs(basic)
-        for pair in basic:
+        self._rigs(self.basic)
+        for pair in self.basic:
             self._basic_pair(pair)
         for segment in segments:
             self._segment(segment)
         p.trajectory = self._node(
             "trajectory",
             "trajectory",
-            {"frames": list(self.frames)},
+            {"frames": list(self.frames)} | ({"lost": self.lost} if self.lost else {}),
             segments=p.resections,
-            levels=[p.level[s[0]] for s in segments] or [p.level[basic[0]]],
+            levels=[p.level[s[0]] for s in segments] or [p.level[self.basic[0]]],
+            **self._refined([s[0] for s in segments]),
         )
         self._assess_trajectory()
-        for pair in basic:
-            p.world_dem[pair] = self._world_dem(pair, basic[0], p.trajectory)
+        self.graph.expand([p.trajectory], self._after_trajectory)
+
+    def _after_trajectory(self, trajectory: Ref) -> None:
+        """The world is that of the largest unbroken piece: its models, straight on the world lattice."""
+        p = self.products
+        assert p.trajectory is not None
+        first, last = trajectory.meta["pieces"][trajectory.meta["main"]]
+        pairs = [k for k in self.basic if first <= k <= last and trajectory.meta["positions"][self.frames.index(k)]]
+        for pair in pairs:
+            p.world_dem[pair] = self._world_dem(pair, pairs[0], p.trajectory)
         side, margin = TILE_CELLS, self.config.merge.margin
         footprints = [
             self._node("footprint", f"footprint/{pair}", {"side": side, "margin": margin}, dem=dem)
@@ -223,7 +291,7 @@ class Reconstruction:
             f"track/{key}",
             {"frames": segment},
             frames=[self.left[f] for f in segment],
-            motions=[self.motion[f] for f in segment[:-1]],
+            motions=[self.motion[step] for step in pairwise(segment)],
         )
         p.tracks.append(track)
         # landmarks come from the disparity, or (resect.landmarks = "dem") where rays meet the local elevation model
@@ -241,10 +309,28 @@ class Reconstruction:
             )
         )
 
+    def _refined(self, keys: list[int]) -> dict[str, Handle]:
+        """All segments adjusted jointly with their landmarks, where that is wanted."""
+        p = self.products
+        if not (self.config.refine.enabled and keys and self.config.resect.landmarks == "disparity"):
+            return {}
+        args = {"pairs": self.basic, "resect": self.config.resect.model_dump(mode="json")}
+        p.refined = self._node(
+            "refine",
+            "refine",
+            args,
+            tracks=p.tracks,
+            resections=p.resections,
+            levels=[p.level[k] for k in keys],
+            disparities=[p.disparity[k] for k in self.basic],
+            rigs=[self.calibration[k] for k in self.basic],
+        )
+        return {"refined": p.refined}
+
     def _crosscheck(self) -> None:
         """Structure from motion by another program, in windows; it knows nothing of our trajectory, nor we of its."""
         p, rig = self.products, self.sequence.rig.to_dict()
-        for window in windows(self.frames, self.config.crosscheck):
+        for window in windows(self.whole, self.config.crosscheck):
             p.crosschecks.append(
                 self._node(
                     "crosscheck",
@@ -254,9 +340,7 @@ class Reconstruction:
                     right=[self._image(f, "right") for f in window],
                 )
             )
-        p.crosscheck = self._node(
-            "crosscheck_join", "crosscheck_join", {"frames": list(self.frames)}, windows=p.crosschecks
-        )
+        p.crosscheck = self._node("crosscheck_join", "crosscheck_join", {"frames": self.whole}, windows=p.crosschecks)
 
     def _after_world(self, *refs: Ref) -> None:
         """Where the models lie is known: audit their seams, and level exposures before they are merged."""
@@ -321,9 +405,22 @@ class Reconstruction:
                 "frames": list(self.frames),
             },
         )
-        p.accuracy = self._node("accuracy", "accuracy", {}, trajectory=p.trajectory, truth=truth)
+        self.graph.expand([p.trajectory], lambda found: self._accuracy_of_pieces(found, truth))
         if p.crosscheck is not None:
             self.graph.expand([p.crosscheck], lambda found: self._crosscheck_accuracy(found, truth))
+
+    def _accuracy_of_pieces(self, found: Ref, truth: Handle) -> None:
+        """Each unbroken piece against truth; a whole trajectory as it is."""
+        p, pieces = self.products, found.meta["pieces"]
+        assert p.trajectory is not None
+        for number in range(len(pieces)):
+            main = number == found.meta["main"]
+            args = {"piece": number} if len(pieces) > 1 else {}
+            label = "accuracy" if main else f"accuracy/piece/{number + 1}"
+            judged = self._node("accuracy", label, args, trajectory=p.trajectory, truth=truth)
+            p.accuracy_pieces[number] = judged
+            if main:
+                p.accuracy = judged
 
     def _crosscheck_accuracy(self, found: Ref, truth: Handle) -> None:
         """The other program's trajectory against truth, where it has one there."""
@@ -400,7 +497,10 @@ class Reconstruction:
         )
 
     def _pyramid(self, frame: int, camera: str) -> Handle:
-        return self._node("pyramid", f"pyramid/{camera}/{frame}", {}, image=self._image(frame, camera))
+        if (frame, camera) not in self._pyramids:
+            image = self._image(frame, camera)
+            self._pyramids[frame, camera] = self._node("pyramid", f"pyramid/{camera}/{frame}", {}, image=image)
+        return self._pyramids[frame, camera]
 
     def _image(self, frame: int, camera: str) -> Handle:
         """One image as an ideal camera would have taken it."""
@@ -481,6 +581,8 @@ def _centre(box: Mapping[str, Any]) -> list[float]:
 
 def _heading(trajectory: Mapping[str, Any]) -> list[float]:
     """Mean driving direction (dx, dy) in the world: from the first to the last position; ahead where it rests."""
-    (x0, y0, _), (x1, y1, _) = trajectory["positions"][0], trajectory["positions"][-1]
+    first, last = trajectory["pieces"][trajectory["main"]]
+    at = [trajectory["positions"][trajectory["frames"].index(frame)] for frame in (first, last)]
+    (x0, y0, _), (x1, y1, _) = at
     dx, dy = x1 - x0, y1 - y0
     return [dx, dy] if dx * dx + dy * dy > 0 else [0.0, 1.0]

@@ -12,10 +12,10 @@ import hashlib
 import os
 import shutil
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from datasets.protocol import Sequence
 from pipeline import config as configuration
@@ -26,6 +26,9 @@ from pipeline.location import Location, hints_folder, locate
 from pipeline.store import GoneError, at
 from stages.declare import Bundle
 from stages.errors import ConfigError, RilleError
+
+if TYPE_CHECKING:
+    from pipeline.reconstruct import Products
 
 COMPLETE, FAILED, HOLES = 0, 1, 3
 DISTRIBUTIONS = (
@@ -88,11 +91,15 @@ def choose_frames(text: str | None, count: int) -> tuple[int, ...]:
 def settings(options: Options) -> tuple[Sequence, Any, str]:
     """Sequence, configuration, and who stated the vehicle's limits."""
     from datasets.registry import open_sequence
+    from pipeline.verdicts import judge_rig
 
     given = configuration.read_toml(options.config) if options.config else {}
     configuration.merge(given, configuration.parse_assignments(options.assignments))
     for_dataset, for_stages = configuration.split_dataset(given)
     sequence = open_sequence(options.sequence, for_dataset, hints_folder(locate(options.cache)) / "files.json")
+    doubts = [f"{v.text}: {v.remedy}" for v in judge_rig(sequence.rig) if v.level != "OK"]
+    if doubts and not any("baseline" in line for line in sequence.warnings):
+        sequence = replace(sequence, warnings=(*sequence.warnings, *doubts))
     vehicle, source = {}, "default rover of the program (neither the sequence nor the user states one)"
     if sequence.vehicle is not None:
         vehicle, source = {"vehicle": sequence.vehicle.model_dump()}, f"sequence {sequence.name}"
@@ -166,7 +173,7 @@ def _reconstruct(options: Options) -> int:
         shutil.rmtree(folder)
         warn_of_results(graph)
         print(f"{earlier.parent / earlier.readlink()}  cached {result.total().cached}, nothing new: that run stands")
-        return COMPLETE
+        return _posed_all(products)
 
     from pipeline import ledger, outputs
     from pipeline.report import RunView
@@ -200,7 +207,7 @@ def _reconstruct(options: Options) -> int:
     total = result.total()
     print(f"{folder}  computed {total.computed}, cached {total.cached}, missing {total.failed + total.skipped}")
     if result.ok:
-        return COMPLETE
+        return _posed_all(products)
     _list_missing(graph, folder)
     return HOLES
 
@@ -212,6 +219,20 @@ def lay_out(sequence: Sequence, config: Any, frames: tuple[int, ...]) -> Graph:
     graph = Graph()
     Reconstruction(graph, sequence, config, frames).build()
     return graph
+
+
+def _posed_all(products: Products) -> int:
+    """Exit code of a run without failures: frames without a pose in the world are holes, too, and said on stderr."""
+    handle = products.trajectory
+    if handle is None or handle.ref is None:
+        return COMPLETE
+    meta = handle.ref.meta
+    lost, pieces, total = len(meta["lost"]), len(meta["pieces"]), len(meta["frames"])
+    if not lost and pieces == 1:
+        return COMPLETE
+    broken = f", in {pieces} pieces" if pieces > 1 else ""
+    print(f"rille: incomplete: {total - lost} of {total} frames posed{broken}; see the warnings", file=sys.stderr)
+    return HOLES
 
 
 def _known_stages(names: frozenset[str]) -> None:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from datasets.protocol import Rows
 from stages.geometry import Rig, RigidTransform
-from stages.pyramid import grey
+from stages.sight import Look
 
 Floats = NDArray[np.float64]
 Level = Literal["OK", "WARN", "FAIL"]
@@ -35,9 +35,6 @@ UNLIKE_GREY = 1.5
 
 CLIPPED = 0.2
 """Share of pixels at either end of the scale; sky may be white, the ground may not."""
-
-LOW, HIGH = 2.0, 253.0
-"""Grey values at which an 8-bit image is taken as clipped."""
 
 UNIFORM = 1.0
 """Grey levels of deviation over an image, below which it shows nothing."""
@@ -75,42 +72,6 @@ class Verdict:
 
     def __str__(self) -> str:
         return f"{self.level:4s}  {self.subject:12s}  {self.text}" + (f": {self.remedy}" if self.remedy else "")
-
-
-@dataclass(frozen=True)
-class Look:
-    """One image in figures: mean grey 0..255, deviation, shares of dark and bright clipped pixels, sharpness."""
-
-    mean: float
-    deviation: float
-    dark: float
-    bright: float
-    sharpness: float
-
-
-def look(image: NDArray[Any], valid: NDArray[np.uint8]) -> Look:
-    """Figures of an image (row, col); ``valid`` not zero where usable.
-
-    Sharpness is the share of detail between one and two pixels in that between two and four, RMS: it hardly depends on
-    what is shown, but falls with blur.
-    """
-    level = grey(image)
-    usable = (valid != 0) & np.isfinite(level)
-    values = level[usable]
-    if not values.size:
-        return Look(math.nan, 0.0, 0.0, 0.0, math.nan)
-    level = np.where(usable, level, values.mean())
-    once, twice = (cv2.GaussianBlur(level, (0, 0), sigma) for sigma in (1.0, 2.0))
-    inner = cv2.erode(usable.astype(np.uint8), np.ones((13, 13), np.uint8)) != 0
-    coarse = float(np.sqrt(((once - twice)[inner] ** 2).mean())) if inner.any() else 0.0
-    fine = float(np.sqrt(((level - once)[inner] ** 2).mean())) if inner.any() else 0.0
-    return Look(
-        float(values.mean()),
-        float(values.std()),
-        float((values <= LOW).mean()),
-        float((values >= HIGH).mean()),
-        fine / coarse if coarse > 0 else math.nan,
-    )
 
 
 def judge_rig(rig: Rig) -> list[Verdict]:

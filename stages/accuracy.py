@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from stages.accuracy_parts import Metric, along, angle, inverse, metric, posed, rms, square
 from stages.declare import Array, Bundle, Inputs, NoParams, Stage
 from stages.errors import InputError
+from stages.trajectory import world_poses
 from stages.trajectory_error import against_claims, by_cause, by_shares, by_steps
 
 Floats = NDArray[np.float64]
@@ -227,7 +228,8 @@ def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     trajectory, truth = inputs["trajectory"], inputs["truth"]
     given = list(trajectory.meta["frames"])
     wanted = given if truth.meta["frames"] is None else list(truth.meta["frames"])
-    estimate, true = by_frame(np.asarray(trajectory["poses"]), given, wanted), np.asarray(truth["poses"])
+    poses = world_poses(trajectory, int(args["piece"]) if "piece" in args else None)
+    estimate, true = by_frame(poses, given, wanted), np.asarray(truth["poses"])
     has_pose, has_truth = posed(estimate), posed(true)
     if len(estimate) == len(true) and not (has_pose & has_truth).any():
         arrays, metrics = _nothing(estimate), _counts(has_pose, has_truth)
@@ -239,7 +241,7 @@ def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
 
 STAGE = Stage(
     name="accuracy",
-    version=3,
+    version=4,
     summary="trajectory against truth: ATE, RPE, displacements, drift, KITTI",
     params=NoParams,
     inputs=("trajectory", "truth"),

@@ -134,6 +134,22 @@ def flag(arrays: Mapping[str, Floats], params: AgreementParams) -> tuple[NDArray
     return flags, limits
 
 
+def unbroken(theirs: NDArray[np.int64], ours: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Pieces (frame,) that are unbroken in both trajectories, -1 where the other program has none.
+
+    A frame that we lost counts to our piece before it, so that the other program's pose of it is shown.
+    """
+    posed = np.flatnonzero(ours >= 0)
+    if not posed.size:
+        return theirs
+    before = posed[np.maximum(np.searchsorted(posed, np.arange(len(ours)), side="right") - 1, 0)]
+    both = np.stack([theirs, ours[before]])
+    known = theirs >= 0
+    piece = np.full(len(theirs), -1, dtype=np.int64)
+    piece[known] = np.unique(both[:, known], axis=1, return_inverse=True)[1].reshape(-1)
+    return piece
+
+
 def _metrics(arrays: Mapping[str, Floats], facts: Mapping[str, Any], length: float) -> dict[str, Metric]:
     def rms(name: str) -> float | None:
         values = arrays[name][np.isfinite(arrays[name])]
@@ -167,6 +183,8 @@ def _run(params: AgreementParams, args: Mapping[str, Any], inputs: Inputs) -> Bu
     ours, theirs = np.asarray(trajectory["poses"]), by_frame(np.asarray(other["piece_poses"]), given, frames)
     number = dict(zip(given, np.asarray(other["piece"]).tolist(), strict=True))
     piece = np.array([number.get(f, -1) for f in frames], dtype=np.int64)
+    if "piece" in trajectory.arrays:
+        piece = unbroken(piece, np.asarray(trajectory["piece"], dtype=np.int64))
     arrays, facts = compare(ours, theirs, piece)
     flags, limits = flag(arrays, params)
     compared = np.isfinite(arrays["distance"])
@@ -200,7 +218,7 @@ def _run(params: AgreementParams, args: Mapping[str, Any], inputs: Inputs) -> Bu
 
 STAGE = Stage(
     name="agreement",
-    version=1,
+    version=2,
     summary="trajectory against the crosscheck's",
     params=AgreementParams,
     inputs=("trajectory", "crosscheck"),

@@ -67,7 +67,7 @@ def landmarks_from_disparity(
     cameras, and a distance whose standard deviation is below ``max_depth_ratio`` of it. ``disparity_sigma`` (n,) is in
     pixels; NaN refuses a point (see :func:`relief`).
     """
-    disparity, matched = _disparity_at(points, column_disparity, row_disparity, validity)
+    disparity, matched = matches_at(points, column_disparity, row_disparity, validity)
     rays = rig.left.rays(points)
     depth = _triangulate(rays, points + disparity, rig)
     right, _ = _right_image(rays, depth, rig)
@@ -84,7 +84,7 @@ def _known(points: Floats) -> Bools:
     return np.asarray(np.isfinite(points).all(axis=1))
 
 
-def _disparity_at(
+def matches_at(
     points: Floats, column: NDArray[np.float32], row: NDArray[np.float32], validity: NDArray[np.uint8]
 ) -> tuple[Floats, Bools]:
     """Disparity vectors (n, 2) by bilinear interpolation, and whether the four neighbours are matched and agree."""

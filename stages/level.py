@@ -30,6 +30,10 @@ SAMPLES = 5000  # matched pixels that the plane is fitted to: three parameters n
 MARGIN = 0.05  # share of the camera's height that the range of elevations is widened by: a low rock, a kerb
 
 
+BEYOND = 3.0  # standard deviations that a match lies beyond infinity, which no noise explains
+SWAPPED = 0.5  # share of such matches: nearly all where left and right are swapped
+
+
 class LevelParams(Params):
     """Parameters of the stage ``level``."""
 
@@ -94,6 +98,12 @@ def level(
     """
     rays, rho, sigma = _samples(np.asarray(column_disparity), np.asarray(row_disparity), usable, rig, params)
     vertical, source = _given_vertical(up, initial_up, pitch)
+    beyond = float(np.mean(rho < -BEYOND * sigma)) if rho.size else 0.0
+    if beyond > SWAPPED:
+        raise DegenerateError(
+            f"{beyond:.0%} of the matches lie beyond infinity",
+            remedy="check left/right order, they seem swapped, and the sign of the baseline",
+        )
     rng = np.random.default_rng(params.seed)
     ground = fit_plane(rays, rho, sigma, lambda n: _allowed(n, vertical, params), params.relief, rng)
     R_local_left = level_rotation(ground.up if vertical is None else vertical)

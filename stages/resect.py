@@ -10,8 +10,14 @@ is that weighted one in units of ``pixel_sigma``; for exact landmarks it is the 
 
 Covariances here are 6 x 6 of ``(dt, dtheta)`` in the destination frame: position error in metres, then the rotation
 vector ``R_true = exp(dtheta) R`` in radians. They tell of the measurements and of a shared error of the disparities;
-errors of the calibration (focal length, direction of the camera in the vehicle) are not in them. They are those of
-independent errors times what the errors of a segment's frames go together by (:func:`scatter_of_blocks`).
+errors of the calibration (focal length, direction of the camera in the vehicle) are not in them. They have two parts:
+
+* what the residuals show: the errors found, times what they go together by (:func:`scatter_of_blocks`). It begins anew
+  with the landmarks of every segment;
+* what they do not show, and every segment *shares* (``shared``): the error common to all disparities, and what the
+  stated errors of tracks and disparities leave once those found are subtracted. An error that all landmarks of a
+  neighbourhood have (of sub-pixel interpolation, of relief under a template) bends the pose and leaves no residual; the
+  same camera makes the same over the same kind of ground, so along a chain these errors add up, and not their squares.
 """
 
 from __future__ import annotations
@@ -49,6 +55,10 @@ MOST_BLOCKS = 6
 """Blocks along either side of the image whose mean errors show how far neighbours' errors go together."""
 PER_BLOCK = 6
 """Landmarks a block, at least on average."""
+MOVING = 0.3
+"""Share of the landmarks that agree with no pose, from which on it is warned of."""
+SHARED = 7
+"""Errors that segments share: as many as the pose has parameters, and that of all disparities."""
 SAMPLE = 4
 """Landmarks of one hypothesis: the fewest that fix a pose uniquely."""
 
@@ -78,6 +88,13 @@ class ResectParams(Params):
     max_position_ratio: float = Field(
         0.02, gt=0, description="std of the position over the median distance of landmarks; beyond it: degenerate"
     )
+    min_share: float = Field(
+        0.15,
+        ge=0,
+        le=1,
+        description="share of a frame's landmarks that must agree with one pose; a twentieth agrees with a wrong one by"
+        " chance, since all are searched near their predictions",
+    )
     hypotheses: int = Field(
         150, ge=1, description="samples of four landmarks; finds a clean one at half outliers with p = 0.9999"
     )
@@ -89,7 +106,8 @@ class ResectParams(Params):
 class Resection:
     """Pose of one frame.
 
-    ``T_local_left``; ``covariance`` (6, 6) of (position m, rotation rad) in the local frame; ``inlier`` (n,);
+    ``T_local_left``; ``covariance`` (6, 6) of (position m, rotation rad) in the local frame, without what is shared;
+    ``shared`` (6, 7): pose errors per standard deviation of what all segments have in common; ``inlier`` (n,);
     ``residual`` (n,) back-projection error, pixels, of every landmark (NaN: behind the camera); ``bias`` of the
     disparities, pixels;
     ``condition`` of the normal matrix with unit diagonal; ``together``: how many times as far as independent errors the
@@ -98,12 +116,18 @@ class Resection:
 
     T_local_left: RigidTransform
     covariance: Floats
+    shared: Floats
     inlier: Bools
     residual: Floats
     bias: float
     iterations: int
     condition: float
     together: float
+
+    @property
+    def total(self) -> Floats:
+        """Covariance (6, 6) of the pose, all errors together."""
+        return np.asarray(self.covariance + self.shared @ self.shared.T)
 
 
 def resect(
@@ -146,6 +170,11 @@ def resect(
     predictions = [Poses.of(T.inverse()) for T in (start, reckoned) if T is not None]
     poses, near = _robust_start(obs, predictions, params, rng)
     poses, active, steps = _remove_inconsistent(obs, poses, near, params, where)
+    if active.sum() < params.min_share * len(active):
+        raise DegenerateError(
+            f"{where}: only {int(active.sum())} of {len(active)} landmarks agree with one pose",
+            remedy="look at the image; or lower resect.min_share",
+        )
     _not_collinear(landmarks.position[active], where)
     return _result(obs, poses, active, steps, params, where)
 
@@ -210,19 +239,21 @@ def _result(obs: Observations, poses: Poses, active: Bools, steps: int, params: 
     factor = max(float(squares / (2 * active.sum() - 6)), 1e-12)
     R = poses.R[0]
     T = RigidTransform(R, poses.t[0]).inverse()
-    expected, condition = _covariance(normal[0], obs.prior, R)
+    stated, bias, condition = _covariance(normal[0] / max(factor, 1.0), obs.prior, R)
     depth = float(np.median((obs.landmarks[0][active] @ R.T + poses.t[0])[:, 2]))
-    position_sigma = float(np.sqrt(np.trace(expected[:3, :3])))
+    expected, other, _ = _covariance(normal[0], obs.prior, R)
+    position_sigma = float(np.sqrt(np.trace(expected[:3, :3]) + (other[:3] ** 2).sum()))
     if position_sigma > params.max_position_ratio * depth:
         raise DegenerateError(
             f"{where}: {int(active.sum())} landmarks at a median distance of {depth:.3g} m leave the position uncertain"
             f" by {position_sigma:.2g} m (condition {condition:.1e})",
             remedy="they are too far, too few or in one direction: set track.points higher or use nearer texture",
         )
-    covariance, _ = _covariance(normal[0] / factor, obs.prior, R)
+    covariance, _, _ = _covariance(normal[0] / factor, obs.prior, R)
+    shared = np.column_stack([_root(stated - covariance, depth), bias])
     residual = np.where(np.isfinite(errors.norm[0]), np.sqrt((errors.pixels[0] ** 2).sum(-1)), np.nan)
     together = scatter_of_blocks(obs.pixels[0][active], errors.white[0][active], weight[0][active], obs.camera)
-    return Resection(T, covariance, active, residual, float(poses.bias[0]), steps, condition, together)
+    return Resection(T, covariance, shared, active, residual, float(poses.bias[0]), steps, condition, together)
 
 
 def scatter_of_blocks(pixels: Floats, white: Floats, weight: Floats, camera: Camera) -> float:
@@ -249,10 +280,12 @@ def scatter_of_blocks(pixels: Floats, white: Floats, weight: Floats, camera: Cam
     return float((sums[:, used] ** 2 / count[used]).sum()) / spread / freedom
 
 
-def _covariance(normal: Floats, prior: float, R_cam_local: Floats) -> tuple[Floats, float]:
-    """Covariance (6, 6) of position and rotation in the local frame, the bias included; condition with unit diagonal.
+def _covariance(normal: Floats, prior: float, R_cam_local: Floats) -> tuple[Floats, Floats, float]:
+    """Of position and rotation in the local frame: covariance (6, 6) by the measurements, error (6,) by the bias.
 
-    ``C = -R^T t`` and ``R^T`` change by ``-R^T v`` and ``-R^T w`` under a step (v, w).
+    The latter is that of one standard deviation of the prior: both together are the covariance of the adjustment. Also
+    the condition of its matrix with unit diagonal. ``C = -R^T t`` and ``R^T`` change by ``-R^T v`` and ``-R^T w`` under
+    a step (v, w).
     """
     full = normal + np.diag([0.0] * 6 + [prior])
     scale = np.sqrt(np.maximum(np.diag(full), 1e-300))
@@ -260,7 +293,16 @@ def _covariance(normal: Floats, prior: float, R_cam_local: Floats) -> tuple[Floa
     inverse = (vectors / np.maximum(values, 1e-300)) @ vectors.T / np.outer(scale, scale)
     turn = np.zeros((6, 6))
     turn[:3, :3] = turn[3:, 3:] = R_cam_local.T
-    return turn @ inverse[:6, :6] @ turn.T, float(values[-1] / max(values[0], 1e-300))
+    bias = math.sqrt(prior) * inverse[:6, 6]
+    noise = inverse[:6, :6] - np.outer(bias, bias)
+    return turn @ noise @ turn.T, turn @ bias, float(values[-1] / max(values[0], 1e-300))
+
+
+def _root(covariance: Floats, depth: float) -> Floats:
+    """Symmetric root (6, 6) of a covariance, radians counted as what they move at a depth (m)."""
+    unit = np.array([1.0] * 3 + [depth] * 3)
+    values, vectors = np.linalg.eigh(covariance * np.outer(unit, unit))
+    return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T / unit[:, None])
 
 
 def _enough(count: int, where: str, what: str, remedy: str) -> None:
@@ -280,10 +322,11 @@ def _not_collinear(landmarks: Floats, where: str) -> None:
 
 @dataclass(frozen=True)
 class SegmentPoses:
-    """Poses of a segment's frames; see the stage's outputs."""
+    """Poses of a segment's frames; see the stage's outputs. A lost frame has NaN, and its fact ``lost`` says why."""
 
     poses: Floats
     covariance: Floats
+    shared: Floats
     inlier: NDArray[np.uint8]
     residual: NDArray[np.float32]
     facts: list[dict[str, Any]]
@@ -298,7 +341,7 @@ def resect_segment(
     params: ResectParams,
     reckoned: Sequence[RigidTransform | None] | None = None,
 ) -> SegmentPoses:
-    """Poses of the frames of a segment, the key frame's given.
+    """Poses of the frames of a segment, the key frame's given. A frame that cannot be posed is lost, the others go on.
 
     Parameters
     ----------
@@ -307,58 +350,72 @@ def resect_segment(
     T_local_key : pose of the key frame's left camera.
     frames : frame numbers, for messages and seeds.
     reckoned : T_key_left of each frame by dead reckoning, where there is one; competes as a start.
-
-    Raises
-    ------
-    DegenerateError
-        A frame cannot be posed; named with the reason.
     """
     n, count = points.shape[:2]
     out = SegmentPoses(
-        np.zeros((count, 3, 4)),
-        np.zeros((count, 6, 6)),
+        np.full((count, 3, 4), np.nan),
+        np.full((count, 6, 6), np.nan),
+        np.full((count, 6, SHARED), np.nan),
         np.zeros((n, count), np.uint8),
         np.full((n, count), np.nan, np.float32),
         [],
     )
     known = np.isfinite(landmarks.position).all(1)
     pose, together = T_local_key, list[float]()
-    out.poses[0] = pose.matrix34
+    out.poses[0], out.covariance[0], out.shared[0] = pose.matrix34, 0.0, 0.0
     for j in range(count):
         use = np.flatnonzero(known & np.isfinite(points[:, j]).all(1))
         if j == 0:
             out.inlier[use, 0], out.residual[use, 0] = 1, 0.0
             out.facts.append(_facts(frames[0], use.size, use.size, 0.0, None))
             continue
-        if use.size < MINIMUM:
-            _enough(
-                use.size,
-                f"frame {frames[j]}",
-                f"of {n} tracked points have coordinates and were found ({landmarks.summary()})",
-                FEW,
+        try:
+            found = _resect_one(
+                landmarks, points[:, j], use, camera, pose, params, frames[j], _reckoned(T_local_key, reckoned, j)
             )
-        found = resect(
-            landmarks.take(use),
-            points[use, j].astype(np.float64),
-            camera,
-            pose,
-            params,
-            np.random.default_rng([params.seed, frames[j]]),
-            reckoned=None if reckoned is None or (T := reckoned[j]) is None else T_local_key @ T,
-            where=f"frame {frames[j]}",
-        )
+        except DegenerateError as error:
+            cause = error.message.removeprefix(f"frame {frames[j]}: ")
+            out.facts.append(_facts(frames[j], use.size, 0, None, None) | {"lost": cause})
+            continue
         pose = found.T_local_left
-        out.poses[j], out.covariance[j] = pose.matrix34, found.covariance
+        out.poses[j], out.covariance[j], out.shared[j] = pose.matrix34, found.covariance, found.shared
         out.inlier[use, j], out.residual[use, j] = found.inlier, found.residual
         rms = float(np.sqrt(np.mean(found.residual[found.inlier] ** 2)))
         out.facts.append(_facts(frames[j], use.size, int(found.inlier.sum()), rms, found))
         together.append(found.together)
     # One frame's figure scatters by a fifth, a segment's frames share their landmarks.
     out.covariance[:] *= max(1.0, float(np.mean(together))) if together else 1.0
+    out.covariance[:] += out.shared @ np.swapaxes(out.shared, 1, 2)
     return out
 
 
-def _facts(frame: int, seen: int, inliers: int, rms: float, found: Resection | None) -> dict[str, Any]:
+def _reckoned(
+    T_local_key: RigidTransform, reckoned: Sequence[RigidTransform | None] | None, j: int
+) -> RigidTransform | None:
+    return None if reckoned is None or (T := reckoned[j]) is None else T_local_key @ T
+
+
+def _resect_one(
+    landmarks: Landmarks,
+    points: NDArray[np.float32],
+    use: NDArray[np.intp],
+    camera: Camera,
+    start: RigidTransform,
+    params: ResectParams,
+    frame: int,
+    reckoned: RigidTransform | None,
+) -> Resection:
+    """One frame of a segment, by those of its points (n, 2) that are used."""
+    where = f"frame {frame}"
+    if use.size < MINIMUM:
+        what = f"of {len(points)} tracked points have coordinates and were found ({landmarks.summary()})"
+        _enough(use.size, where, what, FEW)
+    rng = np.random.default_rng([params.seed, frame])
+    pixels = points[use].astype(np.float64)
+    return resect(landmarks.take(use), pixels, camera, start, params, rng, reckoned=reckoned, where=where)
+
+
+def _facts(frame: int, seen: int, inliers: int, rms: float | None, found: Resection | None) -> dict[str, Any]:
     return {
         "frame": frame,
         "landmarks": seen,
@@ -375,7 +432,7 @@ def _run(params: ResectParams, args: Mapping[str, Any], inputs: Inputs) -> Bundl
     track, rig = inputs["track"], Rig.from_dict(inputs["rig"].meta["rig"])
     T_local_key = RigidTransform.from_matrix(inputs["level"].meta["T_local_left"])
     points = np.asarray(track["points"])
-    landmarks = _coordinates(points[:, 0].astype(np.float64), inputs, rig, T_local_key, params)
+    landmarks = coordinates(points[:, 0].astype(np.float64), inputs, rig, T_local_key, params)
     frames = [int(f) for f in track.meta["frames"]]
     reckoned = None
     if "prediction" in args:
@@ -386,16 +443,46 @@ def _run(params: ResectParams, args: Mapping[str, Any], inputs: Inputs) -> Bundl
     arrays: dict[str, AnyArray] = {
         "poses": found.poses,
         "covariance": found.covariance,
+        "shared": found.shared,
         "inlier": found.inlier,
         "landmarks": landmarks.position,
         "residual": found.residual,
     }
-    return Bundle(
-        arrays, {"per_frame": found.facts, "landmark_source": params.landmarks, "without_coordinates": landmarks.lost}
-    )
+    tracks, moving = moving_tracks(points, landmarks, found)
+    meta: dict[str, Any] = {
+        "per_frame": found.facts,
+        "landmark_source": params.landmarks,
+        "without_coordinates": landmarks.lost,
+    }
+    meta |= {"tracks": tracks, "moving_tracks": moving, "warnings": _moving_words(frames, tracks, moving)}
+    return Bundle(arrays, meta)
 
 
-def _coordinates(
+def moving_tracks(points: NDArray[np.float32], landmarks: Landmarks, found: SegmentPoses) -> tuple[int, int]:
+    """How many landmarks were found in two posed frames or more, and how many of them agree with no pose.
+
+    What is followed well from frame to frame and never agrees does not stand on the ground: the vehicle's own shadow,
+    its wheels, other things that move; or its coordinates are wrong (a match on the edge of a rock).
+    """
+    posed = np.asarray(np.isfinite(found.poses).all(axis=(1, 2)))
+    posed[0] = False
+    known = np.asarray(np.isfinite(landmarks.position).all(axis=1))
+    seen = np.asarray(np.isfinite(points).all(axis=2)) & posed & known[:, None]
+    often = seen.sum(axis=1) >= 2
+    agrees = (found.inlier != 0) & seen
+    return int(often.sum()), int((often & ~agrees.any(axis=1)).sum())
+
+
+def _moving_words(frames: list[int], tracks: int, moving: int) -> list[str]:
+    if tracks == 0 or moving < MOVING * tracks:
+        return []
+    return [
+        f"frames {frames[0]}-{frames[-1]}: {moving} of {tracks} tracked landmarks agree with no pose: does something"
+        " move in view (a shadow, a wheel)?"
+    ]
+
+
+def coordinates(
     points: Floats, inputs: Inputs, rig: Rig, T_local_key: RigidTransform, params: ResectParams
 ) -> Landmarks:
     """Landmarks of the key frame's points from the source that the parameters name."""
@@ -423,19 +510,29 @@ def _coordinates(
 
 STAGE = Stage(
     name="resect",
-    version=1,
+    version=2,
     summary="poses of a segment's frames in the local frame of its basic pair",
     params=ResectParams,
     inputs=("track", "dem?", "disparity?", "level", "rig"),
     outputs=(
-        Array("poses", ("frame", "row", "col"), "float64", "m", "pose [R | t] of the left camera", frame="local"),
+        Array("poses", ("frame", "row", "col"), "float64", "m", "pose [R | t] of the left camera", "nan", "local"),
         Array(
             "covariance",
             ("frame", "parameter", "parameter_b"),
             "float64",
             "m^2, m rad, rad^2",
             "covariance of position and rotation vector",
-            frame="local",
+            "nan",
+            "local",
+        ),
+        Array(
+            "shared",
+            ("frame", "parameter", "source"),
+            "float64",
+            "m, rad",
+            "errors of position and rotation vector per standard deviation of what all segments share",
+            "nan",
+            "local",
         ),
         Array("inlier", ("point", "frame"), "uint8", "1", "landmark agrees with the pose", nodata="0"),
         Array("landmarks", ("point", "xyz"), "float64", "m", "coordinates of the landmarks", "nan", "local"),

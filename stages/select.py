@@ -79,34 +79,38 @@ class Choice:
     overlap: list[float | None]
 
 
-def by_stride(steps: Sequence[Step], params: SelectParams) -> Choice:
-    """Positions 0, stride, 2 stride ... of one more frame than there are steps."""
-    basic = list(range(0, len(steps) + 1, params.stride))
+def by_stride(steps: Sequence[Step], params: SelectParams, unfit: frozenset[int] = frozenset()) -> Choice:
+    """Positions 0, stride, 2 stride ... of one more frame than there are steps; for an unfit one the next that is."""
+    count = len(steps) + 1
+    wanted = range(0, count, params.stride)
+    basic = sorted({b for k in wanted if (b := next((n for n in range(k, count) if n not in unfit), None)) is not None})
     overlap = [_overlap(steps[a:b], params) for a, b in itertools.pairwise(basic)]
     return Choice(basic, ["first frame"] + ["stride"] * len(overlap), [None, *overlap])
 
 
-def by_overlap(steps: Sequence[Step], params: SelectParams) -> Choice:
+def by_overlap(steps: Sequence[Step], params: SelectParams, unfit: frozenset[int] = frozenset()) -> Choice:
     """Basic pairs as far apart as the wanted overlap permits; at least one frame apart.
 
     Parameters
     ----------
     steps : coarse displacements from each frame to the next.
+    unfit : positions that may not be basic; the last one before that may takes their place, else the next one.
     """
     choice = Choice([0], ["first frame"], [None])
-    seen = Seen.all_of(steps[0]) if steps else None
-    for k, step in enumerate(steps):
+    seen, k = (Seen.all_of(steps[0]) if steps else None), 0
+    while k < len(steps):
         assert seen is not None
+        step, key = steps[k], choice.basic[-1]
         ahead = seen.after(step)
-        key = choice.basic[-1]
         reason = _why(steps, k, key, ahead, params)
-        if reason and k > key:
-            known = not any(doubtful(s, params) for s in steps[key:k])
-            choice.basic.append(k)
+        fit = next((n for n in range(k, key, -1) if n not in unfit), None) if reason else None
+        if fit is not None:
+            choice.basic.append(fit)
             choice.why.append(reason)
-            choice.overlap.append(seen.overlap if known else None)
+            choice.overlap.append(_overlap(steps[key:fit], params))
+            k, step = fit, steps[fit]
             ahead = Seen.all_of(step).after(step)
-        seen = ahead
+        seen, k = ahead, k + 1
     return choice
 
 
@@ -148,7 +152,7 @@ def _run(params: SelectParams, args: Mapping[str, Any], inputs: Inputs) -> Bundl
     if len(steps) != frames - 1:
         raise InputError(f"{frames} frames need {frames - 1} motions, not {len(steps)}")
     stride = params.rule == "stride"
-    choice = (by_stride if stride else by_overlap)(steps, params)
+    choice = (by_stride if stride else by_overlap)(steps, params, frozenset(args.get("unfit", ())))
     meta = {
         "basic": choice.basic,
         "segments": segments(choice.basic, frames),

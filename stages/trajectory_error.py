@@ -134,13 +134,14 @@ def rotation_vectors(R: Floats) -> Floats:
 def against_claims(P: Floats, aligned: Floats, covariance: Floats) -> dict[str, Metric]:
     """Mean squared error over the claimed one, per degree of freedom (NEES): 1 where the claims are right.
 
-    ``covariance`` (n, 6, 6) of (position m, rotation rad) in the world whose origin is the first frame, which is exact:
-    ``aligned`` is the truth with the first poses made equal.
+    ``covariance`` (n, 6, 6) of (position m, rotation rad) in the world whose origin is the first posed frame, which is
+    exact: ``aligned`` is the truth with the first poses made equal.
     """
     known = np.asarray(np.isfinite(P).all(axis=(1, 2)) & np.isfinite(aligned).all(axis=(1, 2)))
     known = np.asarray(known & np.isfinite(covariance).all(axis=(1, 2)))
-    rows = np.flatnonzero(known)[1:]
-    if len(rows) == 0 or not known[0] or not (np.linalg.eigvalsh(covariance[rows])[:, 0] > 0).all():
+    claimed = np.isfinite(P).all(axis=(1, 2)) & np.isfinite(covariance).all(axis=(1, 2))
+    rows, origin = np.flatnonzero(known)[1:], int(np.argmax(claimed))
+    if len(rows) == 0 or not known[origin] or not (np.linalg.eigvalsh(covariance[rows])[:, 0] > 0).all():
         return {"nees": metric(None, "1", "not applicable: no covariances of frames behind the first")}
     turn = rotation_vectors(aligned[rows, :3, :3] @ np.swapaxes(P[rows, :3, :3], 1, 2))
     error = np.concatenate([aligned[rows, :3, 3] - P[rows, :3, 3], turn], axis=1)

@@ -10,7 +10,7 @@ import pytest
 
 from pipeline.config import STAGE_MODULES, stage
 
-UNITS = {"1", "px", "m", "rad", "grey", "m^2, m rad, rad^2"}
+UNITS = {"1", "px", "m", "rad", "grey", "m^2, m rad, rad^2", "m, rad"}
 DATASET_STAGES = ("files", "files16", "mockup.scene", "mockup.render", "mockup.truth", "mockup.truth_dem")
 TILE_STAGES = ("hfvm_tile", "hfvm_join")
 DECLARED = (

@@ -47,7 +47,8 @@ META: dict[str, dict[str, Any]] = {
     "select": {"basic": list(BASIC), "segments": [[0, 1, 2], [2, 3, 4]]},
     "level": {"T_local_left": IDENTITY},
     "locus": {"lattice": LATTICE},
-    "trajectory": {"positions": [[0.0, 0.0, 0.0]] * 5},
+    "continuity": {"asks": {"bridges": [], "sides": []}, "chain": list(FRAMES), "unfit": [], "lost": []},
+    "trajectory": {"frames": list(FRAMES), "positions": [[0.0, 0.0, 0.0]] * 5, "pieces": [[0, 4]], "main": 0},
     "crosscheck_join": {"frames": list(FRAMES), "positions": [[0.0, 0.0, 0.0]] * 5},
     "exposure": {"steps": {"2": 3}},
 }
@@ -63,11 +64,12 @@ MERGED = {"merge", "risk/world", "path/world", "dem_accuracy/world", "path_check
 MODELS = {"locus/world", "footprint", "seam", "seam_audit", "exposure"}
 MISSION = MODELS | MERGED
 LOCAL = {"locus/local", "risk/local", "path/local", "dem_accuracy/local"}
-POSES = {"resect", "trajectory", "agreement", "accuracy", "pose"} | MISSION
+REFINED = {"refine", "trajectory", "agreement", "accuracy", "pose"} | MISSION
+POSES = {"resect"} | REFINED
 LEVELLED = {"level"} | LOCAL | POSES
 RIG = {"rig", "calibration"} | LEVELLED
 MATCHED = {"hfvm", "orientation"} | RIG
-MOVED = {"motion", "select", "track"} | POSES
+MOVED = {"motion", "continuity", "select", "track"} | POSES
 COUNTERCHECK = {"crosscheck", "crosscheck_join", "agreement", "accuracy/crosscheck"}
 PYRAMIDS = {"pyramid/left", "pyramid/right"} | MATCHED | MOVED
 RISK = {"risk/local", "risk/world", "risk/truth", "path/local", "path/world", "path_check"}
@@ -76,9 +78,10 @@ TILES = {f"hfvm/{step}" for step in ("coarse", "left", "right", "band", "check",
 TILES |= {"hfvm/fine/left", "hfvm/fine/right"}
 
 STALE: dict[str, set[str]] = {
-    "undistort": {"undistort/left", "undistort/right"} | PYRAMIDS | COUNTERCHECK,
+    "undistort": {"undistort/left", "undistort/right", "sight"} | PYRAMIDS | COUNTERCHECK,
     "pyramid": PYRAMIDS,
     "motion": MOVED,
+    "continuity": {"continuity"},  # what follows hangs on its result, not on it
     "select": {"select"},  # what follows hangs on its result, not on it
     "hfvm": MATCHED,
     "orientation": {"orientation"} | RIG,
@@ -87,6 +90,7 @@ STALE: dict[str, set[str]] = {
     "locus": LOCAL | MISSION,
     "track": {"track"} | POSES,
     "resect": POSES,
+    "refine": REFINED,
     "seam_audit": {"seam_audit"},  # nothing is computed from what it says
     "exposure": {"exposure"},  # as with select: tiles hang on the steps that it finds
     "merge": MERGED,
@@ -98,6 +102,8 @@ STALE: dict[str, set[str]] = {
     "vehicle": RISK,
 }
 EXCEPTIONS: dict[str, set[str]] = {
+    "refine.enabled": REFINED - {"refine"},  # without it there is less to compute
+    "resect.landmarks": POSES - {"refine"},  # refined are landmarks of the disparity alone
     "crosscheck.enabled": set(),  # without it there is less to compute
     "merge.max_hole": {"footprint"} | MERGED,  # how far beyond its edge a tile depends on what is there
     "tiling.memory": set(),  # small pairs are matched whole with some more or less of it

@@ -19,6 +19,7 @@ import numpy as np
 from datasets.protocol import Sequence, Source
 from pipeline import config as configuration
 from stages.declare import Bundle, NoParams
+from stages.trajectory import world_poses
 
 MATCHING = ("hfvm", "orientation", "rig", "calibration", "level")
 """Stages of the basic pairs; all others see every frame."""
@@ -46,7 +47,11 @@ class Images:
     def __init__(self, sequence: Sequence, frames: range) -> None:
         self.sequence, self.frames = sequence, frames
         self._made: dict[Any, Bundle] = {}
-        self.bundle = {(f, c): self._take(sequence.image(f, c)) for f in frames for c in ("left", "right")}
+        self.bundle = {(f, c): self._take(sequence.image(f, c)) for f in self._whole() for c in ("left", "right")}
+
+    def _whole(self) -> list[int]:
+        """Frames that have both images."""
+        return [f for f in self.frames if f not in self.sequence.lost]
 
     def _take(self, source: Source) -> Bundle:
         shared = None if source.args else (source.module, source.params)
@@ -95,25 +100,61 @@ class Chain:
         self.frames = list(images.frames)
         self.clock = Clock()
         self._pyramids: dict[tuple[int, str], Bundle] = {}
+        self._ideal: dict[tuple[int, str], Bundle] = {}
 
     def run(self) -> Navigated:
-        """Poses of all frames."""
-        frames = self.frames
-        self.motion = {a: self._motion(a, b) for a, b in itertools.pairwise(frames)}
-        select = self._stage("select", {"frames": len(frames)}, motions=list(self.motion.values()))
-        basic = [frames[i] for i in select.meta["basic"]]
-        parts = [[frames[i] for i in part] for part in select.meta["segments"]]
+        """Poses of all frames; NaN of lost ones, and of those in other pieces than the largest."""
+        frames = [f for f in self.frames if f not in self.sequence.lost]
+        self.motion = {step: self._motion(*step) for step in itertools.pairwise(frames)}
+        chain, lost, unfit = self._continuity(frames)
+        motions = [self.motion[step] for step in itertools.pairwise(chain)]
+        where = {"unfit": [chain.index(f) for f in unfit]} if unfit else {}
+        select = self._stage("select", {"frames": len(chain)} | where, motions=motions)
+        basic = [chain[i] for i in select.meta["basic"]]
+        parts = [[chain[i] for i in part] for part in select.meta["segments"]]
         self.disparity = {k: self._match(k) for k in basic}
         self.calibration = self._calibration(basic)
-        resections, levels = [], []
-        for part in parts:
-            resection, level = self._segment(part)
-            resections.append(resection)
-            levels.append(level)
-        trajectory = self._stage("trajectory", {"frames": frames}, segments=resections, levels=levels)
-        facts = {"basic": basic, "select": select.meta, "resect": [r.meta for r in resections]}
-        facts["rig"] = self.rig_facts
-        return Navigated(trajectory["poses"], trajectory["covariance"], facts, self.clock)
+        segments = [self._segment(part) for part in parts]
+        given = {"segments": [r for r, _, _ in segments], "levels": [level for _, level, _ in segments]}
+        if self.config.refine.enabled and self.config.resect.landmarks == "disparity":
+            given["refined"] = self._refined(basic, segments)
+        trajectory = self._stage("trajectory", {"frames": self.frames, "lost": lost}, **given)
+        facts = {"basic": basic, "select": select.meta, "resect": [r.meta for r, _, _ in segments]}
+        facts |= {"rig": self.rig_facts, "trajectory": trajectory.meta}
+        return Navigated(world_poses(trajectory), trajectory["covariance"], facts, self.clock)
+
+    def _continuity(self, frames: list[int]) -> tuple[list[int], list[Any], list[int]]:
+        """Frames to go through, lost ones with their causes, and those that may not be basic."""
+        sights = [
+            self._stage("sight", {"frame": f}, **{c: self._image(f, c) for c in ("left", "right")}) for f in frames
+        ]
+        motions = [self.motion[step] for step in itertools.pairwise(frames)]
+        sides: dict[int, Bundle] = {}
+        bridges: list[tuple[int, int]] = []
+        while True:
+            given = {"motions": motions, "bridges": [self.motion[s] for s in bridges], "sides": list(sides.values())}
+            found = self._stage("continuity", {"frames": frames, "bridges": bridges}, sights=sights, **given)
+            asks = found.meta["asks"]
+            if not any(asks.values()):
+                missing = [{"frame": f, "cause": why} for f, why in self.sequence.lost.items()]
+                return found.meta["chain"], [*missing, *found.meta["lost"]], found.meta["unfit"]
+            for a, b in asks["bridges"]:
+                self.motion[a, b] = self._motion(a, b)
+                bridges.append((a, b))
+            for f in asks["sides"]:
+                pair = {c: self._pyramid(f, c) for c in ("left", "right")}
+                sides[f] = self._stage("sides", {"frame": f, "rig": self.sequence.rig.to_dict()}, **pair)
+
+    def _refined(self, basic: list[int], segments: list[tuple[Bundle, Bundle, Bundle]]) -> Bundle:
+        return self._stage(
+            "refine",
+            {"pairs": basic, "resect": self.config.resect.model_dump(mode="json")},
+            tracks=[track for _, _, track in segments],
+            resections=[r for r, _, _ in segments],
+            levels=[level for _, level, _ in segments],
+            disparities=[self.disparity[k] for k in basic],
+            rigs=[self.calibration] * len(basic),
+        )
 
     def _motion(self, a: int, b: int) -> Bundle:
         s, args = self.sequence, {"frames": [a, b]}
@@ -133,7 +174,7 @@ class Chain:
         self.rig_facts = found.meta
         return self._stage("calibration", {}, rig=found)
 
-    def _segment(self, part: list[int]) -> tuple[Bundle, Bundle]:
+    def _segment(self, part: list[int]) -> tuple[Bundle, Bundle, Bundle]:
         key, s = part[0], self.sequence
         args: dict[str, Any] = {"pair": key}
         if s.up is not None and s.up[key] is not None:
@@ -147,7 +188,7 @@ class Chain:
             "track",
             {"frames": part},
             frames=[self._pyramid(f, "left") for f in part],
-            motions=[self.motion[f] for f in part[:-1]],
+            motions=[self.motion[step] for step in itertools.pairwise(part)],
         )
         found = self._stage(
             "resect",
@@ -157,13 +198,17 @@ class Chain:
             level=level,
             rig=self.calibration,
         )
-        return found, level
+        return found, level, track
 
     def _pyramid(self, frame: int, camera: str) -> Bundle:
         if (frame, camera) not in self._pyramids:
-            image = self.clock.timed("undistort", self.images.ideal, frame, camera)
-            self._pyramids[frame, camera] = self._stage("pyramid", {}, image=image)
+            self._pyramids[frame, camera] = self._stage("pyramid", {}, image=self._image(frame, camera))
         return self._pyramids[frame, camera]
+
+    def _image(self, frame: int, camera: str) -> Bundle:
+        if (frame, camera) not in self._ideal:
+            self._ideal[frame, camera] = self.clock.timed("undistort", self.images.ideal, frame, camera)
+        return self._ideal[frame, camera]
 
     def _stage(self, name: str, args: Mapping[str, Any], **inputs: Any) -> Bundle:
         stage = configuration.stage(name)

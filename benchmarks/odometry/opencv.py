@@ -44,7 +44,7 @@ class Odometry:
         if not _in_rows(rig):
             T = rig.T_right_left
             R1, R2, P1, P2, *_ = cv2.stereoRectify(
-                rig.left.matrix, None, rig.right.matrix, None, size, T.rotation, T.translation, alpha=0
+                rig.left.matrix, None, rig.right.matrix, None, size, T.rotation, T.translation.reshape(3, 1), alpha=0
             )
             self.maps = [
                 cv2.initUndistortRectifyMap(c.matrix, None, R, P, size, cv2.CV_16SC2)

@@ -35,3 +35,9 @@ def by_frame(view: RunView, bundle: Bundle, name: str) -> Floats:
         if frame in row:
             out[i] = values[row[frame]]
     return out
+
+
+def chain(view: RunView) -> tuple[int, ...]:
+    """Frames that the trajectory goes through, in order; all chosen ones where nothing else is known."""
+    bundle = view.bundle(view.products.continuity)
+    return view.frames if bundle is None else tuple(int(f) for f in bundle.meta["chain"])

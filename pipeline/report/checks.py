@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.report import canvas, curves, figures
+from pipeline.report.artifacts import chain
 from pipeline.report.block import Block, Table
 from pipeline.report.calibration import Calibration
 from pipeline.report.comparison import Comparison
@@ -130,18 +131,19 @@ def basic_pairs(scene: Scene) -> Block | None:
     if bundle is None or len(view.frames) < 2:
         return None
     meta = bundle.meta
-    pairs = [view.frames[i] for i in meta.get("basic", ())]
+    tracked = chain(view)
+    pairs = [tracked[i] for i in meta.get("basic", ())]
     overlap = np.array([np.nan if v is None else v for v in meta.get("overlap") or [None] * len(pairs)], dtype=float)
     moved = np.array([np.nan if v is None else v for v in meta.get("displacement") or ()], dtype=float)
-    if len(moved) != len(view.frames) - 1:
-        moved = np.full(len(view.frames) - 1, np.nan)
+    if len(moved) != len(tracked) - 1:
+        moved = np.full(len(tracked) - 1, np.nan)
     params = getattr(view.config, "select", None)
     by_overlap = getattr(params, "rule", "") == "overlap"
     wanted = params.overlap if by_overlap and params is not None else None
     known = overlap[np.isfinite(overlap)]
     shares = f"{known.min():.0%} to {known.max():.0%}" if len(known) else "not known"
     alt = f"Overlap of successive basic pairs {shares}; displacement between frames {spread(moved)} px"
-    panel = curves.basic_pairs(pairs, overlap, wanted, view.frames[1:], moved, alt)
+    panel = curves.basic_pairs(pairs, overlap, wanted, tracked[1:], moved, alt)
     why = _reasons(meta.get("why") or ())
     caption = (
         f"{len(pairs)} of {len(view.frames)} pairs are basic by the rule “{meta.get('rule', '')}”{why}; each became an "

@@ -66,6 +66,10 @@ def compare(view: RunView) -> Comparison | None:
         return None
     names = ("poses", "distance", "angle", "step_distance", "step_angle")
     found = {name: by_frame(view, bundle, name) for name in names}
+    trajectory = view.bundle(view.products.trajectory)
+    if trajectory is not None and "piece" in trajectory.arrays:  # other pieces lie in frames of their own
+        piece = by_frame(view, trajectory, "piece")
+        found["poses"][(piece >= 0) & (piece != trajectory.meta["main"])] = np.nan
     flagged = np.nan_to_num(by_frame(view, bundle, "flagged").astype(np.float64)) > 0
     p = view.products
     error, theirs = (_error(view, view.bundle(handle)) for handle in (p.accuracy, p.crosscheck_accuracy))

@@ -19,6 +19,7 @@ from pipeline.report.view import RunView
 from stages.declare import Bundle
 from stages.geometry import RigidTransform
 from stages.lattice import Lattice, mosaic, union
+from stages.trajectory import world_poses
 
 NODATA: Mapping[str, float] = {"count": 0, "source": -1}
 """Of the arrays of merged terrain that are not floats."""
@@ -142,7 +143,7 @@ def trajectory(view: RunView) -> Track:
     right, posed = [], {}
     bundle = view.bundle(view.products.trajectory)
     if bundle is not None:
-        poses = np.asarray(bundle["poses"])
+        poses = world_poses(bundle)
         for i, frame in enumerate(bundle.meta.get("frames", view.frames[: len(poses)])):
             if frame not in row or not np.isfinite(poses[i]).all():
                 continue

@@ -120,7 +120,16 @@ def find_warnings(scene: Scene) -> list[str]:
     lines = list(view.sequence.warnings)
     lines += scene.calibration.collected("warnings") if scene.calibration is not None else []
     p = view.products
-    for handle in (p.select, *p.crosschecks, p.crosscheck, p.agreement, p.trajectory, p.accuracy, p.seam_audit):
+    for handle in (
+        p.continuity,
+        p.select,
+        *p.crosschecks,
+        p.crosscheck,
+        p.agreement,
+        p.trajectory,
+        p.accuracy,
+        p.seam_audit,
+    ):
         bundle = view.bundle(handle)
         lines += (bundle.meta.get("warnings") or []) if bundle is not None else []
     compared = scene.comparison

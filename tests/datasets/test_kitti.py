@@ -116,11 +116,21 @@ def breaks(name):
 
 
 def _drop_right(f):
-    (f / "image_r" / "000001.png").unlink()
+    for k in (1, 2):
+        (f / "image_r" / f"{k:06d}.png").unlink()
 
 
 def _drop_left(f):
-    (f / "image_l" / "000001.png").unlink()
+    for k in (1, 2):
+        (f / "image_l" / f"{k:06d}.png").unlink()
+
+
+def _time_goes_back(f):
+    (f / "times.txt").write_text("0.0\n0.2\n0.1\n")
+
+
+def _time_twice(f):
+    (f / "times.txt").write_text("0.0\n0.1\n0.1\n")
 
 
 def _resize(f):
@@ -156,6 +166,12 @@ def _swapped(f):
     (f / "calib.txt").write_text(line(P_RIGHT) + "\n" + line(P_LEFT))
 
 
+def _millimetres(f):
+    right = P_RIGHT.copy()
+    right[:, 3] *= 1000
+    (f / "calib.txt").write_text(line(P_LEFT) + "\n" + line(right))
+
+
 def _same_place(f):
     (f / "calib.txt").write_text(line(P_LEFT) + "\n" + line(P_LEFT))
 
@@ -181,16 +197,19 @@ def _not_an_image(f):
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
-        breaks(("right missing", _drop_right, r"image_l/000001\.png has no partner in .*image_r")),
+        breaks(("right missing", _drop_right, r"image_l/000001\.png has no partner in .*image_r \(and 1 more\)")),
         breaks(("left missing", _drop_left, r"image_r/000001\.png has no partner in .*image_l")),
         breaks(("size", _resize, r"image_r/000002\.png is 60 x 48, 8 bits; the sequence has 64 x 48, 8 bits")),
         breaks(("depth", _deepen, r"image_l/000001\.png is 64 x 48, 16 bits; the sequence has 64 x 48, 8 bits")),
         breaks(("pose count", _fewer_poses, r"poses\.txt has 2 poses for 3 pairs")),
         breaks(("time count", _times, r"times\.txt has 4 times for 3 pairs")),
+        breaks(("time goes back", _time_goes_back, r"times\.txt, line 3: time 0\.1 goes back from 0\.2")),
+        breaks(("time twice", _time_twice, r"times\.txt, line 3: time 0\.1 is there twice")),
         breaks(("no calibration", _no_calib, r"no calib\.txt: `rille init")),
         breaks(("one camera", _one_row, r"calib\.txt has no projection matrices of image_l and image_r")),
         breaks(("short row", _short_row, r"calib\.txt, line 2: not 12 numbers")),
         breaks(("swapped", _swapped, r"stands 0\.5 m to the left of the left one")),
+        breaks(("millimetres", _millimetres, r"baseline is 500 m, which looks like millimetres: did you mean 0\.5 m")),
         breaks(("one place", _same_place, r"stand in one place")),
         breaks(("singular", _singular, r"image_r is singular")),
         breaks(("no rotation", _no_rotation, r"poses\.txt, line 1: .*not a rotation")),
@@ -204,6 +223,53 @@ def test_what_is_wrong_is_one_line_with_a_remedy(folder, spoil, message):
         open_sequence(str(folder))
     assert "\n" not in str(caught.value)
     assert caught.value.remedy
+
+
+def test_a_frame_that_lacks_an_image_is_lost_and_named(folder):
+    (folder / "image_r" / "000001.png").unlink()
+    s = open_sequence(str(folder))
+    assert s.frames == 3
+    assert s.lost == {1: "image_r/000001.png is missing"}
+    assert s.truth[2].translation[2] == pytest.approx(2.4)
+    assert s.image(2, "left").hints["path"].endswith("000002.png")
+
+
+@pytest.mark.parametrize("rows", [5, 4])
+def test_a_number_left_out_of_the_count_is_a_lost_frame(folder, rows):
+    """Poses and times may have a line for each frame, or for those alone that have images."""
+    numbers = [0, 1, 2, 3, 4]
+    for side in ("image_l", "image_r"):
+        for k in (3, 4):
+            picture(folder / side / f"{k:06d}.png")
+        (folder / side / "000001.png").unlink()
+    if rows == 4:
+        numbers.remove(1)
+    (folder / "poses.txt").write_text("\n".join(line(np.hstack([np.eye(3), [[0], [0], [k]]])) for k in numbers))
+    (folder / "times.txt").write_text("\n".join(f"{0.1 * k:.1f}" for k in numbers))
+    s = open_sequence(str(folder))
+    assert s.frame_names == tuple(f"{k:06d}" for k in range(5))
+    assert s.lost == {1: "image_l/000001.png and image_r/000001.png are missing"}
+    assert s.truth[2].translation[2] == pytest.approx(2.0)
+    assert s.times == pytest.approx((0.0, 0.1, 0.2, 0.3, 0.4))
+    assert (s.truth[1] is None) == (rows == 4)
+
+
+def test_numbers_that_do_not_count_on_by_one_are_names(folder):
+    for side in ("image_l", "image_r"):
+        (folder / side / "000002.png").rename(folder / side / "000007.png")
+        (folder / side / "000001.png").rename(folder / side / "000003.png")
+    s = open_sequence(str(folder))
+    assert s.frame_names == ("000000", "000003", "000007")
+    assert not s.lost
+
+
+def test_truth_may_have_gaps(folder):
+    rows = (folder / "poses.txt").read_text().splitlines()
+    rows[1] = " ".join(["nan"] * 12)
+    (folder / "poses.txt").write_text("\n".join(rows))
+    s = open_sequence(str(folder))
+    assert s.truth[1] is None
+    assert s.truth[2].translation[2] == pytest.approx(2.4)
 
 
 @pytest.mark.data

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from pipeline import verdicts
-from pipeline.verdicts import Look
 from stages.geometry import Camera, Rig, RigidTransform, rotation_exp
+from stages.sight import Look, look
 
 CAMERA = Camera(500.0, 500.0, 160.0, 120.0, 320, 240)
 
@@ -84,26 +84,24 @@ def test_look_of_a_known_image():
     image = np.full((60, 80), 100, np.uint8)
     image[:, :20] = 255
     image[:, 20:25] = 0
-    found = verdicts.look(image, np.ones(image.shape, np.uint8))
+    found = look(image, np.ones(image.shape, np.uint8))
     assert found.bright == pytest.approx(0.25)
     assert found.dark == pytest.approx(0.0625)
     assert found.mean == pytest.approx((20 * 255 + 55 * 100) / 80)
     masked = np.ones(image.shape, np.uint8)
     masked[:, :25] = 0
-    assert verdicts.look(image, masked).deviation == 0
-    assert math.isnan(verdicts.look(image, np.zeros_like(masked)).mean)
-    assert verdicts.look(image.astype(np.uint16) * 257, np.ones(image.shape, np.uint8)).mean == pytest.approx(
-        found.mean
-    )
+    assert look(image, masked).deviation == 0
+    assert math.isnan(look(image, np.zeros_like(masked)).mean)
+    assert look(image.astype(np.uint16) * 257, np.ones(image.shape, np.uint8)).mean == pytest.approx(found.mean)
 
 
 def test_sharpness_falls_with_blur_and_not_with_contrast():
     rng = np.random.default_rng(0)
     image = 128 + 60 * cv2.GaussianBlur(rng.standard_normal((120, 160)), (0, 0), 0.8)
     valid = np.ones(image.shape, np.uint8)
-    sharp = verdicts.look(image, valid).sharpness
-    assert verdicts.look(128 + 0.3 * (image - 128), valid).sharpness == pytest.approx(sharp, rel=1e-3)
-    blurred = verdicts.look(cv2.GaussianBlur(image, (0, 0), 1.5), valid).sharpness
+    sharp = look(image, valid).sharpness
+    assert look(128 + 0.3 * (image - 128), valid).sharpness == pytest.approx(sharp, rel=1e-3)
+    blurred = look(cv2.GaussianBlur(image, (0, 0), 1.5), valid).sharpness
     assert blurred < verdicts.BLURRED * sharp
 
 

@@ -1,0 +1,67 @@
+"""Whether left and right of one pair are exchanged: its coarse matches under the rig as given, and exchanged.
+
+With parallel cameras exchanged images lie beyond infinity; with cameras turned inward they need not, but their rows
+then depart the wrong way towards the corners. A match therefore fits the rig if it lies near its epipolar line *and*
+in front of the cameras.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.adjustment import RIG
+from stages.declare import Bundle, Inputs, NoParams, Stage
+from stages.epipolar import beyond_infinity, distances
+from stages.geometry import Rig
+from stages.motion import MotionParams, coarse_motion
+from stages.pyramid import Pyramid
+from stages.validity import matched
+
+Floats = NDArray[np.float64]
+
+SEARCH = MotionParams(top_columns=0.5, turn_below=0.0)
+"""Half of the width to either side, as far as pairs are matched."""
+LEAST = 50
+"""Coarse matches, below which nothing is said."""
+MAJORITY = 0.5
+"""Share of the matches that must fit the exchanged rig, and twice as many as the given one."""
+
+
+def fits(rig: Rig, left: Floats, right: Floats, tolerance: float) -> float:
+    """Share of the matches (n, 2), (n, 2) that lie within ``tolerance`` pixels of their epipolar lines, ahead."""
+    off, _ = distances(rig, np.zeros(RIG), left, right)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ahead = beyond_infinity(rig, left, right) < 0.5 * tolerance
+    return float(np.mean((np.abs(off) < tolerance) & ahead))
+
+
+def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+    rig = Rig.from_dict(args["rig"])
+    found = coarse_motion(Pyramid.from_bundle(inputs["left"]), Pyramid.from_bundle(inputs["right"]), SEARCH)
+    row, col = np.nonzero(matched(found.validity))
+    scale = 2.0**found.level
+    left = np.asarray((np.stack([col, row], -1) + 0.5) * scale - 0.5, dtype=np.float64)
+    shift = np.stack([found.column_disparity[row, col], found.row_disparity[row, col]], -1)
+    right = np.asarray(left + shift, dtype=np.float64)
+    facts: dict[str, Any] = {"frame": int(args["frame"]), "matches": len(left), "swapped": False}
+    if len(left) >= LEAST:
+        given, exchanged = fits(rig, left, right, scale), fits(rig, right, left, scale)
+        swapped = exchanged > MAJORITY and exchanged > 2.0 * given
+        facts |= {"as_given": given, "exchanged": exchanged, "swapped": bool(swapped)}
+    return Bundle({}, facts)
+
+
+STAGE = Stage(
+    name="sides",
+    version=1,
+    summary="whether left and right of a pair are exchanged",
+    params=NoParams,
+    inputs=("left", "right"),
+    outputs=(),
+    requires=("numpy", "numba", "opencv-python-headless"),
+    run=_run,
+)

@@ -1,0 +1,109 @@
+"""What one stereo pair looks like, before anything is matched: grey values, sharpness, and whether it repeats another.
+
+Plain figures that tell a black, blurred or repeated image from a good one; what follows from them is decided over the
+whole sequence (:mod:`stages.continuity`).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.declare import Bundle, Inputs, NoParams, Stage
+from stages.pyramid import grey
+
+LOW, HIGH = 2.0, 253.0
+"""Grey values at which an 8-bit image is taken as clipped."""
+
+BANDS = (0.25, 0.5, 0.75)
+"""Of the height: where the strips lie whose sharpness stands for the image's."""
+STRIP = 48
+"""Rows of a strip."""
+
+
+@dataclass(frozen=True)
+class Look:
+    """One image in figures: mean grey 0..255, deviation, shares of dark and bright clipped pixels, sharpness.
+
+    ``detail`` is what lies between two and four pixels, RMS over the deviation: where even that is gone, noise alone
+    decides on the sharpness.
+    """
+
+    mean: float
+    deviation: float
+    dark: float
+    bright: float
+    sharpness: float
+    detail: float = 0.0
+
+
+def look(image: NDArray[Any], valid: NDArray[np.uint8]) -> Look:
+    """Figures of an image (row, col); ``valid`` not zero where usable.
+
+    Sharpness is the share of detail between one and two pixels in that between two and four, RMS: it hardly depends on
+    what is shown, but falls with blur.
+    """
+    level = grey(image)
+    usable = (valid != 0) & np.isfinite(level)
+    values = level[usable]
+    if not values.size:
+        return Look(math.nan, 0.0, 0.0, 0.0, math.nan)
+    level = np.where(usable, level, values.mean())
+    once, twice = (cv2.GaussianBlur(level, (0, 0), sigma) for sigma in (1.0, 2.0))
+    inner = cv2.erode(usable.astype(np.uint8), np.ones((13, 13), np.uint8)) != 0
+    coarse = float(np.sqrt(((once - twice)[inner] ** 2).mean())) if inner.any() else 0.0
+    fine = float(np.sqrt(((level - once)[inner] ** 2).mean())) if inner.any() else 0.0
+    deviation = float(values.std())
+    return Look(
+        float(values.mean()),
+        deviation,
+        float((values <= LOW).mean()),
+        float((values >= HIGH).mean()),
+        fine / coarse if coarse > 0 else math.nan,
+        coarse / deviation if deviation > 0 else 0.0,
+    )
+
+
+def glance(image: NDArray[Any], valid: NDArray[np.uint8]) -> dict[str, Any]:
+    """Mean and deviation (grey), sharpness (None: none to tell) and detail of strips of an image, and its digest."""
+    rows = image.shape[0]
+    first = sorted({int(np.clip(share * rows - STRIP / 2, 0, max(rows - STRIP, 0))) for share in BANDS})
+    found = [look(image[r : r + STRIP], valid[r : r + STRIP]) for r in first]
+    sharp = [f.sharpness for f in found if math.isfinite(f.sharpness)]
+    rough = [f.detail for f in found]
+    values = grey(np.ascontiguousarray(image[::2, ::2]))[valid[::2, ::2] != 0]
+    return {
+        "mean": float(values.mean()) if values.size else None,
+        "deviation": float(values.std()) if values.size else 0.0,
+        "sharpness": float(np.median(sharp)) if sharp else None,
+        "detail": float(np.median(rough)),
+        "digest": hashlib.sha256(np.ascontiguousarray(image).tobytes()).hexdigest(),
+    }
+
+
+def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+    facts = {
+        side: glance(np.asarray(inputs[side]["image"]), np.asarray(inputs[side]["valid"]))
+        for side in ("left", "right")
+        if side in inputs
+    }
+    return Bundle({}, {"frame": int(args["frame"])} | facts)
+
+
+STAGE = Stage(
+    name="sight",
+    version=1,
+    summary="grey values and sharpness of a pair, before anything is matched",
+    params=NoParams,
+    inputs=("left", "right"),
+    outputs=(),
+    requires=("numpy", "opencv-python-headless"),
+    run=_run,
+)

@@ -1,0 +1,177 @@
+"""Joint refinement: derivatives against differences, what it gains, that it never loses, and the stage's wiring."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stages.declare import Bundle, check_outputs
+from stages.errors import ConfigError
+from stages.geometry import Camera, Rig, RigidTransform, rotation_exp
+from stages.landmarks import landmarks_from_disparity
+from stages.refine import STAGE, RefineParams, State, Views, _normal, adjust, cost_of, views_of
+from stages.resect import ResectParams
+
+CAMERA = Camera(500.0, 500.0, 299.5, 199.5, 600, 400)
+RIG = Rig(CAMERA, CAMERA, RigidTransform(np.eye(3), np.array([-0.2, 0.0, 0.0])))
+PARAMS = RefineParams(stereo=True)
+
+
+def scene(seed, n=150, frames=4, bias=0.0, noise=0.2, stereo=True):
+    """Views of a segment with noisy depths and tracks, the true state, and a start as resection would give it."""
+    rng = np.random.default_rng(seed)
+    key = rng.uniform([20, 20], [580, 380], (n, 2))
+    depth = rng.uniform(2.0, 6.0, n)
+    X = CAMERA.rays(key) * depth[:, None]
+    per_pixel = (depth**2 / (500.0 * 0.2))[:, None] * CAMERA.rays(key)
+    error = noise * rng.standard_normal(n)
+    T = [
+        RigidTransform(rotation_exp(0.01 * k * np.array([1, -2, 1])), np.array([0.02, 0.01, -0.1]) * k)
+        for k in range(1, frames)
+    ]
+    pixels = np.array([CAMERA.project(P.apply(X)) for P in T]) + noise * rng.standard_normal((frames - 1, n, 2))
+    right, sigma = np.full((n, 2), np.nan), np.full(n, np.nan)
+    if stereo:
+        last = T[-1].apply(X)
+        seen_right = CAMERA.project(RIG.T_right_left.apply(last)) + pixels[-1] - CAMERA.project(last)
+        # a bias makes every disparity point to a depth that lies too near by so many pixels
+        right = seen_right - [bias, 0.0] + noise * rng.standard_normal((n, 1)) * [1.0, 0.0]
+        sigma = np.full(n, noise)
+    views = Views(
+        X - (error + bias)[:, None] * per_pixel,
+        per_pixel,
+        np.full(n, noise),
+        pixels,
+        np.ones((frames - 1, n), bool),
+        right,
+        sigma,
+        CAMERA,
+        RIG,
+    )
+    start = [P @ RigidTransform(rotation_exp(1e-4 * rng.standard_normal(3)), 3e-3 * rng.standard_normal(3)) for P in T]
+    return views, State(np.array([P.rotation for P in start]), np.array([P.translation for P in start]), np.zeros(n)), T
+
+
+def error_of(state, T):
+    return float(
+        np.sqrt(
+            np.mean(
+                [np.sum((-R.T @ t - P.inverse().translation) ** 2) for R, t, P in zip(state.R, state.t, T, strict=True)]
+            )
+        )
+    )
+
+
+def test_gradient_is_that_of_the_cost():
+    views, state, _ = scene(1, n=20)
+    state = replace(state, depth=np.linspace(-0.3, 0.3, 20))
+    _, _, _, pose, depth = _normal(views, state, 0.0, 0.2)
+    base = np.zeros((3, 6))
+
+    def cost(step, depths=0.0, bias=0.0):
+        return cost_of(views, state.moved(step, depths * np.ones(20)), bias, 0.2)
+
+    numeric = []
+    for k in range(18):
+        e = base.copy()
+        e.flat[k] = 1e-6
+        numeric.append((cost(e) - cost(-e)) / 2e-6)
+    numeric.append((cost(base, bias=1e-6) - cost(base, bias=-1e-6)) / 2e-6)
+    np.testing.assert_allclose(pose, numeric, rtol=1e-3, atol=0.5)
+    assert depth.sum() == pytest.approx((cost(base, 1e-6) - cost(base, -1e-6)) / 2e-6, rel=1e-4)
+
+
+def test_without_noise_the_truth_is_found():
+    views, start, T = scene(2, noise=1e-6)
+    views = replace(views, sigma=np.full(150, 0.2), right_sigma=np.full(150, 0.2))
+    (state,), bias, before, after = adjust([(views, start)], PARAMS)
+    assert error_of(state, T) < 1e-6
+    assert abs(bias) < 1e-4
+    assert after < 1e-6 * before
+
+
+def test_stereo_at_the_end_and_shared_depths_lower_the_error():
+    gains = []
+    for seed in range(8):
+        views, start, T = scene(10 + seed)
+        (alone,), _, _, _ = adjust([(replace(views, right_sigma=np.full(150, np.nan)), start)], PARAMS)
+        (state,), _, before, after = adjust([(views, start)], PARAMS)
+        assert after <= before
+        gains.append([error_of(state, T), error_of(alone, T)])
+    both, tracks = np.sqrt(np.mean(np.square(gains), axis=0))
+    assert both < tracks
+
+
+def test_a_bias_of_all_disparities_is_found_by_many_segments():
+    parts = [scene(30 + k, bias=0.3) for k in range(5)]
+    _, bias, _, _ = adjust([(v, s) for v, s, _ in parts], RefineParams(bias_sigma=1.0, stereo=True))
+    assert bias == pytest.approx(0.3, abs=0.1)
+
+
+def test_the_cost_never_rises_and_an_optimum_stays():
+    views, start, _ = scene(3)
+    (state,), *_ = adjust([(views, start)], PARAMS)
+    (again,), _, before, after = adjust([(views, state)], RefineParams(iterations=1, stereo=True))
+    assert after <= before
+    np.testing.assert_allclose(again.t, state.t, atol=1e-4)
+
+
+def bundles(tracks_of_last=True):
+    """A segment of three frames ahead of a textured wall, as the stages hand it over."""
+    rng = np.random.default_rng(5)
+    disparity = np.full((400, 600), -500.0 * 0.2 / 4.0, np.float32)
+    pair = Bundle(
+        {"column_disparity": disparity, "row_disparity": 0 * disparity, "validity": np.ones((400, 600), np.uint8)}, {}
+    )
+    later = Bundle({**pair.arrays, "column_disparity": np.full((400, 600), -500.0 * 0.2 / 3.8, np.float32)}, {})
+    key = rng.uniform([60, 60], [540, 340], (80, 2))
+    X = CAMERA.rays(key) * 4.0
+    points = np.stack([CAMERA.project(X - [0.0, 0.0, 0.1 * j]) for j in range(3)], 1).astype(np.float32)
+    poses = np.array([np.hstack([np.eye(3), [[0.0], [0.0], [0.1 * j + 0.002 * (j > 0)]]]) for j in range(3)])
+    track = Bundle({"points": points}, {"frames": [0, 1, 2]})
+    resection = Bundle({"poses": poses, "inlier": np.ones((80, 3), np.uint8)}, {})
+    level = Bundle({}, {"T_local_left": RigidTransform.identity().to_list()})
+    rig = Bundle({}, {"rig": RIG.to_dict()})
+    return {
+        "tracks": [track],
+        "resections": [resection],
+        "levels": [level],
+        "disparities": [pair, later],
+        "rigs": [rig] * 2,
+    }
+
+
+@pytest.mark.parametrize("window", [0, 1])
+def test_the_stage_gives_the_poses_of_all_segments(window):
+    inputs = bundles()
+    args = {"pairs": [0, 2], "resect": ResectParams().model_dump(mode="json")}
+    out = STAGE.run(RefineParams(window=window, stereo=True), args, inputs)
+    check_outputs(STAGE, out)
+    assert out.meta["frames"] == [3]
+    np.testing.assert_allclose(out["poses"][:, :, 3], [[0, 0, 0], [0, 0, 0.1], [0, 0, 0.2]], atol=2e-4)
+    with pytest.raises(ConfigError, match="landmarks=disparity"):
+        STAGE.run(RefineParams(), args | {"resect": ResectParams(landmarks="dem").model_dump(mode="json")}, inputs)
+
+
+def test_a_lost_frame_stays_lost_and_disagreeing_stereo_is_left_out():
+    inputs = bundles()
+    inputs["resections"][0].arrays["poses"][1] = np.nan
+    inputs["disparities"][1].arrays["column_disparity"][:, :300] = -5.0  # another surface
+    args = {"pairs": [0, 2], "resect": ResectParams().model_dump(mode="json")}
+    out = STAGE.run(PARAMS, args, inputs)
+    assert np.isnan(out["poses"][1]).all()
+    assert out["poses"][2, 2, 3] == pytest.approx(0.2, abs=3e-4)
+    track, resection = inputs["tracks"][0], inputs["resections"][0]
+    known = landmarks_from_disparity(
+        np.asarray(track["points"])[:, 0].astype(float),
+        *inputs["disparities"][0].arrays.values(),
+        RIG,
+        RigidTransform.identity(),
+        np.full(80, 0.2),
+        max_depth_ratio=0.2,
+    )
+    views, _, frames = views_of(track, resection, known, RIG, inputs["disparities"][1], PARAMS)
+    assert frames == [2]
+    used = np.isfinite(views.right_sigma)
+    assert used.any()
+    assert (views.pixels[-1][used, 0] > 295).all()
