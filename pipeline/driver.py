@@ -320,8 +320,6 @@ class _Run:
     def _begin(self) -> None:
         """Look ahead, share the memory out, and start the workers that it leaves room for."""
         known, jobs = costs.recall(self.store), self.jobs or cores()
-        if self.executor_kind == "processes":
-            import distributed  # noqa: F401 (what it takes is this process's own)
         ahead = self._look_ahead()
         most = max(largest(ahead, known), *(known.foresee(h.spec, input_bytes(h)).most for h in self.missing))
         shares = account(known, self.memory_limit, self.executor_kind, jobs, most)

@@ -186,10 +186,6 @@ def test_a_limit_keeps_tasks_apart_that_do_not_fit_together(learned, executor):
     store = make("tight")
     rest = costs.recall(store).rest if executor == "processes" else 0.0
     limit = memory.resident() + 2 * rest + 1.5 * HOG + 2 * costs.SLACK
-    if executor == "processes":
-        import distributed  # noqa: F401 (its memory is this process's)
-
-        limit = memory.resident() + 2 * rest + 1.5 * HOG + 2 * costs.SLACK
     graph = hogs()
     result, path = run(graph, store, executor, limit)
     assert result.ok
