@@ -31,26 +31,22 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-import google_crc32c
 import numpy as np
 
-from pipeline.artifact import LazyArrays, array_digests, output_digest, write
+from pipeline.artifact import LazyArrays, checksum
 from pipeline.bucket import Bucket, BucketError, Entry, connect
 from pipeline.location import hints_folder
 from pipeline.store import (
     USED,
-    GoneError,
     Manifest,
-    NonDeterministicError,
     Ref,
     Store,
     StoreError,
-    difference,
     frame,
     reference,
     unframe,
 )
-from stages.declare import AnyArray, Bundle, Stage
+from stages.declare import AnyArray
 
 INDICES = 8
 """Indices read by a survey, the newest."""
@@ -146,64 +142,29 @@ class ObjectStore(Store):
         """Artifacts here are not files."""
         raise StoreError(f"{ref.path} is in {self.location}, not in a folder", remedy="open it with zarr and obstore")
 
-    def open(self, ref: Ref) -> Bundle:
-        """The bundle behind a reference; each array is fetched, its objects compared, at first access."""
+    def _current(self, ref: Ref) -> Manifest | None:
         path = manifest_path(ref.stage, ref.key)
-        try:
-            manifest = self._known[path][1] if path in self._known else self._fetch(path)
-        except ValueError:
-            manifest = None
-        if manifest is None or manifest["digest"] != ref.digest:
-            raise GoneError(f"artifact {ref.stage} {ref.key[:12]} has gone from {self.location}", remedy="run again")
+        with suppress(ValueError):
+            return self._known[path][1] if path in self._known else self._fetch(path)
+        return None
 
-        def damaged(reason: str) -> None:
-            self.set_aside(ref.stage, ref.key, manifest, reason)
-
-        return Bundle(RemoteArrays(self.bucket, manifest, damaged), manifest["meta"])
+    def _arrays(self, manifest: Manifest, damaged: Callable[[str], None]) -> LazyArrays:
+        return RemoteArrays(self.bucket, manifest, damaged)
 
     # -- writing ------------------------------------------------------------------------------------------------
 
-    def commit(
-        self, stage: Stage, key: str, bundle: Bundle, *, label: str = "", provenance: Mapping[str, Any] | None = None
-    ) -> Ref:
-        """Write a result and publish it under its key; what another one has published before stays.
-
-        Raises
-        ------
-        NonDeterministicError
-            The key is there already, with another digest.
-        BucketError
-            The server does not answer, or refuses.
-        """
-        digests = array_digests(bundle.arrays)
-        digest = output_digest(digests, bundle.meta)
-        attempt = f"data/{stage.name}/{key}/a-{uuid.uuid4().hex[:16]}"
-        files, arrays = _encoded(stage, bundle)
-        manifest: Manifest = {
-            "stage": stage.name,
-            "label": label,
-            "key": key,
-            "digest": digest,
-            "path": attempt,
-            "arrays": {name: {**about, "sha256": digests[name]} for name, about in arrays.items()},
-            "meta": dict(bundle.meta),
-            "files": {name: [len(data), _crc32c(data)] for name, data in files.items()},
-            "provenance": dict(provenance or {}),
-        }
-        framed = frame(manifest)
-        objects = {f"{attempt}/{name}": data for name, data in files.items()}
+    def _write(self, manifest: Manifest, files: Mapping[str, bytes]) -> Manifest | None:
+        manifest["path"] = f"data/{manifest['stage']}/{manifest['key']}/a-{uuid.uuid4().hex[:16]}"
+        objects = {f"{manifest['path']}/{name}": data for name, data in files.items()}
         try:
             self.bucket.put_all(objects)
         except BaseException:
             self._discard(objects)
             raise
-        there = self._create(manifest, framed)
-        if there is None:
-            return reference(json.loads(json.dumps(manifest)))
-        self._discard(objects)
-        if there["digest"] != digest:
-            raise NonDeterministicError(difference(label or key[:12], manifest, there))
-        return reference(there)
+        there = self._create(manifest, frame(manifest))
+        if there is not None:
+            self._discard(objects)
+        return there
 
     def _create(self, manifest: Manifest, framed: bytes) -> Manifest | None:
         """Write the manifest unless there is one; returns the one that was there before, if any."""
@@ -283,22 +244,9 @@ def damaged_objects(files: Mapping[str, list[Any]], contents: Mapping[str, bytes
             return f"{name} is missing"
         if len(data) != size:
             return f"{name} has {len(data)} bytes instead of {size}"
-        if _crc32c(data) != crc:
+        if checksum(data) != crc:
             return f"{name} has another checksum"
     return ""
-
-
-def _encoded(stage: Stage, bundle: Bundle) -> tuple[dict[str, bytes], dict[str, Any]]:
-    """The zarr group of a bundle as objects by relative name, and the description of its arrays."""
-    from zarr.storage import MemoryStore
-
-    chunks: dict[str, Any] = {}
-    arrays = write(MemoryStore(chunks), stage, bundle)
-    return {name: chunk.to_bytes() for name, chunk in chunks.items()}, arrays
-
-
-def _crc32c(data: bytes) -> str:
-    return f"{google_crc32c.value(data):08x}"
 
 
 def _pack(index: dict[str, tuple[str, Manifest]]) -> tuple[str, bytes]:

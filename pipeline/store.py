@@ -25,7 +25,7 @@ import os
 import shutil
 import time
 import uuid
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,7 +33,7 @@ from typing import Any
 
 import google_crc32c
 
-from pipeline.artifact import LazyArrays, array_digests, damage, fsync, output_digest, seal, write
+from pipeline.artifact import LazyArrays, array_digests, checksum, damage, encode, fsync, output_digest, spill
 from pipeline.location import Location, locate
 from stages.declare import Bundle, Stage
 from stages.errors import RilleError
@@ -144,14 +144,20 @@ class Store:
         GoneError
             The artifact has gone since it was looked up.
         """
-        manifest = self.manifest(ref.stage, ref.key)
+        manifest = self._current(ref)
         if manifest is None or manifest["digest"] != ref.digest:
-            raise GoneError(f"artifact {ref.stage} {ref.key[:12]} has gone from {self.root}", remedy="run again")
+            raise GoneError(f"artifact {ref.stage} {ref.key[:12]} has gone from {self.location}", remedy="run again")
 
         def damaged(reason: str) -> None:
             self.set_aside(ref.stage, ref.key, manifest, reason)
 
-        return Bundle(LazyArrays(self.root / manifest["path"], manifest, damaged), manifest["meta"])
+        return Bundle(self._arrays(manifest, damaged), manifest["meta"])
+
+    def _current(self, ref: Ref) -> Manifest | None:
+        return self.manifest(ref.stage, ref.key)
+
+    def _arrays(self, manifest: Manifest, damaged: Callable[[str], None]) -> LazyArrays:
+        return LazyArrays(self.root / manifest["path"], manifest, damaged)
 
     def commit(
         self, stage: Stage, key: str, bundle: Bundle, *, label: str = "", provenance: Mapping[str, Any] | None = None
@@ -164,38 +170,32 @@ class Store:
             The key is there already, with another digest.
         StoreError
             The disk is full or may not be written.
+        BucketError
+            The server does not answer, or refuses.
         """
-        digests = array_digests(bundle.arrays)
-        digest = output_digest(digests, bundle.meta)
-        home = self.home(stage.name, key)
+        files, manifest = prepare(stage, key, bundle, label, provenance)
+        return settle(manifest, self._write(manifest, files))
+
+    def _write(self, manifest: Manifest, files: Mapping[str, bytes]) -> Manifest | None:
+        """Write an attempt, whose path is noted in the manifest, and publish it; what was there before, if anything."""
+        home = self.home(manifest["stage"], manifest["key"])
         attempt = home / f"a-{uuid.uuid4().hex[:16]}"
+        manifest["path"] = attempt.relative_to(self.root).as_posix()
         with self._clear_errors():
             try:
                 _make(attempt)
-                arrays = write(attempt, stage, bundle)
-                manifest: Manifest = {
-                    "stage": stage.name,
-                    "label": label,
-                    "key": key,
-                    "digest": digest,
-                    "path": attempt.relative_to(self.root).as_posix(),
-                    "arrays": {name: {**about, "sha256": digests[name]} for name, about in arrays.items()},
-                    "meta": dict(bundle.meta),
-                    "files": seal(attempt),
-                    "provenance": dict(provenance or {}),
-                }
+                spill(attempt, files)
                 there = self._publish(home, manifest)
             except BaseException:
-                published = self.manifest(stage.name, key)  # an interruption may come just after the link
-                if published is None or published["path"] != attempt.relative_to(self.root).as_posix():
-                    _discard(attempt)
+                published = self.manifest(
+                    manifest["stage"], manifest["key"]
+                )  # an interruption may come just after the link
+                if published is None or published["path"] != manifest["path"]:
+                    shutil.rmtree(attempt, ignore_errors=True)
                 raise
-        if there is None:
-            return reference(json.loads(json.dumps(manifest)))
-        shutil.rmtree(attempt, ignore_errors=True)
-        if there["digest"] != digest:
-            raise NonDeterministicError(difference(label or key[:12], manifest, there))
-        return reference(there)
+        if there is not None:
+            shutil.rmtree(attempt, ignore_errors=True)
+        return there
 
     def _publish(self, home: Path, manifest: Manifest) -> Manifest | None:
         """Link the manifest into place; returns the sound one that was there before, if any."""
@@ -295,6 +295,40 @@ def at(cache: Path | str) -> Store:
     return ObjectStore(where)
 
 
+def prepare(
+    stage: Stage, key: str, bundle: Bundle, label: str, provenance: Mapping[str, Any] | None
+) -> tuple[dict[str, bytes], Manifest]:
+    """A result as contents by relative path, and its manifest, which lacks only the ``path`` of the attempt."""
+    digests = array_digests(bundle.arrays)
+    digest = output_digest(digests, bundle.meta)
+    files, arrays = encode(stage, bundle)
+    return files, {
+        "stage": stage.name,
+        "label": label,
+        "key": key,
+        "digest": digest,
+        "arrays": {name: {**about, "sha256": digests[name]} for name, about in arrays.items()},
+        "meta": dict(bundle.meta),
+        "files": {name: [len(data), checksum(data)] for name, data in files.items()},
+        "provenance": dict(provenance or {}),
+    }
+
+
+def settle(manifest: Manifest, there: Manifest | None) -> Ref:
+    """Reference of a commit: to what was published, or to what was ``there`` before if that is the same.
+
+    Raises
+    ------
+    NonDeterministicError
+        It is not the same.
+    """
+    if there is None:
+        return reference(json.loads(json.dumps(manifest)))
+    if there["digest"] != manifest["digest"]:
+        raise NonDeterministicError(difference(manifest["label"] or manifest["key"][:12], manifest, there))
+    return reference(there)
+
+
 def frame(manifest: Manifest) -> bytes:
     """A manifest as it is stored, with its checksum."""
     body = json.dumps(manifest, allow_nan=False).encode()
@@ -318,15 +352,6 @@ def _make(attempt: Path) -> None:
             attempt.mkdir(parents=True)
             return
     attempt.mkdir(parents=True)
-
-
-def _discard(attempt: Path) -> None:
-    """Remove an attempt; where one write failed, others of zarr's may be under way still."""
-    for pause in (0.0, 0.02, 0.1, 0.5):
-        time.sleep(pause)
-        shutil.rmtree(attempt, ignore_errors=True)
-        if not attempt.exists():
-            return
 
 
 def reference(manifest: Manifest) -> Ref:
