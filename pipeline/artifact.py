@@ -193,17 +193,26 @@ def damage(folder: Path | str, files: Mapping[str, list[Any]], checksums: Callab
 
     Sizes are always compared, contents where ``checksums(relative path)`` says so.
     """
-    base = str(folder)
     for name, (size, crc) in files.items():
-        path = f"{base}/{name}"
+        if wrong := resized(str(folder), {name: size}):
+            return wrong
         try:
-            found = os.stat(path).st_size
-            if found != size:
-                return f"{name} has {found} bytes instead of {size}"
-            if checksums(name) and crc32c(Path(path)) != crc:
+            if checksums(name) and crc32c(Path(folder, name)) != crc:
                 return f"{name} has another checksum"
         except (FileNotFoundError, NotADirectoryError):
             return f"{name} is missing"
+    return ""
+
+
+def resized(folder: str, files: Mapping[str, int]) -> str:
+    """The first file that has not the given size, in words; empty if there is none."""
+    for name, size in files.items():
+        try:
+            found = os.stat(f"{folder}/{name}").st_size
+        except (FileNotFoundError, NotADirectoryError):
+            return f"{name} is missing"
+        if found != size:
+            return f"{name} has {found} bytes instead of {size}"
     return ""
 
 

@@ -67,7 +67,7 @@ class ObjectStore(Store):
 
     # -- looking up ---------------------------------------------------------------------------------------------
 
-    def survey(self) -> None:
+    def survey(self, sequence: str) -> None:
         """List the manifests, and read the newest indices (a copy of each is kept on this machine)."""
         self._listed = {e.path: e.etag for e in self.bucket.list("manifests")}
         self._indices = {e.path: e for e in self.bucket.list("index")}

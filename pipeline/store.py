@@ -6,6 +6,7 @@ Layout under the cache folder::
     artifacts/<stage>/<k>/<key>/a-<unique>/      one attempt: an immutable zarr 3 group (xarray.open_zarr reads it)
     quarantine/<stage>-<key>-<unique>/           damaged artifacts, set aside
     labels/...  seconds.json  costs.json         hints for explanations and estimates; never a matter of correctness
+    index/<sequence>                             what its last run found: spares reading manifests that nobody touched
     pins/<run>.json                              keys that clearing up leaves alone
     numba/<digest>/                              compiled kernels by digest of all own code
 
@@ -33,7 +34,8 @@ from typing import Any
 
 import google_crc32c
 
-from pipeline.artifact import LazyArrays, array_digests, checksum, damage, encode, fsync, output_digest, spill
+from pipeline.artifact import LazyArrays, array_digests, checksum, encode, fsync, output_digest, resized, spill
+from pipeline.catalogue import Catalogue, Entry, status
 from pipeline.location import Location, locate
 from stages.declare import Bundle, Stage
 from stages.errors import RilleError
@@ -87,43 +89,74 @@ class Store:
     def __init__(self, root: Path | str) -> None:
         self.root = Path(root).absolute()
         self.location = self.root
+        self._catalogue: Catalogue | None = None
 
     def __fspath__(self) -> str:
         return str(self.root)
 
-    def survey(self) -> None:
-        """Before many look-ups: a store far away finds out at once what is there, with few requests."""
+    def survey(self, sequence: str) -> None:
+        """Before many look-ups: find out at once what is there, with few requests or readings.
+
+        ``sequence`` names what runs over the same images, whatever their parameters.
+        """
+        self._catalogue = Catalogue.load(self.root / "index" / sequence)
 
     def note(self, refs: Iterable[Ref]) -> None:
         """At the end of a run: what it used, for later surveys."""
+        if self._catalogue is None:
+            return
+        used = {ref.key: ref for ref in refs}
+        for key, ref in used.items():
+            if key not in self._catalogue.lines and key not in self._catalogue.found:
+                with suppress(OSError, ValueError):
+                    home = self._home(ref.stage, key)
+                    self._enter(os.stat(f"{home}/manifest.json"), self._read_manifest(home))
+        self._catalogue.save(used)
+
+    def _enter(self, stat: os.stat_result, manifest: Manifest) -> Entry:
+        """Of a manifest that was read after its status was taken."""
+        nbytes, stored = sizes(manifest)
+        files = {name: size for name, (size, _) in manifest["files"].items()}
+        m = manifest
+        entry = Entry(status(stat), m["digest"], m["path"], nbytes, stored, m["meta"], files)
+        if self._catalogue is not None:
+            self._catalogue.found[m["key"]] = entry
+        return entry
 
     def lookup(self, stage: str, key: str, *, fresh: bool = False) -> Ref | None:
         """The artifact of a key, its file sizes checked; a damaged one is set aside and counts as absent.
 
         ``fresh`` does not rely on a survey.
         """
-        manifest = self._sound(stage, key)
-        return None if manifest is None else reference(manifest)
+        entry = self._sound(stage, key)
+        if entry is None:
+            return None
+        return Ref(key, stage, entry.digest, entry.path, entry.meta, entry.nbytes, entry.stored)
 
-    def _sound(self, stage: str, key: str) -> Manifest | None:
+    def _sound(self, stage: str, key: str) -> Entry | None:
         home = self._home(stage, key)  # no Path: a plan looks tens of thousands up
-        published = f"{home}/manifest.json"
+        published, manifest = f"{home}/manifest.json", None
         try:
             with self._clear_errors():
-                if os.stat(published).st_mtime < time.time() - USED:
+                stat = os.stat(published)
+                if stat.st_mtime < time.time() - USED:
                     with suppress(OSError):  # a cache may be read-only
                         os.utime(published)
-                manifest = self._read_manifest(home)
+                        stat = os.stat(published)
+                entry = self._catalogue and self._catalogue.get(key, status(stat))
+                if entry is None:
+                    manifest = self._read_manifest(home)
+                    entry = self._enter(stat, manifest)
         except FileNotFoundError:
             return None
         except ValueError:
             self.set_aside(stage, key, None, "manifest.json is not readable")
             return None
-        wrong = damage(f"{self.root}/{manifest['path']}", manifest["files"], lambda _: False)
+        wrong = resized(f"{self.root}/{entry.path}", entry.files)
         if wrong:
-            self.set_aside(stage, key, manifest, wrong)
+            self.set_aside(stage, key, manifest or self.manifest(stage, key), wrong)
             return None
-        return manifest
+        return entry
 
     def manifest(self, stage: str, key: str) -> Manifest | None:
         """Manifest of a key as it was committed, no check of the files; None if absent or not readable."""
@@ -210,7 +243,8 @@ class Store:
                 try:
                     os.link(temporary, home / "manifest.json")
                 except FileExistsError:
-                    there = self._sound(manifest["stage"], manifest["key"])
+                    sound = self._sound(manifest["stage"], manifest["key"])
+                    there = self.manifest(manifest["stage"], manifest["key"]) if sound else None
                     if there is not None:
                         return there
                 else:

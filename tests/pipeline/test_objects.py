@@ -192,7 +192,7 @@ def test_damage_is_seen_when_read_and_healed(url, right, way):
         store.bucket.delete([entry.path])
     else:
         store.bucket.put(entry.path, bytes(data) if way == "flip" else bytes(data[:-3]))
-    store.survey()
+    store.survey("")
     ref = store.lookup("numbers", entry.path.split("/")[2])
     with pytest.raises(DamagedError, match="values/c"):
         store.open(ref)["values"]
