@@ -216,19 +216,41 @@ class RemoteArrays(LazyArrays):
 
     def _load(self, name: str, files: Mapping[str, list[Any]], window: tuple[Any, ...]) -> tuple[AnyArray, str]:
         import zarr
-        from zarr.core.buffer import cpu
-        from zarr.storage import MemoryStore
 
-        place = self._manifest["path"]
-        found = self._bucket.get_all(f"{place}/{file}" for file in files)
-        contents = {file: found[f"{place}/{file}"] for file in files}
-        if wrong := damaged_objects(files, {f: None if c is None else c[0] for f, c in contents.items()}):
-            return np.empty(0), wrong
-        chunks: Any = {
-            f.removeprefix(f"{name}/"): cpu.Buffer.from_bytes(c[0]) for f, c in contents.items() if c is not None
-        }
-        array = zarr.open_array(store=MemoryStore(chunks, read_only=True), mode="r")
-        return np.asarray(array[window]), ""
+        def fetch(key: str) -> bytes | None:
+            file = f"{name}/{key}"
+            if file not in files:
+                return None
+            found = self._bucket.get(f"{self._manifest['path']}/{file}")
+            data = None if found is None else found[0]
+            if wrong := damaged_objects({file: files[file]}, {file: data}):
+                raise _WrongError(wrong)
+            return data
+
+        try:
+            array = zarr.open_array(store=_reading(fetch), mode="r")
+            return np.asarray(array[window]), ""
+        except _WrongError as error:
+            return np.empty(0), str(error)
+
+
+class _WrongError(Exception):
+    """What is wrong with an object."""
+
+
+def _reading(fetch: Callable[[str], bytes | None]) -> Any:
+    """A store of zarr's that asks for each object when it is read: of a window, only the chunks that it touches."""
+    import asyncio
+
+    from zarr.core.buffer import cpu
+    from zarr.storage import MemoryStore
+
+    class Reading(MemoryStore):
+        async def get(self, key: str, prototype: Any = None, byte_range: Any = None) -> Any:
+            data = await asyncio.to_thread(fetch, key)  # several at once
+            return None if data is None else cpu.Buffer.from_bytes(data)
+
+    return Reading(read_only=True)
 
 
 def manifest_path(stage: str, key: str) -> str:

@@ -308,6 +308,25 @@ def test_locations():
     assert not isinstance(at("some/folder"), ObjectStore)
 
 
+def test_of_a_window_only_the_chunks_are_fetched_that_it_touches(url, proxied):
+    rng = np.random.default_rng(0)
+    whole = Bundle({"values": rng.random((2500, 1100)), "mask": np.zeros((3, 4), dtype=np.uint8)}, {"frame": 0})
+    ref = at(url).commit(numbers.STAGE, "k" * 64, whole, label="numbers/0")
+    proxy = proxied(lambda *_: "")
+    opened = at(url).open(ref)
+    del proxy.requests[:]
+    part = opened.part("values", (slice(1000, 1040), slice(5, 9)))
+    assert (part == whole["values"][1000:1040, 5:9]).all()
+    asked = sorted(path.rpartition("/")[2] for _, path in proxy.requests)
+    assert asked == ["c.0.0", "c.1.0", "zarr.json"]
+    assert (opened.raster("values")[2499:, 1024:] == whole["values"][2499:, 1024:]).all()
+    assert (opened["values"] == whole["values"]).all()
+    at(url).bucket.delete([f"{ref.path}/values/c.2.1"])
+    assert (opened.part("values", (slice(0, 5), slice(0, 5))) == whole["values"][:5, :5]).all()
+    with pytest.raises(DamagedError, match=r"values/c\.2\.1 is missing"):
+        opened.part("values", (slice(2400, 2500), slice(1030, 1040)))
+
+
 def test_arrays_are_read_by_zarr_as_they_are(url):
     zarr = pytest.importorskip("zarr")
     from zarr.storage import ObjectStore as Remote
