@@ -62,11 +62,11 @@ class Entry:
 
 @dataclass
 class Catalogue:
-    """Lines by key; ``found`` are those that were read from manifests since."""
+    """Lines by key; ``found`` are those that were read from manifests since, with the manifest's time of change."""
 
     path: Path
     lines: dict[str, str] = field(default_factory=dict)
-    found: dict[str, Entry] = field(default_factory=dict)
+    found: dict[str, tuple[int, str]] = field(default_factory=dict)
 
     @staticmethod
     def load(path: Path) -> Catalogue:
@@ -85,10 +85,14 @@ class Catalogue:
             return None
         return Entry.read(line)
 
+    def enter(self, key: str, entry: Entry) -> None:
+        """Take in what a manifest says that was read."""
+        self.found[key] = entry.status[3], entry.line()
+
     def save(self, used: Iterable[str]) -> None:
         """Write the file where manifests were read; ``used`` are the keys that a run asked for. Best effort."""
         settled = time.time_ns() - RACY
-        new = {key: entry.line() for key, entry in self.found.items() if entry.status[3] < settled}
+        new = {key: line for key, (changed, line) in self.found.items() if changed < settled}
         if not new:
             return
         lines = self.lines | new

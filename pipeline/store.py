@@ -120,7 +120,7 @@ class Store:
         m = manifest
         entry = Entry(status(stat), m["digest"], m["path"], nbytes, stored, m["meta"], files)
         if self._catalogue is not None:
-            self._catalogue.found[m["key"]] = entry
+            self._catalogue.enter(m["key"], entry)
         return entry
 
     def lookup(self, stage: str, key: str, *, fresh: bool = False) -> Ref | None:

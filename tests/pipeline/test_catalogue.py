@@ -113,6 +113,7 @@ def test_lines_that_no_run_uses_any_more_go(tmp_path):
     entry = Entry(status(made), "d", "p", 1, 2, {"a": [1.5, None]}, {"zarr.json": 3})
     assert Entry.read(entry.line()) == entry
     book = Catalogue(tmp_path / "index" / "x")
-    book.found = {f"{k:064d}": entry for k in range(20)}
+    for k in range(20):
+        book.enter(f"{k:064d}", entry)
     book.save([f"{k:064d}" for k in range(2)])
     assert len(Catalogue.load(book.path).lines) == 2 * (1 + catalogue.SPARE)

@@ -147,7 +147,8 @@ def test_a_run_heals_an_artifact_of_each_stage(whole, tmp_path, row):
     wrong = [label for label, r in rows(whole.where).items() if healed[label]["digest"] != r["digest"]]
     wrong += same_files(whole, tmp_path)
     lost = sorted(set(whole.right) - set(look.manifests(cache)))
-    computed = sum(r["status"] == "computed" for r in healed.values())
+    # not by the ledger: what is found when the results are drawn is computed by a second run
+    computed = sum(store.manifest(m["stage"], m["key"])["path"] != m["path"] for m in made.values())
     row("one artifact of each stage damaged", len(made), lost, wrong, computed, range(certain, len(made) + 1),
         "what keeps its size counts where it is read")  # fmt: skip
 
