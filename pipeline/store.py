@@ -143,7 +143,7 @@ class Store:
                     with suppress(OSError):  # a cache may be read-only
                         os.utime(published)
                         stat = os.stat(published)
-                entry = self._catalogue and self._catalogue.get(key, status(stat))
+                entry = None if self._catalogue is None else self._catalogue.get(key, status(stat))
                 if entry is None:
                     manifest = self._read_manifest(home)
                     entry = self._enter(stat, manifest)
