@@ -15,6 +15,7 @@ from types import SimpleNamespace
 
 import psutil
 import pytest
+import xarray
 from test_damage import WAYS
 from torn import look
 
@@ -95,6 +96,18 @@ def one_of_each_stage(store):
     for path in sorted(store.root.glob("artifacts/*/*/*/manifest.json")):
         found.setdefault(path.parents[2].name, store.manifest(path.parents[2].name, path.parent.name))
     return found
+
+
+def test_an_artifact_of_each_stage_opens_with_xarray_and_has_units(whole):
+    store = Store(whole.where / "cache")
+    made = one_of_each_stage(store)
+    assert len(made) > 25
+    for stage, manifest in made.items():
+        opened = xarray.open_zarr(store.root / manifest["path"], consolidated=False)
+        assert set(opened.data_vars) == set(manifest["arrays"]), stage
+        for name in opened.data_vars:
+            assert opened[name].attrs["units"], (stage, name)
+            assert opened[name].attrs["long_name"], (stage, name)
 
 
 def value(store, made):
