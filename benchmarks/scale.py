@@ -52,6 +52,9 @@ STAGE = image_stage()
 SPACING = 0.5
 """Metres from pair to pair; elevation models of 1.6 m then overlap."""
 
+CELL = 0.004
+"""Metres; a world tile of 512 cells then holds cells of about seven models."""
+
 UNFLUSHED = "RILLE_SCALE_UNFLUSHED"
 
 
@@ -71,7 +74,7 @@ def nothing(name: str) -> Any:
             for a in stage.outputs
             if not a.optional
         }
-        return Bundle(arrays, {**_facts(name, args), "of": _of(args, inputs)})
+        return Bundle(arrays, {**_facts(name, args, inputs), "of": _of(args, inputs)})
 
     return run
 
@@ -90,7 +93,7 @@ def _real(name: str) -> Any:
     return stage(name)
 
 
-def _facts(name: str, args: Any) -> dict[str, Any]:
+def _facts(name: str, args: Any, inputs: Any) -> dict[str, Any]:
     if name == "select":
         n = args["frames"]
         return {"basic": list(range(n)), "segments": [[k, k + 1] for k in range(n - 1)]}
@@ -102,8 +105,28 @@ def _facts(name: str, args: Any) -> dict[str, Any]:
         from stages.lattice import Lattice
 
         y = SPACING * args["pair"]
-        return {"lattice": Lattice.snap((-0.8, 0.8, y, y + 1.6), 0.1).to_dict(), "pair": args["pair"]}
+        return {"lattice": Lattice.snap((-0.8, 0.8, y, y + 1.6), CELL).to_dict(), "pair": args["pair"]}
+    if name == "footprint":
+        lattice = inputs["dem"].meta["lattice"]
+        return {
+            "pair": inputs["dem"].meta["pair"],
+            "cell": CELL,
+            "box": lattice,
+            "tiles": list(_tiles(lattice, args["side"])),
+        }
+    if name == "exposure":
+        return {"steps": {}}
     return {k: v for k, v in args.items() if k in ("pair", "frames")}
+
+
+def _tiles(lattice: Any, side: int) -> Iterator[list[int]]:
+    """World tiles that a model without a hole touches, with the box of its cells in each."""
+    col, line = round(lattice["x0"] / lattice["cell"]), round(-lattice["y0"] / lattice["cell"])
+    right, foot = col + lattice["cols"], line + lattice["rows"]
+    for tx in range(col // side, (right - 1) // side + 1):
+        for ty in range(line // side, (foot - 1) // side + 1):
+            left, top = max(col, tx * side), max(line, ty * side)
+            yield [tx, ty, left, top, min(right, (tx + 1) * side) - left, min(foot, (ty + 1) * side) - top]
 
 
 def image_stage() -> Any:

@@ -132,8 +132,12 @@ def forecast(graph: Graph, costs: Costs) -> dict[int, Foreseen]:
     results: dict[int, float] = {}
     for handle in graph.nodes:  # inputs come before what they lead to
         if handle.status == "planned":
-            found[handle.index] = foreseen = costs.foresee(handle.spec, input_bytes(handle, results))
+            size = input_bytes(handle, results)
+            found[handle.index] = foreseen = costs.foresee(handle.spec, size)
             results[handle.index] = foreseen.result
+            inputs = [float(h.ref.nbytes) if h.ref else results.get(h.index, 0.0) for h in handle.upstream()]
+            if inputs and not foreseen.measured:  # guesses upon guesses would grow without end along a chain
+                results[handle.index] = min(foreseen.result, max(*inputs, size - sum(inputs)))
     return found
 
 

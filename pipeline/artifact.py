@@ -13,8 +13,9 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -82,39 +83,17 @@ def _refuse_non_finite(value: Any, where: str) -> None:
         canonical(value, where)
 
 
-def write(place: Any, stage: Stage, bundle: Bundle) -> dict[str, Any]:
-    """Write the arrays of a bundle as a zarr group; returns their description by name (for the manifest).
-
-    ``place`` is a folder, or a store of zarr's.
-    """
+def encode(stage: Stage, bundle: Bundle) -> tuple[dict[str, bytes], dict[str, Any]]:
+    """A bundle as a zarr group: contents by relative path, and the description of its arrays (for the manifest)."""
     import zarr
-    from zarr.codecs import BloscCodec, Crc32cCodec
-    from zarr.storage import LocalStore
+    from zarr.storage import MemoryStore
 
+    chunks: dict[str, Any] = {}
     attributes = {"stage": stage.name, "source": coordinates.source(stage), "meta": dict(bundle.meta)}
-    group = zarr.create_group(
-        store=LocalStore(place) if isinstance(place, Path) else place, zarr_format=3, attributes=attributes
-    )
-    described = {}
+    # in memory first: zarr hands each small file over to a thread of its own, which takes longer than to write it
+    group = zarr.create_group(store=MemoryStore(chunks), zarr_format=3, attributes=attributes)
     lattice = coordinates.lattice_of(bundle.meta)
-    for name in sorted(bundle.arrays):
-        array = np.asarray(bundle.arrays[name])
-        spec = next(a for a in stage.outputs if a.matches(name))
-        described[name] = about = _describe(name, array, spec)
-        written = group.create_array(
-            name,
-            shape=array.shape,
-            dtype=array.dtype.newbyteorder("<"),
-            chunks=tuple(min(max(n, 1), CHUNK) for n in array.shape),
-            compressors=(BloscCodec(cname="lz4", clevel=5, shuffle="shuffle"), Crc32cCodec()),
-            fill_value=np.nan if array.dtype.kind == "f" else 0,
-            dimension_names=about["dims"],
-            chunk_key_encoding={"name": "default", "separator": "."},  # no folders within, which would need flushing
-            attributes={k: about[k] for k in ("units", "long_name", "nodata", "frame") if about[k]}
-            | coordinates.attributes(name, about, bundle.arrays, lattice),
-            config={"write_empty_chunks": True},  # so that a missing chunk is always damage
-        )
-        written[...] = array
+    described = {name: _add(group, name, stage, bundle, lattice) for name in sorted(bundle.arrays)}
     if lattice is not None and bundle.arrays:
         for name, (values, dims, attrs) in coordinates.coordinates(lattice, str(bundle.meta.get("frame", ""))).items():
             at = group.create_array(
@@ -122,7 +101,30 @@ def write(place: Any, stage: Stage, bundle: Bundle) -> dict[str, Any]:
                 chunk_key_encoding={"name": "default", "separator": "."},
             )  # fmt: skip
             at[...] = values
-    return described
+    return {name: chunk.to_bytes() for name, chunk in chunks.items()}, described
+
+
+def _add(group: Any, name: str, stage: Stage, bundle: Bundle, lattice: Any) -> dict[str, Any]:
+    """Write one array into a group; its description."""
+    from zarr.codecs import BloscCodec, Crc32cCodec
+
+    array = np.asarray(bundle.arrays[name])
+    about = _describe(name, array, next(a for a in stage.outputs if a.matches(name)))
+    written = group.create_array(
+        name,
+        shape=array.shape,
+        dtype=array.dtype.newbyteorder("<"),
+        chunks=tuple(min(max(n, 1), CHUNK) for n in array.shape),
+        compressors=(BloscCodec(cname="lz4", clevel=5, shuffle="shuffle"), Crc32cCodec()),
+        fill_value=np.nan if array.dtype.kind == "f" else 0,
+        dimension_names=about["dims"],
+        chunk_key_encoding={"name": "default", "separator": "."},  # no folders within, which would need flushing
+        attributes={k: about[k] for k in ("units", "long_name", "nodata", "frame") if about[k]}
+        | coordinates.attributes(name, about, bundle.arrays, lattice),
+        config={"write_empty_chunks": True},  # so that a missing chunk is always damage
+    )
+    written[...] = array
+    return about
 
 
 def _describe(name: str, array: AnyArray, spec: Array) -> dict[str, Any]:
@@ -138,12 +140,33 @@ def _describe(name: str, array: AnyArray, spec: Array) -> dict[str, Any]:
     }
 
 
-def seal(folder: Path) -> dict[str, list[Any]]:
-    """Flush every file and folder to the disk; returns ``{relative path: [size, crc32c]}``."""
-    paths = [folder, *folder.rglob("*")]
-    with ThreadPoolExecutor(SYNCS) as pool:  # the file system takes those that wait together
-        list(pool.map(fsync, paths))
-    return {p.relative_to(folder).as_posix(): [p.stat().st_size, crc32c(p)] for p in paths if p.is_file()}
+def spill(folder: Path, files: Mapping[str, bytes]) -> None:
+    """Write files below a folder that is there, and flush them and all folders to the disk."""
+    within = sorted({folder / parent for name in files for parent in Path(name).parents})
+    for place in within[1:]:
+        place.mkdir()
+    pool = _writers(os.getpid())  # the file system takes those that wait together
+    under_way = [pool.submit(_write, folder / name, data) for name, data in files.items()]
+    try:
+        for one in under_way:
+            one.result()
+        under_way = [pool.submit(fsync, place) for place in within]
+        for one in under_way:
+            one.result()
+    finally:
+        wait(under_way)  # none may come after what the caller clears away
+
+
+@lru_cache(maxsize=1)
+def _writers(process: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(SYNCS)
+
+
+def _write(path: Path, data: bytes) -> None:
+    with path.open("wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
 
 
 def fsync(path: Path) -> None:
@@ -155,9 +178,14 @@ def fsync(path: Path) -> None:
         os.close(handle)
 
 
+def checksum(data: bytes) -> str:
+    """CRC32C, 8 hexadecimal digits."""
+    return f"{google_crc32c.value(data):08x}"
+
+
 def crc32c(path: Path) -> str:
-    """Checksum of a file, 8 hexadecimal digits."""
-    return f"{google_crc32c.value(path.read_bytes()):08x}"
+    """Checksum of a file."""
+    return checksum(path.read_bytes())
 
 
 def damage(folder: Path | str, files: Mapping[str, list[Any]], checksums: Callable[[str], bool]) -> str:
@@ -165,17 +193,26 @@ def damage(folder: Path | str, files: Mapping[str, list[Any]], checksums: Callab
 
     Sizes are always compared, contents where ``checksums(relative path)`` says so.
     """
-    base = str(folder)
     for name, (size, crc) in files.items():
-        path = f"{base}/{name}"
+        if wrong := resized(str(folder), {name: size}):
+            return wrong
         try:
-            found = os.stat(path).st_size
-            if found != size:
-                return f"{name} has {found} bytes instead of {size}"
-            if checksums(name) and crc32c(Path(path)) != crc:
+            if checksums(name) and crc32c(Path(folder, name)) != crc:
                 return f"{name} has another checksum"
         except (FileNotFoundError, NotADirectoryError):
             return f"{name} is missing"
+    return ""
+
+
+def resized(folder: str, files: Mapping[str, int]) -> str:
+    """The first file that has not the given size, in words; empty if there is none."""
+    for name, size in files.items():
+        try:
+            found = os.stat(f"{folder}/{name}").st_size
+        except (FileNotFoundError, NotADirectoryError):
+            return f"{name} is missing"
+        if found != size:
+            return f"{name} has {found} bytes instead of {size}"
     return ""
 
 

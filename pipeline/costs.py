@@ -51,7 +51,7 @@ SLACK = 8e6
 """Bytes added to each task's upper bound: the granularity of allocators."""
 
 REST = 250e6
-"""Bytes that a worker process holds between tasks, while none was measured: Python with NumPy, numba and dask."""
+"""Bytes that a worker process holds between tasks, while none was measured: Python with NumPy, SciPy and numba."""
 
 Sample = tuple[float, float | None, float, float]
 """Bytes of input, memory (None: not measured), bytes of result decoded, and on disk."""

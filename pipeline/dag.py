@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Any
 
 from pipeline.store import Ref
@@ -127,14 +128,19 @@ def _check_ports(spec: Spec, given: Mapping[str, Handle | list[Handle]]) -> None
     stage = spec.stage
     if not isinstance(spec.params, stage.params):
         raise TypeError(f"{spec.label}: params are {type(spec.params).__name__}, not {stage.params.__name__}")
-    ports = {port.rstrip("*?"): port for port in stage.inputs}
-    unknown = sorted(set(given) - set(ports))
-    missing = [name for name, port in ports.items() if "?" not in port and name not in given]
-    if unknown or missing:
+    ports, needed = _ports(stage.inputs)
+    if not (needed <= given.keys() <= ports.keys()):
+        unknown, missing = sorted(given.keys() - ports.keys()), sorted(needed - given.keys())
         raise TypeError(f"{spec.label}: unknown inputs {unknown}, missing inputs {missing} (ports {stage.inputs})")
     for name, handle in given.items():
         if isinstance(handle, list) != ("*" in ports[name]):
             raise TypeError(f"{spec.label}: input {name} takes {'a list' if '*' in ports[name] else 'one handle'}")
+
+
+@cache
+def _ports(declared: tuple[str, ...]) -> tuple[dict[str, str], frozenset[str]]:
+    """Ports by name, and the names of those that must be given."""
+    return {port.rstrip("*?"): port for port in declared}, frozenset(p.rstrip("*") for p in declared if "?" not in p)
 
 
 def _ref(handle: Handle) -> Ref:

@@ -33,6 +33,7 @@ from pipeline.costs import input_bytes
 from pipeline.dag import Expansion, Graph, Handle
 from pipeline.environment import cores
 from pipeline.executor import Executor, Failed, make
+from pipeline.key import digest
 from pipeline.ledger import Ledger
 from pipeline.progress import Progress, Quiet, recall_seconds, remember_seconds
 from pipeline.store import GoneError, NonDeterministicError, Ref, Store
@@ -218,7 +219,7 @@ class _Run:
 
     def _loop(self) -> None:
         self.progress.open(self.graph, recall_seconds(self.store), self.jobs or cores())
-        self.store.survey()
+        self.store.survey(_sequence(self.graph))
         while True:
             self._settle()
             self._submit()
@@ -257,14 +258,15 @@ class _Run:
         self.expanded = len(self.graph.expansions)
 
     def _look_up(self, handle: Handle) -> None:
-        made = recipe(handle.spec, handle.refs())
-        handle.key = key = key_of(handle.spec, made)
+        refs = handle.refs()
+        handle.key = key = key_of(handle.spec, refs)
         forced = handle.stage in self.force
         ref = None if forced else self.store.lookup(handle.stage, key)
         if ref is not None:
             handle.ref = ref
             self._resolve(handle, "cached")
             return
+        made = recipe(handle.spec, refs)
         handle.reason = "forced" if forced else explain.reason(self.store, handle.stage, handle.label, key, made)
         if self.dry:
             self._resolve(handle, "planned")
@@ -320,8 +322,6 @@ class _Run:
     def _begin(self) -> None:
         """Look ahead, share the memory out, and start the workers that it leaves room for."""
         known, jobs = costs.recall(self.store), self.jobs or cores()
-        if self.executor_kind == "processes":
-            import distributed  # noqa: F401 (what it takes is this process's own)
         ahead = self._look_ahead()
         most = max(largest(ahead, known), *(known.foresee(h.spec, input_bytes(h)).most for h in self.missing))
         shares = account(known, self.memory_limit, self.executor_kind, jobs, most)
@@ -450,6 +450,12 @@ class _Run:
             missing = [h for h in handles if not h.done]
             self.result.unknown += [h.label for h in missing]
             self.ledger.note(f"plan after {_labels(handles)}", "planned" if self.dry else "skipped", _labels(missing))
+
+
+def _sequence(graph: Graph) -> str:
+    """Name of what the graph works on: its first task reads the first image, or what all images are made from."""
+    first = graph.nodes[0].spec if graph.nodes else None
+    return digest(None if first is None else [first.module, first.params, dict(first.args)])[:16]
 
 
 def _light(ref: Ref) -> Ref:

@@ -1,10 +1,9 @@
 """Where tasks run: in this process, on its threads, on worker processes, or on a running dask cluster.
 
-:func:`make` is the one factory. All executors are the same three verbs: ``submit``, ``wait``, ``close``. Worker
-processes are spawned (never forked) with one thread each, for isolation: a crash takes one task with it, and a task
-that has taken three workers along is given up (:class:`WorkerDiedError`). Who ran when a worker died is told by a mark
-on the disk; tasks that only waited there begin elsewhere, as often as it takes. A cluster given by address is examined
-first (:mod:`pipeline.cluster`).
+:func:`make` is the one factory. All executors are the same three verbs: ``submit``, ``wait``, ``close``. Processes of
+this machine are :mod:`pipeline.workers`: a task costs them tenths of a millisecond beside itself, where distributed's
+scheduler takes seven of a core that the workers need. A cluster given by address is dask's, and examined first
+(:mod:`pipeline.cluster`).
 
 Programs call :func:`pipeline.environment.prepare_environment` first thing, so that this process and the workers run
 alike.
@@ -18,49 +17,26 @@ import os
 import pickle
 import queue
 import re
-import shutil
-import signal
-import tempfile
 import threading
 import time
 import traceback
 import warnings
-from collections import Counter
-from collections.abc import Iterator
 from concurrent.futures import Future
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
-from multiprocessing import resource_tracker
-from pathlib import Path
 from typing import Any, Protocol
 
-import psutil
-
 from pipeline import cluster
-from pipeline.environment import cores, prepare_environment, worker_environment
+from pipeline.environment import cores, prepare_environment
 from pipeline.location import Location
 from pipeline.task import Outcome, Refs, Spec, ensure
+from pipeline.workers import WorkerDiedError, Workers, died
 from stages.errors import ConfigError, RilleError
 
 __all__ = ["Executor", "Failed", "WorkerDiedError", "make", "prepare_environment"]
 
-DEATHS = 3
-"""Worker processes that one task may take along."""
-
-INNOCENT = 30
-"""Worker processes that may die before they even begin a task that was sent to them."""
-
-LOST = 4.0
-"""Seconds without a process after which a worker is replaced: its keeper gives up if it dies while it starts."""
-
-START = 60.0
-"""Seconds more for one that has not begun yet."""
-
-REPLACED = 12
-"""Workers replaced without a single task done before the run is given up."""
-
 WATCH = 0.5
-"""Seconds between looks at the memory of the workers."""
+"""Seconds until something else than an end of a task is looked after."""
 
 CONNECT = 10.0
 """Seconds until a scheduler must have answered."""
@@ -69,15 +45,10 @@ LOOK = 2.0
 """Seconds between looks at the scheduler of others."""
 
 GRACE = 2.0
-"""Seconds that workers get to leave at the end of a run before they are killed."""
-
+"""Seconds to take leave of a scheduler at the end of a run."""
 
 HURRY = 0.5
-"""The same for the client and the scheduler of an interrupted run, whose workers are killed already."""
-
-
-class WorkerDiedError(RilleError):
-    """A task took several worker processes along: out of memory, or a crash in native code."""
+"""The same for an interrupted run."""
 
 
 @dataclass(frozen=True)
@@ -272,7 +243,7 @@ class _Client(_Futures):
         return super()._result(key, future)
 
     def _killed(self, key: str, task: str) -> Failed | None:
-        return Failed(_died("worker processes died that had it"), "")
+        return Failed(died("worker processes died that had it"), "")
 
     def close(self, kill: bool = False) -> None:
         """Leave the cluster as it is."""
@@ -321,163 +292,27 @@ def _elsewhere(
     return _attempt(key, root, spec, refs, force)
 
 
-class Processes(_Client):
-    """Worker processes of our own, one thread each."""
+class Processes:
+    """Worker processes of our own, one thread each (:mod:`pipeline.workers`)."""
 
     def __init__(self, jobs: int, cache: Location, memory: float = math.inf) -> None:
-        _quiet()
-        import dask
-        from distributed import LocalCluster
+        self._workers = Workers(jobs, _attempt, cache, memory)
 
-        self._memory: dict[str, int] = {}
-        """Greatest memory of a worker that ran a task, bytes, by the task's key."""
-        self._deaths: Counter[str] = Counter()
-        self._strays: Counter[str] = Counter()
-        self._tasks: dict[str, tuple[Any, ...]] = {}
-        self._marks = Path(tempfile.mkdtemp(prefix="rille-"))
-        self._alive: dict[Any, float] = {}
-        """When each worker was last seen with a process."""
-        self._replaced = 0
-        self._settings = ExitStack()
-        settings = {
-            "distributed.deploy.lost-worker-timeout": "10 days",  # it takes workers away that are just restarting
-            "distributed.nanny.pre-spawn-environ": worker_environment(cache)
-            | {"DASK_DISTRIBUTED__LOGGING__DISTRIBUTED": "critical"},
-            "distributed.scheduler.allowed-failures": 0,  # it would blame what only waited on a worker that died
-            "distributed.scheduler.work-stealing": False,
-            "distributed.scheduler.http.routes": [],
-            "distributed.worker.multiprocessing-method": "spawn",
-            "distributed.worker.profile.enabled": False,
-            # tasks were admitted by their memory: a worker must not refuse one that the others left room for
-            **{f"distributed.worker.memory.{step}": False for step in ("target", "spill", "pause")},
-            "distributed.admin.system-monitor.gil.enabled": False,
-        }
-        try:
-            self._settings.enter_context(dask.config.set(settings))  # workers that replace others need them too
-            with _interrupts_deferred():
-                self._cluster = LocalCluster(
-                    n_workers=jobs,
-                    threads_per_worker=1,
-                    processes=True,
-                    memory_limit=round(memory) if math.isfinite(memory) else "auto",
-                    dashboard_address=None,
-                    scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},  # else port 8787, with a warning if taken
-                    silence_logs=logging.CRITICAL,
-                )
-                super().__init__(self._cluster.scheduler_address)
-        except KeyboardInterrupt:
-            self.close(kill=True)
-            raise
-        except BaseException:
-            self._settings.close()
-            shutil.rmtree(self._marks, ignore_errors=True)
-            raise
-        self._slots = jobs  # all of them, though some may still be starting
+    def idle(self) -> bool:
+        """Whether a worker has nothing to do; it may still be starting."""
+        return self._workers.idle()
 
-    def _start(self, key: str, *task: Any) -> Any:
-        self._tasks[key] = task
-        return self._send(task, key, _marked, self._marks / key)
+    def submit(self, key: str, root: Location, spec: Spec, refs: Refs, force: bool) -> None:
+        """Start the task."""
+        self._workers.give(key, (key, root, spec, refs, force))
 
-    def _killed(self, key: str, task: str) -> Failed | None:
-        """Begin it anew, unless it ran on too many workers that died."""
-        mark = self._marks / key
-        ran = mark.exists()
-        mark.unlink(missing_ok=True)
-        (self._deaths if ran else self._strays)[key] += 1
-        if self._deaths[key] >= DEATHS:
-            seen = f", last seen with {self._memory[key] / 1e6:.0f} MB" if self._memory.get(key) else ""
-            return Failed(_died(f"{DEATHS} worker processes died while they ran it{seen}"), "")
-        if self._strays[key] >= INNOCENT:
-            return Failed(_died(f"{INNOCENT} worker processes died before they began it"), "")
-        self.submit(key, *self._tasks[key])
-        return None
-
-    def _result(self, key: str, future: Any) -> Outcome | Failed | None:
-        outcome = super()._result(key, future)
-        if outcome is not None:
-            self._replaced = 0
-        return outcome
-
-    def _watch(self) -> None:
-        self._replace_lost()
-        for mark in self._marks.iterdir():
-            with suppress(OSError, ValueError, psutil.Error):  # it ends as we look
-                memory = int(psutil.Process(int(mark.read_text())).memory_info().rss)
-                self._memory[mark.name] = max(memory, self._memory.get(mark.name, 0))
-
-    def _replace_lost(self) -> None:
-        now, lost = time.monotonic(), []
-        for name in list(self._cluster.worker_spec):
-            nanny = self._cluster.workers.get(name)
-            process = nanny and nanny.process and nanny.process.process
-            if process is not None and process.is_alive():
-                self._alive[name] = now
-            elif now - self._alive.setdefault(name, now + START) > LOST:
-                lost.append(name)
-        if lost:
-            self._replaced += len(lost)
-            if self._replaced > REPLACED:
-                raise _died(f"{REPLACED} worker processes died as they started")
-            for name in lost:
-                del self._cluster.worker_spec[name]
-            self._cluster.scale(self._slots)
+    def wait(self) -> Landed:
+        """Block until a task has ended; a worker that dies is replaced, and its task begun anew."""
+        return [(key, Failed(a, "") if isinstance(a, RilleError) else a) for key, a in self._workers.wait()]
 
     def close(self, kill: bool = False) -> None:
         """End the workers, at once if ``kill``; none is left behind."""
-        nannies = list({*self._cluster.workers.values(), *self._cluster._created})
-        processes = [n.process.process for n in nannies if n.process and n.process.process]
-        if kill:
-            self._cluster.shutdown_on_close = False  # nor wait for it at exit
-            _kill(nannies, processes)
-        for leave in (self._client.close, self._cluster.close):
-            with suppress(Exception):
-                leave(timeout=HURRY if kill else GRACE)
-        _kill(nannies, processes)
-        self._settings.close()
-        shutil.rmtree(self._marks, ignore_errors=True)
-
-
-def _marked(mark: Path, key: str, root: Location, spec: Spec, refs: Refs, force: bool) -> Outcome | Failed:
-    """Run a task under a mark that outlives the process."""
-    mark.write_text(str(os.getpid()))
-    try:
-        return _attempt(key, root, spec, refs, force)
-    finally:
-        mark.unlink(missing_ok=True)
-
-
-def _died(what: str) -> WorkerDiedError:
-    remedy = "give it more memory with fewer --jobs, or run it with --executor inline to see the crash"
-    return WorkerDiedError(what, remedy=remedy)
-
-
-@contextmanager
-def _interrupts_deferred() -> Iterator[None]:
-    """Hold Ctrl-C back until the end of the block; processes that its new threads begin never see it.
-
-    Otherwise a cluster interrupted half-way could not be closed, and each worker would print a traceback of its own.
-    """
-    resource_tracker.ensure_running()  # it unblocks the signal in the thread that happens to start it
-    came: list[int] = []
-    main = threading.current_thread() is threading.main_thread()
-    previous = signal.signal(signal.SIGINT, lambda number, _: came.append(number)) if main else None
-    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # threads and processes inherit it
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
-        if main:
-            signal.signal(signal.SIGINT, previous)
-    if came:
-        raise KeyboardInterrupt
-
-
-def _kill(nannies: list[Any], processes: list[Any]) -> None:
-    for nanny in nannies:
-        nanny.close_gracefully()  # that is, do not restart its worker
-    for process in processes:
-        with suppress(Exception):
-            process._process.kill()
+        self._workers.close(kill)
 
 
 def _leave_unsaid() -> None:

@@ -15,6 +15,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+from json.encoder import encode_basestring_ascii as _quoted
 from typing import Any
 
 from pydantic import BaseModel
@@ -49,28 +50,47 @@ def canonical(value: Any, where: str = "value") -> Any:
 
 def digest(value: Any, where: str = "value") -> str:
     """SHA-256 of the canonical form, 64 hexadecimal digits."""
-    return hashlib.sha256(_text(canonical(value, where)).encode()).hexdigest()
+    return hashlib.sha256(text(value, where).encode()).hexdigest()
 
 
-class Fixed:
-    """A part of what is digested whose canonical form is kept: the same code, packages, parameters of many tasks.
+def text(value: Any, where: str = "value") -> str:
+    """The canonical form as JSON without spaces, keys in order; without building the tree, for plans ask it often.
 
-    >>> digest_of({"a": Fixed([1.0]), "b": 2}) == digest({"a": [1.0], "b": 2})
-    True
+    Raises
+    ------
+    TypeError
+        As :func:`canonical`.
     """
+    try:
+        return _plain(value)
+    except _FormlessError:
+        return _text(canonical(value, where))
 
-    def __init__(self, value: Any, where: str = "value") -> None:
-        self.value = value
-        self.text = _text(canonical(value, where))
+
+class _FormlessError(Exception):
+    """Something has no canonical form; :func:`canonical` says what, and where."""
 
 
-def digest_of(parts: dict[str, Any], where: str = "value") -> str:
-    """:func:`digest` of a dictionary, some of whose values are :class:`Fixed`."""
-    texts = (
-        f"{json.dumps(name)}:{part.text if isinstance(part, Fixed) else _text(canonical(part, f'{where}.{name}'))}"
-        for name, part in sorted(parts.items())
-    )
-    return hashlib.sha256(f"{{{','.join(texts)}}}".encode()).hexdigest()
+def _plain(value: Any) -> str:
+    kind = type(value)
+    if kind is str:
+        return _quoted(value)
+    if kind is int or value is None or kind is bool:
+        return "null" if value is None else repr(value).lower()
+    if isinstance(value, float):
+        return f'["float","{"nan" if math.isnan(value) else float(value).hex()}"]'
+    if isinstance(value, dict):
+        if not all(type(key) is str for key in value):
+            raise _FormlessError
+        return "{" + ",".join([f"{_quoted(key)}:{_plain(value[key])}" for key in sorted(value)]) + "}"
+    if isinstance(value, list | tuple):
+        return ",".join(['["list"', *map(_plain, value)]) + "]"
+    if isinstance(value, set | frozenset):
+        return ",".join(['["set"', *sorted(map(_plain, value))]) + "]"
+    if isinstance(value, BaseModel):
+        fields = {name: getattr(value, name) for name in type(value).model_fields}
+        return f'["model",{_quoted(type(value).__name__)},{_plain(fields)}]'
+    raise _FormlessError
 
 
 def _text(tree: Any) -> str:

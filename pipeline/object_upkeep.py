@@ -53,7 +53,7 @@ def _damage(store: ObjectStore, manifest: Manifest) -> str:
 def gc(store: ObjectStore, keep: Collection[str], *, grace: float, dry_run: bool) -> tuple[int, int, int]:
     """Numbers of artifacts and of orphans removed, and their bytes; a manifest goes before its objects."""
     limit, kept = time.time() - grace, set(keep)
-    store.survey()
+    store.survey("")
     doomed: list[Entry] = []
     for entry in store.bucket.list("index"):
         if entry.modified > limit:

@@ -31,26 +31,22 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-import google_crc32c
 import numpy as np
 
-from pipeline.artifact import LazyArrays, array_digests, output_digest, write
+from pipeline.artifact import LazyArrays, checksum
 from pipeline.bucket import Bucket, BucketError, Entry, connect
 from pipeline.location import hints_folder
 from pipeline.store import (
     USED,
-    GoneError,
     Manifest,
-    NonDeterministicError,
     Ref,
     Store,
     StoreError,
-    difference,
     frame,
     reference,
     unframe,
 )
-from stages.declare import AnyArray, Bundle, Stage
+from stages.declare import AnyArray
 
 INDICES = 8
 """Indices read by a survey, the newest."""
@@ -71,7 +67,7 @@ class ObjectStore(Store):
 
     # -- looking up ---------------------------------------------------------------------------------------------
 
-    def survey(self) -> None:
+    def survey(self, sequence: str) -> None:
         """List the manifests, and read the newest indices (a copy of each is kept on this machine)."""
         self._listed = {e.path: e.etag for e in self.bucket.list("manifests")}
         self._indices = {e.path: e for e in self.bucket.list("index")}
@@ -146,64 +142,29 @@ class ObjectStore(Store):
         """Artifacts here are not files."""
         raise StoreError(f"{ref.path} is in {self.location}, not in a folder", remedy="open it with zarr and obstore")
 
-    def open(self, ref: Ref) -> Bundle:
-        """The bundle behind a reference; each array is fetched, its objects compared, at first access."""
+    def _current(self, ref: Ref) -> Manifest | None:
         path = manifest_path(ref.stage, ref.key)
-        try:
-            manifest = self._known[path][1] if path in self._known else self._fetch(path)
-        except ValueError:
-            manifest = None
-        if manifest is None or manifest["digest"] != ref.digest:
-            raise GoneError(f"artifact {ref.stage} {ref.key[:12]} has gone from {self.location}", remedy="run again")
+        with suppress(ValueError):
+            return self._known[path][1] if path in self._known else self._fetch(path)
+        return None
 
-        def damaged(reason: str) -> None:
-            self.set_aside(ref.stage, ref.key, manifest, reason)
-
-        return Bundle(RemoteArrays(self.bucket, manifest, damaged), manifest["meta"])
+    def _arrays(self, manifest: Manifest, damaged: Callable[[str], None]) -> LazyArrays:
+        return RemoteArrays(self.bucket, manifest, damaged)
 
     # -- writing ------------------------------------------------------------------------------------------------
 
-    def commit(
-        self, stage: Stage, key: str, bundle: Bundle, *, label: str = "", provenance: Mapping[str, Any] | None = None
-    ) -> Ref:
-        """Write a result and publish it under its key; what another one has published before stays.
-
-        Raises
-        ------
-        NonDeterministicError
-            The key is there already, with another digest.
-        BucketError
-            The server does not answer, or refuses.
-        """
-        digests = array_digests(bundle.arrays)
-        digest = output_digest(digests, bundle.meta)
-        attempt = f"data/{stage.name}/{key}/a-{uuid.uuid4().hex[:16]}"
-        files, arrays = _encoded(stage, bundle)
-        manifest: Manifest = {
-            "stage": stage.name,
-            "label": label,
-            "key": key,
-            "digest": digest,
-            "path": attempt,
-            "arrays": {name: {**about, "sha256": digests[name]} for name, about in arrays.items()},
-            "meta": dict(bundle.meta),
-            "files": {name: [len(data), _crc32c(data)] for name, data in files.items()},
-            "provenance": dict(provenance or {}),
-        }
-        framed = frame(manifest)
-        objects = {f"{attempt}/{name}": data for name, data in files.items()}
+    def _write(self, manifest: Manifest, files: Mapping[str, bytes]) -> Manifest | None:
+        manifest["path"] = f"data/{manifest['stage']}/{manifest['key']}/a-{uuid.uuid4().hex[:16]}"
+        objects = {f"{manifest['path']}/{name}": data for name, data in files.items()}
         try:
             self.bucket.put_all(objects)
         except BaseException:
             self._discard(objects)
             raise
-        there = self._create(manifest, framed)
-        if there is None:
-            return reference(json.loads(json.dumps(manifest)))
-        self._discard(objects)
-        if there["digest"] != digest:
-            raise NonDeterministicError(difference(label or key[:12], manifest, there))
-        return reference(there)
+        there = self._create(manifest, frame(manifest))
+        if there is not None:
+            self._discard(objects)
+        return there
 
     def _create(self, manifest: Manifest, framed: bytes) -> Manifest | None:
         """Write the manifest unless there is one; returns the one that was there before, if any."""
@@ -255,19 +216,41 @@ class RemoteArrays(LazyArrays):
 
     def _load(self, name: str, files: Mapping[str, list[Any]], window: tuple[Any, ...]) -> tuple[AnyArray, str]:
         import zarr
-        from zarr.core.buffer import cpu
-        from zarr.storage import MemoryStore
 
-        place = self._manifest["path"]
-        found = self._bucket.get_all(f"{place}/{file}" for file in files)
-        contents = {file: found[f"{place}/{file}"] for file in files}
-        if wrong := damaged_objects(files, {f: None if c is None else c[0] for f, c in contents.items()}):
-            return np.empty(0), wrong
-        chunks: Any = {
-            f.removeprefix(f"{name}/"): cpu.Buffer.from_bytes(c[0]) for f, c in contents.items() if c is not None
-        }
-        array = zarr.open_array(store=MemoryStore(chunks, read_only=True), mode="r")
-        return np.asarray(array[window]), ""
+        def fetch(key: str) -> bytes | None:
+            file = f"{name}/{key}"
+            if file not in files:
+                return None
+            found = self._bucket.get(f"{self._manifest['path']}/{file}")
+            data = None if found is None else found[0]
+            if wrong := damaged_objects({file: files[file]}, {file: data}):
+                raise _WrongError(wrong)
+            return data
+
+        try:
+            array = zarr.open_array(store=_reading(fetch), mode="r")
+            return np.asarray(array[window]), ""
+        except _WrongError as error:
+            return np.empty(0), str(error)
+
+
+class _WrongError(Exception):
+    """What is wrong with an object."""
+
+
+def _reading(fetch: Callable[[str], bytes | None]) -> Any:
+    """A store of zarr's that asks for each object when it is read: of a window, only the chunks that it touches."""
+    import asyncio
+
+    from zarr.core.buffer import cpu
+    from zarr.storage import MemoryStore
+
+    class Reading(MemoryStore):
+        async def get(self, key: str, prototype: Any = None, byte_range: Any = None) -> Any:
+            data = await asyncio.to_thread(fetch, key)  # several at once
+            return None if data is None else cpu.Buffer.from_bytes(data)
+
+    return Reading(read_only=True)
 
 
 def manifest_path(stage: str, key: str) -> str:
@@ -283,22 +266,9 @@ def damaged_objects(files: Mapping[str, list[Any]], contents: Mapping[str, bytes
             return f"{name} is missing"
         if len(data) != size:
             return f"{name} has {len(data)} bytes instead of {size}"
-        if _crc32c(data) != crc:
+        if checksum(data) != crc:
             return f"{name} has another checksum"
     return ""
-
-
-def _encoded(stage: Stage, bundle: Bundle) -> tuple[dict[str, bytes], dict[str, Any]]:
-    """The zarr group of a bundle as objects by relative name, and the description of its arrays."""
-    from zarr.storage import MemoryStore
-
-    chunks: dict[str, Any] = {}
-    arrays = write(MemoryStore(chunks), stage, bundle)
-    return {name: chunk.to_bytes() for name, chunk in chunks.items()}, arrays
-
-
-def _crc32c(data: bytes) -> str:
-    return f"{google_crc32c.value(data):08x}"
 
 
 def _pack(index: dict[str, tuple[str, Manifest]]) -> tuple[str, bytes]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import numpy as np
 from pipeline import products as files
 from pipeline.conventions import describe
 from pipeline.dag import Graph, Handle
-from pipeline.report import RunView, TaskRow, write_report
+from pipeline.report import RunView, TaskRow, draw, write_report
 from pipeline.report.canvas import ground_limits
 from pipeline.report.comparison import compare
 from pipeline.store import Store
@@ -52,7 +53,17 @@ def task_rows(graph: Graph, store: Store) -> tuple[TaskRow, ...]:
 
 def write(folder: Path, view: RunView) -> None:
     """All files of a run; what has no artifact is left out (the report says so)."""
-    find, p, place = view.bundle, view.products, view.sequence.georeference
+    with ThreadPoolExecutor(1) as pool:  # rasters are computed and compressed while figures are drawn
+        rasters = pool.submit(_write_rasters, folder, view)
+        drawn = draw(view)
+        rasters.result()
+    _write_path(folder, view)
+    _write_trajectories(folder, view)
+    write_report(folder, view, drawn)
+
+
+def _write_rasters(folder: Path, view: RunView) -> None:
+    find, p = view.bundle, view.products
     tiles = [find(tile) for tile in p.tiles]
     if tiles and all(tiles):  # a hole in the run must not look like unknown terrain
         _write_terrain(folder, view, [t for t in tiles if t is not None])
@@ -61,16 +72,17 @@ def write(folder: Path, view: RunView) -> None:
         bands = {"class": risk["risk"], "reason": risk["reason"], "filled": risk["filled"]}
         reasons = ", ".join(f"{bit} {name}" for name, bit in REASONS.items())
         tags = {"classes": "0 safe, 1 hazardous, 2 unknown (never safe)", "reason_bits": reasons}
-        lattice = Lattice.from_dict(risk.meta["lattice"])
+        lattice, place = Lattice.from_dict(risk.meta["lattice"]), view.sequence.georeference
         files.write_raster(folder / "risk.tif", bands, lattice, unit="", nodata=None, tags=tags, place=place)
         files.write_style(folder / "risk.qml", "risk")
-    path = find(p.path)
+
+
+def _write_path(folder: Path, view: RunView) -> None:
+    path = view.bundle(view.products.path)
     if path is not None:
         facts = {k: v for k, v in path.meta.items() if not isinstance(v, dict)}
         files.write_path_geojson(folder / "path.geojson", np.asarray(path["path"]), facts)
-        files.write_path_gpkg(folder / "path.gpkg", np.asarray(path["path"]), facts, place)
-    _write_trajectories(folder, view)
-    write_report(folder, view)
+        files.write_path_gpkg(folder / "path.gpkg", np.asarray(path["path"]), facts, view.sequence.georeference)
 
 
 def _write_trajectories(folder: Path, view: RunView) -> None:

@@ -6,6 +6,7 @@ Layout under the cache folder::
     artifacts/<stage>/<k>/<key>/a-<unique>/      one attempt: an immutable zarr 3 group (xarray.open_zarr reads it)
     quarantine/<stage>-<key>-<unique>/           damaged artifacts, set aside
     labels/...  seconds.json  costs.json         hints for explanations and estimates; never a matter of correctness
+    index/<sequence>                             what its last run found: spares reading manifests that nobody touched
     pins/<run>.json                              keys that clearing up leaves alone
     numba/<digest>/                              compiled kernels by digest of all own code
 
@@ -25,7 +26,7 @@ import os
 import shutil
 import time
 import uuid
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,7 +34,8 @@ from typing import Any
 
 import google_crc32c
 
-from pipeline.artifact import LazyArrays, array_digests, damage, fsync, output_digest, seal, write
+from pipeline.artifact import LazyArrays, array_digests, checksum, encode, fsync, output_digest, resized, spill
+from pipeline.catalogue import Catalogue, Entry, status
 from pipeline.location import Location, locate
 from stages.declare import Bundle, Stage
 from stages.errors import RilleError
@@ -87,43 +89,74 @@ class Store:
     def __init__(self, root: Path | str) -> None:
         self.root = Path(root).absolute()
         self.location = self.root
+        self._catalogue: Catalogue | None = None
 
     def __fspath__(self) -> str:
         return str(self.root)
 
-    def survey(self) -> None:
-        """Before many look-ups: a store far away finds out at once what is there, with few requests."""
+    def survey(self, sequence: str) -> None:
+        """Before many look-ups: find out at once what is there, with few requests or readings.
+
+        ``sequence`` names what runs over the same images, whatever their parameters.
+        """
+        self._catalogue = Catalogue.load(self.root / "index" / sequence)
 
     def note(self, refs: Iterable[Ref]) -> None:
         """At the end of a run: what it used, for later surveys."""
+        if self._catalogue is None:
+            return
+        used = {ref.key: ref for ref in refs}
+        for key, ref in used.items():
+            if key not in self._catalogue.lines and key not in self._catalogue.found:
+                with suppress(OSError, ValueError):
+                    home = self._home(ref.stage, key)
+                    self._enter(os.stat(f"{home}/manifest.json"), self._read_manifest(home))
+        self._catalogue.save(used)
+
+    def _enter(self, stat: os.stat_result, manifest: Manifest) -> Entry:
+        """Of a manifest that was read after its status was taken."""
+        nbytes, stored = sizes(manifest)
+        files = {name: size for name, (size, _) in manifest["files"].items()}
+        m = manifest
+        entry = Entry(status(stat), m["digest"], m["path"], nbytes, stored, m["meta"], files)
+        if self._catalogue is not None:
+            self._catalogue.enter(m["key"], entry)
+        return entry
 
     def lookup(self, stage: str, key: str, *, fresh: bool = False) -> Ref | None:
         """The artifact of a key, its file sizes checked; a damaged one is set aside and counts as absent.
 
         ``fresh`` does not rely on a survey.
         """
-        manifest = self._sound(stage, key)
-        return None if manifest is None else reference(manifest)
+        entry = self._sound(stage, key)
+        if entry is None:
+            return None
+        return Ref(key, stage, entry.digest, entry.path, entry.meta, entry.nbytes, entry.stored)
 
-    def _sound(self, stage: str, key: str) -> Manifest | None:
+    def _sound(self, stage: str, key: str) -> Entry | None:
         home = self._home(stage, key)  # no Path: a plan looks tens of thousands up
-        published = f"{home}/manifest.json"
+        published, manifest = f"{home}/manifest.json", None
         try:
             with self._clear_errors():
-                if os.stat(published).st_mtime < time.time() - USED:
+                stat = os.stat(published)
+                if stat.st_mtime < time.time() - USED:
                     with suppress(OSError):  # a cache may be read-only
                         os.utime(published)
-                manifest = self._read_manifest(home)
+                        stat = os.stat(published)
+                entry = None if self._catalogue is None else self._catalogue.get(key, status(stat))
+                if entry is None:
+                    manifest = self._read_manifest(home)
+                    entry = self._enter(stat, manifest)
         except FileNotFoundError:
             return None
         except ValueError:
             self.set_aside(stage, key, None, "manifest.json is not readable")
             return None
-        wrong = damage(f"{self.root}/{manifest['path']}", manifest["files"], lambda _: False)
+        wrong = resized(f"{self.root}/{entry.path}", entry.files)
         if wrong:
-            self.set_aside(stage, key, manifest, wrong)
+            self.set_aside(stage, key, manifest or self.manifest(stage, key), wrong)
             return None
-        return manifest
+        return entry
 
     def manifest(self, stage: str, key: str) -> Manifest | None:
         """Manifest of a key as it was committed, no check of the files; None if absent or not readable."""
@@ -144,14 +177,20 @@ class Store:
         GoneError
             The artifact has gone since it was looked up.
         """
-        manifest = self.manifest(ref.stage, ref.key)
+        manifest = self._current(ref)
         if manifest is None or manifest["digest"] != ref.digest:
-            raise GoneError(f"artifact {ref.stage} {ref.key[:12]} has gone from {self.root}", remedy="run again")
+            raise GoneError(f"artifact {ref.stage} {ref.key[:12]} has gone from {self.location}", remedy="run again")
 
         def damaged(reason: str) -> None:
             self.set_aside(ref.stage, ref.key, manifest, reason)
 
-        return Bundle(LazyArrays(self.root / manifest["path"], manifest, damaged), manifest["meta"])
+        return Bundle(self._arrays(manifest, damaged), manifest["meta"])
+
+    def _current(self, ref: Ref) -> Manifest | None:
+        return self.manifest(ref.stage, ref.key)
+
+    def _arrays(self, manifest: Manifest, damaged: Callable[[str], None]) -> LazyArrays:
+        return LazyArrays(self.root / manifest["path"], manifest, damaged)
 
     def commit(
         self, stage: Stage, key: str, bundle: Bundle, *, label: str = "", provenance: Mapping[str, Any] | None = None
@@ -164,38 +203,32 @@ class Store:
             The key is there already, with another digest.
         StoreError
             The disk is full or may not be written.
+        BucketError
+            The server does not answer, or refuses.
         """
-        digests = array_digests(bundle.arrays)
-        digest = output_digest(digests, bundle.meta)
-        home = self.home(stage.name, key)
+        files, manifest = prepare(stage, key, bundle, label, provenance)
+        return settle(manifest, self._write(manifest, files))
+
+    def _write(self, manifest: Manifest, files: Mapping[str, bytes]) -> Manifest | None:
+        """Write an attempt, whose path is noted in the manifest, and publish it; what was there before, if anything."""
+        home = self.home(manifest["stage"], manifest["key"])
         attempt = home / f"a-{uuid.uuid4().hex[:16]}"
+        manifest["path"] = attempt.relative_to(self.root).as_posix()
         with self._clear_errors():
             try:
                 _make(attempt)
-                arrays = write(attempt, stage, bundle)
-                manifest: Manifest = {
-                    "stage": stage.name,
-                    "label": label,
-                    "key": key,
-                    "digest": digest,
-                    "path": attempt.relative_to(self.root).as_posix(),
-                    "arrays": {name: {**about, "sha256": digests[name]} for name, about in arrays.items()},
-                    "meta": dict(bundle.meta),
-                    "files": seal(attempt),
-                    "provenance": dict(provenance or {}),
-                }
+                spill(attempt, files)
                 there = self._publish(home, manifest)
             except BaseException:
-                published = self.manifest(stage.name, key)  # an interruption may come just after the link
-                if published is None or published["path"] != attempt.relative_to(self.root).as_posix():
-                    _discard(attempt)
+                published = self.manifest(
+                    manifest["stage"], manifest["key"]
+                )  # an interruption may come just after the link
+                if published is None or published["path"] != manifest["path"]:
+                    shutil.rmtree(attempt, ignore_errors=True)
                 raise
-        if there is None:
-            return reference(json.loads(json.dumps(manifest)))
-        shutil.rmtree(attempt, ignore_errors=True)
-        if there["digest"] != digest:
-            raise NonDeterministicError(difference(label or key[:12], manifest, there))
-        return reference(there)
+        if there is not None:
+            shutil.rmtree(attempt, ignore_errors=True)
+        return there
 
     def _publish(self, home: Path, manifest: Manifest) -> Manifest | None:
         """Link the manifest into place; returns the sound one that was there before, if any."""
@@ -210,7 +243,8 @@ class Store:
                 try:
                     os.link(temporary, home / "manifest.json")
                 except FileExistsError:
-                    there = self._sound(manifest["stage"], manifest["key"])
+                    sound = self._sound(manifest["stage"], manifest["key"])
+                    there = self.manifest(manifest["stage"], manifest["key"]) if sound else None
                     if there is not None:
                         return there
                 else:
@@ -295,6 +329,40 @@ def at(cache: Path | str) -> Store:
     return ObjectStore(where)
 
 
+def prepare(
+    stage: Stage, key: str, bundle: Bundle, label: str, provenance: Mapping[str, Any] | None
+) -> tuple[dict[str, bytes], Manifest]:
+    """A result as contents by relative path, and its manifest, which lacks only the ``path`` of the attempt."""
+    digests = array_digests(bundle.arrays)
+    digest = output_digest(digests, bundle.meta)
+    files, arrays = encode(stage, bundle)
+    return files, {
+        "stage": stage.name,
+        "label": label,
+        "key": key,
+        "digest": digest,
+        "arrays": {name: {**about, "sha256": digests[name]} for name, about in arrays.items()},
+        "meta": dict(bundle.meta),
+        "files": {name: [len(data), checksum(data)] for name, data in files.items()},
+        "provenance": dict(provenance or {}),
+    }
+
+
+def settle(manifest: Manifest, there: Manifest | None) -> Ref:
+    """Reference of a commit: to what was published, or to what was ``there`` before if that is the same.
+
+    Raises
+    ------
+    NonDeterministicError
+        It is not the same.
+    """
+    if there is None:
+        return reference(json.loads(json.dumps(manifest)))
+    if there["digest"] != manifest["digest"]:
+        raise NonDeterministicError(difference(manifest["label"] or manifest["key"][:12], manifest, there))
+    return reference(there)
+
+
 def frame(manifest: Manifest) -> bytes:
     """A manifest as it is stored, with its checksum."""
     body = json.dumps(manifest, allow_nan=False).encode()
@@ -318,15 +386,6 @@ def _make(attempt: Path) -> None:
             attempt.mkdir(parents=True)
             return
     attempt.mkdir(parents=True)
-
-
-def _discard(attempt: Path) -> None:
-    """Remove an attempt; where one write failed, others of zarr's may be under way still."""
-    for pause in (0.0, 0.02, 0.1, 0.5):
-        time.sleep(pause)
-        shutil.rmtree(attempt, ignore_errors=True)
-        if not attempt.exists():
-            return
 
 
 def reference(manifest: Manifest) -> Ref:

@@ -13,6 +13,7 @@ tasks only :class:`~pipeline.store.Ref` travel.
 
 from __future__ import annotations
 
+import hashlib
 import importlib
 import json
 import os
@@ -29,7 +30,7 @@ from typing import Any
 from pipeline import explain
 from pipeline.code import environment, module_digests
 from pipeline.kernels import guard
-from pipeline.key import Fixed, digest_of
+from pipeline.key import text
 from pipeline.memory import Meter
 from pipeline.store import Ref, Store, at
 from stages.declare import Bundle, Params, Stage, check_outputs
@@ -93,7 +94,7 @@ class Outcome:
 MANY = 4096
 """Parameter models whose canonical form is kept."""
 
-_kept: dict[int, tuple[Params, Fixed]] = {}
+_kept: dict[int, tuple[Params, str]] = {}
 """By the id of the model, which is held so that the id stays its own."""
 
 _run: set[str] = set()
@@ -115,33 +116,41 @@ def resolve(module: str) -> Stage:
 
 def recipe(spec: Spec, refs: Refs) -> dict[str, Any]:
     """All that determines a result; its digest is the key."""
-    stage = spec.stage
-    return {
-        "format": FORMAT,
-        "stage": stage.name,
-        "version": stage.version,
-        "code": module_digests(spec.module),
-        "env": environment(stage.requires),
-        "params": spec.params,
-        "args": dict(spec.args),
-        "inputs": {p: [r.digest for r in ref] if isinstance(ref, list) else ref.digest for p, ref in refs.items()},
-    }
+    return {**_fixed(spec.module), "params": spec.params, "args": dict(spec.args), "inputs": _digests(refs)}
 
 
-def key_of(spec: Spec, made: Mapping[str, Any]) -> str:
-    """Key of a recipe: ``digest(made)``, with what many tasks share put into its canonical form only once."""
+def key_of(spec: Spec, refs: Refs) -> str:
+    """Key of a task, ``digest(recipe(spec, refs))``; what many tasks share is put into its canonical form only once."""
     kept = _kept.get(id(spec.params))
     if kept is None or kept[0] is not spec.params:
-        kept = _kept[id(spec.params)] = (spec.params, Fixed(spec.params, f"{spec.label}.params"))
         if len(_kept) > MANY:
             _kept.clear()
-    return digest_of({**made, "params": kept[1], **_shared(spec.module)}, spec.label)
+        kept = _kept[id(spec.params)] = (spec.params, text(spec.params, f"{spec.label}.params"))
+    before, after = _shared(spec.module)
+    args, inputs = text(dict(spec.args), f"{spec.label}.args"), text(_digests(refs))
+    parts = f'{{"args":{args},{before},"inputs":{inputs},"params":{kept[1]},{after}}}'
+    return hashlib.sha256(parts.encode()).hexdigest()
 
 
 @cache
-def _shared(module: str) -> dict[str, Fixed]:
-    """What all tasks of a stage have in common."""
-    return {"code": Fixed(module_digests(module)), "env": Fixed(environment(resolve(module).requires))}
+def _shared(module: str) -> tuple[str, str]:
+    """What all tasks of a stage have in common, in the order of the names: before the inputs, and after parameters."""
+    fixed = {name: text(value) for name, value in _fixed(module).items()}
+    before, after = ([f'"{name}":{fixed[name]}' for name in names] for names in (_FIXED[:3], _FIXED[3:]))
+    return ",".join(before), ",".join(after)
+
+
+_FIXED = ("code", "env", "format", "stage", "version")
+
+
+def _fixed(module: str) -> dict[str, Any]:
+    stage = resolve(module)
+    found = (module_digests(module), environment(stage.requires), FORMAT, stage.name, stage.version)
+    return dict(zip(_FIXED, found, strict=True))
+
+
+def _digests(refs: Refs) -> dict[str, Any]:
+    return {p: [r.digest for r in ref] if isinstance(ref, list) else ref.digest for p, ref in refs.items()}
 
 
 def ensure(root: Path | str, spec: Spec, refs: Refs, *, key: str | None = None, force: bool = False) -> Outcome:
@@ -151,8 +160,7 @@ def ensure(root: Path | str, spec: Spec, refs: Refs, *, key: str | None = None, 
     output (``OSError``, ``TimeoutError``) are tried three times; what a stage raises otherwise is not tried again.
     """
     begin, started = time.perf_counter(), time.time()
-    made = recipe(spec, refs)
-    own = key_of(spec, made)
+    own = key_of(spec, refs)
     if key is not None and key != own:
         raise CodeChangedError(
             f"{spec.label}: source code or packages of the worker are not those the run began with",
@@ -166,7 +174,7 @@ def ensure(root: Path | str, spec: Spec, refs: Refs, *, key: str | None = None, 
                 return Outcome(ref, True, time.perf_counter() - begin, _peak_rss(), started)
             first = spec.module not in _run
             with Meter() as meter:
-                ref, kernel = _compute(store, spec, refs, own, made)
+                ref, kernel = _compute(store, spec, refs, own)
             seconds = time.perf_counter() - begin
             _run.add(spec.module)
             return Outcome(ref, False, seconds, _peak_rss(), started, kernel, meter.memory, meter.rest, first)
@@ -177,7 +185,7 @@ def ensure(root: Path | str, spec: Spec, refs: Refs, *, key: str | None = None, 
     raise AssertionError("unreachable")
 
 
-def _compute(store: Store, spec: Spec, refs: Refs, key: str, made: Mapping[str, Any]) -> tuple[Ref, float]:
+def _compute(store: Store, spec: Spec, refs: Refs, key: str) -> tuple[Ref, float]:
     stage = spec.stage
     inputs = {p: [store.open(r) for r in ref] if isinstance(ref, list) else store.open(ref) for p, ref in refs.items()}
     started = time.time()
@@ -188,7 +196,7 @@ def _compute(store: Store, spec: Spec, refs: Refs, key: str, made: Mapping[str, 
         raise TypeError(f"{stage.name}: run gave a {type(result).__name__}, not a Bundle")
     check_outputs(stage, result)
     provenance = {
-        **made,
+        **recipe(spec, refs),
         "params": spec.params.model_dump(mode="json"),
         "hints": {k: str(v) for k, v in spec.hints.items()},
         "host": {"name": platform.node(), "machine": platform.machine(), "cpus": os.cpu_count()},

@@ -123,7 +123,8 @@ def describe(run: Path) -> Iterable[str]:
         f"{share * (t.tasks - t.kernel):.0f} %, starting, waiting and drawing {100 - share * t.tasks:.0f} %"
     )
     verdict = "kept" if t.wall <= t.good else f"exceeded by {t.wall - t.good:.1f} s"
-    yield f"least possible {t.least:.1f} s; {FACTOR} of it and {START:.0f} s are {t.good:.1f} s: {verdict}"
+    bound = f"{FACTOR} of it and {START:.0f} s are {t.good:.1f} s: {verdict}"
+    yield f"least possible {t.least:.1f} s, of which the run took {t.wall / max(t.least, 0.001):.2f}; {bound}"
 
 
 def _chain(chain: tuple[tuple[str, float], ...]) -> str:

@@ -100,7 +100,7 @@ def gc(store: Store, keep: Collection[str], *, grace: float = GRACE, dry_run: bo
             cleared.orphans += 1
             _remove(path, cleared, dry_run)
     current = tree_digest()
-    for path in (*store.root.glob("quarantine/*"), *store.root.glob("numba/*")):
+    for path in (*store.root.glob("quarantine/*"), *store.root.glob("numba/*"), *store.root.glob("index/*")):
         if _written(path) <= limit and not current.startswith(path.name):
             _remove(path, cleared, dry_run)
     return cleared

@@ -11,12 +11,15 @@ import shutil
 import typing
 from collections import Counter
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from datasets.misalign import MisalignParams
+from datasets.mockup.params import SHORT, MockupParams
 from datasets.protocol import Sequence
 from datasets.registry import open_sequence
 from pipeline import code, driver, explain, task
@@ -111,6 +114,47 @@ EXCEPTIONS: dict[str, set[str]] = {
 }
 
 
+SOURCES = {"scene", "image/left", "image/right", "truth", "truth_dem/local", "truth_dem/world"}
+"""They hang on the sequence alone."""
+
+IMAGES = {"image/left", "image/right", "undistort/left", "undistort/right", "truth_dem/local", "truth_dem/world"}
+EVERYTHING = IMAGES | PYRAMIDS | COUNTERCHECK | RISK | {"scene", "truth"}
+GIVEN_RIG = {"orientation"} | RIG | COUNTERCHECK
+RIGHT_IMAGE = {"image/right", "undistort/right", "pyramid/right"} | MATCHED | COUNTERCHECK
+
+SCENE = ("seed", "bed_width", "bed_length", "cell", "relief", "rocks", "craters", "grain")
+SCENE += ("sun_elevation_deg", "sun_azimuth_deg", "sun_diameter_deg")
+RENDERED = ("blur", "noise", "exposure", "exposure_jitter", "right_gain", "vignetting")
+DRIVE = (
+    "frames",
+    "baseline",
+    "toe_in_deg",
+    "pitch_deg",
+    "camera_height",
+    "forward",
+    "sideways",
+    "turn_deg",
+    "roll_deg",
+)
+DRIVE += ("roll_swing_deg", "jitter_deg")
+CAMERA = ("image_width", "image_height", "focal_length")
+
+SEQUENCE: dict[str, set[str]] = {
+    **dict.fromkeys([f"mockup.{name}" for name in SCENE], EVERYTHING - {"truth"}),
+    **dict.fromkeys(
+        [f"mockup.{name}" for name in RENDERED],
+        EVERYTHING - {"truth", "scene", "truth_dem/local", "truth_dem/world", "risk/truth"},
+    ),
+    **dict.fromkeys([f"mockup.{name}" for name in DRIVE], EVERYTHING - {"scene"}),
+    **dict.fromkeys([f"mockup.{name}" for name in CAMERA], EVERYTHING - {"scene", "truth"}),
+    "mockup.attitude_noise_deg": {"motion", "select", "track"} | LEVELLED,
+    "mockup.focal_error": {"undistort/left", "undistort/right"} | PYRAMIDS | COUNTERCHECK,  # by the ideal camera
+    "mockup.rig_error_deg": GIVEN_RIG,
+    **dict.fromkeys([f"misalign.{name}" for name in MisalignParams.model_fields], RIGHT_IMAGE),
+}
+"""Parameters of a built-in sequence, whose stages are its sources."""
+
+
 class Everything(Store):
     """Has every artifact that it is asked for while it learns, and later only those."""
 
@@ -163,13 +207,18 @@ def group(label: str) -> str:
 
 @pytest.fixture(scope="module")
 def chain(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chain]:
-    sequence = open_sequence("mockup-short", {"mockup": {"frames": len(FRAMES)}})
-    defaults = {**sequence.defaults, "hfvm.preset": "default"}  # which can be matched in tiles
-    lens = {c: Lens(getattr(sequence.rig, c), "radtan", (-0.1, 0.01, 0.0, 0.0)) for c in ("left", "right")}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(explain, "reason", lambda *_: "")
         patch.setattr(explain, "latest", lambda store, stage, label: store.labels.get(label))
-        yield Chain(replace(sequence, lenses=lens, defaults=defaults), tmp_path_factory.mktemp("store"))
+        yield Chain(short({}), tmp_path_factory.mktemp("store"))
+
+
+def short(given: dict[str, dict[str, Any]]) -> Sequence:
+    """A mockup with distorted images, that can be matched in tiles."""
+    mockup = {"frames": len(FRAMES), **given.get("mockup", {})}
+    sequence = open_sequence("mockup-short", {**given, "mockup": mockup})
+    lens = {c: Lens(getattr(sequence.rig, c), "radtan", (-0.1, 0.01, 0.0, 0.0)) for c in ("left", "right")}
+    return replace(sequence, lenses=lens, defaults={**sequence.defaults, "hfvm.preset": "default"})
 
 
 PARAMETERS = [
@@ -193,6 +242,7 @@ def candidates(kind: Any, value: Any) -> Iterator[Any]:
         yield f"{value}x"
     elif isinstance(value, tuple):
         yield tuple(v * 1.01 for v in value)
+        yield tuple(v + 0.1 for v in value)
     elif value is None:
         yield from (0.0123, (0.1, 0.2), (-1.0, 0.5, 1.0, 2.0), 320)
 
@@ -216,8 +266,9 @@ def test_the_table_is_whole(chain: Chain) -> None:
     assert set(STALE) == {p.split(".")[0] for p in PARAMETERS}
     assert set(EXCEPTIONS) <= set(PARAMETERS)
     assert set().union(*STALE.values()) - TILES <= chain.groups
-    sources = {"scene", "image/left", "image/right", "truth", "truth_dem/local", "truth_dem/world"}
-    assert chain.groups - set().union(*STALE.values()) == sources, "they hang on the sequence alone"
+    assert chain.groups - set().union(*STALE.values()) == SOURCES
+    assert chain.groups == EVERYTHING
+    assert {f"{section}.{name}" for section, kind in KINDS.items() for name in kind.model_fields} == set(SEQUENCE)
 
 
 def test_the_same_again_is_stale_nowhere(chain: Chain) -> None:
@@ -229,6 +280,27 @@ def test_a_parameter_makes_stale_exactly(chain: Chain, parameter: str) -> None:
     given = changes(parameter, configuration.expand(chain.sequence.defaults))
     expected = EXCEPTIONS.get(parameter, STALE[parameter.split(".")[0]])
     assert chain.stale(given) == expected, given
+
+
+KINDS = {"mockup": MockupParams, "misalign": MisalignParams}
+
+
+@pytest.mark.parametrize("parameter", SEQUENCE)
+def test_a_parameter_of_the_sequence_makes_stale_exactly(chain: Chain, parameter: str) -> None:
+    section, name = parameter.split(".")
+    field = KINDS[section].model_fields[name]
+    now = {**SHORT, "frames": len(FRAMES)}.get(name, field.default) if section == "mockup" else field.default
+    for value in candidates(field.annotation, now):
+        if value != now:
+            with suppress(RilleError):
+                chain.sequence, before = short({section: {name: value}}), chain.sequence
+                break
+    else:
+        raise AssertionError(f"{parameter}: find another value than {now}")
+    try:
+        assert chain.stale({}) == SEQUENCE[parameter], value
+    finally:
+        chain.sequence = before
 
 
 # -- edits of the sources: a module counts with all that it reaches ---------------------------------------------------

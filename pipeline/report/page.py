@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -17,20 +17,36 @@ from pipeline.report.view import RunView
 from pipeline.report.words import coordinate, metres, number, quantity, seconds, share
 
 
-def write_report(folder: Path, view: RunView) -> None:
+@dataclass(frozen=True)
+class Drawn:
+    """What takes the time of a report: figures, and facts gathered from the artifacts."""
+
+    scene: Scene
+    gallery: Gallery
+    facts: Mapping[str, Any]
+
+
+def draw(view: RunView) -> Drawn:
+    """Figures and facts of a run; needs none of its files."""
+    # Opening an artifact reads its manifest; a few stay open, since several tables and figures need the same.
+    scene = Scene(replace(view, bundle=lru_cache(maxsize=16)(view.bundle)))
+    drawn = gallery.draw(scene)
+    return Drawn(scene, drawn, summary.summarise(scene, drawn))
+
+
+def write_report(folder: Path, view: RunView, drawn: Drawn | None = None) -> None:
     """Write ``report.json`` and ``report.html``; each appears whole or not at all.
 
     Parameters
     ----------
     folder : the run's folder; what it holds already is listed and explained in the report.
     view : the run.
+    drawn : of that run, where it was drawn before.
     """
-    # Opening an artifact reads its manifest; a few stay open, since several tables and figures need the same.
-    scene = Scene(replace(view, bundle=lru_cache(maxsize=16)(view.bundle)))
-    drawn = gallery.draw(scene)
-    facts = summary.summarise(scene, drawn)
+    drawn = drawn or draw(view)
+    facts = drawn.facts
     write_text(folder / "report.json", json.dumps(facts, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
-    write_text(folder / "report.html", render(scene, facts, drawn, tables.files(folder)))
+    write_text(folder / "report.html", render(drawn.scene, facts, drawn.gallery, tables.files(folder)))
 
 
 def render(scene: Scene, facts: Mapping[str, Any], drawn: Gallery, files: list[tuple[str, str, str]]) -> str:

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from toys.scale import ScaleParams
 
-from pipeline.key import Fixed, canonical, digest, digest_of
+from pipeline.key import canonical, digest, text
+from pipeline.store import Ref
+from pipeline.task import Spec, key_of, recipe
 from stages.declare import Params
 
 scalars = st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5)
@@ -115,10 +119,19 @@ def test_models_count_with_their_defaults_filled():
     assert digest(Outer()) != digest(Twin())
 
 
-def test_parts_kept_in_canonical_form_change_no_digest():
-    parts = {"b": [1.0, {"z": 1, "a": (2, None)}], 'a"': "x", "c": {"k": float("nan")}}
-    kept = {name: Fixed(part) if name != "b" else part for name, part in parts.items()}
-    assert digest_of(kept) == digest_of(parts) == digest(parts)
-    assert digest_of({**parts, "c": {"k": 1}}) != digest(parts)
-    with pytest.raises(TypeError, match=r"value\.d is a object"):
-        digest_of({"d": object()})
+@given(values | st.sets(scalars.filter(lambda v: v == v)))
+def test_text_is_that_of_the_canonical_tree(value):
+    assert text(value) == json.dumps(canonical(value), sort_keys=True, separators=(",", ":"))
+
+
+def test_a_task_s_key_is_the_digest_of_its_recipe():
+    spec = Spec(
+        "toys.scale", 'scale/"0"', ScaleParams(offset=0.5), {"pair": 3, "at": [0.1, None], "a": {"z": 1, "b": 2}}
+    )
+    one, other = (Ref(k * 64, "numbers", k * 64, "", {}) for k in "ab")
+    for refs in ({"values": one}, {"values": other}, {"values": [one, other]}, {}):
+        assert key_of(spec, refs) == digest(recipe(spec, refs))
+    assert key_of(spec, {"values": one}) != key_of(spec, {"values": other})
+    assert key_of(spec, {}) != key_of(replace(spec, params=ScaleParams(offset=0.25)), {})
+    with pytest.raises(TypeError, match=r"args\.b is a object"):
+        key_of(replace(spec, args={"b": object()}), {})

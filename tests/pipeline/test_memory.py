@@ -186,10 +186,6 @@ def test_a_limit_keeps_tasks_apart_that_do_not_fit_together(learned, executor):
     store = make("tight")
     rest = costs.recall(store).rest if executor == "processes" else 0.0
     limit = memory.resident() + 2 * rest + 1.5 * HOG + 2 * costs.SLACK
-    if executor == "processes":
-        import distributed  # noqa: F401 (its memory is this process's)
-
-        limit = memory.resident() + 2 * rest + 1.5 * HOG + 2 * costs.SLACK
     graph = hogs()
     result, path = run(graph, store, executor, limit)
     assert result.ok
@@ -282,3 +278,16 @@ def test_a_plan_foresees_memory_and_bytes_and_says_from_what(cache):
     assert scale.result == 400 * 400 * 4 + 200 * 200 * 4
     assert scale.memory > 0
     assert "of 8.0 GB" in told[-1]
+
+
+def test_guesses_upon_guesses_do_not_grow_without_end():
+    """Each task of a long ladder takes both before it: counted as their sums, results would double again and again."""
+    graph = Graph()
+    rungs = [graph.node("toys.numbers", f"n/{k}", NumbersParams(), {"frame": k}, expect=1e6) for k in range(2)]
+    for k in range(60):
+        rungs.append(graph.node("toys.total", f"t/{k}", NoParams(), inputs={"parts": rungs[-2:]}))
+    for handle in graph.nodes:
+        handle.status = "planned"
+    found = forecast(graph, Costs())
+    assert max(f.memory for f in found.values()) < 200 * MB
+    assert found[rungs[-1].index].result == pytest.approx(2e6)

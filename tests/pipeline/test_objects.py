@@ -192,7 +192,7 @@ def test_damage_is_seen_when_read_and_healed(url, right, way):
         store.bucket.delete([entry.path])
     else:
         store.bucket.put(entry.path, bytes(data) if way == "flip" else bytes(data[:-3]))
-    store.survey()
+    store.survey("")
     ref = store.lookup("numbers", entry.path.split("/")[2])
     with pytest.raises(DamagedError, match="values/c"):
         store.open(ref)["values"]
@@ -306,6 +306,25 @@ def test_locations():
     assert hints_folder("s3://bucket/a/b").name == "bucket+a+b"
     assert isinstance(at("some/folder"), Store)
     assert not isinstance(at("some/folder"), ObjectStore)
+
+
+def test_of_a_window_only_the_chunks_are_fetched_that_it_touches(url, proxied):
+    rng = np.random.default_rng(0)
+    whole = Bundle({"values": rng.random((2500, 1100)), "mask": np.zeros((3, 4), dtype=np.uint8)}, {"frame": 0})
+    ref = at(url).commit(numbers.STAGE, "k" * 64, whole, label="numbers/0")
+    proxy = proxied(lambda *_: "")
+    opened = at(url).open(ref)
+    del proxy.requests[:]
+    part = opened.part("values", (slice(1000, 1040), slice(5, 9)))
+    assert (part == whole["values"][1000:1040, 5:9]).all()
+    asked = sorted(path.rpartition("/")[2] for _, path in proxy.requests)
+    assert asked == ["c.0.0", "c.1.0", "zarr.json"]
+    assert (opened.raster("values")[2499:, 1024:] == whole["values"][2499:, 1024:]).all()
+    assert (opened["values"] == whole["values"]).all()
+    at(url).bucket.delete([f"{ref.path}/values/c.2.1"])
+    assert (opened.part("values", (slice(0, 5), slice(0, 5))) == whole["values"][:5, :5]).all()
+    with pytest.raises(DamagedError, match=r"values/c\.2\.1 is missing"):
+        opened.part("values", (slice(2400, 2500), slice(1030, 1040)))
 
 
 def test_arrays_are_read_by_zarr_as_they_are(url):

@@ -211,10 +211,11 @@ def test_a_description_that_is_plausible_but_wrong_never_reaches_a_reader(cache,
 
 
 def test_an_attempt_that_fails_leaves_nothing(cache, monkeypatch):
-    def full(folder):
+    def full(folder, files):
+        artifact.spill(folder, files)
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(store, "seal", full)
+    monkeypatch.setattr(store, "spill", full)
     with pytest.raises(StoreError, match="no space left for the cache"):
         commit(cache)
     assert files(cache) == []

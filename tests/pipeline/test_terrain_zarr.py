@@ -10,7 +10,7 @@ import pyproj
 import xarray
 from terrain_runs import LATTICE, PLACE, elevation
 
-from pipeline.artifact import write
+from pipeline.artifact import encode, spill
 from pipeline.terrain_zarr import write_terrain
 from stages import merge
 from stages.declare import Bundle
@@ -22,6 +22,11 @@ def arrays() -> dict:
     layer = Layer(4, LATTICE, z, np.full_like(z, 0.01), np.zeros_like(z), np.full_like(z, 90))
     found = vars(merge.merge([layer], LATTICE, MergeParams()))
     return {spec.name: (spec, found[spec.name]) for spec in merge.STAGE.outputs if spec.name in found}
+
+
+def write(path: Path, bundle: Bundle) -> None:
+    path.mkdir()
+    spill(path, encode(merge.STAGE, bundle)[0])
 
 
 def opened(path: Path) -> xarray.Dataset:
@@ -65,7 +70,7 @@ def test_a_place_on_earth_gives_every_cell_its_easting_and_northing(tmp_path: Pa
 
 def test_an_artifact_on_a_lattice_has_coordinates_too(tmp_path: Path) -> None:
     found = {name: values for name, (_, values) in arrays().items()}
-    write(tmp_path / "a", merge.STAGE, Bundle(found, {"lattice": LATTICE.to_dict(), "frame": "world"}))
+    write(tmp_path / "a", Bundle(found, {"lattice": LATTICE.to_dict(), "frame": "world"}))
     data = xarray.open_zarr(tmp_path / "a", consolidated=False)
     assert set(data.elevation.coords) == {"x", "y"}
     np.testing.assert_array_equal(data.x.values, LATTICE.xs())
@@ -77,5 +82,5 @@ def test_an_artifact_on_a_lattice_has_coordinates_too(tmp_path: Path) -> None:
 
 def test_an_artifact_without_a_lattice_is_left_alone(tmp_path: Path) -> None:
     found = {name: values[:3] for name, (_, values) in arrays().items()}
-    write(tmp_path / "a", merge.STAGE, Bundle(found, {"lattice": "none"}))
+    write(tmp_path / "a", Bundle(found, {"lattice": "none"}))
     assert not xarray.open_zarr(tmp_path / "a", consolidated=False).coords

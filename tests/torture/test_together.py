@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import os
 import random
 import shutil
-import signal
-import subprocess
-import sys
 import time
-from pathlib import Path
 
 import pytest
 from torn import look
@@ -120,53 +115,3 @@ def test_a_race_finds_a_stage_that_is_not_deterministic(programs, tmp_path, row)
     whys = [p.found()["nodes"]["saboteur/random"]["why"] for p in (first, second)]
     caught = sum("NonDeterministicError" in why for why in whys)
     row("planted non-deterministic stage, raced", 1, [], [], caught, 1, "detected: compared at the commit")
-
-
-SMALL = (
-    *("mockup.frames=5", "mockup.image_width=285", "mockup.image_height=260", "mockup.focal_length=300.0"),
-    *("select.stride=2", "locus.cell_size=0.004"),
-)
-
-
-@pytest.mark.slow
-def test_small_mockup_killed_on_its_way(tmp_path, row):
-    rng, tries = random.Random(5), 4
-
-    def command(where):
-        words = [sys.executable, "-m", "pipeline.cli", "reconstruct", "mockup-short", "--jobs", "2", "--quiet"]
-        words += [w for a in SMALL for w in ("--set", a)]
-        return [*words, "--cache", str(where / "cache"), "--runs", str(where / "runs")]
-
-    def rows(where):
-        latest = where / "runs" / "mockup-short" / "latest"
-        return {r["label"]: r for r in ledger.read(latest / "ledger.jsonl")}
-
-    calm, torn = tmp_path / "calm", tmp_path / "torn"
-    begin = time.monotonic()
-    subprocess.run(command(calm), check=True, stdout=subprocess.DEVNULL)
-    span = time.monotonic() - begin
-    right = {r["key"]: r["digest"] for r in rows(calm).values()}
-    lost, wrong, known = [], [], {}
-    for _ in range(tries):
-        process = subprocess.Popen(command(torn), start_new_session=True, stdout=subprocess.DEVNULL)
-        time.sleep(rng.uniform(0.15, 0.35) * span)
-        with_latest = (torn / "runs" / "mockup-short" / "latest").exists()
-        if process.poll() is None:
-            os.killpg(process.pid, signal.SIGKILL)
-            assert not with_latest, "latest moves last"
-        process.wait()
-        found = look.published(torn / "cache")
-        lost += sorted(set(known) - set(found)) + sorted(look.manifests(torn / "cache") - set(found))
-        wrong += look.wrong(found, right)
-        known = found
-    shutil.rmtree(torn / "runs")
-    subprocess.run(command(torn), check=True, stdout=subprocess.DEVNULL)
-    resumed = rows(torn)
-    wrong += [label for label, r in rows(calm).items() if resumed[label]["digest"] != r["digest"]]
-    for name in ("trajectory.kitti", "agreement.csv", "path.geojson"):
-        calm_file, torn_file = (Path(w) / "runs" / "mockup-short" / "latest" / name for w in (calm, torn))
-        wrong += [] if calm_file.read_bytes() == torn_file.read_bytes() else [name]
-    report = json.loads((torn / "runs" / "mockup-short" / "latest" / "report.json").read_text())
-    assert report["complete"]
-    computed = sum(r["status"] == "computed" for r in resumed.values())
-    row("small mockup, SIGKILL", tries, lost, wrong, computed, len(right) - len(known), f"{len(right)} artifacts")

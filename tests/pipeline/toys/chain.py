@@ -1,6 +1,7 @@
 """A small run as a program of its own: ``python -m toys.chain CACHE [executor] [what] [ledger]``; prints JSON."""
 
 import json
+import signal
 import sys
 from pathlib import Path
 
@@ -48,6 +49,7 @@ def main(cache, executor="inline", what="", ledger=""):
 
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell lets its background jobs ignore it
     try:
         main(*sys.argv[1:])
     except KeyboardInterrupt:

@@ -48,7 +48,7 @@ def build(graph, *, frames=FRAMES, size=150, shuffle=None, sleepers=0, sabotage=
 def run(cache, executor="inline", ledger=None, jobs=2, memory=None, environment=None, **options):
     """One run; what became of it, as plain values. ``memory`` is what all workers together may have, bytes."""
     if memory is not None:
-        resource.setrlimit(resource.RLIMIT_RSS, (memory, memory))  # distributed heeds it, the kernel does not
+        resource.setrlimit(resource.RLIMIT_RSS, (memory, memory))  # the engine heeds it, the kernel does not
     os.environ.update(environment or {})
     from pipeline import driver
     from pipeline.dag import Graph

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 from pipeline.artifact import array_digests, damage, output_digest
@@ -26,6 +27,15 @@ def published(cache):
         if manifest and not damage(store.root / manifest["path"], manifest["files"], lambda _: True):
             found[manifest["key"]] = manifest["digest"]
     return found
+
+
+def settled(cache):
+    """Wait until a server has carried out what a killed program still asked of it."""
+    if str(cache).startswith("s3://"):
+        bucket, before = at(cache).bucket, None
+        while (now := sorted((e.path, e.etag) for e in bucket.list(""))) != before:
+            before = now
+            time.sleep(0.1)
 
 
 def manifests(cache):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import sys
 
 import google_crc32c  # noqa: F401
@@ -29,6 +30,7 @@ def _child(line, alone):
     code = 1
     try:
         os.setsid()
+        signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell lets its background jobs ignore it
         os.write(alone, b"x")
         os.close(alone)
         task = json.loads(line)

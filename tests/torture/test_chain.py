@@ -1,0 +1,199 @@
+"""The whole chain on a small mockup: killed on its way, an artifact of each stage damaged, workers killed mid-tile."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from types import SimpleNamespace
+
+import psutil
+import pytest
+import xarray
+from test_damage import WAYS
+from torn import look
+
+from pipeline import ledger
+from pipeline.artifact import DamagedError, array_digests, output_digest
+from pipeline.store import Store
+
+SMALL = (
+    *("mockup.frames=5", "mockup.image_width=285", "mockup.image_height=260", "mockup.focal_length=300.0"),
+    *("select.stride=2", "locus.cell_size=0.004"),
+)
+
+pytestmark = pytest.mark.slow
+
+
+def command(where, *more, progress="quiet"):
+    words = [sys.executable, "-m", "pipeline.cli", "reconstruct", "mockup-short", "--jobs", "2", "--progress", progress]
+    words += [w for a in SMALL for w in ("--set", a)]
+    return [*words, "--cache", str(where / "cache"), "--runs", str(where / "runs"), *more]
+
+
+def rows(where):
+    latest = where / "runs" / "mockup-short" / "latest"
+    return {r["label"]: r for r in ledger.read(latest / "ledger.jsonl")}
+
+
+def begin(where, *more, **options):
+    return subprocess.Popen(command(where, *more, **options), start_new_session=True, stdout=subprocess.DEVNULL,
+                            stderr=subprocess.PIPE, text=True)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """The undisturbed run."""
+    where = tmp_path_factory.mktemp("whole")
+    start = time.monotonic()
+    subprocess.run(command(where), check=True, stdout=subprocess.DEVNULL)
+    span = time.monotonic() - start
+    return SimpleNamespace(where=where, span=span, right={r["key"]: r["digest"] for r in rows(where).values()})
+
+
+def same_files(whole, where):
+    """Names of products that differ from those of the undisturbed run."""
+    report = json.loads((where / "runs" / "mockup-short" / "latest" / "report.json").read_text())
+    assert report["complete"]
+    names = ("trajectory.kitti", "agreement.csv", "path.geojson", "dem.tif", "risk.tif")
+    both = [[Path(w) / "runs" / "mockup-short" / "latest" / name for w in (whole.where, where)] for name in names]
+    return [a.name for a, b in both if a.read_bytes() != b.read_bytes()]
+
+
+def test_small_mockup_killed_on_its_way(whole, tmp_path, row):
+    rng, tries, right = random.Random(5), 4, whole.right
+    lost, wrong, known = [], [], {}
+    for _ in range(tries):
+        process = begin(tmp_path)
+        time.sleep(rng.uniform(0.15, 0.35) * whole.span)
+        with_latest = (tmp_path / "runs" / "mockup-short" / "latest").exists()
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+            assert not with_latest, "latest moves last"
+        process.communicate()
+        found = look.published(tmp_path / "cache")
+        lost += sorted(set(known) - set(found)) + sorted(look.manifests(tmp_path / "cache") - set(found))
+        wrong += look.wrong(found, right)
+        known = found
+    shutil.rmtree(tmp_path / "runs")
+    subprocess.run(command(tmp_path), check=True, stdout=subprocess.DEVNULL)
+    resumed = rows(tmp_path)
+    wrong += [label for label, r in rows(whole.where).items() if resumed[label]["digest"] != r["digest"]]
+    wrong += same_files(whole, tmp_path)
+    computed = sum(r["status"] == "computed" for r in resumed.values())
+    row("small mockup, SIGKILL", tries, lost, wrong, computed, len(right) - len(known), f"{len(right)} artifacts")
+
+
+def one_of_each_stage(store):
+    """The first artifact of each stage: its manifest."""
+    found = {}
+    for path in sorted(store.root.glob("artifacts/*/*/*/manifest.json")):
+        found.setdefault(path.parents[2].name, store.manifest(path.parents[2].name, path.parent.name))
+    return found
+
+
+def test_an_artifact_of_each_stage_opens_with_xarray_and_has_units(whole):
+    store = Store(whole.where / "cache")
+    made = one_of_each_stage(store)
+    assert len(made) > 25
+    for stage, manifest in made.items():
+        opened = xarray.open_zarr(store.root / manifest["path"], consolidated=False)
+        assert set(opened.data_vars) == set(manifest["arrays"]), stage
+        for name in opened.data_vars:
+            assert opened[name].attrs["units"], (stage, name)
+            assert opened[name].attrs["long_name"], (stage, name)
+
+
+def value(store, made):
+    """Digest of what a reader gets; None if the damage is seen."""
+    ref = store.lookup(made["stage"], made["key"])
+    if ref is None:
+        return None
+    try:
+        bundle = store.open(ref)
+        return output_digest(array_digests(bundle.arrays), bundle.meta)
+    except DamagedError:
+        return None
+
+
+def test_an_artifact_of_each_stage_damaged_is_seen_or_read_as_it_was(whole, tmp_path, row):
+    cache, rng = tmp_path / "cache", random.Random(7)
+    shutil.copytree(whole.where / "cache", cache)
+    store, tries, seen, wrong = Store(cache), 0, 0, []
+    made = one_of_each_stage(store)
+    for stage, manifest in made.items():
+        home = store.home(stage, manifest["key"])
+        shutil.copytree(home, tmp_path / "kept")
+        for way, change in WAYS.items():
+            for name in ("manifest.json", *(f"{Path(manifest['path']).name}/{f}" for f in manifest["files"])):
+                data, tries = (home / name).read_bytes(), tries + 1
+                (home / name).unlink() if change is None else (home / name).write_bytes(change(data, rng))
+                found = value(Store(cache), manifest)
+                seen += found is None
+                if found not in (None, manifest["digest"]):
+                    wrong.append((stage, way, name))
+                shutil.rmtree(home, ignore_errors=True)
+                shutil.copytree(tmp_path / "kept", home)
+        shutil.rmtree(tmp_path / "kept")
+    row("each file of an artifact of each stage", tries, [], wrong, 0, 0, f"{len(made)} stages, {seen} seen when read")
+
+
+def test_a_run_heals_an_artifact_of_each_stage(whole, tmp_path, row):
+    cache, rng = tmp_path / "cache", random.Random(9)
+    shutil.copytree(whole.where / "cache", cache)
+    store, certain = Store(cache), 0
+    made = one_of_each_stage(store)
+    for turn, manifest in enumerate(made.values()):
+        way = list(WAYS)[turn % len(WAYS)]
+        path = store.root / manifest["path"] / rng.choice(sorted(manifest["files"]))
+        data = path.read_bytes()
+        path.unlink() if WAYS[way] is None else path.write_bytes(WAYS[way](data, rng))
+        certain += way in ("truncate", "empty", "delete")
+    subprocess.run(command(tmp_path), check=True, stdout=subprocess.DEVNULL)
+    healed = rows(tmp_path)
+    wrong = [label for label, r in rows(whole.where).items() if healed[label]["digest"] != r["digest"]]
+    wrong += same_files(whole, tmp_path)
+    lost = sorted(set(whole.right) - set(look.manifests(cache)))
+    # not by the ledger: what is found when the results are drawn is computed by a second run
+    computed = sum(store.manifest(m["stage"], m["key"])["path"] != m["path"] for m in made.values())
+    row("one artifact of each stage damaged", len(made), lost, wrong, computed, range(certain, len(made) + 1),
+        "what keeps its size counts where it is read")  # fmt: skip
+
+
+TILED = ("--frames", "0:2", "--set", "hfvm.preset=fast", "--set", "crosscheck.enabled=false")
+
+
+def test_workers_killed_mid_tile(whole, tmp_path, row):
+    calm, torn = tmp_path / "calm", tmp_path / "torn"
+    for where in (calm, torn):  # compiling them is not the point here
+        shutil.copytree(whole.where / "cache" / "numba", where / "cache" / "numba")
+    subprocess.run(command(calm, *TILED), check=True, stdout=subprocess.DEVNULL)
+    process, kills, tiles = begin(torn, *TILED, "--set", "tiling.tile=128", progress="json"), 0, 0
+    for line in process.stderr:
+        event = json.loads(line) if line.startswith("{") else {}
+        if event.get("event") == "running" and event["label"].startswith("hfvm/0/"):
+            tiles += 1
+            if tiles in (2, 5, 9):
+                time.sleep(0.05)
+                for child in psutil.Process(process.pid).children():
+                    if "spawn_main" in " ".join(child.cmdline()):
+                        child.kill()
+                        kills += 1
+    assert process.wait() == 0
+    found = rows(torn)
+    wrong = [label for label, r in rows(calm).items() if found[label]["digest"] != r["digest"]]
+    wrong += [label for label, r in found.items() if r["status"] != "computed"]
+    assert upkeep_finds_nothing(torn / "cache")
+    row("workers killed mid-tile", 3, [], wrong, len(found), len(found), f"{kills} workers died, {tiles} tiles begun")
+
+
+def upkeep_finds_nothing(cache):
+    from pipeline import upkeep
+
+    return upkeep.verify(Store(cache), deep=True)[1] == []
