@@ -104,7 +104,14 @@ def window_reach(side: float, cell: float) -> int:
     return max(1, int(side / (2.0 * cell) + 1e-6))
 
 
-def measure(elevation: Floats32, elevation_std: Floats32, cell: float, vehicle: Vehicle, window: float) -> Measured:
+def measure(
+    elevation: Floats32,
+    elevation_std: Floats32,
+    cell: float,
+    vehicle: Vehicle,
+    window: float,
+    filled: NDArray[np.uint8] | None = None,
+) -> Measured:
     """All measures of an elevation model.
 
     Parameters
@@ -112,8 +119,11 @@ def measure(elevation: Floats32, elevation_std: Floats32, cell: float, vehicle: 
     elevation, elevation_std : (row, col) float32, metres, NaN unknown; the latter 0 where it is not known.
     cell : side of a cell, metres.
     window : metres, side of the wheel's window.
+    filled : not 0 where the elevation is interpolated: it counts as known and with its noise, but heights between other
+        heights prove no relief (and a rim that is raised would raise them over lower ground).
     """
-    surface = median3(elevation) if 3 * cell <= 0.5 * vehicle.wheel_diameter else elevation
+    surface = elevation if filled is None else np.where(filled != 0, np.float32(np.nan), elevation)
+    surface = median3(surface) if 3 * cell <= 0.5 * vehicle.wheel_diameter else surface
     reach, near = window_reach(window, cell), window_reach(0.5 * window, cell)
     values = {}
     high, low = running_range(surface, reach)
@@ -123,7 +133,7 @@ def measure(elevation: Floats32, elevation_std: Floats32, cell: float, vehicle: 
     values["step"] = _difference(high, low)
     n = stride(vehicle, cell)
     lag = max(1, round(0.25 * vehicle.wheel_diameter / cell))
-    highest, lowest, sums = _blocks(surface, elevation_std, n, lag)
+    highest, lowest, sums = _blocks(surface, elevation, elevation_std, n, lag)
     around = 2 * round(reach / n) + 1
     count, square, number, deviation = (window_sum(a, around) for a in sums)
     values["roughness"] = np.sqrt(0.5 * deviation / np.maximum(number, 1.0)).astype(np.float32)
@@ -214,10 +224,19 @@ def _difference(high: Floats32, low: Floats32) -> Floats32:
     return np.maximum(np.subtract(high, low, out=high), np.float32(0.0), out=high)
 
 
+@njit(cache=True, nogil=True, inline="always")
+def _pair(sums, i, j, k, m, d):  # type: ignore[no-untyped-def]
+    square = d * d
+    sums[2][i, j] += 1.0
+    sums[3][i, j] += square
+    sums[2][k, m] += 1.0
+    sums[3][k, m] += square
+
+
 @njit(cache=True, nogil=True)
-def _blocks(z, s, n, lag):  # type: ignore[no-untyped-def]
+def _blocks(z, closed, s, n, lag):  # type: ignore[no-untyped-def]
     """Highest and lowest height of n x n cells (NaN where none is known); and sums over them: known cells, squared
-    standard deviations, pairs of known cells ``lag`` apart along either axis, their squared differences."""
+    standard deviations, pairs of cells ``lag`` apart along either axis (at both ends), their squared differences."""
     rows, cols = z.shape
     shape = ((rows + n - 1) // n, (cols + n - 1) // n)
     high, low = np.full(shape, np.nan, dtype=np.float32), np.full(shape, np.nan, dtype=np.float32)
@@ -227,11 +246,12 @@ def _blocks(z, s, n, lag):  # type: ignore[no-untyped-def]
         down = r + lag < rows
         for j in range(shape[1]):
             for c in range(j * n, min(j * n + n, cols)):
+                if closed[r, c] == closed[r, c]:
+                    sums[0][i, j] += 1.0
+                    sums[1][i, j] += s[r, c] * s[r, c]
                 v = z[r, c]
                 if v != v:
                     continue
-                sums[0][i, j] += 1.0
-                sums[1][i, j] += s[r, c] * s[r, c]
                 if not high[i, j] >= v:
                     high[i, j] = v
                 if not low[i, j] <= v:
@@ -239,13 +259,11 @@ def _blocks(z, s, n, lag):  # type: ignore[no-untyped-def]
                 if c + lag < cols:
                     d = z[r, c + lag] - v
                     if d == d:
-                        sums[2][i, j] += 1.0
-                        sums[3][i, j] += d * d
+                        _pair(sums, i, j, i, (c + lag) // n, d)
                 if down:
                     d = z[r + lag, c] - v
                     if d == d:
-                        sums[2][i, j] += 1.0
-                        sums[3][i, j] += d * d
+                        _pair(sums, i, j, (r + lag) // n, j, d)
     return high, low, sums
 
 

@@ -105,7 +105,7 @@ def risk_map(
     z, s, filled = close_holes(
         elevation, s, p.max_hole * vehicle.wheel_diameter / cell, window_cells(window, cell), p.min_known
     )
-    measured = measure(z, s, cell, vehicle, window)
+    measured = measure(z, s, cell, vehicle, window, filled)
     judged = judge(measured, vehicle, window, cell, p.sigmas)
     known = ~np.isnan(z)
     spread = [spread_out(a, measured.stride, z.shape) for a in (measured.share, measured.unstood)]
