@@ -26,10 +26,10 @@ CELL = 0.004
 
 @pytest.mark.parametrize("direction", np.linspace(0, 2 * math.pi, 9)[:-1])
 def test_on_a_plane_tilt_and_slope_are_its_gradient(direction: float) -> None:
-    y, x = np.mgrid[:60, :60] * CELL
+    y, x = np.mgrid[:90, :90] * CELL
     z = (0.3 * (x * math.cos(direction) + y * math.sin(direction))).astype(np.float32)
     found = place(z, z, MODEL, CELL)
-    inner = np.s_[22:-22, 22:-22]
+    inner = np.s_[32:-32, 32:-32]
     # wheels are put on the nearest cell, so a side and an axle are not quite at right angles: half a cell of 80 mm
     for values in (found.tilt[inner], found.slope[inner]):
         np.testing.assert_allclose(values, 0.3, rtol=0.035)
