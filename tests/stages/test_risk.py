@@ -184,7 +184,7 @@ def danger(out: dict) -> np.ndarray:
 
 
 def rough(seed: int, shape: tuple[int, int] = (40, 44)) -> np.ndarray:
-    """Ground with slopes and stones about the limits, at cells of 5 mm; whole parts of 1/8192 m, which float32 keeps."""
+    """Ground with slopes and stones about the limits, at cells of 5 mm, in parts of 1/8192 m that float32 keeps."""
     rng = np.random.default_rng(seed)
     z = np.rint(8192 * np.cumsum(rng.normal(scale=0.002, size=shape), axis=int(rng.integers(2)))) / 8192
     z[rng.random(shape) < rng.uniform(0, 0.3)] = np.nan
