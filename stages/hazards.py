@@ -293,21 +293,26 @@ def _combine(facts, a, b, d, load0, excess0, bits0, noise, doubtful, n, table, l
     rows, cols = load.shape
     values = (a, b, d)
     wide, wider = np.empty(cols, dtype=np.float32), np.empty(cols, dtype=np.float32)
-    excess = np.empty(cols, dtype=np.float32)
+    first, before = np.empty(cols, dtype=np.float32), np.empty(cols, dtype=np.float32)
+    excess, known = np.empty(cols, dtype=np.float32), np.empty(cols, dtype=np.uint16)
     for r in range(rows):
         i = r // n
+        if r % n == 0:
+            for j in range(noise.shape[1]):
+                for c in range(j * n, min(j * n + n, cols)):
+                    wide[c], wider[c] = noise[i, j], doubtful[i, j]
+                    first[c], before[c], known[c] = load0[i, j], excess0[i, j], bits0[i, j]
+        line, marks = load[r], bits[r]
         for c in range(cols):
-            j = c // n
-            wide[c], wider[c] = noise[i, j], doubtful[i, j]
-            load[r, c] = load0[i, j]
-            excess[c] = excess0[i, j]
-            bits[r, c] = bits0[i, j]
+            line[c] = first[c]
+            excess[c] = before[c]
+            marks[c] = known[c]
         for k in range(3):
-            _hold(values[k][r], facts[k], wide, wider, load[r], excess, bits[r])
+            _hold(values[k][r], facts[k], wide, wider, line, excess, marks)
         for c in range(cols):
             t = min(max(excess[c], -FARTHEST), FARTHEST)
             p[r, c] = table[int((t + FARTHEST) * STEPS)]
-            doubt[r, c] = 1 if load[r, c] > 1.0 and excess[c] <= 0.0 else 0
+            doubt[r, c] = 1 if line[c] > 1.0 and excess[c] <= 0.0 else 0
 
 
 @njit(cache=True, nogil=True)

@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from stages.windows import window_sum
+from stages.windows import window_count
 
 Floats32 = NDArray[np.float32]
 Flags = NDArray[np.uint8]
@@ -41,7 +41,7 @@ def close_holes(
     rim's range either), and flags (uint8, 1 = closed here).
     """
     known = ~np.isnan(elevation)
-    candidate = ~known & (window_sum(known, n) >= min_known * n * n)
+    candidate = ~known & (window_count(known, n) >= min_known * n * n)
     z, s = elevation.copy(), elevation_std.copy()
     filled = np.zeros(elevation.shape, dtype=np.uint8)
     cells = np.argwhere(candidate)

@@ -54,6 +54,35 @@ def _sum_down(a: Floats, n: int) -> Floats:
     return np.asarray(prefix[np.minimum(index + n // 2 + 1, rows)] - prefix[np.maximum(index - n // 2, 0)])
 
 
+def window_count(mask: Mask, n: int) -> NDArray[np.int32]:
+    """How many cells (row, col) of the window are set."""
+    out = np.empty(mask.shape, dtype=np.int32)
+    _count(np.ascontiguousarray(mask), n // 2, out)
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _count(a, half, out):  # type: ignore[no-untyped-def]
+    rows, cols = a.shape
+    total = np.zeros(cols, dtype=np.int32)
+    for r in range(-half, rows):
+        for row, sign in ((r + half, 1), (r - half - 1, -1)):
+            if 0 <= row < rows:
+                for c in range(cols):
+                    total[c] += sign if a[row, c] else 0
+        if r < 0:
+            continue
+        s = 0
+        for c in range(min(half, cols)):
+            s += total[c]
+        for c in range(cols):
+            if c + half < cols:
+                s += total[c + half]
+            if c > half:
+                s -= total[c - half - 1]
+            out[r, c] = s
+
+
 def window_mean(a: Floats32, n: int) -> Floats32:
     """Mean (row, col) of the known cells in the window; NaN where there is none."""
     known = a == a
