@@ -13,8 +13,9 @@ from stages.windows import fit_planes, running_max, running_min
 
 from .scenes import CELL, Scene
 
-RANGE, BLOCK = 192, 5
+RANGE, BLOCK = 256, 5
 """Disparities searched, and the side of SGBM's window, pixels."""
+NO_LENS = np.zeros(5)
 THRESHOLD = 0.5
 """Of the blend, as in grid maps' traversability filters."""
 
@@ -25,19 +26,19 @@ def elevations(scene: Scene) -> NDArray[np.float32]:
     size = left.shape[::-1]
     T = rig.T_right_left
     R1, R2, P1, P2, Q, _, _ = cv2.stereoRectify(
-        rig.left.matrix, None, rig.right.matrix, None, size, T.rotation, T.translation, alpha=0
+        rig.left.matrix, NO_LENS, rig.right.matrix, NO_LENS, size, T.rotation, T.translation[:, None], alpha=0
     )
     images = []
     for image, camera, R, P in ((left, rig.left, R1, P1), (right, rig.right, R2, P2)):
-        maps = cv2.initUndistortRectifyMap(camera.matrix, None, R, P, size, cv2.CV_32FC1)
+        maps = cv2.initUndistortRectifyMap(camera.matrix, NO_LENS, R, P, size, cv2.CV_32FC1)
         images.append(cv2.remap(image, *maps, cv2.INTER_LINEAR))
     smooth = {"P1": 8 * BLOCK**2, "P2": 32 * BLOCK**2, "disp12MaxDiff": 1, "uniquenessRatio": 10}
     matcher = cv2.StereoSGBM_create(
-        -RANGE // 2, RANGE, BLOCK, **smooth, speckleWindowSize=100, speckleRange=2, mode=cv2.STEREO_SGBM_MODE_HH
+        0, RANGE, BLOCK, **smooth, speckleWindowSize=100, speckleRange=2, mode=cv2.STEREO_SGBM_MODE_HH
     )
     disparity = matcher.compute(*images).astype(np.float32) / 16.0
     points = cv2.reprojectImageTo3D(disparity, Q)
-    good = (disparity > -RANGE // 2) & np.isfinite(points).all(axis=-1) & (points[..., 2] > 0)
+    good = (disparity > 0) & np.isfinite(points).all(axis=-1) & (points[..., 2] > 0)
     found = scene.T_local_left.apply(points[good].astype(np.float64) @ R1)
     low, high = scene.z_range
     return _gridded(found[(found[:, 2] >= low) & (found[:, 2] <= high)], scene)
