@@ -160,7 +160,7 @@ def mockup(p: MockupParams, name: str = "mockup") -> Sequence:
         up=None if attitude is None else tuple(rows[2] for rows in attitude),
         attitude=attitude,
         pitch=math.radians(p.pitch_deg) if level else None,
-        vehicle=_vehicle(),
+        vehicle=vehicle_at_scale(),
         truth_dem=dem,
         truth_disparity=disparity,
         evaluation_window=WINDOW,
@@ -173,7 +173,7 @@ def mockup(p: MockupParams, name: str = "mockup") -> Sequence:
     )
 
 
-def _vehicle() -> Any:
+def vehicle_at_scale() -> Any:
     """The rover at 1:10: a 0.8 m wide, 1 m long one with 0.3 m wheels at full scale."""
     from stages.vehicle import Vehicle
 

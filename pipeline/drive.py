@@ -1,0 +1,391 @@
+"""The closed loop, top to bottom: stop, think, drive, and again, as tasks like all others.
+
+::
+
+    drive/start -> sense -+
+                          v
+    stop k:  image -> pyramid -> hfvm -> level -> locus (local) -> locus (world) -> merge (all models so far, pad)
+                                           |                          ^                      |
+                                           |            trajectory -> pose                 risk
+                                           v               ^   |                             |
+                                         resect -----------+   +---------> leg <-------------+
+                                           ^                                |
+                                           |          goal, no path: end    | drive, look
+                                           |                                v
+    leg k:   safety <- sense <- drive/k (true poses) <- leg, pose (believed), drive/k-1 (where it truly stands)
+               |             images on the way -> pyramid -> motion -> track -> resect -> safety
+               v
+             stop k+1 at the last image, or at the one that a safety stop names
+
+``drive``, ``sense``, the images and nothing else know the true poses. What the vehicle believes is the trajectory:
+the product of the segments that were tracked and resected. Every node is keyed by what it reads, so a drive that is
+killed goes on where it was, and one that is repeated computes nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from pydantic import Field
+
+from datasets.protocol import Sequence, Simulation, Source
+from pipeline.dag import Graph, Handle
+from pipeline.reconstruct import Products, Reconstruction
+from pipeline.task import Ref
+from stages.declare import Params
+from stages.errors import ConfigError, DegenerateError
+from stages.geometry import RigidTransform
+from stages.lattice import Lattice
+
+
+class DriveParams(Params):
+    """The loop itself; what happens on a leg and at a stop is the stages' own."""
+
+    goal: tuple[float, float] | None = Field(
+        None, description="m; x, y of the goal in the world frame, which begins at the first left camera"
+    )
+    around: float = Field(0.6, gt=0, description="m; the map reaches this far around start and goal")
+    max_stops: int = Field(40, ge=1, description="stops after which the drive is given up")
+    max_safety_stops: int = Field(3, ge=1, description="safety stops in a row from which the drive does not recover")
+    least_match: float = Field(
+        0.1, ge=0, le=1, description="share of the pixels with texture that match the image before; below: a lost image"
+    )
+
+
+@dataclass
+class Stop:
+    """One stop and the leg that follows it: handles, the frame it stands at, and in words what became of the leg."""
+
+    index: int
+    frame: int
+    merged: Handle | None = None
+    risk: Handle | None = None
+    trajectory: Handle | None = None
+    leg: Handle | None = None
+    drive: Handle | None = None
+    sense: Handle | None = None
+    safety: Handle | None = None
+    frames: list[int] = field(default_factory=list)
+    event: str = ""
+
+
+@dataclass
+class Driven:
+    """What became of a drive: its stops, ``verdict`` (goal, no path, safety stop, stops) and ``reason``."""
+
+    stops: list[Stop] = field(default_factory=list)
+    verdict: str = ""
+    reason: str = ""
+    place: Handle | None = None
+    truth_leg: Handle | None = None
+    check: Handle | None = None
+
+
+class Drive(Reconstruction):
+    """Builds the graph of a drive, stop by stop, as results arrive."""
+
+    def __init__(self, graph: Graph, sequence: Sequence, config: Any, frames: tuple[int, ...] = (0,)) -> None:
+        super().__init__(graph, sequence, config, frames)
+        if sequence.simulation is None or config.drive.goal is None:
+            raise ConfigError(f"{sequence.name} has no goal to drive to", remedy="set drive.goal=[x, y], metres")
+        if config.locus.cell_size is None:
+            raise ConfigError("a drive needs locus.cell_size", remedy="set it to about an eighth of a wheel, metres")
+        self.simulation: Simulation = sequence.simulation
+        self.mounting = {"T_vehicle_left": self.simulation.T_vehicle_left.to_list()}
+        self.driven = self.products.drive = Driven()
+        self.left: dict[int, Handle] = {}
+        self.motion: dict[tuple[int, int], Handle] = {}  # type: ignore[assignment]
+        self.posed: list[int] = [0]
+        """Frames of the trajectory so far."""
+        self.true: dict[int, tuple[float, ...]] = {}
+        """True pose of each frame that was taken; read by the renderer and by what assesses, never by an estimate."""
+        self.looks = self.troubles = 0
+
+    def build(self) -> Products:
+        """Lay out the start; the rest follows by expansion."""
+        self.scene = self._source(self.simulation.scene, "site")
+        place = self.driven.place = self._simulate(self.simulation.place, "drive/start", scene=self.scene)
+        sense = self._simulate(self.simulation.sense(-1), "sense/start", drive=place)
+        self.graph.expand([place, sense], lambda there, said: self._first(place, there, said))
+        return self.products
+
+    def _first(self, place: Handle, there: Ref, said: Ref) -> None:
+        self.true[0] = tuple(there.meta["poses"][0])
+        self._stop(0, place, 0, said.meta["up"][0])
+
+    # -- a stop -------------------------------------------------------------------------------------------------
+
+    def _stop(self, frame: int, before: Handle, row: int, up: list[float]) -> None:
+        """Stereo pair to local model, merged map, hazards, and the next leg."""
+        p, k = self.products, len(self.driven.stops)
+        stop = Stop(k, frame)
+        self.driven.stops.append(stop)
+        if frame not in self.left:
+            self._left(frame)
+        right = self._taken(frame, "right")
+        p.disparity[frame] = self._disparity(frame, right)
+        if k == 0:
+            self._calibrate(frame)
+        p.rigs[frame], self.calibration[frame] = p.rigs[0], self.calibration[0]
+        p.level[frame] = self._node(
+            "level",
+            f"level/{frame}",
+            {"pair": frame, "up": up},
+            disparity=p.disparity[frame],
+            rig=self.calibration[frame],
+        )
+        p.local_dem[frame] = self._node(
+            "locus",
+            f"locus/local/{frame}",
+            {"pair": frame, "frame": "local"},
+            disparity=p.disparity[frame],
+            rig=self.calibration[frame],
+            left=self.left[frame],
+            level=p.level[frame],
+            reference=p.level[0],
+        )
+        self._map(stop)
+        assert stop.leg is not None
+        self.graph.expand([stop.leg], lambda leg: self._after_leg(stop, before, row, leg))
+
+    def _calibrate(self, frame: int) -> None:
+        """The rig of the whole drive, from the first pair."""
+        p = self.products
+        given = self.sequence.rig.to_dict()
+        p.orientations[frame] = self._node(
+            "orientation", f"orientation/{frame}", {"pair": frame, "rig": given}, disparity=p.disparity[frame]
+        )
+        p.rigs = {frame: self._rig([frame], "")}
+        self.calibration = {frame: self._node("calibration", "calibration", {}, rig=p.rigs[frame])}
+
+    def _map(self, stop: Stop) -> None:
+        """What is known of the world at a stop, its hazards, and where to go next."""
+        p, k, frame = self.products, stop.index, stop.frame
+        keys = [s.frame for s in self.driven.stops]
+        stop.trajectory = p.trajectory = self._node(
+            "trajectory",
+            f"trajectory/{k}",
+            {"frames": list(self.posed)},
+            segments=list(p.resections),
+            levels=[p.level[key] for key in keys[:k]] or [p.level[frame]],
+        )
+        self.pose = self._node("pose", f"pose/{frame}", {"row": len(self.posed) - 1}, trajectory=p.trajectory)
+        p.world_dem[frame] = self._node(
+            "locus",
+            f"locus/world/{frame}",
+            {"pair": frame, "frame": "world", "row": 0},
+            disparity=p.disparity[frame],
+            rig=self.calibration[frame],
+            left=self.left[frame],
+            level=p.level[frame],
+            reference=p.level[0],
+            trajectory=self.pose,
+            local=p.local_dem[frame],
+        )
+        if k == 0:
+            self._pad(frame)
+        stop.merged = self._node(
+            "merge", f"merge/{k}", {"lattice": self.arena().to_dict()}, dems=[*self.pads, *p.world_dem.values()]
+        )
+        p.tiles = [stop.merged]
+        stop.risk = p.risk = self._risk(f"risk/{k}", [stop.merged])
+        stop.leg = self._leg(f"leg/{k}", stop.risk, self.pose)
+
+    def _pad(self, frame: int) -> None:
+        """The ground under the vehicle at the start, and where it is."""
+        args = {"radius": self.simulation.pad, "wheel_diameter": self.config.vehicle.wheel_diameter, **self.mounting}
+        self.first_pose = self.pose
+        like = self.products.world_dem[frame]
+        self.pads = [self._node("pad", "pad", args, pose=self.pose, like=like)] if self.simulation.pad > 0 else []
+
+    def _leg(self, label: str, risk: Handle, pose: Handle) -> Handle:
+        args = {"goal": list(self.config.drive.goal), "looks": self.looks, **self.mounting}
+        return self._node("leg", label, args, risk=risk, pose=pose)
+
+    def arena(self) -> Lattice:
+        """The part of the world that is mapped: around the start, which is at the origin, and the goal."""
+        d = self.config.drive
+        bounds = [f(0.0, g) + s * d.around for g in d.goal for f, s in ((min, -1.0), (max, 1.0))]
+        return Lattice.snap(bounds, self.config.locus.cell_size)
+
+    def _after_leg(self, stop: Stop, before: Handle, row: int, leg: Ref) -> None:
+        verdict = leg.meta["verdict"]
+        if verdict in ("goal", "no path"):
+            stop.event = leg.meta["reason"]
+            self._end(verdict, leg.meta["reason"])
+        elif stop.index + 1 >= self.config.drive.max_stops:
+            self._end("stops", f"{stop.index + 1} stops and {1000 * leg.meta['left_m']:.0f} mm from the goal")
+        else:
+            self.looks = 0 if verdict == "drive" else self.looks + 1
+            stop.event = leg.meta["reason"]
+            self._drive(stop, before, row)
+
+    # -- a leg --------------------------------------------------------------------------------------------------
+
+    def _drive(self, stop: Stop, before: Handle, row: int) -> None:
+        """The true motion, and what the sensors say of it."""
+        k, s = stop.index, self.simulation
+        assert stop.leg is not None
+        told = {"before": before, "pose": self.pose, "leg": stop.leg}
+        change = s.change(k, row)
+        if change is not None:
+            self.scene = self._simulate(change, f"obstacle/{k}", scene=self.scene, **told)
+        stop.drive = self._simulate(s.drive(k, row), f"drive/{k}", scene=self.scene, **told)
+        stop.sense = self._simulate(s.sense(k), f"sense/{k}", drive=stop.drive)
+        self.graph.expand([stop.drive, stop.sense], lambda there, said: self._on_the_way(stop, there, said))
+
+    def _on_the_way(self, stop: Stop, there: Ref, said: Ref) -> None:
+        """Images of the leg, and how each moved against the one before."""
+        first = max(self.true) + 1
+        rows = {stop.frame: 0}
+        for row, pose in enumerate(there.meta["poses"][1:], start=1):
+            frame = first + row - 1
+            self.true[frame] = tuple(pose)
+            rows[frame] = row
+            self._left(frame)
+        frames = list(rows)
+        if len(frames) < 2:
+            self._end("safety stop", "the rover did not move: it stands at the edge of the simulated bed")
+            return
+        moved = [self._moved(a, b) for a, b in zip(frames, frames[1:], strict=False)]
+        self.graph.expand(moved, lambda *found: self._seen(stop, rows, list(said.meta["up"]), list(found)))
+
+    def _seen(self, stop: Stop, rows: dict[int, int], up: list[list[float]], moved: list[Ref]) -> None:
+        """Leave lost images out; where two in a row are lost, or the last one, the vehicle stops and looks again."""
+        frames, least = list(rows), self.config.drive.least_match
+        rate = [float(m.meta["match_rate"] or 0.0) for m in moved]
+        lost = [
+            b
+            for n, b in enumerate(frames[1:])
+            if rate[n] < least and (n + 1 == len(rate) or rate[n + 1] < least)
+        ]
+        if lost:
+            shares = ", ".join(f"{b} ({rate[frames.index(b) - 1]:.0%} matched)" for b in lost)
+            stop.event = f"lost image {shares}: left out"
+            pair = next((n for n in range(1, len(frames) - 1) if {*frames[n : n + 2]} <= set(lost)), None)
+            end = frames[-1] if pair is None else frames[pair + 1]
+            frames = frames[: frames.index(end) + 1]
+            if end in lost:
+                again = max(self.true) + 1
+                self.true[again], rows[again] = self.true[end], rows[end]
+                stop.event = f"lost image {shares}: stopped and taken again as image {again}"
+                self._left(again)
+                frames.append(again)
+        kept = [f for f in frames if f not in lost]
+        if len(kept) < 2:
+            self._end("safety stop", "tracking is lost: " + stop.event)
+            return
+        self._segment_of(stop, kept, rows, up)
+
+    def _segment_of(self, stop: Stop, frames: list[int], rows: dict[int, int], up: list[list[float]]) -> None:
+        """Track and resect the images of the leg, then judge it."""
+        resection = self._resection(stop, frames, f"{stop.frame}")
+        args = {"rows": [rows[f] for f in frames], **self.mounting}
+        args["vehicle"] = self.config.vehicle.model_dump(mode="json", include={"max_slope_deg", "wheel_base"})
+        assert stop.sense is not None
+        stop.safety = self._node("safety", f"safety/{stop.index}", args, sense=stop.sense, resect=resection)
+        self.graph.expand([stop.safety], lambda safety: self._after(stop, frames, rows, up, resection, safety))
+
+    def _resection(self, stop: Stop, frames: list[int], which: str) -> Handle:
+        p, key = self.products, stop.frame
+        track = self._node(
+            "track",
+            f"track/{which}",
+            {"frames": frames},
+            frames=[self.left[f] for f in frames],
+            motions=[self._moved(a, b) for a, b in zip(frames, frames[1:], strict=False)],
+        )
+        p.tracks.append(track)
+        surface = {"dem": p.local_dem[key]} if self.config.resect.landmarks == "dem" else {}
+        return self._node(
+            "resect",
+            f"resect/{which}",
+            {"frames": frames},
+            track=track,
+            disparity=p.disparity[key],
+            level=p.level[key],
+            rig=self.calibration[key],
+            **surface,
+        )
+
+    def _after(
+        self,
+        stop: Stop,
+        frames: list[int],
+        rows: dict[int, int],
+        up: list[list[float]],
+        resection: Handle,
+        safety: Ref,
+    ) -> None:
+        """The leg is over: at its end, or where a safety stop ended it."""
+        cut = safety.meta["stop"]
+        self.troubles = 0 if cut is None else self.troubles + 1
+        if cut is not None:
+            stop.event = f"safety stop at image {frames[cut]}: {safety.meta['reason']}"
+            if cut < len(frames) - 1:
+                frames = frames[: cut + 1]
+                self.products.tracks.pop()
+                resection = self._resection(stop, frames, f"{stop.frame}/stopped")
+        stop.frames = frames
+        self.products.resections.append(resection)
+        self.posed += frames[1:]
+        terminal = cut is not None and safety.meta["kind"] in ("attitude", "acceleration", "lost")
+        if terminal or self.troubles >= self.config.drive.max_safety_stops:
+            often = f", {self.troubles} legs in a row" if self.troubles > 1 else ""
+            self._end("safety stop", safety.meta["reason"] + often)
+            return
+        assert stop.drive is not None
+        self._stop(frames[-1], stop.drive, rows[frames[-1]], up[rows[frames[-1]]])
+
+    # -- the end ------------------------------------------------------------------------------------------------
+
+    def _end(self, verdict: str, reason: str) -> None:
+        self.driven.verdict, self.driven.reason = verdict, reason
+
+    def outcome(self) -> tuple[str, str]:
+        """Verdict and reason, once the graph has run: of the last stop, or of what failed on the way."""
+        if self.driven.verdict:
+            return self.driven.verdict, self.driven.reason
+        failed = next((h for h in self.graph.nodes if h.status == "failed"), None)
+        if failed is not None and isinstance(failed.error, DegenerateError):
+            return "safety stop", f"{failed.label}: {failed.error.message}"
+        return "failed", "" if failed is None else f"{failed.label}: {failed.error}"
+
+    def taken(self) -> tuple[Sequence, tuple[int, ...]]:
+        """The sequence as it came about, and the frames that have a pose in it."""
+        n = max(self.true, default=0) + 1
+        truth = tuple(RigidTransform.from_matrix(self.true[f]) if f in self.true else None for f in range(n))
+        names = tuple(f"{f:06d}" for f in range(n))
+        return replace(self.sequence, frames=n, frame_names=names, truth=truth), tuple(self.posed)
+
+    # -- small things -------------------------------------------------------------------------------------------
+
+    def _simulate(self, source: Source, label: str, **inputs: Handle) -> Handle:
+        return self.graph.node(source.module, label, source.params, dict(source.args), dict(source.hints), inputs)
+
+    def _left(self, frame: int) -> None:
+        self.left[frame] = self._taken(frame, "left")
+
+    def _taken(self, frame: int, camera: str) -> Handle:
+        """Pyramid of an image taken at its true pose."""
+        source = self.simulation.image(frame, camera, RigidTransform.from_matrix(self.true[frame]))
+        image = self._simulate(source, f"image/{camera}/{frame}", scene=self.scene)
+        if camera == "left":
+            self.products.images[frame] = image
+        return self._node("pyramid", f"pyramid/{camera}/{frame}", {}, image=image)
+
+    def _moved(self, a: int, b: int) -> Handle:
+        if (a, b) not in self.motion:
+            self.motion[a, b] = self._node(
+                "motion", f"motion/{a}-{b}", {"frames": [a, b]}, a=self.left[a], b=self.left[b]
+            )
+        return self.motion[a, b]
+
+
+def dataflow(graph: Graph, sequence: Sequence, config: Any, frames: tuple[int, ...]) -> Reconstruction:
+    """The builder that suits a sequence: of a recorded one, or of one that is driven."""
+    kind = Reconstruction if sequence.simulation is None else Drive
+    return kind(graph, sequence, config, frames)

@@ -1,0 +1,301 @@
+"""The next leg of a drive to a goal: where to, how far of it is safe to drive now, or why no way leads there.
+
+The way is planned to the goal over all of the map. Ground that is known and free costs its length; unknown ground may
+be planned over, at a higher price, since the next stop will see it, but is never driven on: the leg ends before it.
+Ground that is known to be hazardous, or nearer to it than the vehicle and its margin need, is closed. So the way bends
+round dead ends as soon as they are seen, and where no way is left even over unknown ground there is none. This is the
+usual free-space assumption (Koenig, Tovey, Smirnov 2003, doi:10.1016/S0004-3702(03)00062-6), planned anew at each stop.
+
+The vehicle turns on the spot, so that what it needs is the circle of its wheels.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+from scipy.ndimage import distance_transform_edt
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import dijkstra
+
+from stages.declare import Array, Bundle, Inputs, Params, Stage
+from stages.errors import InputError
+from stages.geometry import RigidTransform
+from stages.lattice import Lattice
+from stages.risk import HAZARDOUS, SAFE, UNKNOWN
+from stages.vehicle import Vehicle
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Point = tuple[float, float]
+
+
+class LegParams(Params):
+    """Parameters of the stage ``leg``."""
+
+    length: float = Field(1.5, gt=0, description="wheel bases; longest leg, which is driven without a new map")
+    least: float = Field(0.3, gt=0, description="wheel bases; a shorter leg is not worth a stop: look elsewhere first")
+    max_turn_deg: float = Field(
+        35.0, gt=5, le=120, description="degrees turned on one leg: landmarks must stay in view, half of it at least"
+    )
+    unknown_price: float = Field(2.0, ge=1, description="price of a metre over unknown ground, known ground is 1")
+    near_price: float = Field(0.5, ge=0, description="added to the price beside hazards, falls to 0 within the margin")
+    tolerance: float = Field(0.3, gt=0, description="wheel bases; the goal is reached this near")
+    looks: int = Field(3, ge=1, description="looks around without a leg after which the way counts as closed")
+
+
+@dataclass(frozen=True)
+class Leg:
+    """``verdict``: drive, look, goal or no path; ``path`` (vertex, 2) m to drive now; ``turn`` rad on the spot after.
+
+    ``way`` (vertex, 2) m to the goal, as it is planned; ``cost`` (row, col) m to the goal at these prices, NaN closed.
+    """
+
+    verdict: str
+    reason: str
+    path: Floats
+    turn: float
+    way: Floats
+    cost: NDArray[np.float32]
+
+
+def half_width(vehicle: Vehicle) -> float:
+    """Radius of the circle through the wheels' centres, m."""
+    return 0.5 * math.hypot(vehicle.track, vehicle.wheel_base)
+
+
+def clear(risk: NDArray[np.uint8], cell: float, vehicle: Vehicle) -> tuple[Floats, Floats]:
+    """Distances (row, col), m, from the circle of the vehicle standing on a cell to hazards, and to unknown ground.
+
+    What is nearer than ``vehicle.margin`` to a hazard is closed.
+    """
+    need = half_width(vehicle)
+    out = []
+    for kind in (HAZARDOUS, UNKNOWN):
+        there = risk == kind
+        far = distance_transform_edt(~there) * cell if there.any() else np.full(risk.shape, np.inf)
+        out.append(np.asarray(far, dtype=np.float64) - need)
+    return out[0], out[1]
+
+
+def costs(price: Floats, goals: Mask, cell: float) -> tuple[Floats, NDArray[np.int32]]:
+    """Least cost from each cell to one of the goals over 8 neighbours, and the next cell on the way (flat, < 0 none).
+
+    ``price`` (row, col) a metre, infinite where closed; a step costs the mean of both cells' prices.
+    """
+    rows, cols = price.shape
+    number = np.arange(rows * cols).reshape(rows, cols)
+    ends, lengths = [], []
+    for dr, dc in ((0, 1), (1, 0), (1, 1), (1, -1)):
+        a = (slice(0, rows - dr), slice(max(0, -dc), cols - max(0, dc)))
+        b = (slice(dr, rows), slice(max(0, dc), cols + min(0, dc)))
+        mean = 0.5 * (price[a] + price[b])
+        there = np.isfinite(mean)
+        ends.append(np.stack([number[a][there], number[b][there]]))
+        lengths.append(mean[there] * cell * math.hypot(dr, dc))
+    pairs, length = np.concatenate(ends, axis=1), np.concatenate(lengths)
+    graph = coo_array((length, (pairs[0], pairs[1])), shape=(rows * cols, rows * cols)).tocsr()
+    sources = number[goals & np.isfinite(price)]
+    if sources.size == 0:
+        return np.full(price.shape, np.inf), np.full(rows * cols, -9999, np.int32)
+    cost, nearer, _ = dijkstra(graph, directed=False, indices=sources, return_predecessors=True, min_only=True)
+    return np.asarray(cost).reshape(rows, cols), np.asarray(nearer)
+
+
+def plan_leg(
+    risk: NDArray[np.uint8],
+    lattice: Lattice,
+    vehicle: Vehicle,
+    start: Point,
+    heading: float,
+    goal: Point,
+    params: LegParams,
+    looks: int = 0,
+) -> Leg:
+    """The next leg.
+
+    Parameters
+    ----------
+    risk : (row, col) classes of :mod:`stages.risk`.
+    start, heading : m; rad to the left of y.
+    looks : looks around since the last leg that was driven.
+
+    Raises
+    ------
+    InputError
+        Start or goal lies outside the map.
+    """
+    at, target = (_cell_of(lattice, name, p) for name, p in (("start", start), ("goal", goal)))
+    base, cell = vehicle.wheel_base, lattice.cell
+    xy = lattice.xy()
+    nothing = np.full(lattice.shape, np.nan, np.float32)
+    left = math.hypot(goal[0] - start[0], goal[1] - start[1])
+    if left <= params.tolerance * base:
+        return Leg("goal", f"{1000 * left:.0f} mm from the goal", _line([start]), 0.0, _line([start]), nothing)
+    hazard, unknown = clear(risk, cell, vehicle)
+    here = np.hypot(xy[..., 0] - start[0], xy[..., 1] - start[1]) <= 0.3 * base
+    opened = (hazard > vehicle.margin) | here
+    known = (opened & (unknown > 0.0) & (risk == SAFE)) | here
+    price = np.where(known, 1.0, params.unknown_price)
+    if vehicle.margin > 0:
+        price = price + params.near_price * np.clip(2.0 - hazard / vehicle.margin, 0.0, 1.0)
+    price = np.where(opened, price, np.inf)
+    goals = np.hypot(xy[..., 0] - goal[0], xy[..., 1] - goal[1]) <= 0.5 * params.tolerance * base
+    cost, nearer = costs(price, goals, cell)
+    shown = np.where(np.isfinite(cost), cost, np.nan).astype(np.float32)
+    if not np.isfinite(cost[at]):
+        reason = _why_closed(price, goals, target, cost, at, lattice)
+        return Leg("no path", reason, _line([start]), 0.0, _line([start]), shown)
+    cells = _follow(nearer, at, lattice)
+    way = _points(lattice, cells, start)
+    path = _safe_part(cells, way, known, lattice, params.length * base)
+    path, turn = _within_turn(path, heading, math.radians(params.max_turn_deg))
+    if len(path) > 1 and _length(path) >= min(params.least * base, left):
+        return Leg("drive", "", path, 0.0, way, shown)
+    ahead = way[min(len(way) - 1, max(1, int(1.5 * base / cell)))]
+    wanted = _turn_to(start, (float(ahead[0]), float(ahead[1])), heading)
+    if len(path) > 1 or abs(turn) > 0:
+        wanted = turn
+    if looks >= params.looks:
+        unseen = _length(way) - _length(path)
+        reason = (
+            f"after {looks} looks around no {1000 * params.least * base:.0f} mm of the way are known and free;"
+            f" {1000 * unseen:.0f} mm of it stay unknown or closed"
+        )
+        return Leg("no path", reason, _line([start]), 0.0, way, shown)
+    if abs(wanted) < math.radians(8.0):
+        wanted = math.radians((25.0, -50.0, 75.0)[looks % 3])
+    bound = math.radians(params.max_turn_deg)
+    wanted = max(-bound, min(bound, wanted))
+    return Leg("look", f"turns {math.degrees(wanted):.0f} degrees to see the way", _line([start]), wanted, way, shown)
+
+
+def _cell_of(lattice: Lattice, name: str, point: Point) -> tuple[int, int]:
+    row, col = (int(v) for v in np.rint(lattice.index(point)))
+    if not (0 <= row < lattice.rows and 0 <= col < lattice.cols):
+        x0, x1, y0, y1 = lattice.bounds
+        raise InputError(
+            f"the {name} ({point[0]:.3f}, {point[1]:.3f}) m is outside the map",
+            remedy=f"give x in {x0:.3f}..{x1:.3f} and y in {y0:.3f}..{y1:.3f} m",
+        )
+    return row, col
+
+
+def _why_closed(
+    price: Floats, goals: Mask, target: tuple[int, int], cost: Floats, at: tuple[int, int], lattice: Lattice
+) -> str:
+    if not np.isfinite(price[goals]).any():
+        return "the goal itself is on hazardous ground, or too near to it"
+    reach = np.isfinite(cost)
+    back = lattice.xy()[reach] - lattice.xy()[at]
+    gap = float(np.hypot(back[:, 0], back[:, 1]).min())
+    return f"hazards close every way: ground from which the goal can be reached ends {1000 * gap:.0f} mm away"
+
+
+def _line(points: list[Point]) -> Floats:
+    return np.array(points, dtype=np.float64).reshape(-1, 2)
+
+
+def _length(path: Floats) -> float:
+    return float(np.hypot(*np.diff(path, axis=0).T).sum()) if len(path) > 1 else 0.0
+
+
+def _follow(nearer: NDArray[np.int32], at: tuple[int, int], lattice: Lattice) -> NDArray[np.int64]:
+    """Cells (vertex, 2) from a cell to the goal."""
+    here = at[0] * lattice.cols + at[1]
+    cells = [here]
+    while nearer[here] >= 0:
+        here = int(nearer[here])
+        cells.append(here)
+    flat = np.array(cells)
+    return np.stack([flat // lattice.cols, flat % lattice.cols], axis=1)
+
+
+def _points(lattice: Lattice, cells: NDArray[np.int64], start: Point) -> Floats:
+    points = lattice.xy()[cells[:, 0], cells[:, 1]]
+    points[0] = start
+    return np.asarray(points)
+
+
+def _safe_part(
+    cells: NDArray[np.int64], way: Floats, known: Mask, lattice: Lattice, length: float
+) -> Floats:
+    """The way up to where it is not known to be free, or ``length`` is reached, as straight pieces over free cells."""
+    free = known[cells[:, 0], cells[:, 1]]
+    stop = int(np.argmin(free)) if not free.all() else len(free)
+    run = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(way, axis=0).T))])
+    stop = min(stop, int(np.searchsorted(run, length, side="right")))
+    if stop < 2:
+        return way[:1]
+    chosen, i = [0], 0
+    while i < stop - 1:
+        j = next(j for j in range(stop - 1, i, -1) if j == i + 1 or _sees(way[i], way[j], known, lattice))
+        chosen.append(j)
+        i = j
+    return way[chosen]
+
+
+def _sees(a: Floats, b: Floats, known: Mask, lattice: Lattice) -> bool:
+    """Whether the straight line from a to b stays on free cells."""
+    n = max(2, math.ceil(2.0 * math.hypot(*(b - a)) / lattice.cell))
+    points = a + np.linspace(0.0, 1.0, n)[:, None] * (b - a)
+    at = np.rint(lattice.index(points)).astype(np.int64)
+    return bool(known[at[:, 0], at[:, 1]].all())
+
+
+def _turn_to(a: Point | Floats, b: Point | Floats, heading: float) -> float:
+    return math.remainder(math.atan2(-(b[0] - a[0]), b[1] - a[1]) - heading, 2 * math.pi)
+
+
+def _within_turn(path: Floats, heading: float, bound: float) -> tuple[Floats, float]:
+    """The path as far as the turns on it stay within a bound, and the part of a larger first turn that does."""
+    total = 0.0
+    for k in range(len(path) - 1):
+        turn = _turn_to(path[k], path[k + 1], heading)
+        if abs(total + turn) > bound + 1e-9:
+            return path[: k + 1], (math.copysign(bound, turn) if k == 0 else 0.0)
+        total, heading = total + turn, heading + turn
+    return path, 0.0
+
+
+def _run(params: LegParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+    risk = inputs["risk"]
+    lattice, vehicle = Lattice.from_dict(risk.meta["lattice"]), Vehicle.model_validate(risk.meta["vehicle"])
+    T_world_left = RigidTransform.from_matrix(np.asarray(inputs["pose"]["poses"])[-1])
+    T = T_world_left @ RigidTransform.from_matrix(args["T_vehicle_left"]).inverse()
+    start = float(T.translation[0]), float(T.translation[1])
+    heading = math.atan2(-T.rotation[0, 1], T.rotation[1, 1])
+    goal = (float(args["goal"][0]), float(args["goal"][1]))
+    found = plan_leg(np.asarray(risk["risk"]), lattice, vehicle, start, heading, goal, params, int(args["looks"]))
+    meta = {
+        "verdict": found.verdict,
+        "reason": found.reason,
+        "turn": found.turn,
+        "start": [*start, heading],
+        "goal": list(goal),
+        "left_m": math.hypot(goal[0] - start[0], goal[1] - start[1]),
+        "length_m": _length(found.path),
+        "way_m": _length(found.way),
+    }
+    return Bundle({"path": found.path, "way": found.way, "cost_to_go": found.cost}, meta)
+
+
+STAGE = Stage(
+    name="leg",
+    version=1,
+    summary="the next leg of a drive to a goal, over ground that is known to be free",
+    params=LegParams,
+    inputs=("risk", "pose"),
+    outputs=(
+        Array("path", ("vertex", "xy"), "float64", "m", "vertices of the leg, from where the vehicle stands", frame="world"),
+        Array("way", ("way_vertex", "xy"), "float64", "m", "vertices of the way to the goal as planned", frame="world"),
+        Array("cost_to_go", ("row", "col"), "float32", "m", "price of the way from each cell to the goal", "nan"),
+    ),
+    requires=("numpy", "scipy"),
+    run=_run,
+)
