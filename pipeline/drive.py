@@ -103,6 +103,8 @@ class Drive(Reconstruction):
         self.true: dict[int, tuple[float, ...]] = {}
         """True pose of each frame that was taken; read by the renderer and by what assesses, never by an estimate."""
         self.looks = self.troubles = 0
+        self.closed: list[list[float]] = []
+        """Places about which unknown ground was looked at in vain."""
 
     def build(self) -> Products:
         """Lay out the start; the rest follows by expansion."""
@@ -202,7 +204,7 @@ class Drive(Reconstruction):
         self.pads = [self._node("pad", "pad", args, pose=self.pose, like=like)] if self.simulation.pad > 0 else []
 
     def _leg(self, label: str, risk: Handle, pose: Handle) -> Handle:
-        args = {"goal": list(self.config.drive.goal), "looks": self.looks, **self.mounting}
+        args = {"goal": list(self.config.drive.goal), "looks": self.looks, "closed": self.closed, **self.mounting}
         return self._node("leg", label, args, risk=risk, pose=pose)
 
     def arena(self) -> Lattice:
@@ -216,6 +218,12 @@ class Drive(Reconstruction):
         if verdict in ("goal", "no path"):
             stop.event = leg.meta["reason"]
             self._end(verdict, leg.meta["reason"])
+        elif verdict == "closed":
+            self.closed = [*self.closed, leg.meta["where"]]
+            self.looks = 0
+            assert stop.risk is not None
+            stop.leg = self._leg(f"leg/{stop.index}/{len(self.closed)}", stop.risk, self.pose)
+            self.graph.expand([stop.leg], lambda again: self._after_leg(stop, before, row, again))
         elif stop.index + 1 >= self.config.drive.max_stops:
             self._end("stops", f"{stop.index + 1} stops and {1000 * leg.meta['left_m']:.0f} mm from the goal")
         else:

@@ -47,11 +47,14 @@ class LegParams(Params):
     near_price: float = Field(0.5, ge=0, description="added to the price beside hazards, falls to 0 within the margin")
     tolerance: float = Field(0.3, gt=0, description="wheel bases; the goal is reached this near")
     looks: int = Field(3, ge=1, description="looks around without a leg after which the way counts as closed")
+    vain: float = Field(0.8, gt=0, description="wheel bases; radius of what is closed then, as far as it is unknown")
 
 
 @dataclass(frozen=True)
 class Leg:
-    """``verdict``: drive, look, goal or no path; ``path`` (vertex, 2) m to drive now; ``turn`` rad on the spot after.
+    """``verdict``: drive, look, closed, goal or no path; ``path`` (vertex, 2) m to drive; ``turn`` rad on the spot after.
+
+    ``closed``: looking around did not help; ``where`` the way is not known to be free.
 
     ``way`` (vertex, 2) m to the goal, as it is planned; ``cost`` (row, col) m to the goal at these prices, NaN closed.
     """
@@ -62,6 +65,7 @@ class Leg:
     turn: float
     way: Floats
     cost: NDArray[np.float32]
+    where: Point | None = None
 
 
 def half_width(vehicle: Vehicle) -> float:
@@ -116,6 +120,7 @@ def plan_leg(
     goal: Point,
     params: LegParams,
     looks: int = 0,
+    closed: list[Point] | None = None,
 ) -> Leg:
     """The next leg.
 
@@ -124,6 +129,7 @@ def plan_leg(
     risk : (row, col) classes of :mod:`stages.risk`.
     start, heading : m; rad to the left of y.
     looks : looks around since the last leg that was driven.
+    closed : places about which unknown ground was looked at in vain.
 
     Raises
     ------
@@ -141,6 +147,8 @@ def plan_leg(
     here = np.hypot(xy[..., 0] - start[0], xy[..., 1] - start[1]) <= 0.3 * base
     opened = (hazard > vehicle.margin) | here
     known = (opened & (unknown > 0.0) & (risk == SAFE)) | here
+    for x, y in closed or []:
+        opened &= known | (np.hypot(xy[..., 0] - x, xy[..., 1] - y) > params.vain * base)
     price = np.where(known, 1.0, params.unknown_price)
     if vehicle.margin > 0:
         price = price + params.near_price * np.clip(2.0 - hazard / vehicle.margin, 0.0, 1.0)
@@ -162,12 +170,10 @@ def plan_leg(
     if len(path) > 1 or abs(turn) > 0:
         wanted = turn
     if looks >= params.looks:
-        unseen = _length(way) - _length(path)
-        reason = (
-            f"after {looks} looks around no {1000 * params.least * base:.0f} mm of the way are known and free;"
-            f" {1000 * unseen:.0f} mm of it stay unknown or closed"
-        )
-        return Leg("no path", reason, _line([start]), 0.0, way, shown)
+        free = known[cells[:, 0], cells[:, 1]]
+        x, y = way[int(np.argmin(free))] if not free.all() else way[-1]
+        reason = f"{looks} looks around did not show the ground at ({x:.3f}, {y:.3f}) m"
+        return Leg("closed", reason, _line([start]), 0.0, way, shown, (float(x), float(y)))
     if abs(wanted) < math.radians(8.0):
         wanted = math.radians((25.0, -50.0, 75.0)[looks % 3])
     bound = math.radians(params.max_turn_deg)
@@ -271,11 +277,13 @@ def _run(params: LegParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     start = float(T.translation[0]), float(T.translation[1])
     heading = math.atan2(-T.rotation[0, 1], T.rotation[1, 1])
     goal = (float(args["goal"][0]), float(args["goal"][1]))
-    found = plan_leg(np.asarray(risk["risk"]), lattice, vehicle, start, heading, goal, params, int(args["looks"]))
+    closed = [(float(x), float(y)) for x, y in args["closed"]]
+    found = plan_leg(np.asarray(risk["risk"]), lattice, vehicle, start, heading, goal, params, int(args["looks"]), closed)
     meta = {
         "verdict": found.verdict,
         "reason": found.reason,
         "turn": found.turn,
+        "where": None if found.where is None else list(found.where),
         "start": [*start, heading],
         "goal": list(goal),
         "left_m": math.hypot(goal[0] - start[0], goal[1] - start[1]),

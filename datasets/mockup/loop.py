@@ -19,16 +19,16 @@ LOOP: Mapping[str, Any] = {
     "frames": 1,
     "image_width": 320,
     "image_height": 240,
-    "focal_length": 220.0,
+    "focal_length": 180.0,
     "toe_in_deg": 3.0,
-    "pitch_deg": 28.0,
+    "pitch_deg": 32.0,
     "bed_width": 1.6,
     "bed_length": 2.0,
     "cell": 0.002,
     "rocks": 12.0,
     "craters": 4.0,
 }
-"""``mockup-loop``: small images of wide-angle cameras, which see the ground from 0.12 m before them to the horizon."""
+"""``mockup-loop``: small images of wide-angle cameras, which see the ground from 0.08 m before them to the horizon."""
 
 DEFAULTS: Mapping[str, Any] = {
     "hfvm.preset": "fast",

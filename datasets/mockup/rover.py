@@ -44,7 +44,7 @@ class RoverParams(Params):
         1.0, ge=0, le=20, description="degrees; standard deviation of the heading's drift over one leg"
     )
     turn_sigma: float = Field(0.03, ge=0, le=0.5, description="relative standard deviation of a turn on the spot")
-    frame_step: float = Field(0.02, gt=0.001, description="m; an image is taken at least this often")
+    frame_step: float = Field(0.025, gt=0.001, description="m; an image is taken at least this often")
     frame_turn_deg: float = Field(5.0, gt=0.5, le=15, description="degrees; and this often on the spot")
     speed: float = Field(0.05, gt=0, description="m/s; turns bumps into accelerations")
     odometry_sigma: float = Field(0.01, ge=0, description="relative standard deviation of what the wheels report")
@@ -52,7 +52,7 @@ class RoverParams(Params):
     acceleration_sigma: float = Field(0.05, ge=0, description="m/s2; noise of the accelerometer's peaks")
     camera_forward: float = Field(0.05, description="m; cameras ahead of the centre of the wheels")
     pad: float = Field(
-        0.22, ge=0, description="m; radius about the start that is level and free of rocks, known to the rover"
+        0.28, ge=0, description="m; radius about the start that is level and free of rocks, known to the rover"
     )
     blank: tuple[float, float, float] | None = Field(
         None, description="m; x, y, radius of a patch of the bed without any texture; none by default"
@@ -68,7 +68,7 @@ class RoverParams(Params):
 
 @dataclass
 class _Drive:
-    """The true motion in the making: position, heading, way and turn since the last image."""
+    """The true motion in the making: where it is, how it stood on the way, and what its wheels did."""
 
     ground: Ground
     vehicle: Vehicle
@@ -77,7 +77,6 @@ class _Drive:
     heading: float
     trail: list[Stand]
     wheels: list[tuple[float, float, float]]
-    frames: list[int]
 
     def advance(self, distance: float, turn: float, rolled: float, turned: float) -> bool:
         """Move on; whether the vehicle still stands on the bed."""
@@ -124,38 +123,39 @@ def drive_leg(
     first = stand(ground, *before, vehicle)
     if first is None:
         raise InputError("the rover stands beside the bed", remedy="set rover.start within the bed, or a larger bed")
-    d = _Drive(ground, vehicle, *before, [first], [(0.0, 0.0, 0.0)], [0])
+    d = _Drive(ground, vehicle, *before, [first], [(0.0, 0.0, 0.0)])
     x, y, heading = believed
 
     def rotate(by: float) -> bool:
-        by = math.remainder(by, 2 * math.pi)
         n = math.ceil(abs(by) / STEP_TURN)
-        every = max(1, round(math.radians(p.frame_turn_deg) / STEP_TURN))
-        for k in range(n):
-            if not d.advance(0.0, spin * by / n, 0.0, by / n):
-                return False
-            if (k + 1) % every == 0 or k == n - 1:
-                d.frames.append(len(d.trail) - 1)
-        return True
+        return all(d.advance(0.0, spin * by / n, 0.0, by / n) for _ in range(n))
 
-    every = max(1, round(p.frame_step / STEP))
     for vertex in path[1:]:
         dx, dy = vertex[0] - x, vertex[1] - y
-        way = math.hypot(dx, dy)
-        if way < 1e-9:
-            continue
-        towards = math.atan2(-dx, dy)
-        if not rotate(towards - heading):
-            return d
+        way, towards = math.hypot(dx, dy), math.atan2(-dx, dy)
         n = math.ceil(way / STEP)
-        for k in range(n):
-            if not d.advance((1.0 - slip) * way / n, drift * way / n, way / n, 0.0):
-                return d
-            if (k + 1) % every == 0 or k == n - 1:
-                d.frames.append(len(d.trail) - 1)
+        there = rotate(math.remainder(towards - heading, 2 * math.pi)) and all(
+            d.advance((1.0 - slip) * way / n, drift * way / n, way / n, 0.0) for _ in range(n)
+        )
+        if not there:
+            break
         x, y, heading = float(vertex[0]), float(vertex[1]), towards
-    rotate(turn)
+    else:
+        rotate(turn)
     return d
+
+
+def images_at(wheels: Floats, p: RoverParams) -> list[int]:
+    """Positions (of wheels (n, 3): x, y in m, heading in rad) at which an image is taken: the first, the last, and
+    whenever the way or the turn since the last one is large enough."""
+    at, way, turn = [0], 0.0, 0.0
+    for k in range(1, len(wheels)):
+        dx, dy, dh = wheels[k] - wheels[k - 1]
+        way, turn = way + math.hypot(dx, dy), turn + abs(dh)
+        if way > p.frame_step - 1e-9 or turn > math.radians(p.frame_turn_deg) - 1e-9 or k == len(wheels) - 1:
+            at.append(k)
+            way, turn = 0.0, 0.0
+    return at
 
 
 def bed_ground(scene: Bundle, vehicle: Vehicle, at: tuple[float, float], reach: float) -> Ground:
@@ -186,19 +186,21 @@ def _run(params: RoverParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle
     length = float(np.hypot(*np.diff(path, axis=0).T).sum()) if len(path) > 1 else 0.0
     ground = bed_ground(scene, vehicle, before[:2], length + REACH)
     d = drive_leg(ground, vehicle, before, start, path, turn, params, rng)
+    wheels = np.array(d.wheels)
+    frames = images_at(wheels, params)
     vehicles = np.stack([s.T_ground_vehicle.matrix34 for s in d.trail])
-    lefts = np.stack([(d.trail[i].T_ground_vehicle @ T_left_vehicle.inverse()).matrix34 for i in d.frames])
+    lefts = np.stack([(d.trail[i].T_ground_vehicle @ T_left_vehicle.inverse()).matrix34 for i in frames])
     arrays = {
         "poses": lefts,
-        "vehicle": vehicles[d.frames],
+        "vehicle": vehicles[frames],
         "trail": vehicles,
-        "frame_at": np.array(d.frames, dtype=np.int32),
-        "wheels": np.array(d.wheels),
+        "frame_at": np.array(frames, dtype=np.int32),
+        "wheels": wheels,
         "tilt": np.array([s.tilt for s in d.trail]),
         "clearance": np.array([s.clearance for s in d.trail]),
         "step": np.array([s.step for s in d.trail]),
     }
-    return Bundle(arrays, {"leg": args["leg"], "frames": len(d.frames), "poses": [m.reshape(-1).tolist() for m in lefts]})
+    return Bundle(arrays, {"leg": args["leg"], "frames": len(frames), "poses": [m.reshape(-1).tolist() for m in lefts]})
 
 
 def _trail(name: str, unit: str, long_name: str) -> Array:
