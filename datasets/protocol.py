@@ -82,6 +82,10 @@ class Simulation:
     T_vehicle_left: RigidTransform
     pad: float
 
+    def to_dict(self) -> dict[str, Any]:
+        """JSON form of what the rover knows of itself (the sources have keys of their own)."""
+        return {"T_vehicle_left": self.T_vehicle_left.to_list(), "pad": self.pad}
+
 
 @dataclass(frozen=True)
 class Sequence:

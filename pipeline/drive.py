@@ -103,6 +103,8 @@ class Drive(Reconstruction):
         self.true: dict[int, tuple[float, ...]] = {}
         """True pose of each frame that was taken; read by the renderer and by what assesses, never by an estimate."""
         self.looks = self.troubles = 0
+        self.rows: dict[int, int] = {}
+        """Row of each frame in the artifact of its leg."""
         self.closed: list[list[float]] = []
         """Places about which unknown ground was looked at in vain."""
 
@@ -203,8 +205,8 @@ class Drive(Reconstruction):
         like = self.products.world_dem[frame]
         self.pads = [self._node("pad", "pad", args, pose=self.pose, like=like)] if self.simulation.pad > 0 else []
 
-    def _leg(self, label: str, risk: Handle, pose: Handle) -> Handle:
-        args = {"goal": list(self.config.drive.goal), "looks": self.looks, "closed": self.closed, **self.mounting}
+    def _leg(self, label: str, risk: Handle, pose: Handle, **more: Any) -> Handle:
+        args = {"goal": list(self.config.drive.goal), "looks": self.looks, "closed": self.closed, **self.mounting, **more}
         return self._node("leg", label, args, risk=risk, pose=pose)
 
     def arena(self) -> Lattice:
@@ -338,6 +340,7 @@ class Drive(Reconstruction):
                 self.products.tracks.pop()
                 resection = self._resection(stop, frames, f"{stop.frame}/stopped")
         stop.frames = frames
+        self.rows |= {f: rows[f] for f in frames[1:]}
         self.products.resections.append(resection)
         self.posed += frames[1:]
         terminal = cut is not None and safety.meta["kind"] in ("attitude", "acceleration", "lost")
@@ -351,7 +354,43 @@ class Drive(Reconstruction):
     # -- the end ------------------------------------------------------------------------------------------------
 
     def _end(self, verdict: str, reason: str) -> None:
+        """Say how it ended, and assess it: here alone truth and estimates meet."""
         self.driven.verdict, self.driven.reason = verdict, reason
+        p, s, first = self.products, self.simulation, self.products.level[0]
+        poses = [list(self.true[f]) for f in self.posed]
+        args = {"poses": poses, "source": self.sequence.truth_source, "frames": list(self.posed)}
+        self.truth = self._node("truth", "truth", args)
+        assert p.trajectory is not None
+        p.accuracy = self._node("accuracy", "accuracy", {}, trajectory=p.trajectory, truth=self.truth)
+
+        def ground(level: Ref) -> None:
+            T_left_local = RigidTransform.from_matrix(level.meta["T_local_left"]).inverse()
+            T_truth_world = RigidTransform.from_matrix(self.true[0]) @ T_left_local
+            stops = [RigidTransform.from_matrix(self.true[stop.frame]) for stop in self.driven.stops]
+            source = s.truth_dem(self.arena().to_dict(), T_truth_world, stops)
+            truth_dem = self._simulate(source, "truth_dem", scene=self.scene)
+            p.dem_accuracy = self._node("dem_accuracy", "dem_accuracy/world", {}, dem=p.tiles, truth=truth_dem)
+            p.truth_risk = self._risk("risk/truth", [truth_dem])
+            self.looks, self.closed = 0, []
+            self.driven.truth_leg = self._leg("leg/truth", p.truth_risk, self.first_pose, whole=True)
+            self._check()
+
+        self.graph.expand([first], ground)
+
+    def _check(self) -> None:
+        """The drive against the truth."""
+        d, p = self.driven, self.products
+        legs = [s for s in d.stops if s.drive is not None and s.frames]
+        assert d.place is not None and d.truth_leg is not None and p.trajectory is not None
+        d.check = self._node(
+            "drive_check",
+            "drive_check",
+            {"rows": [0, *(self.rows[s.frames[-1]] for s in legs)], "vehicle": self.config.vehicle.model_dump(mode="json")},
+            drives=[d.place, *(s.drive for s in legs if s.drive is not None)],
+            trajectory=p.trajectory,
+            truth=self.truth,
+            best=d.truth_leg,
+        )
 
     def outcome(self) -> tuple[str, str]:
         """Verdict and reason, once the graph has run: of the last stop, or of what failed on the way."""

@@ -181,6 +181,23 @@ def plan_leg(
     return Leg("look", f"turns {math.degrees(wanted):.0f} degrees to see the way", _line([start]), wanted, way, shown)
 
 
+def shortest(
+    risk: NDArray[np.uint8], lattice: Lattice, vehicle: Vehicle, start: Point, goal: Point, tolerance: float
+) -> float | None:
+    """Length, m, of the shortest way over known, free ground to within ``tolerance`` metres of the goal; None: none."""
+    hazard, unknown = clear(risk, lattice.cell, vehicle)
+    xy = lattice.xy()
+    here = np.hypot(xy[..., 0] - start[0], xy[..., 1] - start[1]) <= 0.3 * vehicle.wheel_base
+    known = ((hazard > vehicle.margin) & (unknown > 0.0) & (risk == SAFE)) | here
+    goals = np.hypot(xy[..., 0] - goal[0], xy[..., 1] - goal[1]) <= tolerance
+    cost, nearer = costs(np.where(known, 1.0, np.inf), goals, lattice.cell)
+    at = _cell_of(lattice, "start", start)
+    if not np.isfinite(cost[at]):
+        return None
+    cells = _follow(nearer, at, lattice)
+    return _length(_safe_part(cells, _points(lattice, cells, start), known, lattice, math.inf))
+
+
 def _cell_of(lattice: Lattice, name: str, point: Point) -> tuple[int, int]:
     row, col = (int(v) for v in np.rint(lattice.index(point)))
     if not (0 <= row < lattice.rows and 0 <= col < lattice.cols):
@@ -279,7 +296,12 @@ def _run(params: LegParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     goal = (float(args["goal"][0]), float(args["goal"][1]))
     closed = [(float(x), float(y)) for x, y in args["closed"]]
     found = plan_leg(np.asarray(risk["risk"]), lattice, vehicle, start, heading, goal, params, int(args["looks"]), closed)
+    best = None
+    if args.get("whole"):
+        tolerance = 0.5 * params.tolerance * vehicle.wheel_base
+        best = shortest(np.asarray(risk["risk"]), lattice, vehicle, start, goal, tolerance)
     meta = {
+        "shortest_m": best,
         "verdict": found.verdict,
         "reason": found.reason,
         "turn": found.turn,
