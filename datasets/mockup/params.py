@@ -21,6 +21,19 @@ class SceneParams(Params):
     )
     relief: float = Field(0.007, ge=0.0, le=0.03, description="m, RMS of the longest (0.5 m) octave of the relief")
     rocks: float = Field(30.0, ge=0.0, le=200.0, description="1/m2, rocks wider than 30 mm; smaller ones follow D^-2")
+    rock_cover: float | None = Field(
+        None,
+        gt=0.0,
+        le=0.3,
+        description="share of the bed under rocks wider than 4 mm, sizes by Golombek and Rapp (1997), none "
+        "over another; none: as rocks says",
+    )
+    slope_deg: float = Field(
+        0.0,
+        ge=-25.0,
+        le=25.0,
+        description="degrees; rise of the bed ahead. The body stands square on it; an inclinometer tells the vertical",
+    )
     craters: float = Field(8.0, ge=0.0, le=50.0, description="1/m2, craters wider than 100 mm; others follow D^-2")
     grain: float = Field(0.06, ge=0.0, le=0.3, description="relative RMS of each octave of the albedo grain")
     sun_elevation_deg: float = Field(20.0, ge=3.0, le=90.0, description="degrees above the horizon")

@@ -30,6 +30,9 @@ def build_scene(p: SceneParams) -> Bundle:
     height = terrain.relief(p, (rows, cols))
     terrain.add_craters(height, p)
     height -= np.float32(height.mean(dtype=np.float64))
+    if p.slope_deg:
+        rise = np.tan(np.deg2rad(p.slope_deg)) * p.cell * np.arange(rows - 1, -1, -1)
+        height += rise[:, None].astype(np.float32)
     tint = terrain.add_rocks(height, p)
     arrays: dict[str, Any] = {
         "height": height,

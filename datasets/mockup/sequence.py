@@ -42,7 +42,7 @@ def mount(p: MockupParams, camera: str) -> RigidTransform:
 
 
 def body_poses(p: MockupParams) -> list[RigidTransform]:
-    """T_bed_body of every frame: steps along the body's own heading, then roll and jitter."""
+    """T_bed_body of every frame: steps along the body's own heading on the mean plane, then roll and jitter."""
     rng = np.random.default_rng([p.seed, 60])
     headings = -np.deg2rad(p.turn_deg) * np.arange(p.frames)
     offsets = np.zeros((p.frames, 2))
@@ -62,6 +62,9 @@ def body_poses(p: MockupParams) -> list[RigidTransform]:
             @ rotation_exp([0.0, roll, 0.0])
         )
         poses.append(RigidTransform(rotation, np.array([offset[0], offset[1], p.camera_height])))
+    if p.slope_deg:
+        T_bed_plane = RigidTransform(rotation_exp([np.deg2rad(p.slope_deg), 0.0, 0.0]), np.zeros(3))
+        poses = [T_bed_plane @ pose for pose in poses]
     return poses
 
 
@@ -147,7 +150,12 @@ def mockup(p: MockupParams, name: str = "mockup") -> Sequence:
         return Source("datasets.mockup.truth_dem", NoParams(), args, inputs={"scene": scene})
 
     attitude = _attitude(p, poses["left"])
-    level = p.roll_deg == 0.0 and p.jitter_deg == 0.0 and p.roll_swing_deg == 0.0
+    level = p.roll_deg == p.jitter_deg == p.roll_swing_deg == p.slope_deg == 0.0
+    up: tuple[tuple[float, float, float], ...] | None = None
+    if attitude is not None:
+        up = tuple(rows[2] for rows in attitude)
+    elif p.slope_deg:
+        up = tuple((float(x), float(y), float(z)) for x, y, z in (pose.rotation[2] for pose in poses["left"]))
     return Sequence(
         name=name,
         rig=given_rig(p),
@@ -157,7 +165,7 @@ def mockup(p: MockupParams, name: str = "mockup") -> Sequence:
         times=tuple(float(k) for k in range(p.frames)),
         truth=tuple(poses["left"]),
         truth_source="the simulator's own poses: exact",
-        up=None if attitude is None else tuple(rows[2] for rows in attitude),
+        up=up,
         attitude=attitude,
         pitch=math.radians(p.pitch_deg) if level else None,
         vehicle=vehicle_at_scale(),

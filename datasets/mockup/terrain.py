@@ -25,6 +25,12 @@ SPLINE_RMS = 0.479
 
 WIDEST_ROCK = 0.11
 WIDEST_CRATER = 0.35
+LEAST_COVER_ROCK, WIDEST_COVER_ROCK = 0.004, 0.15
+"""Rocks of a stated cover, metres: what a camera resolves, and 1.5 m at full scale."""
+FULL_SCALE = 10.0
+"""Metres of Mars or Moon to a metre of the bed, for the law of the rocks' sizes."""
+TRIES = 300
+"""Places tried for one rock; at a cover of 0.3 one in a thousand finds none."""
 EMISSION = 0.31
 """Cosine of the emission angle for which the exposure is set: ground seen 18 degrees below the horizon."""
 
@@ -126,13 +132,12 @@ def add_craters(height: Floats32, p: SceneParams) -> None:
 
 def add_rocks(height: Floats32, p: SceneParams) -> Floats32:
     """Put rocks of profile 1 - q^4 (bounded slopes) on the ground; returns their tint, the albedo relative to it."""
+    if p.rock_cover is not None:
+        return _add_rock_cover(height, p, p.rock_cover)
     rng = stream(p.seed, 2)
     area = (height.shape[0] * p.cell) * (height.shape[1] * p.cell)
     least = 0.004
-    stones = np.zeros_like(height)
-    rough = np.zeros_like(height)
-    for k, wave in enumerate((0.016, 0.008, 0.004)):
-        add_octave(rough, max(wave / p.cell, 1.0), 0.5**k, stream(p.seed, 20 + k))
+    stones, rough = np.zeros_like(height), _rough_faces(height, p)
     tint = np.ones_like(height)
     for diameter in _sizes(rng, p.rocks * area * (0.03 / least) ** 2, least, WIDEST_ROCK):
         x, y, a, b, c, e, g, s = rng.random(8)
@@ -140,26 +145,88 @@ def add_rocks(height: Floats32, p: SceneParams) -> Floats32:
         if patch is None:
             continue
         window, dx, dy = patch
-        turn = 2.0 * np.pi * a
-        u, v = np.cos(turn) * dx + np.sin(turn) * dy, -np.sin(turn) * dx + np.cos(turn) * dy
-        v = v / (0.65 + 0.35 * b)
-        bearing = np.arctan2(v, u)
-        outline = 1.0 + 0.10 * np.cos(3.0 * bearing + 6.3 * c) + 0.06 * np.cos(5.0 * bearing + 6.3 * e)
-        q = np.sqrt(u**2 + v**2) / (0.5 * diameter * outline)
-        # tilted faces cut the body, as broken stones are; the profile bounds the slopes of what remains
-        shape = 1.0 - q**4
-        for k in range(3):
-            way = 6.3 * g + 2.1 * k + c
-            shape = np.minimum(
-                shape, 0.70 + 0.15 * k + (0.35 + 0.2 * k) * (np.cos(way) * u + np.sin(way) * v) / diameter
-            )
-        stone = min(diameter * (0.25 + 0.35 * s), 0.04) * (shape + 0.06 * rough[window] * np.maximum(shape, 0.0))
-        stone = np.where(q < 1.0, np.maximum(stone, 0.0), 0.0).astype(np.float32)
+        stone = _stone(dx, dy, diameter, 0.65 + 0.35 * b, (a, c, e, g, s), rough[window])
         over = stone > stones[window]
         tint[window] = np.where(over, np.float32(0.75 + 0.6 * e), tint[window])
         stones[window] = np.maximum(stones[window], stone)
     height += stones
     return tint
+
+
+def _rough_faces(height: Floats32, p: SceneParams) -> Floats32:
+    """Relief of the rocks' faces relative to their height."""
+    rough = np.zeros_like(height)
+    for k, wave in enumerate((0.016, 0.008, 0.004)):
+        add_octave(rough, max(wave / p.cell, 1.0), 0.5**k, stream(p.seed, 20 + k))
+    return rough
+
+
+def _add_rock_cover(height: Floats32, p: SceneParams, cover: float) -> Floats32:
+    """Rocks beside each other, the largest first, until they cover the stated share; returns their tint."""
+    rng = stream(p.seed, 3)
+    length, width = height.shape[0] * p.cell, height.shape[1] * p.cell
+    stones, rough, tint = np.zeros_like(height), _rough_faces(height, p), np.ones_like(height)
+    for diameter in cover_sizes(rng, cover, length * width):
+        b, *draws = (float(v) for v in rng.random(6))
+        aspect = 0.65 + 0.35 * b
+        long_axis = diameter / np.sqrt(aspect)  # the ellipse has the area of a circle of that diameter
+        for _ in range(TRIES):
+            x, y = rng.random(2)
+            patch = _patch(height.shape, p.cell, x * width, y * length, 0.6 * long_axis)
+            if patch is None:
+                continue
+            window, dx, dy = patch
+            stone = _stone(dx, dy, long_axis, aspect, tuple(draws), rough[window])
+            if not (stones[window][stone > 0] > 0).any():
+                stones[window] = np.maximum(stones[window], stone)
+                tint[window] = np.where(stone > 0, np.float32(0.75 + 0.6 * draws[2]), tint[window])
+                break
+    height += stones
+    return tint
+
+
+def cover_sizes(rng: np.random.Generator, cover: float, area: float) -> NDArray[np.float64]:
+    """Diameters, metres of the bed, falling, of rocks that together cover a share of an area (m2).
+
+    The law is that of Golombek and Rapp (1997), doi:10.1029/96JE03319: the share under rocks wider than D metres falls
+    with exp(-q D), q = 1.79 + 0.152 / cover, at full scale. Sizes are drawn one from each equal part of the numbers.
+    """
+    q = (1.79 + 0.152 / cover) * FULL_SCALE
+    d = np.geomspace(LEAST_COVER_ROCK, WIDEST_COVER_ROCK, 2000)
+    covered = np.exp(-q * d[0]) - np.exp(-q * d)
+    middle = np.sqrt(d[1:] * d[:-1])
+    number = np.concatenate([[0.0], np.cumsum(np.diff(covered) / (0.25 * np.pi * middle**2))])
+    count = round(number[-1] * cover * area / covered[-1])
+    u = (np.arange(count) + rng.random(count)) / max(count, 1)
+    return np.asarray(np.interp(u * number[-1], number, d)[::-1], dtype=np.float64)
+
+
+def _stone(
+    dx: NDArray[np.float64],
+    dy: NDArray[np.float64],
+    diameter: float,
+    aspect: float,
+    draws: tuple[float, ...],
+    rough: Floats32,
+) -> Floats32:
+    """Heights (row, col) of one rock at offsets (dx, dy) from its middle, metres; 0 beside it.
+
+    ``diameter`` is that of the long axis, ``aspect`` short over long; ``draws`` (5,) in 0..1 turn and break it.
+    """
+    a, c, e, g, s = draws
+    turn = 2.0 * np.pi * a
+    u, v = np.cos(turn) * dx + np.sin(turn) * dy, -np.sin(turn) * dx + np.cos(turn) * dy
+    v = v / aspect
+    bearing = np.arctan2(v, u)
+    outline = 1.0 + 0.10 * np.cos(3.0 * bearing + 6.3 * c) + 0.06 * np.cos(5.0 * bearing + 6.3 * e)
+    q = np.sqrt(u**2 + v**2) / (0.5 * diameter * outline)
+    # tilted faces cut the body, as broken stones are; the profile bounds the slopes of what remains
+    shape = 1.0 - q**4
+    for k in range(3):
+        way = 6.3 * g + 2.1 * k + c
+        shape = np.minimum(shape, 0.70 + 0.15 * k + (0.35 + 0.2 * k) * (np.cos(way) * u + np.sin(way) * v) / diameter)
+    stone = min(diameter * (0.25 + 0.35 * s), 0.04) * (shape + 0.06 * rough * np.maximum(shape, 0.0))
+    return np.asarray(np.where(q < 1.0, np.maximum(stone, 0.0), 0.0), dtype=np.float32)
 
 
 def albedo(p: SceneParams, nodes: tuple[int, int]) -> NDArray[np.uint8]:

@@ -305,6 +305,35 @@ def test_rocks_and_craters_change_only_their_own_part():
     np.testing.assert_array_equal(a["albedo_0"], b["albedo_0"])
 
 
+@pytest.mark.parametrize("cover", [0.05, 0.2])
+def test_rocks_cover_the_stated_share_in_the_stated_sizes(cover: float) -> None:
+    p = SceneParams(bed_width=1.2, bed_length=1.2, rock_cover=cover, seed=4)
+    bare, stony = build_scene(p.model_copy(update={"rock_cover": None, "rocks": 0.0})), build_scene(p)
+    # a hundredth of the bed is a tenth to a half of the widest rock: what one rock more or less at the border changes
+    assert (stony["height"] - bare["height"] > 1e-6).mean() == pytest.approx(cover, rel=0.05, abs=0.004)
+    sizes = terrain.cover_sizes(np.random.default_rng(0), cover, 200.0)
+    area = 0.25 * np.pi * sizes**2
+    q = 10.0 * (1.79 + 0.152 / cover)
+    for least in (0.01, 0.02, 0.05):
+        share = (np.exp(-q * least) - np.exp(-q * 0.15)) / (np.exp(-q * 0.004) - np.exp(-q * 0.15))
+        assert area[sizes > least].sum() / area.sum() == pytest.approx(share, rel=0.02)
+
+
+def test_a_sloped_bed_is_seen_as_a_level_one_is() -> None:
+    p = MockupParams(frames=2, bed_width=0.9, bed_length=1.0, relief=0.0, rocks=0.0, craters=0.0, slope_deg=10.0)
+    height = build_scene(p.scene())["height"]
+    assert height[0, 0] - height[-1, 0] == pytest.approx(math.tan(math.radians(10.0)), rel=1e-5)
+    for pose in seq.body_poses(p):
+        normal = pose.rotation[:, 2]
+        assert math.degrees(math.acos(normal[2])) == pytest.approx(10.0)
+        # distance of the body from the plane z = tan(10 degrees) y
+        assert normal @ pose.translation == pytest.approx(p.camera_height)
+    sloped = seq.mockup(p)
+    assert sloped.pitch is None
+    for up, left in zip(sloped.up, sloped.truth, strict=True):
+        np.testing.assert_allclose(left.rotation @ up, [0.0, 0.0, 1.0], atol=1e-12)
+
+
 def test_bed_challenges_the_rover():
     from stages.risk import risk_map
 
