@@ -1,4 +1,4 @@
-"""The command line: ``rille reconstruct | drive | plan | why | timing | check | init | calibrate | match | export | ...``.
+"""The command line: ``rille reconstruct | drive | plan | why | timing | check | init | calibrate | match | ...``.
 
 Exit codes: 0 complete; 1 failed; 2 usage, configuration or input; 3 finished with holes under ``--keep-going``;
 130 interrupted. Results go to stdout, progress and complaints to stderr. Heavy imports happen inside the commands, so

@@ -52,6 +52,7 @@ STAGE_MODULES: dict[str, str] = {
     "pad": "stages.pad",
     "leg": "stages.leg",
     "safety": "stages.safety",
+    "reflex": "stages.reflex",
     "drive_check": "stages.drive_check",
 }
 """Every stage of the chain by name; a section of the configuration where the stage has parameters."""

@@ -24,14 +24,15 @@ killed goes on where it was, and one that is repeated computes nothing.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
+import itertools
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import numpy as np
 from pydantic import Field
 
 from datasets.protocol import Sequence, Simulation, Source
+from pipeline.config import STAGE_MODULES
 from pipeline.dag import Graph, Handle
 from pipeline.reconstruct import Products, Reconstruction
 from pipeline.task import Ref
@@ -39,6 +40,7 @@ from stages.declare import Params
 from stages.errors import ConfigError, DegenerateError
 from stages.geometry import RigidTransform
 from stages.lattice import Lattice
+from stages.reflex import pairs
 
 
 class DriveParams(Params):
@@ -68,6 +70,7 @@ class Stop:
     drive: Handle | None = None
     sense: Handle | None = None
     safety: Handle | None = None
+    reflex: Handle | None = None
     frames: list[int] = field(default_factory=list)
     event: str = ""
 
@@ -206,7 +209,13 @@ class Drive(Reconstruction):
         self.pads = [self._node("pad", "pad", args, pose=self.pose, like=like)] if self.simulation.pad > 0 else []
 
     def _leg(self, label: str, risk: Handle, pose: Handle, **more: Any) -> Handle:
-        args = {"goal": list(self.config.drive.goal), "looks": self.looks, "closed": self.closed, **self.mounting, **more}
+        args = {
+            "goal": list(self.config.drive.goal),
+            "looks": self.looks,
+            "closed": self.closed,
+            **self.mounting,
+            **more,
+        }
         return self._node("leg", label, args, risk=risk, pose=pose)
 
     def arena(self) -> Lattice:
@@ -260,18 +269,14 @@ class Drive(Reconstruction):
         if len(frames) < 2:
             self._end("safety stop", "the rover did not move: it stands at the edge of the simulated bed")
             return
-        moved = [self._moved(a, b) for a, b in zip(frames, frames[1:], strict=False)]
-        self.graph.expand(moved, lambda *found: self._seen(stop, rows, list(said.meta["up"]), list(found)))
+        moved = [self._moved(a, b) for a, b in itertools.pairwise(frames)]
+        self.graph.expand(moved, lambda *found: self._seen(stop, rows, said, list(found)))
 
-    def _seen(self, stop: Stop, rows: dict[int, int], up: list[list[float]], moved: list[Ref]) -> None:
+    def _seen(self, stop: Stop, rows: dict[int, int], said: Ref, moved: list[Ref]) -> None:
         """Leave lost images out; where two in a row are lost, or the last one, the vehicle stops and looks again."""
         frames, least = list(rows), self.config.drive.least_match
         rate = [float(m.meta["match_rate"] or 0.0) for m in moved]
-        lost = [
-            b
-            for n, b in enumerate(frames[1:])
-            if rate[n] < least and (n + 1 == len(rate) or rate[n + 1] < least)
-        ]
+        lost = [b for n, b in enumerate(frames[1:]) if rate[n] < least and (n + 1 == len(rate) or rate[n + 1] < least)]
         if lost:
             shares = ", ".join(f"{b} ({rate[frames.index(b) - 1]:.0%} matched)" for b in lost)
             stop.event = f"lost image {shares}: left out"
@@ -288,16 +293,48 @@ class Drive(Reconstruction):
         if len(kept) < 2:
             self._end("safety stop", "tracking is lost: " + stop.event)
             return
-        self._segment_of(stop, kept, rows, up)
+        self._segment_of(stop, kept, rows, said)
 
-    def _segment_of(self, stop: Stop, frames: list[int], rows: dict[int, int], up: list[list[float]]) -> None:
+    def _segment_of(self, stop: Stop, frames: list[int], rows: dict[int, int], said: Ref) -> None:
         """Track and resect the images of the leg, then judge it."""
         resection = self._resection(stop, frames, f"{stop.frame}")
-        args = {"rows": [rows[f] for f in frames], **self.mounting}
-        args["vehicle"] = self.config.vehicle.model_dump(mode="json", include={"max_slope_deg", "wheel_base"})
+        vehicle = self.config.vehicle.model_dump(mode="json")
+        args = {"rows": [rows[f] for f in frames], "vehicle": vehicle, **self.mounting}
         assert stop.sense is not None
         stop.safety = self._node("safety", f"safety/{stop.index}", args, sense=stop.sense, resect=resection)
-        self.graph.expand([stop.safety], lambda safety: self._after(stop, frames, rows, up, resection, safety))
+        judges = [stop.safety]
+        if self.config.reflex.enabled:
+            stop.reflex = self._reflex(stop, frames, rows, said, resection)
+            judges.append(stop.reflex)
+        self.graph.expand(judges, lambda *found: self._after(stop, frames, rows, said, resection, *found))
+
+    def _reflex(self, stop: Stop, frames: list[int], rows: dict[int, int], said: Ref, resection: Handle) -> Handle:
+        """Whether the images on the way show what the last model does not."""
+        p, vehicle = self.config.reflex, self.config.vehicle
+        wheels = np.array([said.meta["odometry"][rows[f]] for f in frames])
+        compared = pairs(wheels, vehicle.wheel_diameter, p)
+        params = self.config.motion.model_copy(update={"level": p.level})
+        motions = [
+            self.graph.node(
+                STAGE_MODULES["motion"],
+                f"motion/way/{frames[i]}-{frames[j]}",
+                params,
+                {"frames": [frames[i], frames[j]]},
+                {},
+                {"a": self.left[frames[i]], "b": self.left[frames[j]]},
+            )
+            for i, j in compared
+        ]
+        args = {"pairs": [list(c) for c in compared], "vehicle": vehicle.model_dump(mode="json"), **self.mounting}
+        return self._node(
+            "reflex",
+            f"reflex/{stop.index}",
+            args,
+            dem=self.products.local_dem[stop.frame],
+            resect=resection,
+            rig=self.calibration[stop.frame],
+            motions=motions,
+        )
 
     def _resection(self, stop: Stop, frames: list[int], which: str) -> Handle:
         p, key = self.products, stop.frame
@@ -306,7 +343,7 @@ class Drive(Reconstruction):
             f"track/{which}",
             {"frames": frames},
             frames=[self.left[f] for f in frames],
-            motions=[self._moved(a, b) for a, b in zip(frames, frames[1:], strict=False)],
+            motions=[self._moved(a, b) for a, b in itertools.pairwise(frames)],
         )
         p.tracks.append(track)
         surface = {"dem": p.local_dem[key]} if self.config.resect.landmarks == "dem" else {}
@@ -326,15 +363,19 @@ class Drive(Reconstruction):
         stop: Stop,
         frames: list[int],
         rows: dict[int, int],
-        up: list[list[float]],
+        said: Ref,
         resection: Handle,
         safety: Ref,
+        reflex: Ref | None = None,
     ) -> None:
-        """The leg is over: at its end, or where a safety stop ended it."""
-        cut = safety.meta["stop"]
-        self.troubles = 0 if cut is None else self.troubles + 1
+        """The leg is over: at its end, or where a safety stop or an obstacle ended it."""
+        cut, kind, reason = safety.meta["stop"], safety.meta["kind"], safety.meta["reason"]
+        seen = None if reflex is None else reflex.meta["stop"]
+        if reflex is not None and seen is not None and (cut is None or seen < cut):
+            cut, kind, reason = seen, "reflex", reflex.meta["reason"]
+        self.troubles = 0 if cut is None or kind == "reflex" else self.troubles + 1
         if cut is not None:
-            stop.event = f"safety stop at image {frames[cut]}: {safety.meta['reason']}"
+            stop.event = f"{'reflex' if kind == 'reflex' else 'safety stop'} at image {frames[cut]}: {reason}"
             if cut < len(frames) - 1:
                 frames = frames[: cut + 1]
                 self.products.tracks.pop()
@@ -343,13 +384,13 @@ class Drive(Reconstruction):
         self.rows |= {f: rows[f] for f in frames[1:]}
         self.products.resections.append(resection)
         self.posed += frames[1:]
-        terminal = cut is not None and safety.meta["kind"] in ("attitude", "acceleration", "lost")
+        terminal = kind in ("attitude", "acceleration", "lost")
         if terminal or self.troubles >= self.config.drive.max_safety_stops:
             often = f", {self.troubles} legs in a row" if self.troubles > 1 else ""
-            self._end("safety stop", safety.meta["reason"] + often)
+            self._end("safety stop", reason + often)
             return
         assert stop.drive is not None
-        self._stop(frames[-1], stop.drive, rows[frames[-1]], up[rows[frames[-1]]])
+        self._stop(frames[-1], stop.drive, rows[frames[-1]], said.meta["up"][rows[frames[-1]]])
 
     # -- the end ------------------------------------------------------------------------------------------------
 
@@ -381,11 +422,16 @@ class Drive(Reconstruction):
         """The drive against the truth."""
         d, p = self.driven, self.products
         legs = [s for s in d.stops if s.drive is not None and s.frames]
-        assert d.place is not None and d.truth_leg is not None and p.trajectory is not None
+        assert d.place is not None
+        assert d.truth_leg is not None
+        assert p.trajectory is not None
         d.check = self._node(
             "drive_check",
             "drive_check",
-            {"rows": [0, *(self.rows[s.frames[-1]] for s in legs)], "vehicle": self.config.vehicle.model_dump(mode="json")},
+            {
+                "rows": [0, *(self.rows[s.frames[-1]] for s in legs)],
+                "vehicle": self.config.vehicle.model_dump(mode="json"),
+            },
             drives=[d.place, *(s.drive for s in legs if s.drive is not None)],
             trajectory=p.trajectory,
             truth=self.truth,

@@ -29,7 +29,9 @@ def placements(parts: Sequence[Mapping[str, Floats]], vehicle: Mapping[str, Any]
         "placements": metric(len(tilt), "placements", "of the vehicle along its true way that were judged"),
         "clearance_violations": metric(int((clearance < 0).sum()), "placements", f"belly strikes the ground, {truly}"),
         "tilt_violations": metric(int((tilt > steepest).sum()), "placements", f"tilt beyond max_slope_deg, {truly}"),
-        "step_violations": metric(int((step > edge).sum()), "placements", f"a wheel on an edge above max_step, {truly}"),
+        "step_violations": metric(
+            int((step > edge).sum()), "placements", f"a wheel on an edge above max_step, {truly}"
+        ),
         "least_clearance": metric(float(clearance.min()), "m", f"under the belly, {truly}"),
         "greatest_tilt": metric(float(np.degrees(tilt.max())), "deg", truly),
         "greatest_step": metric(float(step.max()), "m", f"under a wheel, {truly}"),

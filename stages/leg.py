@@ -52,7 +52,7 @@ class LegParams(Params):
 
 @dataclass(frozen=True)
 class Leg:
-    """``verdict``: drive, look, closed, goal or no path; ``path`` (vertex, 2) m to drive; ``turn`` rad on the spot after.
+    """``verdict``: drive, look, closed, goal or no path; ``path`` (vertex, 2) m to drive; ``turn`` rad then.
 
     ``closed``: looking around did not help; ``where`` the way is not known to be free.
 
@@ -245,9 +245,7 @@ def _points(lattice: Lattice, cells: NDArray[np.int64], start: Point) -> Floats:
     return np.asarray(points)
 
 
-def _safe_part(
-    cells: NDArray[np.int64], way: Floats, known: Mask, lattice: Lattice, length: float
-) -> Floats:
+def _safe_part(cells: NDArray[np.int64], way: Floats, known: Mask, lattice: Lattice, length: float) -> Floats:
     """The way up to where it is not known to be free, or ``length`` is reached, as straight pieces over free cells."""
     free = known[cells[:, 0], cells[:, 1]]
     stop = int(np.argmin(free)) if not free.all() else len(free)
@@ -295,7 +293,9 @@ def _run(params: LegParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     heading = math.atan2(-T.rotation[0, 1], T.rotation[1, 1])
     goal = (float(args["goal"][0]), float(args["goal"][1]))
     closed = [(float(x), float(y)) for x, y in args["closed"]]
-    found = plan_leg(np.asarray(risk["risk"]), lattice, vehicle, start, heading, goal, params, int(args["looks"]), closed)
+    found = plan_leg(
+        np.asarray(risk["risk"]), lattice, vehicle, start, heading, goal, params, int(args["looks"]), closed
+    )
     best = None
     if args.get("whole"):
         tolerance = 0.5 * params.tolerance * vehicle.wheel_base
@@ -322,7 +322,14 @@ STAGE = Stage(
     params=LegParams,
     inputs=("risk", "pose"),
     outputs=(
-        Array("path", ("vertex", "xy"), "float64", "m", "vertices of the leg, from where the vehicle stands", frame="world"),
+        Array(
+            "path",
+            ("vertex", "xy"),
+            "float64",
+            "m",
+            "vertices of the leg, from where the vehicle stands",
+            frame="world",
+        ),
         Array("way", ("way_vertex", "xy"), "float64", "m", "vertices of the way to the goal as planned", frame="world"),
         Array("cost_to_go", ("row", "col"), "float32", "m", "price of the way from each cell to the goal", "nan"),
     ),

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from stages.declare import Array, Bundle, Inputs, Params, Stage
+from stages.declare import Bundle, Inputs, Params, Stage
 from stages.geometry import RigidTransform
 
 Floats = NDArray[np.float64]
@@ -30,7 +30,9 @@ class SafetyParams(Params):
     """Thresholds of the safety stops."""
 
     max_tilt: float = Field(
-        1.0, gt=0, description="times the vehicle's max_slope_deg; the body averages over the wheels, so it is steep then"
+        1.0,
+        gt=0,
+        description="times the vehicle's max_slope_deg; the body averages over the wheels, so it is steep then",
     )
     max_acceleration: float = Field(
         3.0, gt=0, description="m/s2; vertical peaks of driving over permitted steps stay below half of it"

@@ -1,4 +1,4 @@
-"""The simulated experiment as a closed loop: a rover on the bed that is driven by what the chain makes of its images."""
+"""The simulated experiment as a closed loop: a rover that is driven by what the chain makes of its images."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ LOOP: Mapping[str, Any] = {
 """``mockup-loop``: small images of wide-angle cameras, which see the ground from 0.08 m before them to the horizon."""
 
 DEFAULTS: Mapping[str, Any] = {
-    "hfvm.preset": "fast",
+    "hfvm.preset": "default",
     "locus.cell_size": 0.004,
     "crosscheck.enabled": False,
     "drive.goal": (0.0, 1.0),

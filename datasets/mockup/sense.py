@@ -28,7 +28,8 @@ def _run(params: RoverParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle
     acceleration = [float(peak[a + 1 : b + 1].max(initial=0.0)) for a, b in zip([0, *at[:-1]], at, strict=True)]
     noise = params.acceleration_sigma * rng.standard_normal(len(at))
     arrays = {"odometry": odometry, "up": up, "acceleration": np.abs(np.array(acceleration) + noise)}
-    return Bundle(arrays, {"leg": args["leg"], "up": [[float(v) for v in u] for u in up]})
+    facts = {"up": up.tolist(), "odometry": odometry.tolist()}
+    return Bundle(arrays, {"leg": args["leg"], **facts})
 
 
 def _peaks(z: np.ndarray, wheels: np.ndarray, speed: float) -> np.ndarray:
