@@ -53,6 +53,7 @@ STAGE_MODULES: dict[str, str] = {
     "leg": "stages.leg",
     "safety": "stages.safety",
     "reflex": "stages.reflex",
+    "global_fix": "stages.global_fix",
     "drive_check": "stages.drive_check",
 }
 """Every stage of the chain by name; a section of the configuration where the stage has parameters."""

@@ -12,7 +12,7 @@ from pipeline.config import STAGE_MODULES, stage
 
 UNITS = {"1", "px", "m", "rad", "grey", "m^2, m rad, rad^2"}
 DATASET_STAGES = ("files", "files16", "mockup.scene", "mockup.render", "mockup.truth", "mockup.truth_dem")
-DRIVE_STAGES = ("mockup.rover", "mockup.sense", "mockup.site", "mockup.obstacle")
+DRIVE_STAGES = ("mockup.rover", "mockup.sense", "mockup.site", "mockup.obstacle", "mockup.overview")
 TILE_STAGES = ("hfvm_tile", "hfvm_join")
 DECLARED = (
     {name: stage(name) for name in STAGE_MODULES}

@@ -78,6 +78,9 @@ def mockup_loop(p: MockupParams, rover: RoverParams, name: str = "mockup-loop") 
         truth_dem=dem,
         T_vehicle_left=T_vehicle_left,
         pad=rover.pad,
+        overview=None
+        if rover.map_cell is None
+        else Source("datasets.mockup.overview", rover, {"cell": rover.map_cell}),
     )
 
     def nothing(frame: int, camera: str) -> Source:

@@ -54,6 +54,10 @@ class RoverParams(Params):
     pad: float = Field(
         0.28, ge=0, description="m; radius about the start that is level and free of rocks, known to the rover"
     )
+    map_cell: float | None = Field(
+        None, gt=0.004, description="m; cell of a coarse map of the whole bed that the rover is given; none by default"
+    )
+    map_sigma: float = Field(0.002, ge=0, description="m; error of its elevations")
     blank: tuple[float, float, float] | None = Field(
         None, description="m; x, y, radius of a patch of the bed without any texture; none by default"
     )
