@@ -25,8 +25,9 @@ killed goes on where it was, and one that is repeated computes nothing.
 from __future__ import annotations
 
 import itertools
+import math
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -48,6 +49,16 @@ class DriveParams(Params):
 
     goal: tuple[float, float] | None = Field(
         None, description="m; x, y of the goal in the world frame, which begins at the first left camera"
+    )
+    frame: Literal["world", "map"] = Field(
+        "world", description="what the goal is given in: the world frame, or the global map's, where there is one"
+    )
+    prior: tuple[float, float, float] | None = Field(
+        None, description="m, m, degrees to the left; where the first left camera roughly is in the global map"
+    )
+    prior_sigma: tuple[float, float] = Field((0.1, 5.0), description="m, degrees; standard deviations of the prior")
+    pose: tuple[float, float, float, float] | None = Field(
+        None, description="m, m, m, degrees; its pose in the global map, handed in instead of found"
     )
     around: float = Field(0.6, gt=0, description="m; the map reaches this far around start and goal")
     max_stops: int = Field(40, ge=1, description="stops after which the drive is given up")
@@ -83,6 +94,7 @@ class Driven:
     verdict: str = ""
     reason: str = ""
     place: Handle | None = None
+    fix: Handle | None = None
     truth_leg: Handle | None = None
     check: Handle | None = None
 
@@ -103,6 +115,8 @@ class Drive(Reconstruction):
         self.motion: dict[tuple[int, int], Handle] = {}  # type: ignore[assignment]
         self.posed: list[int] = [0]
         """Frames of the trajectory so far."""
+        self.goal: tuple[float, float] = config.drive.goal
+        """In the world frame."""
         self.true: dict[int, tuple[float, ...]] = {}
         """True pose of each frame that was taken; read by the renderer and by what assesses, never by an estimate."""
         self.looks = self.troubles = 0
@@ -154,9 +168,41 @@ class Drive(Reconstruction):
             level=p.level[frame],
             reference=p.level[0],
         )
+        if k == 0 and self.config.drive.frame == "map":
+            self.graph.expand([self._fix(frame)], lambda fixed: self._on_the_map(stop, before, row, fixed))
+        else:
+            self._think(stop, before, row)
+
+    def _think(self, stop: Stop, before: Handle, row: int) -> None:
         self._map(stop)
         assert stop.leg is not None
         self.graph.expand([stop.leg], lambda leg: self._after_leg(stop, before, row, leg))
+
+    def _fix(self, frame: int) -> Handle:
+        """Where the first pair is in the global map: handed in, or found by its elevation model."""
+        d, inputs = self.config.drive, dict[str, Handle]()
+        args: dict[str, Any] = {}
+        if d.pose is not None:
+            args["pose"] = [*d.pose[:3], math.radians(d.pose[3])]
+        elif d.prior is None or self.simulation.overview is None:
+            raise ConfigError(
+                "drive.frame=map needs drive.pose, or drive.prior and a global map",
+                remedy="set drive.pose=[x, y, z, degrees], or drive.prior and rover.map_cell",
+            )
+        else:
+            overview = self._simulate(self.simulation.overview, "overview", scene=self.scene)
+            inputs = {"dem": self.products.local_dem[frame], "map": overview}
+            args["prior"] = [*d.prior[:2], math.radians(d.prior[2])]
+            args["prior_sigma"] = [d.prior_sigma[0], math.radians(d.prior_sigma[1])]
+        self.driven.fix = self._node("global_fix", "global_fix", args, **inputs)
+        return self.driven.fix
+
+    def _on_the_map(self, stop: Stop, before: Handle, row: int, fixed: Ref) -> None:
+        """The goal in the world frame, which is the local frame of the first pair."""
+        T_world_map = RigidTransform.from_matrix(fixed.meta["T_global_local"]).inverse()
+        x, y, _ = T_world_map.apply([*self.config.drive.goal, fixed.meta["T_global_local"][11]])
+        self.goal = float(x), float(y)
+        self._think(stop, before, row)
 
     def _calibrate(self, frame: int) -> None:
         """The rig of the whole drive, from the first pair."""
@@ -210,7 +256,7 @@ class Drive(Reconstruction):
 
     def _leg(self, label: str, risk: Handle, pose: Handle, **more: Any) -> Handle:
         args = {
-            "goal": list(self.config.drive.goal),
+            "goal": list(self.goal),
             "looks": self.looks,
             "closed": self.closed,
             **self.mounting,
@@ -221,7 +267,7 @@ class Drive(Reconstruction):
     def arena(self) -> Lattice:
         """The part of the world that is mapped: around the start, which is at the origin, and the goal."""
         d = self.config.drive
-        bounds = [f(0.0, g) + s * d.around for g in d.goal for f, s in ((min, -1.0), (max, 1.0))]
+        bounds = [f(0.0, g) + s * d.around for g in self.goal for f, s in ((min, -1.0), (max, 1.0))]
         return Lattice.snap(bounds, self.config.locus.cell_size)
 
     def _after_leg(self, stop: Stop, before: Handle, row: int, leg: Ref) -> None:
