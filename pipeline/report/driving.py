@@ -75,7 +75,7 @@ def strip(scene: Scene) -> Block | None:
             (meta["start"][0], meta["start"][1]),
             estimate[:upto],
             None if truth is None else truth[:upto],
-            stop.event != "",
+            stop.event != "" and meta["verdict"] != "goal",
         )
         alt = f"Stop {stop.index} at frame {stop.frame}, {metres(meta['left_m'])} from the goal: {meta['verdict']}"
         panels.append(column(shown, alt))
@@ -164,7 +164,7 @@ def column(s: Shown, alt: str) -> Panel:
         axes[1].plot(s.path[:, 0], s.path[:, 1], color=canvas.MARK, linewidth=2)
     low, high = canvas.ground_limits(s.elevation)
     _map(axes[2], s.elevation, whole, whole, cmap=canvas.color_map("gray", "white"), vmin=low, vmax=high)
-    for track, shade, width in ((s.truth, canvas.REFERENCE, 3.0), (s.estimate, canvas.ESTIMATE, 1.3)):
+    for track, shade, width in ((s.truth, canvas.REFERENCE, 4.0), (s.estimate, canvas.ESTIMATE, 1.6)):
         if track is not None:
             axes[2].plot(track[:, 0], track[:, 1], color=shade, linewidth=width)
     for ax in axes[1:]:

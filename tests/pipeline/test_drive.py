@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 
 from datasets.registry import open_sequence
-from pipeline import config, driver
+from pipeline import config, driver, run
 from pipeline.dag import Graph, Handle
 from pipeline.drive import Drive
 from pipeline.driver import Result
@@ -77,6 +78,23 @@ def test_driven_again_nothing_is_computed_and_all_is_the_same(arrived: tuple[Dri
     assert {h.label: h.ref.digest for h in flow.graph.nodes if h.ref} == {
         h.label: h.ref.digest for h in arrived[0].graph.nodes if h.ref
     }
+
+
+def test_the_report_shows_the_drive(
+    arrived: tuple[Drive, Result], store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given: dict[str, Any] = {"runs": tmp_path, "cache": store, "executor": "inline", "progress": "quiet"}
+    assert run.reconstruct(run.Options("mockup-loop", assignments=SMALL, verb="drive", **given)) == 0
+    assert capsys.readouterr().out.startswith("goal: ")
+    folder = tmp_path / "mockup-loop" / "latest"
+    facts = json.loads((folder / "report.json").read_text())
+    assert facts["complete"], facts["missing"]
+    assert facts["metrics"]["drive_step_violations"]["value"] == 0
+    page = (folder / "report.html").read_text()
+    assert "The drive, stop by stop" in page
+    assert page.count('alt="Stop ') == len(arrived[0].driven.stops)
+    with pytest.raises(ConfigError, match="cannot be driven"):
+        run.reconstruct(run.Options("mockup-short", verb="drive", **given))
 
 
 def numbers(value: Any) -> Iterator[float]:

@@ -49,11 +49,11 @@ def test_the_leg_ends_before_the_wheels_stand_on_unknown_ground() -> None:
 
 
 def test_a_wall_with_a_gap_is_gone_round_and_a_closed_one_is_no_path() -> None:
-    wall = (np.abs(Y - 0.4) < 0.02) & (X < 0.2)
+    wall = (np.abs(Y - 0.4) < 0.02) & (X < 0.1)
     leg = plan_leg(ground((wall, HAZARDOUS)), LATTICE, ROVER, START, 0.0, GOAL, P)
     assert leg.verdict == "drive"
     beside = leg.way[np.abs(leg.way[:, 1] - 0.4) < 0.02]
-    assert beside[:, 0].min() >= 0.2 + half_width(ROVER) + ROVER.margin - 0.011
+    assert beside[:, 0].min() >= 0.1 + half_width(ROVER) + ROVER.margin - 0.011
     closed = plan_leg(ground((np.abs(Y - 0.4) < 0.02, HAZARDOUS)), LATTICE, ROVER, START, 0.0, GOAL, P)
     assert closed.verdict == "no path"
     match = re.search(r"ends (\d+) mm away", closed.reason)
