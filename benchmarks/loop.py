@@ -204,7 +204,7 @@ def main() -> None:
 
         for k in range(given.first, given.reflex):
             rng = np.random.default_rng([1999, k])
-            ahead, aside = 0.24 + 0.08 * rng.random(), 0.05 * (2 * rng.random() - 1)
+            ahead, aside = 0.24 + 0.10 * rng.random(), 0.05 * (2 * rng.random() - 1)
             more = [f"mockup.seed={100 + k}", f"rover.seed={100 + k}", "mockup.rock_cover=0.03", "rover.obstacle_leg=0"]
             more += [f"rover.obstacle_ahead={ahead:.4f}", f"rover.obstacle_aside={aside:.4f}", "leg.length=3.0"]
             work.append((f"reflex-{k}", {"trial": k}, [*more, "rover.pad=0.2", "drive.max_stops=2"]))

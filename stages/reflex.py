@@ -9,7 +9,7 @@ point goes; what the image shows instead is put down to another depth along the 
 
 with t the share of the distance to the camera, and so to a point in space. It counts as raised where it lies higher
 than all of the model within reach of its errors, by more than half a wheel's radius and by more than its noise. Enough
-raised points together, in two images in a row, are an obstacle: the vehicle stops and looks.
+raised points together are an obstacle: the vehicle stops and looks.
 """
 
 from __future__ import annotations
@@ -47,11 +47,11 @@ class ReflexParams(Params):
     aside: float = Field(0.5, ge=0, description="wheel diameters to either side of the wheels that are watched")
     height: float = Field(0.25, gt=0, description="wheel diameters; rise over the model that counts: half a radius")
     sigma: float = Field(0.5, gt=0, description="pixels of the displacements' level; their error")
-    sigmas: float = Field(3.0, gt=0, description="standard deviations of the rise that it must exceed as well")
+    sigmas: float = Field(2.0, gt=0, description="standard deviations of the rise that it must exceed as well")
     blur: float = Field(0.5, ge=0, description="wheel diameters; the model's greatest height within this is compared")
     points: int = Field(6, ge=1, description="raised points within one wheel diameter that make an obstacle")
-    share: float = Field(0.35, ge=0, le=1, description="and their share of all points there")
-    images: int = Field(2, ge=1, description="images in a row in which it must show: mismatches do not persist")
+    share: float = Field(0.25, ge=0, le=1, description="and their share of all points there")
+    images: int = Field(1, ge=1, description="images in a row in which it must show; more are surer and later")
 
 
 @dataclass(frozen=True)
