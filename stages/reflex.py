@@ -112,9 +112,8 @@ def look(
     wide = 0.5 * vehicle.track + p.aside * wheel
     near = (np.abs(ahead[:, 0]) <= wide) & (ahead[:, 1] > 0.5 * vehicle.wheel_base) & (ahead[:, 1] <= p.reach * wheel)
     cells = surface.points[near]
-    T_before, T_now = view.before.inverse(), view.now.inverse()
-    first = camera.project(T_before.apply(cells))
-    pixel, cells, first = _seen(view, cells, first, camera, T_before)
+    T_now = view.now.inverse()
+    pixel, cells, first = _seen(view, cells, camera)
     found = np.stack([view.column[pixel[:, 1], pixel[:, 0]], view.row[pixel[:, 1], pixel[:, 0]]], axis=1)
     target = first + found.astype(np.float64)
     to_camera = view.before.translation - cells
@@ -136,21 +135,26 @@ def look(
     return Points(place[along], rise[along], raised[along])
 
 
-def _seen(
-    view: View, cells: Floats, first: Floats, camera: Camera, T_before: RigidTransform
-) -> tuple[NDArray[np.intp], Floats, Floats]:
-    """Of the cells that one grid pixel shows, the nearest; with a displacement that was measured."""
+def _seen(view: View, cells: Floats, camera: Camera) -> tuple[NDArray[np.intp], Floats, Floats]:
+    """Grid pixels (n, 2) that show a cell and have a displacement, the ground they show (n, 3), their centres (n, 2).
+
+    Of the cells that one pixel shows, the nearest one; its ground is where the pixel's ray meets the cell's height.
+    """
     rows, cols = view.matched.shape
-    scale = 0.5**view.level
-    at = np.rint((np.nan_to_num(first, nan=-1e6) + 0.5) * scale - 0.5).astype(np.intp)
+    scale = 2.0**view.level
+    in_camera = view.before.inverse().apply(cells)
+    at = np.rint((np.nan_to_num(camera.project(in_camera), nan=-1e6) + 0.5) / scale - 0.5).astype(np.intp)
     ok = ((at >= 0) & (at < [cols, rows])).all(axis=1)
     ok[ok] &= view.matched[at[ok, 1], at[ok, 0]]
-    at, cells, first = at[ok], cells[ok], first[ok]
-    depth = T_before.apply(cells)[:, 2]
+    at, cells, depth = at[ok], cells[ok], in_camera[ok, 2]
     order = np.lexsort((depth, at[:, 0], at[:, 1]))
     flat = (at[:, 1] * cols + at[:, 0])[order]
     keep = order[np.concatenate([[True], np.diff(flat) != 0])] if len(order) else order
-    return at[keep], cells[keep], first[keep]
+    centre = (at[keep] + 0.5) * scale - 0.5
+    rays = camera.rays(centre) @ view.before.rotation.T
+    origin = view.before.translation
+    ground = origin + ((cells[keep, 2] - origin[2]) / rays[:, 2])[:, None] * rays
+    return at[keep], ground, centre
 
 
 def cluster(points: Points, wheel: float, p: ReflexParams) -> tuple[int, float, float] | None:
