@@ -24,7 +24,7 @@ from pipeline.cli import cache_folder
 from pipeline.store import Store
 from pipeline.task import Ref, Spec, ensure
 
-RISK = np.array([[0.36, 0.72, 0.60], [0.80, 0.28, 0.10], [1.0, 1.0, 1.0]])
+RISK = np.array([[0.36, 0.72, 0.60], [0.90, 0.80, 0.45], [0.80, 0.28, 0.10], [1.0, 1.0, 1.0]])
 
 
 def artifact(source: Source) -> Ref:
@@ -58,7 +58,7 @@ def main() -> None:
     cell = (extent[1] - extent[0]) / z.shape[1]
     filled = np.where(np.isnan(z), np.nanmedian(z), z)
     shade = LightSource(315, 45).hillshade(filled, vert_exag=1.5, dx=cell, dy=cell)
-    colour = RISK[risk] * np.where(risk == 2, 1.0, 0.35 + 0.65 * shade)[..., None]
+    colour = RISK[risk.astype(int)] * np.where(risk == 3, 1.0, 0.35 + 0.65 * shade)[..., None]
     features = json.loads((run / "path.geojson").read_text(encoding="utf-8"))["features"]
     line = next(f["geometry"]["coordinates"] for f in features if f["geometry"]["type"] == "LineString")
 

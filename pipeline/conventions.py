@@ -76,7 +76,7 @@ FILES: dict[str, dict[str, str]] = {
         "values": "all merged arrays as one zarr 3 group, by the CF conventions; units with each",
         "opens_with": "xarray.open_zarr",
     },
-    "risk.tif": {**_RASTER, "values": "class 0 safe, 1 hazardous, 2 unknown; reason bits; filled 0 or 1"},
+    "risk.tif": {**_RASTER, "values": "class 0 safe, 1 caution, 2 hazard, 3 unknown; reason bits; p_hazard; measures"},
     "path.gpkg": {"frame": "world", "crs": "engineering CRS, metres", "coordinates": "x y z, m"},
     "path.geojson": {"frame": "world", "crs": "none: local metres, not WGS 84", "coordinates": "x y z, m"},
 }

@@ -22,6 +22,7 @@ from stages import merge
 from stages.declare import Array, Bundle
 from stages.lattice import Lattice, mosaic, union
 from stages.risk import REASONS
+from stages.risk import STAGE as RISK
 from stages.shading import hillshade, slope_deg
 
 SLOPE = Array("slope", ("row", "col"), "float32", "degree", "inclination of the terrain", "nan", "world")
@@ -58,12 +59,7 @@ def write(folder: Path, view: RunView) -> None:
         _write_terrain(folder, view, [t for t in tiles if t is not None])
     risk = find(p.risk)
     if risk is not None:
-        bands = {"class": risk["risk"], "reason": risk["reason"], "filled": risk["filled"]}
-        reasons = ", ".join(f"{bit} {name}" for name, bit in REASONS.items())
-        tags = {"classes": "0 safe, 1 hazardous, 2 unknown (never safe)", "reason_bits": reasons}
-        lattice = Lattice.from_dict(risk.meta["lattice"])
-        files.write_raster(folder / "risk.tif", bands, lattice, unit="", nodata=None, tags=tags, place=place)
-        files.write_style(folder / "risk.qml", "risk")
+        _write_risk(folder, risk, place)
     path = find(p.path)
     if path is not None:
         facts = {k: v for k, v in path.meta.items() if not isinstance(v, dict)}
@@ -71,6 +67,25 @@ def write(folder: Path, view: RunView) -> None:
         files.write_path_gpkg(folder / "path.gpkg", np.asarray(path["path"]), facts, place)
     _write_trajectories(folder, view)
     write_report(folder, view)
+
+
+def _write_risk(folder: Path, risk: Bundle, place: Any) -> None:
+    """Class, measures in metres and degrees, probability and reasons in one file, so all of one type (float32)."""
+    units = {a.name: a.unit for a in RISK.outputs if a.unit in ("m", "rad") and a.name != "elevation"}
+    bands = {"class": risk["risk"], "reason": risk["reason"], "p_hazard": risk["p_hazard"], "filled": risk["filled"]}
+    bands |= {name: np.degrees(risk[name]) if unit == "rad" else risk[name] for name, unit in units.items()}
+    unit = {name: {"rad": "degree"}.get(units.get(name, ""), units.get(name, "")) for name in bands}
+    tags = {
+        "classes": "0 safe, 1 caution, 2 hazard, 3 unknown (never entered)",
+        "reason_bits": ", ".join(f"{bit} {name}" for name, bit in REASONS.items()),
+        "vehicle": json.dumps(risk.meta.get("vehicle", {})),
+    }
+    given = {name: np.asarray(values, dtype=np.float32) for name, values in bands.items()}
+    files.write_raster(
+        folder / "risk.tif", given, Lattice.from_dict(risk.meta["lattice"]), unit=unit, nodata=float("nan"),
+        tags=tags, place=place, overviews="nearest",
+    )  # fmt: skip
+    files.write_style(folder / "risk.qml", "risk")
 
 
 def _write_trajectories(folder: Path, view: RunView) -> None:

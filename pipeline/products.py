@@ -68,10 +68,11 @@ def write_raster(
     bands: Mapping[str, NDArray[Any]],
     lattice: Lattice,
     *,
-    unit: str,
+    unit: str | Mapping[str, str],
     nodata: float | None,
     tags: Mapping[str, str] | None = None,
     place: Georeference | None = None,
+    overviews: str | None = None,
 ) -> None:
     """Write a cloud-optimised GeoTIFF in the engineering CRS, or in that of ``place``.
 
@@ -79,12 +80,13 @@ def write_raster(
     ----------
     path : file to write or replace.
     bands : arrays (row, col) of one dtype on ``lattice``, by the band's name.
-    unit : unit of the values; ``"m"`` is written as GDAL's ``metre``.
+    unit : unit of the values, or of each band by name; ``"m"`` is written as GDAL's ``metre``.
     nodata : value of unknown cells (NaN for floats). None where every value means something; the overviews then take
         the most frequent value, since classes have no mean.
     tags : more metadata; the frame, the unit and the cell size are always there.
     place : of the world frame. The raster is not resampled: its geotransform is turned by the azimuth. Elevations have
         to be heights in its system already.
+    overviews : how they are resampled; None: the mean, or without ``nodata`` the most frequent value.
 
     Raises
     ------
@@ -110,14 +112,20 @@ def write_raster(
         "num_threads": "all_cpus",
         "predictor": "yes",
         "blocksize": 256,
-        "overview_resampling": "mode" if nodata is None else "average",
+        "overview_resampling": overviews or ("mode" if nodata is None else "average"),
     }
-    facts = {"FRAME": FRAME, "AXES": _axes(place), "UNIT": unit, "CELL_SIZE_M": f"{lattice.cell:.12g}"}
+    units = [unit if isinstance(unit, str) else unit[name] for name in bands]
+    facts = {
+        "FRAME": FRAME,
+        "AXES": _axes(place),
+        "UNIT": ", ".join(dict.fromkeys(units)),
+        "CELL_SIZE_M": f"{lattice.cell:.12g}",
+    }
     with replacing(path) as temporary, rasterio.open(temporary, "w", **profile) as file:
         for number, (name, values) in enumerate(bands.items(), start=1):
             file.write(np.asarray(values), number)
             file.set_band_description(number, name)
-        file.units = ("metre" if unit == "m" else unit,) * len(bands)
+        file.units = tuple("metre" if u == "m" else u for u in units)
         file.update_tags(**facts, **{key.upper(): value for key, value in dict(tags or {}).items()})
 
 

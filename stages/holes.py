@@ -37,7 +37,8 @@ def close_holes(
 
     Returns
     -------
-    Closed elevation, its standard deviation (not below the largest of the rim's), and flags (uint8, 1 = closed here).
+    Closed elevation, its standard deviation (not below the largest of the rim's; unless ``judged``, not below half the
+    rim's range either), and flags (uint8, 1 = closed here).
     """
     known = ~np.isnan(elevation)
     candidate = ~known & (window_sum(known, n) >= min_known * n * n)
@@ -94,7 +95,7 @@ def _close(z_in, s_in, cells, max_gap, window, z, s, filled):  # type: ignore[no
             used += 1
         if weight > 0.0:
             z[r, c] = total / weight
-            s[r, c] = worst
+            s[r, c] = max(worst, 0.5 * (high - low))
             filled[r, c] = 1
             if window > 0:
                 missed = _missed(z_in, r, c, window, lines, weights, used, weight)

@@ -1,13 +1,19 @@
-"""Local path on a risk map: the row-monotone graph, solved in one sweep (section 4.7).
+"""Local path on a risk map (section 4.7), for a vehicle with a width.
 
-Nodes are the free cells: safe, and farther than the vehicle's margin from every hazard. Each node of a row has edges to
-three nodes of the next row (same column and its neighbours). The weight of an edge is the absolute height difference
-between the places where a wheel would stand: means over the wheel's window, rounded to a step that means nothing to the
-vehicle. Rounded heights are integers, so sums are exact and ties are ties: among equals the path with fewest sideways
-moves wins, then the one whose last move is straight, else to the left, else to the right.
+Two planners. ``rows`` is the paper's: a path that runs monotonically through the rows across the driving direction,
+with all targets of the far row from one sweep (:mod:`stages.row_graph`). ``grid8`` goes in any direction and reaches
+what lies beside or behind an obstacle (:mod:`stages.grid8`). ``auto`` takes the first, and the second where the first
+reaches no target that was asked for.
 
-Since all edges lead from row to row, Dijkstra's algorithm is one sweep over the rows, O(N) in the number of cells, and
-yields all targets of the far row at once (Figure 3).
+The weight of an edge is the absolute height difference between the places where a wheel would stand: means over the
+wheel's window, rounded to a step that means nothing to the vehicle. ``grid8`` adds the length, since without rows to
+cross a path of no climb could be of any length. Caution ground costs a toll.
+
+Footprint. The middle of the vehicle never enters a hazardous or unknown cell; and in the direction of each edge its
+wheels keep the margin from ground that is hazardous to a wheel, and its middle keeps it from places where the vehicle
+as a whole would tilt or strike (:mod:`stages.swept`). Of unknown ground three shares are tried: none under its
+outline, else none under its wheels, else none under its middle. The last happens where the elevation model is
+narrower than the vehicle, as beside the cameras; the result says so (``ground``).
 
 Rows lie across the driving direction: the elevation model's own rows where it is heading-aligned (row 0 farthest), or
 the rows of a grid turned by a heading or by the line from start to target, filled by nearest neighbour.
@@ -16,10 +22,6 @@ An elevation model is fan-shaped and ragged: the first and last rows with a free
 nowhere. So a start that is not given is, of the free cells within one vehicle length of the first row that lead on,
 the one nearest to that row's middle; the target likewise at the last row. A path counts as found when it comes within
 one vehicle length of the last row.
-
-An obstacle hides part of itself, so the rim of unknown ground is less certain than its elevations say: what lies in the
-dark belongs to the same wheel's window. A path that stays half a wheel away from unknown ground is preferred; where
-there is none, unknown ground may be passed closely, but never entered.
 """
 
 from __future__ import annotations
@@ -27,29 +29,48 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
-from scipy.ndimage import distance_transform_edt
+from scipy.ndimage import label
 
+from stages import grid8
 from stages.declare import Array, Bundle, Inputs, Memory, Params, Stage
 from stages.errors import InputError
+from stages.hazards import BITS
 from stages.lattice import Lattice
-from stages.risk import HAZARDOUS, SAFE, UNKNOWN, window_cells
+from stages.risk import CAUTION, HAZARDOUS, UNKNOWN, check_size, window_cells
+from stages.row_graph import UNREACHED, Plan, plan, row_span
 from stages.row_grid import RowGrid
+from stages.swept import standing
 from stages.vehicle import Vehicle
 from stages.windows import window_mean
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
-Mask = NDArray[np.bool_]
+Bytes = NDArray[np.uint8]
 Point = tuple[float, float]
+Maps = Mapping[str, NDArray[Any]]
+Planner = Literal["rows", "grid8", "auto"]
 
-UNREACHED = np.iinfo(np.int64).max // 4
-MOVES = (0, 1, -1)
-"""Column of the predecessor minus the cell's own, in order of preference: came straight, to the left, to the right."""
+GROUNDS = ("outline", "wheels", "middle")
+"""What of the vehicle stays on known ground, as tried in turn."""
+
+WHEEL_BITS = np.uint16(BITS["inclination"] | BITS["range"] | BITS["step"] | BITS["roughness"])
+"""Hazards to a wheel on the cell; the other ones are to the vehicle with its middle there."""
+
+WORDS = {
+    "inclination": ("inclination", "max_slope_deg", "deg"),
+    "step": ("step", "max_step", "m"),
+    "roughness": ("roughness", "max_roughness", "m"),
+    "slope": ("slope of the footprint", "max_slope_deg", "deg"),
+    "tilt": ("tilt", "max_slope_deg", "deg"),
+    "range": ("height range", "clearance", "m"),
+    "rise": ("rise under the belly", "clearance", "m"),
+}
+"""Measure: in words, the vehicle's limit, unit."""
 
 
 class PathParams(Params):
@@ -63,227 +84,231 @@ class PathParams(Params):
         default=None,
         description="m; x, y in the world frame; not set: the free cell nearest to the middle of the last row",
     )
+    planner: Planner = Field(
+        default="auto",
+        description="rows: ahead in every row, as in the paper; grid8: any direction; auto: grid8 where rows do not "
+        "reach a target that is set",
+    )
     height_step: float = Field(
         default=0.02, gt=0, le=1, description="share of max_step; smaller height differences count as none"
+    )
+    caution: float = Field(
+        default=0.2, ge=0, le=10, description="m of climb that a metre of caution ground is worth: a detour of a fifth"
     )
 
 
 @dataclass(frozen=True)
-class Plan:
-    """What the sweep found, in cells of its grid.
+class Route:
+    """A path and how it was found.
 
-    ``cells`` (vertex, 2) row, column from start to target, empty where there is no path; ``cost`` (row, col) int64 of
-    :func:`sweep`; ``reachable`` (col,) of ``target_row``; ``blocking_row`` the first row that cannot be entered and
-    ``reason`` in words, both empty where a path was found. ``beside_unknown``: no path keeps half a wheel from unknown.
+    ``cells`` (vertex, 2) on ``grid`` and ``xyz`` (vertex, 3) metres, z the mean height under a wheel, both empty where
+    there is none; ``plan`` of the row graph, ``planner`` that gave the path, ``ground`` one of :data:`GROUNDS`;
+    ``cost`` (row, col) metres: from the start by rows, to the target by grid8; NaN where not reached.
     """
 
     cells: Ints
-    cost: Ints
-    reachable: Mask
-    target_row: int
-    blocking_row: int | None = None
-    reason: str = ""
-    beside_unknown: bool = False
-
-
-def free_cells(risk: NDArray[np.uint8], cell: float, margin: float, rim: float = 0.0) -> Mask:
-    """Safe cells farther (centre to centre) than ``margin`` metres from hazardous and ``rim`` from unknown ones."""
-    free = risk == SAFE
-    for kind, distance in ((HAZARDOUS, margin), (UNKNOWN, rim)):
-        blocked = risk == kind
-        if distance > 0 and blocked.any():
-            free &= distance_transform_edt(~blocked) * cell > distance
-    return np.asarray(free)
-
-
-def sweep(height: Ints, free: Mask, sources: Mask) -> tuple[Ints, NDArray[np.int8]]:
-    """Least cost from any source to every cell of the row graph, towards row 0.
-
-    Parameters
-    ----------
-    height : (row, col) int64, any unit.
-    free, sources : (row, col) cells that may be entered; cells where a path may start.
-
-    Returns
-    -------
-    Cost (row, col) int64: sum of absolute height differences times the number of rows, plus the sideways moves; and
-    the index into :data:`MOVES` of the last move (-1 at sources and where not reached).
-    """
-    rows, cols = height.shape
-    cost = np.where(sources & free, 0, UNREACHED).astype(np.int64)
-    move = np.full((rows, cols), -1, dtype=np.int8)
-    for r in range(rows - 2, -1, -1):
-        before = np.pad(cost[r + 1], 1, constant_values=UNREACHED)
-        level = np.pad(height[r + 1], 1)
-        candidates = np.stack(
-            [
-                before[1 + m : 1 + m + cols] + np.abs(height[r] - level[1 + m : 1 + m + cols]) * rows + (m != 0)
-                for m in MOVES
-            ]
-        )
-        best = np.argmin(candidates, axis=0)
-        least = candidates[best, np.arange(cols)]
-        enter = free[r] & (least < UNREACHED) & (cost[r] == UNREACHED)
-        cost[r, enter], move[r, enter] = least[enter], best[enter]
-    return cost, move
-
-
-def farthest_row(free: Mask) -> Ints:
-    """Smallest row (row, col) that can be reached from each free cell; the number of rows where not free."""
-    rows = free.shape[0]
-    far = np.full(free.shape, rows, dtype=np.int64)
-    for r in range(rows):
-        ahead = np.full(free.shape[1], r)
-        if r:
-            next_row = np.pad(far[r - 1], 1, constant_values=rows)
-            ahead = np.minimum(ahead, np.minimum(np.minimum(next_row[:-2], next_row[1:-1]), next_row[2:]))
-        far[r] = np.where(free[r], ahead, rows)
-    return far
-
-
-def plan(
-    height: Ints,
-    free: Mask,
-    tolerance: int = 0,
-    start: tuple[int, int] | None = None,
-    target: tuple[int, int] | None = None,
-    span: tuple[int, int] | None = None,
-) -> Plan:
-    """Path from the nearest to the farthest row, or between given cells.
-
-    Parameters
-    ----------
-    height : (row, col) int64 rounded heights. ``free`` : cells that may be entered. Row 0 is farthest.
-    tolerance : rows by which a start or target that is not given may miss the nearest or farthest row with a free cell;
-        at most a quarter of the rows between them.
-    start, target : row and column, inside the grid.
-    span : the farthest and the nearest row that count; None: those with a free cell.
-    """
-    rows, cols = free.shape
-    first_last = span or row_span(free)
-    nothing = Plan(np.empty((0, 2), dtype=np.int64), np.full(free.shape, UNREACHED), np.zeros(cols, dtype=bool), 0)
-    for name, cell in (("start", start), ("target", target)):
-        if cell is not None and not free[cell]:
-            return _blocked(nothing, cell[0], f"the {name} is not a free cell")
-    if first_last is None:
-        return _blocked(nothing, rows - 1, "there is no free cell")
-    farthest, nearest = first_last
-    tolerance = min(tolerance, (nearest - farthest) // 4)
-    limit = farthest + tolerance
-    candidates = np.zeros_like(free)
-    if start is not None:
-        candidates[start] = True
-    else:
-        candidates[max(nearest - tolerance, 0) : nearest + 1] = free[max(nearest - tolerance, 0) : nearest + 1]
-    allowed = free
-    if target is not None:
-        allowed = free.copy()
-        allowed[: target[0] + 1] = False
-        allowed[target], limit = True, target[0]
-        candidates[: target[0] + 1] = False
-        if not candidates.any():
-            return _blocked(nothing, target[0], "the target is not ahead of the start")
-    far = farthest_row(allowed)
-    good = candidates & (far <= limit)
-    if not good.any():
-        cost, _ = sweep(height, allowed, candidates)
-        stop = int(far[candidates].min()) - 1 if candidates.any() else nearest
-        return _blocked(
-            Plan(nothing.cells, cost, nothing.reachable, limit), stop, "no free cell of this row can be entered"
-        )
-    source = np.zeros_like(free)
-    source[_nearest_middle(good, nearest)] = True
-    cost, move = sweep(height, allowed, source)
-    ends = cost < UNREACHED
-    ends[limit + 1 :] = False
-    row, col = _nearest_middle(ends, farthest)
-    return Plan(_trace(move, row, col), cost, cost[row] < UNREACHED, row)
-
-
-def row_span(free: Mask) -> tuple[int, int] | None:
-    """The farthest and the nearest row with a free cell."""
-    occupied = np.flatnonzero(free.any(axis=1))
-    return (int(occupied[0]), int(occupied[-1])) if len(occupied) else None
-
-
-def _blocked(at: Plan, row: int, reason: str) -> Plan:
-    return replace(at, blocking_row=row, reason=reason)
-
-
-def _nearest_middle(cells: Mask, row: int) -> tuple[int, int]:
-    """The set cell with the fewest moves along rows and columns to the middle of a row; the first one among equals."""
-    r, c = np.nonzero(cells)
-    best = int(np.argmin(2 * np.abs(r - row) + np.abs(2 * c - (cells.shape[1] - 1))))
-    return int(r[best]), int(c[best])
-
-
-def _trace(move: NDArray[np.int8], row: int, col: int) -> Ints:
-    """Cells (vertex, 2) from the source to the given cell."""
-    cells = [(row, col)]
-    while move[row, col] >= 0:
-        row, col = row + 1, col + MOVES[move[row, col]]
-        cells.append((row, col))
-    return np.array(cells[::-1], dtype=np.int64)
+    xyz: Floats
+    plan: Plan
+    grid: RowGrid
+    planner: str
+    ground: str
+    cost: NDArray[np.float32]
 
 
 def find_path(
-    risk: NDArray[np.uint8],
-    elevation: NDArray[np.float32],
+    maps: Maps,
     lattice: Lattice,
     vehicle: Vehicle,
     *,
     heading: Point = (0.0, 1.0),
     start: Point | None = None,
     target: Point | None = None,
-    height_step: float = 0.02,
-) -> tuple[Plan, RowGrid, Floats]:
+    params: PathParams | None = None,
+) -> Route:
     """Path over a risk map.
 
     Parameters
     ----------
-    risk : (row, col) uint8 class. ``elevation`` : (row, col) float32 metres, closed, NaN unknown.
+    maps : arrays (row, col) of stage ``risk``: ``risk``, ``reason``, ``elevation``; the others serve messages.
     heading : driving direction (dx, dy) in the frame of the lattice; start and target together override it.
-    start, target : x, y, metres; None: see the module.
-    height_step : rounding of heights, as a share of the vehicle's ``max_step``.
-
-    Returns
-    -------
-    The plan, the grid it lies on, and its vertices (vertex, xyz) float64, metres; z is the mean height under a wheel.
+    start, target : x, y, metres; None: see the module. Those of ``params`` are not looked at.
 
     Raises
     ------
     InputError
-        Start or target lies outside the map, or they are the same cell.
+        Start or target lies outside the map, in a hazard or on unknown ground, or they are the same cell; or the
+        vehicle is wider than the map.
     """
+    p = params or PathParams()
+    check_size(vehicle, lattice.shape, lattice.cell)
+    for name, point in (("start", start), ("target", target)):
+        if point is not None:
+            check_end(maps, lattice, vehicle, name, point)
     if start is not None and target is not None:
         heading = (target[0] - start[0], target[1] - start[1])
-    grid = RowGrid.over(lattice, heading)
-    ends = [
-        None if point is None else _cell_of(grid, lattice, name, point)
-        for name, point in (("start", start), ("target", target))
-    ]
-    free = grid.sample(lattice, free_cells(risk, lattice.cell, vehicle.margin), False)
-    rim = 0.5 * vehicle.wheel_diameter
-    clear = free & grid.sample(lattice, free_cells(risk, lattice.cell, 0.0, rim), False)
-    stand = grid.sample(lattice, window_mean(elevation, window_cells(vehicle.wheel_diameter, lattice.cell)), np.nan)
-    height = np.rint(np.where(free, stand, 0.0) / (height_step * vehicle.max_step)).astype(np.int64)
+    found = None
+    if p.planner != "grid8":
+        found = _by_rows(maps, lattice, vehicle, heading, start, target, p)
+    if p.planner == "grid8" or (
+        p.planner == "auto" and found is not None and not len(found.cells) and target is not None
+    ):
+        found = _by_grid(maps, lattice, vehicle, start, target, p, found)
+    assert found is not None
+    return found
+
+
+class _Ground:
+    """The maps on a grid, and where the vehicle may stand there."""
+
+    def __init__(self, maps: Maps, lattice: Lattice, grid: RowGrid, vehicle: Vehicle, p: PathParams) -> None:
+        self.grid, self.vehicle = grid, vehicle
+        self.unit = p.height_step * vehicle.max_step
+        self.risk = grid.sample(lattice, maps["risk"], UNKNOWN)
+        hazard = self.risk == HAZARDOUS
+        reason = grid.sample(lattice, maps["reason"], 0)
+        self.closed = hazard | (self.risk == UNKNOWN)
+        self.wheel_hazard = hazard & ((reason & WHEEL_BITS) > 0)
+        self.body_hazard = hazard & ((reason & np.uint16(sum(BITS.values()) - int(WHEEL_BITS))) > 0)
+        mean = window_mean(maps["elevation"], window_cells(vehicle.wheel_diameter, lattice.cell))
+        self.stand = grid.sample(lattice, mean, np.nan)
+        self.height = np.rint(np.where(self.closed, 0.0, self.stand) / self.unit).astype(np.int64)
+        self.toll = (self.risk == CAUTION) * np.int64(round(p.caution * grid.cell / self.unit))
+
+    def ways(self, ground: str) -> Bytes:
+        """Directions (row, col) as bits with ``ground`` on the known."""
+        unknown = self.risk == UNKNOWN
+        given = None if ground == "middle" else unknown
+        ways = standing(self.wheel_hazard, self.body_hazard, self.vehicle, self.grid.cell, unknown=given, below=ground)
+        ways[self.closed] = 0
+        return ways
+
+    def xyz(self, cells: Ints) -> Floats:
+        row, col = cells[:, 0], cells[:, 1]
+        return np.column_stack([self.grid.xy(row, col), self.stand[row, col]])
+
+
+def _by_rows(
+    maps: Maps,
+    lattice: Lattice,
+    vehicle: Vehicle,
+    heading: Point,
+    start: Point | None,
+    target: Point | None,
+    p: PathParams,
+) -> Route:
+    ground = _Ground(maps, lattice, RowGrid.over(lattice, heading), vehicle, p)
+    grid = ground.grid
+    first, last = (None if point is None else grid.index(point) for point in (start, target))
     tolerance = math.ceil((vehicle.wheel_base + vehicle.wheel_diameter) / lattice.cell)
-    found = plan(height, clear, tolerance, start=ends[0], target=ends[1], span=row_span(free))
-    if len(found.cells) == 0:
-        found = replace(plan(height, free, tolerance, start=ends[0], target=ends[1]), beside_unknown=True)
-    row, col = found.cells[:, 0], found.cells[:, 1]
-    return found, grid, np.column_stack([grid.xy(row, col), stand[row, col]])
+    span = row_span(~ground.closed)
+    for name in GROUNDS:
+        found = plan(ground.height, ground.ways(name), tolerance, first, last, span=span, toll=ground.toll)
+        if len(found.cells):
+            break
+    cost = np.where(found.cost < UNREACHED, found.cost // grid.rows * ground.unit, np.nan).astype(np.float32)
+    return Route(found.cells, ground.xyz(found.cells), found, grid, "rows", name, cost)
 
 
-def _cell_of(grid: RowGrid, lattice: Lattice, name: str, point: Point) -> tuple[int, int]:
-    row, col = grid.index(point)
-    if not (0 <= row < grid.rows and 0 <= col < grid.cols):
+def _by_grid(
+    maps: Maps,
+    lattice: Lattice,
+    vehicle: Vehicle,
+    start: Point | None,
+    target: Point | None,
+    p: PathParams,
+    before: Route | None,
+) -> Route:
+    ground = _Ground(maps, lattice, RowGrid.over(lattice, (0.0, 1.0)), vehicle, p)
+    grid, unit = ground.grid, max(1, round(lattice.cell / ground.unit))
+    given = tuple(None if point is None else grid.index(point) for point in (start, target))
+    nothing = np.empty((0, 2), dtype=np.int64)
+    cells, cost, name = nothing, np.full(ground.height.shape, UNREACHED), GROUNDS[0]
+    for name in GROUNDS:
+        ways = ground.ways(name)
+        first, last = _chosen(ways, given[0], given[1], ground, unit)
+        if first is None or last is None or not ways[first] or not ways[last]:
+            continue
+        cost, step = grid8.cost_to_go(ground.height, ways, last, first, unit, ground.toll)
+        if cost[first] < UNREACHED:
+            cells = grid8.trace(step, first)
+            break
+    reason = "" if len(cells) else "start and target are not connected by ground that the vehicle may cross"
+    base = before.plan if before is not None else Plan(nothing, cost, np.zeros(grid.cols, dtype=bool), 0)
+    found = replace(base, cells=cells, cost=cost, reachable=np.zeros(grid.cols, dtype=bool), reason=reason)
+    if len(cells):
+        found = replace(found, target_row=int(cells[-1, 0]), blocking_row=None)
+        found.reachable[cells[-1, 1]] = True
+    metres = np.where(cost < UNREACHED, cost * ground.unit, np.nan).astype(np.float32)
+    return Route(cells, ground.xyz(cells), found, grid, "grid8", name, metres)
+
+
+def _chosen(
+    ways: Bytes, start: tuple[int, int] | None, target: tuple[int, int] | None, ground: _Ground, unit: int
+) -> tuple[tuple[int, int] | None, tuple[int, int] | None]:
+    """Ends as given; else, of the largest connected free ground (that of the target), the cell nearest to the middle
+    of the first row, and of those that it reaches the one nearest to that of the last."""
+    span = row_span(ways > 0)
+    if span is None:
+        return None, None
+    if start is None:
+        parts, count = label(ways > 0, structure=np.ones((3, 3)))
+        largest = parts[target] if target is not None else 1 + int(np.argmax(np.bincount(parts.ravel())[1 : count + 1]))
+        start = _nearest(parts == largest, span[1])
+    if target is None:
+        cost, _ = grid8.cost_to_go(ground.height, ways, start, None, unit, ground.toll)
+        target = _nearest(cost < UNREACHED, span[0])
+    return start, target
+
+
+def _nearest(cells: NDArray[np.bool_], row: int) -> tuple[int, int]:
+    """The set cell nearest to the middle of a row, as :mod:`stages.row_graph` has it."""
+    r, c = np.nonzero(cells)
+    best = int(np.argmin(2 * np.abs(r - row) + np.abs(2 * c - (cells.shape[1] - 1))))
+    return int(r[best]), int(c[best])
+
+
+def check_end(maps: Maps, lattice: Lattice, vehicle: Vehicle, name: str, point: Point) -> None:
+    """Refuse a start or target outside the map, in a hazard or on unknown ground, with the figure that decides."""
+    row, col = (int(v) for v in np.rint(lattice.index(point)))
+    where = f"path.{name} ({point[0]:g}, {point[1]:g}) m"
+    if not (0 <= row < lattice.rows and 0 <= col < lattice.cols):
         x0, x1, y0, y1 = lattice.bounds
         raise InputError(
-            f"path.{name} ({point[0]:g}, {point[1]:g}) m is outside the map",
-            remedy=f"give x in {x0:.3f}..{x1:.3f} and y in {y0:.3f}..{y1:.3f} m",
+            f"{where} is outside the map", remedy=f"give x in {x0:.3f}..{x1:.3f} and y in {y0:.3f}..{y1:.3f} m"
         )
-    return row, col
+    kind = maps["risk"][row, col]
+    if kind == UNKNOWN:
+        free = np.argwhere(maps["risk"] < HAZARDOUS)
+        away = (
+            f", the nearest ground to drive on is {_away(free, row, col, lattice.cell):.3g} m away" if len(free) else ""
+        )
+        raise InputError(f"{where} lies on unknown ground{away}", remedy=f"choose another {name}")
+    if kind == HAZARDOUS:
+        raise InputError(
+            f"{where} lies in a hazard: {hazard_words(maps, (row, col), vehicle)}", remedy=f"choose another {name}"
+        )
+
+
+def _away(cells: NDArray[np.intp], row: int, col: int, cell: float) -> float:
+    return float(np.hypot(cells[:, 0] - row, cells[:, 1] - col).min()) * cell
+
+
+def hazard_words(maps: Maps, at: tuple[int, int], vehicle: Vehicle) -> str:
+    """The measures over their limits at a cell, with both figures."""
+    band = {"range": "height_range", "rise": "clearance"}
+    told = []
+    for name, bit in BITS.items():
+        if not int(maps["reason"][at]) & bit:
+            continue
+        words, limit, unit = WORDS[name]
+        values = maps.get(band.get(name, name))
+        if values is None:
+            told.append(f"{words} over vehicle.{limit}")
+            continue
+        value = float(values[at])
+        value = vehicle.clearance - value if name == "rise" else math.degrees(value) if unit == "deg" else value
+        told.append(f"{words} {value:.3g} {unit}, vehicle.{limit} {getattr(vehicle, limit):g}")
+    return "; ".join(told)
 
 
 def _run(params: PathParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
@@ -291,63 +316,82 @@ def _run(params: PathParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     lattice, vehicle = Lattice.from_dict(source.meta["lattice"]), Vehicle.model_validate(source.meta["vehicle"])
     local = args.get("use") == "local"
     dx, dy = args.get("heading", (0.0, 1.0))
-    risk = np.asarray(source["risk"])
-    found, grid, xyz = find_path(
-        risk,
-        np.asarray(source["elevation"]),
-        lattice,
-        vehicle,
-        heading=(dx, dy),
-        start=None if local else params.start,
-        target=None if local else params.target,
-        height_step=params.height_step,
-    )
-    cost = found.cost // grid.rows * (params.height_step * vehicle.max_step)
+    maps = {name: np.asarray(source[name]) for name in source.arrays}
+    ends = {} if local else {"start": params.start, "target": params.target}
+    route = find_path(maps, lattice, vehicle, heading=(dx, dy), params=params, **ends)
     arrays: dict[str, NDArray[Any]] = {
-        "path": xyz,
-        "cost_to_go": np.where(found.cost < UNREACHED, cost, np.nan).astype(np.float32),
-        "reachable": found.reachable.astype(np.uint8),
+        "path": route.xyz,
+        "cost_to_go": route.cost,
+        "reachable": route.plan.reachable.astype(np.uint8),
     }
-    inclination = grid.sample(lattice, np.asarray(source["inclination"]), np.nan)[found.cells[:, 0], found.cells[:, 1]]
-    return Bundle(arrays, _meta(found, grid, xyz, inclination) | {"frame": source.meta.get("frame", "local")})
+    return Bundle(arrays, describe(route, maps, lattice, vehicle) | {"frame": source.meta.get("frame", "local")})
 
 
-def _meta(found: Plan, grid: RowGrid, xyz: Floats, inclination: NDArray[np.float32]) -> dict[str, Any]:
+def describe(route: Route, maps: Maps, lattice: Lattice, vehicle: Vehicle) -> dict[str, Any]:
+    """Facts of a route: length, climb, and the worst that it meets."""
+    found, grid, xyz = route.plan, route.grid, route.xyz
     meta: dict[str, Any] = {
         "found": len(xyz) > 0,
-        "reason": found.reason,
+        "planner": route.planner,
+        "ground": route.ground,
+        "reason": found.reason or "" if len(xyz) else _why(found, maps, vehicle),
         "blocking_row": found.blocking_row,
         "blocking_y": None if found.blocking_row is None else (grid.j0 - found.blocking_row) * grid.cell,
-        "beside_unknown": found.beside_unknown,
+        "beside_unknown": route.ground != GROUNDS[0],
         "target_row": found.target_row,
         "reachable_targets": int(found.reachable.sum()),
         "vertices": len(xyz),
         "grid": grid.to_dict(),
     }
+    none = ("length_m", "climb_m", "max_inclination", "max_tilt", "least_clearance", "max_p_hazard", "caution_share")
     if len(xyz) == 0:
-        return meta | dict.fromkeys(("length_m", "climb_m", "max_inclination", "start", "target"))
+        return meta | dict.fromkeys((*none, "start", "target"))
+    at = tuple(np.rint(lattice.index(xyz[:, :2])).astype(np.int64).T)
     steps = np.diff(xyz, axis=0)
     return meta | {
         "length_m": float(np.sqrt((steps**2).sum(axis=1)).sum()),
         "climb_m": float(np.maximum(steps[:, 2], 0.0).sum()),
-        "max_inclination": float(inclination.max()),
+        "max_inclination": _worst(maps, "inclination", at, np.nanmax),
+        "max_tilt": _worst(maps, "tilt", at, np.nanmax),
+        "least_clearance": _worst(maps, "clearance", at, np.nanmin),
+        "max_p_hazard": _worst(maps, "p_hazard", at, np.nanmax),
+        "caution_share": float((maps["risk"][at] == CAUTION).mean()),
         "start": [float(v) for v in xyz[0]],
         "target": [float(v) for v in xyz[-1]],
     }
 
 
+def _worst(maps: Maps, name: str, at: Any, of: Any) -> float | None:
+    return float(of(maps[name][at])) if name in maps else None
+
+
+def _why(found: Plan, maps: Maps, vehicle: Vehicle) -> str:
+    """Why there is no path; where hazards leave nothing to drive on, the limit that does the most."""
+    risk = maps["risk"]
+    judged = int((risk != UNKNOWN).sum())
+    if judged == 0 or (risk[risk != UNKNOWN] < HAZARDOUS).any():
+        return found.reason
+    most = max(BITS, key=lambda name: int(((maps["reason"] & BITS[name]) > 0).sum()))
+    share = float(((maps["reason"] & BITS[most]) > 0).sum()) / judged
+    words, limit, _ = WORDS[most]
+    return (
+        f"all {judged} known cells are hazardous, {100 * share:.0f} % of them by {words}: "
+        f"is vehicle.{limit} {getattr(vehicle, limit):g} at the scale of the sequence?"
+    )
+
+
 STAGE = Stage(
     name="path",
-    version=1,
-    summary="path of least height differences over free cells, monotone in the rows across the heading",
+    version=2,
+    summary="path of least height differences for a vehicle with a width: monotone in the rows, or any direction",
     params=PathParams,
     inputs=("risk",),
     outputs=(
         Array("path", ("vertex", "xyz"), "float64", "m", "vertices from start to target; z = mean under a wheel"),
-        Array("cost_to_go", ("row", "col"), "float32", "m", "height differences from the start to the cell", "nan"),
+        Array("cost_to_go", ("row", "col"), "float32", "m", "rows: cost from the start; grid8: to the target", "nan"),
         Array("reachable", ("col",), "uint8", "1", "1 where the target row can be reached"),
     ),
-    requires=("numpy", "scipy"),
+    requires=("numpy", "numba", "scipy"),
     run=_run,
-    memory=Memory(factor=12.0, lower=("locus.cell_size",)),
+    memory=Memory(factor=6.0, lower=("locus.cell_size",)),
 )

@@ -38,6 +38,21 @@ class Vehicle(Params):
         description="m; distance that a path keeps from hazards, half a wheel for what localisation errs",
     )
 
+    @property
+    def wheel_width(self) -> float:
+        """Metres; half the diameter, as that of most rovers is."""
+        return 0.5 * self.wheel_diameter
+
+    @property
+    def half_width(self) -> float:
+        """Metres from the middle line to the outer face of the wheels."""
+        return 0.5 * (self.track + self.wheel_width)
+
+    @property
+    def half_length(self) -> float:
+        """Metres from the middle to the front of the front wheels."""
+        return 0.5 * (self.wheel_base + self.wheel_diameter)
+
     @model_validator(mode="after")
     def _belly_clears_what_wheels_climb(self) -> Vehicle:
         if self.max_step > self.clearance:

@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
@@ -53,12 +54,40 @@ def _sum_down(a: Floats, n: int) -> Floats:
     return np.asarray(prefix[np.minimum(index + n // 2 + 1, rows)] - prefix[np.maximum(index - n // 2, 0)])
 
 
-def window_mean(a: Floats32, n: int) -> Floats:
+def window_mean(a: Floats32, n: int) -> Floats32:
     """Mean (row, col) of the known cells in the window; NaN where there is none."""
-    known = ~np.isnan(a)
-    count = window_sum(known, n)
-    total = window_sum(np.where(known, a, 0.0), n)
-    return np.where(count > 0.5, total / np.maximum(count, 1.0), np.nan)
+    known = a == a
+    offset = np.float32(a[known].mean(dtype=np.float64)) if known.any() else np.float32(0)
+    out = np.empty(a.shape, dtype=np.float32)
+    _mean(np.ascontiguousarray(a), n // 2, offset, out)
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _mean(a, half, offset, out):  # type: ignore[no-untyped-def]
+    """Sums of the columns move down with the window, the sum over columns along each row."""
+    rows, cols = a.shape
+    total, count = np.zeros(cols), np.zeros(cols)
+    for r in range(-half, rows):
+        for row, sign in ((r + half, 1.0), (r - half - 1, -1.0)):
+            if 0 <= row < rows:
+                for c in range(cols):
+                    v = a[row, c] - offset
+                    known = v == v
+                    total[c] += sign * v if known else 0.0
+                    count[c] += sign if known else 0.0
+        if r < 0:
+            continue
+        s, n = 0.0, 0.0
+        for c in range(-half, cols):
+            if c + half < cols:
+                s += total[c + half]
+                n += count[c + half]
+            if c > half:
+                s -= total[c - half - 1]
+                n -= count[c - half - 1]
+            if c >= 0:
+                out[r, c] = s / n + offset if n > 0.5 else np.nan
 
 
 @dataclass(frozen=True)

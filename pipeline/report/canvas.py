@@ -26,8 +26,8 @@ WIDTH = 4.6
 MAX_PIXELS = 700
 """Longest side of an array that is drawn; larger ones are averaged first."""
 UNDEFINED = "#e9e9ec"
-SAFE, HAZARDOUS, UNKNOWN = "#a6d7c3", "#c8501e", "#8d8f98"
-"""Distinct for colour-blind eyes and in grey: light, dark, medium."""
+SAFE, CAUTION, HAZARDOUS, UNKNOWN = "#a6d7c3", "#f0d68a", "#c8501e", "#8d8f98"
+"""Distinct for colour-blind eyes; in grey, what may be driven on is light, hazards dark, unknown medium."""
 MEASURED, INTERPOLATED = "#2f6f9f", "#f0b84a"
 ESTIMATE, REFERENCE, MARK = "#0b4f8a", "#d1731a", "#111111"
 OTHER, RIGHT = "#2c8a5b", "#333333"

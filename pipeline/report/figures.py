@@ -14,12 +14,11 @@ from numpy.typing import NDArray
 
 from pipeline.report import canvas
 from pipeline.report.canvas import Extent, Panel
+from stages.risk import HAZARDOUS
 from stages.validity import defined, matched
 
 Floats = NDArray[Any]
 Bytes = NDArray[np.uint8]
-
-SAFE, HAZARDOUS, UNKNOWN = 0, 1, 2
 
 
 def photo(image: Floats, alt: str) -> Panel:
@@ -60,7 +59,7 @@ def ortho(grey: Floats, extent: Extent, alt: str) -> Panel:
 def elevation_with_path(elevation: Floats, risk: Bytes | None, path: Floats | None, extent: Extent, alt: str) -> Panel:
     """Elevation (row, col) m, bright is high; unknown and hazardous black; the path on it (Figure 7, right)."""
     fig, ax, cax = canvas.map_axes(extent, bar=True)
-    blocked = ~np.isfinite(elevation) if risk is None else risk != SAFE
+    blocked = ~np.isfinite(elevation) if risk is None else risk >= HAZARDOUS
     factor, unit = canvas.metres_or_mm(elevation)
     # The grey scale starts well above black, so that black means "not to be driven" only.
     shown = np.where(blocked, np.nan, elevation * factor)
@@ -74,12 +73,12 @@ def elevation_with_path(elevation: Floats, risk: Bytes | None, path: Floats | No
 
 
 def risk_map(risk: Bytes, path: Floats | None, extent: Extent, alt: str, *, far: Floats | None = None) -> Panel:
-    """Safe, hazardous and unknown cells, the path, and which targets of the far row can be reached.
+    """Safe, caution, hazardous and unknown cells, the path, and which targets of the far row can be reached.
 
     ``far`` (n, 3): x, y of a cell of the far row, m, and 1 where a path leads there.
     """
     fig, ax, _ = canvas.map_axes(extent)
-    _show(ax, _paint(risk, canvas.SAFE, canvas.HAZARDOUS, canvas.UNKNOWN), extent)
+    _show(ax, _paint(risk, canvas.SAFE, canvas.CAUTION, canvas.HAZARDOUS, canvas.UNKNOWN), extent)
     if path is not None and len(path):
         canvas.polyline(ax, path)
     if far is not None and len(far):
@@ -92,7 +91,7 @@ def risk_map(risk: Bytes, path: Floats | None, extent: Extent, alt: str, *, far:
 
 
 def cost_to_go(cost: Floats, path: Floats | None, extent: Extent, alt: str) -> Panel:
-    """Summed height differences (row, col), m, of the best path to each cell; not reachable is grey (Figure 3)."""
+    """Cost (row, col), m, of the best path to each cell; not reachable is grey (Figure 3)."""
     fig, ax, cax = canvas.map_axes(extent, bar=True)
     finite = np.where(np.isfinite(cost), cost, np.nan)
     factor, unit = canvas.metres_or_mm(finite)
@@ -101,7 +100,7 @@ def cost_to_go(cost: Floats, path: Floats | None, extent: Extent, alt: str) -> P
     )
     if path is not None and len(path):
         canvas.polyline(ax, path)
-    canvas.color_bar(drawn, cax, f"summed height differences, {unit}")
+    canvas.color_bar(drawn, cax, f"cost of the path, {unit}")
     return canvas.encode(fig, alt, photo=True)
 
 

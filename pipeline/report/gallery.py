@@ -90,8 +90,8 @@ def _risk(scene: Scene) -> Block | None:
     if scene.risk is None:
         return None
     risk = scene.risk.arrays["risk"]
-    shares = [float((risk == k).mean()) for k in range(3)]
-    words = f"{shares[0]:.0%} safe, {shares[1]:.0%} hazardous, {shares[2]:.0%} unknown"
+    shares = [float((risk == k).mean()) for k in range(4)]
+    words = f"{shares[0]:.0%} safe, {shares[1]:.0%} caution, {shares[2]:.0%} hazard, {shares[3]:.0%} unknown"
     vehicle = scene.view.config.vehicle
     panels = [figures.risk_map(risk, scene.path, scene.risk.extent, f"Risk map seen from above: {words}")]
     slope = scene.risk.get("inclination")
@@ -101,10 +101,11 @@ def _risk(scene: Scene) -> Block | None:
         label = "local inclination, degrees"
         panels.append(figures.scalar_map(degrees, scene.risk.extent, label, alt, length=False))
     caption = (
-        f"Of all cells {words}. Limits of {vehicle.name}: slope {vehicle.max_slope_deg:g}°, "
-        f"step {length(vehicle.max_step)}, roughness {length(vehicle.max_roughness)}, judged in windows of one wheel "
-        f"diameter ({length(vehicle.wheel_diameter)}). {_path_words(scene)} Second: the local inclination, which the "
-        "slope's limit applies to."
+        f"Of all cells {words}. Limits of {vehicle.name}: slope and tilt {vehicle.max_slope_deg:g}°, "
+        f"step {length(vehicle.max_step)}, roughness {length(vehicle.max_roughness)}, clearance "
+        f"{length(vehicle.clearance)}; a hazard is what exceeds one within {scene.view.config.risk.sigmas:g} standard "
+        f"deviations, caution what comes near it. {_path_words(scene)} Second: the local inclination, over a wheel's "
+        f"diameter ({length(vehicle.wheel_diameter)})."
     )
     return Block("Risk map", "Risk map and path of the whole run", caption, tuple(panels), _legend(shares))
 
@@ -113,14 +114,22 @@ def _path_words(scene: Scene) -> str:
     if scene.path is None:
         return "There is no path."
     margin = length(scene.view.config.vehicle.margin)
+    path = scene.view.bundle(scene.view.products.path)
+    ground = "" if path is None else path.meta.get("ground", "")
+    known = {
+        "outline": "no unknown ground comes under its outline",
+        "wheels": "its wheels stay on known ground, its belly does not everywhere",
+        "middle": "its middle stays on known ground, its wheels do not everywhere",
+    }.get(ground, "unknown ground is not entered")
     return (
-        f"The path (black line, ring: start, disk: target) keeps {margin} from hazardous cells and never enters "
-        "unknown ones."
+        f"The path (black line, ring: start, disk: target) is that of the vehicle's middle; its wheels keep {margin} "
+        f"from hazards; {known}."
     )
 
 
 def _legend(shares: list[float]) -> tuple[tuple[str, str], ...]:
-    colors, names = (canvas.SAFE, canvas.HAZARDOUS, canvas.UNKNOWN), ("safe", "hazardous", "unknown")
+    colors = (canvas.SAFE, canvas.CAUTION, canvas.HAZARDOUS, canvas.UNKNOWN)
+    names = ("safe", "caution", "hazard", "unknown")
     return tuple((c, f"{name} {share:.0%}") for c, name, share in zip(colors, names, shares, strict=True))
 
 
@@ -153,11 +162,11 @@ def _local(scene: Scene) -> Block | None:
     )
     caption = (
         f"Heading-aligned local map of {name}: each cell of a row leads to three cells of the next, so one sweep finds "
-        f"the best path to every cell; {outcome}. Second: height differences summed along the best path from the start "
-        "to each cell; grey cells cannot be reached."
+        f"the best path to every cell; {outcome}. Second: height differences, and tolls for caution ground, summed "
+        "along the best path from the start to each cell; grey cells cannot be reached."
     )
     title = f"Figure 3. Local risk map and reachable targets, frame {pair}"
-    legend = _legend([float((risk.arrays["risk"] == k).mean()) for k in range(3)])
+    legend = _legend([float((risk.arrays["risk"] == k).mean()) for k in range(4)])
     return Block("Figure 3", title, caption, tuple(panels), legend)
 
 

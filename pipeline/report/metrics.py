@@ -98,6 +98,7 @@ KEY = frozenset(
         "mapped_area",
         "elevation_sigma",
         "safe",
+        "caution",
         "hazardous",
         "unknown",
         "path_length",
@@ -321,7 +322,7 @@ def _hazards(scene: Scene) -> dict[str, Metric]:
     if scene.risk is None:
         return {}
     risk, found = scene.risk.arrays["risk"], {}
-    for k, name in enumerate(("safe", "hazardous", "unknown")):
+    for k, name in enumerate(("safe", "caution", "hazardous", "unknown")):
         how = f"share of all cells of the risk map; limits of {scene.view.config.vehicle.name}"
         found[name] = _metric(f"{name.capitalize()} cells", float((risk == k).mean()), "1", how)
     return found
@@ -338,6 +339,15 @@ def _path(view: RunView) -> dict[str, Metric]:
     if meta.get("max_inclination") is not None:
         value = float(np.degrees(meta["max_inclination"]))
         found["path_inclination"] = _metric("Steepest ground on the path", value, "deg", "local inclination, largest")
+    if meta.get("max_tilt") is not None:
+        value = float(np.degrees(meta["max_tilt"]))
+        found["path_tilt"] = _metric("Greatest tilt on the path", value, "deg", "of the vehicle, at the worst heading")
+    if meta.get("least_clearance") is not None:
+        how = "left under the belly, at the worst heading"
+        found["path_clearance"] = _metric("Least clearance on the path", meta["least_clearance"], "m", how)
+    if meta.get("max_p_hazard") is not None:
+        how = "probability that a measure exceeds its limit, largest of the path's cells"
+        found["path_p_hazard"] = _metric("Greatest hazard probability on the path", meta["max_p_hazard"], "1", how)
     return found
 
 

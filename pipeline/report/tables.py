@@ -52,7 +52,7 @@ FILES: dict[str, tuple[str, str]] = {
     "terrain.zarr": ("all merged arrays with units and coordinates", "xarray.open_zarr"),
     "ortho.tif": ("merged ortho image, grey 0..255", "QGIS, GDAL"),
     "risk.tif": (
-        "risk map; bands: class (0 safe, 1 hazardous, 2 unknown), reason (bits), filled (1: closed hole)",
+        "risk map; bands: class (0 safe, 1 caution, 2 hazard, 3 unknown), reason (bits), p_hazard, filled, measures",
         "QGIS, GDAL",
     ),
     "risk.qml": ("colours and names of the classes of risk.tif, which QGIS applies by itself", "QGIS"),

@@ -4,8 +4,9 @@
     <rasterrenderer type="paletted" band="1" opacity="0.8" alphaBand="-1" nodataColor="">
       <colorPalette>
         <paletteEntry value="0" label="safe" color="#a6d7c3" alpha="255"/>
-        <paletteEntry value="1" label="hazardous" color="#c8501e" alpha="255"/>
-        <paletteEntry value="2" label="unknown (never safe)" color="#8d8f98" alpha="255"/>
+        <paletteEntry value="1" label="caution" color="#f0d68a" alpha="255"/>
+        <paletteEntry value="2" label="hazard" color="#c8501e" alpha="255"/>
+        <paletteEntry value="3" label="unknown (never entered)" color="#8d8f98" alpha="255"/>
       </colorPalette>
     </rasterrenderer>
     <brightnesscontrast brightness="0" contrast="0"/>

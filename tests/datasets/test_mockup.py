@@ -341,7 +341,7 @@ def test_bed_challenges_the_rover():
         p = SceneParams(bed_width=1.0, bed_length=1.0, **kind)
         height = build_scene(p)["height"]
         risk = risk_map(height, np.zeros_like(height), p.cell, seq.mockup(MockupParams(frames=1)).vehicle)["risk"]
-        assert 0.05 < (risk == 1).mean() < 0.40
+        assert 0.05 < (risk == 2).mean() < 0.40
 
 
 def test_a_swing_rolls_each_frame_against_the_last_and_nothing_else():

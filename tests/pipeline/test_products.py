@@ -204,8 +204,9 @@ def test_styles_name_the_classes_and_span_the_elevations(tmp_path: Path) -> None
     entries = ElementTree.parse(tmp_path / "risk.qml").findall(".//paletteEntry")
     assert [(e.get("value"), (e.get("label") or "").split()[0]) for e in entries] == [
         ("0", "safe"),
-        ("1", "hazardous"),
-        ("2", "unknown"),
+        ("1", "caution"),
+        ("2", "hazard"),
+        ("3", "unknown"),
     ]
     write_style(tmp_path / "dem.qml", "dem", {f"e{k}": -1.0 + k / 4 for k in range(9)})
     style = ElementTree.parse(tmp_path / "dem.qml")
@@ -229,7 +230,8 @@ def test_tables_leave_empty_what_is_not_known(tmp_path: Path) -> None:
 def test_a_run_writes_the_files_that_it_describes(tmp_path: Path) -> None:
     made = bundles() | checks()
     risk = made["risk"]
-    more = dict.fromkeys(("reason", "filled"), risk["risk"])
+    names = ("height_range", "step", "roughness", "slope", "tilt", "clearance", "p_hazard")
+    more = dict.fromkeys(("reason", "filled"), risk["risk"]) | dict.fromkeys(names, risk["inclination"])
     made["risk"] = Bundle({**risk.arrays, **more}, risk.meta)
     outputs.write(tmp_path, view(made, products=checked()))
     facts = json.loads((tmp_path / "frames.json").read_text())

@@ -66,8 +66,8 @@ def bundles() -> dict[str, Bundle]:
     z = (-0.18 + 0.01 * np.sin(x / 9.0) * np.cos(y / 7.0)).astype(np.float32)
     z[:5, :9] = np.nan
     risk = np.zeros((ROWS, COLS), dtype=np.uint8)
-    risk[20:30, 50:60] = 1
-    risk[:5, :9] = 2
+    risk[20:30, 50:60] = 2
+    risk[:5, :9] = 3
     rows = np.arange(ROWS - 1, 9, -1)
     path = np.column_stack([np.zeros(len(rows)), 0.8 - CELL * rows, np.full(len(rows), -0.18)])
     cost = np.where(risk == 0, 0.001 * (ROWS - y), np.nan).astype(np.float32)
@@ -83,6 +83,10 @@ def bundles() -> dict[str, Bundle]:
         "length_m": 0.49,
         "climb_m": 0.004,
         "max_inclination": 0.1,
+        "max_tilt": 0.08,
+        "least_clearance": 0.02,
+        "max_p_hazard": 0.01,
+        "ground": "outline",
         "grid": {"ahead": [0.0, 1.0], "i0": -40, "j0": 80, "cell": CELL, "rows": ROWS, "cols": COLS},
     }
     poses = np.array([level_pose(i * STEP).matrix34 for i in FRAMES])

@@ -1,0 +1,1 @@
+"""Parts of ``benchmarks/hazards.py``: simulated scenes, ways to classes, and how they are judged."""

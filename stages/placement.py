@@ -1,0 +1,197 @@
+"""A vehicle put down on the ground at every place and heading: tilt, slope of the footprint and rise under the belly.
+
+Places lie on a coarse grid, every seventh of a wheel; heights are first reduced to the highest and the lowest of each
+of its blocks, so that nothing is left out. A wheel *stands* on the highest ground in its contact patch, half a wheel
+wide;
+*ground* is the lowest there. At each place the vehicle is turned through ``HEADINGS`` headings. Four wheels touch in
+threes: of each three, two span the wheel base and two the track, so the plane through them has the gradient (difference
+along a side / wheel base, difference along an axle / track). The greatest over threes and headings is
+
+* tilt, from where the wheels stand (stones count), and
+* slope of the footprint's plane, from the ground beneath (stones narrower than a wheel do not).
+
+Rise under the belly is how far the ground there comes up from the plane of the wheels: for a point p between the axles
+with bilinear weights w of the four wheels, ``sum_i w_i max(0, z(p) - stand_i)``. It is the height of p over that plane
+where no wheel stands higher than p, and more where one does: a wheel that happens to stand high lifts the belly, but is
+not relied on, as in the bounds of Otsu et al. (2020), doi:10.1002/rob.21917 (ACE). On a plane of gradient g it is at
+most g wheel_base / 4 along, and as much across with the track.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from stages.extrema import running_range
+from stages.vehicle import Vehicle
+
+Floats32 = NDArray[np.float32]
+Ints = NDArray[np.int64]
+
+HEADINGS = 8
+"""Over half a turn, since the footprint is the same backwards: 22.5 degrees move a wheel by less than its diameter."""
+
+PLACES_PER_WHEEL = 7
+"""Places along a wheel's diameter, at least."""
+
+
+@dataclass(frozen=True)
+class Places:
+    """Results (row, col) on the coarse grid, float32: gradients ``tilt`` and ``slope`` (1), ``rise`` (m).
+
+    ``unstood``: share of the headings with a wheel wholly on unknown ground; what it would do there is not in the
+    others.
+    """
+
+    tilt: Floats32
+    slope: Floats32
+    rise: Floats32
+    unstood: Floats32
+
+
+@dataclass(frozen=True)
+class Stance:
+    """Offsets (row, col) in coarse cells: wheels (heading, 4, 2), belly (heading, point, 2), and sizes in coarse cells.
+
+    Wheels: front left, front right, rear left, rear right. ``spans`` (heading, 4) metres: left side, right side, front
+    axle, rear axle. ``weights`` (point, 4) of the wheels at the belly's points.
+    """
+
+    wheels: Ints
+    belly: Ints
+    spans: Floats32
+    weights: Floats32
+    wheel_reach: int
+    belly_reach: int
+
+    @staticmethod
+    def of(vehicle: Vehicle, cell: float) -> Stance:
+        """Of a vehicle on a grid of ``cell`` metres."""
+        half = np.array([[1.0, -1.0], [1.0, 1.0], [-1.0, -1.0], [-1.0, 1.0]]) / 2.0  # ahead, right
+        wheels = half * [vehicle.wheel_base, vehicle.track]
+        width = max(vehicle.track - vehicle.wheel_width, vehicle.wheel_width)
+        parts = _parts(vehicle.wheel_base, width), _parts(width, vehicle.wheel_base)
+        ahead, right = ((np.arange(n) + 0.5) / n - 0.5 for n in parts)
+        share = np.stack(np.meshgrid(ahead, right, indexing="ij"), axis=-1).reshape(-1, 2)
+        points = share * [vehicle.wheel_base, width]
+        along, across = share[:, :1], points[:, 1:] / vehicle.track
+        weights = (0.5 + 2.0 * along * half[:, 0]) * (0.5 + 2.0 * across * half[:, 1])
+        turns = [_rotation(k * math.pi / HEADINGS) for k in range(HEADINGS)]
+        at = np.stack([np.rint(wheels @ turn / cell) for turn in turns])
+        under = np.stack([np.rint(points @ turn / cell) for turn in turns])
+        pairs = ((0, 2), (1, 3), (0, 1), (2, 3))
+        spans = np.stack([np.hypot(*(at[:, a] - at[:, b]).T) for a, b in pairs], axis=1) * cell
+        part = max(vehicle.wheel_base / parts[0], width / parts[1])
+        return Stance(
+            at.astype(np.int64),
+            under.astype(np.int64),
+            np.maximum(spans, cell).astype(np.float32),
+            weights.astype(np.float32),
+            max(1, round(0.25 * vehicle.wheel_diameter / cell)),
+            max(1, round(0.5 * part / cell)),
+        )
+
+
+def _parts(length: float, other: float) -> int:
+    """Into how many about square parts a side is divided; the shorter one into two."""
+    return max(2, round(2.0 * length / min(length, other)))
+
+
+def _rotation(angle: float) -> NDArray[np.float64]:
+    """(ahead, right) to (row, col) of a raster whose rows fall ahead, turned clockwise."""
+    c, s = math.cos(angle), math.sin(angle)
+    return np.array([[-c, s], [s, c]])
+
+
+def stride(vehicle: Vehicle, cell: float) -> int:
+    """Cells from place to place."""
+    return max(1, int(vehicle.wheel_diameter / (PLACES_PER_WHEEL * cell) + 1e-6))
+
+
+def place(high: Floats32, low: Floats32, vehicle: Vehicle, cell: float) -> Places:
+    """Put the vehicle down everywhere.
+
+    Parameters
+    ----------
+    high, low : (row, col) float32, metres, highest and lowest ground in each coarse cell, NaN unknown.
+    cell : side of a coarse cell, metres.
+    """
+    stance = Stance.of(vehicle, cell)
+    reach = int(max(np.abs(stance.wheels).max(), np.abs(stance.belly).max()))
+    stand, _ = running_range(high, stance.wheel_reach)
+    _, ground = running_range(low, stance.wheel_reach)
+    belly, _ = running_range(high, stance.belly_reach)
+    padded = [np.pad(np.where(np.isfinite(a), a, np.float32(np.nan)), reach, constant_values=np.nan)
+              for a in (stand, ground, belly)]  # fmt: skip
+    out = [np.zeros(high.shape, dtype=np.float32) for _ in range(4)]
+    _place(*padded, stance.wheels + reach, stance.belly + reach, stance.spans, stance.weights, *out)
+    return Places(np.sqrt(out[0]), np.sqrt(out[1]), out[2], out[3])
+
+
+@njit(cache=True, nogil=True)
+def _place(stand, ground, belly, wheels, under, spans, weights, tilt, slope, rise, unstood):  # type: ignore[no-untyped-def]
+    rows = tilt.shape[0]
+    headings = wheels.shape[0]
+    each = np.float32(1.0 / headings)
+    for r in range(rows):
+        for k in range(headings):
+            _steepest(stand, wheels[k], spans[k], r, tilt[r])
+            _steepest(ground, wheels[k], spans[k], r, slope[r])
+            _missing(stand, wheels[k], r, each, unstood[r])
+            for j in range(under.shape[1]):
+                _rise(belly, stand, under[k, j], wheels[k], weights[j], r, rise[r])
+
+
+@njit(cache=True, nogil=True)
+def _line(a, at, r, n):  # type: ignore[no-untyped-def]
+    return a[r + at[0], at[1] : at[1] + n]
+
+
+@njit(cache=True, nogil=True)
+def _steepest(a, wheels, spans, r, out):  # type: ignore[no-untyped-def]
+    """Raise ``out`` to the greatest squared gradient of the planes through three wheels, those that are known."""
+    n = out.shape[0]
+    fl, fr = _line(a, wheels[0], r, n), _line(a, wheels[1], r, n)
+    rl, rr = _line(a, wheels[2], r, n), _line(a, wheels[3], r, n)
+    one, zero = np.float32(1.0), np.float32(0.0)
+    left, right, front, rear = one / spans[0], one / spans[1], one / spans[2], one / spans[3]
+    for c in range(n):
+        u, v = abs(fl[c] - rl[c]) * left, abs(fr[c] - rr[c]) * right
+        along = u if u > zero else zero
+        along = v if v > along else along
+        u, v = abs(fl[c] - fr[c]) * front, abs(rl[c] - rr[c]) * rear
+        across = u if u > zero else zero
+        across = v if v > across else across
+        square = along * along + across * across
+        out[c] = square if square > out[c] else out[c]
+
+
+@njit(cache=True, nogil=True)
+def _missing(a, wheels, r, each, out):  # type: ignore[no-untyped-def]
+    """Add ``each`` where a wheel is on unknown ground."""
+    n = out.shape[0]
+    fl, fr = _line(a, wheels[0], r, n), _line(a, wheels[1], r, n)
+    rl, rr = _line(a, wheels[2], r, n), _line(a, wheels[3], r, n)
+    for c in range(n):
+        total = fl[c] + fr[c] + rl[c] + rr[c]
+        out[c] += np.float32(0.0) if total == total else each
+
+
+@njit(cache=True, nogil=True)
+def _rise(belly, stand, at, wheels, w, r, out):  # type: ignore[no-untyped-def]
+    """Raise ``out`` to the rise of one point of the belly over the wheels' plane."""
+    n = out.shape[0]
+    p = _line(belly, at, r, n)
+    fl, fr = _line(stand, wheels[0], r, n), _line(stand, wheels[1], r, n)
+    rl, rr = _line(stand, wheels[2], r, n), _line(stand, wheels[3], r, n)
+    w0, w1, w2, w3 = w[0], w[1], w[2], w[3]
+    zero = np.float32(0.0)
+    for c in range(n):
+        a, b, d, e = p[c] - fl[c], p[c] - fr[c], p[c] - rl[c], p[c] - rr[c]
+        total = w0 * (a if a > zero else zero) + w1 * (b if b > zero else zero)
+        total += w2 * (d if d > zero else zero) + w3 * (e if e > zero else zero)
+        out[c] = total if total > out[c] else out[c]
