@@ -78,8 +78,8 @@ def choose_goal(sequence: Any, config: Any) -> tuple[float, float]:
     from stages.declare import Bundle
     from stages.geometry import RigidTransform, level_rotation
     from stages.lattice import Lattice
-    from stages.leg import clear
-    from stages.risk import SAFE, risk_map
+    from stages.leg import Hazards
+    from stages.risk import risk_map
     from stages.wheels import stand
 
     mockup, rover = sequence.parameters["mockup"], sequence.parameters["rover"]
@@ -95,9 +95,9 @@ def choose_goal(sequence: Any, config: Any) -> tuple[float, float]:
     at = scene.meta["lattice"]
     field = HeightField.build(np.asarray(scene["height"]), at["x0"], at["y0"], at["cell"])
     z = true_dem(field, lattice.to_dict(), T_bed_left @ T_world_left.inverse())[0]
-    risk = risk_map(z, np.zeros_like(z), cell, config.vehicle, config.risk)["risk"]
-    hazard, _ = clear(risk, cell, config.vehicle)
-    free = (hazard > 1.5 * config.vehicle.margin) & (risk == SAFE)
+    judged = risk_map(z, np.zeros_like(z), cell, config.vehicle, config.risk)
+    hazards = Hazards.of(judged["risk"], judged["reason"], cell, config.vehicle)
+    free = (hazards.gap > 1.5 * config.vehicle.margin) & hazards.free
     xy = lattice.xy()
     far = np.where(free, np.hypot(xy[..., 0] - x, xy[..., 1] - y), np.inf)
     row, col = np.unravel_index(int(np.argmin(far)), far.shape)

@@ -27,7 +27,8 @@ from stages.declare import Array, Bundle, Inputs, Params, Stage
 from stages.errors import InputError
 from stages.geometry import RigidTransform
 from stages.lattice import Lattice
-from stages.risk import HAZARDOUS, SAFE, UNKNOWN
+from stages.path import WHEEL_BITS
+from stages.risk import HAZARDOUS, UNKNOWN
 from stages.vehicle import Vehicle
 
 Floats = NDArray[np.float64]
@@ -73,18 +74,33 @@ def half_width(vehicle: Vehicle) -> float:
     return 0.5 * math.hypot(vehicle.track, vehicle.wheel_base)
 
 
-def clear(risk: NDArray[np.uint8], cell: float, vehicle: Vehicle) -> tuple[Floats, Floats]:
-    """Distances (row, col), m, from the circle of the vehicle standing on a cell to hazards, and to unknown ground.
+@dataclass(frozen=True)
+class Hazards:
+    """A risk map as the circle of the vehicle meets it, (row, col).
 
-    What is nearer than ``vehicle.margin`` to a hazard is closed.
+    ``gap`` m from the vehicle standing on a cell to the nearest hazard: from the circle of its wheels to what is
+    hazardous to a wheel, from its middle to where the vehicle as a whole would tilt or strike. ``unknown`` m from the
+    circle to unknown ground. ``free``: the cell itself is neither hazardous nor unknown.
     """
-    need = half_width(vehicle)
-    out = []
-    for kind in (HAZARDOUS, UNKNOWN):
-        there = risk == kind
-        far = distance_transform_edt(~there) * cell if there.any() else np.full(risk.shape, np.inf)
-        out.append(np.asarray(far, dtype=np.float64) - need)
-    return out[0], out[1]
+
+    gap: Floats
+    unknown: Floats
+    free: Mask
+
+    @staticmethod
+    def of(risk: NDArray[np.uint8], reason: NDArray[np.uint16] | None, cell: float, vehicle: Vehicle) -> Hazards:
+        """From classes and reason bits of :mod:`stages.risk`; without bits every hazard is one to a wheel."""
+        hazardous = risk == HAZARDOUS
+        wheel = hazardous if reason is None else hazardous & ((reason & WHEEL_BITS) > 0)
+        need = half_width(vehicle)
+        gap = np.minimum(_distance(wheel, cell) - need, _distance(hazardous & ~wheel, cell))
+        unknown = risk == UNKNOWN
+        return Hazards(gap, _distance(unknown, cell) - need, ~(hazardous | unknown))
+
+
+def _distance(mask: Mask, cell: float) -> Floats:
+    far = distance_transform_edt(~mask) * cell if mask.any() else np.full(mask.shape, np.inf)
+    return np.asarray(far, dtype=np.float64)
 
 
 def costs(price: Floats, goals: Mask, cell: float) -> tuple[Floats, NDArray[np.int32]]:
@@ -112,7 +128,7 @@ def costs(price: Floats, goals: Mask, cell: float) -> tuple[Floats, NDArray[np.i
 
 
 def plan_leg(
-    risk: NDArray[np.uint8],
+    hazards: Hazards,
     lattice: Lattice,
     vehicle: Vehicle,
     start: Point,
@@ -126,7 +142,7 @@ def plan_leg(
 
     Parameters
     ----------
-    risk : (row, col) classes of :mod:`stages.risk`.
+    hazards : of the map known so far.
     start, heading : m; rad to the left of y.
     looks : looks around since the last leg that was driven.
     closed : places about which unknown ground was looked at in vain.
@@ -143,15 +159,14 @@ def plan_leg(
     left = math.hypot(goal[0] - start[0], goal[1] - start[1])
     if left <= params.tolerance * base:
         return Leg("goal", f"{1000 * left:.0f} mm from the goal", _line([start]), 0.0, _line([start]), nothing)
-    hazard, unknown = clear(risk, cell, vehicle)
     here = np.hypot(xy[..., 0] - start[0], xy[..., 1] - start[1]) <= 0.3 * base
-    opened = (hazard > vehicle.margin) | here
-    known = (opened & (unknown > 0.0) & (risk == SAFE)) | here
+    opened = (hazards.gap > vehicle.margin) | here
+    known = (opened & (hazards.unknown > 0.0) & hazards.free) | here
     for x, y in closed or []:
         opened &= known | (np.hypot(xy[..., 0] - x, xy[..., 1] - y) > params.vain * base)
     price = np.where(known, 1.0, params.unknown_price)
     if vehicle.margin > 0:
-        price = price + params.near_price * np.clip(2.0 - hazard / vehicle.margin, 0.0, 1.0)
+        price = price + params.near_price * np.clip(2.0 - hazards.gap / vehicle.margin, 0.0, 1.0)
     price = np.where(opened, price, np.inf)
     goals = np.hypot(xy[..., 0] - goal[0], xy[..., 1] - goal[1]) <= 0.5 * params.tolerance * base
     cost, nearer = costs(price, goals, cell)
@@ -182,13 +197,12 @@ def plan_leg(
 
 
 def shortest(
-    risk: NDArray[np.uint8], lattice: Lattice, vehicle: Vehicle, start: Point, goal: Point, tolerance: float
+    hazards: Hazards, lattice: Lattice, vehicle: Vehicle, start: Point, goal: Point, tolerance: float
 ) -> float | None:
     """Length, m, of the shortest way over known, free ground to within ``tolerance`` metres of the goal; None: none."""
-    hazard, unknown = clear(risk, lattice.cell, vehicle)
     xy = lattice.xy()
     here = np.hypot(xy[..., 0] - start[0], xy[..., 1] - start[1]) <= 0.3 * vehicle.wheel_base
-    known = ((hazard > vehicle.margin) & (unknown > 0.0) & (risk == SAFE)) | here
+    known = ((hazards.gap > vehicle.margin) & (hazards.unknown > 0.0) & hazards.free) | here
     goals = np.hypot(xy[..., 0] - goal[0], xy[..., 1] - goal[1]) <= tolerance
     cost, nearer = costs(np.where(known, 1.0, np.inf), goals, lattice.cell)
     at = _cell_of(lattice, "start", start)
@@ -292,14 +306,13 @@ def _run(params: LegParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     start = float(T.translation[0]), float(T.translation[1])
     heading = math.atan2(-T.rotation[0, 1], T.rotation[1, 1])
     goal = (float(args["goal"][0]), float(args["goal"][1]))
+    hazards = Hazards.of(np.asarray(risk["risk"]), np.asarray(risk["reason"]), lattice.cell, vehicle)
     closed = [(float(x), float(y)) for x, y in args["closed"]]
-    found = plan_leg(
-        np.asarray(risk["risk"]), lattice, vehicle, start, heading, goal, params, int(args["looks"]), closed
-    )
+    found = plan_leg(hazards, lattice, vehicle, start, heading, goal, params, int(args["looks"]), closed)
     best = None
     if args.get("whole"):
         tolerance = 0.5 * params.tolerance * vehicle.wheel_base
-        best = shortest(np.asarray(risk["risk"]), lattice, vehicle, start, goal, tolerance)
+        best = shortest(hazards, lattice, vehicle, start, goal, tolerance)
     meta = {
         "shortest_m": best,
         "verdict": found.verdict,

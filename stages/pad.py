@@ -24,7 +24,7 @@ NOBODY = -1
 class PadParams(Params):
     """Parameters of the stage ``pad``."""
 
-    sigma: float = Field(0.08, gt=0, description="wheel diameters; standard deviation of the plane's elevations")
+    sigma: float = Field(0.03, gt=0, description="wheel diameters; standard deviation of the plane's elevations")
 
 
 def pad(T_world_vehicle: RigidTransform, radius: float, cell: float) -> tuple[Lattice, np.ndarray]:

@@ -103,6 +103,7 @@ def strip(scene: Scene) -> Block | None:
     )
     legend = (
         (canvas.SAFE, "safe"),
+        (canvas.CAUTION, "caution"),
         (canvas.HAZARDOUS, "hazardous"),
         (canvas.UNKNOWN, "unknown"),
         (canvas.ESTIMATE, "estimated track"),
@@ -156,8 +157,8 @@ def column(s: Shown, alt: str) -> Panel:
     color = canvas.HAZARDOUS if s.event else canvas.MARK
     fig.text(0.5, 1 - 0.6 * top / total, s.title, ha="center", va="center", fontsize=9, color=color)
     axes[0].imshow(s.image, cmap="gray", vmin=0, vmax=255, aspect="auto")
-    colors = np.array([_rgb(c) for c in (canvas.SAFE, canvas.HAZARDOUS, canvas.UNKNOWN)])
-    _map(axes[1], colors[np.minimum(s.risk, 2)], whole, near)
+    colors = np.array([_rgb(c) for c in (canvas.SAFE, canvas.CAUTION, canvas.HAZARDOUS, canvas.UNKNOWN)])
+    _map(axes[1], colors[s.risk], whole, near)
     axes[1].plot(s.way[:, 0], s.way[:, 1], color=canvas.MARK, linewidth=0.7)
     if len(s.path) > 1:
         axes[1].plot(s.path[:, 0], s.path[:, 1], color="white", linewidth=4)

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from stages.errors import InputError
 from stages.lattice import Lattice
-from stages.leg import LegParams, costs, half_width, plan_leg, shortest
-from stages.risk import HAZARDOUS, SAFE, UNKNOWN
+from stages.leg import Hazards, LegParams, costs, half_width, plan_leg, shortest
+from stages.risk import HAZARDOUS, REASONS, SAFE, UNKNOWN
 from stages.vehicle import Vehicle
 
 ROVER = Vehicle(
@@ -26,11 +26,11 @@ X, Y = LATTICE.xy()[..., 0], LATTICE.xy()[..., 1]
 P = LegParams()
 
 
-def ground(*changes: tuple[np.ndarray, int]) -> np.ndarray:
+def ground(*changes: tuple[np.ndarray, int]) -> Hazards:
     risk = np.full(LATTICE.shape, SAFE, np.uint8)
     for where, kind in changes:
         risk[where] = kind
-    return risk
+    return Hazards.of(risk, None, LATTICE.cell, ROVER)
 
 
 def test_over_free_ground_it_goes_straight_one_leg_far() -> None:
@@ -126,11 +126,11 @@ def test_costs_are_those_of_networkx(seed: int, rows: int, cols: int) -> None:
 @given(st.integers(0, 2**31))
 def test_no_leg_comes_near_a_hazard_or_onto_unknown_ground(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    risk = ground()
+    risk = np.full(LATTICE.shape, SAFE, np.uint8)
     for _ in range(8):
         x, y, r = rng.uniform(-0.4, 0.4), rng.uniform(0.12, 0.9), rng.uniform(0.01, 0.04)
         risk[np.hypot(X - x, Y - y) < r] = rng.choice([HAZARDOUS, UNKNOWN])
-    leg = plan_leg(risk, LATTICE, ROVER, START, 0.0, GOAL, P)
+    leg = plan_leg(Hazards.of(risk, None, LATTICE.cell, ROVER), LATTICE, ROVER, START, 0.0, GOAL, P)
     line = np.concatenate([np.linspace(a, b, 20) for a, b in zip(leg.path, leg.path[1:], strict=False)] or [leg.path])
     line = line[np.hypot(*line.T) > 0.3 * ROVER.wheel_base]  # where it stands already is as it is
     for kind, need in ((HAZARDOUS, half_width(ROVER) + ROVER.margin), (UNKNOWN, half_width(ROVER))):
@@ -138,6 +138,19 @@ def test_no_leg_comes_near_a_hazard_or_onto_unknown_ground(seed: int) -> None:
         if len(there) and len(line):
             gap = np.hypot(*(line[:, None] - there[None]).transpose(2, 0, 1)).min()
             assert gap > need - 0.5 * math.sqrt(2) * LATTICE.cell - 1e-9  # a point of the line is within its cell
+
+
+def test_hazards_to_the_whole_vehicle_count_at_its_middle_alone() -> None:
+    risk = np.full(LATTICE.shape, SAFE, np.uint8)
+    reason = np.zeros(LATTICE.shape, np.uint16)
+    at = (60, 40)
+    risk[at] = HAZARDOUS
+    gaps = {}
+    for name in ("step", "tilt"):
+        reason[at] = REASONS[name]
+        gaps[name] = Hazards.of(risk, reason, LATTICE.cell, ROVER).gap[60, 50]
+    assert gaps["tilt"] == pytest.approx(0.1)
+    assert gaps["step"] == pytest.approx(0.1 - half_width(ROVER))
 
 
 def test_the_shortest_way_is_straight_or_none() -> None:
