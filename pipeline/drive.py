@@ -10,7 +10,7 @@
                                            v               ^   |                             |
                                          resect -----------+   +---------> leg <-------------+
                                            ^                                |
-                                           |          goal, no path: end    | drive, look
+                                           |          goal, no path: end    | drive, turn, look
                                            |                                v
     leg k:   safety <- sense <- drive/k (true poses) <- leg, pose (believed), drive/k-1 (where it truly stands)
                |             images on the way -> pyramid -> motion -> track -> resect -> safety
@@ -284,7 +284,7 @@ class Drive(Reconstruction):
         elif stop.index + 1 >= self.config.drive.max_stops:
             self._end("stops", f"{stop.index + 1} stops and {1000 * leg.meta['left_m']:.0f} mm from the goal")
         else:
-            self.looks = 0 if verdict == "drive" else self.looks + 1
+            self.looks = {"drive": 0, "turn": self.looks, "look": self.looks + 1}[verdict]
             stop.event = leg.meta["reason"]
             self._drive(stop, before, row)
 

@@ -11,6 +11,7 @@ The vehicle turns on the spot, so that what it needs is the circle of its wheels
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -53,7 +54,7 @@ class LegParams(Params):
 
 @dataclass(frozen=True)
 class Leg:
-    """``verdict``: drive, look, closed, goal or no path; ``path`` (vertex, 2) m to drive; ``turn`` rad then.
+    """``verdict``: drive, turn, look, closed, goal or no path; ``path`` (vertex, 2) m to drive; ``turn`` rad then.
 
     ``closed``: looking around did not help; ``where`` the way is not known to be free.
 
@@ -177,23 +178,26 @@ def plan_leg(
     cells = _follow(nearer, at, lattice)
     way = _points(lattice, cells, start)
     path = _safe_part(cells, way, known, lattice, params.length * base)
-    path, turn = _within_turn(path, heading, math.radians(params.max_turn_deg))
-    if len(path) > 1 and _length(path) >= min(params.least * base, left):
-        return Leg("drive", "", path, 0.0, way, shown)
-    ahead = way[min(len(way) - 1, max(1, int(1.5 * base / cell)))]
-    wanted = _turn_to(start, (float(ahead[0]), float(ahead[1])), heading)
-    if len(path) > 1 or abs(turn) > 0:
-        wanted = turn
+    if _length(path) >= min(params.least * base, left):
+        path, turn = _within_turn(path, heading, math.radians(params.max_turn_deg))
+        if len(path) > 1:
+            return Leg("drive", "", path, 0.0, way, shown)
+        return Leg("turn", f"turns {math.degrees(turn):.0f} degrees to where it goes on", path, turn, way, shown)
     if looks >= params.looks:
         free = known[cells[:, 0], cells[:, 1]]
         x, y = way[int(np.argmin(free))] if not free.all() else way[-1]
         reason = f"{looks} looks around did not show the ground at ({x:.3f}, {y:.3f}) m"
         return Leg("closed", reason, _line([start]), 0.0, way, shown, (float(x), float(y)))
+    ahead = way[min(len(way) - 1, max(1, int(1.5 * base / cell)))]
+    turn = _look_to(_turn_to(start, ahead, heading), looks, math.radians(params.max_turn_deg))
+    return Leg("look", f"turns {math.degrees(turn):.0f} degrees to see the way", _line([start]), turn, way, shown)
+
+
+def _look_to(wanted: float, looks: int, bound: float) -> float:
+    """Turn to look along the way; where it looks there already, to one side and then to the other."""
     if abs(wanted) < math.radians(8.0):
         wanted = math.radians((25.0, -50.0, 75.0)[looks % 3])
-    bound = math.radians(params.max_turn_deg)
-    wanted = max(-bound, min(bound, wanted))
-    return Leg("look", f"turns {math.degrees(wanted):.0f} degrees to see the way", _line([start]), wanted, way, shown)
+    return max(-bound, min(bound, wanted))
 
 
 def shortest(
@@ -260,19 +264,31 @@ def _points(lattice: Lattice, cells: NDArray[np.int64], start: Point) -> Floats:
 
 
 def _safe_part(cells: NDArray[np.int64], way: Floats, known: Mask, lattice: Lattice, length: float) -> Floats:
-    """The way up to where it is not known to be free, or ``length`` is reached, as straight pieces over free cells."""
+    """The way up to where it is not known to be free, as straight pieces over free cells, and of it ``length`` metres.
+
+    It is straightened before it is cut: where a way on a grid turns is a matter of ties.
+    """
     free = known[cells[:, 0], cells[:, 1]]
     stop = int(np.argmin(free)) if not free.all() else len(free)
-    run = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(way, axis=0).T))])
-    stop = min(stop, int(np.searchsorted(run, length, side="right")))
     if stop < 2:
         return way[:1]
-    chosen, i = [0], 0
+    chosen, i = [way[0]], 0
     while i < stop - 1:
-        j = next(j for j in range(stop - 1, i, -1) if j == i + 1 or _sees(way[i], way[j], known, lattice))
-        chosen.append(j)
-        i = j
-    return way[chosen]
+        i = next(j for j in range(stop - 1, i, -1) if j == i + 1 or _sees(way[i], way[j], known, lattice))
+        chosen.append(way[i])
+    return _cut(np.array(chosen), length)
+
+
+def _cut(path: Floats, length: float) -> Floats:
+    """The first ``length`` metres of a path."""
+    out, left = [path[0]], length
+    for a, b in itertools.pairwise(path):
+        step = float(np.hypot(*(b - a)))
+        if step >= left:
+            return np.array([*out, a + (left / step) * (b - a)])
+        out.append(b)
+        left -= step
+    return np.array(out)
 
 
 def _sees(a: Floats, b: Floats, known: Mask, lattice: Lattice) -> bool:
