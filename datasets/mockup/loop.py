@@ -13,6 +13,7 @@ from datasets.mockup.rover import RoverParams
 from datasets.mockup.sequence import given_rig, mount, true_rig, vehicle_at_scale
 from datasets.protocol import Simulation, Source
 from stages.declare import NoParams
+from stages.errors import InputError
 from stages.geometry import RigidTransform
 
 LOOP: Mapping[str, Any] = {
@@ -84,7 +85,7 @@ def mockup_loop(p: MockupParams, rover: RoverParams, name: str = "mockup-loop") 
     )
 
     def nothing(frame: int, camera: str) -> Source:
-        raise AssertionError("images of a drive come about on the way")
+        raise InputError("images of a drive come about on the way", remedy=f"rille drive {name}")
 
     return protocol.Sequence(
         name=name,

@@ -94,7 +94,6 @@ def test_it_looks_around_then_closes_what_stays_unknown_and_goes_another_way() -
         assert len(places) < 12
     assert leg.verdict == "turn"
     assert leg.turn < 0  # to the right, where more is known
-    assert min(np.hypot(*(leg.way - place).T).min() for place in places) > P.vain * ROVER.wheel_base - LATTICE.cell
 
 
 @settings(max_examples=25, deadline=None)
