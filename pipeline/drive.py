@@ -13,9 +13,10 @@
                                            |          goal, no path: end    | drive, turn, look
                                            |                                v
     leg k:   safety <- sense <- drive/k (true poses) <- leg, pose (believed), drive/k-1 (where it truly stands)
-               |             images on the way -> pyramid -> motion -> track -> resect -> safety
+               |             images on the way -> pyramid -> motion -> track -> resect -> safety, reflex
+               |             motion (a baseline apart), locus (local) ---------------------> reflex
                v
-             stop k+1 at the last image, or at the one that a safety stop names
+             stop k+1 at the last image, or at the one where safety or reflex stopped
 
 ``drive``, ``sense``, the images and nothing else know the true poses. What the vehicle believes is the trajectory:
 the product of the segments that were tracked and resected. Every node is keyed by what it reads, so a drive that is

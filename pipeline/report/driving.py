@@ -101,6 +101,7 @@ def strip(scene: Scene) -> Block | None:
         "and the way as planned beyond it (thin); the star is the goal. Third: the merged elevations of all stops so "
         "far with the vehicle's track, estimated (blue) and true (orange)."
     )
+    caption += _fixed(scene)
     legend = (
         (canvas.SAFE, "safe"),
         (canvas.CAUTION, "caution"),
@@ -111,6 +112,23 @@ def strip(scene: Scene) -> Block | None:
     )
     table = Table(head, tuple(rows), frozenset({0, 1, 2, 4, 5}))
     return Block("Drive", "The drive, stop by stop", caption, tuple(panels), legend, table, strip=True)
+
+
+def _fixed(scene: Scene) -> str:
+    """Where the start is in the global map, in words; empty without one."""
+    drive = scene.view.products.drive
+    fix = None if drive is None else scene.view.bundle(drive.fix)
+    if fix is None:
+        return ""
+    x, y = fix.meta["T_global_local"][3], fix.meta["T_global_local"][7]
+    place = f" In the global map the first camera is at ({x:.3f}, {y:.3f}) m, {fix.meta['source']}"
+    if "std" not in fix.meta:
+        return place + "."
+    sx, sy, heading, _ = fix.meta["std"]
+    other = fix.meta["other"]
+    next_best = "" if other is None else f"; the next best place has a chi2 larger by {other['chi2']:.0f}"
+    turn = f"{np.degrees(heading):.2f}°"
+    return f"{place} (standard deviations {metres(sx)}, {metres(sy)}, {turn}){next_best}."
 
 
 def tracks(scene: Scene) -> tuple[Floats, Floats | None]:
