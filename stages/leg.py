@@ -1,10 +1,11 @@
 """The next leg of a drive to a goal: where to, how far of it is safe to drive now, or why no way leads there.
 
 The way is planned to the goal over all of the map. Ground that is known and free costs its length; unknown ground may
-be planned over, at a higher price, since the next stop will see it, but is never driven on: the leg ends before it.
-Ground that is known to be hazardous, or nearer to it than the vehicle and its margin need, is closed. So the way bends
-round dead ends as soon as they are seen, and where no way is left even over unknown ground there is none. This is the
-usual free-space assumption (Koenig, Tovey, Smirnov 2003, doi:10.1016/S0004-3702(03)00062-6), planned anew at each stop.
+be planned over, at a higher price, since the next stop will see it, but is never driven on: the leg ends before it. So
+may ground that is hazardous only by the standard deviation of its elevations. Ground that is known to be hazardous, or
+nearer to it than the vehicle and its margin need, is closed. So the way bends round dead ends as soon as they are seen,
+and where no way is left even over unknown ground there is none. This is the usual free-space assumption (Koenig, Tovey,
+Smirnov 2003, doi:10.1016/S0004-3702(03)00062-6), planned anew at each stop.
 
 The vehicle turns on the spot, so that what it needs is the circle of its wheels.
 """
@@ -29,7 +30,7 @@ from stages.errors import InputError
 from stages.geometry import RigidTransform
 from stages.lattice import Lattice
 from stages.path import WHEEL_BITS
-from stages.risk import HAZARDOUS, UNKNOWN
+from stages.risk import DOUBT_BIT, HAZARDOUS, UNKNOWN
 from stages.vehicle import Vehicle
 
 Floats = NDArray[np.float64]
@@ -81,10 +82,12 @@ class Hazards:
 
     ``gap`` m from the vehicle standing on a cell to the nearest hazard: from the circle of its wheels to what is
     hazardous to a wheel, from its middle to where the vehicle as a whole would tilt or strike. ``unknown`` m from the
-    circle to unknown ground. ``free``: the cell itself is neither hazardous nor unknown.
+    circle to unknown ground. ``free``: the cell itself is neither hazardous nor unknown. ``proven`` m as ``gap``, to
+    hazards that are not just the map's uncertainty: what is far is uncertain, and the next stop knows more.
     """
 
     gap: Floats
+    proven: Floats
     unknown: Floats
     free: Mask
 
@@ -92,11 +95,15 @@ class Hazards:
     def of(risk: NDArray[np.uint8], reason: NDArray[np.uint16] | None, cell: float, vehicle: Vehicle) -> Hazards:
         """From classes and reason bits of :mod:`stages.risk`; without bits every hazard is one to a wheel."""
         hazardous = risk == HAZARDOUS
-        wheel = hazardous if reason is None else hazardous & ((reason & WHEEL_BITS) > 0)
+        bits = np.full(risk.shape, WHEEL_BITS) if reason is None else reason
+        wheel, doubt = (bits & WHEEL_BITS) > 0, (bits & DOUBT_BIT) > 0
         need = half_width(vehicle)
-        gap = np.minimum(_distance(wheel, cell) - need, _distance(hazardous & ~wheel, cell))
+        gaps = [
+            np.minimum(_distance(which & wheel, cell) - need, _distance(which & ~wheel, cell))
+            for which in (hazardous, hazardous & ~doubt)
+        ]
         unknown = risk == UNKNOWN
-        return Hazards(gap, _distance(unknown, cell) - need, ~(hazardous | unknown))
+        return Hazards(gaps[0], gaps[1], _distance(unknown, cell) - need, ~(hazardous | unknown))
 
 
 def _distance(mask: Mask, cell: float) -> Floats:
@@ -161,8 +168,8 @@ def plan_leg(
     if left <= params.tolerance * base:
         return Leg("goal", f"{1000 * left:.0f} mm from the goal", _line([start]), 0.0, _line([start]), nothing)
     here = np.hypot(xy[..., 0] - start[0], xy[..., 1] - start[1]) <= 0.3 * base
-    opened = (hazards.gap > vehicle.margin) | here
-    known = (opened & (hazards.unknown > 0.0) & hazards.free) | here
+    opened = (hazards.proven > vehicle.margin) | here
+    known = ((hazards.gap > vehicle.margin) & (hazards.unknown > 0.0) & hazards.free) | here
     for x, y in closed or []:
         opened &= known | (np.hypot(xy[..., 0] - x, xy[..., 1] - y) > params.vain * base)
     price = np.where(known, 1.0, params.unknown_price)

@@ -144,8 +144,22 @@ def test_hazards_to_the_whole_vehicle_count_at_its_middle_alone() -> None:
     for name in ("step", "tilt"):
         reason[at] = REASONS[name]
         gaps[name] = Hazards.of(risk, reason, LATTICE.cell, ROVER).gap[60, 50]
+    reason[at] |= REASONS["uncertain"]
+    doubtful = Hazards.of(risk, reason, LATTICE.cell, ROVER)
+    assert doubtful.gap[60, 50] == pytest.approx(0.1)
+    assert doubtful.proven[60, 50] == np.inf
     assert gaps["tilt"] == pytest.approx(0.1)
     assert gaps["step"] == pytest.approx(0.1 - half_width(ROVER))
+
+
+def test_uncertain_ground_is_planned_over_and_not_driven_on() -> None:
+    risk, reason = np.full(LATTICE.shape, SAFE, np.uint8), np.zeros(LATTICE.shape, np.uint16)
+    wall = np.abs(Y - 0.2) < 0.02
+    risk[wall], reason[wall] = HAZARDOUS, REASONS["step"] | REASONS["uncertain"]
+    leg = plan_leg(Hazards.of(risk, reason, LATTICE.cell, ROVER), LATTICE, ROVER, START, 0.0, GOAL, P)
+    assert leg.verdict == "drive"
+    assert leg.path[-1, 1] <= 0.18 - half_width(ROVER) - ROVER.margin + LATTICE.cell
+    assert leg.way[-1, 1] > 0.75
 
 
 def test_the_shortest_way_is_straight_or_none() -> None:
