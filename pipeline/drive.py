@@ -49,23 +49,31 @@ class DriveParams(Params):
     """The loop itself; what happens on a leg and at a stop is the stages' own."""
 
     goal: tuple[float, float] | None = Field(
-        None, description="m; x, y of the goal in the world frame, which begins at the first left camera"
+        default=None, description="m; x, y of the goal in the world frame, which begins at the first left camera"
     )
     frame: Literal["world", "map"] = Field(
-        "world", description="what the goal is given in: the world frame, or the global map's, where there is one"
+        default="world",
+        description="what the goal is given in: the world frame, or the global map's, where there is one",
     )
     prior: tuple[float, float, float] | None = Field(
-        None, description="m, m, degrees to the left; where the first left camera roughly is in the global map"
+        default=None, description="m, m, degrees to the left; where the first left camera roughly is in the global map"
     )
-    prior_sigma: tuple[float, float] = Field((0.1, 5.0), description="m, degrees; standard deviations of the prior")
+    prior_sigma: tuple[float, float] = Field(
+        default=(0.1, 5.0), description="m, degrees; standard deviations of the prior"
+    )
     pose: tuple[float, float, float, float] | None = Field(
-        None, description="m, m, m, degrees; its pose in the global map, handed in instead of found"
+        default=None, description="m, m, m, degrees; its pose in the global map, handed in instead of found"
     )
-    around: float = Field(0.6, gt=0, description="m; the map reaches this far around start and goal")
-    max_stops: int = Field(40, ge=1, description="stops after which the drive is given up")
-    max_safety_stops: int = Field(3, ge=1, description="safety stops in a row from which the drive does not recover")
+    around: float = Field(default=0.6, gt=0, description="m; the map reaches this far around start and goal")
+    max_stops: int = Field(default=40, ge=1, description="stops after which the drive is given up")
+    max_safety_stops: int = Field(
+        default=3, ge=1, description="safety stops in a row from which the drive does not recover"
+    )
     least_match: float = Field(
-        0.1, ge=0, le=1, description="share of the pixels with texture that match the image before; below: a lost image"
+        default=0.1,
+        ge=0,
+        le=1,
+        description="share of the pixels with texture that match the image before; below: a lost image",
     )
 
 

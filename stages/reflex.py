@@ -144,7 +144,7 @@ def _seen(view: View, cells: Floats, camera: Camera) -> tuple[NDArray[np.intp], 
     scale = 2.0**view.level
     in_camera = view.before.inverse().apply(cells)
     at = np.rint((np.nan_to_num(camera.project(in_camera), nan=-1e6) + 0.5) / scale - 0.5).astype(np.intp)
-    ok = ((at >= 0) & (at < [cols, rows])).all(axis=1)
+    ok: Bools = np.asarray(((at >= 0) & (at < [cols, rows])).all(axis=1))
     ok[ok] &= view.matched[at[ok, 1], at[ok, 0]]
     at, cells, depth = at[ok], cells[ok], in_camera[ok, 2]
     order = np.lexsort((depth, at[:, 0], at[:, 1]))
@@ -154,7 +154,7 @@ def _seen(view: View, cells: Floats, camera: Camera) -> tuple[NDArray[np.intp], 
     rays = camera.rays(centre) @ view.before.rotation.T
     origin = view.before.translation
     ground = origin + ((cells[keep, 2] - origin[2]) / rays[:, 2])[:, None] * rays
-    return at[keep], ground, centre
+    return np.asarray(at[keep]), np.asarray(ground), np.asarray(centre)
 
 
 def cluster(points: Points, wheel: float, p: ReflexParams) -> tuple[int, float, float] | None:

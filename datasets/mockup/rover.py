@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from stages.declare import Array, Bundle, Inputs, Params, Stage
+from stages.declare import AnyArray, Array, Bundle, Inputs, Params, Stage
 from stages.errors import InputError
 from stages.geometry import RigidTransform
 from stages.vehicle import Vehicle
@@ -194,7 +194,7 @@ def _run(params: RoverParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle
     frames = images_at(wheels, params)
     vehicles = np.stack([s.T_ground_vehicle.matrix34 for s in d.trail])
     lefts = np.stack([(d.trail[i].T_ground_vehicle @ T_left_vehicle.inverse()).matrix34 for i in frames])
-    arrays = {
+    arrays: dict[str, AnyArray] = {
         "poses": lefts,
         "vehicle": vehicles[frames],
         "trail": vehicles,
