@@ -120,7 +120,10 @@ def _down(buffer, rows, n, slant):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def median3(z):  # type: ignore[no-untyped-def]
-    """Median (row, col) of the known cells in 3 x 3; unknown stays unknown. Of an even number: mean of two."""
+    """Median (row, col) of the known cells in 3 x 3; unknown stays unknown.
+
+    Of an even number the upper one: the mean of two heights would not be one of the heights.
+    """
     rows, cols = z.shape
     out = np.full((rows, cols), np.nan, dtype=np.float32)
     for r in range(1, rows - 1):
@@ -183,4 +186,4 @@ def _median_known(z, r, c):  # type: ignore[no-untyped-def]
                 k -= 1
             v[k] = value
             m += 1
-    return v[m // 2] if m % 2 else np.float32(0.5) * (v[m // 2 - 1] + v[m // 2])
+    return v[m // 2]

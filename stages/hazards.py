@@ -31,7 +31,8 @@ exceeds the limit; with ``k spread >= bias``, which is enforced, more noise is n
 
 ``p_hazard`` is the probability that the exact measure exceeds its limit, ``F((V - bias s - limit) / (spread s))``, of
 the worst measure: all of them look at one ground, so they err together. F has wider tails than the normal distribution
-(Student's t), since matching errs grossly now and then.
+(Student's t), since matching errs grossly now and then. Unknown ground in a window hides what would raise a measure, so
+up to the limit it widens the doubt (:data:`HIDDEN`).
 """
 
 from __future__ import annotations
@@ -55,15 +56,21 @@ MEASURES = ("inclination", "range", "step", "roughness", "slope", "tilt", "rise"
 BITS = {name: 1 << k for k, name in enumerate(MEASURES)}
 
 NOISE = {
-    "inclination": (0.5, 1.0),
-    "range": (0.5, 1.0),
-    "step": (0.5, 1.0),
-    "roughness": (0.1, 0.3),
-    "slope": (0.3, 1.0),
-    "tilt": (0.3, 1.0),
-    "rise": (0.3, 1.0),
+    "inclination": (0.1, 0.95),
+    "range": (0.05, 0.8),
+    "step": (0.05, 0.9),
+    "roughness": (0.0, 0.3),
+    "slope": (0.3, 2.0),
+    "tilt": (0.0, 2.5),
+    "rise": (0.3, 2.5),
 }
-"""Bias and spread of each measure's heights over the RMS standard deviation of the elevations in the window."""
+"""Bias and spread of each measure's heights over the RMS standard deviation of the elevations that it looks at, found
+on simulated pairs (``benchmarks/hazards.py``). Elevations of a matcher err together over some cells, so the bias is far
+below that of as many independent ones; the last three look at places far apart, which err less alike."""
+
+HIDDEN = (0.5, 0.5)
+"""Steps of the vehicle by which unknown ground widens the doubt of a measure, where all of the wheel's window, or of
+the ground below the vehicle, is unknown: what is hidden there is not in the measures."""
 
 FREEDOM = 3.0
 """Degrees of freedom of Student's t."""
@@ -83,6 +90,7 @@ class Measured:
 
     values: dict[str, Floats32]
     noise: Floats32
+    noise_under: Floats32
     share: Floats32
     unstood: Floats32
     stride: int
@@ -104,7 +112,14 @@ def window_reach(side: float, cell: float) -> int:
     return max(1, int(side / (2.0 * cell) + 1e-6))
 
 
-def measure(elevation: Floats32, elevation_std: Floats32, cell: float, vehicle: Vehicle, window: float) -> Measured:
+def measure(
+    elevation: Floats32,
+    elevation_std: Floats32,
+    cell: float,
+    vehicle: Vehicle,
+    window: float,
+    filled: NDArray[np.uint8] | None = None,
+) -> Measured:
     """All measures of an elevation model.
 
     Parameters
@@ -112,8 +127,11 @@ def measure(elevation: Floats32, elevation_std: Floats32, cell: float, vehicle: 
     elevation, elevation_std : (row, col) float32, metres, NaN unknown; the latter 0 where it is not known.
     cell : side of a cell, metres.
     window : metres, side of the wheel's window.
+    filled : not 0 where the elevation is interpolated: it counts as known and with its noise, but heights between other
+        heights prove no relief (and a rim that is raised would raise them over lower ground).
     """
-    surface = median3(elevation) if 3 * cell <= 0.5 * vehicle.wheel_diameter else elevation
+    surface = elevation if filled is None else np.where(filled != 0, np.float32(np.nan), elevation)
+    surface = median3(surface) if 3 * cell <= 0.5 * vehicle.wheel_diameter else surface
     reach, near = window_reach(window, cell), window_reach(0.5 * window, cell)
     values = {}
     high, low = running_range(surface, reach)
@@ -123,15 +141,18 @@ def measure(elevation: Floats32, elevation_std: Floats32, cell: float, vehicle: 
     values["step"] = _difference(high, low)
     n = stride(vehicle, cell)
     lag = max(1, round(0.25 * vehicle.wheel_diameter / cell))
-    highest, lowest, sums = _blocks(surface, elevation_std, n, lag)
+    highest, lowest, sums = _blocks(surface, elevation, elevation_std, n, lag)
     around = 2 * round(reach / n) + 1
     count, square, number, deviation = (window_sum(a, around) for a in sums)
     values["roughness"] = np.sqrt(0.5 * deviation / np.maximum(number, 1.0)).astype(np.float32)
-    places = place(highest, lowest, vehicle, n * cell)
+    whole = sums[0] > n * n - 0.5
+    places = place(highest, lowest, vehicle, n * cell, whole)
+    wide = 2 * round((vehicle.half_length + vehicle.half_width) / (2.0 * n * cell)) + 1
+    under = np.sqrt(window_sum(sums[1], wide) / np.maximum(window_sum(sums[0], wide), 1.0)).astype(np.float32)
     values |= {"slope": places.slope, "tilt": places.tilt, "rise": places.rise}
     noise = np.sqrt(square / np.maximum(count, 1.0)).astype(np.float32)
     share = (count / float((around * n) ** 2)).astype(np.float32)
-    return Measured(values, noise, share, places.unstood, n)
+    return Measured(values, noise, under, share, places.unstood, n)
 
 
 def limits(vehicle: Vehicle) -> dict[str, float]:
@@ -171,12 +192,20 @@ def judge(measured: Measured, vehicle: Vehicle, window: float, cell: float, sigm
         )
         for name in MEASURES
     }
-    coarse = _judge([measured.values[n] for n in blocks], [facts[n] for n in blocks], measured.noise)
+    gap, patchy = np.float32(vehicle.max_step) * (1.0 - np.minimum(measured.share, 1.0)), measured.unstood
+    doubt = np.hypot(measured.noise, np.float32(HIDDEN[0]) * gap).astype(np.float32)
+    below = np.hypot(measured.noise_under, np.float32(HIDDEN[1] * vehicle.max_step) * patchy).astype(np.float32)
+    wheel = measured.noise, doubt
+    coarse = _judge(
+        [measured.values[n] for n in blocks],
+        [facts[n] for n in blocks],
+        [wheel if n == "roughness" else (measured.noise_under, below) for n in blocks],
+    )
     out = Judged(
         np.empty(shape, np.float32), np.empty(shape, np.float32), np.empty(shape, np.uint16), np.empty(shape, np.uint8)
     )
     _combine(
-        np.stack([facts[n] for n in fine]), *(measured.values[n] for n in fine), *coarse, measured.noise,
+        np.stack([facts[n] for n in fine]), *(measured.values[n] for n in fine), *coarse, *wheel,
         measured.stride, table, out.load, out.p, out.bits, out.doubt,
     )  # fmt: skip
     return out
@@ -188,17 +217,19 @@ def spread_out(blocks: NDArray, n: int, shape: tuple[int, int]) -> NDArray:
 
 
 def _judge(
-    values: list[Floats32], facts: list[Floats32], noise: Floats32
+    values: list[Floats32], facts: list[Floats32], noises: list[tuple[Floats32, Floats32]]
 ) -> tuple[Floats32, Floats32, NDArray[np.uint16]]:
     """Greatest load, greatest standardised excess and bits of the measures on blocks."""
-    load, excess = np.zeros(noise.shape, np.float32), np.full(noise.shape, -FARTHEST, np.float32)
-    bits = np.zeros(noise.shape, np.uint16)
+    shape = values[0].shape
+    load, excess = np.zeros(shape, np.float32), np.full(shape, -FARTHEST, np.float32)
+    bits = np.zeros(shape, np.uint16)
     least = np.float32(1e-12)
-    for v, (limit, bias, spread, added, bit) in zip(values, facts, strict=True):
+    for v, (limit, bias, spread, added, bit), (noise, doubt) in zip(values, facts, noises, strict=True):
         here = (v + added * noise) / limit
         bits[here > 1.0] |= np.uint16(bit)
         np.maximum(load, here, out=load)
-        np.maximum(excess, (v - bias * noise - limit) / (spread * noise + least * limit), out=excess)
+        over = v - bias * noise - limit
+        np.maximum(excess, over / (spread * np.where(over > 0, noise, doubt) + least * limit), out=excess)
     return load, excess, bits
 
 
@@ -214,10 +245,19 @@ def _difference(high: Floats32, low: Floats32) -> Floats32:
     return np.maximum(np.subtract(high, low, out=high), np.float32(0.0), out=high)
 
 
+@njit(cache=True, nogil=True, inline="always")
+def _pair(sums, i, j, k, m, d):  # type: ignore[no-untyped-def]
+    square = d * d
+    sums[2][i, j] += 1.0
+    sums[3][i, j] += square
+    sums[2][k, m] += 1.0
+    sums[3][k, m] += square
+
+
 @njit(cache=True, nogil=True)
-def _blocks(z, s, n, lag):  # type: ignore[no-untyped-def]
+def _blocks(z, closed, s, n, lag):  # type: ignore[no-untyped-def]
     """Highest and lowest height of n x n cells (NaN where none is known); and sums over them: known cells, squared
-    standard deviations, pairs of known cells ``lag`` apart along either axis, their squared differences."""
+    standard deviations, pairs of cells ``lag`` apart along either axis (at both ends), their squared differences."""
     rows, cols = z.shape
     shape = ((rows + n - 1) // n, (cols + n - 1) // n)
     high, low = np.full(shape, np.nan, dtype=np.float32), np.full(shape, np.nan, dtype=np.float32)
@@ -227,11 +267,12 @@ def _blocks(z, s, n, lag):  # type: ignore[no-untyped-def]
         down = r + lag < rows
         for j in range(shape[1]):
             for c in range(j * n, min(j * n + n, cols)):
+                if closed[r, c] == closed[r, c]:
+                    sums[0][i, j] += 1.0
+                    sums[1][i, j] += s[r, c] * s[r, c]
                 v = z[r, c]
                 if v != v:
                     continue
-                sums[0][i, j] += 1.0
-                sums[1][i, j] += s[r, c] * s[r, c]
                 if not high[i, j] >= v:
                     high[i, j] = v
                 if not low[i, j] <= v:
@@ -239,32 +280,30 @@ def _blocks(z, s, n, lag):  # type: ignore[no-untyped-def]
                 if c + lag < cols:
                     d = z[r, c + lag] - v
                     if d == d:
-                        sums[2][i, j] += 1.0
-                        sums[3][i, j] += d * d
+                        _pair(sums, i, j, i, (c + lag) // n, d)
                 if down:
                     d = z[r + lag, c] - v
                     if d == d:
-                        sums[2][i, j] += 1.0
-                        sums[3][i, j] += d * d
+                        _pair(sums, i, j, (r + lag) // n, j, d)
     return high, low, sums
 
 
 @njit(cache=True, nogil=True)
-def _combine(facts, a, b, d, load0, excess0, bits0, noise, n, table, load, p, bits, doubt):  # type: ignore[no-untyped-def]
+def _combine(facts, a, b, d, load0, excess0, bits0, noise, doubtful, n, table, load, p, bits, doubt):  # type: ignore[no-untyped-def]
     rows, cols = load.shape
     values = (a, b, d)
-    wide = np.empty(cols, dtype=np.float32)
+    wide, wider = np.empty(cols, dtype=np.float32), np.empty(cols, dtype=np.float32)
     excess = np.empty(cols, dtype=np.float32)
     for r in range(rows):
         i = r // n
         for c in range(cols):
             j = c // n
-            wide[c] = noise[i, j]
+            wide[c], wider[c] = noise[i, j], doubtful[i, j]
             load[r, c] = load0[i, j]
             excess[c] = excess0[i, j]
             bits[r, c] = bits0[i, j]
         for k in range(3):
-            _hold(values[k][r], facts[k], wide, load[r], excess, bits[r])
+            _hold(values[k][r], facts[k], wide, wider, load[r], excess, bits[r])
         for c in range(cols):
             t = min(max(excess[c], -FARTHEST), FARTHEST)
             p[r, c] = table[int((t + FARTHEST) * STEPS)]
@@ -272,7 +311,7 @@ def _combine(facts, a, b, d, load0, excess0, bits0, noise, n, table, load, p, bi
 
 
 @njit(cache=True, nogil=True)
-def _hold(v, facts, noise, load, excess, bits):  # type: ignore[no-untyped-def]
+def _hold(v, facts, noise, doubt, load, excess, bits):  # type: ignore[no-untyped-def]
     """One row of one measure against its limit: facts = limit, bias, spread, added sigmas, bit."""
     limit, bias, spread, added, bit = facts[0], facts[1], facts[2], facts[3], np.uint16(facts[4])
     scale, least, none = np.float32(1.0) / limit, np.float32(1e-12) * limit, np.uint16(0)
@@ -280,5 +319,6 @@ def _hold(v, facts, noise, load, excess, bits):  # type: ignore[no-untyped-def]
         here = (v[c] + added * noise[c]) * scale
         load[c] = here if here > load[c] else load[c]
         bits[c] |= bit if here > np.float32(1.0) else none
-        t = (v[c] - bias * noise[c] - limit) / (spread * noise[c] + least)
+        over = v[c] - bias * noise[c] - limit
+        t = over / (spread * (noise[c] if over > np.float32(0.0) else doubt[c]) + least)
         excess[c] = t if t > excess[c] else excess[c]

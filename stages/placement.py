@@ -43,8 +43,8 @@ PLACES_PER_WHEEL = 7
 class Places:
     """Results (row, col) on the coarse grid, float32: gradients ``tilt`` and ``slope`` (1), ``rise`` (m).
 
-    ``unstood``: share of the headings with a wheel wholly on unknown ground; what it would do there is not in the
-    others.
+    ``unstood``: of wheels and parts of the belly, over headings, the share with unknown ground below; what is there is
+    not in the others.
     """
 
     tilt: Floats32
@@ -112,37 +112,48 @@ def stride(vehicle: Vehicle, cell: float) -> int:
     return max(1, int(vehicle.wheel_diameter / (PLACES_PER_WHEEL * cell) + 1e-6))
 
 
-def place(high: Floats32, low: Floats32, vehicle: Vehicle, cell: float) -> Places:
+def place(
+    high: Floats32, low: Floats32, vehicle: Vehicle, cell: float, whole: NDArray[np.bool_] | None = None
+) -> Places:
     """Put the vehicle down everywhere.
 
     Parameters
     ----------
     high, low : (row, col) float32, metres, highest and lowest ground in each coarse cell, NaN unknown.
     cell : side of a coarse cell, metres.
+    whole : (row, col) coarse cells that are wholly known; None: those with a height.
     """
     stance = Stance.of(vehicle, cell)
+    gaps = np.isnan(high) if whole is None else ~whole
     reach = int(max(np.abs(stance.wheels).max(), np.abs(stance.belly).max()))
     stand, _ = running_range(high, stance.wheel_reach)
     _, ground = running_range(low, stance.wheel_reach)
     belly, _ = running_range(high, stance.belly_reach)
-    padded = [np.pad(np.where(np.isfinite(a), a, np.float32(np.nan)), reach, constant_values=np.nan)
-              for a in (stand, ground, belly)]  # fmt: skip
+    patchy = [running_range(gaps.astype(np.float32), n)[0] > 0 for n in (stance.wheel_reach, stance.belly_reach)]
+    padded = [
+        np.pad(np.where(np.isfinite(a), a, np.float32(np.nan)), reach, constant_values=np.nan)
+        for a in (stand, ground, belly)
+    ]
+    padded += [np.pad(a.astype(np.float32), reach, constant_values=1.0) for a in patchy]
     out = [np.zeros(high.shape, dtype=np.float32) for _ in range(4)]
     _place(*padded, stance.wheels + reach, stance.belly + reach, stance.spans, stance.weights, *out)
     return Places(np.sqrt(out[0]), np.sqrt(out[1]), out[2], out[3])
 
 
 @njit(cache=True, nogil=True)
-def _place(stand, ground, belly, wheels, under, spans, weights, tilt, slope, rise, unstood):  # type: ignore[no-untyped-def]
+def _place(stand, ground, belly, gaps, gaps_below, wheels, under, spans, weights, tilt, slope, rise, unstood):  # type: ignore[no-untyped-def]
     rows = tilt.shape[0]
     headings = wheels.shape[0]
-    each = np.float32(1.0 / headings)
+    points = wheels.shape[1] + under.shape[1]
+    each = np.float32(1.0 / (headings * points))
     for r in range(rows):
         for k in range(headings):
             _steepest(stand, wheels[k], spans[k], r, tilt[r])
             _steepest(ground, wheels[k], spans[k], r, slope[r])
-            _missing(stand, wheels[k], r, each, unstood[r])
+            for j in range(wheels.shape[1]):
+                _missing(gaps, wheels[k, j], r, each, unstood[r])
             for j in range(under.shape[1]):
+                _missing(gaps_below, under[k, j], r, each, unstood[r])
                 _rise(belly, stand, under[k, j], wheels[k], weights[j], r, rise[r])
 
 
@@ -171,14 +182,11 @@ def _steepest(a, wheels, spans, r, out):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _missing(a, wheels, r, each, out):  # type: ignore[no-untyped-def]
-    """Add ``each`` where a wheel is on unknown ground."""
-    n = out.shape[0]
-    fl, fr = _line(a, wheels[0], r, n), _line(a, wheels[1], r, n)
-    rl, rr = _line(a, wheels[2], r, n), _line(a, wheels[3], r, n)
-    for c in range(n):
-        total = fl[c] + fr[c] + rl[c] + rr[c]
-        out[c] += np.float32(0.0) if total == total else each
+def _missing(gaps, at, r, each, out):  # type: ignore[no-untyped-def]
+    """Add ``each`` where there is a gap."""
+    line = _line(gaps, at, r, out.shape[0])
+    for c in range(out.shape[0]):
+        out[c] += each * line[c]
 
 
 @njit(cache=True, nogil=True)

@@ -1,10 +1,10 @@
 """Risk map: where a vehicle must not go, measure by measure against its limits (section 4.6).
 
-Classes, from the least to the greatest risk: *safe*; *caution*, where a measure comes near its limit, or where some
-of the ground that it looks at is unknown (in the wheel's window, or under a wheel at some heading); *hazard*, where a
-measure exceeds its limit, or may within ``sigmas`` standard deviations; and *unknown*, where too little of the window
-is known to say, which is never entered. The measures, their noise and the probability are those of
-:mod:`stages.hazards`; each that exceeds its limit has its bit in ``reason``.
+Classes, from the least to the greatest risk: *safe*; *caution*, where a measure comes near its limit, or exceeds it
+with a probability of more than ``max_p``, as beside unknown ground; *hazard*, where a measure exceeds its limit, or
+does with ``sigmas`` standard deviations added; and *unknown*, where too little of the window is known to say, which
+is never entered. The measures, their noise and the probability are those of :mod:`stages.hazards`; each that exceeds
+its limit has its bit in ``reason``.
 
 Where three cells are at most a wheel's radius, a 3 x 3 median first removes single wrong cells; coarser models keep
 every cell, since one cell may then be a post.
@@ -55,13 +55,16 @@ class RiskParams(Params):
         default=1.0, gt=0, le=20, description="wheel diameters; side of the window, since a wheel bridges what is finer"
     )
     sigmas: float = Field(
-        default=2.0,
+        default=1.25,
         ge=0,
         le=10,
         description="standard deviations added to a measure before it is held against its limit",
     )
     caution: float = Field(
         default=0.75, gt=0, le=1, description="share of a limit from which a cell asks for caution: the usual reserve"
+    )
+    max_p: float = Field(
+        default=0.02, gt=0, lt=0.5, description="probability of a hazard from which a cell asks for caution"
     )
     min_known: float = Field(
         default=0.5, gt=0, le=1, description="share of the window that must be known; 0.5 is a straight border"
@@ -105,14 +108,15 @@ def risk_map(
     z, s, filled = close_holes(
         elevation, s, p.max_hole * vehicle.wheel_diameter / cell, window_cells(window, cell), p.min_known
     )
-    measured = measure(z, s, cell, vehicle, window)
+    measured = measure(z, s, cell, vehicle, window, filled)
     judged = judge(measured, vehicle, window, cell, p.sigmas)
     known = ~np.isnan(z)
     spread = [spread_out(a, measured.stride, z.shape) for a in (measured.share, measured.unstood)]
     hazardous = known & (judged.load > 1.0)
     unknown = ~known | ((spread[0] < p.min_known) & ~hazardous)
     unseen = (spread[0] < WHOLE) | (spread[1] > 0)
-    risk = np.where((judged.load > p.caution) | unseen, np.uint8(CAUTION), np.uint8(SAFE))
+    near = (judged.load > p.caution) | (judged.p > p.max_p)
+    risk = np.where(near, np.uint8(CAUTION), np.uint8(SAFE))
     risk[hazardous], risk[unknown] = HAZARDOUS, UNKNOWN
     reason = np.where(hazardous, judged.bits, np.uint16(0))
     for mask, bit in ((unknown, UNKNOWN_BIT), (filled == 1, FILLED_BIT), (unseen, UNSEEN_BIT)):

@@ -38,7 +38,7 @@ def test_sums_means_and_planes_equal_loops(n: int) -> None:
             known = ~np.isnan(part)
             assert sums[r, c] == pytest.approx(known.sum())
             if known.any():
-                assert means[r, c] == pytest.approx(part[known].mean(), abs=1e-12)
+                assert means[r, c] == pytest.approx(part[known].mean(), abs=2.5e-7)  # float32 of about 2
             else:
                 assert np.isnan(means[r, c])
             y, x = np.nonzero(known)

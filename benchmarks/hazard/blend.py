@@ -1,0 +1,74 @@
+"""The usual way: OpenCV's rectification and matching, points gridded, slope and roughness blended to one number."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.risk import HAZARDOUS, SAFE, UNKNOWN
+from stages.windows import fit_planes, running_max, running_min
+
+from .scenes import CELL, Scene
+
+RANGE, BLOCK = 192, 5
+"""Disparities searched, and the side of SGBM's window, pixels."""
+THRESHOLD = 0.5
+"""Of the blend, as in grid maps' traversability filters."""
+
+
+def elevations(scene: Scene) -> NDArray[np.float32]:
+    """Median height (row, col), metres, of the points in each cell; NaN where there is none."""
+    left, right, rig = *scene.images, scene.rig
+    size = left.shape[::-1]
+    T = rig.T_right_left
+    R1, R2, P1, P2, Q, _, _ = cv2.stereoRectify(
+        rig.left.matrix, None, rig.right.matrix, None, size, T.rotation, T.translation, alpha=0
+    )
+    images = []
+    for image, camera, R, P in ((left, rig.left, R1, P1), (right, rig.right, R2, P2)):
+        maps = cv2.initUndistortRectifyMap(camera.matrix, None, R, P, size, cv2.CV_32FC1)
+        images.append(cv2.remap(image, *maps, cv2.INTER_LINEAR))
+    smooth = {"P1": 8 * BLOCK**2, "P2": 32 * BLOCK**2, "disp12MaxDiff": 1, "uniquenessRatio": 10}
+    matcher = cv2.StereoSGBM_create(
+        -RANGE // 2, RANGE, BLOCK, **smooth, speckleWindowSize=100, speckleRange=2, mode=cv2.STEREO_SGBM_MODE_HH
+    )
+    disparity = matcher.compute(*images).astype(np.float32) / 16.0
+    points = cv2.reprojectImageTo3D(disparity, Q)
+    good = (disparity > -RANGE // 2) & np.isfinite(points).all(axis=-1) & (points[..., 2] > 0)
+    found = scene.T_local_left.apply(points[good].astype(np.float64) @ R1)
+    low, high = scene.z_range
+    return _gridded(found[(found[:, 2] >= low) & (found[:, 2] <= high)], scene)
+
+
+def _gridded(points: NDArray[np.float64], scene: Scene) -> NDArray[np.float32]:
+    at = np.rint(scene.lattice.index(points[:, :2])).astype(np.int64)
+    inside = ((at >= 0) & (at < scene.lattice.shape)).all(axis=1)
+    cell, z = at[inside, 0] * scene.lattice.cols + at[inside, 1], points[inside, 2]
+    order = np.lexsort((z, cell))
+    cell, z = cell[order], z[order]
+    first = np.flatnonzero(np.r_[True, cell[1:] != cell[:-1]])
+    count = np.diff(np.r_[first, len(cell)])
+    out = np.full(scene.lattice.rows * scene.lattice.cols, np.nan, dtype=np.float32)
+    out[cell[first]] = z[first + count // 2]
+    return out.reshape(scene.lattice.shape)
+
+
+def blend(scene: Scene) -> dict[str, Any]:
+    """Classes (row, col): hazardous where the mean of slope, roughness and step over their limits exceeds a half."""
+    z, vehicle = elevations(scene), scene.vehicle
+    size = 2 * round(0.5 * vehicle.wheel_base / CELL) + 1
+    planes = fit_planes(z, size, CELL)
+    near = 2 * round(0.5 * vehicle.wheel_diameter / CELL) + 1
+    step = running_max(z, near) - running_min(z, near)
+    parts = (
+        np.degrees(np.arctan(planes.slope)) / vehicle.max_slope_deg,
+        planes.residual / vehicle.max_roughness,
+        step / vehicle.max_step,
+    )
+    value = sum(np.clip(part, 0.0, 1.0) for part in parts) / 3.0
+    risk = np.where(value > THRESHOLD, np.uint8(HAZARDOUS), np.uint8(SAFE))
+    risk[np.isnan(z) | ~np.isfinite(value)] = UNKNOWN
+    return {"risk": risk}
