@@ -53,27 +53,23 @@ class DriveParams(Params):
     )
     frame: Literal["world", "map"] = Field(
         default="world",
-        description="what the goal is given in: the world frame, or the global map's, where there is one",
+        description="frame of the goal: the world, or the global map where there is one",
     )
     prior: tuple[float, float, float] | None = Field(
         default=None, description="m, m, degrees to the left; where the first left camera roughly is in the global map"
     )
-    prior_sigma: tuple[float, float] = Field(
-        default=(0.1, 5.0), description="m, degrees; standard deviations of the prior"
-    )
+    prior_sigma: tuple[float, float] = Field(default=(0.1, 5.0), description="m, degrees; its standard deviations")
     pose: tuple[float, float, float, float] | None = Field(
         default=None, description="m, m, m, degrees; its pose in the global map, handed in instead of found"
     )
     around: float = Field(default=0.6, gt=0, description="m; the map reaches this far around start and goal")
     max_stops: int = Field(default=40, ge=1, description="stops after which the drive is given up")
-    max_safety_stops: int = Field(
-        default=3, ge=1, description="safety stops in a row from which the drive does not recover"
-    )
+    max_safety_stops: int = Field(default=3, ge=1, description="safety stops in a row that end the drive")
     least_match: float = Field(
         default=0.1,
         ge=0,
         le=1,
-        description="share of the pixels with texture that match the image before; below: a lost image",
+        description="share of the pixels that match the image before, below which it is lost",
     )
 
 
