@@ -1,20 +1,24 @@
-"""Hazards judged against the exact elevations: false safe, false hazard, unknown, and whether p_hazard is a probability.
+"""Hazards judged against the exact elevations: false safe, false hazard, unknown, and whether p_hazard is a
+probability.
 
 python benchmarks/hazards.py [--seeds 20] [--cover 0.05 0.1 0.2] [--json FILE] [--picture FILE]
 
-Each scene is one simulated stereo pair: a seed, a rock cover and one of the slopes, which take turns. Every way to classes
-is judged cell by cell against the risk map of the exact elevations with the same vehicle and no standard deviation:
+Each scene is one simulated stereo pair: a seed, a rock cover and one of the slopes, which take turns. Every way to
+classes is judged cell by cell against the risk map of the exact elevations with the same vehicle and no standard
+deviation:
 
 * rille: matched, reconstructed and judged with default parameters;
-* perfect DEM: exact elevations on the cells that rille has, with no standard deviation: what the ragged map alone costs;
-* SGBM + blend: OpenCV's rectification and semi-global matching, median height of a cell's points, and the usual blend of
+* perfect DEM: exact elevations on the cells that rille has, with no standard deviation: what the ragged map alone
+costs;
+* SGBM + blend: OpenCV's rectification and semi-global matching, median height of a cell's points, and the usual blend
+of
   slope and roughness, (slope / limit + roughness / limit + step / limit) / 3 of a plane fitted in the vehicle's size,
   hazardous where it exceeds 0.5 (as traversability maps do); no standard deviation, unknown where nothing is known.
 
 All poses are perfect: a single pair has none to err. 'false safe' are truly hazardous cells called safe, 'enterable
-hazard' those called safe or caution, 'false hazard' cells called hazard that are not: shares of the observed cells, those
-that are not unknown, with Wilson's 95 % interval over scenes' cells thinned to one a vehicle length (cells are not
-independent).
+hazard' those called safe or caution, 'false hazard' cells called hazard that are not: shares of the observed cells,
+those that are not unknown, with Wilson's 95 % interval over scenes' cells thinned to one a vehicle length (cells are
+not independent).
 """
 
 from __future__ import annotations

@@ -57,12 +57,18 @@ class RowGrid:
 
     def sample(self, lattice: Lattice, array: NDArray[Any], outside: float) -> NDArray[Any]:
         """An array on the lattice brought to this grid by nearest neighbour."""
-        row, col = np.indices((self.rows, self.cols))
+        if self.ahead == (0.0, 1.0) and (self.i0, self.j0) == (lattice.i0, lattice.j0) and array.shape == self._shape:
+            return array
+        row, col = np.indices(self._shape)
         at = np.rint(lattice.index(self.xy(row, col))).astype(np.int64)
         inside = ((at >= 0) & (at < lattice.shape)).all(axis=-1)
         out = np.full((self.rows, self.cols), outside, dtype=array.dtype)
         out[inside] = array[at[inside, 0], at[inside, 1]]
         return out
+
+    @property
+    def _shape(self) -> tuple[int, int]:
+        return self.rows, self.cols
 
     def to_dict(self) -> dict[str, Any]:
         """JSON form."""

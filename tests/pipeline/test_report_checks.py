@@ -29,6 +29,7 @@ from toys.finished import (
 
 from pipeline.report import artifacts, canvas, figures, gather
 from stages.declare import Bundle
+from stages.risk import RiskParams
 from stages.vehicle import Vehicle
 
 
@@ -121,7 +122,7 @@ def test_a_broken_comparison_says_why(tmp_path: Path) -> None:
 
 
 def test_no_comparison_is_told_only_where_it_was_switched_off(tmp_path: Path) -> None:
-    config = SimpleNamespace(vehicle=Vehicle(), crosscheck=SimpleNamespace(enabled=False))
+    config = SimpleNamespace(vehicle=Vehicle(), risk=RiskParams(), crosscheck=SimpleNamespace(enabled=False))
     facts, _, _, _ = written(tmp_path, view(config=config))
     assert [m["kind"] for m in facts["missing"]] == ["crosscheck"]
     assert "crosscheck.enabled = false" in facts["missing"][0]["why"]

