@@ -7,6 +7,7 @@ are cached tasks like all others. Truth is optional and only for assessment; no 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from collections.abc import Sequence as Sequence_
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -51,6 +52,44 @@ class TruthDem(Protocol):
 
 
 @dataclass(frozen=True)
+class Simulation:
+    """A vehicle that can be driven: how its true poses, its sensors' readings and its images come about.
+
+    Of each :class:`Source` here the input ports are connected by who drives: ``scene`` to the artifact of the world as
+    it is then, the others as named.
+
+    Attributes
+    ----------
+    scene : the world at the start.
+    place : true poses before the first leg (one row): ``scene``.
+    drive : ``drive(leg, row)``, true poses of a leg: ``scene``; ``before``, the leg that led here, at that row;
+        ``pose``, where the vehicle believes to be; ``leg``, what it is to drive.
+    sense : ``sense(leg)``, what its sensors say: ``drive``.
+    change : ``change(leg, row)``, the world after something happened, with ports as of ``drive``; None: nothing does.
+    image : ``image(frame, camera, T_truth_left)``: ``scene``.
+    truth_dem : ``truth_dem(lattice, T_truth_world, T_truth_left of stops)``: ``scene``.
+    T_vehicle_left : mounting of the left camera; the vehicle's frame is between its wheels on the ground, y ahead.
+    pad : m; radius about the start whose ground is known.
+    overview : a coarse elevation model of the whole world in a frame of its own: ``scene``.
+    """
+
+    scene: Source
+    place: Source
+    drive: Callable[[int, int], Source]
+    sense: Callable[[int], Source]
+    change: Callable[[int, int], Source | None]
+    image: Callable[[int, str, RigidTransform], Source]
+    truth_dem: Callable[[Mapping[str, Any], RigidTransform, Sequence_[RigidTransform]], Source]
+    T_vehicle_left: RigidTransform
+    pad: float
+    overview: Source | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON form of what the rover knows of itself (the sources have keys of their own)."""
+        return {"T_vehicle_left": self.T_vehicle_left.to_list(), "pad": self.pad}
+
+
+@dataclass(frozen=True)
 class Sequence:
     """A calibrated stereo sequence.
 
@@ -82,6 +121,7 @@ class Sequence:
     notes : facts that the report repeats.
     warnings : what is suspicious but possible, one line each with the figure; a run prints them and goes on.
     parameters : the sequence's own settings by configuration section, all defaults filled.
+    simulation : of a vehicle that is driven, not recorded: its frames come about on the way.
     """
 
     name: str
@@ -108,6 +148,7 @@ class Sequence:
     notes: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
     parameters: Mapping[str, Params] = field(default_factory=dict)
+    simulation: Simulation | None = None
 
     def __post_init__(self) -> None:
         if self.frames < 1:

@@ -13,7 +13,9 @@ from datasets import euroc, kitti
 from datasets.files import Digests
 from datasets.manifest import open_manifest
 from datasets.misalign import MisalignParams, misalign
+from datasets.mockup.loop import LOOP, mockup_loop
 from datasets.mockup.params import SHORT, MockupParams
+from datasets.mockup.rover import RoverParams
 from datasets.mockup.sequence import mockup
 from datasets.protocol import Sequence
 from stages.declare import Params
@@ -22,6 +24,7 @@ from stages.errors import ConfigError, InputError
 BUILT_IN: dict[str, tuple[str, Mapping[str, Any]]] = {
     "mockup": ("the paper's experiment, simulated: 40 pairs over a lunar bed at 1:10, with exact truth", {}),
     "mockup-short": ("the same in small: 9 pairs over a bed of 1.2 x 1.2 m", SHORT),
+    "mockup-loop": ("a simulated rover that drives to a goal over such a bed: stop, think, drive, again", LOOP),
 }
 
 MANIFESTS: dict[str, str] = {
@@ -67,6 +70,10 @@ def open_sequence(
     warp = validated(MisalignParams, "misalign", sections.pop("misalign", {}))
     if name_or_path in BUILT_IN:
         preset, given = BUILT_IN[name_or_path][1], sections.pop("mockup", {})
+        if name_or_path == "mockup-loop":
+            rover = validated(RoverParams, "rover", sections.pop("rover", {}))
+            _none_left(sections, name_or_path)
+            return mockup_loop(validated(MockupParams, "mockup", {**preset, **given}), rover, name_or_path)
         _none_left(sections, name_or_path)
         sequence = mockup(validated(MockupParams, "mockup", {**preset, **given}), name_or_path)
     else:

@@ -1,4 +1,4 @@
-"""The command line: ``rille reconstruct | plan | why | timing | check | init | calibrate | match | export | ...``.
+"""The command line: ``rille reconstruct | drive | plan | why | timing | check | init | calibrate | match | ...``.
 
 Exit codes: 0 complete; 1 failed; 2 usage, configuration or input; 3 finished with holes under ``--keep-going``;
 130 interrupted. Results go to stdout, progress and complaints to stderr. Heavy imports happen inside the commands, so
@@ -119,6 +119,72 @@ def reconstruct(
         progress="quiet" if quiet else progress,
         fresh=fresh,
         memory_limit=memory_limit,
+    )
+    return run.reconstruct(options)
+
+
+@app.command
+def drive(
+    seq: str = "mockup-loop",
+    *,
+    assignments: Assignments = None,
+    config: Path | None = None,
+    jobs: int | None = None,
+    executor: str = "processes",
+    force: Annotated[list[str] | None, Parameter(negative="", consume_multiple=False)] = None,
+    fresh: Annotated[bool, Parameter(negative="")] = False,
+    runs: Path = Path("runs"),
+    cache: CacheFolder = None,
+    progress: Progress = "auto",
+    quiet: Annotated[bool, Parameter(name=["--quiet", "-q"], negative="")] = False,
+    debug: Annotated[bool, Parameter(negative="")] = False,
+) -> int:
+    """Drive a simulated rover to a goal in a closed loop: stop, think, drive, localise, and again.
+
+    Prints how it ended (goal, no path, safety stop and why) and the folder of the report.
+
+    Parameters
+    ----------
+    seq
+        A simulated sequence; mockup-loop.
+    assignments
+        A parameter, section.key=value, for example rover.slip=0.3 or drive.goal=[0.2,1.1]; may be repeated.
+    config
+        TOML file of parameters; every run writes one with all defaults filled.
+    jobs
+        Worker processes; the number of cores by default.
+    executor
+        Where tasks run: processes, threads, inline, or the address of a dask scheduler, tcp://host:port.
+    force
+        Recompute this stage although it is cached; may be repeated.
+    fresh
+        Write a new folder of results even if nothing is new and the latest run stands.
+    runs
+        Folder of results; each run makes RUNS/sequence/run-id.
+    cache
+        Folder of cached artifacts, or s3://bucket/prefix; RILLE_CACHE or .rille/cache by default.
+    progress
+        How progress is shown on stderr.
+    quiet
+        No progress; complaints only.
+    debug
+        Show tracebacks.
+    """
+    _prepare(cache)
+    from pipeline import run
+
+    options = run.Options(
+        sequence=seq,
+        assignments=tuple(assignments or ()),
+        config=config,
+        jobs=jobs,
+        executor=executor,
+        force=frozenset(force or ()),
+        runs=runs,
+        cache=cache_folder(cache),
+        progress="quiet" if quiet else progress,
+        fresh=fresh,
+        verb="drive",
     )
     return run.reconstruct(options)
 

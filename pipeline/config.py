@@ -53,10 +53,16 @@ STAGE_MODULES: dict[str, str] = {
     "accuracy": "stages.accuracy",
     "dem_accuracy": "stages.dem_accuracy",
     "path_check": "stages.path_check",
+    "pad": "stages.pad",
+    "leg": "stages.leg",
+    "safety": "stages.safety",
+    "reflex": "stages.reflex",
+    "global_fix": "stages.global_fix",
+    "drive_check": "stages.drive_check",
 }
 """Every stage of the chain by name; a section of the configuration where the stage has parameters."""
 
-DATASET_SECTIONS = ("mockup", "misalign")
+DATASET_SECTIONS = ("mockup", "misalign", "rover")
 """Sections that belong to a kind of sequence; the sequence validates them."""
 
 
@@ -69,6 +75,7 @@ def stage(name: str) -> Stage:
 @cache
 def model() -> type[Params]:
     """Model of the whole configuration, made of the stages' own parameter models."""
+    from pipeline.drive import DriveParams
     from pipeline.tiling import Tiling
     from stages.vehicle import DEFAULT_VEHICLE, Vehicle
 
@@ -76,6 +83,7 @@ def model() -> type[Params]:
         name: (stage(name).params, stage(name).params()) for name in STAGE_MODULES if stage(name).params.model_fields
     }
     fields["tiling"] = (Tiling, Tiling())
+    fields["drive"] = (DriveParams, DriveParams())
     fields["vehicle"] = (Vehicle, DEFAULT_VEHICLE)
     return create_model("Config", __base__=Params, **fields)
 

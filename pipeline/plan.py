@@ -14,11 +14,11 @@ from pipeline import costs, driver, memory
 from pipeline.admission import Account, Admission, account, forecast, largest
 from pipeline.costs import Costs, Foreseen, count
 from pipeline.dag import Graph, Handle
+from pipeline.drive import dataflow
 from pipeline.driver import Result
 from pipeline.environment import cores
 from pipeline.memory import words
 from pipeline.progress import recall_seconds
-from pipeline.reconstruct import Reconstruction
 from pipeline.run import Options, choose_frames, settings, warn
 from pipeline.store import at
 
@@ -38,7 +38,7 @@ def plan(options: Options, *, verbose: bool = False) -> int:
     warn(sequence)
     frames = choose_frames(options.frames, sequence.frames)
     graph, store = Graph(), at(options.cache)
-    Reconstruction(graph, sequence, config, frames).build()
+    dataflow(graph, sequence, config, frames).build()
     result = driver.run(graph, store, dry=True, force=options.force)
     result.check()
     jobs = options.jobs or cores()

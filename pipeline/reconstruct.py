@@ -36,7 +36,7 @@ from collections.abc import Callable, Mapping
 from collections.abc import Sequence as Series
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -51,6 +51,9 @@ from stages.errors import DegenerateError, InputError
 from stages.footprint import Box, tile_lattice
 from stages.geometry import RigidTransform
 from stages.lattice import Lattice, union
+
+if TYPE_CHECKING:
+    from pipeline.drive import Driven
 
 TILE_CELLS = 512
 """Side of a world tile, cells: 512 x 512 float32 is 1 MiB an array, small enough to recompute alone."""
@@ -91,6 +94,7 @@ class Products:
     dem_accuracy: Handle | None = None
     truth_risk: Handle | None = None
     path_check: Handle | None = None
+    drive: Driven | None = None
 
 
 class Reconstruction:

@@ -54,10 +54,11 @@ class Options:
     progress: str = "auto"
     fresh: bool = False
     memory_limit: str | None = None
+    verb: str = "reconstruct"
 
     def command(self) -> str:
         """The command line that repeats this run."""
-        words = ["rille", "reconstruct", self.sequence]
+        words = ["rille", self.verb, self.sequence]
         words += [f"--config {self.config}"] if self.config else []
         words += [f"--frames {self.frames}"] if self.frames else []
         return " ".join(words + [f"--set {a}" for a in self.assignments])
@@ -132,21 +133,24 @@ def reconstruct(options: Options) -> int:
 
 def _reconstruct(options: Options) -> int:
     from pipeline import driver, memory, progress
+    from pipeline.drive import Drive, dataflow
     from pipeline.executor import known
-    from pipeline.reconstruct import Reconstruction
 
     _known_stages(options.force)
     known(options.executor)
     started = datetime.now(UTC)
     sequence, config, vehicle_source = settings(options)
     warn(sequence)
+    if options.verb == "drive" and sequence.simulation is None:
+        raise ConfigError(f"{sequence.name} is recorded, it cannot be driven", remedy="drive mockup-loop")
     frames = choose_frames(options.frames, sequence.frames)
     text = _header(options) + configuration.to_toml(config, sequence.parameters)
     folder = _make_folder(options.runs / sequence.name, started, text + repr(frames))
     (folder / "config.toml").write_text(text, encoding="utf-8")
 
     graph, store = Graph(), at(options.cache)
-    products = Reconstruction(graph, sequence, config, frames).build()
+    flow = dataflow(graph, sequence, config, frames)
+    products = flow.build()
     result = driver.run(
         graph,
         store,
@@ -159,8 +163,10 @@ def _reconstruct(options: Options) -> int:
         memory_limit=None if options.memory_limit is None else memory.parse(options.memory_limit),
         survey=lambda: lay_out(sequence, config, frames),
     )
-    if not options.keep_going:
+    if not options.keep_going and not (isinstance(flow, Drive) and flow.outcome()[0] == "safety stop"):
         result.check()
+    if isinstance(flow, Drive):
+        sequence, frames = flow.taken()
 
     from pipeline import standing
 
@@ -205,6 +211,8 @@ def _reconstruct(options: Options) -> int:
     _point_latest(folder)
     warn_of_results(graph)
     total = result.total()
+    if isinstance(flow, Drive):
+        print(f"{': '.join(word for word in flow.outcome() if word)}  ({len(flow.driven.stops)} stops)")
     print(f"{folder}  computed {total.computed}, cached {total.cached}, missing {total.failed + total.skipped}")
     if result.ok:
         return _posed_all(products)
@@ -214,10 +222,10 @@ def _reconstruct(options: Options) -> int:
 
 def lay_out(sequence: Sequence, config: Any, frames: tuple[int, ...]) -> Graph:
     """The graph of a reconstruction as far as it is known beforehand."""
-    from pipeline.reconstruct import Reconstruction
+    from pipeline.drive import dataflow
 
     graph = Graph()
-    Reconstruction(graph, sequence, config, frames).build()
+    dataflow(graph, sequence, config, frames).build()
     return graph
 
 
@@ -237,6 +245,7 @@ def _posed_all(products: Products) -> int:
 
 def _known_stages(names: frozenset[str]) -> None:
     known = {*configuration.STAGE_MODULES, "hfvm_tile", "hfvm_join", "image", "scene", "render"}
+    known |= {"mockup.drive", "mockup.sense", "mockup.site"}
     for name in sorted(names - known):
         raise ConfigError(f"--force {name!r} is no stage", remedy=f"one of {', '.join(sorted(known))}")
 

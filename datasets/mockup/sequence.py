@@ -168,7 +168,7 @@ def mockup(p: MockupParams, name: str = "mockup") -> Sequence:
         up=up,
         attitude=attitude,
         pitch=math.radians(p.pitch_deg) if level else None,
-        vehicle=_vehicle(),
+        vehicle=vehicle_at_scale(),
         truth_dem=dem,
         truth_disparity=disparity,
         evaluation_window=WINDOW,
@@ -181,7 +181,7 @@ def mockup(p: MockupParams, name: str = "mockup") -> Sequence:
     )
 
 
-def _vehicle() -> Any:
+def vehicle_at_scale() -> Any:
     """The rover at 1:10: a 0.8 m wide, 1 m long one with 0.3 m wheels at full scale."""
     from stages.vehicle import Vehicle
 

@@ -18,7 +18,10 @@ class Table:
 
 @dataclass(frozen=True)
 class Block:
-    """One figure: panels side by side under a title, what one sees, a legend of ``(colour, words)`` and a table."""
+    """One figure: panels side by side under a title, what one sees, a legend of ``(colour, words)`` and a table.
+
+    ``strip``: the panels are narrow columns.
+    """
 
     name: str
     title: str
@@ -26,6 +29,7 @@ class Block:
     panels: tuple[Panel, ...]
     legend: tuple[tuple[str, str], ...] = ()
     table: Table | None = None
+    strip: bool = False
 
     @property
     def anchor(self) -> str:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.report import artifacts, canvas, checks, figures, gather, seams
+from pipeline.report import artifacts, canvas, checks, driving, figures, gather, seams
 from pipeline.report.block import Block, Gallery
 from pipeline.report.gather import Scene
 from pipeline.report.words import length, spread
@@ -279,12 +279,17 @@ def _always(scene: Scene) -> bool:
     return True
 
 
+def _planned(scene: Scene) -> bool:
+    return scene.view.products.drive is None
+
+
 _FIGURES: tuple[tuple[str, Callable[[Scene], Block | None], Callable[[Scene], bool]], ...] = (
+    ("Drive", driving.strip, lambda scene: scene.view.products.drive is not None),
     ("Figure 6. Disparities", _disparities, _always),
     ("Rig", checks.rig, lambda scene: bool(scene.view.products.rigs)),
     ("Figure 7. Ortho image and path", _terrain, _always),
     ("Risk map", _risk, _always),
-    ("Figure 3. Local risk map", _local, _always),
+    ("Figure 3. Local risk map", _local, _planned),
     ("Figure 8. Tracks", _tracks, _several),
     ("Figure 9. Trajectory", _trajectory, _several),
     ("Crosscheck", checks.crosscheck, lambda scene: scene.view.products.agreement is not None),

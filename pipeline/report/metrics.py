@@ -74,6 +74,13 @@ AGREEMENT: Mapping[str, str] = {
 
 KEY = frozenset(
     {
+        "drive_clearance_violations",
+        "drive_tilt_violations",
+        "drive_step_violations",
+        "drive_localisation_error",
+        "drive_localisation_share",
+        "drive_way",
+        "drive_shortest_way",
         "trajectory_drift",
         "trajectory_ate_rmse",
         "trajectory_rpe_translation_rmse",
@@ -107,7 +114,12 @@ KEY = frozenset(
 
 def metrics(scene: Scene, frames: Rows, pairs: Rows) -> dict[str, Metric]:
     """Every figure: ``group, label, value, unit, how, truth, completeness, key``, those against truth first."""
-    found = {**_trajectory(scene.view, frames), **_elevation(scene.view, pairs), **_path_check(scene.view)}
+    found = {
+        **_drive(scene.view),
+        **_trajectory(scene.view, frames),
+        **_elevation(scene.view, pairs),
+        **_path_check(scene.view),
+    }
     for group, more in (
         ("Poses", _poses(frames)),
         ("Agreement with COLMAP", _agreement(scene)),
@@ -235,6 +247,14 @@ def _elevation(view: RunView, pairs: Rows) -> dict[str, Metric]:
         found[name] = {**metric, "label": f"Merged: {metric['label'][0].lower()}{metric['label'][1:]}"}
         found[name]["completeness"] = complete
     return found
+
+
+def _drive(view: RunView) -> dict[str, Metric]:
+    if view.products.drive is None:
+        return {}
+    truth = "the simulator's own placements"
+    found = dict(_assessed(view, view.products.drive.check, "drive_", "Drive against truth", truth))
+    return {name: {**metric, "completeness": None} for name, metric in found.items()}
 
 
 def _path_check(view: RunView) -> dict[str, Metric]:

@@ -141,6 +141,9 @@ def find_warnings(scene: Scene) -> list[str]:
 
 
 def _path_missing(view: RunView) -> list[dict[str, str]]:
+    drive = view.products.drive
+    if drive is not None:
+        return [] if drive.verdict == "goal" else [_missing("no path", f"Drive: {drive.verdict}", drive.reason)]
     path = view.bundle(view.products.path)
     if path is None:
         return [_missing("no path", "No path", "the path over the merged terrain was not computed")]
@@ -165,11 +168,19 @@ def _verdict(
     parts = [
         "one stereo pair" if len(frames) == 1 else f"{posed} of {len(frames)} frames posed",
         f"{models} of {len(pairs)} elevation models",
-        "no path" if length is None else f"a path of {length:.3g} m",
+        _way_words(view, length),
         *([] if any(_truth(view)) else ["not assessed against truth"]),
     ]
     failures = sum(m["kind"] in ("failed", "skipped") for m in missing)
     return ("Incomplete: " if failures or posed < len(frames) else "Complete: ") + ", ".join(parts) + "."
+
+
+def _way_words(view: RunView, length: float | None) -> str:
+    """What came of the path, or of the drive."""
+    if view.products.drive is not None:
+        drive = view.products.drive
+        return f"{drive.verdict} after {len(drive.stops)} stops" + (f" ({drive.reason})" if drive.reason else "")
+    return "no path" if length is None else f"a path of {length:.3g} m"
 
 
 def _sequence(view: RunView) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from stages.errors import ConfigError, InputError
 
 def test_every_listed_name_opens():
     names = [name for name, _ in catalogue()]
-    assert names[:4] == ["mockup", "mockup-short", "devon_island", "nasa_k10"]
+    assert names[:5] == ["mockup", "mockup-short", "mockup-loop", "devon_island", "nasa_k10"]
     full, short = open_sequence("mockup"), open_sequence("mockup-short")
     assert (full.frames, short.frames) == (40, 9)
     assert full.defaults == {

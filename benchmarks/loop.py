@@ -1,0 +1,231 @@
+"""The closed loop over many beds: does the rover arrive, where does it stand, does it know where it is?
+
+    benchmarks/loop.py                     20 seeds, rock cover 5 and 10 %: the table
+    benchmarks/loop.py --reflex 100        an obstacle of one wheel radius laid on the way after its ground was mapped
+
+The goal of each bed is the free place nearest to (0, 1) m on the exact map, as an operator would choose it. Violations
+are counted by the true placement of the wheels; what is possible is judged on the risk map of the exact elevations by
+the same vehicle. Intervals are Wilson's of 95 %. Runs that ``--out`` holds already are not repeated, so that a
+benchmark that is interrupted goes on, and several processes may share the seeds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import shutil
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+NOMINAL = (0.0, 1.0)
+COVERS = (0.05, 0.1)
+
+
+def arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", default="1:21", help="FIRST:END of the seeds (default 1:21)")
+    parser.add_argument("--cover", type=float, action="append", help=f"rock cover; may be repeated (default {COVERS})")
+    parser.add_argument("--reflex", type=int, default=0, metavar="N", help="trials of the reflex detection instead")
+    parser.add_argument("--first", type=int, default=0, help="number of the first trial")
+    parser.add_argument("--set", action="append", default=[], help="a parameter, section.key=value; may be repeated")
+    parser.add_argument("--out", type=Path, default=Path("loop.jsonl"), help="one line a run, appended (loop.jsonl)")
+    parser.add_argument("--table", action="store_true", help="only print the table of what is there")
+    return parser.parse_args()
+
+
+def drive(settings: list[str], *, goal: bool) -> dict[str, Any]:
+    """One drive in a store of its own; figures of it."""
+    from datasets.registry import open_sequence
+    from pipeline import config, driver
+    from pipeline.dag import Graph
+    from pipeline.drive import Drive
+    from pipeline.store import at
+
+    begin = time.perf_counter()
+    for_dataset, for_stages = config.split_dataset(config.parse_assignments(settings))
+    sequence = open_sequence("mockup-loop", for_dataset)
+    assert sequence.vehicle is not None
+    vehicle = {"vehicle": sequence.vehicle.model_dump()}
+    layers = [vehicle, config.expand(sequence.defaults), for_stages]
+    if goal:
+        layers.append({"drive": {"goal": choose_goal(sequence, config.build(*layers))}})
+    graph, folder = Graph(), Path(tempfile.mkdtemp(prefix="loop-"))
+    try:
+        store = at(folder)
+        flow = Drive(graph, sequence, config.build(*layers))
+        flow.build()
+        result = driver.run(graph, store, executor="inline", keep_going=True)
+        found = figures(flow, store)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+    errors = [f"{f.label}: {f.error}" for f in result.failures]
+    return {**found, "errors": errors, "seconds": time.perf_counter() - begin}
+
+
+def choose_goal(sequence: Any, config: Any) -> tuple[float, float]:
+    """The free place nearest to the nominal goal on the exact map."""
+    import numpy as np
+
+    from datasets.mockup import scene as bed
+    from datasets.mockup.raycast import HeightField
+    from datasets.mockup.rover import bed_ground
+    from datasets.mockup.site import prepare
+    from datasets.mockup.truth_dem import true_dem
+    from stages.declare import Bundle
+    from stages.geometry import RigidTransform, level_rotation
+    from stages.lattice import Lattice
+    from stages.leg import Hazards
+    from stages.risk import risk_map
+    from stages.wheels import stand
+
+    mockup, rover = sequence.parameters["mockup"], sequence.parameters["rover"]
+    plain = bed.build_scene(mockup.scene())
+    scene = Bundle(prepare(plain, (*rover.start, rover.pad), None), plain.meta)
+    ground = bed_ground(scene, config.vehicle, rover.start, 0.3)
+    found = stand(ground, *rover.start, math.radians(rover.heading_deg), config.vehicle)
+    assert found is not None
+    T_bed_left = found.T_ground_vehicle @ sequence.simulation.T_vehicle_left
+    T_world_left = RigidTransform(level_rotation(T_bed_left.rotation[2]), np.zeros(3))
+    (x, y), reach, cell = NOMINAL, 0.3, config.locus.cell_size
+    lattice = Lattice.snap((x - reach, x + reach, y - reach, y + reach), cell)
+    at = scene.meta["lattice"]
+    field = HeightField.build(np.asarray(scene["height"]), at["x0"], at["y0"], at["cell"])
+    z = true_dem(field, lattice.to_dict(), T_bed_left @ T_world_left.inverse())[0]
+    judged = risk_map(z, np.zeros_like(z), cell, config.vehicle, config.risk)
+    hazards = Hazards.of(judged["risk"], judged["reason"], cell, config.vehicle)
+    free = (hazards.gap > 1.5 * config.vehicle.margin) & hazards.free
+    xy = lattice.xy()
+    far = np.where(free, np.hypot(xy[..., 0] - x, xy[..., 1] - y), np.inf)
+    row, col = np.unravel_index(int(np.argmin(far)), far.shape)
+    return (float(xy[row, col, 0]), float(xy[row, col, 1])) if np.isfinite(far[row, col]) else NOMINAL
+
+
+def figures(flow: Any, store: Any) -> dict[str, Any]:
+    """What became of a drive."""
+    import numpy as np
+
+    verdict, reason = flow.outcome()
+    driven = flow.driven
+    out: dict[str, Any] = {"verdict": verdict, "reason": reason, "stops": len(driven.stops)}
+    out["events"] = [stop.event for stop in driven.stops if stop.event]
+    out["reflex_stops"] = sum(event.startswith("reflex") for event in out["events"])
+    out["safety_stops"] = sum(event.startswith("safety") for event in out["events"])
+    out["images"] = max(flow.true, default=0) + 1
+    if driven.check is not None and driven.check.ref is not None:
+        check = store.open(driven.check.ref)
+        out |= {name: m["value"] for name, m in check.meta["metrics"].items()}
+        out["path_exists"] = check.meta["path_exists"]
+    laid = next((h for h in flow.graph.nodes if h.stage == "mockup.obstacle" and h.ref is not None), None)
+    if laid is not None:
+        stop = driven.stops[int(laid.label.split("/")[1])]
+        if stop.drive.ref is not None and laid.ref.meta["obstacle"] is not None:
+            trail = np.asarray(store.open(stop.drive.ref)["trail"])[:, :2, 3]
+            at = np.asarray(store.open(stop.drive.ref)["frame_at"])
+            away = np.hypot(*(trail - laid.ref.meta["obstacle"]).T)
+            vehicle = flow.config.vehicle
+            touch = 0.5 * vehicle.wheel_base + 0.5 * vehicle.wheel_diameter + 1.2 * 0.5 * vehicle.wheel_diameter
+            out["obstacle"] = {
+                "nearest": float(away.min()),
+                "would_touch": bool(away.min() < touch),
+                "seen": stop.event.startswith("reflex"),
+                "away_when_stopped": float(away[at[flow.rows[stop.frames[-1]]]] - touch) if stop.frames else None,
+            }
+    return out
+
+
+def wilson(hits: int, n: int) -> str:
+    """Share and Wilson's interval of 95 %, per cent."""
+    if n == 0:
+        return "-"
+    z, p = 1.959964, hits / n
+    middle, half = p + z * z / (2 * n), z * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
+    low, high = ((middle + s * half) / (1 + z * z / n) for s in (-1, 1))
+    return f"{100 * p:.0f} % ({100 * low:.0f}-{100 * high:.0f})"
+
+
+def table(rows: list[dict[str, Any]]) -> list[str]:
+    """The runs by rock cover."""
+    lines = [
+        "| rock cover | runs | path exists | of these reached | runs with a violation | drift, median, worst "
+        "| way / shortest, median, worst | reflex stops | way, m | s a loop |",
+        "|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    for cover in sorted({r["cover"] for r in rows}):
+        mine = [r for r in rows if r["cover"] == cover]
+        judged = [r for r in mine if "path_exists" in r]
+        possible = [r for r in judged if r["path_exists"]]
+        reached = [r for r in possible if r["verdict"] == "goal"]
+        broken = [r for r in judged if any(r[f"{k}_violations"] for k in ("clearance", "tilt", "step"))]
+        drift = sorted(100 * r["localisation_share"] for r in judged if r["verdict"] == "goal")
+        ratio = sorted(r["way"] / r["shortest_way"] for r in reached)
+        way = sum(r["way"] for r in judged)
+        seconds = sum(r["seconds"] for r in mine) / len(mine)
+        cells = [f"{100 * cover:.0f} %", str(len(mine)), str(len(possible))]
+        cells += [f"{len(reached)}: {wilson(len(reached), len(possible))}"]
+        cells += [f"{len(broken)}: {wilson(len(broken), len(judged))}", f"{_middle(drift)} %", _middle(ratio)]
+        cells += [str(sum(r["reflex_stops"] for r in mine)), f"{way:.1f}", f"{seconds:.0f}"]
+        lines.append(f"| {' | '.join(cells)} |")
+    return lines
+
+
+def _middle(values: list[float]) -> str:
+    return f"{values[len(values) // 2]:.2f}, {values[-1]:.2f}" if values else "-"
+
+
+def trials(rows: list[dict[str, Any]]) -> list[str]:
+    """The trials of the reflex."""
+    told = [r["obstacle"] for r in rows if "obstacle" in r and r["obstacle"]["would_touch"]]
+    seen = [o for o in told if o["seen"] and o["away_when_stopped"] > 0]
+    away = sorted(1000 * o["away_when_stopped"] for o in seen)
+    return [
+        f"{len(rows)} trials, {len(told)} in which the leg leads over the obstacle; stopped before contact in "
+        f"{len(seen)}: {wilson(len(seen), len(told))}; way left to it, mm: least {away[0] if away else 0:.0f}, median "
+        f"{away[len(away) // 2] if away else 0:.0f}"
+    ]
+
+
+def main() -> None:
+    """Run what is not there yet, and print the table."""
+    from pipeline.cli import cache_folder
+    from pipeline.environment import SINGLE, prepare_environment
+
+    given = arguments()
+    prepare_environment(cache_folder(None))
+    os.environ.update({f"{name}_NUM_THREADS": "1" for name in SINGLE})
+    rows = [json.loads(line) for line in given.out.read_text().splitlines()] if given.out.exists() else []
+    done = {r["name"] for r in rows}
+    work: list[tuple[str, dict[str, Any], list[str]]] = []
+    if given.reflex:
+        import numpy as np
+
+        for k in range(given.first, given.reflex):
+            rng = np.random.default_rng([1999, k])
+            ahead, aside = 0.24 + 0.10 * rng.random(), 0.05 * (2 * rng.random() - 1)
+            more = [f"mockup.seed={100 + k}", f"rover.seed={100 + k}", "mockup.rock_cover=0.03", "rover.obstacle_leg=0"]
+            more += [f"rover.obstacle_ahead={ahead:.4f}", f"rover.obstacle_aside={aside:.4f}", "leg.length=3.0"]
+            work.append((f"reflex-{k}", {"trial": k}, [*more, "rover.pad=0.2", "drive.max_stops=2"]))
+    else:
+        first, end = (int(v) for v in given.seeds.split(":"))
+        for seed in range(first, end):
+            for cover in given.cover or COVERS:
+                more = [f"mockup.seed={seed}", f"rover.seed={seed}", f"mockup.rock_cover={cover}"]
+                work.append((f"loop-{cover}-{seed}", {"seed": seed, "cover": cover}, more))
+    for name, facts, settings in [] if given.table else work:
+        if name in done:
+            continue
+        row = {"name": name, **facts, **drive([*settings, *given.set], goal=not given.reflex)}
+        rows.append(row)
+        with given.out.open("a") as file:
+            file.write(json.dumps(row) + "\n")
+        print(f"{name}: {row['verdict']} {row['reason']} ({row['seconds']:.0f} s)", flush=True)
+    kind = "reflex" if given.reflex else "loop"
+    rows = [r for r in rows if r["name"].startswith(kind)]
+    print("\n".join(trials(rows) if given.reflex else table(rows)))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,105 @@
+"""The simulated experiment as a closed loop: a rover that is driven by what the chain makes of its images."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from datasets import protocol
+from datasets.mockup.params import MockupParams
+from datasets.mockup.rover import RoverParams
+from datasets.mockup.sequence import given_rig, mount, true_rig, vehicle_at_scale
+from datasets.protocol import Simulation, Source
+from stages.declare import NoParams
+from stages.errors import InputError
+from stages.geometry import RigidTransform
+
+LOOP: Mapping[str, Any] = {
+    "frames": 1,
+    "image_width": 320,
+    "image_height": 240,
+    "focal_length": 180.0,
+    "toe_in_deg": 3.0,
+    "pitch_deg": 32.0,
+    "bed_width": 1.6,
+    "bed_length": 2.0,
+    "cell": 0.002,
+    "rocks": 12.0,
+    "craters": 4.0,
+}
+"""``mockup-loop``: small images of wide-angle cameras, which see the ground from 0.08 m before them to the horizon."""
+
+DEFAULTS: Mapping[str, Any] = {
+    "hfvm.preset": "default",
+    "locus.cell_size": 0.004,
+    "crosscheck.enabled": False,
+    "drive.goal": (0.0, 1.0),
+}
+
+
+def mockup_loop(p: MockupParams, rover: RoverParams, name: str = "mockup-loop") -> protocol.Sequence:
+    """The sequence of a rover that is driven: one pair at the start, the others come about on the way."""
+    rig, vehicle = true_rig(p), vehicle_at_scale()
+    cameras = {"left": rig.left, "right": rig.right}
+    T_vehicle_body = RigidTransform(np.eye(3), np.array([0.0, rover.camera_forward, p.camera_height]))
+    T_vehicle_left = T_vehicle_body @ mount(p, "left")
+    T_left_right = rig.T_right_left.inverse()
+    mounted = {"vehicle": vehicle.model_dump(mode="json"), "T_vehicle_left": T_vehicle_left.to_list()}
+
+    def image(frame: int, camera: str, T_bed_left: RigidTransform) -> Source:
+        T_bed_camera = T_bed_left if camera == "left" else T_bed_left @ T_left_right
+        sensor = p.render()
+        if frame in rover.lost_frames:
+            sensor = sensor.model_copy(update={"exposure": 1e-3})
+        args = {"frame": frame, "camera": camera, "geometry": cameras[camera].to_dict()}
+        return Source("datasets.mockup.render", sensor, args | {"T_bed_camera": T_bed_camera.to_list()})
+
+    def change(leg: int, row: int) -> Source | None:
+        if leg != rover.obstacle_leg:
+            return None
+        return Source("datasets.mockup.obstacle", rover, {"leg": leg, "row": row, **mounted})
+
+    def dem(lattice: Mapping[str, Any], T_truth_world: RigidTransform, stops: Sequence[RigidTransform]) -> Source:
+        args = {"lattice": dict(lattice), "T_bed_world": T_truth_world.to_list(), "rig": rig.to_dict()}
+        return Source("datasets.mockup.truth_dem", NoParams(), args | {"pairs": [T.to_list() for T in stops]})
+
+    pad = [*rover.start, rover.pad] if rover.pad > 0 else None
+    site = {"pad": pad, "blank": None if rover.blank is None else list(rover.blank)}
+    simulation = Simulation(
+        scene=Source(
+            "datasets.mockup.site", NoParams(), site, inputs={"scene": Source("datasets.mockup.scene", p.scene())}
+        ),
+        place=Source("datasets.mockup.rover", rover, {"leg": -1, **mounted}),
+        drive=lambda leg, row: Source("datasets.mockup.rover", rover, {"leg": leg, "row": row, **mounted}),
+        sense=lambda leg: Source("datasets.mockup.sense", rover, {"leg": leg}),
+        change=change,
+        image=image,
+        truth_dem=dem,
+        T_vehicle_left=T_vehicle_left,
+        pad=rover.pad,
+        overview=None
+        if rover.map_cell is None
+        else Source("datasets.mockup.overview", rover, {"cell": rover.map_cell}),
+    )
+
+    def nothing(frame: int, camera: str) -> Source:
+        raise InputError("images of a drive come about on the way", remedy=f"rille drive {name}")
+
+    return protocol.Sequence(
+        name=name,
+        rig=given_rig(p),
+        frames=1,
+        image=nothing,
+        frame_names=("000000",),
+        truth_source="the simulator's own poses: exact",
+        vehicle=vehicle,
+        defaults=DEFAULTS,
+        notes=(
+            f"simulated at 1:10, bed of seed {p.seed}, rover of seed {rover.seed}; lengths are those of the model",
+            "a closed loop: each image was rendered where the rover had driven to by what was made of those before",
+        ),
+        parameters={"mockup": p, "rover": rover},
+        simulation=simulation,
+    )

@@ -1,0 +1,70 @@
+"""Stage ``mockup.obstacle``: a stone laid on the way after its ground was mapped."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from datasets.mockup import scene as bed
+from datasets.mockup import terrain
+from datasets.mockup.params import SceneParams
+from datasets.mockup.rover import RoverParams, heading_of
+from stages.declare import Bundle, Inputs, Stage
+from stages.geometry import RigidTransform
+
+
+def on_path(path: np.ndarray, way: float, aside: float) -> tuple[float, float]:
+    """Point ``way`` metres along a path (vertex, 2), or beyond its end, and ``aside`` to the right of it."""
+    steps = np.diff(path, axis=0)
+    lengths = np.hypot(steps[:, 0], steps[:, 1])
+    ends = np.concatenate([[0.0], np.cumsum(lengths)])
+    k = int(np.clip(np.searchsorted(ends, way, side="right") - 1, 0, len(steps) - 1))
+    ahead = steps[k] / lengths[k]
+    point = path[k] + (way - ends[k]) * ahead + aside * np.array([ahead[1], -ahead[0]])
+    return float(point[0]), float(point[1])
+
+
+def lay(scene: Bundle, x: float, y: float, height: float) -> dict[str, Any]:
+    """Arrays of the scene with a round stone of profile 1 - q^4, as wide as twice its height on either side."""
+    arrays: dict[str, Any] = {name: np.asarray(scene[name]) for name in scene.arrays}
+    lattice, z = scene.meta["lattice"], np.array(arrays["height"])
+    dx = lattice["x0"] + lattice["cell"] * np.arange(z.shape[1]) - x
+    dy = lattice["y0"] - lattice["cell"] * np.arange(z.shape[0]) - y
+    q = np.hypot(dx[None, :], dy[:, None]) / (1.2 * height)
+    inside = q < 1.0
+    ground = float(np.median(z[inside])) if inside.any() else 0.0
+    z[inside] = np.maximum(z[inside], ground + height * (1.0 - q[inside] ** 4))
+    arrays["height"] = z.astype(np.float32)
+    arrays["tint"] = np.where(inside, np.uint8(120), arrays["tint"])
+    arrays["sunlit"] = terrain.sunlit(arrays["height"], SceneParams(**scene.meta["scene"]))
+    return arrays
+
+
+def _run(params: RoverParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+    scene, path = inputs["scene"], np.asarray(inputs["leg"]["path"])[:, :2]
+    if len(path) < 2:
+        return Bundle({name: np.asarray(scene[name]) for name in scene.arrays}, {**scene.meta, "obstacle": None})
+    T_left_vehicle = RigidTransform.from_matrix(args["T_vehicle_left"]).inverse()
+    true = RigidTransform.from_matrix(np.asarray(inputs["before"]["vehicle"])[int(args["row"])])
+    believed = RigidTransform.from_matrix(np.asarray(inputs["pose"]["poses"])[-1]) @ T_left_vehicle
+    px, py = on_path(path, params.obstacle_ahead, params.obstacle_aside)
+    turn = heading_of(true) - heading_of(believed)
+    dx, dy = px - believed.translation[0], py - believed.translation[1]
+    c, s = math.cos(turn), math.sin(turn)
+    x, y = float(true.translation[0] + c * dx - s * dy), float(true.translation[1] + s * dx + c * dy)
+    return Bundle(lay(scene, x, y, params.obstacle_height), {**scene.meta, "obstacle": [x, y]})
+
+
+STAGE = Stage(
+    name="mockup.obstacle",
+    version=1,
+    summary="the simulated bed with a stone laid on the rover's way",
+    params=RoverParams,
+    inputs=("scene", "before", "pose", "leg"),
+    outputs=bed.STAGE.outputs,
+    requires=("numpy", "numba"),
+    run=_run,
+)

@@ -1,0 +1,42 @@
+"""Stage ``mockup.overview``: a coarse elevation model of the whole bed, as an orbiter's camera would give it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from datasets.mockup.rover import RoverParams
+from stages.declare import Array, Bundle, Inputs, Stage
+from stages.lattice import Lattice
+
+
+def _run(params: RoverParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+    at, z = inputs["scene"].meta["lattice"], np.asarray(inputs["scene"]["height"], dtype=np.float64)
+    cell = float(args["cell"])
+    n = max(1, round(cell / at["cell"]))
+    i0, j0 = math.ceil(at["x0"] / cell + 0.5), math.floor(at["y0"] / cell - 0.5)
+    cols = math.floor((at["x0"] + at["cell"] * (at["cols"] - 1)) / cell - 0.5) - i0 + 1
+    rows = j0 - math.ceil((at["y0"] - at["cell"] * (at["rows"] - 1)) / cell + 0.5) + 1
+    lattice = Lattice.at(i0, j0, cell, rows, cols)
+    out = np.empty(lattice.shape)
+    for r, y in enumerate(lattice.ys()):
+        for c, x in enumerate(lattice.xs()):
+            row, col = (at["y0"] - y) / at["cell"] - 0.5 * (n - 1), (x - at["x0"]) / at["cell"] - 0.5 * (n - 1)
+            out[r, c] = z[round(row) : round(row) + n, round(col) : round(col) + n].mean()
+    out += params.map_sigma * np.random.default_rng([params.seed, 72]).standard_normal(out.shape)
+    return Bundle({"elevation": out.astype(np.float32)}, {"lattice": lattice.to_dict(), "frame": "bed"})
+
+
+STAGE = Stage(
+    name="mockup.overview",
+    version=1,
+    summary="a coarse elevation model of the whole simulated bed",
+    params=RoverParams,
+    inputs=("scene",),
+    outputs=(Array("elevation", ("row", "col"), "float32", "m", "mean elevation of the cell", "nan", "bed"),),
+    requires=("numpy",),
+    run=_run,
+)

@@ -1,0 +1,232 @@
+"""Stage ``mockup.drive``: a rover that drives one leg over the simulated bed, with slip and errors of its heading.
+
+It is told a path in the frame of its own estimate and where it believes to stand; it turns towards each vertex and
+drives there by its wheels. What its wheels do and what it does are not the same: it slips and drifts off its heading.
+The body follows the wheels over the ground (:mod:`stages.wheels`). Nothing of what this stage gives is known to the
+rover; what its sensors tell of it is stage ``mockup.sense``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from stages.declare import AnyArray, Array, Bundle, Inputs, Params, Stage
+from stages.errors import InputError
+from stages.geometry import RigidTransform
+from stages.vehicle import Vehicle
+from stages.wheels import Ground, Stand, stand
+
+Floats = NDArray[np.float64]
+
+STEP = 0.005
+"""m; the drive is simulated, and its placements are recorded, in steps of this length."""
+STEP_TURN = math.radians(2.5)
+REACH = 0.3
+"""m; ground around a leg that may be touched on it, beyond its length."""
+
+
+class RoverParams(Params):
+    """The simulated rover: where it starts and how well it drives. All of it is unknown to the estimates."""
+
+    seed: int = Field(1, ge=0, description="seed of slip, heading errors and sensors; the bed has its own")
+    start: tuple[float, float] = Field((0.0, 0.3), description="m; centre of the wheels on the bed at the start")
+    heading_deg: float = Field(0.0, ge=-180, le=180, description="degrees to the left of straight along the bed")
+    slip: float = Field(0.05, ge=-0.5, lt=1, description="share of what the wheels turn that is no way; sand: 0.05-0.2")
+    slip_sigma: float = Field(0.03, ge=0, lt=0.5, description="standard deviation of the slip from leg to leg")
+    heading_sigma_deg: float = Field(
+        1.0, ge=0, le=20, description="degrees; standard deviation of the heading's drift over one leg"
+    )
+    turn_sigma: float = Field(0.03, ge=0, le=0.5, description="relative standard deviation of a turn on the spot")
+    frame_step: float = Field(0.025, gt=0.001, description="m; an image is taken at least this often")
+    frame_turn_deg: float = Field(5.0, gt=0.5, le=15, description="degrees; and this often on the spot")
+    speed: float = Field(0.05, gt=0, description="m/s; turns bumps into accelerations")
+    odometry_sigma: float = Field(0.01, ge=0, description="relative standard deviation of what the wheels report")
+    attitude_sigma_deg: float = Field(0.2, ge=0, description="degrees; error of the inclinometer, each axis")
+    acceleration_sigma: float = Field(0.05, ge=0, description="m/s2; noise of the accelerometer's peaks")
+    camera_forward: float = Field(0.05, description="m; cameras ahead of the centre of the wheels")
+    pad: float = Field(
+        0.28, ge=0, description="m; radius about the start that is level and free of rocks, known to the rover"
+    )
+    map_cell: float | None = Field(
+        None, gt=0.004, description="m; cell of a coarse map of the whole bed that the rover is given; none by default"
+    )
+    map_sigma: float = Field(0.002, ge=0, description="m; error of its elevations")
+    blank: tuple[float, float, float] | None = Field(
+        None, description="m; x, y, radius of a patch of the bed without any texture; none by default"
+    )
+    lost_frames: tuple[int, ...] = Field((), description="frames whose images are black")
+    obstacle_leg: int | None = Field(
+        None, ge=0, description="leg on which an obstacle appears after its ground was mapped; none by default"
+    )
+    obstacle_ahead: float = Field(0.2, gt=0, description="m; the obstacle's way along the leg from the wheels' centre")
+    obstacle_aside: float = Field(0.0, description="m; and to the right of it")
+    obstacle_height: float = Field(0.015, gt=0, description="m; its height: a wheel's radius")
+
+
+@dataclass
+class _Drive:
+    """The true motion in the making: where it is, how it stood on the way, and what its wheels did."""
+
+    ground: Ground
+    vehicle: Vehicle
+    x: float
+    y: float
+    heading: float
+    trail: list[Stand]
+    wheels: list[tuple[float, float, float]]
+
+    def advance(self, distance: float, turn: float, rolled: float, turned: float) -> bool:
+        """Move on; whether the vehicle still stands on the bed."""
+        self.heading += turn
+        self.x -= distance * math.sin(self.heading)
+        self.y += distance * math.cos(self.heading)
+        found = stand(self.ground, self.x, self.y, self.heading, self.vehicle)
+        if found is None:
+            return False
+        self.trail.append(found)
+        x, y, h = self.wheels[-1]
+        h += turned
+        self.wheels.append((x - rolled * math.sin(h), y + rolled * math.cos(h), h))
+        return True
+
+
+def heading_of(T: RigidTransform) -> float:
+    """Angle (rad, to the left of y) of the y axis of a frame, seen from above."""
+    return math.atan2(-T.rotation[0, 1], T.rotation[1, 1])
+
+
+def drive_leg(
+    ground: Ground,
+    vehicle: Vehicle,
+    before: tuple[float, float, float],
+    believed: tuple[float, float, float],
+    path: Floats,
+    turn: float,
+    p: RoverParams,
+    rng: np.random.Generator,
+) -> _Drive:
+    """True motion along a path.
+
+    Parameters
+    ----------
+    before, believed : x, y (m), heading (rad) on the bed, and where the rover believes to be in the path's frame.
+    path : (vertex, 2) m, the first one where the rover believes to stand.
+    turn : rad; turned on the spot at the end.
+    """
+    slip = p.slip + p.slip_sigma * float(rng.standard_normal())
+    length = float(np.hypot(*np.diff(path, axis=0).T).sum()) if len(path) > 1 else 0.0
+    drift = math.radians(p.heading_sigma_deg) * float(rng.standard_normal()) / max(length, STEP)
+    spin = 1.0 + p.turn_sigma * float(rng.standard_normal())
+    first = stand(ground, *before, vehicle)
+    if first is None:
+        raise InputError("the rover stands beside the bed", remedy="set rover.start within the bed, or a larger bed")
+    d = _Drive(ground, vehicle, *before, [first], [(0.0, 0.0, 0.0)])
+    x, y, heading = believed
+
+    def rotate(by: float) -> bool:
+        n = math.ceil(abs(by) / STEP_TURN)
+        return all(d.advance(0.0, spin * by / n, 0.0, by / n) for _ in range(n))
+
+    for vertex in path[1:]:
+        dx, dy = vertex[0] - x, vertex[1] - y
+        way, towards = math.hypot(dx, dy), math.atan2(-dx, dy)
+        n = math.ceil(way / STEP)
+        there = rotate(math.remainder(towards - heading, 2 * math.pi)) and all(
+            d.advance((1.0 - slip) * way / n, drift * way / n, way / n, 0.0) for _ in range(n)
+        )
+        if not there:
+            break
+        x, y, heading = float(vertex[0]), float(vertex[1]), towards
+    else:
+        rotate(turn)
+    return d
+
+
+def images_at(wheels: Floats, p: RoverParams) -> list[int]:
+    """Positions (of wheels (n, 3): x, y in m, heading in rad) at which an image is taken: the first, the last, and
+    whenever the way or the turn since the last one is large enough."""
+    at, way, turn = [0], 0.0, 0.0
+    for k in range(1, len(wheels)):
+        dx, dy, dh = wheels[k] - wheels[k - 1]
+        way, turn = way + math.hypot(dx, dy), turn + abs(dh)
+        if way > p.frame_step - 1e-9 or turn > math.radians(p.frame_turn_deg) - 1e-9 or k == len(wheels) - 1:
+            at.append(k)
+            way, turn = 0.0, 0.0
+    return at
+
+
+def bed_ground(scene: Bundle, vehicle: Vehicle, at: tuple[float, float], reach: float) -> Ground:
+    """The bed around a point."""
+    lattice = scene.meta["lattice"]
+    whole = Ground(lattice["x0"], lattice["y0"], lattice["cell"], np.asarray(scene["height"], np.float64), *2 * [_NONE])
+    box = [(v - reach, v + reach) for v in at]
+    return whole.part(box[0], box[1], vehicle.wheel_diameter)
+
+
+_NONE = np.zeros((0, 0))
+
+
+def _run(params: RoverParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+    scene, vehicle = inputs["scene"], Vehicle.model_validate(args["vehicle"])
+    T_left_vehicle = RigidTransform.from_matrix(args["T_vehicle_left"]).inverse()
+    rng = np.random.default_rng([params.seed, 70, 1 + int(args["leg"])])
+    if "before" in inputs:
+        T = RigidTransform.from_matrix(np.asarray(inputs["before"]["vehicle"])[int(args["row"])])
+        before = float(T.translation[0]), float(T.translation[1]), heading_of(T)
+        believed = RigidTransform.from_matrix(np.asarray(inputs["pose"]["poses"])[-1]) @ T_left_vehicle
+        path = np.asarray(inputs["leg"]["path"])[:, :2]
+        start = float(believed.translation[0]), float(believed.translation[1]), heading_of(believed)
+        turn = float(inputs["leg"].meta["turn"])
+    else:
+        before = *params.start, math.radians(params.heading_deg)
+        path, start, turn = np.zeros((1, 2)), (0.0, 0.0, 0.0), 0.0
+    length = float(np.hypot(*np.diff(path, axis=0).T).sum()) if len(path) > 1 else 0.0
+    ground = bed_ground(scene, vehicle, before[:2], length + REACH)
+    d = drive_leg(ground, vehicle, before, start, path, turn, params, rng)
+    wheels = np.array(d.wheels)
+    frames = images_at(wheels, params)
+    vehicles = np.stack([s.T_ground_vehicle.matrix34 for s in d.trail])
+    lefts = np.stack([(d.trail[i].T_ground_vehicle @ T_left_vehicle.inverse()).matrix34 for i in frames])
+    arrays: dict[str, AnyArray] = {
+        "poses": lefts,
+        "vehicle": vehicles[frames],
+        "trail": vehicles,
+        "frame_at": np.array(frames, dtype=np.int32),
+        "wheels": wheels,
+        "tilt": np.array([s.tilt for s in d.trail]),
+        "clearance": np.array([s.clearance for s in d.trail]),
+        "step": np.array([s.step for s in d.trail]),
+    }
+    return Bundle(arrays, {"leg": args["leg"], "frames": len(frames), "poses": [m.reshape(-1).tolist() for m in lefts]})
+
+
+def _trail(name: str, unit: str, long_name: str) -> Array:
+    return Array(name, ("position",), "float64", unit, long_name)
+
+
+STAGE = Stage(
+    name="mockup.drive",
+    version=1,
+    summary="true motion of the simulated rover along one leg",
+    params=RoverParams,
+    inputs=("scene", "before?", "pose?", "leg?"),
+    outputs=(
+        Array("poses", ("frame", "row", "col"), "float64", "m", "true pose [R | t] of the left camera", frame="bed"),
+        Array("vehicle", ("frame", "row", "col"), "float64", "m", "true pose of the vehicle", frame="bed"),
+        Array("trail", ("position", "row", "col"), "float64", "m", "true pose of the vehicle, finely", frame="bed"),
+        Array("frame_at", ("frame",), "int32", "1", "position of the trail at which the image is taken"),
+        Array("wheels", ("position", "xyh"), "float64", "1", "x, y (m), heading (rad) as the wheels turned"),
+        _trail("tilt", "rad", "angle of the vehicle to the horizontal"),
+        _trail("clearance", "m", "least distance of the belly to the ground"),
+        _trail("step", "m", "edge under the worst wheel"),
+    ),
+    requires=("numpy", "scipy"),
+    run=_run,
+)

@@ -1,0 +1,67 @@
+"""Stage ``mockup.site``: the bed prepared for a drive: a level pad to start from, and a patch without texture."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from datasets.mockup import scene as bed
+from datasets.mockup import terrain
+from datasets.mockup.params import SceneParams
+from stages.declare import Bundle, Inputs, NoParams, Stage
+
+EDGE = 0.06
+"""m; over which the pad passes into the ground around it."""
+
+
+def _distance(scene: Bundle, x: float, y: float, shape: tuple[int, ...], spacing: float) -> NDArray[np.float64]:
+    lattice = scene.meta["lattice"]
+    dx = lattice["x0"] + spacing * np.arange(shape[1]) - x
+    dy = lattice["y0"] - spacing * np.arange(shape[0]) - y
+    return np.asarray(np.hypot(dx[None, :], dy[:, None]))
+
+
+def prepare(
+    scene: Bundle, pad: tuple[float, float, float] | None, blank: tuple[float, float, float] | None
+) -> dict[str, Any]:
+    """Arrays of the scene with a pad and a blank patch, each x, y, radius on the bed, m."""
+    arrays: dict[str, Any] = {name: np.asarray(scene[name]) for name in scene.arrays}
+    height, cell = arrays["height"].copy(), float(scene.meta["lattice"]["cell"])
+    for place in (pad, blank):
+        if place is None:
+            continue
+        far = _distance(scene, place[0], place[1], height.shape, cell)
+        weight = np.clip((place[2] + EDGE - far) / EDGE, 0.0, 1.0)
+        weight = weight * weight * (3.0 - 2.0 * weight)
+        level = float(np.median(height[far <= place[2]]))
+        height = (height + weight * (level - height)).astype(np.float32)
+        arrays["tint"] = np.where(weight > 0.5, np.uint8(100), arrays["tint"])
+    arrays["height"] = height
+    arrays["sunlit"] = terrain.sunlit(height, SceneParams(**scene.meta["scene"]))
+    if blank is not None:
+        for level in range(bed.MIPS):
+            texture = arrays[f"albedo_{level}"]
+            far = _distance(scene, blank[0], blank[1], texture.shape, 0.5 * cell * 2**level)
+            arrays[f"albedo_{level}"] = np.where(far <= blank[2], np.uint8(128), texture)
+    return arrays
+
+
+def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+    places = {name: None if args[name] is None else tuple(args[name]) for name in ("pad", "blank")}
+    scene = inputs["scene"]
+    return Bundle(prepare(scene, places["pad"], places["blank"]), dict(scene.meta))
+
+
+STAGE = Stage(
+    name="mockup.site",
+    version=1,
+    summary="the simulated bed, prepared for a drive",
+    params=NoParams,
+    inputs=("scene",),
+    outputs=bed.STAGE.outputs,
+    requires=("numpy", "numba"),
+    run=_run,
+)

@@ -1,0 +1,535 @@
+"""The closed loop, top to bottom: stop, think, drive, and again, as tasks like all others.
+
+::
+
+    drive/start -> sense -+
+                          v
+    stop k:  image -> pyramid -> hfvm -> level -> locus (local) -> locus (world) -> merge (all models so far, pad)
+                                           |                          ^                      |
+                                           |            trajectory -> pose                 risk
+                                           v               ^   |                             |
+                                         resect -----------+   +---------> leg <-------------+
+                                           ^                                |
+                                           |          goal, no path: end    | drive, turn, look
+                                           |                                v
+    leg k:   safety <- sense <- drive/k (true poses) <- leg, pose (believed), drive/k-1 (where it truly stands)
+               |             images on the way -> pyramid -> motion -> track -> resect -> safety, reflex
+               |             motion (a baseline apart), locus (local) ---------------------> reflex
+               v
+             stop k+1 at the last image, or at the one where safety or reflex stopped
+
+``drive``, ``sense``, the images and nothing else know the true poses. What the vehicle believes is the trajectory:
+the product of the segments that were tracked and resected. Every node is keyed by what it reads, so a drive that is
+killed goes on where it was, and one that is repeated computes nothing.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from datasets.protocol import Sequence, Simulation, Source
+from pipeline.config import STAGE_MODULES
+from pipeline.dag import Graph, Handle
+from pipeline.reconstruct import Products, Reconstruction
+from pipeline.task import Ref
+from stages.declare import Params
+from stages.errors import ConfigError, DegenerateError
+from stages.geometry import RigidTransform
+from stages.lattice import Lattice
+from stages.reflex import pairs
+
+
+class DriveParams(Params):
+    """The loop itself; what happens on a leg and at a stop is the stages' own."""
+
+    goal: tuple[float, float] | None = Field(
+        default=None, description="m; x, y of the goal in the world frame, which begins at the first left camera"
+    )
+    frame: Literal["world", "map"] = Field(
+        default="world",
+        description="frame of the goal: the world, or the global map where there is one",
+    )
+    prior: tuple[float, float, float] | None = Field(
+        default=None, description="m, m, degrees to the left; where the first left camera roughly is in the global map"
+    )
+    prior_sigma: tuple[float, float] = Field(default=(0.1, 5.0), description="m, degrees; its standard deviations")
+    pose: tuple[float, float, float, float] | None = Field(
+        default=None, description="m, m, m, degrees; its pose in the global map, handed in instead of found"
+    )
+    around: float = Field(default=0.6, gt=0, description="m; the map reaches this far around start and goal")
+    max_stops: int = Field(default=40, ge=1, description="stops after which the drive is given up")
+    max_safety_stops: int = Field(default=3, ge=1, description="safety stops in a row that end the drive")
+    least_match: float = Field(
+        default=0.1,
+        ge=0,
+        le=1,
+        description="share of the pixels that match the image before, below which it is lost",
+    )
+
+
+@dataclass
+class Stop:
+    """One stop and the leg that follows it: handles, the frame it stands at, and in words what became of the leg."""
+
+    index: int
+    frame: int
+    merged: Handle | None = None
+    risk: Handle | None = None
+    trajectory: Handle | None = None
+    leg: Handle | None = None
+    drive: Handle | None = None
+    sense: Handle | None = None
+    safety: Handle | None = None
+    reflex: Handle | None = None
+    frames: list[int] = field(default_factory=list)
+    event: str = ""
+
+
+@dataclass
+class Driven:
+    """What became of a drive: its stops, ``verdict`` (goal, no path, safety stop, stops) and ``reason``."""
+
+    stops: list[Stop] = field(default_factory=list)
+    verdict: str = ""
+    reason: str = ""
+    place: Handle | None = None
+    fix: Handle | None = None
+    truth_leg: Handle | None = None
+    check: Handle | None = None
+
+
+class Drive(Reconstruction):
+    """Builds the graph of a drive, stop by stop, as results arrive."""
+
+    def __init__(self, graph: Graph, sequence: Sequence, config: Any, frames: tuple[int, ...] = (0,)) -> None:
+        super().__init__(graph, sequence, config, frames)
+        if sequence.simulation is None or config.drive.goal is None:
+            raise ConfigError(f"{sequence.name} has no goal to drive to", remedy="set drive.goal=[x, y], metres")
+        if config.locus.cell_size is None:
+            raise ConfigError("a drive needs locus.cell_size", remedy="set it to about an eighth of a wheel, metres")
+        self.simulation: Simulation = sequence.simulation
+        self.mounting = {"T_vehicle_left": self.simulation.T_vehicle_left.to_list()}
+        self.driven = self.products.drive = Driven()
+        self.left: dict[int, Handle] = {}
+        self.motion: dict[tuple[int, int], Handle] = {}  # type: ignore[assignment]
+        self.posed: list[int] = [0]
+        """Frames of the trajectory so far."""
+        self.goal: tuple[float, float] = config.drive.goal
+        """In the world frame."""
+        self.true: dict[int, tuple[float, ...]] = {}
+        """True pose of each frame that was taken; read by the renderer and by what assesses, never by an estimate."""
+        self.looks = self.troubles = 0
+        self.rows: dict[int, int] = {}
+        """Row of each frame in the artifact of its leg."""
+        self.closed: list[list[float]] = []
+        """Places about which unknown ground was looked at in vain."""
+
+    def build(self) -> Products:
+        """Lay out the start; the rest follows by expansion."""
+        self.scene = self._source(self.simulation.scene, "site")
+        place = self.driven.place = self._simulate(self.simulation.place, "drive/start", scene=self.scene)
+        sense = self._simulate(self.simulation.sense(-1), "sense/start", drive=place)
+        self.graph.expand([place, sense], lambda there, said: self._first(place, there, said))
+        return self.products
+
+    def _first(self, place: Handle, there: Ref, said: Ref) -> None:
+        self.true[0] = tuple(there.meta["poses"][0])
+        self._stop(0, place, 0, said.meta["up"][0])
+
+    # -- a stop -------------------------------------------------------------------------------------------------
+
+    def _stop(self, frame: int, before: Handle, row: int, up: list[float]) -> None:
+        """Stereo pair to local model, merged map, hazards, and the next leg."""
+        p, k = self.products, len(self.driven.stops)
+        stop = Stop(k, frame)
+        self.driven.stops.append(stop)
+        if frame not in self.left:
+            self._left(frame)
+        right = self._taken(frame, "right")
+        p.disparity[frame] = self._disparity(frame, right)
+        if k == 0:
+            self._calibrate(frame)
+        p.rigs[frame], self.calibration[frame] = p.rigs[0], self.calibration[0]
+        p.level[frame] = self._node(
+            "level",
+            f"level/{frame}",
+            {"pair": frame, "up": up},
+            disparity=p.disparity[frame],
+            rig=self.calibration[frame],
+        )
+        p.local_dem[frame] = self._node(
+            "locus",
+            f"locus/local/{frame}",
+            {"pair": frame, "frame": "local"},
+            disparity=p.disparity[frame],
+            rig=self.calibration[frame],
+            left=self.left[frame],
+            level=p.level[frame],
+            reference=p.level[0],
+        )
+        if k == 0 and self.config.drive.frame == "map":
+            self.graph.expand([self._fix(frame)], lambda fixed: self._on_the_map(stop, before, row, fixed))
+        else:
+            self._think(stop, before, row)
+
+    def _think(self, stop: Stop, before: Handle, row: int) -> None:
+        self._map(stop)
+        assert stop.leg is not None
+        self.graph.expand([stop.leg], lambda leg: self._after_leg(stop, before, row, leg))
+
+    def _fix(self, frame: int) -> Handle:
+        """Where the first pair is in the global map: handed in, or found by its elevation model."""
+        d, inputs = self.config.drive, dict[str, Handle]()
+        args: dict[str, Any] = {}
+        if d.pose is not None:
+            args["pose"] = [*d.pose[:3], math.radians(d.pose[3])]
+        elif d.prior is None or self.simulation.overview is None:
+            raise ConfigError(
+                "drive.frame=map needs drive.pose, or drive.prior and a global map",
+                remedy="set drive.pose=[x, y, z, degrees], or drive.prior and rover.map_cell",
+            )
+        else:
+            overview = self._simulate(self.simulation.overview, "overview", scene=self.scene)
+            inputs = {"dem": self.products.local_dem[frame], "map": overview}
+            args["prior"] = [*d.prior[:2], math.radians(d.prior[2])]
+            args["prior_sigma"] = [d.prior_sigma[0], math.radians(d.prior_sigma[1])]
+        self.driven.fix = self._node("global_fix", "global_fix", args, **inputs)
+        return self.driven.fix
+
+    def _on_the_map(self, stop: Stop, before: Handle, row: int, fixed: Ref) -> None:
+        """The goal in the world frame, which is the local frame of the first pair."""
+        T_world_map = RigidTransform.from_matrix(fixed.meta["T_global_local"]).inverse()
+        x, y, _ = T_world_map.apply([*self.config.drive.goal, fixed.meta["T_global_local"][11]])
+        self.goal = float(x), float(y)
+        self._think(stop, before, row)
+
+    def _calibrate(self, frame: int) -> None:
+        """The rig of the whole drive, from the first pair."""
+        p = self.products
+        given = self.sequence.rig.to_dict()
+        p.orientations[frame] = self._node(
+            "orientation", f"orientation/{frame}", {"pair": frame, "rig": given}, disparity=p.disparity[frame]
+        )
+        p.rigs = {frame: self._rig([frame], "")}
+        self.calibration = {frame: self._node("calibration", "calibration", {}, rig=p.rigs[frame])}
+
+    def _map(self, stop: Stop) -> None:
+        """What is known of the world at a stop, its hazards, and where to go next."""
+        p, k, frame = self.products, stop.index, stop.frame
+        keys = [s.frame for s in self.driven.stops]
+        stop.trajectory = p.trajectory = self._node(
+            "trajectory",
+            f"trajectory/{k}",
+            {"frames": list(self.posed)},
+            segments=list(p.resections),
+            levels=[p.level[key] for key in keys[:k]] or [p.level[frame]],
+        )
+        self.pose = self._node("pose", f"pose/{frame}", {"row": len(self.posed) - 1}, trajectory=p.trajectory)
+        p.world_dem[frame] = self._node(
+            "locus",
+            f"locus/world/{frame}",
+            {"pair": frame, "frame": "world", "row": 0},
+            disparity=p.disparity[frame],
+            rig=self.calibration[frame],
+            left=self.left[frame],
+            level=p.level[frame],
+            reference=p.level[0],
+            trajectory=self.pose,
+            local=p.local_dem[frame],
+        )
+        if k == 0:
+            self._pad(frame)
+        stop.merged = self._node(
+            "merge", f"merge/{k}", {"lattice": self.arena().to_dict()}, dems=[*self.pads, *p.world_dem.values()]
+        )
+        p.tiles = [stop.merged]
+        stop.risk = p.risk = self._risk(f"risk/{k}", [stop.merged])
+        stop.leg = self._leg(f"leg/{k}", stop.risk, self.pose)
+
+    def _pad(self, frame: int) -> None:
+        """The ground under the vehicle at the start, and where it is."""
+        args = {"radius": self.simulation.pad, "wheel_diameter": self.config.vehicle.wheel_diameter, **self.mounting}
+        self.first_pose = self.pose
+        like = self.products.world_dem[frame]
+        self.pads = [self._node("pad", "pad", args, pose=self.pose, like=like)] if self.simulation.pad > 0 else []
+
+    def _leg(self, label: str, risk: Handle, pose: Handle, **more: Any) -> Handle:
+        args = {
+            "goal": list(self.goal),
+            "looks": self.looks,
+            "closed": self.closed,
+            **self.mounting,
+            **more,
+        }
+        return self._node("leg", label, args, risk=risk, pose=pose)
+
+    def arena(self) -> Lattice:
+        """The part of the world that is mapped: around the start, which is at the origin, and the goal."""
+        d = self.config.drive
+        bounds = [f(0.0, g) + s * d.around for g in self.goal for f, s in ((min, -1.0), (max, 1.0))]
+        return Lattice.snap(bounds, self.config.locus.cell_size)
+
+    def _after_leg(self, stop: Stop, before: Handle, row: int, leg: Ref) -> None:
+        verdict = leg.meta["verdict"]
+        if verdict in ("goal", "no path"):
+            stop.event = leg.meta["reason"]
+            self._end(verdict, leg.meta["reason"])
+        elif verdict == "closed":
+            self.closed = [*self.closed, leg.meta["where"]]
+            self.looks = 0
+            assert stop.risk is not None
+            stop.leg = self._leg(f"leg/{stop.index}/{len(self.closed)}", stop.risk, self.pose)
+            self.graph.expand([stop.leg], lambda again: self._after_leg(stop, before, row, again))
+        elif stop.index + 1 >= self.config.drive.max_stops:
+            self._end("stops", f"{stop.index + 1} stops and {1000 * leg.meta['left_m']:.0f} mm from the goal")
+        else:
+            self.looks = {"drive": 0, "turn": self.looks, "look": self.looks + 1}[verdict]
+            stop.event = leg.meta["reason"]
+            self._drive(stop, before, row)
+
+    # -- a leg --------------------------------------------------------------------------------------------------
+
+    def _drive(self, stop: Stop, before: Handle, row: int) -> None:
+        """The true motion, and what the sensors say of it."""
+        k, s = stop.index, self.simulation
+        assert stop.leg is not None
+        told = {"before": before, "pose": self.pose, "leg": stop.leg}
+        change = s.change(k, row)
+        if change is not None:
+            self.scene = self._simulate(change, f"obstacle/{k}", scene=self.scene, **told)
+        stop.drive = self._simulate(s.drive(k, row), f"drive/{k}", scene=self.scene, **told)
+        stop.sense = self._simulate(s.sense(k), f"sense/{k}", drive=stop.drive)
+        self.graph.expand([stop.drive, stop.sense], lambda there, said: self._on_the_way(stop, there, said))
+
+    def _on_the_way(self, stop: Stop, there: Ref, said: Ref) -> None:
+        """Images of the leg, and how each moved against the one before."""
+        first = max(self.true) + 1
+        rows = {stop.frame: 0}
+        for row, pose in enumerate(there.meta["poses"][1:], start=1):
+            frame = first + row - 1
+            self.true[frame] = tuple(pose)
+            rows[frame] = row
+            self._left(frame)
+        frames = list(rows)
+        if len(frames) < 2:
+            self._end("safety stop", "the rover did not move: it stands at the edge of the simulated bed")
+            return
+        moved = [self._moved(a, b) for a, b in itertools.pairwise(frames)]
+        self.graph.expand(moved, lambda *found: self._seen(stop, rows, said, list(found)))
+
+    def _seen(self, stop: Stop, rows: dict[int, int], said: Ref, moved: list[Ref]) -> None:
+        """Leave lost images out; where two in a row are lost, or the last one, the vehicle stops and looks again."""
+        frames, least = list(rows), self.config.drive.least_match
+        rate = [float(m.meta["match_rate"] or 0.0) for m in moved]
+        lost = [b for n, b in enumerate(frames[1:]) if rate[n] < least and (n + 1 == len(rate) or rate[n + 1] < least)]
+        if lost:
+            shares = ", ".join(f"{b} ({rate[frames.index(b) - 1]:.0%} matched)" for b in lost)
+            stop.event = f"lost image {shares}: left out"
+            pair = next((n for n in range(1, len(frames) - 1) if {*frames[n : n + 2]} <= set(lost)), None)
+            end = frames[-1] if pair is None else frames[pair + 1]
+            frames = frames[: frames.index(end) + 1]
+            if end in lost:
+                again = max(self.true) + 1
+                self.true[again], rows[again] = self.true[end], rows[end]
+                stop.event = f"lost image {shares}: stopped and taken again as image {again}"
+                self._left(again)
+                frames.append(again)
+        kept = [f for f in frames if f not in lost]
+        if len(kept) < 2:
+            self._end("safety stop", "tracking is lost: " + stop.event)
+            return
+        self._segment_of(stop, kept, rows, said)
+
+    def _segment_of(self, stop: Stop, frames: list[int], rows: dict[int, int], said: Ref) -> None:
+        """Track and resect the images of the leg, then judge it."""
+        resection = self._resection(stop, frames, f"{stop.frame}")
+        vehicle = self.config.vehicle.model_dump(mode="json")
+        args = {"rows": [rows[f] for f in frames], "vehicle": vehicle, **self.mounting}
+        assert stop.sense is not None
+        stop.safety = self._node("safety", f"safety/{stop.index}", args, sense=stop.sense, resect=resection)
+        judges = [stop.safety]
+        if self.config.reflex.enabled:
+            stop.reflex = self._reflex(stop, frames, rows, said, resection)
+            judges.append(stop.reflex)
+        self.graph.expand(judges, lambda *found: self._after(stop, frames, rows, said, resection, *found))
+
+    def _reflex(self, stop: Stop, frames: list[int], rows: dict[int, int], said: Ref, resection: Handle) -> Handle:
+        """Whether the images on the way show what the last model does not."""
+        p, vehicle = self.config.reflex, self.config.vehicle
+        wheels = np.array([said.meta["odometry"][rows[f]] for f in frames])
+        compared = pairs(wheels, vehicle.wheel_diameter, p)
+        params = self.config.motion.model_copy(update={"level": p.level})
+        motions = [
+            self.graph.node(
+                STAGE_MODULES["motion"],
+                f"motion/way/{frames[i]}-{frames[j]}",
+                params,
+                {"frames": [frames[i], frames[j]]},
+                {},
+                {"a": self.left[frames[i]], "b": self.left[frames[j]]},
+            )
+            for i, j in compared
+        ]
+        args = {"pairs": [list(c) for c in compared], "vehicle": vehicle.model_dump(mode="json"), **self.mounting}
+        return self._node(
+            "reflex",
+            f"reflex/{stop.index}",
+            args,
+            dem=self.products.local_dem[stop.frame],
+            resect=resection,
+            rig=self.calibration[stop.frame],
+            motions=motions,
+        )
+
+    def _resection(self, stop: Stop, frames: list[int], which: str) -> Handle:
+        p, key = self.products, stop.frame
+        track = self._node(
+            "track",
+            f"track/{which}",
+            {"frames": frames},
+            frames=[self.left[f] for f in frames],
+            motions=[self._moved(a, b) for a, b in itertools.pairwise(frames)],
+        )
+        p.tracks.append(track)
+        surface = {"dem": p.local_dem[key]} if self.config.resect.landmarks == "dem" else {}
+        return self._node(
+            "resect",
+            f"resect/{which}",
+            {"frames": frames},
+            track=track,
+            disparity=p.disparity[key],
+            level=p.level[key],
+            rig=self.calibration[key],
+            **surface,
+        )
+
+    def _after(
+        self,
+        stop: Stop,
+        frames: list[int],
+        rows: dict[int, int],
+        said: Ref,
+        resection: Handle,
+        safety: Ref,
+        reflex: Ref | None = None,
+    ) -> None:
+        """The leg is over: at its end, or where a safety stop or an obstacle ended it."""
+        cut, kind, reason = safety.meta["stop"], safety.meta["kind"], safety.meta["reason"]
+        seen = None if reflex is None else reflex.meta["stop"]
+        if reflex is not None and seen is not None and (cut is None or seen < cut):
+            cut, kind, reason = seen, "reflex", reflex.meta["reason"]
+        self.troubles = 0 if cut is None or kind == "reflex" else self.troubles + 1
+        if cut is not None:
+            stop.event = f"{'reflex' if kind == 'reflex' else 'safety stop'} at image {frames[cut]}: {reason}"
+            if cut < len(frames) - 1:
+                frames = frames[: cut + 1]
+                self.products.tracks.pop()
+                resection = self._resection(stop, frames, f"{stop.frame}/stopped")
+        stop.frames = frames
+        self.rows |= {f: rows[f] for f in frames[1:]}
+        self.products.resections.append(resection)
+        self.posed += frames[1:]
+        terminal = kind in ("attitude", "acceleration", "lost")
+        if terminal or self.troubles >= self.config.drive.max_safety_stops:
+            often = f", {self.troubles} legs in a row" if self.troubles > 1 else ""
+            self._end("safety stop", reason + often)
+            return
+        assert stop.drive is not None
+        self._stop(frames[-1], stop.drive, rows[frames[-1]], said.meta["up"][rows[frames[-1]]])
+
+    # -- the end ------------------------------------------------------------------------------------------------
+
+    def _end(self, verdict: str, reason: str) -> None:
+        """Say how it ended, and assess it: here alone truth and estimates meet."""
+        self.driven.verdict, self.driven.reason = verdict, reason
+        p, s, first = self.products, self.simulation, self.products.level[0]
+        poses = [list(self.true[f]) for f in self.posed]
+        args = {"poses": poses, "source": self.sequence.truth_source, "frames": list(self.posed)}
+        self.truth = self._node("truth", "truth", args)
+        assert p.trajectory is not None
+        p.accuracy = self._node("accuracy", "accuracy", {}, trajectory=p.trajectory, truth=self.truth)
+
+        def ground(level: Ref) -> None:
+            T_left_local = RigidTransform.from_matrix(level.meta["T_local_left"]).inverse()
+            T_truth_world = RigidTransform.from_matrix(self.true[0]) @ T_left_local
+            stops = [RigidTransform.from_matrix(self.true[stop.frame]) for stop in self.driven.stops]
+            source = s.truth_dem(self.arena().to_dict(), T_truth_world, stops)
+            truth_dem = self._simulate(source, "truth_dem", scene=self.scene)
+            p.dem_accuracy = self._node("dem_accuracy", "dem_accuracy/world", {}, dem=p.tiles, truth=truth_dem)
+            p.truth_risk = self._risk("risk/truth", [truth_dem])
+            self.looks, self.closed = 0, []
+            self.driven.truth_leg = self._leg("leg/truth", p.truth_risk, self.first_pose, whole=True)
+            self._check()
+
+        self.graph.expand([first], ground)
+
+    def _check(self) -> None:
+        """The drive against the truth."""
+        d, p = self.driven, self.products
+        legs = [s for s in d.stops if s.drive is not None and s.frames]
+        assert d.place is not None
+        assert d.truth_leg is not None
+        assert p.trajectory is not None
+        d.check = self._node(
+            "drive_check",
+            "drive_check",
+            {
+                "rows": [0, *(self.rows[s.frames[-1]] for s in legs)],
+                "vehicle": self.config.vehicle.model_dump(mode="json"),
+            },
+            drives=[d.place, *(s.drive for s in legs if s.drive is not None)],
+            trajectory=p.trajectory,
+            truth=self.truth,
+            best=d.truth_leg,
+        )
+
+    def outcome(self) -> tuple[str, str]:
+        """Verdict and reason, once the graph has run: of the last stop, or of what failed on the way."""
+        if self.driven.verdict:
+            return self.driven.verdict, self.driven.reason
+        failed = next((h for h in self.graph.nodes if h.status == "failed"), None)
+        if failed is not None and isinstance(failed.error, DegenerateError):
+            return "safety stop", f"{failed.label}: {failed.error.message}"
+        return "failed", "" if failed is None else f"{failed.label}: {failed.error}"
+
+    def taken(self) -> tuple[Sequence, tuple[int, ...]]:
+        """The sequence as it came about, and the frames that have a pose in it."""
+        n = max(self.true, default=0) + 1
+        truth = tuple(RigidTransform.from_matrix(self.true[f]) if f in self.true else None for f in range(n))
+        names = tuple(f"{f:06d}" for f in range(n))
+        return replace(self.sequence, frames=n, frame_names=names, truth=truth), tuple(self.posed)
+
+    # -- small things -------------------------------------------------------------------------------------------
+
+    def _simulate(self, source: Source, label: str, **inputs: Handle) -> Handle:
+        return self.graph.node(source.module, label, source.params, dict(source.args), dict(source.hints), inputs)
+
+    def _left(self, frame: int) -> None:
+        self.left[frame] = self._taken(frame, "left")
+
+    def _taken(self, frame: int, camera: str) -> Handle:
+        """Pyramid of an image taken at its true pose."""
+        source = self.simulation.image(frame, camera, RigidTransform.from_matrix(self.true[frame]))
+        image = self._simulate(source, f"image/{camera}/{frame}", scene=self.scene)
+        if camera == "left":
+            self.products.images[frame] = image
+        return self._node("pyramid", f"pyramid/{camera}/{frame}", {}, image=image)
+
+    def _moved(self, a: int, b: int) -> Handle:
+        if (a, b) not in self.motion:
+            self.motion[a, b] = self._node(
+                "motion", f"motion/{a}-{b}", {"frames": [a, b]}, a=self.left[a], b=self.left[b]
+            )
+        return self.motion[a, b]
+
+
+def dataflow(graph: Graph, sequence: Sequence, config: Any, frames: tuple[int, ...]) -> Reconstruction:
+    """The builder that suits a sequence: of a recorded one, or of one that is driven."""
+    kind = Reconstruction if sequence.simulation is None else Drive
+    return kind(graph, sequence, config, frames)

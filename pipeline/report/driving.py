@@ -1,0 +1,215 @@
+"""The drive as a strip of pictures: a stop per column, with what was seen, what was thought and what was known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.report import canvas
+from pipeline.report.block import Block, Table
+from pipeline.report.canvas import Extent, Panel
+from pipeline.report.gather import Scene
+from pipeline.report.words import metres
+from stages.geometry import RigidTransform
+from stages.lattice import Lattice
+
+Floats = NDArray[Any]
+
+WIDTH = 2.2
+"""Inches of a column."""
+AROUND = 0.35
+"""Share of the map's larger side that the local risk map shows to either side of the vehicle."""
+VERDICTS = {
+    "goal": "The goal was reached",
+    "no path": "No path leads to the goal",
+    "safety stop": "Safety stop",
+    "stops": "Given up after too many stops",
+}
+
+
+@dataclass(frozen=True)
+class Shown:
+    """One stop: its picture, risk map, leg and merged elevations, with the vehicle's tracks up to it (n, 2) m."""
+
+    title: str
+    image: Floats
+    lattice: Lattice
+    risk: Floats
+    elevation: Floats
+    path: Floats
+    way: Floats
+    goal: tuple[float, float]
+    at: tuple[float, float]
+    estimate: Floats
+    truth: Floats | None
+    event: bool
+
+
+def strip(scene: Scene) -> Block | None:
+    """The figure of a drive; None where nothing was driven."""
+    view = scene.view
+    drive = view.products.drive
+    if drive is None:
+        return None
+    panels, rows = [], []
+    estimate, truth = tracks(scene)
+    for stop in drive.stops:
+        leg, risk = view.bundle(stop.leg), view.bundle(stop.risk)
+        image = view.bundle(view.products.images.get(stop.frame))
+        if leg is None or risk is None or image is None:
+            continue
+        upto = view.frames.index(stop.frame) + 1
+        meta = leg.meta
+        shown = Shown(
+            f"stop {stop.index}: {meta['verdict']}",
+            np.asarray(image["image"]),
+            Lattice.from_dict(risk.meta["lattice"]),
+            np.asarray(risk["risk"]),
+            np.asarray(risk["elevation"]),
+            np.asarray(leg["path"]),
+            np.asarray(leg["way"]),
+            (meta["goal"][0], meta["goal"][1]),
+            (meta["start"][0], meta["start"][1]),
+            estimate[:upto],
+            None if truth is None else truth[:upto],
+            stop.event != "" and meta["verdict"] != "goal",
+        )
+        alt = f"Stop {stop.index} at frame {stop.frame}, {metres(meta['left_m'])} from the goal: {meta['verdict']}"
+        panels.append(column(shown, alt))
+        off = None if truth is None else float(np.hypot(*(estimate[upto - 1] - truth[upto - 1])))
+        rows.append(
+            (
+                str(stop.index),
+                str(stop.frame),
+                metres(meta["left_m"]),
+                meta["verdict"],
+                metres(meta["length_m"]),
+                metres(off),
+                stop.event,
+            )
+        )
+    if not panels:
+        return None
+    head = ("Stop", "Frame", "From the goal", "Decision", "Leg", "Position error", "What happened")
+    reason = f": {drive.reason}" if drive.reason else ""
+    caption = (
+        f"{VERDICTS.get(drive.verdict, 'The drive did not end')}{reason}. Each column is a stop. First: the left "
+        "image. Second: the hazards around the vehicle (disk) as known then, with the leg that is driven next (black) "
+        "and the way as planned beyond it (thin); the star is the goal. Third: the merged elevations of all stops so "
+        "far with the vehicle's track, estimated (blue) and true (orange)."
+    )
+    caption += _fixed(scene)
+    legend = (
+        (canvas.SAFE, "safe"),
+        (canvas.CAUTION, "caution"),
+        (canvas.HAZARDOUS, "hazardous"),
+        (canvas.UNKNOWN, "unknown"),
+        (canvas.ESTIMATE, "estimated track"),
+        (canvas.REFERENCE, "true track"),
+    )
+    table = Table(head, tuple(rows), frozenset({0, 1, 2, 4, 5}))
+    return Block("Drive", "The drive, stop by stop", caption, tuple(panels), legend, table, strip=True)
+
+
+def _fixed(scene: Scene) -> str:
+    """Where the start is in the global map, in words; empty without one."""
+    drive = scene.view.products.drive
+    fix = None if drive is None else scene.view.bundle(drive.fix)
+    if fix is None:
+        return ""
+    x, y = fix.meta["T_global_local"][3], fix.meta["T_global_local"][7]
+    place = f" In the global map the first camera is at ({x:.3f}, {y:.3f}) m, {fix.meta['source']}"
+    if "std" not in fix.meta:
+        return place + "."
+    sx, sy, heading, _ = fix.meta["std"]
+    other = fix.meta["other"]
+    next_best = "" if other is None else f"; the next best place has a chi2 larger by {other['chi2']:.0f}"
+    turn = f"{np.degrees(heading):.2f}°"
+    return f"{place} (standard deviations {metres(sx)}, {metres(sy)}, {turn}){next_best}."
+
+
+def tracks(scene: Scene) -> tuple[Floats, Floats | None]:
+    """Track (frame, 2) m of the centre of the wheels in the world, estimated and true (first poses made equal)."""
+    view = scene.view
+    simulation, trajectory = view.sequence.simulation, view.bundle(view.products.trajectory)
+    assert simulation is not None
+    T_left_vehicle = simulation.T_vehicle_left.inverse()
+    n = len(view.frames)
+    found = np.full((n, 2), np.nan)
+    if trajectory is None:
+        return found, None
+    poses = [RigidTransform.from_matrix(m) for m in np.asarray(trajectory["poses"])]
+    for k, pose in enumerate(poses):
+        found[k] = (pose @ T_left_vehicle).translation[:2]
+    true = [None if view.sequence.truth is None else view.sequence.truth[f] for f in view.frames]
+    first = true[0]
+    if first is None:
+        return found, None
+    T_world_truth = poses[0] @ first.inverse()
+    truth = np.full((n, 2), np.nan)
+    for k, pose_ in enumerate(true):
+        if pose_ is not None:
+            truth[k] = (T_world_truth @ pose_ @ T_left_vehicle).translation[:2]
+    return found, truth
+
+
+def column(s: Shown, alt: str) -> Panel:
+    """One stop as a column of three pictures."""
+    rows, cols = s.image.shape[:2]
+    whole = s.lattice.bounds
+    near = _near(s.at, AROUND * max(whole[1] - whole[0], whole[3] - whole[2]) / 1.5)
+    heights = [WIDTH * rows / cols, WIDTH, WIDTH * (whole[3] - whole[2]) / (whole[1] - whole[0])]
+    gap, top = 0.06, 0.24
+    total = top + sum(heights) + 2 * gap
+    fig = canvas.figure(WIDTH, total)
+    edge, axes = total - top, []
+    for height in heights:
+        edge -= height
+        ax = fig.add_axes((0.0, edge / total, 1.0, height / total))
+        ax.set_axis_off()
+        axes.append(ax)
+        edge -= gap
+    color = canvas.HAZARDOUS if s.event else canvas.MARK
+    fig.text(0.5, 1 - 0.6 * top / total, s.title, ha="center", va="center", fontsize=9, color=color)
+    axes[0].imshow(s.image, cmap="gray", vmin=0, vmax=255, aspect="auto")
+    colors = np.array([_rgb(c) for c in (canvas.SAFE, canvas.CAUTION, canvas.HAZARDOUS, canvas.UNKNOWN)])
+    _map(axes[1], colors[s.risk], whole, near)
+    axes[1].plot(s.way[:, 0], s.way[:, 1], color=canvas.MARK, linewidth=0.7)
+    if len(s.path) > 1:
+        axes[1].plot(s.path[:, 0], s.path[:, 1], color="white", linewidth=4)
+        axes[1].plot(s.path[:, 0], s.path[:, 1], color=canvas.MARK, linewidth=2)
+    low, high = canvas.ground_limits(s.elevation)
+    _map(axes[2], s.elevation, whole, whole, cmap=canvas.color_map("gray", "white"), vmin=low, vmax=high)
+    for track, shade, width in ((s.truth, canvas.REFERENCE, 4.0), (s.estimate, canvas.ESTIMATE, 1.6)):
+        if track is not None:
+            axes[2].plot(track[:, 0], track[:, 1], color=shade, linewidth=width)
+    for ax in axes[1:]:
+        ax.plot(*s.at, "o", markersize=5, markerfacecolor=canvas.MARK, markeredgecolor="white")
+        ax.plot(*s.goal, "*", markersize=9, markerfacecolor="#ffd34d", markeredgecolor=canvas.MARK)
+    return canvas.encode(fig, alt)
+
+
+def _near(at: tuple[float, float], reach: float) -> Extent:
+    return at[0] - reach, at[0] + reach, at[1] - 0.4 * reach, at[1] + 1.6 * reach
+
+
+def _map(ax: Any, values: Floats, extent: Extent, shown: Extent, **style: Any) -> None:
+    ax.imshow(values, extent=extent, aspect="auto", interpolation="nearest", **style)
+    ax.set_xlim(shown[0], shown[1])
+    ax.set_ylim(shown[2], shown[3])
+
+
+def _rgb(color: str) -> tuple[float, float, float]:
+    return tuple(int(color[k : k + 2], 16) / 255 for k in (1, 3, 5))  # type: ignore[return-value]
+
+
+def verdict(scene: Scene) -> str | None:
+    """One line on how a drive ended; None where nothing was driven."""
+    drive = scene.view.products.drive
+    if drive is None:
+        return None
+    words = VERDICTS.get(drive.verdict, "The drive did not end")
+    return f"{words}{': ' + drive.reason if drive.reason else ''}; {len(drive.stops)} stops"

@@ -1,0 +1,128 @@
+"""How a vehicle stands on a surface: where its four wheels touch, how it tilts, and what is left under its belly.
+
+A wheel is a sphere of its diameter that rests on the surface (the highest position that the heights under it enforce).
+The body is the plane of least squares through the four contacts: averaging suspensions (rocker-bogie) keep to it.
+
+* tilt: angle of that plane to the horizontal;
+* clearance: least distance of the belly, ``vehicle.clearance`` above the plane between the wheels, to the surface;
+* step: range of the heights within half a wheel's diameter about the worst contact, the edge that it climbs there.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from stages.geometry import RigidTransform
+from stages.vehicle import Vehicle
+
+Floats = NDArray[np.float64]
+
+BELLY_POINTS = 9
+"""Samples along either side of the belly."""
+
+
+@dataclass(frozen=True)
+class Ground:
+    """Heights (row, col), metres, NaN unknown; node (row, col) is at x = x0 + col cell, y = y0 - row cell.
+
+    ``resting`` (row, col): height of a wheel's lowest point where it rests above the node; ``step`` (row, col): range
+    of the heights in the window of half a wheel's diameter.
+    """
+
+    x0: float
+    y0: float
+    cell: float
+    height: Floats
+    resting: Floats
+    step: Floats
+
+    @staticmethod
+    def of(height: NDArray[np.floating], x0: float, y0: float, cell: float, wheel_diameter: float) -> Ground:
+        """Ground with what a wheel makes of it."""
+        z = np.asarray(height, dtype=np.float64)
+        radius = 0.5 * wheel_diameter
+        n = int(radius / cell)
+        dy, dx = np.mgrid[-n : n + 1, -n : n + 1] * cell
+        inside = dx**2 + dy**2 <= radius**2
+        sphere = np.where(inside, np.sqrt(np.maximum(radius**2 - dx**2 - dy**2, 0.0)) - radius, 0.0)
+        low = np.where(np.isnan(z), -1e9, z)
+        resting = ndimage.grey_dilation(low, footprint=inside, structure=sphere, mode="nearest")
+        side = 2 * max(1, int(0.25 * wheel_diameter / cell + 1e-6)) + 1
+        high = ndimage.maximum_filter(low, side, mode="nearest")
+        least = ndimage.minimum_filter(np.where(np.isnan(z), 1e9, z), side, mode="nearest")
+        unknown = np.isnan(z)
+        return Ground(
+            x0, y0, cell, z, np.where(unknown, np.nan, resting), np.where(unknown, np.nan, np.maximum(high - least, 0))
+        )
+
+    def at(self, what: Floats, points: Floats) -> Floats:
+        """Bilinear values (n,) of one of the arrays at points (n, 2); NaN outside or beside unknown nodes."""
+        row, col = (self.y0 - points[:, 1]) / self.cell, (points[:, 0] - self.x0) / self.cell
+        rows, cols = what.shape
+        inside = (row >= 0) & (col >= 0) & (row <= rows - 1) & (col <= cols - 1)
+        r = np.clip(np.floor(np.where(inside, row, 0.0)).astype(np.intp), 0, rows - 2)
+        c = np.clip(np.floor(np.where(inside, col, 0.0)).astype(np.intp), 0, cols - 2)
+        u, v = row - r, col - c
+        top = (1 - v) * what[r, c] + v * what[r, c + 1]
+        foot = (1 - v) * what[r + 1, c] + v * what[r + 1, c + 1]
+        return np.where(inside, (1 - u) * top + u * foot, np.nan)
+
+    def part(self, x: tuple[float, float], y: tuple[float, float], wheel_diameter: float) -> Ground:
+        """The ground of a box alone, wheels recomputed."""
+        c0, c1 = (int((v - self.x0) / self.cell) for v in x)
+        r0, r1 = (int((self.y0 - v) / self.cell) for v in (y[1], y[0]))
+        r0, r1 = max(r0, 0), min(r1 + 2, self.height.shape[0])
+        c0, c1 = max(c0, 0), min(c1 + 2, self.height.shape[1])
+        part = self.height[r0:r1, c0:c1]
+        return Ground.of(part, self.x0 + c0 * self.cell, self.y0 - r0 * self.cell, self.cell, wheel_diameter)
+
+
+@dataclass(frozen=True)
+class Stand:
+    """How a vehicle stands: pose of its frame (origin between the wheels on the ground, y ahead, z up), and measures.
+
+    ``tilt`` rad, ``clearance`` m (negative: the belly strikes), ``step`` m; NaN where a wheel stands on nothing known.
+    """
+
+    T_ground_vehicle: RigidTransform
+    tilt: float
+    clearance: float
+    step: float
+
+
+def wheel_positions(vehicle: Vehicle) -> Floats:
+    """Wheels (4, 2): right and ahead of the centre, m; front left, front right, rear left, rear right."""
+    a, b = 0.5 * vehicle.track, 0.5 * vehicle.wheel_base
+    return np.array([[-a, b], [a, b], [-a, -b], [a, -b]])
+
+
+def stand(ground: Ground, x: float, y: float, heading: float, vehicle: Vehicle) -> Stand | None:
+    """The vehicle with its centre above (x, y), turned by ``heading`` (rad, to the left of y); None: off the ground."""
+    c, s = math.cos(heading), math.sin(heading)
+    turn = np.array([[c, -s], [s, c]])
+    wheels = wheel_positions(vehicle)
+    at = wheels @ turn.T + [x, y]
+    z = ground.at(ground.resting, at)
+    if not np.isfinite(z).all():
+        return None
+    rise = 0.5 * (z[0] + z[1] - z[2] - z[3]) / vehicle.wheel_base
+    lean = 0.5 * (z[1] + z[3] - z[0] - z[2]) / vehicle.track
+    middle = float(z.mean())
+    up = np.array([-lean, -rise, 1.0]) / math.sqrt(1.0 + lean * lean + rise * rise)
+    ahead = np.array([0.0, 1.0, rise]) / math.sqrt(1.0 + rise * rise)
+    right = np.cross(ahead, up)
+    level = np.stack([right, ahead, up], axis=1)
+    R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    pose = RigidTransform(R @ level, np.array([x, y, middle]))
+    half = np.linspace(-0.5, 0.5, BELLY_POINTS)
+    across, along = np.meshgrid(half * (vehicle.track - 0.2 * vehicle.wheel_diameter), half * vehicle.wheel_base)
+    belly = np.stack([across.ravel(), along.ravel()], axis=1)
+    terrain = ground.at(ground.height, belly @ turn.T + [x, y])
+    free = middle + lean * belly[:, 0] + rise * belly[:, 1] + vehicle.clearance - terrain
+    step = ground.at(ground.step, at)
+    return Stand(pose, math.acos(min(1.0, float(up[2]))), float(np.nanmin(free)), float(step.max()))

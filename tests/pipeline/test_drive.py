@@ -1,0 +1,172 @@
+"""The closed loop in small: it arrives, it repeats to the bit, no estimate reads the truth, it says why it stops."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from datasets.registry import open_sequence
+from pipeline import config, driver, run
+from pipeline.dag import Graph, Handle
+from pipeline.drive import Drive
+from pipeline.driver import Result
+from pipeline.store import Store
+from stages.errors import ConfigError
+
+SMALL = (
+    "mockup.image_width=160",
+    "mockup.image_height=120",
+    "mockup.focal_length=90.0",
+    "mockup.bed_width=1.0",
+    "mockup.bed_length=1.1",
+    "mockup.cell=0.004",
+    "mockup.rocks=0.0",
+    "mockup.craters=0.0",
+    "rover.frame_step=0.05",
+    "locus.cell_size=0.008",
+    "drive.goal=[0.03, 0.25]",
+    "drive.around=0.4",
+    "reflex.enabled=false",
+)
+KNOW_THE_TRUTH = {"mockup.drive", "mockup.sense", "mockup.render", "mockup.obstacle", "mockup.truth_dem", "drive_check"}
+
+
+def drive(store: Path, *more: str) -> tuple[Drive, Result]:
+    for_dataset, for_stages = config.split_dataset(config.parse_assignments((*SMALL, *more)))
+    sequence = open_sequence("mockup-loop", for_dataset)
+    assert sequence.vehicle is not None
+    layers: list[dict[str, Any]] = [{"vehicle": sequence.vehicle.model_dump()}, config.expand(sequence.defaults)]
+    flow = Drive(Graph(), sequence, config.build(*layers, for_stages))
+    flow.build()
+    return flow, driver.run(flow.graph, Store(store), executor="inline", keep_going=True)
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("drive") / "cache"
+
+
+@pytest.fixture(scope="module")
+def arrived(store: Path) -> tuple[Drive, Result]:
+    return drive(store)
+
+
+def test_it_arrives_and_knows_where_it_is(arrived: tuple[Drive, Result], store: Path) -> None:
+    flow, result = arrived
+    assert result.failures == []
+    assert flow.outcome()[0] == "goal", flow.outcome()
+    assert len(flow.driven.stops) >= 3
+    assert flow.driven.check is not None
+    assert flow.driven.check.ref is not None
+    metrics = Store(store).open(flow.driven.check.ref).meta["metrics"]
+    assert [metrics[f"{name}_violations"]["value"] for name in ("clearance", "tilt", "step")] == [0, 0, 0]
+    # 0.2 px at 90 px of focal length and 0.4 m are 0.9 mm an image; the legs of a drive of 0.3 m add up to a few
+    assert metrics["localisation_error"]["value"] < 0.006
+    assert 0.2 < metrics["way"]["value"] < 0.45
+
+
+def test_driven_again_nothing_is_computed_and_all_is_the_same(arrived: tuple[Drive, Result], store: Path) -> None:
+    flow, result = drive(store)
+    assert result.total().computed == 0
+    assert flow.outcome() == arrived[0].outcome()
+    assert [s.frames for s in flow.driven.stops] == [s.frames for s in arrived[0].driven.stops]
+    assert {h.label: h.ref.digest for h in flow.graph.nodes if h.ref} == {
+        h.label: h.ref.digest for h in arrived[0].graph.nodes if h.ref
+    }
+
+
+def test_the_report_shows_the_drive(
+    arrived: tuple[Drive, Result], store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given: dict[str, Any] = {"runs": tmp_path, "cache": store, "executor": "inline", "progress": "quiet"}
+    assert run.reconstruct(run.Options("mockup-loop", assignments=SMALL, verb="drive", **given)) == 0
+    assert capsys.readouterr().out.startswith("goal: ")
+    folder = tmp_path / "mockup-loop" / "latest"
+    facts = json.loads((folder / "report.json").read_text())
+    assert facts["complete"], facts["missing"]
+    assert facts["metrics"]["drive_step_violations"]["value"] == 0
+    page = (folder / "report.html").read_text()
+    assert "The drive, stop by stop" in page
+    assert page.count('alt="Stop ') == len(arrived[0].driven.stops)
+    with pytest.raises(ConfigError, match="cannot be driven"):
+        run.reconstruct(run.Options("mockup-short", verb="drive", **given))
+
+
+def numbers(value: Any) -> Iterator[float]:
+    if isinstance(value, dict):
+        value = list(value.values())
+    if isinstance(value, list | tuple):
+        for item in value:
+            yield from numbers(item)
+    elif isinstance(value, float):
+        yield value
+
+
+def test_no_estimate_reads_a_true_pose(arrived: tuple[Drive, Result]) -> None:
+    flow, _ = arrived
+    assess = {"truth", "truth_dem"}
+    positions = {value for f, pose in flow.true.items() if f for value in np.array(pose).reshape(3, 4)[:, 3].tolist()}
+
+    def honest(handle: Handle) -> bool:
+        return handle.stage not in KNOW_THE_TRUTH | assess
+
+    for handle in filter(honest, flow.graph.nodes):
+        assert not {h.stage for h in handle.upstream()} & {"mockup.drive", "mockup.truth_dem"} or handle.stage in (
+            "dem_accuracy",
+            "risk",
+        ), handle.label
+        assert not positions & set(numbers(handle.spec.args)), handle.label
+    judged = {h.label for h in flow.graph.nodes if any(u.stage == "mockup.truth_dem" for u in h.upstream())}
+    assert judged == {"dem_accuracy/world", "risk/truth"}
+
+
+def test_a_lost_image_is_left_out_and_the_last_one_taken_again(arrived: tuple[Drive, Result], store: Path) -> None:
+    frames = arrived[0].driven.stops[0].frames
+    flow, result = drive(store, f"rover.lost_frames=[{frames[1]}]", "drive.max_stops=2")
+    assert result.failures == []
+    first = flow.driven.stops[0]
+    assert first.frames == [frames[0], *frames[2:]]
+    assert first.event.startswith(f"lost image {frames[1]} (")
+    flow, _ = drive(store, f"rover.lost_frames=[{frames[-1]}]", "drive.max_stops=2")
+    first = flow.driven.stops[0]
+    assert first.frames == [*frames[:-1], frames[-1] + 1]
+    assert first.event.endswith(f"taken again as image {frames[-1] + 1}")
+    assert flow.true[frames[-1] + 1] == flow.true[frames[-1]]
+
+
+def test_slip_of_thirty_per_cent_stops_and_says_so(arrived: tuple[Drive, Result], store: Path) -> None:
+    flow, _ = drive(store, "rover.slip=0.3", "rover.slip_sigma=0.0", "drive.max_safety_stops=1")
+    verdict, reason = flow.outcome()
+    assert verdict == "safety stop"
+    assert reason.startswith("slip of ")
+    assert "by the wheels" in reason
+    assert flow.driven.check is not None
+
+
+def test_a_drive_needs_a_goal_and_a_cell(store: Path) -> None:
+    sequence = open_sequence("mockup-loop")
+    with_goal = config.build({"drive": {"goal": (0.0, 1.0)}})
+    with pytest.raises(ConfigError, match=r"needs locus\.cell_size"):
+        Drive(Graph(), sequence, with_goal)
+    with pytest.raises(ConfigError, match="has no goal"):
+        Drive(Graph(), sequence, config.build({}))
+
+
+def test_a_goal_in_a_global_map_is_found_from_a_rough_prior(store: Path) -> None:
+    more = ("rover.map_cell=0.03", "drive.frame=map", "drive.goal=[0.0, 0.6]", "drive.max_stops=1")
+    flow, result = drive(store, *more, "drive.prior=[0.0, 0.38, 0.0]", "mockup.relief=0.02")
+    assert result.failures == []
+    fixed = next(h for h in flow.graph.nodes if h.stage == "global_fix").ref
+    assert fixed is not None
+    true = np.array(flow.true[0]).reshape(3, 4)[:, 3]
+    found = np.array(fixed.meta["T_global_local"]).reshape(3, 4)[:, 3]
+    assert np.abs(found - true)[:2].max() < 0.03  # a cell of the map
+    assert np.hypot(*flow.goal) == pytest.approx(np.hypot(*(np.array([0.0, 0.6]) - true[:2])), abs=0.03)
+    elsewhere, lost = drive(store, *more, "drive.prior=[9.0, 9.0, 0.0]", "mockup.relief=0.02")
+    assert "the global map knows at most 0% of the ground" in str(lost.failures[0].error)
+    assert elsewhere.outcome()[0] == "failed"

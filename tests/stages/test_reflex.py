@@ -1,0 +1,114 @@
+"""Reflex detection on exact displacements of a plane and a block: found where it stands, silent where none is new."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from stages.geometry import Camera, RigidTransform, rotation_exp
+from stages.lattice import Lattice
+from stages.reflex import ReflexParams, Surface, View, cluster, look, pairs
+from stages.vehicle import Vehicle
+
+Floats = NDArray[np.float64]
+ROVER = Vehicle(
+    wheel_diameter=0.03, track=0.08, wheel_base=0.10, clearance=0.025, max_step=0.012, max_roughness=0.004, margin=0.01
+)
+CAMERA = Camera(180.0, 180.0, 159.5, 119.5, 320, 240)
+P = ReflexParams()
+HEIGHT, PITCH = 0.18, math.radians(32.0)
+OPTICAL = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+T_VEHICLE_LEFT = RigidTransform(rotation_exp([-PITCH, 0.0, 0.0]) @ OPTICAL, np.array([0.0, 0.05, HEIGHT]))
+LATTICE = Lattice.snap((-0.3, 0.3, -0.1, 0.8), 0.004)
+BLOCK = (0.01, 0.26, 0.02, 0.015)  # x, y, half a side, height: a wheel's radius
+
+
+def at(y: float) -> RigidTransform:
+    """Pose of the camera with the vehicle's centre at (0, y)."""
+    return RigidTransform(np.eye(3), np.array([0.0, y, 0.0])) @ T_VEHICLE_LEFT
+
+
+def hit(pose: RigidTransform, pixels: Floats, block: tuple[float, float, float, float] | None) -> Floats:
+    """Where rays meet the plane z = 0, or the block's top or front side."""
+    rays = CAMERA.rays(pixels) @ pose.rotation.T
+    o = pose.translation
+    points = o + (-o[2] / rays[:, 2])[:, None] * rays
+    points[rays[:, 2] > -0.05] = np.nan
+    if block is not None:
+        x, y, half, h = block
+        top = o + ((h - o[2]) / rays[:, 2])[:, None] * rays
+        on_top = (np.abs(top[:, 0] - x) < half) & (np.abs(top[:, 1] - y) < half)
+        front = o + ((y - half - o[1]) / rays[:, 1])[:, None] * rays
+        on_front = (np.abs(front[:, 0] - x) < half) & (front[:, 2] > 0) & (front[:, 2] < h)
+        points = np.where(on_front[:, None], front, np.where(on_top[:, None], top, points))
+    return points
+
+
+def view(y0: float, y1: float, block: tuple[float, float, float, float] | None, noise: float = 0.4) -> View:
+    """Exact displacements of level 1 with noise, pixels of level 0."""
+    rows, cols = 120, 160
+    c, r = np.meshgrid((np.arange(cols) + 0.5) * 2 - 0.5, (np.arange(rows) + 0.5) * 2 - 0.5)
+    pixels = np.column_stack([c.ravel(), r.ravel()])
+    moved = CAMERA.project(at(y1).inverse().apply(hit(at(y0), pixels, block))) - pixels
+    moved += noise * np.random.default_rng(5).standard_normal(moved.shape)
+    known = np.isfinite(moved).all(axis=1).reshape(rows, cols)
+    u, v = (moved[:, k].reshape(rows, cols).astype(np.float32) for k in (0, 1))
+    return View(at(y0), at(y1), u, v, known, 1)
+
+
+def surface(block: tuple[float, float, float, float] | None = None) -> Surface:
+    z = np.zeros(LATTICE.shape)
+    if block is not None:
+        xy = LATTICE.xy()
+        z[(np.abs(xy[..., 0] - block[0]) < block[2]) & (np.abs(xy[..., 1] - block[1]) < block[2])] = block[3]
+    return Surface.of(z, LATTICE, P.blur * ROVER.wheel_diameter)
+
+
+def found(v: View, s: Surface) -> tuple[int, float, float] | None:
+    return cluster(look(v, s, CAMERA, T_VEHICLE_LEFT, ROVER, P), ROVER.wheel_diameter, P)
+
+
+@pytest.mark.parametrize("y1", [0.05, 0.075])
+def test_a_new_block_is_seen_where_it_stands(y1: float) -> None:
+    seen = found(view(y1 - 0.05, y1, BLOCK), surface())
+    assert seen is not None
+    _, right, ahead = seen
+    assert abs(right - BLOCK[0]) < BLOCK[2] + 0.01
+    assert abs(ahead - (BLOCK[1] - y1)) < BLOCK[2] + 0.015
+
+
+def test_clear_ground_is_silent_though_displacements_are_noisy() -> None:
+    assert found(view(0.0, 0.05, None, noise=0.8), surface()) is None
+
+
+def test_a_block_that_the_model_knows_is_silent() -> None:
+    assert found(view(0.0, 0.05, BLOCK), surface(BLOCK)) is None
+
+
+def test_a_block_lower_than_the_threshold_is_silent() -> None:
+    low = (*BLOCK[:3], 0.5 * P.height * ROVER.wheel_diameter)
+    assert found(view(0.0, 0.05, low), surface()) is None
+
+
+def test_a_block_beside_the_way_is_not_watched() -> None:
+    assert found(view(0.0, 0.05, (0.15, *BLOCK[1:])), surface()) is None
+
+
+def test_rises_are_those_of_the_block() -> None:
+    points = look(view(0.0, 0.05, BLOCK, noise=0.0), surface(), CAMERA, T_VEHICLE_LEFT, ROVER, P)
+    up = points.rise[points.raised]
+    # level-1 pixels straddle the block's edges; on its top the rise is exact
+    assert np.percentile(up, 90) == pytest.approx(BLOCK[3], abs=0.001)
+    flat = points.rise[np.abs(points.place[:, 0]) > 0.05]
+    assert np.abs(flat).max() < 1e-4
+
+
+def test_images_are_compared_over_a_baseline_and_not_across_a_turn() -> None:
+    wheel = ROVER.wheel_diameter
+    way = np.array([[0.0, 0.025 * k, 0.0] for k in range(5)])
+    assert pairs(way, wheel, P) == [(0, 2), (1, 3), (2, 4)]
+    way[3:, 2] = math.radians(20.0)
+    assert pairs(way, wheel, P) == [(0, 2)]
