@@ -117,7 +117,7 @@ class Drive(Reconstruction):
         self.mounting = {"T_vehicle_left": self.simulation.T_vehicle_left.to_list()}
         self.driven = self.products.drive = Driven()
         self.left: dict[int, Handle] = {}
-        self.motion: dict[tuple[int, int], Handle] = {}  # type: ignore[assignment]
+        self.motion: dict[tuple[int, int], Handle] = {}
         self.posed: list[int] = [0]
         """Frames of the trajectory so far."""
         self.goal: tuple[float, float] = config.drive.goal
