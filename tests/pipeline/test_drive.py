@@ -56,6 +56,7 @@ def arrived(store: Path) -> tuple[Drive, Result]:
     return drive(store)
 
 
+@pytest.mark.slow
 def test_it_arrives_and_knows_where_it_is(arrived: tuple[Drive, Result], store: Path) -> None:
     flow, result = arrived
     assert result.failures == []
@@ -70,6 +71,7 @@ def test_it_arrives_and_knows_where_it_is(arrived: tuple[Drive, Result], store: 
     assert 0.2 < metrics["way"]["value"] < 0.45
 
 
+@pytest.mark.slow
 def test_driven_again_nothing_is_computed_and_all_is_the_same(arrived: tuple[Drive, Result], store: Path) -> None:
     flow, result = drive(store)
     assert result.total().computed == 0
@@ -80,6 +82,7 @@ def test_driven_again_nothing_is_computed_and_all_is_the_same(arrived: tuple[Dri
     }
 
 
+@pytest.mark.slow
 def test_the_report_shows_the_drive(
     arrived: tuple[Drive, Result], store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -107,6 +110,7 @@ def numbers(value: Any) -> Iterator[float]:
         yield value
 
 
+@pytest.mark.slow
 def test_no_estimate_reads_a_true_pose(arrived: tuple[Drive, Result]) -> None:
     flow, _ = arrived
     assess = {"truth", "truth_dem"}
@@ -125,6 +129,7 @@ def test_no_estimate_reads_a_true_pose(arrived: tuple[Drive, Result]) -> None:
     assert judged == {"dem_accuracy/world", "risk/truth"}
 
 
+@pytest.mark.slow
 def test_a_lost_image_is_left_out_and_the_last_one_taken_again(arrived: tuple[Drive, Result], store: Path) -> None:
     frames = arrived[0].driven.stops[0].frames
     flow, result = drive(store, f"rover.lost_frames=[{frames[1]}]", "drive.max_stops=2")
@@ -139,6 +144,7 @@ def test_a_lost_image_is_left_out_and_the_last_one_taken_again(arrived: tuple[Dr
     assert flow.true[frames[-1] + 1] == flow.true[frames[-1]]
 
 
+@pytest.mark.slow
 def test_slip_of_thirty_per_cent_stops_and_says_so(arrived: tuple[Drive, Result], store: Path) -> None:
     flow, _ = drive(store, "rover.slip=0.3", "rover.slip_sigma=0.0", "drive.max_safety_stops=1")
     verdict, reason = flow.outcome()
@@ -157,6 +163,7 @@ def test_a_drive_needs_a_goal_and_a_cell(store: Path) -> None:
         Drive(Graph(), sequence, config.build({}))
 
 
+@pytest.mark.slow
 def test_a_goal_in_a_global_map_is_found_from_a_rough_prior(store: Path) -> None:
     more = ("rover.map_cell=0.03", "drive.frame=map", "drive.goal=[0.0, 0.6]", "drive.max_stops=1")
     flow, result = drive(store, *more, "drive.prior=[0.0, 0.38, 0.0]", "mockup.relief=0.02")
