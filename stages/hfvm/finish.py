@@ -41,9 +41,9 @@ class Finish:
 
     @property
     def refining(self) -> HfvmParams:
-        """Parameters of the refinement: an image that a plane has aligned is sheared, and takes a step more."""
+        """Parameters of the refinement: an image that a plane has aligned is sheared, and takes two steps more."""
         p = self.params
-        return p if self.alignment is None else p.model_copy(update={"refine_steps": p.refine_steps + 1})
+        return p if self.alignment is None else p.model_copy(update={"refine_steps": p.refine_steps + 2})
 
     def fine(self, window: Window, a: Map) -> Results:
         """Map of a window of the left image with fractions of a pixel, means of like neighbours; feature distances.

@@ -154,7 +154,8 @@ class FastSolver:
             reach = p.search_columns, p.search_rows
             propagation.descend(a.words, b.words, up.u, up.v, *reach, p.centres, lines, mu, packed, data, *at)
         rounds = self.rounds(level)
-        propagation.checkerboard(a.words, b.words, packed, data, dirty, lines, mu, p.smoothness, rounds, *at)
+        # Rows are settled on the coarser levels, where trying them costs little.
+        propagation.checkerboard(a.words, b.words, packed, data, dirty, lines, mu, p.smoothness, rounds, level > 0, *at)
         propagation.unpack(packed, u, v)
         return Map(u, v, np.zeros(shape, bool))
 

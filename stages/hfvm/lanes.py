@@ -197,7 +197,7 @@ def make_settle(width: int) -> Any:
         typingctx, left, right, packed, data, lines, todo, at, here, above, below, y, shape, smooth, mu, new, cost
     ):
         i64 = types.int64
-        sizes = types.UniTuple(i64, 5)
+        sizes = types.UniTuple(i64, 6)
         signature = types.void(
             WORDS, WORDS, PAIRS, PAIRS, LINES, PAIRS, i64, i64, i64, i64, i64, sizes, i64, types.float32, PAIRS, PAIRS
         )
@@ -208,7 +208,7 @@ def make_settle(width: int) -> Any:
                 for kind, a in zip(sig.args[:5], args[:5], strict=True)
             )
             at, here, above, below, y = args[6:11]
-            rows, cols, left_cols, size, ahead = (
+            rows, cols, left_cols, size, ahead, upright = (
                 builder.trunc(n, _I32) for n in cgutils.unpack_tuple(builder, args[11])
             )
             x = builder.load(_as(builder, _pointer(context, builder, sig.args[5], args[5], at), _INTS), align=4)
@@ -254,8 +254,7 @@ def make_settle(width: int) -> Any:
 
             beside(-1, 0)
             beside(1, 0)
-            free = builder.fcmp_ordered("<", args[13], ir.Constant(ir.FloatType(), SHARP))
-            with builder.if_then(free):
+            with builder.if_then(builder.icmp_signed("!=", upright, ir.Constant(_I32, 0))):
                 beside(0, -1)
                 beside(0, 1)
             for tried in near:
@@ -282,10 +281,10 @@ neighbours.
 ``todo[at : at + 8]``: columns of the pixels, no two of them neighbours. All arrays are flat: words of both images;
 ``packed`` displacements, v << 16 | u, and their costs without smoothness; ``lines``: three planes of the left image's
 size. ``here, above, below``: index at which the row and its neighbours begin. ``shape``: rows and columns of the right
-image, columns and size of the left one, and the column of the left one's first pixel in the right one, as ``y`` is the
-row there: both may be windows. In this order: own, own a column less, more, where ``mu`` is below :data:`SHARP` a row
-less, more, then up, west, east, down; the first of equal ones wins. Costs have ``smooth`` times the roughness added.
-``new[at : at + 8]`` gets the best ones and ``cost`` their costs without smoothness.
+image, columns and size of the left one, the column of the left one's first pixel in the right one, as ``y`` is the row
+there (both may be windows), and whether other rows are tried. In this order: own, own a column less, more, where
+``shape`` says so a row less, more, then up, west, east, down; the first of equal ones wins. Costs have ``smooth`` times
+the roughness added. ``new[at : at + 8]`` gets the best ones and ``cost`` their costs without smoothness.
 """
 
 

@@ -92,7 +92,7 @@ class HfvmParams(Params):
         default=1, ge=0, le=32, description="the same at the finest level, which costs most; null: as at the others"
     )
     back_rounds: int = Field(
-        default=0, ge=0, le=32, description="at most so many at the finest level from right to left, for the check"
+        default=1, ge=0, le=32, description="at most so many at the finest level from right to left, for the check"
     )
     centres: int = Field(
         default=5,
@@ -142,7 +142,7 @@ class HfvmParams(Params):
         description="least correlation of both images after refinement; below, noise met noise",
     )
     refine_steps: int = Field(
-        default=1, ge=1, le=8, description="steps; a second one gains nothing; a pre-aligned image takes one more"
+        default=1, ge=1, le=8, description="steps; a second one gains nothing; a pre-aligned image takes two more"
     )
     refine_radius: int = Field(
         default=2, ge=1, le=8, description="pixels; 5 x 5 windows: wider ones smooth relief away"

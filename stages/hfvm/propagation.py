@@ -200,10 +200,10 @@ def _centres(up_u, up_v, lines, mu, centres):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def checkerboard(left, right, packed, data, dirty, lines, mu, smoothness, rounds, ox=0, oy=0):  # type: ignore[no-untyped-def]
+def checkerboard(left, right, packed, data, dirty, lines, mu, smoothness, rounds, upright, ox=0, oy=0):  # type: ignore[no-untyped-def]
     """Rounds of propagation in place: each pixel tries its neighbours' displacements and its own a column beside.
 
-    Where the band is not sharp, which then does not say in which row to search, also its own a row beside.
+    ``upright``: its own a row beside, too; so it is where the band is not sharp and hardly says in which row to search.
 
     Cost: that of the displacement + ``smoothness`` times the sum over the four neighbours of min(|du| + |dv|, 2);
     beyond the border the neighbour on the other side stands in. The two colours of a checkerboard take turns, which
@@ -213,7 +213,7 @@ def checkerboard(left, right, packed, data, dirty, lines, mu, smoothness, rounds
     rows, cols = left.shape
     here, there, flat, cost = left.reshape(-1), right.reshape(-1), packed.reshape(-1), data.reshape(-1)
     normals = lines.reshape(-1)
-    shape = (right.shape[0], right.shape[1], cols, rows * cols, ox)
+    shape = (right.shape[0], right.shape[1], cols, rows * cols, ox, int(upright or mu < SHARP))
     todo, new, found = (
         np.empty(cols + LANES, np.int32),
         np.empty(cols + LANES, np.int32),

@@ -55,7 +55,7 @@ def test_all_widths_search_alike():
                 at = np.int64(4 * 21 + 2 * k), np.int64(5 * 30 + 2 * k)
                 sizes = np.int64(21), np.int64(12 * 21), np.int64(30)
                 four(left, right, lines, at[0], at[1], sizes, mu, place, counts, best[4 * k :], least[4 * k :])  # noqa: B023 (called before the next turn)
-            shape = (20, 30, 21, 12 * 21, 3)
+            shape = (20, 30, 21, 12 * 21, 3, 1)
             settle(  # noqa: B023
                 left, right, packed, data, lines, todo, 0, 4 * 21, 3 * 21, 5 * 21, 4, shape, 5, mu, new, cost
             )

@@ -89,7 +89,7 @@ def test_descend_finds_the_first_of_the_best_around_its_centres(mu, reach_x, rea
         assert found == best
 
 
-def slow_checkerboard(left, right, u, v, lines, mu, smoothness, rounds):
+def slow_checkerboard(left, right, u, v, lines, mu, smoothness, rounds, upright):
     u, v = u.copy(), v.copy()
 
     def at(y, x):
@@ -103,7 +103,7 @@ def slow_checkerboard(left, right, u, v, lines, mu, smoothness, rounds):
                 a, b = int(u[y, x]), int(v[y, x])
                 best = None
                 own = [(a, b), (a - 1, b), (a + 1, b)]
-                own += [(a, b - 1), (a, b + 1)] if mu < lanes.SHARP else []
+                own += [(a, b - 1), (a, b + 1)] if upright or mu < lanes.SHARP else []
                 for du, dv in [*own, *near]:
                     if not (0 <= x + du < right.shape[1] and 0 <= y + dv < right.shape[0]):
                         continue
@@ -116,17 +116,17 @@ def slow_checkerboard(left, right, u, v, lines, mu, smoothness, rounds):
     return u, v
 
 
-@pytest.mark.parametrize("mu", [0.0, 3.0])
-def test_propagation_equals_slow_numpy_over_several_rounds(mu):
+@pytest.mark.parametrize(("mu", "upright"), [(0.0, False), (3.0, False), (3.0, True)])
+def test_propagation_equals_slow_numpy_over_several_rounds(mu, upright):
     left, right = words((ROWS, COLS), 5), words((ROWS, COLS + 2), 6)
     u, v = np.random.default_rng(7).integers(-3, 4, (2, ROWS, COLS)).astype(np.int16)
     lines = some_lines(8)
-    expected = slow_checkerboard(left, right, u, v, lines, mu, 2, 3)
+    expected = slow_checkerboard(left, right, u, v, lines, mu, 2, 3, upright)
     packed, data = np.empty((2, ROWS, COLS), np.int32)
     propagation.pack_map(u, v, packed)
     data[:] = costs(left, right, u, v, lines, mu)
     dirty = np.empty((ROWS, COLS), np.uint8)
-    propagation.checkerboard(left, right, packed, data, dirty, lines, np.float32(mu), 2, 3)
+    propagation.checkerboard(left, right, packed, data, dirty, lines, np.float32(mu), 2, 3, upright)
     found = np.empty((2, ROWS, COLS), np.int16)
     propagation.unpack(packed, *found)
     np.testing.assert_array_equal(found, expected)
