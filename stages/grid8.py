@@ -62,6 +62,45 @@ def trace(step: NDArray[np.int8], start: tuple[int, int]) -> Ints:
     return np.array(cells, dtype=np.int64)
 
 
+def parts(ways: Bytes) -> tuple[NDArray[np.int32], Ints]:
+    """Ground that is connected by edges: its number of every cell (row, col), -1 where the vehicle may not stand; and
+    the first and the last row of each (number, 2), in reading order of their first cells."""
+    number = np.full(ways.shape, -1, dtype=np.int32)
+    spans = np.empty((1024, 2), dtype=np.int64)
+    count, spans = _flood(ways, number, spans)
+    return number, spans[:count]
+
+
+@njit(cache=True, nogil=True)
+def _flood(ways, number, spans):  # type: ignore[no-untyped-def]
+    rows, cols = ways.shape
+    stack = np.empty(ways.size, dtype=np.int64)
+    count = 0
+    for at in range(ways.size):
+        if ways[at // cols, at % cols] == 0 or number[at // cols, at % cols] >= 0:
+            continue
+        if count == spans.shape[0]:
+            more = np.empty((2 * count, 2), dtype=np.int64)
+            more[:count] = spans
+            spans = more
+        spans[count, 0] = spans[count, 1] = at // cols
+        number[at // cols, at % cols], stack[0], size = count, at, 1
+        while size:
+            size -= 1
+            r, c = stack[size] // cols, stack[size] % cols
+            spans[count, 1] = max(spans[count, 1], r)
+            for k in range(8):
+                dr, dc, way = NEIGHBOURS[k]
+                i, j = r + dr, c + dc
+                if i < 0 or j < 0 or i >= rows or j >= cols or number[i, j] >= 0:
+                    continue
+                if ways[r, c] & ways[i, j] & way:
+                    number[i, j], stack[size] = count, i * cols + j
+                    size += 1
+        count += 1
+    return count, spans
+
+
 @njit(cache=True, nogil=True)
 def _search(height, ways, toll, lengths, target, end, cost, step):  # type: ignore[no-untyped-def]
     rows, cols = height.shape

@@ -21,7 +21,9 @@ the rows of a grid turned by a heading or by the line from start to target, fill
 An elevation model is fan-shaped and ragged: the first and last rows with a free cell hold a few, which may lead
 nowhere. So a start that is not given is, of the free cells within one vehicle length of the first row that lead on,
 the one nearest to that row's middle; the target likewise at the last row. A path counts as found when it comes within
-one vehicle length of the last row.
+one vehicle length of the last row. A mission's map, on which the vehicle stands nowhere in particular, may be cut by
+ground that it cannot cross: then the connected ground over most rows is crossed, in any direction, and what is left out
+is told (``left_out_m``).
 """
 
 from __future__ import annotations
@@ -34,7 +36,6 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
-from scipy.ndimage import label
 
 from stages import grid8
 from stages.declare import Array, Bundle, Inputs, Memory, Params, Stage
@@ -57,6 +58,9 @@ Planner = Literal["rows", "grid8", "auto"]
 
 GROUNDS = ("outline", "wheels", "middle")
 """What of the vehicle stays on known ground, as tried in turn."""
+
+MOST = 0.75
+"""Share of the rows: a path that stays clearer of unknown ground is worth a quarter of its length."""
 
 WHEEL_BITS = np.uint16(BITS["inclination"] | BITS["range"] | BITS["step"] | BITS["roughness"])
 """Hazards to a wheel on the cell; the other ones are to the vehicle with its middle there."""
@@ -87,7 +91,7 @@ class PathParams(Params):
     planner: Planner = Field(
         default="auto",
         description="rows: ahead in every row, as in the paper; grid8: any direction; auto: grid8 where rows do not "
-        "reach a target that is set",
+        "reach the target, or do not lead over the map of a mission",
     )
     height_step: float = Field(
         default=0.02, gt=0, le=1, description="share of max_step; smaller height differences count as none"
@@ -104,6 +108,7 @@ class Route:
     ``cells`` (vertex, 2) on ``grid`` and ``xyz`` (vertex, 3) metres, z the mean height under a wheel, both empty where
     there is none; ``plan`` of the row graph, ``planner`` that gave the path, ``ground`` one of :data:`GROUNDS`;
     ``cost`` (row, col) metres: from the start by rows, to the target by grid8; NaN where not reached.
+    ``span``: farthest and nearest row of the grid that are free somewhere.
     """
 
     cells: Ints
@@ -113,6 +118,7 @@ class Route:
     planner: str
     ground: str
     cost: NDArray[np.float32]
+    span: tuple[int, int]
 
 
 def find_path(
@@ -123,6 +129,7 @@ def find_path(
     heading: Point = (0.0, 1.0),
     start: Point | None = None,
     target: Point | None = None,
+    stretch: bool = False,
     params: PathParams | None = None,
 ) -> Route:
     """Path over a risk map.
@@ -132,6 +139,7 @@ def find_path(
     maps : arrays (row, col) of stage ``risk``: ``risk``, ``reason``, ``elevation``; the others serve messages.
     heading : driving direction (dx, dy) in the frame of the lattice; start and target together override it.
     start, target : x, y, metres; None: see the module. Those of ``params`` are not looked at.
+    stretch : with neither of them, cross the connected ground over most rows where no path leads over all of them.
 
     Raises
     ------
@@ -150,7 +158,10 @@ def find_path(
     if p.planner != "grid8":
         found = _by_rows(maps, lattice, vehicle, heading, start, target, p)
     if p.planner == "grid8" or (
-        p.planner == "auto" and found is not None and not len(found.cells) and target is not None
+        p.planner == "auto"
+        and found is not None
+        and not len(found.cells)
+        and (target is not None or (stretch and start is None))
     ):
         found = _by_grid(maps, lattice, vehicle, start, target, p, found)
     assert found is not None
@@ -206,7 +217,7 @@ def _by_rows(
         if len(found.cells):
             break
     cost = np.where(found.cost < UNREACHED, found.cost // grid.rows * ground.unit, np.nan).astype(np.float32)
-    return Route(found.cells, ground.xyz(found.cells), found, grid, "rows", name, cost)
+    return Route(found.cells, ground.xyz(found.cells), found, grid, "rows", name, cost, span or (0, 0))
 
 
 def _by_grid(
@@ -223,7 +234,7 @@ def _by_grid(
     given = tuple(None if point is None else grid.index(point) for point in (start, target))
     nothing = np.empty((0, 2), dtype=np.int64)
     cells, cost, name = nothing, np.full(ground.height.shape, UNREACHED), GROUNDS[0]
-    for name in GROUNDS:
+    for name in _worth(ground) if given == (None, None) else GROUNDS:
         ways = ground.ways(name)
         first, last = _chosen(ways, given[0], given[1], ground, unit)
         if first is None or last is None or not ways[first] or not ways[last]:
@@ -239,21 +250,30 @@ def _by_grid(
         found = replace(found, target_row=int(cells[-1, 0]), blocking_row=None)
         found.reachable[cells[-1, 1]] = True
     metres = np.where(cost < UNREACHED, cost * ground.unit, np.nan).astype(np.float32)
-    return Route(cells, ground.xyz(cells), found, grid, "grid8", name, metres)
+    return Route(cells, ground.xyz(cells), found, grid, "grid8", name, metres, row_span(~ground.closed) or (0, 0))
+
+
+def _worth(ground: _Ground) -> tuple[str, ...]:
+    """Of :data:`GROUNDS` those on which connected ground covers most of the rows that it covers on any."""
+    spans = [grid8.parts(ground.ways(name))[1] for name in GROUNDS]
+    rows = [int((s[:, 1] - s[:, 0]).max(initial=0)) for s in spans]
+    return tuple(name for name, n in zip(GROUNDS, rows, strict=True) if n >= MOST * max(rows))
 
 
 def _chosen(
     ways: Bytes, start: tuple[int, int] | None, target: tuple[int, int] | None, ground: _Ground, unit: int
 ) -> tuple[tuple[int, int] | None, tuple[int, int] | None]:
-    """Ends as given; else, of the largest connected free ground (that of the target), the cell nearest to the middle
+    """Ends as given; else, of the connected ground over most rows (that of the target), the cell nearest to the middle
     of the first row, and of those that it reaches the one nearest to that of the last."""
     span = row_span(ways > 0)
     if span is None:
         return None, None
     if start is None:
-        parts, count = label(ways > 0, structure=np.ones((3, 3)))
-        largest = parts[target] if target is not None else 1 + int(np.argmax(np.bincount(parts.ravel())[1 : count + 1]))
-        start = _nearest(parts == largest, span[1])
+        number, spans = grid8.parts(ways)
+        most = number[target] if target is not None else int(np.argmax(spans[:, 1] - spans[:, 0]))
+        if most < 0:
+            return None, target
+        start = _nearest(number == most, span[1])
     if target is None:
         cost, _ = grid8.cost_to_go(ground.height, ways, start, None, unit, ground.toll)
         target = _nearest(cost < UNREACHED, span[0])
@@ -318,7 +338,7 @@ def _run(params: PathParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     dx, dy = args.get("heading", (0.0, 1.0))
     maps = {name: np.asarray(source[name]) for name in source.arrays}
     ends = {} if local else {"start": params.start, "target": params.target}
-    route = find_path(maps, lattice, vehicle, heading=(dx, dy), params=params, **ends)
+    route = find_path(maps, lattice, vehicle, heading=(dx, dy), stretch=not local, params=params, **ends)
     arrays: dict[str, NDArray[Any]] = {
         "path": route.xyz,
         "cost_to_go": route.cost,
@@ -345,7 +365,7 @@ def describe(route: Route, maps: Maps, lattice: Lattice, vehicle: Vehicle) -> di
     }
     none = ("length_m", "climb_m", "max_inclination", "max_tilt", "least_clearance", "max_p_hazard", "caution_share")
     if len(xyz) == 0:
-        return meta | dict.fromkeys((*none, "start", "target"))
+        return meta | dict.fromkeys((*none, "start", "target", "left_out_m"))
     at = tuple(np.rint(lattice.index(xyz[:, :2])).astype(np.int64).T)
     steps = np.diff(xyz, axis=0)
     return meta | {
@@ -356,9 +376,16 @@ def describe(route: Route, maps: Maps, lattice: Lattice, vehicle: Vehicle) -> di
         "least_clearance": _worst(maps, "clearance", at, np.nanmin),
         "max_p_hazard": _worst(maps, "p_hazard", at, np.nanmax),
         "caution_share": float((maps["risk"][at] == CAUTION).mean()),
+        "left_out_m": _left_out(route),
         "start": [float(v) for v in xyz[0]],
         "target": [float(v) for v in xyz[-1]],
     }
+
+
+def _left_out(route: Route) -> list[float]:
+    """Metres of rows with known ground before the start and beyond the target."""
+    span, rows = route.span, route.cells[[0, -1], 0]
+    return [float(span[1] - rows[0]) * route.grid.cell, float(rows[1] - span[0]) * route.grid.cell]
 
 
 def _worst(maps: Maps, name: str, at: Any, of: Any) -> float | None:

@@ -116,6 +116,14 @@ def _path_words(scene: Scene) -> str:
     margin = length(scene.view.config.vehicle.margin)
     path = scene.view.bundle(scene.view.products.path)
     ground = "" if path is None else path.meta.get("ground", "")
+    before, beyond = (path.meta.get("left_out_m") if path is not None else None) or (0.0, 0.0)
+    vehicle = scene.view.config.vehicle
+    rest = ""
+    if max(before, beyond) > vehicle.wheel_base + vehicle.wheel_diameter:
+        rest = (
+            f" It crosses the connected ground over most rows: {length(before)} of nearer and {length(beyond)} of "
+            "farther rows are left out, which the vehicle cannot reach from there."
+        )
     known = {
         "outline": "no unknown ground comes under its outline",
         "wheels": "its wheels stay on known ground, its belly does not everywhere",
@@ -123,7 +131,7 @@ def _path_words(scene: Scene) -> str:
     }.get(ground, "unknown ground is not entered")
     return (
         f"The path (black line, ring: start, disk: target) is that of the vehicle's middle; its wheels keep {margin} "
-        f"from hazards; {known}."
+        f"from hazards; {known}.{rest}"
     )
 
 
