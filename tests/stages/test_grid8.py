@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
-from stages.grid8 import NEIGHBOURS, cost_to_go, trace
+from stages.grid8 import NEIGHBOURS, cost_to_go, parts, trace
 from stages.row_graph import UNREACHED
 
 UNIT = 5
@@ -70,3 +70,21 @@ def test_the_search_ends_at_the_start_and_its_cost_is_the_same() -> None:
     assert part[48, 55] == whole[48, 55]
     assert (part == UNREACHED).sum() > 1000
     assert len(trace(step, (48, 55))) >= 6
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 9999), rows=st.integers(1, 11), cols=st.integers(1, 11))
+def test_connected_parts_equal_networkx(seed: int, rows: int, cols: int) -> None:
+    rng = np.random.default_rng(seed)
+    ways = np.where(rng.random((rows, cols)) < 0.5, 0, rng.integers(1, 16, (rows, cols))).astype(np.uint8)
+    nothing = np.zeros((rows, cols), dtype=np.int64)
+    graph = nx.Graph()
+    graph.add_nodes_from((int(r), int(c)) for r, c in np.argwhere(ways > 0))
+    graph.add_edges_from((a, b) for a, b, _ in edges(nothing, ways, nothing))
+    number, spans = parts(ways)
+    assert (number >= 0).sum() == graph.number_of_nodes()
+    expected = sorted(nx.connected_components(graph), key=min)
+    assert len(spans) == len(expected)
+    for k, cells in enumerate(expected):
+        assert {(int(r), int(c)) for r, c in np.argwhere(number == k)} == cells
+        assert spans[k].tolist() == [min(cells)[0], max(r for r, _ in cells)]

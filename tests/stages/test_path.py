@@ -152,6 +152,19 @@ def test_behind_a_wall_rows_fail_and_grid8_goes_round() -> None:
     assert np.diff(route.xyz[:, 1]).min() < 0  # it goes back
 
 
+def test_a_map_that_is_cut_is_crossed_on_its_longer_side() -> None:
+    lattice = Lattice.at(-30, 60, CELL, 100, 61)
+    risk, z = level(lattice)
+    risk[70:74] = HAZARDOUS  # from edge to edge: 70 rows ahead of it, 26 before
+    given = maps(risk, z)
+    assert not describe(find_path(given, lattice, MODEL), given, lattice, MODEL)["found"]
+    facts = describe(find_path(given, lattice, MODEL, stretch=True), given, lattice, MODEL)
+    assert facts["planner"] == "grid8"
+    before, beyond = facts["left_out_m"]
+    assert 0.30 <= before <= 0.30 + 2 * MODEL.half_length
+    assert beyond <= 2 * MODEL.half_length
+
+
 @pytest.mark.parametrize(
     ("kind", "message"),
     [
