@@ -98,8 +98,8 @@ def make_four(width: int) -> Any:
                 # Lanes: four pixels, each with the row less, then the same with the row more.
                 at = builder.add(there, builder.sext(builder.sub(centre, u), _I64))
                 rows = [load(1, right, moved(at, j, 0, rcols), _PAIR) for j in (-1, 0, 1, 2)]
-                above, below = (_pairs(builder, rows[k], rows[k + 1], (0, 1, 2, 3)) for k in (0, 2))
-                found = _pairs(builder, above, below, tuple(range(8)))
+                less, more = (_pairs(builder, rows[k], rows[k + 1], (0, 1, 2, 3)) for k in (0, 2))
+                found = _pairs(builder, less, more, tuple(range(8)))
 
                 def twice(values: Any, kind: Any) -> Any:
                     total = ir.Constant(kind, ir.Undefined)
