@@ -16,7 +16,7 @@ from pipeline.dag import Graph, Handle
 from pipeline.report import RunView, TaskRow, draw, write_report
 from pipeline.report.canvas import ground_limits
 from pipeline.report.comparison import compare
-from pipeline.store import Store
+from pipeline.store import GoneError, Store
 from pipeline.terrain_zarr import write_terrain
 from stages import merge
 from stages.declare import Array, Bundle
@@ -56,7 +56,11 @@ def write(folder: Path, view: RunView) -> None:
     """All files of a run; what has no artifact is left out (the report says so)."""
     with ThreadPoolExecutor(1) as pool:  # rasters are computed and compressed while figures are drawn
         rasters = pool.submit(_write_rasters, folder, view)
-        drawn = draw(view)
+        try:
+            drawn = draw(view)
+        except GoneError:  # the other one may have set it aside, and says why
+            rasters.result()
+            raise
         rasters.result()
     _write_path(folder, view)
     _write_trajectories(folder, view)

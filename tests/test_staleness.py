@@ -103,6 +103,8 @@ STALE: dict[str, set[str]] = {
     "agreement": {"agreement"},
     "tiling": TILES | MATCHED,  # as far as a plan can tell: that the same comes out is seen once it has
     "vehicle": RISK,
+    # of a drive, which this chain is not
+    **dict.fromkeys(("drive", "global_fix", "leg", "pad", "reflex", "safety"), set()),
 }
 EXCEPTIONS: dict[str, set[str]] = {
     "refine.enabled": REFINED - {"refine"},  # without it there is less to compute
@@ -118,11 +120,11 @@ SOURCES = {"scene", "image/left", "image/right", "truth", "truth_dem/local", "tr
 """They hang on the sequence alone."""
 
 IMAGES = {"image/left", "image/right", "undistort/left", "undistort/right", "truth_dem/local", "truth_dem/world"}
-EVERYTHING = IMAGES | PYRAMIDS | COUNTERCHECK | RISK | {"scene", "truth"}
+EVERYTHING = IMAGES | {"sight"} | PYRAMIDS | COUNTERCHECK | RISK | {"scene", "truth"}
 GIVEN_RIG = {"orientation"} | RIG | COUNTERCHECK
-RIGHT_IMAGE = {"image/right", "undistort/right", "pyramid/right"} | MATCHED | COUNTERCHECK
+RIGHT_IMAGE = {"image/right", "undistort/right", "pyramid/right", "sight", "continuity"} | MATCHED | COUNTERCHECK
 
-SCENE = ("seed", "bed_width", "bed_length", "cell", "relief", "rocks", "craters", "grain")
+SCENE = ("seed", "bed_width", "bed_length", "cell", "relief", "rocks", "rock_cover", "craters", "grain")
 SCENE += ("sun_elevation_deg", "sun_azimuth_deg", "sun_diameter_deg")
 RENDERED = ("blur", "noise", "exposure", "exposure_jitter", "right_gain", "vignetting")
 DRIVE = (
@@ -147,8 +149,11 @@ SEQUENCE: dict[str, set[str]] = {
     ),
     **dict.fromkeys([f"mockup.{name}" for name in DRIVE], EVERYTHING - {"scene"}),
     **dict.fromkeys([f"mockup.{name}" for name in CAMERA], EVERYTHING - {"scene", "truth"}),
-    "mockup.attitude_noise_deg": {"motion", "select", "track"} | LEVELLED,
-    "mockup.focal_error": {"undistort/left", "undistort/right"} | PYRAMIDS | COUNTERCHECK,  # by the ideal camera
+    "mockup.slope_deg": EVERYTHING,  # the cameras go along with the ground
+    "mockup.attitude_noise_deg": {"motion", "continuity", "select", "track"} | LEVELLED,
+    "mockup.focal_error": {"undistort/left", "undistort/right", "sight"}
+    | PYRAMIDS
+    | COUNTERCHECK,  # by the ideal camera
     "mockup.rig_error_deg": GIVEN_RIG,
     **dict.fromkeys([f"misalign.{name}" for name in MisalignParams.model_fields], RIGHT_IMAGE),
 }
@@ -244,7 +249,7 @@ def candidates(kind: Any, value: Any) -> Iterator[Any]:
         yield tuple(v * 1.01 for v in value)
         yield tuple(v + 0.1 for v in value)
     elif value is None:
-        yield from (0.0123, (0.1, 0.2), (-1.0, 0.5, 1.0, 2.0), 320)
+        yield from (0.0123, (0.1, 0.2), (-1.0, 0.5, 1.0, 2.0), (0.1, 0.2, 0.3), 320)
 
 
 def changes(parameter: str, defaults: Any) -> dict[str, Any]:
