@@ -104,7 +104,7 @@ STALE: dict[str, set[str]] = {
     "tiling": TILES | MATCHED,  # as far as a plan can tell: that the same comes out is seen once it has
     "vehicle": RISK,
     # of a drive, which this chain is not
-    **dict.fromkeys(("drive", "global_fix", "leg", "pad", "reflex", "safety"), set()),
+    **{key: set() for key in ("drive", "global_fix", "leg", "pad", "reflex", "safety")},
 }
 EXCEPTIONS: dict[str, set[str]] = {
     "refine.enabled": REFINED - {"refine"},  # without it there is less to compute
