@@ -59,8 +59,8 @@ Planner = Literal["rows", "grid8", "auto"]
 GROUNDS = ("outline", "wheels", "middle")
 """What of the vehicle stays on known ground, as tried in turn."""
 
-MOST = 0.75
-"""Share of the rows: a path that stays clearer of unknown ground is worth a quarter of its length."""
+MOST = 0.5
+"""Share of the rows: a path that stays clearer of unknown ground is worth half of its length."""
 
 WHEEL_BITS = np.uint16(BITS["inclination"] | BITS["range"] | BITS["step"] | BITS["roughness"])
 """Hazards to a wheel on the cell; the other ones are to the vehicle with its middle there."""
