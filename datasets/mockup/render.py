@@ -20,7 +20,7 @@ from datasets.mockup.params import RenderParams
 from datasets.mockup.raycast import HeightField
 from datasets.mockup.scene import height_field
 from datasets.mockup.terrain import EMISSION
-from stages.declare import Array, Bundle, Inputs, Stage
+from stages.declare import Array, Bundle, Inputs, Memory, Stage
 from stages.geometry import Camera, RigidTransform
 
 SUPERSAMPLING = 2
@@ -226,4 +226,5 @@ STAGE = Stage(
     ),
     requires=("numpy", "numba", "scipy"),
     run=_run,
+    memory=Memory(result=0.02),  # an image has a fiftieth of the scene's bytes
 )
