@@ -190,7 +190,7 @@ def trials(rows: list[dict[str, Any]]) -> list[str]:
 
 def main() -> None:
     """Run what is not there yet, and print the table."""
-    from pipeline.cli import cache_folder
+    from pipeline.commands.options import cache_folder
     from pipeline.environment import SINGLE, prepare_environment
 
     given = arguments()

@@ -53,7 +53,7 @@ def arguments() -> argparse.Namespace:
 
 def start_process() -> None:
     """Place of compiled kernels, and one thread each, before NumPy and numba are imported."""
-    from pipeline.cli import cache_folder
+    from pipeline.commands.options import cache_folder
     from pipeline.environment import SINGLE, prepare_environment
 
     prepare_environment(cache_folder(None))

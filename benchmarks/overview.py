@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from datasets.protocol import Source
 from datasets.registry import open_sequence
-from pipeline.cli import cache_folder
+from pipeline.commands.options import cache_folder
 from pipeline.store import Store
 from pipeline.task import Ref, Spec, ensure
 

@@ -94,13 +94,17 @@ def _real(name: str) -> Any:
 
 
 def _facts(name: str, args: Any, inputs: Any) -> dict[str, Any]:
+    if name == "continuity":
+        return {"asks": {}, "chain": args["frames"], "lost": [], "unfit": []}
     if name == "select":
         n = args["frames"]
         return {"basic": list(range(n)), "segments": [[k, k + 1] for k in range(n - 1)]}
     if name == "level":
         return {"T_local_left": np.eye(4)[:3].tolist(), "pair": args["pair"]}
     if name == "trajectory":
-        return {"positions": [[0.0, SPACING * k, 0.0] for k in range(len(args["frames"]))]}
+        frames = args["frames"]
+        positions = [[0.0, SPACING * k, 0.0] for k in range(len(frames))]
+        return {"frames": frames, "positions": positions, "pieces": [[frames[0], frames[-1]]], "main": 0}
     if name == "locus":
         from stages.lattice import Lattice
 

@@ -85,7 +85,7 @@ def match(scene: Scene) -> Disparities:
 def mockup(pairs: int | None = None) -> Iterator[Scene]:
     """Basic pairs of the built-in simulator with its true disparities, in the window that its accuracy is judged in."""
     from datasets.registry import open_sequence
-    from pipeline.cli import cache_folder
+    from pipeline.commands.options import cache_folder
 
     sequence, fetch = open_sequence("mockup"), fetcher(cache_folder(None))
     assert sequence.truth is not None

@@ -113,7 +113,7 @@ def with_truth() -> list[Pair]:
 def mockup() -> Pair:
     """First pair of the built-in simulator, 570 x 520 as in the paper, and its exact truth."""
     from datasets.registry import open_sequence
-    from pipeline.cli import cache_folder
+    from pipeline.commands.options import cache_folder
 
     sequence, fetch = open_sequence("mockup"), fetcher(cache_folder(None))
     assert sequence.truth_disparity is not None

@@ -1,0 +1,80 @@
+"""``rille cache``: look after the cache of artifacts."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from cyclopts import App
+
+from pipeline.commands.options import RUNS, CacheFolder, Debug, Run, Runs, cache_folder, flag
+
+app = App(name="cache", help="Look after the cache of artifacts.")
+
+
+@app.command
+def verify(
+    *,
+    deep: Annotated[bool, flag("Decode every chunk too, and compare the digests of the arrays.")] = False,
+    cache: CacheFolder = None,
+    debug: Debug = False,
+) -> int:
+    """Read every artifact and compare its checksums; damaged ones are named and recomputed by the next run."""
+    from pipeline import run
+
+    return run.verify_cache(cache_folder(cache), deep=deep)
+
+
+@app.command
+def gc(
+    *,
+    cache: CacheFolder = None,
+    runs: Runs = RUNS,
+    dry_run: Annotated[bool, flag("Say what would go, by stage, and keep it.")] = False,
+    debug: Debug = False,
+) -> int:
+    """Remove artifacts that no kept and no pinned run refers to, and leftovers of interrupted runs."""
+    from pipeline import run
+
+    return run.collect_garbage(cache_folder(cache), runs, dry_run=dry_run)
+
+
+@app.command
+def ls(
+    *,
+    as_json: Annotated[bool, flag("As JSON.", "--json")] = False,
+    cache: CacheFolder = None,
+    runs: Runs = RUNS,
+    debug: Debug = False,
+) -> int:
+    """Say what the cache holds, by sequence and stage: number, sizes, age, and the run that used it last."""
+    from pipeline import inventory
+
+    return inventory.ls(cache_folder(cache), runs, as_json=as_json)
+
+
+@app.command
+def pin(
+    run: Run,
+    *,
+    cache: CacheFolder = None,
+    runs: Runs = RUNS,
+    debug: Debug = False,
+) -> int:
+    """Keep all artifacts of a run, whatever is cleared away, even if the run's folder is removed."""
+    from pipeline import run as commands
+
+    return commands.pin(cache_folder(cache), run, runs)
+
+
+@app.command
+def unpin(run: str, *, cache: CacheFolder = None, debug: Debug = False) -> int:
+    """Take the pin of a run away; its artifacts stay until they are cleared away.
+
+    Parameters
+    ----------
+    run
+        SEQUENCE/ID, or ID.
+    """
+    from pipeline import run as commands
+
+    return commands.unpin(cache_folder(cache), run)

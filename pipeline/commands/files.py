@@ -1,0 +1,189 @@
+"""Commands on files: manifests, calibration, two images, elevation models, and what other programs read."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from cyclopts import Parameter
+
+from pipeline.commands.options import COMPLETE, Assignments, CacheFolder, Debug, Output, cache_folder, flag, prepare
+
+
+def init(
+    directory: Path,
+    *,
+    output: Annotated[Path | None, Output] = None,
+    force: Annotated[bool, flag("Replace a manifest that is there.")] = False,
+    debug: Debug = False,
+) -> int:
+    """Look at a folder of stereo images and write a commented manifest: what was found, and what is still needed.
+
+    Parameters
+    ----------
+    directory
+        Folder with the images, and with whatever is known of the cameras.
+    output
+        Manifest to write; by default DIRECTORY's name with .rille.toml, in the present folder.
+    """
+    from pipeline import init as command
+
+    return command.init(directory, output, force)
+
+
+def calibrate(
+    left: Path,
+    right: Path,
+    *,
+    square: float,
+    corners: str | None = None,
+    model: Literal["radtan", "radtan4", "rational", "fisheye"] = "radtan",
+    output: Annotated[Path, Output] = Path("rig.yaml"),
+    keep_bad: Annotated[bool, flag("Use views too whose residuals are far above the others'.")] = False,
+    debug: Debug = False,
+) -> int:
+    """Calibrate a stereo rig from pictures of a chessboard; prints the residual of each view.
+
+    Parameters
+    ----------
+    left
+        Folder or glob of the left camera's images.
+    right
+        The same of the right camera; views are paired by number.
+    square
+        Side of a square, metres.
+    corners
+        Inner corners, COLUMNSxROWS, for example 9x6; found by itself if not given.
+    model
+        Distortion model.
+    output
+        YAML file to write.
+    """
+    from pipeline import calibrate as command
+
+    return command.calibrate(left, right, square=square, corners=corners, model=model, output=output, keep_bad=keep_bad)
+
+
+def match(
+    left: Path,
+    right: Path,
+    *,
+    output: Annotated[Path, Output] = Path("disparity.tif"),
+    preset: Literal["default", "fast", "accurate", "paper"] | None = None,
+    dense: Annotated[bool, flag("Fill undefined disparities by interpolation.")] = False,
+    prior_disparity: Path | None = None,
+    confidence: Path | None = None,
+    assignments: Assignments = None,
+    debug: Debug = False,
+) -> int:
+    """Match any two images, without calibration or rectification, to a two-band disparity TIFF.
+
+    Band 1 is column_disparity and band 2 row_disparity, float32 pixels, right minus left (negative columns on a
+    rectified pair), NaN where undefined.
+
+    Parameters
+    ----------
+    left
+        Reference image.
+    right
+        Search image.
+    output
+        TIFF to write.
+    preset
+        Parameter set of the matcher: fast matches at half the resolution, accurate takes several times as long, paper
+        follows the publication to the letter.
+    prior_disparity
+        Disparity TIFF of this left image to start from, as this command writes it; where it is undefined the search
+        starts as without it. It may err by some pixels: three and a few more from neighbours.
+    confidence
+        TIFF to write with the bands disparity_std (pixels, standard deviation of the column), validity (bits) and
+        backmatch_error (pixels).
+    """
+    prepare(None)
+    from pipeline import match as command
+
+    return command.match_files(
+        left,
+        right,
+        output,
+        preset=preset,
+        dense=dense,
+        assignments=tuple(assignments or ()),
+        prior=prior_disparity,
+        confidence=confidence,
+    )
+
+
+def export(
+    run: Path,
+    *,
+    to: Annotated[list[Literal["laz", "glb", "colmap"]], Parameter(negative="")],
+    output: Annotated[Path | None, Output] = None,
+    cache: CacheFolder = None,
+    debug: Debug = False,
+) -> int:
+    """Write a run for other programs: cloud.laz (a point a cell), terrain.glb (textured mesh) or a COLMAP model.
+
+    Parameters
+    ----------
+    run
+        Folder of a run, for example runs/mockup/latest.
+    to
+        laz: CloudCompare, PDAL, QGIS; glb: any glTF viewer, Blender; colmap: cameras, rig, poses and tracked points.
+        May be repeated.
+    output
+        What to write, for one form only; by default cloud.laz, terrain.glb or the folder colmap in the run's folder.
+    """
+    from stages.errors import ConfigError
+
+    if output is not None and len(to) > 1:
+        raise ConfigError(
+            f"--output names one place for {len(to)} forms", remedy="give one --to, or leave --output out"
+        )
+    prepare(cache)
+    for kind in to:
+        print(_export(run, kind, output, cache))
+    return COMPLETE
+
+
+def _export(run: Path, kind: Literal["laz", "glb", "colmap"], output: Path | None, cache: str | None) -> str:
+    """Write one form; what was written, in words."""
+    if kind == "colmap":
+        from pipeline import colmap
+        from pipeline.store import at
+
+        return str(colmap.export_run(run, output or run / kind, at(cache_folder(cache))))
+    from pipeline import cloud
+
+    path, words = cloud.export(run, kind, output)
+    return f"{path}  {words}"
+
+
+def compare_dem(
+    a: Path,
+    b: Path,
+    *,
+    align: Literal["none", "shift", "tilt", "rigid"] = "none",
+    output: Annotated[Path, Output] = Path("dem_comparison"),
+    debug: Debug = False,
+) -> int:
+    """Compare elevation model A with reference B: errors, completeness, error against range and slope.
+
+    The finer one is brought to the coarser one's cells (means of the known cells inside, or bilinear between four known
+    ones); only cells that both know are compared. Prints the figures; writes OUTPUT.png and OUTPUT.json.
+
+    Parameters
+    ----------
+    a
+        GeoTIFF, folder of a run, or zarr group with elevation, x and y.
+    b
+        Reference, likewise.
+    align
+        Move A onto B first: shift (x, y, z), tilt (z and two inclinations) or rigid (all six); what was moved is told.
+    output
+        Files to write, without ending.
+    """
+    prepare(None)
+    from pipeline import compare_dem as command
+
+    return command.compare(a, b, align=align, output=output)

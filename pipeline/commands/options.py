@@ -1,0 +1,131 @@
+"""What the commands of ``rille`` have in common: options with their explanation, and the steps before any of them."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from cyclopts import Parameter
+
+if TYPE_CHECKING:
+    from pipeline.run import Options
+
+COMPLETE, FAILED, USAGE, HOLES, INTERRUPTED = 0, 1, 2, 3, 130
+
+RUNS = Path("runs")
+
+
+def flag(words: str, *names: str) -> Parameter:
+    """An option that is given or not, without a ``--no-`` form."""
+    return Parameter(name=list(names) or None, negative="", help=words)
+
+
+def several(words: str, *names: str) -> Parameter:
+    """An option that may be repeated, one value each time."""
+    return Parameter(name=list(names) or None, negative="", consume_multiple=False, help=f"{words}; may be repeated.")
+
+
+Assignments = Annotated[
+    list[str] | None, several("A parameter, section.key=value, for example locus.cell_size=0.002", "--set", "-s")
+]
+CacheFolder = Annotated[
+    str | None,
+    Parameter(
+        name="--cache",
+        help="Folder of cached artifacts, or s3://bucket/prefix; RILLE_CACHE or .rille/cache by default.",
+    ),
+]
+Debug = Annotated[bool, flag("Show tracebacks.")]
+Executor = Annotated[
+    str,
+    Parameter(help="Where tasks run: processes, threads, inline, or the address of a dask scheduler, tcp://host:port."),
+]
+Frames = Annotated[str | None, Parameter(help="Frame range START:STOP[:STEP], as in Python; all by default.")]
+MemoryLimit = Annotated[
+    str | None,
+    Parameter(
+        help="Memory that a run may take in all, 6GB or 75% for example; nine tenths of what is free by default."
+    ),
+]
+Output = Parameter(name=["--output", "-o"])
+Run = Annotated[str, Parameter(help="SEQUENCE (its latest run), SEQUENCE/ID, or the run's folder.")]
+Runs = Annotated[Path, Parameter(help="Folder of results; each run makes RUNS/sequence/run-id.")]
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class Settings:
+    """What decides what is computed, and where it is kept."""
+
+    assignments: Assignments = None
+    config: Annotated[
+        Path | None, Parameter(help="TOML file of parameters; every run writes one with all defaults filled.")
+    ] = None
+    jobs: Annotated[int | None, Parameter(help="Worker processes; the number of cores by default.")] = None
+    force: Annotated[list[str] | None, several("A stage to compute again although it is cached")] = None
+    cache: CacheFolder = None
+    debug: Debug = False
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class Results:
+    """Where results are written, and what is said on the way."""
+
+    fresh: Annotated[bool, flag("Write a new folder of results even if nothing is new and the latest run stands.")] = (
+        False
+    )
+    runs: Runs = RUNS
+    progress: Annotated[
+        Literal["auto", "bar", "plain", "json", "quiet"], Parameter(help="How progress is shown on stderr.")
+    ] = "auto"
+    quiet: Annotated[bool, flag("No progress; complaints only.", "--quiet", "-q")] = False
+
+
+def options(
+    seq: str,
+    settings: Settings,
+    results: Results,
+    *,
+    verb: str = "reconstruct",
+    executor: str = "processes",
+    frames: str | None = None,
+    keep_going: bool = False,
+    memory_limit: str | None = None,
+) -> Options:
+    """What was given on the command line, for :mod:`pipeline.run`."""
+    from pipeline.run import Options
+
+    return Options(
+        sequence=seq,
+        assignments=tuple(settings.assignments or ()),
+        config=settings.config,
+        frames=frames,
+        jobs=settings.jobs,
+        executor=executor,
+        keep_going=keep_going,
+        force=frozenset(settings.force or ()),
+        runs=results.runs,
+        cache=cache_folder(settings.cache),
+        progress="quiet" if results.quiet else results.progress,
+        fresh=results.fresh,
+        memory_limit=memory_limit,
+        verb=verb,
+    )
+
+
+def cache_folder(given: str | Path | None) -> Path | str:
+    """Where the artifact cache is: ``--cache``, else ``RILLE_CACHE``, else ``.rille/cache`` here."""
+    from pipeline.location import locate
+
+    return locate(given or os.environ.get("RILLE_CACHE") or Path(".rille/cache"))
+
+
+def prepare(cache: str | None) -> None:
+    """Threads and the place of compiled kernels, before NumPy and numba are imported."""
+    from pipeline.environment import prepare_environment
+    from pipeline.location import hints_folder
+
+    prepare_environment(hints_folder(cache_folder(cache)))
