@@ -33,8 +33,8 @@ reconstruct: $(STAMP) ## a sequence to terrain, trajectory, risk map, path and r
 test: $(STAMP) lint ## lint, types and the test suite (a few minutes on two cores)
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow" $(ARGS)
 
-check: $(STAMP) lint ## everything, the slow checks too
-	$(BIN)/python -m pytest $(ARGS)
+check: test torture ## everything, the slow checks too
+	$(BIN)/python -m pytest -m slow --ignore=tests/torture $(ARGS)
 
 torture: $(STAMP) ## kills, damage, full disks, races: what the engine endures, as a table (also part of check)
 	$(BIN)/python -m pytest tests/torture $(ARGS)
