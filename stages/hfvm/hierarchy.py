@@ -143,7 +143,7 @@ class FastSolver:
         """Integer map of a level."""
         p, shape = self.params, a.window.shape
         at = (*offset(a, b), a.window.x0, a.window.y0)
-        u, v = np.zeros(shape, np.int16), np.zeros(shape, np.int16)
+        u, v = np.empty(shape, np.int16), np.empty(shape, np.int16)
         packed, data, dirty = (self._room(name, shape, kind) for name, kind in ROOM)
         f, mu = band.f, np.float32(band.mu)
         if up is None:

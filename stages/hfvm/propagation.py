@@ -142,9 +142,15 @@ def _rows(near, at, wide, count, reach_x, reach_y, plan):  # type: ignore[no-unt
     low = high = u
     planned = 1
     reach = 2 * reach_x + 1
-    if near[at - 1] == own and near[at + 1] == own and near[at - wide] == own and near[at + wide] == own and count <= 5:
-        count = 1
     widest = min(reach, LANES - reach)
+    if count == 5:
+        west, east, north, south = near[at - 1], near[at + 1], near[at - wide], near[at + wide]
+        same_row = (((west ^ own) | (east ^ own) | (north ^ own) | (south ^ own)) >> 16) == 0
+        least = min(min(columns(west), columns(east)), min(columns(north), columns(south)))
+        most = max(max(columns(west), columns(east)), max(columns(north), columns(south)))
+        # What is true nearly everywhere: all fit into one strip.
+        if same_row and max(most, u) - min(least, u) <= widest:
+            low, high, count = min(least, u), max(most, u), 1
     for k in range(1, count):
         other = _neighbour(near, at, wide, k)
         if other == own:
@@ -230,37 +236,43 @@ def checkerboard(left, right, packed, data, dirty, f, mu, smoothness, rounds, up
     flat = left.reshape(-1), right.reshape(-1), packed.reshape(-1), data.reshape(-1)
     shape = (right.shape[0], right.shape[1], cols, ox, x0, int(upright or mu < SHARP))
     room = np.empty((4, cols + LANES), np.int32)
-    dirty[:] = 1
+    dirty[:] = 0
     turns = 2 * rounds
     for step in range(rows + turns - 1 if turns else 0):
         for turn in range(max(0, step - rows + 1), min(turns, step + 1)):
             y = step - turn
             line = (*epipolar.row_terms(f, np.float64(y + y0)), mu)
-            _turn(flat, dirty, y, turn, line, shape, y + oy, smoothness, room)
+            _turn(flat, dirty, y, turn, line, shape, y + oy, smoothness, turns == 2, room)
 
 
 @njit(cache=True, nogil=True)
-def _turn(flat, dirty, y, turn, line, shape, yr, smoothness, room):  # type: ignore[no-untyped-def]
-    """One colour of row ``y``; ``yr``: the row in the right window."""
+def _turn(flat, dirty, y, turn, line, shape, yr, smoothness, once, room):  # type: ignore[no-untyped-def]
+    """One colour of row ``y``; ``yr``: the row in the right window; ``once``: no turn will look again."""
     rows, cols = dirty.shape
     here, there, packed, cost = flat
     todo, new, found, moved = room[0], room[1], room[2], room[3]
     above, below = (y - 1 if y > 0 else min(1, rows - 1)), (y + 1 if y < rows - 1 else max(rows - 2, 0))
-    # What to look at and what changes cannot be predicted: lists, written always and kept by counting.
     flags, before, after = dirty[y], dirty[above], dirty[below]
-    n = 0
-    for x in range((y + turn) & 1, cols, 2):
-        todo[n] = x
-        n += 1 if flags[x] else 0
-        flags[x] = 0
+    n, first = 0, (y + turn) & 1
+    if turn < 2:
+        n = (cols - first + 1) // 2
+        for k in range(n):
+            todo[k] = first + 2 * k
+        flags[first::2] = 0
+    else:
+        # What to look at and what changes cannot be predicted: lists, written always and kept by counting.
+        for x in range(first, cols, 2):
+            todo[n] = x
+            n += 1 if flags[x] else 0
+            flags[x] = 0
     if n == 0:
         return
     todo[n : n + LANES] = todo[n - 1]
     start = y * cols
     for k in range(0, n, LANES):
-        first, last = np.int64(todo[k]), np.int64(todo[k + LANES - 1])
+        a, b = np.int64(todo[k]), np.int64(todo[k + LANES - 1])
         args = start, above * cols, below * cols, yr
-        if last - first == 2 * LANES - 2 and first > 0 and last + 2 < cols:
+        if b - a == 2 * LANES - 2 and a > 0 and b + 2 < cols:
             lanes.settle_dense(
                 here, there, packed, cost, line, todo, k, args[0], args[1], args[2], args[3], shape, smoothness, new,
                 found,
@@ -270,6 +282,10 @@ def _turn(flat, dirty, y, turn, line, shape, yr, smoothness, room):  # type: ign
                 here, there, packed, cost, line, todo, k, args[0], args[1], args[2], args[3], shape, smoothness, new,
                 found,
             )  # fmt: skip
+    if once:
+        for k in range(n):
+            packed[start + todo[k]], cost[start + todo[k]] = new[k], found[k]
+        return
     m = 0
     for k in range(n):
         moved[m] = k
