@@ -70,7 +70,8 @@ def descend(left, right, up_u, up_v, reach_x, reach_y, count, f, mu, packed, dat
                 planned = _rectangles(near, at, wide, count, reach_x, reach_y, mu < SHARP, plan)
             x, y = 2 * i, 2 * j
             whole = x + 1 < cols and y + 1 < rows
-            best[:], least[:] = near[at], lanes.FAR
+            best[0] = best[1] = best[2] = best[3] = near[at]
+            least[0] = least[1] = least[2] = least[3] = lanes.FAR
             line = lines[0, i], lines[1, i], lines[2, i]
             for k in range(planned):
                 u, size, centre, v, cross = plan[k, 0], plan[k, 1], plan[k, 2], plan[k, 3], plan[k, 4]
