@@ -102,10 +102,12 @@ def pack(image: AnyArray, weights: tuple[float, ...]) -> tuple[Words, Planes]:
 
 def pack_batch(images: AnyArray, weights: tuple[float, ...]) -> tuple[Words, Planes]:
     """As :func:`pack`, of a batch (image, row, col)."""
-    padded = np.pad(images, ((0, 0), (RADIUS, RADIUS), (RADIUS, RADIUS)), mode="edge")
-    words = np.empty(images.shape, dtype=np.uint64)
-    deviation = np.empty(images.shape, dtype=np.float32)
-    _pack(np.ascontiguousarray(padded), np.asarray(weights, np.float32) * np.float32(STEPS_PER_UNIT), words, deviation)
+    images = np.ascontiguousarray(images, dtype=np.float32)
+    # One piece of memory: great ones come in great pages, and fresh memory costs more than filling it.
+    room = np.empty(3 * images.size, np.float32)
+    words, deviation = room[: 2 * images.size].view(np.uint64), room[2 * images.size :]
+    words, deviation = words.reshape(images.shape), deviation.reshape(images.shape)
+    _pack_all(images, np.asarray(weights, np.float32) * np.float32(STEPS_PER_UNIT), words, deviation)
     return words, deviation
 
 
@@ -114,8 +116,28 @@ def pack_inner(images: AnyArray, weights: tuple[float, ...]) -> Words:
     count, rows, cols = images.shape
     words = np.empty((count, rows - 2 * RADIUS, cols - 2 * RADIUS), dtype=np.uint64)
     scale = np.asarray(weights, np.float32) * np.float32(STEPS_PER_UNIT)
-    _pack(np.ascontiguousarray(images, dtype=np.float32), scale, words, np.empty(words.shape, np.float32))
+    deviation = np.empty(words.shape[1:], np.float32)
+    for image, found in zip(np.ascontiguousarray(images, dtype=np.float32), words, strict=True):
+        _pack(image, 0, scale, found, deviation)
     return words
+
+
+BAND = 64
+"""Rows that are completed at their edges together."""
+
+
+@njit(cache=True, nogil=True)
+def _pack_all(images, scale, words, deviation):  # type: ignore[no-untyped-def]
+    """Features of whole images, each completed by repeating its edge."""
+    count, rows, cols = images.shape
+    room = np.empty((BAND + 2 * RADIUS, cols + 2 * RADIUS), np.float32)
+    for i in range(count):
+        for start in range(0, rows, BAND):
+            size = min(BAND, rows - start) + 2 * RADIUS
+            for j in range(size):
+                row, out = images[i, min(max(start + j - RADIUS, 0), rows - 1)], room[j]
+                out[:RADIUS], out[RADIUS : RADIUS + cols], out[RADIUS + cols :] = row[0], row, row[cols - 1]
+            _pack(room[:size], start, scale, words[i], deviation[i])
 
 
 @njit(cache=True, nogil=True)
@@ -127,68 +149,71 @@ def _byte(value, scale):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _pack(a, scale, words, deviation):  # type: ignore[no-untyped-def]
-    """Table 1 by sums of fixed order; ``a`` is padded by RADIUS. No fast maths: bytes must not depend on the CPU."""
-    count, rows, cols = words.shape
+def _pack(a, start, scale, words, deviation):  # type: ignore[no-untyped-def]
+    """Table 1 by sums of fixed order, for rows from ``start`` on, RADIUS more of which ``a`` holds on every side.
+
+    No fast maths: bytes must not depend on the CPU.
+    """
+    rows, cols = a.shape[0] - 2 * RADIUS, words.shape[1]
     width = cols + 2 * RADIUS
     sums = np.empty(width, np.float32)
     squares = np.empty(width, np.float32)
     two, three, five, eight = np.float32(2.0), np.float32(3.0), np.float32(5.0), np.float32(8.0)
-    for i in range(count):
-        for y in range(rows):
-            r = a[i, y : y + 2 * RADIUS + 1]
-            for x in range(width):
-                s = np.float32(0.0)
-                q = np.float32(0.0)
-                for k in range(RADIUS - VARIANCE_RADIUS, RADIUS + VARIANCE_RADIUS + 1):
-                    c = r[k, x] - np.float32(128.0)
-                    s += c
-                    q += c * c
-                sums[x] = s
-                squares[x] = q
-            for x in range(cols):
-                m = x + RADIUS
-                f0 = (two * (r[6, m + 2] - r[6, m - 2]) + (r[6, m + 1] - r[6, m - 1])) * np.float32(0.25)
-                f1 = (two * (r[8, m] - r[4, m]) + (r[7, m] - r[5, m])) * np.float32(0.25)
-                f2 = ((r[6, m + 3] - r[6, m - 3]) - (r[6, m + 1] - r[6, m - 1])) * np.float32(0.5)
-                f3 = ((r[9, m] - r[3, m]) - (r[7, m] - r[5, m])) * np.float32(0.5)
-                f4 = (
-                    two * (r[6, m + 6] - r[6, m - 6])
-                    + (r[6, m + 5] - r[6, m - 5])
-                    - (r[6, m + 3] - r[6, m - 3])
-                    - two * (r[6, m + 2] - r[6, m - 2])
-                    - (r[6, m + 1] - r[6, m - 1])
-                ) * np.float32(0.125)
-                f5 = (
-                    two * (r[12, m] - r[0, m])
-                    + (r[11, m] - r[1, m])
-                    - (r[9, m] - r[3, m])
-                    - two * (r[8, m] - r[4, m])
-                    - (r[7, m] - r[5, m])
-                ) * np.float32(0.125)
-                s = sums[m - 2] + sums[m - 1] + sums[m] + sums[m + 1] + sums[m + 2]
-                q = squares[m - 2] + squares[m - 1] + squares[m] + squares[m + 1] + squares[m + 2]
-                s *= np.float32(0.04)
-                f6 = np.sqrt(max(q * np.float32(0.04) - s * s, np.float32(0.0)))
-                f7 = (
-                    eight * r[6, m]
-                    + five * (r[6, m - 1] + r[6, m + 1] + r[5, m] + r[7, m])
-                    + three * (r[5, m - 1] + r[5, m + 1] + r[7, m - 1] + r[7, m + 1])
-                    + two * (r[6, m - 2] + r[6, m + 2] + r[4, m] + r[8, m])
-                    + (r[4, m - 1] + r[4, m + 1] + r[8, m - 1] + r[8, m + 1])
-                    + (r[5, m - 2] + r[5, m + 2] + r[7, m - 2] + r[7, m + 2])
-                ) / np.float32(56.0)
-                deviation[i, y, x] = f6
-                words[i, y, x] = (
-                    _byte(f0, scale[0])
-                    | (_byte(f1, scale[1]) << np.uint64(8))
-                    | (_byte(f2, scale[2]) << np.uint64(16))
-                    | (_byte(f3, scale[3]) << np.uint64(24))
-                    | (_byte(f4, scale[4]) << np.uint64(32))
-                    | (_byte(f5, scale[5]) << np.uint64(40))
-                    | (_byte(f6, scale[6]) << np.uint64(48))
-                    | (_byte(f7, scale[7]) << np.uint64(56))
-                )
+    for y in range(rows):
+        r = a[y : y + 2 * RADIUS + 1]
+        found, sigma = words[start + y], deviation[start + y]
+        for x in range(width):
+            s = np.float32(0.0)
+            q = np.float32(0.0)
+            for k in range(RADIUS - VARIANCE_RADIUS, RADIUS + VARIANCE_RADIUS + 1):
+                c = r[k, x] - np.float32(128.0)
+                s += c
+                q += c * c
+            sums[x] = s
+            squares[x] = q
+        for x in range(cols):
+            m = x + RADIUS
+            f0 = (two * (r[6, m + 2] - r[6, m - 2]) + (r[6, m + 1] - r[6, m - 1])) * np.float32(0.25)
+            f1 = (two * (r[8, m] - r[4, m]) + (r[7, m] - r[5, m])) * np.float32(0.25)
+            f2 = ((r[6, m + 3] - r[6, m - 3]) - (r[6, m + 1] - r[6, m - 1])) * np.float32(0.5)
+            f3 = ((r[9, m] - r[3, m]) - (r[7, m] - r[5, m])) * np.float32(0.5)
+            f4 = (
+                two * (r[6, m + 6] - r[6, m - 6])
+                + (r[6, m + 5] - r[6, m - 5])
+                - (r[6, m + 3] - r[6, m - 3])
+                - two * (r[6, m + 2] - r[6, m - 2])
+                - (r[6, m + 1] - r[6, m - 1])
+            ) * np.float32(0.125)
+            f5 = (
+                two * (r[12, m] - r[0, m])
+                + (r[11, m] - r[1, m])
+                - (r[9, m] - r[3, m])
+                - two * (r[8, m] - r[4, m])
+                - (r[7, m] - r[5, m])
+            ) * np.float32(0.125)
+            s = sums[m - 2] + sums[m - 1] + sums[m] + sums[m + 1] + sums[m + 2]
+            q = squares[m - 2] + squares[m - 1] + squares[m] + squares[m + 1] + squares[m + 2]
+            s *= np.float32(0.04)
+            f6 = np.sqrt(max(q * np.float32(0.04) - s * s, np.float32(0.0)))
+            f7 = (
+                eight * r[6, m]
+                + five * (r[6, m - 1] + r[6, m + 1] + r[5, m] + r[7, m])
+                + three * (r[5, m - 1] + r[5, m + 1] + r[7, m - 1] + r[7, m + 1])
+                + two * (r[6, m - 2] + r[6, m + 2] + r[4, m] + r[8, m])
+                + (r[4, m - 1] + r[4, m + 1] + r[8, m - 1] + r[8, m + 1])
+                + (r[5, m - 2] + r[5, m + 2] + r[7, m - 2] + r[7, m + 2])
+            ) / np.float32(56.0)
+            sigma[x] = f6
+            found[x] = (
+                _byte(f0, scale[0])
+                | (_byte(f1, scale[1]) << np.uint64(8))
+                | (_byte(f2, scale[2]) << np.uint64(16))
+                | (_byte(f3, scale[3]) << np.uint64(24))
+                | (_byte(f4, scale[4]) << np.uint64(32))
+                | (_byte(f5, scale[5]) << np.uint64(40))
+                | (_byte(f6, scale[6]) << np.uint64(48))
+                | (_byte(f7, scale[7]) << np.uint64(56))
+            )
 
 
 @intrinsic

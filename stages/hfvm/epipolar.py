@@ -33,6 +33,9 @@ SHARP = 0.2
 """Pixels: median distance of sub-pixel matches from their lines in an ideal rig; beyond it the band is softened."""
 
 LEAST_MATCHES = 40
+LEAST_NORMAL = np.float32(1e-12)
+"""Length below which a normal is none: there is no band."""
+
 ITERATIONS, SETTLED = 10, 1e-4
 """At most so many; fewer once no term changes by more than this share of its prior deviation."""
 
@@ -193,3 +196,35 @@ def write_lines(f, found, x0=0, y0=0):  # type: ignore[no-untyped-def]
             c = f[2, 0] * x + f[2, 1] * y + f[2, 2]
             scale = 1.0 / max(np.sqrt(a * a + b * b), 1e-12)
             first[i], second[i], third[i] = a * scale, b * scale, (c + a * x + b * y) * scale
+
+
+@njit(cache=True, nogil=True)
+def row_terms(f, y):  # type: ignore[no-untyped-def]
+    """Lines of a row as polynomials of the column: seven float32, see :func:`line`.
+
+    Summed up in double precision, so that on a nearly rectified rig nothing cancels in single precision.
+    """
+    a, b = f[0, 1] * y + f[0, 2], f[1, 1] * y + f[1, 2]
+    c = f[2, 2] + f[2, 1] * y + b * y
+    terms = a, f[0, 0], b, f[1, 0], c, f[2, 0] + a + f[1, 0] * y, f[0, 0]
+    return (
+        np.float32(terms[0]),
+        np.float32(terms[1]),
+        np.float32(terms[2]),
+        np.float32(terms[3]),
+        np.float32(terms[4]),
+        np.float32(terms[5]),
+        np.float32(terms[6]),
+    )
+
+
+@njit(cache=True, nogil=True)
+def line(terms, x, length):  # type: ignore[no-untyped-def]
+    """Normal of ``length`` and offset (a, b, c) of the epipolar line of column ``x``; zeros where there is no band.
+
+    ``|a u + b v + c|`` is ``length`` times the distance of displacement (u, v) from the line. All float32.
+    """
+    a, b = terms[0] + terms[1] * x, terms[2] + terms[3] * x
+    c = terms[4] + x * (terms[5] + x * terms[6])
+    scale = length / max(np.sqrt(a * a + b * b), LEAST_NORMAL)
+    return a * scale, b * scale, c * scale

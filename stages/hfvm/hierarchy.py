@@ -141,21 +141,21 @@ class FastSolver:
 
     def match(self, level: int, a: Patch, b: Patch, shapes: tuple[Shape, Shape], up: Map | None, band: Band) -> Map:
         """Integer map of a level."""
-        p, at, shape = self.params, offset(a, b), a.window.shape
-        u, v = np.zeros(shape, np.int16), np.zeros(shape, np.int16)
+        p, shape = self.params, a.window.shape
+        at = (*offset(a, b), a.window.x0, a.window.y0)
+        u, v = np.empty(shape, np.int16), np.empty(shape, np.int16)
         packed, data, dirty = (self._room(name, shape, kind) for name, kind in ROOM)
-        lines, mu = self._room("lines", (3, *shape), np.float32), np.float32(band.mu)
-        epipolar.write_lines(band.f, lines, a.window.x0, a.window.y0)
+        f, mu = band.f, np.float32(band.mu)
         if up is None:
             reach_x, reach_y = top_reach(p, *shapes)
             search.exhaustive(a.words, b.words, reach_x, reach_y, 1, u, v, data)
             propagation.pack_map(u, v, packed)
         else:
             reach = p.search_columns, p.search_rows
-            propagation.descend(a.words, b.words, up.u, up.v, *reach, p.centres, lines, mu, packed, data, *at)
+            propagation.descend(a.words, b.words, up.u, up.v, *reach, p.centres, f, mu, packed, data, *at)
         rounds = self.rounds(level)
         # Rows are settled on the coarser levels, where trying them costs little.
-        propagation.checkerboard(a.words, b.words, packed, data, dirty, lines, mu, p.smoothness, rounds, level > 0, *at)
+        propagation.checkerboard(a.words, b.words, packed, data, dirty, f, mu, p.smoothness, rounds, level > 0, *at)
         propagation.unpack(packed, u, v)
         return Map(u, v, np.zeros(shape, bool))
 

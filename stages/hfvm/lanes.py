@@ -4,7 +4,8 @@ A feature vector is one 64-bit word, so eight of them fill a 512-bit register, a
 the bytes of each word in one instruction (``psadbw``, in 512, 256 or 128 bits). Elsewhere the same sums come from
 generic vector code; both give the same integers.
 
-Costs: distance + min(trunc(mu * |a u + b v + c|), 2047), with the epipolar line (a, b, c) and the sum in float32.
+Costs: distance + min(trunc(|a u + b v + c|), 2047), with the epipolar line (a, b, c), its normal as long as a pixel off
+it costs (:func:`stages.hfvm.epipolar.line`), and the sum in float32.
 """
 
 from __future__ import annotations
@@ -17,6 +18,8 @@ from llvmlite import ir
 from numba import types
 from numba.core import cgutils, config
 from numba.extending import intrinsic
+
+from stages.hfvm.epipolar import LEAST_NORMAL
 
 LANES = 8
 
@@ -94,7 +97,7 @@ def _as(builder: Any, pointer: Any, kind: Any) -> Any:
 
 WORDS = types.Array(types.uint64, 1, "C")
 PAIRS = types.Array(types.int32, 1, "C")
-LINES = types.Array(types.float32, 1, "C")
+TERMS = types.UniTuple(types.float32, 8)
 
 
 def _load(builder: Any, pointer: Any, inside: Any) -> Any:
@@ -144,7 +147,6 @@ class _Pixels:
     y: Any
     words: Any
     line: tuple[Any, Any, Any]
-    mu: Any
     image: Any
     rows: Any
     cols: Any
@@ -162,12 +164,12 @@ class _Pixels:
         a, b, c = self.line
         across = builder.fmul(a, builder.sitofp(u, _FLOATS8))
         off = builder.fadd(builder.fadd(across, builder.fmul(b, builder.sitofp(v, _FLOATS8))), c)
-        return builder.add(distance, band_cost(builder, off, self.mu)), inside
+        return builder.add(distance, band_cost(builder, off)), inside
 
 
-def band_cost(builder: Any, off: Any, mu: Any) -> Any:
-    """trunc(mu |off|) of eight pixels off their lines, at most :data:`FARTHEST_OFF`."""
-    band = builder.fmul(mu, _call(builder, "llvm.fabs.v8f32", _FLOATS8, off))
+def band_cost(builder: Any, off: Any) -> Any:
+    """trunc(|off|) of eight costs of being off a line, at most :data:`FARTHEST_OFF`."""
+    band = _call(builder, "llvm.fabs.v8f32", _FLOATS8, off)
     most = _vector(_FLOATS8, [float(FARTHEST_OFF)] * LANES)
     return builder.fptosi(builder.select(builder.fcmp_ordered("<", band, most), band, most), _INTS)
 
@@ -185,33 +187,59 @@ def _rough(builder: Any, tried: Any, near: list[Any]) -> Any:
     return total
 
 
+def _every_other(builder: Any, pointer: Any, kind: Any) -> Any:
+    """Eight elements of vector type ``kind``, the first one at ``pointer``; the ones between are read and dropped."""
+    size = kind.element.width // 8
+    halves = [builder.load(_as(builder, builder.gep(pointer, [ir.Constant(_I64, n)]), kind), align=size) for n in (0, LANES)]
+    return builder.shuffle_vector(*halves, ir.Constant(_INTS, list(range(0, 2 * LANES, 2))))
+
+
+def _lines(builder: Any, terms: Any, x: Any) -> tuple[Any, Any, Any]:
+    """:func:`stages.hfvm.epipolar.line` of eight columns; ``terms``: the row's, and the length."""
+    *t, length = (_splat(builder, n) for n in cgutils.unpack_tuple(builder, terms))
+    a, b = (builder.fadd(t[k], builder.fmul(t[k + 1], x)) for k in (0, 2))
+    c = builder.fadd(t[4], builder.fmul(x, builder.fadd(t[5], builder.fmul(x, t[6]))))
+    norm = _call(
+        builder, "llvm.sqrt.v8f32", _FLOATS8, builder.fadd(builder.fmul(a, a), builder.fmul(b, b))
+    )
+    least = _vector(_FLOATS8, [float(LEAST_NORMAL)] * LANES)
+    norm = builder.select(builder.fcmp_ordered(">", norm, least), norm, least)
+    scale = builder.fdiv(length, norm)
+    return builder.fmul(a, scale), builder.fmul(b, scale), builder.fmul(c, scale)
+
+
 def _any(builder: Any, mask: Any) -> Any:
     return builder.icmp_unsigned("!=", builder.bitcast(mask, _I8), ir.Constant(_I8, 0))
 
 
-def make_settle(width: int) -> Any:
-    """Intrinsic ``settle``, see :data:`settle`."""
+def make_settle(width: int, dense: bool = False) -> Any:
+    """Intrinsic ``settle``, see :data:`settle`; ``dense``: of every other pixel of a row, see :data:`settle_dense`."""
 
     @intrinsic
     def settle(  # type: ignore[no-untyped-def]
-        typingctx, left, right, packed, data, lines, todo, at, here, above, below, y, shape, smooth, mu, new, cost
+        typingctx, left, right, packed, data, line, todo, at, here, above, below, y, shape, smooth, new, cost
     ):
         i64 = types.int64
         sizes = types.UniTuple(i64, 6)
         signature = types.void(
-            WORDS, WORDS, PAIRS, PAIRS, LINES, PAIRS, i64, i64, i64, i64, i64, sizes, i64, types.float32, PAIRS, PAIRS
+            WORDS, WORDS, PAIRS, PAIRS, TERMS, PAIRS, i64, i64, i64, i64, i64, sizes, i64, PAIRS, PAIRS
         )
 
         def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
-            left, right, packed, data, lines = (
+            left, right, packed, data = (
                 context.make_array(kind)(context, builder, a).data
-                for kind, a in zip(sig.args[:5], args[:5], strict=True)
+                for kind, a in zip(sig.args[:4], args[:4], strict=True)
             )
             at, here, above, below, y = args[6:11]
-            rows, cols, left_cols, size, ahead, upright = (
+            rows, cols, left_cols, ahead, begin, upright = (
                 builder.trunc(n, _I32) for n in cgutils.unpack_tuple(builder, args[11])
             )
-            x = builder.load(_as(builder, _pointer(context, builder, sig.args[5], args[5], at), _INTS), align=4)
+            columns = _pointer(context, builder, sig.args[5], args[5], at)
+            if dense:
+                start = builder.load(columns)
+                x = builder.add(_splat(builder, start), _vector(_INTS, range(0, 2 * LANES, 2)))
+            else:
+                x = builder.load(_as(builder, columns, _INTS), align=4)
             one, nil = _vector(_INTS, [1] * LANES), _vector(_INTS, [0] * LANES)
             last = _splat(builder, builder.sub(left_cols, ir.Constant(_I32, 1)))
             # Beyond the border the pixel on the other side stands in.
@@ -220,30 +248,31 @@ def make_settle(width: int) -> Any:
             back = _call(builder, "llvm.smax.v8i32", _INTS, builder.sub(last, one), nil)
             east = builder.select(final, back, builder.add(x, one))
 
-            def read(array: Any, row: Any, column: Any, kind: Any) -> Any:
+            def read(array: Any, row: Any, column: Any, kind: Any, side: int = 0) -> Any:
+                if dense:
+                    place = builder.add(row, builder.sext(builder.add(start, ir.Constant(_I32, side)), _I64))
+                    return _every_other(builder, builder.gep(array, [place]), kind)
                 return _gather(builder, array, builder.add(column, _splat(builder, builder.trunc(row, _I32))), kind)
 
             own, stay = read(packed, here, x, _INTS), read(data, here, x, _INTS)
-            near = [read(packed, row, i, _INTS) for row, i in ((above, x), (here, west), (here, east), (below, x))]
-            place = builder.add(x, _splat(builder, builder.trunc(here, _I32)))
-            line = []
-            for _ in range(3):
-                line.append(_gather(builder, lines, place, _FLOATS8))
-                place = builder.add(place, _splat(builder, size))
+            around = ((above, x, 0), (here, west, -1), (here, east, 1), (below, x, 0))
+            near = [read(packed, row, i, _INTS, side) for row, i, side in around]
+            absolute = builder.sitofp(builder.add(x, _splat(builder, begin)), _FLOATS8)
             pixels = _Pixels(
                 builder, width, builder.add(x, _splat(builder, ahead)), _splat(builder, builder.trunc(y, _I32)),
-                read(left, here, x, _WORDS),
-                (line[0], line[1], line[2]), _splat(builder, args[13]), right, _splat(builder, rows),
+                read(left, here, x, _WORDS), _lines(builder, args[4], absolute), right, _splat(builder, rows),
                 _splat(builder, cols),
             )  # fmt: skip
             smooth = _splat(builder, builder.trunc(args[12], _I32))
             total = builder.add(stay, builder.mul(smooth, _rough(builder, own, near)))
             best, found, least = (cgutils.alloca_once_value(builder, a) for a in (own, stay, total))
 
-            def attempt(tried: Any) -> None:
+            def attempt(tried: Any, fresh: Any = None) -> None:
                 cost, inside = pixels.cost(tried)
                 total = builder.add(cost, builder.mul(smooth, _rough(builder, tried, near)))
                 better = builder.and_(inside, builder.icmp_signed("<", total, builder.load(least)))
+                if fresh is not None:
+                    better = builder.and_(better, fresh)
                 for slot, value in ((best, tried), (found, cost), (least, total)):
                     builder.store(builder.select(better, value, builder.load(slot)), slot)
 
@@ -252,18 +281,21 @@ def make_settle(width: int) -> Any:
                 moved = builder.add(builder.bitcast(own, _HALVES), builder.bitcast(step, _HALVES))
                 attempt(builder.bitcast(moved, _INTS))
 
-            beside(-1, 0)
-            beside(1, 0)
             with builder.if_then(builder.icmp_signed("!=", upright, ir.Constant(_I32, 0))):
+                beside(-1, 0)
+                beside(1, 0)
                 beside(0, -1)
                 beside(0, 1)
-            for tried in near:
-                # What lies a column beside the own one has been tried.
+            for k, tried in enumerate(near):
+                # What lies a column beside the own one has been tried or is left out; and what came before.
                 away = builder.sub(builder.bitcast(tried, _HALVES), builder.bitcast(own, _HALVES))
                 columns = builder.bitcast(builder.add(away, _vector(_HALVES, [1, 0] * LANES)), _INTS)
-                with builder.if_then(_any(builder, builder.icmp_unsigned(">", columns, _vector(_INTS, [2] * LANES)))):
-                    attempt(tried)
-            for kind, array, slot in ((sig.args[14], args[14], best), (sig.args[15], args[15], found)):
+                fresh = builder.icmp_unsigned(">", columns, _vector(_INTS, [2] * LANES))
+                for other in near[:k]:
+                    fresh = builder.and_(fresh, builder.icmp_signed("!=", tried, other))
+                with builder.if_then(_any(builder, fresh)):
+                    attempt(tried, fresh)
+            for kind, array, slot in ((sig.args[13], args[13], best), (sig.args[14], args[14], found)):
                 pointer = _as(builder, _pointer(context, builder, kind, array, at), _INTS)
                 builder.store(builder.load(slot), pointer, align=4)
             return context.get_dummy_value()
@@ -274,17 +306,23 @@ def make_settle(width: int) -> Any:
 
 
 settle = make_settle(widest())
-"""``settle(left, right, packed, data, lines, todo, at, here, above, below, y, shape, smooth, mu, new, cost)``: the best
+"""``settle(left, right, packed, data, line, todo, at, here, above, below, y, shape, smooth, new, cost)``: the best
 displacement of eight pixels of row ``y`` among each one's own, those a pixel beside it, and those of its four
 neighbours.
 
 ``todo[at : at + 8]``: columns of the pixels, no two of them neighbours. All arrays are flat: words of both images;
-``packed`` displacements, v << 16 | u, and their costs without smoothness; ``lines``: three planes of the left image's
-size. ``here, above, below``: index at which the row and its neighbours begin. ``shape``: rows and columns of the right
-image, columns and size of the left one, the column of the left one's first pixel in the right one, as ``y`` is the row
-there (both may be windows), and whether other rows are tried. In this order: own, own a column less, more, where
-``shape`` says so a row less, more, then up, west, east, down; the first of equal ones wins. Costs have ``smooth`` times
-the roughness added. ``new[at : at + 8]`` gets the best ones and ``cost`` their costs without smoothness.
+``packed`` displacements, v << 16 | u, and their costs without smoothness. ``line``: the row's terms of
+:func:`stages.hfvm.epipolar.line`, and the length of a normal. ``here, above, below``: index at which the row and its
+neighbours begin. ``shape``: rows and columns of the right image, columns of the left one, the column of the left one's
+first pixel in the right one, as ``y`` is the row there (both may be windows), its column in the whole left image, and
+whether other rows are tried. In this order: own, own a column less, more, where ``shape`` says so a row less, more,
+then up, west, east, down; the first of equal ones wins. Costs have ``smooth`` times the roughness added. ``new[at : at
++ 8]`` gets the best ones and ``cost`` their costs without smoothness.
+"""
+
+settle_dense = make_settle(widest(), dense=True)
+"""As ``settle``, of the eight pixels ``todo[at]``, ``todo[at] + 2``, ... none of which nor of their neighbours lies
+beyond the row: whole vectors are read. A column more than those is read, too.
 """
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 
 from stages.features import distance
-from stages.hfvm import lanes, strip_lanes
+from stages.hfvm import epipolar, lanes, strip_lanes
 from stages.hfvm.lanes import LANES, SHARP
 
 MOST_STRIPS = 512
@@ -37,30 +37,31 @@ def rows_of(packed):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def descend(left, right, up_u, up_v, reach_x, reach_y, count, lines, mu, packed, data, ox=0, oy=0):  # type: ignore[no-untyped-def]
+def descend(left, right, up_u, up_v, reach_x, reach_y, count, f, mu, packed, data, ox=0, oy=0, x0=0, y0=0):  # type: ignore[no-untyped-def]
     """Search around the doubled displacements of the coarse parent and of its nearest neighbours.
 
     The four pixels of a parent try the same. ``count``: centres, of the parent, its neighbours along the row, along the
     column and on the diagonals. ``reach_x, reach_y``: search to either side, along the row, and about the parent also
     along its column; where the band is not sharp, over the whole rectangle about each. Of equal ones the parent's own
-    wins. ``lines`` (3, row, col) float32: epipolar line of each pixel (:func:`stages.hfvm.epipolar.write_lines`), zeros
-    without a band; ``mu``: cost per pixel off it. Where the band is sharp each centre is first moved towards its
-    line, by a pixel at most: a coarse fit may be wrong by more than that. ``packed, data`` (row, col) int32 get the
-    displacements and their costs. With nothing inside the other image the prediction stays: it leads out of it. ``ox,
-    oy``: where the left window's first pixel lies in the right window; a window starts at even rows and columns.
+    wins. ``f``: fundamental matrix of the band, zeros without one; the four pixels share the line of their middle.
+    ``mu``: cost per pixel off it, float32. Where the band is sharp each centre is first moved towards its line, by a
+    pixel at most: a coarse fit may be wrong by more than that. ``packed, data`` (row, col) int32 get the displacements
+    and their costs. With nothing inside the other image the prediction stays: it leads out of it. ``ox, oy``: where the
+    left window's first pixel lies in the right window; ``x0, y0``: its column and row, even, in the whole left image.
     Reach: a coarse pixel.
     """
     rows, cols = left.shape
     crows, ccols = up_u.shape
     centres = np.empty((crows + 2, ccols + 2), np.int32)
-    _centres(up_u, up_v, lines, mu, centres)
+    _centres(up_u, up_v, f, mu, x0, y0, centres)
     wide = ccols + 2
     plan, best, least = np.empty((MOST_STRIPS, 5), np.int64), np.empty(4, np.int32), np.empty(4, np.int32)
-    here, there, near, normals = left.reshape(-1), right.reshape(-1), centres.reshape(-1), lines.reshape(-1)
+    here, there, near, lines = left.reshape(-1), right.reshape(-1), centres.reshape(-1), np.empty((3, ccols), np.float32)
     rrows, rcols = right.shape
-    sizes = cols, rows * cols, rcols
+    sizes = cols, rcols
     in_rows = mu >= SHARP and 2 * reach_x < LANES and reach_y <= 1
     for j in range(crows):
+        _lines(f, x0, y0 + 2 * j, mu, lines)
         for i in range(ccols):
             at = (j + 1) * wide + i + 1
             if in_rows:
@@ -69,15 +70,17 @@ def descend(left, right, up_u, up_v, reach_x, reach_y, count, lines, mu, packed,
                 planned = _rectangles(near, at, wide, count, reach_x, reach_y, mu < SHARP, plan)
             x, y = 2 * i, 2 * j
             whole = x + 1 < cols and y + 1 < rows
-            best[:], least[:] = near[at], lanes.FAR
+            best[0] = best[1] = best[2] = best[3] = near[at]
+            least[0] = least[1] = least[2] = least[3] = lanes.FAR
+            line = lines[0, i], lines[1, i], lines[2, i]
             for k in range(planned):
                 u, size, centre, v, cross = plan[k, 0], plan[k, 1], plan[k, 2], plan[k, 3], plan[k, 4]
                 xr, yr = x + ox + u, y + oy + v
                 if whole and xr >= 0 and xr + LANES < rcols and yr >= cross and yr + 1 + cross < rrows:
                     start, target, place = y * cols + x, yr * rcols + xr, (u, centre, v)
-                    strip_lanes.four(here, there, normals, start, target, sizes, mu, place, (size, cross), best, least)
+                    strip_lanes.four(here, there, line, start, target, sizes, place, (size, cross), best, least)
                 else:
-                    _singly(here, there, normals, x, y, (rows, cols), (rrows, rcols), ox, oy, mu, plan, k, best, least)
+                    _singly(here, there, line, x, y, (rows, cols), (rrows, rcols), ox, oy, plan, k, best, least)
             packed[y, x], data[y, x] = best[0], least[0]
             if whole:
                 packed[y, x + 1], data[y, x + 1] = best[1], least[1]
@@ -90,7 +93,7 @@ def descend(left, right, up_u, up_v, reach_x, reach_y, count, lines, mu, packed,
 
 
 @njit(cache=True, nogil=True)
-def _singly(here, there, normals, x0, y0, shape, other, ox, oy, mu, plan, at, best, least):  # type: ignore[no-untyped-def]
+def _singly(here, there, line, x0, y0, shape, other, ox, oy, plan, at, best, least):  # type: ignore[no-untyped-def]
     """What ``strip_lanes.four`` does, candidate by candidate: near the borders."""
     u, count, centre, v, cross = plan[at, 0], plan[at, 1], plan[at, 2], plan[at, 3], plan[at, 4]
     rows, cols = shape
@@ -100,15 +103,14 @@ def _singly(here, there, normals, x0, y0, shape, other, ox, oy, mu, plan, at, be
         x, y = x0 + (n & 1), y0 + (n >> 1)
         if x >= cols or y >= rows:
             continue
-        i = y * cols + x
-        word, a, b, c = here[i], normals[i], normals[i + rows * cols], normals[i + 2 * rows * cols]
+        word = here[y * cols + x]
         first, last = max(u, -x - ox) - u, min(u + count, rcols - x - ox) - u
         own = centre - u
         for k in range(-1, count + 2 * cross):
             du, dv = (centre, v) if k < 0 else (u + k, v) if k < count else (centre, v + 2 * (k - count) - 1)
             lane, yr = du - u, y + oy + dv
             if first <= lane < last and 0 <= yr < rrows and (k >= 0 or 0 <= own < count):
-                off = mu * abs((a * np.float32(du) + b * np.float32(dv)) + c)
+                off = abs((line[0] * np.float32(du) + line[1] * np.float32(dv)) + line[2])
                 cost = distance(word, there[yr * rcols + x + ox + du]) + np.int64(min(off, most))
                 if cost < least[n]:
                     best[n], least[n] = pack(du, dv), cost
@@ -141,9 +143,15 @@ def _rows(near, at, wide, count, reach_x, reach_y, plan):  # type: ignore[no-unt
     low = high = u
     planned = 1
     reach = 2 * reach_x + 1
-    if near[at - 1] == own and near[at + 1] == own and near[at - wide] == own and near[at + wide] == own and count <= 5:
-        count = 1
     widest = min(reach, LANES - reach)
+    if count == 5:
+        west, east, north, south = near[at - 1], near[at + 1], near[at - wide], near[at + wide]
+        same_row = (((west ^ own) | (east ^ own) | (north ^ own) | (south ^ own)) >> 16) == 0
+        least = min(min(columns(west), columns(east)), min(columns(north), columns(south)))
+        most = max(max(columns(west), columns(east)), max(columns(north), columns(south)))
+        # What is true nearly everywhere: all fit into one strip.
+        if same_row and max(most, u) - min(least, u) <= widest:
+            low, high, count = min(least, u), max(most, u), 1
     for k in range(1, count):
         other = _neighbour(near, at, wide, k)
         if other == own:
@@ -178,20 +186,33 @@ def _rectangles(near, at, wide, count, reach_x, reach_y, square, plan):  # type:
 
 
 @njit(cache=True, nogil=True)
-def _centres(up_u, up_v, lines, mu, centres):  # type: ignore[no-untyped-def]
+def _lines(f, x0, y, length, lines):  # type: ignore[no-untyped-def]
+    """Lines (3, col) of the middles of a row of squares of 2 x 2 pixels that begin in column ``x0``, row ``y``."""
+    terms, first, half = epipolar.row_terms(f, y + 0.5), np.float32(x0), np.float32(0.5)
+    for i in range(lines.shape[1]):
+        a, b, c = epipolar.line(terms, first + (np.float32(2 * i) + half), length)
+        lines[0, i], lines[1, i], lines[2, i] = a, b, c
+
+
+@njit(cache=True, nogil=True)
+def _centres(up_u, up_v, f, mu, x0, y0, centres):  # type: ignore[no-untyped-def]
     """Doubled displacements, each moved towards its epipolar line by a pixel at most; a border repeats the edge."""
     crows, ccols = up_u.shape
-    one = np.float32(1.0)
+    one, lines = np.float32(1.0), np.empty((3, ccols), np.float32)
     for j in range(crows):
-        normal = lines[:, 2 * j]
-        for i in range(ccols):
-            pu, pv = 2 * np.int64(up_u[j, i]), 2 * np.int64(up_v[j, i])
-            if mu >= SHARP:
-                a, b = normal[0, 2 * i], normal[1, 2 * i]
-                e = min(max(a * np.float32(pu) + b * np.float32(pv) + normal[2, 2 * i], -one), one)
-                pu -= np.int64(np.rint(e * a))
-                pv -= np.int64(np.rint(e * b))
-            centres[j + 1, i + 1] = pack(pu, pv)
+        us, vs, row = up_u[j], up_v[j], centres[j + 1, 1 : ccols + 1]
+        if mu >= SHARP:
+            _lines(f, x0, y0 + 2 * j, one, lines)
+            a, b, c = lines[0], lines[1], lines[2]
+            for i in range(ccols):
+                pu, pv = np.float32(2 * us[i]), np.float32(2 * vs[i])
+                e = min(max(a[i] * pu + b[i] * pv + c[i], -one), one)
+                u, v = np.int32(pu - np.rint(e * a[i])), np.int32(pv - np.rint(e * b[i]))
+                row[i] = (v << np.int32(16)) | (u & np.int32(0xFFFF))
+        else:
+            for i in range(ccols):
+                u, v = np.int32(2 * us[i]), np.int32(2 * vs[i])
+                row[i] = (v << np.int32(16)) | (u & np.int32(0xFFFF))
     centres[1 : crows + 1, 0], centres[1 : crows + 1, ccols + 1] = (
         centres[1 : crows + 1, 1],
         centres[1 : crows + 1, ccols],
@@ -200,54 +221,80 @@ def _centres(up_u, up_v, lines, mu, centres):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def checkerboard(left, right, packed, data, dirty, lines, mu, smoothness, rounds, upright, ox=0, oy=0):  # type: ignore[no-untyped-def]
+def checkerboard(left, right, packed, data, dirty, f, mu, smoothness, rounds, upright, ox=0, oy=0, x0=0, y0=0):  # type: ignore[no-untyped-def]
     """Rounds of propagation in place: each pixel tries its neighbours' displacements and its own a column beside.
 
     ``upright``: its own a row beside, too; so it is where the band is not sharp and hardly says in which row to search.
 
     Cost: that of the displacement + ``smoothness`` times the sum over the four neighbours of min(|du| + |dv|, 2);
     beyond the border the neighbour on the other side stands in. The two colours of a checkerboard take turns, which
-    settles in half the rounds of all at once. ``dirty`` (row, col) uint8: room; from the second round on only the
-    neighbourhoods of what changed are looked at. ``ox, oy``: as in :func:`descend`. A round reaches two pixels.
+    settles in half the rounds of all at once. Each turn follows the one before at a row's distance, so that all of them
+    pass over the image while it is at hand. ``dirty`` (row, col) uint8: room; from the second round on only the
+    neighbourhoods of what changed are looked at. ``f``, ``ox, oy``, ``x0, y0``: as in :func:`descend`. A round reaches
+    two pixels.
     """
     rows, cols = left.shape
-    here, there, flat, cost = left.reshape(-1), right.reshape(-1), packed.reshape(-1), data.reshape(-1)
-    normals = lines.reshape(-1)
-    shape = (right.shape[0], right.shape[1], cols, rows * cols, ox, int(upright or mu < SHARP))
-    todo, new, found = (
-        np.empty(cols + LANES, np.int32),
-        np.empty(cols + LANES, np.int32),
-        np.empty(cols + LANES, np.int32),
-    )
-    moved = np.empty(cols + LANES, np.int32)
-    dirty[:] = 1
-    for turn in range(2 * rounds):
-        for y in range(rows):
-            above, below = (y - 1 if y > 0 else min(1, rows - 1)), (y + 1 if y < rows - 1 else max(rows - 2, 0))
-            # What to look at and what changes cannot be predicted: lists, written always and kept by counting.
-            flags, before, after = dirty[y], dirty[above], dirty[below]
-            n = 0
-            for x in range((y + turn) & 1, cols, 2):
-                todo[n] = x
-                n += 1 if flags[x] else 0
-                flags[x] = 0
-            if n == 0:
-                continue
-            todo[n : n + LANES] = todo[n - 1]
-            start = y * cols
-            for k in range(0, n, LANES):
-                lanes.settle(
-                    here, there, flat, cost, normals, todo, k, start, above * cols, below * cols, y + oy, shape,
-                    smoothness, mu, new, found,
-                )  # fmt: skip
-            m = 0
-            for k in range(n):
-                moved[m] = k
-                m += 1 if new[k] != flat[start + todo[k]] else 0
-            for k in range(m):
-                i = np.int64(todo[moved[k]])
-                flat[start + i], cost[start + i] = new[moved[k]], found[moved[k]]
-                before[i] = after[i] = flags[i] = flags[max(i - 1, 0)] = flags[min(i + 1, cols - 1)] = 1
+    flat = left.reshape(-1), right.reshape(-1), packed.reshape(-1), data.reshape(-1)
+    shape = (right.shape[0], right.shape[1], cols, ox, x0, int(upright or mu < SHARP))
+    room = np.empty((4, cols + LANES), np.int32)
+    dirty[:] = 0
+    turns = 2 * rounds
+    for step in range(rows + turns - 1 if turns else 0):
+        for turn in range(max(0, step - rows + 1), min(turns, step + 1)):
+            y = step - turn
+            line = (*epipolar.row_terms(f, np.float64(y + y0)), mu)
+            _turn(flat, dirty, y, turn, line, shape, y + oy, smoothness, turns == 2, room)
+
+
+@njit(cache=True, nogil=True)
+def _turn(flat, dirty, y, turn, line, shape, yr, smoothness, once, room):  # type: ignore[no-untyped-def]
+    """One colour of row ``y``; ``yr``: the row in the right window; ``once``: no turn will look again."""
+    rows, cols = dirty.shape
+    here, there, packed, cost = flat
+    todo, new, found, moved = room[0], room[1], room[2], room[3]
+    above, below = (y - 1 if y > 0 else min(1, rows - 1)), (y + 1 if y < rows - 1 else max(rows - 2, 0))
+    flags, before, after = dirty[y], dirty[above], dirty[below]
+    n, first = 0, (y + turn) & 1
+    if turn < 2:
+        n = (cols - first + 1) // 2
+        for k in range(n):
+            todo[k] = first + 2 * k
+        flags[first::2] = 0
+    else:
+        # What to look at and what changes cannot be predicted: lists, written always and kept by counting.
+        for x in range(first, cols, 2):
+            todo[n] = x
+            n += 1 if flags[x] else 0
+            flags[x] = 0
+    if n == 0:
+        return
+    todo[n : n + LANES] = todo[n - 1]
+    start = y * cols
+    for k in range(0, n, LANES):
+        a, b = np.int64(todo[k]), np.int64(todo[k + LANES - 1])
+        args = start, above * cols, below * cols, yr
+        if b - a == 2 * LANES - 2 and a > 0 and b + 2 < cols:
+            lanes.settle_dense(
+                here, there, packed, cost, line, todo, k, args[0], args[1], args[2], args[3], shape, smoothness, new,
+                found,
+            )  # fmt: skip
+        else:
+            lanes.settle(
+                here, there, packed, cost, line, todo, k, args[0], args[1], args[2], args[3], shape, smoothness, new,
+                found,
+            )  # fmt: skip
+    if once:
+        for k in range(n):
+            packed[start + todo[k]], cost[start + todo[k]] = new[k], found[k]
+        return
+    m = 0
+    for k in range(n):
+        moved[m] = k
+        m += 1 if new[k] != packed[start + todo[k]] else 0
+    for k in range(m):
+        i = np.int64(todo[moved[k]])
+        packed[start + i], cost[start + i] = new[moved[k]], found[moved[k]]
+        before[i] = after[i] = flags[i] = flags[max(i - 1, 0)] = flags[min(i + 1, cols - 1)] = 1
 
 
 @njit(cache=True, nogil=True)

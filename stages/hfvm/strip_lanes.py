@@ -41,57 +41,54 @@ def make_four(width: int) -> Any:
     """Intrinsic ``four``, see :data:`four`."""
 
     @intrinsic
-    def four(typingctx, left, right, lines, here, there, sizes, mu, place, counts, best, least):  # type: ignore[no-untyped-def]
+    def four(typingctx, left, right, line, here, there, sizes, place, counts, best, least):  # type: ignore[no-untyped-def]
         i64 = types.int64
         signature = types.void(
-            lanes.WORDS, lanes.WORDS, lanes.LINES, i64, i64, types.UniTuple(i64, 3), types.float32,
+            lanes.WORDS, lanes.WORDS, types.UniTuple(types.float32, 3), i64, i64, types.UniTuple(i64, 2),
             types.UniTuple(i64, 3), types.UniTuple(i64, 2), lanes.PAIRS, lanes.PAIRS,
         )  # fmt: skip
 
         def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
             splat, vector = lanes._splat, lanes._vector
-            left, right, lines, here, there = args[:5]
-            cols, size, rcols = cgutils.unpack_tuple(builder, args[5])
-            mu = splat(builder, args[6])
-            u, centre, v = (builder.trunc(n, _I32) for n in cgutils.unpack_tuple(builder, args[7]))
-            count, cross = cgutils.unpack_tuple(builder, args[8])
+            left, right, line, here, there = args[:5]
+            cols, rcols = cgutils.unpack_tuple(builder, args[5])
+            u, centre, v = (builder.trunc(n, _I32) for n in cgutils.unpack_tuple(builder, args[6]))
+            count, cross = cgutils.unpack_tuple(builder, args[7])
+            a, b, c = (splat(builder, n) for n in cgutils.unpack_tuple(builder, line))
 
             def load(k: int, array: Any, index: Any, kind: Any) -> Any:
                 pointer = lanes._pointer(context, builder, sig.args[k], array, index)
-                return builder.load(lanes._as(builder, pointer, kind), align=4 if kind == _FLOAT else 8)
+                return builder.load(lanes._as(builder, pointer, kind), align=8)
 
             def moved(index: Any, rows: int, columns: int, wide: Any) -> Any:
                 index = builder.add(index, builder.mul(wide, ir.Constant(_I64, rows)))
                 return builder.add(index, ir.Constant(_I64, columns))
 
-            def line(index: Any) -> tuple[Any, ...]:
-                found = []
-                for _ in range(3):
-                    found.append(load(2, lines, index, _FLOAT))
-                    index = builder.add(index, size)
-                return tuple(found)
+            def band(columns: Any, rows: Any, rank: Any) -> Any:
+                """What eight displacements cost by the line, << 4 | rank."""
+                off = builder.fadd(builder.fmul(a, builder.sitofp(columns, _FLOATS)), builder.fmul(b, builder.sitofp(rows, _FLOATS)))
+                return shorts(lanes.band_cost(builder, builder.fadd(off, c)), rank)
 
-            def cost(distance: Any, across: Any, b_v: Any, c: Any) -> Any:
-                off = builder.fadd(builder.fadd(across, b_v), c)
-                total = builder.add(builder.trunc(distance, _INTS), lanes.band_cost(builder, off, mu))
-                return builder.shl(total, vector(_INTS, [4] * LANES))
+            def shorts(cost: Any, rank: Any) -> Any:
+                four_bits = vector(_INTS, [4] * LANES)
+                return builder.trunc(builder.or_(builder.shl(cost, four_bits), rank), _SHORTS)
 
-            columns = builder.sitofp(builder.add(splat(builder, u), vector(_INTS, range(LANES))), _FLOATS)
+            def cost(distance: Any, other: Any) -> Any:
+                near = builder.trunc(builder.shl(distance, vector(lanes._WORDS, [4] * LANES)), _SHORTS)
+                return lanes._call(builder, "llvm.uadd.sat.v8i16", _SHORTS, near, other)
+
             lane = vector(_INTS, range(LANES))
             is_own = builder.icmp_signed("==", lane, splat(builder, builder.sub(centre, u)))
             rank = builder.select(is_own, vector(_INTS, [0] * LANES), vector(_INTS, range(1, LANES + 1)))
             taking = builder.icmp_signed("<", lane, splat(builder, builder.trunc(count, _I32)))
-            row = builder.sitofp(v, _FLOAT)
-            normals = [line(moved(here, j, i, cols)) for j, i in _CHILDREN]
+            other = band(builder.add(splat(builder, u), lane), splat(builder, v), rank)
+            other = builder.select(taking, other, vector(_SHORTS, [-1] * LANES))
             words = [load(0, left, moved(here, j, i, cols), _I64) for j, i in _CHILDREN]
             key = ir.Constant(_FOUR, ir.Undefined)
-            for k, (word, (a, b, c)) in enumerate(zip(words, normals, strict=True)):
+            for k, word in enumerate(words):
                 found = load(1, right, moved(there, *_CHILDREN[k], rcols), lanes._WORDS)
-                distance = lanes._distances(builder, splat(builder, word), found, width)
-                across = builder.fmul(splat(builder, a), columns)
-                one = cost(distance, across, splat(builder, builder.fmul(b, row)), splat(builder, c))
-                one = builder.select(taking, builder.or_(one, rank), vector(_INTS, [NONE] * LANES))
-                one = lanes._call(builder, "llvm.vector.reduce.umin.v8i16", _I16, builder.trunc(one, _SHORTS))
+                one = cost(lanes._distances(builder, splat(builder, word), found, width), other)
+                one = lanes._call(builder, "llvm.vector.reduce.umin.v8i16", _I16, one)
                 key = builder.insert_element(key, builder.zext(one, _I32), ir.Constant(_I32, k))
             slot = cgutils.alloca_once_value(builder, key)
             with builder.if_then(builder.icmp_signed("!=", cross, ir.Constant(_I64, 0))):
@@ -101,19 +98,13 @@ def make_four(width: int) -> Any:
                 less, more = (_pairs(builder, rows[k], rows[k + 1], (0, 1, 2, 3)) for k in (0, 2))
                 found = _pairs(builder, less, more, tuple(range(8)))
 
-                def twice(values: Any, kind: Any) -> Any:
-                    total = ir.Constant(kind, ir.Undefined)
-                    for k, value in enumerate(values):
-                        total = builder.insert_element(total, value, ir.Constant(_I32, k))
-                    return _pairs(builder, total, total, (0, 1, 2, 3, 0, 1, 2, 3))
-
-                own = twice(words, ir.VectorType(_I64, 4))
-                a, b, c = (twice([n[k] for n in normals], ir.VectorType(_FLOAT, 4)) for k in range(3))
-                rows_of = builder.add(splat(builder, v), vector(_INTS, [-1] * 4 + [1] * 4))
-                across = builder.fmul(a, splat(builder, builder.sitofp(centre, _FLOAT)))
-                b_v = builder.fmul(b, builder.sitofp(rows_of, _FLOATS))
-                other = cost(lanes._distances(builder, own, found, width), across, b_v, c)
-                other = builder.or_(other, vector(_INTS, [ABOVE] * 4 + [BELOW] * 4))
+                own = ir.Constant(lanes._WORDS, ir.Undefined)
+                for k, word in enumerate([*words, *words]):
+                    own = builder.insert_element(own, word, ir.Constant(_I32, k))
+                away = builder.add(splat(builder, v), vector(_INTS, [-1] * 4 + [1] * 4))
+                other = band(splat(builder, centre), away, vector(_INTS, [ABOVE] * 4 + [BELOW] * 4))
+                other = cost(lanes._distances(builder, own, found, width), other)
+                other = builder.zext(other, _INTS)
                 for pick in ((0, 1, 2, 3), (4, 5, 6, 7)):
                     one, least_key = _pairs(builder, other, other, pick), builder.load(slot)
                     builder.store(builder.select(builder.icmp_signed("<", one, least_key), one, least_key), slot)
@@ -136,7 +127,7 @@ def make_four(width: int) -> Any:
             total = builder.lshr(key, vector(_FOUR, [4] * 4))
             pointers = [
                 lanes._as(builder, lanes._pointer(context, builder, sig.args[k], args[k], ir.Constant(_I64, 0)), _FOUR)
-                for k in (9, 10)
+                for k in (8, 9)
             ]
             before = builder.load(pointers[1], align=4)
             better = builder.icmp_signed("<", total, before)
@@ -150,13 +141,13 @@ def make_four(width: int) -> Any:
 
 
 four = make_four(lanes.widest())
-"""``four(left, right, lines, here, there, (cols, size, right cols), mu, (u, centre, v), (count, cross), best, least)``:
+"""``four(left, right, line, here, there, (cols, right cols), (u, centre, v), (count, cross), best, least)``:
 the best candidate, cost << 4 | rank, of each pixel of a square of two by two.
 
 ``left[here]``: word of the first pixel; ``right[there]``: the one it meets at column displacement ``u``, row
 displacement ``v``. Candidates are the column displacements ``u + k`` for k < ``count``, at most eight; where ``cross``,
 also ``centre`` a row less and a row more. Eight words from the first one on are read for each pixel, whatever
-``count``. ``cols, size``: columns and pixels of the left image; ``lines, mu`` as in ``lanes``. Rank 0 is the candidate
+``count``. ``cols``: columns of the left image; ``line``: that of the square (:func:`stages.hfvm.epipolar.line`). Rank 0 is the candidate
 of column ``centre``, 1 + k the others; ABOVE and BELOW those of the other rows. Of equal ones the least rank wins.
 ``best, least``: packed displacement and cost of the best so far, replaced where this one costs less.
 """

@@ -31,6 +31,10 @@ COARSE_SHARE, FINE_SHARE = 0.15, 0.65
 """Share of the time when the coarse levels are done, and when all whole-pixel maps are; a level costs four times the
 one above."""
 
+KEPT = 31 << 20
+"""Bytes: glibc keeps freed memory up to twice the greatest piece it has seen freed, if that is below 32 MiB, and
+hands it out again; else each array of a match comes as fresh pages, and those cost an eighth of the whole time."""
+
 Order = Callable[[list[Window]], list[Window]]
 
 
@@ -71,6 +75,7 @@ def halved_params(params: HfvmParams) -> HfvmParams:
 
 def prepare(left: View, right: View, params: HfvmParams, side: int | None) -> Prepared:
     """The matcher of two views; features of whole levels are held where the images are matched whole."""
+    np.empty(KEPT, np.uint8)  # freed at once, and never touched
     seen = [Seen(view, params, {} if side is None else None) for view in (left, right)]
     return Prepared(seen[0], seen[1], accurate.choose(params), params, side)
 
