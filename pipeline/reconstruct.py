@@ -221,6 +221,7 @@ class Reconstruction:
             disparity=p.disparity[pair],
             rig=self.calibration[pair],
             left=self.left[pair],
+            right=self._pyramid(pair, "right"),
             level=p.level[pair],
             reference=p.level[first],
             trajectory=pose,
@@ -279,6 +280,7 @@ class Reconstruction:
             disparity=p.disparity[pair],
             rig=self.calibration[pair],
             left=self.left[pair],
+            right=self._pyramid(pair, "right"),
             level=p.level[pair],
             reference=p.level[next(iter(p.level))],  # cells and extent of the first pair serve all, so that they merge
         )

@@ -27,6 +27,8 @@ from stages.lattice import Lattice
 from stages.level import z_range as plane_z_range
 from stages.locus_empty import explain
 from stages.locus_kernel import search
+from stages.locus_refine import refine, standard_deviation
+from stages.locus_views import Views, views
 from stages.surface import Surface, plane
 from stages.validity import matched
 
@@ -77,6 +79,13 @@ class LocusParams(Params):
         description="pixels; greatest error of back-matching (4.3.3); a stricter one leaves out more good cells than "
         "bad ones, which max_std tells apart",
     )
+    refine_steps: int = Field(
+        3,
+        ge=0,
+        le=20,
+        description="steps of refining the elevations by what both images show of the surface, a fourth changes "
+        "nothing; 0: none, and standard deviations are those of the disparity alone",
+    )
     max_jump: float = Field(
         3.0,
         gt=0,
@@ -111,6 +120,7 @@ def reconstruct(
     params: LocusParams,
     *,
     disparity_std: ArrayLike | None = None,
+    right: ArrayLike | None = None,
 ) -> Dem:
     """Elevation and ortho image of every cell of a reference surface.
 
@@ -125,6 +135,8 @@ def reconstruct(
     params : thresholds; ``cell_size`` and ``extent`` are not used here.
     disparity_std : (rows, cols) standard deviation of the usable disparities, pixels; None:
         ``params.sigma_disparity`` everywhere.
+    right : (rows, cols) grey values of the right image, to refine the elevations with (:mod:`stages.locus_refine`);
+        None: they stay what the disparity says.
 
     Returns
     -------
@@ -151,14 +163,24 @@ def reconstruct(
         sigma: float | Floats = params.sigma_disparity
         if disparity_std is not None:
             sigma = task.at_left_pixel(np.asarray(disparity_std), surface, rows, found[..., 0])
-        std = sigma / found[..., 2]
-        greatest = _greatest_std(params, disparity_std is not None)
-        if greatest is not None:
-            found[~(std <= greatest)] = std[~(std <= greatest)] = np.nan
         block = slice(start, start + rows.size)
-        out.elevation[block], out.elevation_std[block] = found[..., 0], std
+        out.elevation[block], out.elevation_std[block] = found[..., 0], sigma / found[..., 2]
         out.residual[block], out.ortho[block] = found[..., 1], found[..., 3]
+    if right is not None and params.refine_steps:
+        _refine(out, task.views(right, rig, T_surface_left), surface, params.refine_steps)
+    greatest = _greatest_std(params, disparity_std is not None)
+    if greatest is not None:
+        unsure = ~(out.elevation_std <= greatest)
+        for array in vars(out).values():
+            array[unsure] = np.nan
     return out
+
+
+def _refine(dem: Dem, views: Views, surface: Surface, steps: int) -> None:
+    """Refine a model in place: elevations, their standard deviations, grey values; cells that both images show."""
+    elevation, seen = refine(views, surface, dem.elevation, steps)
+    dem.elevation_std[...] = standard_deviation(elevation, seen, dem.elevation_std.astype(np.float64))
+    dem.elevation[...], dem.ortho[...] = elevation, np.clip(seen[0], 0.0, 255.0)
 
 
 def _greatest_std(params: LocusParams, measured: bool) -> float | None:
@@ -203,6 +225,13 @@ class _Task:
         self.sizes = np.array([rig.left.width, rig.left.height, rig.right.width, rig.right.height], dtype=np.float64)
         self.z_range = float(z_range[0]), float(z_range[1])
         self.limits = np.array([params.max_residual, params.max_jump])
+
+    def views(self, right: ArrayLike, rig: Rig, T_surface_left: RigidTransform) -> Views:
+        """Both images as they see the surface."""
+        image = np.array(right, dtype=np.float32, order="C")
+        if image.shape != (rig.right.height, rig.right.width):
+            raise InputError(f"the right image is {image.shape}, its camera's {(rig.right.height, rig.right.width)}")
+        return views(self.left, self.right, self.image, image, T_surface_left.translation)
 
     def solve(self, surface: Surface, rows: ArrayLike, cols: ArrayLike, low: ArrayLike, high: ArrayLike) -> Floats:
         """Kernel's output (r, c, 4) for the cells rows x cols, searched from low..high (NaN: left out)."""
@@ -301,6 +330,7 @@ def _run(params: LocusParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle
         (z_range[0], z_range[1]),
         params,
         disparity_std=disparity.arrays.get("disparity_std"),
+        right=inputs["right"]["level_0"] if "right" in inputs else None,
     )
     if not np.isfinite(dem.elevation).any():
         raise explain(rig, T, plane(lattice), (z_range[0], z_range[1]), good)
@@ -357,17 +387,17 @@ def _array(name: str, unit: str, long_name: str) -> Array:
 
 STAGE = Stage(
     name="locus",
-    version=2,
+    version=3,
     summary="elevation model and ortho image of a basic pair",
     params=LocusParams,
-    inputs=("disparity", "rig", "left", "level", "reference?", "trajectory?", "local?"),
+    inputs=("disparity", "rig", "left", "right?", "level", "reference?", "trajectory?", "local?"),
     outputs=(
         _array("elevation", "m", "elevation of the cell centre"),
         _array("elevation_std", "m", "standard deviation of the elevation"),
         _array("residual", "px", "mismatch of disparity and calibration at the elevation"),
         _array("ortho", "grey", "grey value of the left image, 0..255"),
     ),
-    requires=("numpy", "numba"),
+    requires=("numpy", "numba", "scipy"),
     run=_run,
     memory=Memory(lower=("locus.cell_size", "locus.extent"), size=_size),
 )
