@@ -24,6 +24,8 @@ two images does not correlate.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -75,14 +77,15 @@ def refine(views: Views, surface: Surface, elevation: Float32, steps: int) -> tu
 
     Returns
     -------
-    elevation (rows, cols), and what :func:`stages.locus_views.look` gives for it.
+    elevation (rows, cols), and what :func:`stages.locus_views.look` gives for it, the right image with the left one's
+    contrast.
     """
     start = elevation.astype(np.float64)
+    views = _levelled(views, look(views, surface, start))
     z, seen = start, look(views, surface, start)
-    gain = _gain(seen)
     for _ in range(steps):
         keep = np.isfinite(seen[3])
-        weight, rest = _misfit(seen, gain, keep)
+        weight, rest = _misfit(seen, keep)
         slope = np.where(keep, seen[2], 0.0)
         scale = np.where(keep, seen[3], 0.0)
         across, down = np.zeros_like(z), np.zeros_like(z)
@@ -114,17 +117,20 @@ def standard_deviation(elevation: Float32, seen: Float32, from_disparity: Floats
     return np.where(known, std, from_disparity)
 
 
-def _gain(seen: Float32) -> float:
-    """Factor that gives the right image the left one's contrast, from the gradients along both axes of the surface."""
+def _levelled(views: Views, seen: Float32) -> Views:
+    """The right image with the left one's contrast, from the gradients of what both show along the surface's axes."""
     power = [
         sum(float(np.nansum(np.square(np.diff(image, axis=k), dtype=np.float64))) for k in (0, 1)) for image in seen[:2]
     ]
-    return float(np.sqrt(power[0] / power[1])) if min(power) > 0 else 1.0
+    if not min(power) > 0:
+        return views
+    left, right = views.splines
+    return replace(views, splines=(left, right * np.float32(np.sqrt(power[0] / power[1]))))
 
 
-def _misfit(seen: Float32, gain: float, keep: Mask) -> tuple[Floats, Floats]:
+def _misfit(seen: Float32, keep: Mask) -> tuple[Floats, Floats]:
     """Weight of each cell's equation, and difference of both images without its local mean; zero where not kept."""
-    rest = np.where(keep, seen[0] - gain * seen[1], 0.0)
+    rest = np.where(keep, seen[0] - seen[1], 0.0)
     weight = keep.astype(np.float64)
     for _ in range(MEAN_ROUNDS + 1):
         mean = window_sum(weight * rest, MEAN_SIDE) / np.maximum(window_sum(weight, MEAN_SIDE), LEAST_WEIGHT)
