@@ -6,10 +6,11 @@ from terrain_scenes import disparity, pitched, plane, smooth_noise, toed_in_rig
 
 from stages import locus_views
 from stages.errors import InputError
-from stages.geometry import Camera, RigidTransform
+from stages.geometry import Camera, Rig, RigidTransform
 from stages.lattice import Lattice
-from stages.locus import Dem, LocusParams, reconstruct
+from stages.locus import LocusParams, reconstruct
 from stages.locus_refine import UNKNOWN_BEND, refine, standard_deviation
+from stages.locus_solve import ONE_SIDED, Dem, Matches, join
 from stages.locus_views import Views, look, views
 from stages.surface import plane as reference_plane
 
@@ -187,3 +188,48 @@ def test_without_steps_or_a_right_image_the_disparity_decides() -> None:
 def test_a_right_image_of_another_size_is_refused() -> None:
     with pytest.raises(InputError, match="right image"):
         model(MAPS[0], right=RIGHT[:-1])
+
+
+def flat(elevation: list[float], std: list[float]) -> Dem:
+    arrays = [np.array([values], np.float32) for values in (elevation, std, [0.1] * len(std), [9.0] * len(std))]
+    arrays[2][~np.isfinite(arrays[0])] = np.nan
+    return Dem(*arrays)
+
+
+def test_both_directions_are_joined_by_hand() -> None:
+    nan = float("nan")
+    a, b = flat([1.0, 1.0, nan, nan], [0.1, 0.1, nan, nan]), flat([1.3, nan, 2.0, nan], [0.2, nan, 0.3, nan])
+    found = join(a, b)
+    # Weights 100 and 25; variance .1 x .2 + .3^2.
+    np.testing.assert_allclose(found.elevation, [[1.06, 1.0, 2.0, nan]], rtol=1e-6)
+    np.testing.assert_allclose(
+        found.elevation_std, [[np.sqrt(0.02 + 0.09), 0.1 * ONE_SIDED, 0.3 * ONE_SIDED, nan]], rtol=1e-6
+    )
+    np.testing.assert_allclose(found.residual, [[0.1, 0.1, 0.1, nan]], rtol=1e-6)
+
+
+def test_cells_that_one_direction_lost_come_from_the_other() -> None:
+    """Exact disparities of both images; of the left one, a band is missing, and another contradicts the right one."""
+    turned = Rig(RIG.right, RIG.left, RIG.T_right_left.inverse())
+    column, row, usable = disparity(turned, T_LOCAL_LEFT @ RIG.T_right_left.inverse(), plane(A, B, -HEIGHT))
+    back = Matches(column, row, usable, np.full(column.shape, 0.2, np.float32))
+    params = LocusParams(max_std=1.0, max_residual=2.0, refine_steps=0)
+    given, known = MAPS[0].copy(), MAPS[2].copy()
+    known[:, 140:160] = False
+    given[:, 200:240] += 1.0
+    args = LEFT, RIG, T_LOCAL_LEFT, SURFACE, (-1.0, -0.3), params
+    std = np.full(given.shape, 0.2, np.float32)
+    alone = reconstruct(given, MAPS[1], known, *args, disparity_std=std, right=RIGHT)
+    both = reconstruct(given, MAPS[1], known, *args, disparity_std=std, right=RIGHT, back=back)
+    seen = np.isfinite(look(through(), SURFACE, TRUTH)[0])
+    x = RIG.left.project(T_LOCAL_LEFT.inverse().apply(np.dstack([LATTICE.xy(), TRUTH])))[..., 0]
+    lost, wrong, plain = (seen & (x > a) & (x < b) for a, b in ((143, 157), (205, 235), (60, 130)))
+    assert not np.isfinite(alone.elevation[lost]).any()
+    scale = look(through(), SURFACE, TRUTH)[3]
+    assert np.nanmax(np.abs((both.elevation - TRUTH) * scale)[lost]) < 0.05
+    assert np.isfinite(both.ortho[lost]).all()
+    assert np.abs(both.ortho - texture(LATTICE.xy().reshape(-1, 2)).reshape(x.shape))[lost].max() < 3.0
+    np.testing.assert_allclose(np.abs((both.elevation - TRUTH) * scale)[wrong].mean(), 0.5, atol=0.1)
+    assert np.median(both.elevation_std[wrong]) > 2.0 * np.median(both.elevation_std[plain])
+    with pytest.raises(InputError, match="without the image"):
+        reconstruct(given, MAPS[1], known, *args, disparity_std=std, back=back)
