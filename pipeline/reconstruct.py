@@ -23,7 +23,8 @@ against right).
 
 A segment needs landmarks only relative to its own basic pair, so all segments run at once; absolute poses are one
 cheap scan (``trajectory``), and Locus then runs a second time, straight on the shared world lattice: nothing is
-resampled. What depends on data (which pairs are basic, how far the world reaches) is expanded as results arrive.
+resampled. Locus reads both pyramids' finest images, and with ``locus.both`` the disparities of both (``hfvm/back``).
+What depends on data (which pairs are basic, how far the world reaches) is expanded as results arrive.
 
 The world is cut into tiles once and for all; a tile's task has those models alone as inputs that have a cell in it. A
 pair that is added, or moved by another pose, is thus merged anew in the tiles that it touches and touched, no others:

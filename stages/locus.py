@@ -6,8 +6,8 @@ right one at the elevation. Nothing is rectified and no point cloud is made: row
 images, for any orientation of the cameras. The kernel and its equations are in :mod:`stages.locus_kernel`; elevations
 are then refined by what both images show of the surface (:mod:`stages.locus_refine`).
 
-The elevation's error is that of the disparity over its sensitivity: ``sigma_Z = sigma_d / |ds/dZ|``, with the
-disparity's own standard deviation at the pixel where the matcher gives one.
+The disparity's part of an elevation's error is ``sigma_d / |ds/dZ|``, with the disparity's own standard deviation at
+the pixel where the matcher gives one; what else makes it uncertain is seen on the surface.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class LocusParams(Params):
         None,
         gt=0,
         description="m; cells whose own standard deviation of elevation is greater are left undefined, where the "
-        "matcher gives one: most gross errors are among them; none: 1.5 max_sigma, which 5 % of the cells exceed",
+        "matcher gives one: most gross errors are among them; none: 1.5 max_sigma, which 5 to 10 % of the cells exceed",
     )
     sigma_disparity: float = Field(
         0.2,
@@ -291,13 +291,13 @@ def _in_world(
 
 
 def _size(params: LocusParams, args: Mapping[str, Any], metas: Mapping[str, Any]) -> float:
-    """Bytes of the surface's arrays: four of float32."""
+    """Bytes of the surface's arrays, four of float32, and a half more for refining them."""
     if args["frame"] == "world":
         lattice = Lattice.from_dict(metas["local"]["lattice"])
     else:
         cell = params.cell_size or metas.get("reference", metas["level"])["cell_size"]
         lattice = local_lattice(Rig.from_dict(metas["rig"]["rig"]), metas["level"], cell, params)
-    return 16.0 * lattice.rows * lattice.cols
+    return 24.0 * lattice.rows * lattice.cols
 
 
 def _median(array: Float32) -> float | None:
