@@ -23,7 +23,8 @@ against right).
 
 A segment needs landmarks only relative to its own basic pair, so all segments run at once; absolute poses are one
 cheap scan (``trajectory``), and Locus then runs a second time, straight on the shared world lattice: nothing is
-resampled. What depends on data (which pairs are basic, how far the world reaches) is expanded as results arrive.
+resampled. Locus reads both pyramids' finest images, and with ``locus.both`` the disparities of both (``hfvm/back``).
+What depends on data (which pairs are basic, how far the world reaches) is expanded as results arrive.
 
 The world is cut into tiles once and for all; a tile's task has those models alone as inputs that have a cell in it. A
 pair that is added, or moved by another pose, is thus merged anew in the tiles that it touches and touched, no others:
@@ -49,7 +50,7 @@ from stages.crosscheck import windows
 from stages.declare import NoParams, Params
 from stages.errors import DegenerateError, InputError
 from stages.footprint import Box, tile_lattice
-from stages.geometry import RigidTransform
+from stages.geometry import Camera, RigidTransform
 from stages.lattice import Lattice, union
 
 if TYPE_CHECKING:
@@ -106,6 +107,7 @@ class Reconstruction:
         self._sources: dict[str, Handle] = {}
         self._images: dict[tuple[int, str], Handle] = {}
         self._pyramids: dict[tuple[int, str], Handle] = {}
+        self._backward: dict[int, Handle] = {}
 
     def build(self) -> Products:
         """Lay out everything that is known beforehand; the rest follows by expansion."""
@@ -221,6 +223,8 @@ class Reconstruction:
             disparity=p.disparity[pair],
             rig=self.calibration[pair],
             left=self.left[pair],
+            right=self._pyramid(pair, "right"),
+            **self._back(pair),
             level=p.level[pair],
             reference=p.level[first],
             trajectory=pose,
@@ -242,14 +246,28 @@ class Reconstruction:
         )
 
     def _disparity(self, pair: int, right: Handle) -> Handle:
+        """Disparity of the left image of a pair."""
+        rig = self.sequence.rig
+        return self._matched(f"hfvm/{pair}", pair, (self.left[pair], right), (rig.left, rig.right))
+
+    def _back(self, pair: int) -> dict[str, Handle]:
+        """Disparity of the right image, where elevations are to be read from both."""
+        if not self.config.locus.both:
+            return {}
+        if pair not in self._backward:
+            rig, images = self.sequence.rig, (self._pyramid(pair, "right"), self.left[pair])
+            self._backward[pair] = self._matched(f"hfvm/back/{pair}", pair, images, (rig.right, rig.left))
+        return {"back": self._backward[pair]}
+
+    def _matched(self, label: str, pair: int, images: tuple[Handle, Handle], cameras: tuple[Camera, Camera]) -> Handle:
         """One task, or for a large pair tasks per level and tile that give the same artifact."""
-        rig, images = self.sequence.rig, {"left": self.left[pair], "right": right}
-        shapes = (rig.left.height, rig.left.width), (rig.right.height, rig.right.width)
-        side = tiling.side(self.config.tiling, self.config.hfvm, shapes)
+        ports = dict(zip(("left", "right"), images, strict=True))
+        first, second = ((camera.height, camera.width) for camera in cameras)
+        side = tiling.side(self.config.tiling, self.config.hfvm, (first, second))
         if side is None:
-            return self._node("hfvm", f"hfvm/{pair}", {"pair": pair}, left=images["left"], right=right)
-        given = self.config.hfvm, self.config.pyramid, images, shapes, side
-        return tiling.Tiles(self.graph, *given, f"hfvm/{pair}").build()
+            return self._node("hfvm", label, {"pair": pair}, **ports)
+        given = self.config.hfvm, self.config.pyramid, ports, (first, second), side
+        return tiling.Tiles(self.graph, *given, label).build()
 
     def _rigs(self, basic: list[int]) -> None:
         """The rig that each basic pair is reconstructed with: one for all, or one each."""
@@ -279,6 +297,8 @@ class Reconstruction:
             disparity=p.disparity[pair],
             rig=self.calibration[pair],
             left=self.left[pair],
+            right=self._pyramid(pair, "right"),
+            **self._back(pair),
             level=p.level[pair],
             reference=p.level[next(iter(p.level))],  # cells and extent of the first pair serve all, so that they merge
         )

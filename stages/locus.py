@@ -3,16 +3,16 @@
 The cells come first, not the image points: for each cell of a reference surface the straight line perpendicular to it
 is projected into both images (the left and right *locus*); the left locus, mapped through the disparity, meets the
 right one at the elevation. Nothing is rectified and no point cloud is made: rows and columns are those of the original
-images, for any orientation of the cameras. The kernel and its equations are in :mod:`stages.locus_kernel`.
+images, for any orientation of the cameras. The kernel and its equations are in :mod:`stages.locus_kernel`; elevations
+are then refined by what both images show of the surface (:mod:`stages.locus_refine`).
 
-The elevation's error is that of the disparity over its sensitivity: ``sigma_Z = sigma_d / |ds/dZ|``, with the
-disparity's own standard deviation at the pixel where the matcher gives one.
+The disparity's part of an elevation's error is ``sigma_d / |ds/dZ|``, with the disparity's own standard deviation at
+the pixel where the matcher gives one; what else makes it uncertain is seen on the surface.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -26,16 +26,16 @@ from stages.ground import view_ground
 from stages.lattice import Lattice
 from stages.level import z_range as plane_z_range
 from stages.locus_empty import explain
-from stages.locus_kernel import search
+from stages.locus_refine import refine, standard_deviation
+from stages.locus_solve import Dem, Matches, Task, join, projections, solve
+from stages.locus_views import Views, views
 from stages.surface import Surface, plane
 from stages.validity import matched
 
 Floats = NDArray[np.float64]
 Float32 = NDArray[np.float32]
 
-COARSE = 8  # cells a coarse cell is wide: a 64th of the cells search the whole range
 OWN_STD = 1.5  # times max_sigma: a cell's own standard deviation scatters about the typical one
-BLOCK_ROWS = 64  # rows of cells in one kernel call, so that a large surface stays small in memory
 
 
 class LocusParams(Params):
@@ -60,7 +60,7 @@ class LocusParams(Params):
         None,
         gt=0,
         description="m; cells whose own standard deviation of elevation is greater are left undefined, where the "
-        "matcher gives one: most gross errors are among them; none: 1.5 max_sigma, which 5 % of the cells exceed",
+        "matcher gives one: most gross errors are among them; none: 1.5 max_sigma, which 5 to 10 % of the cells exceed",
     )
     sigma_disparity: float = Field(
         0.2,
@@ -77,26 +77,24 @@ class LocusParams(Params):
         description="pixels; greatest error of back-matching (4.3.3); a stricter one leaves out more good cells than "
         "bad ones, which max_std tells apart",
     )
+    refine_steps: int = Field(
+        3,
+        ge=0,
+        le=20,
+        description="steps of refining the elevations by what both images show of the surface, a fourth changes "
+        "nothing; 0: none, and standard deviations are those of the disparity alone",
+    )
+    both: bool = Field(
+        False,
+        description="match from right to left as well and read elevations from both: more cells, and errors where the "
+        "two differ show; it doubles the time of matching",
+    )
     max_jump: float = Field(
         3.0,
         gt=0,
         description="pixels; range of the four disparities around a cell that is still one surface: relief seen at a "
         "grazing angle changes by 1.5 px a pixel, twice that across the diagonal",
     )
-
-
-@dataclass(frozen=True)
-class Dem:
-    """Elevation model on a reference surface, arrays (rows, cols) float32, NaN undefined.
-
-    ``elevation`` and its standard deviation ``elevation_std`` in metres along the surface's normal, ``residual`` the
-    mismatch at the solution in pixels, ``ortho`` the grey value of the left image.
-    """
-
-    elevation: Float32
-    elevation_std: Float32
-    residual: Float32
-    ortho: Float32
 
 
 def reconstruct(
@@ -111,6 +109,8 @@ def reconstruct(
     params: LocusParams,
     *,
     disparity_std: ArrayLike | None = None,
+    right: ArrayLike | None = None,
+    back: Matches | None = None,
 ) -> Dem:
     """Elevation and ortho image of every cell of a reference surface.
 
@@ -125,6 +125,10 @@ def reconstruct(
     params : thresholds; ``cell_size`` and ``extent`` are not used here.
     disparity_std : (rows, cols) standard deviation of the usable disparities, pixels; None:
         ``params.sigma_disparity`` everywhere.
+    right : (rows, cols) grey values of the right image, to refine the elevations with (:mod:`stages.locus_refine`);
+        None: they stay what the disparity says.
+    back : disparities of the right image, left minus right, to read elevations from as well (:func:`join`); they need
+        ``right``.
 
     Returns
     -------
@@ -136,29 +140,43 @@ def reconstruct(
     Raises
     ------
     InputError
-        An array's shape differs from the left camera's, or ``z_range`` is empty.
+        An array's shape differs from its camera's, ``z_range`` is empty, or ``right`` is missing.
     DegenerateError
         The baseline is zero.
     """
-    task = _Task(column_disparity, row_disparity, usable, image, rig, T_surface_left, z_range, params)
-    cells = [np.unique(np.append(np.arange(0, n, COARSE), n - 1)) for n in (surface.rows, surface.cols)]
-    coarse = task.solve(surface, cells[0], cells[1], np.float64(z_range[0]), np.float64(z_range[1]))[..., 0]
-    out = Dem(*(np.full((surface.rows, surface.cols), np.nan, np.float32) for _ in range(4)))
-    for start in range(0, surface.rows, BLOCK_ROWS):
-        rows = np.arange(start, min(start + BLOCK_ROWS, surface.rows))
-        low, high = _from_coarse(coarse, rows, np.arange(surface.cols))
-        found = task.solve(surface, rows, np.arange(surface.cols), low, high)
-        sigma: float | Floats = params.sigma_disparity
-        if disparity_std is not None:
-            sigma = task.at_left_pixel(np.asarray(disparity_std), surface, rows, found[..., 0])
-        std = sigma / found[..., 2]
-        greatest = _greatest_std(params, disparity_std is not None)
-        if greatest is not None:
-            found[~(std <= greatest)] = std[~(std <= greatest)] = np.nan
-        block = slice(start, start + rows.size)
-        out.elevation[block], out.elevation_std[block] = found[..., 0], std
-        out.residual[block], out.ortho[block] = found[..., 1], found[..., 3]
+    maps = Matches(column_disparity, row_disparity, usable, disparity_std)
+    told = z_range, params.sigma_disparity, (params.max_residual, params.max_jump)
+    out = solve(Task(maps, image, rig, T_surface_left, *told), surface)
+    seen = None if right is None else _views(image, right, rig, T_surface_left)
+    if back is not None:
+        if right is None:
+            raise InputError("disparities of the right image are given without the image")
+        turned = Rig(rig.right, rig.left, rig.T_right_left.inverse())
+        T_surface_right = T_surface_left @ rig.T_right_left.inverse()
+        out = join(out, solve(Task(back, right, turned, T_surface_right, *told), surface))
+    if seen is not None and (params.refine_steps or back is not None):
+        _refine(out, seen, surface, params.refine_steps)
+    greatest = _greatest_std(params, disparity_std is not None)
+    if greatest is not None:
+        unsure = ~(out.elevation_std <= greatest)
+        for array in vars(out).values():
+            array[unsure] = np.nan
     return out
+
+
+def _views(image: ArrayLike, right: ArrayLike, rig: Rig, T_surface_left: RigidTransform) -> Views:
+    """Both images as they see the surface."""
+    images = [np.array(a, dtype=np.float32, order="C") for a in (image, right)]
+    if images[1].shape != (rig.right.height, rig.right.width):
+        raise InputError(f"the right image is {images[1].shape}, its camera's {(rig.right.height, rig.right.width)}")
+    return views(*projections(rig, T_surface_left), images[0], images[1], T_surface_left.translation)
+
+
+def _refine(dem: Dem, views: Views, surface: Surface, steps: int) -> None:
+    """Refine a model in place: elevations, their standard deviations, grey values of the left image."""
+    elevation, seen = refine(views, surface, dem.elevation, steps)
+    dem.elevation_std[...] = standard_deviation(elevation, seen, dem.elevation_std.astype(np.float64))
+    dem.elevation[...], dem.ortho[...] = elevation, np.clip(seen[0], 0.0, 255.0)
 
 
 def _greatest_std(params: LocusParams, measured: bool) -> float | None:
@@ -168,78 +186,6 @@ def _greatest_std(params: LocusParams, measured: bool) -> float | None:
     if params.max_sigma is None:
         return None
     return OWN_STD * params.max_sigma if measured else params.max_sigma
-
-
-class _Task:
-    """The arrays of one pair as the kernel wants them."""
-
-    def __init__(
-        self,
-        column_disparity: ArrayLike,
-        row_disparity: ArrayLike,
-        usable: NDArray[np.bool_],
-        image: ArrayLike,
-        rig: Rig,
-        T_surface_left: RigidTransform,
-        z_range: tuple[float, float],
-        params: LocusParams,
-    ) -> None:
-        if not rig.baseline > 0:
-            raise DegenerateError("the rig's baseline is 0 m", remedy="give T_right_left with a translation in metres")
-        if not z_range[0] < z_range[1]:
-            raise InputError(f"the range of elevations {z_range[0]}..{z_range[1]} m is empty")
-        shape = (rig.left.height, rig.left.width)
-        maps = [np.array(a, dtype=np.float32, order="C") for a in (column_disparity, row_disparity, image)]
-        for name, array in zip(("column disparity", "row disparity", "image"), maps, strict=True):
-            if array.shape != shape:
-                raise InputError(f"the {name} is {array.shape}, the left camera's image {shape}")
-        self.dcol, self.drow, self.image = maps
-        self.dcol[~usable] = np.nan
-        T_left_surface = T_surface_left.inverse()
-        T_right_surface = rig.T_right_left @ T_left_surface
-        self.left = np.ascontiguousarray(rig.left.matrix @ T_left_surface.matrix34)
-        self.right = np.ascontiguousarray(rig.right.matrix @ T_right_surface.matrix34)
-        self.epipole = rig.right.matrix @ rig.T_right_left.translation
-        self.sizes = np.array([rig.left.width, rig.left.height, rig.right.width, rig.right.height], dtype=np.float64)
-        self.z_range = float(z_range[0]), float(z_range[1])
-        self.limits = np.array([params.max_residual, params.max_jump])
-
-    def solve(self, surface: Surface, rows: ArrayLike, cols: ArrayLike, low: ArrayLike, high: ArrayLike) -> Floats:
-        """Kernel's output (r, c, 4) for the cells rows x cols, searched from low..high (NaN: left out)."""
-        feet, normals = surface.block(rows, cols)
-        shape = feet.shape[:2]
-        start = [np.array(np.broadcast_to(v, shape), dtype=np.float64, order="C") for v in (low, high)]
-        out = np.full((*shape, 4), np.nan)
-        search(
-            feet, normals, *start, *self.z_range, self.left, self.right, self.epipole, self.sizes,
-            self.dcol, self.drow, self.image, self.limits, out,
-        )  # fmt: skip
-        return out
-
-    def at_left_pixel(
-        self, values: NDArray[Any], surface: Surface, rows: NDArray[np.intp], elevation: Floats
-    ) -> Floats:
-        """Value of the left pixel nearest to each solved cell (r, c) of ``rows``; NaN elsewhere."""
-        feet, normals = surface.block(rows, np.arange(surface.cols))
-        out = np.full(elevation.shape, np.nan)
-        solved = np.isfinite(elevation)
-        points = (feet + elevation[..., None] * normals)[solved]
-        p = points @ self.left[:, :3].T + self.left[:, 3]
-        x, y = (np.rint(p[:, k] / p[:, 2]).astype(np.intp) for k in (0, 1))
-        out[solved] = values[y, x]
-        return out
-
-
-def _from_coarse(coarse: Floats, rows: NDArray[np.intp], cols: NDArray[np.intp]) -> tuple[Floats, Floats]:
-    """Lowest and highest elevation of the 4 x 4 coarse cells around each cell; NaN where none has one."""
-    padded = np.pad(coarse, 2, constant_values=np.nan)
-    low = np.full((rows.size, cols.size), np.nan)
-    high = low.copy()
-    for i in range(1, 5):
-        for j in range(1, 5):
-            near = padded[np.ix_(rows // COARSE + i, cols // COARSE + j)]
-            low, high = np.fmin(low, near), np.fmax(high, near)
-    return low, high
 
 
 def local_lattice(rig: Rig, level: Mapping[str, Any], cell: float, params: LocusParams) -> Lattice:
@@ -301,6 +247,8 @@ def _run(params: LocusParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle
         (z_range[0], z_range[1]),
         params,
         disparity_std=disparity.arrays.get("disparity_std"),
+        right=inputs["right"]["level_0"] if "right" in inputs else None,
+        back=_backward(inputs["back"], params) if "back" in inputs else None,
     )
     if not np.isfinite(dem.elevation).any():
         raise explain(rig, T, plane(lattice), (z_range[0], z_range[1]), good)
@@ -323,6 +271,12 @@ def usable(validity: ArrayLike, backmatch_error: ArrayLike, params: LocusParams)
         return matched(np.asarray(validity)) & (np.asarray(backmatch_error) <= params.max_backmatch)
 
 
+def _backward(disparity: Bundle, params: LocusParams) -> Matches:
+    good = usable(disparity["validity"], disparity["backmatch_error"], params)
+    maps = np.asarray(disparity["column_disparity"]), np.asarray(disparity["row_disparity"])
+    return Matches(*maps, good, disparity.arrays.get("disparity_std"))
+
+
 def _in_world(
     args: Mapping[str, Any], inputs: Inputs, T_local_left: RigidTransform
 ) -> tuple[RigidTransform, Lattice, list[float]]:
@@ -337,13 +291,13 @@ def _in_world(
 
 
 def _size(params: LocusParams, args: Mapping[str, Any], metas: Mapping[str, Any]) -> float:
-    """Bytes of the surface's arrays: four of float32."""
+    """Bytes of the surface's arrays, four of float32, and a half more for refining them."""
     if args["frame"] == "world":
         lattice = Lattice.from_dict(metas["local"]["lattice"])
     else:
         cell = params.cell_size or metas.get("reference", metas["level"])["cell_size"]
         lattice = local_lattice(Rig.from_dict(metas["rig"]["rig"]), metas["level"], cell, params)
-    return 16.0 * lattice.rows * lattice.cols
+    return 24.0 * lattice.rows * lattice.cols
 
 
 def _median(array: Float32) -> float | None:
@@ -357,17 +311,17 @@ def _array(name: str, unit: str, long_name: str) -> Array:
 
 STAGE = Stage(
     name="locus",
-    version=2,
+    version=3,
     summary="elevation model and ortho image of a basic pair",
     params=LocusParams,
-    inputs=("disparity", "rig", "left", "level", "reference?", "trajectory?", "local?"),
+    inputs=("disparity", "rig", "left", "right?", "back?", "level", "reference?", "trajectory?", "local?"),
     outputs=(
         _array("elevation", "m", "elevation of the cell centre"),
         _array("elevation_std", "m", "standard deviation of the elevation"),
         _array("residual", "px", "mismatch of disparity and calibration at the elevation"),
         _array("ortho", "grey", "grey value of the left image, 0..255"),
     ),
-    requires=("numpy", "numba"),
+    requires=("numpy", "numba", "scipy"),
     run=_run,
     memory=Memory(lower=("locus.cell_size", "locus.extent"), size=_size),
 )

@@ -40,15 +40,21 @@ class Method:
     run: Callable[[Scene, float, bool], Model]
 
 
-def locus(scene: Scene, max_backmatch: float, bounded: bool) -> Model:
-    """Cells first: :mod:`stages.locus`."""
+def locus(scene: Scene, max_backmatch: float, bounded: bool, *, images: bool = True) -> Model:
+    """Cells first: :mod:`stages.locus`; ``images``: refined on the surface, as a run does it (not true disparities)."""
     params = DEFAULT.model_copy(update={"max_sigma": scene.max_sigma if bounded else None})
     d = scene.disparities
+    right = scene.right if images and d.std is not None else None
     dem = reconstruct(
         d.column, d.row, d.usable(max_backmatch), scene.left, scene.rig, scene.T_surface_left, plane(scene.lattice),
-        scene.z_range, params, disparity_std=d.std,
+        scene.z_range, params, disparity_std=d.std, right=right,
     )  # fmt: skip
     return Model(dem.elevation, dem.elevation_std)
+
+
+def locus_alone(scene: Scene, max_backmatch: float, bounded: bool) -> Model:
+    """Locus from the disparity alone, which is all that the other methods are given."""
+    return locus(scene, max_backmatch, bounded, images=False)
 
 
 @dataclass(frozen=True)
@@ -157,6 +163,7 @@ def available() -> list[Method]:
     """Locus first, then triangulation with each way of gridding."""
     found = [
         Method("Locus", locus),
+        Method("Locus, disparity alone", locus_alone),
         Method("median in the cell", median_in_cell),
         Method("mesh", mesh),
     ]

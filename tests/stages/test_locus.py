@@ -8,7 +8,7 @@ import pytest
 from terrain_scenes import ball, box, disparity, interpolation_error, nearest, pitched, plane, smooth_noise, toed_in_rig
 
 from stages import level as level_stage
-from stages import locus, locus_kernel
+from stages import locus, locus_kernel, locus_solve
 from stages.declare import Bundle, check_outputs
 from stages.errors import ConfigError, DegenerateError, InputError
 from stages.geometry import Rig, RigidTransform
@@ -292,7 +292,7 @@ def inside_ball(o: np.ndarray, v: np.ndarray, radius: float) -> np.ndarray:
 
 
 def test_a_block_border_shows_nowhere() -> None:
-    assert LATTICE.rows > locus.BLOCK_ROWS
+    assert LATTICE.rows > locus_solve.BLOCK_ROWS
     maps = disparity(RIG, T_LOCAL_LEFT, plane(0.1, 0.1, -HEIGHT))
     whole = solve(maps, (-1.0, -0.3))
     coarse_start = Lattice.at(LATTICE.i0, LATTICE.j0 - 16, LATTICE.cell, LATTICE.rows - 16, LATTICE.cols)
