@@ -60,7 +60,7 @@ MOVING = 0.3
 SHARED = 7
 """Errors that segments share: as many as the pose has parameters, and that of all disparities."""
 AT_ONCE = 8
-"""Of the landmarks above the threshold, one in so many is removed before the pose is adjusted anew, and one at least."""
+"""Of the landmarks above the threshold, one in so many (at least one) is removed before the pose is adjusted anew."""
 SAMPLE = 4
 """Landmarks of one hypothesis: the fewest that fix a pose uniquely."""
 
