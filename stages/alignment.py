@@ -149,12 +149,10 @@ def _prior(expected, m, ridge, out):  # type: ignore[no-untyped-def]
 def _gram(descent, ridge, out):  # type: ignore[no-untyped-def]
     out[:] = 0.0
     for i in range(SIDE * SIDE):
+        row = descent[i]
         for j in range(UNKNOWNS):
-            for k in range(j, UNKNOWNS):
-                out[j, k] += descent[i, j] * descent[i, k]
-    for j in range(UNKNOWNS):
-        for k in range(j):
-            out[j, k] = out[k, j]
+            for k in range(UNKNOWNS):
+                out[j, k] += row[j] * row[k]
     for k in range(2, 6):
         out[k, k] += ridge
 
