@@ -27,10 +27,18 @@ LEAST_BLOCKS = 12
 LITTLE = 0.4
 """Overlap below which a stride, which asks for none, is warned of: most landmarks of a segment leave the image."""
 
+NAVIGATION: Mapping[str, Any] = {"rule": "overlap", "overlap": 0.6}
+"""What preset ``navigation`` sets; a value given by the user wins."""
+
 
 class SelectParams(Params):
     """Parameters of the choice of basic pairs."""
 
+    preset: Literal["terrain", "navigation"] = Field(
+        "terrain",
+        description="terrain: close pairs, so that elevation models share ground; navigation: rule overlap with 0.6,"
+        " fewer pairs to match for the trajectory alone. What is given beside it wins, but for a mere stride",
+    )
     rule: Literal["overlap", "stride"] = Field(
         "overlap", description="overlap: as far apart as the wanted overlap permits; stride: evenly, as in the paper"
     )
@@ -64,6 +72,14 @@ class SelectParams(Params):
         """Who sets a stride and no rule wants the stride."""
         if isinstance(values, Mapping) and "stride" in values and "rule" not in values:
             return {"rule": "stride", **values}
+        return values
+
+    @model_validator(mode="before")
+    @classmethod
+    def _navigation(cls, values: Any) -> Any:
+        """What preset navigation sets. The validator written last runs first, so a mere stride changes nothing."""
+        if isinstance(values, Mapping) and values.get("preset") == "navigation":
+            return {**NAVIGATION, **values}
         return values
 
 

@@ -171,6 +171,15 @@ def test_street_at_ten_frames_a_second_gets_about_every_second_pair(data_dir):
     assert not meta["warnings"]
 
 
+def test_preset_navigation_takes_pairs_farther_apart_and_yields_to_what_is_given():
+    assert (SelectParams(preset="navigation").rule, SelectParams(preset="navigation").overlap) == ("overlap", 0.6)
+    assert SelectParams(preset="navigation", stride=4).rule == "overlap"  # a sequence's own, for its terrain
+    assert SelectParams(preset="navigation", stride=4, rule="stride").rule == "stride"
+    assert SelectParams(preset="navigation", overlap=0.5).overlap == 0.5
+    again = SelectParams.model_validate(SelectParams(preset="navigation").model_dump())
+    assert again == SelectParams(preset="navigation")
+
+
 def test_a_stride_given_alone_sets_the_rule():
     assert SelectParams().rule == "overlap"
     assert SelectParams(stride=3).rule == "stride"
