@@ -63,7 +63,7 @@ class SelectParams(Params):
         ge=0,
         le=1,
         description="share of the pixels with texture that found a coarse displacement; below, the displacement is not"
-        " trusted and both frames are basic",
+        " trusted and both frames are basic (rule stride: the later one)",
     )
 
     @model_validator(mode="before")
@@ -96,12 +96,17 @@ class Choice:
 
 
 def by_stride(steps: Sequence[Step], params: SelectParams, unfit: frozenset[int] = frozenset()) -> Choice:
-    """Positions 0, stride, 2 stride ... of one more frame than there are steps; for an unfit one the next that is."""
+    """Positions 0, stride, 2 stride ... of one more frame than there are steps; for an unfit one the next that is.
+
+    Behind a step that is not to be believed there is one, too: what follows can then be posed, though by itself.
+    """
     count = len(steps) + 1
-    wanted = range(0, count, params.stride)
+    broken = [k + 1 for k, step in enumerate(steps) if doubtful(step, params)]
+    wanted = [*range(0, count, params.stride), *broken]
     basic = sorted({b for k in wanted if (b := next((n for n in range(k, count) if n not in unfit), None)) is not None})
     overlap = [_overlap(steps[a:b], params) for a, b in itertools.pairwise(basic)]
-    return Choice(basic, ["first frame"] + ["stride"] * len(overlap), [None, *overlap])
+    why = ["few matches" if k in broken and k % params.stride else "stride" for k in basic[1:]]
+    return Choice(basic, ["first frame", *why], [None, *overlap])
 
 
 def by_overlap(steps: Sequence[Step], params: SelectParams, unfit: frozenset[int] = frozenset()) -> Choice:

@@ -124,6 +124,15 @@ def test_steps_with_few_matches_are_bounded_by_basic_pairs_and_named():
     assert run([dark, dark])["basic"] == [0, 1]
 
 
+def test_a_stride_has_a_basic_pair_behind_a_step_with_few_matches():
+    """Frame 5 shows something else: with the pairs 0, 3, 6 alone it would belong to nothing."""
+    steps = [motion(shift(2.0))] * 4 + [blind()] + [motion(shift(2.0))] * 2
+    meta = run(steps, rule="stride", stride=3)
+    assert meta["basic"] == [0, 3, 5, 6]
+    assert meta["why"] == ["first frame", "stride", "few matches", "stride"]
+    assert meta["segments"] == [[0, 1, 2, 3], [3, 4, 5], [5, 6], [6, 7]]
+
+
 def test_too_little_overlap_is_named():
     meta = run([motion(shift(240.0))] * 3)
     assert meta["basic"] == [0, 1, 2]
