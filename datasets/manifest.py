@@ -66,6 +66,7 @@ def open_manifest(path: Path, digests: files.Digests) -> Sequence:
         pitch=None if pitch is None else math.radians(pitch),
         georeference=georeference(world.crs, world.origin, world.azimuth_deg, name),
         vehicle=manifest.vehicle,
+        lost={k: pair.absent for k, pair in enumerate(pairs) if pair.absent},
         defaults=dict(dotted(manifest.defaults)),
         notes=manifest.notes,
         warnings=(*optics.warnings, *motion.warnings),
@@ -102,12 +103,12 @@ def root_folder(text: str, path: Path) -> Path:
 
 
 def find_pairs(images: Images, root: Path, name: str) -> tuple[Pair, ...]:
-    """The pairs that the patterns find.
+    """The pairs that the patterns find; where files are paired by name, some may lack one (``Pair.absent``).
 
     Raises
     ------
     InputError
-        A pattern finds nothing, both find the same files, or an image has no partner.
+        A pattern finds nothing, both find the same files, or images have no partners.
     """
     found = {}
     for side, pattern in (("left", images.left), ("right", images.right)):
@@ -126,7 +127,7 @@ def find_pairs(images: Images, root: Path, name: str) -> tuple[Pair, ...]:
     if both:
         raise InputError(f"{name}: images.left and images.right both find {both[0]}", remedy="narrow the patterns")
     try:
-        return pair_up(found["left"], found["right"], images.pair)
+        return pair_up(found["left"], found["right"], images.pair, gaps=True)
     except InputError as error:
         raise InputError(f"{name}: {error.message}", remedy=error.remedy) from error
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from datasets import files
@@ -32,11 +32,12 @@ SIDES: tuple[tuple[str, str], ...] = (
 
 @dataclass(frozen=True)
 class Pair:
-    """One stereo pair: its name and both files."""
+    """One stereo pair: its name and both files; ``absent`` says which of them is missing, empty: none."""
 
     name: str
     left: Path
     right: Path
+    absent: str = ""
 
 
 def natural(text: str) -> tuple[tuple[int, int | str], ...]:
@@ -74,7 +75,7 @@ def _number(stem: str) -> int | None:
     return int(digits[-1]) if digits else None
 
 
-def pair_up(left: Sequence[Path], right: Sequence[Path], rule: str = "auto") -> tuple[Pair, ...]:
+def pair_up(left: Sequence[Path], right: Sequence[Path], rule: str = "auto", *, gaps: bool = False) -> tuple[Pair, ...]:
     """Pairs in the natural order of the left names.
 
     Parameters
@@ -82,6 +83,8 @@ def pair_up(left: Sequence[Path], right: Sequence[Path], rule: str = "auto") -> 
     left, right : image files of each camera.
     rule : ``name`` (equal stems, sides' tokens aside), ``number`` (the last number in the stem), ``order`` (sorted
         names), or ``auto``: name, and number where the names of the two cameras have nothing in common.
+    gaps : images that are paired by name and have no partner make a pair of which a file is absent, as long as they
+        are fewer than the whole pairs.
 
     Raises
     ------
@@ -102,8 +105,31 @@ def pair_up(left: Sequence[Path], right: Sequence[Path], rule: str = "auto") -> 
     by_key = [dict(zip(keys[rule](paths, side), paths, strict=True)) for side, paths in enumerate((left, right))]
     for side, paths in enumerate((left, right)):
         _unique(keys[rule](paths, side), paths, rule)
+    if gaps and rule == "name" and 2 * len(set(by_key[0]) & set(by_key[1])) > len(set(by_key[0]) | set(by_key[1])):
+        return _with_gaps(by_key)
     _all_partnered(by_key, rule, (len(left), len(right)))
     return _named([(path, by_key[1][key]) for key, path in by_key[0].items()])
+
+
+def _with_gaps(by_key: list[dict[str, Path]]) -> tuple[Pair, ...]:
+    """Pairs of all keys; a file that is not there has the name that it would have."""
+    whole = next(key for key in by_key[0] if key in by_key[1])
+    keys = sorted({**by_key[0], **by_key[1]}, key=natural)
+    paths = [[ours.get(key) or _called(ours[whole], whole, key) for ours in by_key] for key in keys]
+    absent = [
+        [p for p, ours in zip(both, by_key, strict=True) if key not in ours]
+        for both, key in zip(paths, keys, strict=True)
+    ]
+    pairs = _named([(both[0], both[1]) for both in paths])
+    words = [f"{gone[0].parent.name}/{gone[0].name} is missing" if gone else "" for gone in absent]
+    return tuple(replace(pair, absent=text) for pair, text in zip(pairs, words, strict=True))
+
+
+def _called(example: Path, key: str, wanted: str) -> Path:
+    """File of another key, named as ``example``, whose key is ``key``: its side's token for the asterisk."""
+    before, star, behind = key.partition("*")
+    token = example.stem[len(before) : len(example.stem) - len(behind)] if star else ""
+    return example.with_name(wanted.replace("*", token) + example.suffix)
 
 
 def _names(paths: Iterable[Path], side: int) -> list[str]:
@@ -158,11 +184,14 @@ def _named(pairs: list[tuple[Path, Path]]) -> tuple[Pair, ...]:
 def common_size(pairs: Sequence[Pair]) -> tuple[int, int, int]:
     """Width, height and bits that all images share; those of PNG files are compared here, others when read.
 
+    Pairs of which a file is absent are left out.
+
     Raises
     ------
     InputError
         The first image cannot be read, or another one has a different size or depth.
     """
+    pairs = [pair for pair in pairs if not pair.absent]
     wanted = files.png_header(pairs[0].left)
     if wanted is None:
         image = files.read_grey(pairs[0].left)

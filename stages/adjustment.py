@@ -21,6 +21,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from stages import adjustment_kernel
 from stages.epipolar import NAMES, distances, normals
 from stages.geometry import Rig
 
@@ -56,6 +57,8 @@ BLOCKS = 6
 """Blocks along either side of the image whose means show how far errors of neighbours go together."""
 
 ITERATIONS = 30
+LINEAR = 1e-3
+"""Radians: corrections nearer than this share their derivatives; what is left out is below a thousandth of a pixel."""
 CONVERGED = 1e-3
 """Share of a parameter's sigma."""
 
@@ -151,10 +154,11 @@ def _adjust(
     rig: Rig, pairs: Sequence[Matches], prior: Callable[[float], Floats], smooth: float, *, estimate: bool
 ) -> Fit:
     """Gauss-Newton with weights from the scatter; ``prior`` of the smooth error's size, ``estimate`` it or keep it."""
-    x, scales = np.zeros(SIZE), [np.inf] * len(pairs)
-    bases = [_smooth_terms(rig, m) for m in pairs]
+    x, scales, linear = np.zeros(SIZE), [np.inf] * len(pairs), [_linear(rig, m) for m in pairs]
     for _ in range(ITERATIONS):
-        parts = [_pair(rig, *given, x) for given in zip(pairs, bases, scales, strict=True)]
+        if np.abs(x - linear[0].about)[:RIG].max() > LINEAR:
+            linear = [_linear(rig, m, x, one) for m, one in zip(pairs, linear, strict=True)]
+        parts = [_pair(one, scale, x) for one, scale in zip(linear, scales, strict=True)]
         scales = [p.noise for p in parts]
         normal = np.sum([p.normal for p in parts], axis=0)
         pull = np.sum([p.pull for p in parts], axis=0)
@@ -203,50 +207,50 @@ class _Part:
     weights: Floats
 
 
-def _pair(rig: Rig, matches: Matches, basis: Floats, last: float, x: Floats) -> _Part:
-    """One pair's part of the normal equations, with weights from its own scatter (at most ``last``, pixels)."""
-    distance, design = _design(rig, matches, basis, x[:RIG])
-    rest = distance + design[:, RIG:] @ x[RIG:]
-    noise = max(LEAST_NOISE, min(last, 1.4826 * float(np.median(np.abs(rest)))))
-    weights = np.maximum(0.0, 1.0 - (rest / (TUKEY * noise)) ** 2) ** 2
-    information = weights / (noise**2 * _correlation(rig, matches, rest, weights, noise))
-    normal = design.T @ (design * information[:, None])
-    pull = design.T @ (information * (design @ x - rest))
-    return _Part(normal, pull, noise, weights)
+@dataclass(frozen=True)
+class _Linear:
+    """Distances ``constant + design @ x`` (n,) of one pair, to first order about ``about``; the matches' blocks."""
+
+    constant: Floats
+    design: Floats
+    about: Floats
+    block: NDArray[np.int64]
 
 
-def _design(rig: Rig, matches: Matches, basis: Floats, correction: Floats) -> tuple[Floats, Floats]:
-    """Distances (n,) of a corrected rig, and derivatives (n, SIZE) of distances with systematic errors."""
-    distance, by_rig = distances(rig, correction, matches.left, matches.right)
+def _linear(rig: Rig, matches: Matches, x: Floats | None = None, before: _Linear | None = None) -> _Linear:
+    """Distances of a corrected rig with systematic errors about ``x``; what stays is taken from ``before``."""
+    x = np.zeros(SIZE) if x is None else x
+    distance, by_rig = distances(rig, x[:RIG], matches.left, matches.right)
     # A principal point further right (down) by a pixel, its rotation made up for by yaw (pitch).
     made_up = by_rig[:, [1, 0]] * [-1.0 / rig.right.fx, 1.0 / rig.right.fy]
-    shifts = made_up - normals(rig, correction, matches.left)
-    return distance, np.column_stack([by_rig, shifts, basis])
+    shifts = made_up - normals(rig, x[:RIG], matches.left)
+    basis = _smooth_terms(rig, matches) if before is None else before.design[:, SMOOTH]
+    design = np.column_stack([by_rig, shifts, basis])
+    block = _blocks(rig, matches) if before is None else before.block
+    return _Linear(distance - by_rig @ x[:RIG], design, x, block)
+
+
+def _blocks(rig: Rig, matches: Matches) -> NDArray[np.int64]:
+    """Block (n,) of the image that each left point lies in."""
+    column = np.minimum(matches.left[:, 0] * BLOCKS / rig.left.width, BLOCKS - 1).astype(np.int64)
+    row = np.minimum(matches.left[:, 1] * BLOCKS / rig.left.height, BLOCKS - 1).astype(np.int64)
+    return np.asarray(row * BLOCKS + column, dtype=np.int64)
+
+
+def _pair(linear: _Linear, last: float, x: Floats) -> _Part:
+    """One pair's part of the normal equations, with weights from its own scatter (at most ``last``, pixels)."""
+    weights, normal, pull = np.empty(len(linear.constant)), np.empty((SIZE, SIZE)), np.empty(SIZE)
+    given = linear.constant, linear.design, x, linear.block
+    noise = adjustment_kernel.weigh(*given, BLOCKS**2, last, LEAST_NOISE, TUKEY, weights, normal, pull)
+    return _Part(normal, pull, float(noise), weights)
 
 
 def _smooth_terms(rig: Rig, matches: Matches) -> Floats:
     """Normalised Legendre polynomials (n, terms) of the left pixel: RMS 1 over the image."""
     u = 2.0 * matches.left[:, 0] / max(rig.left.width - 1, 1) - 1.0
     v = 2.0 * matches.left[:, 1] / max(rig.left.height - 1, 1) - 1.0
-    columns = [math.sqrt((2 * i + 1) * (2 * j + 1)) * _legendre(u, i) * _legendre(v, j) for i, j in TERMS]
-    return np.column_stack(columns)
-
-
-def _legendre(x: Floats, degree: int) -> Floats:
-    return np.asarray(np.polynomial.legendre.legval(x, np.eye(DEGREE + 1)[degree]), dtype=np.float64)
-
-
-def _correlation(rig: Rig, matches: Matches, rest: Floats, weights: Floats, noise: float) -> float:
-    """How many times as far block means scatter (variance) as means of independent errors would; at least 1."""
-    column = np.minimum(matches.left[:, 0] * BLOCKS / rig.left.width, BLOCKS - 1).astype(np.int64)
-    row = np.minimum(matches.left[:, 1] * BLOCKS / rig.left.height, BLOCKS - 1).astype(np.int64)
-    block = row * BLOCKS + column
-    count = np.bincount(block, weights, BLOCKS**2)
-    total = np.bincount(block, weights * rest, BLOCKS**2)
-    used = count >= 5.0
-    if not used.any():
-        return 1.0
-    return max(1.0, float(np.mean(total[used] ** 2 / count[used])) / noise**2)
+    across, down = (np.polynomial.legendre.legvander(a, DEGREE) for a in (u, v))
+    return np.column_stack([math.sqrt((2 * i + 1) * (2 * j + 1)) * across[:, i] * down[:, j] for i, j in TERMS])
 
 
 def rms(distance: Floats, weights: Floats) -> float:

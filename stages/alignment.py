@@ -95,9 +95,15 @@ def _descent(a, x0, y0, patch, template, descent):  # type: ignore[no-untyped-de
     """Template and derivatives of its grey values by the unknowns; False where it leaves the image."""
     wide = SIDE + 2
     total = 0.0
-    for i in range(wide * wide):
-        patch[i] = _grey(a, x0 + i % wide - HALF - 1, y0 + i // wide - HALF - 1)
-        total += patch[i]
+    on_grid = x0 == np.floor(x0) and y0 == np.floor(y0)
+    if on_grid and _holds(a, x0 - HALF - 1, y0 - HALF - 1) and _holds(a, x0 + HALF + 1, y0 + HALF + 1):
+        for i in range(wide * wide):
+            patch[i] = a[int(y0) + i // wide - HALF - 1, int(x0) + i % wide - HALF - 1]
+            total += patch[i]
+    else:
+        for i in range(wide * wide):
+            patch[i] = _grey(a, x0 + i % wide - HALF - 1, y0 + i // wide - HALF - 1)
+            total += patch[i]
     mean = 0.0
     for i in range(SIDE * SIDE):
         x, y = i % SIDE - HALF, i // SIDE - HALF
@@ -143,12 +149,10 @@ def _prior(expected, m, ridge, out):  # type: ignore[no-untyped-def]
 def _gram(descent, ridge, out):  # type: ignore[no-untyped-def]
     out[:] = 0.0
     for i in range(SIDE * SIDE):
+        row = descent[i]
         for j in range(UNKNOWNS):
-            for k in range(j, UNKNOWNS):
-                out[j, k] += descent[i, j] * descent[i, k]
-    for j in range(UNKNOWNS):
-        for k in range(j):
-            out[j, k] = out[k, j]
+            for k in range(UNKNOWNS):
+                out[j, k] += row[j] * row[k]
     for k in range(2, 6):
         out[k, k] += ridge
 
@@ -186,6 +190,12 @@ def _solve(a, b):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True)
 def _grey(image, x, y):  # type: ignore[no-untyped-def]
     """Grey value between pixels by cubic convolution; NaN outside."""
-    if not (1.0 <= x < image.shape[1] - 2.0 and 1.0 <= y < image.shape[0] - 2.0):
+    if not _holds(image, x, y):
         return np.float32(np.nan)
     return cubic(image, x, y)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _holds(image, x, y):  # type: ignore[no-untyped-def]
+    """Whether all that cubic interpolation reads lies in the image."""
+    return 1.0 <= x < image.shape[1] - 2.0 and 1.0 <= y < image.shape[0] - 2.0

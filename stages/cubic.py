@@ -9,8 +9,11 @@ from numba import njit
 @njit(cache=True, nogil=True, inline="always")
 def cubic(a, x, y):  # type: ignore[no-untyped-def]
     """Catmull-Rom value (float32) of ``a`` at (x, y), a pixel or more inside; that of ``sample_cubic`` to the bit."""
-    i, j = int(x), int(y)
+    # Unsigned indices need no check for counting from the end.
+    i, j, step = np.uint64(x), np.uint64(y), np.uint64(1)
     t, s = np.float32(x) - np.float32(i), np.float32(y) - np.float32(j)
+    left, right, far = i - step, i + step, i + step + step
+    above, below, bottom = j - step, j + step, j + step + step
     h, one, two = np.float32(0.5), np.float32(1.0), np.float32(2.0)
     three, four, five = np.float32(3.0), np.float32(4.0), np.float32(5.0)
     w0, w3 = h * t * (two * t - one - t * t), h * t * t * (t - one)
@@ -18,8 +21,8 @@ def cubic(a, x, y):  # type: ignore[no-untyped-def]
     v0, v3 = h * s * (two * s - one - s * s), h * s * s * (s - one)
     v1, v2 = h * (two + s * s * (three * s - five)), h * s * (one + four * s - three * s * s)
     value = np.float32(0.0)
-    value += v0 * (a[j - 1, i - 1] * w0 + a[j - 1, i] * w1 + a[j - 1, i + 1] * w2 + a[j - 1, i + 2] * w3)
-    value += v1 * (a[j, i - 1] * w0 + a[j, i] * w1 + a[j, i + 1] * w2 + a[j, i + 2] * w3)
-    value += v2 * (a[j + 1, i - 1] * w0 + a[j + 1, i] * w1 + a[j + 1, i + 1] * w2 + a[j + 1, i + 2] * w3)
-    value += v3 * (a[j + 2, i - 1] * w0 + a[j + 2, i] * w1 + a[j + 2, i + 1] * w2 + a[j + 2, i + 2] * w3)
+    value += v0 * (a[above, left] * w0 + a[above, i] * w1 + a[above, right] * w2 + a[above, far] * w3)
+    value += v1 * (a[j, left] * w0 + a[j, i] * w1 + a[j, right] * w2 + a[j, far] * w3)
+    value += v2 * (a[below, left] * w0 + a[below, i] * w1 + a[below, right] * w2 + a[below, far] * w3)
+    value += v3 * (a[bottom, left] * w0 + a[bottom, i] * w1 + a[bottom, right] * w2 + a[bottom, far] * w3)
     return value

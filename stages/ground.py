@@ -98,6 +98,7 @@ def fit_plane(
 
 MIN_POINTS = 100
 MIN_SHARE = 0.05
+SCORED = 1200  # points, about, that planes are compared on: the best one is then fitted to all
 HYPOTHESES = 1000  # an all-ground sample of three is among them (p > .999) where a fifth of the pixels are ground
 
 
@@ -126,8 +127,8 @@ def _consensus(
     theta = theta[allowed(-theta / length)]
     if not len(theta):
         return None
-    totals = np.empty(len(theta))
-    _totals(theta, rays, rho, 5.0 * sigma, tolerance**-2.0, totals)
+    totals, some = np.empty(len(theta)), slice(None, None, max(1, len(rays) // SCORED))
+    _totals(theta, rays[some], rho[some], 5.0 * sigma[some], tolerance[some] ** -2.0, totals)
     return np.asarray(theta[int(np.argmax(totals))], dtype=np.float64)
 
 
@@ -211,8 +212,15 @@ def view_ground(rig: Rig, R_local_left: Floats, plane: Sequence[float]) -> Groun
         raise DegenerateError(
             "the two cameras see no common ground", remedy="check the pitch, the left/right order and T_right_left"
         )
-    size = np.asarray(np.linalg.svd(jacobian[good], compute_uv=False), dtype=np.float64)
+    size = _singular_values(jacobian[good])
     return GroundView(here[good, :2], _length(here[good]), size[:, 0], size[:, 1], slope[good])
+
+
+def _singular_values(m: Floats) -> Floats:
+    """Singular values (n, 2), the greater first, of matrices (n, 2, 2)."""
+    a, b, c, d = m[:, 0, 0], m[:, 0, 1], m[:, 1, 0], m[:, 1, 1]
+    plus, minus = np.hypot(a + d, c - b), np.hypot(a - d, c + b)
+    return np.asarray(0.5 * np.stack([plus + minus, np.abs(plus - minus)], -1), dtype=np.float64)
 
 
 def _meet(rig: Rig, R_local_left: Floats, plane: Sequence[float], pixels: Floats) -> Floats:

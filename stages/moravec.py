@@ -40,21 +40,29 @@ def interest_operator(image: Floats) -> Floats:
 
 @njit(cache=True, nogil=True)
 def _operator(image, directions, out):  # type: ignore[no-untyped-def]
+    """Works on slices, whose indices start at 0 and need no check: only such loops become vector code."""
     rows, cols = image.shape
+    wide = cols - 2
     square = np.zeros((rows, cols), np.float32)
-    tall = np.empty(cols, np.float32)
+    tall, ssd = np.empty(cols, np.float32), np.empty(cols, np.float32)
     for d in range(len(directions)):
         dr, dc = directions[d]
         for y in range(1, rows - 1):
-            for x in range(1, cols - 1):
-                ahead, behind = image[y + dr, x + dc] - image[y, x], image[y - dr, x - dc] - image[y, x]
-                square[y, x] = ahead * ahead + behind * behind
+            here, found = image[y, 1 : 1 + wide], square[y, 1 : 1 + wide]
+            there, back = image[y + dr, 1 + dc : 1 + dc + wide], image[y - dr, 1 - dc : 1 - dc + wide]
+            for x in range(wide):
+                ahead, behind = there[x] - here[x], back[x] - here[x]
+                found[x] = ahead * ahead + behind * behind
         for y in range(HALF + 1, rows - HALF - 1):
+            a, b, c, e, f = square[y - 2], square[y - 1], square[y], square[y + 1], square[y + 2]
             for x in range(cols):
-                tall[x] = square[y - 2, x] + square[y - 1, x] + square[y, x] + square[y + 1, x] + square[y + 2, x]
-            for x in range(HALF + 1, cols - HALF - 1):
-                ssd = np.float32(0.5) * (tall[x - 2] + tall[x - 1] + tall[x] + tall[x + 1] + tall[x + 2])
-                out[y, x] = ssd if d == 0 else min(out[y, x], ssd)
+                tall[x] = a[x] + b[x] + c[x] + e[x] + f[x]
+            least, inner = out[y, HALF + 1 : cols - HALF - 1], tall[1:]
+            for x in range(cols - 2 * HALF - 2):
+                total = inner[x] + inner[x + 1] + inner[x + 2] + inner[x + 3] + inner[x + 4]
+                ssd[x] = np.float32(0.5) * total
+            for x in range(cols - 2 * HALF - 2):
+                least[x] = ssd[x] if d == 0 or ssd[x] < least[x] else least[x]
 
 
 def interest_points(
@@ -82,8 +90,7 @@ def interest_points(
     """
     response = interest_operator(image)
     # The expected sum of squared differences of pure noise is 2 sigma^2 for each of the 25 pixels.
-    usable = np.empty(response.shape, np.bool_)
-    _peaks(response, 3.0 * 2.0 * (2 * HALF + 1) ** 2 * noise**2, usable)
+    usable = _peaks(response, 3.0 * 2.0 * (2 * HALF + 1) ** 2 * noise**2)
     rows, cols = np.nonzero(usable & _inside(valid, border))
     side = max(math.sqrt(image.shape[0] * image.shape[1] / max(count, 1)), 1.0)
     across = math.ceil(image.shape[1] / side)
@@ -101,25 +108,26 @@ def interest_points(
     return np.stack([cols[best], rows[best]], axis=-1).astype(np.float32)
 
 
-@njit(cache=True, nogil=True)
-def _peaks(response, least, out):  # type: ignore[no-untyped-def]
+def _peaks(response: Floats, least: float) -> Bools:
     """Above ``least``, and greatest of the 5 x 5 neighbourhood; of equal ones the first in reading order."""
-    rows, cols = response.shape
-    for y in range(rows):
-        for x in range(cols):
-            r = response[y, x]
-            peak = r > least
-            if peak:
-                for j in range(max(y - HALF, 0), min(y + HALF + 1, rows)):
-                    for i in range(max(x - HALF, 0), min(x + HALF + 1, cols)):
-                        other = response[j, i]
-                        before = j < y or (j == y and i < x)
-                        if other > r or (before and other == r):
-                            peak = False
-                            break
-                    if not peak:
-                        break
-            out[y, x] = peak
+    side = np.ones((2 * HALF + 1, 2 * HALF + 1), np.uint8)
+    found = (response > least) & (response == cv2.dilate(response, side))
+    rows, cols = np.nonzero(found)
+    found[rows, cols] = _first_of_equals(response, rows, cols)
+    return np.asarray(found)
+
+
+@njit(cache=True, nogil=True)
+def _first_of_equals(response, rows, cols):  # type: ignore[no-untyped-def]
+    """Whether (n,) no pixel of the neighbourhood that is read before is as great."""
+    first = np.ones(len(rows), np.bool_)
+    for n in range(len(rows)):
+        y, x = rows[n], cols[n]
+        for j in range(max(y - HALF, 0), y + 1):
+            for i in range(max(x - HALF, 0), min(x + HALF + 1, response.shape[1])):
+                if (j < y or i < x) and response[j, i] == response[y, x]:
+                    first[n] = False
+    return first
 
 
 def _inside(valid: NDArray[np.uint8], border: int) -> Bools:

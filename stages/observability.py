@@ -169,10 +169,23 @@ class _Chooser:
                     chosen = others
             if sorted(chosen) == before:
                 break
-        fit = settle(self.rig, self.pairs, [i in chosen for i in range(RIG)], self.beliefs)
-        free = [i in chosen for i in range(RIG)]
-        correction = np.where(free, fit.x[:RIG], 0.0)
+        fit, correction = self._settled(chosen)
+        if chosen and not self._worth(correction):  # what was asked for singly may come to nothing together
+            chosen = []
+            fit, correction = self._settled(chosen)
         return Decision(correction, tuple(self._parameter(i, chosen, fit) for i in range(RIG)), fit)
+
+    def _settled(self, chosen: Sequence[int]) -> tuple[Fit, Floats]:
+        """The fit with the chosen parameters free, and their correction (5,)."""
+        free = [i in chosen for i in range(RIG)]
+        fit = settle(self.rig, self.pairs, free, self.beliefs)
+        return fit, np.where(free, fit.x[:RIG], 0.0)
+
+    def _worth(self, correction: Floats) -> bool:
+        """Whether a correction (5,) moves rows or depth by more than a good calibration is out anyway."""
+        rows = float(np.max(np.abs(correction) * self.rows))
+        depth = math.sqrt(float(correction @ self.depth @ correction))
+        return self.impossible or rows >= self.params.least_rows or depth >= self.params.least_depth
 
     def _add(self, chosen: list[int], group: Sequence[int]) -> None:
         """Take up what the images change most, one after the other."""
@@ -247,7 +260,8 @@ class _Chooser:
         observed = self._depth_error(i, others) <= self.params.max_depth_error or i in chosen
         if i not in chosen:
             value, sigma = self._estimate(i, chosen)
-            return Parameter(NAMES[i], 0.0, value, sigma, observed, False, self._refusal(i, chosen) or "")
+            why = self._refusal(i, chosen) or "not worth it: with the others it moves rows and depth by too little"
+            return Parameter(NAMES[i], 0.0, value, sigma, observed, False, why)
         free = [k in chosen for k in range(RIG)]
         sigma = math.sqrt(float(considered(fit, free, self.beliefs, self.all.smooth, self._held(chosen))[i, i]))
         value = float(fit.x[i])

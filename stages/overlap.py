@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.declare import AnyArray, Bundle
-from stages.track import fit_affinity
+from stages.track import fit_affinity, known_median
 from stages.validity import Validity, matched
 
 Floats = NDArray[np.float64]
@@ -54,7 +54,7 @@ class Step:
         shift = np.full((*enough.shape, 2), np.nan)
         for k, name in enumerate(("column_disparity", "row_disparity")):
             values = np.where(inside, _blocks(np.asarray(bundle[name]), side), np.float32(np.nan))
-            shift[enough, k] = np.nanmedian(values[enough], axis=-1)
+            shift[enough, k] = known_median(values[enough], inside[enough].sum(-1))
         textured = validity & np.uint8(Validity.OUT_OF_IMAGE | Validity.NO_TEXTURE) == 0
         n = int(np.count_nonzero(textured))
         return Step(

@@ -50,24 +50,42 @@ def _observe(X, along, sigma_d, pixel, cam, sigma, nearest, R, t, bias, jacobian
 
 
 @njit(cache=True, nogil=True)
-def norms(X, along, sigma_d, pixels, cam, sigma, nearest, R, t, bias, out):  # type: ignore[no-untyped-def]
-    """Weighted error lengths ``out`` (b, n) at poses (b); observations of one problem serve all, or of each its own."""
-    jacobian = np.empty((2, UNKNOWNS + 1))
-    for b in range(len(out)):
-        o = b if len(X) > 1 else 0
-        for n in range(out.shape[1]):
-            out[b, n] = _observe(
-                X[o, n], along[o, n], sigma_d[o, n], pixels[o, n], cam, sigma, nearest, R[b], t[b], bias[b], jacobian
-            )
+def _square(X, along, sigma_d, pixel, cam, sigma, nearest, R, t, bias):  # type: ignore[no-untyped-def]
+    """Squared length of the whitened error of one landmark, inf if behind: ``e^T (sigma^2 I + g g^T)^-1 e``."""
+    fx, fy, cx, cy = cam
+    a, b, c = X[0] + bias * along[0], X[1] + bias * along[1], X[2] + bias * along[2]
+    x = R[0, 0] * a + R[0, 1] * b + R[0, 2] * c + t[0]
+    y = R[1, 0] * a + R[1, 1] * b + R[1, 2] * c + t[1]
+    z = R[2, 0] * a + R[2, 1] * b + R[2, 2] * c + t[2]
+    if not z >= nearest:
+        return np.inf
+    u, v = x / z, y / z
+    wx = R[0, 0] * along[0] + R[0, 1] * along[1] + R[0, 2] * along[2]
+    wy = R[1, 0] * along[0] + R[1, 1] * along[1] + R[1, 2] * along[2]
+    wz = R[2, 0] * along[0] + R[2, 1] * along[1] + R[2, 2] * along[2]
+    gu, gv = sigma_d * fx / z * (wx - u * wz), sigma_d * fy / z * (wy - v * wz)
+    eu, ev = fx * u + cx - pixel[0], fy * v + cy - pixel[1]
+    mixed = gu * eu + gv * ev
+    return (eu * eu + ev * ev - mixed * mixed / (sigma * sigma + gu * gu + gv * gv)) / (sigma * sigma)
 
 
 @njit(cache=True, nogil=True)
-def _cost(X, along, sigma_d, pixels, cam, sigma, nearest, huber, prior, active, R, t, bias, jacobian):  # type: ignore[no-untyped-def]
+def norms(X, along, sigma_d, pixels, cam, sigma, nearest, R, t, bias, out):  # type: ignore[no-untyped-def]
+    """Weighted error lengths ``out`` (b, n) at poses (b); observations of one problem serve all, or of each its own."""
+    for b in range(len(out)):
+        o = b if len(X) > 1 else 0
+        for n in range(out.shape[1]):
+            data = X[o, n], along[o, n], sigma_d[o, n], pixels[o, n]
+            out[b, n] = np.sqrt(_square(*data, cam, sigma, nearest, R[b], t[b], bias[b]))
+
+
+@njit(cache=True, nogil=True)
+def _cost(X, along, sigma_d, pixels, cam, sigma, nearest, huber, prior, active, R, t, bias):  # type: ignore[no-untyped-def]
     """Huber's cost of the active landmarks and of the prior; infinite if one is behind the camera."""
     total = 0.5 * prior * bias * bias
     for n in range(len(active)):
         if active[n]:
-            r = _observe(X[n], along[n], sigma_d[n], pixels[n], cam, sigma, nearest, R, t, bias, jacobian)
+            r = np.sqrt(_square(X[n], along[n], sigma_d[n], pixels[n], cam, sigma, nearest, R, t, bias))
             total += 0.5 * r * r if r <= huber else huber * r - 0.5 * huber * huber
     return total
 
@@ -159,7 +177,7 @@ def minimise(X, along, sigma_d, pixels, cam, sigma, nearest, huber, prior, activ
         o = b if len(X) > 1 else 0
         data = (X[o], along[o], sigma_d[o], pixels[o], cam, sigma, nearest, huber)
         damping = 1e-4
-        cost = _cost(*data, prior, active[b], R[b], t[b], bias[b], jacobian)
+        cost = _cost(*data, prior, active[b], R[b], t[b], bias[b])
         for done in range(iterations):
             most = max(most, done + 1)
             _normal(*data, active[b], R[b], t[b], bias[b], jacobian, normal, gradient)
@@ -170,7 +188,7 @@ def minimise(X, along, sigma_d, pixels, cam, sigma, nearest, huber, prior, activ
                 continue
             _moved(R[b], t[b], step, new_R, new_t)
             new_bias = bias[b] + step[6]
-            new_cost = _cost(*data, prior, active[b], new_R, new_t, new_bias, jacobian)
+            new_cost = _cost(*data, prior, active[b], new_R, new_t, new_bias)
             promised = 0.0
             for k in range(UNKNOWNS):
                 promised -= 0.5 * gradient[k] * step[k]

@@ -59,6 +59,8 @@ MOVING = 0.3
 """Share of the landmarks that agree with no pose, from which on it is warned of."""
 SHARED = 7
 """Errors that segments share: as many as the pose has parameters, and that of all disparities."""
+AT_ONCE = 8
+"""Of the landmarks above the threshold, one in so many (at least one) is removed before the pose is adjusted anew."""
 SAMPLE = 4
 """Landmarks of one hypothesis: the fewest that fix a pose uniquely."""
 
@@ -216,19 +218,20 @@ def _repeat(poses: Poses, count: int) -> Poses:
 def _remove_inconsistent(
     obs: Observations, poses: Poses, active: Bools, params: ResectParams, where: str
 ) -> tuple[Poses, Bools, int]:
-    """The paper's rule: adjust, remove the most inconsistent landmark, again until all are under the threshold."""
+    """The paper's rule: adjust, remove the most inconsistent, again until all are under the threshold."""
     bound = params.threshold / params.pixel_sigma
     steps = 0
     while True:
         _enough(int(active.sum()), where, "agree with one pose", "raise resect.threshold or choose basic pairs closer")
-        poses, done = levenberg_marquardt(obs, poses, active[None], params.iterations)
+        poses, done = levenberg_marquardt(obs, poses, active[None], params.iterations, tolerance=1e-6)
         steps += done
         norm = np.where(active, norms(obs, poses)[0], -1.0)
-        worst = int(np.argmax(norm))
-        if norm[worst] <= bound:
-            return poses, active, steps
+        beyond = int((norm > bound).sum())
+        if beyond == 0:
+            poses, done = levenberg_marquardt(obs, poses, active[None], params.iterations)
+            return poses, active, steps + done
         active = active.copy()
-        active[worst] = False
+        active[np.argsort(-norm, kind="stable")[: math.ceil(beyond / AT_ONCE)]] = False
 
 
 def _result(obs: Observations, poses: Poses, active: Bools, steps: int, params: ResectParams, where: str) -> Resection:

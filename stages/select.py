@@ -27,10 +27,18 @@ LEAST_BLOCKS = 12
 LITTLE = 0.4
 """Overlap below which a stride, which asks for none, is warned of: most landmarks of a segment leave the image."""
 
+NAVIGATION: Mapping[str, Any] = {"rule": "overlap", "overlap": 0.6}
+"""What preset ``navigation`` sets; a value given by the user wins."""
+
 
 class SelectParams(Params):
     """Parameters of the choice of basic pairs."""
 
+    preset: Literal["terrain", "navigation"] = Field(
+        "terrain",
+        description="terrain: close pairs, so that elevation models share ground; navigation: rule overlap with 0.6,"
+        " fewer pairs to match for the trajectory alone. What is given beside it wins, but for a mere stride",
+    )
     rule: Literal["overlap", "stride"] = Field(
         "overlap", description="overlap: as far apart as the wanted overlap permits; stride: evenly, as in the paper"
     )
@@ -55,7 +63,7 @@ class SelectParams(Params):
         ge=0,
         le=1,
         description="share of the pixels with texture that found a coarse displacement; below, the displacement is not"
-        " trusted and both frames are basic",
+        " trusted and both frames are basic (rule stride: the later one)",
     )
 
     @model_validator(mode="before")
@@ -64,6 +72,14 @@ class SelectParams(Params):
         """Who sets a stride and no rule wants the stride."""
         if isinstance(values, Mapping) and "stride" in values and "rule" not in values:
             return {"rule": "stride", **values}
+        return values
+
+    @model_validator(mode="before")
+    @classmethod
+    def _navigation(cls, values: Any) -> Any:
+        """What preset navigation sets. The validator written last runs first, so a mere stride changes nothing."""
+        if isinstance(values, Mapping) and values.get("preset") == "navigation":
+            return {**NAVIGATION, **values}
         return values
 
 
@@ -80,12 +96,17 @@ class Choice:
 
 
 def by_stride(steps: Sequence[Step], params: SelectParams, unfit: frozenset[int] = frozenset()) -> Choice:
-    """Positions 0, stride, 2 stride ... of one more frame than there are steps; for an unfit one the next that is."""
+    """Positions 0, stride, 2 stride ... of one more frame than there are steps; for an unfit one the next that is.
+
+    Behind a step that is not to be believed there is one, too: what follows can then be posed, though by itself.
+    """
     count = len(steps) + 1
-    wanted = range(0, count, params.stride)
+    broken = [k + 1 for k, step in enumerate(steps) if doubtful(step, params)]
+    wanted = [*range(0, count, params.stride), *broken]
     basic = sorted({b for k in wanted if (b := next((n for n in range(k, count) if n not in unfit), None)) is not None})
     overlap = [_overlap(steps[a:b], params) for a, b in itertools.pairwise(basic)]
-    return Choice(basic, ["first frame"] + ["stride"] * len(overlap), [None, *overlap])
+    why = ["few matches" if k in broken and k % params.stride else "stride" for k in basic[1:]]
+    return Choice(basic, ["first frame", *why], [None, *overlap])
 
 
 def by_overlap(steps: Sequence[Step], params: SelectParams, unfit: frozenset[int] = frozenset()) -> Choice:

@@ -52,14 +52,15 @@ def look(image: NDArray[Any], valid: NDArray[np.uint8]) -> Look:
     """
     level = grey(image)
     usable = (valid != 0) & np.isfinite(level)
-    values = level[usable]
+    values = level if usable.all() else level[usable]
     if not values.size:
         return Look(math.nan, 0.0, 0.0, 0.0, math.nan)
-    level = np.where(usable, level, values.mean())
+    level = level if usable.all() else np.where(usable, level, values.mean())
     once, twice = (cv2.GaussianBlur(level, (0, 0), sigma) for sigma in (1.0, 2.0))
-    inner = cv2.erode(usable.astype(np.uint8), np.ones((13, 13), np.uint8)) != 0
-    coarse = float(np.sqrt(((once - twice)[inner] ** 2).mean())) if inner.any() else 0.0
-    fine = float(np.sqrt(((level - once)[inner] ** 2).mean())) if inner.any() else 0.0
+    inner = usable.astype(np.uint8)
+    inner = inner if usable.all() else cv2.erode(inner, np.ones((13, 13), np.uint8))
+    count = math.sqrt(max(int(np.count_nonzero(inner)), 1))
+    coarse, fine = (cv2.norm(a, b, cv2.NORM_L2, inner) / count for a, b in ((once, twice), (level, once)))
     deviation = float(values.std())
     return Look(
         float(values.mean()),

@@ -198,10 +198,20 @@ def displacement_at(motion: Motion, points: Floats) -> Floats:
     y, x = np.clip(centre[:, 1:] + dy, 0, rows - 1), np.clip(centre[:, :1] + dx, 0, cols - 1)
     both = np.stack([motion.column[y, x], motion.row[y, x]], -1).astype(np.float64)
     known: Bools = np.asarray(np.isfinite(both).all(axis=-1))
-    any_known: Bools = np.asarray(known.any(axis=1))
-    both[~any_known] = 0.0
-    value = np.nanmedian(np.where(known[..., None] | ~any_known[:, None, None], both, np.nan), axis=1)
-    return np.where((any_known & _known(points))[:, None], value, np.nan)
+    count = known.sum(axis=1)
+    both = np.where(known[..., None], both, np.nan)
+    value = np.stack([known_median(both[..., k], count) for k in range(2)], axis=-1)
+    return np.where(_known(points)[:, None], value, np.nan)
+
+
+def known_median(values: NDArray[Any], known: NDArray[Any]) -> NDArray[Any]:
+    """Median (n,) of the values (n, k) that are not NaN, of which there are ``known`` (n,); NaN where there are none.
+
+    NumPy's own takes twenty times as long on many short rows.
+    """
+    ordered, row = np.sort(values, axis=-1), np.arange(len(values))
+    low, high = ordered[row, np.maximum(known - 1, 0) // 2], ordered[row, known // 2]
+    return np.asarray(np.where(known > 0, (low + high) * values.dtype.type(0.5), values.dtype.type(np.nan)))
 
 
 def fit_affinity(origin: Floats, moved: Floats, use: Bools, at: Floats) -> tuple[Floats, Floats]:

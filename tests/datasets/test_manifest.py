@@ -41,6 +41,17 @@ def test_smallest_manifest(tmp_path, materialise):
             assert (materialise(s.image(frame, camera))["image"] == 2 * frame + k).all()
 
 
+def test_a_missing_image_is_a_lost_frame(tmp_path, materialise):
+    """The others keep their numbers, and what is read by the left images' names is still found."""
+    path = write_sequence(tmp_path, '[times]\nfile = "times.csv"\n')
+    write_lines(tmp_path / "times.csv", [f"{0.5 * k},{k:02d}.png" for k in range(3)])
+    (tmp_path / "left" / "01.png").unlink()
+    s = opened(path)
+    assert (s.frames, s.frame_names, s.times) == (3, ("00", "01", "02"), (0.0, 0.5, 1.0))
+    assert s.lost == {1: "left/01.png is missing"}
+    assert (materialise(s.image(2, "right"))["image"] == 5).all()
+
+
 def test_everything_else_that_a_manifest_may_say(tmp_path):
     text = """
 [times]
@@ -307,7 +318,7 @@ def test_bad_manifests(tmp_path, parts, message):
         ('left = "*/*.png"\nright = "right/*.png"', "images.left and images.right both find"),
         ('left = "/left/*.png"\nright = "right/*.png"', r"images\.left = '/left/\*\.png' is no pattern"),
         ('left = "left/*.png"', r"images\.right is missing"),
-        ('left = "left/*.png"\nright = "right/0[01].png"', r"02\.png has no partner by name .*; 3 left, 2 right"),
+        ('left = "left/*.png"\nright = "right/00.png"', r"01\.png has no partner by name .*; 3 left, 1 right"),
         ('left = "left/*.png"\nright = "right/*.png"\npair = "size"', r"images\.pair = 'size' is not permitted"),
     ],
 )

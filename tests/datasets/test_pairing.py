@@ -67,6 +67,18 @@ def test_what_has_no_partner_is_named(left, right, rule, message):
         pair_up(paths(*left), paths(*right), rule)
 
 
+def test_a_gap_is_a_pair_of_which_a_file_is_absent():
+    left, right = paths("l/cam_left_9.png", "l/cam_left_10.png"), paths("r/cam_right_9.png", "r/cam_right_11.png")
+    more = paths("l/cam_left_12.png", "l/cam_left_13.png"), paths("r/cam_right_12.png", "r/cam_right_13.png")
+    pairs = pair_up(left + more[0], right + more[1], gaps=True)
+    assert [(p.left.name, p.right.name) for p in pairs] == [
+        (f"cam_left_{k}.png", f"cam_right_{k}.png") for k in (9, 10, 11, 12, 13)
+    ]
+    assert [p.absent for p in pairs] == ["", "r/cam_right_10.png is missing", "l/cam_left_11.png is missing", "", ""]
+    with pytest.raises(InputError, match="has no partner by name"):
+        pair_up(left, right, gaps=True)  # more is missing than whole
+
+
 def test_numbers_in_names_sort_as_numbers():
     names = [f"a{k}b{j}" for k in (1, 2, 10) for j in (3, 20)]
     shuffled = random.Random(4).sample(names, len(names))

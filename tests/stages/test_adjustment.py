@@ -7,6 +7,7 @@ import pytest
 from rig_scenes import knocked, matches, street_depth, street_rig
 
 from stages.adjustment import Beliefs, Matches, adjust, considered, settle, solution
+from stages.adjustment_kernel import weigh
 from stages.epipolar import distances
 
 BELIEFS = Beliefs(rotation=np.radians(0.05), baseline=np.radians(0.2), principal=3.5, systematic=0.1)
@@ -93,3 +94,30 @@ def test_the_pair_order_does_not_matter_to_rounding():
     pairs = [matches(knocked(street_rig(), pitch_deg=0.3), street_depth, pair=k) for k in range(3)]
     here, there = (adjust(street_rig(), p, ANGLES, BELIEFS, rival=True).x for p in (pairs, pairs[::-1]))
     np.testing.assert_allclose(here, there, rtol=0, atol=1e-6)
+
+
+def test_normal_equations_and_weights_by_plain_numpy():
+    rng = np.random.default_rng(5)
+    n, m, blocks = 300, 4, 9
+    constant, design = rng.normal(0.0, 0.4, n), rng.normal(size=(n, m))
+    constant[:20] += 30.0
+    x, block = 0.1 * rng.normal(size=m), rng.integers(0, blocks, n)
+    weights, normal, pull = np.empty(n), np.empty((m, m)), np.empty(m)
+    noise = weigh(constant, design, x, block, blocks, np.inf, 0.02, 4.685, weights, normal, pull)
+    rest = constant + design @ x
+    assert noise == pytest.approx(1.4826 * np.median(np.abs(rest)))
+    expected = np.maximum(0.0, 1.0 - (rest / (4.685 * noise)) ** 2) ** 2
+    np.testing.assert_allclose(weights, expected, atol=1e-12)
+    assert (weights[:20] == 0).all()
+    count, total = (np.bincount(block, w, blocks) for w in (expected, expected * rest))
+    information = expected / (noise**2 * max(1.0, np.mean(total**2 / count) / noise**2))
+    np.testing.assert_allclose(normal, design.T @ (design * information[:, None]), rtol=1e-9)
+    np.testing.assert_allclose(pull, -design.T @ (information * constant), rtol=1e-9)
+
+
+def test_a_large_correction_is_found_though_derivatives_are_shared():
+    """Half a degree is far beyond what one linearisation serves: the distances of the corrected rig vanish."""
+    given, m = street_rig(), matches(knocked(street_rig(), pitch_deg=0.5, roll_deg=-0.5), street_depth, noise=0.0)
+    fit = settle(given, [m], [True, False, True, False, False], BELIEFS)
+    off, _ = distances(given, fit.x[:5], m.left, m.right)
+    assert np.abs(off).max() < 0.01

@@ -12,7 +12,7 @@ from stages import level as level_stage
 from stages.declare import Bundle
 from stages.errors import DegenerateError, InputError
 from stages.geometry import Camera, Rig, RigidTransform
-from stages.ground import inverse_depth
+from stages.ground import _singular_values, inverse_depth
 from stages.level import LevelParams, level
 from stages.validity import Validity
 
@@ -178,3 +178,8 @@ def test_kitti_street(data_dir: Path) -> None:
     facts = level(-d, np.zeros_like(d), d > 0, rig, PARAMS)
     assert facts["ground_height"] == pytest.approx(-1.65, abs=0.12)
     assert math.degrees(math.acos(-float(up_of(facts)[1]))) < 3.0
+
+
+def test_singular_values_of_small_matrices():
+    m = np.random.default_rng(4).normal(size=(50, 2, 2))
+    np.testing.assert_allclose(_singular_values(m), np.linalg.svd(m, compute_uv=False), rtol=1e-9, atol=1e-12)

@@ -94,3 +94,19 @@ def test_clear_of_mask():
     valid[10, 20] = 0
     at = np.array([[20.0, 13.4], [20.0, 13.6], [5.0, 5.0], [1.9, 15.0], [36.6, 15.0], [np.nan, 3.0]])
     assert clear_of_mask(valid, at, 3).tolist() == [False, True, True, False, False, False]
+
+
+def test_points_are_the_peaks_that_a_plain_search_finds():
+    """Of a plateau the first pixel in reading order; quantised noise has many."""
+    image = np.random.default_rng(2).integers(0, 4, (40, 50)).astype(np.float32) * 40.0
+    response = interest_operator(image)
+    response[:3], response[-3:], response[:, :3], response[:, -3:] = 0, 0, 0, 0
+    peaks = set()
+    for y in range(8, 32):
+        for x in range(8, 42):
+            around = response[y - 2 : y + 3, x - 2 : x + 3].copy()
+            before = np.arange(25).reshape(5, 5) < 12
+            if response[y, x] >= around.max() and not (around[before] == response[y, x]).any() and response[y, x] > 150:
+                peaks.add((x, y))
+    found = interest_points(image, np.ones(image.shape, np.uint8), 10000, noise=1.0, border=8)
+    assert {(int(x), int(y)) for x, y in found} == peaks

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from rig_scenes import bed_depth, bed_rig, knocked, matches, street_depth, street_rig
 
+from stages import observability
 from stages.epipolar import NAMES, distances
 from stages.geometry import Rig, RigidTransform
 from stages.observability import RelativeParams, decide
@@ -171,3 +172,17 @@ def test_what_is_small_is_left():
     assert "pitch" in freed(
         decide(rig, [matches(knocked(rig, pitch_deg=0.015), street_depth, pair=k) for k in range(3)], eager)
     )
+
+
+def test_what_comes_to_nothing_together_is_left(monkeypatch):
+    """Two parameters that each ask for much, one against the other: a sound calibration stays."""
+    rig, depth = SCENES["bed"]
+    pairs = [matches(rig, depth, pair=k) for k in range(2)]
+
+    def greedy(self, i, chosen):
+        return None if i >= observability.ANGLES else "held"
+
+    monkeypatch.setattr(observability._Chooser, "_refusal", greedy)
+    decision = decide(rig, pairs, PARAMS)
+    assert not decision.changed
+    assert "with the others" in decision.parameters[3].why

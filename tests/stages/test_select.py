@@ -124,6 +124,15 @@ def test_steps_with_few_matches_are_bounded_by_basic_pairs_and_named():
     assert run([dark, dark])["basic"] == [0, 1]
 
 
+def test_a_stride_has_a_basic_pair_behind_a_step_with_few_matches():
+    """Frame 5 shows something else: with the pairs 0, 3, 6 alone it would belong to nothing."""
+    steps = [motion(shift(2.0))] * 4 + [blind()] + [motion(shift(2.0))] * 2
+    meta = run(steps, rule="stride", stride=3)
+    assert meta["basic"] == [0, 3, 5, 6]
+    assert meta["why"] == ["first frame", "stride", "few matches", "stride"]
+    assert meta["segments"] == [[0, 1, 2, 3], [3, 4, 5], [5, 6], [6, 7]]
+
+
 def test_too_little_overlap_is_named():
     meta = run([motion(shift(240.0))] * 3)
     assert meta["basic"] == [0, 1, 2]
@@ -169,6 +178,15 @@ def test_street_at_ten_frames_a_second_gets_about_every_second_pair(data_dir):
     assert set(np.diff(meta["basic"])) <= {1, 2, 3}
     assert 1.5 < np.mean(np.diff(meta["basic"])) < 3
     assert not meta["warnings"]
+
+
+def test_preset_navigation_takes_pairs_farther_apart_and_yields_to_what_is_given():
+    assert (SelectParams(preset="navigation").rule, SelectParams(preset="navigation").overlap) == ("overlap", 0.6)
+    assert SelectParams(preset="navigation", stride=4).rule == "overlap"  # a sequence's own, for its terrain
+    assert SelectParams(preset="navigation", stride=4, rule="stride").rule == "stride"
+    assert SelectParams(preset="navigation", overlap=0.5).overlap == 0.5
+    again = SelectParams.model_validate(SelectParams(preset="navigation").model_dump())
+    assert again == SelectParams(preset="navigation")
 
 
 def test_a_stride_given_alone_sets_the_rule():

@@ -8,7 +8,16 @@ import pytest
 from stages.declare import Bundle, check_outputs
 from stages.errors import InputError
 from stages.pyramid import PyramidParams, build
-from stages.track import STAGE, Motion, TrackParams, common_similarity, displacement_at, fit_affinity, track
+from stages.track import (
+    STAGE,
+    Motion,
+    TrackParams,
+    common_similarity,
+    displacement_at,
+    fit_affinity,
+    known_median,
+    track,
+)
 
 ROWS, COLS = 200, 260
 PARAMS = TrackParams(points=80)
@@ -262,3 +271,16 @@ def test_affinity_of_the_nearest_by_arrays():
             weight = 1.0 / (1.0 + ((rest - basis @ x) ** 2).sum(1))
         np.testing.assert_allclose(affinity[k], common + x[:2].T, atol=1e-10)
         np.testing.assert_allclose(shift[k], x[2], atol=1e-8)
+
+
+def test_median_of_what_is_known_is_numpys():
+    rng = np.random.default_rng(8)
+    values = rng.normal(size=(60, 9))
+    values[rng.random(values.shape) < 0.4] = np.nan
+    values[3] = np.nan
+    values[4] = 1.5
+    known = np.isfinite(values).sum(axis=1)
+    found = known_median(values, known)
+    assert np.isnan(found[3])
+    rest = known > 0
+    np.testing.assert_array_equal(found[rest], np.nanmedian(values[rest], axis=1))
