@@ -246,8 +246,9 @@ def _free_turn(ground: Ground, towards: float, looks: int) -> float:
 
 
 def shortest(footing: Footing, start: Point, heading: float, goal: Point, params: LegParams) -> float | None:
-    """Length, m, of the way that would be driven over known ground alone if the map were all known; None: none."""
-    ground = Ground(footing, start, heading, params.model_copy(update={"unknown_price": math.inf}))
+    """Length, m, of the shortest way over known ground, at no price but its length; None: none."""
+    free = {"unknown_price": math.inf, "near_price": 0.0, "caution_price": 0.0, "turn_price": 0.0, "back_price": 1.0}
+    ground = Ground(footing, start, heading, params.model_copy(update=free))
     _, cost, move = ground.search(goal, 0.5 * params.tolerance * footing.vehicle.wheel_base)
     if not np.isfinite(cost[0, ground.grid.origin[0], ground.grid.origin[1]]):
         return None
