@@ -112,14 +112,13 @@ def test_more_than_the_greatest_turn_is_done_on_the_spot_first() -> None:
 
 
 def test_it_does_not_look_where_its_wheels_have_no_room_to_turn() -> None:
-    # a wheel's middle moves to the side by 0.05 m sin 25 = 0.02 m in a turn of 25 degrees
-    walls = (X > 0.055) & (Y > 0.0) & (Y < 0.08)
-    ahead = Y > 0.09
-    open_ground = plan_leg(ground((ahead, UNKNOWN)), START, 0.0, GOAL, P)
-    beside = plan_leg(ground((walls, HAZARDOUS), (ahead, UNKNOWN)), START, 0.0, GOAL, P)
-    assert (open_ground.verdict, beside.verdict) == ("look", "look")
-    assert math.degrees(open_ground.turn) == pytest.approx(25.0)
-    assert beside.turn != open_ground.turn or not walls.any()
+    ahead = (Y > 0.07, UNKNOWN)
+    leg = plan_leg(ground(ahead), START, 0.0, GOAL, P)
+    assert (leg.verdict, math.degrees(leg.turn)) == ("look", pytest.approx(25.0))
+    # the right rear wheel would move to (0.057, -0.028) m
+    wall = (X > 0.055) & (Y > -0.08) & (Y < -0.02)
+    leg = plan_leg(ground(ahead, (wall, HAZARDOUS)), START, 0.0, GOAL, P)
+    assert (leg.verdict, math.degrees(leg.turn)) == ("look", pytest.approx(-P.max_turn_deg))
 
 
 def test_it_looks_around_then_closes_what_stays_unknown_and_goes_another_way() -> None:
