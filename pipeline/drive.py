@@ -130,6 +130,8 @@ class Drive(Reconstruction):
         """Row of each frame in the artifact of its leg."""
         self.closed: list[list[float]] = []
         """Places about which unknown ground was looked at in vain."""
+        self.turned: Handle | None = None
+        """The leg that made the vehicle turn on the spot, while it has not driven since."""
         self.reopened = False
         """Whether these places were tried once more, as the last way that is left."""
 
@@ -270,7 +272,8 @@ class Drive(Reconstruction):
             **self.mounting,
             **more,
         }
-        return self._node("leg", label, args, risk=risk, pose=pose)
+        turned = {} if more or self.turned is None else {"before": self.turned}
+        return self._node("leg", label, args, risk=risk, pose=pose, **turned)
 
     def arena(self) -> Lattice:
         """The part of the world that is mapped: around the start, which is at the origin, and the goal."""
@@ -293,6 +296,7 @@ class Drive(Reconstruction):
         elif stop.index + 1 >= self.config.drive.max_stops:
             self._end("stops", f"{stop.index + 1} stops and {1000 * leg.meta['left_m']:.0f} mm from the goal")
         else:
+            self.turned = None if verdict == "drive" else stop.leg
             self.looks = {"drive": 0, "turn": self.looks, "look": self.looks + 1}[verdict]
             stop.event = leg.meta["reason"]
             self._drive(stop, before, row)

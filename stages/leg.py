@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
+from scipy.ndimage import distance_transform_edt
 
 from stages.declare import Array, Bundle, Inputs, Params, Stage
 from stages.errors import InputError
@@ -57,6 +58,15 @@ class LegParams(Params):
     caution_price: float = Field(
         0.2, ge=0, description="added to the price where all wheels are on caution ground: a detour of a fifth"
     )
+    blind: float = Field(
+        1.5, ge=0, description="wheel bases; unknown ground this near is not seen by looking there from here"
+    )
+    blind_price: float = Field(6.0, ge=1, description="price of a metre over it, so that other ways are tried first")
+    loyalty: float = Field(
+        0.3,
+        ge=0,
+        description="share by which another way must be better than the one that a turn on the spot was made for",
+    )
     near_price: float = Field(0.5, ge=0, description="added to the price beside hazards, falls to 0 within the margin")
     back_price: float = Field(3.0, ge=1, description="price of a metre driven back, which no camera looks along")
     turn_price: float = Field(0.3, ge=0, description="wheel bases that a radian turned on the spot is worth")
@@ -91,7 +101,13 @@ class Ground:
     """The map about a vehicle: what it may drive on, what it may plan over, and at which price."""
 
     def __init__(
-        self, footing: Footing, start: Point, heading: float, p: LegParams, closed: Sequence[Point] = ()
+        self,
+        footing: Footing,
+        start: Point,
+        heading: float,
+        p: LegParams,
+        closed: Sequence[Point] = (),
+        before: Floats | None = None,
     ) -> None:
         self.footing, self.start, self.heading, self.p, self.closed = footing, start, heading, p, tuple(closed)
         self.vehicle, self.cell = footing.vehicle, footing.lattice.cell
@@ -99,6 +115,7 @@ class Ground:
         # where it stands it may be: near there, ground that is no worse by more than a cell will do
         self.here = [min(self.vehicle.margin, float(a[0]) - self.cell) for a in (at.gap, at.proven)]
         self.on_unknown = float(at.unknown[0]) <= 0
+        self.astray = None if before is None else _away_from(before, footing.lattice, 0.5 * self.vehicle.wheel_base)
         spacing = max(p.spacing * self.vehicle.wheel_diameter, self.cell)
         self.grid = PoseGrid.over(footing.lattice, start, heading, spacing)
         self._sure: list[Mask] = []
@@ -118,10 +135,21 @@ class Ground:
     def _prices(self, gaps: Gaps, x: Floats, y: Floats, heading: Floats) -> Floats:
         known, opened = self._split(gaps, x, y)
         self._sure.append(known)
-        price = np.where(known, 1.0, self.p.unknown_price) + self.p.caution_price * gaps.caution
+        blind = np.hypot(x - self.start[0], y - self.start[1]) <= self.p.blind * self.vehicle.wheel_base
+        unknown = np.where(blind, max(self.p.blind_price, self.p.unknown_price), self.p.unknown_price)
+        price = np.where(known, 1.0, unknown) + self.p.caution_price * gaps.caution
         if self.vehicle.margin > 0:
             price = price + self.p.near_price * np.clip(2.0 - gaps.gap / self.vehicle.margin, 0.0, 1.0)
+        if self.astray is not None:
+            price = price * (1.0 + self.p.loyalty * self._at(self.astray, x, y))
         return np.where(opened, price, np.inf)
+
+    def _at(self, mask: Mask, x: Floats, y: Floats) -> Mask:
+        """Values of a mask on the map at points; true outside."""
+        at = np.rint(self.footing.lattice.index(np.stack([x, y], axis=-1))).astype(np.int64)
+        inside = ((at >= 0) & (at < mask.shape)).all(axis=-1)
+        row, col = (np.where(inside, at[..., k], 0) for k in (0, 1))
+        return np.asarray(~inside | mask[row, col])
 
     def known(self) -> tuple[Mask, ...]:
         """Poses, steps and turns of the graph that may be driven, each (heading over half a turn, row, col)."""
@@ -165,6 +193,7 @@ def plan_leg(
     params: LegParams,
     looks: int = 0,
     closed: Sequence[Point] = (),
+    before: Floats | None = None,
 ) -> Leg:
     """The next leg.
 
@@ -174,6 +203,7 @@ def plan_leg(
     start, heading : m; rad to the left of y.
     looks : looks around since the last leg that was driven.
     closed : places about which unknown ground was looked at in vain.
+    before : (vertex, 2) m, the way for which the vehicle has just turned; None: it has driven since.
 
     Raises
     ------
@@ -187,7 +217,7 @@ def plan_leg(
     if left <= params.tolerance * base:
         nothing = np.full(footing.lattice.shape, np.nan, np.float32)
         return _stay("goal", f"{1000 * left:.0f} mm from the goal", start, [], nothing)
-    ground = Ground(footing, start, heading, params, closed)
+    ground = Ground(footing, start, heading, params, closed, before)
     goals, cost, move = ground.search(goal, 0.5 * params.tolerance * base)
     shown = ground.on_map(cost)
     if not np.isfinite(cost[0, ground.grid.origin[0], ground.grid.origin[1]]):
@@ -212,6 +242,18 @@ def plan_leg(
         return _stay("look", f"turns {math.degrees(turn):.0f} degrees to see the way", start, way, shown, turn)
     reason = f"{looks} looks around did not show the ground at ({x:.3f}, {y:.3f}) m"
     return _stay("closed", reason, start, way, shown, where=(x, y))
+
+
+def _away_from(way: Floats, lattice: Lattice, reach: float) -> Mask:
+    """Cells farther than ``reach`` metres from a way (vertex, 2)."""
+    n = max(2, math.ceil(_length(way) / lattice.cell))
+    ends = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(way, axis=0).T))])
+    points = np.stack([np.interp(np.linspace(0.0, ends[-1], n), ends, way[:, k]) for k in (0, 1)], axis=1)
+    at = np.rint(lattice.index(points)).astype(np.int64)
+    at = at[((at >= 0) & (at < lattice.shape)).all(axis=1)]
+    on = np.zeros(lattice.shape, bool)
+    on[at[:, 0], at[:, 1]] = True
+    return np.asarray(distance_transform_edt(~on) * lattice.cell > reach) if on.any() else ~on
 
 
 def _stay(
@@ -283,7 +325,9 @@ def _run(params: LegParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     goal = (float(args["goal"][0]), float(args["goal"][1]))
     footing = Footing.of(np.asarray(risk["risk"]), np.asarray(risk["reason"]), lattice, vehicle)
     closed = [(float(x), float(y)) for x, y in args["closed"]]
-    found = plan_leg(footing, start, heading, goal, params, int(args["looks"]), closed)
+    before = np.asarray(inputs["before"]["way"]) if "before" in inputs else None
+    before = None if before is None or len(before) < 2 else before
+    found = plan_leg(footing, start, heading, goal, params, int(args["looks"]), closed, before)
     best = shortest(footing, start, heading, goal, params) if args.get("whole") else None
     meta = {
         "shortest_m": best,
@@ -309,7 +353,7 @@ STAGE = Stage(
     version=2,
     summary="the next leg of a drive to a goal, over ground that is known to be free",
     params=LegParams,
-    inputs=("risk", "pose"),
+    inputs=("risk", "pose", "before?"),
     outputs=(
         Array(
             "path",

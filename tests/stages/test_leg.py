@@ -165,6 +165,25 @@ def test_no_leg_comes_near_a_hazard_or_onto_unknown_ground(seed: int, heading: f
                 assert gap > need - 0.5 * math.sqrt(2) * LATTICE.cell - 0.25 * LATTICE.cell
 
 
+def test_the_way_that_it_has_turned_for_is_kept_unless_another_one_is_much_better() -> None:
+    right_is_nearer = ground(((np.abs(Y - 0.4) < 0.02) & (X > -0.17) & (X < 0.15), HAZARDOUS))
+    first = plan_leg(right_is_nearer, START, 0.0, GOAL, P)
+    assert first.way[:, 0].max() > 0.15
+    left = np.array([START, (-0.23, 0.4), GOAL])
+    assert plan_leg(right_is_nearer, START, 0.0, GOAL, P, before=left).way[:, 0].min() < -0.17
+    right_is_near = ground(((np.abs(Y - 0.4) < 0.02) & (X > -0.35) & (X < 0.0), HAZARDOUS))
+    kept = plan_leg(right_is_near, START, 0.0, GOAL, P, before=np.array([START, (-0.39, 0.4), GOAL]))
+    assert kept.way[:, 0].min() > -0.1
+
+
+def test_unknown_ground_beside_the_vehicle_is_the_last_way_that_is_tried() -> None:
+    # the way round costs 0.15 m more than the way through
+    hole = (np.abs(Y - 0.12) < 0.02) & (X < 0.18) & (X > -0.39)
+    through = plan_leg(ground((hole, UNKNOWN)), START, 0.0, GOAL, P.model_copy(update={"blind": 0.0}))
+    assert np.abs(through.way[:, 0]).max() < 0.1
+    assert plan_leg(ground((hole, UNKNOWN)), START, 0.0, GOAL, P).way[:, 0].max() > 0.18
+
+
 def test_hazards_to_the_whole_vehicle_count_at_its_middle_alone() -> None:
     risk = np.full(LATTICE.shape, SAFE, np.uint8)
     reason = np.zeros(LATTICE.shape, np.uint16)
