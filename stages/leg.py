@@ -49,10 +49,13 @@ Point = tuple[float, float]
 class LegParams(Params):
     """Parameters of the stage ``leg``."""
 
-    length: float = Field(1.5, gt=0, description="wheel bases; longest leg, which is driven without a new map")
+    length: float = Field(2.0, gt=0, description="wheel bases; longest leg, which is driven without a new map")
     least: float = Field(0.3, gt=0, description="wheel bases; a shorter leg is not worth a stop: look elsewhere first")
     max_turn_deg: float = Field(
-        35.0, gt=5, le=120, description="degrees turned on one leg: landmarks must stay in view, half of it at least"
+        40.0,
+        gt=5,
+        le=120,
+        description="degrees that a leg turns off its first heading: landmarks must stay in view, half of it at least",
     )
     unknown_price: float = Field(2.0, ge=1, description="price of a metre over unknown ground, known ground is 1")
     caution_price: float = Field(
@@ -61,7 +64,7 @@ class LegParams(Params):
     blind: float = Field(
         1.5, ge=0, description="wheel bases; unknown ground this near is not seen by looking there from here"
     )
-    blind_price: float = Field(6.0, ge=1, description="price of a metre over it, so that other ways are tried first")
+    blind_price: float = Field(3.0, ge=1, description="price of a metre over it, so that other ways are tried first")
     loyalty: float = Field(
         0.3,
         ge=0,
@@ -233,7 +236,7 @@ def plan_leg(
         leg, turn = within_turn(leg, heading, math.radians(params.max_turn_deg))
         if leg:
             gear = np.array([piece.gear for piece in leg], np.int8)
-            return Leg("drive", "", vertices(leg, start), gear, 0.0, vertices(way, start), shown)
+            return Leg("drive", "", vertices(leg, start), gear, turn, vertices(way, start), shown)
         return _stay("turn", f"turns {math.degrees(turn):.0f} degrees to where it goes on", start, way, shown, turn)
     x, y = way[_sure(way)].b if _sure(way) < len(way) else way[-1].b
     towards = math.remainder(math.atan2(-(x - start[0]), y - start[1]) - heading, 2 * math.pi)
@@ -279,7 +282,7 @@ def _free_turn(ground: Ground, towards: float, looks: int) -> float:
     wheels have room for; 0: none."""
     bound = math.radians(ground.p.max_turn_deg)
     aside = [math.radians(d) for d in (25.0, -50.0, 75.0)]
-    aside = aside[looks % 3 :] + aside[: looks % 3]
+    aside = aside[looks % 3 :] + aside[: looks % 3] + [math.radians(d) for d in (-25.0, 15.0, -15.0)]
     wanted = [*([towards] if abs(towards) >= math.radians(8.0) else []), *aside]
     for turn in (max(-bound, min(bound, w)) for w in wanted):
         if turnable(ground.start, ground.heading, ground.heading + turn, ground.clear):

@@ -120,13 +120,13 @@ def first_metres(way: Sequence[Piece], length: float) -> list[Piece]:
 
 
 def within_turn(way: Sequence[Piece], heading: float, bound: float) -> tuple[list[Piece], float]:
-    """The way as far as the turns on it stay within a bound (rad), and the part of a larger first turn that does."""
-    total, out = 0.0, list[Piece]()
+    """The way as far as its headings stay within a bound (rad) about the present one; and the turn (rad) at its end
+    towards where it goes on, as far as it stays within the bound too."""
+    out, now = list[Piece](), heading
     for piece in way:
-        turn = abs(piece.heading - heading)
-        if total + turn > bound + 1e-9:
-            return out, (0.0 if out else math.copysign(bound, piece.heading - heading))
-        total, heading = total + turn, piece.heading
+        if abs(piece.heading - heading) > bound + 1e-9:
+            return out, heading + math.copysign(bound, piece.heading - heading) - now
+        now = piece.heading
         out.append(piece)
     return out, 0.0
 

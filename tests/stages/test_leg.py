@@ -60,7 +60,7 @@ def test_a_stone_between_the_wheels_is_passed_over_and_a_gap_too_narrow_to_turn_
     leg = plan_leg(ground((stone, HAZARDOUS), (walls, HAZARDOUS)), START, 0.0, GOAL, P)
     assert leg.verdict == "drive"
     assert np.abs(leg.way[:, 0]).max() < 0.011
-    narrow = (np.abs(X) > 0.055) & (np.abs(Y - 0.3) < 0.1)
+    narrow = (np.abs(X) > 0.045) & (np.abs(Y - 0.3) < 0.1)
     closed = plan_leg(ground((stone, HAZARDOUS), (narrow, HAZARDOUS)), START, 0.0, GOAL, P, P.looks)
     assert closed.verdict == "no path"
 
