@@ -38,7 +38,7 @@ class Gaps:
     """Of each pose, float32: ``gap`` m to the nearest hazard (from wheel to what is hazardous to wheels, from the
     middle to what is to the vehicle), ``proven`` m the same to those that are not just the map's uncertainty,
     ``unknown`` m at least from wheels and belly to unknown ground (not positive: on it), ``caution`` share of wheels
-    and middle on caution ground."""
+    and middle on caution ground. With its middle outside the map a vehicle is within a hazard."""
 
     gap: Floats32
     proven: Floats32
@@ -58,11 +58,23 @@ class Footing:
     caution: NDArray[np.uint8]
 
     @staticmethod
-    def of(risk: NDArray[np.uint8], reason: NDArray[np.uint16] | None, lattice: Lattice, vehicle: Vehicle) -> Footing:
-        """From classes and reason bits of :mod:`stages.risk`; without bits every hazard is one to a wheel."""
+    def of(
+        risk: NDArray[np.uint8],
+        reason: NDArray[np.uint16] | None,
+        lattice: Lattice,
+        vehicle: Vehicle,
+        p_hazard: NDArray[np.float32] | None = None,
+        sure: float = 0.5,
+    ) -> Footing:
+        """From classes and reason bits of :mod:`stages.risk`; without bits every hazard is one to a wheel.
+
+        A hazard is proven where it is not one by sigma alone, and at least as probable as ``sure``.
+        """
         hazardous, cell = risk == HAZARDOUS, lattice.cell
         bits = np.full(risk.shape, WHEEL_BITS) if reason is None else reason
         proven = hazardous & ((bits & DOUBT_BIT) == 0)
+        if p_hazard is not None:
+            proven &= p_hazard >= sure
         kinds = [(bits & which) > 0 for which in (WHEEL_BITS, BODY_BITS)]
         fields = np.stack([_distance(which & kind, cell) for kind in kinds for which in (hazardous, proven)])
         unknown = risk == UNKNOWN
@@ -103,8 +115,8 @@ def _gaps(at, cosine, sine, wheels, belly, fields, unknown, caution, reach, out)
         for k in range(4):
             out[k, n] = np.float32(-1.0) if k == 2 else np.float32(0.0)
         i, j = math.floor(row + 0.5), math.floor(col + 0.5)
-        out[0, n] = out[1, n] = np.inf
         if i < 0 or j < 0 or i >= rows or j >= cols:
+            out[0, n] = out[1, n] = -np.inf
             continue
         gap, proven, share = fields[2, i, j], fields[3, i, j], np.float32(caution[i, j])
         spare = unknown[i, j] - reach

@@ -57,6 +57,11 @@ class LegParams(Params):
         le=120,
         description="degrees that a leg turns off its first heading: landmarks must stay in view, half of it at least",
     )
+    sure: tuple[float, float] = Field(
+        (0.9, 0.995),
+        description="probability from which a hazard closes ground, and the same where no way is left: what is far is "
+        "uncertain, and nearer to it more is known",
+    )
     unknown_price: float = Field(2.0, ge=1, description="price of a metre over unknown ground, known ground is 1")
     caution_price: float = Field(
         0.2, ge=0, description="added to the price where all wheels are on caution ground: a detour of a fifth"
@@ -326,11 +331,15 @@ def _run(params: LegParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     start = float(T.translation[0]), float(T.translation[1])
     heading = math.atan2(-T.rotation[0, 1], T.rotation[1, 1])
     goal = (float(args["goal"][0]), float(args["goal"][1]))
-    footing = Footing.of(np.asarray(risk["risk"]), np.asarray(risk["reason"]), lattice, vehicle)
     closed = [(float(x), float(y)) for x, y in args["closed"]]
     before = np.asarray(inputs["before"]["way"]) if "before" in inputs else None
     before = None if before is None or len(before) < 2 else before
-    found = plan_leg(footing, start, heading, goal, params, int(args["looks"]), closed, before)
+    maps = (np.asarray(risk["risk"]), np.asarray(risk["reason"]), lattice, vehicle, np.asarray(risk["p_hazard"]))
+    for sure in params.sure:
+        footing = Footing.of(*maps, sure)
+        found = plan_leg(footing, start, heading, goal, params, int(args["looks"]), closed, before)
+        if found.verdict == "goal" or len(found.way) > 1:
+            break
     best = shortest(footing, start, heading, goal, params) if args.get("whole") else None
     meta = {
         "shortest_m": best,

@@ -123,7 +123,7 @@ def test_it_does_not_look_where_its_wheels_have_no_room_to_turn() -> None:
 
 def test_it_looks_around_then_closes_what_stays_unknown_and_goes_another_way() -> None:
     risk = ground(((np.abs(Y - 0.15) < 0.07) & (X < 0.1), UNKNOWN))
-    start, goal = (-0.3, 0.02), (-0.3, 0.8)
+    start, goal = (-0.3, 0.0), (-0.3, 0.8)
     for looks in range(P.looks):
         assert plan_leg(risk, start, 0.0, goal, P, looks).verdict == "look"
     places: list[tuple[float, float]] = []
@@ -177,11 +177,12 @@ def test_the_way_that_it_has_turned_for_is_kept_unless_another_one_is_much_bette
 
 
 def test_unknown_ground_beside_the_vehicle_is_the_last_way_that_is_tried() -> None:
-    # the way round costs 0.15 m more than the way through
-    hole = (np.abs(Y - 0.12) < 0.02) & (X < 0.18) & (X > -0.39)
-    through = plan_leg(ground((hole, UNKNOWN)), START, 0.0, GOAL, P.model_copy(update={"blind": 0.0}))
+    # the way through leads over 0.14 m of it, the way round is longer by 0.1 m and turns by 1.3 rad
+    hole = (np.abs(Y - 0.12) < 0.02) & (X < 0.12) & (X > -0.39)
+    cheap = P.model_copy(update={"unknown_price": 1.3})
+    through = plan_leg(ground((hole, UNKNOWN)), START, 0.0, GOAL, cheap.model_copy(update={"blind": 0.0}))
     assert np.abs(through.way[:, 0]).max() < 0.1
-    assert plan_leg(ground((hole, UNKNOWN)), START, 0.0, GOAL, P).way[:, 0].max() > 0.18
+    assert plan_leg(ground((hole, UNKNOWN)), START, 0.0, GOAL, cheap).way[:, 0].max() > 0.12
 
 
 def test_hazards_to_the_whole_vehicle_count_at_its_middle_alone() -> None:
