@@ -67,9 +67,12 @@ class LegParams(Params):
         0.2, ge=0, description="added to the price where all wheels are on caution ground: a detour of a fifth"
     )
     blind: float = Field(
-        1.5, ge=0, description="wheel bases; unknown ground this near is not seen by looking there from here"
+        1.5,
+        ge=0,
+        description="wheel bases; unknown ground this near is not seen by looking there from here, and what is doubtful "
+        "within twice of it will stay so",
     )
-    blind_price: float = Field(3.0, ge=1, description="price of a metre over it, so that other ways are tried first")
+    blind_price: float = Field(6.0, ge=1, description="price of a metre over it, so that other ways are tried first")
     loyalty: float = Field(
         0.3,
         ge=0,
@@ -143,7 +146,8 @@ class Ground:
     def _prices(self, gaps: Gaps, x: Floats, y: Floats, heading: Floats) -> Floats:
         known, opened = self._split(gaps, x, y)
         self._sure.append(known)
-        blind = np.hypot(x - self.start[0], y - self.start[1]) <= self.p.blind * self.vehicle.wheel_base
+        reach = self.p.blind * self.vehicle.wheel_base * np.where(gaps.unknown > 0, 2.0, 1.0)
+        blind = np.hypot(x - self.start[0], y - self.start[1]) <= reach
         unknown = np.where(blind, max(self.p.blind_price, self.p.unknown_price), self.p.unknown_price)
         price = np.where(known, 1.0, unknown) + self.p.caution_price * gaps.caution
         if self.vehicle.margin > 0:
