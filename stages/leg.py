@@ -69,7 +69,7 @@ class LegParams(Params):
     blind: float = Field(
         1.5,
         ge=0,
-        description="wheel bases; unknown ground this near is not seen by looking there from here, and what is doubtful "
+        description="wheel bases; unknown ground this near is not seen by looking there, and what is doubtful "
         "within twice of it will stay so",
     )
     blind_price: float = Field(6.0, ge=1, description="price of a metre over it, so that other ways are tried first")
