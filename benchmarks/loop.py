@@ -50,6 +50,8 @@ def drive(settings: list[str]) -> dict[str, Any]:
     begin = time.perf_counter()
     sequence, layers = prepared(settings)
     goal = choose_goal(sequence, config_of(layers))
+    if goal is None:
+        return {"verdict": "not driven", "reason": "", "path_exists": False, "seconds": time.perf_counter() - begin}
     graph, folder = Graph(), Path(tempfile.mkdtemp(prefix="loop-"))
     try:
         store = at(folder)
@@ -63,7 +65,7 @@ def drive(settings: list[str]) -> dict[str, Any]:
     return {**found, "goal": goal, "errors": errors, "seconds": time.perf_counter() - begin}
 
 
-def choose_goal(sequence: Any, config: Any) -> tuple[float, float]:
+def choose_goal(sequence: Any, config: Any) -> tuple[float, float] | None:
     """The place nearest to the nominal goal that can be driven to on the exact map, and where there is room to turn."""
     import numpy as np
 
@@ -105,7 +107,7 @@ def choose_goal(sequence: Any, config: Any) -> tuple[float, float]:
     far = np.where(np.isfinite(cost).all(axis=0), np.hypot(x - NOMINAL[0], y - NOMINAL[1]), np.inf)
     far[np.hypot(x - start[0], y - start[1]) < LEAST] = np.inf
     best = np.unravel_index(int(np.argmin(far)), far.shape)
-    return (float(x[best]), float(y[best])) if np.isfinite(far[best]) else NOMINAL
+    return (float(x[best]), float(y[best])) if np.isfinite(far[best]) else None
 
 
 def figures(flow: Any, store: Any) -> dict[str, Any]:
@@ -122,6 +124,8 @@ def figures(flow: Any, store: Any) -> dict[str, Any]:
         check = store.open(driven.check.ref)
         out |= {name: m["value"] for name, m in check.meta["metrics"].items()}
         out["path_exists"] = check.meta["path_exists"]
+    else:
+        out["path_exists"] = True  # as far as the choice of the goal knows: a failed drive counts as one
     return out
 
 
@@ -219,9 +223,9 @@ def table(rows: list[dict[str, Any]]) -> list[str]:
     ]
     for cover in sorted({r["cover"] for r in rows}):
         mine = [r for r in rows if r["cover"] == cover]
-        judged = [r for r in mine if "path_exists" in r]
-        possible = [r for r in judged if r["path_exists"]]
-        reached = [r for r in possible if r["verdict"] == "goal"]
+        judged = [r for r in mine if "clearance_violations" in r]
+        possible = [r for r in mine if r.get("path_exists", True)]
+        reached = [r for r in possible if r["verdict"] == "goal" and "way" in r]
         broken = [r for r in judged if any(r[f"{k}_violations"] for k in ("clearance", "tilt", "step"))]
         drift = sorted(100 * r["localisation_share"] for r in judged if r["verdict"] == "goal")
         ratio = sorted(r["way"] / r["shortest_way"] for r in reached)
@@ -230,7 +234,7 @@ def table(rows: list[dict[str, Any]]) -> list[str]:
         cells = [f"{100 * cover:.0f} %", str(len(mine)), str(len(possible))]
         cells += [f"{len(reached)}: {wilson(len(reached), len(possible))}"]
         cells += [f"{len(broken)}: {wilson(len(broken), len(judged))}", f"{_middle(drift)} %", _middle(ratio)]
-        cells += [str(sum(r["reflex_stops"] for r in mine)), f"{way:.1f}", f"{seconds:.0f}"]
+        cells += [str(sum(r["reflex_stops"] for r in judged)), f"{way:.1f}", f"{seconds:.0f}"]
         lines.append(f"| {' | '.join(cells)} |")
     return lines
 
