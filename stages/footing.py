@@ -36,9 +36,9 @@ NEAR_UNKNOWN = 0.5
 @dataclass(frozen=True)
 class Gaps:
     """Of each pose, float32: ``gap`` m to the nearest hazard (from wheel to what is hazardous to wheels, from the
-    middle to what is to the vehicle), ``proven`` m the same to those that are not just the map's uncertainty,
-    ``unknown`` m at least from wheels and belly to unknown ground (not positive: on it), ``caution`` share of wheels
-    and middle on caution ground. With its middle outside the map a vehicle is within a hazard."""
+    middle to what is to the vehicle; farther by the margin to what is one by sigma alone), ``proven`` m to those that
+    are proven, ``unknown`` m at least from wheels and belly to unknown ground (not positive: on it), ``caution`` share
+    of wheels and middle on caution ground. With its middle outside the map a vehicle is within a hazard."""
 
     gap: Floats32
     proven: Floats32
@@ -72,13 +72,18 @@ class Footing:
         """
         hazardous, cell = risk == HAZARDOUS, lattice.cell
         bits = np.full(risk.shape, WHEEL_BITS) if reason is None else reason
-        proven = hazardous & ((bits & DOUBT_BIT) == 0)
+        doubtful = hazardous & ((bits & DOUBT_BIT) > 0)
+        likely = proven = hazardous & ~doubtful
         if p_hazard is not None:
-            proven &= p_hazard >= sure
+            proven = likely & (p_hazard >= sure)
         kinds = [(bits & which) > 0 for which in (WHEEL_BITS, BODY_BITS)]
-        fields = np.stack([_distance(which & kind, cell) for kind in kinds for which in (hazardous, proven)])
+        fields = []
+        for kind in kinds:
+            # sigma is the room for error there: the margin is not added to it
+            beside = _distance(doubtful & kind, cell) + np.float32(vehicle.margin)
+            fields += [np.minimum(_distance(likely & kind, cell), beside), _distance(proven & kind, cell)]
         unknown = risk == UNKNOWN
-        return Footing(lattice, vehicle, fields, _distance(unknown, cell), (risk == CAUTION).astype(np.uint8))
+        return Footing(lattice, vehicle, np.stack(fields), _distance(unknown, cell), (risk == CAUTION).astype(np.uint8))
 
     def gaps(self, x: Floats, y: Floats, heading: Floats) -> Gaps:
         """At poses: x, y of the middle (m) and heading (rad to the left of y), arrays of one shape."""
