@@ -55,9 +55,8 @@ def pieces(
         if m in (AHEAD, BACK):
             begin = (r, c) if (m == AHEAD) == (k % 16 < 8) else (r1, c1)
             here = known[0][k % 8, r, c] and known[0][k % 8, r1, c1] and known[1][k % 8, begin[0], begin[1]]
-            a, b = (
-                (float(x), float(y)) for x, y in (grid.xy(np.float64(i), np.float64(j)) for i, j in ((r, c), (r1, c1)))
-            )
+            x, y = grid.xy(np.array([r, r1], np.float64), np.array([c, c1], np.float64))
+            a, b = (float(x[0]), float(y[0])), (float(x[1]), float(y[1]))
             out.append(Piece(a, b, grid.heading + angle_of(k), 1 if m == AHEAD else -1, bool(here and sure)))
             sure = True
         else:

@@ -76,8 +76,8 @@ def test_hazards_of_little_probability_are_not_proven() -> None:
     risk = np.where(np.hypot(X, Y - 0.1) < 0.01, np.uint8(HAZARDOUS), np.uint8(SAFE))
     p = np.where(Y > 0.1, 0.6, 0.95).astype(np.float32)
     reason = np.full(risk.shape, REASONS["step"], np.uint16)
-    gap, proven, _, _ = at(Footing.of(risk, reason, LATTICE, ROVER, p, 0.9), 0.04, 0.15, 0.0)
-    below = at(Footing.of(risk, reason, LATTICE, ROVER, p, 0.5), 0.04, 0.15, 0.0)
+    gap, proven, _, _ = at(Footing.of(risk, reason, LATTICE, ROVER, p, 0.9), 0.04, 0.17, 0.0)
+    below = at(Footing.of(risk, reason, LATTICE, ROVER, p, 0.5), 0.04, 0.17, 0.0)
     assert gap == below[0] == below[1]
     assert proven > gap
 
