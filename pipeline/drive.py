@@ -89,6 +89,7 @@ class Stop:
     reflex: Handle | None = None
     frames: list[int] = field(default_factory=list)
     event: str = ""
+    thoughts: int = 0
 
 
 @dataclass
@@ -129,6 +130,10 @@ class Drive(Reconstruction):
         """Row of each frame in the artifact of its leg."""
         self.closed: list[list[float]] = []
         """Places about which unknown ground was looked at in vain."""
+        self.turned: Handle | None = None
+        """The leg that made the vehicle turn on the spot, while it has not driven since."""
+        self.reopened = False
+        """Whether these places were tried once more, as the last way that is left."""
 
     def build(self) -> Products:
         """Lay out the start; the rest follows by expansion."""
@@ -267,7 +272,8 @@ class Drive(Reconstruction):
             **self.mounting,
             **more,
         }
-        return self._node("leg", label, args, risk=risk, pose=pose)
+        turned = {} if more or self.turned is None else {"before": self.turned}
+        return self._node("leg", label, args, risk=risk, pose=pose, **turned)
 
     def arena(self) -> Lattice:
         """The part of the world that is mapped: around the start, which is at the origin, and the goal."""
@@ -277,21 +283,30 @@ class Drive(Reconstruction):
 
     def _after_leg(self, stop: Stop, before: Handle, row: int, leg: Ref) -> None:
         verdict = leg.meta["verdict"]
-        if verdict in ("goal", "no path"):
+        if verdict == "no path" and self.closed and not self.reopened:
+            self.closed, self.looks, self.reopened = [], 0, True
+            self._again(stop, before, row)
+        elif verdict in ("goal", "no path"):
             stop.event = leg.meta["reason"]
             self._end(verdict, leg.meta["reason"])
         elif verdict == "closed":
             self.closed = [*self.closed, leg.meta["where"]]
             self.looks = 0
-            assert stop.risk is not None
-            stop.leg = self._leg(f"leg/{stop.index}/{len(self.closed)}", stop.risk, self.pose)
-            self.graph.expand([stop.leg], lambda again: self._after_leg(stop, before, row, again))
+            self._again(stop, before, row)
         elif stop.index + 1 >= self.config.drive.max_stops:
             self._end("stops", f"{stop.index + 1} stops and {1000 * leg.meta['left_m']:.0f} mm from the goal")
         else:
+            self.turned = None if verdict == "drive" else stop.leg
             self.looks = {"drive": 0, "turn": self.looks, "look": self.looks + 1}[verdict]
             stop.event = leg.meta["reason"]
             self._drive(stop, before, row)
+
+    def _again(self, stop: Stop, before: Handle, row: int) -> None:
+        """Think anew at the same stop."""
+        assert stop.risk is not None
+        stop.thoughts += 1
+        stop.leg = self._leg(f"leg/{stop.index}/{stop.thoughts}", stop.risk, self.pose)
+        self.graph.expand([stop.leg], lambda again: self._after_leg(stop, before, row, again))
 
     # -- a leg --------------------------------------------------------------------------------------------------
 

@@ -7,14 +7,14 @@ nearer to it than the vehicle and its margin need, is closed. So the way bends r
 and where no way is left even over unknown ground there is none. This is the usual free-space assumption (Koenig, Tovey,
 Smirnov 2003, doi:10.1016/S0004-3702(03)00062-6), planned anew at each stop.
 
-The vehicle turns on the spot, so that what it needs is the circle of its wheels.
+The vehicle drives ahead, or back at a higher price, and turns on the spot where its wheels have room to
+(:mod:`stages.pose_graph`): it may pass between two hazards between which it could not turn.
 """
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,15 +22,23 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 from scipy.ndimage import distance_transform_edt
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import dijkstra
 
 from stages.declare import Array, Bundle, Inputs, Params, Stage
 from stages.errors import InputError
+from stages.footing import Footing, Gaps
 from stages.geometry import RigidTransform
 from stages.lattice import Lattice
-from stages.path import WHEEL_BITS
-from stages.risk import DOUBT_BIT, HAZARDOUS, UNKNOWN
+from stages.pose_graph import PoseGraph, PoseGrid
+from stages.route import (
+    Piece,
+    first_metres,
+    length_of,
+    pieces,
+    straightened,
+    turnable,
+    vertices,
+    within_turn,
+)
 from stages.vehicle import Vehicle
 
 Floats = NDArray[np.float64]
@@ -41,13 +49,39 @@ Point = tuple[float, float]
 class LegParams(Params):
     """Parameters of the stage ``leg``."""
 
-    length: float = Field(1.5, gt=0, description="wheel bases; longest leg, which is driven without a new map")
+    length: float = Field(2.0, gt=0, description="wheel bases; longest leg, which is driven without a new map")
     least: float = Field(0.3, gt=0, description="wheel bases; a shorter leg is not worth a stop: look elsewhere first")
     max_turn_deg: float = Field(
-        35.0, gt=5, le=120, description="degrees turned on one leg: landmarks must stay in view, half of it at least"
+        40.0,
+        gt=5,
+        le=120,
+        description="degrees that a leg turns off its first heading: landmarks must stay in view, half of it at least",
+    )
+    sure: tuple[float, float] = Field(
+        (0.9, 0.995),
+        description="probability from which a hazard closes ground, and the same where no way is left: what is far is "
+        "uncertain, and nearer to it more is known",
     )
     unknown_price: float = Field(2.0, ge=1, description="price of a metre over unknown ground, known ground is 1")
+    caution_price: float = Field(
+        0.2, ge=0, description="added to the price where all wheels are on caution ground: a detour of a fifth"
+    )
+    blind: float = Field(
+        1.5,
+        ge=0,
+        description="wheel bases; unknown ground this near is not seen by looking there, and what is doubtful "
+        "within twice of it will stay so",
+    )
+    blind_price: float = Field(6.0, ge=1, description="price of a metre over it, so that other ways are tried first")
+    loyalty: float = Field(
+        0.3,
+        ge=0,
+        description="share by which another way must be better than the one that a turn on the spot was made for",
+    )
     near_price: float = Field(0.5, ge=0, description="added to the price beside hazards, falls to 0 within the margin")
+    back_price: float = Field(3.0, ge=1, description="price of a metre driven back, which no camera looks along")
+    turn_price: float = Field(0.3, ge=0, description="wheel bases that a radian turned on the spot is worth")
+    spacing: float = Field(0.25, gt=0, le=1, description="wheel diameters; spacing of the places that are planned over")
     tolerance: float = Field(0.3, gt=0, description="wheel bases; the goal is reached this near")
     looks: int = Field(3, ge=1, description="looks around without a leg after which the way counts as closed")
     vain: float = Field(0.8, gt=0, description="wheel bases; radius of what is closed then, as far as it is unknown")
@@ -55,175 +89,227 @@ class LegParams(Params):
 
 @dataclass(frozen=True)
 class Leg:
-    """``verdict``: drive, turn, look, closed, goal or no path; ``path`` (vertex, 2) m to drive; ``turn`` rad then.
+    """``verdict``: drive, turn, look, closed, goal or no path; ``path`` (vertex, 2) m to drive, ``gear`` (piece,) 1 for
+    ahead and -1 for back; ``turn`` rad then.
 
     ``closed``: looking around did not help; ``where`` the way is not known to be free.
 
-    ``way`` (vertex, 2) m to the goal, as it is planned; ``cost`` (row, col) m to the goal at these prices, NaN closed.
+    ``way`` (vertex, 2) m to the goal, as it is planned; ``cost`` (row, col) m to the goal at these prices at the best
+    heading, NaN where it is closed, or farther than the vehicle.
     """
 
     verdict: str
     reason: str
     path: Floats
+    gear: NDArray[np.int8]
     turn: float
     way: Floats
     cost: NDArray[np.float32]
     where: Point | None = None
 
 
-def half_width(vehicle: Vehicle) -> float:
-    """Radius of the circle through the wheels' centres, m."""
-    return 0.5 * math.hypot(vehicle.track, vehicle.wheel_base)
+class Ground:
+    """The map about a vehicle: what it may drive on, what it may plan over, and at which price."""
 
+    def __init__(
+        self,
+        footing: Footing,
+        start: Point,
+        heading: float,
+        p: LegParams,
+        closed: Sequence[Point] = (),
+        before: Floats | None = None,
+    ) -> None:
+        self.footing, self.start, self.heading, self.p, self.closed = footing, start, heading, p, tuple(closed)
+        self.vehicle, self.cell = footing.vehicle, footing.lattice.cell
+        at = footing.gaps(*(np.array([v]) for v in (*start, heading)))
+        # where it stands it may be: near there, ground that is no worse by more than a cell will do
+        self.here = [min(self.vehicle.margin, float(a[0]) - self.cell) for a in (at.gap, at.proven)]
+        self.on_unknown = float(at.unknown[0]) <= 0
+        self.astray = None if before is None else _away_from(before, footing.lattice, 0.5 * self.vehicle.wheel_base)
+        spacing = max(p.spacing * self.vehicle.wheel_diameter, self.cell)
+        self.grid = PoseGrid.over(footing.lattice, start, heading, spacing)
+        self._sure: list[Mask] = []
+        self.graph = PoseGraph.of(footing, self.grid, self._prices)
 
-@dataclass(frozen=True)
-class Hazards:
-    """A risk map as the circle of the vehicle meets it, (row, col).
+    def _split(self, gaps: Gaps, x: Floats, y: Floats) -> tuple[Mask, Mask]:
+        """Poses that may be driven, and those that may be planned over."""
+        near = np.hypot(x - self.start[0], y - self.start[1]) <= 0.3 * self.vehicle.wheel_base
+        margin = self.vehicle.margin
+        known = gaps.gap > np.where(near, self.here[0], margin)
+        known &= (gaps.unknown > 0) | (near & self.on_unknown)
+        opened = gaps.proven > np.where(near, self.here[1], margin)
+        for cx, cy in self.closed:
+            opened &= known | (np.hypot(x - cx, y - cy) > self.p.vain * self.vehicle.wheel_base)
+        return known, opened | known
 
-    ``gap`` m from the vehicle standing on a cell to the nearest hazard: from the circle of its wheels to what is
-    hazardous to a wheel, from its middle to where the vehicle as a whole would tilt or strike. ``unknown`` m from the
-    circle to unknown ground. ``free``: the cell itself is neither hazardous nor unknown. ``proven`` m as ``gap``, to
-    hazards that are not just the map's uncertainty: what is far is uncertain, and the next stop knows more.
-    """
+    def _prices(self, gaps: Gaps, x: Floats, y: Floats, heading: Floats) -> Floats:
+        known, opened = self._split(gaps, x, y)
+        self._sure.append(known)
+        reach = self.p.blind * self.vehicle.wheel_base * np.where(gaps.unknown > 0, 2.0, 1.0)
+        blind = np.hypot(x - self.start[0], y - self.start[1]) <= reach
+        unknown = np.where(blind, max(self.p.blind_price, self.p.unknown_price), self.p.unknown_price)
+        price = np.where(known, 1.0, unknown) + self.p.caution_price * gaps.caution
+        if self.vehicle.margin > 0:
+            price = price + self.p.near_price * np.clip(2.0 - gaps.gap / self.vehicle.margin, 0.0, 1.0)
+        if self.astray is not None:
+            price = price * (1.0 + self.p.loyalty * self._at(self.astray, x, y))
+        return np.where(opened, price, np.inf)
 
-    gap: Floats
-    proven: Floats
-    unknown: Floats
-    free: Mask
+    def _at(self, mask: Mask, x: Floats, y: Floats) -> Mask:
+        """Values of a mask on the map at points; true outside."""
+        at = np.rint(self.footing.lattice.index(np.stack([x, y], axis=-1))).astype(np.int64)
+        inside = ((at >= 0) & (at < mask.shape)).all(axis=-1)
+        row, col = (np.where(inside, at[..., k], 0) for k in (0, 1))
+        return np.asarray(~inside | mask[row, col])
 
-    @staticmethod
-    def of(risk: NDArray[np.uint8], reason: NDArray[np.uint16] | None, cell: float, vehicle: Vehicle) -> Hazards:
-        """From classes and reason bits of :mod:`stages.risk`; without bits every hazard is one to a wheel."""
-        hazardous = risk == HAZARDOUS
-        bits = np.full(risk.shape, WHEEL_BITS) if reason is None else reason
-        wheel, doubt = (bits & WHEEL_BITS) > 0, (bits & DOUBT_BIT) > 0
-        need = half_width(vehicle)
-        gaps = [
-            np.minimum(_distance(which & wheel, cell) - need, _distance(which & ~wheel, cell))
-            for which in (hazardous, hazardous & ~doubt)
-        ]
-        unknown = risk == UNKNOWN
-        return Hazards(gaps[0], gaps[1], _distance(unknown, cell) - need, ~(hazardous | unknown))
+    def known(self) -> tuple[Mask, ...]:
+        """Poses, steps and turns of the graph that may be driven, each (heading over half a turn, row, col)."""
+        return tuple(np.stack(self._sure[kind::3]) for kind in range(3))
 
+    def clear(self, x: Floats, y: Floats, heading: Floats) -> bool:
+        """Whether all of these poses may be driven."""
+        return bool(self._split(self.footing.gaps(x, y, heading), x, y)[0].all())
 
-def _distance(mask: Mask, cell: float) -> Floats:
-    far = distance_transform_edt(~mask) * cell if mask.any() else np.full(mask.shape, np.inf)
-    return np.asarray(far, dtype=np.float64)
+    def places(self) -> tuple[Floats, Floats]:
+        """x and y (row, col), m, of the graph's places."""
+        row, col = np.meshgrid(*(np.arange(n, dtype=np.float64) for n in self.grid.shape), indexing="ij")
+        return self.grid.xy(row, col)
 
+    def search(self, goal: Point, reach: float, *, whole: bool = False) -> tuple[Mask, Floats, NDArray[np.int8]]:
+        """Goals (row, col) within ``reach`` metres, cost and move (heading, row, col)."""
+        x, y = self.places()
+        goals: Mask = np.asarray(np.hypot(x - goal[0], y - goal[1]) <= reach)
+        turn = self.p.turn_price * self.vehicle.wheel_base
+        return goals, *self.graph.search(goals, turn, self.p.back_price, whole=whole)
 
-def costs(price: Floats, goals: Mask, cell: float) -> tuple[Floats, NDArray[np.int32]]:
-    """Least cost from each cell to one of the goals over 8 neighbours, and the next cell on the way (flat, < 0 none).
+    def way(self, move: NDArray[np.int8]) -> list[Piece]:
+        """The way from the start in steps."""
+        return pieces(self.graph, self.known(), self.graph.follow(move))
 
-    ``price`` (row, col) a metre, infinite where closed; a step costs the mean of both cells' prices.
-    """
-    rows, cols = price.shape
-    number = np.arange(rows * cols).reshape(rows, cols)
-    ends, lengths = [], []
-    for dr, dc in ((0, 1), (1, 0), (1, 1), (1, -1)):
-        a = (slice(0, rows - dr), slice(max(0, -dc), cols - max(0, dc)))
-        b = (slice(dr, rows), slice(max(0, dc), cols + min(0, dc)))
-        mean = 0.5 * (price[a] + price[b])
-        there = np.isfinite(mean)
-        ends.append(np.stack([number[a][there], number[b][there]]))
-        lengths.append(mean[there] * cell * math.hypot(dr, dc))
-    pairs, length = np.concatenate(ends, axis=1), np.concatenate(lengths)
-    graph = coo_array((length, (pairs[0], pairs[1])), shape=(rows * cols, rows * cols)).tocsr()
-    sources = number[goals & np.isfinite(price)]
-    if sources.size == 0:
-        return np.full(price.shape, np.inf), np.full(rows * cols, -9999, np.int32)
-    cost, nearer, _ = dijkstra(graph, directed=False, indices=sources, return_predecessors=True, min_only=True)
-    return np.asarray(cost).reshape(rows, cols), np.asarray(nearer)
+    def on_map(self, cost: Floats) -> NDArray[np.float32]:
+        """Cost at the best heading on the cells of the map, NaN where it is not known."""
+        best = cost.min(axis=0)
+        xy = self.footing.lattice.xy()
+        row, col = (np.rint(v).astype(np.int64) for v in self.grid.index(xy[..., 0], xy[..., 1]))
+        inside = (row >= 0) & (col >= 0) & (row < self.grid.shape[0]) & (col < self.grid.shape[1])
+        found = np.where(inside, best[np.where(inside, row, 0), np.where(inside, col, 0)], np.inf)
+        return np.where(np.isfinite(found), found, np.nan).astype(np.float32)
 
 
 def plan_leg(
-    hazards: Hazards,
-    lattice: Lattice,
-    vehicle: Vehicle,
+    footing: Footing,
     start: Point,
     heading: float,
     goal: Point,
     params: LegParams,
     looks: int = 0,
-    closed: list[Point] | None = None,
+    closed: Sequence[Point] = (),
+    before: Floats | None = None,
 ) -> Leg:
     """The next leg.
 
     Parameters
     ----------
-    hazards : of the map known so far.
+    footing : of the map known so far.
     start, heading : m; rad to the left of y.
     looks : looks around since the last leg that was driven.
     closed : places about which unknown ground was looked at in vain.
+    before : (vertex, 2) m, the way for which the vehicle has just turned; None: it has driven since.
 
     Raises
     ------
     InputError
         Start or goal lies outside the map.
     """
-    at, target = (_cell_of(lattice, name, p) for name, p in (("start", start), ("goal", goal)))
-    base, cell = vehicle.wheel_base, lattice.cell
-    xy = lattice.xy()
-    nothing = np.full(lattice.shape, np.nan, np.float32)
+    for name, point in (("start", start), ("goal", goal)):
+        _check(footing.lattice, name, point)
+    base = footing.vehicle.wheel_base
     left = math.hypot(goal[0] - start[0], goal[1] - start[1])
     if left <= params.tolerance * base:
-        return Leg("goal", f"{1000 * left:.0f} mm from the goal", _line([start]), 0.0, _line([start]), nothing)
-    here = np.hypot(xy[..., 0] - start[0], xy[..., 1] - start[1]) <= 0.3 * base
-    opened = (hazards.proven > vehicle.margin) | here
-    known = ((hazards.gap > vehicle.margin) & (hazards.unknown > 0.0) & hazards.free) | here
-    for x, y in closed or []:
-        opened &= known | (np.hypot(xy[..., 0] - x, xy[..., 1] - y) > params.vain * base)
-    price = np.where(known, 1.0, params.unknown_price)
-    if vehicle.margin > 0:
-        price = price + params.near_price * np.clip(2.0 - hazards.gap / vehicle.margin, 0.0, 1.0)
-    price = np.where(opened, price, np.inf)
-    goals = np.hypot(xy[..., 0] - goal[0], xy[..., 1] - goal[1]) <= 0.5 * params.tolerance * base
-    cost, nearer = costs(price, goals, cell)
-    shown = np.where(np.isfinite(cost), cost, np.nan).astype(np.float32)
-    if not np.isfinite(cost[at]):
-        reason = _why_closed(price, goals, target, cost, at, lattice)
-        return Leg("no path", reason, _line([start]), 0.0, _line([start]), shown)
-    cells = _follow(nearer, at, lattice)
-    way = _points(lattice, cells, start)
-    path = _safe_part(cells, way, known, lattice, params.length * base)
-    if _length(path) >= min(params.least * base, left):
-        path, turn = _within_turn(path, heading, math.radians(params.max_turn_deg))
-        if len(path) > 1:
-            return Leg("drive", "", path, 0.0, way, shown)
-        return Leg("turn", f"turns {math.degrees(turn):.0f} degrees to where it goes on", path, turn, way, shown)
-    if looks >= params.looks:
-        free = known[cells[:, 0], cells[:, 1]]
-        x, y = way[int(np.argmin(free))] if not free.all() else way[-1]
-        reason = f"{looks} looks around did not show the ground at ({x:.3f}, {y:.3f}) m"
-        return Leg("closed", reason, _line([start]), 0.0, way, shown, (float(x), float(y)))
-    ahead = way[min(len(way) - 1, max(1, int(1.5 * base / cell)))]
-    turn = _look_to(_turn_to(start, ahead, heading), looks, math.radians(params.max_turn_deg))
-    return Leg("look", f"turns {math.degrees(turn):.0f} degrees to see the way", _line([start]), turn, way, shown)
+        nothing = np.full(footing.lattice.shape, np.nan, np.float32)
+        return _stay("goal", f"{1000 * left:.0f} mm from the goal", start, [], nothing)
+    ground = Ground(footing, start, heading, params, closed, before)
+    goals, cost, move = ground.search(goal, 0.5 * params.tolerance * base)
+    shown = ground.on_map(cost)
+    if not np.isfinite(cost[0, ground.grid.origin[0], ground.grid.origin[1]]):
+        why = _why_closed(ground, goals, cost)
+        turn = 0.0 if looks >= params.looks else _free_turn(ground, 0.0, looks)
+        if turn:
+            return _stay("look", f"{why}: looks around", start, [], shown, turn)
+        return _stay("no path", why, start, [], shown)
+    way = ground.way(move)
+    sure = first_metres(way[: _sure(way)], 4.0 * params.length * base)
+    leg = first_metres(straightened(sure, heading, ground.clear, ground.cell), params.length * base)
+    if length_of(leg) >= min(params.least * base, length_of(way) - 1e-9):
+        leg, turn = within_turn(leg, heading, math.radians(params.max_turn_deg))
+        if leg:
+            gear = np.array([piece.gear for piece in leg], np.int8)
+            return Leg("drive", "", vertices(leg, start), gear, turn, vertices(way, start), shown)
+        return _stay("turn", f"turns {math.degrees(turn):.0f} degrees to where it goes on", start, way, shown, turn)
+    x, y = way[_sure(way)].b if _sure(way) < len(way) else way[-1].b
+    towards = math.remainder(math.atan2(-(x - start[0]), y - start[1]) - heading, 2 * math.pi)
+    turn = 0.0 if looks >= params.looks else _free_turn(ground, towards, looks)
+    if turn:
+        return _stay("look", f"turns {math.degrees(turn):.0f} degrees to see the way", start, way, shown, turn)
+    reason = f"{looks} looks around did not show the ground at ({x:.3f}, {y:.3f}) m"
+    return _stay("closed", reason, start, way, shown, where=(x, y))
 
 
-def _look_to(wanted: float, looks: int, bound: float) -> float:
-    """Turn to look along the way; where it looks there already, to one side and then to the other."""
-    if abs(wanted) < math.radians(8.0):
-        wanted = math.radians((25.0, -50.0, 75.0)[looks % 3])
-    return max(-bound, min(bound, wanted))
+def _away_from(way: Floats, lattice: Lattice, reach: float) -> Mask:
+    """Cells farther than ``reach`` metres from a way (vertex, 2)."""
+    n = max(2, math.ceil(_length(way) / lattice.cell))
+    ends = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(way, axis=0).T))])
+    points = np.stack([np.interp(np.linspace(0.0, ends[-1], n), ends, way[:, k]) for k in (0, 1)], axis=1)
+    at = np.rint(lattice.index(points)).astype(np.int64)
+    at = at[((at >= 0) & (at < lattice.shape)).all(axis=1)]
+    on = np.zeros(lattice.shape, bool)
+    on[at[:, 0], at[:, 1]] = True
+    return np.asarray(distance_transform_edt(~on) * lattice.cell > reach) if on.any() else ~on
 
 
-def shortest(
-    hazards: Hazards, lattice: Lattice, vehicle: Vehicle, start: Point, goal: Point, tolerance: float
-) -> float | None:
-    """Length, m, of the shortest way over known, free ground to within ``tolerance`` metres of the goal; None: none."""
-    xy = lattice.xy()
-    here = np.hypot(xy[..., 0] - start[0], xy[..., 1] - start[1]) <= 0.3 * vehicle.wheel_base
-    known = ((hazards.gap > vehicle.margin) & (hazards.unknown > 0.0) & hazards.free) | here
-    goals = np.hypot(xy[..., 0] - goal[0], xy[..., 1] - goal[1]) <= tolerance
-    cost, nearer = costs(np.where(known, 1.0, np.inf), goals, lattice.cell)
-    at = _cell_of(lattice, "start", start)
-    if not np.isfinite(cost[at]):
+def _stay(
+    verdict: str,
+    reason: str,
+    start: Point,
+    way: Sequence[Piece],
+    cost: NDArray[np.float32],
+    turn: float = 0.0,
+    where: Point | None = None,
+) -> Leg:
+    """A leg on the spot."""
+    return Leg(verdict, reason, vertices([], start), np.empty(0, np.int8), turn, vertices(way, start), cost, where)
+
+
+def _sure(way: Sequence[Piece]) -> int:
+    """Number of pieces before the first that is not known to be free."""
+    return next((i for i, piece in enumerate(way) if not piece.known), len(way))
+
+
+def _free_turn(ground: Ground, towards: float, looks: int) -> float:
+    """Turn (rad) to look along the way, where it looks there already to one side and then to the other, that the
+    wheels have room for; 0: none."""
+    bound = math.radians(ground.p.max_turn_deg)
+    aside = [math.radians(d) for d in (25.0, -50.0, 75.0)]
+    aside = aside[looks % 3 :] + aside[: looks % 3] + [math.radians(d) for d in (-25.0, 15.0, -15.0)]
+    wanted = [*([towards] if abs(towards) >= math.radians(8.0) else []), *aside]
+    for turn in (max(-bound, min(bound, w)) for w in wanted):
+        if turnable(ground.start, ground.heading, ground.heading + turn, ground.clear):
+            return turn
+    return 0.0
+
+
+def shortest(footing: Footing, start: Point, heading: float, goal: Point, params: LegParams) -> float | None:
+    """Length, m, of the shortest way over known ground, at no price but its length; None: none."""
+    free = {"unknown_price": math.inf, "near_price": 0.0, "caution_price": 0.0, "turn_price": 0.0, "back_price": 1.0}
+    ground = Ground(footing, start, heading, params.model_copy(update=free))
+    _, cost, move = ground.search(goal, 0.5 * params.tolerance * footing.vehicle.wheel_base)
+    if not np.isfinite(cost[0, ground.grid.origin[0], ground.grid.origin[1]]):
         return None
-    cells = _follow(nearer, at, lattice)
-    return _length(_safe_part(cells, _points(lattice, cells, start), known, lattice, math.inf))
+    return length_of(straightened(ground.way(move), heading, ground.clear, ground.cell))
 
 
-def _cell_of(lattice: Lattice, name: str, point: Point) -> tuple[int, int]:
+def _check(lattice: Lattice, name: str, point: Point) -> None:
     row, col = (int(v) for v in np.rint(lattice.index(point)))
     if not (0 <= row < lattice.rows and 0 <= col < lattice.cols):
         x0, x1, y0, y1 = lattice.bounds
@@ -231,94 +317,14 @@ def _cell_of(lattice: Lattice, name: str, point: Point) -> tuple[int, int]:
             f"the {name} ({point[0]:.3f}, {point[1]:.3f}) m is outside the map",
             remedy=f"give x in {x0:.3f}..{x1:.3f} and y in {y0:.3f}..{y1:.3f} m",
         )
-    return row, col
 
 
-def _why_closed(
-    price: Floats, goals: Mask, target: tuple[int, int], cost: Floats, at: tuple[int, int], lattice: Lattice
-) -> str:
-    if not np.isfinite(price[goals]).any():
+def _why_closed(ground: Ground, goals: Mask, cost: Floats) -> str:
+    if not np.isfinite(ground.graph.pose[:, goals]).any():
         return "the goal itself is on hazardous ground, or too near to it"
-    reach = np.isfinite(cost)
-    back = lattice.xy()[reach] - lattice.xy()[at]
-    gap = float(np.hypot(back[:, 0], back[:, 1]).min())
+    row, col = np.nonzero(np.isfinite(cost).any(axis=0))
+    gap = float(np.hypot(row - ground.grid.origin[0], col - ground.grid.origin[1]).min()) * ground.grid.spacing
     return f"hazards close every way: ground from which the goal can be reached ends {1000 * gap:.0f} mm away"
-
-
-def _line(points: list[Point]) -> Floats:
-    return np.array(points, dtype=np.float64).reshape(-1, 2)
-
-
-def _length(path: Floats) -> float:
-    return float(np.hypot(*np.diff(path, axis=0).T).sum()) if len(path) > 1 else 0.0
-
-
-def _follow(nearer: NDArray[np.int32], at: tuple[int, int], lattice: Lattice) -> NDArray[np.int64]:
-    """Cells (vertex, 2) from a cell to the goal."""
-    here = at[0] * lattice.cols + at[1]
-    cells = [here]
-    while nearer[here] >= 0:
-        here = int(nearer[here])
-        cells.append(here)
-    flat = np.array(cells)
-    return np.stack([flat // lattice.cols, flat % lattice.cols], axis=1)
-
-
-def _points(lattice: Lattice, cells: NDArray[np.int64], start: Point) -> Floats:
-    points = lattice.xy()[cells[:, 0], cells[:, 1]]
-    points[0] = start
-    return np.asarray(points)
-
-
-def _safe_part(cells: NDArray[np.int64], way: Floats, known: Mask, lattice: Lattice, length: float) -> Floats:
-    """The way up to where it is not known to be free, as straight pieces over free cells, and of it ``length`` metres.
-
-    It is straightened before it is cut: where a way on a grid turns is a matter of ties.
-    """
-    free = known[cells[:, 0], cells[:, 1]]
-    stop = int(np.argmin(free)) if not free.all() else len(free)
-    if stop < 2:
-        return way[:1]
-    chosen, i = [way[0]], 0
-    while i < stop - 1:
-        i = next(j for j in range(stop - 1, i, -1) if j == i + 1 or _sees(way[i], way[j], known, lattice))
-        chosen.append(way[i])
-    return _cut(np.array(chosen), length)
-
-
-def _cut(path: Floats, length: float) -> Floats:
-    """The first ``length`` metres of a path."""
-    out, left = [path[0]], length
-    for a, b in itertools.pairwise(path):
-        step = float(np.hypot(*(b - a)))
-        if step >= left:
-            return np.array([*out, a + (left / step) * (b - a)])
-        out.append(b)
-        left -= step
-    return np.array(out)
-
-
-def _sees(a: Floats, b: Floats, known: Mask, lattice: Lattice) -> bool:
-    """Whether the straight line from a to b stays on free cells."""
-    n = max(2, math.ceil(2.0 * math.hypot(*(b - a)) / lattice.cell))
-    points = a + np.linspace(0.0, 1.0, n)[:, None] * (b - a)
-    at = np.rint(lattice.index(points)).astype(np.int64)
-    return bool(known[at[:, 0], at[:, 1]].all())
-
-
-def _turn_to(a: Point | Floats, b: Point | Floats, heading: float) -> float:
-    return math.remainder(math.atan2(-(b[0] - a[0]), b[1] - a[1]) - heading, 2 * math.pi)
-
-
-def _within_turn(path: Floats, heading: float, bound: float) -> tuple[Floats, float]:
-    """The path as far as the turns on it stay within a bound, and the part of a larger first turn that does."""
-    total = 0.0
-    for k in range(len(path) - 1):
-        turn = _turn_to(path[k], path[k + 1], heading)
-        if abs(total + turn) > bound + 1e-9:
-            return path[: k + 1], (math.copysign(bound, turn) if k == 0 else 0.0)
-        total, heading = total + turn, heading + turn
-    return path, 0.0
 
 
 def _run(params: LegParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
@@ -329,13 +335,16 @@ def _run(params: LegParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     start = float(T.translation[0]), float(T.translation[1])
     heading = math.atan2(-T.rotation[0, 1], T.rotation[1, 1])
     goal = (float(args["goal"][0]), float(args["goal"][1]))
-    hazards = Hazards.of(np.asarray(risk["risk"]), np.asarray(risk["reason"]), lattice.cell, vehicle)
     closed = [(float(x), float(y)) for x, y in args["closed"]]
-    found = plan_leg(hazards, lattice, vehicle, start, heading, goal, params, int(args["looks"]), closed)
-    best = None
-    if args.get("whole"):
-        tolerance = 0.5 * params.tolerance * vehicle.wheel_base
-        best = shortest(hazards, lattice, vehicle, start, goal, tolerance)
+    before = np.asarray(inputs["before"]["way"]) if "before" in inputs else None
+    before = None if before is None or len(before) < 2 else before
+    maps = (np.asarray(risk["risk"]), np.asarray(risk["reason"]), lattice, vehicle, np.asarray(risk["p_hazard"]))
+    for sure in params.sure:
+        footing = Footing.of(*maps, sure)
+        found = plan_leg(footing, start, heading, goal, params, int(args["looks"]), closed, before)
+        if found.verdict == "goal" or len(found.way) > 1:
+            break
+    best = shortest(footing, start, heading, goal, params) if args.get("whole") else None
     meta = {
         "shortest_m": best,
         "verdict": found.verdict,
@@ -348,15 +357,19 @@ def _run(params: LegParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
         "length_m": _length(found.path),
         "way_m": _length(found.way),
     }
-    return Bundle({"path": found.path, "way": found.way, "cost_to_go": found.cost}, meta)
+    return Bundle({"path": found.path, "gear": found.gear, "way": found.way, "cost_to_go": found.cost}, meta)
+
+
+def _length(path: Floats) -> float:
+    return float(np.hypot(*np.diff(path, axis=0).T).sum()) if len(path) > 1 else 0.0
 
 
 STAGE = Stage(
     name="leg",
-    version=1,
+    version=2,
     summary="the next leg of a drive to a goal, over ground that is known to be free",
     params=LegParams,
-    inputs=("risk", "pose"),
+    inputs=("risk", "pose", "before?"),
     outputs=(
         Array(
             "path",
@@ -366,9 +379,10 @@ STAGE = Stage(
             "vertices of the leg, from where the vehicle stands",
             frame="world",
         ),
+        Array("gear", ("piece",), "int8", "1", "1 where the leg is driven ahead, -1 where it is driven back"),
         Array("way", ("way_vertex", "xy"), "float64", "m", "vertices of the way to the goal as planned", frame="world"),
         Array("cost_to_go", ("row", "col"), "float32", "m", "price of the way from each cell to the goal", "nan"),
     ),
-    requires=("numpy", "scipy"),
+    requires=("numpy", "numba", "scipy"),
     run=_run,
 )

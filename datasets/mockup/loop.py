@@ -23,13 +23,15 @@ LOOP: Mapping[str, Any] = {
     "focal_length": 180.0,
     "toe_in_deg": 3.0,
     "pitch_deg": 32.0,
+    "sampling": 1,
     "bed_width": 1.6,
     "bed_length": 2.0,
     "cell": 0.002,
     "rocks": 12.0,
     "craters": 4.0,
 }
-"""``mockup-loop``: small images of wide-angle cameras, which see the ground from 0.08 m before them to the horizon."""
+"""``mockup-loop``: small images of wide-angle cameras, which see the ground from 0.08 m before them to the horizon;
+one ray a pixel, since a drive takes a hundred of them."""
 
 DEFAULTS: Mapping[str, Any] = {
     "hfvm.preset": "default",

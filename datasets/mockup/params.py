@@ -49,6 +49,9 @@ class RenderParams(Params):
     """The camera as a sensor: optics, exposure and noise."""
 
     seed: int = Field(1, ge=0, description="seed of the sensor noise")
+    sampling: int = Field(
+        2, ge=1, le=4, description="rays a pixel, along either axis; what a ray sees of the grain is as wide as it"
+    )
     blur: float = Field(0.6, ge=0.0, le=5.0, description="px, standard deviation of the optics' point spread")
     noise: float = Field(1.5, ge=0.0, le=50.0, description="grey levels, standard deviation of the sensor noise")
     exposure: float = Field(1.0, gt=0.0, le=10.0, description="factor on the grey values; 1 gives a mean of about 100")

@@ -1,6 +1,6 @@
 """Stage ``mockup.render``: one image of the bed by one camera.
 
-2 x 2 rays a pixel; McEwen's lunar-Lambert reflectance 2 L mu0 / (mu0 + mu) + (1 - L) mu0 (doi:10.1016/0019-1035(91)
+Some rays a pixel; McEwen's lunar-Lambert reflectance 2 L mu0 / (mu0 + mu) + (1 - L) mu0 (doi:10.1016/0019-1035(91)
 90038-7), the first term Lommel-Seeliger; anisotropic look-up of the albedo pyramid by footprint; then optics blur,
 vignetting, exposure, noise and quantisation.
 """
@@ -23,7 +23,6 @@ from datasets.mockup.terrain import EMISSION
 from stages.declare import Array, Bundle, Inputs, Memory, Stage
 from stages.geometry import Camera, RigidTransform
 
-SUPERSAMPLING = 2
 LUNAR = 0.6
 """McEwen's L near 70 degrees of phase angle, the usual one here."""
 AMBIENT = 0.05
@@ -132,13 +131,14 @@ def sun_direction(elevation_deg: float, azimuth_deg: float) -> NDArray[np.float6
 
 
 def radiance(
-    scene: Bundle, field: HeightField, camera: Camera, T_bed_camera: RigidTransform
+    scene: Bundle, field: HeightField, camera: Camera, T_bed_camera: RigidTransform, sampling: int = 2
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Radiance of every ray, float32 (row, 2, col, 2), NaN beside the bed; and the bed's mask, bool (row, col).
+    """Radiance of every ray, float32 (row, n, col, n) for n = ``sampling``, NaN beside the bed; and the bed's mask,
+    bool (row, col).
 
     The mask is true where all rays of the pixel and of its eight neighbours hit the bed.
     """
-    rays = camera_rays(camera, T_bed_camera, SUPERSAMPLING)
+    rays = camera_rays(camera, T_bed_camera, sampling)
     origin = T_bed_camera.translation
     distance = field.cast(origin[None, :], rays)
     mips = [np.asarray(scene[f"albedo_{k}"][:]) for k in range(sum(n.startswith("albedo_") for n in scene.arrays))]
@@ -154,17 +154,17 @@ def radiance(
         np.ascontiguousarray(origin),
         rays,
         distance,
-        1.0 / (SUPERSAMPLING * camera.fx),
+        1.0 / (sampling * camera.fx),
         sun_direction(light["sun_elevation_deg"], light["sun_azimuth_deg"]),
     )
-    blocks = values.reshape(camera.height, SUPERSAMPLING, camera.width, SUPERSAMPLING)
+    blocks = values.reshape(camera.height, sampling, camera.width, sampling)
     hit = np.isfinite(blocks).all(axis=(1, 3))
     mask = ndimage.binary_erosion(hit, np.ones((3, 3)), border_value=1)
     return blocks, np.asarray(mask)
 
 
 def expose(blocks: NDArray[np.float32], p: RenderParams, flat: float, frame: int, camera: str) -> NDArray[np.uint8]:
-    """Grey image uint8 (row, col) from radiance samples (row, 2, col, 2); ``flat`` is the radiance of level ground."""
+    """Grey image uint8 (row, col) from radiance samples (row, n, col, n); ``flat`` is the radiance of level ground."""
     rng = np.random.default_rng([p.seed, 50, frame, CAMERA_INDEX[camera]])
     gain = LEVEL_GREY / flat * p.exposure * (1.0 + p.exposure_jitter * float(rng.standard_normal()))
     gain *= p.right_gain if camera == "right" else 1.0
@@ -197,7 +197,7 @@ def render(
     frame, name : number of the pair and ``"left"`` or ``"right"``; with the seed they fix the noise.
     """
     field = height_field(scene)
-    blocks, mask = radiance(scene, field, camera, T_bed_camera)
+    blocks, mask = radiance(scene, field, camera, T_bed_camera, params.sampling)
     flat = flat_radiance(scene.meta["scene"]["sun_elevation_deg"])
     return expose(blocks, params, flat, frame, name), mask.astype(np.uint8)
 

@@ -9,7 +9,7 @@ rover; what its sensors tell of it is stage ``mockup.sense``.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -108,6 +108,7 @@ def drive_leg(
     before: tuple[float, float, float],
     believed: tuple[float, float, float],
     path: Floats,
+    gear: Sequence[int],
     turn: float,
     p: RoverParams,
     rng: np.random.Generator,
@@ -118,6 +119,7 @@ def drive_leg(
     ----------
     before, believed : x, y (m), heading (rad) on the bed, and where the rover believes to be in the path's frame.
     path : (vertex, 2) m, the first one where the rover believes to stand.
+    gear : of each piece of the path, 1 ahead or -1 back.
     turn : rad; turned on the spot at the end.
     """
     slip = p.slip + p.slip_sigma * float(rng.standard_normal())
@@ -134,12 +136,13 @@ def drive_leg(
         n = math.ceil(abs(by) / STEP_TURN)
         return all(d.advance(0.0, spin * by / n, 0.0, by / n) for _ in range(n))
 
-    for vertex in path[1:]:
-        dx, dy = vertex[0] - x, vertex[1] - y
+    for vertex, sign in zip(path[1:], gear, strict=True):
+        dx, dy = sign * (vertex[0] - x), sign * (vertex[1] - y)
         way, towards = math.hypot(dx, dy), math.atan2(-dx, dy)
-        n = math.ceil(way / STEP)
+        n = max(1, math.ceil(way / STEP))
+        rolled = sign * way / n
         there = rotate(math.remainder(towards - heading, 2 * math.pi)) and all(
-            d.advance((1.0 - slip) * way / n, drift * way / n, way / n, 0.0) for _ in range(n)
+            d.advance((1.0 - slip) * rolled, drift * way / n, rolled, 0.0) for _ in range(n)
         )
         if not there:
             break
@@ -181,15 +184,15 @@ def _run(params: RoverParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle
         T = RigidTransform.from_matrix(np.asarray(inputs["before"]["vehicle"])[int(args["row"])])
         before = float(T.translation[0]), float(T.translation[1]), heading_of(T)
         believed = RigidTransform.from_matrix(np.asarray(inputs["pose"]["poses"])[-1]) @ T_left_vehicle
-        path = np.asarray(inputs["leg"]["path"])[:, :2]
+        path, gear = np.asarray(inputs["leg"]["path"])[:, :2], np.asarray(inputs["leg"]["gear"]).tolist()
         start = float(believed.translation[0]), float(believed.translation[1]), heading_of(believed)
         turn = float(inputs["leg"].meta["turn"])
     else:
         before = *params.start, math.radians(params.heading_deg)
-        path, start, turn = np.zeros((1, 2)), (0.0, 0.0, 0.0), 0.0
+        path, gear, start, turn = np.zeros((1, 2)), [], (0.0, 0.0, 0.0), 0.0
     length = float(np.hypot(*np.diff(path, axis=0).T).sum()) if len(path) > 1 else 0.0
     ground = bed_ground(scene, vehicle, before[:2], length + REACH)
-    d = drive_leg(ground, vehicle, before, start, path, turn, params, rng)
+    d = drive_leg(ground, vehicle, before, start, path, gear, turn, params, rng)
     wheels = np.array(d.wheels)
     frames = images_at(wheels, params)
     vehicles = np.stack([s.T_ground_vehicle.matrix34 for s in d.trail])
@@ -213,7 +216,7 @@ def _trail(name: str, unit: str, long_name: str) -> Array:
 
 STAGE = Stage(
     name="mockup.drive",
-    version=1,
+    version=2,
     summary="true motion of the simulated rover along one leg",
     params=RoverParams,
     inputs=("scene", "before?", "pose?", "leg?"),

@@ -22,7 +22,7 @@ FLAT = Ground.of(0.0 * X, -0.5, 0.5, 0.004, VEHICLE.wheel_diameter)
 
 
 def driven(p: RoverParams, turn: float = 0.0, seed: int = 0, believed: tuple[float, float, float] = (0.0, 0.0, 0.0)):
-    return drive_leg(FLAT, VEHICLE, (0.0, 0.0, 0.0), believed, PATH, turn, p, np.random.default_rng(seed))
+    return drive_leg(FLAT, VEHICLE, (0.0, 0.0, 0.0), believed, PATH, [1, 1], turn, p, np.random.default_rng(seed))
 
 
 def test_without_errors_it_is_where_it_was_sent_and_the_wheels_say_so() -> None:
@@ -68,9 +68,20 @@ def test_images_are_taken_by_way_and_turn() -> None:
         assert turn <= math.radians(EXACT.frame_turn_deg + 2.5)
 
 
+def test_a_piece_that_is_driven_back_is_driven_back() -> None:
+    rng = np.random.default_rng(0)
+    behind = np.array([[0.0, 0.0], [0.0, -0.1], [0.0, 0.05]])
+    d = drive_leg(FLAT, VEHICLE, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), behind, [-1, 1], 0.0, EXACT, rng)
+    y = np.array([s.T_ground_vehicle.translation[1] for s in d.trail])
+    assert y.min() == pytest.approx(-0.1)
+    assert y[-1] == pytest.approx(0.05)
+    assert np.abs([heading_of(s.T_ground_vehicle) for s in d.trail]).max() < 1e-12
+    assert np.array(d.wheels)[:, 1] == pytest.approx(y)
+
+
 def test_beside_the_bed_it_is_not_placed() -> None:
     with pytest.raises(InputError, match="beside the bed"):
-        drive_leg(FLAT, VEHICLE, (0.5, 0.0, 0.0), (0.0, 0.0, 0.0), PATH, 0.0, EXACT, np.random.default_rng(0))
+        drive_leg(FLAT, VEHICLE, (0.5, 0.0, 0.0), (0.0, 0.0, 0.0), PATH, [1, 1], 0.0, EXACT, np.random.default_rng(0))
 
 
 def test_a_place_along_and_beside_a_path() -> None:

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -77,6 +81,28 @@ def test_driven_again_nothing_is_computed_and_all_is_the_same(arrived: tuple[Dri
     assert result.total().computed == 0
     assert flow.outcome() == arrived[0].outcome()
     assert [s.frames for s in flow.driven.stops] == [s.frames for s in arrived[0].driven.stops]
+    assert {h.label: h.ref.digest for h in flow.graph.nodes if h.ref} == {
+        h.label: h.ref.digest for h in arrived[0].graph.nodes if h.ref
+    }
+
+
+@pytest.mark.slow
+def test_killed_in_the_middle_it_goes_on_to_the_same_bits(arrived: tuple[Drive, Result], tmp_path: Path) -> None:
+    here, cache = Path(__file__).parent, tmp_path / "cache"
+    program = "import sys, pathlib, test_drive; test_drive.drive(pathlib.Path(sys.argv[1]))"
+    paths = os.pathsep.join([str(here), str(here.parents[1])])
+    driving = subprocess.Popen([sys.executable, "-c", program, str(cache)], env=os.environ | {"PYTHONPATH": paths})
+    try:
+        while not list(cache.glob("labels/leg/*/leg%2F1.json")):
+            assert driving.poll() is None, "it had ended before it was killed"
+            time.sleep(0.05)
+    finally:
+        driving.kill()
+        driving.wait()
+    flow, result = drive(cache)
+    assert result.total().cached > 10
+    assert result.total().computed > 10
+    assert flow.outcome() == arrived[0].outcome()
     assert {h.label: h.ref.digest for h in flow.graph.nodes if h.ref} == {
         h.label: h.ref.digest for h in arrived[0].graph.nodes if h.ref
     }

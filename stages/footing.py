@@ -1,0 +1,151 @@
+"""Where a vehicle may stand on a risk map, at any place and heading: its wheels and its belly laid over the map.
+
+What is hazardous to a wheel was found in a window as large as the wheel, so it counts where the middle of a wheel is:
+the vehicle may pass a stone between its wheels, since what the belly cannot pass over (tilt, slope, rise, for the worst
+heading) is hazardous to its middle. Unknown ground may be neither under a wheel nor under the belly.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
+
+from stages.hazards import BITS
+from stages.lattice import Lattice
+from stages.path import WHEEL_BITS
+from stages.risk import CAUTION, DOUBT_BIT, HAZARDOUS, UNKNOWN
+from stages.vehicle import Vehicle
+from stages.wheels import wheel_positions
+
+Floats = NDArray[np.float64]
+Floats32 = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+BODY_BITS = np.uint16(sum(BITS.values()) - int(WHEEL_BITS))
+"""Hazards to the vehicle with its middle on the cell."""
+
+NEAR_UNKNOWN = 0.5
+"""Cells; nearer than this a point of the belly lies in an unknown cell."""
+
+
+@dataclass(frozen=True)
+class Gaps:
+    """Of each pose, float32: ``gap`` m to the nearest hazard (from wheel to what is hazardous to wheels, from the
+    middle to what is to the vehicle; farther by the margin to what is one by sigma alone), ``proven`` m to those that
+    are proven, ``unknown`` m at least from wheels and belly to unknown ground (not positive: on it), ``caution`` share
+    of wheels and middle on caution ground. With its middle outside the map a vehicle is within a hazard."""
+
+    gap: Floats32
+    proven: Floats32
+    unknown: Floats32
+    caution: Floats32
+
+
+@dataclass(frozen=True)
+class Footing:
+    """A risk map as a vehicle meets it: ``fields`` (4, row, col) m to hazards to a wheel, proven ones, hazards to the
+    vehicle, proven ones; ``unknown`` (row, col) m to unknown ground; ``caution`` (row, col) 1 there."""
+
+    lattice: Lattice
+    vehicle: Vehicle
+    fields: Floats32
+    unknown: Floats32
+    caution: NDArray[np.uint8]
+
+    @staticmethod
+    def of(
+        risk: NDArray[np.uint8],
+        reason: NDArray[np.uint16] | None,
+        lattice: Lattice,
+        vehicle: Vehicle,
+        p_hazard: NDArray[np.float32] | None = None,
+        sure: float = 0.5,
+    ) -> Footing:
+        """From classes and reason bits of :mod:`stages.risk`; without bits every hazard is one to a wheel.
+
+        A hazard is proven where it is not one by sigma alone, and at least as probable as ``sure``.
+        """
+        hazardous, cell = risk == HAZARDOUS, lattice.cell
+        bits = np.full(risk.shape, WHEEL_BITS) if reason is None else reason
+        doubtful = hazardous & ((bits & DOUBT_BIT) > 0)
+        likely = proven = hazardous & ~doubtful
+        if p_hazard is not None:
+            proven = likely & (p_hazard >= sure)
+        kinds = [(bits & which) > 0 for which in (WHEEL_BITS, BODY_BITS)]
+        fields = []
+        for kind in kinds:
+            # sigma is the room for error there: the margin is not added to it
+            beside = _distance(doubtful & kind, cell) + np.float32(vehicle.margin)
+            fields += [np.minimum(_distance(likely & kind, cell), beside), _distance(proven & kind, cell)]
+        unknown = risk == UNKNOWN
+        return Footing(lattice, vehicle, np.stack(fields), _distance(unknown, cell), (risk == CAUTION).astype(np.uint8))
+
+    def gaps(self, x: Floats, y: Floats, heading: Floats) -> Gaps:
+        """At poses: x, y of the middle (m) and heading (rad to the left of y), arrays of one shape."""
+        at = self.lattice.index(np.stack([x, y], axis=-1)).reshape(-1, 2)
+        turn = np.broadcast_to(heading, np.shape(x)).reshape(-1)
+        out = np.empty((4, len(at)), np.float32)
+        cell = self.lattice.cell
+        reach = 0.5 * math.hypot(self.vehicle.track, self.vehicle.wheel_base) + cell
+        _gaps(
+            at, np.cos(turn), np.sin(turn), wheel_positions(self.vehicle) / cell, _belly(self.vehicle) / cell,
+            self.fields, self.unknown, self.caution, np.float32(reach), out,
+        )  # fmt: skip
+        out[2] -= NEAR_UNKNOWN * cell
+        return Gaps(*(a.reshape(np.shape(x)) for a in out))
+
+
+def _distance(mask: Mask, cell: float) -> Floats32:
+    far = distance_transform_edt(~mask) * cell if mask.any() else np.full(mask.shape, np.inf)
+    return np.asarray(far, dtype=np.float32)
+
+
+def _belly(vehicle: Vehicle) -> Floats:
+    """Points (n, 2) right and ahead of the middle, m, at most half a wheel apart."""
+    sides = [np.linspace(-0.5, 0.5, 1 + math.ceil(v / (0.5 * vehicle.wheel_diameter))) * v
+             for v in (vehicle.track, vehicle.wheel_base)]  # fmt: skip
+    return np.stack(np.meshgrid(*sides), axis=-1).reshape(-1, 2)
+
+
+@njit(cache=True, nogil=True)
+def _gaps(at, cosine, sine, wheels, belly, fields, unknown, caution, reach, out):  # type: ignore[no-untyped-def]
+    rows, cols = unknown.shape
+    for n in range(at.shape[0]):
+        row, col, c, s = at[n, 0], at[n, 1], cosine[n], sine[n]
+        for k in range(4):
+            out[k, n] = np.float32(-1.0) if k == 2 else np.float32(0.0)
+        i, j = math.floor(row + 0.5), math.floor(col + 0.5)
+        if i < 0 or j < 0 or i >= rows or j >= cols:
+            out[0, n] = out[1, n] = -np.inf
+            continue
+        gap, proven, share = fields[2, i, j], fields[3, i, j], np.float32(caution[i, j])
+        spare = unknown[i, j] - reach
+        outside = False
+        for k in range(4):
+            a, b = wheels[k, 0], wheels[k, 1]
+            i, j = math.floor(row - (a * s + b * c) + 0.5), math.floor(col + (a * c - b * s) + 0.5)
+            if i < 0 or j < 0 or i >= rows or j >= cols:
+                outside = True
+                continue
+            gap, proven = min(gap, fields[0, i, j]), min(proven, fields[1, i, j])
+            share += caution[i, j]
+        out[0, n], out[1, n], out[3, n] = gap, proven, share / np.float32(5.0)
+        if outside:
+            continue
+        if spare > 0:  # nothing unknown within the circle about the vehicle
+            out[2, n] = spare
+            continue
+        least = np.float32(np.inf)
+        for k in range(belly.shape[0]):
+            a, b = belly[k, 0], belly[k, 1]
+            i, j = math.floor(row - (a * s + b * c) + 0.5), math.floor(col + (a * c - b * s) + 0.5)
+            i, j = min(max(i, 0), rows - 1), min(max(j, 0), cols - 1)
+            least = min(least, unknown[i, j])
+            if least <= 0:
+                break
+        out[2, n] = least

@@ -1,0 +1,88 @@
+"""Poses on a risk map: distances by hand, and by looking at every cell."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from stages.footing import Footing
+from stages.lattice import Lattice
+from stages.risk import CAUTION, HAZARDOUS, REASONS, SAFE, UNKNOWN
+from stages.vehicle import Vehicle
+
+ROVER = Vehicle(
+    wheel_diameter=0.03, track=0.08, wheel_base=0.10, clearance=0.025, max_step=0.012, max_roughness=0.004, margin=0.01
+)
+LATTICE = Lattice.snap((-0.3, 0.3, -0.3, 0.3), 0.005)
+XY = LATTICE.xy()
+X, Y = XY[..., 0], XY[..., 1]
+WHEELS = np.array([(a, b) for a in (-0.04, 0.04) for b in (-0.05, 0.05)])
+
+
+def at(footing: Footing, x: float, y: float, heading: float) -> tuple[float, float, float, float]:
+    g = footing.gaps(np.array([x]), np.array([y]), np.array([heading]))
+    return float(g.gap[0]), float(g.proven[0]), float(g.unknown[0]), float(g.caution[0])
+
+
+def test_turned_by_a_right_angle_the_wheels_are_where_they_are() -> None:
+    risk = np.full(LATTICE.shape, SAFE, np.uint8)
+    risk[np.hypot(X - 0.05, Y - 0.1) < 1e-9] = HAZARDOUS
+    footing = Footing.of(risk, None, LATTICE, ROVER)
+    assert at(footing, 0.0, 0.0, 0.0)[0] == pytest.approx(math.hypot(0.01, 0.05))
+    assert at(footing, 0.0, 0.0, math.pi / 2)[0] == pytest.approx(math.hypot(0.0, 0.06))  # a wheel is at (0.05, 0.04)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**31), st.floats(-0.2, 0.2), st.floats(-0.2, 0.2), st.floats(-3.1, 3.1))
+def test_gaps_are_those_of_looking_at_every_cell(seed: int, x: float, y: float, heading: float) -> None:
+    rng = np.random.default_rng(seed)
+    risk = rng.choice([SAFE, HAZARDOUS, UNKNOWN], LATTICE.shape, p=[0.98, 0.01, 0.01]).astype(np.uint8)
+    reason = np.where(rng.random(risk.shape) < 0.5, REASONS["tilt"], REASONS["step"]).astype(np.uint16)
+    gap, _, unknown, _ = at(Footing.of(risk, reason, LATTICE, ROVER), x, y, heading)
+    c, s = math.cos(heading), math.sin(heading)
+    wheels = WHEELS @ np.array([[c, s], [-s, c]]) + (x, y)
+    step, tilt = (XY[(risk == HAZARDOUS) & (reason == REASONS[name])] for name in ("step", "tilt"))
+    least = min(
+        float(np.hypot(*(wheels[:, None] - step[None]).transpose(2, 0, 1)).min()),
+        float(np.hypot(*(tilt - (x, y)).T).min()),
+    )
+    half = 0.5 * math.sqrt(2) * LATTICE.cell  # a point counts as the middle of its cell
+    assert gap == pytest.approx(least, abs=half + 1e-6)
+    inside = (XY[risk == UNKNOWN] - (x, y)) @ np.array([[c, -s], [s, c]])
+    beside = (np.abs(inside) > np.array([0.04, 0.05]) + 2 * half).any(axis=1)
+    if beside.all():
+        assert unknown > 0
+
+
+def test_unknown_ground_wider_than_half_a_wheel_is_never_missed() -> None:
+    for x, y in np.random.default_rng(1).uniform((-0.04, -0.05), (0.04, 0.05), (60, 2)):
+        risk = np.full(LATTICE.shape, SAFE, np.uint8)
+        risk[np.hypot(X - x, Y - y) < 0.0125] = UNKNOWN
+        assert at(Footing.of(risk, None, LATTICE, ROVER), 0.0, 0.0, 0.0)[2] <= 0
+
+
+def test_outside_the_map_it_may_not_be() -> None:
+    footing = Footing.of(np.full(LATTICE.shape, SAFE, np.uint8), None, LATTICE, ROVER)
+    assert at(footing, 0.0, 0.0, 0.0) == (np.inf, np.inf, np.inf, 0.0)
+    assert at(footing, 0.27, 0.0, 0.0)[2] < 0  # two wheels are beyond its edge
+    assert at(footing, 0.4, 0.0, 0.0)[:2] == (-np.inf, -np.inf)
+
+
+def test_hazards_of_little_probability_are_not_proven() -> None:
+    risk = np.where(np.hypot(X, Y - 0.1) < 0.01, np.uint8(HAZARDOUS), np.uint8(SAFE))
+    p = np.where(Y > 0.1, 0.6, 0.95).astype(np.float32)
+    reason = np.full(risk.shape, REASONS["step"], np.uint16)
+    gap, proven, _, _ = at(Footing.of(risk, reason, LATTICE, ROVER, p, 0.9), 0.04, 0.17, 0.0)
+    below = at(Footing.of(risk, reason, LATTICE, ROVER, p, 0.5), 0.04, 0.17, 0.0)
+    assert gap == below[0] == below[1]
+    assert proven > gap
+
+
+def test_caution_counts_wheels_and_middle() -> None:
+    risk = np.where(X > 0.02, np.uint8(CAUTION), np.uint8(SAFE))
+    footing = Footing.of(risk, None, LATTICE, ROVER)
+    assert [at(footing, x, 0.0, 0.0)[3] for x in (-0.1, 0.0, 0.1)] == pytest.approx([0.0, 0.4, 1.0])
