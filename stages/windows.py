@@ -63,8 +63,11 @@ def window_count(mask: Mask, n: int) -> NDArray[np.int32]:
 
 @njit(cache=True, nogil=True)
 def _count(a, half, out):  # type: ignore[no-untyped-def]
+    """Columns' counts move down with the window; along a row they are added by doubling, whole lines at a time."""
     rows, cols = a.shape
+    wide = cols + 2 * half
     total = np.zeros(cols, dtype=np.int32)
+    line, done = np.zeros(wide, dtype=np.int32), np.zeros(wide, dtype=np.int32)
     for r in range(-half, rows):
         for row, sign in ((r + half, 1), (r - half - 1, -1)):
             if 0 <= row < rows:
@@ -72,51 +75,97 @@ def _count(a, half, out):  # type: ignore[no-untyped-def]
                     total[c] += sign if a[row, c] else 0
         if r < 0:
             continue
-        s = 0
-        for c in range(min(half, cols)):
-            s += total[c]
-        for c in range(cols):
-            if c + half < cols:
-                s += total[c + half]
-            if c > half:
-                s -= total[c - half - 1]
-            out[r, c] = s
+        line[:] = 0
+        line[half : half + cols] = total
+        _sums(line, done, 2 * half + 1)
+        out[r] = done[:cols]
+
+
+@njit(cache=True, nogil=True)
+def _sums(line, done, n):  # type: ignore[no-untyped-def]
+    """``done[c]`` = sum of c .. c + n - 1 of ``line``, which is used up."""
+    m = line.shape[0]
+    done[:] = 0
+    w, have = 1, 0
+    while True:
+        if n & w:  # ``done`` holds sums of ``have``, ``line`` those of ``w``
+            for c in range(m - w):
+                done[c] = line[c] + done[c + w]
+            for c in range(m - w, m):
+                done[c] = line[c]
+            have += w
+        if have == n:
+            break
+        for c in range(m - w):
+            line[c] += line[c + w]
+        w *= 2
 
 
 def window_mean(a: Floats32, n: int) -> Floats32:
     """Mean (row, col) of the known cells in the window; NaN where there is none."""
-    known = a == a
-    offset = np.float32(a[known].mean(dtype=np.float64)) if known.any() else np.float32(0)
     out = np.empty(a.shape, dtype=np.float32)
-    _mean(np.ascontiguousarray(a), n // 2, offset, out)
+    _mean(np.ascontiguousarray(a), n // 2, out)
     return out
 
 
+LANES = 8
+"""Rows whose sums along the columns run side by side: each waits for its own last one only."""
+
+
 @njit(cache=True, nogil=True)
-def _mean(a, half, offset, out):  # type: ignore[no-untyped-def]
+def _mean(a, half, out):  # type: ignore[no-untyped-def]
     """Sums of the columns move down with the window, the sum over columns along each row."""
     rows, cols = a.shape
+    offset = _middle(a)
     total, count = np.zeros(cols), np.zeros(cols)
+    sums, counts = np.zeros((cols + 2 * half + 1, LANES)), np.zeros((cols + 2 * half + 1, LANES))
+    s, n = np.zeros(LANES), np.zeros(LANES)
+    means = np.empty((cols, LANES), dtype=np.float32)
     for r in range(-half, rows):
         for row, sign in ((r + half, 1.0), (r - half - 1, -1.0)):
             if 0 <= row < rows:
-                for c in range(cols):
-                    v = a[row, c] - offset
-                    known = v == v
-                    total[c] += sign * v if known else 0.0
-                    count[c] += sign if known else 0.0
+                _add_row(a[row], offset, sign, total, count)
         if r < 0:
             continue
-        s, n = 0.0, 0.0
+        lane = r % LANES
+        for c in range(cols):
+            sums[c + half + 1, lane], counts[c + half + 1, lane] = total[c], count[c]
+        if lane < LANES - 1 and r < rows - 1:
+            continue
+        s[:], n[:] = 0.0, 0.0
         for c in range(-half, cols):
-            if c + half < cols:
-                s += total[c + half]
-                n += count[c + half]
+            for k in range(LANES):
+                s[k] += sums[c + 2 * half + 1, k]
+                n[k] += counts[c + 2 * half + 1, k]
             if c > half:
-                s -= total[c - half - 1]
-                n -= count[c - half - 1]
+                for k in range(LANES):
+                    s[k] -= sums[c, k]
+                    n[k] -= counts[c, k]
             if c >= 0:
-                out[r, c] = s / n + offset if n > 0.5 else np.nan
+                for k in range(LANES):
+                    means[c, k] = s[k] / n[k] + offset if n[k] > 0.5 else np.nan
+        for k in range(lane + 1):
+            for c in range(cols):
+                out[r - lane + k, c] = means[c, k]
+
+
+@njit(cache=True, nogil=True)
+def _add_row(line, offset, sign, total, count):  # type: ignore[no-untyped-def]
+    for c in range(line.shape[0]):
+        v = line[c] - offset
+        known = v == v
+        total[c] += sign * v if known else 0.0
+        count[c] += sign if known else 0.0
+
+
+@njit(cache=True, nogil=True)
+def _middle(a):  # type: ignore[no-untyped-def]
+    """Mean of the known cells; 0 where there is none."""
+    total, count = np.zeros(a.shape[1]), np.zeros(a.shape[1])
+    for r in range(a.shape[0]):
+        _add_row(a[r], np.float32(0.0), 1.0, total, count)
+    n = count.sum()
+    return np.float32(total.sum() / n) if n > 0 else np.float32(0.0)
 
 
 @dataclass(frozen=True)
