@@ -47,9 +47,10 @@ def running_max(surface: Floats32, reach: int) -> Floats32:
 
 
 def relief(surface: Floats32, near: int, reach: int) -> tuple[Floats32, Floats32]:
-    """Highest minus lowest value (row, col) within two octagons, ``near`` and ``reach`` >= near; 0 where all is unknown.
+    """Highest minus lowest value (row, col) within two octagons, ``near`` and ``reach`` >= near.
 
-    The larger octagon is the smaller one widened once more, so it starts from that one's extrema.
+    It is 0 where all is unknown. The larger octagon is the smaller one widened once more, so it starts from that one's
+    extrema.
     """
     side, diagonal = octagon(near)
     more, steps = (b - a for a, b in zip((side, diagonal), octagon(reach), strict=True))

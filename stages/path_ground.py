@@ -1,4 +1,4 @@
-"""A risk map on the grid of a planner: where the vehicle may stand, what a step costs, and which ground is connected."""
+"""A risk map on the grid of a planner: where the vehicle may stand, what a step costs, which ground is connected."""
 
 from __future__ import annotations
 
@@ -59,11 +59,12 @@ class Ground:
         hazard, unknown = risk == HAZARDOUS, risk == UNKNOWN
         self.closed = hazard | unknown
         wheels, body = (hazard & ((reason & bits) > 0) for bits in (WHEEL_BITS, BODY_BITS))
-        self._stand = Stand(wheels, body, vehicle, grid.cell, unknown)
+        self._stand = Stand(wheels, body, vehicle, grid.cell, unknown, self.closed)
         mean = window_mean(maps["elevation"], window_cells(vehicle.wheel_diameter, lattice.cell))
         self.stand = grid.sample(lattice, mean, np.nan)
-        self.height, self.toll = np.empty(risk.shape, dtype=np.int32), np.empty(risk.shape, dtype=np.int32)
         toll = round(caution * grid.cell / unit)
+        self.height = np.empty(risk.shape, dtype=np.int32)
+        self.toll = np.empty(risk.shape, dtype=np.int16 if toll <= np.iinfo(np.int16).max else np.int64)
         if _price(self.stand, risk, np.float32(unit), toll, self.height, self.toll) > LARGE:
             self.height = np.rint(np.where(self.closed, np.float32(0), self.stand) / np.float32(unit)).astype(np.int64)
         self._ways: dict[str, Bytes] = {}
@@ -72,9 +73,7 @@ class Ground:
     def ways(self, below: str) -> Bytes:
         """Directions (row, col) as bits with ``below``, one of :data:`GROUNDS`, on the known."""
         if below not in self._ways:
-            ways = self._stand.ways(below)
-            ways[self.closed] = 0
-            self._ways[below] = ways
+            self._ways[below] = self._stand.ways(below)
         return self._ways[below]
 
     def parts(self, below: str) -> tuple[NDArray[np.int32], Ints]:
@@ -101,7 +100,7 @@ class Ground:
         return np.column_stack([self.grid.xy(row, col), self.stand[row, col]])
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _price(stand, risk, unit, caution, height, toll):  # type: ignore[no-untyped-def]
     """Heights in units and tolls; returns the greatest magnitude of a height."""
     most = np.float32(0.0)
@@ -115,7 +114,7 @@ def _price(stand, risk, unit, caution, height, toll):  # type: ignore[no-untyped
     return most
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _metres(cost, unreached, each, unit, out):  # type: ignore[no-untyped-def]
     for r in range(cost.shape[0]):
         for c in range(cost.shape[1]):

@@ -13,12 +13,13 @@ Guarantees, each tested: of two elevation models the one with the greater relief
 the greater standard deviations, is in no cell the safer one; nor is it with a larger ``sigmas``.
 
 Holes. A window is judged on what is known of it, so unknown does not grow; a hazard that is proven by a part is one.
-Small holes are closed with a flag. Their standard deviation has half the range of the rim (:mod:`stages.holes`); their
-heights lie within it, so they add no relief of their own.
+Small holes are closed with a flag. Their heights lie within the range of the rim (:mod:`stages.holes`), anywhere in
+it as far as is known, so they add no relief of their own, and their standard deviation is that of such a height.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -52,6 +53,10 @@ Floats32 = NDArray[np.float32]
 REASONS = BITS | {"unknown": UNKNOWN_BIT, "filled": FILLED_BIT, "uncertain": DOUBT_BIT, "unseen": UNSEEN_BIT}
 """Bits of ``reason``: a measure over its limit; too little known to judge; elevation interpolated; over a limit only
 because of sigma; some of the ground that is looked at is unknown."""
+
+
+RIM = 1.0 / math.sqrt(12.0)
+"""Standard deviation of a height that lies anywhere within a range, of that range."""
 
 
 class RiskParams(Params):
@@ -112,7 +117,7 @@ def risk_map(
     window = p.window * vehicle.wheel_diameter
     s = np.where(np.isfinite(elevation_std), elevation_std, np.float32(0)).astype(np.float32, copy=False)
     z, s, filled = close_holes(
-        elevation, s, p.max_hole * vehicle.wheel_diameter / cell, window_cells(window, cell), p.min_known
+        elevation, s, p.max_hole * vehicle.wheel_diameter / cell, window_cells(window, cell), p.min_known, rim=RIM
     )
     measured = measure(elevation, z, s, cell, vehicle, window)
     rules = Rules(p.sigmas, p.caution, p.max_p, p.min_known)
@@ -171,7 +176,7 @@ _GRID = ("row", "col")
 
 STAGE = Stage(
     name="risk",
-    version=2,
+    version=3,
     summary="safe, caution, hazard and unknown cells by seven measures against a vehicle's limits",
     params=RiskParams,
     inputs=("dem*",),

@@ -60,7 +60,13 @@ class Stand:
     """Where the vehicle may stand: its wheels and its middle laid over hazards once, for whatever is below it."""
 
     def __init__(
-        self, wheel_hazard: Mask, body_hazard: Mask, vehicle: Vehicle, cell: float, unknown: Mask | None = None
+        self,
+        wheel_hazard: Mask,
+        body_hazard: Mask,
+        vehicle: Vehicle,
+        cell: float,
+        unknown: Mask | None = None,
+        closed: Mask | None = None,
     ) -> None:
         """
         Parameters
@@ -70,14 +76,19 @@ class Stand:
         cell : side of a cell, metres.
         unknown : cells that the outline (without margin) or the wheels may not touch, where that is asked for; what
             lies outside the map counts as such. None: none, and nothing outside.
+        closed : cells on which its middle may not be, without a margin.
         """
         self._half = vehicle.half_length / cell, vehicle.half_width / cell
         ahead, aside = 0.5 * vehicle.wheel_base / cell, 0.5 * vehicle.track / cell
         self._places = [_wheels(ahead, aside, dr, dc) for _, dr, dc in STEPS]
         self._border = max(abs(v) for four in self._places for at in four for v in at)
         self._unknown = unknown
-        wheels, middle = (Canvas.of(grown(m, vehicle.margin / cell), self._border) for m in (wheel_hazard, body_hazard))
-        self._closed = [self._under(places, wheels, middle) for places in self._places]
+        wheels, middle = (grown(mask, vehicle.margin / cell) for mask in (wheel_hazard, body_hazard))
+        on_wheels, on_middle = (
+            Canvas.of(wheels, self._border),
+            Canvas.of(middle if closed is None else middle | closed, self._border),
+        )
+        self._closed = [self._under(places, on_wheels, on_middle) for places in self._places]
 
     def ways(self, below: str = "middle") -> Bytes:
         """Directions (row, col) as bits in which it may, with ``below``, its "outline", its "wheels" or its "middle",
@@ -93,8 +104,8 @@ class Stand:
                 mask = self._under(places, beyond_wheels, closed).mask()
                 if below == "outline":
                     mask |= widened(self._unknown, *self._half, (dr, dc))
-            out |= (mask.view(np.uint8) ^ np.uint8(1)) * np.uint8(bit)
-        return out
+            out |= mask.view(np.uint8) * np.uint8(bit)
+        return out ^ np.uint8(ALL)
 
     @staticmethod
     def _under(places: list[tuple[int, int]], wheels: Canvas, closed: Canvas) -> Canvas:

@@ -13,7 +13,7 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.special import stdtr
 
-from stages.hazards import BITS, FREEDOM, HIDDEN, MEASURES, Measured, limits, noise_factors
+from stages.hazards import BITS, FREEDOM, HIDDEN, LIFT, MEASURES, Measured, limits, noise_factors
 from stages.vehicle import Vehicle
 
 Floats32 = NDArray[np.float32]
@@ -115,22 +115,28 @@ def _facts(vehicle: Vehicle, window: float, cell: float, sigmas: float) -> dict[
 
 def _table() -> Floats32:
     t = np.arange(-FARTHEST * STEPS, FARTHEST * STEPS + 1) / STEPS
-    found = stdtr(FREEDOM, t)
+    start, width, lift = LIFT
+    found = stdtr(FREEDOM, t + lift * np.clip((t - start) / width, 0.0, 1.0))
     found[0], found[-1] = 0.0, 1.0
     return np.asarray(found, dtype=np.float32)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _hold(v, facts, noise, doubt, load, excess, bits):  # type: ignore[no-untyped-def]
     """One row of one measure against its limit: load, standardised excess and bits of the worst so far."""
     limit, bias, spread, added, bit = facts[0], facts[1], facts[2], facts[3], np.uint16(facts[4])
-    scale, least, none = np.float32(1.0) / limit, LEAST * limit, np.uint16(0)
+    scale, least, none, one = np.float32(1.0) / limit, LEAST * limit, np.uint16(0), np.float32(1.0)
+    # three loops of few arrays each, which the compiler then takes several cells at a time
     for c in range(v.shape[0]):
         here = (v[c] + added * noise[c]) * scale
         load[c] = here if here > load[c] else load[c]
-        bits[c] |= bit if here > np.float32(1.0) else none
-        over = v[c] - bias * noise[c] - limit
-        t = over / (spread * (noise[c] if over > np.float32(0.0) else doubt[c]) + least)
+    for c in range(v.shape[0]):
+        bits[c] |= bit if (v[c] + added * noise[c]) * scale > one else none
+    for c in range(v.shape[0]):
+        s, wide = noise[c], doubt[c]
+        over = v[c] - bias * s - limit
+        s = s if over > np.float32(0.0) else wide
+        t = over / (spread * s + least)
         excess[c] = t if t > excess[c] else excess[c]
 
 
@@ -174,15 +180,19 @@ def _classify(
 
 @njit(cache=True, nogil=True)
 def _spread(blocks, n, out):  # type: ignore[no-untyped-def]
-    for j in range(blocks.shape[0]):
-        for c in range(j * n, min(j * n + n, out.shape[0])):
-            out[c] = blocks[j]
+    whole = out.shape[0] // n
+    for k in range(n):
+        for j in range(whole):
+            out[j * n + k] = blocks[j]
+    out[whole * n :] = blocks[-1]
 
 
 @njit(cache=True, nogil=True)
 def _look_up(excess, table, p):  # type: ignore[no-untyped-def]
     for c in range(p.shape[0]):
-        t = min(max(excess[c], -FARTHEST), FARTHEST)
+        t = np.float64(excess[c])
+        t = t if t > -FARTHEST else -FARTHEST
+        t = t if t < FARTHEST else FARTHEST
         p[c] = table[np.int32((t + FARTHEST) * STEPS)]
 
 
@@ -192,16 +202,18 @@ def _decide(load, excess, bits, p, closed, filled, share, unstood, marks, risk, 
     one, zero, none = np.float32(1.0), np.float32(0.0), np.uint16(0)
     for c in range(risk.shape[0]):
         known = closed[c] == closed[c]
-        hazardous = known and load[c] > one
-        unknown = not known or (share[c] < min_known and not hazardous)
-        near = load[c] > caution or p[c] > max_p
+        hazardous = known & (load[c] > one)
+        unknown = (not known) | ((share[c] < min_known) & (not hazardous))
+        near = (load[c] > caution) | (p[c] > max_p)
         kind = np.uint8(HAZARDOUS) if hazardous else (np.uint8(CAUTION) if near else np.uint8(SAFE))
         risk[c] = np.uint8(UNKNOWN) if unknown else kind
+    for c in range(risk.shape[0]):
+        hazardous, unknown = risk[c] == HAZARDOUS, risk[c] == UNKNOWN
         why = bits[c] if hazardous else none
-        why |= np.uint16(DOUBT_BIT) if hazardous and excess[c] <= zero else none
+        why |= np.uint16(DOUBT_BIT) if hazardous & (excess[c] <= zero) else none
         why |= np.uint16(UNKNOWN_BIT) if unknown else none
         why |= np.uint16(FILLED_BIT) if filled[c] == 1 else none
-        why |= np.uint16(UNSEEN_BIT) if share[c] < whole or unstood[c] > zero else none
+        why |= np.uint16(UNSEEN_BIT) if (share[c] < whole) | (unstood[c] > zero) else none
         reason[c] = why
 
 

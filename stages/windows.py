@@ -63,42 +63,29 @@ def window_count(mask: Mask, n: int) -> NDArray[np.int32]:
 
 @njit(cache=True, nogil=True)
 def _count(a, half, out):  # type: ignore[no-untyped-def]
-    """Columns' counts move down with the window; along a row they are added by doubling, whole lines at a time."""
+    """Columns' counts move down with the window, the count over columns along each row."""
     rows, cols = a.shape
-    wide = cols + 2 * half
-    total = np.zeros(cols, dtype=np.int32)
-    line, done = np.zeros(wide, dtype=np.int32), np.zeros(wide, dtype=np.int32)
+    n = 2 * half + 1
+    line = np.zeros(cols + n, dtype=np.int32)  # behind the line's start and beyond its end there is nothing
+    total = line[half + 1 : half + 1 + cols]
     for r in range(-half, rows):
-        for row, sign in ((r + half, 1), (r - half - 1, -1)):
-            if 0 <= row < rows:
-                for c in range(cols):
-                    total[c] += sign if a[row, c] else 0
+        if r + half < rows:
+            _tally(a[r + half], np.int32(1), total)
+        if r > half:
+            _tally(a[r - half - 1], np.int32(-1), total)
         if r < 0:
             continue
-        line[:] = 0
-        line[half : half + cols] = total
-        _sums(line, done, 2 * half + 1)
-        out[r] = done[:cols]
+        s = line[1:n].sum()
+        target = out[r]
+        for c in range(cols):
+            s += line[c + n] - line[c]
+            target[c] = s
 
 
 @njit(cache=True, nogil=True)
-def _sums(line, done, n):  # type: ignore[no-untyped-def]
-    """``done[c]`` = sum of c .. c + n - 1 of ``line``, which is used up."""
-    m = line.shape[0]
-    done[:] = 0
-    w, have = 1, 0
-    while True:
-        if n & w:  # ``done`` holds sums of ``have``, ``line`` those of ``w``
-            for c in range(m - w):
-                done[c] = line[c] + done[c + w]
-            for c in range(m - w, m):
-                done[c] = line[c]
-            have += w
-        if have == n:
-            break
-        for c in range(m - w):
-            line[c] += line[c + w]
-        w *= 2
+def _tally(mask, sign, total):  # type: ignore[no-untyped-def]
+    for c in range(mask.shape[0]):
+        total[c] += sign if mask[c] else np.int32(0)
 
 
 def window_mean(a: Floats32, n: int) -> Floats32:
@@ -108,8 +95,8 @@ def window_mean(a: Floats32, n: int) -> Floats32:
     return out
 
 
-LANES = 8
-"""Rows whose sums along the columns run side by side: each waits for its own last one only."""
+LANES = 4
+"""Rows whose sums along the columns run side by side: each addition waits for the last one of its own row only."""
 
 
 @njit(cache=True, nogil=True)
@@ -117,36 +104,47 @@ def _mean(a, half, out):  # type: ignore[no-untyped-def]
     """Sums of the columns move down with the window, the sum over columns along each row."""
     rows, cols = a.shape
     offset = _middle(a)
-    total, count = np.zeros(cols), np.zeros(cols)
-    sums, counts = np.zeros((cols + 2 * half + 1, LANES)), np.zeros((cols + 2 * half + 1, LANES))
-    s, n = np.zeros(LANES), np.zeros(LANES)
-    means = np.empty((cols, LANES), dtype=np.float32)
+    # behind the line's start and beyond its end a window has nothing
+    total, count = np.zeros((LANES, cols + 2 * half + 1)), np.zeros((LANES, cols + 2 * half + 1))
+    inner = slice(half + 1, half + 1 + cols)
+    sums, counts = np.empty((LANES, cols)), np.empty((LANES, cols))
+    lane = 0
     for r in range(-half, rows):
-        for row, sign in ((r + half, 1.0), (r - half - 1, -1.0)):
-            if 0 <= row < rows:
-                _add_row(a[row], offset, sign, total, count)
+        if r + half < rows:
+            _add_row(a[r + half], offset, 1.0, total[lane, inner], count[lane, inner])
+        if r > half:
+            _add_row(a[r - half - 1], offset, -1.0, total[lane, inner], count[lane, inner])
         if r < 0:
             continue
-        lane = r % LANES
-        for c in range(cols):
-            sums[c + half + 1, lane], counts[c + half + 1, lane] = total[c], count[c]
-        if lane < LANES - 1 and r < rows - 1:
-            continue
-        s[:], n[:] = 0.0, 0.0
-        for c in range(-half, cols):
-            for k in range(LANES):
-                s[k] += sums[c + 2 * half + 1, k]
-                n[k] += counts[c + 2 * half + 1, k]
-            if c > half:
-                for k in range(LANES):
-                    s[k] -= sums[c, k]
-                    n[k] -= counts[c, k]
-            if c >= 0:
-                for k in range(LANES):
-                    means[c, k] = s[k] / n[k] + offset if n[k] > 0.5 else np.nan
-        for k in range(lane + 1):
-            for c in range(cols):
-                out[r - lane + k, c] = means[c, k]
+        if lane == LANES - 1 or r == rows - 1:
+            _slide(total, 2 * half + 1, sums)
+            _slide(count, 2 * half + 1, counts)
+            for k in range(lane + 1):
+                _divide(sums[k], counts[k], offset, out[r - lane + k])
+        after = (lane + 1) % LANES
+        total[after] = total[lane]
+        count[after] = count[lane]
+        lane = after
+
+
+@njit(cache=True, nogil=True)
+def _slide(lines, n, out):  # type: ignore[no-untyped-def]
+    """Sums of c + 1 .. c + n of :data:`LANES` lines."""
+    p, q, s, t = lines[0], lines[1], lines[2], lines[3]
+    a, b, d, e = 0.0, 0.0, 0.0, 0.0
+    for c in range(1, n):
+        a, b, d, e = a + p[c], b + q[c], d + s[c], e + t[c]
+    for c in range(out.shape[1]):
+        a, b, d, e = a + p[c + n], b + q[c + n], d + s[c + n], e + t[c + n]
+        a, b, d, e = a - p[c], b - q[c], d - s[c], e - t[c]
+        out[0, c], out[1, c], out[2, c], out[3, c] = a, b, d, e
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _divide(sums, counts, offset, out):  # type: ignore[no-untyped-def]
+    for c in range(out.shape[0]):
+        mean = sums[c] / counts[c] + offset
+        out[c] = mean if counts[c] > 0.5 else np.nan
 
 
 @njit(cache=True, nogil=True)

@@ -102,31 +102,34 @@ def build(seed: int, cover: float, slope_deg: float) -> Scene:
     assert sequence.up is not None
     assert sequence.truth is not None
     assert sequence.truth_dem is not None
-    params = LocusParams(cell_size=CELL, max_sigma=CELL)
-    good = usable(found.validity, found.backmatch_error, params)
-    lattice, frames, dems = None, [], []
-    for up in (sequence.up[0], sequence.truth[0].rotation[2]):
-        args = found.column_disparity, found.row_disparity, matched(found.validity), sequence.rig, LevelParams()
-        facts = level(*args, up=up)
-        lattice = lattice or local_lattice(sequence.rig, facts, CELL, params)
-        T_local_left = RigidTransform.from_matrix(facts["T_local_left"])
-        low, high = z_range(facts["plane"], facts["relief"], list(lattice.bounds))
-        dems.append(
-            reconstruct(
-                found.column_disparity, found.row_disparity, good, np.asarray(left["image"], np.float32), sequence.rig,
-                T_local_left, plane(lattice), (low, high), params, disparity_std=found.disparity_std,
-            )  # fmt: skip
-        )
-        frames.append((T_local_left, (low, high)))
-    assert lattice is not None
+    args = found, np.asarray(left["image"], np.float32), sequence.rig
+    lattice, first, (dem, std) = _reconstructed(*args, sequence.up[0])
+    _, exactly, (posed, posed_std) = _reconstructed(*args, sequence.truth[0].rotation[2], lattice)
     n = round(PAD / CELL)
     wide = Lattice.at(lattice.i0 - n, lattice.j0 + n, CELL, lattice.rows + 2 * n, lattice.cols + 2 * n)
-    exact = fetch(sequence.truth_dem(wide.to_dict(), sequence.truth[0] @ frames[1][0].inverse(), (0,)))
+    exact = fetch(sequence.truth_dem(wide.to_dict(), sequence.truth[0] @ exactly[0].inverse(), (0,)))
     return Scene(
-        seed, cover, slope_deg, sequence.vehicle, lattice, wide, dems[0].elevation, dems[0].elevation_std,
-        dems[1].elevation, dems[1].elevation_std, np.asarray(exact["elevation"], np.float32),
-        (np.asarray(left["image"]), np.asarray(right["image"])), sequence.rig, *frames[0],
+        seed, cover, slope_deg, sequence.vehicle, lattice, wide, dem, std, posed, posed_std,
+        np.asarray(exact["elevation"], np.float32), (np.asarray(left["image"]), np.asarray(right["image"])),
+        sequence.rig, *first,
     )  # fmt: skip
+
+
+def _reconstructed(
+    found: Any, image: Floats32, rig: Rig, up: Any, lattice: Lattice | None = None
+) -> tuple[Lattice, tuple[RigidTransform, tuple[float, float]], tuple[Floats32, Floats32]]:
+    """Lattice, frame and range of elevations, and elevations with their standard deviation, by a vertical."""
+    params, disparity = LocusParams(cell_size=CELL, max_sigma=CELL), (found.column_disparity, found.row_disparity)
+    facts = level(*disparity, matched(found.validity), rig, LevelParams(), up=up)
+    lattice = lattice or local_lattice(rig, facts, CELL, params)
+    T_local_left = RigidTransform.from_matrix(facts["T_local_left"])
+    low, high = z_range(facts["plane"], facts["relief"], list(lattice.bounds))
+    good = usable(found.validity, found.backmatch_error, params)
+    dem = reconstruct(
+        *disparity, good, image, rig, T_local_left, plane(lattice), (low, high), params,
+        disparity_std=found.disparity_std,
+    )  # fmt: skip
+    return lattice, (T_local_left, (low, high)), (dem.elevation, dem.elevation_std)
 
 
 def kept(folder: Path | None, seed: int, cover: float, slope_deg: float) -> Scene:
@@ -136,7 +139,7 @@ def kept(folder: Path | None, seed: int, cover: float, slope_deg: float) -> Scen
     path = folder / f"{seed}-{cover:g}-{slope_deg:g}-{_fingerprint()}.pickle"
     if path.exists():
         with path.open("rb") as file:
-            scene = pickle.load(file)  # noqa: S301  (written below)
+            scene = pickle.load(file)
         assert isinstance(scene, Scene)
         return scene
     scene = build(seed, cover, slope_deg)

@@ -68,8 +68,7 @@ def test_a_wider_margin_frees_no_cell(seed: int, margins: tuple[float, float], b
     rng = np.random.default_rng(seed)
     wheel, body, unknown = (rng.random((30, 34)) < 0.02 for _ in range(3))
     narrow, wide = (
-        Stand(wheel, body, MODEL.model_copy(update={"margin": m}), CELL, unknown).ways(below)
-        for m in sorted(margins)
+        Stand(wheel, body, MODEL.model_copy(update={"margin": m}), CELL, unknown).ways(below) for m in sorted(margins)
     )
     assert ((wide & ~narrow) == 0).all()
 
