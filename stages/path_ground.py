@@ -63,8 +63,8 @@ class Ground:
         mean = window_mean(maps["elevation"], window_cells(vehicle.wheel_diameter, lattice.cell))
         self.stand = grid.sample(lattice, mean, np.nan)
         toll = round(caution * grid.cell / unit)
-        self.height = np.empty(risk.shape, dtype=np.int32)
-        self.toll = np.empty(risk.shape, dtype=np.int16 if toll <= np.iinfo(np.int16).max else np.int64)
+        self.height: Ints = np.empty(risk.shape, dtype=np.int32)
+        self.toll: Ints = np.empty(risk.shape, dtype=np.int16 if toll <= np.iinfo(np.int16).max else np.int64)
         if _price(self.stand, risk, np.float32(unit), toll, self.height, self.toll) > LARGE:
             self.height = np.rint(np.where(self.closed, np.float32(0), self.stand) / np.float32(unit)).astype(np.int64)
         self._ways: dict[str, Bytes] = {}

@@ -38,8 +38,8 @@ class Plan:
     ``reason`` in words, both empty where a path was found. ``beside_unknown``: no path keeps half a wheel from unknown.
     """
 
-    cells: Ints
-    cost: Ints
+    cells: NDArray[np.int64]
+    cost: NDArray[np.int64]
     reachable: Mask
     target_row: int
     blocking_row: int | None = None
@@ -52,7 +52,9 @@ def ways_of(free: Mask | Ways) -> Ways:
     return np.where(free, np.uint8(ALL), np.uint8(0)) if free.dtype == np.bool_ else np.asarray(free, np.uint8)
 
 
-def sweep(height: Ints, free: Mask | Ways, sources: Mask, toll: Ints | None = None) -> tuple[Ints, NDArray[np.int8]]:
+def sweep(
+    height: Ints, free: Mask | Ways, sources: Mask, toll: Ints | None = None
+) -> tuple[NDArray[np.int64], NDArray[np.int8]]:
     """Least cost from any source to every cell of the row graph, towards row 0.
 
     Parameters
@@ -211,7 +213,7 @@ def nearest_middle(cells: Mask, row: int) -> tuple[int, int]:
     return int(r[best]), int(c[best])
 
 
-def _trace(move: NDArray[np.int8], row: int, col: int) -> Ints:
+def _trace(move: NDArray[np.int8], row: int, col: int) -> NDArray[np.int64]:
     """Cells (vertex, 2) from the source to the given cell."""
     out = np.empty((move.shape[0] - row, 2), dtype=np.int64)
     return out[: _walk(move, row, col, out)][::-1].copy()

@@ -147,10 +147,10 @@ def _hold_all(values, facts, noise, doubt, load, excess, bits):  # type: ignore[
 
 
 @njit(cache=True, nogil=True)
-def _classify(
+def _classify(  # type: ignore[no-untyped-def]
     facts, per_metre, height_range, step, closed, filled, blocks, bits0, n, marks, table,
     risk, reason, inclination, roughness, slope, tilt, clearance, p,
-):  # type: ignore[no-untyped-def]  # fmt: skip
+):  # fmt: skip
     rows, cols = risk.shape
     wide = np.empty((blocks.shape[0], cols), dtype=np.float32)
     before, bits = np.empty(cols, dtype=np.uint16), np.empty(cols, dtype=np.uint16)
@@ -190,9 +190,8 @@ def _spread(blocks, n, out):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True)
 def _look_up(excess, table, p):  # type: ignore[no-untyped-def]
     for c in range(p.shape[0]):
-        t = np.float64(excess[c])
-        t = t if t > -FARTHEST else -FARTHEST
-        t = t if t < FARTHEST else FARTHEST
+        least = excess[c] if excess[c] > -FARTHEST else -FARTHEST
+        t = least if least < FARTHEST else FARTHEST
         p[c] = table[np.int32((t + FARTHEST) * STEPS)]
 
 
