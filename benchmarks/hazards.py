@@ -1,24 +1,25 @@
 """Hazards judged against the exact elevations: false safe, false hazard, unknown, and whether p_hazard is a
 probability.
 
-python benchmarks/hazards.py [--seeds 20] [--cover 0.05 0.1 0.2] [--json FILE] [--picture FILE]
+python benchmarks/hazards.py [--seeds 20] [--cover 0.05 0.1 0.2] [--scenes FOLDER] [--json FILE] [--picture FILE]
 
 Each scene is one simulated stereo pair: a seed, a rock cover and one of the slopes, which take turns. Every way to
 classes is judged cell by cell against the risk map of the exact elevations with the same vehicle and no standard
 deviation:
 
-* rille: matched, reconstructed and judged with default parameters;
-* perfect DEM: exact elevations on the cells that rille has, with no standard deviation: what the ragged map alone
-costs;
+* rille: matched, reconstructed and judged with default parameters; the inclinometer errs by 0.2 degrees about each
+  axis;
+* perfect pose: the same with the exact vertical;
+* perfect DEM: exact elevations on the cells that it has, with no standard deviation: what the ragged map alone costs;
 * SGBM + blend: OpenCV's rectification and semi-global matching, median height of a cell's points, and the usual blend
-of
-  slope and roughness, (slope / limit + roughness / limit + step / limit) / 3 of a plane fitted in the vehicle's size,
-  hazardous where it exceeds 0.5 (as traversability maps do); no standard deviation, unknown where nothing is known.
+  of slope and roughness, (slope / limit + roughness / limit + step / limit) / 3 of a plane fitted in the vehicle's
+  size, hazardous where it exceeds 0.5 (as traversability maps do); no standard deviation, unknown where nothing is
+  known.
 
-All poses are perfect: a single pair has none to err. 'false safe' are truly hazardous cells called safe, 'enterable
-hazard' those called safe or caution, 'false hazard' cells called hazard that are not: shares of the observed cells,
-those that are not unknown, with Wilson's 95 % interval over scenes' cells thinned to one a vehicle length (cells are
-not independent).
+'false safe' are truly hazardous cells called safe, 'enterable hazard' those called safe or caution, 'false hazard'
+cells called hazard that are not: shares of the observed cells, those that are not unknown, with Wilson's 95 % interval
+over scenes' cells thinned to one a vehicle length (cells are not independent). 'missed' is the share of the truly
+hazardous cells that are called safe or caution.
 """
 
 from __future__ import annotations
@@ -45,6 +46,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--seeds", type=int, default=20, help="scenes of each cover (default 20)")
     parser.add_argument("--first", type=int, default=1, help="first seed (default 1; 101 to 106 set the constants)")
     parser.add_argument("--cover", type=float, nargs="+", default=[0.05, 0.1, 0.2], help="rock covers")
+    parser.add_argument("--scenes", type=Path, help="keep simulated pairs there, so that a run that ended goes on")
     parser.add_argument("--json", type=Path, help="write all figures there, by scene")
     parser.add_argument("--picture", type=Path, help="draw the curve of p_hazard there, e.g. docs/hazards.png")
     return parser.parse_args()
@@ -81,24 +83,25 @@ def judge(scene: Any, exact: Any, found: Any) -> dict[str, Any]:
     return out
 
 
-def one(seed: int, cover: float, slope: float) -> dict[str, Any]:
+def one(seed: int, cover: float, slope: float, folder: Path | None) -> dict[str, Any]:
     """All ways on one scene."""
     import numpy as np
     from hazard.blend import blend
-    from hazard.scenes import CELL, build
+    from hazard.scenes import CELL, kept
 
     from stages.risk import risk_map
 
-    scene = build(seed, cover, slope)
+    scene = kept(folder, seed, cover, slope)
     exact = risk_map(scene.exact, np.zeros_like(scene.exact), CELL, scene.vehicle)
-    known = np.isfinite(scene.elevation)
+    known = np.isfinite(scene.posed)
     perfect = np.where(known, scene.crop(scene.exact), np.float32(np.nan))
     ways = {
         "rille": risk_map(scene.elevation, scene.elevation_std, CELL, scene.vehicle),
+        "perfect pose": risk_map(scene.posed, scene.posed_std, CELL, scene.vehicle),
         "perfect DEM": risk_map(perfect, np.zeros_like(perfect), CELL, scene.vehicle),
         "SGBM + blend": blend(scene),
     }
-    error = (scene.elevation - scene.crop(scene.exact))[known]
+    error = (scene.posed - scene.crop(scene.exact))[known]
     facts = {"seed": seed, "cover": cover, "slope_deg": slope, "rmse_m": float(np.sqrt(np.nanmean(error**2)))}
     return facts | {"ways": {name: judge(scene, exact, found) for name, found in ways.items()}}
 
@@ -163,7 +166,7 @@ def main() -> int:
     scenes = []
     for seed in range(given.first, given.first + given.seeds):
         for k, cover in enumerate(given.cover):
-            scenes.append(one(seed, cover, SLOPES[(seed + k) % len(SLOPES)]))
+            scenes.append(one(seed, cover, SLOPES[(seed + k) % len(SLOPES)], given.scenes))
             say(f"seed {seed}, cover {cover:g}: {scenes[-1]['ways']['rille']}"[:150])
             if given.json:
                 given.json.write_text(json.dumps({"scenes": scenes}, indent=1) + "\n", encoding="utf-8")

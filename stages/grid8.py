@@ -8,6 +8,8 @@ whole numbers, so that sums are exact. Ties go to the lower cell index. scipy's 
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -16,6 +18,7 @@ from stages.row_graph import UNREACHED
 from stages.swept import ACROSS, LEFT, RIGHT, STRAIGHT
 
 Ints = NDArray[np.int64]
+Whole = NDArray[np.integer[Any]]
 Bytes = NDArray[np.uint8]
 
 NEIGHBOURS = (
@@ -28,17 +31,17 @@ DIAGONAL = 1.4142135623730951
 
 
 def cost_to_go(
-    height: Ints, ways: Bytes, target: tuple[int, int], start: tuple[int, int] | None, unit: int, toll: Ints
+    height: Whole, ways: Bytes, target: tuple[int, int], start: tuple[int, int] | None, unit: int, toll: Whole
 ) -> tuple[Ints, NDArray[np.int8]]:
     """Least cost from every cell to the target.
 
     Parameters
     ----------
-    height : (row, col) int64, of which a difference of one costs one.
+    height : (row, col) whole numbers, of which a difference of one costs one.
     ways : (row, col) directions as bits in which the vehicle may stand (:mod:`stages.swept`).
     target, start : row and column; the search ends where it meets ``start``, None: when all is settled.
     unit : cost of a straight step's length, at least 1.
-    toll : (row, col) int64, cost of entering a cell.
+    toll : (row, col) whole numbers, cost of entering a cell.
 
     Returns
     -------

@@ -31,8 +31,8 @@ exceeds the limit; with ``k spread >= bias``, which is enforced, more noise is n
 
 ``p_hazard`` is the probability that the exact measure exceeds its limit, ``F((V - bias s - limit) / (spread s))``, of
 the worst measure: all of them look at one ground, so they err together. F has wider tails than the normal distribution
-(Student's t), since matching errs grossly now and then. Unknown ground in a window hides what would raise a measure, so
-up to the limit it widens the doubt (:data:`HIDDEN`).
+(Student's t), since matching errs grossly now and then, and is steeper about the limit (:data:`LIFT`). Unknown ground
+in a window hides what would raise a measure, so up to the limit it widens the doubt (:data:`HIDDEN`).
 """
 
 from __future__ import annotations
@@ -41,19 +41,19 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
-from scipy.special import stdtr
 
-from stages.extrema import median3, running_range
+from stages.blocks import reduce_to_blocks, sum_around
+from stages.extrema import median3, relief
 from stages.placement import place, stride
 from stages.vehicle import Vehicle
-from stages.windows import window_sum
 
 Floats32 = NDArray[np.float32]
 
 MEASURES = ("inclination", "range", "step", "roughness", "slope", "tilt", "rise")
 BITS = {name: 1 << k for k, name in enumerate(MEASURES)}
+WHEEL_BITS = np.uint16(BITS["inclination"] | BITS["range"] | BITS["step"] | BITS["roughness"])
+"""Hazards to a wheel on the cell; the other ones are to the vehicle with its middle there."""
 
 NOISE = {
     "inclination": (0.1, 0.95),
@@ -75,36 +75,31 @@ the ground below the vehicle, is unknown: what is hidden there is not in the mea
 FREEDOM = 3.0
 """Degrees of freedom of Student's t."""
 
-STEPS, FARTHEST = 64, 16.0
-"""Table of F: steps a unit, and where it ends."""
+LIFT = (-0.4, 0.6, 0.8)
+"""From where and over what width t rises, and by how much: what is found at a limit is more often above it than below,
+since a matcher smooths and hides relief more often than it makes some. Found with :data:`NOISE`; F stays a rising
+function."""
 
 
 @dataclass(frozen=True)
 class Measured:
-    """Measures by name on the cells (inclination, range, step) or on blocks of ``stride`` cells (the others), float32.
+    """Measures, raw, with the bias of noise, NaN-free; gradients dimensionless, the rest metres, float32.
 
-    Gradients are dimensionless, the rest metres; raw, with the bias of noise. ``noise``, ``share`` and ``unstood``
-    are on blocks: RMS standard deviation, m; known share of the wheel's window; share of headings with a wheel on the
-    unknown.
+    ``step`` and ``range`` on the cells; ``blocks`` by name on blocks of ``stride`` cells. ``extent``: metres over which
+    the range is an inclination. ``noise`` and ``noise_under``: RMS standard deviation, m, in the wheel's window and
+    below the vehicle; ``share``: known share of the wheel's window; ``unstood``: share of headings with a wheel on the
+    unknown; all four on blocks.
     """
 
-    values: dict[str, Floats32]
+    step: Floats32
+    range: Floats32
+    blocks: dict[str, Floats32]
     noise: Floats32
     noise_under: Floats32
     share: Floats32
     unstood: Floats32
     stride: int
-
-
-@dataclass(frozen=True)
-class Judged:
-    """On the cells (row, col): ``load`` greatest of value + k sigma over its limit, ``p`` probability, ``bits`` of what
-    exceeds its limit, ``doubt`` 1 where only because of sigma."""
-
-    load: Floats32
-    p: Floats32
-    bits: NDArray[np.uint16]
-    doubt: NDArray[np.uint8]
+    extent: float
 
 
 def window_reach(side: float, cell: float) -> int:
@@ -113,46 +108,46 @@ def window_reach(side: float, cell: float) -> int:
 
 
 def measure(
-    elevation: Floats32,
+    surface: Floats32,
+    closed: Floats32,
     elevation_std: Floats32,
     cell: float,
     vehicle: Vehicle,
     window: float,
-    filled: NDArray[np.uint8] | None = None,
 ) -> Measured:
     """All measures of an elevation model.
 
     Parameters
     ----------
-    elevation, elevation_std : (row, col) float32, metres, NaN unknown; the latter 0 where it is not known.
+    surface : (row, col) float32, metres, NaN unknown.
+    closed : the same with small holes closed. A closed cell counts as known and with its noise, but heights between
+        other heights prove no relief (and a rim that is raised would raise them over lower ground).
+    elevation_std : (row, col) float32 of ``closed``, metres, 0 where it is not known.
     cell : side of a cell, metres.
     window : metres, side of the wheel's window.
-    filled : not 0 where the elevation is interpolated: it counts as known and with its noise, but heights between other
-        heights prove no relief (and a rim that is raised would raise them over lower ground).
     """
-    surface = elevation if filled is None else np.where(filled != 0, np.float32(np.nan), elevation)
     surface = median3(surface) if 3 * cell <= 0.5 * vehicle.wheel_diameter else surface
     reach, near = window_reach(window, cell), window_reach(0.5 * window, cell)
-    values = {}
-    high, low = running_range(surface, reach)
-    values["range"] = _difference(high, low)
-    values["inclination"] = values["range"] * np.float32(1.0 / (2 * reach * cell))
-    high, low = running_range(surface, near)
-    values["step"] = _difference(high, low)
+    step, height_range = relief(surface, near, reach)
     n = stride(vehicle, cell)
     lag = max(1, round(0.25 * vehicle.wheel_diameter / cell))
-    highest, lowest, sums = _blocks(surface, elevation, elevation_std, n, lag)
+    blocks = reduce_to_blocks(surface, closed, elevation_std, n, lag)
     around = 2 * round(reach / n) + 1
-    count, square, number, deviation = (window_sum(a, around) for a in sums)
-    values["roughness"] = np.sqrt(0.5 * deviation / np.maximum(number, 1.0)).astype(np.float32)
-    whole = sums[0] > n * n - 0.5
-    places = place(highest, lowest, vehicle, n * cell, whole)
+    sums = (blocks.count, blocks.variance, blocks.pairs, blocks.deviation)
+    count, square, number, deviation = (sum_around(a, around) for a in sums)
+    places = place(blocks.high, blocks.low, vehicle, n * cell, blocks.count > n * n - 0.5)
     wide = 2 * round((vehicle.half_length + vehicle.half_width) / (2.0 * n * cell)) + 1
-    under = np.sqrt(window_sum(sums[1], wide) / np.maximum(window_sum(sums[0], wide), 1.0)).astype(np.float32)
-    values |= {"slope": places.slope, "tilt": places.tilt, "rise": places.rise}
+    under = np.sqrt(sum_around(blocks.variance, wide) / np.maximum(sum_around(blocks.count, wide), 1.0))
+    values = {
+        "roughness": np.sqrt(0.5 * deviation / np.maximum(number, 1.0)).astype(np.float32),
+        "slope": places.slope,
+        "tilt": places.tilt,
+        "rise": places.rise,
+    }
     noise = np.sqrt(square / np.maximum(count, 1.0)).astype(np.float32)
     share = (count / float((around * n) ** 2)).astype(np.float32)
-    return Measured(values, noise, under, share, places.unstood, n)
+    found = noise, under.astype(np.float32), share, places.unstood
+    return Measured(step, height_range, values, *found, n, 2 * reach * cell)
 
 
 def limits(vehicle: Vehicle) -> dict[str, float]:
@@ -175,155 +170,3 @@ def noise_factors(vehicle: Vehicle, window: float, cell: float) -> dict[str, tup
     across = min(vehicle.track, vehicle.wheel_base)
     unit = {"inclination": 1.0 / extent, "slope": 1.0 / across, "tilt": 1.0 / across}
     return {name: (bias * unit.get(name, 1.0), spread * unit.get(name, 1.0)) for name, (bias, spread) in NOISE.items()}
-
-
-def judge(measured: Measured, vehicle: Vehicle, window: float, cell: float, sigmas: float) -> Judged:
-    """Hold every measure against its limit."""
-    limit, noise = limits(vehicle), noise_factors(vehicle, window, cell)
-    shape = measured.values["step"].shape
-    fine = [
-        name for name in MEASURES if measured.values[name].shape == shape and name in ("inclination", "range", "step")
-    ]
-    blocks = [name for name in MEASURES if name not in fine]
-    table = _table()
-    facts = {
-        name: np.array(
-            [limit[name], *noise[name], max(0.0, sigmas * noise[name][1] - noise[name][0]), BITS[name]], np.float32
-        )
-        for name in MEASURES
-    }
-    gap, patchy = np.float32(vehicle.max_step) * (1.0 - np.minimum(measured.share, 1.0)), measured.unstood
-    doubt = np.hypot(measured.noise, np.float32(HIDDEN[0]) * gap).astype(np.float32)
-    below = np.hypot(measured.noise_under, np.float32(HIDDEN[1] * vehicle.max_step) * patchy).astype(np.float32)
-    wheel = measured.noise, doubt
-    coarse = _judge(
-        [measured.values[n] for n in blocks],
-        [facts[n] for n in blocks],
-        [wheel if n == "roughness" else (measured.noise_under, below) for n in blocks],
-    )
-    out = Judged(
-        np.empty(shape, np.float32), np.empty(shape, np.float32), np.empty(shape, np.uint16), np.empty(shape, np.uint8)
-    )
-    _combine(
-        np.stack([facts[n] for n in fine]), *(measured.values[n] for n in fine), *coarse, *wheel,
-        measured.stride, table, out.load, out.p, out.bits, out.doubt,
-    )  # fmt: skip
-    return out
-
-
-def spread_out(blocks: NDArray, n: int, shape: tuple[int, int]) -> NDArray:
-    """An array on blocks of n x n cells brought to the cells."""
-    return np.repeat(np.repeat(blocks, n, axis=0)[: shape[0]], n, axis=1)[:, : shape[1]]
-
-
-def _judge(
-    values: list[Floats32], facts: list[Floats32], noises: list[tuple[Floats32, Floats32]]
-) -> tuple[Floats32, Floats32, NDArray[np.uint16]]:
-    """Greatest load, greatest standardised excess and bits of the measures on blocks."""
-    shape = values[0].shape
-    load, excess = np.zeros(shape, np.float32), np.full(shape, -FARTHEST, np.float32)
-    bits = np.zeros(shape, np.uint16)
-    least = np.float32(1e-12)
-    for v, (limit, bias, spread, added, bit), (noise, doubt) in zip(values, facts, noises, strict=True):
-        here = (v + added * noise) / limit
-        bits[here > 1.0] |= np.uint16(bit)
-        np.maximum(load, here, out=load)
-        over = v - bias * noise - limit
-        np.maximum(excess, over / (spread * np.where(over > 0, noise, doubt) + least * limit), out=excess)
-    return load, excess, bits
-
-
-def _table() -> Floats32:
-    t = np.arange(-FARTHEST * STEPS, FARTHEST * STEPS + 1) / STEPS
-    found = stdtr(FREEDOM, t)
-    found[0], found[-1] = 0.0, 1.0
-    return np.asarray(found, dtype=np.float32)
-
-
-def _difference(high: Floats32, low: Floats32) -> Floats32:
-    """High minus low; 0 where nothing is known."""
-    return np.maximum(np.subtract(high, low, out=high), np.float32(0.0), out=high)
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _pair(sums, i, j, k, m, d):  # type: ignore[no-untyped-def]
-    square = d * d
-    sums[2][i, j] += 1.0
-    sums[3][i, j] += square
-    sums[2][k, m] += 1.0
-    sums[3][k, m] += square
-
-
-@njit(cache=True, nogil=True)
-def _blocks(z, closed, s, n, lag):  # type: ignore[no-untyped-def]
-    """Highest and lowest height of n x n cells (NaN where none is known); and sums over them: known cells, squared
-    standard deviations, pairs of cells ``lag`` apart along either axis (at both ends), their squared differences."""
-    rows, cols = z.shape
-    shape = ((rows + n - 1) // n, (cols + n - 1) // n)
-    high, low = np.full(shape, np.nan, dtype=np.float32), np.full(shape, np.nan, dtype=np.float32)
-    sums = (np.zeros(shape), np.zeros(shape), np.zeros(shape), np.zeros(shape))
-    for r in range(rows):
-        i = r // n
-        down = r + lag < rows
-        for j in range(shape[1]):
-            for c in range(j * n, min(j * n + n, cols)):
-                if closed[r, c] == closed[r, c]:
-                    sums[0][i, j] += 1.0
-                    sums[1][i, j] += s[r, c] * s[r, c]
-                v = z[r, c]
-                if v != v:
-                    continue
-                if not high[i, j] >= v:
-                    high[i, j] = v
-                if not low[i, j] <= v:
-                    low[i, j] = v
-                if c + lag < cols:
-                    d = z[r, c + lag] - v
-                    if d == d:
-                        _pair(sums, i, j, i, (c + lag) // n, d)
-                if down:
-                    d = z[r + lag, c] - v
-                    if d == d:
-                        _pair(sums, i, j, (r + lag) // n, j, d)
-    return high, low, sums
-
-
-@njit(cache=True, nogil=True)
-def _combine(facts, a, b, d, load0, excess0, bits0, noise, doubtful, n, table, load, p, bits, doubt):  # type: ignore[no-untyped-def]
-    rows, cols = load.shape
-    values = (a, b, d)
-    wide, wider = np.empty(cols, dtype=np.float32), np.empty(cols, dtype=np.float32)
-    first, before = np.empty(cols, dtype=np.float32), np.empty(cols, dtype=np.float32)
-    excess, known = np.empty(cols, dtype=np.float32), np.empty(cols, dtype=np.uint16)
-    for r in range(rows):
-        i = r // n
-        if r % n == 0:
-            for j in range(noise.shape[1]):
-                for c in range(j * n, min(j * n + n, cols)):
-                    wide[c], wider[c] = noise[i, j], doubtful[i, j]
-                    first[c], before[c], known[c] = load0[i, j], excess0[i, j], bits0[i, j]
-        line, marks = load[r], bits[r]
-        for c in range(cols):
-            line[c] = first[c]
-            excess[c] = before[c]
-            marks[c] = known[c]
-        for k in range(3):
-            _hold(values[k][r], facts[k], wide, wider, line, excess, marks)
-        for c in range(cols):
-            t = min(max(excess[c], -FARTHEST), FARTHEST)
-            p[r, c] = table[int((t + FARTHEST) * STEPS)]
-            doubt[r, c] = 1 if line[c] > 1.0 and excess[c] <= 0.0 else 0
-
-
-@njit(cache=True, nogil=True)
-def _hold(v, facts, noise, doubt, load, excess, bits):  # type: ignore[no-untyped-def]
-    """One row of one measure against its limit: facts = limit, bias, spread, added sigmas, bit."""
-    limit, bias, spread, added, bit = facts[0], facts[1], facts[2], facts[3], np.uint16(facts[4])
-    scale, least, none = np.float32(1.0) / limit, np.float32(1e-12) * limit, np.uint16(0)
-    for c in range(v.shape[0]):
-        here = (v[c] + added * noise[c]) * scale
-        load[c] = here if here > load[c] else load[c]
-        bits[c] |= bit if here > np.float32(1.0) else none
-        over = v[c] - bias * noise[c] - limit
-        t = over / (spread * (noise[c] if over > np.float32(0.0) else doubt[c]) + least)
-        excess[c] = t if t > excess[c] else excess[c]

@@ -18,7 +18,14 @@ LEAST_TRIALS = 8
 
 
 def close_holes(
-    elevation: Floats32, elevation_std: Floats32, max_gap: float, n: int, min_known: float, *, judged: bool = False
+    elevation: Floats32,
+    elevation_std: Floats32,
+    max_gap: float,
+    n: int,
+    min_known: float,
+    *,
+    judged: bool = False,
+    rim: float = 0.5,
 ) -> tuple[Floats32, Floats32, Flags]:
     """Interpolate unknown cells that lie between known ones.
 
@@ -34,11 +41,12 @@ def close_holes(
     n, min_known : side of the window, cells, odd, and the share of its n x n cells that must be known.
     judged : whether the standard deviation has the error of the interpolation too. It is found where the answer is
         known: the same lines, laid through known cells of the window, tell by how much they miss them.
+    rim : share of the rim's range that is the standard deviation where it is not judged; 0.5 holds all of it.
 
     Returns
     -------
-    Closed elevation, its standard deviation (not below the largest of the rim's; unless ``judged``, not below half the
-    rim's range either), and flags (uint8, 1 = closed here).
+    Closed elevation, its standard deviation (not below the largest of the rim's; unless ``judged``, not below ``rim``
+    of its range either), and flags (uint8, 1 = closed here).
     """
     known = ~np.isnan(elevation)
     candidate = ~known & (window_count(known, n) >= min_known * n * n)
@@ -46,12 +54,12 @@ def close_holes(
     filled = np.zeros(elevation.shape, dtype=np.uint8)
     cells = np.argwhere(candidate)
     if len(cells) and max_gap > 0:
-        _close(elevation, elevation_std, cells, float(max_gap), n // 2 if judged else 0, z, s, filled)
+        _close(elevation, elevation_std, cells, float(max_gap), n // 2 if judged else 0, rim, z, s, filled)
     return z, s, filled
 
 
 @njit(cache=True, nogil=True)
-def _close(z_in, s_in, cells, max_gap, window, z, s, filled):  # type: ignore[no-untyped-def]
+def _close(z_in, s_in, cells, max_gap, window, rim, z, s, filled):  # type: ignore[no-untyped-def]
     rows, cols = z_in.shape
     steps = ((0, 1), (1, 0), (1, 1), (1, -1))
     lines = np.empty((4, 4), dtype=np.int64)
@@ -95,11 +103,11 @@ def _close(z_in, s_in, cells, max_gap, window, z, s, filled):  # type: ignore[no
             used += 1
         if weight > 0.0:
             z[r, c] = total / weight
-            s[r, c] = max(worst, 0.5 * (high - low))
+            s[r, c] = max(worst, rim * (high - low))
             filled[r, c] = 1
             if window > 0:
                 missed = _missed(z_in, r, c, window, lines, weights, used, weight)
-                s[r, c] = max(worst, 0.5 * (high - low) if math.isnan(missed) else missed)
+                s[r, c] = max(worst, rim * (high - low) if math.isnan(missed) else missed)
 
 
 @njit(cache=True, nogil=True)

@@ -30,7 +30,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
@@ -39,42 +39,19 @@ from pydantic import Field
 
 from stages import grid8
 from stages.declare import Array, Bundle, Inputs, Memory, Params, Stage
-from stages.errors import InputError
-from stages.hazards import BITS
+from stages.hazards import WHEEL_BITS
 from stages.lattice import Lattice
-from stages.risk import CAUTION, HAZARDOUS, UNKNOWN, check_size, window_cells
+from stages.path_ends import Point, check_end, chosen
+from stages.path_ground import GROUNDS, Ground
+from stages.risk import check_size
+from stages.path_words import Maps, Route, describe
 from stages.row_graph import UNREACHED, Plan, plan, row_span
 from stages.row_grid import RowGrid
-from stages.swept import standing
 from stages.vehicle import Vehicle
-from stages.windows import window_mean
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Bytes = NDArray[np.uint8]
-Point = tuple[float, float]
-Maps = Mapping[str, NDArray[Any]]
+__all__ = ["STAGE", "WHEEL_BITS", "PathParams", "Route", "describe", "find_path"]
+
 Planner = Literal["rows", "grid8", "auto"]
-
-GROUNDS = ("outline", "wheels", "middle")
-"""What of the vehicle stays on known ground, as tried in turn."""
-
-MOST = 0.5
-"""Share of the rows: a path that stays clearer of unknown ground is worth half of its length."""
-
-WHEEL_BITS = np.uint16(BITS["inclination"] | BITS["range"] | BITS["step"] | BITS["roughness"])
-"""Hazards to a wheel on the cell; the other ones are to the vehicle with its middle there."""
-
-WORDS = {
-    "inclination": ("inclination", "max_slope_deg", "deg"),
-    "step": ("step", "max_step", "m"),
-    "roughness": ("roughness", "max_roughness", "m"),
-    "slope": ("slope of the footprint", "max_slope_deg", "deg"),
-    "tilt": ("tilt", "max_slope_deg", "deg"),
-    "range": ("height range", "clearance", "m"),
-    "rise": ("rise under the belly", "clearance", "m"),
-}
-"""Measure: in words, the vehicle's limit, unit."""
 
 
 class PathParams(Params):
@@ -99,26 +76,6 @@ class PathParams(Params):
     caution: float = Field(
         default=0.2, ge=0, le=10, description="m of climb that a metre of caution ground is worth: a detour of a fifth"
     )
-
-
-@dataclass(frozen=True)
-class Route:
-    """A path and how it was found.
-
-    ``cells`` (vertex, 2) on ``grid`` and ``xyz`` (vertex, 3) metres, z the mean height under a wheel, both empty where
-    there is none; ``plan`` of the row graph, ``planner`` that gave the path, ``ground`` one of :data:`GROUNDS`;
-    ``cost`` (row, col) metres: from the start by rows, to the target by grid8; NaN where not reached.
-    ``span``: farthest and nearest row of the grid that are free somewhere.
-    """
-
-    cells: Ints
-    xyz: Floats
-    plan: Plan
-    grid: RowGrid
-    planner: str
-    ground: str
-    cost: NDArray[np.float32]
-    span: tuple[int, int]
 
 
 def find_path(
@@ -168,34 +125,8 @@ def find_path(
     return found
 
 
-class _Ground:
-    """The maps on a grid, and where the vehicle may stand there."""
-
-    def __init__(self, maps: Maps, lattice: Lattice, grid: RowGrid, vehicle: Vehicle, p: PathParams) -> None:
-        self.grid, self.vehicle = grid, vehicle
-        self.unit = p.height_step * vehicle.max_step
-        self.risk = grid.sample(lattice, maps["risk"], UNKNOWN)
-        hazard = self.risk == HAZARDOUS
-        reason = grid.sample(lattice, maps["reason"], 0)
-        self.closed = hazard | (self.risk == UNKNOWN)
-        self.wheel_hazard = hazard & ((reason & WHEEL_BITS) > 0)
-        self.body_hazard = hazard & ((reason & np.uint16(sum(BITS.values()) - int(WHEEL_BITS))) > 0)
-        mean = window_mean(maps["elevation"], window_cells(vehicle.wheel_diameter, lattice.cell))
-        self.stand = grid.sample(lattice, mean, np.nan)
-        self.height = np.rint(np.where(self.closed, 0.0, self.stand) / self.unit).astype(np.int64)
-        self.toll = (self.risk == CAUTION) * np.int64(round(p.caution * grid.cell / self.unit))
-
-    def ways(self, ground: str) -> Bytes:
-        """Directions (row, col) as bits with ``ground`` on the known."""
-        unknown = self.risk == UNKNOWN
-        given = None if ground == "middle" else unknown
-        ways = standing(self.wheel_hazard, self.body_hazard, self.vehicle, self.grid.cell, unknown=given, below=ground)
-        ways[self.closed] = 0
-        return ways
-
-    def xyz(self, cells: Ints) -> Floats:
-        row, col = cells[:, 0], cells[:, 1]
-        return np.column_stack([self.grid.xy(row, col), self.stand[row, col]])
+def _ground(maps: Maps, lattice: Lattice, grid: RowGrid, vehicle: Vehicle, p: PathParams) -> Ground:
+    return Ground(maps, lattice, grid, vehicle, unit=p.height_step * vehicle.max_step, caution=p.caution)
 
 
 def _by_rows(
@@ -207,16 +138,19 @@ def _by_rows(
     target: Point | None,
     p: PathParams,
 ) -> Route:
-    ground = _Ground(maps, lattice, RowGrid.over(lattice, heading), vehicle, p)
+    ground = _ground(maps, lattice, RowGrid.over(lattice, heading), vehicle, p)
     grid = ground.grid
     first, last = (None if point is None else grid.index(point) for point in (start, target))
     tolerance = math.ceil((vehicle.wheel_base + vehicle.wheel_diameter) / lattice.cell)
     span = row_span(~ground.closed)
     for name in GROUNDS:
-        found = plan(ground.height, ground.ways(name), tolerance, first, last, span=span, toll=ground.toll)
+        explain = name == GROUNDS[-1]
+        found = plan(
+            ground.height, ground.ways(name), tolerance, first, last, span=span, toll=ground.toll, explain=explain
+        )
         if len(found.cells):
             break
-    cost = np.where(found.cost < UNREACHED, found.cost // grid.rows * ground.unit, np.nan).astype(np.float32)
+    cost = ground.metres(found.cost, UNREACHED, grid.rows)
     return Route(found.cells, ground.xyz(found.cells), found, grid, "rows", name, cost, span or (0, 0))
 
 
@@ -229,14 +163,14 @@ def _by_grid(
     p: PathParams,
     before: Route | None,
 ) -> Route:
-    ground = _Ground(maps, lattice, RowGrid.over(lattice, (0.0, 1.0)), vehicle, p)
+    ground = _ground(maps, lattice, RowGrid.over(lattice, (0.0, 1.0)), vehicle, p)
     grid, unit = ground.grid, max(1, round(lattice.cell / ground.unit))
     given = tuple(None if point is None else grid.index(point) for point in (start, target))
     nothing = np.empty((0, 2), dtype=np.int64)
     cells, cost, name = nothing, np.full(ground.height.shape, UNREACHED), GROUNDS[0]
-    for name in _worth(ground) if given == (None, None) else GROUNDS:
+    for name in ground.worth() if given == (None, None) else GROUNDS:
         ways = ground.ways(name)
-        first, last = _chosen(ways, given[0], given[1], ground, unit)
+        first, last = chosen(ground, name, *given)
         if first is None or last is None or not ways[first] or not ways[last]:
             continue
         cost, step = grid8.cost_to_go(ground.height, ways, last, first, unit, ground.toll)
@@ -249,86 +183,8 @@ def _by_grid(
     if len(cells):
         found = replace(found, target_row=int(cells[-1, 0]), blocking_row=None)
         found.reachable[cells[-1, 1]] = True
-    metres = np.where(cost < UNREACHED, cost * ground.unit, np.nan).astype(np.float32)
+    metres = ground.metres(cost, UNREACHED)
     return Route(cells, ground.xyz(cells), found, grid, "grid8", name, metres, row_span(~ground.closed) or (0, 0))
-
-
-def _worth(ground: _Ground) -> tuple[str, ...]:
-    """Of :data:`GROUNDS` those on which connected ground covers most of the rows that it covers on any."""
-    spans = [grid8.parts(ground.ways(name))[1] for name in GROUNDS]
-    rows = [int((s[:, 1] - s[:, 0]).max(initial=0)) for s in spans]
-    return tuple(name for name, n in zip(GROUNDS, rows, strict=True) if n >= MOST * max(rows))
-
-
-def _chosen(
-    ways: Bytes, start: tuple[int, int] | None, target: tuple[int, int] | None, ground: _Ground, unit: int
-) -> tuple[tuple[int, int] | None, tuple[int, int] | None]:
-    """Ends as given; else, of the connected ground over most rows (that of the target), the cell nearest to the middle
-    of the first row, and of those that it reaches the one nearest to that of the last."""
-    span = row_span(ways > 0)
-    if span is None:
-        return None, None
-    if start is None:
-        number, spans = grid8.parts(ways)
-        most = number[target] if target is not None else int(np.argmax(spans[:, 1] - spans[:, 0]))
-        if most < 0:
-            return None, target
-        start = _nearest(number == most, span[1])
-    if target is None:
-        cost, _ = grid8.cost_to_go(ground.height, ways, start, None, unit, ground.toll)
-        target = _nearest(cost < UNREACHED, span[0])
-    return start, target
-
-
-def _nearest(cells: NDArray[np.bool_], row: int) -> tuple[int, int]:
-    """The set cell nearest to the middle of a row, as :mod:`stages.row_graph` has it."""
-    r, c = np.nonzero(cells)
-    best = int(np.argmin(2 * np.abs(r - row) + np.abs(2 * c - (cells.shape[1] - 1))))
-    return int(r[best]), int(c[best])
-
-
-def check_end(maps: Maps, lattice: Lattice, vehicle: Vehicle, name: str, point: Point) -> None:
-    """Refuse a start or target outside the map, in a hazard or on unknown ground, with the figure that decides."""
-    row, col = (int(v) for v in np.rint(lattice.index(point)))
-    where = f"path.{name} ({point[0]:g}, {point[1]:g}) m"
-    if not (0 <= row < lattice.rows and 0 <= col < lattice.cols):
-        x0, x1, y0, y1 = lattice.bounds
-        raise InputError(
-            f"{where} is outside the map", remedy=f"give x in {x0:.3f}..{x1:.3f} and y in {y0:.3f}..{y1:.3f} m"
-        )
-    kind = maps["risk"][row, col]
-    if kind == UNKNOWN:
-        free = np.argwhere(maps["risk"] < HAZARDOUS)
-        away = (
-            f", the nearest ground to drive on is {_away(free, row, col, lattice.cell):.3g} m away" if len(free) else ""
-        )
-        raise InputError(f"{where} lies on unknown ground{away}", remedy=f"choose another {name}")
-    if kind == HAZARDOUS:
-        raise InputError(
-            f"{where} lies in a hazard: {hazard_words(maps, (row, col), vehicle)}", remedy=f"choose another {name}"
-        )
-
-
-def _away(cells: NDArray[np.intp], row: int, col: int, cell: float) -> float:
-    return float(np.hypot(cells[:, 0] - row, cells[:, 1] - col).min()) * cell
-
-
-def hazard_words(maps: Maps, at: tuple[int, int], vehicle: Vehicle) -> str:
-    """The measures over their limits at a cell, with both figures."""
-    band = {"range": "height_range", "rise": "clearance"}
-    told = []
-    for name, bit in BITS.items():
-        if not int(maps["reason"][at]) & bit:
-            continue
-        words, limit, unit = WORDS[name]
-        values = maps.get(band.get(name, name))
-        if values is None:
-            told.append(f"{words} over vehicle.{limit}")
-            continue
-        value = float(values[at])
-        value = vehicle.clearance - value if name == "rise" else math.degrees(value) if unit == "deg" else value
-        told.append(f"{words} {value:.3g} {unit}, vehicle.{limit} {getattr(vehicle, limit):g}")
-    return "; ".join(told)
 
 
 def _run(params: PathParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
@@ -345,66 +201,6 @@ def _run(params: PathParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
         "reachable": route.plan.reachable.astype(np.uint8),
     }
     return Bundle(arrays, describe(route, maps, lattice, vehicle) | {"frame": source.meta.get("frame", "local")})
-
-
-def describe(route: Route, maps: Maps, lattice: Lattice, vehicle: Vehicle) -> dict[str, Any]:
-    """Facts of a route: length, climb, and the worst that it meets."""
-    found, grid, xyz = route.plan, route.grid, route.xyz
-    meta: dict[str, Any] = {
-        "found": len(xyz) > 0,
-        "planner": route.planner,
-        "ground": route.ground,
-        "reason": found.reason or "" if len(xyz) else _why(found, maps, vehicle),
-        "blocking_row": found.blocking_row,
-        "blocking_y": None if found.blocking_row is None else (grid.j0 - found.blocking_row) * grid.cell,
-        "beside_unknown": route.ground != GROUNDS[0],
-        "target_row": found.target_row,
-        "reachable_targets": int(found.reachable.sum()),
-        "vertices": len(xyz),
-        "grid": grid.to_dict(),
-    }
-    none = ("length_m", "climb_m", "max_inclination", "max_tilt", "least_clearance", "max_p_hazard", "caution_share")
-    if len(xyz) == 0:
-        return meta | dict.fromkeys((*none, "start", "target", "left_out_m"))
-    at = tuple(np.rint(lattice.index(xyz[:, :2])).astype(np.int64).T)
-    steps = np.diff(xyz, axis=0)
-    return meta | {
-        "length_m": float(np.sqrt((steps**2).sum(axis=1)).sum()),
-        "climb_m": float(np.maximum(steps[:, 2], 0.0).sum()),
-        "max_inclination": _worst(maps, "inclination", at, np.nanmax),
-        "max_tilt": _worst(maps, "tilt", at, np.nanmax),
-        "least_clearance": _worst(maps, "clearance", at, np.nanmin),
-        "max_p_hazard": _worst(maps, "p_hazard", at, np.nanmax),
-        "caution_share": float((maps["risk"][at] == CAUTION).mean()),
-        "left_out_m": _left_out(route),
-        "start": [float(v) for v in xyz[0]],
-        "target": [float(v) for v in xyz[-1]],
-    }
-
-
-def _left_out(route: Route) -> list[float]:
-    """Metres of rows with known ground before the start and beyond the target."""
-    span, rows = route.span, route.cells[[0, -1], 0]
-    return [float(span[1] - rows[0]) * route.grid.cell, float(rows[1] - span[0]) * route.grid.cell]
-
-
-def _worst(maps: Maps, name: str, at: Any, of: Any) -> float | None:
-    return float(of(maps[name][at])) if name in maps else None
-
-
-def _why(found: Plan, maps: Maps, vehicle: Vehicle) -> str:
-    """Why there is no path; where hazards leave nothing to drive on, the limit that does the most."""
-    risk = maps["risk"]
-    judged = int((risk != UNKNOWN).sum())
-    if judged == 0 or (risk[risk != UNKNOWN] < HAZARDOUS).any():
-        return found.reason
-    most = max(BITS, key=lambda name: int(((maps["reason"] & BITS[name]) > 0).sum()))
-    share = float(((maps["reason"] & BITS[most]) > 0).sum()) / judged
-    words, limit, _ = WORDS[most]
-    return (
-        f"all {judged} known cells are hazardous, {100 * share:.0f} % of them by {words}: "
-        f"is vehicle.{limit} {getattr(vehicle, limit):g} at the scale of the sequence?"
-    )
 
 
 STAGE = Stage(

@@ -26,7 +26,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from stages.extrema import running_range
+from stages.extrema import running_max
 from stages.vehicle import Vehicle
 
 Floats32 = NDArray[np.float32]
@@ -126,10 +126,9 @@ def place(
     stance = Stance.of(vehicle, cell)
     gaps = np.isnan(high) if whole is None else ~whole
     reach = int(max(np.abs(stance.wheels).max(), np.abs(stance.belly).max()))
-    stand, _ = running_range(high, stance.wheel_reach)
-    _, ground = running_range(low, stance.wheel_reach)
-    belly, _ = running_range(high, stance.belly_reach)
-    patchy = [running_range(gaps.astype(np.float32), n)[0] > 0 for n in (stance.wheel_reach, stance.belly_reach)]
+    stand, belly = (running_max(high, n) for n in (stance.wheel_reach, stance.belly_reach))
+    ground = -running_max(-low, stance.wheel_reach)
+    patchy = [running_max(gaps.astype(np.float32), n) > 0 for n in (stance.wheel_reach, stance.belly_reach)]
     padded = [
         np.pad(np.where(np.isfinite(a), a, np.float32(np.nan)), reach, constant_values=np.nan)
         for a in (stand, ground, belly)

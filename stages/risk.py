@@ -13,12 +13,13 @@ Guarantees, each tested: of two elevation models the one with the greater relief
 the greater standard deviations, is in no cell the safer one; nor is it with a larger ``sigmas``.
 
 Holes. A window is judged on what is known of it, so unknown does not grow; a hazard that is proven by a part is one.
-Small holes are closed with a flag. Their standard deviation has half the range of the rim (:mod:`stages.holes`); their
-heights lie within it, so they add no relief of their own.
+Small holes are closed with a flag. Their heights lie within the range of the rim (:mod:`stages.holes`), anywhere in
+it as far as is known, so they add no relief of their own, and their standard deviation is that of such a height.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -28,24 +29,34 @@ from pydantic import Field
 
 from stages.declare import Array, Bundle, Inputs, Memory, Params, Stage
 from stages.errors import InputError
-from stages.hazards import BITS, judge, measure, spread_out
+from stages.hazards import BITS, measure
 from stages.holes import close_holes
 from stages.lattice import Lattice, mosaic, union
 from stages.vehicle import DEFAULT_VEHICLE, Vehicle
+from stages.verdict import (
+    CAUTION,
+    DOUBT_BIT,
+    FILLED_BIT,
+    HAZARDOUS,
+    SAFE,
+    UNKNOWN,
+    UNKNOWN_BIT,
+    UNSEEN_BIT,
+    Rules,
+    classify,
+)
+
+__all__ = ["BITS", "CAUTION", "DOUBT_BIT", "HAZARDOUS", "REASONS", "SAFE", "UNKNOWN", "UNKNOWN_BIT", "risk_map"]
 
 Floats32 = NDArray[np.float32]
-
-SAFE, CAUTION, HAZARDOUS, UNKNOWN = 0, 1, 2, 3
-"""Classes of ``risk``."""
-
-UNKNOWN_BIT, FILLED_BIT, DOUBT_BIT, UNSEEN_BIT = 1 << 7, 1 << 8, 1 << 9, 1 << 10
 
 REASONS = BITS | {"unknown": UNKNOWN_BIT, "filled": FILLED_BIT, "uncertain": DOUBT_BIT, "unseen": UNSEEN_BIT}
 """Bits of ``reason``: a measure over its limit; too little known to judge; elevation interpolated; over a limit only
 because of sigma; some of the ground that is looked at is unknown."""
 
-WHOLE = 0.999
-"""Share of a window from which it counts as wholly known."""
+
+RIM = 1.0 / math.sqrt(12.0)
+"""Standard deviation of a height that lies anywhere within a range, of that range."""
 
 
 class RiskParams(Params):
@@ -104,46 +115,13 @@ def risk_map(
     p = params or RiskParams()
     check_size(vehicle, elevation.shape, cell)
     window = p.window * vehicle.wheel_diameter
-    s = np.where(np.isfinite(elevation_std), elevation_std, np.float32(0)).astype(np.float32)
+    s = np.where(np.isfinite(elevation_std), elevation_std, np.float32(0)).astype(np.float32, copy=False)
     z, s, filled = close_holes(
-        elevation, s, p.max_hole * vehicle.wheel_diameter / cell, window_cells(window, cell), p.min_known
+        elevation, s, p.max_hole * vehicle.wheel_diameter / cell, window_cells(window, cell), p.min_known, rim=RIM
     )
-    measured = measure(z, s, cell, vehicle, window, filled)
-    judged = judge(measured, vehicle, window, cell, p.sigmas)
-    known = ~np.isnan(z)
-    spread = [spread_out(a, measured.stride, z.shape) for a in (measured.share, measured.unstood)]
-    hazardous = known & (judged.load > 1.0)
-    unknown = ~known | ((spread[0] < p.min_known) & ~hazardous)
-    unseen = (spread[0] < WHOLE) | (spread[1] > 0)
-    near = (judged.load > p.caution) | (judged.p > p.max_p)
-    risk = np.where(near, np.uint8(CAUTION), np.uint8(SAFE))
-    risk[hazardous], risk[unknown] = HAZARDOUS, UNKNOWN
-    reason = np.where(hazardous, judged.bits, np.uint16(0))
-    for mask, bit in ((unknown, UNKNOWN_BIT), (filled == 1, FILLED_BIT), (unseen, UNSEEN_BIT)):
-        reason[mask] |= np.uint16(bit)
-    reason[hazardous & (judged.doubt == 1)] |= np.uint16(DOUBT_BIT)
-    return {
-        "risk": risk,
-        "reason": reason,
-        **_bands(measured.values, measured.stride, vehicle, unknown),
-        "p_hazard": np.where(unknown, np.float32(np.nan), judged.p),
-        "filled": filled,
-        "elevation": z,
-    }
-
-
-def _bands(values: Mapping[str, Floats32], n: int, vehicle: Vehicle, unknown: NDArray[np.bool_]) -> dict[str, Floats32]:
-    """Measures in radians and metres on the cells, NaN where unknown."""
-    out = {
-        "inclination": np.arctan(values["inclination"]),
-        "height_range": values["range"],
-        "step": values["step"],
-        "roughness": spread_out(values["roughness"], n, unknown.shape),
-        "slope": spread_out(np.arctan(values["slope"]), n, unknown.shape),
-        "tilt": spread_out(np.arctan(values["tilt"]), n, unknown.shape),
-        "clearance": spread_out(np.float32(vehicle.clearance) - values["rise"], n, unknown.shape),
-    }
-    return {name: np.where(unknown, np.float32(np.nan), a) for name, a in out.items()}
+    measured = measure(elevation, z, s, cell, vehicle, window)
+    rules = Rules(p.sigmas, p.caution, p.max_p, p.min_known)
+    return classify(measured, z, filled, vehicle, window, cell, rules) | {"filled": filled, "elevation": z}
 
 
 def check_size(vehicle: Vehicle, shape: tuple[int, ...], cell: float) -> None:
@@ -198,7 +176,7 @@ _GRID = ("row", "col")
 
 STAGE = Stage(
     name="risk",
-    version=2,
+    version=3,
     summary="safe, caution, hazard and unknown cells by seven measures against a vehicle's limits",
     params=RiskParams,
     inputs=("dem*",),

@@ -12,6 +12,7 @@ in the direction of the edge.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -19,15 +20,13 @@ from numpy.typing import NDArray
 
 from stages.swept import ALL, LEFT, RIGHT, STRAIGHT
 
-Ints = NDArray[np.int64]
+Ints = NDArray[np.integer[Any]]
 Mask = NDArray[np.bool_]
 Ways = NDArray[np.uint8]
 
 UNREACHED = np.iinfo(np.int64).max // 4
 MOVES = (0, 1, -1)
 """Column of the predecessor minus the cell's own, in order of preference: came straight, to the left, to the right."""
-WAYS = (STRAIGHT, LEFT, RIGHT)
-"""Bits of the directions of the moves."""
 
 
 @dataclass(frozen=True)
@@ -39,8 +38,8 @@ class Plan:
     ``reason`` in words, both empty where a path was found. ``beside_unknown``: no path keeps half a wheel from unknown.
     """
 
-    cells: Ints
-    cost: Ints
+    cells: NDArray[np.int64]
+    cost: NDArray[np.int64]
     reachable: Mask
     target_row: int
     blocking_row: int | None = None
@@ -53,14 +52,16 @@ def ways_of(free: Mask | Ways) -> Ways:
     return np.where(free, np.uint8(ALL), np.uint8(0)) if free.dtype == np.bool_ else np.asarray(free, np.uint8)
 
 
-def sweep(height: Ints, free: Mask | Ways, sources: Mask, toll: Ints | None = None) -> tuple[Ints, NDArray[np.int8]]:
+def sweep(
+    height: Ints, free: Mask | Ways, sources: Mask, toll: Ints | None = None
+) -> tuple[NDArray[np.int64], NDArray[np.int8]]:
     """Least cost from any source to every cell of the row graph, towards row 0.
 
     Parameters
     ----------
-    height : (row, col) int64, any unit.
+    height : (row, col) whole numbers, any unit.
     free, sources : (row, col) cells that may be entered, or directions as bits; cells where a path may start.
-    toll : (row, col) int64, added on entering a cell, in the unit of the heights.
+    toll : (row, col) whole numbers, added on entering a cell, in the unit of the heights.
 
     Returns
     -------
@@ -68,53 +69,66 @@ def sweep(height: Ints, free: Mask | Ways, sources: Mask, toll: Ints | None = No
     moves; and the index into :data:`MOVES` of the last move (-1 at sources and where not reached).
     """
     ways = ways_of(free)
-    cost = np.where(sources & (ways > 0), 0, UNREACHED).astype(np.int64)
-    move = np.full(height.shape, -1, dtype=np.int8)
-    _sweep(np.ascontiguousarray(height), ways, np.zeros_like(height) if toll is None else toll, cost, move)
+    cost, move = np.empty(height.shape, dtype=np.int64), np.empty(height.shape, dtype=np.int8)
+    _sweep(np.ascontiguousarray(height), ways, np.zeros_like(height) if toll is None else toll, sources, cost, move)
     return cost, move
 
 
 @njit(cache=True, nogil=True)
-def _sweep(height, ways, toll, cost, move):  # type: ignore[no-untyped-def]
+def _sweep(height, ways, toll, sources, cost, move):  # type: ignore[no-untyped-def]
+    """Rows are worked on as lines: the last one is kept with an unreachable cell at either end."""
     rows, cols = height.shape
-    for r in range(rows - 2, -1, -1):
+    last, around = np.full(cols + 2, UNREACHED, dtype=np.int64), np.zeros(cols + 2, dtype=np.uint8)
+    before = np.zeros(cols + 2, dtype=np.int64)
+    for r in range(rows - 1, -1, -1):
+        _enter(height[r], ways[r], toll[r], last, around, before, rows, cost[r], move[r])
         for c in range(cols):
-            here = ways[r, c]
-            if here == 0 or cost[r, c] != UNREACHED:
-                continue
-            best, found = UNREACHED, -1
-            for k in range(3):
-                d = c + MOVES[k]
-                if d < 0 or d >= cols or cost[r + 1, d] >= UNREACHED or not here & ways[r + 1, d] & WAYS[k]:
-                    continue
-                total = cost[r + 1, d] + (abs(height[r, c] - height[r + 1, d]) + toll[r, c]) * rows + (k != 0)
-                if total < best:
-                    best, found = total, k
-            if found >= 0:
-                cost[r, c], move[r, c] = best, found
-
-
-def farthest_row(free: Mask | Ways) -> Ints:
-    """Smallest row (row, col) that can be reached from each free cell; the number of rows where not free."""
-    ways = ways_of(free)
-    far = np.full(ways.shape, ways.shape[0], dtype=np.int64)
-    _farthest(ways, far)
-    return far
+            if sources[r, c] and ways[r, c]:
+                cost[r, c], move[r, c] = 0, -1
+        for c in range(cols):
+            last[c + 1], around[c + 1], before[c + 1] = cost[r, c], ways[r, c], height[r, c]
 
 
 @njit(cache=True, nogil=True)
-def _farthest(ways, far):  # type: ignore[no-untyped-def]
+def _enter(height, ways, toll, last, around, before, rows, cost, move):  # type: ignore[no-untyped-def]
+    """Least cost of one row from the last one; without branches, so that cells go side by side."""
+    far = np.int64(UNREACHED)
+    for c in range(height.shape[0]):
+        here, h, step = ways[c], np.int64(height[c]), np.int64(toll[c])
+        a = last[c + 1] + (abs(h - before[c + 1]) + step) * rows
+        a = a if here & around[c + 1] & STRAIGHT and last[c + 1] < far else far
+        b = last[c + 2] + (abs(h - before[c + 2]) + step) * rows + 1
+        b = b if here & around[c + 2] & LEFT and last[c + 2] < far else far
+        d = last[c] + (abs(h - before[c]) + step) * rows + 1
+        d = d if here & around[c] & RIGHT and last[c] < far else far
+        best = a
+        k = np.int8(0) if a < far else np.int8(-1)
+        k = np.int8(1) if b < best else k
+        best = b if b < best else best
+        k = np.int8(2) if d < best else k
+        best = d if d < best else best
+        cost[c], move[c] = best, k
+
+
+def leading(free: Mask | Ways, limit: int) -> Mask:
+    """Free cells (row, col) from which a row up to ``limit`` can be reached."""
+    ways = ways_of(free)
+    out = np.empty(ways.shape, dtype=np.bool_)
+    _leading(ways, limit, out)
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _leading(ways, limit, out):  # type: ignore[no-untyped-def]
     rows, cols = ways.shape
+    ahead = np.zeros(cols + 2, dtype=np.uint8)  # ways of the cells of the last row that lead on
     for r in range(rows):
+        here, line = ways[r], out[r]
         for c in range(cols):
-            if ways[r, c] == 0:
-                continue
-            best = r
-            for k in range(3):
-                d = c - MOVES[k]
-                if r > 0 and 0 <= d < cols and ways[r, c] & ways[r - 1, d] & WAYS[k] and far[r - 1, d] < best:
-                    best = far[r - 1, d]
-            far[r, c] = best
+            on = ahead[c + 1] & STRAIGHT | ahead[c] & LEFT | ahead[c + 2] & RIGHT
+            line[c] = here[c] & on != 0 or (r <= limit and here[c] != 0)
+        for c in range(cols):
+            ahead[c + 1] = here[c] if line[c] else 0
 
 
 def plan(
@@ -125,37 +139,40 @@ def plan(
     target: tuple[int, int] | None = None,
     span: tuple[int, int] | None = None,
     toll: Ints | None = None,
+    explain: bool = True,
 ) -> Plan:
     """Path from the nearest to the farthest row, or between given cells.
 
     Parameters
     ----------
-    height : (row, col) int64 rounded heights. ``free`` : cells that may be entered, or directions as
+    height : (row, col) rounded heights, whole numbers. ``free`` : cells that may be entered, or directions as
         bits. Row 0 is farthest.
     tolerance : rows by which a start or target that is not given may miss the nearest or farthest row with a free cell;
         at most a quarter of the rows between them.
     start, target : row and column, inside the grid.
     span : the farthest and the nearest row that count; None: those with a free cell.
     toll : see :func:`sweep`.
+    explain : where there is no path, find out how far one can go.
     """
     ways = ways_of(free)
-    free = ways > 0
-    rows, cols = free.shape
-    first_last = span or row_span(free)
-    nothing = Plan(np.empty((0, 2), dtype=np.int64), np.full(free.shape, UNREACHED), np.zeros(cols, dtype=bool), 0)
+    rows, cols = ways.shape
+    first_last = span or row_span(ways > 0)
+    unreached = np.broadcast_to(np.int64(UNREACHED), ways.shape)
+    nothing = Plan(np.empty((0, 2), dtype=np.int64), unreached, np.zeros(cols, dtype=bool), 0)
     for name, cell in (("start", start), ("target", target)):
-        if cell is not None and not free[cell]:
+        if cell is not None and not ways[cell]:
             return _blocked(nothing, cell[0], f"the {name} is not a free cell")
     if first_last is None:
         return _blocked(nothing, rows - 1, "there is no free cell")
     farthest, nearest = first_last
     tolerance = min(tolerance, (nearest - farthest) // 4)
     limit = farthest + tolerance
-    candidates = np.zeros_like(free)
+    candidates = np.zeros(ways.shape, dtype=bool)
     if start is not None:
         candidates[start] = True
     else:
-        candidates[max(nearest - tolerance, 0) : nearest + 1] = free[max(nearest - tolerance, 0) : nearest + 1]
+        near = slice(max(nearest - tolerance, 0), nearest + 1)
+        candidates[near] = ways[near] > 0
     allowed = ways
     if target is not None:
         allowed = ways.copy()
@@ -164,20 +181,18 @@ def plan(
         candidates[: target[0] + 1] = False
         if not candidates.any():
             return _blocked(nothing, target[0], "the target is not ahead of the start")
-    far = farthest_row(allowed)
-    good = candidates & (far <= limit)
+    good = candidates & leading(allowed, limit)
     if not good.any():
+        if not explain:
+            return nothing
         cost, _ = sweep(height, allowed, candidates, toll)
-        stop = int(far[candidates].min()) - 1 if candidates.any() else nearest
-        return _blocked(
-            Plan(nothing.cells, cost, nothing.reachable, limit), stop, "no free cell of this row can be entered"
-        )
-    source = np.zeros_like(free)
-    source[_nearest_middle(good, nearest)] = True
+        reached = np.flatnonzero((cost < UNREACHED).any(axis=1))
+        stop = int(reached[0]) - 1 if len(reached) else nearest
+        return _blocked(replace(nothing, cost=cost, target_row=limit), stop, "no free cell of this row can be entered")
+    source = np.zeros(ways.shape, dtype=bool)
+    source[nearest_middle(good, nearest)] = True
     cost, move = sweep(height, allowed, source, toll)
-    ends = cost < UNREACHED
-    ends[limit + 1 :] = False
-    row, col = _nearest_middle(ends, farthest)
+    row, col = nearest_middle(cost[: limit + 1] < UNREACHED, farthest)
     return Plan(_trace(move, row, col), cost, cost[row] < UNREACHED, row)
 
 
@@ -191,17 +206,26 @@ def _blocked(at: Plan, row: int, reason: str) -> Plan:
     return replace(at, blocking_row=row, reason=reason)
 
 
-def _nearest_middle(cells: Mask, row: int) -> tuple[int, int]:
+def nearest_middle(cells: Mask, row: int) -> tuple[int, int]:
     """The set cell with the fewest moves along rows and columns to the middle of a row; the first one among equals."""
     r, c = np.nonzero(cells)
     best = int(np.argmin(2 * np.abs(r - row) + np.abs(2 * c - (cells.shape[1] - 1))))
     return int(r[best]), int(c[best])
 
 
-def _trace(move: NDArray[np.int8], row: int, col: int) -> Ints:
+def _trace(move: NDArray[np.int8], row: int, col: int) -> NDArray[np.int64]:
     """Cells (vertex, 2) from the source to the given cell."""
-    cells = [(row, col)]
-    while move[row, col] >= 0:
-        row, col = row + 1, col + MOVES[move[row, col]]
-        cells.append((row, col))
-    return np.array(cells[::-1], dtype=np.int64)
+    out = np.empty((move.shape[0] - row, 2), dtype=np.int64)
+    return out[: _walk(move, row, col, out)][::-1].copy()
+
+
+@njit(cache=True, nogil=True)
+def _walk(move, row, col, out):  # type: ignore[no-untyped-def]
+    n = 0
+    while True:
+        out[n, 0], out[n, 1] = row, col
+        n += 1
+        k = move[row, col]
+        if k < 0:
+            return n
+        row, col = row + 1, col + MOVES[k]

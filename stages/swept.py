@@ -10,10 +10,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from stages.extrema import octagon
+from stages.packed import Canvas
 from stages.vehicle import Vehicle
 
 Mask = NDArray[np.bool_]
@@ -37,108 +37,87 @@ def widened(mask: Mask, half_length: float, half_width: float, step: tuple[int, 
     """
     along, across = step, (step[1], -step[0])
     unit = math.hypot(*step)
-    diagonal = unit > 1
     # a diagonal line leaves every other cell out: a square of two closes them
     sides = [max(0, math.ceil(v / unit - 1e-9)) for v in (half_length, half_width)]
-    pad = (sides[0] + sides[1] + 1) * max(abs(along[0]), abs(along[1]), 1)
-    work = np.pad(mask.astype(np.uint8), pad, constant_values=1)
-    spare = np.empty_like(work)
+    canvas = Canvas.of(mask, sum(sides) + 1, outside=True)
     for n, (dr, dc) in zip(sides, (along, across), strict=True):
-        work, spare = _spread(work, spare, n, dr, dc)
-    if diagonal:
-        work, spare = _spread(work, spare, 1, 0, 1)
-    return np.asarray(work[pad:-pad, pad:-pad] != 0)
-
-
-@njit(cache=True, nogil=True)
-def _or(a, b, out):  # type: ignore[no-untyped-def]
-    for c in range(out.shape[0]):
-        out[c] = a[c] | b[c]
-
-
-@njit(cache=True, nogil=True)
-def _spread(work, spare, n, dr, dc):  # type: ignore[no-untyped-def]
-    """Union over the shifts by -n .. n steps, by doubling; returns the result and the other buffer."""
-    for sign in (1, -1):
-        left = n
-        w = 1  # union of shifts 0 .. w - 1
-        while left > 0:
-            k = min(w, left)
-            _shifted(work, spare, sign * k * dr, sign * k * dc)
-            work, spare = spare, work
-            left -= k
-            w += k
-    return work, spare
-
-
-@njit(cache=True, nogil=True)
-def _shifted(work, out, dr, dc):  # type: ignore[no-untyped-def]
-    """``out = work | work shifted by (dr, dc)``; what comes from outside is 0."""
-    rows, cols = work.shape
-    c0, c1 = max(0, dc), min(cols, cols + dc)
-    for r in range(rows):
-        for c in range(cols):
-            out[r, c] = work[r, c]
-        if 0 <= r - dr < rows and c1 > c0:
-            _or(work[r, c0:c1], work[r - dr, c0 - dc : c1 - dc], out[r, c0:c1])
+        canvas.spread(n, dr, dc)
+    if unit > 1:
+        canvas.spread(1, 0, 1)
+    return canvas.mask()
 
 
 def grown(mask: Mask, reach: float) -> Mask:
     """Cells within ``reach`` cells of the mask: an octagon, nowhere smaller than the circle."""
     side, diagonal = octagon(math.ceil(reach - 1e-9))
-    pad = side + 2 * diagonal
-    if pad == 0:
-        return mask.copy()
-    work = np.pad(mask.astype(np.uint8), pad)
-    spare = np.empty_like(work)
+    canvas = Canvas.of(mask, side + 2 * diagonal)
     for n, dr, dc in ((side, 0, 1), (side, 1, 0), (diagonal, 1, 1), (diagonal, 1, -1)):
-        work, spare = _spread(work, spare, n, dr, dc)
-    return np.asarray(work[pad:-pad, pad:-pad] != 0)
+        canvas.spread(n, dr, dc)
+    return canvas.mask()
 
 
-def standing(
-    wheel_hazard: Mask,
-    body_hazard: Mask,
-    vehicle: Vehicle,
-    cell: float,
-    *,
-    unknown: Mask | None = None,
-    below: str = "",
-) -> Bytes:
-    """Directions (row, col) as bits in which the vehicle may stand with its middle on a cell.
+class Stand:
+    """Where the vehicle may stand: its wheels and its middle laid over hazards once, for whatever is below it."""
 
-    Parameters
-    ----------
-    wheel_hazard : cells to which no wheel's middle may come as near as the margin.
-    body_hazard : cells to which the vehicle's middle may not.
-    unknown : cells that ``below``, its "outline" (without margin) or its "wheels", may not touch; what lies outside the
-        map counts as such. None: wherever its middle may be.
-    """
-    wheels, middle = (grown(mask, vehicle.margin / cell) for mask in (wheel_hazard, body_hazard))
-    wheels = wheels | unknown if unknown is not None and below == "wheels" else wheels
-    ahead, aside = 0.5 * vehicle.wheel_base / cell, 0.5 * vehicle.track / cell
-    out = np.zeros(wheel_hazard.shape, dtype=np.uint8)
-    for bit, dr, dc in STEPS:
-        unit = math.hypot(dr, dc)
-        closed = middle.copy()
-        for along, across in ((ahead, aside), (ahead, -aside), (-ahead, aside), (-ahead, -aside)):
-            # the wheel is at (row, col) of the middle plus this: what lies there closes the middle
-            at = round((along * dr + across * dc) / unit), round((along * dc - across * dr) / unit)
-            _mark(closed, wheels, at[0], at[1], unknown is not None)
-        if unknown is not None and below == "outline":
-            closed |= widened(unknown, vehicle.half_length / cell, vehicle.half_width / cell, (dr, dc))
-        out[~closed] |= np.uint8(bit)
-    return out
+    def __init__(
+        self,
+        wheel_hazard: Mask,
+        body_hazard: Mask,
+        vehicle: Vehicle,
+        cell: float,
+        unknown: Mask | None = None,
+        closed: Mask | None = None,
+    ) -> None:
+        """
+        Parameters
+        ----------
+        wheel_hazard : (row, col) cells to which no wheel's middle may come as near as the margin.
+        body_hazard : cells to which the vehicle's middle may not.
+        cell : side of a cell, metres.
+        unknown : cells that the outline (without margin) or the wheels may not touch, where that is asked for; what
+            lies outside the map counts as such. None: none, and nothing outside.
+        closed : cells on which its middle may not be, without a margin.
+        """
+        self._half = vehicle.half_length / cell, vehicle.half_width / cell
+        ahead, aside = 0.5 * vehicle.wheel_base / cell, 0.5 * vehicle.track / cell
+        self._places = [_wheels(ahead, aside, dr, dc) for _, dr, dc in STEPS]
+        self._border = max(abs(v) for four in self._places for at in four for v in at)
+        self._unknown = unknown
+        wheels, middle = (grown(mask, vehicle.margin / cell) for mask in (wheel_hazard, body_hazard))
+        on_wheels, on_middle = (
+            Canvas.of(wheels, self._border),
+            Canvas.of(middle if closed is None else middle | closed, self._border),
+        )
+        self._closed = [self._under(places, on_wheels, on_middle) for places in self._places]
+
+    def ways(self, below: str = "middle") -> Bytes:
+        """Directions (row, col) as bits in which it may, with ``below``, its "outline", its "wheels" or its "middle",
+        on known ground."""
+        out = np.zeros((self._closed[0].rows, self._closed[0].cols), dtype=np.uint8)
+        if below != "middle" and self._unknown is not None:
+            beyond = self._unknown if below == "wheels" else np.zeros_like(self._unknown)
+            beyond_wheels = Canvas.of(beyond, self._border, outside=True)
+        for (bit, dr, dc), places, closed in zip(STEPS, self._places, self._closed, strict=True):
+            if below == "middle" or self._unknown is None:
+                mask = closed.mask()
+            else:
+                mask = self._under(places, beyond_wheels, closed).mask()
+                if below == "outline":
+                    mask |= widened(self._unknown, *self._half, (dr, dc))
+            out |= mask.view(np.uint8) * np.uint8(bit)
+        return out ^ np.uint8(ALL)
+
+    @staticmethod
+    def _under(places: list[tuple[int, int]], wheels: Canvas, closed: Canvas) -> Canvas:
+        """What is closed already, and the cells from which a wheel touches ``wheels``."""
+        out = closed.copy()
+        for dr, dc in places:
+            out.add(wheels, -dr, -dc)
+        return out
 
 
-def _mark(out: Mask, mask: Mask, dr: int, dc: int, outside: bool) -> None:
-    """Mark in ``out`` the cells from which the mask lies at (dr, dc), or ``outside`` if that counts."""
-    rows, cols = mask.shape
-    target = slice(max(-dr, 0), rows - max(dr, 0)), slice(max(-dc, 0), cols - max(dc, 0))
-    source = slice(max(dr, 0), rows - max(-dr, 0)), slice(max(dc, 0), cols - max(-dc, 0))
-    if outside:
-        inner = np.ones_like(out)
-        inner[target] = mask[source]
-        out |= inner
-    else:
-        out[target] |= mask[source]
+def _wheels(ahead: float, aside: float, dr: int, dc: int) -> list[tuple[int, int]]:
+    """Row and column of the four wheels from the middle, cells, on a way along (dr, dc)."""
+    unit = math.hypot(dr, dc)
+    corners = ((ahead, aside), (ahead, -aside), (-ahead, aside), (-ahead, -aside))
+    return [(round((a * dr + b * dc) / unit), round((a * dc - b * dr) / unit)) for a, b in corners]

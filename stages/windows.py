@@ -63,60 +63,107 @@ def window_count(mask: Mask, n: int) -> NDArray[np.int32]:
 
 @njit(cache=True, nogil=True)
 def _count(a, half, out):  # type: ignore[no-untyped-def]
+    """Columns' counts move down with the window, the count over columns along each row."""
     rows, cols = a.shape
-    total = np.zeros(cols, dtype=np.int32)
+    n = 2 * half + 1
+    line = np.zeros(cols + n, dtype=np.int32)  # behind the line's start and beyond its end there is nothing
+    total = line[half + 1 : half + 1 + cols]
     for r in range(-half, rows):
-        for row, sign in ((r + half, 1), (r - half - 1, -1)):
-            if 0 <= row < rows:
-                for c in range(cols):
-                    total[c] += sign if a[row, c] else 0
+        if r + half < rows:
+            _tally(a[r + half], np.int32(1), total)
+        if r > half:
+            _tally(a[r - half - 1], np.int32(-1), total)
         if r < 0:
             continue
-        s = 0
-        for c in range(min(half, cols)):
-            s += total[c]
+        s = line[1:n].sum()
+        target = out[r]
         for c in range(cols):
-            if c + half < cols:
-                s += total[c + half]
-            if c > half:
-                s -= total[c - half - 1]
-            out[r, c] = s
+            s += line[c + n] - line[c]
+            target[c] = s
+
+
+@njit(cache=True, nogil=True)
+def _tally(mask, sign, total):  # type: ignore[no-untyped-def]
+    for c in range(mask.shape[0]):
+        total[c] += sign if mask[c] else np.int32(0)
 
 
 def window_mean(a: Floats32, n: int) -> Floats32:
     """Mean (row, col) of the known cells in the window; NaN where there is none."""
-    known = a == a
-    offset = np.float32(a[known].mean(dtype=np.float64)) if known.any() else np.float32(0)
     out = np.empty(a.shape, dtype=np.float32)
-    _mean(np.ascontiguousarray(a), n // 2, offset, out)
+    _mean(np.ascontiguousarray(a), n // 2, out)
     return out
 
 
+LANES = 4
+"""Rows whose sums along the columns run side by side: each addition waits for the last one of its own row only."""
+
+
 @njit(cache=True, nogil=True)
-def _mean(a, half, offset, out):  # type: ignore[no-untyped-def]
+def _mean(a, half, out):  # type: ignore[no-untyped-def]
     """Sums of the columns move down with the window, the sum over columns along each row."""
     rows, cols = a.shape
-    total, count = np.zeros(cols), np.zeros(cols)
+    offset = _middle(a)
+    # behind the line's start and beyond its end a window has nothing
+    total, count = np.zeros((LANES, cols + 2 * half + 1)), np.zeros((LANES, cols + 2 * half + 1))
+    inner = slice(half + 1, half + 1 + cols)
+    sums, counts = np.empty((LANES, cols)), np.empty((LANES, cols))
+    lane = 0
     for r in range(-half, rows):
-        for row, sign in ((r + half, 1.0), (r - half - 1, -1.0)):
-            if 0 <= row < rows:
-                for c in range(cols):
-                    v = a[row, c] - offset
-                    known = v == v
-                    total[c] += sign * v if known else 0.0
-                    count[c] += sign if known else 0.0
+        if r + half < rows:
+            _add_row(a[r + half], offset, 1.0, total[lane, inner], count[lane, inner])
+        if r > half:
+            _add_row(a[r - half - 1], offset, -1.0, total[lane, inner], count[lane, inner])
         if r < 0:
             continue
-        s, n = 0.0, 0.0
-        for c in range(-half, cols):
-            if c + half < cols:
-                s += total[c + half]
-                n += count[c + half]
-            if c > half:
-                s -= total[c - half - 1]
-                n -= count[c - half - 1]
-            if c >= 0:
-                out[r, c] = s / n + offset if n > 0.5 else np.nan
+        if lane == LANES - 1 or r == rows - 1:
+            _slide(total, 2 * half + 1, sums)
+            _slide(count, 2 * half + 1, counts)
+            for k in range(lane + 1):
+                _divide(sums[k], counts[k], offset, out[r - lane + k])
+        after = (lane + 1) % LANES
+        total[after] = total[lane]
+        count[after] = count[lane]
+        lane = after
+
+
+@njit(cache=True, nogil=True)
+def _slide(lines, n, out):  # type: ignore[no-untyped-def]
+    """Sums of c + 1 .. c + n of :data:`LANES` lines."""
+    p, q, s, t = lines[0], lines[1], lines[2], lines[3]
+    a, b, d, e = 0.0, 0.0, 0.0, 0.0
+    for c in range(1, n):
+        a, b, d, e = a + p[c], b + q[c], d + s[c], e + t[c]
+    for c in range(out.shape[1]):
+        a, b, d, e = a + p[c + n], b + q[c + n], d + s[c + n], e + t[c + n]
+        a, b, d, e = a - p[c], b - q[c], d - s[c], e - t[c]
+        out[0, c], out[1, c], out[2, c], out[3, c] = a, b, d, e
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _divide(sums, counts, offset, out):  # type: ignore[no-untyped-def]
+    for c in range(out.shape[0]):
+        mean = sums[c] / counts[c] + offset
+        out[c] = mean if counts[c] > 0.5 else np.nan
+
+
+@njit(cache=True, nogil=True)
+def _add_row(line, offset, sign, total, count):  # type: ignore[no-untyped-def]
+    for c in range(line.shape[0]):
+        v = line[c] - offset
+        known = v == v
+        total[c] += sign * v if known else 0.0
+        count[c] += sign if known else 0.0
+
+
+@njit(cache=True, nogil=True)
+def _middle(a):  # type: ignore[no-untyped-def]
+    """Mean of the known cells; 0 where there is none."""
+    total, count = np.zeros(a.shape[1]), np.zeros(a.shape[1])
+    for r in range(a.shape[0]):
+        _add_row(a[r], np.float32(0.0), 1.0, total, count)
+    n = count.sum()
+    return np.float32(total.sum() / n) if n > 0 else np.float32(0.0)
 
 
 @dataclass(frozen=True)

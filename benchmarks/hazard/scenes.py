@@ -1,10 +1,17 @@
-"""One simulated pair each: images, Rille's elevation model of them, and the exact elevations far around it."""
+"""One simulated pair each: images, Rille's elevation models of them, and the exact elevations far around.
+
+The vertical is told by an inclinometer that errs; the elevation model of the exact one stands beside it. Both lie on
+one lattice, and what is exact is so in the exact frame: an error of the vertical is one of the map.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import importlib
+import pickle
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -30,11 +37,21 @@ PAD = 0.12
 """Metres of exact elevations around a model: what a vehicle at its border stands on."""
 
 
+ATTITUDE_DEG = 0.2
+"""Error of the inclinometer about each axis, degrees, as that of the simulated rover."""
+
+MADE_BY = (
+    "benchmarks/hazard/scenes.py", "datasets/mockup/*.py", "stages/hfvm/*.py", "stages/hfvm_*.py", "stages/level.py",
+    "stages/ground.py", "stages/locus*.py", "stages/surface.py", "stages/lattice.py", "stages/validity.py",
+)  # fmt: skip
+"""Modules by which a scene is made: one that was kept is used as long as none of them changes."""
+
+
 @dataclass(frozen=True)
 class Scene:
     """Arrays (row, col) on ``lattice``; ``exact`` on ``wide``, which is ``PAD`` larger on every side.
 
-    ``seen``: both cameras see the cell's true surface. ``level``: facts of stage ``level``.
+    ``elevation`` with the inclinometer's vertical, ``posed`` with the exact one, each with its standard deviation.
     """
 
     seed: int
@@ -45,8 +62,9 @@ class Scene:
     wide: Lattice
     elevation: Floats32
     elevation_std: Floats32
+    posed: Floats32
+    posed_std: Floats32
     exact: Floats32
-    seen: NDArray[np.bool_]
     images: tuple[NDArray[np.uint8], NDArray[np.uint8]]
     rig: Rig
     T_local_left: RigidTransform
@@ -76,31 +94,65 @@ def fetcher() -> Callable[[Source], Any]:
 
 def build(seed: int, cover: float, slope_deg: float) -> Scene:
     """Simulate a pair and reconstruct it with default parameters."""
-    sequence = mockup(MockupParams(**BED, seed=seed, rock_cover=cover, slope_deg=slope_deg))
+    bed = MockupParams(**BED, seed=seed, rock_cover=cover, slope_deg=slope_deg, attitude_noise_deg=ATTITUDE_DEG)
+    sequence = mockup(bed)
     fetch = fetcher()
     left, right = (fetch(sequence.image(0, camera)) for camera in ("left", "right"))
     found = match(left["image"], right["image"], left_valid=left["valid"], right_valid=right["valid"])
-    up = None if sequence.up is None else sequence.up[0]
-    measured = matched(found.validity)
-    args = found.column_disparity, found.row_disparity, measured, sequence.rig, LevelParams()
-    facts = level(*args, up=up, pitch=sequence.pitch)
-    params = LocusParams(cell_size=CELL, max_sigma=CELL)
-    lattice = local_lattice(sequence.rig, facts, CELL, params)
-    T_local_left = RigidTransform.from_matrix(facts["T_local_left"])
-    low, high = z_range(facts["plane"], facts["relief"], list(lattice.bounds))
-    dem = reconstruct(
-        found.column_disparity, found.row_disparity, usable(found.validity, found.backmatch_error, params),
-        np.asarray(left["image"], np.float32), sequence.rig, T_local_left, plane(lattice), (low, high), params,
-        disparity_std=found.disparity_std,
-    )  # fmt: skip
+    assert sequence.up is not None
     assert sequence.truth is not None
     assert sequence.truth_dem is not None
+    args = found, np.asarray(left["image"], np.float32), sequence.rig
+    lattice, first, (dem, std) = _reconstructed(*args, sequence.up[0])
+    _, exactly, (posed, posed_std) = _reconstructed(*args, sequence.truth[0].rotation[2], lattice)
     n = round(PAD / CELL)
     wide = Lattice.at(lattice.i0 - n, lattice.j0 + n, CELL, lattice.rows + 2 * n, lattice.cols + 2 * n)
-    exact = fetch(sequence.truth_dem(wide.to_dict(), sequence.truth[0] @ T_local_left.inverse(), (0,)))
-    seen = np.asarray(exact["seen"]) != 0
+    exact = fetch(sequence.truth_dem(wide.to_dict(), sequence.truth[0] @ exactly[0].inverse(), (0,)))
     return Scene(
-        seed, cover, slope_deg, sequence.vehicle, lattice, wide, dem.elevation, dem.elevation_std,
-        np.asarray(exact["elevation"], np.float32), seen[wide.window(lattice)],
-        (np.asarray(left["image"]), np.asarray(right["image"])), sequence.rig, T_local_left, (low, high),
+        seed, cover, slope_deg, sequence.vehicle, lattice, wide, dem, std, posed, posed_std,
+        np.asarray(exact["elevation"], np.float32), (np.asarray(left["image"]), np.asarray(right["image"])),
+        sequence.rig, *first,
     )  # fmt: skip
+
+
+def _reconstructed(
+    found: Any, image: Floats32, rig: Rig, up: Any, lattice: Lattice | None = None
+) -> tuple[Lattice, tuple[RigidTransform, tuple[float, float]], tuple[Floats32, Floats32]]:
+    """Lattice, frame and range of elevations, and elevations with their standard deviation, by a vertical."""
+    params, disparity = LocusParams(cell_size=CELL, max_sigma=CELL), (found.column_disparity, found.row_disparity)
+    facts = level(*disparity, matched(found.validity), rig, LevelParams(), up=up)
+    lattice = lattice or local_lattice(rig, facts, CELL, params)
+    T_local_left = RigidTransform.from_matrix(facts["T_local_left"])
+    low, high = z_range(facts["plane"], facts["relief"], list(lattice.bounds))
+    good = usable(found.validity, found.backmatch_error, params)
+    dem = reconstruct(
+        *disparity, good, image, rig, T_local_left, plane(lattice), (low, high), params,
+        disparity_std=found.disparity_std,
+    )  # fmt: skip
+    return lattice, (T_local_left, (low, high)), (dem.elevation, dem.elevation_std)
+
+
+def kept(folder: Path | None, seed: int, cover: float, slope_deg: float) -> Scene:
+    """A scene that an earlier run left in the folder, or a new one that is left there."""
+    if folder is None:
+        return build(seed, cover, slope_deg)
+    path = folder / f"{seed}-{cover:g}-{slope_deg:g}-{_fingerprint()}.pickle"
+    if path.exists():
+        with path.open("rb") as file:
+            scene = pickle.load(file)
+        assert isinstance(scene, Scene)
+        return scene
+    scene = build(seed, cover, slope_deg)
+    folder.mkdir(parents=True, exist_ok=True)
+    part = path.with_suffix(".part")
+    with part.open("wb") as file:
+        pickle.dump(scene, file)
+    part.replace(path)
+    return scene
+
+
+def _fingerprint() -> str:
+    """Of the modules that make a scene."""
+    root = Path(__file__).resolve().parents[2]
+    files = sorted(path for pattern in MADE_BY for path in root.glob(pattern))
+    return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()[:12]

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stages.extrema import median3, octagon, running_range
+from stages.extrema import median3, octagon, relief, running_max, running_range
 
 
 def offsets(reach: int) -> np.ndarray:
@@ -30,6 +30,19 @@ def test_extrema_equal_a_look_at_every_cell(seed: int, reach: int, share: float,
     high, low = running_range(z, reach)
     np.testing.assert_array_equal(high, np.where(np.isnan(stack), -np.inf, stack).max(axis=0))
     np.testing.assert_array_equal(low, np.where(np.isnan(stack), np.inf, stack).min(axis=0))
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 999), near=st.integers(1, 9), more=st.integers(0, 12), rows=st.integers(1, 150))
+def test_relief_of_two_octagons_equals_each_alone(seed: int, near: int, more: int, rows: int) -> None:
+    """Also where the larger one is no widening of the smaller one."""
+    rng = np.random.default_rng(seed)
+    z = rng.normal(size=(rows, 31)).astype(np.float32)
+    z[rng.random(z.shape) < 0.4] = np.nan
+    for found, reach in zip(relief(z, near, near + more), (near, near + more), strict=True):
+        high, low = running_range(z, reach)
+        np.testing.assert_array_equal(found, np.where(high > low, high - low, np.float32(0)))
+        np.testing.assert_array_equal(running_max(z, reach), high)
 
 
 @pytest.mark.parametrize("reach", [7, 14, 15, 30, 31])

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
-from stages.row_graph import UNREACHED, farthest_row, plan, sweep
+from stages.row_graph import UNREACHED, leading, plan, sweep
 from stages.swept import LEFT, RIGHT, STRAIGHT
 
 
@@ -105,13 +105,15 @@ def test_a_path_is_free_monotone_and_as_cheap_as_its_cost(seed: int, blocked: fl
     assert found.reachable[c[-1]]
 
 
-def test_farthest_row_equals_networkx() -> None:
+@pytest.mark.parametrize("limit", [0, 2, 5])
+def test_what_leads_on_equals_networkx(limit: int) -> None:
     height, free = grid(5, 10, 9, 0.45)
     graph = nx.DiGraph([(a, b) for a, b, _ in edges(height, free)])
     graph.add_nodes_from(map(tuple, np.argwhere(free).tolist()))
-    far = farthest_row(free)
+    found = leading(free, limit)
     for node in graph:
-        assert far[node] == min(r for r, _ in {node} | nx.descendants(graph, node))
+        assert found[node] == (min(r for r, _ in {node} | nx.descendants(graph, node)) <= limit)
+    assert not found[~free].any()
 
 
 @pytest.mark.parametrize("row", [3, 7, 12])

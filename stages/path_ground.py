@@ -1,0 +1,122 @@
+"""A risk map on the grid of a planner: where the vehicle may stand, what a step costs, which ground is connected."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from stages import grid8
+from stages.hazards import BITS, WHEEL_BITS
+from stages.lattice import Lattice
+from stages.risk import CAUTION, HAZARDOUS, UNKNOWN, window_cells
+from stages.row_grid import RowGrid
+from stages.swept import Stand
+from stages.vehicle import Vehicle
+from stages.windows import window_mean
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.integer[Any]]
+Bytes = NDArray[np.uint8]
+Maps = Mapping[str, NDArray[Any]]
+
+GROUNDS = ("outline", "wheels", "middle")
+"""What of the vehicle stays on known ground, as tried in turn."""
+
+MOST = 0.5
+"""Share of the rows: a path that stays clearer of unknown ground is worth half of its length."""
+
+BODY_BITS = np.uint16(sum(BITS.values()) - int(WHEEL_BITS))
+
+LARGE = 1 << 30
+"""Heights above it are kept in 64 bits."""
+
+
+class Ground:
+    """The maps on a grid.
+
+    ``unit``: metres of height that cost one; ``stand`` (row, col) float32 m, mean height under a wheel; ``height`` the
+    same in units, 0 where closed; ``toll`` (row, col) units, of caution ground; ``closed`` (row, col) where the
+    vehicle's middle may not be.
+    """
+
+    def __init__(
+        self, maps: Maps, lattice: Lattice, grid: RowGrid, vehicle: Vehicle, *, unit: float, caution: float
+    ) -> None:
+        """
+        Parameters
+        ----------
+        maps : arrays (row, col) of stage ``risk`` on ``lattice``: ``risk``, ``reason``, ``elevation``.
+        unit : metres.
+        caution : metres of climb that a metre of caution ground costs.
+        """
+        self.grid, self.unit = grid, unit
+        risk = grid.sample(lattice, maps["risk"], UNKNOWN)
+        reason = grid.sample(lattice, maps["reason"], 0)
+        hazard, unknown = risk == HAZARDOUS, risk == UNKNOWN
+        self.closed = hazard | unknown
+        wheels, body = (hazard & ((reason & bits) > 0) for bits in (WHEEL_BITS, BODY_BITS))
+        self._stand = Stand(wheels, body, vehicle, grid.cell, unknown, self.closed)
+        mean = window_mean(maps["elevation"], window_cells(vehicle.wheel_diameter, lattice.cell))
+        self.stand = grid.sample(lattice, mean, np.nan)
+        toll = round(caution * grid.cell / unit)
+        self.height: Ints = np.empty(risk.shape, dtype=np.int32)
+        self.toll: Ints = np.empty(risk.shape, dtype=np.int16 if toll <= np.iinfo(np.int16).max else np.int64)
+        if _price(self.stand, risk, np.float32(unit), toll, self.height, self.toll) > LARGE:
+            self.height = np.rint(np.where(self.closed, np.float32(0), self.stand) / np.float32(unit)).astype(np.int64)
+        self._ways: dict[str, Bytes] = {}
+        self._parts: dict[str, tuple[NDArray[np.int32], Ints]] = {}
+
+    def ways(self, below: str) -> Bytes:
+        """Directions (row, col) as bits with ``below``, one of :data:`GROUNDS`, on the known."""
+        if below not in self._ways:
+            self._ways[below] = self._stand.ways(below)
+        return self._ways[below]
+
+    def parts(self, below: str) -> tuple[NDArray[np.int32], Ints]:
+        """Connected ground, see :func:`stages.grid8.parts`."""
+        if below not in self._parts:
+            self._parts[below] = grid8.parts(self.ways(below))
+        return self._parts[below]
+
+    def worth(self) -> tuple[str, ...]:
+        """Of :data:`GROUNDS` those on which connected ground covers most of the rows that it covers on any."""
+        spans = [self.parts(name)[1] for name in GROUNDS]
+        rows = [int((s[:, 1] - s[:, 0]).max(initial=0)) for s in spans]
+        return tuple(name for name, n in zip(GROUNDS, rows, strict=True) if n >= MOST * max(rows))
+
+    def metres(self, cost: Ints, unreached: int, each: int = 1) -> NDArray[np.float32]:
+        """A cost (row, col) of which ``each`` are a unit, rounded down to units, in metres; NaN where not reached."""
+        out = np.empty(cost.shape, dtype=np.float32)
+        _metres(cost, unreached, float(each), self.unit, out)
+        return out
+
+    def xyz(self, cells: NDArray[np.int64]) -> Floats:
+        """Points (vertex, 3), metres, of cells (vertex, 2)."""
+        row, col = cells[:, 0], cells[:, 1]
+        return np.column_stack([self.grid.xy(row, col), self.stand[row, col]])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _price(stand, risk, unit, caution, height, toll):  # type: ignore[no-untyped-def]
+    """Heights in units and tolls; returns the greatest magnitude of a height."""
+    most = np.float32(0.0)
+    for r in range(risk.shape[0]):
+        for c in range(risk.shape[1]):
+            kind = risk[r, c]
+            v = np.rint(stand[r, c] / unit) if kind < HAZARDOUS else np.float32(0.0)
+            most = max(most, abs(v))
+            height[r, c] = np.int32(v)
+            toll[r, c] = caution if kind == CAUTION else 0
+    return most
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _metres(cost, unreached, each, unit, out):  # type: ignore[no-untyped-def]
+    for r in range(cost.shape[0]):
+        for c in range(cost.shape[1]):
+            v = cost[r, c]
+            out[r, c] = np.floor(v / each) * unit if v < unreached else np.nan
