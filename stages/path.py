@@ -43,8 +43,8 @@ from stages.hazards import WHEEL_BITS
 from stages.lattice import Lattice
 from stages.path_ends import Point, check_end, chosen
 from stages.path_ground import GROUNDS, Ground
-from stages.risk import check_size
 from stages.path_words import Maps, Route, describe
+from stages.risk import check_size
 from stages.row_graph import UNREACHED, Plan, plan, row_span
 from stages.row_grid import RowGrid
 from stages.vehicle import Vehicle

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from stages.errors import InputError
 from stages.lattice import Lattice
 from stages.path_ground import Ground
-from stages.risk import HAZARDOUS, UNKNOWN
 from stages.path_words import Maps, hazard_words
+from stages.risk import HAZARDOUS, UNKNOWN
 from stages.row_graph import nearest_middle, row_span
 from stages.vehicle import Vehicle
 
