@@ -125,7 +125,8 @@ class Task:
     def finish(self) -> Finish:
         """Steps of the finest level."""
         facts = self.inputs["band"].meta if "band" in self.inputs else self.facts
-        return Finish(self.pair(), self.right, self.params, self.alignment, facts["near_sign"], self.facts["contrast"])
+        known = self.alignment, facts["near_sign"], self.facts["contrast"], band(facts)
+        return Finish(self.pair(), self.right, self.params, *known)
 
     def window(self, shape: Shape) -> Window | None:
         """The task's tile of an image of ``shape``; None: beyond the last one."""

@@ -79,6 +79,15 @@ class TestMeasures:
         assert filled.u.tolist() == [[-8.0, -8.0, -3.0, -3.0, -3.0, -3.0]]
         assert filled.v.tolist() == [[1.0, 1.0, 2.0, 2.0, 2.0, 2.0]]
 
+    def test_filled_rows_follow_the_lines_of_all_matches(self) -> None:
+        y, x = np.indices((20, 60), np.float64)
+        u = -5.0 - 3.0 * np.sin(x / 7.0) * np.cos(y / 5.0)
+        v = 0.5 + 0.04 * (x + u) - 0.01 * y
+        known = (x < 20) | (x > 50)
+        filled = fill(found(np.where(known, u, NONE), v=np.where(known, v, NONE)))
+        np.testing.assert_allclose(filled.v, 0.5 + 0.04 * (x + filled.u) - 0.01 * y, atol=0.01)
+        assert np.array_equal(filled.v[known], v[known])
+
     def test_locking(self) -> None:
         assert locking(np.arange(-50, 50) / 10.0)[0] == pytest.approx(1.0)
         assert locking(np.array([-3.0, -2.96, 4.04, 7.0]))[1] == [10.0, *[0.0] * 9]

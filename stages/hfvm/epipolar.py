@@ -228,3 +228,20 @@ def line(terms, x, length):  # type: ignore[no-untyped-def]
     c = terms[4] + x * (terms[5] + x * terms[6])
     scale = length / max(np.sqrt(a * a + b * b), LEAST_NORMAL)
     return a * scale, b * scale, c * scale
+
+
+@njit(cache=True, nogil=True)
+def settle_rows(f, u, v, wanted, x0, y0):  # type: ignore[no-untyped-def]
+    """Row displacements of the ``wanted`` pixels from their column displacements and their lines, in place.
+
+    For lines that run along the rows rather than along the columns; other pixels keep theirs. ``x0, y0``: first column
+    and row of the window.
+    """
+    one = np.float32(1.0)
+    for j in range(u.shape[0]):
+        terms = row_terms(f, np.float64(j + y0))
+        for i in range(u.shape[1]):
+            if wanted[j, i]:
+                a, b, c = line(terms, np.float32(i + x0), one)
+                if abs(b) > abs(a):
+                    v[j, i] = -(a * u[j, i] + c) / b

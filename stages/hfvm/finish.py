@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from stages.declare import AnyArray
-from stages.hfvm import consistency, guided, hierarchy, plane, refine, relief, rowwise, uncertainty
-from stages.hfvm.hierarchy import Map, Prepared
+from stages.hfvm import consistency, epipolar, guided, hierarchy, lanes, plane, refine, relief, rowwise, uncertainty
+from stages.hfvm.hierarchy import Band, Map, Prepared
 from stages.hfvm.lanes import SUM_RADIUS
 from stages.hfvm.params import HfvmParams
 from stages.hfvm.views import View
@@ -33,6 +33,7 @@ class Finish:
     alignment: plane.Matrix | None
     near_sign: float
     contrast: float = 1.0
+    band: Band = hierarchy.FREE
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -146,6 +147,13 @@ class Finish:
             u[w.slices], v[w.slices] = cut(a.u, w), cut(a.v, w)
         return consistency.unsupported(u, v, keep, self.params.speckle).view(np.uint8)
 
+    def _lines(self) -> epipolar.Matrix:
+        """Fundamental matrix of the band, towards the original right image."""
+        if self.alignment is None:
+            return self.band.f
+        g = self.alignment @ plane.translation(-plane.margin(self.shape))
+        return np.ascontiguousarray(np.linalg.inv(g).T @ self.band.f)
+
     def final(self, window: Window, fine: Rasters, checked: Rasters, refined: Rasters, gone: Raster) -> Results:
         """Everything that :class:`~stages.hfvm.Disparity` has.
 
@@ -173,6 +181,9 @@ class Finish:
         interpolated[valid == 0] = 0
         if p.guided_fill:
             u, v = guided.median(u, v, keep, interpolated, left)
+        if self.band.mu >= lanes.SHARP:
+            # A filled pixel has its neighbour's depth, not its row: between turned cameras rows change along a row.
+            epipolar.settle_rows(self._lines(), u, v, interpolated, outer.x0, outer.y0)
         error, distance = cut(checked["error"], outer).copy(), cut(fine["distance"], outer).copy()
         consistency.conclude(validity, keep, interpolated, u, v, error, distance)
         arrays = {

@@ -39,7 +39,7 @@ from stages.hfvm.window import (
 )
 from stages.pyramid import Pyramid
 
-FIT_SAMPLES = 1000
+FIT_SAMPLES = 500
 """Matches that a band or plane is fitted to; more change nothing that matters and cost time."""
 
 
@@ -132,7 +132,7 @@ class FastSolver:
     def rounds(self, level: int) -> int:
         """Rounds of propagation at a level."""
         p = self.params
-        rounds = p.rounds if level > 0 or p.fine_rounds is None else p.fine_rounds
+        rounds = p.rounds if p.fine_rounds is None else min(p.rounds, p.fine_rounds + level)
         return min(rounds, p.back_rounds) if level == 0 and self.back else rounds
 
     def reverse(self) -> FastSolver:
@@ -154,8 +154,10 @@ class FastSolver:
             reach = p.search_columns, p.search_rows
             propagation.descend(a.words, b.words, up.u, up.v, *reach, p.centres, f, mu, packed, data, *at)
         rounds = self.rounds(level)
-        # Rows are settled on the coarser levels, where trying them costs little.
-        propagation.checkerboard(a.words, b.words, packed, data, dirty, f, mu, p.smoothness, rounds, level > 0, *at)
+        # Rows are settled on the coarser levels, where trying them costs little; of a single round on the finest one,
+        # which costs most, jumps are wanted alone: the search has just tried the columns beside.
+        beside = 2 if level > 0 else 1 if rounds > 1 else 0
+        propagation.checkerboard(a.words, b.words, packed, data, dirty, f, mu, p.smoothness, rounds, beside, *at)
         propagation.unpack(packed, u, v)
         return Map(u, v, np.zeros(shape, bool))
 

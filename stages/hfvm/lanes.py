@@ -190,7 +190,9 @@ def _rough(builder: Any, tried: Any, near: list[Any]) -> Any:
 def _every_other(builder: Any, pointer: Any, kind: Any) -> Any:
     """Eight elements of vector type ``kind``, the first one at ``pointer``; the ones between are read and dropped."""
     size = kind.element.width // 8
-    halves = [builder.load(_as(builder, builder.gep(pointer, [ir.Constant(_I64, n)]), kind), align=size) for n in (0, LANES)]
+    halves = [
+        builder.load(_as(builder, builder.gep(pointer, [ir.Constant(_I64, n)]), kind), align=size) for n in (0, LANES)
+    ]
     return builder.shuffle_vector(*halves, ir.Constant(_INTS, list(range(0, 2 * LANES, 2))))
 
 
@@ -199,9 +201,7 @@ def _lines(builder: Any, terms: Any, x: Any) -> tuple[Any, Any, Any]:
     *t, length = (_splat(builder, n) for n in cgutils.unpack_tuple(builder, terms))
     a, b = (builder.fadd(t[k], builder.fmul(t[k + 1], x)) for k in (0, 2))
     c = builder.fadd(t[4], builder.fmul(x, builder.fadd(t[5], builder.fmul(x, t[6]))))
-    norm = _call(
-        builder, "llvm.sqrt.v8f32", _FLOATS8, builder.fadd(builder.fmul(a, a), builder.fmul(b, b))
-    )
+    norm = _call(builder, "llvm.sqrt.v8f32", _FLOATS8, builder.fadd(builder.fmul(a, a), builder.fmul(b, b)))
     least = _vector(_FLOATS8, [float(LEAST_NORMAL)] * LANES)
     norm = builder.select(builder.fcmp_ordered(">", norm, least), norm, least)
     scale = builder.fdiv(length, norm)
@@ -231,7 +231,7 @@ def make_settle(width: int, dense: bool = False) -> Any:
                 for kind, a in zip(sig.args[:4], args[:4], strict=True)
             )
             at, here, above, below, y = args[6:11]
-            rows, cols, left_cols, ahead, begin, upright = (
+            rows, cols, left_cols, ahead, begin, beside = (
                 builder.trunc(n, _I32) for n in cgutils.unpack_tuple(builder, args[11])
             )
             columns = _pointer(context, builder, sig.args[5], args[5], at)
@@ -276,16 +276,17 @@ def make_settle(width: int, dense: bool = False) -> Any:
                 for slot, value in ((best, tried), (found, cost), (least, total)):
                     builder.store(builder.select(better, value, builder.load(slot)), slot)
 
-            def beside(du: int, dv: int) -> None:
+            def attempt_beside(du: int, dv: int) -> None:
                 step = _vector(_INTS, [((dv & 0xFFFF) << 16) | (du & 0xFFFF)] * LANES)
                 moved = builder.add(builder.bitcast(own, _HALVES), builder.bitcast(step, _HALVES))
                 attempt(builder.bitcast(moved, _INTS))
 
-            with builder.if_then(builder.icmp_signed("!=", upright, ir.Constant(_I32, 0))):
-                beside(-1, 0)
-                beside(1, 0)
-                beside(0, -1)
-                beside(0, 1)
+            with builder.if_then(builder.icmp_signed(">", beside, ir.Constant(_I32, 0))):
+                attempt_beside(-1, 0)
+                attempt_beside(1, 0)
+            with builder.if_then(builder.icmp_signed(">", beside, ir.Constant(_I32, 1))):
+                attempt_beside(0, -1)
+                attempt_beside(0, 1)
             for k, tried in enumerate(near):
                 # What lies a column beside the own one has been tried or is left out; and what came before.
                 away = builder.sub(builder.bitcast(tried, _HALVES), builder.bitcast(own, _HALVES))
@@ -315,9 +316,10 @@ neighbours.
 :func:`stages.hfvm.epipolar.line`, and the length of a normal. ``here, above, below``: index at which the row and its
 neighbours begin. ``shape``: rows and columns of the right image, columns of the left one, the column of the left one's
 first pixel in the right one, as ``y`` is the row there (both may be windows), its column in the whole left image, and
-whether other rows are tried. In this order: own, own a column less, more, where ``shape`` says so a row less, more,
-then up, west, east, down; the first of equal ones wins. Costs have ``smooth`` times the roughness added. ``new[at : at
-+ 8]`` gets the best ones and ``cost`` their costs without smoothness.
+what beside the own one is tried: nothing, columns (1), rows too (2). In this order: own, own a column less, more, a row
+less, more, then up, west, east, down, but for those that lie a column beside the own one; the first of equal ones
+wins. Costs have ``smooth`` times the roughness added. ``new[at : at + 8]`` gets the best ones and ``cost`` their costs
+without smoothness.
 """
 
 settle_dense = make_settle(widest(), dense=True)

@@ -89,7 +89,10 @@ class HfvmParams(Params):
         default=3, ge=0, le=32, description="propagation rounds a level; they recover what the coarse level lost"
     )
     fine_rounds: int | None = Field(
-        default=1, ge=0, le=32, description="the same at the finest level, which costs most; null: as at the others"
+        default=1,
+        ge=0,
+        le=32,
+        description="the same at the finest level, which costs most, one more at each above; null: as at the others",
     )
     back_rounds: int = Field(
         default=1, ge=0, le=32, description="at most so many at the finest level from right to left, for the check"

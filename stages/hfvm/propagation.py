@@ -56,7 +56,12 @@ def descend(left, right, up_u, up_v, reach_x, reach_y, count, f, mu, packed, dat
     _centres(up_u, up_v, f, mu, x0, y0, centres)
     wide = ccols + 2
     plan, best, least = np.empty((MOST_STRIPS, 5), np.int64), np.empty(4, np.int32), np.empty(4, np.int32)
-    here, there, near, lines = left.reshape(-1), right.reshape(-1), centres.reshape(-1), np.empty((3, ccols), np.float32)
+    here, there, near, lines = (
+        left.reshape(-1),
+        right.reshape(-1),
+        centres.reshape(-1),
+        np.empty((3, ccols), np.float32),
+    )
     rrows, rcols = right.shape
     sizes = cols, rcols
     in_rows = mu >= SHARP and 2 * reach_x < LANES and reach_y <= 1
@@ -221,10 +226,11 @@ def _centres(up_u, up_v, f, mu, x0, y0, centres):  # type: ignore[no-untyped-def
 
 
 @njit(cache=True, nogil=True)
-def checkerboard(left, right, packed, data, dirty, f, mu, smoothness, rounds, upright, ox=0, oy=0, x0=0, y0=0):  # type: ignore[no-untyped-def]
-    """Rounds of propagation in place: each pixel tries its neighbours' displacements and its own a column beside.
+def checkerboard(left, right, packed, data, dirty, f, mu, smoothness, rounds, beside, ox=0, oy=0, x0=0, y0=0):  # type: ignore[no-untyped-def]
+    """Rounds of propagation in place: each pixel tries its neighbours' displacements, and what lies beside its own.
 
-    ``upright``: its own a row beside, too; so it is where the band is not sharp and hardly says in which row to search.
+    ``beside``: nothing (0), a column to either side (1), also a row (2); the latter always where the band is not sharp
+    and hardly says in which row to search. A neighbour's that is just a column beside is for ``beside`` to try.
 
     Cost: that of the displacement + ``smoothness`` times the sum over the four neighbours of min(|du| + |dv|, 2);
     beyond the border the neighbour on the other side stands in. The two colours of a checkerboard take turns, which
@@ -235,7 +241,7 @@ def checkerboard(left, right, packed, data, dirty, f, mu, smoothness, rounds, up
     """
     rows, cols = left.shape
     flat = left.reshape(-1), right.reshape(-1), packed.reshape(-1), data.reshape(-1)
-    shape = (right.shape[0], right.shape[1], cols, ox, x0, int(upright or mu < SHARP))
+    shape = (right.shape[0], right.shape[1], cols, ox, x0, 2 if mu < SHARP else np.int64(beside))
     room = np.empty((4, cols + LANES), np.int32)
     dirty[:] = 0
     turns = 2 * rounds
@@ -273,7 +279,7 @@ def _turn(flat, dirty, y, turn, line, shape, yr, smoothness, once, room):  # typ
     for k in range(0, n, LANES):
         a, b = np.int64(todo[k]), np.int64(todo[k + LANES - 1])
         args = start, above * cols, below * cols, yr
-        if b - a == 2 * LANES - 2 and a > 0 and b + 2 < cols:
+        if k + LANES <= n and b - a == 2 * LANES - 2 and a > 0 and b + 2 < cols:
             lanes.settle_dense(
                 here, there, packed, cost, line, todo, k, args[0], args[1], args[2], args[3], shape, smoothness, new,
                 found,

@@ -66,7 +66,9 @@ def make_four(width: int) -> Any:
 
             def band(columns: Any, rows: Any, rank: Any) -> Any:
                 """What eight displacements cost by the line, << 4 | rank."""
-                off = builder.fadd(builder.fmul(a, builder.sitofp(columns, _FLOATS)), builder.fmul(b, builder.sitofp(rows, _FLOATS)))
+                off = builder.fadd(
+                    builder.fmul(a, builder.sitofp(columns, _FLOATS)), builder.fmul(b, builder.sitofp(rows, _FLOATS))
+                )
                 return shorts(lanes.band_cost(builder, builder.fadd(off, c)), rank)
 
             def shorts(cost: Any, rank: Any) -> Any:
@@ -147,7 +149,8 @@ the best candidate, cost << 4 | rank, of each pixel of a square of two by two.
 ``left[here]``: word of the first pixel; ``right[there]``: the one it meets at column displacement ``u``, row
 displacement ``v``. Candidates are the column displacements ``u + k`` for k < ``count``, at most eight; where ``cross``,
 also ``centre`` a row less and a row more. Eight words from the first one on are read for each pixel, whatever
-``count``. ``cols``: columns of the left image; ``line``: that of the square (:func:`stages.hfvm.epipolar.line`). Rank 0 is the candidate
-of column ``centre``, 1 + k the others; ABOVE and BELOW those of the other rows. Of equal ones the least rank wins.
+``count``. ``cols``: columns of the left image; ``line``: the square's (:func:`stages.hfvm.epipolar.line`). Rank 0 is
+the candidate of column ``centre``, 1 + k the others; ABOVE and BELOW those of the other rows. Of equal ones the least
+rank wins.
 ``best, least``: packed displacement and cost of the best so far, replaced where this one costs less.
 """

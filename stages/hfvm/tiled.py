@@ -121,10 +121,12 @@ def match(
     begun = coarse(left, right, params, side, prior)
     pair = prepare(left, begun.aligned or right, params, side)
     state = begun.state
+    band = state.band
     for level in range(state.level - 1, -1, -1):
+        band = state.band
         tell(COARSE_SHARE + (FINE_SHARE - COARSE_SHARE) * 0.25 ** (level + 1), f"level {level}")
         state = hierarchy.run(pair, params, level, state)
-    steps = Finish(pair, right, params, begun.alignment, state.near_sign, begun.contrast)
+    steps = Finish(pair, right, params, begun.alignment, state.near_sign, begun.contrast, band)
     return Found(_finish(steps, state, side, order, tell), begun.alignment is not None)
 
 

@@ -40,27 +40,34 @@ def test_sums_over_windows(width):
 def test_all_widths_search_alike():
     left, right = words(12 * 21, 5), words(20 * 30, 6)
     rng = np.random.default_rng(7)
-    lines = rng.normal(size=3 * 12 * 21).astype(np.float32)
+    terms = tuple(np.float32(t) for t in rng.normal(size=8))
+    line = terms[:3]
     todo = np.array([1, 3, 5, 7, 11, 13, 19, 19], np.int32)
     start = ((rng.integers(-2, 3, 12 * 21) << 16) | (rng.integers(-4, 5, 12 * 21) & 0xFFFF)).astype(np.int32)
     found = []
     for width in WIDTHS:
-        four, settle = strip_lanes.make_four(width), lanes.make_settle(width)
+        four, settle, dense = (
+            strip_lanes.make_four(width),
+            lanes.make_settle(width),
+            lanes.make_settle(width, dense=True),
+        )
 
         @njit
         def call(packed, data, new, cost, best, least):
-            mu = np.float32(8.0)
             for k in range(6):
                 place, counts = (np.int64(-2), np.int64(k - 2), np.int64(-1)), (np.int64(8 - k), np.int64(k % 2))
                 at = np.int64(4 * 21 + 2 * k), np.int64(5 * 30 + 2 * k)
-                sizes = np.int64(21), np.int64(12 * 21), np.int64(30)
-                four(left, right, lines, at[0], at[1], sizes, mu, place, counts, best[4 * k :], least[4 * k :])  # noqa: B023 (called before the next turn)
-            shape = (20, 30, 21, 12 * 21, 3, 1)
+                sizes = np.int64(21), np.int64(30)
+                four(left, right, line, at[0], at[1], sizes, place, counts, best[4 * k :], least[4 * k :])  # noqa: B023 (called before the next turn)
+            shape = (20, 30, 21, 3, 40, 2)
             settle(  # noqa: B023
-                left, right, packed, data, lines, todo, 0, 4 * 21, 3 * 21, 5 * 21, 4, shape, 5, mu, new, cost
+                left, right, packed, data, terms, todo, 0, 4 * 21, 3 * 21, 5 * 21, 4, shape, 5, new, cost
+            )
+            dense(  # noqa: B023
+                left, right, packed, data, terms, todo, 0, 4 * 21, 3 * 21, 5 * 21, 4, shape, 5, new[8:], cost[8:]
             )
 
-        results = [np.zeros(8, np.int32), np.zeros(8, np.int32), np.zeros(24, np.int32), np.full(24, 9999, np.int32)]
+        results = [np.zeros(16, np.int32), np.zeros(16, np.int32), np.zeros(24, np.int32), np.full(24, 9999, np.int32)]
         call(start, np.full(12 * 21, 900, np.int32), *results)
         found.append(results)
     for other in found[1:]:

@@ -17,24 +17,56 @@ def sad(a, b):
     return int(np.abs(np.array([a]).view(np.uint8).astype(int) - np.array([b]).view(np.uint8).astype(int)).sum())
 
 
-def some_lines(seed):
+X0, Y0 = 6, 4
+"""Where the window lies in the left image."""
+
+
+def some_band(seed):
     f = np.array([[1e-4, 0.02, 0.1], [0.01, 1e-3, 1.0], [0.03, -1.0, 0.4]])
-    planes = np.empty((3, ROWS, COLS), np.float32)
-    epipolar.write_lines(f + np.random.default_rng(seed).normal(0, 1e-3, (3, 3)), planes)
-    return planes
+    return f + np.random.default_rng(seed).normal(0, 1e-3, (3, 3))
 
 
-def off_line(lines, y, x, u, v, mu):
-    a, b, c = lines[:, y, x]
-    return int(np.float32(mu) * abs(a * np.float32(u) + b * np.float32(v) + c)) if mu else 0
+def line(f, y, x, length):
+    """Line of a pixel of the window, as the kernels add it up."""
+    terms = epipolar.row_terms(f, float(y + Y0))
+    return np.array(epipolar.line(terms, np.float32(x + X0), np.float32(length)), np.float32)
 
 
-def centre(up_u, up_v, lines, j, i, mu):
+def off_line(f, y, x, u, v, mu):
+    a, b, c = line(f, y, x, mu)
+    return min(int(abs(a * np.float32(u) + b * np.float32(v) + c)), lanes.FARTHEST_OFF)
+
+
+def test_terms_of_a_row_make_its_lines():
+    f = some_band(1)
+    planes = np.moveaxis(epipolar.lines(f, (ROWS, COLS), X0, Y0), 2, 0)
+    for y, x in np.ndindex(ROWS, COLS):
+        np.testing.assert_allclose(line(f, y, x, 1.0), planes[:, y, x], rtol=1e-5, atol=1e-5)
+        np.testing.assert_allclose(line(f, y, x, 3.0), 3 * planes[:, y, x], rtol=1e-5, atol=1e-5)
+    assert not line(np.zeros((3, 3)), 2, 3, 0.0).any()
+
+
+def test_rows_are_settled_onto_their_lines():
+    f, u = some_band(2), np.random.default_rng(3).uniform(-5, 5, (ROWS, COLS)).astype(np.float32)
+    v, wanted = np.full((ROWS, COLS), 7.0, np.float32), np.zeros((ROWS, COLS), np.uint8)
+    wanted[::2] = 1
+    epipolar.settle_rows(f, u, v, wanted, X0, Y0)
+    assert (v[1::2] == 7.0).all()
+    for y, x in np.ndindex(ROWS, COLS):
+        if wanted[y, x]:
+            p, q = np.array([x + X0, y + Y0, 1.0]), np.array([x + X0 + u[y, x], y + Y0 + v[y, x], 1.0])
+            assert abs(q @ f @ p) < 1e-4
+    down = np.full((ROWS, COLS), 7.0, np.float32)
+    epipolar.settle_rows(np.array([[0.0, 0, -1], [0, 0, 0], [1, 0, 0.0]]), u, down, wanted, X0, Y0)
+    assert (down == 7.0).all()  # lines along the columns do not say how far
+
+
+def centre(up_u, up_v, f, j, i, mu):
     """Doubled displacement of a coarse pixel, the border repeated, moved to its line by a pixel at most."""
     j, i = min(max(j, 0), 5), min(max(i, 0), 6)
     u, v = 2 * int(up_u[j, i]), 2 * int(up_v[j, i])
     if mu >= lanes.SHARP:
-        a, b, c = lines[:, 2 * j, 2 * i]
+        a, b, c = line(f, 2 * j + 0.5, 2 * i + 0.5, 1.0)
         e = np.float32(np.clip(a * np.float32(u) + b * np.float32(v) + c, -1, 1))
         u, v = u - int(np.rint(e * a)), v - int(np.rint(e * b))
     return u, v
@@ -73,23 +105,23 @@ def test_descend_finds_the_first_of_the_best_around_its_centres(mu, reach_x, rea
     up_u, up_v = np.random.default_rng(3).integers(-2, 3, (2, 6, 7)).astype(np.int16)
     # Equal parents side by side, and inside: their children are searched in one piece, four at once.
     up_u[2:], up_v[2:] = up_u[2:] // 2 + 1, 0
-    lines = some_lines(4)
+    f, length = some_band(4), np.float32(mu)
     packed, data = np.zeros((2, ROWS, COLS), np.int32)
-    propagation.descend(left, right, up_u, up_v, reach_x, reach_y, count, lines, np.float32(mu), packed, data)
+    propagation.descend(left, right, up_u, up_v, reach_x, reach_y, count, f, length, packed, data, 0, 0, X0, Y0)
     for y, x in np.ndindex(ROWS, COLS):
         j, i = y // 2, x // 2
         near = [(0, 0), (0, -1), (0, 1), (-1, 0), (1, 0), (-1, -1), (-1, 1), (1, -1), (1, 1)][:count]
-        centres = [centre(up_u, up_v, lines, j + dj, i + di, mu) for dj, di in near]
+        centres = [centre(up_u, up_v, f, j + dj, i + di, mu) for dj, di in near]
         best = (*centres[0], lanes.FAR)
         for u, v in candidates(centres, reach_x, reach_y, mu):
             if 0 <= x + u < 24 and 0 <= y + v < 12:
-                cost = sad(left[y, x], right[y + v, x + u]) + off_line(lines, y, x, u, v, mu)
+                cost = sad(left[y, x], right[y + v, x + u]) + off_line(f, 2 * j + 0.5, 2 * i + 0.5, u, v, mu)
                 best = (u, v, cost) if cost < best[2] else best
         found = propagation.columns(packed[y, x]), propagation.rows_of(packed[y, x]), data[y, x]
         assert found == best
 
 
-def slow_checkerboard(left, right, u, v, lines, mu, smoothness, rounds, upright):
+def slow_checkerboard(left, right, u, v, f, mu, smoothness, rounds, beside):
     u, v = u.copy(), v.copy()
 
     def at(y, x):
@@ -102,12 +134,16 @@ def slow_checkerboard(left, right, u, v, lines, mu, smoothness, rounds, upright)
                 near = [(int(u[at(*p)]), int(v[at(*p)])) for p in around]
                 a, b = int(u[y, x]), int(v[y, x])
                 best = None
-                own = [(a, b), (a - 1, b), (a + 1, b)]
-                own += [(a, b - 1), (a, b + 1)] if upright or mu < lanes.SHARP else []
-                for du, dv in [*own, *near]:
+                own = [
+                    (a, b),
+                    *([(a - 1, b), (a + 1, b)] if beside else []),
+                    *([(a, b - 1), (a, b + 1)] if beside > 1 else []),
+                ]
+                others = [p for p in near if p[1] != b or abs(p[0] - a) > 1]
+                for du, dv in [*own, *others]:
                     if not (0 <= x + du < right.shape[1] and 0 <= y + dv < right.shape[0]):
                         continue
-                    cost = sad(left[y, x], right[y + dv, x + du]) + off_line(lines, y, x, du, dv, mu)
+                    cost = sad(left[y, x], right[y + dv, x + du]) + off_line(f, y, x, du, dv, mu)
                     cost += smoothness * sum(min(abs(p - du) + abs(q - dv), 2) for p, q in near)
                     if best is None or cost < best[0]:
                         best = (cost, du, dv)
@@ -116,31 +152,34 @@ def slow_checkerboard(left, right, u, v, lines, mu, smoothness, rounds, upright)
     return u, v
 
 
-@pytest.mark.parametrize(("mu", "upright"), [(0.0, False), (3.0, False), (3.0, True)])
-def test_propagation_equals_slow_numpy_over_several_rounds(mu, upright):
+@pytest.mark.parametrize(("mu", "beside"), [(0.0, 2), (3.0, 0), (3.0, 1), (3.0, 2)])
+def test_propagation_equals_slow_numpy_over_several_rounds(mu, beside, monkeypatch):
+    # Wide enough that some pixels are read as whole vectors and others are not.
+    monkeypatch.setitem(globals(), "COLS", 37)
     left, right = words((ROWS, COLS), 5), words((ROWS, COLS + 2), 6)
     u, v = np.random.default_rng(7).integers(-3, 4, (2, ROWS, COLS)).astype(np.int16)
-    lines = some_lines(8)
-    expected = slow_checkerboard(left, right, u, v, lines, mu, 2, 3, upright)
-    packed, data = np.empty((2, ROWS, COLS), np.int32)
-    propagation.pack_map(u, v, packed)
-    data[:] = costs(left, right, u, v, lines, mu)
-    dirty = np.empty((ROWS, COLS), np.uint8)
-    propagation.checkerboard(left, right, packed, data, dirty, lines, np.float32(mu), 2, 3, upright)
-    found = np.empty((2, ROWS, COLS), np.int16)
-    propagation.unpack(packed, *found)
-    np.testing.assert_array_equal(found, expected)
-    assert (found[0] != u).any()
-    np.testing.assert_array_equal(data, costs(left, right, *found, lines, mu))
+    f = some_band(8)
+    for rounds in (1, 3):
+        expected = slow_checkerboard(left, right, u, v, f, mu, 2, rounds, beside)
+        packed, data = np.empty((2, ROWS, COLS), np.int32)
+        propagation.pack_map(u, v, packed)
+        data[:] = costs(left, right, u, v, f, mu)
+        dirty = np.empty((ROWS, COLS), np.uint8)
+        propagation.checkerboard(left, right, packed, data, dirty, f, np.float32(mu), 2, rounds, beside, 0, 0, X0, Y0)
+        found = np.empty((2, ROWS, COLS), np.int16)
+        propagation.unpack(packed, *found)
+        np.testing.assert_array_equal(found, expected)
+        assert (found[0] != u).any()
+        np.testing.assert_array_equal(data, costs(left, right, *found, f, mu))
 
 
-def costs(left, right, u, v, lines, mu):
+def costs(left, right, u, v, f, mu):
     """Cost of every pixel's displacement without smoothness."""
     found = np.full((ROWS, COLS), lanes.FAR, np.int32)
     for y, x in np.ndindex(ROWS, COLS):
         i, j = x + int(u[y, x]), y + int(v[y, x])
         if 0 <= i < right.shape[1] and 0 <= j < right.shape[0]:
-            found[y, x] = sad(left[y, x], right[j, i]) + off_line(lines, y, x, int(u[y, x]), int(v[y, x]), mu)
+            found[y, x] = sad(left[y, x], right[j, i]) + off_line(f, y, x, int(u[y, x]), int(v[y, x]), mu)
     return found
 
 
