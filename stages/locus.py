@@ -78,11 +78,11 @@ class LocusParams(Params):
         "bad ones, which max_std tells apart",
     )
     refine_steps: int = Field(
-        3,
+        2,
         ge=0,
         le=20,
-        description="steps of refining the elevations by what both images show of the surface, a fourth changes "
-        "nothing; 0: none, and standard deviations are those of the disparity alone",
+        description="steps of refining the elevations by what both images show of the surface, a third gains a "
+        "hundredth; 0: none, and standard deviations are those of the disparity alone",
     )
     both: bool = Field(
         False,

@@ -19,7 +19,7 @@ Float32 = NDArray[np.float32]
 Floats = NDArray[np.float64]
 
 BLOCK_ROWS = 64  # rows of cells in one call, so that a large surface's feet stay small in memory
-PLANES = 5
+PLANES = 6
 
 
 @dataclass(frozen=True)
@@ -47,9 +47,9 @@ def look(views: Views, surface: Surface, elevation: Floats) -> Float32:
 
     Returns
     -------
-    (5, rows, cols) float32: grey value of the left and of the right image; how their difference (left minus right)
-    changes with the elevation, per metre, with the sign of a decrease; disparity a metre of elevation, pixels; pixels
-    of the left image that a cell covers. NaN where a cell is unknown or not inside both images.
+    (6, rows, cols) float32: grey value of the left and of the right image; how the left one changes with the
+    elevation, per metre; disparity a metre of elevation, pixels; pixels of the left image that a cell covers; how the
+    right one changes with the elevation. NaN where a cell is unknown or not inside both images.
     """
     out = np.full((PLANES, surface.rows, surface.cols), np.nan, np.float32)
     cols = np.arange(surface.cols)
@@ -136,7 +136,8 @@ def _look(feet, normals, z, left, right, centre, left_spline, right_spline, out)
             grey_right, rx, ry = _read(right_spline, xr, yr, w, slope)
             move_left, move_right = _motion(left, a, normal), _motion(right, b, normal)
             out[0, r, c], out[1, r, c] = grey_left, grey_right
-            out[2, r, c] = rx * move_right[0] + ry * move_right[1] - lx * move_left[0] - ly * move_left[1]
+            out[2, r, c] = lx * move_left[0] + ly * move_left[1]
+            out[5, r, c] = rx * move_right[0] + ry * move_right[1]
             out[3, r, c] = np.sqrt(disparity[0] ** 2 + disparity[1] ** 2)
             below, beside = (r + 1 if r + 1 < rows else r - 1), (c + 1 if c + 1 < cols else c - 1)
             if below < 0 or beside < 0:

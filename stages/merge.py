@@ -67,7 +67,7 @@ class MergeParams(Params):
 
 @dataclass(frozen=True)
 class Layer:
-    """One pair's elevation model: arrays (rows, cols) on ``lattice``, NaN undefined, see :class:`stages.locus.Dem`.
+    """One pair's model on ``lattice``: arrays (rows, cols), NaN undefined, those of :class:`stages.locus_solve.Dem`.
 
     ``gain``: factor of its grey values that levels its exposure with that of its neighbours.
     """
