@@ -207,6 +207,16 @@ def test_limits_that_leave_nothing_to_drive_on_are_named() -> None:
     assert "all 1200 known cells are hazardous, 100 % of them by tilt: is vehicle.max_slope_deg 20" in facts["reason"]
 
 
+def test_limits_that_leave_nothing_are_a_warning_of_the_whole_map_alone() -> None:
+    lattice = Lattice.at(0, 40, CELL, 40, 30)
+    risk, z = level(lattice)
+    arrays = maps(np.full_like(risk, HAZARDOUS), z, "tilt")
+    source = Bundle(arrays, {"lattice": lattice.to_dict(), "vehicle": MODEL.model_dump()})
+    (line,) = STAGE.run(PathParams(), {}, {"risk": source}).meta["warnings"]
+    assert line.startswith("no path: all 1200 known cells are hazardous")
+    assert "warnings" not in STAGE.run(PathParams(), {"use": "local"}, {"risk": source}).meta
+
+
 @pytest.mark.parametrize("blocked", [False, True])
 def test_the_stage(blocked: bool) -> None:
     lattice = Lattice.at(-10, 60, CELL, 50, 21)
