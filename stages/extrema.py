@@ -218,14 +218,15 @@ def median3(z):  # type: ignore[no-untyped-def]
     Of an even number the upper one: the mean of two heights would not be one of the heights.
     """
     rows, cols = z.shape
-    out = np.full((rows, cols), np.nan, dtype=np.float32)
-    for r in range(1, rows - 1):
-        _median_row(z[r - 1], z[r], z[r + 1], out[r])
+    out = np.empty((rows, cols), dtype=np.float32)
     for r in range(rows):
+        out[r, 0] = out[r, cols - 1] = np.nan
+        if 0 < r < rows - 1:
+            _median_row(z[r - 1], z[r], z[r + 1], out[r])
+        else:
+            out[r, :] = np.nan
         for c in range(cols):
-            if np.isnan(z[r, c]):
-                out[r, c] = np.nan
-            elif np.isnan(out[r, c]):
+            if np.isnan(out[r, c]) and not np.isnan(z[r, c]):
                 out[r, c] = _median_known(z, r, c)
     return out
 

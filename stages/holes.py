@@ -52,7 +52,7 @@ def close_holes(
     candidate = ~known & (window_count(known, n) >= min_known * n * n)
     z, s = elevation.copy(), elevation_std.copy()
     filled = np.zeros(elevation.shape, dtype=np.uint8)
-    cells = np.argwhere(candidate)
+    cells = np.flatnonzero(candidate)
     if len(cells) and max_gap > 0:
         _close(elevation, elevation_std, cells, float(max_gap), n // 2 if judged else 0, rim, z, s, filled)
     return z, s, filled
@@ -64,8 +64,8 @@ def _close(z_in, s_in, cells, max_gap, window, rim, z, s, filled):  # type: igno
     steps = ((0, 1), (1, 0), (1, 1), (1, -1))
     lines = np.empty((4, 4), dtype=np.int64)
     weights = np.empty((4, 2))
-    for i in range(cells.shape[0]):
-        r, c = cells[i, 0], cells[i, 1]
+    for at in cells:
+        r, c = at // cols, at % cols
         total = 0.0
         weight = 0.0
         worst = 0.0

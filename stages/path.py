@@ -44,7 +44,7 @@ from stages.lattice import Lattice
 from stages.path_ends import Point, check_end, chosen
 from stages.path_ground import GROUNDS, Ground
 from stages.path_words import Maps, Route, describe
-from stages.risk import check_size
+from stages.risk import HAZARDOUS, check_size
 from stages.row_graph import UNREACHED, Plan, plan, row_span
 from stages.row_grid import RowGrid
 from stages.vehicle import Vehicle
@@ -200,7 +200,10 @@ def _run(params: PathParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
         "cost_to_go": route.cost,
         "reachable": route.plan.reachable.astype(np.uint8),
     }
-    return Bundle(arrays, describe(route, maps, lattice, vehicle) | {"frame": source.meta.get("frame", "local")})
+    meta = describe(route, maps, lattice, vehicle) | {"frame": source.meta.get("frame", "local")}
+    if not local and not meta["found"] and not (maps["risk"] < HAZARDOUS).any():
+        meta["warnings"] = [f"no path: {meta['reason']}"]
+    return Bundle(arrays, meta)
 
 
 STAGE = Stage(

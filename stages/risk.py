@@ -115,9 +115,15 @@ def risk_map(
     p = params or RiskParams()
     check_size(vehicle, elevation.shape, cell)
     window = p.window * vehicle.wheel_diameter
-    s = np.where(np.isfinite(elevation_std), elevation_std, np.float32(0)).astype(np.float32, copy=False)
+    finite = np.isfinite(elevation_std)
+    s = elevation_std if finite.all() else np.where(finite, elevation_std, np.float32(0))
     z, s, filled = close_holes(
-        elevation, s, p.max_hole * vehicle.wheel_diameter / cell, window_cells(window, cell), p.min_known, rim=RIM
+        elevation,
+        s.astype(np.float32, copy=False),
+        p.max_hole * vehicle.wheel_diameter / cell,
+        window_cells(window, cell),
+        p.min_known,
+        rim=RIM,
     )
     measured = measure(elevation, z, s, cell, vehicle, window)
     rules = Rules(p.sigmas, p.caution, p.max_p, p.min_known)

@@ -207,10 +207,25 @@ def _blocked(at: Plan, row: int, reason: str) -> Plan:
 
 
 def nearest_middle(cells: Mask, row: int) -> tuple[int, int]:
-    """The set cell with the fewest moves along rows and columns to the middle of a row; the first one among equals."""
-    r, c = np.nonzero(cells)
-    best = int(np.argmin(2 * np.abs(r - row) + np.abs(2 * c - (cells.shape[1] - 1))))
-    return int(r[best]), int(c[best])
+    """The set cell with the fewest moves along rows and columns to the middle of a row; the first one among equals.
+
+    At least one is set.
+    """
+    r, c = _nearest_middle(cells, row)
+    return int(r), int(c)
+
+
+@njit(cache=True, nogil=True)
+def _nearest_middle(cells, row):  # type: ignore[no-untyped-def]
+    rows, cols = cells.shape
+    best, found = np.iinfo(np.int64).max, (-1, -1)
+    for r in range(rows):
+        for c in range(cols if 2 * abs(r - row) < best else 0):
+            if cells[r, c]:
+                away = 2 * abs(r - row) + abs(2 * c - (cols - 1))
+                if away < best:
+                    best, found = away, (r, c)
+    return found
 
 
 def _trace(move: NDArray[np.int8], row: int, col: int) -> NDArray[np.int64]:
