@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stages.footing import Footing
+from stages.footing import DOUBT_WEIGHT, Footing
 from stages.lattice import Lattice
 from stages.risk import CAUTION, HAZARDOUS, REASONS, SAFE, UNKNOWN
 from stages.vehicle import Vehicle
@@ -86,3 +86,12 @@ def test_caution_counts_wheels_and_middle() -> None:
     risk = np.where(X > 0.02, np.uint8(CAUTION), np.uint8(SAFE))
     footing = Footing.of(risk, None, LATTICE, ROVER)
     assert [at(footing, x, 0.0, 0.0)[3] for x in (-0.1, 0.0, 0.1)] == pytest.approx([0.0, 0.4, 1.0])
+
+
+def test_what_is_hazardous_by_sigma_alone_and_improbable_is_caution_ground_many_times() -> None:
+    risk = np.where(np.hypot(X - 0.04, Y - 0.05) < 0.01, np.uint8(HAZARDOUS), np.uint8(SAFE))
+    reason = np.full(risk.shape, REASONS["step"] | REASONS["uncertain"], np.uint16)
+    p = np.full(risk.shape, 0.2, np.float32)
+    daring, not_so = (at(Footing.of(risk, reason, LATTICE, ROVER, p, 0.9, d), 0.0, 0.0, 0.0) for d in (0.3, 0.1))
+    assert (daring[0], daring[3]) == (np.inf, pytest.approx(DOUBT_WEIGHT / 5))
+    assert (not_so[0], not_so[3]) == (pytest.approx(ROVER.margin), 0.0)
