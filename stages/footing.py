@@ -100,10 +100,11 @@ class Footing:
         turn = np.broadcast_to(heading, np.shape(x)).reshape(-1)
         out = np.empty((4, len(at)), np.float32)
         cell = self.lattice.cell
-        reach = 0.5 * math.hypot(self.vehicle.track, self.vehicle.wheel_base) + cell
+        # beyond the circle about the vehicle, and what rounding to cells takes, nothing is beneath it
+        reach = np.float32(0.5 * math.hypot(self.vehicle.track, self.vehicle.wheel_base) + 1.5 * cell), np.float32(cell)
         _gaps(
             at, np.cos(turn), np.sin(turn), wheel_positions(self.vehicle) / cell, _belly(self.vehicle) / cell,
-            self.fields, self.unknown, self.caution, np.float32(reach), out,
+            self.fields, self.unknown, self.caution, reach, out,
         )  # fmt: skip
         out[2] -= NEAR_UNKNOWN * cell
         return Gaps(*(a.reshape(np.shape(x)) for a in out))
@@ -133,7 +134,7 @@ def _gaps(at, cosine, sine, wheels, belly, fields, unknown, caution, reach, out)
             out[0, n] = out[1, n] = -np.inf
             continue
         gap, proven, share = fields[2, i, j], fields[3, i, j], np.float32(caution[i, j])
-        spare = unknown[i, j] - reach
+        spare = unknown[i, j] - reach[0]
         outside = False
         for k in range(4):
             a, b = wheels[k, 0], wheels[k, 1]
@@ -146,8 +147,8 @@ def _gaps(at, cosine, sine, wheels, belly, fields, unknown, caution, reach, out)
         out[0, n], out[1, n], out[3, n] = gap, proven, share / np.float32(5.0)
         if outside:
             continue
-        if spare > 0:  # nothing unknown within the circle about the vehicle
-            out[2, n] = spare
+        if spare > 0:
+            out[2, n] = spare + reach[1]
             continue
         least = np.float32(np.inf)
         for k in range(belly.shape[0]):
