@@ -32,6 +32,9 @@ BODY_BITS = np.uint16(sum(BITS.values()) - int(WHEEL_BITS))
 NEAR_UNKNOWN = 0.5
 """Cells; nearer than this a point of the belly lies in an unknown cell."""
 
+DOUBT_WEIGHT = 15
+"""Of ground that is hazardous by sigma alone, against caution: a wheel there makes a way dearer by half."""
+
 
 @dataclass(frozen=True)
 class Gaps:
@@ -49,7 +52,7 @@ class Gaps:
 @dataclass(frozen=True)
 class Footing:
     """A risk map as a vehicle meets it: ``fields`` (4, row, col) m to hazards to a wheel, proven ones, hazards to the
-    vehicle, proven ones; ``unknown`` (row, col) m to unknown ground; ``caution`` (row, col) 1 there."""
+    vehicle, proven ones; ``unknown`` (row, col) m to unknown ground; ``caution`` (row, col) its weight there."""
 
     lattice: Lattice
     vehicle: Vehicle
@@ -65,17 +68,23 @@ class Footing:
         vehicle: Vehicle,
         p_hazard: NDArray[np.float32] | None = None,
         sure: float = 0.5,
+        dare: float = 0.0,
     ) -> Footing:
         """From classes and reason bits of :mod:`stages.risk`; without bits every hazard is one to a wheel.
 
-        A hazard is proven where it is not one by sigma alone, and at least as probable as ``sure``.
+        A hazard is proven where it is not one by sigma alone, and at least as probable as ``sure``. What is one by
+        sigma alone and less probable than ``dare`` is caution ground :data:`DOUBT_WEIGHT` times.
         """
         hazardous, cell = risk == HAZARDOUS, lattice.cell
         bits = np.full(risk.shape, WHEEL_BITS) if reason is None else reason
         doubtful = hazardous & ((bits & DOUBT_BIT) > 0)
         likely = proven = hazardous & ~doubtful
+        caution = (risk == CAUTION).astype(np.uint8)
         if p_hazard is not None:
             proven = likely & (p_hazard >= sure)
+            dared = doubtful & (p_hazard < dare)
+            doubtful &= ~dared
+            caution[dared] = DOUBT_WEIGHT
         kinds = [(bits & which) > 0 for which in (WHEEL_BITS, BODY_BITS)]
         fields = []
         for kind in kinds:
@@ -83,7 +92,7 @@ class Footing:
             beside = _distance(doubtful & kind, cell) + np.float32(vehicle.margin)
             fields += [np.minimum(_distance(likely & kind, cell), beside), _distance(proven & kind, cell)]
         unknown = risk == UNKNOWN
-        return Footing(lattice, vehicle, np.stack(fields), _distance(unknown, cell), (risk == CAUTION).astype(np.uint8))
+        return Footing(lattice, vehicle, np.stack(fields), _distance(unknown, cell), caution)
 
     def gaps(self, x: Floats, y: Floats, heading: Floats) -> Gaps:
         """At poses: x, y of the middle (m) and heading (rad to the left of y), arrays of one shape."""
@@ -91,10 +100,11 @@ class Footing:
         turn = np.broadcast_to(heading, np.shape(x)).reshape(-1)
         out = np.empty((4, len(at)), np.float32)
         cell = self.lattice.cell
-        reach = 0.5 * math.hypot(self.vehicle.track, self.vehicle.wheel_base) + cell
+        # beyond the circle about the vehicle, and what rounding to cells takes, nothing is beneath it
+        reach = np.float32(0.5 * math.hypot(self.vehicle.track, self.vehicle.wheel_base) + 1.5 * cell), np.float32(cell)
         _gaps(
             at, np.cos(turn), np.sin(turn), wheel_positions(self.vehicle) / cell, _belly(self.vehicle) / cell,
-            self.fields, self.unknown, self.caution, np.float32(reach), out,
+            self.fields, self.unknown, self.caution, reach, out,
         )  # fmt: skip
         out[2] -= NEAR_UNKNOWN * cell
         return Gaps(*(a.reshape(np.shape(x)) for a in out))
@@ -124,7 +134,7 @@ def _gaps(at, cosine, sine, wheels, belly, fields, unknown, caution, reach, out)
             out[0, n] = out[1, n] = -np.inf
             continue
         gap, proven, share = fields[2, i, j], fields[3, i, j], np.float32(caution[i, j])
-        spare = unknown[i, j] - reach
+        spare = unknown[i, j] - reach[0]
         outside = False
         for k in range(4):
             a, b = wheels[k, 0], wheels[k, 1]
@@ -137,8 +147,8 @@ def _gaps(at, cosine, sine, wheels, belly, fields, unknown, caution, reach, out)
         out[0, n], out[1, n], out[3, n] = gap, proven, share / np.float32(5.0)
         if outside:
             continue
-        if spare > 0:  # nothing unknown within the circle about the vehicle
-            out[2, n] = spare
+        if spare > 0:
+            out[2, n] = spare + reach[1]
             continue
         least = np.float32(np.inf)
         for k in range(belly.shape[0]):

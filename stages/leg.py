@@ -62,6 +62,13 @@ class LegParams(Params):
         description="probability from which a hazard closes ground, and the same where no way is left: what is far is "
         "uncertain, and nearer to it more is known",
     )
+    dare: float = Field(
+        0.3,
+        ge=0,
+        le=0.5,
+        description="probability up to which ground that is hazardous by sigma alone is driven on, at a price: limits "
+        "are half of what tips the vehicle over, and who never dares does not arrive among rocks",
+    )
     unknown_price: float = Field(2.0, ge=1, description="price of a metre over unknown ground, known ground is 1")
     caution_price: float = Field(
         0.2, ge=0, description="added to the price where all wheels are on caution ground: a detour of a fifth"
@@ -340,7 +347,7 @@ def _run(params: LegParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     before = None if before is None or len(before) < 2 else before
     maps = (np.asarray(risk["risk"]), np.asarray(risk["reason"]), lattice, vehicle, np.asarray(risk["p_hazard"]))
     for sure in params.sure:
-        footing = Footing.of(*maps, sure)
+        footing = Footing.of(*maps, sure, params.dare)
         found = plan_leg(footing, start, heading, goal, params, int(args["looks"]), closed, before)
         if found.verdict == "goal" or len(found.way) > 1:
             break

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stages.footing import Footing
+from stages.footing import DOUBT_WEIGHT, Footing
 from stages.lattice import Lattice
 from stages.risk import CAUTION, HAZARDOUS, REASONS, SAFE, UNKNOWN
 from stages.vehicle import Vehicle
@@ -65,6 +65,14 @@ def test_unknown_ground_wider_than_half_a_wheel_is_never_missed() -> None:
         assert at(Footing.of(risk, None, LATTICE, ROVER), 0.0, 0.0, 0.0)[2] <= 0
 
 
+def test_unknown_ground_beyond_the_vehicle_is_not_beneath_it_at_any_distance() -> None:
+    for far in np.arange(0.045, 0.12, 0.001):
+        risk = np.where(far < X, np.uint8(UNKNOWN), np.uint8(SAFE))
+        edge = X[risk == UNKNOWN].min()
+        beneath = at(Footing.of(risk, None, LATTICE, ROVER), 0.0, 0.0, 0.0)[2] <= 0
+        assert beneath == (edge < 0.04 + 0.5 * LATTICE.cell + 1e-9)
+
+
 def test_outside_the_map_it_may_not_be() -> None:
     footing = Footing.of(np.full(LATTICE.shape, SAFE, np.uint8), None, LATTICE, ROVER)
     assert at(footing, 0.0, 0.0, 0.0) == (np.inf, np.inf, np.inf, 0.0)
@@ -86,3 +94,12 @@ def test_caution_counts_wheels_and_middle() -> None:
     risk = np.where(X > 0.02, np.uint8(CAUTION), np.uint8(SAFE))
     footing = Footing.of(risk, None, LATTICE, ROVER)
     assert [at(footing, x, 0.0, 0.0)[3] for x in (-0.1, 0.0, 0.1)] == pytest.approx([0.0, 0.4, 1.0])
+
+
+def test_what_is_hazardous_by_sigma_alone_and_improbable_is_caution_ground_many_times() -> None:
+    risk = np.where(np.hypot(X - 0.04, Y - 0.05) < 0.01, np.uint8(HAZARDOUS), np.uint8(SAFE))
+    reason = np.full(risk.shape, REASONS["step"] | REASONS["uncertain"], np.uint16)
+    p = np.full(risk.shape, 0.2, np.float32)
+    daring, not_so = (at(Footing.of(risk, reason, LATTICE, ROVER, p, 0.9, d), 0.0, 0.0, 0.0) for d in (0.3, 0.1))
+    assert (daring[0], daring[3]) == (np.inf, pytest.approx(DOUBT_WEIGHT / 5))
+    assert (not_so[0], not_so[3]) == (pytest.approx(ROVER.margin), 0.0)
