@@ -139,7 +139,7 @@ DRIVE = (
     "turn_deg",
     "roll_deg",
 )
-DRIVE += ("roll_swing_deg", "jitter_deg")
+DRIVE += ("roll_swing_deg", "jitter_deg", "sampling")
 CAMERA = ("image_width", "image_height", "focal_length")
 
 SEQUENCE: dict[str, set[str]] = {

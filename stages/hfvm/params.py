@@ -86,7 +86,7 @@ class HfvmParams(Params):
         default=4, ge=0, description="byte steps a pixel of difference to each neighbour; kept weak"
     )
     rounds: int = Field(
-        default=3, ge=0, le=32, description="propagation rounds a level; they recover what the coarse level lost"
+        default=4, ge=0, le=32, description="propagation rounds a level; they recover what the coarse level lost"
     )
     fine_rounds: int | None = Field(
         default=1,
