@@ -127,7 +127,7 @@ RIGHT_IMAGE = {"image/right", "undistort/right", "pyramid/right", "sight", "cont
 
 SCENE = ("seed", "bed_width", "bed_length", "cell", "relief", "rocks", "rock_cover", "craters", "grain")
 SCENE += ("sun_elevation_deg", "sun_azimuth_deg", "sun_diameter_deg")
-RENDERED = ("blur", "noise", "exposure", "exposure_jitter", "right_gain", "vignetting")
+RENDERED = ("blur", "sampling", "noise", "exposure", "exposure_jitter", "right_gain", "vignetting")
 DRIVE = (
     "frames",
     "baseline",
@@ -139,7 +139,7 @@ DRIVE = (
     "turn_deg",
     "roll_deg",
 )
-DRIVE += ("roll_swing_deg", "jitter_deg", "sampling")
+DRIVE += ("roll_swing_deg", "jitter_deg")
 CAMERA = ("image_width", "image_height", "focal_length")
 
 SEQUENCE: dict[str, set[str]] = {
