@@ -6,10 +6,11 @@ sizes: 570 x 520 (the mockup's, and the paper's), the first pair of the KITTI st
 interpolation to 1.4 megapixels. With ``--left --right --truth``: accuracy, misalignment and time of that pair.
 
 All matchers get equal threads and are filled alike: a pixel without a match takes the column of the nearest match in
-its row, of two the background's; its row follows the epipolar lines of the matches, which are level for matchers of rows. Matchers along rows are told the truth's range of disparities and get images padded
-by it, so that they match at the left edge, too; HFVM is told nothing. HFVM is judged on its vector, the others on the
-column, so that rows cannot help them. Times: HFVM with pyramid, both directions, consistency and filling; the others
-one direction on the padded images.
+its row, of two the background's; its row follows the epipolar lines of the matches, which are level for matchers of
+rows. Matchers along rows are told the truth's range of disparities and get images padded by it, so that they match at
+the left edge, too; HFVM is told nothing. HFVM is judged on its vector, the others on the column, so that rows cannot
+help them. Times: HFVM with pyramid, both directions, consistency and filling; the others one direction on the padded
+images.
 """
 
 from __future__ import annotations

@@ -76,6 +76,20 @@ class PathParams(Params):
     caution: float = Field(
         default=0.2, ge=0, le=10, description="m of climb that a metre of caution ground is worth: a detour of a fifth"
     )
+    doubt: float = Field(
+        default=5.0,
+        ge=0,
+        le=1000,
+        description="m of climb that a metre of ground is worth, times its probability of a hazard: at 0.1 a detour of "
+        "half of it",
+    )
+    sure: float = Field(
+        default=0.1,
+        gt=0,
+        le=1,
+        description="probability of a hazard above which ground is not driven on, though no measure exceeds its limit "
+        "by as many standard deviations as make a hazard",
+    )
 
 
 def find_path(
@@ -126,7 +140,8 @@ def find_path(
 
 
 def _ground(maps: Maps, lattice: Lattice, grid: RowGrid, vehicle: Vehicle, p: PathParams) -> Ground:
-    return Ground(maps, lattice, grid, vehicle, unit=p.height_step * vehicle.max_step, caution=p.caution)
+    unit = p.height_step * vehicle.max_step
+    return Ground(maps, lattice, grid, vehicle, unit=unit, caution=p.caution, doubt=p.doubt, sure=p.sure)
 
 
 def _by_rows(
@@ -208,7 +223,7 @@ def _run(params: PathParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
 
 STAGE = Stage(
     name="path",
-    version=2,
+    version=3,
     summary="path of least height differences for a vehicle with a width: monotone in the rows, or any direction",
     params=PathParams,
     inputs=("risk",),

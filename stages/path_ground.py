@@ -39,32 +39,50 @@ class Ground:
     """The maps on a grid.
 
     ``unit``: metres of height that cost one; ``stand`` (row, col) float32 m, mean height under a wheel; ``height`` the
-    same in units, 0 where closed; ``toll`` (row, col) units, of caution ground; ``closed`` (row, col) where the
-    vehicle's middle may not be.
+    same in units, 0 where closed; ``toll`` (row, col) units, of caution and doubtful ground; ``closed`` (row, col):
+    where the vehicle's middle may not be.
     """
 
     def __init__(
-        self, maps: Maps, lattice: Lattice, grid: RowGrid, vehicle: Vehicle, *, unit: float, caution: float
+        self,
+        maps: Maps,
+        lattice: Lattice,
+        grid: RowGrid,
+        vehicle: Vehicle,
+        *,
+        unit: float,
+        caution: float,
+        doubt: float = 0.0,
+        sure: float = 1.0,
     ) -> None:
         """
         Parameters
         ----------
-        maps : arrays (row, col) of stage ``risk`` on ``lattice``: ``risk``, ``reason``, ``elevation``.
+        maps : arrays (row, col) of stage ``risk`` on ``lattice``: ``risk``, ``reason``, ``elevation`` and, where
+            there is a price of doubt, ``p_hazard``.
         unit : metres.
         caution : metres of climb that a metre of caution ground costs.
+        doubt : metres of climb that a metre of ground costs times its probability of a hazard.
+        sure : probability of a hazard above which ground is closed.
         """
         self.grid, self.unit = grid, unit
         risk = grid.sample(lattice, maps["risk"], UNKNOWN)
         reason = grid.sample(lattice, maps["reason"], 0)
         hazard, unknown = risk == HAZARDOUS, risk == UNKNOWN
         self.closed = hazard | unknown
+        chance = grid.sample(lattice, maps["p_hazard"], np.nan) if "p_hazard" in maps else None
+        if chance is not None and sure < 1:
+            self.closed |= chance > sure
         wheels, body = (hazard & ((reason & bits) > 0) for bits in (WHEEL_BITS, BODY_BITS))
         self._stand = Stand(wheels, body, vehicle, grid.cell, unknown, self.closed)
         mean = window_mean(maps["elevation"], window_cells(vehicle.wheel_diameter, lattice.cell))
         self.stand = grid.sample(lattice, mean, np.nan)
         toll = round(caution * grid.cell / unit)
+        dearest = toll + round(doubt * grid.cell / unit)
         self.height: Ints = np.empty(risk.shape, dtype=np.int32)
-        self.toll: Ints = np.empty(risk.shape, dtype=np.int16 if toll <= np.iinfo(np.int16).max else np.int64)
+        self.toll: Ints = np.zeros(risk.shape, dtype=np.int16 if dearest <= np.iinfo(np.int16).max else np.int64)
+        if doubt > 0 and chance is not None:
+            _doubt(chance, np.float32(doubt * grid.cell / unit), self.toll)
         if _price(self.stand, risk, np.float32(unit), toll, self.height, self.toll) > LARGE:
             self.height = np.rint(np.where(self.closed, np.float32(0), self.stand) / np.float32(unit)).astype(np.int64)
         self._ways: dict[str, Bytes] = {}
@@ -110,8 +128,17 @@ def _price(stand, risk, unit, caution, height, toll):  # type: ignore[no-untyped
             v = np.rint(stand[r, c] / unit) if kind < HAZARDOUS else np.float32(0.0)
             most = max(most, abs(v))
             height[r, c] = np.int32(v)
-            toll[r, c] = caution if kind == CAUTION else 0
+            toll[r, c] += caution if kind == CAUTION else 0
     return most
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _doubt(probability, price, toll):  # type: ignore[no-untyped-def]
+    """Tolls of ground that may be a hazard; none where nothing is known of it, which is closed."""
+    for r in range(toll.shape[0]):
+        for c in range(toll.shape[1]):
+            p = probability[r, c]
+            toll[r, c] = np.int64(np.rint(price * p)) if p > 0 else 0
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

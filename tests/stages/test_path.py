@@ -125,6 +125,26 @@ def test_caution_ground_is_avoided_where_the_detour_is_short() -> None:
     assert found[0.2]["caution_share"] == 0.0
 
 
+@pytest.mark.parametrize(("chance", "crossed"), [(0.0, True), (0.09, False), (0.5, False)])
+def test_ground_that_may_be_a_hazard_is_gone_round(chance: float, crossed: bool) -> None:
+    lattice = Lattice.at(-30, 60, CELL, 61, 61)
+    given = maps(*level(lattice)) | {"p_hazard": np.zeros(lattice.shape, dtype=np.float32)}
+    given["p_hazard"][25:36, 24:37] = chance
+    ends = {"start": (0.0, 0.1), "target": (0.0, 0.5)}
+    route = find_path(given, lattice, MODEL, **ends, params=PathParams(doubt=20.0))
+    assert bool((given["p_hazard"][route.cells[:, 0], route.cells[:, 1]] == np.float32(chance)).all()) == crossed
+    assert len(route.cells) > 30
+
+
+def test_ground_that_is_probably_a_hazard_closes_the_way() -> None:
+    lattice = Lattice.at(-30, 60, CELL, 61, 61)
+    given = maps(*level(lattice)) | {"p_hazard": np.zeros(lattice.shape, dtype=np.float32)}
+    given["p_hazard"][30] = 0.2
+    ends = {"start": (0.0, 0.1), "target": (0.0, 0.5)}
+    assert not len(find_path(given, lattice, MODEL, **ends).cells)
+    assert len(find_path(given, lattice, MODEL, **ends, params=PathParams(sure=0.3)).cells) > 30
+
+
 def test_from_start_to_target_in_metres() -> None:
     lattice = Lattice.at(-50, 50, CELL, 101, 101)
     given = maps(*level(lattice))
