@@ -13,9 +13,9 @@ from typing import Any
 
 import cv2
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 from pydantic import Field
-from scipy import ndimage
 
 from datasets.protocol import Sequence, Source
 from stages.declare import AnyArray, Array, Bundle, Inputs, Params, Stage
@@ -110,7 +110,7 @@ def warp(image: AnyArray, valid: AnyArray, lens: Lens, params: MisalignParams) -
     column, row = origins(lens, params)
     there = np.isfinite(column) & np.isfinite(row)
     at = np.stack([np.where(there, row, -1e6), np.where(there, column, -1e6)])
-    values = ndimage.map_coordinates(image.astype(np.float64), at, order=3, mode="nearest")
+    values = scipy.ndimage.map_coordinates(image.astype(np.float64), at, order=3, mode="nearest")
     top = np.iinfo(image.dtype).max if np.issubdtype(image.dtype, np.integer) else np.inf
     values = np.clip(np.rint(values) if np.isfinite(top) else values, 0, top)
     kernel = np.ones((KERNEL, KERNEL), np.uint8)

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.ndimage import map_coordinates
 
 from stages.errors import DegenerateError, InputError
 from stages.geometry import orthonormal, rotation_exp
@@ -68,7 +68,7 @@ def interpolate(grid: Grid, xy: Floats, values: Floats | None = None) -> Floats:
     index = np.where(np.abs(index - nearest) < 1e-6, nearest, index)  # the same cells: the same values
     known = np.isfinite(array)
     share, z = (
-        map_coordinates(a, index, order=1, mode="constant", cval=0.0)
+        scipy.ndimage.map_coordinates(a, index, order=1, mode="constant", cval=0.0)
         for a in (known.astype(np.float64), np.where(known, array, 0.0))
     )
     return np.where(share > 1.0 - 1e-9, z, np.nan)

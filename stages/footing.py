@@ -11,9 +11,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numba import njit
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt
 
 from stages.hazards import BITS
 from stages.lattice import Lattice
@@ -111,7 +111,7 @@ class Footing:
 
 
 def _distance(mask: Mask, cell: float) -> Floats32:
-    far = distance_transform_edt(~mask) * cell if mask.any() else np.full(mask.shape, np.inf)
+    far = scipy.ndimage.distance_transform_edt(~mask) * cell if mask.any() else np.full(mask.shape, np.inf)
     return np.asarray(far, dtype=np.float32)
 
 

@@ -19,9 +19,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 from pydantic import Field
-from scipy.ndimage import distance_transform_edt
 
 from stages.declare import Array, Bundle, Inputs, Params, Stage
 from stages.errors import InputError
@@ -272,7 +272,7 @@ def _away_from(way: Floats, lattice: Lattice, reach: float) -> Mask:
     at = at[((at >= 0) & (at < lattice.shape)).all(axis=1)]
     on = np.zeros(lattice.shape, bool)
     on[at[:, 0], at[:, 1]] = True
-    return np.asarray(distance_transform_edt(~on) * lattice.cell > reach) if on.any() else ~on
+    return np.asarray(scipy.ndimage.distance_transform_edt(~on) * lattice.cell > reach) if on.any() else ~on
 
 
 def _stay(

@@ -9,9 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numba import njit
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from stages.surface import Surface
 
@@ -34,7 +34,7 @@ class Views:
 
 def views(left: Floats, right: Floats, left_image: Float32, right_image: Float32, centre: Floats) -> Views:
     """Views of two images (row, col), grey values; ``centre`` of the left camera in the frame of the surface, m."""
-    splines = [ndimage.spline_filter(image, 3, np.float32, mode="mirror") for image in (left_image, right_image)]
+    splines = [scipy.ndimage.spline_filter(image, 3, np.float32, mode="mirror") for image in (left_image, right_image)]
     return Views(left, right, (splines[0], splines[1]), np.asarray(centre, np.float64))
 
 

@@ -20,9 +20,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 from pydantic import Field
-from scipy import ndimage
 
 from stages.declare import Array, Bundle, Inputs, Params, Stage
 from stages.geometry import Camera, Rig, RigidTransform
@@ -68,7 +68,7 @@ class Surface:
         """From elevations, comparing within ``blur`` metres."""
         z = np.asarray(elevation, np.float64)
         side = 2 * round(blur / lattice.cell) + 1
-        top = ndimage.maximum_filter(np.where(np.isnan(z), -np.inf, z), side, mode="nearest")
+        top = scipy.ndimage.maximum_filter(np.where(np.isnan(z), -np.inf, z), side, mode="nearest")
         known = np.isfinite(z)
         return Surface(lattice, z, top, np.column_stack([lattice.xy()[known], z[known]]))
 

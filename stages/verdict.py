@@ -9,9 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numba import njit
 from numpy.typing import NDArray
-from scipy.special import stdtr
 
 from stages.hazards import BITS, FREEDOM, HIDDEN, LIFT, MEASURES, Measured, limits, noise_factors
 from stages.vehicle import Vehicle
@@ -116,7 +116,7 @@ def _facts(vehicle: Vehicle, window: float, cell: float, sigmas: float) -> dict[
 def _table() -> Floats32:
     t = np.arange(-FARTHEST * STEPS, FARTHEST * STEPS + 1) / STEPS
     start, width, lift = LIFT
-    found = stdtr(FREEDOM, t + lift * np.clip((t - start) / width, 0.0, 1.0))
+    found = scipy.special.stdtr(FREEDOM, t + lift * np.clip((t - start) / width, 0.0, 1.0))
     found[0], found[-1] = 0.0, 1.0
     return np.asarray(found, dtype=np.float32)
 

@@ -14,8 +14,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from stages.geometry import RigidTransform
 from stages.vehicle import Vehicle
@@ -51,10 +51,10 @@ class Ground:
         inside = dx**2 + dy**2 <= radius**2
         sphere = np.where(inside, np.sqrt(np.maximum(radius**2 - dx**2 - dy**2, 0.0)) - radius, 0.0)
         low = np.where(np.isnan(z), -1e9, z)
-        resting = ndimage.grey_dilation(low, footprint=inside, structure=sphere, mode="nearest")
+        resting = scipy.ndimage.grey_dilation(low, footprint=inside, structure=sphere, mode="nearest")
         side = 2 * max(1, int(0.25 * wheel_diameter / cell + 1e-6)) + 1
-        high = ndimage.maximum_filter(low, side, mode="nearest")
-        least = ndimage.minimum_filter(np.where(np.isnan(z), 1e9, z), side, mode="nearest")
+        high = scipy.ndimage.maximum_filter(low, side, mode="nearest")
+        least = scipy.ndimage.minimum_filter(np.where(np.isnan(z), 1e9, z), side, mode="nearest")
         unknown = np.isnan(z)
         return Ground(
             x0, y0, cell, z, np.where(unknown, np.nan, resting), np.where(unknown, np.nan, np.maximum(high - least, 0))

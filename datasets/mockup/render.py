@@ -12,9 +12,9 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+import scipy
 from numba import njit
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from datasets.mockup.params import RenderParams
 from datasets.mockup.raycast import HeightField
@@ -159,7 +159,7 @@ def radiance(
     )
     blocks = values.reshape(camera.height, sampling, camera.width, sampling)
     hit = np.isfinite(blocks).all(axis=(1, 3))
-    mask = ndimage.binary_erosion(hit, np.ones((3, 3)), border_value=1)
+    mask = scipy.ndimage.binary_erosion(hit, np.ones((3, 3)), border_value=1)
     return blocks, np.asarray(mask)
 
 
@@ -171,7 +171,7 @@ def expose(blocks: NDArray[np.float32], p: RenderParams, flat: float, frame: int
     samples = np.where(np.isnan(blocks), np.float32(BACKGROUND), blocks * np.float32(gain))
     grey = samples.astype(np.float64).mean(axis=(1, 3))
     if p.blur > 0:
-        grey = ndimage.gaussian_filter(grey, p.blur, mode="nearest")
+        grey = scipy.ndimage.gaussian_filter(grey, p.blur, mode="nearest")
     y, x = np.ogrid[-1.0 : 1.0 : grey.shape[0] * 1j, -1.0 : 1.0 : grey.shape[1] * 1j]
     grey = grey * (1.0 - p.vignetting * (x * x + y * y) / 2.0)
     noisy = grey + p.noise * rng.standard_normal(grey.shape)

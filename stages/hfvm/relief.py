@@ -16,8 +16,8 @@ do not lie on lines. Solved by a fixed number of Gauss-Seidel sweeps in reading 
 from __future__ import annotations
 
 import numpy as np
+import scipy
 from numba import njit
-from scipy import ndimage
 
 from stages.declare import AnyArray
 from stages.hfvm import epipolar
@@ -74,7 +74,7 @@ def fit(
     """
     start_u, start_v = u, v
     u, v = np.where(keep, u, np.float32(0)), np.where(keep, v, np.float32(0))
-    spline = ndimage.spline_filter(right, 3, np.float32, mode="mirror")
+    spline = scipy.ndimage.spline_filter(right, 3, np.float32, mode="mirror")
     for step in range(params.relief_steps):
         soft = step < min(SOFT_STEPS, params.relief_steps - FULL_STEPS)
         stiffness = params.relief_stiffness * (SOFT_STIFFNESS if soft else 1.0)
