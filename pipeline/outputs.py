@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ from pipeline import products as files
 from pipeline.conventions import describe
 from pipeline.dag import Graph, Handle
 from pipeline.report import RunView, TaskRow, draw, write_report
+from pipeline.report.block import Block
 from pipeline.report.canvas import ground_limits
 from pipeline.report.comparison import compare
 from pipeline.store import GoneError, Store
@@ -52,12 +53,12 @@ def task_rows(graph: Graph, store: Store) -> tuple[TaskRow, ...]:
     return tuple(rows)
 
 
-def write(folder: Path, view: RunView) -> None:
-    """All files of a run; what has no artifact is left out (the report says so)."""
+def write(folder: Path, view: RunView, figures: Mapping[str, Block] | None = None) -> None:
+    """All files of a run; what has no artifact is left out (the report says so). ``figures`` were drawn before."""
     with ThreadPoolExecutor(1) as pool:  # rasters are computed and compressed while figures are drawn
         rasters = pool.submit(_write_rasters, folder, view)
         try:
-            drawn = draw(view)
+            drawn = draw(view, figures)
         except GoneError:  # the other one may have set it aside, and says why
             rasters.result()
             raise

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 from datasets.protocol import Sequence
 from pipeline import config as configuration
+from pipeline.ahead import Ahead
 from pipeline.artifact import DamagedError
 from pipeline.code import remember
 from pipeline.dag import Graph
@@ -29,6 +30,7 @@ from stages.errors import ConfigError, RilleError
 
 if TYPE_CHECKING:
     from pipeline.reconstruct import Products
+    from pipeline.report import RunView
 
 COMPLETE, FAILED, HOLES = 0, 1, 3
 DISTRIBUTIONS = (
@@ -151,18 +153,46 @@ def _reconstruct(options: Options) -> int:
     graph, store = Graph(), at(options.cache)
     flow = dataflow(graph, sequence, config, frames)
     products = flow.build()
-    result = driver.run(
-        graph,
-        store,
-        executor=options.executor,
-        jobs=options.jobs,
-        keep_going=options.keep_going,
-        force=options.force,
-        ledger=folder / "ledger.jsonl",
-        progress=progress.make(options.progress),
-        memory_limit=None if options.memory_limit is None else memory.parse(options.memory_limit),
-        survey=lambda: lay_out(sequence, config, frames),
-    )
+    versions = _versions()
+
+    def view(**late: Any) -> RunView:
+        """What is drawn; ``late`` is what only the end of the run knows."""
+        from pipeline import outputs
+        from pipeline.report import RunView
+
+        return RunView(
+            run_id=folder.name,
+            sequence=sequence,
+            frames=frames,
+            products=products,
+            bundle=outputs.bundles(store),
+            config=config,
+            config_toml=text,
+            versions=versions,
+            command=options.command(),
+            vehicle_source=vehicle_source,
+            started=started.strftime("%Y-%m-%dT%H:%M:%SZ"),
+            notes=sequence.notes,
+            **late,
+        )
+
+    ahead = Ahead(lambda: view(tasks=()))
+    try:
+        result = driver.run(
+            graph,
+            store,
+            executor=options.executor,
+            jobs=options.jobs,
+            keep_going=options.keep_going,
+            force=options.force,
+            ledger=folder / "ledger.jsonl",
+            progress=progress.make(options.progress),
+            memory_limit=None if options.memory_limit is None else memory.parse(options.memory_limit),
+            survey=lambda: lay_out(sequence, config, frames),
+            meanwhile=None if isinstance(flow, Drive) else ahead.draw,
+        )
+    finally:
+        figures = ahead.take()
     if not options.keep_going and not (isinstance(flow, Drive) and flow.outcome()[0] == "safety stop"):
         result.check()
     if isinstance(flow, Drive):
@@ -170,7 +200,6 @@ def _reconstruct(options: Options) -> int:
 
     from pipeline import standing
 
-    versions = _versions()
     facts = {"config": text, "frames": frames, "vehicle": vehicle_source, "command": options.command()}
     stamped = standing.stamp(graph, sequence, versions, **facts)
     remember()
@@ -182,26 +211,10 @@ def _reconstruct(options: Options) -> int:
         return _posed_all(products)
 
     from pipeline import ledger, outputs
-    from pipeline.report import RunView
 
-    view = RunView(
-        run_id=folder.name,
-        sequence=sequence,
-        frames=frames,
-        products=products,
-        bundle=outputs.bundles(store),
-        tasks=outputs.task_rows(graph, store),
-        config=config,
-        config_toml=text,
-        seconds=result.seconds,
-        versions=versions,
-        command=options.command(),
-        vehicle_source=vehicle_source,
-        started=started.strftime("%Y-%m-%dT%H:%M:%SZ"),
-        notes=sequence.notes,
-    )
+    whole = view(tasks=outputs.task_rows(graph, store), seconds=result.seconds)
     try:
-        outputs.write(folder, view)
+        outputs.write(folder, whole, figures)
         ledger.add_facts(folder / "ledger.jsonl", total=(datetime.now(UTC) - started).total_seconds())
     except (DamagedError, GoneError):
         shutil.rmtree(folder)

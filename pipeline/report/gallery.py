@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -14,12 +14,12 @@ from pipeline.report.words import length, spread
 from stages.declare import Bundle
 
 
-def draw(scene: Scene) -> Gallery:
-    """Draw every figure whose artifacts are there."""
+def draw(scene: Scene, drawn: Mapping[str, Block] | None = None) -> Gallery:
+    """Draw every figure whose artifacts are there, but those that are ``drawn`` (by title)."""
     blocks, absent = [], []
     for title, maker, expected in _FIGURES:
         try:
-            block = maker(scene)
+            block = (drawn or {}).get(title) or maker(scene)
         except Exception as error:  # a figure must not cost the run its report; the failure is shown in it
             absent.append((title, f"drawing failed, {type(error).__name__}: {error}"))
             continue
@@ -28,6 +28,11 @@ def draw(scene: Scene) -> Gallery:
         elif expected(scene):
             absent.append((title, "what it shows was not computed"))
     return Gallery(tuple(blocks), tuple(absent))
+
+
+def makers() -> list[tuple[str, Callable[[Scene], Block | None]]]:
+    """Title of each figure that a report can have, and what draws it."""
+    return [(title, maker) for title, maker, _ in _FIGURES]
 
 
 def _disparities(scene: Scene) -> Block | None:

@@ -11,7 +11,7 @@ from typing import Any
 
 from pipeline.products import write_text
 from pipeline.report import gallery, summary, tables
-from pipeline.report.block import Gallery
+from pipeline.report.block import Block, Gallery
 from pipeline.report.gather import Scene
 from pipeline.report.view import RunView
 from pipeline.report.words import coordinate, metres, number, quantity, seconds, share
@@ -26,12 +26,12 @@ class Drawn:
     facts: Mapping[str, Any]
 
 
-def draw(view: RunView) -> Drawn:
-    """Figures and facts of a run; needs none of its files."""
+def draw(view: RunView, drawn: Mapping[str, Block] | None = None) -> Drawn:
+    """Figures and facts of a run; needs none of its files. Figures ``drawn`` before (by title) are taken over."""
     # Opening an artifact reads its manifest; a few stay open, since several tables and figures need the same.
     scene = Scene(replace(view, bundle=lru_cache(maxsize=16)(view.bundle)))
-    drawn = gallery.draw(scene)
-    return Drawn(scene, drawn, summary.summarise(scene, drawn))
+    figures = gallery.draw(scene, drawn)
+    return Drawn(scene, figures, summary.summarise(scene, figures))
 
 
 def write_report(folder: Path, view: RunView, drawn: Drawn | None = None) -> None:
