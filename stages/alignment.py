@@ -13,6 +13,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from stages.cubic import cubic
+from stages.line import copy_line
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -76,7 +77,8 @@ def _align_all(a, b, points, start, affinity, ridge, reach, position, error):  #
         for _ in range(STEPS):
             square = _right_side(b, x, y, m, template, descent, step)
             _prior(affinity[n], m, ridge, step)
-            normal[:] = gram
+            for k in range(UNKNOWNS):
+                copy_line(gram[k], normal[k])
             if not _solve(normal, step):
                 break
             dx, dy = _compose(m, step)

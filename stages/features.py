@@ -19,6 +19,7 @@ from numba.extending import intrinsic
 from numpy.typing import ArrayLike, NDArray
 
 from stages.declare import AnyArray
+from stages.line import copy_line
 
 Words = NDArray[np.uint64]
 Planes = NDArray[np.float32]
@@ -136,7 +137,8 @@ def _pack_all(images, scale, words, deviation):  # type: ignore[no-untyped-def]
             size = min(BAND, rows - start) + 2 * RADIUS
             for j in range(size):
                 row, out = images[i, min(max(start + j - RADIUS, 0), rows - 1)], room[j]
-                out[:RADIUS], out[RADIUS : RADIUS + cols], out[RADIUS + cols :] = row[0], row, row[cols - 1]
+                out[:RADIUS], out[RADIUS + cols :] = row[0], row[cols - 1]
+                copy_line(row, out[RADIUS:])
             _pack(room[:size], start, scale, words[i], deviation[i])
 
 

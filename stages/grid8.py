@@ -14,6 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from stages.line import copy_line
 from stages.row_graph import UNREACHED
 from stages.swept import ACROSS, LEFT, RIGHT, STRAIGHT
 
@@ -84,7 +85,8 @@ def _flood(ways, number, spans):  # type: ignore[no-untyped-def]
             continue
         if count == spans.shape[0]:
             more = np.empty((2 * count, 2), dtype=np.int64)
-            more[:count] = spans
+            for k in range(count):
+                copy_line(spans[k], more[k])
             spans = more
         spans[count, 0] = spans[count, 1] = at // cols
         number[at // cols, at % cols], stack[0], size = count, at, 1
@@ -137,7 +139,7 @@ def _search(height, ways, toll, lengths, target, end, cost, step):  # type: igno
 @njit(cache=True, nogil=True)
 def _grown(a):  # type: ignore[no-untyped-def]
     out = np.empty(2 * a.shape[0], dtype=np.int64)
-    out[: a.shape[0]] = a
+    copy_line(a, out)
     return out
 
 

@@ -13,6 +13,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from stages.line import copy_line
+
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -122,8 +124,8 @@ def _mean(a, half, out):  # type: ignore[no-untyped-def]
             for k in range(lane + 1):
                 _divide(sums[k], counts[k], offset, out[r - lane + k])
         after = (lane + 1) % LANES
-        total[after] = total[lane]
-        count[after] = count[lane]
+        copy_line(total[lane], total[after])
+        copy_line(count[lane], count[after])
         lane = after
 
 

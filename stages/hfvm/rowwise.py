@@ -10,6 +10,7 @@ import numpy as np
 from numba import njit
 
 from stages.hfvm import lanes
+from stages.line import copy_line
 
 PLANES = 10
 
@@ -177,7 +178,7 @@ def _add_rows(ring, first, total):  # type: ignore[no-untyped-def]
         for x in range(total.size):
             total[x] = (one[x] + (two[x] + three[x])) + (four[x] + five[x])
         return
-    total[:] = ring[first % size]
+    copy_line(ring[first % size], total)
     for j in range(1, size, 2):
         one, two = ring[(first + j) % size], ring[(first + 1 + j) % size]
         for x in range(total.size):
