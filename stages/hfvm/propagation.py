@@ -13,6 +13,7 @@ from numba import njit
 from stages.features import distance
 from stages.hfvm import epipolar, lanes, strip_lanes
 from stages.hfvm.lanes import LANES, SHARP
+from stages.line import copy_line
 
 MOST_STRIPS = 512
 """Room for the strips that a pixel searches: 9 centres, 17 rows each, 17 columns in three pieces."""
@@ -218,11 +219,9 @@ def _centres(up_u, up_v, f, mu, x0, y0, centres):  # type: ignore[no-untyped-def
             for i in range(ccols):
                 u, v = np.int32(2 * us[i]), np.int32(2 * vs[i])
                 row[i] = (v << np.int32(16)) | (u & np.int32(0xFFFF))
-    centres[1 : crows + 1, 0], centres[1 : crows + 1, ccols + 1] = (
-        centres[1 : crows + 1, 1],
-        centres[1 : crows + 1, ccols],
-    )
-    centres[0], centres[crows + 1] = centres[1], centres[crows]
+        centres[j + 1, 0], centres[j + 1, ccols + 1] = row[0], row[ccols - 1]
+    copy_line(centres[1], centres[0])
+    copy_line(centres[crows], centres[crows + 1])
 
 
 @njit(cache=True, nogil=True)
