@@ -9,7 +9,10 @@ SEQ    ?= mockup
 FRAMES ?=
 JOBS   ?=
 SET    ?=
+ONLY   ?=
 ARGS   ?=
+
+BENCHMARKS := $(sort $(basename $(notdir $(wildcard benchmarks/*.py))))
 
 .DEFAULT_GOAL := help
 .PHONY: help install reconstruct test check torture bench lint clean
@@ -39,8 +42,9 @@ check: test torture ## everything, the slow checks too
 torture: $(STAMP) ## kills, damage, full disks, races: what the engine endures, as a table (also part of check)
 	$(BIN)/python -m pytest tests/torture $(ARGS)
 
-bench: $(STAMP) ## side-by-side measurements: every figure of the README
-	@for b in benchmarks/*.py; do echo "== $$b"; $(BIN)/python $$b $(ARGS) || exit 1; done
+bench: $(STAMP) ## side-by-side measurements: every figure of the README; ONLY=matching: one of them, ARGS=--help: its options
+	@$(if $(filter-out $(BENCHMARKS),$(ONLY)),echo "no such benchmark: $(filter-out $(BENCHMARKS),$(ONLY)); ONLY= any of: $(BENCHMARKS)" >&2; exit 2)
+	@for b in $(or $(ONLY),$(BENCHMARKS)); do echo "== $$b"; $(BIN)/python benchmarks/$$b.py $(ARGS) || exit 1; done
 
 lint: $(STAMP) ## ruff and mypy
 	$(BIN)/ruff check .

@@ -91,13 +91,16 @@ def build(image: AnyArray, params: PyramidParams, valid: AnyArray | None = None)
     level = grey(image)
     if valid is not None and valid.shape != level.shape:
         raise InputError(f"mask {valid.shape} and image {level.shape} differ", remedy="give a mask of the image's size")
-    mask = np.isfinite(level)
+    whole = image.dtype.kind == "u"  # and so finite
+    mask = np.ones(level.shape, bool) if whole else np.isfinite(level)
     if valid is not None:
         mask &= valid != 0
     levels, side = 1, min(level.shape)
     while levels < params.levels and side >= 2 * params.min_side:
         levels, side = levels + 1, (side + 1) // 2
-    return halved(np.where(mask, level, np.float32(0.0)), mask.astype(np.uint8), levels)
+    if not (whole and valid is None):
+        level = np.where(mask, level, np.float32(0.0))
+    return halved(level, mask.view(np.uint8), levels)
 
 
 def halved(image: Image, mask: Mask, levels: int) -> Pyramid:
@@ -123,17 +126,23 @@ def _halve(image: Image, mask: Mask) -> tuple[Image, Mask]:
 
 @njit(cache=True, nogil=True)
 def _means(image, mask, coarse, valid):  # type: ignore[no-untyped-def]
+    """Indices without sign, so that the compiler need not mind negative ones and makes vector code of the loop."""
     rows, cols = image.shape
-    nil, one = np.float32(0.0), np.float32(1.0)
+    nil, one, three = np.float32(0.0), np.float32(1.0), np.float32(3.0)
     for y in range(coarse.shape[0]):
         a, b = image[2 * y], image[min(2 * y + 1, rows - 1)]
         p, q = mask[2 * y], mask[min(2 * y + 1, rows - 1)]
-        for x in range(coarse.shape[1]):
-            i = min(2 * x + 1, cols - 1)
-            total = a[2 * x] + a[i] + b[2 * x] + b[i]
-            count = p[2 * x] + p[i] + q[2 * x] + q[i]
-            coarse[y, x] = total / max(np.float32(count), one) if count >= 3 else nil
-            valid[y, x] = count >= 3
+        found, usable = coarse[y], valid[y]
+        for x in range(cols // 2):
+            i, k = np.uint64(2 * x), np.uint64(2 * x + 1)
+            count = (np.float32(p[i]) + np.float32(p[k])) + (np.float32(q[i]) + np.float32(q[k]))
+            found[x] = (a[i] + a[k] + b[i] + b[k]) / max(count, one) if count >= three else nil
+            usable[x] = count >= three
+        if cols % 2:
+            x, i = cols // 2, cols - 1
+            count = np.float32(2 * (p[i] + q[i]))
+            found[x] = (a[i] + a[i] + b[i] + b[i]) / max(count, one) if count >= three else nil
+            usable[x] = count >= three
 
 
 def filled(pyramid: Pyramid) -> tuple[Image, ...]:

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from benchmarks.stereo import methods, pairs
+from benchmarks.stereo import limits, methods, pairs
 from benchmarks.stereo.measures import Found, Truth, fill, judge, locking
 from benchmarks.stereo.misalignment import camera_of, conditions, knocked
 from benchmarks.stereo.pairs import Pair, measured, parallel, read_truth
@@ -35,7 +35,7 @@ class TestMeasures:
     def test_the_truth_itself_has_no_error(self) -> None:
         truth = parallel(np.random.default_rng(0).uniform(1, 40, (20, 30)))
         figures = judge(found(truth.u), truth)
-        wrong = [figures[k] for k in figures if k.startswith("bad")]
+        wrong = [figures[k] for k in figures if k.startswith("bad") and k != "bad2_own"]
         assert wrong == [0.0] * len(wrong)
         assert figures["median"] == 0.0
         assert figures["completeness"] == 1.0
@@ -87,6 +87,27 @@ class TestMeasures:
         filled = fill(found(np.where(known, u, NONE), v=np.where(known, v, NONE)))
         np.testing.assert_allclose(filled.v, 0.5 + 0.04 * (x + filled.u) - 0.01 * y, atol=0.01)
         assert np.array_equal(filled.v[known], v[known])
+
+    def test_spread_of_matched_columns_and_what_is_claimed_for_it(self) -> None:
+        # errors 1, 2, 3, 5 and one beyond everything: median 3, departures 2, 1, 0, 2, 97; their median 2
+        truth = parallel(np.full((1, 6), 10.0))
+        u = np.array([[-9.0, -8.0, -7.0, -5.0, 90.0, NONE]])
+        std = np.array([[1.0, 1.5, 1.0, 2.0, 5.0, NONE]])
+        figures = judge(Found(u, 0 * u, np.isfinite(u), True, std), truth)
+        assert figures["nmad"] == pytest.approx(1.4826 * 2)
+        assert figures["within_1"] == pytest.approx(1 / 5)
+        assert figures["within_2"] == pytest.approx(2 / 5)
+        assert judge(found(u), truth)["within_1"] is None
+        assert judge(found(np.full((1, 6), NONE)), truth)["nmad"] is None
+
+    def test_own_filling_is_judged_as_it_is(self) -> None:
+        truth = parallel(np.array([[5.0, 5.0, 5.0, 9.0]]))
+        u = np.array([[-5.0, NONE, NONE, -9.0]])
+        dense = np.array([[-5.0, -9.0, -5.5, -9.0]]), np.array([[0.0, 0.0, 3.0, 0.0]])
+        figures = judge(Found(u, 0 * u, np.isfinite(u), True, dense=dense), truth)
+        assert figures["bad2"] == 0.0
+        assert figures["bad2_own"] == 0.5
+        assert judge(found(u), truth)["bad2_own"] is None
 
     def test_locking(self) -> None:
         assert locking(np.arange(-50, 50) / 10.0)[0] == pytest.approx(1.0)
@@ -196,3 +217,54 @@ class TestMethods:
         large = pairs.enlarged(pair, 14000.0)
         assert abs(large.left.size / 14000.0 - 1.0) < 0.02
         assert large.searching(224).range == (0, 224)
+
+
+class TestClaims:
+    def figures(self) -> dict[str, Any]:
+        def accuracy(pair: str, method: str, bad2: float, **more: Any) -> dict[str, Any]:
+            rest = {"nmad": 0.12, "completeness": 0.75, "within_1": 0.62, "within_2": None}
+            return {"pair": pair, "method": method, "bad2": bad2, **rest, **more}
+
+        def time(pair: str, size: list[int], method: str, least: float, median: float) -> dict[str, Any]:
+            return {"pair": pair, "size": size, "method": method, "min_ratio": least, "median_ratio": median}
+
+        return {
+            "accuracy": [
+                accuracy("cones", "SGBM 3WAY", 0.1),
+                accuracy("cones", "HFVM accurate", 0.101),
+                accuracy("cones", "HFVM default", 0.119),
+                accuracy("mockup", "HFVM accurate", 0.5, nmad=0.121),
+            ],
+            "misalignment": [
+                {"pair": "cones", "method": "SGBM 3WAY", "condition": "aligned", "bad2": 0.1},
+                {"pair": "cones", "method": "HFVM default", "condition": "shift 4 px", "bad2": 0.14},
+                {"pair": "cones", "method": "HFVM default", "condition": "shift 3 px", "bad2": 0.9},
+            ],
+            "time": [
+                time("street", [1226, 370], "SGBM 3WAY", 1.0, 1.0),
+                time("street", [1226, 370], "HFVM default", 0.9, 1.1),
+                time("motorcycle x 1.944", [1440, 972], "SGBM 3WAY", 1.0, 1.0),
+                time("motorcycle x 1.944", [1440, 972], "HFVM default", 0.7, 0.6),
+            ],
+        }
+
+    def test_each_figure_is_held_against_its_limit(self) -> None:
+        found = limits.lines(self.figures())
+        assert [(c.figure, c.limit, c.kept) for c in found] == [
+            (pytest.approx(1.01), "<= 1", False),
+            (pytest.approx(1.19), "<= 1.2", True),
+            (pytest.approx(1.4), "<= 1.5", True),
+            (0.121, "<= 0.12", False),
+            (0.75, ">= 0.75", True),
+            (0.62, "0.61 .. 0.75", True),
+            (0.9, "<= 1", True),
+            (1.1, "<= 1", False),
+            (0.7, "<= 0.7", True),
+            (0.6, "<= 0.7", True),
+        ]
+
+    def test_what_was_not_measured_is_left_out(self) -> None:
+        figures = self.figures()
+        assert limits.lines({}) == []
+        del figures["accuracy"][0], figures["misalignment"][0], figures["time"][2]
+        assert [c.figure for c in limits.lines(figures)] == [0.121, 0.75, 0.62, 0.9, 1.1]

@@ -36,12 +36,18 @@ class Truth:
 
 @dataclass(frozen=True)
 class Found:
-    """A matcher's claim: displacements, and where they were measured. ``rows``: whether it searches rows, too."""
+    """A matcher's claim: displacements, and where they were measured. ``rows``: whether it searches rows, too.
+
+    ``std``: standard deviation of the columns that it claims, pixels, if it does. ``dense``: displacements (u, v) with
+    the pixels that it fills itself, if it does.
+    """
 
     u: Map
     v: Map
     matched: NDArray[np.bool_]
     rows: bool
+    std: Map | None = None
+    dense: tuple[Map, Map] | None = None
 
 
 def fill(found: Found) -> Found:
@@ -101,9 +107,12 @@ def judge(found: Found, truth: Truth) -> dict[str, Any]:
     """Figures of one map.
 
     ``bad1..3``: share of all pixels with truth that are off by more than 1, 2, 3 px after :func:`fill`, missing ones
-    counted; ``bad1..3_column``: the same of the columns alone; ``bad2_inside``: of the pixels whose true counterpart
-    lies in an image of this size; ``bad1..3_matched``, ``median``: of what was matched; ``completeness``: share of the
-    pixels with truth that were matched; ``locking``: see :func:`locking`.
+    counted; ``bad1..3_column``: the same of the columns alone; ``bad2_own``: ``bad2`` with the matcher's own filling,
+    if it has one; ``bad2_inside``: of the pixels whose true counterpart lies in an image of this size;
+    ``bad1..3_matched``, ``median``: of what was matched; ``completeness``: share of the pixels with truth that were
+    matched; ``nmad``: 1.4826 times the median departure of the matched columns' errors from their median, pixels;
+    ``within_1``, ``within_2``: share of the matched pixels whose column errs by at most one and two of the standard
+    deviations claimed for it; ``locking``: see :func:`locking`.
     """
     known = truth.known
     if not known.any():
@@ -120,11 +129,23 @@ def judge(found: Found, truth: Truth) -> dict[str, Any]:
     figures: dict[str, Any] = {f"bad{t}": _bad(off, t) for t in THRESHOLDS}
     figures |= {f"bad{t}_column": _bad(off_column, t) for t in THRESHOLDS}
     figures |= {f"bad{t}_matched": _bad(off_matched, t) for t in THRESHOLDS}
+    own = None if found.dense is None else Found(*found.dense, found.matched, found.rows)
+    figures["bad2_own"] = None if own is None else _bad(error(own, truth)[known], 2)
     figures["bad2_inside"] = _bad(off[inside], 2)
     figures["median"] = float(np.median(off_matched)) if off_matched.size else None
     figures["completeness"] = off_matched.size / off.size
+    figures |= _spread((found.u - truth.u)[both], None if found.std is None else found.std[both])
     figures["locking"], figures["histogram"] = locking(found.u[both])
     return figures
+
+
+def _spread(off: Map, std: Map | None) -> dict[str, float | None]:
+    """Figures of matched columns: NMAD, and shares within one and two standard deviations."""
+    if not off.size:
+        return {"nmad": None, "within_1": None, "within_2": None}
+    nmad = 1.4826 * float(np.median(np.abs(off - np.median(off))))
+    within = {f"within_{k}": None if std is None else float(np.mean(np.abs(off) <= k * std)) for k in (1, 2)}
+    return {"nmad": nmad, **within}
 
 
 def _bad(off: Map, threshold: float) -> float | None:

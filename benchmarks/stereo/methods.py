@@ -177,7 +177,8 @@ def _hfvm(name: str, values: dict[str, Any], threads: int) -> Method:
     def read(raw: Any, pair: Pair) -> Found:
         good = matched(raw.validity)
         u, v = (np.where(good, m, np.nan).astype(np.float64) for m in (raw.column_disparity, raw.row_disparity))
-        return Found(u, v, good, rows=True)
+        std, *dense = (np.asarray(m, np.float64) for m in (raw.disparity_std, raw.column_disparity, raw.row_disparity))
+        return Found(u, v, good, rows=True, std=std, dense=(dense[0], dense[1]))
 
     return Method(name, lambda pair: match(pair.left, pair.right, params, **extra), read)
 

@@ -162,7 +162,7 @@ class Finish:
         p, near = self.params, uncertainty.SURROUNDINGS // 2 + consistency.CROWD // 2
         extra = guided.RADIUS if p.guided_fill else 0
         outer = window.grow(near + extra, max(near, p.fill_reach) + extra, self.shape)
-        u, v, noise = (cut(refined[name], outer).copy() for name in ("u", "v", "noise"))
+        u, v = (cut(refined[name], outer).copy() for name in ("u", "v"))
         validity, removed = cut(refined["validity"], outer).copy(), cut(gone, outer) != 0
         left, valid = self.pair.left.view.grey(0, outer), self.pair.left.view.valid(0, outer)
         keep = validity == 0
@@ -173,11 +173,12 @@ class Finish:
         interpolated = lonely.astype(np.uint8)
         consistency.fill_rows(u, v, keep & ~removed, p.fill_reach, self.near_sign or -1.0, interpolated)
         keep &= ~removed & ~lonely
-        std = uncertainty.standard_deviation(noise, u, keep, p)
-        unsure = keep & (std > p.greatest_std) if p.greatest_std is not None else np.zeros_like(keep)
-        mark(validity, unsure, Validity.OVER_THRESHOLD)
-        interpolated[unsure], std[unsure] = 1, np.nan
-        keep &= ~unsure
+        std = uncertainty.standard_deviation(cut(refined["noise"], outer), u, keep, p)
+        if p.greatest_std is not None:
+            unsure = keep & (std > p.greatest_std)
+            mark(validity, unsure, Validity.OVER_THRESHOLD)
+            interpolated[unsure], std[unsure] = 1, np.nan
+            keep &= ~unsure
         interpolated[valid == 0] = 0
         if p.guided_fill:
             u, v = guided.median(u, v, keep, interpolated, left)

@@ -71,21 +71,32 @@ def fit(
     right_valid : (row, col) uint8, 1 = usable.
     u, v : (row, col) float32 displacements to start from, pixels.
     keep : (row, col) bool, pixels to use and to improve; the others are returned as they are.
+
+    Notes
+    -----
+    A pixel that is led farther than :data:`stages.hfvm.refine.FARTHEST` from where it started stays there. Only the way
+    along its line counts: a match that was found rows off its line is on the same thing more often than not, and the
+    lines know its row.
     """
     start_u, start_v = u, v
     u, v = np.where(keep, u, np.float32(0)), np.where(keep, v, np.float32(0))
     spline = scipy.ndimage.spline_filter(right, 3, np.float32, mode="mirror")
+    lines = None
     for step in range(params.relief_steps):
         soft = step < min(SOFT_STEPS, params.relief_steps - FULL_STEPS)
         stiffness = params.relief_stiffness * (SOFT_STIFFNESS if soft else 1.0)
         bend = params.relief_bend * (SOFT_BEND if soft else 1.0)
         a, b, c, p, q = _normal(left, spline, right_valid, u, v, keep)
-        _hold_to_lines(u, v, keep, right.shape, a, b, c, p, q)
+        lines = _lines(u, v, keep, right.shape)
+        if lines is not None:
+            _hold_to_lines(*lines, u, v, keep, a, b, c, p, q)
         across, down = np.zeros(u.shape, np.float32), np.zeros(u.shape, np.float32)
         _stiffness(u, v, keep, np.float32(bend), np.float32(stiffness), across, down)
         new_u, new_v = u.copy(), v.copy()
         _solve(a, b, c, p, q, keep, across, down, SWEEPS, np.float32(OVERSHOOT), u, v, new_u, new_v)
         u, v = new_u, new_v
+    if lines is not None:
+        start_u, start_v = _feet(*lines, start_u, start_v, keep)
     good = keep & (np.hypot(u - start_u, v - start_v) <= FARTHEST)
     return np.where(good, u, start_u), np.where(good, v, start_v)
 
@@ -150,20 +161,35 @@ def _weights(t, w, slope):  # type: ignore[no-untyped-def]
     slope[1], slope[2] = half * t * (three * t - four), -half * q * (three * q - four)
 
 
-def _hold_to_lines(u: AnyArray, v: AnyArray, keep: AnyArray, right_shape: tuple[int, int], *terms: AnyArray) -> None:
-    """Add the squared distance from the epipolar lines to the normal equations, in place."""
+def _lines(u: AnyArray, v: AnyArray, keep: AnyArray, right_shape: tuple[int, int]) -> tuple[AnyArray, float] | None:
+    """Epipolar lines (row, col, 3) fitted to the matches, and how far to trust them, 0..1; None: not determined."""
     found = epipolar.fit(u, v, evenly(keep, FIT_SAMPLES), right_shape)
     if found is None:
-        return
+        return None
+    return epipolar.lines(found[0], u.shape), min(1.0, (SHARP / max(found[1], 1e-9)) ** 2)
+
+
+def _off(lines: AnyArray, u: AnyArray, v: AnyArray) -> AnyArray:
+    """Signed distance from the line, pixels."""
+    return np.asarray(lines[..., 0] * u + lines[..., 1] * v + lines[..., 2])
+
+
+def _hold_to_lines(lines: AnyArray, trust: float, u: AnyArray, v: AnyArray, keep: AnyArray, *terms: AnyArray) -> None:
+    """Add the squared distance from the epipolar lines to the normal equations, in place."""
     a, b, c, p, q = terms
-    lines = epipolar.lines(found[0], u.shape)
-    x, y, e = lines[..., 0], lines[..., 1], lines[..., 0] * u + lines[..., 1] * v + lines[..., 2]
-    k = np.where(keep, np.float32(LINE * min(1.0, (SHARP / max(found[1], 1e-9)) ** 2)), np.float32(0))
+    x, y, e = lines[..., 0], lines[..., 1], _off(lines, u, v)
+    k = np.where(keep, np.float32(LINE * trust), np.float32(0))
     a += k * x * x
     b += k * x * y
     c += k * y * y
     p -= k * x * e
     q -= k * y * e
+
+
+def _feet(lines: AnyArray, trust: float, u: AnyArray, v: AnyArray, keep: AnyArray) -> tuple[AnyArray, AnyArray]:
+    """Kept displacements moved to their lines as far as those are trusted; the others as they are."""
+    e = np.where(keep, np.float32(trust) * _off(lines, u, v), np.float32(0))
+    return u - e * lines[..., 0], v - e * lines[..., 1]
 
 
 @njit(cache=True, nogil=True)

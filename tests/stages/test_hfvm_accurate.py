@@ -242,6 +242,19 @@ def test_relief_restores_a_slanted_plane():
     np.testing.assert_array_equal(found_u[~keep], start[0][~keep])
 
 
+def test_matches_far_off_their_line_are_led_to_it():
+    left, right, u, v = slanted(noise=1.0)
+    keep = seen(u, v, right.shape, 8)
+    astray = np.zeros(u.shape, bool)
+    astray[30:40, 50:60] = astray[60:63, 80:83] = True
+    assert keep[astray].all()
+    start = u.astype(np.float32), np.where(astray, v + 2.0, v).astype(np.float32)
+    found_u, found_v = relief.fit(left, right, np.ones(right.shape, np.uint8), *start, keep, ACC)
+    # As far off as the others, whose rows the lines fitted to all of them hold.
+    assert np.abs(found_v - v)[astray].max() < 0.1
+    assert np.hypot(found_u - u, found_v - v)[astray].max() < 1.0
+
+
 def test_relief_keeps_a_step():
     left, right, u, occluded = stairs()
     keep = ~occluded & seen(u, 0 * u, left.shape, 4)
