@@ -74,7 +74,7 @@ class TerrainParams(Params):
     """One choice for all stages that make elevations."""
 
     preset: Literal["default", "accurate"] = Field(
-        "default",
+        default="default",
         description="accurate: preset accurate of the matcher, elevations from both directions of matching, and "
         "merged cells of an own standard deviation above 0.7 cells left undefined: errors are about a fifth smaller, "
         "matching takes many times as long",
