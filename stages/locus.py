@@ -262,6 +262,8 @@ def _run(params: LocusParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle
         "median_residual": _median(dem.residual),
         "median_elevation_std": _median(dem.elevation_std),
     }
+    if args["frame"] == "world" and "covariance" in inputs["trajectory"].arrays:
+        meta["pose_covariance"] = np.asarray(inputs["trajectory"]["covariance"])[int(args["row"])].ravel().tolist()
     return Bundle(vars(dem), meta)
 
 
@@ -311,7 +313,7 @@ def _array(name: str, unit: str, long_name: str) -> Array:
 
 STAGE = Stage(
     name="locus",
-    version=3,
+    version=4,
     summary="elevation model and ortho image of a basic pair",
     params=LocusParams,
     inputs=("disparity", "rig", "left", "right?", "back?", "level", "reference?", "trajectory?", "local?"),

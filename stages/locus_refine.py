@@ -28,6 +28,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from stages.locus_sweep import sweep
 from stages.locus_views import Views, look
 from stages.surface import Surface
 from stages.windows import window_sum
@@ -90,7 +91,7 @@ def refine(views: Views, surface: Surface, elevation: Float32, steps: int) -> tu
         across, down = np.zeros_like(z), np.zeros_like(z)
         _stiffness(z, scale, across, down)
         moved = z.copy()
-        _sweep(weight * slope * slope, weight * slope * rest, keep, across, down, z, moved)
+        sweep(weight * slope * slope, weight * slope * rest, keep, across, down, z, moved, SWEEPS, OVERSHOOT)
         reach = FARTHEST / np.where(keep, seen[3], np.inf)
         z = np.where(keep, np.clip(moved, start - reach, start + reach), start)
         seen = look(views, surface, z)
@@ -161,46 +162,6 @@ def _stiffness(z, scale, across, down):  # type: ignore[no-untyped-def]
                 d = s * (z[r - 1, c] - z[r, c] + z[r + 1, c] - z[r, c]) / BEND
                 if np.isfinite(d):
                     down[r, c] = STIFFNESS * s * s / (1.0 + d * d)
-
-
-@njit(cache=True, nogil=True)
-def _sweep(power, pull, keep, across, down, start, z):  # type: ignore[no-untyped-def]
-    """Gauss-Seidel sweeps on ``z`` in place; the images' terms are those at ``start``.
-
-    A cell takes part in three second differences of its row and three of its column: as their middle, where it counts
-    twice, and as either end. ``s``, ``t``: their weights, and weighted values they want.
-    """
-    rows, cols = z.shape
-    for _ in range(SWEEPS):
-        for r in range(rows):
-            for c in range(cols):
-                if not keep[r, c]:
-                    continue
-                s = t = 0.0
-                k = across[r, c]
-                if k > 0.0:
-                    s += 4.0 * k
-                    t += 2.0 * k * (z[r, c - 1] + z[r, c + 1])
-                k = down[r, c]
-                if k > 0.0:
-                    s += 4.0 * k
-                    t += 2.0 * k * (z[r - 1, c] + z[r + 1, c])
-                for side in (-1, 1):
-                    i, j = c + side, r + side
-                    if i > 0 and i < cols - 1:
-                        k = across[r, i]
-                        if k > 0.0:
-                            s += k
-                            t += k * (2.0 * z[r, i] - z[r, i + side])
-                    if j > 0 and j < rows - 1:
-                        k = down[j, c]
-                        if k > 0.0:
-                            s += k
-                            t += k * (2.0 * z[j, c] - z[j + side, c])
-                total = power[r, c] + s
-                if total > 0.0:
-                    wanted = (power[r, c] * start[r, c] + pull[r, c] + t) / total
-                    z[r, c] += OVERSHOOT * (wanted - z[r, c])
 
 
 @njit(cache=True, nogil=True)

@@ -160,10 +160,12 @@ def projections(rig: Rig, T_surface_left: RigidTransform) -> tuple[Floats, Float
 def _from_coarse(coarse: Floats, rows: NDArray[np.intp], cols: NDArray[np.intp]) -> tuple[Floats, Floats]:
     """Lowest and highest elevation of the 4 x 4 coarse cells around each cell; NaN where none has one."""
     padded = np.pad(coarse, 2, constant_values=np.nan)
-    low = np.full((rows.size, cols.size), np.nan)
+    shape = padded.shape[0] - 3, padded.shape[1] - 3
+    low = np.full(shape, np.nan)
     high = low.copy()
-    for i in range(1, 5):
-        for j in range(1, 5):
-            near = padded[np.ix_(rows // COARSE + i, cols // COARSE + j)]
+    for i in range(4):
+        for j in range(4):
+            near = padded[i : i + shape[0], j : j + shape[1]]
             low, high = np.fmin(low, near), np.fmax(high, near)
-    return low, high
+    at = np.ix_(rows // COARSE + 1, cols // COARSE + 1)
+    return low[at], high[at]

@@ -7,6 +7,17 @@ deviation and r its residual, a model's weight is
 
 Where three or more models meet, one re-weighting about their weighted median takes out the one that contradicts.
 
+The standard deviation of the result has three parts. Each model's own, independent of the others'; what the models
+have in common, since they saw the same light and the same shapes (``alike`` is the correlation of two models' errors);
+and that of the poses. With s_i the shares of the weights, p_i what the covariance of model i's pose says of the height
+there (dz = dC_z + dtheta_x (y - C_y) - dtheta_y (x - C_x)),
+
+    sigma^2 = (1 - alike) sum (s_i sigma_i)^2 + alike (sum s_i sigma_i)^2 + (sum s_i p_i)^2
+
+Poses of models that overlap have nearly all of their way in common, so that their errors neither average out over the
+models nor over the cells of one. ``relief_std`` is the first part alone (alike = 0): that of a cell against the ground
+around it, which is what slopes and steps are judged by.
+
 A tile is merged in strips of lines, of each model only the strip is read: what is in memory at once is bounded by
 :data:`STRIP_BYTES`, however many models meet and however large they are.
 """
@@ -25,12 +36,16 @@ from pydantic import Field
 from stages.declare import Array, Bundle, Inputs, Memory, Params, Stage
 from stages.errors import InputError
 from stages.exposure import STEP
+from stages.geometry import RigidTransform
 from stages.holes import close_holes
 from stages.lattice import Lattice
-from stages.merge_kernel import merge_cells
+from stages.merge_kernel import PLANES, merge_cells
 
 Float32 = NDArray[np.float32]
+Floats = NDArray[np.float64]
 
+ALIKE = 0.8
+"""Of the simulator's models at their true poses: then 70 % of the merged errors are below one standard deviation."""
 SHARPNESS = 8  # exponent of the ortho image's weights: the best image, but without a visible seam
 STRIP_BYTES = 1 << 26
 """Bytes of the models that are in memory at once: 64 MiB are all of a usual tile, and a part where dozens meet."""
@@ -42,6 +57,19 @@ class MergeParams(Params):
 
     residual_scale: float = Field(
         0.1, gt=0, description="pixels; residual that halves a model's weight: the disparity's error when it is good"
+    )
+    alike: float = Field(
+        ALIKE,
+        ge=0,
+        le=1,
+        description="correlation of the errors that two models have at one cell, beyond those of their poses; as found "
+        "with the simulator's true poses",
+    )
+    max_std_cells: float | None = Field(
+        None,
+        gt=0,
+        description="cells; merged cells whose standard deviation, the poses' part left out, is greater than so many "
+        "sides of a cell are left undefined; none: all are given",
     )
     max_hole: int = Field(
         0,
@@ -66,10 +94,33 @@ class MergeParams(Params):
 
 
 @dataclass(frozen=True)
+class Placed:
+    """Error of a model's pose: ``centre`` (2,) x and y of its camera, m; ``covariance`` (3, 3) of the height of the
+    camera, m, and of its rotations about x and y, rad, in the world frame.
+    """
+
+    centre: Floats
+    covariance: Floats
+
+    @staticmethod
+    def of(meta: Mapping[str, Any]) -> Placed:
+        """As the model's facts say; exact where they do not."""
+        if meta.get("pose_covariance") is None:
+            return EXACT
+        full = np.array(meta["pose_covariance"], dtype=np.float64).reshape(6, 6)
+        at = RigidTransform.from_matrix(meta["T_frame_left"]).translation
+        return Placed(at[:2], full[2:5, 2:5])
+
+
+EXACT = Placed(np.zeros(2), np.zeros((3, 3)))
+
+
+@dataclass(frozen=True)
 class Layer:
     """One pair's model on ``lattice``: arrays (rows, cols), NaN undefined, those of :class:`stages.locus_solve.Dem`.
 
-    ``gain``: factor of its grey values that levels its exposure with that of its neighbours.
+    ``gain``: factor of its grey values that levels its exposure with that of its neighbours; ``pose``: how exactly it
+    is placed.
     """
 
     pair: int
@@ -79,6 +130,7 @@ class Layer:
     residual: Float32
     ortho: Float32
     gain: float = 1.0
+    pose: Placed = EXACT
 
     def part(self, name: str, window: tuple[slice, slice]) -> Float32:
         """Part of an array."""
@@ -94,15 +146,17 @@ class _Stored:
     lattice: Lattice
     part: Callable[[str, tuple[slice, slice]], Any]
     gain: float
+    pose: Placed
 
 
 @dataclass(frozen=True)
 class Merged:
     """Result (rows, cols) on the tile.
 
-    ``elevation``, ``elevation_std`` (of the weighted mean, as the models say), ``spread`` (standard deviation of the
-    models about it; 0 for one model) in metres, NaN undefined; ``count`` of models; ``source`` pair of the greatest
-    weight, -1 none; ``ortho`` grey value; ``filled`` 1 where a small hole was closed (count 0, source -1).
+    ``elevation``, ``elevation_std`` and ``relief_std`` (of the weighted mean, see the module), ``spread`` (standard
+    deviation of the models about it; 0 for one model) in metres, NaN undefined; ``count`` of models; ``source`` pair
+    of the greatest weight, -1 none; ``ortho`` grey value; ``filled`` 1 where a small hole was closed (count 0, source
+    -1).
     """
 
     elevation: Float32
@@ -112,6 +166,7 @@ class Merged:
     source: NDArray[np.int16]
     ortho: Float32
     filled: NDArray[np.uint8]
+    relief_std: Float32
 
 
 def merge(layers: Sequence[Layer | _Stored], tile: Lattice, params: MergeParams) -> Merged:
@@ -153,10 +208,15 @@ def _merge_strip(
         return
     stacks = [_stacked(present, strip, name) for name in MAPS]
     gain = np.array([layer.gain for layer in present])
-    floats = np.empty((4, *strip.shape), dtype=np.float32)
+    centre, pose = (np.array([getattr(layer.pose, name) for layer in present]) for name in ("centre", "covariance"))
+    floats = np.empty((PLANES, *strip.shape), dtype=np.float32)
     best = np.empty(strip.shape, dtype=np.int64)
-    merge_cells(*stacks, gain, params.residual_scale, SHARPNESS, floats, out.count[rows], best)
-    for name, values in zip(("elevation", "elevation_std", "spread", "ortho"), floats, strict=True):
+    worst = math.inf if params.max_std_cells is None else params.max_std_cells * strip.cell
+    merge_cells(
+        *stacks, gain, centre, pose, strip.xs(), strip.ys(), params.residual_scale, SHARPNESS, params.alike, worst,
+        floats, out.count[rows], best,
+    )  # fmt: skip
+    for name, values in zip(("elevation", "elevation_std", "spread", "ortho", "relief_std"), floats, strict=True):
         getattr(out, name)[rows] = values
     pairs = np.array([*(layer.pair for layer in present), -1])
     out.source[rows] = pairs[best]
@@ -174,8 +234,10 @@ def _stacked(layers: Sequence[Layer | _Stored], strip: Lattice, name: str) -> Fl
 def _close(merged: Merged, params: MergeParams) -> None:
     """Close the small holes in place; their grey value stays undefined, nobody took it."""
     gap, window = float(params.max_hole), params.hole_window
-    z, sigma, filled = close_holes(merged.elevation, merged.elevation_std, gap, window, params.hole_known, judged=True)
-    merged.elevation[...], merged.elevation_std[...], merged.filled[...] = z, sigma, filled
+    stds = merged.elevation_std, merged.relief_std
+    closed = [close_holes(merged.elevation, std, gap, window, params.hole_known, judged=True) for std in stds]
+    for std, (z, sigma, filled) in zip(stds, closed, strict=True):
+        merged.elevation[...], std[...], merged.filled[...] = z, sigma, filled
 
 
 def _empty(tile: Lattice) -> Merged:
@@ -188,6 +250,7 @@ def _empty(tile: Lattice) -> Merged:
         source=np.full(tile.shape, -1, np.int16),
         ortho=nan.copy(),
         filled=np.zeros(tile.shape, np.uint8),
+        relief_std=nan.copy(),
     )
 
 
@@ -198,7 +261,7 @@ def _run(params: MergeParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle
     for dem in inputs["dems"]:
         pair = int(dem.meta["pair"])
         gain = math.exp(STEP * int(steps.get(str(pair), 0)))
-        layers.append(_Stored(pair, Lattice.from_dict(dem.meta["lattice"]), dem.part, gain))
+        layers.append(_Stored(pair, Lattice.from_dict(dem.meta["lattice"]), dem.part, gain, Placed.of(dem.meta)))
     merged = merge(layers, tile, params)
     meta = {
         "lattice": tile.to_dict(),
@@ -216,17 +279,18 @@ def _array(name: str, dtype: str, unit: str, long_name: str, nodata: str) -> Arr
 
 STAGE = Stage(
     name="merge",
-    version=2,
+    version=3,
     summary="merged elevation model and ortho image of one tile of the world",
     params=MergeParams,
     inputs=("dems*",),
     outputs=(
         _array("elevation", "float32", "m", "elevation of the cell centre", "nan"),
-        _array("elevation_std", "float32", "m", "standard deviation of the elevation, from the models' own", "nan"),
+        _array("elevation_std", "float32", "m", "standard deviation of the elevation, poses included", "nan"),
         _array("spread", "float32", "m", "standard deviation of the merged models about the elevation", "nan"),
         _array("count", "uint16", "1", "number of merged models", "0"),
         _array("source", "int16", "1", "pair of the greatest weight", "-1"),
         _array("ortho", "float32", "grey", "grey value, 0..255", "nan"),
+        _array("relief_std", "float32", "m", "standard deviation of the elevation against that around", "nan"),
         _array("filled", "uint8", "1", "1 where a small hole was closed by interpolation", ""),
     ),
     requires=("numpy", "numba"),

@@ -11,19 +11,26 @@ import math
 import numpy as np
 from numba import njit
 
+PLANES = 5
+"""Maps that :func:`merge_cells` fills."""
 BICUBIC = 4.685  # Tukey's constant: 95 % efficiency where the errors are normal
 CONSISTENT = 1.4826  # median absolute deviation to standard deviation, of normal errors
 
 
 @njit(cache=True, nogil=True)
-def merge_cells(z, sigma, residual, ortho, gain, scale, sharpness, out, count, best):  # type: ignore[no-untyped-def]
+def merge_cells(  # type: ignore[no-untyped-def]
+    z, sigma, residual, ortho, gain, centre, pose, x, y, scale, sharpness, alike, worst, out, count, best
+):
     """Merge models (n, rows, cols) float32, NaN undefined; weights and equations are those of :mod:`stages.merge`.
 
-    ``gain`` (n,) of the grey values. Fills ``out`` (4, rows, cols): elevation, its standard deviation, spread and
-    grey value; ``count`` of models that count; ``best`` index of the one of greatest weight, -1 none.
+    ``gain`` (n,) of the grey values; ``centre`` (n, 2) and ``pose`` (n, 3, 3): where each camera stands, m, and the
+    covariance of its height and its rotations about x and y; ``x`` (cols,), ``y`` (rows,) of the cells, m; ``alike``:
+    correlation of two models' errors; ``worst``: greatest standard deviation but for the poses, m. Fills ``out`` (5,
+    rows, cols): elevation, its standard deviation, spread, grey value and the standard deviation of unrelated errors
+    alone; ``count`` of models that count; ``best`` index of the one of greatest weight, -1 none.
     """
     n, rows, cols = z.shape
-    h, s, w, d = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
+    h, s, w, d, p = np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n)
     which, order = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64)
     for r in range(rows):
         for c in range(cols):
@@ -36,16 +43,46 @@ def merge_cells(z, sigma, residual, ortho, gain, scale, sharpness, out, count, b
                 weight = 1.0 / (step * step * (1.0 + misfit * misfit))
                 if weight > 0.0 and weight < math.inf:
                     h[m], s[m], w[m], which[m] = z[k, r, c], step, weight, k
+                    p[m] = _swing(pose[k], x[c] - centre[k, 0], y[r] - centre[k, 1])
                     m += 1
-            count[r, c] = 0
-            best[r, c] = -1
             if m == 0:
-                for i in range(4):
-                    out[i, r, c] = math.nan
+                _forget(r, c, out, count, best)
                 continue
             if m >= 3:
                 _agree(h, s, w, d, order, m)
-            _average(h, s, w, which, m, ortho, gain, sharpness, r, c, out, count, best)
+            _average(h, s, w, which, m, ortho, gain, sharpness, alike, r, c, out, count, best)
+            if out[1, r, c] > worst:
+                _forget(r, c, out, count, best)
+            else:
+                placed = _placed(w, p, m)
+                out[1, r, c] = math.sqrt(out[1, r, c] ** 2 + placed * placed)
+
+
+@njit(cache=True, nogil=True)
+def _forget(r, c, out, count, best):  # type: ignore[no-untyped-def]
+    """Nothing is known of a cell."""
+    count[r, c] = 0
+    best[r, c] = -1
+    for i in range(PLANES):
+        out[i, r, c] = math.nan
+
+
+@njit(cache=True, nogil=True)
+def _placed(w, p, m):  # type: ignore[no-untyped-def]
+    """Standard deviation by the poses: they drift together, so that their errors do not average out."""
+    total = 0.0
+    found = 0.0
+    for i in range(m):
+        total += w[i]
+        found += w[i] * p[i]
+    return found / total
+
+
+@njit(cache=True, nogil=True)
+def _swing(cov, dx, dy):  # type: ignore[no-untyped-def]
+    """Standard deviation of the elevation at dx, dy from the camera by ``cov`` of (height, rotation about x, y)."""
+    tilt = dy * dy * cov[1, 1] + dx * dx * cov[2, 2] - 2.0 * dx * dy * cov[1, 2]
+    return math.sqrt(max(0.0, cov[0, 0] + tilt + 2.0 * (dy * cov[0, 1] - dx * cov[0, 2])))
 
 
 @njit(cache=True, nogil=True)
@@ -81,7 +118,9 @@ def _agree(h, s, w, d, order, m):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _average(h, s, w, which, m, ortho, gain, sharpness, r, c, out, count, best):  # type: ignore[no-untyped-def]
+def _average(  # type: ignore[no-untyped-def]
+    h, s, w, which, m, ortho, gain, sharpness, alike, r, c, out, count, best
+):
     total = 0.0
     top = 0.0
     used = 0
@@ -95,6 +134,7 @@ def _average(h, s, w, which, m, ortho, gain, sharpness, r, c, out, count, best):
     count[r, c] = used
     mean = 0.0
     variance = 0.0
+    together = 0.0
     grey = 0.0
     greys = 0.0
     for i in range(m):
@@ -102,6 +142,7 @@ def _average(h, s, w, which, m, ortho, gain, sharpness, r, c, out, count, best):
             share = w[i] / total
             mean += share * h[i]
             variance += (share * s[i]) ** 2
+            together += share * s[i]
             value = ortho[which[i], r, c]
             if math.isfinite(value):
                 sharp = (w[i] / top) ** sharpness
@@ -112,6 +153,7 @@ def _average(h, s, w, which, m, ortho, gain, sharpness, r, c, out, count, best):
         if w[i] > 0.0:
             spread += w[i] / total * (h[i] - mean) ** 2
     out[0, r, c] = mean
-    out[1, r, c] = math.sqrt(variance)
+    out[1, r, c] = math.sqrt(variance + alike * (together * together - variance))
     out[2, r, c] = math.sqrt(spread)
     out[3, r, c] = grey / greys if greys > 0.0 else math.nan
+    out[4, r, c] = math.sqrt(variance)

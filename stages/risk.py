@@ -150,7 +150,8 @@ def _run(params: RiskParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     lattices = [Lattice.from_dict(dem.meta["lattice"]) for dem in dems]
     whole = union(lattices)
     z = mosaic([(part, dem["elevation"]) for part, dem in zip(lattices, dems, strict=True)], np.nan, whole)
-    stds = [(part, d["elevation_std"]) for part, d in zip(lattices, dems, strict=True) if "elevation_std" in d.arrays]
+    names = [next((n for n in ("relief_std", "elevation_std") if n in d.arrays), None) for d in dems]
+    stds = [(part, d[name]) for part, d, name in zip(lattices, dems, names, strict=True) if name is not None]
     s = mosaic(stds, np.nan, whole) if stds else np.zeros(whole.shape, dtype=np.float32)
     vehicle = Vehicle.model_validate(args["vehicle"]) if "vehicle" in args else DEFAULT_VEHICLE
     arrays = risk_map(z.astype(np.float32), s.astype(np.float32), whole.cell, vehicle, params)

@@ -45,15 +45,31 @@ def _max_down(a: Floats32, n: int) -> Floats32:
 
 def window_sum(a: NDArray, n: int) -> Floats:
     """Sum (row, col), float64, over the window."""
-    return _sum_down(_sum_down(np.asarray(a, dtype=np.float64), n).T, n).T
+    values = np.ascontiguousarray(a, dtype=np.float64)
+    out = np.empty(values.shape)
+    _sums(values, n // 2, out)
+    return out
 
 
-def _sum_down(a: Floats, n: int) -> Floats:
-    rows = a.shape[0]
-    prefix = np.zeros((rows + 1, a.shape[1]))
-    np.cumsum(a, axis=0, out=prefix[1:])
-    index = np.arange(rows)
-    return np.asarray(prefix[np.minimum(index + n // 2 + 1, rows)] - prefix[np.maximum(index - n // 2, 0)])
+@njit(cache=True, nogil=True)
+def _sums(a, half, out):  # type: ignore[no-untyped-def]
+    """Differences of prefix sums down the columns, then of theirs along the rows."""
+    rows, cols = a.shape
+    prefix = np.zeros((rows + 1, cols))
+    for r in range(rows):
+        for c in range(cols):
+            prefix[r + 1, c] = prefix[r, c] + a[r, c]
+    line, along = np.empty(cols), np.zeros(cols + 1)
+    for r in range(rows):
+        low, high = prefix[max(r - half, 0)], prefix[min(r + half + 1, rows)]
+        for c in range(cols):
+            line[c] = high[c] - low[c]
+        total = 0.0
+        for c in range(cols):
+            total += line[c]
+            along[c + 1] = total
+        for c in range(cols):
+            out[r, c] = along[min(c + half + 1, cols)] - along[max(c - half, 0)]
 
 
 def window_count(mask: Mask, n: int) -> NDArray[np.int32]:

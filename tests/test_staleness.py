@@ -101,6 +101,7 @@ STALE: dict[str, set[str]] = {
     "path": {"path/local", "path/world", "path_check"},
     "crosscheck": COUNTERCHECK,
     "agreement": {"agreement"},
+    "terrain": LOCAL | MISSION,
     "tiling": TILES | MATCHED,  # as far as a plan can tell: that the same comes out is seen once it has
     "vehicle": RISK,
     # of a drive, which this chain is not
@@ -108,6 +109,7 @@ STALE: dict[str, set[str]] = {
 }
 EXCEPTIONS: dict[str, set[str]] = {
     "locus.both": {"hfvm/back"} | LOCAL | MISSION,  # the other direction is matched as well
+    "terrain.preset": {"hfvm/back"} | LOCAL | MISSION,  # the matcher's preset is given here, and stays
     "refine.enabled": REFINED - {"refine"},  # without it there is less to compute
     "resect.landmarks": POSES - {"refine"},  # refined are landmarks of the disparity alone
     "crosscheck.enabled": set(),  # without it there is less to compute

@@ -34,10 +34,14 @@ class Model:
 
 @dataclass(frozen=True)
 class Method:
-    """``run(scene, max_backmatch, bounded)``; ``bounded``: with the limit on the geometry's error, one cell."""
+    """``run(scene, max_backmatch, bounded)``; ``bounded``: with the limit on the geometry's error, one cell.
+
+    ``what`` it is, in a line.
+    """
 
     name: str
     run: Callable[[Scene, float, bool], Model]
+    what: str
 
 
 def locus(scene: Scene, max_backmatch: float, bounded: bool, *, images: bool = True) -> Model:
@@ -162,16 +166,24 @@ def cars(scene: Scene, max_backmatch: float, bounded: bool, sigma_cells: float =
 def available() -> list[Method]:
     """Locus first, then triangulation with each way of gridding."""
     found = [
-        Method("Locus", locus),
-        Method("Locus, disparity alone", locus_alone),
-        Method("median in the cell", median_in_cell),
-        Method("mesh", mesh),
+        Method("Locus", locus, "as a run does it: refined by both images (with true disparities: not refined)"),
+        Method("Locus, disparity alone", locus_alone, "the same without the images: knows what the others know"),
+        Method(
+            "median in the cell",
+            median_in_cell,
+            "triangulate and grid: each pixel becomes a point, a cell has the median of the points in it",
+        ),
+        Method(
+            "mesh", mesh, "triangulate and connect neighbouring pixels: the same bilinear surface that Locus samples"
+        ),
     ]
     if importlib.util.find_spec("rasterize") is None:
         print("CARS' rasteriser is left out: not installed (pip install cars-rasterize)")
         return found
     return [
         *found,
-        Method("CARS, sigma 0.5 cells", cars),
-        Method("CARS, sigma 1 cell", lambda s, b, g: cars(s, b, g, 1.0)),
+        Method(
+            "CARS, sigma 0.5 cells", cars, "triangulate, then CNES's rasteriser: Gaussian mean of the points around"
+        ),
+        Method("CARS, sigma 1 cell", lambda s, b, g: cars(s, b, g, 1.0), "the same, smoother"),
     ]

@@ -265,8 +265,8 @@ def _quality(scene: Scene) -> Block | None:
         panels.append(figures.scalar_map(seen, world.extent, "models per cell", alt, length=False))
     caption = (
         "Shaded relief (light from the upper left, tinted by elevation); standard deviation of the elevation as "
-        "predicted from the disparity's error, the rig's geometry and how well both images agree; number of basic "
-        "pairs that saw a cell. "
+        "predicted from the disparity's error, the rig's geometry, how well both images agree and the poses' "
+        "covariances; number of basic pairs that saw a cell. "
         "Undefined: light grey."
     )
     return Block("Terrain", "Terrain, its standard deviation and its coverage", caption, tuple(panels))

@@ -313,7 +313,8 @@ def _terrain(scene: Scene) -> dict[str, Metric]:
     sigma = world.get("elevation_std")
     if sigma is not None and np.isfinite(sigma).any():
         how = (
-            "predicted from the disparity's error, the rig's geometry and how well both images agree: median over cells"
+            "predicted from the disparity's error, the rig's geometry, how well both images agree and the poses' "
+            "covariances: median over cells"
         )
         value = float(np.nanmedian(sigma))
         found["elevation_sigma"] = _metric("Standard deviation of elevation", value, "m", how, of_map)

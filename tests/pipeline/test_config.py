@@ -17,6 +17,20 @@ def test_layers_win_in_order() -> None:
     assert built.select.stride == 5
 
 
+def test_one_setting_makes_terrain_accurate_and_what_is_given_beside_it_wins() -> None:
+    plain = config.build()
+    assert (plain.hfvm.preset, plain.locus.both, plain.merge.max_std_cells) == ("default", False, None)
+    built = config.build({"locus": {"cell_size": 0.01}}, config.parse_assignments(["terrain.preset=accurate"]))
+    assert (built.hfvm.preset, built.locus.both, built.merge.max_std_cells) == ("accurate", True, 0.7)
+    assert built.locus.cell_size == 0.01
+    assert built.hfvm.relief_steps == config.build({"hfvm": {"preset": "accurate"}}).hfvm.relief_steps
+    built = config.build({"terrain": {"preset": "accurate"}}, config.parse_assignments(["locus.both=false"]))
+    assert (built.hfvm.preset, built.locus.both) == ("accurate", False)
+    assert config.build().locus.both is False, "the preset itself is not changed by what is laid over it"
+    with pytest.raises(ConfigError, match=r"terrain\.preset = 'best' is not permitted"):
+        config.build({"terrain": {"preset": "best"}})
+
+
 def test_unknown_key_names_the_nearest() -> None:
     with pytest.raises(ConfigError, match=r"unknown key 'select\.strid'.*did you mean 'select\.stride'"):
         config.build(config.parse_assignments(["select.strid=2"]))

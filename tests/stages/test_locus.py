@@ -351,6 +351,8 @@ def test_stage_in_both_frames() -> None:
     )
     check_outputs(locus.STAGE, world)
     json.dumps([local.meta, world.meta], allow_nan=False)
+    assert "pose_covariance" not in world.meta
+    assert "pose_covariance" not in local.meta
     # A quarter turn maps cells on cells: the same surface, computed anew, not resampled.
     rows, cols = np.nonzero(np.isfinite(local["elevation"]))
     xyz = turn.apply(np.column_stack([lattice.xy()[rows, cols], local["elevation"][rows, cols]]))

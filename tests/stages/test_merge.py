@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from stages import merge as merge_stage
 from stages.declare import Bundle, check_outputs
 from stages.errors import InputError
 from stages.lattice import Lattice, mosaic
-from stages.merge import Layer, Merged, MergeParams, merge
+from stages.merge import EXACT, Layer, Merged, MergeParams, Placed, merge
 
 TILE = Lattice.at(0, 0, 0.1, 4, 5)
 PARAMS = MergeParams()
@@ -50,7 +51,9 @@ def test_two_models_by_hand() -> None:
     """Weights 1/0.1^2 = 100 and 1/0.1^2 / (1 + (0.2/0.1)^2) = 20: mean of 1.0 and 1.6 is 1.1."""
     merged = merge([layer(0, 1.0), layer(4, 1.6, residual=0.2, ortho=200.0)], TILE, PARAMS)
     np.testing.assert_allclose(merged.elevation, 1.1, rtol=1e-6)
-    np.testing.assert_allclose(merged.elevation_std, 0.1 * np.hypot(100, 20) / 120, rtol=1e-6)
+    np.testing.assert_allclose(merged.relief_std, 0.1 * np.hypot(100, 20) / 120, rtol=1e-6)
+    # shares 5/6 and 1/6 of models with equal sigma: fully alike their mean has that sigma
+    np.testing.assert_allclose(merged.elevation_std, 0.1 * np.sqrt(0.2 * (25 + 1) / 36 + 0.8), rtol=1e-6)
     np.testing.assert_allclose(merged.spread, np.sqrt((100 * 0.1**2 + 20 * 0.5**2) / 120), rtol=1e-6)
     assert (merged.count == 2).all()
     assert (merged.source == 0).all()
@@ -63,6 +66,7 @@ def test_one_model_passes_through() -> None:
     assert np.array_equal(merged.elevation, one.elevation, equal_nan=True)
     seen = np.isfinite(one.elevation)
     np.testing.assert_allclose(merged.elevation_std[seen], one.elevation_std[seen], rtol=1e-6)
+    np.testing.assert_allclose(merged.relief_std[seen], one.elevation_std[seen], rtol=1e-6)
     np.testing.assert_allclose(merged.ortho[seen], one.ortho[seen], rtol=1e-6)
     assert (merged.spread[seen] == 0).all()
     assert np.array_equal(merged.count, seen.astype(np.uint16))
@@ -122,7 +126,61 @@ def test_std_of_normal_models_is_calibrated() -> None:
         std = rng.uniform(0.05, 0.2, tile.shape)
         layers.append(layer(k, rng.normal(0.0, std), std, lattice=tile))
     merged = merge(layers, tile, PARAMS)
-    assert 0.9 < (merged.elevation / merged.elevation_std).std() < 1.15
+    assert 0.9 < (merged.elevation / merged.relief_std).std() < 1.15
+    independent = merge(layers, tile, MergeParams(alike=0.0))
+    assert independent.elevation_std.tobytes() == merged.relief_std.tobytes()
+
+
+def test_std_of_models_that_share_a_part_of_their_error_is_calibrated() -> None:
+    """Errors with a correlation of one half from model to model, all of one standard deviation."""
+    tile = Lattice.at(0, 0, 0.1, 100, 100)
+    rng = np.random.default_rng(4)
+    common = rng.normal(0.0, 0.1, tile.shape)
+    layers = [layer(k, np.sqrt(0.5) * (common + rng.normal(0.0, 0.1, tile.shape)), lattice=tile) for k in range(2)]
+    merged = merge(layers, tile, MergeParams(alike=0.5))
+    assert 0.97 < (merged.elevation / merged.elevation_std).std() < 1.03
+    assert (merged.elevation / merged.relief_std).std() > 1.15
+
+
+def test_errors_of_poses_do_not_average_out() -> None:
+    """Two models whose poses err together: simulated heights and tilts against the stated standard deviation."""
+    rng = np.random.default_rng(5)
+    root = np.array([[0.01, 0.0, 0.0], [0.004, 0.02, 0.0], [-0.003, 0.01, 0.03]])
+    pose = Placed(np.array([0.1, -0.7]), root @ root.T)
+    layers = [replace(layer(k, 1.0, 1e-5), pose=pose) for k in range(2)]
+    merged = merge(layers, TILE, PARAMS)
+    xy = TILE.xy() - pose.centre
+    errors = rng.normal(size=(20000, 3)) @ root.T
+    found = errors[:, 0, None, None] + errors[:, 1, None, None] * xy[..., 1] - errors[:, 2, None, None] * xy[..., 0]
+    np.testing.assert_allclose(merged.elevation_std, found.std(axis=0), rtol=0.03)
+    np.testing.assert_allclose(merged.relief_std, 1e-5 / np.sqrt(2), rtol=1e-6)
+    assert (
+        merged.elevation.tobytes() == merge([layer(k, 1.0, 1e-5) for k in range(2)], TILE, PARAMS).elevation.tobytes()
+    )
+
+
+def test_a_rotation_moves_the_ground_as_its_covariance_says() -> None:
+    """A rotation about x lifts what lies ahead (y), one about y lowers what lies to the right (x)."""
+    meta = {"pose_covariance": np.diag([9, 9, 0, 1e-4, 0, 9]).ravel().tolist()}
+    meta |= {"T_frame_left": np.hstack([np.eye(3), [[0.2], [-0.1], [0.5]]]).ravel().tolist()}
+    ahead = merge([replace(layer(0, 0.0, 1e-6), pose=Placed.of(meta))], TILE, PARAMS).elevation_std
+    np.testing.assert_allclose(ahead, np.abs(TILE.xy()[..., 1] + 0.1) * 1e-2, atol=1e-6)
+    assert Placed.of({"T_frame_left": [0.0] * 12}) is EXACT
+
+
+def test_unsure_cells_are_left_undefined_on_request() -> None:
+    one, other = layer(0, 1.0, 0.05), layer(4, 1.0, 0.05)
+    one.elevation_std[0], other.elevation[:2] = 0.2, np.nan
+    one.elevation_std[1] = 0.06
+    merged = merge([one, other], TILE, MergeParams(max_std_cells=0.7))  # 0.07 m
+    assert np.isnan(merged.elevation[0]).all()
+    assert np.isnan(merged.elevation_std[0]).all()
+    assert (merged.count[0] == 0).all()
+    assert (merged.source[0] == -1).all()
+    assert np.isfinite(merged.elevation[1:]).all()
+    drifting = Placed(np.zeros(2), np.diag([1.0, 0.0, 0.0]))
+    merged = merge([replace(one, pose=drifting)], TILE, MergeParams(max_std_cells=0.7))
+    assert np.isfinite(merged.elevation[1:]).all(), "poses' part does not count"
 
 
 def test_unusable_values_have_no_weight() -> None:

@@ -1,0 +1,91 @@
+"""Gauss-Seidel sweeps of the refined elevations, in reading order to the bit, a diagonal of cells at a time.
+
+A cell takes part in second differences of its own row and column only, so it depends on the cells to its left and above
+as they are after this sweep, and on those to its right and below as they were before. All cells of one diagonal
+(row + column) are therefore independent of each other. The arrays are sheared so that a diagonal is a line in memory:
+its cells are then computed side by side, and the next sweep follows three diagonals behind, while they are still near.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+BORDER = 2
+"""Diagonals and rows of nothing around: a second difference reaches two cells far."""
+BEHIND = 3
+"""Diagonals that a sweep keeps behind the one before it."""
+
+
+@njit(cache=True, nogil=True)
+def sweep(  # type: ignore[no-untyped-def]
+    power, pull, keep, across, down, start, z, sweeps, overshoot
+):
+    """Minimise ``power (z - start)^2 - 2 pull z`` and the weighted squares of the second differences, ``z`` in place.
+
+    Parameters
+    ----------
+    power, pull : (rows, cols) the images' terms at ``start``.
+    keep : (rows, cols) cells that move.
+    across, down : (rows, cols) weights of the second differences at a cell, 0 at borders and beside unknown cells.
+    start, z : (rows, cols) NaN unknown.
+    sweeps, overshoot : how many, and the factor on each step.
+    """
+    rows, cols = z.shape
+    shape = rows + cols - 1 + 2 * BORDER, rows + 2 * BORDER
+    at, by_row, by_column = np.zeros(shape), np.zeros(shape), np.zeros(shape)
+    wanted, total = np.zeros(shape), np.zeros(shape)
+    for r in range(rows):
+        for c in range(cols):
+            t, i = r + c + BORDER, r + BORDER
+            by_row[t, i], by_column[t, i] = across[r, c], down[r, c]
+            if z[r, c] == z[r, c]:
+                at[t, i] = z[r, c]
+            if keep[r, c]:
+                wanted[t, i] = power[r, c] * start[r, c] + pull[r, c]
+    for r in range(rows):
+        for c in range(cols):
+            if keep[r, c]:
+                t, i = r + c + BORDER, r + BORDER
+                s = 4.0 * by_row[t, i] + 4.0 * by_column[t, i]
+                s = (s + by_row[t - 1, i]) + by_column[t - 1, i - 1]
+                s = (s + by_row[t + 1, i]) + by_column[t + 1, i + 1]
+                total[t, i] = power[r, c] + s
+    sums = np.empty(rows)
+    for turn in range(rows + cols - 1 + BEHIND * (sweeps - 1)):
+        for k in range(sweeps):
+            d = turn - BEHIND * k
+            if d < 0 or d >= rows + cols - 1:
+                continue
+            low, high = max(0, d - cols + 1), min(rows, d + 1)
+            _diagonal(at, by_row, by_column, wanted, total, d + BORDER, low + BORDER, high - low, overshoot, sums)
+    for r in range(rows):
+        for c in range(cols):
+            if keep[r, c]:
+                z[r, c] = at[r + c + BORDER, r + BORDER]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _diagonal(at, by_row, by_column, wanted, total, t, i, n, overshoot, sums):  # type: ignore[no-untyped-def]
+    """Cells ``i`` to ``i + n`` of diagonal ``t``; ``sums`` is room for what the second differences want of each."""
+    j = i + n
+    left, right, above, below = at[t - 1, i:j], at[t + 1, i:j], at[t - 1, i - 1 : j - 1], at[t + 1, i + 1 : j + 1]
+    a, b = by_row[t, i:j], by_column[t, i:j]
+    for m in range(n):
+        sums[m] = 2.0 * a[m] * (left[m] + right[m]) + 2.0 * b[m] * (above[m] + below[m])
+    a, b = by_row[t - 1, i:j], by_column[t - 1, i - 1 : j - 1]
+    before, over = at[t - 2, i:j], at[t - 2, i - 2 : j - 2]
+    for m in range(n):
+        sums[m] = (sums[m] + a[m] * (2.0 * left[m] - before[m])) + b[m] * (2.0 * above[m] - over[m])
+    a, b = by_row[t + 1, i:j], by_column[t + 1, i + 1 : j + 1]
+    behind, under = at[t + 2, i:j], at[t + 2, i + 2 : j + 2]
+    for m in range(n):
+        sums[m] = (sums[m] + a[m] * (2.0 * right[m] - behind[m])) + b[m] * (2.0 * below[m] - under[m])
+    own, goal, all_ = at[t, i:j], wanted[t, i:j], total[t, i:j]
+    for m in range(n):
+        moved = own[m] + overshoot * ((goal[m] + sums[m]) / all_[m] - own[m])
+        own[m] = moved if all_[m] > 0.0 else own[m]
