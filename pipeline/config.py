@@ -164,8 +164,18 @@ def build(*layers: Mapping[str, Any]) -> Params:
     nested: dict[str, Any] = {}
     for layer in layers:
         merge(nested, layer)
+    _navigate(nested)
     built: Params = validate(model(), nested, (), DATASET_SECTIONS)
     return built
+
+
+def _navigate(nested: dict[str, Any]) -> None:
+    """Preset ``navigation`` matches fast, too: what the trajectory needs of a disparity, half the resolution gives."""
+    select = nested.get("select")
+    if isinstance(select, Mapping) and select.get("preset") == "navigation":
+        hfvm = nested.setdefault("hfvm", {})
+        if isinstance(hfvm, dict):
+            hfvm.setdefault("preset", "fast")
 
 
 def validate(kind: type[Params], values: Mapping[str, Any], prefix: tuple[str, ...], also: Iterable[str] = ()) -> Any:

@@ -57,6 +57,8 @@ BLOCKS = 6
 """Blocks along either side of the image whose means show how far errors of neighbours go together."""
 
 ITERATIONS = 30
+INNER = 10
+"""Rounds for the smooth error's size between two passes over the matches."""
 LINEAR = 1e-3
 """Radians: corrections nearer than this share their derivatives; what is left out is below a thousandth of a pixel."""
 CONVERGED = 1e-3
@@ -162,13 +164,28 @@ def _adjust(
         scales = [p.noise for p in parts]
         normal = np.sum([p.normal for p in parts], axis=0)
         pull = np.sum([p.pull for p in parts], axis=0)
-        total = normal + prior(smooth)
-        last, x, variance = x, np.linalg.solve(total, pull), np.diag(np.linalg.inv(total))
+        last = x
+        x, variance, smooth = _maximised(normal, pull, prior, smooth, INNER if estimate else 0)
         if bool(np.all(np.abs(x - last)[:RIG] < CONVERGED * np.sqrt(variance[:RIG]))):
             break
-        if estimate:
-            smooth = max(LEAST_SMOOTH, float(np.sqrt(np.mean(x[SMOOTH] ** 2 + variance[SMOOTH]))))
     return Fit(x, normal, pull, smooth, tuple(scales), tuple(p.weights for p in parts))
+
+
+def _maximised(
+    normal: Floats, pull: Floats, prior: Callable[[float], Floats], smooth: float, rounds: int
+) -> tuple[Floats, Floats, float]:
+    """Unknowns, their variances, and the smooth error's size by so many rounds of expectation maximisation.
+
+    The rounds need the normal equations alone, which took a pass over all matches.
+    """
+    for _ in range(rounds + 1):
+        covariance = np.linalg.inv(normal + prior(smooth))
+        x, variance = covariance @ pull, np.diag(covariance)
+        size = max(LEAST_SMOOTH, float(np.sqrt(np.mean(x[SMOOTH] ** 2 + variance[SMOOTH]))))
+        if rounds == 0 or abs(size - smooth) <= CONVERGED * smooth:
+            break
+        smooth = size
+    return x, variance, smooth
 
 
 def precision(free: Sequence[bool], beliefs: Beliefs, smooth: float, *, rival: bool) -> Floats:

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from stages import refine_kernel as kernel
 from stages.declare import Array, Bundle, Inputs, Params, Stage
 from stages.errors import ConfigError
 from stages.geometry import Camera, Rig, RigidTransform
@@ -112,24 +113,15 @@ def _camera_errors(x: Floats, moves: Floats, camera: Camera, pixels: Floats) -> 
     return error, P, np.einsum("...ij,...j->...i", P, moves)
 
 
-def _rows(views: Views, state: State, bias: float, sigma: float) -> list[tuple[Floats, Floats, Floats, Floats, Bools]]:
-    """Whitened errors (f, n, 2), Jacobians by pose (f, n, 2, 6), depth and bias (f, n, 2), use: tracks, then stereo."""
-    X = views.position + (state.depth + bias)[:, None] * views.along
-    x = np.einsum("fij,nj->fni", state.R, X) + state.t[:, None]
-    moves = np.einsum("fij,nj->fni", state.R, views.along)
-    error, P, g = _camera_errors(x, moves, views.camera, views.pixels)
-    pose = np.concatenate([P, np.einsum("fnij,fnjk->fnik", P, -cross_matrix(x))], -1)
-    found = [(error / sigma, pose / sigma, g / sigma, g / sigma, views.seen & np.isfinite(error).all(-1))]
+def _stereo_rows(views: Views, state: State, bias: float) -> tuple[Floats, Floats, Floats, Floats, Bools]:
+    """Disparities (along their epipolar lines) of the last frame's pair: only its right minus its left image counts.
+
+    Whitened errors (n,), derivatives by the last pose (n, 6), by depth and by bias (n,), use.
+    """
     use = np.isfinite(views.right_sigma)
-    if use.any():
-        found.append(_stereo_rows(views, bias, x[-1], moves[-1], use))
-    return found
-
-
-def _stereo_rows(
-    views: Views, bias: float, x: Floats, moves: Floats, use: Bools
-) -> tuple[Floats, Floats, Floats, Floats, Bools]:
-    """Disparities (along their epipolar lines) of the last frame's pair: only its right minus its left image counts."""
+    R = state.R[-1]
+    x = (views.position + (state.depth + bias)[:, None] * views.along) @ R.T + state.t[-1]
+    moves = views.along @ R.T
     T, pixels = views.rig.T_right_left, views.pixels[-1]
     left, P, g = _camera_errors(x, moves, views.camera, pixels)
     right, Q, h = _camera_errors(x @ T.rotation.T + T.translation, moves @ T.rotation.T, views.rig.right, views.right)
@@ -141,22 +133,28 @@ def _stereo_rows(
     by_pose = np.concatenate([change, np.einsum("nij,njk->nik", change, -cross_matrix(x))], -1)
     error = ((right - left) * unit).sum(-1) - bias
     by_depth = ((h - g) * unit).sum(-1)
-    none = np.zeros_like(error)
-    good = use & np.isfinite(error)
-    rows = (
-        np.stack([error / s, none], -1),
-        np.stack([np.einsum("ni,nij->nj", unit, by_pose) / s[:, None], np.zeros((len(s), 6))], 1),
-        np.stack([by_depth / s, none], -1),
-        np.stack([(by_depth - 1.0) / s, none], -1),
-    )
-    return rows[0][None], rows[1][None], rows[2][None], rows[3][None], good[None]
+    by_pose = np.einsum("ni,nij->nj", unit, by_pose) / s[:, None]
+    good = use & np.isfinite(error) & np.isfinite(by_pose).all(-1)
+    rows = (np.where(good, a, 0.0) for a in (error / s, by_depth / s, (by_depth - 1.0) / s))
+    error, by_depth, by_bias = rows
+    return error, np.where(good[:, None], by_pose, 0.0), by_depth, by_bias, good
+
+
+def _tracks(views: Views, state: State, bias: float, sigma: float) -> tuple[Any, ...]:
+    """What the compiled loops want of the tracks."""
+    camera = views.camera
+    cam = (float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy))
+    given = (views.position, views.along, views.pixels, views.seen, cam, float(sigma), HUBER)
+    return (*given, state.R, state.t, state.depth + bias)
 
 
 def cost_of(views: Views, state: State, bias: float, sigma: float) -> float:
     """Huber's cost of a segment with its depths' priors (that of the bias is the window's)."""
     total = 0.5 * float(((state.depth / views.sigma) ** 2).sum())
-    for error, _, _, _, use in _rows(views, state, bias, sigma):
-        norm = np.sqrt((error**2).sum(-1))[use]
+    total += float(kernel.cost(*_tracks(views, state, bias, sigma)))
+    if np.isfinite(views.right_sigma).any():
+        error, *_, use = _stereo_rows(views, state, bias)
+        norm = np.abs(error[use])
         total += float(np.where(norm <= HUBER, 0.5 * norm**2, HUBER * norm - 0.5 * HUBER**2).sum())
     return total
 
@@ -166,26 +164,17 @@ def _normal(views: Views, state: State, bias: float, sigma: float) -> tuple[Floa
     m, n = len(state.R), len(state.depth)
     A, B, d = np.zeros((6 * m + 1, 6 * m + 1)), np.zeros((6 * m + 1, n)), views.sigma**-2.0
     ga, gd = np.zeros(6 * m + 1), state.depth * d
-    for k, (error, pose, depth, common, use) in enumerate(_rows(views, state, bias, sigma)):
-        norm = np.sqrt((np.where(use[..., None], error, 0.0) ** 2).sum(-1))
-        w = np.where(use, HUBER / np.maximum(norm, HUBER), 0.0)
-        error, pose, depth, common = (
-            np.where(use.reshape(*use.shape, *[1] * (a.ndim - 2)), a, 0.0) for a in (error, pose, depth, common)
-        )
-        for f in range(len(error)):
-            at = slice(6 * (m - 1), 6 * m) if k else slice(6 * f, 6 * f + 6)
-            J, c, g, e = pose[f], common[f], depth[f], error[f]
-            wJ, wc = J * w[f][:, None, None], c * w[f][:, None]
-            A[at, at] += np.einsum("nia,nib->ab", wJ, J)
-            A[at, -1] += np.einsum("nia,ni->a", wJ, c)
-            A[-1, -1] += (wc * c).sum()
-            B[at] += np.einsum("nia,ni->an", wJ, g)
-            B[-1] += (wc * g).sum(-1)
-            ga[at] += np.einsum("nia,ni->a", wJ, e)
-            ga[-1] += (wc * e).sum()
-            d = d + w[f] * (g**2).sum(-1)
-            gd = gd + w[f] * (g * e).sum(-1)
-    A[-1, :-1] = A[:-1, -1]
+    kernel.normal(*_tracks(views, state, bias, sigma), A, B, d, ga, gd)
+    if np.isfinite(views.right_sigma).any():
+        error, pose, g, c, use = _stereo_rows(views, state, bias)
+        w = np.where(use, HUBER / np.maximum(np.abs(error), HUBER), 0.0)
+        J = np.zeros((n, 6 * m + 1))
+        J[:, 6 * (m - 1) : 6 * m], J[:, -1] = pose, c
+        weighted = J * w[:, None]
+        A += weighted.T @ J
+        B += weighted.T * g
+        ga += weighted.T @ error
+        d, gd = d + w * g**2, gd + w * g * error
     return A, B, d, ga, gd
 
 
@@ -259,20 +248,19 @@ def views_of(
     if not len(which):
         return None
     points = np.asarray(track["points"], dtype=np.float64)[which]
-    known, pixels = landmarks.take(which), np.swapaxes(points[:, frames], 0, 1)
+    known, pixels = landmarks.take(which), np.ascontiguousarray(np.swapaxes(points[:, frames], 0, 1))
     right, sigma = np.full((len(which), 2), np.nan), np.full(len(which), np.nan)
     if after is not None and params.stereo and frames[-1] == len(poses) - 1:
         right, sigma = _stereo(pixels[-1], inlier[which, frames[-1]], after, params)
     T = [RigidTransform.from_matrix(poses[j]).inverse() for j in frames]
     state = State(np.array([p.rotation for p in T]), np.array([p.translation for p in T]), np.zeros(len(which)))
-    seen = inlier[which][:, frames].T
+    seen = np.ascontiguousarray(inlier[which][:, frames].T)
     views = Views(
         known.position, known.per_pixel, np.maximum(known.sigma, 1e-3), pixels, seen, right, sigma, rig.left, rig
     )
     if np.isfinite(sigma).any():  # what disagrees altogether lies on another surface
-        error, _, _, _, use = _rows(views, state, 0.0, params.pixel_sigma)[1]
-        bad = ~(use[0] & (np.sqrt((error[0] ** 2).sum(-1)) < AGREES))
-        views.right_sigma[bad] = np.nan
+        error, *_, use = _stereo_rows(views, state, 0.0)
+        views.right_sigma[~(use & (np.abs(error) < AGREES))] = np.nan
     return views, state, frames
 
 

@@ -52,14 +52,14 @@ def look(image: NDArray[Any], valid: NDArray[np.uint8]) -> Look:
     """
     level = grey(image)
     usable = (valid != 0) & np.isfinite(level)
-    values = level if usable.all() else level[usable]
+    whole = bool(usable.all())
+    values = level if whole else level[usable]
     if not values.size:
         return Look(math.nan, 0.0, 0.0, 0.0, math.nan)
-    level = level if usable.all() else np.where(usable, level, values.mean())
+    level = level if whole else np.where(usable, level, values.mean())
     once, twice = (cv2.GaussianBlur(level, (0, 0), sigma) for sigma in (1.0, 2.0))
-    inner = usable.astype(np.uint8)
-    inner = inner if usable.all() else cv2.erode(inner, np.ones((13, 13), np.uint8))
-    count = math.sqrt(max(int(np.count_nonzero(inner)), 1))
+    inner = None if whole else cv2.erode(usable.astype(np.uint8), np.ones((13, 13), np.uint8))
+    count = math.sqrt(max(level.size if inner is None else int(np.count_nonzero(inner)), 1))
     coarse, fine = (cv2.norm(a, b, cv2.NORM_L2, inner) / count for a, b in ((once, twice), (level, once)))
     deviation = float(values.std())
     return Look(

@@ -17,6 +17,19 @@ def test_layers_win_in_order() -> None:
     assert built.select.stride == 5
 
 
+def test_navigation_matches_fast_unless_told_otherwise(tmp_path: Path) -> None:
+    assert config.build({}).hfvm.preset == "default"
+    built = config.build(config.parse_assignments(["select.preset=navigation"]))
+    assert (built.hfvm.preset, built.hfvm.finest, built.select.overlap) == ("fast", 1, 0.6)
+    for given in ("hfvm.preset=default", "hfvm.preset=accurate"):
+        kept = config.build(config.parse_assignments(["select.preset=navigation", given]))
+        assert kept.hfvm == config.build(config.parse_assignments([given])).hfvm
+    assert config.build(config.parse_assignments(["select.preset=navigation", "hfvm.finest=0"])).hfvm.finest == 0
+    path = tmp_path / "config.toml"
+    path.write_text(config.to_toml(built))
+    assert config.build(config.read_toml(path)) == built
+
+
 def test_unknown_key_names_the_nearest() -> None:
     with pytest.raises(ConfigError, match=r"unknown key 'select\.strid'.*did you mean 'select\.stride'"):
         config.build(config.parse_assignments(["select.strid=2"]))
