@@ -2,9 +2,10 @@
 
 Without arguments: the street ``kitti06_51`` where RILLE_DATA has it, and the short mockup. Any sequence with truth can
 be named. All get the same decoded images, one thread and the given calibration. Rille runs the stages that a trajectory
-needs (its tracking is all but those of the basic pairs), as for terrain, and with the preset ``navigation``; OpenCV's odometry goes from frame to frame: semi-global depth, corners, Lucas-Kanade there and back,
-PnP; COLMAP is the project's cross-check. Whoever needs rectified or undistorted images pays for making them; reading
-files is left out for all.
+needs (its tracking is all but those of the basic pairs), as for terrain, and with the preset ``navigation``; OpenCV's
+odometry goes from frame to frame: semi-global depth, corners, Lucas-Kanade there and back, PnP; COLMAP is the project's
+cross-check. Whoever needs rectified or undistorted images pays for making them; reading files is left out for all.
+The second table holds Rille's figures against what it is held to, by the other methods of the same run.
 
 Times are of the least of the rounds, which alternate; the first round, which compiles, is not counted. Milliseconds a
 frame are all work divided by all frames, so the matching of basic pairs is shared out. COLMAP, by far the slowest, has
@@ -123,8 +124,8 @@ def table(name: str, frames: int, found: list[dict[str, Any]]) -> None:
         print(
             f"| {f['method']} | {f['lost']:.0f} | {' | '.join(shown)} | {f['processor'] / found[0]['processor']:.2f} |"
         )
-    print("\nratio: of processor time a frame to that of the first row; tracking and matching are processor time, too\n")
-    print("| line | figure | limit | |\n|---|---|---|---|")
+    print("\nratio: of processor time a frame to that of the first row; tracking and matching are processor time, too")
+    print("\n| line | figure | limit | |\n|---|---|---|---|")
     for line in lines(name, found):
         print(f"| {line.what} | {line.figure:.3g} | {line.limit:.3g} | {'kept' if line.kept else 'not kept'} |")
 

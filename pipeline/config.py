@@ -169,13 +169,24 @@ def build(*layers: Mapping[str, Any]) -> Params:
     return built
 
 
+NAVIGATION: Mapping[str, Mapping[str, Any]] = {
+    "hfvm": {"preset": "fast"},
+    "motion": {"level": 3},
+    "track": {"points": 250},
+    "orientation": {"samples": 800},
+}
+"""What ``select.preset = "navigation"`` sets in other sections, where nothing is given there."""
+
+
 def _navigate(nested: dict[str, Any]) -> None:
-    """Preset ``navigation`` matches fast, too: what the trajectory needs of a disparity, half the resolution gives."""
+    """What a trajectory needs of disparities and displacements, half the resolution of each gives."""
     select = nested.get("select")
-    if isinstance(select, Mapping) and select.get("preset") == "navigation":
-        hfvm = nested.setdefault("hfvm", {})
-        if isinstance(hfvm, dict):
-            hfvm.setdefault("preset", "fast")
+    if not isinstance(select, Mapping) or select.get("preset") != "navigation":
+        return
+    for section, values in NAVIGATION.items():
+        given = nested.setdefault(section, {})
+        if isinstance(given, dict):
+            nested[section] = {**values, **given}
 
 
 def validate(kind: type[Params], values: Mapping[str, Any], prefix: tuple[str, ...], also: Iterable[str] = ()) -> Any:

@@ -23,10 +23,13 @@ from stages.pyramid import Pyramid, filled
 Floats = NDArray[np.float64]
 
 SUM_RADIUS = 3
+SIDE = 2 * SUM_RADIUS + 1
 """Pixels: distances are summed over 7 x 7."""
 
 BACKMATCH = 1.0
 """Pixels: greatest distance between a point and where matching there and back leads (4.3.3)."""
+BACK_RADIUS = 3
+"""Pixels searched on the way back, at most: thrice what is allowed; fewer refuse too little."""
 
 DEFAULT_WEIGHTS = HfvmParams().weights
 
@@ -85,7 +88,8 @@ def find_points(
     good = np.isfinite(there_cost) & (there_cost <= threshold)
     good &= _on_valid(a_valid, points[who]) & _on_valid(b_valid, there)
     who, there, there_cost = who[good], there[good], there_cost[good]
-    back, _ = _search(b_image, a_image, there, points[who], np.asarray(np.linalg.inv(shape[who])), radius, weights)
+    inverse, reach = np.asarray(np.linalg.inv(shape[who])), min(radius, BACK_RADIUS)
+    back, _ = _search(b_image, a_image, there, points[who], inverse, reach, weights)
     good = np.hypot(*(back - points[who]).T) <= BACKMATCH
     who = who[good]
     found[who], cost[who], ok[who] = there[good], there_cost[good], True
@@ -126,15 +130,15 @@ def _search_all(a, b, points, whole, shape, radius, scale, offset, cost):  # typ
     side = 2 * (SUM_RADIUS + features.RADIUS) + 1
     wide = side + 2 * (radius + 1)
     template, area = np.empty((side, side), np.float32), np.empty((wide, wide), np.float32)
-    n, m = side - 2 * features.RADIUS, wide - 2 * features.RADIUS
-    words, searched = np.empty((n, n), np.uint64), np.empty((m, m), np.uint64)
+    m = wide - 2 * features.RADIUS
+    words, searched = np.empty((SIDE, SIDE), np.uint64), np.empty((m, m), np.uint64)
     deviation = np.empty((m, m), np.float32)
     for k in range(len(points)):
         if not _cut(a, points[k, 0], points[k, 1], shape[k], template) or not _copy(b, whole[k], area):
             continue
         features.pack_rows(template, 0, scale, words, deviation)
         features.pack_rows(area, 0, scale, searched, deviation)
-        cost[k] = _best(words, searched, radius + 1, offset[k])
+        cost[k] = _best(words.ravel(), searched.ravel(), radius + 1, offset[k])
 
 
 @njit(cache=True, nogil=True)
@@ -173,15 +177,19 @@ def _copy(image, point, out):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _sum_at(words, area, u, v, most):  # type: ignore[no-untyped-def]
-    """Summed distance at a place of the area; given up, and greater than ``most``, after the row that exceeds it."""
+def _sum_at(words, area, wide, u, v, most):  # type: ignore[no-untyped-def]
+    """Summed distance at a place of the area; given up, and greater than ``most``, after the row that exceeds it.
+
+    Both in reading order, ``area`` in rows of ``wide``. Unsigned indices need no check for counting from the end.
+    """
     total = np.int64(0)
-    for j in range(words.shape[0]):
-        mine, theirs = words[j], area[v + j, u : u + words.shape[1]]
-        for i in range(words.shape[1]):
-            total += distance(mine[i], theirs[i])
+    k, at = np.uint64(0), np.uint64(v * wide + u)
+    for _ in range(SIDE):
+        for i in range(SIDE):
+            total += distance(words[k + np.uint64(i)], area[at + np.uint64(i)])
         if total > most:
             break
+        k, at = k + np.uint64(SIDE), at + np.uint64(wide)
     return total
 
 
@@ -191,20 +199,22 @@ def _best(words, area, middle, offset):  # type: ignore[no-untyped-def]
 
     ``middle`` places to every side of the prediction; ``offset`` (2,) from there, with linear sub-pixel parts.
     """
-    everything = np.int64(2**62)
-    most, bu, bv = everything, middle, middle
+    wide, all_of_it = 2 * middle + SIDE, np.int64(2**62)
+    most, bu, bv = all_of_it, middle, middle
     # From the prediction outwards, so that most places are given up early.
     for ring in range(middle + 1):
         for v in range(middle - ring, middle + ring + 1):
             step = 1 if abs(v - middle) == ring else max(2 * ring, 1)
             for u in range(middle - ring, middle + ring + 1, step):
-                total = _sum_at(words, area, u, v, most)
+                total = _sum_at(words, area, wide, u, v, most)
                 if total < most or (total == most and (v < bv or (v == bv and u < bu))):
                     most, bu, bv = total, u, v
     if min(bu, bv) < 1 or max(bu, bv) > 2 * middle - 1:
         return -1.0
-    left, right = _sum_at(words, area, bu - 1, bv, everything), _sum_at(words, area, bu + 1, bv, everything)
-    above, below = _sum_at(words, area, bu, bv - 1, everything), _sum_at(words, area, bu, bv + 1, everything)
-    offset[0] = bu - middle + linear(left, most, right)
+    before = _sum_at(words, area, wide, bu - 1, bv, all_of_it)
+    behind = _sum_at(words, area, wide, bu + 1, bv, all_of_it)
+    above = _sum_at(words, area, wide, bu, bv - 1, all_of_it)
+    below = _sum_at(words, area, wide, bu, bv + 1, all_of_it)
+    offset[0] = bu - middle + linear(before, most, behind)
     offset[1] = bv - middle + linear(above, most, below)
-    return most / words.size
+    return most / (SIDE * SIDE)

@@ -6,6 +6,12 @@ its disparity alone. Where the segment ends at another basic pair, that pair's d
 second measurement of their depths. What all disparities share is one unknown of a window of segments, since one rig
 made them.
 
+Another error that they share shows over the whole sequence only. A right image whose rows lie too low may have been
+turned (pitch), or have its principal point there; epipolar lines hardly tell the two apart, and a rig that is repaired
+takes the turn. The wrong choice tilts disparities: by ``f x y`` a radian, nothing along both axes of the image and most
+in its corners, which bends the path to one side. Tracks see depth once more, by parallax, so all segments together
+measure the tilt; where it is beyond doubt, all are adjusted once more without it.
+
 Least squares with Huber's weights, by Levenberg-Marquardt. A landmark has one unknown (along its ray), so that its
 elimination (Schur's complement) is a division, and the system has the size of the poses (Triggs, McLauchlan, Hartley,
 Fitzgibbon 2000, doi:10.1007/3-540-44480-7_21). The result is never worse than its input by the same cost: where no step
@@ -14,8 +20,9 @@ lowers it, the input is returned.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -61,6 +68,15 @@ class RefineParams(Params):
     bias_sigma: float = Field(
         default=0.1, ge=0, description="pixels; prior of the error that all disparities share (toe-in of the rig)"
     )
+    tilt_sigma_deg: float = Field(
+        default=0.3,
+        ge=0,
+        description="degrees; prior of the pitch that may stand for a principal point's row: 0.5 % of the focal length,"
+        " as in rig.prior_principal; 0: none is looked for",
+    )
+    tilt_significance: float = Field(
+        default=4.0, ge=0, description="standard deviations, by the scatter of segments, from which on it is undone"
+    )
 
 
 @dataclass(frozen=True)
@@ -69,7 +85,8 @@ class Views:
 
     ``position``, ``along`` (n, 3) of the landmarks in the local frame, and how they move with their disparity, m and
     m/pixel; ``sigma`` (n,) of it, pixels. ``pixels`` (frame, n, 2) of the frames behind the key, ``seen`` (frame, n)
-    whether they count. ``right`` (n, 2) of the last frame, pixels, ``right_sigma`` (n,); NaN none.
+    whether they count. ``right`` (n, 2) of the last frame, pixels, ``right_sigma`` (n,); NaN none. ``tilt`` (n,) pixels
+    of disparity a radian of pitch that stands for a principal point's row.
     """
 
     position: Floats
@@ -81,6 +98,11 @@ class Views:
     right_sigma: Floats
     camera: Camera
     rig: Rig
+    tilt: Floats
+
+    def without_tilt(self, tilt: float) -> Views:
+        """With landmarks where they are if the disparities are tilted by so many radians."""
+        return replace(self, position=self.position + (tilt * self.tilt)[:, None] * self.along)
 
 
 @dataclass(frozen=True)
@@ -227,6 +249,45 @@ def _step(
     return float(common), steps
 
 
+def common_tilt(adjusted: Sequence[tuple[Views, State, float]], params: RefineParams) -> tuple[float, float]:
+    """Tilt that all disparities share and its standard deviation, radians, by adjusted segments and their biases.
+
+    To first order about the adjusted states. The segments' own values scatter by more than their errors, for their
+    landmarks are few and near each other; the scatter decides. Infinite deviation: fewer than three segments.
+    """
+    parts = np.array([_tilt_of(*one, params) for one in adjusted]).reshape(-1, 2)
+    parts = parts[parts[:, 0] > 0]
+    if len(parts) < 3:
+        return 0.0, float("inf")
+    information, value = parts[:, 0], parts[:, 1] / parts[:, 0]
+    for _ in range(5):  # of a segment that is far off, no more than of one at two deviations
+        tilt = float((information * value).sum() / information.sum())
+        off = np.abs(value - tilt) * np.sqrt(information)
+        spread = max(1.0, 1.4826 * float(np.median(off)))
+        information = parts[:, 0] * np.minimum(1.0, 2.0 * spread / np.maximum(off, 1e-12))
+    total = float(information.sum()) / spread**2
+    prior = math.radians(params.tilt_sigma_deg) ** -2.0
+    return tilt * total / (total + prior), (total + prior) ** -0.5
+
+
+def _tilt_of(views: Views, state: State, bias: float, params: RefineParams) -> tuple[float, float]:
+    """Information and pull of the tilt by one segment, its poses, depths and bias free."""
+    A, B, d, ga, gd = _normal(views, state, bias, params.pixel_sigma)
+    prior = 1.0 / max(params.bias_sigma, 1e-4) ** 2
+    A[-1, -1] += prior
+    ga[-1] += prior * bias
+    held, g = views.sigma**-2.0, views.tilt
+    by_depth = g * (d - held)
+    column = np.append(B @ g, g @ by_depth)
+    A = np.column_stack([np.vstack([A, column[:-1]]), column])
+    B = np.vstack([B, by_depth])
+    S = A - (B / d) @ B.T
+    r = -(np.append(ga, g @ (gd - held * state.depth)) - B @ (gd / d))
+    solved = np.linalg.solve(S[:-1, :-1], np.column_stack([S[:-1, -1], r[:-1]]))
+    information, pull = S[-1, -1] - S[-1, :-1] @ solved[:, 0], r[-1] - S[-1, :-1] @ solved[:, 1]
+    return float(information), float(pull)
+
+
 def views_of(
     track: Bundle, resection: Bundle, landmarks: Landmarks, rig: Rig, after: Bundle | None, params: RefineParams
 ) -> Segment | None:
@@ -255,13 +316,19 @@ def views_of(
     T = [RigidTransform.from_matrix(poses[j]).inverse() for j in frames]
     state = State(np.array([p.rotation for p in T]), np.array([p.translation for p in T]), np.zeros(len(which)))
     seen = np.ascontiguousarray(inlier[which][:, frames].T)
-    views = Views(
-        known.position, known.per_pixel, np.maximum(known.sigma, 1e-3), pixels, seen, right, sigma, rig.left, rig
-    )
+    camera, tilt = rig.left, _tilt_pattern(known.position, RigidTransform.from_matrix(poses[0]), rig)
+    held = np.maximum(known.sigma, 1e-3)
+    views = Views(known.position, known.per_pixel, held, pixels, seen, right, sigma, camera, rig, tilt)
     if np.isfinite(sigma).any():  # what disagrees altogether lies on another surface
         error, *_, use = _stereo_rows(views, state, 0.0)
         views.right_sigma[~(use & (np.abs(error) < AGREES))] = np.nan
     return views, state, frames
+
+
+def _tilt_pattern(position: Floats, T_local_key: RigidTransform, rig: Rig) -> Floats:
+    """Pixels (n,) along its line that a landmark's right image moves for a radian across it: ``f x y``."""
+    x, y, z = rig.T_right_left.apply(T_local_key.inverse().apply(position)).T
+    return np.asarray(np.where(z > 0, rig.right.fx * x * y / np.where(z > 0, z, 1.0) ** 2, 0.0))
 
 
 def _stereo(pixels: Floats, use: Bools, after: Bundle, params: RefineParams) -> tuple[Floats, Floats]:
@@ -290,19 +357,38 @@ def _run(params: RefineParams, args: Mapping[str, Any], inputs: Inputs) -> Bundl
         landmarks = coordinates(points, {"disparity": disparity[frames[0]]}, rig, T, resect)
         found.append(views_of(track, resection, landmarks, rig, disparity.get(frames[-1]), params))
         poses.append(np.array(resection["poses"], dtype=np.float64))
+    facts, states = _adjusted(found, poses, params)
+    tilt, sigma = 0.0, float("inf")
+    if params.tilt_sigma_deg > 0:
+        tilt, sigma = common_tilt([(found[k][0], *state) for k, state in states.items()], params)
+    undone = abs(tilt) > params.tilt_significance * sigma
+    if undone:
+        again = [one and (one[0].without_tilt(tilt), states[k][0], one[2]) for k, one in enumerate(found)]
+        facts, _ = _adjusted(again, poses, params)
+    same = sum(f["cost_after"] >= f["cost_before"] for f in facts)
+    words = [f"refinement lowers the residuals of {same} of {len(facts)} windows no further: they stay as resected"]
+    meta: dict[str, Any] = {"frames": [len(p) for p in poses], "adjustments": facts, "notes": words if same else []}
+    if math.isfinite(sigma):
+        meta["tilt"] = {"deg": math.degrees(tilt), "sigma_deg": math.degrees(sigma), "undone": undone}
+    return Bundle({"poses": np.concatenate(poses)}, meta)
+
+
+def _adjusted(
+    found: Sequence[Segment | None], poses: list[Floats], params: RefineParams
+) -> tuple[list[dict[str, float]], dict[int, tuple[State, float]]]:
+    """Windows adjusted, ``poses`` written to; facts of the windows, and state and bias of each segment."""
     facts: list[dict[str, float]] = []
+    last: dict[int, tuple[State, float]] = {}
     for group, kept in _windows([k for k, one in enumerate(found) if one is not None], params.window):
         parts = [one for k in group if (one := found[k]) is not None]
         states, bias, before, after = adjust([(views, state) for views, state, _ in parts], params)
         for k, (_, _, rows), state in zip(group, parts, states, strict=True):
             if k in kept:
+                last[k] = state, bias
                 for row, R, t in zip(rows, state.R, state.t, strict=True):
                     poses[k][row] = RigidTransform(R, t).inverse().matrix34
         facts.append({"bias_px": bias, "cost_before": before, "cost_after": after})
-    same = sum(f["cost_after"] >= f["cost_before"] for f in facts)
-    words = [f"refinement lowers the residuals of {same} of {len(facts)} windows no further: they stay as resected"]
-    meta = {"frames": [len(p) for p in poses], "adjustments": facts, "notes": words if same else []}
-    return Bundle({"poses": np.concatenate(poses)}, meta)
+    return facts, last
 
 
 def _windows(segments: list[int], window: int) -> list[tuple[list[int], list[int]]]:

@@ -79,10 +79,11 @@ def glance(image: NDArray[Any], valid: NDArray[np.uint8]) -> dict[str, Any]:
     found = [look(image[r : r + STRIP], valid[r : r + STRIP]) for r in first]
     sharp = [f.sharpness for f in found if math.isfinite(f.sharpness)]
     rough = [f.detail for f in found]
-    values = grey(np.ascontiguousarray(image[::2, ::2]))[valid[::2, ::2] != 0]
+    some, mask = grey(np.ascontiguousarray(image[::2, ::2])), (valid[::2, ::2] != 0).astype(np.uint8)
+    (mean,), (deviation,) = (a.ravel() for a in cv2.meanStdDev(some, mask=mask))
     return {
-        "mean": float(values.mean()) if values.size else None,
-        "deviation": float(values.std()) if values.size else 0.0,
+        "mean": float(mean) if mask.any() else None,
+        "deviation": float(deviation),
         "sharpness": float(np.median(sharp)) if sharp else None,
         "detail": float(np.median(rough)),
         "digest": hashlib.sha256(np.ascontiguousarray(image).tobytes()).hexdigest(),

@@ -107,6 +107,7 @@ STALE: dict[str, set[str]] = {
     **{key: set() for key in ("drive", "global_fix", "leg", "pad", "reflex", "safety")},
 }
 EXCEPTIONS: dict[str, set[str]] = {
+    "select.preset": {"orientation"} | RIG | MOVED,  # navigation sets parameters of other stages, too
     "locus.both": {"hfvm/back"} | LOCAL | MISSION,  # the other direction is matched as well
     "refine.enabled": REFINED - {"refine"},  # without it there is less to compute
     "resect.landmarks": POSES - {"refine"},  # refined are landmarks of the disparity alone

@@ -1,4 +1,4 @@
-"""What navigation is held to: limits of time and accuracy, most of them relative to the other methods of the same run."""
+"""What navigation is held to: limits of time and accuracy, most of them relative to other methods of the same run."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Line:
 
 
 def lines(sequence: str, found: Sequence[Mapping[str, Any]]) -> list[Line]:
-    """The limits of each of Rille's methods, by the figures (:func:`judge`, :func:`times`) of all methods of one run."""
+    """The limits of each of Rille's methods, by the figures (``judge``, ``times``) of all methods of one run."""
     by_method = {str(f["method"]): f for f in found}
     opencv, colmap = by_method.get("OpenCV odometry"), by_method.get("COLMAP")
     out = []

@@ -9,7 +9,18 @@ from stages.declare import Bundle, check_outputs
 from stages.errors import ConfigError
 from stages.geometry import Camera, Rig, RigidTransform, rotation_exp
 from stages.landmarks import landmarks_from_disparity
-from stages.refine import STAGE, RefineParams, State, Views, _normal, adjust, cost_of, views_of
+from stages.refine import (
+    STAGE,
+    RefineParams,
+    State,
+    Views,
+    _normal,
+    _tilt_pattern,
+    adjust,
+    common_tilt,
+    cost_of,
+    views_of,
+)
 from stages.resect import ResectParams
 
 CAMERA = Camera(500.0, 500.0, 299.5, 199.5, 600, 400)
@@ -47,6 +58,7 @@ def scene(seed, n=150, frames=4, bias=0.0, noise=0.2, stereo=True):
         sigma,
         CAMERA,
         RIG,
+        500.0 * np.prod(CAMERA.rays(key)[:, :2], axis=1),
     )
     start = [P @ RigidTransform(rotation_exp(1e-4 * rng.standard_normal(3)), 3e-3 * rng.standard_normal(3)) for P in T]
     return views, State(np.array([P.rotation for P in start]), np.array([P.translation for P in start]), np.zeros(n)), T
@@ -114,6 +126,47 @@ def test_the_cost_never_rises_and_an_optimum_stays():
     (again,), _, before, after = adjust([(views, state)], RefineParams(iterations=1, stereo=True))
     assert after <= before
     np.testing.assert_allclose(again.t, state.t, atol=1e-4)
+
+
+def tilted(seed, tilt, frames=4):
+    """Views whose landmarks lie where disparities put them that are tilted by so many radians, adjusted once."""
+    views, start, T = scene(seed, n=120, frames=frames, stereo=False)
+    views = replace(views, sigma=np.full(120, 0.2)).without_tilt(-tilt)
+    (state,), bias, _, _ = adjust([(views, start)], PARAMS)
+    return views, state, bias, T
+
+
+def test_a_tilt_of_all_disparities_is_found_by_many_segments_and_undone():
+    parts = [tilted(60 + k, 0.004) for k in range(12)]
+    tilt, sigma = common_tilt([part[:3] for part in parts], PARAMS)
+    assert tilt == pytest.approx(0.004, abs=4 * sigma)
+    assert sigma < 0.001
+    errors = []
+    for views, state, _, T in parts:
+        (again,), *_ = adjust([(views.without_tilt(tilt), state)], PARAMS)
+        errors.append([error_of(state, T), error_of(again, T)])
+    before, after = np.sqrt(np.mean(np.square(errors), axis=0))
+    assert after < 0.9 * before
+
+
+def test_a_tilt_that_is_not_there_is_not_believed():
+    parts = [tilted(90 + k, 0.0)[:3] for k in range(12)]
+    tilt, sigma = common_tilt(parts, PARAMS)
+    assert abs(tilt) < PARAMS.tilt_significance * sigma
+    # Two segments say nothing of their scatter.
+    assert common_tilt(parts[:2], PARAMS) == (0.0, float("inf"))
+
+
+def test_the_pattern_of_a_tilt_is_what_a_turned_camera_and_a_moved_row_make():
+    X = np.random.default_rng(3).uniform([-2.0, -1.0, 3.0], [2.0, 1.0, 6.0], (50, 3))
+    theta = 1e-5
+    turned = CAMERA.project(RIG.T_right_left.apply(X) @ rotation_exp([theta, 0.0, 0.0]).T)
+    straight = CAMERA.project(RIG.T_right_left.apply(X))
+    pattern = _tilt_pattern(X, RigidTransform.identity(), RIG)
+    np.testing.assert_allclose(np.abs(turned - straight)[:, 0] / theta, np.abs(pattern), rtol=1e-3, atol=1e-6)
+    # The whole of it is one sign: a tilt of either sign fits.
+    sign = np.sign((turned - straight)[:, 0] * pattern)
+    assert np.all(sign[np.abs(pattern) > 1.0] == sign[np.abs(pattern) > 1.0][0])
 
 
 def bundles(tracks_of_last=True):
