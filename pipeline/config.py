@@ -172,8 +172,8 @@ def build(*layers: Mapping[str, Any]) -> Params:
 NAVIGATION: Mapping[str, Mapping[str, Any]] = {
     "hfvm": {"preset": "fast"},
     "motion": {"level": 3},
-    "track": {"points": 250},
-    "orientation": {"samples": 800},
+    "track": {"points": 200},
+    "orientation": {"samples": 600},
 }
 """What ``select.preset = "navigation"`` sets in other sections, where nothing is given there."""
 

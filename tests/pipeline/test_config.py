@@ -21,7 +21,7 @@ def test_navigation_matches_fast_unless_told_otherwise(tmp_path: Path) -> None:
     assert config.build({}).hfvm.preset == "default"
     built = config.build(config.parse_assignments(["select.preset=navigation"]))
     assert (built.hfvm.preset, built.hfvm.finest, built.select.overlap) == ("fast", 1, 0.6)
-    assert (built.motion.level, built.track.points) == (3, 250)
+    assert (built.motion.level, built.track.points) == (3, 200)
     assert config.build(config.parse_assignments(["select.preset=navigation", "track.points=300"])).track.points == 300
     for given in ("hfvm.preset=default", "hfvm.preset=accurate"):
         kept = config.build(config.parse_assignments(["select.preset=navigation", given]))
