@@ -34,7 +34,7 @@ from stages.declare import Array, Bundle, Inputs, Params, Stage
 from stages.errors import ConfigError
 from stages.geometry import Camera, Rig, RigidTransform
 from stages.landmarks import Landmarks, matches_at, relief
-from stages.reprojection import HUBER, cross_matrix, exponential
+from stages.reprojection import HUBER, Observations, Poses, cross_matrix, exponential, norms
 from stages.resect import ResectParams, coordinates
 
 Floats = NDArray[np.float64]
@@ -348,15 +348,16 @@ def _run(params: RefineParams, args: Mapping[str, Any], inputs: Inputs) -> Bundl
         )
     disparity = {int(k): b for k, b in zip(args["pairs"], inputs["disparities"], strict=True)}
     rigs = {int(k): Rig.from_dict(b.meta["rig"]) for k, b in zip(args["pairs"], inputs["rigs"], strict=True)}
-    found: list[Segment | None] = []
+    given: list[_Given] = []
     poses: list[Floats] = []
     for track, resection, level in zip(inputs["tracks"], inputs["resections"], inputs["levels"], strict=True):
         frames = [int(f) for f in track.meta["frames"]]
         rig, T = rigs[frames[0]], RigidTransform.from_matrix(level.meta["T_local_left"])
         points = np.asarray(track["points"])[:, 0].astype(np.float64)
         landmarks = coordinates(points, {"disparity": disparity[frames[0]]}, rig, T, resect)
-        found.append(views_of(track, resection, landmarks, rig, disparity.get(frames[-1]), params))
+        given.append(_Given(track, resection, landmarks, rig, disparity.get(frames[-1])))
         poses.append(np.array(resection["poses"], dtype=np.float64))
+    found = [views_of(*vars(one).values(), params) for one in given]
     facts, states = _adjusted(found, poses, params)
     tilt, sigma = 0.0, float("inf")
     if params.tilt_sigma_deg > 0:
@@ -364,13 +365,42 @@ def _run(params: RefineParams, args: Mapping[str, Any], inputs: Inputs) -> Bundl
     undone = abs(tilt) > params.tilt_significance * sigma
     if undone:
         again = [one and (one[0].without_tilt(tilt), states[k][0], one[2]) for k, one in enumerate(found)]
-        facts, _ = _adjusted(again, poses, params)
+        _adjusted(again, poses, params)
+        judged = [_anew(*pair, tilt, resect, params) for pair in zip(given, poses, strict=True)]
+        facts, _ = _adjusted(judged, poses, params)
     same = sum(f["cost_after"] >= f["cost_before"] for f in facts)
     words = [f"refinement lowers the residuals of {same} of {len(facts)} windows no further: they stay as resected"]
     meta: dict[str, Any] = {"frames": [len(p) for p in poses], "adjustments": facts, "notes": words if same else []}
     if math.isfinite(sigma):
         meta["tilt"] = {"deg": math.degrees(tilt), "sigma_deg": math.degrees(sigma), "undone": undone}
     return Bundle({"poses": np.concatenate(poses)}, meta)
+
+
+@dataclass(frozen=True)
+class _Given:
+    """What :func:`views_of` wants of a segment."""
+
+    track: Bundle
+    resection: Bundle
+    landmarks: Landmarks
+    rig: Rig
+    after: Bundle | None
+
+
+def _anew(given: _Given, poses: Floats, tilt: float, resect: ResectParams, params: RefineParams) -> Segment | None:
+    """A segment without the tilt, its landmarks judged once more by poses: the tilt had made good ones inconsistent."""
+    tracked = np.isfinite(np.asarray(given.track["points"])).all(-1)
+    resection = Bundle({"poses": poses, "inlier": tracked.astype(np.uint8)}, {})
+    one = views_of(given.track, resection, given.landmarks, given.rig, given.after, params)
+    if one is None:
+        return None
+    (views, state, rows), most = one, resect.threshold / resect.pixel_sigma
+    views = views.without_tilt(tilt)
+    for f in range(len(rows)):
+        data = (views.position, views.along, views.sigma, views.pixels[f])
+        seen = Observations(*(a[None] for a in data), views.camera, resect.pixel_sigma, resect.bias_sigma)
+        views.seen[f] &= norms(seen, Poses(state.R[f : f + 1], state.t[f : f + 1], np.zeros(1)))[0] <= most
+    return views, state, rows
 
 
 def _adjusted(

@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -25,6 +26,32 @@ BANDS = (0.25, 0.5, 0.75)
 """Of the height: where the strips lie whose sharpness stands for the image's."""
 STRIP = 32
 """Rows of a strip: some ten thousand pixels, and thrice what the wider blur reaches."""
+
+
+@dataclass(frozen=True)
+class Look:
+    """One image in figures: mean grey 0..255, deviation, shares of dark and bright clipped pixels, sharpness.
+
+    ``detail`` is what lies between two and four pixels, RMS over the deviation: where even that is gone, noise alone
+    decides on the sharpness.
+    """
+
+    mean: float
+    deviation: float
+    dark: float
+    bright: float
+    sharpness: float
+    detail: float = 0.0
+
+
+def look(image: NDArray[Any], valid: NDArray[np.uint8]) -> Look:
+    """Figures of an image (row, col); ``valid`` not zero where usable."""
+    level = grey(image)
+    values = level[(valid != 0) & np.isfinite(level)]
+    if not values.size:
+        return Look(math.nan, 0.0, 0.0, 0.0, math.nan)
+    clipped = float((values <= LOW).mean()), float((values >= HIGH).mean())
+    return Look(float(values.mean()), float(values.std()), *clipped, *texture(image, valid))
 
 
 def texture(image: NDArray[Any], valid: NDArray[np.uint8]) -> tuple[float, float]:
