@@ -373,6 +373,8 @@ def _run(params: RefineParams, args: Mapping[str, Any], inputs: Inputs) -> Bundl
     meta: dict[str, Any] = {"frames": [len(p) for p in poses], "adjustments": facts, "notes": words if same else []}
     if math.isfinite(sigma):
         meta["tilt"] = {"deg": math.degrees(tilt), "sigma_deg": math.degrees(sigma), "undone": undone}
+    if undone:
+        meta["warnings"] = [_tilted(tilt, sigma, next(iter(rigs.values())))]
     return Bundle({"poses": np.concatenate(poses)}, meta)
 
 
@@ -401,6 +403,14 @@ def _anew(given: _Given, poses: Floats, tilt: float, resect: ResectParams, param
         seen = Observations(*(a[None] for a in data), views.camera, resect.pixel_sigma, resect.bias_sigma)
         views.seen[f] &= norms(seen, Poses(state.R[f : f + 1], state.t[f : f + 1], np.zeros(1)))[0] <= most
     return views, state, rows
+
+
+def _tilted(tilt: float, sigma: float, rig: Rig) -> str:
+    return (
+        f"the tracks contradict the disparities: {math.degrees(abs(tilt)):.2f} +- {math.degrees(sigma):.2f} degrees of"
+        f" pitch stand for a principal point that is {abs(tilt) * rig.right.fy:.1f} rows off; undone in the trajectory,"
+        " not in elevations: calibrate anew"
+    )
 
 
 def _adjusted(
