@@ -9,19 +9,9 @@ from stages.declare import Bundle, check_outputs
 from stages.errors import ConfigError
 from stages.geometry import Camera, Rig, RigidTransform, rotation_exp
 from stages.landmarks import landmarks_from_disparity
-from stages.refine import (
-    STAGE,
-    RefineParams,
-    State,
-    Views,
-    _normal,
-    _tilt_pattern,
-    adjust,
-    common_tilt,
-    cost_of,
-    views_of,
-)
+from stages.refine import STAGE, _tilt_pattern, views_of
 from stages.resect import ResectParams
+from stages.segment_adjustment import RefineParams, State, Views, adjust, common_tilt, cost_of, normal
 
 CAMERA = Camera(500.0, 500.0, 299.5, 199.5, 600, 400)
 RIG = Rig(CAMERA, CAMERA, RigidTransform(np.eye(3), np.array([-0.2, 0.0, 0.0])))
@@ -77,7 +67,7 @@ def error_of(state, T):
 def test_gradient_is_that_of_the_cost():
     views, state, _ = scene(1, n=20)
     state = replace(state, depth=np.linspace(-0.3, 0.3, 20))
-    _, _, _, pose, depth = _normal(views, state, 0.0, 0.2)
+    _, _, _, pose, depth = normal(views, state, 0.0, 0.2)
     base = np.zeros((3, 6))
 
     def cost(step, depths=0.0, bias=0.0):

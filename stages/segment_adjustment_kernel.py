@@ -1,4 +1,4 @@
-"""Compiled loops of :mod:`stages.refine`: cost and normal equations of tracked landmarks, sums in their order."""
+"""Compiled loops of :mod:`stages.segment_adjustment`: cost and normal equations of tracks, sums in their order."""
 
 from __future__ import annotations
 
