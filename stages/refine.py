@@ -107,14 +107,16 @@ def _run(params: RefineParams, args: Mapping[str, Any], inputs: Inputs) -> Bundl
         landmarks = coordinates(points, {"disparity": disparity[frames[0]]}, rig, T, resect)
         given.append(_Given(track, resection, landmarks, rig, disparity.get(frames[-1])))
         poses.append(np.array(resection["poses"], dtype=np.float64))
-    found = [views_of(*vars(one).values(), params) for one in given]
+    found = [views_of(g.track, g.resection, g.landmarks, g.rig, g.after, params) for g in given]
     facts, states = _adjusted(found, poses, params)
     tilt, sigma = 0.0, float("inf")
     if params.tilt_sigma_deg > 0:
-        tilt, sigma = common_tilt([(found[k][0], *state) for k, state in states.items()], params)
+        tilt, sigma = common_tilt([(one[0], *states[k]) for k, one in enumerate(found) if one is not None], params)
     undone = abs(tilt) > params.tilt_significance * sigma
     if undone:
-        again = [one and (one[0].without_tilt(tilt), states[k][0], one[2]) for k, one in enumerate(found)]
+        again = [
+            None if one is None else (one[0].without_tilt(tilt), states[k][0], one[2]) for k, one in enumerate(found)
+        ]
         _adjusted(again, poses, params)
         judged = [_anew(*pair, tilt, resect, params) for pair in zip(given, poses, strict=True)]
         facts, _ = _adjusted(judged, poses, params)
@@ -149,8 +151,15 @@ def _anew(given: _Given, poses: Floats, tilt: float, resect: ResectParams, param
     (views, state, rows), most = one, resect.threshold / resect.pixel_sigma
     views = views.without_tilt(tilt)
     for f in range(len(rows)):
-        data = (views.position, views.along, views.sigma, views.pixels[f])
-        seen = Observations(*(a[None] for a in data), views.camera, resect.pixel_sigma, resect.bias_sigma)
+        seen = Observations(
+            views.position[None],
+            views.along[None],
+            views.sigma[None],
+            views.pixels[f : f + 1],
+            views.camera,
+            resect.pixel_sigma,
+            resect.bias_sigma,
+        )
         views.seen[f] &= norms(seen, Poses(state.R[f : f + 1], state.t[f : f + 1], np.zeros(1)))[0] <= most
     return views, state, rows
 
