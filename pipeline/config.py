@@ -187,8 +187,29 @@ def build(*layers: Mapping[str, Any]) -> Params:
     terrain = nested.get("terrain")
     if isinstance(terrain, Mapping) and terrain.get("preset") == "accurate":
         nested = merge(merge({}, ACCURATE_TERRAIN), nested)
+    _navigate(nested)
     built: Params = validate(model(), nested, (), DATASET_SECTIONS)
     return built
+
+
+NAVIGATION: Mapping[str, Mapping[str, Any]] = {
+    "hfvm": {"preset": "fast"},
+    "motion": {"level": 3},
+    "track": {"points": 200},
+    "orientation": {"samples": 600},
+}
+"""What ``select.preset = "navigation"`` sets in other sections, where nothing is given there."""
+
+
+def _navigate(nested: dict[str, Any]) -> None:
+    """What a trajectory needs of disparities and displacements, half the resolution of each gives."""
+    select = nested.get("select")
+    if not isinstance(select, Mapping) or select.get("preset") != "navigation":
+        return
+    for section, values in NAVIGATION.items():
+        given = nested.setdefault(section, {})
+        if isinstance(given, dict):
+            nested[section] = {**values, **given}
 
 
 def validate(kind: type[Params], values: Mapping[str, Any], prefix: tuple[str, ...], also: Iterable[str] = ()) -> Any:

@@ -15,7 +15,7 @@ neighbours. Weights are Tukey's, narrowed from the scatter about the given rig.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -57,9 +57,11 @@ BLOCKS = 6
 """Blocks along either side of the image whose means show how far errors of neighbours go together."""
 
 ITERATIONS = 30
+INNER = 10
+"""Rounds for the smooth error's size between two passes over the matches."""
 LINEAR = 1e-3
 """Radians: corrections nearer than this share their derivatives; what is left out is below a thousandth of a pixel."""
-CONVERGED = 1e-3
+CONVERGED = 1e-2
 """Share of a parameter's sigma."""
 
 
@@ -112,25 +114,51 @@ class Fit:
     weights: tuple[Floats, ...]
 
 
-def adjust(rig: Rig, pairs: Sequence[Matches], free: Sequence[bool], beliefs: Beliefs, *, rival: bool) -> Fit:
+@dataclass(frozen=True)
+class Linear:
+    """Distances ``constant + design @ x`` (n,) of one pair, to first order about ``about``; the matches' blocks."""
+
+    constant: Floats
+    design: Floats
+    about: Floats
+    block: NDArray[np.int64]
+
+
+def linearised(rig: Rig, pairs: Sequence[Matches]) -> list[Linear]:
+    """What every fit of a rig to some pairs begins with."""
+    return [_linear(rig, m) for m in pairs]
+
+
+def adjust(
+    rig: Rig,
+    pairs: Sequence[Matches],
+    free: Sequence[bool],
+    beliefs: Beliefs,
+    *,
+    rival: bool,
+    start: list[Linear] | None = None,
+) -> Fit:
     """Adjust a rig to pairs, everything that no rig explains allowed for.
 
     ``free`` says which of the five parameters the images alone decide. The others are held by what the calibration is
     believed to be good for: they take up their share of the error, so that the free ones do not have to. ``rival``: see
     :func:`precision`. The smooth error's size is estimated, too (expectation maximisation, starting from the belief).
+    ``start``: what :func:`linearised` gives for them, where it is at hand.
     """
-    return _adjust(
-        rig, pairs, lambda smooth: precision(free, beliefs, smooth, rival=rival), beliefs.term, estimate=True
-    )
+    prior = precision(free, beliefs, beliefs.term, rival=rival)
+    return _adjust(rig, pairs, prior, beliefs.term, start, estimate=True)
 
 
-def settle(rig: Rig, pairs: Sequence[Matches], free: Sequence[bool], beliefs: Beliefs) -> Fit:
+def settle(
+    rig: Rig, pairs: Sequence[Matches], free: Sequence[bool], beliefs: Beliefs, start: list[Linear] | None = None
+) -> Fit:
     """Adjust the free parameters to the smallest residuals of the rig that results.
 
     In that rig the others are exactly as given and smooth errors stay in the images, so neither takes a share here.
     """
     nil = replace(beliefs, rotation=EXACT, baseline=EXACT)
-    return _adjust(rig, pairs, lambda smooth: precision(free, nil, smooth, rival=False), LEAST_SMOOTH, estimate=False)
+    prior = precision(free, nil, LEAST_SMOOTH, rival=False)
+    return _adjust(rig, pairs, prior, LEAST_SMOOTH, start, estimate=False)
 
 
 def considered(fit: Fit, free: Sequence[bool], beliefs: Beliefs, smooth: float, held: Floats) -> Floats:
@@ -151,10 +179,10 @@ def considered(fit: Fit, free: Sequence[bool], beliefs: Beliefs, smooth: float, 
 
 
 def _adjust(
-    rig: Rig, pairs: Sequence[Matches], prior: Callable[[float], Floats], smooth: float, *, estimate: bool
+    rig: Rig, pairs: Sequence[Matches], prior: Floats, smooth: float, start: list[Linear] | None, *, estimate: bool
 ) -> Fit:
-    """Gauss-Newton with weights from the scatter; ``prior`` of the smooth error's size, ``estimate`` it or keep it."""
-    x, scales, linear = np.zeros(SIZE), [np.inf] * len(pairs), [_linear(rig, m) for m in pairs]
+    """Gauss-Newton with weights from the scatter; ``prior`` matrix, the smooth error's size kept or estimated."""
+    x, scales, linear = np.zeros(SIZE), [np.inf] * len(pairs), linearised(rig, pairs) if start is None else start
     for _ in range(ITERATIONS):
         if np.abs(x - linear[0].about)[:RIG].max() > LINEAR:
             linear = [_linear(rig, m, x, one) for m, one in zip(pairs, linear, strict=True)]
@@ -162,13 +190,28 @@ def _adjust(
         scales = [p.noise for p in parts]
         normal = np.sum([p.normal for p in parts], axis=0)
         pull = np.sum([p.pull for p in parts], axis=0)
-        total = normal + prior(smooth)
-        last, x, variance = x, np.linalg.solve(total, pull), np.diag(np.linalg.inv(total))
+        last = x
+        x, variance, smooth = _maximised(normal, pull, prior, smooth, INNER if estimate else 0)
         if bool(np.all(np.abs(x - last)[:RIG] < CONVERGED * np.sqrt(variance[:RIG]))):
             break
-        if estimate:
-            smooth = max(LEAST_SMOOTH, float(np.sqrt(np.mean(x[SMOOTH] ** 2 + variance[SMOOTH]))))
     return Fit(x, normal, pull, smooth, tuple(scales), tuple(p.weights for p in parts))
+
+
+def _maximised(normal: Floats, pull: Floats, prior: Floats, smooth: float, rounds: int) -> tuple[Floats, Floats, float]:
+    """Unknowns, their variances, and the smooth error's size by so many rounds of expectation maximisation.
+
+    The rounds need the normal equations alone, which took a pass over all matches.
+    """
+    total, terms = normal + prior, np.arange(SIZE)[SMOOTH]
+    for _ in range(rounds + 1):
+        total[terms, terms] = normal[terms, terms] + smooth**-2.0
+        covariance = np.linalg.inv(total)
+        x, variance = covariance @ pull, np.diag(covariance)
+        size = max(LEAST_SMOOTH, float(np.sqrt(np.mean(x[SMOOTH] ** 2 + variance[SMOOTH]))))
+        if rounds == 0 or abs(size - smooth) <= CONVERGED * smooth:
+            break
+        smooth = size
+    return x, variance, smooth
 
 
 def precision(free: Sequence[bool], beliefs: Beliefs, smooth: float, *, rival: bool) -> Floats:
@@ -194,8 +237,8 @@ def solution(fit: Fit, free: Sequence[bool], beliefs: Beliefs, *, rival: bool) -
     The smooth error counts with no less than is believed of it.
     """
     total = fit.normal + precision(free, beliefs, max(beliefs.term, fit.smooth), rival=rival)
-    x = np.asarray(np.linalg.solve(total, fit.pull), dtype=np.float64)
     covariance = np.asarray(np.linalg.inv(total), dtype=np.float64)
+    x = covariance @ fit.pull
     return x, covariance, 0.5 * float(np.sum(fit.pull * x))
 
 
@@ -207,17 +250,7 @@ class _Part:
     weights: Floats
 
 
-@dataclass(frozen=True)
-class _Linear:
-    """Distances ``constant + design @ x`` (n,) of one pair, to first order about ``about``; the matches' blocks."""
-
-    constant: Floats
-    design: Floats
-    about: Floats
-    block: NDArray[np.int64]
-
-
-def _linear(rig: Rig, matches: Matches, x: Floats | None = None, before: _Linear | None = None) -> _Linear:
+def _linear(rig: Rig, matches: Matches, x: Floats | None = None, before: Linear | None = None) -> Linear:
     """Distances of a corrected rig with systematic errors about ``x``; what stays is taken from ``before``."""
     x = np.zeros(SIZE) if x is None else x
     distance, by_rig = distances(rig, x[:RIG], matches.left, matches.right)
@@ -227,7 +260,7 @@ def _linear(rig: Rig, matches: Matches, x: Floats | None = None, before: _Linear
     basis = _smooth_terms(rig, matches) if before is None else before.design[:, SMOOTH]
     design = np.column_stack([by_rig, shifts, basis])
     block = _blocks(rig, matches) if before is None else before.block
-    return _Linear(distance - by_rig @ x[:RIG], design, x, block)
+    return Linear(distance - by_rig @ x[:RIG], design, x, block)
 
 
 def _blocks(rig: Rig, matches: Matches) -> NDArray[np.int64]:
@@ -237,7 +270,7 @@ def _blocks(rig: Rig, matches: Matches) -> NDArray[np.int64]:
     return np.asarray(row * BLOCKS + column, dtype=np.int64)
 
 
-def _pair(linear: _Linear, last: float, x: Floats) -> _Part:
+def _pair(linear: Linear, last: float, x: Floats) -> _Part:
     """One pair's part of the normal equations, with weights from its own scatter (at most ``last``, pixels)."""
     weights, normal, pull = np.empty(len(linear.constant)), np.empty((SIZE, SIZE)), np.empty(SIZE)
     given = linear.constant, linear.design, x, linear.block

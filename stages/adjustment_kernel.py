@@ -47,6 +47,9 @@ def weigh(constant, design, x, block, blocks, last, least, tukey, weights, norma
         for i in range(unknowns):
             a = information * design[n, i]
             pull[i] -= a * constant[n]
-            for k in range(unknowns):
+            for k in range(i + 1):
                 normal[i, k] += a * design[n, k]
+    for i in range(unknowns):
+        for k in range(i):
+            normal[k, i] = normal[i, k]
     return noise

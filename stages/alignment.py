@@ -13,7 +13,6 @@ from numba import njit
 from numpy.typing import NDArray
 
 from stages.cubic import cubic
-from stages.line import copy_line
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -66,21 +65,22 @@ def align(
 @njit(cache=True, nogil=True)
 def _align_all(a, b, points, start, affinity, ridge, reach, position, error):  # type: ignore[no-untyped-def]
     patch, template = np.empty((SIDE + 2) ** 2), np.empty(SIDE * SIDE)
-    descent = np.empty((SIDE * SIDE, UNKNOWNS))
-    gram, normal, step = np.empty((UNKNOWNS, UNKNOWNS)), np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS)
+    descent, grey = np.empty((SIDE * SIDE, UNKNOWNS)), np.empty(SIDE * SIDE)
+    gram, step = np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS)
     for n in range(points.shape[0]):
         if not _descent(a, points[n, 0], points[n, 1], patch, template, descent):
             continue
         _gram(descent, ridge, gram)
+        if not _factor(gram):
+            continue
         m = affinity[n].copy()
         x, y = start[n, 0], start[n, 1]
         for _ in range(STEPS):
-            square = _right_side(b, x, y, m, template, descent, step)
-            _prior(affinity[n], m, ridge, step)
-            for k in range(UNKNOWNS):
-                copy_line(gram[k], normal[k])
-            if not _solve(normal, step):
+            if not _warp(b, x, y, m, grey):
                 break
+            square = _right_side(grey, template, descent, step)
+            _prior(affinity[n], m, ridge, step)
+            _solve(gram, step)
             dx, dy = _compose(m, step)
             x -= dx
             y -= dy
@@ -95,17 +95,15 @@ def _align_all(a, b, points, start, affinity, ridge, reach, position, error):  #
 @njit(cache=True, nogil=True)
 def _descent(a, x0, y0, patch, template, descent):  # type: ignore[no-untyped-def]
     """Template and derivatives of its grey values by the unknowns; False where it leaves the image."""
-    wide = SIDE + 2
-    total = 0.0
-    on_grid = x0 == np.floor(x0) and y0 == np.floor(y0)
-    if on_grid and _holds(a, x0 - HALF - 1, y0 - HALF - 1) and _holds(a, x0 + HALF + 1, y0 + HALF + 1):
+    wide, far = SIDE + 2, HALF + 1
+    if not (_holds(a, x0 - far, y0 - far) and _holds(a, x0 + far, y0 + far)):
+        return False
+    if x0 == np.floor(x0) and y0 == np.floor(y0):
         for i in range(wide * wide):
-            patch[i] = a[int(y0) + i // wide - HALF - 1, int(x0) + i % wide - HALF - 1]
-            total += patch[i]
+            patch[i] = a[int(y0) + i // wide - far, int(x0) + i % wide - far]
     else:
         for i in range(wide * wide):
-            patch[i] = _grey(a, x0 + i % wide - HALF - 1, y0 + i // wide - HALF - 1)
-            total += patch[i]
+            patch[i] = cubic(a, x0 + i % wide - far, y0 + i // wide - far)
     mean = 0.0
     for i in range(SIDE * SIDE):
         x, y = i % SIDE - HALF, i // SIDE - HALF
@@ -118,21 +116,35 @@ def _descent(a, x0, y0, patch, template, descent):  # type: ignore[no-untyped-de
         descent[i, 6] = 1.0
     for i in range(SIDE * SIDE):
         descent[i, 7] = template[i] - mean / (SIDE * SIDE)
-    return total == total
+    return True
 
 
 @njit(cache=True, nogil=True)
-def _right_side(b, x0, y0, m, template, descent, out):  # type: ignore[no-untyped-def]
-    """Differences of the warped image to the template, projected on the derivatives; returns their sum of squares."""
-    out[:] = 0.0
-    square = 0.0
+def _warp(b, x0, y0, m, grey):  # type: ignore[no-untyped-def]
+    """Grey values under the template; False where one of its corners, and so it, leaves the image."""
+    for j in (-HALF, HALF):
+        for i in (-HALF, HALF):
+            if not _holds(b, x0 + m[0, 0] * i + m[0, 1] * j, y0 + m[1, 0] * i + m[1, 1] * j):
+                return False
+    k = 0
+    for j in range(-HALF, HALF + 1):
+        for i in range(-HALF, HALF + 1):
+            grey[k] = cubic(b, x0 + m[0, 0] * i + m[0, 1] * j, y0 + m[1, 0] * i + m[1, 1] * j)
+            k += 1
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _right_side(grey, template, descent, out):  # type: ignore[no-untyped-def]
+    """Differences of grey values to the template, projected on the derivatives; returns their sum of squares."""
+    square = o0 = o1 = o2 = o3 = o4 = o5 = o6 = o7 = 0.0
     for i in range(SIDE * SIDE):
-        x, y = i % SIDE - HALF, i // SIDE - HALF
-        grey = _grey(b, x0 + m[0, 0] * x + m[0, 1] * y, y0 + m[1, 0] * x + m[1, 1] * y)
-        d = grey - template[i]
+        d = grey[i] - template[i]
+        r = descent[i]
         square += d * d
-        for k in range(UNKNOWNS):
-            out[k] += descent[i, k] * d
+        o0, o1, o2, o3 = o0 + r[0] * d, o1 + r[1] * d, o2 + r[2] * d, o3 + r[3] * d
+        o4, o5, o6, o7 = o4 + r[4] * d, o5 + r[5] * d, o6 + r[6] * d, o7 + r[7] * d
+    out[0], out[1], out[2], out[3], out[4], out[5], out[6], out[7] = o0, o1, o2, o3, o4, o5, o6, o7
     return square
 
 
@@ -149,12 +161,16 @@ def _prior(expected, m, ridge, out):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _gram(descent, ridge, out):  # type: ignore[no-untyped-def]
+    """Products of the derivatives, summed over the template, with the prior of the affinity."""
     out[:] = 0.0
     for i in range(SIDE * SIDE):
-        row = descent[i]
+        r = descent[i]
+        # Values in registers first: stores to ``out`` might change ``r`` for all that the compiler knows.
+        v = (r[0], r[1], r[2], r[3], r[4], r[5], r[6], r[7])
         for j in range(UNKNOWNS):
-            for k in range(UNKNOWNS):
-                out[j, k] += row[j] * row[k]
+            o, w = out[j], r[j]
+            o[0], o[1], o[2], o[3] = o[0] + w * v[0], o[1] + w * v[1], o[2] + w * v[2], o[3] + w * v[3]
+            o[4], o[5], o[6], o[7] = o[4] + w * v[4], o[5] + w * v[5], o[6] + w * v[6], o[7] + w * v[7]
     for k in range(2, 6):
         out[k, k] += ridge
 
@@ -171,30 +187,35 @@ def _compose(m, step):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _solve(a, b):  # type: ignore[no-untyped-def]
-    """Solve a x = b in place for a symmetric positive matrix (Gauss); False where it is singular."""
-    n = b.shape[0]
+def _factor(a):  # type: ignore[no-untyped-def]
+    """Factors of a symmetric positive matrix in place, by Gauss: multipliers below, pivots' inverses on the diagonal.
+
+    False where it is singular.
+    """
+    n = a.shape[0]
     for i in range(n):
         if not a[i, i] > 1e-9:
             return False
+        a[i, i] = 1.0 / a[i, i]
         for j in range(i + 1, n):
-            f = a[j, i] / a[i, i]
-            for k in range(i, n):
+            f = a[j, i] * a[i, i]
+            a[j, i] = f
+            for k in range(i + 1, n):
                 a[j, k] -= f * a[i, k]
-            b[j] -= f * b[i]
-    for i in range(n - 1, -1, -1):
-        for k in range(i + 1, n):
-            b[i] -= a[i, k] * b[k]
-        b[i] /= a[i, i]
     return True
 
 
 @njit(cache=True, nogil=True)
-def _grey(image, x, y):  # type: ignore[no-untyped-def]
-    """Grey value between pixels by cubic convolution; NaN outside."""
-    if not _holds(image, x, y):
-        return np.float32(np.nan)
-    return cubic(image, x, y)
+def _solve(factors, b):  # type: ignore[no-untyped-def]
+    """Solve in place by the factors of :func:`_factor`."""
+    n = b.shape[0]
+    for i in range(n):
+        for j in range(i + 1, n):
+            b[j] -= factors[j, i] * b[i]
+    for i in range(n - 1, -1, -1):
+        for k in range(i + 1, n):
+            b[i] -= factors[i, k] * b[k]
+        b[i] *= factors[i, i]
 
 
 @njit(cache=True, nogil=True, inline="always")

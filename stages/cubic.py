@@ -10,8 +10,9 @@ from numba import njit
 def cubic(a, x, y):  # type: ignore[no-untyped-def]
     """Catmull-Rom value (float32) of ``a`` at (x, y), a pixel or more inside; that of ``sample_cubic`` to the bit."""
     # Unsigned indices need no check for counting from the end.
-    i, j, step = np.uint64(x), np.uint64(y), np.uint64(1)
-    t, s = np.float32(x) - np.float32(i), np.float32(y) - np.float32(j)
+    whole_x, whole_y = np.int64(x), np.int64(y)
+    i, j, step = np.uint64(whole_x), np.uint64(whole_y), np.uint64(1)
+    t, s = np.float32(x) - np.float32(whole_x), np.float32(y) - np.float32(whole_y)
     left, right, far = i - step, i + step, i + step + step
     above, below, bottom = j - step, j + step, j + step + step
     h, one, two = np.float32(0.5), np.float32(1.0), np.float32(2.0)

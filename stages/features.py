@@ -112,17 +112,6 @@ def pack_batch(images: AnyArray, weights: tuple[float, ...]) -> tuple[Words, Pla
     return words, deviation
 
 
-def pack_inner(images: AnyArray, weights: tuple[float, ...]) -> Words:
-    """Words of :func:`pack_batch` of those pixels whose whole kernel lies in the image: RADIUS fewer on each side."""
-    count, rows, cols = images.shape
-    words = np.empty((count, rows - 2 * RADIUS, cols - 2 * RADIUS), dtype=np.uint64)
-    scale = np.asarray(weights, np.float32) * np.float32(STEPS_PER_UNIT)
-    deviation = np.empty(words.shape[1:], np.float32)
-    for image, found in zip(np.ascontiguousarray(images, dtype=np.float32), words, strict=True):
-        _pack(image, 0, scale, found, deviation)
-    return words
-
-
 BAND = 64
 """Rows that are completed at their edges together."""
 
@@ -139,7 +128,7 @@ def _pack_all(images, scale, words, deviation):  # type: ignore[no-untyped-def]
                 row, out = images[i, min(max(start + j - RADIUS, 0), rows - 1)], room[j]
                 out[:RADIUS], out[RADIUS + cols :] = row[0], row[cols - 1]
                 copy_line(row, out[RADIUS:])
-            _pack(room[:size], start, scale, words[i], deviation[i])
+            pack_rows(room[:size], start, scale, words[i], deviation[i])
 
 
 @njit(cache=True, nogil=True)
@@ -151,7 +140,7 @@ def _byte(value, scale):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _pack(a, start, scale, words, deviation):  # type: ignore[no-untyped-def]
+def pack_rows(a, start, scale, words, deviation):  # type: ignore[no-untyped-def]
     """Table 1 by sums of fixed order, for rows from ``start`` on, RADIUS more of which ``a`` holds on every side.
 
     No fast maths: bytes must not depend on the CPU.

@@ -82,10 +82,13 @@ def fit_plane(
     tolerance = np.sqrt((2.0 * sigma) ** 2 + (relief * rho) ** 2)
     theta = _consensus(rays, rho, sigma, tolerance, allowed, rng)
     if theta is not None:
+        information = tolerance**-2.0
         for _ in range(20):
-            weight = np.maximum(0.0, 1.0 - ((rho - rays @ theta) / (2.0 * tolerance)) ** 2) ** 2 / tolerance**2
+            weight = np.maximum(0.0, 1.0 - 0.25 * (rho - rays @ theta) ** 2 * information) ** 2 * information
             weighted = rays * weight[:, None]
-            theta = np.linalg.solve(weighted.T @ rays, weighted.T @ rho)
+            last, theta = theta, np.linalg.solve(weighted.T @ rays, weighted.T @ rho)
+            if np.abs(theta - last).max() <= SETTLED * np.abs(theta).max():
+                break
         share = float(np.mean(_score(theta[None], rays, rho, sigma, tolerance) > 0))
         length = float(np.linalg.norm(theta))
         if share >= MIN_SHARE and bool(allowed(-theta[None] / length)[0]):
@@ -97,6 +100,7 @@ def fit_plane(
 
 
 MIN_POINTS = 100
+SETTLED = 1e-9  # share of the plane's parameters: of a height of metres, nanometres
 MIN_SHARE = 0.05
 SCORED = 1200  # points, about, that planes are compared on: the best one is then fitted to all
 HYPOTHESES = 1000  # an all-ground sample of three is among them (p > .999) where a fifth of the pixels are ground

@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from stages.geometry import Rig, RigidTransform
@@ -118,24 +119,55 @@ def relief(
     the track are then uncertain by the relief inside the template. NaN where that is beyond :data:`CONSISTENT`, since
     then there are two surfaces, or where less than half of the template is matched.
     """
-    rows, cols = column.shape
     known = _known(points)
-    centre = np.floor(np.where(known[:, None], points, 0.0) + 0.5).astype(np.intp)
-    dy, dx = (o.ravel() for o in np.mgrid[-TEMPLATE : TEMPLATE + 1, -TEMPLATE : TEMPLATE + 1])
-    y, x = centre[:, 1:] + dy, centre[:, :1] + dx
-    inside = (y >= 0) & (y < rows) & (x >= 0) & (x < cols)
-    y, x = np.clip(y, 0, rows - 1), np.clip(x, 0, cols - 1)
-    disparity = np.stack([column[y, x], row[y, x]], -1).astype(np.float64)
-    good = inside & ((validity[y, x] & MATCHED) != 0) & np.isfinite(disparity).all(-1)
-    disparity = np.where(good[..., None], disparity, 0.0)
-    basis = np.stack([np.ones(len(dx)), dx / TEMPLATE, dy / TEMPLATE], -1)
-    squares = (basis[:, :, None] * basis[:, None, :]).reshape(len(dx), 9)
-    normal = (good.astype(np.float64) @ squares).reshape(-1, 3, 3) + 1e-9 * np.eye(3)
-    plane = np.linalg.solve(normal, basis.T @ disparity)
-    apart = np.where(good, ((disparity - basis @ plane) ** 2).sum(-1), 0.0)
-    count = good.sum(1)
-    rms = np.sqrt(apart.sum(1) / np.maximum(count, 1))
-    return np.where(known & (2 * count >= len(dx)) & (rms <= CONSISTENT), rms, np.nan)
+    centre = np.floor(np.where(known[:, None], points, 0.0) + 0.5).astype(np.int64)
+    rms = np.full(len(points), np.nan)
+    _relief(centre, np.asarray(column), np.asarray(row), np.asarray(validity), rms)
+    return np.where(known & (rms <= CONSISTENT), rms, np.nan)
+
+
+@njit(cache=True, nogil=True)
+def _relief(centre, column, row, validity, rms):  # type: ignore[no-untyped-def]
+    """Rms about the fitted plane under each template of which at least half is matched."""
+    rows, cols = column.shape
+    a, b = np.empty((3, 3)), np.empty((3, 2))
+    half = ((2 * TEMPLATE + 1) ** 2 + 1) // 2
+    for n in range(len(centre)):
+        a[:], b[:] = 0.0, 0.0
+        x0, y0 = centre[n]
+        for j in range(max(y0 - TEMPLATE, 0), min(y0 + TEMPLATE + 1, rows)):
+            for i in range(max(x0 - TEMPLATE, 0), min(x0 + TEMPLATE + 1, cols)):
+                u, v = np.float64(column[j, i]), np.float64(row[j, i])
+                if validity[j, i] & MATCHED and np.isfinite(u) and np.isfinite(v):
+                    p, q = (i - x0) / TEMPLATE, (j - y0) / TEMPLATE
+                    a[0, 0] += 1.0
+                    a[0, 1] += p
+                    a[0, 2] += q
+                    a[1, 1] += p * p
+                    a[1, 2] += p * q
+                    a[2, 2] += q * q
+                    b[0, 0] += u
+                    b[1, 0] += p * u
+                    b[2, 0] += q * u
+                    b[0, 1] += v
+                    b[1, 1] += p * v
+                    b[2, 1] += q * v
+        count = a[0, 0]
+        if count < half:
+            continue
+        a[1, 0], a[2, 0], a[2, 1] = a[0, 1], a[0, 2], a[1, 2]
+        for k in range(3):
+            a[k, k] += 1e-9
+        plane = np.linalg.solve(a, b)
+        total = 0.0
+        for j in range(max(y0 - TEMPLATE, 0), min(y0 + TEMPLATE + 1, rows)):
+            for i in range(max(x0 - TEMPLATE, 0), min(x0 + TEMPLATE + 1, cols)):
+                u, v = np.float64(column[j, i]), np.float64(row[j, i])
+                if validity[j, i] & MATCHED and np.isfinite(u) and np.isfinite(v):
+                    p, q = (i - x0) / TEMPLATE, (j - y0) / TEMPLATE
+                    total += (u - plane[0, 0] - p * plane[1, 0] - q * plane[2, 0]) ** 2
+                    total += (v - plane[0, 1] - p * plane[1, 1] - q * plane[2, 1]) ** 2
+        rms[n] = np.sqrt(total / count)
 
 
 def _triangulate(rays: Floats, right: Floats, rig: Rig) -> Floats:

@@ -90,8 +90,9 @@ def interest_points(
     """
     response = interest_operator(image)
     # The expected sum of squared differences of pure noise is 2 sigma^2 for each of the 25 pixels.
-    usable = _peaks(response, 3.0 * 2.0 * (2 * HALF + 1) ** 2 * noise**2)
-    rows, cols = np.nonzero(usable & _inside(valid, border))
+    rows, cols = _peaks(response, 3.0 * 2.0 * (2 * HALF + 1) ** 2 * noise**2)
+    inner = _inside(valid, border)[rows, cols]
+    rows, cols = rows[inner], cols[inner]
     side = max(math.sqrt(image.shape[0] * image.shape[1] / max(count, 1)), 1.0)
     across = math.ceil(image.shape[1] / side)
     bucket = (rows // side).astype(np.int64) * across + (cols // side).astype(np.int64)
@@ -100,7 +101,9 @@ def interest_points(
         empty = ~np.isin(bucket, seen[:, 1] * across + seen[:, 0])
         rows, cols, bucket = rows[empty], cols[empty], bucket[empty]
     strength = response[rows, cols]
-    order = np.lexsort((cols, rows, -strength, bucket))
+    # Peaks come in reading order, which a stable sort keeps among equals.
+    order = np.argsort(-strength, kind="stable")
+    order = order[np.argsort(bucket[order], kind="stable")]
     rank = np.arange(len(order)) - np.searchsorted(bucket[order], bucket[order], side="left")
     if occupied is not None:
         order, rank = order[rank == 0], rank[rank == 0]
@@ -108,13 +111,13 @@ def interest_points(
     return np.stack([cols[best], rows[best]], axis=-1).astype(np.float32)
 
 
-def _peaks(response: Floats, least: float) -> Bools:
-    """Above ``least``, and greatest of the 5 x 5 neighbourhood; of equal ones the first in reading order."""
+def _peaks(response: Floats, least: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Rows and columns of pixels above ``least``, and greatest of the 5 x 5 neighbourhood; of equal ones the first."""
     side = np.ones((2 * HALF + 1, 2 * HALF + 1), np.uint8)
     found = (response > least) & (response == cv2.dilate(response, side))
-    rows, cols = np.nonzero(found)
-    found[rows, cols] = _first_of_equals(response, rows, cols)
-    return np.asarray(found)
+    rows, cols = np.divmod(np.flatnonzero(found), response.shape[1])
+    first = _first_of_equals(response, rows, cols)
+    return rows[first], cols[first]
 
 
 @njit(cache=True, nogil=True)

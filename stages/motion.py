@@ -185,9 +185,9 @@ def _run(params: MotionParams, args: Mapping[str, Any], inputs: Inputs) -> Bundl
         found, turn, roll_deg = rolled
     ok = matched(found.validity)
     rows, cols = ok.shape
-    y, x = np.indices(ok.shape)
-    scale = 2.0**found.level
-    xb, yb = x + found.column_disparity / scale, y + found.row_disparity / scale
+    scale = np.float32(2.0**found.level)
+    xb = np.arange(cols, dtype=np.float32) + found.column_disparity / scale
+    yb = np.arange(rows, dtype=np.float32)[:, None] + found.row_disparity / scale
     seen = ok & (xb >= 0) & (xb <= cols - 1) & (yb >= 0) & (yb <= rows - 1)
     u, v = found.column_disparity[ok], found.row_disparity[ok]
     usable = int(np.count_nonzero(found.validity & np.uint8(Validity.OUT_OF_IMAGE) == 0))

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from stages.adjustment import RIG, Beliefs, Fit, Matches, adjust, considered, settle, solution
+from stages.adjustment import RIG, Beliefs, Fit, Linear, Matches, adjust, considered, linearised, settle, solution
 from stages.declare import Params
 from stages.epipolar import NAMES, beyond_infinity, corrected, depth_sensitivity, distances
 from stages.geometry import Rig
@@ -125,11 +125,15 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Decision:
-    """What the images change: ``correction`` (5,) radians, the parameters in order, and the fit behind it."""
+    """What the images change: ``correction`` (5,) radians, the parameters in order, and the fit behind it.
+
+    ``start``: of each pair, what fits to it begin with.
+    """
 
     correction: Floats
     parameters: tuple[Parameter, ...]
     fit: Fit
+    start: tuple[Linear, ...] = ()
 
     @property
     def changed(self) -> bool:
@@ -151,7 +155,9 @@ class _Chooser:
 
     def __init__(self, rig: Rig, pairs: Sequence[Matches], params: RelativeParams) -> None:
         self.rig, self.pairs, self.params, self.beliefs = rig, pairs, params, params.beliefs(rig)
-        self.all = adjust(rig, pairs, [True] * RIG, self.beliefs, rival=True)
+        self.start = linearised(rig, pairs)
+        self.all = adjust(rig, pairs, [True] * RIG, self.beliefs, rival=True, start=self.start)
+        self.solved: dict[tuple[frozenset[int], bool], tuple[Floats, Floats, float]] = {}
         near = corrected(rig, self.all.x[:RIG])
         self.depth = np.mean([depth_sensitivity(near, m.left, m.right) for m in pairs], axis=0)
         self.impossible = impossible_share(rig, pairs, self.all) > BEYOND_SHARE
@@ -173,12 +179,13 @@ class _Chooser:
         if chosen and not self._worth(correction):  # what was asked for singly may come to nothing together
             chosen = []
             fit, correction = self._settled(chosen)
-        return Decision(correction, tuple(self._parameter(i, chosen, fit) for i in range(RIG)), fit)
+        parameters = tuple(self._parameter(i, chosen, fit) for i in range(RIG))
+        return Decision(correction, parameters, fit, tuple(self.start))
 
     def _settled(self, chosen: Sequence[int]) -> tuple[Fit, Floats]:
         """The fit with the chosen parameters free, and their correction (5,)."""
         free = [i in chosen for i in range(RIG)]
-        fit = settle(self.rig, self.pairs, free, self.beliefs)
+        fit = settle(self.rig, self.pairs, free, self.beliefs, self.start)
         return fit, np.where(free, fit.x[:RIG], 0.0)
 
     def _worth(self, correction: Floats) -> bool:
@@ -196,7 +203,10 @@ class _Chooser:
             chosen.append(max(able, key=lambda i: self._gain(i, chosen)))
 
     def _solve(self, chosen: Sequence[int], *, rival: bool) -> tuple[Floats, Floats, float]:
-        return solution(self.all, [i in chosen for i in range(RIG)], self.beliefs, rival=rival)
+        key = frozenset(chosen), rival
+        if key not in self.solved:
+            self.solved[key] = solution(self.all, [i in chosen for i in range(RIG)], self.beliefs, rival=rival)
+        return self.solved[key]
 
     def _gain(self, i: int, chosen: list[int]) -> float:
         return self._solve([*chosen, i], rival=False)[2]

@@ -23,10 +23,13 @@ from stages.pyramid import Pyramid, filled
 Floats = NDArray[np.float64]
 
 SUM_RADIUS = 3
+SIDE = 2 * SUM_RADIUS + 1
 """Pixels: distances are summed over 7 x 7."""
 
 BACKMATCH = 1.0
 """Pixels: greatest distance between a point and where matching there and back leads (4.3.3)."""
+BACK_RADIUS = 3
+"""Pixels searched on the way back, at most: thrice what is allowed; fewer refuse too little."""
 
 DEFAULT_WEIGHTS = HfvmParams().weights
 
@@ -85,7 +88,8 @@ def find_points(
     good = np.isfinite(there_cost) & (there_cost <= threshold)
     good &= _on_valid(a_valid, points[who]) & _on_valid(b_valid, there)
     who, there, there_cost = who[good], there[good], there_cost[good]
-    back, _ = _search(b_image, a_image, there, points[who], np.asarray(np.linalg.inv(shape[who])), radius, weights)
+    inverse, reach = np.asarray(np.linalg.inv(shape[who])), min(radius, BACK_RADIUS)
+    back, _ = _search(b_image, a_image, there, points[who], inverse, reach, weights)
     good = np.hypot(*(back - points[who]).T) <= BACKMATCH
     who = who[good]
     found[who], cost[who], ok[who] = there[good], there_cost[good], True
@@ -111,84 +115,106 @@ def _search(
     weights: tuple[float, ...],
 ) -> tuple[Floats, Floats]:
     """Best positions (n, 2) and mean distances (n,), NaN where not found, one direction."""
-    side = 2 * (SUM_RADIUS + features.RADIUS) + 1
-    wide = side + 2 * (radius + 1)
-    template = np.zeros((len(points), side, side), np.float32)
-    area = np.zeros((len(points), wide, wide), np.float32)
     whole = np.rint(predicted)
-    inside = np.empty((2, len(points)), np.uint8)
-    _cut(a, points, np.linalg.inv(affinity), template, inside[0])
-    _copy(b, whole.astype(np.int64), area, inside[1])
-    words = features.pack_inner(template, weights)
-    searched = features.pack_inner(area, weights)
-    offset, cost = np.empty((len(points), 2)), np.empty(len(points))
-    _best(words, searched, radius, offset, cost)
-    lost = (inside == 0).any(0) | (cost < 0)
+    scale = np.asarray(weights, np.float32) * np.float32(features.STEPS_PER_UNIT)
+    offset, cost = np.zeros((len(points), 2)), np.full(len(points), -1.0)
+    inverse = np.ascontiguousarray(np.linalg.inv(affinity))
+    _search_all(a, b, np.ascontiguousarray(points), whole.astype(np.int64), inverse, radius, scale, offset, cost)
+    lost = cost < 0
     return np.where(lost[:, None], np.nan, whole + offset), np.where(lost, np.nan, cost)
 
 
 @njit(cache=True, nogil=True)
-def _cut(image, points, shape, out, inside):  # type: ignore[no-untyped-def]
-    """Patches around points, pixel offsets taken through ``shape``; ``inside`` 0 where the centre is off the image.
+def _search_all(a, b, points, whole, shape, radius, scale, offset, cost):  # type: ignore[no-untyped-def]
+    """Each point by itself: its template, the area around its prediction, and where in it the template fits best."""
+    side = 2 * (SUM_RADIUS + features.RADIUS) + 1
+    wide = side + 2 * (radius + 1)
+    template, area = np.empty((side, side), np.float32), np.empty((wide, wide), np.float32)
+    m = wide - 2 * features.RADIUS
+    words, searched = np.empty((SIDE, SIDE), np.uint64), np.empty((m, m), np.uint64)
+    deviation = np.empty((m, m), np.float32)
+    for k in range(len(points)):
+        if not _cut(a, points[k, 0], points[k, 1], shape[k], template) or not _copy(b, whole[k], area):
+            continue
+        features.pack_rows(template, 0, scale, words, deviation)
+        features.pack_rows(area, 0, scale, searched, deviation)
+        cost[k] = _best(words.ravel(), searched.ravel(), radius + 1, offset[k])
+
+
+@njit(cache=True, nogil=True)
+def _cut(image, px, py, shape, out):  # type: ignore[no-untyped-def]
+    """Patch around a point, pixel offsets taken through ``shape``; False where its centre is off the image.
 
     Positions beyond the border take the nearest inner one.
     """
     rows, cols = image.shape
-    side = out.shape[1]
-    for k in range(len(points)):
-        px, py = points[k, 0], points[k, 1]
-        inside[k] = px >= 0 and px <= cols - 1 and py >= 0 and py <= rows - 1
-        if not inside[k] or rows < 4 or cols < 4:
-            inside[k] = 0
-            continue
-        for j in range(side):
-            for i in range(side):
-                dx, dy = i - side // 2, j - side // 2
-                x = px + shape[k, 0, 0] * dx + shape[k, 0, 1] * dy
-                y = py + shape[k, 1, 0] * dx + shape[k, 1, 1] * dy
-                x, y = min(max(x, 1.0), cols - 2.001), min(max(y, 1.0), rows - 2.001)
-                out[k, j, i] = cubic(image, x, y)
+    side = out.shape[0]
+    if not (px >= 0 and px <= cols - 1 and py >= 0 and py <= rows - 1) or rows < 4 or cols < 4:
+        return False
+    for j in range(side):
+        for i in range(side):
+            dx, dy = i - side // 2, j - side // 2
+            x = px + shape[0, 0] * dx + shape[0, 1] * dy
+            y = py + shape[1, 0] * dx + shape[1, 1] * dy
+            x, y = min(max(x, 1.0), cols - 2.001), min(max(y, 1.0), rows - 2.001)
+            out[j, i] = cubic(image, x, y)
+    return True
 
 
 @njit(cache=True, nogil=True)
-def _copy(image, points, out, inside):  # type: ignore[no-untyped-def]
-    """As :func:`_cut`, around whole pixels and without a change of shape."""
+def _copy(image, point, out):  # type: ignore[no-untyped-def]
+    """As :func:`_cut`, around a whole pixel and without a change of shape."""
     rows, cols = image.shape
-    half = out.shape[1] // 2
-    for k in range(len(points)):
-        px, py = points[k, 0], points[k, 1]
-        inside[k] = px >= 0 and px <= cols - 1 and py >= 0 and py <= rows - 1 and rows >= 4 and cols >= 4
-        if not inside[k]:
-            continue
-        for j in range(out.shape[1]):
-            y = min(max(py + j - half, 1), rows - 2)
-            for i in range(out.shape[2]):
-                out[k, j, i] = image[y, min(max(px + i - half, 1), cols - 2)]
+    half = out.shape[0] // 2
+    px, py = point
+    if not (px >= 0 and px <= cols - 1 and py >= 0 and py <= rows - 1 and rows >= 4 and cols >= 4):
+        return False
+    for j in range(out.shape[0]):
+        y = min(max(py + j - half, 1), rows - 2)
+        for i in range(out.shape[1]):
+            out[j, i] = image[y, min(max(px + i - half, 1), cols - 2)]
+    return True
 
 
 @njit(cache=True, nogil=True)
-def _best(words, area, radius, offset, cost):  # type: ignore[no-untyped-def]
-    """Least summed distance of each template in its area; offsets with linear sub-pixel parts, mean distance or -1."""
-    n = 2 * SUM_RADIUS + 1
-    side = 2 * radius + 3
-    sums = np.empty((side, side), np.int64)
-    for k in range(len(words)):
-        for v in range(side):
-            for u in range(side):
-                total = np.int64(0)
-                for j in range(n):
-                    for i in range(n):
-                        total += distance(words[k, j, i], area[k, v + j, u + i])
-                sums[v, u] = total
-        bu, bv = 1, 1
-        for v in range(side):
-            for u in range(side):
-                if sums[v, u] < sums[bv, bu]:
-                    bu, bv = u, v
-        cost[k] = -1.0
-        offset[k, 0], offset[k, 1] = 0.0, 0.0
-        if bu < 1 or bu > side - 2 or bv < 1 or bv > side - 2:
-            continue
-        cost[k] = sums[bv, bu] / (n * n)
-        offset[k, 0] = bu - radius - 1 + linear(sums[bv, bu - 1], sums[bv, bu], sums[bv, bu + 1])
-        offset[k, 1] = bv - radius - 1 + linear(sums[bv - 1, bu], sums[bv, bu], sums[bv + 1, bu])
+def _sum_at(words, area, wide, u, v, most):  # type: ignore[no-untyped-def]
+    """Summed distance at a place of the area; given up, and greater than ``most``, after the row that exceeds it.
+
+    Both in reading order, ``area`` in rows of ``wide``. Unsigned indices need no check for counting from the end.
+    """
+    total = np.int64(0)
+    k, at = np.uint64(0), np.uint64(v * wide + u)
+    for _ in range(SIDE):
+        for i in range(SIDE):
+            total += distance(words[k + np.uint64(i)], area[at + np.uint64(i)])
+        if total > most:
+            break
+        k, at = k + np.uint64(SIDE), at + np.uint64(wide)
+    return total
+
+
+@njit(cache=True, nogil=True)
+def _best(words, area, middle, offset):  # type: ignore[no-untyped-def]
+    """Mean distance of a template at its best place in an area, of equals the first in reading order; -1 at the border.
+
+    ``middle`` places to every side of the prediction; ``offset`` (2,) from there, with linear sub-pixel parts.
+    """
+    wide, all_of_it = 2 * middle + SIDE, np.int64(2**62)
+    most, bu, bv = all_of_it, middle, middle
+    # From the prediction outwards, so that most places are given up early.
+    for ring in range(middle + 1):
+        for v in range(middle - ring, middle + ring + 1):
+            step = 1 if abs(v - middle) == ring else max(2 * ring, 1)
+            for u in range(middle - ring, middle + ring + 1, step):
+                total = _sum_at(words, area, wide, u, v, most)
+                if total < most or (total == most and (v < bv or (v == bv and u < bu))):
+                    most, bu, bv = total, u, v
+    if min(bu, bv) < 1 or max(bu, bv) > 2 * middle - 1:
+        return -1.0
+    before = _sum_at(words, area, wide, bu - 1, bv, all_of_it)
+    behind = _sum_at(words, area, wide, bu + 1, bv, all_of_it)
+    above = _sum_at(words, area, wide, bu, bv - 1, all_of_it)
+    below = _sum_at(words, area, wide, bu, bv + 1, all_of_it)
+    offset[0] = bu - middle + linear(before, most, behind)
+    offset[1] = bv - middle + linear(above, most, below)
+    return most / (SIDE * SIDE)

@@ -6,236 +6,36 @@ its disparity alone. Where the segment ends at another basic pair, that pair's d
 second measurement of their depths. What all disparities share is one unknown of a window of segments, since one rig
 made them.
 
-Least squares with Huber's weights, by Levenberg-Marquardt. A landmark has one unknown (along its ray), so that its
-elimination (Schur's complement) is a division, and the system has the size of the poses (Triggs, McLauchlan, Hartley,
-Fitzgibbon 2000, doi:10.1007/3-540-44480-7_21). The result is never worse than its input by the same cost: where no step
-lowers it, the input is returned.
+Another error that they share, a tilt, shows over the whole sequence only (:mod:`stages.segment_adjustment`). Where it
+is beyond doubt, landmarks are judged and all segments adjusted once more without it.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
-from stages.declare import Array, Bundle, Inputs, Params, Stage
+from stages.declare import Array, Bundle, Inputs, Stage
 from stages.errors import ConfigError
-from stages.geometry import Camera, Rig, RigidTransform
+from stages.geometry import Rig, RigidTransform
 from stages.landmarks import Landmarks, matches_at, relief
-from stages.reprojection import HUBER, cross_matrix, exponential
+from stages.reprojection import Observations, Poses, norms
 from stages.resect import ResectParams, coordinates
+from stages.segment_adjustment import RefineParams, State, Views, adjust, common_tilt, stereo_rows
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
-FIRST_DAMPING, MOST_DAMPING = 1e-4, 1e8
 AGREES = 5.0
 """Standard deviations within which the next pair's disparity must agree with the start to be used at all."""
 
-
-class RefineParams(Params):
-    """Parameters of the joint refinement."""
-
-    enabled: bool = Field(
-        default=True,
-        description="refine the poses of segments jointly with their landmarks, where these are of the disparity",
-    )
-    window: int = Field(
-        default=1,
-        ge=0,
-        description="segments that are adjusted together, the last of them for good; 0: all of the sequence at once",
-    )
-    stereo: bool = Field(
-        default=False,
-        description="use the disparity of the basic pair at a segment's end as a second measurement; it shares its"
-        " errors with the first one, and gains little",
-    )
-    iterations: int = Field(default=20, ge=1, description="limit of Levenberg-Marquardt steps; five are usual")
-    pixel_sigma: float = Field(default=0.2, gt=0, description="pixels; expected error of a tracked position")
-    disparity_sigma: float = Field(default=0.2, gt=0, description="pixels; expected error of the next pair's disparity")
-    bias_sigma: float = Field(
-        default=0.1, ge=0, description="pixels; prior of the error that all disparities share (toe-in of the rig)"
-    )
-
-
-@dataclass(frozen=True)
-class Views:
-    """Measurements of one segment.
-
-    ``position``, ``along`` (n, 3) of the landmarks in the local frame, and how they move with their disparity, m and
-    m/pixel; ``sigma`` (n,) of it, pixels. ``pixels`` (frame, n, 2) of the frames behind the key, ``seen`` (frame, n)
-    whether they count. ``right`` (n, 2) of the last frame, pixels, ``right_sigma`` (n,); NaN none.
-    """
-
-    position: Floats
-    along: Floats
-    sigma: Floats
-    pixels: Floats
-    seen: Bools
-    right: Floats
-    right_sigma: Floats
-    camera: Camera
-    rig: Rig
-
-
-@dataclass(frozen=True)
-class State:
-    """``R`` (frame, 3, 3), ``t`` (frame, 3) of T_cam_local behind the key; ``depth`` (n,) corrections, pixels."""
-
-    R: Floats
-    t: Floats
-    depth: Floats
-
-    def moved(self, pose: Floats, depth: Floats) -> State:
-        """After steps (frame, 6) ``v, w`` as in :mod:`stages.reprojection`, and (n,)."""
-        turn = exponential(pose[:, 3:])
-        t = np.einsum("fij,fj->fi", turn, self.t) + pose[:, :3]
-        return State(turn @ self.R, t, self.depth + depth)
-
-
 Segment = tuple[Views, State, list[int]]
 """Measurements of a segment, where its adjustment starts, and which of its frames have a pose."""
-
-
-def _camera_errors(x: Floats, moves: Floats, camera: Camera, pixels: Floats) -> tuple[Floats, Floats, Floats]:
-    """Errors (..., 2), derivatives (..., 2, 3) by camera coordinates ``x``, and along ``moves`` (..., 2)."""
-    z = np.where(x[..., 2] > 1e-6, x[..., 2], np.nan)
-    u, v = x[..., 0] / z, x[..., 1] / z
-    error = np.stack([camera.fx * u + camera.cx, camera.fy * v + camera.cy], -1) - pixels
-    P = np.zeros((*z.shape, 2, 3))
-    P[..., 0, 0], P[..., 0, 2] = camera.fx / z, -camera.fx * u / z
-    P[..., 1, 1], P[..., 1, 2] = camera.fy / z, -camera.fy * v / z
-    return error, P, np.einsum("...ij,...j->...i", P, moves)
-
-
-def _rows(views: Views, state: State, bias: float, sigma: float) -> list[tuple[Floats, Floats, Floats, Floats, Bools]]:
-    """Whitened errors (f, n, 2), Jacobians by pose (f, n, 2, 6), depth and bias (f, n, 2), use: tracks, then stereo."""
-    X = views.position + (state.depth + bias)[:, None] * views.along
-    x = np.einsum("fij,nj->fni", state.R, X) + state.t[:, None]
-    moves = np.einsum("fij,nj->fni", state.R, views.along)
-    error, P, g = _camera_errors(x, moves, views.camera, views.pixels)
-    pose = np.concatenate([P, np.einsum("fnij,fnjk->fnik", P, -cross_matrix(x))], -1)
-    found = [(error / sigma, pose / sigma, g / sigma, g / sigma, views.seen & np.isfinite(error).all(-1))]
-    use = np.isfinite(views.right_sigma)
-    if use.any():
-        found.append(_stereo_rows(views, bias, x[-1], moves[-1], use))
-    return found
-
-
-def _stereo_rows(
-    views: Views, bias: float, x: Floats, moves: Floats, use: Bools
-) -> tuple[Floats, Floats, Floats, Floats, Bools]:
-    """Disparities (along their epipolar lines) of the last frame's pair: only its right minus its left image counts."""
-    T, pixels = views.rig.T_right_left, views.pixels[-1]
-    left, P, g = _camera_errors(x, moves, views.camera, pixels)
-    right, Q, h = _camera_errors(x @ T.rotation.T + T.translation, moves @ T.rotation.T, views.rig.right, views.right)
-    rays = (x / np.where(x[:, 2:] > 0, x[:, 2:], np.nan)) @ T.rotation.T
-    _, _, slope = _camera_errors(x @ T.rotation.T + T.translation, rays, views.rig.right, views.right)
-    unit = slope / np.linalg.norm(slope, axis=-1, keepdims=True)
-    s = np.where(use, views.right_sigma, 1.0)
-    change = Q @ T.rotation - P
-    by_pose = np.concatenate([change, np.einsum("nij,njk->nik", change, -cross_matrix(x))], -1)
-    error = ((right - left) * unit).sum(-1) - bias
-    by_depth = ((h - g) * unit).sum(-1)
-    none = np.zeros_like(error)
-    good = use & np.isfinite(error)
-    rows = (
-        np.stack([error / s, none], -1),
-        np.stack([np.einsum("ni,nij->nj", unit, by_pose) / s[:, None], np.zeros((len(s), 6))], 1),
-        np.stack([by_depth / s, none], -1),
-        np.stack([(by_depth - 1.0) / s, none], -1),
-    )
-    return rows[0][None], rows[1][None], rows[2][None], rows[3][None], good[None]
-
-
-def cost_of(views: Views, state: State, bias: float, sigma: float) -> float:
-    """Huber's cost of a segment with its depths' priors (that of the bias is the window's)."""
-    total = 0.5 * float(((state.depth / views.sigma) ** 2).sum())
-    for error, _, _, _, use in _rows(views, state, bias, sigma):
-        norm = np.sqrt((error**2).sum(-1))[use]
-        total += float(np.where(norm <= HUBER, 0.5 * norm**2, HUBER * norm - 0.5 * HUBER**2).sum())
-    return total
-
-
-def _normal(views: Views, state: State, bias: float, sigma: float) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-    """``A`` (p, p), ``B`` (p, n), ``d`` (n,), gradients (p,) and (n,): p of the poses and the bias, n depths."""
-    m, n = len(state.R), len(state.depth)
-    A, B, d = np.zeros((6 * m + 1, 6 * m + 1)), np.zeros((6 * m + 1, n)), views.sigma**-2.0
-    ga, gd = np.zeros(6 * m + 1), state.depth * d
-    for k, (error, pose, depth, common, use) in enumerate(_rows(views, state, bias, sigma)):
-        norm = np.sqrt((np.where(use[..., None], error, 0.0) ** 2).sum(-1))
-        w = np.where(use, HUBER / np.maximum(norm, HUBER), 0.0)
-        error, pose, depth, common = (
-            np.where(use.reshape(*use.shape, *[1] * (a.ndim - 2)), a, 0.0) for a in (error, pose, depth, common)
-        )
-        for f in range(len(error)):
-            at = slice(6 * (m - 1), 6 * m) if k else slice(6 * f, 6 * f + 6)
-            J, c, g, e = pose[f], common[f], depth[f], error[f]
-            wJ, wc = J * w[f][:, None, None], c * w[f][:, None]
-            A[at, at] += np.einsum("nia,nib->ab", wJ, J)
-            A[at, -1] += np.einsum("nia,ni->a", wJ, c)
-            A[-1, -1] += (wc * c).sum()
-            B[at] += np.einsum("nia,ni->an", wJ, g)
-            B[-1] += (wc * g).sum(-1)
-            ga[at] += np.einsum("nia,ni->a", wJ, e)
-            ga[-1] += (wc * e).sum()
-            d = d + w[f] * (g**2).sum(-1)
-            gd = gd + w[f] * (g * e).sum(-1)
-    A[-1, :-1] = A[:-1, -1]
-    return A, B, d, ga, gd
-
-
-def adjust(segments: Sequence[tuple[Views, State]], params: RefineParams) -> tuple[list[State], float, float, float]:
-    """Minimise the cost of some segments with one bias; states, bias (pixels), cost before and after."""
-    prior, sigma = 1.0 / max(params.bias_sigma, 1e-4) ** 2, params.pixel_sigma
-    views, states = [v for v, _ in segments], [s for _, s in segments]
-    bias, damping = 0.0, FIRST_DAMPING
-
-    def cost(at: Sequence[State], b: float) -> float:
-        return 0.5 * prior * b * b + sum(cost_of(v, s, b, sigma) for v, s in zip(views, at, strict=True))
-
-    first = now = cost(states, bias)
-    for _ in range(params.iterations):
-        parts = [_normal(v, s, bias, sigma) for v, s in zip(views, states, strict=True)]
-        while damping < MOST_DAMPING:
-            step_bias, steps = _step(parts, prior, bias, damping)
-            ahead = [s.moved(pose, depth) for s, (pose, depth) in zip(states, steps, strict=True)]
-            then = cost(ahead, bias + step_bias)
-            if then < now:
-                break
-            damping *= 10.0
-        else:
-            break
-        finished = now - then <= 1e-9 * now
-        states, bias, now, damping = ahead, bias + step_bias, then, max(0.1 * damping, 1e-12)
-        if finished:
-            break
-    return states, bias, first, now
-
-
-def _step(
-    parts: Sequence[tuple[Floats, Floats, Floats, Floats, Floats]], prior: float, bias: float, damping: float
-) -> tuple[float, list[tuple[Floats, Floats]]]:
-    """Damped steps: of the bias, and of poses (frame, 6) and depths (n,) of each segment."""
-    corner, right, kept = prior * (1.0 + damping), -prior * bias, []
-    for A, B, d, ga, gd in parts:
-        d = d * (1.0 + damping)
-        S = A + damping * np.diag(np.diag(A)) - (B / d) @ B.T
-        r = -(ga - B @ (gd / d))
-        solved = np.linalg.solve(S[:-1, :-1], np.column_stack([S[:-1, -1], r[:-1]]))
-        corner += S[-1, -1] - S[-1, :-1] @ solved[:, 0]
-        right += r[-1] - S[-1, :-1] @ solved[:, 1]
-        kept.append((solved, B, d, gd))
-    common = right / corner
-    steps = []
-    for solved, B, d, gd in kept:
-        pose = np.append(solved[:, 1] - common * solved[:, 0], common)
-        steps.append((pose[:-1].reshape(-1, 6), -(gd + B.T @ pose) / d))
-    return float(common), steps
 
 
 def views_of(
@@ -259,21 +59,26 @@ def views_of(
     if not len(which):
         return None
     points = np.asarray(track["points"], dtype=np.float64)[which]
-    known, pixels = landmarks.take(which), np.swapaxes(points[:, frames], 0, 1)
+    known, pixels = landmarks.take(which), np.ascontiguousarray(np.swapaxes(points[:, frames], 0, 1))
     right, sigma = np.full((len(which), 2), np.nan), np.full(len(which), np.nan)
     if after is not None and params.stereo and frames[-1] == len(poses) - 1:
         right, sigma = _stereo(pixels[-1], inlier[which, frames[-1]], after, params)
     T = [RigidTransform.from_matrix(poses[j]).inverse() for j in frames]
     state = State(np.array([p.rotation for p in T]), np.array([p.translation for p in T]), np.zeros(len(which)))
-    seen = inlier[which][:, frames].T
-    views = Views(
-        known.position, known.per_pixel, np.maximum(known.sigma, 1e-3), pixels, seen, right, sigma, rig.left, rig
-    )
+    seen = np.ascontiguousarray(inlier[which][:, frames].T)
+    camera, tilt = rig.left, _tilt_pattern(known.position, RigidTransform.from_matrix(poses[0]), rig)
+    held = np.maximum(known.sigma, 1e-3)
+    views = Views(known.position, known.per_pixel, held, pixels, seen, right, sigma, camera, rig, tilt)
     if np.isfinite(sigma).any():  # what disagrees altogether lies on another surface
-        error, _, _, _, use = _rows(views, state, 0.0, params.pixel_sigma)[1]
-        bad = ~(use[0] & (np.sqrt((error[0] ** 2).sum(-1)) < AGREES))
-        views.right_sigma[bad] = np.nan
+        error, *_, use = stereo_rows(views, state, 0.0)
+        views.right_sigma[~(use & (np.abs(error) < AGREES))] = np.nan
     return views, state, frames
+
+
+def _tilt_pattern(position: Floats, T_local_key: RigidTransform, rig: Rig) -> Floats:
+    """Pixels (n,) along its line that a landmark's right image moves for a radian across it: ``f x y``."""
+    x, y, z = rig.T_right_left.apply(T_local_key.inverse().apply(position)).T
+    return np.asarray(np.where(z > 0, rig.right.fx * x * y / np.where(z > 0, z, 1.0) ** 2, 0.0))
 
 
 def _stereo(pixels: Floats, use: Bools, after: Bundle, params: RefineParams) -> tuple[Floats, Floats]:
@@ -293,28 +98,96 @@ def _run(params: RefineParams, args: Mapping[str, Any], inputs: Inputs) -> Bundl
         )
     disparity = {int(k): b for k, b in zip(args["pairs"], inputs["disparities"], strict=True)}
     rigs = {int(k): Rig.from_dict(b.meta["rig"]) for k, b in zip(args["pairs"], inputs["rigs"], strict=True)}
-    found: list[Segment | None] = []
+    given: list[_Given] = []
     poses: list[Floats] = []
     for track, resection, level in zip(inputs["tracks"], inputs["resections"], inputs["levels"], strict=True):
         frames = [int(f) for f in track.meta["frames"]]
         rig, T = rigs[frames[0]], RigidTransform.from_matrix(level.meta["T_local_left"])
         points = np.asarray(track["points"])[:, 0].astype(np.float64)
         landmarks = coordinates(points, {"disparity": disparity[frames[0]]}, rig, T, resect)
-        found.append(views_of(track, resection, landmarks, rig, disparity.get(frames[-1]), params))
+        given.append(_Given(track, resection, landmarks, rig, disparity.get(frames[-1])))
         poses.append(np.array(resection["poses"], dtype=np.float64))
+    found = [views_of(g.track, g.resection, g.landmarks, g.rig, g.after, params) for g in given]
+    facts, states = _adjusted(found, poses, params)
+    tilt, sigma = 0.0, float("inf")
+    if params.tilt_sigma_deg > 0:
+        tilt, sigma = common_tilt([(one[0], *states[k]) for k, one in enumerate(found) if one is not None], params)
+    undone = abs(tilt) > params.tilt_significance * sigma
+    if undone:
+        again = [
+            None if one is None else (one[0].without_tilt(tilt), states[k][0], one[2]) for k, one in enumerate(found)
+        ]
+        _adjusted(again, poses, params)
+        judged = [_anew(*pair, tilt, resect, params) for pair in zip(given, poses, strict=True)]
+        facts, _ = _adjusted(judged, poses, params)
+    same = sum(f["cost_after"] >= f["cost_before"] for f in facts)
+    words = [f"refinement lowers the residuals of {same} of {len(facts)} windows no further: they stay as resected"]
+    meta: dict[str, Any] = {"frames": [len(p) for p in poses], "adjustments": facts, "notes": words if same else []}
+    if math.isfinite(sigma):
+        meta["tilt"] = {"deg": math.degrees(tilt), "sigma_deg": math.degrees(sigma), "undone": undone}
+    if undone:
+        meta["warnings"] = [_tilted(tilt, sigma, next(iter(rigs.values())))]
+    return Bundle({"poses": np.concatenate(poses)}, meta)
+
+
+@dataclass(frozen=True)
+class _Given:
+    """What :func:`views_of` wants of a segment."""
+
+    track: Bundle
+    resection: Bundle
+    landmarks: Landmarks
+    rig: Rig
+    after: Bundle | None
+
+
+def _anew(given: _Given, poses: Floats, tilt: float, resect: ResectParams, params: RefineParams) -> Segment | None:
+    """A segment without the tilt, its landmarks judged once more by poses: the tilt had made good ones inconsistent."""
+    tracked = np.isfinite(np.asarray(given.track["points"])).all(-1)
+    resection = Bundle({"poses": poses, "inlier": tracked.astype(np.uint8)}, {})
+    one = views_of(given.track, resection, given.landmarks, given.rig, given.after, params)
+    if one is None:
+        return None
+    (views, state, rows), most = one, resect.threshold / resect.pixel_sigma
+    views = views.without_tilt(tilt)
+    for f in range(len(rows)):
+        seen = Observations(
+            views.position[None],
+            views.along[None],
+            views.sigma[None],
+            views.pixels[f : f + 1],
+            views.camera,
+            resect.pixel_sigma,
+            resect.bias_sigma,
+        )
+        views.seen[f] &= norms(seen, Poses(state.R[f : f + 1], state.t[f : f + 1], np.zeros(1)))[0] <= most
+    return views, state, rows
+
+
+def _tilted(tilt: float, sigma: float, rig: Rig) -> str:
+    return (
+        f"the tracks contradict the disparities: {math.degrees(abs(tilt)):.2f} +- {math.degrees(sigma):.2f} degrees of"
+        f" pitch stand for a principal point that is {abs(tilt) * rig.right.fy:.1f} rows off; undone in the trajectory,"
+        " not in elevations: calibrate anew"
+    )
+
+
+def _adjusted(
+    found: Sequence[Segment | None], poses: list[Floats], params: RefineParams
+) -> tuple[list[dict[str, float]], dict[int, tuple[State, float]]]:
+    """Windows adjusted, ``poses`` written to; facts of the windows, and state and bias of each segment."""
     facts: list[dict[str, float]] = []
+    last: dict[int, tuple[State, float]] = {}
     for group, kept in _windows([k for k, one in enumerate(found) if one is not None], params.window):
         parts = [one for k in group if (one := found[k]) is not None]
         states, bias, before, after = adjust([(views, state) for views, state, _ in parts], params)
         for k, (_, _, rows), state in zip(group, parts, states, strict=True):
             if k in kept:
+                last[k] = state, bias
                 for row, R, t in zip(rows, state.R, state.t, strict=True):
                     poses[k][row] = RigidTransform(R, t).inverse().matrix34
         facts.append({"bias_px": bias, "cost_before": before, "cost_after": after})
-    same = sum(f["cost_after"] >= f["cost_before"] for f in facts)
-    words = [f"refinement lowers the residuals of {same} of {len(facts)} windows no further: they stay as resected"]
-    meta = {"frames": [len(p) for p in poses], "adjustments": facts, "notes": words if same else []}
-    return Bundle({"poses": np.concatenate(poses)}, meta)
+    return facts, last
 
 
 def _windows(segments: list[int], window: int) -> list[tuple[list[int], list[int]]]:

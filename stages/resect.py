@@ -190,7 +190,7 @@ def _robust_start(
     the score. Each prediction competes with samples of four landmarks that are adjusted from it.
     """
     n = obs.landmarks.shape[1]
-    samples = np.argsort(rng.random((params.hypotheses, n)), axis=1, kind="stable")[:, :SAMPLE]
+    samples = _draw(rng, params.hypotheses, n)
     every, sampled = np.ones(samples.shape, bool), obs.take(samples)
     candidates = []
     for prediction in predictions:
@@ -209,6 +209,14 @@ def _robust_start(
         if active.sum() >= SAMPLE:
             best, _ = levenberg_marquardt(obs, best, active, 10, tolerance=1e-6)
     return best, norms(obs, best)[0] <= bound
+
+
+def _draw(rng: np.random.Generator, count: int, n: int) -> NDArray[np.intp]:
+    """``count`` samples of :data:`SAMPLE` different numbers below n."""
+    drawn = rng.random((count, n))
+    least = np.argpartition(drawn, SAMPLE - 1, axis=1)[:, :SAMPLE]
+    order = np.argsort(np.take_along_axis(drawn, least, axis=1), axis=1)
+    return np.take_along_axis(least, order, axis=1)
 
 
 def _repeat(poses: Poses, count: int) -> Poses:

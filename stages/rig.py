@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from stages.adjustment import LEAST_MATCHES, RIG, Matches, adjust, rms, solution
+from stages.adjustment import LEAST_MATCHES, RIG, Linear, Matches, adjust, rms, solution
 from stages.declare import Bundle, Inputs, Stage
 from stages.epipolar import NAMES, corrected, distances
 from stages.errors import InputError
@@ -33,7 +33,7 @@ from stages.orientation import misalignment
 
 Floats = NDArray[np.float64]
 
-MOST_MATCHES = 20_000
+MOST_MATCHES = 10_000
 """Of all pairs together: beyond, systematic errors rule."""
 
 LEAST_OF_A_PAIR = 200
@@ -100,7 +100,7 @@ def _judged(given: Rig, pairs: list[Matches], params: RigParams) -> dict[str, An
     decision = decide(given, pairs, params)
     applied = params.mode != "fixed" and decision.changed
     rig = corrected(given, decision.correction) if applied else given
-    per_pair = [_alone(given, m, decision, params) for m in pairs]
+    per_pair = [_alone(given, m, one, decision, params) for m, one in zip(pairs, decision.start, strict=True)]
     share = impossible_share(rig, pairs, decision.fit)
     if share > SWAPPED:
         raise InputError(
@@ -133,12 +133,12 @@ def _share(pairs: list[Matches]) -> list[Matches]:
     return [Matches(m.pair, m.left[::s], m.right[::s]) for m, s in zip(pairs, steps, strict=True)]
 
 
-def _alone(given: Rig, matches: Matches, decision: Decision, params: RigParams) -> dict[str, Any]:
+def _alone(given: Rig, matches: Matches, start: Linear, decision: Decision, params: RigParams) -> dict[str, Any]:
     """One pair's own values and sigmas, degrees, of all that the sequence observes."""
     names = [p.name for p in decision.parameters if p.observed]
     free = [p.observed for p in decision.parameters]
     beliefs = params.beliefs(given)
-    fit = adjust(given, [matches], free, beliefs, rival=False)
+    fit = adjust(given, [matches], free, beliefs, rival=False, start=[start])
     sigma = np.sqrt(np.diag(solution(fit, free, beliefs, rival=False)[1]))
     return {
         "pair": matches.pair,

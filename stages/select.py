@@ -37,7 +37,8 @@ class SelectParams(Params):
     preset: Literal["terrain", "navigation"] = Field(
         "terrain",
         description="terrain: close pairs, so that elevation models share ground; navigation: rule overlap with 0.6,"
-        " fewer pairs to match for the trajectory alone. What is given beside it wins, but for a mere stride",
+        " fewer pairs to match for the trajectory alone, those with hfvm.preset fast; and motion.level, track.points,"
+        " orientation.samples are cheaper. What is given beside it wins, but for a mere stride",
     )
     rule: Literal["overlap", "stride"] = Field(
         "overlap", description="overlap: as far apart as the wanted overlap permits; stride: evenly, as in the paper"

@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
+from benchmarks.odometry.limits import lines
 from benchmarks.odometry.measures import judge
 from benchmarks.odometry.opencv import Odometry
 from stages.declare import Bundle
@@ -33,6 +34,42 @@ def test_a_lost_frame_takes_two_motions_with_it():
     found = judge(estimate, straight())
     assert found["lost"] == 1
     assert found["one_frame"] == pytest.approx(0.0, abs=1e-12)
+
+
+def figures(method, **changes):
+    plain = {"lost": 0.0, "one_frame": 0.01, "drift": 0.9, "rmse_first": 0.02, "processor": 200.0}
+    return {"method": method, **plain, **changes}
+
+
+def test_limits_are_those_of_the_same_run():
+    run = [
+        figures("OpenCV odometry", one_frame=0.0125),
+        figures("Rille default", processor=201.0),
+        figures("Rille navigation", one_frame=0.0119, rmse_first=0.03, processor=99.0),
+        figures("COLMAP", rmse_first=0.02, processor=1000.0),
+    ]
+    kept = {line.what: line.kept for line in lines("somewhere/kitti06_51", run)}
+    assert kept == {
+        "Rille default: frames lost": True,
+        "Rille default: error of one frame, mm": True,
+        "Rille default: drift, %": True,
+        "Rille default: error of one frame against OpenCV's": True,  # 0.8
+        "Rille default: processor time against OpenCV's": False,
+        "Rille default: RMSE of the first frames against COLMAP's": True,
+        "Rille default: processor time against COLMAP's": False,
+        "Rille navigation: frames lost": True,
+        "Rille navigation: error of one frame, mm": False,
+        "Rille navigation: drift, %": True,
+        "Rille navigation: error of one frame against OpenCV's": False,  # 0.952
+        "Rille navigation: processor time against OpenCV's": True,
+        "Rille navigation: RMSE of the first frames against COLMAP's": False,
+        "Rille navigation: processor time against COLMAP's": True,
+    }
+
+
+def test_elsewhere_and_alone_there_are_fewer_limits_and_a_missing_figure_keeps_none():
+    alone = lines("mockup-short", [figures("Rille default", lost=float("nan"))])
+    assert [(line.what, line.kept) for line in alone] == [("Rille default: frames lost", False)]
 
 
 class Drive:

@@ -108,6 +108,7 @@ STALE: dict[str, set[str]] = {
     **{key: set() for key in ("drive", "global_fix", "leg", "pad", "reflex", "safety")},
 }
 EXCEPTIONS: dict[str, set[str]] = {
+    "select.preset": {"orientation"} | RIG | MOVED,  # navigation sets parameters of other stages, too
     "locus.both": {"hfvm/back"} | LOCAL | MISSION,  # the other direction is matched as well
     "terrain.preset": {"hfvm/back"} | LOCAL | MISSION,  # the matcher's preset is given here, and stays
     "refine.enabled": REFINED - {"refine"},  # without it there is less to compute

@@ -123,6 +123,7 @@ def find_warnings(scene: Scene) -> list[str]:
     for handle in (
         p.continuity,
         p.select,
+        p.refined,
         *p.crosschecks,
         p.crosscheck,
         p.agreement,

@@ -31,6 +31,21 @@ def test_one_setting_makes_terrain_accurate_and_what_is_given_beside_it_wins() -
         config.build({"terrain": {"preset": "best"}})
 
 
+def test_navigation_matches_fast_unless_told_otherwise(tmp_path: Path) -> None:
+    assert config.build({}).hfvm.preset == "default"
+    built = config.build(config.parse_assignments(["select.preset=navigation"]))
+    assert (built.hfvm.preset, built.hfvm.finest, built.select.overlap) == ("fast", 1, 0.6)
+    assert (built.motion.level, built.track.points) == (3, 200)
+    assert config.build(config.parse_assignments(["select.preset=navigation", "track.points=300"])).track.points == 300
+    for given in ("hfvm.preset=default", "hfvm.preset=accurate"):
+        kept = config.build(config.parse_assignments(["select.preset=navigation", given]))
+        assert kept.hfvm == config.build(config.parse_assignments([given])).hfvm
+    assert config.build(config.parse_assignments(["select.preset=navigation", "hfvm.finest=0"])).hfvm.finest == 0
+    path = tmp_path / "config.toml"
+    path.write_text(config.to_toml(built))
+    assert config.build(config.read_toml(path)) == built
+
+
 def test_unknown_key_names_the_nearest() -> None:
     with pytest.raises(ConfigError, match=r"unknown key 'select\.strid'.*did you mean 'select\.stride'"):
         config.build(config.parse_assignments(["select.strid=2"]))

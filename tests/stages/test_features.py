@@ -97,8 +97,10 @@ def test_distance_of_words_is_the_sum_of_absolute_byte_differences():
     assert out[0] == 8 * 255
 
 
-def test_words_of_inner_pixels_are_those_of_the_whole():
-    batch = (255 * np.random.default_rng(4).random((3, 20, 22))).astype(np.float32)
-    inner = features.pack_inner(batch, WEIGHTS)
+def test_words_of_rows_are_those_of_the_whole():
+    image = (255 * np.random.default_rng(4).random((20, 22))).astype(np.float32)
     r = features.RADIUS
-    np.testing.assert_array_equal(inner, features.pack_batch(batch, WEIGHTS)[0][:, r:-r, r:-r])
+    words, deviation = np.empty((8, 10), np.uint64), np.empty((8, 10), np.float32)
+    scale = np.asarray(WEIGHTS, np.float32) * np.float32(features.STEPS_PER_UNIT)
+    features.pack_rows(image, 0, scale, words, deviation)
+    np.testing.assert_array_equal(words, features.pack(image, WEIGHTS)[0][r:-r, r:-r])

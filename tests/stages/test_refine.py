@@ -9,8 +9,9 @@ from stages.declare import Bundle, check_outputs
 from stages.errors import ConfigError
 from stages.geometry import Camera, Rig, RigidTransform, rotation_exp
 from stages.landmarks import landmarks_from_disparity
-from stages.refine import STAGE, RefineParams, State, Views, _normal, adjust, cost_of, views_of
+from stages.refine import STAGE, _tilt_pattern, views_of
 from stages.resect import ResectParams
+from stages.segment_adjustment import RefineParams, State, Views, adjust, common_tilt, cost_of, normal
 
 CAMERA = Camera(500.0, 500.0, 299.5, 199.5, 600, 400)
 RIG = Rig(CAMERA, CAMERA, RigidTransform(np.eye(3), np.array([-0.2, 0.0, 0.0])))
@@ -47,6 +48,7 @@ def scene(seed, n=150, frames=4, bias=0.0, noise=0.2, stereo=True):
         sigma,
         CAMERA,
         RIG,
+        500.0 * np.prod(CAMERA.rays(key)[:, :2], axis=1),
     )
     start = [P @ RigidTransform(rotation_exp(1e-4 * rng.standard_normal(3)), 3e-3 * rng.standard_normal(3)) for P in T]
     return views, State(np.array([P.rotation for P in start]), np.array([P.translation for P in start]), np.zeros(n)), T
@@ -65,7 +67,7 @@ def error_of(state, T):
 def test_gradient_is_that_of_the_cost():
     views, state, _ = scene(1, n=20)
     state = replace(state, depth=np.linspace(-0.3, 0.3, 20))
-    _, _, _, pose, depth = _normal(views, state, 0.0, 0.2)
+    _, _, _, pose, depth = normal(views, state, 0.0, 0.2)
     base = np.zeros((3, 6))
 
     def cost(step, depths=0.0, bias=0.0):
@@ -114,6 +116,76 @@ def test_the_cost_never_rises_and_an_optimum_stays():
     (again,), _, before, after = adjust([(views, state)], RefineParams(iterations=1, stereo=True))
     assert after <= before
     np.testing.assert_allclose(again.t, state.t, atol=1e-4)
+
+
+def tilted(seed, tilt, frames=4):
+    """Views whose landmarks lie where disparities put them that are tilted by so many radians, adjusted once."""
+    views, start, T = scene(seed, n=120, frames=frames, noise=0.05, stereo=False)
+    views = replace(views, sigma=np.full(120, 0.2)).without_tilt(-tilt)
+    (state,), bias, _, _ = adjust([(views, start)], PARAMS)
+    return views, state, bias, T
+
+
+def test_a_tilt_of_all_disparities_is_found_by_many_segments_and_undone():
+    parts = [tilted(60 + k, 0.004) for k in range(12)]
+    tilt, sigma = common_tilt([part[:3] for part in parts], PARAMS)
+    assert tilt == pytest.approx(0.004, abs=4 * sigma)
+    assert sigma < 0.001
+    errors = []
+    for views, state, _, T in parts:
+        (again,), *_ = adjust([(views.without_tilt(tilt), state)], PARAMS)
+        errors.append([error_of(state, T), error_of(again, T)])
+    before, after = np.sqrt(np.mean(np.square(errors), axis=0))
+    assert after < 0.8 * before
+
+
+def test_a_tilt_that_is_not_there_is_not_believed():
+    parts = [tilted(90 + k, 0.0)[:3] for k in range(12)]
+    tilt, sigma = common_tilt(parts, PARAMS)
+    assert abs(tilt) < PARAMS.tilt_significance * sigma
+    # Two segments say nothing of their scatter.
+    assert common_tilt(parts[:2], PARAMS) == (0.0, float("inf"))
+
+
+def test_the_stage_undoes_a_tilt_and_says_so():
+    def stage(tilt):
+        """Ten segments of three frames ahead of a wall; each right image as a camera turned by ``tilt`` has it."""
+        one = bundles()
+        rows, cols = np.mgrid[0:400, 0:600]
+        x, y = (cols - 299.5) / 500.0, (rows - 199.5) / 500.0
+        for k, depth in enumerate((4.0, 3.8)):
+            bent = -500.0 * 0.2 / depth + tilt * 500.0 * (x - 0.2 / depth) * y
+            one["disparities"][k] = Bundle({**one["disparities"][k].arrays, "column_disparity": np.float32(bent)}, {})
+        rng, many = np.random.default_rng(8), {}
+        many["tracks"] = []
+        for _ in range(10):
+            points = np.asarray(one["tracks"][0]["points"]) + 0.1 * rng.standard_normal((80, 3, 2))
+            many["tracks"].append(Bundle({"points": points.astype(np.float32)}, {"frames": [0, 1, 2]}))
+        many |= {"resections": one["resections"] * 10, "levels": one["levels"] * 10}
+        args = {"pairs": [0, 2], "resect": ResectParams().model_dump(mode="json")}
+        return STAGE.run(RefineParams(), args, one | many)
+
+    plain, bent = stage(0.0), stage(0.006)
+    assert not plain.meta["tilt"]["undone"]
+    assert "warnings" not in plain.meta
+    assert bent.meta["tilt"]["undone"]
+    assert np.radians(abs(bent.meta["tilt"]["deg"])) == pytest.approx(0.006, rel=0.2)
+    assert "degrees of pitch stand for a principal point" in bent.meta["warnings"][0]
+    straight = np.arange(3) * 0.1
+    off = [np.abs(np.asarray(out["poses"])[:, 2, 3].reshape(10, 3) - straight).max() for out in (plain, bent)]
+    assert off[1] < 3 * off[0] + 0.002
+
+
+def test_the_pattern_of_a_tilt_is_what_a_turned_camera_and_a_moved_row_make():
+    X = np.random.default_rng(3).uniform([-2.0, -1.0, 3.0], [2.0, 1.0, 6.0], (50, 3))
+    theta = 1e-5
+    turned = CAMERA.project(RIG.T_right_left.apply(X) @ rotation_exp([theta, 0.0, 0.0]).T)
+    straight = CAMERA.project(RIG.T_right_left.apply(X))
+    pattern = _tilt_pattern(X, RigidTransform.identity(), RIG)
+    np.testing.assert_allclose(np.abs(turned - straight)[:, 0] / theta, np.abs(pattern), rtol=1e-3, atol=1e-2)
+    # The whole of it is one sign: a tilt of either sign fits.
+    sign = np.sign((turned - straight)[:, 0] * pattern)
+    assert np.all(sign[np.abs(pattern) > 1.0] == sign[np.abs(pattern) > 1.0][0])
 
 
 def bundles(tracks_of_last=True):
