@@ -3,7 +3,7 @@
 The window is a regular octagon rather than a square, since the highest minus the lowest height of a plane over a square
 is larger by a factor of 1.41 on the diagonal; over the octagon it is by at most 1.10 (:func:`octagon`), nowhere smaller
 than along an axis. An octagon is a square widened along both diagonals, so its running maximum is four running maxima
-along lines, each by doubling (van Herk's result at about as many comparisons a cell, all of them of whole rows).
+along lines, each by tripling or more (van Herk's result at about as many comparisons a cell, all of whole rows).
 
 Everything here commutes with any rising function of the heights: where relief is made greater, every difference of two
 of these results is (the argument is in :mod:`stages.hazards`).
@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 
 Floats32 = NDArray[np.float32]
 
-BAND = 128
-"""Rows worked on at a time: with the window's own they stay in a cache of 1 MB up to widths of 1500 cells."""
+BAND, STRIP = 128, 512
+"""Rows and columns worked on at a time: with what a window looks at they stay in a cache of 0.5 MB, and as many lines
+as make one in a pass in a cache of 32 kB."""
 
 
 def octagon(reach: int) -> tuple[int, int]:
@@ -69,66 +70,81 @@ def _running_max(z, f, side, diagonal, out):  # type: ignore[no-untyped-def]
     """``f`` times the maximum of ``f`` times z."""
     rows, cols = z.shape
     reach = side + 2 * diagonal
-    buffer, spare = _room(cols, reach)
+    width = _strip(cols)
+    buffer, spare = _room(width, reach)
     for start in range(0, rows, BAND):
         stop = min(start + BAND, rows)
-        n = _fill(z, f, start - reach, stop + reach, 2 * reach, buffer)
-        _widen(buffer, n, spare, side, diagonal)
-        first = 2 * reach - side
-        for i in range(stop - start):
-            target, line = out[start + i], buffer[i, first:]
-            for c in range(cols):
-                target[c] = f * line[c]
+        for k in range(-(-cols // width)):
+            left = min(k * width, cols - width)
+            n = _fill(z, f, start - reach, stop + reach, left - reach, buffer)
+            _widen(buffer, n, spare, side, diagonal)
+            for i in range(stop - start):
+                target, line = out[start + i, left : left + width], buffer[i, reach - side : reach - side + width]
+                for c in range(width):
+                    target[c] = f * line[c]
 
 
 @njit(cache=True, nogil=True)
 def _relief(z, side, diagonal, more, steps, small, large):  # type: ignore[no-untyped-def]
-    """Of a band the highest values are written first, and the lowest ones taken from them."""
+    """Of a strip the highest values are written first, and the lowest ones taken from them."""
     rows, cols = z.shape
     near, added = side + 2 * diagonal, more + 2 * steps
     reach = near + added
-    buffer, spare = _room(cols, reach)
+    width = _strip(cols)
+    buffer, spare = _room(width, reach)
     for start in range(0, rows, BAND):
         stop = min(start + BAND, rows)
-        for sign in (1.0, -1.0):
-            n = _fill(z, np.float32(sign), start - reach, stop + reach, 2 * reach, buffer)
-            n = _widen(buffer, n, spare, side, diagonal)
-            _emit(buffer[added:], 2 * reach - side, sign > 0, small[start:stop])
-            _widen(buffer, n, spare, more, steps)
-            _emit(buffer, 2 * reach - side - more, sign > 0, large[start:stop])
+        for k in range(-(-cols // width)):
+            left = min(k * width, cols - width)
+            for sign in (1.0, -1.0):
+                n = _fill(z, np.float32(sign), start - reach, stop + reach, left - reach, buffer)
+                n = _widen(buffer, n, spare, side, diagonal)
+                _emit(buffer[added:], reach - side, sign > 0, small[start:stop], left, width)
+                _widen(buffer, n, spare, more, steps)
+                _emit(buffer, reach - side - more, sign > 0, large[start:stop], left, width)
 
 
 @njit(cache=True, nogil=True)
-def _emit(buffer, first, highest, out):  # type: ignore[no-untyped-def]
-    rows, cols = out.shape
-    for i in range(rows):
-        target, line = out[i], buffer[i, first : first + cols]
+def _emit(buffer, first, highest, out, left, width):  # type: ignore[no-untyped-def]
+    for i in range(out.shape[0]):
+        target, line = out[i, left : left + width], buffer[i, first : first + width]
         if highest:
-            for c in range(cols):
+            for c in range(width):
                 target[c] = line[c]
         else:
-            for c in range(cols):
+            for c in range(width):
                 d = target[c] + line[c]
                 target[c] = d if d > np.float32(0.0) else np.float32(0.0)
 
 
 @njit(cache=True, nogil=True)
-def _room(cols, reach):  # type: ignore[no-untyped-def]
-    """A band with room beside for all that moves along diagonals, and a line."""
-    wide = cols + 4 * reach
+def _strip(cols):  # type: ignore[no-untyped-def]
+    """Width of strips of equal width; the last one may overlap the one before, and writes the same there."""
+    return -(-cols // -(-cols // STRIP))
+
+
+@njit(cache=True, nogil=True)
+def _room(width, reach):  # type: ignore[no-untyped-def]
+    """A band with all that its cells look at, and a line."""
+    wide = width + 2 * reach
     return np.empty((BAND + 2 * reach, wide), dtype=np.float32), np.empty(wide, dtype=np.float32)
 
 
 @njit(cache=True, nogil=True)
 def _fill(z, f, first, last, left, buffer):  # type: ignore[no-untyped-def]
-    """``f`` times rows ``first`` to ``last`` of z, ``left`` columns to the right, -inf around; how many rows."""
+    """``f`` times rows ``first`` to ``last`` of z from column ``left`` on, -inf beyond its border; how many rows."""
     rows, cols = z.shape
+    wide = buffer.shape[1]
+    begin, end = max(-left, 0), min(cols - left, wide)
     for i in range(last - first):
         line = buffer[i]
-        for c in range(line.shape[0]):
+        inside = 0 <= first + i < rows
+        for c in range(begin if inside else wide):
             line[c] = -np.inf
-        if 0 <= first + i < rows:
-            _load(z[first + i], f, line[left : left + cols])
+        if inside:
+            _load(z[first + i, left + begin : left + end], f, line[begin:end])
+            for c in range(end, wide):
+                line[c] = -np.inf
     return last - first
 
 
@@ -139,7 +155,7 @@ def _widen(buffer, n, spare, side, diagonal):  # type: ignore[no-untyped-def]
     Results move up by ``side + 2 diagonal`` rows and to the left by ``side`` columns.
     """
     for i in range(n):
-        _double(buffer[i], spare, 2 * side + 1)
+        _along(buffer[i], spare, 2 * side + 1)
     n = _down(buffer, n, 2 * side + 1, 0)
     n = _down(buffer, n, 2 * diagonal + 1, 1)
     return _down(buffer, n, 2 * diagonal + 1, -1)
@@ -154,115 +170,160 @@ def _load(source, f, out):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _raise(line, other):  # type: ignore[no-untyped-def]
-    """The greater of two lines, cell by cell, in place of the first; they must not overlap, or wait for each other."""
-    for c in range(line.shape[0]):
-        a, b = line[c], other[c]
-        line[c] = a if a > b else b
+def _parts(n, w):  # type: ignore[no-untyped-def]
+    """Of how many windows of w the next wider one is made, on the way to one of n: each pass goes over all lines."""
+    more = -(-n // w)
+    return 2 if more == 2 else 3 if more == 3 or 5 < more <= 9 else 5
 
 
 @njit(cache=True, nogil=True)
-def _raise4(line, p, q, s):  # type: ignore[no-untyped-def]
-    """The greatest of four lines in place of the first."""
-    for c in range(line.shape[0]):
-        a, b, d, e = line[c], p[c], q[c], s[c]
-        a = a if a > b else b
-        d = d if d > e else e
-        line[c] = a if a > d else d
-
-
-@njit(cache=True, nogil=True)
-def _double(line, spare, n):  # type: ignore[no-untyped-def]
+def _along(line, spare, n):  # type: ignore[no-untyped-def]
     """Maximum of c .. c + n - 1 in place; the last n - 1 values are of what is left."""
-    m = line.shape[0]
-    w = 1
+    cols = line.shape[0]
+    source, target = line, spare
+    w, passes = 1, 0
     while w < n:
-        step = min(w, n - w)
-        for c in range(m):
-            spare[c] = line[c]
-        _raise(line[: m - step], spare[step:])
-        w += step
+        parts, rest = _parts(n, w), n - w
+        far = min((parts - 1) * w, rest)
+        p, q, s = min(w, rest), min(2 * w, far), min(3 * w, far)
+        m = cols - far
+        a, b, d, e = source[p : p + m], source[q : q + m], source[s : s + m], source[far:]
+        if parts < 5:
+            _highest3(source[:m], a, b, target[:m])
+        else:
+            _highest5(source[:m], a, b, d, e, target[:m])
+        for c in range(m, cols):
+            target[c] = source[c]
+        source, target = target, source
+        w += far
+        passes += 1
+    if passes % 2:
+        for c in range(cols):
+            line[c] = spare[c]
 
 
 @njit(cache=True, nogil=True)
 def _down(buffer, rows, n, slant):  # type: ignore[no-untyped-def]
-    """The same down the rows, ``slant`` columns to the right a row; returns how many rows are whole.
-
-    Windows of w rows make one of up to 4 w rows in one pass: each pass goes through the slower cache.
-    """
+    """The same down the rows, ``slant`` columns to the right a row; returns how many rows are whole."""
     cols = buffer.shape[1]
     w = 1
     while w < n:
-        s1 = min(w, n - w)
-        s2 = min(2 * w, n - w)
-        s3 = min(3 * w, n - w)
-        far = s3 * slant
-        first, last = max(0, -far), min(cols, cols - far)
-        for i in range(rows - s3):
+        parts, rest = _parts(n, w), n - w
+        far = min((parts - 1) * w, rest)
+        p, q, s = min(w, rest), min(2 * w, far), min(3 * w, far)
+        first, last = max(0, -far * slant), min(cols, cols - far * slant)
+        for i in range(rows - far):
             line = buffer[i, first:last]
-            a = buffer[i + s1, first + s1 * slant : last + s1 * slant]
-            if s3 == s1:
-                _raise(line, a)
+            a = buffer[i + p, first + p * slant : last + p * slant]
+            b = buffer[i + q, first + q * slant : last + q * slant]
+            if parts < 5:
+                _raise3(line, a, b)
                 continue
-            b = buffer[i + s2, first + s2 * slant : last + s2 * slant]
-            _raise4(line, a, b, buffer[i + s3, first + far : last + far])
-        rows -= s3
-        w += s3
+            d = buffer[i + s, first + s * slant : last + s * slant]
+            _raise5(line, a, b, d, buffer[i + far, first + far * slant : last + far * slant])
+        rows -= far
+        w += far
     return rows
 
 
 @njit(cache=True, nogil=True)
-def median3(z):  # type: ignore[no-untyped-def]
+def _highest3(p, q, s, out):  # type: ignore[no-untyped-def]
+    """The greatest of three lines, cell by cell."""
+    for c in range(out.shape[0]):
+        a, b, d = p[c], q[c], s[c]
+        a = a if a > b else b
+        out[c] = a if a > d else d
+
+
+@njit(cache=True, nogil=True)
+def _highest5(p, q, s, t, u, out):  # type: ignore[no-untyped-def]
+    """The greatest of five lines."""
+    for c in range(out.shape[0]):
+        a, b, d, e, f = p[c], q[c], s[c], t[c], u[c]
+        a = a if a > b else b
+        d = d if d > e else e
+        a = a if a > f else f
+        out[c] = a if a > d else d
+
+
+@njit(cache=True, nogil=True)
+def _raise3(line, p, q):  # type: ignore[no-untyped-def]
+    """The greatest of three lines in place of the first; they must not overlap, or wait for each other."""
+    for c in range(line.shape[0]):
+        a, b, d = line[c], p[c], q[c]
+        a = a if a > b else b
+        line[c] = a if a > d else d
+
+
+@njit(cache=True, nogil=True)
+def _raise5(line, p, q, s, t):  # type: ignore[no-untyped-def]
+    """The greatest of five lines in place of the first."""
+    for c in range(line.shape[0]):
+        a, b, d, e, f = line[c], p[c], q[c], s[c], t[c]
+        a = a if a > b else b
+        d = d if d > e else e
+        a = a if a > f else f
+        line[c] = a if a > d else d
+
+
+def median3(surface: Floats32) -> Floats32:
     """Median (row, col) of the known cells in 3 x 3; unknown stays unknown.
 
     Of an even number the upper one: the mean of two heights would not be one of the heights.
     """
-    rows, cols = z.shape
-    out = np.empty((rows, cols), dtype=np.float32)
-    for r in range(rows):
-        out[r, 0] = out[r, cols - 1] = np.nan
-        if 0 < r < rows - 1:
-            _median_row(z[r - 1], z[r], z[r + 1], out[r])
-        else:
-            out[r, :] = np.nan
-        for c in range(cols):
-            if np.isnan(out[r, c]) and not np.isnan(z[r, c]):
-                out[r, c] = _median_known(z, r, c)
+    out = np.empty(surface.shape, dtype=np.float32)
+    _median3(surface, out)
     return out
 
 
-@njit(cache=True, nogil=True, inline="always")
-def _order(a, b):  # type: ignore[no-untyped-def]
-    return (a, b) if a < b else (b, a)
+@njit(cache=True, nogil=True)
+def _median3(z, out):  # type: ignore[no-untyped-def]
+    rows, cols = z.shape
+    low, middle = np.empty(cols, dtype=np.float32), np.empty(cols, dtype=np.float32)
+    high, total = np.empty(cols, dtype=np.float32), np.empty(cols, dtype=np.float32)
+    for r in range(rows):
+        here, line, patchy = z[r], out[r], True
+        if 0 < r < rows - 1:
+            _sort_columns(z[r - 1], here, z[r + 1], low, middle, high, total)
+            patchy = _median_row(here, low, middle, high, total, line)
+        step = 1 if patchy else max(cols - 1, 1)
+        for c in range(0, cols, step):
+            if step > 1 or c == 0 or c == cols - 1 or not 0 < r < rows - 1 or np.isnan(line[c]):
+                line[c] = np.nan if np.isnan(here[c]) else _median_known(z, r, c)
 
 
 @njit(cache=True, nogil=True)
-def _median_row(up, here, down, out):  # type: ignore[no-untyped-def]
-    """Median of nine by the least exchanges (Paeth, Graphics Gems, 1990); NaN where one of the nine is."""
-    for c in range(1, here.shape[0] - 1):
-        a, b, d = up[c - 1], up[c], up[c + 1]
-        e, f, g = here[c - 1], here[c], here[c + 1]
-        h, i, j = down[c - 1], down[c], down[c + 1]
-        total = a + b + d + e + f + g + h + i + j
-        lo1, hi1 = min(a, b), max(a, b)
-        low_a = min(lo1, d)
-        high_a = max(hi1, d)
-        mid_a = max(min(hi1, d), lo1)
-        lo2, hi2 = min(e, f), max(e, f)
-        low_b = min(lo2, g)
-        high_b = max(hi2, g)
-        mid_b = max(min(hi2, g), lo2)
-        lo3, hi3 = min(h, i), max(h, i)
-        low_c = min(lo3, j)
-        high_c = max(hi3, j)
-        mid_c = max(min(hi3, j), lo3)
-        x = max(max(low_a, low_b), low_c)
-        y = min(min(high_a, high_b), high_c)
-        lo4, hi4 = min(mid_a, mid_b), max(mid_a, mid_b)
-        m = max(min(hi4, mid_c), lo4)
-        lo5, hi5 = min(x, m), max(x, m)
-        median = max(min(hi5, y), lo5)
-        out[c] = median if total == total else np.float32(np.nan)
+def _sort_columns(up, here, down, low, middle, high, total):  # type: ignore[no-untyped-def]
+    """Three heights of each column in order, and their sum, which is not known where one is not."""
+    for c in range(here.shape[0]):
+        a, b, d = up[c], here[c], down[c]
+        lo, hi = min(a, b), max(a, b)
+        low[c], high[c] = min(lo, d), max(hi, d)
+        middle[c] = max(min(hi, d), lo)
+    for c in range(here.shape[0]):
+        total[c] = up[c] + here[c] + down[c]
+
+
+@njit(cache=True, nogil=True)
+def _median_row(here, low, middle, high, total, out):  # type: ignore[no-untyped-def]
+    """Median of nine from sorted columns (Paeth, Graphics Gems, 1990), NaN where one is; whether it is where the cell
+    itself is known."""
+    n = here.shape[0] - 2
+    for c in range(1, n + 1):
+        x = max(max(low[c - 1], low[c]), low[c + 1])
+        y = min(min(high[c - 1], high[c]), high[c + 1])
+        a, b = middle[c - 1], middle[c]
+        lo, hi = min(a, b), max(a, b)
+        m = max(min(hi, middle[c + 1]), lo)
+        lo, hi = min(x, m), max(x, m)
+        out[c] = max(min(hi, y), lo)
+    some = np.int32(0)
+    for c in range(1, n + 1):
+        known = total[c - 1] + total[c] + total[c + 1]
+        whole = known == known
+        out[c] = out[c] if whole else np.float32(np.nan)
+        some += np.int32((not whole) & (here[c] == here[c]))
+    return some > 0
 
 
 @njit(cache=True, nogil=True)

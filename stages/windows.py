@@ -54,40 +54,6 @@ def _sum_down(a: Floats, n: int) -> Floats:
     return np.asarray(prefix[np.minimum(index + n // 2 + 1, rows)] - prefix[np.maximum(index - n // 2, 0)])
 
 
-def window_count(mask: Mask, n: int) -> NDArray[np.int32]:
-    """How many cells (row, col) of the window are set."""
-    out = np.empty(mask.shape, dtype=np.int32)
-    _count(np.ascontiguousarray(mask), n // 2, out)
-    return out
-
-
-@njit(cache=True, nogil=True)
-def _count(a, half, out):  # type: ignore[no-untyped-def]
-    """Columns' counts move down with the window, the count over columns along each row."""
-    rows, cols = a.shape
-    n = 2 * half + 1
-    line = np.zeros(cols + n, dtype=np.int32)  # behind the line's start and beyond its end there is nothing
-    total = line[half + 1 : half + 1 + cols]
-    for r in range(-half, rows):
-        if r + half < rows:
-            _tally(a[r + half], np.int32(1), total)
-        if r > half:
-            _tally(a[r - half - 1], np.int32(-1), total)
-        if r < 0:
-            continue
-        s = line[1:n].sum()
-        target = out[r]
-        for c in range(cols):
-            s += line[c + n] - line[c]
-            target[c] = s
-
-
-@njit(cache=True, nogil=True)
-def _tally(mask, sign, total):  # type: ignore[no-untyped-def]
-    for c in range(mask.shape[0]):
-        total[c] += sign if mask[c] else np.int32(0)
-
-
 def window_mean(a: Floats32, n: int) -> Floats32:
     """Mean (row, col) of the known cells in the window; NaN where there is none."""
     out = np.empty(a.shape, dtype=np.float32)
