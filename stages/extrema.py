@@ -77,7 +77,7 @@ def _running_max(z, f, side, diagonal, out):  # type: ignore[no-untyped-def]
         for k in range(-(-cols // width)):
             left = min(k * width, cols - width)
             n = _fill(z, f, start - reach, stop + reach, left - reach, buffer)
-            _widen(buffer, n, spare, side, diagonal)
+            _widen(buffer, n, spare, side, diagonal, 0, 0)
             for i in range(stop - start):
                 target, line = out[start + i, left : left + width], buffer[i, reach - side : reach - side + width]
                 for c in range(width):
@@ -98,9 +98,9 @@ def _relief(z, side, diagonal, more, steps, small, large):  # type: ignore[no-un
             left = min(k * width, cols - width)
             for sign in (1.0, -1.0):
                 n = _fill(z, np.float32(sign), start - reach, stop + reach, left - reach, buffer)
-                n = _widen(buffer, n, spare, side, diagonal)
+                n = _widen(buffer, n, spare, side, diagonal, 0, 0)
                 _emit(buffer[added:], reach - side, sign > 0, small[start:stop], left, width)
-                _widen(buffer, n, spare, more, steps)
+                _widen(buffer, n, spare, more, steps, side, diagonal)
                 _emit(buffer, reach - side - more, sign > 0, large[start:stop], left, width)
 
 
@@ -149,16 +149,19 @@ def _fill(z, f, first, last, left, buffer):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _widen(buffer, n, spare, side, diagonal):  # type: ignore[no-untyped-def]
+def _widen(buffer, n, spare, side, diagonal, had, slant):  # type: ignore[no-untyped-def]
     """Maximum over the square and both diagonals, of ``n`` rows; returns how many are whole.
 
-    Results move up by ``side + 2 diagonal`` rows and to the left by ``side`` columns.
+    Results move up by ``side + 2 diagonal`` rows and to the left by ``side`` columns. What is there already are maxima
+    over an octagon of ``had`` and ``slant``: no line across it is shorter than its sides, so its copies may lie as far
+    apart as these are long.
     """
+    straight, oblique = 2 * had + 1, 2 * slant + 1
     for i in range(n):
-        _along(buffer[i], spare, 2 * side + 1)
-    n = _down(buffer, n, 2 * side + 1, 0)
-    n = _down(buffer, n, 2 * diagonal + 1, 1)
-    return _down(buffer, n, 2 * diagonal + 1, -1)
+        _along(buffer[i], spare, straight, straight + 2 * side)
+    n = _down(buffer, n, straight, straight + 2 * side, 0)
+    n = _down(buffer, n, oblique, oblique + 2 * diagonal, 1)
+    return _down(buffer, n, oblique, oblique + 2 * diagonal, -1)
 
 
 @njit(cache=True, nogil=True)
@@ -177,11 +180,11 @@ def _parts(n, w):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _along(line, spare, n):  # type: ignore[no-untyped-def]
-    """Maximum of c .. c + n - 1 in place; the last n - 1 values are of what is left."""
+def _along(line, spare, w, n):  # type: ignore[no-untyped-def]
+    """Maxima of windows of w made such of windows of n, in place; the last n - w values are of what is left."""
     cols = line.shape[0]
     source, target = line, spare
-    w, passes = 1, 0
+    passes = 0
     while w < n:
         parts, rest = _parts(n, w), n - w
         far = min((parts - 1) * w, rest)
@@ -203,10 +206,9 @@ def _along(line, spare, n):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _down(buffer, rows, n, slant):  # type: ignore[no-untyped-def]
+def _down(buffer, rows, w, n, slant):  # type: ignore[no-untyped-def]
     """The same down the rows, ``slant`` columns to the right a row; returns how many rows are whole."""
     cols = buffer.shape[1]
-    w = 1
     while w < n:
         parts, rest = _parts(n, w), n - w
         far = min((parts - 1) * w, rest)
@@ -281,15 +283,20 @@ def _median3(z, out):  # type: ignore[no-untyped-def]
     rows, cols = z.shape
     low, middle = np.empty(cols, dtype=np.float32), np.empty(cols, dtype=np.float32)
     high, total = np.empty(cols, dtype=np.float32), np.empty(cols, dtype=np.float32)
+    patchy = np.ones(8 * -(-cols // 8), dtype=np.uint8)
+    eight = patchy.view(np.uint64)
     for r in range(rows):
-        here, line, patchy = z[r], out[r], True
+        here, line = z[r], out[r]
         if 0 < r < rows - 1:
             _sort_columns(z[r - 1], here, z[r + 1], low, middle, high, total)
-            patchy = _median_row(here, low, middle, high, total, line)
-        step = 1 if patchy else max(cols - 1, 1)
-        for c in range(0, cols, step):
-            if step > 1 or c == 0 or c == cols - 1 or not 0 < r < rows - 1 or np.isnan(line[c]):
-                line[c] = np.nan if np.isnan(here[c]) else _median_known(z, r, c)
+            _median_row(here, low, middle, high, total, line, patchy)
+        else:
+            patchy[:] = 1
+        for k in range(eight.shape[0]):
+            if eight[k]:
+                for c in range(8 * k, min(8 * k + 8, cols)):
+                    if patchy[c]:
+                        line[c] = np.nan if np.isnan(here[c]) else _median_known(z, r, c)
 
 
 @njit(cache=True, nogil=True)
@@ -305,9 +312,9 @@ def _sort_columns(up, here, down, low, middle, high, total):  # type: ignore[no-
 
 
 @njit(cache=True, nogil=True)
-def _median_row(here, low, middle, high, total, out):  # type: ignore[no-untyped-def]
-    """Median of nine from sorted columns (Paeth, Graphics Gems, 1990), NaN where one is; whether it is where the cell
-    itself is known."""
+def _median_row(here, low, middle, high, total, out, patchy):  # type: ignore[no-untyped-def]
+    """Median of nine from sorted columns (Paeth, Graphics Gems, 1990), NaN where the cell is unknown; where another of
+    the nine is, or does not exist, ``patchy`` is set."""
     n = here.shape[0] - 2
     for c in range(1, n + 1):
         x = max(max(low[c - 1], low[c]), low[c + 1])
@@ -316,14 +323,12 @@ def _median_row(here, low, middle, high, total, out):  # type: ignore[no-untyped
         lo, hi = min(a, b), max(a, b)
         m = max(min(hi, middle[c + 1]), lo)
         lo, hi = min(x, m), max(x, m)
-        out[c] = max(min(hi, y), lo)
-    some = np.int32(0)
+        median = max(min(hi, y), lo)
+        out[c] = median if here[c] == here[c] else np.float32(np.nan)
     for c in range(1, n + 1):
         known = total[c - 1] + total[c] + total[c + 1]
-        whole = known == known
-        out[c] = out[c] if whole else np.float32(np.nan)
-        some += np.int32((not whole) & (here[c] == here[c]))
-    return some > 0
+        patchy[c] = (known != known) & (here[c] == here[c])
+    patchy[0] = patchy[n + 1] = 1
 
 
 @njit(cache=True, nogil=True)

@@ -81,6 +81,7 @@ def _candidates(z, half, least):  # type: ignore[no-untyped-def]
     n = 2 * half + 1
     line = np.zeros(cols + n, dtype=np.int32)  # behind the line's start and beyond its end there is nothing
     total = line[half + 1 : half + 1 + cols]
+    upto = np.zeros(cols + n, dtype=np.int32)
     out, m = np.empty(cols, dtype=np.int64), 0
     for r in range(-half, rows):
         if r + half < rows:
@@ -93,10 +94,10 @@ def _candidates(z, half, least):  # type: ignore[no-untyped-def]
             more = np.empty(2 * out.shape[0] + cols, dtype=np.int64)
             more[:m] = out[:m]
             out = more
-        s = line[1:n].sum()
+        for c in range(1, cols + n):
+            upto[c] = upto[c - 1] + line[c]
         for c in range(cols):
-            s += line[c + n] - line[c]
-            if z[r, c] != z[r, c] and s >= least:
+            if z[r, c] != z[r, c] and upto[c + n] - upto[c] >= least:
                 out[m] = r * cols + c
                 m += 1
     return out[:m]
