@@ -134,8 +134,8 @@ def find_path(
     at = tuple(np.rint(lattice.index(other.xyz[:, :2])).astype(np.int64).T)
     chance = math.ceil(1e3 * float(np.nanmax(maps["p_hazard"][at])) - 1e-3) / 1e3
     reason = (
-        f"ground with a p_hazard above path.sure {p.sure:g} closes every way; without it one leads over ground of up to "
-        f"{chance:.3g}: raise path.sure to that to take it"
+        f"ground with a p_hazard above path.sure {p.sure:g} closes every way; without it one leads over ground of up "
+        f"to {chance:.3g}: raise path.sure to that to take it"
     )
     return replace(found, plan=replace(found.plan, reason=reason), doubt=chance)
 
