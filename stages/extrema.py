@@ -3,7 +3,7 @@
 The window is a regular octagon rather than a square, since the highest minus the lowest height of a plane over a square
 is larger by a factor of 1.41 on the diagonal; over the octagon it is by at most 1.10 (:func:`octagon`), nowhere smaller
 than along an axis. An octagon is a square widened along both diagonals, so its running maximum is four running maxima
-along lines, each by tripling or more (van Herk's result at about as many comparisons a cell, all of whole rows).
+along lines, each by doubling (van Herk's result at about as many comparisons a cell, all of them of whole rows).
 
 Everything here commutes with any rising function of the heights: where relief is made greater, every difference of two
 of these results is (the argument is in :mod:`stages.hazards`).
@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 
 Floats32 = NDArray[np.float32]
 
-BAND, STRIP = 128, 512
-"""Rows and columns worked on at a time: with what a window looks at they stay in a cache of 0.5 MB, and as many lines
-as make one in a pass in a cache of 32 kB."""
+BAND = 128
+"""Rows worked on at a time: with the window's own they stay in a cache of 1 MB up to widths of 1500 cells."""
 
 
 def octagon(reach: int) -> tuple[int, int]:
@@ -70,98 +69,80 @@ def _running_max(z, f, side, diagonal, out):  # type: ignore[no-untyped-def]
     """``f`` times the maximum of ``f`` times z."""
     rows, cols = z.shape
     reach = side + 2 * diagonal
-    width = _strip(cols)
-    buffer, spare = _room(width, reach)
+    buffer, spare = _room(cols, reach)
     for start in range(0, rows, BAND):
         stop = min(start + BAND, rows)
-        for k in range(-(-cols // width)):
-            left = min(k * width, cols - width)
-            n = _fill(z, f, start - reach, stop + reach, left - reach, buffer)
-            _widen(buffer, n, spare, side, diagonal, 0, 0)
-            for i in range(stop - start):
-                target, line = out[start + i, left : left + width], buffer[i, reach - side : reach - side + width]
-                for c in range(width):
-                    target[c] = f * line[c]
+        n = _fill(z, f, start - reach, stop + reach, 2 * reach, buffer)
+        _widen(buffer, n, spare, side, diagonal)
+        first = 2 * reach - side
+        for i in range(stop - start):
+            target, line = out[start + i], buffer[i, first:]
+            for c in range(cols):
+                target[c] = f * line[c]
 
 
 @njit(cache=True, nogil=True)
 def _relief(z, side, diagonal, more, steps, small, large):  # type: ignore[no-untyped-def]
-    """Of a strip the highest values are written first, and the lowest ones taken from them."""
+    """Of a band the highest values are written first, and the lowest ones taken from them."""
     rows, cols = z.shape
     near, added = side + 2 * diagonal, more + 2 * steps
     reach = near + added
-    width = _strip(cols)
-    buffer, spare = _room(width, reach)
+    buffer, spare = _room(cols, reach)
     for start in range(0, rows, BAND):
         stop = min(start + BAND, rows)
-        for k in range(-(-cols // width)):
-            left = min(k * width, cols - width)
-            for sign in (1.0, -1.0):
-                n = _fill(z, np.float32(sign), start - reach, stop + reach, left - reach, buffer)
-                n = _widen(buffer, n, spare, side, diagonal, 0, 0)
-                _emit(buffer[added:], reach - side, sign > 0, small[start:stop], left, width)
-                _widen(buffer, n, spare, more, steps, side, diagonal)
-                _emit(buffer, reach - side - more, sign > 0, large[start:stop], left, width)
+        for sign in (1.0, -1.0):
+            n = _fill(z, np.float32(sign), start - reach, stop + reach, 2 * reach, buffer)
+            n = _widen(buffer, n, spare, side, diagonal)
+            _emit(buffer[added:], 2 * reach - side, sign > 0, small[start:stop])
+            _widen(buffer, n, spare, more, steps)
+            _emit(buffer, 2 * reach - side - more, sign > 0, large[start:stop])
 
 
 @njit(cache=True, nogil=True)
-def _emit(buffer, first, highest, out, left, width):  # type: ignore[no-untyped-def]
-    for i in range(out.shape[0]):
-        target, line = out[i, left : left + width], buffer[i, first : first + width]
+def _emit(buffer, first, highest, out):  # type: ignore[no-untyped-def]
+    rows, cols = out.shape
+    for i in range(rows):
+        target, line = out[i], buffer[i, first : first + cols]
         if highest:
-            for c in range(width):
+            for c in range(cols):
                 target[c] = line[c]
         else:
-            for c in range(width):
+            for c in range(cols):
                 d = target[c] + line[c]
                 target[c] = d if d > np.float32(0.0) else np.float32(0.0)
 
 
 @njit(cache=True, nogil=True)
-def _strip(cols):  # type: ignore[no-untyped-def]
-    """Width of strips of equal width; the last one may overlap the one before, and writes the same there."""
-    return -(-cols // -(-cols // STRIP))
-
-
-@njit(cache=True, nogil=True)
-def _room(width, reach):  # type: ignore[no-untyped-def]
-    """A band with all that its cells look at, and a line."""
-    wide = width + 2 * reach
+def _room(cols, reach):  # type: ignore[no-untyped-def]
+    """A band with room beside for all that moves along diagonals, and a line."""
+    wide = cols + 4 * reach
     return np.empty((BAND + 2 * reach, wide), dtype=np.float32), np.empty(wide, dtype=np.float32)
 
 
 @njit(cache=True, nogil=True)
 def _fill(z, f, first, last, left, buffer):  # type: ignore[no-untyped-def]
-    """``f`` times rows ``first`` to ``last`` of z from column ``left`` on, -inf beyond its border; how many rows."""
+    """``f`` times rows ``first`` to ``last`` of z, ``left`` columns to the right, -inf around; how many rows."""
     rows, cols = z.shape
-    wide = buffer.shape[1]
-    begin, end = max(-left, 0), min(cols - left, wide)
     for i in range(last - first):
         line = buffer[i]
-        inside = 0 <= first + i < rows
-        for c in range(begin if inside else wide):
+        for c in range(line.shape[0]):
             line[c] = -np.inf
-        if inside:
-            _load(z[first + i, left + begin : left + end], f, line[begin:end])
-            for c in range(end, wide):
-                line[c] = -np.inf
+        if 0 <= first + i < rows:
+            _load(z[first + i], f, line[left : left + cols])
     return last - first
 
 
 @njit(cache=True, nogil=True)
-def _widen(buffer, n, spare, side, diagonal, had, slant):  # type: ignore[no-untyped-def]
+def _widen(buffer, n, spare, side, diagonal):  # type: ignore[no-untyped-def]
     """Maximum over the square and both diagonals, of ``n`` rows; returns how many are whole.
 
-    Results move up by ``side + 2 diagonal`` rows and to the left by ``side`` columns. What is there already are maxima
-    over an octagon of ``had`` and ``slant``: no line across it is shorter than its sides, so its copies may lie as far
-    apart as these are long.
+    Results move up by ``side + 2 diagonal`` rows and to the left by ``side`` columns.
     """
-    straight, oblique = 2 * had + 1, 2 * slant + 1
     for i in range(n):
-        _along(buffer[i], spare, straight, straight + 2 * side)
-    n = _down(buffer, n, straight, straight + 2 * side, 0)
-    n = _down(buffer, n, oblique, oblique + 2 * diagonal, 1)
-    return _down(buffer, n, oblique, oblique + 2 * diagonal, -1)
+        _double(buffer[i], spare, 2 * side + 1)
+    n = _down(buffer, n, 2 * side + 1, 0)
+    n = _down(buffer, n, 2 * diagonal + 1, 1)
+    return _down(buffer, n, 2 * diagonal + 1, -1)
 
 
 @njit(cache=True, nogil=True)
@@ -173,99 +154,61 @@ def _load(source, f, out):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _parts(n, w):  # type: ignore[no-untyped-def]
-    """Of how many windows of w the next wider one is made, on the way to one of n: each pass goes over all lines."""
-    more = -(-n // w)
-    return 2 if more == 2 else 3 if more == 3 or 5 < more <= 9 else 5
+def _raise(line, other):  # type: ignore[no-untyped-def]
+    """The greater of two lines, cell by cell, in place of the first; they must not overlap, or wait for each other."""
+    for c in range(line.shape[0]):
+        a, b = line[c], other[c]
+        line[c] = a if a > b else b
 
 
 @njit(cache=True, nogil=True)
-def _along(line, spare, w, n):  # type: ignore[no-untyped-def]
-    """Maxima of windows of w made such of windows of n, in place; the last n - w values are of what is left."""
-    cols = line.shape[0]
-    source, target = line, spare
-    passes = 0
+def _raise4(line, p, q, s):  # type: ignore[no-untyped-def]
+    """The greatest of four lines in place of the first."""
+    for c in range(line.shape[0]):
+        a, b, d, e = line[c], p[c], q[c], s[c]
+        a = a if a > b else b
+        d = d if d > e else e
+        line[c] = a if a > d else d
+
+
+@njit(cache=True, nogil=True)
+def _double(line, spare, n):  # type: ignore[no-untyped-def]
+    """Maximum of c .. c + n - 1 in place; the last n - 1 values are of what is left."""
+    m = line.shape[0]
+    w = 1
     while w < n:
-        parts, rest = _parts(n, w), n - w
-        far = min((parts - 1) * w, rest)
-        p, q, s = min(w, rest), min(2 * w, far), min(3 * w, far)
-        m = cols - far
-        a, b, d, e = source[p : p + m], source[q : q + m], source[s : s + m], source[far:]
-        if parts < 5:
-            _highest3(source[:m], a, b, target[:m])
-        else:
-            _highest5(source[:m], a, b, d, e, target[:m])
-        for c in range(m, cols):
-            target[c] = source[c]
-        source, target = target, source
-        w += far
-        passes += 1
-    if passes % 2:
-        for c in range(cols):
-            line[c] = spare[c]
+        step = min(w, n - w)
+        for c in range(m):
+            spare[c] = line[c]
+        _raise(line[: m - step], spare[step:])
+        w += step
 
 
 @njit(cache=True, nogil=True)
-def _down(buffer, rows, w, n, slant):  # type: ignore[no-untyped-def]
-    """The same down the rows, ``slant`` columns to the right a row; returns how many rows are whole."""
+def _down(buffer, rows, n, slant):  # type: ignore[no-untyped-def]
+    """The same down the rows, ``slant`` columns to the right a row; returns how many rows are whole.
+
+    Windows of w rows make one of up to 4 w rows in one pass: each pass goes through the slower cache.
+    """
     cols = buffer.shape[1]
+    w = 1
     while w < n:
-        parts, rest = _parts(n, w), n - w
-        far = min((parts - 1) * w, rest)
-        p, q, s = min(w, rest), min(2 * w, far), min(3 * w, far)
-        first, last = max(0, -far * slant), min(cols, cols - far * slant)
-        for i in range(rows - far):
+        s1 = min(w, n - w)
+        s2 = min(2 * w, n - w)
+        s3 = min(3 * w, n - w)
+        far = s3 * slant
+        first, last = max(0, -far), min(cols, cols - far)
+        for i in range(rows - s3):
             line = buffer[i, first:last]
-            a = buffer[i + p, first + p * slant : last + p * slant]
-            b = buffer[i + q, first + q * slant : last + q * slant]
-            if parts < 5:
-                _raise3(line, a, b)
+            a = buffer[i + s1, first + s1 * slant : last + s1 * slant]
+            if s3 == s1:
+                _raise(line, a)
                 continue
-            d = buffer[i + s, first + s * slant : last + s * slant]
-            _raise5(line, a, b, d, buffer[i + far, first + far * slant : last + far * slant])
-        rows -= far
-        w += far
+            b = buffer[i + s2, first + s2 * slant : last + s2 * slant]
+            _raise4(line, a, b, buffer[i + s3, first + far : last + far])
+        rows -= s3
+        w += s3
     return rows
-
-
-@njit(cache=True, nogil=True)
-def _highest3(p, q, s, out):  # type: ignore[no-untyped-def]
-    """The greatest of three lines, cell by cell."""
-    for c in range(out.shape[0]):
-        a, b, d = p[c], q[c], s[c]
-        a = a if a > b else b
-        out[c] = a if a > d else d
-
-
-@njit(cache=True, nogil=True)
-def _highest5(p, q, s, t, u, out):  # type: ignore[no-untyped-def]
-    """The greatest of five lines."""
-    for c in range(out.shape[0]):
-        a, b, d, e, f = p[c], q[c], s[c], t[c], u[c]
-        a = a if a > b else b
-        d = d if d > e else e
-        a = a if a > f else f
-        out[c] = a if a > d else d
-
-
-@njit(cache=True, nogil=True)
-def _raise3(line, p, q):  # type: ignore[no-untyped-def]
-    """The greatest of three lines in place of the first; they must not overlap, or wait for each other."""
-    for c in range(line.shape[0]):
-        a, b, d = line[c], p[c], q[c]
-        a = a if a > b else b
-        line[c] = a if a > d else d
-
-
-@njit(cache=True, nogil=True)
-def _raise5(line, p, q, s, t):  # type: ignore[no-untyped-def]
-    """The greatest of five lines in place of the first."""
-    for c in range(line.shape[0]):
-        a, b, d, e, f = line[c], p[c], q[c], s[c], t[c]
-        a = a if a > b else b
-        d = d if d > e else e
-        a = a if a > f else f
-        line[c] = a if a > d else d
 
 
 def median3(surface: Floats32) -> Floats32:
