@@ -76,24 +76,19 @@ def _reduce(z, closed, s, n, lag, high, low, count, variance, pairs, deviation):
     rows, cols = z.shape
     floor = np.float32(-np.inf)
     top, bottom = np.empty(cols, dtype=np.float32), np.empty(cols, dtype=np.float32)
-    square, line = np.empty(cols, dtype=np.float32), np.empty(cols, dtype=np.float32)
     known, met = np.empty(cols, dtype=np.float32), np.empty(cols, dtype=np.float32)
     noise, apart = np.empty(cols), np.empty(cols)
+    nothing, line = np.full(cols, np.nan, dtype=np.float32), np.full(cols + 2 * lag, np.nan, dtype=np.float32)
     for i in range(high.shape[0]):
         for c in range(cols):
             top[c], bottom[c] = floor, -floor
             known[c], met[c], noise[c], apart[c] = 0, 0, 0, 0
         for r in range(i * n, min(i * n + n, rows)):
+            line[lag : lag + cols] = z[r]
             _extremes(z[r], top, bottom)
             _noise(closed[r], s[r], known, noise)
-            if lag < cols:
-                _squares(z[r, : cols - lag], z[r, lag:], square, line)
-                _add(square[: cols - lag], line[: cols - lag], apart[: cols - lag], met[: cols - lag])
-                _add(square[: cols - lag], line[: cols - lag], apart[lag:], met[lag:])
-            for other in (r - lag, r + lag):
-                if 0 <= other < rows:
-                    _squares(z[r], z[other], square, line)
-                    _add(square, line, apart, met)
+            _apart(z[r], line[2 * lag :], line[:cols], apart, met)
+            _apart(z[r], z[r - lag] if r >= lag else nothing, z[r + lag] if r + lag < rows else nothing, apart, met)
         for j in range(high.shape[1]):
             a, b = floor, -floor
             total, spread, both, far = 0.0, 0.0, 0.0, 0.0
@@ -125,17 +120,12 @@ def _noise(closed, s, known, noise):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _squares(a, b, square, met):  # type: ignore[no-untyped-def]
-    """Squared differences, and 1 where both are known."""
-    for c in range(a.shape[0]):
-        d = a[c] - b[c]
-        here = d == d
-        square[c] = d * d if here else np.float32(0.0)
-        met[c] = np.float32(1.0) if here else np.float32(0.0)
-
-
-@njit(cache=True, nogil=True)
-def _add(square, line, apart, met):  # type: ignore[no-untyped-def]
-    for c in range(square.shape[0]):
-        apart[c] += square[c]
-        met[c] += line[c]
+def _apart(z, one, other, apart, met):  # type: ignore[no-untyped-def]
+    """Adds squared differences from two lines, one after the other, and how many are known."""
+    none = np.float32(0.0)
+    for c in range(z.shape[0]):
+        a, b = z[c] - one[c], z[c] - other[c]
+        here, there = a == a, b == b
+        a, b = a * a if here else none, b * b if there else none
+        apart[c] = (apart[c] + a) + b
+        met[c] += (np.float32(1.0) if here else none) + (np.float32(1.0) if there else none)

@@ -211,58 +211,67 @@ def _down(buffer, rows, n, slant):  # type: ignore[no-untyped-def]
     return rows
 
 
-@njit(cache=True, nogil=True)
-def median3(z):  # type: ignore[no-untyped-def]
+def median3(surface: Floats32) -> Floats32:
     """Median (row, col) of the known cells in 3 x 3; unknown stays unknown.
 
     Of an even number the upper one: the mean of two heights would not be one of the heights.
     """
-    rows, cols = z.shape
-    out = np.empty((rows, cols), dtype=np.float32)
-    for r in range(rows):
-        out[r, 0] = out[r, cols - 1] = np.nan
-        if 0 < r < rows - 1:
-            _median_row(z[r - 1], z[r], z[r + 1], out[r])
-        else:
-            out[r, :] = np.nan
-        for c in range(cols):
-            if np.isnan(out[r, c]) and not np.isnan(z[r, c]):
-                out[r, c] = _median_known(z, r, c)
+    out = np.empty(surface.shape, dtype=np.float32)
+    _median3(surface, out)
     return out
 
 
-@njit(cache=True, nogil=True, inline="always")
-def _order(a, b):  # type: ignore[no-untyped-def]
-    return (a, b) if a < b else (b, a)
+@njit(cache=True, nogil=True)
+def _median3(z, out):  # type: ignore[no-untyped-def]
+    rows, cols = z.shape
+    low, middle = np.empty(cols, dtype=np.float32), np.empty(cols, dtype=np.float32)
+    high, total = np.empty(cols, dtype=np.float32), np.empty(cols, dtype=np.float32)
+    patchy = np.ones(8 * -(-cols // 8), dtype=np.uint8)
+    eight = patchy.view(np.uint64)
+    for r in range(rows):
+        here, line = z[r], out[r]
+        if 0 < r < rows - 1:
+            _sort_columns(z[r - 1], here, z[r + 1], low, middle, high, total)
+            _median_row(here, low, middle, high, total, line, patchy)
+        else:
+            patchy[:] = 1
+        for k in range(eight.shape[0]):
+            if eight[k]:
+                for c in range(8 * k, min(8 * k + 8, cols)):
+                    if patchy[c]:
+                        line[c] = np.nan if np.isnan(here[c]) else _median_known(z, r, c)
 
 
 @njit(cache=True, nogil=True)
-def _median_row(up, here, down, out):  # type: ignore[no-untyped-def]
-    """Median of nine by the least exchanges (Paeth, Graphics Gems, 1990); NaN where one of the nine is."""
-    for c in range(1, here.shape[0] - 1):
-        a, b, d = up[c - 1], up[c], up[c + 1]
-        e, f, g = here[c - 1], here[c], here[c + 1]
-        h, i, j = down[c - 1], down[c], down[c + 1]
-        total = a + b + d + e + f + g + h + i + j
-        lo1, hi1 = min(a, b), max(a, b)
-        low_a = min(lo1, d)
-        high_a = max(hi1, d)
-        mid_a = max(min(hi1, d), lo1)
-        lo2, hi2 = min(e, f), max(e, f)
-        low_b = min(lo2, g)
-        high_b = max(hi2, g)
-        mid_b = max(min(hi2, g), lo2)
-        lo3, hi3 = min(h, i), max(h, i)
-        low_c = min(lo3, j)
-        high_c = max(hi3, j)
-        mid_c = max(min(hi3, j), lo3)
-        x = max(max(low_a, low_b), low_c)
-        y = min(min(high_a, high_b), high_c)
-        lo4, hi4 = min(mid_a, mid_b), max(mid_a, mid_b)
-        m = max(min(hi4, mid_c), lo4)
-        lo5, hi5 = min(x, m), max(x, m)
-        median = max(min(hi5, y), lo5)
-        out[c] = median if total == total else np.float32(np.nan)
+def _sort_columns(up, here, down, low, middle, high, total):  # type: ignore[no-untyped-def]
+    """Three heights of each column in order, and their sum, which is not known where one is not."""
+    for c in range(here.shape[0]):
+        a, b, d = up[c], here[c], down[c]
+        lo, hi = min(a, b), max(a, b)
+        low[c], high[c] = min(lo, d), max(hi, d)
+        middle[c] = max(min(hi, d), lo)
+    for c in range(here.shape[0]):
+        total[c] = up[c] + here[c] + down[c]
+
+
+@njit(cache=True, nogil=True)
+def _median_row(here, low, middle, high, total, out, patchy):  # type: ignore[no-untyped-def]
+    """Median of nine from sorted columns (Paeth, Graphics Gems, 1990), NaN where the cell is unknown; where another of
+    the nine is, or does not exist, ``patchy`` is set."""
+    n = here.shape[0] - 2
+    for c in range(1, n + 1):
+        x = max(max(low[c - 1], low[c]), low[c + 1])
+        y = min(min(high[c - 1], high[c]), high[c + 1])
+        a, b = middle[c - 1], middle[c]
+        lo, hi = min(a, b), max(a, b)
+        m = max(min(hi, middle[c + 1]), lo)
+        lo, hi = min(x, m), max(x, m)
+        median = max(min(hi, y), lo)
+        out[c] = median if here[c] == here[c] else np.float32(np.nan)
+    for c in range(1, n + 1):
+        known = total[c - 1] + total[c] + total[c + 1]
+        patchy[c] = (known != known) & (here[c] == here[c])
+    patchy[0] = patchy[n + 1] = 1
 
 
 @njit(cache=True, nogil=True)

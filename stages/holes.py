@@ -8,8 +8,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from stages.windows import window_count
-
 Floats32 = NDArray[np.float32]
 Flags = NDArray[np.uint8]
 
@@ -48,14 +46,75 @@ def close_holes(
     Closed elevation, its standard deviation (not below the largest of the rim's; unless ``judged``, not below ``rim``
     of its range either), and flags (uint8, 1 = closed here).
     """
-    known = ~np.isnan(elevation)
-    candidate = ~known & (window_count(known, n) >= min_known * n * n)
     z, s = elevation.copy(), elevation_std.copy()
+    return z, s, close_into(z, s, elevation, max_gap, n, min_known, judged=judged, rim=rim)
+
+
+def close_into(
+    z: Floats32,
+    s: Floats32,
+    elevation: Floats32,
+    max_gap: float,
+    n: int,
+    min_known: float,
+    *,
+    judged: bool = False,
+    rim: float = 0.5,
+) -> Flags:
+    """The same in ``z`` and ``s``, copies of the elevation and of its standard deviation; returns the flags."""
     filled = np.zeros(elevation.shape, dtype=np.uint8)
-    cells = np.flatnonzero(candidate)
+    cells = candidates(elevation, n, min_known)
     if len(cells) and max_gap > 0:
-        _close(elevation, elevation_std, cells, float(max_gap), n // 2 if judged else 0, rim, z, s, filled)
-    return z, s, filled
+        _close(elevation, s, cells, float(max_gap), n // 2 if judged else 0, rim, z, s, filled)
+    return filled
+
+
+def candidates(elevation: Floats32, n: int, min_known: float) -> NDArray[np.int64]:
+    """Unknown cells, counted row by row, of whose n x n window at least ``min_known`` is known."""
+    return np.asarray(_candidates(np.ascontiguousarray(elevation), n // 2, min_known * n * n), dtype=np.int64)
+
+
+@njit(cache=True, nogil=True)
+def _candidates(z, half, least):  # type: ignore[no-untyped-def]
+    """Columns' counts move down with the window; along a row they are added up only where a cell is unknown."""
+    rows, cols = z.shape
+    n = 2 * half + 1
+    line = np.zeros(cols + n, dtype=np.int32)  # behind the line's start and beyond its end there is nothing
+    total = line[half + 1 : half + 1 + cols]
+    upto = np.zeros(cols + n, dtype=np.int32)
+    out, m = np.empty(cols, dtype=np.int64), 0
+    for r in range(-half, rows):
+        if r + half < rows:
+            _tally(z[r + half], np.int32(1), total)
+        if r > half:
+            _tally(z[r - half - 1], np.int32(-1), total)
+        if r < 0 or not _any_unknown(z[r]):
+            continue
+        if m + cols > out.shape[0]:
+            more = np.empty(2 * out.shape[0] + cols, dtype=np.int64)
+            more[:m] = out[:m]
+            out = more
+        for c in range(1, cols + n):
+            upto[c] = upto[c - 1] + line[c]
+        for c in range(cols):
+            if z[r, c] != z[r, c] and upto[c + n] - upto[c] >= least:
+                out[m] = r * cols + c
+                m += 1
+    return out[:m]
+
+
+@njit(cache=True, nogil=True)
+def _tally(line, sign, total):  # type: ignore[no-untyped-def]
+    for c in range(line.shape[0]):
+        total[c] += sign if line[c] == line[c] else np.int32(0)
+
+
+@njit(cache=True, nogil=True)
+def _any_unknown(line):  # type: ignore[no-untyped-def]
+    unknown = np.int32(0)
+    for c in range(line.shape[0]):
+        unknown += np.int32(line[c] != line[c])
+    return unknown > 0
 
 
 @njit(cache=True, nogil=True)

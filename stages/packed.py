@@ -7,6 +7,7 @@ is column 64 w + k.
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -64,9 +65,41 @@ class Canvas:
                 _shift(self.words, self.words, sign * k * dr, sign * k * dc)
                 left, w = left - k, w + k
 
+    def join(self, other: Canvas) -> None:
+        """Set what is set on a canvas with the same border."""
+        np.bitwise_or(self.words, other.words, out=self.words)
+
     def add(self, other: Canvas, dr: int, dc: int) -> None:
         """Set what lies (row, col) from a set cell of a canvas with the same border; nothing comes from beyond it."""
         _shift(other.words, self.words, dr, dc)
+
+
+def codes(canvases: Sequence[Canvas], bits: Sequence[int]) -> NDArray[np.uint8]:
+    """Sum (row, col) of the bits of those of four canvases with the same border whose cell is not set."""
+    one = canvases[0]
+    out = np.empty((one.rows, one.cols), dtype=np.uint8)
+    first = -(-one.border // WORD)
+    _codes(*(canvas.words for canvas in canvases), np.array(bits, dtype=np.uint8), one.border, first, out)
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _codes(p, q, s, t, bits, border, first, out):  # type: ignore[no-untyped-def]
+    rows, cols = out.shape
+    one, none, most = np.uint64(1), np.uint64(0), np.uint8(bits.sum())
+    for r in range(rows):
+        for w in range(-(-cols // WORD)):
+            a, b = ~p[r + border, first + w], ~q[r + border, first + w]
+            d, e = ~s[r + border, first + w], ~t[r + border, first + w]
+            line = out[r, w * WORD : min(w * WORD + WORD, cols)]
+            if a & b & d & e == ~none or a | b | d | e == none:
+                line[:] = most if a else np.uint8(0)
+                continue
+            for k in range(line.shape[0]):
+                n = np.uint64(k)
+                x = np.uint8(a >> n & one) * bits[0] | np.uint8(b >> n & one) * bits[1]
+                y = np.uint8(d >> n & one) * bits[2] | np.uint8(e >> n & one) * bits[3]
+                line[k] = np.uint8(x | y)
 
 
 @njit(cache=True, nogil=True)

@@ -88,7 +88,7 @@ class PathParams(Params):
         gt=0,
         le=1,
         description="probability of a hazard above which ground is not driven on, though no measure exceeds its limit "
-        "by as many standard deviations as make a hazard",
+        "by as many standard deviations as make a hazard; where this alone closes every way, the reason says so",
     )
 
 
@@ -125,6 +125,31 @@ def find_path(
             check_end(maps, lattice, vehicle, name, point)
     if start is not None and target is not None:
         heading = (target[0] - start[0], target[1] - start[1])
+    found = _found(maps, lattice, vehicle, heading, start, target, stretch, p)
+    if len(found.cells) or p.sure >= 1 or "p_hazard" not in maps:
+        return found
+    other = _found(maps, lattice, vehicle, heading, start, target, stretch, p.model_copy(update={"sure": 1.0}))
+    if not len(other.cells):
+        return found
+    at = tuple(np.rint(lattice.index(other.xyz[:, :2])).astype(np.int64).T)
+    chance = math.ceil(1e3 * float(np.nanmax(maps["p_hazard"][at])) - 1e-3) / 1e3
+    reason = (
+        f"ground with a p_hazard above path.sure {p.sure:g} closes every way; without it one leads over ground of up "
+        f"to {chance:.3g}: raise path.sure to that to take it"
+    )
+    return replace(found, plan=replace(found.plan, reason=reason), doubt=chance)
+
+
+def _found(
+    maps: Maps,
+    lattice: Lattice,
+    vehicle: Vehicle,
+    heading: Point,
+    start: Point | None,
+    target: Point | None,
+    stretch: bool,
+    p: PathParams,
+) -> Route:
     found = None
     if p.planner != "grid8":
         found = _by_rows(maps, lattice, vehicle, heading, start, target, p)
@@ -216,7 +241,7 @@ def _run(params: PathParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
         "reachable": route.plan.reachable.astype(np.uint8),
     }
     meta = describe(route, maps, lattice, vehicle) | {"frame": source.meta.get("frame", "local")}
-    if not local and not meta["found"] and not (maps["risk"] < HAZARDOUS).any():
+    if not local and not meta["found"] and (route.doubt is not None or not (maps["risk"] < HAZARDOUS).any()):
         meta["warnings"] = [f"no path: {meta['reason']}"]
     return Bundle(arrays, meta)
 

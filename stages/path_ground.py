@@ -68,12 +68,14 @@ class Ground:
         self.grid, self.unit = grid, unit
         risk = grid.sample(lattice, maps["risk"], UNKNOWN)
         reason = grid.sample(lattice, maps["reason"], 0)
-        hazard, unknown = risk == HAZARDOUS, risk == UNKNOWN
-        self.closed = hazard | unknown
         chance = grid.sample(lattice, maps["p_hazard"], np.nan) if "p_hazard" in maps else None
-        if chance is not None and sure < 1:
-            self.closed |= chance > sure
-        wheels, body = (hazard & ((reason & bits) > 0) for bits in (WHEEL_BITS, BODY_BITS))
+        unknown, self.closed, wheels, body = (np.empty(risk.shape, dtype=np.bool_) for _ in range(4))
+        _hazards(risk, reason, WHEEL_BITS, BODY_BITS, wheels, body)
+        if chance is None:
+            np.equal(risk, UNKNOWN, out=unknown)
+            np.greater_equal(risk, HAZARDOUS, out=self.closed)
+        else:
+            _closed(risk, chance, np.float32(sure if sure < 1 else np.inf), unknown, self.closed)
         self._stand = Stand(wheels, body, vehicle, grid.cell, unknown, self.closed)
         mean = window_mean(maps["elevation"], window_cells(vehicle.wheel_diameter, lattice.cell))
         self.stand = grid.sample(lattice, mean, np.nan)
@@ -116,6 +118,25 @@ class Ground:
         """Points (vertex, 3), metres, of cells (vertex, 2)."""
         row, col = cells[:, 0], cells[:, 1]
         return np.column_stack([self.grid.xy(row, col), self.stand[row, col]])
+
+
+@njit(cache=True, nogil=True)
+def _hazards(risk, reason, wheel_bits, body_bits, wheels, body):  # type: ignore[no-untyped-def]
+    """Masks of what is hazardous to a wheel, and to the vehicle as a whole."""
+    for r in range(risk.shape[0]):
+        for c in range(risk.shape[1]):
+            hazard = risk[r, c] == HAZARDOUS
+            wheels[r, c] = hazard & (reason[r, c] & wheel_bits != 0)
+            body[r, c] = hazard & (reason[r, c] & body_bits != 0)
+
+
+@njit(cache=True, nogil=True)
+def _closed(risk, chance, sure, unknown, closed):  # type: ignore[no-untyped-def]
+    """Masks of unknown ground, and of all that is not entered."""
+    for r in range(risk.shape[0]):
+        for c in range(risk.shape[1]):
+            unknown[r, c] = risk[r, c] == UNKNOWN
+            closed[r, c] = (risk[r, c] >= HAZARDOUS) | (chance[r, c] > sure)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

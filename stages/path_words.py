@@ -41,7 +41,8 @@ class Route:
     ``cells`` (vertex, 2) on ``grid`` and ``xyz`` (vertex, 3) metres, z the mean height under a wheel, both empty where
     there is none; ``plan`` of the row graph, ``planner`` that gave the path, ``ground`` one of :data:`GROUNDS`;
     ``cost`` (row, col) metres: from the start by rows, to the target by grid8; NaN where not reached.
-    ``span``: farthest and nearest row of the grid that are free somewhere.
+    ``span``: farthest and nearest row of the grid that are free somewhere. ``doubt``: where there is none only because
+    ground is closed that is probably a hazard, greatest probability on a path that ignores it.
     """
 
     cells: Ints
@@ -52,6 +53,7 @@ class Route:
     ground: str
     cost: NDArray[np.float32]
     span: tuple[int, int]
+    doubt: float | None = None
 
 
 def describe(route: Route, maps: Maps, lattice: Lattice, vehicle: Vehicle) -> dict[str, Any]:

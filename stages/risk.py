@@ -24,13 +24,14 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from pydantic import Field
 
 from stages.declare import Array, Bundle, Inputs, Memory, Params, Stage
 from stages.errors import InputError
 from stages.hazards import BITS, measure
-from stages.holes import close_holes
+from stages.holes import close_into
 from stages.lattice import Lattice, mosaic, union
 from stages.vehicle import DEFAULT_VEHICLE, Vehicle
 from stages.verdict import (
@@ -115,19 +116,23 @@ def risk_map(
     p = params or RiskParams()
     check_size(vehicle, elevation.shape, cell)
     window = p.window * vehicle.wheel_diameter
-    finite = np.isfinite(elevation_std)
-    s = elevation_std if finite.all() else np.where(finite, elevation_std, np.float32(0))
-    z, s, filled = close_holes(
-        elevation,
-        s.astype(np.float32, copy=False),
-        p.max_hole * vehicle.wheel_diameter / cell,
-        window_cells(window, cell),
-        p.min_known,
-        rim=RIM,
-    )
+    z, s = elevation.copy(), np.empty(elevation.shape, dtype=np.float32)
+    _finite(np.ascontiguousarray(elevation_std, dtype=np.float32), s)
+    gap, side = p.max_hole * vehicle.wheel_diameter / cell, window_cells(window, cell)
+    filled = close_into(z, s, elevation, gap, side, p.min_known, rim=RIM)
     measured = measure(elevation, z, s, cell, vehicle, window)
     rules = Rules(p.sigmas, p.caution, p.max_p, p.min_known)
     return classify(measured, z, filled, vehicle, window, cell, rules) | {"filled": filled, "elevation": z}
+
+
+@njit(cache=True, nogil=True)
+def _finite(source, out):  # type: ignore[no-untyped-def]
+    """A copy with 0 for what is not finite."""
+    for r in range(out.shape[0]):
+        line, target = source[r], out[r]
+        for c in range(out.shape[1]):
+            v = line[c]
+            target[c] = v if v - v == np.float32(0.0) else np.float32(0.0)
 
 
 def check_size(vehicle: Vehicle, shape: tuple[int, ...], cell: float) -> None:

@@ -82,7 +82,10 @@ def _sweep(height, ways, toll, sources, cost, move):  # type: ignore[no-untyped-
     before = np.zeros(cols + 2, dtype=np.int64)
     for r in range(rows - 1, -1, -1):
         _enter(height[r], ways[r], toll[r], last, around, before, rows, cost[r], move[r])
+        some = np.int32(0)
         for c in range(cols):
+            some += np.int32(sources[r, c])
+        for c in range(cols if some else 0):
             if sources[r, c] and ways[r, c]:
                 cost[r, c], move[r, c] = 0, -1
         for c in range(cols):

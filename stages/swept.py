@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.extrema import octagon
-from stages.packed import Canvas
+from stages.packed import Canvas, codes
 from stages.vehicle import Vehicle
 
 Mask = NDArray[np.bool_]
@@ -35,16 +35,29 @@ def widened(mask: Mask, half_length: float, half_width: float, step: tuple[int, 
     ----------
     half_length, half_width : cells, of the rectangle along and across the step.
     """
-    along, across = step, (step[1], -step[0])
-    unit = math.hypot(*step)
-    # a diagonal line leaves every other cell out: a square of two closes them
-    sides = [max(0, math.ceil(v / unit - 1e-9)) for v in (half_length, half_width)]
-    canvas = Canvas.of(mask, sum(sides) + 1, outside=True)
-    for n, (dr, dc) in zip(sides, (along, across), strict=True):
-        canvas.spread(n, dr, dc)
-    if unit > 1:
-        canvas.spread(1, 0, 1)
+    canvas = Canvas.of(mask, _reach(half_length, half_width, step), outside=True)
+    _widen(canvas, half_length, half_width, step)
     return canvas.mask()
+
+
+def _sides(half_length: float, half_width: float, step: tuple[int, int]) -> list[int]:
+    """Steps along and across that cover a rectangle."""
+    return [max(0, math.ceil(v / math.hypot(*step) - 1e-9)) for v in (half_length, half_width)]
+
+
+def _reach(half_length: float, half_width: float, step: tuple[int, int]) -> int:
+    """Border that a canvas needs for :func:`_widen`, cells."""
+    return sum(_sides(half_length, half_width, step)) + 1
+
+
+def _widen(canvas: Canvas, half_length: float, half_width: float, step: tuple[int, int]) -> None:
+    """:func:`widened` on a canvas."""
+    along, across = step, (step[1], -step[0])
+    for n, (dr, dc) in zip(_sides(half_length, half_width, step), (along, across), strict=True):
+        canvas.spread(n, dr, dc)
+    if step[0] and step[1]:
+        # a diagonal line leaves every other cell out: a square of two closes them
+        canvas.spread(1, 0, 1)
 
 
 def grown(mask: Mask, reach: float) -> Mask:
@@ -81,7 +94,8 @@ class Stand:
         self._half = vehicle.half_length / cell, vehicle.half_width / cell
         ahead, aside = 0.5 * vehicle.wheel_base / cell, 0.5 * vehicle.track / cell
         self._places = [_wheels(ahead, aside, dr, dc) for _, dr, dc in STEPS]
-        self._border = max(abs(v) for four in self._places for at in four for v in at)
+        reaches = [_reach(*self._half, (dr, dc)) for _, dr, dc in STEPS]
+        self._border = max(*reaches, *(abs(v) for four in self._places for at in four for v in at))
         self._unknown = unknown
         wheels, middle = (grown(mask, vehicle.margin / cell) for mask in (wheel_hazard, body_hazard))
         on_wheels, on_middle = (
@@ -93,19 +107,20 @@ class Stand:
     def ways(self, below: str = "middle") -> Bytes:
         """Directions (row, col) as bits in which it may, with ``below``, its "outline", its "wheels" or its "middle",
         on known ground."""
-        out = np.zeros((self._closed[0].rows, self._closed[0].cols), dtype=np.uint8)
-        if below != "middle" and self._unknown is not None:
-            beyond = self._unknown if below == "wheels" else np.zeros_like(self._unknown)
-            beyond_wheels = Canvas.of(beyond, self._border, outside=True)
-        for (bit, dr, dc), places, closed in zip(STEPS, self._places, self._closed, strict=True):
-            if below == "middle" or self._unknown is None:
-                mask = closed.mask()
-            else:
-                mask = self._under(places, beyond_wheels, closed).mask()
-                if below == "outline":
-                    mask |= widened(self._unknown, *self._half, (dr, dc))
-            out |= mask.view(np.uint8) * np.uint8(bit)
-        return out ^ np.uint8(ALL)
+        if below == "middle" or self._unknown is None:
+            found = self._closed
+        else:
+            unknown = Canvas.of(self._unknown, self._border, outside=True)
+            beyond = unknown if below == "wheels" else Canvas.of(np.zeros_like(self._unknown), self._border, True)
+            found = [
+                self._under(places, beyond, closed) for places, closed in zip(self._places, self._closed, strict=True)
+            ]
+            if below == "outline":
+                for (_, dr, dc), canvas in zip(STEPS, found, strict=True):
+                    outline = unknown.copy()
+                    _widen(outline, *self._half, (dr, dc))
+                    canvas.join(outline)
+        return codes(found, [bit for bit, _, _ in STEPS])
 
     @staticmethod
     def _under(places: list[tuple[int, int]], wheels: Canvas, closed: Canvas) -> Canvas:

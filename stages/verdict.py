@@ -29,6 +29,9 @@ WHOLE = 0.999
 FINE = ("inclination", "range", "step")
 """Measures on the cells; the others are on blocks."""
 
+BAND, STRIP = 16, 384
+"""Rows of blocks, and columns of cells, that are worked on at a time: lines of all bands stay in a cache of 48 kB."""
+
 STEPS, FARTHEST = 64, 16.0
 """Table of the distribution: steps a unit, and where it ends."""
 
@@ -82,12 +85,17 @@ def classify(
     risk, reason = np.empty(shape, np.uint8), np.empty(shape, np.uint16)
     bands = [np.empty(shape, np.float32) for _ in range(6)]
     marks = np.array([rules.caution, rules.max_p, rules.min_known, WHOLE], np.float32)
-    _classify(
-        np.stack([facts[name] for name in FINE]), np.float32(1.0 / measured.extent), measured.range, measured.step,
-        closed, filled, blocks, bits, measured.stride, marks, _table(), risk, reason, *bands,
-    )  # fmt: skip
+    fine, table, n = np.stack([facts[name] for name in FINE]), _table(), measured.stride
+    at = (np.arange(shape[1]) // n).astype(np.uint32)
     inclination, roughness, slope, tilt, clearance, p = bands
-    np.arctan(inclination, out=inclination)
+    for first in range(0, shape[0], n * BAND):
+        rows, of = slice(first, first + n * BAND), slice(first // n, first // n + BAND)
+        _classify(
+            fine, np.float32(1.0 / measured.extent), measured.range[rows], measured.step[rows], closed[rows],
+            filled[rows], np.ascontiguousarray(blocks[:, of]), bits[of], at, n, marks, table, risk[rows], reason[rows],
+            *(band[rows] for band in bands),
+        )  # fmt: skip
+        np.arctan(inclination[rows], out=inclination[rows])
     return {
         "risk": risk,
         "reason": reason,
@@ -127,12 +135,13 @@ def _hold(v, facts, noise, doubt, load, excess, bits):  # type: ignore[no-untype
     limit, bias, spread, added, bit = facts[0], facts[1], facts[2], facts[3], np.uint16(facts[4])
     scale, least, none, one = np.float32(1.0) / limit, LEAST * limit, np.uint16(0), np.float32(1.0)
     # three loops of few arrays each, which the compiler then takes several cells at a time
-    for c in range(v.shape[0]):
+    n = v.shape[0]
+    for c in range(n):
         here = (v[c] + added * noise[c]) * scale
         load[c] = here if here > load[c] else load[c]
-    for c in range(v.shape[0]):
+    for c in range(n):
         bits[c] |= bit if (v[c] + added * noise[c]) * scale > one else none
-    for c in range(v.shape[0]):
+    for c in range(n):
         s, wide = noise[c], doubt[c]
         over = v[c] - bias * s - limit
         s = s if over > np.float32(0.0) else wide
@@ -148,43 +157,51 @@ def _hold_all(values, facts, noise, doubt, load, excess, bits):  # type: ignore[
 
 @njit(cache=True, nogil=True)
 def _classify(  # type: ignore[no-untyped-def]
-    facts, per_metre, height_range, step, closed, filled, blocks, bits0, n, marks, table,
+    facts, per_metre, height_range, step, closed, filled, blocks, bits0, at, n, marks, table,
     risk, reason, inclination, roughness, slope, tilt, clearance, p,
 ):  # fmt: skip
+    """Rows of cells, of which the first one is the first of a row of blocks; ``at`` is the block of each column."""
     rows, cols = risk.shape
-    wide = np.empty((blocks.shape[0], cols), dtype=np.float32)
-    before, bits = np.empty(cols, dtype=np.uint16), np.empty(cols, dtype=np.uint16)
-    load, excess = np.empty(cols, dtype=np.float32), np.empty(cols, dtype=np.float32)
-    for r in range(rows):
-        if r % n == 0:
+    width = min(cols, STRIP)
+    wide = np.empty((blocks.shape[0], width), dtype=np.float32)
+    before, bits = np.empty(width, dtype=np.uint16), np.empty(width, dtype=np.uint16)
+    load, excess = np.empty(width, dtype=np.float32), np.empty(width, dtype=np.float32)
+    for top in range(0, rows, n):
+        for left in range(0, cols, width):
+            right = min(left + width, cols)
+            m = right - left
             for k in range(blocks.shape[0]):
-                _spread(blocks[k, r // n], n, wide[k])
-            _spread(bits0[r // n], n, before)
-        for c in range(cols):
-            load[c], excess[c], bits[c] = wide[0, c], wide[1, c], before[c]
-            inclination[r, c] = height_range[r, c] * per_metre
-        _hold(inclination[r], facts[0], wide[2], wide[3], load, excess, bits)
-        _hold(height_range[r], facts[1], wide[2], wide[3], load, excess, bits)
-        _hold(step[r], facts[2], wide[2], wide[3], load, excess, bits)
-        _look_up(excess, table, p[r])
-        _decide(load, excess, bits, p[r], closed[r], filled[r], wide[4], wide[5], marks, risk[r], reason[r])
-        _blank(risk[r], inclination[r], inclination[r])
-        _blank(risk[r], height_range[r], height_range[r])
-        _blank(risk[r], step[r], step[r])
-        _blank(risk[r], p[r], p[r])
-        _blank(risk[r], wide[6], roughness[r])
-        _blank(risk[r], wide[7], slope[r])
-        _blank(risk[r], wide[8], tilt[r])
-        _blank(risk[r], wide[9], clearance[r])
+                _spread(blocks[k, top // n], at[left:right], wide[k])
+            _spread(bits0[top // n], at[left:right], before)
+            for r in range(top, min(top + n, rows)):
+                for c in range(m):
+                    load[c], excess[c], bits[c] = wide[0, c], wide[1, c], before[c]
+                inclined, ranged, stepped = inclination[r, left:right], height_range[r, left:right], step[r, left:right]
+                kind, chance = risk[r, left:right], p[r, left:right]
+                for c in range(m):
+                    inclined[c] = ranged[c] * per_metre
+                _hold(inclined, facts[0], wide[2], wide[3], load, excess, bits)
+                _hold(ranged, facts[1], wide[2], wide[3], load, excess, bits)
+                _hold(stepped, facts[2], wide[2], wide[3], load, excess, bits)
+                _look_up(excess, table, chance)
+                _decide(
+                    load, excess, bits, chance, closed[r, left:right], filled[r, left:right], wide[4], wide[5], marks,
+                    kind, reason[r, left:right],
+                )  # fmt: skip
+                _blank(kind, inclined)
+                _blank(kind, ranged)
+                _blank(kind, stepped)
+                _blank(kind, chance)
+                _put(kind, wide[6], roughness[r, left:right])
+                _put(kind, wide[7], slope[r, left:right])
+                _put(kind, wide[8], tilt[r, left:right])
+                _put(kind, wide[9], clearance[r, left:right])
 
 
 @njit(cache=True, nogil=True)
-def _spread(blocks, n, out):  # type: ignore[no-untyped-def]
-    whole = out.shape[0] // n
-    for k in range(n):
-        for j in range(whole):
-            out[j * n + k] = blocks[j]
-    out[whole * n :] = blocks[-1]
+def _spread(blocks, at, out):  # type: ignore[no-untyped-def]
+    for c in range(at.shape[0]):
+        out[c] = blocks[at[c]]
 
 
 @njit(cache=True, nogil=True)
@@ -192,7 +209,7 @@ def _look_up(excess, table, p):  # type: ignore[no-untyped-def]
     for c in range(p.shape[0]):
         least = excess[c] if excess[c] > -FARTHEST else -FARTHEST
         t = least if least < FARTHEST else FARTHEST
-        p[c] = table[np.int32((t + FARTHEST) * STEPS)]
+        p[c] = table[np.uint32((t + FARTHEST) * STEPS)]
 
 
 @njit(cache=True, nogil=True)
@@ -217,6 +234,12 @@ def _decide(load, excess, bits, p, closed, filled, share, unstood, marks, risk, 
 
 
 @njit(cache=True, nogil=True)
-def _blank(risk, values, out):  # type: ignore[no-untyped-def]
+def _blank(risk, values):  # type: ignore[no-untyped-def]
+    for c in range(values.shape[0]):
+        values[c] = np.float32(np.nan) if risk[c] == UNKNOWN else values[c]
+
+
+@njit(cache=True, nogil=True)
+def _put(risk, values, out):  # type: ignore[no-untyped-def]
     for c in range(out.shape[0]):
         out[c] = np.float32(np.nan) if risk[c] == UNKNOWN else values[c]

@@ -72,40 +72,6 @@ def _sums(a, half, out):  # type: ignore[no-untyped-def]
             out[r, c] = along[min(c + half + 1, cols)] - along[max(c - half, 0)]
 
 
-def window_count(mask: Mask, n: int) -> NDArray[np.int32]:
-    """How many cells (row, col) of the window are set."""
-    out = np.empty(mask.shape, dtype=np.int32)
-    _count(np.ascontiguousarray(mask), n // 2, out)
-    return out
-
-
-@njit(cache=True, nogil=True)
-def _count(a, half, out):  # type: ignore[no-untyped-def]
-    """Columns' counts move down with the window, the count over columns along each row."""
-    rows, cols = a.shape
-    n = 2 * half + 1
-    line = np.zeros(cols + n, dtype=np.int32)  # behind the line's start and beyond its end there is nothing
-    total = line[half + 1 : half + 1 + cols]
-    for r in range(-half, rows):
-        if r + half < rows:
-            _tally(a[r + half], np.int32(1), total)
-        if r > half:
-            _tally(a[r - half - 1], np.int32(-1), total)
-        if r < 0:
-            continue
-        s = line[1:n].sum()
-        target = out[r]
-        for c in range(cols):
-            s += line[c + n] - line[c]
-            target[c] = s
-
-
-@njit(cache=True, nogil=True)
-def _tally(mask, sign, total):  # type: ignore[no-untyped-def]
-    for c in range(mask.shape[0]):
-        total[c] += sign if mask[c] else np.int32(0)
-
-
 def window_mean(a: Floats32, n: int) -> Floats32:
     """Mean (row, col) of the known cells in the window; NaN where there is none."""
     out = np.empty(a.shape, dtype=np.float32)
@@ -135,8 +101,7 @@ def _mean(a, half, out):  # type: ignore[no-untyped-def]
         if r < 0:
             continue
         if lane == LANES - 1 or r == rows - 1:
-            _slide(total, 2 * half + 1, sums)
-            _slide(count, 2 * half + 1, counts)
+            _slide(total, count, 2 * half + 1, sums, counts)
             for k in range(lane + 1):
                 _divide(sums[k], counts[k], offset, out[r - lane + k])
         after = (lane + 1) % LANES
@@ -146,16 +111,22 @@ def _mean(a, half, out):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _slide(lines, n, out):  # type: ignore[no-untyped-def]
-    """Sums of c + 1 .. c + n of :data:`LANES` lines."""
+def _slide(lines, more, n, out, out_more):  # type: ignore[no-untyped-def]
+    """Sums of c + 1 .. c + n of :data:`LANES` lines each."""
     p, q, s, t = lines[0], lines[1], lines[2], lines[3]
+    i, j, k, m = more[0], more[1], more[2], more[3]
     a, b, d, e = 0.0, 0.0, 0.0, 0.0
+    f, g, h, u = 0.0, 0.0, 0.0, 0.0
     for c in range(1, n):
         a, b, d, e = a + p[c], b + q[c], d + s[c], e + t[c]
+        f, g, h, u = f + i[c], g + j[c], h + k[c], u + m[c]
     for c in range(out.shape[1]):
         a, b, d, e = a + p[c + n], b + q[c + n], d + s[c + n], e + t[c + n]
+        f, g, h, u = f + i[c + n], g + j[c + n], h + k[c + n], u + m[c + n]
         a, b, d, e = a - p[c], b - q[c], d - s[c], e - t[c]
+        f, g, h, u = f - i[c], g - j[c], h - k[c], u - m[c]
         out[0, c], out[1, c], out[2, c], out[3, c] = a, b, d, e
+        out_more[0, c], out_more[1, c], out_more[2, c], out_more[3, c] = f, g, h, u
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import distance_transform_cdt, gaussian_filter
 
-from stages.holes import close_holes
+from stages.holes import candidates, close_holes
 
 
 def plane(rows: int, cols: int) -> np.ndarray:
@@ -104,3 +104,17 @@ def test_where_nothing_tells_the_error_half_the_rims_range_stands_in() -> None:
     _, std, filled = close_holes(z, np.full_like(z, 0.1), 1.0, 3, 0.1, judged=True)
     assert filled[1, 2] == 1
     assert std[1, 2] == 1.0
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 999), half=st.integers(1, 6), share=st.floats(0.0, 1.0), rows=st.integers(1, 30))
+def test_candidates_are_the_unknown_cells_whose_window_is_known_enough(
+    seed: int, half: int, share: float, rows: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    z = np.zeros((rows, 17), dtype=np.float32)
+    z[rng.random(z.shape) < share] = np.nan
+    n, known = 2 * half + 1, ~np.isnan(z)
+    padded = np.pad(known, half)
+    count = sum(padded[r : r + rows, c : c + 17].astype(int) for r in range(n) for c in range(n))
+    np.testing.assert_array_equal(candidates(z, n, 0.4), np.flatnonzero(~known & (count >= 0.4 * n * n)))

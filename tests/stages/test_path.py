@@ -141,8 +141,21 @@ def test_ground_that_is_probably_a_hazard_closes_the_way() -> None:
     given = maps(*level(lattice)) | {"p_hazard": np.zeros(lattice.shape, dtype=np.float32)}
     given["p_hazard"][30] = 0.2
     ends = {"start": (0.0, 0.1), "target": (0.0, 0.5)}
-    assert not len(find_path(given, lattice, MODEL, **ends).cells)
-    assert len(find_path(given, lattice, MODEL, **ends, params=PathParams(sure=0.3)).cells) > 30
+    closed = find_path(given, lattice, MODEL, **ends)
+    assert not len(closed.cells)
+    assert "above path.sure 0.1 closes every way; without it one leads over ground of up to 0.2:" in closed.plan.reason
+    assert len(find_path(given, lattice, MODEL, **ends, params=PathParams(sure=0.2)).cells) > 30
+    given["risk"][30] = HAZARDOUS  # then it is not for what may be hazardous
+    assert find_path(given, lattice, MODEL, **ends).doubt is None
+
+
+def test_ground_that_is_probably_a_hazard_everywhere_is_a_warning_with_the_figure() -> None:
+    lattice = Lattice.at(0, 40, CELL, 40, 30)
+    arrays = maps(*level(lattice)) | {"p_hazard": np.full(lattice.shape, 0.15, dtype=np.float32)}
+    source = Bundle(arrays, {"lattice": lattice.to_dict(), "vehicle": MODEL.model_dump()})
+    (line,) = STAGE.run(PathParams(), {}, {"risk": source}).meta["warnings"]
+    assert line.startswith("no path: ground with a p_hazard above path.sure 0.1 closes every way")
+    assert "up to 0.15" in line
 
 
 def test_from_start_to_target_in_metres() -> None:
