@@ -86,7 +86,7 @@ def fit_plane(
         for _ in range(20):
             weight = np.maximum(0.0, 1.0 - 0.25 * (rho - rays @ theta) ** 2 * information) ** 2 * information
             weighted = rays * weight[:, None]
-            last, theta = theta, np.linalg.solve(weighted.T @ rays, weighted.T @ rho)
+            last, theta = theta, np.asarray(np.linalg.solve(weighted.T @ rays, weighted.T @ rho), dtype=np.float64)
             if np.abs(theta - last).max() <= SETTLED * np.abs(theta).max():
                 break
         share = float(np.mean(_score(theta[None], rays, rho, sigma, tolerance) > 0))
