@@ -30,6 +30,9 @@ PAIRS = (("image_0", "image_1"), ("image_2", "image_3"), ("image_l", "image_r"),
 STREET = {"locus.cell_size": 0.1}
 """0.1 m resolves kerbs where the disparity does."""
 
+CAR = 0.3
+"""m, baseline from which a rig is taken for a car's: of a smaller one the cells follow from what its pixels resolve."""
+
 
 @dataclass(frozen=True)
 class Layout:
@@ -324,7 +327,7 @@ def open_kitti(layout: Layout, digests: files.Digests) -> Sequence:
         truth=truth,
         truth_source=f"poses of {layout.poses.name}, as recorded" if layout.poses is not None else "",
         lost=listing.lost,
-        defaults=STREET,
+        defaults=STREET if rig.baseline >= CAR else {},
         warnings=warnings,
     )
 

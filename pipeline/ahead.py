@@ -10,6 +10,7 @@ import threading
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import lru_cache
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from stages.declare import Bundle
@@ -18,6 +19,9 @@ if TYPE_CHECKING:  # a run that has nothing to draw need not import what draws
     from pipeline.report.block import Block
     from pipeline.report.view import RunView
 
+
+WRITERS = ("PIL.Image", "jinja2", "matplotlib.figure", "pyogrio.raw", "rasterio", "zarr")
+"""What writes results is imported beforehand, too: two seconds."""
 
 AGAIN = 0.5
 """Seconds until artifacts that were not there are looked for again."""
@@ -44,6 +48,8 @@ class Ahead:
             from pipeline.report.gather import Scene
 
             view = self._view()
+            for name in WRITERS:
+                import_module(name)
             scene = Scene(replace(view, bundle=_there(view.bundle)))
             left = dict(gallery.makers())
             while left and not self._wanted.is_set():

@@ -13,6 +13,10 @@ SAMPLES = 64
 """Cells along either side of the surface, and elevations, that are looked at."""
 
 
+FEW = 400
+"""Cells of a surface, 20 x 20, below which their size is the likely reason."""
+
+
 def explain(
     rig: Rig, T_surface_left: RigidTransform, surface: Surface, z_range: tuple[float, float], usable: NDArray[np.bool_]
 ) -> DegenerateError:
@@ -46,6 +50,13 @@ def explain(
         return DegenerateError(
             f"none of {usable.size} disparities is valid, so no elevation can be found",
             remedy="look at the disparity's validity: exposure, focus, left/right order; or raise locus.max_backmatch",
+        )
+    cells = surface.rows * surface.cols
+    if cells < FEW:
+        return DegenerateError(
+            f"no cell could be reconstructed, and there are {cells} only ({surface.rows} x {surface.cols}): they are "
+            "too coarse for what the cameras see",
+            remedy="lower locus.cell_size, or leave it out: then it follows from the rig",
         )
     return DegenerateError(
         f"no cell could be reconstructed from {count} valid disparities of {usable.size}: they contradict the "

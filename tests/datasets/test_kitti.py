@@ -65,6 +65,14 @@ def test_self_contained_folder(folder):
     assert s.image(1, "right").hints["path"].endswith("image_r/000001.png")
 
 
+def test_cells_of_a_small_rig_follow_from_the_rig(folder):
+    right = np.hstack([K, K @ [[-0.1], [0.0], [0.0]]])
+    (folder / "calib.txt").write_text(line(P_LEFT) + "\n" + line(right))
+    s = open_sequence(str(folder))
+    assert s.rig.baseline == pytest.approx(0.1)
+    assert "locus.cell_size" not in s.defaults
+
+
 def test_standard_layout_by_folder_and_by_number(root):
     by_folder = open_sequence(str(root / "sequences" / "06"))
     by_number = open_sequence(f"{root}:06")

@@ -44,3 +44,12 @@ def test_no_valid_disparity_and_contradicting_ones_are_two_things() -> None:
     told = reason()
     assert "76800 valid disparities" in told
     assert "locus.max_residual" in told
+
+
+def test_a_handful_of_cells_is_too_coarse() -> None:
+    coarse = Lattice.snap((-0.2, 0.2, 0.6, 1.0), 0.1)
+    told = reason(where=coarse)
+    assert f"there are {coarse.rows * coarse.cols} only ({coarse.rows} x {coarse.cols})" in told
+    assert coarse.rows * coarse.cols < 40
+    assert "locus.cell_size" in told
+    assert "none of 76800" in reason(where=coarse, usable=~GOOD)
