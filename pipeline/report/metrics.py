@@ -153,9 +153,16 @@ def _trajectory(view: RunView, frames: Rows) -> dict[str, Metric]:
         given = dict(_assessed(view, handle, prefix, group, view.sequence.truth_source))
         order = [f"{prefix}{name}" for name in LABELS]
         ordered = sorted(given, key=lambda name: order.index(name) if name in order else len(order))
-        share = complete if prefix == "trajectory_" else _posed(given, prefix)
+        share = (complete if prefix == "trajectory_" else _posed(given, prefix)) + _with_truth(view)
         found |= {name: {**given[name], "completeness": share} for name in ordered}
     return found
+
+
+def _with_truth(view: RunView) -> str:
+    """How many of the frames have a truth, where some have none."""
+    truth = view.sequence.truth or ()
+    known = sum(truth[f] is not None for f in view.frames if f < len(truth))
+    return "" if not truth or known == len(view.frames) else f", truth for {known}"
 
 
 def _posed(given: Mapping[str, Metric], prefix: str) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -272,3 +273,12 @@ def test_shading_is_bright_towards_the_light() -> None:
 
 def test_spans() -> None:
     assert words.spans([1, 2, 3, 7, 9, 10]) == "1-3, 7, 9-10"
+
+
+def test_frames_without_truth_are_counted_where_errors_are_stated(tmp_path: Path) -> None:
+    run = view()
+    assert run.sequence.truth is not None
+    truth = tuple(None if k in (1, 3) else pose for k, pose in enumerate(run.sequence.truth))
+    facts, _, _, _ = written(tmp_path, replace(run, sequence=replace(run.sequence, truth=truth)))
+    assert facts["metrics"]["trajectory_ate_rmse"]["completeness"] == "6 of 6 frames, truth for 4"
+    assert facts["metrics"]["frames_posed"]["completeness"] == "6 of 6 frames"
