@@ -64,10 +64,11 @@ STAGE_MODULES: dict[str, str] = {
 
 ACCURATE_TERRAIN: dict[str, Any] = {
     "hfvm": {"preset": "accurate"},
-    "locus": {"both": True},
+    "locus": {"both": True, "max_jump": 5.0},
     "merge": {"max_std_cells": 0.7},
 }
-"""What ``terrain.preset = "accurate"`` sets; a value given for any of these keys wins."""
+"""What ``terrain.preset = "accurate"`` sets; a value given for any of these keys wins. With both directions, a standard
+deviation tells steep ground from an edge, so that a disparity may jump farther; beyond 5 pixels nothing is gained."""
 
 
 class TerrainParams(Params):

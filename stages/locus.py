@@ -28,6 +28,7 @@ from stages.level import z_range as plane_z_range
 from stages.locus_empty import explain
 from stages.locus_refine import refine, standard_deviation
 from stages.locus_solve import Dem, Matches, Task, join, projections, solve
+from stages.locus_std import from_both
 from stages.locus_views import Views, views
 from stages.surface import Surface, plane
 from stages.validity import matched
@@ -148,14 +149,17 @@ def reconstruct(
     told = z_range, params.sigma_disparity, (params.max_residual, params.max_jump)
     out = solve(Task(maps, image, rig, T_surface_left, *told), surface)
     seen = None if right is None else _views(image, right, rig, T_surface_left)
+    apart = None
     if back is not None:
         if right is None:
             raise InputError("disparities of the right image are given without the image")
         turned = Rig(rig.right, rig.left, rig.T_right_left.inverse())
         T_surface_right = T_surface_left @ rig.T_right_left.inverse()
-        out = join(out, solve(Task(back, right, turned, T_surface_right, *told), surface))
+        other = solve(Task(back, right, turned, T_surface_right, *told), surface)
+        apart = out.elevation.astype(np.float64) - other.elevation
+        out = join(out, other)
     if seen is not None and (params.refine_steps or back is not None):
-        _refine(out, seen, surface, params.refine_steps)
+        _refine(out, seen, surface, params.refine_steps, apart)
     greatest = _greatest_std(params, disparity_std is not None)
     if greatest is not None:
         unsure = ~(out.elevation_std <= greatest)
@@ -172,10 +176,18 @@ def _views(image: ArrayLike, right: ArrayLike, rig: Rig, T_surface_left: RigidTr
     return views(*projections(rig, T_surface_left), images[0], images[1], T_surface_left.translation)
 
 
-def _refine(dem: Dem, views: Views, surface: Surface, steps: int) -> None:
-    """Refine a model in place: elevations, their standard deviations, grey values of the left image."""
+def _refine(dem: Dem, views: Views, surface: Surface, steps: int, apart: Floats | None) -> None:
+    """Refine a model in place: elevations, their standard deviations, grey values of the left image.
+
+    ``apart``: (rows, cols) difference of both directions of matching, metres; None: there was one.
+    """
     elevation, seen = refine(views, surface, dem.elevation, steps)
-    dem.elevation_std[...] = standard_deviation(elevation, seen, dem.elevation_std.astype(np.float64))
+    before = dem.elevation_std.astype(np.float64)
+    if apart is None:
+        dem.elevation_std[...] = standard_deviation(elevation, seen, before)
+    else:
+        moved = elevation.astype(np.float64) - dem.elevation
+        dem.elevation_std[...] = from_both(elevation, seen, moved, apart, before)
     dem.elevation[...], dem.ortho[...] = elevation, np.clip(seen[0], 0.0, 255.0)
 
 
