@@ -63,12 +63,13 @@ STAGE_MODULES: dict[str, str] = {
 """Every stage of the chain by name; a section of the configuration where the stage has parameters."""
 
 ACCURATE_TERRAIN: dict[str, Any] = {
-    "hfvm": {"preset": "accurate"},
+    "hfvm": {"preset": "accurate", "greatest_std": None},
     "locus": {"both": True, "max_jump": 5.0},
     "merge": {"max_std_cells": 0.7},
 }
-"""What ``terrain.preset = "accurate"`` sets; a value given for any of these keys wins. With both directions, a standard
-deviation tells steep ground from an edge, so that a disparity may jump farther; beyond 5 pixels nothing is gained."""
+"""What ``terrain.preset = "accurate"`` sets; a value given for any of these keys wins. With both directions a cell's own
+standard deviation tells good from bad better than the matcher's limits do, so they leave it more to choose from: no
+greatest standard deviation of a match, and disparities may jump by 5 pixels (beyond that nothing is gained)."""
 
 
 class TerrainParams(Params):

@@ -2,17 +2,18 @@
 
 A sum of variances, each of which can be seen on the ground itself. With s the pixels of disparity a metre of elevation,
 
-    (s sigma_Z)^2 = FLOOR^2 + t^2 / 2 + N^2 / I + (SHADE N / g)^2 + d^2 + (MOVED m)^2
+    (s sigma_Z)^2 = FLOOR^2 + t^2 / 2 + r^2 / (2 I) + (SHADE N / g)^2 + (APART d)^2 + (MOVED m)^2
 
 t: the step of Z from cell to cell (RMS of 3 x 3 cells), since a position that is wrong by a part of a cell is an
-elevation that is wrong by as much of its step. N: what both images differ by on the surface (robust, one figure for a
-pair); I: the sum of the squared gradients in 9 x 9 cells, so that N^2 / I is what least squares expects of them. g: the
-grey value. In a shadow the gradients found are those of noise; what contrast there can be, brightness says. d: the
-difference of both directions (RMS of 5 x 5 cells), :data:`ALONE` where none of them has both. m: how far the refinement
-moved the cells (RMS of 5 x 5 cells): what the disparity and the ground disagree about, neither is sure of.
+elevation that is wrong by as much of its step. r: what both images still differ by (RMS of 5 x 5 cells), I: the sum of
+the squared gradients there, so that r^2 / I is what least squares expects of such differences. N: the differences of
+the whole pair (robust), g: the grey value. In a shadow the gradients found are those of noise; what contrast there can
+be, brightness says. d: the difference of both directions (RMS of 5 x 5 cells), :data:`ALONE` where none of them has
+both. m: how far the refinement moved the cells (RMS of 5 x 5 cells): what the disparity and the ground disagree about,
+neither is sure of.
 
 The factors are those of a fit by non-negative least squares to the squared errors of pairs of the simulator's seeds 2
-and 3 (preset ``accurate`` of the matcher), rounded; those of N^2 / I and d^2 came out as 0.9 and 1.0 by themselves.
+and 3 (preset ``accurate`` of the matcher), rounded. Its default seed, which figures are given for, had no part in it.
 """
 
 from __future__ import annotations
@@ -25,17 +26,22 @@ from stages.windows import window_sum
 Float32 = NDArray[np.float32]
 Floats = NDArray[np.float64]
 
-FLOOR = 0.045
+FLOOR = 0.03
 """Pixels of disparity."""
-SHADE = 1.8
+STEP = 0.5
+"""Of the squared step: a position is uncertain by 0.7 cells."""
+REST = 0.5
+"""Of r^2 / I."""
+SHADE = 1.9
 """Of noise over grey value: what is left of the ground's contrast in the dark."""
+APART = 0.87
 ALONE = 0.2
 """Pixels of disparity: difference of both directions where only one of them found something."""
 MOVED = 1.7
-LEAST_GRADIENT = 1e-3
-"""Squared grey levels a pixel: so that a blank wall is not divided by."""
-STEP_SIDE, NEAR_SIDE, NOISE_SIDE, MEAN_SIDE = 3, 5, 9, 15
-"""Cells: sides of the windows of t; of d, m and g; of I; and of the local mean that N goes without."""
+LEAST_GRADIENT = 1.0
+"""Squared grey levels a pixel, of each cell: so that a blank wall is not divided by."""
+STEP_SIDE, NEAR_SIDE, MEAN_SIDE = 3, 5, 15
+"""Cells: sides of the windows of t, of all others, and of the local mean that differences go without."""
 
 
 def from_both(elevation: Float32, seen: Float32, moved: Floats, apart: Floats, otherwise: Floats) -> Floats:
@@ -53,25 +59,26 @@ def from_both(elevation: Float32, seen: Float32, moved: Floats, apart: Floats, o
     if not known.any():
         return otherwise
     scale = np.where(known, seen[3], 1.0).astype(np.float64)
-    noise, power = _noise(seen, known, scale)
-    grey = np.maximum(_mean(np.where(known, seen[0], 0.0), known, NEAR_SIDE), max(noise, LEAST_GRADIENT))
+    rest = np.where(known, seen[0] - seen[1], 0.0).astype(np.float64)
+    rest = np.where(known, rest - _mean(rest, known, MEAN_SIDE), 0.0)
+    noise = 1.4826 * float(np.median(np.abs(rest[known])))
+    grey = np.maximum(_mean(np.where(known, seen[0], 0.0), known, NEAR_SIDE), max(noise, 1.0))
     both = known & np.isfinite(apart)
     differ = _mean(np.where(both, np.square(scale * apart), 0.0), both, NEAR_SIDE)
     differ[window_sum(both, NEAR_SIDE) < 1.0] = ALONE**2
-    variance = FLOOR**2 + 0.5 * _mean(_steps(elevation, scale, known), known, STEP_SIDE)
-    variance += noise**2 / (np.maximum(window_sum(power, NOISE_SIDE), 0.0) + LEAST_GRADIENT)
-    variance += np.square(SHADE * noise / grey) + differ
+    variance = FLOOR**2 + STEP * _mean(_steps(elevation, scale, known), known, STEP_SIDE)
+    variance += REST * _mean(np.square(rest), known, NEAR_SIDE) / _gradients(seen, scale, known)
+    variance += np.square(SHADE * noise / grey) + APART**2 * differ
     variance += MOVED**2 * _mean(np.where(known, np.square(scale * moved), 0.0), known, NEAR_SIDE)
     # Differences of running sums may fall below zero by their rounding.
     return np.where(known, np.sqrt(np.maximum(variance, FLOOR**2)) / scale, otherwise)
 
 
-def _noise(seen: Float32, known: NDArray[np.bool_], scale: Floats) -> tuple[float, Floats]:
-    """Robust standard deviation of the images' difference, grey levels, and squared gradient a pixel of disparity."""
-    rest = np.where(known, seen[0] - seen[1], 0.0).astype(np.float64)
-    noise = 1.4826 * float(np.median(np.abs((rest - _mean(rest, known, MEAN_SIDE))[known])))
+def _gradients(seen: Float32, scale: Floats, known: NDArray[np.bool_]) -> Floats:
+    """Sum of the squared gradients around each cell, squared grey levels a pixel of disparity."""
     slope = np.where(known, seen[5] - seen[2], 0.0) / scale
-    return noise, np.square(slope) * np.where(known, np.minimum(seen[4], 1.0), 0.0)
+    power = np.square(slope) * np.where(known, np.minimum(seen[4], 1.0), 0.0)
+    return np.maximum(window_sum(power, NEAR_SIDE), 0.0) + LEAST_GRADIENT * NEAR_SIDE**2
 
 
 def _steps(elevation: Float32, scale: Floats, known: NDArray[np.bool_]) -> Floats:

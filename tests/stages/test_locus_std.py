@@ -3,18 +3,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stages.locus_std import ALONE, FLOOR, MOVED, SHADE, from_both
+from stages.locus_std import ALONE, APART, FLOOR, LEAST_GRADIENT, MOVED, REST, SHADE, STEP, from_both
 
 SHAPE = (40, 50)
 SCALE = 500.0
 CONTRAST, AREA, NOISE, GREY = 8.0, 0.5, 2.0, 100.0
-STEP, APART, SHIFT = 2e-4, 1.5e-4, 1e-4
+RISE, AWAY, SHIFT = 2e-4, 1.5e-4, 1e-4
 
 
-def ground(step: float = STEP) -> tuple[np.ndarray, np.ndarray]:
+def ground(rise: float = RISE) -> tuple[np.ndarray, np.ndarray]:
     """A slope across the rows' cells, and two images whose difference is a chequerboard of +-NOISE."""
     rows, cols = np.indices(SHAPE)
-    elevation = (step * cols).astype(np.float32)
+    elevation = (rise * cols).astype(np.float32)
     seen = np.empty((6, *SHAPE), np.float32)
     seen[0] = GREY
     seen[1] = GREY - NOISE * np.where((rows + cols) % 2, 1.0, -1.0)
@@ -31,27 +31,27 @@ def std(elevation: np.ndarray, seen: np.ndarray, moved: float = 0.0, apart: floa
     return from_both(elevation, seen, uniform(moved), uniform(1.0) * apart, uniform(0.5))
 
 
-def expected(*, step: float = STEP, grey: float = GREY, apart: float = 0.0, moved: float = 0.0) -> float:
+def expected(*, rise: float = RISE, grey: float = GREY, apart: float = 0.0, moved: float = 0.0) -> float:
     """By hand: the chequerboard's median difference is its height, its local mean nearly nothing."""
     noise = 1.4826 * NOISE
-    variance = FLOOR**2 + 0.5 * (SCALE * step) ** 2 + noise**2 / (81 * CONTRAST**2 * AREA)
-    variance += (SHADE * noise / grey) ** 2 + (SCALE * apart) ** 2 + (MOVED * SCALE * moved) ** 2
+    variance = FLOOR**2 + STEP * (SCALE * rise) ** 2 + REST * NOISE**2 / (25 * (CONTRAST**2 * AREA + LEAST_GRADIENT))
+    variance += (SHADE * noise / grey) ** 2 + (APART * SCALE * apart) ** 2 + (MOVED * SCALE * moved) ** 2
     return float(np.sqrt(variance) / SCALE)
 
 
-@pytest.mark.parametrize("term", [{}, {"apart": APART}, {"moved": SHIFT}, {"apart": APART, "moved": SHIFT}])
+@pytest.mark.parametrize("term", [{}, {"apart": AWAY}, {"moved": SHIFT}, {"apart": AWAY, "moved": SHIFT}])
 def test_variances_add_up_as_by_hand(term: dict[str, float]) -> None:
     np.testing.assert_allclose(std(*ground(), **term)[20, 25], expected(**term), rtol=5e-3)
 
 
 def test_each_part_counts() -> None:
     """Of what the figures above are made: none of the parts is lost among the others."""
-    whole = expected(apart=APART, moved=SHIFT)
+    whole = expected(apart=AWAY, moved=SHIFT)
     for less in (
         expected(apart=0.0, moved=SHIFT),
-        expected(apart=APART, moved=0.0),
-        expected(step=0.0, apart=APART, moved=SHIFT),
-        expected(grey=1e6, apart=APART, moved=SHIFT),
+        expected(apart=AWAY, moved=0.0),
+        expected(rise=0.0, apart=AWAY, moved=SHIFT),
+        expected(grey=1e6, apart=AWAY, moved=SHIFT),
     ):
         assert less < 0.99 * whole
 
@@ -67,12 +67,12 @@ def test_in_the_dark_there_is_no_contrast_to_match() -> None:
 
 
 def test_where_one_direction_found_nothing_a_difference_is_supposed() -> None:
-    apart = uniform(APART)
+    apart = uniform(AWAY)
     apart[:, 20:] = np.nan
     found = std(*ground(), apart=apart)
     np.testing.assert_allclose(found[20, 40], expected(apart=ALONE / SCALE), rtol=5e-3)
-    np.testing.assert_allclose(found[20, 20], expected(apart=APART), rtol=5e-3)  # its neighbours have both
-    np.testing.assert_allclose(found[20, 10], expected(apart=APART), rtol=5e-3)
+    np.testing.assert_allclose(found[20, 20], expected(apart=AWAY), rtol=5e-3)  # its neighbours have both
+    np.testing.assert_allclose(found[20, 10], expected(apart=AWAY), rtol=5e-3)
 
 
 def test_cells_that_the_images_do_not_show_keep_theirs() -> None:
@@ -88,6 +88,6 @@ def test_cells_that_the_images_do_not_show_keep_theirs() -> None:
 
 
 def test_images_without_noise_or_contrast_leave_the_rest() -> None:
-    elevation, seen = ground(step=0.0)
+    elevation, seen = ground(rise=0.0)
     seen[1], seen[5] = seen[0], 0.0
     np.testing.assert_allclose(std(elevation, seen)[20, 25], FLOOR / SCALE, rtol=1e-3)
