@@ -63,7 +63,7 @@ STAGE_MODULES: dict[str, str] = {
 """Every stage of the chain by name; a section of the configuration where the stage has parameters."""
 
 ACCURATE_TERRAIN: dict[str, Any] = {
-    "hfvm": {"preset": "accurate", "greatest_std": None},
+    "hfvm": {"preset": "accurate", "greatest_std": 100.0},
     "locus": {"both": True, "max_jump": 5.0},
     "merge": {"max_std_cells": 0.7},
 }

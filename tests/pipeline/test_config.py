@@ -22,7 +22,7 @@ def test_one_setting_makes_terrain_accurate_and_what_is_given_beside_it_wins() -
     assert (plain.hfvm.preset, plain.locus.both, plain.merge.max_std_cells) == ("default", False, None)
     built = config.build({"locus": {"cell_size": 0.01}}, config.parse_assignments(["terrain.preset=accurate"]))
     assert (built.hfvm.preset, built.locus.both, built.merge.max_std_cells) == ("accurate", True, 0.7)
-    assert (built.locus.cell_size, built.locus.max_jump, built.hfvm.greatest_std) == (0.01, 5.0, None)
+    assert (built.locus.cell_size, built.locus.max_jump, built.hfvm.greatest_std) == (0.01, 5.0, 100.0)
     assert config.build({"hfvm": {"preset": "accurate"}}).hfvm.greatest_std == 1.1
     assert built.hfvm.relief_steps == config.build({"hfvm": {"preset": "accurate"}}).hfvm.relief_steps
     built = config.build({"terrain": {"preset": "accurate"}}, config.parse_assignments(["locus.both=false"]))
