@@ -67,9 +67,12 @@ ACCURATE_TERRAIN: dict[str, Any] = {
     "locus": {"both": True, "max_jump": 5.0},
     "merge": {"max_std_cells": 0.7},
 }
-"""What ``terrain.preset = "accurate"`` sets; a value given for any of these keys wins. With both directions a cell's own
-standard deviation tells good from bad better than the matcher's limits do, so they leave it more to choose from: no
-greatest standard deviation of a match, and disparities may jump by 5 pixels (beyond that nothing is gained)."""
+"""What ``terrain.preset = "accurate"`` sets; a value given for any of these keys wins.
+
+With both directions a cell's own standard deviation tells good from bad better than the matcher's limits do, so they
+leave it more to choose from: no greatest standard deviation of a match, and disparities may jump by 5 pixels (beyond
+that nothing is gained).
+"""
 
 
 class TerrainParams(Params):
