@@ -3,9 +3,12 @@
 The way is planned to the goal over all of the map. Ground that is known and free costs its length; unknown ground may
 be planned over, at a higher price, since the next stop will see it, but is never driven on: the leg ends before it. So
 may ground that is hazardous only by the standard deviation of its elevations. Ground that is known to be hazardous, or
-nearer to it than the vehicle and its margin need, is closed. So the way bends round dead ends as soon as they are seen,
-and where no way is left even over unknown ground there is none. This is the usual free-space assumption (Koenig, Tovey,
-Smirnov 2003, doi:10.1016/S0004-3702(03)00062-6), planned anew at each stop.
+nearer to it than the vehicle and its margin need, is closed. What was seen from afar alone counts as unknown but for
+its hazards, at a price of its own: the windows of a matcher smooth away what is smaller than they are on the ground.
+
+So the way bends round dead ends as soon as they are seen, and where no way is left even over unknown ground there is
+none. This is the usual free-space assumption (Koenig, Tovey, Smirnov 2003, doi:10.1016/S0004-3702(03)00062-6), planned
+anew at each stop.
 
 The vehicle drives ahead, or back at a higher price, and turns on the spot where its wheels have room to
 (:mod:`stages.pose_graph`): it may pass between two hazards between which it could not turn.
@@ -40,6 +43,7 @@ from stages.route import (
     within_turn,
 )
 from stages.vehicle import Vehicle
+from stages.verdict import UNKNOWN
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -68,6 +72,9 @@ class LegParams(Params):
         le=0.5,
         description="probability up to which ground that is hazardous by sigma alone is driven on, at a price: limits "
         "are half of what tips the vehicle over, and who never dares does not arrive among rocks",
+    )
+    glance_price: float = Field(
+        1.3, ge=1, description="price of a metre over ground that was seen from afar alone: mostly it is as it looks"
     )
     unknown_price: float = Field(2.0, ge=1, description="price of a metre over unknown ground, known ground is 1")
     caution_price: float = Field(
@@ -132,7 +139,7 @@ class Ground:
         at = footing.gaps(*(np.array([v]) for v in (*start, heading)))
         # where it stands it may be: near there, ground that is no worse by more than a cell will do
         self.here = [min(self.vehicle.margin, float(a[0]) - self.cell) for a in (at.gap, at.proven)]
-        self.on_unknown = float(at.unknown[0]) <= 0
+        self.unknown_here = min(0.0, float(at.unknown[0]) - self.cell)
         self.astray = None if before is None else _away_from(before, footing.lattice, 0.5 * self.vehicle.wheel_base)
         spacing = max(p.spacing * self.vehicle.wheel_diameter, self.cell)
         self.grid = PoseGrid.over(footing.lattice, start, heading, spacing)
@@ -144,7 +151,7 @@ class Ground:
         near = np.hypot(x - self.start[0], y - self.start[1]) <= 0.3 * self.vehicle.wheel_base
         margin = self.vehicle.margin
         known = gaps.gap > np.where(near, self.here[0], margin)
-        known &= (gaps.unknown > 0) | (near & self.on_unknown)
+        known &= gaps.unknown > np.where(near, self.unknown_here, 0.0)
         opened = gaps.proven > np.where(near, self.here[1], margin)
         for cx, cy in self.closed:
             opened &= known | (np.hypot(x - cx, y - cy) > self.p.vain * self.vehicle.wheel_base)
@@ -155,7 +162,10 @@ class Ground:
         self._sure.append(known)
         reach = self.p.blind * self.vehicle.wheel_base * np.where(gaps.unknown > 0, 2.0, 1.0)
         blind = np.hypot(x - self.start[0], y - self.start[1]) <= reach
-        unknown = np.where(blind, max(self.p.blind_price, self.p.unknown_price), self.p.unknown_price)
+        unseen = self.p.unknown_price
+        if self.footing.glanced is not None:
+            unseen = np.where(self._at(~self.footing.glanced, x, y), unseen, min(self.p.glance_price, unseen))
+        unknown = np.where(blind, np.maximum(self.p.blind_price, unseen), unseen)
         price = np.where(known, 1.0, unknown) + self.p.caution_price * gaps.caution
         if self.vehicle.margin > 0:
             price = price + self.p.near_price * np.clip(2.0 - gaps.gap / self.vehicle.margin, 0.0, 1.0)
@@ -345,9 +355,18 @@ def _run(params: LegParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     closed = [(float(x), float(y)) for x, y in args["closed"]]
     before = np.asarray(inputs["before"]["way"]) if "before" in inputs else None
     before = None if before is None or len(before) < 2 else before
-    maps = (np.asarray(risk["risk"]), np.asarray(risk["reason"]), lattice, vehicle, np.asarray(risk["p_hazard"]))
+    names = ("risk", "reason", "p_hazard")
+    classes, reason, chance = (np.asarray(risk[name]) for name in names)
+    unknown, glanced = classes == UNKNOWN, None
+    if "far" in inputs:
+        far = inputs["far"]
+        classes, reason, chance = (
+            np.where(unknown, np.asarray(far[name]), near)
+            for name, near in zip(names, (classes, reason, chance), strict=True)
+        )
+        glanced = unknown & (classes != UNKNOWN)
     for sure in params.sure:
-        footing = Footing.of(*maps, sure, params.dare)
+        footing = Footing.of(classes, reason, lattice, vehicle, chance, sure, params.dare, unknown, glanced)
         found = plan_leg(footing, start, heading, goal, params, int(args["looks"]), closed, before)
         if found.verdict == "goal" or len(found.way) > 1:
             break
@@ -373,10 +392,10 @@ def _length(path: Floats) -> float:
 
 STAGE = Stage(
     name="leg",
-    version=2,
+    version=3,
     summary="the next leg of a drive to a goal, over ground that is known to be free",
     params=LegParams,
-    inputs=("risk", "pose", "before?"),
+    inputs=("risk", "far?", "pose", "before?"),
     outputs=(
         Array(
             "path",

@@ -65,12 +65,12 @@ def test_unknown_ground_wider_than_half_a_wheel_is_never_missed() -> None:
         assert at(Footing.of(risk, None, LATTICE, ROVER), 0.0, 0.0, 0.0)[2] <= 0
 
 
-def test_unknown_ground_beyond_the_vehicle_is_not_beneath_it_at_any_distance() -> None:
+def test_wheels_keep_the_margin_from_unknown_ground_and_no_more() -> None:
     for far in np.arange(0.045, 0.12, 0.001):
         risk = np.where(far < X, np.uint8(UNKNOWN), np.uint8(SAFE))
         edge = X[risk == UNKNOWN].min()
         beneath = at(Footing.of(risk, None, LATTICE, ROVER), 0.0, 0.0, 0.0)[2] <= 0
-        assert beneath == (edge < 0.04 + 0.5 * LATTICE.cell + 1e-9)
+        assert beneath == (edge < 0.04 + ROVER.margin + 0.5 * LATTICE.cell + 1e-9)
 
 
 def test_outside_the_map_it_may_not_be() -> None:
