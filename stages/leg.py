@@ -370,9 +370,17 @@ def _run(params: LegParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
         found = plan_leg(footing, start, heading, goal, params, int(args["looks"]), closed, before)
         if found.verdict == "goal" or len(found.way) > 1:
             break
-    best = shortest(footing, start, heading, goal, params) if args.get("whole") else None
+    best: float | None = None
+    margin: float | None = None
+    for margin in (vehicle.margin, 0.0) if args.get("whole") else ():
+        bare = vehicle.model_copy(update={"margin": margin})
+        allowed = Footing.of(classes, reason, lattice, bare, chance, params.sure[-1], params.dare)
+        best = shortest(allowed, start, heading, goal, params)
+        if best is not None:
+            break
     meta = {
         "shortest_m": best,
+        "shortest_margin_m": margin,
         "verdict": found.verdict,
         "reason": found.reason,
         "turn": found.turn,
