@@ -50,6 +50,10 @@ Mask = NDArray[np.bool_]
 Point = tuple[float, float]
 
 
+FACING = math.radians(8.0)
+"""What lies within it of the heading is looked at already."""
+
+
 class LegParams(Params):
     """Parameters of the stage ``leg``."""
 
@@ -106,7 +110,8 @@ class Leg:
     """``verdict``: drive, turn, look, closed, goal or no path; ``path`` (vertex, 2) m to drive, ``gear`` (piece,) 1 for
     ahead and -1 for back; ``turn`` rad then.
 
-    ``closed``: looking around did not help; ``where`` the way is not known to be free.
+    A look around turns, or drives back to see what lies nearer than the camera's view. ``closed``: it did not help;
+    ``where`` the way is not known to be free.
 
     ``way`` (vertex, 2) m to the goal, as it is planned; ``cost`` (row, col) m to the goal at these prices at the best
     heading, NaN where it is closed, or farther than the vehicle.
@@ -186,7 +191,11 @@ class Ground:
 
     def clear(self, x: Floats, y: Floats, heading: Floats) -> bool:
         """Whether all of these poses may be driven."""
-        return bool(self._split(self.footing.gaps(x, y, heading), x, y)[0].all())
+        return bool(self.free(x, y, heading).all())
+
+    def free(self, x: Floats, y: Floats, heading: Floats) -> Mask:
+        """Which of these poses may be driven."""
+        return self._split(self.footing.gaps(x, y, heading), x, y)[0]
 
     def places(self) -> tuple[Floats, Floats]:
         """x and y (row, col), m, of the graph's places."""
@@ -266,6 +275,12 @@ def plan_leg(
         return _stay("turn", f"turns {math.degrees(turn):.0f} degrees to where it goes on", start, way, shown, turn)
     x, y = way[_sure(way)].b if _sure(way) < len(way) else way[-1].b
     towards = math.remainder(math.atan2(-(x - start[0]), y - start[1]) - heading, 2 * math.pi)
+    if looks < params.looks and (looks > 0 or abs(towards) < FACING):
+        back = _free_back(ground, params.blind * base)
+        if length_of(back) >= params.least * base:
+            reason = f"drives back {1000 * length_of(back):.0f} mm to see the ground before it"
+            gear = np.full(len(back), -1, np.int8)
+            return Leg("look", reason, vertices(back, start), gear, 0.0, vertices(way, start), shown)
     turn = 0.0 if looks >= params.looks else _free_turn(ground, towards, looks)
     if turn:
         return _stay("look", f"turns {math.degrees(turn):.0f} degrees to see the way", start, way, shown, turn)
@@ -309,11 +324,21 @@ def _free_turn(ground: Ground, towards: float, looks: int) -> float:
     bound = math.radians(ground.p.max_turn_deg)
     aside = [math.radians(d) for d in (25.0, -50.0, 75.0)]
     aside = aside[looks % 3 :] + aside[: looks % 3] + [math.radians(d) for d in (-25.0, 15.0, -15.0)]
-    wanted = [*([towards] if abs(towards) >= math.radians(8.0) else []), *aside]
+    wanted = [*([towards] if abs(towards) >= FACING else []), *aside]
     for turn in (max(-bound, min(bound, w)) for w in wanted):
         if turnable(ground.start, ground.heading, ground.heading + turn, ground.clear):
             return turn
     return 0.0
+
+
+def _free_back(ground: Ground, most: float) -> list[Piece]:
+    """Straight back, at most so many metres, as far as it is free: then the camera sees what it is blind to now."""
+    n = math.ceil(2.0 * most / ground.cell)
+    way = np.linspace(0.0, most, n + 1)
+    x, y = ground.start[0] + way * math.sin(ground.heading), ground.start[1] - way * math.cos(ground.heading)
+    free = ground.free(x, y, np.full(way.shape, ground.heading))
+    last = int(np.argmin(free)) - 1 if not free.all() else n
+    return [Piece(ground.start, (float(x[last]), float(y[last])), ground.heading, -1)] if last > 0 else []
 
 
 def shortest(footing: Footing, start: Point, heading: float, goal: Point, params: LegParams) -> float | None:

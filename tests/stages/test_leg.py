@@ -259,3 +259,17 @@ def test_the_shortest_way_over_free_ground_is_little_longer_than_the_beeline(x: 
     length = shortest(ground(), START, 0.0, (x, y), P)
     assert length is not None
     assert math.hypot(x, y) - 0.016 <= length <= 1.02 * math.hypot(x, y)
+
+
+def test_what_lies_nearer_than_its_view_is_looked_at_from_farther_back() -> None:
+    band, walls = np.abs(Y - 0.10) < 0.02, np.abs(X) > 0.1
+    before = ground((band, UNKNOWN), (walls, HAZARDOUS))
+    leg = plan_leg(before, START, 0.0, GOAL, P)
+    assert leg.verdict == "look"
+    assert leg.gear.tolist() == [-1]
+    x, y = leg.path[-1]
+    assert abs(x) < 1e-9
+    # the map ends 0.2 m behind the start: there the rear wheels stand
+    assert -P.blind * ROVER.wheel_base - 1e-9 <= y < -0.1
+    blocked = ground((band, UNKNOWN), (walls | (Y < -0.08), HAZARDOUS))
+    assert plan_leg(blocked, START, 0.0, GOAL, P).gear.tolist() == []
