@@ -63,7 +63,7 @@ class DriveParams(Params):
         default=None, description="m, m, m, degrees; its pose in the global map, handed in instead of found"
     )
     detail: float = Field(
-        default=5.0,
+        default=4.0,
         ge=0,
         description="pixels that a wheel's diameter covers along the range where it may drive: about a matching "
         "window, which smooths away what is smaller; what is seen from farther serves to plan; 0: all is driven on",
@@ -137,6 +137,8 @@ class Drive(Reconstruction):
         """Row of each frame in the artifact of its leg."""
         self.closed: list[list[float]] = []
         """Places about which unknown ground was looked at in vain."""
+        self.backs: list[list[float]] = []
+        """Places from which it drove back to see what lies before them."""
         self.turned: Handle | None = None
         """The leg that made the vehicle turn on the spot, while it has not driven since."""
         self.reopened = False
@@ -287,7 +289,8 @@ class Drive(Reconstruction):
         self.pads = [self._node("pad", "pad", args, pose=self.pose, like=like)] if self.simulation.pad > 0 else []
 
     def _leg(self, label: str, risk: Handle, pose: Handle, *, whole: bool = False, **more: Handle) -> Handle:
-        args = {"goal": list(self.goal), "looks": self.looks, "closed": self.closed, **self.mounting}
+        args: dict[str, Any] = {"goal": list(self.goal), "looks": self.looks, **self.mounting}
+        args |= {"closed": self.closed, "backs": self.backs}
         if whole:
             args["whole"] = True
         elif self.turned is not None:
@@ -317,6 +320,8 @@ class Drive(Reconstruction):
         else:
             self.turned = None if verdict == "drive" else stop.leg
             self.looks = {"drive": 0, "turn": self.looks, "look": self.looks + 1}[verdict]
+            if verdict == "look" and leg.meta["length_m"] > 0:
+                self.backs = [*self.backs, leg.meta["start"][:2]]
             stop.event = leg.meta["reason"]
             self._drive(stop, before, row)
 
@@ -497,7 +502,7 @@ class Drive(Reconstruction):
             truth_dem = self._simulate(source, "truth_dem", scene=self.scene)
             p.dem_accuracy = self._node("dem_accuracy", "dem_accuracy/world", {}, dem=p.tiles, truth=truth_dem)
             p.truth_risk = self._risk("risk/truth", [truth_dem])
-            self.looks, self.closed = 0, []
+            self.looks, self.closed, self.backs = 0, [], []
             self.driven.truth_leg = self._leg("leg/truth", p.truth_risk, self.first_pose, whole=True)
             self._check()
 

@@ -33,8 +33,8 @@ BODY_BITS = np.uint16(sum(BITS.values()) - int(WHEEL_BITS))
 NEAR_UNKNOWN = 0.5
 """Cells; nearer than this a point of the belly lies in an unknown cell."""
 
-DOUBT_WEIGHT = 15
-"""Of ground that is hazardous by sigma alone, against caution: a wheel there makes a way dearer by half."""
+DOUBT_WEIGHT = 75
+"""Of doubtful ground against caution: a wheel there makes a metre cost four, so that most detours are cheaper."""
 
 
 @dataclass(frozen=True)
@@ -75,6 +75,7 @@ class Footing:
         dare: float = 0.0,
         unknown: Mask | None = None,
         glanced: Mask | None = None,
+        avoid: float = 1.0,
     ) -> Footing:
         """From classes and reason bits of :mod:`stages.risk`; without bits every hazard is one to a wheel.
 
@@ -82,7 +83,8 @@ class Footing:
         of it something is known nevertheless.
 
         A hazard is proven where it is not one by sigma alone, and at least as probable as ``sure``. What is one by
-        sigma alone and less probable than ``dare`` is caution ground :data:`DOUBT_WEIGHT` times.
+        sigma alone and less probable than ``dare`` is caution ground :data:`DOUBT_WEIGHT` times, and so is what is
+        within a quarter of a wheel, where its edge touches, of ground that is a hazard with a probability of ``avoid``.
         """
         hazardous, cell = risk == HAZARDOUS, lattice.cell
         bits = np.full(risk.shape, WHEEL_BITS) if reason is None else reason
@@ -93,7 +95,7 @@ class Footing:
             proven = likely & (p_hazard >= sure)
             dared = doubtful & (p_hazard < dare)
             doubtful &= ~dared
-            caution[dared] = DOUBT_WEIGHT
+            caution[dared | (_distance(p_hazard >= avoid, cell) <= 0.25 * vehicle.wheel_diameter)] = DOUBT_WEIGHT
         kinds = [(bits & which) > 0 for which in (WHEEL_BITS, BODY_BITS)]
         fields = []
         for kind in kinds:

@@ -77,6 +77,13 @@ class LegParams(Params):
         description="probability up to which ground that is hazardous by sigma alone is driven on, at a price: limits "
         "are half of what tips the vehicle over, and who never dares does not arrive among rocks",
     )
+    avoid: float = Field(
+        0.06,
+        gt=0,
+        le=1,
+        description="probability of a hazard from which ground is driven on only where a detour is much longer: on the "
+        "simulator's beds all edges that the map did not show lay on ground of 0.07 and more",
+    )
     glance_price: float = Field(
         1.3, ge=1, description="price of a metre over ground that was seen from afar alone: mostly it is as it looks"
     )
@@ -232,6 +239,7 @@ def plan_leg(
     looks: int = 0,
     closed: Sequence[Point] = (),
     before: Floats | None = None,
+    backs: Sequence[Point] = (),
 ) -> Leg:
     """The next leg.
 
@@ -242,6 +250,7 @@ def plan_leg(
     looks : looks around since the last leg that was driven.
     closed : places about which unknown ground was looked at in vain.
     before : (vertex, 2) m, the way for which the vehicle has just turned; None: it has driven since.
+    backs : places from which it drove back already, to see what lies before it.
 
     Raises
     ------
@@ -275,7 +284,8 @@ def plan_leg(
         return _stay("turn", f"turns {math.degrees(turn):.0f} degrees to where it goes on", start, way, shown, turn)
     x, y = way[_sure(way)].b if _sure(way) < len(way) else way[-1].b
     towards = math.remainder(math.atan2(-(x - start[0]), y - start[1]) - heading, 2 * math.pi)
-    if looks < params.looks and (looks > 0 or abs(towards) < FACING):
+    again = any(math.hypot(start[0] - bx, start[1] - by) < params.vain * base for bx, by in backs)
+    if looks < params.looks and not again and (looks > 0 or abs(towards) < FACING):
         back = _free_back(ground, params.blind * base)
         if length_of(back) >= params.least * base:
             reason = f"drives back {1000 * length_of(back):.0f} mm to see the ground before it"
@@ -391,8 +401,10 @@ def _run(params: LegParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
         )
         glanced = unknown & (classes != UNKNOWN)
     for sure in params.sure:
-        footing = Footing.of(classes, reason, lattice, vehicle, chance, sure, params.dare, unknown, glanced)
-        found = plan_leg(footing, start, heading, goal, params, int(args["looks"]), closed, before)
+        footing = Footing.of(
+            classes, reason, lattice, vehicle, chance, sure, params.dare, unknown, glanced, params.avoid
+        )
+        found = plan_leg(footing, start, heading, goal, params, int(args["looks"]), closed, before, args["backs"])
         if found.verdict == "goal" or len(found.way) > 1:
             break
     best: float | None = None

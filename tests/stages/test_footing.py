@@ -103,3 +103,11 @@ def test_what_is_hazardous_by_sigma_alone_and_improbable_is_caution_ground_many_
     daring, not_so = (at(Footing.of(risk, reason, LATTICE, ROVER, p, 0.9, d), 0.0, 0.0, 0.0) for d in (0.3, 0.1))
     assert (daring[0], daring[3]) == (np.inf, pytest.approx(DOUBT_WEIGHT / 5))
     assert (not_so[0], not_so[3]) == (pytest.approx(ROVER.margin), 0.0)
+
+
+def test_ground_within_a_quarter_of_a_wheel_of_a_probable_hazard_is_dear() -> None:
+    p = np.where(X > 0.059, 0.1, 0.0).astype(np.float32)
+    risk, reason = np.full(LATTICE.shape, SAFE, np.uint8), np.zeros(LATTICE.shape, np.uint16)
+    dear, free = (Footing.of(risk, reason, LATTICE, ROVER, p, 0.9, 0.3, avoid=a).caution > 0 for a in (0.06, 0.2))
+    assert np.array_equal(dear, X > 0.054)  # a cell of 5 mm beside it, not the next
+    assert not free.any()

@@ -271,5 +271,6 @@ def test_what_lies_nearer_than_its_view_is_looked_at_from_farther_back() -> None
     assert abs(x) < 1e-9
     # the map ends 0.2 m behind the start: there the rear wheels stand
     assert -P.blind * ROVER.wheel_base - 1e-9 <= y < -0.1
+    assert plan_leg(before, START, 0.0, GOAL, P, backs=[(0.0, 0.02)]).gear.tolist() == []
     blocked = ground((band, UNKNOWN), (walls | (Y < -0.08), HAZARDOUS))
     assert plan_leg(blocked, START, 0.0, GOAL, P).gear.tolist() == []
