@@ -278,8 +278,7 @@ class Drive(Reconstruction):
     def _decide(self, stop: Stop, label: str) -> None:
         """The leg of a stop, by what is known there."""
         assert stop.risk is not None
-        far = {} if stop.far is None else {"far": stop.far}
-        stop.leg = self._leg(label, stop.risk, self.pose, **far)
+        stop.leg = self._leg(label, stop.risk, self.pose, far=stop.far)
 
     def _pad(self, frame: int) -> None:
         """The ground under the vehicle at the start, and where it is."""
@@ -288,14 +287,13 @@ class Drive(Reconstruction):
         like = self.products.world_dem[frame]
         self.pads = [self._node("pad", "pad", args, pose=self.pose, like=like)] if self.simulation.pad > 0 else []
 
-    def _leg(self, label: str, risk: Handle, pose: Handle, *, whole: bool = False, **more: Handle) -> Handle:
+    def _leg(self, label: str, risk: Handle, pose: Handle, *, far: Handle | None = None, whole: bool = False) -> Handle:
         args: dict[str, Any] = {"goal": list(self.goal), "looks": self.looks, **self.mounting}
         args |= {"closed": self.closed, "backs": self.backs}
         if whole:
-            args["whole"] = True
-        elif self.turned is not None:
-            more["before"] = self.turned
-        return self._node("leg", label, args, risk=risk, pose=pose, **more)
+            return self._node("leg", label, args | {"whole": True}, risk=risk, pose=pose)
+        given = {"risk": risk, "far": far, "pose": pose, "before": self.turned}
+        return self._node("leg", label, args, **{name: handle for name, handle in given.items() if handle is not None})
 
     def arena(self) -> Lattice:
         """The part of the world that is mapped: around the start, which is at the origin, and the goal."""

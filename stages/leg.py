@@ -174,9 +174,9 @@ class Ground:
         self._sure.append(known)
         reach = self.p.blind * self.vehicle.wheel_base * np.where(gaps.unknown > 0, 2.0, 1.0)
         blind = np.hypot(x - self.start[0], y - self.start[1]) <= reach
-        unseen = self.p.unknown_price
+        unseen = np.full(x.shape, self.p.unknown_price)
         if self.footing.glanced is not None:
-            unseen = np.where(self._at(~self.footing.glanced, x, y), unseen, min(self.p.glance_price, unseen))
+            unseen[~self._at(~self.footing.glanced, x, y)] = min(self.p.glance_price, self.p.unknown_price)
         unknown = np.where(blind, np.maximum(self.p.blind_price, unseen), unseen)
         price = np.where(known, 1.0, unknown) + self.p.caution_price * gaps.caution
         if self.vehicle.margin > 0:
