@@ -33,8 +33,11 @@ BODY_BITS = np.uint16(sum(BITS.values()) - int(WHEEL_BITS))
 NEAR_UNKNOWN = 0.5
 """Cells; nearer than this a point of the belly lies in an unknown cell."""
 
-DOUBT_WEIGHT = 75
-"""Of doubtful ground against caution: a wheel there makes a metre cost four, so that most detours are cheaper."""
+DOUBT_WEIGHT = 15
+"""Of ground that is hazardous by sigma alone, against caution: a wheel there makes a way dearer by half."""
+
+AVOID_WEIGHT = 60
+"""Of ground that was seen from near and is doubtful still, against caution: a wheel there makes a metre cost three."""
 
 
 @dataclass(frozen=True)
@@ -83,10 +86,12 @@ class Footing:
         of it something is known nevertheless.
 
         A hazard is proven where it is not one by sigma alone, and at least as probable as ``sure``. What is one by
-        sigma alone and less probable than ``dare`` is caution ground :data:`DOUBT_WEIGHT` times, and so is what is
-        within a quarter of a wheel, where its edge touches, of ground that is a hazard with a probability of ``avoid``.
+        sigma alone and less probable than ``dare`` is caution ground :data:`DOUBT_WEIGHT` times. What is not unknown
+        and within a quarter of a wheel, where its edge touches, of a hazard more probable than ``avoid`` is
+        :data:`AVOID_WEIGHT` times.
         """
         hazardous, cell = risk == HAZARDOUS, lattice.cell
+        unknown = risk == UNKNOWN if unknown is None else unknown
         bits = np.full(risk.shape, WHEEL_BITS) if reason is None else reason
         doubtful = hazardous & ((bits & DOUBT_BIT) > 0)
         likely = proven = hazardous & ~doubtful
@@ -95,14 +100,15 @@ class Footing:
             proven = likely & (p_hazard >= sure)
             dared = doubtful & (p_hazard < dare)
             doubtful &= ~dared
-            caution[dared | (_distance(p_hazard >= avoid, cell) <= 0.25 * vehicle.wheel_diameter)] = DOUBT_WEIGHT
+            caution[dared] = DOUBT_WEIGHT
+            probable = (p_hazard >= avoid) & ~unknown
+            caution[(_distance(probable, cell) <= 0.25 * vehicle.wheel_diameter) & ~unknown] = AVOID_WEIGHT
         kinds = [(bits & which) > 0 for which in (WHEEL_BITS, BODY_BITS)]
         fields = []
         for kind in kinds:
             # sigma is the room for error there: the margin is not added to it
             beside = _distance(doubtful & kind, cell) + np.float32(vehicle.margin)
             fields += [np.minimum(_distance(likely & kind, cell), beside), _distance(proven & kind, cell)]
-        unknown = risk == UNKNOWN if unknown is None else unknown
         return Footing(lattice, vehicle, np.stack(fields), _distance(unknown, cell), caution, glanced)
 
     def gaps(self, x: Floats, y: Floats, heading: Floats) -> Gaps:
