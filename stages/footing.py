@@ -34,10 +34,7 @@ NEAR_UNKNOWN = 0.5
 """Cells; nearer than this a point of the belly lies in an unknown cell."""
 
 DOUBT_WEIGHT = 15
-"""Of ground that is hazardous by sigma alone, against caution: a wheel there makes a way dearer by half."""
-
-AVOID_WEIGHT = 60
-"""Of ground that was seen from near and is doubtful still, against caution: a wheel there makes a metre cost three."""
+"""Of ground that is hazardous by sigma alone, or doubted, against caution: a wheel there makes a way dearer by half."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +75,7 @@ class Footing:
         dare: float = 0.0,
         unknown: Mask | None = None,
         glanced: Mask | None = None,
-        avoid: float = 1.0,
+        doubted: Mask | None = None,
     ) -> Footing:
         """From classes and reason bits of :mod:`stages.risk`; without bits every hazard is one to a wheel.
 
@@ -86,9 +83,8 @@ class Footing:
         of it something is known nevertheless.
 
         A hazard is proven where it is not one by sigma alone, and at least as probable as ``sure``. What is one by
-        sigma alone and less probable than ``dare`` is caution ground :data:`DOUBT_WEIGHT` times. What is not unknown
-        and within a quarter of a wheel, where its edge touches, of a hazard more probable than ``avoid`` is
-        :data:`AVOID_WEIGHT` times.
+        sigma alone and less probable than ``dare`` is caution ground :data:`DOUBT_WEIGHT` times. ``doubted`` ground
+        and what is within a quarter of a wheel of it, where its edge touches, is :data:`DOUBT_WEIGHT` times.
         """
         hazardous, cell = risk == HAZARDOUS, lattice.cell
         unknown = risk == UNKNOWN if unknown is None else unknown
@@ -101,8 +97,8 @@ class Footing:
             dared = doubtful & (p_hazard < dare)
             doubtful &= ~dared
             caution[dared] = DOUBT_WEIGHT
-            probable = (p_hazard >= avoid) & ~unknown
-            caution[(_distance(probable, cell) <= 0.25 * vehicle.wheel_diameter) & ~unknown] = AVOID_WEIGHT
+        if doubted is not None:
+            caution[(_distance(doubted, cell) <= 0.25 * vehicle.wheel_diameter) & ~unknown] = DOUBT_WEIGHT
         kinds = [(bits & which) > 0 for which in (WHEEL_BITS, BODY_BITS)]
         fields = []
         for kind in kinds:

@@ -43,7 +43,7 @@ from stages.route import (
     within_turn,
 )
 from stages.vehicle import Vehicle
-from stages.verdict import UNKNOWN
+from stages.verdict import UNKNOWN, UNSEEN_BIT
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -81,8 +81,8 @@ class LegParams(Params):
         0.06,
         gt=0,
         le=1,
-        description="probability of a hazard from which ground is driven on only where a detour is much longer: on the "
-        "simulator's beds all edges that the map did not show lay on ground of 0.07 and more",
+        description="probability of a hazard from which ground is dear: on the simulator's beds all edges that the map "
+        "did not show lay on ground of 0.07 and more",
     )
     glance_price: float = Field(
         1.3, ge=1, description="price of a metre over ground that was seen from afar alone: mostly it is as it looks"
@@ -392,18 +392,19 @@ def _run(params: LegParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     before = None if before is None or len(before) < 2 else before
     names = ("risk", "reason", "p_hazard")
     classes, reason, chance = (np.asarray(risk[name]) for name in names)
-    unknown, glanced = classes == UNKNOWN, None
+    unknown, glanced, doubted = classes == UNKNOWN, None, chance >= params.avoid
     if "far" in inputs:
         far = inputs["far"]
+        # at the rim of what is near, a window that is cut off widens the doubt; the whole of it was seen from afar
+        doubted &= ((reason & UNSEEN_BIT) == 0) | ~(np.asarray(far["p_hazard"]) < params.avoid)
         classes, reason, chance = (
             np.where(unknown, np.asarray(far[name]), near)
             for name, near in zip(names, (classes, reason, chance), strict=True)
         )
         glanced = unknown & (classes != UNKNOWN)
+    seen = {"unknown": unknown, "glanced": glanced, "doubted": doubted}
     for sure in params.sure:
-        footing = Footing.of(
-            classes, reason, lattice, vehicle, chance, sure, params.dare, unknown, glanced, params.avoid
-        )
+        footing = Footing.of(classes, reason, lattice, vehicle, chance, sure, params.dare, **seen)
         found = plan_leg(footing, start, heading, goal, params, int(args["looks"]), closed, before, args["backs"])
         if found.verdict == "goal" or len(found.way) > 1:
             break

@@ -54,8 +54,11 @@ def test_gaps_are_those_of_looking_at_every_cell(seed: int, x: float, y: float, 
     assert gap == pytest.approx(least, abs=half + 1e-6)
     inside = (XY[risk == UNKNOWN] - (x, y)) @ np.array([[c, -s], [s, c]])
     beside = (np.abs(inside) > np.array([0.04, 0.05]) + 2 * half).any(axis=1)
-    if beside.all():
+    away = np.hypot(*(wheels[:, None] - XY[risk == UNKNOWN][None]).transpose(2, 0, 1)).min()
+    if beside.all() and away > ROVER.margin + 2 * half:
         assert unknown > 0
+    if away < ROVER.margin - half:
+        assert unknown < 0
 
 
 def test_unknown_ground_wider_than_half_a_wheel_is_never_missed() -> None:
@@ -105,9 +108,8 @@ def test_what_is_hazardous_by_sigma_alone_and_improbable_is_caution_ground_many_
     assert (not_so[0], not_so[3]) == (pytest.approx(ROVER.margin), 0.0)
 
 
-def test_ground_within_a_quarter_of_a_wheel_of_a_probable_hazard_is_dear() -> None:
-    p = np.where(X > 0.059, 0.1, 0.0).astype(np.float32)
-    risk, reason = np.full(LATTICE.shape, SAFE, np.uint8), np.zeros(LATTICE.shape, np.uint16)
-    dear, free = (Footing.of(risk, reason, LATTICE, ROVER, p, 0.9, 0.3, avoid=a).caution > 0 for a in (0.06, 0.2))
-    assert np.array_equal(dear, X > 0.054)  # a cell of 5 mm beside it, not the next
-    assert not free.any()
+def test_ground_within_a_quarter_of_a_wheel_of_doubted_ground_is_dear() -> None:
+    risk = np.full(LATTICE.shape, SAFE, np.uint8)
+    unknown = Y > 0.2
+    footing = Footing.of(risk, None, LATTICE, ROVER, unknown=unknown, doubted=X > 0.059)
+    assert np.array_equal(footing.caution > 0, (X > 0.054) & ~unknown)  # a cell of 5 mm beside it, not the next
