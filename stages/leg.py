@@ -4,7 +4,8 @@ The way is planned to the goal over all of the map. Ground that is known and fre
 be planned over, at a higher price, since the next stop will see it, but is never driven on: the leg ends before it. So
 may ground that is hazardous only by the standard deviation of its elevations. Ground that is known to be hazardous, or
 nearer to it than the vehicle and its margin need, is closed. What was seen from afar alone counts as unknown but for
-its hazards, at a price of its own: the windows of a matcher smooth away what is smaller than they are on the ground.
+its hazards and for what is clearly free, at a price of its own: the windows of a matcher smooth away what is smaller
+than they are on the ground.
 
 So the way bends round dead ends as soon as they are seen, and where no way is left even over unknown ground there is
 none. This is the usual free-space assumption (Koenig, Tovey, Smirnov 2003, doi:10.1016/S0004-3702(03)00062-6), planned
@@ -83,6 +84,13 @@ class LegParams(Params):
         le=1,
         description="probability of a hazard from which ground is dear: on the simulator's beds all edges that the map "
         "did not show lay on ground of 0.07 and more",
+    )
+    clear: float = Field(
+        0.02,
+        ge=0,
+        lt=1,
+        description="probability of a hazard below which ground is driven on that was seen from afar alone: of places "
+        "for a wheel below it 0.05 in a thousand had an edge that the map did not show, of all 3.7",
     )
     glance_price: float = Field(
         1.3, ge=1, description="price of a metre over ground that was seen from afar alone: mostly it is as it looks"
@@ -401,6 +409,7 @@ def _run(params: LegParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
             np.where(unknown, np.asarray(far[name]), near)
             for name, near in zip(names, (classes, reason, chance), strict=True)
         )
+        unknown &= ~(chance < params.clear)
         glanced = unknown & (classes != UNKNOWN)
     seen = {"unknown": unknown, "glanced": glanced, "doubted": doubted}
     for sure in params.sure:
