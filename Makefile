@@ -27,6 +27,7 @@ $(STAMP): pyproject.toml constraints.txt
 	  || { echo "rille needs Python 3.11 or newer; say which with PYTHON=..." >&2; exit 2; }
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	@$(BIN)/python -m compileall -q pipeline stages datasets
 	@touch $@
 
 reconstruct: $(STAMP) ## a sequence to terrain, trajectory, risk map, path and report: SEQ= FRAMES= JOBS= SET="key=value ..."

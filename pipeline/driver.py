@@ -360,7 +360,8 @@ class _Run:
         amounts = {k: round(v) for k, v in vars(shares).items() if math.isfinite(v)}
         self.ledger.run(executor=self.executor_kind, jobs=shares.workers, **amounts)
         workers = shares.workers if few else self.jobs
-        self.executor = make(self.executor_kind, workers, self.store.location, shares.limit)
+        modules = tuple(dict.fromkeys(h.spec.module for h in ahead.nodes if not h.done))
+        self.executor = make(self.executor_kind, workers, self.store.location, shares.limit, modules)
         self.result.executor_started = True
 
     def _look_ahead(self) -> Graph:

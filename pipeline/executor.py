@@ -21,6 +21,7 @@ import threading
 import time
 import traceback
 import warnings
+from collections.abc import Sequence
 from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import dataclass
@@ -29,7 +30,7 @@ from typing import Any, Protocol
 from pipeline import cluster
 from pipeline.environment import cores, prepare_environment
 from pipeline.location import Location
-from pipeline.task import Outcome, Refs, Spec, ensure
+from pipeline.task import Outcome, Refs, Spec, ensure, resolve
 from pipeline.workers import WorkerDiedError, Workers, died
 from stages.errors import ConfigError, RilleError
 
@@ -103,10 +104,13 @@ def known(kind: str) -> None:
         raise ConfigError(f"executor {kind!r} is unknown", remedy=f"{', '.join(KINDS)} or tcp://host:port")
 
 
-def make(kind: str, jobs: int | None, cache: Location, memory: float = math.inf) -> Executor:
+def make(
+    kind: str, jobs: int | None, cache: Location, memory: float = math.inf, modules: Sequence[str] = ()
+) -> Executor:
     """``inline``, ``threads``, ``processes`` or a scheduler's address; ``jobs`` None is one a core.
 
     A worker process of our own that takes more than ``memory`` bytes by itself is ended, before the system ends others.
+    ``modules`` are those of the stages to come, in their order: a worker that has nothing to do imports them.
 
     Raises
     ------
@@ -122,7 +126,7 @@ def make(kind: str, jobs: int | None, cache: Location, memory: float = math.inf)
     if kind == "threads":
         return Threads(jobs)
     if kind == "processes":
-        return Processes(jobs, cache, memory)
+        return Processes(jobs, cache, memory, modules)
     return Cluster(kind, cache)
 
 
@@ -295,8 +299,8 @@ def _elsewhere(
 class Processes:
     """Worker processes of our own, one thread each (:mod:`pipeline.workers`)."""
 
-    def __init__(self, jobs: int, cache: Location, memory: float = math.inf) -> None:
-        self._workers = Workers(jobs, _attempt, cache, memory)
+    def __init__(self, jobs: int, cache: Location, memory: float = math.inf, modules: Sequence[str] = ()) -> None:
+        self._workers = Workers(jobs, _attempt, cache, memory, resolve, modules)
 
     def idle(self) -> bool:
         """Whether a worker has nothing to do; it may still be starting."""

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 
 from pipeline import products as files
+from pipeline.ahead import Early
 from pipeline.conventions import describe
 from pipeline.dag import Graph, Handle
 from pipeline.report import RunView, TaskRow, draw, write_report
-from pipeline.report.block import Block
 from pipeline.report.canvas import ground_limits
 from pipeline.report.comparison import compare
 from pipeline.store import GoneError, Store
@@ -53,29 +53,33 @@ def task_rows(graph: Graph, store: Store) -> tuple[TaskRow, ...]:
     return tuple(rows)
 
 
-def write(folder: Path, view: RunView, figures: Mapping[str, Block] | None = None) -> None:
-    """All files of a run; what has no artifact is left out (the report says so). ``figures`` were drawn before."""
+def write(folder: Path, view: RunView, early: Early) -> None:
+    """All files of a run; what has no artifact is left out (the report says so). ``early`` was made before."""
     with ThreadPoolExecutor(1) as pool:  # rasters are computed and compressed while figures are drawn
-        rasters = pool.submit(_write_rasters, folder, view)
+        files = pool.submit(_write_files, folder, view, early.files)
         try:
-            drawn = draw(view, figures)
+            drawn = draw(view, early.figures)
         except GoneError:  # the other one may have set it aside, and says why
-            rasters.result()
+            files.result()
             raise
-        rasters.result()
-    _write_path(folder, view)
+        files.result()
     _write_trajectories(folder, view)
     write_report(folder, view, drawn)
 
 
-def _write_rasters(folder: Path, view: RunView) -> None:
-    find, p = view.bundle, view.products
-    tiles = [find(tile) for tile in p.tiles]
+def _write_files(folder: Path, view: RunView, early: Mapping[str, Path]) -> None:
+    for name, writer in WRITERS.items():
+        if name not in early:
+            writer(folder, view)
+            continue
+        for file in sorted(early[name].iterdir()):
+            file.rename(folder / file.name)
+
+
+def _write_terrain(folder: Path, view: RunView) -> None:
+    tiles = [view.bundle(tile) for tile in view.products.tiles]
     if tiles and all(tiles):  # a hole in the run must not look like unknown terrain
-        _write_terrain(folder, view, [t for t in tiles if t is not None])
-    risk = find(p.risk)
-    if risk is not None:
-        _write_risk(folder, risk, view.sequence.georeference)
+        _write_tiles(folder, view, [t for t in tiles if t is not None])
 
 
 def _write_path(folder: Path, view: RunView) -> None:
@@ -86,8 +90,11 @@ def _write_path(folder: Path, view: RunView) -> None:
         files.write_path_gpkg(folder / "path.gpkg", np.asarray(path["path"]), facts, view.sequence.georeference)
 
 
-def _write_risk(folder: Path, risk: Bundle, place: Any) -> None:
+def _write_risk(folder: Path, view: RunView) -> None:
     """Class, measures in metres and degrees, probability and reasons in one file, so all of one type (float32)."""
+    risk, place = view.bundle(view.products.risk), view.sequence.georeference
+    if risk is None:
+        return
     units = {a.name: a.unit for a in RISK.outputs if a.unit in ("m", "rad") and a.name != "elevation"}
     bands = {"class": risk["risk"], "reason": risk["reason"], "p_hazard": risk["p_hazard"], "filled": risk["filled"]}
     bands |= {name: np.degrees(risk[name]) if unit == "rad" else risk[name] for name, unit in units.items()}
@@ -130,7 +137,7 @@ def _write_trajectories(folder: Path, view: RunView) -> None:
     files.write_text(folder / "frames.json", json.dumps(facts, indent=1) + "\n")
 
 
-def _write_terrain(folder: Path, view: RunView, tiles: list[Bundle]) -> None:
+def _write_tiles(folder: Path, view: RunView, tiles: list[Bundle]) -> None:
     """Merged rasters, assembled from world tiles, what is derived of the elevation, its style, and all as zarr."""
     lattices, place = [Lattice.from_dict(t.meta["lattice"]) for t in tiles], view.sequence.georeference
     whole = union(lattices)
@@ -168,3 +175,11 @@ def _write_terrain(folder: Path, view: RunView, tiles: list[Bundle]) -> None:
         "history": view.command,
     }
     write_terrain(folder / "terrain.zarr", arrays, whole, place, about)
+
+
+WRITERS: Mapping[str, Callable[[Path, RunView], None]] = {
+    "terrain": _write_terrain,
+    "risk": _write_risk,
+    "path": _write_path,
+}
+"""What writes files of artifacts alone, each of its own; it may be called before the run has ended."""

@@ -12,6 +12,7 @@ import hashlib
 import os
 import shutil
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -24,11 +25,12 @@ from pipeline.artifact import DamagedError
 from pipeline.code import remember
 from pipeline.dag import Graph
 from pipeline.location import Location, hints_folder, locate
-from pipeline.store import GoneError, at
+from pipeline.store import GoneError, Store, at
 from stages.declare import Bundle
 from stages.errors import ConfigError, RilleError
 
 if TYPE_CHECKING:
+    from pipeline.driver import Result
     from pipeline.reconstruct import Products
     from pipeline.report import RunView
 
@@ -133,9 +135,90 @@ def reconstruct(options: Options) -> int:
         return _reconstruct(options)
 
 
+@dataclass(frozen=True)
+class _Opened:
+    """A run that is configured and laid out, with the folder that its results go to."""
+
+    options: Options
+    sequence: Sequence
+    frames: tuple[int, ...]
+    config: Any
+    text: str
+    vehicle_source: str
+    folder: Path
+    started: datetime
+    versions: dict[str, str]
+    store: Store
+    graph: Graph
+    flow: Any
+    products: Products
+
+    def view(self, **late: Any) -> RunView:
+        """What is drawn; ``late`` is what only the end of the run knows."""
+        from pipeline import outputs
+        from pipeline.report import RunView
+
+        return RunView(
+            run_id=self.folder.name,
+            sequence=self.sequence,
+            frames=self.frames,
+            products=self.products,
+            bundle=outputs.bundles(self.store),
+            config=self.config,
+            config_toml=self.text,
+            versions=self.versions,
+            command=self.options.command(),
+            vehicle_source=self.vehicle_source,
+            started=self.started.strftime("%Y-%m-%dT%H:%M:%SZ"),
+            notes=self.sequence.notes,
+            **late,
+        )
+
+    def stamp(self) -> str:
+        """What the files of the run are rendered from, in one word."""
+        from pipeline import standing
+
+        facts = {"config": self.text, "frames": self.frames, "vehicle": self.vehicle_source}
+        return standing.stamp(self.graph, self.sequence, self.versions, **facts, command=self.options.command())
+
+
 def _reconstruct(options: Options) -> int:
-    from pipeline import driver, memory, progress
-    from pipeline.drive import Drive, dataflow
+    opened = _open(options)
+    driven = opened.sequence.simulation is not None
+    with Ahead(opened.folder, lambda: opened.view(tasks=())) as ahead:
+        result = _compute(opened, None if driven else ahead.work)
+        if driven:
+            sequence, frames = opened.flow.taken()
+            opened = replace(opened, sequence=sequence, frames=frames)
+        stamped, earlier = opened.stamp(), opened.folder.parent / "latest"
+        remember()
+        if _stands(options, result, earlier, stamped):
+            shutil.rmtree(opened.folder)
+            warn_of_results(opened.graph)
+            cached = result.total().cached
+            print(f"{earlier.parent / earlier.readlink()}  cached {cached}, nothing new: that run stands")
+            return _posed_all(opened.products)
+        _write(opened, result, ahead)
+    if result.ok:
+        from pipeline import standing
+
+        standing.seal(opened.folder, stamped)
+    _point_latest(opened.folder)
+    warn_of_results(opened.graph)
+    if driven:
+        outcome, stops = opened.flow.outcome(), opened.flow.driven.stops
+        print(f"{': '.join(word for word in outcome if word)}  ({len(stops)} stops)")
+    total = result.total()
+    print(f"{opened.folder}  computed {total.computed}, cached {total.cached}, missing {total.failed + total.skipped}")
+    if result.ok:
+        return _posed_all(opened.products)
+    _list_missing(opened.graph, opened.folder)
+    return HOLES
+
+
+def _open(options: Options) -> _Opened:
+    """Read the input and lay the run out."""
+    from pipeline.drive import dataflow
     from pipeline.executor import known
 
     _known_stages(options.force)
@@ -149,88 +232,56 @@ def _reconstruct(options: Options) -> int:
     text = _header(options) + configuration.to_toml(config, sequence.parameters)
     folder = _make_folder(options.runs / sequence.name, started, text + repr(frames))
     (folder / "config.toml").write_text(text, encoding="utf-8")
-
     graph, store = Graph(), at(options.cache)
     flow = dataflow(graph, sequence, config, frames)
-    products = flow.build()
-    versions = _versions()
+    return _Opened(
+        options, sequence, frames, config, text, vehicle_source, folder, started, _versions(), store, graph, flow,
+        flow.build(),
+    )  # fmt: skip
 
-    def view(**late: Any) -> RunView:
-        """What is drawn; ``late`` is what only the end of the run knows."""
-        from pipeline import outputs
-        from pipeline.report import RunView
 
-        return RunView(
-            run_id=folder.name,
-            sequence=sequence,
-            frames=frames,
-            products=products,
-            bundle=outputs.bundles(store),
-            config=config,
-            config_toml=text,
-            versions=versions,
-            command=options.command(),
-            vehicle_source=vehicle_source,
-            started=started.strftime("%Y-%m-%dT%H:%M:%SZ"),
-            notes=sequence.notes,
-            **late,
-        )
+def _compute(opened: _Opened, meanwhile: Callable[[], None] | None) -> Result:
+    """Bring every task to its artifact, or raise the first failure."""
+    from pipeline import driver, memory, progress
 
-    ahead = Ahead(lambda: view(tasks=()))
-    try:
-        result = driver.run(
-            graph,
-            store,
-            executor=options.executor,
-            jobs=options.jobs,
-            keep_going=options.keep_going,
-            force=options.force,
-            ledger=folder / "ledger.jsonl",
-            progress=progress.make(options.progress),
-            memory_limit=None if options.memory_limit is None else memory.parse(options.memory_limit),
-            survey=lambda: lay_out(sequence, config, frames),
-            meanwhile=None if isinstance(flow, Drive) else ahead.draw,
-        )
-    finally:
-        figures = ahead.take()
-    if not options.keep_going and not (isinstance(flow, Drive) and flow.outcome()[0] == "safety stop"):
+    options = opened.options
+    result = driver.run(
+        opened.graph,
+        opened.store,
+        executor=options.executor,
+        jobs=options.jobs,
+        keep_going=options.keep_going,
+        force=options.force,
+        ledger=opened.folder / "ledger.jsonl",
+        progress=progress.make(options.progress),
+        memory_limit=None if options.memory_limit is None else memory.parse(options.memory_limit),
+        survey=lambda: lay_out(opened.sequence, opened.config, opened.frames),
+        meanwhile=meanwhile,
+    )
+    safety_stop = opened.sequence.simulation is not None and opened.flow.outcome()[0] == "safety stop"
+    if not options.keep_going and not safety_stop:
         result.check()
-    if isinstance(flow, Drive):
-        sequence, frames = flow.taken()
+    return result
 
+
+def _stands(options: Options, result: Result, earlier: Path, stamped: str) -> bool:
     from pipeline import standing
 
-    facts = {"config": text, "frames": frames, "vehicle": vehicle_source, "command": options.command()}
-    stamped = standing.stamp(graph, sequence, versions, **facts)
-    remember()
-    earlier = folder.parent / "latest"
-    if result.ok and not result.total().computed and not options.fresh and standing.stands(earlier, stamped):
-        shutil.rmtree(folder)
-        warn_of_results(graph)
-        print(f"{earlier.parent / earlier.readlink()}  cached {result.total().cached}, nothing new: that run stands")
-        return _posed_all(products)
+    return result.ok and not result.total().computed and not options.fresh and standing.stands(earlier, stamped)
 
+
+def _write(opened: _Opened, result: Result, ahead: Ahead) -> None:
+    """Everything that the run leaves; nothing of it where an artifact was found damaged."""
     from pipeline import ledger, outputs
 
-    whole = view(tasks=outputs.task_rows(graph, store), seconds=result.seconds)
+    whole = opened.view(tasks=outputs.task_rows(opened.graph, opened.store), seconds=result.seconds)
     try:
-        outputs.write(folder, whole, figures)
-        ledger.add_facts(folder / "ledger.jsonl", total=(datetime.now(UTC) - started).total_seconds())
+        outputs.write(opened.folder, whole, ahead.take())
+        total = (datetime.now(UTC) - opened.started).total_seconds()
+        ledger.add_facts(opened.folder / "ledger.jsonl", total=total)
     except (DamagedError, GoneError):
-        shutil.rmtree(folder)
+        shutil.rmtree(opened.folder)
         raise
-    if result.ok:
-        standing.seal(folder, stamped)
-    _point_latest(folder)
-    warn_of_results(graph)
-    total = result.total()
-    if isinstance(flow, Drive):
-        print(f"{': '.join(word for word in flow.outcome() if word)}  ({len(flow.driven.stops)} stops)")
-    print(f"{folder}  computed {total.computed}, cached {total.cached}, missing {total.failed + total.skipped}")
-    if result.ok:
-        return _posed_all(products)
-    _list_missing(graph, folder)
-    return HOLES
 
 
 def lay_out(sequence: Sequence, config: Any, frames: tuple[int, ...]) -> Graph:

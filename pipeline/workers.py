@@ -13,7 +13,7 @@ import signal
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing import connection, resource_tracker
@@ -30,7 +30,7 @@ DEATHS = 3
 """Worker processes that one task may take along."""
 
 UNREADY = 12
-"""Workers that may die as they start, with no task done in between, before the run is given up."""
+"""Workers that may die without a task, with none done in between, before the run is given up."""
 
 WATCH = 0.2
 """Seconds between looks at the memory of the workers."""
@@ -65,10 +65,21 @@ class Workers:
     """So many processes that run ``attempt(*task)`` each; one that dies is replaced.
 
     ``attempt`` must be importable, tasks and answers picklable. A worker with more than ``memory`` bytes is ended.
+    While a worker waits for a task it runs ``prepare`` on one of ``names`` after the other; what fails there is left to
+    the task that needs it.
     """
 
-    def __init__(self, count: int, attempt: Callable[..., Any], cache: Location, memory: float = math.inf) -> None:
+    def __init__(
+        self,
+        count: int,
+        attempt: Callable[..., Any],
+        cache: Location,
+        memory: float = math.inf,
+        prepare: Callable[[str], Any] = str,
+        names: Sequence[str] = (),
+    ) -> None:
         self._attempt, self._cache, self._memory = attempt, cache, memory
+        self._prepare, self._names = prepare, tuple(names)
         self._tasks: dict[str, Task] = {}
         self._deaths: Counter[str] = Counter()
         self._seen: dict[str, int] = {}
@@ -86,7 +97,8 @@ class Workers:
     def _start(self) -> _Worker:
         context = multiprocessing.get_context("spawn")
         here, there = context.Pipe()
-        process = context.Process(target=_serve, args=(there, self._attempt, self._cache), daemon=True)
+        args = (there, self._attempt, self._cache, self._prepare, self._names)
+        process = context.Process(target=_serve, args=args, daemon=True)
         with _environment(worker_environment(self._cache)):
             process.start()
         there.close()  # so that its death ends the pipe
@@ -140,10 +152,10 @@ class Workers:
         """Put another one in its place, which goes on with its task unless that has taken too many along."""
         key = worker.key
         self._end([worker])
-        if not worker.ready:
+        if not worker.ready or key is None:
             self._unready += 1
             if self._unready > UNREADY:
-                raise died(f"{UNREADY} worker processes died as they started")
+                raise died(f"{UNREADY} worker processes died without a task")
         with _interrupts_deferred():
             self._workers[self._workers.index(worker)] = another = self._start()
         if key is None:
@@ -187,7 +199,13 @@ class Workers:
             worker.process.join()
 
 
-def _serve(pipe: connection.Connection, attempt: Callable[..., Any], cache: Location) -> None:
+def _serve(
+    pipe: connection.Connection,
+    attempt: Callable[..., Any],
+    cache: Location,
+    prepare: Callable[[str], Any],
+    names: Sequence[str],
+) -> None:
     """What a worker does until its pipe ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
@@ -196,7 +214,11 @@ def _serve(pipe: connection.Connection, attempt: Callable[..., Any], cache: Loca
     remember_in(hints_folder(locate(cache)) / "sources.json")
     with suppress(EOFError, BrokenPipeError, ConnectionResetError):
         pipe.send(None)
+        to_come = list(reversed(names))
         while True:
+            while to_come and not pipe.poll():
+                with suppress(Exception):
+                    prepare(to_come.pop())
             pipe.send(attempt(*pipe.recv()))
 
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from stages.declare import Array, Bundle, Inputs, NoParams, Stage
+from stages.declare import Bundle, Inputs, NoParams, Stage
+from stages.pose_arrays import COVARIANCE, POSES
 
 
 def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
@@ -23,16 +25,8 @@ STAGE = Stage(
     params=NoParams,
     inputs=("trajectory",),
     outputs=(
-        Array("poses", ("frame", "row", "col"), "float64", "m", "pose [R | t] of the left camera", frame="world"),
-        Array(
-            "covariance",
-            ("frame", "parameter", "parameter_b"),
-            "float64",
-            "m^2, m rad, rad^2",
-            "covariance of position and rotation vector",
-            frame="world",
-            optional=True,
-        ),
+        replace(POSES, frame="world", nodata=""),
+        replace(COVARIANCE, frame="world", nodata="", optional=True),
     ),
     requires=("numpy",),
     run=_run,

@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -36,6 +36,7 @@ from stages.errors import DegenerateError, InputError
 from stages.geometry import Camera, Rig, RigidTransform
 from stages.landmarks import Landmarks, landmarks_from_dem, landmarks_from_disparity, relief
 from stages.lattice import Lattice
+from stages.pose_arrays import COVARIANCE, POSES
 from stages.reprojection import (
     Observations,
     Poses,
@@ -526,16 +527,8 @@ STAGE = Stage(
     params=ResectParams,
     inputs=("track", "dem?", "disparity?", "level", "rig"),
     outputs=(
-        Array("poses", ("frame", "row", "col"), "float64", "m", "pose [R | t] of the left camera", "nan", "local"),
-        Array(
-            "covariance",
-            ("frame", "parameter", "parameter_b"),
-            "float64",
-            "m^2, m rad, rad^2",
-            "covariance of position and rotation vector",
-            "nan",
-            "local",
-        ),
+        replace(POSES, frame="local"),
+        replace(COVARIANCE, frame="local"),
         Array(
             "shared",
             ("frame", "parameter", "source"),

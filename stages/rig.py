@@ -27,7 +27,6 @@ from stages.observability import (
     RelativeParams,
     decide,
     impossible_share,
-    row_sensitivity,
 )
 from stages.orientation import misalignment
 
@@ -111,7 +110,7 @@ def _judged(given: Rig, pairs: list[Matches], params: RigParams) -> dict[str, An
     residuals = _residuals(given, rig, pairs, decision)
     warnings = _contradiction(given, pairs, decision, params.mode)
     warnings += _doubts(share, residuals["residual_after_px"])
-    warnings += _drift(given, pairs, per_pair, params)
+    warnings += _drift(decision.start, per_pair, params)
     return {
         "rig": rig.to_dict(),
         "source": _source(decision, applied, len(pairs)),
@@ -200,16 +199,27 @@ def _doubts(share: float, residual: float) -> list[str]:
     return lines
 
 
-def _drift(given: Rig, pairs: Sequence[Matches], per_pair: list[dict[str, Any]], params: RigParams) -> list[str]:
-    """Parameters that change from pair to pair by more than their errors, and by enough to matter."""
+def _drift(start: Sequence[Linear], per_pair: list[dict[str, Any]], params: RigParams) -> list[str]:
+    """Parameters that change from pair to pair by more than their errors, in pairs whose rows move enough to matter.
+
+    Over one scene parameters stand in for each other (a pitch for a baseline across, over flat ground), so it counts by
+    how much all that changed moves the rows together.
+    """
+    names = list(per_pair[0]["values"]) if len(per_pair) > 2 else []
+    values = np.array([[p["values"][name] for name in names] for p in per_pair])
+    sigma = np.array([[p["sigma"][name] for name in names] for p in per_pair])
+    departure = values - np.median(values, axis=0)
+    columns = [NAMES.index(name) for name in names]
+    moved = np.array(
+        [
+            np.sqrt(np.mean((one.design[:, columns] @ np.radians(by)) ** 2))
+            for one, by in zip(start, departure, strict=True)
+        ]
+    )
     lines = []
-    rows = dict(zip(NAMES, row_sensitivity(given, pairs), strict=True))
-    for name in per_pair[0]["values"] if len(per_pair) > 2 else ():
-        values = np.array([p["values"][name] for p in per_pair])
-        sigma = np.array([p["sigma"][name] for p in per_pair])
-        away = np.abs(values - np.median(values))
-        moved = np.radians(away) * rows[name]
-        odd = (away > params.significance * sigma) & (moved > params.least_rows)
+    for k, name in enumerate(names):
+        away = np.abs(departure[:, k])
+        odd = (away > params.significance * sigma[:, k]) & (moved > params.least_rows)
         if odd.any():
             worst = int(np.argmax(np.where(odd, away, 0.0)))
             lines.append(

@@ -17,7 +17,7 @@ with the length of the way and not with its root (:mod:`stages.resect`).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from stages.declare import Array, Bundle, Inputs, NoParams, Stage
 from stages.errors import InputError
 from stages.geometry import RigidTransform, orthonormal
+from stages.pose_arrays import COVARIANCE, POSES
 from stages.reprojection import cross_matrix
 
 Floats = NDArray[np.float64]
@@ -223,16 +224,8 @@ STAGE = Stage(
     params=NoParams,
     inputs=("segments*", "levels*", "refined?"),
     outputs=(
-        Array("poses", ("frame", "row", "col"), "float64", "m", "pose [R | t] of the left camera", "nan", "world"),
-        Array(
-            "covariance",
-            ("frame", "parameter", "parameter_b"),
-            "float64",
-            "m^2, m rad, rad^2",
-            "covariance of position and rotation vector",
-            "nan",
-            "world",
-        ),
+        replace(POSES, frame="world"),
+        replace(COVARIANCE, frame="world"),
         Array("segment", ("frame",), "int16", "1", "segment that posed the frame, -1: lost", "-1"),
         Array("piece", ("frame",), "int16", "1", "unbroken piece, each in its own frame; -1: lost", "-1"),
     ),

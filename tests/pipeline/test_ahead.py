@@ -1,4 +1,4 @@
-"""Figures that are drawn before a run has ended are those that it would have at its end."""
+"""Figures drawn and files written before a run has ended are those that it would have at its end."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from toys.chain import build
 from toys.finished import bundles, view
 
 from pipeline import ahead as ahead_module
-from pipeline import driver
-from pipeline.ahead import Ahead
+from pipeline import driver, outputs
+from pipeline.ahead import Ahead, Early
 from pipeline.dag import Graph
 from pipeline.report import canvas, gallery
 from pipeline.report.block import Block
@@ -48,9 +48,9 @@ def early(monkeypatch: pytest.MonkeyPatch) -> tuple[Any, threading.Event]:
     return replace(whole, bundle=find, tasks=()), there
 
 
-def draw(early: Any) -> tuple[Ahead, threading.Thread]:
-    begun = Ahead(lambda: early)
-    thread = threading.Thread(target=begun.draw)
+def begin(early: Any, folder: Path) -> tuple[Ahead, threading.Thread]:
+    begun = Ahead(folder, lambda: early)
+    thread = threading.Thread(target=begun.work)
     thread.start()
     return begun, thread
 
@@ -64,28 +64,67 @@ def until(condition: Any) -> None:
     raise AssertionError("it never came")
 
 
-def test_a_figure_waits_for_all_its_artifacts_and_is_as_at_the_end(early: tuple[Any, threading.Event]) -> None:
+def contents(folder: Path) -> dict[str, bytes]:
+    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+def test_a_figure_waits_for_all_its_artifacts_and_is_as_at_the_end(
+    early: tuple[Any, threading.Event], tmp_path: Path
+) -> None:
     expected = at_the_end()
     needs_path = "Figure 7. Ortho image and path"
     assert needs_path in expected
-    begun, thread = draw(early[0])
-    until(lambda: "Figure 9. Trajectory" in begun._drawn)
-    assert needs_path not in begun._drawn
+    begun, thread = begin(early[0], tmp_path)
+    until(lambda: "Figure 9. Trajectory" in begun._made.figures)
+    assert needs_path not in begun._made.figures
     early[1].set()
-    until(lambda: set(begun._drawn) == set(expected))
+    until(lambda: set(begun._made.figures) == set(expected))
     thread.join()
-    assert begun.take() == expected
+    assert begun.take().figures == expected
 
 
-def test_nothing_is_drawn_after_it_was_taken(early: tuple[Any, threading.Event]) -> None:
-    begun, thread = draw(early[0])
-    taken = dict(begun.take())
+def test_files_wait_too_and_the_run_takes_them_as_they_are(early: tuple[Any, threading.Event], tmp_path: Path) -> None:
+    whole, folders = replace(early[0], bundle=view().bundle), [tmp_path / "plain", tmp_path / "early"]
+    for folder in folders:
+        folder.mkdir()
+    outputs.write(folders[0], whole, Early())
+    with Ahead(folders[1], lambda: early[0]) as ahead:
+        thread = threading.Thread(target=ahead.work)
+        thread.start()
+        until(lambda: {"terrain", "risk"} <= set(ahead._made.files))
+        assert "path" not in ahead._made.files
+        assert [p.name for p in folders[1].iterdir()] == [".early"]
+        early[1].set()
+        until(lambda: "path" in ahead._made.files)
+        thread.join()
+        outputs.write(folders[1], whole, ahead.take())
+    plain, found = map(contents, folders)
+    assert {"dem.tif", "risk.tif", "path.gpkg", "path.geojson"} <= set(plain)
+    assert found == plain
+
+
+def test_a_run_that_fails_leaves_nothing_of_it(early: tuple[Any, threading.Event], tmp_path: Path) -> None:
+    def fail() -> None:
+        with Ahead(tmp_path, lambda: early[0]) as ahead:
+            threading.Thread(target=ahead.work).start()
+            until(lambda: "terrain" in ahead._made.files)
+            assert contents(tmp_path)
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fail()
+    assert not list(tmp_path.iterdir())
+
+
+def test_nothing_is_made_after_it_was_taken(early: tuple[Any, threading.Event], tmp_path: Path) -> None:
+    begun, thread = begin(early[0], tmp_path)
+    taken = dict(begun.take().figures)
     early[1].set()
     thread.join()
-    assert begun.take() == taken
+    assert begun.take().figures == taken
     assert len(taken) < len(at_the_end())
-    begun.draw()
-    assert begun.take() == taken
+    begun.work()
+    assert begun.take().figures == taken
 
 
 def test_the_report_takes_what_was_drawn_and_draws_the_rest() -> None:

@@ -13,12 +13,14 @@ from pathlib import Path
 
 import psutil
 import pytest
+from toys import waiting
 from toys.chain import build
 
 from pipeline import driver, upkeep
 from pipeline.dag import Graph
 from pipeline.executor import WorkerDiedError
 from pipeline.store import Store
+from pipeline.workers import Workers
 from stages.declare import NoParams
 
 HERE = Path(__file__).parent
@@ -160,3 +162,27 @@ def test_an_edit_computes_again_exactly_what_it_can_change(editable):
     real = editable(old="SCALE = 2.0", new="SCALE = 3.0")
     assert {n for n, v in real.items() if v[0] == "computed"} == {*(f"scale/{i}" for i in range(4)), "total"}
     assert real["total"][2] == "input parts changed (4 of 4)"
+
+
+def test_a_worker_that_waits_prepares_what_is_to_come(cache, tmp_path):
+    names = [str(tmp_path / name) for name in ("first", "bad", "last")]
+    workers = Workers(1, waiting.answer, cache, prepare=waiting.note, names=names)
+    try:
+        until = time.monotonic() + HANGS
+        while len(list(tmp_path.iterdir())) < len(names) and time.monotonic() < until:
+            time.sleep(0.01)
+        assert {p.name for p in tmp_path.iterdir()} >= {"first", "bad", "last"}
+        workers.give("key", ("word",))
+        assert workers.wait() == [("key", "WORD")]
+    finally:
+        workers.close(kill=True)
+
+
+def test_a_preparation_that_kills_workers_ends_the_run(cache, tmp_path, monkeypatch):
+    monkeypatch.setattr("pipeline.workers.UNREADY", 1)
+    workers = Workers(1, waiting.answer, cache, prepare=waiting.note, names=[str(tmp_path / "deadly")])
+    try:
+        with pytest.raises(WorkerDiedError, match="died without a task"):
+            workers.wait()
+    finally:
+        workers.close(kill=True)

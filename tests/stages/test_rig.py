@@ -10,11 +10,12 @@ from rig_scenes import bed_depth, bed_rig, knocked, matches, street_depth, stree
 from terrain_scenes import toed_in_rig
 
 from stages import rig as rig_stage
-from stages.adjustment import Matches
+from stages.adjustment import RIG, Matches, linearised
 from stages.declare import Bundle
+from stages.epipolar import NAMES
 from stages.errors import InputError
 from stages.geometry import Rig, RigidTransform
-from stages.rig import RigParams, orient_rig
+from stages.rig import RigParams, _drift, orient_rig
 
 
 def facts(rig: Rig, pairs, **params):
@@ -115,6 +116,28 @@ def test_a_rig_that_moves_is_told():
     assert len(lines) == 1
     assert "roll" in lines[0]
     assert "pair 99" in lines[0]
+
+
+def test_parameters_that_stand_in_for_each_other_do_not_move_the_rig():
+    start = linearised(street_rig(), street(5))
+    design = start[-1].design[:, :RIG]
+    away = np.linalg.svd(design)[2][-1]  # of all directions the one in which rows move least
+    away *= 0.6 / np.sqrt(np.mean((design * away) ** 2, axis=0)).max()  # pixels by one parameter alone
+    strong = int(np.argmax(np.mean((design * away) ** 2, axis=0)))
+    assert np.sqrt(np.mean((design @ away) ** 2)) < RigParams().least_rows < 0.6
+
+    def told(by):
+        degrees = np.degrees([0.0 * by] * 4 + [by])
+        rows = [
+            {"pair": k, "values": dict(zip(NAMES, row, strict=True)), "sigma": dict.fromkeys(NAMES, 1e-3)}
+            for k, row in enumerate(degrees)
+        ]
+        return _drift(start, rows, RigParams())
+
+    assert told(away) == []
+    assert told(np.where(np.arange(RIG) == strong, away, 0.0))[0].startswith(
+        f"the rig moves: {NAMES[strong].replace('_', ' ')} of 1 of 5 pairs"
+    )
 
 
 def test_swapped_images_lie_beyond_infinity():

@@ -69,6 +69,9 @@ def bundles() -> dict[str, Bundle]:
     risk = np.zeros((ROWS, COLS), dtype=np.uint8)
     risk[20:30, 50:60] = 2
     risk[:5, :9] = 3
+    measures = ("inclination", "height_range", "step", "roughness", "slope", "tilt", "clearance", "p_hazard")
+    bands = dict.fromkeys(measures, np.full((ROWS, COLS), 0.1, dtype=np.float32))
+    bands |= {"risk": risk, **dict.fromkeys(("reason", "filled"), np.zeros_like(risk))}
     rows = np.arange(ROWS - 1, 9, -1)
     path = np.column_stack([np.zeros(len(rows)), 0.8 - CELL * rows, np.full(len(rows), -0.18)])
     cost = np.where(risk == 0, 0.001 * (ROWS - y), np.nan).astype(np.float32)
@@ -94,7 +97,7 @@ def bundles() -> dict[str, Bundle]:
     count = np.where(np.isfinite(z), 2, 0).astype(np.uint16)
     made = {
         "tile": Bundle({**dem, "count": count, "spread": sigma}, lattice),
-        "risk": Bundle({"risk": risk, "inclination": np.full((ROWS, COLS), 0.1, dtype=np.float32)}, lattice),
+        "risk": Bundle(bands, lattice),
         "path": Bundle({"path": path, "cost_to_go": cost, "reachable": (risk[10] == 0).astype(np.uint8)}, path_meta),
         "trajectory": Bundle(
             {

@@ -1,0 +1,16 @@
+"""How poses are stored, wherever a stage gives them: the frame of reference is the stage's to say."""
+
+from __future__ import annotations
+
+from stages.declare import Array
+
+POSES = Array("poses", ("frame", "row", "col"), "float64", "m", "pose [R | t] of the left camera", "nan")
+
+COVARIANCE = Array(
+    "covariance",
+    ("frame", "parameter", "parameter_b"),
+    "float64",
+    "m^2, m rad, rad^2",
+    "covariance of position and rotation vector",
+    "nan",
+)
