@@ -400,17 +400,18 @@ def _run(params: LegParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     before = None if before is None or len(before) < 2 else before
     names = ("risk", "reason", "p_hazard")
     classes, reason, chance = (np.asarray(risk[name]) for name in names)
-    unknown, glanced, doubted = classes == UNKNOWN, None, chance >= params.avoid
+    unknown, glanced = classes == UNKNOWN, None
     if "far" in inputs:
         far = inputs["far"]
-        # at the rim of what is near, a window that is cut off widens the doubt; the whole of it was seen from afar
-        doubted &= ((reason & UNSEEN_BIT) == 0) | ~(np.asarray(far["p_hazard"]) < params.avoid)
+        # at the rim of what is near, a window is cut off, which widens the doubt; all of it was seen from afar
+        cut = unknown | ((reason & UNSEEN_BIT) != 0)
         classes, reason, chance = (
-            np.where(unknown, np.asarray(far[name]), near)
+            np.where(cut, np.asarray(far[name]), near)
             for name, near in zip(names, (classes, reason, chance), strict=True)
         )
         unknown &= ~(chance < params.clear)
         glanced = unknown & (classes != UNKNOWN)
+    doubted = chance >= params.avoid
     seen = {"unknown": unknown, "glanced": glanced, "doubted": doubted}
     for sure in params.sure:
         footing = Footing.of(classes, reason, lattice, vehicle, chance, sure, params.dare, **seen)
