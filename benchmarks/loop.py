@@ -123,7 +123,7 @@ def figures(flow: Any, store: Any) -> dict[str, Any]:
     if driven.check is not None and driven.check.ref is not None:
         check = store.open(driven.check.ref)
         out |= {name: m["value"] for name, m in check.meta["metrics"].items()}
-        out["path_exists"] = check.meta["path_exists"]
+        out |= {name: check.meta[name] for name in ("path_exists", "with_margin")}
     else:
         out["path_exists"] = True  # as far as the choice of the goal knows: a failed drive counts as one
     return out

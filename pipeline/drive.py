@@ -4,9 +4,9 @@
 
     drive/start -> sense -+
                           v
-    stop k:  image -> pyramid -> hfvm -> level -> locus (local) -> locus (world) -> merge (all models so far, pad)
-                                           |                          ^                      |
-                                           |            trajectory -> pose                 risk
+    stop k:  image -> pyramid -> hfvm -> level -> locus (local) -> locus (world) -> merge (all models so far, pad;
+                                           |                          ^                |      and what of them is near)
+                                           |            trajectory -> pose           risk (of both)
                                            v               ^   |                             |
                                          resect -----------+   +---------> leg <-------------+
                                            ^                                |
@@ -62,6 +62,12 @@ class DriveParams(Params):
     pose: tuple[float, float, float, float] | None = Field(
         default=None, description="m, m, m, degrees; its pose in the global map, handed in instead of found"
     )
+    detail: float = Field(
+        default=4.0,
+        ge=0,
+        description="pixels that a wheel's diameter covers along the range where it may drive: about a matching "
+        "window, which smooths away what is smaller; what is seen from farther serves to plan; 0: all is driven on",
+    )
     around: float = Field(default=0.6, gt=0, description="m; the map reaches this far around start and goal")
     max_stops: int = Field(default=40, ge=1, description="stops after which the drive is given up")
     max_safety_stops: int = Field(default=3, ge=1, description="safety stops in a row that end the drive")
@@ -81,6 +87,7 @@ class Stop:
     frame: int
     merged: Handle | None = None
     risk: Handle | None = None
+    far: Handle | None = None
     trajectory: Handle | None = None
     leg: Handle | None = None
     drive: Handle | None = None
@@ -130,6 +137,8 @@ class Drive(Reconstruction):
         """Row of each frame in the artifact of its leg."""
         self.closed: list[list[float]] = []
         """Places about which unknown ground was looked at in vain."""
+        self.backs: list[list[float]] = []
+        """Places from which it drove back to see what lies before them."""
         self.turned: Handle | None = None
         """The leg that made the vehicle turn on the spot, while it has not driven since."""
         self.reopened = False
@@ -250,12 +259,26 @@ class Drive(Reconstruction):
         )
         if k == 0:
             self._pad(frame)
-        stop.merged = self._node(
-            "merge", f"merge/{k}", {"lattice": self.arena().to_dict()}, dems=[*self.pads, *p.world_dem.values()]
-        )
+        stop.merged = self._merged(f"merge/{k}", None)
         p.tiles = [stop.merged]
         stop.risk = p.risk = self._risk(f"risk/{k}", [stop.merged])
-        stop.leg = self._leg(f"leg/{k}", stop.risk, self.pose)
+        if self.config.drive.detail > 0:
+            stop.far = stop.risk
+            near = self._merged(f"merge/{k}/near", self.config.vehicle.wheel_diameter / self.config.drive.detail)
+            stop.risk = self._risk(f"risk/{k}/near", [near])
+        self._decide(stop, f"leg/{k}")
+
+    def _merged(self, label: str, finest: float | None) -> Handle:
+        """All that was seen so far, or what of it a pixel covers ``finest`` metres of at most."""
+        params = self.config.merge.model_copy(update={} if finest is None else {"max_footprint": finest})
+        args = {"lattice": self.arena().to_dict()}
+        dems = [*self.pads, *self.products.world_dem.values()]
+        return self.graph.node(STAGE_MODULES["merge"], label, params, args, {}, {"dems": dems})
+
+    def _decide(self, stop: Stop, label: str) -> None:
+        """The leg of a stop, by what is known there."""
+        assert stop.risk is not None
+        stop.leg = self._leg(label, stop.risk, self.pose, far=stop.far)
 
     def _pad(self, frame: int) -> None:
         """The ground under the vehicle at the start, and where it is."""
@@ -264,16 +287,13 @@ class Drive(Reconstruction):
         like = self.products.world_dem[frame]
         self.pads = [self._node("pad", "pad", args, pose=self.pose, like=like)] if self.simulation.pad > 0 else []
 
-    def _leg(self, label: str, risk: Handle, pose: Handle, **more: Any) -> Handle:
-        args = {
-            "goal": list(self.goal),
-            "looks": self.looks,
-            "closed": self.closed,
-            **self.mounting,
-            **more,
-        }
-        turned = {} if more or self.turned is None else {"before": self.turned}
-        return self._node("leg", label, args, risk=risk, pose=pose, **turned)
+    def _leg(self, label: str, risk: Handle, pose: Handle, *, far: Handle | None = None, whole: bool = False) -> Handle:
+        args: dict[str, Any] = {"goal": list(self.goal), "looks": self.looks, **self.mounting}
+        args |= {"closed": self.closed, "backs": self.backs}
+        if whole:
+            return self._node("leg", label, args | {"whole": True}, risk=risk, pose=pose)
+        given = {"risk": risk, "far": far, "pose": pose, "before": self.turned}
+        return self._node("leg", label, args, **{name: handle for name, handle in given.items() if handle is not None})
 
     def arena(self) -> Lattice:
         """The part of the world that is mapped: around the start, which is at the origin, and the goal."""
@@ -298,14 +318,16 @@ class Drive(Reconstruction):
         else:
             self.turned = None if verdict == "drive" else stop.leg
             self.looks = {"drive": 0, "turn": self.looks, "look": self.looks + 1}[verdict]
+            if verdict == "look" and leg.meta["length_m"] > 0:
+                self.backs = [*self.backs, leg.meta["start"][:2]]
             stop.event = leg.meta["reason"]
             self._drive(stop, before, row)
 
     def _again(self, stop: Stop, before: Handle, row: int) -> None:
         """Think anew at the same stop."""
-        assert stop.risk is not None
         stop.thoughts += 1
-        stop.leg = self._leg(f"leg/{stop.index}/{stop.thoughts}", stop.risk, self.pose)
+        self._decide(stop, f"leg/{stop.index}/{stop.thoughts}")
+        assert stop.leg is not None
         self.graph.expand([stop.leg], lambda again: self._after_leg(stop, before, row, again))
 
     # -- a leg --------------------------------------------------------------------------------------------------
@@ -478,7 +500,7 @@ class Drive(Reconstruction):
             truth_dem = self._simulate(source, "truth_dem", scene=self.scene)
             p.dem_accuracy = self._node("dem_accuracy", "dem_accuracy/world", {}, dem=p.tiles, truth=truth_dem)
             p.truth_risk = self._risk("risk/truth", [truth_dem])
-            self.looks, self.closed = 0, []
+            self.looks, self.closed, self.backs = 0, [], []
             self.driven.truth_leg = self._leg("leg/truth", p.truth_risk, self.first_pose, whole=True)
             self._check()
 

@@ -2,7 +2,8 @@
 
 Each placement of the simulation (a few millimetres apart) is judged against the vehicle's limits: a belly that strikes,
 a tilt beyond ``max_slope_deg``, a wheel on an edge above ``max_step``. Positions are compared after making the first
-pose equal, as everywhere (:mod:`stages.accuracy`).
+pose equal, as everywhere (:mod:`stages.accuracy`). The shortest way is the planner's on the exact elevations; where its
+margin, which is for what a vehicle does not know, closes every one, it is that within the limits alone.
 """
 
 from __future__ import annotations
@@ -69,17 +70,23 @@ def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     best = inputs["best"].meta
     possible = best["shortest_m"] is not None
     metrics["way"] = metric(length, "m", "true way of the vehicle, seen from above")
+    room = "with the vehicle's margin" if best["shortest_margin_m"] else "within its limits, but without its margin"
     metrics["shortest_way"] = metric(
-        best["shortest_m"], "m", "from start to goal over the risk map of the exact elevations"
+        best["shortest_m"], "m", f"from start to goal over the risk map of the exact elevations, {room}"
     )
     T = np.concatenate([p["trail"] for p in parts])
-    facts = {"metrics": metrics, "path_exists": possible, "stops": len(parts)}
+    facts = {
+        "metrics": metrics,
+        "path_exists": possible,
+        "with_margin": bool(possible and best["shortest_margin_m"] > 0),
+        "stops": len(parts),
+    }
     return Bundle({"error": error, "way": T[:, :, 3].copy()}, facts)
 
 
 STAGE = Stage(
     name="drive_check",
-    version=1,
+    version=2,
     summary="a drive against the truth: placements, localisation, length",
     params=NoParams,
     inputs=("drives*", "trajectory", "truth", "best"),

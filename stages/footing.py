@@ -2,7 +2,8 @@
 
 What is hazardous to a wheel was found in a window as large as the wheel, so it counts where the middle of a wheel is:
 the vehicle may pass a stone between its wheels, since what the belly cannot pass over (tilt, slope, rise, for the worst
-heading) is hazardous to its middle. Unknown ground may be neither under a wheel nor under the belly.
+heading) is hazardous to its middle. Unknown ground may not be under the belly, and the middles of the wheels keep the
+margin from it as from a hazard: what is unknown is mostly what is hidden by a stone, or the stone itself.
 """
 
 from __future__ import annotations
@@ -33,15 +34,16 @@ NEAR_UNKNOWN = 0.5
 """Cells; nearer than this a point of the belly lies in an unknown cell."""
 
 DOUBT_WEIGHT = 15
-"""Of ground that is hazardous by sigma alone, against caution: a wheel there makes a way dearer by half."""
+"""Of ground that is hazardous by sigma alone, or doubted, against caution: a wheel there makes a way dearer by half."""
 
 
 @dataclass(frozen=True)
 class Gaps:
     """Of each pose, float32: ``gap`` m to the nearest hazard (from wheel to what is hazardous to wheels, from the
     middle to what is to the vehicle; farther by the margin to what is one by sigma alone), ``proven`` m to those that
-    are proven, ``unknown`` m at least from wheels and belly to unknown ground (not positive: on it), ``caution`` share
-    of wheels and middle on caution ground. With its middle outside the map a vehicle is within a hazard."""
+    are proven, ``unknown`` m at least from the belly, and beyond the margin from the wheels, to unknown ground (not
+    positive: on it, or too near), ``caution`` share of wheels and middle on caution ground. With its middle outside the
+    map a vehicle is within a hazard."""
 
     gap: Floats32
     proven: Floats32
@@ -52,13 +54,15 @@ class Gaps:
 @dataclass(frozen=True)
 class Footing:
     """A risk map as a vehicle meets it: ``fields`` (4, row, col) m to hazards to a wheel, proven ones, hazards to the
-    vehicle, proven ones; ``unknown`` (row, col) m to unknown ground; ``caution`` (row, col) its weight there."""
+    vehicle, proven ones; ``unknown`` (row, col) m to unknown ground; ``caution`` (row, col) its weight there;
+    ``glanced`` (row, col) where unknown ground was seen, from afar; None: nowhere."""
 
     lattice: Lattice
     vehicle: Vehicle
     fields: Floats32
     unknown: Floats32
     caution: NDArray[np.uint8]
+    glanced: Mask | None = None
 
     @staticmethod
     def of(
@@ -69,13 +73,21 @@ class Footing:
         p_hazard: NDArray[np.float32] | None = None,
         sure: float = 0.5,
         dare: float = 0.0,
+        unknown: Mask | None = None,
+        glanced: Mask | None = None,
+        doubted: Mask | None = None,
     ) -> Footing:
         """From classes and reason bits of :mod:`stages.risk`; without bits every hazard is one to a wheel.
 
+        ``unknown``: where the vehicle may not stand for what is not known; None: the unknown class. ``glanced``: where
+        of it something is known nevertheless.
+
         A hazard is proven where it is not one by sigma alone, and at least as probable as ``sure``. What is one by
-        sigma alone and less probable than ``dare`` is caution ground :data:`DOUBT_WEIGHT` times.
+        sigma alone and less probable than ``dare`` is caution ground :data:`DOUBT_WEIGHT` times. ``doubted`` ground
+        and what is within a quarter of a wheel of it, where its edge touches, is :data:`DOUBT_WEIGHT` times.
         """
         hazardous, cell = risk == HAZARDOUS, lattice.cell
+        unknown = risk == UNKNOWN if unknown is None else unknown
         bits = np.full(risk.shape, WHEEL_BITS) if reason is None else reason
         doubtful = hazardous & ((bits & DOUBT_BIT) > 0)
         likely = proven = hazardous & ~doubtful
@@ -85,14 +97,15 @@ class Footing:
             dared = doubtful & (p_hazard < dare)
             doubtful &= ~dared
             caution[dared] = DOUBT_WEIGHT
+        if doubted is not None:
+            caution[(_distance(doubted, cell) <= 0.25 * vehicle.wheel_diameter) & ~unknown] = DOUBT_WEIGHT
         kinds = [(bits & which) > 0 for which in (WHEEL_BITS, BODY_BITS)]
         fields = []
         for kind in kinds:
             # sigma is the room for error there: the margin is not added to it
             beside = _distance(doubtful & kind, cell) + np.float32(vehicle.margin)
             fields += [np.minimum(_distance(likely & kind, cell), beside), _distance(proven & kind, cell)]
-        unknown = risk == UNKNOWN
-        return Footing(lattice, vehicle, np.stack(fields), _distance(unknown, cell), caution)
+        return Footing(lattice, vehicle, np.stack(fields), _distance(unknown, cell), caution, glanced)
 
     def gaps(self, x: Floats, y: Floats, heading: Floats) -> Gaps:
         """At poses: x, y of the middle (m) and heading (rad to the left of y), arrays of one shape."""
@@ -101,7 +114,8 @@ class Footing:
         out = np.empty((4, len(at)), np.float32)
         cell = self.lattice.cell
         # beyond the circle about the vehicle, and what rounding to cells takes, nothing is beneath it
-        reach = np.float32(0.5 * math.hypot(self.vehicle.track, self.vehicle.wheel_base) + 1.5 * cell), np.float32(cell)
+        around = 0.5 * math.hypot(self.vehicle.track, self.vehicle.wheel_base) + 1.5 * cell
+        reach = np.array([around + self.vehicle.margin, cell, self.vehicle.margin], np.float32)
         _gaps(
             at, np.cos(turn), np.sin(turn), wheel_positions(self.vehicle) / cell, _belly(self.vehicle) / cell,
             self.fields, self.unknown, self.caution, reach, out,
@@ -135,7 +149,7 @@ def _gaps(at, cosine, sine, wheels, belly, fields, unknown, caution, reach, out)
             continue
         gap, proven, share = fields[2, i, j], fields[3, i, j], np.float32(caution[i, j])
         spare = unknown[i, j] - reach[0]
-        outside = False
+        outside, least = False, np.float32(np.inf)
         for k in range(4):
             a, b = wheels[k, 0], wheels[k, 1]
             i, j = math.floor(row - (a * s + b * c) + 0.5), math.floor(col + (a * c - b * s) + 0.5)
@@ -144,18 +158,16 @@ def _gaps(at, cosine, sine, wheels, belly, fields, unknown, caution, reach, out)
                 continue
             gap, proven = min(gap, fields[0, i, j]), min(proven, fields[1, i, j])
             share += caution[i, j]
+            least = min(least, unknown[i, j] - reach[2])
         out[0, n], out[1, n], out[3, n] = gap, proven, share / np.float32(5.0)
         if outside:
             continue
         if spare > 0:
             out[2, n] = spare + reach[1]
             continue
-        least = np.float32(np.inf)
         for k in range(belly.shape[0]):
             a, b = belly[k, 0], belly[k, 1]
             i, j = math.floor(row - (a * s + b * c) + 0.5), math.floor(col + (a * c - b * s) + 0.5)
             i, j = min(max(i, 0), rows - 1), min(max(j, 0), cols - 1)
             least = min(least, unknown[i, j])
-            if least <= 0:
-                break
         out[2, n] = least

@@ -3,9 +3,13 @@
 The way is planned to the goal over all of the map. Ground that is known and free costs its length; unknown ground may
 be planned over, at a higher price, since the next stop will see it, but is never driven on: the leg ends before it. So
 may ground that is hazardous only by the standard deviation of its elevations. Ground that is known to be hazardous, or
-nearer to it than the vehicle and its margin need, is closed. So the way bends round dead ends as soon as they are seen,
-and where no way is left even over unknown ground there is none. This is the usual free-space assumption (Koenig, Tovey,
-Smirnov 2003, doi:10.1016/S0004-3702(03)00062-6), planned anew at each stop.
+nearer to it than the vehicle and its margin need, is closed. What was seen from afar alone counts as unknown but for
+its hazards and for what is clearly free, at a price of its own: the windows of a matcher smooth away what is smaller
+than they are on the ground.
+
+So the way bends round dead ends as soon as they are seen, and where no way is left even over unknown ground there is
+none. This is the usual free-space assumption (Koenig, Tovey, Smirnov 2003, doi:10.1016/S0004-3702(03)00062-6), planned
+anew at each stop.
 
 The vehicle drives ahead, or back at a higher price, and turns on the spot where its wheels have room to
 (:mod:`stages.pose_graph`): it may pass between two hazards between which it could not turn.
@@ -40,10 +44,15 @@ from stages.route import (
     within_turn,
 )
 from stages.vehicle import Vehicle
+from stages.verdict import UNKNOWN, UNSEEN_BIT
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Point = tuple[float, float]
+
+
+FACING = math.radians(8.0)
+"""What lies within it of the heading is looked at already."""
 
 
 class LegParams(Params):
@@ -68,6 +77,23 @@ class LegParams(Params):
         le=0.5,
         description="probability up to which ground that is hazardous by sigma alone is driven on, at a price: limits "
         "are half of what tips the vehicle over, and who never dares does not arrive among rocks",
+    )
+    avoid: float = Field(
+        0.06,
+        gt=0,
+        le=1,
+        description="probability of a hazard from which ground is dear: on the simulator's beds all edges that the map "
+        "did not show lay on ground of 0.07 and more",
+    )
+    clear: float = Field(
+        0.02,
+        ge=0,
+        lt=1,
+        description="probability of a hazard below which ground is driven on that was seen from afar alone: of places "
+        "for a wheel below it 0.05 in a thousand had an edge that the map did not show, of all 3.7",
+    )
+    glance_price: float = Field(
+        1.3, ge=1, description="price of a metre over ground that was seen from afar alone: mostly it is as it looks"
     )
     unknown_price: float = Field(2.0, ge=1, description="price of a metre over unknown ground, known ground is 1")
     caution_price: float = Field(
@@ -99,7 +125,8 @@ class Leg:
     """``verdict``: drive, turn, look, closed, goal or no path; ``path`` (vertex, 2) m to drive, ``gear`` (piece,) 1 for
     ahead and -1 for back; ``turn`` rad then.
 
-    ``closed``: looking around did not help; ``where`` the way is not known to be free.
+    A look around turns, or drives back to see what lies nearer than the camera's view. ``closed``: it did not help;
+    ``where`` the way is not known to be free.
 
     ``way`` (vertex, 2) m to the goal, as it is planned; ``cost`` (row, col) m to the goal at these prices at the best
     heading, NaN where it is closed, or farther than the vehicle.
@@ -132,7 +159,7 @@ class Ground:
         at = footing.gaps(*(np.array([v]) for v in (*start, heading)))
         # where it stands it may be: near there, ground that is no worse by more than a cell will do
         self.here = [min(self.vehicle.margin, float(a[0]) - self.cell) for a in (at.gap, at.proven)]
-        self.on_unknown = float(at.unknown[0]) <= 0
+        self.unknown_here = min(0.0, float(at.unknown[0]) - self.cell)
         self.astray = None if before is None else _away_from(before, footing.lattice, 0.5 * self.vehicle.wheel_base)
         spacing = max(p.spacing * self.vehicle.wheel_diameter, self.cell)
         self.grid = PoseGrid.over(footing.lattice, start, heading, spacing)
@@ -144,7 +171,7 @@ class Ground:
         near = np.hypot(x - self.start[0], y - self.start[1]) <= 0.3 * self.vehicle.wheel_base
         margin = self.vehicle.margin
         known = gaps.gap > np.where(near, self.here[0], margin)
-        known &= (gaps.unknown > 0) | (near & self.on_unknown)
+        known &= gaps.unknown > np.where(near, self.unknown_here, 0.0)
         opened = gaps.proven > np.where(near, self.here[1], margin)
         for cx, cy in self.closed:
             opened &= known | (np.hypot(x - cx, y - cy) > self.p.vain * self.vehicle.wheel_base)
@@ -155,7 +182,10 @@ class Ground:
         self._sure.append(known)
         reach = self.p.blind * self.vehicle.wheel_base * np.where(gaps.unknown > 0, 2.0, 1.0)
         blind = np.hypot(x - self.start[0], y - self.start[1]) <= reach
-        unknown = np.where(blind, max(self.p.blind_price, self.p.unknown_price), self.p.unknown_price)
+        unseen = np.full(x.shape, self.p.unknown_price)
+        if self.footing.glanced is not None:
+            unseen[~self._at(~self.footing.glanced, x, y)] = min(self.p.glance_price, self.p.unknown_price)
+        unknown = np.where(blind, np.maximum(self.p.blind_price, unseen), unseen)
         price = np.where(known, 1.0, unknown) + self.p.caution_price * gaps.caution
         if self.vehicle.margin > 0:
             price = price + self.p.near_price * np.clip(2.0 - gaps.gap / self.vehicle.margin, 0.0, 1.0)
@@ -176,7 +206,11 @@ class Ground:
 
     def clear(self, x: Floats, y: Floats, heading: Floats) -> bool:
         """Whether all of these poses may be driven."""
-        return bool(self._split(self.footing.gaps(x, y, heading), x, y)[0].all())
+        return bool(self.free(x, y, heading).all())
+
+    def free(self, x: Floats, y: Floats, heading: Floats) -> Mask:
+        """Which of these poses may be driven."""
+        return self._split(self.footing.gaps(x, y, heading), x, y)[0]
 
     def places(self) -> tuple[Floats, Floats]:
         """x and y (row, col), m, of the graph's places."""
@@ -213,6 +247,7 @@ def plan_leg(
     looks: int = 0,
     closed: Sequence[Point] = (),
     before: Floats | None = None,
+    backs: Sequence[Point] = (),
 ) -> Leg:
     """The next leg.
 
@@ -223,6 +258,7 @@ def plan_leg(
     looks : looks around since the last leg that was driven.
     closed : places about which unknown ground was looked at in vain.
     before : (vertex, 2) m, the way for which the vehicle has just turned; None: it has driven since.
+    backs : places from which it drove back already, to see what lies before it.
 
     Raises
     ------
@@ -256,6 +292,13 @@ def plan_leg(
         return _stay("turn", f"turns {math.degrees(turn):.0f} degrees to where it goes on", start, way, shown, turn)
     x, y = way[_sure(way)].b if _sure(way) < len(way) else way[-1].b
     towards = math.remainder(math.atan2(-(x - start[0]), y - start[1]) - heading, 2 * math.pi)
+    again = any(math.hypot(start[0] - bx, start[1] - by) < params.vain * base for bx, by in backs)
+    if looks < params.looks and not again and (looks > 0 or abs(towards) < FACING):
+        back = _free_back(ground, params.blind * base)
+        if length_of(back) >= params.least * base:
+            reason = f"drives back {1000 * length_of(back):.0f} mm to see the ground before it"
+            gear = np.full(len(back), -1, np.int8)
+            return Leg("look", reason, vertices(back, start), gear, 0.0, vertices(way, start), shown)
     turn = 0.0 if looks >= params.looks else _free_turn(ground, towards, looks)
     if turn:
         return _stay("look", f"turns {math.degrees(turn):.0f} degrees to see the way", start, way, shown, turn)
@@ -299,11 +342,21 @@ def _free_turn(ground: Ground, towards: float, looks: int) -> float:
     bound = math.radians(ground.p.max_turn_deg)
     aside = [math.radians(d) for d in (25.0, -50.0, 75.0)]
     aside = aside[looks % 3 :] + aside[: looks % 3] + [math.radians(d) for d in (-25.0, 15.0, -15.0)]
-    wanted = [*([towards] if abs(towards) >= math.radians(8.0) else []), *aside]
+    wanted = [*([towards] if abs(towards) >= FACING else []), *aside]
     for turn in (max(-bound, min(bound, w)) for w in wanted):
         if turnable(ground.start, ground.heading, ground.heading + turn, ground.clear):
             return turn
     return 0.0
+
+
+def _free_back(ground: Ground, most: float) -> list[Piece]:
+    """Straight back, at most so many metres, as far as it is free: then the camera sees what it is blind to now."""
+    n = math.ceil(2.0 * most / ground.cell)
+    way = np.linspace(0.0, most, n + 1)
+    x, y = ground.start[0] + way * math.sin(ground.heading), ground.start[1] - way * math.cos(ground.heading)
+    free = ground.free(x, y, np.full(way.shape, ground.heading))
+    last = int(np.argmin(free)) - 1 if not free.all() else n
+    return [Piece(ground.start, (float(x[last]), float(y[last])), ground.heading, -1)] if last > 0 else []
 
 
 def shortest(footing: Footing, start: Point, heading: float, goal: Point, params: LegParams) -> float | None:
@@ -345,15 +398,37 @@ def _run(params: LegParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     closed = [(float(x), float(y)) for x, y in args["closed"]]
     before = np.asarray(inputs["before"]["way"]) if "before" in inputs else None
     before = None if before is None or len(before) < 2 else before
-    maps = (np.asarray(risk["risk"]), np.asarray(risk["reason"]), lattice, vehicle, np.asarray(risk["p_hazard"]))
+    names = ("risk", "reason", "p_hazard")
+    classes, reason, chance = (np.asarray(risk[name]) for name in names)
+    unknown, glanced = classes == UNKNOWN, None
+    if "far" in inputs:
+        far = inputs["far"]
+        # at the rim of what is near, a window is cut off, which widens the doubt; all of it was seen from afar
+        cut = unknown | ((reason & UNSEEN_BIT) != 0)
+        classes, reason, chance = (
+            np.where(cut, np.asarray(far[name]), near)
+            for name, near in zip(names, (classes, reason, chance), strict=True)
+        )
+        unknown &= ~(chance < params.clear)
+        glanced = unknown & (classes != UNKNOWN)
+    doubted = chance >= params.avoid
+    seen = {"unknown": unknown, "glanced": glanced, "doubted": doubted}
     for sure in params.sure:
-        footing = Footing.of(*maps, sure, params.dare)
-        found = plan_leg(footing, start, heading, goal, params, int(args["looks"]), closed, before)
+        footing = Footing.of(classes, reason, lattice, vehicle, chance, sure, params.dare, **seen)
+        found = plan_leg(footing, start, heading, goal, params, int(args["looks"]), closed, before, args["backs"])
         if found.verdict == "goal" or len(found.way) > 1:
             break
-    best = shortest(footing, start, heading, goal, params) if args.get("whole") else None
+    best: float | None = None
+    margin: float | None = None
+    for margin in (vehicle.margin, 0.0) if args.get("whole") else ():
+        bare = vehicle.model_copy(update={"margin": margin})
+        allowed = Footing.of(classes, reason, lattice, bare, chance, params.sure[-1], params.dare)
+        best = shortest(allowed, start, heading, goal, params)
+        if best is not None:
+            break
     meta = {
         "shortest_m": best,
+        "shortest_margin_m": margin,
         "verdict": found.verdict,
         "reason": found.reason,
         "turn": found.turn,
@@ -373,10 +448,10 @@ def _length(path: Floats) -> float:
 
 STAGE = Stage(
     name="leg",
-    version=2,
+    version=3,
     summary="the next leg of a drive to a goal, over ground that is known to be free",
     params=LegParams,
-    inputs=("risk", "pose", "before?"),
+    inputs=("risk", "far?", "pose", "before?"),
     outputs=(
         Array(
             "path",

@@ -270,6 +270,7 @@ def _run(params: LocusParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle
         "pair": args["pair"],
         "z_range": z_range,
         "T_frame_left": T.to_list(),
+        "pixel_rad": 1.0 / rig.left.fx,
         "defined": float(np.mean(np.isfinite(dem.elevation))),
         "median_residual": _median(dem.residual),
         "median_elevation_std": _median(dem.elevation_std),

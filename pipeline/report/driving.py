@@ -58,8 +58,9 @@ def strip(scene: Scene) -> Block | None:
     estimate, truth = tracks(scene)
     for stop in drive.stops:
         leg, risk = view.bundle(stop.leg), view.bundle(stop.risk)
+        whole = risk if stop.far is None else view.bundle(stop.far)
         image = view.bundle(view.products.images.get(stop.frame))
-        if leg is None or risk is None or image is None:
+        if leg is None or risk is None or whole is None or image is None:
             continue
         upto = view.frames.index(stop.frame) + 1
         meta = leg.meta
@@ -68,7 +69,7 @@ def strip(scene: Scene) -> Block | None:
             np.asarray(image["image"]),
             Lattice.from_dict(risk.meta["lattice"]),
             np.asarray(risk["risk"]),
-            np.asarray(risk["elevation"]),
+            np.asarray(whole["elevation"]),
             np.asarray(leg["path"]),
             np.asarray(leg["way"]),
             (meta["goal"][0], meta["goal"][1]),
@@ -97,7 +98,8 @@ def strip(scene: Scene) -> Block | None:
     reason = f": {drive.reason}" if drive.reason else ""
     caption = (
         f"{VERDICTS.get(drive.verdict, 'The drive did not end')}{reason}. Each column is a stop. First: the left "
-        "image. Second: the hazards around the vehicle (disk) as known then, with the leg that is driven next (black) "
+        "image. Second: the hazards around the vehicle (disk), as far as known from near enough to drive there, with "
+        "the leg that is driven next (black) "
         "and the way as planned beyond it (thin); the star is the goal. Third: the merged elevations of all stops so "
         "far with the vehicle's track, estimated (blue) and true (orange)."
     )

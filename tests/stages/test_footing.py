@@ -54,8 +54,11 @@ def test_gaps_are_those_of_looking_at_every_cell(seed: int, x: float, y: float, 
     assert gap == pytest.approx(least, abs=half + 1e-6)
     inside = (XY[risk == UNKNOWN] - (x, y)) @ np.array([[c, -s], [s, c]])
     beside = (np.abs(inside) > np.array([0.04, 0.05]) + 2 * half).any(axis=1)
-    if beside.all():
+    away = np.hypot(*(wheels[:, None] - XY[risk == UNKNOWN][None]).transpose(2, 0, 1)).min()
+    if beside.all() and away > ROVER.margin + 2 * half:
         assert unknown > 0
+    if away < ROVER.margin - half:
+        assert unknown < 0
 
 
 def test_unknown_ground_wider_than_half_a_wheel_is_never_missed() -> None:
@@ -65,12 +68,12 @@ def test_unknown_ground_wider_than_half_a_wheel_is_never_missed() -> None:
         assert at(Footing.of(risk, None, LATTICE, ROVER), 0.0, 0.0, 0.0)[2] <= 0
 
 
-def test_unknown_ground_beyond_the_vehicle_is_not_beneath_it_at_any_distance() -> None:
+def test_wheels_keep_the_margin_from_unknown_ground_and_no_more() -> None:
     for far in np.arange(0.045, 0.12, 0.001):
         risk = np.where(far < X, np.uint8(UNKNOWN), np.uint8(SAFE))
         edge = X[risk == UNKNOWN].min()
         beneath = at(Footing.of(risk, None, LATTICE, ROVER), 0.0, 0.0, 0.0)[2] <= 0
-        assert beneath == (edge < 0.04 + 0.5 * LATTICE.cell + 1e-9)
+        assert beneath == (edge < 0.04 + ROVER.margin + 0.5 * LATTICE.cell + 1e-9)
 
 
 def test_outside_the_map_it_may_not_be() -> None:
@@ -103,3 +106,10 @@ def test_what_is_hazardous_by_sigma_alone_and_improbable_is_caution_ground_many_
     daring, not_so = (at(Footing.of(risk, reason, LATTICE, ROVER, p, 0.9, d), 0.0, 0.0, 0.0) for d in (0.3, 0.1))
     assert (daring[0], daring[3]) == (np.inf, pytest.approx(DOUBT_WEIGHT / 5))
     assert (not_so[0], not_so[3]) == (pytest.approx(ROVER.margin), 0.0)
+
+
+def test_ground_within_a_quarter_of_a_wheel_of_doubted_ground_is_dear() -> None:
+    risk = np.full(LATTICE.shape, SAFE, np.uint8)
+    unknown = Y > 0.2
+    footing = Footing.of(risk, None, LATTICE, ROVER, unknown=unknown, doubted=X > 0.059)
+    assert np.array_equal(footing.caution > 0, (X > 0.054) & ~unknown)  # a cell of 5 mm beside it, not the next

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from stages.errors import InputError
 from stages.footing import Footing
 from stages.lattice import Lattice
-from stages.leg import LegParams, plan_leg, shortest
+from stages.leg import Leg, LegParams, plan_leg, shortest
 from stages.risk import HAZARDOUS, REASONS, SAFE, UNKNOWN
 from stages.vehicle import Vehicle
 
@@ -161,7 +161,7 @@ def test_no_leg_comes_near_a_hazard_or_onto_unknown_ground(seed: int, heading: f
         c, s = math.cos(h), math.sin(h)
         at = wheels @ np.array([[c, s], [-s, c]]) + (x, y)
         near = math.hypot(x, y) <= 0.3 * ROVER.wheel_base  # where it stands already is as it is
-        for kind, need in ((HAZARDOUS, 0.0 if near else ROVER.margin), (UNKNOWN, 0.0)):
+        for kind, need in ((HAZARDOUS, 0.0 if near else ROVER.margin), (UNKNOWN, ROVER.margin)):
             there = np.column_stack([X[risk == kind], Y[risk == kind]])
             if len(there):
                 gap = np.hypot(*(at[:, None] - there[None]).transpose(2, 0, 1)).min()
@@ -187,6 +187,34 @@ def test_unknown_ground_beside_the_vehicle_is_the_last_way_that_is_tried() -> No
     through = plan_leg(ground((hole, UNKNOWN)), START, 0.0, GOAL, cheap.model_copy(update={"blind": 0.0}))
     assert np.abs(through.way[:, 0]).max() < 0.1
     assert plan_leg(ground((hole, UNKNOWN)), START, 0.0, GOAL, cheap).way[:, 0].max() > 0.12
+
+
+def test_ground_seen_from_afar_alone_is_planned_over_rather_than_unseen_one_and_never_driven() -> None:
+    unknown = Y > 0.15
+    glanced = unknown & (np.abs(X - 0.25) < 0.1)
+    free = np.full(LATTICE.shape, SAFE, np.uint8)
+
+    def planned(risk: np.ndarray, p: LegParams = SEEN) -> Leg:
+        footing = Footing.of(risk, None, LATTICE, ROVER, unknown=unknown, glanced=glanced)
+        return plan_leg(footing, START, 0.0, GOAL, p)
+
+    leg = planned(free)
+    assert leg.path[-1, 1] + 0.5 * ROVER.wheel_base <= 0.155 - ROVER.margin
+    assert leg.way[:, 0].max() > 0.15
+    dear = SEEN.model_copy(update={"glance_price": SEEN.unknown_price})
+    assert planned(free, dear).way[:, 0].max() < 0.05
+    wall = np.where(glanced & (np.abs(Y - 0.5) < 0.02), np.uint8(HAZARDOUS), free)
+    assert planned(wall).way[:, 0].max() < 0.15
+
+
+def test_standing_beside_unknown_ground_it_may_leave_but_not_go_nearer() -> None:
+    beside = 0.04 + 0.5 * ROVER.margin < X
+    leg = plan_leg(ground((beside, UNKNOWN)), START, 0.0, GOAL, SEEN)
+    assert leg.verdict == "drive"
+    assert leg.path[:, 0].max() <= LATTICE.cell
+    leg = plan_leg(ground((0.04 - 0.5 * ROVER.margin < X, UNKNOWN)), START, 0.0, GOAL, SEEN)
+    assert leg.verdict == "turn"  # to the left: a wheel stands on it already
+    assert leg.turn > 0
 
 
 def test_hazards_to_the_whole_vehicle_count_at_its_middle_alone() -> None:
@@ -231,3 +259,18 @@ def test_the_shortest_way_over_free_ground_is_little_longer_than_the_beeline(x: 
     length = shortest(ground(), START, 0.0, (x, y), P)
     assert length is not None
     assert math.hypot(x, y) - 0.016 <= length <= 1.02 * math.hypot(x, y)
+
+
+def test_what_lies_nearer_than_its_view_is_looked_at_from_farther_back() -> None:
+    band, walls = np.abs(Y - 0.10) < 0.02, np.abs(X) > 0.1
+    before = ground((band, UNKNOWN), (walls, HAZARDOUS))
+    leg = plan_leg(before, START, 0.0, GOAL, P)
+    assert leg.verdict == "look"
+    assert leg.gear.tolist() == [-1]
+    x, y = leg.path[-1]
+    assert abs(x) < 1e-9
+    # the map ends 0.2 m behind the start: there the rear wheels stand
+    assert -P.blind * ROVER.wheel_base - 1e-9 <= y < -0.1
+    assert plan_leg(before, START, 0.0, GOAL, P, backs=[(0.0, 0.02)]).gear.tolist() == []
+    blocked = ground((band, UNKNOWN), (walls | (Y < -0.08), HAZARDOUS))
+    assert plan_leg(blocked, START, 0.0, GOAL, P).gear.tolist() == []

@@ -12,7 +12,7 @@ from stages import merge as merge_stage
 from stages.declare import Bundle, check_outputs
 from stages.errors import InputError
 from stages.lattice import Lattice, mosaic
-from stages.merge import EXACT, Layer, Merged, MergeParams, Placed, merge
+from stages.merge import EXACT, Layer, Merged, MergeParams, Placed, footprint, merge
 
 TILE = Lattice.at(0, 0, 0.1, 4, 5)
 PARAMS = MergeParams()
@@ -259,6 +259,36 @@ def test_of_a_stored_model_the_tile_alone_is_read() -> None:
     merged = merge_stage.STAGE.run(PARAMS, {"lattice": TILE.to_dict()}, {"dems": [dem]})
     assert Watched.cells == TILE.rows * TILE.cols
     assert (merged["elevation"] == 0.5).all()
+
+
+def test_the_footprint_is_the_ground_between_two_rays_a_pixel_apart() -> None:
+    height, angle, far = 0.2, 0.002, np.array([0.0, 0.1, 0.5, 1.0])
+    found = footprint(np.zeros((1, 4), np.float32), far, np.zeros(1), np.array([0.0, 0.0, height]), angle)[0]
+    down = np.arctan2(far, height)
+    between = height * (np.tan(down + angle / 2) - np.tan(down - angle / 2))
+    np.testing.assert_allclose(found, between, rtol=1e-3)
+    assert footprint(np.float32([[0.3]]), np.zeros(1), np.zeros(1), np.array([0.0, 0.0, height]), angle)[0, 0] == np.inf
+
+
+def test_cells_seen_from_afar_alone_are_left_out_on_request_and_what_is_vouched_for_stays() -> None:
+    """A camera 1 m above the corner: at 0.01 rad a pixel covers 1.04 cm under 0.2 m of it, 1.17 cm at 0.41 m."""
+    names = ("elevation", "elevation_std", "residual", "ortho")
+    maps = {n: np.full(TILE.shape, 0.05, np.float32) for n in names}
+    T = [1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.05]
+    facts = {"lattice": TILE.to_dict(), "frame": "world"}
+    seen = Bundle(maps, facts | {"pair": 4, "T_frame_left": T, "pixel_rad": 0.01})
+    known = Bundle({n: v + np.float32(0.1) for n, v in maps.items()}, facts | {"pair": -1})
+    near = np.hypot(*np.moveaxis(TILE.xy(), -1, 0)) < 0.31
+
+    def merged(dems: list[Bundle], most: float | None) -> Bundle:
+        params = MergeParams(max_footprint=most)
+        return merge_stage.STAGE.run(params, {"lattice": TILE.to_dict()}, {"dems": dems})
+
+    assert (merged([seen], None)["count"] == 1).all()
+    assert np.array_equal(merged([seen], 0.01 * (1 + 0.31**2))["count"], near)
+    both = merged([seen, known], 0.01 * (1 + 0.31**2))
+    assert np.array_equal(both["count"], 1 + near)
+    np.testing.assert_allclose(both["elevation"][~near], 0.15, rtol=1e-6)
 
 
 def test_exposures_are_levelled_and_stay_grey_values() -> None:
