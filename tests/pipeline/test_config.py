@@ -23,10 +23,12 @@ def test_one_setting_makes_terrain_accurate_and_what_is_given_beside_it_wins() -
     built = config.build({"locus": {"cell_size": 0.01}}, config.parse_assignments(["terrain.preset=accurate"]))
     assert (built.hfvm.preset, built.locus.both, built.merge.max_std_cells) == ("accurate", True, 0.7)
     assert (built.locus.cell_size, built.locus.max_jump, built.hfvm.greatest_std) == (0.01, 5.0, 100.0)
+    assert (plain.track.points, built.track.points) == (400, 2000)
     assert config.build({"hfvm": {"preset": "accurate"}}).hfvm.greatest_std == 1.1
     assert built.hfvm.relief_steps == config.build({"hfvm": {"preset": "accurate"}}).hfvm.relief_steps
     built = config.build({"terrain": {"preset": "accurate"}}, config.parse_assignments(["locus.both=false"]))
     assert (built.hfvm.preset, built.locus.both) == ("accurate", False)
+    assert (built.hfvm.greatest_std, built.locus.max_jump) == (1.1, plain.locus.max_jump), "limits as without both"
     assert config.build().locus.both is False, "the preset itself is not changed by what is laid over it"
     with pytest.raises(ConfigError, match=r"terrain\.preset = 'best' is not permitted"):
         config.build({"terrain": {"preset": "best"}})
