@@ -110,7 +110,8 @@ STALE: dict[str, set[str]] = {
 EXCEPTIONS: dict[str, set[str]] = {
     "select.preset": {"orientation"} | RIG | MOVED,  # navigation sets parameters of other stages, too
     "locus.both": {"hfvm/back"} | LOCAL | MISSION,  # the other direction is matched as well
-    "terrain.preset": {"hfvm/back"} | LOCAL | MISSION,  # the matcher's preset is given here, and stays
+    # limits of matches and number of points, with which all begins that is not an image
+    "terrain.preset": {"hfvm/back", "track"} | MATCHED | POSES | LOCAL | MISSION,
     "refine.enabled": REFINED - {"refine"},  # without it there is less to compute
     "resect.landmarks": POSES - {"refine"},  # refined are landmarks of the disparity alone
     "crosscheck.enabled": set(),  # without it there is less to compute
