@@ -64,7 +64,7 @@ STAGE_MODULES: dict[str, str] = {
 
 ACCURATE_TERRAIN: dict[str, Any] = {
     "hfvm": {"preset": "accurate"},
-    "locus": {"both": True},
+    "locus": {"both": True, "refined_share": 0.5},
     "track": {"points": 2000},
     "merge": {"max_std_cells": 0.7},
 }

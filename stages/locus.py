@@ -85,6 +85,14 @@ class LocusParams(Params):
         description="steps of refining the elevations by what both images show of the surface, a third gains a "
         "hundredth; 0: none, and standard deviations are those of the disparity alone",
     )
+    refined_share: float = Field(
+        1.0,
+        gt=0,
+        le=1,
+        description="share of the refined elevation in the result, the rest is what the disparity said: 0.5 where the "
+        "matcher is as sure as that (preset accurate), since both then err about as much and not alike; where it is "
+        "less sure, less than 1 only loses",
+    )
     both: bool = Field(
         False,
         description="match from right to left as well and read elevations from both: more cells, and errors where the "
@@ -159,7 +167,7 @@ def reconstruct(
         apart = out.elevation.astype(np.float64) - other.elevation
         out = join(out, other)
     if seen is not None and (params.refine_steps or back is not None):
-        _refine(out, seen, surface, params.refine_steps, apart)
+        _refine(out, seen, surface, params, apart)
     greatest = _greatest_std(params, disparity_std is not None)
     if greatest is not None:
         unsure = ~(out.elevation_std <= greatest)
@@ -176,19 +184,21 @@ def _views(image: ArrayLike, right: ArrayLike, rig: Rig, T_surface_left: RigidTr
     return views(*projections(rig, T_surface_left), images[0], images[1], T_surface_left.translation)
 
 
-def _refine(dem: Dem, views: Views, surface: Surface, steps: int, apart: Floats | None) -> None:
+def _refine(dem: Dem, views: Views, surface: Surface, params: LocusParams, apart: Floats | None) -> None:
     """Refine a model in place: elevations, their standard deviations, grey values of the left image.
 
     ``apart``: (rows, cols) difference of both directions of matching, metres; None: there was one.
     """
-    elevation, seen = refine(views, surface, dem.elevation, steps)
+    elevation, seen = refine(views, surface, dem.elevation, params.refine_steps)
     before = dem.elevation_std.astype(np.float64)
     if apart is None:
         dem.elevation_std[...] = standard_deviation(elevation, seen, before)
     else:
         moved = elevation.astype(np.float64) - dem.elevation
         dem.elevation_std[...] = from_both(elevation, seen, moved, apart, before)
-    dem.elevation[...], dem.ortho[...] = elevation, np.clip(seen[0], 0.0, 255.0)
+    share = np.float32(params.refined_share)
+    dem.elevation[...] = share * elevation + (np.float32(1.0) - share) * dem.elevation
+    dem.ortho[...] = np.clip(seen[0], 0.0, 255.0)
 
 
 def _greatest_std(params: LocusParams, measured: bool) -> float | None:
@@ -326,7 +336,7 @@ def _array(name: str, unit: str, long_name: str) -> Array:
 
 STAGE = Stage(
     name="locus",
-    version=4,
+    version=5,
     summary="elevation model and ortho image of a basic pair",
     params=LocusParams,
     inputs=("disparity", "rig", "left", "right?", "back?", "level", "reference?", "trajectory?", "local?"),

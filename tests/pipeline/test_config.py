@@ -22,6 +22,7 @@ def test_one_setting_makes_terrain_accurate_and_what_is_given_beside_it_wins() -
     assert (plain.hfvm.preset, plain.locus.both, plain.merge.max_std_cells) == ("default", False, None)
     built = config.build({"locus": {"cell_size": 0.01}}, config.parse_assignments(["terrain.preset=accurate"]))
     assert (built.hfvm.preset, built.locus.both, built.merge.max_std_cells) == ("accurate", True, 0.7)
+    assert (plain.locus.refined_share, built.locus.refined_share) == (1.0, 0.5)
     assert (built.locus.cell_size, built.locus.max_jump, built.hfvm.greatest_std) == (0.01, 5.0, 100.0)
     assert (plain.track.points, built.track.points) == (400, 2000)
     assert config.build({"hfvm": {"preset": "accurate"}}).hfvm.greatest_std == 1.1

@@ -54,8 +54,10 @@ def through(left: np.ndarray = LEFT, right: np.ndarray = RIGHT) -> Views:
     return views(*projections, left, right, T_LOCAL_LEFT.translation)
 
 
-def model(column: np.ndarray, left: np.ndarray = LEFT, right: np.ndarray | None = RIGHT, steps: int = 4) -> Dem:
-    params = LocusParams(refine_steps=steps, max_residual=2.0)
+def model(
+    column: np.ndarray, left: np.ndarray = LEFT, right: np.ndarray | None = RIGHT, steps: int = 4, share: float = 1.0
+) -> Dem:
+    params = LocusParams(refine_steps=steps, refined_share=share, max_residual=2.0)
     std = np.full(column.shape, 0.2, np.float32)
     return reconstruct(
         column, MAPS[1], MAPS[2], left, RIG, T_LOCAL_LEFT, SURFACE, (-1.0, -0.3), params, disparity_std=std, right=right
@@ -115,6 +117,14 @@ def test_errors_of_the_disparity_are_taken_out() -> None:
     # No noise in the images: what remains is what the smoothness and the sweeps leave of it.
     assert rms(after) < 0.2 * rms(before)
     assert len(after) > 0.9 * len(before)
+
+
+def test_a_share_of_the_refined_elevation_lies_between_it_and_the_read_one() -> None:
+    column = noisy()
+    read, part, whole = (model(column, right=r, share=s) for r, s in ((None, 1.0), (RIGHT, 0.25), (RIGHT, 1.0)))
+    np.testing.assert_allclose(part.elevation, 0.25 * whole.elevation + 0.75 * read.elevation, atol=1e-6)
+    for name in ("elevation_std", "ortho"):
+        np.testing.assert_array_equal(getattr(part, name), getattr(whole, name))
 
 
 def test_an_elevation_that_is_right_stays() -> None:
