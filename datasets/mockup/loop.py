@@ -34,11 +34,15 @@ LOOP: Mapping[str, Any] = {
 one ray a pixel, since a drive takes a hundred of them."""
 
 DEFAULTS: Mapping[str, Any] = {
-    "hfvm.preset": "default",
+    "terrain.preset": "accurate",
+    "track.points": 400,
     "locus.cell_size": 0.004,
     "crosscheck.enabled": False,
     "drive.goal": (0.0, 1.0),
 }
+"""Accurate terrain, since what a map smooths away is met by a wheel: of the cells with an edge above ``max_step`` (six
+beds, three stops each) half as many have a probability below 0.3, none below 0.06 (0.5 %), and a tenth fewer cells are
+false hazards. It takes a quarter more time a stop. Poses need no more points than by default."""
 
 
 def mockup_loop(p: MockupParams, rover: RoverParams, name: str = "mockup-loop") -> protocol.Sequence:
