@@ -1,14 +1,15 @@
 """Hazards judged against the exact elevations: false safe, false hazard, unknown, and whether p_hazard is a
 probability.
 
-python benchmarks/hazards.py [--seeds 20] [--cover 0.05 0.1 0.2] [--scenes FOLDER] [--json FILE] [--picture FILE]
+python benchmarks/hazards.py [--seeds 20] [--cover 0.05 0.1 0.2] [--preset default] [--scenes FOLDER]
+                             [--json FILE] [--picture FILE]
 
 Each scene is one simulated stereo pair: a seed, a rock cover and one of the slopes, which take turns. Every way to
 classes is judged cell by cell against the risk map of the exact elevations with the same vehicle and no standard
 deviation:
 
-* rille: matched, reconstructed and judged with default parameters; the inclinometer errs by 0.2 degrees about each
-  axis;
+* rille: matched and reconstructed as a run does with this ``terrain.preset``, judged with default parameters; the
+  inclinometer errs by 0.2 degrees about each axis;
 * perfect pose: the same with the exact vertical;
 * perfect DEM: exact elevations on the cells that it has, with no standard deviation: what the ragged map alone costs;
 * SGBM + blend: OpenCV's rectification and semi-global matching, median height of a cell's points, and the usual blend
@@ -46,6 +47,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--seeds", type=int, default=20, help="scenes of each cover (default 20)")
     parser.add_argument("--first", type=int, default=1, help="first seed (default 1; 101 to 106 set the constants)")
     parser.add_argument("--cover", type=float, nargs="+", default=[0.05, 0.1, 0.2], help="rock covers")
+    parser.add_argument("--preset", choices=("default", "accurate"), default="default", help="of the terrain")
     parser.add_argument("--scenes", type=Path, help="keep simulated pairs there, so that a run that ended goes on")
     parser.add_argument("--json", type=Path, help="write all figures there, by scene")
     parser.add_argument("--picture", type=Path, help="draw the curve of p_hazard there, e.g. docs/hazards.png")
@@ -83,7 +85,7 @@ def judge(scene: Any, exact: Any, found: Any) -> dict[str, Any]:
     return out
 
 
-def one(seed: int, cover: float, slope: float, folder: Path | None) -> dict[str, Any]:
+def one(seed: int, cover: float, slope: float, folder: Path | None, preset: str) -> dict[str, Any]:
     """All ways on one scene."""
     import numpy as np
     from hazard.blend import blend
@@ -91,7 +93,7 @@ def one(seed: int, cover: float, slope: float, folder: Path | None) -> dict[str,
 
     from stages.risk import risk_map
 
-    scene = kept(folder, seed, cover, slope)
+    scene = kept(folder, seed, cover, slope, preset)
     exact = risk_map(scene.exact, np.zeros_like(scene.exact), CELL, scene.vehicle)
     known = np.isfinite(scene.posed)
     perfect = np.where(known, scene.crop(scene.exact), np.float32(np.nan))
@@ -166,7 +168,7 @@ def main() -> int:
     scenes = []
     for seed in range(given.first, given.first + given.seeds):
         for k, cover in enumerate(given.cover):
-            scenes.append(one(seed, cover, SLOPES[(seed + k) % len(SLOPES)], given.scenes))
+            scenes.append(one(seed, cover, SLOPES[(seed + k) % len(SLOPES)], given.scenes, given.preset))
             say(f"seed {seed}, cover {cover:g}: {scenes[-1]['ways']['rille']}"[:150])
             if given.json:
                 given.json.write_text(json.dumps({"scenes": scenes}, indent=1) + "\n", encoding="utf-8")

@@ -20,11 +20,13 @@ from numpy.typing import NDArray
 from datasets.mockup.params import MockupParams
 from datasets.mockup.sequence import mockup
 from datasets.protocol import Source
+from pipeline import config
 from stages.geometry import Rig, RigidTransform
 from stages.hfvm import match
 from stages.lattice import Lattice
 from stages.level import LevelParams, level, z_range
 from stages.locus import LocusParams, local_lattice, reconstruct, usable
+from stages.locus_solve import Matches
 from stages.surface import plane
 from stages.validity import matched
 from stages.vehicle import Vehicle
@@ -41,8 +43,9 @@ ATTITUDE_DEG = 0.2
 """Error of the inclinometer about each axis, degrees, as that of the simulated rover."""
 
 MADE_BY = (
-    "benchmarks/hazard/scenes.py", "datasets/mockup/*.py", "stages/hfvm/*.py", "stages/hfvm_*.py", "stages/level.py",
-    "stages/ground.py", "stages/locus*.py", "stages/surface.py", "stages/lattice.py", "stages/validity.py",
+    "benchmarks/hazard/scenes.py", "pipeline/config.py", "datasets/mockup/*.py", "stages/hfvm/*.py",
+    "stages/hfvm_*.py", "stages/level.py", "stages/ground.py", "stages/locus*.py", "stages/surface.py",
+    "stages/lattice.py", "stages/validity.py",
 )  # fmt: skip
 """Modules by which a scene is made: one that was kept is used as long as none of them changes."""
 
@@ -92,57 +95,77 @@ def fetcher() -> Callable[[Source], Any]:
     return run
 
 
-def build(seed: int, cover: float, slope_deg: float) -> Scene:
-    """Simulate a pair and reconstruct it with default parameters."""
+@dataclass(frozen=True)
+class Pair:
+    """A matched pair: its images, disparities of the left one and, with ``locus.both``, of the right one."""
+
+    images: tuple[NDArray[np.uint8], NDArray[np.uint8]]
+    rig: Rig
+    params: LocusParams
+    forth: Any
+    back: Any
+
+    def matches(self, found: Any) -> Matches:
+        good = usable(found.validity, found.backmatch_error, self.params)
+        return Matches(found.column_disparity, found.row_disparity, good, found.disparity_std)
+
+
+def build(seed: int, cover: float, slope_deg: float, preset: str = "default") -> Scene:
+    """Simulate a pair and reconstruct it as a run with this preset of the terrain does."""
     bed = MockupParams(**BED, seed=seed, rock_cover=cover, slope_deg=slope_deg, attitude_noise_deg=ATTITUDE_DEG)
     sequence = mockup(bed)
     fetch = fetcher()
     left, right = (fetch(sequence.image(0, camera)) for camera in ("left", "right"))
-    found = match(left["image"], right["image"], left_valid=left["valid"], right_valid=right["valid"])
+    chosen: Any = config.build({"terrain": {"preset": preset}, "locus": {"cell_size": CELL, "max_sigma": CELL}})
+    assert isinstance(sequence.rig, Rig)
+    images = np.asarray(left["image"]), np.asarray(right["image"])
+    forth, back = (
+        match(a["image"], b["image"], chosen.hfvm, left_valid=a["valid"], right_valid=b["valid"]) if wanted else None
+        for a, b, wanted in ((left, right, True), (right, left, chosen.locus.both))
+    )
+    pair = Pair(images, sequence.rig, chosen.locus, forth, back)
     assert sequence.up is not None
     assert sequence.truth is not None
     assert sequence.truth_dem is not None
-    args = found, np.asarray(left["image"], np.float32), sequence.rig
-    lattice, first, (dem, std) = _reconstructed(*args, sequence.up[0])
-    _, exactly, (posed, posed_std) = _reconstructed(*args, sequence.truth[0].rotation[2], lattice)
+    lattice, first, (dem, std) = _reconstructed(pair, sequence.up[0])
+    _, exactly, (posed, posed_std) = _reconstructed(pair, sequence.truth[0].rotation[2], lattice)
     n = round(PAD / CELL)
     wide = Lattice.at(lattice.i0 - n, lattice.j0 + n, CELL, lattice.rows + 2 * n, lattice.cols + 2 * n)
     exact = fetch(sequence.truth_dem(wide.to_dict(), sequence.truth[0] @ exactly[0].inverse(), (0,)))
     return Scene(
         seed, cover, slope_deg, sequence.vehicle, lattice, wide, dem, std, posed, posed_std,
-        np.asarray(exact["elevation"], np.float32), (np.asarray(left["image"]), np.asarray(right["image"])),
-        sequence.rig, *first,
+        np.asarray(exact["elevation"], np.float32), images, sequence.rig, *first,
     )  # fmt: skip
 
 
 def _reconstructed(
-    found: Any, image: Floats32, rig: Rig, up: Any, lattice: Lattice | None = None
+    pair: Pair, up: Any, lattice: Lattice | None = None
 ) -> tuple[Lattice, tuple[RigidTransform, tuple[float, float]], tuple[Floats32, Floats32]]:
     """Lattice, frame and range of elevations, and elevations with their standard deviation, by a vertical."""
-    params, disparity = LocusParams(cell_size=CELL, max_sigma=CELL), (found.column_disparity, found.row_disparity)
-    facts = level(*disparity, matched(found.validity), rig, LevelParams(), up=up)
-    lattice = lattice or local_lattice(rig, facts, CELL, params)
+    given = pair.matches(pair.forth)
+    facts = level(given.column, given.row, matched(pair.forth.validity), pair.rig, LevelParams(), up=up)
+    lattice = lattice or local_lattice(pair.rig, facts, CELL, pair.params)
     T_local_left = RigidTransform.from_matrix(facts["T_local_left"])
     low, high = z_range(facts["plane"], facts["relief"], list(lattice.bounds))
-    good = usable(found.validity, found.backmatch_error, params)
+    left, right = (np.asarray(image, np.float32) for image in pair.images)
     dem = reconstruct(
-        *disparity, good, image, rig, T_local_left, plane(lattice), (low, high), params,
-        disparity_std=found.disparity_std,
+        given.column, given.row, given.usable, left, pair.rig, T_local_left, plane(lattice), (low, high), pair.params,
+        disparity_std=given.std, right=right, back=None if pair.back is None else pair.matches(pair.back),
     )  # fmt: skip
     return lattice, (T_local_left, (low, high)), (dem.elevation, dem.elevation_std)
 
 
-def kept(folder: Path | None, seed: int, cover: float, slope_deg: float) -> Scene:
+def kept(folder: Path | None, seed: int, cover: float, slope_deg: float, preset: str = "default") -> Scene:
     """A scene that an earlier run left in the folder, or a new one that is left there."""
     if folder is None:
-        return build(seed, cover, slope_deg)
-    path = folder / f"{seed}-{cover:g}-{slope_deg:g}-{_fingerprint()}.pickle"
+        return build(seed, cover, slope_deg, preset)
+    path = folder / f"{seed}-{cover:g}-{slope_deg:g}-{preset}-{_fingerprint()}.pickle"
     if path.exists():
         with path.open("rb") as file:
             scene = pickle.load(file)
         assert isinstance(scene, Scene)
         return scene
-    scene = build(seed, cover, slope_deg)
+    scene = build(seed, cover, slope_deg, preset)
     folder.mkdir(parents=True, exist_ok=True)
     part = path.with_suffix(".part")
     with part.open("wb") as file:
