@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.pose_graph import AHEAD, BACK, PoseGraph, angle_of
+from stages.pose_graph import AHEAD, ANGLES, BACK, PoseGraph, angle_of
 
 Floats = NDArray[np.float64]
 Clear = Callable[[Floats, Floats, Floats], bool]
@@ -120,14 +120,26 @@ def first_metres(way: Sequence[Piece], length: float) -> list[Piece]:
 
 def within_turn(way: Sequence[Piece], heading: float, bound: float) -> tuple[list[Piece], float]:
     """The way as far as its headings stay within a bound (rad) about the present one; and the turn (rad) at its end
-    towards where it goes on, as far as it stays within the bound too."""
+    towards where it goes on.
+
+    That is as far as it stays within the bound too and what remains is between two headings of the planner. Where it
+    goes on then is a way that is planned again; a turn that ends elsewhere may find none there, and turn back.
+    """
     out, now = list[Piece](), heading
     for piece in way:
         if abs(piece.heading - heading) > bound + 1e-9:
-            return out, heading + math.copysign(bound, piece.heading - heading) - now
+            wanted = piece.heading - heading
+            return out, heading + math.copysign(_cut(abs(wanted), bound), wanted) - now
         now = piece.heading
         out.append(piece)
     return out, 0.0
+
+
+def _cut(wanted: float, bound: float) -> float:
+    """The greatest part of a turn within the bound of which the rest is between two headings; the bound if none is."""
+    parts = wanted - np.sort(ANGLES)
+    parts = parts[(parts > 0) & (parts <= bound + 1e-9)]
+    return float(parts[0]) if parts.size else bound
 
 
 def length_of(way: Sequence[Piece]) -> float:

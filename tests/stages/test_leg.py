@@ -110,7 +110,7 @@ def test_a_goal_outside_the_map_is_refused_with_the_map() -> None:
 def test_more_than_the_greatest_turn_is_done_on_the_spot_first() -> None:
     leg = plan_leg(ground(), START, math.pi / 2, GOAL, P)
     assert (leg.verdict, len(leg.path)) == ("turn", 1)
-    assert leg.turn == pytest.approx(-math.radians(P.max_turn_deg))
+    assert leg.turn == pytest.approx(-math.atan2(1, 2)), "63 degrees are left, and lie between two headings"
 
 
 def test_it_does_not_look_where_its_wheels_have_no_room_to_turn() -> None:

@@ -60,7 +60,9 @@ def test_the_first_metres_and_the_first_turns() -> None:
     part = first_metres(STAIRS, 0.15)
     assert length_of(part) == pytest.approx(0.15)
     assert part[-1].b == pytest.approx((0.05, 0.1))
-    assert within_turn(STAIRS, 0.0, 1.0) == (STAIRS[:1], -1.0)
+    # a quarter of a turn to the right in all; what is left is between two headings of the planner
+    assert within_turn(STAIRS, 0.0, 1.0) == (STAIRS[:1], pytest.approx(-math.pi / 4))
+    assert within_turn(STAIRS, 0.0, 0.7) == (STAIRS[:1], pytest.approx(-math.atan2(1, 2)))
     assert within_turn(STAIRS, 0.0, 1.6) == (STAIRS, 0.0)  # off the first heading: turns to and fro do not add up
     assert within_turn(STAIRS, -0.8, 0.8) == (STAIRS, 0.0)
     assert within_turn(STAIRS[1:], -0.8, 0.3) == ([], pytest.approx(-0.3))
