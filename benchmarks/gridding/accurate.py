@@ -1,0 +1,41 @@
+"""Matching and Locus of a scene as ``terrain.preset=accurate`` does them: both directions, to be timed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from pipeline import config
+from stages.hfvm import match
+from stages.locus import reconstruct, usable
+from stages.locus_solve import Matches
+from stages.surface import plane
+
+from .scenes import Scene
+
+MATCHING, LOCUS = "matching, accurate", "Locus, accurate"
+
+
+def jobs(scene: Scene) -> dict[str, Callable[[], Any]]:
+    """Both steps by name, the matching first; Locus takes what the matching gave last."""
+    chosen: Any = config.build({"terrain": {"preset": "accurate"}, "locus": {"max_sigma": scene.max_sigma}})
+    sides = ((scene.left, scene.valid[0]), (scene.right, scene.valid[1]))
+    found: list[Matches] = []
+
+    def matching() -> None:
+        found.clear()
+        for (image, valid), (other, also) in (sides, sides[::-1]):
+            d = match(image, other, chosen.hfvm, left_valid=valid, right_valid=also)
+            good = usable(d.validity, d.backmatch_error, chosen.locus)
+            found.append(Matches(d.column_disparity, d.row_disparity, good, d.disparity_std))
+
+    def locus() -> Any:
+        forth, back = found
+        return reconstruct(
+            forth.column, forth.row, forth.usable, np.asarray(scene.left, np.float32), scene.rig, scene.T_surface_left,
+            plane(scene.lattice), scene.z_range, chosen.locus, disparity_std=forth.std, right=scene.right, back=back,
+        )  # fmt: skip
+
+    return {MATCHING: matching, LOCUS: locus}
