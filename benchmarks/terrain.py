@@ -1,6 +1,6 @@
 """Locus against triangulating and gridding the same disparities: error at equal completeness, and time.
 
-python benchmarks/terrain.py [--pairs N] [--threads N] [--picture FILE] [--json FILE]
+python benchmarks/terrain.py [--preset default] [--pairs N] [--threads N] [--picture FILE] [--json FILE]
 
 Every method gets the same disparities, masks and limits, and the same cells. A sweep over the limit of back-matching,
 the limit of the geometry's error and the share of the least doubtful cells draws each method's curve of error over
@@ -37,6 +37,7 @@ TIME_GOAL = 1.5
 
 def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--preset", choices=("default", "accurate"), default="default", help="of the matcher")
     parser.add_argument("--pairs", type=int, help="basic pairs of the simulator (default: all)")
     parser.add_argument("--threads", type=int, default=1, help="threads of every method (default 1)")
     parser.add_argument("--rounds", type=int, default=5, help="timed rounds (default 5)")
@@ -45,7 +46,7 @@ def arguments() -> argparse.Namespace:
     return parser.parse_args()
 
 
-def scenes(pairs: int | None) -> Iterator[tuple[str, Any]]:
+def scenes(pairs: int | None, preset: str) -> Iterator[tuple[str, Any]]:
     """Scenes by the kind of their disparities."""
     from gridding.scenes import mockup, motorcycle
 
@@ -55,7 +56,7 @@ def scenes(pairs: int | None) -> Iterator[tuple[str, Any]]:
         print("RILLE_DATA does not name a folder with motorcycle: it is left out")
     for scene in [*known, *([extra] if extra else [])]:
         yield "true disparity", scene
-        yield "our disparity", scene.matched()
+        yield "our disparity", scene.matched(preset)
 
 
 def compare(kind: str, scene: Any, methods: list[Any]) -> list[dict[str, Any]]:
@@ -134,14 +135,14 @@ def summary(found: list[dict[str, Any]]) -> None:
     print(f"\n{WHY}")
 
 
-def times(scene: Any, methods: list[Any], rounds: int) -> list[dict[str, Any]]:
+def times(scene: Any, methods: list[Any], rounds: int, preset: str) -> list[dict[str, Any]]:
     """Least seconds of each step in alternating rounds, and ratios to the pair's matching by the same preset."""
     from gridding import accurate
     from gridding.methods import DEFAULT
     from gridding.scenes import match
 
-    ours = scene.matched()
-    jobs: dict[str, Callable[[], Any]] = {"matching": lambda: match(scene)}
+    ours = scene.matched(preset)
+    jobs: dict[str, Callable[[], Any]] = {"matching": lambda: match(scene, preset)}
     jobs |= {m.name: lambda m=m: m.run(ours, DEFAULT.max_backmatch, True) for m in methods}
     jobs |= accurate.jobs(scene)
     taken: dict[str, list[float]] = {name: [] for name in jobs}
@@ -198,13 +199,13 @@ def main() -> None:
     set_threads(given.threads)
     methods, found, timed = available(), [], []
     print("\n".join(f"{method.name}: {method.what}" for method in methods))
-    for kind, scene in scenes(given.pairs):
+    for kind, scene in scenes(given.pairs, given.preset):
         mine = compare(kind, scene, methods)
         cells = f"{int(scene.judged.sum())} cells of {1e3 * scene.lattice.cell:g} mm"
         show(f"{scene.name}, {kind}, {cells}; x: Locus over the method at completeness 'at'", mine)
         found += mine
         if kind == "true disparity" and scene.name in ("mockup 0", "motorcycle"):
-            timed += times(scene, methods, given.rounds)
+            timed += times(scene, methods, given.rounds, given.preset)
     summary(found)
     for name in dict.fromkeys(t["scene"] for t in timed):
         rows = [[t["step"], t["ms"], t["ratio"]] for t in timed if t["scene"] == name]

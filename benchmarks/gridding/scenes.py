@@ -67,17 +67,19 @@ class Scene:
     disparities: Disparities
     valid: tuple[NDArray[np.bool_], NDArray[np.bool_]]
 
-    def matched(self) -> Scene:
+    def matched(self, preset: str = "default") -> Scene:
         """The same scene with our matcher's disparities in place of the true ones."""
-        return replace(self, disparities=match(self))
+        return replace(self, disparities=match(self, preset))
 
 
-def match(scene: Scene) -> Disparities:
-    """Disparities by the matcher with its default parameters."""
+def match(scene: Scene, preset: str = "default") -> Disparities:
+    """Disparities by the matcher with a preset."""
+    from pipeline import config
     from stages.hfvm import match as hfvm
     from stages.validity import matched
 
-    found = hfvm(scene.left, scene.right, left_valid=scene.valid[0], right_valid=scene.valid[1])
+    params = config.build({"hfvm": {"preset": preset}}).hfvm
+    found = hfvm(scene.left, scene.right, params, left_valid=scene.valid[0], right_valid=scene.valid[1])
     maps = found.column_disparity, found.row_disparity, matched(found.validity)
     return Disparities(*maps, found.backmatch_error, found.disparity_std)
 
