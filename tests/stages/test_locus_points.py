@@ -17,10 +17,10 @@ EPIPOLE = np.array([-7.0, 1.0, 0.02])
 SIZES = np.array([WIDTH, HEIGHT, WIDTH, HEIGHT], float)
 
 
-def cells(n: int = 20) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def cells(n: int = 20, spread: float = 0.3) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Feet and normals (n, 3), and lanes that hold them and their lines."""
     rng = np.random.default_rng(1)
-    feet, normals = rng.uniform(-0.3, 0.3, (n, 3)), rng.normal(size=(n, 3)) * 0.2 + [0.0, 0.0, 1.0]
+    feet, normals = rng.uniform(-spread, spread, (n, 3)), rng.normal(size=(n, 3)) * 0.2 + [0.0, 0.0, 1.0]
     lanes = np.zeros(LINE_PLANES * LANES)
     for k in range(3):
         lanes[FOOT + k * LANES :][:n], lanes[NORMAL + k * LANES :][:n] = feet[:, k], normals[:, k]
@@ -73,7 +73,7 @@ def test_points_of_lanes_and_of_steps_equal_single_points() -> None:
 
 
 def test_lines_end_where_an_image_does_and_steps_are_a_pixel_at_most() -> None:
-    feet, normals, lanes = cells()
+    feet, normals, lanes = cells(30, 0.6)
     n = len(feet)
     lanes[LOW : LOW + n], lanes[HIGH : HIGH + n] = 0.05, 0.1
     clip(n, SIZES, -0.4, 2.0, lanes)
