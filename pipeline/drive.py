@@ -69,7 +69,11 @@ class DriveParams(Params):
         "window, which smooths away what is smaller; what is seen from farther serves to plan; 0: all is driven on",
     )
     around: float = Field(default=0.6, gt=0, description="m; the map reaches this far around start and goal")
-    max_stops: int = Field(default=40, ge=1, description="stops after which the drive is given up")
+    max_stops: int = Field(
+        default=80,
+        ge=1,
+        description="stops after which the drive is given up; among many rocks a way of 2.8 m took more than 60",
+    )
     max_safety_stops: int = Field(default=3, ge=1, description="safety stops in a row that end the drive")
     least_match: float = Field(
         default=0.1,
