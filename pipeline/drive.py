@@ -143,7 +143,8 @@ class Drive(Reconstruction):
         """Places about which unknown ground was looked at in vain."""
         self.backs: list[list[float]] = []
         """Places from which it drove back to see what lies before them."""
-        self.turned: Handle | None = None
+        self.planned: Handle | None = None
+        """The last leg, of whose way a part is left."""
         """The leg that made the vehicle turn on the spot, while it has not driven since."""
         self.reopened = False
         """Whether these places were tried once more, as the last way that is left."""
@@ -302,7 +303,7 @@ class Drive(Reconstruction):
         args |= {"closed": self.closed, "backs": self.backs}
         if whole:
             return self._node("leg", label, args | {"whole": True}, risk=risk, pose=pose)
-        given = {"risk": risk, "far": far, "pose": pose, "before": self.turned}
+        given = {"risk": risk, "far": far, "pose": pose, "before": self.planned}
         return self._node("leg", label, args, **{name: handle for name, handle in given.items() if handle is not None})
 
     def arena(self) -> Lattice:
@@ -326,7 +327,7 @@ class Drive(Reconstruction):
         elif stop.index + 1 >= self.config.drive.max_stops:
             self._end("stops", f"{stop.index + 1} stops and {1000 * leg.meta['left_m']:.0f} mm from the goal")
         else:
-            self.turned = None if verdict == "drive" else stop.leg
+            self.planned = stop.leg
             self.looks = {"drive": 0, "turn": self.looks, "look": self.looks + 1}[verdict]
             if verdict == "look" and leg.meta["length_m"] > 0:
                 self.backs = [*self.backs, leg.meta["start"][:2]]
@@ -473,6 +474,7 @@ class Drive(Reconstruction):
             cut, kind, reason = seen, "reflex", reflex.meta["reason"]
         self.troubles = 0 if cut is None or kind == "reflex" else self.troubles + 1
         if cut is not None:
+            self.planned = None
             stop.event = f"{'reflex' if kind == 'reflex' else 'safety stop'} at image {frames[cut]}: {reason}"
             if cut < len(frames) - 1:
                 frames = frames[: cut + 1]

@@ -19,11 +19,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 from pydantic import Field
 
@@ -34,11 +33,14 @@ from stages.geometry import RigidTransform
 from stages.lattice import Lattice
 from stages.pose_graph import PoseGraph, PoseGrid
 from stages.route import (
+    STEP_TURN,
     Piece,
     first_metres,
+    last_metres,
     length_of,
     pieces,
     straightened,
+    through,
     turnable,
     vertices,
     within_turn,
@@ -107,9 +109,9 @@ class LegParams(Params):
     )
     blind_price: float = Field(6.0, ge=1, description="price of a metre over it, so that other ways are tried first")
     loyalty: float = Field(
-        0.3,
+        0.15,
         ge=0,
-        description="share by which another way must be better than the one that a turn on the spot was made for",
+        description="share by which another way must be cheaper than the one that the vehicle is on",
     )
     near_price: float = Field(0.5, ge=0, description="added to the price beside hazards, falls to 0 within the margin")
     back_price: float = Field(3.0, ge=1, description="price of a metre driven back, which no camera looks along")
@@ -128,7 +130,8 @@ class Leg:
     A look around turns, or drives back to see what lies nearer than the camera's view. ``closed``: it did not help;
     ``where`` the way is not known to be free.
 
-    ``way`` (vertex, 2) m to the goal, as it is planned; ``cost`` (row, col) m to the goal at these prices at the best
+    ``way`` (vertex, 2) m to the goal, as it is planned; ``rest`` (vertex, 2) m what is left of it after the leg, and
+    ``rest_gear`` (piece,) how it is driven; ``cost`` (row, col) m to the goal at these prices at the best
     heading, NaN where it is closed, or farther than the vehicle.
     """
 
@@ -138,6 +141,8 @@ class Leg:
     gear: NDArray[np.int8]
     turn: float
     way: Floats
+    rest: Floats
+    rest_gear: NDArray[np.int8]
     cost: NDArray[np.float32]
     where: Point | None = None
 
@@ -152,7 +157,6 @@ class Ground:
         heading: float,
         p: LegParams,
         closed: Sequence[Point] = (),
-        before: Floats | None = None,
     ) -> None:
         self.footing, self.start, self.heading, self.p, self.closed = footing, start, heading, p, tuple(closed)
         self.vehicle, self.cell = footing.vehicle, footing.lattice.cell
@@ -160,26 +164,30 @@ class Ground:
         # where it stands it may be: near there, ground that is no worse by more than a cell will do
         self.here = [min(self.vehicle.margin, float(a[0]) - self.cell) for a in (at.gap, at.proven)]
         self.unknown_here = min(0.0, float(at.unknown[0]) - self.cell)
-        self.astray = None if before is None else _away_from(before, footing.lattice, 0.5 * self.vehicle.wheel_base)
         spacing = max(p.spacing * self.vehicle.wheel_diameter, self.cell)
         self.grid = PoseGrid.over(footing.lattice, start, heading, spacing)
         self._sure: list[Mask] = []
         self.graph = PoseGraph.of(footing, self.grid, self._prices)
 
-    def _split(self, gaps: Gaps, x: Floats, y: Floats) -> tuple[Mask, Mask]:
-        """Poses that may be driven, and those that may be planned over."""
+    def _split(self, gaps: Gaps, x: Floats, y: Floats, slack: float = 0.0) -> tuple[Mask, Mask]:
+        """Poses that may be driven, and those that may be planned over: there the margin may lack ``slack`` m."""
         near = np.hypot(x - self.start[0], y - self.start[1]) <= 0.3 * self.vehicle.wheel_base
         margin = self.vehicle.margin
         known = gaps.gap > np.where(near, self.here[0], margin)
         known &= gaps.unknown > np.where(near, self.unknown_here, 0.0)
-        opened = gaps.proven > np.where(near, self.here[1], margin)
+        opened = gaps.proven > np.where(near, self.here[1], margin) - slack
         for cx, cy in self.closed:
             opened &= known | (np.hypot(x - cx, y - cy) > self.p.vain * self.vehicle.wheel_base)
         return known, opened | known
 
     def _prices(self, gaps: Gaps, x: Floats, y: Floats, heading: Floats) -> Floats:
-        known, opened = self._split(gaps, x, y)
+        known, price = self._price(gaps, x, y)
         self._sure.append(known)
+        return price
+
+    def _price(self, gaps: Gaps, x: Floats, y: Floats, slack: float = 0.0) -> tuple[Mask, Floats]:
+        """Poses that may be driven, and the price of a metre, infinite where none may be planned."""
+        known, opened = self._split(gaps, x, y, slack)
         reach = self.p.blind * self.vehicle.wheel_base * np.where(gaps.unknown > 0, 2.0, 1.0)
         blind = np.hypot(x - self.start[0], y - self.start[1]) <= reach
         unseen = np.full(x.shape, self.p.unknown_price)
@@ -189,9 +197,7 @@ class Ground:
         price = np.where(known, 1.0, unknown) + self.p.caution_price * gaps.caution
         if self.vehicle.margin > 0:
             price = price + self.p.near_price * np.clip(2.0 - gaps.gap / self.vehicle.margin, 0.0, 1.0)
-        if self.astray is not None:
-            price = price * (1.0 + self.p.loyalty * self._at(self.astray, x, y))
-        return np.where(opened, price, np.inf)
+        return known, np.where(opened, price, np.inf)
 
     def _at(self, mask: Mask, x: Floats, y: Floats) -> Mask:
         """Values of a mask on the map at points; true outside."""
@@ -228,6 +234,28 @@ class Ground:
         """The way from the start in steps."""
         return pieces(self.graph, self.known(), self.graph.follow(move))
 
+    def again(self, way: Sequence[Piece]) -> tuple[list[Piece], float]:
+        """A way that was planned before, from the start: which of it is known now, and its cost at present prices.
+
+        It was looked at in steps of the places then; looked at more closely its margin may be short by a cell.
+        """
+        out, cost, heading = list[Piece](), 0.0, self.heading
+        for piece in way:
+            turn = abs(piece.heading - heading)
+            n, m = (max(2, 1 + math.ceil(v)) for v in (turn / STEP_TURN, 2.0 * piece.length / self.grid.spacing))
+            share = np.append(np.zeros(n), np.linspace(0.0, 1.0, m))
+            x, y = (piece.a[i] + share * (piece.b[i] - piece.a[i]) for i in (0, 1))
+            angle = np.append(np.linspace(heading, piece.heading, n), np.full(m, piece.heading))
+            known, price = self._price(self.footing.gaps(x, y, angle), x, y, self.cell)
+            metres = piece.length * (self.p.back_price if piece.gear < 0 else 1.0)
+            if not np.isfinite(price).all():
+                return [], math.inf
+            cost += turn * self.p.turn_price * self.vehicle.wheel_base * float(price[:n].max())
+            cost += metres * float(price[n:].mean())
+            out.append(replace(piece, known=bool(known.all())))
+            heading = piece.heading
+        return out, cost
+
     def on_map(self, cost: Floats) -> NDArray[np.float32]:
         """Cost at the best heading on the cells of the map, NaN where it is not known."""
         best = cost.min(axis=0)
@@ -246,7 +274,7 @@ def plan_leg(
     params: LegParams,
     looks: int = 0,
     closed: Sequence[Point] = (),
-    before: Floats | None = None,
+    before: tuple[Floats, NDArray[np.int8]] | None = None,
     backs: Sequence[Point] = (),
 ) -> Leg:
     """The next leg.
@@ -257,7 +285,8 @@ def plan_leg(
     start, heading : m; rad to the left of y.
     looks : looks around since the last leg that was driven.
     closed : places about which unknown ground was looked at in vain.
-    before : (vertex, 2) m, the way for which the vehicle has just turned; None: it has driven since.
+    before : what was left, after the last leg, of the way planned then: (vertex, 2) m, (piece,) gear. It is kept unless
+        another one is better by ``loyalty``; None: there is none.
     backs : places from which it drove back already, to see what lies before it.
 
     Raises
@@ -272,26 +301,32 @@ def plan_leg(
     if left <= params.tolerance * base:
         nothing = np.full(footing.lattice.shape, np.nan, np.float32)
         return _stay("goal", f"{1000 * left:.0f} mm from the goal", start, [], nothing)
-    ground = Ground(footing, start, heading, params, closed, before)
+    ground = Ground(footing, start, heading, params, closed)
     goals, cost, move = ground.search(goal, 0.5 * params.tolerance * base)
     shown = ground.on_map(cost)
-    if not np.isfinite(cost[0, ground.grid.origin[0], ground.grid.origin[1]]):
+    least = float(cost[0, ground.grid.origin[0], ground.grid.origin[1]])
+    kept, price = list[Piece](), math.inf
+    if before is not None:
+        kept, price = ground.again(_onward(before, start, heading, ground.grid.spacing))
+    if not np.isfinite(min(least, price)):
         why = _why_closed(ground, goals, cost)
         turn = 0.0 if looks >= params.looks else _free_turn(ground, 0.0, looks)
         if turn:
             return _stay("look", f"{why}: looks around", start, [], shown, turn)
         return _stay("no path", why, start, [], shown)
-    way = ground.way(move)
+    way = kept if kept and price <= (1.0 + params.loyalty) * least else ground.way(move)
     sure = first_metres(way[: _sure(way)], 4.0 * params.length * base)
-    leg = first_metres(straightened(sure, heading, ground.clear, ground.cell), params.length * base)
+    straight = straightened(sure, heading, ground.clear, ground.cell)
+    plan = [*straight, *last_metres(way, length_of(sure))]
+    leg = first_metres(straight, params.length * base)
     if length_of(leg) >= min(params.least * base, length_of(way) - 1e-9):
         leg, turn = within_turn(leg, heading, math.radians(params.max_turn_deg))
         if leg:
             if not turnable(leg[-1].b, leg[-1].heading, leg[-1].heading + turn, ground.clear):
                 turn = 0.0
-            gear = np.array([piece.gear for piece in leg], np.int8)
-            return Leg("drive", "", vertices(leg, start), gear, turn, vertices(way, start), shown)
-        return _stay("turn", f"turns {math.degrees(turn):.0f} degrees to where it goes on", start, way, shown, turn)
+            rest = last_metres(plan, length_of(leg))
+            return Leg("drive", "", *_line(leg, start), turn, vertices(way, start), *_line(rest, leg[-1].b), shown)
+        return _stay("turn", f"turns {math.degrees(turn):.0f} degrees to where it goes on", start, plan, shown, turn)
     x, y = way[_sure(way)].b if _sure(way) < len(way) else way[-1].b
     towards = math.remainder(math.atan2(-(x - start[0]), y - start[1]) - heading, 2 * math.pi)
     again = any(math.hypot(start[0] - bx, start[1] - by) < params.vain * base for bx, by in backs)
@@ -299,8 +334,8 @@ def plan_leg(
         back = _free_back(ground, params.blind * base)
         if length_of(back) >= params.least * base:
             reason = f"drives back {1000 * length_of(back):.0f} mm to see the ground before it"
-            gear = np.full(len(back), -1, np.int8)
-            return Leg("look", reason, vertices(back, start), gear, 0.0, vertices(way, start), shown)
+            rest = [Piece(back[-1].b, start, heading, 1), *plan]
+            return Leg("look", reason, *_line(back, start), 0.0, vertices(way, start), *_line(rest, back[-1].b), shown)
     turn = 0.0 if looks >= params.looks else _free_turn(ground, towards, looks)
     if turn:
         return _stay("look", f"turns {math.degrees(turn):.0f} degrees to see the way", start, way, shown, turn)
@@ -308,16 +343,17 @@ def plan_leg(
     return _stay("closed", reason, start, way, shown, where=(x, y))
 
 
-def _away_from(way: Floats, lattice: Lattice, reach: float) -> Mask:
-    """Cells farther than ``reach`` metres from a way (vertex, 2)."""
-    n = max(2, math.ceil(_length(way) / lattice.cell))
-    ends = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(way, axis=0).T))])
-    points = np.stack([np.interp(np.linspace(0.0, ends[-1], n), ends, way[:, k]) for k in (0, 1)], axis=1)
-    at = np.rint(lattice.index(points)).astype(np.int64)
-    at = at[((at >= 0) & (at < lattice.shape)).all(axis=1)]
-    on = np.zeros(lattice.shape, bool)
-    on[at[:, 0], at[:, 1]] = True
-    return np.asarray(scipy.ndimage.distance_transform_edt(~on) * lattice.cell > reach) if on.any() else ~on
+def _line(way: Sequence[Piece], start: Point) -> tuple[Floats, NDArray[np.int8]]:
+    """Vertices (n, 2) m, the start first, and gear (n - 1,)."""
+    return vertices(way, start), np.array([piece.gear for piece in way], np.int8)
+
+
+def _onward(before: tuple[Floats, NDArray[np.int8]], start: Point, heading: float, least: float) -> list[Piece]:
+    """What was left of a way, from where the vehicle is now; vertices nearer than ``least`` metres are passed."""
+    (points, gear), first = before, 1
+    while first + 1 < len(points) and math.hypot(*(points[first] - start)) < least:
+        first += 1
+    return through(np.concatenate([[start], points[first:]]), gear[first - 1 :], heading)
 
 
 def _stay(
@@ -330,7 +366,7 @@ def _stay(
     where: Point | None = None,
 ) -> Leg:
     """A leg on the spot."""
-    return Leg(verdict, reason, vertices([], start), np.empty(0, np.int8), turn, vertices(way, start), cost, where)
+    return Leg(verdict, reason, *_line([], start), turn, vertices(way, start), *_line(way, start), cost, where)
 
 
 def _sure(way: Sequence[Piece]) -> int:
@@ -398,8 +434,9 @@ def _run(params: LegParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     heading = math.atan2(-T.rotation[0, 1], T.rotation[1, 1])
     goal = (float(args["goal"][0]), float(args["goal"][1]))
     closed = [(float(x), float(y)) for x, y in args["closed"]]
-    before = np.asarray(inputs["before"]["way"]) if "before" in inputs else None
-    before = None if before is None or len(before) < 2 else before
+    before = None
+    if "before" in inputs and len(inputs["before"]["rest_gear"]):
+        before = np.asarray(inputs["before"]["rest"]), np.asarray(inputs["before"]["rest_gear"])
     names = ("risk", "reason", "p_hazard")
     classes, reason, chance = (np.asarray(risk[name]) for name in names)
     unknown, glanced = classes == UNKNOWN, None
@@ -441,7 +478,9 @@ def _run(params: LegParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
         "length_m": _length(found.path),
         "way_m": _length(found.way),
     }
-    return Bundle({"path": found.path, "gear": found.gear, "way": found.way, "cost_to_go": found.cost}, meta)
+    arrays: dict[str, NDArray[Any]] = {"path": found.path, "gear": found.gear, "way": found.way}
+    arrays |= {"rest": found.rest, "rest_gear": found.rest_gear, "cost_to_go": found.cost}
+    return Bundle(arrays, meta)
 
 
 def _length(path: Floats) -> float:
@@ -450,7 +489,7 @@ def _length(path: Floats) -> float:
 
 STAGE = Stage(
     name="leg",
-    version=4,
+    version=5,
     summary="the next leg of a drive to a goal, over ground that is known to be free",
     params=LegParams,
     inputs=("risk", "far?", "pose", "before?"),
@@ -465,6 +504,10 @@ STAGE = Stage(
         ),
         Array("gear", ("piece",), "int8", "1", "1 where the leg is driven ahead, -1 where it is driven back"),
         Array("way", ("way_vertex", "xy"), "float64", "m", "vertices of the way to the goal as planned", frame="world"),
+        Array(
+            "rest", ("rest_vertex", "xy"), "float64", "m", "vertices of what is left of it after the leg", frame="world"
+        ),
+        Array("rest_gear", ("rest_piece",), "int8", "1", "1 where that is driven ahead, -1 where it is driven back"),
         Array("cost_to_go", ("row", "col"), "float32", "m", "price of the way from each cell to the goal", "nan"),
     ),
     requires=("numpy", "numba", "scipy"),

@@ -5,12 +5,12 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.pose_graph import AHEAD, ANGLES, BACK, PoseGraph, angle_of
+from stages.pose_graph import AHEAD, BACK, PoseGraph, angle_of
 
 Floats = NDArray[np.float64]
 Clear = Callable[[Floats, Floats, Floats], bool]
@@ -118,39 +118,45 @@ def first_metres(way: Sequence[Piece], length: float) -> list[Piece]:
     return out
 
 
+def last_metres(way: Sequence[Piece], length: float) -> list[Piece]:
+    """What is left of a way after its first ``length`` metres."""
+    out: list[Piece] = []
+    for piece in way:
+        if length >= piece.length - 1e-9:
+            length -= piece.length
+            continue
+        out.append(replace(piece, a=piece.cut(length).b) if length > 0 else piece)
+        length = 0.0
+    return out
+
+
 def within_turn(way: Sequence[Piece], heading: float, bound: float) -> tuple[list[Piece], float]:
     """The way as far as its headings stay within a bound (rad) about the present one; and the turn (rad) at its end
-    towards where it goes on.
-
-    That is as far as it stays within the bound too and what remains is between two headings of the planner. Where it
-    goes on then is a way that is planned again; a turn that ends elsewhere may find none there, and turn back. Where
-    there is no such turn there is none after a piece that is driven, and one to the bound where nothing is.
-    """
+    towards where it goes on, as far as that stays within the bound too."""
     out, now = list[Piece](), heading
     for piece in way:
         if abs(piece.heading - heading) > bound + 1e-9:
-            wanted = piece.heading - now
-            side = math.copysign(1.0, wanted)
-            room = bound - side * (now - heading)
-            turn = _cut(abs(wanted), room)
-            if turn is None:
-                turn = 0.0 if out else room
-            return out, side * turn
+            side = math.copysign(1.0, piece.heading - now)
+            return out, side * min(abs(piece.heading - now), bound - side * (now - heading))
         now = piece.heading
         out.append(piece)
     return out, 0.0
 
 
-def _cut(wanted: float, bound: float) -> float | None:
-    """The greatest part of a turn within the bound of which the rest is between two headings; None: there is none."""
-    parts = wanted - np.sort(ANGLES)
-    parts = parts[(parts > 0) & (parts <= bound + 1e-9)]
-    return float(parts[0]) if parts.size else None
-
-
 def length_of(way: Sequence[Piece]) -> float:
     """Metres."""
     return sum(piece.length for piece in way)
+
+
+def through(points: Floats, gear: NDArray[np.int8], heading: float) -> list[Piece]:
+    """Straight pieces between points (n, 2), m, each driven with its ``gear`` (n - 1,); headings are counted on from
+    the one given, by the shorter turn."""
+    out: list[Piece] = []
+    for a, b, g in zip(points[:-1].tolist(), points[1:].tolist(), gear.tolist(), strict=True):
+        dx, dy = g * (b[0] - a[0]), g * (b[1] - a[1])
+        heading += math.remainder(math.atan2(-dx, dy) - heading, 2 * math.pi)
+        out.append(Piece((a[0], a[1]), (b[0], b[1]), heading, g))
+    return out
 
 
 def vertices(way: Sequence[Piece], start: tuple[float, float]) -> Floats:

@@ -15,6 +15,7 @@ from stages.footing import Footing
 from stages.lattice import Lattice
 from stages.leg import Leg, LegParams, plan_leg, shortest
 from stages.risk import HAZARDOUS, REASONS, SAFE, UNKNOWN
+from stages.route import length_of, through
 from stages.vehicle import Vehicle
 
 ROVER = Vehicle(
@@ -110,7 +111,11 @@ def test_a_goal_outside_the_map_is_refused_with_the_map() -> None:
 def test_more_than_the_greatest_turn_is_done_on_the_spot_first() -> None:
     leg = plan_leg(ground(), START, math.pi / 2, GOAL, P)
     assert (leg.verdict, len(leg.path)) == ("turn", 1)
-    assert leg.turn == pytest.approx(-math.atan2(1, 2)), "63 degrees are left, and lie between two headings"
+    assert leg.turn == pytest.approx(-math.radians(P.max_turn_deg))
+    assert length_of(through(leg.rest, leg.rest_gear, 0.0)) == pytest.approx(0.8, abs=0.02), "all of it is left"
+    turned = math.pi / 2 + leg.turn
+    onward = plan_leg(ground(), START, turned, GOAL, P, before=(leg.rest, leg.rest_gear))
+    assert onward.turn == pytest.approx(-math.radians(P.max_turn_deg)), "on towards the same way, at any heading"
 
 
 def test_it_does_not_look_where_its_wheels_have_no_room_to_turn() -> None:
@@ -171,15 +176,33 @@ def test_no_leg_comes_near_a_hazard_or_onto_unknown_ground(seed: int, heading: f
                 assert gap > need - 0.5 * math.sqrt(2) * LATTICE.cell - 0.25 * LATTICE.cell
 
 
-def test_the_way_that_it_has_turned_for_is_kept_unless_another_one_is_much_better() -> None:
+AHEAD = np.ones(2, np.int8)
+
+
+def test_the_way_that_it_is_on_is_kept_unless_another_one_is_much_better() -> None:
     right_is_nearer = ground(((np.abs(Y - 0.4) < 0.02) & (X > -0.17) & (X < 0.15), HAZARDOUS))
     first = plan_leg(right_is_nearer, START, 0.0, GOAL, P)
     assert first.way[:, 0].max() > 0.15
     left = np.array([START, (-0.23, 0.4), GOAL])
-    assert plan_leg(right_is_nearer, START, 0.0, GOAL, P, before=left).way[:, 0].min() < -0.17
+    assert plan_leg(right_is_nearer, START, 0.0, GOAL, P, before=(left, AHEAD)).way[:, 0].min() < -0.17
     right_is_near = ground(((np.abs(Y - 0.4) < 0.02) & (X > -0.35) & (X < 0.0), HAZARDOUS))
-    kept = plan_leg(right_is_near, START, 0.0, GOAL, P, before=np.array([START, (-0.39, 0.4), GOAL]))
-    assert kept.way[:, 0].min() > -0.1
+    far = np.array([START, (-0.39, 0.4), GOAL])
+    assert plan_leg(right_is_near, START, 0.0, GOAL, P, before=(far, AHEAD)).way[:, 0].min() > -0.1
+    # and never where it is closed by now
+    closed = ground(((np.abs(Y - 0.4) < 0.02) & (X < 0.15), HAZARDOUS))
+    assert plan_leg(closed, START, 0.0, GOAL, P, before=(left, AHEAD)).way[:, 0].max() > 0.15
+
+
+def test_what_is_left_after_a_leg_goes_on_from_where_the_vehicle_stands() -> None:
+    band = ground(((np.abs(Y - 0.4) < 0.02) & (X > -0.17) & (X < 0.15), HAZARDOUS))
+    leg = plan_leg(band, START, 0.0, GOAL, P)
+    end, heading = leg.path[-1], math.atan2(*(leg.path[-2] - leg.path[-1])[:2] * (1, -1)) + leg.turn
+    assert leg.rest[0] == pytest.approx(end)
+    assert leg.rest[-1] == pytest.approx(leg.way[-1])
+    beside = (float(end[0]) + 0.004, float(end[1]) - 0.003)
+    onward = plan_leg(band, beside, heading, GOAL, P, before=(leg.rest, leg.rest_gear))
+    assert onward.way[0] == pytest.approx(beside)
+    assert onward.way[1:] == pytest.approx(leg.rest[1:])
 
 
 def test_unknown_ground_beside_the_vehicle_is_the_last_way_that_is_tried() -> None:

@@ -2,13 +2,24 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from stages.route import Piece, first_metres, length_of, straightened, turnable, vertices, within_turn
+from stages.route import (
+    Piece,
+    first_metres,
+    last_metres,
+    length_of,
+    straightened,
+    through,
+    turnable,
+    vertices,
+    within_turn,
+)  # fmt: skip
 
 STAIRS = [
     Piece((0.0, 0.0), (0.0, 0.1), 0.0, 1),
@@ -61,25 +72,34 @@ def test_the_first_metres_and_the_first_turns() -> None:
     part = first_metres(STAIRS, 0.15)
     assert length_of(part) == pytest.approx(0.15)
     assert part[-1].b == pytest.approx((0.05, 0.1))
-    # a quarter of a turn to the right in all; what is left is between two headings of the planner
-    assert within_turn(STAIRS, 0.0, 1.0) == (STAIRS[:1], pytest.approx(-math.pi / 4))
-    assert within_turn(STAIRS, 0.0, 0.7) == (STAIRS[:1], pytest.approx(-math.atan2(1, 2)))
+    assert within_turn(STAIRS, 0.0, 1.0) == (STAIRS[:1], pytest.approx(-1.0))
     assert within_turn(STAIRS, 0.0, 1.6) == (STAIRS, 0.0)  # off the first heading: turns to and fro do not add up
     assert within_turn(STAIRS, -0.8, 0.8) == (STAIRS, 0.0)
     assert within_turn(STAIRS[1:], -0.8, 0.3) == ([], pytest.approx(-0.3))
-    # a turn at the end of a leg goes on from the heading there, and never back over ground that was not looked at
+    # a turn at the end of a leg goes on from the heading there, and no farther than the next piece asks for
     bent = [Piece((0.0, 0.0), (0.0, 0.1), -0.6, 1), Piece((0.0, 0.1), (0.1, 0.1), -0.8, 1)]
-    assert within_turn(bent, 0.0, 0.7) == (bent[:1], 0.0)
-    assert within_turn([bent[0], replace(bent[1], heading=-1.1)], 0.0, 0.7) == (
-        bent[:1],
-        pytest.approx(-(0.5 - math.atan2(1, 2))),
-    )
-    # nor does it go beyond the bound off the first heading on the other side
-    back = [bent[0], replace(bent[1], heading=0.9)]
-    assert within_turn(back, 0.0, 0.7) == (bent[:1], pytest.approx(1.5 - math.atan2(1, 2)))
+    assert within_turn(bent, 0.0, 0.7) == (bent[:1], pytest.approx(-0.1))
+    assert within_turn([bent[0], replace(bent[1], heading=0.9)], 0.0, 0.7) == (bent[:1], pytest.approx(1.3))
+    assert within_turn([bent[0], replace(bent[1], heading=-1.1)], -0.6, 0.4) == (bent[:1], pytest.approx(-0.4))
     # a turn that is counted on past half a turn keeps its direction
     around = [Piece((0.0, 0.0), (0.0, 0.1), 1.2 * math.pi, 1)]
-    assert within_turn(around, 0.0, 0.5) == ([], pytest.approx(0.2 * math.pi - math.atan2(1, 2)))
+    assert within_turn(around, 0.0, 0.5) == ([], pytest.approx(0.5))
+
+
+def test_the_first_and_the_last_metres_are_the_whole_way() -> None:
+    for length in (0.0, 0.04, 0.1, 0.15, 0.25):
+        parts = [*first_metres(STAIRS, length), *last_metres(STAIRS, length)]
+        assert length_of(parts) == pytest.approx(length_of(STAIRS))
+        assert [piece.b for piece in parts if piece.b in [p.b for p in STAIRS]] == [piece.b for piece in STAIRS]
+        assert all(a.b == pytest.approx(b.a) for a, b in itertools.pairwise(parts))
+
+
+def test_pieces_through_points_head_where_they_are_driven() -> None:
+    points = np.array([(0.0, 0.0), (0.0, 0.1), (0.1, 0.1), (0.1, 0.0)])
+    found = through(points, np.array([1, 1, -1], np.int8), 2 * math.pi)
+    assert [piece.heading for piece in found] == pytest.approx([2 * math.pi, 1.5 * math.pi, 2 * math.pi])
+    assert [piece.gear for piece in found] == [1, 1, -1]
+    np.testing.assert_array_equal(vertices(found, found[0].a), points)
 
 
 def test_a_turn_is_looked_at_all_the_way() -> None:
