@@ -7,6 +7,7 @@ spread over it, those of the three measures of its own added, and all bands writ
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 import scipy
@@ -14,6 +15,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from stages.hazards import BITS, FREEDOM, HIDDEN, LIFT, MEASURES, Measured, limits, noise_factors
+from stages.line import copy_line
 from stages.vehicle import Vehicle
 
 Floats32 = NDArray[np.float32]
@@ -29,8 +31,8 @@ WHOLE = 0.999
 FINE = ("inclination", "range", "step")
 """Measures on the cells; the others are on blocks."""
 
-BAND, STRIP = 16, 384
-"""Rows of blocks, and columns of cells, that are worked on at a time: lines of all bands stay in a cache of 48 kB."""
+STRIP = 384
+"""Columns of cells that are worked on at a time: lines of all bands stay in a cache of 48 kB."""
 
 STEPS, FARTHEST = 64, 16.0
 """Table of the distribution: steps a unit, and where it ends."""
@@ -67,35 +69,31 @@ def classify(
     """
     facts = _facts(vehicle, window, cell, rules.sigmas)
     gap, patchy = np.float32(vehicle.max_step) * (1.0 - np.minimum(measured.share, 1.0)), measured.unstood
-    doubt = np.hypot(measured.noise, np.float32(HIDDEN[0]) * gap).astype(np.float32)
-    below = np.hypot(measured.noise_under, np.float32(HIDDEN[1] * vehicle.max_step) * patchy).astype(np.float32)
+    doubt = _with(measured.noise, np.float32(HIDDEN[0]) * gap)
+    below = _with(measured.noise_under, np.float32(HIDDEN[1] * vehicle.max_step) * patchy)
     shape, coarse = closed.shape, measured.noise.shape
     load, excess = np.zeros(coarse, np.float32), np.full(coarse, -FARTHEST, np.float32)
-    bits = np.zeros(coarse, np.uint16)
+    bits = np.zeros((2, *coarse), np.uint16)
     for name, values in measured.blocks.items():
         noise = (measured.noise, doubt) if name == "roughness" else (measured.noise_under, below)
-        _hold_all(values, facts[name], *noise, load, excess, bits)
+        _hold_all(values, facts[name], *noise, load, excess, bits[0])
+    bits[1] = np.where((measured.share < WHOLE) | (patchy > 0), UNSEEN_BIT, 0)
     blocks = np.stack(
         [
-            load, excess, measured.noise, doubt, measured.share, measured.unstood, measured.blocks["roughness"],
+            load, excess, measured.noise, doubt, measured.share, measured.blocks["roughness"],
             np.arctan(measured.blocks["slope"]), np.arctan(measured.blocks["tilt"]),
             np.float32(vehicle.clearance) - measured.blocks["rise"],
         ]
     )  # fmt: skip
     risk, reason = np.empty(shape, np.uint8), np.empty(shape, np.uint16)
-    bands = [np.empty(shape, np.float32) for _ in range(6)]
-    marks = np.array([rules.caution, rules.max_p, rules.min_known, WHOLE], np.float32)
-    fine, table, n = np.stack([facts[name] for name in FINE]), _table(), measured.stride
-    at = (np.arange(shape[1]) // n).astype(np.uint32)
-    inclination, roughness, slope, tilt, clearance, p = bands
-    for first in range(0, shape[0], n * BAND):
-        rows, of = slice(first, first + n * BAND), slice(first // n, first // n + BAND)
-        _classify(
-            fine, np.float32(1.0 / measured.extent), measured.range[rows], measured.step[rows], closed[rows],
-            filled[rows], np.ascontiguousarray(blocks[:, of]), bits[of], at, n, marks, table, risk[rows], reason[rows],
-            *(band[rows] for band in bands),
-        )  # fmt: skip
-        np.arctan(inclination[rows], out=inclination[rows])
+    inclination, roughness, slope, tilt, clearance, p = (np.empty(shape, np.float32) for _ in range(6))
+    marks = np.array([rules.caution, rules.max_p, rules.min_known], np.float32)
+    _classify(
+        np.stack([facts[name] for name in FINE]), np.float32(1.0 / measured.extent), measured.range, measured.step,
+        closed, filled, blocks, bits, measured.stride, marks, _table(), risk, reason,
+        inclination, roughness, slope, tilt, clearance, p,
+    )  # fmt: skip
+    np.arctan(inclination, out=inclination)
     return {
         "risk": risk,
         "reason": reason,
@@ -121,6 +119,14 @@ def _facts(vehicle: Vehicle, window: float, cell: float, sigmas: float) -> dict[
     }
 
 
+def _with(noise: Floats32, hidden: Floats32) -> Floats32:
+    """Noise widened by what may be hidden; mostly there is nothing."""
+    out = noise.copy()
+    np.hypot(noise, hidden, out=out, where=hidden > 0)
+    return out
+
+
+@cache
 def _table() -> Floats32:
     t = np.arange(-FARTHEST * STEPS, FARTHEST * STEPS + 1) / STEPS
     start, width, lift = LIFT
@@ -155,67 +161,114 @@ def _hold_all(values, facts, noise, doubt, load, excess, bits):  # type: ignore[
         _hold(values[r], facts, noise[r], doubt[r], load[r], excess[r], bits[r])
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _classify(  # type: ignore[no-untyped-def]
-    facts, per_metre, height_range, step, closed, filled, blocks, bits0, at, n, marks, table,
+    facts, per_metre, height_range, step, closed, filled, blocks, bits, n, marks, table,
     risk, reason, inclination, roughness, slope, tilt, clearance, p,
 ):  # fmt: skip
-    """Rows of cells, of which the first one is the first of a row of blocks; ``at`` is the block of each column."""
+    """Cells of each block of ``n`` x ``n``, by strips of whole blocks; ``bits`` (2, row, col) of the blocks' own
+    hazards, and of any class."""
     rows, cols = risk.shape
-    width = min(cols, STRIP)
+    width = n * max(1, STRIP // n)
     wide = np.empty((blocks.shape[0], width), dtype=np.float32)
-    before, bits = np.empty(width, dtype=np.uint16), np.empty(width, dtype=np.uint16)
+    own = np.empty((2, width), dtype=np.uint16)
     load, excess = np.empty(width, dtype=np.float32), np.empty(width, dtype=np.float32)
+    place = np.empty(width, dtype=np.uint32)
     for top in range(0, rows, n):
         for left in range(0, cols, width):
             right = min(left + width, cols)
-            m = right - left
+            strip, of = slice(left, right), slice(left // n, left // n + width // n)
             for k in range(blocks.shape[0]):
-                _spread(blocks[k, top // n], at[left:right], wide[k])
-            _spread(bits0[top // n], at[left:right], before)
+                _spread(blocks[k, top // n, of], n, wide[k])
+            for k in range(2):
+                _spread(bits[k, top // n, of], n, own[k])
             for r in range(top, min(top + n, rows)):
-                for c in range(m):
-                    load[c], excess[c], bits[c] = wide[0, c], wide[1, c], before[c]
-                inclined, ranged, stepped = inclination[r, left:right], height_range[r, left:right], step[r, left:right]
-                kind, chance = risk[r, left:right], p[r, left:right]
-                for c in range(m):
+                inclined, ranged, stepped = inclination[r, strip], height_range[r, strip], step[r, strip]
+                kind, chance = risk[r, strip], p[r, strip]
+                _load(facts, per_metre, ranged, stepped, wide[2], wide[0], load)
+                _excess(facts, per_metre, ranged, stepped, wide[2], wide[3], wide[1], excess)
+                _look_up(excess[: right - left], table, place, chance)
+                some = _decide(load, chance, closed[r, strip], wide[4], marks, kind)
+                _explain(kind, filled[r, strip], own[1], reason[r, strip])
+                if some & 1:
+                    _blame(kind, facts, per_metre, ranged, stepped, wide[2], own[0], reason[r, strip])
+                    _doubt(kind, excess, reason[r, strip])
+                for c in range(right - left):
                     inclined[c] = ranged[c] * per_metre
-                _hold(inclined, facts[0], wide[2], wide[3], load, excess, bits)
-                _hold(ranged, facts[1], wide[2], wide[3], load, excess, bits)
-                _hold(stepped, facts[2], wide[2], wide[3], load, excess, bits)
-                _look_up(excess, table, chance)
-                _decide(
-                    load, excess, bits, chance, closed[r, left:right], filled[r, left:right], wide[4], wide[5], marks,
-                    kind, reason[r, left:right],
-                )  # fmt: skip
-                _blank(kind, inclined)
-                _blank(kind, ranged)
-                _blank(kind, stepped)
-                _blank(kind, chance)
-                _put(kind, wide[6], roughness[r, left:right])
-                _put(kind, wide[7], slope[r, left:right])
-                _put(kind, wide[8], tilt[r, left:right])
-                _put(kind, wide[9], clearance[r, left:right])
+                if some & 2:
+                    for line in (inclined, ranged, stepped, chance):
+                        _blank(kind, line)
+                for k, band in enumerate((roughness, slope, tilt, clearance)):
+                    _put(kind, wide[5 + k], some & 2 > 0, band[r, strip])
 
 
 @njit(cache=True, nogil=True)
-def _spread(blocks, at, out):  # type: ignore[no-untyped-def]
-    for c in range(at.shape[0]):
-        out[c] = blocks[at[c]]
+def _spread(blocks, n, out):  # type: ignore[no-untyped-def]
+    """Each block ``n`` times."""
+    if n == 4:  # of a known number the compiler writes all at once
+        for j in range(blocks.shape[0]):
+            v = blocks[j]
+            out[4 * j], out[4 * j + 1], out[4 * j + 2], out[4 * j + 3] = v, v, v, v
+        return
+    for j in range(blocks.shape[0]):
+        for k in range(n):
+            out[n * j + k] = blocks[j]
+
+
+# Loops below write one array each: with more, the compiler would have to compare too many of them for overlaps before
+# it may take several cells at a time.
 
 
 @njit(cache=True, nogil=True)
-def _look_up(excess, table, p):  # type: ignore[no-untyped-def]
-    for c in range(p.shape[0]):
+def _load(facts, per_metre, ranged, stepped, noise, before, out):  # type: ignore[no-untyped-def]
+    """Greatest load of the blocks' and of the three measures."""
+    one = np.float32(1.0)
+    p, q, s = one / facts[0, 0], one / facts[1, 0], one / facts[2, 0]
+    u, v, w = facts[0, 3], facts[1, 3], facts[2, 3]
+    for c in range(ranged.shape[0]):
+        a, b = (ranged[c] * per_metre + u * noise[c]) * p, (ranged[c] + v * noise[c]) * q
+        d, most = (stepped[c] + w * noise[c]) * s, before[c]
+        most = a if a > most else most
+        most = b if b > most else most
+        out[c] = d if d > most else most
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _excess(facts, per_metre, ranged, stepped, noise, doubt, before, out):  # type: ignore[no-untyped-def]
+    """Greatest standardised excess, likewise."""
+    f, g, h = facts[0], facts[1], facts[2]
+    limit0, bias0, spread0, least0 = f[0], f[1], f[2], LEAST * f[0]
+    limit1, bias1, spread1, least1 = g[0], g[1], g[2], LEAST * g[0]
+    limit2, bias2, spread2, least2 = h[0], h[1], h[2], LEAST * h[0]
+    none = np.float32(0.0)
+    for c in range(ranged.shape[0]):
+        s, wide, most = noise[c], doubt[c], before[c]
+        over = ranged[c] * per_metre - bias0 * s - limit0
+        t = over / (spread0 * (s if over > none else wide) + least0)
+        most = t if t > most else most
+        over = ranged[c] - bias1 * s - limit1
+        t = over / (spread1 * (s if over > none else wide) + least1)
+        most = t if t > most else most
+        over = stepped[c] - bias2 * s - limit2
+        t = over / (spread2 * (s if over > none else wide) + least2)
+        out[c] = t if t > most else most
+
+
+@njit(cache=True, nogil=True)
+def _look_up(excess, table, place, p):  # type: ignore[no-untyped-def]
+    for c in range(excess.shape[0]):
         least = excess[c] if excess[c] > -FARTHEST else -FARTHEST
         t = least if least < FARTHEST else FARTHEST
-        p[c] = table[np.uint32((t + FARTHEST) * STEPS)]
+        place[c] = np.uint32((t + FARTHEST) * STEPS)
+    for c in range(excess.shape[0]):
+        p[c] = table[place[c]]
 
 
 @njit(cache=True, nogil=True)
-def _decide(load, excess, bits, p, closed, filled, share, unstood, marks, risk, reason):  # type: ignore[no-untyped-def]
-    caution, max_p, min_known, whole = marks[0], marks[1], marks[2], marks[3]
-    one, zero, none = np.float32(1.0), np.float32(0.0), np.uint16(0)
+def _decide(load, p, closed, share, marks, risk):  # type: ignore[no-untyped-def]
+    """Classes; returns 1 if some are hazardous, plus 2 if some are unknown."""
+    caution, max_p, min_known = marks[0], marks[1], marks[2]
+    one = np.float32(1.0)
     for c in range(risk.shape[0]):
         known = closed[c] == closed[c]
         hazardous = known & (load[c] > one)
@@ -223,14 +276,41 @@ def _decide(load, excess, bits, p, closed, filled, share, unstood, marks, risk, 
         near = (load[c] > caution) | (p[c] > max_p)
         kind = np.uint8(HAZARDOUS) if hazardous else (np.uint8(CAUTION) if near else np.uint8(SAFE))
         risk[c] = np.uint8(UNKNOWN) if unknown else kind
+    hazards, gaps = np.uint8(0), np.uint8(0)
     for c in range(risk.shape[0]):
-        hazardous, unknown = risk[c] == HAZARDOUS, risk[c] == UNKNOWN
-        why = bits[c] if hazardous else none
-        why |= np.uint16(DOUBT_BIT) if hazardous & (excess[c] <= zero) else none
-        why |= np.uint16(UNKNOWN_BIT) if unknown else none
-        why |= np.uint16(FILLED_BIT) if filled[c] == 1 else none
-        why |= np.uint16(UNSEEN_BIT) if (share[c] < whole) | (unstood[c] > zero) else none
-        reason[c] = why
+        hazards |= np.uint8(risk[c] == HAZARDOUS)
+        gaps |= np.uint8(risk[c] == UNKNOWN)
+    return np.int64(hazards) + 2 * np.int64(gaps)
+
+
+@njit(cache=True, nogil=True)
+def _explain(risk, filled, any_class, reason):  # type: ignore[no-untyped-def]
+    """Reasons of cells that are not hazardous."""
+    none = np.uint16(0)
+    for c in range(risk.shape[0]):
+        why = any_class[c] | (np.uint16(UNKNOWN_BIT) if risk[c] == UNKNOWN else none)
+        reason[c] = why | (np.uint16(FILLED_BIT) if filled[c] == 1 else none)
+
+
+@njit(cache=True, nogil=True)
+def _blame(risk, facts, per_metre, ranged, stepped, noise, own, reason):  # type: ignore[no-untyped-def]
+    """Add the measures that make a hazard."""
+    one, none = np.float32(1.0), np.uint16(0)
+    p, q, s = one / facts[0, 0], one / facts[1, 0], one / facts[2, 0]
+    u, v, w = facts[0, 3], facts[1, 3], facts[2, 3]
+    bit0, bit1, bit2 = np.uint16(facts[0, 4]), np.uint16(facts[1, 4]), np.uint16(facts[2, 4])
+    for c in range(risk.shape[0]):
+        why = own[c] | (bit0 if (ranged[c] * per_metre + u * noise[c]) * p > one else none)
+        why |= bit1 if (ranged[c] + v * noise[c]) * q > one else none
+        why |= bit2 if (stepped[c] + w * noise[c]) * s > one else none
+        reason[c] |= why if risk[c] == HAZARDOUS else none
+
+
+@njit(cache=True, nogil=True)
+def _doubt(risk, excess, reason):  # type: ignore[no-untyped-def]
+    for c in range(risk.shape[0]):
+        by_sigma = (risk[c] == HAZARDOUS) & (excess[c] <= np.float32(0.0))
+        reason[c] |= np.uint16(DOUBT_BIT) if by_sigma else np.uint16(0)
 
 
 @njit(cache=True, nogil=True)
@@ -240,6 +320,9 @@ def _blank(risk, values):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _put(risk, values, out):  # type: ignore[no-untyped-def]
+def _put(risk, values, gaps, out):  # type: ignore[no-untyped-def]
+    if not gaps:
+        copy_line(values[: out.shape[0]], out)
+        return
     for c in range(out.shape[0]):
         out[c] = np.float32(np.nan) if risk[c] == UNKNOWN else values[c]
