@@ -85,7 +85,7 @@ class Ground:
         self.toll: Ints = np.zeros(risk.shape, dtype=np.int16 if dearest <= np.iinfo(np.int16).max else np.int64)
         if doubt > 0 and chance is not None:
             _doubt(chance, np.float32(doubt * grid.cell / unit), self.toll)
-        if _price(self.stand, risk, np.float32(unit), toll, self.height, self.toll) > LARGE:
+        if _price(self.stand, risk, np.float32(unit), toll, self.height, self.toll):
             self.height = np.rint(np.where(self.closed, np.float32(0), self.stand) / np.float32(unit)).astype(np.int64)
         self._ways: dict[str, Bytes] = {}
         self._parts: dict[str, tuple[NDArray[np.int32], Ints]] = {}
@@ -141,16 +141,17 @@ def _closed(risk, chance, sure, unknown, closed):  # type: ignore[no-untyped-def
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _price(stand, risk, unit, caution, height, toll):  # type: ignore[no-untyped-def]
-    """Heights in units and tolls; returns the greatest magnitude of a height."""
-    most = np.float32(0.0)
+    """Heights in units and tolls; returns whether some height is too large."""
+    large = np.uint8(0)
     for r in range(risk.shape[0]):
-        for c in range(risk.shape[1]):
-            kind = risk[r, c]
-            v = np.rint(stand[r, c] / unit) if kind < HAZARDOUS else np.float32(0.0)
-            most = max(most, abs(v))
-            height[r, c] = np.int32(v)
-            toll[r, c] += caution if kind == CAUTION else 0
-    return most
+        kind, z, line, price = risk[r], stand[r], height[r], toll[r]
+        for c in range(kind.shape[0]):
+            v = np.rint(z[c] / unit) if kind[c] < HAZARDOUS else np.float32(0.0)
+            line[c] = np.int32(v)
+            large |= np.uint8(abs(v) > np.float32(LARGE))
+        for c in range(kind.shape[0]):
+            price[c] += caution if kind[c] == CAUTION else 0
+    return large > 0
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
