@@ -15,6 +15,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from stages.line import copy_line
+
 Floats32 = NDArray[np.float32]
 
 BAND = 128
@@ -125,10 +127,11 @@ def _fill(z, f, first, last, left, buffer):  # type: ignore[no-untyped-def]
     rows, cols = z.shape
     for i in range(last - first):
         line = buffer[i]
-        for c in range(line.shape[0]):
-            line[c] = -np.inf
-        if 0 <= first + i < rows:
+        inside = 0 <= first + i < rows
+        line[: left if inside else line.shape[0]] = -np.inf
+        if inside:
             _load(z[first + i], f, line[left : left + cols])
+            line[left + cols :] = -np.inf
     return last - first
 
 
@@ -139,10 +142,10 @@ def _widen(buffer, n, spare, side, diagonal):  # type: ignore[no-untyped-def]
     Results move up by ``side + 2 diagonal`` rows and to the left by ``side`` columns.
     """
     for i in range(n):
-        _double(buffer[i], spare, 2 * side + 1)
-    n = _down(buffer, n, 2 * side + 1, 0)
-    n = _down(buffer, n, 2 * diagonal + 1, 1)
-    return _down(buffer, n, 2 * diagonal + 1, -1)
+        _along(buffer[i], spare, 2 * side + 1)
+    n = _down(buffer, n, spare, 2 * side + 1, 0)
+    n = _down(buffer, n, spare, 2 * diagonal + 1, 1)
+    return _down(buffer, n, spare, 2 * diagonal + 1, -1)
 
 
 @njit(cache=True, nogil=True)
@@ -172,24 +175,58 @@ def _raise4(line, p, q, s):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _double(line, spare, n):  # type: ignore[no-untyped-def]
-    """Maximum of c .. c + n - 1 in place; the last n - 1 values are of what is left."""
-    m = line.shape[0]
-    w = 1
+def _along(line, spare, n):  # type: ignore[no-untyped-def]
+    """Maximum of c .. c + n - 1 in place; the last n - 1 values are of what is left. Windows of w make one of up to 4 w
+    at once."""
+    w, swaps = 1, 0
+    a, b = line, spare
     while w < n:
-        step = min(w, n - w)
-        for c in range(m):
-            spare[c] = line[c]
-        _raise(line[: m - step], spare[step:])
-        w += step
+        s1, s2, s3 = min(w, n - w), min(2 * w, n - w), min(3 * w, n - w)
+        _most4(a, a[s1:], a[s2:], a[s3:], b)
+        for c in range(line.shape[0] - s3, line.shape[0]):
+            b[c] = a[c]
+        a, b = b, a
+        w, swaps = w + s3, swaps + 1
+    if swaps % 2 == 1:
+        copy_line(spare, line)
 
 
 @njit(cache=True, nogil=True)
-def _down(buffer, rows, n, slant):  # type: ignore[no-untyped-def]
+def _most4(p, q, s, t, out):  # type: ignore[no-untyped-def]
+    """The greatest of four lines, as far as the last one goes."""
+    for c in range(t.shape[0]):
+        a, b, d, e = p[c], q[c], s[c], t[c]
+        a = a if a > b else b
+        d = d if d > e else e
+        out[c] = a if a > d else d
+
+
+@njit(cache=True, nogil=True)
+def _most6(o, p, q, s, t, u, out):  # type: ignore[no-untyped-def]
+    for c in range(out.shape[0]):
+        a, b, d, e, f, g = o[c], p[c], q[c], s[c], t[c], u[c]
+        a = a if a > b else b
+        d = d if d > e else e
+        f = f if f > g else g
+        a = a if a > d else d
+        out[c] = a if a > f else f
+
+
+@njit(cache=True, nogil=True)
+def _most2(p, q, out):  # type: ignore[no-untyped-def]
+    for c in range(out.shape[0]):
+        out[c] = p[c] if p[c] > q[c] else q[c]
+
+
+@njit(cache=True, nogil=True)
+def _down(buffer, rows, spare, n, slant):  # type: ignore[no-untyped-def]
     """The same down the rows, ``slant`` columns to the right a row; returns how many rows are whole.
 
-    Windows of w rows make one of up to 4 w rows in one pass: each pass goes through the slower cache.
+    Windows of w rows make one of up to 4 w rows in one pass: each pass goes through the slower cache. Of up to nine
+    rows, which are odd, two windows share all but one, and one pass does.
     """
+    if 1 < n <= 9:
+        return _down_by_twos(buffer, rows, spare, n, slant)
     cols = buffer.shape[1]
     w = 1
     while w < n:
@@ -209,6 +246,52 @@ def _down(buffer, rows, n, slant):  # type: ignore[no-untyped-def]
         rows -= s3
         w += s3
     return rows
+
+
+@njit(cache=True, nogil=True)
+def _down_by_twos(buffer, rows, spare, n, slant):  # type: ignore[no-untyped-def]
+    """Of rows i and i + 1 the windows share rows i + 1 .. i + n - 1."""
+    cols = buffer.shape[1]
+    far = n * slant
+    first, last = max(0, -far), min(cols, cols - far)
+    shared = spare[: last - first]
+    for i in range(0, rows - n + 1, 2):
+        _share(buffer[i : i + n], n, first, last, slant, shared)
+        _raise(buffer[i, first:last], shared)
+        if i + n < rows:
+            _most2(shared, buffer[i + n, first + far : last + far], buffer[i + 1, first + slant : last + slant])
+    return rows - n + 1
+
+
+@njit(cache=True, nogil=True)
+def _share(buffer, n, first, last, slant, out):  # type: ignore[no-untyped-def]
+    """The greatest of rows 1 .. n - 1, ``slant`` columns to the right a row."""
+    p, q = _slanted(buffer, 1, first, last, slant), _slanted(buffer, 2, first, last, slant)
+    if n == 3:
+        _most2(p, q, out)
+        return
+    s, t = _slanted(buffer, 3, first, last, slant), _slanted(buffer, 4, first, last, slant)
+    if n == 5:
+        _most4(p, q, s, t, out)
+        return
+    u, v = _slanted(buffer, 5, first, last, slant), _slanted(buffer, 6, first, last, slant)
+    _most6(p, q, s, t, u, v, out)
+    if n == 9:
+        _raise3(out, _slanted(buffer, 7, first, last, slant), _slanted(buffer, 8, first, last, slant))
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _slanted(buffer, k, first, last, slant):  # type: ignore[no-untyped-def]
+    return buffer[k, first + k * slant : last + k * slant]
+
+
+@njit(cache=True, nogil=True)
+def _raise3(line, p, q):  # type: ignore[no-untyped-def]
+    """The greatest of three lines in place of the first."""
+    for c in range(line.shape[0]):
+        a, b, d = line[c], p[c], q[c]
+        a = a if a > b else b
+        line[c] = a if a > d else d
 
 
 def median3(surface: Floats32) -> Floats32:
