@@ -62,13 +62,23 @@ def _sum_around(a, half, out):  # type: ignore[no-untyped-def]
     for r in range(rows):
         for c in range(cols):
             down[r + 1, c] = down[r, c] + a[r, c]
-    along = np.zeros(cols + 1)
+    # from before the first column, where nothing is, to as far behind the last one as the window goes
+    along = np.zeros(cols + 2 * half + 1)
+    inner = along[half + 1 : half + 1 + cols]
     for r in range(rows):
         first, last = down[max(r - half, 0)], down[min(r + half + 1, rows)]
+        total = 0.0
         for c in range(cols):
-            along[c + 1] = along[c] + (last[c] - first[c])
-        for c in range(cols):
-            out[r, c] = along[min(c + half + 1, cols)] - along[max(c - half, 0)]
+            total += last[c] - first[c]
+            inner[c] = total
+        along[half + 1 + cols :] = total
+        _differences(along[2 * half + 1 :], along, out[r])
+
+
+@njit(cache=True, nogil=True)
+def _differences(p, q, out):  # type: ignore[no-untyped-def]
+    for c in range(out.shape[0]):
+        out[c] = p[c] - q[c]
 
 
 @njit(cache=True, nogil=True)

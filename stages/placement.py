@@ -133,7 +133,7 @@ def place(
         np.pad(np.where(np.isfinite(a), a, np.float32(np.nan)), reach, constant_values=np.nan)
         for a in (stand, ground, belly)
     ]
-    padded += [np.pad(a.astype(np.float32), reach, constant_values=1.0) for a in patchy]
+    padded += [np.pad(a.astype(np.uint16), reach, constant_values=1) for a in patchy]
     out = [np.zeros(high.shape, dtype=np.float32) for _ in range(4)]
     _place(*padded, stance.wheels + reach, stance.belly + reach, stance.spans, stance.weights, *out)
     return Places(np.sqrt(out[0]), np.sqrt(out[1]), out[2], out[3])
@@ -143,17 +143,23 @@ def place(
 def _place(stand, ground, belly, gaps, gaps_below, wheels, under, spans, weights, tilt, slope, rise, unstood):  # type: ignore[no-untyped-def]
     rows = tilt.shape[0]
     headings = wheels.shape[0]
-    points = wheels.shape[1] + under.shape[1]
-    each = np.float32(1.0 / (headings * points))
+    parts = headings * (wheels.shape[1] + under.shape[1])
+    shares = np.zeros(parts + 1, dtype=np.float32)
+    for k in range(parts):
+        shares[k + 1] = shares[k] + np.float32(1.0 / parts)
+    missing = np.empty(tilt.shape[1], dtype=np.uint16)
     for r in range(rows):
+        missing[:] = 0
         for k in range(headings):
             _steepest(stand, wheels[k], spans[k], r, tilt[r])
             _steepest(ground, wheels[k], spans[k], r, slope[r])
             for j in range(wheels.shape[1]):
-                _missing(gaps, wheels[k, j], r, each, unstood[r])
+                _count(gaps, wheels[k, j], r, missing)
             for j in range(under.shape[1]):
-                _missing(gaps_below, under[k, j], r, each, unstood[r])
+                _count(gaps_below, under[k, j], r, missing)
                 _rise(belly, stand, under[k, j], wheels[k], weights[j], r, rise[r])
+        for c in range(missing.shape[0]):
+            unstood[r, c] = shares[missing[c]]
 
 
 @njit(cache=True, nogil=True)
@@ -181,11 +187,11 @@ def _steepest(a, wheels, spans, r, out):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _missing(gaps, at, r, each, out):  # type: ignore[no-untyped-def]
-    """Add ``each`` where there is a gap."""
+def _count(gaps, at, r, out):  # type: ignore[no-untyped-def]
+    """Add one where there is a gap."""
     line = _line(gaps, at, r, out.shape[0])
     for c in range(out.shape[0]):
-        out[c] += each * line[c]
+        out[c] += line[c]
 
 
 @njit(cache=True, nogil=True)

@@ -31,11 +31,14 @@ WHOLE = 0.999
 FINE = ("inclination", "range", "step")
 """Measures on the cells; the others are on blocks."""
 
-STRIP = 384
-"""Columns of cells that are worked on at a time: lines of all bands stay in a cache of 48 kB."""
+STRIP = 1536
+"""Columns of cells that are worked on at a time: long lines are read ahead of their use, and all stay in a cache of 1 MB."""
 
 STEPS, FARTHEST = 64, 16.0
 """Table of the distribution: steps a unit, and where it ends."""
+
+NONE = 2.0**-44
+"""Of a step: the sum of it and 16 in 64 bits is 16."""
 
 LEAST = np.float32(1e-12)
 """Of a limit; standard deviation of a measure of exact elevations, so that none is divided by."""
@@ -173,7 +176,7 @@ def _classify(  # type: ignore[no-untyped-def]
     wide = np.empty((blocks.shape[0], width), dtype=np.float32)
     own = np.empty((2, width), dtype=np.uint16)
     load, excess = np.empty(width, dtype=np.float32), np.empty(width, dtype=np.float32)
-    place = np.empty(width, dtype=np.uint32)
+    place = np.empty(width, dtype=np.int32)
     for top in range(0, rows, n):
         for left in range(0, cols, width):
             right = min(left + width, cols)
@@ -256,12 +259,16 @@ def _excess(facts, per_metre, ranged, stepped, noise, doubt, before, out):  # ty
 
 @njit(cache=True, nogil=True)
 def _look_up(excess, table, place, p):  # type: ignore[no-untyped-def]
+    """The entry at or below; what is below 0 by no more than :data:`NONE` counts as 0."""
+    far, steps, none = np.float32(FARTHEST), np.float32(STEPS), np.float32(-NONE)
     for c in range(excess.shape[0]):
-        least = excess[c] if excess[c] > -FARTHEST else -FARTHEST
-        t = least if least < FARTHEST else FARTHEST
-        place[c] = np.uint32((t + FARTHEST) * STEPS)
+        least = excess[c] if excess[c] > -far else -far
+        t = (least if least < far else far) * steps
+        k = np.int32(t)
+        below = (np.float32(k) > t) & (t < none)
+        place[c] = k + np.int32(FARTHEST * STEPS) - np.int32(below)
     for c in range(excess.shape[0]):
-        p[c] = table[place[c]]
+        p[c] = table[np.uint32(place[c])]
 
 
 @njit(cache=True, nogil=True)
