@@ -19,8 +19,8 @@ from stages.line import copy_line
 
 Floats32 = NDArray[np.float32]
 
-BAND = 128
-"""Rows worked on at a time: with the window's own they stay in a cache of 1 MB up to widths of 1500 cells."""
+BAND = 64
+"""Rows worked on at a time: with the window's own, both extremes stay in a cache of 1.25 MB to widths of 1500 cells."""
 
 
 def octagon(reach: int) -> tuple[int, int]:
@@ -85,19 +85,52 @@ def _running_max(z, f, side, diagonal, out):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _relief(z, side, diagonal, more, steps, small, large):  # type: ignore[no-untyped-def]
-    """Of a band the highest values are written first, and the lowest ones taken from them."""
+    """The highest values are written first, and the lowest ones taken from them.
+
+    Rows enter at the end of a band, and each pass goes on as far as it can: ``done`` rows of the band. What is whole
+    leaves at the top, and the rest moves up, so that no row is worked on twice.
+    """
     rows, cols = z.shape
-    near, added = side + 2 * diagonal, more + 2 * steps
-    reach = near + added
-    buffer, spare = _room(cols, reach)
-    for start in range(0, rows, BAND):
-        stop = min(start + BAND, rows)
-        for sign in (1.0, -1.0):
-            n = _fill(z, np.float32(sign), start - reach, stop + reach, 2 * reach, buffer)
-            n = _widen(buffer, n, spare, side, diagonal)
-            _emit(buffer[added:], 2 * reach - side, sign > 0, small[start:stop])
-            _widen(buffer, n, spare, more, steps)
-            _emit(buffer, 2 * reach - side - more, sign > 0, large[start:stop])
+    added = more + 2 * steps
+    reach = side + 2 * diagonal + added
+    high, spare = _room(cols, reach)
+    low = np.empty_like(high)
+    inner, outer = _passes(side, diagonal), _passes(more, steps)
+    k = inner.shape[0]
+    done = np.zeros(k + outer.shape[0] + 1, dtype=np.int64)
+    after, top = np.zeros_like(done), 0
+    while top < rows:
+        after[0] = done[0] + min(BAND, rows + 2 * reach - top - done[0])
+        for sign, buffer in ((1.0, high), (-1.0, low)):
+            first = top - reach
+            _fill(z, np.float32(sign), first + done[0], first + after[0], 2 * reach, buffer[done[0] :])
+            _all_along(buffer[done[0] : after[0]], spare, 2 * side + 1)
+            _advance(buffer, spare, inner, done[: k + 1], after[: k + 1])
+            low_row, end = max(done[k], added - top), min(after[k], rows + added - top)
+            at = top - added
+            if end > low_row:
+                _emit(buffer[low_row:], 2 * reach - side, sign > 0, small[at + low_row : at + end])
+            _all_along(buffer[done[k] : after[k]], spare, 2 * more + 1)
+            _advance(buffer, spare, outer, done[k:], after[k:])
+            _emit(buffer, 2 * reach - side - more, sign > 0, large[top : top + after[-1]])
+            for i in range(after[-1], after[0]):
+                copy_line(buffer[i], buffer[i - after[-1]])
+        top += after[-1]
+        done[:] = after - after[-1]
+
+
+@njit(cache=True, nogil=True)
+def _all_along(buffer, spare, n):  # type: ignore[no-untyped-def]
+    for i in range(buffer.shape[0]):
+        _along(buffer[i], spare, n)
+
+
+@njit(cache=True, nogil=True)
+def _advance(buffer, spare, passes, done, after):  # type: ignore[no-untyped-def]
+    """Each pass over the rows that the one before has done and it has not."""
+    for k in range(passes.shape[0]):
+        n, w, slant = passes[k]
+        after[k + 1] = done[k + 1] + _pass(buffer[done[k + 1] :], after[k] - done[k + 1], spare, n, w, slant)
 
 
 @njit(cache=True, nogil=True)
@@ -141,11 +174,29 @@ def _widen(buffer, n, spare, side, diagonal):  # type: ignore[no-untyped-def]
 
     Results move up by ``side + 2 diagonal`` rows and to the left by ``side`` columns.
     """
-    for i in range(n):
-        _along(buffer[i], spare, 2 * side + 1)
-    n = _down(buffer, n, spare, 2 * side + 1, 0)
-    n = _down(buffer, n, spare, 2 * diagonal + 1, 1)
-    return _down(buffer, n, spare, 2 * diagonal + 1, -1)
+    _all_along(buffer[:n], spare, 2 * side + 1)
+    for k, w, slant in _passes(side, diagonal):
+        n = _pass(buffer, n, spare, k, w, slant)
+    return n
+
+
+@njit(cache=True, nogil=True)
+def _passes(side, diagonal):  # type: ignore[no-untyped-def]
+    """Down the rows of a square, and along both diagonals: rows of the window; rows of those that it is made of;
+    columns to the right a row.
+
+    Windows of w rows make one of up to 4 w rows in one pass: each pass goes through the slower cache. Windows of up to
+    nine rows, which are odd, take one, marked by w = 0.
+    """
+    out, m = np.empty((99, 3), dtype=np.int64), 0
+    for n, slant in ((2 * side + 1, 0), (2 * diagonal + 1, 1), (2 * diagonal + 1, -1)):
+        w = 1
+        while w < n:
+            twos = n <= 9
+            out[m, 0], out[m, 1], out[m, 2] = n, 0 if twos else w, slant
+            m += 1
+            w = n if twos else w + min(3 * w, n - w)
+    return out[:m]
 
 
 @njit(cache=True, nogil=True)
@@ -219,38 +270,28 @@ def _most2(p, q, out):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _down(buffer, rows, spare, n, slant):  # type: ignore[no-untyped-def]
-    """The same down the rows, ``slant`` columns to the right a row; returns how many rows are whole.
-
-    Windows of w rows make one of up to 4 w rows in one pass: each pass goes through the slower cache. Of up to nine
-    rows, which are odd, two windows share all but one, and one pass does.
-    """
-    if 1 < n <= 9:
+def _pass(buffer, rows, spare, n, w, slant):  # type: ignore[no-untyped-def]
+    """One of :func:`_passes` over ``rows`` rows, in place; returns how many rows are whole."""
+    if w == 0:
         return _down_by_twos(buffer, rows, spare, n, slant)
     cols = buffer.shape[1]
-    w = 1
-    while w < n:
-        s1 = min(w, n - w)
-        s2 = min(2 * w, n - w)
-        s3 = min(3 * w, n - w)
-        far = s3 * slant
-        first, last = max(0, -far), min(cols, cols - far)
-        for i in range(rows - s3):
-            line = buffer[i, first:last]
-            a = buffer[i + s1, first + s1 * slant : last + s1 * slant]
-            if s3 == s1:
-                _raise(line, a)
-                continue
-            b = buffer[i + s2, first + s2 * slant : last + s2 * slant]
-            _raise4(line, a, b, buffer[i + s3, first + far : last + far])
-        rows -= s3
-        w += s3
-    return rows
+    s1, s2, s3 = min(w, n - w), min(2 * w, n - w), min(3 * w, n - w)
+    far = s3 * slant
+    first, last = max(0, -far), min(cols, cols - far)
+    for i in range(rows - s3):
+        line = buffer[i, first:last]
+        a = buffer[i + s1, first + s1 * slant : last + s1 * slant]
+        if s3 == s1:
+            _raise(line, a)
+            continue
+        b = buffer[i + s2, first + s2 * slant : last + s2 * slant]
+        _raise4(line, a, b, buffer[i + s3, first + far : last + far])
+    return max(rows - s3, 0)
 
 
 @njit(cache=True, nogil=True)
 def _down_by_twos(buffer, rows, spare, n, slant):  # type: ignore[no-untyped-def]
-    """Of rows i and i + 1 the windows share rows i + 1 .. i + n - 1."""
+    """The same for an odd window of 3 to 9: of rows i and i + 1 it shares rows i + 1 .. i + n - 1."""
     cols = buffer.shape[1]
     far = n * slant
     first, last = max(0, -far), min(cols, cols - far)
@@ -260,7 +301,7 @@ def _down_by_twos(buffer, rows, spare, n, slant):  # type: ignore[no-untyped-def
         _raise(buffer[i, first:last], shared)
         if i + n < rows:
             _most2(shared, buffer[i + n, first + far : last + far], buffer[i + 1, first + slant : last + slant])
-    return rows - n + 1
+    return max(rows - n + 1, 0)
 
 
 @njit(cache=True, nogil=True)

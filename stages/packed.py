@@ -85,7 +85,7 @@ class Canvas:
 
     def _offset(self, dr: int, dc: int) -> int:
         """Bits from a cell to the one (row, col) from it, where rows follow each other."""
-        return dr * self.words.shape[1] * WORD + dc
+        return dr * int(self.words.shape[1]) * WORD + dc
 
 
 def codes(canvases: Sequence[Canvas], bits: Sequence[int]) -> NDArray[np.uint8]:

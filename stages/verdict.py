@@ -32,7 +32,7 @@ FINE = ("inclination", "range", "step")
 """Measures on the cells; the others are on blocks."""
 
 STRIP = 1536
-"""Columns of cells that are worked on at a time: long lines are read ahead of their use, and all stay in a cache of 1 MB."""
+"""Columns of cells that are worked on at a time: long lines are read ahead of their use, and all stay in the cache."""
 
 STEPS, FARTHEST = 64, 16.0
 """Table of the distribution: steps a unit, and where it ends."""
@@ -122,7 +122,7 @@ def _facts(vehicle: Vehicle, window: float, cell: float, sigmas: float) -> dict[
     }
 
 
-def _with(noise: Floats32, hidden: Floats32) -> Floats32:
+def _with(noise: Floats32, hidden: NDArray[np.floating]) -> Floats32:
     """Noise widened by what may be hidden; mostly there is nothing."""
     out = noise.copy()
     np.hypot(noise, hidden, out=out, where=hidden > 0)
