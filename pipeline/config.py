@@ -64,7 +64,7 @@ STAGE_MODULES: dict[str, str] = {
 
 ACCURATE_TERRAIN: dict[str, Any] = {
     "hfvm": {"preset": "accurate"},
-    "locus": {"both": True, "refined_share": 0.5},
+    "locus": {"both": True},
     "track": {"points": 2000},
     "merge": {"max_std_cells": 0.7},
 }
@@ -73,12 +73,16 @@ ACCURATE_TERRAIN: dict[str, Any] = {
 So many points because models that are half as wrong show half as small an error of the poses that merge them.
 """
 
-FROM_BOTH: dict[str, Any] = {"hfvm": {"greatest_std": 100.0}, "locus": {"max_jump": 5.0}}
-"""The same, where elevations do come from both directions.
+AND_THEN: tuple[tuple[str, str, Any, dict[str, Any]], ...] = (
+    ("hfvm", "preset", "accurate", {"locus": {"refined_share": 0.5}}),
+    ("locus", "both", True, {"hfvm": {"greatest_std": 100.0}, "locus": {"max_jump": 5.0}}),
+)
+"""The same, where this value of that section's key has not been overruled.
 
-With both a cell's own standard deviation tells good from bad better than the matcher's limits do, so they leave it more
-to choose from: no greatest standard deviation of a match, and disparities may jump by 5 pixels (beyond that nothing is
-gained).
+With an accurate matcher the mean of what the disparity says and of what the images show is better than either. With
+both directions a cell's own standard deviation tells good from bad better than the matcher's limits do, so they leave
+it more to choose from: no greatest standard deviation of a match, and disparities may jump by 5 pixels (beyond that
+nothing is gained).
 """
 
 
@@ -207,8 +211,11 @@ def _with_accurate_terrain(nested: dict[str, Any]) -> dict[str, Any]:
     if not isinstance(terrain, Mapping) or terrain.get("preset") != "accurate":
         return nested
     nested = merge(merge({}, ACCURATE_TERRAIN), nested)
-    locus = nested["locus"]
-    return merge(merge({}, FROM_BOTH), nested) if isinstance(locus, Mapping) and locus["both"] is True else nested
+    for section, key, value, more in AND_THEN:
+        given = nested[section]
+        if isinstance(given, Mapping) and given[key] == value:
+            nested = merge(merge({}, more), nested)
+    return nested
 
 
 NAVIGATION: Mapping[str, Mapping[str, Any]] = {

@@ -30,6 +30,8 @@ def test_one_setting_makes_terrain_accurate_and_what_is_given_beside_it_wins() -
     built = config.build({"terrain": {"preset": "accurate"}}, config.parse_assignments(["locus.both=false"]))
     assert (built.hfvm.preset, built.locus.both) == ("accurate", False)
     assert (built.hfvm.greatest_std, built.locus.max_jump) == (1.1, plain.locus.max_jump), "limits as without both"
+    built = config.build({"terrain": {"preset": "accurate"}, "hfvm": {"preset": "default"}})
+    assert (built.locus.refined_share, built.locus.max_jump) == (1.0, 5.0), "one of each"
     assert config.build().locus.both is False, "the preset itself is not changed by what is laid over it"
     with pytest.raises(ConfigError, match=r"terrain\.preset = 'best' is not permitted"):
         config.build({"terrain": {"preset": "best"}})
