@@ -15,12 +15,28 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from stages.extrema_lanes import (
+    LANES,
+    along_five,
+    along_nine,
+    along_seven,
+    along_three,
+    five,
+    nine,
+    raise4,
+    seven,
+    three,
+)
 from stages.line import copy_line
 
 Floats32 = NDArray[np.float32]
 
-BAND = 64
-"""Rows worked on at a time: with the window's own, both extremes stay in a cache of 1.25 MB to widths of 1500 cells."""
+BAND, STRIP = 32, 768
+"""Rows and columns worked on at a time, at most: rows of a window stay in the innermost cache, a band in the next."""
+
+SLACK = 8
+"""Columns beside: windows along a diagonal are found for four rows from the same columns of the first one, so that three
+of the others are not; that happens twice along either diagonal."""
 
 
 def octagon(reach: int) -> tuple[int, int]:
@@ -71,113 +87,122 @@ def _running_max(z, f, side, diagonal, out):  # type: ignore[no-untyped-def]
     """``f`` times the maximum of ``f`` times z."""
     rows, cols = z.shape
     reach = side + 2 * diagonal
-    buffer, spare = _room(cols, reach)
-    for start in range(0, rows, BAND):
-        stop = min(start + BAND, rows)
-        n = _fill(z, f, start - reach, stop + reach, 2 * reach, buffer)
-        _widen(buffer, n, spare, side, diagonal)
-        first = 2 * reach - side
-        for i in range(stop - start):
-            target, line = out[start + i], buffer[i, first:]
-            for c in range(cols):
-                target[c] = f * line[c]
+    width, wide, buffer = _room(cols, reach)
+    passes = _passes(side, diagonal)
+    for left in range(0, cols, width):
+        for top in range(0, rows, BAND):
+            n = min(BAND, rows - top)
+            _fill(z, f, top - reach, n + 2 * reach, left - reach - SLACK, wide, buffer)
+            _all_along(buffer, 0, n + 2 * reach, wide, 2 * side + 1)
+            whole = n + 2 * reach
+            for k in range(passes.shape[0]):
+                whole = _pass(buffer, 0, whole, wide, passes[k])
+            first = reach + SLACK - side
+            for i in range(n):
+                line = out[top + i, left : min(left + width, cols)]
+                start = i * wide + first
+                _times(buffer[start : start + line.shape[0]], f, line)
 
 
 @njit(cache=True, nogil=True)
 def _relief(z, side, diagonal, more, steps, small, large):  # type: ignore[no-untyped-def]
+    cols = z.shape[1]
+    width, wide, high = _room(cols, side + 2 * diagonal + more + 2 * steps)
+    low = np.empty_like(high)
+    for left in range(0, cols, width):
+        _relief_strip(z, side, diagonal, more, steps, left, min(left + width, cols), wide, high, low, small, large)
+
+
+@njit(cache=True, nogil=True)
+def _relief_strip(z, side, diagonal, more, steps, left, right, wide, high, low, small, large):  # type: ignore[no-untyped-def]
     """The highest values are written first, and the lowest ones taken from them.
 
     Rows enter at the end of a band, and each pass goes on as far as it can: ``done`` rows of the band. What is whole
     leaves at the top, and the rest moves up, so that no row is worked on twice.
     """
-    rows, cols = z.shape
+    rows = z.shape[0]
     added = more + 2 * steps
     reach = side + 2 * diagonal + added
-    high, spare = _room(cols, reach)
-    low = np.empty_like(high)
     inner, outer = _passes(side, diagonal), _passes(more, steps)
     k = inner.shape[0]
     done = np.zeros(k + outer.shape[0] + 1, dtype=np.int64)
     after, top = np.zeros_like(done), 0
+    column, near = left - reach - SLACK, reach + SLACK - side
     while top < rows:
         after[0] = done[0] + min(BAND, rows + 2 * reach - top - done[0])
         for sign, buffer in ((1.0, high), (-1.0, low)):
-            first = top - reach
-            _fill(z, np.float32(sign), first + done[0], first + after[0], 2 * reach, buffer[done[0] :])
-            _all_along(buffer[done[0] : after[0]], spare, 2 * side + 1)
-            _advance(buffer, spare, inner, done[: k + 1], after[: k + 1])
-            low_row, end = max(done[k], added - top), min(after[k], rows + added - top)
-            at = top - added
-            if end > low_row:
-                _emit(buffer[low_row:], 2 * reach - side, sign > 0, small[at + low_row : at + end])
-            _all_along(buffer[done[k] : after[k]], spare, 2 * more + 1)
-            _advance(buffer, spare, outer, done[k:], after[k:])
-            _emit(buffer, 2 * reach - side - more, sign > 0, large[top : top + after[-1]])
-            for i in range(after[-1], after[0]):
-                copy_line(buffer[i], buffer[i - after[-1]])
+            new = after[0] - done[0]
+            _fill(z, np.float32(sign), top - reach + done[0], new, column, wide, buffer[done[0] * wide :])
+            _all_along(buffer, done[0], after[0], wide, 2 * side + 1)
+            _advance(buffer, wide, inner, done[: k + 1], after[: k + 1])
+            first, end = max(done[k], added - top), min(after[k], rows + added - top)
+            if end > first:
+                start = top - added + first
+                _emit(buffer[first * wide + near :], wide, end - first, sign > 0, small, start, left, right)
+            _all_along(buffer, done[k], after[k], wide, 2 * more + 1)
+            _advance(buffer, wide, outer, done[k:], after[k:])
+            _emit(buffer[near - more :], wide, after[-1], sign > 0, large, top, left, right)
+            _move_up(buffer, after[-1] * wide, (after[0] - after[-1]) * wide)
         top += after[-1]
         done[:] = after - after[-1]
 
 
 @njit(cache=True, nogil=True)
-def _all_along(buffer, spare, n):  # type: ignore[no-untyped-def]
-    for i in range(buffer.shape[0]):
-        _along(buffer[i], spare, n)
+def _room(cols, reach):  # type: ignore[no-untyped-def]
+    """Columns of a strip, all of them about as wide; those of a band, with room beside for the window, and a band."""
+    width = -(-cols // -(-cols // STRIP))
+    wide = -(-(width + 2 * (reach + SLACK)) // LANES) * LANES
+    # a line more, since vectors that begin in the last one end there
+    return width, wide, np.empty((BAND + 2 * reach + 1) * wide, dtype=np.float32)
 
 
 @njit(cache=True, nogil=True)
-def _advance(buffer, spare, passes, done, after):  # type: ignore[no-untyped-def]
-    """Each pass over the rows that the one before has done and it has not."""
-    for k in range(passes.shape[0]):
-        n, w, slant = passes[k]
-        after[k + 1] = done[k + 1] + _pass(buffer[done[k + 1] :], after[k] - done[k + 1], spare, n, w, slant)
+def _fill(z, f, first, n, left, wide, buffer):  # type: ignore[no-untyped-def]
+    """``f`` times ``n`` rows of z from row ``first`` and column ``left`` on, -inf around."""
+    rows, cols = z.shape
+    begin, end = max(left, 0), min(left + wide, cols)
+    for i in range(n):
+        line = buffer[i * wide : i * wide + wide]
+        inside = 0 <= first + i < rows
+        line[: begin - left if inside else wide] = -np.inf
+        if inside:
+            _load(z[first + i, begin:end], f, line[begin - left : end - left])
+            line[end - left :] = -np.inf
 
 
 @njit(cache=True, nogil=True)
-def _emit(buffer, first, highest, out):  # type: ignore[no-untyped-def]
-    rows, cols = out.shape
-    for i in range(rows):
-        target, line = out[i], buffer[i, first : first + cols]
+def _load(source, f, out):  # type: ignore[no-untyped-def]
+    """``f`` times the source, -inf where unknown."""
+    for c in range(source.shape[0]):
+        v = f * source[c]
+        out[c] = v if v > -np.inf else np.float32(-np.inf)  # NaN compares false
+
+
+@njit(cache=True, nogil=True)
+def _times(source, f, out):  # type: ignore[no-untyped-def]
+    for c in range(out.shape[0]):
+        out[c] = f * source[c]
+
+
+@njit(cache=True, nogil=True)
+def _emit(buffer, wide, n, highest, out, first, left, right):  # type: ignore[no-untyped-def]
+    """``n`` rows of the buffer become those of the result from row ``first`` on, in columns ``left`` to ``right``."""
+    for i in range(n):
+        target, line = out[first + i, left:right], buffer[i * wide : i * wide + right - left]
         if highest:
-            for c in range(cols):
-                target[c] = line[c]
+            copy_line(line, target)
         else:
-            for c in range(cols):
+            for c in range(target.shape[0]):
                 d = target[c] + line[c]
                 target[c] = d if d > np.float32(0.0) else np.float32(0.0)
 
 
 @njit(cache=True, nogil=True)
-def _room(cols, reach):  # type: ignore[no-untyped-def]
-    """A band with room beside for all that moves along diagonals, and a line."""
-    wide = cols + 4 * reach
-    return np.empty((BAND + 2 * reach, wide), dtype=np.float32), np.empty(wide, dtype=np.float32)
-
-
-@njit(cache=True, nogil=True)
-def _fill(z, f, first, last, left, buffer):  # type: ignore[no-untyped-def]
-    """``f`` times rows ``first`` to ``last`` of z, ``left`` columns to the right, -inf around; how many rows."""
-    rows, cols = z.shape
-    for i in range(last - first):
-        line = buffer[i]
-        inside = 0 <= first + i < rows
-        line[: left if inside else line.shape[0]] = -np.inf
-        if inside:
-            _load(z[first + i], f, line[left : left + cols])
-            line[left + cols :] = -np.inf
-    return last - first
-
-
-@njit(cache=True, nogil=True)
-def _widen(buffer, n, spare, side, diagonal):  # type: ignore[no-untyped-def]
-    """Maximum over the square and both diagonals, of ``n`` rows; returns how many are whole.
-
-    Results move up by ``side + 2 diagonal`` rows and to the left by ``side`` columns.
-    """
-    _all_along(buffer[:n], spare, 2 * side + 1)
-    for k, w, slant in _passes(side, diagonal):
-        n = _pass(buffer, n, spare, k, w, slant)
-    return n
+def _move_up(buffer, by, n):  # type: ignore[no-untyped-def]
+    """To the start what comes ``by`` cells later."""
+    for c in range(0, n if by else 0, max(by, 1)):
+        size = min(by, n - c)
+        copy_line(buffer[c + by : c + by + size], buffer[c : c + size])
 
 
 @njit(cache=True, nogil=True)
@@ -192,147 +217,86 @@ def _passes(side, diagonal):  # type: ignore[no-untyped-def]
     for n, slant in ((2 * side + 1, 0), (2 * diagonal + 1, 1), (2 * diagonal + 1, -1)):
         w = 1
         while w < n:
-            twos = n <= 9
-            out[m, 0], out[m, 1], out[m, 2] = n, 0 if twos else w, slant
+            fours = n <= 9
+            out[m, 0], out[m, 1], out[m, 2] = n, 0 if fours else w, slant
             m += 1
-            w = n if twos else w + min(3 * w, n - w)
+            w = n if fours else w + min(3 * w, n - w)
     return out[:m]
 
 
 @njit(cache=True, nogil=True)
-def _load(source, f, out):  # type: ignore[no-untyped-def]
-    """``f`` times the source, -inf where unknown."""
-    for c in range(source.shape[0]):
-        v = f * source[c]
-        out[c] = v if v > -np.inf else np.float32(-np.inf)  # NaN compares false
+def _advance(buffer, wide, passes, done, after):  # type: ignore[no-untyped-def]
+    """Each pass over the rows that the one before has done and it has not."""
+    for k in range(passes.shape[0]):
+        after[k + 1] = _pass(buffer, done[k + 1], after[k], wide, passes[k])
 
 
 @njit(cache=True, nogil=True)
-def _raise(line, other):  # type: ignore[no-untyped-def]
-    """The greater of two lines, cell by cell, in place of the first; they must not overlap, or wait for each other."""
-    for c in range(line.shape[0]):
-        a, b = line[c], other[c]
-        line[c] = a if a > b else b
+def _all_along(buffer, first, last, wide, n):  # type: ignore[no-untyped-def]
+    """Maximum of c .. c + n - 1 of some rows, in place; at the ends of rows something else."""
+    if n > 9:
+        _far_along(buffer, first, last, wide, n)
+        return
+    for i in range(first, last):
+        if n == 9:
+            along_nine(buffer, i * wide, wide // LANES)
+        elif n == 7:
+            along_seven(buffer, i * wide, wide // LANES)
+        elif n == 5:
+            along_five(buffer, i * wide, wide // LANES)
+        elif n == 3:
+            along_three(buffer, i * wide, wide // LANES)
 
 
 @njit(cache=True, nogil=True)
-def _raise4(line, p, q, s):  # type: ignore[no-untyped-def]
-    """The greatest of four lines in place of the first."""
-    for c in range(line.shape[0]):
-        a, b, d, e = line[c], p[c], q[c], s[c]
-        a = a if a > b else b
-        d = d if d > e else e
-        line[c] = a if a > d else d
-
-
-@njit(cache=True, nogil=True)
-def _along(line, spare, n):  # type: ignore[no-untyped-def]
-    """Maximum of c .. c + n - 1 in place; the last n - 1 values are of what is left. Windows of w make one of up to 4 w
-    at once."""
-    w, swaps = 1, 0
-    a, b = line, spare
+def _far_along(buffer, first, last, wide, n):  # type: ignore[no-untyped-def]
+    """The same for any window: those of w make one of up to 4 w at once."""
+    w = 1
     while w < n:
         s1, s2, s3 = min(w, n - w), min(2 * w, n - w), min(3 * w, n - w)
-        _most4(a, a[s1:], a[s2:], a[s3:], b)
-        for c in range(line.shape[0] - s3, line.shape[0]):
-            b[c] = a[c]
-        a, b = b, a
-        w, swaps = w + s3, swaps + 1
-    if swaps % 2 == 1:
-        copy_line(spare, line)
+        for at in range(first * wide, last * wide, LANES):
+            raise4(buffer, at, s1, s2, s3)
+        w += s3
 
 
 @njit(cache=True, nogil=True)
-def _most4(p, q, s, t, out):  # type: ignore[no-untyped-def]
-    """The greatest of four lines, as far as the last one goes."""
-    for c in range(t.shape[0]):
-        a, b, d, e = p[c], q[c], s[c], t[c]
-        a = a if a > b else b
-        d = d if d > e else e
-        out[c] = a if a > d else d
+def _pass(buffer, first, last, wide, kind):  # type: ignore[no-untyped-def]
+    """One of :func:`_passes` from row ``first`` to ``last``, in place; returns where what is whole ends.
 
-
-@njit(cache=True, nogil=True)
-def _most6(o, p, q, s, t, u, out):  # type: ignore[no-untyped-def]
-    for c in range(out.shape[0]):
-        a, b, d, e, f, g = o[c], p[c], q[c], s[c], t[c], u[c]
-        a = a if a > b else b
-        d = d if d > e else e
-        f = f if f > g else g
-        a = a if a > d else d
-        out[c] = a if a > f else f
-
-
-@njit(cache=True, nogil=True)
-def _most2(p, q, out):  # type: ignore[no-untyped-def]
-    for c in range(out.shape[0]):
-        out[c] = p[c] if p[c] > q[c] else q[c]
-
-
-@njit(cache=True, nogil=True)
-def _pass(buffer, rows, spare, n, w, slant):  # type: ignore[no-untyped-def]
-    """One of :func:`_passes` over ``rows`` rows, in place; returns how many rows are whole."""
+    Results move up by half of the window.
+    """
+    n, w, slant = kind
     if w == 0:
-        return _down_by_twos(buffer, rows, spare, n, slant)
-    cols = buffer.shape[1]
+        return _by_fours(buffer, first, last, wide, n, wide + slant)
     s1, s2, s3 = min(w, n - w), min(2 * w, n - w), min(3 * w, n - w)
-    far = s3 * slant
-    first, last = max(0, -far), min(cols, cols - far)
-    for i in range(rows - s3):
-        line = buffer[i, first:last]
-        a = buffer[i + s1, first + s1 * slant : last + s1 * slant]
-        if s3 == s1:
-            _raise(line, a)
-            continue
-        b = buffer[i + s2, first + s2 * slant : last + s2 * slant]
-        _raise4(line, a, b, buffer[i + s3, first + far : last + far])
-    return max(rows - s3, 0)
+    step = wide + slant
+    end = max(last - s3, first)
+    for at in range(first * wide, end * wide, LANES):
+        raise4(buffer, at, s1 * step, s2 * step, s3 * step)
+    return end
 
 
 @njit(cache=True, nogil=True)
-def _down_by_twos(buffer, rows, spare, n, slant):  # type: ignore[no-untyped-def]
-    """The same for an odd window of 3 to 9: of rows i and i + 1 it shares rows i + 1 .. i + n - 1."""
-    cols = buffer.shape[1]
-    far = n * slant
-    first, last = max(0, -far), min(cols, cols - far)
-    shared = spare[: last - first]
-    for i in range(0, rows - n + 1, 2):
-        _share(buffer[i : i + n], n, first, last, slant, shared)
-        _raise(buffer[i, first:last], shared)
-        if i + n < rows:
-            _most2(shared, buffer[i + n, first + far : last + far], buffer[i + 1, first + slant : last + slant])
-    return max(rows - n + 1, 0)
-
-
-@njit(cache=True, nogil=True)
-def _share(buffer, n, first, last, slant, out):  # type: ignore[no-untyped-def]
-    """The greatest of rows 1 .. n - 1, ``slant`` columns to the right a row."""
-    p, q = _slanted(buffer, 1, first, last, slant), _slanted(buffer, 2, first, last, slant)
-    if n == 3:
-        _most2(p, q, out)
-        return
-    s, t = _slanted(buffer, 3, first, last, slant), _slanted(buffer, 4, first, last, slant)
-    if n == 5:
-        _most4(p, q, s, t, out)
-        return
-    u, v = _slanted(buffer, 5, first, last, slant), _slanted(buffer, 6, first, last, slant)
-    _most6(p, q, s, t, u, v, out)
-    if n == 9:
-        _raise3(out, _slanted(buffer, 7, first, last, slant), _slanted(buffer, 8, first, last, slant))
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _slanted(buffer, k, first, last, slant):  # type: ignore[no-untyped-def]
-    return buffer[k, first + k * slant : last + k * slant]
-
-
-@njit(cache=True, nogil=True)
-def _raise3(line, p, q):  # type: ignore[no-untyped-def]
-    """The greatest of three lines in place of the first."""
-    for c in range(line.shape[0]):
-        a, b, d = line[c], p[c], q[c]
-        a = a if a > b else b
-        line[c] = a if a > d else d
+def _by_fours(buffer, first, last, wide, n, step):  # type: ignore[no-untyped-def]
+    """The same for an odd window of 3 to 9 rows: four windows below each other share all but three of them."""
+    i = first
+    while i + n + 3 <= last:
+        for at in range(i * wide, i * wide + wide, LANES):
+            if n == 9:
+                nine(buffer, at, step)
+            elif n == 7:
+                seven(buffer, at, step)
+            elif n == 5:
+                five(buffer, at, step)
+            else:
+                three(buffer, at, step)
+        i += 4
+    while i + n <= last:
+        for at in range(i * wide, i * wide + wide, LANES):
+            for k in range(1, n):
+                raise4(buffer, at, k * step, k * step, k * step)
+        i += 1
+    return i
 
 
 def median3(surface: Floats32) -> Floats32:
