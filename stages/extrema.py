@@ -22,6 +22,7 @@ from stages.extrema_lanes import (
     along_seven,
     along_three,
     five,
+    median_row,
     nine,
     raise4,
     seven,
@@ -35,8 +36,8 @@ BAND, STRIP = 32, 768
 """Rows and columns worked on at a time, at most: rows of a window stay in the innermost cache, a band in the next."""
 
 SLACK = 8
-"""Columns beside: windows along a diagonal are found for four rows from the same columns of the first one, so that three
-of the others are not; that happens twice along either diagonal."""
+"""Columns beside: windows along a diagonal are found for four rows at once, from the same columns of the first one, so
+that up to three of the others are not; that happens twice along either diagonal."""
 
 
 def octagon(reach: int) -> tuple[int, int]:
@@ -305,61 +306,30 @@ def median3(surface: Floats32) -> Floats32:
     Of an even number the upper one: the mean of two heights would not be one of the heights.
     """
     out = np.empty(surface.shape, dtype=np.float32)
-    _median3(surface, out)
+    _median3(np.ascontiguousarray(surface), out)
     return out
 
 
 @njit(cache=True, nogil=True)
 def _median3(z, out):  # type: ignore[no-untyped-def]
+    """Whole vectors from the second column on, the last one from behind; what they cannot tell goes one by one."""
     rows, cols = z.shape
-    low, middle = np.empty(cols, dtype=np.float32), np.empty(cols, dtype=np.float32)
-    high, total = np.empty(cols, dtype=np.float32), np.empty(cols, dtype=np.float32)
-    patchy = np.ones(8 * -(-cols // 8), dtype=np.uint8)
+    flat, found = z.reshape(-1), out.reshape(-1)
+    vectors = (cols - 2) // LANES
+    patchy = np.ones((cols + 2 * LANES + 7) // 8 * 8, dtype=np.uint8)
     eight = patchy.view(np.uint64)
     for r in range(rows):
         here, line = z[r], out[r]
-        if 0 < r < rows - 1:
-            _sort_columns(z[r - 1], here, z[r + 1], low, middle, high, total)
-            _median_row(here, low, middle, high, total, line, patchy)
-        else:
-            patchy[:] = 1
+        patchy[:] = 1
+        if 0 < r < rows - 1 and vectors:
+            last = cols - 1 - LANES
+            median_row(flat, r * cols + 1, cols, vectors, found, r * cols + 1, patchy[1:])
+            median_row(flat, r * cols + last, cols, 1, found, r * cols + last, patchy[last:])
         for k in range(eight.shape[0]):
             if eight[k]:
                 for c in range(8 * k, min(8 * k + 8, cols)):
                     if patchy[c]:
                         line[c] = np.nan if np.isnan(here[c]) else _median_known(z, r, c)
-
-
-@njit(cache=True, nogil=True)
-def _sort_columns(up, here, down, low, middle, high, total):  # type: ignore[no-untyped-def]
-    """Three heights of each column in order, and their sum, which is not known where one is not."""
-    for c in range(here.shape[0]):
-        a, b, d = up[c], here[c], down[c]
-        lo, hi = min(a, b), max(a, b)
-        low[c], high[c] = min(lo, d), max(hi, d)
-        middle[c] = max(min(hi, d), lo)
-    for c in range(here.shape[0]):
-        total[c] = up[c] + here[c] + down[c]
-
-
-@njit(cache=True, nogil=True)
-def _median_row(here, low, middle, high, total, out, patchy):  # type: ignore[no-untyped-def]
-    """Median of nine from sorted columns (Paeth, Graphics Gems, 1990), NaN where the cell is unknown; where another of
-    the nine is, or does not exist, ``patchy`` is set."""
-    n = here.shape[0] - 2
-    for c in range(1, n + 1):
-        x = max(max(low[c - 1], low[c]), low[c + 1])
-        y = min(min(high[c - 1], high[c]), high[c + 1])
-        a, b = middle[c - 1], middle[c]
-        lo, hi = min(a, b), max(a, b)
-        m = max(min(hi, middle[c + 1]), lo)
-        lo, hi = min(x, m), max(x, m)
-        median = max(min(hi, y), lo)
-        out[c] = median if here[c] == here[c] else np.float32(np.nan)
-    for c in range(1, n + 1):
-        known = total[c - 1] + total[c] + total[c + 1]
-        patchy[c] = (known != known) & (here[c] == here[c])
-    patchy[0] = patchy[n + 1] = 1
 
 
 @njit(cache=True, nogil=True)

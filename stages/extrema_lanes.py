@@ -17,6 +17,7 @@ from numba.extending import intrinsic
 LANES = 16
 
 FLAT = types.Array(types.float32, 1, "C")
+BYTES = types.Array(types.uint8, 1, "C")
 _VECTOR = ir.VectorType(ir.FloatType(), LANES)
 
 
@@ -51,7 +52,7 @@ def raise4(typingctx, flat, at, first, second, third):  # type: ignore[no-untype
 
 
 def _make_four(n: int) -> Any:
-    """Intrinsic of windows of ``n`` rows, see :data:`FOUR`."""
+    """Intrinsic of windows of ``n`` rows, see :data:`nine`."""
 
     @intrinsic
     def four(typingctx, flat, at, step):  # type: ignore[no-untyped-def]
@@ -85,8 +86,8 @@ def _make_four(n: int) -> Any:
 
 
 three, five, seven, nine = (_make_four(n) for n in (3, 5, 7, 9))
-"""``nine(flat, at, step)``: the cells from ``at`` on, and those one, two and three steps behind them, become the greatest
-of themselves and of those up to eight steps behind each; in the same way windows of three, five and seven."""
+"""``nine(flat, at, step)``: the cells from ``at`` on, and those one, two and three steps behind them, become the
+greatest of themselves and of those up to eight steps behind each; in the same way windows of three, five and seven."""
 
 
 def _make_along(n: int) -> Any:
@@ -123,5 +124,66 @@ def _make_along(n: int) -> Any:
 
 
 along_three, along_five, along_seven, along_nine = (_make_along(n) for n in (3, 5, 7, 9))
-"""``along_nine(flat, at, count)``: of ``count`` vectors from ``at`` on, which are a row, each cell becomes the greatest of
-itself and of the eight that follow in the row; in the same way windows of three, five and seven."""
+"""``along_nine(flat, at, count)``: of ``count`` vectors from ``at`` on, which are a row, each cell becomes the greatest
+of itself and of the eight that follow in the row; in the same way windows of three, five and seven."""
+
+
+def _least(builder: Any, a: Any, b: Any) -> Any:
+    return builder.select(builder.fcmp_ordered("<", a, b), a, b)
+
+
+def _middle(builder: Any, a: Any, b: Any, c: Any) -> Any:
+    """Of three the one between."""
+    low, high = _least(builder, a, b), _most(builder, a, b)
+    return _most(builder, _least(builder, high, c), low)
+
+
+@intrinsic
+def median_row(typingctx, flat, at, cols, count, out, to, patchy):  # type: ignore[no-untyped-def]
+    """``out[to + k]``: median of the nine cells around ``at + k``, whose rows have ``cols`` columns, of ``count``
+    vectors. One of nine is NaN, or the sum of all is: then it means nothing, and ``patchy[k]`` is 1, else 0.
+
+    The columns of three are sorted, and the median is the middle one of the greatest least, the middle middle and the
+    least greatest (Paeth, Graphics Gems, 1990).
+    """
+    i64 = types.int64
+    signature = types.void(FLAT, i64, i64, i64, FLAT, i64, BYTES)
+
+    def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        array, at, cols, count, out, to, patchy = args
+        lanes = ir.Constant(at.type, LANES)
+        marks = context.make_array(BYTES)(context, builder, patchy).data
+        octets = ir.VectorType(ir.IntType(8), LANES)
+
+        def sorted_columns(place: Any) -> tuple[Any, ...]:
+            a, b, c = (
+                builder.load(_pointer(context, builder, array, where), align=4)
+                for where in (builder.sub(place, cols), place, builder.add(place, cols))
+            )
+            low, high = _least(builder, a, b), _most(builder, a, b)
+            middle = _most(builder, _least(builder, high, c), low)
+            total = builder.fadd(builder.fadd(a, b), c)
+            return _least(builder, low, c), middle, _most(builder, high, c), total
+
+        one = ir.Constant(at.type, 1)
+        with cgutils.for_range(builder, count) as loop:
+            shift = builder.mul(loop.index, lanes)
+            place = builder.add(at, shift)
+            low, middle, high, total = (
+                [west, here, east]
+                for west, here, east in zip(
+                    *(sorted_columns(where) for where in (builder.sub(place, one), place, builder.add(place, one))),
+                    strict=True,
+                )
+            )
+            x = _most(builder, *low)
+            y = _least(builder, _least(builder, high[0], high[1]), high[2])
+            median = _middle(builder, x, _middle(builder, *middle), y)
+            builder.store(median, _pointer(context, builder, out, builder.add(to, shift)), align=4)
+            known = builder.fadd(builder.fadd(total[0], total[1]), total[2])
+            unknown = builder.zext(builder.fcmp_unordered("uno", known, known), octets)
+            mark = builder.bitcast(builder.gep(marks, [shift]), octets.as_pointer())
+            builder.store(unknown, mark, align=1)
+        return context.get_dummy_value()
+
+    return signature, codegen

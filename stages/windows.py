@@ -92,29 +92,36 @@ def _mean(a, half, out):  # type: ignore[no-untyped-def]
     total, count = np.zeros((LANES, cols + 2 * half + 1)), np.zeros((LANES, cols + 2 * half + 1), dtype=np.int32)
     inner = slice(half + 1, half + 1 + cols)
     sums, counts, of = np.empty((LANES, cols)), np.empty(cols, dtype=np.int32), np.zeros_like(count[0])
-    for r in range(min(half, rows)):
-        _add_row(a[r], offset, total[LANES - 1, inner], count[LANES - 1, inner])
-    lane, before = 0, LANES - 1
-    for r in range(rows):
-        _take(total[before, inner], count[before, inner], total[lane, inner], count[lane, inner])
-        if r + half < rows:
-            _add_row(a[r + half], offset, total[lane, inner], count[lane, inner])
-        if r > half:
-            _remove_row(a[r - half - 1], offset, total[lane, inner], count[lane, inner])
-        if lane == LANES - 1 or r == rows - 1:
+    nothing = np.full(cols, np.nan, dtype=np.float32)
+    for r in range(-half, rows):
+        lane = r % LANES if r > 0 else 0
+        before = (lane - 1) % LANES if r > 0 else 0
+        enters, leaves = a[r + half] if r + half < rows else nothing, a[r - half - 1] if r > half else nothing
+        _move_sums(enters, leaves, offset, total[before, inner], total[lane, inner])
+        _move_counts(enters, leaves, offset, count[before, inner], count[lane, inner])
+        if r >= 0 and (lane == LANES - 1 or r == rows - 1):
             _slide(total, 2 * half + 1, sums)
             for k in range(lane + 1):
                 if r - lane + k == 0 or _differ(count[k], of):
                     copy_line(count[k], of)
                     _slide_counts(of, 2 * half + 1, counts)
                 _divide(sums[k], counts, offset, out[r - lane + k])
-        lane, before = (lane + 1) % LANES, lane
 
 
 @njit(cache=True, nogil=True)
-def _take(total, count, out, out_count):  # type: ignore[no-untyped-def]
-    copy_line(total, out)
-    copy_line(count, out_count)
+def _move_sums(enters, leaves, offset, before, out):  # type: ignore[no-untyped-def]
+    """Sums of the columns with what enters the window and without what leaves it."""
+    none = np.float32(0.0)
+    for c in range(out.shape[0]):
+        v, w = enters[c] - offset, leaves[c] - offset
+        out[c] = (before[c] + (v if v == v else none)) - (w if w == w else none)
+
+
+@njit(cache=True, nogil=True)
+def _move_counts(enters, leaves, offset, before, out):  # type: ignore[no-untyped-def]
+    for c in range(out.shape[0]):
+        v, w = enters[c] - offset, leaves[c] - offset
+        out[c] = before[c] + np.int32(v == v) - np.int32(w == w)
 
 
 @njit(cache=True, nogil=True)
@@ -163,16 +170,6 @@ def _add_row(line, offset, total, count):  # type: ignore[no-untyped-def]
     for c in range(line.shape[0]):
         v = line[c] - offset
         count[c] += np.int32(v == v)
-
-
-@njit(cache=True, nogil=True)
-def _remove_row(line, offset, total, count):  # type: ignore[no-untyped-def]
-    for c in range(line.shape[0]):
-        v = line[c] - offset
-        total[c] -= v if v == v else np.float32(0.0)
-    for c in range(line.shape[0]):
-        v = line[c] - offset
-        count[c] -= np.int32(v == v)
 
 
 @njit(cache=True, nogil=True)
