@@ -286,7 +286,9 @@ def _nearest_middle(cells, row):  # type: ignore[no-untyped-def]
     rows, cols = cells.shape
     best, found = np.iinfo(np.int64).max, (-1, -1)
     for r in range(rows):
-        for c in range(cols if 2 * abs(r - row) < best else 0):
+        if 2 * abs(r - row) >= best:
+            continue
+        for c in range(*_between(cells[r])):
             if cells[r, c]:
                 away = 2 * abs(r - row) + abs(2 * c - (cols - 1))
                 if away < best:
