@@ -69,7 +69,11 @@ class DriveParams(Params):
         "window, which smooths away what is smaller; what is seen from farther serves to plan; 0: all is driven on",
     )
     around: float = Field(default=0.6, gt=0, description="m; the map reaches this far around start and goal")
-    max_stops: int = Field(default=40, ge=1, description="stops after which the drive is given up")
+    max_stops: int = Field(
+        default=80,
+        ge=1,
+        description="stops after which the drive is given up; among many rocks a way of 2.8 m took more than 60",
+    )
     max_safety_stops: int = Field(default=3, ge=1, description="safety stops in a row that end the drive")
     least_match: float = Field(
         default=0.1,
@@ -236,15 +240,8 @@ class Drive(Reconstruction):
     def _map(self, stop: Stop) -> None:
         """What is known of the world at a stop, its hazards, and where to go next."""
         p, k, frame = self.products, stop.index, stop.frame
-        keys = [s.frame for s in self.driven.stops]
-        stop.trajectory = p.trajectory = self._node(
-            "trajectory",
-            f"trajectory/{k}",
-            {"frames": list(self.posed)},
-            segments=list(p.resections),
-            levels=[p.level[key] for key in keys[:k]] or [p.level[frame]],
-        )
-        self.pose = self._node("pose", f"pose/{frame}", {"row": len(self.posed) - 1}, trajectory=p.trajectory)
+        stop.trajectory = trajectory = self._located(k)
+        self.pose = self._node("pose", f"pose/{frame}", {"row": len(self.posed) - 1}, trajectory=trajectory)
         p.world_dem[frame] = self._node(
             "locus",
             f"locus/world/{frame}",
@@ -279,6 +276,19 @@ class Drive(Reconstruction):
         """The leg of a stop, by what is known there."""
         assert stop.risk is not None
         stop.leg = self._leg(label, stop.risk, self.pose, far=stop.far)
+
+    def _located(self, legs: int) -> Handle:
+        """The trajectory over so many legs, which is that of the drive from now on."""
+        p = self.products
+        keys = [stop.frame for stop in self.driven.stops]
+        found = p.trajectory = self._node(
+            "trajectory",
+            f"trajectory/{legs}",
+            {"frames": list(self.posed)},
+            segments=list(p.resections),
+            levels=[p.level[key] for key in keys[:legs] or keys[:1]],
+        )
+        return found
 
     def _pad(self, frame: int) -> None:
         """The ground under the vehicle at the start, and where it is."""
@@ -475,6 +485,8 @@ class Drive(Reconstruction):
         terminal = kind in ("attitude", "acceleration", "lost")
         if terminal or self.troubles >= self.config.drive.max_safety_stops:
             often = f", {self.troubles} legs in a row" if self.troubles > 1 else ""
+            if len(frames) > 1:  # else it stands where the trajectory ends already
+                self._located(len(self.driven.stops))
             self._end("safety stop", reason + often)
             return
         assert stop.drive is not None

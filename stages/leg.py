@@ -287,6 +287,8 @@ def plan_leg(
     if length_of(leg) >= min(params.least * base, length_of(way) - 1e-9):
         leg, turn = within_turn(leg, heading, math.radians(params.max_turn_deg))
         if leg:
+            if not turnable(leg[-1].b, leg[-1].heading, leg[-1].heading + turn, ground.clear):
+                turn = 0.0
             gear = np.array([piece.gear for piece in leg], np.int8)
             return Leg("drive", "", vertices(leg, start), gear, turn, vertices(way, start), shown)
         return _stay("turn", f"turns {math.degrees(turn):.0f} degrees to where it goes on", start, way, shown, turn)

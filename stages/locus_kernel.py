@@ -1,4 +1,4 @@
-"""Kernel of Locus reconstruction (paper, section 4.4): one cell after the other, straight from the disparity.
+"""Kernel of Locus reconstruction (paper, section 4.4): cells straight from the disparity.
 
 For a cell with foot F and normal N let P(Z) = F + Z N, p_l and p_r its projections and d the disparity vector. The
 paper minimises |g(Z)|, g = p_l(Z) + d(p_l(Z)) - p_r(Z). Here the *sign change* of s(Z) = g(Z) . e is solved, e being
@@ -8,6 +8,11 @@ same solution with a tenth of the evaluations, and more exact, because a minimum
 s > 0: the surface that the left camera sees behind P is farther than P, so P is in free space; s < 0: P is behind the
 surface. A terrain surface is a change from free (above) to behind (below) along the normal. Where the change happens
 across a depth jump between two pixels nothing was seen: the cell is occluded there.
+
+A few dozen cells are followed side by side, each in its own *lane*: their lines are divided into steps
+(:mod:`stages.locus_lines`), steps are looked at several at once (:mod:`stages.locus_points`) until s changes its sign,
+and the roots of all the changes found are solved together (:mod:`stages.locus_roots`). A lane whose root does not stand
+goes on from there.
 """
 
 from __future__ import annotations
@@ -18,207 +23,23 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from stages.locus_lines import BOTTOM, COUNT, DZ, FOOT, HIGH, LAST, LOW, NORMAL, START, TOP, clip, lines, spans
+from stages.locus_lines import PLANES as LINE_PLANES
+from stages.locus_points import LANES, POINT_PLANES, POINTS, STEPS, S, climb, meet, pixels
+from stages.locus_roots import PLANES as ROOT_PLANES
+from stages.locus_roots import accept, gather, roots, slopes
+
 Floats = NDArray[np.float64]
 Float32 = NDArray[np.float32]
 
-STEP_PX = 1.0  # search step: disparity is bilinear between pixels, so nothing hides in a shorter one
-MARGIN = 2  # steps that the interval handed down from the coarse level is widened by
-MAX_STEPS = 4096.0  # of one locus: more than the diagonal of a 12 megapixel image
-SOLVED_PX = 1e-3  # |s| of a solution: a hundredth of the disparity's own noise
-NEAR = 1e-9  # least projective depth (metres): excludes the camera's own plane
+WAY, PLACE, LEVEL, FIRST, BRACKET = (k * LANES for k in range(LINE_PLANES, LINE_PLANES + 5))
+"""Planes of the search: -1 downwards, 1 upwards, 0 not begun; the step looked at last, and s there; s at the start; the
+bracket found (upper end, s there, lower end, s there)."""
+PLANES = LINE_PLANES + 8
+DONE, MORE, FOUND = 0, 1, 2
 
 
-@njit(cache=True, nogil=True)
-def _mismatch(z: float, a: Floats, b: Floats, epipole: Floats, dcol: Float32, drow: Float32) -> tuple:
-    """Signed mismatch s, its part across the epipolar line, and p_l; NaN where disparity is undefined.
-
-    ``a + z b``: homogeneous projections of P(Z), left in 0..2 and right in 3..5.
-    """
-    w_left, w_right = a[2] + z * b[2], a[5] + z * b[5]
-    if w_left < NEAR or w_right < NEAR:
-        return np.nan, np.nan, 0.0, 0.0
-    x, y = (a[0] + z * b[0]) / w_left, (a[1] + z * b[1]) / w_left
-    c, r = math.floor(x), math.floor(y)
-    if c < 0 or r < 0 or c + 1 >= dcol.shape[1] or r + 1 >= dcol.shape[0]:
-        return np.nan, np.nan, 0.0, 0.0
-    fx, fy = x - c, y - r
-    w00, w01, w10, w11 = (1.0 - fx) * (1.0 - fy), fx * (1.0 - fy), (1.0 - fx) * fy, fx * fy
-    u = w00 * dcol[r, c] + w01 * dcol[r, c + 1] + w10 * dcol[r + 1, c] + w11 * dcol[r + 1, c + 1]
-    v = w00 * drow[r, c] + w01 * drow[r, c + 1] + w10 * drow[r + 1, c] + w11 * drow[r + 1, c + 1]
-    xr, yr = (a[3] + z * b[3]) / w_right, (a[4] + z * b[4]) / w_right
-    gx, gy = x + u - xr, y + v - yr
-    # With p_r(t) = (epipole + t m) / w on the ray of p_l, d p_r / d t is parallel to p_r * epipole_2 - epipole_01.
-    ex, ey = xr * epipole[2] - epipole[0], yr * epipole[2] - epipole[1]
-    norm = math.sqrt(ex * ex + ey * ey)
-    if norm == 0.0:
-        return np.nan, np.nan, 0.0, 0.0
-    return (gx * ex + gy * ey) / norm, (gy * ex - gx * ey) / norm, x, y
-
-
-@njit(cache=True, nogil=True)
-def _clip(a: Floats, b: Floats, sizes: Floats, low: float, high: float) -> tuple:
-    """The part of low..high where P(Z) projects into both images; empty (low > high) where there is none."""
-    for k in range(2):
-        a0, a1, a2 = a[3 * k], a[3 * k + 1], a[3 * k + 2]
-        b0, b1, b2 = b[3 * k], b[3 * k + 1], b[3 * k + 2]
-        w, h = sizes[2 * k] - 1.0, sizes[2 * k + 1] - 1.0
-        for side in range(5):
-            if side == 0:
-                p, q = a0, b0
-            elif side == 1:
-                p, q = w * a2 - a0, w * b2 - b0
-            elif side == 2:
-                p, q = a1, b1
-            elif side == 3:
-                p, q = h * a2 - a1, h * b2 - b1
-            else:
-                p, q = a2 - NEAR, b2
-            # p + z q >= 0
-            if q > 0.0:
-                low = max(low, -p / q)
-            elif q < 0.0:
-                high = min(high, -p / q)
-            elif p < 0.0:
-                return 1.0, 0.0
-    return low, high
-
-
-@njit(cache=True, nogil=True)
-def _speed(z: float, a: Floats, b: Floats) -> float:
-    """Greater of the two image speeds |d p / d Z|, pixels per metre."""
-    fastest = 0.0
-    for k in range(2):
-        w = max(a[3 * k + 2] + z * b[3 * k + 2], NEAR)
-        x, y = (a[3 * k] + z * b[3 * k]) / w, (a[3 * k + 1] + z * b[3 * k + 1]) / w
-        dx, dy = (b[3 * k] - x * b[3 * k + 2]) / w, (b[3 * k + 1] - y * b[3 * k + 2]) / w
-        fastest = max(fastest, math.sqrt(dx * dx + dy * dy))
-    return fastest
-
-
-@njit(cache=True, nogil=True)
-def _solve(
-    z0: float, s0: float, z1: float, s1: float, a: Floats, b: Floats, epipole: Floats, dcol: Float32, drow: Float32
-) -> float:
-    """Root of s between z0 (s >= 0) and z1 (s < 0) by regula falsi (Illinois); NaN at undefined disparity."""
-    z, side = z1, 0
-    for _ in range(16):
-        z = (z0 * s1 - z1 * s0) / (s1 - s0)
-        s = _mismatch(z, a, b, epipole, dcol, drow)[0]
-        if math.isnan(s) or abs(s) < SOLVED_PX:
-            return z if not math.isnan(s) else np.nan
-        if s > 0.0:
-            z0, s0 = z, s
-            if side == 1:
-                s1 *= 0.5
-            side = 1
-        else:
-            z1, s1 = z, s
-            if side == -1:
-                s0 *= 0.5
-            side = -1
-    return z
-
-
-@njit(cache=True, nogil=True)
-def _is_jump(x: float, y: float, epipole: Floats, dcol: Float32, drow: Float32, max_jump: float) -> bool:
-    """Whether the disparities around pixel (x, y) differ by more than ``max_jump`` (a depth discontinuity)."""
-    c, r = math.floor(x), math.floor(y)
-    low_u, high_u, low_v, high_v = np.inf, -np.inf, np.inf, -np.inf
-    for i in range(2):
-        for j in range(2):
-            u, v = dcol[r + i, c + j], drow[r + i, c + j]
-            low_u, high_u, low_v, high_v = min(low_u, u), max(high_u, u), min(low_v, v), max(high_v, v)
-    return (high_u - low_u) ** 2 + (high_v - low_v) ** 2 > max_jump * max_jump
-
-
-@njit(cache=True, nogil=True)
-def _slope(z: float, dz: float, a: Floats, b: Floats, epipole: Floats, dcol: Float32, drow: Float32) -> float:
-    """ds/dZ at a solution, pixels per metre: the lesser one-sided slope, so that a jump nearby does not flatter it."""
-    up = _mismatch(z + dz, a, b, epipole, dcol, drow)[0] / dz
-    down = -_mismatch(z - dz, a, b, epipole, dcol, drow)[0] / dz
-    if math.isnan(up):
-        up = down
-    if math.isnan(down):
-        down = up
-    return float(min(up, down))
-
-
-@njit(cache=True, nogil=True)
-def _accept(
-    z: float,
-    dz: float,
-    a: Floats,
-    b: Floats,
-    epipole: Floats,
-    dcol: Float32,
-    drow: Float32,
-    image: Float32,
-    limits: Floats,
-    out: Floats,
-) -> bool:
-    """Check a solution; fill ``out`` = elevation, residual, ds/dZ, grey value where it stands."""
-    s, across, x, y = _mismatch(z, a, b, epipole, dcol, drow)
-    residual = math.sqrt(s * s + across * across)
-    if not residual <= limits[0] or _is_jump(x, y, epipole, dcol, drow, limits[1]):
-        return False
-    slope = _slope(z, dz, a, b, epipole, dcol, drow)
-    if not slope > 0.0:
-        return False
-    c, r = math.floor(x), math.floor(y)
-    fx, fy = x - c, y - r
-    top = image[r, c] * (1.0 - fx) + image[r, c + 1] * fx
-    bottom = image[r + 1, c] * (1.0 - fx) + image[r + 1, c + 1] * fx
-    out[0], out[1], out[2], out[3] = z, residual, slope, top * (1.0 - fy) + bottom * fy
-    return True
-
-
-@njit(cache=True, nogil=True)
-def _cell(
-    span: tuple,
-    a: Floats,
-    b: Floats,
-    epipole: Floats,
-    dcol: Float32,
-    drow: Float32,
-    image: Float32,
-    limits: Floats,
-    out: Floats,
-) -> None:
-    """The highest accepted change from free to behind; the search starts in low..high and may leave it.
-
-    Leaves the interval upwards while the point is behind the surface, downwards while it is free.
-    ``span`` = low, high, bottom, top; bottom..top is where both images see the normal.
-    """
-    low, high, bottom, top = span
-    steps = math.ceil(max(_speed(bottom, a, b), _speed(top, a, b)) * (top - bottom) / STEP_PX)
-    n = int(max(1.0, min(steps, MAX_STEPS)))
-    dz = (top - bottom) / n
-    k = int(max(0.0, min(float(n), math.ceil((high - bottom) / dz) + MARGIN)))
-    last = math.floor((low - bottom) / dz) - MARGIN
-    z = bottom + k * dz
-    s = _mismatch(z, a, b, epipole, dcol, drow)[0]
-    up, s_up = k, s
-    while s_up < 0.0 and up < n:
-        below = s_up
-        up += 1
-        s_up = _mismatch(bottom + up * dz, a, b, epipole, dcol, drow)[0]
-        if s_up >= 0.0:
-            root = _solve(bottom + up * dz, s_up, bottom + (up - 1) * dz, below, a, b, epipole, dcol, drow)
-            if _accept(root, dz, a, b, epipole, dcol, drow, image, limits, out):
-                return
-    while k > 0:
-        above = s
-        k -= 1
-        s = _mismatch(bottom + k * dz, a, b, epipole, dcol, drow)[0]
-        if above >= 0.0 and s < 0.0:
-            root = _solve(bottom + (k + 1) * dz, above, bottom + k * dz, s, a, b, epipole, dcol, drow)
-            if _accept(root, dz, a, b, epipole, dcol, drow, image, limits, out):
-                return
-        if k <= last and not s >= 0.0:
-            return
-
-
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def search(
     feet: Floats,
     normals: Floats,
@@ -230,8 +51,8 @@ def search(
     right: Floats,
     epipole: Floats,
     sizes: Floats,
-    dcol: Float32,
-    drow: Float32,
+    disparity: Float32,
+    std: Floats,
     image: Float32,
     limits: Floats,
     out: Floats,
@@ -241,30 +62,158 @@ def search(
     Parameters
     ----------
     feet, normals : (r, c, 3) metres, frame of the surface.
-    low, high : (r, c) interval of Z in which the search starts, metres; NaN: the cell is left out.
+    low, high : (r, c) interval of Z in which the search starts, metres; NaN: the cell is left out. The search may leave
+        it: upwards while the point is behind the surface, downwards while it is free.
     z_min, z_max : limits of Z.
     left, right : (3, 4) projections from the frame of the surface to pixels.
     epipole : (3,) homogeneous projection of the left camera's centre into the right image.
     sizes : (4,) width and height of the left, then of the right image.
-    dcol, drow : disparity vector (right minus left) on the left image, pixels, NaN where it must not be used.
-    image : grey values of the left image.
+    disparity : (2 rows cols,) column and row disparity (right minus left) of each pixel of the left image in turn,
+        pixels, NaN where it must not be used.
+    std : (rows, cols) standard deviation of the disparities, pixels.
+    image : (rows, cols) grey values of the left image.
     limits : (2,) greatest residual and greatest jump in the bilinear cell, pixels.
-    out : (r, c, 4) elevation (m), residual (px), ds/dZ (px/m), grey value; to be filled with NaN before.
+    out : (r, c, 4) elevation (m), its standard deviation (m), residual (px) and grey value of the highest change from
+        free to behind that stands; to be filled with NaN before.
     """
-    a, b = np.empty(6), np.empty(6)
-    for i in range(feet.shape[0]):
-        for j in range(feet.shape[1]):
-            if math.isnan(low[i, j]):
-                continue
+    lanes, solved, room = np.zeros(PLANES * LANES), np.zeros(ROOT_PLANES * LANES), np.zeros(POINT_PLANES * POINTS)
+    active, found, cells = np.empty(LANES, np.int64), np.empty(LANES, np.int64), np.empty(LANES, np.int64)
+    foot, normal, rows = feet.reshape(-1, 3), normals.reshape(-1, 3), out.reshape(-1, 4)
+    lowest, highest = low.ravel(), high.ravel()
+    n, last = 0, low.size - 1
+    for i in range(low.size):
+        if not math.isnan(lowest[i]):
+            cells[n], lanes[LOW + n], lanes[HIGH + n] = i, lowest[i], highest[i]
             for k in range(3):
-                pl, pr, nl, nr = left[k, 3], right[k, 3], 0.0, 0.0
-                for m in range(3):
-                    pl += left[k, m] * feet[i, j, m]
-                    pr += right[k, m] * feet[i, j, m]
-                    nl += left[k, m] * normals[i, j, m]
-                    nr += right[k, m] * normals[i, j, m]
-                a[k], a[3 + k], b[k], b[3 + k] = pl, pr, nl, nr
-            bottom, top = _clip(a, b, sizes, z_min, z_max)
-            if top > bottom:
-                span = low[i, j], high[i, j], bottom, top
-                _cell(span, a, b, epipole, dcol, drow, image, limits, out[i, j])
+                lanes[FOOT + k * LANES + n], lanes[NORMAL + k * LANES + n] = foot[i, k], normal[i, k]
+            n += 1
+        if n == LANES or (n > 0 and i == last):
+            lines(n, left, right, lanes)
+            clip(n, sizes, z_min, z_max, lanes)
+            spans(n, lanes)
+            _solve(n, cells, active, found, lanes, solved, room, epipole, disparity, std, image, limits, rows)
+            n = 0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _solve(n, cells, active, found, lanes, solved, room, epipole, disparity, std, image, limits, out):  # type: ignore[no-untyped-def]
+    """Follow ``n`` lanes to the end; ``active``, ``found``, ``solved`` and ``room`` are room to work in."""
+    height, width = image.shape
+    count = 0
+    for m in range(n):
+        lanes[WAY + m], lanes[PLACE + m] = 0.0, lanes[START + m] + 1.0
+        if lanes[TOP + m] > lanes[BOTTOM + m]:
+            active[count] = m
+            count += 1
+    while count:
+        hits = 0
+        while count:
+            _look(active, count, lanes, width, height, room)
+            meet(STEPS * count, epipole, width, disparity, room)
+            count, hits = _scan(active, count, found, hits, lanes, room)
+        gather(found, hits, lanes, DZ, BRACKET, solved)
+        roots(hits, solved, epipole, width, height, disparity, room)
+        slopes(hits, solved, epipole, width, height, disparity, room)
+        refused = accept(hits, found, cells, solved, room, disparity, image, std, limits, out, active)
+        for t in range(refused):
+            if lanes[PLACE + active[t]] > 0.0:
+                active[count] = active[t]
+                count += 1
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _look(active, count, lanes, width, height, room):  # type: ignore[no-untyped-def]
+    """Project the next steps of the active lanes."""
+    for t in range(count):
+        m = active[t]
+        way = 1.0 if lanes[WAY + m] > 0.0 else -1.0
+        climb(
+            lanes, m, lanes[BOTTOM + m], lanes[PLACE + m] + way, way, lanes[DZ + m], width, height, room[STEPS * t :]
+        )  # fmt: skip
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _scan(active, count, found, hits, lanes, room):  # type: ignore[no-untyped-def]
+    """Follow s over the steps looked at: lanes that go on stay active, those with a bracket are added to ``found``."""
+    keep = 0
+    for t in range(count):
+        m, first = active[t], STEPS * t
+        fresh = lanes[WAY + m] == 0.0
+        if lanes[WAY + m] > 0.0:
+            outcome = _upwards(lanes, m, room, first)
+        elif fresh and _begin(lanes, m, room, first):
+            outcome = MORE
+        else:
+            outcome = _downwards(lanes, m, room, first, 1 if fresh else 0)
+        if outcome == MORE:
+            active[keep] = m
+            keep += 1
+        elif outcome == FOUND:
+            found[hits] = m
+            hits += 1
+    return keep, hits
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _begin(lanes, m, room, k):  # type: ignore[no-untyped-def]
+    """Take s at the start from point ``k``; whether the search begins upwards, because the point is behind."""
+    lanes[FIRST + m] = lanes[LEVEL + m] = pixels(room, S, k)
+    lanes[PLACE + m] = lanes[START + m]
+    upwards = (lanes[LEVEL + m] < 0.0) & (lanes[START + m] < lanes[COUNT + m])
+    lanes[WAY + m] = 1.0 if upwards else -1.0
+    return upwards
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _downwards(lanes, m, room, first, begin):  # type: ignore[no-untyped-def]
+    """Go down from free to behind, beyond the last step only while free."""
+    place, last, above, outcome = lanes[PLACE + m], lanes[LAST + m], lanes[LEVEL + m], MORE
+    for i in range(begin, STEPS):
+        place -= 1.0
+        s = room[S + first + i]
+        if place < 0.0:
+            outcome = DONE
+            break
+        if above >= 0.0 and s < 0.0:
+            upper = pixels(room, S, first + i - 1) if i else lanes[LEVEL + m]
+            lanes[LEVEL + m] = pixels(room, S, first + i)
+            _bracket(lanes, m, place + 1.0, upper, lanes[LEVEL + m])
+            lanes[PLACE + m] = place if place > last else 0.0
+            outcome = FOUND
+            break
+        if place <= last and not s >= 0.0:
+            outcome = DONE
+            break
+        above = s
+    if outcome == MORE:
+        lanes[PLACE + m], lanes[LEVEL + m] = place, pixels(room, S, first + STEPS - 1)
+    return outcome
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _upwards(lanes, m, room, first):  # type: ignore[no-untyped-def]
+    """Go up while behind; what comes after that, or after a bracket, is the way down from the start."""
+    place, outcome, turned = lanes[PLACE + m], MORE, False
+    for i in range(STEPS):
+        place += 1.0
+        s = room[S + first + i]
+        turned = place > lanes[COUNT + m] or not s < 0.0
+        if turned:
+            if place <= lanes[COUNT + m] and s >= 0.0:
+                below = pixels(room, S, first + i - 1) if i else lanes[LEVEL + m]
+                _bracket(lanes, m, place, pixels(room, S, first + i), below)
+                outcome = FOUND
+            break
+    if turned:
+        lanes[WAY + m], lanes[PLACE + m], lanes[LEVEL + m] = -1.0, lanes[START + m], lanes[FIRST + m]
+    else:
+        lanes[PLACE + m], lanes[LEVEL + m] = place, pixels(room, S, first + STEPS - 1)
+    return outcome
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _bracket(lanes, m, step, upper, lower):  # type: ignore[no-untyped-def]
+    """The step below ``step``, with s at both ends."""
+    lanes[BRACKET + m], lanes[BRACKET + LANES + m] = lanes[BOTTOM + m] + step * lanes[DZ + m], upper
+    z = lanes[BOTTOM + m] + (step - 1.0) * lanes[DZ + m]
+    lanes[BRACKET + 2 * LANES + m], lanes[BRACKET + 3 * LANES + m] = z, lower

@@ -6,7 +6,6 @@ The kernel and its equations are in :mod:`stages.locus_kernel`.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -73,14 +72,15 @@ class Task:
         if not z_range[0] < z_range[1]:
             raise InputError(f"the range of elevations {z_range[0]}..{z_range[1]} m is empty")
         shape = (rig.left.height, rig.left.width)
-        maps = [np.array(a, dtype=np.float32, order="C") for a in (given.column, given.row, image)]
+        maps = [np.asarray(a) for a in (given.column, given.row, image)]
         for name, array in zip(("column disparity", "row disparity", "image"), maps, strict=True):
             if array.shape != shape:
                 raise InputError(f"the {name} is {array.shape}, the left camera's image {shape}")
-        self.dcol, self.drow, self.image = maps
-        self.dcol[~given.usable] = np.nan
-        self.sigma = sigma
-        self.std = None if given.std is None else np.asarray(given.std)
+        self.disparity = np.stack(maps[:2], axis=-1, dtype=np.float32, casting="unsafe")
+        self.disparity[~given.usable] = np.nan
+        self.image = np.ascontiguousarray(maps[2], np.float32)
+        std = np.full(shape, sigma) if given.std is None else given.std
+        self.std = np.ascontiguousarray(std, np.float64)
         self.left, self.right = projections(rig, T_surface_left)
         self.epipole = rig.right.matrix @ rig.T_right_left.translation
         self.sizes = np.array([rig.left.width, rig.left.height, rig.right.width, rig.right.height], dtype=np.float64)
@@ -95,21 +95,8 @@ class Task:
         out = np.full((*shape, 4), np.nan)
         search(
             feet, normals, *start, *self.z_range, self.left, self.right, self.epipole, self.sizes,
-            self.dcol, self.drow, self.image, self.limits, out,
+            self.disparity.ravel(), self.std, self.image, self.limits, out,
         )  # fmt: skip
-        return out
-
-    def at_left_pixel(
-        self, values: NDArray[Any], surface: Surface, rows: NDArray[np.intp], elevation: Floats
-    ) -> Floats:
-        """Value of the left pixel nearest to each solved cell (r, c) of ``rows``; NaN elsewhere."""
-        feet, normals = surface.block(rows, np.arange(surface.cols))
-        out = np.full(elevation.shape, np.nan)
-        solved = np.isfinite(elevation)
-        points = (feet + elevation[..., None] * normals)[solved]
-        p = points @ self.left[:, :3].T + self.left[:, 3]
-        x, y = (np.rint(p[:, k] / p[:, 2]).astype(np.intp) for k in (0, 1))
-        out[solved] = values[y, x]
         return out
 
 
@@ -119,16 +106,15 @@ def solve(task: Task, surface: Surface) -> Dem:
     z_range = task.z_range
     coarse = task.cells(surface, cells[0], cells[1], np.float64(z_range[0]), np.float64(z_range[1]))[..., 0]
     out = Dem(*(np.full((surface.rows, surface.cols), np.nan, np.float32) for _ in range(4)))
+    low, high = _around(coarse)
+    cols = np.arange(surface.cols)
     for start in range(0, surface.rows, BLOCK_ROWS):
         rows = np.arange(start, min(start + BLOCK_ROWS, surface.rows))
-        low, high = _from_coarse(coarse, rows, np.arange(surface.cols))
-        found = task.cells(surface, rows, np.arange(surface.cols), low, high)
-        sigma: float | Floats = task.sigma
-        if task.std is not None:
-            sigma = task.at_left_pixel(task.std, surface, rows, found[..., 0])
+        at = np.ix_(rows // COARSE + 1, cols // COARSE + 1)
+        found = task.cells(surface, rows, cols, low[at], high[at])
         block = slice(start, start + rows.size)
-        out.elevation[block], out.elevation_std[block] = found[..., 0], sigma / found[..., 2]
-        out.residual[block], out.ortho[block] = found[..., 1], found[..., 3]
+        for k, array in enumerate((out.elevation, out.elevation_std, out.residual, out.ortho)):
+            array[block] = found[..., k]
     return out
 
 
@@ -157,8 +143,8 @@ def projections(rig: Rig, T_surface_left: RigidTransform) -> tuple[Floats, Float
     return np.ascontiguousarray(left), np.ascontiguousarray(right)
 
 
-def _from_coarse(coarse: Floats, rows: NDArray[np.intp], cols: NDArray[np.intp]) -> tuple[Floats, Floats]:
-    """Lowest and highest elevation of the 4 x 4 coarse cells around each cell; NaN where none has one."""
+def _around(coarse: Floats) -> tuple[Floats, Floats]:
+    """Lowest and highest elevation of the 4 x 4 coarse cells around each gap between them; NaN where none has one."""
     padded = np.pad(coarse, 2, constant_values=np.nan)
     shape = padded.shape[0] - 3, padded.shape[1] - 3
     low = np.full(shape, np.nan)
@@ -167,5 +153,4 @@ def _from_coarse(coarse: Floats, rows: NDArray[np.intp], cols: NDArray[np.intp])
         for j in range(4):
             near = padded[i : i + shape[0], j : j + shape[1]]
             low, high = np.fmin(low, near), np.fmax(high, near)
-    at = np.ix_(rows // COARSE + 1, cols // COARSE + 1)
-    return low[at], high[at]
+    return low, high

@@ -38,35 +38,46 @@ def sweep(  # type: ignore[no-untyped-def]
     rows, cols = z.shape
     shape = rows + cols - 1 + 2 * BORDER, rows + 2 * BORDER
     at, by_row, by_column = np.zeros(shape), np.zeros(shape), np.zeros(shape)
-    wanted, total = np.zeros(shape), np.zeros(shape)
+    wanted, total = np.zeros(shape), np.full(shape, np.nan)
     for r in range(rows):
         for c in range(cols):
-            t, i = r + c + BORDER, r + BORDER
-            by_row[t, i], by_column[t, i] = across[r, c], down[r, c]
             if z[r, c] == z[r, c]:
-                at[t, i] = z[r, c]
-            if keep[r, c]:
-                wanted[t, i] = power[r, c] * start[r, c] + pull[r, c]
-    for r in range(rows):
-        for c in range(cols):
-            if keep[r, c]:
                 t, i = r + c + BORDER, r + BORDER
-                s = 4.0 * by_row[t, i] + 4.0 * by_column[t, i]
-                s = (s + by_row[t - 1, i]) + by_column[t - 1, i - 1]
-                s = (s + by_row[t + 1, i]) + by_column[t + 1, i + 1]
-                total[t, i] = power[r, c] + s
+                by_row[t, i], by_column[t, i], at[t, i] = across[r, c], down[r, c], z[r, c]
+                if keep[r, c]:
+                    wanted[t, i], total[t, i] = power[r, c] * start[r, c] + pull[r, c], power[r, c]
+    low, high = _totals(by_row, by_column, total)
     sums = np.empty(rows)
     for turn in range(rows + cols - 1 + BEHIND * (sweeps - 1)):
         for k in range(sweeps):
-            d = turn - BEHIND * k
-            if d < 0 or d >= rows + cols - 1:
-                continue
-            low, high = max(0, d - cols + 1), min(rows, d + 1)
-            _diagonal(at, by_row, by_column, wanted, total, d + BORDER, low + BORDER, high - low, overshoot, sums)
+            t = turn - BEHIND * k + BORDER
+            if t >= BORDER and t < shape[0] - BORDER and low[t] < high[t]:
+                _diagonal(at, by_row, by_column, wanted, total, t, low[t], high[t] - low[t], overshoot, sums)
     for r in range(rows):
         for c in range(cols):
             if keep[r, c]:
                 z[r, c] = at[r + c + BORDER, r + BORDER]
+
+
+@njit(cache=True, nogil=True)
+def _totals(by_row, by_column, total):  # type: ignore[no-untyped-def]
+    """Add what the second differences weigh to ``total``, 0 where it is NaN; from where to where a diagonal has any."""
+    diagonals, rows = total.shape
+    low, high = np.zeros(diagonals, np.int64), np.zeros(diagonals, np.int64)
+    for t in range(BORDER, diagonals - BORDER):
+        low[t] = BORDER
+        for i in range(BORDER, rows - BORDER):
+            s = 4.0 * by_row[t, i] + 4.0 * by_column[t, i]
+            s = (s + by_row[t - 1, i]) + by_column[t - 1, i - 1]
+            s = (s + by_row[t + 1, i]) + by_column[t + 1, i + 1]
+            own = total[t, i] + s
+            total[t, i] = own if own == own else 0.0
+        while low[t] < rows - BORDER and not total[t, low[t]] > 0.0:
+            low[t] += 1
+        high[t] = rows - BORDER
+        while high[t] > low[t] and not total[t, high[t] - 1] > 0.0:
+            high[t] -= 1
+    return low, high
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

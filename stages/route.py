@@ -123,23 +123,29 @@ def within_turn(way: Sequence[Piece], heading: float, bound: float) -> tuple[lis
     towards where it goes on.
 
     That is as far as it stays within the bound too and what remains is between two headings of the planner. Where it
-    goes on then is a way that is planned again; a turn that ends elsewhere may find none there, and turn back.
+    goes on then is a way that is planned again; a turn that ends elsewhere may find none there, and turn back. Where
+    there is no such turn there is none after a piece that is driven, and one to the bound where nothing is.
     """
     out, now = list[Piece](), heading
     for piece in way:
         if abs(piece.heading - heading) > bound + 1e-9:
-            wanted = piece.heading - heading
-            return out, heading + math.copysign(_cut(abs(wanted), bound), wanted) - now
+            wanted = piece.heading - now
+            side = math.copysign(1.0, wanted)
+            room = bound - side * (now - heading)
+            turn = _cut(abs(wanted), room)
+            if turn is None:
+                turn = 0.0 if out else room
+            return out, side * turn
         now = piece.heading
         out.append(piece)
     return out, 0.0
 
 
-def _cut(wanted: float, bound: float) -> float:
-    """The greatest part of a turn within the bound of which the rest is between two headings; the bound if none is."""
+def _cut(wanted: float, bound: float) -> float | None:
+    """The greatest part of a turn within the bound of which the rest is between two headings; None: there is none."""
     parts = wanted - np.sort(ANGLES)
     parts = parts[(parts > 0) & (parts <= bound + 1e-9)]
-    return float(parts[0]) if parts.size else bound
+    return float(parts[0]) if parts.size else None
 
 
 def length_of(way: Sequence[Piece]) -> float:

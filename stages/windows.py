@@ -20,6 +20,10 @@ Floats32 = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 
+LANES = 4
+"""Rows whose sums along the columns run side by side: each addition waits for the last one of its own row only."""
+
+
 def running_max(a: Floats32, n: int) -> Floats32:
     """Largest value (row, col) in the window; NaN is left out, and -inf stands where all are NaN."""
     filled = np.where(np.isnan(a), np.float32(-np.inf), a)
@@ -53,23 +57,47 @@ def window_sum(a: NDArray, n: int) -> Floats:
 
 @njit(cache=True, nogil=True)
 def _sums(a, half, out):  # type: ignore[no-untyped-def]
-    """Differences of prefix sums down the columns, then of theirs along the rows."""
+    """Differences of prefix sums down the columns, then of theirs along the rows, :data:`LANES` rows at a time."""
     rows, cols = a.shape
     prefix = np.zeros((rows + 1, cols))
     for r in range(rows):
-        for c in range(cols):
-            prefix[r + 1, c] = prefix[r, c] + a[r, c]
-    line, along = np.empty(cols), np.zeros(cols + 1)
-    for r in range(rows):
-        low, high = prefix[max(r - half, 0)], prefix[min(r + half + 1, rows)]
-        for c in range(cols):
-            line[c] = high[c] - low[c]
-        total = 0.0
-        for c in range(cols):
-            total += line[c]
-            along[c + 1] = total
-        for c in range(cols):
-            out[r, c] = along[min(c + half + 1, cols)] - along[max(c - half, 0)]
+        _add(prefix[r], a[r], prefix[r + 1])
+    # The sums along a row, with half a window of what they begin and end with.
+    lines, along = np.zeros((LANES, cols)), np.zeros((LANES, cols + 2 * half + 1))
+    for first in range(0, rows, LANES):
+        n = min(LANES, rows - first)
+        for k in range(n):
+            r = first + k
+            _subtract(prefix[min(r + half + 1, rows)], prefix[max(r - half, 0)], lines[k])
+        _accumulate(lines, half, along)
+        for k in range(n):
+            _subtract(along[k, 2 * half + 1 :], along[k, :cols], out[first + k])
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _add(a, b, out):  # type: ignore[no-untyped-def]
+    for c in range(out.shape[0]):
+        out[c] = a[c] + b[c]
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _subtract(a, b, out):  # type: ignore[no-untyped-def]
+    for c in range(out.shape[0]):
+        out[c] = a[c] - b[c]
+
+
+@njit(cache=True, nogil=True)
+def _accumulate(lines, half, out):  # type: ignore[no-untyped-def]
+    """Sums of the first entries of :data:`LANES` lines side by side, since an addition waits for the last."""
+    cols = lines.shape[1]
+    p, q, s, t = lines[0], lines[1], lines[2], lines[3]
+    i, j, k, m = out[0], out[1], out[2], out[3]
+    a, b, d, e = 0.0, 0.0, 0.0, 0.0
+    for c in range(cols):
+        a, b, d, e = a + p[c], b + q[c], d + s[c], e + t[c]
+        i[c + half + 1], j[c + half + 1], k[c + half + 1], m[c + half + 1] = a, b, d, e
+    for c in range(cols + half + 1, cols + 2 * half + 1):
+        i[c], j[c], k[c], m[c] = a, b, d, e
 
 
 def window_mean(a: Floats32, n: int) -> Floats32:
@@ -77,10 +105,6 @@ def window_mean(a: Floats32, n: int) -> Floats32:
     out = np.empty(a.shape, dtype=np.float32)
     _mean(np.ascontiguousarray(a), n // 2, out)
     return out
-
-
-LANES = 4
-"""Rows whose sums along the columns run side by side: each addition waits for the last one of its own row only."""
 
 
 @njit(cache=True, nogil=True)

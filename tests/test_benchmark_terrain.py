@@ -10,7 +10,7 @@ import pytest
 
 from stages.geometry import Camera, Rig, RigidTransform
 from stages.lattice import Lattice
-from stages.locus_kernel import SOLVED_PX
+from stages.locus_roots import SOLVED_PX
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 

@@ -171,13 +171,21 @@ def test_a_lost_image_is_left_out_and_the_last_one_taken_again(arrived: tuple[Dr
 
 
 @pytest.mark.slow
-def test_slip_of_thirty_per_cent_stops_and_says_so(arrived: tuple[Drive, Result], store: Path) -> None:
-    flow, _ = drive(store, "rover.slip=0.3", "rover.slip_sigma=0.0", "drive.max_safety_stops=1")
+def test_slip_of_thirty_per_cent_stops_says_so_and_keeps_all(
+    arrived: tuple[Drive, Result], store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    slips = ("rover.slip=0.3", "rover.slip_sigma=0.0", "drive.max_safety_stops=1")
+    flow, _ = drive(store, *slips)
     verdict, reason = flow.outcome()
     assert verdict == "safety stop"
     assert reason.startswith("slip of ")
     assert "by the wheels" in reason
     assert flow.driven.check is not None
+    given: dict[str, Any] = {"runs": tmp_path, "cache": store, "executor": "inline", "progress": "quiet"}
+    run.reconstruct(run.Options("mockup-loop", assignments=(*SMALL, *slips), verb="drive", **given))
+    assert capsys.readouterr().out.startswith("safety stop: slip of ")
+    lines = (tmp_path / "mockup-loop" / "latest" / "trajectory.tum").read_text().splitlines()
+    assert len(lines) == 1 + len(flow.posed) > 2, "the way to where it stopped, too"
 
 
 def test_a_drive_needs_a_goal_and_a_cell(store: Path) -> None:

@@ -138,7 +138,7 @@ def test_it_looks_around_then_closes_what_stays_unknown_and_goes_another_way() -
         assert np.hypot(*(over_unknown - place).T).min() > P.vain * ROVER.wheel_base - LATTICE.cell
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(st.integers(0, 2**31), st.floats(-math.pi, math.pi))
 def test_no_leg_comes_near_a_hazard_or_onto_unknown_ground(seed: int, heading: float) -> None:
     rng = np.random.default_rng(seed)
@@ -149,7 +149,7 @@ def test_no_leg_comes_near_a_hazard_or_onto_unknown_ground(seed: int, heading: f
     risk[np.hypot(X, Y) < 0.1] = SAFE
     leg = plan_leg(Footing.of(risk, None, LATTICE, ROVER), START, heading, GOAL, P)
     wheels = np.array([(a, b) for a in (-0.04, 0.04) for b in (-0.05, 0.05)])
-    poses = [(START, heading + leg.turn * t) for t in np.linspace(0, 1, 9)]
+    poses = list[tuple[np.ndarray, float]]()
     for a, b, gear in zip(leg.path, leg.path[1:], leg.gear, strict=False):
         dx, dy = gear * (b - a)
         towards = math.atan2(-dx, dy)
@@ -157,6 +157,8 @@ def test_no_leg_comes_near_a_hazard_or_onto_unknown_ground(seed: int, heading: f
         poses += [(a, heading + t * turn) for t in np.linspace(0, 1, 20)]
         poses += [(a + t * (b - a), towards) for t in np.linspace(0, 1, 20)]
         heading = towards
+    end = leg.path[-1] if len(leg.path) else np.array(START)
+    poses += [(end, heading + leg.turn * t) for t in np.linspace(0, 1, 20)]
     for (x, y), h in poses:
         c, s = math.cos(h), math.sin(h)
         at = wheels @ np.array([[c, s], [-s, c]]) + (x, y)

@@ -8,7 +8,7 @@ import pytest
 from terrain_scenes import ball, box, disparity, interpolation_error, nearest, pitched, plane, smooth_noise, toed_in_rig
 
 from stages import level as level_stage
-from stages import locus, locus_kernel, locus_solve
+from stages import locus, locus_roots, locus_solve
 from stages.declare import Bundle, check_outputs
 from stages.errors import ConfigError, DegenerateError, InputError
 from stages.geometry import Rig, RigidTransform
@@ -359,7 +359,7 @@ def test_stage_in_both_frames() -> None:
     index = np.round(Lattice.from_dict(world.meta["lattice"]).index(xyz[:, :2])).astype(int)
     found = world["elevation"][index[:, 0], index[:, 1]]
     assert np.isfinite(found).mean() > 0.99
-    solved = locus_kernel.SOLVED_PX / LocusParams().sigma_disparity * local["elevation_std"][rows, cols]
+    solved = locus_roots.SOLVED_PX / LocusParams().sigma_disparity * local["elevation_std"][rows, cols]
     assert np.nanmean(np.abs(found - xyz[:, 2]) <= 2.0 * solved + 1e-6) > 0.99
     # Pixels that fail back-matching by 1.2 px are not used.
     p = RIG.left.project(T_LOCAL_LEFT.inverse().apply(np.dstack([lattice.xy(), local["elevation"]])))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -66,6 +67,16 @@ def test_the_first_metres_and_the_first_turns() -> None:
     assert within_turn(STAIRS, 0.0, 1.6) == (STAIRS, 0.0)  # off the first heading: turns to and fro do not add up
     assert within_turn(STAIRS, -0.8, 0.8) == (STAIRS, 0.0)
     assert within_turn(STAIRS[1:], -0.8, 0.3) == ([], pytest.approx(-0.3))
+    # a turn at the end of a leg goes on from the heading there, and never back over ground that was not looked at
+    bent = [Piece((0.0, 0.0), (0.0, 0.1), -0.6, 1), Piece((0.0, 0.1), (0.1, 0.1), -0.8, 1)]
+    assert within_turn(bent, 0.0, 0.7) == (bent[:1], 0.0)
+    assert within_turn([bent[0], replace(bent[1], heading=-1.1)], 0.0, 0.7) == (
+        bent[:1],
+        pytest.approx(-(0.5 - math.atan2(1, 2))),
+    )
+    # nor does it go beyond the bound off the first heading on the other side
+    back = [bent[0], replace(bent[1], heading=0.9)]
+    assert within_turn(back, 0.0, 0.7) == (bent[:1], pytest.approx(1.5 - math.atan2(1, 2)))
     # a turn that is counted on past half a turn keeps its direction
     around = [Piece((0.0, 0.0), (0.0, 0.1), 1.2 * math.pi, 1)]
     assert within_turn(around, 0.0, 0.5) == ([], pytest.approx(0.2 * math.pi - math.atan2(1, 2)))
