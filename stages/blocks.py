@@ -53,39 +53,6 @@ def reduce_to_blocks(surface: Floats32, closed: Floats32, std: Floats32, n: int,
     return Blocks(high, low, *sums)
 
 
-def sum_around(a: Floats, n: int) -> Floats:
-    """Sum (row, col) over the n x n blocks around each, clipped at the border; n odd. Differences of prefix sums."""
-    out = np.empty_like(a)
-    _sum_around(a, n // 2, out)
-    return out
-
-
-@njit(cache=True, nogil=True)
-def _sum_around(a, half, out):  # type: ignore[no-untyped-def]
-    rows, cols = a.shape
-    down = np.zeros((rows + 1, cols))
-    for r in range(rows):
-        for c in range(cols):
-            down[r + 1, c] = down[r, c] + a[r, c]
-    # from before the first column, where nothing is, to as far behind the last one as the window goes
-    along = np.zeros(cols + 2 * half + 1)
-    inner = along[half + 1 : half + 1 + cols]
-    for r in range(rows):
-        first, last = down[max(r - half, 0)], down[min(r + half + 1, rows)]
-        total = 0.0
-        for c in range(cols):
-            total += last[c] - first[c]
-            inner[c] = total
-        along[half + 1 + cols :] = total
-        _differences(along[2 * half + 1 :], along, out[r])
-
-
-@njit(cache=True, nogil=True)
-def _differences(p, q, out):  # type: ignore[no-untyped-def]
-    for c in range(out.shape[0]):
-        out[c] = p[c] - q[c]
-
-
 @njit(cache=True, nogil=True)
 def _reduce(z, closed, s, n, lag, high, low, count, variance, pairs, deviation):  # type: ignore[no-untyped-def]
     """Each row of blocks by strips of whole blocks, whose lines stay in the innermost cache."""
