@@ -15,7 +15,6 @@ from numba import njit
 from numpy.typing import NDArray
 
 from stages.hazards import BITS, FREEDOM, HIDDEN, LIFT, MEASURES, Measured, limits, noise_factors
-from stages.line import copy_line
 from stages.vehicle import Vehicle
 
 Floats32 = NDArray[np.float32]
@@ -33,6 +32,9 @@ FINE = ("inclination", "range", "step")
 
 STRIP = 1536
 """Columns of cells that are worked on at a time: long lines are read ahead of their use, and all stay in the cache."""
+
+BAND = 64
+"""Rows of cells, about, after which their inclination becomes an angle, while it is in the cache."""
 
 STEPS, FARTHEST = 64, 16.0
 """Table of the distribution: steps a unit, and where it ends."""
@@ -91,12 +93,14 @@ def classify(
     risk, reason = np.empty(shape, np.uint8), np.empty(shape, np.uint16)
     inclination, roughness, slope, tilt, clearance, p = (np.empty(shape, np.float32) for _ in range(6))
     marks = np.array([rules.caution, rules.max_p, rules.min_known], np.float32)
-    _classify(
-        np.stack([facts[name] for name in FINE]), np.float32(1.0 / measured.extent), measured.range, measured.step,
-        closed, filled, blocks, bits, measured.stride, marks, _table(), risk, reason,
-        inclination, roughness, slope, tilt, clearance, p,
-    )  # fmt: skip
-    np.arctan(inclination, out=inclination)
+    fine, n = np.stack([facts[name] for name in FINE]), measured.stride
+    for top in range(0, shape[0], n * max(1, BAND // n)):
+        bottom = min(top + n * max(1, BAND // n), shape[0])
+        _classify(
+            fine, np.float32(1.0 / measured.extent), measured.range, measured.step, closed, filled, blocks, bits, n,
+            marks, _table(), top, bottom, risk, reason, inclination, roughness, slope, tilt, clearance, p,
+        )  # fmt: skip
+        np.arctan(inclination[top:bottom], out=inclination[top:bottom])
     return {
         "risk": risk,
         "reason": reason,
@@ -164,45 +168,47 @@ def _hold_all(values, facts, noise, doubt, load, excess, bits):  # type: ignore[
         _hold(values[r], facts, noise[r], doubt[r], load[r], excess[r], bits[r])
 
 
+# Lines are read and written in place, from a column that is not signed: to make them arrays of their own takes a tenth
+# of the work on them, and a signed index would be looked at for whether it counts from the end.
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def _classify(  # type: ignore[no-untyped-def]
-    facts, per_metre, height_range, step, closed, filled, blocks, bits, n, marks, table,
+    facts, per_metre, height_range, step, closed, filled, blocks, bits, n, marks, table, first, bottom,
     risk, reason, inclination, roughness, slope, tilt, clearance, p,
 ):  # fmt: skip
-    """Cells of each block of ``n`` x ``n``, by strips of whole blocks; ``bits`` (2, row, col) of the blocks' own
-    hazards, and of any class."""
-    rows, cols = risk.shape
+    """Cells of rows ``first`` to ``bottom``, of each block of ``n`` x ``n``, by strips of whole blocks; ``bits``
+    (2, row, col) of the blocks' own hazards, and of any class."""
+    cols = risk.shape[1]
     width = n * max(1, STRIP // n)
     wide = np.empty((blocks.shape[0], width), dtype=np.float32)
     own = np.empty((2, width), dtype=np.uint16)
     load, excess = np.empty(width, dtype=np.float32), np.empty(width, dtype=np.float32)
     place = np.empty(width, dtype=np.int32)
-    for top in range(0, rows, n):
+    for top in range(first, bottom, n):
         for left in range(0, cols, width):
-            right = min(left + width, cols)
-            strip, of = slice(left, right), slice(left // n, left // n + width // n)
+            size, of = np.uint64(min(width, cols - left)), slice(left // n, left // n + width // n)
             for k in range(blocks.shape[0]):
                 _spread(blocks[k, top // n, of], n, wide[k])
             for k in range(2):
                 _spread(bits[k, top // n, of], n, own[k])
-            for r in range(top, min(top + n, rows)):
-                inclined, ranged, stepped = inclination[r, strip], height_range[r, strip], step[r, strip]
-                kind, chance = risk[r, strip], p[r, strip]
-                _load(facts, per_metre, ranged, stepped, wide[2], wide[0], load)
-                _excess(facts, per_metre, ranged, stepped, wide[2], wide[3], wide[1], excess)
-                _look_up(excess[: right - left], table, place, chance)
-                some = _decide(load, chance, closed[r, strip], wide[4], marks, kind)
-                _explain(kind, filled[r, strip], own[1], reason[r, strip])
+            for row in range(top, min(top + n, bottom)):
+                r, at = np.uint64(row), np.uint64(left)
+                _load(facts, per_metre, height_range, step, wide, r, at, size, load)
+                _excess(facts, per_metre, height_range, step, wide, r, at, size, excess)
+                _look_up(excess, table, place, r, at, size, p)
+                some = _decide(load, p, closed, wide, marks, r, at, size, risk)
+                _explain(risk, filled, own, r, at, size, reason)
                 if some & 1:
-                    _blame(kind, facts, per_metre, ranged, stepped, wide[2], own[0], reason[r, strip])
-                    _doubt(kind, excess, reason[r, strip])
-                for c in range(right - left):
-                    inclined[c] = ranged[c] * per_metre
+                    _blame(risk, facts, per_metre, height_range, step, wide, own, excess, r, at, size, reason)
+                _incline(risk, height_range, per_metre, r, at, size, inclination)
                 if some & 2:
-                    for line in (inclined, ranged, stepped, chance):
-                        _blank(kind, line)
-                for k, band in enumerate((roughness, slope, tilt, clearance)):
-                    _put(kind, wide[5 + k], some & 2 > 0, band[r, strip])
+                    for band in (height_range, step, p):
+                        _blank(risk, r, at, size, band)
+                _put(risk, wide, np.uint64(5), some & 2, r, at, size, roughness)
+                _put(risk, wide, np.uint64(6), some & 2, r, at, size, slope)
+                _put(risk, wide, np.uint64(7), some & 2, r, at, size, tilt)
+                _put(risk, wide, np.uint64(8), some & 2, r, at, size, clearance)
 
 
 @njit(cache=True, nogil=True)
@@ -223,113 +229,119 @@ def _spread(blocks, n, out):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _load(facts, per_metre, ranged, stepped, noise, before, out):  # type: ignore[no-untyped-def]
+def _load(facts, per_metre, height_range, step, wide, r, left, size, out):  # type: ignore[no-untyped-def]
     """Greatest load of the blocks' and of the three measures."""
     one = np.float32(1.0)
     p, q, s = one / facts[0, 0], one / facts[1, 0], one / facts[2, 0]
     u, v, w = facts[0, 3], facts[1, 3], facts[2, 3]
-    for c in range(ranged.shape[0]):
-        a, b = (ranged[c] * per_metre + u * noise[c]) * p, (ranged[c] + v * noise[c]) * q
-        d, most = (stepped[c] + w * noise[c]) * s, before[c]
+    for c in range(size):
+        ranged, stepped, noise, most = height_range[r, left + c], step[r, left + c], wide[2, c], wide[0, c]
+        a, b = (ranged * per_metre + u * noise) * p, (ranged + v * noise) * q
+        d = (stepped + w * noise) * s
         most = a if a > most else most
         most = b if b > most else most
         out[c] = d if d > most else most
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _excess(facts, per_metre, ranged, stepped, noise, doubt, before, out):  # type: ignore[no-untyped-def]
+def _excess(facts, per_metre, height_range, step, wide, r, left, size, out):  # type: ignore[no-untyped-def]
     """Greatest standardised excess, likewise."""
-    f, g, h = facts[0], facts[1], facts[2]
-    limit0, bias0, spread0, least0 = f[0], f[1], f[2], LEAST * f[0]
-    limit1, bias1, spread1, least1 = g[0], g[1], g[2], LEAST * g[0]
-    limit2, bias2, spread2, least2 = h[0], h[1], h[2], LEAST * h[0]
+    limit0, bias0, spread0, least0 = facts[0, 0], facts[0, 1], facts[0, 2], LEAST * facts[0, 0]
+    limit1, bias1, spread1, least1 = facts[1, 0], facts[1, 1], facts[1, 2], LEAST * facts[1, 0]
+    limit2, bias2, spread2, least2 = facts[2, 0], facts[2, 1], facts[2, 2], LEAST * facts[2, 0]
     none = np.float32(0.0)
-    for c in range(ranged.shape[0]):
-        s, wide, most = noise[c], doubt[c], before[c]
-        over = ranged[c] * per_metre - bias0 * s - limit0
-        t = over / (spread0 * (s if over > none else wide) + least0)
+    for c in range(size):
+        ranged, stepped = height_range[r, left + c], step[r, left + c]
+        s, doubt, most = wide[2, c], wide[3, c], wide[1, c]
+        over = ranged * per_metre - bias0 * s - limit0
+        t = over / (spread0 * (s if over > none else doubt) + least0)
         most = t if t > most else most
-        over = ranged[c] - bias1 * s - limit1
-        t = over / (spread1 * (s if over > none else wide) + least1)
+        over = ranged - bias1 * s - limit1
+        t = over / (spread1 * (s if over > none else doubt) + least1)
         most = t if t > most else most
-        over = stepped[c] - bias2 * s - limit2
-        t = over / (spread2 * (s if over > none else wide) + least2)
+        over = stepped - bias2 * s - limit2
+        t = over / (spread2 * (s if over > none else doubt) + least2)
         out[c] = t if t > most else most
 
 
 @njit(cache=True, nogil=True)
-def _look_up(excess, table, place, p):  # type: ignore[no-untyped-def]
+def _look_up(excess, table, place, r, left, size, p):  # type: ignore[no-untyped-def]
     """The entry at or below; what is below 0 by no more than :data:`NONE` counts as 0."""
     far, steps, none = np.float32(FARTHEST), np.float32(STEPS), np.float32(-NONE)
-    for c in range(excess.shape[0]):
+    for c in range(size):
         least = excess[c] if excess[c] > -far else -far
         t = (least if least < far else far) * steps
         k = np.int32(t)
         below = (np.float32(k) > t) & (t < none)
         place[c] = k + np.int32(FARTHEST * STEPS) - np.int32(below)
-    for c in range(excess.shape[0]):
-        p[c] = table[np.uint32(place[c])]
+    for c in range(size):
+        p[r, left + c] = table[np.uint32(place[c])]
 
 
 @njit(cache=True, nogil=True)
-def _decide(load, p, closed, share, marks, risk):  # type: ignore[no-untyped-def]
+def _decide(load, p, closed, wide, marks, r, left, size, risk):  # type: ignore[no-untyped-def]
     """Classes; returns 1 if some are hazardous, plus 2 if some are unknown."""
     caution, max_p, min_known = marks[0], marks[1], marks[2]
     one = np.float32(1.0)
-    for c in range(risk.shape[0]):
-        known = closed[c] == closed[c]
+    for c in range(size):
+        known = closed[r, left + c] == closed[r, left + c]
         hazardous = known & (load[c] > one)
-        unknown = (not known) | ((share[c] < min_known) & (not hazardous))
-        near = (load[c] > caution) | (p[c] > max_p)
+        unknown = (not known) | ((wide[4, c] < min_known) & (not hazardous))
+        near = (load[c] > caution) | (p[r, left + c] > max_p)
         kind = np.uint8(HAZARDOUS) if hazardous else (np.uint8(CAUTION) if near else np.uint8(SAFE))
-        risk[c] = np.uint8(UNKNOWN) if unknown else kind
+        risk[r, left + c] = np.uint8(UNKNOWN) if unknown else kind
     hazards, gaps = np.uint8(0), np.uint8(0)
-    for c in range(risk.shape[0]):
-        hazards |= np.uint8(risk[c] == HAZARDOUS)
-        gaps |= np.uint8(risk[c] == UNKNOWN)
+    for c in range(size):
+        hazards |= np.uint8(risk[r, left + c] == HAZARDOUS)
+        gaps |= np.uint8(risk[r, left + c] == UNKNOWN)
     return np.int64(hazards) + 2 * np.int64(gaps)
 
 
 @njit(cache=True, nogil=True)
-def _explain(risk, filled, any_class, reason):  # type: ignore[no-untyped-def]
+def _explain(risk, filled, own, r, left, size, reason):  # type: ignore[no-untyped-def]
     """Reasons of cells that are not hazardous."""
     none = np.uint16(0)
-    for c in range(risk.shape[0]):
-        why = any_class[c] | (np.uint16(UNKNOWN_BIT) if risk[c] == UNKNOWN else none)
-        reason[c] = why | (np.uint16(FILLED_BIT) if filled[c] == 1 else none)
+    for c in range(size):
+        why = own[1, c] | (np.uint16(UNKNOWN_BIT) if risk[r, left + c] == UNKNOWN else none)
+        reason[r, left + c] = why | (np.uint16(FILLED_BIT) if filled[r, left + c] == 1 else none)
 
 
 @njit(cache=True, nogil=True)
-def _blame(risk, facts, per_metre, ranged, stepped, noise, own, reason):  # type: ignore[no-untyped-def]
-    """Add the measures that make a hazard."""
-    one, none = np.float32(1.0), np.uint16(0)
+def _blame(risk, facts, per_metre, height_range, step, wide, own, excess, r, left, size, reason):  # type: ignore[no-untyped-def]
+    """Add the measures that make a hazard, and whether only noise does."""
+    one, zero, none = np.float32(1.0), np.float32(0.0), np.uint16(0)
     p, q, s = one / facts[0, 0], one / facts[1, 0], one / facts[2, 0]
     u, v, w = facts[0, 3], facts[1, 3], facts[2, 3]
     bit0, bit1, bit2 = np.uint16(facts[0, 4]), np.uint16(facts[1, 4]), np.uint16(facts[2, 4])
-    for c in range(risk.shape[0]):
-        why = own[c] | (bit0 if (ranged[c] * per_metre + u * noise[c]) * p > one else none)
-        why |= bit1 if (ranged[c] + v * noise[c]) * q > one else none
-        why |= bit2 if (stepped[c] + w * noise[c]) * s > one else none
-        reason[c] |= why if risk[c] == HAZARDOUS else none
+    for c in range(size):
+        ranged, stepped, noise = height_range[r, left + c], step[r, left + c], wide[2, c]
+        why = own[0, c] | (bit0 if (ranged * per_metre + u * noise) * p > one else none)
+        why |= bit1 if (ranged + v * noise) * q > one else none
+        why |= bit2 if (stepped + w * noise) * s > one else none
+        why |= np.uint16(DOUBT_BIT) if excess[c] <= zero else none
+        reason[r, left + c] |= why if risk[r, left + c] == HAZARDOUS else none
 
 
 @njit(cache=True, nogil=True)
-def _doubt(risk, excess, reason):  # type: ignore[no-untyped-def]
-    for c in range(risk.shape[0]):
-        by_sigma = (risk[c] == HAZARDOUS) & (excess[c] <= np.float32(0.0))
-        reason[c] |= np.uint16(DOUBT_BIT) if by_sigma else np.uint16(0)
+def _incline(risk, height_range, per_metre, r, left, size, out):  # type: ignore[no-untyped-def]
+    for c in range(size):
+        v = height_range[r, left + c] * per_metre
+        out[r, left + c] = np.float32(np.nan) if risk[r, left + c] == UNKNOWN else v
 
 
 @njit(cache=True, nogil=True)
-def _blank(risk, values):  # type: ignore[no-untyped-def]
-    for c in range(values.shape[0]):
-        values[c] = np.float32(np.nan) if risk[c] == UNKNOWN else values[c]
+def _blank(risk, r, left, size, band):  # type: ignore[no-untyped-def]
+    for c in range(size):
+        v = band[r, left + c]
+        band[r, left + c] = np.float32(np.nan) if risk[r, left + c] == UNKNOWN else v
 
 
 @njit(cache=True, nogil=True)
-def _put(risk, values, gaps, out):  # type: ignore[no-untyped-def]
+def _put(risk, wide, k, gaps, r, left, size, out):  # type: ignore[no-untyped-def]
     if not gaps:
-        copy_line(values[: out.shape[0]], out)
+        for c in range(size):
+            out[r, left + c] = wide[k, c]
         return
-    for c in range(out.shape[0]):
-        out[c] = np.float32(np.nan) if risk[c] == UNKNOWN else values[c]
+    for c in range(size):
+        v = wide[k, c]
+        out[r, left + c] = np.float32(np.nan) if risk[r, left + c] == UNKNOWN else v
