@@ -33,9 +33,6 @@ FINE = ("inclination", "range", "step")
 STRIP = 1536
 """Columns of cells that are worked on at a time: long lines are read ahead of their use, and all stay in the cache."""
 
-BAND = 64
-"""Rows of cells, about, after which their inclination becomes an angle, while it is in the cache."""
-
 STEPS, FARTHEST = 64, 16.0
 """Table of the distribution: steps a unit, and where it ends."""
 
@@ -77,30 +74,27 @@ def classify(
     doubt = _with(measured.noise, np.float32(HIDDEN[0]) * gap)
     below = _with(measured.noise_under, np.float32(HIDDEN[1] * vehicle.max_step) * patchy)
     shape, coarse = closed.shape, measured.noise.shape
-    load, excess = np.zeros(coarse, np.float32), np.full(coarse, -FARTHEST, np.float32)
+    blocks = np.empty((9, *coarse), np.float32)
+    load, excess = blocks[0], blocks[1]
+    load[:], excess[:] = 0.0, -FARTHEST
+    blocks[2], blocks[3], blocks[4], blocks[5] = measured.noise, doubt, measured.share, measured.blocks["roughness"]
+    for k, name in ((6, "slope"), (7, "tilt")):
+        np.arctan(measured.blocks[name], out=blocks[k])
+    np.subtract(np.float32(vehicle.clearance), measured.blocks["rise"], out=blocks[8])
     bits = np.zeros((2, *coarse), np.uint16)
     for name, values in measured.blocks.items():
         noise = (measured.noise, doubt) if name == "roughness" else (measured.noise_under, below)
         _hold_all(values, facts[name], *noise, load, excess, bits[0])
     bits[1] = np.where((measured.share < WHOLE) | (patchy > 0), UNSEEN_BIT, 0)
-    blocks = np.stack(
-        [
-            load, excess, measured.noise, doubt, measured.share, measured.blocks["roughness"],
-            np.arctan(measured.blocks["slope"]), np.arctan(measured.blocks["tilt"]),
-            np.float32(vehicle.clearance) - measured.blocks["rise"],
-        ]
-    )  # fmt: skip
     risk, reason = np.empty(shape, np.uint8), np.empty(shape, np.uint16)
     inclination, roughness, slope, tilt, clearance, p = (np.empty(shape, np.float32) for _ in range(6))
     marks = np.array([rules.caution, rules.max_p, rules.min_known], np.float32)
-    fine, n = np.stack([facts[name] for name in FINE]), measured.stride
-    for top in range(0, shape[0], n * max(1, BAND // n)):
-        bottom = min(top + n * max(1, BAND // n), shape[0])
-        _classify(
-            fine, np.float32(1.0 / measured.extent), measured.range, measured.step, closed, filled, blocks, bits, n,
-            marks, _table(), top, bottom, risk, reason, inclination, roughness, slope, tilt, clearance, p,
-        )  # fmt: skip
-        np.arctan(inclination[top:bottom], out=inclination[top:bottom])
+    _classify(
+        np.stack([facts[name] for name in FINE]), np.float32(1.0 / measured.extent), measured.range, measured.step,
+        closed, filled, blocks, bits, measured.stride, marks, _table(), risk, reason,
+        inclination, roughness, slope, tilt, clearance, p,
+    )  # fmt: skip
+    np.arctan(inclination, out=inclination)
     return {
         "risk": risk,
         "reason": reason,
@@ -174,25 +168,25 @@ def _hold_all(values, facts, noise, doubt, load, excess, bits):  # type: ignore[
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _classify(  # type: ignore[no-untyped-def]
-    facts, per_metre, height_range, step, closed, filled, blocks, bits, n, marks, table, first, bottom,
+    facts, per_metre, height_range, step, closed, filled, blocks, bits, n, marks, table,
     risk, reason, inclination, roughness, slope, tilt, clearance, p,
 ):  # fmt: skip
-    """Cells of rows ``first`` to ``bottom``, of each block of ``n`` x ``n``, by strips of whole blocks; ``bits``
-    (2, row, col) of the blocks' own hazards, and of any class."""
-    cols = risk.shape[1]
+    """Cells of each block of ``n`` x ``n``, by strips of whole blocks; ``bits`` (2, row, col) of the blocks' own
+    hazards, and of any class."""
+    rows, cols = risk.shape
     width = n * max(1, STRIP // n)
     wide = np.empty((blocks.shape[0], width), dtype=np.float32)
     own = np.empty((2, width), dtype=np.uint16)
     load, excess = np.empty(width, dtype=np.float32), np.empty(width, dtype=np.float32)
     place = np.empty(width, dtype=np.int32)
-    for top in range(first, bottom, n):
+    for top in range(0, rows, n):
         for left in range(0, cols, width):
             size, of = np.uint64(min(width, cols - left)), slice(left // n, left // n + width // n)
             for k in range(blocks.shape[0]):
                 _spread(blocks[k, top // n, of], n, wide[k])
             for k in range(2):
                 _spread(bits[k, top // n, of], n, own[k])
-            for row in range(top, min(top + n, bottom)):
+            for row in range(top, min(top + n, rows)):
                 r, at = np.uint64(row), np.uint64(left)
                 _load(facts, per_metre, height_range, step, wide, r, at, size, load)
                 _excess(facts, per_metre, height_range, step, wide, r, at, size, excess)
