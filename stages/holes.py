@@ -14,6 +14,9 @@ Flags = NDArray[np.uint8]
 LEAST_TRIALS = 8
 """Known cells nearby that must tell the error of an interpolation; with fewer, half the range of its rim stands in."""
 
+PART = 64
+"""Cells of a row that are passed over together where all are known."""
+
 
 def close_holes(
     elevation: Floats32,
@@ -95,7 +98,7 @@ def _candidates(z, half, least):  # type: ignore[no-untyped-def]
     out, m = np.empty(cols, dtype=np.int64), 0
     for r in range(-half, rows):
         _tally(z[r + half] if r + half < rows else nothing, z[r - half - 1] if r > half else nothing, total)
-        if r < 0 or not _any_unknown(z[r]):
+        if r < 0 or not _any_unknown(z, r, 0, cols):
             continue
         if m + cols > out.shape[0]:
             more = np.empty(2 * out.shape[0] + cols, dtype=np.int64)
@@ -103,10 +106,13 @@ def _candidates(z, half, least):  # type: ignore[no-untyped-def]
             out = more
         for c in range(1, cols + n):
             upto[c] = upto[c - 1] + line[c]
-        for c in range(cols):
-            if z[r, c] != z[r, c] and upto[c + n] - upto[c] >= least:
-                out[m] = r * cols + c
-                m += 1
+        for first in range(0, cols, PART):
+            end = min(first + PART, cols)
+            if _any_unknown(z, r, first, end):
+                for c in range(first, end):
+                    if z[r, c] != z[r, c] and upto[c + n] - upto[c] >= least:
+                        out[m] = r * cols + c
+                        m += 1
     return out[:m]
 
 
@@ -117,10 +123,10 @@ def _tally(enters, leaves, total):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _any_unknown(line):  # type: ignore[no-untyped-def]
-    unknown = np.int32(0)
-    for c in range(line.shape[0]):
-        unknown += np.int32(line[c] != line[c])
+def _any_unknown(z, r, first, end):  # type: ignore[no-untyped-def]
+    row, left, unknown = np.uint64(r), np.uint64(first), np.uint8(0)
+    for c in range(np.uint64(end - first)):
+        unknown |= np.uint8(z[row, left + c] != z[row, left + c])
     return unknown > 0
 
 
@@ -129,6 +135,7 @@ def _close(z_in, s_in, cells, max_gap, window, rim, z, s, filled):  # type: igno
     rows, cols = z_in.shape
     steps = np.array([[0, 1], [1, 0], [1, 1], [1, -1]])
     units = np.sqrt((steps * steps).sum(axis=1).astype(np.float64))
+    reaches = (max_gap / units + 1e-9).astype(np.int64)
     inverse = 1.0 / (units.reshape(4, 1) * np.arange(int(max_gap + 1e-9) + 2))
     lines = np.empty((4, 4), dtype=np.int64)
     weights = np.empty((4, 2))
@@ -141,8 +148,8 @@ def _close(z_in, s_in, cells, max_gap, window, rim, z, s, filled):  # type: igno
         low, high = np.inf, -np.inf
         used = 0
         for k in range(4):
-            dr, dc = steps[k]
-            reach, step = int(max_gap / units[k] + 1e-9), dr * cols + dc
+            dr, dc, reach = steps[k, 0], steps[k, 1], reaches[k]
+            step = dr * cols + dc
             # of either side the cells inside the map
             behind, ahead = (r, rows - 1 - r) if dr else (cols, cols)
             if dc > 0:
