@@ -33,11 +33,19 @@ class Canvas:
     @staticmethod
     def of(mask: Mask, border: int, outside: bool = False) -> Canvas:
         """A mask (row, col) on a canvas."""
-        rows, cols = mask.shape
+        return Canvas._around(np.packbits(mask, axis=1, bitorder="little"), mask.shape, border, outside)
+
+    @staticmethod
+    def outside(shape: tuple[int, ...], border: int) -> Canvas:
+        """A canvas of (row, col) cells of which none is set, in a border that is."""
+        return Canvas._around(np.zeros((shape[0], -(-shape[1] // 8)), dtype=np.uint8), shape, border, True)
+
+    @staticmethod
+    def _around(bits: NDArray[np.uint8], shape: tuple[int, ...], border: int, outside: bool) -> Canvas:
+        rows, cols = shape
         margin = -(-border // WORD)
         n = 2 * margin - (-cols // WORD)
         room = np.full((rows + 2 * border, 8 * n), 255 if outside else 0, dtype=np.uint8)
-        bits = np.packbits(mask, axis=1, bitorder="little")
         if outside and cols % 8:
             bits[:, -1] |= np.uint8(255 << cols % 8 & 255)
         room[border : border + rows, 8 * margin : 8 * margin + bits.shape[1]] = bits

@@ -119,7 +119,7 @@ class Stand:
             found = self._closed
         else:
             unknown = Canvas.of(self._unknown, self._border, outside=True)
-            beyond = unknown if below == "wheels" else Canvas.of(np.zeros_like(self._unknown), self._border, True)
+            beyond = unknown if below == "wheels" else Canvas.outside(self._unknown.shape, self._border)
             found = [
                 self._under(places, beyond, closed) for places, closed in zip(self._places, self._closed, strict=True)
             ]
