@@ -3,8 +3,8 @@
 python benchmarks/local_path.py [--rows 1300] [--cols 1500] [--rounds 20]
 
 The maps are exact elevations of the simulated bed, with 300 unknown patches of 8 x 8 cells and a standard deviation of
-0.3 mm, for the vehicle at its scale: with few rocks a path is found with the whole outline on known ground; with many
-there is none, and all three ways to stand on known ground are tried in vain, the longest that the row graph can take.
+0.3 mm, for the vehicle at its scale. A path is found with the whole outline on known ground, with few rocks and with
+many; where there is none, all three ways to stand on known ground are tried, which takes longer.
 """
 
 from __future__ import annotations

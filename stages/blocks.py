@@ -13,8 +13,13 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from stages.line import copy_line
+
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
+
+STRIP = 512
+"""Columns of cells that are worked on at a time, at most."""
 
 
 @dataclass(frozen=True)
@@ -48,59 +53,77 @@ def reduce_to_blocks(surface: Floats32, closed: Floats32, std: Floats32, n: int,
     return Blocks(high, low, *sums)
 
 
-def sum_around(a: Floats, n: int) -> Floats:
-    """Sum (row, col) over the n x n blocks around each, clipped at the border; n odd. Differences of prefix sums."""
-    out = np.empty_like(a)
-    _sum_around(a, n // 2, out)
-    return out
-
-
-@njit(cache=True, nogil=True)
-def _sum_around(a, half, out):  # type: ignore[no-untyped-def]
-    rows, cols = a.shape
-    down = np.zeros((rows + 1, cols))
-    for r in range(rows):
-        for c in range(cols):
-            down[r + 1, c] = down[r, c] + a[r, c]
-    along = np.zeros(cols + 1)
-    for r in range(rows):
-        first, last = down[max(r - half, 0)], down[min(r + half + 1, rows)]
-        for c in range(cols):
-            along[c + 1] = along[c] + (last[c] - first[c])
-        for c in range(cols):
-            out[r, c] = along[min(c + half + 1, cols)] - along[max(c - half, 0)]
-
-
 @njit(cache=True, nogil=True)
 def _reduce(z, closed, s, n, lag, high, low, count, variance, pairs, deviation):  # type: ignore[no-untyped-def]
+    """Each row of blocks by strips of whole blocks, whose lines stay in the innermost cache."""
     rows, cols = z.shape
-    floor = np.float32(-np.inf)
-    top, bottom = np.empty(cols, dtype=np.float32), np.empty(cols, dtype=np.float32)
-    known, met = np.empty(cols, dtype=np.float32), np.empty(cols, dtype=np.float32)
-    noise, apart = np.empty(cols), np.empty(cols)
-    nothing, line = np.full(cols, np.nan, dtype=np.float32), np.full(cols + 2 * lag, np.nan, dtype=np.float32)
+    width = n * max(1, STRIP // n)
+    top, bottom = np.empty(width, dtype=np.float32), np.empty(width, dtype=np.float32)
+    known, met = np.empty(width, dtype=np.float32), np.empty(width, dtype=np.float32)
+    noise, apart = np.empty(width), np.empty(width)
+    nothing, line = np.full(cols, np.nan, dtype=np.float32), np.empty(width + 2 * lag, dtype=np.float32)
     for i in range(high.shape[0]):
-        for c in range(cols):
-            top[c], bottom[c] = floor, -floor
-            known[c], met[c], noise[c], apart[c] = 0, 0, 0, 0
-        for r in range(i * n, min(i * n + n, rows)):
-            line[lag : lag + cols] = z[r]
-            _extremes(z[r], top, bottom)
-            _noise(closed[r], s[r], known, noise)
-            _apart(z[r], line[2 * lag :], line[:cols], apart, met)
-            _apart(z[r], z[r - lag] if r >= lag else nothing, z[r + lag] if r + lag < rows else nothing, apart, met)
-        for j in range(high.shape[1]):
-            a, b = floor, -floor
-            total, spread, both, far = 0.0, 0.0, 0.0, 0.0
-            for c in range(j * n, min(j * n + n, cols)):
-                a, b = max(a, top[c]), min(b, bottom[c])
-                total += known[c]
-                spread += noise[c]
-                both += met[c]
-                far += apart[c]
-            high[i, j] = a if a > floor else np.nan
-            low[i, j] = b if b < -floor else np.nan
-            count[i, j], variance[i, j], pairs[i, j], deviation[i, j] = total, spread, both, far
+        for left in range(0, cols, width):
+            right = min(left + width, cols)
+            size, strip = right - left, slice(left, right)
+            blocks = slice(left // n, left // n - (-size // n))
+            top[:], bottom[:], known[:], met[:], noise[:], apart[:] = -np.inf, np.inf, 0, 0, 0, 0
+            for r in range(i * n, min(i * n + n, rows)):
+                above, below = z[r - lag] if r >= lag else nothing, z[r + lag] if r + lag < rows else nothing
+                _surround(z[r], left - lag, line[: size + 2 * lag])
+                _extremes(z[r, strip], top, bottom)
+                _noise(closed[r, strip], s[r, strip], known, noise)
+                _apart(z[r, strip], line[2 * lag :], line, apart, met)
+                _apart(z[r, strip], above[strip], below[strip], apart, met)
+            _highest(top[:size], n, np.float32(1.0), high[i, blocks])
+            _highest(bottom[:size], n, np.float32(-1.0), low[i, blocks])
+            _total(known[:size], n, count[i, blocks])
+            _total(noise[:size], n, variance[i, blocks])
+            _total(met[:size], n, pairs[i, blocks])
+            _total(apart[:size], n, deviation[i, blocks])
+
+
+@njit(cache=True, nogil=True)
+def _surround(line, left, out):  # type: ignore[no-untyped-def]
+    """The line from column ``left`` on, NaN beyond its ends."""
+    first, end = max(left, 0), min(left + out.shape[0], line.shape[0])
+    out[: first - left] = np.nan
+    copy_line(line[first:end], out[first - left : end - left])
+    out[end - left :] = np.nan
+
+
+@njit(cache=True, nogil=True)
+def _highest(line, n, sign, out):  # type: ignore[no-untyped-def]
+    """Of each n columns the highest value, or the lowest with a negative sign; NaN where it is not finite."""
+    whole, first = line.shape[0] // n, 0
+    if n == 4:  # of a known number the compiler takes several blocks at once
+        for j in range(whole):
+            a, b, d, e = sign * line[4 * j], sign * line[4 * j + 1], sign * line[4 * j + 2], sign * line[4 * j + 3]
+            a, d = a if a > b else b, d if d > e else e
+            a = a if a > d else d
+            out[j] = sign * a if a > np.float32(-np.inf) else np.float32(np.nan)
+        first = whole
+    for j in range(first, out.shape[0]):
+        a = np.float32(-np.inf)
+        for c in range(j * n, min(j * n + n, line.shape[0])):
+            a = max(a, sign * line[c])
+        out[j] = sign * a if a > np.float32(-np.inf) else np.float32(np.nan)
+
+
+@njit(cache=True, nogil=True)
+def _total(line, n, out):  # type: ignore[no-untyped-def]
+    """Sum of each n columns, one after the other, in 64 bits."""
+    whole, first = line.shape[0] // n, 0
+    if n == 4:
+        for j in range(whole):
+            a, b = np.float64(line[4 * j]), np.float64(line[4 * j + 1])
+            out[j] = ((a + b) + np.float64(line[4 * j + 2])) + np.float64(line[4 * j + 3])
+        first = whole
+    for j in range(first, out.shape[0]):
+        total = 0.0
+        for c in range(j * n, min(j * n + n, line.shape[0])):
+            total += line[c]
+        out[j] = total
 
 
 @njit(cache=True, nogil=True)

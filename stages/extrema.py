@@ -15,10 +15,29 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from stages.extrema_lanes import (
+    LANES,
+    along_five,
+    along_nine,
+    along_seven,
+    along_three,
+    five,
+    median_row,
+    nine,
+    raise4,
+    seven,
+    three,
+)
+from stages.line import copy_line
+
 Floats32 = NDArray[np.float32]
 
-BAND = 128
-"""Rows worked on at a time: with the window's own they stay in a cache of 1 MB up to widths of 1500 cells."""
+BAND, STRIP = 32, 768
+"""Rows and columns worked on at a time, at most: rows of a window stay in the innermost cache, a band in the next."""
+
+SLACK = 8
+"""Columns beside: windows along a diagonal are found for four rows at once, from the same columns of the first one, so
+that up to three of the others are not; that happens twice along either diagonal."""
 
 
 def octagon(reach: int) -> tuple[int, int]:
@@ -69,80 +88,87 @@ def _running_max(z, f, side, diagonal, out):  # type: ignore[no-untyped-def]
     """``f`` times the maximum of ``f`` times z."""
     rows, cols = z.shape
     reach = side + 2 * diagonal
-    buffer, spare = _room(cols, reach)
-    for start in range(0, rows, BAND):
-        stop = min(start + BAND, rows)
-        n = _fill(z, f, start - reach, stop + reach, 2 * reach, buffer)
-        _widen(buffer, n, spare, side, diagonal)
-        first = 2 * reach - side
-        for i in range(stop - start):
-            target, line = out[start + i], buffer[i, first:]
-            for c in range(cols):
-                target[c] = f * line[c]
+    width, wide, buffer = _room(cols, reach)
+    passes = _passes(side, diagonal)
+    for left in range(0, cols, width):
+        for top in range(0, rows, BAND):
+            n = min(BAND, rows - top)
+            _fill(z, f, top - reach, n + 2 * reach, left - reach - SLACK, wide, buffer)
+            _all_along(buffer, 0, n + 2 * reach, wide, 2 * side + 1)
+            whole = n + 2 * reach
+            for k in range(passes.shape[0]):
+                whole = _pass(buffer, 0, whole, wide, passes[k])
+            first = reach + SLACK - side
+            for i in range(n):
+                line = out[top + i, left : min(left + width, cols)]
+                start = i * wide + first
+                _times(buffer[start : start + line.shape[0]], f, line)
 
 
 @njit(cache=True, nogil=True)
 def _relief(z, side, diagonal, more, steps, small, large):  # type: ignore[no-untyped-def]
-    """Of a band the highest values are written first, and the lowest ones taken from them."""
-    rows, cols = z.shape
-    near, added = side + 2 * diagonal, more + 2 * steps
-    reach = near + added
-    buffer, spare = _room(cols, reach)
-    for start in range(0, rows, BAND):
-        stop = min(start + BAND, rows)
-        for sign in (1.0, -1.0):
-            n = _fill(z, np.float32(sign), start - reach, stop + reach, 2 * reach, buffer)
-            n = _widen(buffer, n, spare, side, diagonal)
-            _emit(buffer[added:], 2 * reach - side, sign > 0, small[start:stop])
-            _widen(buffer, n, spare, more, steps)
-            _emit(buffer, 2 * reach - side - more, sign > 0, large[start:stop])
+    cols = z.shape[1]
+    width, wide, high = _room(cols, side + 2 * diagonal + more + 2 * steps)
+    low = np.empty_like(high)
+    for left in range(0, cols, width):
+        _relief_strip(z, side, diagonal, more, steps, left, min(left + width, cols), wide, high, low, small, large)
 
 
 @njit(cache=True, nogil=True)
-def _emit(buffer, first, highest, out):  # type: ignore[no-untyped-def]
-    rows, cols = out.shape
-    for i in range(rows):
-        target, line = out[i], buffer[i, first : first + cols]
-        if highest:
-            for c in range(cols):
-                target[c] = line[c]
-        else:
-            for c in range(cols):
-                d = target[c] + line[c]
-                target[c] = d if d > np.float32(0.0) else np.float32(0.0)
+def _relief_strip(z, side, diagonal, more, steps, left, right, wide, high, low, small, large):  # type: ignore[no-untyped-def]
+    """The highest values are written first, and the lowest ones taken from them.
+
+    Rows enter at the end of a band, and each pass goes on as far as it can: ``done`` rows of the band. What is whole
+    leaves at the top, and the rest moves up, so that no row is worked on twice.
+    """
+    rows = z.shape[0]
+    added = more + 2 * steps
+    reach = side + 2 * diagonal + added
+    inner, outer = _passes(side, diagonal), _passes(more, steps)
+    k = inner.shape[0]
+    done = np.zeros(k + outer.shape[0] + 1, dtype=np.int64)
+    after, top = np.zeros_like(done), 0
+    column, near = left - reach - SLACK, reach + SLACK - side
+    while top < rows:
+        after[0] = done[0] + min(BAND, rows + 2 * reach - top - done[0])
+        for sign, buffer in ((1.0, high), (-1.0, low)):
+            new = after[0] - done[0]
+            _fill(z, np.float32(sign), top - reach + done[0], new, column, wide, buffer[done[0] * wide :])
+            _all_along(buffer, done[0], after[0], wide, 2 * side + 1)
+            _advance(buffer, wide, inner, done[: k + 1], after[: k + 1])
+            first, end = max(done[k], added - top), min(after[k], rows + added - top)
+            if end > first:
+                start = top - added + first
+                _emit(buffer[first * wide + near :], wide, end - first, sign > 0, small, start, left, right)
+            _all_along(buffer, done[k], after[k], wide, 2 * more + 1)
+            _advance(buffer, wide, outer, done[k:], after[k:])
+            _emit(buffer[near - more :], wide, after[-1], sign > 0, large, top, left, right)
+            _move_up(buffer, after[-1] * wide, (after[0] - after[-1]) * wide)
+        top += after[-1]
+        done[:] = after - after[-1]
 
 
 @njit(cache=True, nogil=True)
 def _room(cols, reach):  # type: ignore[no-untyped-def]
-    """A band with room beside for all that moves along diagonals, and a line."""
-    wide = cols + 4 * reach
-    return np.empty((BAND + 2 * reach, wide), dtype=np.float32), np.empty(wide, dtype=np.float32)
+    """Columns of a strip, all of them about as wide; those of a band, with room beside for the window, and a band."""
+    width = -(-cols // -(-cols // STRIP))
+    wide = -(-(width + 2 * (reach + SLACK)) // LANES) * LANES
+    # a line more, since vectors that begin in the last one end there
+    return width, wide, np.empty((BAND + 2 * reach + 1) * wide, dtype=np.float32)
 
 
 @njit(cache=True, nogil=True)
-def _fill(z, f, first, last, left, buffer):  # type: ignore[no-untyped-def]
-    """``f`` times rows ``first`` to ``last`` of z, ``left`` columns to the right, -inf around; how many rows."""
+def _fill(z, f, first, n, left, wide, buffer):  # type: ignore[no-untyped-def]
+    """``f`` times ``n`` rows of z from row ``first`` and column ``left`` on, -inf around."""
     rows, cols = z.shape
-    for i in range(last - first):
-        line = buffer[i]
-        for c in range(line.shape[0]):
-            line[c] = -np.inf
-        if 0 <= first + i < rows:
-            _load(z[first + i], f, line[left : left + cols])
-    return last - first
-
-
-@njit(cache=True, nogil=True)
-def _widen(buffer, n, spare, side, diagonal):  # type: ignore[no-untyped-def]
-    """Maximum over the square and both diagonals, of ``n`` rows; returns how many are whole.
-
-    Results move up by ``side + 2 diagonal`` rows and to the left by ``side`` columns.
-    """
+    begin, end = max(left, 0), min(left + wide, cols)
     for i in range(n):
-        _double(buffer[i], spare, 2 * side + 1)
-    n = _down(buffer, n, 2 * side + 1, 0)
-    n = _down(buffer, n, 2 * diagonal + 1, 1)
-    return _down(buffer, n, 2 * diagonal + 1, -1)
+        line = buffer[i * wide : i * wide + wide]
+        inside = 0 <= first + i < rows
+        line[: begin - left if inside else wide] = -np.inf
+        if inside:
+            _load(z[first + i, begin:end], f, line[begin - left : end - left])
+            line[end - left :] = -np.inf
 
 
 @njit(cache=True, nogil=True)
@@ -154,61 +180,124 @@ def _load(source, f, out):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _raise(line, other):  # type: ignore[no-untyped-def]
-    """The greater of two lines, cell by cell, in place of the first; they must not overlap, or wait for each other."""
-    for c in range(line.shape[0]):
-        a, b = line[c], other[c]
-        line[c] = a if a > b else b
+def _times(source, f, out):  # type: ignore[no-untyped-def]
+    for c in range(out.shape[0]):
+        out[c] = f * source[c]
 
 
 @njit(cache=True, nogil=True)
-def _raise4(line, p, q, s):  # type: ignore[no-untyped-def]
-    """The greatest of four lines in place of the first."""
-    for c in range(line.shape[0]):
-        a, b, d, e = line[c], p[c], q[c], s[c]
-        a = a if a > b else b
-        d = d if d > e else e
-        line[c] = a if a > d else d
+def _emit(buffer, wide, n, highest, out, first, left, right):  # type: ignore[no-untyped-def]
+    """``n`` rows of the buffer become those of the result from row ``first`` on, in columns ``left`` to ``right``."""
+    for i in range(n):
+        target, line = out[first + i, left:right], buffer[i * wide : i * wide + right - left]
+        if highest:
+            copy_line(line, target)
+        else:
+            for c in range(target.shape[0]):
+                d = target[c] + line[c]
+                target[c] = d if d > np.float32(0.0) else np.float32(0.0)
 
 
 @njit(cache=True, nogil=True)
-def _double(line, spare, n):  # type: ignore[no-untyped-def]
-    """Maximum of c .. c + n - 1 in place; the last n - 1 values are of what is left."""
-    m = line.shape[0]
-    w = 1
-    while w < n:
-        step = min(w, n - w)
-        for c in range(m):
-            spare[c] = line[c]
-        _raise(line[: m - step], spare[step:])
-        w += step
+def _move_up(buffer, by, n):  # type: ignore[no-untyped-def]
+    """To the start what comes ``by`` cells later."""
+    for c in range(0, n if by else 0, max(by, 1)):
+        size = min(by, n - c)
+        copy_line(buffer[c + by : c + by + size], buffer[c : c + size])
 
 
 @njit(cache=True, nogil=True)
-def _down(buffer, rows, n, slant):  # type: ignore[no-untyped-def]
-    """The same down the rows, ``slant`` columns to the right a row; returns how many rows are whole.
+def _passes(side, diagonal):  # type: ignore[no-untyped-def]
+    """Down the rows of a square, and along both diagonals: rows of the window; rows of those that it is made of;
+    columns to the right a row.
 
-    Windows of w rows make one of up to 4 w rows in one pass: each pass goes through the slower cache.
+    Windows of w rows make one of up to 4 w rows in one pass: each pass goes through the slower cache. Windows of up to
+    nine rows, which are odd, take one, marked by w = 0.
     """
-    cols = buffer.shape[1]
+    out, m = np.empty((99, 3), dtype=np.int64), 0
+    for n, slant in ((2 * side + 1, 0), (2 * diagonal + 1, 1), (2 * diagonal + 1, -1)):
+        w = 1
+        while w < n:
+            fours = n <= 9
+            out[m, 0], out[m, 1], out[m, 2] = n, 0 if fours else w, slant
+            m += 1
+            w = n if fours else w + min(3 * w, n - w)
+    return out[:m]
+
+
+@njit(cache=True, nogil=True)
+def _advance(buffer, wide, passes, done, after):  # type: ignore[no-untyped-def]
+    """Each pass over the rows that the one before has done and it has not."""
+    for k in range(passes.shape[0]):
+        after[k + 1] = _pass(buffer, done[k + 1], after[k], wide, passes[k])
+
+
+@njit(cache=True, nogil=True)
+def _all_along(buffer, first, last, wide, n):  # type: ignore[no-untyped-def]
+    """Maximum of c .. c + n - 1 of some rows, in place; at the ends of rows something else."""
+    if n > 9:
+        _far_along(buffer, first, last, wide, n)
+        return
+    for i in range(first, last):
+        if n == 9:
+            along_nine(buffer, i * wide, wide // LANES)
+        elif n == 7:
+            along_seven(buffer, i * wide, wide // LANES)
+        elif n == 5:
+            along_five(buffer, i * wide, wide // LANES)
+        elif n == 3:
+            along_three(buffer, i * wide, wide // LANES)
+
+
+@njit(cache=True, nogil=True)
+def _far_along(buffer, first, last, wide, n):  # type: ignore[no-untyped-def]
+    """The same for any window: those of w make one of up to 4 w at once."""
     w = 1
     while w < n:
-        s1 = min(w, n - w)
-        s2 = min(2 * w, n - w)
-        s3 = min(3 * w, n - w)
-        far = s3 * slant
-        first, last = max(0, -far), min(cols, cols - far)
-        for i in range(rows - s3):
-            line = buffer[i, first:last]
-            a = buffer[i + s1, first + s1 * slant : last + s1 * slant]
-            if s3 == s1:
-                _raise(line, a)
-                continue
-            b = buffer[i + s2, first + s2 * slant : last + s2 * slant]
-            _raise4(line, a, b, buffer[i + s3, first + far : last + far])
-        rows -= s3
+        s1, s2, s3 = min(w, n - w), min(2 * w, n - w), min(3 * w, n - w)
+        for at in range(first * wide, last * wide, LANES):
+            raise4(buffer, at, s1, s2, s3)
         w += s3
-    return rows
+
+
+@njit(cache=True, nogil=True)
+def _pass(buffer, first, last, wide, kind):  # type: ignore[no-untyped-def]
+    """One of :func:`_passes` from row ``first`` to ``last``, in place; returns where what is whole ends.
+
+    Results move up by half of the window.
+    """
+    n, w, slant = kind
+    if w == 0:
+        return _by_fours(buffer, first, last, wide, n, wide + slant)
+    s1, s2, s3 = min(w, n - w), min(2 * w, n - w), min(3 * w, n - w)
+    step = wide + slant
+    end = max(last - s3, first)
+    for at in range(first * wide, end * wide, LANES):
+        raise4(buffer, at, s1 * step, s2 * step, s3 * step)
+    return end
+
+
+@njit(cache=True, nogil=True)
+def _by_fours(buffer, first, last, wide, n, step):  # type: ignore[no-untyped-def]
+    """The same for an odd window of 3 to 9 rows: four windows below each other share all but three of them."""
+    i = first
+    while i + n + 3 <= last:
+        for at in range(i * wide, i * wide + wide, LANES):
+            if n == 9:
+                nine(buffer, at, step)
+            elif n == 7:
+                seven(buffer, at, step)
+            elif n == 5:
+                five(buffer, at, step)
+            else:
+                three(buffer, at, step)
+        i += 4
+    while i + n <= last:
+        for at in range(i * wide, i * wide + wide, LANES):
+            for k in range(1, n):
+                raise4(buffer, at, k * step, k * step, k * step)
+        i += 1
+    return i
 
 
 def median3(surface: Floats32) -> Floats32:
@@ -217,61 +306,30 @@ def median3(surface: Floats32) -> Floats32:
     Of an even number the upper one: the mean of two heights would not be one of the heights.
     """
     out = np.empty(surface.shape, dtype=np.float32)
-    _median3(surface, out)
+    _median3(np.ascontiguousarray(surface), out)
     return out
 
 
 @njit(cache=True, nogil=True)
 def _median3(z, out):  # type: ignore[no-untyped-def]
+    """Whole vectors from the second column on, the last one from behind; what they cannot tell goes one by one."""
     rows, cols = z.shape
-    low, middle = np.empty(cols, dtype=np.float32), np.empty(cols, dtype=np.float32)
-    high, total = np.empty(cols, dtype=np.float32), np.empty(cols, dtype=np.float32)
-    patchy = np.ones(8 * -(-cols // 8), dtype=np.uint8)
+    flat, found = z.reshape(-1), out.reshape(-1)
+    vectors = (cols - 2) // LANES
+    patchy = np.ones((cols + 2 * LANES + 7) // 8 * 8, dtype=np.uint8)
     eight = patchy.view(np.uint64)
     for r in range(rows):
         here, line = z[r], out[r]
-        if 0 < r < rows - 1:
-            _sort_columns(z[r - 1], here, z[r + 1], low, middle, high, total)
-            _median_row(here, low, middle, high, total, line, patchy)
-        else:
-            patchy[:] = 1
+        patchy[:] = 1
+        if 0 < r < rows - 1 and vectors:
+            last = cols - 1 - LANES
+            median_row(flat, r * cols + 1, cols, vectors, found, r * cols + 1, patchy[1:])
+            median_row(flat, r * cols + last, cols, 1, found, r * cols + last, patchy[last:])
         for k in range(eight.shape[0]):
             if eight[k]:
                 for c in range(8 * k, min(8 * k + 8, cols)):
                     if patchy[c]:
                         line[c] = np.nan if np.isnan(here[c]) else _median_known(z, r, c)
-
-
-@njit(cache=True, nogil=True)
-def _sort_columns(up, here, down, low, middle, high, total):  # type: ignore[no-untyped-def]
-    """Three heights of each column in order, and their sum, which is not known where one is not."""
-    for c in range(here.shape[0]):
-        a, b, d = up[c], here[c], down[c]
-        lo, hi = min(a, b), max(a, b)
-        low[c], high[c] = min(lo, d), max(hi, d)
-        middle[c] = max(min(hi, d), lo)
-    for c in range(here.shape[0]):
-        total[c] = up[c] + here[c] + down[c]
-
-
-@njit(cache=True, nogil=True)
-def _median_row(here, low, middle, high, total, out, patchy):  # type: ignore[no-untyped-def]
-    """Median of nine from sorted columns (Paeth, Graphics Gems, 1990), NaN where the cell is unknown; where another of
-    the nine is, or does not exist, ``patchy`` is set."""
-    n = here.shape[0] - 2
-    for c in range(1, n + 1):
-        x = max(max(low[c - 1], low[c]), low[c + 1])
-        y = min(min(high[c - 1], high[c]), high[c + 1])
-        a, b = middle[c - 1], middle[c]
-        lo, hi = min(a, b), max(a, b)
-        m = max(min(hi, middle[c + 1]), lo)
-        lo, hi = min(x, m), max(x, m)
-        median = max(min(hi, y), lo)
-        out[c] = median if here[c] == here[c] else np.float32(np.nan)
-    for c in range(1, n + 1):
-        known = total[c - 1] + total[c] + total[c + 1]
-        patchy[c] = (known != known) & (here[c] == here[c])
-    patchy[0] = patchy[n + 1] = 1
 
 
 @njit(cache=True, nogil=True)

@@ -43,10 +43,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.blocks import reduce_to_blocks, sum_around
+from stages.blocks import reduce_to_blocks
 from stages.extrema import median3, relief
 from stages.placement import place, stride
 from stages.vehicle import Vehicle
+from stages.windows import window_sum
 
 Floats32 = NDArray[np.float32]
 
@@ -134,10 +135,10 @@ def measure(
     blocks = reduce_to_blocks(surface, closed, elevation_std, n, lag)
     around = 2 * round(reach / n) + 1
     sums = (blocks.count, blocks.variance, blocks.pairs, blocks.deviation)
-    count, square, number, deviation = (sum_around(a, around) for a in sums)
+    count, square, number, deviation = (window_sum(a, around) for a in sums)
     places = place(blocks.high, blocks.low, vehicle, n * cell, blocks.count > n * n - 0.5)
     wide = 2 * round((vehicle.half_length + vehicle.half_width) / (2.0 * n * cell)) + 1
-    under = np.sqrt(sum_around(blocks.variance, wide) / np.maximum(sum_around(blocks.count, wide), 1.0))
+    under = np.sqrt(window_sum(blocks.variance, wide) / np.maximum(window_sum(blocks.count, wide), 1.0))
     values = {
         "roughness": np.sqrt(0.5 * deviation / np.maximum(number, 1.0)).astype(np.float32),
         "slope": places.slope,

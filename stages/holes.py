@@ -14,6 +14,9 @@ Flags = NDArray[np.uint8]
 LEAST_TRIALS = 8
 """Known cells nearby that must tell the error of an interpolation; with fewer, half the range of its rim stands in."""
 
+PART = 64
+"""Cells of a row that are passed over together where all are known."""
+
 
 def close_holes(
     elevation: Floats32,
@@ -65,7 +68,17 @@ def close_into(
     filled = np.zeros(elevation.shape, dtype=np.uint8)
     cells = candidates(elevation, n, min_known)
     if len(cells) and max_gap > 0:
-        _close(elevation, s, cells, float(max_gap), n // 2 if judged else 0, rim, z, s, filled)
+        _close(
+            np.ascontiguousarray(elevation),
+            np.ascontiguousarray(s),
+            cells,
+            float(max_gap),
+            n // 2 if judged else 0,
+            rim,
+            z,
+            s,
+            filled,
+        )
     return filled
 
 
@@ -81,14 +94,11 @@ def _candidates(z, half, least):  # type: ignore[no-untyped-def]
     n = 2 * half + 1
     line = np.zeros(cols + n, dtype=np.int32)  # behind the line's start and beyond its end there is nothing
     total = line[half + 1 : half + 1 + cols]
-    upto = np.zeros(cols + n, dtype=np.int32)
+    upto, nothing = np.zeros(cols + n, dtype=np.int32), np.full(cols, np.nan, dtype=z.dtype)
     out, m = np.empty(cols, dtype=np.int64), 0
     for r in range(-half, rows):
-        if r + half < rows:
-            _tally(z[r + half], np.int32(1), total)
-        if r > half:
-            _tally(z[r - half - 1], np.int32(-1), total)
-        if r < 0 or not _any_unknown(z[r]):
+        _tally(z[r + half] if r + half < rows else nothing, z[r - half - 1] if r > half else nothing, total)
+        if r < 0 or not _any_unknown(z, r, 0, cols):
             continue
         if m + cols > out.shape[0]:
             more = np.empty(2 * out.shape[0] + cols, dtype=np.int64)
@@ -96,33 +106,40 @@ def _candidates(z, half, least):  # type: ignore[no-untyped-def]
             out = more
         for c in range(1, cols + n):
             upto[c] = upto[c - 1] + line[c]
-        for c in range(cols):
-            if z[r, c] != z[r, c] and upto[c + n] - upto[c] >= least:
-                out[m] = r * cols + c
-                m += 1
+        for first in range(0, cols, PART):
+            end = min(first + PART, cols)
+            if _any_unknown(z, r, first, end):
+                for c in range(first, end):
+                    if z[r, c] != z[r, c] and upto[c + n] - upto[c] >= least:
+                        out[m] = r * cols + c
+                        m += 1
     return out[:m]
 
 
 @njit(cache=True, nogil=True)
-def _tally(line, sign, total):  # type: ignore[no-untyped-def]
-    for c in range(line.shape[0]):
-        total[c] += sign if line[c] == line[c] else np.int32(0)
+def _tally(enters, leaves, total):  # type: ignore[no-untyped-def]
+    for c in range(total.shape[0]):
+        total[c] += np.int32(enters[c] == enters[c]) - np.int32(leaves[c] == leaves[c])
 
 
 @njit(cache=True, nogil=True)
-def _any_unknown(line):  # type: ignore[no-untyped-def]
-    unknown = np.int32(0)
-    for c in range(line.shape[0]):
-        unknown += np.int32(line[c] != line[c])
+def _any_unknown(z, r, first, end):  # type: ignore[no-untyped-def]
+    row, left, unknown = np.uint64(r), np.uint64(first), np.uint8(0)
+    for c in range(np.uint64(end - first)):
+        unknown |= np.uint8(z[row, left + c] != z[row, left + c])
     return unknown > 0
 
 
 @njit(cache=True, nogil=True)
 def _close(z_in, s_in, cells, max_gap, window, rim, z, s, filled):  # type: ignore[no-untyped-def]
     rows, cols = z_in.shape
-    steps = ((0, 1), (1, 0), (1, 1), (1, -1))
+    steps = np.array([[0, 1], [1, 0], [1, 1], [1, -1]])
+    units = np.sqrt((steps * steps).sum(axis=1).astype(np.float64))
+    reaches = (max_gap / units + 1e-9).astype(np.int64)
+    inverse = 1.0 / (units.reshape(4, 1) * np.arange(int(max_gap + 1e-9) + 2))
     lines = np.empty((4, 4), dtype=np.int64)
     weights = np.empty((4, 2))
+    heights, noise = z_in.reshape(-1), s_in.reshape(-1)
     for at in cells:
         r, c = at // cols, at % cols
         total = 0.0
@@ -130,33 +147,32 @@ def _close(z_in, s_in, cells, max_gap, window, rim, z, s, filled):  # type: igno
         worst = 0.0
         low, high = np.inf, -np.inf
         used = 0
-        for dr, dc in steps:
-            unit = math.sqrt(float(dr * dr + dc * dc))
-            reach = int(max_gap / unit + 1e-9)
-            a = 1
-            while a <= reach:
-                ra, ca = r - a * dr, c - a * dc
-                if ra < 0 or ca < 0 or ca >= cols or not math.isnan(z_in[ra, ca]):
-                    break
+        for k in range(4):
+            dr, dc, reach = steps[k, 0], steps[k, 1], reaches[k]
+            step = dr * cols + dc
+            # of either side the cells inside the map
+            behind, ahead = (r, rows - 1 - r) if dr else (cols, cols)
+            if dc > 0:
+                behind, ahead = min(behind, c), min(ahead, cols - 1 - c)
+            elif dc < 0:
+                behind, ahead = min(behind, cols - 1 - c), min(ahead, c)
+            most, a = min(reach, behind), 1
+            while a <= most and math.isnan(heights[at - a * step]):
                 a += 1
-            ra, ca = r - a * dr, c - a * dc
-            if a > reach or ra < 0 or ca < 0 or ca >= cols:
+            if a > most:
                 continue
             # a + b - 1 cells of the line are unknown
-            b = 1
-            while a + b - 1 <= reach:
-                rb, cb = r + b * dr, c + b * dc
-                if rb >= rows or cb < 0 or cb >= cols or not math.isnan(z_in[rb, cb]):
-                    break
+            most, b = min(reach - a + 1, ahead), 1
+            while b <= most and math.isnan(heights[at + b * step]):
                 b += 1
-            rb, cb = r + b * dr, c + b * dc
-            if a + b - 1 > reach or rb >= rows or cb < 0 or cb >= cols:
+            if b > most:
                 continue
-            wa, wb = 1.0 / (a * unit), 1.0 / (b * unit)
-            total += wa * z_in[ra, ca] + wb * z_in[rb, cb]
+            p, q = at - a * step, at + b * step
+            wa, wb = inverse[k, a], inverse[k, b]
+            total += wa * heights[p] + wb * heights[q]
             weight += wa + wb
-            worst = max(worst, s_in[ra, ca], s_in[rb, cb])
-            low, high = min(low, z_in[ra, ca], z_in[rb, cb]), max(high, z_in[ra, ca], z_in[rb, cb])
+            worst = max(worst, noise[p], noise[q])
+            low, high = min(low, heights[p], heights[q]), max(high, heights[p], heights[q])
             lines[used, 0], lines[used, 1], lines[used, 2], lines[used, 3] = dr, dc, a, b
             weights[used, 0], weights[used, 1] = wa, wb
             used += 1

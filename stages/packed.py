@@ -33,11 +33,19 @@ class Canvas:
     @staticmethod
     def of(mask: Mask, border: int, outside: bool = False) -> Canvas:
         """A mask (row, col) on a canvas."""
-        rows, cols = mask.shape
+        return Canvas._around(np.packbits(mask, axis=1, bitorder="little"), mask.shape, border, outside)
+
+    @staticmethod
+    def outside(shape: tuple[int, ...], border: int) -> Canvas:
+        """A canvas of (row, col) cells of which none is set, in a border that is."""
+        return Canvas._around(np.zeros((shape[0], -(-shape[1] // 8)), dtype=np.uint8), shape, border, True)
+
+    @staticmethod
+    def _around(bits: NDArray[np.uint8], shape: tuple[int, ...], border: int, outside: bool) -> Canvas:
+        rows, cols = shape
         margin = -(-border // WORD)
         n = 2 * margin - (-cols // WORD)
         room = np.full((rows + 2 * border, 8 * n), 255 if outside else 0, dtype=np.uint8)
-        bits = np.packbits(mask, axis=1, bitorder="little")
         if outside and cols % 8:
             bits[:, -1] |= np.uint8(255 << cols % 8 & 255)
         room[border : border + rows, 8 * margin : 8 * margin + bits.shape[1]] = bits
@@ -57,21 +65,35 @@ class Canvas:
         return Canvas(self.words.copy(), self.border, self.rows, self.cols)
 
     def spread(self, n: int, dr: int, dc: int) -> None:
-        """Set what lies up to ``n`` steps of (row, col) before or behind a set cell."""
-        for sign in (1, -1):
-            left, w = n, 1  # what is set within w - 1 steps has been
-            while left > 0:
-                k = min(w, left)
-                _shift(self.words, self.words, sign * k * dr, sign * k * dc)
-                left, w = left - k, w + k
+        """Set what lies up to ``n`` steps of (row, col) before or behind a set cell.
+
+        All that is spread on one canvas together may be no more than its border.
+        """
+        if n > 0:
+            words = self.words.reshape(-1)
+            _spread(words, np.empty_like(words), n, self._offset(dr, dc))
 
     def join(self, other: Canvas) -> None:
         """Set what is set on a canvas with the same border."""
         np.bitwise_or(self.words, other.words, out=self.words)
 
     def add(self, other: Canvas, dr: int, dc: int) -> None:
-        """Set what lies (row, col) from a set cell of a canvas with the same border; nothing comes from beyond it."""
-        _shift(other.words, self.words, dr, dc)
+        """Set what lies (row, col), at most the border, from a set cell of another canvas with the same border."""
+        _add(other.words.reshape(-1), self.words.reshape(-1), self._offset(dr, dc))
+
+    def clear_border(self) -> None:
+        """Nothing is set outside any more."""
+        self.words[: self.border] = 0
+        self.words[self.border + self.rows :] = 0
+        first = -(-self.border // WORD)
+        last = first + self.cols // WORD
+        self.words[:, :first] = 0
+        self.words[:, last] &= np.uint64((1 << self.cols % WORD) - 1)
+        self.words[:, last + 1 :] = 0
+
+    def _offset(self, dr: int, dc: int) -> int:
+        """Bits from a cell to the one (row, col) from it, where rows follow each other."""
+        return dr * int(self.words.shape[1]) * WORD + dc
 
 
 def codes(canvases: Sequence[Canvas], bits: Sequence[int]) -> NDArray[np.uint8]:
@@ -102,38 +124,54 @@ def _codes(p, q, s, t, bits, border, first, out):  # type: ignore[no-untyped-def
                 line[k] = np.uint8(x | y)
 
 
-@njit(cache=True, nogil=True)
-def _shift(source, out, dr, dc):  # type: ignore[no-untyped-def]
-    """``out |= source`` moved by (dr, dc); they may be one: rows are taken in an order that reads each before it
-    changes."""
-    rows, n = source.shape
-    line = np.empty(n, dtype=np.uint64)
-    for i in range(rows):
-        r = rows - 1 - i if dr > 0 else i
-        if not 0 <= r - dr < rows:
-            continue
-        for c in range(n):
-            line[c] = source[r - dr, c]
-        _shift_line(line, out[r], dc)
+# Rows follow each other, so that a canvas is moved as one line: what leaves a row arrives in the border of the next
+# one, and from there nothing gets inside.
 
 
 @njit(cache=True, nogil=True)
-def _shift_line(line, out, dc):  # type: ignore[no-untyped-def]
-    n = line.shape[0]
-    whole, bits = abs(dc) // WORD, np.uint64(abs(dc) % WORD)
-    rest = np.uint64(WORD) - bits
-    m = n - whole
-    if m <= 0:
+def _spread(words, spare, n, offset):  # type: ignore[no-untyped-def]
+    """Ahead by 0 .. n offsets, by doubling; then behind, from what is n behind."""
+    a, b = words, spare
+    reach, swaps = 0, 0
+    while reach < n:
+        k = min(reach + 1, n - reach)
+        _copy(a, b)
+        _add(a, b, k * offset)
+        a, b = b, a
+        reach, swaps = reach + k, swaps + 1
+    _copy(a, b)
+    _add(a, b, -n * offset)
+    if swaps % 2 == 1:
         return
-    if dc >= 0:
-        target, source = out[whole:], line[:m]
-        for c in range(m):
-            target[c] |= source[c] << bits
-        for c in range(1, m if bits else 0):
-            target[c] |= source[c - 1] >> rest
-    else:
-        target, source = out[:m], line[whole:]
-        for c in range(m):
-            target[c] |= source[c] >> bits
-        for c in range(m - 1 if bits else 0):
-            target[c] |= source[c + 1] << rest
+    _copy(b, a)
+
+
+@njit(cache=True, nogil=True)
+def _copy(source, out):  # type: ignore[no-untyped-def]
+    for i in range(source.shape[0]):
+        out[i] = source[i]
+
+
+@njit(cache=True, nogil=True)
+def _add(source, out, offset):  # type: ignore[no-untyped-def]
+    """``out |= source`` moved by ``offset`` bits; two arrays."""
+    n = source.shape[0]
+    whole, bits = offset // WORD, np.uint64(offset % WORD)
+    first, last = max(whole, 0), min(n + whole, n)
+    if last <= first:
+        return
+    target, high = out[first:last], source[first - whole : last - whole]
+    if not bits:
+        for i in range(target.shape[0]):
+            target[i] |= high[i]
+        return
+    rest = np.uint64(WORD) - bits
+    target[0] |= high[0] << bits
+    if first - whole > 0:
+        target[0] |= source[first - whole - 1] >> rest
+    below = high[: high.shape[0] - 1]
+    target, high = target[1:], high[1:]
+    for i in range(target.shape[0]):
+        target[i] |= high[i] << bits | below[i] >> rest
+    if last < n:
+        out[last] |= source[n - 1] >> rest

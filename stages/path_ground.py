@@ -68,25 +68,21 @@ class Ground:
         self.grid, self.unit = grid, unit
         risk = grid.sample(lattice, maps["risk"], UNKNOWN)
         reason = grid.sample(lattice, maps["reason"], 0)
-        chance = grid.sample(lattice, maps["p_hazard"], np.nan) if "p_hazard" in maps else None
-        unknown, self.closed, wheels, body = (np.empty(risk.shape, dtype=np.bool_) for _ in range(4))
-        _hazards(risk, reason, WHEEL_BITS, BODY_BITS, wheels, body)
-        if chance is None:
-            np.equal(risk, UNKNOWN, out=unknown)
-            np.greater_equal(risk, HAZARDOUS, out=self.closed)
-        else:
-            _closed(risk, chance, np.float32(sure if sure < 1 else np.inf), unknown, self.closed)
-        self._stand = Stand(wheels, body, vehicle, grid.cell, unknown, self.closed)
+        known = "p_hazard" in maps
+        chance = grid.sample(lattice, maps["p_hazard"], np.nan) if known else np.zeros(risk.shape, np.float32)
         mean = window_mean(maps["elevation"], window_cells(vehicle.wheel_diameter, lattice.cell))
         self.stand = grid.sample(lattice, mean, np.nan)
+        unknown, self.closed, wheels, body = (np.empty(risk.shape, dtype=np.bool_) for _ in range(4))
         toll = round(caution * grid.cell / unit)
         dearest = toll + round(doubt * grid.cell / unit)
         self.height: Ints = np.empty(risk.shape, dtype=np.int32)
-        self.toll: Ints = np.zeros(risk.shape, dtype=np.int16 if dearest <= np.iinfo(np.int16).max else np.int64)
-        if doubt > 0 and chance is not None:
-            _doubt(chance, np.float32(doubt * grid.cell / unit), self.toll)
-        if _price(self.stand, risk, np.float32(unit), toll, self.height, self.toll) > LARGE:
+        self.toll: Ints = np.empty(risk.shape, dtype=np.int16 if dearest <= np.iinfo(np.int16).max else np.int64)
+        prices = np.float32(unit), toll, np.float32(doubt * grid.cell / unit)
+        limit = np.float32(sure if sure < 1 else np.inf)
+        if _lay(risk, reason, chance, self.stand, limit, *prices, unknown, self.closed, wheels, body, self.height,
+                self.toll):  # fmt: skip
             self.height = np.rint(np.where(self.closed, np.float32(0), self.stand) / np.float32(unit)).astype(np.int64)
+        self._stand = Stand(wheels, body, vehicle, grid.cell, unknown, self.closed)
         self._ways: dict[str, Bytes] = {}
         self._parts: dict[str, tuple[NDArray[np.int32], Ints]] = {}
 
@@ -120,46 +116,27 @@ class Ground:
         return np.column_stack([self.grid.xy(row, col), self.stand[row, col]])
 
 
-@njit(cache=True, nogil=True)
-def _hazards(risk, reason, wheel_bits, body_bits, wheels, body):  # type: ignore[no-untyped-def]
-    """Masks of what is hazardous to a wheel, and to the vehicle as a whole."""
-    for r in range(risk.shape[0]):
-        for c in range(risk.shape[1]):
-            hazard = risk[r, c] == HAZARDOUS
-            wheels[r, c] = hazard & (reason[r, c] & wheel_bits != 0)
-            body[r, c] = hazard & (reason[r, c] & body_bits != 0)
-
-
-@njit(cache=True, nogil=True)
-def _closed(risk, chance, sure, unknown, closed):  # type: ignore[no-untyped-def]
-    """Masks of unknown ground, and of all that is not entered."""
+@njit(cache=True, nogil=True, error_model="numpy")
+def _lay(risk, reason, chance, stand, sure, unit, caution, doubt, unknown, closed, wheels, body, height, toll):  # type: ignore[no-untyped-def]
+    """Masks of unknown ground, of all that is not entered, and of what is hazardous to a wheel and to the vehicle as a
+    whole; heights in units and tolls. Returns whether some height is too large."""
+    large = np.uint8(0)
     for r in range(risk.shape[0]):
         for c in range(risk.shape[1]):
             unknown[r, c] = risk[r, c] == UNKNOWN
             closed[r, c] = (risk[r, c] >= HAZARDOUS) | (chance[r, c] > sure)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _price(stand, risk, unit, caution, height, toll):  # type: ignore[no-untyped-def]
-    """Heights in units and tolls; returns the greatest magnitude of a height."""
-    most = np.float32(0.0)
-    for r in range(risk.shape[0]):
         for c in range(risk.shape[1]):
-            kind = risk[r, c]
-            v = np.rint(stand[r, c] / unit) if kind < HAZARDOUS else np.float32(0.0)
-            most = max(most, abs(v))
+            wheels[r, c] = (risk[r, c] == HAZARDOUS) & (reason[r, c] & WHEEL_BITS != 0)
+            body[r, c] = (risk[r, c] == HAZARDOUS) & (reason[r, c] & BODY_BITS != 0)
+        for c in range(risk.shape[1]):
+            v = np.rint(stand[r, c] / unit) if risk[r, c] < HAZARDOUS else np.float32(0.0)
             height[r, c] = np.int32(v)
-            toll[r, c] += caution if kind == CAUTION else 0
-    return most
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _doubt(probability, price, toll):  # type: ignore[no-untyped-def]
-    """Tolls of ground that may be a hazard; none where nothing is known of it, which is closed."""
-    for r in range(toll.shape[0]):
-        for c in range(toll.shape[1]):
-            p = probability[r, c]
-            toll[r, c] = np.int64(np.rint(price * p)) if p > 0 else 0
+            large |= np.uint8(abs(v) > np.float32(LARGE))
+        for c in range(risk.shape[1]):
+            # where nothing is known of it, which is closed, there is none of doubt
+            p = chance[r, c] if chance[r, c] > np.float32(0.0) else np.float32(0.0)
+            toll[r, c] = np.int64(np.rint(doubt * p)) + (caution if risk[r, c] == CAUTION else 0)
+    return large > 0
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

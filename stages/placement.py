@@ -133,72 +133,83 @@ def place(
         np.pad(np.where(np.isfinite(a), a, np.float32(np.nan)), reach, constant_values=np.nan)
         for a in (stand, ground, belly)
     ]
-    padded += [np.pad(a.astype(np.float32), reach, constant_values=1.0) for a in patchy]
+    padded += [np.pad(a.astype(np.uint16), reach, constant_values=1) for a in patchy]
     out = [np.zeros(high.shape, dtype=np.float32) for _ in range(4)]
-    _place(*padded, stance.wheels + reach, stance.belly + reach, stance.spans, stance.weights, *out)
+    wheels, under = ((at + reach).astype(np.uint64) for at in (stance.wheels, stance.belly))
+    _place(*padded, wheels, under, stance.spans, stance.weights, *out)
     return Places(np.sqrt(out[0]), np.sqrt(out[1]), out[2], out[3])
+
+
+# Lines are read in place, by offsets that are not signed: a line is short, and to make it an array of its own takes as
+# long as the work on it; and a signed index would be looked at for whether it counts from the end.
 
 
 @njit(cache=True, nogil=True)
 def _place(stand, ground, belly, gaps, gaps_below, wheels, under, spans, weights, tilt, slope, rise, unstood):  # type: ignore[no-untyped-def]
-    rows = tilt.shape[0]
     headings = wheels.shape[0]
-    points = wheels.shape[1] + under.shape[1]
-    each = np.float32(1.0 / (headings * points))
-    for r in range(rows):
+    parts = headings * (wheels.shape[1] + under.shape[1])
+    shares = np.zeros(parts + 1, dtype=np.float32)
+    for k in range(parts):
+        shares[k + 1] = shares[k] + np.float32(1.0 / parts)
+    missing = np.empty(tilt.shape[1], dtype=np.uint16)
+    for r in range(np.uint64(tilt.shape[0])):
+        missing[:] = 0
         for k in range(headings):
-            _steepest(stand, wheels[k], spans[k], r, tilt[r])
-            _steepest(ground, wheels[k], spans[k], r, slope[r])
-            for j in range(wheels.shape[1]):
-                _missing(gaps, wheels[k, j], r, each, unstood[r])
-            for j in range(under.shape[1]):
-                _missing(gaps_below, under[k, j], r, each, unstood[r])
-                _rise(belly, stand, under[k, j], wheels[k], weights[j], r, rise[r])
+            _steepest(stand, wheels, spans, k, r, tilt)
+            _steepest(ground, wheels, spans, k, r, slope)
+            for j in range(0, wheels.shape[1], 2):
+                _count(gaps, wheels, k, j, r, missing)
+            for j in range(0, under.shape[1], 2):
+                _count(gaps_below, under, k, j, r, missing)
+                _rise(belly, stand, under, wheels, weights, k, j, r, rise)
+        for c in range(missing.shape[0]):
+            unstood[r, c] = shares[missing[c]]
 
 
 @njit(cache=True, nogil=True)
-def _line(a, at, r, n):  # type: ignore[no-untyped-def]
-    return a[r + at[0], at[1] : at[1] + n]
-
-
-@njit(cache=True, nogil=True)
-def _steepest(a, wheels, spans, r, out):  # type: ignore[no-untyped-def]
+def _steepest(a, wheels, spans, k, r, out):  # type: ignore[no-untyped-def]
     """Raise ``out`` to the greatest squared gradient of the planes through three wheels, those that are known."""
-    n = out.shape[0]
-    fl, fr = _line(a, wheels[0], r, n), _line(a, wheels[1], r, n)
-    rl, rr = _line(a, wheels[2], r, n), _line(a, wheels[3], r, n)
+    y0, y1, y2, y3 = r + wheels[k, 0, 0], r + wheels[k, 1, 0], r + wheels[k, 2, 0], r + wheels[k, 3, 0]
+    x0, x1, x2, x3 = wheels[k, 0, 1], wheels[k, 1, 1], wheels[k, 2, 1], wheels[k, 3, 1]
     one, zero = np.float32(1.0), np.float32(0.0)
-    left, right, front, rear = one / spans[0], one / spans[1], one / spans[2], one / spans[3]
-    for c in range(n):
-        u, v = abs(fl[c] - rl[c]) * left, abs(fr[c] - rr[c]) * right
+    left, right, front, rear = one / spans[k, 0], one / spans[k, 1], one / spans[k, 2], one / spans[k, 3]
+    for c in range(np.uint64(out.shape[1])):
+        fl, fr, rl, rr = a[y0, c + x0], a[y1, c + x1], a[y2, c + x2], a[y3, c + x3]
+        u, v = abs(fl - rl) * left, abs(fr - rr) * right
         along = u if u > zero else zero
         along = v if v > along else along
-        u, v = abs(fl[c] - fr[c]) * front, abs(rl[c] - rr[c]) * rear
+        u, v = abs(fl - fr) * front, abs(rl - rr) * rear
         across = u if u > zero else zero
         across = v if v > across else across
         square = along * along + across * across
-        out[c] = square if square > out[c] else out[c]
+        out[r, c] = square if square > out[r, c] else out[r, c]
 
 
 @njit(cache=True, nogil=True)
-def _missing(gaps, at, r, each, out):  # type: ignore[no-untyped-def]
-    """Add ``each`` where there is a gap."""
-    line = _line(gaps, at, r, out.shape[0])
-    for c in range(out.shape[0]):
-        out[c] += each * line[c]
+def _count(gaps, at, k, j, r, out):  # type: ignore[no-untyped-def]
+    """Add one for each of parts ``j`` and ``j + 1`` where there is a gap; of wheels and of the belly's parts there is
+    an even number."""
+    y0, y1, x0, x1 = r + at[k, j, 0], r + at[k, j + 1, 0], at[k, j, 1], at[k, j + 1, 1]
+    for c in range(np.uint64(out.shape[0])):
+        out[c] += gaps[y0, c + x0] + gaps[y1, c + x1]
 
 
 @njit(cache=True, nogil=True)
-def _rise(belly, stand, at, wheels, w, r, out):  # type: ignore[no-untyped-def]
-    """Raise ``out`` to the rise of one point of the belly over the wheels' plane."""
-    n = out.shape[0]
-    p = _line(belly, at, r, n)
-    fl, fr = _line(stand, wheels[0], r, n), _line(stand, wheels[1], r, n)
-    rl, rr = _line(stand, wheels[2], r, n), _line(stand, wheels[3], r, n)
-    w0, w1, w2, w3 = w[0], w[1], w[2], w[3]
+def _rise(belly, stand, at, wheels, w, k, j, r, out):  # type: ignore[no-untyped-def]
+    """Raise ``out`` to the rise of points ``j`` and ``j + 1`` of the belly over the wheels' plane."""
+    y0, y1, y2, y3 = r + wheels[k, 0, 0], r + wheels[k, 1, 0], r + wheels[k, 2, 0], r + wheels[k, 3, 0]
+    x0, x1, x2, x3 = wheels[k, 0, 1], wheels[k, 1, 1], wheels[k, 2, 1], wheels[k, 3, 1]
+    y, x, v0, v1, v2, v3 = r + at[k, j, 0], at[k, j, 1], w[j, 0], w[j, 1], w[j, 2], w[j, 3]
+    z, s, w0, w1, w2, w3 = r + at[k, j + 1, 0], at[k, j + 1, 1], w[j + 1, 0], w[j + 1, 1], w[j + 1, 2], w[j + 1, 3]
     zero = np.float32(0.0)
-    for c in range(n):
-        a, b, d, e = p[c] - fl[c], p[c] - fr[c], p[c] - rl[c], p[c] - rr[c]
+    for c in range(np.uint64(out.shape[1])):
+        fl, fr, rl, rr = stand[y0, c + x0], stand[y1, c + x1], stand[y2, c + x2], stand[y3, c + x3]
+        p, q, most = belly[y, c + x], belly[z, c + s], out[r, c]
+        a, b, d, e = p - fl, p - fr, p - rl, p - rr
+        total = v0 * (a if a > zero else zero) + v1 * (b if b > zero else zero)
+        total += v2 * (d if d > zero else zero) + v3 * (e if e > zero else zero)
+        most = total if total > most else most
+        a, b, d, e = q - fl, q - fr, q - rl, q - rr
         total = w0 * (a if a > zero else zero) + w1 * (b if b > zero else zero)
         total += w2 * (d if d > zero else zero) + w3 * (e if e > zero else zero)
-        out[c] = total if total > out[c] else out[c]
+        out[r, c] = total if total > most else most

@@ -76,41 +76,104 @@ def sweep(
 
 @njit(cache=True, nogil=True)
 def _sweep(height, ways, toll, sources, cost, move):  # type: ignore[no-untyped-def]
-    """Rows are worked on as lines: the last one is kept with an unreachable cell at either end."""
+    """Rows are worked on as lines, each from the first to the last cell that can be reached; the last one is kept with
+    an unreachable cell at either end. Costs there are four times as large, plus the index of the move."""
     rows, cols = height.shape
-    last, around = np.full(cols + 2, UNREACHED, dtype=np.int64), np.zeros(cols + 2, dtype=np.uint8)
-    before = np.zeros(cols + 2, dtype=np.int64)
+    last, around = np.full(cols + 2, 4 * UNREACHED, dtype=np.int64), np.zeros(cols + 2, dtype=np.uint8)
+    lines = np.zeros((2, cols + 2), dtype=np.int64)
+    best, step, can = np.empty(cols, dtype=np.int64), np.empty(cols, dtype=np.int64), np.empty(cols, dtype=np.uint8)
+    low, high = cols, -1  # the reached cells of the last row lie between
     for r in range(rows - 1, -1, -1):
-        _enter(height[r], ways[r], toll[r], last, around, before, rows, cost[r], move[r])
-        some = np.int32(0)
-        for c in range(cols):
-            some += np.int32(sources[r, c])
-        for c in range(cols if some else 0):
+        here, before = lines[r % 2], lines[1 - r % 2]
+        first, end = _between(sources[r])
+        left, right = max(min(low - 1, first), 0), min(max(high + 2, end), cols)
+        cost[r, : min(left, cols)], move[r, : min(left, cols)] = UNREACHED, -1
+        cost[r, max(right, left) :], move[r, max(right, left) :] = UNREACHED, -1
+        if right <= left:
+            low, high = cols, -1
+            continue
+        if r + 1 < rows:
+            _copy_ways(ways[r + 1], around)
+        inner = slice(left, right)
+        _scale(height[r, inner], 4 * rows, here[left + 1 : right + 1])
+        _scale(toll[r, inner], 4 * rows, step[inner])
+        _allow(ways[r, inner], around[left : right + 2], can[inner])
+        _enter(here[left + 1 : right + 1], step[inner], can[inner], last[left : right + 2], before[left : right + 2],
+               best[inner])  # fmt: skip
+        _unpack(best[inner], cost[r, inner], move[r, inner])
+        for c in range(first, end):
             if sources[r, c] and ways[r, c]:
-                cost[r, c], move[r, c] = 0, -1
-        for c in range(cols):
-            last[c + 1], around[c + 1], before[c + 1] = cost[r, c], ways[r, c], height[r, c]
+                best[c], cost[r, c], move[r, c] = 0, 0, -1
+        for c in range(left, right):
+            last[c + 1] = best[c] & ~3
+        low, high = left, right - 1
+        while low <= high and cost[r, low] >= UNREACHED:
+            low += 1
+        while high >= low and cost[r, high] >= UNREACHED:
+            high -= 1
+        if high < low:
+            low, high = cols, -1
 
 
 @njit(cache=True, nogil=True)
-def _enter(height, ways, toll, last, around, before, rows, cost, move):  # type: ignore[no-untyped-def]
-    """Least cost of one row from the last one; without branches, so that cells go side by side."""
-    far = np.int64(UNREACHED)
+def _between(mask):  # type: ignore[no-untyped-def]
+    """The first set cell of a line, and the one after the last; the line's length and 0 where none is."""
+    n, some = mask.shape[0], np.uint8(0)
+    for c in range(n):
+        some |= np.uint8(mask[c])
+    if not some:
+        return n, 0
+    first, end = 0, n
+    while not mask[first]:
+        first += 1
+    while not mask[end - 1]:
+        end -= 1
+    return first, end
+
+
+@njit(cache=True, nogil=True)
+def _copy_ways(ways, out):  # type: ignore[no-untyped-def]
+    for c in range(ways.shape[0]):
+        out[c + 1] = ways[c]
+
+
+@njit(cache=True, nogil=True)
+def _scale(values, by, out):  # type: ignore[no-untyped-def]
+    for c in range(values.shape[0]):
+        out[c] = np.int64(values[c]) * by
+
+
+@njit(cache=True, nogil=True)
+def _allow(here, around, out):  # type: ignore[no-untyped-def]
+    """Directions in which a cell can be entered from the last row."""
+    for c in range(here.shape[0]):
+        out[c] = here[c] & (around[c + 1] & STRAIGHT | around[c + 2] & LEFT | around[c] & RIGHT)
+
+
+@njit(cache=True, nogil=True)
+def _enter(height, toll, can, last, before, out):  # type: ignore[no-untyped-def]
+    """Least cost of one row from the last one, with the index of the move in the last two bits: of equal costs the
+    first move is the least. Without branches, so that cells go side by side."""
+    far = np.int64(4 * UNREACHED)
     for c in range(height.shape[0]):
-        here, h, step = ways[c], np.int64(height[c]), np.int64(toll[c])
-        a = last[c + 1] + (abs(h - before[c + 1]) + step) * rows
-        a = a if here & around[c + 1] & STRAIGHT and last[c + 1] < far else far
-        b = last[c + 2] + (abs(h - before[c + 2]) + step) * rows + 1
-        b = b if here & around[c + 2] & LEFT and last[c + 2] < far else far
-        d = last[c] + (abs(h - before[c]) + step) * rows + 1
-        d = d if here & around[c] & RIGHT and last[c] < far else far
-        best = a
-        k = np.int8(0) if a < far else np.int8(-1)
-        k = np.int8(1) if b < best else k
-        best = b if b < best else best
-        k = np.int8(2) if d < best else k
-        best = d if d < best else best
-        cost[c], move[c] = best, k
+        way, h, step = can[c], height[c], toll[c]
+        a = last[c + 1] + (abs(h - before[c + 1]) + step)
+        a = a if (way & STRAIGHT != 0) & (last[c + 1] < far) else far
+        b = last[c + 2] + (abs(h - before[c + 2]) + step) + 5
+        b = b if (way & LEFT != 0) & (last[c + 2] < far) else far
+        d = last[c] + (abs(h - before[c]) + step) + 6
+        d = d if (way & RIGHT != 0) & (last[c] < far) else far
+        best = a if a < b else b
+        out[c] = best if best < d else d
+
+
+@njit(cache=True, nogil=True)
+def _unpack(best, cost, move):  # type: ignore[no-untyped-def]
+    far = np.int64(4 * UNREACHED)
+    for c in range(best.shape[0]):
+        cost[c] = best[c] >> 2
+    for c in range(best.shape[0]):
+        move[c] = np.int8(best[c] & 3) if best[c] < far else np.int8(-1)
 
 
 def leading(free: Mask | Ways, limit: int) -> Mask:
@@ -223,7 +286,9 @@ def _nearest_middle(cells, row):  # type: ignore[no-untyped-def]
     rows, cols = cells.shape
     best, found = np.iinfo(np.int64).max, (-1, -1)
     for r in range(rows):
-        for c in range(cols if 2 * abs(r - row) < best else 0):
+        if 2 * abs(r - row) >= best:
+            continue
+        for c in range(*_between(cells[r])):
             if cells[r, c]:
                 away = 2 * abs(r - row) + abs(2 * c - (cols - 1))
                 if away < best:

@@ -62,11 +62,16 @@ def _widen(canvas: Canvas, half_length: float, half_width: float, step: tuple[in
 
 def grown(mask: Mask, reach: float) -> Mask:
     """Cells within ``reach`` cells of the mask: an octagon, nowhere smaller than the circle."""
+    canvas = Canvas.of(mask, math.ceil(reach - 1e-9))
+    _grow(canvas, reach)
+    return canvas.mask()
+
+
+def _grow(canvas: Canvas, reach: float) -> None:
+    """:func:`grown` on a canvas with a border of at least that."""
     side, diagonal = octagon(math.ceil(reach - 1e-9))
-    canvas = Canvas.of(mask, side + 2 * diagonal)
     for n, dr, dc in ((side, 0, 1), (side, 1, 0), (diagonal, 1, 1), (diagonal, 1, -1)):
         canvas.spread(n, dr, dc)
-    return canvas.mask()
 
 
 class Stand:
@@ -95,13 +100,16 @@ class Stand:
         ahead, aside = 0.5 * vehicle.wheel_base / cell, 0.5 * vehicle.track / cell
         self._places = [_wheels(ahead, aside, dr, dc) for _, dr, dc in STEPS]
         reaches = [_reach(*self._half, (dr, dc)) for _, dr, dc in STEPS]
-        self._border = max(*reaches, *(abs(v) for four in self._places for at in four for v in at))
+        margin = vehicle.margin / cell
+        offsets = (abs(v) for four in self._places for at in four for v in at)
+        self._border = max(*reaches, *offsets, math.ceil(margin - 1e-9))
         self._unknown = unknown
-        wheels, middle = (grown(mask, vehicle.margin / cell) for mask in (wheel_hazard, body_hazard))
-        on_wheels, on_middle = (
-            Canvas.of(wheels, self._border),
-            Canvas.of(middle if closed is None else middle | closed, self._border),
-        )
+        on_wheels, on_middle = (Canvas.of(mask, self._border) for mask in (wheel_hazard, body_hazard))
+        for canvas in (on_wheels, on_middle):
+            _grow(canvas, margin)
+            canvas.clear_border()
+        if closed is not None:
+            on_middle.join(Canvas.of(closed, self._border))
         self._closed = [self._under(places, on_wheels, on_middle) for places in self._places]
 
     def ways(self, below: str = "middle") -> Bytes:
@@ -111,7 +119,7 @@ class Stand:
             found = self._closed
         else:
             unknown = Canvas.of(self._unknown, self._border, outside=True)
-            beyond = unknown if below == "wheels" else Canvas.of(np.zeros_like(self._unknown), self._border, True)
+            beyond = unknown if below == "wheels" else Canvas.outside(self._unknown.shape, self._border)
             found = [
                 self._under(places, beyond, closed) for places, closed in zip(self._places, self._closed, strict=True)
             ]

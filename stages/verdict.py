@@ -7,6 +7,7 @@ spread over it, those of the three measures of its own added, and all bands writ
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 import scipy
@@ -29,11 +30,14 @@ WHOLE = 0.999
 FINE = ("inclination", "range", "step")
 """Measures on the cells; the others are on blocks."""
 
-BAND, STRIP = 16, 384
-"""Rows of blocks, and columns of cells, that are worked on at a time: lines of all bands stay in a cache of 48 kB."""
+STRIP = 1536
+"""Columns of cells that are worked on at a time: long lines are read ahead of their use, and all stay in the cache."""
 
 STEPS, FARTHEST = 64, 16.0
 """Table of the distribution: steps a unit, and where it ends."""
+
+NONE = 2.0**-44
+"""Of a step: the sum of it and 16 in 64 bits is 16."""
 
 LEAST = np.float32(1e-12)
 """Of a limit; standard deviation of a measure of exact elevations, so that none is divided by."""
@@ -67,35 +71,30 @@ def classify(
     """
     facts = _facts(vehicle, window, cell, rules.sigmas)
     gap, patchy = np.float32(vehicle.max_step) * (1.0 - np.minimum(measured.share, 1.0)), measured.unstood
-    doubt = np.hypot(measured.noise, np.float32(HIDDEN[0]) * gap).astype(np.float32)
-    below = np.hypot(measured.noise_under, np.float32(HIDDEN[1] * vehicle.max_step) * patchy).astype(np.float32)
+    doubt = _with(measured.noise, np.float32(HIDDEN[0]) * gap)
+    below = _with(measured.noise_under, np.float32(HIDDEN[1] * vehicle.max_step) * patchy)
     shape, coarse = closed.shape, measured.noise.shape
-    load, excess = np.zeros(coarse, np.float32), np.full(coarse, -FARTHEST, np.float32)
-    bits = np.zeros(coarse, np.uint16)
+    blocks = np.empty((9, *coarse), np.float32)
+    load, excess = blocks[0], blocks[1]
+    load[:], excess[:] = 0.0, -FARTHEST
+    blocks[2], blocks[3], blocks[4], blocks[5] = measured.noise, doubt, measured.share, measured.blocks["roughness"]
+    for k, name in ((6, "slope"), (7, "tilt")):
+        np.arctan(measured.blocks[name], out=blocks[k])
+    np.subtract(np.float32(vehicle.clearance), measured.blocks["rise"], out=blocks[8])
+    bits = np.zeros((2, *coarse), np.uint16)
     for name, values in measured.blocks.items():
         noise = (measured.noise, doubt) if name == "roughness" else (measured.noise_under, below)
-        _hold_all(values, facts[name], *noise, load, excess, bits)
-    blocks = np.stack(
-        [
-            load, excess, measured.noise, doubt, measured.share, measured.unstood, measured.blocks["roughness"],
-            np.arctan(measured.blocks["slope"]), np.arctan(measured.blocks["tilt"]),
-            np.float32(vehicle.clearance) - measured.blocks["rise"],
-        ]
-    )  # fmt: skip
+        _hold_all(values, facts[name], *noise, load, excess, bits[0])
+    bits[1] = np.where((measured.share < WHOLE) | (patchy > 0), UNSEEN_BIT, 0)
     risk, reason = np.empty(shape, np.uint8), np.empty(shape, np.uint16)
-    bands = [np.empty(shape, np.float32) for _ in range(6)]
-    marks = np.array([rules.caution, rules.max_p, rules.min_known, WHOLE], np.float32)
-    fine, table, n = np.stack([facts[name] for name in FINE]), _table(), measured.stride
-    at = (np.arange(shape[1]) // n).astype(np.uint32)
-    inclination, roughness, slope, tilt, clearance, p = bands
-    for first in range(0, shape[0], n * BAND):
-        rows, of = slice(first, first + n * BAND), slice(first // n, first // n + BAND)
-        _classify(
-            fine, np.float32(1.0 / measured.extent), measured.range[rows], measured.step[rows], closed[rows],
-            filled[rows], np.ascontiguousarray(blocks[:, of]), bits[of], at, n, marks, table, risk[rows], reason[rows],
-            *(band[rows] for band in bands),
-        )  # fmt: skip
-        np.arctan(inclination[rows], out=inclination[rows])
+    inclination, roughness, slope, tilt, clearance, p = (np.empty(shape, np.float32) for _ in range(6))
+    marks = np.array([rules.caution, rules.max_p, rules.min_known], np.float32)
+    _classify(
+        np.stack([facts[name] for name in FINE]), np.float32(1.0 / measured.extent), measured.range, measured.step,
+        closed, filled, blocks, bits, measured.stride, marks, _table(), risk, reason,
+        inclination, roughness, slope, tilt, clearance, p,
+    )  # fmt: skip
+    np.arctan(inclination, out=inclination)
     return {
         "risk": risk,
         "reason": reason,
@@ -121,6 +120,14 @@ def _facts(vehicle: Vehicle, window: float, cell: float, sigmas: float) -> dict[
     }
 
 
+def _with(noise: Floats32, hidden: NDArray[np.floating]) -> Floats32:
+    """Noise widened by what may be hidden; mostly there is nothing."""
+    out = noise.copy()
+    np.hypot(noise, hidden, out=out, where=hidden > 0)
+    return out
+
+
+@cache
 def _table() -> Floats32:
     t = np.arange(-FARTHEST * STEPS, FARTHEST * STEPS + 1) / STEPS
     start, width, lift = LIFT
@@ -155,91 +162,180 @@ def _hold_all(values, facts, noise, doubt, load, excess, bits):  # type: ignore[
         _hold(values[r], facts, noise[r], doubt[r], load[r], excess[r], bits[r])
 
 
-@njit(cache=True, nogil=True)
+# Lines are read and written in place, from a column that is not signed: to make them arrays of their own takes a tenth
+# of the work on them, and a signed index would be looked at for whether it counts from the end.
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def _classify(  # type: ignore[no-untyped-def]
-    facts, per_metre, height_range, step, closed, filled, blocks, bits0, at, n, marks, table,
+    facts, per_metre, height_range, step, closed, filled, blocks, bits, n, marks, table,
     risk, reason, inclination, roughness, slope, tilt, clearance, p,
 ):  # fmt: skip
-    """Rows of cells, of which the first one is the first of a row of blocks; ``at`` is the block of each column."""
+    """Cells of each block of ``n`` x ``n``, by strips of whole blocks; ``bits`` (2, row, col) of the blocks' own
+    hazards, and of any class."""
     rows, cols = risk.shape
-    width = min(cols, STRIP)
+    width = n * max(1, STRIP // n)
     wide = np.empty((blocks.shape[0], width), dtype=np.float32)
-    before, bits = np.empty(width, dtype=np.uint16), np.empty(width, dtype=np.uint16)
+    own = np.empty((2, width), dtype=np.uint16)
     load, excess = np.empty(width, dtype=np.float32), np.empty(width, dtype=np.float32)
+    place = np.empty(width, dtype=np.int32)
     for top in range(0, rows, n):
         for left in range(0, cols, width):
-            right = min(left + width, cols)
-            m = right - left
+            size, of = np.uint64(min(width, cols - left)), slice(left // n, left // n + width // n)
             for k in range(blocks.shape[0]):
-                _spread(blocks[k, top // n], at[left:right], wide[k])
-            _spread(bits0[top // n], at[left:right], before)
-            for r in range(top, min(top + n, rows)):
-                for c in range(m):
-                    load[c], excess[c], bits[c] = wide[0, c], wide[1, c], before[c]
-                inclined, ranged, stepped = inclination[r, left:right], height_range[r, left:right], step[r, left:right]
-                kind, chance = risk[r, left:right], p[r, left:right]
-                for c in range(m):
-                    inclined[c] = ranged[c] * per_metre
-                _hold(inclined, facts[0], wide[2], wide[3], load, excess, bits)
-                _hold(ranged, facts[1], wide[2], wide[3], load, excess, bits)
-                _hold(stepped, facts[2], wide[2], wide[3], load, excess, bits)
-                _look_up(excess, table, chance)
-                _decide(
-                    load, excess, bits, chance, closed[r, left:right], filled[r, left:right], wide[4], wide[5], marks,
-                    kind, reason[r, left:right],
-                )  # fmt: skip
-                _blank(kind, inclined)
-                _blank(kind, ranged)
-                _blank(kind, stepped)
-                _blank(kind, chance)
-                _put(kind, wide[6], roughness[r, left:right])
-                _put(kind, wide[7], slope[r, left:right])
-                _put(kind, wide[8], tilt[r, left:right])
-                _put(kind, wide[9], clearance[r, left:right])
+                _spread(blocks[k, top // n, of], n, wide[k])
+            for k in range(2):
+                _spread(bits[k, top // n, of], n, own[k])
+            for row in range(top, min(top + n, rows)):
+                r, at = np.uint64(row), np.uint64(left)
+                _load(facts, per_metre, height_range, step, wide, r, at, size, load)
+                _excess(facts, per_metre, height_range, step, wide, r, at, size, excess)
+                _look_up(excess, table, place, r, at, size, p)
+                some = _decide(load, p, closed, wide, marks, r, at, size, risk)
+                _explain(risk, filled, own, r, at, size, reason)
+                if some & 1:
+                    _blame(risk, facts, per_metre, height_range, step, wide, own, excess, r, at, size, reason)
+                _incline(risk, height_range, per_metre, r, at, size, inclination)
+                if some & 2:
+                    for band in (height_range, step, p):
+                        _blank(risk, r, at, size, band)
+                _put(risk, wide, np.uint64(5), some & 2, r, at, size, roughness)
+                _put(risk, wide, np.uint64(6), some & 2, r, at, size, slope)
+                _put(risk, wide, np.uint64(7), some & 2, r, at, size, tilt)
+                _put(risk, wide, np.uint64(8), some & 2, r, at, size, clearance)
 
 
 @njit(cache=True, nogil=True)
-def _spread(blocks, at, out):  # type: ignore[no-untyped-def]
-    for c in range(at.shape[0]):
-        out[c] = blocks[at[c]]
+def _spread(blocks, n, out):  # type: ignore[no-untyped-def]
+    """Each block ``n`` times."""
+    if n == 4:  # of a known number the compiler writes all at once
+        for j in range(blocks.shape[0]):
+            v = blocks[j]
+            out[4 * j], out[4 * j + 1], out[4 * j + 2], out[4 * j + 3] = v, v, v, v
+        return
+    for j in range(blocks.shape[0]):
+        for k in range(n):
+            out[n * j + k] = blocks[j]
+
+
+# Loops below write one array each: with more, the compiler would have to compare too many of them for overlaps before
+# it may take several cells at a time.
 
 
 @njit(cache=True, nogil=True)
-def _look_up(excess, table, p):  # type: ignore[no-untyped-def]
-    for c in range(p.shape[0]):
-        least = excess[c] if excess[c] > -FARTHEST else -FARTHEST
-        t = least if least < FARTHEST else FARTHEST
-        p[c] = table[np.uint32((t + FARTHEST) * STEPS)]
+def _load(facts, per_metre, height_range, step, wide, r, left, size, out):  # type: ignore[no-untyped-def]
+    """Greatest load of the blocks' and of the three measures."""
+    one = np.float32(1.0)
+    p, q, s = one / facts[0, 0], one / facts[1, 0], one / facts[2, 0]
+    u, v, w = facts[0, 3], facts[1, 3], facts[2, 3]
+    for c in range(size):
+        ranged, stepped, noise, most = height_range[r, left + c], step[r, left + c], wide[2, c], wide[0, c]
+        a, b = (ranged * per_metre + u * noise) * p, (ranged + v * noise) * q
+        d = (stepped + w * noise) * s
+        most = a if a > most else most
+        most = b if b > most else most
+        out[c] = d if d > most else most
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _excess(facts, per_metre, height_range, step, wide, r, left, size, out):  # type: ignore[no-untyped-def]
+    """Greatest standardised excess, likewise."""
+    limit0, bias0, spread0, least0 = facts[0, 0], facts[0, 1], facts[0, 2], LEAST * facts[0, 0]
+    limit1, bias1, spread1, least1 = facts[1, 0], facts[1, 1], facts[1, 2], LEAST * facts[1, 0]
+    limit2, bias2, spread2, least2 = facts[2, 0], facts[2, 1], facts[2, 2], LEAST * facts[2, 0]
+    none = np.float32(0.0)
+    for c in range(size):
+        ranged, stepped = height_range[r, left + c], step[r, left + c]
+        s, doubt, most = wide[2, c], wide[3, c], wide[1, c]
+        over = ranged * per_metre - bias0 * s - limit0
+        t = over / (spread0 * (s if over > none else doubt) + least0)
+        most = t if t > most else most
+        over = ranged - bias1 * s - limit1
+        t = over / (spread1 * (s if over > none else doubt) + least1)
+        most = t if t > most else most
+        over = stepped - bias2 * s - limit2
+        t = over / (spread2 * (s if over > none else doubt) + least2)
+        out[c] = t if t > most else most
 
 
 @njit(cache=True, nogil=True)
-def _decide(load, excess, bits, p, closed, filled, share, unstood, marks, risk, reason):  # type: ignore[no-untyped-def]
-    caution, max_p, min_known, whole = marks[0], marks[1], marks[2], marks[3]
-    one, zero, none = np.float32(1.0), np.float32(0.0), np.uint16(0)
-    for c in range(risk.shape[0]):
-        known = closed[c] == closed[c]
+def _look_up(excess, table, place, r, left, size, p):  # type: ignore[no-untyped-def]
+    """The entry at or below; what is below 0 by no more than :data:`NONE` counts as 0."""
+    far, steps, none = np.float32(FARTHEST), np.float32(STEPS), np.float32(-NONE)
+    for c in range(size):
+        least = excess[c] if excess[c] > -far else -far
+        t = (least if least < far else far) * steps
+        k = np.int32(t)
+        below = (np.float32(k) > t) & (t < none)
+        place[c] = k + np.int32(FARTHEST * STEPS) - np.int32(below)
+    for c in range(size):
+        p[r, left + c] = table[np.uint32(place[c])]
+
+
+@njit(cache=True, nogil=True)
+def _decide(load, p, closed, wide, marks, r, left, size, risk):  # type: ignore[no-untyped-def]
+    """Classes; returns 1 if some are hazardous, plus 2 if some are unknown."""
+    caution, max_p, min_known = marks[0], marks[1], marks[2]
+    one = np.float32(1.0)
+    for c in range(size):
+        known = closed[r, left + c] == closed[r, left + c]
         hazardous = known & (load[c] > one)
-        unknown = (not known) | ((share[c] < min_known) & (not hazardous))
-        near = (load[c] > caution) | (p[c] > max_p)
+        unknown = (not known) | ((wide[4, c] < min_known) & (not hazardous))
+        near = (load[c] > caution) | (p[r, left + c] > max_p)
         kind = np.uint8(HAZARDOUS) if hazardous else (np.uint8(CAUTION) if near else np.uint8(SAFE))
-        risk[c] = np.uint8(UNKNOWN) if unknown else kind
-    for c in range(risk.shape[0]):
-        hazardous, unknown = risk[c] == HAZARDOUS, risk[c] == UNKNOWN
-        why = bits[c] if hazardous else none
-        why |= np.uint16(DOUBT_BIT) if hazardous & (excess[c] <= zero) else none
-        why |= np.uint16(UNKNOWN_BIT) if unknown else none
-        why |= np.uint16(FILLED_BIT) if filled[c] == 1 else none
-        why |= np.uint16(UNSEEN_BIT) if (share[c] < whole) | (unstood[c] > zero) else none
-        reason[c] = why
+        risk[r, left + c] = np.uint8(UNKNOWN) if unknown else kind
+    hazards, gaps = np.uint8(0), np.uint8(0)
+    for c in range(size):
+        hazards |= np.uint8(risk[r, left + c] == HAZARDOUS)
+        gaps |= np.uint8(risk[r, left + c] == UNKNOWN)
+    return np.int64(hazards) + 2 * np.int64(gaps)
 
 
 @njit(cache=True, nogil=True)
-def _blank(risk, values):  # type: ignore[no-untyped-def]
-    for c in range(values.shape[0]):
-        values[c] = np.float32(np.nan) if risk[c] == UNKNOWN else values[c]
+def _explain(risk, filled, own, r, left, size, reason):  # type: ignore[no-untyped-def]
+    """Reasons of cells that are not hazardous."""
+    none = np.uint16(0)
+    for c in range(size):
+        why = own[1, c] | (np.uint16(UNKNOWN_BIT) if risk[r, left + c] == UNKNOWN else none)
+        reason[r, left + c] = why | (np.uint16(FILLED_BIT) if filled[r, left + c] == 1 else none)
 
 
 @njit(cache=True, nogil=True)
-def _put(risk, values, out):  # type: ignore[no-untyped-def]
-    for c in range(out.shape[0]):
-        out[c] = np.float32(np.nan) if risk[c] == UNKNOWN else values[c]
+def _blame(risk, facts, per_metre, height_range, step, wide, own, excess, r, left, size, reason):  # type: ignore[no-untyped-def]
+    """Add the measures that make a hazard, and whether only noise does."""
+    one, zero, none = np.float32(1.0), np.float32(0.0), np.uint16(0)
+    p, q, s = one / facts[0, 0], one / facts[1, 0], one / facts[2, 0]
+    u, v, w = facts[0, 3], facts[1, 3], facts[2, 3]
+    bit0, bit1, bit2 = np.uint16(facts[0, 4]), np.uint16(facts[1, 4]), np.uint16(facts[2, 4])
+    for c in range(size):
+        ranged, stepped, noise = height_range[r, left + c], step[r, left + c], wide[2, c]
+        why = own[0, c] | (bit0 if (ranged * per_metre + u * noise) * p > one else none)
+        why |= bit1 if (ranged + v * noise) * q > one else none
+        why |= bit2 if (stepped + w * noise) * s > one else none
+        why |= np.uint16(DOUBT_BIT) if excess[c] <= zero else none
+        reason[r, left + c] |= why if risk[r, left + c] == HAZARDOUS else none
+
+
+@njit(cache=True, nogil=True)
+def _incline(risk, height_range, per_metre, r, left, size, out):  # type: ignore[no-untyped-def]
+    for c in range(size):
+        v = height_range[r, left + c] * per_metre
+        out[r, left + c] = np.float32(np.nan) if risk[r, left + c] == UNKNOWN else v
+
+
+@njit(cache=True, nogil=True)
+def _blank(risk, r, left, size, band):  # type: ignore[no-untyped-def]
+    for c in range(size):
+        v = band[r, left + c]
+        band[r, left + c] = np.float32(np.nan) if risk[r, left + c] == UNKNOWN else v
+
+
+@njit(cache=True, nogil=True)
+def _put(risk, wide, k, gaps, r, left, size, out):  # type: ignore[no-untyped-def]
+    if not gaps:
+        for c in range(size):
+            out[r, left + c] = wide[k, c]
+        return
+    for c in range(size):
+        v = wide[k, c]
+        out[r, left + c] = np.float32(np.nan) if risk[r, left + c] == UNKNOWN else v

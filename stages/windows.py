@@ -113,69 +113,96 @@ def _mean(a, half, out):  # type: ignore[no-untyped-def]
     rows, cols = a.shape
     offset = _middle(a)
     # behind the line's start and beyond its end a window has nothing
-    total, count = np.zeros((LANES, cols + 2 * half + 1)), np.zeros((LANES, cols + 2 * half + 1))
+    total, count = np.zeros((LANES, cols + 2 * half + 1)), np.zeros((LANES, cols + 2 * half + 1), dtype=np.int32)
     inner = slice(half + 1, half + 1 + cols)
-    sums, counts = np.empty((LANES, cols)), np.empty((LANES, cols))
-    lane = 0
+    sums, counts, of = np.empty((LANES, cols)), np.empty(cols, dtype=np.int32), np.zeros_like(count[0])
+    nothing = np.full(cols, np.nan, dtype=np.float32)
     for r in range(-half, rows):
-        if r + half < rows:
-            _add_row(a[r + half], offset, 1.0, total[lane, inner], count[lane, inner])
-        if r > half:
-            _add_row(a[r - half - 1], offset, -1.0, total[lane, inner], count[lane, inner])
-        if r < 0:
-            continue
-        if lane == LANES - 1 or r == rows - 1:
-            _slide(total, count, 2 * half + 1, sums, counts)
+        lane = r % LANES if r > 0 else 0
+        before = (lane - 1) % LANES if r > 0 else 0
+        enters, leaves = a[r + half] if r + half < rows else nothing, a[r - half - 1] if r > half else nothing
+        _move_sums(enters, leaves, offset, total[before, inner], total[lane, inner])
+        _move_counts(enters, leaves, offset, count[before, inner], count[lane, inner])
+        if r >= 0 and (lane == LANES - 1 or r == rows - 1):
+            _slide(total, 2 * half + 1, sums)
             for k in range(lane + 1):
-                _divide(sums[k], counts[k], offset, out[r - lane + k])
-        after = (lane + 1) % LANES
-        copy_line(total[lane], total[after])
-        copy_line(count[lane], count[after])
-        lane = after
+                if r - lane + k == 0 or _differ(count[k], of):
+                    copy_line(count[k], of)
+                    _slide_counts(of, 2 * half + 1, counts)
+                _divide(sums[k], counts, offset, out[r - lane + k])
 
 
 @njit(cache=True, nogil=True)
-def _slide(lines, more, n, out, out_more):  # type: ignore[no-untyped-def]
-    """Sums of c + 1 .. c + n of :data:`LANES` lines each."""
+def _move_sums(enters, leaves, offset, before, out):  # type: ignore[no-untyped-def]
+    """Sums of the columns with what enters the window and without what leaves it."""
+    none = np.float32(0.0)
+    for c in range(out.shape[0]):
+        v, w = enters[c] - offset, leaves[c] - offset
+        out[c] = (before[c] + (v if v == v else none)) - (w if w == w else none)
+
+
+@njit(cache=True, nogil=True)
+def _move_counts(enters, leaves, offset, before, out):  # type: ignore[no-untyped-def]
+    for c in range(out.shape[0]):
+        v, w = enters[c] - offset, leaves[c] - offset
+        out[c] = before[c] + np.int32(v == v) - np.int32(w == w)
+
+
+@njit(cache=True, nogil=True)
+def _slide(lines, n, out):  # type: ignore[no-untyped-def]
+    """Sums of c + 1 .. c + n of :data:`LANES` lines."""
     p, q, s, t = lines[0], lines[1], lines[2], lines[3]
-    i, j, k, m = more[0], more[1], more[2], more[3]
     a, b, d, e = 0.0, 0.0, 0.0, 0.0
-    f, g, h, u = 0.0, 0.0, 0.0, 0.0
     for c in range(1, n):
         a, b, d, e = a + p[c], b + q[c], d + s[c], e + t[c]
-        f, g, h, u = f + i[c], g + j[c], h + k[c], u + m[c]
     for c in range(out.shape[1]):
         a, b, d, e = a + p[c + n], b + q[c + n], d + s[c + n], e + t[c + n]
-        f, g, h, u = f + i[c + n], g + j[c + n], h + k[c + n], u + m[c + n]
         a, b, d, e = a - p[c], b - q[c], d - s[c], e - t[c]
-        f, g, h, u = f - i[c], g - j[c], h - k[c], u - m[c]
         out[0, c], out[1, c], out[2, c], out[3, c] = a, b, d, e
-        out_more[0, c], out_more[1, c], out_more[2, c], out_more[3, c] = f, g, h, u
+
+
+@njit(cache=True, nogil=True)
+def _differ(p, q):  # type: ignore[no-untyped-def]
+    some = np.int32(0)
+    for c in range(p.shape[0]):
+        some |= p[c] ^ q[c]
+    return some != 0
+
+
+@njit(cache=True, nogil=True)
+def _slide_counts(line, n, out):  # type: ignore[no-untyped-def]
+    total = np.int32(0)
+    for c in range(1, n):
+        total += line[c]
+    for c in range(out.shape[0]):
+        total += line[c + n] - line[c]
+        out[c] = total
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _divide(sums, counts, offset, out):  # type: ignore[no-untyped-def]
     for c in range(out.shape[0]):
-        mean = sums[c] / counts[c] + offset
-        out[c] = mean if counts[c] > 0.5 else np.nan
+        mean = sums[c] / np.float64(counts[c]) + offset
+        out[c] = mean if counts[c] > 0 else np.nan
 
 
 @njit(cache=True, nogil=True)
-def _add_row(line, offset, sign, total, count):  # type: ignore[no-untyped-def]
+def _add_row(line, offset, total, count):  # type: ignore[no-untyped-def]
     for c in range(line.shape[0]):
         v = line[c] - offset
-        known = v == v
-        total[c] += sign * v if known else 0.0
-        count[c] += sign if known else 0.0
+        total[c] += v if v == v else np.float32(0.0)
+    for c in range(line.shape[0]):
+        v = line[c] - offset
+        count[c] += np.int32(v == v)
 
 
 @njit(cache=True, nogil=True)
 def _middle(a):  # type: ignore[no-untyped-def]
     """Mean of the known cells; 0 where there is none."""
-    total, count = np.zeros(a.shape[1]), np.zeros(a.shape[1])
+    total, count = np.zeros(a.shape[1]), np.zeros(a.shape[1], dtype=np.int32)
     for r in range(a.shape[0]):
-        _add_row(a[r], np.float32(0.0), 1.0, total, count)
-    n = count.sum()
+        _add_row(a[r], np.float32(0.0), total, count)
+    n = float(count.sum())
     return np.float32(total.sum() / n) if n > 0 else np.float32(0.0)
 
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stages.blocks import reduce_to_blocks, sum_around
+from stages.blocks import reduce_to_blocks
 
 
 @settings(max_examples=20, deadline=None)
@@ -37,13 +37,3 @@ def test_blocks_equal_a_look_at_every_cell(seed: int, rows: int, cols: int, n: i
         apart = [d for d in apart if not np.isnan(d)]
         assert found.pairs[i, j] == len(apart)
         assert found.deviation[i, j] == pytest.approx(sum(d * d for d in apart), rel=1e-5)
-
-
-@pytest.mark.parametrize("n", [1, 3, 9])
-def test_sums_around(n: int) -> None:
-    a = np.random.default_rng(n).integers(0, 9, (7, 12)).astype(float)
-    half = n // 2
-    expected = [
-        [a[max(r - half, 0) : r + half + 1, max(c - half, 0) : c + half + 1].sum() for c in range(12)] for r in range(7)
-    ]
-    np.testing.assert_array_equal(sum_around(a, n), expected)

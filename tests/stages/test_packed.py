@@ -43,3 +43,11 @@ def test_spreading_is_the_union_of_all_shifts(seed: int, cols: int, n: int, step
             if 0 <= r + k * step[0] < 12 and 0 <= c + k * step[1] < cols:
                 expected[r + k * step[0], c + k * step[1]] = True
     np.testing.assert_array_equal(canvas.mask(), expected)
+
+
+@settings(max_examples=20, deadline=None)
+@given(rows=st.integers(1, 5), cols=st.integers(1, 140), border=st.integers(0, 70))
+def test_only_the_outside_is_set(rows: int, cols: int, border: int) -> None:
+    of_nothing = Canvas.of(np.zeros((rows, cols), dtype=np.bool_), border, outside=True)
+    np.testing.assert_array_equal(Canvas.outside((rows, cols), border).words, of_nothing.words)
+    assert not Canvas.outside((rows, cols), border).mask().any()

@@ -52,6 +52,16 @@ def test_sums_means_and_planes_equal_loops(n: int) -> None:
             assert planes.residual[r, c] == pytest.approx(rms, abs=1e-6)  # the root of what rounding leaves of 1
 
 
+@pytest.mark.parametrize("n", [1, 3, 9])
+def test_sums_of_whole_numbers_are_exact(n: int) -> None:
+    a = np.random.default_rng(n).integers(0, 9, (7, 12)).astype(float)
+    half = n // 2
+    expected = [
+        [a[max(r - half, 0) : r + half + 1, max(c - half, 0) : c + half + 1].sum() for c in range(12)] for r in range(7)
+    ]
+    np.testing.assert_array_equal(window_sum(a, n), expected)
+
+
 def test_plane_far_from_the_origin_keeps_its_slope() -> None:
     y, x = np.mgrid[:400, :300] * 0.001
     z = (100.0 + 0.25 * x - 0.1 * y).astype(np.float32)
