@@ -34,6 +34,7 @@ from pipeline.costs import input_bytes
 from pipeline.dag import Expansion, Graph, Handle
 from pipeline.environment import cores
 from pipeline.executor import Executor, Failed, make
+from pipeline.interrupts import Interrupts
 from pipeline.key import digest
 from pipeline.ledger import Ledger
 from pipeline.progress import Progress, Quiet, recall_seconds, remember_seconds
@@ -213,8 +214,9 @@ class _Run:
         begin = time.perf_counter()
         gc.freeze()  # what is there need not be searched for garbage again and again as the graph grows
         try:
-            self._loop()
-            self._leave_out()
+            with Interrupts() as interrupts:
+                self._loop(interrupts)
+                self._leave_out()
         except BaseException:
             self._close(kill=True)
             raise
@@ -236,11 +238,12 @@ class _Run:
         if self.executor is not None:
             self.executor.close(kill=kill)
 
-    def _loop(self) -> None:
+    def _loop(self, interrupts: Interrupts) -> None:
         self.progress.open(self.graph, recall_seconds(self.store), self.jobs or cores())
         self.store.survey(_sequence(self.graph))
         while True:
             self._settle()
+            interrupts.check()
             self._submit()
             if not self.flying:
                 return

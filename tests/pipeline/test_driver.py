@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import json
+import signal
+import time
 
 import numpy as np
 import pytest
@@ -193,6 +195,32 @@ def test_an_expansion_that_fails_is_a_failure_and_one_that_cannot_be_made_is_not
         "status": "skipped",
         "reason": "value",
     }
+
+
+def test_an_interrupt_where_python_forgets_it_stops_the_run_all_the_same(cache, capfd):
+    class Forgotten:
+        def __del__(self):
+            signal.raise_signal(signal.SIGINT)
+            time.sleep(0)  # the handler runs between two instructions
+
+    done = []
+
+    def make(graph):
+        first = graph.node("toys.numbers", "first", NumbersParams(), {"frame": 0})
+
+        def rest(ref):
+            Forgotten()
+            done.append(graph.node("toys.numbers", "second", NumbersParams(), {"frame": 1}))
+
+        graph.expand([first], rest)
+
+    with pytest.raises(KeyboardInterrupt):
+        run(cache, make=make)
+    assert [node.status for node in done] == ["pending"], "the expansion went on, the run did not"
+    assert capfd.readouterr().err == ""
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    found, _ = run(cache, make=lambda graph: graph.node("toys.numbers", "first", NumbersParams(), {"frame": 0}))
+    assert statuses(found) == {"first": "cached"}
 
 
 def test_what_was_created_first_runs_first(cache, tmp_path):

@@ -1,0 +1,47 @@
+"""Ctrl-C that does not get lost.
+
+Python raises KeyboardInterrupt wherever the main thread happens to be. In a callback of a weak reference, or in a
+finaliser, an exception is printed and forgotten, and the run would go on to its end. Here every interrupt is remembered
+as well, so that it can be raised again where the run next looks.
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+import threading
+from types import FrameType, TracebackType
+from typing import Any, NoReturn
+
+
+class Interrupts:
+    """Remembers interrupts while it is entered, on the main thread and where nobody else handles them."""
+
+    def __init__(self) -> None:
+        self.came = False
+        self._hook: Any = None
+
+    def __enter__(self) -> Interrupts:
+        main = threading.current_thread() is threading.main_thread()
+        if main and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+            signal.signal(signal.SIGINT, self._interrupted)
+            self._hook, sys.unraisablehook = sys.unraisablehook, self._unraisable
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        if self._hook is not None:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+            sys.unraisablehook, self._hook = self._hook, None
+
+    def check(self) -> None:
+        """Raise KeyboardInterrupt if one came."""
+        if self.came:
+            raise KeyboardInterrupt
+
+    def _interrupted(self, number: int, frame: FrameType | None) -> NoReturn:
+        self.came = True
+        raise KeyboardInterrupt
+
+    def _unraisable(self, what: Any) -> None:
+        if not issubclass(what.exc_type, KeyboardInterrupt):
+            self._hook(what)
