@@ -197,7 +197,15 @@ def test_an_expansion_that_fails_is_a_failure_and_one_that_cannot_be_made_is_not
     }
 
 
-def test_an_interrupt_where_python_forgets_it_stops_the_run_all_the_same(cache, capfd):
+@pytest.fixture
+def interruptible():
+    """SIGINT as Python handles it: a shell's background job ignores it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+def test_an_interrupt_where_python_forgets_it_stops_the_run_all_the_same(cache, capfd, interruptible):
     class Forgotten:
         def __del__(self):
             signal.raise_signal(signal.SIGINT)
