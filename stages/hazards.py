@@ -104,8 +104,8 @@ class Measured:
 
 
 def window_reach(side: float, cell: float) -> int:
-    """Cells from the middle of a window to its border; at least one."""
-    return max(1, int(side / (2.0 * cell) + 1e-6))
+    """Cells from the middle of a window to its border, the nearest number, halves rounded down; at least one."""
+    return max(1, math.ceil(side / (2.0 * cell) - 0.5 - 1e-6))
 
 
 def measure(

@@ -18,7 +18,7 @@ The vehicle drives ahead, or back at a higher price, and turns on the spot where
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -55,6 +55,10 @@ Point = tuple[float, float]
 
 FACING = math.radians(8.0)
 """What lies within it of the heading is looked at already."""
+
+ASIDE = tuple(math.radians(d) for d in (3.0, -3.0, 6.0, -6.0, 9.0, -9.0))
+"""Headings off the present one from which a way is looked for where there is none: a graph's headings are some 20
+degrees apart, and out of a narrow place a way may lead at those between alone."""
 
 
 class LegParams(Params):
@@ -157,7 +161,9 @@ class Ground:
         heading: float,
         p: LegParams,
         closed: Sequence[Point] = (),
+        aside: float = 0.0,
     ) -> None:
+        """``aside``: rad from the heading to the graph's first one."""
         self.footing, self.start, self.heading, self.p, self.closed = footing, start, heading, p, tuple(closed)
         self.vehicle, self.cell = footing.vehicle, footing.lattice.cell
         at = footing.gaps(*(np.array([v]) for v in (*start, heading)))
@@ -165,7 +171,7 @@ class Ground:
         self.here = [min(self.vehicle.margin, float(a[0]) - self.cell) for a in (at.gap, at.proven)]
         self.unknown_here = min(0.0, float(at.unknown[0]) - self.cell)
         spacing = max(p.spacing * self.vehicle.wheel_diameter, self.cell)
-        self.grid = PoseGrid.over(footing.lattice, start, heading, spacing)
+        self.grid = PoseGrid.over(footing.lattice, start, heading + aside, spacing)
         self._sure: list[Mask] = []
         self.graph = PoseGraph.of(footing, self.grid, self._prices)
 
@@ -229,6 +235,20 @@ class Ground:
         goals: Mask = np.asarray(np.hypot(x - goal[0], y - goal[1]) <= reach)
         turn = self.p.turn_price * self.vehicle.wheel_base
         return goals, *self.graph.search(goals, turn, self.p.back_price, whole=whole)
+
+    def beside(self) -> Iterator[Ground]:
+        """The same from headings a little aside, as far as the wheels have room to turn there."""
+        for aside in ASIDE:
+            if turnable(self.start, self.heading, self.heading + aside, self.clear):
+                yield Ground(self.footing, self.start, self.heading, self.p, self.closed, aside)
+
+    def opens(self, goals: Mask) -> bool:
+        """Whether the vehicle may be at one of these places (row, col)."""
+        return bool(np.isfinite(self.graph.pose[:, goals]).any())
+
+    def from_start(self, cost: Floats) -> float:
+        """Cost of the way from the start, infinite where there is none."""
+        return float(cost[0, self.grid.origin[0], self.grid.origin[1]])
 
     def way(self, move: NDArray[np.int8]) -> list[Piece]:
         """The way from the start in steps."""
@@ -303,11 +323,16 @@ def plan_leg(
         return _stay("goal", f"{1000 * left:.0f} mm from the goal", start, [], nothing)
     ground = Ground(footing, start, heading, params, closed)
     goals, cost, move = ground.search(goal, 0.5 * params.tolerance * base)
-    shown = ground.on_map(cost)
-    least = float(cost[0, ground.grid.origin[0], ground.grid.origin[1]])
+    shown, least = ground.on_map(cost), ground.from_start(cost)
     kept, price = list[Piece](), math.inf
     if before is not None:
         kept, price = ground.again(_onward(before, start, heading, ground.grid.spacing))
+    for other in ground.beside() if not np.isfinite(min(least, price)) and ground.opens(goals) else ():
+        _, found, move = other.search(goal, 0.5 * params.tolerance * base)
+        least = other.from_start(found)
+        if np.isfinite(least):
+            ground, shown = other, other.on_map(found)
+            break
     if not np.isfinite(min(least, price)):
         why = _why_closed(ground, goals, cost)
         turn = 0.0 if looks >= params.looks else _free_turn(ground, 0.0, looks)
@@ -402,7 +427,7 @@ def shortest(footing: Footing, start: Point, heading: float, goal: Point, params
     free = {"unknown_price": math.inf, "near_price": 0.0, "caution_price": 0.0, "turn_price": 0.0, "back_price": 1.0}
     ground = Ground(footing, start, heading, params.model_copy(update=free))
     _, cost, move = ground.search(goal, 0.5 * params.tolerance * footing.vehicle.wheel_base)
-    if not np.isfinite(cost[0, ground.grid.origin[0], ground.grid.origin[1]]):
+    if not np.isfinite(ground.from_start(cost)):
         return None
     return length_of(straightened(ground.way(move), heading, ground.clear, ground.cell))
 
@@ -418,7 +443,7 @@ def _check(lattice: Lattice, name: str, point: Point) -> None:
 
 
 def _why_closed(ground: Ground, goals: Mask, cost: Floats) -> str:
-    if not np.isfinite(ground.graph.pose[:, goals]).any():
+    if not ground.opens(goals):
         return "the goal itself is on hazardous ground, or too near to it"
     row, col = np.nonzero(np.isfinite(cost).any(axis=0))
     gap = float(np.hypot(row - ground.grid.origin[0], col - ground.grid.origin[1]).min()) * ground.grid.spacing
@@ -489,7 +514,7 @@ def _length(path: Floats) -> float:
 
 STAGE = Stage(
     name="leg",
-    version=5,
+    version=6,
     summary="the next leg of a drive to a goal, over ground that is known to be free",
     params=LegParams,
     inputs=("risk", "far?", "pose", "before?"),

@@ -30,7 +30,7 @@ from pydantic import Field
 
 from stages.declare import Array, Bundle, Inputs, Memory, Params, Stage
 from stages.errors import InputError
-from stages.hazards import BITS, measure
+from stages.hazards import BITS, measure, window_reach
 from stages.holes import close_into
 from stages.lattice import Lattice, mosaic, union
 from stages.vehicle import DEFAULT_VEHICLE, Vehicle
@@ -146,8 +146,8 @@ def check_size(vehicle: Vehicle, shape: tuple[int, ...], cell: float) -> None:
 
 
 def window_cells(side: float, cell: float) -> int:
-    """Odd number of cells, at least three, that a window of ``side`` metres covers."""
-    return 2 * max(1, int(side / (2.0 * cell) + 1e-6)) + 1
+    """Odd number of cells across a window of ``side`` metres, see :func:`stages.hazards.window_reach`."""
+    return 2 * window_reach(side, cell) + 1
 
 
 def _run(params: RiskParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
@@ -188,7 +188,7 @@ _GRID = ("row", "col")
 
 STAGE = Stage(
     name="risk",
-    version=3,
+    version=4,
     summary="safe, caution, hazard and unknown cells by seven measures against a vehicle's limits",
     params=RiskParams,
     inputs=("dem*",),

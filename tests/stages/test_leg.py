@@ -77,6 +77,17 @@ def test_out_of_a_dead_end_it_drives_back() -> None:
     assert abs(leg.path[1, 0]) < 0.011
 
 
+@pytest.mark.parametrize("degrees", [6.0, -3.0])
+def test_out_of_a_narrow_place_it_goes_at_the_heading_that_fits(degrees: float) -> None:
+    turn = math.radians(degrees)
+    aside, along = X * math.cos(turn) + Y * math.sin(turn), Y * math.cos(turn) - X * math.sin(turn)
+    walls = (np.abs(aside) > 0.061) & (np.abs(along - 0.2) < 0.3)
+    leg = plan_leg(ground((walls, HAZARDOUS)), START, 0.0, GOAL, P, P.looks)
+    assert leg.verdict == "drive"
+    driven = leg.path[-1] - leg.path[0]
+    assert math.degrees(math.atan2(-driven[0], driven[1])) == pytest.approx(degrees, abs=2.0)
+
+
 def test_a_wall_with_a_gap_is_gone_round_and_a_closed_one_is_no_path() -> None:
     wall = (np.abs(Y - 0.4) < 0.02) & (X < 0.1)
     leg = plan_leg(ground((wall, HAZARDOUS)), START, 0.0, GOAL, P)

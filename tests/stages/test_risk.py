@@ -78,6 +78,7 @@ def test_a_post_on_coarse_ground_by_hand() -> None:
 def test_windows_are_the_wheel_in_cells() -> None:
     assert [window_cells(d, 0.001) for d in (0.03, 0.025, 0.001)] == [31, 25, 3]
     assert window_cells(0.3, 0.1) == 3
+    assert [window_cells(d, 0.004) for d in (0.015, 0.03)] == [5, 9], "the nearest number, not the next lower one"
 
 
 @pytest.mark.parametrize("direction", [0.0, 0.4, math.pi / 4, 2.0])
