@@ -1,4 +1,4 @@
-"""A planned path against the risk map of the exact elevations: does it cross what is truly hazardous?"""
+"""A planned path against the risk map of the exact elevations: does it cross what is truly hazardous, is it long?"""
 
 from __future__ import annotations
 
@@ -8,12 +8,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stages import grid8
 from stages.accuracy_parts import Metric, metric
 from stages.declare import Array, Bundle, Inputs, NoParams, Stage
 from stages.lattice import Lattice
+from stages.path_ground import Ground, Maps
 from stages.risk import HAZARDOUS, UNKNOWN
+from stages.row_graph import UNREACHED
+from stages.row_grid import RowGrid
+from stages.vehicle import Vehicle
 
 Floats = NDArray[np.float64]
+
+UNIT = 1000
+"""Cost of a step along an axis: a step aside costs 1414."""
 
 
 def crossed_cells(path: Floats, lattice: Lattice) -> NDArray[np.int64]:
@@ -58,20 +66,67 @@ def path_check(path: Floats, risk: NDArray[np.uint8], lattice: Lattice) -> tuple
     }
 
 
+def shortest(path: Floats, maps: Maps, lattice: Lattice, vehicle: Vehicle) -> dict[str, Metric]:
+    """The shortest way between the path's ends over the exact map, and how much longer the path is, from above.
+
+    It is one in steps to the eight neighbours as the path itself is, at no price but its length, where the vehicle
+    keeps its margin from hazards; where that closes every way, the one without it.
+
+    Parameters
+    ----------
+    path : (vertex, xyz) float64, metres, in the frame of the lattice; empty where no path was found.
+    maps : arrays (row, col) of stage ``risk`` from the exact elevations.
+    """
+    found, kept = None, vehicle.margin
+    for kept in (vehicle.margin, 0.0) if len(path) else ():
+        found = _shortest(path, maps, lattice, vehicle.model_copy(update={"margin": kept}))
+        if found is not None:
+            break
+    if found is None:
+        how = (
+            "not applicable: no path was found"
+            if len(path) == 0
+            else "none leads from one end of the path to the other"
+        )
+        return {"shortest_length": metric(None, "m", how), "length_ratio": metric(None, "1", how)}
+    room = "keeping the margin" if kept else "within the limits, but without the margin"
+    how = f"shortest way between the path's ends over the risk map of the exact elevations, {room}, seen from above"
+    length = float(np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1).sum())
+    return {
+        "shortest_length": metric(found, "m", how),
+        "length_ratio": metric(
+            length / found if found > 0 else None, "1", f"length of the path over that of the {how}"
+        ),
+    }
+
+
+def _shortest(path: Floats, maps: Maps, lattice: Lattice, vehicle: Vehicle) -> float | None:
+    ground = Ground(maps, lattice, RowGrid.over(lattice, (0.0, 1.0)), vehicle, unit=vehicle.max_step, caution=0.0)
+    ways = ground.ways("middle")
+    first, last = (ground.grid.index((float(path[k, 0]), float(path[k, 1]))) for k in (0, -1))
+    if not all(0 <= r < ways.shape[0] and 0 <= c < ways.shape[1] and ways[r, c] for r, c in (first, last)):
+        return None
+    level = np.zeros(ways.shape, np.int32)
+    cost, _ = grid8.cost_to_go(level, ways, last, first, UNIT, level.astype(np.int16))
+    return float(cost[first]) / UNIT * lattice.cell if cost[first] < UNREACHED else None
+
+
 def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     path, risk = inputs["path"], inputs["risk"]
     lattice = Lattice.from_dict(risk.meta["lattice"])
-    hit, metrics = path_check(np.asarray(path["path"]), np.asarray(risk["risk"]), lattice)
+    vertices, maps = np.asarray(path["path"]), {name: np.asarray(risk[name]) for name in risk.arrays}
+    hit, metrics = path_check(vertices, maps["risk"], lattice)
+    metrics |= shortest(vertices, maps, lattice, Vehicle.model_validate(risk.meta["vehicle"]))
     return Bundle({"hazard_cell": hit.astype(np.int32)}, {"metrics": metrics})
 
 
 STAGE = Stage(
     name="path_check",
-    version=1,
+    version=2,
     summary="planned path against the risk map of the exact elevations",
     params=NoParams,
     inputs=("path", "risk"),
     outputs=(Array("hazard_cell", ("cell", "rowcol"), "int32", "1", "crossed cells that are truly hazardous"),),
-    requires=("numpy",),
+    requires=("numpy", "numba", "scipy"),
     run=_run,
 )

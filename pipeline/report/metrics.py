@@ -92,6 +92,7 @@ KEY = frozenset(
         "dem_merged_rmse",
         "dem_merged_nmad",
         "path_check_hazard_cells",
+        "path_check_length_ratio",
         "frames_posed",
         "reprojection_rms",
         "matched",
@@ -267,8 +268,14 @@ def _drive(view: RunView) -> dict[str, Metric]:
 def _path_check(view: RunView) -> dict[str, Metric]:
     truth = "risk map of the exact elevations"
     found = dict(_assessed(view, view.products.path_check, "path_check_", "Path against truth", truth))
-    if "path_check_path_length" in found:
-        found["path_check_path_length"]["label"] = "Length of the path"
+    labels = {
+        "path_length": "Length of the path",
+        "shortest_length": "Shortest way on the exact map",
+        "length_ratio": "Length of the path over the shortest",
+    }
+    for name, label in labels.items():
+        if f"path_check_{name}" in found:
+            found[f"path_check_{name}"]["label"] = label
     return {name: {**metric, "completeness": None} for name, metric in found.items()}
 
 
