@@ -272,6 +272,10 @@ class Ground:
                 return [], math.inf
             cost += turn * self.p.turn_price * self.vehicle.wheel_base * float(price[:n].max())
             cost += metres * float(price[n:].mean())
+            first = piece.length * float(share[np.argmin(known) - 1])  # metres before what is not known
+            if not known.all() and np.argmin(known) > n and first > 0:
+                out.append(replace(piece.cut(first), known=True))
+                piece = replace(piece, a=out[-1].b)
             out.append(replace(piece, known=bool(known.all())))
             heading = piece.heading
         return out, cost
@@ -352,7 +356,7 @@ def plan_leg(
             rest = last_metres(plan, length_of(leg))
             return Leg("drive", "", *_line(leg, start), turn, vertices(way, start), *_line(rest, leg[-1].b), shown)
         return _stay("turn", f"turns {math.degrees(turn):.0f} degrees to where it goes on", start, plan, shown, turn)
-    x, y = way[_sure(way)].b if _sure(way) < len(way) else way[-1].b
+    x, y = way[min(_sure(way), len(way) - 1)].cut(ground.grid.spacing).b
     towards = math.remainder(math.atan2(-(x - start[0]), y - start[1]) - heading, 2 * math.pi)
     again = any(math.hypot(start[0] - bx, start[1] - by) < params.vain * base for bx, by in backs)
     if looks < params.looks and not again and (looks > 0 or abs(towards) < FACING):

@@ -216,6 +216,22 @@ def test_what_is_left_after_a_leg_goes_on_from_where_the_vehicle_stands() -> Non
     assert onward.way[1:] == pytest.approx(leg.rest[1:])
 
 
+def test_of_a_kept_way_it_drives_what_is_known() -> None:
+    risk = ground((Y > 0.15, UNKNOWN))
+    straight = np.array([START, GOAL])
+    leg = plan_leg(risk, START, 0.0, GOAL, SEEN, before=(straight, AHEAD[:1]))
+    assert leg.verdict == "drive"
+    assert leg.path[-1, 1] == pytest.approx(plan_leg(risk, START, 0.0, GOAL, SEEN).path[-1, 1], abs=0.008)
+    assert leg.rest == pytest.approx(np.array([leg.path[-1], GOAL]))
+    # nearer by less than a leg is worth it looks, and what it looks at in vain is where known ground ends
+    at = (0.0, float(leg.path[-1, 1]) - 0.01)
+    kept = np.array([at, GOAL])
+    closed = plan_leg(risk, at, 0.0, GOAL, SEEN, P.looks, before=(kept, AHEAD[:1]))
+    assert closed.verdict == "closed"
+    assert closed.where is not None
+    assert 0.0 <= closed.where[1] - leg.path[-1, 1] < LATTICE.cell + 1e-9
+
+
 def test_unknown_ground_beside_the_vehicle_is_the_last_way_that_is_tried() -> None:
     # the way through leads over 0.14 m of it, the way round is longer by 0.1 m and turns by 1.3 rad
     hole = (np.abs(Y - 0.12) < 0.02) & (X < 0.12) & (X > -0.39)
