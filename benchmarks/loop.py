@@ -78,7 +78,7 @@ def choose_goal(sequence: Any, config: Any) -> tuple[float, float] | None:
     from stages.footing import Footing
     from stages.geometry import RigidTransform, level_rotation
     from stages.lattice import Lattice
-    from stages.leg import Ground
+    from stages.leg_ground import Ground
     from stages.risk import risk_map
     from stages.wheels import stand
 
