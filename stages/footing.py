@@ -33,8 +33,12 @@ BODY_BITS = np.uint16(sum(BITS.values()) - int(WHEEL_BITS))
 NEAR_UNKNOWN = 0.5
 """Cells; nearer than this a point of the belly lies in an unknown cell."""
 
-DOUBT_WEIGHT = 15
-"""Of ground that is hazardous by sigma alone, or doubted, against caution: a wheel there makes a way dearer by half."""
+PARTS = 5
+"""Of a vehicle that stand on ground: its wheels and its middle."""
+
+DOUBT_WEIGHT = 60
+"""Of ground that is hazardous by sigma alone, or doubted, against caution: a wheel there makes a way more than three
+times as dear."""
 
 
 @dataclass(frozen=True)
@@ -159,7 +163,7 @@ def _gaps(at, cosine, sine, wheels, belly, fields, unknown, caution, reach, out)
             gap, proven = min(gap, fields[0, i, j]), min(proven, fields[1, i, j])
             share += caution[i, j]
             least = min(least, unknown[i, j] - reach[2])
-        out[0, n], out[1, n], out[3, n] = gap, proven, share / np.float32(5.0)
+        out[0, n], out[1, n], out[3, n] = gap, proven, share / np.float32(PARTS)
         if outside:
             continue
         if spare > 0:

@@ -135,7 +135,7 @@ def plan_leg(
         return _stay("no path", why, start, [], shown)
     way = kept if kept and price <= (1.0 + params.loyalty) * least else ground.way(move)
     sure = first_metres(way[: _sure(way)], 4.0 * params.length * base)
-    straight = straightened(sure, heading, ground.clear, ground.cell)
+    straight = straightened(sure, heading, ground.plain, ground.cell)
     plan = [*straight, *last_metres(way, length_of(sure))]
     leg = first_metres(straight, params.length * base)
     if length_of(leg) >= min(params.least * base, length_of(way) - 1e-9):
@@ -295,8 +295,10 @@ def _seen(near: Bundle, far: Bundle | None, p: LegParams) -> tuple[list[NDArray[
     maps = [np.asarray(near[name]) for name in names]
     unknown, glanced = maps[0] == UNKNOWN, None
     if far is not None:
-        # at the rim of what is near, a window is cut off, which widens the doubt; all of it was seen from afar
-        cut = unknown | ((maps[1] & UNSEEN_BIT) != 0)
+        # at the rim of what is near, a window is cut off, which widens the doubt; all of it was seen from afar, which
+        # counts where it looks clearly free
+        chance = np.asarray(far["p_hazard"])
+        cut = unknown | (((maps[1] & UNSEEN_BIT) != 0) & (chance < p.clear))
         maps = [np.where(cut, np.asarray(far[name]), seen) for name, seen in zip(names, maps, strict=True)]
         unknown &= ~(maps[2] < p.clear)
         glanced = unknown & (maps[0] != UNKNOWN)

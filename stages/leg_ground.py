@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.footing import Footing, Gaps
+from stages.footing import DOUBT_WEIGHT, PARTS, Footing, Gaps
 from stages.leg_params import LegParams
 from stages.pose_graph import PoseGraph, PoseGrid
 from stages.route import STEP_TURN, Piece, pieces, turnable
@@ -95,6 +95,11 @@ class Ground:
     def clear(self, x: Floats, y: Floats, heading: Floats) -> bool:
         """Whether all of these poses may be driven."""
         return bool(self.free(x, y, heading).all())
+
+    def plain(self, x: Floats, y: Floats, heading: Floats) -> bool:
+        """Whether all of these poses may be driven and no wheel stands on doubtful ground there."""
+        gaps = self.footing.gaps(x, y, heading)
+        return bool((self._split(gaps, x, y)[0] & (gaps.caution < DOUBT_WEIGHT / PARTS)).all())
 
     def free(self, x: Floats, y: Floats, heading: Floats) -> Mask:
         """Which of these poses may be driven."""
