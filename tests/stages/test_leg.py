@@ -10,10 +10,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from stages.declare import Bundle
 from stages.errors import InputError
-from stages.footing import Footing
+from stages.footing import DOUBT_WEIGHT, PARTS, Footing
 from stages.lattice import Lattice
-from stages.leg import Leg, LegParams, plan_leg, shortest
+from stages.leg import Leg, LegParams, _seen, plan_leg, shortest
 from stages.risk import HAZARDOUS, REASONS, SAFE, UNKNOWN
 from stages.route import length_of, through
 from stages.vehicle import Vehicle
@@ -230,6 +231,35 @@ def test_of_a_kept_way_it_drives_what_is_known() -> None:
     assert closed.verdict == "closed"
     assert closed.where is not None
     assert 0.0 <= closed.where[1] - leg.path[-1, 1] < LATTICE.cell + 1e-9
+
+
+def test_no_wheel_is_driven_over_doubtful_ground_that_can_be_gone_round() -> None:
+    free = np.full(LATTICE.shape, SAFE, np.uint8)
+    doubted = np.hypot(X + 0.5 * ROVER.track, Y - 0.15) < 0.011
+    footing = Footing.of(free, None, LATTICE, ROVER, doubted=doubted)
+    leg = plan_leg(footing, START, 0.0, GOAL, P)
+    assert leg.verdict == "drive"
+    for piece in through(leg.path, leg.gear, 0.0):
+        along = np.linspace(0.0, 1.0, 50)
+        x, y = (a + along * (b - a) for a, b in zip(piece.a, piece.b, strict=True))
+        assert footing.gaps(x, y, np.full(50, piece.heading)).caution.max() < DOUBT_WEIGHT / PARTS
+    # where there is no room to go round, it is driven over
+    risk = np.where(np.abs(X) > 0.075, np.uint8(HAZARDOUS), free)
+    between = plan_leg(Footing.of(risk, None, LATTICE, ROVER, doubted=doubted), START, 0.0, GOAL, P)
+    assert between.path[-1, 1] > 0.15
+
+
+@pytest.mark.parametrize(("chance", "kind"), [(0.19, HAZARDOUS), (0.01, SAFE)])
+def test_at_the_rim_of_what_is_near_only_what_is_clearly_free_from_afar_counts(chance: float, kind: int) -> None:
+    def seen(risk: int, reason: int, p: float) -> Bundle:
+        maps = {"risk": np.uint8(risk), "reason": np.uint16(reason), "p_hazard": np.float32(p)}
+        return Bundle({name: np.full((2, 2), value) for name, value in maps.items()}, {})
+
+    near = seen(HAZARDOUS, REASONS["slope"] | REASONS["uncertain"] | REASONS["unseen"], 0.45)
+    (classes, _, found), known = _seen(near, seen(SAFE, 0, chance), P)
+    assert (classes == kind).all()
+    assert found == pytest.approx(0.45 if kind == HAZARDOUS else chance)
+    assert not known["unknown"].any()
 
 
 def test_unknown_ground_beside_the_vehicle_is_the_last_way_that_is_tried() -> None:
