@@ -26,6 +26,8 @@ NOMINAL = (0.0, 1.0)
 LEAST = 0.7
 """m; of the goal from the start."""
 COVERS = (0.05, 0.1)
+LONGEST = 1.15
+"""Of a way over the shortest one."""
 
 
 def arguments() -> argparse.Namespace:
@@ -218,8 +220,8 @@ def table(rows: list[dict[str, Any]]) -> list[str]:
     """The runs by rock cover."""
     lines = [
         "| rock cover | runs | path exists | of these reached | runs with a violation | drift, median, worst "
-        "| way / shortest, median, worst | reflex stops | way, m | s a loop |",
-        "|---|---|---|---|---|---|---|---|---|---|",
+        f"| way / shortest, median, worst | at most {LONGEST:g} | reflex stops | way, m | s a loop |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for cover in sorted({r["cover"] for r in rows}):
         mine = [r for r in rows if r["cover"] == cover]
@@ -234,6 +236,7 @@ def table(rows: list[dict[str, Any]]) -> list[str]:
         cells = [f"{100 * cover:.0f} %", str(len(mine)), str(len(possible))]
         cells += [f"{len(reached)}: {wilson(len(reached), len(possible))}"]
         cells += [f"{len(broken)}: {wilson(len(broken), len(judged))}", f"{_middle(drift)} %", _middle(ratio)]
+        cells += [wilson(sum(r <= LONGEST for r in ratio), len(ratio))]
         cells += [str(sum(r["reflex_stops"] for r in judged)), f"{way:.1f}", f"{seconds:.0f}"]
         lines.append(f"| {' | '.join(cells)} |")
     return lines

@@ -73,6 +73,9 @@ HIDDEN = (0.5, 0.5)
 """Steps of the vehicle by which unknown ground widens the doubt of a measure, where all of the wheel's window, or of
 the ground below the vehicle, is unknown: what is hidden there is not in the measures."""
 
+FINE = 5
+"""Cells along a wheel's radius from which single ones are taken for wrong: three of them are then no stone to it."""
+
 FREEDOM = 3.0
 """Degrees of freedom of Student's t."""
 
@@ -127,7 +130,7 @@ def measure(
     cell : side of a cell, metres.
     window : metres, side of the wheel's window.
     """
-    surface = median3(surface) if 3 * cell <= 0.5 * vehicle.wheel_diameter else surface
+    surface = median3(surface) if FINE * cell <= 0.5 * vehicle.wheel_diameter else surface
     reach, near = window_reach(window, cell), window_reach(0.5 * window, cell)
     step, height_range = relief(surface, near, reach)
     n = stride(vehicle, cell)

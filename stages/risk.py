@@ -6,8 +6,8 @@ does with ``sigmas`` standard deviations added; and *unknown*, where too little 
 is never entered. The measures, their noise and the probability are those of :mod:`stages.hazards`; each that exceeds
 its limit has its bit in ``reason``.
 
-Where three cells are at most a wheel's radius, a 3 x 3 median first removes single wrong cells; coarser models keep
-every cell, since one cell may then be a post.
+Where five cells are at most a wheel's radius, a 3 x 3 median first removes single wrong cells; coarser models keep
+every cell, since one cell may then be the top of a stone, or a post.
 
 Guarantees, each tested: of two elevation models the one with the greater relief (see :mod:`stages.hazards`), or with
 the greater standard deviations, is in no cell the safer one; nor is it with a larger ``sigmas``.
@@ -188,7 +188,7 @@ _GRID = ("row", "col")
 
 STAGE = Stage(
     name="risk",
-    version=4,
+    version=5,
     summary="safe, caution, hazard and unknown cells by seven measures against a vehicle's limits",
     params=RiskParams,
     inputs=("dem*",),
