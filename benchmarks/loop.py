@@ -212,7 +212,7 @@ def wilson(hits: int, n: int) -> str:
         return "-"
     z, p = 1.959964, hits / n
     middle, half = p + z * z / (2 * n), z * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
-    low, high = ((middle + s * half) / (1 + z * z / n) for s in (-1, 1))
+    low, high = (min(max((middle + s * half) / (1 + z * z / n), 0.0), 1.0) for s in (-1, 1))
     return f"{100 * p:.0f} % ({100 * low:.0f}-{100 * high:.0f})"
 
 
