@@ -145,7 +145,6 @@ class Drive(Reconstruction):
         """Places from which it drove back to see what lies before them."""
         self.planned: Handle | None = None
         """The last leg, of whose way a part is left."""
-        """The leg that made the vehicle turn on the spot, while it has not driven since."""
         self.reopened = False
         """Whether these places were tried once more, as the last way that is left."""
 
