@@ -21,6 +21,9 @@ deviation:
 cells called hazard that are not: shares of the observed cells, those that are not unknown, with Wilson's 95 % interval
 over scenes' cells thinned to one a vehicle length (cells are not independent). 'missed' is the share of the truly
 hazardous cells that are called safe or caution.
+
+Of each scene a path is planned on the map of 'rille' and on that of 'perfect DEM', over as many rows as are connected,
+and compared with the shortest way between its ends on the map of the exact elevations, where all is known.
 """
 
 from __future__ import annotations
@@ -39,6 +42,9 @@ from matching import say, start_process, table
 SLOPES = (0.0, 5.0, 10.0, -5.0)
 EDGES = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99, 1.0)
 COUNTS = ("all", "observed", "truly hazardous", "safe", "caution", "false safe", "enterable hazard", "false hazard")
+PLANNED = ("rille", "perfect DEM")
+LONGEST = 1.15
+"""Of a path over the shortest one."""
 GOALS = {"false safe": 0.002, "false hazard": 0.05}
 
 
@@ -85,6 +91,18 @@ def judge(scene: Any, exact: Any, found: Any) -> dict[str, Any]:
     return out
 
 
+def path_of(scene: Any, exact: Any, found: Any) -> dict[str, Any]:
+    """Length of a path over a map, the shortest between its ends over the exact one, and what it truly crosses."""
+    from stages.path import find_path
+    from stages.path_check import path_check, shortest
+
+    path = find_path(found, scene.lattice, scene.vehicle, stretch=True)
+    true = shortest(path.xyz, exact, scene.wide, scene.vehicle)
+    crossed = path_check(path.xyz, exact["risk"], scene.wide)[1]
+    values = {name: m["value"] for name, m in (true | crossed).items()}
+    return {"planner": path.planner, "ground": path.ground, **values}
+
+
 def one(seed: int, cover: float, slope: float, folder: Path | None, preset: str) -> dict[str, Any]:
     """All ways on one scene."""
     import numpy as np
@@ -105,7 +123,8 @@ def one(seed: int, cover: float, slope: float, folder: Path | None, preset: str)
     }
     error = (scene.posed - scene.crop(scene.exact))[known]
     facts = {"seed": seed, "cover": cover, "slope_deg": slope, "rmse_m": float(np.sqrt(np.nanmean(error**2)))}
-    return facts | {"ways": {name: judge(scene, exact, found) for name, found in ways.items()}}
+    paths = {name: path_of(scene, exact, ways[name]) for name in PLANNED}
+    return facts | {"ways": {name: judge(scene, exact, found) for name, found in ways.items()}, "paths": paths}
 
 
 def total(scenes: list[dict[str, Any]], way: str) -> dict[str, float]:
@@ -132,6 +151,27 @@ def show(scenes: list[dict[str, Any]], covers: list[float]) -> None:
                  100 * t["enterable hazard"] / n, 100 * t["false hazard"] / n, f"{100 * low2:.2f}-{100 * high2:.2f}"]
             )  # fmt: skip
     table("Classes against the exact elevations", headings, rows)
+
+
+def show_paths(scenes: list[dict[str, Any]], covers: list[float]) -> None:
+    """Length of paths over the shortest."""
+    headings = ["cover", "map", "scenes", "path", "of rows", "length, m", "over the shortest: median", "greatest",
+                f"at most {LONGEST:g}", "hazardous of crossed cells, %"]  # fmt: skip
+    rows = []
+    for cover in [*covers, None]:
+        mine = [s for s in scenes if cover is None or s["cover"] == cover]
+        for way in PLANNED:
+            found = [s["paths"][way] for s in mine if s["paths"][way]["path_length"] is not None]
+            ratio = sorted(p["length_ratio"] for p in found if p["length_ratio"] is not None)
+            crossed = sum(p["crossed_cells"] for p in found)
+            rows.append(
+                ["all" if cover is None else f"{100 * cover:.0f} %", way, len(mine), len(found),
+                 sum(p["planner"] == "rows" for p in found), sum(p["path_length"] for p in found),
+                 *((ratio[len(ratio) // 2], ratio[-1]) if ratio else ("-", "-")),
+                 f"{sum(r <= LONGEST for r in ratio)} of {len(ratio)}",
+                 100 * sum(p["hazard_cells"] for p in found) / max(crossed, 1)]
+            )  # fmt: skip
+    table("Paths against the shortest on the exact map", headings, rows)
 
 
 def calibration(scenes: list[dict[str, Any]]) -> list[tuple[float, float, int]]:
@@ -173,6 +213,7 @@ def main() -> int:
             if given.json:
                 given.json.write_text(json.dumps({"scenes": scenes}, indent=1) + "\n", encoding="utf-8")
     show(scenes, given.cover)
+    show_paths(scenes, given.cover)
     curve = calibration(scenes)
     table("p_hazard", ["mean p", "truly hazardous", "cells"], [list(row) for row in curve])
     if given.picture:

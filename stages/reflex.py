@@ -9,7 +9,8 @@ point goes; what the image shows instead is put down to another depth along the 
 
 with t the share of the distance to the camera, and so to a point in space. It counts as raised where it lies higher
 than all of the model within reach of its errors, by more than half a wheel's radius and by more than its noise. Enough
-raised points together are an obstacle: the vehicle stops and looks.
+raised points together are an obstacle, at once where they are much of what is seen there, else where the next image
+shows them again: the vehicle stops and looks.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 from pydantic import Field
+from scipy.spatial import KDTree
 
 from stages.declare import Array, Bundle, Inputs, Params, Stage
 from stages.geometry import Camera, Rig, RigidTransform
@@ -50,8 +52,10 @@ class ReflexParams(Params):
     sigmas: float = Field(2.0, gt=0, description="standard deviations of the rise that it must exceed as well")
     blur: float = Field(0.5, ge=0, description="wheel diameters; the model's greatest height within this is compared")
     points: int = Field(6, ge=1, description="raised points within one wheel diameter that make an obstacle")
-    share: float = Field(0.25, ge=0, le=1, description="and their share of all points there")
-    images: int = Field(1, ge=1, description="images in a row in which it must show; more are surer and later")
+    share: float = Field(0.35, ge=0, le=1, description="and their share of all points there")
+    again_share: float = Field(
+        0.15, ge=0, le=1, description="the same where so many were raised there in the image compared before as well"
+    )
 
 
 @dataclass(frozen=True)
@@ -95,11 +99,21 @@ class View:
 
 @dataclass(frozen=True)
 class Points:
-    """Points ahead: ``place`` (n, 2) right and ahead of the vehicle, m; ``rise`` (n,) m over the model; ``raised``."""
+    """Points ahead: ``place`` (n, 2) right and ahead of the vehicle, m; ``ground`` (n, 2) the same in the
+    model's frame; ``rise`` (n,) m over the model; ``raised``."""
 
     place: Floats
+    ground: Floats
     rise: Floats
     raised: Bools
+
+
+@dataclass(frozen=True)
+class Obstacle:
+    """A group of raised points: how many, and ``place`` (2,) right and ahead of the vehicle, m."""
+
+    count: int
+    place: Floats
 
 
 def look(
@@ -132,7 +146,7 @@ def look(
     noise = error / np.maximum(np.hypot(slope[:, 0], slope[:, 1]), 1e-9) * to_camera[:, 2]
     raised = along & (rise > p.height * wheel) & (rise > p.sigmas * noise) & np.isfinite(rise)
     place = T_vehicle_local.apply(q)[:, :2]
-    return Points(place[along], rise[along], raised[along])
+    return Points(place[along], q[along, :2], rise[along], raised[along])
 
 
 def _seen(view: View, cells: Floats, camera: Camera) -> tuple[NDArray[np.intp], Floats, Floats]:
@@ -157,17 +171,25 @@ def _seen(view: View, cells: Floats, camera: Camera) -> tuple[NDArray[np.intp], 
     return np.asarray(at[keep]), np.asarray(ground), np.asarray(centre)
 
 
-def cluster(points: Points, wheel: float, p: ReflexParams) -> tuple[int, float, float] | None:
-    """The largest group of raised points within one wheel's diameter: count, right and ahead of the vehicle, m."""
-    up = points.place[points.raised]
+def obstacle(points: Points, wheel: float, p: ReflexParams, before: Floats) -> tuple[Obstacle | None, Floats]:
+    """The largest group of raised points within one wheel's diameter that counts, and what counts if it is seen again.
+
+    ``before`` (n, 2) m, the model's frame: what counted so in the image before.
+    """
+    up, ground = points.place[points.raised], points.ground[points.raised]
     if len(up) < p.points:
-        return None
-    near = (np.abs(up[:, None, :] - up[None, :, :]) <= 0.5 * wheel).all(axis=2).sum(axis=1)
-    best = int(np.argmax(near))
-    around = (np.abs(points.place - up[best]) <= 0.5 * wheel).all(axis=1).sum()
-    if near[best] < p.points or near[best] < p.share * around:
-        return None
-    return int(near[best]), float(up[best, 0]), float(up[best, 1])
+        return None, np.zeros((0, 2))
+    raised, around = (
+        KDTree(some).query_ball_point(up, 0.5 * wheel, p=np.inf, return_length=True) for some in (up, points.place)
+    )
+    enough = raised >= p.points
+    doubtful = enough & (raised >= p.again_share * around)
+    apart = KDTree(before).query(ground)[0] if len(before) else np.full(len(up), np.inf)
+    counts = enough & (raised >= p.share * around) | doubtful & (apart <= 0.5 * wheel)
+    if not counts.any():
+        return None, ground[doubtful]
+    best = int(np.argmax(np.where(counts, raised, -1)))
+    return Obstacle(int(raised[best]), up[best]), ground[doubtful]
 
 
 def _run(params: ReflexParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
@@ -177,32 +199,36 @@ def _run(params: ReflexParams, args: Mapping[str, Any], inputs: Inputs) -> Bundl
     wheel = vehicle.wheel_diameter
     lattice = Lattice.from_dict(dem.meta["lattice"])
     surface = Surface.of(np.asarray(dem["elevation"]), lattice, params.blur * wheel)
-    poses = [RigidTransform.from_matrix(m) for m in np.asarray(resect["poses"])]
+    poses = np.asarray(resect["poses"])  # NaN where tracking was lost, which is for the stage safety to judge
+    known = np.isfinite(poses).all(axis=(1, 2))
     frames = [int(f["frame"]) for f in resect.meta["per_frame"]]
     raised = np.zeros(len(frames), np.int32)
     where = np.full((len(frames), 2), np.nan)
-    stop, reason, in_a_row = None, "", 0
+    stop, reason, doubtful = None, "", np.zeros((0, 2))
     for (i, j), motion in zip(args["pairs"], inputs["motions"], strict=True):
+        if not (known[i] and known[j]):
+            continue
         ok = matched(np.asarray(motion["validity"]))
         column, row = np.asarray(motion["column_disparity"]), np.asarray(motion["row_disparity"])
-        view = View(poses[i], poses[j], column, row, ok, int(motion.meta["level"]))
-        found = cluster(look(view, surface, camera, T_vehicle_left, vehicle, params), wheel, params)
-        in_a_row = 0 if found is None else in_a_row + 1
+        first, second = (RigidTransform.from_matrix(poses[k]) for k in (i, j))
+        view = View(first, second, column, row, ok, int(motion.meta["level"]))
+        points = look(view, surface, camera, T_vehicle_left, vehicle, params)
+        found, doubtful = obstacle(points, wheel, params, doubtful)
         if found is None:
             continue
-        raised[j], where[j] = found[0], found[1:]
-        if stop is None and in_a_row >= params.images:
-            away = 1000.0 * (found[2] - 0.5 * vehicle.wheel_base - 0.5 * wheel)
+        raised[j], where[j] = found.count, found.place
+        if stop is None:
+            away = 1000.0 * (found.place[1] - 0.5 * vehicle.wheel_base - 0.5 * wheel)
             stop = j
-            reason = f"obstacle {away:.0f} mm before the wheels: {found[0]} points rise above the model"
+            reason = f"obstacle {away:.0f} mm before the wheels: {found.count} points rise above the model"
     meta = {"stop": stop, "frame": None if stop is None else frames[stop], "reason": reason, "frames": frames}
-    watched = [int(j) for _, j in args["pairs"]]
+    watched = [int(j) for i, j in args["pairs"] if known[i] and known[j]]
     return Bundle({"raised": raised, "where": where}, meta | {"watched": watched})
 
 
 STAGE = Stage(
     name="reflex",
-    version=1,
+    version=2,
     summary="obstacles that the last elevation model does not know, seen on the way",
     params=ReflexParams,
     inputs=("dem", "resect", "rig", "motions*"),

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from stages.geometry import Camera, RigidTransform, rotation_exp
 from stages.lattice import Lattice
-from stages.reflex import ReflexParams, Surface, View, cluster, look, pairs
+from stages.reflex import Obstacle, Points, ReflexParams, Surface, View, look, obstacle, pairs
 from stages.vehicle import Vehicle
 
 Floats = NDArray[np.float64]
@@ -67,15 +67,18 @@ def surface(block: tuple[float, float, float, float] | None = None) -> Surface:
     return Surface.of(z, LATTICE, P.blur * ROVER.wheel_diameter)
 
 
-def found(v: View, s: Surface) -> tuple[int, float, float] | None:
-    return cluster(look(v, s, CAMERA, T_VEHICLE_LEFT, ROVER, P), ROVER.wheel_diameter, P)
+NOTHING = np.zeros((0, 2))
+
+
+def found(v: View, s: Surface) -> Obstacle | None:
+    return obstacle(look(v, s, CAMERA, T_VEHICLE_LEFT, ROVER, P), ROVER.wheel_diameter, P, NOTHING)[0]
 
 
 @pytest.mark.parametrize("y1", [0.05, 0.075])
 def test_a_new_block_is_seen_where_it_stands(y1: float) -> None:
     seen = found(view(y1 - 0.05, y1, BLOCK), surface())
     assert seen is not None
-    _, right, ahead = seen
+    right, ahead = seen.place
     assert abs(right - BLOCK[0]) < BLOCK[2] + 0.01
     assert abs(ahead - (BLOCK[1] - y1)) < BLOCK[2] + 0.015
 
@@ -104,6 +107,44 @@ def test_rises_are_those_of_the_block() -> None:
     assert np.percentile(up, 90) == pytest.approx(BLOCK[3], abs=0.001)
     flat = points.rise[np.abs(points.place[:, 0]) > 0.05]
     assert np.abs(flat).max() < 1e-4
+
+
+def scattered(raised: int, flat: int, at: float = 0.2, *, moved: float = 0.0) -> Points:
+    """So many points within a wheel's diameter, ``at`` metres ahead; the model's frame is ``moved`` metres behind."""
+    place = np.array([0.0, at]) + 0.008 * np.random.default_rng(raised).uniform(-1, 1, (raised + flat, 2))
+    up = np.arange(raised + flat) < raised
+    return Points(place, place + np.array([0.0, moved]), np.where(up, 0.012, 0.0), up)
+
+
+def test_few_among_many_count_where_the_image_before_showed_them_as_well() -> None:
+    wheel, few = ROVER.wheel_diameter, scattered(8, 36)
+    alone, doubtful = obstacle(few, wheel, P, NOTHING)
+    assert alone is None
+    assert len(doubtful) == 8
+    nearer = scattered(9, 40, 0.175, moved=0.025)
+    again, _ = obstacle(nearer, wheel, P, doubtful)
+    assert again is not None
+    assert again.count == 9
+    elsewhere, _ = obstacle(scattered(9, 40, 0.175, moved=0.025 + 2 * wheel), wheel, P, doubtful)
+    assert elsewhere is None
+
+
+def test_too_few_never_count() -> None:
+    wheel = ROVER.wheel_diameter
+    assert obstacle(scattered(P.points - 1, 0), wheel, P, np.array([[0.0, 0.2]]))[0] is None
+    assert obstacle(scattered(8, 80), wheel, P, np.array([[0.0, 0.2]]))[0] is None, "a tenth of what is seen there"
+
+
+def test_the_largest_group_does_not_hide_a_surer_one() -> None:
+    """Twelve of a hundred, and seven of ten beside them."""
+    parts = [scattered(12, 88), scattered(7, 3, 0.3)]
+    both = Points(
+        *(np.concatenate([getattr(part, name) for part in parts]) for name in ("place", "ground", "rise", "raised"))
+    )
+    seen, _ = obstacle(both, ROVER.wheel_diameter, P, NOTHING)
+    assert seen is not None
+    assert seen.count == 7
+    assert seen.place[1] == pytest.approx(0.3, abs=0.01)
 
 
 def test_images_are_compared_over_a_baseline_and_not_across_a_turn() -> None:
