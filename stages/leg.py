@@ -134,32 +134,98 @@ def plan_leg(
             return _stay("look", f"{why}: looks around", start, [], shown, turn)
         return _stay("no path", why, start, [], shown)
     way = kept if kept and price <= (1.0 + params.loyalty) * least else ground.way(move)
-    sure = first_metres(way[: _sure(way)], 4.0 * params.length * base)
-    straight = straightened(sure, heading, ground.plain, ground.cell)
-    plan = [*straight, *last_metres(way, length_of(sure))]
-    leg = first_metres(straight, params.length * base)
-    if length_of(leg) >= min(params.least * base, length_of(way) - 1e-9):
-        leg, turn = within_turn(leg, heading, math.radians(params.max_turn_deg))
-        if leg:
-            if not turnable(leg[-1].b, leg[-1].heading, leg[-1].heading + turn, ground.clear):
-                turn = 0.0
-            rest = last_metres(plan, length_of(leg))
-            return Leg("drive", "", *_line(leg, start), turn, vertices(way, start), *_line(rest, leg[-1].b), shown)
+    plan = _plain(ground, way)
+    return _onwards(ground, way, plan, shown, looks) or _look(ground, way, plan, shown, looks, backs)
+
+
+def _plain(ground: Ground, way: Sequence[Piece]) -> list[Piece]:
+    """A way whose first metres are made straighter, as far as they are known."""
+    sure = first_metres(way[: _sure(way)], 4.0 * ground.p.length * ground.vehicle.wheel_base)
+    straight = straightened(sure, ground.heading, ground.plain, ground.cell)
+    return [*straight, *last_metres(way, length_of(sure))]
+
+
+def _onwards(
+    ground: Ground, way: Sequence[Piece], plan: Sequence[Piece], shown: NDArray[np.float32], looks: int
+) -> Leg | None:
+    """The leg along a way: as far as it is known, and not nearer to where it is not than can be seen from there. None:
+    that is not worth a stop."""
+    p, base, start, heading = ground.p, ground.vehicle.wheel_base, ground.start, ground.heading
+    bound = math.radians(p.max_turn_deg)
+    leg = first_metres(plan[: _sure(plan)], p.length * base)
+    if length_of(leg) < min(p.least * base, length_of(way) - 1e-9):
+        return None
+    look_at = _unknown(ground, plan)
+    off = math.inf if look_at is None else _metres_before(leg, look_at, p.blind * base, ground.cell)
+    if look_at is not None and off < p.least * base:
+        towards = _towards(start, look_at, heading)
+        turn = max(-bound, min(bound, towards))
+        if off > 0 and looks == 0 and abs(towards) >= FACING and turnable(start, heading, heading + turn, ground.clear):
+            return _stay("look", f"turns {math.degrees(turn):.0f} degrees to see the way", start, plan, shown, turn)
+        off = math.inf
+    leg = first_metres(leg, off)
+    leg, turn = within_turn(leg, heading, bound)
+    if not leg:
         return _stay("turn", f"turns {math.degrees(turn):.0f} degrees to where it goes on", start, plan, shown, turn)
+    end = leg[-1]
+    if look_at is not None and turn == 0.0 and math.isfinite(off):
+        turn = _towards(end.b, look_at, end.heading)
+        turn = max(heading - bound - end.heading, min(heading + bound - end.heading, turn))
+    if not turnable(end.b, end.heading, end.heading + turn, ground.clear):
+        turn = 0.0
+    rest = last_metres(plan, length_of(leg))
+    return Leg("drive", "", *_line(leg, start), turn, vertices(way, start), *_line(rest, end.b), shown)
+
+
+def _look(
+    ground: Ground,
+    way: Sequence[Piece],
+    plan: Sequence[Piece],
+    shown: NDArray[np.float32],
+    looks: int,
+    backs: Sequence[Point],
+) -> Leg:
+    """A look at where a way is not known, or that looks did not help."""
+    p, base, start, heading = ground.p, ground.vehicle.wheel_base, ground.start, ground.heading
     x, y = way[min(_sure(way), len(way) - 1)].cut(ground.grid.spacing).b
-    towards = math.remainder(math.atan2(-(x - start[0]), y - start[1]) - heading, 2 * math.pi)
-    again = any(math.hypot(start[0] - bx, start[1] - by) < params.vain * base for bx, by in backs)
-    if looks < params.looks and not again and (looks > 0 or abs(towards) < FACING):
-        back = _free_back(ground, params.blind * base)
-        if length_of(back) >= params.least * base:
+    towards = _towards(start, (x, y), heading)
+    again = any(math.hypot(start[0] - bx, start[1] - by) < p.vain * base for bx, by in backs)
+    if looks < p.looks and not again and (looks > 0 or abs(towards) < FACING):
+        back = _free_back(ground, p.blind * base)
+        if length_of(back) >= p.least * base:
             reason = f"drives back {1000 * length_of(back):.0f} mm to see the ground before it"
             rest = [Piece(back[-1].b, start, heading, 1), *plan]
             return Leg("look", reason, *_line(back, start), 0.0, vertices(way, start), *_line(rest, back[-1].b), shown)
-    turn = 0.0 if looks >= params.looks else _free_turn(ground, towards, looks)
+    turn = 0.0 if looks >= p.looks else _free_turn(ground, towards, looks)
     if turn:
         return _stay("look", f"turns {math.degrees(turn):.0f} degrees to see the way", start, way, shown, turn)
     reason = f"{looks} looks around did not show the ground at ({x:.3f}, {y:.3f}) m"
     return _stay("closed", reason, start, way, shown, where=(x, y))
+
+
+def _unknown(ground: Ground, way: Sequence[Piece]) -> Point | None:
+    """Where a way is first not known to be free; None: nowhere."""
+    first = _sure(way)
+    return way[first].cut(ground.grid.spacing).b if first < len(way) else None
+
+
+def _towards(at: Point, point: Point, heading: float) -> float:
+    """Turn (rad) from a heading to face a point."""
+    return math.remainder(math.atan2(at[0] - point[0], point[1] - at[1]) - heading, 2 * math.pi)
+
+
+def _metres_before(way: Sequence[Piece], point: Point, distance: float, step: float) -> float:
+    """Metres of a way before it comes nearer to a point than this; infinite: it does not; 0: it begins there."""
+    done = 0.0
+    for piece in way:
+        n = max(2, 1 + math.ceil(piece.length / step))
+        share = np.linspace(0.0, 1.0, n)
+        x, y = (piece.a[i] + share * (piece.b[i] - piece.a[i]) for i in (0, 1))
+        near = np.hypot(x - point[0], y - point[1]) < distance
+        if near.any():
+            return done + piece.length * float(share[max(int(np.argmax(near)) - 1, 0)])
+        done += piece.length
+    return math.inf
 
 
 def _line(way: Sequence[Piece], start: Point) -> tuple[Floats, NDArray[np.int8]]:

@@ -356,3 +356,32 @@ def test_what_lies_nearer_than_its_view_is_looked_at_from_farther_back() -> None
     assert plan_leg(before, START, 0.0, GOAL, P, backs=[(0.0, 0.02)]).gear.tolist() == []
     blocked = ground((band, UNKNOWN), (walls | (Y < -0.08), HAZARDOUS))
     assert plan_leg(blocked, START, 0.0, GOAL, P).gear.tolist() == []
+
+
+def around_a_corner() -> Footing:
+    """The way leads ahead and then to the right, over ground that is not known there."""
+    return ground(((X > 0.09) & (Y < 0.3), HAZARDOUS), ((X > 0.15) & (Y >= 0.3), UNKNOWN))
+
+
+@pytest.mark.parametrize("y", [0.1, 0.14, 0.18])
+def test_a_leg_ends_facing_what_is_not_known_from_where_that_is_seen(y: float) -> None:
+    leg = plan_leg(around_a_corner(), (0.0, y), 0.0, (0.35, 0.45), P)
+    assert leg.verdict == "drive"
+    end = leg.path[-1]
+    assert np.hypot(*(end - leg.path[0])) < P.length * ROVER.wheel_base - 1e-6, "it could go on"
+    first = (0.10, 0.37)  # there its right wheels come to stand on it
+    away = math.hypot(first[0] - end[0], first[1] - end[1])
+    assert P.blind * ROVER.wheel_base - 0.03 < away < P.blind * ROVER.wheel_base + 0.03
+    last = leg.path[-1] - leg.path[-2]
+    assert math.atan2(-last[0], last[1]) + leg.turn == pytest.approx(
+        math.atan2(-first[0] + end[0], first[1] - end[1]), abs=0.2
+    )
+
+
+def test_it_turns_to_what_comes_next_before_it_is_too_near_to_see_it_and_then_drives() -> None:
+    start, goal = (0.0, 0.21), (0.35, 0.45)
+    leg = plan_leg(around_a_corner(), start, 0.0, goal, P)
+    assert leg.verdict == "look"
+    assert -math.radians(P.max_turn_deg) - 1e-9 <= leg.turn < -math.radians(15)
+    assert len(leg.path) == 1
+    assert plan_leg(around_a_corner(), start, leg.turn, goal, P, looks=1).verdict == "drive", "it did not help"
