@@ -187,10 +187,11 @@ def _look(
 ) -> Leg:
     """A look at where a way is not known, or that looks did not help."""
     p, base, start, heading = ground.p, ground.vehicle.wheel_base, ground.start, ground.heading
-    x, y = way[min(_sure(way), len(way) - 1)].cut(ground.grid.spacing).b
+    first = min(_sure(way), len(way) - 1)
+    x, y = way[first].cut(ground.grid.spacing).b
     towards = _towards(start, (x, y), heading)
     again = any(math.hypot(start[0] - bx, start[1] - by) < p.vain * base for bx, by in backs)
-    if looks < p.looks and not again and (looks > 0 or abs(towards) < FACING):
+    if looks < p.looks and not again and (looks > 0 or abs(towards) < FACING) and ground.unseen(way, first):
         back = _free_back(ground, p.blind * base)
         if length_of(back) >= p.least * base:
             reason = f"drives back {1000 * length_of(back):.0f} mm to see the ground before it"

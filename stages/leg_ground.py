@@ -53,14 +53,19 @@ class Ground:
 
     def _split(self, gaps: Gaps, x: Floats, y: Floats, slack: float = 0.0) -> tuple[Mask, Mask]:
         """Poses that may be driven, and those that may be planned over: there the margin may lack ``slack`` m."""
-        near = np.hypot(x - self.start[0], y - self.start[1]) <= 0.3 * self.vehicle.wheel_base
-        margin = self.vehicle.margin
-        known = gaps.gap > np.where(near, self.here[0], margin)
-        known &= gaps.unknown > np.where(near, self.unknown_here, 0.0)
+        near, margin = self._near(x, y), self.vehicle.margin
+        known = (gaps.gap > np.where(near, self.here[0], margin)) & self._seen(gaps, near)
         opened = gaps.proven > np.where(near, self.here[1], margin) - slack
         for cx, cy in self.closed:
             opened &= known | (np.hypot(x - cx, y - cy) > self.p.vain * self.vehicle.wheel_base)
         return known, opened | known
+
+    def _near(self, x: Floats, y: Floats) -> Mask:
+        """Where it stands: ground there that is no worse than that under it will do."""
+        return np.asarray(np.hypot(x - self.start[0], y - self.start[1]) <= 0.3 * self.vehicle.wheel_base)
+
+    def _seen(self, gaps: Gaps, near: Mask) -> Mask:
+        return np.asarray(gaps.unknown > np.where(near, self.unknown_here, 0.0))
 
     def _prices(self, gaps: Gaps, x: Floats, y: Floats, heading: Floats) -> Floats:
         known, price = self._price(gaps, x, y)
@@ -142,16 +147,12 @@ class Ground:
         """
         out, cost, heading = list[Piece](), 0.0, self.heading
         for piece in way:
-            turn = abs(piece.heading - heading)
-            n, m = (max(2, 1 + math.ceil(v)) for v in (turn / STEP_TURN, 2.0 * piece.length / self.grid.spacing))
-            share = np.append(np.zeros(n), np.linspace(0.0, 1.0, m))
-            x, y = (piece.a[i] + share * (piece.b[i] - piece.a[i]) for i in (0, 1))
-            angle = np.append(np.linspace(heading, piece.heading, n), np.full(m, piece.heading))
+            n, share, (x, y, angle) = self._along(piece, heading)
             known, price = self._price(self.footing.gaps(x, y, angle), x, y, self.cell)
             metres = piece.length * (self.p.back_price if piece.gear < 0 else 1.0)
             if not np.isfinite(price).all():
                 return [], math.inf
-            cost += turn * self.p.turn_price * self.vehicle.wheel_base * float(price[:n].max())
+            cost += abs(piece.heading - heading) * self.p.turn_price * self.vehicle.wheel_base * float(price[:n].max())
             cost += metres * float(price[n:].mean())
             first = piece.length * float(share[np.argmin(known) - 1])  # metres before what is not known
             if not known.all() and np.argmin(known) > n and first > 0:
@@ -160,6 +161,21 @@ class Ground:
             out.append(replace(piece, known=bool(known.all())))
             heading = piece.heading
         return out, cost
+
+    def _along(self, piece: Piece, before: float) -> tuple[int, Floats, tuple[Floats, Floats, Floats]]:
+        """Poses of a turn on the spot and a piece after it: how many of the turn, share of the piece, x, y, heading."""
+        turn, steps = abs(piece.heading - before) / STEP_TURN, 2.0 * piece.length / self.grid.spacing
+        n, m = (max(2, 1 + math.ceil(v)) for v in (turn, steps))
+        share = np.append(np.zeros(n), np.linspace(0.0, 1.0, m))
+        x, y = (piece.a[i] + share * (piece.b[i] - piece.a[i]) for i in (0, 1))
+        return n, share, (x, y, np.append(np.linspace(before, piece.heading, n), np.full(m, piece.heading)))
+
+    def unseen(self, way: Sequence[Piece], first: int) -> bool:
+        """Whether the first piece of a way that is not known is so for ground that was not seen from near, and not for
+        hazards that are doubtful though it was."""
+        piece, before = way[first], way[first - 1].heading if first > 0 else self.heading
+        _, _, (x, y, angle) = self._along(piece.cut(self.grid.spacing), before)
+        return not self._seen(self.footing.gaps(x, y, angle), self._near(x, y)).all()
 
     def on_map(self, cost: Floats) -> NDArray[np.float32]:
         """Cost at the best heading on the cells of the map, NaN where it is not known."""
