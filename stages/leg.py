@@ -378,7 +378,7 @@ def _length(path: Floats) -> float:
 
 STAGE = Stage(
     name="leg",
-    version=6,
+    version=7,
     summary="the next leg of a drive to a goal, over ground that is known to be free",
     params=LegParams,
     inputs=("risk", "far?", "pose", "before?"),
