@@ -385,3 +385,17 @@ def test_it_turns_to_what_comes_next_before_it_is_too_near_to_see_it_and_then_dr
     assert -math.radians(P.max_turn_deg) - 1e-9 <= leg.turn < -math.radians(15)
     assert len(leg.path) == 1
     assert plan_leg(around_a_corner(), start, leg.turn, goal, P, looks=1).verdict == "drive", "it did not help"
+
+
+def test_what_was_seen_from_near_and_stays_doubtful_is_not_looked_at_from_farther_back() -> None:
+    risk, reason = np.full(LATTICE.shape, SAFE, np.uint8), np.zeros(LATTICE.shape, np.uint16)
+    band = np.abs(Y - 0.09) < 0.02
+    risk[np.abs(X) > 0.1] = HAZARDOUS
+    reason[np.abs(X) > 0.1] = REASONS["step"]
+    unseen, doubtful = (risk.copy(), reason.copy()), (risk.copy(), reason.copy())
+    unseen[0][band] = UNKNOWN
+    doubtful[0][band], doubtful[1][band] = HAZARDOUS, REASONS["step"] | REASONS["uncertain"]
+    back, turn = (plan_leg(Footing.of(*maps, LATTICE, ROVER), START, 0.0, GOAL, P) for maps in (unseen, doubtful))
+    assert (back.verdict, back.gear.tolist()) == ("look", [-1])
+    assert (turn.verdict, turn.gear.tolist()) == ("look", [])
+    assert turn.turn != 0.0

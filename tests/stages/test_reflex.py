@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from stages.geometry import Camera, RigidTransform, rotation_exp
+from stages.declare import Bundle
+from stages.geometry import Camera, Rig, RigidTransform, rotation_exp
 from stages.lattice import Lattice
-from stages.reflex import Obstacle, Points, ReflexParams, Surface, View, look, obstacle, pairs
+from stages.reflex import STAGE, Obstacle, Points, ReflexParams, Surface, View, look, obstacle, pairs
+from stages.validity import Validity
 from stages.vehicle import Vehicle
 
 Floats = NDArray[np.float64]
@@ -153,3 +155,34 @@ def test_images_are_compared_over_a_baseline_and_not_across_a_turn() -> None:
     assert pairs(way, wheel, P) == [(0, 2), (1, 3), (2, 4)]
     way[3:, 2] = math.radians(20.0)
     assert pairs(way, wheel, P) == [(0, 2)]
+
+
+def along_the_way(lost: int | None) -> Bundle:
+    """Four images 25 mm apart before a block, compared two apart; one of them may have no pose."""
+    ys, compared = [0.025 * k for k in range(4)], [(0, 2), (1, 3)]
+    poses = np.stack([at(y).matrix34 for y in ys])
+    if lost is not None:
+        poses[lost] = np.nan
+    motions = []
+    for i, j in compared:
+        v = view(ys[i], ys[j], BLOCK)
+        validity = np.where(v.matched, np.uint16(Validity.MATCHED), np.uint16(0))
+        arrays = {"validity": validity, "column_disparity": v.column, "row_disparity": v.row}
+        motions.append(Bundle(arrays, {"level": v.level}))
+    inputs = {
+        "dem": Bundle({"elevation": np.zeros(LATTICE.shape, np.float32)}, {"lattice": LATTICE.to_dict()}),
+        "resect": Bundle({"poses": poses}, {"per_frame": [{"frame": 10 + k} for k in range(4)]}),
+        "rig": Bundle({}, {"rig": Rig(CAMERA, CAMERA, RigidTransform(np.eye(3), np.array([-0.1, 0, 0]))).to_dict()}),
+        "motions": motions,
+    }
+    args = {"pairs": compared, "vehicle": ROVER.model_dump(mode="json"), "T_vehicle_left": T_VEHICLE_LEFT.to_list()}
+    return STAGE.run(P, args, inputs)
+
+
+def test_the_stage_says_where_it_stops_and_leaves_out_images_without_a_pose() -> None:
+    found = along_the_way(None)
+    assert (found.meta["stop"], found.meta["frame"], found.meta["watched"]) == (2, 12, [2, 3])
+    assert found.meta["reason"].startswith("obstacle ")
+    found = along_the_way(0)
+    assert (found.meta["stop"], found.meta["frame"], found.meta["watched"]) == (3, 13, [3])
+    assert along_the_way(3).meta["watched"] == [2]
