@@ -51,7 +51,7 @@ class ReflexParams(Params):
     sigma: float = Field(0.5, gt=0, description="pixels of the displacements' level; their error")
     sigmas: float = Field(2.0, gt=0, description="standard deviations of the rise that it must exceed as well")
     blur: float = Field(0.5, ge=0, description="wheel diameters; the model's greatest height within this is compared")
-    points: int = Field(6, ge=1, description="raised points within one wheel diameter that make an obstacle")
+    points: int = Field(8, ge=1, description="raised points within one wheel diameter that make an obstacle")
     share: float = Field(0.35, ge=0, le=1, description="and their share of all points there")
     again_share: float = Field(
         0.15, ge=0, le=1, description="the same where so many were raised there in the image compared before as well"

@@ -138,14 +138,14 @@ def test_too_few_never_count() -> None:
 
 
 def test_the_largest_group_does_not_hide_a_surer_one() -> None:
-    """Twelve of a hundred, and seven of ten beside them."""
-    parts = [scattered(12, 88), scattered(7, 3, 0.3)]
+    """Twelve of a hundred, and nine of twelve beside them."""
+    parts = [scattered(12, 88), scattered(9, 3, 0.3)]
     both = Points(
         *(np.concatenate([getattr(part, name) for part in parts]) for name in ("place", "ground", "rise", "raised"))
     )
     seen, _ = obstacle(both, ROVER.wheel_diameter, P, NOTHING)
     assert seen is not None
-    assert seen.count == 7
+    assert seen.count == 9
     assert seen.place[1] == pytest.approx(0.3, abs=0.01)
 
 
