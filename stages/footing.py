@@ -43,28 +43,32 @@ times as dear."""
 
 @dataclass(frozen=True)
 class Gaps:
-    """Of each pose, float32: ``gap`` m to the nearest hazard (from wheel to what is hazardous to wheels, from the
-    middle to what is to the vehicle; farther by the margin to what is one by sigma alone), ``proven`` m to those that
-    are proven, ``unknown`` m at least from the belly, and beyond the margin from the wheels, to unknown ground (not
-    positive: on it, or too near), ``caution`` share of wheels and middle on caution ground. With its middle outside the
-    map a vehicle is within a hazard."""
+    """Of each pose, float32: ``gap`` m to the nearest hazard that is none by sigma alone (from wheel to what is
+    hazardous to wheels, from the middle to what is to the vehicle), ``doubtful`` m to those that are, ``proven`` m to
+    those that are proven, ``unknown`` m at least from the belly, and beyond the margin from the wheels, to unknown
+    ground (not positive: on it, or too near), ``frontier`` m to that of it where a wheel has room, ``caution`` share of
+    wheels and middle on caution ground. With its middle outside the map a vehicle is within a hazard."""
 
     gap: Floats32
+    doubtful: Floats32
     proven: Floats32
     unknown: Floats32
+    frontier: Floats32
     caution: Floats32
 
 
 @dataclass(frozen=True)
 class Footing:
-    """A risk map as a vehicle meets it: ``fields`` (4, row, col) m to hazards to a wheel, proven ones, hazards to the
-    vehicle, proven ones; ``unknown`` (row, col) m to unknown ground; ``caution`` (row, col) its weight there;
-    ``glanced`` (row, col) where unknown ground was seen, from afar; None: nowhere."""
+    """A risk map as a vehicle meets it: ``fields`` (6, row, col) m to hazards to a wheel that are none by sigma alone,
+    those that are, proven ones, and the same of hazards to the vehicle; ``unknown`` (row, col) m to unknown ground,
+    ``frontier`` to that of it where a wheel has room: the rest is mostly the shadows of stones; ``caution`` (row, col)
+    its weight there; ``glanced`` (row, col) where unknown ground was seen, from afar; None: nowhere."""
 
     lattice: Lattice
     vehicle: Vehicle
     fields: Floats32
     unknown: Floats32
+    frontier: Floats32
     caution: NDArray[np.uint8]
     glanced: Mask | None = None
 
@@ -87,8 +91,8 @@ class Footing:
         of it something is known nevertheless.
 
         A hazard is proven where it is not one by sigma alone, and at least as probable as ``sure``. What is one by
-        sigma alone and less probable than ``dare`` is caution ground :data:`DOUBT_WEIGHT` times. ``doubted`` ground
-        and what is within a quarter of a wheel of it, where its edge touches, is :data:`DOUBT_WEIGHT` times.
+        sigma alone and less probable than ``dare`` is caution ground :data:`DOUBT_WEIGHT` times, if it is not unknown.
+        So is ``doubted`` ground, and what is within a quarter of a wheel of it, where its edge touches.
         """
         hazardous, cell = risk == HAZARDOUS, lattice.cell
         unknown = risk == UNKNOWN if unknown is None else unknown
@@ -100,37 +104,44 @@ class Footing:
             proven = likely & (p_hazard >= sure)
             dared = doubtful & (p_hazard < dare)
             doubtful &= ~dared
-            caution[dared] = DOUBT_WEIGHT
+            caution[dared & ~unknown] = DOUBT_WEIGHT
         if doubted is not None:
             caution[(_distance(doubted, cell) <= 0.25 * vehicle.wheel_diameter) & ~unknown] = DOUBT_WEIGHT
         kinds = [(bits & which) > 0 for which in (WHEEL_BITS, BODY_BITS)]
         fields = []
         for kind in kinds:
-            # sigma is the room for error there: the margin is not added to it
-            beside = _distance(doubtful & kind, cell) + np.float32(vehicle.margin)
-            fields += [np.minimum(_distance(likely & kind, cell), beside), _distance(proven & kind, cell)]
-        return Footing(lattice, vehicle, np.stack(fields), _distance(unknown, cell), caution, glanced)
+            fields += [_distance(mask & kind, cell) for mask in (likely, doubtful, proven)]
+        wide = _opened(unknown, 0.5 * vehicle.wheel_diameter, cell)
+        return Footing(
+            lattice, vehicle, np.stack(fields), _distance(unknown, cell), _distance(wide, cell), caution, glanced
+        )
 
     def gaps(self, x: Floats, y: Floats, heading: Floats) -> Gaps:
         """At poses: x, y of the middle (m) and heading (rad to the left of y), arrays of one shape."""
         at = self.lattice.index(np.stack([x, y], axis=-1)).reshape(-1, 2)
         turn = np.broadcast_to(heading, np.shape(x)).reshape(-1)
-        out = np.empty((4, len(at)), np.float32)
+        out = np.empty((6, len(at)), np.float32)
         cell = self.lattice.cell
         # beyond the circle about the vehicle, and what rounding to cells takes, nothing is beneath it
         around = 0.5 * math.hypot(self.vehicle.track, self.vehicle.wheel_base) + 1.5 * cell
         reach = np.array([around + self.vehicle.margin, cell, self.vehicle.margin], np.float32)
         _gaps(
             at, np.cos(turn), np.sin(turn), wheel_positions(self.vehicle) / cell, _belly(self.vehicle) / cell,
-            self.fields, self.unknown, self.caution, reach, out,
+            self.fields, self.unknown, self.frontier, self.caution, reach, out,
         )  # fmt: skip
-        out[2] -= NEAR_UNKNOWN * cell
+        out[3:5] -= NEAR_UNKNOWN * cell
         return Gaps(*(a.reshape(np.shape(x)) for a in out))
 
 
 def _distance(mask: Mask, cell: float) -> Floats32:
     far = scipy.ndimage.distance_transform_edt(~mask) * cell if mask.any() else np.full(mask.shape, np.inf)
     return np.asarray(far, dtype=np.float32)
+
+
+def _opened(mask: Mask, radius: float, cell: float) -> Mask:
+    """What of a mask circles of this radius, m, cover that lie within it."""
+    inner = _distance(~mask, cell) - 0.5 * cell  # to the edge of the nearest cell without
+    return np.asarray(mask & (_distance(inner >= radius, cell) < radius + 0.5 * cell))
 
 
 def _belly(vehicle: Vehicle) -> Floats:
@@ -141,37 +152,39 @@ def _belly(vehicle: Vehicle) -> Floats:
 
 
 @njit(cache=True, nogil=True)
-def _gaps(at, cosine, sine, wheels, belly, fields, unknown, caution, reach, out):  # type: ignore[no-untyped-def]
+def _gaps(at, cosine, sine, wheels, belly, fields, unknown, frontier, caution, reach, out):  # type: ignore[no-untyped-def]
     rows, cols = unknown.shape
     for n in range(at.shape[0]):
         row, col, c, s = at[n, 0], at[n, 1], cosine[n], sine[n]
-        for k in range(4):
-            out[k, n] = np.float32(-1.0) if k == 2 else np.float32(0.0)
+        for k in range(6):
+            out[k, n] = np.float32(-1.0) if k == 3 or k == 4 else np.float32(0.0)
         i, j = math.floor(row + 0.5), math.floor(col + 0.5)
         if i < 0 or j < 0 or i >= rows or j >= cols:
-            out[0, n] = out[1, n] = -np.inf
+            out[0, n] = out[1, n] = out[2, n] = -np.inf
             continue
-        gap, proven, share = fields[2, i, j], fields[3, i, j], np.float32(caution[i, j])
+        gap, doubtful, proven = fields[3, i, j], fields[4, i, j], fields[5, i, j]
+        share = np.float32(caution[i, j])
         spare = unknown[i, j] - reach[0]
-        outside, least = False, np.float32(np.inf)
+        outside, least, wide = False, np.float32(np.inf), np.float32(np.inf)
         for k in range(4):
             a, b = wheels[k, 0], wheels[k, 1]
             i, j = math.floor(row - (a * s + b * c) + 0.5), math.floor(col + (a * c - b * s) + 0.5)
             if i < 0 or j < 0 or i >= rows or j >= cols:
                 outside = True
                 continue
-            gap, proven = min(gap, fields[0, i, j]), min(proven, fields[1, i, j])
+            gap, doubtful = min(gap, fields[0, i, j]), min(doubtful, fields[1, i, j])
+            proven = min(proven, fields[2, i, j])
             share += caution[i, j]
-            least = min(least, unknown[i, j] - reach[2])
-        out[0, n], out[1, n], out[3, n] = gap, proven, share / np.float32(PARTS)
+            least, wide = min(least, unknown[i, j] - reach[2]), min(wide, frontier[i, j] - reach[2])
+        out[0, n], out[1, n], out[2, n], out[5, n] = gap, doubtful, proven, share / np.float32(PARTS)
         if outside:
             continue
         if spare > 0:
-            out[2, n] = spare + reach[1]
+            out[3, n] = out[4, n] = spare + reach[1]
             continue
         for k in range(belly.shape[0]):
             a, b = belly[k, 0], belly[k, 1]
             i, j = math.floor(row - (a * s + b * c) + 0.5), math.floor(col + (a * c - b * s) + 0.5)
             i, j = min(max(i, 0), rows - 1), min(max(j, 0), cols - 1)
-            least = min(least, unknown[i, j])
-        out[2, n] = least
+            least, wide = min(least, unknown[i, j]), min(wide, frontier[i, j])
+        out[3, n], out[4, n] = least, wide

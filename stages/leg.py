@@ -2,10 +2,11 @@
 
 The way is planned to the goal over all of the map. Ground that is known and free costs its length; unknown ground may
 be planned over, at a higher price, since the next stop will see it, but is never driven on: the leg ends before it. So
-may ground that is hazardous only by the standard deviation of its elevations. Ground that is known to be hazardous, or
-nearer to it than the vehicle and its margin need, is closed. What was seen from afar alone counts as unknown but for
-its hazards and for what is clearly free, at a price of its own: the windows of a matcher smooth away what is smaller
-than they are on the ground.
+may ground that is hazardous only by the standard deviation of its elevations, and, dearer, what is likely hazardous but
+not certainly so, and the shadows of stones: both mostly stay as they are when looked at from nearer. Ground that is
+known to be hazardous, or nearer to it than the vehicle and its margin need, is closed. What was seen from afar alone
+counts as unknown but for its hazards and for what is clearly free, at a price of its own: the windows of a matcher
+smooth away what is smaller than they are on the ground.
 
 So the way bends round dead ends as soon as they are seen, and where no way is left even over unknown ground there is
 none. This is the usual free-space assumption (Koenig, Tovey, Smirnov 2003, doi:10.1016/S0004-3702(03)00062-6), planned
@@ -44,7 +45,7 @@ from stages.route import (
     within_turn,
 )
 from stages.vehicle import Vehicle
-from stages.verdict import UNKNOWN, UNSEEN_BIT
+from stages.verdict import HAZARDOUS, UNKNOWN, UNSEEN_BIT
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -323,7 +324,7 @@ def _run(params: LegParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     before = None
     if "before" in inputs and len(inputs["before"]["rest_gear"]):
         before = np.asarray(inputs["before"]["rest"]), np.asarray(inputs["before"]["rest_gear"])
-    (classes, reason, chance), seen = _seen(risk, inputs.get("far"), params)
+    (classes, reason, chance), seen = seen_so_far(risk, inputs.get("far"), params)
     for sure in params.sure:
         footing = Footing.of(classes, reason, lattice, vehicle, chance, sure, params.dare, **seen)
         found = plan_leg(footing, start, heading, goal, params, int(args["looks"]), closed, before, args["backs"])
@@ -355,7 +356,7 @@ def _run(params: LegParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     return Bundle(arrays, meta)
 
 
-def _seen(near: Bundle, far: Bundle | None, p: LegParams) -> tuple[list[NDArray[Any]], dict[str, Mask | None]]:
+def seen_so_far(near: Bundle, far: Bundle | None, p: LegParams) -> tuple[list[NDArray[Any]], dict[str, Mask | None]]:
     """Classes, reasons and probabilities (row, col) of a map, of which only what was seen from near is driven on; and
     how well each cell is known, as :meth:`stages.footing.Footing.of` asks for it."""
     names = ("risk", "reason", "p_hazard")
@@ -368,7 +369,7 @@ def _seen(near: Bundle, far: Bundle | None, p: LegParams) -> tuple[list[NDArray[
         cut = unknown | (((maps[1] & UNSEEN_BIT) != 0) & (chance < p.clear))
         maps = [np.where(cut, np.asarray(far[name]), seen) for name, seen in zip(names, maps, strict=True)]
         unknown &= ~(maps[2] < p.clear)
-        glanced = unknown & (maps[0] != UNKNOWN)
+        glanced = unknown & (maps[0] < HAZARDOUS)
     return maps, {"unknown": unknown, "glanced": glanced, "doubted": maps[2] >= p.avoid}
 
 
@@ -378,7 +379,7 @@ def _length(path: Floats) -> float:
 
 STAGE = Stage(
     name="leg",
-    version=7,
+    version=8,
     summary="the next leg of a drive to a goal, over ground that is known to be free",
     params=LegParams,
     inputs=("risk", "far?", "pose", "before?"),

@@ -44,7 +44,11 @@ class Ground:
         self.vehicle, self.cell = footing.vehicle, footing.lattice.cell
         at = footing.gaps(*(np.array([v]) for v in (*start, heading)))
         # where it stands it may be: near there, ground that is no worse by more than a cell will do
-        self.here = [min(self.vehicle.margin, float(a[0]) - self.cell) for a in (at.gap, at.proven)]
+        margin = self.vehicle.margin
+        self.here = [
+            min(most, float(a[0]) - self.cell)
+            for most, a in ((margin, at.gap), (0.0, at.doubtful), (margin, at.proven))
+        ]
         self.unknown_here = min(0.0, float(at.unknown[0]) - self.cell)
         spacing = max(p.spacing * self.vehicle.wheel_diameter, self.cell)
         self.grid = PoseGrid.over(footing.lattice, start, heading + aside, spacing)
@@ -52,10 +56,14 @@ class Ground:
         self.graph = PoseGraph.of(footing, self.grid, self._prices)
 
     def _split(self, gaps: Gaps, x: Floats, y: Floats, slack: float = 0.0) -> tuple[Mask, Mask]:
-        """Poses that may be driven, and those that may be planned over: there the margin may lack ``slack`` m."""
+        """Poses that may be driven, and those that may be planned over; the margin may lack ``slack`` m.
+
+        Of what is hazardous by sigma alone no margin is kept: sigma is the room for error there.
+        """
         near, margin = self._near(x, y), self.vehicle.margin
-        known = (gaps.gap > np.where(near, self.here[0], margin)) & self._seen(gaps, near)
-        opened = gaps.proven > np.where(near, self.here[1], margin) - slack
+        known = (gaps.gap > np.where(near, self.here[0], margin) - slack) & self._seen(gaps, near)
+        known &= gaps.doubtful > np.where(near, self.here[1], 0.0)
+        opened = gaps.proven > np.where(near, self.here[2], margin) - slack
         for cx, cy in self.closed:
             opened &= known | (np.hypot(x - cx, y - cy) > self.p.vain * self.vehicle.wheel_base)
         return known, opened | known
@@ -81,9 +89,12 @@ class Ground:
         if self.footing.glanced is not None:
             unseen[~self._at(~self.footing.glanced, x, y)] = min(self.p.glance_price, self.p.unknown_price)
         unknown = np.where(blind, np.maximum(self.p.blind_price, unseen), unseen)
+        stays = (gaps.gap <= self.vehicle.margin) | ((gaps.unknown <= 0) & (gaps.frontier > 0))
+        unknown = np.where(stays, np.maximum(self.p.doubt_price, unknown), unknown)
         price = np.where(known, 1.0, unknown) + self.p.caution_price * gaps.caution
         if self.vehicle.margin > 0:
-            price = price + self.p.near_price * np.clip(2.0 - gaps.gap / self.vehicle.margin, 0.0, 1.0)
+            beside = np.minimum(gaps.gap / self.vehicle.margin - 1.0, gaps.doubtful / self.vehicle.margin)
+            price = price + self.p.near_price * np.clip(1.0 - beside, 0.0, 1.0)
         return known, np.where(opened, price, np.inf)
 
     def _at(self, mask: Mask, x: Floats, y: Floats) -> Mask:

@@ -48,6 +48,12 @@ class LegParams(Params):
         1.3, ge=1, description="price of a metre over ground that was seen from afar alone: mostly it is as it looks"
     )
     unknown_price: float = Field(2.0, ge=1, description="price of a metre over unknown ground, known ground is 1")
+    doubt_price: float = Field(
+        4.0,
+        ge=1,
+        description="price of a metre where hazards are likely, not certain, or spots narrower than a wheel are not "
+        "seen, which are shadows of stones: mostly both stay so from near",
+    )
     caution_price: float = Field(
         0.2, ge=0, description="added to the price where all wheels are on caution ground: a detour of a fifth"
     )

@@ -17,6 +17,8 @@ Clear = Callable[[Floats, Floats, Floats], bool]
 """Whether the vehicle may be at all of the poses x, y (m), heading (rad)."""
 
 STEP_TURN = math.radians(5.0)
+NOTHING = 1e-9
+"""m; a shorter piece is what rounding leaves over, and has no heading."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +113,7 @@ def first_metres(way: Sequence[Piece], length: float) -> list[Piece]:
     """The first ``length`` metres of a way."""
     out: list[Piece] = []
     for piece in way:
-        if length <= 0:
+        if length <= NOTHING:
             break
         out.append(piece.cut(length) if piece.length > length else piece)
         length -= piece.length
@@ -122,7 +124,7 @@ def last_metres(way: Sequence[Piece], length: float) -> list[Piece]:
     """What is left of a way after its first ``length`` metres."""
     out: list[Piece] = []
     for piece in way:
-        if length >= piece.length - 1e-9:
+        if length >= piece.length - NOTHING:
             length -= piece.length
             continue
         out.append(replace(piece, a=piece.cut(length).b) if length > 0 else piece)

@@ -76,6 +76,16 @@ def test_wheels_keep_the_margin_from_unknown_ground_and_no_more() -> None:
         assert beneath == (edge < 0.04 + ROVER.margin + 0.5 * LATTICE.cell + 1e-9)
 
 
+def test_unknown_spots_where_a_wheel_has_no_room_are_no_frontier() -> None:
+    spot, hole = np.hypot(X, Y - 0.05) < 0.012, np.hypot(X, Y - 0.05) < 0.03
+    for unknown, is_one in ((spot, False), (hole, True), (Y > 0.03, True), (np.abs(Y - 0.05) < 0.006, False)):
+        risk = np.where(unknown, np.uint8(UNKNOWN), np.uint8(SAFE))
+        gaps = Footing.of(risk, None, LATTICE, ROVER).gaps(*np.zeros((3, 1)))
+        assert gaps.unknown[0] <= 0
+        assert (gaps.frontier[0] <= 0) == is_one
+        assert gaps.frontier[0] >= gaps.unknown[0]
+
+
 def test_outside_the_map_it_may_not_be() -> None:
     footing = Footing.of(np.full(LATTICE.shape, SAFE, np.uint8), None, LATTICE, ROVER)
     assert at(footing, 0.0, 0.0, 0.0) == (np.inf, np.inf, np.inf, 0.0)
@@ -103,9 +113,9 @@ def test_what_is_hazardous_by_sigma_alone_and_improbable_is_caution_ground_many_
     risk = np.where(np.hypot(X - 0.04, Y - 0.05) < 0.01, np.uint8(HAZARDOUS), np.uint8(SAFE))
     reason = np.full(risk.shape, REASONS["step"] | REASONS["uncertain"], np.uint16)
     p = np.full(risk.shape, 0.2, np.float32)
-    daring, not_so = (at(Footing.of(risk, reason, LATTICE, ROVER, p, 0.9, d), 0.0, 0.0, 0.0) for d in (0.3, 0.1))
-    assert (daring[0], daring[3]) == (np.inf, pytest.approx(DOUBT_WEIGHT / 5))
-    assert (not_so[0], not_so[3]) == (pytest.approx(ROVER.margin), 0.0)
+    daring, not_so = (Footing.of(risk, reason, LATTICE, ROVER, p, 0.9, d).gaps(*np.zeros((3, 1))) for d in (0.3, 0.1))
+    assert (daring.gap[0], daring.doubtful[0], daring.caution[0]) == (np.inf, np.inf, pytest.approx(DOUBT_WEIGHT / 5))
+    assert (not_so.gap[0], not_so.doubtful[0], not_so.caution[0]) == (np.inf, 0.0, 0.0)
 
 
 def test_ground_within_a_quarter_of_a_wheel_of_doubted_ground_is_dear() -> None:

@@ -14,7 +14,7 @@ from stages.declare import Bundle
 from stages.errors import InputError
 from stages.footing import DOUBT_WEIGHT, PARTS, Footing
 from stages.lattice import Lattice
-from stages.leg import Leg, LegParams, _seen, plan_leg, shortest
+from stages.leg import Leg, LegParams, plan_leg, seen_so_far, shortest
 from stages.risk import HAZARDOUS, REASONS, SAFE, UNKNOWN
 from stages.route import length_of, through
 from stages.vehicle import Vehicle
@@ -233,6 +233,38 @@ def test_of_a_kept_way_it_drives_what_is_known() -> None:
     assert 0.0 <= closed.where[1] - leg.path[-1, 1] < LATTICE.cell + 1e-9
 
 
+def test_a_kept_way_is_not_given_up_for_rounding() -> None:
+    beside = ground((X > 0.045, HAZARDOUS))  # the right wheels of a way straight ahead lack a part of the margin
+    straight, even = np.array([START, GOAL]), P.model_copy(update={"near_price": 0.0})
+    for closed in ([], [(0.0, 0.25)]):
+        leg = plan_leg(beside, START, 0.0, GOAL, even, closed=closed, before=(straight, AHEAD[:1]))
+        assert leg.verdict == "drive"
+        assert leg.path == pytest.approx(np.array([START, (0.0, P.length * ROVER.wheel_base)]))
+    # but never onto what is hazardous by sigma alone
+    risk = np.full(LATTICE.shape, SAFE, np.uint8)
+    risk[Y > 0.15] = HAZARDOUS
+    reason = np.full(LATTICE.shape, REASONS["step"] | REASONS["uncertain"], np.uint16)
+    leg = plan_leg(Footing.of(risk, reason, LATTICE, ROVER), START, 0.0, GOAL, P, before=(straight, AHEAD[:1]))
+    assert leg.path[-1, 1] < 0.15 - 0.5 * ROVER.wheel_base + LATTICE.cell
+
+
+def test_what_is_likely_a_hazard_is_gone_round_farther_than_what_is_unknown() -> None:
+    wall, band = (X < 0.22) & (np.abs(Y - 0.4) < 0.03), np.abs(Y - 0.4) < 0.12
+    risk = np.where(wall, np.uint8(HAZARDOUS), np.uint8(SAFE))
+    likely = Footing.of(risk, None, LATTICE, ROVER, np.where(wall, 0.7, 0.0).astype(np.float32), sure=0.9)
+    assert plan_leg(likely, START, 0.0, GOAL, SEEN).way[:, 0].max() > 0.22
+    assert plan_leg(ground((band & wall, UNKNOWN)), START, 0.0, GOAL, SEEN).way[:, 0].max() < 0.1
+    across = Footing.of(risk, None, LATTICE, ROVER, np.where(wall, 0.7, 0.0).astype(np.float32), sure=0.6)
+    assert plan_leg(across, START, 0.0, GOAL, SEEN).way[:, 0].max() > 0.22  # which is certain
+
+
+def test_the_shadow_of_a_stone_is_gone_round_farther_than_ground_that_nobody_looked_at() -> None:
+    # 0.80 m straight over it, a vehicle's length and more of it unknown, or some 1.0 m round it
+    shadow, unseen = ((X < 0.22) & (np.abs(Y - 0.4) < w) for w in (0.006, 0.021))
+    assert plan_leg(ground((shadow, UNKNOWN)), START, 0.0, GOAL, SEEN).way[:, 0].max() > 0.15
+    assert plan_leg(ground((unseen, UNKNOWN)), START, 0.0, GOAL, SEEN).way[:, 0].max() < 0.1
+
+
 def test_no_wheel_is_driven_over_doubtful_ground_that_can_be_gone_round() -> None:
     free = np.full(LATTICE.shape, SAFE, np.uint8)
     doubted = np.hypot(X + 0.5 * ROVER.track, Y - 0.15) < 0.011
@@ -256,7 +288,7 @@ def test_at_the_rim_of_what_is_near_only_what_is_clearly_free_from_afar_counts(c
         return Bundle({name: np.full((2, 2), value) for name, value in maps.items()}, {})
 
     near = seen(HAZARDOUS, REASONS["slope"] | REASONS["uncertain"] | REASONS["unseen"], 0.45)
-    (classes, _, found), known = _seen(near, seen(SAFE, 0, chance), P)
+    (classes, _, found), known = seen_so_far(near, seen(SAFE, 0, chance), P)
     assert (classes == kind).all()
     assert found == pytest.approx(0.45 if kind == HAZARDOUS else chance)
     assert not known["unknown"].any()
@@ -313,8 +345,8 @@ def test_hazards_to_the_whole_vehicle_count_at_its_middle_alone() -> None:
     assert gaps["step"] == pytest.approx(math.hypot(0.1 - 0.04, 0.05))
     reason[60, 40] |= REASONS["uncertain"]
     doubtful = Footing.of(risk, reason, LATTICE, ROVER).gaps(x, y, ahead)
-    assert doubtful.gap[0] == pytest.approx(0.1 + ROVER.margin)  # which is not kept on top of sigma
-    assert doubtful.proven[0] == np.inf
+    assert doubtful.doubtful[0] == pytest.approx(0.1)
+    assert doubtful.gap[0] == doubtful.proven[0] == np.inf
 
 
 def test_uncertain_ground_is_planned_over_and_not_driven_on() -> None:

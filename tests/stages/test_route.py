@@ -108,3 +108,9 @@ def test_a_turn_is_looked_at_all_the_way() -> None:
 
     assert not turnable((0.0, 0.0), 0.0, 1.0, but_once)
     assert turnable((0.0, 0.0), 0.0, 0.4, but_once)
+
+
+def test_what_rounding_leaves_over_is_no_piece() -> None:
+    way = [Piece((0.0, 0.0), (0.0, 0.1), 0.0, 1), Piece((0.0, 0.1), (0.0, 0.2), 0.0, 1)]
+    assert [piece.b for piece in first_metres(way, 0.1 + 1e-15)] == [(0.0, 0.1)]
+    assert [piece.a for piece in last_metres(way, 0.1 - 1e-15)] == [(0.0, 0.1)]
