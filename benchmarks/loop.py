@@ -70,39 +70,16 @@ def drive(settings: list[str]) -> dict[str, Any]:
 def choose_goal(sequence: Any, config: Any) -> tuple[float, float] | None:
     """The place nearest to the nominal goal that can be driven to on the exact map, and where there is room to turn."""
     import numpy as np
+    from exact_bed import ExactBed
 
-    from datasets.mockup import scene as bed
-    from datasets.mockup.raycast import HeightField
-    from datasets.mockup.rover import bed_ground
-    from datasets.mockup.site import prepare
-    from datasets.mockup.truth_dem import true_dem
-    from stages.declare import Bundle
     from stages.footing import Footing
-    from stages.geometry import RigidTransform, level_rotation
-    from stages.lattice import Lattice
     from stages.leg_ground import Ground
     from stages.risk import risk_map
-    from stages.wheels import stand
 
-    mockup, rover = sequence.parameters["mockup"], sequence.parameters["rover"]
-    plain = bed.build_scene(mockup.scene())
-    scene = Bundle(prepare(plain, (*rover.start, rover.pad), None), plain.meta)
-    bed_heading = math.radians(rover.heading_deg)
-    found = stand(bed_ground(scene, config.vehicle, rover.start, 0.3), *rover.start, bed_heading, config.vehicle)
-    assert found is not None
-    T_bed_left = found.T_ground_vehicle @ sequence.simulation.T_vehicle_left
-    T_world_left = RigidTransform(level_rotation(T_bed_left.rotation[2]), np.zeros(3))
-    T_world_bed = T_world_left @ T_bed_left.inverse()
-    T_world_vehicle = T_world_bed @ found.T_ground_vehicle
-    at, cell = scene.meta["lattice"], config.locus.cell_size
-    bounds = [f(0.0, g) + s * config.drive.around for g in NOMINAL for f, s in ((min, -1.0), (max, 1.0))]
-    lattice = Lattice.snap(bounds, cell)
-    field = HeightField.build(np.asarray(scene["height"]), at["x0"], at["y0"], at["cell"])
-    z = true_dem(field, lattice.to_dict(), T_world_bed.inverse())[0]
-    judged = risk_map(z, np.zeros_like(z), cell, config.vehicle, config.risk)
-    footing = Footing.of(judged["risk"], judged["reason"], lattice, config.vehicle)
-    start = float(T_world_vehicle.translation[0]), float(T_world_vehicle.translation[1])
-    heading = math.atan2(-T_world_vehicle.rotation[0, 1], T_world_vehicle.rotation[1, 1])
+    bed, cell = ExactBed.of(sequence, config, NOMINAL), config.locus.cell_size
+    judged = risk_map(bed.elevation, np.zeros_like(bed.elevation), cell, config.vehicle, config.risk)
+    footing = Footing.of(judged["risk"], judged["reason"], bed.lattice, config.vehicle)
+    start, heading = bed.start()
     ground = Ground(footing, start, heading, config.leg.model_copy(update={"unknown_price": math.inf}))
     _, cost, _ = ground.search(start, cell, whole=True)
     x, y = ground.places()

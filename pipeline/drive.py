@@ -42,6 +42,7 @@ from stages.declare import Params
 from stages.errors import ConfigError, DegenerateError
 from stages.geometry import RigidTransform
 from stages.lattice import Lattice
+from stages.leg_memory import Memory
 from stages.reflex import pairs
 
 
@@ -136,17 +137,12 @@ class Drive(Reconstruction):
         """In the world frame."""
         self.true: dict[int, tuple[float, ...]] = {}
         """True pose of each frame that was taken; read by the renderer and by what assesses, never by an estimate."""
-        self.looks = self.troubles = 0
+        self.troubles = 0
         self.rows: dict[int, int] = {}
         """Row of each frame in the artifact of its leg."""
-        self.closed: list[list[float]] = []
-        """Places about which unknown ground was looked at in vain."""
-        self.backs: list[list[float]] = []
-        """Places from which it drove back to see what lies before them."""
+        self.memory = Memory()
         self.planned: Handle | None = None
         """The last leg, of whose way a part is left."""
-        self.reopened = False
-        """Whether these places were tried once more, as the last way that is left."""
 
     def build(self) -> Products:
         """Lay out the start; the rest follows by expansion."""
@@ -298,8 +294,9 @@ class Drive(Reconstruction):
         self.pads = [self._node("pad", "pad", args, pose=self.pose, like=like)] if self.simulation.pad > 0 else []
 
     def _leg(self, label: str, risk: Handle, pose: Handle, *, far: Handle | None = None, whole: bool = False) -> Handle:
-        args: dict[str, Any] = {"goal": list(self.goal), "looks": self.looks, **self.mounting}
-        args |= {"closed": self.closed, "backs": self.backs}
+        memory = Memory() if whole else self.memory
+        args: dict[str, Any] = {"goal": list(self.goal), "looks": memory.looks, **self.mounting}
+        args |= {"closed": [list(p) for p in memory.closed], "backs": [list(p) for p in memory.backs]}
         if whole:
             return self._node("leg", label, args | {"whole": True}, risk=risk, pose=pose)
         given = {"risk": risk, "far": far, "pose": pose, "before": self.planned}
@@ -312,24 +309,19 @@ class Drive(Reconstruction):
         return Lattice.snap(bounds, self.config.locus.cell_size)
 
     def _after_leg(self, stop: Stop, before: Handle, row: int, leg: Ref) -> None:
-        verdict = leg.meta["verdict"]
-        if verdict == "no path" and self.closed and not self.reopened:
-            self.closed, self.looks, self.reopened = [], 0, True
+        verdict, where = leg.meta["verdict"], leg.meta["where"]
+        follows = self.memory.after(
+            verdict, tuple(leg.meta["start"][:2]), leg.meta["length_m"], None if where is None else tuple(where)
+        )
+        if follows == "again":
             self._again(stop, before, row)
-        elif verdict in ("goal", "no path"):
+        elif follows == "end":
             stop.event = leg.meta["reason"]
             self._end(verdict, leg.meta["reason"])
-        elif verdict == "closed":
-            self.closed = [*self.closed, leg.meta["where"]]
-            self.looks = 0
-            self._again(stop, before, row)
         elif stop.index + 1 >= self.config.drive.max_stops:
             self._end("stops", f"{stop.index + 1} stops and {1000 * leg.meta['left_m']:.0f} mm from the goal")
         else:
             self.planned = stop.leg
-            self.looks = {"drive": 0, "turn": self.looks, "look": self.looks + 1}[verdict]
-            if verdict == "look" and leg.meta["length_m"] > 0:
-                self.backs = [*self.backs, leg.meta["start"][:2]]
             stop.event = leg.meta["reason"]
             self._drive(stop, before, row)
 
@@ -513,7 +505,6 @@ class Drive(Reconstruction):
             truth_dem = self._simulate(source, "truth_dem", scene=self.scene)
             p.dem_accuracy = self._node("dem_accuracy", "dem_accuracy/world", {}, dem=p.tiles, truth=truth_dem)
             p.truth_risk = self._risk("risk/truth", [truth_dem])
-            self.looks, self.closed, self.backs = 0, [], []
             self.driven.truth_leg = self._leg("leg/truth", p.truth_risk, self.first_pose, whole=True)
             self._check()
 
