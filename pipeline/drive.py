@@ -465,7 +465,6 @@ class Drive(Reconstruction):
             cut, kind, reason = seen, "reflex", reflex.meta["reason"]
         self.troubles = 0 if cut is None or kind == "reflex" else self.troubles + 1
         if cut is not None:
-            self.planned = None
             stop.event = f"{'reflex' if kind == 'reflex' else 'safety stop'} at image {frames[cut]}: {reason}"
             if cut < len(frames) - 1:
                 frames = frames[: cut + 1]

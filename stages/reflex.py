@@ -43,7 +43,10 @@ class ReflexParams(Params):
     level: int = Field(1, ge=0, le=4, description="pyramid level of the displacements: half the resolution is enough")
     baseline: float = Field(1.6, gt=0, description="wheel diameters; way between the two images that are compared")
     max_turn_deg: float = Field(
-        10.0, gt=0, description="degrees; images turned farther against each other are not used"
+        6.0,
+        gt=0,
+        description="degrees; images turned farther against each other are not used: at 7 and 8 degrees points rose "
+        "above ground that the model had right",
     )
     reach: float = Field(10.0, gt=0, description="wheel diameters ahead of the vehicle's centre that are watched")
     aside: float = Field(0.5, ge=0, description="wheel diameters to either side of the wheels that are watched")
