@@ -15,6 +15,7 @@ from datasets.mockup.rover import bed_ground, heading_of
 from datasets.mockup.sequence import true_rig
 from datasets.mockup.site import prepare
 from datasets.mockup.truth_dem import seen_by, true_dem
+from pipeline.drive import arena
 from stages.declare import Bundle
 from stages.geometry import RigidTransform, level_rotation
 from stages.lattice import Lattice
@@ -53,9 +54,8 @@ class ExactBed:
         T_bed_left = found.T_ground_vehicle @ sequence.simulation.T_vehicle_left
         T_world_left = RigidTransform(level_rotation(T_bed_left.rotation[2]), np.zeros(3))
         T_world_bed = T_world_left @ T_bed_left.inverse()
-        at, around = scene.meta["lattice"], config.drive.around
-        bounds = [f(0.0, g) + s * around for g in goal for f, s in ((min, -1.0), (max, 1.0))]
-        lattice = Lattice.snap(bounds, config.locus.cell_size)
+        at = scene.meta["lattice"]
+        lattice = arena(goal, config.drive.around, config.locus.cell_size)
         field = HeightField.build(np.asarray(scene["height"]), at["x0"], at["y0"], at["cell"])
         z, points = true_dem(field, lattice.to_dict(), T_world_bed.inverse())
         T_world_vehicle = T_world_bed @ found.T_ground_vehicle

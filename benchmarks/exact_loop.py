@@ -38,53 +38,44 @@ def drive(sequence: Any, config: Any, goal: tuple[float, float]) -> dict[str, An
     from exact_bed import ExactBed, place_of
 
     from stages.declare import Bundle
-    from stages.footing import Footing
-    from stages.leg import plan_leg, seen_so_far, shortest
+    from stages.leg import next_leg, shortest_way
     from stages.leg_memory import Memory
     from stages.risk import risk_map
+    from stages.view import View
 
     bed, vehicle, p = ExactBed.of(sequence, config, goal), config.vehicle, config.leg
     fine = vehicle.wheel_diameter / config.drive.detail
+    view = View.of(sequence.rig, sequence.simulation.T_vehicle_left)
+    meta = {"lattice": bed.lattice.to_dict(), "vehicle": vehicle.model_dump(mode="json")}
 
     def judged(known: Any) -> Bundle:
         z = np.where(known, bed.elevation, np.float32(np.nan))
-        return Bundle(risk_map(z, np.zeros_like(z), bed.lattice.cell, vehicle, config.risk), {})
-
-    def footing(near: Bundle, far: Bundle | None, sure: float, on: Any = vehicle) -> Footing:
-        (classes, reason, chance), seen = seen_so_far(near, far, p)
-        return Footing.of(classes, reason, bed.lattice, on, chance, sure, p.dare, **seen)
+        return Bundle(risk_map(z, np.zeros_like(z), bed.lattice.cell, vehicle, config.risk), meta)
 
     T, memory, before = bed.T_world_vehicle, Memory(), None
-    best, whole = None, judged(np.isfinite(bed.elevation))
-    for margin in (vehicle.margin, 0.0):
-        exact = footing(whole, None, p.sure[-1], vehicle.model_copy(update={"margin": margin}))
-        best = best or shortest(exact, *bed.start(), goal, p)
+    (start, heading), whole = bed.start(), judged(np.isfinite(bed.elevation))
+    best, _ = shortest_way(whole, (*start, heading), goal, p)
     far = bed.under(T, sequence.parameters["rover"].pad)
-    near, way, stops = far.copy(), 0.0, 0
-    while True:
+    near, way, stops, follows = far.copy(), 0.0, 0, "drive"
+    while follows != "end" and stops < config.drive.max_stops:
         seen, covers = bed.in_view(T, max(FARTHEST, fine))
         far, near = far | seen, near | (seen & (covers <= fine))
-        maps = judged(near), judged(far)
-        follows = "again"
+        maps, follows, (place, heading) = (judged(near), judged(far)), "again", place_of(T)
         while follows == "again":
-            for sure in p.sure:
-                here = place_of(T)
-                leg = plan_leg(
-                    footing(*maps, sure), *here, goal, p, memory.looks, memory.closed, before, memory.backs
-                )  # fmt: skip
-                if leg.verdict == "goal" or len(leg.way) > 1:
-                    break
-            length = float(np.hypot(*np.diff(leg.path, axis=0).T).sum())
-            follows = memory.after(leg.verdict, here[0], length, leg.where)
-        stops, way = stops + 1, way + length
-        if follows == "end" or stops >= config.drive.max_stops:
-            verdict = leg.verdict if follows == "end" else "stops"
-            return {"verdict": verdict, "reason": leg.reason, "way": way, "shortest_way": best, "stops": stops}
+            leg = next_leg(*maps, (*place, heading), goal, p, memory, view, before)
+            follows = memory.after(leg.verdict, (*place, heading), leg.where)
         before = (leg.rest, leg.rest_gear) if len(leg.rest_gear) else None
-        place, heading = here
-        for a, b, gear in zip(leg.path[:-1], leg.path[1:], leg.gear, strict=True):
-            place, heading = (float(b[0]), float(b[1])), math.atan2(-gear * (b[0] - a[0]), gear * (b[1] - a[1]))
-        T = bed.at(place, heading + leg.turn)
+        T = bed.at(*after(leg, heading))
+        stops, way = stops + 1, way + float(np.hypot(*np.diff(leg.path, axis=0).T).sum())
+    verdict = leg.verdict if follows == "end" else "stops"
+    return {"verdict": verdict, "reason": leg.reason, "way": way, "shortest_way": best, "stops": stops}
+
+
+def after(leg: Any, heading: float) -> tuple[tuple[float, float], float]:
+    """Where (m) the vehicle stands after a leg that is driven exactly, and its heading (rad)."""
+    for a, b, gear in zip(leg.path[:-1], leg.path[1:], leg.gear, strict=True):
+        heading = math.atan2(-gear * (b[0] - a[0]), gear * (b[1] - a[1]))
+    return (float(leg.path[-1, 0]), float(leg.path[-1, 1])), heading + leg.turn
 
 
 def table(rows: list[dict[str, Any]]) -> list[str]:

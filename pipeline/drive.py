@@ -117,6 +117,12 @@ class Driven:
     check: Handle | None = None
 
 
+def arena(goal: tuple[float, float], around: float, cell: float) -> Lattice:
+    """What a drive maps: so many metres around its start, which is at the origin, and its goal, m."""
+    bounds = [f(0.0, g) + s * around for g in goal for f, s in ((min, -1.0), (max, 1.0))]
+    return Lattice.snap(bounds, cell)
+
+
 class Drive(Reconstruction):
     """Builds the graph of a drive, stop by stop, as results arrive."""
 
@@ -296,23 +302,20 @@ class Drive(Reconstruction):
     def _leg(self, label: str, risk: Handle, pose: Handle, *, far: Handle | None = None, whole: bool = False) -> Handle:
         memory = Memory() if whole else self.memory
         args: dict[str, Any] = {"goal": list(self.goal), "looks": memory.looks, **self.mounting}
-        args |= {"closed": [list(p) for p in memory.closed], "backs": [list(p) for p in memory.backs]}
+        args |= {"closed": [list(p) for p in memory.closed], "stands": [list(p) for p in memory.stands]}
+        args["rig"] = self.sequence.rig.to_dict()
         if whole:
             return self._node("leg", label, args | {"whole": True}, risk=risk, pose=pose)
         given = {"risk": risk, "far": far, "pose": pose, "before": self.planned}
         return self._node("leg", label, args, **{name: handle for name, handle in given.items() if handle is not None})
 
     def arena(self) -> Lattice:
-        """The part of the world that is mapped: around the start, which is at the origin, and the goal."""
-        d = self.config.drive
-        bounds = [f(0.0, g) + s * d.around for g in self.goal for f, s in ((min, -1.0), (max, 1.0))]
-        return Lattice.snap(bounds, self.config.locus.cell_size)
+        """The part of the world that is mapped."""
+        return arena(self.goal, self.config.drive.around, self.config.locus.cell_size)
 
     def _after_leg(self, stop: Stop, before: Handle, row: int, leg: Ref) -> None:
         verdict, where = leg.meta["verdict"], leg.meta["where"]
-        follows = self.memory.after(
-            verdict, tuple(leg.meta["start"][:2]), leg.meta["length_m"], None if where is None else tuple(where)
-        )
+        follows = self.memory.after(verdict, tuple(leg.meta["start"]), None if where is None else tuple(where))
         if follows == "again":
             self._again(stop, before, row)
         elif follows == "end":

@@ -132,6 +132,25 @@ class Footing:
         out[3:5] -= NEAR_UNKNOWN * cell
         return Gaps(*(a.reshape(np.shape(x)) for a in out))
 
+    def beneath(self, mask: Mask, stand: tuple[float, float, float]) -> Floats:
+        """Middles (n, 2), m, of the cells of a mask (row, col) that a vehicle at x, y (m), heading (rad) has under its
+        belly, or within its margin of the middles of its wheels: all that come too near to it, for it rounds to cells,
+        and what is a cell farther."""
+        x, y, heading = stand
+        cell, vehicle = self.lattice.cell, self.vehicle
+        reach = 0.5 * math.hypot(vehicle.track, vehicle.wheel_base) + vehicle.margin + 2.0 * cell
+        row, col = self.lattice.index((x, y))
+        n = math.ceil(reach / cell)
+        rows, cols = (slice(max(0, round(float(v)) - n), max(0, round(float(v)) + n + 1)) for v in (row, col))
+        at = self.lattice.xy()[rows, cols][mask[rows, cols]]
+        c, s = math.cos(heading), math.sin(heading)
+        right = c * (at[:, 0] - x) + s * (at[:, 1] - y)
+        ahead = c * (at[:, 1] - y) - s * (at[:, 0] - x)
+        under = (np.abs(right) <= 0.5 * vehicle.track + cell) & (np.abs(ahead) <= 0.5 * vehicle.wheel_base + cell)
+        for across, along in wheel_positions(vehicle):
+            under |= np.hypot(right - across, ahead - along) <= vehicle.margin + cell
+        return np.asarray(at[under])
+
 
 def _distance(mask: Mask, cell: float) -> Floats32:
     far = scipy.ndimage.distance_transform_edt(~mask) * cell if mask.any() else np.full(mask.shape, np.inf)

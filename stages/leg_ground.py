@@ -181,12 +181,20 @@ class Ground:
         x, y = (piece.a[i] + share * (piece.b[i] - piece.a[i]) for i in (0, 1))
         return n, share, (x, y, np.append(np.linspace(before, piece.heading, n), np.full(m, piece.heading)))
 
-    def unseen(self, way: Sequence[Piece], first: int) -> bool:
-        """Whether the first piece of a way that is not known is so for ground that was not seen from near, and not for
-        hazards that are doubtful though it was."""
+    def lacking(self, way: Sequence[Piece], first: int) -> tuple[Floats, bool]:
+        """Middles (n, 2), m, of the cells for which the first piece of a way that is not known is not, at the first
+        pose at which it is so: those that were not seen from near, else hazards; and whether they were not seen."""
         piece, before = way[first], way[first - 1].heading if first > 0 else self.heading
         _, _, (x, y, angle) = self._along(piece.cut(self.grid.spacing), before)
-        return not self._seen(self.footing.gaps(x, y, angle), self._near(x, y)).all()
+        gaps = self.footing.gaps(x, y, angle)
+        k = int(np.argmin(self._split(gaps, x, y)[0]))
+        stand = float(x[k]), float(y[k]), float(angle[k])
+        fields = self.footing.fields
+        for mask, unseen in ((self.footing.unknown == 0, True), ((fields[:2] == 0).any(axis=0), False)):
+            points = self.footing.beneath(mask, stand)
+            if len(points):
+                return points, unseen
+        return np.array([stand[:2]]), False
 
     def on_map(self, cost: Floats) -> NDArray[np.float32]:
         """Cost at the best heading on the cells of the map, NaN where it is not known."""

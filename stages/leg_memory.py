@@ -1,9 +1,11 @@
-"""What a vehicle remembers from leg to leg: where it looked in vain, and from where it drove back to look."""
+"""What a vehicle remembers from leg to leg: where it stood and looked, and what it looked at in vain."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from typing import Literal
+
+from stages.view import Stand
 
 Place = tuple[float, float]
 
@@ -11,22 +13,20 @@ Place = tuple[float, float]
 @dataclass
 class Memory:
     """``looks`` around since the last leg that was driven; ``closed`` places (m) about which unknown ground was looked
-    at in vain; ``backs`` places from which it drove back to see what lies before them; ``reopened``: the closed ones
-    were tried once more, as the last way that is left."""
+    at in vain; ``stands`` from which it has looked; ``reopened``: the closed places were tried once more, as the last
+    way that is left."""
 
     looks: int = 0
     closed: list[Place] = field(default_factory=list)
-    backs: list[Place] = field(default_factory=list)
+    stands: list[Stand] = field(default_factory=list)
     reopened: bool = False
 
-    def after(
-        self, verdict: str, start: Place, length: float, where: Place | None = None
-    ) -> Literal["end", "again", "drive"]:
+    def after(self, verdict: str, stand: Stand, where: Place | None = None) -> Literal["end", "again", "drive"]:
         """What follows a leg (:class:`stages.leg.Leg`): the end, another plan from where it stands, or the drive.
 
         Parameters
         ----------
-        start, length : m; where the leg begins and what of it is driven.
+        stand : where the leg begins.
         where : m; place that it closes.
         """
         if verdict == "no path" and self.closed and not self.reopened:
@@ -40,6 +40,5 @@ class Memory:
             self.closed, self.looks = [*self.closed, where], 0
             return "again"
         self.looks = {"drive": 0, "turn": self.looks, "look": self.looks + 1}[verdict]
-        if verdict == "look" and length > 0:
-            self.backs = [*self.backs, start]
+        self.stands = [*self.stands, stand]
         return "drive"

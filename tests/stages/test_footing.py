@@ -76,6 +76,23 @@ def test_wheels_keep_the_margin_from_unknown_ground_and_no_more() -> None:
         assert beneath == (edge < 0.04 + ROVER.margin + 0.5 * LATTICE.cell + 1e-9)
 
 
+@settings(max_examples=30, deadline=None)
+@given(st.floats(-0.1, 0.1), st.floats(-0.1, 0.1), st.floats(-4.0, 4.0))
+def test_cells_beneath_are_those_for_which_it_may_not_stand_there(x: float, y: float, heading: float) -> None:
+    footing = Footing.of(np.full(LATTICE.shape, SAFE, np.uint8), None, LATTICE, ROVER)
+    beneath = footing.beneath(np.ones(LATTICE.shape, bool), (x, y, heading))
+    assert len(np.unique(beneath, axis=0)) == len(beneath) > 0
+    taken = {tuple(np.rint(LATTICE.index(p)).astype(int)) for p in beneath}
+    for row, col in np.random.default_rng(0).integers((20, 20), (100, 100), (60, 2)):
+        unknown = np.full(LATTICE.shape, SAFE, np.uint8)
+        unknown[row, col] = UNKNOWN
+        gap = at(Footing.of(unknown, None, LATTICE, ROVER), x, y, heading)[2]
+        if gap <= 0.0:
+            assert (row, col) in taken
+        elif (row, col) in taken:
+            assert gap < 0.5 * math.hypot(0.015, 0.015) + 2.0 * LATTICE.cell, "points of the belly are 15 mm apart"
+
+
 def test_unknown_spots_where_a_wheel_has_no_room_are_no_frontier() -> None:
     spot, hole = np.hypot(X, Y - 0.05) < 0.012, np.hypot(X, Y - 0.05) < 0.03
     for unknown, is_one in ((spot, False), (hole, True), (Y > 0.03, True), (np.abs(Y - 0.05) < 0.006, False)):

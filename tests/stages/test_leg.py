@@ -9,32 +9,21 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from leg_scenes import CAMERAS, GOAL, LATTICE, ROVER, START, P, X, Y, ground
 
 from stages.declare import Bundle
 from stages.errors import InputError
 from stages.footing import DOUBT_WEIGHT, PARTS, Footing
-from stages.lattice import Lattice
-from stages.leg import Leg, LegParams, plan_leg, seen_so_far, shortest
+from stages.leg import next_leg, seen_so_far, shortest_way
+from stages.leg_memory import Memory
+from stages.leg_params import LegParams
+from stages.leg_plan import Leg, plan_leg, shortest
 from stages.risk import HAZARDOUS, REASONS, SAFE, UNKNOWN
 from stages.route import length_of, through
-from stages.vehicle import Vehicle
+from stages.view import Stand
 
-ROVER = Vehicle(
-    wheel_diameter=0.03, track=0.08, wheel_base=0.10, clearance=0.025, max_step=0.012, max_roughness=0.004, margin=0.01
-)
-LATTICE = Lattice.snap((-0.4, 0.4, -0.2, 1.0), 0.01)
-START, GOAL = (0.0, 0.0), (0.0, 0.8)
-X, Y = LATTICE.xy()[..., 0], LATTICE.xy()[..., 1]
-P = LegParams()
 SEEN = P.model_copy(update={"blind": 0.0})
 """Without the rule for what is near, which on this small map is half of it."""
-
-
-def ground(*changes: tuple[np.ndarray, int]) -> Footing:
-    risk = np.full(LATTICE.shape, SAFE, np.uint8)
-    for where, kind in changes:
-        risk[where] = kind
-    return Footing.of(risk, None, LATTICE, ROVER)
 
 
 def test_over_free_ground_it_goes_straight_one_leg_far() -> None:
@@ -133,11 +122,11 @@ def test_more_than_the_greatest_turn_is_done_on_the_spot_first() -> None:
 def test_it_does_not_look_where_its_wheels_have_no_room_to_turn() -> None:
     ahead = (Y > 0.07, UNKNOWN)
     leg = plan_leg(ground(ahead), START, 0.0, GOAL, SEEN)
-    assert (leg.verdict, math.degrees(leg.turn)) == ("look", pytest.approx(25.0))
-    # the right rear wheel would move to (0.057, -0.028) m
-    wall = (X > 0.055) & (Y > -0.08) & (Y < -0.02)
+    assert (leg.verdict, math.degrees(leg.turn)) == ("look", pytest.approx(15.0))
+    # the right rear wheel would move to (0.052, -0.038) m
+    wall = (X > 0.045) & (Y > -0.045) & (Y < -0.02)
     leg = plan_leg(ground(ahead, (wall, HAZARDOUS)), START, 0.0, GOAL, SEEN)
-    assert (leg.verdict, math.degrees(leg.turn)) == ("look", pytest.approx(-P.max_turn_deg))
+    assert (leg.verdict, math.degrees(leg.turn)) == ("look", pytest.approx(-15.0))
 
 
 def test_it_looks_around_then_closes_what_stays_unknown_and_goes_another_way() -> None:
@@ -246,6 +235,29 @@ def test_a_kept_way_is_not_given_up_for_rounding() -> None:
     reason = np.full(LATTICE.shape, REASONS["step"] | REASONS["uncertain"], np.uint16)
     leg = plan_leg(Footing.of(risk, reason, LATTICE, ROVER), START, 0.0, GOAL, P, before=(straight, AHEAD[:1]))
     assert leg.path[-1, 1] < 0.15 - 0.5 * ROVER.wheel_base + LATTICE.cell
+
+
+def judged(hazardous: np.ndarray, chance: float) -> Bundle:
+    risk = np.where(hazardous, np.uint8(HAZARDOUS), np.uint8(SAFE))
+    maps = {"risk": risk, "reason": np.where(hazardous, np.uint16(REASONS["step"]), np.uint16(0))}
+    maps["p_hazard"] = np.where(hazardous, chance, 0.0).astype(np.float32)
+    return Bundle(maps, {"lattice": LATTICE.to_dict(), "vehicle": ROVER.model_dump(mode="json")})
+
+
+def test_where_probable_hazards_close_every_way_those_next_to_certain_do() -> None:
+    wall = np.abs(Y - 0.3) < 0.03
+    for chance, verdict in ((0.93, "drive"), (0.999, "look")):
+        leg = next_leg(judged(wall, chance), None, (*START, 0.0), GOAL, P, Memory(), CAMERAS)
+        assert leg.verdict == verdict
+        assert (len(leg.way) > 1) == (verdict == "drive")
+
+
+@pytest.mark.parametrize(("half", "margin"), [(0.065, ROVER.margin), (0.045, 0.0), (0.035, None)])
+def test_the_shortest_way_keeps_the_margin_where_one_can(half: float, margin: float | None) -> None:
+    walls = (np.abs(X) > half) & (np.abs(Y - 0.3) < 0.03)
+    length, kept = shortest_way(judged(walls, 1.0), (*START, 0.0), GOAL, P)
+    assert kept == margin
+    assert (length is None) == (margin is None)
 
 
 def test_what_is_likely_a_hazard_is_gone_round_farther_than_what_is_unknown() -> None:
@@ -378,16 +390,21 @@ def test_the_shortest_way_over_free_ground_is_little_longer_than_the_beeline(x: 
 def test_what_lies_nearer_than_its_view_is_looked_at_from_farther_back() -> None:
     band, walls = np.abs(Y - 0.10) < 0.02, np.abs(X) > 0.1
     before = ground((band, UNKNOWN), (walls, HAZARDOUS))
-    leg = plan_leg(before, START, 0.0, GOAL, P)
+    leg = plan_leg(before, START, 0.0, GOAL, P, view=CAMERAS)
     assert leg.verdict == "look"
     assert leg.gear.tolist() == [-1]
     x, y = leg.path[-1]
     assert abs(x) < 1e-9
-    # the map ends 0.2 m behind the start: there the rear wheels stand
-    assert -P.blind * ROVER.wheel_base - 1e-9 <= y < -0.1
-    assert plan_leg(before, START, 0.0, GOAL, P, backs=[(0.0, 0.02)]).gear.tolist() == []
+    beneath = np.array([(x, 0.09) for x in (-0.05, 0.0, 0.05)])
+    assert CAMERAS.sees(beneath, (x, y, leg.turn)).all()
+    assert not CAMERAS.sees(beneath, (x, y + 0.02, leg.turn)).all(), "and no farther than that"
+    # what it saw from there already, and from nearer, is not looked at again
+    vain = plan_leg(before, START, 0.0, GOAL, P, view=CAMERAS, stands=[(x, y, leg.turn)])
+    assert vain.verdict == "closed"
+    aside = plan_leg(before, START, 0.0, GOAL, P, view=CAMERAS, stands=[(x - 0.15, y, -0.5)])
+    assert aside.gear.tolist() == [-1], "from another side it may show"
     blocked = ground((band, UNKNOWN), (walls | (Y < -0.08), HAZARDOUS))
-    assert plan_leg(blocked, START, 0.0, GOAL, P).gear.tolist() == []
+    assert plan_leg(blocked, START, 0.0, GOAL, P, view=CAMERAS).gear.tolist() == []
 
 
 def around_a_corner() -> Footing:
@@ -395,28 +412,30 @@ def around_a_corner() -> Footing:
     return ground(((X > 0.09) & (Y < 0.3), HAZARDOUS), ((X > 0.15) & (Y >= 0.3), UNKNOWN))
 
 
+FIRST = np.array([(0.16, 0.34), (0.16, 0.4)])
+"""Ground there on which its right wheels come to stand first."""
+
+
 @pytest.mark.parametrize("y", [0.1, 0.14, 0.18])
 def test_a_leg_ends_facing_what_is_not_known_from_where_that_is_seen(y: float) -> None:
-    leg = plan_leg(around_a_corner(), (0.0, y), 0.0, (0.35, 0.45), P)
+    leg = plan_leg(around_a_corner(), (0.0, y), 0.0, (0.35, 0.45), P, view=CAMERAS)
     assert leg.verdict == "drive"
-    end = leg.path[-1]
-    assert np.hypot(*(end - leg.path[0])) < P.length * ROVER.wheel_base - 1e-6, "it could go on"
-    first = (0.10, 0.37)  # there its right wheels come to stand on it
-    away = math.hypot(first[0] - end[0], first[1] - end[1])
-    assert P.blind * ROVER.wheel_base - 0.03 < away < P.blind * ROVER.wheel_base + 0.03
+    assert np.hypot(*(leg.path[-1] - leg.path[0])) >= P.least * ROVER.wheel_base
     last = leg.path[-1] - leg.path[-2]
-    assert math.atan2(-last[0], last[1]) + leg.turn == pytest.approx(
-        math.atan2(-first[0] + end[0], first[1] - end[1]), abs=0.2
-    )
+    end: Stand = (leg.path[-1, 0], leg.path[-1, 1], math.atan2(-last[0], last[1]) + leg.turn)
+    assert CAMERAS.sees(FIRST, end).all()
 
 
 def test_it_turns_to_what_comes_next_before_it_is_too_near_to_see_it_and_then_drives() -> None:
-    start, goal = (0.0, 0.21), (0.35, 0.45)
-    leg = plan_leg(around_a_corner(), start, 0.0, goal, P)
+    start, goal = (0.0, 0.3), (0.35, 0.45)
+    leg = plan_leg(around_a_corner(), start, 0.0, goal, P, view=CAMERAS)
     assert leg.verdict == "look"
-    assert -math.radians(P.max_turn_deg) - 1e-9 <= leg.turn < -math.radians(15)
+    assert -math.radians(P.max_turn_deg) - 1e-9 <= leg.turn < 0.0
     assert len(leg.path) == 1
-    assert plan_leg(around_a_corner(), start, leg.turn, goal, P, looks=1).verdict == "drive", "it did not help"
+    assert not CAMERAS.sees(FIRST, (*start, 0.0)).any()
+    assert CAMERAS.sees(FIRST, (*start, leg.turn)).any()
+    again = plan_leg(around_a_corner(), start, leg.turn, goal, P, looks=1, view=CAMERAS, stands=[(*start, 0.0)])
+    assert again.verdict == "drive", "it did not help"
 
 
 def test_what_was_seen_from_near_and_stays_doubtful_is_not_looked_at_from_farther_back() -> None:
@@ -427,7 +446,8 @@ def test_what_was_seen_from_near_and_stays_doubtful_is_not_looked_at_from_farthe
     unseen, doubtful = (risk.copy(), reason.copy()), (risk.copy(), reason.copy())
     unseen[0][band] = UNKNOWN
     doubtful[0][band], doubtful[1][band] = HAZARDOUS, REASONS["step"] | REASONS["uncertain"]
-    back, turn = (plan_leg(Footing.of(*maps, LATTICE, ROVER), START, 0.0, GOAL, P) for maps in (unseen, doubtful))
+    back, closed = (
+        plan_leg(Footing.of(*maps, LATTICE, ROVER), START, 0.0, GOAL, P, view=CAMERAS) for maps in (unseen, doubtful)
+    )
     assert (back.verdict, back.gear.tolist()) == ("look", [-1])
-    assert (turn.verdict, turn.gear.tolist()) == ("look", [])
-    assert turn.turn != 0.0
+    assert closed.verdict == "closed"
