@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from stages.leg_ground import Ground
 from stages.route import Piece, length_of
-from stages.view import MOST, Stand, View, looked
+from stages.view import Stand, View, bearing, looked
 
 Floats = NDArray[np.float64]
 Point = tuple[float, float]
@@ -52,10 +52,9 @@ class Target:
 
     def shows(self, stand: Stand, looks: int = 1) -> bool:
         """Whether it is in view from a place, and was looked at fewer times from there or nearer."""
-        if self.view.sees(self.points, stand).mean() < MOST:
+        if not self.view.holds(self.points, stand):
             return False
-        x, y = self.points.mean(axis=0)
-        side, far = math.atan2(stand[1] - y, stand[0] - x), math.hypot(stand[1] - y, stand[0] - x)
+        side, far = bearing(self.points, stand)
         same = (d <= FARTHER * far and abs(math.remainder(a - side, 2 * math.pi)) < SIDE for a, d in self.before)
         return sum(same) < looks
 

@@ -47,6 +47,10 @@ class View:
         at = np.stack([c * dx + s * dy, c * dy - s * dx, np.ones(len(points))])
         return np.asarray((self.edges @ at > 0).all(axis=0))
 
+    def holds(self, points: Floats, stand: Stand) -> bool:
+        """Whether :data:`MOST` of these points lie in view."""
+        return bool(self.sees(points, stand).mean() >= MOST)
+
 
 def _edges(camera: Camera, T_vehicle_camera: RigidTransform) -> Floats:
     """(4, 3): lines on the ground, positive inside."""
@@ -63,9 +67,10 @@ AHEAD = View(np.array([[0.0, 1.0, 0.0]]))
 
 def looked(view: View, stands: Iterable[Stand], points: Floats) -> list[tuple[float, float]]:
     """From where points (n, 2), m, were in view: direction (rad) and distance (m) from their middle to those places."""
+    return [bearing(points, stand) for stand in stands if view.holds(points, stand)]
+
+
+def bearing(points: Floats, stand: Stand) -> tuple[float, float]:
+    """Direction (rad, from x to y) and distance (m) from the middle of points (n, 2), m, to a place."""
     x, y = points.mean(axis=0)
-    return [
-        (math.atan2(stand[1] - y, stand[0] - x), math.hypot(stand[1] - y, stand[0] - x))
-        for stand in stands
-        if view.sees(points, stand).mean() >= MOST
-    ]
+    return math.atan2(stand[1] - y, stand[0] - x), math.hypot(stand[1] - y, stand[0] - x)
