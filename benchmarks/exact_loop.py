@@ -37,10 +37,12 @@ def drive(sequence: Any, config: Any, goal: tuple[float, float]) -> dict[str, An
     import numpy as np
     from exact_bed import ExactBed, place_of
 
+    from stages.ceiling import ceiling
     from stages.declare import Bundle
     from stages.leg import next_leg, shortest_way
     from stages.leg_memory import Memory
     from stages.risk import risk_map
+    from stages.straddle import Bounds
     from stages.view import View
 
     bed, vehicle, p = ExactBed.of(sequence, config, goal), config.vehicle, config.leg
@@ -57,12 +59,17 @@ def drive(sequence: Any, config: Any, goal: tuple[float, float]) -> dict[str, An
     best, _ = shortest_way(whole, (*start, heading), goal, p)
     far = bed.under(T, sequence.parameters["rover"].pad)
     near, way, stops, follows = far.copy(), 0.0, 0, "drive"
+    top = np.full_like(bed.elevation, np.nan)
     while follows != "end" and stops < config.drive.max_stops:
         seen, covers = bed.in_view(T, max(FARTHEST, fine))
-        far, near = far | seen, near | (seen & (covers <= fine))
+        far, now = far | seen, seen & (covers <= fine)
+        near |= now
+        centre = (T @ sequence.simulation.T_vehicle_left).translation
+        top = np.fmin(top, ceiling(np.where(now, bed.elevation, np.float32(np.nan)), bed.lattice, centre))
+        bounds = Bounds(*(np.where(near, bed.elevation, a).astype(np.float32) for a in (top, np.nan)))
         maps, follows, (place, heading) = (judged(near), judged(far)), "again", place_of(T)
         while follows == "again":
-            leg = next_leg(*maps, (*place, heading), goal, p, memory, view, before)
+            leg = next_leg(*maps, (*place, heading), goal, p, memory, view, before, bounds)
             follows = memory.after(leg.verdict, (*place, heading), leg.where)
         before = (leg.rest, leg.rest_gear) if len(leg.rest_gear) else None
         T = bed.at(*after(leg, heading))

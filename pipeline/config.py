@@ -54,6 +54,7 @@ STAGE_MODULES: dict[str, str] = {
     "dem_accuracy": "stages.dem_accuracy",
     "path_check": "stages.path_check",
     "pad": "stages.pad",
+    "ceiling": "stages.ceiling",
     "leg": "stages.leg",
     "safety": "stages.safety",
     "reflex": "stages.reflex",

@@ -6,7 +6,7 @@
                           v
     stop k:  image -> pyramid -> hfvm -> level -> locus (local) -> locus (world) -> merge (all models so far, pad;
                                            |                          ^                |      and what of them is near)
-                                           |            trajectory -> pose           risk (of both)
+                                           |            trajectory -> pose           risk (of both), ceiling
                                            v               ^   |                             |
                                          resect -----------+   +---------> leg <-------------+
                                            ^                                |
@@ -93,6 +93,7 @@ class Stop:
     merged: Handle | None = None
     risk: Handle | None = None
     far: Handle | None = None
+    ceiling: Handle | None = None
     trajectory: Handle | None = None
     leg: Handle | None = None
     drive: Handle | None = None
@@ -261,10 +262,13 @@ class Drive(Reconstruction):
         stop.merged = self._merged(f"merge/{k}", None)
         p.tiles = [stop.merged]
         stop.risk = p.risk = self._risk(f"risk/{k}", [stop.merged])
+        near, finest = stop.merged, None
         if self.config.drive.detail > 0:
             stop.far = stop.risk
-            near = self._merged(f"merge/{k}/near", self.config.vehicle.wheel_diameter / self.config.drive.detail)
+            finest = self.config.vehicle.wheel_diameter / self.config.drive.detail
+            near = self._merged(f"merge/{k}/near", finest)
             stop.risk = self._risk(f"risk/{k}/near", [near])
+        stop.ceiling = self._ceiling(f"ceiling/{k}", near, finest)
         self._decide(stop, f"leg/{k}")
 
     def _merged(self, label: str, finest: float | None) -> Handle:
@@ -274,10 +278,17 @@ class Drive(Reconstruction):
         dems = [*self.pads, *self.products.world_dem.values()]
         return self.graph.node(STAGE_MODULES["merge"], label, params, args, {}, {"dems": dems})
 
+    def _ceiling(self, label: str, merged: Handle, finest: float | None) -> Handle:
+        """How high the ground may be, also where it was not seen."""
+        params = self.config.ceiling.model_copy(update={} if finest is None else {"max_footprint": finest})
+        inputs: dict[str, Any] = {"merged": merged, "dems": list(self.products.world_dem.values())}
+        return self.graph.node(STAGE_MODULES["ceiling"], label, params, {}, {}, inputs)
+
     def _decide(self, stop: Stop, label: str) -> None:
         """The leg of a stop, by what is known there."""
-        assert stop.risk is not None
-        stop.leg = self._leg(label, stop.risk, self.pose, far=stop.far)
+        given = {"risk": stop.risk, "far": stop.far, "ceiling": stop.ceiling, "before": self.planned}
+        there = {name: handle for name, handle in given.items() if handle is not None}
+        stop.leg = self._leg(label, self.memory, {}, pose=self.pose, **there)
 
     def _located(self, legs: int) -> Handle:
         """The trajectory over so many legs, which is that of the drive from now on."""
@@ -299,15 +310,10 @@ class Drive(Reconstruction):
         like = self.products.world_dem[frame]
         self.pads = [self._node("pad", "pad", args, pose=self.pose, like=like)] if self.simulation.pad > 0 else []
 
-    def _leg(self, label: str, risk: Handle, pose: Handle, *, far: Handle | None = None, whole: bool = False) -> Handle:
-        memory = Memory() if whole else self.memory
+    def _leg(self, label: str, memory: Memory, more: dict[str, Any], **inputs: Handle) -> Handle:
         args: dict[str, Any] = {"goal": list(self.goal), "looks": memory.looks, **self.mounting}
         args |= {"closed": [list(p) for p in memory.closed], "stands": [list(p) for p in memory.stands]}
-        args["rig"] = self.sequence.rig.to_dict()
-        if whole:
-            return self._node("leg", label, args | {"whole": True}, risk=risk, pose=pose)
-        given = {"risk": risk, "far": far, "pose": pose, "before": self.planned}
-        return self._node("leg", label, args, **{name: handle for name, handle in given.items() if handle is not None})
+        return self._node("leg", label, args | {"rig": self.sequence.rig.to_dict()} | more, **inputs)
 
     def arena(self) -> Lattice:
         """The part of the world that is mapped."""
@@ -507,7 +513,9 @@ class Drive(Reconstruction):
             truth_dem = self._simulate(source, "truth_dem", scene=self.scene)
             p.dem_accuracy = self._node("dem_accuracy", "dem_accuracy/world", {}, dem=p.tiles, truth=truth_dem)
             p.truth_risk = self._risk("risk/truth", [truth_dem])
-            self.driven.truth_leg = self._leg("leg/truth", p.truth_risk, self.first_pose, whole=True)
+            self.driven.truth_leg = self._leg(
+                "leg/truth", Memory(), {"whole": True}, risk=p.truth_risk, pose=self.first_pose
+            )
             self._check()
 
         self.graph.expand([first], ground)

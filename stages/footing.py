@@ -2,8 +2,9 @@
 
 What is hazardous to a wheel was found in a window as large as the wheel, so it counts where the middle of a wheel is:
 the vehicle may pass a stone between its wheels, since what the belly cannot pass over (tilt, slope, rise, for the worst
-heading) is hazardous to its middle. Unknown ground may not be under the belly, and the middles of the wheels keep the
-margin from it as from a hazard: what is unknown is mostly what is hidden by a stone, or the stone itself.
+heading) is hazardous to its middle. Unknown ground may not be under the belly unless it is known to be low enough
+(:mod:`stages.straddle`), and the middles of the wheels keep the margin from it as from a hazard: what is unknown is
+mostly what is hidden by a stone, or the stone itself.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from stages.hazards import BITS
 from stages.lattice import Lattice
 from stages.path import WHEEL_BITS
 from stages.risk import CAUTION, DOUBT_BIT, HAZARDOUS, UNKNOWN
+from stages.straddle import Bounds, Straddle, clears, stands
 from stages.vehicle import Vehicle
 from stages.wheels import wheel_positions
 
@@ -62,7 +64,8 @@ class Footing:
     """A risk map as a vehicle meets it: ``fields`` (6, row, col) m to hazards to a wheel that are none by sigma alone,
     those that are, proven ones, and the same of hazards to the vehicle; ``unknown`` (row, col) m to unknown ground,
     ``frontier`` to that of it where a wheel has room: the rest is mostly the shadows of stones; ``caution`` (row, col)
-    its weight there; ``glanced`` (row, col) where unknown ground was seen, from afar; None: nowhere."""
+    its weight there; ``straddle``: what of unknown ground the belly may pass over; ``glanced`` (row, col) where unknown
+    ground was seen, from afar; None: nowhere."""
 
     lattice: Lattice
     vehicle: Vehicle
@@ -70,6 +73,7 @@ class Footing:
     unknown: Floats32
     frontier: Floats32
     caution: NDArray[np.uint8]
+    straddle: Straddle
     glanced: Mask | None = None
 
     @staticmethod
@@ -84,11 +88,12 @@ class Footing:
         unknown: Mask | None = None,
         glanced: Mask | None = None,
         doubted: Mask | None = None,
+        bounds: Bounds | None = None,
     ) -> Footing:
         """From classes and reason bits of :mod:`stages.risk`; without bits every hazard is one to a wheel.
 
         ``unknown``: where the vehicle may not stand for what is not known; None: the unknown class. ``glanced``: where
-        of it something is known nevertheless.
+        of it something is known nevertheless; ``bounds`` of the ground, by which the belly may pass over it.
 
         A hazard is proven where it is not one by sigma alone, and at least as probable as ``sure``. What is one by
         sigma alone and less probable than ``dare`` is caution ground :data:`DOUBT_WEIGHT` times, if it is not unknown.
@@ -108,13 +113,12 @@ class Footing:
         if doubted is not None:
             caution[(_distance(doubted, cell) <= 0.25 * vehicle.wheel_diameter) & ~unknown] = DOUBT_WEIGHT
         kinds = [(bits & which) > 0 for which in (WHEEL_BITS, BODY_BITS)]
-        fields = []
-        for kind in kinds:
-            fields += [_distance(mask & kind, cell) for mask in (likely, doubtful, proven)]
+        fields = np.stack([_distance(mask & kind, cell) for kind in kinds for mask in (likely, doubtful, proven)])
         wide = _opened(unknown, 0.5 * vehicle.wheel_diameter, cell)
-        return Footing(
-            lattice, vehicle, np.stack(fields), _distance(unknown, cell), _distance(wide, cell), caution, glanced
-        )
+        void = _distance(unknown if bounds is None else unknown & np.isnan(bounds.upper), cell)
+        straddle = Straddle.of(void, bounds, vehicle, _belly(vehicle), cell)
+        unseen, frontier = _distance(unknown, cell), _distance(wide, cell)
+        return Footing(lattice, vehicle, fields, unseen, frontier, caution, straddle, glanced)
 
     def gaps(self, x: Floats, y: Floats, heading: Floats) -> Gaps:
         """At poses: x, y of the middle (m) and heading (rad to the left of y), arrays of one shape."""
@@ -127,7 +131,7 @@ class Footing:
         reach = np.array([around + self.vehicle.margin, cell, self.vehicle.margin], np.float32)
         _gaps(
             at, np.cos(turn), np.sin(turn), wheel_positions(self.vehicle) / cell, _belly(self.vehicle) / cell,
-            self.fields, self.unknown, self.frontier, self.caution, reach, out,
+            self.fields, self.unknown, self.frontier, self.straddle, self.caution, reach, out,
         )  # fmt: skip
         out[3:5] -= NEAR_UNKNOWN * cell
         return Gaps(*(a.reshape(np.shape(x)) for a in out))
@@ -171,8 +175,9 @@ def _belly(vehicle: Vehicle) -> Floats:
 
 
 @njit(cache=True, nogil=True)
-def _gaps(at, cosine, sine, wheels, belly, fields, unknown, frontier, caution, reach, out):  # type: ignore[no-untyped-def]
+def _gaps(at, cosine, sine, wheels, belly, fields, unknown, frontier, straddle, caution, reach, out):  # type: ignore[no-untyped-def]
     rows, cols = unknown.shape
+    stand, heights = np.empty((4, 2), dtype=np.int64), np.empty(4)
     for n in range(at.shape[0]):
         row, col, c, s = at[n, 0], at[n, 1], cosine[n], sine[n]
         for k in range(6):
@@ -191,6 +196,7 @@ def _gaps(at, cosine, sine, wheels, belly, fields, unknown, frontier, caution, r
             if i < 0 or j < 0 or i >= rows or j >= cols:
                 outside = True
                 continue
+            stand[k, 0], stand[k, 1] = i, j
             gap, doubtful = min(gap, fields[0, i, j]), min(doubtful, fields[1, i, j])
             proven = min(proven, fields[2, i, j])
             share += caution[i, j]
@@ -201,9 +207,13 @@ def _gaps(at, cosine, sine, wheels, belly, fields, unknown, frontier, caution, r
         if spare > 0:
             out[3, n] = out[4, n] = spare + reach[1]
             continue
+        high = stands(straddle, stand, heights)
         for k in range(belly.shape[0]):
             a, b = belly[k, 0], belly[k, 1]
             i, j = math.floor(row - (a * s + b * c) + 0.5), math.floor(col + (a * c - b * s) + 0.5)
             i, j = min(max(i, 0), rows - 1), min(max(j, 0), cols - 1)
-            least, wide = min(least, unknown[i, j]), min(wide, frontier[i, j])
+            if high and straddle.void[i, j] > unknown[i, j] and clears(straddle, k, i, j, heights):
+                least = min(least, straddle.void[i, j])
+            else:
+                least, wide = min(least, unknown[i, j]), min(wide, frontier[i, j])
         out[3, n], out[4, n] = least, wide

@@ -20,6 +20,7 @@ from stages.lattice import Lattice
 from stages.leg_memory import Memory
 from stages.leg_params import LegParams
 from stages.leg_plan import Before, Leg, plan_leg, shortest
+from stages.straddle import Bounds
 from stages.vehicle import Vehicle
 from stages.verdict import HAZARDOUS, UNKNOWN, UNSEEN_BIT
 from stages.view import Stand, View
@@ -37,6 +38,7 @@ def next_leg(
     memory: Memory,
     view: View,
     before: Before | None = None,
+    bounds: Bounds | None = None,
 ) -> Leg:
     """The next leg on the hazards (:mod:`stages.risk`) of what was seen from near, and of all that was seen; None: that
     is the same. The other parameters are those of :func:`stages.leg_plan.plan_leg`."""
@@ -44,7 +46,7 @@ def next_leg(
     lattice, vehicle = Lattice.from_dict(near.meta["lattice"]), Vehicle.model_validate(near.meta["vehicle"])
     start, heading = (stand[0], stand[1]), stand[2]
     for sure in params.sure:
-        footing = Footing.of(classes, reason, lattice, vehicle, chance, sure, params.dare, **seen)
+        footing = Footing.of(classes, reason, lattice, vehicle, chance, sure, params.dare, bounds=bounds, **seen)
         found = plan_leg(
             footing, start, heading, goal, params, memory.looks, memory.closed, before, memory.stands, view
         )  # fmt: skip
@@ -82,7 +84,11 @@ def _run(params: LegParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     if "before" in inputs and len(inputs["before"]["rest_gear"]):
         before = np.asarray(inputs["before"]["rest"]), np.asarray(inputs["before"]["rest_gear"])
     view = View.of(Rig.from_dict(args["rig"]), T_vehicle_left)
-    found = next_leg(risk, inputs.get("far"), stand, goal, params, memory, view, before)
+    bounds = None
+    if "ceiling" in inputs:
+        high, low = (np.asarray(inputs["ceiling"][name]) for name in ("upper", "lower"))
+        bounds = Bounds(high, low)
+    found = next_leg(risk, inputs.get("far"), stand, goal, params, memory, view, before, bounds)
     best, margin = shortest_way(risk, stand, goal, params) if args.get("whole") else (None, None)
     meta = {
         "shortest_m": best,
@@ -125,10 +131,10 @@ def _length(path: NDArray[np.float64]) -> float:
 
 STAGE = Stage(
     name="leg",
-    version=9,
+    version=10,
     summary="the next leg of a drive to a goal, over ground that is known to be free",
     params=LegParams,
-    inputs=("risk", "far?", "pose", "before?"),
+    inputs=("risk", "far?", "ceiling?", "pose", "before?"),
     outputs=(
         Array(
             "path",

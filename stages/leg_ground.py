@@ -49,7 +49,8 @@ class Ground:
             min(most, float(a[0]) - self.cell)
             for most, a in ((margin, at.gap), (0.0, at.doubtful), (margin, at.proven))
         ]
-        self.unknown_here = min(0.0, float(at.unknown[0]) - self.cell)
+        # rounded to cells, places less than half a cell apart may be a diagonal apart
+        self.unknown_here = min(0.0, float(at.unknown[0]) - 1.5 * self.cell)
         spacing = max(p.spacing * self.vehicle.wheel_diameter, self.cell)
         self.grid = PoseGrid.over(footing.lattice, start, heading + aside, spacing)
         self._sure: list[Mask] = []

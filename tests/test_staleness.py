@@ -105,7 +105,7 @@ STALE: dict[str, set[str]] = {
     "tiling": TILES | MATCHED,  # as far as a plan can tell: that the same comes out is seen once it has
     "vehicle": RISK,
     # of a drive, which this chain is not
-    **{key: set() for key in ("drive", "global_fix", "leg", "pad", "reflex", "safety")},
+    **{key: set() for key in ("ceiling", "drive", "global_fix", "leg", "pad", "reflex", "safety")},
 }
 EXCEPTIONS: dict[str, set[str]] = {
     "select.preset": {"orientation"} | RIG | MOVED,  # navigation sets parameters of other stages, too

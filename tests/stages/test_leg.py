@@ -15,11 +15,13 @@ from stages.declare import Bundle
 from stages.errors import InputError
 from stages.footing import DOUBT_WEIGHT, PARTS, Footing
 from stages.leg import next_leg, seen_so_far, shortest_way
+from stages.leg_ground import Ground
 from stages.leg_memory import Memory
 from stages.leg_params import LegParams
 from stages.leg_plan import Leg, plan_leg, shortest
 from stages.risk import HAZARDOUS, REASONS, SAFE, UNKNOWN
 from stages.route import length_of, through
+from stages.straddle import Bounds
 from stages.view import Stand
 
 SEEN = P.model_copy(update={"blind": 0.0})
@@ -45,6 +47,24 @@ def test_unknown_ground_under_the_belly_alone_ends_the_leg_too() -> None:
     hole = (np.abs(X) < 0.016) & (np.abs(Y - 0.16) < 0.016)
     leg = plan_leg(ground((hole, UNKNOWN), (np.abs(X) > 0.06, HAZARDOUS)), START, 0.0, GOAL, P)
     assert leg.path[-1, 1] <= 0.145 - 0.5 * ROVER.wheel_base
+
+
+def test_over_a_hole_between_walls_it_goes_where_lines_of_sight_pass_low_enough() -> None:
+    hole = (np.abs(X) < 0.016) & (np.abs(Y - 0.16) < 0.016)
+    risk = np.where(np.abs(X) > 0.075, np.uint8(HAZARDOUS), np.where(hole, np.uint8(UNKNOWN), np.uint8(SAFE)))
+    meta = {"lattice": LATTICE.to_dict(), "vehicle": ROVER.model_dump(mode="json")}
+    chance = np.where(risk == HAZARDOUS, np.float32(1.0), np.float32(0.0))
+    chance[hole] = np.nan
+    maps = {"risk": risk, "reason": np.full(risk.shape, REASONS["step"], np.uint16), "p_hazard": chance}
+    seen = np.where(hole, np.nan, 0.0).astype(np.float32)
+
+    def driven(top: float) -> Leg:
+        bounds = Bounds(np.where(hole, np.float32(top), seen), seen)
+        return next_leg(Bundle(maps, meta), None, (*START, 0.0), GOAL, P, Memory(), CAMERAS, bounds=bounds)
+
+    over, before = driven(0.9 * ROVER.clearance), driven(1.1 * ROVER.clearance)
+    assert over.path[-1, 1] > 0.16
+    assert before.path[-1, 1] <= 0.145 - 0.5 * ROVER.wheel_base
 
 
 def test_a_stone_between_the_wheels_is_passed_over_and_a_gap_too_narrow_to_turn_in_is_driven_through() -> None:
@@ -343,6 +363,18 @@ def test_standing_beside_unknown_ground_it_may_leave_but_not_go_nearer() -> None
     assert leg.turn > 0
 
 
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2**31), st.floats(-3.2, 3.2), st.floats(-0.49, 0.49), st.floats(-0.49, 0.49))
+def test_where_it_stands_it_may_be_half_a_cell_farther_too(seed: int, heading: float, dx: float, dy: float) -> None:
+    rng = np.random.default_rng(seed)
+    risk = np.full(LATTICE.shape, SAFE, np.uint8)
+    row, col = (round(v) for v in LATTICE.index(START))
+    at = rng.integers(-8, 9, (6, 2)) + np.array([row, col])
+    risk[at[:, 0], at[:, 1]] = UNKNOWN
+    there = Ground(Footing.of(risk, None, LATTICE, ROVER), START, heading, P)
+    assert there.clear(*(np.array([v]) for v in (dx * LATTICE.cell, dy * LATTICE.cell, heading)))
+
+
 def test_hazards_to_the_whole_vehicle_count_at_its_middle_alone() -> None:
     risk = np.full(LATTICE.shape, SAFE, np.uint8)
     reason = np.zeros(LATTICE.shape, np.uint16)
@@ -388,7 +420,7 @@ def test_the_shortest_way_over_free_ground_is_little_longer_than_the_beeline(x: 
 
 
 def test_what_lies_nearer_than_its_view_is_looked_at_from_farther_back() -> None:
-    band, walls = np.abs(Y - 0.10) < 0.02, np.abs(X) > 0.1
+    band, walls = np.abs(Y - 0.10) < 0.025, np.abs(X) > 0.1
     before = ground((band, UNKNOWN), (walls, HAZARDOUS))
     leg = plan_leg(before, START, 0.0, GOAL, P, view=CAMERAS)
     assert leg.verdict == "look"
