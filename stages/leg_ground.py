@@ -73,6 +73,12 @@ class Ground:
         """Where it stands: ground there that is no worse than that under it will do."""
         return np.asarray(np.hypot(x - self.start[0], y - self.start[1]) <= 0.3 * self.vehicle.wheel_base)
 
+    def _far(self, x: Floats, y: Floats) -> Mask:
+        """So far that it will be seen from nearer, where most doubts go: it is not dearer for them than if nothing were
+        known."""
+        reach = 2.0 * self.p.blind * self.vehicle.wheel_base
+        return np.asarray(np.hypot(x - self.start[0], y - self.start[1]) > reach)
+
     def _seen(self, gaps: Gaps, near: Mask) -> Mask:
         return np.asarray(gaps.unknown > np.where(near, self.unknown_here, 0.0))
 
@@ -92,7 +98,10 @@ class Ground:
         unknown = np.where(blind, np.maximum(self.p.blind_price, unseen), unseen)
         stays = (gaps.gap <= self.vehicle.margin) | ((gaps.unknown <= 0) & (gaps.frontier > 0))
         unknown = np.where(stays, np.maximum(self.p.doubt_price, unknown), unknown)
-        price = np.where(known, 1.0, unknown) + self.p.caution_price * gaps.caution
+        caution = self.p.caution_price * gaps.caution
+        fades = self._far(x, y) & ~stays
+        caution = np.where(fades, np.minimum(caution, self.p.unknown_price - 1.0), caution)
+        price = np.where(known, 1.0, unknown) + caution
         if self.vehicle.margin > 0:
             beside = np.minimum(gaps.gap / self.vehicle.margin - 1.0, gaps.doubtful / self.vehicle.margin)
             price = price + self.p.near_price * np.clip(1.0 - beside, 0.0, 1.0)

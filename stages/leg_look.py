@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.leg_ground import Ground
-from stages.route import Piece, length_of
+from stages.route import Piece, length_of, room_to_turn
 from stages.view import Stand, View, bearing, looked
 
 Floats = NDArray[np.float64]
@@ -68,13 +68,15 @@ class Target:
         return next((t for t in sorted(found, key=abs) if self.shows((*at, heading + t), looks)), None)
 
     def last_view(self, leg: Sequence[Piece], bound: float) -> tuple[float, float] | None:
-        """Metres of a leg after which it is last in view, and the turn (rad) for that, off the present heading by a
-        bound (rad) at most; None: nowhere on it."""
-        heading = self.ground.heading
-        for done, piece, share in _backward(leg, 2.0 * self.ground.cell):
+        """Metres of a leg after which it is last in view, and the turn (rad) for that, with all headings of the leg
+        within a bound (rad) of each other; None: nowhere on it."""
+        headings = np.array([self.ground.heading, *(piece.heading for piece in leg)])
+        low, high = np.minimum.accumulate(headings), np.maximum.accumulate(headings)
+        for done, k, share in _backward(leg, 2.0 * self.ground.cell):
+            piece = leg[k]
             at = tuple(a + share * (b - a) for a, b in zip(piece.a, piece.b, strict=True))
-            turned = piece.heading - heading
-            turn = self.turn((at[0], at[1]), piece.heading, bound + turned, bound - turned)
+            room = room_to_turn(float(low[k + 1]), float(high[k + 1]), piece.heading, bound)
+            turn = self.turn((at[0], at[1]), piece.heading, *room)
             if turn is not None:
                 return done, turn
         return None
@@ -105,10 +107,10 @@ def free_back(ground: Ground, most: float) -> list[Piece]:
     return [Piece(ground.start, end, ground.heading, -1) for end in ends[1:]]
 
 
-def _backward(leg: Sequence[Piece], step: float) -> Iterator[tuple[float, Piece, float]]:
-    """Places of a leg from its end on: metres from its beginning, the piece and the share of it."""
+def _backward(leg: Sequence[Piece], step: float) -> Iterator[tuple[float, int, float]]:
+    """Places of a leg from its end on: metres from its beginning, number of the piece and the share of it."""
     done = length_of(leg)
-    for piece in reversed(leg):
+    for k, piece in reversed(list(enumerate(leg))):
         done -= piece.length
         for share in np.linspace(1.0, 0.0, max(2, 1 + math.ceil(piece.length / step))).tolist():
-            yield done + share * piece.length, piece, share
+            yield done + share * piece.length, k, share

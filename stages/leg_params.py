@@ -16,7 +16,7 @@ class LegParams(Params):
         40.0,
         gt=5,
         le=120,
-        description="degrees that a leg turns off its first heading: landmarks must stay in view, half of it at least",
+        description="degrees between any two headings of a leg: landmarks must stay in view, half of it at least",
     )
     sure: tuple[float, float] = Field(
         (0.9, 0.995),

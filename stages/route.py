@@ -133,16 +133,22 @@ def last_metres(way: Sequence[Piece], length: float) -> list[Piece]:
 
 
 def within_turn(way: Sequence[Piece], heading: float, bound: float) -> tuple[list[Piece], float]:
-    """The way as far as its headings stay within a bound (rad) about the present one; and the turn (rad) at its end
-    towards where it goes on, as far as that stays within the bound too."""
-    out, now = list[Piece](), heading
+    """The way as far as all its headings, the present one too, lie within a bound (rad) of each other; and the turn
+    (rad) at its end towards where it goes on, as far as that keeps to the bound too."""
+    out, low, high, now = list[Piece](), heading, heading, heading
     for piece in way:
-        if abs(piece.heading - heading) > bound + 1e-9:
-            side = math.copysign(1.0, piece.heading - now)
-            return out, side * min(abs(piece.heading - now), bound - side * (now - heading))
-        now = piece.heading
+        if max(high, piece.heading) - min(low, piece.heading) > bound + 1e-9:
+            right, left = room_to_turn(low, high, now, bound)
+            return out, max(-right, min(left, piece.heading - now))
+        low, high, now = min(low, piece.heading), max(high, piece.heading), piece.heading
         out.append(piece)
     return out, 0.0
+
+
+def room_to_turn(low: float, high: float, now: float, bound: float) -> tuple[float, float]:
+    """How far (rad) one may turn to the right and to the left so that all headings, from low to high so far, lie within
+    a bound of each other."""
+    return max(0.0, now - high + bound), max(0.0, low - now + bound)
 
 
 def length_of(way: Sequence[Piece]) -> float:

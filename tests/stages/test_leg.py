@@ -22,7 +22,8 @@ from stages.leg_plan import Leg, plan_leg, shortest
 from stages.risk import HAZARDOUS, REASONS, SAFE, UNKNOWN
 from stages.route import length_of, through
 from stages.straddle import Bounds
-from stages.view import Stand
+from stages.view import AHEAD as ANYWHERE
+from stages.view import Stand, View
 
 SEEN = P.model_copy(update={"blind": 0.0})
 """Without the rule for what is near, which on this small map is half of it."""
@@ -165,15 +166,17 @@ def test_it_looks_around_then_closes_what_stays_unknown_and_goes_another_way() -
 
 
 @settings(max_examples=25, deadline=None)
-@given(st.integers(0, 2**31), st.floats(-math.pi, math.pi))
-def test_no_leg_comes_near_a_hazard_or_onto_unknown_ground(seed: int, heading: float) -> None:
+@given(st.integers(0, 2**31), st.floats(-math.pi, math.pi), st.sampled_from([ANYWHERE, CAMERAS]))
+def test_no_leg_comes_near_a_hazard_or_onto_unknown_ground_or_turns_too_far(
+    seed: int, heading: float, view: View
+) -> None:
     rng = np.random.default_rng(seed)
     risk = np.full(LATTICE.shape, SAFE, np.uint8)
     for _ in range(12):
         x, y, r = rng.uniform(-0.4, 0.4), rng.uniform(-0.15, 0.9), rng.uniform(0.01, 0.04)
         risk[np.hypot(X - x, Y - y) < r] = rng.choice([HAZARDOUS, UNKNOWN])
     risk[np.hypot(X, Y) < 0.1] = SAFE
-    leg = plan_leg(Footing.of(risk, None, LATTICE, ROVER), START, heading, GOAL, P)
+    leg = plan_leg(Footing.of(risk, None, LATTICE, ROVER), START, heading, GOAL, P, view=view)
     wheels = np.array([(a, b) for a in (-0.04, 0.04) for b in (-0.05, 0.05)])
     poses = list[tuple[np.ndarray, float]]()
     for a, b, gear in zip(leg.path, leg.path[1:], leg.gear, strict=False):
@@ -185,6 +188,7 @@ def test_no_leg_comes_near_a_hazard_or_onto_unknown_ground(seed: int, heading: f
         heading = towards
     end = leg.path[-1] if len(leg.path) else np.array(START)
     poses += [(end, heading + leg.turn * t) for t in np.linspace(0, 1, 20)]
+    assert np.ptp(np.unwrap([h for _, h in poses])) <= math.radians(P.max_turn_deg) + 1e-6
     for (x, y), h in poses:
         c, s = math.cos(h), math.sin(h)
         at = wheels @ np.array([[c, s], [-s, c]]) + (x, y)
@@ -278,6 +282,19 @@ def test_the_shortest_way_keeps_the_margin_where_one_can(half: float, margin: fl
     length, kept = shortest_way(judged(walls, 1.0), (*START, 0.0), GOAL, P)
     assert kept == margin
     assert (length is None) == (margin is None)
+
+
+def test_doubtful_ground_is_dear_where_it_will_not_be_seen_from_nearer() -> None:
+    free, way = np.full(LATTICE.shape, SAFE, np.uint8), through(np.array([START, GOAL]), AHEAD[:1], 0.0)
+
+    def cost(y: float, kind: int) -> float:
+        band = np.abs(Y - y) < 0.03
+        risk = np.where(band, np.uint8(kind), free)
+        footing = Footing.of(risk, None, LATTICE, ROVER, doubted=band if kind == SAFE else None)
+        return Ground(footing, START, 0.0, P).again(way)[1]
+
+    assert cost(0.2, SAFE) > 1.05 * cost(0.5, SAFE)
+    assert 0.85 < cost(0.5, SAFE) <= cost(0.5, UNKNOWN)
 
 
 def test_what_is_likely_a_hazard_is_gone_round_farther_than_what_is_unknown() -> None:

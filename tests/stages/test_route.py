@@ -73,13 +73,16 @@ def test_the_first_metres_and_the_first_turns() -> None:
     assert length_of(part) == pytest.approx(0.15)
     assert part[-1].b == pytest.approx((0.05, 0.1))
     assert within_turn(STAIRS, 0.0, 1.0) == (STAIRS[:1], pytest.approx(-1.0))
-    assert within_turn(STAIRS, 0.0, 1.6) == (STAIRS, 0.0)  # off the first heading: turns to and fro do not add up
-    assert within_turn(STAIRS, -0.8, 0.8) == (STAIRS, 0.0)
+    assert within_turn(STAIRS, 0.0, 1.6) == (STAIRS, 0.0)  # turns to and fro do not add up
+    assert within_turn(STAIRS, -0.8, 1.6) == (STAIRS, 0.0)
+    # but what was turned to one side is lost on the other
+    assert within_turn(STAIRS, -0.8, 0.9) == (STAIRS[:1], pytest.approx(-0.9))
+    assert within_turn(STAIRS, 0.5, 1.6) == (STAIRS[:1], pytest.approx(-1.1))
     assert within_turn(STAIRS[1:], -0.8, 0.3) == ([], pytest.approx(-0.3))
     # a turn at the end of a leg goes on from the heading there, and no farther than the next piece asks for
     bent = [Piece((0.0, 0.0), (0.0, 0.1), -0.6, 1), Piece((0.0, 0.1), (0.1, 0.1), -0.8, 1)]
     assert within_turn(bent, 0.0, 0.7) == (bent[:1], pytest.approx(-0.1))
-    assert within_turn([bent[0], replace(bent[1], heading=0.9)], 0.0, 0.7) == (bent[:1], pytest.approx(1.3))
+    assert within_turn([bent[0], replace(bent[1], heading=0.9)], 0.0, 0.7) == (bent[:1], pytest.approx(0.7))
     assert within_turn([bent[0], replace(bent[1], heading=-1.1)], -0.6, 0.4) == (bent[:1], pytest.approx(-0.4))
     # a turn that is counted on past half a turn keeps its direction
     around = [Piece((0.0, 0.0), (0.0, 0.1), 1.2 * math.pi, 1)]
