@@ -207,12 +207,12 @@ def _gaps(at, cosine, sine, wheels, belly, fields, unknown, frontier, straddle, 
         if spare > 0:
             out[3, n] = out[4, n] = spare + reach[1]
             continue
-        high = stands(straddle, stand, heights)
+        steady = stands(straddle, stand, heights)
         for k in range(belly.shape[0]):
             a, b = belly[k, 0], belly[k, 1]
             i, j = math.floor(row - (a * s + b * c) + 0.5), math.floor(col + (a * c - b * s) + 0.5)
             i, j = min(max(i, 0), rows - 1), min(max(j, 0), cols - 1)
-            if high and straddle.void[i, j] > unknown[i, j] and clears(straddle, k, i, j, heights):
+            if steady and straddle.void[i, j] > unknown[i, j] and clears(straddle, k, i, j, heights):
                 least = min(least, straddle.void[i, j])
             else:
                 least, wide = min(least, unknown[i, j]), min(wide, frontier[i, j])

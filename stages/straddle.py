@@ -25,7 +25,6 @@ from stages.wheels import wheel_positions
 
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
