@@ -84,10 +84,9 @@ def _run(params: LegParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     if "before" in inputs and len(inputs["before"]["rest_gear"]):
         before = np.asarray(inputs["before"]["rest"]), np.asarray(inputs["before"]["rest_gear"])
     view = View.of(Rig.from_dict(args["rig"]), T_vehicle_left)
-    bounds = None
-    if "ceiling" in inputs:
-        high, low = (np.asarray(inputs["ceiling"][name]) for name in ("upper", "lower"))
-        bounds = Bounds(high, low)
+    ceiling, bounds = inputs.get("ceiling"), None
+    if ceiling is not None:
+        bounds = Bounds(upper=np.asarray(ceiling["upper"]), lower=np.asarray(ceiling["lower"]))
     found = next_leg(risk, inputs.get("far"), stand, goal, params, memory, view, before, bounds)
     best, margin = shortest_way(risk, stand, goal, params) if args.get("whole") else (None, None)
     meta = {

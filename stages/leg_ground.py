@@ -71,13 +71,16 @@ class Ground:
 
     def _near(self, x: Floats, y: Floats) -> Mask:
         """Where it stands: ground there that is no worse than that under it will do."""
-        return np.asarray(np.hypot(x - self.start[0], y - self.start[1]) <= 0.3 * self.vehicle.wheel_base)
+        return np.asarray(self._away(x, y) <= 0.3 * self.vehicle.wheel_base)
 
     def _far(self, x: Floats, y: Floats) -> Mask:
         """So far that it will be seen from nearer, where most doubts go: it is not dearer for them than if nothing were
         known."""
-        reach = 2.0 * self.p.blind * self.vehicle.wheel_base
-        return np.asarray(np.hypot(x - self.start[0], y - self.start[1]) > reach)
+        return np.asarray(self._away(x, y) > 2.0 * self.p.blind * self.vehicle.wheel_base)
+
+    def _away(self, x: Floats, y: Floats) -> Floats:
+        """Metres from where it stands."""
+        return np.asarray(np.hypot(x - self.start[0], y - self.start[1]))
 
     def _seen(self, gaps: Gaps, near: Mask) -> Mask:
         return np.asarray(gaps.unknown > np.where(near, self.unknown_here, 0.0))
@@ -91,7 +94,7 @@ class Ground:
         """Poses that may be driven, and the price of a metre, infinite where none may be planned."""
         known, opened = self._split(gaps, x, y, slack)
         reach = self.p.blind * self.vehicle.wheel_base * np.where(gaps.unknown > 0, 2.0, 1.0)
-        blind = np.hypot(x - self.start[0], y - self.start[1]) <= reach
+        blind = self._away(x, y) <= reach
         unseen = np.full(x.shape, self.p.unknown_price)
         if self.footing.glanced is not None:
             unseen[~self._at(~self.footing.glanced, x, y)] = min(self.p.glance_price, self.p.unknown_price)
