@@ -196,8 +196,9 @@ def _reconstruct(options: Options) -> int:
             shutil.rmtree(opened.folder)
             warn_of_results(opened.graph)
             cached = result.total().cached
+            arrived = _outcome(opened)
             print(f"{earlier.parent / earlier.readlink()}  cached {cached}, nothing new: that run stands")
-            return _posed_all(opened.products)
+            return max(arrived, _posed_all(opened.products))
         _write(opened, result, ahead)
     if result.ok:
         from pipeline import standing
@@ -205,13 +206,11 @@ def _reconstruct(options: Options) -> int:
         standing.seal(opened.folder, stamped)
     _point_latest(opened.folder)
     warn_of_results(opened.graph)
-    if driven:
-        outcome, stops = opened.flow.outcome(), opened.flow.driven.stops
-        print(f"{': '.join(word for word in outcome if word)}  ({len(stops)} stops)")
+    arrived = _outcome(opened)
     total = result.total()
     print(f"{opened.folder}  computed {total.computed}, cached {total.cached}, missing {total.failed + total.skipped}")
     if result.ok:
-        return _posed_all(opened.products)
+        return max(arrived, _posed_all(opened.products))
     _list_missing(opened.graph, opened.folder)
     return HOLES
 
@@ -291,6 +290,15 @@ def lay_out(sequence: Sequence, config: Any, frames: tuple[int, ...]) -> Graph:
     graph = Graph()
     dataflow(graph, sequence, config, frames).build()
     return graph
+
+
+def _outcome(opened: _Opened) -> int:
+    """Say how a drive ended; the exit code, which is that of a run with holes where it did not reach its goal."""
+    if opened.sequence.simulation is None:
+        return COMPLETE
+    outcome, stops = opened.flow.outcome(), opened.flow.driven.stops
+    print(f"{': '.join(word for word in outcome if word)}  ({len(stops)} stops)")
+    return COMPLETE if outcome[0] == "goal" else HOLES
 
 
 def _posed_all(products: Products) -> int:

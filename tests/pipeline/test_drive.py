@@ -115,6 +115,8 @@ def test_the_report_shows_the_drive(
     given: dict[str, Any] = {"runs": tmp_path, "cache": store, "executor": "inline", "progress": "quiet"}
     assert run.reconstruct(run.Options("mockup-loop", assignments=SMALL, verb="drive", **given)) == 0
     assert capsys.readouterr().out.startswith("goal: ")
+    assert run.reconstruct(run.Options("mockup-loop", assignments=SMALL, verb="drive", **given)) == 0
+    assert capsys.readouterr().out.startswith("goal: "), "nothing computed, the same answer"
     folder = tmp_path / "mockup-loop" / "latest"
     facts = json.loads((folder / "report.json").read_text())
     assert facts["complete"], facts["missing"]
@@ -182,8 +184,10 @@ def test_slip_of_thirty_per_cent_stops_says_so_and_keeps_all(
     assert "by the wheels" in reason
     assert flow.driven.check is not None
     given: dict[str, Any] = {"runs": tmp_path, "cache": store, "executor": "inline", "progress": "quiet"}
-    run.reconstruct(run.Options("mockup-loop", assignments=(*SMALL, *slips), verb="drive", **given))
-    assert capsys.readouterr().out.startswith("safety stop: slip of ")
+    for _ in range(2):  # the second time nothing is computed, and the run before stands
+        code = run.reconstruct(run.Options("mockup-loop", assignments=(*SMALL, *slips), verb="drive", **given))
+        assert code == run.HOLES
+        assert capsys.readouterr().out.startswith("safety stop: slip of ")
     lines = (tmp_path / "mockup-loop" / "latest" / "trajectory.tum").read_text().splitlines()
     assert len(lines) == 1 + len(flow.posed) > 2, "the way to where it stopped, too"
 
