@@ -313,7 +313,7 @@ class Drive(Reconstruction):
     def _leg(self, label: str, memory: Memory, more: dict[str, Any], **inputs: Handle) -> Handle:
         args: dict[str, Any] = {"goal": list(self.goal), "looks": memory.looks, **self.mounting}
         args |= {"closed": [list(p) for p in memory.closed], "stands": [list(p) for p in memory.stands]}
-        return self._node("leg", label, args | {"rig": self.sequence.rig.to_dict()} | more, **inputs)
+        return self._node("leg", label, args | more, rig=self.calibration[0], **inputs)
 
     def arena(self) -> Lattice:
         """The part of the world that is mapped."""

@@ -83,7 +83,7 @@ def _run(params: LegParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     before = None
     if "before" in inputs and len(inputs["before"]["rest_gear"]):
         before = np.asarray(inputs["before"]["rest"]), np.asarray(inputs["before"]["rest_gear"])
-    view = View.of(Rig.from_dict(args["rig"]), T_vehicle_left)
+    view = View.of(Rig.from_dict(inputs["rig"].meta["rig"]), T_vehicle_left)
     ceiling, bounds = inputs.get("ceiling"), None
     if ceiling is not None:
         bounds = Bounds(upper=np.asarray(ceiling["upper"]), lower=np.asarray(ceiling["lower"]))
@@ -133,7 +133,7 @@ STAGE = Stage(
     version=10,
     summary="the next leg of a drive to a goal, over ground that is known to be free",
     params=LegParams,
-    inputs=("risk", "far?", "ceiling?", "pose", "before?"),
+    inputs=("risk", "far?", "ceiling?", "pose", "rig", "before?"),
     outputs=(
         Array(
             "path",
