@@ -76,6 +76,22 @@ def test_it_arrives_and_knows_where_it_is(arrived: tuple[Drive, Result], store: 
 
 
 @pytest.mark.slow
+def test_a_rig_that_is_given_off_by_degrees_is_repaired_at_the_first_stop(store: Path) -> None:
+    flow, result = drive(store, "mockup.rig_error_deg=[2.0,2.0,2.0]")
+    assert result.failures == []
+    assert flow.outcome()[0] == "goal", flow.outcome()
+    rigs = [handle for handle in flow.graph.nodes if handle.stage == "rig"]
+    assert len(rigs) == 1
+    assert rigs[0].ref is not None
+    assert "too low" in " ".join(rigs[0].ref.meta["warnings"])
+    assert flow.driven.check is not None
+    assert flow.driven.check.ref is not None
+    metrics = Store(store).open(flow.driven.check.ref).meta["metrics"]
+    assert [metrics[f"{name}_violations"]["value"] for name in ("clearance", "tilt", "step")] == [0, 0, 0]
+    assert metrics["localisation_error"]["value"] < 0.006
+
+
+@pytest.mark.slow
 def test_driven_again_nothing_is_computed_and_all_is_the_same(arrived: tuple[Drive, Result], store: Path) -> None:
     flow, result = drive(store)
     assert result.total().computed == 0
