@@ -16,7 +16,8 @@ import math
 from pathlib import Path
 from typing import Any
 
-from loop import COVERS, LONGEST, choose_goal, config_of, prepared, wilson
+from driving.beds import COVERS, choose_goal, config_of, prepared
+from driving.ratios import HEADINGS, Ratios
 
 FARTHEST = 0.035
 """m that a pixel covers on the ground where the loop's own models end: most of theirs do between 0.03 and 0.045."""
@@ -35,7 +36,7 @@ def arguments() -> argparse.Namespace:
 def drive(sequence: Any, config: Any, goal: tuple[float, float]) -> dict[str, Any]:
     """One drive on exact elevations; figures of it."""
     import numpy as np
-    from exact_bed import ExactBed, place_of
+    from driving.exact_bed import ExactBed, place_of
 
     from stages.ceiling import ceiling
     from stages.declare import Bundle
@@ -87,18 +88,13 @@ def after(leg: Any, heading: float) -> tuple[tuple[float, float], float]:
 
 def table(rows: list[dict[str, Any]]) -> list[str]:
     """The drives by rock cover."""
-    lines = [
-        f"| rock cover | drives | reached | way / shortest: together | median | worst | at most {LONGEST:g} |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    for cover in sorted({r["cover"] for r in rows}):
-        mine = [r for r in rows if r["cover"] == cover and r["shortest_way"]]
+    lines = [f"| rock cover | drives | reached | {' | '.join(HEADINGS)} |", "|---" * (3 + len(HEADINGS)) + "|"]
+    for cover in [*sorted({r["cover"] for r in rows}), None]:
+        mine = [r for r in rows if cover in (None, r["cover"]) and r["shortest_way"]]
         reached = [r for r in mine if r["verdict"] == "goal"]
-        ratio = sorted(r["way"] / r["shortest_way"] for r in reached)
-        together = sum(r["way"] for r in reached) / sum(r["shortest_way"] for r in reached)
-        cells = [f"{100 * cover:.0f} %", str(len(mine)), str(len(reached)), f"{together:.2f}"]
-        cells += [f"{ratio[len(ratio) // 2]:.2f}", f"{ratio[-1]:.2f}"]
-        lines.append(f"| {' | '.join(cells)} | {wilson(sum(r <= LONGEST for r in ratio), len(ratio))} |")
+        cells = ["all" if cover is None else f"{100 * cover:.0f} %", str(len(mine)), str(len(reached))]
+        cells += Ratios([(r["way"], r["shortest_way"]) for r in reached]).cells()
+        lines.append(f"| {' | '.join(cells)} |")
     return lines
 
 

@@ -30,21 +30,19 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import sys
 from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from driving.ratios import HEADINGS, Ratios, wilson
 from matching import say, start_process, table
 
 SLOPES = (0.0, 5.0, 10.0, -5.0)
 EDGES = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99, 1.0)
 COUNTS = ("all", "observed", "truly hazardous", "safe", "caution", "false safe", "enterable hazard", "false hazard")
 PLANNED = ("rille", "perfect DEM")
-LONGEST = 1.15
-"""Of a path over the shortest one."""
 GOALS = {"false safe": 0.002, "false hazard": 0.05}
 
 
@@ -58,15 +56,6 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--json", type=Path, help="write all figures there, by scene")
     parser.add_argument("--picture", type=Path, help="draw the curve of p_hazard there, e.g. docs/hazards.png")
     return parser.parse_args()
-
-
-def wilson(hits: float, n: float, z: float = 1.96) -> tuple[float, float]:
-    """Wilson's interval of a share of ``n`` independent trials."""
-    if n <= 0:
-        return math.nan, math.nan
-    p = hits / n
-    middle, half = p + z * z / (2 * n), z * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
-    return max(0.0, (middle - half) / (1 + z * z / n)), (middle + half) / (1 + z * z / n)
 
 
 def judge(scene: Any, exact: Any, found: Any) -> dict[str, Any]:
@@ -155,21 +144,19 @@ def show(scenes: list[dict[str, Any]], covers: list[float]) -> None:
 
 def show_paths(scenes: list[dict[str, Any]], covers: list[float]) -> None:
     """Length of paths over the shortest."""
-    headings = ["cover", "map", "scenes", "path", "of rows", "length, m", "over the shortest: median", "greatest",
-                f"at most {LONGEST:g}", "hazardous of crossed cells, %"]  # fmt: skip
+    headings = ["cover", "map", "scenes", "path", "of rows", "length, m", *HEADINGS, "hazardous of crossed cells, %"]
     rows = []
     for cover in [*covers, None]:
         mine = [s for s in scenes if cover is None or s["cover"] == cover]
         for way in PLANNED:
             found = [s["paths"][way] for s in mine if s["paths"][way]["path_length"] is not None]
-            ratio = sorted(p["length_ratio"] for p in found if p["length_ratio"] is not None)
+            best = [p for p in found if p["length_ratio"] is not None]
+            ratios = Ratios([(p["length_ratio"] * p["shortest_length"], p["shortest_length"]) for p in best])
             crossed = sum(p["crossed_cells"] for p in found)
             rows.append(
                 ["all" if cover is None else f"{100 * cover:.0f} %", way, len(mine), len(found),
                  sum(p["planner"] == "rows" for p in found), sum(p["path_length"] for p in found),
-                 *((ratio[len(ratio) // 2], ratio[-1]) if ratio else ("-", "-")),
-                 f"{sum(r <= LONGEST for r in ratio)} of {len(ratio)}",
-                 100 * sum(p["hazard_cells"] for p in found) / max(crossed, 1)]
+                 *ratios.cells(), 100 * sum(p["hazard_cells"] for p in found) / max(crossed, 1)]
             )  # fmt: skip
     table("Paths against the shortest on the exact map", headings, rows)
 
