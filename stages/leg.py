@@ -44,12 +44,9 @@ def next_leg(
     is the same. The other parameters are those of :func:`stages.leg_plan.plan_leg`."""
     (classes, reason, chance), seen = seen_so_far(near, far, params)
     lattice, vehicle = Lattice.from_dict(near.meta["lattice"]), Vehicle.model_validate(near.meta["vehicle"])
-    start, heading = (stand[0], stand[1]), stand[2]
     for sure in params.sure:
         footing = Footing.of(classes, reason, lattice, vehicle, chance, sure, params.dare, bounds=bounds, **seen)
-        found = plan_leg(
-            footing, start, heading, goal, params, memory.looks, memory.closed, before, memory.stands, view
-        )  # fmt: skip
+        found = plan_leg(footing, stand, goal, params, memory, before, view)
         if found.verdict == "goal" or len(found.way) > 1:
             break
     return found
@@ -64,7 +61,7 @@ def shortest_way(risk: Bundle, stand: Stand, goal: Point, params: LegParams) -> 
     for margin in (vehicle.margin, 0.0):
         bare = vehicle.model_copy(update={"margin": margin})
         allowed = Footing.of(classes, reason, lattice, bare, chance, params.sure[-1], params.dare)
-        best = shortest(allowed, (stand[0], stand[1]), stand[2], goal, params)
+        best = shortest(allowed, stand, goal, params)
         if best is not None:
             return best, margin
     return None, None

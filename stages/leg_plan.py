@@ -30,6 +30,7 @@ from stages.footing import Footing
 from stages.lattice import Lattice
 from stages.leg_ground import Ground
 from stages.leg_look import ROUND, TWICE, Target
+from stages.leg_memory import Memory
 from stages.leg_params import LegParams
 from stages.route import (
     Piece,
@@ -81,14 +82,11 @@ class Leg:
 
 def plan_leg(
     footing: Footing,
-    start: Point,
-    heading: float,
+    stand: Stand,
     goal: Point,
     params: LegParams,
-    looks: int = 0,
-    closed: Sequence[Point] = (),
+    memory: Memory | None = None,
     before: Before | None = None,
-    stands: Sequence[Stand] = (),
     view: View = AHEAD,
 ) -> Leg:
     """The next leg.
@@ -96,12 +94,11 @@ def plan_leg(
     Parameters
     ----------
     footing : of the map known so far.
-    start, heading : m; rad to the left of y.
-    looks : looks around since the last leg that was driven.
-    closed : places about which unknown ground was looked at in vain.
+    stand : where the vehicle is.
+    goal : m.
+    memory : what it has looked at before; None: nothing.
     before : what was left, after the last leg, of the way planned then: (vertex, 2) m, (piece,) gear. It is kept unless
         another one is better by ``loyalty``; None: there is none.
-    stands : from where it has looked before.
     view : the ground that its cameras see.
 
     Raises
@@ -109,6 +106,8 @@ def plan_leg(
     InputError
         Start or goal lies outside the map.
     """
+    start, heading, memory = (stand[0], stand[1]), stand[2], memory or Memory()
+    looks = memory.looks
     for name, point in (("start", start), ("goal", goal)):
         _check(footing.lattice, name, point)
     base = footing.vehicle.wheel_base
@@ -116,7 +115,7 @@ def plan_leg(
     if left <= params.tolerance * base:
         nothing = np.full(footing.lattice.shape, np.nan, np.float32)
         return _stay("goal", f"{1000 * left:.0f} mm from the goal", start, [], nothing)
-    ground = Ground(footing, start, heading, params, closed)
+    ground = Ground(footing, start, heading, params, memory.closed)
     goals, cost, move = ground.search(goal, 0.5 * params.tolerance * base)
     shown, least = ground.on_map(cost), ground.from_start(cost)
     kept, price = list[Piece](), math.inf
@@ -137,7 +136,7 @@ def plan_leg(
     way = kept if kept and price <= (1.0 + params.loyalty) * least else ground.way(move)
     plan = _plain(ground, way)
     first = _sure(plan)
-    target = Target.of(ground, plan, first, view, stands) if first < len(plan) else None
+    target = Target.of(ground, plan, first, view, memory.stands) if first < len(plan) else None
     onwards = _onwards(ground, way, plan, shown, target, looks)
     if onwards is None:
         assert target is not None, "what is known to the goal can be driven"
@@ -251,9 +250,10 @@ def _free_turn(ground: Ground, looks: int) -> float:
     return 0.0
 
 
-def shortest(footing: Footing, start: Point, heading: float, goal: Point, params: LegParams) -> float | None:
+def shortest(footing: Footing, stand: Stand, goal: Point, params: LegParams) -> float | None:
     """Length, m, of the shortest way over known ground, at no price but its length; None: none."""
     free = {"unknown_price": math.inf, "near_price": 0.0, "caution_price": 0.0, "turn_price": 0.0, "back_price": 1.0}
+    start, heading = (stand[0], stand[1]), stand[2]
     ground = Ground(footing, start, heading, params.model_copy(update=free))
     _, cost, move = ground.search(goal, 0.5 * params.tolerance * footing.vehicle.wheel_base)
     if not np.isfinite(ground.from_start(cost)):

@@ -19,6 +19,7 @@ ROVER = Vehicle(
 )
 LATTICE = Lattice.snap((-0.4, 0.4, -0.2, 1.0), 0.01)
 START, GOAL = (0.0, 0.0), (0.0, 0.8)
+AT = (*START, 0.0)
 X, Y = LATTICE.xy()[..., 0], LATTICE.xy()[..., 1]
 P = LegParams()
 

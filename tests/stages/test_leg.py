@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from leg_scenes import CAMERAS, GOAL, LATTICE, ROVER, START, P, X, Y, ground
+from leg_scenes import AT, CAMERAS, GOAL, LATTICE, ROVER, START, P, X, Y, ground
 
 from stages.declare import Bundle
 from stages.errors import InputError
@@ -27,10 +27,12 @@ from stages.view import Stand, View
 
 SEEN = P.model_copy(update={"blind": 0.0})
 """Without the rule for what is near, which on this small map is half of it."""
+TIRED = Memory(looks=P.looks)
+"""Of a vehicle that has looked as often as it may."""
 
 
 def test_over_free_ground_it_goes_straight_one_leg_far() -> None:
-    leg = plan_leg(ground(), START, 0.0, GOAL, P)
+    leg = plan_leg(ground(), AT, GOAL, P)
     assert leg.verdict == "drive"
     assert np.abs(leg.path[:, 0]).max() < 1e-9
     assert leg.path[-1, 1] == pytest.approx(P.length * ROVER.wheel_base, abs=1e-9)
@@ -38,7 +40,7 @@ def test_over_free_ground_it_goes_straight_one_leg_far() -> None:
 
 
 def test_the_leg_ends_before_a_wheel_stands_on_unknown_ground() -> None:
-    leg = plan_leg(ground((Y > 0.15, UNKNOWN)), START, 0.0, GOAL, SEEN)
+    leg = plan_leg(ground((Y > 0.15, UNKNOWN)), AT, GOAL, SEEN)
     assert leg.verdict == "drive"
     assert 0.15 - 0.5 * ROVER.wheel_base - 0.02 < leg.path[-1, 1] <= 0.155 - 0.5 * ROVER.wheel_base
     assert leg.way[-1, 1] > 0.75  # though the way is planned on over it
@@ -46,7 +48,7 @@ def test_the_leg_ends_before_a_wheel_stands_on_unknown_ground() -> None:
 
 def test_unknown_ground_under_the_belly_alone_ends_the_leg_too() -> None:
     hole = (np.abs(X) < 0.016) & (np.abs(Y - 0.16) < 0.016)
-    leg = plan_leg(ground((hole, UNKNOWN), (np.abs(X) > 0.06, HAZARDOUS)), START, 0.0, GOAL, P)
+    leg = plan_leg(ground((hole, UNKNOWN), (np.abs(X) > 0.06, HAZARDOUS)), AT, GOAL, P)
     assert leg.path[-1, 1] <= 0.145 - 0.5 * ROVER.wheel_base
 
 
@@ -61,7 +63,7 @@ def test_over_a_hole_between_walls_it_goes_where_lines_of_sight_pass_low_enough(
 
     def driven(top: float) -> Leg:
         bounds = Bounds(np.where(hole, np.float32(top), seen), seen)
-        return next_leg(Bundle(maps, meta), None, (*START, 0.0), GOAL, P, Memory(), CAMERAS, bounds=bounds)
+        return next_leg(Bundle(maps, meta), None, AT, GOAL, P, Memory(), CAMERAS, bounds=bounds)
 
     over, before = driven(0.9 * ROVER.clearance), driven(1.1 * ROVER.clearance)
     assert over.path[-1, 1] > 0.16
@@ -71,17 +73,17 @@ def test_over_a_hole_between_walls_it_goes_where_lines_of_sight_pass_low_enough(
 def test_a_stone_between_the_wheels_is_passed_over_and_a_gap_too_narrow_to_turn_in_is_driven_through() -> None:
     stone = np.hypot(X, Y - 0.3) < 0.011
     walls = (np.abs(X) > 0.065) & (np.abs(Y - 0.3) < 0.1)
-    leg = plan_leg(ground((stone, HAZARDOUS), (walls, HAZARDOUS)), START, 0.0, GOAL, P)
+    leg = plan_leg(ground((stone, HAZARDOUS), (walls, HAZARDOUS)), AT, GOAL, P)
     assert leg.verdict == "drive"
     assert np.abs(leg.way[:, 0]).max() < 0.011
     narrow = (np.abs(X) > 0.045) & (np.abs(Y - 0.3) < 0.1)
-    closed = plan_leg(ground((stone, HAZARDOUS), (narrow, HAZARDOUS)), START, 0.0, GOAL, P, P.looks)
+    closed = plan_leg(ground((stone, HAZARDOUS), (narrow, HAZARDOUS)), AT, GOAL, P, TIRED)
     assert closed.verdict == "no path"
 
 
 def test_out_of_a_dead_end_it_drives_back() -> None:
     pocket = ((np.abs(X) > 0.065) & (np.abs(Y) < 0.12)) | ((Y > 0.08) & (Y < 0.12))
-    leg = plan_leg(ground((pocket, HAZARDOUS)), START, 0.0, (0.0, -0.19), P)
+    leg = plan_leg(ground((pocket, HAZARDOUS)), AT, (0.0, -0.19), P)
     assert leg.verdict == "drive"
     assert leg.gear[0] == -1
     assert leg.path[1, 1] < 0
@@ -93,7 +95,7 @@ def test_out_of_a_narrow_place_it_goes_at_the_heading_that_fits(degrees: float) 
     turn = math.radians(degrees)
     aside, along = X * math.cos(turn) + Y * math.sin(turn), Y * math.cos(turn) - X * math.sin(turn)
     walls = (np.abs(aside) > 0.061) & (np.abs(along - 0.2) < 0.3)
-    leg = plan_leg(ground((walls, HAZARDOUS)), START, 0.0, GOAL, P, P.looks)
+    leg = plan_leg(ground((walls, HAZARDOUS)), AT, GOAL, P, TIRED)
     assert leg.verdict == "drive"
     driven = leg.path[-1] - leg.path[0]
     assert math.degrees(math.atan2(-driven[0], driven[1])) == pytest.approx(degrees, abs=2.0)
@@ -101,13 +103,13 @@ def test_out_of_a_narrow_place_it_goes_at_the_heading_that_fits(degrees: float) 
 
 def test_a_wall_with_a_gap_is_gone_round_and_a_closed_one_is_no_path() -> None:
     wall = (np.abs(Y - 0.4) < 0.02) & (X < 0.1)
-    leg = plan_leg(ground((wall, HAZARDOUS)), START, 0.0, GOAL, P)
+    leg = plan_leg(ground((wall, HAZARDOUS)), AT, GOAL, P)
     assert leg.verdict == "drive"
     beside = leg.way[np.abs(leg.way[:, 1] - 0.4) < 0.02]
     assert beside[:, 0].min() >= 0.1 + 0.5 * ROVER.track + ROVER.margin - 0.011
     across = ground((np.abs(Y - 0.4) < 0.02, HAZARDOUS))
-    assert plan_leg(across, START, 0.0, GOAL, P).verdict == "look"
-    closed = plan_leg(across, START, 0.0, GOAL, P, P.looks)
+    assert plan_leg(across, AT, GOAL, P).verdict == "look"
+    closed = plan_leg(across, AT, GOAL, P, TIRED)
     assert closed.verdict == "no path"
     match = re.search(r"ends (\d+) mm away", closed.reason)
     assert match is not None
@@ -117,46 +119,46 @@ def test_a_wall_with_a_gap_is_gone_round_and_a_closed_one_is_no_path() -> None:
 
 def test_a_goal_among_hazards_is_said() -> None:
     rock = np.hypot(X - GOAL[0], Y - GOAL[1]) < 0.1
-    leg = plan_leg(ground((rock, HAZARDOUS)), START, 0.0, GOAL, P, P.looks)
+    leg = plan_leg(ground((rock, HAZARDOUS)), AT, GOAL, P, TIRED)
     assert (leg.verdict, leg.reason) == ("no path", "the goal itself is on hazardous ground, or too near to it")
 
 
 def test_at_the_goal_it_ends() -> None:
-    assert plan_leg(ground(), (0.0, 0.78), 0.0, GOAL, P).verdict == "goal"
+    assert plan_leg(ground(), (0.0, 0.78, 0.0), GOAL, P).verdict == "goal"
 
 
 def test_a_goal_outside_the_map_is_refused_with_the_map() -> None:
     with pytest.raises(InputError, match=r"the goal \(0.000, 3.000\) m is outside the map: give x in -0.4"):
-        plan_leg(ground(), START, 0.0, (0.0, 3.0), P)
+        plan_leg(ground(), AT, (0.0, 3.0), P)
 
 
 def test_more_than_the_greatest_turn_is_done_on_the_spot_first() -> None:
-    leg = plan_leg(ground(), START, math.pi / 2, GOAL, P)
+    leg = plan_leg(ground(), (*START, math.pi / 2), GOAL, P)
     assert (leg.verdict, len(leg.path)) == ("turn", 1)
     assert leg.turn == pytest.approx(-math.radians(P.max_turn_deg))
     assert length_of(through(leg.rest, leg.rest_gear, 0.0)) == pytest.approx(0.8, abs=0.02), "all of it is left"
     turned = math.pi / 2 + leg.turn
-    onward = plan_leg(ground(), START, turned, GOAL, P, before=(leg.rest, leg.rest_gear))
+    onward = plan_leg(ground(), (*START, turned), GOAL, P, before=(leg.rest, leg.rest_gear))
     assert onward.turn == pytest.approx(-math.radians(P.max_turn_deg)), "on towards the same way, at any heading"
 
 
 def test_it_does_not_look_where_its_wheels_have_no_room_to_turn() -> None:
     ahead = (Y > 0.07, UNKNOWN)
-    leg = plan_leg(ground(ahead), START, 0.0, GOAL, SEEN)
+    leg = plan_leg(ground(ahead), AT, GOAL, SEEN)
     assert (leg.verdict, math.degrees(leg.turn)) == ("look", pytest.approx(15.0))
     # the right rear wheel would move to (0.052, -0.038) m
     wall = (X > 0.045) & (Y > -0.045) & (Y < -0.02)
-    leg = plan_leg(ground(ahead, (wall, HAZARDOUS)), START, 0.0, GOAL, SEEN)
+    leg = plan_leg(ground(ahead, (wall, HAZARDOUS)), AT, GOAL, SEEN)
     assert (leg.verdict, math.degrees(leg.turn)) == ("look", pytest.approx(-15.0))
 
 
 def test_it_looks_around_then_closes_what_stays_unknown_and_goes_another_way() -> None:
     risk = ground(((np.abs(Y - 0.15) < 0.07) & (X < 0.1), UNKNOWN))
-    start, goal = (-0.3, 0.0), (-0.3, 0.8)
+    start, goal = (-0.3, 0.0, 0.0), (-0.3, 0.8)
     for looks in range(P.looks):
-        assert plan_leg(risk, start, 0.0, goal, SEEN, looks).verdict == "look"
+        assert plan_leg(risk, start, goal, SEEN, Memory(looks)).verdict == "look"
     places: list[tuple[float, float]] = []
-    while (leg := plan_leg(risk, start, 0.0, goal, SEEN, P.looks, places)).where is not None:
+    while (leg := plan_leg(risk, start, goal, SEEN, Memory(P.looks, places))).where is not None:
         places.append(leg.where)
         assert len(places) < 12
     assert leg.verdict in ("turn", "drive")
@@ -176,7 +178,7 @@ def test_no_leg_comes_near_a_hazard_or_onto_unknown_ground_or_turns_too_far(
         x, y, r = rng.uniform(-0.4, 0.4), rng.uniform(-0.15, 0.9), rng.uniform(0.01, 0.04)
         risk[np.hypot(X - x, Y - y) < r] = rng.choice([HAZARDOUS, UNKNOWN])
     risk[np.hypot(X, Y) < 0.1] = SAFE
-    leg = plan_leg(Footing.of(risk, None, LATTICE, ROVER), START, heading, GOAL, P, view=view)
+    leg = plan_leg(Footing.of(risk, None, LATTICE, ROVER), (*START, heading), GOAL, P, view=view)
     wheels = np.array([(a, b) for a in (-0.04, 0.04) for b in (-0.05, 0.05)])
     poses = list[tuple[np.ndarray, float]]()
     for a, b, gear in zip(leg.path, leg.path[1:], leg.gear, strict=False):
@@ -206,26 +208,26 @@ AHEAD = np.ones(2, np.int8)
 
 def test_the_way_that_it_is_on_is_kept_unless_another_one_is_much_better() -> None:
     right_is_nearer = ground(((np.abs(Y - 0.4) < 0.02) & (X > -0.17) & (X < 0.15), HAZARDOUS))
-    first = plan_leg(right_is_nearer, START, 0.0, GOAL, P)
+    first = plan_leg(right_is_nearer, AT, GOAL, P)
     assert first.way[:, 0].max() > 0.15
     left = np.array([START, (-0.23, 0.4), GOAL])
-    assert plan_leg(right_is_nearer, START, 0.0, GOAL, P, before=(left, AHEAD)).way[:, 0].min() < -0.17
+    assert plan_leg(right_is_nearer, AT, GOAL, P, before=(left, AHEAD)).way[:, 0].min() < -0.17
     right_is_near = ground(((np.abs(Y - 0.4) < 0.02) & (X > -0.35) & (X < 0.0), HAZARDOUS))
     far = np.array([START, (-0.39, 0.4), GOAL])
-    assert plan_leg(right_is_near, START, 0.0, GOAL, P, before=(far, AHEAD)).way[:, 0].min() > -0.1
+    assert plan_leg(right_is_near, AT, GOAL, P, before=(far, AHEAD)).way[:, 0].min() > -0.1
     # and never where it is closed by now
     closed = ground(((np.abs(Y - 0.4) < 0.02) & (X < 0.15), HAZARDOUS))
-    assert plan_leg(closed, START, 0.0, GOAL, P, before=(left, AHEAD)).way[:, 0].max() > 0.15
+    assert plan_leg(closed, AT, GOAL, P, before=(left, AHEAD)).way[:, 0].max() > 0.15
 
 
 def test_what_is_left_after_a_leg_goes_on_from_where_the_vehicle_stands() -> None:
     band = ground(((np.abs(Y - 0.4) < 0.02) & (X > -0.17) & (X < 0.15), HAZARDOUS))
-    leg = plan_leg(band, START, 0.0, GOAL, P)
+    leg = plan_leg(band, AT, GOAL, P)
     end, heading = leg.path[-1], math.atan2(*(leg.path[-2] - leg.path[-1])[:2] * (1, -1)) + leg.turn
     assert leg.rest[0] == pytest.approx(end)
     assert leg.rest[-1] == pytest.approx(leg.way[-1])
     beside = (float(end[0]) + 0.004, float(end[1]) - 0.003)
-    onward = plan_leg(band, beside, heading, GOAL, P, before=(leg.rest, leg.rest_gear))
+    onward = plan_leg(band, (*beside, heading), GOAL, P, before=(leg.rest, leg.rest_gear))
     assert onward.way[0] == pytest.approx(beside)
     assert onward.way[1:] == pytest.approx(leg.rest[1:])
 
@@ -233,14 +235,14 @@ def test_what_is_left_after_a_leg_goes_on_from_where_the_vehicle_stands() -> Non
 def test_of_a_kept_way_it_drives_what_is_known() -> None:
     risk = ground((Y > 0.15, UNKNOWN))
     straight = np.array([START, GOAL])
-    leg = plan_leg(risk, START, 0.0, GOAL, SEEN, before=(straight, AHEAD[:1]))
+    leg = plan_leg(risk, AT, GOAL, SEEN, before=(straight, AHEAD[:1]))
     assert leg.verdict == "drive"
-    assert leg.path[-1, 1] == pytest.approx(plan_leg(risk, START, 0.0, GOAL, SEEN).path[-1, 1], abs=0.008)
+    assert leg.path[-1, 1] == pytest.approx(plan_leg(risk, AT, GOAL, SEEN).path[-1, 1], abs=0.008)
     assert leg.rest == pytest.approx(np.array([leg.path[-1], GOAL]))
     # nearer by less than a leg is worth it looks, and what it looks at in vain is where known ground ends
     at = (0.0, float(leg.path[-1, 1]) - 0.01)
     kept = np.array([at, GOAL])
-    closed = plan_leg(risk, at, 0.0, GOAL, SEEN, P.looks, before=(kept, AHEAD[:1]))
+    closed = plan_leg(risk, (*at, 0.0), GOAL, SEEN, TIRED, before=(kept, AHEAD[:1]))
     assert closed.verdict == "closed"
     assert closed.where is not None
     assert 0.0 <= closed.where[1] - leg.path[-1, 1] < LATTICE.cell + 1e-9
@@ -250,14 +252,14 @@ def test_a_kept_way_is_not_given_up_for_rounding() -> None:
     beside = ground((X > 0.045, HAZARDOUS))  # the right wheels of a way straight ahead lack a part of the margin
     straight, even = np.array([START, GOAL]), P.model_copy(update={"near_price": 0.0})
     for closed in ([], [(0.0, 0.25)]):
-        leg = plan_leg(beside, START, 0.0, GOAL, even, closed=closed, before=(straight, AHEAD[:1]))
+        leg = plan_leg(beside, AT, GOAL, even, Memory(closed=closed), before=(straight, AHEAD[:1]))
         assert leg.verdict == "drive"
         assert leg.path == pytest.approx(np.array([START, (0.0, P.length * ROVER.wheel_base)]))
     # but never onto what is hazardous by sigma alone
     risk = np.full(LATTICE.shape, SAFE, np.uint8)
     risk[Y > 0.15] = HAZARDOUS
     reason = np.full(LATTICE.shape, REASONS["step"] | REASONS["uncertain"], np.uint16)
-    leg = plan_leg(Footing.of(risk, reason, LATTICE, ROVER), START, 0.0, GOAL, P, before=(straight, AHEAD[:1]))
+    leg = plan_leg(Footing.of(risk, reason, LATTICE, ROVER), AT, GOAL, P, before=(straight, AHEAD[:1]))
     assert leg.path[-1, 1] < 0.15 - 0.5 * ROVER.wheel_base + LATTICE.cell
 
 
@@ -271,7 +273,7 @@ def judged(hazardous: np.ndarray, chance: float) -> Bundle:
 def test_where_probable_hazards_close_every_way_those_next_to_certain_do() -> None:
     wall = np.abs(Y - 0.3) < 0.03
     for chance, verdict in ((0.93, "drive"), (0.999, "look")):
-        leg = next_leg(judged(wall, chance), None, (*START, 0.0), GOAL, P, Memory(), CAMERAS)
+        leg = next_leg(judged(wall, chance), None, AT, GOAL, P, Memory(), CAMERAS)
         assert leg.verdict == verdict
         assert (len(leg.way) > 1) == (verdict == "drive")
 
@@ -279,7 +281,7 @@ def test_where_probable_hazards_close_every_way_those_next_to_certain_do() -> No
 @pytest.mark.parametrize(("half", "margin"), [(0.065, ROVER.margin), (0.045, 0.0), (0.035, None)])
 def test_the_shortest_way_keeps_the_margin_where_one_can(half: float, margin: float | None) -> None:
     walls = (np.abs(X) > half) & (np.abs(Y - 0.3) < 0.03)
-    length, kept = shortest_way(judged(walls, 1.0), (*START, 0.0), GOAL, P)
+    length, kept = shortest_way(judged(walls, 1.0), AT, GOAL, P)
     assert kept == margin
     assert (length is None) == (margin is None)
 
@@ -301,24 +303,24 @@ def test_what_is_likely_a_hazard_is_gone_round_farther_than_what_is_unknown() ->
     wall, band = (X < 0.22) & (np.abs(Y - 0.4) < 0.03), np.abs(Y - 0.4) < 0.12
     risk = np.where(wall, np.uint8(HAZARDOUS), np.uint8(SAFE))
     likely = Footing.of(risk, None, LATTICE, ROVER, np.where(wall, 0.7, 0.0).astype(np.float32), sure=0.9)
-    assert plan_leg(likely, START, 0.0, GOAL, SEEN).way[:, 0].max() > 0.22
-    assert plan_leg(ground((band & wall, UNKNOWN)), START, 0.0, GOAL, SEEN).way[:, 0].max() < 0.1
+    assert plan_leg(likely, AT, GOAL, SEEN).way[:, 0].max() > 0.22
+    assert plan_leg(ground((band & wall, UNKNOWN)), AT, GOAL, SEEN).way[:, 0].max() < 0.1
     across = Footing.of(risk, None, LATTICE, ROVER, np.where(wall, 0.7, 0.0).astype(np.float32), sure=0.6)
-    assert plan_leg(across, START, 0.0, GOAL, SEEN).way[:, 0].max() > 0.22  # which is certain
+    assert plan_leg(across, AT, GOAL, SEEN).way[:, 0].max() > 0.22  # which is certain
 
 
 def test_the_shadow_of_a_stone_is_gone_round_farther_than_ground_that_nobody_looked_at() -> None:
     # 0.80 m straight over it, a vehicle's length and more of it unknown, or some 1.0 m round it
     shadow, unseen = ((X < 0.22) & (np.abs(Y - 0.4) < w) for w in (0.006, 0.021))
-    assert plan_leg(ground((shadow, UNKNOWN)), START, 0.0, GOAL, SEEN).way[:, 0].max() > 0.15
-    assert plan_leg(ground((unseen, UNKNOWN)), START, 0.0, GOAL, SEEN).way[:, 0].max() < 0.1
+    assert plan_leg(ground((shadow, UNKNOWN)), AT, GOAL, SEEN).way[:, 0].max() > 0.15
+    assert plan_leg(ground((unseen, UNKNOWN)), AT, GOAL, SEEN).way[:, 0].max() < 0.1
 
 
 def test_no_wheel_is_driven_over_doubtful_ground_that_can_be_gone_round() -> None:
     free = np.full(LATTICE.shape, SAFE, np.uint8)
     doubted = np.hypot(X + 0.5 * ROVER.track, Y - 0.15) < 0.011
     footing = Footing.of(free, None, LATTICE, ROVER, doubted=doubted)
-    leg = plan_leg(footing, START, 0.0, GOAL, P)
+    leg = plan_leg(footing, AT, GOAL, P)
     assert leg.verdict == "drive"
     for piece in through(leg.path, leg.gear, 0.0):
         along = np.linspace(0.0, 1.0, 50)
@@ -326,7 +328,7 @@ def test_no_wheel_is_driven_over_doubtful_ground_that_can_be_gone_round() -> Non
         assert footing.gaps(x, y, np.full(50, piece.heading)).caution.max() < DOUBT_WEIGHT / PARTS
     # where there is no room to go round, it is driven over
     risk = np.where(np.abs(X) > 0.075, np.uint8(HAZARDOUS), free)
-    between = plan_leg(Footing.of(risk, None, LATTICE, ROVER, doubted=doubted), START, 0.0, GOAL, P)
+    between = plan_leg(Footing.of(risk, None, LATTICE, ROVER, doubted=doubted), AT, GOAL, P)
     assert between.path[-1, 1] > 0.15
 
 
@@ -347,9 +349,9 @@ def test_unknown_ground_beside_the_vehicle_is_the_last_way_that_is_tried() -> No
     # the way through leads over 0.14 m of it, the way round is longer by 0.1 m and turns by 1.3 rad
     hole = (np.abs(Y - 0.12) < 0.02) & (X < 0.12) & (X > -0.39)
     cheap = P.model_copy(update={"unknown_price": 1.3})
-    through = plan_leg(ground((hole, UNKNOWN)), START, 0.0, GOAL, cheap.model_copy(update={"blind": 0.0}))
+    through = plan_leg(ground((hole, UNKNOWN)), AT, GOAL, cheap.model_copy(update={"blind": 0.0}))
     assert np.abs(through.way[:, 0]).max() < 0.1
-    assert plan_leg(ground((hole, UNKNOWN)), START, 0.0, GOAL, cheap).way[:, 0].max() > 0.12
+    assert plan_leg(ground((hole, UNKNOWN)), AT, GOAL, cheap).way[:, 0].max() > 0.12
 
 
 def test_ground_seen_from_afar_alone_is_planned_over_rather_than_unseen_one_and_never_driven() -> None:
@@ -359,7 +361,7 @@ def test_ground_seen_from_afar_alone_is_planned_over_rather_than_unseen_one_and_
 
     def planned(risk: np.ndarray, p: LegParams = SEEN) -> Leg:
         footing = Footing.of(risk, None, LATTICE, ROVER, unknown=unknown, glanced=glanced)
-        return plan_leg(footing, START, 0.0, GOAL, p)
+        return plan_leg(footing, AT, GOAL, p)
 
     leg = planned(free)
     assert leg.path[-1, 1] + 0.5 * ROVER.wheel_base <= 0.155 - ROVER.margin
@@ -372,10 +374,10 @@ def test_ground_seen_from_afar_alone_is_planned_over_rather_than_unseen_one_and_
 
 def test_standing_beside_unknown_ground_it_may_leave_but_not_go_nearer() -> None:
     beside = 0.04 + 0.5 * ROVER.margin < X
-    leg = plan_leg(ground((beside, UNKNOWN)), START, 0.0, GOAL, SEEN)
+    leg = plan_leg(ground((beside, UNKNOWN)), AT, GOAL, SEEN)
     assert leg.verdict == "drive"
     assert leg.path[:, 0].max() <= LATTICE.cell
-    leg = plan_leg(ground((0.04 - 0.5 * ROVER.margin < X, UNKNOWN)), START, 0.0, GOAL, SEEN)
+    leg = plan_leg(ground((0.04 - 0.5 * ROVER.margin < X, UNKNOWN)), AT, GOAL, SEEN)
     assert leg.verdict == "turn"  # to the left: a wheel stands on it already
     assert leg.turn > 0
 
@@ -414,24 +416,24 @@ def test_uncertain_ground_is_planned_over_and_not_driven_on() -> None:
     risk, reason = np.full(LATTICE.shape, SAFE, np.uint8), np.zeros(LATTICE.shape, np.uint16)
     wall = np.abs(Y - 0.2) < 0.02
     risk[wall], reason[wall] = HAZARDOUS, REASONS["step"] | REASONS["uncertain"]
-    leg = plan_leg(Footing.of(risk, reason, LATTICE, ROVER), START, 0.0, GOAL, SEEN)
+    leg = plan_leg(Footing.of(risk, reason, LATTICE, ROVER), AT, GOAL, SEEN)
     assert leg.verdict == "drive"
     assert leg.path[-1, 1] <= 0.18 - 0.5 * ROVER.wheel_base + LATTICE.cell
     assert leg.way[-1, 1] > 0.75
 
 
 def test_the_shortest_way_is_straight_or_none() -> None:
-    length = shortest(ground(), START, 0.0, GOAL, P)
+    length = shortest(ground(), AT, GOAL, P)
     assert length == pytest.approx(0.8 - 0.015, abs=0.011)
     wall = ground((np.abs(Y - 0.4) < 0.02, HAZARDOUS))
-    assert shortest(wall, START, 0.0, GOAL, P) is None
-    assert shortest(ground((Y > 0.5, UNKNOWN)), START, 0.0, GOAL, P) is None
+    assert shortest(wall, AT, GOAL, P) is None
+    assert shortest(ground((Y > 0.5, UNKNOWN)), AT, GOAL, P) is None
 
 
 @settings(max_examples=15, deadline=None)
 @given(st.floats(-0.3, 0.3), st.floats(0.3, 0.9))
 def test_the_shortest_way_over_free_ground_is_little_longer_than_the_beeline(x: float, y: float) -> None:
-    length = shortest(ground(), START, 0.0, (x, y), P)
+    length = shortest(ground(), AT, (x, y), P)
     assert length is not None
     assert math.hypot(x, y) - 0.016 <= length <= 1.02 * math.hypot(x, y)
 
@@ -439,7 +441,7 @@ def test_the_shortest_way_over_free_ground_is_little_longer_than_the_beeline(x: 
 def test_what_lies_nearer_than_its_view_is_looked_at_from_farther_back() -> None:
     band, walls = np.abs(Y - 0.10) < 0.025, np.abs(X) > 0.1
     before = ground((band, UNKNOWN), (walls, HAZARDOUS))
-    leg = plan_leg(before, START, 0.0, GOAL, P, view=CAMERAS)
+    leg = plan_leg(before, AT, GOAL, P, view=CAMERAS)
     assert leg.verdict == "look"
     assert leg.gear.tolist() == [-1]
     x, y = leg.path[-1]
@@ -448,12 +450,12 @@ def test_what_lies_nearer_than_its_view_is_looked_at_from_farther_back() -> None
     assert CAMERAS.sees(beneath, (x, y, leg.turn)).all()
     assert not CAMERAS.sees(beneath, (x, y + 0.02, leg.turn)).all(), "and no farther than that"
     # what it saw from there already, and from nearer, is not looked at again
-    vain = plan_leg(before, START, 0.0, GOAL, P, view=CAMERAS, stands=[(x, y, leg.turn)])
+    vain = plan_leg(before, AT, GOAL, P, Memory(stands=[(x, y, leg.turn)]), view=CAMERAS)
     assert vain.verdict == "closed"
-    aside = plan_leg(before, START, 0.0, GOAL, P, view=CAMERAS, stands=[(x - 0.15, y, -0.5)])
+    aside = plan_leg(before, AT, GOAL, P, Memory(stands=[(x - 0.15, y, -0.5)]), view=CAMERAS)
     assert aside.gear.tolist() == [-1], "from another side it may show"
     blocked = ground((band, UNKNOWN), (walls | (Y < -0.08), HAZARDOUS))
-    assert plan_leg(blocked, START, 0.0, GOAL, P, view=CAMERAS).gear.tolist() == []
+    assert plan_leg(blocked, AT, GOAL, P, view=CAMERAS).gear.tolist() == []
 
 
 def around_a_corner() -> Footing:
@@ -467,7 +469,7 @@ FIRST = np.array([(0.16, 0.34), (0.16, 0.4)])
 
 @pytest.mark.parametrize("y", [0.1, 0.14, 0.18])
 def test_a_leg_ends_facing_what_is_not_known_from_where_that_is_seen(y: float) -> None:
-    leg = plan_leg(around_a_corner(), (0.0, y), 0.0, (0.35, 0.45), P, view=CAMERAS)
+    leg = plan_leg(around_a_corner(), (0.0, y, 0.0), (0.35, 0.45), P, view=CAMERAS)
     assert leg.verdict == "drive"
     assert np.hypot(*(leg.path[-1] - leg.path[0])) >= P.least * ROVER.wheel_base
     last = leg.path[-1] - leg.path[-2]
@@ -477,13 +479,13 @@ def test_a_leg_ends_facing_what_is_not_known_from_where_that_is_seen(y: float) -
 
 def test_it_turns_to_what_comes_next_before_it_is_too_near_to_see_it_and_then_drives() -> None:
     start, goal = (0.0, 0.3), (0.35, 0.45)
-    leg = plan_leg(around_a_corner(), start, 0.0, goal, P, view=CAMERAS)
+    leg = plan_leg(around_a_corner(), (*start, 0.0), goal, P, view=CAMERAS)
     assert leg.verdict == "look"
     assert -math.radians(P.max_turn_deg) - 1e-9 <= leg.turn < 0.0
     assert len(leg.path) == 1
     assert not CAMERAS.sees(FIRST, (*start, 0.0)).any()
     assert CAMERAS.sees(FIRST, (*start, leg.turn)).any()
-    again = plan_leg(around_a_corner(), start, leg.turn, goal, P, looks=1, view=CAMERAS, stands=[(*start, 0.0)])
+    again = plan_leg(around_a_corner(), (*start, leg.turn), goal, P, Memory(1, stands=[(*start, 0.0)]), view=CAMERAS)
     assert again.verdict == "drive", "it did not help"
 
 
@@ -496,7 +498,7 @@ def test_what_was_seen_from_near_and_stays_doubtful_is_not_looked_at_from_farthe
     unseen[0][band] = UNKNOWN
     doubtful[0][band], doubtful[1][band] = HAZARDOUS, REASONS["step"] | REASONS["uncertain"]
     back, closed = (
-        plan_leg(Footing.of(*maps, LATTICE, ROVER), START, 0.0, GOAL, P, view=CAMERAS) for maps in (unseen, doubtful)
+        plan_leg(Footing.of(*maps, LATTICE, ROVER), AT, GOAL, P, view=CAMERAS) for maps in (unseen, doubtful)
     )
     assert (back.verdict, back.gear.tolist()) == ("look", [-1])
     assert closed.verdict == "closed"
