@@ -26,6 +26,11 @@ ASIDE = tuple(math.radians(d) for d in (3.0, -3.0, 6.0, -6.0, 9.0, -9.0))
 """Headings off the present one from which a way is looked for where there is none: a graph's headings are some 20
 degrees apart, and out of a narrow place a way may lead at those between alone."""
 
+HERE = 0.3
+"""Wheel bases: ground so near to where it stands may be as that under it is."""
+NEARER = 2.0
+"""Times ``blind``: what is doubtful, farther than that, will be seen from nearer, where most doubts go."""
+
 
 class Ground:
     """The map about a vehicle: what it may drive on, what it may plan over, and at which price."""
@@ -71,16 +76,11 @@ class Ground:
 
     def _near(self, x: Floats, y: Floats) -> Mask:
         """Where it stands: ground there that is no worse than that under it will do."""
-        return np.asarray(self._away(x, y) <= 0.3 * self.vehicle.wheel_base)
-
-    def _far(self, x: Floats, y: Floats) -> Mask:
-        """So far that it will be seen from nearer, where most doubts go: it is not dearer for them than if nothing were
-        known."""
-        return np.asarray(self._away(x, y) > 2.0 * self.p.blind * self.vehicle.wheel_base)
+        return np.asarray(self._away(x, y) <= HERE)
 
     def _away(self, x: Floats, y: Floats) -> Floats:
-        """Metres from where it stands."""
-        return np.asarray(np.hypot(x - self.start[0], y - self.start[1]))
+        """Wheel bases from where it stands."""
+        return np.asarray(np.hypot(x - self.start[0], y - self.start[1]) / self.vehicle.wheel_base)
 
     def _seen(self, gaps: Gaps, near: Mask) -> Mask:
         return np.asarray(gaps.unknown > np.where(near, self.unknown_here, 0.0))
@@ -93,8 +93,8 @@ class Ground:
     def _price(self, gaps: Gaps, x: Floats, y: Floats, slack: float = 0.0) -> tuple[Mask, Floats]:
         """Poses that may be driven, and the price of a metre, infinite where none may be planned."""
         known, opened = self._split(gaps, x, y, slack)
-        reach = self.p.blind * self.vehicle.wheel_base * np.where(gaps.unknown > 0, 2.0, 1.0)
-        blind = self._away(x, y) <= reach
+        away = self._away(x, y)
+        blind = away <= self.p.blind * np.where(gaps.unknown > 0, NEARER, 1.0)
         unseen = np.full(x.shape, self.p.unknown_price)
         if self.footing.glanced is not None:
             unseen[~self._at(~self.footing.glanced, x, y)] = min(self.p.glance_price, self.p.unknown_price)
@@ -102,7 +102,8 @@ class Ground:
         stays = (gaps.gap <= self.vehicle.margin) | ((gaps.unknown <= 0) & (gaps.frontier > 0))
         unknown = np.where(stays, np.maximum(self.p.doubt_price, unknown), unknown)
         caution = self.p.caution_price * gaps.caution
-        fades = self._far(x, y) & ~stays
+        # not dearer than if nothing were known of it
+        fades = (away > NEARER * self.p.blind) & ~stays
         caution = np.where(fades, np.minimum(caution, self.p.unknown_price - 1.0), caution)
         price = np.where(known, 1.0, unknown) + caution
         if self.vehicle.margin > 0:
