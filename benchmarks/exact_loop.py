@@ -38,12 +38,11 @@ def drive(sequence: Any, config: Any, goal: tuple[float, float]) -> dict[str, An
     import numpy as np
     from driving.exact_bed import ExactBed, place_of
 
-    from stages.ceiling import ceiling
+    from stages.ceiling import Bounds, ceiling
     from stages.declare import Bundle
     from stages.leg import next_leg, shortest_way
     from stages.leg_memory import Memory
     from stages.risk import risk_map
-    from stages.straddle import Bounds
     from stages.view import View
 
     bed, vehicle, p = ExactBed.of(sequence, config, goal), config.vehicle, config.leg
@@ -67,7 +66,8 @@ def drive(sequence: Any, config: Any, goal: tuple[float, float]) -> dict[str, An
         near |= now
         centre = (T @ sequence.simulation.T_vehicle_left).translation
         top = np.fmin(top, ceiling(np.where(now, bed.elevation, np.float32(np.nan)), bed.lattice, centre))
-        bounds = Bounds(*(np.where(near, bed.elevation, a).astype(np.float32) for a in (top, np.nan)))
+        known = np.where(near, bed.elevation, np.float32(np.nan))
+        bounds = Bounds.of(known, np.zeros_like(known), top)
         maps, follows, (place, heading) = (judged(near), judged(far)), "again", place_of(T)
         while follows == "again":
             leg = next_leg(*maps, (*place, heading), goal, p, memory, view, before, bounds)

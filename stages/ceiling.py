@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -44,6 +45,20 @@ class CeilingParams(Params):
         gt=0,
         description="m; no line of sight is drawn to ground where a pixel covers more along the range; none: to all",
     )
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """Between which heights (row, col) float32, m, the ground lies: ``lower``, NaN where it was not seen, and
+    ``upper``, NaN where nothing bounds it either."""
+
+    upper: Floats32
+    lower: Floats32
+
+    @staticmethod
+    def of(elevation: Floats32, doubt: Floats32, hidden: Floats32) -> Bounds:
+        """Of what was seen, give or take ``doubt``, m, NaN unknown; where it was not, at most ``hidden`` high."""
+        return Bounds(np.where(np.isnan(elevation), hidden, elevation + doubt), elevation - doubt)
 
 
 def ceiling(elevation: Floats32, lattice: Lattice, centre: Floats) -> Floats32:
@@ -87,8 +102,7 @@ def _run(params: CeilingParams, args: Mapping[str, Any], inputs: Inputs) -> Bund
     lattice = Lattice.from_dict(merged.meta["lattice"])
     z, s = (np.asarray(merged[name], dtype=np.float32) for name in ("elevation", "relief_std"))
     k = np.float32(params.sigmas)
-    upper, lower = z + k * s, z - k * s
-    least = np.full(lattice.shape, np.inf, dtype=np.float32)
+    least = np.full(lattice.shape, np.nan, dtype=np.float32)
     for dem in inputs["dems"]:
         own = Lattice.from_dict(dem.meta["lattice"])
         centre = RigidTransform.from_matrix(dem.meta["T_frame_left"]).translation
@@ -102,11 +116,10 @@ def _run(params: CeilingParams, args: Mapping[str, Any], inputs: Inputs) -> Bund
         found = ceiling(seen + k * std, own, centre)[own.window(part)]
         here = lattice.window(part)
         least[here] = np.fmin(least[here], found)
-    unknown = np.isnan(z)
-    bounded = unknown & np.isfinite(least)
-    upper = np.where(bounded, least, upper)
-    shares = {"unknown": float(unknown.mean()), "bounded": float(bounded.mean())}
-    return Bundle({"upper": upper, "lower": lower}, {"lattice": lattice.to_dict(), "frame": "world", "shares": shares})
+    bounds, unknown = Bounds.of(z, k * s, least), np.isnan(z)
+    shares = {"unknown": float(unknown.mean()), "bounded": float((unknown & np.isfinite(least)).mean())}
+    meta = {"lattice": lattice.to_dict(), "frame": "world", "shares": shares}
+    return Bundle({"upper": bounds.upper, "lower": bounds.lower}, meta)
 
 
 def _array(name: str, long_name: str) -> Array:

@@ -17,11 +17,12 @@ import scipy
 from numba import njit
 from numpy.typing import NDArray
 
+from stages.ceiling import Bounds
 from stages.hazards import BITS
 from stages.lattice import Lattice
 from stages.path import WHEEL_BITS
 from stages.risk import CAUTION, DOUBT_BIT, HAZARDOUS, UNKNOWN
-from stages.straddle import Bounds, Straddle, clears, stands
+from stages.straddle import Straddle, clears, stands
 from stages.vehicle import Vehicle
 from stages.wheels import wheel_positions
 

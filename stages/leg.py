@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.ceiling import Bounds
 from stages.declare import Array, Bundle, Inputs, Stage
 from stages.footing import Footing
 from stages.geometry import Rig, RigidTransform
@@ -20,7 +21,6 @@ from stages.lattice import Lattice
 from stages.leg_memory import Memory
 from stages.leg_params import LegParams
 from stages.leg_plan import Before, Leg, plan_leg, shortest
-from stages.straddle import Bounds
 from stages.vehicle import Vehicle
 from stages.verdict import HAZARDOUS, UNKNOWN, UNSEEN_BIT
 from stages.view import Stand, View

@@ -12,28 +12,19 @@ that ground may have about that point; see :mod:`stages.placement` for the rise.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from stages.ceiling import Bounds
 from stages.extrema import running_max
 from stages.vehicle import Vehicle
 from stages.wheels import wheel_positions
 
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
-
-
-@dataclass(frozen=True)
-class Bounds:
-    """Between which heights (row, col) float32, m, the ground lies: ``lower``, NaN where it was not seen, and
-    ``upper``, NaN where nothing bounds it either."""
-
-    upper: Floats32
-    lower: Floats32
 
 
 class Straddle(NamedTuple):

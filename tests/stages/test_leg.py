@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from leg_scenes import AT, CAMERAS, GOAL, LATTICE, ROVER, START, P, X, Y, ground
 
+from stages.ceiling import Bounds
 from stages.declare import Bundle
 from stages.errors import InputError
 from stages.footing import DOUBT_WEIGHT, PARTS, Footing
@@ -21,7 +22,6 @@ from stages.leg_params import LegParams
 from stages.leg_plan import Leg, plan_leg, shortest
 from stages.risk import HAZARDOUS, REASONS, SAFE, UNKNOWN
 from stages.route import length_of, through
-from stages.straddle import Bounds
 from stages.view import AHEAD as ANYWHERE
 from stages.view import Stand, View
 

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from stages.ceiling import Bounds
 from stages.footing import Footing
 from stages.lattice import Lattice
 from stages.risk import SAFE, UNKNOWN
-from stages.straddle import Bounds
 from stages.vehicle import Vehicle
 
 ROVER = Vehicle(
