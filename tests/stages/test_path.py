@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from vehicles import SHORT
 
 from stages.declare import Bundle, check_outputs
 from stages.errors import InputError
@@ -16,17 +17,6 @@ from stages.path import STAGE, PathParams, Route, describe, find_path
 from stages.risk import BITS, CAUTION, HAZARDOUS, UNKNOWN
 from stages.vehicle import Vehicle
 
-MODEL = Vehicle(
-    name="model",
-    wheel_diameter=0.03,
-    track=0.03,
-    wheel_base=0.02,
-    clearance=0.03,
-    max_slope_deg=20.0,
-    max_step=0.01,
-    max_roughness=0.01,
-    margin=0.0,
-)
 CELL = 0.01
 
 
@@ -70,7 +60,7 @@ def test_unknown_and_hazard_are_never_entered(seed: int, angle: float, planner: 
     lattice = Lattice.at(-20, 30, CELL, 40, 36)
     risk, z = terrain(seed, lattice)
     heading = (math.sin(angle), math.cos(angle))
-    route = find_path(maps(risk, z), lattice, MODEL, heading=heading, params=PathParams(planner=planner))
+    route = find_path(maps(risk, z), lattice, SHORT, heading=heading, params=PathParams(planner=planner))
     xyz = route.xyz
     if len(xyz):
         at = np.rint(lattice.index(xyz[:, :2])).astype(int)
@@ -87,7 +77,7 @@ def test_unknown_and_hazard_are_never_entered(seed: int, angle: float, planner: 
 def test_wheels_keep_the_margin_from_hazards(seed: int, margin: float, planner: str) -> None:
     lattice = Lattice.at(-20, 30, CELL, 60, 56)
     risk, z = terrain(seed, lattice)
-    vehicle = MODEL.model_copy(update={"margin": margin})
+    vehicle = SHORT.model_copy(update={"margin": margin})
     route = find_path(maps(risk, z), lattice, vehicle, params=PathParams(planner=planner))
     hazards = lattice.xy()[risk == HAZARDOUS]
     if len(route.xyz) < 2:
@@ -105,7 +95,7 @@ def test_what_stays_on_known_ground_is_told(gap: int, ground: str) -> None:
     risk, z = level(lattice)
     risk[15:25] = UNKNOWN
     risk[15:25, 15 - gap // 2 : 15 - gap // 2 + gap] = 0
-    vehicle = MODEL.model_copy(update={"track": 0.05})  # 6.5 cells over the wheels
+    vehicle = SHORT.model_copy(update={"track": 0.05})  # 6.5 cells over the wheels
     route = find_path(maps(risk, z), lattice, vehicle)
     assert route.ground == ground
     assert len(route.xyz) > 30
@@ -117,7 +107,7 @@ def test_caution_ground_is_avoided_where_the_detour_is_short() -> None:
     risk[25:35, 12:24] = CAUTION
     found = {
         toll: describe(
-            find_path(maps(risk, z), lattice, MODEL, params=PathParams(caution=toll)), maps(risk, z), lattice, MODEL
+            find_path(maps(risk, z), lattice, SHORT, params=PathParams(caution=toll)), maps(risk, z), lattice, SHORT
         )
         for toll in (0.0, 0.2)
     }
@@ -131,7 +121,7 @@ def test_ground_that_may_be_a_hazard_is_gone_round(chance: float, crossed: bool)
     given = maps(*level(lattice)) | {"p_hazard": np.zeros(lattice.shape, dtype=np.float32)}
     given["p_hazard"][25:36, 24:37] = chance
     ends = {"start": (0.0, 0.1), "target": (0.0, 0.5)}
-    route = find_path(given, lattice, MODEL, **ends, params=PathParams(doubt=20.0))
+    route = find_path(given, lattice, SHORT, **ends, params=PathParams(doubt=20.0))
     assert bool((given["p_hazard"][route.cells[:, 0], route.cells[:, 1]] == np.float32(chance)).all()) == crossed
     assert len(route.cells) > 30
 
@@ -141,18 +131,18 @@ def test_ground_that_is_probably_a_hazard_closes_the_way() -> None:
     given = maps(*level(lattice)) | {"p_hazard": np.zeros(lattice.shape, dtype=np.float32)}
     given["p_hazard"][30] = 0.2
     ends = {"start": (0.0, 0.1), "target": (0.0, 0.5)}
-    closed = find_path(given, lattice, MODEL, **ends)
+    closed = find_path(given, lattice, SHORT, **ends)
     assert not len(closed.cells)
     assert "above path.sure 0.1 closes every way; without it one leads over ground of up to 0.2:" in closed.plan.reason
-    assert len(find_path(given, lattice, MODEL, **ends, params=PathParams(sure=0.2)).cells) > 30
+    assert len(find_path(given, lattice, SHORT, **ends, params=PathParams(sure=0.2)).cells) > 30
     given["risk"][30] = HAZARDOUS  # then it is not for what may be hazardous
-    assert find_path(given, lattice, MODEL, **ends).doubt is None
+    assert find_path(given, lattice, SHORT, **ends).doubt is None
 
 
 def test_ground_that_is_probably_a_hazard_everywhere_is_a_warning_with_the_figure() -> None:
     lattice = Lattice.at(0, 40, CELL, 40, 30)
     arrays = maps(*level(lattice)) | {"p_hazard": np.full(lattice.shape, 0.15, dtype=np.float32)}
-    source = Bundle(arrays, {"lattice": lattice.to_dict(), "vehicle": MODEL.model_dump()})
+    source = Bundle(arrays, {"lattice": lattice.to_dict(), "vehicle": SHORT.model_dump()})
     (line,) = STAGE.run(PathParams(), {}, {"risk": source}).meta["warnings"]
     assert line.startswith("no path: ground with a p_hazard above path.sure 0.1 closes every way")
     assert "up to 0.15" in line
@@ -161,15 +151,15 @@ def test_ground_that_is_probably_a_hazard_everywhere_is_a_warning_with_the_figur
 def test_from_start_to_target_in_metres() -> None:
     lattice = Lattice.at(-50, 50, CELL, 101, 101)
     given = maps(*level(lattice))
-    xyz = find_path(given, lattice, MODEL, start=(-0.3, -0.2), target=(0.3, 0.25)).xyz
+    xyz = find_path(given, lattice, SHORT, start=(-0.3, -0.2), target=(0.3, 0.25)).xyz
     # ends are moved to the centres of their cells on the turned grid: half a diagonal
     assert np.hypot(*(xyz[0, :2] - [-0.3, -0.2])) < 0.71 * CELL
     assert np.hypot(*(xyz[-1, :2] - [0.3, 0.25])) < 0.71 * CELL
     assert (np.hypot(*np.diff(xyz[:, :2], axis=0).T)).sum() == pytest.approx(0.75, abs=2 * CELL)
     with pytest.raises(InputError, match=r"path.target \(2, 0\) m is outside the map.*x in -0.505"):
-        find_path(given, lattice, MODEL, start=(-0.3, -0.2), target=(2.0, 0.0))
+        find_path(given, lattice, SHORT, start=(-0.3, -0.2), target=(2.0, 0.0))
     with pytest.raises(InputError, match="start and target that differ"):
-        find_path(given, lattice, MODEL, start=(0.1, 0.1), target=(0.1, 0.1))
+        find_path(given, lattice, SHORT, start=(0.1, 0.1), target=(0.1, 0.1))
 
 
 def test_behind_a_wall_rows_fail_and_grid8_goes_round() -> None:
@@ -177,9 +167,9 @@ def test_behind_a_wall_rows_fail_and_grid8_goes_round() -> None:
     risk, z = level(lattice)
     risk[20, 8:53] = risk[20:45, 8] = risk[20:45, 52] = HAZARDOUS  # a cup that opens to the near side
     ends = {"start": (0.0, 0.25), "target": (0.0, 0.55)}
-    by_rows = find_path(maps(risk, z), lattice, MODEL, **ends, params=PathParams(planner="rows"))
+    by_rows = find_path(maps(risk, z), lattice, SHORT, **ends, params=PathParams(planner="rows"))
     assert len(by_rows.xyz) == 0
-    route = find_path(maps(risk, z), lattice, MODEL, **ends)
+    route = find_path(maps(risk, z), lattice, SHORT, **ends)
     assert route.planner == "grid8"
     np.testing.assert_allclose(route.xyz[[0, -1], :2], [[0.0, 0.25], [0.0, 0.55]], atol=1e-9)
     assert np.diff(route.xyz[:, 1]).min() < 0  # it goes back
@@ -191,7 +181,7 @@ def test_heights_far_from_the_datum_cost_what_they_differ(datum: float) -> None:
     lattice = Lattice.at(-15, 60, CELL, 40, 31)
     risk, z = level(lattice)
     z[:20] = 0.5
-    route = find_path(maps(risk, z + np.float32(datum)), lattice, MODEL)
+    route = find_path(maps(risk, z + np.float32(datum)), lattice, SHORT)
     assert len(route.xyz) > 30
     assert route.cost[route.cells[-1, 0], route.cells[-1, 1]] == pytest.approx(0.5, abs=0.03)
 
@@ -201,12 +191,12 @@ def test_a_map_that_is_cut_is_crossed_on_its_longer_side() -> None:
     risk, z = level(lattice)
     risk[70:74] = HAZARDOUS  # from edge to edge: 70 rows ahead of it, 26 before
     given = maps(risk, z)
-    assert not describe(find_path(given, lattice, MODEL), given, lattice, MODEL)["found"]
-    facts = describe(find_path(given, lattice, MODEL, stretch=True), given, lattice, MODEL)
+    assert not describe(find_path(given, lattice, SHORT), given, lattice, SHORT)["found"]
+    facts = describe(find_path(given, lattice, SHORT, stretch=True), given, lattice, SHORT)
     assert facts["planner"] == "grid8"
     before, beyond = facts["left_out_m"]
-    assert 0.30 <= before <= 0.30 + 2 * MODEL.half_length
-    assert beyond <= 2 * MODEL.half_length
+    assert 0.30 <= before <= 0.30 + 2 * SHORT.half_length
+    assert beyond <= 2 * SHORT.half_length
 
 
 @pytest.mark.parametrize(
@@ -222,20 +212,20 @@ def test_a_start_that_cannot_be_stood_on_is_refused_with_the_figure(kind: int, m
     risk[30:39, 15:26] = kind
     given = maps(risk, z) | {"step": np.full(lattice.shape, 0.02, dtype=np.float32)}
     with pytest.raises(InputError, match=message):
-        find_path(given, lattice, MODEL, start=(0.0, 0.06))
+        find_path(given, lattice, SHORT, start=(0.0, 0.06))
 
 
 def test_a_vehicle_wider_than_the_map_is_refused() -> None:
     lattice = Lattice.at(0, 40, CELL, 40, 5)
     with pytest.raises(InputError, match=r"the vehicle is 0.095 m wide over its wheels, the map only 0.05 m"):
-        find_path(maps(*level(lattice)), lattice, MODEL.model_copy(update={"track": 0.08}))
+        find_path(maps(*level(lattice)), lattice, SHORT.model_copy(update={"track": 0.08}))
 
 
 def test_limits_that_leave_nothing_to_drive_on_are_named() -> None:
     lattice = Lattice.at(0, 40, CELL, 40, 30)
     risk, z = level(lattice)
     given = maps(np.full_like(risk, HAZARDOUS), z, "tilt")
-    facts = describe(find_path(given, lattice, MODEL), given, lattice, MODEL)
+    facts = describe(find_path(given, lattice, SHORT), given, lattice, SHORT)
     assert facts["found"] is False
     assert "all 1200 known cells are hazardous, 100 % of them by tilt: is vehicle.max_slope_deg 20" in facts["reason"]
 
@@ -244,7 +234,7 @@ def test_limits_that_leave_nothing_are_a_warning_of_the_whole_map_alone() -> Non
     lattice = Lattice.at(0, 40, CELL, 40, 30)
     risk, z = level(lattice)
     arrays = maps(np.full_like(risk, HAZARDOUS), z, "tilt")
-    source = Bundle(arrays, {"lattice": lattice.to_dict(), "vehicle": MODEL.model_dump()})
+    source = Bundle(arrays, {"lattice": lattice.to_dict(), "vehicle": SHORT.model_dump()})
     (line,) = STAGE.run(PathParams(), {}, {"risk": source}).meta["warnings"]
     assert line.startswith("no path: all 1200 known cells are hazardous")
     assert "warnings" not in STAGE.run(PathParams(), {"use": "local"}, {"risk": source}).meta
@@ -264,7 +254,7 @@ def test_the_stage(blocked: bool) -> None:
         "p_hazard": np.full(lattice.shape, 0.01, dtype=np.float32),
     }
     arrays["clearance"][30, 10] = 0.015
-    source = Bundle(arrays, {"lattice": lattice.to_dict(), "vehicle": MODEL.model_dump(), "frame": "local"})
+    source = Bundle(arrays, {"lattice": lattice.to_dict(), "vehicle": SHORT.model_dump(), "frame": "local"})
     out = STAGE.run(PathParams(start=(9.0, 9.0)), {"use": "local"}, {"risk": source})
     check_outputs(STAGE, out)
     assert out.meta["found"] is not blocked
@@ -273,7 +263,7 @@ def test_the_stage(blocked: bool) -> None:
         assert out.meta["blocking_row"] in (20, 21, 22)
         assert out["path"].shape == (0, 3)
         return
-    outside = 2 * math.ceil(MODEL.half_length / CELL)  # rows at which the outline leaves the map
+    outside = 2 * math.ceil(SHORT.half_length / CELL)  # rows at which the outline leaves the map
     assert 50 - outside <= out.meta["vertices"] <= 50
     assert out.meta["max_inclination"] == pytest.approx(math.atan(0.1))
     assert out.meta["least_clearance"] == pytest.approx(0.015)

@@ -6,21 +6,10 @@ import math
 
 import numpy as np
 import pytest
+from vehicles import MODEL
 
 from stages.placement import Stance, place, stride
-from stages.vehicle import Vehicle
 
-MODEL = Vehicle(
-    name="model",
-    wheel_diameter=0.03,
-    track=0.08,
-    wheel_base=0.1,
-    clearance=0.03,
-    max_slope_deg=20.0,
-    max_step=0.015,
-    max_roughness=0.01,
-    margin=0.01,
-)
 CELL = 0.004
 
 

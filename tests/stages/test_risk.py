@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from vehicles import MODEL
 
 from stages.declare import Bundle, check_outputs
 from stages.errors import InputError
@@ -28,17 +29,6 @@ from stages.risk import (
 )
 from stages.vehicle import DEFAULT_VEHICLE, Vehicle
 
-MODEL = Vehicle(
-    name="model",
-    wheel_diameter=0.03,
-    track=0.08,
-    wheel_base=0.1,
-    clearance=0.03,
-    max_slope_deg=20.0,
-    max_step=0.015,
-    max_roughness=0.01,
-    margin=0.01,
-)
 FINE = 0.001
 COARSE = 0.005
 

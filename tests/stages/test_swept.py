@@ -8,21 +8,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from vehicles import SHORT
 
 from stages.swept import ACROSS, STEPS, STRAIGHT, Stand, grown, widened
-from stages.vehicle import Vehicle
 
-MODEL = Vehicle(
-    name="model",
-    wheel_diameter=0.03,
-    track=0.03,
-    wheel_base=0.02,
-    clearance=0.03,
-    max_slope_deg=20.0,
-    max_step=0.01,
-    max_roughness=0.01,
-    margin=0.0,
-)
 CELL = 0.01
 
 
@@ -68,7 +57,7 @@ def test_a_wider_margin_frees_no_cell(seed: int, margins: tuple[float, float], b
     rng = np.random.default_rng(seed)
     wheel, body, unknown = (rng.random((30, 34)) < 0.02 for _ in range(3))
     narrow, wide = (
-        Stand(wheel, body, MODEL.model_copy(update={"margin": m}), CELL, unknown).ways(below) for m in sorted(margins)
+        Stand(wheel, body, SHORT.model_copy(update={"margin": m}), CELL, unknown).ways(below) for m in sorted(margins)
     )
     assert ((wide & ~narrow) == 0).all()
 
@@ -77,7 +66,7 @@ def test_where_a_vehicle_may_stand_by_hand() -> None:
     """One hazard to a wheel, wheels 2 cells ahead and behind, 3 to the left and right: four places each way."""
     wheel = np.zeros((21, 21), dtype=bool)
     wheel[10, 10] = True
-    vehicle = MODEL.model_copy(update={"wheel_base": 0.04, "track": 0.06})
+    vehicle = SHORT.model_copy(update={"wheel_base": 0.04, "track": 0.06})
     none = np.zeros_like(wheel)
     ways = Stand(wheel, none, vehicle, CELL).ways()
     expected = {STRAIGHT: {(8, 7), (8, 13), (12, 7), (12, 13)}, ACROSS: {(7, 8), (13, 8), (7, 12), (13, 12)}}
@@ -98,7 +87,7 @@ def test_where_a_vehicle_may_stand_equals_a_look_at_every_wheel(seed: int, margi
     """All three grounds, on maps narrower and wider than the words that masks are packed in."""
     rng = np.random.default_rng(seed)
     wheel, body, unknown = (rng.random((23, cols)) < 0.03 for _ in range(3))
-    vehicle = MODEL.model_copy(update={"wheel_base": 0.07, "track": 0.05, "margin": margin})
+    vehicle = SHORT.model_copy(update={"wheel_base": 0.07, "track": 0.05, "margin": margin})
     stand = Stand(wheel, body, vehicle, CELL, unknown)
     near, middle = grown(wheel, margin / CELL), grown(body, margin / CELL)
     found = {below: stand.ways(below) for below in ("outline", "wheels", "middle")}

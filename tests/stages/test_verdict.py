@@ -4,22 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from vehicles import MODEL
 
 from stages.hazards import BITS, MEASURES, Measured, limits, noise_factors
-from stages.vehicle import Vehicle
 from stages.verdict import CAUTION, DOUBT_BIT, FARTHEST, HAZARDOUS, STEPS, UNKNOWN, Rules, _table, classify
 
-MODEL = Vehicle(
-    name="model",
-    wheel_diameter=0.03,
-    track=0.08,
-    wheel_base=0.1,
-    clearance=0.03,
-    max_slope_deg=20.0,
-    max_step=0.015,
-    max_roughness=0.01,
-    margin=0.01,
-)
 RULES = Rules(sigmas=1.25, caution=0.75, max_p=0.02, min_known=0.5)
 
 
