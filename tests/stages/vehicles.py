@@ -14,15 +14,5 @@ MODEL = Vehicle(
     margin=0.01,
 )
 
-SHORT = Vehicle(
-    name="model",
-    wheel_diameter=0.03,
-    track=0.03,
-    wheel_base=0.02,
-    clearance=0.03,
-    max_slope_deg=20.0,
-    max_step=0.01,
-    max_roughness=0.01,
-    margin=0.0,
-)
+SHORT = MODEL.model_copy(update={"track": 0.03, "wheel_base": 0.02, "max_step": 0.01, "margin": 0.0})
 """Which covers few cells and keeps no margin."""
