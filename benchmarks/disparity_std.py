@@ -135,7 +135,7 @@ def main() -> None:
     options = parser.parse_args()
     from pipeline.environment import prepare_environment
 
-    prepare_environment(options.cache)
+    prepare_environment()
     pairs = {name: rendered(options.cache, p, frame) for name, (p, frame, _) in PAIRS.items()} | photographs()
     fitted = []
     for name, pair in pairs.items():

@@ -100,11 +100,10 @@ def table(rows: list[dict[str, Any]]) -> list[str]:
 
 def main() -> None:
     """Drive what is not there yet, and print the table."""
-    from pipeline.commands.options import cache_folder
     from pipeline.environment import prepare_environment
 
     given = arguments()
-    prepare_environment(cache_folder(None))
+    prepare_environment()
     rows = [json.loads(line) for line in given.out.read_text().splitlines()] if given.out.exists() else []
     done = {(r["seed"], r["cover"]) for r in rows}
     first, end = (int(v) for v in given.seeds.split(":"))

@@ -137,7 +137,7 @@ def main() -> None:
     from stages.pyramid import PyramidParams
 
     with tempfile.TemporaryDirectory(prefix="rille-large-") as folder:
-        prepare_environment(Path(folder) / "cache")
+        prepare_environment()
         shape = int(ROWS * options.scale), int(COLS * options.scale)
         store, params = Store(Path(folder) / "cache"), HfvmParams(preset=options.preset)
         paths = make_pair(Path(folder), shape)

@@ -121,11 +121,10 @@ def worst(rows: list[dict[str, Any]]) -> list[str]:
 
 def main() -> None:
     """Run what is not there yet, and print the table."""
-    from pipeline.commands.options import cache_folder
     from pipeline.environment import SINGLE, prepare_environment
 
     given = arguments()
-    prepare_environment(cache_folder(None))
+    prepare_environment()
     os.environ.update({f"{name}_NUM_THREADS": "1" for name in SINGLE})
     rows = [json.loads(line) for line in given.out.read_text().splitlines()] if given.out.exists() else []
     done = {r["name"] for r in rows}

@@ -85,10 +85,9 @@ def arguments() -> argparse.Namespace:
 
 def start_process(threads: int) -> None:
     """Place of compiled kernels and number of threads, before NumPy and numba are imported."""
-    from pipeline.commands.options import cache_folder
     from pipeline.environment import SINGLE, prepare_environment
 
-    prepare_environment(cache_folder(None))
+    prepare_environment()
     os.environ.update({f"{name}_NUM_THREADS": str(threads) for name in SINGLE})
     os.environ["OPENCV_FOR_THREADS_NUM"] = str(threads)
 

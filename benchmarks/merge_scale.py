@@ -113,7 +113,7 @@ def main() -> int:
         from pipeline.executor import prepare_environment
 
         cache = args.cache or Path(temporary) / "cache"
-        prepare_environment(cache)
+        prepare_environment()
         where = places(args.side, args.models, args.cells)
         print(f"{len(where)} models of {args.cells} x {args.cells} cells over {args.side} x {args.side}")
         before = merged(cache, where, args.cells, args.jobs, Path(temporary) / "first.jsonl")

@@ -2,7 +2,7 @@
 
 ``python benchmarks/runs.py [--sequence mockup] [--warm 5] [--bucket]``
 
-A cold run starts with an empty cache, where compiled kernels are kept, too; warm runs follow, with nothing to compute.
+A cold run starts with an empty cache and no compiled kernels; warm runs follow, with nothing to compute.
 ``--bucket`` repeats both with the cache in a bucket of moto's S3 server on this machine (a process of its own). Printed
 are wall and processor time, the bound ``1.15 x max(seconds of stages / cores, longest chain) + 5 s`` of the cold run
 with ``rille timing``'s account, and for warm runs that no worker was started: a run that starts none writes no ledger.
@@ -66,7 +66,7 @@ def bucket() -> Iterator[dict[str, str]]:
 def measure(sequence: str, cache: str, folder: Path, warm: int, environment: dict[str, str]) -> None:
     """Print one cold run with its account, and some warm ones."""
     where = ["--cache", cache, "--runs", str(folder / "runs")]
-    environment = {**os.environ, "RILLE_LOCAL": str(folder / "local"), **environment}
+    environment = {**os.environ, "RILLE_LOCAL": str(folder / "local"), "XDG_CACHE_HOME": str(folder), **environment}
     wall, used, text = rille("reconstruct", sequence, *where, environment=environment)
     print(f"cold   {wall:7.2f} s by the clock, {used:7.2f} s of processors: {text.split('  ')[-1].strip()}")
     _, _, account = rille("timing", sequence, "--runs", str(folder / "runs"), environment=environment)

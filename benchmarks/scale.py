@@ -273,7 +273,7 @@ def main() -> None:
     if given.what != "all":
         from pipeline.environment import prepare_environment
 
-        prepare_environment(given.folder / "cache")
+        prepare_environment()
         print(json.dumps(measure(given.pairs, given.folder / "cache", given.executor, given.jobs, given.what)))
         return
     sizes = [max(2, given.pairs // 4), given.pairs]

@@ -75,7 +75,7 @@ def reconstruct(
     seq
         A name from `rille datasets`, or a folder whose layout is recognised.
     """
-    prepare(settings.cache)
+    prepare()
     from pipeline import run
 
     given = options(
@@ -102,7 +102,7 @@ def drive(
     seq
         A simulated sequence; mockup-loop.
     """
-    prepare(settings.cache)
+    prepare()
     from pipeline import run
 
     return run.reconstruct(options(seq, settings, results, executor=executor, verb="drive"))
@@ -127,7 +127,7 @@ def plan(
     executor
         Where tasks would run.
     """
-    prepare(settings.cache)
+    prepare()
     from pipeline import plan as command
 
     given = options(seq, settings, _RESULTS, frames=frames, executor=executor, memory_limit=memory_limit)
@@ -188,7 +188,7 @@ def check(
     output
         PNG to write; SEQUENCE-check.png by default.
     """
-    prepare(cache)
+    prepare()
     from pipeline import check as command
     from pipeline.run import choose_frames
     from pipeline.run import settings as settle

@@ -159,7 +159,7 @@ def _no_cache(name: str, cache: Location, why: str) -> ConfigError:
     return ConfigError(f"{name} does not share the cache {cache}: {why}", remedy=remedy)
 
 
-def ready(ours: tuple[tuple[str, str], ...], cache: Location) -> None:
+def ready(ours: tuple[tuple[str, str], ...]) -> None:
     """On a worker before each task: prepared as our own workers are, and the same as the client.
 
     Raises
@@ -167,13 +167,13 @@ def ready(ours: tuple[tuple[str, str], ...], cache: Location) -> None:
     CodeChangedError
         It is not.
     """
-    if difference := _prepared(ours, cache, os.getpid()):
+    if difference := _prepared(ours, os.getpid()):
         raise CodeChangedError(f"worker {_here()} differs: {difference}", remedy="install the same there")
 
 
 @lru_cache(maxsize=4)
-def _prepared(ours: tuple[tuple[str, str], ...], cache: Location, process: int) -> str:
-    prepare_environment(cache)
+def _prepared(ours: tuple[tuple[str, str], ...], process: int) -> str:
+    prepare_environment()
     return unlike(identity(), dict(ours))
 
 

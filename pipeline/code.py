@@ -110,7 +110,7 @@ def code_digest(module: str, own: Iterable[str] = OWN) -> str:
 
 
 def tree_digest(own: Iterable[str] = OWN) -> str:
-    """One digest of all modules of the own packages, reached or not (numba's cache folder is named by it)."""
+    """One digest of all modules of the own packages, reached or not."""
     found: dict[str, str] = {}
     for package in own:
         for root in _roots(package):

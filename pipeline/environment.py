@@ -6,40 +6,28 @@ Call :func:`prepare_environment` first thing in a program. Worker processes get 
 from __future__ import annotations
 
 import os
-import sys
-from pathlib import Path
 
-from pipeline.code import remember_in, tree_digest
+from pipeline.code import remember_in
 from pipeline.kernels import guard
-from pipeline.location import hints_folder, locate
+from pipeline.private import private_folder
 
 SINGLE = ("OMP", "OPENBLAS", "MKL", "NUMBA", "BLIS", "VECLIB_MAXIMUM", "NUMEXPR")
 
 
-def worker_environment(cache: Path | str) -> dict[str, str]:
-    """One thread a library, and numba's cache in a folder named by the digest of all own code.
-
-    Numba does not notice that a callee in another file has changed (numba#1833), hence a folder for each state of
-    the sources.
-    """
-    cache = hints_folder(locate(cache))
+def worker_environment() -> dict[str, str]:
+    """One thread a library."""
     return {f"{name}_NUM_THREADS": "1" for name in SINGLE} | {
         "OPENCV_FOR_THREADS_NUM": "1",
         # a killed worker's semaphores are the tracker's business, not the user's
         "PYTHONWARNINGS": os.environ.get("PYTHONWARNINGS") or "ignore:resource_tracker:UserWarning",
-        "NUMBA_CACHE_DIR": str(cache.absolute() / "numba" / tree_digest()[:32]),
     }
 
 
-def prepare_environment(cache: Path | str) -> None:
+def prepare_environment() -> None:
     """Set this process up to run stages itself, and to start workers."""
-    cache = hints_folder(locate(cache))
-    remember_in(cache / "sources.json")
-    environment = worker_environment(cache)
-    os.environ.update(environment)
+    remember_in(private_folder() / "sources.json")
+    os.environ.update(worker_environment())
     guard()
-    if "numba" in sys.modules:
-        sys.modules["numba"].config.CACHE_DIR = environment["NUMBA_CACHE_DIR"]
 
 
 def cores() -> int:

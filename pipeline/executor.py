@@ -290,7 +290,7 @@ def _elsewhere(
 ) -> Outcome | Failed:
     """Run a task on a worker that somebody else has started."""
     try:
-        cluster.ready(identity, root)
+        cluster.ready(identity)
     except Exception as error:
         return Failed.of(error)
     return _attempt(key, root, spec, refs, force)
@@ -300,7 +300,7 @@ class Processes:
     """Worker processes of our own, one thread each (:mod:`pipeline.workers`)."""
 
     def __init__(self, jobs: int, cache: Location, memory: float = math.inf, modules: Sequence[str] = ()) -> None:
-        self._workers = Workers(jobs, _attempt, cache, memory, resolve, modules)
+        self._workers = Workers(jobs, _attempt, memory, resolve, modules)
 
     def idle(self) -> bool:
         """Whether a worker has nothing to do; it may still be starting."""

@@ -1,9 +1,13 @@
-"""Numba's cache of compiled kernels on disk, made safe: a damaged file, or another signature's, counts as none.
+"""Compiled kernels on disk: of this user alone, found by the code that they were made from, checked before they run.
 
-Numba 0.68 trusts what it finds there. A file cut short (the power failed before it was flushed) fails every later run
-until somebody removes it, a flipped bit is executed, and two processes that compile two signatures of one function at
-once may both take the same number, so that the index names the other's code. Here each entry is a file of its own,
-named by its key; it holds the key and a checksum.
+Numba 0.68 keeps a kernel by the path and the bytes of its own file. It does not notice that a callee in another file
+has changed (numba#1833), it trusts what it finds (a file cut short fails every later run, a flipped bit is executed),
+and two processes that compile two signatures of one function at once may both take the same number. Here
+
+- a kernel is known by the digest of its module and of all own modules that this one reaches (:mod:`pipeline.code`), so
+  that an edit compiles anew what it can change, and nothing else;
+- each entry is a file of its own, named by its key; it holds the key and a checksum, against damage;
+- all lie in :func:`pipeline.private.private_folder`, because loading one executes it.
 """
 
 from __future__ import annotations
@@ -11,14 +15,23 @@ from __future__ import annotations
 import hashlib
 import importlib.abc
 import importlib.util
+import os
 import pickle
 import sys
+import time
+from contextlib import suppress
 from importlib.machinery import ModuleSpec
 from pathlib import Path
-from types import ModuleType
+from types import CodeType, ModuleType
 from typing import Any
 
+from pipeline.code import OWN, code_digest
+from pipeline.private import private_folder
+
 CACHING = "numba.core.caching"
+
+UNUSED_DAYS = 30
+"""A kernel that was not loaded for so long is removed by ``rille cache gc``."""
 
 
 def guard() -> None:
@@ -27,6 +40,17 @@ def guard() -> None:
         _patch(sys.modules[CACHING])
     elif not any(isinstance(finder, _Finder) for finder in sys.meta_path):
         sys.meta_path.insert(0, _Finder())
+
+
+def folder() -> Path:
+    """Where the kernels of own modules lie."""
+    return private_folder() / "kernels"
+
+
+def unused(now: float | None = None) -> list[Path]:
+    """Kernels that nothing loaded for :data:`UNUSED_DAYS`."""
+    limit = (time.time() if now is None else now) - 86400 * UNUSED_DAYS
+    return [path for path in sorted(folder().glob("*")) if path.stat().st_mtime <= limit]
 
 
 class _Finder(importlib.abc.MetaPathFinder):
@@ -48,6 +72,38 @@ class _Finder(importlib.abc.MetaPathFinder):
         return spec
 
 
+class _Locator:
+    """Place and stamp of an own module's kernels (the interface of numba's locators)."""
+
+    def __init__(self, function: Any, file: str) -> None:
+        module = function.__module__
+        self._stamp = repr((module, function.__qualname__, code_digest(module), _content(function.__code__)))
+        self._py_file = file  # numba names it in a warning
+
+    @classmethod
+    def from_function(cls, function: Any, file: str) -> _Locator | None:
+        """None for functions of others: numba keeps these as it always does."""
+        own = function.__module__.partition(".")[0] in OWN
+        return cls(function, file) if own else None
+
+    def ensure_cache_path(self) -> None:
+        folder().mkdir(mode=0o700, exist_ok=True)
+
+    def get_cache_path(self) -> str:
+        return str(folder())
+
+    def get_source_stamp(self) -> str:
+        return self._stamp
+
+    def get_disambiguator(self) -> str:
+        return "own"
+
+
+def _content(code: CodeType) -> tuple[object, ...]:
+    """What tells apart two functions of one name that a factory makes; numba's key has the bytecode alone."""
+    return code.co_names, [_content(c) if isinstance(c, CodeType) else repr(c) for c in code.co_consts]
+
+
 def _patch(caching: Any) -> None:
     kind = caching.IndexDataCacheFile
     if getattr(kind, "guarded", False):
@@ -63,13 +119,17 @@ def _patch(caching: Any) -> None:
             file.write(hashlib.sha256(body).digest() + body)
 
     def load(self: Any, key: Any) -> Any:
+        file = path(self, key)
         try:
-            content = path(self, key).read_bytes()
+            content = file.read_bytes()
         except OSError:
             return None
         if hashlib.sha256(content[32:]).digest() != content[:32]:
             return None
+        with suppress(OSError):
+            os.utime(file)  # it is in use
         *found, data = pickle.loads(content[32:])
         return data if found == [self._version, self._source_stamp, key] else None
 
     kind.save, kind.load, kind.flush, kind.guarded = save, load, lambda self: None, True
+    caching.CacheImpl._locator_classes.insert(0, _Locator)

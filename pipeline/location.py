@@ -1,7 +1,7 @@
 """Where a cache is: a folder, or ``s3://bucket/prefix``; and the local folder of what is only a hint.
 
-Compiled kernels, digests of source files, labels for explanations and mean times are hints of one machine. With a cache
-in a bucket they are kept in a folder beside it on this machine (``RILLE_LOCAL``, else ``.rille/local``).
+Labels for explanations and mean times are hints of one machine. With a cache in a bucket they are kept in a folder
+beside it on this machine (``RILLE_LOCAL``, else ``.rille/local``).
 """
 
 from __future__ import annotations

@@ -8,7 +8,6 @@ Layout under the cache folder::
     labels/...  seconds.json  costs.json         hints for explanations and estimates; never a matter of correctness
     index/<sequence>                             what its last run found: spares reading manifests that nobody touched
     pins/<run>.json                              keys that clearing up leaves alone
-    numba/<digest>/                              compiled kernels by digest of all own code
 
 An attempt becomes an artifact when its manifest is linked into place, create-if-absent, after all its files are on
 the disk. Killed at any instant, a run leaves either a whole artifact or an orphan that nobody reads. Of two that

@@ -9,9 +9,8 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from pipeline import object_upkeep
+from pipeline import kernels, object_upkeep
 from pipeline.artifact import DamagedError, LazyArrays, array_digests, damage, output_digest
-from pipeline.code import tree_digest
 from pipeline.objects import ObjectStore
 from pipeline.store import Manifest, Store
 
@@ -82,7 +81,7 @@ def _decoded(store: Store, manifest: Manifest) -> str:
 
 
 def gc(store: Store, keep: Collection[str], *, grace: float = GRACE, dry_run: bool = False) -> Cleared:
-    """Remove artifacts whose key is not in ``keep``, and orphans, quarantine and compiled kernels of other sources.
+    """Remove artifacts whose key is not in ``keep``, orphans, quarantine, and this user's kernels that nothing uses.
 
     Only what was neither made nor used within ``grace`` seconds goes (a run may be under way). The manifest goes first,
     so that an interruption leaves an orphan and never half an artifact. ``keep`` are the keys of the kept runs
@@ -99,10 +98,11 @@ def gc(store: Store, keep: Collection[str], *, grace: float = GRACE, dry_run: bo
         if _written(path) <= limit:
             cleared.orphans += 1
             _remove(path, cleared, dry_run)
-    current = tree_digest()
-    for path in (*store.root.glob("quarantine/*"), *store.root.glob("numba/*"), *store.root.glob("index/*")):
-        if _written(path) <= limit and not current.startswith(path.name):
+    for path in (*store.root.glob("quarantine/*"), *store.root.glob("index/*")):
+        if _written(path) <= limit:
             _remove(path, cleared, dry_run)
+    for path in kernels.unused():
+        _remove(path, cleared, dry_run)
     return cleared
 
 

@@ -23,7 +23,7 @@ import psutil
 
 from pipeline.code import remember_in
 from pipeline.environment import worker_environment
-from pipeline.location import Location, hints_folder, locate
+from pipeline.private import private_folder
 from stages.errors import RilleError
 
 DEATHS = 3
@@ -73,12 +73,11 @@ class Workers:
         self,
         count: int,
         attempt: Callable[..., Any],
-        cache: Location,
         memory: float = math.inf,
         prepare: Callable[[str], Any] = str,
         names: Sequence[str] = (),
     ) -> None:
-        self._attempt, self._cache, self._memory = attempt, cache, memory
+        self._attempt, self._memory = attempt, memory
         self._prepare, self._names = prepare, tuple(names)
         self._tasks: dict[str, Task] = {}
         self._deaths: Counter[str] = Counter()
@@ -97,9 +96,9 @@ class Workers:
     def _start(self) -> _Worker:
         context = multiprocessing.get_context("spawn")
         here, there = context.Pipe()
-        args = (there, self._attempt, self._cache, self._prepare, self._names)
+        args = (there, self._attempt, self._prepare, self._names)
         process = context.Process(target=_serve, args=args, daemon=True)
-        with _environment(worker_environment(self._cache)):
+        with _environment(worker_environment()):
             process.start()
         there.close()  # so that its death ends the pipe
         return _Worker(process, here)
@@ -202,7 +201,6 @@ class Workers:
 def _serve(
     pipe: connection.Connection,
     attempt: Callable[..., Any],
-    cache: Location,
     prepare: Callable[[str], Any],
     names: Sequence[str],
 ) -> None:
@@ -211,7 +209,7 @@ def _serve(
     parent = multiprocessing.parent_process()
     assert parent is not None
     threading.Thread(target=_leave_with, args=(parent.sentinel,), daemon=True).start()
-    remember_in(hints_folder(locate(cache)) / "sources.json")
+    remember_in(private_folder() / "sources.json")
     with suppress(EOFError, BrokenPipeError, ConnectionResetError):
         pipe.send(None)
         to_come = list(reversed(names))

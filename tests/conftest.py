@@ -9,7 +9,7 @@ import pytest
 
 from pipeline.environment import prepare_environment
 
-prepare_environment(Path(__file__).resolve().parent.parent / ".rille" / "cache")  # before NumPy and numba
+prepare_environment()  # before NumPy and numba
 
 
 @pytest.fixture(scope="session")

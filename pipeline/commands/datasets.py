@@ -39,7 +39,7 @@ def export(
     directory
         Folder to make; it must not exist yet or be empty.
     """
-    prepare(cache)
+    prepare()
     from pipeline import run
 
     return run.export_dataset(seq, directory, tuple(assignments or ()), cache_folder(cache))

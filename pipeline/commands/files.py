@@ -99,7 +99,7 @@ def match(
         TIFF to write with the bands disparity_std (pixels, standard deviation of the column), validity (bits) and
         backmatch_error (pixels).
     """
-    prepare(None)
+    prepare()
     from pipeline import match as command
 
     return command.match_files(
@@ -140,7 +140,7 @@ def export(
         raise ConfigError(
             f"--output names one place for {len(to)} forms", remedy="give one --to, or leave --output out"
         )
-    prepare(cache)
+    prepare()
     for kind in to:
         print(_export(run, kind, output, cache))
     return COMPLETE
@@ -183,7 +183,7 @@ def compare_dem(
     output
         Files to write, without ending.
     """
-    prepare(None)
+    prepare()
     from pipeline import compare_dem as command
 
     return command.compare(a, b, align=align, output=output)

@@ -123,9 +123,8 @@ def cache_folder(given: str | Path | None) -> Path | str:
     return locate(given or os.environ.get("RILLE_CACHE") or Path(".rille/cache"))
 
 
-def prepare(cache: str | None) -> None:
-    """Threads and the place of compiled kernels, before NumPy and numba are imported."""
+def prepare() -> None:
+    """One thread a library, and safe kernels, before NumPy and numba are imported."""
     from pipeline.environment import prepare_environment
-    from pipeline.location import hints_folder
 
-    prepare_environment(hints_folder(cache_folder(cache)))
+    prepare_environment()

@@ -166,7 +166,7 @@ def test_an_edit_computes_again_exactly_what_it_can_change(editable):
 
 def test_a_worker_that_waits_prepares_what_is_to_come(cache, tmp_path):
     names = [str(tmp_path / name) for name in ("first", "bad", "last")]
-    workers = Workers(1, waiting.answer, cache, prepare=waiting.note, names=names)
+    workers = Workers(1, waiting.answer, prepare=waiting.note, names=names)
     try:
         until = time.monotonic() + HANGS
         while len(list(tmp_path.iterdir())) < len(names) and time.monotonic() < until:
@@ -180,7 +180,7 @@ def test_a_worker_that_waits_prepares_what_is_to_come(cache, tmp_path):
 
 def test_a_preparation_that_kills_workers_ends_the_run(cache, tmp_path, monkeypatch):
     monkeypatch.setattr("pipeline.workers.UNREADY", 1)
-    workers = Workers(1, waiting.answer, cache, prepare=waiting.note, names=[str(tmp_path / "deadly")])
+    workers = Workers(1, waiting.answer, prepare=waiting.note, names=[str(tmp_path / "deadly")])
     try:
         with pytest.raises(WorkerDiedError, match="died without a task"):
             workers.wait()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -10,6 +11,7 @@ from pathlib import Path
 import pytest
 from numba.core import caching
 
+from pipeline import kernels
 from pipeline.kernels import guard
 
 ROOT = Path(__file__).resolve().parent.parent.parent
@@ -78,3 +80,69 @@ def test_numba_itself_finds_its_kernels_and_survives_damage(tmp_path):
     first.write_bytes(b"")
     assert said() == ["42", "5.0", "1"]
     assert said() == ["42", "5.0", "2"]
+
+
+CALLEE = "import numba\n@numba.njit(cache=True)\ndef twice(x):\n    return x * 2\n"
+CALLER = "import numba\nfrom stages.callee import twice\n@numba.njit(cache=True)\ndef f(x):\n    return twice(x) + 1\n"
+RUN = """
+from pipeline.environment import prepare_environment
+prepare_environment()
+from stages.caller import f
+print(f(21), sum(f.stats.cache_hits.values()))
+"""
+
+
+@pytest.fixture
+def checkout(tmp_path):
+    """``checkout(name)``: own modules in which one kernel calls another file's; ``said`` runs it as a new process."""
+    environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path / "user")}
+
+    def make(name):
+        stages = tmp_path / name / "stages"
+        stages.mkdir(parents=True)
+        for file, text in {"__init__": "", "callee": CALLEE, "caller": CALLER}.items():
+            (stages / f"{file}.py").write_text(text)
+        shutil.copy(ROOT / "stages" / "errors.py", stages)
+
+        def said():
+            path = os.pathsep.join([str(tmp_path / name), str(ROOT)])
+            done = subprocess.run(
+                [sys.executable, "-c", RUN],
+                env={**environment, "PYTHONPATH": path},
+                cwd=tmp_path,
+                capture_output=True,
+                text=True,
+                check=True,
+            )
+            return done.stdout.split()
+
+        return stages, said
+
+    return make
+
+
+def test_a_kernel_is_compiled_anew_when_another_file_changes_that_it_calls(checkout):
+    stages, said = checkout("one")
+    assert said() == ["43", "0"]
+    assert said() == ["43", "1"]
+    (stages / "callee.py").write_text(CALLEE.replace("x * 2", "x * 3"))
+    assert said() == ["64", "0"]
+
+
+def test_an_edit_beside_it_compiles_nothing_and_checkouts_share(checkout, tmp_path):
+    _, said = checkout("one")
+    said()
+    stages, said = checkout("two")
+    (stages / "other.py").write_text("X = 1\n")
+    (stages / "caller.py").write_text(f'"""Words."""\n\n# and a comment\n{CALLER}')
+    assert said() == ["43", "1"]
+    assert {path.parent for path in tmp_path.rglob("*.nbc")} == {tmp_path / "user" / "rille" / "kernels"}
+
+
+def test_kernels_that_nothing_loads_are_cleared(tmp_path, monkeypatch):
+    monkeypatch.setattr(kernels, "folder", lambda: tmp_path)
+    old, new = tmp_path / "old.nbc", tmp_path / "new.nbc"
+    for path in (old, new):
+        path.write_bytes(b"")
+    os.utime(old, (0, 0))
+    assert kernels.unused() == [old]

@@ -95,7 +95,7 @@ def programs(tmp_path_factory: pytest.TempPathFactory):
     from pipeline.environment import worker_environment
 
     folder = tmp_path_factory.mktemp("programs")
-    environment = {**os.environ, **worker_environment(folder), "PYTHONPATH": os.pathsep.join(PLACES)}
+    environment = {**os.environ, **worker_environment(), "PYTHONPATH": os.pathsep.join(PLACES)}
 
     def give(count: int) -> list[Program]:
         while len(made) < count:

@@ -171,8 +171,6 @@ TILED = ("--frames", "0:2", "--set", "hfvm.preset=fast", "--set", "crosscheck.en
 
 def test_workers_killed_mid_tile(whole, tmp_path, row):
     calm, torn = tmp_path / "calm", tmp_path / "torn"
-    for where in (calm, torn):  # compiling them is not the point here
-        shutil.copytree(whole.where / "cache" / "numba", where / "cache" / "numba")
     subprocess.run(command(calm, *TILED), check=True, stdout=subprocess.DEVNULL)
     process, kills, tiles = begin(torn, *TILED, "--set", "tiling.tile=128", progress="json"), 0, 0
     for line in process.stderr:

@@ -31,7 +31,7 @@ def main(cache, executor="inline", what="", ledger=""):
     """Run it, and say what became of it."""
     from pipeline.executor import prepare_environment
 
-    prepare_environment(cache)
+    prepare_environment()
     from pipeline import driver
     from pipeline.dag import Graph
     from pipeline.store import Store
