@@ -1,4 +1,4 @@
-"""What tasks cost in memory and bytes: remembered from earlier runs on a cache, and foreseen for those to come.
+"""What tasks cost in memory and bytes: remembered from earlier runs of a sequence, and foreseen for those to come.
 
 Each run leaves, for each stage and each set of its parameters, samples of what its tasks took: bytes of their inputs,
 memory, bytes of the result decoded and on disk (``costs.json``, a hint like the explanations: where it is missing or
@@ -14,6 +14,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
+from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +23,6 @@ from stages.declare import Params
 
 if TYPE_CHECKING:
     from pipeline.dag import Handle
-    from pipeline.store import Store
     from pipeline.task import Spec
 
 FILE = "costs.json"
@@ -224,10 +224,10 @@ def _meta(handle: Handle) -> Any:
     return ref.meta if ref is not None else {}
 
 
-def recall(store: Store) -> Costs:
-    """What is remembered on this cache; nothing where that cannot be read."""
+def recall(hints: Path) -> Costs:
+    """What is remembered in a sequence's folder of hints; nothing where that cannot be read."""
     try:
-        known = json.loads((store.root / FILE).read_text(encoding="utf-8"))
+        known = json.loads((hints / FILE).read_text(encoding="utf-8"))
         groups = {
             stage: {
                 name: Group(int(g["runs"]), int(g["tasks"]), [(s[0], s[1], s[2], s[3]) for s in g["samples"]])
@@ -240,16 +240,17 @@ def recall(store: Store) -> Costs:
         return Costs()
 
 
-def remember(store: Store, handles: Iterable[Handle]) -> None:
+def remember(hints: Path, handles: Iterable[Handle]) -> None:
     """Add what was computed now; best effort."""
     computed = [h for h in handles if h.status == "computed"]
     if not computed:
         return
-    costs = recall(store)
+    costs = recall(hints)
     costs.learn(computed)
     stages = {stage: {name: vars(g) for name, g in named.items()} for stage, named in costs.groups.items()}
-    path = store.root / FILE
+    path = hints / FILE
     temporary = path.with_name(f"{FILE}.{os.getpid()}.tmp")
     with suppress(OSError):
+        hints.mkdir(parents=True, exist_ok=True)
         temporary.write_text(json.dumps({"stages": stages, "rests": costs.rests}), encoding="utf-8")
         temporary.replace(path)

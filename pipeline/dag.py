@@ -83,6 +83,9 @@ class Handle:
 class Graph:
     """Nodes in order of creation, and expansions that wait for some of them."""
 
+    sequence: str = ""
+    """Name of the sequence it works on, and of the choice of its frames: hints of earlier runs are kept by them."""
+    choice: str = ""
     nodes: list[Handle] = field(default_factory=list)
     expansions: list[tuple[list[Handle], Expansion]] = field(default_factory=list)
     _labels: set[str] = field(default_factory=set)

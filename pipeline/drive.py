@@ -36,6 +36,7 @@ from pydantic import Field
 from datasets.protocol import Sequence, Simulation, Source
 from pipeline.config import STAGE_MODULES
 from pipeline.dag import Graph, Handle
+from pipeline.key import digest
 from pipeline.reconstruct import Products, Reconstruction
 from pipeline.task import Ref
 from stages.declare import Params
@@ -582,5 +583,6 @@ class Drive(Reconstruction):
 
 def dataflow(graph: Graph, sequence: Sequence, config: Any, frames: tuple[int, ...]) -> Reconstruction:
     """The builder that suits a sequence: of a recorded one, or of one that is driven."""
+    graph.sequence, graph.choice = sequence.name, digest(frames)[:16]
     kind = Reconstruction if sequence.simulation is None else Drive
     return kind(graph, sequence, config, frames)

@@ -209,6 +209,8 @@ class _Run:
         self.put_back: dict[str, int] = defaultdict(int)
         self.fates: dict[int, str] = {}
         self.expansions: list[tuple[list[Handle], Expansion]] = []
+        self.hints = store.hints(graph.sequence)
+        self.known = explain.Known(self.hints, graph.choice)
 
     def go(self) -> Result:
         begin = time.perf_counter()
@@ -224,10 +226,12 @@ class _Run:
             self._close(kill=False)
             if not self.dry:
                 self.store.note(h.ref for h in self.graph.nodes if h.ref is not None)
-                remember_seconds(self.store, self.result.counts)
-                costs.remember(self.store, self.graph.nodes)
+                remember_seconds(self.hints, self.result.counts)
+                costs.remember(self.hints, self.graph.nodes)
         finally:
             gc.unfreeze()
+            if not self.dry:
+                self.known.save(self.graph.nodes)
             self.result.seconds = time.perf_counter() - begin
             self.ledger.run(seconds=round(self.result.seconds, 3), ok=self.result.ok)
             self.progress.close(self.result)
@@ -239,7 +243,7 @@ class _Run:
             self.executor.close(kill=kill)
 
     def _loop(self, interrupts: Interrupts) -> None:
-        self.progress.open(self.graph, recall_seconds(self.store), self.jobs or cores())
+        self.progress.open(self.graph, recall_seconds(self.hints), self.jobs or cores())
         self.store.survey(_sequence(self.graph))
         while True:
             self._settle()
@@ -289,7 +293,7 @@ class _Run:
             self._resolve(handle, "cached")
             return
         made = recipe(handle.spec, refs)
-        handle.reason = "forced" if forced else explain.reason(self.store, handle.stage, handle.label, key, made)
+        handle.reason = "forced" if forced else self.known.reason(self.store, handle.stage, handle.label, key, made)
         if self.dry:
             self._resolve(handle, "planned")
         elif key in self.flying:
@@ -303,12 +307,16 @@ class _Run:
         for i, (handles, fn) in enumerate(self.expansions):
             if all(h.done or h.earlier for h in handles):
                 del self.expansions[i]
-                self.result.assumed += [h.label for h in handles if not h.done]
+                assumed = [h.label for h in handles if not h.done]
+                self.result.assumed += assumed
                 before = len(self.graph.nodes)
                 try:
                     fn(*(h.ref or h.earlier for h in handles))
                 except Exception as error:
-                    self._failed(Failure(f"plan after {_labels(handles)}", "", error, Failed.of(error).traceback))
+                    if assumed:  # what was found with other parameters or images does not fit: no more can be said
+                        self.result.unknown += assumed
+                    else:
+                        self._failed(Failure(f"plan after {_labels(handles)}", "", error, Failed.of(error).traceback))
                 self.ledger.expansion([h.label for h in handles], [h.label for h in self.graph.nodes[before:]])
                 return True
         return False
@@ -353,7 +361,7 @@ class _Run:
 
     def _begin(self) -> None:
         """Look ahead, share the memory out, and start the workers that it leaves room for."""
-        known, jobs = costs.recall(self.store), self.jobs or cores()
+        known, jobs = costs.recall(self.hints), self.jobs or cores()
         ahead = self._look_ahead()
         most = max(largest(ahead, known), *(known.foresee(h.spec, input_bytes(h)).most for h in self.missing))
         shares = account(known, self.memory_limit, self.executor_kind, jobs, most)
@@ -444,7 +452,7 @@ class _Run:
     def _resolve(self, handle: Handle, status: str) -> None:
         handle.status = status
         if status == "planned":
-            handle.earlier = explain.latest(self.store, handle.stage, handle.label)
+            handle.earlier = self.known.latest(self.store, handle.stage, handle.label)
         counts = self.result.counts.setdefault(handle.stage, Counts())
         setattr(counts, status, getattr(counts, status) + 1)
         counts.seconds += handle.seconds

@@ -1,22 +1,21 @@
 """Why a task is not in the cache, in words, against the most similar earlier artifact of the same stage and label.
 
-A small file per stage and label remembers the last few keys. It is a hint: written without care for crashes, and
-where it is wrong or missing only the words suffer.
+A file for each sequence and choice of frames remembers the last few keys of each task. It is a hint: written once, at
+the end of a run, and where it is wrong or missing only the words suffer.
 """
 
 from __future__ import annotations
 
 import json
 import os
-import uuid
-import zlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from urllib.parse import quote
 
 if TYPE_CHECKING:
+    from pipeline.dag import Handle
     from pipeline.store import Ref, Store
 
 KEPT = 4
@@ -25,36 +24,64 @@ KEPT = 4
 SHOWN = 3
 """Differences told per node."""
 
-
-def remember(store: Store, stage: str, label: str, key: str) -> None:
-    """Note that ``key`` was the latest of this stage and label."""
-    path = _index(store, stage, label)
-    with suppress(OSError):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        keys = [key, *(k for k in _recall(path) if k != key)][:KEPT]
-        temporary = path.with_name(f"{path.name}.{uuid.uuid4().hex[:8]}.tmp")
-        temporary.write_text(json.dumps(keys), encoding="utf-8")
-        os.replace(temporary, path)
+Keys = dict[str, list[str]]
+"""Stage and label to keys, the latest first."""
 
 
-def reason(store: Store, stage: str, label: str, key: str, recipe: Mapping[str, Any]) -> str:
-    """Why ``key`` is missed, in words: ``params.cell_size 0.02 -> 0.01``, ``never computed`` ..."""
-    keys = _recall(_index(store, stage, label))
-    if key in keys:
-        return "was computed before, its artifact is gone or damaged"
-    earlier = [m["provenance"] for k in keys if (m := store.manifest(stage, k)) is not None]
-    if not earlier:
-        return "never computed" if not keys else "earlier artifacts are gone"
-    now = {**recipe, "params": recipe["params"].model_dump(mode="json")}
-    now = json.loads(json.dumps(now))
-    found = min((differences(then, now) for then in earlier), key=len)
-    told = found[:SHOWN] + ([f"and {len(found) - SHOWN} more"] if len(found) > SHOWN else [])
-    return "; ".join(told) or "the key has another format"
+class Known:
+    """The latest keys of each task of a sequence.
 
+    Parameters
+    ----------
+    hints : the sequence's folder of hints.
+    choice : names the choice of frames. What is to be laid out follows results of the same choice alone; a reason may
+        come from another one, where this one has none.
+    """
 
-def latest(store: Store, stage: str, label: str) -> Ref | None:
-    """The latest artifact of a stage and label that is still there, whatever it was made from."""
-    return next((ref for k in _recall(_index(store, stage, label)) if (ref := store.lookup(stage, k))), None)
+    def __init__(self, hints: Path, choice: str) -> None:
+        self._path = hints / f"keys-{choice}.json"
+
+    @cached_property
+    def _own(self) -> Keys:
+        return _read(self._path)
+
+    @cached_property
+    def _others(self) -> list[Keys]:
+        """Of other choices of frames, the newest first."""
+        found = [p for p in self._path.parent.glob("keys-*.json") if p != self._path]
+        return [_read(p) for p in sorted(found, key=_written, reverse=True)]
+
+    def reason(self, store: Store, stage: str, label: str, key: str, recipe: Mapping[str, Any]) -> str:
+        """Why ``key`` is missed, in words: ``params.cell_size 0.02 -> 0.01``, ``never computed`` ..."""
+        name = _name(stage, label)
+        keys = self._own.get(name) or next((k[name] for k in self._others if name in k), [])
+        if key in keys:
+            return "was computed before, its artifact is gone or damaged"
+        earlier = [m["provenance"] for k in keys if (m := store.manifest(stage, k)) is not None]
+        if not earlier:
+            return "never computed" if not keys else "earlier artifacts are gone"
+        now = {**recipe, "params": recipe["params"].model_dump(mode="json")}
+        now = json.loads(json.dumps(now))
+        found = min((differences(then, now) for then in earlier), key=len)
+        told = found[:SHOWN] + ([f"and {len(found) - SHOWN} more"] if len(found) > SHOWN else [])
+        return "; ".join(told) or "the key has another format"
+
+    def latest(self, store: Store, stage: str, label: str) -> Ref | None:
+        """The latest artifact of a stage and label that is still there, whatever it was made from."""
+        return next((ref for k in self._own.get(_name(stage, label), []) if (ref := store.lookup(stage, k))), None)
+
+    def save(self, nodes: Iterable[Handle]) -> None:
+        """Note what a run used; best effort."""
+        known = _read(self._path)
+        used = {_name(h.stage, h.label): h.key for h in nodes if h.ref is not None}
+        if all(known.get(name, [""])[0] == key for name, key in used.items()):
+            return
+        known |= {name: [key, *(k for k in known.get(name, []) if k != key)][:KEPT] for name, key in used.items()}
+        temporary = self._path.with_name(f"{self._path.name}.{os.getpid()}.tmp")
+        with suppress(OSError):
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            temporary.write_text(json.dumps(known), encoding="utf-8")
+            temporary.replace(self._path)
 
 
 def differences(then: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
@@ -110,14 +137,19 @@ def _change(name: str, old: Mapping[str, str], new: Mapping[str, str]) -> str:
     return "is new" if name not in old else "is gone" if name not in new else "changed"
 
 
-def _index(store: Store, stage: str, label: str) -> Path:
-    name = quote(label, safe="")
-    return store.root / "labels" / stage / f"{zlib.crc32(name.encode()) & 0xFF:02x}" / f"{name}.json"
+def _name(stage: str, label: str) -> str:
+    return f"{stage} {label}"
 
 
-def _recall(path: Path) -> list[str]:
-    try:
-        keys = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return []
-    return [k for k in keys if isinstance(k, str)] if isinstance(keys, list) else []
+def _read(path: Path) -> Keys:
+    """A damaged file counts as empty."""
+    with suppress(OSError, ValueError, AttributeError):
+        found = json.loads(path.read_text(encoding="utf-8")).items()
+        return {name: [k for k in keys if isinstance(k, str)] for name, keys in found if isinstance(keys, list)}
+    return {}
+
+
+def _written(path: Path) -> float:
+    with suppress(OSError):
+        return path.stat().st_mtime
+    return 0.0

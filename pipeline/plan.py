@@ -42,9 +42,10 @@ def plan(options: Options, *, verbose: bool = False) -> int:
     result = driver.run(graph, store, dry=True, force=options.force)
     result.check()
     jobs = options.jobs or cores()
-    for line in describe(graph, result, recall_seconds(store), jobs, verbose=verbose):
+    hints = store.hints(graph.sequence)
+    for line in describe(graph, result, recall_seconds(hints), jobs, verbose=verbose):
         print(line)
-    known = costs.recall(store)
+    known = costs.recall(hints)
     limit = None if options.memory_limit is None else memory.parse(options.memory_limit)
     shares = account(known, limit, options.executor, jobs, largest(graph, known))
     for line in needs(graph, known, shares):

@@ -1,7 +1,7 @@
 """Progress of a run on stderr: a bar with an estimate on a terminal, plain lines elsewhere, JSON lines, or nothing.
 
-The estimate weighs each task with the seconds that its stage took in earlier runs on this cache (``seconds.json``, a
-hint like the explanations); stages never seen count as the mean of the others.
+The estimate weighs each task with the seconds that its stage took in earlier runs of the same sequence (a hint like
+the explanations); stages never seen count as the mean of the others.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import sys
 import time
 from collections.abc import Mapping
 from contextlib import suppress
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, TextIO
 
 from stages.errors import ConfigError
@@ -19,7 +20,6 @@ from stages.errors import ConfigError
 if TYPE_CHECKING:
     from pipeline.dag import Graph, Handle
     from pipeline.driver import Counts, Result
-    from pipeline.store import Store
 
 INTERVAL = 5.0
 """Seconds between plain lines."""
@@ -229,21 +229,22 @@ def _clock(seconds: float) -> str:
     return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min"
 
 
-def recall_seconds(store: Store) -> dict[str, float]:
-    """Mean seconds of a task of each stage, from earlier runs on this cache."""
+def recall_seconds(hints: Path) -> dict[str, float]:
+    """Mean seconds of a task of each stage, from earlier runs; ``hints`` is the sequence's folder of them."""
     try:
-        known = json.loads((store.root / "seconds.json").read_text(encoding="utf-8"))
+        known = json.loads((hints / "seconds.json").read_text(encoding="utf-8"))
         return {str(stage): float(seconds) for stage, seconds in known.items()}
     except (OSError, ValueError, AttributeError, TypeError):
         return {}
 
 
-def remember_seconds(store: Store, counts: Mapping[str, Counts]) -> None:
+def remember_seconds(hints: Path, counts: Mapping[str, Counts]) -> None:
     """Note the mean seconds of what was computed now; best effort."""
     new = {stage: round(c.seconds / c.computed, 4) for stage, c in counts.items() if c.computed}
     if new:
-        path = store.root / "seconds.json"
+        path = hints / "seconds.json"
         temporary = path.with_name(f"seconds.json.{os.getpid()}.tmp")
         with suppress(OSError):
-            temporary.write_text(json.dumps(recall_seconds(store) | new), encoding="utf-8")
+            hints.mkdir(parents=True, exist_ok=True)
+            temporary.write_text(json.dumps(recall_seconds(hints) | new), encoding="utf-8")
             temporary.replace(path)

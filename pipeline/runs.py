@@ -74,9 +74,10 @@ def _some(names: list[str]) -> str:
     return ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
 
 
-def earlier(run: Path) -> Iterator[Path]:
-    """Runs of the same sequence before this one, the latest first."""
-    yield from sorted((r for r in all_runs(run.parent.parent) if r.parent == run.parent and r < run), reverse=True)
+def earlier(run: Path, *, of_any: bool = False) -> Iterator[Path]:
+    """Runs of the same sequence (or of any) before this one, the latest first."""
+    before = [r for r in all_runs(run.parent.parent) if r.name < run.name and (of_any or r.parent == run.parent)]
+    yield from sorted(before, key=lambda r: r.name, reverse=True)
 
 
 def keys(runs: Path) -> dict[str, str]:

@@ -5,7 +5,8 @@ Layout under the cache folder::
     artifacts/<stage>/<k>/<key>/manifest.json    the only commit point; <k> are the key's first two digits
     artifacts/<stage>/<k>/<key>/a-<unique>/      one attempt: an immutable zarr 3 group (xarray.open_zarr reads it)
     quarantine/<stage>-<key>-<unique>/           damaged artifacts, set aside
-    labels/...  seconds.json  costs.json         hints for explanations and estimates; never a matter of correctness
+    hints/<sequence>/                            of its earlier runs, for explanations and estimates; never a matter
+                                                 of correctness
     index/<sequence>                             what its last run found: spares reading manifests that nobody touched
     pins/<run>.json                              keys that clearing up leaves alone
 
@@ -30,6 +31,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import google_crc32c
 
@@ -92,6 +94,11 @@ class Store:
 
     def __fspath__(self) -> str:
         return str(self.root)
+
+    def hints(self, sequence: str) -> Path:
+        """Folder of what earlier runs of a sequence leave for explanations and estimates."""
+        name = quote(sequence, safe="").replace(".", "%2E")  # no name leads out of it
+        return self.root / "hints" / (name or "-")
 
     def survey(self, sequence: str) -> None:
         """Before many look-ups: find out at once what is there, with few requests or readings.

@@ -27,7 +27,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from pipeline import explain
 from pipeline.code import environment, module_digests
 from pipeline.kernels import guard
 from pipeline.key import text
@@ -206,7 +205,6 @@ def _compute(store: Store, spec: Spec, refs: Refs, key: str) -> tuple[Ref, float
         "peak_rss": _peak_rss(),
     }
     ref = store.commit(stage, key, result, label=spec.label, provenance=json.loads(json.dumps(provenance)))
-    explain.remember(store, stage.name, spec.label, key)
     return ref, kernel
 
 

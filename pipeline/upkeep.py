@@ -94,7 +94,7 @@ def gc(store: Store, keep: Collection[str], *, grace: float = GRACE, dry_run: bo
     kept = set(keep)
     for home in sorted(store.root.glob("artifacts/*/*/*")):
         _clear_home(store, home, home.name in kept, limit, cleared, dry_run)
-    for path in (*store.root.glob("*.tmp"), *store.root.glob("labels/*/*/*.tmp")):
+    for path in (*store.root.glob("*.tmp"), *store.root.glob("hints/*/*.tmp")):
         if _written(path) <= limit:
             cleared.orphans += 1
             _remove(path, cleared, dry_run)

@@ -72,7 +72,7 @@ def _fate(row: Mapping[str, Any], run: Path, made: Mapping[str, Any] | None) -> 
 
 def _computed_by(row: Mapping[str, Any], run: Path) -> str:
     """Which kept run computed it."""
-    for before in runs.earlier(run):
+    for before in runs.earlier(run, of_any=True):
         for other in ledger.read(before / runs.LEDGER):
             if other.get("key") == row["key"] and other["status"] == "computed":
                 return f"; run {runs.name(before)} computed it"

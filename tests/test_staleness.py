@@ -217,8 +217,8 @@ def group(label: str) -> str:
 @pytest.fixture(scope="module")
 def chain(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chain]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(explain, "reason", lambda *_: "")
-        patch.setattr(explain, "latest", lambda store, stage, label: store.labels.get(label))
+        patch.setattr(explain.Known, "reason", lambda *_: "")
+        patch.setattr(explain.Known, "latest", lambda known, store, stage, label: store.labels.get(label))
         yield Chain(short({}), tmp_path_factory.mktemp("store"))
 
 

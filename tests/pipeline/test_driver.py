@@ -331,7 +331,7 @@ def test_progress_speaks_on_its_stream_alone(cache, mode, capsys, monkeypatch):
 
 def test_estimate_weighs_stages_by_their_earlier_seconds(cache):
     run(cache)
-    seconds = progress.recall_seconds(Store(cache))
+    seconds = progress.recall_seconds(Store(cache).hints(""))
     assert set(seconds) == {"numbers", "scale", "total"}
     seen = progress.Quiet()
     graph = Graph()

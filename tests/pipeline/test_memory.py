@@ -168,7 +168,9 @@ def learned(cache, tmp_path):
 
     def make(name):
         (tmp_path / name).mkdir()
-        (tmp_path / name / costs.FILE).write_bytes((cache / costs.FILE).read_bytes())
+        there, here = (Store(folder).hints("") / costs.FILE for folder in (tmp_path / name, cache))
+        there.parent.mkdir(parents=True)
+        there.write_bytes(here.read_bytes())
         return Store(tmp_path / name)
 
     return make, {h.label: h.ref.digest for h in graph.nodes}
@@ -184,7 +186,7 @@ def run(graph, store, executor, limit):
 def test_a_limit_keeps_tasks_apart_that_do_not_fit_together(learned, executor):
     make, digests = learned
     store = make("tight")
-    rest = costs.recall(store).rest if executor == "processes" else 0.0
+    rest = costs.recall(store.hints("")).rest if executor == "processes" else 0.0
     limit = memory.resident() + 2 * rest + 1.5 * HOG + 2 * costs.SLACK
     graph = hogs()
     result, path = run(graph, store, executor, limit)
@@ -259,7 +261,7 @@ def test_a_plan_foresees_memory_and_bytes_and_says_from_what(cache):
         graph = Graph()
         build(graph, **kw)
         driver.run(graph, Store(cache), dry=True)
-        kept = costs.recall(Store(cache))
+        kept = costs.recall(Store(cache).hints(""))
         return list(plan.needs(graph, kept, Account(8e9, 1e8, 2e8, 2))), forecast(graph, kept), graph
 
     told, _, _ = lines(size=400)

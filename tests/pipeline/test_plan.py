@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
+import pytest
 from toys.chain import build
 
-from pipeline import driver, plan
+from datasets.registry import open_sequence
+from pipeline import config as configuration
+from pipeline import costs, driver, plan, progress
 from pipeline.dag import Graph
+from pipeline.drive import dataflow
 from pipeline.store import Store
 
+SECONDS = {"numbers": 2.0, "scale": 3.0, "total": 1.0}
 
-def lines(cache, *, verbose=False, **changed):
-    graph = Graph()
+
+def lines(cache, *, verbose=False, sequence="", choice="", **changed):
+    graph = Graph(sequence, choice)
     build(graph, **changed)
     result = driver.run(graph, Store(cache), dry=True)
-    return list(plan.describe(graph, result, {"numbers": 2.0, "scale": 3.0, "total": 1.0}, 2, verbose=verbose))
+    result.check()
+    return list(plan.describe(graph, result, SECONDS, 2, verbose=verbose))
 
 
-def compute(cache, **kw):
-    graph = Graph()
+def compute(cache, *, sequence="", choice="", **kw):
+    graph = Graph(sequence, choice)
     build(graph, **kw)
     driver.run(graph, Store(cache), executor="inline").check()
 
@@ -48,3 +55,54 @@ def test_verbose_gives_each_task_its_reason(cache):
     told = lines(cache, verbose=True, offset=0.5)
     assert "    scale/0: params.offset 0.0 -> 0.5" in told
     assert "    total: input scale/0 is to be computed" in told
+
+
+def test_hints_belong_to_their_sequence(cache):
+    compute(cache, sequence="long", frames=6)
+    store = Store(cache)
+    assert lines(cache, sequence="short", frames=3, seed=1)[1].endswith("never computed (3)")
+    assert lines(cache, sequence="long", frames=6, seed=1)[1].endswith("params.seed 0 -> 1 (6)")
+    for recall, empty in ((progress.recall_seconds, {}), (lambda hints: costs.recall(hints).groups, {})):
+        assert recall(store.hints("long"))
+        assert recall(store.hints("short")) == empty
+
+
+def test_what_follows_is_laid_out_by_the_same_choice_of_frames_only(cache):
+    compute(cache, sequence="long", choice="all", frames=6)
+    told = lines(cache, sequence="long", choice="few", frames=3, seed=1)
+    assert told[1].endswith("params.seed 0 -> 1 (3)"), "a reason may come from another choice"
+    assert told[-1].startswith("more tasks follow, known only after numbers/0, numbers/1, numbers/2")
+    assert told[-2].startswith("3 tasks known")
+
+
+def test_a_dataflow_says_whose_hints_are_meant():
+    given = configuration.build({})
+
+    def whose(name, frames):
+        graph = Graph()
+        dataflow(graph, open_sequence(name), given, frames)
+        return graph.sequence, graph.choice
+
+    assert whose("mockup", (0, 1)) == whose("mockup", (0, 1))
+    assert len({whose("mockup", (0, 1)), whose("mockup", (0, 2)), whose("mockup-short", (0, 1))}) == 3
+
+
+@pytest.mark.parametrize("name", ["..", "../../x", "/etc", "a b%/c", ""])
+def test_no_name_of_a_sequence_leads_out_of_the_hints(cache, name):
+    folder = Store(cache).hints(name)
+    assert folder.resolve().parent == (cache / "hints").resolve()
+
+
+def test_an_earlier_result_that_does_not_fit_hides_what_follows(cache):
+    def lay_out(seed, wanted):
+        graph = Graph()
+        build(graph, frames=1, seed=seed)
+        graph.expand(graph.nodes[:1], lambda ref: {0: "known"}[wanted])
+        return graph
+
+    driver.run(lay_out(0, 0), Store(cache), executor="inline").check()
+    result = driver.run(lay_out(1, 1), Store(cache), dry=True)
+    assert result.ok
+    assert result.unknown == ["numbers/0"]
+    result = driver.run(lay_out(0, 1), Store(cache), dry=True)
+    assert [f.label for f in result.failures] == ["plan after numbers/0"], "by what is there it is a failure"

@@ -13,10 +13,10 @@ from pipeline.store import Store
 from stages.errors import ConfigError
 
 
-def run(folder, name, **kw):
-    graph = Graph()
+def run(folder, name, sequence="toy", **kw):
+    graph = Graph(sequence)
     build(graph, **kw)
-    at = folder / "runs" / "toy" / name
+    at = folder / "runs" / sequence / name
     driver.run(graph, Store(folder / "cache"), executor="inline", ledger=at / "ledger.jsonl").check()
     return at
 
@@ -54,6 +54,14 @@ def test_a_cached_task_names_the_run_that_computed_it(three):
     )
     assert told(folder, first, "numbers/0")[1] == "why           never computed"
     assert told(folder, first, "numbers/0")[-1] == "since         no earlier run of this sequence had this task"
+
+
+def test_it_may_be_a_run_of_another_sequence(tmp_path):
+    run(tmp_path, "1"), run(tmp_path, "2", sequence="other", offset=0.5)
+    at = run(tmp_path, "3", sequence="other")
+    lines = told(tmp_path, at, "scale/1")
+    assert lines[1] == "why           an artifact of the same key was there; run toy/1 computed it"
+    assert lines[-1] == "since         other/2: params.offset 0.5 -> 0.0", "compared with runs of its own"
 
 
 def test_many_inputs_are_counted_and_an_artifact_that_has_gone_is_said(tmp_path):

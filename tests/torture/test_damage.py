@@ -34,9 +34,9 @@ KINDS = {
     "array": "artifacts/numbers/*/{key}/a-*/values/zarr.json",
     "chunk": "artifacts/numbers/*/{key}/a-*/values/c.0.0",
     "other chunk": "artifacts/numbers/*/{key}/a-*/mask/c.0.0",
-    "label": "labels/numbers/*/numbers%2F1.json",
-    "seconds": "seconds.json",
-    "costs": "costs.json",
+    "label": "hints/-/keys-.json",
+    "seconds": "hints/-/seconds.json",
+    "costs": "hints/-/costs.json",
     "index": "index/*",
 }
 HINTS = ("label", "seconds", "costs", "index")
