@@ -52,6 +52,7 @@ def parse_corners(text: str) -> tuple[int, int]:
     columns, _, rows = text.lower().partition("x")
     if not (columns.isdigit() and rows.isdigit() and min(int(columns), int(rows)) >= LEAST_SIDE):
         raise ConfigError(
+            "RIL-151",
             f"--corners {text!r} is not COLUMNSxROWS",
             remedy=f"give inner corners, e.g. 9x6 for a board of 10 x 7 squares; at least {LEAST_SIDE} each",
         )
@@ -69,7 +70,7 @@ def board_points(corners: tuple[int, int], square: float) -> Floats:
     if not 0 < square <= ABSURD_SQUARE:
         guess = next((square / unit for unit in (100.0, 1000.0) if 0.005 <= square / unit <= 0.2), square / 1000.0)
         hint = f"; did you mean {guess:g}?" if square > 0 else ""
-        raise ConfigError(f"--square {square:g} m is no side of a square", remedy=f"give it in metres{hint}")
+        raise ConfigError("RIL-152", f"--square {square:g} m is no side of a square", remedy=f"give it in metres{hint}")
     rows, columns = np.indices((corners[1], corners[0]))
     return np.stack([square * columns, square * rows, np.zeros(rows.shape)], axis=-1).reshape(-1, 3)
 
@@ -103,6 +104,7 @@ def find_size(images: Iterable[Grey]) -> tuple[int, int]:
     agreed = {size: count for size, count in votes.items() if count > 1}
     if not agreed:
         raise InputError(
+            "RIL-153",
             "no chessboard of one size is found in the images",
             remedy="give its inner corners, e.g. --corners 9x6, and check that all of it is in view and in focus",
         )

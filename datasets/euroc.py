@@ -138,6 +138,7 @@ def list_frames(layout: Layout) -> Frames:
     left_out = [len(taken[camera]) - len(common) for camera in CAMERAS]
     if not common:
         raise InputError(
+            "RIL-156",
             f"{layout.folder}: no time stamp of {len(taken['left'])} images in cam0 is also one of "
             f"{len(taken['right'])} in cam1",
             remedy="give both cameras of one recording; stamps of a pair must be equal",
@@ -156,24 +157,30 @@ def _images(folder: Path, warnings: list[str]) -> dict[str, tuple[Path, int]]:
     """File and line of each image by its time stamp as written; by file names where there is no list."""
     there = {path.name: path for path in sorted((folder / "data").iterdir()) if path.suffix.lower() in files.SUFFIXES}
     if not there:
-        raise InputError(f"{folder / 'data'} holds no images", remedy=f"put files there: {', '.join(files.SUFFIXES)}")
+        raise InputError(
+            "RIL-157", f"{folder / 'data'} holds no images", remedy=f"put files there: {', '.join(files.SUFFIXES)}"
+        )
     listed = folder / "data.csv"
     if not listed.is_file():
         names = sorted(there, key=lambda name: (len(Path(name).stem), name))
         return {Path(name).stem: (there[name], k) for k, name in enumerate(names, start=1)}
     table = read_table(listed, "list of images")
     if table.columns < 2:
-        raise InputError(f"{listed} has no file names", remedy="give a time stamp and a file name a line")
+        raise InputError("RIL-158", f"{listed} has no file names", remedy="give a time stamp and a file name a line")
     out: dict[str, tuple[Path, int]] = {}
     for row, line in zip(table.rows, table.lines, strict=True):
         if row[1] not in there:
             continue
         if row[0] in out:
-            raise InputError(f"{listed}, line {line}: time {row[0]} is there twice", remedy="remove one of the lines")
+            raise InputError(
+                "RIL-159", f"{listed}, line {line}: time {row[0]} is there twice", remedy="remove one of the lines"
+            )
         out[row[0]] = (there[row[1]], line)
     lost = len(table.rows) - len(out)
     if not out:
-        raise InputError(f"none of the {lost} images that {listed} lists is there", remedy=f"check {folder / 'data'}")
+        raise InputError(
+            "RIL-160", f"none of the {lost} images that {listed} lists is there", remedy=f"check {folder / 'data'}"
+        )
     if lost:
         warnings.append(f"{lost} of {len(table.rows)} images that {listed} lists are not there: left out")
     return out
@@ -183,12 +190,15 @@ def _camera(folder: Path) -> CalibratedCamera:
     path = folder / "sensor.yaml"
     if not path.is_file():
         raise InputError(
+            "RIL-161",
             f"{path} is missing: {folder.name} has no calibration",
             remedy="put it there (T_BS, resolution, intrinsics, distortion), or name another calibration in a manifest",
         )
     camera, *others = read_cameras(path)
     if others:
-        raise InputError(f"{path} describes {len(others) + 1} cameras", remedy="give each camera its own sensor.yaml")
+        raise InputError(
+            "RIL-162", f"{path} describes {len(others) + 1} cameras", remedy="give each camera its own sensor.yaml"
+        )
     return camera
 
 

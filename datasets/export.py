@@ -64,7 +64,7 @@ def export(sequence: Sequence, directory: Path, materialise: Materialise, pairs:
         The folder has something in it, or cannot be made.
     """
     if directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
-        raise InputError(f"{directory} is not empty", remedy="name a folder that does not exist yet")
+        raise InputError("RIL-165", f"{directory} is not empty", remedy="name a folder that does not exist yet")
     chosen = tuple(
         range(0, sequence.frames, int(sequence.defaults.get("select.stride", 1))) if pairs is None else pairs
     )
@@ -72,7 +72,9 @@ def export(sequence: Sequence, directory: Path, materialise: Materialise, pairs:
         directory.parent.mkdir(parents=True, exist_ok=True)
         part = Path(tempfile.mkdtemp(prefix=f".{directory.name}.", dir=directory.parent))
     except OSError as error:
-        raise InputError(f"{directory} cannot be made: {error.strerror}", remedy="name another folder") from error
+        raise InputError(
+            "RIL-166", f"{directory} cannot be made: {error.strerror}", remedy="name another folder"
+        ) from error
     try:
         _write(sequence, part, materialise, chosen)
         part.chmod(0o755)
@@ -120,7 +122,7 @@ def _write_png(path: Path, image: Any) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     done, data = cv2.imencode(".png", image)
     if not done:
-        raise InputError(f"{path} cannot be encoded as PNG")
+        raise InputError("RIL-167", f"{path} cannot be encoded as PNG")
     path.write_bytes(data.tobytes())
 
 

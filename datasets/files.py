@@ -74,12 +74,16 @@ def decode(data: bytes, name: str) -> Grey:
     """
     damage = _damage(data)
     if damage:
-        raise InputError(f"{name} {damage}", remedy=COPY_AGAIN)
+        raise InputError("RIL-170", f"{name} {damage}", remedy=COPY_AGAIN)
     image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if image is None:
-        raise InputError(f"{name} cannot be read as an image", remedy=f"{COPY_AGAIN}; PNG, JPEG, TIFF and PGM are read")
+        raise InputError(
+            "RIL-171", f"{name} cannot be read as an image", remedy=f"{COPY_AGAIN}; PNG, JPEG, TIFF and PGM are read"
+        )
     if image.dtype not in (np.uint8, np.uint16):
-        raise InputError(f"{name} has samples of type {image.dtype}", remedy="save it with 8 or 16 bits a sample")
+        raise InputError(
+            "RIL-172", f"{name} has samples of type {image.dtype}", remedy="save it with 8 or 16 bits a sample"
+        )
     if image.ndim == 3 and image.shape[2] >= 3:
         image = cv2.cvtColor(np.ascontiguousarray(image[:, :, :3]), cv2.COLOR_BGR2GRAY)
     elif image.ndim == 3:
@@ -97,7 +101,9 @@ def _bytes(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}", remedy="check the path and its rights") from error
+        raise InputError(
+            "RIL-173", f"{path} cannot be read: {error.strerror}", remedy="check the path and its rights"
+        ) from error
 
 
 def png_header(path: Path) -> tuple[int, int, int] | None:
@@ -106,7 +112,9 @@ def png_header(path: Path) -> tuple[int, int, int] | None:
         with path.open("rb") as file:
             head = file.read(26)
     except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}", remedy="check the path and its rights") from error
+        raise InputError(
+            "RIL-174", f"{path} cannot be read: {error.strerror}", remedy="check the path and its rights"
+        ) from error
     if len(head) < 26 or not head.startswith(PNG_SIGNATURE):
         return None
     width, height, bits = struct.unpack_from(">IIB", head, 16)
@@ -134,7 +142,7 @@ class Digests:
         try:
             status = path.stat()
         except OSError as error:
-            raise InputError(f"{path} cannot be read: {error.strerror}", remedy="check the path") from error
+            raise InputError("RIL-175", f"{path} cannot be read: {error.strerror}", remedy="check the path") from error
         key = f"{status.st_size} {status.st_mtime_ns} {path.resolve()}"
         if key not in self._known:
             self._known[key] = hashlib.sha256(_bytes(path)).hexdigest()
@@ -165,6 +173,7 @@ def check_size(found: tuple[int, int, int], wanted: tuple[int, int, int], name: 
     if found != wanted:
         words = [f"{w} x {h}, {d} bits" for w, h, d in (found, wanted)]
         raise InputError(
+            "RIL-176",
             f"{name} is {words[0]}; the sequence has {words[1]}",
             remedy="all images of a sequence must have one size and depth; leave the frame out or convert it",
         )
@@ -174,7 +183,7 @@ def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     name = f"frame {args['frame']}, {args['camera']} image {args['path']}"
     data = _bytes(Path(args["path"]))
     if hashlib.sha256(data).hexdigest() != args["sha256"]:
-        raise InputError(f"{name} has changed since the run began", remedy="run the same command again")
+        raise InputError("RIL-177", f"{name} has changed since the run began", remedy="run the same command again")
     image = decode(data, name)
     found = (image.shape[1], image.shape[0], image.dtype.itemsize * 8)
     check_size(found, (args["width"], args["height"], args["depth"]), name)

@@ -58,6 +58,7 @@ def georeference(
         return None
     if crs is None or origin is None or azimuth_deg is None:
         raise InputError(
+            "RIL-180",
             f"{where}: world.{' and world.'.join(missing)} missing: a place needs crs, origin and azimuth_deg",
             remedy='e.g. crs = "EPSG:32633", origin = [easting, northing, height], azimuth_deg = 90 for looking east',
         )
@@ -73,9 +74,9 @@ def _check_crs(text: str, where: str) -> None:
     try:
         crs = CRS.from_user_input(text)
     except CRSError as error:
-        raise InputError(f"{where}: world.crs = {text!r} is no known CRS", remedy=remedy) from error
+        raise InputError("RIL-181", f"{where}: world.crs = {text!r} is no known CRS", remedy=remedy) from error
     if not crs.is_projected:
-        raise InputError(f"{where}: world.crs = {text!r} is not projected", remedy=remedy)
+        raise InputError("RIL-182", f"{where}: world.crs = {text!r} is not projected", remedy=remedy)
     unit, factor = crs.linear_units_factor
     if factor != 1.0:
-        raise InputError(f"{where}: world.crs = {text!r} is in {unit} of {factor:.6g} m", remedy=remedy)
+        raise InputError("RIL-183", f"{where}: world.crs = {text!r} is in {unit} of {factor:.6g} m", remedy=remedy)

@@ -116,6 +116,7 @@ def read_imu(path: Path, *, unit: str = "auto") -> Imu:
     table = read_table(path, "IMU record")
     if table.columns < 7:
         raise InputError(
+            "RIL-186",
             f"{path}, line {table.lines[0]}: {table.columns} columns are no IMU record",
             remedy="give time, three rates (rad/s) and three accelerations (m/s^2) a row",
         )
@@ -139,11 +140,13 @@ def _plausible(rates: Floats, forces: Floats, name: str) -> None:
     turn, force = (float(np.median(np.linalg.norm(v, axis=1))) for v in (rates, forces))
     if turn > 8 and force < 6:
         raise InputError(
+            "RIL-187",
             f"{name}: the rates are {turn:.3g} and the accelerations {force:.3g}: they look exchanged",
             remedy="order the columns time, rates, accelerations, or name them gyro_x ... acc_x ...",
         )
     if 0.8 < force < 1.2:
         raise InputError(
+            "RIL-188",
             f"{name}: accelerations of {force:.3g} look like multiples of gravity",
             remedy="give them in m/s^2: 9.81 at rest",
         )
@@ -291,10 +294,11 @@ def bins(values: Floats, times: Floats) -> Floats:
 
 def _overlap(imu: Imu, at: Sequence[float]) -> None:
     if len(imu.times) < 2:
-        raise InputError(f"{imu.name} has one sample", remedy="give the whole record")
+        raise InputError("RIL-189", f"{imu.name} has one sample", remedy="give the whole record")
     first, last = float(imu.times[0]), float(imu.times[-1])
     if at[-1] < first or at[0] > last:
         raise InputError(
+            "RIL-190",
             f"{imu.name} reaches from {first:.3f} to {last:.3f} s, the frames from {at[0]:.3f} to {at[-1]:.3f} s: "
             "no common time",
             remedy="check that both have the same clock and unit; a constant offset can be stated",

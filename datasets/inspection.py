@@ -81,7 +81,7 @@ def inspect(folder: Path) -> Findings:
         It is no folder, or no two sets of images in it belong to a left and a right camera.
     """
     if not folder.is_dir():
-        raise InputError(f"{folder} is no folder", remedy="name a folder that holds images of two cameras")
+        raise InputError("RIL-193", f"{folder} is no folder", remedy="name a folder that holds images of two cameras")
     paths = list(_files(folder))
     found = Findings(folder, find_views(folder, [p for p in paths if p.suffix.lower() in SUFFIXES]))
     texts = [p for p in paths if p.suffix.lower() in CALIBRATIONS and p.stat().st_size <= LARGEST_CALIBRATION]
@@ -127,6 +127,7 @@ def find_views(folder: Path, images: list[Path]) -> Views:
     both = {key: sides for key, sides in groups.items() if all(sides)}
     if not both:
         raise InputError(
+            "RIL-194",
             f"{folder} holds {len(images)} images, but none are told apart as left and right",
             remedy="name files or folders left and right (or _l and _r, cam0 and cam1), or write a manifest by hand",
         )

@@ -62,10 +62,14 @@ def recognise(path: Path, number: str | None = None) -> Layout | None:
     if (path / "sequences").is_dir():
         there = sorted(d.name for d in (path / "sequences").iterdir() if d.is_dir() and image_folders(d))
         if number is None and len(there) != 1:
-            raise InputError(f"{path} holds {len(there)} sequences", remedy=f"choose one, e.g. {path}:{_first(there)}")
+            raise InputError(
+                "RIL-197", f"{path} holds {len(there)} sequences", remedy=f"choose one, e.g. {path}:{_first(there)}"
+            )
         number = number if number is not None else there[0]
         if number not in there:
-            raise InputError(f"{path} has no sequence {number!r}", remedy=f"it has {', '.join(there) or 'none'}")
+            raise InputError(
+                "RIL-198", f"{path} has no sequence {number!r}", remedy=f"it has {', '.join(there) or 'none'}"
+            )
         path = path / "sequences" / number
     elif number is not None:
         return None
@@ -96,7 +100,7 @@ def _rows(path: Path, count: int, what: str, gaps: bool = False) -> list[tuple[s
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{what} {path} cannot be read: {error}", remedy="check the file") from error
+        raise InputError("RIL-199", f"{what} {path} cannot be read: {error}", remedy="check the file") from error
     out = []
     for k, line in enumerate(lines, start=1):
         label, _, numbers = line.rpartition(":")
@@ -108,7 +112,9 @@ def _rows(path: Path, count: int, what: str, gaps: bool = False) -> list[tuple[s
             values = np.empty(0)
         gap = gaps and np.isnan(values).all()
         if values.size != count or not (gap or np.isfinite(values).all()):
-            raise InputError(f"{path}, line {k}: not {count} numbers", remedy=f"correct that line of the {what}")
+            raise InputError(
+                "RIL-200", f"{path}, line {k}: not {count} numbers", remedy=f"correct that line of the {what}"
+            )
         out.append((label.strip(), values))
     return out
 
@@ -120,7 +126,9 @@ def read_projections(path: Path, pair: tuple[str, str]) -> tuple[NDArray[np.floa
     """
     if not path.is_file():
         raise InputError(
-            f"{path} is missing", remedy="put the calibration there: a 3 x 4 projection matrix a line, left and right"
+            "RIL-201",
+            f"{path} is missing",
+            remedy="put the calibration there: a 3 x 4 projection matrix a line, left and right",
         )
     rows = [(label, v.reshape(3, 4)) for label, v in _rows(path, 12, "calibration") if not label.startswith("Tr")]
     labelled = {label: p for label, p in rows if label}
@@ -132,6 +140,7 @@ def read_projections(path: Path, pair: tuple[str, str]) -> tuple[NDArray[np.floa
         return rows[int(pair[0][-1])][1], rows[int(pair[1][-1])][1]
     if (numbered and labelled) or len(rows) < 2:
         raise InputError(
+            "RIL-202",
             f"{path} has no projection matrices of {pair[0]} and {pair[1]}",
             remedy=f"give lines {wanted[0]}: and {wanted[1]}:" if labelled else "give two lines of 12 numbers",
         )
@@ -145,7 +154,9 @@ def decompose(projection: NDArray[np.float64], name: str) -> tuple[NDArray[np.fl
     m = projection[:, :3]
     # written so that NaN-free but singular matrices are refused before anything divides by them
     if abs(np.linalg.det(m)) < 1e-9:
-        raise InputError(f"calibration: {name} is singular", remedy="give P = K [R | t], 12 numbers, row-major")
+        raise InputError(
+            "RIL-203", f"calibration: {name} is singular", remedy="give P = K [R | t], 12 numbers, row-major"
+        )
     if m[1, 0] == m[2, 0] == m[2, 1] == 0.0 and m[2, 2] > 0:
         k, r = m / m[2, 2], np.eye(3)
     else:
@@ -155,7 +166,9 @@ def decompose(projection: NDArray[np.float64], name: str) -> tuple[NDArray[np.fl
         k = k / k[2, 2]
     scale = np.linalg.norm(m[2])
     if abs(k[0, 1]) > 1e-4 * k[0, 0]:
-        raise InputError(f"calibration: {name} has skewed pixels", remedy="give a camera with perpendicular axes")
+        raise InputError(
+            "RIL-204", f"calibration: {name} has skewed pixels", remedy="give a camera with perpendicular axes"
+        )
     t = np.linalg.solve(k, projection[:, 3]) / scale * np.sign(np.linalg.det(m))
     return k, RigidTransform(orthonormal(r), t)
 
@@ -171,14 +184,18 @@ def read_rig(layout: Layout, width: int, height: int) -> tuple[Rig, RigidTransfo
     T_right_left = poses[1] @ poses[0].inverse()
     rig = Rig(cameras[0], cameras[1], T_right_left)
     if not rig.baseline > 0:
-        raise InputError(f"{layout.calib}: the two cameras stand in one place", remedy="check the fourth column of P")
+        raise InputError(
+            "RIL-205", f"{layout.calib}: the two cameras stand in one place", remedy="check the fourth column of P"
+        )
     if rig.baseline > LONGEST_BASELINE:
         raise InputError(
+            "RIL-206",
             f"{layout.calib}: the baseline is {rig.baseline:g} m, which looks like millimetres",
             remedy=f"did you mean {rig.baseline / 1000:g} m? the fourth column of P is focal length times metres",
         )
     if T_right_left.translation[0] > 0.5 * rig.baseline:
         raise InputError(
+            "RIL-207",
             f"{layout.calib}: the right camera stands {T_right_left.translation[0]:g} m to the left of the left one",
             remedy="swap the two lines or the two folders",
         )
@@ -191,7 +208,9 @@ def _listing(folder: Path) -> dict[str, Path]:
     for path in sorted(folder.iterdir()):
         if path.suffix.lower() in files.SUFFIXES:
             if path.stem in out:
-                raise InputError(f"{path} and {out[path.stem].name} are the same frame", remedy="remove one of them")
+                raise InputError(
+                    "RIL-208", f"{path} and {out[path.stem].name} are the same frame", remedy="remove one of them"
+                )
             out[path.stem] = path
     return out
 
@@ -218,13 +237,16 @@ def list_pairs(layout: Layout) -> Listing:
     if len(alone) > len(present) - len(alone):
         ours, side = (left, layout.pair[1]) if alone[0] in left else (right, layout.pair[0])
         raise InputError(
+            "RIL-209",
             f"{ours[alone[0]]} has no partner in {layout.folder / side} (and {len(alone) - 1} more)",
             remedy="add the missing images or remove these",
         )
     names = sorted(present, key=lambda s: (len(s), s) if s.isdigit() else (0, s))
     if not names:
         raise InputError(
-            f"{layout.folder / layout.pair[0]} holds no images", remedy=f"put files there: {', '.join(files.SUFFIXES)}"
+            "RIL-210",
+            f"{layout.folder / layout.pair[0]} holds no images",
+            remedy=f"put files there: {', '.join(files.SUFFIXES)}",
         )
     names = _counted(names)
     lost, suffix = {}, next(iter({**left, **right}.values())).suffix
@@ -275,6 +297,7 @@ def _per_frame(
     if len(rows) != len(there):
         missing = f" ({len(listing.lost)} of {frames} frames lack an image)" if listing.lost else ""
         raise InputError(
+            "RIL-211",
             f"{path} has {len(rows)} {what} for {len(there)} pairs{missing}",
             remedy="give one line a pair, or remove the file",
         )
@@ -338,5 +361,5 @@ def _pose(row: NDArray[np.float64], line: int, path: Path) -> RigidTransform:
     try:
         RigidTransform(m[:, :3], m[:, 3])
     except InputError as error:
-        raise InputError(f"{path}, line {line}: {error.message}", remedy=error.remedy) from error
+        raise error.at(f"{path}, line {line}") from error
     return RigidTransform(orthonormal(m[:, :3]), m[:, 3])

@@ -91,6 +91,7 @@ def root_folder(text: str, path: Path) -> Path:
     def value(match: re.Match[str]) -> str:
         if not os.environ.get(match[1]):
             raise InputError(
+                "RIL-214",
                 f"{path}: root = {text!r} needs the environment variable {match[1]}, which is not set",
                 remedy=f"export {match[1]}=FOLDER",
             )
@@ -98,7 +99,9 @@ def root_folder(text: str, path: Path) -> Path:
 
     root = path.resolve().parent / Path(VARIABLE.sub(value, text)).expanduser()
     if not root.is_dir():
-        raise InputError(f"{path}: root = {text!r}: there is no folder {root}", remedy="correct root, or its variable")
+        raise InputError(
+            "RIL-215", f"{path}: root = {text!r}: there is no folder {root}", remedy="correct root, or its variable"
+        )
     return root
 
 
@@ -116,20 +119,26 @@ def find_pairs(images: Images, root: Path, name: str) -> tuple[Pair, ...]:
             paths = [path for path in root.glob(pattern) if path.is_file()]
         except (ValueError, NotImplementedError) as error:
             raise InputError(
-                f"{name}: images.{side} = {pattern!r} is no pattern: {error}", remedy="give one relative to root"
+                "RIL-216",
+                f"{name}: images.{side} = {pattern!r} is no pattern: {error}",
+                remedy="give one relative to root",
             ) from error
         if not paths:
             raise InputError(
-                f"{name}: images.{side} = {pattern!r} finds no file in {root}", remedy="correct the pattern or root"
+                "RIL-217",
+                f"{name}: images.{side} = {pattern!r} finds no file in {root}",
+                remedy="correct the pattern or root",
             )
         found[side] = paths
     both = sorted(set(found["left"]) & set(found["right"]))
     if both:
-        raise InputError(f"{name}: images.left and images.right both find {both[0]}", remedy="narrow the patterns")
+        raise InputError(
+            "RIL-218", f"{name}: images.left and images.right both find {both[0]}", remedy="narrow the patterns"
+        )
     try:
         return pair_up(found["left"], found["right"], images.pair, gaps=True)
     except InputError as error:
-        raise InputError(f"{name}: {error.message}", remedy=error.remedy) from error
+        raise error.at(name) from error
 
 
 def dotted(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:

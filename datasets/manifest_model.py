@@ -256,15 +256,17 @@ def read_manifest(path: Path) -> Manifest:
     try:
         values = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
-        raise InputError(f"manifest {path} cannot be read: {error.strerror}", remedy="check the path") from error
+        raise InputError(
+            "RIL-221", f"manifest {path} cannot be read: {error.strerror}", remedy="check the path"
+        ) from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} is not TOML: {error}", remedy="correct the file at that place") from error
+        raise InputError("RIL-222", f"{path} is not TOML: {error}", remedy="correct the file at that place") from error
     try:
         return Manifest.model_validate(values)
     except ValidationError as error:
         lines = [_complaint(dict(e)) for e in error.errors()]
         raise InputError(
-            f"{path}: {'; '.join(lines)}", remedy="`rille init FOLDER` writes one to begin with"
+            "RIL-223", f"{path}: {'; '.join(lines)}", remedy="`rille init FOLDER` writes one to begin with"
         ) from error
 
 

@@ -57,7 +57,9 @@ def read_motion(manifest: Manifest, root: Path, name: str, pairs: Sequence[Pair]
     if manifest.odometry is not None:
         motion.odometry = _poses(manifest.odometry, "odometry", root, name, motion, len(pairs))
     if manifest.attitude is not None and manifest.imu is not None:
-        raise InputError(f"{name}: [attitude] and [imu] both state the rotation", remedy="remove one of them")
+        raise InputError(
+            "RIL-226", f"{name}: [attitude] and [imu] both state the rotation", remedy="remove one of them"
+        )
     if manifest.attitude is not None:
         _attitude(manifest.attitude, root, name, motion, len(pairs))
     if manifest.imu is not None:
@@ -90,7 +92,7 @@ def _stamp(pair: Pair, name: str) -> str:
     """The time stamp in an image's name: its last number, with its decimals."""
     found = re.findall(r"\d+(?:\.\d+)?", pair.left.stem)
     if not found:
-        raise InputError(f"{name}: times.names: {pair.left} has no number in its name", remedy=NEEDS_TIMES)
+        raise InputError("RIL-227", f"{name}: times.names: {pair.left} has no number in its name", remedy=NEEDS_TIMES)
     return str(found[-1])
 
 
@@ -99,7 +101,7 @@ def _times_of_file(path: Path, names: Sequence[str]) -> tuple[list[str], list[in
     try:
         text = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"times {path} cannot be read: {error}", remedy="check the file") from error
+        raise InputError("RIL-228", f"times {path} cannot be read: {error}", remedy="check the file") from error
     rows = [(k, re.split(r"[,;\s]+", line.strip().strip(","))) for k, line in enumerate(text, start=1)]
     rows = [(k, words) for k, words in rows if words[0] and words[0][0] in "0123456789.+-"]
     by_name = {Path(words[1]).stem: (words[0], k) for k, words in rows if len(words) > 1}
@@ -109,6 +111,7 @@ def _times_of_file(path: Path, names: Sequence[str]) -> tuple[list[str], list[in
     if len(rows) != len(names):
         absent = next((n for n, stem in zip(names, stems, strict=True) if stem not in by_name), "")
         raise InputError(
+            "RIL-229",
             f"{path} has {len(rows)} times for {len(names)} pairs" + (f", none of {absent}" if by_name else ""),
             remedy="give one line a pair, or lines of time and file name",
         )
@@ -129,12 +132,15 @@ def _poses(
     if timed.times is None:
         if len(timed.poses) != count:
             raise InputError(
+                "RIL-230",
                 f"{name}: {table}.file: {path} has {len(timed.poses)} poses for {count} pairs",
                 remedy="give one a pair, or poses with times",
             )
     else:
         if motion.times is None:
-            raise InputError(f"{name}: the poses of {path} have times, but the pairs have none", remedy=NEEDS_TIMES)
+            raise InputError(
+                "RIL-231", f"{name}: the poses of {path} have times, but the pairs have none", remedy=NEEDS_TIMES
+            )
         moved = replace(timed, times=tuple(t + section.time_offset for t in timed.times))
         poses = interpolate(moved, motion.times, section.max_gap)
         motion.warnings += coverage(poses, motion.times, f"{table} ({path.name})")
@@ -158,7 +164,7 @@ def _rows(pose: RigidTransform) -> Rows:
 
 def _imu(section: Imu, root: Path, name: str, motion: Motion) -> None:
     if motion.times is None:
-        raise InputError(f"{name}: [imu] needs times, but the pairs have none", remedy=NEEDS_TIMES)
+        raise InputError("RIL-232", f"{name}: [imu] needs times, but the pairs have none", remedy=NEEDS_TIMES)
     imu = read_imu(root / section.file)
     shifted = replace(imu, times=imu.times + section.time_offset)
     inertial = at_frames(shifted, motion.times, RigidTransform.from_matrix(section.T_imu_left))

@@ -61,7 +61,7 @@ def read_optics(manifest: Manifest, root: Path, name: str, size: tuple[int, int]
     try:
         rig, lenses = rig_of(left, right, size)
     except InputError as error:
-        raise InputError(f"{name}: {error.message}", remedy=error.remedy) from error
+        raise error.at(name) from error
     lines += _check_baseline(rig.baseline, manifest.rig, name)
     lines += [line for c, side in ((left, "left"), (right, "right")) for line in _unusual(c.lens.camera, side, size)]
     return Optics(rig, lenses, up, tuple(lines))
@@ -76,6 +76,7 @@ def _cameras(section: Cameras, root: Path, name: str, size: tuple[int, int]) -> 
     if section.stated:
         return tuple(_one(section, side, root, name, size) for side in ("left", "right"))
     raise InputError(
+        "RIL-235",
         f"{name}: the cameras are not known",
         remedy="give cameras.file, cameras.left and cameras.right, or cameras.fx, cx and cy (px)",
     )
@@ -87,6 +88,7 @@ def _one(value: str | PinholeLens, side: str, root: Path, name: str, size: tuple
         found = read_cameras(root / value)
         if len(found) != 1:
             raise InputError(
+                "RIL-236",
                 f"{name}: cameras.{side}: {root / value} has {len(found)} cameras",
                 remedy="give it as cameras.file, and name the two by cameras.names",
             )
@@ -99,7 +101,7 @@ def _one(value: str | PinholeLens, side: str, root: Path, name: str, size: tuple
     try:
         return CalibratedCamera(side, Lens(camera, model, value.distortion), None)
     except InputError as error:
-        raise InputError(f"{name}: cameras: {error.message}", remedy=error.remedy) from error
+        raise error.at(f"{name}: cameras") from error
 
 
 def _of_file(section: Cameras, path: Path, name: str) -> tuple[CalibratedCamera, ...]:
@@ -110,11 +112,14 @@ def _of_file(section: Cameras, path: Path, name: str) -> tuple[CalibratedCamera,
         missing = [wanted for wanted in section.names if wanted not in by_name]
         if missing:
             raise InputError(
-                f"{name}: cameras.names: {path} has no camera {missing[0]!r}", remedy=f"it has {', '.join(by_name)}"
+                "RIL-237",
+                f"{name}: cameras.names: {path} has no camera {missing[0]!r}",
+                remedy=f"it has {', '.join(by_name)}",
             )
         return tuple(by_name[wanted] for wanted in section.names)
     if len(found) > 2:
         raise InputError(
+            "RIL-238",
             f"{name}: {path} has {len(found)} cameras: {', '.join(camera.name for camera in found)}",
             remedy="say which two by cameras.names = [left, right]",
         )
@@ -136,7 +141,9 @@ def _up(manifest: Manifest, left: CalibratedCamera, name: str) -> tuple[float, f
     if stated is None:
         return None
     if manifest.world.pitch_deg is not None:
-        raise InputError(f"{name}: world.up and world.pitch_deg both state the vertical", remedy="remove one of them")
+        raise InputError(
+            "RIL-239", f"{name}: world.up and world.pitch_deg both state the vertical", remedy="remove one of them"
+        )
     return direction(stated, left.T_camera_reference, f"{name}: world.up")
 
 
@@ -146,7 +153,7 @@ def direction(
     """A unit direction of the reference frame in the camera's frame."""
     length = math.hypot(*stated)
     if not length > 0:
-        raise InputError(f"{what} = {list(stated)} has no direction", remedy="e.g. [0, 0, 1] where z is up")
+        raise InputError("RIL-240", f"{what} = {list(stated)} has no direction", remedy="e.g. [0, 0, 1] where z is up")
     turned = np.array(stated) / length
     if T_camera_reference is not None:
         turned = T_camera_reference.rotation @ turned
@@ -164,6 +171,7 @@ def _placed(
     stated = _stated(section, name)
     if stated is None and of_files is None:
         raise InputError(
+            "RIL-241",
             f"{name}: the rig is not known: nothing says where the right camera stands",
             remedy="give rig.baseline (m; parallel cameras) or rig.T_right_left, or calibration files that have it",
         )
@@ -180,7 +188,7 @@ def _placed(
 def _stated(section: RigSection, name: str) -> RigidTransform | None:
     if section.T_right_left is not None and section.baseline is not None:
         raise InputError(
-            f"{name}: rig.baseline and rig.T_right_left both state the baseline", remedy="remove one of them"
+            "RIL-242", f"{name}: rig.baseline and rig.T_right_left both state the baseline", remedy="remove one of them"
         )
     if section.T_right_left is not None:
         return RigidTransform.from_matrix(section.T_right_left)
@@ -188,6 +196,7 @@ def _stated(section: RigSection, name: str) -> RigidTransform | None:
         return None
     if section.baseline <= 0:
         raise InputError(
+            "RIL-243",
             f"{name}: rig.baseline = {section.baseline:g} m is not positive",
             remedy="give the distance of the cameras; where the left one stands to the right, "
             "they are swapped: exchange images.left and images.right",
@@ -202,6 +211,7 @@ def _check_baseline(baseline: float, section: RigSection, name: str) -> list[str
         unit = section.unit / 1000
         hint = f"set rig.unit = {unit:g}, if the calibration is in millimetres" if from_files else "lengths are metres"
         raise InputError(
+            "RIL-244",
             f"{name}: the baseline is {baseline:g} m, which looks like millimetres",
             remedy=f"did you mean {baseline / 1000:g}? {hint}",
         )

@@ -95,6 +95,7 @@ def pair_up(left: Sequence[Path], right: Sequence[Path], rule: str = "auto", *, 
     if rule == "order" or (rule == "auto" and len(left) == len(right) == 1):
         if len(left) != len(right):
             raise InputError(
+                "RIL-256",
                 f"{len(left)} left images and {len(right)} right ones cannot be paired by order",
                 remedy="remove what is too many, or pair by name or number",
             )
@@ -142,6 +143,7 @@ def _numbers(paths: Iterable[Path], side: int) -> list[str]:
         number = _number(path.stem)
         if number is None:
             raise InputError(
+                "RIL-257",
                 f"{path} has no number in its name and no partner of its name",
                 remedy='say how images are paired: images.pair = "order", or narrow the patterns',
             )
@@ -154,6 +156,7 @@ def _unique(keys: list[str], paths: Sequence[Path], rule: str) -> None:
     if count > 1:
         first, second = [p for k, p in zip(keys, paths, strict=True) if k == key][:2]
         raise InputError(
+            "RIL-258",
             f"{first} and {second.name} are the same frame by {rule}",
             remedy="narrow the patterns, or choose another images.pair",
         )
@@ -165,6 +168,7 @@ def _all_partnered(by_key: list[dict[str, Path]], rule: str, counts: tuple[int, 
         if alone:
             more = f" (and {len(alone) - 1} more)" if len(alone) > 1 else ""
             raise InputError(
+                "RIL-259",
                 f"{alone[0]} has no partner by {rule} among the {side} images{more}; "
                 f"{counts[0]} left, {counts[1]} right",
                 remedy="add the missing image, narrow the patterns, or choose another images.pair",

@@ -85,7 +85,7 @@ def read_poses(path: Path, format: str = "auto", *, unit: str = "auto") -> Timed
     from scipy.spatial.transform import Rotation
 
     if format not in FORMATS:
-        raise InputError(f"format {format!r} of poses is unknown", remedy=f"one of {', '.join(FORMATS)}")
+        raise InputError("RIL-262", f"format {format!r} of poses is unknown", remedy=f"one of {', '.join(FORMATS)}")
     table = read_table(path, "pose file")
     if format == "kitti" or (format == "auto" and table.columns in (12, 16) and not _named(table)):
         return TimedPoses(None, _matrices(table), table.name)
@@ -127,6 +127,7 @@ def _columns(table: Table, format: str) -> dict[str, int]:
     named = _named(table)
     if format == "csv" and not named:
         raise InputError(
+            "RIL-263",
             f"{table.name} does not name its columns",
             remedy="begin with a line such as time,qw,qx,qy,qz or time,roll_deg,pitch_deg,yaw_deg",
         )
@@ -136,6 +137,7 @@ def _columns(table: Table, format: str) -> dict[str, int]:
     order = ORDERED[chosen]
     if table.columns < len(order) or (chosen == "tum" and table.columns > len(order)):
         raise InputError(
+            "RIL-264",
             f"{table.name}, line {table.lines[0]}: {table.columns} numbers are no pose of format {chosen}",
             remedy="3 x 4 numbers (kitti), time and 7 numbers (tum, euroc), or columns with names (csv)",
         )
@@ -151,6 +153,7 @@ def _angle_unit(table: Table, columns: Mapping[str, int]) -> str:
     if not said and values.max() > 2 * np.pi:
         return "deg"
     raise InputError(
+        "RIL-265",
         f"{table.name}: roll, pitch and yaw have {'two units' if said else 'no unit'}",
         remedy="name the columns roll_deg, pitch_deg, yaw_deg or roll_rad, pitch_rad, yaw_rad",
     )
@@ -166,6 +169,7 @@ def _quaternions(table: Table, columns: Mapping[str, int]) -> Floats:
     if bad.size:
         k = int(bad[0])
         raise InputError(
+            "RIL-266",
             f"{table.name}, line {table.lines[k]}: a quaternion of length {norms[k]:.4g}",
             remedy="give unit quaternions, and the format whose order of columns the file has",
         )
@@ -176,6 +180,7 @@ def _matrices(table: Table) -> tuple[RigidTransform, ...]:
     """Poses of rows of [R | t]; written with few digits, so that their rotations are made orthonormal."""
     if table.columns not in (12, 16):
         raise InputError(
+            "RIL-267",
             f"{table.name}, line {table.lines[0]}: {table.columns} numbers are no 3 x 4 pose",
             remedy="give 12 numbers a line, or state the format",
         )
@@ -185,7 +190,7 @@ def _matrices(table: Table) -> tuple[RigidTransform, ...]:
         try:
             RigidTransform(m[:, :3], m[:, 3])
         except InputError as error:
-            raise InputError(f"{table.name}, line {line}: {error.message}", remedy=error.remedy) from error
+            raise error.at(f"{table.name}, line {line}") from error
         out.append(RigidTransform(orthonormal(m[:, :3]), m[:, 3]))
     return tuple(out)
 
@@ -211,11 +216,12 @@ def interpolate(timed: TimedPoses, at: Sequence[float], max_gap: float) -> tuple
     from scipy.spatial.transform import Rotation, Slerp
 
     if timed.times is None:
-        raise InputError(f"{timed.name} has no times", remedy="give one pose a frame, or a file with times")
+        raise InputError("RIL-268", f"{timed.name} has no times", remedy="give one pose a frame, or a file with times")
     t, wanted = np.array(timed.times), np.asarray(at, dtype=np.float64)
     inside = (wanted >= t[0] - WITHIN) & (wanted <= t[-1] + WITHIN)
     if not inside.any():
         raise InputError(
+            "RIL-269",
             f"{timed.name} reaches from {t[0]:.3f} to {t[-1]:.3f} s, the frames from {wanted[0]:.3f} to "
             f"{wanted[-1]:.3f} s: no common time",
             remedy="check that both have the same clock and unit; a constant offset can be stated",

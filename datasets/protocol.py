@@ -152,11 +152,14 @@ class Sequence:
 
     def __post_init__(self) -> None:
         if self.frames < 1:
-            raise InputError(f"sequence {self.name} has no frames", remedy="give a folder with at least one pair")
+            raise InputError(
+                "RIL-272", f"sequence {self.name} has no frames", remedy="give a folder with at least one pair"
+            )
         for what in ("frame_names", "times", "truth", "up", "attitude", "odometry"):
             values = getattr(self, what)
             if values is not None and len(values) != self.frames:
                 raise InputError(
+                    "RIL-273",
                     f"sequence {self.name}: {len(values)} {what.replace('_', ' ')} for {self.frames} frames",
                     remedy=f"give one entry of {what.replace('_', ' ')} a frame",
                 )

@@ -89,11 +89,12 @@ def _of_files(name_or_path: str, digests: Digests) -> Sequence:
     if path.is_file() and path.suffix == ".toml":
         return open_manifest(path, digests)
     if not path.is_dir():
-        raise InputError(f"no sequence {name_or_path!r}", remedy=_suggestion(name_or_path))
+        raise InputError("RIL-276", f"no sequence {name_or_path!r}", remedy=_suggestion(name_or_path))
     layout = _recognised(path, number)
     if layout is None:
         forms = "; or ".join(f"{form}: {words}" for form, words in LAYOUTS)
         raise InputError(
+            "RIL-277",
             f"{name_or_path} has no layout that is recognised",
             remedy=f"try `rille init {name_or_path}`; forms: {forms}",
         )
@@ -103,6 +104,7 @@ def _of_files(name_or_path: str, digests: Digests) -> Sequence:
         return euroc.open_euroc(layout, digests)
     if not layout.calib.is_file():
         raise InputError(
+            "RIL-278",
             f"{name_or_path} has image folders {' and '.join(layout.pair)}, but no {layout.calib.name}",
             remedy=f"`rille init {name_or_path}` writes a manifest that says what is needed",
         )
@@ -133,7 +135,9 @@ def folder_manifest(folder: Path) -> Path | None:
     found = sorted(folder.glob("*.rille.toml")) or [p for p in (folder / "manifest.toml",) if p.is_file()]
     if len(found) > 1:
         names = ", ".join(path.name for path in found)
-        raise InputError(f"{folder} holds {len(found)} manifests: {names}", remedy=f"choose one, e.g. {found[0]}")
+        raise InputError(
+            "RIL-279", f"{folder} holds {len(found)} manifests: {names}", remedy=f"choose one, e.g. {found[0]}"
+        )
     return found[0] if found else None
 
 
@@ -149,7 +153,7 @@ def validated(kind: type[Params], section: str, values: Mapping[str, Any]) -> An
         return kind.model_validate(dict(values))
     except ValidationError as error:
         lines = [_complaint(kind, section, dict(e)) for e in error.errors()]
-        raise ConfigError("; ".join(lines), remedy="") from error
+        raise ConfigError("RIL-280", "; ".join(lines), remedy="") from error
 
 
 def _complaint(kind: type[Params], section: str, error: dict[str, Any]) -> str:
@@ -163,7 +167,7 @@ def _complaint(kind: type[Params], section: str, error: dict[str, Any]) -> str:
 
 def _none_left(sections: Mapping[str, Any], name: str) -> None:
     if sections:
-        raise ConfigError(f"[{next(iter(sections))}] does not belong to {name}", remedy="remove its keys")
+        raise ConfigError("RIL-281", f"[{next(iter(sections))}] does not belong to {name}", remedy="remove its keys")
 
 
 def _split(name_or_path: str) -> tuple[Path, str | None]:

@@ -61,7 +61,9 @@ def number(cell: str, name: str, line: int) -> float:
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise InputError(f"{name}, line {line}: {cell!r} is not a finite number", remedy="correct or remove that line")
+        raise InputError(
+            "RIL-284", f"{name}, line {line}: {cell!r} is not a finite number", remedy="correct or remove that line"
+        )
     return value
 
 
@@ -93,13 +95,14 @@ def read_table(path: Path, what: str) -> Table:
             continue
         if rows and len(row) != len(rows[0]):
             raise InputError(
+                "RIL-285",
                 f"{path}, line {k}: {len(row)} columns where the first row has {len(rows[0])}",
                 remedy="correct or remove that line",
             )
         rows.append(row)
         at.append(k)
     if not rows:
-        raise InputError(f"{what} {path} has no rows of numbers", remedy="check that it is the right file")
+        raise InputError("RIL-286", f"{what} {path} has no rows of numbers", remedy="check that it is the right file")
     header = split(names, separator) if names else ()
     header = header if len(header) == len(rows[0]) else ()
     return Table(str(path), tuple(name.lower() for name in header), tuple(rows), tuple(at), separator is not None)
@@ -109,7 +112,7 @@ def _lines(path: Path, what: str) -> list[str]:
     try:
         return path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{what} {path} cannot be read: {error}", remedy="check the file") from error
+        raise InputError("RIL-287", f"{what} {path} cannot be read: {error}", remedy="check the file") from error
 
 
 def split(text: str, separator: str | None) -> tuple[str, ...]:

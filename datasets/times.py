@@ -53,7 +53,9 @@ def seconds(
         A stamp is no number, two are equal or go back, units are mixed, or the unit is unknown.
     """
     if unit != "auto" and unit not in UNITS:
-        raise InputError(f"{what}: unit {unit!r} of time is unknown", remedy=f"one of auto, {', '.join(UNITS)}")
+        raise InputError(
+            "RIL-290", f"{what}: unit {unit!r} of time is unknown", remedy=f"one of auto, {', '.join(UNITS)}"
+        )
     at = list(lines) if lines is not None else list(range(1, len(values) + 1))
     exact = [_decimal(v, what, k) for v, k in zip(values, at, strict=True)]
     if not exact:
@@ -93,7 +95,7 @@ def _decimal(value: str | int | float, what: str, line: int) -> Decimal:
     except (InvalidOperation, ValueError):
         exact = Decimal("nan")
     if not exact.is_finite():
-        raise InputError(f"{what}, line {line}: {value!r} is not a time", remedy="give numbers, one a frame")
+        raise InputError("RIL-291", f"{what}, line {line}: {value!r} is not a time", remedy="give numbers, one a frame")
     return exact
 
 
@@ -112,6 +114,7 @@ def _unit(exact: Sequence[Decimal], what: str, lines: Sequence[int]) -> str:
 
 def _mixed(what: str, lines: Sequence[int], exact: Sequence[Decimal], k: int, how: str) -> InputError:
     return InputError(
+        "RIL-292",
         f"{what}, line {lines[k]}: time {exact[k]} after {exact[k - 1]}: mixed units ({how})",
         remedy="write all times in one unit, or state it where small stamps are not seconds",
     )
@@ -122,6 +125,7 @@ def _in_order(exact: Sequence[Decimal], what: str, lines: Sequence[int]) -> None
         if exact[k] <= exact[k - 1]:
             words = "is there twice" if exact[k] == exact[k - 1] else f"goes back from {exact[k - 1]}"
             raise InputError(
+                "RIL-293",
                 f"{what}, line {lines[k]}: time {exact[k]} {words}",
                 remedy="put the rows in order of time, each once, in one unit",
             )

@@ -112,6 +112,7 @@ class Admission:
         lower = handle.spec.stage.memory.lower
         change = f"change {' or '.join(lower)}, or " if lower else ""
         return MemoryRefusedError(
+            "RIL-500",
             f"would need about {words(foreseen.memory)} ({foreseen.source}), and "
             f"{words(self.shares.alone)} are left for a task of the limit of {words(self.shares.limit)} "
             f"(the program itself and a worker hold {words(self.shares.own + self.shares.rest)})",
@@ -123,7 +124,7 @@ class Admission:
         for index, foreseen in forecast(graph, self.costs).items():
             error = self.refusal(graph.nodes[index], foreseen)
             if error is not None:
-                raise MemoryRefusedError(f"{graph.nodes[index].label} {error.message}", remedy=error.remedy)
+                raise error.at(graph.nodes[index].label)
 
 
 def forecast(graph: Graph, costs: Costs) -> dict[int, Foreseen]:

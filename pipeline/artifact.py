@@ -271,6 +271,7 @@ class LazyArrays(Mapping[str, AnyArray]):
             return values
         self._damaged(wrong)
         raise DamagedError(
+            "RIL-504",
             f"artifact {self._manifest['label']} ({self._manifest['stage']}) is damaged, {wrong}; it was set aside",
             remedy="run again: it will be recomputed",
         )

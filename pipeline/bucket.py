@@ -160,19 +160,25 @@ class Bucket:
         text, code, bucket = str(error), _code(error), self.url.split("/")[2]
         endpoint = _endpoint()
         if code == "NoSuchBucket":
-            return BucketError(f"bucket {bucket} does not exist at {endpoint}", remedy="make it, or correct --cache")
+            return BucketError(
+                "RIL-508", f"bucket {bucket} does not exist at {endpoint}", remedy="make it, or correct --cache"
+            )
         if "169.254.169.254" in text or "169.254.170.2" in text:
             remedy = "set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_PROFILE"
-            return BucketError(f"no credentials for {self.url} in the environment", remedy=remedy)
+            return BucketError("RIL-509", f"no credentials for {self.url} in the environment", remedy=remedy)
         if re.search(r"\b40[13] ", text) or isinstance(error, PermissionError):
             remedy = "check AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY, AWS_SESSION_TOKEN and the bucket's policy"
             return BucketError(
-                f"{endpoint} refuses the credentials for {self.url} ({code or 'forbidden'})", remedy=remedy
+                "RIL-510", f"{endpoint} refuses the credentials for {self.url} ({code or 'forbidden'})", remedy=remedy
             )
         if status := re.search(r"status code: (\d{3}[^:\n]{0,40})", text):
             what = f"answers {status[1].strip()}" + (f" ({code})" if code else "")
-            return BucketError(f"{endpoint} {what} for {self.url}", remedy="try later: what is committed stays")
-        return BucketError(f"no object store answers at {endpoint} for {self.url}", remedy="check AWS_ENDPOINT_URL")
+            return BucketError(
+                "RIL-511", f"{endpoint} {what} for {self.url}", remedy="try later: what is committed stays"
+            )
+        return BucketError(
+            "RIL-512", f"no object store answers at {endpoint} for {self.url}", remedy="check AWS_ENDPOINT_URL"
+        )
 
 
 def _code(error: BaseException) -> str:
@@ -213,7 +219,7 @@ def _store(url: str, retry: dict[str, Any]) -> Any:
     except Exception as error:
         reason = str(error).splitlines()[0][:120]
         raise ConfigError(
-            f"the environment does not describe an object store: {reason}", remedy="check AWS_*"
+            "RIL-513", f"the environment does not describe an object store: {reason}", remedy="check AWS_*"
         ) from None
 
 
@@ -222,13 +228,16 @@ def _profile() -> Any:
         from obstore.auth.boto3 import Boto3CredentialProvider
     except ImportError:
         raise ConfigError(
+            "RIL-514",
             "AWS_PROFILE is read with boto3, which is not installed",
             remedy="pip install boto3, or set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY",
         ) from None
     try:
         return Boto3CredentialProvider()
     except Exception as error:
-        raise ConfigError(f"AWS_PROFILE: {str(error).splitlines()[0][:120]}", remedy="check ~/.aws/config") from None
+        raise ConfigError(
+            "RIL-515", f"AWS_PROFILE: {str(error).splitlines()[0][:120]}", remedy="check ~/.aws/config"
+        ) from None
 
 
 def connect(url: str) -> Bucket:
@@ -264,6 +273,7 @@ def _try(bucket: Bucket, endpoint: str) -> None:
             bucket.delete([path])
     if not refused or kept is None or kept[0] != first:
         raise BucketError(
+            "RIL-516",
             f"{endpoint} ignores If-None-Match: of two runs on {bucket.url} one could overwrite what the other has"
             " published, so this store is not used",
             remedy="use a server that honours it (AWS S3, MinIO, Ceph, R2 in recent versions), or a folder as cache",

@@ -96,7 +96,9 @@ def _files(left: Path, right: Path) -> tuple[list[Path], list[Path]]:
         told = [[p for p in paths if (pairing.side_of(p.stem) or (0, -1))[1] == k] for k, paths in enumerate(sides)]
         if not all(told):
             raise InputError(
-                f"the names in {left} do not tell left from right", remedy="give two folders, or two globs in quotes"
+                "RIL-010",
+                f"the names in {left} do not tell left from right",
+                remedy="give two folders, or two globs in quotes",
             )
         return told[0], told[1]
     return sides[0], sides[1]
@@ -107,7 +109,9 @@ def _images(place: Path) -> list[Path]:
     found = list(place.iterdir()) if place.is_dir() else [Path(p) for p in glob.glob(str(place.expanduser()))]
     images = sorted(p for p in found if p.suffix.lower() in pairing.SUFFIXES)
     if not images:
-        raise InputError(f"{place} names no images", remedy="give a folder, or a glob in quotes such as 'left*.jpg'")
+        raise InputError(
+            "RIL-011", f"{place} names no images", remedy="give a folder, or a glob in quotes such as 'left*.jpg'"
+        )
     return images
 
 
@@ -245,4 +249,6 @@ def _write(path: Path, text: str) -> None:
     try:
         path.write_text(text, encoding="utf-8")
     except OSError as error:
-        raise RilleError(f"cannot write {path}: {error.strerror}", remedy="choose another --output") from error
+        raise RilleError(
+            "RIL-012", f"cannot write {path}: {error.strerror}", remedy="choose another --output"
+        ) from error

@@ -304,4 +304,6 @@ def draw(path: Path, name: str, frame: str, match: Match) -> None:
     try:
         fig.savefig(path, dpi=110)
     except OSError as error:
-        raise RilleError(f"cannot write {path}: {error.strerror}", remedy="choose another --output") from error
+        raise RilleError(
+            "RIL-016", f"cannot write {path}: {error.strerror}", remedy="choose another --output"
+        ) from error

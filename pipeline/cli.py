@@ -209,7 +209,7 @@ def main(argv: list[str] | None = None) -> None:
         print("rille: interrupted; the same command resumes from here", file=sys.stderr)
         code = INTERRUPTED
     except CycloptsError as error:
-        print(f"rille: {error}", file=sys.stderr)
+        _print_error("RIL-001", str(error))
         code = USAGE
     except Exception as error:
         code = _complain(error, debug)
@@ -223,11 +223,16 @@ def _complain(error: Exception, debug: bool) -> int:
 
     if debug:
         traceback.print_exception(error)
-    known = isinstance(error, RilleError)
-    hint = "" if known or debug else " (run again with --debug for the traceback)"
-    name = "" if known else f"{type(error).__name__}: "
-    print(f"rille: {name}{' '.join(str(error).split())}{hint}", file=sys.stderr)
+    if isinstance(error, RilleError):
+        _print_error(error.code, str(error))
+    else:
+        hint = "" if debug else " (run again with --debug for the traceback)"
+        _print_error("RIL-999", f"{type(error).__name__}: {error}{hint}")
     return USAGE if isinstance(error, ConfigError | InputError) else FAILED
+
+
+def _print_error(code: str, words: str) -> None:
+    print(f"rille: error {code}: {' '.join(words.split())}", file=sys.stderr)
 
 
 if __name__ == "__main__":

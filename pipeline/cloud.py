@@ -40,14 +40,16 @@ def export(run: Path, kind: str, output: Path | None) -> tuple[Path, str]:
     """
     default, write = FORMATS[kind]
     if not run.is_dir():
-        raise InputError(f"{run} is not the folder of a run", remedy="give RUNS/sequence/latest")
+        raise InputError("RIL-600", f"{run} is not the folder of a run", remedy="give RUNS/sequence/latest")
     target = output or run / default
     terrain = read_elevation(run)
     ortho, sigma = (_beside(run, name, terrain) for name in ("ortho", "dem_sigma"))
     try:
         return target, write(target, terrain, ortho, sigma)
     except OSError as error:
-        raise InputError(f"{target} cannot be written: {error.strerror}", remedy="name another file with -o") from error
+        raise InputError(
+            "RIL-601", f"{target} cannot be written: {error.strerror}", remedy="name another file with -o"
+        ) from error
 
 
 def _beside(run: Path, name: str, terrain: Raster) -> NDArray[np.float64] | None:
@@ -57,7 +59,7 @@ def _beside(run: Path, name: str, terrain: Raster) -> NDArray[np.float64] | None
         return None
     found = read_tiff(path, length=False)
     if found.values.shape != terrain.values.shape or found.transform != terrain.transform:
-        raise InputError(f"{path} and dem.tif have other cells", remedy="make the run again")
+        raise InputError("RIL-602", f"{path} and dem.tif have other cells", remedy="make the run again")
     return found.values
 
 
@@ -109,7 +111,9 @@ def write_glb(path: Path, terrain: Raster, ortho: NDArray[np.float64] | None, si
         step += 1
         vertices, faces, uv = _mesh(terrain, step)
     if not len(faces):
-        raise InputError(f"{terrain.name}: no four neighbouring cells are known", remedy="give a more complete one")
+        raise InputError(
+            "RIL-603", f"{terrain.name}: no four neighbouring cells are known", remedy="give a more complete one"
+        )
     middle = np.round(0.5 * (vertices.min(axis=0) + vertices.max(axis=0)), 3)
     local = vertices - middle
     shown = np.column_stack([local[:, 0], local[:, 2], -local[:, 1]]).astype(np.float32)

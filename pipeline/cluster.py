@@ -135,13 +135,17 @@ def _judge(client: Any, address: str, told: Any, ours: Identity, cache: Location
     name = _name(client, address)
     if isinstance(told, BaseException):
         raise ConfigError(
+            "RIL-520",
             f"{name} cannot run Rille: {type(told).__name__}: {' '.join(str(told).split())[:200]}",
             remedy="install the same version there, and start the workers with it",
         )
     if difference := unlike(told["identity"], ours):
-        raise ConfigError(f"{name} differs: {difference}", remedy="install the same there, and start it again")
+        raise ConfigError(
+            "RIL-521", f"{name} differs: {difference}", remedy="install the same there, and start it again"
+        )
     if told["threads"]:
         raise ConfigError(
+            "RIL-522",
             f"{name} may use several threads a library ({told['threads'][0]} is not 1)",
             remedy="start it with OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1",
         )
@@ -156,7 +160,7 @@ def _name(client: Any, address: str) -> str:
 
 def _no_cache(name: str, cache: Location, why: str) -> ConfigError:
     remedy = "give --cache a folder that all machines share, or s3://bucket/prefix"
-    return ConfigError(f"{name} does not share the cache {cache}: {why}", remedy=remedy)
+    return ConfigError("RIL-523", f"{name} does not share the cache {cache}: {why}", remedy=remedy)
 
 
 def ready(ours: tuple[tuple[str, str], ...]) -> None:
@@ -168,7 +172,7 @@ def ready(ours: tuple[tuple[str, str], ...]) -> None:
         It is not.
     """
     if difference := _prepared(ours, os.getpid()):
-        raise CodeChangedError(f"worker {_here()} differs: {difference}", remedy="install the same there")
+        raise CodeChangedError("RIL-524", f"worker {_here()} differs: {difference}", remedy="install the same there")
 
 
 @lru_cache(maxsize=4)
@@ -212,6 +216,7 @@ class Presence:
             self._manned = now
         elif now - self._manned > NO_WORKERS:
             raise ClusterError(
+                "RIL-525",
                 f"the dask scheduler at {self._address} had no workers for {NO_WORKERS:.0f} s",
                 remedy="start workers, and run the same command: what is committed stays",
             )
@@ -220,6 +225,7 @@ class Presence:
     def gone(self) -> ClusterError:
         """The scheduler is."""
         return ClusterError(
+            "RIL-526",
             f"the dask scheduler at {self._address} is gone",
             remedy="start it again with its workers, and run the same command: what is committed stays",
         )

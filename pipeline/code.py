@@ -131,7 +131,9 @@ def version(distribution: str) -> str:
     try:
         return importlib.metadata.version(distribution)
     except importlib.metadata.PackageNotFoundError as error:
-        raise MissingPackageError(f"package {distribution} is not installed", remedy="run `make install`") from error
+        raise MissingPackageError(
+            "RIL-530", f"package {distribution} is not installed", remedy="run `make install`"
+        ) from error
 
 
 def environment(requires: Iterable[str]) -> dict[str, str]:

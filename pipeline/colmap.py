@@ -34,7 +34,7 @@ def export_run(run: Path, target: Path, store: Store) -> str:
         The folder holds no finished run, its artifacts are gone from the cache, or the target is not empty.
     """
     if target.exists() and any(target.iterdir()):
-        raise InputError(f"{target} is not empty", remedy="give a new folder with --output")
+        raise InputError("RIL-607", f"{target} is not empty", remedy="give a new folder with --output")
     bundles = _Artifacts(run, store)
     rig = Rig.from_dict(bundles.one("calibration").meta["rig"])
     trajectory = bundles.one("trajectory")
@@ -145,7 +145,9 @@ class _Artifacts:
     def __init__(self, run: Path, store: Store) -> None:
         path = run / "ledger.jsonl"
         if not path.is_file():
-            raise InputError(f"{run} holds no ledger.jsonl", remedy="give the folder of a run, e.g. runs/mockup/latest")
+            raise InputError(
+                "RIL-608", f"{run} holds no ledger.jsonl", remedy="give the folder of a run, e.g. runs/mockup/latest"
+            )
         self.store = store
         self.rows = [row for row in ledger.read(path) if row["status"] in ("computed", "cached") and "key" in row]
 
@@ -153,7 +155,7 @@ class _Artifacts:
         """The artifact of this label."""
         row = next((r for r in self.rows if r["label"].split("/")[0] == label), None)
         if row is None:
-            raise InputError(f"the run has no {label}", remedy="finish it with rille reconstruct")
+            raise InputError("RIL-609", f"the run has no {label}", remedy="finish it with rille reconstruct")
         return self._open(row)
 
     def pairs(self, first: str, second: str) -> list[tuple[Bundle, Bundle]]:
@@ -166,5 +168,7 @@ class _Artifacts:
     def _open(self, row: Mapping[str, Any]) -> Bundle:
         ref = self.store.lookup(str(row["stage"]), str(row["key"]))
         if ref is None:
-            raise InputError(f"{row['label']} is not in the cache", remedy="name the run's cache with --cache")
+            raise InputError(
+                "RIL-610", f"{row['label']} is not in the cache", remedy="name the run's cache with --cache"
+            )
         return self.store.open(ref)

@@ -46,7 +46,9 @@ def compare(path_a: Path, path_b: Path, *, align: str = "none", output: Path = P
         write_text(target.with_name(target.name + ".json"), json.dumps(found, indent=1, allow_nan=False) + "\n")
         draw(target.with_name(target.name + ".png"), found, error, slope, distance)
     except OSError as problem:
-        raise InputError(f"{target} cannot be written: {problem.strerror}", remedy="name others with -o") from problem
+        raise InputError(
+            "RIL-614", f"{target} cannot be written: {problem.strerror}", remedy="name others with -o"
+        ) from problem
     print(f"{target}.png  {target}.json")
     return 0
 
@@ -61,6 +63,7 @@ def check(a: Raster, b: Raster) -> None:
     """
     if a.crs and b.crs and not _same_crs(a.crs, b.crs):
         raise InputError(
+            "RIL-615",
             f"{a.name} is in {_crs_name(a.crs)}, {b.name} in {_crs_name(b.crs)}",
             remedy="bring one to the other's system first, e.g. with gdalwarp -t_srs",
         )
@@ -68,6 +71,7 @@ def check(a: Raster, b: Raster) -> None:
     u0, u1, v0, v1 = b.extent
     if min(x1, u1) <= max(x0, u0) or min(y1, v1) <= max(y0, v0):
         raise InputError(
+            "RIL-616",
             f"no overlap: A is at x {x0:.6g}..{x1:.6g}, y {y0:.6g}..{y1:.6g} m, B at x {u0:.6g}..{u1:.6g}, "
             f"y {v0:.6g}..{v1:.6g} m",
             remedy="compare models of the same place",
@@ -109,7 +113,9 @@ def measure(a: Raster, b: Raster, kind: str = "none") -> tuple[dict[str, Any], F
     found["figures"] = figures(error)
     given = int(np.isfinite(error).sum())
     if not given:
-        raise InputError("no cell is left that both know", remedy="leave --align out, or compare other models")
+        raise InputError(
+            "RIL-617", "no cell is left that both know", remedy="leave --align out, or compare other models"
+        )
     found["completeness"] = {
         "of_b": min(given / known.sum(), 1.0),
         "of_b_within_a": min(given / max(int((known & inside).sum()), 1), 1.0),

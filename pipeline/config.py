@@ -139,7 +139,7 @@ def parse_assignments(assignments: Iterable[str]) -> dict[str, Any]:
         key = key.strip()
         if not sep or "." not in key:
             raise ConfigError(
-                f"--set {text!r} is not section.key=value", remedy="write e.g. --set locus.cell_size=0.002"
+                "RIL-024", f"--set {text!r} is not section.key=value", remedy="write e.g. --set locus.cell_size=0.002"
             )
         merge(nested, expand({key: _toml_value(value.strip())}))
     return nested
@@ -157,9 +157,11 @@ def read_toml(path: Path) -> dict[str, Any]:
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
-        raise ConfigError(f"cannot read configuration {path}: {error.strerror}", remedy="check --config") from error
+        raise ConfigError(
+            "RIL-025", f"cannot read configuration {path}: {error.strerror}", remedy="check --config"
+        ) from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path} is not TOML: {error}", remedy="correct the file at that place") from error
+        raise ConfigError("RIL-026", f"{path} is not TOML: {error}", remedy="correct the file at that place") from error
 
 
 def expand(dotted: Mapping[str, Any]) -> dict[str, Any]:
@@ -245,7 +247,7 @@ def validate(kind: type[Params], values: Mapping[str, Any], prefix: tuple[str, .
         return kind.model_validate(dict(values))
     except ValidationError as error:
         lines = [_complaint(kind, prefix, dict(e), also) for e in error.errors()]
-        raise ConfigError("; ".join(lines)) from error
+        raise ConfigError("RIL-027", "; ".join(lines)) from error
 
 
 def _complaint(kind: type[Params], prefix: tuple[str, ...], error: dict[str, Any], also: Iterable[str]) -> str:

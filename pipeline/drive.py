@@ -131,9 +131,13 @@ class Drive(Reconstruction):
     def __init__(self, graph: Graph, sequence: Sequence, config: Any, frames: tuple[int, ...] = (0,)) -> None:
         super().__init__(graph, sequence, config, frames)
         if sequence.simulation is None or config.drive.goal is None:
-            raise ConfigError(f"{sequence.name} has no goal to drive to", remedy="set drive.goal=[x, y], metres")
+            raise ConfigError(
+                "RIL-031", f"{sequence.name} has no goal to drive to", remedy="set drive.goal=[x, y], metres"
+            )
         if config.locus.cell_size is None:
-            raise ConfigError("a drive needs locus.cell_size", remedy="set it to about an eighth of a wheel, metres")
+            raise ConfigError(
+                "RIL-032", "a drive needs locus.cell_size", remedy="set it to about an eighth of a wheel, metres"
+            )
         self.simulation: Simulation = sequence.simulation
         self.mounting = {"T_vehicle_left": self.simulation.T_vehicle_left.to_list()}
         self.driven = self.products.drive = Driven()
@@ -213,6 +217,7 @@ class Drive(Reconstruction):
             args["pose"] = [*d.pose[:3], math.radians(d.pose[3])]
         elif d.prior is None or self.simulation.overview is None:
             raise ConfigError(
+                "RIL-033",
                 "drive.frame=map needs drive.pose, or drive.prior and a global map",
                 remedy="set drive.pose=[x, y, z, degrees], or drive.prior and rover.map_cell",
             )

@@ -107,8 +107,10 @@ class Result:
             first = self.failures[0]
             error = first.error
             if isinstance(error, RilleError):
-                raise type(error)(f"{first.label}: {error.message}", remedy=error.remedy) from error
-            raise TaskError(f"{first.label} (stage {first.stage}): {type(error).__name__}: {error}") from error
+                raise error.at(first.label) from error
+            raise TaskError(
+                "RIL-534", f"{first.label} (stage {first.stage}): {type(error).__name__}: {error}"
+            ) from error
 
 
 def run(
@@ -392,7 +394,9 @@ class _Run:
             return
         del self.flying[key]
         if not isinstance(outcome, Failed) and first.ref is not None and first.ref.digest != outcome.ref.digest:
-            error = NonDeterministicError(f"stage {first.stage} is not deterministic: another digest when healed")
+            error = NonDeterministicError(
+                "RIL-535", f"stage {first.stage} is not deterministic: another digest when healed"
+            )
             outcome = Failed(error, "")
         if isinstance(outcome, Failed):
             for handle in (first, *others):

@@ -101,7 +101,7 @@ def known(kind: str) -> None:
         It is neither one of the kinds nor an address.
     """
     if kind not in KINDS and not re.fullmatch(r"(tcp|tls)://[^/\s]+:\d+", kind):
-        raise ConfigError(f"executor {kind!r} is unknown", remedy=f"{', '.join(KINDS)} or tcp://host:port")
+        raise ConfigError("RIL-539", f"executor {kind!r} is unknown", remedy=f"{', '.join(KINDS)} or tcp://host:port")
 
 
 def make(
@@ -119,7 +119,7 @@ def make(
     """
     known(kind)
     if jobs is not None and jobs < 1:
-        raise ConfigError(f"{jobs} jobs are not permitted", remedy="give 1 or more")
+        raise ConfigError("RIL-540", f"{jobs} jobs are not permitted", remedy="give 1 or more")
     jobs = jobs or cores()
     if kind == "inline":
         return Inline()
@@ -230,7 +230,9 @@ class _Client(_Futures):
         try:
             self._client = Client(address, set_as_default=False, timeout=CONNECT)
         except (OSError, TimeoutError, ValueError) as error:
-            raise ConfigError(f"no dask scheduler answers at {address}", remedy="check the address") from error
+            raise ConfigError(
+                "RIL-541", f"no dask scheduler answers at {address}", remedy="check the address"
+            ) from error
         super().__init__(max(1, sum(self._client.nthreads().values())))
         self._submitted = 0
 
@@ -247,7 +249,7 @@ class _Client(_Futures):
         return super()._result(key, future)
 
     def _killed(self, key: str, task: str) -> Failed | None:
-        return Failed(died("worker processes died that had it"), "")
+        return Failed(died("RIL-542", "worker processes died that had it"), "")
 
     def close(self, kill: bool = False) -> None:
         """Leave the cluster as it is."""

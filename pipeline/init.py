@@ -36,14 +36,19 @@ def init(directory: Path, output: Path | None = None, force: bool = False) -> in
     found = inspect(directory)
     path = output if output is not None else Path(f"{short_name(directory)}.rille.toml")
     if path.suffix != ".toml":
-        raise ConfigError(f"--output {path} is no .toml file", remedy=f"e.g. {short_name(directory)}.rille.toml")
+        raise ConfigError(
+            "RIL-037", f"--output {path} is no .toml file", remedy=f"e.g. {short_name(directory)}.rille.toml"
+        )
     if path.exists() and not force:
-        raise ConfigError(f"{path} exists", remedy="name another file by --output, or overwrite it by --force")
+        raise ConfigError(
+            "RIL-038", f"{path} exists", remedy="name another file by --output, or overwrite it by --force"
+        )
     text = manifest_text(found, _root(directory, path))
     try:
         path.write_text(text, encoding="utf-8")
     except OSError as error:
         raise InputError(
+            "RIL-039",
             f"{path} cannot be written: {error.strerror}",
             remedy=f"name another file, e.g. --output {short_name(directory)}.rille.toml",
         ) from error

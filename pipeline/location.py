@@ -36,14 +36,16 @@ def locate(given: Path | str) -> Location:
     remedy = "give --cache s3://bucket/prefix, and credentials in the environment (AWS_ACCESS_KEY_ID ...)"
     parts = urlsplit(text)
     if parts.scheme != "s3":
-        raise ConfigError(f"a cache at {parts.scheme}:// is not supported", remedy=remedy)
+        raise ConfigError("RIL-546", f"a cache at {parts.scheme}:// is not supported", remedy=remedy)
     if "@" in parts.netloc or parts.query or parts.fragment:
-        raise ConfigError("the URL of the cache has more than bucket and prefix", remedy=remedy)
+        raise ConfigError("RIL-547", "the URL of the cache has more than bucket and prefix", remedy=remedy)
     prefix = "/".join(p for p in parts.path.split("/") if p)
     if not _BUCKET.fullmatch(parts.netloc):
-        raise ConfigError(f"{parts.netloc!r} is no name of a bucket", remedy=remedy)
+        raise ConfigError("RIL-548", f"{parts.netloc!r} is no name of a bucket", remedy=remedy)
     if not _PREFIX.fullmatch(prefix) or {".", ".."} & set(prefix.split("/")):
-        raise ConfigError(f"{prefix!r} is no prefix for a cache: letters, digits and ._=- only", remedy=remedy)
+        raise ConfigError(
+            "RIL-549", f"{prefix!r} is no prefix for a cache: letters, digits and ._=- only", remedy=remedy
+        )
     return f"s3://{parts.netloc}/{prefix}".rstrip("/")
 
 

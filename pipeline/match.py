@@ -62,7 +62,7 @@ def match_files(
 
     params = matcher_params(preset, assignments)
     if confidence is not None and confidence.resolve() == output.resolve():
-        raise ConfigError(f"--confidence and --output are both {output}", remedy="give them two names")
+        raise ConfigError("RIL-043", f"--confidence and --output are both {output}", remedy="give them two names")
     images = read_grey(left), read_grey(right)
     given = _prior(prior, images[0].shape) if prior is not None else None
 
@@ -127,11 +127,14 @@ def _prior(path: Path, shape: tuple[int, ...]) -> tuple[NDArray[Any], NDArray[An
     if column.shape != shape:
         sizes = [f"{s[1]} x {s[0]}" for s in (column.shape, shape)]
         raise InputError(
+            "RIL-044",
             f"prior disparity {path} is {sizes[0]} pixels, the left image {sizes[1]}",
             remedy="give a disparity of this left image",
         )
     if not (np.isfinite(column) & np.isfinite(row)).any():
-        raise InputError(f"prior disparity {path} is undefined everywhere", remedy="leave --prior-disparity out")
+        raise InputError(
+            "RIL-045", f"prior disparity {path} is undefined everywhere", remedy="leave --prior-disparity out"
+        )
     return column, row
 
 
@@ -140,7 +143,9 @@ def matcher_params(preset: str | None, assignments: tuple[str, ...]) -> Any:
     nested = configuration.parse_assignments(assignments)
     if set(nested) - {"hfvm"}:
         other = next(k for k in nested if k != "hfvm")
-        raise ConfigError(f"--set {other}: match has the section hfvm only", remedy="write --set hfvm.key=value")
+        raise ConfigError(
+            "RIL-046", f"--set {other}: match has the section hfvm only", remedy="write --set hfvm.key=value"
+        )
     values: dict[str, Any] = dict(nested.get("hfvm", {}))
     if preset is not None:
         values["preset"] = preset

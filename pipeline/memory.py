@@ -47,7 +47,9 @@ def parse(text: str) -> int:
         found = _WORDS.fullmatch(words)
         if found and float(found[1]) > 0:
             return int(float(found[1]) * UNITS[found[2].lower()])
-    raise ConfigError(f"--memory-limit {text!r} is no amount of memory", remedy="give e.g. 6GB, 800MB or 75%")
+    raise ConfigError(
+        "RIL-553", f"--memory-limit {text!r} is no amount of memory", remedy="give e.g. 6GB, 800MB or 75%"
+    )
 
 
 def words(amount: float) -> str:

@@ -140,7 +140,9 @@ class ObjectStore(Store):
 
     def path(self, ref: Ref) -> Path:
         """Artifacts here are not files."""
-        raise StoreError(f"{ref.path} is in {self.location}, not in a folder", remedy="open it with zarr and obstore")
+        raise StoreError(
+            "RIL-557", f"{ref.path} is in {self.location}, not in a folder", remedy="open it with zarr and obstore"
+        )
 
     def _current(self, ref: Ref) -> Manifest | None:
         path = manifest_path(ref.stage, ref.key)
@@ -180,7 +182,9 @@ class ObjectStore(Store):
                 continue
             if there is not None:  # it may be this one, whose first answer was lost
                 return None if there["path"] == manifest["path"] else there
-        raise StoreError(f"cannot publish {path} in {self.location}", remedy="remove that object and run again")
+        raise StoreError(
+            "RIL-558", f"cannot publish {path} in {self.location}", remedy="remove that object and run again"
+        )
 
     def _discard(self, objects: Iterable[str]) -> None:
         with suppress(BucketError):

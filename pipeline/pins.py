@@ -26,7 +26,7 @@ def pin(store: Store, run: Path) -> int:
         temporary.write_text(body, encoding="utf-8")
         temporary.replace(path)
     except OSError as error:
-        raise StoreError(f"cannot pin in {store.root}: {error.strerror}", remedy="check --cache") from error
+        raise StoreError("RIL-562", f"cannot pin in {store.root}: {error.strerror}", remedy="check --cache") from error
     return len(keys)
 
 
@@ -45,7 +45,7 @@ def unpin(store: Store, text: str) -> str:
             _path(store, name).unlink(missing_ok=True)
             return str(name)
     remedy = f"pinned are {', '.join(pinned)}" if pinned else "nothing is pinned in this cache"
-    raise ConfigError(f"run {text!r} is not pinned", remedy=remedy)
+    raise ConfigError("RIL-563", f"run {text!r} is not pinned", remedy=remedy)
 
 
 def pins(store: Store) -> list[dict[str, Any]]:
@@ -63,7 +63,7 @@ def pins(store: Store) -> list[dict[str, Any]]:
             found.append({"run": str(one["run"]), "pinned": float(one["pinned"]), "keys": list(one["keys"])})
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise StoreError(
-                f"the pin {path} cannot be read", remedy="pin that run again, or remove the file"
+                "RIL-564", f"the pin {path} cannot be read", remedy="pin that run again, or remove the file"
             ) from error
     return found
 

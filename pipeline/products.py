@@ -97,7 +97,7 @@ def write_raster(
 
     for name, values in bands.items():
         if values.shape != lattice.shape:
-            raise InputError(f"band {name} of {values.shape} cells does not fit its lattice {lattice.shape}")
+            raise InputError("RIL-621", f"band {name} of {values.shape} cells does not fit its lattice {lattice.shape}")
     profile = {
         "driver": "COG",
         "height": lattice.rows,
@@ -342,8 +342,8 @@ def read_disparity(path: Path) -> tuple[NDArray[np.float32], NDArray[np.float32]
                 names = tuple(name for name in file.descriptions if name)
                 if file.count != 2 or names not in ((), ("column_disparity", "row_disparity")):
                     told = ", ".join(names) or "without names"
-                    raise InputError(f"{path} has {file.count} bands ({told}), no disparity", remedy=remedy)
+                    raise InputError("RIL-622", f"{path} has {file.count} bands ({told}), no disparity", remedy=remedy)
                 column, row = file.read(out_dtype="float32", masked=True).filled(np.nan)
     except RasterioError as error:
-        raise InputError(f"{path} cannot be read as a TIFF ({error})", remedy=remedy) from error
+        raise InputError("RIL-623", f"{path} cannot be read as a TIFF ({error})", remedy=remedy) from error
     return np.ascontiguousarray(column), np.ascontiguousarray(row)

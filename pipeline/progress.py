@@ -51,7 +51,7 @@ def make(mode: str = "auto", stream: TextIO | None = None) -> Progress:
         mode = "bar" if stream.isatty() else "plain"
     kinds: dict[str, Any] = {"bar": Bar, "plain": Plain, "json": Json, "quiet": Quiet}
     if mode not in kinds:
-        raise ConfigError(f"progress {mode!r} is unknown", remedy=f"one of auto, {', '.join(kinds)}")
+        raise ConfigError("RIL-568", f"progress {mode!r} is unknown", remedy=f"one of auto, {', '.join(kinds)}")
     progress: Progress = kinds[mode](stream)
     return progress
 

@@ -59,7 +59,9 @@ def read_elevation(path: Path) -> Raster:
         There is nothing, it is none of these, its unit is not the metre, or it has no known cell.
     """
     if not path.exists():
-        raise InputError(f"{path} does not exist", remedy="give a GeoTIFF, the folder of a run, or a zarr group")
+        raise InputError(
+            "RIL-627", f"{path} does not exist", remedy="give a GeoTIFF, the folder of a run, or a zarr group"
+        )
     if (path / "zarr.json").is_file():
         found = _of_zarr(path)
     elif path.is_dir():
@@ -67,7 +69,9 @@ def read_elevation(path: Path) -> Raster:
     else:
         found = read_tiff(path)
     if not np.isfinite(found.values).any():
-        raise InputError(f"{path} has no known cell among {found.values.size}", remedy="give another elevation model")
+        raise InputError(
+            "RIL-628", f"{path} has no known cell among {found.values.size}", remedy="give another elevation model"
+        )
     return found
 
 
@@ -91,11 +95,12 @@ def read_tiff(path: Path, *, length: bool = True) -> Raster:
                 values = file.read(1, out_dtype="float64", masked=True).filled(np.nan)
                 crs, transform, unit = file.crs, file.transform, file.units[0]
     except RasterioError as error:
-        raise InputError(f"{path} cannot be read as a raster ({error})", remedy="give a GeoTIFF") from error
+        raise InputError("RIL-629", f"{path} cannot be read as a raster ({error})", remedy="give a GeoTIFF") from error
     if transform == Affine.identity():
-        raise InputError(f"{path} has no geotransform", remedy="give a raster that says where its cells are")
+        raise InputError("RIL-630", f"{path} has no geotransform", remedy="give a raster that says where its cells are")
     if not np.isclose(np.hypot(transform.a, transform.d), np.hypot(transform.b, transform.e), rtol=1e-6):
         raise InputError(
+            "RIL-631",
             f"{path} has cells of {np.hypot(transform.a, transform.d):g} x {np.hypot(transform.b, transform.e):g}",
             remedy="resample it to square cells, e.g. with gdalwarp -tr",
         )
@@ -103,7 +108,9 @@ def read_tiff(path: Path, *, length: bool = True) -> Raster:
     if crs is not None and length:
         _metric_crs(path, crs)
     if length and unit and unit.lower() not in METRE:
-        raise InputError(f"{path} has elevations in {unit!r}, not in metres", remedy="convert it, e.g. with gdal_calc")
+        raise InputError(
+            "RIL-632", f"{path} has elevations in {unit!r}, not in metres", remedy="convert it, e.g. with gdal_calc"
+        )
     if length and not unit:
         told.append(f"{path} states no unit of its elevations: taken as metres")
     return Raster(
@@ -113,16 +120,20 @@ def read_tiff(path: Path, *, length: bool = True) -> Raster:
 
 def _metric_crs(path: Path, crs: Any) -> None:
     if crs.is_geographic:
-        raise InputError(f"{path} is in degrees ({crs.to_string()})", remedy="project it, e.g. with gdalwarp -t_srs")
+        raise InputError(
+            "RIL-633", f"{path} is in degrees ({crs.to_string()})", remedy="project it, e.g. with gdalwarp -t_srs"
+        )
     unit, factor = crs.linear_units_factor if crs.is_projected else ("metre", 1.0)
     if factor != 1.0:
-        raise InputError(f"{path} has coordinates in {unit} of {factor:.6g} m", remedy="give one in metres")
+        raise InputError("RIL-634", f"{path} has coordinates in {unit} of {factor:.6g} m", remedy="give one in metres")
 
 
 def _of_run(path: Path) -> Raster:
     if not (path / "dem.tif").is_file():
         raise InputError(
-            f"{path} has no dem.tif", remedy="give the folder of a finished run, RUNS/sequence/latest, or a GeoTIFF"
+            "RIL-635",
+            f"{path} has no dem.tif",
+            remedy="give the folder of a finished run, RUNS/sequence/latest, or a GeoTIFF",
         )
     found = read_tiff(path / "dem.tif")
     return Raster(str(path), found.values, found.transform, found.crs, _cameras(path), found.warnings)
@@ -154,17 +165,21 @@ def _of_zarr(path: Path) -> Raster:
         crs = str(group["spatial_ref"].attrs["crs_wkt"]) if "spatial_ref" in group else ""
     except (KeyError, ValueError, OSError, TypeError) as error:
         raise InputError(
-            f"{path} has no elevation with coordinates x and y ({error})", remedy="give terrain.zarr of a run"
+            "RIL-636",
+            f"{path} has no elevation with coordinates x and y ({error})",
+            remedy="give terrain.zarr of a run",
         ) from error
     if unit not in METRE:
-        raise InputError(f"{path} has elevations in {unit!r}, not in metres", remedy="give one in metres")
+        raise InputError("RIL-637", f"{path} has elevations in {unit!r}, not in metres", remedy="give one in metres")
     if z.shape != (y.size, x.size) or min(z.shape) < 2:
         raise InputError(
-            f"{path}: elevation is {z.shape}, its coordinates {(y.size, x.size)}", remedy="give another one"
+            "RIL-638", f"{path}: elevation is {z.shape}, its coordinates {(y.size, x.size)}", remedy="give another one"
         )
     steps = np.concatenate([np.diff(x), -np.diff(y)])
     cell = float(np.median(steps))
     if not cell > 0 or np.abs(steps - cell).max() > 1e-3 * cell:
-        raise InputError(f"{path}: cells are {steps.min():g} to {steps.max():g} m wide", remedy="give a regular one")
+        raise InputError(
+            "RIL-639", f"{path}: cells are {steps.min():g} to {steps.max():g} m wide", remedy="give a regular one"
+        )
     corner = Affine(cell, 0.0, x[0] - 0.5 * cell, 0.0, -cell, y[0] + 0.5 * cell)
     return Raster(str(path), z, corner, crs, None)

@@ -113,7 +113,7 @@ class Reconstruction:
         """Lay out everything that is known beforehand; the rest follows by expansion."""
         self.whole = [f for f in self.frames if f not in self.sequence.lost]
         if not self.whole:
-            raise InputError("no chosen frame has both images", remedy="choose others with --frames")
+            raise InputError("RIL-050", "no chosen frame has both images", remedy="choose others with --frames")
         self.left = {f: self._pyramid(f, "left") for f in self.whole}
         self.motion: dict[tuple[int, int], Handle] = {}
         for a, b in pairwise(self.whole):
@@ -372,7 +372,7 @@ class Reconstruction:
         footprints = [ref.meta for ref in found if ref.meta["tiles"]]
         if not footprints:
             raise DegenerateError(
-                "no elevation model has a cell in the world", remedy="look at the disparities' validity"
+                "RIL-051", "no elevation model has a cell in the world", remedy="look at the disparities' validity"
             )
         centres = {str(f["pair"]): _centre(f["box"]) for f in footprints}
         seams = self._seams(footprints)

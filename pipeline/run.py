@@ -82,14 +82,14 @@ def choose_frames(text: str | None, count: int) -> tuple[int, ...]:
     try:
         parts = [int(p) if p else None for p in text.split(":")]
     except ValueError:
-        raise ConfigError(f"--frames {text!r} is not a range", remedy=remedy) from None
+        raise ConfigError("RIL-055", f"--frames {text!r} is not a range", remedy=remedy) from None
     if not 2 <= len(parts) <= 3 or any(p is not None and p < 0 for p in parts) or parts[2:] == [0]:
-        raise ConfigError(f"--frames {text!r} is not a range", remedy=remedy)
+        raise ConfigError("RIL-056", f"--frames {text!r} is not a range", remedy=remedy)
     if (parts[1] or 0) > count or (parts[0] or 0) >= count:
-        raise ConfigError(f"--frames {text!r} reaches beyond the sequence's {count} frames", remedy=remedy)
+        raise ConfigError("RIL-057", f"--frames {text!r} reaches beyond the sequence's {count} frames", remedy=remedy)
     chosen = tuple(range(count)[slice(*parts)])
     if not chosen:
-        raise ConfigError(f"--frames {text!r} leaves no frame", remedy="widen the range")
+        raise ConfigError("RIL-058", f"--frames {text!r} leaves no frame", remedy="widen the range")
     return chosen
 
 
@@ -226,7 +226,7 @@ def _open(options: Options) -> _Opened:
     sequence, config, vehicle_source = settings(options)
     warn(sequence)
     if options.verb == "drive" and sequence.simulation is None:
-        raise ConfigError(f"{sequence.name} is recorded, it cannot be driven", remedy="drive mockup-loop")
+        raise ConfigError("RIL-059", f"{sequence.name} is recorded, it cannot be driven", remedy="drive mockup-loop")
     frames = choose_frames(options.frames, sequence.frames)
     text = _header(options) + configuration.to_toml(config, sequence.parameters)
     folder = _make_folder(options.runs / sequence.name, started, text + repr(frames))
@@ -319,7 +319,7 @@ def _known_stages(names: frozenset[str]) -> None:
     known = {*configuration.STAGE_MODULES, "hfvm_tile", "hfvm_join", "image", "scene", "render"}
     known |= {"mockup.drive", "mockup.sense", "mockup.site"}
     for name in sorted(names - known):
-        raise ConfigError(f"--force {name!r} is no stage", remedy=f"one of {', '.join(sorted(known))}")
+        raise ConfigError("RIL-060", f"--force {name!r} is no stage", remedy=f"one of {', '.join(sorted(known))}")
 
 
 def _header(options: Options) -> str:
@@ -337,10 +337,10 @@ def _make_folder(parent: Path, started: datetime, plan: str) -> Path:
             continue
         except OSError as error:
             raise RilleError(
-                f"cannot make {folder}: {error.strerror}", remedy="choose another --runs folder"
+                "RIL-061", f"cannot make {folder}: {error.strerror}", remedy="choose another --runs folder"
             ) from error
         return folder
-    raise RilleError(f"too many runs named {name}", remedy="remove some, or wait a second")
+    raise RilleError("RIL-062", f"too many runs named {name}", remedy="remove some, or wait a second")
 
 
 def _point_latest(folder: Path) -> None:
@@ -375,7 +375,9 @@ def export_dataset(name: str, directory: Path, assignments: tuple[str, ...], cac
 
     for_dataset, others = configuration.split_dataset(configuration.parse_assignments(assignments))
     if others:
-        raise ConfigError(f"--set {next(iter(others))}: not a section of a sequence", remedy="set mockup.key=value")
+        raise ConfigError(
+            "RIL-063", f"--set {next(iter(others))}: not a section of a sequence", remedy="set mockup.key=value"
+        )
     store = at(cache)
 
     def materialise(source: Source) -> Bundle:

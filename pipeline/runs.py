@@ -45,7 +45,7 @@ def find(text: str, runs: Path) -> Path:
         return started[-1]
     names = [n for run in known for n in (name(run), run.parent.name, run.name)]
     where = f"there are {_some(sorted({run.parent.name for run in known}))}" if known else f"{runs} holds none"
-    raise ConfigError(f"no run {text!r}", remedy=_near(text, names) or where)
+    raise ConfigError("RIL-067", f"no run {text!r}", remedy=_near(text, names) or where)
 
 
 def row(rows: Iterable[dict[str, Any]], label: str, run: Path) -> dict[str, Any]:
@@ -60,7 +60,9 @@ def row(rows: Iterable[dict[str, Any]], label: str, run: Path) -> dict[str, Any]
     if label in by_label:
         return by_label[label]
     near = _near(label, by_label)
-    raise ConfigError(f"run {name(run)} has no task {label!r}", remedy=near or f"it has {_some(list(by_label))}")
+    raise ConfigError(
+        "RIL-068", f"run {name(run)} has no task {label!r}", remedy=near or f"it has {_some(list(by_label))}"
+    )
 
 
 def _near(text: str, names: Iterable[str]) -> str:

@@ -185,7 +185,9 @@ class Store:
         """
         manifest = self._current(ref)
         if manifest is None or manifest["digest"] != ref.digest:
-            raise GoneError(f"artifact {ref.stage} {ref.key[:12]} has gone from {self.location}", remedy="run again")
+            raise GoneError(
+                "RIL-572", f"artifact {ref.stage} {ref.key[:12]} has gone from {self.location}", remedy="run again"
+            )
 
         def damaged(reason: str) -> None:
             self.set_aside(ref.stage, ref.key, manifest, reason)
@@ -258,7 +260,9 @@ class Store:
                         for folder in (home, *list(home.parents)[:3]):
                             fsync(folder)
                     return None
-            raise StoreError(f"cannot publish {home / 'manifest.json'}", remedy="remove that file and run again")
+            raise StoreError(
+                "RIL-573", f"cannot publish {home / 'manifest.json'}", remedy="remove that file and run again"
+            )
         finally:
             temporary.unlink(missing_ok=True)
 
@@ -306,16 +310,20 @@ class Store:
         except OSError as error:
             if error.errno in (errno.ENOSPC, errno.EDQUOT):
                 raise StoreError(
+                    "RIL-574",
                     f"no space left for the cache {self.root}",
                     remedy="free space, clear the cache, or choose another folder with --cache",
                 ) from error
             if error.errno in (errno.EROFS, errno.EACCES, errno.EPERM):
                 raise StoreError(
+                    "RIL-575",
                     f"the cache {self.root} may not be used ({os.strerror(error.errno)})",
                     remedy="choose another folder with --cache",
                 ) from error
             if isinstance(error, NotADirectoryError):
-                raise StoreError(f"the cache {self.root} is not a folder", remedy="choose one with --cache") from error
+                raise StoreError(
+                    "RIL-576", f"the cache {self.root} is not a folder", remedy="choose one with --cache"
+                ) from error
             raise
 
 
@@ -365,7 +373,7 @@ def settle(manifest: Manifest, there: Manifest | None) -> Ref:
     if there is None:
         return reference(json.loads(json.dumps(manifest)))
     if there["digest"] != manifest["digest"]:
-        raise NonDeterministicError(difference(manifest["label"] or manifest["key"][:12], manifest, there))
+        raise NonDeterministicError("RIL-577", difference(manifest["label"] or manifest["key"][:12], manifest, there))
     return reference(there)
 
 

@@ -162,6 +162,7 @@ def ensure(root: Path | str, spec: Spec, refs: Refs, *, key: str | None = None, 
     own = key_of(spec, refs)
     if key is not None and key != own:
         raise CodeChangedError(
+            "RIL-581",
             f"{spec.label}: source code or packages of the worker are not those the run began with",
             remedy="run again, and edit nothing meanwhile",
         )

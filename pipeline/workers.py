@@ -45,10 +45,10 @@ class WorkerDiedError(RilleError):
     """A task took several worker processes along: out of memory, or a crash in native code."""
 
 
-def died(what: str) -> WorkerDiedError:
+def died(code: str, what: str) -> WorkerDiedError:
     """The error, with what to do."""
     remedy = "give it more memory with fewer --jobs, or run it with --executor inline to see the crash"
-    return WorkerDiedError(what, remedy=remedy)
+    return WorkerDiedError(code, what, remedy=remedy)
 
 
 @dataclass(eq=False)
@@ -154,7 +154,7 @@ class Workers:
         if not worker.ready or key is None:
             self._unready += 1
             if self._unready > UNREADY:
-                raise died(f"{UNREADY} worker processes died without a task")
+                raise died("RIL-585", f"{UNREADY} worker processes died without a task")
         with _interrupts_deferred():
             self._workers[self._workers.index(worker)] = another = self._start()
         if key is None:
@@ -165,7 +165,7 @@ class Workers:
             return []
         del self._tasks[key]
         seen = f", last seen with {self._seen[key] / 1e6:.0f} MB" if self._seen.get(key) else ""
-        return [(key, died(f"{DEATHS} worker processes died while they ran it{seen}"))]
+        return [(key, died("RIL-586", f"{DEATHS} worker processes died while they ran it{seen}"))]
 
     def _watch(self) -> None:
         """Note what memory the workers have, now and then; end one that has too much before the system ends others."""

@@ -56,13 +56,13 @@ def trajectory_accuracy(
         The numbers of frames differ, no frame has a pose, or none that has one has truth.
     """
     if estimate.shape != truth.shape:
-        raise InputError(f"{len(estimate)} estimated and {len(truth)} true poses do not match")
+        raise InputError("RIL-300", f"{len(estimate)} estimated and {len(truth)} true poses do not match")
     has_pose, has_truth = posed(estimate), posed(truth)
     if not has_pose.any():
-        raise InputError("no frame has a pose", remedy="see why tracking or resection failed")
+        raise InputError("RIL-301", "no frame has a pose", remedy="see why tracking or resection failed")
     judged = np.flatnonzero(has_pose & has_truth)
     if len(judged) == 0:
-        raise InputError("no frame with a pose has truth", remedy="give truth that covers the chosen frames")
+        raise InputError("RIL-302", "no frame with a pose has truth", remedy="give truth that covers the chosen frames")
     P, Q = square(estimate), square(truth)
     aligned = P[judged[0]] @ inverse(Q[judged[0]]) @ Q
     arrays = {

@@ -45,7 +45,9 @@ class Derotation:
         """
         R = np.asarray(rotation, dtype=np.float64)
         if R.shape != (3, 3) or not np.isfinite(R).all() or np.abs(R @ R.T - np.eye(3)).max() > 1e-4:
-            raise InputError("an attitude is not a 3 x 3 rotation", remedy="check the attitudes of the sequence")
+            raise InputError(
+                "RIL-305", "an attitude is not a 3 x 3 rotation", remedy="check the attitudes of the sequence"
+            )
         K = camera.matrix
         return Derotation(K @ R @ np.linalg.inv(K), (camera.height, camera.width))
 

@@ -119,7 +119,7 @@ def calibrate_rig(
         The right camera stands on the left one's left.
     """
     if model not in MODELS:
-        raise ConfigError(f"distortion model {model!r} is unknown", remedy=f"one of {', '.join(MODELS)}")
+        raise ConfigError("RIL-308", f"distortion model {model!r} is unknown", remedy=f"one of {', '.join(MODELS)}")
     _enough(views)
     task = Adjustment(board, tuple(views), size, model)
     x = task.solve(task.start(), robust=True)
@@ -146,6 +146,7 @@ def calibrate_rig(
 def _enough(views: Sequence[BoardView]) -> None:
     if len(views) < LEAST_VIEWS:
         raise DegenerateError(
+            "RIL-309",
             f"{len(views)} views of the board are too few to calibrate with",
             remedy=MORE_VIEWS,
         )
@@ -155,7 +156,9 @@ def _sides(T_right_left: RigidTransform) -> None:
     x = float(T_right_left.translation[0])
     if x > SWAPPED * float(np.linalg.norm(T_right_left.translation)):
         raise InputError(
-            f"the right camera stands {x:.4g} m to the left of the left one", remedy="swap the two sets of images"
+            "RIL-310",
+            f"the right camera stands {x:.4g} m to the left of the left one",
+            remedy="swap the two sets of images",
         )
 
 
@@ -205,7 +208,9 @@ class Adjustment:
                 flags = {"rational": cv2.CALIB_RATIONAL_MODEL, "radtan4": cv2.CALIB_FIX_K3}.get(self.model, 0)
                 out = cv2.calibrateCamera(boards, flat, self.size, None, None, flags=flags)
         except cv2.error as error:
-            raise DegenerateError(UNDETERMINED, remedy=f"{MORE_VIEWS}, or a model with fewer coefficients") from error
+            raise DegenerateError(
+                "RIL-311", UNDETERMINED, remedy=f"{MORE_VIEWS}, or a model with fewer coefficients"
+            ) from error
         _, k, d, rotations, translations = out
         count = len(MODELS[self.model])
         lens = np.concatenate([[k[0, 0], k[1, 1], k[0, 2], k[1, 2]], np.ravel(d)[:count]])
@@ -262,7 +267,7 @@ class Adjustment:
                 if damping > 1e12:
                     break
         if not (np.isfinite(x).all() and min(x[0], x[1], x[self.lens], x[self.lens + 1]) > 0):
-            raise DegenerateError("the adjustment of the cameras diverges", remedy=MORE_VIEWS)
+            raise DegenerateError("RIL-312", "the adjustment of the cameras diverges", remedy=MORE_VIEWS)
         return x
 
     def _normal(self, x: Floats, robust: bool) -> tuple[float, Floats, Floats]:
@@ -319,7 +324,7 @@ class Adjustment:
         scaled = jacobian / np.where(scale > 0, scale, 1.0)
         normal = scaled.T @ scaled
         if not scale.all() or np.linalg.cond(normal) > 1e15:
-            raise DegenerateError(UNDETERMINED, remedy=f"{MORE_VIEWS}, or a model with fewer coefficients")
+            raise DegenerateError("RIL-313", UNDETERMINED, remedy=f"{MORE_VIEWS}, or a model with fewer coefficients")
         variance = float(residual @ residual) / (residual.size - x.size)
         covariance = variance * np.linalg.inv(normal) / np.outer(scale, scale)
         deviation = np.sqrt(np.diag(covariance))

@@ -194,6 +194,7 @@ def _leading(out: Judgement, chain: list[int]) -> None:
     if fit is None:
         first = next(iter((out.unfit | out.lost).items()), (0, "no images"))
         raise DegenerateError(
+            "RIL-316",
             f"no pair can be reconstructed from: frame {first[0]}: {first[1]}",
             remedy="look at the images; the limits are those of [continuity]",
         )
@@ -228,7 +229,7 @@ def _run(params: ContinuityParams, args: Mapping[str, Any], inputs: Inputs) -> B
     frames = [int(f) for f in args["frames"]]
     motions, bridges = list(inputs.get("motions") or []), list(inputs.get("bridges") or [])
     if len(motions) != len(frames) - 1 or len(inputs["sights"]) != len(frames):
-        raise InputError(f"{len(frames)} frames need as many sights and {len(frames) - 1} motions")
+        raise InputError("RIL-317", f"{len(frames)} frames need as many sights and {len(frames) - 1} motions")
     sights = {f: s.meta for f, s in zip(frames, inputs["sights"], strict=True)}
     steps = {s: share(Step.from_bundle(m)) for s, m in zip(pairwise(frames), motions, strict=True)}
     changes = [change(a, b) for a, b in pairwise(motions)]

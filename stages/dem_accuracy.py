@@ -65,7 +65,7 @@ def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     lattice = Lattice.from_dict(truth.meta["lattice"])
     parts = [(Lattice.from_dict(dem.meta["lattice"]), np.asarray(dem["elevation"])) for dem in inputs["dem"]]
     if not parts:
-        raise InputError("no elevation model to compare with truth")
+        raise InputError("RIL-320", "no elevation model to compare with truth")
     elevation = mosaic(parts, np.nan, lattice)
     true = np.asarray(truth["elevation"])
     judged = (np.asarray(truth["seen"]) != 0) & in_window(lattice, args.get("window"))

@@ -109,7 +109,9 @@ def common(a: Grid, b: Grid) -> tuple[Grid, Grid, str]:
     brought = Grid(values, target.matrix)
     pair = (brought, target) if name == "A" else (target, brought)
     if not (np.isfinite(values) & np.isfinite(target.values)).any():
-        raise InputError("they have no known cell in common", remedy="compare models of the same place and frame")
+        raise InputError(
+            "RIL-323", "they have no known cell in common", remedy="compare models of the same place and frame"
+        )
     return *pair, how
 
 
@@ -164,6 +166,7 @@ def align(a: Grid, b: Grid, kind: Align) -> Alignment:
         if np.abs(step / unit).max() < 1e-4:
             return _with_rms(b, slopes, points, state, start)
     raise DegenerateError(
+        "RIL-324",
         f"no alignment after {ITERATIONS} steps: the last one still moved by {np.abs(step / unit).max():.2g} cells",
         remedy="choose fewer freedoms (tilt or shift), or bring the models closer first",
     )
@@ -185,7 +188,9 @@ def _gauss_newton(
     good = np.isfinite(difference) & np.isfinite(normal).all(axis=1)
     if good.sum() < 10 * len(free):
         raise DegenerateError(
-            f"{int(good.sum())} cells are left to align by", remedy="leave --align out, or choose overlapping models"
+            "RIL-325",
+            f"{int(good.sum())} cells are left to align by",
+            remedy="leave --align out, or choose overlapping models",
         )
     r, n = difference[good], normal[good]
     q = moved[good] - state.centre - state.translation
@@ -196,6 +201,7 @@ def _gauss_newton(
     values = np.linalg.eigvalsh(N)
     if not values[0] * WORST_CONDITION > values[-1]:
         raise DegenerateError(
+            "RIL-326",
             f"the terrain is too flat to align by: condition {values[-1] / max(values[0], 1e-300):.1e}, "
             f"more than {WORST_CONDITION:.0e}",
             remedy="choose --align tilt, which flat terrain determines",

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from typing import Self
+
 
 class RilleError(Exception):
     """Base of every error that Rille raises on purpose; the command line prints it as one line.
 
-    ``remedy`` says what to change; it is printed behind the message.
+    ``code`` (``RIL-214``) names the message for good, whatever its words become; ``remedy`` says what to change and is
+    printed behind the message. Codes: 001-099 command line and configuration, 100-299 input, 300-499 stages,
+    500-599 engine and store, 600-699 outputs.
     """
 
-    def __init__(self, message: str, *, remedy: str = "") -> None:
-        super().__init__(message, remedy)
+    def __init__(self, code: str, message: str, *, remedy: str = "") -> None:
+        super().__init__(code, message, remedy)
+        self.code = code
         self.message = message
         self.remedy = remedy
 
@@ -18,11 +23,15 @@ class RilleError(Exception):
         return f"{self.message}: {self.remedy}" if self.remedy else self.message
 
     def __reduce__(self) -> tuple[object, ...]:
-        return (_rebuild, (type(self), self.message, self.remedy))
+        return (_rebuild, (type(self), self.code, self.message, self.remedy))
+
+    def at(self, where: str) -> Self:
+        """Return the same error with the place in front: ``where: message``."""
+        return type(self)(self.code, f"{where}: {self.message}", remedy=self.remedy)
 
 
-def _rebuild(kind: type[RilleError], message: str, remedy: str) -> RilleError:
-    return kind(message, remedy=remedy)
+def _rebuild(kind: type[RilleError], code: str, message: str, remedy: str) -> RilleError:
+    return kind(code, message, remedy=remedy)
 
 
 class ConfigError(RilleError, ValueError):

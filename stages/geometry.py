@@ -42,10 +42,14 @@ class Camera:
     def __post_init__(self) -> None:
         if not (self.fx > 0 and self.fy > 0 and math.isfinite(self.fx) and math.isfinite(self.fy)):
             raise InputError(
-                f"focal length fx={self.fx}, fy={self.fy} px is not positive", remedy="give fx and fy in pixels"
+                "RIL-329",
+                f"focal length fx={self.fx}, fy={self.fy} px is not positive",
+                remedy="give fx and fy in pixels",
             )
         if self.width < 1 or self.height < 1:
-            raise InputError(f"image size {self.width} x {self.height} is empty", remedy="check the image size")
+            raise InputError(
+                "RIL-330", f"image size {self.width} x {self.height} is empty", remedy="check the image size"
+            )
 
     @property
     def matrix(self) -> Floats:
@@ -93,11 +97,12 @@ class RigidTransform:
         r = np.array(self.rotation, dtype=np.float64)
         t = np.array(self.translation, dtype=np.float64).reshape(-1)
         if r.shape != (3, 3) or t.shape != (3,):
-            raise InputError(f"a rigid transform needs 3 x 3 and 3 numbers, not {r.shape} and {t.shape}")
+            raise InputError("RIL-331", f"a rigid transform needs 3 x 3 and 3 numbers, not {r.shape} and {t.shape}")
         if not (np.isfinite(r).all() and np.isfinite(t).all()):
-            raise InputError("a rigid transform has a value that is not finite")
+            raise InputError("RIL-332", "a rigid transform has a value that is not finite")
         if np.abs(r @ r.T - np.eye(3)).max() > 1e-4 or np.linalg.det(r) < 0:
             raise InputError(
+                "RIL-333",
                 "a pose's 3 x 3 part is not a rotation",
                 remedy="give rows of [R | t] with R orthonormal and det R = +1",
             )
@@ -226,6 +231,6 @@ def level_rotation(up_in_camera: ArrayLike) -> Floats:
     y = forward - z * float(z @ forward)
     norm = float(np.linalg.norm(y))
     if norm < 1e-6:
-        raise InputError("the optical axis is vertical", remedy="give an attitude whose heading is defined")
+        raise InputError("RIL-334", "the optical axis is vertical", remedy="give an attitude whose heading is defined")
     y = y / norm
     return np.array([np.cross(y, z), y, z], dtype=np.float64)

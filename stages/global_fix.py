@@ -135,6 +135,7 @@ def fix(
     """
     if len(points) < params.least:
         raise DegenerateError(
+            "RIL-337",
             f"the local model covers {len(points)} cells of the global map, {params.least} are needed",
             remedy="give a finer global map, or a first pair that sees farther",
         )
@@ -149,6 +150,7 @@ def fix(
     enough = overlaps >= params.min_overlap
     if not enough.any():
         raise InputError(
+            "RIL-338",
             f"the global map knows at most {overlaps.max():.0%} of the ground of the first model around the prior "
             f"({prior[0]:.2f}, {prior[1]:.2f}) m, {params.min_overlap:.0%} are needed",
             remedy="give a map that covers the start, or a better prior",
@@ -215,6 +217,7 @@ def _refine(
         values = np.linalg.eigvalsh(normal / np.outer(scale, scale))
         if values[0] < 1e-6:
             raise DegenerateError(
+                "RIL-339",
                 "the global map is too flat around the start to tell the position",
                 remedy="hand the pose in, or give a finer map",
             )

@@ -75,6 +75,7 @@ def fit_plane(
     """
     if rays.shape[0] < MIN_POINTS:
         raise DegenerateError(
+            "RIL-342",
             f"only {rays.shape[0]} sampled pixels are matched: left and right have no texture in common",
             remedy="check exposure and focus, and that left and right show one scene; or lower hfvm.texture",
         )
@@ -94,6 +95,7 @@ def fit_plane(
         if share >= MIN_SHARE and bool(allowed(-theta[None] / length)[0]):
             return GroundPlane(-theta / length, 1.0 / length, share)
     raise DegenerateError(
+        "RIL-343",
         "the disparity shows no ground plane below the camera",
         remedy="give the rig's pitch or an attitude, or check left/right order and the rig's calibration",
     )
@@ -183,7 +185,9 @@ class GroundView:
         good = (self.along <= max_cells * cell) & (sigma_d <= max_sigma * self.slope)
         if np.count_nonzero(good) < 3:
             raise DegenerateError(
-                f"no ground is seen well enough for cells of {cell:g} m", remedy="set locus.cell_size to a larger cell"
+                "RIL-344",
+                f"no ground is seen well enough for cells of {cell:g} m",
+                remedy="set locus.cell_size to a larger cell",
             )
         low, high = self.xy[good].min(axis=0), self.xy[good].max(axis=0)
         return [float(low[0]), float(high[0]), float(low[1]), float(high[1])]
@@ -214,7 +218,9 @@ def view_ground(rig: Rig, R_local_left: Floats, plane: Sequence[float]) -> Groun
     good = np.isfinite(jacobian).all((1, 2)) & (slope > 0)
     if not good.any():
         raise DegenerateError(
-            "the two cameras see no common ground", remedy="check the pitch, the left/right order and T_right_left"
+            "RIL-345",
+            "the two cameras see no common ground",
+            remedy="check the pitch, the left/right order and T_right_left",
         )
     size = _singular_values(jacobian[good])
     return GroundView(here[good, :2], _length(here[good]), size[:, 0], size[:, 1], slope[good])

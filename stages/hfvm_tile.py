@@ -145,6 +145,7 @@ def mosaic(parts: Sequence[Bundle], name: str, shape: Shape, side: int) -> Mosai
     windows = tiles(shape, side)
     if len(parts) < len(windows):
         raise InputError(
+            "RIL-351",
             f"image of {shape[1]} x {shape[0]} pixels does not have the size that its camera states",
             remedy="correct the camera's width and height",
         )

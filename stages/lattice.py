@@ -48,19 +48,24 @@ class Lattice:
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.cell) and self.cell > 0):
-            raise InputError(f"cell size {self.cell} m is not positive", remedy="give the cell size in metres")
+            raise InputError(
+                "RIL-354", f"cell size {self.cell} m is not positive", remedy="give the cell size in metres"
+            )
         if self.rows < 1 or self.cols < 1:
-            raise InputError(f"a lattice of {self.rows} x {self.cols} cells is empty", remedy="widen its extent")
+            raise InputError(
+                "RIL-355", f"a lattice of {self.rows} x {self.cols} cells is empty", remedy="widen its extent"
+            )
         if self.rows * self.cols > MAX_CELLS:
             enough = 1.06 * self.cell * math.sqrt(self.rows * self.cols / MAX_CELLS)  # rounding takes up to 5 %
             raise ConfigError(
+                "RIL-356",
                 f"{self.rows} x {self.cols} cells of {self.cell:g} m are more than {MAX_CELLS}",
                 remedy=f"set locus.cell_size to {enough:.2g} m or more, or narrow locus.extent",
             )
         for name, value in (("x0", self.x0), ("y0", self.y0)):
             index = value / self.cell
             if not math.isfinite(index) or abs(index - round(index)) > 1e-3:
-                raise InputError(f"lattice origin {name}={value} is no multiple of the cell {self.cell}")
+                raise InputError("RIL-357", f"lattice origin {name}={value} is no multiple of the cell {self.cell}")
             object.__setattr__(self, name, round(index) * self.cell)
 
     @staticmethod
@@ -73,9 +78,11 @@ class Lattice:
         """Smallest lattice whose cells (not only their centres) cover ``bounds`` = x_min, x_max, y_min, y_max."""
         x_min, x_max, y_min, y_max = (float(v) for v in bounds)
         if not (math.isfinite(x_max - x_min) and math.isfinite(y_max - y_min) and x_min <= x_max and y_min <= y_max):
-            raise InputError(f"extent x {x_min}..{x_max}, y {y_min}..{y_max} m is empty", remedy="give min before max")
+            raise InputError(
+                "RIL-358", f"extent x {x_min}..{x_max}, y {y_min}..{y_max} m is empty", remedy="give min before max"
+            )
         if not (math.isfinite(cell) and cell > 0):
-            raise InputError(f"cell size {cell} m is not positive", remedy="give the cell size in metres")
+            raise InputError("RIL-359", f"cell size {cell} m is not positive", remedy="give the cell size in metres")
         slack = 1e-6  # a bound on a cell's border does not ask for the next cell
         low = [math.floor(v / cell + 0.5 + slack) for v in (x_min, y_min)]
         high = [math.ceil(v / cell - 0.5 - slack) for v in (x_max, y_max)]
@@ -143,7 +150,7 @@ class Lattice:
         self._same_cell(part)
         row, col = self.j0 - part.j0, part.i0 - self.i0
         if row < 0 or col < 0 or row + part.rows > self.rows or col + part.cols > self.cols:
-            raise InputError("the window is not inside the lattice")
+            raise InputError("RIL-360", "the window is not inside the lattice")
         return slice(row, row + part.rows), slice(col, col + part.cols)
 
     def tiles(self, size: int) -> Iterator[Lattice]:
@@ -168,6 +175,7 @@ class Lattice:
     def _same_cell(self, other: Lattice) -> None:
         if self.cell != other.cell:
             raise InputError(
+                "RIL-361",
                 f"lattices of {self.cell:g} m and {other.cell:g} m cells do not fit together",
                 remedy="use one cell_size for the whole run",
             )
@@ -185,7 +193,7 @@ def union(lattices: Iterable[Lattice]) -> Lattice:
     for lattice in lattices:
         result = lattice if result is None else result.union(lattice)
     if result is None:
-        raise InputError("no lattice to unite", remedy="give at least one elevation model")
+        raise InputError("RIL-362", "no lattice to unite", remedy="give at least one elevation model")
     return result
 
 
@@ -202,7 +210,7 @@ def mosaic(parts: Sequence[tuple[Lattice, NDArray[Any]]], nodata: float, target:
     out = np.full(whole.shape, nodata, dtype=parts[0][1].dtype if parts else np.float32)
     for lattice, array in parts:
         if array.shape != lattice.shape:
-            raise InputError(f"an array of {array.shape} does not fit its lattice {lattice.shape}")
+            raise InputError("RIL-363", f"an array of {array.shape} does not fit its lattice {lattice.shape}")
         common = whole.intersection(lattice)
         if common is not None:
             out[whole.window(common)] = array[lattice.window(common)]

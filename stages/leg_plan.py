@@ -266,6 +266,7 @@ def _check(lattice: Lattice, name: str, point: Point) -> None:
     if not (0 <= row < lattice.rows and 0 <= col < lattice.cols):
         x0, x1, y0, y1 = lattice.bounds
         raise InputError(
+            "RIL-366",
             f"the {name} ({point[0]:.3f}, {point[1]:.3f}) m is outside the map",
             remedy=f"give x in {x0:.3f}..{x1:.3f} and y in {y0:.3f}..{y1:.3f} m",
         )

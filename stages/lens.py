@@ -57,16 +57,19 @@ class Lens:
 
     def __post_init__(self) -> None:
         if self.model not in COUNTS:
-            raise InputError(f"distortion model {self.model!r} is unknown", remedy=f"one of {', '.join(COUNTS)}")
+            raise InputError(
+                "RIL-369", f"distortion model {self.model!r} is unknown", remedy=f"one of {', '.join(COUNTS)}"
+            )
         wanted = COUNTS[self.model]
         if len(self.coefficients) not in wanted:
             counts = " or ".join(str(n) for n in wanted)
             raise InputError(
+                "RIL-370",
                 f"distortion {self.model} has {len(self.coefficients)} coefficients, it takes {counts}",
                 remedy="check the model's name, or the list of its coefficients",
             )
         if not all(math.isfinite(v) for v in self.coefficients):
-            raise InputError("a distortion coefficient is not finite", remedy="correct the calibration")
+            raise InputError("RIL-371", "a distortion coefficient is not finite", remedy="correct the calibration")
 
     @property
     def ideal(self) -> bool:
@@ -209,7 +212,7 @@ class Lens:
 def _points(points: ArrayLike) -> Floats:
     p = np.asarray(points, dtype=np.float64)
     if p.ndim != 2 or p.shape[1] != 2:
-        raise InputError(f"points of shape {p.shape} are not (n, 2)", remedy="give column and row of each")
+        raise InputError("RIL-372", f"points of shape {p.shape} are not (n, 2)", remedy="give column and row of each")
     return p
 
 

@@ -101,6 +101,7 @@ def level(
     beyond = float(np.mean(rho < -BEYOND * sigma)) if rho.size else 0.0
     if beyond > SWAPPED:
         raise DegenerateError(
+            "RIL-375",
             f"{beyond:.0%} of the matches lie beyond infinity",
             remedy="check left/right order, they seem swapped, and the sign of the baseline",
         )
@@ -139,9 +140,11 @@ def _samples(
     """Rays, inverse depths and their errors at a regular sparse grid of usable pixels."""
     expected = (rig.left.height, rig.left.width)
     if column.shape != expected:
-        raise InputError(f"the disparity is {column.shape}, the left camera's image {expected}")
+        raise InputError("RIL-376", f"the disparity is {column.shape}, the left camera's image {expected}")
     if not rig.baseline > 0:
-        raise DegenerateError("the rig's baseline is 0 m", remedy="give T_right_left with a translation in metres")
+        raise DegenerateError(
+            "RIL-377", "the rig's baseline is 0 m", remedy="give T_right_left with a translation in metres"
+        )
     step = max(1, int(math.sqrt(column.size / (2 * SAMPLES))))
     r, c = np.nonzero(usable[::step, ::step])
     r, c = r * step, c * step
@@ -159,7 +162,9 @@ def _given_vertical(
             v = np.asarray(value, dtype=np.float64)
             length = float(np.linalg.norm(v))
             if v.shape != (3,) or not math.isfinite(length) or length == 0.0:
-                raise InputError(f"the {source}'s direction of up {value} is no direction", remedy="give three numbers")
+                raise InputError(
+                    "RIL-378", f"the {source}'s direction of up {value} is no direction", remedy="give three numbers"
+                )
             return v / length, source
     if pitch is not None:
         return np.array([0.0, -math.cos(pitch), -math.sin(pitch)]), "pitch"

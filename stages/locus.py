@@ -160,7 +160,7 @@ def reconstruct(
     apart = None
     if back is not None:
         if right is None:
-            raise InputError("disparities of the right image are given without the image")
+            raise InputError("RIL-381", "disparities of the right image are given without the image")
         turned = Rig(rig.right, rig.left, rig.T_right_left.inverse())
         T_surface_right = T_surface_left @ rig.T_right_left.inverse()
         other = solve(Task(back, right, turned, T_surface_right, *told), surface)
@@ -180,7 +180,9 @@ def _views(image: ArrayLike, right: ArrayLike, rig: Rig, T_surface_left: RigidTr
     """Both images as they see the surface."""
     images = [np.array(a, dtype=np.float32, order="C") for a in (image, right)]
     if images[1].shape != (rig.right.height, rig.right.width):
-        raise InputError(f"the right image is {images[1].shape}, its camera's {(rig.right.height, rig.right.width)}")
+        raise InputError(
+            "RIL-382", f"the right image is {images[1].shape}, its camera's {(rig.right.height, rig.right.width)}"
+        )
     return views(*projections(rig, T_surface_left), images[0], images[1], T_surface_left.translation)
 
 
@@ -215,7 +217,9 @@ def local_lattice(rig: Rig, level: Mapping[str, Any], cell: float, params: Locus
     if params.extent is not None:
         x_min, x_max, y_min, y_max = params.extent
         if not (x_min < x_max and y_min < y_max):
-            raise ConfigError(f"locus.extent={list(params.extent)} is empty", remedy="give x_min, x_max, y_min, y_max")
+            raise ConfigError(
+                "RIL-383", f"locus.extent={list(params.extent)} is empty", remedy="give x_min, x_max, y_min, y_max"
+            )
         return Lattice.snap(params.extent, cell)
     R = RigidTransform.from_matrix(level["T_local_left"]).rotation
     view = view_ground(rig, R, level["plane"])
@@ -234,7 +238,9 @@ def world_lattice(elevation: Float32, lattice: Lattice, T_world_local: RigidTran
     seen = np.isfinite(elevation)
     if not seen.any():
         raise DegenerateError(
-            "the local elevation model is empty", remedy="look at the disparity's validity and at locus.max_residual"
+            "RIL-384",
+            "the local elevation model is empty",
+            remedy="look at the disparity's validity and at locus.max_residual",
         )
     points = T_world_local.apply(np.column_stack([lattice.xy()[seen], elevation[seen]]))
     low, high = points.min(axis=0), points.max(axis=0)

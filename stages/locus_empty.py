@@ -33,6 +33,7 @@ def explain(
     depth = points[..., 2]
     if not (depth > 0).any():
         return DegenerateError(
+            "RIL-387",
             f"the reference surface lies behind the left camera: {depth.min():.3g} to {depth.max():.3g} m along its "
             "optical axis",
             remedy="check locus.extent (y is ahead), the vertical (world.up, world.pitch_deg), or T_surface_left",
@@ -41,6 +42,7 @@ def explain(
     if not (seen[0] & seen[1]).any():
         left, right = (100.0 * float(s.any(axis=0).mean()) for s in seen)
         return DegenerateError(
+            "RIL-388",
             f"the cameras look away from the reference surface: the left one sees {left:.0f} %, the right one "
             f"{right:.0f} % of its cells, and no cell is seen by both",
             remedy="check locus.extent, the vertical, the left/right order and T_right_left",
@@ -48,17 +50,20 @@ def explain(
     count = int(usable.sum())
     if not count:
         return DegenerateError(
+            "RIL-389",
             f"none of {usable.size} disparities is valid, so no elevation can be found",
             remedy="look at the disparity's validity: exposure, focus, left/right order; or raise locus.max_backmatch",
         )
     cells = surface.rows * surface.cols
     if cells < FEW:
         return DegenerateError(
+            "RIL-390",
             f"no cell could be reconstructed, and there are {cells} only ({surface.rows} x {surface.cols}): they are "
             "too coarse for what the cameras see",
             remedy="lower locus.cell_size, or leave it out: then it follows from the rig",
         )
     return DegenerateError(
+        "RIL-391",
         f"no cell could be reconstructed from {count} valid disparities of {usable.size}: they contradict the "
         f"calibration, or lie outside of {z_range[0]:.4g} to {z_range[1]:.4g} m of elevation",
         remedy="look at the rig's residuals in the report; or raise locus.max_residual or locus.max_sigma",

@@ -68,14 +68,16 @@ class Task:
         limits: tuple[float, float],
     ) -> None:
         if not rig.baseline > 0:
-            raise DegenerateError("the rig's baseline is 0 m", remedy="give T_right_left with a translation in metres")
+            raise DegenerateError(
+                "RIL-394", "the rig's baseline is 0 m", remedy="give T_right_left with a translation in metres"
+            )
         if not z_range[0] < z_range[1]:
-            raise InputError(f"the range of elevations {z_range[0]}..{z_range[1]} m is empty")
+            raise InputError("RIL-395", f"the range of elevations {z_range[0]}..{z_range[1]} m is empty")
         shape = (rig.left.height, rig.left.width)
         maps = [np.asarray(a) for a in (given.column, given.row, image)]
         for name, array in zip(("column disparity", "row disparity", "image"), maps, strict=True):
             if array.shape != shape:
-                raise InputError(f"the {name} is {array.shape}, the left camera's image {shape}")
+                raise InputError("RIL-396", f"the {name} is {array.shape}, the left camera's image {shape}")
         self.disparity = np.stack(maps[:2], axis=-1, dtype=np.float32, casting="unsafe")
         self.disparity[~given.usable] = np.nan
         self.image = np.ascontiguousarray(maps[2], np.float32)

@@ -205,7 +205,7 @@ def merge(layers: Sequence[Layer | _Stored], tile: Lattice, params: MergeParams)
     ordered = sorted(layers, key=lambda layer: layer.pair)
     pairs = [layer.pair for layer in ordered]
     if len(set(pairs)) != len(pairs):
-        raise InputError(f"two elevation models of one pair among {pairs}", remedy="merge each pair once")
+        raise InputError("RIL-399", f"two elevation models of one pair among {pairs}", remedy="merge each pair once")
     m = params.margin
     grown = Lattice.at(tile.i0 - m, tile.j0 + m, tile.cell, tile.rows + 2 * m, tile.cols + 2 * m) if m else tile
     ordered = [layer for layer in ordered if grown.intersection(layer.lattice) is not None]

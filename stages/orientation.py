@@ -135,10 +135,13 @@ def _arrays(before: Floats, after: Floats, weight: Floats) -> dict[str, AnyArray
 def _run(params: OrientationParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     rig, disparity = Rig.from_dict(args["rig"]), inputs["disparity"]
     if not rig.baseline > 0:
-        raise InputError("the rig's baseline is 0 m", remedy="give T_right_left with a translation in metres")
+        raise InputError(
+            "RIL-402", "the rig's baseline is 0 m", remedy="give T_right_left with a translation in metres"
+        )
     usable = matched(np.asarray(disparity["validity"]))
     if usable.shape != (rig.left.height, rig.left.width):
         raise InputError(
+            "RIL-403",
             f"the disparity is {usable.shape}, the left camera's image {(rig.left.height, rig.left.width)}",
             remedy="give the camera's width and height as the images have them",
         )

@@ -24,7 +24,9 @@ def check_end(maps: Maps, lattice: Lattice, vehicle: Vehicle, name: str, point: 
     if not (0 <= row < lattice.rows and 0 <= col < lattice.cols):
         x0, x1, y0, y1 = lattice.bounds
         raise InputError(
-            f"{where} is outside the map", remedy=f"give x in {x0:.3f}..{x1:.3f} and y in {y0:.3f}..{y1:.3f} m"
+            "RIL-406",
+            f"{where} is outside the map",
+            remedy=f"give x in {x0:.3f}..{x1:.3f} and y in {y0:.3f}..{y1:.3f} m",
         )
     kind = maps["risk"][row, col]
     if kind == UNKNOWN:
@@ -32,10 +34,12 @@ def check_end(maps: Maps, lattice: Lattice, vehicle: Vehicle, name: str, point: 
         away = (
             f", the nearest ground to drive on is {_away(free, row, col, lattice.cell):.3g} m away" if len(free) else ""
         )
-        raise InputError(f"{where} lies on unknown ground{away}", remedy=f"choose another {name}")
+        raise InputError("RIL-407", f"{where} lies on unknown ground{away}", remedy=f"choose another {name}")
     if kind == HAZARDOUS:
         raise InputError(
-            f"{where} lies in a hazard: {hazard_words(maps, (row, col), vehicle)}", remedy=f"choose another {name}"
+            "RIL-408",
+            f"{where} lies in a hazard: {hazard_words(maps, (row, col), vehicle)}",
+            remedy=f"choose another {name}",
         )
 
 

@@ -65,13 +65,13 @@ def grey(image: AnyArray) -> Image:
         The array is not two-dimensional, is empty, or has another type.
     """
     if image.ndim != 2 or image.size == 0:
-        raise InputError(f"image of shape {image.shape} is not (row, col)", remedy="give one grey channel")
+        raise InputError("RIL-411", f"image of shape {image.shape} is not (row, col)", remedy="give one grey channel")
     if image.dtype == np.uint16:
         return image.astype(np.float32) * np.float32(1.0 / 257.0)
     if image.dtype == np.uint8 or image.dtype.kind == "f":
         return np.ascontiguousarray(image, dtype=np.float32)
     raise InputError(
-        f"image of type {image.dtype} has no known grey scale", remedy="give uint8, uint16 or float 0..255"
+        "RIL-412", f"image of type {image.dtype} has no known grey scale", remedy="give uint8, uint16 or float 0..255"
     )
 
 
@@ -90,7 +90,9 @@ def build(image: AnyArray, params: PyramidParams, valid: AnyArray | None = None)
     """
     level = grey(image)
     if valid is not None and valid.shape != level.shape:
-        raise InputError(f"mask {valid.shape} and image {level.shape} differ", remedy="give a mask of the image's size")
+        raise InputError(
+            "RIL-413", f"mask {valid.shape} and image {level.shape} differ", remedy="give a mask of the image's size"
+        )
     whole = image.dtype.kind == "u"  # and so finite
     mask = np.ones(level.shape, bool) if whole else np.isfinite(level)
     if valid is not None:

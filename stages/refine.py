@@ -94,7 +94,9 @@ def _run(params: RefineParams, args: Mapping[str, Any], inputs: Inputs) -> Bundl
     resect = ResectParams.model_validate(args["resect"])
     if resect.landmarks != "disparity":
         raise ConfigError(
-            "refine needs landmarks of the disparity", remedy="set resect.landmarks=disparity or refine.enabled=false"
+            "RIL-416",
+            "refine needs landmarks of the disparity",
+            remedy="set resect.landmarks=disparity or refine.enabled=false",
         )
     disparity = {int(k): b for k, b in zip(args["pairs"], inputs["disparities"], strict=True)}
     rigs = {int(k): Rig.from_dict(b.meta["rig"]) for k, b in zip(args["pairs"], inputs["rigs"], strict=True)}

@@ -175,6 +175,7 @@ def resect(
     poses, active, steps = _remove_inconsistent(obs, poses, near, params, where)
     if active.sum() < params.min_share * len(active):
         raise DegenerateError(
+            "RIL-419",
             f"{where}: only {int(active.sum())} of {len(active)} landmarks agree with one pose",
             remedy="look at the image; or lower resect.min_share",
         )
@@ -257,6 +258,7 @@ def _result(obs: Observations, poses: Poses, active: Bools, steps: int, params: 
     position_sigma = float(np.sqrt(np.trace(expected[:3, :3]) + (other[:3] ** 2).sum()))
     if position_sigma > params.max_position_ratio * depth:
         raise DegenerateError(
+            "RIL-420",
             f"{where}: {int(active.sum())} landmarks at a median distance of {depth:.3g} m leave the position uncertain"
             f" by {position_sigma:.2g} m (condition {condition:.1e})",
             remedy="they are too far, too few or in one direction: set track.points higher or use nearer texture",
@@ -319,7 +321,9 @@ def _root(covariance: Floats, depth: float) -> Floats:
 
 def _enough(count: int, where: str, what: str, remedy: str) -> None:
     if count < MINIMUM:
-        raise DegenerateError(f"{where}: too few landmarks: {count} {what}, {MINIMUM} are needed", remedy=remedy)
+        raise DegenerateError(
+            "RIL-421", f"{where}: too few landmarks: {count} {what}, {MINIMUM} are needed", remedy=remedy
+        )
 
 
 def _not_collinear(landmarks: Floats, where: str) -> None:
@@ -327,6 +331,7 @@ def _not_collinear(landmarks: Floats, where: str) -> None:
     spread = np.linalg.svd(landmarks - landmarks.mean(0), compute_uv=False)
     if spread[1] < 0.01 * spread[0]:
         raise DegenerateError(
+            "RIL-422",
             f"{where}: the {len(landmarks)} landmarks are collinear, the rotation about their line is free",
             remedy="set track.points higher so that landmarks cover the image",
         )
@@ -450,7 +455,7 @@ def _run(params: ResectParams, args: Mapping[str, Any], inputs: Inputs) -> Bundl
     if "prediction" in args:
         reckoned = [None if T is None else RigidTransform.from_matrix(T) for T in args["prediction"]]
         if len(reckoned) != len(frames):
-            raise InputError(f"{len(frames)} frames need {len(frames)} predicted poses, not {len(reckoned)}")
+            raise InputError("RIL-423", f"{len(frames)} frames need {len(frames)} predicted poses, not {len(reckoned)}")
     found = resect_segment(points, landmarks, rig.left, T_local_key, frames, params, reckoned)
     arrays: dict[str, AnyArray] = {
         "poses": found.poses,
@@ -501,6 +506,7 @@ def coordinates(
     source, disparity = inputs.get(params.landmarks), inputs.get("disparity")
     if source is None:
         raise InputError(
+            "RIL-424",
             f"resect.landmarks={params.landmarks!r} but no {params.landmarks} was computed",
             remedy=f"connect the input {params.landmarks!r}",
         )

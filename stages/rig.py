@@ -73,7 +73,9 @@ def orient_rig(given: Rig, pairs: Sequence[Matches], params: RigParams) -> dict[
         The cameras share one projection centre, or their images are swapped.
     """
     if not given.baseline > 0:
-        raise InputError("the rig's baseline is 0 m", remedy="give T_right_left with a translation in metres")
+        raise InputError(
+            "RIL-427", "the rig's baseline is 0 m", remedy="give T_right_left with a translation in metres"
+        )
     facts: dict[str, Any] = {
         "rig": given.to_dict(),
         "given": given.to_dict(),
@@ -103,6 +105,7 @@ def _judged(given: Rig, pairs: list[Matches], params: RigParams) -> dict[str, An
     share = impossible_share(rig, pairs, decision.fit)
     if share > SWAPPED:
         raise InputError(
+            "RIL-428",
             f"{100 * share:.0f} % of the matches lie beyond infinity: left and right are swapped, or the baseline "
             "points the other way",
             remedy="exchange the left and the right images, or the sign of the baseline",

@@ -140,6 +140,7 @@ def check_size(vehicle: Vehicle, shape: tuple[int, ...], cell: float) -> None:
     width, side = 2.0 * vehicle.half_width, min(shape) * cell
     if width > side:
         raise InputError(
+            "RIL-431",
             f"the vehicle is {width:.3g} m wide over its wheels, the map only {side:.3g} m",
             remedy="give vehicle.track and vehicle.wheel_diameter in metres at the scale of the sequence",
         )

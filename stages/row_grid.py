@@ -35,7 +35,9 @@ class RowGrid:
         """The grid that covers a lattice; with heading (0, 1) the lattice itself."""
         norm = math.hypot(*heading)
         if not (math.isfinite(norm) and norm > 0):
-            raise InputError(f"heading {heading} has no direction", remedy="give start and target that differ")
+            raise InputError(
+                "RIL-434", f"heading {heading} has no direction", remedy="give start and target that differ"
+            )
         dx, dy = heading[0] / norm, heading[1] / norm
         x, y = lattice.xs()[[0, -1, 0, -1]], lattice.ys()[[0, 0, -1, -1]]
         right, ahead = (x * dy - y * dx) / lattice.cell, (x * dx + y * dy) / lattice.cell

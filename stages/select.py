@@ -169,10 +169,10 @@ def segments(basic: list[int], frames: int) -> list[list[int]]:
 def _run(params: SelectParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     frames = int(args["frames"])
     if frames < 1:
-        raise ConfigError("no frame is chosen", remedy="choose at least one with --frames")
+        raise ConfigError("RIL-437", "no frame is chosen", remedy="choose at least one with --frames")
     steps = [Step.from_bundle(b) for b in inputs.get("motions") or []]
     if len(steps) != frames - 1:
-        raise InputError(f"{frames} frames need {frames - 1} motions, not {len(steps)}")
+        raise InputError("RIL-438", f"{frames} frames need {frames - 1} motions, not {len(steps)}")
     stride = params.rule == "stride"
     choice = (by_stride if stride else by_overlap)(steps, params, frozenset(args.get("unfit", ())))
     meta = {

@@ -34,7 +34,7 @@ def gradient(elevation: ArrayLike, cell: float) -> Floats:
         The cell is not positive.
     """
     if not cell > 0:
-        raise InputError(f"the cell size {cell} m is not positive")
+        raise InputError("RIL-441", f"the cell size {cell} m is not positive")
     z = np.asarray(elevation, dtype=np.float64)
     known = np.isfinite(z)
     middle = np.where(known, z, 0.0)

@@ -113,4 +113,4 @@ def sphere(centre: ArrayLike, radius: float, longitudes: ArrayLike, latitudes: A
 
 def _check_radius(radius: float) -> None:
     if not radius > 0:
-        raise InputError(f"the reference surface's radius {radius} m is not positive")
+        raise InputError("RIL-444", f"the reference surface's radius {radius} m is not positive")

@@ -89,7 +89,7 @@ def track(frames: Sequence[Pyramid], motions: Sequence[Motion], params: TrackPar
         Not one motion between each two frames.
     """
     if len(motions) != len(frames) - 1:
-        raise InputError(f"{len(frames)} frames need {len(frames) - 1} motions, not {len(motions)}")
+        raise InputError("RIL-447", f"{len(frames)} frames need {len(frames) - 1} motions, not {len(motions)}")
     first = frames[0]
     seeds = interest_points(first.images[0], first.valid[0], params.points, noise=params.noise, border=BORDER)
     state = _State.born(seeds.astype(np.float64), 0, len(frames))

@@ -65,14 +65,14 @@ def chain(segments: Sequence[Segment], levels: Sequence[RigidTransform]) -> Chai
         Not one level a segment, or a segment whose key pose is not its level's.
     """
     if len(levels) != max(len(segments), 1):
-        raise InputError(f"{len(segments)} segments and {len(levels)} levels do not make a trajectory")
+        raise InputError("RIL-450", f"{len(segments)} segments and {len(levels)} levels do not make a trajectory")
     kinds = segments[0][2].shape[2] if segments else 0
     nothing = np.zeros((6, 6)), np.zeros((6, kinds))
     world, (own, common), broken, piece = levels[0], nothing, False, 0
     poses, covariances, owner, pieces = [world.matrix34], [own], [0], [0]
     for number, ((local, local_cov, shared), level) in enumerate(zip(segments, levels, strict=False)):
         if np.abs(local[0] - level.matrix34).max() > 1e-9 * max(1.0, float(np.abs(local[0]).max())):
-            raise InputError(f"segment {number} was not resected in the local frame of its own basic pair")
+            raise InputError("RIL-451", f"segment {number} was not resected in the local frame of its own basic pair")
         if broken:
             world, (own, common), piece = level, nothing, piece + 1
             poses[-1], covariances[-1], owner[-1], pieces[-1] = world.matrix34, own, number, piece

@@ -100,11 +100,14 @@ def undistort(
     size = (lens.camera.height, lens.camera.width)
     if raw.shape != size:
         raise InputError(
+            "RIL-454",
             f"the image is {raw.shape[1]} x {raw.shape[0]} pixels, its lens is calibrated for {size[1]} x {size[0]}",
             remedy="give images as they were calibrated: not scaled, not cropped",
         )
     if valid is not None and valid.shape != size:
-        raise InputError(f"mask {valid.shape} and image {raw.shape} differ", remedy="give a mask of the image's size")
+        raise InputError(
+            "RIL-455", f"mask {valid.shape} and image {raw.shape} differ", remedy="give a mask of the image's size"
+        )
     usable = np.isfinite(raw)
     if valid is not None:
         usable &= valid != 0
@@ -148,9 +151,7 @@ def _run(params: UndistortParams, args: Mapping[str, Any], inputs: Inputs) -> Bu
     try:
         image, valid = undistort(bundle["image"], lens, camera, params, bundle["valid"])
     except InputError as error:
-        raise InputError(
-            f"frame {args['frame']}, {args['camera_name']} camera: {error.message}", remedy=error.remedy
-        ) from error
+        raise error.at(f"frame {args['frame']}, {args['camera_name']} camera") from error
     meta = {
         "frame": args["frame"],
         "camera": args["camera_name"],

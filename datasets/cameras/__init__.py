@@ -58,4 +58,4 @@ def read_cameras(path: Path) -> list[CalibratedCamera]:
     for knows, read_fields in NESTED:
         if knows(fields):
             return read_fields(fields, path)
-    raise InputError(f"{path} holds no camera that is known", remedy=KNOWN)
+    raise InputError("RIL-100", f"{path} holds no camera that is known", remedy=KNOWN)

@@ -36,10 +36,10 @@ def boofcv(f: Fields, path: Path) -> list[CalibratedCamera]:
 def _lens(f: Fields) -> Lens:
     model = f.text("model", "pinhole")
     if model not in MODELS:
-        raise f.error("model", f"= {model!r} is not read", f"calibrate as {MODELS[1]}")
+        raise f.error("RIL-103", "model", f"= {model!r} is not read", f"calibrate as {MODELS[1]}")
     p = f.sub("pinhole")
     if abs(p.number("skew", 0.0)) > 1e-6 * p.number("fx"):
-        raise p.error("skew", f"= {p.number('skew'):g} is not 0", "calibrate without skew")
+        raise p.error("RIL-104", "skew", f"= {p.number('skew'):g} is not 0", "calibrate without skew")
     values = (p.number("fx"), p.number("fy"), p.number("cx"), p.number("cy"))
     camera = p.camera("fx", values, p.size("width", "height"))
     if "radial_tangential" not in f:
@@ -47,7 +47,9 @@ def _lens(f: Fields) -> Lens:
     bent = f.sub("radial_tangential")
     radial = bent.numbers("radial") if "radial" in bent else ()
     if len(radial) > MOST_RADIAL:
-        raise bent.error("radial", f"has {len(radial)} numbers, at most {MOST_RADIAL} are read", "calibrate with fewer")
+        raise bent.error(
+            "RIL-105", "radial", f"has {len(radial)} numbers, at most {MOST_RADIAL} are read", "calibrate with fewer"
+        )
     k1, k2, k3 = (*radial, *(0.0,) * (MOST_RADIAL - len(radial)))
     coefficients = (k1, k2, bent.number("t1", 0.0), bent.number("t2", 0.0), k3)
     return bent.lens("radial", camera, "radtan", coefficients if k3 else coefficients[:4])

@@ -51,11 +51,13 @@ def colmap(text: str, path: Path) -> list[CalibratedCamera]:
     for number, model, width, height, *values in _lines(text):
         at = f"camera {number} "
         if model not in PARAMETERS:
-            raise Fields({}, str(path), at).error("model", f"{model} is not read", f"one of {', '.join(PARAMETERS)}")
+            raise Fields({}, str(path), at).error(
+                "RIL-108", "model", f"{model} is not read", f"one of {', '.join(PARAMETERS)}"
+            )
         names = PARAMETERS[model].split()
         if len(values) != len(names):
             f = Fields({}, str(path), at)
-            raise f.error("parameters", f"are {len(values)}, {model} takes {len(names)}: {' '.join(names)}")
+            raise f.error("RIL-109", "parameters", f"are {len(values)}, {model} takes {len(names)}: {' '.join(names)}")
         f = Fields(dict(zip(names, values, strict=True)) | {"width": width, "height": height}, str(path), at)
         found.append(CalibratedCamera(number, _lens(f, model), poses.get(number)))
     return found
@@ -88,7 +90,7 @@ def _rig(path: Path) -> dict[str, RigidTransform]:
         f = Fields({"pose": rest[:7]}, str(path), f"sensor {number} ")
         w, x, y, z, *t = f.numbers("pose", 7)
         if not np.hypot(np.hypot(w, x), np.hypot(y, z)) > 0:
-            raise f.error("pose", "has a quaternion of length 0")
+            raise f.error("RIL-110", "pose", "has a quaternion of length 0")
         rest = rest[7:]
         if kind == "CAMERA":
             poses[number] = RigidTransform(Rotation.from_quat([x, y, z, w]).as_matrix(), np.array(t))

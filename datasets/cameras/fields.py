@@ -49,21 +49,21 @@ class Fields:
     def __contains__(self, key: str) -> bool:
         return self.values.get(key) is not None
 
-    def error(self, key: str, what: str, remedy: str = CORRECT) -> InputError:
+    def error(self, code: str, key: str, what: str, remedy: str = CORRECT) -> InputError:
         """One line with the file and the full key."""
-        return InputError(f"{self.file}: {self.at}{key} {what}", remedy=remedy)
+        return InputError(code, f"{self.file}: {self.at}{key} {what}", remedy=remedy)
 
     def get(self, key: str) -> Any:
         """An entry that must be there."""
         if key not in self:
-            raise self.error(key, "is missing")
+            raise self.error("RIL-113", key, "is missing")
         return self.values[key]
 
     def sub(self, key: str) -> Fields:
         """A nested part."""
         value = self.get(key)
         if not isinstance(value, Mapping):
-            raise self.error(key, f"is {_shown(value)}, it should hold entries of its own")
+            raise self.error("RIL-114", key, f"is {_shown(value)}, it should hold entries of its own")
         return Fields(value, self.file, f"{self.at}{key}.")
 
     def text(self, key: str, default: str | None = None) -> str:
@@ -82,9 +82,9 @@ class Fields:
         """A list of finite numbers, row by row where it is a matrix; ``count`` of them."""
         flat = _flat(self.get(key))
         if flat is None:
-            raise self.error(key, f"is {_shown(self.values[key])}, it should be a list of numbers")
+            raise self.error("RIL-115", key, f"is {_shown(self.values[key])}, it should be a list of numbers")
         if count is not None and len(flat) != count:
-            raise self.error(key, f"has {len(flat)} numbers, it takes {count}")
+            raise self.error("RIL-116", key, f"has {len(flat)} numbers, it takes {count}")
         return tuple(self._number(key, v) for v in flat)
 
     def matrix(self, key: str, rows: int, columns: int) -> Floats:
@@ -111,17 +111,19 @@ class Fields:
     def pose(self, key: str) -> RigidTransform:
         """Rigid transform from a 4 x 4 or 3 x 4 matrix."""
         if len(self.numbers(key)) not in (12, 16):
-            raise self.error(key, f"has {len(self.numbers(key))} numbers, it takes a 4 x 4 matrix")
+            raise self.error("RIL-117", key, f"has {len(self.numbers(key))} numbers, it takes a 4 x 4 matrix")
         m = np.array(self.numbers(key)).reshape(-1, 4)
         if len(m) == 4 and np.abs(m[3] - [0, 0, 0, 1]).max() > 1e-9:
-            raise self.error(key, f"has the last row {m[3].tolist()}, it should be 0 0 0 1")
+            raise self.error("RIL-118", key, f"has the last row {m[3].tolist()}, it should be 0 0 0 1")
         return self.rigid(key, m[:3, :3], m[:3, 3])
 
     def pinhole(self, key: str, size: tuple[int, int]) -> Camera:
         """Camera from a 3 x 3 matrix K."""
         k = self.matrix(key, 3, 3)
         if abs(k[0, 1]) > 1e-6 * abs(k[0, 0]) or abs(k[1, 0]) > 0 or np.abs(k[2] - [0, 0, 1]).max() > 1e-9:
-            raise self.error(key, f"is {k.tolist()}, no matrix fx 0 cx, 0 fy cy, 0 0 1", "calibrate without skew")
+            raise self.error(
+                "RIL-119", key, f"is {k.tolist()}, no matrix fx 0 cx, 0 fy cy, 0 0 1", "calibrate without skew"
+            )
         return self.camera(key, (k[0, 0], k[1, 1], k[0, 2], k[1, 2]), size)
 
     def camera(self, key: str, values: tuple[float, float, float, float], size: tuple[int, int]) -> Camera:
@@ -129,14 +131,14 @@ class Fields:
         try:
             return Camera(values[0], values[1], values[2], values[3], size[0], size[1])
         except InputError as error:
-            raise self.error(key, f"gives no camera: {error.message}", error.remedy) from error
+            raise self.error(error.code, key, f"gives no camera: {error.message}", error.remedy) from error
 
     def lens(self, key: str, camera: Camera, model: str, coefficients: tuple[float, ...]) -> Lens:
         """Lens with a model of :mod:`stages.lens`; ``key`` is where the coefficients stand."""
         try:
             return Lens(camera, model, coefficients)
         except InputError as error:
-            raise self.error(key, f"is wrong: {error.message}", error.remedy) from error
+            raise self.error(error.code, key, f"is wrong: {error.message}", error.remedy) from error
 
     def model(self, key: str, default: str) -> str:
         """Lens model of :mod:`stages.lens` by the name that the file has for it."""
@@ -144,7 +146,10 @@ class Fields:
         word = stated.lower().replace("_", "-").replace(" ", "-")
         if word not in MODELS:
             raise self.error(
-                key, f"= {stated!r} is a lens model that is not read", "calibrate as radial-tangential or equidistant"
+                "RIL-120",
+                key,
+                f"= {stated!r} is a lens model that is not read",
+                "calibrate as radial-tangential or equidistant",
             )
         return MODELS[word]
 
@@ -154,12 +159,12 @@ class Fields:
         except (TypeError, ValueError):
             number = math.nan
         if not math.isfinite(number):
-            raise self.error(key, f"is {_shown(value)}, it should be a number")
+            raise self.error("RIL-121", key, f"is {_shown(value)}, it should be a number")
         return number
 
     def _pixels(self, key: str, value: float) -> int:
         if value < 2 or value != int(value):
-            raise self.error(key, f"= {value:g} is no image size in pixels")
+            raise self.error("RIL-122", key, f"= {value:g} is no image size in pixels")
         return int(value)
 
     def rigid(self, key: str, rotation: Floats, translation: Floats) -> RigidTransform:
@@ -167,7 +172,7 @@ class Fields:
         try:
             return RigidTransform(rotation, translation)
         except InputError as error:
-            raise self.error(key, f"is no pose: {error.message}") from error
+            raise self.error(error.code, key, f"is no pose: {error.message}") from error
 
 
 def by_count(coefficients: tuple[float, ...]) -> tuple[str, tuple[float, ...]]:

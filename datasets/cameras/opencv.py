@@ -121,9 +121,9 @@ def _unrectified(f: Fields, rotation: str, projection: str) -> RigidTransform:
     """T_camera_reference, where the reference is the rectified left camera."""
     R, P = f.matrix(rotation, 3, 3), f.matrix(projection, 3, 4)
     if not P[0, 0] > 0:
-        raise f.error(projection, f"has the focal length {P[0, 0]:g}")
+        raise f.error("RIL-125", projection, f"has the focal length {P[0, 0]:g}")
     T = RigidTransform(np.eye(3), np.array([P[0, 3] / P[0, 0], P[1, 3] / P[0, 0], 0.0]))
     try:
         return RigidTransform(R, np.zeros(3)).inverse() @ T
     except InputError as error:
-        raise f.error(rotation, f"is no pose: {error.message}") from error
+        raise f.error(error.code, rotation, f"is no pose: {error.message}") from error

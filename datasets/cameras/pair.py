@@ -40,6 +40,7 @@ def rig_of(
     if left.T_camera_reference is None or right.T_camera_reference is None:
         lacking = left if left.T_camera_reference is None else right
         raise InputError(
+            "RIL-128",
             f"cameras {left.name} and {right.name} have no relative pose: the calibration does not say where "
             f"{lacking.name} stands",
             remedy="give the baseline in metres, or a stereo calibration",
@@ -48,12 +49,14 @@ def rig_of(
     rig = Rig(lenses["left"].ideal_camera(), lenses["right"].ideal_camera(), T_right_left)
     if rig.baseline < LEAST_BASELINE:
         raise InputError(
+            "RIL-129",
             f"cameras {left.name} and {right.name} stand in one place: the baseline is 0 m",
             remedy="give the baseline in metres, or the calibration of both cameras",
         )
     to_the_right = float(T_right_left.inverse().translation[0])
     if to_the_right < -SIDEWAYS * rig.baseline:
         raise InputError(
+            "RIL-130",
             f"swapped cameras: the right camera {right.name} stands {-to_the_right:.4g} m to the left of the left "
             f"camera {left.name}",
             remedy="exchange left and right, of the images too if they are swapped as well",
@@ -65,12 +68,14 @@ def rig_of(
 def _sized(camera: CalibratedCamera, size: tuple[int, int] | None) -> Lens:
     if camera.size is not None and size is not None and camera.size != size:
         raise InputError(
+            "RIL-131",
             f"camera {camera.name} is calibrated for {camera.size[0]} x {camera.size[1]} pixels, "
             f"the images are {size[0]} x {size[1]}",
             remedy="give the images as they were calibrated, or the calibration of images of this size",
         )
     if camera.size is None and size is None:
         raise InputError(
+            "RIL-132",
             f"the calibration of camera {camera.name} does not say how large its images are",
             remedy="give the size of the images",
         )

@@ -42,13 +42,15 @@ def read_text(path: Path) -> str:
     try:
         data = path.read_bytes() if path.stat().st_size <= LARGEST else None
     except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}", remedy="check the path and its rights") from error
+        raise InputError(
+            "RIL-138", f"{path} cannot be read: {error.strerror}", remedy="check the path and its rights"
+        ) from error
     if data is None:
-        raise InputError(f"{path} is too large for a calibration file", remedy="give the calibration file")
+        raise InputError("RIL-139", f"{path} is too large for a calibration file", remedy="give the calibration file")
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise InputError(f"{path} is no text file", remedy="give the calibration file") from error
+        raise InputError("RIL-140", f"{path} is no text file", remedy="give the calibration file") from error
 
 
 def parse_yaml(text: str, file: str) -> Mapping[Any, Any]:
@@ -59,7 +61,7 @@ def parse_yaml(text: str, file: str) -> Mapping[Any, Any]:
         mark = getattr(error, "problem_mark", None)
         where = f" (line {mark.line + 1})" if mark is not None else ""
         problem = getattr(error, "problem", None) or "not YAML"
-        raise InputError(f"{file} cannot be parsed{where}: {problem}", remedy="correct the file") from error
+        raise InputError("RIL-141", f"{file} cannot be parsed{where}: {problem}", remedy="correct the file") from error
     return found if isinstance(found, Mapping) else {}
 
 
@@ -72,11 +74,13 @@ def parse_xml(text: str, file: str) -> Mapping[str, Any]:
         The file is not well formed, or declares entities (which expand without bound, and no calibration needs).
     """
     if "<!ENTITY" in text:
-        raise InputError(f"{file} declares XML entities", remedy="give the calibration file as OpenCV writes it")
+        raise InputError(
+            "RIL-142", f"{file} declares XML entities", remedy="give the calibration file as OpenCV writes it"
+        )
     try:
         root = ElementTree.fromstring(text)
     except ElementTree.ParseError as error:
-        raise InputError(f"{file} cannot be parsed: {error}", remedy="correct the file") from error
+        raise InputError("RIL-143", f"{file} cannot be parsed: {error}", remedy="correct the file") from error
     return {child.tag: _node(child) for child in root} if root.tag == "opencv_storage" else {}
 
 

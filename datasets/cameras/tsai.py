@@ -34,14 +34,16 @@ def tsai(text: str, path: Path) -> list[CalibratedCamera]:
     f, lens = _entries(text, str(path))
     pitch = f.number("pitch", 1.0)
     if not pitch > 0:
-        raise f.error("pitch", f"= {pitch:g} is not positive")
+        raise f.error("RIL-146", "pitch", f"= {pitch:g} is not positive")
     fu, fv, cu, cv = (f.number(key) / pitch for key in ("fu", "fv", "cu", "cv"))
     camera = f.camera("fu", (fu, fv, cu, cv), UNKNOWN_SIZE)
     # with the directions as rows, the projection is K axes R^T (P - C)
     keys = ("u_direction", "v_direction", "w_direction")
     axes = np.array([f.numbers(key, 3) if key in f else row for key, row in zip(keys, np.eye(3), strict=True)])
     if np.linalg.det(axes) < 0:
-        raise f.error("u_direction", "and the other two directions mirror the image", "give a model without mirroring")
+        raise f.error(
+            "RIL-147", "u_direction", "and the other two directions mirror the image", "give a model without mirroring"
+        )
     T_world_body = f.rigid("R", f.matrix("R", 3, 3), np.array(f.numbers("C", 3)))
     T_camera_body = f.rigid("u_direction", axes, np.zeros(3))
     return [CalibratedCamera(path.stem, _lens(f, lens, camera), T_camera_body @ T_world_body.inverse())]
@@ -69,7 +71,10 @@ def _lens(f: Fields, kind: str, camera: Camera) -> Lens:
         return f.lens("k1", camera, "fisheye", tuple(f.number(key) for key in ("k1", "k2", "k3", "k4")))
     if name not in ("", "tsai"):
         raise f.error(
-            f"lens model {kind}", "is not read", "convert it by convert_pinhole_model --output-type TsaiLensDistortion"
+            "RIL-148",
+            f"lens model {kind}",
+            "is not read",
+            "convert it by convert_pinhole_model --output-type TsaiLensDistortion",
         )
     k3 = (f.number("k3"),) if "k3" in f else ()
     return f.lens("k1", camera, "radtan", (*(f.number(key) for key in ("k1", "k2", "p1", "p2")), *k3))

@@ -91,7 +91,7 @@ def mockup_loop(p: MockupParams, rover: RoverParams, name: str = "mockup-loop") 
     )
 
     def nothing(frame: int, camera: str) -> Source:
-        raise InputError("images of a drive come about on the way", remedy=f"rille drive {name}")
+        raise InputError("RIL-247", "images of a drive come about on the way", remedy=f"rille drive {name}")
 
     return protocol.Sequence(
         name=name,

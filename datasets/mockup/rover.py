@@ -128,7 +128,9 @@ def drive_leg(
     spin = 1.0 + p.turn_sigma * float(rng.standard_normal())
     first = stand(ground, *before, vehicle)
     if first is None:
-        raise InputError("the rover stands beside the bed", remedy="set rover.start within the bed, or a larger bed")
+        raise InputError(
+            "RIL-250", "the rover stands beside the bed", remedy="set rover.start within the bed, or a larger bed"
+        )
     d = _Drive(ground, vehicle, *before, [first], [(0.0, 0.0, 0.0)])
     x, y, heading = believed
 

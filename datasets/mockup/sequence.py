@@ -96,6 +96,7 @@ def _check_on_bed(p: MockupParams, poses: list[RigidTransform]) -> None:
         x, y, _ = pose.translation
         if abs(x) > 0.5 * p.bed_width or y > p.bed_length:
             raise ConfigError(
+                "RIL-253",
                 f"mockup: frame {k} stands at x = {x:.2f} m, y = {y:.2f} m, outside the bed of "
                 f"{p.bed_width:g} x {p.bed_length:g} m",
                 remedy="take fewer frames, smaller steps or turns, or a larger bed",

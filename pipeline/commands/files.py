@@ -138,7 +138,7 @@ def export(
 
     if output is not None and len(to) > 1:
         raise ConfigError(
-            f"--output names one place for {len(to)} forms", remedy="give one --to, or leave --output out"
+            "RIL-020", f"--output names one place for {len(to)} forms", remedy="give one --to, or leave --output out"
         )
     prepare()
     for kind in to:

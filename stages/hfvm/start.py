@@ -44,6 +44,7 @@ def check(prior: tuple[AnyArray, AnyArray] | None, shape: tuple[int, ...]) -> Pr
     u, v = (np.asarray(a, dtype=np.float32) for a in prior)
     if u.shape != shape or v.shape != shape:
         raise InputError(
+            "RIL-348",
             f"prior disparities {u.shape} and {v.shape} and the left image {shape} differ",
             remedy="give disparities of the left image, one a pixel",
         )

@@ -209,7 +209,7 @@ def lay_out():
 
 def test_what_does_not_fit_alone_is_refused_before_anything_runs(cache):
     graph = lay_out()
-    with pytest.raises(MemoryRefusedError, match=r"huge would need about .* GB \(no earlier run: a guess") as caught:
+    with pytest.raises(MemoryRefusedError, match=r"huge: would need about .* GB \(no earlier run: a guess") as caught:
         driver.run(graph, Store(cache), executor="inline", survey=lay_out)
     assert caught.value.remedy == "change hog.bytes, or give more with --memory-limit"
     assert [h.status for h in graph.nodes] == ["pending", "pending"]

@@ -98,6 +98,6 @@ def test_orthonormal_repairs_rounding() -> None:
 def test_errors_survive_a_process_boundary() -> None:
     import pickle
 
-    error = pickle.loads(pickle.dumps(InputError("what", remedy="do")))
+    error = pickle.loads(pickle.dumps(InputError("RIL-123", "what", remedy="do")))
     assert isinstance(error, InputError)
     assert str(error) == "what: do"

@@ -26,7 +26,7 @@ def _run(params, args, inputs):
             file.write("x")
         count = Path(args["tally"]).stat().st_size
     if what == "degenerate":
-        raise DegenerateError("no texture in frame 7", remedy="choose other frames")
+        raise DegenerateError("RIL-899", "no texture in frame 7", remedy="choose other frames")
     if what == "value":
         raise ValueError("negative depth")
     if what == "unpicklable":
