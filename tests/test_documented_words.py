@@ -63,3 +63,9 @@ def test_a_quoted_line_is_what_the_program_says(page: str, line: str) -> None:
 
 def test_other_words_are_noticed() -> None:
     assert strange("rille: numbers/0: there is not enough room on this disk: make room on it") > VARIABLE
+
+
+def test_a_quoted_error_has_a_code_that_there_is() -> None:
+    quoted = {code for _, line in QUOTED for code in re.findall(r"^rille: error (\S+): ", line)}
+    assert len(quoted) > 20
+    assert quoted <= set(_pieces())
