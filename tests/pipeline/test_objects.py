@@ -276,8 +276,8 @@ def test_each_mistake_is_one_line(port, tmp_path, monkeypatch, proxied, url):
         at(url)
     assert rille("s3://Bad_Bucket/x", dict(os.environ)) == (
         2,
-        "rille: error RIL-548: 'Bad_Bucket' is no name of a bucket: give --cache s3://bucket/prefix, and credentials in the"
-        " environment (AWS_ACCESS_KEY_ID ...)",
+        "rille: error RIL-548: 'Bad_Bucket' is no name of a bucket: give --cache s3://bucket/prefix, and credentials"
+        " in the environment (AWS_ACCESS_KEY_ID ...)",
     )
 
 
