@@ -1,5 +1,7 @@
 """The closed loop, top to bottom: stop, think, drive, and again, as tasks like all others.
 
+Pair, world model, segment and hazards are wired as in a reconstruction: by the same methods.
+
 ::
 
     drive/start -> sense -+
@@ -141,8 +143,6 @@ class Drive(Reconstruction):
         self.simulation: Simulation = sequence.simulation
         self.mounting = {"T_vehicle_left": self.simulation.T_vehicle_left.to_list()}
         self.driven = self.products.drive = Driven()
-        self.left: dict[int, Handle] = {}
-        self.motion: dict[tuple[int, int], Handle] = {}
         self.posed: list[int] = [0]
         """Frames of the trajectory so far."""
         self.goal: tuple[float, float] = config.drive.goal
@@ -175,30 +175,14 @@ class Drive(Reconstruction):
         p, k = self.products, len(self.driven.stops)
         stop = Stop(k, frame)
         self.driven.stops.append(stop)
-        if frame not in self.left:
-            self._left(frame)
-        right = self._taken(frame, "right")
-        p.disparity[frame] = self._disparity(frame, right)
+        self.left[frame] = self._pyramid(frame, "left")
         if k == 0:
-            self._calibrate(frame)
-        p.rigs[frame], self.calibration[frame] = p.rigs[0], self.calibration[0]
-        p.level[frame] = self._node(
-            "level",
-            f"level/{frame}",
-            {"pair": frame, "up": up},
-            disparity=p.disparity[frame],
-            rig=self.calibration[frame],
-        )
-        p.local_dem[frame] = self._node(
-            "locus",
-            f"locus/local/{frame}",
-            {"pair": frame, "frame": "local"},
-            disparity=p.disparity[frame],
-            rig=self.calibration[frame],
-            left=self.left[frame],
-            level=p.level[frame],
-            reference=p.level[0],
-        )
+            self._match(frame)
+            self._rigs([frame])
+        else:
+            self._disparity(frame)
+            p.rigs[frame], self.calibration[frame] = p.rigs[0], self.calibration[0]
+        self._pair(frame, {"pair": frame, "up": up})
         if k == 0 and self.config.drive.frame == "map":
             self.graph.expand([self._fix(frame)], lambda fixed: self._on_the_map(stop, before, row, fixed))
         else:
@@ -236,33 +220,11 @@ class Drive(Reconstruction):
         self.goal = float(x), float(y)
         self._think(stop, before, row)
 
-    def _calibrate(self, frame: int) -> None:
-        """The rig of the whole drive, from the first pair."""
-        p = self.products
-        given = self.sequence.rig.to_dict()
-        p.orientations[frame] = self._node(
-            "orientation", f"orientation/{frame}", {"pair": frame, "rig": given}, disparity=p.disparity[frame]
-        )
-        p.rigs = {frame: self._rig([frame], "")}
-        self.calibration = {frame: self._node("calibration", "calibration", {}, rig=p.rigs[frame])}
-
     def _map(self, stop: Stop) -> None:
         """What is known of the world at a stop, its hazards, and where to go next."""
         p, k, frame = self.products, stop.index, stop.frame
         stop.trajectory = trajectory = self._located(k)
-        self.pose = self._node("pose", f"pose/{frame}", {"row": len(self.posed) - 1}, trajectory=trajectory)
-        p.world_dem[frame] = self._node(
-            "locus",
-            f"locus/world/{frame}",
-            {"pair": frame, "frame": "world", "row": 0},
-            disparity=p.disparity[frame],
-            rig=self.calibration[frame],
-            left=self.left[frame],
-            level=p.level[frame],
-            reference=p.level[0],
-            trajectory=self.pose,
-            local=p.local_dem[frame],
-        )
+        self.pose = self._world_model(frame, 0, len(self.posed) - 1, trajectory)
         if k == 0:
             self._pad(frame)
         stop.merged = self._merged(f"merge/{k}", None)
@@ -369,12 +331,12 @@ class Drive(Reconstruction):
             frame = first + row - 1
             self.true[frame] = tuple(pose)
             rows[frame] = row
-            self._left(frame)
+            self.left[frame] = self._pyramid(frame, "left")
         frames = list(rows)
         if len(frames) < 2:
             self._end("safety stop", "the rover did not move: it stands at the edge of the simulated bed")
             return
-        moved = [self._moved(a, b) for a, b in itertools.pairwise(frames)]
+        moved = [self._motion(a, b) for a, b in itertools.pairwise(frames)]
         self.graph.expand(moved, lambda *found: self._seen(stop, rows, said, list(found)))
 
     def _seen(self, stop: Stop, rows: dict[int, int], said: Ref, moved: list[Ref]) -> None:
@@ -392,7 +354,7 @@ class Drive(Reconstruction):
                 again = max(self.true) + 1
                 self.true[again], rows[again] = self.true[end], rows[end]
                 stop.event = f"lost image {shares}: stopped and taken again as image {again}"
-                self._left(again)
+                self.left[again] = self._pyramid(again, "left")
                 frames.append(again)
         kept = [f for f in frames if f not in lost]
         if len(kept) < 2:
@@ -402,7 +364,8 @@ class Drive(Reconstruction):
 
     def _segment_of(self, stop: Stop, frames: list[int], rows: dict[int, int], said: Ref) -> None:
         """Track and resect the images of the leg, then judge it."""
-        resection = self._resection(stop, frames, f"{stop.frame}")
+        track, resection = self._segment(frames, f"{stop.frame}")
+        self.products.tracks.append(track)
         vehicle = self.config.vehicle.model_dump(mode="json")
         args = {"rows": [rows[f] for f in frames], "vehicle": vehicle, **self.mounting}
         assert stop.sense is not None
@@ -441,28 +404,6 @@ class Drive(Reconstruction):
             motions=motions,
         )
 
-    def _resection(self, stop: Stop, frames: list[int], which: str) -> Handle:
-        p, key = self.products, stop.frame
-        track = self._node(
-            "track",
-            f"track/{which}",
-            {"frames": frames},
-            frames=[self.left[f] for f in frames],
-            motions=[self._moved(a, b) for a, b in itertools.pairwise(frames)],
-        )
-        p.tracks.append(track)
-        surface = {"dem": p.local_dem[key]} if self.config.resect.landmarks == "dem" else {}
-        return self._node(
-            "resect",
-            f"resect/{which}",
-            {"frames": frames},
-            track=track,
-            disparity=p.disparity[key],
-            level=p.level[key],
-            rig=self.calibration[key],
-            **surface,
-        )
-
     def _after(
         self,
         stop: Stop,
@@ -483,8 +424,8 @@ class Drive(Reconstruction):
             stop.event = f"{'reflex' if kind == 'reflex' else 'safety stop'} at image {frames[cut]}: {reason}"
             if cut < len(frames) - 1:
                 frames = frames[: cut + 1]
-                self.products.tracks.pop()
-                resection = self._resection(stop, frames, f"{stop.frame}/stopped")
+                track, resection = self._segment(frames, f"{stop.frame}/stopped")
+                self.products.tracks[-1] = track
         stop.frames = frames
         self.rows |= {f: rows[f] for f in frames[1:]}
         self.products.resections.append(resection)
@@ -567,23 +508,13 @@ class Drive(Reconstruction):
     def _simulate(self, source: Source, label: str, **inputs: Handle) -> Handle:
         return self.graph.node(source.module, label, source.params, dict(source.args), dict(source.hints), inputs)
 
-    def _left(self, frame: int) -> None:
-        self.left[frame] = self._taken(frame, "left")
-
-    def _taken(self, frame: int, camera: str) -> Handle:
-        """Pyramid of an image taken at its true pose."""
+    def _undistorted(self, frame: int, camera: str) -> Handle:
+        """An image taken at its true pose; its camera is an ideal one."""
         source = self.simulation.image(frame, camera, RigidTransform.from_matrix(self.true[frame]))
         image = self._simulate(source, f"image/{camera}/{frame}", scene=self.scene)
         if camera == "left":
             self.products.images[frame] = image
-        return self._node("pyramid", f"pyramid/{camera}/{frame}", {}, image=image)
-
-    def _moved(self, a: int, b: int) -> Handle:
-        if (a, b) not in self.motion:
-            self.motion[a, b] = self._node(
-                "motion", f"motion/{a}-{b}", {"frames": [a, b]}, a=self.left[a], b=self.left[b]
-            )
-        return self.motion[a, b]
+        return image
 
 
 def dataflow(graph: Graph, sequence: Sequence, config: Any, frames: tuple[int, ...]) -> Reconstruction:

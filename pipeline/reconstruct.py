@@ -108,6 +108,9 @@ class Reconstruction:
         self._images: dict[tuple[int, str], Handle] = {}
         self._pyramids: dict[tuple[int, str], Handle] = {}
         self._backward: dict[int, Handle] = {}
+        self.left: dict[int, Handle] = {}
+        self.motion: dict[tuple[int, int], Handle] = {}
+        self.calibration: dict[int, Handle] = {}
 
     def build(self) -> Products:
         """Lay out everything that is known beforehand; the rest follows by expansion."""
@@ -115,7 +118,6 @@ class Reconstruction:
         if not self.whole:
             raise InputError("RIL-050", "no chosen frame has both images", remedy="choose others with --frames")
         self.left = {f: self._pyramid(f, "left") for f in self.whole}
-        self.motion: dict[tuple[int, int], Handle] = {}
         for a, b in pairwise(self.whole):
             self._motion(a, b)
         self._match(self.whole[0])  # basic unless it is lost, so that its matching need not wait for the choice
@@ -185,7 +187,9 @@ class Reconstruction:
         for pair in self.basic:
             self._basic_pair(pair)
         for segment in segments:
-            self._segment(segment)
+            track, resection = self._segment(segment, f"{segment[0]}")
+            p.tracks.append(track)
+            p.resections.append(resection)
         p.trajectory = self._node(
             "trajectory",
             "trajectory",
@@ -204,7 +208,7 @@ class Reconstruction:
         first, last = trajectory.meta["pieces"][trajectory.meta["main"]]
         pairs = [k for k in self.basic if first <= k <= last and trajectory.meta["positions"][self.frames.index(k)]]
         for pair in pairs:
-            p.world_dem[pair] = self._world_dem(pair, pairs[0], p.trajectory)
+            self._world_model(pair, pairs[0], self.frames.index(pair), p.trajectory)
         side, margin = TILE_CELLS, self.config.merge.margin
         footprints = [
             self._node("footprint", f"footprint/{pair}", {"side": side, "margin": margin}, dem=dem)
@@ -212,32 +216,12 @@ class Reconstruction:
         ]
         self.graph.expand([*footprints, p.trajectory], self._after_world)
 
-    def _world_dem(self, pair: int, first: int, trajectory: Handle) -> Handle:
-        """Locus straight on the world lattice, by this pair's own pose."""
-        p = self.products
-        pose = self._node("pose", f"pose/{pair}", {"row": self.frames.index(pair)}, trajectory=trajectory)
-        return self._node(
-            "locus",
-            f"locus/world/{pair}",
-            {"pair": pair, "frame": "world", "row": 0},
-            disparity=p.disparity[pair],
-            rig=self.calibration[pair],
-            left=self.left[pair],
-            right=self._pyramid(pair, "right"),
-            **self._back(pair),
-            level=p.level[pair],
-            reference=p.level[first],
-            trajectory=pose,
-            local=p.local_dem[pair],
-        )
-
     def _match(self, pair: int) -> None:
         """Disparity of a pair, and the relative orientation that it asks for."""
         p = self.products
         if pair in p.disparity:
             return
-        right = self._pyramid(pair, "right")
-        p.disparity[pair] = self._disparity(pair, right)
+        self._disparity(pair)
         p.orientations[pair] = self._node(
             "orientation",
             f"orientation/{pair}",
@@ -245,10 +229,10 @@ class Reconstruction:
             disparity=p.disparity[pair],
         )
 
-    def _disparity(self, pair: int, right: Handle) -> Handle:
+    def _disparity(self, pair: int) -> None:
         """Disparity of the left image of a pair."""
-        rig = self.sequence.rig
-        return self._matched(f"hfvm/{pair}", pair, (self.left[pair], right), (rig.left, rig.right))
+        rig, images = self.sequence.rig, (self.left[pair], self._pyramid(pair, "right"))
+        self.products.disparity[pair] = self._matched(f"hfvm/{pair}", pair, images, (rig.left, rig.right))
 
     def _back(self, pair: int) -> dict[str, Handle]:
         """Disparity of the right image, where elevations are to be read from both."""
@@ -284,54 +268,72 @@ class Reconstruction:
         orientations = [self.products.orientations[k] for k in pairs]
         return self._node("rig", f"rig{which}", {"rig": self.sequence.rig.to_dict()}, orientations=orientations)
 
-    def _basic_pair(self, pair: int) -> None:
-        """Stereo pair to local elevation model, risk map and path (stop and think)."""
+    def _pair(self, pair: int, vertical: Mapping[str, Any]) -> None:
+        """Vertical and local elevation model of a pair whose disparity and rig are there."""
         p = self.products
-        p.level[pair] = self._node(
-            "level", f"level/{pair}", self._vertical(pair), disparity=p.disparity[pair], rig=self.calibration[pair]
-        )
-        p.local_dem[pair] = self._node(
+        known = {"disparity": p.disparity[pair], "rig": self.calibration[pair]}
+        p.level[pair] = self._node("level", f"level/{pair}", vertical, **known)
+        first = next(iter(p.level))  # cells and extent of the first pair serve all, so that they merge
+        p.local_dem[pair] = self._elevations(f"locus/local/{pair}", {"pair": pair, "frame": "local"}, first)
+
+    def _world_model(self, pair: int, first: int, row: int, trajectory: Handle) -> Handle:
+        """Locus straight on the world lattice, by the pair's own pose: the one in this row of the trajectory."""
+        p = self.products
+        pose = self._node("pose", f"pose/{pair}", {"row": row}, trajectory=trajectory)
+        args = {"pair": pair, "frame": "world", "row": 0}
+        given = {"trajectory": pose, "local": p.local_dem[pair]}
+        p.world_dem[pair] = self._elevations(f"locus/world/{pair}", args, first, **given)
+        return pose
+
+    def _elevations(self, label: str, args: Mapping[str, Any], first: int, **where: Handle) -> Handle:
+        """Locus: what the images of the pair ``args["pair"]`` show; the frame of pair ``first`` is the reference."""
+        p, pair = self.products, args["pair"]
+        return self._node(
             "locus",
-            f"locus/local/{pair}",
-            {"pair": pair, "frame": "local"},
+            label,
+            args,
             disparity=p.disparity[pair],
             rig=self.calibration[pair],
             left=self.left[pair],
             right=self._pyramid(pair, "right"),
             **self._back(pair),
             level=p.level[pair],
-            reference=p.level[next(iter(p.level))],  # cells and extent of the first pair serve all, so that they merge
+            reference=p.level[first],
+            **where,
         )
+
+    def _basic_pair(self, pair: int) -> None:
+        """Stereo pair to local elevation model, risk map and path (stop and think)."""
+        p = self.products
+        self._pair(pair, self._vertical(pair))
         p.local_risk[pair] = self._risk(f"risk/local/{pair}", [p.local_dem[pair]])
         p.local_path[pair] = self._node("path", f"path/local/{pair}", {"use": "local"}, risk=p.local_risk[pair])
         if self.sequence.truth_dem is not None and self._truth(pair) is not None:
             self.graph.expand([p.level[pair], p.local_dem[pair]], lambda *refs, k=pair: self._local_accuracy(k, *refs))
 
-    def _segment(self, segment: list[int]) -> None:
-        """Track and resect the left images between two basic pairs (path execution)."""
-        p, key = self.products, segment[0]
+    def _segment(self, frames: list[int], which: str) -> tuple[Handle, Handle]:
+        """Track and resect the left images that follow a basic pair, which is the first of them (path execution)."""
+        p, key = self.products, frames[0]
         track = self._node(
             "track",
-            f"track/{key}",
-            {"frames": segment},
-            frames=[self.left[f] for f in segment],
-            motions=[self.motion[step] for step in pairwise(segment)],
+            f"track/{which}",
+            {"frames": frames},
+            frames=[self.left[f] for f in frames],
+            motions=[self._motion(a, b) for a, b in pairwise(frames)],
         )
-        p.tracks.append(track)
         # landmarks come from the disparity, or (resect.landmarks = "dem") where rays meet the local elevation model
         surface = {"dem": p.local_dem[key]} if self.config.resect.landmarks == "dem" else {}
-        p.resections.append(
-            self._node(
-                "resect",
-                f"resect/{key}",
-                {"frames": segment} | self._prediction(segment),
-                track=track,
-                disparity=p.disparity[key],
-                level=p.level[key],
-                rig=self.calibration[key],
-                **surface,
-            )
+        resection = self._node(
+            "resect",
+            f"resect/{which}",
+            {"frames": frames} | self._prediction(frames),
+            track=track,
+            disparity=p.disparity[key],
+            level=p.level[key],
+            rig=self.calibration[key],
+            **surface,
         )
+        return track, resection
 
     def _refined(self, keys: list[int]) -> dict[str, Handle]:
         """All segments adjusted jointly with their landmarks, where that is wanted."""

@@ -1,0 +1,90 @@
+"""A recorded sequence and a drive are one chain: each stage that both have gets the same ports in both."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from datasets.registry import open_sequence
+from pipeline import config
+from pipeline.dag import Graph
+from pipeline.drive import Drive
+from pipeline.reconstruct import Reconstruction
+
+HERE = [1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0]
+BOX = {"x0": 0.0, "y0": 0.0, "cell": 0.01, "rows": 4, "cols": 4}
+LEG = {"start": [0.0, 0.0, 0.0], "where": None, "reason": "", "left_m": 1.0}
+
+FACTS: dict[str, dict[str, Any]] = {
+    "continuity": {"asks": {"bridges": [], "sides": []}, "chain": [0, 1, 2], "lost": [], "unfit": []},
+    "select": {"basic": [0, 2], "segments": [[0, 1, 2]]},
+    "trajectory": {"pieces": [[0, 2]], "main": 0, "frames": [0, 1, 2], "positions": [[0, k, 0] for k in range(3)]},
+    "exposure": {"steps": {}},
+    "footprint": {"tiles": [(0, 0, 0, 0, 4, 4)], "box": BOX, "cell": 0.01},
+    "level": {"T_local_left": HERE},
+    "locus": {"lattice": BOX},
+    "mockup.drive": {"poses": [HERE, HERE]},
+    "mockup.sense": {"up": [[0.0, 0.0, 1.0]] * 2, "odometry": [[0.0, 0.0, 0.0], [0.0, 0.05, 0.0]]},
+    "motion": {"match_rate": 1.0},
+    "safety": {"stop": None, "kind": None, "reason": ""},
+    "reflex": {"stop": None, "reason": ""},
+}
+"""What each stage would have found: enough that the graph grows to its end."""
+
+APART = {"trajectory": {"refined"}}
+"""Ports that one flow alone has, by stage: a drive goes on before there is anything to be adjusted jointly."""
+
+
+def grown(flow: Reconstruction) -> Graph:
+    """All tasks of a flow, none of them run."""
+    flow.build()
+    waiting, legs = flow.graph.expansions, 0
+    while waiting:
+        handles, grow = waiting.pop(0)
+        facts = []
+        for handle in handles:
+            meta = FACTS.get(handle.stage, {})
+            if handle.stage == "footprint":
+                meta = meta | {"pair": int(handle.label.split("/")[1])}
+            if handle.stage == "leg":
+                meta, legs = LEG | {"verdict": "goal" if legs else "drive"}, legs + 1
+            facts.append(SimpleNamespace(meta=meta))
+        grow(*facts)
+    return flow.graph
+
+
+def ports(graph: Graph) -> dict[str, set[frozenset[str]]]:
+    """Which ports the tasks of each stage have: more than one set where its tasks are of more than one kind."""
+    found: dict[str, set[frozenset[str]]] = {}
+    for handle in graph.nodes:
+        if not any(upstream.stage.endswith("truth_dem") for upstream in handle.upstream()):
+            found.setdefault(handle.stage, set()).add(frozenset(handle.inputs) - APART.get(handle.stage, set()))
+    return found
+
+
+@pytest.mark.parametrize("landmarks", ["disparity", "dem"])
+@pytest.mark.parametrize("both", [True, False])
+def test_each_stage_gets_the_same_ports_in_a_drive_as_in_a_reconstruction(landmarks: str, both: bool) -> None:
+    driven, recorded = open_sequence("mockup-loop"), open_sequence("mockup-short", {"mockup": {"frames": 3}})
+    more = {"resect": {"landmarks": landmarks}, "locus": {"both": both}}
+    settings = config.build(config.expand(driven.defaults), more)
+    loop = ports(grown(Drive(Graph(), driven, settings)))
+    chain = ports(grown(Reconstruction(Graph(), recorded, settings, (0, 1, 2))))
+    shared = set(loop) & set(chain)
+    assert shared >= {
+        "hfvm",
+        "level",
+        "locus",
+        "motion",
+        "track",
+        "resect",
+        "pose",
+        "risk",
+        "merge",
+        "trajectory",
+        "rig",
+    }
+    assert {stage: loop[stage] for stage in shared} == {stage: chain[stage] for stage in shared}
+    assert all(("back" in given) is both and "right" in given for given in loop["locus"])
