@@ -1,8 +1,8 @@
 """The command line: ``rille reconstruct | drive | plan | why | timing | check | init | calibrate | match | ...``.
 
-Exit codes: 0 complete; 1 failed; 2 usage, configuration or input; 3 finished, but not all of it: failures under
-``--keep-going``, frames without a pose, a drive that did not reach its goal; 130 interrupted. Results go to
-stdout, progress and complaints to stderr. Heavy imports happen inside the commands, so that ``--help`` answers at once.
+Exit codes: 0 complete; 1 failed; 2 usage, configuration or input; 3 finished, but not all of it: what the data do not
+determine, failures under ``--keep-going``, frames without a pose, a drive that did not reach its goal; 130
+interrupted. Results go to stdout, progress and complaints to stderr. Heavy imports happen inside the commands, so that ``--help`` answers at once.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def reconstruct(
     frames: Frames = None,
     executor: Executor = "processes",
     keep_going: Annotated[
-        bool, flag("Finish what does not depend on a failed task; the exit status is then 3.")
+        bool, flag("Finish what does not depend on a task that failed for whatever reason; the exit status is then 3.")
     ] = False,
     memory_limit: MemoryLimit = None,
 ) -> int:

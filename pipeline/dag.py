@@ -87,7 +87,7 @@ class Graph:
     """Name of the sequence it works on, and of the choice of its frames: hints of earlier runs are kept by them."""
     choice: str = ""
     nodes: list[Handle] = field(default_factory=list)
-    expansions: list[tuple[list[Handle], Expansion]] = field(default_factory=list)
+    expansions: list[tuple[list[Handle], Expansion, bool]] = field(default_factory=list)
     _labels: set[str] = field(default_factory=set)
 
     def node(
@@ -122,9 +122,12 @@ class Graph:
         self.nodes.append(handle)
         return handle
 
-    def expand(self, handles: Sequence[Handle], fn: Expansion) -> None:
-        """Call ``fn(ref, ref, ...)`` on the client as soon as all ``handles`` have artifacts; it adds nodes."""
-        self.expansions.append((list(handles), fn))
+    def expand(self, handles: Sequence[Handle], fn: Expansion, *, holes: bool = False) -> None:
+        """Call ``fn(ref, ref, ...)`` on the client as soon as all ``handles`` have artifacts; it adds nodes.
+
+        With ``holes`` it is called, too, when some of them will never have one: it gets None for each of these.
+        """
+        self.expansions.append((list(handles), fn, holes))
 
 
 def _check_ports(spec: Spec, given: Mapping[str, Handle | list[Handle]]) -> None:

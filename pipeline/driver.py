@@ -9,9 +9,10 @@ A run that finds everything starts no worker. With ``dry=True`` nothing is compu
 ``cached`` or ``planned``, and ``reason`` says why (``rille plan``). What depends on results still to come is laid out
 by those of an earlier run where there was one (``Result.assumed``), else it is not known (``Result.unknown``).
 
-What a stage raises is not tried again. An artifact that is found damaged, or gone, when a task reads it is computed
-again, and the task after it. What depends on it is skipped; with ``keep_going`` everything else finishes,
-without it nothing new is begun. A task whose worker process dies is tried three times. In every case the ledger
+What a stage raises is not tried again, and what depends on it is skipped. Where the data do not determine an answer
+(:class:`~stages.errors.DegenerateError`) everything else finishes: the run has a hole. After any other error nothing
+new is begun, unless with ``keep_going``. An artifact that is found damaged, or gone, when a task reads it is computed
+again, and the task after it. A task whose worker process dies is tried three times. In every case the ledger
 has one line for each node that is missing, with the reason.
 """
 
@@ -40,7 +41,7 @@ from pipeline.ledger import Ledger
 from pipeline.progress import Progress, Quiet, recall_seconds, remember_seconds
 from pipeline.store import GoneError, NonDeterministicError, Ref, Store
 from pipeline.task import Outcome, key_of, recipe
-from stages.errors import RilleError
+from stages.errors import DegenerateError, RilleError
 
 FEW = 20
 """So many tasks, or one of so many, are few."""
@@ -101,16 +102,25 @@ class Result:
         fields = ("computed", "cached", "failed", "skipped", "planned", "seconds")
         return Counts(**{f: sum(getattr(c, f) for c in self.counts.values()) for f in fields})
 
-    def check(self) -> None:
-        """Raise the first failure as one line with its label: the original error of Rille, or what wraps another."""
-        if self.failures:
-            first = self.failures[0]
+    def check(self, *, holes: bool = False) -> None:
+        """Raise the first failure as one line with its label: the original error of Rille, or what wraps another.
+
+        With ``holes`` failures that lie in the data are passed over.
+        """
+        failures = [f for f in self.failures if not (holes and is_hole(f.error))]
+        if failures:
+            first = failures[0]
             error = first.error
             if isinstance(error, RilleError):
                 raise error.at(first.label) from error
             raise TaskError(
                 "RIL-534", f"{first.label} (stage {first.stage}): {type(error).__name__}: {error}"
             ) from error
+
+
+def is_hole(error: BaseException) -> bool:
+    """Whether a failure lies in the data, so that what does not depend on it is delivered all the same."""
+    return isinstance(error, DegenerateError)
 
 
 def run(
@@ -136,7 +146,7 @@ def run(
     store : where artifacts are.
     executor : ``inline``, ``threads``, ``processes`` or the address of a running dask scheduler (``tcp://...``).
     jobs : worker processes; None is one a core.
-    keep_going : finish what does not depend on a failure.
+    keep_going : finish what does not depend on a failure, of whatever kind.
     force : names of stages to compute again though they are there; the digests must agree.
     dry : look up only.
     ledger : file of JSON lines, one a node, written as they resolve.
@@ -210,7 +220,7 @@ class _Run:
         """Keys that must be computed again before the task of a key can be."""
         self.put_back: dict[str, int] = defaultdict(int)
         self.fates: dict[int, str] = {}
-        self.expansions: list[tuple[list[Handle], Expansion]] = []
+        self.expansions: list[tuple[list[Handle], Expansion, bool]] = []
         self.hints = store.hints(graph.sequence)
         self.known = explain.Known(self.hints, graph.choice)
 
@@ -306,10 +316,10 @@ class _Run:
 
     def _expand(self) -> bool:
         """Call the first expansion whose handles are done; whether there was one."""
-        for i, (handles, fn) in enumerate(self.expansions):
-            if all(h.done or h.earlier for h in handles):
+        for i, (handles, fn, holes) in enumerate(self.expansions):
+            if all(h.done or h.earlier or (holes and h.status in _FATE) for h in handles):
                 del self.expansions[i]
-                assumed = [h.label for h in handles if not h.done]
+                assumed = [h.label for h in handles if h.earlier and not h.done]
                 self.result.assumed += assumed
                 before = len(self.graph.nodes)
                 try:
@@ -448,7 +458,7 @@ class _Run:
     def _failed(self, failure: Failure) -> None:
         self.result.failures.append(failure)
         self.progress.failed(failure.label, failure.error)
-        if not self.keep_going:
+        if not self.keep_going and not is_hole(failure.error):
             self.stopped = f"stopped after {failure.label} failed"
 
     # -- what became of it --------------------------------------------------------------------------------------
@@ -491,7 +501,7 @@ class _Run:
             if handle.status == "pending":
                 handle.reason = self.stopped
                 self._resolve(handle, "skipped")
-        for handles, _ in self.expansions:
+        for handles, *_ in self.expansions:
             missing = [h for h in handles if not h.done]
             self.result.unknown += [h.label for h in missing]
             self.ledger.note(f"plan after {_labels(handles)}", "planned" if self.dry else "skipped", _labels(missing))

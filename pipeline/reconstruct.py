@@ -214,7 +214,7 @@ class Reconstruction:
             self._node("footprint", f"footprint/{pair}", {"side": side, "margin": margin}, dem=dem)
             for pair, dem in p.world_dem.items()
         ]
-        self.graph.expand([*footprints, p.trajectory], self._after_world)
+        self.graph.expand([*footprints, p.trajectory], self._after_world, holes=True)
 
     def _match(self, pair: int) -> None:
         """Disparity of a pair, and the relative orientation that it asks for."""
@@ -368,10 +368,11 @@ class Reconstruction:
             )
         p.crosscheck = self._node("crosscheck_join", "crosscheck_join", {"frames": self.whole}, windows=p.crosschecks)
 
-    def _after_world(self, *refs: Ref) -> None:
-        """Where the models lie is known: audit their seams, and level exposures before they are merged."""
+    def _after_world(self, *refs: Ref | None) -> None:
+        """Where the models lie is known: audit their seams, and level exposures before those that are are merged."""
         *found, trajectory = refs
-        footprints = [ref.meta for ref in found if ref.meta["tiles"]]
+        assert trajectory is not None
+        footprints = [ref.meta for ref in found if ref is not None and ref.meta["tiles"]]
         if not footprints:
             raise DegenerateError(
                 "RIL-051", "no elevation model has a cell in the world", remedy="look at the disparities' validity"

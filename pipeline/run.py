@@ -2,7 +2,7 @@
 
 Everything that takes time is a cached task; what this module writes (rasters, trajectory, path, report) is rendered
 anew by each run into ``RUNS/<sequence>/<run id>/``. ``latest`` moves last, and only to a folder that is complete
-or whose holes were accepted by ``--keep-going``. A run that computes nothing, and would write what ``latest`` holds
+or whose holes are named in its report. A run that computes nothing, and would write what ``latest`` holds
 already, leaves no folder of its own: that one stands (:mod:`pipeline.standing`).
 """
 
@@ -240,7 +240,7 @@ def _open(options: Options) -> _Opened:
 
 
 def _compute(opened: _Opened, meanwhile: Callable[[], None] | None) -> Result:
-    """Bring every task to its artifact, or raise the first failure."""
+    """Bring every task to its artifact; raise the first failure unless the data are its cause and poses are there."""
     from pipeline import driver, memory, progress
 
     options = opened.options
@@ -257,9 +257,9 @@ def _compute(opened: _Opened, meanwhile: Callable[[], None] | None) -> Result:
         survey=lambda: lay_out(opened.sequence, opened.config, opened.frames),
         meanwhile=meanwhile,
     )
-    safety_stop = opened.sequence.simulation is not None and opened.flow.outcome()[0] == "safety stop"
-    if not options.keep_going and not safety_stop:
-        result.check()
+    trajectory = opened.products.trajectory
+    if not options.keep_going:
+        result.check(holes=opened.sequence.simulation is not None or (trajectory is not None and trajectory.done))
     return result
 
 

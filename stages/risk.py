@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from stages.declare import Array, Bundle, Inputs, Memory, Params, Stage
-from stages.errors import InputError
+from stages.errors import DegenerateError
 from stages.hazards import BITS, measure, window_reach
 from stages.holes import close_into
 from stages.lattice import Lattice, mosaic, union
@@ -110,7 +110,7 @@ def risk_map(
 
     Raises
     ------
-    InputError
+    DegenerateError
         The vehicle is wider than the map.
     """
     p = params or RiskParams()
@@ -139,7 +139,7 @@ def check_size(vehicle: Vehicle, shape: tuple[int, ...], cell: float) -> None:
     """Refuse a vehicle that does not fit on the map at all."""
     width, side = 2.0 * vehicle.half_width, min(shape) * cell
     if width > side:
-        raise InputError(
+        raise DegenerateError(
             "RIL-431",
             f"the vehicle is {width:.3g} m wide over its wheels, the map only {side:.3g} m",
             remedy="give vehicle.track and vehicle.wheel_diameter in metres at the scale of the sequence",

@@ -185,6 +185,23 @@ def test_one_vehicle_limit_reruns_the_same(cold: Path) -> None:
     assert {label.split("/")[0] for label in computed(cold)} == {"risk", "path", "path_check"}
 
 
+def test_what_the_data_do_not_determine_is_missing_and_the_rest_is_delivered(cold: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "runs"
+    assert run.reconstruct(replace(options(cold, "vehicle.track=5.0"), runs=folder)) == 3
+    latest = folder / "mockup-short" / "latest"
+    assert {"dem.tif", "trajectory.tum", "report.html"} <= {p.name for p in latest.iterdir()}
+    report = json.loads((latest / "report.json").read_text())
+    assert {"risk/world", "risk/local/0"} <= {m["what"] for m in report["missing"] if m["kind"] == "failed"}
+    assert not report["complete"]
+
+    # one model without a cell: the world is made of the others
+    behind = options(cold, "locus.extent=[-0.1, 0.1, -9.0, -8.9]")
+    assert run.reconstruct(replace(behind, runs=folder)) == 3
+    written = {p.name for p in latest.iterdir()}
+    assert {"trajectory.tum", "report.html"} <= written
+    assert "dem.tif" not in written
+
+
 def test_written_configuration_repeats_the_run(cold: Path) -> None:
     assert run.reconstruct(options(cold)) == 0
     first = digests(cold)

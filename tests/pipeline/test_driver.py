@@ -158,6 +158,25 @@ def test_with_keep_going_the_rest_finishes_and_the_ledger_accounts_for_all(cache
     assert all(r["digest"] and r["seconds"] > 0 for r in rows if r["status"] == "computed")
 
 
+def test_what_the_data_do_not_determine_is_a_hole(cache):
+    told = []
+
+    def make(graph):
+        mischief("degenerate", "fine")(graph)
+        graph.expand([graph.nodes[1], graph.nodes[4]], lambda *refs: told.append([r is None for r in refs]), holes=True)
+        graph.expand([graph.nodes[1], graph.nodes[4]], lambda *refs: told.append("no holes"))
+
+    graph, result = run(cache, make=make)
+    assert {h.label for h in graph.nodes if h.done} == {"fine", "fine/after", "fine/third"}
+    assert told == [[True, False]]
+    result.check(holes=True)
+    with pytest.raises(DegenerateError):
+        result.check()
+    _, result = run(cache, make=mischief("degenerate", "value"))
+    with pytest.raises(driver.TaskError):
+        result.check(holes=True)
+
+
 def test_the_users_error_is_the_original_with_its_place(cache):
     _, result = run(cache, make=mischief("degenerate"))
     with pytest.raises(DegenerateError) as caught:

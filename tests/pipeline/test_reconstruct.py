@@ -27,7 +27,7 @@ def lay_out(
     nothing = {"asks": {"bridges": [], "sides": []}}
     for meta in [*({"asks": asks} for asks in asked), nothing | answer, chosen]:
         graph.expansions[-1][1](SimpleNamespace(meta=meta))
-    for handles, grow in list(graph.expansions):
+    for handles, grow, _ in list(graph.expansions):
         if handles == [products.trajectory]:
             grow(SimpleNamespace(meta=trajectory))
     return graph, products

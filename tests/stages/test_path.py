@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from vehicles import SHORT
 
 from stages.declare import Bundle, check_outputs
-from stages.errors import InputError
+from stages.errors import DegenerateError, InputError
 from stages.lattice import Lattice
 from stages.path import STAGE, PathParams, Route, describe, find_path
 from stages.risk import BITS, CAUTION, HAZARDOUS, UNKNOWN
@@ -217,7 +217,7 @@ def test_a_start_that_cannot_be_stood_on_is_refused_with_the_figure(kind: int, m
 
 def test_a_vehicle_wider_than_the_map_is_refused() -> None:
     lattice = Lattice.at(0, 40, CELL, 40, 5)
-    with pytest.raises(InputError, match=r"the vehicle is 0.095 m wide over its wheels, the map only 0.05 m"):
+    with pytest.raises(DegenerateError, match=r"the vehicle is 0.095 m wide over its wheels, the map only 0.05 m"):
         find_path(maps(*level(lattice)), lattice, SHORT.model_copy(update={"track": 0.08}))
 
 
