@@ -14,3 +14,12 @@ COVARIANCE = Array(
     "covariance of position and rotation vector",
     "nan",
 )
+
+SHARED = Array(
+    "shared",
+    ("frame", "parameter", "source"),
+    "float64",
+    "m, rad",
+    "errors of position and rotation vector per standard deviation of what all segments share",
+    "nan",
+)

@@ -6,6 +6,9 @@ its disparity alone. Where the segment ends at another basic pair, that pair's d
 second measurement of their depths. What all disparities share is one unknown of a window of segments, since one rig
 made them.
 
+The poses' covariances are those of this adjustment, by the same rules as the resection's (:mod:`stages.resect`): the
+errors that are found set the scale, what the stated ones leave beyond them is shared by all segments.
+
 Another error that they share, a tilt, shows over the whole sequence only (:mod:`stages.segment_adjustment`). Where it
 is beyond doubt, landmarks are judged and all segments adjusted once more without it.
 """
@@ -14,19 +17,30 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.declare import Array, Bundle, Inputs, Stage
+from stages.declare import Bundle, Inputs, Stage
 from stages.errors import ConfigError
 from stages.geometry import Rig, RigidTransform
 from stages.landmarks import Landmarks, matches_at, relief
-from stages.reprojection import Observations, Poses, norms
-from stages.resect import ResectParams, coordinates
-from stages.segment_adjustment import RefineParams, State, Views, adjust, common_tilt, stereo_rows
+from stages.pose_arrays import COVARIANCE, POSES, SHARED
+from stages.reprojection import HUBER, Observations, Poses, back_projection, norms
+from stages.resect import SOURCES, ResectParams, coordinates, root, scatter_of_blocks
+from stages.segment_adjustment import (
+    RefineParams,
+    State,
+    Views,
+    adjust,
+    common_tilt,
+    normal,
+    posterior,
+    scatter,
+    stereo_rows,
+)
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -101,16 +115,16 @@ def _run(params: RefineParams, args: Mapping[str, Any], inputs: Inputs) -> Bundl
     disparity = {int(k): b for k, b in zip(args["pairs"], inputs["disparities"], strict=True)}
     rigs = {int(k): Rig.from_dict(b.meta["rig"]) for k, b in zip(args["pairs"], inputs["rigs"], strict=True)}
     given: list[_Given] = []
-    poses: list[Floats] = []
+    out: list[SegmentOut] = []
     for track, resection, level in zip(inputs["tracks"], inputs["resections"], inputs["levels"], strict=True):
         frames = [int(f) for f in track.meta["frames"]]
         rig, T = rigs[frames[0]], RigidTransform.from_matrix(level.meta["T_local_left"])
         points = np.asarray(track["points"])[:, 0].astype(np.float64)
         landmarks = coordinates(points, {"disparity": disparity[frames[0]]}, rig, T, resect)
         given.append(_Given(track, resection, landmarks, rig, disparity.get(frames[-1])))
-        poses.append(np.array(resection["poses"], dtype=np.float64))
+        out.append(SegmentOut.of(resection))
     found = [views_of(g.track, g.resection, g.landmarks, g.rig, g.after, params) for g in given]
-    facts, states = _adjusted(found, poses, params)
+    facts, states = _adjusted(found, out, params)
     tilt, sigma = 0.0, float("inf")
     if params.tilt_sigma_deg > 0:
         tilt, sigma = common_tilt([(one[0], *states[k]) for k, one in enumerate(found) if one is not None], params)
@@ -119,17 +133,36 @@ def _run(params: RefineParams, args: Mapping[str, Any], inputs: Inputs) -> Bundl
         again = [
             None if one is None else (one[0].without_tilt(tilt), states[k][0], one[2]) for k, one in enumerate(found)
         ]
-        _adjusted(again, poses, params)
-        judged = [_anew(*pair, tilt, resect, params) for pair in zip(given, poses, strict=True)]
-        facts, _ = _adjusted(judged, poses, params)
+        _adjusted(again, out, params)
+        judged = [_anew(one, new.poses, tilt, resect, params) for one, new in zip(given, out, strict=True)]
+        facts, _ = _adjusted(judged, out, params)
     same = sum(f["cost_after"] >= f["cost_before"] for f in facts)
     words = [f"refinement lowers the residuals of {same} of {len(facts)} windows no further: they stay as resected"]
-    meta: dict[str, Any] = {"frames": [len(p) for p in poses], "adjustments": facts, "notes": words if same else []}
+    meta: dict[str, Any] = {
+        "frames": [len(one.poses) for one in out],
+        "adjustments": facts,
+        "notes": words if same else [],
+    }
     if math.isfinite(sigma):
         meta["tilt"] = {"deg": math.degrees(tilt), "sigma_deg": math.degrees(sigma), "undone": undone}
     if undone:
         meta["warnings"] = [_tilted(tilt, sigma, next(iter(rigs.values())))]
-    return Bundle({"poses": np.concatenate(poses)}, meta)
+    names = ("poses", "covariance", "shared")
+    return Bundle({name: np.concatenate([getattr(one, name) for one in out]) for name in names}, meta)
+
+
+@dataclass(frozen=True)
+class SegmentOut:
+    """What a segment's frames get: ``poses`` (frame, 3, 4), ``covariance`` (frame, 6, 6), ``shared`` (frame, 6, 7)."""
+
+    poses: Floats
+    covariance: Floats
+    shared: Floats
+
+    @staticmethod
+    def of(resection: Bundle) -> SegmentOut:
+        """As resected."""
+        return SegmentOut(*(np.array(resection[n], dtype=np.float64) for n in ("poses", "covariance", "shared")))
 
 
 @dataclass(frozen=True)
@@ -153,17 +186,45 @@ def _anew(given: _Given, poses: Floats, tilt: float, resect: ResectParams, param
     (views, state, rows), most = one, resect.threshold / resect.pixel_sigma
     views = views.without_tilt(tilt)
     for f in range(len(rows)):
-        seen = Observations(
-            views.position[None],
-            views.along[None],
-            views.sigma[None],
-            views.pixels[f : f + 1],
-            views.camera,
-            resect.pixel_sigma,
-            resect.bias_sigma,
-        )
-        views.seen[f] &= norms(seen, Poses(state.R[f : f + 1], state.t[f : f + 1], np.zeros(1)))[0] <= most
+        views.seen[f] &= norms(_frame(views, f, resect.pixel_sigma), _pose(state, f, 0.0))[0] <= most
     return views, state, rows
+
+
+def _frame(views: Views, f: int, pixel_sigma: float) -> Observations:
+    """One frame of a segment by itself, landmarks as their disparities have them."""
+    given = views.position[None], views.along[None], views.sigma[None], views.pixels[f : f + 1]
+    return Observations(*given, views.camera, pixel_sigma, 0.0)
+
+
+def _pose(state: State, f: int, bias: float) -> Poses:
+    return Poses(state.R[f : f + 1], state.t[f : f + 1], np.array([bias]))
+
+
+def claims(segments: Sequence[tuple[Views, State]], bias: float, params: RefineParams) -> list[tuple[Floats, Floats]]:
+    """Covariances (frame, 6, 6) and shared errors (frame, 6, 7) of the poses of segments that were adjusted together.
+
+    Of position (m) and rotation vector (rad) of T_local_left, as in :mod:`stages.resect`.
+    """
+    parts = [normal(views, state, bias, params.pixel_sigma) for views, state in segments]
+    factors = [scatter(views, state, bias, params.pixel_sigma) for views, state in segments]
+    found, stated = (posterior(parts, scale, params) for scale in (factors, [max(f, 1.0) for f in factors]))
+    out = []
+    for (views, state), (noise, _), (expected, by_bias) in zip(segments, found, stated, strict=True):
+        count = len(state.R)
+        covariance, shared, together = np.empty((count, 6, 6)), np.empty((count, 6, SOURCES)), list[float]()
+        for f in range(count):
+            turn, at = np.kron(np.eye(2), state.R[f].T), slice(6 * f, 6 * f + 6)
+            covariance[f] = turn @ noise[at, at] @ turn.T
+            seen = views.seen[f]
+            depth = float(np.median((views.position[seen] @ state.R[f].T + state.t[f])[:, 2]))
+            left = turn @ expected[at, at] @ turn.T - covariance[f]
+            shared[f] = np.column_stack([root(left, depth), turn @ by_bias[at]])
+            errors = back_projection(_frame(views, f, params.pixel_sigma), _pose(state, f, bias))
+            weight = HUBER / np.maximum(errors.norm[0], HUBER)
+            together.append(scatter_of_blocks(views.pixels[f][seen], errors.white[0][seen], weight[seen], views.camera))
+        covariance *= max(1.0, float(np.mean(together)))
+        out.append((covariance + shared @ np.swapaxes(shared, 1, 2), shared))
+    return out
 
 
 def _tilted(tilt: float, sigma: float, rig: Rig) -> str:
@@ -175,19 +236,21 @@ def _tilted(tilt: float, sigma: float, rig: Rig) -> str:
 
 
 def _adjusted(
-    found: Sequence[Segment | None], poses: list[Floats], params: RefineParams
+    found: Sequence[Segment | None], out: Sequence[SegmentOut], params: RefineParams
 ) -> tuple[list[dict[str, float]], dict[int, tuple[State, float]]]:
-    """Windows adjusted, ``poses`` written to; facts of the windows, and state and bias of each segment."""
+    """Windows adjusted, ``out`` written to; facts of the windows, and state and bias of each segment."""
     facts: list[dict[str, float]] = []
     last: dict[int, tuple[State, float]] = {}
     for group, kept in _windows([k for k, one in enumerate(found) if one is not None], params.window):
         parts = [one for k in group if (one := found[k]) is not None]
         states, bias, before, after = adjust([(views, state) for views, state, _ in parts], params)
-        for k, (_, _, rows), state in zip(group, parts, states, strict=True):
+        claimed = claims([(views, state) for (views, *_), state in zip(parts, states, strict=True)], bias, params)
+        for k, (_, _, rows), state, (covariance, shared) in zip(group, parts, states, claimed, strict=True):
             if k in kept:
                 last[k] = state, bias
                 for row, R, t in zip(rows, state.R, state.t, strict=True):
-                    poses[k][row] = RigidTransform(R, t).inverse().matrix34
+                    out[k].poses[row] = RigidTransform(R, t).inverse().matrix34
+                out[k].covariance[rows], out[k].shared[rows] = covariance, shared
         facts.append({"bias_px": bias, "cost_before": before, "cost_after": after})
     return facts, last
 
@@ -201,20 +264,14 @@ def _windows(segments: list[int], window: int) -> list[tuple[list[int], list[int
 
 STAGE = Stage(
     name="refine",
-    version=1,
+    version=2,
     summary="poses of segments adjusted jointly with their landmarks",
     params=RefineParams,
     inputs=("tracks*", "resections*", "levels*", "disparities*", "rigs*"),
     outputs=(
-        Array(
-            "poses",
-            ("frame", "row", "col"),
-            "float64",
-            "m",
-            "poses of all segments, one after the other",
-            "nan",
-            "local",
-        ),
+        replace(POSES, long_name="poses of all segments, one after the other", frame="local"),
+        replace(COVARIANCE, frame="local"),
+        replace(SHARED, frame="local"),
     ),
     requires=("numpy", "numba"),
     run=_run,

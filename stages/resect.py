@@ -36,7 +36,7 @@ from stages.errors import DegenerateError, InputError
 from stages.geometry import Camera, Rig, RigidTransform
 from stages.landmarks import Landmarks, landmarks_from_dem, landmarks_from_disparity, relief
 from stages.lattice import Lattice
-from stages.pose_arrays import COVARIANCE, POSES
+from stages.pose_arrays import COVARIANCE, POSES, SHARED
 from stages.reprojection import (
     Observations,
     Poses,
@@ -58,7 +58,7 @@ PER_BLOCK = 6
 """Landmarks a block, at least on average."""
 MOVING = 0.3
 """Share of the landmarks that agree with no pose, from which on it is warned of."""
-SHARED = 7
+SOURCES = 7
 """Errors that segments share: as many as the pose has parameters, and that of all disparities."""
 AT_ONCE = 8
 """Of the landmarks above the threshold, one in so many (at least one) is removed before the pose is adjusted anew."""
@@ -264,7 +264,7 @@ def _result(obs: Observations, poses: Poses, active: Bools, steps: int, params: 
             remedy="they are too far, too few or in one direction: set track.points higher or use nearer texture",
         )
     covariance, _, _ = _covariance(normal[0] / factor, obs.prior, R)
-    shared = np.column_stack([_root(stated - covariance, depth), bias])
+    shared = np.column_stack([root(stated - covariance, depth), bias])
     residual = np.where(np.isfinite(errors.norm[0]), np.sqrt((errors.pixels[0] ** 2).sum(-1)), np.nan)
     together = scatter_of_blocks(obs.pixels[0][active], errors.white[0][active], weight[0][active], obs.camera)
     return Resection(T, covariance, shared, active, residual, float(poses.bias[0]), steps, condition, together)
@@ -312,7 +312,7 @@ def _covariance(normal: Floats, prior: float, R_cam_local: Floats) -> tuple[Floa
     return turn @ noise @ turn.T, turn @ bias, float(values[-1] / max(values[0], 1e-300))
 
 
-def _root(covariance: Floats, depth: float) -> Floats:
+def root(covariance: Floats, depth: float) -> Floats:
     """Symmetric root (6, 6) of a covariance, radians counted as what they move at a depth (m)."""
     unit = np.array([1.0] * 3 + [depth] * 3)
     values, vectors = np.linalg.eigh(covariance * np.outer(unit, unit))
@@ -372,7 +372,7 @@ def resect_segment(
     out = SegmentPoses(
         np.full((count, 3, 4), np.nan),
         np.full((count, 6, 6), np.nan),
-        np.full((count, 6, SHARED), np.nan),
+        np.full((count, 6, SOURCES), np.nan),
         np.zeros((n, count), np.uint8),
         np.full((n, count), np.nan, np.float32),
         [],
@@ -535,15 +535,7 @@ STAGE = Stage(
     outputs=(
         replace(POSES, frame="local"),
         replace(COVARIANCE, frame="local"),
-        Array(
-            "shared",
-            ("frame", "parameter", "source"),
-            "float64",
-            "m, rad",
-            "errors of position and rotation vector per standard deviation of what all segments share",
-            "nan",
-            "local",
-        ),
+        replace(SHARED, frame="local"),
         Array("inlier", ("point", "frame"), "uint8", "1", "landmark agrees with the pose", nodata="0"),
         Array("landmarks", ("point", "xyz"), "float64", "m", "coordinates of the landmarks", "nan", "local"),
         Array("residual", ("point", "frame"), "float32", "px", "back-projection error", nodata="nan"),

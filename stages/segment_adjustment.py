@@ -3,7 +3,7 @@
 Huber's weights, Levenberg-Marquardt. A landmark has one unknown (along its ray), so that its elimination (Schur's
 complement) is a division, and the system has the size of the poses (Triggs, McLauchlan, Hartley, Fitzgibbon 2000,
 doi:10.1007/3-540-44480-7_21). The result is never worse than its start by the same cost: where no step lowers it, the
-start is returned.
+start is returned. The inverse of the same reduced system is the covariance of the poses (:func:`posterior`).
 
 Another error that disparities share shows over the whole sequence only (:func:`common_tilt`). A right image whose rows
 lie too low may have been turned (pitch), or have its principal point there; epipolar lines hardly tell the two apart,
@@ -187,7 +187,7 @@ def normal(views: Views, state: State, bias: float, sigma: float) -> tuple[Float
 
 def adjust(segments: Sequence[tuple[Views, State]], params: RefineParams) -> tuple[list[State], float, float, float]:
     """Minimise the cost of some segments with one bias; states, bias (pixels), cost before and after."""
-    prior, sigma = 1.0 / max(params.bias_sigma, 1e-4) ** 2, params.pixel_sigma
+    prior, sigma = _prior(params), params.pixel_sigma
     views, states = [v for v, _ in segments], [s for _, s in segments]
     bias, damping = 0.0, FIRST_DAMPING
 
@@ -213,6 +213,11 @@ def adjust(segments: Sequence[tuple[Views, State]], params: RefineParams) -> tup
     return states, bias, first, now
 
 
+def _prior(params: RefineParams) -> float:
+    """Information of the bias beforehand; below a ten thousandth of a pixel it is held."""
+    return 1.0 / max(params.bias_sigma, 1e-4) ** 2
+
+
 def _step(
     parts: Sequence[tuple[Floats, Floats, Floats, Floats, Floats]], prior: float, bias: float, damping: float
 ) -> tuple[float, list[tuple[Floats, Floats]]]:
@@ -232,6 +237,59 @@ def _step(
         pose = np.append(solved[:, 1] - common * solved[:, 0], common)
         steps.append((pose[:-1].reshape(-1, 6), -(gd + B.T @ pose) / d))
     return float(common), steps
+
+
+def scatter(views: Views, state: State, bias: float, sigma: float) -> float:
+    """Variance of the errors found over the one expected: weighted squares of a segment per degree of freedom.
+
+    Depths add one unknown and one measurement each (their disparity), so that tracks and poses decide the freedom.
+    """
+    x = np.einsum("fij,nj->fni", state.R, views.position + (state.depth + bias)[:, None] * views.along)
+    x += state.t[:, None]
+    error = _camera_errors(x, np.zeros_like(x), views.camera, views.pixels)[0] / sigma
+    use = views.seen & np.isfinite(error).all(-1)
+    squares = np.where(use, (error**2).sum(-1), 0.0)
+    total = float((squares * HUBER / np.maximum(np.sqrt(squares), HUBER)).sum())
+    total += float(((state.depth / views.sigma) ** 2).sum())
+    measured = 2 * int(use.sum())
+    if np.isfinite(views.right_sigma).any():
+        off, *_, good = stereo_rows(views, state, bias)
+        total += float((off**2 * HUBER / np.maximum(np.abs(off), HUBER)).sum())
+        measured += int(good.sum())
+    return max(total / max(measured - 6 * len(state.R), 1), 1e-12)
+
+
+def posterior(
+    parts: Sequence[tuple[Floats, Floats, Floats, Floats, Floats]],
+    factors: Sequence[float],
+    params: RefineParams,
+) -> list[tuple[Floats, Floats]]:
+    """Of the poses of each segment, depths and bias free: covariance (p, p), and error (p,) that windows share.
+
+    The covariance of the whole adjustment is the first plus the square of the second. Windows share the error of the
+    bias: what its prior leaves of it where each segment is adjusted alone; all of it where windows overlap, for then
+    they measure it with the same tracks.
+
+    Parameters
+    ----------
+    parts : normal equations of segments with one bias, as :func:`normal` gives them.
+    factors : variance of each segment's errors over the expected one.
+    """
+    prior, kept = _prior(params), []
+    corner = prior
+    for (A, B, d, *_), factor in zip(parts, factors, strict=True):
+        S = (A - (B / d) @ B.T) / factor
+        scale = np.sqrt(np.maximum(np.diag(S)[:-1], 1e-300))
+        values, vectors = np.linalg.eigh(S[:-1, :-1] / np.outer(scale, scale))
+        inverse = (vectors / np.maximum(values, 1e-12)) @ vectors.T / np.outer(scale, scale)
+        by_bias = inverse @ S[:-1, -1]
+        corner += float(S[-1, -1] - S[-1, :-1] @ by_bias)
+        kept.append((inverse, by_bias))
+    common = prior if params.window == 1 else corner
+    return [
+        (inverse + np.outer(by_bias, by_bias) * (corner - common) / corner**2, -by_bias * math.sqrt(common) / corner)
+        for inverse, by_bias in kept
+    ]
 
 
 def common_tilt(adjusted: Sequence[tuple[Views, State, float]], params: RefineParams) -> tuple[float, float]:
@@ -258,7 +316,7 @@ def common_tilt(adjusted: Sequence[tuple[Views, State, float]], params: RefinePa
 def _tilt_of(views: Views, state: State, bias: float, params: RefineParams) -> tuple[float, float]:
     """Information and pull of the tilt by one segment, its poses, depths and bias free."""
     A, B, d, ga, gd = normal(views, state, bias, params.pixel_sigma)
-    prior = 1.0 / max(params.bias_sigma, 1e-4) ** 2
+    prior = _prior(params)
     A[-1, -1] += prior
     ga[-1] += prior * bias
     held, g = views.sigma**-2.0, views.tilt

@@ -195,9 +195,9 @@ def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
         (np.asarray(b["poses"]), np.asarray(b["covariance"]), np.asarray(b["shared"])) for b in inputs["segments"]
     ]
     if "refined" in inputs:
-        ends = np.cumsum([len(poses) for poses, _, _ in segments])
-        better = np.split(np.asarray(inputs["refined"]["poses"]), ends[:-1])
-        segments = [(new, cov, shared) for new, (_, cov, shared) in zip(better, segments, strict=True)]
+        ends = np.cumsum([len(poses) for poses, _, _ in segments])[:-1]
+        better = (np.split(np.asarray(inputs["refined"][name]), ends) for name in ("poses", "covariance", "shared"))
+        segments = list(zip(*better, strict=True))
     frames = [int(f) for f in args["frames"]]
     facts = _facts(inputs["segments"]) or [{"frame": frames[0], "inliers": 0}]
     causes = {int(f["frame"]): str(f["cause"]) for f in args.get("lost", ())}

@@ -9,9 +9,19 @@ from stages.declare import Bundle, check_outputs
 from stages.errors import ConfigError
 from stages.geometry import Camera, Rig, RigidTransform, rotation_exp
 from stages.landmarks import landmarks_from_disparity
-from stages.refine import STAGE, _tilt_pattern, views_of
+from stages.refine import STAGE, _tilt_pattern, claims, views_of
 from stages.resect import ResectParams
-from stages.segment_adjustment import RefineParams, State, Views, adjust, common_tilt, cost_of, normal
+from stages.segment_adjustment import (
+    RefineParams,
+    State,
+    Views,
+    adjust,
+    common_tilt,
+    cost_of,
+    normal,
+    posterior,
+    scatter,
+)
 
 CAMERA = Camera(500.0, 500.0, 299.5, 199.5, 600, 400)
 RIG = Rig(CAMERA, CAMERA, RigidTransform(np.eye(3), np.array([-0.2, 0.0, 0.0])))
@@ -118,6 +128,66 @@ def test_the_cost_never_rises_and_an_optimum_stays():
     np.testing.assert_allclose(again.t, state.t, atol=1e-4)
 
 
+def test_the_covariance_is_the_inverse_of_the_whole_normal_matrix():
+    """Depths and bias as unknowns among the others, none eliminated, derivatives by differences: the same blocks."""
+    views, state, _ = scene(4, n=25, frames=3)
+    (state,), bias, *_ = adjust([(views, state)], PARAMS)
+    n, m = 25, 2
+
+    def residuals(x):
+        """Whitened errors of tracks, of the next pair's disparities, of depths and of the bias."""
+        moved, b = state.moved(x[:12].reshape(m, 6), x[12 : 12 + n]), bias + x[-1]
+        X = views.position + (moved.depth + b)[:, None] * views.along
+        tracks = [
+            (CAMERA.project(X @ R.T + t) - p) / 0.2 for R, t, p in zip(moved.R, moved.t, views.pixels, strict=True)
+        ]
+        last = X @ moved.R[-1].T + moved.t[-1]
+        apart = CAMERA.project(RIG.T_right_left.apply(last)) - CAMERA.project(last) - (views.right - views.pixels[-1])
+        stereo = (apart[:, 0] - b) / views.right_sigma  # the second pair shares the bias
+        return np.concatenate([*(t.ravel() for t in tracks), stereo, moved.depth / views.sigma, [b / 0.1]])
+
+    steps = 1e-6 * np.eye(12 + n + 1)
+    J = np.array([(residuals(e) - residuals(-e)) / 2e-6 for e in steps]).T
+    size = np.linalg.norm(residuals(np.zeros(12 + n + 1))[: 2 * m * n].reshape(-1, 2), axis=1)
+    alone = np.abs(residuals(np.zeros(12 + n + 1))[2 * m * n : 2 * m * n + n])
+    weight = np.concatenate([np.repeat(np.minimum(1, 2.5 / size), 2), np.minimum(1, 2.5 / alone), np.ones(n + 1)])
+    dense = np.linalg.inv(J.T @ (weight[:, None] * J))[:12, :12]
+    ((noise, by_bias),) = posterior([normal(views, state, bias, 0.2)], [1.0], PARAMS)
+    np.testing.assert_allclose(noise + np.outer(by_bias, by_bias), dense, rtol=1e-4, atol=1e-6 * np.abs(dense).max())
+    # Of a window over the whole sequence all of the bias' error is shared; the sum is the same.
+    ((own, shared),) = posterior([normal(views, state, bias, 0.2)], [1.0], PARAMS.model_copy(update={"window": 0}))
+    np.testing.assert_allclose(own + np.outer(shared, shared), noise + np.outer(by_bias, by_bias), rtol=1e-9)
+    assert (np.abs(shared) > np.abs(by_bias)).all()
+
+
+@pytest.mark.parametrize("window", [1, 0])
+def test_claimed_covariances_are_those_of_the_errors(window):
+    """Squared errors over the claimed ones of many segments, noise as it is stated."""
+    params = RefineParams(window=window)
+    ratios = []
+    for seed in range(60):
+        rng = np.random.default_rng([seed, 1])
+        views, start, T = scene(200 + seed, n=120, bias=0.1 * rng.standard_normal(), stereo=False)
+        (state,), bias, *_ = adjust([(views, start)], params)
+        ((covariance, _),) = claims([(views, state)], bias, params)
+        for R, t, true, claimed in zip(state.R, state.t, T, covariance, strict=True):
+            found, right = RigidTransform(R, t).inverse(), true.inverse()
+            turn = right.rotation @ found.rotation.T
+            w = 0.5 * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
+            error = np.concatenate([right.translation - found.translation, w])
+            ratios.append(error @ np.linalg.solve(claimed, error) / 6)
+    # Frames of a segment share landmarks, so some 60 independent sums of six squares: deviation of the mean 0.08.
+    assert 0.75 < np.mean(ratios) < 1.3
+
+
+def test_errors_larger_than_stated_widen_the_covariance():
+    for noise in (0.1, 0.2, 0.3):
+        views, start, _ = scene(5, noise=noise, stereo=False)
+        views = replace(views, sigma=np.full(150, 0.2))
+        (state,), bias, *_ = adjust([(views, start)], PARAMS)
+        assert scatter(views, state, bias, 0.2) == pytest.approx((noise / 0.2) ** 2, rel=0.25)
+
+
 def tilted(seed, tilt, frames=4):
     """Views whose landmarks lie where disparities put them that are tilted by so many radians, adjusted once."""
     views, start, T = scene(seed, n=120, frames=frames, noise=0.05, stereo=False)
@@ -201,7 +271,8 @@ def bundles(tracks_of_last=True):
     points = np.stack([CAMERA.project(X - [0.0, 0.0, 0.1 * j]) for j in range(3)], 1).astype(np.float32)
     poses = np.array([np.hstack([np.eye(3), [[0.0], [0.0], [0.1 * j + 0.002 * (j > 0)]]]) for j in range(3)])
     track = Bundle({"points": points}, {"frames": [0, 1, 2]})
-    resection = Bundle({"poses": poses, "inlier": np.ones((80, 3), np.uint8)}, {})
+    claimed = {"covariance": np.zeros((3, 6, 6)), "shared": np.zeros((3, 6, 7))}
+    resection = Bundle({"poses": poses, "inlier": np.ones((80, 3), np.uint8)} | claimed, {})
     level = Bundle({}, {"T_local_left": RigidTransform.identity().to_list()})
     rig = Bundle({}, {"rig": RIG.to_dict()})
     return {
@@ -221,17 +292,22 @@ def test_the_stage_gives_the_poses_of_all_segments(window):
     check_outputs(STAGE, out)
     assert out.meta["frames"] == [3]
     np.testing.assert_allclose(out["poses"][:, :, 3], [[0, 0, 0], [0, 0, 0.1], [0, 0, 0.2]], atol=2e-4)
+    assert not out["covariance"][0].any()
+    assert (np.linalg.eigvalsh(out["covariance"][1:])[:, 0] > 0).all()
     with pytest.raises(ConfigError, match="landmarks=disparity"):
         STAGE.run(RefineParams(), args | {"resect": ResectParams(landmarks="dem").model_dump(mode="json")}, inputs)
 
 
 def test_a_lost_frame_stays_lost_and_disagreeing_stereo_is_left_out():
     inputs = bundles()
-    inputs["resections"][0].arrays["poses"][1] = np.nan
+    for name in ("poses", "covariance", "shared"):
+        inputs["resections"][0].arrays[name][1] = np.nan
     inputs["disparities"][1].arrays["column_disparity"][:, :300] = -5.0  # another surface
     args = {"pairs": [0, 2], "resect": ResectParams().model_dump(mode="json")}
     out = STAGE.run(PARAMS, args, inputs)
-    assert np.isnan(out["poses"][1]).all()
+    for name in ("poses", "covariance", "shared"):
+        assert np.isnan(out[name][1]).all()
+        assert np.isfinite(out[name][[0, 2]]).all()
     assert out["poses"][2, 2, 3] == pytest.approx(0.2, abs=3e-4)
     track, resection = inputs["tracks"][0], inputs["resections"][0]
     known = landmarks_from_disparity(

@@ -147,7 +147,7 @@ def test_what_segments_share_adds_up_and_what_they_do_not_adds_squared():
     np.testing.assert_allclose(found.covariance[:, 2, 2], [k * 3e-3**2 + (k * 2e-3) ** 2 for k in range(5)], atol=1e-15)
 
 
-def test_refined_poses_take_the_place_of_resected_ones():
+def test_refined_poses_and_their_covariances_take_the_place_of_resected_ones():
     truth, levels, _ = broken_run(set())
     segments, better = [], []
     for (a, b), T_local_key in zip(((0, 3), (3, 6), (6, 7)), levels, strict=True):
@@ -159,7 +159,18 @@ def test_refined_poses_take_the_place_of_resected_ones():
         arrays = {"poses": rough, "covariance": np.zeros((n, 6, 6)), "shared": NONE[:n]}
         segments.append(Bundle(arrays, {"per_frame": [{"frame": i, "inliers": 9} for i in range(a, b + 1)]}))
     inputs = {"segments": segments, "levels": [Bundle({}, {"T_local_left": T.to_list()}) for T in levels]}
-    inputs["refined"] = Bundle({"poses": np.concatenate(better)}, {})
+    rows, claimed = sum(len(local) for local in better), np.diag([1e-6] * 3 + [1e-8] * 3)
+    inputs["refined"] = Bundle(
+        {
+            "poses": np.concatenate(better),
+            "covariance": np.tile(claimed, (rows, 1, 1)),
+            "shared": np.zeros((rows, 6, 2)),
+        },
+        {},
+    )
     out = STAGE.run(NoParams(), {"frames": list(range(8))}, inputs)
+    # Of a frame of the first segment it is what was claimed, in the world: both parts are the same about all axes.
+    np.testing.assert_allclose(out["covariance"][1], claimed, atol=1e-18)
+    assert np.trace(out["covariance"][7][:3, :3]) > 2 * np.trace(claimed[:3, :3])
     expected = [(levels[0] @ truth[0].inverse() @ T).matrix34 for T in truth]
     np.testing.assert_allclose(out["poses"], expected, atol=1e-12)
