@@ -307,11 +307,11 @@ def _posed_all(products: Products) -> int:
     if handle is None or handle.ref is None:
         return COMPLETE
     meta = handle.ref.meta
-    lost, pieces, total = len(meta["lost"]), len(meta["pieces"]), len(meta["frames"])
-    if not lost and pieces == 1:
+    posed, total = meta["posed"], len(meta["frames"])
+    if meta["in_world"] == total:
         return COMPLETE
-    broken = f", in {pieces} pieces" if pieces > 1 else ""
-    print(f"rille: incomplete: {total - lost} of {total} frames posed{broken}; see the warnings", file=sys.stderr)
+    pieces = f", {meta['in_world']} in the world, in {len(meta['pieces'])} pieces" if posed > meta["in_world"] else ""
+    print(f"rille: incomplete: {posed} of {total} frames posed{pieces}; see the warnings", file=sys.stderr)
     return HOLES
 
 

@@ -153,7 +153,7 @@ def _spread(found: Chained, at: NDArray[np.intp], count: int) -> Chained:
 
 
 def _account(frames: list[int], piece: NDArray[np.int16], causes: Mapping[int, str]) -> dict[str, Any]:
-    """Pieces, lost frames with their causes, and all of it in words."""
+    """Pieces, how many frames have a pose and how many in the world, lost frames with their causes; in words."""
     posed = np.flatnonzero(piece >= 0)
     pieces = [
         [frames[rows[0]], frames[rows[-1]]]
@@ -178,7 +178,9 @@ def _account(frames: list[int], piece: NDArray[np.int16], causes: Mapping[int, s
         where = ", ".join(f"before frame {a} ({causes.get(a, 'no motion found')})" for a, _ in pieces[1:])
         world = f"each in its own frame, the world is that of piece {largest(piece) + 1}, the largest"
         lines.append(f"the trajectory is broken {where}: {words}; {world}")
-    return {"pieces": pieces, "main": largest(piece), "lost": lost, "warnings": lines}
+    main = largest(piece)
+    counts = {"posed": len(posed), "in_world": int((piece == main).sum())}
+    return {"pieces": pieces, "main": main, **counts, "lost": lost, "warnings": lines}
 
 
 def _facts(segments: Sequence[Bundle]) -> list[dict[str, Any]]:

@@ -242,7 +242,7 @@ SIDE_BY_SIDE: Mapping[str, str] = {
     "rpe_translation_rmse": "Relative error, translation",
     "rpe_rotation_rmse": "Relative error, rotation",
     "kitti_translation": "KITTI translation error",
-    "frames_missing": "Frames without a pose",
+    "frames_missing": "Frames without a pose in the world",
 }
 
 

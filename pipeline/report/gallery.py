@@ -218,7 +218,7 @@ def _tracks(scene: Scene) -> Block | None:
 
 def _trajectory(scene: Scene) -> Block | None:
     track, other = scene.track, scene.comparison
-    n = int(track.posed.sum())
+    n = int(track.in_world.sum())
     if n < 2:
         return None
     known = track.truth is not None

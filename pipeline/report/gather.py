@@ -44,11 +44,12 @@ class Terrain:
 
 @dataclass(frozen=True)
 class Track:
-    """The trajectory: positions (frame, 3) m in the world, one row a chosen frame, NaN without a pose.
+    """The trajectory: positions (frame, 3) m in the world, one row a chosen frame, NaN without a pose there.
 
     ``right`` (pair, 3): right cameras at basic pairs. ``truth`` (frame, 3): aligned by the first frame that has both,
     NaN where the truth has a gap.
     ``sigma`` (frame,): standard deviation of the position, m. ``segment`` (frame,): which segment posed it, -1 none.
+    ``piece`` (frame,): unbroken piece that it lies in, -1 without a pose; one of them is the world.
     """
 
     left: Floats
@@ -56,10 +57,16 @@ class Track:
     truth: Floats | None
     sigma: Floats
     segment: NDArray[np.int64]
+    piece: NDArray[np.int64]
 
     @property
     def posed(self) -> NDArray[np.bool_]:
-        """Which frames have a pose."""
+        """Which frames have a pose, be it in the world or in another piece."""
+        return np.asarray(self.piece >= 0)
+
+    @property
+    def in_world(self) -> NDArray[np.bool_]:
+        """Which frames have a pose in the world."""
         return np.asarray(np.isfinite(self.left).all(axis=1))
 
 
@@ -139,13 +146,18 @@ def trajectory(view: RunView) -> Track:
     """Positions of all chosen frames, of the right cameras at basic pairs, and of the truth."""
     n = len(view.frames)
     row = {frame: i for i, frame in enumerate(view.frames)}
-    left, sigma, segment = np.full((n, 3), np.nan), np.full(n, np.nan), np.full(n, -1, dtype=np.int64)
+    left, sigma = np.full((n, 3), np.nan), np.full(n, np.nan)
+    segment, piece = np.full(n, -1, dtype=np.int64), np.full(n, -1, dtype=np.int64)
     right, posed = [], {}
     bundle = view.bundle(view.products.trajectory)
     if bundle is not None:
         poses = world_poses(bundle)
         for i, frame in enumerate(bundle.meta.get("frames", view.frames[: len(poses)])):
-            if frame not in row or not np.isfinite(poses[i]).all():
+            if frame not in row:
+                continue
+            there = bool(np.isfinite(poses[i]).all())
+            piece[row[frame]] = int(bundle["piece"][i]) if "piece" in bundle.arrays else there - 1
+            if not there:
                 continue
             posed[frame] = pose = RigidTransform.from_matrix(poses[i])
             left[row[frame]] = pose.translation
@@ -154,7 +166,7 @@ def trajectory(view: RunView) -> Track:
                 sigma[row[frame]] = np.sqrt(max(float(np.trace(bundle["covariance"][i][:3, :3])), 0.0))
             if frame in view.products.disparity:
                 right.append((pose @ used_rig(view, frame).T_right_left.inverse()).translation)
-    return Track(left, np.array(right).reshape(-1, 3), _truth(view, posed), sigma, segment)
+    return Track(left, np.array(right).reshape(-1, 3), _truth(view, posed), sigma, segment, piece)
 
 
 def _truth(view: RunView, posed: Mapping[int, RigidTransform]) -> Floats | None:

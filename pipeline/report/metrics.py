@@ -41,7 +41,7 @@ LABELS: Mapping[str, str] = {
     "scatter": "Motion of a frame, what remains",
     "nees": "Squared error over the claimed one (NEES)",
     "frames": "Frames to be posed",
-    "frames_missing": "Frames without a pose",
+    "frames_missing": "Frames without a pose in the world",
     "frames_without_truth": "Frames without truth",
     "rmse": "Elevation error, RMS",
     "nmad": "Elevation error, robust deviation (NMAD)",
@@ -94,6 +94,7 @@ KEY = frozenset(
         "path_check_hazard_cells",
         "path_check_length_ratio",
         "frames_posed",
+        "frames_in_world",
         "reprojection_rms",
         "matched",
         "mapped_area",
@@ -143,7 +144,7 @@ def _assessed(view: RunView, handle: Any, prefix: str, group: str, truth: str) -
 
 def _trajectory(view: RunView, frames: Rows) -> dict[str, Metric]:
     """Ours, then the other program's, both against the truth."""
-    complete = f"{sum(r['posed'] for r in frames)} of {len(frames)} frames"
+    complete = f"{sum(r['in_world'] for r in frames)} of {len(frames)} frames"
     found: dict[str, Metric] = {}
     if len(frames) < 2:
         return found
@@ -289,6 +290,11 @@ def _poses(frames: Rows) -> dict[str, Metric]:
     resected = [r for r in posed if r["rms_px"]]
     every = f"{len(posed)} of {len(frames)} frames"
     found = {"frames_posed": _metric("Frames with a pose", len(posed), "frames", "counted", every)}
+    pieces = len({r["piece"] for r in posed})
+    if pieces > 1:
+        how = f"in the largest of {pieces} pieces, whose frame is the world; the others have frames of their own"
+        value = sum(r["in_world"] for r in posed)
+        found["frames_in_world"] = _metric("Frames with a pose in the world", value, "frames", how, every)
     if resected:
         how = "root mean square over the landmarks that agree with the pose, then median over frames"
         value = statistics.median(r["rms_px"] for r in resected)

@@ -62,6 +62,10 @@ def find_missing(scene: Scene, frames: list[dict[str, Any]], gallery: Gallery) -
     lost = [r["frame"] for r in frames if not r["posed"]]
     if lost:
         found.append(_missing("no pose", f"{len(lost)} of {len(frames)} frames have no pose", _which(lost)))
+    apart = [r["frame"] for r in frames if r["posed"] and not r["in_world"]]
+    if apart:
+        what = f"{len(apart)} of {len(frames)} frames have a pose in another piece of the trajectory, not in the world"
+        found.append(_missing("piece", what, _which(apart)))
     found += _path_missing(view)
     found += _truth_missing(view)
     found += _crosscheck_missing(scene)
@@ -163,17 +167,19 @@ def _verdict(
     view: RunView, frames: list[dict[str, Any]], pairs: list[dict[str, Any]], missing: list[dict[str, str]]
 ) -> str:
     """One line: what there is, of how much."""
-    posed, models = sum(r["posed"] for r in frames), sum(r["modelled"] for r in pairs)
+    posed, placed = (sum(r[key] for r in frames) for key in ("posed", "in_world"))
+    models = sum(r["modelled"] for r in pairs)
+    apart = f", {placed} of them in the world" if placed < posed else ""
     path = view.bundle(view.products.path)
     length = None if path is None else path.meta.get("length_m")
     parts = [
-        "one stereo pair" if len(frames) == 1 else f"{posed} of {len(frames)} frames posed",
+        "one stereo pair" if len(frames) == 1 else f"{posed} of {len(frames)} frames posed{apart}",
         f"{models} of {len(pairs)} elevation models",
         _way_words(view, length),
         *([] if any(_truth(view)) else ["not assessed against truth"]),
     ]
     failures = sum(m["kind"] in ("failed", "skipped") for m in missing)
-    return ("Incomplete: " if failures or posed < len(frames) else "Complete: ") + ", ".join(parts) + "."
+    return ("Incomplete: " if failures or placed < len(frames) else "Complete: ") + ", ".join(parts) + "."
 
 
 def _way_words(view: RunView, length: float | None) -> str:

@@ -164,6 +164,8 @@ def frames(scene: gather.Scene) -> list[dict[str, Any]]:
                 "frame": frame,
                 "name": names[frame] if frame < len(names) else str(frame),
                 "posed": bool(track.posed[i]),
+                "in_world": bool(track.in_world[i]),
+                "piece": int(track.piece[i]) + 1 if track.posed[i] else None,
                 "segment": int(track.segment[i]) if track.segment[i] >= 0 else None,
                 "landmarks": fact.get("landmarks"),
                 "inliers": fact.get("inliers"),
@@ -179,7 +181,7 @@ def frames(scene: gather.Scene) -> list[dict[str, Any]]:
                 "basic": frame in view.products.disparity,
             }
         )
-    if rows and rows[0]["posed"]:  # the first frame is the world's origin: nothing was resected
+    if rows and rows[0]["in_world"]:  # the first frame is the world's origin: nothing was resected
         rows[0]["rms_px"] = rows[0]["segment"] = None
     return rows
 

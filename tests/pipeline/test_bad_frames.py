@@ -139,6 +139,11 @@ def test_a_break_makes_pieces_and_the_world_of_the_largest(place: Path, capsys: 
     code, err, folder = reconstruct(place, "broken", elsewhere, capsys)
     assert code == run.HOLES
     assert "piece 1: frames 0-4, piece 2: frames 5-7" in err
+    assert "incomplete: 8 of 8 frames posed, 5 in the world, in 2 pieces" in err
+    report = json.loads((folder / "report.json").read_text())
+    assert report["metrics"]["frames_posed"]["value"] == 8
+    assert report["metrics"]["frames_in_world"]["value"] == 5
+    assert report["verdict"].startswith("Incomplete: 8 of 8 frames posed, 5 of them in the world")
     at = positions(folder)
     assert np.isfinite(at[:5]).all()
     assert np.isnan(at[5:]).all()

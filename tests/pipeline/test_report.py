@@ -6,16 +6,19 @@ import os
 import re
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from toys.finished import TASKS, Written, bundles, view, written
 
+from pipeline import run
 from pipeline.reconstruct import Products
 from pipeline.report import TaskRow, canvas, figures, tables, words, write_report
 from stages.declare import Bundle
 from stages.errors import RilleError
+from stages.trajectory import _account
 
 
 @pytest.fixture(scope="module")
@@ -155,6 +158,28 @@ def test_frames_without_a_pose_are_named(tmp_path: Path) -> None:
     assert facts["complete"] is False
 
 
+def test_frames_posed_are_counted_alike_on_stderr_and_in_the_report(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of six frames five have a pose, three of them in the world; the other two are a piece of their own."""
+    made = bundles()
+    arrays, piece = dict(made["trajectory"].arrays), np.array([0, 0, 0, -1, 1, 1], dtype=np.int16)
+    arrays["poses"] = np.where((piece < 0)[:, None, None], np.nan, arrays["poses"])
+    account = _account([0, 1, 2, 3, 4, 5], piece, {3: "black"})
+    made["trajectory"] = Bundle(arrays | {"piece": piece}, {"frames": [0, 1, 2, 3, 4, 5]} | account)
+    products: Any = SimpleNamespace(trajectory=SimpleNamespace(ref=SimpleNamespace(meta=made["trajectory"].meta)))
+    assert run._posed_all(products) == run.HOLES
+    assert "incomplete: 5 of 6 frames posed, 3 in the world, in 2 pieces" in capsys.readouterr().err
+    facts, page_, _, _ = written(tmp_path, view(made))
+    assert facts["metrics"]["frames_posed"]["value"] == 5
+    assert facts["metrics"]["frames_in_world"]["value"] == 3
+    assert facts["verdict"].startswith("Incomplete: 5 of 6 frames posed, 3 of them in the world")
+    assert [(m["kind"], m["why"]) for m in facts["missing"]] == [("no pose", "frame 3"), ("piece", "frames 4-5")]
+    assert [(r["posed"], r["piece"]) for r in facts["frames"]] == [(True, 1)] * 3 + [(False, None)] + [(True, 2)] * 2
+    assert "5 of 6 frames posed" in page_.text
+    assert "a pose in piece 2, not in the world" in page_.text
+
+
 def test_no_path_names_the_row_that_blocks(tmp_path: Path) -> None:
     made = bundles()
     meta = {"found": False, "reason": "no free cell of this row can be entered", "blocking_row": 17, "blocking_y": 0.63}
@@ -276,9 +301,9 @@ def test_spans() -> None:
 
 
 def test_frames_without_truth_are_counted_where_errors_are_stated(tmp_path: Path) -> None:
-    run = view()
-    assert run.sequence.truth is not None
-    truth = tuple(None if k in (1, 3) else pose for k, pose in enumerate(run.sequence.truth))
-    facts, _, _, _ = written(tmp_path, replace(run, sequence=replace(run.sequence, truth=truth)))
+    base = view()
+    assert base.sequence.truth is not None
+    truth = tuple(None if k in (1, 3) else pose for k, pose in enumerate(base.sequence.truth))
+    facts, _, _, _ = written(tmp_path, replace(base, sequence=replace(base.sequence, truth=truth)))
     assert facts["metrics"]["trajectory_ate_rmse"]["completeness"] == "6 of 6 frames, truth for 4"
     assert facts["metrics"]["frames_posed"]["completeness"] == "6 of 6 frames"
