@@ -61,9 +61,9 @@ class Simulation:
     Attributes
     ----------
     scene : the world at the start.
-    place : true poses before the first leg (one row): ``scene``.
-    drive : ``drive(leg, row)``, true poses of a leg: ``scene``; ``before``, the leg that led here, at that row;
-        ``pose``, where the vehicle believes to be; ``leg``, what it is to drive.
+    place : ``place(vehicle)``, true poses before the first leg (one row): ``scene``.
+    drive : ``drive(vehicle, leg, row)``, true poses of a leg: ``scene``; ``before``, the leg that led here, at that
+        row; ``pose``, where the vehicle believes to be; ``leg``, what it is to drive.
     sense : ``sense(leg)``, what its sensors say: ``drive``.
     change : ``change(leg, row)``, the world after something happened, with ports as of ``drive``; None: nothing does.
     image : ``image(frame, camera, T_truth_left)``: ``scene``.
@@ -74,8 +74,8 @@ class Simulation:
     """
 
     scene: Source
-    place: Source
-    drive: Callable[[int, int], Source]
+    place: Callable[[Vehicle], Source]
+    drive: Callable[[Vehicle, int, int], Source]
     sense: Callable[[int], Source]
     change: Callable[[int, int], Source | None]
     image: Callable[[int, str, RigidTransform], Source]

@@ -159,7 +159,9 @@ class Drive(Reconstruction):
     def build(self) -> Products:
         """Lay out the start; the rest follows by expansion."""
         self.scene = self._source(self.simulation.scene, "site")
-        place = self.driven.place = self._simulate(self.simulation.place, "drive/start", scene=self.scene)
+        place = self.driven.place = self._simulate(
+            self.simulation.place(self.config.vehicle), "drive/start", scene=self.scene
+        )
         sense = self._simulate(self.simulation.sense(-1), "sense/start", drive=place)
         self.graph.expand([place, sense], lambda there, said: self._first(place, there, said))
         return self.products
@@ -319,7 +321,7 @@ class Drive(Reconstruction):
         change = s.change(k, row)
         if change is not None:
             self.scene = self._simulate(change, f"obstacle/{k}", scene=self.scene, **told)
-        stop.drive = self._simulate(s.drive(k, row), f"drive/{k}", scene=self.scene, **told)
+        stop.drive = self._simulate(s.drive(self.config.vehicle, k, row), f"drive/{k}", scene=self.scene, **told)
         stop.sense = self._simulate(s.sense(k), f"sense/{k}", drive=stop.drive)
         self.graph.expand([stop.drive, stop.sense], lambda there, said: self._on_the_way(stop, there, said))
 

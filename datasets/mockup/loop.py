@@ -15,6 +15,7 @@ from datasets.protocol import Simulation, Source
 from stages.declare import NoParams
 from stages.errors import InputError
 from stages.geometry import RigidTransform
+from stages.vehicle import Vehicle
 
 LOOP: Mapping[str, Any] = {
     "frames": 1,
@@ -52,7 +53,11 @@ def mockup_loop(p: MockupParams, rover: RoverParams, name: str = "mockup-loop") 
     T_vehicle_body = RigidTransform(np.eye(3), np.array([0.0, rover.camera_forward, p.camera_height]))
     T_vehicle_left = T_vehicle_body @ mount(p, "left")
     T_left_right = rig.T_right_left.inverse()
-    mounted = {"vehicle": vehicle.model_dump(mode="json"), "T_vehicle_left": T_vehicle_left.to_list()}
+    mounted = {"T_vehicle_left": T_vehicle_left.to_list()}
+
+    def leg(body: Vehicle, number: int, **more: int) -> Source:
+        args = {"leg": number, **more, "vehicle": body.model_dump(mode="json"), **mounted}
+        return Source("datasets.mockup.rover", rover, args)
 
     def image(frame: int, camera: str, T_bed_left: RigidTransform) -> Source:
         T_bed_camera = T_bed_left if camera == "left" else T_bed_left @ T_left_right
@@ -77,8 +82,8 @@ def mockup_loop(p: MockupParams, rover: RoverParams, name: str = "mockup-loop") 
         scene=Source(
             "datasets.mockup.site", NoParams(), site, inputs={"scene": Source("datasets.mockup.scene", p.scene())}
         ),
-        place=Source("datasets.mockup.rover", rover, {"leg": -1, **mounted}),
-        drive=lambda leg, row: Source("datasets.mockup.rover", rover, {"leg": leg, "row": row, **mounted}),
+        place=lambda body: leg(body, -1),
+        drive=lambda body, number, row: leg(body, number, row=row),
         sense=lambda leg: Source("datasets.mockup.sense", rover, {"leg": leg}),
         change=change,
         image=image,

@@ -231,3 +231,19 @@ def test_a_goal_in_a_global_map_is_found_from_a_rough_prior(store: Path) -> None
     elsewhere, lost = drive(store, *more, "drive.prior=[9.0, 9.0, 0.0]", "mockup.relief=0.02")
     assert "the global map knows at most 0% of the ground" in str(lost.failures[0].error)
     assert elsewhere.outcome()[0] == "failed"
+
+
+def test_the_vehicle_that_is_configured_is_the_one_that_stands_on_the_bed(store: Path) -> None:
+    for_dataset, for_stages = config.split_dataset(config.parse_assignments((*SMALL, "vehicle.clearance=0.05")))
+    for_stages["vehicle"] |= {"track": 0.14, "wheel_base": 0.16}
+    sequence = open_sequence("mockup-loop", for_dataset)
+    assert sequence.vehicle is not None
+    given: dict[str, Any] = {"vehicle": sequence.vehicle.model_dump()}
+    flow = Drive(Graph(), sequence, config.build(given, config.expand(sequence.defaults), for_stages))
+    flow.build()
+    flow.graph.expansions.clear()
+    driver.run(flow.graph, Store(store), executor="inline").check()
+    assert flow.driven.place is not None
+    assert flow.driven.place.ref is not None
+    found = Store(store).open(flow.driven.place.ref)
+    assert np.asarray(found["clearance"]) == pytest.approx(0.05, abs=1e-6), "its belly above a pad that is level"

@@ -42,7 +42,7 @@ def grown(flow: Reconstruction) -> Graph:
     flow.build()
     waiting, legs = flow.graph.expansions, 0
     while waiting:
-        handles, grow = waiting.pop(0)
+        handles, grow, *_ = waiting.pop(0)
         facts = []
         for handle in handles:
             meta = FACTS.get(handle.stage, {})
