@@ -5,7 +5,8 @@ The body is the plane of least squares through the four contacts: averaging susp
 
 * tilt: angle of that plane to the horizontal;
 * clearance: least distance of the belly, ``vehicle.clearance`` above the plane between the wheels, to the surface;
-* step: range of the heights within half a wheel's diameter about the worst contact, the edge that it climbs there.
+* step: range of the heights in a square as wide as half a wheel's diameter about the worst contact, the edge that it
+  climbs there. Heights between the nodes are bilinear, so that the square is as wide on every grid.
 """
 
 from __future__ import annotations
@@ -52,13 +53,10 @@ class Ground:
         sphere = np.where(inside, np.sqrt(np.maximum(radius**2 - dx**2 - dy**2, 0.0)) - radius, 0.0)
         low = np.where(np.isnan(z), -1e9, z)
         resting = scipy.ndimage.grey_dilation(low, footprint=inside, structure=sphere, mode="nearest")
-        side = 2 * max(1, int(0.25 * wheel_diameter / cell + 1e-6)) + 1
-        high = scipy.ndimage.maximum_filter(low, side, mode="nearest")
-        least = scipy.ndimage.minimum_filter(np.where(np.isnan(z), 1e9, z), side, mode="nearest")
+        reach = 0.25 * wheel_diameter / cell
+        step = highest(z, reach) + highest(-z, reach)
         unknown = np.isnan(z)
-        return Ground(
-            x0, y0, cell, z, np.where(unknown, np.nan, resting), np.where(unknown, np.nan, np.maximum(high - least, 0))
-        )
+        return Ground(x0, y0, cell, z, np.where(unknown, np.nan, resting), np.where(unknown, np.nan, step))
 
     def at(self, what: Floats, points: Floats) -> Floats:
         """Bilinear values (n,) of one of the arrays at points (n, 2); NaN outside or beside unknown nodes."""
@@ -80,6 +78,29 @@ class Ground:
         c0, c1 = max(c0, 0), min(c1 + 2, self.height.shape[1])
         part = self.height[r0:r1, c0:c1]
         return Ground.of(part, self.x0 + c0 * self.cell, self.y0 - r0 * self.cell, self.cell, wheel_diameter)
+
+
+def highest(z: Floats, reach: float) -> Floats:
+    """Largest bilinear height (row, col) in the square of ``reach`` cells to each side of a node; NaN is left out."""
+    filled = np.where(np.isnan(z), -np.inf, z)
+    inner, rims = _along(_highest_on_lines(filled, reach), reach, 1)[0], _along(filled, reach, 1)[1:]
+    return np.asarray(np.maximum.reduce([inner, *(_highest_on_lines(rim, reach) for rim in rims)]))
+
+
+def _highest_on_lines(z: Floats, reach: float) -> Floats:
+    return np.asarray(np.maximum.reduce(_along(z, reach, 0)))
+
+
+def _along(z: Floats, reach: float, axis: int) -> list[Floats]:
+    """Largest of the nodes within ``reach`` cells of each node along an axis, and the heights at both ends of that."""
+    whole = int(reach + 1e-6)
+    part = reach - whole
+    found = [scipy.ndimage.maximum_filter1d(z, 2 * whole + 1, axis=axis, mode="nearest")]
+    nodes = np.arange(z.shape[axis])
+    for side in (-1, 1) if part > 1e-6 else ():
+        near, far = (np.take(z, np.clip(nodes + side * (whole + k), 0, len(nodes) - 1), axis=axis) for k in (0, 1))
+        found.append((1.0 - part) * near + part * far)
+    return found
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from stages.vehicle import Vehicle
-from stages.wheels import Ground, stand
+from stages.wheels import Ground, highest, stand
 
 ROVER = Vehicle(
     wheel_diameter=0.03, track=0.08, wheel_base=0.10, clearance=0.025, max_step=0.012, max_roughness=0.004, margin=0.01
@@ -63,3 +63,26 @@ def test_an_edge_under_a_wheel_is_a_step() -> None:
 
 def test_beside_the_ground_it_does_not_stand() -> None:
     assert stand(ground(0.0 * X), 0.17, 0.0, 0.0, ROVER) is None
+
+
+@pytest.mark.parametrize("cell", [0.002, 0.0025, 0.004, 0.001])
+def test_the_step_is_judged_over_half_a_wheel_on_every_grid(cell: float) -> None:
+    x = np.arange(-0.2, 0.2001, cell)
+    z = np.tile(0.4 * np.abs(x), (len(x), 1))  # a valley along which it drives with its left wheels
+    found = stand(Ground.of(z, -0.2, 0.2, cell, ROVER.wheel_diameter), 0.1, 0.0, 0.0, ROVER)
+    assert found is not None
+    assert found.step == pytest.approx(0.4 * 0.5 * ROVER.wheel_diameter, abs=1e-9)
+
+
+def test_the_highest_of_a_square_is_that_of_the_surface_between_the_nodes() -> None:
+    z, reach = np.random.default_rng(3).standard_normal((9, 9)), 1.75
+    at = np.unique(
+        [*np.arange(4 - 1, 4 + 2), 4 - reach, 4 + reach]
+    )  # bilinear: the extremes are on grid lines and rims
+    row, col = np.meshgrid(at, at)
+    i, j = np.floor(row).astype(int), np.floor(col).astype(int)
+    u, v = row - i, col - j
+    surface = (1 - u) * ((1 - v) * z[i, j] + v * z[i, j + 1]) + u * ((1 - v) * z[i + 1, j] + v * z[i + 1, j + 1])
+    assert highest(z, reach)[4, 4] == pytest.approx(surface.max(), abs=1e-12)
+    z[3, 3] = np.nan
+    assert np.isfinite(highest(z, reach)).all()
