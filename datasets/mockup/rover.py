@@ -52,7 +52,9 @@ class RoverParams(Params):
     acceleration_sigma: float = Field(0.05, ge=0, description="m/s2; noise of the accelerometer's peaks")
     camera_forward: float = Field(0.05, description="m; cameras ahead of the centre of the wheels")
     pad: float = Field(
-        0.28, ge=0, description="m; radius about the start that is level and free of rocks, known to the rover"
+        0.28,
+        ge=0,
+        description="m; radius about the start that is plane, as steep as the bed, free of rocks, known to the rover",
     )
     map_cell: float | None = Field(
         None, gt=0.004, description="m; cell of a coarse map of the whole bed that the rover is given; none by default"
@@ -218,7 +220,7 @@ def _trail(name: str, unit: str, long_name: str) -> Array:
 
 STAGE = Stage(
     name="mockup.drive",
-    version=2,
+    version=3,
     summary="true motion of the simulated rover along one leg",
     params=RoverParams,
     inputs=("scene", "before?", "pose?", "leg?"),

@@ -1,7 +1,8 @@
-"""Stage ``mockup.site``: the bed prepared for a drive: a level pad to start from, and a patch without texture."""
+"""Stage ``mockup.site``: the bed prepared for a drive: a smooth pad to start from, and a patch without texture."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -27,17 +28,23 @@ def _distance(scene: Bundle, x: float, y: float, shape: tuple[int, ...], spacing
 def prepare(
     scene: Bundle, pad: tuple[float, float, float] | None, blank: tuple[float, float, float] | None
 ) -> dict[str, Any]:
-    """Arrays of the scene with a pad and a blank patch, each x, y, radius on the bed, m."""
+    """Arrays of the scene with a pad and a blank patch, each x, y, radius on the bed, m.
+
+    Both are planes as steep as the bed is (``slope_deg``), at the median height of the ground that they replace: on a
+    slope a level pad would be a pit with a wall before it.
+    """
     arrays: dict[str, Any] = {name: np.asarray(scene[name]) for name in scene.arrays}
     height, cell = arrays["height"].copy(), float(scene.meta["lattice"]["cell"])
+    ahead = scene.meta["lattice"]["y0"] - cell * np.arange(height.shape[0])[:, None]
+    slope = (math.tan(math.radians(scene.meta["scene"]["slope_deg"])) * ahead).astype(np.float32)
     for place in (pad, blank):
         if place is None:
             continue
         far = _distance(scene, place[0], place[1], height.shape, cell)
         weight = np.clip((place[2] + EDGE - far) / EDGE, 0.0, 1.0)
         weight = weight * weight * (3.0 - 2.0 * weight)
-        level = float(np.median(height[far <= place[2]]))
-        height = (height + weight * (level - height)).astype(np.float32)
+        plane = slope + np.median((height - slope)[far <= place[2]])
+        height = (height + weight * (plane - height)).astype(np.float32)
         arrays["tint"] = np.where(weight > 0.5, np.uint8(100), arrays["tint"])
     arrays["height"] = height
     arrays["sunlit"] = terrain.sunlit(height, SceneParams(**scene.meta["scene"]))
@@ -57,7 +64,7 @@ def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
 
 STAGE = Stage(
     name="mockup.site",
-    version=1,
+    version=2,
     summary="the simulated bed, prepared for a drive",
     params=NoParams,
     inputs=("scene",),

@@ -1,0 +1,32 @@
+"""The bed as a drive finds it: where it starts the ground is plane, and no step leads out of there."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from datasets.mockup.params import SceneParams
+from datasets.mockup.scene import build_scene
+from datasets.mockup.site import EDGE, prepare
+
+PAD = (0.0, 0.3, 0.15)
+
+
+@pytest.mark.parametrize("slope_deg", [0.0, 8.0, -8.0])
+def test_the_pad_is_cut_along_the_ground(slope_deg: float) -> None:
+    p = SceneParams(bed_width=0.8, bed_length=0.8, cell=0.004, rocks=0.0, craters=0.0, slope_deg=slope_deg)
+    scene = build_scene(p)
+    height, lattice = prepare(scene, PAD, None)["height"], scene.meta["lattice"]
+    x = lattice["x0"] + p.cell * np.arange(height.shape[1])
+    y = lattice["y0"] - p.cell * np.arange(height.shape[0])
+    far = np.hypot(x[None, :] - PAD[0], y[:, None] - PAD[1])
+    rise = math.tan(math.radians(slope_deg))
+    above = height - rise * y[:, None]
+    assert np.ptp(above[far <= PAD[2]]) < 1e-6
+    # beside it lies the relief alone: a level pad on 8 degrees would end in a wall of 21 mm, more where it is larger
+    ring = above[(far > PAD[2]) & (far <= PAD[2] + EDGE)]
+    assert np.ptp(ring) < 5.0 * p.relief
+    outside = far > PAD[2] + EDGE
+    assert np.array_equal(height[outside], np.asarray(scene["height"])[outside])
