@@ -78,7 +78,7 @@ def figures(flow: Any, store: Any) -> dict[str, Any]:
         check = store.open(driven.check.ref)
         out |= {name: m["value"] for name, m in check.meta["metrics"].items()}
         out |= {name: check.meta[name] for name in ("path_exists", "with_margin")}
-    else:
+    if out.get("path_exists") is None:
         out["path_exists"] = True  # as far as the choice of the goal knows: a failed drive counts as one
     return out
 

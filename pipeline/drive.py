@@ -29,6 +29,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -104,6 +105,8 @@ class Stop:
     safety: Handle | None = None
     reflex: Handle | None = None
     frames: list[int] = field(default_factory=list)
+    row: int = -1
+    """Of the leg's artifact, where the leg ended: the last one, unless something ended it before."""
     event: str = ""
     thoughts: int = 0
 
@@ -153,6 +156,7 @@ class Drive(Reconstruction):
         self.rows: dict[int, int] = {}
         """Row of each frame in the artifact of its leg."""
         self.memory = Memory()
+        self.truth: Handle | None = None
         self.planned: Handle | None = None
         """The last leg, of whose way a part is left."""
 
@@ -163,7 +167,7 @@ class Drive(Reconstruction):
             self.simulation.place(self.config.vehicle), "drive/start", scene=self.scene
         )
         sense = self._simulate(self.simulation.sense(-1), "sense/start", drive=place)
-        self.graph.expand([place, sense], lambda there, said: self._first(place, there, said))
+        self._then([place, sense], lambda there, said: self._first(place, there, said))
         return self.products
 
     def _first(self, place: Handle, there: Ref, said: Ref) -> None:
@@ -186,14 +190,14 @@ class Drive(Reconstruction):
             p.rigs[frame], self.calibration[frame] = p.rigs[0], self.calibration[0]
         self._pair(frame, {"pair": frame, "up": up})
         if k == 0 and self.config.drive.frame == "map":
-            self.graph.expand([self._fix(frame)], lambda fixed: self._on_the_map(stop, before, row, fixed))
+            self._then([self._fix(frame)], lambda fixed: self._on_the_map(stop, before, row, fixed))
         else:
             self._think(stop, before, row)
 
     def _think(self, stop: Stop, before: Handle, row: int) -> None:
         self._map(stop)
         assert stop.leg is not None
-        self.graph.expand([stop.leg], lambda leg: self._after_leg(stop, before, row, leg))
+        self._then([stop.leg], lambda leg: self._after_leg(stop, before, row, leg))
 
     def _fix(self, frame: int) -> Handle:
         """Where the first pair is in the global map: handed in, or found by its elevation model."""
@@ -309,7 +313,7 @@ class Drive(Reconstruction):
         stop.thoughts += 1
         self._decide(stop, f"leg/{stop.index}/{stop.thoughts}")
         assert stop.leg is not None
-        self.graph.expand([stop.leg], lambda again: self._after_leg(stop, before, row, again))
+        self._then([stop.leg], lambda again: self._after_leg(stop, before, row, again))
 
     # -- a leg --------------------------------------------------------------------------------------------------
 
@@ -323,7 +327,7 @@ class Drive(Reconstruction):
             self.scene = self._simulate(change, f"obstacle/{k}", scene=self.scene, **told)
         stop.drive = self._simulate(s.drive(self.config.vehicle, k, row), f"drive/{k}", scene=self.scene, **told)
         stop.sense = self._simulate(s.sense(k), f"sense/{k}", drive=stop.drive)
-        self.graph.expand([stop.drive, stop.sense], lambda there, said: self._on_the_way(stop, there, said))
+        self._then([stop.drive, stop.sense], lambda there, said: self._on_the_way(stop, there, said))
 
     def _on_the_way(self, stop: Stop, there: Ref, said: Ref) -> None:
         """Images of the leg, and how each moved against the one before."""
@@ -339,7 +343,7 @@ class Drive(Reconstruction):
             self._end("safety stop", "the rover did not move: it stands at the edge of the simulated bed")
             return
         moved = [self._motion(a, b) for a, b in itertools.pairwise(frames)]
-        self.graph.expand(moved, lambda *found: self._seen(stop, rows, said, list(found)))
+        self._then(moved, lambda *found: self._seen(stop, rows, said, list(found)))
 
     def _seen(self, stop: Stop, rows: dict[int, int], said: Ref, moved: list[Ref]) -> None:
         """Leave lost images out; where two in a row are lost, or the last one, the vehicle stops and looks again."""
@@ -352,6 +356,7 @@ class Drive(Reconstruction):
             pair = next((n for n in range(1, len(frames) - 1) if {*frames[n : n + 2]} <= set(lost)), None)
             end = frames[-1] if pair is None else frames[pair + 1]
             frames = frames[: frames.index(end) + 1]
+            stop.row = rows[end]
             if end in lost:
                 again = max(self.true) + 1
                 self.true[again], rows[again] = self.true[end], rows[end]
@@ -376,7 +381,7 @@ class Drive(Reconstruction):
         if self.config.reflex.enabled:
             stop.reflex = self._reflex(stop, frames, rows, said, resection)
             judges.append(stop.reflex)
-        self.graph.expand(judges, lambda *found: self._after(stop, frames, rows, said, resection, *found))
+        self._then(judges, lambda *found: self._after(stop, frames, rows, said, resection, *found))
 
     def _reflex(self, stop: Stop, frames: list[int], rows: dict[int, int], said: Ref, resection: Handle) -> Handle:
         """Whether the images on the way show what the last model does not."""
@@ -426,6 +431,7 @@ class Drive(Reconstruction):
             stop.event = f"{'reflex' if kind == 'reflex' else 'safety stop'} at image {frames[cut]}: {reason}"
             if cut < len(frames) - 1:
                 frames = frames[: cut + 1]
+                stop.row = rows[frames[-1]]
                 track, resection = self._segment(frames, f"{stop.frame}/stopped")
                 self.products.tracks[-1] = track
         stop.frames = frames
@@ -444,14 +450,29 @@ class Drive(Reconstruction):
 
     # -- the end ------------------------------------------------------------------------------------------------
 
+    def _then(self, handles: list[Handle], grow: Callable[..., None]) -> None:
+        """Go on when these have artifacts; where one will never have one the drive has failed, and ends there."""
+
+        def go_on(*refs: Ref | None) -> None:
+            if all(ref is not None for ref in refs):
+                grow(*refs)
+            elif not self.driven.verdict:
+                self._end(*self.outcome())
+
+        self.graph.expand(handles, go_on, holes=True)
+
     def _end(self, verdict: str, reason: str) -> None:
         """Say how it ended, and assess it: here alone truth and estimates meet."""
         self.driven.verdict, self.driven.reason = verdict, reason
-        p, s, first = self.products, self.simulation, self.products.level[0]
+        p, s = self.products, self.simulation
+        first = p.level.get(0)
+        if first is None or p.trajectory is None or _failed(first) or _failed(p.trajectory):
+            p.trajectory = None  # it failed at its first stop
+            self._check()
+            return
         poses = [list(self.true[f]) for f in self.posed]
         args = {"poses": poses, "source": self.sequence.truth_source, "frames": list(self.posed)}
         self.truth = self._node("truth", "truth", args)
-        assert p.trajectory is not None
         p.accuracy = self._node("accuracy", "accuracy", {}, trajectory=p.trajectory, truth=self.truth)
 
         def ground(level: Ref) -> None:
@@ -472,21 +493,18 @@ class Drive(Reconstruction):
     def _check(self) -> None:
         """The drive against the truth."""
         d, p = self.driven, self.products
-        legs = [s for s in d.stops if s.drive is not None and s.frames]
+        legs = [s for s in d.stops if s.drive is not None and not _failed(s.drive)]
         assert d.place is not None
-        assert d.truth_leg is not None
-        assert p.trajectory is not None
+        known = {"trajectory": p.trajectory, "truth": self.truth, "best": d.truth_leg}
         d.check = self._node(
             "drive_check",
             "drive_check",
             {
-                "rows": [0, *(self.rows[s.frames[-1]] for s in legs)],
+                "rows": [0, *(s.row for s in legs)],
                 "vehicle": self.config.vehicle.model_dump(mode="json"),
             },
             drives=[d.place, *(s.drive for s in legs if s.drive is not None)],
-            trajectory=p.trajectory,
-            truth=self.truth,
-            best=d.truth_leg,
+            **{port: handle for port, handle in known.items() if handle is not None},
         )
 
     def outcome(self) -> tuple[str, str]:
@@ -517,6 +535,11 @@ class Drive(Reconstruction):
         if camera == "left":
             self.products.images[frame] = image
         return image
+
+
+def _failed(handle: Handle) -> bool:
+    """Whether a task will never have an artifact."""
+    return handle.status in ("failed", "skipped")
 
 
 def dataflow(graph: Graph, sequence: Sequence, config: Any, frames: tuple[int, ...]) -> Reconstruction:

@@ -1,7 +1,8 @@
 """A drive against the truth: how the wheels truly stood, how far the position was off, how long the way was.
 
-Each placement of the simulation (a few millimetres apart) is judged against the vehicle's limits: a belly that strikes,
-a tilt beyond ``max_slope_deg``, a wheel on an edge above ``max_step``. Positions are compared after making the first
+Each placement of the simulation (a few millimetres apart), however the drive ended, is judged against the vehicle's
+limits: a belly that strikes, a tilt beyond ``max_slope_deg``, a wheel on an edge above ``max_step``. What a drive that
+failed did not come to know, its positions or a way, is left out. Positions are compared after making the first
 pose equal, as everywhere (:mod:`stages.accuracy`). The shortest way is the planner's on the exact elevations; where its
 margin, which is for what a vehicle does not know, closes every one, it is that within the limits alone.
 """
@@ -19,6 +20,12 @@ from stages.accuracy_parts import Metric, inverse, metric, square
 from stages.declare import Array, Bundle, Inputs, NoParams, Stage
 
 Floats = NDArray[np.float64]
+
+
+def judged(drive: Mapping[str, Any], row: int) -> dict[str, Floats]:
+    """What a drive to the image of this row (-1: the last one) has of placements."""
+    end = int(np.asarray(drive["frame_at"])[row]) + 1
+    return {name: np.asarray(drive[name])[:end] for name in ("trail", "tilt", "clearance", "step")}
 
 
 def placements(parts: Sequence[Mapping[str, Floats]], vehicle: Mapping[str, Any]) -> dict[str, Metric]:
@@ -58,38 +65,32 @@ def localisation(estimate: Floats, truth: Floats, length: float) -> tuple[Floats
 
 
 def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
-    parts = []
-    for drive, row in zip(inputs["drives"], args["rows"], strict=True):
-        end = int(np.asarray(drive["frame_at"])[int(row)]) + 1
-        parts.append({n: np.asarray(drive[n])[:end] for n in ("trail", "tilt", "clearance", "step")})
-    length = way(parts)
-    error, metrics = localisation(
-        np.asarray(inputs["trajectory"]["poses"]), np.asarray(inputs["truth"]["poses"]), length
-    )
-    metrics = placements(parts, args["vehicle"]) | metrics
-    best = inputs["best"].meta
-    possible = best["shortest_m"] is not None
+    parts = [judged(drive, int(row)) for drive, row in zip(inputs["drives"], args["rows"], strict=True)]
+    length, error = way(parts), np.zeros(0)
+    metrics = placements(parts, args["vehicle"])
     metrics["way"] = metric(length, "m", "true way of the vehicle, seen from above")
-    room = "with the vehicle's margin" if best["shortest_margin_m"] else "within its limits, but without its margin"
-    metrics["shortest_way"] = metric(
-        best["shortest_m"], "m", f"from start to goal over the risk map of the exact elevations, {room}"
-    )
+    facts: dict[str, Any] = {"metrics": metrics, "stops": len(parts), "path_exists": None, "with_margin": None}
+    if "trajectory" in inputs:
+        estimate, truth = (np.asarray(inputs[port]["poses"]) for port in ("trajectory", "truth"))
+        error, found = localisation(estimate, truth, length)
+        metrics |= found
+    if "best" in inputs:
+        best = inputs["best"].meta
+        shortest, margin = best["shortest_m"], best["shortest_margin_m"]
+        room = "with the vehicle's margin" if margin else "within its limits, but without its margin"
+        how = f"from start to goal over the risk map of the exact elevations, {room}"
+        metrics["shortest_way"] = metric(shortest, "m", how)
+        facts |= {"path_exists": shortest is not None, "with_margin": bool(shortest is not None and margin > 0)}
     T = np.concatenate([p["trail"] for p in parts])
-    facts = {
-        "metrics": metrics,
-        "path_exists": possible,
-        "with_margin": bool(possible and best["shortest_margin_m"] > 0),
-        "stops": len(parts),
-    }
     return Bundle({"error": error, "way": T[:, :, 3].copy()}, facts)
 
 
 STAGE = Stage(
     name="drive_check",
-    version=2,
+    version=3,
     summary="a drive against the truth: placements, localisation, length",
     params=NoParams,
-    inputs=("drives*", "trajectory", "truth", "best"),
+    inputs=("drives*", "trajectory?", "truth?", "best?"),
     outputs=(
         Array("error", ("frame",), "float64", "m", "distance of the estimated from the true position"),
         Array("way", ("position", "xyz"), "float64", "m", "true position of the vehicle on the ground", frame="truth"),

@@ -37,22 +37,51 @@ APART = {"trajectory": {"refined"}}
 """Ports that one flow alone has, by stage: a drive goes on before there is anything to be adjusted jointly."""
 
 
-def grown(flow: Reconstruction) -> Graph:
-    """All tasks of a flow, none of them run."""
+def grown(flow: Reconstruction, failing: str = "") -> Graph:
+    """All tasks of a flow, none of them run; those of a stage that fails have no results, nor has what reads them."""
     flow.build()
     waiting, legs = flow.graph.expansions, 0
     while waiting:
-        handles, grow, *_ = waiting.pop(0)
-        facts = []
+        handles, grow, holes = waiting.pop(0)
+        facts: list[SimpleNamespace | None] = []
+        for handle in flow.graph.nodes:
+            if handle.stage == failing or any(up.status == "failed" for up in handle.upstream()):
+                handle.status = "failed"
         for handle in handles:
+            if handle.status == "failed":
+                facts.append(None)
+                continue
             meta = FACTS.get(handle.stage, {})
             if handle.stage == "footprint":
                 meta = meta | {"pair": int(handle.label.split("/")[1])}
             if handle.stage == "leg":
                 meta, legs = LEG | {"verdict": "goal" if legs else "drive"}, legs + 1
             facts.append(SimpleNamespace(meta=meta))
-        grow(*facts)
+        if all(facts) or holes:
+            grow(*facts)
     return flow.graph
+
+
+def test_a_drive_that_fails_on_a_leg_is_judged_with_that_leg() -> None:
+    sequence = open_sequence("mockup-loop")
+    flow = Drive(Graph(), sequence, config.build(config.expand(sequence.defaults)))
+    grown(flow, failing="safety")
+    check = flow.driven.check
+    assert check is not None
+    drives = check.inputs["drives"]
+    assert isinstance(drives, list)
+    assert [handle.label for handle in drives] == ["drive/start", "drive/0"]
+    assert check.spec.args["rows"] == [0, -1], "all of what was driven"
+
+
+def test_a_drive_that_fails_at_the_start_is_judged_where_it_stands() -> None:
+    sequence = open_sequence("mockup-loop")
+    flow = Drive(Graph(), sequence, config.build(config.expand(sequence.defaults)))
+    grown(flow, failing="level")
+    check = flow.driven.check
+    assert check is not None
+    assert set(check.inputs) == {"drives"}
+    assert check.spec.args["rows"] == [0]
 
 
 def ports(graph: Graph) -> dict[str, set[frozenset[str]]]:
