@@ -6,12 +6,13 @@ from collections.abc import Sequence
 from typing import Any
 
 from datasets.georeference import Georeference
-from pipeline.products import FRAME
+from pipeline.products import FRAME, UNLEVELLED
+from stages.pose_arrays import NO_VERTICAL
 
 FORMAT = 1
 """Raised when the meaning of a key of frames.json changes."""
 
-FRAMES = {
+FRAMES: dict[str, dict[str, Any]] = {
     "world": {
         "handedness": "right",
         "axes": {"x": "right", "y": "ahead", "z": "up"},
@@ -91,6 +92,7 @@ def describe(
     *,
     clock: bool,
     place: Georeference | None = None,
+    vertical: str = "",
 ) -> dict[str, Any]:
     """What ``frames.json`` holds.
 
@@ -100,14 +102,19 @@ def describe(
     frames, names, stamps : number, name and time stamp (as in the trajectory files) of each frame.
     clock : the stamps are seconds; otherwise they are the frames' numbers.
     place : of the world frame, where it is known; rasters and ``path.gpkg`` are then in its CRS.
+    vertical : what told of the world's vertical, "none" where nothing did; empty without a trajectory.
     """
+    world = FRAMES["world"] | ({"vertical": vertical} if vertical else {})
+    if vertical == NO_VERTICAL:
+        world |= {"axes": {"x": "right", "y": "optical axis of the first camera", "z": "that camera's up"}}
+        world |= {"definition": UNLEVELLED}
     known = {name: FILES[name] for name in FILES if name in written}
     if place is not None:
         known = {name: facts | _PLACED if name.endswith(IN_PLACE) else facts for name, facts in known.items()}
     return {
         "format": FORMAT,
         "units": {"length": "m", "angle": "rad, deg where the name says so", "time": "s" if clock else "frame number"},
-        "frames_of_reference": FRAMES,
+        "frames_of_reference": FRAMES | {"world": world},
         "files": known,
         "georeference": None if place is None else place.to_dict(),
         "frames": [

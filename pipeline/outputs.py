@@ -22,6 +22,7 @@ from pipeline.terrain_zarr import write_terrain
 from stages import merge
 from stages.declare import Array, Bundle
 from stages.lattice import Lattice, mosaic, union
+from stages.pose_arrays import NO_VERTICAL
 from stages.risk import REASONS
 from stages.risk import STAGE as RISK
 from stages.shading import hillshade, slope_deg
@@ -117,13 +118,16 @@ def _write_trajectories(folder: Path, view: RunView) -> None:
     times, names = view.sequence.times, view.sequence.frame_names
     stamps = [float(f) if times is None else times[f] for f in view.frames]
     trajectory, compared = view.bundle(view.products.trajectory), compare(view)
+    facts = {} if trajectory is None else trajectory.meta
+    verticals, main = list(facts.get("verticals", [""])), int(facts.get("main", 0))
+    worlds = [files.UNLEVELLED if source == NO_VERTICAL else files.FRAME for source in verticals]
     if trajectory is not None:
         files.write_trajectory_kitti(folder / "trajectory.kitti", world_poses(trajectory))
-        files.write_trajectory_tum(folder / "trajectory.tum", world_poses(trajectory), stamps)
-        for number in range(len(trajectory.meta.get("pieces", ()))):
-            if number != trajectory.meta["main"]:
+        files.write_trajectory_tum(folder / "trajectory.tum", world_poses(trajectory), stamps, worlds[main])
+        for number, words in enumerate(worlds):
+            if number != main:
                 path = folder / f"trajectory.piece{number + 1}.tum"
-                files.write_trajectory_tum(path, world_poses(trajectory, number), stamps)
+                files.write_trajectory_tum(path, world_poses(trajectory, number), stamps, words)
     if compared is not None:
         positions = world_poses(trajectory)[:, :, 3] if trajectory is not None else None
         columns = {"frame": view.frames, "name": [names[f] for f in view.frames], "time_s": stamps}
@@ -133,8 +137,16 @@ def _write_trajectories(folder: Path, view: RunView) -> None:
         files.write_table(folder / "agreement.csv", columns | compared.columns())
     written = [file.name for file in folder.iterdir()]
     chosen = [names[f] for f in view.frames]
-    facts = describe(written, view.frames, chosen, stamps, clock=times is not None, place=view.sequence.georeference)
-    files.write_text(folder / "frames.json", json.dumps(facts, indent=1) + "\n")
+    described = describe(
+        written,
+        view.frames,
+        chosen,
+        stamps,
+        clock=times is not None,
+        place=view.sequence.georeference,
+        vertical=verticals[main],
+    )
+    files.write_text(folder / "frames.json", json.dumps(described, indent=1) + "\n")
 
 
 def _write_tiles(folder: Path, view: RunView, tiles: list[Bundle]) -> None:

@@ -31,6 +31,12 @@ FRAME = (
 )
 """The world frame in words; every file repeats it where its format allows."""
 
+UNLEVELLED = (
+    "right-handed, metres: that of the first left camera, whose own up is z since nothing tells of the vertical; "
+    "origin at its centre, y its optical axis, x right"
+)
+"""The same where the vertical is not known."""
+
 ENGINEERING_CRS = (
     'ENGCRS["Rille world frame (local metres)",EDATUM["centre of the first left camera"],CS[Cartesian,2],'
     'AXIS["x",east,ORDER[1]],AXIS["y",north,ORDER[2]],LENGTHUNIT["metre",1]]'
@@ -249,15 +255,16 @@ def write_trajectory_kitti(path: Path, poses: NDArray[np.float64]) -> None:
     write_text(path, "".join(_line(pose.reshape(-1)) for pose in poses))
 
 
-def write_trajectory_tum(path: Path, poses: NDArray[np.float64], times: Sequence[float]) -> None:
+def write_trajectory_tum(path: Path, poses: NDArray[np.float64], times: Sequence[float], world: str = FRAME) -> None:
     """Write ``time x y z qx qy qz qw``, a line for every frame with a pose.
 
     Parameters
     ----------
     poses : (frame, 3, 4) T_world_left, metres; optical axes x right, y down, z forward.
     times : of the frames, seconds; frame numbers where there is no clock.
+    world : the frame of reference in words.
     """
-    head = f"# time x y z qx qy qz qw; world from left camera (x right, y down, z forward); world {FRAME}\n"
+    head = f"# time x y z qx qy qz qw; world from left camera (x right, y down, z forward); world {world}\n"
     lines = [
         _line([time, *pose[:, 3], *Rotation.from_matrix(pose[:, :3]).as_quat(canonical=True)])
         for time, pose in zip(times, poses, strict=True)

@@ -170,11 +170,7 @@ class GroundView:
     def cell_size(self) -> float:
         """Pixel footprint (geometric mean of both directions) at twice the nearest distance, to 1, 2 or 5."""
         near = self.slant <= 2.0 * self.slant.min()
-        size = float(np.sqrt(self.along * self.across)[near].max())
-        steps = [
-            m * 10.0**e for e in range(math.floor(math.log10(size)), math.floor(math.log10(size)) + 2) for m in _125
-        ]
-        return min(steps, key=lambda step: abs(math.log(step / size)))
+        return rounded_cell(float(np.sqrt(self.along * self.across)[near].max()))
 
     def footprint(self, cell: float, max_cells: float, sigma_d: float, max_sigma: float) -> list[float]:
         """Extent x_min, x_max, y_min, y_max, metres, of the ground that is seen well enough.
@@ -191,6 +187,12 @@ class GroundView:
             )
         low, high = self.xy[good].min(axis=0), self.xy[good].max(axis=0)
         return [float(low[0]), float(high[0]), float(low[1]), float(high[1])]
+
+
+def rounded_cell(size: float) -> float:
+    """The cell size of 1, 2 or 5 times a power of ten, m, that is nearest to ``size``."""
+    first = math.floor(math.log10(size))
+    return min((m * 10.0**e for e in (first, first + 1) for m in _125), key=lambda step: abs(math.log(step / size)))
 
 
 _125 = (1.0, 2.0, 5.0)

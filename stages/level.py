@@ -4,6 +4,9 @@ The local frame of a basic pair has its origin at the left camera's centre, z up
 the optical axis (paper, sections 3.2 and 4.7: the local path is planned heading-aligned). Where "up" is comes from the
 best source at hand: a measured attitude, the given initial pose, the rig's stated pitch, else the ground plane that the
 disparity shows. The ground plane is fitted in any case: it gives the range of elevations that Locus searches.
+
+A trajectory needs neither. Where no ground is seen, no elevation model can be made (unless ``reference_height`` states
+a surface); where nothing tells of the vertical either, the local frame is that of the camera: its own up is z.
 """
 
 from __future__ import annotations
@@ -19,10 +22,13 @@ from pydantic import Field
 from stages.declare import Bundle, Inputs, Params, Stage
 from stages.errors import DegenerateError, InputError
 from stages.geometry import Rig, RigidTransform, level_rotation
-from stages.ground import GroundPlane, fit_plane, inverse_depth, view_ground
+from stages.ground import GroundPlane, fit_plane, inverse_depth, rounded_cell, view_ground
+from stages.pose_arrays import NO_VERTICAL
 from stages.validity import matched
 
 Floats = NDArray[np.float64]
+Samples = tuple[Floats, Floats, Floats]
+"""Rays (n, 3) with z = 1 of the left camera, inverse depths (n,) and their standard deviations, 1/m."""
 
 DEFAULT_RANGE_CELLS = 6.0  # of the footprint in meta; the stage locus has its own parameter
 SAMPLES = 5000  # matched pixels that the plane is fitted to: three parameters need no more
@@ -31,6 +37,9 @@ MARGIN = 0.05  # share of the camera's height that the range of elevations is wi
 
 
 BEYOND = 3.0  # standard deviations that a match lies beyond infinity, which no noise explains
+NEAREST = 0.05  # share of the matches that may be nearer than what counts as nearest: gross mismatches
+UNSEEN = 20.0  # baselines; distance that stands for what is not seen at all
+
 SWAPPED = 0.5  # share of such matches: nearly all where left and right are swapped
 
 
@@ -59,6 +68,12 @@ class LevelParams(Params):
         description="camera heights above the camera; elevations are not searched higher (no surface is seen from above"
         " there, only walls and crowns)",
     )
+    reference_height: float | None = Field(
+        None,
+        gt=0,
+        description="m; where no ground is seen, elevations are searched about a horizontal plane so far below the"
+        " camera; none: there is no elevation model",
+    )
     sigma_disparity: float = Field(0.2, gt=0, description="pixels; error of a disparity after sub-pixel refinement")
     seed: int = Field(1999, ge=0, description="seed of the ground plane's samples; any")
 
@@ -86,15 +101,17 @@ def level(
     Returns
     -------
     dict
-        ``T_local_left`` (12 numbers), ``source``; ``ground_height`` z of the ground below the camera (m, negative);
-        ``plane`` (a, b, c) of z = c + a x + b y; ``tilt`` of the ground (rad); ``relief`` lowest and highest terrain
-        against the plane (m); ``z_range`` (m); ``cell_size`` (m) that suits the rig; ``footprint`` x_min, x_max,
-        y_min, y_max (m) for it; ``ground_share`` of the sampled pixels. All in the local frame.
+        ``T_local_left`` (12 numbers), ``source`` of the vertical (``none``: unknown, z is the camera's own up);
+        ``ground_height`` z of the ground below the camera (m, negative); ``plane`` (a, b, c) of z = c + a x + b y;
+        ``tilt`` of the ground (rad); ``relief`` lowest and highest terrain against the plane (m); ``z_range`` (m);
+        ``cell_size`` (m) that suits the rig; ``footprint`` x_min, x_max, y_min, y_max (m) for it; ``ground_share`` of
+        the sampled pixels. All in the local frame. Where no ground is seen, ``no_ground`` says why, and what would
+        tell of it is None, but for ``cell_size``.
 
     Raises
     ------
     DegenerateError
-        The disparity shows no ground plane under the limits of tilt.
+        Left and right seem swapped, or the rig has no baseline.
     """
     rays, rho, sigma = _samples(np.asarray(column_disparity), np.asarray(row_disparity), usable, rig, params)
     vertical, source = _given_vertical(up, initial_up, pitch)
@@ -105,9 +122,41 @@ def level(
             f"{beyond:.0%} of the matches lie beyond infinity",
             remedy="check left/right order, they seem swapped, and the sign of the baseline",
         )
+    samples = rays, rho, sigma
+    try:
+        ground = _fitted(samples, vertical, params)
+        R_local_left = level_rotation(ground.up if vertical is None else vertical)
+        return {"source": source or "ground plane"} | _on_ground(ground, R_local_left, samples, rig, params)
+    except DegenerateError as error:
+        why = error
+    up_known = np.array([0.0, -1.0, 0.0]) if vertical is None else vertical
+    facts, R_local_left = {"source": source or NO_VERTICAL}, level_rotation(up_known)
+    try:
+        if params.reference_height is not None:
+            ground = GroundPlane(up_known, params.reference_height, 0.0)
+            return facts | _on_ground(ground, R_local_left, samples, rig, params)
+    except DegenerateError as error:
+        why = error
+    nothing = dict.fromkeys(("ground_height", "plane", "tilt", "relief", "z_range", "footprint"))
+    cell, T_local_left = _cell_without_ground(rho[rho > BEYOND * sigma], rig), RigidTransform(R_local_left, np.zeros(3))
+    return (
+        facts
+        | nothing
+        | {"T_local_left": T_local_left.to_list(), "cell_size": cell, "ground_share": 0.0, "no_ground": str(why)}
+    )
+
+
+def _fitted(samples: Samples, vertical: Floats | None, params: LevelParams) -> GroundPlane:
+    """The ground plane that the samples show, under the limits of tilt."""
     rng = np.random.default_rng(params.seed)
-    ground = fit_plane(rays, rho, sigma, lambda n: _allowed(n, vertical, params), params.relief, rng)
-    R_local_left = level_rotation(ground.up if vertical is None else vertical)
+    return fit_plane(*samples, lambda n: _allowed(n, vertical, params), params.relief, rng)
+
+
+def _on_ground(
+    ground: GroundPlane, R_local_left: Floats, samples: Samples, rig: Rig, params: LevelParams
+) -> dict[str, Any]:
+    """What :func:`level` says of a pair whose ground plane is known."""
+    rays, rho, _ = samples
     plane = _local_plane(ground, R_local_left)
     view = view_ground(rig, R_local_left, plane)
     cell = view.cell_size()
@@ -116,7 +165,6 @@ def level(
     relief = _relief(points[rho > 0], plane, footprint, ground.height, params)
     return {
         "T_local_left": RigidTransform(R_local_left, np.zeros(3)).to_list(),
-        "source": source or "ground plane",
         "ground_height": plane[2],
         "plane": plane,
         "tilt": math.atan(math.hypot(plane[0], plane[1])),
@@ -128,6 +176,12 @@ def level(
     }
 
 
+def _cell_without_ground(rho: Floats, rig: Rig) -> float:
+    """Cell size, m, by what is seen instead, inverse depths ``rho`` (n,): a pixel at twice the nearest distance."""
+    near = 1.0 / float(np.quantile(rho, 1.0 - NEAREST)) if rho.size else UNSEEN * rig.baseline
+    return rounded_cell(2.0 * near / rig.left.fx)
+
+
 def z_range(plane: list[float], relief: list[float], extent: list[float]) -> list[float]:
     """Lowest and highest elevation, m, of a plane with relief over an extent x_min, x_max, y_min, y_max."""
     corners = [plane[2] + plane[0] * x + plane[1] * y for x in extent[:2] for y in extent[2:]]
@@ -136,7 +190,7 @@ def z_range(plane: list[float], relief: list[float], extent: list[float]) -> lis
 
 def _samples(
     column: NDArray[Any], row: NDArray[Any], usable: NDArray[np.bool_], rig: Rig, params: LevelParams
-) -> tuple[Floats, Floats, Floats]:
+) -> Samples:
     """Rays, inverse depths and their errors at a regular sparse grid of usable pixels."""
     expected = (rig.left.height, rig.left.width)
     if column.shape != expected:

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from stages.declare import Array
 
+NO_VERTICAL = "none"
+"""Source of the vertical of a frame that nothing tells of: the camera's own up stands for it."""
+
 POSES = Array("poses", ("frame", "row", "col"), "float64", "m", "pose [R | t] of the left camera", "nan")
 
 COVARIANCE = Array(

@@ -10,6 +10,9 @@ so that ``T_world_local(k) = T_world_left(k) T_local_left(k)^-1`` whatever the l
 segment's key frame is the last frame of this one. Where that frame is lost the trajectory breaks: what follows is a
 piece of its own, in the local frame of its first basic pair.
 
+Where nothing tells of the vertical at a piece's first pair, that of its first pair that has one is carried back along
+the piece; where none has, the frame of the piece is that of its first camera, whose own up is z, and that is said.
+
 Of the covariances, what each segment has for itself adds up; of what all segments share, the errors add up, which grows
 with the length of the way and not with its root (:mod:`stages.resect`).
 """
@@ -25,8 +28,8 @@ from numpy.typing import NDArray
 
 from stages.declare import Array, Bundle, Inputs, NoParams, Stage
 from stages.errors import InputError
-from stages.geometry import RigidTransform, orthonormal
-from stages.pose_arrays import COVARIANCE, POSES
+from stages.geometry import RigidTransform, level_rotation, orthonormal
+from stages.pose_arrays import COVARIANCE, NO_VERTICAL, POSES
 from stages.reprojection import cross_matrix
 
 Floats = NDArray[np.float64]
@@ -143,6 +146,39 @@ def world_poses(trajectory: Bundle, piece: int | None = None) -> Floats:
     return np.where((np.asarray(trajectory["piece"]) == wanted)[:, None, None], poses, np.nan)
 
 
+def levelled(found: Chained, first: int, up: Floats) -> Chained:
+    """The same with the piece that begins in row ``first`` turned so that ``up`` (3,) of its frame becomes z."""
+    rows = np.flatnonzero(found.piece == found.piece[first])
+    R = found.poses[first, :, :3]
+    turn = level_rotation(R.T @ up) @ R.T
+    both = np.kron(np.eye(2), turn)
+    poses, covariance = found.poses.copy(), found.covariance.copy()
+    poses[rows] = turn @ poses[rows]
+    covariance[rows] = both @ covariance[rows] @ both.T
+    return replace(found, poses=poses, covariance=covariance)
+
+
+def _with_verticals(found: Chained, keys: Sequence[int], levels: Sequence[Bundle]) -> tuple[Chained, list[str]]:
+    """Pieces levelled by the first of their pairs that knows the vertical; the source of each piece's vertical.
+
+    ``keys`` are the rows of the pairs that ``levels`` are of.
+    """
+    sources = []
+    for piece in range(int(found.piece.max()) + 1):
+        mine = [(key, level) for key, level in zip(keys, levels, strict=True) if found.piece[key] == piece]
+        source = mine[0][1].meta.get("source", "") if mine else NO_VERTICAL
+        if source == NO_VERTICAL:
+            first = int(np.flatnonzero(found.piece == piece)[0])
+            known = ((key, level) for key, level in mine if level.meta["source"] != NO_VERTICAL)
+            for key, level in known:
+                R_local_left = RigidTransform.from_matrix(level.meta["T_local_left"]).rotation
+                found = levelled(found, first, found.poses[key, :, :3] @ R_local_left[2])
+                source = level.meta["source"]
+                break
+        sources.append(source)
+    return found, sources
+
+
 def _spread(found: Chained, at: NDArray[np.intp], count: int) -> Chained:
     """The same with a row for each of ``count`` frames; ``at`` (n,) are the rows of those that were tracked."""
     poses, covariance = np.full((count, 3, 4), np.nan), np.full((count, 6, 6), np.nan)
@@ -183,6 +219,14 @@ def _account(frames: list[int], piece: NDArray[np.int16], causes: Mapping[int, s
     return {"pieces": pieces, "main": main, **counts, "lost": lost, "warnings": lines}
 
 
+def _without_vertical(pieces: Sequence[Sequence[int]], verticals: Sequence[str]) -> list[str]:
+    return [
+        f"nothing tells of the vertical at frames {a}-{b}: their world is that of camera {a}, whose own up is z"
+        for (a, b), source in zip(pieces, verticals, strict=True)
+        if source == NO_VERTICAL
+    ]
+
+
 def _facts(segments: Sequence[Bundle]) -> list[dict[str, Any]]:
     """Facts of each tracked frame; of a key frame those of the segment before, which posed it."""
     facts: list[dict[str, Any]] = []
@@ -207,6 +251,10 @@ def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     row = {frame: k for k, frame in enumerate(frames)}
     at = np.array([row[int(f["frame"])] for f in facts], dtype=np.intp)
     found = _spread(chain(segments, levels), at, len(frames))
+    keys = [row[int(b.meta["per_frame"][0]["frame"])] for b in inputs["segments"]] or [int(at[0])]
+    found, verticals = _with_verticals(found, keys, inputs["levels"])
+    account = _account(frames, found.piece, causes)
+    account["warnings"] += _without_vertical(account["pieces"], verticals)
     inliers = {int(f["frame"]): int(f["inliers"]) for f in facts}
     return Bundle(
         {"poses": found.poses, "covariance": found.covariance, "segment": found.segment, "piece": found.piece},
@@ -214,8 +262,9 @@ def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
             "frames": frames,
             "inliers": [inliers.get(f, 0) for f in frames],
             "positions": [[float(v) for v in p[:, 3]] if np.isfinite(p).all() else None for p in found.poses],
+            "verticals": verticals,
         }
-        | _account(frames, found.piece, causes),
+        | account,
     )
 
 

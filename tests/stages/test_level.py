@@ -125,19 +125,35 @@ def test_relief_holds_the_rocks() -> None:
     assert facts["relief"][0] < 0.0 < facts["relief"][1]
 
 
-def test_no_ground_is_said_with_a_remedy() -> None:
+def test_without_ground_the_pair_is_levelled_all_the_same() -> None:
     wall = disparity(RIG, pitched(0.0), box((-9.0, 1.0, -9.0), (9.0, 2.0, 9.0)))
-    with pytest.raises(DegenerateError, match="pitch"):
-        level(*wall, RIG, PARAMS)
+    facts = level(*wall, RIG, PARAMS)
+    assert facts["source"] == "none"
+    assert "no ground plane" in facts["no_ground"]
+    assert facts["plane"] is facts["footprint"] is None
+    T = RigidTransform.from_matrix(facts["T_local_left"])
+    np.testing.assert_allclose(T.rotation, [[1, 0, 0], [0, 0, 1], [0, -1, 0]], atol=1e-12)
+    # The wall stands a metre ahead: a pixel covers 2 m / f at twice that.
+    assert facts["cell_size"] == pytest.approx(2.0 / RIG.left.fx, rel=0.6)
+    assert level(*wall, RIG, PARAMS, up=[0.0, -1.0, 0.1])["source"] == "attitude"
+
+    stated = level(*wall, RIG, PARAMS.model_copy(update={"reference_height": 0.3}))
+    np.testing.assert_allclose(stated["plane"], [0.0, 0.0, -0.3], atol=1e-12)
+    assert stated["source"] == "none"
+    away = level(*wall, RIG, PARAMS.model_copy(update={"reference_height": 0.3}), up=[0.0, -0.17, 0.98])
+    assert away["plane"] is None  # it looks up: that surface is not in view
+    assert away["source"] == "attitude"
+
     far = disparity(RIG, pitched(0.0), box((-900.0, 100.0, -900.0), (900.0, 200.0, 900.0)))
     patch = np.zeros_like(far[2])
     patch[150:190, 150:190] = True
-    for seed in range(5):
+    for seed in range(5):  # so far away every plane fits, chance sets its tilt
         noisy = far[0] + smooth_noise(far[0].shape, 0.2, np.random.default_rng(seed))
-        with pytest.raises(DegenerateError, match="pitch"):  # so far away every plane fits, chance sets its tilt
-            level(noisy, far[1], patch, RIG, PARAMS)
-    with pytest.raises(DegenerateError, match="texture in common"):
-        level(FLAT[0], FLAT[1], np.zeros_like(FLAT[2]), RIG, PARAMS)
+        assert level(noisy, far[1], patch, RIG, PARAMS)["plane"] is None
+    assert "texture in common" in level(FLAT[0], FLAT[1], np.zeros_like(FLAT[2]), RIG, PARAMS)["no_ground"]
+
+
+def test_what_no_frame_can_be_posed_from_is_said_with_a_remedy() -> None:
     swapped = Rig(RIG.right, RIG.left, RIG.T_right_left)
     with pytest.raises(DegenerateError, match="left/right"):
         level(-FLAT[0], FLAT[1], FLAT[2], swapped, PARAMS)

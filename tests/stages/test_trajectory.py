@@ -174,3 +174,40 @@ def test_refined_poses_and_their_covariances_take_the_place_of_resected_ones():
     assert np.trace(out["covariance"][7][:3, :3]) > 2 * np.trace(claimed[:3, :3])
     expected = [(levels[0] @ truth[0].inverse() @ T).matrix34 for T in truth]
     np.testing.assert_allclose(out["poses"], expected, atol=1e-12)
+
+
+def resected(frames, poses):
+    count = len(frames)
+    arrays = {"poses": np.array([T.matrix34 for T in poses]), "covariance": np.zeros((count, 6, 6))}
+    facts = [{"frame": f, "inliers": 9} for f in frames]
+    return Bundle(arrays | {"shared": np.zeros((count, 6, 2))}, {"per_frame": facts})
+
+
+def test_the_vertical_of_a_later_pair_is_carried_back_where_the_first_has_none():
+    rng = np.random.default_rng(11)
+    true = [pose(rng) for _ in range(5)]  # T_true_left; true z is up
+    unlevelled = RigidTransform(np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]), np.zeros(3))
+    up = true[2].rotation.T[:, 2]
+    along = np.array([0.0, 0.0, 1.0]) - up * up[2]
+    along /= np.linalg.norm(along)
+    level_2 = RigidTransform(np.array([np.cross(along, up), along, up]), np.zeros(3))
+    levels = [Bundle({}, {"T_local_left": T.to_list(), "source": s}) for T, s in ((unlevelled, "none"), (level_2, "x"))]
+    segments = [
+        resected(part, [T @ true[part[0]].inverse() @ true[i] for i in part])
+        for part, T in (([0, 1, 2], unlevelled), ([2, 3, 4], level_2))
+    ]
+    frames = {"frames": [0, 1, 2, 3, 4]}
+    found = STAGE.run(NoParams(), frames, {"segments": segments, "levels": levels})
+    assert found.meta["verticals"] == ["x"]
+    assert not found.meta["warnings"]
+    for got, T in zip(np.asarray(found["poses"]), true, strict=True):
+        np.testing.assert_allclose(got[2, :3], T.rotation[2], atol=1e-9)  # z is up
+        np.testing.assert_allclose(got[2, 3], T.translation[2] - true[0].translation[2], atol=1e-9)
+    axis = np.asarray(found["poses"])[0, :, 2]
+    assert abs(axis[0]) < 1e-9 < axis[1]  # y is the first camera's axis, levelled
+
+    levels[1].meta["source"] = "none"
+    blind = STAGE.run(NoParams(), frames, {"segments": segments, "levels": levels})
+    assert blind.meta["verticals"] == ["none"]
+    assert "nothing tells of the vertical at frames 0-4" in blind.meta["warnings"][0]
+    np.testing.assert_array_equal(np.asarray(blind["poses"])[0], unlevelled.matrix34)
