@@ -4,8 +4,9 @@ The hierarchical matcher of stage ``hfvm``, stopped at a coarse level. There is 
 forward has radial flow, whose epipolar lines meet inside the image, where a band says nothing about the way along it.
 
 Where the rotation between the frames is known from a sensor, it is undone before matching (:mod:`stages.attitude`);
-where the matches show a large in-plane rotation, or are too few and it has to be looked for, that is undone
-(:mod:`stages.roll`). The displacements are those of the frames as they were taken all the same.
+where the matches are too few, the homography that features show (:mod:`stages.feature_homography`), or else an in-plane
+rotation that is looked for, is undone, as is one that the matches show (:mod:`stages.roll`). The displacements are
+those of the frames as they were taken all the same.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from pydantic import Field
 from stages import roll
 from stages.attitude import Derotation
 from stages.declare import AnyArray, Array, Bundle, Inputs, Params, Stage
+from stages.feature_homography import feature_homography
 from stages.geometry import Camera
 from stages.hfvm import consistency, hierarchy
 from stages.hfvm.params import HfvmParams
@@ -43,9 +45,9 @@ class MotionParams(Params):
         default=0.5,
         ge=0,
         le=1,
-        description="share of the pixels with texture that match, below which a rotation about the optical axis is"
-        " looked for; upright windows match three quarters of a street and a third at 30 degrees; 0: no rotation is"
-        " undone but an attitude's",
+        description="share of the pixels with texture that match, below which a homography of features, or else a"
+        " rotation about the optical axis, is looked for; upright windows match three quarters of a street and a third"
+        " at 30 degrees; 0: no rotation is undone but an attitude's",
     )
     turn_range_deg: float = Field(
         default=60.0, gt=0, le=180, description="degrees to either side; greatest rotation that is looked for"
@@ -144,6 +146,14 @@ def _rolled(
 
     best, needed = plain, 1.0
     if share < params.turn_below:
+        wide = feature_homography(a, b)
+        if wide is not None:
+            upright = Derotation(wide, shape)
+            found = coarse_motion(a, b, params, upright)
+            if match_share(found) > roll.GAIN * share:
+                degrees = -roll.relative((0.0, 1.0), wide, shape)[0]
+                known = np.eye(3) if turn is None else turn.homography
+                return found, upright, roll.relative((degrees, 1.0), known, shape)[0]
         coarse, needed = params.model_copy(update={"level": params.level + 1}), roll.GAIN
         for degrees in roll.candidates(params.turn_range_deg):
             found, _ = attempt(roll.similarity(degrees, 1.0, shape), coarse)

@@ -7,6 +7,7 @@ from stages import motion
 from stages.attitude import Derotation
 from stages.declare import Bundle, check_outputs
 from stages.errors import InputError
+from stages.feature_homography import feature_homography
 from stages.geometry import Camera, rotation_exp
 from stages.motion import MotionParams, coarse_motion
 from stages.pyramid import PyramidParams, build
@@ -144,6 +145,32 @@ def test_a_turn_of_thirty_degrees_is_undone_by_an_attitude(axis):
         share, wrong = judge(coarse_motion(*pyramids, MotionParams(), turn), flow)
         assert share > 0.85
         assert wrong < 0.03
+
+
+def test_a_turn_by_half_the_field_of_view_is_found_by_features():
+    flow = held(rotation_exp(np.radians([3.0, -27.0, 9.0])), 12.0, -7.0)
+    images = taken(flow)
+    shares = {}
+    for below in (0.0, 0.5):
+        out = run(*images, turn_below=below)
+        maps = (out["column_disparity"], out["row_disparity"], out["validity"])
+        shares[below], wrong = judge(motion.Motion(out.meta["level"], *maps), flow)
+    assert shares[0.0] < 0.4
+    assert shares[0.5] > 0.8
+    assert wrong < 0.03
+
+
+def test_features_of_other_pictures_or_of_none_show_no_homography():
+    rng = np.random.default_rng(1)
+    one, other = (build(cv2.GaussianBlur(rng.random((280, 400)) * 255, (0, 0), 2.0), PyramidParams()) for _ in range(2))
+    assert feature_homography(one, other) is None
+    assert feature_homography(one, build(np.full((280, 400), 80, np.uint8), PyramidParams())) is None
+    turn = cv2.getRotationMatrix2D((200, 140), 50.0, 1.1)
+    turned = build(cv2.warpAffine(one.images[0], turn, (400, 280)), PyramidParams())
+    found = feature_homography(one, turned)
+    corners = np.array([[120.0, 80.0, 1.0], [280.0, 200.0, 1.0]])
+    there = corners @ found.T
+    np.testing.assert_allclose(there[:, :2] / there[:, 2:], corners @ turn.T, atol=0.5)
 
 
 def test_masked_pixels_of_a_turned_frame_match_nothing():
