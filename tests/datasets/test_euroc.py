@@ -5,10 +5,10 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+from raising import raises
 
 from datasets.euroc import open_euroc, recognise
 from datasets.files import Digests
-from stages.errors import InputError
 from stages.geometry import RigidTransform, rotation_exp
 
 START = 1403715273262142976
@@ -227,23 +227,23 @@ def _elsewhere(m):
 
 
 @pytest.mark.parametrize(
-    ("spoil", "message"),
+    ("spoil", "expected"),
     [
-        (_no_calibration, r"cam1/sensor\.yaml is missing: cam1 has no calibration"),
-        (_shifted, r"no time stamp of 5 images in cam0 is also one of 5 in cam1"),
-        (_mixed, r"cam0/data\.csv, line 4: .*mixed units"),
-        (_twice, r"cam0/data\.csv, line 7: time \d+ is there twice"),
-        (_backwards, r"cam0/data\.csv, line 3: time \d+ goes back"),
-        (_another_day, r"reaches from 1503\d+\.\d+ to .* s, the frames from 1403"),
-        (_swapped, r"swapped cameras"),
-        (_size, r"is 60 x 48, 8 bits; the sequence has 64 x 48"),
-        (_empty, r"cam0/data holds no images"),
-        (_elsewhere, r"none of the 2 images that .*cam0/data\.csv lists is there"),
+        (_no_calibration, ("RIL-161", "cam1/sensor.yaml", "cam1")),
+        (_shifted, ("RIL-156",)),
+        (_mixed, ("RIL-292", "cam0/data.csv", "line 4")),
+        (_twice, ("RIL-159", "cam0/data.csv", "line 7")),
+        (_backwards, ("RIL-293", "cam0/data.csv", "line 3")),
+        (_another_day, ("RIL-269", "1403")),
+        (_swapped, ("RIL-130",)),
+        (_size, ("RIL-176", "60 x 48", "64 x 48")),
+        (_empty, ("RIL-157", "cam0/data")),
+        (_elsewhere, ("RIL-160",)),
     ],
 )
-def test_what_is_wrong_is_one_line_with_a_remedy(flight, spoil, message):
+def test_what_is_wrong_is_one_line_with_a_remedy(flight, spoil, expected):
     spoil(flight / "mav0")
-    with pytest.raises(InputError, match=message) as caught:
+    with raises(*expected) as caught:
         opened(flight)
     assert "\n" not in str(caught.value)
     assert caught.value.remedy

@@ -7,12 +7,12 @@ import json
 import cv2
 import numpy as np
 import pytest
+from raising import raises
 from scipy.ndimage import map_coordinates
 
 from datasets.export import export
 from datasets.mockup import sequence as seq
 from datasets.registry import open_sequence
-from stages.errors import InputError
 from stages.geometry import Rig, RigidTransform
 
 
@@ -75,7 +75,7 @@ def test_dem_cells_project_onto_the_true_disparity(exported, tiny):
 
 def test_existing_files_are_left_alone(tmp_path, tiny, materialise):
     (tmp_path / "mine.txt").write_text("mine")
-    with pytest.raises(InputError, match="is not empty"):
+    with raises("RIL-165"):
         export(seq.mockup(tiny), tmp_path, materialise)
     assert [p.name for p in tmp_path.iterdir()] == ["mine.txt"]
 

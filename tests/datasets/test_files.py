@@ -5,6 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+from raising import raises
 
 from datasets import files, files16
 from datasets.files import Digests
@@ -50,8 +51,9 @@ def test_truncated_png_is_named(tmp_path, grey, kept):
     data = encoded(grey)
     path = tmp_path / "000007.png"
     path.write_bytes(data[: int(kept * len(data)) if isinstance(kept, float) else kept])
-    with pytest.raises(InputError, match=r"000007\.png (is truncated|is empty|cannot be read as an image)") as caught:
+    with pytest.raises(InputError, match=r"000007\.png") as caught:
         files.read_grey(path)
+    assert caught.value.code in {"RIL-170", "RIL-171"}
     assert caught.value.remedy
     assert "\n" not in str(caught.value)
 
@@ -59,16 +61,16 @@ def test_truncated_png_is_named(tmp_path, grey, kept):
 def test_damaged_and_foreign_files_are_named(tmp_path, grey):
     data = bytearray(encoded(grey))
     data[len(data) // 2] ^= 0xFF
-    with pytest.raises(InputError, match=r"x is damaged \(checksum of chunk IDAT"):
+    with raises("RIL-170"):
         files.decode(bytes(data), "x")
     jpeg = encoded(grey, ".jpg")
-    with pytest.raises(InputError, match="x is truncated"):
+    with raises("RIL-170"):
         files.decode(jpeg[: len(jpeg) // 2], "x")
-    with pytest.raises(InputError, match="x cannot be read as an image"):
+    with raises("RIL-171"):
         files.decode(b"not an image at all", "x")
-    with pytest.raises(InputError, match="samples of type float32"):
+    with raises("RIL-172", "float32"):
         files.decode(encoded(grey.astype(np.float32), ".tif"), "x")
-    with pytest.raises(InputError, match="cannot be read: No such file"):
+    with raises("RIL-173"):
         files.read_grey(tmp_path / "absent.png")
 
 
@@ -92,11 +94,11 @@ def test_stage_gives_the_image_whole_and_declared(tmp_path, grey):
 def test_stage_refuses_other_sizes_and_changed_files(tmp_path, grey):
     path = tmp_path / "a.png"
     path.write_bytes(encoded(grey))
-    with pytest.raises(InputError, match=r"frame 3, left image .*a\.png is 50 x 40, 8 bits; the sequence has 51 x 40"):
+    with raises("RIL-176", "frame 3", "50 x 40", "51 x 40"):
         run(files.image_source(path, 3, "left", (51, 40, 8), Digests()))
     source = files.image_source(path, 3, "left", (50, 40, 8), Digests())
     path.write_bytes(encoded(grey[::-1]))
-    with pytest.raises(InputError, match="has changed"):
+    with raises("RIL-177"):
         run(source)
 
 

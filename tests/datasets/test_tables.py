@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from raising import raises
 
 from datasets.tables import read_table
-from stages.errors import InputError
 
 
 def table(tmp_path, text, encoding="utf-8"):
@@ -44,23 +44,23 @@ def test_names_that_do_not_fit_the_columns_are_none(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
+    ("text", "expected"),
     [
-        ("1,2,3\n4,5\n", r"t\.csv, line 2: 2 columns where the first row has 3"),
-        ("1,2,3\n4,five,6\n", r"t\.csv, line 2: 'five' is not a finite number"),
-        ("1,2,3\n4,nan,6\n", r"t\.csv, line 2: 'nan' is not a finite number"),
-        ("time,x\n", r"t\.csv has no rows of numbers"),
+        ("1,2,3\n4,5\n", ("RIL-285", "t.csv", "line 2")),
+        ("1,2,3\n4,five,6\n", ("RIL-284", "t.csv", "line 2", "'five'")),
+        ("1,2,3\n4,nan,6\n", ("RIL-284", "t.csv", "line 2", "'nan'")),
+        ("time,x\n", ("RIL-286", "t.csv")),
     ],
 )
-def test_what_is_wrong_names_the_line(tmp_path, text, message):
-    with pytest.raises(InputError, match=message) as caught:
+def test_what_is_wrong_names_the_line(tmp_path, text, expected):
+    with raises(*expected) as caught:
         table(tmp_path, text).numbers([0, 1])
     assert caught.value.remedy
 
 
 def test_a_missing_or_binary_file(tmp_path):
-    with pytest.raises(InputError, match="cannot be read"):
+    with raises("RIL-287"):
         read_table(tmp_path / "none.csv", "table")
     (tmp_path / "b.csv").write_bytes(b"\xff\xfe\x00\x80")
-    with pytest.raises(InputError, match="cannot be read"):
+    with raises("RIL-287"):
         read_table(tmp_path / "b.csv", "table")

@@ -8,10 +8,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from raising import raises
 
 from datasets.registry import open_sequence
 from pipeline.check import check
-from stages.errors import RilleError
 
 ROWS, COLUMNS, MARGIN = 120, 200, 40
 
@@ -137,5 +137,5 @@ def test_frames_are_chosen_and_warnings_repeated(tmp_path, capsys):
 
 def test_a_picture_that_cannot_be_written_says_so(tmp_path, capsys):
     sequence = open_sequence(str(folder(tmp_path / "wall", frames=1)))
-    with pytest.raises(RilleError, match="cannot write"):
+    with raises("RIL-016"):
         check(sequence, output=tmp_path / "no" / "such" / "a.png", cache=tmp_path / "cache")

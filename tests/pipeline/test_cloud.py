@@ -11,10 +11,10 @@ import numpy as np
 import pyproj
 import pytest
 import trimesh
+from raising import raises
 from terrain_runs import LATTICE, PLACE, elevation, finished
 
 from pipeline import cloud
-from stages.errors import InputError
 
 KNOWN = np.isfinite(elevation())
 
@@ -110,10 +110,10 @@ def test_large_terrain_is_thinned_and_says_so(tmp_path: Path, monkeypatch: pytes
 
 
 def test_what_is_no_run_is_said(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="is not the folder of a run"):
+    with raises("RIL-600"):
         cloud.export(tmp_path / "none", "laz", None)
-    with pytest.raises(InputError, match=r"no dem\.tif"):
+    with raises("RIL-635"):
         cloud.export(tmp_path, "laz", None)
     (finished(tmp_path / "run") / "file").write_text("")
-    with pytest.raises(InputError, match="cannot be written"):
+    with raises("RIL-601"):
         cloud.export(tmp_path / "run", "laz", tmp_path / "run" / "file" / "a.laz")

@@ -5,9 +5,9 @@ from __future__ import annotations
 import sys
 
 import pytest
+from raising import raises
 
 from pipeline import code
-from stages.errors import RilleError
 
 FILES = {
     "__init__.py": '"""Package."""\n',
@@ -108,7 +108,7 @@ def test_every_stage_reaches_the_declarations():
 def test_unknown_module_and_missing_distribution_are_named():
     with pytest.raises(ModuleNotFoundError, match=r"stages\.nowhere"):
         code.code_digest("stages.nowhere")
-    with pytest.raises(RilleError, match="no-such-distribution"):
+    with raises("RIL-530", "no-such-distribution"):
         code.environment(["no-such-distribution"])
     assert code.environment(["zarr", "numpy"]) == {"numpy": code.version("numpy"), "zarr": code.version("zarr")}
 

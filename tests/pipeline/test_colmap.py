@@ -2,12 +2,11 @@
 
 import numpy as np
 import pycolmap
-import pytest
+from raising import raises
 
 from pipeline.colmap import build, export_run
 from pipeline.store import Store
 from stages.declare import Bundle
-from stages.errors import InputError
 from stages.geometry import Camera, Rig, RigidTransform, rotation_exp
 
 CAMERA = Camera(400.0, 410.0, 319.5, 239.5, 640, 480)
@@ -65,8 +64,8 @@ def test_the_model_read_again_has_our_cameras_poses_and_points(tmp_path):
 
 
 def test_what_is_no_run_or_has_content_is_said(tmp_path):
-    with pytest.raises(InputError, match=r"no ledger\.jsonl"):
+    with raises("RIL-608"):
         export_run(tmp_path, tmp_path / "model", Store(tmp_path / "cache"))
     (tmp_path / "x").touch()
-    with pytest.raises(InputError, match="not empty"):
+    with raises("RIL-607"):
         export_run(tmp_path, tmp_path, Store(tmp_path / "cache"))

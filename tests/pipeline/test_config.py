@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import pytest
+from raising import raises
 
 from pipeline import config
-from stages.errors import ConfigError
 
 
 def test_layers_win_in_order() -> None:
@@ -33,7 +32,7 @@ def test_one_setting_makes_terrain_accurate_and_what_is_given_beside_it_wins() -
     built = config.build({"terrain": {"preset": "accurate"}, "hfvm": {"preset": "default"}})
     assert (built.locus.refined_share, built.locus.max_jump) == (1.0, 5.0), "one of each"
     assert config.build().locus.both is False, "the preset itself is not changed by what is laid over it"
-    with pytest.raises(ConfigError, match=r"terrain\.preset = 'best' is not permitted"):
+    with raises("RIL-027", "terrain.preset", "'best'"):
         config.build({"terrain": {"preset": "best"}})
 
 
@@ -53,22 +52,22 @@ def test_navigation_matches_fast_unless_told_otherwise(tmp_path: Path) -> None:
 
 
 def test_unknown_key_names_the_nearest() -> None:
-    with pytest.raises(ConfigError, match=r"unknown key 'select\.strid'.*did you mean 'select\.stride'"):
+    with raises("RIL-027", "'select.strid'", "'select.stride'"):
         config.build(config.parse_assignments(["select.strid=2"]))
-    with pytest.raises(ConfigError, match=r"unknown key 'locsu'.*did you mean 'locus'"):
+    with raises("RIL-027", "'locsu'", "'locus'"):
         config.build({"locsu": {"cell_size": 1.0}})
 
 
 def test_value_out_of_range_says_what_is_permitted() -> None:
-    with pytest.raises(ConfigError, match=r"select\.stride = 0 is not permitted.*greater than or equal to 1"):
+    with raises("RIL-027", "select.stride"):
         config.build(config.parse_assignments(["select.stride=0"]))
-    with pytest.raises(ConfigError, match=r"select\.stride = 'many' is not permitted.*integer"):
+    with raises("RIL-027", "select.stride", "'many'"):
         config.build(config.parse_assignments(["select.stride=many"]))
 
 
 def test_assignment_without_key_or_value() -> None:
     for text in ("select.stride", "stride=3"):
-        with pytest.raises(ConfigError, match=r"section\.key=value"):
+        with raises("RIL-024"):
             config.parse_assignments([text])
 
 
@@ -82,9 +81,9 @@ def test_written_configuration_reads_back_as_the_same(tmp_path: Path) -> None:
 
 
 def test_unreadable_files(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="cannot read"):
+    with raises("RIL-025"):
         config.read_toml(tmp_path / "none.toml")
     bad = tmp_path / "bad.toml"
     bad.write_text("[select\nstride=1")
-    with pytest.raises(ConfigError, match="not TOML"):
+    with raises("RIL-026"):
         config.read_toml(bad)

@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 import pytest
 import rasterio
+from raising import raises
 
 from pipeline import match as command
 from pipeline.cli import main
 from pipeline.products import read_disparity, write_disparity
-from stages.errors import ConfigError, InputError
 from stages.validity import Validity
 
 SHIFT = -9.0
@@ -66,7 +66,7 @@ def test_confidence_has_three_bands_that_fit_the_disparity(folder):
     np.testing.assert_array_equal(ok, np.isfinite(column))
     np.testing.assert_array_equal(ok, np.isfinite(std))
     assert (error[ok] <= 1).all()
-    with pytest.raises(ConfigError):
+    with raises("RIL-043"):
         run(folder, confidence=folder / "out.tif")
 
 
@@ -97,17 +97,17 @@ def test_a_prior_decides_where_the_images_leave_the_choice(folder):
 
 def test_priors_that_are_none(folder):
     write_disparity(folder / "small.tif", np.zeros((5, 6)), np.zeros((5, 6)), {})
-    with pytest.raises(InputError, match=r"6 x 5 pixels, the left image 140 x 96"):
+    with raises("RIL-044", "6 x 5", "140 x 96"):
         run(folder, prior=folder / "small.tif")
     nothing = np.full((96, 140), np.nan)
     write_disparity(folder / "nothing.tif", nothing, nothing, {})
-    with pytest.raises(InputError, match="undefined everywhere"):
+    with raises("RIL-045"):
         run(folder, prior=folder / "nothing.tif")
-    with pytest.raises(InputError, match="1 bands"):
+    with raises("RIL-622"):
         run(folder, prior=folder / "left.png")
     (folder / "text.tif").write_text("no image")
     for name in ("text.tif", "absent.tif"):
-        with pytest.raises(InputError, match=name):
+        with raises("RIL-623", name):
             run(folder, prior=folder / name)
 
 

@@ -7,10 +7,10 @@ import itertools
 import numpy as np
 import pytest
 from motion_scenes import motion, shift
+from raising import raises
 
 from stages.continuity import STAGE, ContinuityParams, judge
 from stages.declare import Bundle, check_outputs
-from stages.errors import DegenerateError
 
 PARAMS = ContinuityParams()
 
@@ -86,7 +86,7 @@ def test_a_sequence_without_a_good_pair_is_refused():
     sights = {k: sight(k) for k in range(7)}
     for k in range(7):
         sights[k]["right"] = sights[k]["right"] | {"deviation": 0.0, "mean": 0.0}
-    with pytest.raises(DegenerateError, match="no pair can be reconstructed from: frame 0: black right image"):
+    with raises("RIL-316", "frame 0"):
         found({}, sights)
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from raising import raises
 from scipy.spatial.transform import Rotation
 
 from stages.errors import InputError
@@ -73,9 +74,9 @@ def test_round_trip(x: float, y: float, z: float) -> None:
 
 
 def test_a_matrix_that_is_no_rotation_is_refused() -> None:
-    with pytest.raises(InputError, match="not a rotation"):
+    with raises("RIL-333"):
         RigidTransform(np.diag([1.0, 1.0, -1.0]), np.zeros(3))
-    with pytest.raises(InputError, match="not finite"):
+    with raises("RIL-332"):
         RigidTransform(np.eye(3), np.array([0.0, np.nan, 0.0]))
 
 
@@ -86,7 +87,7 @@ def test_level_rotation_of_a_camera_that_looks_down() -> None:
     np.testing.assert_allclose(R_level_cam @ up, [0, 0, 1], atol=1e-15)
     np.testing.assert_allclose(R_level_cam @ [0, 0, 1], [0, math.cos(pitch), -math.sin(pitch)], atol=1e-15)
     assert np.linalg.det(R_level_cam) == pytest.approx(1.0)
-    with pytest.raises(InputError, match="vertical"):
+    with raises("RIL-334"):
         level_rotation([0.0, 0.0, -1.0])
 
 

@@ -3,11 +3,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from raising import raises
 
-from stages.errors import ConfigError, InputError
 from stages.lattice import Lattice, mosaic, union
 
 CELLS = st.sampled_from([0.0005, 0.001, 0.002, 0.02, 0.1, 0.25, 1.0])
@@ -94,26 +93,26 @@ def test_mosaic_on_a_larger_target_is_nodata_outside() -> None:
 
 
 def test_what_is_refused() -> None:
-    with pytest.raises(ConfigError, match="cell_size"):
+    with raises("RIL-356"):
         Lattice(0.0, 0.0, 0.001, 10_000, 10_000)
-    with pytest.raises(InputError, match="multiple"):
+    with raises("RIL-357"):
         Lattice(0.05, 0.0, 0.1, 2, 2)
-    with pytest.raises(InputError, match="positive"):
+    with raises("RIL-354"):
         Lattice(0.0, 0.0, 0.0, 2, 2)
-    with pytest.raises(InputError, match="empty"):
+    with raises("RIL-358"):
         Lattice.snap((1.0, 0.0, 0.0, 1.0), 0.1)
-    with pytest.raises(InputError, match="empty"):
+    with raises("RIL-358"):
         Lattice.snap((0.0, math.nan, 0.0, 1.0), 0.1)
-    with pytest.raises(InputError, match="fit together"):
+    with raises("RIL-361"):
         Lattice.at(0, 0, 0.1, 2, 2).union(Lattice.at(0, 0, 0.2, 2, 2))
-    with pytest.raises(InputError, match="inside"):
+    with raises("RIL-360"):
         Lattice.at(0, 0, 0.1, 2, 2).window(Lattice.at(1, 0, 0.1, 2, 2))
-    with pytest.raises(InputError, match="does not fit"):
+    with raises("RIL-363"):
         mosaic([(Lattice.at(0, 0, 1.0, 1, 1), np.zeros((2, 2)))], 0)
 
 
 def test_the_remedy_of_too_many_cells_works() -> None:
-    with pytest.raises(ConfigError) as error:
+    with raises("RIL-356") as error:
         Lattice.snap((0.0, 100.0, 0.0, 100.0), 0.01)
     cell = float(error.value.remedy.split()[3])
     assert Lattice.snap((0.0, 100.0, 0.0, 100.0), cell).rows > 1000

@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from leg_scenes import AT, CAMERAS, GOAL, LATTICE, ROVER, START, P, X, Y, ground
+from raising import raises
 
 from stages.ceiling import Bounds
 from stages.declare import Bundle
-from stages.errors import InputError
 from stages.footing import DOUBT_WEIGHT, PARTS, Footing
 from stages.leg import next_leg, seen_so_far, shortest_way
 from stages.leg_ground import Ground
@@ -128,7 +128,7 @@ def test_at_the_goal_it_ends() -> None:
 
 
 def test_a_goal_outside_the_map_is_refused_with_the_map() -> None:
-    with pytest.raises(InputError, match=r"the goal \(0.000, 3.000\) m is outside the map: give x in -0.4"):
+    with raises("RIL-366", "0.000", "3.000", "-0.4"):
         plan_leg(ground(), AT, (0.0, 3.0), P)
 
 

@@ -2,11 +2,11 @@ import cv2
 import numpy as np
 import pytest
 from matching_scenes import Texture, pair
+from raising import raises
 
 from stages import motion
 from stages.attitude import Derotation
 from stages.declare import Bundle, check_outputs
-from stages.errors import InputError
 from stages.feature_homography import feature_homography
 from stages.geometry import Camera, rotation_exp
 from stages.motion import MotionParams, coarse_motion
@@ -203,5 +203,5 @@ def test_stage_takes_the_attitude_from_its_arguments_and_leaves_small_turns_to_t
     assert not small.meta["derotated"]
     for name, array in plain.arrays.items():
         np.testing.assert_array_equal(array, small[name])
-    with pytest.raises(InputError, match="not a 3 x 3 rotation"):
+    with raises("RIL-305"):
         run(a, b, args={"rotation": (1.1 * rotation).tolist(), "camera": CAMERA.to_dict()})

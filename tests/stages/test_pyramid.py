@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from raising import raises
 from scipy import ndimage
 
 from stages import pyramid
@@ -90,7 +91,7 @@ def test_refuses_what_is_no_grey_image(image):
 
 
 def test_refuses_a_mask_of_another_size():
-    with pytest.raises(InputError, match="mask"):
+    with raises("RIL-413"):
         pyramid.build(np.zeros((4, 4), np.uint8), PyramidParams(), np.ones((4, 5), np.uint8))
 
 

@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 import pytest
+from raising import raises
 
-from stages.errors import InputError
 from stages.lattice import Lattice
 from stages.row_grid import RowGrid
 
@@ -38,5 +38,5 @@ def test_along_y_nothing_is_resampled() -> None:
 
 
 def test_a_heading_needs_a_direction() -> None:
-    with pytest.raises(InputError, match="has no direction"):
+    with raises("RIL-434"):
         RowGrid.over(Lattice.at(0, 0, CELL, 3, 3), (0.0, 0.0))

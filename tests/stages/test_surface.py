@@ -2,8 +2,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from raising import raises
 
-from stages.errors import InputError
 from stages.lattice import Lattice
 from stages.surface import cylinder, plane, sphere
 
@@ -33,5 +33,5 @@ def test_feet_lie_on_the_surface_and_normals_are_radial(inside: bool) -> None:
 
 
 def test_radius_must_be_positive() -> None:
-    with pytest.raises(InputError, match="radius"):
+    with raises("RIL-444"):
         sphere([0, 0, 0], 0.0, [0.0], [0.0], inside=False)

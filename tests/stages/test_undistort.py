@@ -2,10 +2,10 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
+from raising import raises
 
 from stages import undistort
 from stages.declare import Bundle, check_outputs
-from stages.errors import InputError
 from stages.geometry import Camera
 from stages.lens import Lens
 from stages.undistort import KERNELS, PHASES, UndistortParams, weights
@@ -167,7 +167,7 @@ def test_stage():
 
 
 def test_image_of_another_size_is_named():
-    with pytest.raises(InputError, match=r"frame 7, right camera: the image is 300 x 200 pixels.* 376 x 240"):
+    with raises("RIL-454", "frame 7", "300 x 200", "376 x 240"):
         run(np.zeros((200, 300), np.uint8), LENSES["radtan"], RAW)
-    with pytest.raises(InputError, match="mask"):
+    with raises("RIL-455"):
         undistort.undistort(np.zeros((240, 376), np.uint8), Lens(RAW), RAW, UndistortParams(), np.ones((3, 3)))
