@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,9 @@ from pipeline.report.gather import Scene
 from pipeline.report.words import metres
 from stages.geometry import RigidTransform
 from stages.lattice import Lattice
+
+if TYPE_CHECKING:
+    from pipeline.drive import Driven
 
 Floats = NDArray[Any]
 
@@ -95,9 +98,8 @@ def strip(scene: Scene) -> Block | None:
     if not panels:
         return None
     head = ("Stop", "Frame", "From the goal", "Decision", "Leg", "Position error", "What happened")
-    reason = f": {drive.reason}" if drive.reason else ""
     caption = (
-        f"{VERDICTS.get(drive.verdict, 'The drive did not end')}{reason}. Each column is a stop. First: the left "
+        f"{outcome(drive)}. Each column is a stop. First: the left "
         "image. Second: the hazards around the vehicle (disk), as far as known from near enough to drive there, with "
         "the leg that is driven next (black) "
         "and the way as planned beyond it (thin); the star is the goal. Third: the merged elevations of all stops so "
@@ -114,6 +116,12 @@ def strip(scene: Scene) -> Block | None:
     )
     table = Table(head, tuple(rows), frozenset({0, 1, 2, 4, 5}))
     return Block("Drive", "The drive, stop by stop", caption, tuple(panels), legend, table, strip=True)
+
+
+def outcome(drive: Driven) -> str:
+    """How a drive ended, and why."""
+    words = VERDICTS.get(drive.verdict, "The drive did not end")
+    return f"{words}: {drive.reason}" if drive.reason else words
 
 
 def _fixed(scene: Scene) -> str:
@@ -206,12 +214,3 @@ def _map(ax: Any, values: Floats, extent: Extent, shown: Extent, **style: Any) -
 
 def _rgb(color: str) -> tuple[float, float, float]:
     return tuple(int(color[k : k + 2], 16) / 255 for k in (1, 3, 5))  # type: ignore[return-value]
-
-
-def verdict(scene: Scene) -> str | None:
-    """One line on how a drive ended; None where nothing was driven."""
-    drive = scene.view.products.drive
-    if drive is None:
-        return None
-    words = VERDICTS.get(drive.verdict, "The drive did not end")
-    return f"{words}{': ' + drive.reason if drive.reason else ''}; {len(drive.stops)} stops"

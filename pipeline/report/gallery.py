@@ -9,6 +9,7 @@ import numpy as np
 
 from pipeline.report import artifacts, canvas, checks, driving, figures, gather, seams
 from pipeline.report.block import Block, Gallery
+from pipeline.report.delivery import start_words
 from pipeline.report.gather import Scene
 from pipeline.report.words import length, spread
 from stages.declare import Bundle
@@ -80,11 +81,15 @@ def _terrain(scene: Scene) -> Block | None:
         risk = None if scene.risk is None or scene.risk.lattice != world.lattice else scene.risk.arrays["risk"]
         alt = f"Elevation as grey values, {spread(elevation)} m, with the path over it"
         panels.append(figures.elevation_with_path(elevation, risk, scene.path, world.extent, alt))
-    path = "the path is the orange line (ring: start, disk: target)" if scene.path is not None else "there is no path"
+    path = (
+        f"; the path is the orange line (ring: start, disk: target){start_words(scene.view)}"
+        if scene.path is not None
+        else ""
+    )
     caption = (
         f"First: ortho image merged from {pairs} basic pairs, cells of {length(world.lattice.cell)}; undefined and "
-        "occluded cells are white. Second: elevation, bright is high; unknown and hazardous cells are black; "
-        f"{path}. World frame: x right and y ahead of the first left camera, which is at (0, 0)."
+        "occluded cells are white. Second: elevation, bright is high; unknown and hazardous cells are "
+        f"black{path}. World frame: x right and y ahead of the first left camera, which is at (0, 0)."
     )
     return Block(
         "Figure 7", "Figure 7. Merged ortho image, and the path on the elevation model", caption, tuple(panels)
@@ -116,8 +121,14 @@ def _risk(scene: Scene) -> Block | None:
 
 
 def _path_words(scene: Scene) -> str:
+    drive = scene.view.products.drive
+    if drive is not None:
+        return (
+            f"{driving.outcome(drive)}; no path is planned over the whole map, what was driven is shown stop by stop."
+        )
     if scene.path is None:
-        return "There is no path."
+        found = scene.view.bundle(scene.view.products.path)
+        return "The path was not computed." if found is None else f"There is no path: {found.meta.get('reason')}."
     margin = length(scene.view.config.vehicle.margin)
     path = scene.view.bundle(scene.view.products.path)
     ground = "" if path is None else path.meta.get("ground", "")
@@ -136,7 +147,7 @@ def _path_words(scene: Scene) -> str:
     }.get(ground, "unknown ground is not entered")
     return (
         f"The path (black line, ring: start, disk: target) is that of the vehicle's middle; its wheels keep {margin} "
-        f"from hazards; {known}.{rest}"
+        f"from hazards; {known}{start_words(scene.view)}.{rest}"
     )
 
 

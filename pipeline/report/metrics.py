@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.report import tables
+from pipeline.report import delivery, tables
 from pipeline.report.gather import Scene
 from pipeline.report.view import RunView
 from stages.trajectory_error import STEPS
@@ -103,7 +103,9 @@ KEY = frozenset(
         "caution",
         "hazardous",
         "unknown",
+        "local_paths",
         "path_length",
+        "path_start",
         "agreement_rmse",
         "agreement_share",
         "agreement_flagged",
@@ -127,7 +129,7 @@ def metrics(scene: Scene, frames: Rows, pairs: Rows) -> dict[str, Metric]:
         ("Agreement with COLMAP", _agreement(scene)),
         ("Rig", _rig(scene)),
         ("Matching and terrain", _matching(pairs) | _terrain(scene) | _overlap(scene)),
-        ("Hazards and path", _hazards(scene) | _path(scene.view)),
+        ("Hazards and path", _hazards(scene) | _local_paths(pairs) | _path(scene.view)),
         ("Run", _run(scene.view)),
     ):
         found |= {name: {"group": group, "truth": None, **metric} for name, metric in more.items()}
@@ -351,12 +353,21 @@ def _hazards(scene: Scene) -> dict[str, Metric]:
     return found
 
 
+def _local_paths(pairs: Rows) -> dict[str, Metric]:
+    found, asked = delivery.local_paths(pairs)
+    every = f"{asked} of {len(pairs)} basic pairs"
+    return {"local_paths": _metric("Local paths found", found, "", "counted", every)} if asked else {}
+
+
 def _path(view: RunView) -> dict[str, Metric]:
     path = view.bundle(view.products.path)
     if path is None or not path.meta.get("found"):
         return {}
     meta = path.meta
     found = {"path_length": _metric("Path length", meta.get("length_m"), "m", "along its vertices in 3-D")}
+    how = "in plan; nearer ground is not seen, or not to be driven on"
+    away = delivery.start_of_path(view)
+    found["path_start"] = _metric("Start of the path from the first camera", away, "m", how)
     if meta.get("climb_m") is not None:
         found["path_climb"] = _metric("Climb of the path", meta["climb_m"], "m", "sum of its rises")
     if meta.get("max_inclination") is not None:

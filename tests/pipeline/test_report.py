@@ -11,13 +11,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from toys.finished import TASKS, Written, bundles, view, written
+from toys.finished import TASKS, Written, bundles, products, view, written
 
+from datasets.mockup.sequence import vehicle_at_scale
 from pipeline import run
+from pipeline.drive import Driven
 from pipeline.reconstruct import Products
 from pipeline.report import TaskRow, canvas, figures, tables, words, write_report
 from stages.declare import Bundle
 from stages.errors import RilleError
+from stages.risk import RiskParams
 from stages.trajectory import _account
 
 
@@ -31,7 +34,11 @@ def test_a_whole_run_has_every_figure_and_nothing_missing(whole: Written) -> Non
     facts, page_, html, folder = whole
     assert facts["missing"] == []
     assert facts["complete"] is True
-    assert facts["verdict"] == "Complete: 6 of 6 frames posed, 2 of 2 elevation models, a path of 0.49 m."
+    assert facts["absent"] == []
+    said = "Complete: 6 of 6 frames posed, 2 of 2 elevation models, 2 of 2 local paths, a path of 0.49 m."
+    assert facts["verdict"] == said
+    everything = "every task was done, every frame has a pose, every stop has a local path, a path over the merged"
+    assert f"Nothing is missing: {everything} terrain was found." in page_.text
     for anchor in (
         "figure-6",
         "figure-7",
@@ -113,9 +120,12 @@ def test_error_never_without_completeness(whole: Written) -> None:
 
 def test_without_truth_it_says_so_and_shows_no_errors(tmp_path: Path) -> None:
     made = {k: v for k, v in bundles().items() if "accuracy" not in k and k != "path_check"}
-    facts, page_, _, _ = written(tmp_path, view(made, truth=False))
+    facts, page_, html, _ = written(tmp_path, view(made, truth=False))
     assert facts["complete"] is True
-    assert [m["kind"] for m in facts["missing"]] == ["no truth"]
+    assert facts["missing"] == []
+    assert [m["kind"] for m in facts["absent"]] == ["no truth"]
+    assert 'class="note missing"' not in html, "what every user's own data have is no fault"
+    assert page_.text.index("Nothing is missing") < page_.text.index("Not asked for, or not available No truth")
     assert all(metric["truth"] is None for metric in facts["metrics"].values())
     assert all(r["error_m"] is None for r in facts["frames"])
     assert "not assessed against truth" in page_.text
@@ -134,7 +144,9 @@ def test_what_is_missing_comes_first(tmp_path: Path) -> None:
     )
     facts, page_, _, _ = written(tmp_path, view(made, tasks=tasks))
     assert facts["complete"] is False
-    assert facts["verdict"].startswith("Incomplete: 0 of 6 frames posed, 1 of 2 elevation models, no path")
+    assert facts["verdict"].startswith(
+        "Incomplete: 0 of 6 frames posed, 1 of 2 elevation models, 2 of 2 local paths, no path"
+    )
     kinds = [m["kind"] for m in facts["missing"]]
     assert kinds[:4] == ["failed", "skipped", "no pose", "no path"]
     skipped = facts["missing"][1]
@@ -167,8 +179,8 @@ def test_frames_posed_are_counted_alike_on_stderr_and_in_the_report(
     arrays["poses"] = np.where((piece < 0)[:, None, None], np.nan, arrays["poses"])
     account = _account([0, 1, 2, 3, 4, 5], piece, {3: "black"})
     made["trajectory"] = Bundle(arrays | {"piece": piece}, {"frames": [0, 1, 2, 3, 4, 5]} | account)
-    products: Any = SimpleNamespace(trajectory=SimpleNamespace(ref=SimpleNamespace(meta=made["trajectory"].meta)))
-    assert run._posed_all(products) == run.HOLES
+    made_by: Any = SimpleNamespace(trajectory=SimpleNamespace(ref=SimpleNamespace(meta=made["trajectory"].meta)))
+    assert run._posed_all(made_by) == run.HOLES
     assert "incomplete: 5 of 6 frames posed, 3 in the world, in 2 pieces" in capsys.readouterr().err
     facts, page_, _, _ = written(tmp_path, view(made))
     assert facts["metrics"]["frames_posed"]["value"] == 5
@@ -188,15 +200,59 @@ def test_no_path_names_the_row_that_blocks(tmp_path: Path) -> None:
     made["path"] = made["local_path0"] = made["local_path4"] = Bundle(arrays, meta)
     facts, page_, _, _ = written(tmp_path, view(made))
     assert facts["complete"] is True  # an answer, not a hole
+    reason = "no free cell of this row can be entered"
     assert facts["missing"] == [
-        {
-            "kind": "no path",
-            "what": "No path",
-            "why": "no free cell of this row can be entered; blocked at row 17, 0.63 m ahead",
-        }
+        {"kind": "no path", "what": "2 of 2 stops have no local path", "why": f"{reason} (frames 0, 4)"},
+        {"kind": "no path", "what": "No path", "why": f"{reason}; blocked at row 17, 0.63 m ahead"},
     ]
+    assert facts["metrics"]["local_paths"]["value"] == 0
+    assert "0 of 2 local paths, no path" in facts["verdict"]
     assert "path_length" not in facts["metrics"]
+    assert "path_start" not in facts["metrics"]
+    assert f"There is no path: {reason}." in page_.text
     assert "risk-map" in page_.ids
+
+
+def test_one_stop_without_a_local_path_is_not_nothing_missing(tmp_path: Path) -> None:
+    made = bundles()
+    meta = {**made["path"].meta, "found": False, "reason": "no free cell", "length_m": None}
+    made["local_path4"] = Bundle({**made["path"].arrays, "path": np.empty((0, 3))}, meta)
+    facts, page_, _, _ = written(tmp_path, view(made))
+    assert [(m["what"], m["why"]) for m in facts["missing"]] == [
+        ("1 of 2 stops have no local path", "no free cell (frame 4)")
+    ]
+    assert "Nothing is missing" not in page_.text
+    assert "every stop has a local path" not in facts["delivered"]
+    assert facts["complete"] is True  # it was looked for: that is an answer
+
+
+def test_a_path_says_where_it_starts_when_that_is_not_at_the_vehicle(tmp_path: Path) -> None:
+    """It starts 0.21 m ahead of the camera: within the length of the default rover, but two of a rover at 1:10."""
+    config = SimpleNamespace(vehicle=vehicle_at_scale(), risk=RiskParams())
+    facts, page_, _, _ = written(tmp_path, view(config=config))
+    assert facts["metrics"]["path_start"]["value"] == pytest.approx(0.21)
+    assert facts["verdict"].endswith("a path of 0.49 m, which starts 0.210 m from the first camera.")
+    assert "a path over the merged terrain was found, which starts 0.210 m from the first camera" in page_.text
+    near, _, _, _ = written(tmp_path, view())
+    assert "which starts" not in near["verdict"]
+
+
+@pytest.mark.parametrize("verdict", ["goal", "no path"])
+def test_a_drive_that_arrived_does_not_say_that_there_is_no_path(tmp_path: Path, verdict: str) -> None:
+    made = products()
+    made.path, made.local_path = None, {}
+    made.drive = Driven(verdict=verdict, reason="" if verdict == "goal" else "hazards all around")
+    facts, page_, _, _ = written(tmp_path, view(products=made))
+    assert "There is no path" not in page_.text
+    missing = [m["what"] for m in facts["missing"] if m["kind"] == "no path"]
+    if verdict == "goal":
+        assert "Risk map and path of the whole run" in page_.text
+        assert "The goal was reached; no path is planned over the whole map" in page_.text
+        assert "the goal was reached" in facts["delivered"]
+        assert missing == []
+    else:
+        assert "No path leads to the goal: hazards all around" in page_.text
+        assert missing == ["Drive: no path"]
 
 
 def test_nothing_at_all_still_makes_a_page(tmp_path: Path) -> None:

@@ -123,9 +123,12 @@ def test_a_broken_comparison_says_why(tmp_path: Path) -> None:
 
 def test_no_comparison_is_told_only_where_it_was_switched_off(tmp_path: Path) -> None:
     config = SimpleNamespace(vehicle=Vehicle(), risk=RiskParams(), crosscheck=SimpleNamespace(enabled=False))
-    facts, _, _, _ = written(tmp_path, view(config=config))
-    assert [m["kind"] for m in facts["missing"]] == ["crosscheck"]
-    assert "crosscheck.enabled = false" in facts["missing"][0]["why"]
+    facts, _, html, _ = written(tmp_path, view(config=config))
+    assert facts["missing"] == []
+    assert [m["kind"] for m in facts["absent"]] == ["crosscheck"]
+    assert "crosscheck.enabled = false" in facts["absent"][0]["why"]
+    assert 'class="note missing"' not in html
+    assert 'class="note neutral"' in html
     assert facts["complete"] is True
 
 
@@ -134,7 +137,7 @@ def test_gaps_of_the_truth_are_told_and_bridged(tmp_path: Path) -> None:
     truth = list(base.sequence.truth or ())
     truth[0] = truth[3] = None
     facts, _, _, _ = written(tmp_path, replace(base, sequence=replace(base.sequence, truth=tuple(truth))))
-    gaps = [m for m in facts["missing"] if m["kind"] == "no truth"]
+    gaps = [m for m in facts["absent"] if m["kind"] == "no truth"]
     assert gaps == [{"kind": "no truth", "what": "2 of 6 frames have no truth", "why": "frames 0, 3"}]
     errors = [r["error_m"] for r in facts["frames"]]
     assert [e is None for e in errors] == [True, False, False, True, False, False]
@@ -163,7 +166,9 @@ def test_a_single_pair_has_no_trajectory_and_lacks_none(tmp_path: Path) -> None:
     made["tile"] = Bundle({k: v for k, v in made["tile"].arrays.items() if k != "spread"}, made["tile"].meta)
     facts, page_, _, _ = written(tmp_path, view(made, products=one, frames=(0,)))
     assert facts["missing"] == []
-    assert facts["verdict"] == "Complete: one stereo pair, 1 of 1 elevation models, a path of 0.49 m."
+    assert (
+        facts["verdict"] == "Complete: one stereo pair, 1 of 1 elevation models, 1 of 1 local paths, a path of 0.49 m."
+    )
     assert not {"figure-8", "figure-9", "crosscheck", "overlap", "basic-pairs"} & set(page_.ids)
     assert "trajectory_drift" not in facts["metrics"]
 

@@ -1,0 +1,177 @@
+"""What a run delivers, what nobody asked for or the data do not allow, and what is missing: each from its facts.
+
+A path that was looked for and is not there is missing, though it is an answer: who reads "nothing is missing" takes it
+for granted. Truth that the data do not have and a comparison that is switched off are not missing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from pipeline.report.block import Gallery
+from pipeline.report.gather import Scene
+from pipeline.report.view import RunView
+from pipeline.report.words import metres, spans
+
+Rows = list[dict[str, Any]]
+Items = list[dict[str, str]]
+
+ANSWERS = ("no path", "crosscheck")
+"""Kinds of what is missing that are answers, or lie outside of the reconstruction: the run is complete with them."""
+
+
+@dataclass(frozen=True)
+class Delivery:
+    """``delivered`` in words; ``absent`` (neutral) and ``missing``: ``kind``, ``what``, ``why`` each."""
+
+    delivered: list[str]
+    absent: Items
+    missing: Items
+
+    @property
+    def complete(self) -> bool:
+        """Whether all of the reconstruction is there."""
+        return all(m["kind"] in ANSWERS for m in self.missing)
+
+
+def account(scene: Scene, frames: Rows, pairs: Rows, gallery: Gallery) -> Delivery:
+    """All that a reader might take for granted, in one of the three states."""
+    view = scene.view
+    missing = _failures(view) + _poses(frames) + _local_paths(pairs) + _path(view) + _crosscheck_lost(scene)
+    missing += [_item("figure", title, reason) for title, reason in gallery.absent]
+    return Delivery(_delivered(view, frames, pairs), _truth(view) + _crosscheck_off(view), missing)
+
+
+def has_truth(view: RunView) -> list[bool]:
+    """Whether each chosen frame has a true pose."""
+    truth = view.sequence.truth
+    return [truth is not None and truth[frame] is not None for frame in view.frames]
+
+
+def which(frames: list[int]) -> str:
+    """``frames 1-3, 7``."""
+    return f"frame{'s' if len(frames) > 1 else ''} {spans(frames)}"
+
+
+def local_paths(pairs: Rows) -> tuple[int, int]:
+    """How many stops have a local path, of how many at which one was looked for."""
+    asked = [r for r in pairs if r["path"] is not None]
+    return sum(r["path"] == "found" for r in asked), len(asked)
+
+
+def start_of_path(view: RunView) -> float | None:
+    """Distance in plan, m, of the path's start from the first left camera, the origin of the world; None: no path."""
+    path = view.bundle(view.products.path)
+    if path is None or not len(path["path"]):
+        return None
+    return float(np.hypot(*np.asarray(path["path"])[0, :2]))
+
+
+def start_words(view: RunView) -> str:
+    """Where the path starts, with a comma before it; empty where that is within the vehicle's length of the camera."""
+    away, vehicle = start_of_path(view), view.config.vehicle
+    if away is None or away <= vehicle.wheel_base + vehicle.wheel_diameter:
+        return ""
+    return f", which starts {metres(away)} from the first camera"
+
+
+def _delivered(view: RunView, frames: Rows, pairs: Rows) -> list[str]:
+    words = ["every task was done"] if view.tasks else []
+    words += ["every frame has a pose"] if len(frames) > 1 and all(r["in_world"] for r in frames) else []
+    found, asked = local_paths(pairs)
+    words += ["every stop has a local path"] if asked and found == asked else []
+    drive, away = view.products.drive, start_of_path(view)
+    words += ["the goal was reached"] if drive is not None and drive.verdict == "goal" else []
+    words += [f"a path over the merged terrain was found{start_words(view)}"] if away is not None else []
+    return words
+
+
+def _failures(view: RunView) -> Items:
+    found = [_item("failed", t.label, t.reason) for t in view.tasks if t.status == "failed"]
+    skipped = [t for t in view.tasks if t.status not in ("computed", "cached", "failed")]
+    for reason in dict.fromkeys(t.reason for t in skipped):
+        labels = [t.label for t in skipped if t.reason == reason]
+        more = f" and {len(labels) - 6} more" if len(labels) > 6 else ""
+        found.append(_item("skipped", ", ".join(labels[:6]) + more, reason or "something it depends on is missing"))
+    return found
+
+
+def _poses(frames: Rows) -> Items:
+    found = []
+    lost = [r["frame"] for r in frames if not r["posed"]]
+    if lost:
+        found.append(_item("no pose", f"{len(lost)} of {len(frames)} frames have no pose", which(lost)))
+    apart = [r["frame"] for r in frames if r["posed"] and not r["in_world"]]
+    if apart:
+        what = f"{len(apart)} of {len(frames)} frames have a pose in another piece of the trajectory, not in the world"
+        found.append(_item("piece", what, which(apart)))
+    return found
+
+
+def _local_paths(pairs: Rows) -> Items:
+    """Stops without a local path, each reason with its frames."""
+    found, asked = local_paths(pairs)
+    if found == asked:
+        return []
+    without = [r for r in pairs if r["path"] not in (None, "found")]
+    reasons = dict.fromkeys(r["path"] for r in without)
+    why = "; ".join(f"{reason} ({which([r['frame'] for r in without if r['path'] == reason])})" for reason in reasons)
+    return [_item("no path", f"{asked - found} of {asked} stops have no local path", why)]
+
+
+def _path(view: RunView) -> Items:
+    drive = view.products.drive
+    if drive is not None:
+        return [] if drive.verdict == "goal" else [_item("no path", f"Drive: {drive.verdict}", drive.reason)]
+    path = view.bundle(view.products.path)
+    if path is None:
+        return [_item("no path", "No path", "the path over the merged terrain was not computed")]
+    if path.meta.get("found"):
+        return []
+    row, y = path.meta.get("blocking_row"), path.meta.get("blocking_y")
+    where = "" if row is None else f"; blocked at row {row}" + ("" if y is None else f", {y:.3g} m ahead")
+    return [_item("no path", "No path", (path.meta.get("reason") or "the far row cannot be reached") + where)]
+
+
+def _truth(view: RunView) -> Items:
+    known = has_truth(view)
+    if all(known):
+        return []
+    if any(known):
+        gaps = [frame for frame, there in zip(view.frames, known, strict=True) if not there]
+        return [_item("no truth", f"{len(gaps)} of {len(known)} frames have no truth", which(gaps))]
+    owner = "the sequence has none" if view.sequence.truth is None else "it has none for the chosen frames"
+    return [_item("no truth", "No truth", f"{owner}, so accuracy is not assessed")]
+
+
+def _crosscheck_off(view: RunView) -> Items:
+    params = getattr(view.config, "crosscheck", None)
+    if len(view.frames) < 2 or view.products.crosscheck is not None or params is None or params.enabled:
+        return []
+    why = "the crosscheck is switched off (crosscheck.enabled = false)"
+    return [_item("crosscheck", "No second opinion on the trajectory", why)]
+
+
+def _crosscheck_lost(scene: Scene) -> Items:
+    """Frames that the other program was asked for and could not pose."""
+    view, compared = scene.view, scene.comparison
+    if len(view.frames) < 2 or compared is None:
+        return []  # a task that failed or was skipped is told of by itself
+    lost = [frame for frame, there in zip(view.frames, compared.registered, strict=True) if not there]
+    if not lost:
+        return []
+    joined = view.bundle(view.products.crosscheck)
+    meta = {} if joined is None else joined.meta
+    reasons = [f"COLMAP has no pose of {which(lost)}"]
+    if len(meta.get("pieces") or ()) > 1:
+        reasons.append(f"its trajectory falls into {len(meta['pieces'])} pieces, each laid on ours by itself")
+    reasons += [str(w["reason"]) for w in meta.get("windows") or () if w.get("reason")]
+    what = f"{len(lost)} of {len(view.frames)} frames are not compared with another program"
+    return [_item("crosscheck", what, "; ".join(dict.fromkeys(reasons)))]
+
+
+def _item(kind: str, what: str, why: str) -> dict[str, str]:
+    return {"kind": kind, "what": what, "why": why}
