@@ -28,6 +28,7 @@ def test_mockup(tmp_path: Path) -> None:
     m = metrics("mockup", tmp_path)
     assert m["frames_posed"] == 40
     assert m["trajectory_drift"] <= 0.20  # percent of the path
+    assert 0.5 <= m["trajectory_nees"] <= 2.0  # claimed covariances are those of the errors
     assert m["dem_pairs_rmse_max"] <= 1.0e-3
     assert m["dem_pairs_completeness_min"] >= 0.65
     assert 0.05 <= m["path_check_hazardous_share"] <= 0.40

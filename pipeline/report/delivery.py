@@ -70,12 +70,12 @@ def start_of_path(view: RunView) -> float | None:
     return float(np.hypot(*np.asarray(path["path"])[0, :2]))
 
 
-def start_words(view: RunView) -> str:
-    """Where the path starts, with a comma before it; empty where that is within the vehicle's length of the camera."""
+def start_words(view: RunView, lead: str = ", which ") -> str:
+    """Where the path starts, behind a ``lead``; empty where that is within the vehicle's length of the camera."""
     away, vehicle = start_of_path(view), view.config.vehicle
     if away is None or away <= vehicle.wheel_base + vehicle.wheel_diameter:
         return ""
-    return f", which starts {metres(away)} from the first camera"
+    return f"{lead}starts {metres(away)} from the first camera"
 
 
 def _delivered(view: RunView, frames: Rows, pairs: Rows) -> list[str]:

@@ -134,9 +134,10 @@ def _path_words(scene: Scene) -> str:
     ground = "" if path is None else path.meta.get("ground", "")
     before, beyond = (path.meta.get("left_out_m") if path is not None else None) or (0.0, 0.0)
     vehicle = scene.view.config.vehicle
-    rest = ""
+    start = start_words(scene.view, " It ")
+    rest = f"{start}." if start else ""
     if max(before, beyond) > vehicle.wheel_base + vehicle.wheel_diameter:
-        rest = (
+        rest += (
             f" It crosses the connected ground over most rows: {length(before)} of nearer and {length(beyond)} of "
             "farther rows are left out, which the vehicle cannot reach from there."
         )
@@ -147,7 +148,7 @@ def _path_words(scene: Scene) -> str:
     }.get(ground, "unknown ground is not entered")
     return (
         f"The path (black line, ring: start, disk: target) is that of the vehicle's middle; its wheels keep {margin} "
-        f"from hazards; {known}{start_words(scene.view)}.{rest}"
+        f"from hazards; {known}.{rest}"
     )
 
 

@@ -233,6 +233,7 @@ def test_a_path_says_where_it_starts_when_that_is_not_at_the_vehicle(tmp_path: P
     assert facts["metrics"]["path_start"]["value"] == pytest.approx(0.21)
     assert facts["verdict"].endswith("a path of 0.49 m, which starts 0.210 m from the first camera.")
     assert "a path over the merged terrain was found, which starts 0.210 m from the first camera" in page_.text
+    assert "no unknown ground comes under its outline. It starts 0.210 m from the first camera." in page_.text
     near, _, _, _ = written(tmp_path, view())
     assert "which starts" not in near["verdict"]
 
