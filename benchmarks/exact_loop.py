@@ -16,7 +16,7 @@ import math
 from pathlib import Path
 from typing import Any
 
-from driving.beds import COVERS, choose_goal, config_of, prepared
+from driving.beds import COVERS, NOMINAL, choose_goal, config_of, prepared
 from driving.ratios import HEADINGS, Ratios
 
 FARTHEST = 0.035
@@ -104,6 +104,8 @@ def main() -> None:
 
     given = arguments()
     prepare_environment()
+    from driving.exact_bed import ExactBed
+
     rows = [json.loads(line) for line in given.out.read_text().splitlines()] if given.out.exists() else []
     done = {(r["seed"], r["cover"]) for r in rows}
     first, end = (int(v) for v in given.seeds.split(":"))
@@ -115,7 +117,7 @@ def main() -> None:
             more += [] if given.detail is None else [f"drive.detail={given.detail}"]
             sequence, layers = prepared(more)
             config = config_of(layers)
-            goal = choose_goal(sequence, config)
+            goal = choose_goal(ExactBed.of(sequence, config, NOMINAL), config)
             found = {"verdict": "not driven", "shortest_way": None} if goal is None else drive(sequence, config, goal)
             rows.append({"seed": seed, "cover": cover, **found})
             with given.out.open("a") as file:

@@ -4,8 +4,10 @@
     benchmarks/loop.py --reflex 100        an obstacle of one wheel radius laid on the way after its ground was mapped
 
 The goal of each bed is the place nearest to (0, 1) m to which a path exists on the exact map, and where there is room
-to turn, at least 0.7 m from the start. Violations are counted by the true placement of the wheels; what is possible,
-and the shortest way, is found on the risk map of the exact elevations by the same planner for the same vehicle.
+to turn, at least 0.7 m from the start. Violations are counted by the true placement of the wheels, of drives that
+failed, too. Ways are compared with two shortest ones: by own measures, on the risk map of the exact elevations by the
+same planner for the same vehicle, which says what is possible, too; and by the limits alone, over all places where the
+wheels on the exact ground keep to the vehicle's limits (``driving/limits.py``).
 Intervals are of 95 %, Wilson's of shares and resampled ones of lengths. Runs that ``--out`` holds already are not
 repeated, so that a benchmark that is interrupted goes on; several processes may share the seeds, each with a file of
 its own, which put together are read by ``--table``.
@@ -23,8 +25,10 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from driving.beds import COVERS, choose_goal, config_of, prepared
+from driving.beds import COVERS, NOMINAL, choose_goal, config_of, prepared
 from driving.ratios import HEADINGS, Ratios, share
+
+LIMITS = "shortest_within_limits"
 
 
 def arguments() -> argparse.Namespace:
@@ -41,6 +45,9 @@ def arguments() -> argparse.Namespace:
 
 def drive(settings: list[str]) -> dict[str, Any]:
     """One drive in a store of its own; figures of it."""
+    from driving.exact_bed import ExactBed
+    from driving.limits import shortest_within_limits
+
     from pipeline import driver
     from pipeline.dag import Graph
     from pipeline.drive import Drive
@@ -48,7 +55,9 @@ def drive(settings: list[str]) -> dict[str, Any]:
 
     begin = time.perf_counter()
     sequence, layers = prepared(settings)
-    goal = choose_goal(sequence, config_of(layers))
+    config = config_of(layers)
+    bed = ExactBed.of(sequence, config, NOMINAL)
+    goal = choose_goal(bed, config)
     if goal is None:
         return {"verdict": "not driven", "reason": "", "path_exists": False, "seconds": time.perf_counter() - begin}
     graph, folder = Graph(), Path(tempfile.mkdtemp(prefix="loop-"))
@@ -61,7 +70,9 @@ def drive(settings: list[str]) -> dict[str, Any]:
     finally:
         shutil.rmtree(folder, ignore_errors=True)
     errors = [f"{f.label}: {f.error}" for f in result.failures]
-    return {**found, "goal": goal, "errors": errors, "seconds": time.perf_counter() - begin}
+    seconds = time.perf_counter() - begin
+    least = shortest_within_limits(bed, goal, config.leg)
+    return {**found, "goal": goal, "shortest_within_limits": least, "errors": errors, "seconds": seconds}
 
 
 def figures(flow: Any, store: Any) -> dict[str, Any]:
@@ -86,7 +97,7 @@ def figures(flow: Any, store: Any) -> dict[str, Any]:
 def table(rows: list[dict[str, Any]]) -> list[str]:
     """The drives by rock cover and all together, and what was worst on all of them."""
     heads = ["rock cover", "beds", "with a path", "goal reached", "drives with a violation", "drift, median, worst"]
-    heads += HEADINGS
+    heads += [f"{h} ({by})" for by in ("own measures", "limits alone") for h in HEADINGS]
     lines = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
     for cover in [*sorted({r["cover"] for r in rows}), None]:
         mine = [r for r in rows if cover in (None, r["cover"])]
@@ -100,6 +111,7 @@ def table(rows: list[dict[str, Any]]) -> list[str]:
         cells += [f"{len(broken)}: {share(len(broken), len(judged))}"]
         cells += [f"{median(drift):.2f}, {drift[-1]:.2f} %" if drift else "-"]
         cells += Ratios([(r["way"], r["shortest_way"]) for r in reached]).cells()
+        cells += Ratios([(r["way"], r[LIMITS]) for r in reached if r.get(LIMITS)]).cells()
         lines.append(f"| {' | '.join(cells)} |")
     return [*lines, *worst(rows)]
 

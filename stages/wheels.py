@@ -122,28 +122,55 @@ def wheel_positions(vehicle: Vehicle) -> Floats:
     return np.array([[-a, b], [a, b], [-a, -b], [a, -b]])
 
 
+@dataclass(frozen=True)
+class Measures:
+    """How a vehicle stands at poses (n,): ``middle`` m, ``rise`` and ``lean`` (gradients ahead and to the right) of the
+    plane between its wheels, and ``tilt`` rad, ``clearance`` m, ``step`` m as of :class:`Stand`; NaN off the ground."""
+
+    middle: Floats
+    rise: Floats
+    lean: Floats
+    tilt: Floats
+    clearance: Floats
+    step: Floats
+
+
+def measured(ground: Ground, x: Floats, y: Floats, heading: Floats, vehicle: Vehicle) -> Measures:
+    """The vehicle with its centre above points (n,), m, turned by ``heading`` (n,), rad to the left of y."""
+    c, s = np.cos(heading)[:, None], np.sin(heading)[:, None]
+
+    def at(what: Floats, points: Floats) -> Floats:
+        """Values (n, m) at points (m, 2) right and ahead of the centre."""
+        right, ahead = points.T
+        there = np.stack([x[:, None] + c * right - s * ahead, y[:, None] + s * right + c * ahead], axis=-1)
+        return ground.at(what, there.reshape(-1, 2)).reshape(len(x), -1)
+
+    wheels = wheel_positions(vehicle)
+    z = at(ground.resting, wheels)
+    rise = 0.5 * (z[:, 0] + z[:, 1] - z[:, 2] - z[:, 3]) / vehicle.wheel_base
+    lean = 0.5 * (z[:, 1] + z[:, 3] - z[:, 0] - z[:, 2]) / vehicle.track
+    middle = z.mean(axis=1)
+    half = np.linspace(-0.5, 0.5, BELLY_POINTS)
+    across, along = np.meshgrid(half * (vehicle.track - 0.2 * vehicle.wheel_diameter), half * vehicle.wheel_base)
+    belly = np.stack([across.ravel(), along.ravel()], axis=1)
+    plane = middle[:, None] + lean[:, None] * belly[:, 0] + rise[:, None] * belly[:, 1]
+    free = plane + vehicle.clearance - at(ground.height, belly)
+    clearance = np.where(np.isnan(free), np.inf, free).min(axis=1)
+    clearance = np.where(np.isfinite(middle) & np.isfinite(clearance), clearance, np.nan)
+    return Measures(middle, rise, lean, np.arctan(np.hypot(lean, rise)), clearance, at(ground.step, wheels).max(axis=1))
+
+
 def stand(ground: Ground, x: float, y: float, heading: float, vehicle: Vehicle) -> Stand | None:
     """The vehicle with its centre above (x, y), turned by ``heading`` (rad, to the left of y); None: off the ground."""
-    c, s = math.cos(heading), math.sin(heading)
-    turn = np.array([[c, -s], [s, c]])
-    wheels = wheel_positions(vehicle)
-    at = wheels @ turn.T + [x, y]
-    z = ground.at(ground.resting, at)
-    if not np.isfinite(z).all():
+    found = measured(ground, np.array([x]), np.array([y]), np.array([heading]), vehicle)
+    if not np.isfinite(found.middle[0]):
         return None
-    rise = 0.5 * (z[0] + z[1] - z[2] - z[3]) / vehicle.wheel_base
-    lean = 0.5 * (z[1] + z[3] - z[0] - z[2]) / vehicle.track
-    middle = float(z.mean())
+    lean, rise = float(found.lean[0]), float(found.rise[0])
+    c, s = math.cos(heading), math.sin(heading)
     up = np.array([-lean, -rise, 1.0]) / math.sqrt(1.0 + lean * lean + rise * rise)
     ahead = np.array([0.0, 1.0, rise]) / math.sqrt(1.0 + rise * rise)
     right = np.cross(ahead, up)
     level = np.stack([right, ahead, up], axis=1)
     R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    pose = RigidTransform(R @ level, np.array([x, y, middle]))
-    half = np.linspace(-0.5, 0.5, BELLY_POINTS)
-    across, along = np.meshgrid(half * (vehicle.track - 0.2 * vehicle.wheel_diameter), half * vehicle.wheel_base)
-    belly = np.stack([across.ravel(), along.ravel()], axis=1)
-    terrain = ground.at(ground.height, belly @ turn.T + [x, y])
-    free = middle + lean * belly[:, 0] + rise * belly[:, 1] + vehicle.clearance - terrain
-    step = ground.at(ground.step, at)
-    return Stand(pose, math.acos(min(1.0, float(up[2]))), float(np.nanmin(free)), float(step.max()))
+    pose = RigidTransform(R @ level, np.array([x, y, float(found.middle[0])]))
+    return Stand(pose, float(found.tilt[0]), float(found.clearance[0]), float(found.step[0]))

@@ -11,16 +11,16 @@ LEAST = 0.7
 COVERS = (0.05, 0.1)
 
 
-def choose_goal(sequence: Any, config: Any) -> tuple[float, float] | None:
-    """The place nearest to the nominal goal that can be driven to on the exact map, and where there is room to turn."""
+def choose_goal(bed: Any, config: Any) -> tuple[float, float] | None:
+    """The place nearest to the nominal goal that can be driven to on the exact map of a bed
+    (:class:`driving.exact_bed.ExactBed` to :data:`NOMINAL`), and where there is room to turn."""
     import numpy as np
 
-    from driving.exact_bed import ExactBed
     from stages.footing import Footing
     from stages.leg_ground import Ground
     from stages.risk import risk_map
 
-    bed, cell = ExactBed.of(sequence, config, NOMINAL), config.locus.cell_size
+    cell = config.locus.cell_size
     judged = risk_map(bed.elevation, np.zeros_like(bed.elevation), cell, config.vehicle, config.risk)
     footing = Footing.of(judged["risk"], judged["reason"], bed.lattice, config.vehicle)
     start, heading = bed.start()
