@@ -463,6 +463,9 @@ class Drive(Reconstruction):
 
     def _end(self, verdict: str, reason: str) -> None:
         """Say how it ended, and assess it: here alone truth and estimates meet."""
+        closed = self._closed()
+        if verdict == "safety stop" and closed:  # it was but looking around once more
+            verdict, reason = "no path", f"{closed}, then a safety stop: {reason}"
         self.driven.verdict, self.driven.reason = verdict, reason
         p, s = self.products, self.simulation
         first = p.level.get(0)
@@ -489,6 +492,11 @@ class Drive(Reconstruction):
             self._check()
 
         self.graph.expand([first], ground)
+
+    def _closed(self) -> str:
+        """Why there is no way, in words, where the last leg was a look around for that; empty where there was one."""
+        legs = [s.leg.ref.meta for s in self.driven.stops if s.leg is not None and s.leg.ref is not None]
+        return str(legs[-1]["reason"]) if legs and legs[-1]["verdict"] == "look" and not legs[-1]["way_m"] else ""
 
     def _check(self) -> None:
         """The drive against the truth."""

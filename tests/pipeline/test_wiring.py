@@ -15,7 +15,7 @@ from pipeline.reconstruct import Reconstruction
 
 HERE = [1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0]
 BOX = {"x0": 0.0, "y0": 0.0, "cell": 0.01, "rows": 4, "cols": 4}
-LEG = {"start": [0.0, 0.0, 0.0], "where": None, "reason": "", "left_m": 1.0}
+LEG = {"start": [0.0, 0.0, 0.0], "where": None, "reason": "", "left_m": 1.0, "way_m": 1.0}
 
 FACTS: dict[str, dict[str, Any]] = {
     "continuity": {"asks": {"bridges": [], "sides": []}, "chain": [0, 1, 2], "lost": [], "unfit": []},
@@ -55,8 +55,9 @@ def grown(flow: Reconstruction, failing: str = "") -> Graph:
             if handle.stage == "footprint":
                 meta = meta | {"pair": int(handle.label.split("/")[1])}
             if handle.stage == "leg":
-                meta, legs = LEG | {"verdict": "goal" if legs else "drive"}, legs + 1
-            facts.append(SimpleNamespace(meta=meta))
+                meta, legs = LEG | {"verdict": "goal" if legs else "drive"} | meta, legs + 1
+            handle.ref = SimpleNamespace(meta=meta)  # type: ignore[assignment]
+            facts.append(handle.ref)  # type: ignore[arg-type]
         if all(facts) or holes:
             grow(*facts)
     return flow.graph
@@ -82,6 +83,21 @@ def test_a_drive_that_fails_at_the_start_is_judged_where_it_stands() -> None:
     assert check is not None
     assert set(check.inputs) == {"drives"}
     assert check.spec.args["rows"] == [0]
+
+
+@pytest.mark.parametrize(("way_m", "verdict"), [(0.0, "no path"), (0.7, "safety stop")])
+def test_a_safety_stop_of_a_look_around_where_there_is_no_way_is_no_path(
+    way_m: float, verdict: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sequence = open_sequence("mockup-loop")
+    flow = Drive(Graph(), sequence, config.build(config.expand(sequence.defaults)))
+    found = {"verdict": "look", "way_m": way_m, "reason": "hazards close every way"}
+    monkeypatch.setitem(FACTS, "leg", found)
+    monkeypatch.setitem(FACTS, "safety", {"stop": 1, "kind": "lost", "reason": "0 landmarks"})
+    grown(flow)
+    assert flow.driven.verdict == verdict
+    assert flow.driven.reason.endswith("0 landmarks")
+    assert flow.driven.check is not None
 
 
 def ports(graph: Graph) -> dict[str, set[frozenset[str]]]:
