@@ -17,11 +17,13 @@ from pathlib import Path
 from datasets import files
 from datasets.cameras import CalibratedCamera, read_cameras, rig_of
 from datasets.cameras.fields import Fields
-from datasets.cameras.text import parse_yaml, read_text
+from datasets.cameras.text import parse_yaml
 from datasets.imu import Inertial, at_frames, read_imu
+from datasets.names import derived_name
 from datasets.pairing import Pair, common_size
 from datasets.poses import coverage, interpolate, read_poses
 from datasets.protocol import CAMERAS, Sequence, Source
+from datasets.reading import read_text
 from datasets.tables import read_table
 from datasets.times import seconds
 from stages.errors import InputError
@@ -80,7 +82,7 @@ def recognise(path: Path) -> Layout | None:
     truth = next((folder / name for name in TRUTH if (folder / name / "data.csv").is_file()), None)
     imu = folder / "imu0"
     name = folder.parent.name if folder.name == "mav0" else folder.name
-    return Layout(name, folder, truth, imu if (imu / "data.csv").is_file() else None)
+    return Layout(derived_name(name), folder, truth, imu if (imu / "data.csv").is_file() else None)
 
 
 def open_euroc(layout: Layout, digests: files.Digests) -> Sequence:
@@ -210,7 +212,7 @@ def body_pose(folder: Path) -> RigidTransform | None:
     path = folder / "sensor.yaml"
     if not path.is_file():
         return None
-    fields = Fields(parse_yaml(read_text(path), str(path)), str(path))
+    fields = Fields(parse_yaml(read_text(path, "calibration"), str(path)), str(path))
     return fields.pose("T_BS") if "T_BS" in fields else None
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import hashlib
 import struct
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +14,20 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from datasets.headers import PNG_SIGNATURE, Header, read_header
 from datasets.protocol import Source
+from datasets.reading import open_regular, read_bytes
 from stages.declare import Array, Bundle, Inputs, NoParams, Stage
 from stages.errors import InputError
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".pgm")
-PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+MOST_PIXELS = 160_000_000
+"""Of one image: the largest sensors have 150 million."""
+
+MOST_BYTES = 2**29
+"""Of one image file."""
+
+FEWER_BITS = "save it with 8 or 16 bits a sample"
 COPY_AGAIN = "copy the file again, or leave its frame out with --frames"
 
 Grey = NDArray[np.uint8] | NDArray[np.uint16]
@@ -52,7 +61,7 @@ def _damage(data: bytes) -> str:
     return ""
 
 
-def decode(data: bytes, name: str) -> Grey:
+def decode(data: bytes, name: str, wanted: Header | None = None) -> Grey:
     """Grey image of an encoded file.
 
     Colour becomes grey by ITU-R BT.601, 0.299 R + 0.587 G + 0.114 B; an alpha channel is dropped, an orientation tag
@@ -62,6 +71,7 @@ def decode(data: bytes, name: str) -> Grey:
     ----------
     data : the file's bytes.
     name : what to call it in an error.
+    wanted : width, height and bits that it must have; the header is compared before anything is unpacked.
 
     Returns
     -------
@@ -70,55 +80,77 @@ def decode(data: bytes, name: str) -> Grey:
     Raises
     ------
     InputError
-        The file is truncated, damaged, of another kind, or its samples are neither 8- nor 16-bit.
+        The file is truncated, damaged, of another kind, size or depth, or its samples are neither 8- nor 16-bit.
     """
     damage = _damage(data)
     if damage:
         raise InputError("RIL-170", f"{name} {damage}", remedy=COPY_AGAIN)
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    header = _sound(read_header(BytesIO(data)), name)
+    if wanted is not None:
+        check_size((*header[:2], wanted[2]), wanted, name)
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        image = None
     if image is None:
-        raise InputError(
-            "RIL-171", f"{name} cannot be read as an image", remedy=f"{COPY_AGAIN}; PNG, JPEG, TIFF and PGM are read"
-        )
+        raise InputError("RIL-763", f"{name} cannot be decoded", remedy=COPY_AGAIN)
     if image.dtype not in (np.uint8, np.uint16):
-        raise InputError(
-            "RIL-172", f"{name} has samples of type {image.dtype}", remedy="save it with 8 or 16 bits a sample"
-        )
+        raise InputError("RIL-172", f"{name} has samples of type {image.dtype}", remedy=FEWER_BITS)
     if image.ndim == 3 and image.shape[2] >= 3:
         image = cv2.cvtColor(np.ascontiguousarray(image[:, :, :3]), cv2.COLOR_BGR2GRAY)
     elif image.ndim == 3:
         image = image[:, :, 0]
     grey: Grey = np.ascontiguousarray(image)
+    if wanted is not None:
+        check_size((grey.shape[1], grey.shape[0], grey.dtype.itemsize * 8), wanted, name)
     return grey
 
 
-def read_grey(path: Path, name: str = "") -> Grey:
+def _sound(header: Header | None, name: str) -> Header:
+    """A header of an image that may be decoded."""
+    if header is None:
+        raise InputError(
+            "RIL-171", f"{name} cannot be read as an image", remedy=f"{COPY_AGAIN}; PNG, JPEG, TIFF and PGM are read"
+        )
+    width, height, bits = header
+    if bits > 16:
+        raise InputError("RIL-761", f"{name} has samples of {bits} bits", remedy=FEWER_BITS)
+    if not 0 < width * height <= MOST_PIXELS:
+        raise InputError(
+            "RIL-762",
+            f"{name} has {width} x {height} pixels, 1 to {MOST_PIXELS / 1e6:g} million are read",
+            remedy="leave its frame out, or give smaller images",
+        )
+    return header
+
+
+def read_grey(path: Path) -> Grey:
     """Grey image (row, col), uint8 or uint16, of a file (see :func:`decode`)."""
-    return decode(_bytes(path), name or str(path))
+    return decode(read_bytes(path, "image", MOST_BYTES), str(path))
 
 
-def _bytes(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise InputError(
-            "RIL-173", f"{path} cannot be read: {error.strerror}", remedy="check the path and its rights"
-        ) from error
+def common_header(paths: Sequence[Path]) -> Header:
+    """Width, height and bits a sample that all images share; one without a header is left to its reading.
+
+    Raises
+    ------
+    InputError
+        The first image is none, or none that is ever decoded; or another one has a different size or depth.
+    """
+    first = _header(paths[0])
+    if first is None:
+        read_grey(paths[0])  # says what is wrong
+    wanted = _sound(first, str(paths[0]))
+    for path in paths[1:]:
+        found = _header(path)
+        if found is not None:
+            check_size(found, wanted, str(path))
+    return wanted
 
 
-def png_header(path: Path) -> tuple[int, int, int] | None:
-    """Width, height, bits a sample of a PNG from its first bytes; None for other kinds of file."""
-    try:
-        with path.open("rb") as file:
-            head = file.read(26)
-    except OSError as error:
-        raise InputError(
-            "RIL-174", f"{path} cannot be read: {error.strerror}", remedy="check the path and its rights"
-        ) from error
-    if len(head) < 26 or not head.startswith(PNG_SIGNATURE):
-        return None
-    width, height, bits = struct.unpack_from(">IIB", head, 16)
-    return width, height, 8 if bits <= 8 else bits
+def _header(path: Path) -> Header | None:
+    with open_regular(path, "image", MOST_BYTES) as file:
+        return read_header(file)
 
 
 class Digests:
@@ -145,7 +177,8 @@ class Digests:
             raise InputError("RIL-175", f"{path} cannot be read: {error.strerror}", remedy="check the path") from error
         key = f"{status.st_size} {status.st_mtime_ns} {path.resolve()}"
         if key not in self._known:
-            self._known[key] = hashlib.sha256(_bytes(path)).hexdigest()
+            with open_regular(path, "image", MOST_BYTES) as file:
+                self._known[key] = hashlib.file_digest(file, "sha256").hexdigest()
             if self._memory is not None:
                 self._memory.parent.mkdir(parents=True, exist_ok=True)
                 with self._memory.open("a", encoding="utf-8") as file:
@@ -181,12 +214,10 @@ def check_size(found: tuple[int, int, int], wanted: tuple[int, int, int], name: 
 
 def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     name = f"frame {args['frame']}, {args['camera']} image {args['path']}"
-    data = _bytes(Path(args["path"]))
+    data = read_bytes(Path(args["path"]), "image", MOST_BYTES)
     if hashlib.sha256(data).hexdigest() != args["sha256"]:
         raise InputError("RIL-177", f"{name} has changed since the run began", remedy="run the same command again")
-    image = decode(data, name)
-    found = (image.shape[1], image.shape[0], image.dtype.itemsize * 8)
-    check_size(found, (args["width"], args["height"], args["depth"]), name)
+    image = decode(data, name, (args["width"], args["height"], args["depth"]))
     meta = {"frame": args["frame"], "camera": args["camera"]}
     return Bundle({"image": image, "valid": np.ones(image.shape, np.uint8)}, meta)
 

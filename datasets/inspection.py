@@ -7,7 +7,6 @@ written as a comment that says what to fill in. Opening the manifest before that
 from __future__ import annotations
 
 import glob
-import os
 import re
 from collections import defaultdict
 from collections.abc import Iterable
@@ -18,6 +17,7 @@ import numpy as np
 
 from datasets.cameras import CalibratedCamera, read_cameras
 from datasets.pairing import SIDES, SUFFIXES, common_size, natural, pair_up, side_of
+from datasets.reading import Search, is_file, read_lines
 from stages.errors import InputError, RilleError
 
 DEPTH = 4
@@ -25,8 +25,8 @@ DEPTH = 4
 
 CALIBRATIONS = (".yaml", ".yml", ".xml", ".tsai", ".txt", ".toml", ".ini", ".cfg", ".json")
 TABLES = (".txt", ".csv", ".tum", ".dat")
-LARGEST_CALIBRATION = 1_000_000
-"""bytes; a text of calibration is a few kilobytes."""
+MOST_TEXTS = 200
+"""Text files that are tried as calibration and as table; some data sets have one for each image."""
 
 STAMP = re.compile(r"\d{10,}")
 """Seconds since 1970 have ten digits, their fractions more; frame numbers have fewer."""
@@ -82,12 +82,15 @@ def inspect(folder: Path) -> Findings:
     """
     if not folder.is_dir():
         raise InputError("RIL-193", f"{folder} is no folder", remedy="name a folder that holds images of two cameras")
-    paths = list(_files(folder))
+    paths = list(_files(folder, Search()))
     found = Findings(folder, find_views(folder, [p for p in paths if p.suffix.lower() in SUFFIXES]))
-    texts = [p for p in paths if p.suffix.lower() in CALIBRATIONS and p.stat().st_size <= LARGEST_CALIBRATION]
-    _find_calibration(found, texts)
+    texts = [p for p in paths if p.suffix.lower() in (*CALIBRATIONS, *TABLES)]
+    if len(texts) > MOST_TEXTS:
+        found.unread.append(f"of {len(texts)} text files only the first {MOST_TEXTS} were looked at")
+        texts = texts[:MOST_TEXTS]
+    _find_calibration(found, [p for p in texts if p.suffix.lower() in CALIBRATIONS])
     used = set(found.calibration.files if found.calibration else ()) | set(found.others)
-    for path in paths:
+    for path in texts:
         relative = _relative(path, folder)
         kind = table_kind(path, found.views.pairs) if path.suffix.lower() in TABLES and relative not in used else ""
         if kind:
@@ -95,13 +98,13 @@ def inspect(folder: Path) -> Findings:
     return found
 
 
-def _files(folder: Path) -> Iterable[Path]:
+def _files(folder: Path, search: Search, depth: int = 0) -> Iterable[Path]:
     """Files below a folder in natural order, hidden ones left out."""
-    for at, folders, names in os.walk(folder):
-        here = Path(at)
-        deep = len(here.relative_to(folder).parts) >= DEPTH
-        folders[:] = [] if deep else sorted((d for d in folders if not d.startswith(".")), key=natural)
-        yield from (here / n for n in sorted(names, key=natural) if not n.startswith("."))
+    entries = sorted((e for e in search.entries(folder) if not e.name.startswith(".")), key=lambda e: natural(e.name))
+    yield from (Path(e.path) for e in entries if is_file(e))
+    if depth < DEPTH:
+        for inner in (e for e in entries if e.is_dir(follow_symlinks=False)):
+            yield from _files(Path(inner.path), search, depth + 1)
 
 
 def _relative(path: Path, folder: Path) -> str:
@@ -229,9 +232,8 @@ def _calibration(names: tuple[str, ...], cameras: list[CalibratedCamera]) -> Cal
 def table_kind(path: Path, pairs: int) -> str:
     """What a table of numbers holds, by its header and first row: truth, imu, attitude, times, or nothing."""
     try:
-        with path.open(encoding="utf-8") as file:
-            lines = [line.strip() for line in file if line.strip()]
-    except (OSError, UnicodeDecodeError):
+        lines = [line.strip() for line in read_lines(path, "table") if line.strip()]
+    except InputError:
         return ""
     comments = [line for line in lines if not NUMBER.match(line)]
     rows = [line for line in lines if NUMBER.match(line)]

@@ -19,7 +19,9 @@ from numpy.typing import NDArray
 
 from datasets import files
 from datasets.manifest_rig import LONGEST_BASELINE
+from datasets.names import derived_name
 from datasets.protocol import CAMERAS, Sequence, Source
+from datasets.reading import read_lines
 from datasets.times import seconds
 from stages.errors import InputError
 from stages.geometry import Camera, Rig, RigidTransform, orthonormal
@@ -82,7 +84,7 @@ def recognise(path: Path, number: str | None = None) -> Layout | None:
     poses = next((p for p in (path / "poses.txt", *([beside] if standard else [])) if p.is_file()), None)
     times = path / "times.txt"
     return Layout(
-        name=f"kitti-{path.name}" if standard else path.name,
+        name=derived_name(f"kitti-{path.name}" if standard else path.name),
         folder=path,
         pair=pair,
         calib=path / "calib.txt",
@@ -97,12 +99,8 @@ def _first(names: list[str]) -> str:
 
 def _rows(path: Path, count: int, what: str, gaps: bool = False) -> list[tuple[str, NDArray[np.float64]]]:
     """Lines of a text file: (label or "", numbers); each must have ``count`` finite numbers, or only NaN for a gap."""
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError("RIL-199", f"{what} {path} cannot be read: {error}", remedy="check the file") from error
     out = []
-    for k, line in enumerate(lines, start=1):
+    for k, line in enumerate(read_lines(path, what), start=1):
         label, _, numbers = line.rpartition(":")
         if not numbers.strip():
             continue
@@ -272,20 +270,6 @@ def _counted(names: list[str]) -> list[str]:
     return [given.get(k, f"{k:0{len(names[0])}d}") for k in range(numbers[0], numbers[-1] + 1)]
 
 
-def _sizes(paths: dict[str, dict[int, Path]]) -> tuple[int, int, int]:
-    """Width, height and bits that all images share; those of PNG files are compared here, others when read."""
-    first = next(iter(paths["left"].values()))
-    wanted = files.png_header(first)
-    if wanted is None:
-        image = files.read_grey(first)
-        wanted = (image.shape[1], image.shape[0], image.dtype.itemsize * 8)
-    for path in [p for c in CAMERAS for p in paths[c].values()]:
-        found = files.png_header(path)
-        if found is not None:
-            files.check_size(found, wanted, str(path))
-    return wanted
-
-
 def _per_frame(
     path: Path, numbers: int, listing: Listing, what: str
 ) -> tuple[list[NDArray[np.float64] | None], list[int]]:
@@ -323,7 +307,7 @@ def open_kitti(layout: Layout, digests: files.Digests) -> Sequence:
         A partner is missing, sizes or depths differ, a text file does not parse, or counts do not agree.
     """
     listing = list_pairs(layout)
-    paths, size = listing.paths, _sizes(listing.paths)
+    paths, size = listing.paths, files.common_header([p for c in CAMERAS for p in listing.paths[c].values()])
     rig, T_reference_left = read_rig(layout, size[0], size[1])
     truth: tuple[RigidTransform | None, ...] | None = None
     times: tuple[float, ...] | None = None

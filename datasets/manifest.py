@@ -19,8 +19,10 @@ from datasets.georeference import georeference
 from datasets.manifest_model import Images, read_manifest
 from datasets.manifest_motion import read_motion
 from datasets.manifest_rig import read_optics
+from datasets.names import derived_name
 from datasets.pairing import Pair, common_size, pair_up
 from datasets.protocol import Sequence, Source
+from datasets.reading import Search
 from stages.errors import InputError
 
 VARIABLE = re.compile(r"\$\{(\w+)\}")
@@ -76,7 +78,7 @@ def open_manifest(path: Path, digests: files.Digests) -> Sequence:
 def default_name(path: Path) -> str:
     """Name of a sequence whose manifest states none: that of the file, or of its folder for ``manifest.toml``."""
     stem = path.name.removesuffix(".toml").removesuffix(".rille")
-    return path.resolve().parent.name if stem == "manifest" else stem
+    return derived_name(path.resolve().parent.name if stem == "manifest" else stem)
 
 
 def root_folder(text: str, path: Path) -> Path:
@@ -113,16 +115,12 @@ def find_pairs(images: Images, root: Path, name: str) -> tuple[Pair, ...]:
     InputError
         A pattern finds nothing, both find the same files, or images have no partners.
     """
-    found = {}
+    found, search = {}, Search()
     for side, pattern in (("left", images.left), ("right", images.right)):
         try:
-            paths = [path for path in root.glob(pattern) if path.is_file()]
-        except (ValueError, NotImplementedError) as error:
-            raise InputError(
-                "RIL-216",
-                f"{name}: images.{side} = {pattern!r} is no pattern: {error}",
-                remedy="give one relative to root",
-            ) from error
+            paths = search.matching(root, pattern)
+        except InputError as error:
+            raise error.at(f"{name}: images.{side}") from error
         if not paths:
             raise InputError(
                 "RIL-217",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -11,8 +10,9 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BeforeValidator, Discriminator, Field, Tag, ValidationError, model_validator
 
+from datasets.reading import read_toml
 from stages.declare import Params
-from stages.errors import InputError
+from stages.errors import InputError, told
 from stages.geometry import RigidTransform
 from stages.vehicle import Vehicle
 
@@ -253,21 +253,12 @@ def read_manifest(path: Path) -> Manifest:
     InputError
         It cannot be read, is not TOML, or a key is unknown, missing or not permitted; the message names the key.
     """
-    try:
-        values = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(
-            "RIL-221", f"manifest {path} cannot be read: {error.strerror}", remedy="check the path"
-        ) from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError("RIL-222", f"{path} is not TOML: {error}", remedy="correct the file at that place") from error
+    values = read_toml(path, "manifest")
     try:
         return Manifest.model_validate(values)
     except ValidationError as error:
-        lines = [_complaint(dict(e)) for e in error.errors()]
-        raise InputError(
-            "RIL-223", f"{path}: {'; '.join(lines)}", remedy="`rille init FOLDER` writes one to begin with"
-        ) from error
+        what = told(error.errors(), _complaint)
+        raise InputError("RIL-223", f"{path}: {what}", remedy="`rille init FOLDER` writes one to begin with") from error
 
 
 def _complaint(error: Mapping[str, Any]) -> str:

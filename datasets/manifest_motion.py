@@ -16,6 +16,7 @@ from datasets.manifest_rig import direction
 from datasets.pairing import Pair
 from datasets.poses import coverage, interpolate, read_poses
 from datasets.protocol import Rows
+from datasets.reading import read_lines
 from datasets.times import seconds
 from stages.errors import InputError
 from stages.geometry import RigidTransform
@@ -98,10 +99,7 @@ def _stamp(pair: Pair, name: str) -> str:
 
 def _times_of_file(path: Path, names: Sequence[str]) -> tuple[list[str], list[int]]:
     """Time stamps as text, in the order of the pairs, and the lines that they stand in."""
-    try:
-        text = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError("RIL-228", f"times {path} cannot be read: {error}", remedy="check the file") from error
+    text = read_lines(path, "times")
     rows = [(k, re.split(r"[,;\s]+", line.strip().strip(","))) for k, line in enumerate(text, start=1)]
     rows = [(k, words) for k, words in rows if words[0] and words[0][0] in "0123456789.+-"]
     by_name = {Path(words[1]).stem: (words[0], k) for k, words in rows if len(words) > 1}

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import re
-from pathlib import Path
-
 import tomli_w
 
 from datasets.inspection import Calibration, Findings
 from datasets.manifest_rig import LONGEST_BASELINE
+from datasets.names import derived_name
 
 NEEDED = "NEEDED"
 """Marks a line that must be filled in before the manifest opens."""
@@ -19,15 +17,10 @@ HEAD = """# A stereo sequence for Rille, written by `rille init` from what the f
 """
 
 
-def short_name(folder: Path) -> str:
-    """Name of a sequence in a folder, fit for a file name."""
-    return re.sub(r"[^A-Za-z0-9_.-]+", "_", folder.resolve().name).strip("_.") or "sequence"
-
-
 def manifest_text(found: Findings, root: str) -> str:
     """Manifest as TOML; ``root`` is the folder relative to the manifest (or absolute)."""
     parts = [
-        HEAD.format(needed=NEEDED) + "\n" + _pairs(name=short_name(found.folder), root=root),
+        HEAD.format(needed=NEEDED) + "\n" + _pairs(name=derived_name(found.folder.resolve().name), root=root),
         _images(found),
         _cameras(found),
         _rig(found),

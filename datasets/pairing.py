@@ -186,22 +186,8 @@ def _named(pairs: list[tuple[Path, Path]]) -> tuple[Pair, ...]:
 
 
 def common_size(pairs: Sequence[Pair]) -> tuple[int, int, int]:
-    """Width, height and bits that all images share; those of PNG files are compared here, others when read.
+    """Width, height and bits that all images share (see :func:`datasets.files.common_header`).
 
     Pairs of which a file is absent are left out.
-
-    Raises
-    ------
-    InputError
-        The first image cannot be read, or another one has a different size or depth.
     """
-    pairs = [pair for pair in pairs if not pair.absent]
-    wanted = files.png_header(pairs[0].left)
-    if wanted is None:
-        image = files.read_grey(pairs[0].left)
-        wanted = (image.shape[1], image.shape[0], image.dtype.itemsize * 8)
-    for path in [path for pair in pairs for path in (pair.left, pair.right)]:
-        found = files.png_header(path)
-        if found is not None:
-            files.check_size(found, wanted, str(path))
-    return wanted
+    return files.common_header([path for pair in pairs if not pair.absent for path in (pair.left, pair.right)])

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
 from datasets.georeference import Georeference
+from datasets.names import check_name
 from stages.declare import Params
 from stages.errors import InputError
 from stages.geometry import Rig, RigidTransform
@@ -151,6 +152,7 @@ class Sequence:
     simulation: Simulation | None = None
 
     def __post_init__(self) -> None:
+        check_name(self.name)
         if self.frames < 1:
             raise InputError(
                 "RIL-272", f"sequence {self.name} has no frames", remedy="give a folder with at least one pair"

@@ -19,7 +19,7 @@ from datasets.mockup.rover import RoverParams
 from datasets.mockup.sequence import mockup
 from datasets.protocol import Sequence
 from stages.declare import Params
-from stages.errors import ConfigError, InputError
+from stages.errors import ConfigError, InputError, told
 
 BUILT_IN: dict[str, tuple[str, Mapping[str, Any]]] = {
     "mockup": ("the paper's experiment, simulated: 40 pairs over a lunar bed at 1:10, with exact truth", {}),
@@ -152,8 +152,8 @@ def validated(kind: type[Params], section: str, values: Mapping[str, Any]) -> An
     try:
         return kind.model_validate(dict(values))
     except ValidationError as error:
-        lines = [_complaint(kind, section, dict(e)) for e in error.errors()]
-        raise ConfigError("RIL-280", "; ".join(lines), remedy="") from error
+        what = told(error.errors(), lambda e: _complaint(kind, section, e))
+        raise ConfigError("RIL-280", what, remedy="") from error
 
 
 def _complaint(kind: type[Params], section: str, error: dict[str, Any]) -> str:

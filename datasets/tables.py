@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from datasets.reading import read_lines
 from stages.errors import InputError
 
 NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$|[-+]?(nan|inf)$", re.IGNORECASE)
@@ -79,7 +80,7 @@ def read_table(path: Path, what: str) -> Table:
     InputError
         It cannot be read, has no rows, or rows differ in length.
     """
-    lines = _lines(path, what)
+    lines = read_lines(path, what)
     names, separator = "", None
     rows: list[tuple[str, ...]] = []
     at: list[int] = []
@@ -106,13 +107,6 @@ def read_table(path: Path, what: str) -> Table:
     header = split(names, separator) if names else ()
     header = header if len(header) == len(rows[0]) else ()
     return Table(str(path), tuple(name.lower() for name in header), tuple(rows), tuple(at), separator is not None)
-
-
-def _lines(path: Path, what: str) -> list[str]:
-    try:
-        return path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError("RIL-287", f"{what} {path} cannot be read: {error}", remedy="check the file") from error
 
 
 def split(text: str, separator: str | None) -> tuple[str, ...]:

@@ -26,6 +26,10 @@ SLOW = 3600.0
 """s; pairs an hour apart are possible, but a wrong unit is likelier."""
 
 
+LARGEST = 10**20
+"""Above it a value is no time in any unit: nanoseconds reach it in the year 5138."""
+
+
 def seconds(
     values: Sequence[str | int | float],
     what: str,
@@ -94,7 +98,7 @@ def _decimal(value: str | int | float, what: str, line: int) -> Decimal:
         exact = Decimal(text)
     except (InvalidOperation, ValueError):
         exact = Decimal("nan")
-    if not exact.is_finite():
+    if not exact.is_finite() or abs(exact) > LARGEST:
         raise InputError("RIL-291", f"{what}, line {line}: {value!r} is not a time", remedy="give numbers, one a frame")
     return exact
 

@@ -17,8 +17,9 @@ from typing import Any, Literal
 import tomli_w
 from pydantic import Field, ValidationError, create_model
 
+from datasets import reading
 from stages.declare import Params, Stage
-from stages.errors import ConfigError
+from stages.errors import ConfigError, told
 
 STAGE_MODULES: dict[str, str] = {
     "undistort": "stages.undistort",
@@ -148,20 +149,13 @@ def parse_assignments(assignments: Iterable[str]) -> dict[str, Any]:
 def _toml_value(text: str) -> Any:
     try:
         return tomllib.loads(f"v = {text}")["v"]
-    except tomllib.TOMLDecodeError:
+    except (ValueError, RecursionError):  # also numbers of thousands of digits
         return text
 
 
 def read_toml(path: Path) -> dict[str, Any]:
     """Configuration file to a nested mapping."""
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigError(
-            "RIL-025", f"cannot read configuration {path}: {error.strerror}", remedy="check --config"
-        ) from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError("RIL-026", f"{path} is not TOML: {error}", remedy="correct the file at that place") from error
+    return reading.read_toml(path, "configuration")
 
 
 def expand(dotted: Mapping[str, Any]) -> dict[str, Any]:
@@ -246,8 +240,7 @@ def validate(kind: type[Params], values: Mapping[str, Any], prefix: tuple[str, .
     try:
         return kind.model_validate(dict(values))
     except ValidationError as error:
-        lines = [_complaint(kind, prefix, dict(e), also) for e in error.errors()]
-        raise ConfigError("RIL-027", "; ".join(lines)) from error
+        raise ConfigError("RIL-027", told(error.errors(), lambda e: _complaint(kind, prefix, e, also))) from error
 
 
 def _complaint(kind: type[Params], prefix: tuple[str, ...], error: dict[str, Any], also: Iterable[str]) -> str:

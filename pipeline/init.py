@@ -6,7 +6,8 @@ import os
 from pathlib import Path
 
 from datasets.inspection import Findings, inspect
-from datasets.manifest_text import counted, manifest_text, needs, short_name
+from datasets.manifest_text import counted, manifest_text, needs
+from datasets.names import derived_name
 from datasets.registry import opens_as_it_is
 from stages.errors import ConfigError, InputError
 
@@ -33,12 +34,11 @@ def init(directory: Path, output: Path | None = None, force: bool = False) -> in
         print(f"{directory} opens as it is; --output or --force writes a manifest nevertheless")
         print(f"\nnext:\n  rille check {directory}\n  rille reconstruct {directory}")
         return COMPLETE
+    name = f"{derived_name(directory.resolve().name)}.rille.toml"
     found = inspect(directory)
-    path = output if output is not None else Path(f"{short_name(directory)}.rille.toml")
+    path = output if output is not None else Path(name)
     if path.suffix != ".toml":
-        raise ConfigError(
-            "RIL-037", f"--output {path} is no .toml file", remedy=f"e.g. {short_name(directory)}.rille.toml"
-        )
+        raise ConfigError("RIL-037", f"--output {path} is no .toml file", remedy=f"e.g. {name}")
     if path.exists() and not force:
         raise ConfigError(
             "RIL-038", f"{path} exists", remedy="name another file by --output, or overwrite it by --force"
@@ -50,7 +50,7 @@ def init(directory: Path, output: Path | None = None, force: bool = False) -> in
         raise InputError(
             "RIL-039",
             f"{path} cannot be written: {error.strerror}",
-            remedy=f"name another file, e.g. --output {short_name(directory)}.rille.toml",
+            remedy=f"name another file, e.g. --output {name}",
         ) from error
     print("\n".join(_report(found, path, needs(text))))
     return COMPLETE

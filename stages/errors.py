@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Self
+from collections.abc import Callable, Sequence
+from typing import Any, Self
 
 
 class RilleError(Exception):
@@ -44,3 +45,13 @@ class InputError(RilleError, ValueError):
 
 class DegenerateError(RilleError, ArithmeticError):
     """The data do not determine the answer (too few landmarks, no texture, no baseline ...)."""
+
+
+TOLD = 3
+"""Complaints of one kind in a message; whoever mends them sees the next."""
+
+
+def told(complaints: Sequence[Any], words: Callable[[Any], str]) -> str:
+    """The first complaints in words, and how many more there are."""
+    more = [f"and {len(complaints) - TOLD} more"] if len(complaints) > TOLD else []
+    return "; ".join([*map(words, complaints[:TOLD]), *more])

@@ -9,7 +9,8 @@ from datasets.cameras import boofcv, colmap, middlebury, opencv, slam, tsai
 from datasets.cameras.fields import Fields
 from datasets.cameras.model import UNKNOWN_SIZE, CalibratedCamera
 from datasets.cameras.pair import rig_of
-from datasets.cameras.text import parse_xml, parse_yaml, read_text
+from datasets.cameras.text import parse_xml, parse_yaml
+from datasets.reading import read_text
 from stages.errors import InputError
 
 __all__ = ["UNKNOWN_SIZE", "CalibratedCamera", "read_cameras", "rig_of"]
@@ -49,7 +50,7 @@ def read_cameras(path: Path) -> list[CalibratedCamera]:
     InputError
         The file cannot be read or holds no camera, or an entry is missing or wrong; then the line names the key.
     """
-    text = read_text(path)
+    text = read_text(path, "calibration")
     for recognises, read in PLAIN:
         if recognises(text):
             return read(text, path)

@@ -11,7 +11,7 @@ import numpy as np
 
 from datasets.cameras.fields import Fields
 from datasets.cameras.model import CalibratedCamera
-from datasets.cameras.text import read_text
+from datasets.reading import read_text
 from stages.geometry import RigidTransform
 from stages.lens import Lens
 
@@ -77,7 +77,7 @@ def _rig(path: Path) -> dict[str, RigidTransform]:
     """T_camera_rig by camera number; nothing where there is no rig, or more than one."""
     from scipy.spatial.transform import Rotation
 
-    lines = _lines(read_text(path)) if path.is_file() else []
+    lines = _lines(read_text(path, "rigs")) if path.is_file() else []
     if len(lines) != 1 or len(lines[0]) < 4 or lines[0][2] != "CAMERA":
         return {}
     _, _, _, reference, *rest = lines[0]

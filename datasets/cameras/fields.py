@@ -203,8 +203,8 @@ def _flat(value: Any) -> list[Any] | None:
 
 
 def _matrix_data(value: Mapping[Any, Any]) -> list[Any] | None:
-    data, rows, columns = _flat(value["data"]), value.get("rows"), value.get("cols")
-    if data is not None and isinstance(rows, int) and isinstance(columns, int) and rows * columns != len(data):
+    data, rows, columns = _flat(value["data"]), str(value.get("rows")), str(value.get("cols"))
+    if data is not None and rows.isdecimal() and columns.isdecimal() and int(rows[:9]) * int(columns[:9]) != len(data):
         return None
     return data
 

@@ -2,31 +2,28 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 import numpy as np
 
 from datasets.cameras.fields import Fields
 from datasets.cameras.model import CalibratedCamera
+from datasets.cameras.text import assignments
 from stages.geometry import RigidTransform
 from stages.lens import Lens
-
-ENTRY = re.compile(r"^\s*(\w+)\s*=\s*(.*?)\s*$")
-FIRST = re.compile(r"^\s*cam0\s*=\s*\[", re.MULTILINE)
 
 
 def is_middlebury(text: str) -> bool:
     """Whether this is the text of such a calibration."""
-    return FIRST.search(text) is not None
+    return any(key == "cam0" and value.startswith("[") for key, value in assignments(text))
 
 
 def middlebury(text: str, path: Path) -> list[CalibratedCamera]:
     """Both cameras; the file's baseline is in millimetres, here it is in metres."""
     values: dict[str, object] = {}
-    for entry in filter(None, map(ENTRY.match, text.splitlines())):
-        matrix = entry[2].startswith("[")
-        values[entry[1]] = entry[2].strip("[]").replace(";", " ").split() if matrix else entry[2]
+    for key, value in assignments(text):
+        matrix = value.startswith("[")
+        values[key] = value.strip("[]").replace(";", " ").split() if matrix else value
     f = Fields(values, str(path))
     size = f.size("width", "height")
     left, right = (Lens(f.pinhole(key, size)) for key in ("cam0", "cam1"))

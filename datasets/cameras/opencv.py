@@ -8,7 +8,8 @@ import numpy as np
 
 from datasets.cameras.fields import Fields, by_count
 from datasets.cameras.model import CalibratedCamera
-from datasets.cameras.text import parse_xml, parse_yaml, read_text
+from datasets.cameras.text import parse_xml, parse_yaml
+from datasets.reading import read_text
 from stages.errors import InputError
 from stages.geometry import RigidTransform
 from stages.lens import Lens
@@ -112,7 +113,7 @@ def _beside(path: Path) -> RigidTransform | None:
     other = path.with_name(path.name.replace("intrinsic", "extrinsic"))
     if not other.is_file():
         return None
-    text = read_text(other)
+    text = read_text(other, "calibration")
     parse = parse_xml if text.lstrip().startswith("<") else parse_yaml
     return _relative(Fields(parse(text, str(other)), str(other)))
 

@@ -4,65 +4,71 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
 import yaml
 
+from datasets.reading import DEEPEST
 from stages.errors import InputError
 
-LARGEST = 4_000_000
-"""Bytes; calibration files have kilobytes, so that anything larger is something else."""
+MOST_VALUES = 100_000
+"""Of a YAML file; a stereo calibration has a hundred, with the corners of all its views some ten thousand."""
 
 HEADER = re.compile(r"\A%YAML:[0-9.]+[^\n]*\n(\s*---[^\n]*\n)?")
 """OpenCV's first lines, which no YAML parser accepts."""
 
 
-class _Loader(yaml.SafeLoader):  # type: ignore[misc]
-    """YAML as OpenCV writes it: a matrix is a mapping with rows, cols and data."""
+C_OR_PYTHON: Any = getattr(yaml, "CBaseLoader", yaml.BaseLoader)
 
 
-def _mapping(loader: Any, node: Any) -> Any:
-    return loader.construct_mapping(node, deep=True)
+class _Loader(C_OR_PYTHON):  # type: ignore[misc]
+    """YAML whose values stay text, as in XML: no tag, date, merge key or number means anything to the parser."""
+
+    def construct_scalar(self, node: Any) -> Any:
+        """Text, or None where it says that there is nothing."""
+        text = super().construct_scalar(node)
+        return None if text in ("", "~", "null") else text
 
 
-_Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", _mapping)
-_Loader.add_constructor("!opencv-matrix", _mapping)
-
-
-def read_text(path: Path) -> str:
-    """The text of a file.
-
-    Raises
-    ------
-    InputError
-        It cannot be read, is too large for a calibration, or is no text.
-    """
-    try:
-        data = path.read_bytes() if path.stat().st_size <= LARGEST else None
-    except OSError as error:
-        raise InputError(
-            "RIL-138", f"{path} cannot be read: {error.strerror}", remedy="check the path and its rights"
-        ) from error
-    if data is None:
-        raise InputError("RIL-139", f"{path} is too large for a calibration file", remedy="give the calibration file")
-    try:
-        return data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise InputError("RIL-140", f"{path} is no text file", remedy="give the calibration file") from error
+def assignments(text: str) -> list[tuple[str, str]]:
+    """Lines ``key = value``, stripped; a line of another form has the key "" and is its own value."""
+    found = []
+    for line in text.splitlines():
+        key, equals, value = (part.strip() for part in line.partition("="))
+        found.append((key, value) if equals and key.isidentifier() else ("", line.strip()))
+    return found
 
 
 def parse_yaml(text: str, file: str) -> Mapping[Any, Any]:
     """Entries of a YAML or JSON file; empty where it holds something else than entries."""
+    body = HEADER.sub("", text, count=1)
     try:
-        found = yaml.load(HEADER.sub("", text, count=1), Loader=_Loader)
+        _check_extent(body, file)
+        found = yaml.load(body, Loader=_Loader)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         where = f" (line {mark.line + 1})" if mark is not None else ""
         problem = getattr(error, "problem", None) or "not YAML"
         raise InputError("RIL-141", f"{file} cannot be parsed{where}: {problem}", remedy="correct the file") from error
     return found if isinstance(found, Mapping) else {}
+
+
+def _check_extent(text: str, file: str) -> None:
+    """Refuse what is small as text and huge as entries, before anything is made of it."""
+    depth = values = 0
+    for event in yaml.parse(text, Loader=_Loader):
+        if isinstance(event, yaml.AliasEvent):
+            where = f"{file}, line {event.start_mark.line + 1}"
+            raise InputError("RIL-758", f"{where}: the alias *{event.anchor}", remedy="write the values out")
+        values += isinstance(event, yaml.ScalarEvent)
+        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        if depth > DEEPEST or values > MOST_VALUES:
+            raise InputError(
+                "RIL-759",
+                f"{file} has more than {DEEPEST} levels or {MOST_VALUES} values",
+                remedy="give the calibration file",
+            )
 
 
 def parse_xml(text: str, file: str) -> Mapping[str, Any]:
@@ -81,14 +87,17 @@ def parse_xml(text: str, file: str) -> Mapping[str, Any]:
         root = ElementTree.fromstring(text)
     except ElementTree.ParseError as error:
         raise InputError("RIL-143", f"{file} cannot be parsed: {error}", remedy="correct the file") from error
-    return {child.tag: _node(child) for child in root} if root.tag == "opencv_storage" else {}
+    if root.tag != "opencv_storage":
+        return {}
+    return {child.tag: _node(child, file) for child in root}
 
 
-def _node(node: ElementTree.Element) -> Any:
+def _node(node: ElementTree.Element, file: str, depth: int = 2) -> Any:
+    if depth > DEEPEST:
+        raise InputError("RIL-756", f"{file} is nested more than {DEEPEST} levels deep", remedy="correct the file")
     if len(node):
-        values = {child.tag: _node(child) for child in node}
+        values = {child.tag: _node(child, file, depth + 1) for child in node}
         if node.get("type_id") == "opencv-matrix" and isinstance(values.get("data"), str):
             values["data"] = values["data"].split()
-            values |= {key: int(values[key]) for key in ("rows", "cols") if str(values.get(key, "")).isdigit()}
         return values
     return (node.text or "").strip() or None

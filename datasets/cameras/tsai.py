@@ -16,17 +16,16 @@ import numpy as np
 
 from datasets.cameras.fields import Fields
 from datasets.cameras.model import UNKNOWN_SIZE, CalibratedCamera
+from datasets.cameras.text import assignments
 from stages.geometry import Camera
 from stages.lens import Lens
 
-ENTRY = re.compile(r"^\s*([A-Za-z]\w*)\s*=\s*(.*?)\s*$")
-FIRST = re.compile(r"^\s*fu\s*=", re.MULTILINE)
-HEADER = re.compile(r"\s*(VERSION_\d+|PINHOLE)?\s*")
+HEADER = re.compile(r"(VERSION_\d+|PINHOLE)?")
 
 
 def is_tsai(text: str) -> bool:
     """Whether this is the text of a pinhole camera."""
-    return FIRST.search(text) is not None
+    return any(key == "fu" for key, _ in assignments(text))
 
 
 def tsai(text: str, path: Path) -> list[CalibratedCamera]:
@@ -53,13 +52,12 @@ def _entries(text: str, file: str) -> tuple[Fields, str]:
     """Entries ``key = numbers``, and the name of the lens model, which stands alone on its line."""
     values: dict[str, object] = {}
     lens = ""
-    for line in text.splitlines():
-        entry = ENTRY.match(line)
-        if entry:
-            words = entry[2].split()
-            values[entry[1]] = words[0] if len(words) == 1 else words
-        elif not HEADER.fullmatch(line) and not lens:
-            lens = line.strip()
+    for key, value in assignments(text):
+        if key:
+            words = value.split()
+            values[key] = words[0] if len(words) == 1 else words
+        elif not HEADER.fullmatch(value) and not lens:
+            lens = value
     return Fields(values, file), lens
 
 

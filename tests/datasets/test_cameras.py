@@ -262,7 +262,7 @@ def test_orbslam3_pair_of_fisheyes(tmp_path):
 
 
 BOOF = """# Intrinsic and extrinsic parameters for a stereo camera pair
-left: &camera
+left:
   pinhole: {fx: 524.6, fy: 526.9, cx: 312.4, cy: 247.4, width: 640, height: 480, skew: 0.0}
   model: pinhole_radial_tangential
   radial_tangential: {radial: [-0.36, 0.17], t1: 0.001, t2: 0.002}
@@ -272,7 +272,10 @@ rightToLeft:
   x: 120.0
   y: 0.5
   z: -0.25
-right: *camera
+right:
+  pinhole: {fx: 524.6, fy: 526.9, cx: 312.4, cy: 247.4, width: 640, height: 480, skew: 0.0}
+  model: pinhole_radial_tangential
+  radial_tangential: {radial: [-0.36, 0.17], t1: 0.001, t2: 0.002}
 """
 
 

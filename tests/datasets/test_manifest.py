@@ -204,7 +204,7 @@ def test_time_offset_moves_the_poses(tmp_path):
     [
         ('[truth]\nfile = "p.txt"\n', ["1 0 0 0 0 1 0 0 0 0 1 0"], ("RIL-230",)),
         ('[truth]\nfile = "p.txt"\n', [tum(0, 0), tum(1, 1)], ("RIL-231", "p.txt", "[ti")),
-        ('[truth]\nfile = "nothing.txt"\n', [], ("RIL-287", "nothing.txt")),
+        ('[truth]\nfile = "nothing.txt"\n', [], ("RIL-138", "nothing.txt")),
     ],
 )
 def test_bad_truth(tmp_path, text, lines, expected):
@@ -291,7 +291,7 @@ def test_sensors_need_times(tmp_path):
         ({"cameras": '[cameras]\nfile = "nothing.yaml"\n'}, ("RIL-138", "nothing.yaml")),
         ({"head": "baseline = 0.1"}, ("RIL-223", "'baseline'", "0.1", "'rig.baseline'")),
         ({"head": "colour = 1"}, ("RIL-223", "'colour'")),
-        ({"head": "name = "}, ("RIL-222", "rover.rille.toml")),
+        ({"head": "name = "}, ("RIL-026", "rover.rille.toml")),
         ({"text": "[images.more]\n"}, ("RIL-223", "'images.more'")),
         ({"text": "[times]\nrate_hz = 1.0\nnames = true\n"}, ("RIL-223", "rate_hz")),
         ({"text": "[world]\npitch_deg = 3.0\nup = [0, 0, 1]\n"}, ("RIL-239",)),
@@ -348,7 +348,7 @@ def test_unusual_figures_are_warnings(tmp_path, parts, line):
 
 
 def test_missing_manifest(tmp_path):
-    with raises("RIL-221"):
+    with raises("RIL-138"):
         read_manifest(tmp_path / "no.toml")
 
 

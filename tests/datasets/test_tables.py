@@ -59,8 +59,8 @@ def test_what_is_wrong_names_the_line(tmp_path, text, expected):
 
 
 def test_a_missing_or_binary_file(tmp_path):
-    with raises("RIL-287"):
+    with raises("RIL-138"):
         read_table(tmp_path / "none.csv", "table")
     (tmp_path / "b.csv").write_bytes(b"\xff\xfe\x00\x80")
-    with raises("RIL-287"):
+    with raises("RIL-140"):
         read_table(tmp_path / "b.csv", "table")

@@ -81,7 +81,7 @@ def test_written_configuration_reads_back_as_the_same(tmp_path: Path) -> None:
 
 
 def test_unreadable_files(tmp_path: Path) -> None:
-    with raises("RIL-025"):
+    with raises("RIL-138"):
         config.read_toml(tmp_path / "none.toml")
     bad = tmp_path / "bad.toml"
     bad.write_text("[select\nstride=1")

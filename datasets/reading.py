@@ -1,0 +1,216 @@
+"""Files that others wrote, read within bounds: regular files up to a size, folders up to a number of entries.
+
+A pipe blocks for ever, a device never ends, and a short file may unpack or parse to something huge. Everything that is
+read of a sequence, a configuration or a calibration comes through here, so that each of these ends with one line.
+"""
+
+from __future__ import annotations
+
+import fnmatch
+import os
+import re
+import stat
+import tomllib
+from collections.abc import Iterator
+from contextlib import suppress
+from io import BufferedReader
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+from stages.errors import InputError
+
+SMALL = 1_000_000
+"""Bytes of a manifest, a configuration or a calibration, which have kilobytes."""
+
+TABLE = 100_000_000
+"""Bytes of a table: an IMU at 200 Hz writes as much in three quarters of an hour."""
+
+LONGEST_LINE = 10_000
+"""Characters; a pose has 400. Parsers that look back take the square of it."""
+
+DEEPEST = 20
+"""Levels of nested entries; real files have four."""
+
+MOST_ENTRIES = 300_000
+"""Files and folders that are looked at in a search; a walk over them takes two or three seconds."""
+
+WILD = re.compile(r"[*?\[]")
+
+
+def open_regular(path: Path, what: str, most: int) -> BufferedReader:
+    """A regular file of at most ``most`` bytes, open for reading.
+
+    Parameters
+    ----------
+    what : what the file is, for errors.
+
+    Raises
+    ------
+    InputError
+        It cannot be opened, is a folder, a pipe or a device, or is larger.
+    """
+    try:
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode):
+            raise OSError(0, "it is a folder" if stat.S_ISDIR(status.st_mode) else "it is a pipe or a device")
+        if status.st_size <= most:
+            return path.open("rb")
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error  # a path with a zero byte
+        raise InputError(
+            "RIL-138", f"{what} {path} cannot be read: {reason}", remedy="check the path and its rights"
+        ) from error
+    size = f"{status.st_size / 1e6:.1f} MB, at most {most / 1e6:g} MB are read"
+    raise InputError("RIL-139", f"{what} {path} is too large: {size}", remedy="check that it is the right file")
+
+
+def read_bytes(path: Path, what: str, most: int) -> bytes:
+    """Content of a regular file (see :func:`open_regular`)."""
+    with open_regular(path, what, most) as file:
+        try:
+            data = file.read(most + 1)
+        except OSError as error:
+            raise InputError("RIL-753", f"{what} {path} cannot be read: {error.strerror}", remedy="check it") from error
+    if len(data) > most:  # it grew, or does not know its size
+        raise InputError("RIL-754", f"{what} {path} does not end", remedy="check that it is the right file")
+    return data
+
+
+def read_text(path: Path, what: str, most: int = SMALL) -> str:
+    """Text of a regular file in UTF-8, with or without a byte order mark.
+
+    Raises
+    ------
+    InputError
+        It cannot be read, is too large, is no text, or has a line that no such file has.
+    """
+    data = read_bytes(path, what, most)
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        text = "\0"
+    if "\0" in text:
+        raise InputError("RIL-140", f"{what} {path} is no text file", remedy="give it as text in UTF-8")
+    return text
+
+
+def read_lines(path: Path, what: str, most: int = TABLE) -> list[str]:
+    """Lines of a table (see :func:`read_text`)."""
+    lines = read_text(path, what, most).splitlines()
+    _no_long_line(lines, path, what)
+    return lines
+
+
+def read_toml(path: Path, what: str) -> dict[str, Any]:
+    """Tables of a TOML file.
+
+    Raises
+    ------
+    InputError
+        It cannot be read, is not TOML, or is nested deeper than any such file.
+    """
+    text = read_text(path, what)
+    _no_long_line(text.splitlines(), path, what)
+    try:
+        values = tomllib.loads(text)
+    except (ValueError, RecursionError) as error:  # numbers of thousands of digits are plain ValueErrors
+        reason = "it is nested too deeply" if isinstance(error, RecursionError) else error
+        raise InputError("RIL-026", f"{path} is not TOML: {reason}", remedy="correct the file at that place") from error
+    check_depth(values, str(path))
+    return values
+
+
+def check_depth(value: Any, file: str) -> None:
+    """Refuse entries that are nested more than ``DEEPEST`` levels: whatever walks them would run out of stack."""
+    level = [value]
+    for _ in range(DEEPEST):
+        level = [inner for outer in level for inner in _inner(outer)]
+        if not level:
+            return
+    raise InputError("RIL-760", f"{file} is nested more than {DEEPEST} levels deep", remedy="correct the file")
+
+
+def _inner(value: Any) -> Iterator[Any]:
+    if isinstance(value, dict):
+        yield from value.values()
+    elif isinstance(value, list):
+        yield from value
+
+
+def _no_long_line(lines: list[str], path: Path, what: str) -> None:
+    for k, line in enumerate(lines, start=1):
+        if len(line) > LONGEST_LINE:
+            raise InputError(
+                "RIL-757",
+                f"{what} {path}, line {k}: {len(line)} characters, at most {LONGEST_LINE} are read",
+                remedy="check that it is the right file",
+            )
+
+
+def is_file(path: os.DirEntry[str] | Path) -> bool:
+    """Whether it is a regular file, or a link to one, that may be looked at."""
+    with suppress(OSError):
+        return path.is_file()
+    return False
+
+
+class Search:
+    """Looks into folders, at no more than ``MOST_ENTRIES`` files and folders in all."""
+
+    def __init__(self) -> None:
+        self._seen = 0
+
+    def entries(self, folder: Path) -> list[os.DirEntry[str]]:
+        """Entries of a folder in order of name; none where it may not be read.
+
+        Raises
+        ------
+        InputError
+            There are more than may be looked at.
+        """
+        found: list[os.DirEntry[str]] = []
+        with suppress(OSError, ValueError), os.scandir(folder) as there:
+            found = sorted(islice(there, MOST_ENTRIES - self._seen + 1), key=lambda entry: entry.name)
+        self._seen += len(found)
+        if self._seen > MOST_ENTRIES:
+            raise InputError(
+                "RIL-750",
+                f"more than {MOST_ENTRIES} files and folders to look at, so far as {folder}",
+                remedy="name the folder of the images, not one far above it",
+            )
+        return found
+
+    def folders(self, top: Path) -> list[Path]:
+        """The folder and all below it; links are not followed."""
+        found = [top]
+        for folder in found:  # grows on the way
+            found += [Path(e.path) for e in self.entries(folder) if e.is_dir(follow_symlinks=False)]
+        return found
+
+    def matching(self, root: Path, pattern: str) -> list[Path]:
+        """Files whose path below ``root`` matches a pattern; ``**`` stands for any folders.
+
+        Raises
+        ------
+        InputError
+            The pattern is empty or absolute, or there is too much to look at.
+        """
+        *above, last = pattern.split("/")
+        if not last or pattern.startswith("/"):
+            raise InputError(
+                "RIL-216", f"{pattern!r} is no pattern of files below a folder", remedy="give one such as left/*.png"
+            )
+        places = [root]
+        for part in above:
+            if part == "**":
+                places = [place for top in places for place in self.folders(top)]
+            elif WILD.search(part):
+                places = [path for place in places for path in self._named(place, part) if path.is_dir()]
+            else:
+                places = [place / part for place in places if (place / part).is_dir()]
+            places = list(dict.fromkeys(places))
+        return [path for place in places for path in self._named(place, last) if is_file(path)]
+
+    def _named(self, folder: Path, pattern: str) -> list[Path]:
+        return [Path(e.path) for e in self.entries(folder) if fnmatch.fnmatchcase(e.name, pattern)]

@@ -1,0 +1,173 @@
+from __future__ import annotations
+
+import os
+import struct
+import zlib
+
+import cv2
+import numpy as np
+import pytest
+
+from datasets import files, reading
+from datasets.cameras import read_cameras
+from datasets.headers import read_header
+from datasets.reading import Search, read_bytes, read_lines, read_toml
+from stages.errors import InputError
+
+
+def refused(code, call, *args):
+    with pytest.raises(InputError) as caught:
+        call(*args)
+    assert caught.value.code == code
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 1000
+    return str(caught.value)
+
+
+# -- what is no small file ---------------------------------------------------------------------------------------------
+
+
+def test_pipes_devices_and_folders_are_never_opened(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "zero").symlink_to("/dev/zero")
+    for name in ("pipe", "zero", "."):
+        refused("RIL-138", read_bytes, tmp_path / name, "table", 10)
+    refused("RIL-138", read_bytes, tmp_path / "none", "table", 10)
+    refused("RIL-138", read_bytes, tmp_path / "zero\0byte", "table", 10)
+
+
+def test_sizes_lines_and_content_are_bounded(tmp_path):
+    with (tmp_path / "sparse").open("wb") as file:
+        file.truncate(10**12)
+    refused("RIL-139", read_lines, tmp_path / "sparse", "table")
+    (tmp_path / "endless").symlink_to("/proc/self/maps")  # a regular file that says it has no bytes
+    refused("RIL-754", read_bytes, tmp_path / "endless", "table", 10)
+    for name, data in (("binary", b"1 2\0 3"), ("latin", b"\xff\xfe")):
+        (tmp_path / name).write_bytes(data)
+        refused("RIL-140", read_lines, tmp_path / name, "table")
+    (tmp_path / "long").write_text("1\n" + "(" * (reading.LONGEST_LINE + 1))
+    assert "line 2" in refused("RIL-757", read_lines, tmp_path / "long", "table")
+
+
+@pytest.mark.parametrize(
+    ("text", "code"),
+    [
+        ("x = " + "9" * 5000, "RIL-026"),
+        ("x = " + "[" * 4000 + "]" * 4000, "RIL-026"),
+        ("x = " + "[" * 30 + "]" * 30, "RIL-760"),
+        ("a." * 5001 + "a = 1", "RIL-757"),
+        (("a." * 1000 + "a = 1\n"), "RIL-760"),
+    ],
+)
+def test_toml_is_refused_in_one_line(tmp_path, text, code):
+    (tmp_path / "m.toml").write_text(text)
+    refused(code, read_toml, tmp_path / "m.toml", "manifest")
+
+
+# -- calibrations ------------------------------------------------------------------------------------------------------
+
+ALIASES = "a0: &a0 [1, 1]\n" + "".join(f"a{k}: &a{k} [*a{k - 1}, *a{k - 1}]\n" for k in range(1, 40)) + "K: *a39\n"
+MERGES = "a0: &a0 {x: 1}\n" + "".join(f"a{k}: &a{k} {{<<: [*a{k - 1}]}}\n" for k in range(1, 40)) + "cam0: *a39\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "code"),
+    [
+        (ALIASES, "RIL-758"),
+        (MERGES, "RIL-758"),
+        ("K: " + "[" * 100_000, "RIL-759"),
+        ("K: [" + "1," * 150_000 + "1]", "RIL-759"),
+        ("K: [" + "9" * 5000 + "]", "RIL-116"),
+        ("K: 1" + ":1" * 400_000, "RIL-115"),
+        ("K: 2001-99-99", "RIL-115"),
+        ("K: !!python/object/apply:os.system [true]", "RIL-116"),
+        ("<opencv_storage>" + "<a>" * 10_000 + "</a>" * 10_000 + "</opencv_storage>", "RIL-756"),
+        ("fu = 1\nk = a" + " " * 900_000 + "b", "RIL-113"),
+        ("\n" * 900_000 + "x", "RIL-100"),
+    ],
+)
+def test_calibrations_are_refused_in_one_line_and_at_once(tmp_path, text, code):
+    (tmp_path / "cal.yaml").write_text(text)
+    refused(code, read_cameras, tmp_path / "cal.yaml")
+
+
+# -- images ------------------------------------------------------------------------------------------------------------
+
+
+def png(width, height):
+    """A whole PNG of one bit a pixel, all black."""
+
+    def chunk(kind, data):
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    packer = zlib.compressobj(9)
+    rows = b"".join(packer.compress(bytes((width + 7) // 8 + 1)) for _ in range(height)) + packer.flush()
+    head = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 1, 0, 0, 0, 0))
+    return b"\x89PNG\r\n\x1a\n" + head + chunk(b"IDAT", rows) + chunk(b"IEND", b"")
+
+
+def test_an_image_is_never_unpacked_beyond_its_bounds(tmp_path, monkeypatch):
+    (tmp_path / "a.png").write_bytes(png(14_000, 12_000))
+    assert (tmp_path / "a.png").stat().st_size < 100_000
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("unpacked"))
+    refused("RIL-762", files.read_grey, tmp_path / "a.png")
+    refused("RIL-762", files.common_header, [tmp_path / "a.png"])
+    (tmp_path / "b.png").write_bytes(png(640, 480))
+    data = (tmp_path / "b.png").read_bytes()
+    refused("RIL-176", files.decode, data, "b.png", (64, 48, 8))
+    refused("RIL-176", files.common_header, [tmp_path / "b.png", tmp_path / "a.png"])
+
+
+@pytest.mark.parametrize("kind", [".png", ".jpg", ".tif", ".bmp", ".pgm", ".ppm"])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+@pytest.mark.parametrize("channels", [1, 3])
+def test_headers_say_what_the_decoder_gives(tmp_path, kind, dtype, channels):
+    if (dtype == np.uint16 and kind in (".jpg", ".bmp")) or (kind, channels) in ((".pgm", 3), (".ppm", 1)):
+        pytest.skip("no such file")
+    path = tmp_path / f"a{kind}"
+    cv2.imwrite(str(path), np.random.default_rng(3).integers(0, 255, (7, 13, channels)).astype(dtype))
+    with path.open("rb") as file:
+        assert read_header(file) == (13, 7, np.dtype(dtype).itemsize * 8)
+    assert files.read_grey(path).shape == (7, 13)
+
+
+@pytest.mark.parametrize("name", ["x.webp", "x.jp2", "x.hdr"])
+def test_other_formats_reach_no_decoder(tmp_path, name, monkeypatch):
+    if not cv2.haveImageWriter(name):
+        pytest.skip("cannot be written here")
+    cv2.imwrite(str(tmp_path / name), np.ones((9, 9, 3), np.float32 if name.endswith("hdr") else np.uint8))
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("decoded"))
+    refused("RIL-171", files.read_grey, tmp_path / name)
+
+
+# -- searches ----------------------------------------------------------------------------------------------------------
+
+
+def test_patterns_find_what_they_name(tmp_path):
+    for name in ("left/1.png", "left/2.png", "a/b/left/3.png", "left/x.txt", ".left/4.png"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    (tmp_path / "left" / "5.png").mkdir()
+    (tmp_path / "a" / "up").symlink_to(tmp_path)  # a circle
+    patterns = (
+        "left/*.png",
+        "**/*.png",
+        "*/*.png",
+        "a/**/left/[0-9].png",
+        "./left/?.png",
+        "a/../left/1.png",
+        "**/none",
+    )
+    for pattern in patterns:
+        expected = {p.resolve() for p in tmp_path.glob(pattern) if p.is_file()}
+        assert {p.resolve() for p in Search().matching(tmp_path, pattern)} == expected, pattern
+    for pattern in ("", "/left/*.png", "left/"):
+        refused("RIL-216", Search().matching, tmp_path, pattern)
+
+
+@pytest.mark.parametrize("pattern", ["**/*.png", "*/*/*/*", "**/**/**/x"])
+def test_a_search_that_would_walk_the_disk_ends(tmp_path, monkeypatch, pattern):
+    for k in range(60):
+        (tmp_path / f"{k % 3}" / f"{k}").mkdir(parents=True)
+    monkeypatch.setattr(reading, "MOST_ENTRIES", 50)
+    refused("RIL-750", Search().matching, tmp_path, pattern)
