@@ -27,6 +27,9 @@ Floats = NDArray[np.float64]
 NAMES = ("pitch", "yaw", "roll", "baseline_across", "baseline_forward")
 """The five parameters of a correction, in the order of every vector of them."""
 
+MAJORITY = 0.5
+"""Share of the matches that must fit the rig with its sides exchanged, and twice as many as the given one."""
+
 STEP = 1e-6
 """Radians: step of the central differences of depth."""
 
@@ -117,6 +120,19 @@ def beyond_infinity(rig: Rig, left: Floats, right: Floats) -> Floats:
     """How far (n,) points lie beyond infinity, pixels of disparity; negative for points in front of the cameras."""
     rho, per_pixel = inverse_depth(rig, left, right - left)
     return np.asarray(-rho / per_pixel, dtype=np.float64)
+
+
+def fits(rig: Rig, left: Floats, right: Floats, tolerance: float) -> float:
+    """Share of the matches (n, 2), (n, 2) that lie within ``tolerance`` pixels of their epipolar lines, ahead."""
+    off, _ = distances(rig, np.zeros(len(NAMES)), left, right)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ahead = beyond_infinity(rig, left, right) < 0.5 * tolerance
+    return float(np.mean((np.abs(off) < tolerance) & ahead))
+
+
+def exchanged(as_given: float, other_way: float) -> bool:
+    """Whether left and right are exchanged, by the share of matches that fit the rig as given and the other way."""
+    return other_way > MAJORITY and other_way > 2.0 * as_given
 
 
 def _centre(rig: Rig, correction: Floats) -> tuple[Floats, Floats]:

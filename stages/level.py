@@ -20,9 +20,10 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
 from stages.declare import Bundle, Inputs, Params, Stage
+from stages.epipolar import exchanged, fits
 from stages.errors import DegenerateError, InputError
 from stages.geometry import Rig, RigidTransform, level_rotation
-from stages.ground import GroundPlane, fit_plane, inverse_depth, rounded_cell, view_ground
+from stages.ground import MIN_POINTS, GroundPlane, fit_plane, inverse_depth, rounded_cell, view_ground
 from stages.pose_arrays import NO_VERTICAL
 from stages.validity import matched
 
@@ -37,6 +38,7 @@ MARGIN = 0.05  # share of the camera's height that the range of elevations is wi
 
 
 BEYOND = 3.0  # standard deviations that a match lies beyond infinity, which no noise explains
+NEAR = 2.0  # pixels: distance to its epipolar line at which a match fits a rig
 NEAREST = 0.05  # share of the matches that may be nearer than what counts as nearest: gross mismatches
 UNSEEN = 20.0  # baselines; distance that stands for what is not seen at all
 
@@ -204,6 +206,15 @@ def _samples(
     r, c = r * step, c * step
     pixels = np.stack([c, r], axis=-1).astype(np.float64)
     disparity = np.stack([column[r, c], row[r, c]], axis=-1).astype(np.float64)
+    if len(pixels) >= MIN_POINTS:
+        right = pixels + disparity
+        as_given, other_way = fits(rig, pixels, right, NEAR), fits(rig, right, pixels, NEAR)
+        if exchanged(as_given, other_way):
+            raise DegenerateError(
+                "RIL-781",
+                f"{other_way:.0%} of the matches fit the rig with its sides exchanged, {as_given:.0%} as given",
+                remedy="check left/right order, they seem swapped, and the sign of the baseline",
+            )
     rho, per_pixel = inverse_depth(rig, pixels, disparity)
     return rig.left.rays(pixels), rho, per_pixel * params.sigma_disparity
 

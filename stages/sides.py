@@ -13,9 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.adjustment import RIG
 from stages.declare import Bundle, Inputs, NoParams, Stage
-from stages.epipolar import beyond_infinity, distances
+from stages.epipolar import exchanged, fits
 from stages.geometry import Rig
 from stages.motion import MotionParams, coarse_motion
 from stages.pyramid import Pyramid
@@ -27,16 +26,6 @@ SEARCH = MotionParams(top_columns=0.5, turn_below=0.0)
 """Half of the width to either side, as far as pairs are matched."""
 LEAST = 50
 """Coarse matches, below which nothing is said."""
-MAJORITY = 0.5
-"""Share of the matches that must fit the exchanged rig, and twice as many as the given one."""
-
-
-def fits(rig: Rig, left: Floats, right: Floats, tolerance: float) -> float:
-    """Share of the matches (n, 2), (n, 2) that lie within ``tolerance`` pixels of their epipolar lines, ahead."""
-    off, _ = distances(rig, np.zeros(RIG), left, right)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ahead = beyond_infinity(rig, left, right) < 0.5 * tolerance
-    return float(np.mean((np.abs(off) < tolerance) & ahead))
 
 
 def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
@@ -49,9 +38,8 @@ def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     right = np.asarray(left + shift, dtype=np.float64)
     facts: dict[str, Any] = {"frame": int(args["frame"]), "matches": len(left), "swapped": False}
     if len(left) >= LEAST:
-        given, exchanged = fits(rig, left, right, scale), fits(rig, right, left, scale)
-        swapped = exchanged > MAJORITY and exchanged > 2.0 * given
-        facts |= {"as_given": given, "exchanged": exchanged, "swapped": bool(swapped)}
+        given, other_way = fits(rig, left, right, scale), fits(rig, right, left, scale)
+        facts |= {"as_given": given, "exchanged": other_way, "swapped": exchanged(given, other_way)}
     return Bundle({}, facts)
 
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from stages.epipolar import fits
 from stages.geometry import Camera, Rig, RigidTransform, rotation_exp
-from stages.sides import fits
 
 CAMERA = Camera(400.0, 400.0, 319.5, 239.5, 640, 480)
 
