@@ -117,13 +117,6 @@ def level(
     """
     rays, rho, sigma = _samples(np.asarray(column_disparity), np.asarray(row_disparity), usable, rig, params)
     vertical, source = _given_vertical(up, initial_up, pitch)
-    beyond = float(np.mean(rho < -BEYOND * sigma)) if rho.size else 0.0
-    if beyond > SWAPPED:
-        raise DegenerateError(
-            "RIL-375",
-            f"{beyond:.0%} of the matches lie beyond infinity",
-            remedy="check left/right order, they seem swapped, and the sign of the baseline",
-        )
     samples = rays, rho, sigma
     try:
         ground = _fitted(samples, vertical, params)
@@ -206,17 +199,25 @@ def _samples(
     r, c = r * step, c * step
     pixels = np.stack([c, r], axis=-1).astype(np.float64)
     disparity = np.stack([column[r, c], row[r, c]], axis=-1).astype(np.float64)
-    if len(pixels) >= MIN_POINTS:
-        right = pixels + disparity
-        as_given, other_way = fits(rig, pixels, right, NEAR), fits(rig, right, pixels, NEAR)
-        if exchanged(as_given, other_way):
-            raise DegenerateError(
-                "RIL-781",
-                f"{other_way:.0%} of the matches fit the rig with its sides exchanged, {as_given:.0%} as given",
-                remedy="check left/right order, they seem swapped, and the sign of the baseline",
-            )
     rho, per_pixel = inverse_depth(rig, pixels, disparity)
-    return rig.left.rays(pixels), rho, per_pixel * params.sigma_disparity
+    sigma = per_pixel * params.sigma_disparity
+    if len(pixels) >= MIN_POINTS:
+        _refuse_swapped(rig, pixels, pixels + disparity, float(np.mean(rho < -BEYOND * sigma)))
+    return rig.left.rays(pixels), rho, sigma
+
+
+def _refuse_swapped(rig: Rig, left: Floats, right: Floats, beyond: float) -> None:
+    """Parallel cameras see everything ``beyond`` infinity (share) with their sides exchanged, others on wrong lines."""
+    remedy = "check left/right order, they seem swapped, and the sign of the baseline"
+    if beyond > SWAPPED:
+        raise DegenerateError("RIL-375", f"{beyond:.0%} of the matches lie beyond infinity", remedy=remedy)
+    as_given, other_way = fits(rig, left, right, NEAR), fits(rig, right, left, NEAR)
+    if exchanged(as_given, other_way):
+        raise DegenerateError(
+            "RIL-781",
+            f"{other_way:.0%} of the matches fit the rig with its sides exchanged, {as_given:.0%} as given",
+            remedy=remedy,
+        )
 
 
 def _given_vertical(

@@ -156,6 +156,6 @@ def test_sides_swapped_throughout_are_refused_with_one_line(place: Path, capsys:
         for frame in range(8):
             swap(frame)(folder)
 
-    with raises("RIL-343") as caught:
+    with raises("RIL-781") as caught:
         reconstruct(place, "all-swapped", both, capsys)
     assert "\n" not in str(caught.value)

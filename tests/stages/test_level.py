@@ -157,6 +157,10 @@ def test_what_no_frame_can_be_posed_from_is_said_with_a_remedy() -> None:
     swapped = Rig(RIG.right, RIG.left, RIG.T_right_left)
     with raises("RIL-375"):
         level(-FLAT[0], FLAT[1], FLAT[2], swapped, PARAMS)
+    # Turned inward, the cameras see far ground ahead with their sides exchanged, too, but off the epipolar lines.
+    inside_out = disparity(Rig(RIG.right, RIG.left, RIG.T_right_left.inverse()), POSE, plane(0.0, 0.0, -8.0 * HEIGHT))
+    with raises("RIL-781"):
+        level(*inside_out, RIG, PARAMS)
     with raises("RIL-377"):
         level(*FLAT, Rig(RIG.left, RIG.right, RigidTransform.identity()), PARAMS)
     with raises("RIL-378"):
