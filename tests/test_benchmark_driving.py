@@ -1,10 +1,13 @@
 """What a set of drives says of its ways, by hand."""
 
 import math
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
 from benchmarks.driving.ratios import HEADINGS, Ratios, share, wilson
+from stages.wheels import Ground
 
 WAYS = [(1.0, 1.0), (3.0, 2.0), (2.3, 2.0), (0.9, 1.0)]
 
@@ -45,3 +48,29 @@ def test_shares_have_the_interval_of_wilson():
     assert share(37, 37) == "100 % (91-100)"
     assert share(0, 0) == "-"
     assert all(map(math.isnan, wilson(0, 0)))
+
+
+def test_by_the_limits_alone_the_way_is_straight_where_nothing_stands_in_it(monkeypatch):
+    monkeypatch.syspath_prepend(Path(__file__).parents[1] / "benchmarks")
+    from driving.beds import config_of, prepared
+    from driving.exact_bed import ExactBed
+    from driving.limits import shortest_within_limits
+
+    plain = [
+        "mockup.rocks=0.0",
+        "mockup.craters=0.0",
+        "mockup.cell=0.004",
+        "mockup.relief=0.0",
+        "mockup.bed_length=1.2",
+    ]
+    sequence, layers = prepared(plain)
+    config, goal = config_of(layers), (0.0, 0.5)
+    bed = ExactBed.of(sequence, config, goal)
+    (x, y), _ = bed.start()
+    found = shortest_within_limits(bed, goal, config.leg)
+    reach = 0.5 * config.leg.tolerance * config.vehicle.wheel_base  # it has arrived this near, on a grid of 7.5 mm
+    assert found == pytest.approx(math.hypot(goal[0] - x, goal[1] - y) - reach, abs=0.01)
+    wall = bed.ground.height.copy()
+    wall[120:125] += 0.05
+    walled = replace(bed, ground=Ground.of(wall, bed.ground.x0, bed.ground.y0, bed.ground.cell, 0.03))
+    assert shortest_within_limits(walled, goal, config.leg) is None
