@@ -1,7 +1,9 @@
 """Elevation model against truth: error and completeness together, so that leaving out hard cells is no progress.
 
-Judged are the cells that both cameras see. NMAD = 1.4826 median(\\|e - median(e)\\|) is the robust standard deviation
-(Hoehle and Hoehle 2009, doi:10.1016/j.isprsjprs.2009.02.003).
+Truth is given in the frame of the model, by the true pose of the camera that carries it: a vertical that is off is no
+part of these errors, and stands beside them (``tilt``). Judged are the cells that both cameras see.
+NMAD = 1.4826 median(\\|e - median(e)\\|) is the robust standard deviation (Hoehle and Hoehle 2009,
+doi:10.1016/j.isprsjprs.2009.02.003).
 """
 
 from __future__ import annotations
@@ -73,13 +75,16 @@ def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     metrics = dem_accuracy(elevation, true, judged)
     unseen = np.isfinite(elevation) & (np.asarray(truth["seen"]) == 0) & in_window(lattice, args.get("window"))
     metrics["unseen"] = metric(int(unseen.sum()), "cells", "cells given that not both cameras see")
+    if "tilt_deg" in truth.meta:
+        how = "between the vertical of the model and the true one; the errors of elevation are against the tilted truth"
+        metrics["tilt"] = metric(float(truth.meta["tilt_deg"]), "deg", how)
     meta = {"lattice": lattice.to_dict(), "window": args.get("window"), "metrics": metrics}
     return Bundle({"error": error}, meta)
 
 
 STAGE = Stage(
     name="dem_accuracy",
-    version=1,
+    version=2,
     summary="elevation model against truth: RMSE, NMAD, 95 %, bias and completeness",
     params=NoParams,
     inputs=("dem*", "truth"),

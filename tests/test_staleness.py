@@ -154,6 +154,7 @@ SEQUENCE: dict[str, set[str]] = {
     **dict.fromkeys([f"mockup.{name}" for name in DRIVE], EVERYTHING - {"scene"}),
     **dict.fromkeys([f"mockup.{name}" for name in CAMERA], EVERYTHING - {"scene", "truth"}),
     "mockup.slope_deg": EVERYTHING,  # the cameras go along with the ground
+    "mockup.up_noise_deg": LEVELLED,
     "mockup.attitude_noise_deg": {"motion", "continuity", "select", "track"} | LEVELLED,
     "mockup.focal_error": {"undistort/left", "undistort/right", "sight"}
     | PYRAMIDS

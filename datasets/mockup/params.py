@@ -32,7 +32,7 @@ class SceneParams(Params):
         0.0,
         ge=-25.0,
         le=25.0,
-        description="degrees; rise of the bed ahead. The body stands square on it; an inclinometer tells the vertical",
+        description="degrees; rise of the bed ahead. The body stands square on it",
     )
     craters: float = Field(8.0, ge=0.0, le=50.0, description="1/m2, craters wider than 100 mm; others follow D^-2")
     grain: float = Field(0.06, ge=0.0, le=0.3, description="relative RMS of each octave of the albedo grain")
@@ -83,8 +83,19 @@ class MockupParams(SceneParams, RenderParams):
     jitter_deg: float = Field(
         0.0, ge=0.0, le=10.0, description="degrees, standard deviation of pitch, roll and heading from frame to frame"
     )
+    up_noise_deg: float | None = Field(
+        0.2,
+        ge=0.0,
+        le=10.0,
+        description="degrees, standard deviation of the inclinometer's error about each axis, anew in every frame; 0: "
+        "the vertical is exact; none: there is no inclinometer, the ground is levelled by its own plane",
+    )
     attitude_noise_deg: float | None = Field(
-        None, ge=0.0, le=10.0, description="degrees, error of an attitude sensor; none: no attitude is given"
+        None,
+        ge=0.0,
+        le=10.0,
+        description="degrees, error of an attitude sensor, which takes the inclinometer's place and gives rotations "
+        "from frame to frame, too; none: there is none",
     )
     rig_error_deg: tuple[float, float, float] = Field(
         (0.0, 0.0, 0.0), description="degrees about the right camera's x, y, z: error of the rig as it is given"

@@ -116,6 +116,18 @@ def _attitude(p: MockupParams, truth: list[RigidTransform]) -> tuple[Rows, ...] 
     return tuple(out)
 
 
+def _up(p: MockupParams, truth: list[RigidTransform]) -> tuple[tuple[float, float, float], ...] | None:
+    """Direction of up in each left camera, as an inclinometer with the stated error gives it."""
+    if p.up_noise_deg is None:
+        return None
+    out = []
+    for frame, pose in enumerate(truth):
+        error = np.random.default_rng([p.seed, 62, frame]).standard_normal(3)
+        x, y, z = rotation_exp(np.deg2rad(p.up_noise_deg) * error) @ pose.rotation[2]
+        out.append((float(x), float(y), float(z)))
+    return tuple(out)
+
+
 def mockup(p: MockupParams, name: str = "mockup") -> Sequence:
     """The simulated sequence."""
     bodies = body_poses(p)
@@ -151,12 +163,7 @@ def mockup(p: MockupParams, name: str = "mockup") -> Sequence:
         return Source("datasets.mockup.truth_dem", NoParams(), args, inputs={"scene": scene})
 
     attitude = _attitude(p, poses["left"])
-    level = p.roll_deg == p.jitter_deg == p.roll_swing_deg == p.slope_deg == 0.0
-    up: tuple[tuple[float, float, float], ...] | None = None
-    if attitude is not None:
-        up = tuple(rows[2] for rows in attitude)
-    elif p.slope_deg:
-        up = tuple((float(x), float(y), float(z)) for x, y, z in (pose.rotation[2] for pose in poses["left"]))
+    up = _up(p, poses["left"]) if attitude is None else tuple(rows[2] for rows in attitude)
     return Sequence(
         name=name,
         rig=given_rig(p),
@@ -168,7 +175,6 @@ def mockup(p: MockupParams, name: str = "mockup") -> Sequence:
         truth_source="the simulator's own poses: exact",
         up=up,
         attitude=attitude,
-        pitch=math.radians(p.pitch_deg) if level else None,
         vehicle=vehicle_at_scale(),
         truth_dem=dem,
         truth_disparity=disparity,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -61,13 +62,14 @@ def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     elevation, points = true_dem(field, args["lattice"], RigidTransform.from_matrix(args["T_bed_world"]))
     lefts = [RigidTransform.from_matrix(m) for m in args["pairs"]]
     seen = seen_by(field, Rig.from_dict(args["rig"]), lefts, points).reshape(elevation.shape).astype(np.uint8)
-    return Bundle({"elevation": elevation, "seen": seen}, {"lattice": dict(args["lattice"])})
+    tilt = math.degrees(math.acos(min(1.0, RigidTransform.from_matrix(args["T_bed_world"]).rotation[2, 2])))
+    return Bundle({"elevation": elevation, "seen": seen}, {"lattice": dict(args["lattice"]), "tilt_deg": tilt})
 
 
 STAGE = Stage(
     name="mockup.truth_dem",
     version=1,
-    summary="exact elevations of the simulated bed on a lattice",
+    summary="exact elevations of the simulated bed on a lattice, and how far its frame is off the vertical",
     params=NoParams,
     inputs=("scene",),
     outputs=(

@@ -49,6 +49,7 @@ LABELS: Mapping[str, str] = {
     "bias": "Elevation error, mean",
     "completeness": "Completeness",
     "unseen": "Cells that not both cameras see",
+    "tilt": "Vertical off by",
     "hazard_cells": "Hazardous cells crossed",
     "unknown_cells": "Unknown cells crossed",
     "crossed_cells": "Cells crossed",
@@ -91,6 +92,7 @@ KEY = frozenset(
         "dem_pairs_completeness_min",
         "dem_merged_rmse",
         "dem_merged_nmad",
+        "dem_merged_tilt",
         "path_check_hazard_cells",
         "path_check_length_ratio",
         "frames_posed",
@@ -250,6 +252,12 @@ def _elevation(view: RunView, pairs: Rows) -> dict[str, Metric]:
             found[f"dem_pairs_rmse_{name}"] = _metric(label, value, "m", how, least)
         how = f"share of the cells that both cameras see which have an elevation, {where}, worst pair"
         found["dem_pairs_completeness_min"] = _metric("Completeness of a pair, worst", min(shares), "1", how, least)
+    tilts = [r["tilt_deg"] for r in pairs if r["tilt_deg"] is not None]
+    if tilts:
+        value = float(np.sqrt(np.mean(np.square(tilts))))
+        how = "between the vertical of a local model and the true one, RMS over pairs; not in the errors of elevation"
+        every = f"{len(tilts)} of {len(pairs)} pairs"
+        found["dem_pairs_tilt_rms"] = _metric("Vertical of a pair off by, RMS", value, "deg", how, every)
     found = {name: {"group": group, "truth": truth, **metric} for name, metric in found.items()}
     merged = dict(_assessed(view, view.products.dem_accuracy, "dem_merged_", group, truth))
     share = merged.get("dem_merged_completeness", {}).get("value")

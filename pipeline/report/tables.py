@@ -231,6 +231,7 @@ def _pair(view: RunView, pair: int) -> dict[str, Any]:
         "path_m": None if path is None else path.meta.get("length_m"),
         "rmse_m": assessed.get("rmse", {}).get("value"),
         "completeness": assessed.get("completeness", {}).get("value"),
+        "tilt_deg": assessed.get("tilt", {}).get("value"),
     }
 
 
