@@ -16,6 +16,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from datasets.misalign import MisalignParams
@@ -24,11 +25,12 @@ from datasets.protocol import Sequence
 from datasets.registry import open_sequence
 from pipeline import code, driver, explain, task
 from pipeline import config as configuration
-from pipeline.dag import Graph
+from pipeline.dag import Graph, Handle
 from pipeline.key import digest
 from pipeline.reconstruct import Reconstruction
 from pipeline.store import Ref, Store
 from stages.errors import RilleError
+from stages.geometry import RigidTransform, rotation_exp
 from stages.lens import Lens
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -311,6 +313,88 @@ def test_a_parameter_of_the_sequence_makes_stale_exactly(chain: Chain, parameter
         assert chain.stale({}) == SEQUENCE[parameter], value
     finally:
         chain.sequence = before
+
+
+# -- truth: it judges, and nothing is estimated from it ----------------------------------------------------------------
+
+TRUE = {"truth", "truth_dem/local", "truth_dem/world"}
+JUDGES = {"accuracy", "accuracy/crosscheck", "dem_accuracy/local", "dem_accuracy/world", "risk/truth", "path_check"}
+ESTIMATES_BY = {"scene", "image/left", "image/right"}
+"""The pictures were taken from true poses; all that is estimated is estimated from them."""
+
+
+def with_sequence(chain: Chain, sequence: Sequence) -> Graph:
+    chain.sequence, before = sequence, chain.sequence
+    try:
+        return chain.plan({})
+    finally:
+        chain.sequence = before
+
+
+def behind(handle: Handle) -> set[str]:
+    """Groups of all tasks that a task hangs on."""
+    found, ahead = set[int](), [handle]
+    groups = set()
+    while ahead:
+        for h in ahead.pop().upstream():
+            if h.index not in found:
+                found.add(h.index)
+                groups.add(group(h.label))
+                ahead.append(h)
+    return groups
+
+
+def numbers(value: Any) -> Iterator[float]:
+    """All floats in arguments, however nested."""
+    if isinstance(value, dict):
+        value = list(value.values())
+    if isinstance(value, list | tuple):
+        for item in value:
+            yield from numbers(item)
+    elif isinstance(value, float):
+        yield value
+
+
+def test_no_estimate_has_a_path_to_the_truth(chain: Chain) -> None:
+    for h in chain.plan({}).nodes:
+        if group(h.label) not in JUDGES | TRUE:
+            assert not behind(h) & (JUDGES | TRUE), h.label
+    assert {group(h.label) for h in chain.plan({}).nodes if behind(h) & TRUE} == JUDGES
+
+
+def test_another_truth_changes_what_judges_and_no_estimate(chain: Chain) -> None:
+    assert chain.sequence.truth is not None
+    shift = RigidTransform(rotation_exp([0.01, -0.02, 0.03]), np.array([0.1, 0.2, -0.3]))
+    moved = tuple(None if T is None else T @ shift for T in chain.sequence.truth)
+    graph = with_sequence(chain, replace(chain.sequence, truth=moved))
+    assert {group(h.label) for h in graph.nodes if h.status == "planned"} == JUDGES | TRUE
+    without = with_sequence(chain, replace(chain.sequence, truth=None, truth_dem=None, truth_disparity=None))
+    assert {h.status for h in without.nodes} == {"cached"}
+    assert {group(h.label) for h in without.nodes} == chain.groups - JUDGES - TRUE
+
+
+def test_no_estimate_is_told_a_true_pose(chain: Chain) -> None:
+    """No argument of an estimate is a number of a true pose, or of a true motion from frame to frame."""
+
+    def told(**mockup: Any) -> set[str]:
+        # Shaken, so that no number of a pose is one of the mounting, which is given.
+        sequence = short({"mockup": {"jitter_deg": 1.0, **mockup}})
+        poses = [T for T in sequence.truth or () if T is not None]
+        pairs = [a.inverse() @ b for a in poses for b in poses if a is not b]
+        known = np.array([T.matrix34 for T in (*poses, *pairs)]).ravel()
+        true = np.sort(known[np.abs(known) > 1e-6])
+        found = set()
+        for h in with_sequence(chain, sequence).nodes:
+            given = np.array(list(numbers(h.spec.args)))
+            at = np.searchsorted(true, given)
+            near = [np.abs(true[np.clip(at - k, 0, len(true) - 1)] - given) for k in (0, 1)]
+            if group(h.label) not in JUDGES | TRUE | ESTIMATES_BY and (np.min(near, axis=0) < 1e-9).any():
+                found.add(group(h.label))
+        return found
+
+    assert told() == set()
+    assert told(up_noise_deg=0.0) == {"level"}, "an exact vertical is found out"
+    assert told(attitude_noise_deg=0.0) == {"level", "motion"}
 
 
 # -- edits of the sources: a module counts with all that it reaches ---------------------------------------------------
