@@ -12,7 +12,7 @@ from raising import raises
 from vehicles import MODEL
 
 from stages.declare import Bundle, check_outputs
-from stages.hazards import BITS
+from stages.hazards import BITS, measure
 from stages.lattice import Lattice
 from stages.risk import (
     CAUTION,
@@ -287,3 +287,12 @@ def test_the_stage_assembles_tiles() -> None:
         RiskParams(), {"vehicle": small.model_dump()}, {"dem": [Bundle({"elevation": z}, {"lattice": whole.to_dict()})]}
     )
     assert exact.meta["vehicle"]["name"] == "default rover"
+
+
+@pytest.mark.filterwarnings("error")
+def test_flat_ground_beside_rough_ground_has_every_measure() -> None:
+    z = np.zeros((120, 120), dtype=np.float32)
+    z[:40, :40] = np.random.default_rng(0).normal(0.0, 1e-3, (40, 40))  # running sums round; behind it nothing is left
+    measured = measure(z, z, np.zeros_like(z), 0.002, MODEL, 0.06)
+    assert np.isfinite(measured.blocks["roughness"]).all()
+    assert np.isfinite(measured.noise).all()
