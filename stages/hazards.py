@@ -142,7 +142,9 @@ def measure(
     count, square, number, deviation = (np.maximum(window_sum(a, around), 0.0) for a in sums)
     places = place(blocks.high, blocks.low, vehicle, n * cell, blocks.count > n * n - 0.5)
     wide = 2 * round((vehicle.half_length + vehicle.half_width) / (2.0 * n * cell)) + 1
-    under = np.sqrt(np.maximum(window_sum(blocks.variance, wide), 0.0) / np.maximum(window_sum(blocks.count, wide), 1.0))
+    under = np.sqrt(
+        np.maximum(window_sum(blocks.variance, wide), 0.0) / np.maximum(window_sum(blocks.count, wide), 1.0)
+    )
     values = {
         "roughness": np.sqrt(0.5 * deviation / np.maximum(number, 1.0)).astype(np.float32),
         "slope": places.slope,
