@@ -14,7 +14,7 @@ from datasets.files import Digests
 from datasets.manifest import open_manifest
 from datasets.misalign import MisalignParams, misalign
 from datasets.mockup.loop import LOOP, mockup_loop
-from datasets.mockup.params import SHORT, MockupParams
+from datasets.mockup.params import RECORDED_ONLY, SHORT, MockupParams
 from datasets.mockup.rover import RoverParams
 from datasets.mockup.sequence import mockup
 from datasets.protocol import Sequence
@@ -67,19 +67,30 @@ def open_sequence(
         An override is unknown, not permitted, or of another kind of sequence.
     """
     sections = dict(overrides or {})
+    if name_or_path == "mockup-loop":
+        return _loop(sections, name_or_path)
     warp = validated(MisalignParams, "misalign", sections.pop("misalign", {}))
     if name_or_path in BUILT_IN:
         preset, given = BUILT_IN[name_or_path][1], sections.pop("mockup", {})
-        if name_or_path == "mockup-loop":
-            rover = validated(RoverParams, "rover", sections.pop("rover", {}))
-            _none_left(sections, name_or_path)
-            return mockup_loop(validated(MockupParams, "mockup", {**preset, **given}), rover, name_or_path)
         _none_left(sections, name_or_path)
         sequence = mockup(validated(MockupParams, "mockup", {**preset, **given}), name_or_path)
     else:
         _none_left(sections, name_or_path)
         sequence = _of_files(name_or_path, Digests(memory))
     return misalign(sequence, warp)
+
+
+def _loop(sections: dict[str, Mapping[str, Any]], name: str) -> Sequence:
+    preset, given = BUILT_IN[name][1], sections.pop("mockup", {})
+    rover = validated(RoverParams, "rover", sections.pop("rover", {}))
+    _none_left(sections, name)
+    params, default = (validated(MockupParams, "mockup", {**preset, **more}) for more in (given, {}))
+    for key in RECORDED_ONLY:
+        if getattr(params, key) != getattr(default, key):
+            raise ConfigError(
+                "RIL-734", f"mockup.{key} = {getattr(params, key)}: nothing of a drive reads it", remedy="leave it out"
+            )
+    return mockup_loop(params, rover, name)
 
 
 def _of_files(name_or_path: str, digests: Digests) -> Sequence:

@@ -1,7 +1,7 @@
 """``rille check``: open everything of a sequence, match its first pair, and say in one line each what to expect.
 
-Images, disparity and motions are the tasks of a reconstruction with the sequence's own defaults: what is computed here
-is cached for it.
+Images, disparity and motions are the tasks of a reconstruction with the same parameters: what is computed here is
+cached for it.
 """
 
 from __future__ import annotations
@@ -48,6 +48,7 @@ FIRST_NAMED = 3
 
 def check(
     sequence: Sequence,
+    config: Any = None,
     *,
     output: Path | None = None,
     frames: tuple[int, ...] | None = None,
@@ -58,6 +59,7 @@ def check(
     Parameters
     ----------
     sequence : what to look at.
+    config : parameters of the stages; what suits the sequence by default.
     output : PNG to write; ``SEQUENCE-check.png`` here by default.
     frames : frames to look at; all by default.
     cache : folder of cached artifacts.
@@ -72,7 +74,9 @@ def check(
         The picture cannot be written.
     """
     chosen = frames if frames is not None else tuple(range(sequence.frames))
-    inspection = Inspection(sequence, chosen, at(cache))
+    if config is None:
+        config = configuration.build(configuration.expand(sequence.defaults))
+    inspection = Inspection(sequence, config, chosen, at(cache))
     path = output if output is not None else Path(f"{sequence.name}-check.png")
     found = []
     for verdict in inspection.verdicts():
@@ -104,13 +108,13 @@ class Inspection:
     """Measures one thing after the other, so that each verdict is printed as soon as it is known."""
 
     sequence: Sequence
+    config: Any
     frames: tuple[int, ...]
     store: Store
     match: Match | None = None
     broken: dict[tuple[int, str], RilleError] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        self.config = configuration.build(configuration.expand(self.sequence.defaults))
         self.lost = {f: why for f, why in self.sequence.lost.items() if f in self.frames}
         self.frames = tuple(f for f in self.frames if f not in self.lost)
         self._shared: dict[str, Ref] = {}

@@ -193,10 +193,13 @@ def check(
     from pipeline import check as command
     from pipeline.run import choose_frames
     from pipeline.run import settings as settle
+    from pipeline.unread import refuse_unchecked
 
     given = options(seq, Settings(assignments=assignments, cache=cache), _RESULTS, frames=frames)
-    sequence, _, _ = settle(given)
-    return command.check(sequence, output=output, frames=choose_frames(frames, sequence.frames), cache=given.cache)
+    settled = settle(given)
+    refuse_unchecked(settled.given, settled.config)
+    chosen = choose_frames(frames, settled.sequence.frames)
+    return command.check(settled.sequence, settled.config, output=output, frames=chosen, cache=given.cache)
 
 
 def main(argv: list[str] | None = None) -> None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Iterable
 
-from pipeline import costs, driver, memory
+from pipeline import costs, driver, memory, unread
 from pipeline.admission import Account, Admission, account, forecast, largest
 from pipeline.costs import Costs, Foreseen, count
 from pipeline.dag import Graph, Handle
@@ -21,6 +21,7 @@ from pipeline.memory import words
 from pipeline.progress import recall_seconds
 from pipeline.run import Options, choose_frames, settings, warn
 from pipeline.store import at
+from stages.errors import ConfigError
 
 REASONS = 3
 """Different reasons told a stage; ``verbose`` tells each task's."""
@@ -34,13 +35,19 @@ BEHIND = "input "
 
 def plan(options: Options, *, verbose: bool = False) -> int:
     """Print what ``reconstruct`` with the same options would do; gives the exit code."""
-    sequence, config, _ = settings(options)
+    settled = settings(options)
+    sequence, config = settled.sequence, settled.config
+    unread.refuse_unreadable(settled.given, config, sequence)
     warn(sequence)
     frames = choose_frames(options.frames, sequence.frames)
     graph, store = Graph(), at(options.cache)
     dataflow(graph, sequence, config, frames).build()
     result = driver.run(graph, store, dry=True, force=options.force)
     result.check()
+    lost = [] if result.unknown else unread.unread(settled.given, config, graph)
+    if lost:
+        told = f"{unread.values(lost, config)}: no task of this run reads it"
+        raise ConfigError("RIL-733", told, remedy=unread.remedy(lost, config))
     jobs = options.jobs or cores()
     hints = store.hints(graph.sequence)
     for line in describe(graph, result, recall_seconds(hints), jobs, verbose=verbose):

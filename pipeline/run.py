@@ -93,14 +93,25 @@ def choose_frames(text: str | None, count: int) -> tuple[int, ...]:
     return chosen
 
 
-def settings(options: Options) -> tuple[Sequence, Any, str]:
-    """Sequence, configuration, and who stated the vehicle's limits."""
+@dataclass(frozen=True)
+class Settings:
+    """What a command works on: ``given`` are dotted keys that the user has set, ``vehicle_source`` who its limits."""
+
+    sequence: Sequence
+    config: Any
+    vehicle_source: str
+    given: tuple[str, ...]
+
+
+def settings(options: Options) -> Settings:
+    """Open a sequence and settle its configuration."""
     from datasets.registry import open_sequence
+    from pipeline import unread
     from pipeline.verdicts import judge_rig
 
-    given = configuration.read_toml(options.config) if options.config else {}
-    configuration.merge(given, configuration.parse_assignments(options.assignments))
-    for_dataset, for_stages = configuration.split_dataset(given)
+    read = configuration.read_toml(options.config) if options.config else {}
+    configuration.merge(read, configuration.parse_assignments(options.assignments))
+    for_dataset, for_stages = configuration.split_dataset(read)
     sequence = open_sequence(options.sequence, for_dataset, hints_folder(locate(options.cache)) / "files.json")
     doubts = [f"{v.text}: {v.remedy}" for v in judge_rig(sequence.rig) if v.level != "OK"]
     if doubts and not any("baseline" in line for line in sequence.warnings):
@@ -110,8 +121,10 @@ def settings(options: Options) -> tuple[Sequence, Any, str]:
         vehicle, source = {"vehicle": sequence.vehicle.model_dump()}, f"sequence {sequence.name}"
     if "vehicle" in for_stages:
         source = "user"
-    config = configuration.build(vehicle, configuration.expand(sequence.defaults), for_stages)
-    return sequence, config, source
+    layers = vehicle, configuration.expand(sequence.defaults)
+    config = configuration.build(*layers, for_stages)
+    given = unread.set_by_user(for_stages, config, configuration.build(*layers))
+    return Settings(sequence, config, source, given)
 
 
 def warn(sequence: Sequence) -> None:
@@ -144,7 +157,7 @@ class _Opened:
     frames: tuple[int, ...]
     config: Any
     text: str
-    vehicle_source: str
+    settled: Settings
     folder: Path
     started: datetime
     versions: dict[str, str]
@@ -168,7 +181,7 @@ class _Opened:
             config_toml=self.text,
             versions=self.versions,
             command=self.options.command(),
-            vehicle_source=self.vehicle_source,
+            vehicle_source=self.settled.vehicle_source,
             started=self.started.strftime("%Y-%m-%dT%H:%M:%SZ"),
             notes=self.sequence.notes,
             **late,
@@ -178,7 +191,7 @@ class _Opened:
         """What the files of the run are rendered from, in one word."""
         from pipeline import standing
 
-        facts = {"config": self.text, "frames": self.frames, "vehicle": self.vehicle_source}
+        facts = {"config": self.text, "frames": self.frames, "vehicle": self.settled.vehicle_source}
         return standing.stamp(self.graph, self.sequence, self.versions, **facts, command=self.options.command())
 
 
@@ -198,7 +211,7 @@ def _reconstruct(options: Options) -> int:
             cached = result.total().cached
             arrived = _outcome(opened)
             print(f"{earlier.parent / earlier.readlink()}  cached {cached}, nothing new: that run stands")
-            return max(arrived, _posed_all(opened.products))
+            return max(arrived, _posed_all(opened.products), _all_read(opened, arrived))
         _write(opened, result, ahead)
     if result.ok:
         from pipeline import standing
@@ -210,20 +223,23 @@ def _reconstruct(options: Options) -> int:
     total = result.total()
     print(f"{opened.folder}  computed {total.computed}, cached {total.cached}, missing {total.failed + total.skipped}")
     if result.ok:
-        return max(arrived, _posed_all(opened.products))
+        return max(arrived, _posed_all(opened.products), _all_read(opened, arrived))
     _list_missing(opened.graph, opened.folder)
     return HOLES
 
 
 def _open(options: Options) -> _Opened:
     """Read the input and lay the run out."""
+    from pipeline import unread
     from pipeline.drive import dataflow
     from pipeline.executor import known
 
     _known_stages(options.force)
     known(options.executor)
     started = datetime.now(UTC)
-    sequence, config, vehicle_source = settings(options)
+    settled = settings(options)
+    sequence, config = settled.sequence, settled.config
+    unread.refuse_unreadable(settled.given, config, sequence)
     warn(sequence)
     if options.verb == "drive" and sequence.simulation is None:
         raise ConfigError("RIL-059", f"{sequence.name} is recorded, it cannot be driven", remedy="drive mockup-loop")
@@ -234,7 +250,7 @@ def _open(options: Options) -> _Opened:
     graph, store = Graph(), at(options.cache)
     flow = dataflow(graph, sequence, config, frames)
     return _Opened(
-        options, sequence, frames, config, text, vehicle_source, folder, started, _versions(), store, graph, flow,
+        options, sequence, frames, config, text, settled, folder, started, _versions(), store, graph, flow,
         flow.build(),
     )  # fmt: skip
 
@@ -312,6 +328,18 @@ def _posed_all(products: Products) -> int:
         return COMPLETE
     pieces = f", {meta['in_world']} in the world, in {len(meta['pieces'])} pieces" if posed > meta["in_world"] else ""
     print(f"rille: incomplete: {posed} of {total} frames posed{pieces}; see the warnings", file=sys.stderr)
+    return HOLES
+
+
+def _all_read(opened: _Opened, arrived: int) -> int:
+    """Exit code of a run that came to its end: a parameter that no task of it read is an error, and named."""
+    from pipeline import unread
+
+    lost = unread.unread(opened.settled.given, opened.config, opened.graph) if arrived == COMPLETE else []
+    if not lost:
+        return COMPLETE
+    told = f"{unread.values(lost, opened.config)}: no task of this run read it: {unread.remedy(lost, opened.config)}"
+    print(f"rille: error RIL-732: {told}", file=sys.stderr)
     return HOLES
 
 

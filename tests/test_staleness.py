@@ -23,7 +23,7 @@ from datasets.misalign import MisalignParams
 from datasets.mockup.params import SHORT, MockupParams
 from datasets.protocol import Sequence
 from datasets.registry import open_sequence
-from pipeline import code, driver, explain, task
+from pipeline import code, driver, explain, task, unread
 from pipeline import config as configuration
 from pipeline.dag import Graph, Handle
 from pipeline.key import digest
@@ -223,6 +223,13 @@ def chain(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chain]:
         patch.setattr(explain.Known, "reason", lambda *_: "")
         patch.setattr(explain.Known, "latest", lambda known, store, stage, label: store.labels.get(label))
         yield Chain(short({}), tmp_path_factory.mktemp("store"))
+
+
+def test_a_reconstruction_reads_all_sections_but_those_of_a_drive(chain: Chain) -> None:
+    config = configuration.build(configuration.expand(chain.sequence.defaults))
+    every = [f"{section}.x" for section in type(config).model_fields if section != "terrain"]
+    lost = {key.partition(".")[0] for key in unread.unread(every, config, chain.plan({}))}
+    assert lost == unread.DRIVEN - {"drive"}
 
 
 def short(given: dict[str, dict[str, Any]]) -> Sequence:

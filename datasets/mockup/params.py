@@ -113,3 +113,9 @@ class MockupParams(SceneParams, RenderParams):
 
 SHORT = {"frames": 9, "bed_width": 1.2, "bed_length": 1.2}
 """``mockup-short``: two segments and the pair that ends the second, on a smaller bed."""
+
+RECORDED_ONLY = (
+    *("frames", "forward", "sideways", "turn_deg", "roll_deg", "roll_swing_deg", "jitter_deg"),
+    "attitude_noise_deg",
+)
+"""What says how the body moves and what is told of it; a rover that is driven has its own (``RoverParams``)."""

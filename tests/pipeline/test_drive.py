@@ -16,7 +16,7 @@ import pytest
 from raising import raises
 
 from datasets.registry import open_sequence
-from pipeline import config, driver, run
+from pipeline import config, driver, run, unread
 from pipeline.dag import Graph, Handle
 from pipeline.drive import Drive
 from pipeline.driver import Result
@@ -76,6 +76,14 @@ def test_it_arrives_and_knows_where_it_is(arrived: tuple[Drive, Result], store: 
 
 
 @pytest.mark.slow
+def test_it_reads_none_of_the_sections_of_a_reconstruction(arrived: tuple[Drive, Result]) -> None:
+    flow, _ = arrived
+    every = [f"{section}.x" for section in type(flow.config).model_fields if section != "terrain"]
+    lost = {key.partition(".")[0] for key in unread.unread(every, flow.config, flow.graph)}
+    assert lost - {"reflex", "global_fix"} == unread.RECORDED, "both are off here"
+
+
+@pytest.mark.slow
 def test_a_rig_that_is_given_off_by_degrees_is_repaired_at_the_first_stop(store: Path) -> None:
     flow, result = drive(store, "mockup.rig_error_deg=[2.0,2.0,2.0]")
     assert result.failures == []
@@ -106,7 +114,7 @@ def test_driven_again_nothing_is_computed_and_all_is_the_same(arrived: tuple[Dri
 def test_killed_in_the_middle_it_goes_on_to_the_same_bits(arrived: tuple[Drive, Result], tmp_path: Path) -> None:
     here, cache = Path(__file__).parent, tmp_path / "cache"
     program = "import sys, pathlib, test_drive; test_drive.drive(pathlib.Path(sys.argv[1]))"
-    paths = os.pathsep.join([str(here), str(here.parents[1])])
+    paths = os.pathsep.join(map(str, (here, *here.parents[:2])))
     driving = subprocess.Popen([sys.executable, "-c", program, str(cache)], env=os.environ | {"PYTHONPATH": paths})
     try:
         while len(list(cache.glob("artifacts/leg/*/*/manifest.json"))) < 2:
