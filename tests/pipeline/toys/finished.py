@@ -49,11 +49,11 @@ def sequence(*, truth: bool) -> Sequence:
     turn = RigidTransform(np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1.0]]), np.array([5.0, 6.0, 7.0]))
     poses = tuple(turn @ level_pose(i * STEP) for i in FRAMES) if truth else None
     return Sequence(
-        name="bed <1>",
+        name="bed",
         rig=RIG,
         frames=len(FRAMES),
         image=lambda frame, camera: None,  # type: ignore[arg-type,return-value]
-        frame_names=tuple(f"left{i:03d}" for i in FRAMES),
+        frame_names=tuple(f"left <{i}>" for i in FRAMES),
         truth=poses,
         truth_source="exact poses" if truth else "",
         notes=("Rendered for a test.",),
