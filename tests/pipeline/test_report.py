@@ -69,7 +69,7 @@ def test_the_page_needs_nothing_but_itself(whole: Written) -> None:
 
 def test_text_from_outside_is_escaped(whole: Written) -> None:
     _, page_, html, _ = whole
-    assert "left <1>" in page_.text
+    assert "Rendered for test <1>." in page_.text
     assert "<1>" not in html
     assert "<m>" not in html
 

@@ -53,10 +53,10 @@ def sequence(*, truth: bool) -> Sequence:
         rig=RIG,
         frames=len(FRAMES),
         image=lambda frame, camera: None,  # type: ignore[arg-type,return-value]
-        frame_names=tuple(f"left <{i}>" for i in FRAMES),
+        frame_names=tuple(f"left{i:03d}" for i in FRAMES),
         truth=poses,
         truth_source="exact poses" if truth else "",
-        notes=("Rendered for a test.",),
+        notes=("Rendered for test <1>.",),
     )
 
 
