@@ -25,6 +25,8 @@ COLUMNS = (
     ("dem_pairs_rmse_max", "DEM RMSE, worst pair"),
     ("dem_pairs_completeness_min", "completeness, worst pair"),
     ("dem_merged_rmse", "merged DEM RMSE"),
+    ("dem_merged_tilt", "its vertical off by"),
+    ("trajectory_nees", "NEES"),
     ("path_check_hazard_cells", "truly hazardous cells on the path"),
 )
 
