@@ -49,7 +49,6 @@ STAGE = Stage(
         Array(name, ("row", "col"), "float32", "m", name, "nan")
         for name in ("elevation", "elevation_std", "residual", "ortho")
     ),
-    requires=("numpy",),
     run=_run,
 )
 

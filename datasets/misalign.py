@@ -142,6 +142,5 @@ STAGE = Stage(
         Array("image", ("row", "col"), "uint8", "grey", "image"),
         Array("valid", ("row", "col"), "uint8", "1", "1 = usable"),
     ),
-    requires=("numpy", "scipy", "opencv-python-headless"),
     run=_run,
 )

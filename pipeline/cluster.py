@@ -25,6 +25,7 @@ from pipeline.code import OWN, tree_digest
 from pipeline.environment import prepare_environment
 from pipeline.location import Location
 from pipeline.objects import ObjectStore
+from pipeline.packages import version
 from pipeline.store import Store, at
 from pipeline.task import CodeChangedError
 from stages.errors import ConfigError, RilleError
@@ -33,7 +34,7 @@ PACKAGES = (
     *("dask", "distributed", "google-crc32c", "llvmlite", "numba", "numcodecs", "numpy", "obstore", "pydantic", "zarr"),
     *("opencv-python-headless", "pycolmap", "pyogrio", "rasterio", "scipy"),
 )
-"""Distributions whose version must be the client's."""
+"""Distributions whose version must be the client's, and the kind of processor that they work for."""
 
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 
@@ -55,7 +56,7 @@ def identity() -> dict[str, str]:
     found = {"Python": platform.python_version(), "source code": tree_digest((*OWN, "pipeline"))[:12]}
     for name in PACKAGES:
         try:
-            found[name] = metadata.version(name)
+            found[name] = version(name)
         except metadata.PackageNotFoundError:
             found[name] = "none"
     return found

@@ -1,4 +1,4 @@
-"""What a stage's result depends on besides its inputs: its own source code and the packages it declares.
+"""What a stage's result depends on besides its inputs: its own source code (for packages: :mod:`pipeline.packages`).
 
 The code digest of a module covers all *own* modules that it reaches by import statements, at any depth and also from
 within functions, with the ``__init__`` of every package on the way. Each counts as its syntax tree without
@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import ast
 import hashlib
-import importlib.metadata
 import importlib.util
 import json
 import os
@@ -27,16 +26,11 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.key import digest
-from stages.errors import RilleError
 
 OWN = ("stages", "datasets")
 
 FORGET = 8
 """States of the sources that are remembered, before those not in use are forgotten."""
-
-
-class MissingPackageError(RilleError):
-    """A distribution that a stage declares is not installed."""
 
 
 @dataclass(frozen=True)
@@ -125,20 +119,16 @@ def tree_digest(own: Iterable[str] = OWN) -> str:
     return digest(found)
 
 
-@cache
-def version(distribution: str) -> str:
-    """Exact installed version of a distribution."""
-    try:
-        return importlib.metadata.version(distribution)
-    except importlib.metadata.PackageNotFoundError as error:
-        raise MissingPackageError(
-            "RIL-530", f"package {distribution} is not installed", remedy="run `make install`"
-        ) from error
-
-
-def environment(requires: Iterable[str]) -> dict[str, str]:
-    """Exact installed versions of the distributions that a stage declares."""
-    return {name: version(name) for name in sorted(requires)}
+def external_imports(module: str, own: Iterable[str] = OWN) -> set[str]:
+    """Top-level names of what a module and all own modules that it reaches import from elsewhere, but from Python."""
+    packages = tuple(sorted({*own, module.partition(".")[0]}))
+    names = {
+        imported.partition(".")[0]
+        for name, _ in _reachable(module, packages)
+        if (path := _file(name)) is not None
+        for imported in _read(name, path).imports
+    }
+    return {name for name in names if name not in packages and name not in sys.stdlib_module_names}
 
 
 @cache

@@ -27,10 +27,11 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from pipeline.code import environment, module_digests
+from pipeline.code import module_digests
 from pipeline.kernels import guard
 from pipeline.key import text
 from pipeline.memory import Meter
+from pipeline.packages import versions
 from pipeline.store import Ref, Store, at
 from stages.declare import Bundle, Params, Stage, check_outputs
 from stages.errors import RilleError
@@ -144,7 +145,7 @@ _FIXED = ("code", "env", "format", "stage", "version")
 
 def _fixed(module: str) -> dict[str, Any]:
     stage = resolve(module)
-    found = (module_digests(module), environment(stage.requires), FORMAT, stage.name, stage.version)
+    found = (module_digests(module), versions(module), FORMAT, stage.name, stage.version)
     return dict(zip(_FIXED, found, strict=True))
 
 

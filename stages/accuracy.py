@@ -251,6 +251,5 @@ STAGE = Stage(
         Array("displacement", ("step", "xyz"), "float64", "m", "estimated displacement per frame", "nan", "world"),
         Array("displacement_truth", ("step", "xyz"), "float64", "m", "true displacement per frame", "nan", "world"),
     ),
-    requires=("numpy",),
     run=_run,
 )

@@ -232,6 +232,5 @@ STAGE = Stage(
         Array("step_angle", ("frame",), "float64", "rad", "the same, rotation", "nan"),
         Array("flagged", ("frame",), "uint8", "1", "bits: 1 position, 2 rotation, 4 motion, 8 rotation of a step"),
     ),
-    requires=("numpy",),
     run=_run,
 )

@@ -26,6 +26,5 @@ STAGE = Stage(
     params=NoParams,
     inputs=("rig",),
     outputs=(),
-    requires=("numpy",),
     run=_run,
 )

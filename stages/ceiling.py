@@ -136,6 +136,5 @@ STAGE = Stage(
         _array("upper", "height that the ground does not exceed"),
         _array("lower", "height that it does not fall below, where it was seen"),
     ),
-    requires=("numpy", "numba"),
     run=_run,
 )

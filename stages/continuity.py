@@ -261,6 +261,5 @@ STAGE = Stage(
     params=ContinuityParams,
     inputs=("sights*", "motions*", "bridges*", "sides*"),
     outputs=(),
-    requires=("numpy", "numba"),
     run=_run,
 )

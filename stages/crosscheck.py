@@ -316,7 +316,6 @@ STAGE = Stage(
         Array("registered", ("frame",), "uint8", "1", "1 = the frame has a pose"),
         Array("observations", ("frame",), "int32", "1", "adjusted image points of the frame, both cameras"),
     ),
-    requires=("numpy", "pycolmap", "opencv-python-headless"),
     run=_run,
     memory=Memory(factor=10.0, result=0.0, lower=("crosscheck.window", "crosscheck.max_image_size")),
 )

@@ -118,6 +118,5 @@ STAGE = Stage(
         Array("piece_poses", _POSES, "float64", "m", "the same of all pieces", "nan", "crosscheck piece"),
         Array("piece", ("frame",), "int16", "1", "unbroken piece that the frame belongs to", "-1"),
     ),
-    requires=("numpy",),
     run=_run,
 )

@@ -96,8 +96,7 @@ class Stage:
 
     ``run(params, args, inputs)`` gets the tunable parameters, what identifies this task (JSON-able: frame numbers,
     a rig ...), and the upstream bundles by port. A port ``name*`` takes a list, ``name?`` may be absent.
-    ``requires`` names the distributions whose exact version can change the result. ``memory`` never enters a key by
-    itself: it serves the plan and the admission of tasks.
+    ``memory`` never enters a key by itself: it serves the plan and the admission of tasks.
     """
 
     name: str
@@ -106,7 +105,6 @@ class Stage:
     params: type[Params]
     inputs: tuple[str, ...]
     outputs: tuple[Array, ...]
-    requires: tuple[str, ...]
     run: Callable[[Any, Mapping[str, Any], Inputs], Bundle]
     memory: Memory = Memory()
 

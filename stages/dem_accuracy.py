@@ -89,6 +89,5 @@ STAGE = Stage(
     params=NoParams,
     inputs=("dem*", "truth"),
     outputs=(Array("error", ("row", "col"), "float32", "m", "elevation minus truth", "nan"),),
-    requires=("numpy",),
     run=_run,
 )

@@ -95,6 +95,5 @@ STAGE = Stage(
         Array("error", ("frame",), "float64", "m", "distance of the estimated from the true position"),
         Array("way", ("position", "xyz"), "float64", "m", "true position of the vehicle on the ground", frame="truth"),
     ),
-    requires=("numpy",),
     run=_run,
 )

@@ -85,6 +85,5 @@ STAGE = Stage(
     params=ExposureParams,
     inputs=("seams*",),
     outputs=(),
-    requires=("numpy", "scipy"),
     run=_run,
 )

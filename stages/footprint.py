@@ -86,6 +86,5 @@ STAGE = Stage(
     params=NoParams,
     inputs=("dem",),
     outputs=(),
-    requires=("numpy",),
     run=_run,
 )

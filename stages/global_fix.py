@@ -303,6 +303,5 @@ STAGE = Stage(
     params=GlobalFixParams,
     inputs=("dem?", "map?"),
     outputs=(),
-    requires=("numpy", "numba"),
     run=_run,
 )

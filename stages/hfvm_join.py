@@ -60,6 +60,5 @@ STAGE = Stage(
     params=HfvmParams,
     inputs=("left", "right", "coarse", "tiles*"),
     outputs=OUTPUTS,
-    requires=("numpy", "numba", "opencv-python-headless"),
     run=_run,
 )

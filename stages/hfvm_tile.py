@@ -310,6 +310,5 @@ STAGE = Stage(
         *("refined*?", "patches?"),
     ),
     outputs=(*_PARTS, *_OPTIONAL),
-    requires=("numpy", "numba", "opencv-python-headless"),
     run=_run,
 )

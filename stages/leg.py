@@ -148,6 +148,5 @@ STAGE = Stage(
         Array("rest_gear", ("rest_piece",), "int8", "1", "1 where that is driven ahead, -1 where it is driven back"),
         Array("cost_to_go", ("row", "col"), "float32", "m", "price of the way from each cell to the goal", "nan"),
     ),
-    requires=("numpy", "numba", "scipy"),
     run=_run,
 )

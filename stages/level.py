@@ -288,6 +288,5 @@ STAGE = Stage(
     params=LevelParams,
     inputs=("disparity", "rig"),
     outputs=(),
-    requires=("numpy", "numba"),
     run=_run,
 )

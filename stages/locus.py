@@ -360,7 +360,6 @@ STAGE = Stage(
         _array("residual", "px", "mismatch of disparity and calibration at the elevation"),
         _array("ortho", "grey", "grey value of the left image, 0..255"),
     ),
-    requires=("numpy", "numba", "scipy"),
     run=_run,
     memory=Memory(lower=("locus.cell_size", "locus.extent"), size=_size),
 )

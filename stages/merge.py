@@ -335,7 +335,6 @@ STAGE = Stage(
         _array("relief_std", "float32", "m", "standard deviation of the elevation against that around", "nan"),
         _array("filled", "uint8", "1", "1 where a small hole was closed by interpolation", ""),
     ),
-    requires=("numpy", "numba"),
     run=_run,
     memory=Memory(lower=("locus.cell_size",)),
 )

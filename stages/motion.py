@@ -239,6 +239,5 @@ STAGE = Stage(
         Array("row_disparity", _GRID, "float32", "px", "level-0 rows, frame b minus a", "nan", "coarse level of a"),
         Array("validity", _GRID, "uint8", "1", "bit mask, see stages.validity", "", "coarse level of a"),
     ),
-    requires=("numpy", "numba", "opencv-python-headless"),
     run=_run,
 )

@@ -170,6 +170,5 @@ STAGE = Stage(
         Array("residual_after", _MATCH, "float32", "px", "the same, rig adjusted to this pair"),
         Array("weight", _MATCH, "float32", "1", "robust weight in the adjustment, 0 = outlier"),
     ),
-    requires=("numpy", "numba"),
     run=_run,
 )

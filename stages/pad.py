@@ -69,6 +69,5 @@ STAGE = Stage(
         _array("residual", "px", "none: not measured"),
         _array("ortho", "grey", "none: not seen"),
     ),
-    requires=("numpy",),
     run=_run,
 )

@@ -257,7 +257,6 @@ STAGE = Stage(
         Array("cost_to_go", ("row", "col"), "float32", "m", "rows: cost from the start; grid8: to the target", "nan"),
         Array("reachable", ("col",), "uint8", "1", "1 where the target row can be reached"),
     ),
-    requires=("numpy", "numba", "scipy"),
     run=_run,
     memory=Memory(factor=6.0, lower=("locus.cell_size",)),
 )

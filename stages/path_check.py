@@ -127,6 +127,5 @@ STAGE = Stage(
     params=NoParams,
     inputs=("path", "risk"),
     outputs=(Array("hazard_cell", ("cell", "rowcol"), "int32", "1", "crossed cells that are truly hazardous"),),
-    requires=("numpy", "numba", "scipy"),
     run=_run,
 )

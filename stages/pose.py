@@ -28,6 +28,5 @@ STAGE = Stage(
         replace(POSES, frame="world", nodata=""),
         replace(COVARIANCE, frame="world", nodata="", optional=True),
     ),
-    requires=("numpy",),
     run=_run,
 )

@@ -181,6 +181,5 @@ STAGE = Stage(
         Array("level_*", ("row", "col"), "float32", "1", "grey value 0..255, 0 where masked"),
         Array("valid_*", ("row", "col"), "uint8", "1", "1 = usable"),
     ),
-    requires=("numpy", "numba"),
     run=_run,
 )

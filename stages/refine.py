@@ -273,6 +273,5 @@ STAGE = Stage(
         replace(COVARIANCE, frame="local"),
         replace(SHARED, frame="local"),
     ),
-    requires=("numpy", "numba"),
     run=_run,
 )

@@ -239,7 +239,6 @@ STAGE = Stage(
         Array("raised", ("frame",), "int32", "1", "points of the largest raised group"),
         Array("where", ("frame", "xy"), "float64", "m", "its place, right and ahead of the vehicle's centre", "nan"),
     ),
-    requires=("numpy", "scipy"),
     run=_run,
 )
 

@@ -540,6 +540,5 @@ STAGE = Stage(
         Array("landmarks", ("point", "xyz"), "float64", "m", "coordinates of the landmarks", "nan", "local"),
         Array("residual", ("point", "frame"), "float32", "px", "back-projection error", nodata="nan"),
     ),
-    requires=("numpy", "numba"),
     run=_run,
 )

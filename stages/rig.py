@@ -251,6 +251,5 @@ STAGE = Stage(
     params=RigParams,
     inputs=("orientations*?",),
     outputs=(),
-    requires=("numpy",),
     run=_run,
 )

@@ -218,7 +218,6 @@ STAGE = Stage(
         Array("filled", _GRID, "uint8", "1", "1 where the elevation was interpolated"),
         Array("elevation", _GRID, "float32", "m", "elevation with small holes closed", "nan"),
     ),
-    requires=("numpy", "numba", "scipy"),
     run=_run,
     memory=Memory(factor=16.0, lower=("locus.cell_size",)),
 )

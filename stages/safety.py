@@ -141,6 +141,5 @@ STAGE = Stage(
     params=SafetyParams,
     inputs=("sense", "resect"),
     outputs=(),
-    requires=("numpy",),
     run=_run,
 )

@@ -117,6 +117,5 @@ STAGE = Stage(
             optional=True,
         ),
     ),
-    requires=("numpy",),
     run=_run,
 )

@@ -197,6 +197,5 @@ STAGE = Stage(
     params=SeamAuditParams,
     inputs=("seams*",),
     outputs=(),
-    requires=("numpy",),
     run=_run,
 )

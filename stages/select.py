@@ -215,6 +215,5 @@ STAGE = Stage(
     params=SelectParams,
     inputs=("motions*",),
     outputs=(),
-    requires=("numpy", "numba"),
     run=_run,
 )

@@ -50,6 +50,5 @@ STAGE = Stage(
     params=NoParams,
     inputs=("left", "right"),
     outputs=(),
-    requires=("numpy", "numba", "opencv-python-headless"),
     run=_run,
 )

@@ -109,6 +109,5 @@ STAGE = Stage(
     params=NoParams,
     inputs=("left", "right"),
     outputs=(),
-    requires=("numpy", "opencv-python-headless"),
     run=_run,
 )

@@ -354,6 +354,5 @@ STAGE = Stage(
         Array("birth", ("point",), "int16", "1", "index of the frame that the template is from"),
         Array("distance", ("point", "frame"), "float32", "grey", "rms difference to the template", nodata="nan"),
     ),
-    requires=("numpy", "numba", "opencv-python-headless"),
     run=_run,
 )

@@ -280,6 +280,5 @@ STAGE = Stage(
         Array("segment", ("frame",), "int16", "1", "segment that posed the frame, -1: lost", "-1"),
         Array("piece", ("frame",), "int16", "1", "unbroken piece, each in its own frame; -1: lost", "-1"),
     ),
-    requires=("numpy",),
     run=_run,
 )

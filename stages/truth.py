@@ -31,6 +31,5 @@ STAGE = Stage(
     outputs=(
         Array("poses", ("frame", "row", "col"), "float64", "m", "pose [R | t] of the left camera", "nan", "truth"),
     ),
-    requires=("numpy",),
     run=_run,
 )

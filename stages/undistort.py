@@ -170,6 +170,5 @@ STAGE = Stage(
         Array("image", ("row", "col"), "float32", "grey", "image of an ideal camera, 0..255, 0 where masked"),
         Array("valid", ("row", "col"), "uint8", "1", "1 = usable"),
     ),
-    requires=("numpy", "numba", "opencv-python-headless"),
     run=_run,
 )

@@ -65,6 +65,5 @@ STAGE = Stage(
     params=RoverParams,
     inputs=("scene", "before", "pose", "leg"),
     outputs=bed.STAGE.outputs,
-    requires=("numpy", "numba"),
     run=_run,
 )

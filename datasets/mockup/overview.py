@@ -37,6 +37,5 @@ STAGE = Stage(
     params=RoverParams,
     inputs=("scene",),
     outputs=(Array("elevation", ("row", "col"), "float32", "m", "mean elevation of the cell", "nan", "bed"),),
-    requires=("numpy",),
     run=_run,
 )

@@ -224,7 +224,6 @@ STAGE = Stage(
         Array("image", ("row", "col"), "uint8", "grey", "image"),
         Array("valid", ("row", "col"), "uint8", "1", "1 = usable, 0 = background beyond the bed"),
     ),
-    requires=("numpy", "numba", "scipy"),
     run=_run,
     memory=Memory(result=0.02),  # an image has a fiftieth of the scene's bytes
 )

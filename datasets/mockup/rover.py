@@ -234,6 +234,5 @@ STAGE = Stage(
         _trail("clearance", "m", "least distance of the belly to the ground"),
         _trail("step", "m", "edge under the worst wheel"),
     ),
-    requires=("numpy", "scipy"),
     run=_run,
 )

@@ -76,6 +76,5 @@ STAGE = Stage(
             frame="bed",
         ),
     ),
-    requires=("numpy", "numba"),
     run=_run,
 )

@@ -54,6 +54,5 @@ STAGE = Stage(
         Array("up", ("frame", "xyz"), "float64", "1", "direction of up in the left camera, by inclinometer"),
         Array("acceleration", ("frame",), "float64", "1", "peak of vertical acceleration since the last image, m/s2"),
     ),
-    requires=("numpy",),
     run=_run,
 )

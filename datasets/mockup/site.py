@@ -69,6 +69,5 @@ STAGE = Stage(
     params=NoParams,
     inputs=("scene",),
     outputs=bed.STAGE.outputs,
-    requires=("numpy", "numba"),
     run=_run,
 )

@@ -103,6 +103,5 @@ STAGE = Stage(
         Array("occluded", ("row", "col"), "uint8", "1", "0 seen, 1 hidden, 2 outside the right image, 3 no bed"),
         Array("depth", ("row", "col"), "float32", "m", "depth along the left optical axis", nodata="nan"),
     ),
-    requires=("numpy", "numba"),
     run=_run,
 )

@@ -76,6 +76,5 @@ STAGE = Stage(
         Array("elevation", ("row", "col"), "float32", "m", "exact elevation", nodata="nan", frame="world"),
         Array("seen", ("row", "col"), "uint8", "1", "1 = both cameras of a listed pair see the cell", frame="world"),
     ),
-    requires=("numpy", "numba"),
     run=_run,
 )

@@ -142,7 +142,6 @@ STAGE = Stage(
     params=HfvmParams,
     inputs=("left", "right"),
     outputs=OUTPUTS,
-    requires=("numpy", "numba", "opencv-python-headless"),
     run=_run,
     memory=Memory(fixed=30e6, factor=10.0, result=1.6, lower=("hfvm.preset", "hfvm.finest")),
 )

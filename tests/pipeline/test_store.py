@@ -34,7 +34,6 @@ STAGE = Stage(
         Array("count", (), "int64", "1", "count"),
         Array("level_*", ("row", "col"), "uint16", "1", "level"),
     ),
-    requires=(),
     run=lambda params, args, inputs: Bundle({}, {}),
 )
 KEY = "ab" * 32

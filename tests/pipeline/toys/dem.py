@@ -30,6 +30,5 @@ STAGE = Stage(
     outputs=tuple(
         Array(n, ("row", "col"), "float32", "m", n, "nan") for n in ("elevation", "elevation_std", "residual", "ortho")
     ),
-    requires=("numpy",),
     run=_run,
 )

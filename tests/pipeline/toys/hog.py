@@ -20,7 +20,6 @@ STAGE = Stage(
     params=NoParams,
     inputs=("after?",),
     outputs=(Array("value", ("one",), "int64", "1", "value"),),
-    requires=(),
     run=_run,
     memory=Memory(fixed=1e6, factor=1.0, lower=("hog.bytes",), size=lambda params, args, metas: args["bytes"]),
 )

@@ -48,6 +48,5 @@ STAGE = Stage(
     params=NoParams,
     inputs=("after?",),
     outputs=(Array("value", ("one",), "int64", "1", "value"),),
-    requires=(),
     run=_run,
 )

@@ -30,6 +30,5 @@ STAGE = Stage(
         Array("values", ("row", "col"), "float32", "m", "values", nodata="nan"),
         Array("mask", ("row", "col"), "uint8", "1", "positive"),
     ),
-    requires=("numpy",),
     run=_run,
 )

@@ -26,6 +26,5 @@ STAGE = Stage(
     params=ScaleParams,
     inputs=("values",),
     outputs=(Array("level_*", ("row", "col"), "float32", "m", "scaled values", nodata="nan"),),
-    requires=("numpy",),
     run=_run,
 )

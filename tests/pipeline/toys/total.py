@@ -17,6 +17,5 @@ STAGE = Stage(
     params=NoParams,
     inputs=("parts*", "extra?"),
     outputs=(Array("sums", ("part",), "float64", "m", "sum of each part"),),
-    requires=("numpy",),
     run=_run,
 )

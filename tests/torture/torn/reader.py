@@ -17,6 +17,5 @@ STAGE = Stage(
     params=NoParams,
     inputs=("values",),
     outputs=(Array("total", ("one",), "float64", "1", "sum"),),
-    requires=("numpy",),
     run=_run,
 )

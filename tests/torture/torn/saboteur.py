@@ -67,6 +67,5 @@ STAGE = Stage(
     params=NoParams,
     inputs=("after?",),
     outputs=(Array("value", ("one",), "float64", "1", "value"),),
-    requires=(),
     run=_run,
 )
