@@ -49,6 +49,10 @@ class BucketError(RilleError):
     """The object store does not do what is asked of it."""
 
 
+class OddNameError(BucketError):
+    """An object has a name that no listing gives: with ``..``, an empty part or a control character."""
+
+
 @dataclass(frozen=True)
 class Entry:
     """One object of a listing; ``modified`` in seconds since 1970, by the server's clock."""
@@ -157,8 +161,17 @@ class Bucket:
             raise self._told(error) from None  # the original has the request at length
 
     def _told(self, error: BaseException) -> BucketError:
+        import obstore
+
         text, code, bucket = str(error), _code(error), self.url.split("/")[2]
         endpoint = _endpoint()
+        if isinstance(error, obstore.exceptions.InvalidPathError):
+            name = re.search(r'path: (".*?")', text)
+            return OddNameError(
+                "RIL-766",
+                f"objects of {self.url} cannot be listed: one is named {name[1] if name else 'oddly'}",
+                remedy="remove it by another program; it is none of Rille's",
+            )
         if code == "NoSuchBucket":
             return BucketError(
                 "RIL-508", f"bucket {bucket} does not exist at {endpoint}", remedy="make it, or correct --cache"

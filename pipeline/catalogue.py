@@ -83,7 +83,10 @@ class Catalogue:
         line = self.lines.get(key)
         if line is None or not line.startswith(f"[{now[0]},{now[1]},{now[2]},{now[3]},"):
             return None
-        return Entry.read(line)
+        try:
+            return Entry.read(line)
+        except (ValueError, TypeError, RecursionError):
+            return None
 
     def enter(self, key: str, entry: Entry) -> None:
         """Take in what a manifest says that was read."""

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from cyclopts import App, CycloptsError
+from rich.console import Console
 
 from pipeline.commands import cache as cache_commands
 from pipeline.commands import datasets as datasets_commands
@@ -41,6 +42,10 @@ from pipeline.commands.options import (
     options,
     prepare,
 )
+from pipeline.plain import plain_output, raw
+
+LONGEST = 1000
+"""Characters of a complaint."""
 
 app = App(
     name="rille",
@@ -204,21 +209,27 @@ def check(
 
 def main(argv: list[str] | None = None) -> None:
     """Entry point of ``rille``."""
+    with plain_output():
+        code = _run(argv)
+        sys.stdout.flush()
+    sys.exit(code)
+
+
+def _run(argv: list[str] | None) -> int:
     tokens = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in tokens
     try:
-        code = app(tokens, exit_on_error=False, print_error=False, result_action="return_value")
-        code = code if isinstance(code, int) else COMPLETE
+        console = Console(file=raw(sys.stdout))  # of the help, which has colours
+        code = app(tokens, console=console, exit_on_error=False, print_error=False, result_action="return_value")
+        return code if isinstance(code, int) else COMPLETE
     except KeyboardInterrupt:
         print("rille: interrupted; the same command resumes from here", file=sys.stderr)
-        code = INTERRUPTED
+        return INTERRUPTED
     except CycloptsError as error:
         _print_error("RIL-001", str(error))
-        code = USAGE
+        return USAGE
     except Exception as error:
-        code = _complain(error, debug)
-    sys.stdout.flush()
-    sys.exit(code)
+        return _complain(error, debug)
 
 
 def _complain(error: Exception, debug: bool) -> int:
@@ -236,7 +247,10 @@ def _complain(error: Exception, debug: bool) -> int:
 
 
 def _print_error(code: str, words: str) -> None:
-    print(f"rille: error {code}: {' '.join(words.split())}", file=sys.stderr)
+    line = " ".join(words.split())
+    if len(line) > LONGEST:  # of what a file holds, enough to find it
+        line = f"{line[: LONGEST // 2]} ... {line[-LONGEST // 2 :]}"
+    print(f"rille: error {code}: {line}", file=sys.stderr)
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline import config as configuration
+from pipeline.plain import raw
 from stages.errors import ConfigError, InputError
 
 if TYPE_CHECKING:
@@ -161,7 +162,7 @@ def _progress(pixels: int, stream: TextIO) -> Iterator[Tell | None]:
         from rich.console import Console
         from rich.progress import Progress
 
-        with Progress(console=Console(file=stream), transient=True) as bar:
+        with Progress(console=Console(file=raw(stream)), transient=True) as bar:
             task = bar.add_task("matching", total=1.0)
             yield lambda share, step: bar.update(task, completed=share, description=step)
     else:

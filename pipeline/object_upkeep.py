@@ -6,6 +6,7 @@ of last use. Ages are by the server's clock against this machine's: keep the gra
 
 from __future__ import annotations
 
+import re
 import time
 from collections import defaultdict
 from collections.abc import Collection, Iterator
@@ -14,14 +15,16 @@ from pipeline.bucket import Entry
 from pipeline.objects import ObjectStore, damaged_objects, manifest_path
 from pipeline.store import Manifest, unframe
 
+MANIFEST = re.compile(r"manifests/(\w+)/(\w+)\.json")
+ATTEMPT = re.compile(r"data/(\w+)/(\w+)/a-\w+(?=/)")
+
 AT_ONCE = 200
 """Objects deleted in one go."""
 
 
 def verify(store: ObjectStore) -> Iterator[tuple[str, str, str, str]]:
     """Stage, key, label and reason of each artifact; the reason is empty if it is sound, else it was set aside."""
-    for entry in store.bucket.list("manifests"):
-        stage, key = _stage_and_key(entry.path)
+    for entry, stage, key in _committed(store):
         found = store.bucket.get(entry.path)
         if found is None:
             continue  # cleared away, or set aside by a run, just now
@@ -40,8 +43,8 @@ def verify(store: ObjectStore) -> Iterator[tuple[str, str, str, str]]:
 
 def artifacts(store: ObjectStore) -> Iterator[tuple[str, str]]:
     """Stage and key of everything committed."""
-    for entry in store.bucket.list("manifests"):
-        yield _stage_and_key(entry.path)
+    for _, stage, key in _committed(store):
+        yield stage, key
 
 
 def _damage(store: ObjectStore, manifest: Manifest) -> str:
@@ -57,13 +60,12 @@ def gc(store: ObjectStore, keep: Collection[str], *, grace: float, dry_run: bool
     doomed: list[Entry] = []
     for entry in store.bucket.list("index"):
         if entry.modified > limit:
-            kept |= {_stage_and_key(path)[1] for path in store._index(entry.path)}
+            kept |= {found[2] for path in store._index(entry.path) if (found := MANIFEST.fullmatch(path))}
         else:
             doomed.append(entry)
     manifests: list[Entry] = []
     live, gone = {}, set()
-    for entry in store.bucket.list("manifests"):
-        stage, key = _stage_and_key(entry.path)
+    for entry, stage, key in _committed(store):
         manifest = store.manifest(stage, key)
         if key in kept or entry.modified > limit:
             live[entry.path] = None if manifest is None else manifest["path"]
@@ -72,7 +74,8 @@ def gc(store: ObjectStore, keep: Collection[str], *, grace: float, dry_run: bool
             gone.add(None if manifest is None else manifest["path"])
     objects = defaultdict(list)
     for entry in store.bucket.list("data"):
-        objects["/".join(entry.path.split("/")[:4])].append(entry)
+        if (place := ATTEMPT.match(entry.path)) is not None:
+            objects[place[0]].append(entry)
     orphans = 0
     for attempt, entries in objects.items():
         _, stage, key, _ = attempt.split("/")
@@ -90,6 +93,9 @@ def gc(store: ObjectStore, keep: Collection[str], *, grace: float, dry_run: bool
     return len(manifests), orphans, sum(e.size for e in (*manifests, *doomed))
 
 
-def _stage_and_key(path: str) -> tuple[str, str]:
-    _, stage, name = path.split("/")
-    return stage, name.removesuffix(".json")
+def _committed(store: ObjectStore) -> Iterator[tuple[Entry, str, str]]:
+    """Each manifest with its stage and key; objects of other names are not ours, and stay."""
+    for entry in store.bucket.list("manifests"):
+        found = MANIFEST.fullmatch(entry.path)
+        if found is not None:
+            yield entry, found[1], found[2]

@@ -26,6 +26,7 @@ import json
 import os
 import time
 import uuid
+import zlib
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -34,7 +35,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.artifact import LazyArrays, checksum
-from pipeline.bucket import Bucket, BucketError, Entry, connect
+from pipeline.bucket import Bucket, BucketError, Entry, OddNameError, connect
 from pipeline.location import hints_folder
 from pipeline.store import (
     USED,
@@ -43,10 +44,15 @@ from pipeline.store import (
     Store,
     StoreError,
     frame,
+    parsed,
     reference,
+    sound,
     unframe,
 )
 from stages.declare import AnyArray
+
+MOST_UNPACKED = 256_000_000
+"""Bytes of an index; one of a hundred thousand artifacts has less, and a small object may unpack to any size."""
 
 INDICES = 8
 """Indices read by a survey, the newest."""
@@ -69,8 +75,11 @@ class ObjectStore(Store):
 
     def survey(self, sequence: str) -> None:
         """List the manifests, and read the newest indices (a copy of each is kept on this machine)."""
-        self._listed = {e.path: e.etag for e in self.bucket.list("manifests")}
-        self._indices = {e.path: e for e in self.bucket.list("index")}
+        try:
+            self._listed = {e.path: e.etag for e in self.bucket.list("manifests")}
+            self._indices = {e.path: e for e in self.bucket.list("index")}
+        except OddNameError:
+            return  # then each manifest is asked for
         for entry in sorted(self._indices.values(), key=lambda e: -e.modified)[:INDICES]:
             for path, (etag, manifest) in self._index(entry.path).items():
                 if self._listed.get(path) == etag:
@@ -284,13 +293,20 @@ def _pack(index: dict[str, tuple[str, Manifest]]) -> tuple[str, bytes]:
 
 def _unpack(path: str, packed: bytes) -> dict[str, tuple[str, Manifest]]:
     """Raises ValueError or OSError where it is damaged."""
+    unpacker = zlib.decompressobj(wbits=zlib.MAX_WBITS | 16)
     try:
-        data = gzip.decompress(packed)
-    except EOFError:
-        raise ValueError(f"{path} is cut short") from None
+        data = unpacker.decompress(packed, MOST_UNPACKED)
+    except zlib.error as error:
+        raise ValueError(f"{path} is damaged: {error}") from None
+    if not unpacker.eof:
+        raise ValueError(f"{path} is cut short, or unpacks to more than {MOST_UNPACKED} bytes")
     if hashlib.sha256(data[32:]).digest() != data[:32]:
         raise ValueError(f"{path} is damaged")
-    return {name: (etag, manifest) for name, (etag, manifest) in json.loads(data[32:]).items()}
+    index = parsed(data[32:])
+    try:
+        return {name: (str(etag), sound(manifest)) for name, (etag, manifest) in index.items()}
+    except (TypeError, AttributeError) as error:
+        raise ValueError(f"{path} is damaged: {error}") from None
 
 
 def _keep(copy: Path, data: bytes) -> None:

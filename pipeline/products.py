@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from datasets.georeference import Georeference
+from pipeline.plain import plain
 from stages.errors import InputError
 from stages.lattice import Lattice
 
@@ -230,6 +231,10 @@ def write_style(path: Path, name: str, values: Mapping[str, float] | None = None
     write_text(path, Template(text).substitute({key: f"{value:.6g}" for key, value in (values or {}).items()}))
 
 
+FORMULA = ("=", "+", "-", "@", "\t")
+"""A spreadsheet takes a cell that begins so for a formula, and runs it; behind an apostrophe it is text."""
+
+
 def write_table(path: Path, columns: Mapping[str, Sequence[Any]]) -> None:
     """Write columns of equal length as CSV (RFC 4180, but lines end in a line feed); what is not known stays empty."""
     out = io.StringIO()
@@ -242,7 +247,10 @@ def write_table(path: Path, columns: Mapping[str, Sequence[Any]]) -> None:
 def _cell(value: Any) -> str:
     if value is None or (isinstance(value, float) and not np.isfinite(value)):
         return ""
-    return f"{value:.9g}" if isinstance(value, float) else str(value)
+    if isinstance(value, float):
+        return f"{value:.9g}"
+    text = plain(str(value))
+    return f"'{text}" if isinstance(value, str) and text.startswith(FORMULA) else text
 
 
 def write_trajectory_kitti(path: Path, poses: NDArray[np.float64]) -> None:

@@ -15,6 +15,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, TextIO
 
+from pipeline.plain import plain, raw
 from stages.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -181,7 +182,7 @@ class Bar(Plain):
             TimeElapsedColumn(),
             TextColumn("{task.description}"),
         )
-        self.rich = RichProgress(*columns, console=Console(file=self.stream), transient=True)
+        self.rich = RichProgress(*columns, console=Console(file=raw(self.stream)), transient=True)
         self.task = self.rich.add_task("", total=None, count="")
         self.rich.start()
 
@@ -202,7 +203,7 @@ class Bar(Plain):
             completed=self.work_done,
             total=total,
             count=f"{self.done}/{self.total()}",
-            description=label + (f", about {_clock(left)} left" if left is not None else ""),
+            description=plain(label) + (f", about {_clock(left)} left" if left is not None else ""),
         )
 
     def close(self, result: Result) -> None:
@@ -213,7 +214,7 @@ class Bar(Plain):
 
     def _say(self, text: str) -> None:
         if hasattr(self, "rich"):
-            self.rich.console.print(f"rille: {text}", markup=False, highlight=False, soft_wrap=True)
+            self.rich.console.print(f"rille: {plain(text)}", markup=False, highlight=False, soft_wrap=True)
 
 
 def summary(result: Result) -> str:

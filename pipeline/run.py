@@ -356,6 +356,11 @@ def _header(options: Options) -> str:
 
 def _make_folder(parent: Path, started: datetime, plan: str) -> Path:
     """New folder named by time and a short digest of the plan."""
+    latest = parent / "latest"
+    if latest.exists() and not latest.is_symlink():
+        raise ConfigError(
+            "RIL-765", f"{latest} is no link to a run", remedy="move it away, or choose another --runs folder"
+        )
     name = f"{started:%Y%m%dT%H%M%SZ}-{hashlib.sha256(plan.encode()).hexdigest()[:8]}"
     for suffix in ["", *(f"-{i}" for i in range(2, 100))]:
         folder = parent / (name + suffix)

@@ -23,6 +23,7 @@ import errno
 import json
 import math
 import os
+import re
 import shutil
 import time
 import uuid
@@ -45,6 +46,12 @@ Manifest = dict[str, Any]
 
 USED = 3600.0
 """Seconds after which a use is noted again: clearing up spares what was used within its grace."""
+
+FILE = re.compile(r"(?!.*(^|/)\.\.?(/|$))[\w.-]+(/[\w.-]+)*")
+"""A file of an artifact, relative to its attempt, and never above it."""
+
+NUMERIC = re.compile(r"[<>|][biufc]\d{1,2}")
+"""NumPy's name of a type of numbers."""
 
 _HEAD = b'{"crc32c": "%08x", "manifest": '
 _HEAD_SIZE = len(_HEAD % 0)
@@ -389,7 +396,41 @@ def unframe(data: bytes) -> Manifest:
     body = data[_HEAD_SIZE:-2]
     if data != _HEAD % google_crc32c.value(body) + body + b"}\n":
         raise ValueError("the manifest is damaged")
-    manifest: Manifest = json.loads(body)
+    return sound(parsed(body))
+
+
+def parsed(data: bytes) -> Any:
+    """JSON. Raises ValueError where it is none, or nested beyond what any writer makes."""
+    try:
+        return json.loads(data)
+    except RecursionError:
+        raise ValueError("it is nested too deeply") from None
+
+
+def sound(found: Any) -> Manifest:
+    """A manifest whose checksum may be right by intent: it has every entry, and no path in it leaves its attempt.
+
+    Raises ValueError where it is none.
+    """
+    try:
+        manifest: Manifest = dict(found)
+        stage, key = manifest["stage"], manifest["key"]
+        place = re.fullmatch(r"(artifacts|data)/(\w+)/(?:(\w\w)/)?(\w+)/a-\w+", manifest["path"])
+        if place is None or (place[2], place[4]) != (stage, key) or (place[3] or key[:2]) != key[:2]:
+            raise ValueError("path")
+        for name, (size, crc) in manifest["files"].items():
+            if not FILE.fullmatch(name) or type(size) is not int or size < 0 or not isinstance(crc, str):
+                raise ValueError(name)
+        for name, about in manifest["arrays"].items():
+            if not FILE.fullmatch(name) or not NUMERIC.fullmatch(about["dtype"]):
+                raise ValueError(name)
+            if not all(type(n) is int and n >= 0 for n in about["shape"]):
+                raise ValueError(name)
+        words = manifest["label"], manifest["digest"], *manifest["meta"]
+        if not all(isinstance(word, str) for word in words):
+            raise ValueError("text")
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"the manifest is damaged: {error}") from None
     return manifest
 
 

@@ -9,18 +9,21 @@ import random
 import subprocess
 import sys
 import threading
+import tracemalloc
 from pathlib import Path
 
+import google_crc32c
 import numpy as np
 import pytest
 import servers
 from toys import chain
 
-from pipeline import bucket, driver, upkeep
+from pipeline import bucket, driver, objects, upkeep
+from pipeline import store as store_module
 from pipeline.dag import Graph
 from pipeline.location import hints_folder, locate
 from pipeline.objects import ObjectStore, manifest_path
-from pipeline.store import Store, at
+from pipeline.store import Store, at, frame
 from stages.declare import Bundle
 
 from toys import numbers  # isort: skip
@@ -334,3 +337,73 @@ def test_arrays_are_read_by_zarr_as_they_are(url):
     group = zarr.open_group(Remote(store.bucket._store, read_only=True), path=ref.path, mode="r")
     assert (group["values"][...] == 1.0).all()
     assert json.dumps(group.attrs["meta"]) == '{"frame": 0}'
+
+
+# -- what others put there ---------------------------------------------------------------------------------------------
+
+
+def put(port, name, data=b"x"):
+    """An object of any name; the client that Rille uses would refuse to write some of them."""
+    import boto3
+
+    boto3.client("s3", endpoint_url=f"http://127.0.0.1:{port}").put_object(Bucket="bucket", Key=name, Body=data)
+
+
+@pytest.mark.parametrize("name", ["manifests//x.json", "manifests/../x", "manifests/a\x1b[2J/b", "index//x"])
+def test_an_object_of_an_odd_name_leaves_the_bucket_usable(url, port, right, name):
+    run(url)
+    put(port, f"{url.removeprefix('s3://bucket/')}/{name}")
+    bucket._connect.cache_clear()
+    warm, result = run(url)
+    assert digests(warm) == right
+    assert result.total().cached == NODES
+    with raises("RIL-766"):
+        upkeep.gc(at(url), set(), grace=0.0)
+
+
+@pytest.mark.parametrize("name", ["manifests/x", "manifests/a/b/c/d", "data/x", "data/a/b/c/d", "index/x", "notes.txt"])
+def test_objects_of_others_are_passed_over_and_stay(url, port, name):
+    commit(at(url))
+    whole = f"{url.removeprefix('s3://bucket/')}/{name}"
+    put(port, whole)
+    assert upkeep.verify(at(url)) == (1, [])
+    assert upkeep.gc(at(url), set(), grace=-60.0).artifacts == 1
+    assert bucket.Bucket(url).get(name) is not None or name.startswith("index")
+
+
+def test_an_index_is_never_unpacked_beyond_its_bound(url, monkeypatch):
+    store = at(url)
+    bomb = gzip.compress(bytes(100_000_000))
+    assert len(bomb) < 100_000
+    monkeypatch.setattr(objects, "MOST_UNPACKED", 1_000_000)
+    store.bucket.put("index/bomb.json.gz", bomb)
+    tracemalloc.start()
+    store.survey("")
+    assert tracemalloc.get_traced_memory()[1] < 30_000_000
+    tracemalloc.stop()
+    assert store._known == {}
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"path": "data/../../../etc/a-1"},
+        {"path": f"data/numbers/{'j' * 64}/a-1"},
+        {"files": {"../../x": [1, "00000000"]}},
+        {"files": {"values/c.0.0": ["1", "00000000"]}},
+        {"arrays": {"values": {"dtype": "<f8", "shape": ["9" * 5000], "sha256": ""}}},
+        {"arrays": {"values": {"dtype": "|O8", "shape": [1], "sha256": ""}}},
+        {"meta": None},
+        {"label": ["a"]},
+    ],
+)
+def test_a_manifest_that_is_wrong_by_intent_counts_as_damaged(url, change):
+    store = at(url)
+    ref = commit(store)
+    path = manifest_path(ref.stage, ref.key)
+    store.bucket.put(path, frame(store.manifest(ref.stage, ref.key) | change))
+    assert at(url).lookup(ref.stage, ref.key) is None
+    assert at(url).lookup(ref.stage, ref.key) is None, "it was set aside"
+    for text in (b"[" * 100_000, b'{"path": ' * 50_000, b"[]", b"1" * 5000):
+        with pytest.raises(ValueError):  # noqa: PT011
+            store_module.unframe(store_module._HEAD % google_crc32c.value(text) + text + b"}\n")

@@ -1,0 +1,48 @@
+"""The one place that all output of the command line passes through: no name can make a terminal do anything.
+
+File names, cameras' names and manifests' texts come from whoever wrote the data. An escape sequence in one of them
+would set the terminal's title, hide lines, or move the cursor over a complaint; a mark of direction turn it around.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from typing import Any, TextIO
+
+UNSEEN = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
+"""Control characters but for tab and line feed, marks of direction, and bytes of file names that are no UTF-8."""
+
+
+def plain(text: str) -> str:
+    r"""The text with ``\x1b`` and the like for what a terminal would obey."""
+    return UNSEEN.sub(lambda found: ascii(found[0])[1:-1], text)
+
+
+class Plain:
+    """A stream that writes plain text; ``raw`` is the one behind it, for bars and colours of our own."""
+
+    def __init__(self, raw: TextIO) -> None:
+        self.raw = raw
+
+    def write(self, text: str) -> int:
+        """Write, and count the letters as they were given."""
+        self.raw.write(plain(text))
+        return len(text)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.raw, name)
+
+
+def raw(stream: Any) -> Any:
+    """The stream behind a plain one."""
+    return stream.raw if isinstance(stream, Plain) else stream
+
+
+@contextmanager
+def plain_output() -> Iterator[None]:
+    """Everything that is printed within is plain."""
+    with redirect_stdout(Plain(sys.stdout)), redirect_stderr(Plain(sys.stderr)):
+        yield

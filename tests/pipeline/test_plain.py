@@ -1,0 +1,56 @@
+from __future__ import annotations
+
+import csv
+import io
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline import cli
+from pipeline.plain import UNSEEN, Plain, plain, plain_output
+from pipeline.products import write_table
+
+ESCAPE = "\x1b]0;owned\x07\x1b[2J\u202etxt.\x9b1m"
+
+
+@given(st.text(st.characters(codec=None)))
+def test_nothing_that_a_terminal_obeys_is_printed(text):
+    stream = io.StringIO()
+    assert Plain(stream).write(text) == len(text)
+    assert not UNSEEN.search(stream.getvalue())
+    assert plain(text) == text or UNSEEN.search(text)
+    stream.getvalue().encode()  # bytes of names that are no UTF-8 included
+
+
+def test_all_that_is_printed_passes_through(capsys):
+    with plain_output():
+        print(ESCAPE)
+    assert capsys.readouterr().out == "\\x1b]0;owned\\x07\\x1b[2J\\u202etxt.\\x9b1m\n"
+
+
+def test_a_file_of_an_evil_name_does_nothing_to_the_terminal(tmp_path, capsys):
+    (tmp_path / f"{ESCAPE}.rille.toml").write_text("x = 1")
+    with pytest.raises(SystemExit):
+        cli.main(["check", str(tmp_path), "--cache", str(tmp_path / "cache")])
+    shown = capsys.readouterr()
+    assert "owned" in shown.err
+    assert "\x1b" not in shown.err + shown.out
+
+
+def test_a_complaint_is_one_line_of_a_bounded_length(tmp_path, capsys):
+    (tmp_path / "m.toml").write_text("\n".join(f"a{k} = '{'x' * 5000}'" for k in range(100)))
+    with pytest.raises(SystemExit):
+        cli.main(["check", str(tmp_path / "m.toml"), "--cache", str(tmp_path / "cache")])
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("rille: error RIL-223")
+    assert len(line) < 1100
+
+
+def test_no_cell_of_a_table_is_a_formula(tmp_path):
+    names = ["=1+2", "+1", "-1", "@SUM(A1)", "\t=1", "\r=1", "plain", "a=b"]
+    write_table(tmp_path / "t.csv", {"frame": range(8), "name": names, "value": [-1.5, *range(-1, 6)]})
+    with (tmp_path / "t.csv").open(newline="") as file:
+        rows = list(csv.reader(file))[1:]
+    assert [row[1] for row in rows] == ["'=1+2", "'+1", "'-1", "'@SUM(A1)", "'\t=1", "\\r=1", "plain", "a=b"]
+    assert [float(row[2]) for row in rows] == [-1.5, -1, 0, 1, 2, 3, 4, 5], "numbers stay numbers"
