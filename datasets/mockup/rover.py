@@ -131,7 +131,9 @@ def drive_leg(
     first = stand(ground, *before, vehicle)
     if first is None:
         raise InputError(
-            "RIL-250", "the rover stands beside the bed", remedy="set rover.start within the bed, or a larger bed"
+            "RIL-250",
+            "the rover stands beside the bed",
+            remedy="set rover.start within the bed, a larger bed or a smaller vehicle",
         )
     d = _Drive(ground, vehicle, *before, [first], [(0.0, 0.0, 0.0)])
     x, y, heading = believed
