@@ -38,6 +38,9 @@ WINDOW = 0.25
 """Half the side of the window about a corner, as a share of the corners' least spacing: clear of the next corner's
 edges, and as many pixels as that leaves. Half of it doubles the noise, twice of it meets the neighbours."""
 
+LEAST_CONTRAST = 0.1
+"""Between squares that touch, as a share of the range of all squares: print under a shadow keeps more."""
+
 SETTLED = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-4)
 
 
@@ -98,8 +101,8 @@ def find_size(images: Iterable[Grey]) -> tuple[int, int]:
     flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
     votes: Counter[tuple[int, int]] = Counter()
     for image in images:
-        found, _, pattern = cv2.findChessboardCornersSBWithMeta(image, (LEAST_SIDE, LEAST_SIDE), flags)
-        if found and min(pattern.shape) >= LEAST_SIDE:
+        found, points, pattern = cv2.findChessboardCornersSBWithMeta(image, (LEAST_SIDE, LEAST_SIDE), flags)
+        if found and min(pattern.shape) >= LEAST_SIDE and alternates(image, points, pattern.shape[::-1]):
             votes[max(pattern.shape), min(pattern.shape)] += 1
     agreed = {size: count for size, count in votes.items() if count > 1}
     if not agreed:
@@ -113,12 +116,25 @@ def find_size(images: Iterable[Grey]) -> tuple[int, int]:
 
 def find_corners(image: Grey, corners: tuple[int, int]) -> Floats | None:
     """All inner corners (n, 2) column, row of a board, row by row; None where it is not found whole."""
-    found, points = cv2.findChessboardCorners(image, corners, flags=QUICK)
-    for flags in THOROUGH:
-        if found:
-            break
-        found, points = cv2.findChessboardCornersSB(image, corners, flags=flags)
-    return refine(image, points, corners) if found else None
+    attempts = [(cv2.findChessboardCorners, QUICK), *((cv2.findChessboardCornersSB, flags) for flags in THOROUGH)]
+    for find, flags in attempts:
+        found, points = find(image, corners, flags=flags)
+        if found and alternates(image, points, corners):
+            return refine(image, points, corners)
+    return None
+
+
+def alternates(image: Grey, points: AnyArray, corners: tuple[int, int]) -> bool:
+    """Whether the squares between corners (n, 2) are dark and bright by turns, as clutter in a street is not."""
+    grid = np.asarray(points, dtype=np.float32).reshape(corners[1], corners[0], 2)
+    middles = (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:]) / 4
+    grey = cv2.remap(image, middles[..., 0], middles[..., 1], cv2.INTER_LINEAR).astype(np.float64)
+    rows, columns = np.indices(grey.shape)
+    even = (rows + columns) % 2 == 0
+    bright = even if grey[even].mean() > grey[~even].mean() else ~even
+    signed = np.where(bright, grey, -grey)  # the sum of two that touch is bright less dark
+    steps = np.concatenate([(signed[1:] + signed[:-1]).ravel(), (signed[:, 1:] + signed[:, :-1]).ravel()])
+    return bool(steps.min() > LEAST_CONTRAST * np.ptp(grey))
 
 
 def refine(image: Grey, points: AnyArray, corners: tuple[int, int]) -> Floats:

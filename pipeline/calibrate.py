@@ -35,6 +35,10 @@ MANY_BAD_PX = 1.0
 """Pixels RMS over all views that a chessboard on paper does not explain."""
 
 
+NO_BOARD = 0.1
+"""Residual over the spacing of the corners from which they are not those of a flat board: print errs by hundredths."""
+
+
 @dataclass
 class Boards:
     """What was found in the images: ``views``, and ``left_out`` name and reason of the pairs that cannot be used."""
@@ -80,6 +84,7 @@ def calibrate(
     boards = find_boards(pairing.pair_up(*_files(left, right)), given)
     points = chessboard.board_points(boards.corners, square)
     found = calibrate_rig(points, boards.views, boards.size, model, keep_bad=keep_bad)
+    _refuse_clutter(found, boards)
     _write(output, _yaml(found, boards, square, model))
     origin = "given" if given else "found"
     print(f"board        {boards.corners[0]} x {boards.corners[1]} inner corners ({origin}), squares of {square:g} m")
@@ -141,6 +146,19 @@ def find_boards(pairs: Sequence[pairing.Pair], corners: tuple[int, int] | None) 
             continue
         out.views.append(BoardView(name, points[0], chessboard.same_order(points[0], points[1], corners)))
     return out
+
+
+def _refuse_clutter(found: RigCalibration, boards: Boards) -> None:
+    grids = [p.reshape(boards.corners[1], boards.corners[0], 2) for v in boards.views for p in (v.left, v.right)]
+    spacing = float(np.median([np.linalg.norm(np.diff(g, axis=1), axis=-1) for g in grids]))
+    if found.rms > NO_BOARD * spacing:
+        columns, rows = boards.corners
+        raise InputError(
+            "RIL-800",
+            f"the corners taken for a board of {columns} x {rows} miss by {found.rms:.1f} px RMS, "
+            f"{spacing:.0f} px apart: no flat board, or not the same moment left and right",
+            remedy="give pictures of a chessboard, and its inner corners, e.g. --corners 9x6",
+        )
 
 
 def cover(points: Sequence[NDArray[np.float64]], size: tuple[int, int]) -> float:

@@ -19,6 +19,8 @@ from stages.errors import ConfigError, InputError
 if TYPE_CHECKING:
     from stages.hfvm import Disparity
 
+COMPLETE, INCOMPLETE = 0, 3
+
 LARGE = 1_000_000
 """Pixels: above, matching takes seconds, and says how far it is."""
 
@@ -50,6 +52,10 @@ def match_files(
     Without ``dense`` only what was matched and found consistent is written; with it, filled values too. ``prior``: a
     disparity TIFF to start from. ``confidence``: TIFF for standard deviation, validity and back-matching error. What is
     suspicious is said on stderr.
+
+    Returns
+    -------
+    0, or 3 where hardly a pixel matches (share below ``FEW``).
 
     Raises
     ------
@@ -87,7 +93,7 @@ def match_files(
     typical = f", standard deviation {np.nanmedian(found.disparity_std):.2f} px (median)" if share else ""
     figures = f"matched {100 * share:.1f} %, defined {100 * float(kept.mean()):.1f} % of {kept.size} pixels"
     print(f"{output}  {figures}{typical}")
-    return 0
+    return COMPLETE if share >= FEW else INCOMPLETE
 
 
 def warnings(found: Disparity) -> list[str]:

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from raising import raises
 
-from datasets.chessboard import board_points, eight_bit, find_corners, find_size, parse_corners, same_order
+from datasets.chessboard import alternates, board_points, eight_bit, find_corners, find_size, parse_corners, same_order
 
 
 def render(corners=(9, 6), side=24.0, turn=0.1, shift=(50.0, 30.0), size=(230, 300), tilt=0.0004):
@@ -52,6 +52,15 @@ def test_no_board_is_an_answer():
     assert find_corners(flat, (9, 6)) is None
     with raises("RIL-153"):
         find_size([flat, flat])
+
+
+def test_a_grid_whose_squares_do_not_alternate_is_no_board():
+    image, true = render((5, 4), **SMALL)
+    assert alternates(image, true, (5, 4))
+    assert alternates(255 - image, true, (5, 4))
+    rows, columns = np.indices(image.shape)
+    for clutter in (np.full(image.shape, 90), 40 + columns, 40 + rows // 2, np.where(columns // 20 % 2, 40, 210)):
+        assert not alternates(clutter.astype(np.uint8), true, (5, 4))
 
 
 def test_wrong_size_is_not_found():

@@ -113,3 +113,29 @@ def test_complaints_say_what_to_change(tmp_path):
 def test_cover_is_the_share_of_the_hull():
     square = np.array([[0, 0], [50, 0], [50, 40], [0, 40], [20, 20]], dtype=float)
     assert cover([square], (100, 80)) == pytest.approx(0.25)
+
+
+@pytest.mark.data
+def test_pictures_of_a_street_show_no_board(data_dir, tmp_path):
+    sides = [tmp_path / "left", tmp_path / "right"]
+    for side, folder in zip(sides, ("image_l", "image_r"), strict=True):
+        side.mkdir()
+        for path in sorted((data_dir / "kitti06_51" / folder).iterdir())[::10]:
+            shutil.copy(path, side)
+    with raises("RIL-153"):
+        calibrate(*sides, square=0.1, output=tmp_path / "rig.yaml")
+    assert not (tmp_path / "rig.yaml").exists()
+
+
+@pytest.mark.data
+def test_views_of_no_flat_board_write_nothing(data_dir, tmp_path, monkeypatch):
+    """Left and right of different moments throughout: no single rig explains them."""
+    lefts, rights = (
+        [data_dir / "chessboard_bumblebee2" / f"{side}{k:02d}.jpg" for k in range(1, 8)] for side in ("left", "right")
+    )
+    for k, (left, right) in enumerate(zip(lefts, rights[3:] + rights[:3], strict=True)):
+        shutil.copy(left, tmp_path / f"left{k}.jpg")
+        shutil.copy(right, tmp_path / f"right{k}.jpg")
+    with raises("RIL-800", "6 x 4"):
+        calibrate(tmp_path, tmp_path, square=0.03, corners="6x4", keep_bad=True, output=tmp_path / "rig.yaml")
+    assert not (tmp_path / "rig.yaml").exists()
