@@ -415,7 +415,7 @@ def sound(found: Any) -> Manifest:
     try:
         manifest: Manifest = dict(found)
         stage, key = manifest["stage"], manifest["key"]
-        place = re.fullmatch(r"(artifacts|data)/(\w+)/(?:(\w\w)/)?(\w+)/a-\w+", manifest["path"])
+        place = re.fullmatch(r"(artifacts|data)/(\w+(?:\.\w+)*)/(?:(\w\w)/)?(\w+)/a-\w+", manifest["path"])
         if place is None or (place[2], place[4]) != (stage, key) or (place[3] or key[:2]) != key[:2]:
             raise ValueError("path")
         for name, (size, crc) in manifest["files"].items():

@@ -7,6 +7,7 @@ import os
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -57,6 +58,14 @@ def bundle(value=1.0, **meta):
 
 def commit(cache, **kwargs):
     return Store(cache).commit(STAGE, KEY, bundle(**kwargs), label="toy/1", provenance={"params": {"a": 1}})
+
+
+def test_a_stage_whose_name_has_a_dot_is_kept_like_others(tmp_path):
+    dotted = replace(STAGE, name="mockup.toy")
+    ref = Store(tmp_path).commit(dotted, KEY, bundle())
+    found = Store(tmp_path).lookup("mockup.toy", KEY)
+    assert found is not None
+    assert found.digest == ref.digest
 
 
 def files(cache):
