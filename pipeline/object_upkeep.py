@@ -13,10 +13,10 @@ from collections.abc import Collection, Iterator
 
 from pipeline.bucket import Entry
 from pipeline.objects import ObjectStore, damaged_objects, manifest_path
-from pipeline.store import Manifest, unframe
+from pipeline.store import STAGE, Manifest, unframe
 
-MANIFEST = re.compile(r"manifests/(\w+)/(\w+)\.json")
-ATTEMPT = re.compile(r"data/(\w+)/(\w+)/a-\w+(?=/)")
+MANIFEST = re.compile(rf"manifests/({STAGE})/(\w+)\.json")
+ATTEMPT = re.compile(rf"data/({STAGE})/(\w+)/a-\w+(?=/)")
 
 AT_ONCE = 200
 """Objects deleted in one go."""

@@ -50,6 +50,9 @@ USED = 3600.0
 FILE = re.compile(r"(?!.*(^|/)\.\.?(/|$))[\w.-]+(/[\w.-]+)*")
 """A file of an artifact, relative to its attempt, and never above it."""
 
+STAGE = r"\w+(?:\.\w+)*"
+"""Name of a stage, as it stands in paths (``locus``, ``mockup.scene``)."""
+
 NUMERIC = re.compile(r"[<>|][biufc]\d{1,2}")
 """NumPy's name of a type of numbers."""
 
@@ -415,7 +418,7 @@ def sound(found: Any) -> Manifest:
     try:
         manifest: Manifest = dict(found)
         stage, key = manifest["stage"], manifest["key"]
-        place = re.fullmatch(r"(artifacts|data)/(\w+(?:\.\w+)*)/(?:(\w\w)/)?(\w+)/a-\w+", manifest["path"])
+        place = re.fullmatch(rf"(artifacts|data)/({STAGE})/(?:(\w\w)/)?(\w+)/a-\w+", manifest["path"])
         if place is None or (place[2], place[4]) != (stage, key) or (place[3] or key[:2]) != key[:2]:
             raise ValueError("path")
         for name, (size, crc) in manifest["files"].items():

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as st_numpy
 from raising import raises
 
-from pipeline import artifact, store, upkeep
+from pipeline import artifact, object_upkeep, store, upkeep
 from pipeline.artifact import array_digests, output_digest
 from pipeline.store import Store
 from stages.declare import Array, Bundle, NoParams, Stage
@@ -307,3 +307,12 @@ def test_chunks_of_nothing_are_files_too(cache):
     nothing = {"elevation": np.full((2, 2), np.nan, np.float32), "flag": np.zeros((2, 2), bool)}
     Store(cache).commit(STAGE, KEY, Bundle(nothing, {}))
     assert len([p for p in files(cache) if "/c." in p.as_posix()]) == 2
+
+
+@pytest.mark.parametrize("name", ["locus", "mockup.scene"])
+def test_the_name_of_a_stage_may_have_a_point(cache, name):
+    """On disk and in a bucket: those of the simulator have one."""
+    Store(cache).commit(replace(STAGE, name=name), KEY, bundle(), label="here")
+    assert Store(cache).lookup(name, KEY) is not None
+    assert object_upkeep.MANIFEST.fullmatch(f"manifests/{name}/{KEY}.json")[1] == name
+    assert object_upkeep.ATTEMPT.match(f"data/{name}/{KEY}/a-0f/zarr.json")[1] == name
