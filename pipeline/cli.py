@@ -8,6 +8,7 @@ commands, so that ``--help`` answers at once.
 
 from __future__ import annotations
 
+import os
 import sys
 import traceback
 from importlib.metadata import version
@@ -228,18 +229,22 @@ def _run(argv: list[str] | None) -> int:
     except CycloptsError as error:
         _print_error("RIL-001", str(error))
         return USAGE
+    except BrokenPipeError:  # who read the output has had enough of it
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        return FAILED
     except Exception as error:
         return _complain(error, debug)
 
 
 def _complain(error: Exception, debug: bool) -> int:
     """One line that says what to change; the traceback on request."""
-    from stages.errors import ConfigError, InputError, RilleError
+    from pipeline.failures import told
+    from stages.errors import ConfigError, InputError
 
     if debug:
         traceback.print_exception(error)
-    if isinstance(error, RilleError):
-        _print_error(error.code, str(error))
+    if (known := told(error)) is not None:
+        _print_error(known.code, str(known))
     else:
         hint = "" if debug else " (run again with --debug for the traceback)"
         _print_error("RIL-999", f"{type(error).__name__}: {error}{hint}")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import difflib
 import importlib
+import pkgutil
 import tomllib
 from collections.abc import Iterable, Mapping
 from functools import cache
@@ -107,6 +108,19 @@ def stage(name: str) -> Stage:
     """Declaration of a stage by its name."""
     found: Stage = importlib.import_module(STAGE_MODULES[name]).STAGE
     return found
+
+
+def stage_names() -> set[str]:
+    """Names of all stages, of those that make or read images, too."""
+    import datasets
+    import stages
+
+    modules = [
+        importlib.import_module(found.name)
+        for package in (stages, datasets)
+        for found in pkgutil.walk_packages(package.__path__, f"{package.__name__}.")
+    ]
+    return {module.STAGE.name for module in modules if hasattr(module, "STAGE")}
 
 
 @cache

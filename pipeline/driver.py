@@ -35,6 +35,7 @@ from pipeline.costs import input_bytes
 from pipeline.dag import Expansion, Graph, Handle
 from pipeline.environment import cores
 from pipeline.executor import Executor, Failed, make
+from pipeline.failures import told
 from pipeline.interrupts import Interrupts
 from pipeline.key import digest
 from pipeline.ledger import Ledger
@@ -111,8 +112,8 @@ class Result:
         if failures:
             first = failures[0]
             error = first.error
-            if isinstance(error, RilleError):
-                raise error.at(first.label) from error
+            if (known := told(error)) is not None:
+                raise known.at(first.label) from error
             raise TaskError(
                 "RIL-534", f"{first.label} (stage {first.stage}): {type(error).__name__}: {error}"
             ) from error
@@ -373,6 +374,7 @@ class _Run:
 
     def _begin(self) -> None:
         """Look ahead, share the memory out, and start the workers that it leaves room for."""
+        self.store.writable()
         known, jobs = costs.recall(self.hints), self.jobs or cores()
         ahead = self._look_ahead()
         most = max(largest(ahead, known), *(known.foresee(h.spec, input_bytes(h)).most for h in self.missing))

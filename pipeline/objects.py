@@ -85,6 +85,9 @@ class ObjectStore(Store):
                 if self._listed.get(path) == etag:
                     self._known.setdefault(path, (etag, manifest))
 
+    def writable(self) -> None:
+        """The server says so at the first commit."""
+
     def _index(self, path: str) -> dict[str, tuple[str, Manifest]]:
         """A damaged index counts as empty, as does a damaged copy."""
         copy = self.root / path

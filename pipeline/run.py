@@ -289,6 +289,12 @@ def _write(opened: _Opened, result: Result, ahead: Ahead) -> None:
     """Everything that the run leaves; nothing of it where an artifact was found damaged."""
     from pipeline import ledger, outputs
 
+    if not (opened.folder / "config.toml").exists():
+        raise RilleError(
+            "RIL-740",
+            f"{opened.folder} was removed while the run was under way",
+            remedy="run again: what was computed is in the cache",
+        )
     whole = opened.view(tasks=outputs.task_rows(opened.graph, opened.store), seconds=result.seconds)
     try:
         outputs.write(opened.folder, whole, ahead.take())
@@ -335,17 +341,24 @@ def _all_read(opened: _Opened, arrived: int) -> int:
     """Exit code of a run that came to its end: a parameter that no task of it read is an error, and named."""
     from pipeline import unread
 
-    lost = unread.unread(opened.settled.given, opened.config, opened.graph) if arrived == COMPLETE else []
-    if not lost:
+    if arrived != COMPLETE:
         return COMPLETE
-    told = f"{unread.values(lost, opened.config)}: no task of this run read it: {unread.remedy(lost, opened.config)}"
-    print(f"rille: error RIL-732: {told}", file=sys.stderr)
-    return HOLES
+    lost = unread.unread(opened.settled.given, opened.config, opened.graph)
+    if lost:
+        told = f"{unread.values(lost, opened.config)}: no task of this run read it"
+        print(f"rille: error RIL-732: {told}: {unread.remedy(lost, opened.config)}", file=sys.stderr)
+    idle = sorted(opened.options.force - {h.stage for h in opened.graph.nodes})
+    if idle:
+        told = f"--force {', '.join(idle)}: this run has no such task: leave it out"
+        print(f"rille: error RIL-735: {told}", file=sys.stderr)
+    return HOLES if lost or idle else COMPLETE
 
 
 def _known_stages(names: frozenset[str]) -> None:
-    known = {*configuration.STAGE_MODULES, "hfvm_tile", "hfvm_join", "image", "scene", "render"}
-    known |= {"mockup.drive", "mockup.sense", "mockup.site"}
+    """Refuse a stage to be forced that there is not."""
+    if not names:
+        return
+    known = configuration.stage_names()
     for name in sorted(names - known):
         raise ConfigError("RIL-060", f"--force {name!r} is no stage", remedy=f"one of {', '.join(sorted(known))}")
 

@@ -25,11 +25,12 @@ import math
 import os
 import re
 import shutil
+import tempfile
 import time
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -155,14 +156,12 @@ class Store:
         try:
             with self._clear_errors():
                 stat = os.stat(published)
-                if stat.st_mtime < time.time() - USED:
-                    with suppress(OSError):  # a cache may be read-only
-                        os.utime(published)
-                        stat = os.stat(published)
                 entry = None if self._catalogue is None else self._catalogue.get(key, status(stat))
                 if entry is None:
                     manifest = self._read_manifest(home)
                     entry = self._enter(stat, manifest)
+                if stat.st_mtime < time.time() - USED:  # only now: a touched manifest has another status
+                    self._touch(key, published, entry)
         except FileNotFoundError:
             return None
         except ValueError:
@@ -173,6 +172,27 @@ class Store:
             self.set_aside(stage, key, manifest or self.manifest(stage, key), wrong)
             return None
         return entry
+
+    def _touch(self, key: str, published: str, entry: Entry) -> None:
+        """Note that an artifact is in use."""
+        with suppress(OSError):  # a cache may be read-only
+            os.utime(published)
+            if self._catalogue is not None:
+                self._catalogue.enter(key, replace(entry, status=status(os.stat(published))))
+
+    def writable(self) -> None:
+        """Raise if nothing can be written here.
+
+        Raises
+        ------
+        StoreError
+            The folder cannot be made, is full or may not be written.
+        """
+        with self._clear_errors():
+            self.root.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=self.root, suffix=".tmp") as file:
+                file.write(b"\0" * 4096)
+                file.flush()
 
     def manifest(self, stage: str, key: str) -> Manifest | None:
         """Manifest of a key as it was committed, no check of the files; None if absent or not readable."""

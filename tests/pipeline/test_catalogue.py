@@ -9,6 +9,7 @@ import pytest
 from toys import chain
 
 from pipeline import catalogue, driver
+from pipeline import store as store_module
 from pipeline.catalogue import Catalogue, Entry, status
 from pipeline.dag import Graph
 from pipeline.store import Store
@@ -45,6 +46,17 @@ def test_a_second_run_reads_no_manifest_and_finds_the_same(cache):
     without, read, _ = run(cache)
     assert len(read) == 9
     assert with_index == without
+
+
+def test_a_run_that_marks_its_artifacts_as_used_reads_no_manifest_either(cache, monkeypatch):
+    """After an hour each look-up touches the manifest: then, and in the run after it, the index still holds."""
+    run(cache)
+    monkeypatch.setattr(store_module, "USED", -1.0)
+    for _ in range(3):
+        before = {path: path.stat().st_mtime_ns for path in cache.glob("artifacts/*/*/*/manifest.json")}
+        _, read, result = run(cache)
+        assert (read, result.total().cached) == ([], 9)
+        assert all(path.stat().st_mtime_ns > then for path, then in before.items())
 
 
 @pytest.mark.parametrize("way", ["touched", "rewritten", "replaced", "flipped"])

@@ -60,14 +60,6 @@ def commit(cache, **kwargs):
     return Store(cache).commit(STAGE, KEY, bundle(**kwargs), label="toy/1", provenance={"params": {"a": 1}})
 
 
-def test_a_stage_whose_name_has_a_dot_is_kept_like_others(tmp_path):
-    dotted = replace(STAGE, name="mockup.toy")
-    ref = Store(tmp_path).commit(dotted, KEY, bundle())
-    found = Store(tmp_path).lookup("mockup.toy", KEY)
-    assert found is not None
-    assert found.digest == ref.digest
-
-
 def files(cache):
     return sorted(p for p in (cache / "artifacts").rglob("*") if p.is_file())
 
