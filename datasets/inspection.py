@@ -10,7 +10,7 @@ import glob
 import re
 from collections import defaultdict
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -28,8 +28,8 @@ TABLES = (".txt", ".csv", ".tum", ".dat")
 MOST_TEXTS = 200
 """Text files that are tried as calibration and as table; some data sets have one for each image."""
 
-STAMP = re.compile(r"\d{10,}")
-"""Seconds since 1970 have ten digits, their fractions more; frame numbers have fewer."""
+STAMP = re.compile(r"(?<!\d)[1-9]\d{9,}")
+"""Seconds since 1970 have ten digits, their fractions more; frame numbers have fewer, or zeros in front."""
 
 NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 
@@ -48,16 +48,21 @@ class Views:
     why: str
     trouble: str = ""
     stamped: bool = False
+    sides: tuple[str, str] = ("left", "right")
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """Calibration files that suit: one for both cameras or one each, relative to the folder."""
+    """Calibration files that suit: one for both cameras or one each, relative to the folder.
+
+    ``names``: which two of its cameras, where the file has more.
+    """
 
     files: tuple[str, ...]
     size: tuple[int, int] | None
     baseline: float | None
     cameras: int
+    names: tuple[str, str] | None = None
 
 
 @dataclass
@@ -152,6 +157,7 @@ def find_views(folder: Path, images: list[Path]) -> Views:
         f"{len(left)} left and {len(right)} right images, told apart by {tokens[0]!r} and {tokens[1]!r}",
         trouble,
         all(STAMP.search(path.stem) for path in left),
+        tokens,
     )
 
 
@@ -195,6 +201,11 @@ def _find_calibration(found: Findings, texts: list[Path]) -> None:
         if cameras:
             read[relative] = cameras
     candidates = [_calibration((name,), cameras) for name, cameras in read.items() if len(cameras) == 2]
+    for name, cameras in read.items():
+        if len(cameras) > 2:
+            chosen = _of_sides(cameras, found.views.sides)
+            names = (chosen[0].name, chosen[1].name)
+            candidates.append(replace(_calibration((name,), chosen), names=names))
     single = {name: cameras[0] for name, cameras in read.items() if len(cameras) == 1}
     candidates += [
         _calibration((left, right), [single[left], single[right]]) for left, right in _two_sides(list(single))
@@ -206,6 +217,14 @@ def _find_calibration(found: Findings, texts: list[Path]) -> None:
             candidates, key=lambda c: (c.size in (None, size), c.cameras, c.baseline is not None, -len(c.files))
         )
         found.others = [name for name in read if name not in found.calibration.files]
+
+
+def _of_sides(cameras: list[CalibratedCamera], sides: tuple[str, str]) -> list[CalibratedCamera]:
+    """The two of several cameras whose numbers the images' names have (``image_2`` is that of ``P2``), or the first."""
+    numbers = [re.search(r"\d+$", side) for side in sides]
+    by_number = {int(n[0]): c for c in cameras if (n := re.search(r"\d+(?=\D*$)", c.name))}
+    chosen = [by_number[int(n[0])] for n in numbers if n and int(n[0]) in by_number]
+    return chosen if len(chosen) == 2 else cameras[:2]
 
 
 def _two_sides(names: list[str]) -> Iterable[tuple[str, str]]:

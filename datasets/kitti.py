@@ -11,6 +11,7 @@ maps the reference frame, in which the poses are given, to pixels; KITTI's have 
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,14 +21,26 @@ from numpy.typing import NDArray
 from datasets import files
 from datasets.manifest_rig import LONGEST_BASELINE
 from datasets.names import derived_name
+from datasets.pairing import ends
 from datasets.protocol import CAMERAS, Sequence, Source
 from datasets.reading import read_lines
 from datasets.times import seconds
 from stages.errors import InputError
 from stages.geometry import Camera, Rig, RigidTransform, orthonormal
 
-PAIRS = (("image_0", "image_1"), ("image_2", "image_3"), ("image_l", "image_r"), ("left", "right"))
+PAIRS = (
+    ("image_0", "image_1"),
+    ("image_2", "image_3"),
+    ("image_00", "image_01"),
+    ("image_02", "image_03"),
+    ("image_l", "image_r"),
+    ("left", "right"),
+)
 """Names of the image folders, left and right; grey KITTI cameras before colour ones."""
+
+ROI = ("P1_roi", "P2_roi")
+OTHER = re.compile(r"Tr.*|[KDRST]_.*|calib_time.*|corner_dist.*")
+"""Labels of lines that hold no projection: laser scanner, cameras before rectification, date and board."""
 
 STREET = {"locus.cell_size": 0.1}
 """0.1 m resolves kerbs where the disparity does."""
@@ -97,12 +110,17 @@ def _first(names: list[str]) -> str:
     return names[0] if names else "00"
 
 
-def _rows(path: Path, count: int, what: str, gaps: bool = False) -> list[tuple[str, NDArray[np.float64]]]:
-    """Lines of a text file: (label or "", numbers); each must have ``count`` finite numbers, or only NaN for a gap."""
+def _rows(
+    path: Path, count: int, what: str, gaps: bool = False, skip: re.Pattern[str] | None = None
+) -> list[tuple[str, NDArray[np.float64]]]:
+    """Lines of a text file: (label or "", numbers); each must have ``count`` finite numbers, or only NaN for a gap.
+
+    ``skip``: lines with such a label are passed over.
+    """
     out = []
     for k, line in enumerate(read_lines(path, what), start=1):
         label, _, numbers = line.rpartition(":")
-        if not numbers.strip():
+        if not numbers.strip() or (skip is not None and skip.fullmatch(label.strip())):
             continue
         try:
             values = np.array([float(v) for v in numbers.split()])
@@ -128,11 +146,15 @@ def read_projections(path: Path, pair: tuple[str, str]) -> tuple[NDArray[np.floa
             f"{path} is missing",
             remedy="put the calibration there: a 3 x 4 projection matrix a line, left and right",
         )
-    rows = [(label, v.reshape(3, 4)) for label, v in _rows(path, 12, "calibration") if not label.startswith("Tr")]
+    rows = [(label, v.reshape(3, 4)) for label, v in _rows(path, 12, "calibration", skip=OTHER)]
     labelled = {label: p for label, p in rows if label}
     wanted = [f"P{side[-1]}" for side in pair]
-    if all(w in labelled for w in wanted):
-        return labelled[wanted[0]], labelled[wanted[1]]
+    for form in ("P{}", "P_rect_0{}"):
+        chosen = [form.format(side[-1]) for side in pair]
+        if all(w in labelled for w in chosen):
+            return labelled[chosen[0]], labelled[chosen[1]]
+    if all(w in labelled for w in ROI):  # the older sequences count from 1
+        return labelled[ROI[0]], labelled[ROI[1]]
     numbered = pair[0][-1].isdigit()
     if numbered and not labelled and len(rows) == 4:
         return rows[int(pair[0][-1])][1], rows[int(pair[1][-1])][1]
@@ -282,7 +304,7 @@ def _per_frame(
         missing = f" ({len(listing.lost)} of {frames} frames lack an image)" if listing.lost else ""
         raise InputError(
             "RIL-211",
-            f"{path} has {len(rows)} {what} for {len(there)} pairs{missing}",
+            f"{path} has {len(rows)} {what} for {len(there)} pairs ({ends(listing.names)}){missing}",
             remedy="give one line a pair, or remove the file",
         )
     by_frame = dict(zip(there, rows, strict=True))

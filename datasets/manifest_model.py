@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -10,7 +11,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BeforeValidator, Discriminator, Field, Tag, ValidationError, model_validator
 
-from datasets.reading import read_toml
+from datasets.reading import read_lines, read_toml
 from stages.declare import Params
 from stages.errors import InputError, told
 from stages.geometry import RigidTransform
@@ -257,7 +258,7 @@ def read_manifest(path: Path) -> Manifest:
     try:
         return Manifest.model_validate(values)
     except ValidationError as error:
-        what = told(error.errors(), _complaint)
+        what = told(error.errors(), lambda e: _complaint(e) + _under_a_comment(e, path))
         raise InputError("RIL-223", f"{path}: {what}", remedy="`rille init FOLDER` writes one to begin with") from error
 
 
@@ -272,6 +273,21 @@ def _complaint(error: Mapping[str, Any]) -> str:
     reason = str(error.get("ctx", {}).get("error", error["msg"]))
     value = "" if isinstance(error["input"], dict) else f" = {error['input']!r} is not permitted"
     return f"{key or 'manifest'}{value}: {reason[0].lower() + reason[1:]}"
+
+
+def _under_a_comment(error: Mapping[str, Any], path: Path) -> str:
+    """Why a key of another table stands in this one: the header above it is still a comment."""
+    if error["type"] != "extra_forbidden":
+        return ""
+    header = ""
+    for line in read_lines(path, "manifest"):
+        text = line.strip()
+        bare = re.match(r"(#?)\s*\[([A-Za-z_.]+)\]", text)
+        if bare:
+            header = bare[2] if bare[1] else ""
+        if header and re.match(rf"{re.escape(str(error['loc'][-1]))}\s*=", text):
+            return f"; it stands under the line '# [{header}]', which is a comment: remove its #, too"
+    return ""
 
 
 def _nearest(loc: list[str]) -> str:

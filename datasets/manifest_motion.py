@@ -13,7 +13,7 @@ import numpy as np
 from datasets.imu import at_frames, read_imu
 from datasets.manifest_model import Attitude, Imu, Manifest, PoseFile, Times
 from datasets.manifest_rig import direction
-from datasets.pairing import Pair
+from datasets.pairing import Pair, ends
 from datasets.poses import coverage, interpolate, read_poses
 from datasets.protocol import Rows
 from datasets.reading import read_lines
@@ -110,7 +110,8 @@ def _times_of_file(path: Path, names: Sequence[str]) -> tuple[list[str], list[in
         absent = next((n for n, stem in zip(names, stems, strict=True) if stem not in by_name), "")
         raise InputError(
             "RIL-229",
-            f"{path} has {len(rows)} times for {len(names)} pairs" + (f", none of {absent}" if by_name else ""),
+            f"{path} has {len(rows)} times for {len(names)} pairs ({ends(names)})"
+            + (f", none of {absent}" if by_name else ""),
             remedy="give one line a pair, or lines of time and file name",
         )
     return [words[0] for _, words in rows], [k for k, _ in rows]

@@ -87,6 +87,9 @@ def _calibration_lines(calibration: Calibration, found: Findings) -> list[str]:
                 "# One camera in the file: it is taken for both. Give left = and right = files if they differ."
             )
         lines.append(_pairs(file=calibration.files[0]).rstrip())
+        if calibration.names is not None:
+            lines.append("# Of its cameras these two, left and right:")
+            lines.append(f"names = {list(calibration.names)}".replace("'", '"'))
     if found.others:
         lines.append(f"# Other calibrations here: {', '.join(found.others)}")
     return lines

@@ -25,6 +25,7 @@ SIDES: tuple[tuple[str, str], ...] = (
     ("image_02", "image_03"),
     ("im0", "im1"),
     ("view0", "view1"),
+    ("i1", "i2"),
     ("l", "r"),
 )
 """Tokens that name the left and the right camera in file and folder names, the surest first."""
@@ -43,6 +44,11 @@ class Pair:
 def natural(text: str) -> tuple[tuple[int, int | str], ...]:
     """Sorting key in which numbers count as numbers: ``a2`` before ``a10``."""
     return tuple((0, int(part)) if part.isdigit() else (1, part) for part in re.split(r"(\d+)", text) if part)
+
+
+def ends(names: Sequence[str]) -> str:
+    """``000000.png to 000050.png``: the first and the last of a list of names."""
+    return " to ".join(dict.fromkeys((names[0], names[-1]))) if names else "none"
 
 
 def _token(word: str) -> re.Pattern[str]:
@@ -96,7 +102,8 @@ def pair_up(left: Sequence[Path], right: Sequence[Path], rule: str = "auto", *, 
         if len(left) != len(right):
             raise InputError(
                 "RIL-256",
-                f"{len(left)} left images and {len(right)} right ones cannot be paired by order",
+                f"{len(left)} left images ({ends([p.name for p in left])}) and {len(right)} right ones "
+                f"({ends([p.name for p in right])}) cannot be paired by order",
                 remedy="remove what is too many, or pair by name or number",
             )
         return _named(list(zip(left, right, strict=True)))
@@ -108,7 +115,7 @@ def pair_up(left: Sequence[Path], right: Sequence[Path], rule: str = "auto", *, 
         _unique(keys[rule](paths, side), paths, rule)
     if gaps and rule == "name" and 2 * len(set(by_key[0]) & set(by_key[1])) > len(set(by_key[0]) | set(by_key[1])):
         return _with_gaps(by_key)
-    _all_partnered(by_key, rule, (len(left), len(right)))
+    _all_partnered(by_key, rule, (left, right))
     return _named([(path, by_key[1][key]) for key, path in by_key[0].items()])
 
 
@@ -162,7 +169,7 @@ def _unique(keys: list[str], paths: Sequence[Path], rule: str) -> None:
         )
 
 
-def _all_partnered(by_key: list[dict[str, Path]], rule: str, counts: tuple[int, int]) -> None:
+def _all_partnered(by_key: list[dict[str, Path]], rule: str, found: tuple[Sequence[Path], Sequence[Path]]) -> None:
     for ours, others, side in ((by_key[0], by_key[1], "right"), (by_key[1], by_key[0], "left")):
         alone = [path for key, path in ours.items() if key not in others]
         if alone:
@@ -170,7 +177,8 @@ def _all_partnered(by_key: list[dict[str, Path]], rule: str, counts: tuple[int, 
             raise InputError(
                 "RIL-259",
                 f"{alone[0]} has no partner by {rule} among the {side} images{more}; "
-                f"{counts[0]} left, {counts[1]} right",
+                f"{len(found[0])} left ({ends([p.name for p in found[0]])}), "
+                f"{len(found[1])} right ({ends([p.name for p in found[1]])})",
                 remedy="add the missing image, narrow the patterns, or choose another images.pair",
             )
 

@@ -19,7 +19,7 @@ from datasets.mockup.rover import RoverParams
 from datasets.mockup.sequence import mockup
 from datasets.protocol import Sequence
 from stages.declare import Params
-from stages.errors import ConfigError, InputError, told
+from stages.errors import ConfigError, InputError, RilleError, told
 
 BUILT_IN: dict[str, tuple[str, Mapping[str, Any]]] = {
     "mockup": ("the paper's experiment, simulated: 40 pairs over a lunar bed at 1:10, with exact truth", {}),
@@ -129,10 +129,13 @@ def _recognised(path: Path, number: str | None) -> Path | euroc.Layout | kitti.L
     return folder_manifest(path) or euroc.recognise(path) or kitti.recognise(path)
 
 
-def opens_as_it_is(folder: Path) -> bool:
-    """Whether a folder needs no manifest: it has one, or a layout that says everything."""
-    layout = _recognised(folder, None)
-    return layout is not None and (not isinstance(layout, kitti.Layout) or layout.calib.is_file())
+def hindrance(place: Path) -> RilleError | None:
+    """Why a folder or a manifest does not open as it is; None where it does."""
+    try:
+        _of_files(str(place), Digests(None))
+    except RilleError as error:
+        return error
+    return None
 
 
 def folder_manifest(folder: Path) -> Path | None:

@@ -8,10 +8,13 @@ from pathlib import Path
 from datasets.inspection import Findings, inspect
 from datasets.manifest_text import counted, manifest_text, needs
 from datasets.names import derived_name
-from datasets.registry import opens_as_it_is
+from datasets.registry import hindrance
 from stages.errors import ConfigError, InputError
 
 COMPLETE = 0
+
+UNKNOWN_LAYOUT = ("RIL-276", "RIL-277", "RIL-278")
+"""Errors that say no more than that a manifest is needed."""
 
 
 def init(directory: Path, output: Path | None = None, force: bool = False) -> int:
@@ -30,7 +33,8 @@ def init(directory: Path, output: Path | None = None, force: bool = False) -> in
     InputError
         The folder holds no stereo images, or the file cannot be written.
     """
-    if output is None and not force and directory.is_dir() and opens_as_it_is(directory):
+    hindered = hindrance(directory)
+    if output is None and not force and directory.is_dir() and hindered is None:
         print(f"{directory} opens as it is; --output or --force writes a manifest nevertheless")
         print(f"\nnext:\n  rille check {directory}\n  rille reconstruct {directory}")
         return COMPLETE
@@ -52,7 +56,13 @@ def init(directory: Path, output: Path | None = None, force: bool = False) -> in
             f"{path} cannot be written: {error.strerror}",
             remedy=f"name another file, e.g. --output {name}",
         ) from error
-    print("\n".join(_report(found, path, needs(text))))
+    needed = needs(text)
+    left = hindrance(path) if not needed else None
+    if left is not None:
+        needed = [f"{left.message}: {left.remedy}" if left.remedy else left.message]
+    elif hindered is not None and hindered.code not in UNKNOWN_LAYOUT:
+        print(f"{directory} does not open as it is: {hindered.message}")
+    print("\n".join(_report(found, path, needed)))
     return COMPLETE
 
 

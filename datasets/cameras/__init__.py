@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from datasets.cameras import boofcv, colmap, middlebury, opencv, slam, tsai
+from datasets.cameras import boofcv, colmap, kitti, middlebury, opencv, slam, tsai
 from datasets.cameras.fields import Fields
 from datasets.cameras.model import UNKNOWN_SIZE, CalibratedCamera
 from datasets.cameras.pair import rig_of
@@ -16,14 +16,15 @@ from stages.errors import InputError
 __all__ = ["UNKNOWN_SIZE", "CalibratedCamera", "read_cameras", "rig_of"]
 
 KNOWN = (
-    "OpenCV (YAML, XML), ROS camera_info, Kalibr, EuRoC sensor.yaml, ORB-SLAM, BoofCV, COLMAP, Middlebury calib.txt "
-    "and ASP .tsai are read"
+    "OpenCV (YAML, XML), ROS camera_info, Kalibr, EuRoC sensor.yaml, ORB-SLAM, BoofCV, COLMAP, Middlebury calib.txt, "
+    "KITTI and ASP .tsai are read"
 )
 
 PLAIN: tuple[tuple[Callable[[str], bool], Callable[[str, Path], list[CalibratedCamera]]], ...] = (
     (tsai.is_tsai, tsai.tsai),
     (middlebury.is_middlebury, middlebury.middlebury),
     (colmap.is_colmap, colmap.colmap),
+    (kitti.is_kitti, kitti.kitti),
 )
 """Text formats: how each is recognised, and its reader."""
 

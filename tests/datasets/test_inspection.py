@@ -239,3 +239,40 @@ def test_real_folders(data_dir: Path, folder, pairs, files, needed):
     assert found.calibration is not None
     assert found.calibration.files == files
     assert len(needs(manifest_text(found, "."))) == needed
+
+
+P0, P1, P2, P3 = (f"60 0 31.5 {x} 0 60 23.5 0 0 0 1 0" for x in (0, -12, -3, -18))
+
+KITTI_FILES = {
+    "odometry": f"P0: {P0}\nP1: {P1}\nP2: {P2}\nP3: {P3}\nTr: {P0}\n",
+    "raw": "calib_time: 09-Jan-2012 13:57:47\ncorner_dist: 9.95e-02\n"
+    + "".join(
+        f"S_0{k}: 80 60\nK_0{k}: 70 0 40 0 70 30 0 0 1\nD_0{k}: -0.3 0.1 0 0 0\nR_0{k}: 1 0 0 0 1 0 0 0 1\n"
+        f"T_0{k}: 0 0 0\nS_rect_0{k}: {SIZE[0]} {SIZE[1]}\nR_rect_0{k}: 1 0 0 0 1 0 0 0 1\nP_rect_0{k}: {p}\n"
+        for k, p in enumerate((P0, P1, P2, P3))
+    ),
+    "roi": f"K_01: 70 0 40 0 70 30 0 0 1\nD_01: 0 0 0 0 0\nP1: {P1}\nP1_roi: {P0}\nP2_roi: {P1}\n",
+}
+
+
+@pytest.mark.parametrize(
+    ("form", "left", "right", "baseline"),
+    [
+        ("odometry", "image_2/0000000{}", "image_3/0000000{}", 0.25),
+        ("odometry", "image_0/{}", "image_1/{}", 0.2),
+        ("raw", "run/image_02/data/000000000{}", "run/image_03/data/000000000{}", 0.25),
+        ("roi", "I1_00{}", "I2_00{}", 0.2),
+    ],
+)
+def test_a_manifest_takes_kittis_calibration_of_the_cameras_that_are_there(tmp_path, form, left, right, baseline):
+    folder = tmp_path / "drive"
+    for name in (left, right):
+        write_images(folder, [name.format(k) + ".png" for k in range(2)])
+    (folder / "calib.txt").write_text(KITTI_FILES[form])
+    text = manifest_text(inspect(folder), "drive")
+    assert not needs(text)
+    (tmp_path / "m.toml").write_text(text)
+    sequence = open_manifest(tmp_path / "m.toml", Digests())
+    assert (sequence.rig.left.fx, sequence.rig.baseline) == (60.0, pytest.approx(baseline))
+    assert sequence.times is None  # zeros in front: numbers of frames, no times
+    assert sequence.frames == 2

@@ -361,3 +361,10 @@ def test_every_key_is_described():
 
 def test_nested_defaults_become_dotted():
     assert dotted({"a": {"b": {"c": 1}, "d": 2}, "e.f": 3}) == [("a.b.c", 1), ("a.d", 2), ("e.f", 3)]
+
+
+def test_a_key_under_a_header_that_is_a_comment_is_explained(tmp_path):
+    path = write_sequence(tmp_path)
+    path.write_text(path.read_text() + "\n# [times]  # optional\nrate_hz = 10.0\n")
+    with raises("RIL-223", "rate_hz", "# [times]", "comment"):
+        opened(path)

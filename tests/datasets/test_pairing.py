@@ -120,3 +120,11 @@ def test_size_of_another_kind_of_file_is_read(tmp_path):
     for side in "lr":
         cv2.imwrite(str(tmp_path / f"a_{side}.pgm"), np.zeros((4, 6), np.uint16))
     assert common_size(pair_up([tmp_path / "a_l.pgm"], [tmp_path / "a_r.pgm"])) == (6, 4, 16)
+
+
+def test_unequal_counts_name_both_ends():
+    left, right = [[Path(f"{side}/{k:03d}.png") for k in range(n)] for side, n in (("a", 5), ("b", 3))]
+    with raises("RIL-256", "000.png to 004.png", "000.png to 002.png"):
+        pair_up(left, right, "order")
+    with raises("RIL-259", "000.png to 004.png", "000.png to 002.png"):
+        pair_up(left, right, "name")

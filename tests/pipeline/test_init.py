@@ -97,6 +97,26 @@ def test_a_folder_that_opens_as_it_is_gets_no_manifest_unasked(drive, tmp_path, 
     assert (tmp_path / "m.toml").is_file()
 
 
+def test_what_does_not_open_is_not_said_to(drive, capsys):
+    (drive / "calib.txt").write_text("60 0 31.5\n")
+    assert init(drive) == 0
+    printed = capsys.readouterr().out
+    assert "opens as it is" not in printed
+    assert "calib.txt" in printed.splitlines()[0]
+    assert "needed" in printed
+
+
+@pytest.mark.parametrize("pair", [("image_00", "image_01"), ("image_02", "image_03")])
+def test_image_folders_of_raw_recordings_open_with_their_calibration(drive, capsys, pair):
+    rows = {1: "60 0 31.5 -12 0 60 23.5 0 0 0 1 0", 0: "60 0 31.5 0 0 60 23.5 0 0 0 1 0"}
+    for side, name in zip(("left", "right"), pair, strict=True):
+        (drive / side).rename(drive / name)
+    lines = ["calib_time: 09-Jan-2012 13:57:47", "S_00: 80 60", "K_00: 70 0 40 0 70 30 0 0 1"]
+    (drive / "calib.txt").write_text("\n".join(lines + [f"P_rect_0{k}: {rows[k % 2]}" for k in range(4)]))
+    assert init(drive) == 0
+    assert "opens as it is" in capsys.readouterr().out
+
+
 def test_places_that_cannot_be_written(drive, tmp_path):
     with raises("RIL-039", "m.toml"):
         init(drive, tmp_path / "nowhere" / "m.toml")
