@@ -50,6 +50,7 @@ LONGEST = 1000
 
 app = App(
     name="rille",
+    suppress_keyboard_interrupt=False,  # else it ends the program without a word
     version=version("rille"),
     help="Stereo image sequences to terrain, trajectory, risk map and safe path, without rectification.",
 )

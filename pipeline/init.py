@@ -8,13 +8,10 @@ from pathlib import Path
 from datasets.inspection import Findings, inspect
 from datasets.manifest_text import counted, manifest_text, needs
 from datasets.names import derived_name
-from datasets.registry import hindrance
+from datasets.registry import NO_LAYOUT, hindrance
 from stages.errors import ConfigError, InputError
 
 COMPLETE = 0
-
-UNKNOWN_LAYOUT = ("RIL-276", "RIL-277", "RIL-278")
-"""Errors that say no more than that a manifest is needed."""
 
 
 def init(directory: Path, output: Path | None = None, force: bool = False) -> int:
@@ -60,7 +57,7 @@ def init(directory: Path, output: Path | None = None, force: bool = False) -> in
     left = hindrance(path) if not needed else None
     if left is not None:
         needed = [f"{left.message}: {left.remedy}" if left.remedy else left.message]
-    elif hindered is not None and hindered.code not in UNKNOWN_LAYOUT:
+    elif hindered is not None and hindered.code not in NO_LAYOUT:
         print(f"{directory} does not open as it is: {hindered.message}")
     print("\n".join(_report(found, path, needed)))
     return COMPLETE
