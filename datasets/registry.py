@@ -129,10 +129,6 @@ def _recognised(path: Path, number: str | None) -> Path | euroc.Layout | kitti.L
     return folder_manifest(path) or euroc.recognise(path) or kitti.recognise(path)
 
 
-NO_LAYOUT = ("RIL-276", "RIL-277", "RIL-278")
-"""Codes of errors that say no more than that a manifest is needed."""
-
-
 def hindrance(place: Path) -> RilleError | None:
     """Why a folder or a manifest does not open as it is; None where it does."""
     try:

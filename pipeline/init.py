@@ -8,7 +8,7 @@ from pathlib import Path
 from datasets.inspection import Findings, inspect
 from datasets.manifest_text import counted, manifest_text, needs
 from datasets.names import derived_name
-from datasets.registry import NO_LAYOUT, hindrance
+from datasets.registry import hindrance
 from stages.errors import ConfigError, InputError
 
 COMPLETE = 0
@@ -57,7 +57,7 @@ def init(directory: Path, output: Path | None = None, force: bool = False) -> in
     left = hindrance(path) if not needed else None
     if left is not None:
         needed = [f"{left.message}: {left.remedy}" if left.remedy else left.message]
-    elif hindered is not None and hindered.code not in NO_LAYOUT:
+    elif hindered is not None:
         print(f"{directory} does not open as it is: {hindered.message}")
     print("\n".join(_report(found, path, needed)))
     return COMPLETE
