@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from pipeline import pins, runs
+from pipeline import pins, roots, runs
 from pipeline.location import Location
 from pipeline.memory import words
 from pipeline.store import Store, at, sizes
@@ -35,7 +35,10 @@ class Holding:
 
 def holdings(store: Store, folder: Path) -> list[Holding]:
     """What is there, the largest sequence first, then in order of size."""
-    used, kept = runs.keys(folder), pins.keys(store)
+    used: dict[str, str] = {}
+    for place in roots.folders(store, folder):
+        used |= runs.keys(place)
+    kept = pins.keys(store)
     pinned_by = {key: found["run"] for found in pins.pins(store) for key in found["keys"]}
     found: dict[tuple[str, str], Holding] = {}
     for stage, key in artifacts(store):

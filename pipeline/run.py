@@ -257,9 +257,10 @@ def _open(options: Options) -> _Opened:
 
 def _compute(opened: _Opened, meanwhile: Callable[[], None] | None) -> Result:
     """Bring every task to its artifact; raise the first failure unless the data are its cause and poses are there."""
-    from pipeline import driver, memory, progress
+    from pipeline import driver, memory, progress, roots
 
     options = opened.options
+    roots.note(opened.store, options.runs)
     result = driver.run(
         opened.graph,
         opened.store,
@@ -450,14 +451,25 @@ def verify_cache(cache: Location, *, deep: bool = False) -> int:
 
 
 def collect_garbage(cache: Location, runs: Path, *, dry_run: bool) -> int:
-    """Remove what no run in ``runs`` and no pinned run refers to; a dry run says what that is."""
-    from pipeline import ledger, pins, upkeep
+    """Remove what no run in ``runs``, or in a folder that the cache knows, and no pinned run refers to.
+
+    A dry run says what that is.
+    """
+    from pipeline import ledger, pins, roots, upkeep
     from pipeline.memory import words
 
     store = at(cache)
-    kept, ledgers = pins.keys(store), sorted(runs.glob("*/*/ledger.jsonl"))
-    for path in ledgers:
-        kept |= ledger.keys(path)
+    roots.check_all_seen(store)
+    kept = pins.keys(store)
+    for folder in roots.folders(store, runs):
+        for path in sorted(folder.glob("*/*/ledger.jsonl")):
+            kept |= ledger.keys(path)
+    if not kept:
+        raise ConfigError(
+            "RIL-744",
+            f"no run is known that uses the cache {cache}: all of it would go",
+            remedy="give the folder of your runs with --runs, or remove the cache yourself",
+        )
     cleared = upkeep.gc(store, kept, dry_run=dry_run)
     if dry_run:
         for stage, (count, amount) in sorted(cleared.stages.items(), key=lambda item: -item[1][1]):

@@ -9,6 +9,7 @@ Layout under the cache folder::
                                                  of correctness
     index/<sequence>                             what its last run found: spares reading manifests that nobody touched
     pins/<run>.json                              keys that clearing up leaves alone
+    roots/<digest>.json                          folders of runs that use the cache
 
 An attempt becomes an artifact when its manifest is linked into place, create-if-absent, after all its files are on
 the disk. Killed at any instant, a run leaves either a whole artifact or an orphan that nobody reads. Of two that
