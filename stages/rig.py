@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from stages.adjustment import LEAST_MATCHES, RIG, Linear, Matches, adjust, rms, solution
+from stages.adjustment import BLOCKS, LEAST_MATCHES, RIG, Linear, Matches, adjust, rms, solution
 from stages.declare import Bundle, Inputs, Stage
 from stages.epipolar import NAMES, corrected, distances
 from stages.errors import InputError
@@ -36,6 +36,9 @@ MOST_MATCHES = 10_000
 """Of all pairs together: beyond, systematic errors rule."""
 
 LEAST_OF_A_PAIR = 200
+
+LEAST_OF_A_BLOCK = 5
+"""Matches whose median is a block's."""
 
 BAD_ROWS = 1.0
 """Pixels RMS of what no rig explains: an image whose lens distortion was not removed, or a wrong camera."""
@@ -206,19 +209,16 @@ def _drift(start: Sequence[Linear], per_pair: list[dict[str, Any]], params: RigP
     """Parameters that change from pair to pair by more than their errors, in pairs whose rows move enough to matter.
 
     Over one scene parameters stand in for each other (a pitch for a baseline across, over flat ground), so it counts by
-    how much all that changed moves the rows together.
+    how much all that changed moves the rows together; and a rig that moves does so all over the image, mismatches on
+    one thing in view do not, so it counts by how much the blocks of the image show (:func:`_shown`).
     """
     names = list(per_pair[0]["values"]) if len(per_pair) > 2 else []
     values = np.array([[p["values"][name] for name in names] for p in per_pair])
     sigma = np.array([[p["sigma"][name] for name in names] for p in per_pair])
-    departure = values - np.median(values, axis=0)
-    columns = [NAMES.index(name) for name in names]
-    moved = np.array(
-        [
-            np.sqrt(np.mean((one.design[:, columns] @ np.radians(by)) ** 2))
-            for one, by in zip(start, departure, strict=True)
-        ]
-    )
+    # of two states of the rig one, not the mean
+    usual = np.quantile(values, 0.5, axis=0, method="lower") if names else np.zeros(0)
+    departure = values - usual
+    moved = _shown(start, [NAMES.index(name) for name in names], np.radians(usual), np.radians(departure))
     lines = []
     for k, name in enumerate(names):
         away = np.abs(departure[:, k])
@@ -230,6 +230,35 @@ def _drift(start: Sequence[Linear], per_pair: list[dict[str, Any]], params: RigP
                 f"others', by {away[worst]:.2f} degrees at pair {per_pair[worst]['pair']}; try rig.mode = per_pair"
             )
     return lines
+
+
+def _shown(start: Sequence[Linear], columns: list[int], usual: Floats, departure: Floats) -> Floats:
+    """How far (pairs,) the rows of each pair moved against the others', pixels: the median over blocks of the image.
+
+    A block moved by what its median row error, beyond what the pairs' own parameters usually leave there, departs from
+    none, as far as the pair's own parameters claim so. Medians, of matches and of blocks: neither a part of a block's
+    matches nor less than half of the blocks, however wrong, moves a rig.
+
+    Parameters
+    ----------
+    columns : of the design, those of the parameters.
+    usual, departure : (parameters,) of all pairs and (pairs, parameters) of each against them, radians.
+    """
+    error, claimed, left = (np.full((len(start), BLOCKS**2), np.nan) for _ in range(3))
+    for k, (one, by) in enumerate(zip(start, departure, strict=True)):
+        design = one.design[:, columns]
+        off, shift = one.constant + design @ usual, -(design @ by)
+        for block in np.flatnonzero(np.bincount(one.block) >= LEAST_OF_A_BLOCK):
+            inside = one.block == block
+            error[k, block], claimed[k, block] = np.median(off[inside]), np.median(shift[inside])
+            left[k, block] = np.median((off - shift)[inside])
+    moved = np.zeros(len(start))
+    for k, (found, wanted) in enumerate(zip(error, claimed, strict=True)):
+        seen = np.isfinite(found)
+        if seen.any():
+            apart = (found[seen] - np.nanmedian(left[:, seen], axis=0)) * np.sign(wanted[seen])
+            moved[k] = np.median(np.clip(apart, 0.0, np.abs(wanted[seen])))
+    return moved
 
 
 def _run(params: RigParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
@@ -246,7 +275,7 @@ def _run(params: RigParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
 
 STAGE = Stage(
     name="rig",
-    version=2,
+    version=3,
     summary="the rig: the given calibration, repaired where the images contradict it",
     params=RigParams,
     inputs=("orientations*?",),
