@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datasets import files
-from datasets.manifest_rig import LONGEST_BASELINE
+from datasets.manifest_rig import LONGEST_BASELINE, off_centre
 from datasets.names import derived_name
 from datasets.pairing import ends
 from datasets.protocol import CAMERAS, Sequence, Source
@@ -357,7 +357,7 @@ def open_kitti(layout: Layout, digests: files.Digests) -> Sequence:
         truth_source=f"poses of {layout.poses.name}, as recorded" if layout.poses is not None else "",
         lost=listing.lost,
         defaults=STREET if rig.baseline >= CAR else {},
-        warnings=warnings,
+        warnings=(*warnings, *off_centre(rig.left, "left", size[:2]), *off_centre(rig.right, "right", size[:2])),
     )
 
 

@@ -23,6 +23,32 @@ USUAL_BASELINE = (0.02, 2.0)
 USUAL_VIEW_DEG = (5.0, 175.0)
 """degrees; horizontal angle of view."""
 
+OFF_CENTRE = 0.1
+"""Of the width: principal points lie nearer to the centre, unless images were scaled or cut after the calibration."""
+
+COMMON_WIDTHS = (
+    320,
+    512,
+    640,
+    672,
+    720,
+    752,
+    800,
+    848,
+    960,
+    1024,
+    1226,
+    1242,
+    1280,
+    1440,
+    1600,
+    1920,
+    2448,
+    2560,
+    3840,
+)
+"""px, of images as cameras give them."""
+
 SAME = 0.01
 """Relative difference of two stated baselines that is no contradiction."""
 
@@ -221,6 +247,23 @@ def _check_baseline(baseline: float, section: RigSection, name: str) -> list[str
     return []
 
 
+def off_centre(camera: Camera, side: str, size: tuple[int, int]) -> list[str]:
+    """A line on a principal point more than a tenth of the width off the centre, with the size that it would fit."""
+
+    def off(width: float, height: float) -> float:
+        return max(abs(camera.cx - width / 2), abs(camera.cy - height / 2)) / width
+
+    if off(*size) <= OFF_CENTRE:
+        return []
+    scaled = [(width, round(width * size[1] / size[0])) for width in COMMON_WIDTHS if width != size[0]]
+    width, height = min(scaled, key=lambda s: off(*s))
+    text = f"{side} camera: principal point ({camera.cx:g}, {camera.cy:g}) px is far from the centre of "
+    text += f"{size[0]} x {size[1]} images"
+    if off(width, height) < OFF_CENTRE / 2:
+        text += f": it fits {width} x {height}, scale by {size[0] / width:.4g}"
+    return [text]
+
+
 def _unusual(camera: Camera, side: str, size: tuple[int, int]) -> list[str]:
     """Lines on a camera that is possible but strange."""
     lines = []
@@ -229,11 +272,7 @@ def _unusual(camera: Camera, side: str, size: tuple[int, int]) -> list[str]:
         lines.append(
             f"{side} camera: fx = {camera.fx:g} px gives an angle of view of {view:.3g} degrees; is it in pixels?"
         )
-    if abs(camera.cx - size[0] / 2) > size[0] / 4 or abs(camera.cy - size[1] / 2) > size[1] / 4:
-        lines.append(
-            f"{side} camera: principal point ({camera.cx:g}, {camera.cy:g}) px is far from the centre of "
-            f"{size[0]} x {size[1]} images"
-        )
+    lines += off_centre(camera, side, size)
     if not 0.8 < camera.fx / camera.fy < 1.25:
         lines.append(f"{side} camera: fx = {camera.fx:g} and fy = {camera.fy:g} px differ much: no square pixels")
     return lines

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from datasets.protocol import CAMERAS, Sequence, Source
 from pipeline import config as configuration
-from pipeline import verdicts
+from pipeline import synchrony, verdicts
 from pipeline.location import Location
 from pipeline.store import Ref, Store, at
 from pipeline.task import Refs, Spec, ensure
@@ -35,6 +35,9 @@ COMPLETE, FAILED = 0, 1
 
 MOST_MOTIONS = 12
 """Successive pairs whose motion is measured, spread over the sequence: a sample tells what a run can expect."""
+
+MOST_PAIRS = 6
+"""Pairs whose rows are compared with those of shifted right images, spread over the sequence."""
 
 BEYOND = 1.0
 """Pixels beyond infinity that noise does not reach."""
@@ -138,6 +141,7 @@ class Inspection:
             return
         yield from self._first_pair(whole[0])
         yield from self._motions()
+        yield from self._simultaneous()
 
     def _images(self) -> Any:
         """Open every image: sizes, repetitions, exposure, sharpness."""
@@ -230,6 +234,24 @@ class Inspection:
             except RilleError as error:
                 yield Verdict("FAIL", "motion", error.message, error.remedy)
         yield from verdicts.judge_motion(motions, self.sequence.frame_names)
+
+    def _simultaneous(self) -> Any:
+        """Rows of some pairs over the whole sequence, with the right images as named and shifted in time."""
+        last = max(self.frames)
+        inner = [k for k in self.frames if k - 2 >= 0 and k + 2 <= last]
+        chosen = sorted({inner[int(k)] for k in np.linspace(0, len(inner) - 1, MOST_PAIRS).round()}) if inner else []
+        spreads: dict[int, list[float | None]] = {shift: [] for shift in synchrony.SHIFTS}
+        for frame in chosen:
+            left = self._features(frame, "left")
+            for shift, values in spreads.items():
+                right = self._features(frame + shift, "right")
+                values.append(synchrony.row_spread(self.sequence.rig, left, right))
+        yield from verdicts.judge_synchrony(spreads)
+
+    def _features(self, frame: int, camera: str) -> tuple[Any, Any] | None:
+        if frame in self.lost or (frame, camera) in self.broken or frame not in self.frames:
+            return None
+        return synchrony.features(np.asarray(self.store.open(self._image(frame, camera))["image"]))
 
     def _turn(self, a: int, b: int) -> dict[str, Any]:
         known = self.sequence.attitude

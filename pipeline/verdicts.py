@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datasets.protocol import Rows
+from pipeline.synchrony import best_shift
 from stages.geometry import Rig, RigidTransform
 from stages.sight import Look
 
@@ -275,6 +276,26 @@ def judge_epipolar(facts: Mapping[str, Any]) -> list[Verdict]:
         remedy = "the calibration is off; reconstruct repairs what the images tell, `rille calibrate` the rest"
         return [Verdict("WARN", "epipolar", words, remedy)]
     return [Verdict("OK", "epipolar", words)]
+
+
+def judge_synchrony(spreads: Mapping[int, list[float | None]]) -> list[Verdict]:
+    """Whether the right images are of the same moments; ``spreads`` [px] by shift, see :mod:`pipeline.synchrony`."""
+    named = [value for value in spreads[0] if value is not None]
+    if not named:
+        return []
+    found = best_shift(spreads)
+    words = f"rows of {len(named)} pairs over the sequence spread by {float(np.median(named)):.2f} px"
+    if found is None:
+        return [Verdict("OK", "simultaneous", f"{words}; no shift in time explains them better")]
+    shift, as_named, shifted = found
+    text = (
+        f"not simultaneous: left i with right i{shift:+d} spreads rows by {shifted:.2f} px, as named {as_named:.2f} px"
+    )
+    return [Verdict("FAIL", "simultaneous", text, f"pair each left image with the right one {_frames(shift)}")]
+
+
+def _frames(shift: int) -> str:
+    return f"{abs(shift)} frame{'s' if abs(shift) > 1 else ''} {'before' if shift < 0 else 'after'} it"
 
 
 def judge_motion(motions: Mapping[tuple[int, int], Mapping[str, Any]], names: Sequence[str]) -> list[Verdict]:

@@ -15,8 +15,9 @@ from datasets.files import Digests
 from datasets.georeference import Georeference
 from datasets.manifest import dotted, open_manifest
 from datasets.manifest_model import Manifest, known_keys, read_manifest, tables
+from datasets.manifest_rig import off_centre
 from datasets.protocol import Sequence
-from stages.geometry import RigidTransform, rotation_exp
+from stages.geometry import Camera, RigidTransform, rotation_exp
 
 
 def opened(path: Path) -> Sequence:
@@ -368,3 +369,19 @@ def test_a_key_under_a_header_that_is_a_comment_is_explained(tmp_path):
     path.write_text(path.read_text() + "\n# [times]  # optional\nrate_hz = 10.0\n")
     with raises("RIL-223", "rate_hz", "# [times]", "comment"):
         opened(path)
+
+
+@pytest.mark.parametrize(
+    ("size", "centre", "expected"),
+    [
+        ((512, 288), (327.0, 176.0), "fits 640 x 360, scale by 0.8"),
+        ((512, 288), (250.0, 150.0), None),
+        ((1226, 370), (601.9, 183.1), None),
+        ((640, 480), (100.0, 240.0), "far from the centre"),
+    ],
+)
+def test_a_principal_point_off_the_centre_says_which_size_it_fits(size, centre, expected):
+    lines = off_centre(Camera(400.0, 400.0, *centre, *size), "left", size)
+    assert len(lines) == (expected is not None)
+    assert expected is None or expected in lines[0]
+    assert size != (640, 480) or "scale by" not in lines[0]

@@ -1,0 +1,12 @@
+"""Ctrl-C in a command: the documented sentence, and exit code 130."""
+
+from pipeline import cli, run
+
+
+def test_ctrl_c_says_what_the_documents_say(monkeypatch, capsys):
+    def interrupted(options):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(run, "reconstruct", interrupted)
+    assert cli._run(["reconstruct", "mockup-short"]) == 130
+    assert capsys.readouterr().err == "rille: interrupted; the same command resumes from here\n"
