@@ -20,6 +20,8 @@ from datasets.reading import open_regular, read_bytes
 from stages.declare import Array, Bundle, Inputs, NoParams, Stage
 from stages.errors import InputError
 
+cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # what it says on stderr, an error says here
+
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".pgm")
 MOST_PIXELS = 160_000_000
 """Of one image: the largest sensors have 150 million."""

@@ -22,7 +22,7 @@ def _pose(value: Any) -> tuple[float, ...]:
     """Twelve numbers, rows of [R | t], of a 3 x 4 or 4 x 4 matrix, flat or in rows."""
     try:
         matrix = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         matrix = np.empty(0)
     if matrix.size not in (12, 16):
         raise ValueError("give rows of [R | t], 3 x 4 numbers")

@@ -98,7 +98,7 @@ def _decimal(value: str | int | float, what: str, line: int) -> Decimal:
         exact = Decimal(text)
     except (InvalidOperation, ValueError):
         exact = Decimal("nan")
-    if not exact.is_finite() or abs(exact) > LARGEST:
+    if not exact.is_finite() or exact.copy_abs() > LARGEST:
         raise InputError("RIL-291", f"{what}, line {line}: {value!r} is not a time", remedy="give numbers, one a frame")
     return exact
 

@@ -130,14 +130,7 @@ def _prior(path: Path, shape: tuple[int, ...]) -> tuple[NDArray[Any], NDArray[An
     """Prior disparities, checked against the left image's shape."""
     from pipeline.products import read_disparity
 
-    column, row = read_disparity(path)
-    if column.shape != shape:
-        sizes = [f"{s[1]} x {s[0]}" for s in (column.shape, shape)]
-        raise InputError(
-            "RIL-044",
-            f"prior disparity {path} is {sizes[0]} pixels, the left image {sizes[1]}",
-            remedy="give a disparity of this left image",
-        )
+    column, row = read_disparity(path, shape)
     if not (np.isfinite(column) & np.isfinite(row)).any():
         raise InputError(
             "RIL-045", f"prior disparity {path} is undefined everywhere", remedy="leave --prior-disparity out"

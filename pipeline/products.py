@@ -21,7 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from datasets.files import MOST_BYTES
 from datasets.georeference import Georeference
+from datasets.reading import open_regular
 from pipeline.plain import plain
 from stages.errors import InputError
 from stages.lattice import Lattice
@@ -336,13 +338,17 @@ def _write_image(path: Path, bands: Mapping[str, tuple[NDArray[Any], str]], tags
             file.update_tags(**dict(tags))
 
 
-def read_disparity(path: Path) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def read_disparity(path: Path, shape: tuple[int, ...] = ()) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Column and row disparity (row, col), float32 pixels, NaN undefined, of a TIFF as :func:`write_disparity` makes.
+
+    Parameters
+    ----------
+    shape : (rows, columns) that it must have; compared before anything is unpacked.
 
     Raises
     ------
     InputError
-        The file cannot be read, or its two bands are not those.
+        The file cannot be read, its two bands are not those, or it has another size.
     """
     import warnings
 
@@ -353,11 +359,18 @@ def read_disparity(path: Path) -> tuple[NDArray[np.float32], NDArray[np.float32]
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            with rasterio.open(path) as file:
+            open_regular(path, "disparity", MOST_BYTES).close()
+            with rasterio.open(path, driver="GTiff") as file:  # other drivers open other files, by name
                 names = tuple(name for name in file.descriptions if name)
                 if file.count != 2 or names not in ((), ("column_disparity", "row_disparity")):
                     told = ", ".join(names) or "without names"
                     raise InputError("RIL-622", f"{path} has {file.count} bands ({told}), no disparity", remedy=remedy)
+                if shape and file.shape != shape:
+                    raise InputError(
+                        "RIL-044",
+                        f"{path} has {file.width} x {file.height} pixels, the left image {shape[1]} x {shape[0]}",
+                        remedy="give a disparity of this left image",
+                    )
                 column, row = file.read(out_dtype="float32", masked=True).filled(np.nan)
     except RasterioError as error:
         raise InputError("RIL-623", f"{path} cannot be read as a TIFF ({error})", remedy=remedy) from error

@@ -103,11 +103,11 @@ def test_priors_that_are_none(folder):
     write_disparity(folder / "nothing.tif", nothing, nothing, {})
     with raises("RIL-045"):
         run(folder, prior=folder / "nothing.tif")
-    with raises("RIL-622"):
+    with raises("RIL-623"):
         run(folder, prior=folder / "left.png")
     (folder / "text.tif").write_text("no image")
-    for name in ("text.tif", "absent.tif"):
-        with raises("RIL-623", name):
+    for name, code in (("text.tif", "RIL-623"), ("absent.tif", "RIL-138")):
+        with raises(code, name):
             run(folder, prior=folder / name)
 
 
