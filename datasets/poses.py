@@ -89,6 +89,15 @@ def read_poses(path: Path, format: str = "auto", *, unit: str = "auto") -> Timed
     table = read_table(path, "pose file")
     if format == "kitti" or (format == "auto" and table.columns in (12, 16) and not _named(table)):
         return TimedPoses(None, _matrices(table), table.name)
+    meant = _meanings(table)
+    if format in ("auto", "csv") and not _complete(meant) and {"x", "y"} <= set(meant):
+        lacking = [q for q in QUATERNION if q not in meant]
+        raise InputError(
+            "RIL-801",
+            f"{table.name}: its columns {', '.join(table.header)} are positions without a whole rotation "
+            f"({', '.join(lacking)} missing), no poses",
+            remedy="add qw, qx, qy, qz or roll_deg, pitch_deg, yaw_deg; positions alone are not compared",
+        )
     columns = _columns(table, format)
     angles = None if "qw" in columns else _angle_unit(table, columns)
     at = None
@@ -108,6 +117,11 @@ def read_poses(path: Path, format: str = "auto", *, unit: str = "auto") -> Timed
 
 def _named(table: Table) -> dict[str, int]:
     """Columns by what their names mean; a unit in brackets or at the end is no part of a name."""
+    found = _meanings(table)
+    return found if _complete(found) else {}
+
+
+def _meanings(table: Table) -> dict[str, int]:
     found: dict[str, int] = {}
     for k, name in enumerate(table.header):
         bare = re.sub(r"[\[(].*?[\])]|[_ ](deg|rad|m|s|ns|us|ms)$", "", name).strip()
@@ -116,7 +130,7 @@ def _named(table: Table) -> dict[str, int]:
             if match:
                 found.setdefault(meaning(match), k)
                 break
-    return found if _complete(found) else {}
+    return found
 
 
 def _complete(columns: Mapping[str, int]) -> bool:

@@ -34,7 +34,7 @@ class Handle:
     is what the same label led to before: a plan takes its facts for what is to come. ``expect`` are bytes (decoded)
     that it reads from outside. Of a computed node: ``seconds`` of the call and of the stage's own ``kernel``, when it
     ``started`` (seconds since 1970), and the figures of a :class:`pipeline.memory.Meter` (``first``: with imports
-    and kernels).
+    and kernels; ``compiling``: seconds for which kernels were compiled).
     """
 
     index: int
@@ -53,6 +53,7 @@ class Handle:
     memory: int | None = None
     rest: int | None = None
     first: bool = False
+    compiling: float = 0.0
     error: BaseException | None = None
 
     @property

@@ -34,6 +34,37 @@ UNUSED_DAYS = 30
 """A kernel that was not loaded for so long is removed by ``rille cache gc``."""
 
 
+class Compiling:
+    """Seconds for which kernels are compiled in this process, from the first that is not on disk to the last saved."""
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+        self.pending: set[str] = set()
+        self.since = 0.0
+
+    def begin(self, key: str) -> None:
+        """A kernel is not on disk: numba compiles it next, and whatever it calls in between."""
+        if not self.pending:
+            self.since = time.perf_counter()
+        self.pending.add(key)
+
+    def end(self, key: str) -> None:
+        """It is compiled and saved."""
+        known = key in self.pending
+        self.pending.discard(key)
+        if known and not self.pending:
+            self.seconds += time.perf_counter() - self.since
+
+    def take(self) -> float:
+        """The seconds since this was last asked."""
+        seconds, self.seconds = self.seconds, 0.0
+        self.pending.clear()
+        return seconds
+
+
+COMPILING = Compiling()
+
+
 def guard() -> None:
     """Make the cache safe in this process, now or as soon as numba is imported; it is not imported for that."""
     if CACHING in sys.modules:
@@ -117,12 +148,14 @@ def _patch(caching: Any) -> None:
         body = self._dump((self._version, self._source_stamp, key, data))
         with self._open_for_write(str(path(self, key))) as file:
             file.write(hashlib.sha256(body).digest() + body)
+        COMPILING.end(str(path(self, key)))
 
     def load(self: Any, key: Any) -> Any:
         file = path(self, key)
         try:
             content = file.read_bytes()
         except OSError:
+            COMPILING.begin(str(file))
             return None
         if hashlib.sha256(content[32:]).digest() != content[:32]:
             return None

@@ -26,6 +26,10 @@ INTERVAL = 5.0
 """Seconds between plain lines."""
 
 
+SLOW_COMPILE = 1.0
+"""Seconds of compilation that a user notices, and is told of."""
+
+
 class Progress(Protocol):
     """What the driver tells; every method is called on the driver's thread."""
 
@@ -112,8 +116,9 @@ class Plain(Quiet):
         self.shown = time.monotonic()
 
     def resolved(self, handle: Handle) -> None:
-        """Say where we are, now and then."""
+        """Say where we are, now and then, and at once what was compiled."""
         super().resolved(handle)
+        self._compiled(handle)
         if time.monotonic() - self.shown >= INTERVAL:
             self.shown = time.monotonic()
             left = self.left()
@@ -121,6 +126,10 @@ class Plain(Quiet):
                 f"{self.done}/{self.total()} tasks, {handle.label} {handle.status}"
                 + (f", about {_clock(left)} left" if left is not None else "")
             )
+
+    def _compiled(self, handle: Handle) -> None:
+        if handle.compiling >= SLOW_COMPILE:
+            self._say(f"{handle.stage}: compiling, once: {handle.compiling:.0f} s")
 
     def failed(self, label: str, error: BaseException) -> None:
         """Say so at once."""
@@ -193,6 +202,7 @@ class Bar(Plain):
     def resolved(self, handle: Handle) -> None:
         """Move the bar."""
         Quiet.resolved(self, handle)
+        self._compiled(handle)
         self._move(handle.label)
 
     def _move(self, label: str) -> None:

@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.code import module_digests
-from pipeline.kernels import guard
+from pipeline.kernels import COMPILING, guard
 from pipeline.key import text
 from pipeline.memory import Meter
 from pipeline.packages import versions
@@ -77,7 +77,7 @@ class Outcome:
 
     ``kernel`` are the seconds of the stage itself, ``started`` is when the call began (seconds since 1970); ``memory``
     and ``rest`` are a :class:`~pipeline.memory.Meter`'s figures, ``first`` says that the process had not run the stage
-    before (it imports, and compiles or loads kernels).
+    before (it imports, and compiles or loads kernels); ``compiling`` are the seconds for which it compiled.
     """
 
     ref: Ref
@@ -89,6 +89,7 @@ class Outcome:
     memory: int | None = None
     rest: int | None = None
     first: bool = False
+    compiling: float = 0.0
 
 
 MANY = 4096
@@ -174,11 +175,13 @@ def ensure(root: Path | str, spec: Spec, refs: Refs, *, key: str | None = None, 
             if ref is not None:
                 return Outcome(ref, True, time.perf_counter() - begin, _peak_rss(), started)
             first = spec.module not in _run
+            COMPILING.take()  # of what ran before in this process
             with Meter() as meter:
                 ref, kernel = _compute(store, spec, refs, own)
             seconds = time.perf_counter() - begin
             _run.add(spec.module)
-            return Outcome(ref, False, seconds, _peak_rss(), started, kernel, meter.memory, meter.rest, first)
+            measured = (started, kernel, meter.memory, meter.rest, first, COMPILING.take())
+            return Outcome(ref, False, seconds, _peak_rss(), *measured)
         except (OSError, TimeoutError) as error:
             if isinstance(error, PERMANENT) or trial == TRIES - 1:
                 raise

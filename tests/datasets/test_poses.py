@@ -159,3 +159,10 @@ def test_one_row_and_no_times():
     assert [f is not None for f in interpolate(alone, [0.5, 1.0], 1.0)] == [False, True]
     with raises("RIL-268"):
         interpolate(TimedPoses(None, QUARTER.poses), [0.0], 1.0)
+
+
+@pytest.mark.parametrize("header", ["time,x,y", "t,x,y,z", "timestamp,px,py,pz"])
+def test_positions_alone_are_said_to_lack_a_rotation(tmp_path, header):
+    rows = "\n".join(",".join(str(k + j) for j in range(header.count(",") + 1)) for k in range(3))
+    with raises("RIL-801", "qw", *header.split(",")[1:3]):
+        read(tmp_path, f"{header}\n{rows}\n")

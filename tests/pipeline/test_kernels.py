@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import shutil
 import subprocess
@@ -10,9 +11,11 @@ from pathlib import Path
 
 import pytest
 from numba.core import caching
+from toys.numbers import NumbersParams
 
-from pipeline import kernels
-from pipeline.kernels import guard
+from pipeline import kernels, progress
+from pipeline.dag import Graph
+from pipeline.kernels import COMPILING, guard
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 KERNEL = """
@@ -146,3 +149,30 @@ def test_kernels_that_nothing_loads_are_cleared(tmp_path, monkeypatch):
         path.write_bytes(b"")
     os.utime(old, (0, 0))
     assert kernels.unused() == [old]
+
+
+def test_seconds_of_compiling_end_with_the_outermost_kernel(entry, monkeypatch):
+    cache, _ = entry
+    clock = iter([10.0, 41.0, 50.0])
+    monkeypatch.setattr(kernels.time, "perf_counter", lambda: next(clock))
+    COMPILING.take()
+    assert cache.load("outer") is None
+    assert cache.load("callee") is None
+    cache.save("callee", 1)
+    assert COMPILING.seconds == 0
+    cache.save("outer", 1)
+    assert cache.load("outer") == 1
+    assert COMPILING.take() == 31.0
+    assert COMPILING.take() == 0.0
+
+
+def test_a_run_says_what_it_compiled():
+    stream = io.StringIO()
+    shown = progress.Plain(stream)
+    handle = Graph().node("toys.numbers", "n", NumbersParams(), {"frame": 0})
+    shown.open(Graph(), {}, 1)
+    shown.resolved(handle)
+    assert stream.getvalue() == ""
+    handle.compiling = 31.2
+    shown.resolved(handle)
+    assert stream.getvalue() == "rille: numbers: compiling, once: 31 s\n"
