@@ -19,7 +19,7 @@ from stages.geometry import RigidTransform, orthonormal
 from stages.lens import Lens
 
 PROJECTION = re.compile(r"P(\d)(?:_roi)?|P_rect_(\d\d)")
-LINE = re.compile(r"^\s*(P\d(?:_roi)?|P_rect_\d\d|K_\d\d)\s*:", re.MULTILINE)
+LINE = re.compile(r"^[ \t]*(P\d(?:_roi)?|P_rect_\d\d|K_\d\d)[ \t]*:", re.MULTILINE)
 RAW = re.compile(r"K_(\d\d)")
 
 

@@ -258,11 +258,8 @@ def _insert(data: bytes, rng: random.Random) -> bytes:
 
 def _nest(data: bytes, rng: random.Random) -> bytes:
     start, _ = _place(data, rng)
-    return (
-        data[:start]
-        + rng.choice((b"[", b"{a: ", b'{"a":', b"<a>", b"(", b"a.", b"- ", b" ")) * rng.choice((3, 40, 3000, 100_000))
-        + data[start:]
-    )
+    piece = rng.choice((b"[", b"{a: ", b'{"a":', b"<a>", b"(", b"a.", b"- ", b" ", b"\n"))
+    return data[:start] + piece * rng.choice((3, 40, 3000, 100_000)) + data[start:]
 
 
 def _spans(data: bytes, kind: str) -> list[tuple[int, int]]:

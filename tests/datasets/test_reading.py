@@ -7,6 +7,7 @@ import zlib
 import cv2
 import numpy as np
 import pytest
+from fuzzing import LONGEST, within
 
 from datasets import files, reading
 from datasets.cameras import read_cameras
@@ -16,7 +17,7 @@ from stages.errors import InputError
 
 
 def refused(code, call, *args):
-    with pytest.raises(InputError) as caught:
+    with pytest.raises(InputError) as caught, within(LONGEST):
         call(*args)
     assert caught.value.code == code
     assert "\n" not in str(caught.value)
