@@ -30,6 +30,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
+from scipy.special import bdtrc
 
 from stages.declare import AnyArray, Array, Bundle, Inputs, Params, Stage
 from stages.errors import DegenerateError, InputError
@@ -62,6 +63,12 @@ SOURCES = 7
 """Errors that segments share: as many as the pose has parameters, and that of all disparities."""
 AT_ONCE = 8
 """Of the landmarks above the threshold, one in so many (at least one) is removed before the pose is adjusted anew."""
+SEARCHED = 9.0
+"""Side of the square about a prediction, pixels, in which tracking finds a point, be it wrong: four either way."""
+PARTS = (0.25, 0.5, 1.0)
+"""Shares of the threshold at which agreement is counted."""
+FALSE_ALARMS = 0.01
+"""Poses that chance alone may offer in a frame without one right track: one of a hundred such frames gets a pose."""
 SAMPLE = 4
 """Landmarks of one hypothesis: the fewest that fix a pose uniquely."""
 
@@ -179,6 +186,7 @@ def resect(
             f"{where}: only {int(active.sum())} of {len(active)} landmarks agree with one pose",
             remedy="look at the image; or lower resect.min_share",
         )
+    _not_by_chance(obs, poses, int(active.sum()), params, where)
     _not_collinear(landmarks.position[active], where)
     return _result(obs, poses, active, steps, params, where)
 
@@ -323,6 +331,37 @@ def _enough(count: int, where: str, what: str, remedy: str) -> None:
     if count < MINIMUM:
         raise DegenerateError(
             "RIL-421", f"{where}: too few landmarks: {count} {what}, {MINIMUM} are needed", remedy=remedy
+        )
+
+
+def _not_by_chance(obs: Observations, poses: Poses, agree: int, params: ResectParams, where: str) -> None:
+    """Refuse a pose that as many landmarks may agree with though none was found where it is.
+
+    Any three landmarks fix a pose. Where the others were found by mistake, anywhere in what tracking searches, each
+    agrees with the share of that area that is below the threshold; the number of false alarms is that of triples times
+    the chance that so many others do (Desolneux, Moisan, Morel 2000, doi:10.1023/A:1026593302236), the least of some
+    thresholds times their number: right landmarks agree better than they need to. A few landmarks of many tell nothing
+    then, however small their residuals are.
+    """
+    n = obs.landmarks.shape[1]
+    along = back_projection(obs, poses).per_pixel[0] * obs.sigma[0][:, None]
+    stretch = np.sqrt(1.0 + (along**2).sum(1) / params.pixel_sigma**2)
+    stretch = stretch[np.isfinite(stretch)]
+    least = math.inf
+    for part in PARTS:
+        bound = part * params.threshold
+        count = int((norms(obs, poses)[0] <= bound / params.pixel_sigma).sum())
+        strip = min(2.0 * bound / SEARCHED, 1.0)  # the most that a long ellipse leaves of the square
+        share = float(np.minimum(math.pi * (bound / SEARCHED) ** 2 * stretch, strip).mean())
+        if share == 1.0:  # a threshold that every place passes was chosen so as to believe everything
+            return
+        if count >= MINIMUM:
+            least = min(least, len(PARTS) * math.comb(n, 3) * float(bdtrc(count - 4, n - 3, share)))
+    if least > FALSE_ALARMS:
+        raise DegenerateError(
+            "RIL-720",
+            f"{where}: {agree} of {n} landmarks agree with one pose, which as many may do by chance",
+            remedy="set track.points higher, or choose frames that are closer to each other",
         )
 
 
@@ -528,7 +567,7 @@ def coordinates(
 
 STAGE = Stage(
     name="resect",
-    version=2,
+    version=3,
     summary="poses of a segment's frames in the local frame of its basic pair",
     params=ResectParams,
     inputs=("track", "dem?", "disparity?", "level", "rig"),

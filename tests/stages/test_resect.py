@@ -6,6 +6,7 @@ from raising import raises
 from scipy.optimize import least_squares
 from scipy.stats import chi2
 
+from stages.errors import DegenerateError
 from stages.geometry import Camera, RigidTransform, angles_from_rotation, rotation_exp, rotation_from_angles
 from stages.landmarks import Landmarks
 from stages.reprojection import (
@@ -435,3 +436,20 @@ def test_what_moves_by_itself_is_counted():
     known = Landmarks(landmarks, np.zeros_like(landmarks), np.zeros(80), {})
     found = resect_segment(points, known, CAMERA, steps[0], [0, 1, 2, 3], PARAMS)
     assert moving_tracks(points, known, found) == (75, 12)
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize(("right", "n"), [(0, 17), (0, 23), (0, 60), (20, 40)])
+def test_a_pose_by_chance_is_refused_and_a_right_one_is_not(right, n, seed):
+    rng = np.random.default_rng([seed, right, n])
+    landmarks, pose = scene(rng, n), true_pose(rng)
+    pixels = seen(pose, landmarks) + rng.normal(0, 0.2, (n, 2))
+    pixels[right:] = seen(RigidTransform.identity(), landmarks[right:]) + rng.uniform(-4, 4, (n - right, 2))
+    params = ResectParams(min_share=0.0, max_position_ratio=10.0)
+    if right:
+        found = solve(landmarks, pixels, params=params, seed=seed)
+        np.testing.assert_allclose(found.T_local_left.translation, pose.translation, atol=0.1)
+        return
+    with pytest.raises(DegenerateError) as caught:
+        solve(landmarks, pixels, params=params, seed=seed)
+    assert caught.value.code in ("RIL-720", "RIL-421")  # as many as by chance, or fewer than a pose needs
