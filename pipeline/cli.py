@@ -2,8 +2,8 @@
 
 Exit codes: 0 complete; 1 failed; 2 usage, configuration or input; 3 finished, but not all of it: what the data do not
 determine, failures under ``--keep-going``, frames without a pose, images that do not match, a drive that did not reach
-its goal; 130 interrupted. Results go to stdout, progress and complaints to stderr. Heavy imports happen inside the
-commands, so that ``--help`` answers at once.
+its goal, a parameter that no task read; 130 interrupted. Results go to stdout, progress and complaints to stderr. Heavy
+imports happen inside the commands, so that ``--help`` answers at once.
 """
 
 from __future__ import annotations
