@@ -374,13 +374,13 @@ class _Run:
 
     def _begin(self) -> None:
         """Look ahead, share the memory out, and start the workers that it leaves room for."""
-        self.store.writable()
         known, jobs = costs.recall(self.hints), self.jobs or cores()
         ahead = self._look_ahead()
         most = max(largest(ahead, known), *(known.foresee(h.spec, input_bytes(h)).most for h in self.missing))
         shares = account(known, self.memory_limit, self.executor_kind, jobs, most)
         self.admission = Admission(known, shares, automatic=self.memory_limit is None)
         self.admission.check(ahead)
+        self.store.writable()
         few = shares.workers < jobs and self.executor_kind == "processes"
         amounts = {k: round(v) for k, v in vars(shares).items() if math.isfinite(v)}
         self.ledger.run(executor=self.executor_kind, jobs=shares.workers, **amounts)

@@ -26,8 +26,8 @@ KNOWN = {
 }
 """Import name to the distributions that may give it, where they are named otherwise: looking it up takes 0.2 s."""
 
-HARMLESS = frozenset({"pydantic"})
-"""Checks parameters, whose values are part of a key themselves."""
+HARMLESS = frozenset({"pydantic", "pipeline"})
+"""What checks parameters, whose values are part of a key themselves; and the engine, whose format is."""
 
 CORE_NAMES = ("scipy_openblas_get_corename64_", "scipy_openblas_get_corename", "openblas_get_corename")
 
@@ -45,6 +45,8 @@ def versions(module: str, own: Iterable[str] = OWN) -> dict[str, str]:
         One of them is not installed.
     """
     names = external_imports(module, own) - HARMLESS
+    if "numba" in names:
+        names.add("llvmlite")  # generates the code
     return dict(sorted(_version(name) for name in names))
 
 

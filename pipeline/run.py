@@ -234,7 +234,7 @@ def _open(options: Options) -> _Opened:
     from pipeline.drive import dataflow
     from pipeline.executor import known
 
-    _known_stages(options.force)
+    known_stages(options.force)
     known(options.executor)
     started = datetime.now(UTC)
     settled = settings(options)
@@ -355,7 +355,7 @@ def _all_read(opened: _Opened, arrived: int) -> int:
     return HOLES if lost or idle else COMPLETE
 
 
-def _known_stages(names: frozenset[str]) -> None:
+def known_stages(names: frozenset[str]) -> None:
     """Refuse a stage to be forced that there is not."""
     if not names:
         return
