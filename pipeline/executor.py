@@ -92,16 +92,18 @@ class Executor(Protocol):
 KINDS = ("processes", "threads", "inline")
 
 
-def known(kind: str) -> None:
+def known(kind: str, jobs: int | None = None) -> None:
     """Refuse an executor that there is not, before any work.
 
     Raises
     ------
     ConfigError
-        It is neither one of the kinds nor an address.
+        It is neither one of the kinds nor an address, or there are no ``jobs``.
     """
     if kind not in KINDS and not re.fullmatch(r"(tcp|tls)://[^/\s]+:\d+", kind):
         raise ConfigError("RIL-539", f"executor {kind!r} is unknown", remedy=f"{', '.join(KINDS)} or tcp://host:port")
+    if jobs is not None and jobs < 1:
+        raise ConfigError("RIL-540", f"{jobs} jobs are not permitted", remedy="give 1 or more")
 
 
 def make(
@@ -117,9 +119,7 @@ def make(
     ConfigError
         There is no such executor, or the cluster does not answer.
     """
-    known(kind)
-    if jobs is not None and jobs < 1:
-        raise ConfigError("RIL-540", f"{jobs} jobs are not permitted", remedy="give 1 or more")
+    known(kind, jobs)
     jobs = jobs or cores()
     if kind == "inline":
         return Inline()

@@ -19,7 +19,7 @@ from pipeline.driver import Result
 from pipeline.environment import cores
 from pipeline.memory import words
 from pipeline.progress import recall_seconds
-from pipeline.run import Options, choose_frames, known_stages, settings, warn
+from pipeline.run import Options, check_options, choose_frames, settings, warn
 from pipeline.store import at
 from stages.errors import ConfigError
 
@@ -35,7 +35,7 @@ BEHIND = "input "
 
 def plan(options: Options, *, verbose: bool = False) -> int:
     """Print what ``reconstruct`` with the same options would do; gives the exit code."""
-    known_stages(options.force)
+    check_options(options)
     settled = settings(options)
     sequence, config = settled.sequence, settled.config
     unread.refuse_unreadable(settled.given, config, sequence)

@@ -232,10 +232,8 @@ def _open(options: Options) -> _Opened:
     """Read the input and lay the run out."""
     from pipeline import unread
     from pipeline.drive import dataflow
-    from pipeline.executor import known
 
-    known_stages(options.force)
-    known(options.executor)
+    check_options(options)
     started = datetime.now(UTC)
     settled = settings(options)
     sequence, config = settled.sequence, settled.config
@@ -355,7 +353,18 @@ def _all_read(opened: _Opened, arrived: int) -> int:
     return HOLES if lost or idle else COMPLETE
 
 
-def known_stages(names: frozenset[str]) -> None:
+def check_options(options: Options) -> None:
+    """Refuse a stage, an executor or an amount that cannot be, before anything is read or written."""
+    from pipeline import memory
+    from pipeline.executor import known
+
+    _known_stages(options.force)
+    known(options.executor, options.jobs)
+    if options.memory_limit is not None:
+        memory.parse(options.memory_limit)
+
+
+def _known_stages(names: frozenset[str]) -> None:
     """Refuse a stage to be forced that there is not."""
     if not names:
         return

@@ -1,0 +1,294 @@
+"""Every command does what it says, twice the same, with two sequences in one cache."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+from place import MOCKUP, OTHER, SEQUENCE, Place, sets
+
+RUN_ID = r"\d{8}T\d{6}Z-[0-9a-f]{8}"
+RECONSTRUCTED = {"report.html", "report.json", "config.toml", "ledger.jsonl", "trajectory.tum", "trajectory.kitti"}
+RECONSTRUCTED |= {"dem.tif", "dem_sigma.tif", "hillshade.tif", "ortho.tif", "risk.tif", "path.geojson", "terrain.zarr"}
+SAME_IN_EACH_RUN = ("trajectory.tum", "trajectory.kitti", "dem.tif", "dem_sigma.tif", "ortho.tif", "risk.tif")
+
+
+def test_the_version_and_the_commands(place: Place) -> None:
+    version = place.rille("--version")
+    assert (version.status, version.err) == (0, "")
+    assert re.fullmatch(r"\d+\.\d+\.\d+", version.last)
+    bare = place.rille()
+    assert (bare.status, bare.err) == (0, "")
+    assert bare.lines[0] == "Usage: rille COMMAND"
+
+
+@pytest.mark.parametrize(("name", "frames"), [("mockup", 3), ("other", 2)])
+def test_reconstruct(place: Place, name: str, frames: int) -> None:
+    sequence = {"mockup": "mockup-short"}.get(name, name)
+    first, second = place.said[name], place.said[f"{name} again"]
+    assert (first.status, second.status) == (0, 0), first.err + second.err
+    made = re.fullmatch(rf"(runs/{sequence}/{RUN_ID})  computed (\d+), cached (\d+), missing 0", first.last)
+    assert made, first.last
+    folder, total = place.folder / made[1], int(made[2]) + int(made[3])
+    assert second.last == f"{made[1]}  cached {total}, nothing new: that run stands"
+    assert (folder.parent / "latest").resolve() == place.runs(sequence)[-1]
+    assert {p.name for p in folder.iterdir()} >= RECONSTRUCTED
+    poses = [line for line in (folder / "trajectory.tum").read_text().splitlines() if not line.startswith("#")]
+    assert len(poses) == frames
+    assert json.loads((folder / "report.json").read_text())
+
+
+def test_reconstruct_says_how_it_goes(place: Place) -> None:
+    plain = place.said["mockup"].err.splitlines()
+    assert re.fullmatch(r"rille: \d+ computed, 0 cached in [\d.]+ s", plain[-1])
+    assert all(line.startswith("rille: ") for line in plain)
+    events = [json.loads(line) for line in place.said["other"].err.splitlines() if line.startswith("{")]
+    assert {"computed"} <= {event["event"] for event in events}
+
+
+def test_reconstruct_anew_gives_the_same_files(place: Place) -> None:
+    fresh = place.said["mockup fresh"]
+    assert (fresh.status, fresh.err) == (0, "")
+    first, second = place.runs("mockup-short")
+    assert fresh.last.startswith(f"runs/mockup-short/{second.name}  computed 0, cached ")
+    for name in SAME_IN_EACH_RUN:
+        assert (first / name).read_bytes() == (second / name).read_bytes(), name
+
+
+def test_drive(place: Place) -> None:
+    first, second = place.said["drive"], place.said["drive again"]
+    assert (first.status, second.status) == (0, 0), first.err + second.err
+    assert re.fullmatch(r"goal: \d+ mm from the goal  \(\d+ stops?\)", first.lines[-2])
+    assert first.lines[-2] == second.lines[-2]
+    assert re.fullmatch(rf"runs/mockup-loop/{RUN_ID}  computed \d+, cached 0, missing 0", first.last)
+    assert re.fullmatch(rf"runs/mockup-loop/{RUN_ID}  cached \d+, nothing new: that run stands", second.last)
+    (folder,) = place.runs("mockup-loop")
+    assert {p.name for p in folder.iterdir()} >= {"report.html", "report.json", "config.toml", "ledger.jsonl"}
+
+
+@pytest.mark.parametrize("words", [MOCKUP, OTHER], ids=lambda words: words[0])
+def test_plan_of_what_is_there_finds_nothing_to_do(place: Place, words: list[str]) -> None:
+    first, second = place.rille("plan", *words), place.rille("plan", *words)
+    assert (first.status, first.err) == (0, "")
+    assert re.fullmatch(r"(\d+) tasks known: \1 cached, 0 to do", first.last)
+    assert first == second
+
+
+@pytest.mark.parametrize(
+    ("words", "cached"),
+    [
+        (["mockup-short", *sets((*SEQUENCE[:-1], "mockup.frames=2")), "--config", "settings.toml"], False),
+        ([*MOCKUP, "--frames", "1:3"], True),
+        ([*OTHER, "--frames", "0:1"], True),
+        ([*OTHER, "--set", "locus.cell_size=0.02"], True),
+    ],
+    ids=["a shorter sequence", "later frames", "one frame", "another parameter"],
+)
+def test_plan_of_something_else_in_the_same_cache(place: Place, words: list[str], cached: bool) -> None:
+    first, second = place.rille("plan", *words), place.rille("plan", *words, "--verbose")
+    assert (first.status, first.err) == (0, "")
+    assert (second.status, second.err) == (0, "")
+    assert re.search(r"^memory at most \d", first.last)
+    known, again = (re.search(r"^(\d+) tasks known: (\d+) cached, (\d+) to do", d.out, re.M) for d in (first, second))
+    assert known is not None
+    assert again is not None
+    assert known[0] == again[0]
+    assert int(known[1]) == int(known[2]) + int(known[3])
+    assert (int(known[2]) > 0) >= cached
+    assert int(known[3]) > 0
+
+
+@pytest.mark.parametrize("sequence", ["mockup-short", "other"])
+@pytest.mark.parametrize("task", ["trajectory", "hfvm/0"])
+def test_why_tells_of_its_own_sequence(place: Place, sequence: str, task: str) -> None:
+    first, second = place.rille("why", sequence, task), place.rille("why", sequence, task)
+    assert (first.status, first.err) == (0, "")
+    stage = task.partition("/")[0]
+    run = place.runs(sequence)[-1].name
+    assert re.fullmatch(rf"{task}: stage {stage}, (computed|cached) in run {sequence}/{run}", first.lines[0])
+    others = {"mockup-short", "other", "mockup-loop"} - {sequence}
+    assert not [line for line in first.lines if line.startswith("since") and any(f"{o}/" in line for o in others)]
+    assert first == second
+
+
+def test_timing(place: Place) -> None:
+    for run in ("mockup-loop", "other"):
+        first, second = place.rille("timing", run), place.rille("timing", run)
+        assert (first.status, first.err) == (0, "")
+        assert first.lines[0].startswith(f"run {run}/{place.runs(run)[-1].name}: ")
+        assert first.last.startswith("least possible ")
+        assert first == second
+    assert place.rille("timing").lines[0].startswith("run mockup-loop/")
+
+
+def test_check(place: Place) -> None:
+    first, second = place.said["check"], place.said["check again"]
+    assert (first.status, first.err) == (0, "")
+    assert re.fullmatch(r"other: 0 fail, \d+ to look at, \d+ fine", first.last)
+    assert {line.split()[0] for line in first.lines[:-2]} <= {"OK", "LOOK", "WARN"}
+    assert first.lines[-2].split() == ["picture", "other-check.png"]
+    assert (place.folder / "other-check.png").read_bytes().startswith(b"\x89PNG")
+    assert first == second
+
+
+def test_check_fails_where_an_image_is_truncated(place: Place, tmp_path: Path) -> None:
+    shutil.copytree(place.folder / "other", tmp_path / "torn")
+    image = tmp_path / "torn/right/000001.png"
+    image.write_bytes(image.read_bytes()[:1000])
+    done = place.rille("check", "torn", folder=tmp_path)
+    assert done.status == 1
+    assert re.fullmatch(r"torn: [1-9] fail, \d+ to look at, \d+ fine", done.last)
+    assert "000001.png is truncated" in next(line for line in done.lines if line.startswith("FAIL"))
+
+
+def test_init_writes_a_manifest_and_replaces_none(place: Place, tmp_path: Path) -> None:
+    shutil.copytree(place.folder / "other", tmp_path / "rover")
+    assert place.rille("init", "rover", folder=tmp_path).status == 0
+    assert not list(tmp_path.glob("*.toml")), "it opens as it is"
+    written = place.rille("init", "rover", "--force", folder=tmp_path)
+    assert (written.status, written.err) == (0, "")
+    manifest = tmp_path / "rover.rille.toml"
+    before = manifest.read_bytes()
+    refused = place.rille("init", "rover", "--output", manifest, folder=tmp_path)
+    assert refused.status == 2
+    assert refused.complaint.startswith("rille: error RIL-038: ")
+    assert manifest.read_bytes() == before
+    assert place.rille("init", "rover", "--force", folder=tmp_path) == written
+    assert manifest.read_bytes() == before
+
+
+@pytest.mark.data
+def test_calibrate(place: Place, data_dir: Path, tmp_path: Path) -> None:
+    board = data_dir / "chessboard_opencv"
+    words = ["calibrate", board / "left0[1-5].jpg", board / "right0[1-5].jpg", "--square", "0.025", "--corners", "9x6"]
+    words += ["--model", "radtan4"]
+    first = place.rille(*words, folder=tmp_path)
+    assert first.status == 0, first.err
+    assert all(line.startswith("rille: warning: ") for line in first.err.splitlines())
+    assert first.last == 'file = "rig.yaml"'
+    rig = (tmp_path / "rig.yaml").read_bytes()
+    assert place.rille(*words, folder=tmp_path) == first
+    assert (tmp_path / "rig.yaml").read_bytes() == rig
+
+
+def test_calibrate_wants_a_board(place: Place, tmp_path: Path) -> None:
+    images = place.folder / "other"
+    done = place.rille("calibrate", images / "left", images / "right", "--square", "0.1", folder=tmp_path)
+    assert (done.status, done.out) == (2, "")
+    assert done.complaint.startswith("rille: error RIL-153: ")
+    assert not list(tmp_path.iterdir())
+
+
+def test_match(place: Place, tmp_path: Path) -> None:
+    images = place.folder / "other"
+    words = ["match", images / "left/000000.png", images / "right/000000.png", "--confidence", "confidence.tif"]
+    first = place.rille(*words, folder=tmp_path)
+    assert (first.status, first.err) == (0, "")
+    assert re.match(r"disparity\.tif  matched \d+\.\d %, ", first.lines[0])
+    files = {p.name: p.read_bytes() for p in tmp_path.iterdir()}
+    assert set(files) == {"disparity.tif", "confidence.tif"}
+    assert place.rille(*words, folder=tmp_path) == first
+    assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == files
+
+
+@pytest.mark.parametrize(("kind", "made"), [("laz", "cloud.laz"), ("glb", "terrain.glb")])
+def test_export(place: Place, kind: str, made: str, tmp_path: Path) -> None:
+    words = ["export", place.runs("other")[-1], "--to", kind, "--output", tmp_path / made]
+    first, files = place.rille(*words), contents(tmp_path)
+    assert (first.status, first.err) == (0, "")
+    assert first.last.startswith(f"{tmp_path / made}  ")
+    assert set(files) == {made}
+    assert place.rille(*words) == first
+    assert contents(tmp_path) == files
+
+
+def test_export_of_a_model_replaces_none(place: Place, tmp_path: Path) -> None:
+    words = ["export", place.runs("other")[-1], "--to", "colmap", "--output", tmp_path / "colmap"]
+    first, files = place.rille(*words), contents(tmp_path)
+    assert (first.status, first.err) == (0, "")
+    assert first.last.startswith(f"{tmp_path / 'colmap'}: 2 frames of 2 images, ")
+    assert len(files) > 3
+    again = place.rille(*words)
+    assert (again.status, again.out) == (2, "")
+    assert again.complaint.startswith("rille: error RIL-607: ")
+    assert contents(tmp_path) == files
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """All files below a folder."""
+    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+def test_compare_dem(place: Place, tmp_path: Path) -> None:
+    first_run, last_run = place.runs("mockup-short")
+    first = place.rille("compare-dem", first_run, last_run / "dem.tif", folder=tmp_path)
+    assert (first.status, first.err) == (0, "")
+    assert first.last == "dem_comparison.png  dem_comparison.json"
+    found = contents(tmp_path)
+    assert set(found) == {"dem_comparison.png", "dem_comparison.json"}
+    assert "RMSE 0 mm" in first.out
+    assert place.rille("compare-dem", first_run, last_run / "dem.tif", folder=tmp_path) == first
+    assert contents(tmp_path) == found
+
+
+def test_datasets(place: Place, tmp_path: Path) -> None:
+    listed = place.rille("datasets")
+    assert (listed.status, listed.err) == (0, "")
+    assert [line.split()[0] for line in listed.lines[:3]] == ["mockup", "mockup-short", "mockup-loop"]
+    exported = place.said["export"]
+    assert (exported.status, exported.out, exported.err) == (0, "other\n", "")
+    again = place.rille("datasets", "export", place.folder / "other", "copy", folder=tmp_path)
+    assert (again.status, again.last) == (0, "copy")
+    assert (tmp_path / "copy/left/000000.png").is_file()
+
+
+def test_cache_ls_names_each_sequence_and_its_run(place: Place) -> None:
+    done = place.rille("cache", "ls", "--json")
+    assert (done.status, done.err) == (0, "")
+    rows = {(row["sequence"], row["stage"]): row for row in json.loads(done.out)}
+    for sequence in ("mockup-short", "other", "mockup-loop"):
+        assert rows[sequence, "hfvm"]["last_run"] == f"{sequence}/{place.runs(sequence)[-1].name}"
+    total = sum(row["artifacts"] for row in rows.values())
+    assert re.fullmatch(rf"{total} artifacts, .* on disk", place.rille("cache", "ls").last)
+
+
+def test_cache_gc_removes_nothing_that_a_run_uses(place: Place) -> None:
+    before = {str(p) for p in (place.folder / ".rille/cache").rglob("*")}
+    for _ in range(2):
+        done = place.rille("cache", "gc", "--dry-run")
+        assert (done.status, done.err) == (0, "")
+        assert done.last.startswith("would remove 0 artifacts and 0 leftovers")
+    assert before <= {str(p) for p in (place.folder / ".rille/cache").rglob("*")}
+
+
+def test_cache_verify_names_what_is_damaged(place: Place, tmp_path: Path) -> None:
+    sound = place.rille("cache", "verify", "--deep")
+    assert (sound.status, sound.err) == (0, "")
+    assert re.fullmatch(r"\d+ artifacts are sound, 0 damaged", sound.last)
+    copy = tmp_path / "cache"
+    shutil.copytree(place.folder / ".rille/cache", copy)
+    (chunk, *_) = sorted(p for p in (copy / "artifacts" / "trajectory").rglob("c*") if p.is_file())
+    chunk.write_bytes(chunk.read_bytes()[:-1] + b"\0\0")
+    damaged = place.rille("cache", "verify", "--cache", copy)
+    assert damaged.status == 1
+    assert damaged.last.endswith(" 1 damaged")
+    assert re.match(r"rille: trajectory(/\d+)? \(trajectory\): ", damaged.complaint)
+    assert place.rille("cache", "verify", "--cache", copy).status == 0, "it was set aside"
+
+
+def test_cache_pin_and_unpin(place: Place, tmp_path: Path) -> None:
+    copy = tmp_path / "cache"
+    shutil.copytree(place.folder / ".rille/cache", copy)
+    run = f"other/{place.runs('other')[-1].name}"
+    for _ in range(2):
+        pinned = place.rille("cache", "pin", "other", "--cache", copy)
+        assert (pinned.status, pinned.err) == (0, "")
+        assert re.fullmatch(rf"pinned {run}: \d+ artifacts", pinned.last)
+    assert place.rille("cache", "ls", "--cache", copy).last == f"pinned: {run}"
+    assert place.rille("cache", "unpin", run, "--cache", copy).status == 0
+    again = place.rille("cache", "unpin", run, "--cache", copy)
+    assert again.status == 2
+    assert again.complaint.startswith("rille: error RIL-563: ")

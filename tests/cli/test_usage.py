@@ -1,0 +1,141 @@
+"""Wrong usage of each command: status 2, nothing written, the last line of stderr is one error with its code."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+from cyclopts import App
+from place import Place
+
+from pipeline.cli import app
+
+WRONG = {
+    "": [("no-such-command", "RIL-001"), ("--no-such-option", "RIL-001")],
+    "reconstruct": [
+        ("no-such-sequence", "RIL-276"),
+        ("--no-such-option", "RIL-001"),
+        ("other other", "RIL-001"),
+        ("other --frames 7:9", "RIL-057"),
+        ("other --frames a:b", "RIL-055"),
+        ("other --set locus.no_such_key=1", "RIL-027"),
+        ("other --set locus.cell_size=large", "RIL-027"),
+        ("other --set locus", "RIL-024"),
+        ("other --config no-such-file.toml", "RIL-138"),
+        ("other --config other/calib.txt", "RIL-026"),
+        ("other --executor cloud", "RIL-539"),
+        ("other --jobs 0", "RIL-540"),
+        ("other --jobs many", "RIL-001"),
+        ("other --force no-such-stage", "RIL-060"),
+        ("other --memory-limit lots", "RIL-553"),
+        ("other --progress loud", "RIL-001"),
+    ],
+    "drive": [
+        ("other", "RIL-059"),
+        ("mockup-loop --jobs 0", "RIL-540"),
+        ("no-such-sequence", "RIL-276"),
+        ("--no-such-option", "RIL-001"),
+    ],
+    "plan": [
+        ("no-such-sequence", "RIL-276"),
+        ("--no-such-option", "RIL-001"),
+        ("other --frames 7:9", "RIL-057"),
+        ("other --executor cloud", "RIL-001"),
+        ("other --jobs 0", "RIL-540"),
+        ("other --jobs -2", "RIL-540"),
+        ("other --force no-such-stage", "RIL-060"),
+        ("other --memory-limit lots", "RIL-553"),
+    ],
+    "why": [
+        ("", "RIL-001"),
+        ("other", "RIL-001"),
+        ("no-such-run trajectory", "RIL-067"),
+        ("other no-such-task", "RIL-068"),
+        ("other trajectory --no-such-option", "RIL-001"),
+    ],
+    "timing": [("no-such-run", "RIL-067"), ("--runs no-such-folder", "RIL-067"), ("other other", "RIL-001")],
+    "check": [
+        ("", "RIL-001"),
+        ("no-such-sequence", "RIL-276"),
+        ("other --frames 9:12", "RIL-057"),
+        ("other --no-such-option", "RIL-001"),
+    ],
+    "init": [
+        ("", "RIL-001"),
+        ("no-such-folder", "RIL-193"),
+        ("other/left", "RIL-194"),
+        ("other --no-such-option", "RIL-001"),
+    ],
+    "calibrate": [
+        ("other/left other/right", "RIL-001"),
+        ("no-such-folder other/right --square 0.1", "RIL-011"),
+        ("other/left other/right --square -1", "RIL-152"),
+        ("other/left other/right --square 0.1 --corners 9", "RIL-151"),
+        ("other/left other/right --square 0.1 --model bent", "RIL-001"),
+    ],
+    "match": [
+        ("other/left/000000.png", "RIL-001"),
+        ("other/left/000000.png no-such-file.png", "RIL-138"),
+        ("other/left/000000.png other/calib.txt", "RIL-171"),
+        ("other/left/000000.png other/right/000000.png --preset best", "RIL-001"),
+        ("other/left/000000.png other/right/000000.png --set locus.cell_size=1", "RIL-046"),
+    ],
+    "export": [
+        ("other", "RIL-001"),
+        ("other --to obj", "RIL-001"),
+        ("no-such-run --to laz", "RIL-600"),
+        ("other --to colmap", "RIL-608"),
+        ("runs/other/latest --to laz --to glb -o x", "RIL-020"),
+    ],
+    "compare-dem": [
+        ("runs/other/latest", "RIL-001"),
+        ("runs/other/latest no-such-file.tif", "RIL-627"),
+        ("other/calib.txt runs/other/latest", "RIL-629"),
+        ("runs/other/latest runs/other/latest --align shear", "RIL-001"),
+    ],
+    "datasets": [("no-such-dataset", "RIL-001"), ("--no-such-option", "RIL-001")],
+    "datasets export": [
+        ("mockup-short", "RIL-001"),
+        ("no-such-dataset x", "RIL-276"),
+        ("mockup-short other", "RIL-165"),
+    ],
+    "cache": [("no-such-command", "RIL-001")],
+    "cache ls": [("--no-such-option", "RIL-001")],
+    "cache verify": [("--no-such-option", "RIL-001")],
+    "cache gc": [("--no-such-option", "RIL-001")],
+    "cache pin": [("no-such-run", "RIL-067"), ("", "RIL-001")],
+    "cache unpin": [("no-such-run", "RIL-563"), ("", "RIL-001")],
+}
+
+
+def commands(at: App, name: str = "") -> set[str]:
+    """Names of an app's commands, those of its groups too."""
+    found = {name}
+    for word in at:
+        if not word.startswith("-"):
+            found |= commands(at[word], f"{name} {word}".strip())
+    return found
+
+
+def test_every_command_is_here() -> None:
+    assert set(WRONG) == commands(app)
+
+
+@pytest.mark.parametrize(
+    ("command", "words", "code"), [(name, *case) for name, cases in WRONG.items() for case in cases]
+)
+def test_wrong_usage_is_one_line_with_a_code(place: Place, command: str, words: str, code: str) -> None:
+    before = place.made()
+    done = place.rille(*command.split(), *words.split())
+    assert (done.status, done.out) == (2, "")
+    assert place.made() == before
+    *warnings, line = done.err.splitlines()
+    assert re.match(rf"rille: error {code}: \S", line), done.err
+    assert all(line.startswith("rille: warning: ") for line in warnings)
+
+
+@pytest.mark.parametrize("command", sorted(commands(app)))
+def test_help(place: Place, command: str) -> None:
+    done = place.rille(*command.split(), "--help")
+    assert (done.status, done.err) == (0, "")
+    assert done.lines[0].startswith(f"Usage: rille {command}".strip())
