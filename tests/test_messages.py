@@ -1,13 +1,84 @@
-"""Messages: errors carry their code, and the command line prints it."""
+"""Messages: errors carry their code, the command line prints it, and a page lists them.
+
+``python tests/test_messages.py`` writes the page anew.
+"""
 
 from __future__ import annotations
 
+import ast
 import pickle
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path
 
 import pytest
 
 from pipeline.cli import main
 from pipeline.store import GoneError
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGE = ROOT / "docs" / "messages.md"
+CODE = re.compile(r"RIL-\d{3}")
+HEAD = """# Messages
+
+Every error has a code that stays when its words change: `rille: error RIL-214: what, where: what to change`. Here an
+ellipsis stands for what the program fills in. 001-099 command line and configuration, 100-299 input, 300-499 stages,
+500-599 engine and store, 600-699 outputs, 700-899 what came later; RIL-999 is an error of the program itself.
+
+| code | message | what to change |
+|---|---|---|
+"""
+
+
+def constants(tree: ast.Module) -> dict[str, ast.expr]:
+    """Names that a module gives to one text."""
+    found: dict[str, list[ast.expr]] = {}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
+            found.setdefault(node.targets[0].id, []).append(node.value)
+    return {name: values[0] for name, values in found.items() if len(values) == 1}
+
+
+def words(node: ast.expr | None, names: Mapping[str, ast.expr]) -> str:
+    """Text of an expression; an ellipsis for what is filled in."""
+    if isinstance(node, ast.Name) and isinstance(names.get(node.id), ast.Constant | ast.JoinedStr):
+        return words(names[node.id], names)
+    if isinstance(node, ast.Constant):
+        return str(node.value)
+    if isinstance(node, ast.JoinedStr):
+        return "".join(words(part, names) for part in node.values)
+    if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Add):
+        return words(node.left, names) + words(node.right, names)
+    return "" if node is None else "…"
+
+
+def messages(tree: ast.Module) -> Iterator[tuple[str, str, str]]:
+    """Code, message and remedy of each call whose first argument is a code."""
+    names = constants(tree)
+    for call in ast.walk(tree):
+        if not isinstance(call, ast.Call) or len(call.args) < 2:
+            continue
+        code, *told = call.args
+        if not isinstance(code, ast.Constant) or not CODE.fullmatch(str(code.value)):
+            continue
+        remedy = next((k.value for k in call.keywords if k.arg == "remedy"), None)
+        if isinstance(call.func, ast.Attribute) and call.func.attr == "error":  # code, key, what, remedy
+            yield str(code.value), f"…: {words(told[0], names)} {words(told[1], names)}", words((*told, None)[2], names)
+        else:
+            yield str(code.value), words(told[0], names), words(remedy, names)
+
+
+def page() -> str:
+    """The page of all messages, in order of their codes."""
+    found = []
+    for path in sorted(p for name in ("pipeline", "stages", "datasets") for p in (ROOT / name).rglob("*.py")):
+        found += list(messages(ast.parse(path.read_text(encoding="utf-8"))))
+    rows = [" | ".join(" ".join(text.replace("|", "\\|").split()) for text in row) for row in sorted(found)]
+    return HEAD + "".join(f"| {row} |\n" for row in rows)
+
+
+def test_the_page_lists_every_message() -> None:
+    assert PAGE.read_text(encoding="utf-8") == page(), "write it anew: python tests/test_messages.py"
 
 
 def test_an_error_keeps_its_code_between_processes_and_with_a_place() -> None:
@@ -43,3 +114,7 @@ def test_an_error_of_the_program_itself_has_a_code(
         main(["datasets"])
     assert ended.value.code == 1
     assert capsys.readouterr().err.startswith("rille: error RIL-999: ZeroDivisionError: division by zero (run again")
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page(), encoding="utf-8")
