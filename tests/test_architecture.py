@@ -1,4 +1,4 @@
-"""The house: one-way imports, what stages keep their hands off, and a code for each message."""
+"""The house: one-way imports, what stages keep their hands off, codes for messages."""
 
 from __future__ import annotations
 
@@ -102,3 +102,21 @@ def test_the_checks_themselves_see_an_error_without_a_code() -> None:
     tree = ast.parse("class A(InputError): ...\ndef f(code):\n    raise A('RIL-12', 'x')\n    raise A(code, 'y')\n")
     classes = error_classes([*TREES.values(), tree])
     assert without_code(tree, classes) == [3]
+
+
+def matched_by_words(tree: ast.Module, classes: set[str]) -> list[int]:
+    """Lines where a test expects one of our errors by its words."""
+    found = []
+    for call in ast.walk(tree):
+        if isinstance(call, ast.Call) and ast.unparse(call.func) == "pytest.raises" and call.args:
+            expected = set(re.findall(r"\w+", ast.unparse(call.args[0])))
+            if expected & classes and not expected - classes and any(k.arg == "match" for k in call.keywords):
+                found.append(call.lineno)
+    return found
+
+
+def test_tests_expect_codes_not_words() -> None:
+    assert matched_by_words(ast.parse("with pytest.raises(InputError, match='x'): f()"), CLASSES) == [1]
+    tests = {path: ast.parse(path.read_text(encoding="utf-8")) for path in (ROOT / "tests").rglob("*.py")}
+    bad = [f"{p.relative_to(ROOT)}:{line}" for p, tree in tests.items() for line in matched_by_words(tree, CLASSES)]
+    assert not bad, f'use `with raises("RIL-123", "facts")` of tests/raising.py: {bad}'

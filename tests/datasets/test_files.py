@@ -51,8 +51,9 @@ def test_truncated_png_is_named(tmp_path, grey, kept):
     data = encoded(grey)
     path = tmp_path / "000007.png"
     path.write_bytes(data[: int(kept * len(data)) if isinstance(kept, float) else kept])
-    with pytest.raises(InputError, match=r"000007\.png") as caught:
+    with pytest.raises(InputError) as caught:
         files.read_grey(path)
+    assert "000007.png" in str(caught.value)
     assert caught.value.code in {"RIL-170", "RIL-171"}
     assert caught.value.remedy
     assert "\n" not in str(caught.value)

@@ -3,11 +3,11 @@ from __future__ import annotations
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from raising import raises
 
 from datasets.mockup.params import MockupParams
 from datasets.mockup.sequence import mockup
 from datasets.names import check_name, derived_name
-from stages.errors import InputError
 
 
 @pytest.mark.parametrize(
@@ -31,9 +31,8 @@ from stages.errors import InputError
     ],
 )
 def test_a_sequence_has_no_name_that_leaves_its_folder(name):
-    with pytest.raises(InputError, match="not permitted as the name of a sequence") as caught:
+    with raises("RIL-764") as caught:
         mockup(MockupParams(), name)
-    assert caught.value.code == "RIL-764"
     assert len(str(caught.value)) < 300
 
 

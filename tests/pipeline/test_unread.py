@@ -6,6 +6,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from raising import raises
 from toys.chain import build as toy
 
 from datasets.registry import open_sequence
@@ -13,7 +14,6 @@ from pipeline import config as configuration
 from pipeline import run, unread
 from pipeline.cli import main
 from pipeline.dag import Graph
-from stages.errors import ConfigError
 
 
 def settled(tmp_path: Path, sequence: str, *assignments: str, config: Path | None = None) -> run.Settings:
@@ -68,19 +68,17 @@ def test_what_no_such_run_can_read_is_refused_before_anything_is_computed(tmp_pa
 @pytest.mark.parametrize("assignment", ["mockup.forward=0.1", "mockup.frames=3"])
 def test_a_drive_refuses_how_a_recorded_rig_moves(assignment):
     given = configuration.parse_assignments([assignment])
-    with pytest.raises(ConfigError, match=assignment.partition("=")[0]) as error:
+    with raises("RIL-734", assignment.partition("=")[0]):
         open_sequence("mockup-loop", given)
-    assert error.value.code == "RIL-734"
-    with pytest.raises(ConfigError, match="misalign"):
+    with raises("RIL-281", "misalign"):
         open_sequence("mockup-loop", {"misalign": {"rows": 3.0}})
 
 
 def test_check_refuses_what_it_does_not_read(tmp_path):
     config = configuration.build({})
     unread.refuse_unchecked(["hfvm.preset", "motion.level"], config)
-    with pytest.raises(ConfigError, match=r"locus\.both") as error:
+    with raises("RIL-731", "locus.both"):
         unread.refuse_unchecked(["hfvm.preset", "locus.both"], config)
-    assert error.value.code == "RIL-731"
 
 
 def test_sections_without_a_task_in_the_graph_are_told():
