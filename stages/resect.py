@@ -243,6 +243,10 @@ def _remove_inconsistent(
         _enough(int(active.sum()), where, "agree with one pose", "raise resect.threshold or choose basic pairs closer")
         poses, done = levenberg_marquardt(obs, poses, active[None], params.iterations, tolerance=1e-6)
         steps += done
+        usable = _first_order(obs, poses, params)
+        if (active & ~usable).any():
+            active = active & usable
+            continue
         norm = np.where(active, norms(obs, poses)[0], -1.0)
         beyond = int((norm > bound).sum())
         if beyond == 0:
@@ -250,6 +254,16 @@ def _remove_inconsistent(
             return poses, active, steps + done
         active = active.copy()
         active[np.argsort(-norm, kind="stable")[: math.ceil(beyond / AT_ONCE)]] = False
+
+
+def _first_order(obs: Observations, poses: Poses, params: ResectParams) -> Bools:
+    """Which landmarks (n,) are so far before the camera that first-order errors hold.
+
+    A camera that has come close to a landmark, or passed it, sees its error along the old ray at any size: such a
+    landmark agrees with everything, thousands of pixels off.
+    """
+    depth = (obs.landmarks[0] @ poses.R[0].T + poses.t[0])[:, 2]
+    return np.asarray(obs.sigma[0] * np.sqrt((obs.per_pixel[0] ** 2).sum(1)) <= params.max_depth_ratio * depth)
 
 
 def _result(obs: Observations, poses: Poses, active: Bools, steps: int, params: ResectParams, where: str) -> Resection:

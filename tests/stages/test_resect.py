@@ -453,3 +453,16 @@ def test_a_pose_by_chance_is_refused_and_a_right_one_is_not(right, n, seed):
     with pytest.raises(DegenerateError) as caught:
         solve(landmarks, pixels, params=params, seed=seed)
     assert caught.value.code in ("RIL-720", "RIL-421")  # as many as by chance, or fewer than a pose needs
+
+
+def test_a_landmark_that_the_camera_has_nearly_reached_agrees_with_nothing():
+    """Its error along the old ray is of any size in the new image: it would agree thousands of pixels off."""
+    rng = np.random.default_rng(4)
+    landmarks, pose = scene(rng), RigidTransform(np.eye(3), np.array([0.0, 0.0, 3.5]))
+    landmarks[0] = [0.3, 0.2, 3.502]  # 2 mm before the camera's plane
+    pixels = seen(pose, landmarks)
+    pixels[0] = seen(pose, 1.02 * landmarks[:1])[0]  # as its disparity's error of a sigma has it
+    found = solve(landmarks, pixels, per_pixel=0.1 * landmarks, sigma=0.2)
+    assert not found.inlier[0]
+    assert found.residual[found.inlier].max() < 1e-3
+    np.testing.assert_allclose(found.T_local_left.translation, pose.translation, atol=1e-6)
