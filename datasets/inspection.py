@@ -17,6 +17,7 @@ import numpy as np
 
 from datasets.cameras import CalibratedCamera, read_cameras
 from datasets.pairing import SIDES, SUFFIXES, common_size, natural, pair_up, side_of
+from datasets.poses import read_positions
 from datasets.reading import Search, is_file, read_lines
 from stages.errors import InputError, RilleError
 
@@ -267,7 +268,18 @@ def table_kind(path: Path, pairs: int) -> str:
         return "imu"
     if "yaw" in header and "roll" in header:
         return "attitude"
+    if _are_positions(path, pairs):
+        return "positions"
     return _kind_of_row(np.array(numbers), len(rows), pairs, "times" if "time" in path.stem.lower() else "")
+
+
+def _are_positions(path: Path, pairs: int) -> bool:
+    """Whether named columns are positions without rotation, and with times, or one a pair."""
+    try:
+        found = read_positions(path, "csv", {})
+    except InputError:
+        return False
+    return found is not None and (found.times is not None or len(found.positions) == pairs)
 
 
 def _kind_of_row(row: np.ndarray, rows: int, pairs: int, named: str) -> str:

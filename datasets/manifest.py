@@ -61,6 +61,7 @@ def open_manifest(path: Path, digests: files.Digests) -> Sequence:
         lenses=optics.lenses,
         times=motion.times,
         truth=motion.truth,
+        truth_positions=motion.truth_positions,
         truth_source=motion.truth_source,
         up=up,
         attitude=motion.attitude,

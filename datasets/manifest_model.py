@@ -145,7 +145,7 @@ class Times(Params):
 
 
 class PoseFile(Params):
-    """``[truth]`` and ``[odometry]``: poses of the left camera or of a body that carries it."""
+    """``[odometry]``, and the base of ``[truth]``: poses of the left camera or of a body that carries it."""
 
     file: str = Field(description="poses, one a pair, or with times")
     format: PoseFormat = Field(default="auto", description="kitti 3 x 4, tum, euroc or csv")
@@ -158,6 +158,16 @@ class PoseFile(Params):
         default=0.0, description="s; added to the file's times so that they are those of the images"
     )
     source: str = Field(default="", description="words: where the poses come from")
+
+
+class Truth(PoseFile):
+    """``[truth]``: poses, or positions alone, which are compared after a rigid fit in the plane."""
+
+    columns: dict[Literal["time", "x", "y", "z"], str | int] = Field(
+        default={},
+        description='names or numbers (from 1) of the columns of positions alone, e.g. { time = "gps s", x = "E", y = '
+        '"N" }; x and y span the ground, y left of x seen from above, z is up; names that are clear need none',
+    )
 
 
 class Attitude(Params):
@@ -226,7 +236,7 @@ class Manifest(Params):
     cameras: Cameras = Cameras()
     rig: RigSection = RigSection()
     times: Times | None = None
-    truth: PoseFile | None = None
+    truth: Truth | None = None
     odometry: PoseFile | None = None
     attitude: Attitude | None = None
     imu: Imu | None = None

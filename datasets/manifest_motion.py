@@ -11,11 +11,11 @@ from typing import cast
 import numpy as np
 
 from datasets.imu import at_frames, read_imu
-from datasets.manifest_model import Attitude, Imu, Manifest, PoseFile, Times
+from datasets.manifest_model import Attitude, Imu, Manifest, PoseFile, Times, Truth
 from datasets.manifest_rig import direction
 from datasets.pairing import Pair, ends
-from datasets.poses import coverage, interpolate, read_poses
-from datasets.protocol import Rows
+from datasets.poses import coverage, interpolate, read_poses, read_positions
+from datasets.protocol import Positions, Rows
 from datasets.reading import read_lines
 from datasets.times import seconds
 from stages.errors import InputError
@@ -34,6 +34,7 @@ class Motion:
 
     times: Seconds | None
     truth: Poses | None = None
+    truth_positions: Positions | None = None
     truth_source: str = ""
     odometry: Poses | None = None
     attitude: tuple[Rows | None, ...] | None = None
@@ -53,8 +54,7 @@ def read_motion(manifest: Manifest, root: Path, name: str, pairs: Sequence[Pair]
     if manifest.times is not None:
         motion.times, motion.warnings = pair_times(manifest.times, root, name, pairs)
     if manifest.truth is not None:
-        motion.truth = _poses(manifest.truth, "truth", root, name, motion, len(pairs))
-        motion.truth_source = manifest.truth.source or f"poses of {manifest.truth.file}, as recorded"
+        _truth(manifest.truth, root, name, motion, len(pairs))
     if manifest.odometry is not None:
         motion.odometry = _poses(manifest.odometry, "odometry", root, name, motion, len(pairs))
     if manifest.attitude is not None and manifest.imu is not None:
@@ -147,6 +147,40 @@ def _poses(
         return poses
     T_body_left = RigidTransform.from_matrix(section.T_body_left)
     return tuple(None if pose is None else pose @ T_body_left for pose in poses)
+
+
+def _truth(section: Truth, root: Path, name: str, motion: Motion, count: int) -> None:
+    """Poses of each pair, or positions alone with their own times."""
+    alone = read_positions(root / section.file, section.format, {str(k): v for k, v in section.columns.items()})
+    motion.truth_source = section.source or f"{'positions' if alone else 'poses'} of {section.file}, as recorded"
+    if alone is None:
+        motion.truth = _poses(section, "truth", root, name, motion, count)
+        return
+    if section.T_body_left is not None:
+        raise InputError(
+            "RIL-802",
+            f"{name}: truth.T_body_left: the positions of {alone.name} have no rotations by which to move them",
+            remedy="remove T_body_left, or give poses",
+        )
+    times = None if alone.times is None else tuple(t + section.time_offset for t in alone.times)
+    if motion.times is None or times is None:
+        if len(alone.positions) != count:
+            raise InputError(
+                "RIL-803",
+                f"{name}: truth.file: {alone.name} has {len(alone.positions)} positions for {count} pairs, and "
+                f"{'the pairs have' if motion.times is None else 'it has'} no times to match them by",
+                remedy="give one a pair, or times of both ([times] of the pairs)",
+            )
+        times = None
+    elif len(times) > 1 and float(np.median(np.diff(times))) > section.max_gap:
+        raise InputError(
+            "RIL-804",
+            f"{name}: truth.max_gap = {section.max_gap:g} s, but the positions of {alone.name} are "
+            f"{float(np.median(np.diff(times))):.4g} s apart: nothing would be compared",
+            remedy="raise truth.max_gap, if straight lines between them are exact enough",
+        )
+    motion.truth_positions = Positions(alone.positions, times, section.max_gap)
+    motion.warnings += alone.warnings
 
 
 def _attitude(section: Attitude, root: Path, name: str, motion: Motion, count: int) -> None:

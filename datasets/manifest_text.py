@@ -138,11 +138,19 @@ def _world() -> str:
 
 
 def _poses(found: Findings) -> str:
-    files = found.tables.get("truth", [])
+    files, alone = found.tables.get("truth", []), found.tables.get("positions", [])
+    if not files and alone:
+        others = f"# Other tables of positions: {', '.join(alone[1:])}\n" if alone[1:] else ""
+        return (
+            "[truth]\n# Positions alone, only to judge the result: compared after a rigid fit in the plane, with a "
+            f"constant offset in time found.\n{others}{_pairs(file=alone[0])}"
+            '# columns = { time = "NAME", x = "NAME", y = "NAME" }  # where names are not clear; x, y: the ground\n'
+            '# source = "where they come from, in words"\n'
+        )
     if not files:
         return (
             "# [truth]  # optional: true poses, only to judge the result\n"
-            '# file = "poses.txt"  # KITTI 3 x 4, TUM, EuRoC\n'
+            '# file = "poses.txt"  # KITTI 3 x 4, TUM, EuRoC; or a table time,x,y\n'
             "# T_body_left = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]  # where they are poses of another body\n"
         )
     others = f"# Other tables of poses: {', '.join(files[1:])}\n" if files[1:] else ""

@@ -8,6 +8,8 @@ Forms of a file, one pose T_reference_body a row:
 * ``csv``: columns by name in any order: a time (``t``, ``time``, ``timestamp``), quaternion ``qw qx qy qz`` or angles
   ``roll pitch yaw`` with their unit (``roll_deg``, ``yaw [rad]``), and perhaps a position ``x y z`` (``px``, ``tx``).
 
+Truth may be positions alone (:func:`read_positions`): columns x, y and perhaps time and z, by name or as told.
+
 Angles are those of vehicles: R_reference_body = Rz(yaw) Ry(pitch) Rx(roll). Rows without position stand at 0.
 """
 
@@ -47,7 +49,14 @@ WORDS = (
     (re.compile(r"(?:q|quat|quaternion|orientation|rot|q_rs)[_. ]?([wxyz])"), lambda m: "q" + m[1]),
     (re.compile(r"(?:p|t|pos|position|trans|translation|p_rs_r|p_rs)?[_. ]?([xyz])"), lambda m: m[1]),
     (re.compile(r"(roll|pitch|yaw)"), lambda m: m[1]),
+    (re.compile(r"(?:utm[_. ]?)?(?:e|east|easting)"), lambda m: "x"),
+    (re.compile(r"(?:utm[_. ]?)?(?:n|north|northing)"), lambda m: "y"),
+    (re.compile(r"up|height|alt|altitude|elevation"), lambda m: "z"),
 )
+
+
+TIME_UNIT = re.compile(r"[\[(_ ](s|ms|us|ns)[\])]?$")
+"""At the end of the name of a column of times."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +105,7 @@ def read_poses(path: Path, format: str = "auto", *, unit: str = "auto") -> Timed
             "RIL-801",
             f"{table.name}: its columns {', '.join(table.header)} are positions without a whole rotation "
             f"({', '.join(lacking)} missing), no poses",
-            remedy="add qw, qx, qy, qz or roll_deg, pitch_deg, yaw_deg; positions alone are not compared",
+            remedy="add qw, qx, qy, qz or roll_deg, pitch_deg, yaw_deg; positions alone serve as [truth] only",
         )
     columns = _columns(table, format)
     angles = None if "qw" in columns else _angle_unit(table, columns)
@@ -113,6 +122,67 @@ def read_poses(path: Path, format: str = "auto", *, unit: str = "auto") -> Timed
     positions = table.numbers([columns[a] for a in POSITION]) if with_position else np.zeros((len(table.rows), 3))
     poses = tuple(RigidTransform(R, t) for R, t in zip(rotations, positions, strict=True))
     return TimedPoses(at, poses, table.name, warnings)
+
+
+@dataclass(frozen=True)
+class TimedPositions:
+    """Positions of a file, x, y or x, y, z, m, one a row, and their times, s; see :class:`TimedPoses`."""
+
+    times: tuple[float, ...] | None
+    positions: tuple[tuple[float, ...], ...]
+    name: str
+    warnings: tuple[str, ...] = ()
+
+
+def read_positions(path: Path, format: str, columns: Mapping[str, str | int]) -> TimedPositions | None:
+    """Positions of a table without rotations; None where the file holds poses.
+
+    Parameters
+    ----------
+    columns : name or number (from 1) of ``time``, ``x``, ``y``, ``z``, where the table's names do not say it; with any
+        of them the table is one of positions.
+
+    Raises
+    ------
+    InputError
+        A column that is told is not there, x or y is not known, or a cell is no number.
+    """
+    if format not in ("auto", "csv"):
+        return None
+    table = read_table(path, "file of true positions" if columns else "pose file")
+    meant = _meanings(table) | {meaning: _column(table, column) for meaning, column in columns.items()}
+    known = {meaning for meaning in ("x", "y") if meaning in meant}
+    if not columns and (_complete(meant) or (len(known) < 2 and table.columns >= len(ORDERED["tum"]))):
+        return None
+    if known != {"x", "y"}:
+        names = ", ".join(table.header) or f"{table.columns} without names"
+        raise InputError(
+            "RIL-805",
+            f"{table.name}: its columns ({names}) do not say which are x and y in metres",
+            remedy='name them in the manifest: [truth] columns = { time = "NAME", x = "NAME", y = "NAME" }, or numbers',
+        )
+    at: tuple[float, ...] | None = None
+    warnings: tuple[str, ...] = ()
+    if "time" in meant:
+        column = meant["time"]
+        said = TIME_UNIT.search(table.header[column]) if table.header else None
+        unit = said[1] if said else "auto"
+        at, warnings = seconds(table.text(column), table.name, unit=unit, lines=table.lines)
+    rows = table.numbers([meant[axis] for axis in POSITION if axis in meant])
+    return TimedPositions(at, tuple(tuple(float(v) for v in row) for row in rows), table.name, warnings)
+
+
+def _column(table: Table, told: str | int) -> int:
+    """Number from 0 of a column that the manifest names or numbers."""
+    if isinstance(told, str) and told.strip().lower() in table.header:
+        return table.header.index(told.strip().lower())
+    if isinstance(told, int) and 1 <= told <= table.columns:
+        return told - 1
+    raise InputError(
+        "RIL-806",
+        f"{table.name}: truth.columns: there is no column {told!r} of {', '.join(table.header) or table.columns}",
+        remedy="give a name of its first line, or a number from 1",
+    )
 
 
 def _named(table: Table) -> dict[str, int]:

@@ -53,6 +53,27 @@ class TruthDem(Protocol):
 
 
 @dataclass(frozen=True)
+class Positions:
+    """True positions without rotations, in a frame of their own: x and y in the plane, z up.
+
+    Attributes
+    ----------
+    positions : one row each, x, y or x, y, z, metres.
+    times : seconds, increasing, of a clock that may be off by a constant; None: one row a frame.
+    max_gap : seconds; between rows farther apart nothing is interpolated.
+    """
+
+    positions: tuple[tuple[float, ...], ...]
+    times: tuple[float, ...] | None = None
+    max_gap: float = 0.5
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON form."""
+        times = None if self.times is None else list(self.times)
+        return {"positions": [list(row) for row in self.positions], "times": times, "max_gap": self.max_gap}
+
+
+@dataclass(frozen=True)
 class Simulation:
     """A vehicle that can be driven: how its true poses, its sensors' readings and its images come about.
 
@@ -105,6 +126,7 @@ class Sequence:
     frame_names : one name a frame (file stem).
     times : seconds, one a frame.
     truth : T_truth_left of each frame, in any world frame, metres; None where the truth has a gap.
+    truth_positions : truth that is positions alone, where ``truth`` is None.
     truth_source : what the truth is, in words.
     up : direction of "up" in each left camera frame (attitude); None where it is not known.
     attitude : R_reference_left of each frame from a sensor (gyroscope, compass); the reference is any inertial frame,
@@ -133,6 +155,7 @@ class Sequence:
     lenses: Mapping[str, Lens] | None = None
     times: tuple[float, ...] | None = None
     truth: tuple[RigidTransform | None, ...] | None = None
+    truth_positions: Positions | None = None
     truth_source: str = ""
     up: tuple[tuple[float, float, float] | None, ...] | None = None
     attitude: tuple[Rows | None, ...] | None = None

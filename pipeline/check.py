@@ -131,7 +131,7 @@ class Inspection:
         yield from (Verdict("WARN", "input", line) for line in s.warnings)
         yield from verdicts.judge_rig(s.rig)
         yield from verdicts.judge_times(None if s.times is None else [s.times[k] for k in self.frames])
-        yield from verdicts.judge_truth(s.truth, self.frames)
+        yield from verdicts.judge_truth(s.truth, self.frames, s.truth_positions)
         yield from verdicts.judge_attitude(s.attitude, s.truth, self.frames)
         yield from verdicts.judge_up(s.up, self.frames)
         yield from self._images()

@@ -53,6 +53,7 @@ STAGE_MODULES: dict[str, str] = {
     "agreement": "stages.agreement",
     "truth": "stages.truth",
     "accuracy": "stages.accuracy",
+    "position_accuracy": "stages.position_accuracy",
     "dem_accuracy": "stages.dem_accuracy",
     "path_check": "stages.path_check",
     "pad": "stages.pad",

@@ -15,7 +15,7 @@
                     |                                           +-> seam (pair, earlier ones) -> seam_audit, exposure
                     |                                           +-> merge (world tile) -> risk, path (mission)
                     +-> crosscheck (window; images of both cameras) -> crosscheck_join -> agreement <- trajectory
-    leaves: accuracy (trajectory, crosscheck), dem_accuracy (local and merged DEM), path_check
+    leaves: accuracy (trajectory, crosscheck), position_accuracy, dem_accuracy (local and merged DEM), path_check
 
 Frames that show no motion (black, foreign, sides exchanged) are lost: ``continuity`` finds them by ``sight`` (what
 each pair looks like), the motions, and where it asks for them bridges (motions over a lost frame) and ``sides`` (left
@@ -41,7 +41,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from datasets.protocol import Sequence, Source
+from datasets.protocol import Positions, Sequence, Source
 from pipeline import tiling
 from pipeline.config import STAGE_MODULES
 from pipeline.dag import Graph, Handle
@@ -90,6 +90,7 @@ class Products:
     risk: Handle | None = None
     path: Handle | None = None
     accuracy: Handle | None = None
+    position_accuracy: Handle | None = None
     accuracy_pieces: dict[int, Handle] = field(default_factory=dict)
     local_dem_accuracy: dict[int, Handle] = field(default_factory=dict)
     dem_accuracy: Handle | None = None
@@ -420,6 +421,9 @@ class Reconstruction:
         assert p.trajectory is not None
         if p.crosscheck is not None:
             p.agreement = self._node("agreement", "agreement", {}, trajectory=p.trajectory, crosscheck=p.crosscheck)
+        if self.sequence.truth_positions is not None:
+            args = self._positions(self.sequence.truth_positions)
+            p.position_accuracy = self._node("position_accuracy", "position_accuracy", args, trajectory=p.trajectory)
         true = [self._truth(f) for f in self.frames]
         if all(pose is None for pose in true):
             return
@@ -435,6 +439,16 @@ class Reconstruction:
         self.graph.expand([p.trajectory], lambda found: self._accuracy_of_pieces(found, truth))
         if p.crosscheck is not None:
             self.graph.expand([p.crosscheck], lambda found: self._crosscheck_accuracy(found, truth))
+
+    def _positions(self, truth: Positions) -> dict[str, Any]:
+        """Arguments of the comparison with true positions: of the chosen frames, where rows are frames."""
+        s = self.sequence
+        args, moments = truth.to_dict(), None
+        if truth.times is None:
+            args["positions"] = [args["positions"][f] for f in self.frames]
+        elif s.times is not None:
+            moments = [s.times[f] for f in self.frames]
+        return args | {"moments": moments, "frames": list(self.frames), "source": s.truth_source}
 
     def _accuracy_of_pieces(self, found: Ref, truth: Handle) -> None:
         """Each unbroken piece against truth; a whole trajectory as it is."""

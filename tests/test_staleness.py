@@ -21,7 +21,7 @@ import pytest
 
 from datasets.misalign import MisalignParams
 from datasets.mockup.params import SHORT, MockupParams
-from datasets.protocol import Sequence
+from datasets.protocol import Positions, Sequence
 from datasets.registry import open_sequence
 from pipeline import code, driver, explain, task, unread
 from pipeline import config as configuration
@@ -378,6 +378,14 @@ def test_another_truth_changes_what_judges_and_no_estimate(chain: Chain) -> None
     without = with_sequence(chain, replace(chain.sequence, truth=None, truth_dem=None, truth_disparity=None))
     assert {h.status for h in without.nodes} == {"cached"}
     assert {group(h.label) for h in without.nodes} == chain.groups - JUDGES - TRUE
+
+
+def test_true_positions_are_read_by_one_leaf(chain: Chain) -> None:
+    none = replace(chain.sequence, truth=None, truth_dem=None, truth_disparity=None)
+    places = Positions(tuple((1.0 * k, 2.0) for k in range(none.frames)))
+    graph = with_sequence(chain, replace(none, truth_positions=places))
+    assert {group(h.label) for h in graph.nodes if h.status == "planned"} == {"position_accuracy"}
+    assert not [h.label for h in graph.nodes if "position_accuracy" in behind(h)]
 
 
 def test_no_estimate_is_told_a_true_pose(chain: Chain) -> None:

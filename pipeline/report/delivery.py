@@ -46,8 +46,12 @@ def account(scene: Scene, frames: Rows, pairs: Rows, gallery: Gallery) -> Delive
 
 
 def has_truth(view: RunView) -> list[bool]:
-    """Whether each chosen frame has a true pose."""
+    """Whether each chosen frame has a true pose, or a true position where truth is positions alone."""
     truth = view.sequence.truth
+    alone = view.bundle(view.products.position_accuracy)
+    if truth is None and alone is not None:
+        there = np.isfinite(np.asarray(alone["position_truth"])[:, :2]).all(axis=1)
+        return [bool(known) for known in there]
     return [truth is not None and truth[frame] is not None for frame in view.frames]
 
 
@@ -143,7 +147,8 @@ def _truth(view: RunView) -> Items:
     if any(known):
         gaps = [frame for frame, there in zip(view.frames, known, strict=True) if not there]
         return [_item("no truth", f"{len(gaps)} of {len(known)} frames have no truth", which(gaps))]
-    owner = "the sequence has none" if view.sequence.truth is None else "it has none for the chosen frames"
+    none = view.sequence.truth is None and view.sequence.truth_positions is None
+    owner = "the sequence has none" if none else "it has none for the chosen frames"
     return [_item("no truth", "No truth", f"{owner}, so accuracy is not assessed")]
 
 

@@ -249,6 +249,8 @@ def _trajectory(scene: Scene) -> Block | None:
         + (f"; {gaps} of {len(track.truth)} frames have none." if gaps else ".")
         if track.truth is not None
         else " No truth."
+        if scene.view.sequence.truth_positions is None
+        else " Truth is positions alone: compared in the table, not drawn."
     )
     caption = (
         f"First: positions of the left camera in {n} frames, and of the right camera at the basic pairs, seen from "

@@ -20,6 +20,13 @@ LABELS: Mapping[str, str] = {
     "drift": "Drift at the end",
     "final_error": "Position error at the end",
     "final_rotation_error": "Rotation error at the end",
+    "position_rmse": "Position error, RMS, positions only",
+    "position_median": "The same, median",
+    "position_max": "The same, largest",
+    "position_drift": "Drift, positions only, after the fit",
+    "time_offset": "Offset in time of the truth",
+    "time_offset_range": "The same, determined to",
+    "frames_judged": "Frames with pose and truth",
     "path_length": "True length of the drive",
     "ate_rmse": "Absolute trajectory error, best fit",
     "ate_first_frame_rmse": "Absolute trajectory error, first pose equal",
@@ -84,6 +91,11 @@ KEY = frozenset(
         "drive_shortest_way",
         "trajectory_drift",
         "trajectory_ate_rmse",
+        "trajectory_position_rmse",
+        "trajectory_position_median",
+        "trajectory_position_max",
+        "trajectory_position_drift",
+        "trajectory_time_offset",
         "trajectory_rpe_translation_rmse",
         "trajectory_rpe_rotation_rmse",
         "trajectory_kitti_translation",
@@ -153,7 +165,7 @@ def _trajectory(view: RunView, frames: Rows) -> dict[str, Metric]:
     if len(frames) < 2:
         return found
     for prefix, handle, group in (
-        ("trajectory_", view.products.accuracy, "Trajectory against truth"),
+        ("trajectory_", view.products.accuracy or view.products.position_accuracy, "Trajectory against truth"),
         ("crosscheck_", view.products.crosscheck_accuracy, "COLMAP against truth"),
     ):
         given = dict(_assessed(view, handle, prefix, group, view.sequence.truth_source))
@@ -166,9 +178,8 @@ def _trajectory(view: RunView, frames: Rows) -> dict[str, Metric]:
 
 def _with_truth(view: RunView) -> str:
     """How many of the frames have a truth, where some have none."""
-    truth = view.sequence.truth or ()
-    known = sum(truth[f] is not None for f in view.frames if f < len(truth))
-    return "" if not truth or known == len(view.frames) else f", truth for {known}"
+    known = delivery.has_truth(view)
+    return "" if not any(known) or all(known) else f", truth for {sum(known)}"
 
 
 def _posed(given: Mapping[str, Metric], prefix: str) -> str:

@@ -77,6 +77,6 @@ def render(scene: Scene, facts: Mapping[str, Any], drawn: Gallery, files: list[t
         together=together,
         others=tables.other_stages(scene.view),
         config_toml=scene.view.config_toml,
-        true_mean=facts["truth"]["used"],
+        true_mean=scene.view.sequence.truth is not None and facts["truth"]["used"],
         compared=scene.comparison is not None,
     )

@@ -63,6 +63,7 @@ def find_warnings(scene: Scene) -> list[str]:
         p.agreement,
         p.trajectory,
         p.accuracy,
+        p.position_accuracy,
         p.seam_audit,
     ):
         bundle = view.bundle(handle)

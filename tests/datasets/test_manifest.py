@@ -201,6 +201,55 @@ def test_time_offset_moves_the_poses(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("columns", "header", "times"),
+    [
+        ("", "time,x,y", (0.0, 0.5, 1.0)),
+        ("", "Northing [m];Easting [m];t_ms;Height", (0.0, 0.5, 1.0)),
+        ('columns = { time = "GPS week s", x = "to E", y = "to N" }', "sats,GPS week s,to N,to E", (0.0, 0.5, 1.0)),
+        ("columns = { time = 3, y = 1, x = 2 }", "", (0.0, 0.5, 1.0)),
+        ("", "x y z", None),
+    ],
+)
+def test_truth_of_positions_alone(tmp_path, columns, header, times):
+    path = write_sequence(tmp_path, f'[times]\nrate_hz = 1.0\n[truth]\nfile = "p.csv"\nmax_gap = 1.0\n{columns}\n')
+    rows = {
+        "time,x,y": ["0,5,7", "0.5,6,8", "1,7,9"],
+        "Northing [m];Easting [m];t_ms;Height": ["7;5;0;3", "8;6;500;3", "9;7;1000;3"],
+        "sats,GPS week s,to N,to E": ["9,0,7,5", "8,0.5,8,6", "9,1,9,7"],
+        "": ["7 5 0", "8 6 0.5", "9 7 1"],
+        "x y z": ["5 7 3", "6 8 3", "7 9 3"],
+    }[header]
+    write_lines(tmp_path / "p.csv", [*([header] if header else []), *rows])
+    s = opened(path)
+    found = s.truth_positions
+    assert s.truth is None
+    assert found is not None
+    assert found.times == times
+    assert [row[:2] for row in found.positions] == [(5, 7), (6, 8), (7, 9)]
+    assert {len(row) for row in found.positions} == {3 if "z" in header or "Height" in header else 2}
+    assert s.truth_source == "positions of p.csv, as recorded"
+
+
+@pytest.mark.parametrize(
+    ("more", "lines", "expected"),
+    [
+        ("", ["lat,lon,when", "50.1,8.2,0", "50.1,8.3,1"], ("RIL-805", "lat", "columns = ")),
+        ("", ["1 2 3", "2 3 4"], ("RIL-805", "3 without names")),
+        ('columns = { x = "E" }', ["time,x,y", "0,1,2"], ("RIL-806", "'E'", "time, x, y")),
+        ("", ["x,y", "1,2", "2,3"], ("RIL-803", "2 positions for 3 pairs")),
+        ("", ["time,x,y", "0,1,2", "1,2,3"], ("RIL-804", "0.5 s", "1 s apart")),
+        ("", ["time,x,y", "0,1,?", "1,2,3"], ("RIL-284", "line 2")),
+        ("T_body_left = [[0,0,1,2],[-1,0,0,0],[0,-1,0,0]]", ["time,x,y", "0,1,2", "0.1,2,3"], ("RIL-802",)),
+    ],
+)
+def test_bad_truth_of_positions_alone(tmp_path, more, lines, expected):
+    path = write_sequence(tmp_path, f'[times]\nrate_hz = 1.0\n[truth]\nfile = "p.csv"\n{more}\n')
+    write_lines(tmp_path / "p.csv", lines)
+    with raises(*expected):
+        opened(path)
+
+
+@pytest.mark.parametrize(
     ("text", "lines", "expected"),
     [
         ('[truth]\nfile = "p.txt"\n', ["1 0 0 0 0 1 0 0 0 0 1 0"], ("RIL-230",)),

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
+from datasets.protocol import Positions
 from pipeline import verdicts
 from stages.geometry import Camera, Rig, RigidTransform, rotation_exp
 from stages.sight import Look, look
@@ -51,6 +52,9 @@ def poses(count: int) -> list[RigidTransform]:
 
 def test_truth_coverage_and_length():
     assert "none" in verdicts.judge_truth(None, [0])[0].text
+    places = Positions(((0.0, 0.0), (3.0, 4.0)), (0.0, 1.0))
+    (alone,) = verdicts.judge_truth(None, range(4), places)
+    assert (alone.level, "positions only" in alone.text, "5 m" in alone.text) == ("OK", True, True)
     (full,) = verdicts.judge_truth(poses(4), range(4))
     assert (full.level, full.text) == ("OK", "4 of 4 frames, 6 m")
     (part,) = verdicts.judge_truth([*poses(3), None], range(4))
