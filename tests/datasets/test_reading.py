@@ -119,12 +119,17 @@ def test_an_image_is_never_unpacked_beyond_its_bounds(tmp_path, monkeypatch):
     refused("RIL-176", files.common_header, [tmp_path / "b.png", tmp_path / "a.png"])
 
 
-@pytest.mark.parametrize("kind", [".png", ".jpg", ".tif", ".bmp", ".pgm", ".ppm"])
-@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-@pytest.mark.parametrize("channels", [1, 3])
+PIXELS = [
+    (kind, dtype, channels)
+    for kind in (".png", ".jpg", ".tif", ".bmp", ".pgm", ".ppm")
+    for dtype in ((np.uint8,) if kind in (".jpg", ".bmp") else (np.uint8, np.uint16))
+    for channels in {".pgm": (1,), ".ppm": (3,)}.get(kind, (1, 3))
+]
+"""What each format of images can hold."""
+
+
+@pytest.mark.parametrize(("kind", "dtype", "channels"), PIXELS)
 def test_headers_say_what_the_decoder_gives(tmp_path, kind, dtype, channels):
-    if (dtype == np.uint16 and kind in (".jpg", ".bmp")) or (kind, channels) in ((".pgm", 3), (".ppm", 1)):
-        pytest.skip("no such file")
     path = tmp_path / f"a{kind}"
     cv2.imwrite(str(path), np.random.default_rng(3).integers(0, 255, (7, 13, channels)).astype(dtype))
     with path.open("rb") as file:
