@@ -47,8 +47,8 @@ def rendered(cache: Path, parameters: dict[str, Any], frame: int) -> tuple[Any, 
     """Left and right image, the exact column disparity, and both images' masks, of one mockup pair."""
     from datasets.mockup.params import MockupParams
     from datasets.mockup.sequence import mockup
-    from pipeline.store import Store
-    from pipeline.task import Spec, ensure
+    from pipeline.engine.store.folder import Store
+    from pipeline.engine.task import Spec, ensure
 
     store, sequence = Store(cache), mockup(MockupParams(**parameters))
 
@@ -133,7 +133,7 @@ def main() -> None:
     parser.add_argument("--preset", default="default")
     parser.add_argument("--fit", action="store_true")
     options = parser.parse_args()
-    from pipeline.environment import prepare_environment
+    from pipeline.engine.runtime.environment import prepare_environment
 
     prepare_environment()
     pairs = {name: rendered(options.cache, p, frame) for name, (p, frame, _) in PAIRS.items()} | photographs()

@@ -66,10 +66,11 @@ def spoil(good: Path, folder: Path, first: int, gap: int) -> int:
 def trajectory(folder: Path, frames: tuple[int, ...], cache: Path) -> Any:
     """The trajectory of some frames of a folder, without elevation models; None where there is none."""
     from datasets.registry import open_sequence
-    from pipeline import config, driver
-    from pipeline.dag import Graph
-    from pipeline.reconstruct import Reconstruction
-    from pipeline.store import at
+    from pipeline.engine import scheduler
+    from pipeline.engine.graph import Graph
+    from pipeline.engine.store.folder import at
+    from pipeline.flow import config
+    from pipeline.flow.reconstruction import Reconstruction
 
     class Odometry(Reconstruction):
         """A reconstruction that ends with its trajectory."""
@@ -88,7 +89,7 @@ def trajectory(folder: Path, frames: tuple[int, ...], cache: Path) -> Any:
     sequence = open_sequence(str(folder))
     flow = Odometry(graph, sequence, config.build({"crosscheck": {"enabled": False}}), frames)
     flow.build()
-    driver.run(graph, store, executor="inline")
+    scheduler.run(graph, store, executor="inline")
     handle = flow.products.trajectory
     return None if handle is None or handle.ref is None else store.open(handle.ref)
 
@@ -127,7 +128,7 @@ def words(row: dict[str, Any]) -> str:
 def main() -> int:
     import os
 
-    from pipeline.environment import prepare_environment
+    from pipeline.engine.runtime.environment import prepare_environment
 
     given = arguments()
     prepare_environment()

@@ -70,15 +70,17 @@ def make_pair(folder: Path, shape: tuple[int, int]) -> dict[str, Path]:
 
 def lay_out(graph: Any, paths: dict[str, Path], shape: tuple[int, int]) -> dict[str, Any]:
     """Nodes of both pyramids."""
-    from stages.declare import NoParams
-    from stages.pyramid import PyramidParams
+    from stages.core.declare import NoParams
+    from stages.imaging.pyramid import PyramidParams
 
     pyramids = {}
     for camera, path in paths.items():
         args = {"path": str(path), "sha256": hashlib.sha256(path.read_bytes()).hexdigest(), "frame": 0}
         args |= {"camera": camera, "width": shape[1], "height": shape[0], "depth": 8}
         image = graph.node("datasets.files", f"image/{camera}", NoParams(), args)
-        pyramids[camera] = graph.node("stages.pyramid", f"pyramid/{camera}", PyramidParams(), inputs={"image": image})
+        pyramids[camera] = graph.node(
+            "stages.imaging.pyramid", f"pyramid/{camera}", PyramidParams(), inputs={"image": image}
+        )
     return pyramids
 
 
@@ -96,7 +98,7 @@ def table(graph: Any, seconds: float) -> None:
 
 def judge(store: Any, ref: Any, shape: tuple[int, int]) -> None:
     """Errors against the displacements that the pair was made with."""
-    from stages.validity import matched
+    from stages.core.validity import matched
 
     bundle = store.open(ref)
     u, ok = bundle["column_disparity"], matched(bundle["validity"])
@@ -112,9 +114,9 @@ def judge(store: Any, ref: Any, shape: tuple[int, int]) -> None:
 
 
 def run(graph: Any, store: Any, jobs: int) -> float:
-    from pipeline import driver
+    from pipeline.engine import scheduler
 
-    result = driver.run(graph, store, executor="processes", jobs=jobs)
+    result = scheduler.run(graph, store, executor="processes", jobs=jobs)
     result.check()
     return float(result.seconds)
 
@@ -129,12 +131,12 @@ def main() -> None:
     parser.add_argument("--whole", action="store_true", help="match it untiled too, and compare")
     options = parser.parse_args()
 
-    from pipeline import tiling
-    from pipeline.dag import Graph
-    from pipeline.environment import prepare_environment
-    from pipeline.store import Store
+    from pipeline.engine.graph import Graph
+    from pipeline.engine.runtime.environment import prepare_environment
+    from pipeline.engine.store.folder import Store
+    from pipeline.flow import tiles
     from stages.hfvm import HfvmParams
-    from stages.pyramid import PyramidParams
+    from stages.imaging.pyramid import PyramidParams
 
     with tempfile.TemporaryDirectory(prefix="rille-large-") as folder:
         prepare_environment()
@@ -144,7 +146,7 @@ def main() -> None:
         graph = Graph()
         lay_out(graph, paths, shape)
         table(graph, run(graph, store, options.jobs))
-        side = tiling.side(tiling.Tiling(tile=options.tile, memory=options.memory), params, (shape, shape))
+        side = tiles.side(tiles.Tiling(tile=options.tile, memory=options.memory), params, (shape, shape))
         print(f"{shape[1]} x {shape[0]}, preset {options.preset}, tiles of {side}", flush=True)
         graph = Graph()
         pyramids = lay_out(graph, paths, shape)
@@ -152,7 +154,7 @@ def main() -> None:
         if side is not None:
             other = Graph()
             args = (params, PyramidParams(), lay_out(other, paths, shape), (shape, shape), side, "hfvm")
-            tiled = tiling.Tiles(other, *args).build()
+            tiled = tiles.Tiles(other, *args).build()
             table(other, run(other, store, options.jobs))
             judge(store, tiled.ref, shape)
         if whole is not None:

@@ -53,9 +53,9 @@ def one(rows: int, cols: int, cover: float, rounds: int) -> list[Any]:
     import numpy as np
 
     from datasets.mockup.sequence import vehicle_at_scale
-    from stages.lattice import Lattice
-    from stages.path import find_path
-    from stages.risk import risk_map
+    from stages.geometry.lattice import Lattice
+    from stages.hazard.risk import risk_map
+    from stages.planning.path import find_path
 
     z, s = terrain(rows, cols, cover)
     vehicle, lattice = vehicle_at_scale(), Lattice.at(-cols // 2, rows, CELL, rows, cols)

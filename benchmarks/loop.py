@@ -48,10 +48,10 @@ def drive(settings: list[str]) -> dict[str, Any]:
     from driving.exact_bed import ExactBed
     from driving.limits import shortest_within_limits
 
-    from pipeline import driver
-    from pipeline.dag import Graph
-    from pipeline.drive import Drive
-    from pipeline.store import at
+    from pipeline.engine import scheduler
+    from pipeline.engine.graph import Graph
+    from pipeline.engine.store.folder import at
+    from pipeline.flow.closed_loop import Drive
 
     begin = time.perf_counter()
     sequence, layers = prepared(settings)
@@ -65,7 +65,7 @@ def drive(settings: list[str]) -> dict[str, Any]:
         store = at(folder)
         flow = Drive(graph, sequence, config_of([*layers, {"drive": {"goal": goal}}]))
         flow.build()
-        result = driver.run(graph, store, executor="inline", keep_going=True)
+        result = scheduler.run(graph, store, executor="inline", keep_going=True)
         found = figures(flow, store)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
@@ -133,7 +133,7 @@ def worst(rows: list[dict[str, Any]]) -> list[str]:
 
 def main() -> None:
     """Run what is not there yet, and print the table."""
-    from pipeline.environment import SINGLE, prepare_environment
+    from pipeline.engine.runtime.environment import SINGLE, prepare_environment
 
     given = arguments()
     prepare_environment()

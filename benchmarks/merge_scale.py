@@ -19,8 +19,8 @@ from typing import Any
 
 import numpy as np
 
-from stages.declare import Array, Bundle, Inputs, NoParams, Stage
-from stages.lattice import Lattice
+from stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
+from stages.geometry.lattice import Lattice
 
 HERE = Path(__file__).parent
 CELLS = 1500
@@ -62,12 +62,12 @@ def places(side: int, models: int, cells: int) -> list[tuple[int, int]]:
 
 def merged(cache: Path, where: list[tuple[int, int]], cells: int, jobs: int, ledger: Path) -> dict[str, str]:
     """Run the merge of models at ``where``; label to digest of every tile."""
-    from pipeline import driver
-    from pipeline.config import STAGE_MODULES
-    from pipeline.dag import Graph
-    from pipeline.reconstruct import TILE_CELLS, merge_tiles
-    from pipeline.store import Store
-    from stages.merge import MergeParams
+    from pipeline.engine import scheduler
+    from pipeline.engine.graph import Graph
+    from pipeline.engine.store.folder import Store
+    from pipeline.flow.config import STAGE_MODULES
+    from pipeline.flow.reconstruction import TILE_CELLS, merge_tiles
+    from stages.terrain.merge import MergeParams
 
     graph = Graph()
 
@@ -79,7 +79,7 @@ def merged(cache: Path, where: list[tuple[int, int]], cells: int, jobs: int, led
     prints = [node("footprint", f"footprint/{k}", {"side": TILE_CELLS, "margin": 0}, dem=d) for k, d in dems.items()]
     graph.expand(prints, lambda *found: merge_tiles(node, [ref.meta for ref in found], dems, {}) and None)
     begin = time.perf_counter()
-    result = driver.run(graph, Store(cache), jobs=jobs, ledger=ledger)
+    result = scheduler.run(graph, Store(cache), jobs=jobs, ledger=ledger)
     result.check()
     counts = {name: (c.computed, c.cached) for name, c in result.counts.items()}
     print(f"{time.perf_counter() - begin:.0f} s, computed and cached: {counts}", flush=True)
@@ -88,7 +88,7 @@ def merged(cache: Path, where: list[tuple[int, int]], cells: int, jobs: int, led
 
 def tiles_of(cells: int, at: tuple[int, int], cache: Path) -> set[str]:
     """Labels of the tiles that a model's cells touch, cell by cell."""
-    from pipeline.reconstruct import TILE_CELLS
+    from pipeline.flow.reconstruction import TILE_CELLS
 
     z = _run(NoParams(), {"pair": 0, "i0": at[0], "j0": -at[1], "cells": cells}, {})["elevation"]
     rows, cols = np.nonzero(np.isfinite(z))
@@ -108,8 +108,8 @@ def main() -> int:
     sys.path.insert(0, str(HERE.parent))
     os.environ["PYTHONPATH"] = str(HERE.parent)
     with tempfile.TemporaryDirectory() as temporary:
-        from pipeline import ledger
-        from pipeline.executor import prepare_environment
+        from pipeline.engine import events as ledger
+        from pipeline.engine.executors.base import prepare_environment
 
         cache = args.cache or Path(temporary) / "cache"
         prepare_environment()

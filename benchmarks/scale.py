@@ -66,7 +66,7 @@ def nothing(name: str) -> Any:
     """``run`` of a stage of the chain: zeros of the declared arrays, and the facts by which the graph grows."""
 
     def run(params: Any, args: Any, inputs: Any) -> Any:
-        from stages.declare import Bundle
+        from stages.core.declare import Bundle
 
         stage = _real(name)
         arrays = {
@@ -88,7 +88,7 @@ def _of(args: Any, inputs: Any) -> list[Any]:
 
 
 def _real(name: str) -> Any:
-    from pipeline.config import stage
+    from pipeline.flow.config import stage
 
     return stage(name)
 
@@ -106,7 +106,7 @@ def _facts(name: str, args: Any, inputs: Any) -> dict[str, Any]:
         positions = [[0.0, SPACING * k, 0.0] for k in range(len(frames))]
         return {"frames": frames, "positions": positions, "pieces": [[frames[0], frames[-1]]], "main": 0}
     if name == "locus":
-        from stages.lattice import Lattice
+        from stages.geometry.lattice import Lattice
 
         y = SPACING * args["pair"]
         return {"lattice": Lattice.snap((-0.8, 0.8, y, y + 1.6), CELL).to_dict(), "pair": args["pair"]}
@@ -135,7 +135,7 @@ def _tiles(lattice: Any, side: int) -> Iterator[list[int]]:
 
 def image_stage() -> Any:
     """Source of the images."""
-    from stages.declare import Array, Bundle, NoParams, Stage
+    from stages.core.declare import Array, Bundle, NoParams, Stage
 
     def run(params: Any, args: Any, inputs: Any) -> Any:
         return Bundle({"image": np.zeros((4, 4), dtype=np.uint8)}, {"of": [args["frame"], args["camera"]]})
@@ -146,7 +146,7 @@ def image_stage() -> Any:
 
 def write_stages(folder: Path) -> None:
     """The package ``idle`` of stages that do nothing."""
-    from pipeline.config import STAGE_MODULES
+    from pipeline.flow.config import STAGE_MODULES
 
     package = folder / "idle"
     package.mkdir(parents=True)
@@ -159,10 +159,10 @@ def write_stages(folder: Path) -> None:
 def graph_of(pairs: int) -> Any:
     """The real dataflow over a sequence of so many pairs."""
     from datasets.protocol import Sequence, Source
-    from pipeline import config, reconstruct
-    from pipeline.dag import Graph
-    from stages.declare import NoParams
-    from stages.geometry import Camera, Rig, RigidTransform
+    from pipeline.engine.graph import Graph
+    from pipeline.flow import config, reconstruction
+    from stages.core.declare import NoParams
+    from stages.geometry.geometry import Camera, Rig, RigidTransform
 
     camera = Camera(60.0, 60.0, 31.5, 23.5, 64, 48)
     rig = Rig(camera, camera, RigidTransform(np.eye(3), np.array([-0.1, 0.0, 0.0])))
@@ -171,30 +171,30 @@ def graph_of(pairs: int) -> Any:
         return Source("idle.image", NoParams(), {"frame": frame, "camera": which})
 
     sequence = Sequence("scale", rig, pairs, image, tuple(str(k) for k in range(pairs)))
-    reconstruct.STAGE_MODULES = {name: f"idle.{name}" for name in config.STAGE_MODULES}
+    reconstruction.STAGE_MODULES = {name: f"idle.{name}" for name in config.STAGE_MODULES}
     graph = Graph()
-    reconstruct.Reconstruction(graph, sequence, config.build({}), tuple(range(pairs))).build()
+    reconstruction.Reconstruction(graph, sequence, config.build({}), tuple(range(pairs))).build()
     return graph
 
 
 def measure(pairs: int, cache: Path, executor: str, jobs: int, what: str) -> dict[str, float]:
     """One cold run, or one plan of what is cached, in this process."""
-    from pipeline import driver
-    from pipeline.memory import resident
-    from pipeline.store import Store
+    from pipeline.engine import scheduler
+    from pipeline.engine.memory.limits import resident
+    from pipeline.engine.store.folder import Store
 
     before = resident()
-    from pipeline.code import tree_digest
+    from pipeline.engine.code_digest import tree_digest
 
     tree_digest()  # once a process, whatever its size: reading the sources
     cpu, wall = time.process_time(), time.perf_counter()
     graph = graph_of(pairs)
     laid = time.perf_counter() - wall
     if what == "plan":
-        result = driver.run(graph, Store(cache), dry=True)
+        result = scheduler.run(graph, Store(cache), dry=True)
     else:
         ledger = cache.parent / "run" / "ledger.jsonl"
-        result = driver.run(graph, Store(cache), executor=executor, jobs=jobs, ledger=ledger)
+        result = scheduler.run(graph, Store(cache), executor=executor, jobs=jobs, ledger=ledger)
     result.check()
     spent = time.perf_counter() - wall
     n = len(graph.nodes)
@@ -271,7 +271,7 @@ def main() -> None:
     parser.add_argument("--what", choices=("all", "run", "plan"), default="all", help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.what != "all":
-        from pipeline.environment import prepare_environment
+        from pipeline.engine.runtime.environment import prepare_environment
 
         prepare_environment()
         print(json.dumps(measure(given.pairs, given.folder / "cache", given.executor, given.jobs, given.what)))

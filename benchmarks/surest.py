@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from pipeline.store import Store
+    from pipeline.engine.store.folder import Store
 
     Floats = NDArray[np.floating[Any]]
 
@@ -59,8 +59,8 @@ def judged(store: Store, rows: Mapping[str, Any], row: Mapping[str, Any]) -> tup
     """Errors and standard deviations (n,) of what a task ``dem_accuracy`` has judged, and how many cells it wanted."""
     import numpy as np
 
-    from stages.dem_accuracy import in_window
-    from stages.lattice import Lattice, mosaic
+    from stages.evaluation.dem_accuracy import in_window
+    from stages.geometry.lattice import Lattice, mosaic
 
     def found(label: str) -> Any:
         ref = store.lookup(rows[label]["stage"], rows[label]["key"])
@@ -109,25 +109,26 @@ def main() -> None:
     from matching import say, start_process, table
 
     start_process(1)
-    from pipeline import ledger, runs
     from pipeline.commands.options import cache_folder
-    from pipeline.run import Options, reconstruct
-    from pipeline.store import at
+    from pipeline.engine import events
+    from pipeline.engine.store.folder import at
+    from pipeline.runs import lookup
+    from pipeline.runs.session import Options, reconstruct
 
     cache = cache_folder(given.cache)
     if given.run is None and reconstruct(Options(SEQUENCE, (PRESET,), runs=given.runs, cache=cache)):
         sys.exit("the run is not complete")
-    folder = runs.find(given.run or SEQUENCE, given.runs)
-    rows = {row["label"]: row for row in ledger.read(folder / runs.LEDGER)}
+    folder = lookup.find(given.run or SEQUENCE, given.runs)
+    rows = {row["label"]: row for row in events.read(folder / lookup.LEDGER)}
     store, found = at(cache), []
     for label, row in rows.items():
         if row["stage"] == "dem_accuracy" and row["status"] in ("computed", "cached"):
             say(label)
             found.append(figures(label.partition("/")[2], *judged(store, rows, row), given.at))
     if not found:
-        sys.exit(f"{runs.name(folder)} has no elevations with a truth")
+        sys.exit(f"{lookup.name(folder)} has no elevations with a truth")
     headings = ["model", "given", "RMS, mm", *(f"at {share:g}" for share in given.at), "limit, mm", "1 std", "2 std"]
-    table(f"{runs.name(folder)}: elevations, the surest first", headings, sorted(found, key=_order))
+    table(f"{lookup.name(folder)}: elevations, the surest first", headings, sorted(found, key=_order))
     times(rows)
 
 

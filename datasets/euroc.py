@@ -26,8 +26,8 @@ from datasets.protocol import CAMERAS, Sequence, Source
 from datasets.reading import read_text
 from datasets.tables import read_table
 from datasets.times import seconds
-from stages.errors import InputError
-from stages.geometry import RigidTransform
+from stages.core.errors import InputError
+from stages.geometry.geometry import RigidTransform
 
 FOLDERS = {"left": "cam0", "right": "cam1"}
 

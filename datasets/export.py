@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 
 from datasets.protocol import CAMERAS, Sequence, Source
-from stages.declare import Bundle
-from stages.errors import InputError
-from stages.geometry import Camera, RigidTransform, level_rotation
+from stages.core.declare import Bundle
+from stages.core.errors import InputError
+from stages.geometry.geometry import Camera, RigidTransform, level_rotation
 
 Materialise = Callable[[Source], Bundle]
 

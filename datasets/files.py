@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from datasets.headers import PNG_SIGNATURE, Header, read_header
 from datasets.protocol import Source
 from datasets.reading import open_regular, read_bytes
-from stages.declare import Array, Bundle, Inputs, NoParams, Stage
-from stages.errors import InputError
+from stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
+from stages.core.errors import InputError
 
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # what it says on stderr, an error says here
 

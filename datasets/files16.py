@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from datasets import files
-from stages.declare import Array
+from stages.core.declare import Array
 
 STAGE = replace(
     files.STAGE,

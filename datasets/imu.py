@@ -22,8 +22,8 @@ from datasets.poses import coverage
 from datasets.protocol import Rows
 from datasets.tables import Table, read_table
 from datasets.times import GAP, seconds
-from stages.errors import InputError
-from stages.geometry import RigidTransform, orthonormal, rotation_exp
+from stages.core.errors import InputError
+from stages.geometry.geometry import RigidTransform, orthonormal, rotation_exp
 
 Floats = NDArray[np.float64]
 Up = tuple[float, float, float] | None

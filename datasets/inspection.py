@@ -19,7 +19,7 @@ from datasets.cameras import CalibratedCamera, read_cameras
 from datasets.pairing import SIDES, SUFFIXES, common_size, natural, pair_up, side_of
 from datasets.poses import read_positions
 from datasets.reading import Search, is_file, read_lines
-from stages.errors import InputError, RilleError
+from stages.core.errors import InputError, RilleError
 
 DEPTH = 4
 """Folders below the given one that are looked into; more is another data set."""

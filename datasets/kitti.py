@@ -25,8 +25,8 @@ from datasets.pairing import ends
 from datasets.protocol import CAMERAS, Sequence, Source
 from datasets.reading import read_lines
 from datasets.times import seconds
-from stages.errors import InputError
-from stages.geometry import Camera, Rig, RigidTransform, orthonormal
+from stages.core.errors import InputError
+from stages.geometry.geometry import Camera, Rig, RigidTransform, orthonormal
 
 PAIRS = (
     ("image_0", "image_1"),

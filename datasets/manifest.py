@@ -23,7 +23,7 @@ from datasets.names import derived_name
 from datasets.pairing import Pair, common_size, pair_up
 from datasets.protocol import Sequence, Source
 from datasets.reading import Search
-from stages.errors import InputError
+from stages.core.errors import InputError
 
 VARIABLE = re.compile(r"\$\{(\w+)\}")
 

@@ -12,10 +12,10 @@ import numpy as np
 from pydantic import BeforeValidator, Discriminator, Field, Tag, ValidationError, model_validator
 
 from datasets.reading import read_lines, read_toml
-from stages.declare import Params
-from stages.errors import InputError, told
-from stages.geometry import RigidTransform
-from stages.vehicle import Vehicle
+from stages.core.declare import Params
+from stages.core.errors import InputError, told
+from stages.geometry.geometry import RigidTransform
+from stages.hazard.vehicle import Vehicle
 
 
 def _pose(value: Any) -> tuple[float, ...]:

@@ -18,8 +18,8 @@ from datasets.poses import coverage, interpolate, read_poses, read_positions
 from datasets.protocol import Positions, Rows
 from datasets.reading import read_lines
 from datasets.times import seconds
-from stages.errors import InputError
-from stages.geometry import RigidTransform
+from stages.core.errors import InputError
+from stages.geometry.geometry import RigidTransform
 
 Poses = tuple[RigidTransform | None, ...]
 Ups = tuple[tuple[float, float, float] | None, ...]

@@ -10,9 +10,9 @@ import numpy as np
 
 from datasets.cameras import CalibratedCamera, read_cameras, rig_of
 from datasets.manifest_model import Cameras, Manifest, PinholeLens, RigSection
-from stages.errors import InputError
-from stages.geometry import Camera, Rig, RigidTransform
-from stages.lens import Lens
+from stages.core.errors import InputError
+from stages.geometry.geometry import Camera, Rig, RigidTransform
+from stages.geometry.lens import Lens
 
 LONGEST_BASELINE = 20.0
 """m; no vehicle carries a longer one, but 97 (mm) is a common slip."""

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from datasets.protocol import Sequence, Source
-from stages.declare import AnyArray, Array, Bundle, Inputs, Params, Stage
-from stages.geometry import rotation_exp
-from stages.lens import Lens
+from stages.core.declare import AnyArray, Array, Bundle, Inputs, Params, Stage
+from stages.geometry.geometry import rotation_exp
+from stages.geometry.lens import Lens
 
 Floats = NDArray[np.float64]
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from datasets import files
-from stages.errors import InputError
+from stages.core.errors import InputError
 
 SUFFIXES = (*files.SUFFIXES, ".ppm", ".bmp")
 """Kinds of image that are looked for where no pattern is given."""

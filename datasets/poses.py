@@ -26,8 +26,8 @@ from numpy.typing import NDArray
 
 from datasets.tables import Table, read_table
 from datasets.times import seconds
-from stages.errors import InputError
-from stages.geometry import RigidTransform, orthonormal
+from stages.core.errors import InputError
+from stages.geometry.geometry import RigidTransform, orthonormal
 
 Floats = NDArray[np.float64]
 

@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from datasets.georeference import Georeference
 from datasets.names import check_name
-from stages.declare import Params
-from stages.errors import InputError
-from stages.geometry import Rig, RigidTransform
-from stages.lens import Lens
+from stages.core.declare import Params
+from stages.core.errors import InputError
+from stages.geometry.geometry import Rig, RigidTransform
+from stages.geometry.lens import Lens
 
 if TYPE_CHECKING:
-    from stages.vehicle import Vehicle
+    from stages.hazard.vehicle import Vehicle
 
 CAMERAS = ("left", "right")
 

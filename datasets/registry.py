@@ -18,8 +18,8 @@ from datasets.mockup.params import RECORDED_ONLY, SHORT, MockupParams
 from datasets.mockup.rover import RoverParams
 from datasets.mockup.sequence import mockup
 from datasets.protocol import Sequence
-from stages.declare import Params
-from stages.errors import ConfigError, InputError, RilleError, told
+from stages.core.declare import Params
+from stages.core.errors import ConfigError, InputError, RilleError, told
 
 BUILT_IN: dict[str, tuple[str, Mapping[str, Any]]] = {
     "mockup": ("the paper's experiment, simulated: 40 pairs over a lunar bed at 1:10, with exact truth", {}),

@@ -84,7 +84,7 @@ def reconstruct(
         A name from `rille datasets`, or a folder whose layout is recognised.
     """
     prepare()
-    from pipeline import run
+    from pipeline.runs import session as run
 
     given = options(
         seq, settings, results, frames=frames, executor=executor, keep_going=keep_going, memory_limit=memory_limit
@@ -111,7 +111,7 @@ def drive(
         A simulated sequence; mockup-loop.
     """
     prepare()
-    from pipeline import run
+    from pipeline.runs import session as run
 
     return run.reconstruct(options(seq, settings, results, executor=executor, verb="drive"))
 
@@ -136,7 +136,7 @@ def plan(
         Where tasks would run.
     """
     prepare()
-    from pipeline import plan as command
+    from pipeline.commands import plan as command
 
     given = options(seq, settings, _RESULTS, frames=frames, executor=executor, memory_limit=memory_limit)
     return command.plan(given, verbose=verbose)
@@ -158,7 +158,7 @@ def why(
     task
         The task's label, as in the run's ledger.jsonl: hfvm/12, locus/world/12, trajectory.
     """
-    from pipeline import why as command
+    from pipeline.commands import why as command
 
     return command.why(run, task, folder=runs, cache=cache_folder(cache))
 
@@ -172,7 +172,7 @@ def timing(run: str = "latest", *, runs: Runs = RUNS, debug: Debug = False) -> i
     run
         SEQUENCE (its latest run), SEQUENCE/ID, or the run's folder; the latest of all by default.
     """
-    from pipeline import timing as command
+    from pipeline.runs import critical_path as command
 
     return command.show(run, runs)
 
@@ -197,10 +197,10 @@ def check(
         PNG to write; SEQUENCE-check.png by default.
     """
     prepare()
-    from pipeline import check as command
-    from pipeline.run import choose_frames
-    from pipeline.run import settings as settle
-    from pipeline.unread import refuse_unchecked
+    from pipeline.commands import check as command
+    from pipeline.flow.unread import refuse_unchecked
+    from pipeline.runs.session import choose_frames
+    from pipeline.runs.session import settings as settle
 
     given = options(seq, Settings(assignments=assignments, cache=cache), _RESULTS, frames=frames)
     settled = settle(given)
@@ -239,8 +239,8 @@ def _run(argv: list[str] | None) -> int:
 
 def _complain(error: Exception, debug: bool) -> int:
     """One line that says what to change; the traceback on request."""
-    from pipeline.failures import told
-    from stages.errors import ConfigError, InputError
+    from pipeline.engine.failures import told
+    from stages.core.errors import ConfigError, InputError
 
     if debug:
         traceback.print_exception(error)

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from stages.errors import RilleError
+from stages.core.errors import RilleError
 
 
 @contextmanager

@@ -7,15 +7,15 @@ import importlib
 import numpy as np
 import pytest
 
-from pipeline.config import STAGE_MODULES, stage
+from pipeline.flow.config import STAGE_MODULES, stage
 
 UNITS = {"1", "px", "m", "rad", "grey", "m^2, m rad, rad^2", "m, rad"}
 DATASET_STAGES = ("files", "files16", "mockup.scene", "mockup.render", "mockup.truth", "mockup.truth_dem")
 DRIVE_STAGES = ("mockup.rover", "mockup.sense", "mockup.site", "mockup.obstacle", "mockup.overview")
-TILE_STAGES = ("hfvm_tile", "hfvm_join")
+TILE_STAGES = ("tile_stage", "join_stage")
 DECLARED = (
     {name: stage(name) for name in STAGE_MODULES}
-    | {name: importlib.import_module(f"stages.{name}").STAGE for name in TILE_STAGES}
+    | {name: importlib.import_module(f"stages.hfvm.{name}").STAGE for name in TILE_STAGES}
     | {name: importlib.import_module(f"datasets.{name}").STAGE for name in (*DATASET_STAGES, *DRIVE_STAGES)}
 )
 

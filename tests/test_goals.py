@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 import yaml
 
-from pipeline import run
-from pipeline.init import init
+from pipeline.commands.init import init
+from pipeline.runs import session
 
 pytestmark = pytest.mark.slow
 
 
 def metrics(sequence: str, folder: Path, *settings: str, complete: bool = True) -> dict[str, Any]:
-    options = run.Options(
+    options = session.Options(
         sequence, assignments=settings, runs=folder / "runs", cache=folder / "cache", progress="quiet"
     )
-    assert run.reconstruct(options) == (0 if complete else 3)
+    assert session.reconstruct(options) == (0 if complete else 3)
     report = json.loads(next(folder.glob("runs/*/latest/report.json")).read_text())
     assert report["complete"] == complete
     return {name: m["value"] for name, m in report["metrics"].items()}

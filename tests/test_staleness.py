@@ -23,15 +23,16 @@ from datasets.misalign import MisalignParams
 from datasets.mockup.params import SHORT, MockupParams
 from datasets.protocol import Positions, Sequence
 from datasets.registry import open_sequence
-from pipeline import code, driver, explain, task, unread
-from pipeline import config as configuration
-from pipeline.dag import Graph, Handle
-from pipeline.key import digest
-from pipeline.reconstruct import Reconstruction
-from pipeline.store import Ref, Store
-from stages.errors import RilleError
-from stages.geometry import RigidTransform, rotation_exp
-from stages.lens import Lens
+from pipeline.engine import code_digest, provenance, scheduler, task
+from pipeline.engine.graph import Graph, Handle
+from pipeline.engine.keys import digest
+from pipeline.engine.store.folder import Ref, Store
+from pipeline.flow import config as configuration
+from pipeline.flow import unread
+from pipeline.flow.reconstruction import Reconstruction
+from stages.core.errors import RilleError
+from stages.geometry.geometry import RigidTransform, rotation_exp
+from stages.geometry.lens import Lens
 
 ROOT = Path(__file__).resolve().parent.parent
 FRAMES = (0, 1, 2, 3, 4)
@@ -200,7 +201,7 @@ class Chain:
         graph = Graph()
         config = configuration.build(configuration.expand(self.sequence.defaults), given)
         Reconstruction(graph, self.sequence, config, FRAMES).build()
-        result = driver.run(graph, self.store, dry=True)
+        result = scheduler.run(graph, self.store, dry=True)
         assert not result.failures
         return graph
 
@@ -220,8 +221,8 @@ def group(label: str) -> str:
 @pytest.fixture(scope="module")
 def chain(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chain]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(explain.Known, "reason", lambda *_: "")
-        patch.setattr(explain.Known, "latest", lambda known, store, stage, label: store.labels.get(label))
+        patch.setattr(provenance.Known, "reason", lambda *_: "")
+        patch.setattr(provenance.Known, "latest", lambda known, store, stage, label: store.labels.get(label))
         yield Chain(short({}), tmp_path_factory.mktemp("store"))
 
 
@@ -417,19 +418,34 @@ def test_no_estimate_is_told_a_true_pose(chain: Chain) -> None:
 WORDS = "\n# only words\n"
 
 EDITS: dict[str, tuple[str, str, str, set[str]]] = {
-    "a comment, in what all reach": ("stages/geometry.py", "", WORDS, set()),
-    "a docstring, in what all reach": ("stages/declare.py", '"""What a stage takes', '"""What any stage takes', set()),
+    "a comment, in what all reach": ("stages/geometry/geometry.py", "", WORDS, set()),
+    "a docstring, in what all reach": (
+        "stages/core/declare.py",
+        '"""What a stage takes',
+        '"""What any stage takes',
+        set(),
+    ),
     "a docstring of a kernel": ("stages/hfvm/search.py", '"""', '"""Said otherwise. ', set()),
-    "the engine": ("pipeline/driver.py", "HEALS = 3", "HEALS = 4", set()),
+    "the engine": ("pipeline/engine/scheduler.py", "HEALS = 3", "HEALS = 4", set()),
     "the report": ("pipeline/report/words.py", "", "\nMORE = 1\n", set()),
-    "a stage itself": ("stages/merge.py", "", "\nMORE = 1\n", {"merge"}),
-    "a helper of one stage": ("stages/row_grid.py", "", "\nMORE = 1\n", {"path/local", "path/world"}),
-    "a njit callee of one stage": ("stages/locus_kernel.py", "", "\nMORE = 1\n", {"locus/local", "locus/world"}),
-    "a njit callee of several": ("stages/features.py", "", "\nMORE = 1\n", {"motion", "hfvm", "track"}),
-    "a helper of the seams": ("stages/seam_fit.py", "", "\nMORE = 1\n", {"seam"}),
-    "a stage that others hang on by its result": ("stages/footprint.py", "", "\nMORE = 1\n", {"footprint"}),
-    "a helper's helper": ("stages/epipolar.py", "", "\nMORE = 1\n", {"orientation", "rig"}),
-    "a helper of two stages": ("stages/pose_alignment.py", "", "\nMORE = 1\n", {"agreement", "crosscheck_join"}),
+    "a stage itself": ("stages/terrain/merge.py", "", "\nMORE = 1\n", {"merge"}),
+    "a helper of one stage": ("stages/planning/row_grid.py", "", "\nMORE = 1\n", {"path/local", "path/world"}),
+    "a njit callee of one stage": (
+        "stages/terrain/locus/kernel.py",
+        "",
+        "\nMORE = 1\n",
+        {"locus/local", "locus/world"},
+    ),
+    "a njit callee of several": ("stages/hfvm/features.py", "", "\nMORE = 1\n", {"motion", "hfvm", "track"}),
+    "a helper of the seams": ("stages/terrain/overlap_fit.py", "", "\nMORE = 1\n", {"seam"}),
+    "a stage that others hang on by its result": ("stages/terrain/tile_index.py", "", "\nMORE = 1\n", {"footprint"}),
+    "a helper's helper": ("stages/geometry/epipolar.py", "", "\nMORE = 1\n", {"orientation", "rig"}),
+    "a helper of two stages": (
+        "stages/evaluation/pose_alignment.py",
+        "",
+        "\nMORE = 1\n",
+        {"agreement", "crosscheck_join"},
+    ),
 }
 """File, what in it becomes what (at its end, if nothing), and the groups whose *own* code it is part of."""
 
@@ -439,14 +455,14 @@ def edited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     """``edited(file, old, new)``: the sources as a new process would find them after that edit."""
     for package in ("stages", "datasets", "pipeline"):
         shutil.copytree(ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__"))
-    caches = (code._read, code._file, code._reachable, task._shared)
+    caches = (code_digest._read, code_digest._file, code_digest._reachable, task._shared)
 
     def edit(file: str, old: str, new: str) -> None:
         path = tmp_path / file
         text = path.read_text()
         assert old in text
         path.write_text(text.replace(old, new, 1) if old else text + new)
-        monkeypatch.setattr(code, "_roots", lambda package: (tmp_path / package,))
+        monkeypatch.setattr(code_digest, "_roots", lambda package: (tmp_path / package,))
         for cached in caches:
             cached.cache_clear()
 

@@ -15,13 +15,13 @@ from datasets.mockup.rover import bed_ground, heading_of
 from datasets.mockup.sequence import true_rig
 from datasets.mockup.site import prepare
 from datasets.mockup.truth_dem import seen_by, true_dem
-from pipeline.drive import arena
-from stages.declare import Bundle
-from stages.geometry import RigidTransform, level_rotation
-from stages.lattice import Lattice
-from stages.merge import footprint
-from stages.vehicle import Vehicle
-from stages.wheels import Ground, stand
+from pipeline.flow.closed_loop import arena
+from stages.core.declare import Bundle
+from stages.geometry.geometry import RigidTransform, level_rotation
+from stages.geometry.lattice import Lattice
+from stages.hazard.vehicle import Vehicle
+from stages.planning.wheels import Ground, stand
+from stages.terrain.merge import footprint
 
 REACH = 3.0
 """m; ground about the start, all of every bed."""

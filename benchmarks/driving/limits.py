@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 
 from datasets.mockup.rover import heading_of
 from driving.exact_bed import ExactBed
-from stages.lattice import Lattice
-from stages.pose_graph import PoseGraph, PoseGrid
-from stages.route import length_of, pieces, straightened
-from stages.vehicle import Vehicle
-from stages.wheels import Ground, measured
+from stages.geometry.lattice import Lattice
+from stages.hazard.vehicle import Vehicle
+from stages.planning.local_planner.route import length_of, pieces, straightened
+from stages.planning.local_planner.state_lattice import PoseGraph, PoseGrid
+from stages.planning.wheels import Ground, measured
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -28,7 +28,8 @@ Mask = NDArray[np.bool_]
 
 @dataclass
 class Limits:
-    """Ground (bed frame) as a vehicle may stand on it; takes the place of :class:`stages.footing.Footing`."""
+    """Ground (bed frame) as a vehicle may stand on it; takes the place of
+    :class:`stages.planning.local_planner.clearance.Footing`."""
 
     ground: Ground
     vehicle: Vehicle

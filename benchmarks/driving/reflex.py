@@ -27,10 +27,10 @@ def settings_of(k: int) -> list[str]:
 
 def trial(settings: list[str]) -> dict[str, Any]:
     """One leg with a stone on it; figures of the stone."""
-    from pipeline import driver
-    from pipeline.dag import Graph
-    from pipeline.drive import Drive
-    from pipeline.store import at
+    from pipeline.engine import scheduler
+    from pipeline.engine.graph import Graph
+    from pipeline.engine.store.folder import at
+    from pipeline.flow.closed_loop import Drive
 
     class OneLeg(Drive):
         def _stop(self, *where: Any) -> None:
@@ -44,7 +44,7 @@ def trial(settings: list[str]) -> dict[str, Any]:
         store = at(folder)
         flow = OneLeg(graph, sequence, config_of(layers))
         flow.build()
-        result = driver.run(graph, store, executor="inline", keep_going=True)
+        result = scheduler.run(graph, store, executor="inline", keep_going=True)
         found = stone(flow, store)
     finally:
         shutil.rmtree(folder, ignore_errors=True)

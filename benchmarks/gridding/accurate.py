@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from pipeline import config
+from pipeline.flow import config
+from stages.geometry.surface import plane
 from stages.hfvm import match
-from stages.locus import reconstruct, usable
-from stages.locus_solve import Matches
-from stages.surface import plane
+from stages.terrain.locus.solve import Matches
+from stages.terrain.locus.stage import reconstruct, usable
 
 from .scenes import Scene
 

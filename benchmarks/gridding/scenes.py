@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from stereo.pairs import fetcher, read_image, read_truth
 
-from stages.geometry import Camera, Rig, RigidTransform, level_rotation
-from stages.lattice import Lattice
+from stages.geometry.geometry import Camera, Rig, RigidTransform, level_rotation
+from stages.geometry.lattice import Lattice
 
 from .mesh import rasterise, without_jumps
 
@@ -74,9 +74,9 @@ class Scene:
 
 def match(scene: Scene, preset: str = "default") -> Disparities:
     """Disparities by the matcher with a preset."""
-    from pipeline import config
+    from pipeline.flow import config
+    from stages.core.validity import matched
     from stages.hfvm import match as hfvm
-    from stages.validity import matched
 
     params = config.build({"hfvm": {"preset": preset}}).hfvm
     found = hfvm(scene.left, scene.right, params, left_valid=scene.valid[0], right_valid=scene.valid[1])
@@ -117,7 +117,7 @@ def _simulated(sequence: Any, fetch: Any, frame: int) -> Scene:
 
 
 def _searched(rig: Rig, found: Disparities, up: Floats, lattice: Lattice) -> tuple[float, float]:
-    from stages.level import LevelParams, level, z_range
+    from stages.terrain.ground_frame import LevelParams, level, z_range
 
     facts = level(found.column, found.row, found.measured, rig, LevelParams(), up=up)
     low, high = z_range(facts["plane"], facts["relief"], list(lattice.bounds))

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.risk import HAZARDOUS, SAFE, UNKNOWN
-from stages.windows import fit_planes, running_max, running_min
+from stages.hazard.risk import HAZARDOUS, SAFE, UNKNOWN
+from stages.numeric.windows import fit_planes, running_max, running_min
 
 from .scenes import CELL, Scene
 

@@ -20,16 +20,16 @@ from numpy.typing import NDArray
 from datasets.mockup.params import MockupParams
 from datasets.mockup.sequence import mockup
 from datasets.protocol import Source
-from pipeline import config
-from stages.geometry import Rig, RigidTransform
+from pipeline.flow import config
+from stages.core.validity import matched
+from stages.geometry.geometry import Rig, RigidTransform
+from stages.geometry.lattice import Lattice
+from stages.geometry.surface import plane
+from stages.hazard.vehicle import Vehicle
 from stages.hfvm import match
-from stages.lattice import Lattice
-from stages.level import LevelParams, level, z_range
-from stages.locus import LocusParams, local_lattice, reconstruct, usable
-from stages.locus_solve import Matches
-from stages.surface import plane
-from stages.validity import matched
-from stages.vehicle import Vehicle
+from stages.terrain.ground_frame import LevelParams, level, z_range
+from stages.terrain.locus.solve import Matches
+from stages.terrain.locus.stage import LocusParams, local_lattice, reconstruct, usable
 
 Floats32 = NDArray[np.float32]
 
@@ -43,9 +43,10 @@ ATTITUDE_DEG = 0.2
 """Error of the inclinometer about each axis, degrees, as that of the simulated rover."""
 
 MADE_BY = (
-    "benchmarks/hazard/scenes.py", "pipeline/config.py", "datasets/mockup/*.py", "stages/hfvm/*.py",
-    "stages/hfvm_*.py", "stages/level.py", "stages/ground.py", "stages/locus*.py", "stages/surface.py",
-    "stages/lattice.py", "stages/validity.py",
+    "benchmarks/hazard/scenes.py", "pipeline/flow/config.py", "datasets/mockup/*.py", "stages/hfvm/*.py",
+    "stages/terrain/ground_frame.py", "stages/terrain/ground.py", "stages/terrain/locus/*.py",
+    "stages/geometry/surface.py",
+    "stages/geometry/lattice.py", "stages/core/validity.py",
 )  # fmt: skip
 """Modules by which a scene is made: one that was kept is used as long as none of them changes."""
 

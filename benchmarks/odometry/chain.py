@@ -1,7 +1,7 @@
 """Rille's navigation in one process: the stages that a trajectory needs, called one after the other, each timed.
 
-The same stages, with the same parameters and inputs, as in ``pipeline/reconstruct.py``; left out is what no pose
-depends on (elevation models, risk, path, cross-check), and the cache of artifacts.
+The same stages, with the same parameters and inputs, as in ``pipeline/flow/reconstruction.py``; left out is what no
+pose depends on (elevation models, risk, path, cross-check), and the cache of artifacts.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 
 from datasets.protocol import Sequence, Source
-from pipeline import config as configuration
-from stages.declare import Bundle, NoParams
-from stages.trajectory import world_poses
+from pipeline.flow import config as configuration
+from stages.core.declare import Bundle, NoParams
+from stages.odometry.resection.trajectory import world_poses
 
 MATCHING = ("hfvm", "orientation", "rig", "calibration", "level")
 """Stages of the basic pairs; all others see every frame."""

@@ -168,8 +168,8 @@ def hfvm(variants: list[str], threads: int) -> list[Method]:
 
 
 def _hfvm(name: str, values: dict[str, Any], threads: int) -> Method:
+    from stages.core.validity import matched
     from stages.hfvm import HfvmParams, match
-    from stages.validity import matched
 
     params = HfvmParams(**values)
     extra: dict[str, Any] = {"threads": threads} if "threads" in inspect.signature(match).parameters else {}

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from datasets.misalign import MisalignParams, warp
-from stages.geometry import Camera, rotation_exp
-from stages.lens import Lens
+from stages.geometry.geometry import Camera, rotation_exp
+from stages.geometry.lens import Lens
 
 from .measures import Truth, judge
 from .methods import Method

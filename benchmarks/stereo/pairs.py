@@ -159,8 +159,8 @@ def _data(name: str) -> Path | None:
 
 def fetcher(cache: Path) -> Callable[[Any], Any]:
     """Function that computes a source once and then reads it from the cache."""
-    from pipeline.store import Store
-    from pipeline.task import Spec, ensure
+    from pipeline.engine.store.folder import Store
+    from pipeline.engine.task import Spec, ensure
 
     def artifact(source: Any) -> Any:
         refs = {port: artifact(upstream) for port, upstream in source.inputs.items()}

@@ -11,7 +11,7 @@ from datasets.cameras.model import UNKNOWN_SIZE, CalibratedCamera
 from datasets.cameras.pair import rig_of
 from datasets.cameras.text import parse_xml, parse_yaml
 from datasets.reading import read_text
-from stages.errors import InputError
+from stages.core.errors import InputError
 
 __all__ = ["UNKNOWN_SIZE", "CalibratedCamera", "read_cameras", "rig_of"]
 

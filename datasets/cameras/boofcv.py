@@ -8,8 +8,8 @@ import numpy as np
 
 from datasets.cameras.fields import Fields
 from datasets.cameras.model import CalibratedCamera
-from stages.geometry import RigidTransform
-from stages.lens import Lens
+from stages.geometry.geometry import RigidTransform
+from stages.geometry.lens import Lens
 
 MODELS = ("pinhole", "pinhole_radial_tangential")
 MOST_RADIAL = 3

@@ -12,8 +12,8 @@ import numpy as np
 from datasets.cameras.fields import Fields
 from datasets.cameras.model import CalibratedCamera
 from datasets.reading import read_text
-from stages.geometry import RigidTransform
-from stages.lens import Lens
+from stages.geometry.geometry import RigidTransform
+from stages.geometry.lens import Lens
 
 PARAMETERS = {
     "SIMPLE_PINHOLE": "f cx cy",

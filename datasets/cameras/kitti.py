@@ -14,9 +14,9 @@ import numpy as np
 
 from datasets.cameras.fields import Fields
 from datasets.cameras.model import UNKNOWN_SIZE, CalibratedCamera
-from stages.errors import InputError
-from stages.geometry import RigidTransform, orthonormal
-from stages.lens import Lens
+from stages.core.errors import InputError
+from stages.geometry.geometry import RigidTransform, orthonormal
+from stages.geometry.lens import Lens
 
 PROJECTION = re.compile(r"P(\d)(?:_roi)?|P_rect_(\d\d)")
 LINE = re.compile(r"^[ \t]*(P\d(?:_roi)?|P_rect_\d\d|K_\d\d)[ \t]*:", re.MULTILINE)

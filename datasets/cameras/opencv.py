@@ -10,9 +10,9 @@ from datasets.cameras.fields import Fields, by_count
 from datasets.cameras.model import CalibratedCamera
 from datasets.cameras.text import parse_xml, parse_yaml
 from datasets.reading import read_text
-from stages.errors import InputError
-from stages.geometry import RigidTransform
-from stages.lens import Lens
+from stages.core.errors import InputError
+from stages.geometry.geometry import RigidTransform
+from stages.geometry.lens import Lens
 
 SIDES = (
     (("M1", "D1"), ("M2", "D2")),

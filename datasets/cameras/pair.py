@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 from datasets.cameras.model import CalibratedCamera
-from stages.errors import InputError
-from stages.geometry import Rig
-from stages.lens import Lens
+from stages.core.errors import InputError
+from stages.geometry.geometry import Rig
+from stages.geometry.lens import Lens
 
 LEAST_BASELINE = 1e-6
 """Below this, in any unit of length in use, both cameras stand in one place."""
@@ -28,7 +28,7 @@ def rig_of(
 
     Returns
     -------
-    rig : with ideal cameras (:meth:`stages.lens.Lens.ideal_camera`), in the calibration's unit of length.
+    rig : with ideal cameras (:meth:`stages.geometry.lens.Lens.ideal_camera`), in the calibration's unit of length.
     lenses : by camera, ``"left"`` and ``"right"``, only where there is distortion; None where there is none at all.
 
     Raises

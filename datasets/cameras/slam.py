@@ -9,8 +9,8 @@ import numpy as np
 
 from datasets.cameras.fields import Fields
 from datasets.cameras.model import CalibratedCamera
-from stages.geometry import RigidTransform
-from stages.lens import Lens
+from stages.geometry.geometry import RigidTransform
+from stages.geometry.lens import Lens
 
 CAMERA = re.compile(r"cam(\d+)")
 

@@ -10,7 +10,7 @@ from xml.etree import ElementTree
 import yaml
 
 from datasets.reading import DEEPEST
-from stages.errors import InputError
+from stages.core.errors import InputError
 
 MOST_VALUES = 100_000
 """Of a YAML file; a stereo calibration has a hundred, with the corners of all its views some ten thousand."""

@@ -17,8 +17,8 @@ import numpy as np
 from datasets.cameras.fields import Fields
 from datasets.cameras.model import UNKNOWN_SIZE, CalibratedCamera
 from datasets.cameras.text import assignments
-from stages.geometry import Camera
-from stages.lens import Lens
+from stages.geometry.geometry import Camera
+from stages.geometry.lens import Lens
 
 HEADER = re.compile(r"(VERSION_\d+|PINHOLE)?")
 

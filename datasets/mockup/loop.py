@@ -12,10 +12,10 @@ from datasets.mockup.params import MockupParams
 from datasets.mockup.rover import RoverParams
 from datasets.mockup.sequence import given_rig, mount, true_rig, vehicle_at_scale
 from datasets.protocol import Simulation, Source
-from stages.declare import NoParams
-from stages.errors import InputError
-from stages.geometry import RigidTransform
-from stages.vehicle import Vehicle
+from stages.core.declare import NoParams
+from stages.core.errors import InputError
+from stages.geometry.geometry import RigidTransform
+from stages.hazard.vehicle import Vehicle
 
 LOOP: Mapping[str, Any] = {
     "frames": 1,

@@ -12,8 +12,8 @@ from datasets.mockup import scene as bed
 from datasets.mockup import terrain
 from datasets.mockup.params import SceneParams
 from datasets.mockup.rover import RoverParams, heading_of
-from stages.declare import Bundle, Inputs, Stage
-from stages.geometry import RigidTransform
+from stages.core.declare import Bundle, Inputs, Stage
+from stages.geometry.geometry import RigidTransform
 
 
 def on_path(path: np.ndarray, way: float, aside: float) -> tuple[float, float]:

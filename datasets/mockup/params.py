@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from stages.declare import Params
+from stages.core.declare import Params
 
 
 class SceneParams(Params):

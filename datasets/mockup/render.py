@@ -20,8 +20,8 @@ from datasets.mockup.params import RenderParams
 from datasets.mockup.raycast import HeightField
 from datasets.mockup.scene import height_field
 from datasets.mockup.terrain import EMISSION
-from stages.declare import Array, Bundle, Inputs, Memory, Stage
-from stages.geometry import Camera, RigidTransform
+from stages.core.declare import Array, Bundle, Inputs, Memory, Stage
+from stages.geometry.geometry import Camera, RigidTransform
 
 LUNAR = 0.6
 """McEwen's L near 70 degrees of phase angle, the usual one here."""

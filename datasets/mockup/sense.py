@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from datasets.mockup.rover import RoverParams
-from stages.declare import Array, Bundle, Inputs, Stage
-from stages.geometry import rotation_exp
+from stages.core.declare import Array, Bundle, Inputs, Stage
+from stages.geometry.geometry import rotation_exp
 
 
 def _run(params: RoverParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:

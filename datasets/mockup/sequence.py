@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from datasets.mockup.params import MockupParams
 from datasets.protocol import CAMERAS, Rows, Sequence, Source
-from stages.declare import NoParams
-from stages.errors import ConfigError
-from stages.geometry import Camera, Rig, RigidTransform, rotation_exp
+from stages.core.declare import NoParams
+from stages.core.errors import ConfigError
+from stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
 
 Floats = NDArray[np.float64]
 
@@ -190,7 +190,7 @@ def mockup(p: MockupParams, name: str = "mockup") -> Sequence:
 
 def vehicle_at_scale() -> Any:
     """The rover at 1:10: a 0.8 m wide, 1 m long one with 0.3 m wheels at full scale."""
-    from stages.vehicle import Vehicle
+    from stages.hazard.vehicle import Vehicle
 
     return Vehicle(
         name="rover at 1:10",

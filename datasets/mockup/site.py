@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from datasets.mockup import scene as bed
 from datasets.mockup import terrain
 from datasets.mockup.params import SceneParams
-from stages.declare import Bundle, Inputs, NoParams, Stage
+from stages.core.declare import Bundle, Inputs, NoParams, Stage
 
 EDGE = 0.06
 """m; over which the pad passes into the ground around it."""

@@ -13,8 +13,8 @@ from datasets.mockup.raycast import HeightField
 from datasets.mockup.render import transform
 from datasets.mockup.scene import height_field
 from datasets.mockup.truth import visible
-from stages.declare import Array, Bundle, Inputs, NoParams, Stage
-from stages.geometry import Rig, RigidTransform
+from stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
+from stages.geometry.geometry import Rig, RigidTransform
 
 
 def true_dem(

@@ -40,6 +40,6 @@ def export(
         Folder to make; it must not exist yet or be empty.
     """
     prepare()
-    from pipeline import run
+    from pipeline.runs import session
 
-    return run.export_dataset(seq, directory, tuple(assignments or ()), cache_folder(cache))
+    return session.export_dataset(seq, directory, tuple(assignments or ()), cache_folder(cache))

@@ -26,7 +26,7 @@ def init(
     output
         Manifest to write; by default DIRECTORY's name with .rille.toml, in the present folder.
     """
-    from pipeline import init as command
+    from pipeline.commands import init as command
 
     return command.init(directory, output, force)
 
@@ -59,7 +59,7 @@ def calibrate(
     output
         YAML file to write.
     """
-    from pipeline import calibrate as command
+    from pipeline.commands import calibrate as command
 
     return command.calibrate(left, right, square=square, corners=corners, model=model, output=output, keep_bad=keep_bad)
 
@@ -100,7 +100,7 @@ def match(
         backmatch_error (pixels).
     """
     prepare()
-    from pipeline import match as command
+    from pipeline.commands import match as command
 
     return command.match_files(
         left,
@@ -134,7 +134,7 @@ def export(
     output
         What to write, for one form only; by default cloud.laz, terrain.glb or the folder colmap in the run's folder.
     """
-    from stages.errors import ConfigError
+    from stages.core.errors import ConfigError
 
     if output is not None and len(to) > 1:
         raise ConfigError(
@@ -149,13 +149,13 @@ def export(
 def _export(run: Path, kind: Literal["laz", "glb", "colmap"], output: Path | None, cache: str | None) -> str:
     """Write one form; what was written, in words."""
     if kind == "colmap":
-        from pipeline import colmap
-        from pipeline.store import at
+        from pipeline.engine.store.folder import at
+        from pipeline.export import colmap
 
         return str(colmap.export_run(run, output or run / kind, at(cache_folder(cache))))
-    from pipeline import cloud
+    from pipeline.export import point_cloud
 
-    path, words = cloud.export(run, kind, output)
+    path, words = point_cloud.export(run, kind, output)
     return f"{path}  {words}"
 
 
@@ -184,6 +184,6 @@ def compare_dem(
         Files to write, without ending.
     """
     prepare()
-    from pipeline import compare_dem as command
+    from pipeline.commands import compare_dem as command
 
     return command.compare(a, b, align=align, output=output)

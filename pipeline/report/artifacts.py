@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.report.view import RunView
-from stages.declare import Bundle
-from stages.geometry import Rig
+from stages.core.declare import Bundle
+from stages.geometry.geometry import Rig
 
 Floats = NDArray[Any]
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from pipeline.report.artifacts import Floats, used_rig
 from pipeline.report.view import RunView
-from stages.epipolar import distances
+from stages.geometry.epipolar import distances
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pipeline.report.artifacts import Floats, by_frame
 from pipeline.report.view import RunView
-from stages.declare import Bundle
+from stages.core.declare import Bundle
 
 
 @dataclass(frozen=True)

@@ -13,11 +13,11 @@ from pipeline.report.block import Block, Table
 from pipeline.report.canvas import Extent, Panel
 from pipeline.report.gather import Scene
 from pipeline.report.words import metres
-from stages.geometry import RigidTransform
-from stages.lattice import Lattice
+from stages.geometry.geometry import RigidTransform
+from stages.geometry.lattice import Lattice
 
 if TYPE_CHECKING:
-    from pipeline.drive import Driven
+    from pipeline.flow.closed_loop import Driven
 
 Floats = NDArray[Any]
 

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from pipeline.report import canvas
 from pipeline.report.canvas import Extent, Panel
-from stages.risk import HAZARDOUS
-from stages.validity import defined, matched
+from stages.core.validity import defined, matched
+from stages.hazard.risk import HAZARDOUS
 
 Floats = NDArray[Any]
 Bytes = NDArray[np.uint8]

@@ -12,7 +12,7 @@ from pipeline.report.block import Block, Gallery
 from pipeline.report.delivery import start_words
 from pipeline.report.gather import Scene
 from pipeline.report.words import length, spread
-from stages.declare import Bundle
+from stages.core.declare import Bundle
 
 
 def draw(scene: Scene, drawn: Mapping[str, Block] | None = None) -> Gallery:

@@ -16,10 +16,10 @@ from pipeline.report.canvas import Extent
 from pipeline.report.comparison import Comparison, compare
 from pipeline.report.overlap import Difference, differences
 from pipeline.report.view import RunView
-from stages.declare import Bundle
-from stages.geometry import RigidTransform
-from stages.lattice import Lattice, mosaic, union
-from stages.trajectory import world_poses
+from stages.core.declare import Bundle
+from stages.geometry.geometry import RigidTransform
+from stages.geometry.lattice import Lattice, mosaic, union
+from stages.odometry.resection.trajectory import world_poses
 
 NODATA: Mapping[str, float] = {"count": 0, "source": -1}
 """Of the arrays of merged terrain that are not floats."""

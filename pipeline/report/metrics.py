@@ -11,7 +11,7 @@ import numpy as np
 from pipeline.report import delivery, tables
 from pipeline.report.gather import Scene
 from pipeline.report.view import RunView
-from stages.trajectory_error import STEPS
+from stages.evaluation.trajectory_error import STEPS
 
 Metric = dict[str, Any]
 Rows = list[dict[str, Any]]

@@ -9,7 +9,7 @@ import numpy as np
 
 from pipeline.report import canvas
 from pipeline.report.view import RunView
-from stages.lattice import Lattice
+from stages.geometry.lattice import Lattice
 
 LEAST_CELLS = 100
 """Common cells below which a median says little."""

@@ -9,7 +9,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from pipeline.products import write_text
+from pipeline.export.writers import write_text
 from pipeline.report import gallery, summary, tables
 from pipeline.report.block import Block, Gallery
 from pipeline.report.gather import Scene

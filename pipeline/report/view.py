@@ -6,11 +6,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
-from stages.declare import Bundle
+from stages.core.declare import Bundle
 
 if TYPE_CHECKING:
     from datasets.protocol import Sequence
-    from pipeline.reconstruct import Products
+    from pipeline.flow.reconstruction import Products
 
 Status = Literal["computed", "cached", "failed", "skipped"]
 

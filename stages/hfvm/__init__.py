@@ -17,14 +17,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stages import pyramid
-from stages.declare import AnyArray, Array, Bundle, Inputs, Memory, Stage
+from stages.core.declare import AnyArray, Array, Bundle, Inputs, Memory, Stage
+from stages.core.validity import Mask, counts, matched
 from stages.hfvm import start, tiled
 from stages.hfvm.params import HfvmParams
 from stages.hfvm.tiled import Tell
 from stages.hfvm.views import Plain
-from stages.pyramid import Pyramid, PyramidParams
-from stages.validity import Mask, counts, matched
+from stages.imaging import pyramid
+from stages.imaging.pyramid import Pyramid, PyramidParams
 
 __all__ = ["OUTPUTS", "STAGE", "Disparity", "HfvmParams", "facts", "match", "match_pyramids"]
 
@@ -36,9 +36,10 @@ class Disparity:
     """Disparity vectors of the left image, right minus left: ``x_right = x_left + column_disparity``.
 
     All arrays are (row, col) of the left image. ``column_disparity, row_disparity``: float32 pixels, NaN undefined;
-    interpolated ones included. ``validity``: bits of :class:`~stages.validity.Validity`. ``backmatch_error``: float32
-    pixels, NaN where the match leaves the right image. ``distance``: float32 mean feature distance at the whole-pixel
-    match (byte steps; preset ``paper``: Eq. 1, grey levels), NaN where back-matching failed by far. ``disparity_std``:
+    interpolated ones included. ``validity``: bits of :class:`~stages.core.validity.Validity`. ``backmatch_error``:
+    float32 pixels, NaN where the match leaves the right image. ``distance``: float32 mean feature distance at the
+    whole-pixel match (byte steps; preset ``paper``: Eq. 1, grey levels), NaN where back-matching failed by far.
+    ``disparity_std``:
     float32 pixels, standard deviation of the column disparity (see :mod:`~stages.hfvm.uncertainty`), NaN where not
     ``MATCHED``. ``aligned``: whether the right image was pre-aligned by a plane.
     """
@@ -130,7 +131,7 @@ _GRID = ("row", "col")
 OUTPUTS = (
     Array("column_disparity", _GRID, "float32", "px", "column in the right image minus column", "nan", "left image"),
     Array("row_disparity", _GRID, "float32", "px", "row in the right image minus row", "nan", "left image"),
-    Array("validity", _GRID, "uint8", "1", "bit mask, see stages.validity", "", "left image"),
+    Array("validity", _GRID, "uint8", "1", "bit mask, see stages.core.validity", "", "left image"),
     Array("backmatch_error", _GRID, "float32", "px", "error of matching there and back", "nan", "left image"),
     Array("distance", _GRID, "float32", "1", "least feature distance", "nan", "left image"),
     Array("disparity_std", _GRID, "float32", "px", "standard deviation of the column disparity", "nan", "left image"),

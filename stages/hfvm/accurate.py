@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stages.declare import AnyArray
+from stages.core.declare import AnyArray
 from stages.hfvm import compact, paths
 from stages.hfvm.hierarchy import Band, FastSolver, Fine, Map, Solver, solver
 from stages.hfvm.params import HfvmParams

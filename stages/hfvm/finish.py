@@ -11,14 +11,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stages.declare import AnyArray
+from stages.core.declare import AnyArray
+from stages.core.validity import Validity, mark
 from stages.hfvm import consistency, epipolar, guided, hierarchy, lanes, plane, refine, relief, rowwise, uncertainty
 from stages.hfvm.hierarchy import Band, Map, Prepared
 from stages.hfvm.lanes import SUM_RADIUS
 from stages.hfvm.params import HfvmParams
 from stages.hfvm.views import View
 from stages.hfvm.window import Raster, Results, Window, around, blocks, cut, strips, whole
-from stages.validity import Validity, mark
 
 Rasters = Mapping[str, Raster]
 

@@ -18,7 +18,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.declare import AnyArray
+from stages.core.declare import AnyArray
 from stages.hfvm import consistency, epipolar, lookup, paper, propagation, search, subpixel
 from stages.hfvm.lanes import SUM_RADIUS
 from stages.hfvm.params import HfvmParams
@@ -37,7 +37,7 @@ from stages.hfvm.window import (
     tiles,
     whole,
 )
-from stages.pyramid import Pyramid
+from stages.imaging.pyramid import Pyramid
 
 FIT_SAMPLES = 500
 """Matches that a band or plane is fitted to; more change nothing that matters and cost time."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from stages.declare import AnyArray
+from stages.core.declare import AnyArray
 from stages.hfvm.subpixel import linear
 
 

@@ -7,8 +7,8 @@ from typing import Any, Literal
 
 from pydantic import Field, model_validator
 
-from stages.declare import Params
-from stages.features import PAPER_WEIGHTS
+from stages.core.declare import Params
+from stages.hfvm.features import PAPER_WEIGHTS
 
 Weights = tuple[float, float, float, float, float, float, float, float]
 

@@ -17,9 +17,9 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from stages.declare import AnyArray
-from stages.features import Words
+from stages.core.declare import AnyArray
 from stages.hfvm import path_lanes
+from stages.hfvm.features import Words
 from stages.hfvm.path_lanes import MOST, NONE, UNIT
 from stages.hfvm.propagation import pack_map, unpack
 

@@ -15,13 +15,13 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from stages import pyramid
-from stages.declare import AnyArray
+from stages.core.declare import AnyArray
 from stages.hfvm.epipolar import residuals, typical, weighted_normal
 from stages.hfvm.params import HfvmParams
 from stages.hfvm.resample import sample_cubic
 from stages.hfvm.window import Shape, Window, bounded, whole
-from stages.pyramid import Pyramid, PyramidParams
+from stages.imaging import pyramid
+from stages.imaging.pyramid import Pyramid, PyramidParams
 
 Matrix = NDArray[np.float64]
 

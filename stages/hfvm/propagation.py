@@ -10,10 +10,10 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from stages.features import distance
 from stages.hfvm import epipolar, lanes, strip_lanes
+from stages.hfvm.features import distance
 from stages.hfvm.lanes import LANES, SHARP
-from stages.line import copy_line
+from stages.numeric.line import copy_line
 
 MOST_STRIPS = 512
 """Room for the strips that a pixel searches: 9 centres, 17 rows each, 17 columns in three pieces."""

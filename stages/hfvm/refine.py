@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from stages.declare import AnyArray
+from stages.core.declare import AnyArray
 from stages.hfvm import rowwise
 from stages.hfvm.params import HfvmParams
 

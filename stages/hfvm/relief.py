@@ -19,12 +19,12 @@ import numpy as np
 import scipy
 from numba import njit
 
-from stages.declare import AnyArray
+from stages.core.declare import AnyArray
 from stages.hfvm import epipolar
 from stages.hfvm.hierarchy import evenly
 from stages.hfvm.params import HfvmParams
 from stages.hfvm.refine import FARTHEST
-from stages.windows import window_sum
+from stages.numeric.windows import window_sum
 
 MEAN_SIDE = 9
 """Pixels: window of the local mean; brightness varies more slowly."""

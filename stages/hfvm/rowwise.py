@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit
 
 from stages.hfvm import lanes
-from stages.line import copy_line
+from stages.numeric.line import copy_line
 
 PLANES = 10
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from stages.features import distance
+from stages.hfvm.features import distance
 from stages.hfvm.lanes import FAR
 
 NONE = np.iinfo(np.int32).max

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.declare import AnyArray
-from stages.errors import InputError
+from stages.core.declare import AnyArray
+from stages.core.errors import InputError
 from stages.hfvm import hierarchy, plane
 from stages.hfvm.window import whole
 

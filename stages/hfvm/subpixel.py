@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from stages.features import distance
 from stages.hfvm import lanes
+from stages.hfvm.features import distance
 from stages.hfvm.lanes import SUM_RADIUS
 
 NOTHING, ALONE, SUMMED = 0, 1, 2

@@ -1,4 +1,5 @@
-"""The matcher as a composition of windows: of images in memory here, as tasks of the engine in ``stages.hfvm_tile``.
+"""The matcher as a composition of windows: of images in memory here, as tasks of the engine in
+``stages.hfvm.tile_stage``.
 
 ::
 
@@ -15,14 +16,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stages.declare import AnyArray
+from stages.core.declare import AnyArray
+from stages.core.validity import matched
 from stages.hfvm import accurate, hierarchy, plane, refine, resample, start
 from stages.hfvm.finish import Finish
 from stages.hfvm.hierarchy import Prepared, State
 from stages.hfvm.params import HfvmParams
 from stages.hfvm.views import Aligned, Plain, Seen, View
 from stages.hfvm.window import Raster, Results, Shape, Window, cut, gather, tiles, whole
-from stages.validity import matched
 
 Tell = Callable[[float, str], None]
 """Called with the share of the work done, 0..1, and what comes next in words."""

@@ -26,7 +26,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from stages.declare import AnyArray
+from stages.core.declare import AnyArray
 from stages.hfvm import rowwise
 from stages.hfvm.params import HfvmParams
 

@@ -8,12 +8,12 @@ from typing import Protocol
 
 import numpy as np
 
-from stages import features, pyramid
-from stages.declare import AnyArray
-from stages.hfvm import paper, plane
+from stages.core.declare import AnyArray
+from stages.hfvm import features, paper, plane
 from stages.hfvm.params import HfvmParams
 from stages.hfvm.window import Raster, Shape, Window, cut, tiles, whole
-from stages.pyramid import Pyramid
+from stages.imaging import pyramid
+from stages.imaging.pyramid import Pyramid
 
 STRIP = 256
 """Rows whose features are computed at once where many are wanted: their room is small beside the result."""
@@ -37,7 +37,8 @@ class View(Protocol):
         """Mask, uint8, 1 = usable."""
 
     def filled(self, level: int, window: Window) -> AnyArray:
-        """As ``grey``; masked pixels carry the grey of the next valid level above (:func:`stages.pyramid.filled`)."""
+        """As ``grey``; masked pixels carry the grey of the next valid level above
+        (:func:`stages.imaging.pyramid.filled`)."""
 
 
 @dataclass(frozen=True)
@@ -181,7 +182,7 @@ class Aligned:
 
 
 def pyramid_shapes(shape: Shape, levels: int, min_side: int = pyramid.PyramidParams().min_side) -> list[Shape]:
-    """Rows and columns of the levels of :func:`stages.pyramid.build` for at most so many levels."""
+    """Rows and columns of the levels of :func:`stages.imaging.pyramid.build` for at most so many levels."""
     found = [shape]
     while len(found) < levels and min(found[-1]) >= 2 * min_side:
         found.append(((found[-1][0] + 1) // 2, (found[-1][1] + 1) // 2))

@@ -9,7 +9,7 @@ import pytest
 
 from datasets.mockup.params import MockupParams
 from datasets.protocol import Source
-from stages.declare import Bundle, check_outputs
+from stages.core.declare import Bundle, check_outputs
 
 TINY = {
     "frames": 3,

@@ -25,10 +25,12 @@ from datasets.cameras import read_cameras, rig_of
 from datasets.inspection import inspect
 from datasets.manifest import open_manifest
 from datasets.registry import open_sequence
-from pipeline import config, objects, store
-from pipeline.catalogue import Catalogue, _head
-from pipeline.products import read_disparity
-from stages.errors import RilleError
+from pipeline.engine.store import folder as store
+from pipeline.engine.store import s3
+from pipeline.engine.store.index import Catalogue, _head
+from pipeline.export.writers import read_disparity
+from pipeline.flow import config
+from stages.core.errors import RilleError
 
 SEEDS = Path(__file__).parents[1] / "seeds"
 
@@ -103,13 +105,13 @@ def euroc(path: Path) -> None:
 
 def packed(path: Path) -> None:
     data = path.read_bytes()
-    _values_alone(lambda: objects._unpack("index", data))
+    _values_alone(lambda: s3._unpack("index", data))
 
 
 def index(path: Path) -> None:
     """Content that is wrong behind a checksum that is right."""
     data = path.read_bytes()
-    _values_alone(lambda: objects._unpack("index", gzip.compress(hashlib.sha256(data).digest() + data, 1)))
+    _values_alone(lambda: s3._unpack("index", gzip.compress(hashlib.sha256(data).digest() + data, 1)))
 
 
 def artifact(path: Path) -> None:
@@ -172,7 +174,7 @@ ENTRY = [1, 2, 3, 4, "b" * 64, "p", 48, 420, {"frame": 0}, {"zarr.json": 300}]
 MADE: dict[str, bytes] = {
     "artifact/made": json.dumps(MANIFEST).encode(),
     "index/made": json.dumps({f"manifests/numbers/{'a' * 64}.json": ["etag", MANIFEST]}).encode(),
-    "packed/made": objects._pack({f"manifests/numbers/{'a' * 64}.json": ("etag", MANIFEST)})[1],
+    "packed/made": s3._pack({f"manifests/numbers/{'a' * 64}.json": ("etag", MANIFEST)})[1],
     "catalogue/made": "".join(f"{k:064d} {json.dumps(ENTRY, separators=(',', ':'))}\n" for k in range(3)).encode(),
 }
 """Seeds of what Rille itself writes, without the checksum in front."""

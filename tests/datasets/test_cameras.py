@@ -4,8 +4,8 @@ import pytest
 from raising import raises
 
 from datasets.cameras import UNKNOWN_SIZE, CalibratedCamera, read_cameras, rig_of
-from stages.geometry import Camera, RigidTransform, rotation_exp
-from stages.lens import Lens
+from stages.geometry.geometry import Camera, RigidTransform, rotation_exp
+from stages.geometry.lens import Lens
 
 SIZE = (640, 480)
 ROTATION = rotation_exp([0.01, -0.02, 0.03])

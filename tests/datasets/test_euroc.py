@@ -9,7 +9,7 @@ from raising import raises
 
 from datasets.euroc import open_euroc, recognise
 from datasets.files import Digests
-from stages.geometry import RigidTransform, rotation_exp
+from stages.geometry.geometry import RigidTransform, rotation_exp
 
 START = 1403715273262142976
 STEP = 50_000_000

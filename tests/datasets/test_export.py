@@ -13,7 +13,7 @@ from scipy.ndimage import map_coordinates
 from datasets.export import export
 from datasets.mockup import sequence as seq
 from datasets.registry import open_sequence
-from stages.geometry import Rig, RigidTransform
+from stages.geometry.geometry import Rig, RigidTransform
 
 
 @pytest.fixture(scope="module")

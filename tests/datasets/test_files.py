@@ -9,8 +9,8 @@ from raising import raises
 
 from datasets import files, files16
 from datasets.files import Digests
-from stages.declare import NoParams, check_outputs
-from stages.errors import InputError
+from stages.core.declare import NoParams, check_outputs
+from stages.core.errors import InputError
 
 
 @pytest.fixture

@@ -17,7 +17,7 @@ from datasets.manifest import dotted, open_manifest
 from datasets.manifest_model import Manifest, known_keys, read_manifest, tables
 from datasets.manifest_rig import off_centre
 from datasets.protocol import Sequence
-from stages.geometry import Camera, RigidTransform, rotation_exp
+from stages.geometry.geometry import Camera, RigidTransform, rotation_exp
 
 
 def opened(path: Path) -> Sequence:

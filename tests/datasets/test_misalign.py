@@ -14,9 +14,9 @@ from datasets.misalign import MisalignParams, misalign, origins, warp
 from datasets.mockup.params import SHORT, MockupParams
 from datasets.mockup.sequence import mockup
 from datasets.protocol import Source
-from stages.declare import Bundle, NoParams, check_outputs
-from stages.geometry import Camera, rotation_exp
-from stages.lens import Lens
+from stages.core.declare import Bundle, NoParams, check_outputs
+from stages.geometry.geometry import Camera, rotation_exp
+from stages.geometry.lens import Lens
 
 CAMERA = Camera(120.0, 118.0, 47.0, 31.0, 96, 64)
 PINHOLE = Lens(CAMERA)

@@ -15,7 +15,7 @@ from datasets.mockup.params import MockupParams, SceneParams
 from datasets.mockup.scene import build_scene, height_field
 from datasets.mockup.truth import HIDDEN, NO_BED, OUTSIDE, SEEN, true_disparity
 from datasets.mockup.truth_dem import seen_by, true_dem
-from stages.geometry import RigidTransform, level_rotation, rotation_exp
+from stages.geometry.geometry import RigidTransform, level_rotation, rotation_exp
 
 
 @pytest.fixture(scope="module")
@@ -339,7 +339,7 @@ def test_a_sloped_bed_is_seen_as_a_level_one_is() -> None:
 
 
 def test_bed_challenges_the_rover():
-    from stages.risk import risk_map
+    from stages.hazard.risk import risk_map
 
     for kind in ({}, {"seed": 7}):
         p = SceneParams(bed_width=1.0, bed_length=1.0, **kind)

@@ -13,7 +13,7 @@ from datasets import files, reading
 from datasets.cameras import read_cameras
 from datasets.headers import read_header
 from datasets.reading import Search, read_bytes, read_lines, read_toml
-from stages.errors import InputError
+from stages.core.errors import InputError
 
 
 def refused(code, call, *args):

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from raising import raises
 
 from datasets.times import UNITS, gaps, seconds
-from stages.errors import InputError
+from stages.core.errors import InputError
 
 
 @pytest.mark.parametrize(

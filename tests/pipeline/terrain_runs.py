@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from datasets.georeference import Georeference
-from pipeline.products import write_raster, write_trajectory_kitti
-from stages.lattice import Lattice
+from pipeline.export.writers import write_raster, write_trajectory_kitti
+from stages.geometry.lattice import Lattice
 
 LATTICE = Lattice.at(-20, 90, 0.05, 60, 70)
 PLACE = Georeference("EPSG:32633", (500100.0, 5200200.0, 1800.0), 0.6)

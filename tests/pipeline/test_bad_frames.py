@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from raising import raises
 
-from pipeline import run
+from pipeline.runs import session
 
 pytestmark = pytest.mark.slow
 
@@ -24,7 +24,7 @@ PLAIN = ("select.stride=3", "locus.cell_size=0.006", "hfvm.preset=fast", "crossc
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the sequence ``good`` and a cache that all runs share, so that each computes little."""
     folder = tmp_path_factory.mktemp("bad")
-    run.export_dataset("mockup-short", folder / "good", SMALL, folder / "cache")
+    session.export_dataset("mockup-short", folder / "good", SMALL, folder / "cache")
     return folder
 
 
@@ -36,10 +36,10 @@ def reconstruct(
     shutil.copytree(place / "good", folder)
     spoil(folder)
     capsys.readouterr()
-    options = run.Options(
+    options = session.Options(
         str(folder), PLAIN, executor="inline", progress="quiet", runs=place / "runs", cache=place / "cache"
     )
-    code = run.reconstruct(options)
+    code = session.reconstruct(options)
     return code, capsys.readouterr().err, (place / "runs" / name / "latest").resolve()
 
 
@@ -91,7 +91,7 @@ def test_a_bad_frame_is_lost_named_and_bridged(
 ) -> None:
     name = request.node.callspec.id.replace(" ", "_").replace(",", "")
     code, err, folder = reconstruct(place, name, spoil, capsys)
-    assert code == run.HOLES
+    assert code == session.HOLES
     assert says in err
     assert f"bridged from {frame - 1} to {frame + 1}" in err
     assert "incomplete: 7 of 8 frames posed" in err
@@ -107,7 +107,7 @@ def test_a_bad_frame_is_lost_named_and_bridged(
 
 def test_a_blurred_frame_is_posed_but_nothing_is_built_on_it(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     code, err, folder = reconstruct(place, "blurred", change(3, lambda i: cv2.GaussianBlur(i, (0, 0), 2.5)), capsys)
-    assert code == run.COMPLETE
+    assert code == session.COMPLETE
     assert "frame 3 is not used as basic pair: blurred left image" in err
     report = json.loads((folder / "report.json").read_text())
     assert 3 not in report["sequence"]["basic_pairs"]
@@ -120,7 +120,7 @@ def test_a_repeated_frame_does_not_move(place: Path, capsys: pytest.CaptureFixtu
             shutil.copy(source, target)
 
     code, err, folder = reconstruct(place, "repeated", repeat, capsys)
-    assert code == run.COMPLETE
+    assert code == session.COMPLETE
     assert "frame 5 repeats the left image of frame 4" in err
     at = positions(folder)
     assert np.linalg.norm(at[5] - at[4]) < 2e-5
@@ -137,7 +137,7 @@ def test_a_break_makes_pieces_and_the_world_of_the_largest(place: Path, capsys: 
                 assert cv2.imwrite(str(path), np.ascontiguousarray(image[:, ::-1]))
 
     code, err, folder = reconstruct(place, "broken", elsewhere, capsys)
-    assert code == run.HOLES
+    assert code == session.HOLES
     assert "piece 1: frames 0-4, piece 2: frames 5-7" in err
     assert "incomplete: 8 of 8 frames posed, 5 in the world, in 2 pieces" in err
     report = json.loads((folder / "report.json").read_text())

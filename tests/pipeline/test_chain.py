@@ -19,11 +19,11 @@ import xarray
 from raising import raises
 
 from datasets.registry import open_sequence
-from pipeline import run, standing
-from pipeline.dag import Graph
-from pipeline.ledger import read
-from pipeline.store import Store
-from pipeline.upkeep import artifacts
+from pipeline.engine.events import read
+from pipeline.engine.graph import Graph
+from pipeline.engine.store.folder import Store
+from pipeline.engine.store.maintenance import artifacts
+from pipeline.runs import session, unchanged
 
 SMALL = (
     "mockup.frames=5",
@@ -36,9 +36,9 @@ SMALL = (
 )
 
 
-def options(folder: Path, *more: str, **kw: Any) -> run.Options:
+def options(folder: Path, *more: str, **kw: Any) -> session.Options:
     defaults: dict[str, Any] = {"executor": "inline", "progress": "quiet", "cache": folder / "cache"}
-    return run.Options("mockup-short", assignments=(*SMALL, *more), runs=folder / "runs", **(defaults | kw))
+    return session.Options("mockup-short", assignments=(*SMALL, *more), runs=folder / "runs", **(defaults | kw))
 
 
 def latest(folder: Path) -> Path:
@@ -60,7 +60,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 @pytest.fixture(scope="module")
 def cold(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("chain")
-    assert run.reconstruct(options(folder)) == 0
+    assert session.reconstruct(options(folder)) == 0
     return folder
 
 
@@ -113,9 +113,9 @@ def test_the_same_again_computes_nothing(cold: Path, monkeypatch: pytest.MonkeyP
     def no_worker(*args: object, **kw: object) -> None:
         raise AssertionError("a worker was started")
 
-    monkeypatch.setattr("pipeline.driver.make", no_worker)
+    monkeypatch.setattr("pipeline.engine.scheduler.make", no_worker)
     before = digests(cold)
-    assert run.reconstruct(options(cold, executor="processes", fresh=True)) == 0
+    assert session.reconstruct(options(cold, executor="processes", fresh=True)) == 0
     assert computed(cold) == set()
     assert digests(cold) == before
 
@@ -123,21 +123,21 @@ def test_the_same_again_computes_nothing(cold: Path, monkeypatch: pytest.MonkeyP
 def test_where_nothing_is_new_the_latest_run_stands(
     cold: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert run.reconstruct(options(cold)) == 0
+    assert session.reconstruct(options(cold)) == 0
     stands = latest(cold)
     written = contents(stands)
     folders = set(stands.parent.iterdir())
     capsys.readouterr()
     with monkeypatch.context() as patch:
-        patch.setattr("pipeline.outputs.write", lambda *_: pytest.fail("something was drawn"))
-        assert run.reconstruct(options(cold)) == 0
+        patch.setattr("pipeline.export.run_files.write", lambda *_: pytest.fail("something was drawn"))
+        assert session.reconstruct(options(cold)) == 0
     assert capsys.readouterr().out.split()[0] == str(stands)
     assert set(stands.parent.iterdir()) == folders
     assert contents(stands) == written
 
     def draws(why: str, **options_: Any) -> None:
         before = latest(cold)
-        assert run.reconstruct(options(cold, **options_)) == 0
+        assert session.reconstruct(options(cold, **options_)) == 0
         assert latest(cold) != before, why
 
     (stands / "path.geojson").write_text("edited")
@@ -148,18 +148,18 @@ def test_where_nothing_is_new_the_latest_run_stands(
     draws("a file in a folder of the run has gone")
     draws("it was asked for", fresh=True)
     draws("a stage was forced", force=frozenset({"select"}))
-    monkeypatch.setattr("pipeline.run._versions", lambda: {"matplotlib": "0"})
+    monkeypatch.setattr("pipeline.runs.session._versions", lambda: {"matplotlib": "0"})
     draws("another version of a package")
 
 
 def test_what_is_found_damaged_when_it_is_drawn_is_computed_again(
     cold: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert run.reconstruct(options(cold)) == 0
+    assert session.reconstruct(options(cold)) == 0
     before = digests(cold)
     chunk = next((cold / "cache").glob("artifacts/merge/*/*/a-*/ortho/c.0.0"))
     chunk.write_bytes(bytes(chunk.stat().st_size))
-    assert run.reconstruct(options(cold, fresh=True)) == 0
+    assert session.reconstruct(options(cold, fresh=True)) == 0
     assert "is damaged" in capsys.readouterr().err
     assert {label.split("/")[0] for label in computed(cold)} == {"merge"}
     assert digests(cold) == before
@@ -168,28 +168,28 @@ def test_what_is_found_damaged_when_it_is_drawn_is_computed_again(
 def test_a_stamp_sees_what_no_key_sees(cold: Path) -> None:
     sequence = open_sequence("mockup-short")
     stamps = {
-        standing.stamp(Graph(), s, {}, command="a")
+        unchanged.stamp(Graph(), s, {}, command="a")
         for s in (sequence, replace(sequence, notes=("other",)), replace(sequence, times=(0.0,) * 9))
     }
-    stamps |= {standing.stamp(Graph(), sequence, {}, command="b"), standing.stamp(Graph(), sequence, {"x": "1"})}
+    stamps |= {unchanged.stamp(Graph(), sequence, {}, command="b"), unchanged.stamp(Graph(), sequence, {"x": "1"})}
     assert len(stamps) == 5
-    assert standing.stamp(Graph(), open_sequence("mockup-short"), {}, command="a") in stamps
+    assert unchanged.stamp(Graph(), open_sequence("mockup-short"), {}, command="a") in stamps
 
 
 def test_one_risk_parameter_reruns_risk_path_and_what_reads_them(cold: Path) -> None:
-    assert run.reconstruct(options(cold, "risk.max_hole=0.25")) == 0
+    assert session.reconstruct(options(cold, "risk.max_hole=0.25")) == 0
     stages = {label.split("/")[0] for label in computed(cold)}
     assert stages == {"risk", "path", "path_check"}
 
 
 def test_one_vehicle_limit_reruns_the_same(cold: Path) -> None:
-    assert run.reconstruct(options(cold, "vehicle.max_slope_deg=12")) == 0
+    assert session.reconstruct(options(cold, "vehicle.max_slope_deg=12")) == 0
     assert {label.split("/")[0] for label in computed(cold)} == {"risk", "path", "path_check"}
 
 
 def test_what_the_data_do_not_determine_is_missing_and_the_rest_is_delivered(cold: Path, tmp_path: Path) -> None:
     folder = tmp_path / "runs"
-    assert run.reconstruct(replace(options(cold, "vehicle.track=5.0"), runs=folder)) == 3
+    assert session.reconstruct(replace(options(cold, "vehicle.track=5.0"), runs=folder)) == 3
     latest = folder / "mockup-short" / "latest"
     assert {"dem.tif", "trajectory.tum", "report.html"} <= {p.name for p in latest.iterdir()}
     report = json.loads((latest / "report.json").read_text())
@@ -198,16 +198,16 @@ def test_what_the_data_do_not_determine_is_missing_and_the_rest_is_delivered(col
 
     # one model without a cell: the world is made of the others
     behind = options(cold, "locus.extent=[-0.1, 0.1, -9.0, -8.9]")
-    assert run.reconstruct(replace(behind, runs=folder)) == 3
+    assert session.reconstruct(replace(behind, runs=folder)) == 3
     written = {p.name for p in latest.iterdir()}
     assert {"trajectory.tum", "report.html"} <= written
     assert "dem.tif" not in written
 
 
 def test_written_configuration_repeats_the_run(cold: Path) -> None:
-    assert run.reconstruct(options(cold)) == 0
+    assert session.reconstruct(options(cold)) == 0
     first = digests(cold)
-    again = run.Options(
+    again = session.Options(
         "mockup-short",
         config=latest(cold) / "config.toml",
         runs=cold / "runs",
@@ -216,13 +216,13 @@ def test_written_configuration_repeats_the_run(cold: Path) -> None:
         progress="quiet",
         fresh=True,
     )
-    assert run.reconstruct(again) == 0
+    assert session.reconstruct(again) == 0
     assert computed(cold) == set()
     assert digests(cold) == first
 
 
 def test_two_workers_killed_on_the_way_give_the_same_bits(cold: Path, tmp_path: Path) -> None:
-    assert run.reconstruct(options(cold)) == 0
+    assert session.reconstruct(options(cold)) == 0
     command = [sys.executable, "-m", "pipeline.cli", "reconstruct", "mockup-short", "--jobs", "2", "--quiet"]
     command += [w for a in SMALL for w in ("--set", a)]
     command += ["--cache", str(tmp_path / "cache"), "--runs", str(tmp_path / "runs")]
@@ -238,10 +238,10 @@ def test_two_workers_killed_on_the_way_give_the_same_bits(cold: Path, tmp_path: 
 
 
 def test_frames_are_chosen_strictly() -> None:
-    assert run.choose_frames("2:8:3", 9) == (2, 5)
-    assert run.choose_frames(None, 3) == (0, 1, 2)
-    assert run.choose_frames("4:5", 9) == (4,)
+    assert session.choose_frames("2:8:3", 9) == (2, 5)
+    assert session.choose_frames(None, 3) == (0, 1, 2)
+    assert session.choose_frames("4:5", 9) == (4,)
     refused = {"3": "056", "a:b": "055", "0:10": "057", "5:5": "058", "-3:5": "056", "0:9:0": "056"}
     for bad, number in refused.items():
         with raises(f"RIL-{number}"):
-            run.choose_frames(bad, 9)
+            session.choose_frames(bad, 9)

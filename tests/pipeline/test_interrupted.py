@@ -1,12 +1,13 @@
 """Ctrl-C in a command: the documented sentence, and exit code 130."""
 
-from pipeline import cli, run
+from pipeline import cli
+from pipeline.runs import session
 
 
 def test_ctrl_c_says_what_the_documents_say(monkeypatch, capsys):
     def interrupted(options):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(run, "reconstruct", interrupted)
+    monkeypatch.setattr(session, "reconstruct", interrupted)
     assert cli._run(["reconstruct", "mockup-short"]) == 130
     assert capsys.readouterr().err == "rille: interrupted; the same command resumes from here\n"

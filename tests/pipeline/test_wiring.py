@@ -8,10 +8,10 @@ from typing import Any
 import pytest
 
 from datasets.registry import open_sequence
-from pipeline import config
-from pipeline.dag import Graph
-from pipeline.drive import Drive
-from pipeline.reconstruct import Reconstruction
+from pipeline.engine.graph import Graph
+from pipeline.flow import config
+from pipeline.flow.closed_loop import Drive
+from pipeline.flow.reconstruction import Reconstruction
 
 HERE = [1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0]
 BOX = {"x0": 0.0, "y0": 0.0, "cell": 0.01, "rows": 4, "cols": 4}

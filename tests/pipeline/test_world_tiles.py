@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline import driver, ledger
-from pipeline.config import STAGE_MODULES
-from pipeline.dag import Graph
-from pipeline.reconstruct import merge_tiles
-from pipeline.store import Store
-from stages.declare import NoParams
-from stages.merge import MergeParams
+from pipeline.engine import events, scheduler
+from pipeline.engine.graph import Graph
+from pipeline.engine.store.folder import Store
+from pipeline.flow.config import STAGE_MODULES
+from pipeline.flow.reconstruction import merge_tiles
+from stages.core.declare import NoParams
+from stages.terrain.merge import MergeParams
 
 SIDE = 16
 PLACES = {0: (0, 0), 4: (9, 3), 8: (22, -5), 12: (40, 2), 16: (-14, -30), 20: (33, -28)}
@@ -39,8 +39,8 @@ def run(
     cut = {"side": SIDE, "margin": merging.margin}
     prints = [node("footprint", f"footprint/{k}", cut, dem=dem) for k, dem in dems.items()]
     graph.expand(prints, lambda *found: merge_tiles(node, [f.meta for f in found], dems, steps or {}) and None)
-    driver.run(graph, Store(cache), executor=executor, jobs=2, ledger=cache / "ledger.jsonl").check()
-    rows = ledger.read(cache / "ledger.jsonl")
+    scheduler.run(graph, Store(cache), executor=executor, jobs=2, ledger=cache / "ledger.jsonl").check()
+    rows = events.read(cache / "ledger.jsonl")
     again = {r["label"] for r in rows if r["stage"] == "merge" and r["status"] == "computed"}
     return again, {r["label"]: r["digest"] for r in rows if r["stage"] == "merge"}, {h.label: h for h in graph.nodes}
 
@@ -88,7 +88,7 @@ def test_order_of_models_and_number_of_workers_change_no_bit(tmp_path: Path, hol
 
 def test_closed_holes_do_not_see_the_cut_into_tiles(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The same world cut otherwise is the same, to the bit, though holes lie across the cuts."""
-    from stages.lattice import Lattice, mosaic
+    from stages.geometry.lattice import Lattice, mosaic
 
     all_ = Lattice.at(-20, 10, 0.5, 70, 90)
 

@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 
-from stages.adjustment import Matches
-from stages.epipolar import corrected
-from stages.geometry import Camera, Rig, RigidTransform, rotation_exp
+from stages.calibration.relative_orientation import Matches
+from stages.geometry.epipolar import corrected
+from stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
 
 
 def street_rig() -> Rig:

@@ -1,6 +1,6 @@
 """Vehicles that several tests put on their ground."""
 
-from stages.vehicle import Vehicle
+from stages.hazard.vehicle import Vehicle
 
 MODEL = Vehicle(
     name="model",

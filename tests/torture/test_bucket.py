@@ -9,10 +9,10 @@ import servers
 from raising import raises
 from torn import chain, look
 
-from pipeline import bucket as requests
-from pipeline import driver
-from pipeline.dag import Graph
-from pipeline.store import at
+from pipeline.engine import scheduler
+from pipeline.engine.graph import Graph
+from pipeline.engine.store import s3_client as requests
+from pipeline.engine.store.folder import at
 
 METHODS = {"refuse": ("GET", "PUT", "POST"), "deafen": ("PUT",), "cut": ("GET",)}
 WORDS = {
@@ -54,7 +54,7 @@ def test_a_server_in_trouble(calm, bucket, through, row, monkeypatch, how):
         for _ in range(2):  # cold, then warm
             graph = Graph()
             chain.build(graph)
-            result = driver.run(graph, at(f"{prefix}/{trial}"), executor="threads", jobs=3)
+            result = scheduler.run(graph, at(f"{prefix}/{trial}"), executor="threads", jobs=3)
             computed += result.total().computed
             wrong += [h.label for h in graph.nodes if h.ref is None or h.ref.digest != calm["labels"][h.label]]
         found = look.published(f"{prefix}/{trial}")
@@ -69,7 +69,7 @@ def test_a_store_that_ignores_conditional_puts_is_refused(calm, bucket, through,
     prefix = bucket[0]
     graph = Graph()
     chain.build(graph, frames=2, size=20)
-    driver.run(graph, at(prefix), executor="inline").check()
+    scheduler.run(graph, at(prefix), executor="inline").check()
     before = {e.path: e.etag for e in at(prefix).bucket.list("")}
     proxy = through(lambda *_: "blind")
     for place in (prefix, f"{prefix}/new"):

@@ -15,10 +15,11 @@ import pytest
 from torn import chain, look
 from torn.faults import Faults
 
-from pipeline import catalogue, driver, upkeep
-from pipeline.dag import Graph
-from pipeline.store import NonDeterministicError, Store, StoreError
-from stages.declare import NoParams
+from pipeline.engine import scheduler
+from pipeline.engine.graph import Graph
+from pipeline.engine.store import index, maintenance
+from pipeline.engine.store.folder import NonDeterministicError, Store, StoreError
+from stages.core.declare import NoParams
 
 WAYS = {
     "truncate": lambda data, rng: data[: rng.randrange(len(data))],
@@ -57,7 +58,7 @@ SMALL = 3
 @pytest.fixture(autouse=True)
 def _no_waiting_for_the_disk(monkeypatch):
     monkeypatch.setattr(os, "fsync", lambda handle: None)
-    monkeypatch.setattr(catalogue, "RACY", 0)  # a run lies between a copy and its damage
+    monkeypatch.setattr(index, "RACY", 0)  # a run lies between a copy and its damage
 
 
 @pytest.fixture(scope="module")
@@ -74,9 +75,9 @@ def run(cache, **options):
     force = options.pop("force", ())
     chain.build(graph, frames=SMALL, size=40, **options)
     try:
-        result = driver.run(graph, Store(cache), executor="inline", keep_going=True, force=force)
+        result = scheduler.run(graph, Store(cache), executor="inline", keep_going=True, force=force)
     except StoreError as error:  # refused before anything is computed
-        result = driver.Result(failures=[driver.Failure("the cache", "", error, "")])
+        result = scheduler.Result(failures=[scheduler.Failure("the cache", "", error, "")])
     return graph, result
 
 
@@ -125,7 +126,7 @@ def test_damage_of_one_file(small, tmp_path, row, rounds):
                 expected += SMALL + healed
 
                 # what nobody reads is found by comparing everything
-                _, found = upkeep.verify(Store(cache))
+                _, found = maintenance.verify(Store(cache))
                 assert len(found) == (artifact and not seen and not healed), (kind, way, found)
                 graph, result = run(cache)
                 wrong += look.wrong(digests(graph), small["digests"])
@@ -171,7 +172,7 @@ def test_disk_full_at_a_step(small, tmp_path, row, monkeypatch, code, every):
             assert onwards or result.failures or len(found) == len(small["digests"])
             lost += sorted(look.manifests(cache) - set(found)) + sorted({*digests(graph)} - {*found})
             wrong += look.wrong(found, small["digests"])
-            cleared = upkeep.gc(Store(cache), found, grace=-1.0)
+            cleared = maintenance.gc(Store(cache), found, grace=-1.0)
             orphans += cleared.orphans
             assert cleared.artifacts == 0
             left = [p for p in cache.rglob("*") if p.suffix == ".tmp" or ".partial" in p.name]
@@ -248,7 +249,7 @@ def test_shuffled_order(calm, tmp_path, row, seeds):
         graph = Graph()
         chain.build(graph, shuffle=seed)
         executor = ("inline", "threads")[seed % 2]
-        result = driver.run(graph, Store(tmp_path / str(seed)), executor=executor, jobs=3)
+        result = scheduler.run(graph, Store(tmp_path / str(seed)), executor=executor, jobs=3)
         computed += result.total().computed
         wrong += [h.label for h in graph.nodes if h.ref.digest != calm["labels"][h.label]]
     row("shuffled order of tasks", seeds, [], wrong, computed, seeds * len(calm["digests"]), "inline and threads")
@@ -263,7 +264,7 @@ def test_a_stage_that_is_not_deterministic_is_detected(tmp_path, row):
         graph = Graph()
         node = graph.node("toys.mischief", "random", NoParams(), {"what": "random"})
         graph.node("torn.reader", "reader", NoParams(), inputs={"values": node})
-        result = driver.run(graph, Store(cache), executor="inline", keep_going=True, **options)
+        result = scheduler.run(graph, Store(cache), executor="inline", keep_going=True, **options)
         caught += any(isinstance(f.error, NonDeterministicError) for f in result.failures)
         return graph, result
 

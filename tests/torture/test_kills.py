@@ -13,8 +13,8 @@ import psutil
 import pytest
 from torn import look
 
-from pipeline import upkeep
-from pipeline.store import Store
+from pipeline.engine.store import maintenance
+from pipeline.engine.store.folder import Store
 
 WITHIN = 5.0
 """Seconds that an interrupted program may take to leave; held to where all cases are tried."""
@@ -231,4 +231,4 @@ def test_a_worker_out_of_memory_is_named_with_its_memory(programs, calm, tmp_pat
     row(
         "a worker runs out of memory", 1, [], wrong, computed, len(calm["digests"]), hog["why"].split(":", 1)[1].strip()
     )
-    assert upkeep.verify(Store(cache))[1] == []
+    assert maintenance.verify(Store(cache))[1] == []

@@ -19,9 +19,9 @@ import xarray
 from test_damage import WAYS
 from torn import look
 
-from pipeline import ledger
-from pipeline.artifact import DamagedError, array_digests, output_digest
-from pipeline.store import Store
+from pipeline.engine import events
+from pipeline.engine.store.artifact import DamagedError, array_digests, output_digest
+from pipeline.engine.store.folder import Store
 
 SMALL = (
     *("mockup.frames=5", "mockup.image_width=285", "mockup.image_height=260", "mockup.focal_length=300.0"),
@@ -39,7 +39,7 @@ def command(where, *more, progress="quiet"):
 
 def rows(where):
     latest = where / "runs" / "mockup-short" / "latest"
-    return {r["label"]: r for r in ledger.read(latest / "ledger.jsonl")}
+    return {r["label"]: r for r in events.read(latest / "ledger.jsonl")}
 
 
 def begin(where, *more, **options):
@@ -192,6 +192,6 @@ def test_workers_killed_mid_tile(whole, tmp_path, row):
 
 
 def upkeep_finds_nothing(cache):
-    from pipeline import upkeep
+    from pipeline.engine.store import maintenance
 
-    return upkeep.verify(Store(cache), deep=True)[1] == []
+    return maintenance.verify(Store(cache), deep=True)[1] == []

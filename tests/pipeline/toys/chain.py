@@ -8,7 +8,7 @@ from pathlib import Path
 
 def build(graph, frames=4, seed=0, size=40, offset=0.0):
     """Numbers -> scale (per frame) -> total, the parts by expansion."""
-    from stages.declare import NoParams
+    from stages.core.declare import NoParams
     from toys.numbers import NumbersParams
     from toys.scale import ScaleParams
 
@@ -29,13 +29,13 @@ def build(graph, frames=4, seed=0, size=40, offset=0.0):
 
 def main(cache, executor="inline", what="", ledger=""):
     """Run it, and say what became of it."""
-    from pipeline.executor import prepare_environment
+    from pipeline.engine.executors.base import prepare_environment
 
     prepare_environment()
-    from pipeline import driver
-    from pipeline.dag import Graph
-    from pipeline.store import Store
-    from stages.declare import NoParams
+    from pipeline.engine import scheduler
+    from pipeline.engine.graph import Graph
+    from pipeline.engine.store.folder import Store
+    from stages.core.declare import NoParams
 
     graph = Graph()
     build(graph, frames=12 if what == "many" else 4, size=400 if what == "many" else 40)
@@ -43,7 +43,7 @@ def main(cache, executor="inline", what="", ledger=""):
         for i in range(3):
             graph.node("toys.mischief", f"sleep/{i}", NoParams(), {"what": "sleep", "seconds": 60, "i": i})
     print("begun", flush=True)
-    result = driver.run(graph, Store(cache), executor=executor, jobs=2, ledger=Path(ledger) if ledger else None)
+    result = scheduler.run(graph, Store(cache), executor=executor, jobs=2, ledger=Path(ledger) if ledger else None)
     nodes = {h.label: [h.status, h.ref.digest if h.ref else None, h.reason] for h in graph.nodes}
     print(json.dumps({"ok": result.ok, "workers": result.executor_started, "nodes": nodes}), flush=True)
 

@@ -13,18 +13,18 @@ import numpy as np
 import pytest
 
 from datasets.protocol import Sequence
-from pipeline.reconstruct import Products
+from pipeline.flow.reconstruction import Products
 from pipeline.report import RunView, TaskRow, canvas, write_report
-from stages.accuracy import trajectory_accuracy
-from stages.accuracy_parts import metric as figure
-from stages.declare import Bundle
-from stages.dem_accuracy import dem_accuracy
-from stages.epipolar import corrected
-from stages.geometry import Camera, Rig, RigidTransform
-from stages.lattice import Lattice
-from stages.path_check import path_check
-from stages.risk import RiskParams
-from stages.vehicle import Vehicle
+from stages.core.declare import Bundle
+from stages.evaluation.accuracy import trajectory_accuracy
+from stages.evaluation.accuracy_parts import metric as figure
+from stages.evaluation.dem_accuracy import dem_accuracy
+from stages.evaluation.path_check import path_check
+from stages.geometry.epipolar import corrected
+from stages.geometry.geometry import Camera, Rig, RigidTransform
+from stages.geometry.lattice import Lattice
+from stages.hazard.risk import RiskParams
+from stages.hazard.vehicle import Vehicle
 
 CELL, ROWS, COLS = 0.01, 60, 80
 LATTICE = {"x0": -0.4, "y0": 0.8, "cell": CELL, "rows": ROWS, "cols": COLS}

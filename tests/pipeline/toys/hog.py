@@ -4,7 +4,7 @@ import time
 
 import numpy as np
 
-from stages.declare import Array, Bundle, Memory, NoParams, Stage
+from stages.core.declare import Array, Bundle, Memory, NoParams, Stage
 
 
 def _run(params, args, inputs):

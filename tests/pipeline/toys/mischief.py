@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from stages.declare import Array, Bundle, NoParams, Stage
-from stages.errors import DegenerateError
+from stages.core.declare import Array, Bundle, NoParams, Stage
+from stages.core.errors import DegenerateError
 
 
 class UnpicklableError(Exception):

@@ -2,7 +2,7 @@
 
 from pydantic import Field
 
-from stages.declare import Array, Bundle, Params, Stage
+from stages.core.declare import Array, Bundle, Params, Stage
 
 
 class ScaleParams(Params):

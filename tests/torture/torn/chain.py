@@ -18,7 +18,7 @@ def build(graph, *, frames=FRAMES, size=150, shuffle=None, sleepers=0, sabotage=
     from toys.numbers import NumbersParams
     from toys.scale import ScaleParams
 
-    from stages.declare import NoParams
+    from stages.core.declare import NoParams
 
     def shuffled(items):
         items = list(items)
@@ -50,13 +50,13 @@ def run(cache, executor="inline", ledger=None, jobs=2, memory=None, environment=
     if memory is not None:
         resource.setrlimit(resource.RLIMIT_RSS, (memory, memory))  # the engine heeds it, the kernel does not
     os.environ.update(environment or {})
-    from pipeline import driver
-    from pipeline.dag import Graph
-    from pipeline.store import at
+    from pipeline.engine import scheduler
+    from pipeline.engine.graph import Graph
+    from pipeline.engine.store.folder import at
 
     graph = Graph()
     build(graph, **options)
-    made = driver.run(
+    made = scheduler.run(
         graph, at(cache), executor=executor, jobs=jobs, keep_going=True, ledger=Path(ledger) if ledger else None
     )
     nodes = {
@@ -74,15 +74,16 @@ def run(cache, executor="inline", ledger=None, jobs=2, memory=None, environment=
 def clear(cache, runs, until, grace, environment=None):
     """Clear the cache again and again beside the runs, as ``rille cache gc`` does; how often, and what went."""
     os.environ.update(environment or {})
-    from pipeline import ledger, upkeep
-    from pipeline.store import at
+    from pipeline.engine import events as ledger
+    from pipeline.engine.store import maintenance
+    from pipeline.engine.store.folder import at
 
     times = removed = 0
     while not Path(until).exists():
         kept = set()
         for path in Path(runs).glob("*/*/ledger.jsonl"):
             kept |= ledger.keys(path)
-        removed += upkeep.gc(at(cache), kept, grace=grace).artifacts
+        removed += maintenance.gc(at(cache), kept, grace=grace).artifacts
         times += 1
         time.sleep(0.002)
     return {"times": times, "removed": removed}

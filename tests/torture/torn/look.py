@@ -5,9 +5,9 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
-from pipeline.artifact import array_digests, damage, output_digest
-from pipeline.object_upkeep import _damage
-from pipeline.store import Store, at, unframe
+from pipeline.engine.store.artifact import array_digests, damage, output_digest
+from pipeline.engine.store.folder import Store, at, unframe
+from pipeline.engine.store.s3_maintenance import _damage
 
 HERE = Path(__file__).parent.parent
 PLACES = [str(HERE), str(HERE.parent / "pipeline"), str(HERE.parent.parent)]

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from stages.declare import Array, Bundle, NoParams, Stage
+from stages.core.declare import Array, Bundle, NoParams, Stage
 
 
 def _run(params, args, inputs):

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.bucket import Bucket
-from stages.declare import Array, Bundle, NoParams, Stage
+from pipeline.engine.store.s3_client import Bucket
+from stages.core.declare import Array, Bundle, NoParams, Stage
 
 
 def _die():

@@ -1,0 +1,272 @@
+"""``rille calibrate``: pictures of a chessboard to a stereo rig, with each view's residual and each parameter's error.
+
+The result is an OpenCV YAML file, which manifests take: ``[cameras] file = "rig.yaml"``.
+"""
+
+from __future__ import annotations
+
+import glob
+import math
+import sys
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from datasets import chessboard, pairing
+from datasets.files import read_grey
+from stages.calibration.target import MODELS, BoardView, RigCalibration, calibrate_rig
+from stages.core.errors import InputError, RilleError
+
+COMPLETE = 0
+
+LEAST_COVER = 0.5
+"""Share of an image that all corners together should span: beyond them, distortion is extrapolated."""
+
+VAGUE_FOCAL = 0.01
+"""Relative standard deviation of a focal length that is worth a warning: all depths err by as much."""
+
+MANY_BAD_PX = 1.0
+"""Pixels RMS over all views that a chessboard on paper does not explain."""
+
+
+NO_BOARD = 0.1
+"""Residual over the spacing of the corners from which they are not those of a flat board: print errs by hundredths."""
+
+
+@dataclass
+class Boards:
+    """What was found in the images: ``views``, and ``left_out`` name and reason of the pairs that cannot be used."""
+
+    corners: tuple[int, int]
+    size: tuple[int, int]
+    views: list[BoardView] = field(default_factory=list)
+    left_out: list[tuple[str, str]] = field(default_factory=list)
+
+
+def calibrate(
+    left: Path,
+    right: Path,
+    *,
+    square: float,
+    corners: str | None = None,
+    model: str = "radtan",
+    output: Path = Path("rig.yaml"),
+    keep_bad: bool = False,
+) -> int:
+    """Calibrate a stereo rig from pairs of pictures of one chessboard, print how well, and write the rig.
+
+    Parameters
+    ----------
+    left, right : folder or glob of each camera's images; the same folder for both where the names tell the sides.
+    square : side of a square, metres.
+    corners : inner corners, ``COLUMNSxROWS``; None: found.
+    model : distortion model, see :data:`stages.calibration.target.MODELS`.
+    output : YAML file to write.
+    keep_bad : use also views whose residuals are far above the others'; without it they are left out, and named.
+
+    Raises
+    ------
+    ConfigError
+        An option is not permitted; ``square`` is no length in metres.
+    InputError
+        Images are missing, unpaired or show no board, or the sides are swapped.
+    DegenerateError
+        The views do not determine the rig.
+    """
+    given = None if corners is None else chessboard.parse_corners(corners)
+    chessboard.board_points((3, 3), square)  # a wrong unit is told before minutes of detection
+    boards = find_boards(pairing.pair_up(*_files(left, right)), given)
+    points = chessboard.board_points(boards.corners, square)
+    found = calibrate_rig(points, boards.views, boards.size, model, keep_bad=keep_bad)
+    _refuse_clutter(found, boards)
+    _write(output, _yaml(found, boards, square, model))
+    origin = "given" if given else "found"
+    print(f"board        {boards.corners[0]} x {boards.corners[1]} inner corners ({origin}), squares of {square:g} m")
+    print("\n".join([*_views(found, boards), "", *_parameters(found, model), ""]))
+    for line in doubts(found, boards, model):
+        print(f"rille: warning: {line}", file=sys.stderr)
+    print(f'wrote        {output}\nnext         in the manifest of the sequence:\n\n[cameras]\nfile = "{output.name}"')
+    return COMPLETE
+
+
+def _files(left: Path, right: Path) -> tuple[list[Path], list[Path]]:
+    sides = [_images(left), _images(right)]
+    if left == right:
+        told = [[p for p in paths if (pairing.side_of(p.stem) or (0, -1))[1] == k] for k, paths in enumerate(sides)]
+        if not all(told):
+            raise InputError(
+                "RIL-010",
+                f"the names in {left} do not tell left from right",
+                remedy="give two folders, or two globs in quotes",
+            )
+        return told[0], told[1]
+    return sides[0], sides[1]
+
+
+def _images(place: Path) -> list[Path]:
+    """Image files of a folder, a glob or a single path."""
+    found = list(place.iterdir()) if place.is_dir() else [Path(p) for p in glob.glob(str(place.expanduser()))]
+    images = sorted(p for p in found if p.suffix.lower() in pairing.SUFFIXES)
+    if not images:
+        raise InputError(
+            "RIL-011", f"{place} names no images", remedy="give a folder, or a glob in quotes such as 'left*.jpg'"
+        )
+    return images
+
+
+def find_boards(pairs: Sequence[pairing.Pair], corners: tuple[int, int] | None) -> Boards:
+    """The board in all pairs; its size is found where it is not given.
+
+    Raises
+    ------
+    InputError
+        An image cannot be read, or no board of one size is found.
+    """
+    images = {p.name: [chessboard.eight_bit(read_grey(f)) for f in (p.left, p.right)] for p in pairs}
+    sizes = Counter((i.shape[1], i.shape[0]) for both in images.values() for i in both)
+    size = max(sizes, key=lambda s: (sizes[s], s))
+    fit = {n: both for n, both in images.items() if all((i.shape[1], i.shape[0]) == size for i in both)}
+    if corners is None:
+        corners = chessboard.find_size(image for both in fit.values() for image in both)
+    out = Boards(corners, size)
+    for name, both in images.items():
+        if name not in fit:
+            out.left_out.append((name, f"its images are not {size[0]} x {size[1]} pixels as most are"))
+            continue
+        points = [chessboard.find_corners(image, corners) for image in both]
+        missing = [side for side, p in zip(("left", "right"), points, strict=True) if p is None]
+        if points[0] is None or points[1] is None:
+            out.left_out.append((name, f"no whole board in the {' nor in the '.join(missing)} image"))
+            continue
+        out.views.append(BoardView(name, points[0], chessboard.same_order(points[0], points[1], corners)))
+    return out
+
+
+def _refuse_clutter(found: RigCalibration, boards: Boards) -> None:
+    grids = [p.reshape(boards.corners[1], boards.corners[0], 2) for v in boards.views for p in (v.left, v.right)]
+    spacing = float(np.median([np.linalg.norm(np.diff(g, axis=1), axis=-1) for g in grids]))
+    if found.rms > NO_BOARD * spacing:
+        columns, rows = boards.corners
+        raise InputError(
+            "RIL-800",
+            f"the corners taken for a board of {columns} x {rows} miss by {found.rms:.1f} px RMS, "
+            f"{spacing:.0f} px apart: no flat board, or not the same moment left and right",
+            remedy="give pictures of a chessboard, and its inner corners, e.g. --corners 9x6",
+        )
+
+
+def cover(points: Sequence[NDArray[np.float64]], size: tuple[int, int]) -> float:
+    """Share of an image within the convex hull of all corners."""
+    hull = cv2.convexHull(np.concatenate(points).astype(np.float32))
+    return float(cv2.contourArea(hull)) / (size[0] * size[1])
+
+
+def doubts(found: RigCalibration, boards: Boards, model: str) -> list[str]:
+    """What the user should know before trusting the result, one line each with its figure."""
+    lines = [
+        f"view {r.name} is left out: its corners miss by {r.worst:.2f} px RMS; remove or retake it"
+        for r in found.residuals
+        if not r.used
+    ]
+    if found.rms > MANY_BAD_PX:
+        lines.append(f"corners miss by {found.rms:.2f} px RMS: is the board flat, are the images paired rightly?")
+    for side, lens in (("left", found.left), ("right", found.right)):
+        share = found.sigma[f"{side} fx"] / lens.camera.fx
+        if share > VAGUE_FOCAL:
+            lines.append(f"{side} focal length is known to {100 * share:.1f} % only; take views with the board tilted")
+        seen = cover([v.left if side == "left" else v.right for v in boards.views], boards.size)
+        if seen < LEAST_COVER:
+            lines.append(f"the corners span {100 * seen:.0f} % of the {side} image; distortion beyond is a guess")
+        vague = [
+            name
+            for name, value in zip(MODELS[model], lens.coefficients, strict=True)
+            if found.sigma[f"{side} {name}"] > max(abs(value), 0.1) and name not in ("p1", "p2")
+        ]
+        if vague:
+            fewer = "radtan" if model == "rational" else "radtan4"
+            lines.append(f"{side} {', '.join(vague)} cannot be told from 0 with these views; try --model {fewer}")
+    return lines
+
+
+def _views(found: RigCalibration, boards: Boards) -> list[str]:
+    """Table of residuals."""
+    width = max([len("view"), *(len(r.name) for r in found.residuals), *(len(n) for n, _ in boards.left_out)])
+    lines = [f"views        {sum(r.used for r in found.residuals)} used, {found.rms:.3f} px RMS over all corners", ""]
+    lines += [f"{'view':{width}s}  left px  right px  epipolar px"]
+    for r in found.residuals:
+        row = f"{r.name:{width}s}  {r.left:7.3f}  {r.right:8.3f}  {r.epipolar:11.3f}"
+        lines.append(row if r.used else f"{row}  left out: far above the others")
+    return lines + [f"{name:{width}s}  left out: {reason}" for name, reason in boards.left_out]
+
+
+def _parameters(found: RigCalibration, model: str) -> list[str]:
+    """Table of what was determined, each with its standard deviation."""
+    lines = [f"{'':13s}{'left':>24s}{'right':>26s}"]
+    for name in ("fx", "fy", "cx", "cy", *MODELS[model]):
+        unit, digits = ("px", 2) if name[0] in "fc" else ("", 4)
+        cells = []
+        for side, lens in (("left", found.left), ("right", found.right)):
+            value = _value(lens, name, model)
+            cells.append(f"{value:12.{digits}f} +- {found.sigma[f'{side} {name}']:.{digits}f} {unit:2s}")
+        lines.append(f"{name:13s}{cells[0]:>24s}{cells[1]:>26s}")
+    T = found.T_right_left
+    lines.append(f"baseline     {np.linalg.norm(T.translation):.5f} +- {found.sigma['baseline']:.5f} m")
+    turn = np.degrees(cv2.Rodrigues(T.rotation)[0].ravel())
+    angles = [
+        f"{a} {t:+.3f} +- {math.degrees(found.sigma[f'rotation {a}']):.3f}" for a, t in zip("xyz", turn, strict=True)
+    ]
+    return [*lines, f"rotation     {', '.join(angles)} degrees, right camera from left"]
+
+
+def _value(lens: Any, name: str, model: str) -> float:
+    pinhole = {"fx": lens.camera.fx, "fy": lens.camera.fy, "cx": lens.camera.cx, "cy": lens.camera.cy}
+    return float(pinhole[name] if name in pinhole else lens.coefficients[MODELS[model].index(name)])
+
+
+def _yaml(found: RigCalibration, boards: Boards, square: float, model: str) -> str:
+    """The file's text: keys as OpenCV's stereo samples have them, then how it was found."""
+    file = cv2.FileStorage("rig.yaml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
+    file.write("image_width", boards.size[0])
+    file.write("image_height", boards.size[1])
+    file.write("distortion_model", found.left.model)
+    for k, lens in ((1, found.left), (2, found.right)):
+        file.write(f"M{k}", lens.camera.matrix)
+        file.write(f"D{k}", np.array([lens.coefficients]))
+    file.writeComment("x_right = R x_left + T, metres")
+    file.write("R", found.T_right_left.rotation)
+    file.write("T", found.T_right_left.translation.reshape(3, 1))
+    file.writeComment("how it was found: board in inner corners, square in metres, residuals in pixels RMS")
+    file.write("board_width", boards.corners[0])
+    file.write("board_height", boards.corners[1])
+    file.write("square_size", square)
+    file.write("avg_reprojection_error", found.rms)
+    for name, used in (("views", True), ("views_left_out", False)):
+        chosen = [r for r in found.residuals if r.used == used]
+        file.startWriteStruct(name, cv2.FILE_NODE_MAP)
+        for k, r in enumerate(chosen):
+            file.startWriteStruct(f"view_{k}", cv2.FILE_NODE_MAP)
+            file.write("name", r.name)
+            for what in ("left", "right", "epipolar"):
+                file.write(what, getattr(r, what))
+            file.endWriteStruct()
+        file.endWriteStruct()
+    file.startWriteStruct("standard_deviations", cv2.FILE_NODE_MAP)
+    for key, value in found.sigma.items():
+        file.write(key.replace(" ", "_"), value)
+    file.endWriteStruct()
+    return str(file.releaseAndGetString())
+
+
+def _write(path: Path, text: str) -> None:
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise RilleError(
+            "RIL-012", f"cannot write {path}: {error.strerror}", remedy="choose another --output"
+        ) from error

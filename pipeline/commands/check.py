@@ -1,0 +1,336 @@
+"""``rille check``: open everything of a sequence, match its first pair, and say in one line each what to expect.
+
+Images, disparity and motions are the tasks of a reconstruction with the same parameters: what is computed here is
+cached for it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from datasets.protocol import CAMERAS, Sequence, Source
+from pipeline.commands import input_checks as verdicts
+from pipeline.commands import synchrony
+from pipeline.commands.input_checks import Verdict
+from pipeline.engine.store.folder import Ref, Store, at
+from pipeline.engine.store.location import Location
+from pipeline.engine.task import Refs, Spec, ensure
+from pipeline.flow import config as configuration
+from stages.core.declare import NoParams
+from stages.core.errors import RilleError
+from stages.geometry.epipolar import beyond_infinity
+from stages.imaging.image_quality import Look, look
+from stages.terrain.ground import inverse_depth
+
+Floats = NDArray[np.float64]
+
+COMPLETE, FAILED = 0, 1
+
+MOST_MOTIONS = 12
+"""Successive pairs whose motion is measured, spread over the sequence: a sample tells what a run can expect."""
+
+MOST_PAIRS = 6
+"""Pairs whose rows are compared with those of shifted right images, spread over the sequence."""
+
+BEYOND = 1.0
+"""Pixels beyond infinity that noise does not reach."""
+
+WIDTH, LOWER = 11.0, 2.8
+"""Inches: the picture's width, and the height of its lower plots."""
+
+FIRST_NAMED = 3
+"""Damaged images that are named one by one; the rest is counted."""
+
+
+def check(
+    sequence: Sequence,
+    config: Any = None,
+    *,
+    output: Path | None = None,
+    frames: tuple[int, ...] | None = None,
+    cache: Location = Path(".rille/cache"),
+) -> int:
+    """Judge a sequence: prints a line for each finding, and draws the first pair's epipolar residuals.
+
+    Parameters
+    ----------
+    sequence : what to look at.
+    config : parameters of the stages; what suits the sequence by default.
+    output : PNG to write; ``SEQUENCE-check.png`` here by default.
+    frames : frames to look at; all by default.
+    cache : folder of cached artifacts.
+
+    Returns
+    -------
+    0, or 1 where something fails.
+
+    Raises
+    ------
+    RilleError
+        The picture cannot be written.
+    """
+    chosen = frames if frames is not None else tuple(range(sequence.frames))
+    if config is None:
+        config = configuration.build(configuration.expand(sequence.defaults))
+    inspection = Inspection(sequence, config, chosen, at(cache))
+    path = output if output is not None else Path(f"{sequence.name}-check.png")
+    found = []
+    for verdict in inspection.verdicts():
+        print(verdict, flush=True)
+        found.append(verdict)
+    if inspection.match is not None and len(inspection.match.left):
+        draw(path, sequence.name, sequence.frame_names[inspection.frames[0]], inspection.match)
+        print(f"picture       {path}")
+    counts = {level: sum(v.level == level for v in found) for level in ("OK", "WARN", "FAIL")}
+    print(f"{sequence.name}: {counts['FAIL']} fail, {counts['WARN']} to look at, {counts['OK']} fine")
+    return FAILED if counts["FAIL"] else COMPLETE
+
+
+@dataclass(frozen=True)
+class Match:
+    """The first pair: its left image (row, col), thinned matches (n, 2), their residuals (n,) px, and all facts."""
+
+    image: NDArray[Any]
+    left: Floats
+    right: Floats
+    residual: Floats
+    weight: Floats
+    facts: Mapping[str, Any]
+    rate: float | None
+
+
+@dataclass
+class Inspection:
+    """Measures one thing after the other, so that each verdict is printed as soon as it is known."""
+
+    sequence: Sequence
+    config: Any
+    frames: tuple[int, ...]
+    store: Store
+    match: Match | None = None
+    broken: dict[tuple[int, str], RilleError] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.lost = {f: why for f, why in self.sequence.lost.items() if f in self.frames}
+        self.frames = tuple(f for f in self.frames if f not in self.lost)
+        self._shared: dict[str, Ref] = {}
+
+    def verdicts(self) -> Any:
+        """All verdicts, the cheap ones first."""
+        s = self.sequence
+        yield Verdict("OK", "sequence", f"{s.name}, {len(self.frames)} of {s.frames} pairs")
+        for frame, why in self.lost.items():
+            yield Verdict("WARN", "images", f"frame {s.frame_names[frame]}: {why}", "it will have no pose; bridged")
+        yield from (Verdict("WARN", "input", line) for line in s.warnings)
+        yield from verdicts.judge_rig(s.rig)
+        yield from verdicts.judge_times(None if s.times is None else [s.times[k] for k in self.frames])
+        yield from verdicts.judge_truth(s.truth, self.frames, s.truth_positions)
+        yield from verdicts.judge_attitude(s.attitude, s.truth, self.frames)
+        yield from verdicts.judge_up(s.up, self.frames)
+        yield from self._images()
+        whole = [k for k in self.frames if not any((k, camera) in self.broken for camera in CAMERAS)]
+        if not whole:
+            yield Verdict("FAIL", "matching", "no pair is whole")
+            return
+        yield from self._first_pair(whole[0])
+        yield from self._motions()
+        yield from self._simultaneous()
+
+    def _images(self) -> Any:
+        """Open every image: sizes, repetitions, exposure, sharpness."""
+        looks: dict[str, dict[int, Look]] = {camera: {} for camera in CAMERAS}
+        digests: dict[str, dict[int, str]] = {camera: {} for camera in CAMERAS}
+        sizes = set()
+        for frame in self.frames:
+            for camera in CAMERAS:
+                try:
+                    bundle = self.store.open(
+                        self._source(self.sequence.image(frame, camera), f"image/{camera}/{frame}")
+                    )
+                except RilleError as error:
+                    self.broken[frame, camera] = error
+                    continue
+                image = np.asarray(bundle["image"])
+                sizes.add((image.shape[1], image.shape[0], str(image.dtype)))
+                looks[camera][frame] = look(image, np.asarray(bundle["valid"]))
+                digests[camera][frame] = hashlib.sha256(image.tobytes()).hexdigest()
+        for damage in list(self.broken.values())[:FIRST_NAMED]:
+            yield Verdict("FAIL", "images", damage.message, damage.remedy)
+        total = len(self.frames) * len(CAMERAS)
+        if self.broken:
+            yield Verdict("FAIL", "images", f"{len(self.broken)} of {total} cannot be used")
+        else:
+            words = " and ".join(f"{w} x {h} {kind}" for w, h, kind in sorted(sizes))
+            yield Verdict("OK", "images", f"all {total} open, {words}")
+        yield from self._repeated(digests)
+        yield from verdicts.judge_looks(looks, self.sequence.frame_names)
+
+    def _repeated(self, digests: Mapping[str, Mapping[int, str]]) -> list[Verdict]:
+        names, out = self.sequence.frame_names, []
+        same = [k for k, d in digests["left"].items() if digests["right"].get(k) == d]
+        if same:
+            text = f"left and right are one image in {len(same)} pairs, first frame {names[same[0]]}"
+            out.append(Verdict("FAIL", "images", text, "give the right camera's images"))
+        for camera, of in digests.items():
+            frames = list(of)
+            stuck = [b for a, b in pairwise(frames) if of[a] == of[b]]
+            if stuck:
+                text = f"{len(stuck)} {camera} images repeat the one before, first frame {names[stuck[0]]}"
+                out.append(Verdict("WARN", "images", text, "was a frame copied, or did the camera hang?"))
+        return out
+
+    def _first_pair(self, pair: int) -> Any:
+        """Match one pair, and compare it with the rig."""
+        try:
+            self.match = self._matched(pair)
+        except RilleError as error:
+            yield Verdict("FAIL", "matching", f"frame {self.sequence.frame_names[pair]}: {error.message}", error.remedy)
+            return
+        m, rig = self.match, self.sequence.rig
+        rho, _ = inverse_depth(rig, m.left, m.right - m.left)
+        inlier = m.weight > 0 if (m.weight > 0).any() else np.ones(len(m.left), bool)
+        ahead = inlier & (rho > 0)
+        yield from verdicts.judge_matching(m.rate, 1.0 / rho[ahead], rig.baseline)
+        if len(m.left):
+            beyond = beyond_infinity(rig, m.left[inlier], m.right[inlier])
+            yield from verdicts.judge_sides(float((beyond > BEYOND).mean()))
+        yield from verdicts.judge_epipolar(m.facts)
+
+    def _matched(self, pair: int) -> Match:
+        disparity = self._node(
+            "hfvm", f"hfvm/{pair}", {"pair": pair}, left=self._pyramid(pair, "left"), right=self._pyramid(pair, "right")
+        )
+        args = {"pair": pair, "rig": self.sequence.rig.to_dict()}
+        found = self.store.open(self._node("orientation", f"orientation/{pair}", args, disparity=disparity))
+        points = {name: np.asarray(found[name], dtype=np.float64) for name in ("left", "right")}
+        return Match(
+            np.asarray(self.store.open(self._image(pair, "left"))["image"]),
+            points["left"],
+            points["right"],
+            np.asarray(found["residual_before"], dtype=np.float64),
+            np.asarray(found["weight"], dtype=np.float64),
+            found.meta,
+            self.store.open(disparity).meta["match_rate"],
+        )
+
+    def _motions(self) -> Any:
+        """Overlap of some successive left images."""
+        pairs = list(pairwise(self.frames))
+        chosen = sorted({int(k) for k in np.linspace(0, len(pairs) - 1, MOST_MOTIONS).round()}) if pairs else []
+        motions: dict[tuple[int, int], Mapping[str, Any]] = {}
+        for a, b in (pairs[k] for k in chosen):
+            if (a, "left") in self.broken or (b, "left") in self.broken:
+                continue
+            try:
+                ports = {"a": self._pyramid(a, "left"), "b": self._pyramid(b, "left")}
+                motions[a, b] = self.store.open(self._node("motion", f"motion/{a}-{b}", self._turn(a, b), **ports)).meta
+            except RilleError as error:
+                yield Verdict("FAIL", "motion", error.message, error.remedy)
+        yield from verdicts.judge_motion(motions, self.sequence.frame_names)
+
+    def _simultaneous(self) -> Any:
+        """Rows of some pairs over the whole sequence, with the right images as named and shifted in time."""
+        last = max(self.frames)
+        inner = [k for k in self.frames if k - 2 >= 0 and k + 2 <= last]
+        chosen = sorted({inner[int(k)] for k in np.linspace(0, len(inner) - 1, MOST_PAIRS).round()}) if inner else []
+        spreads: dict[int, list[float | None]] = {shift: [] for shift in synchrony.SHIFTS}
+        for frame in chosen:
+            left = self._features(frame, "left")
+            for shift, values in spreads.items():
+                right = self._features(frame + shift, "right")
+                values.append(synchrony.row_spread(self.sequence.rig, left, right))
+        yield from verdicts.judge_synchrony(spreads)
+
+    def _features(self, frame: int, camera: str) -> tuple[Any, Any] | None:
+        if frame in self.lost or (frame, camera) in self.broken or frame not in self.frames:
+            return None
+        return synchrony.features(np.asarray(self.store.open(self._image(frame, camera))["image"]))
+
+    def _turn(self, a: int, b: int) -> dict[str, Any]:
+        known = self.sequence.attitude
+        first, second = (None, None) if known is None else (known[a], known[b])
+        if first is None or second is None:
+            return {"frames": [a, b]}
+        rotation = np.transpose(second) @ np.array(first)
+        return {"frames": [a, b], "rotation": rotation.tolist(), "camera": self.sequence.rig.left.to_dict()}
+
+    def _pyramid(self, frame: int, camera: str) -> Ref:
+        return self._node("pyramid", f"pyramid/{camera}/{frame}", {}, image=self._image(frame, camera))
+
+    def _image(self, frame: int, camera: str) -> Ref:
+        """One image without its lens distortion."""
+        image = self._source(self.sequence.image(frame, camera), f"image/{camera}/{frame}")
+        lens = (self.sequence.lenses or {}).get(camera)
+        if lens is None:
+            return image
+        ideal = self.sequence.rig.left if camera == "left" else self.sequence.rig.right
+        args = {"lens": lens.to_dict(), "camera": ideal.to_dict(), "frame": frame, "camera_name": camera}
+        return self._node("undistort", f"undistort/{camera}/{frame}", args, image=image)
+
+    def _source(self, source: Source, label: str) -> Ref:
+        refs: Refs = {port: self._shared_source(upstream) for port, upstream in source.inputs.items()}
+        return ensure(
+            self.store.location, Spec(source.module, label, source.params, source.args, source.hints), refs
+        ).ref
+
+    def _shared_source(self, source: Source) -> Ref:
+        """What is the same for all frames (a rendered scene) is looked up once."""
+        label = source.module.rsplit(".", 1)[-1]
+        if source.args:
+            return self._source(source, label)
+        if label not in self._shared:
+            self._shared[label] = self._source(source, label)
+        return self._shared[label]
+
+    def _node(self, name: str, label: str, args: Mapping[str, Any], **inputs: Ref) -> Ref:
+        params = getattr(self.config, name, NoParams())
+        return ensure(self.store.location, Spec(configuration.STAGE_MODULES[name], label, params, args), inputs).ref
+
+
+def draw(path: Path, name: str, frame: str, match: Match) -> None:
+    """Picture of the epipolar residuals of one pair under the given rig: where, how large, and along columns and rows.
+
+    Raises
+    ------
+    RilleError
+        The file cannot be written.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    used = match.weight > 0 if (match.weight > 0).any() else np.ones(len(match.left), bool)
+    limit = max(0.5, float(np.percentile(np.abs(match.residual[used]), 98)))
+    shades = {"c": match.residual[used], "s": 9, "cmap": "coolwarm", "vmin": -limit, "vmax": limit, "linewidths": 0}
+    shown = match.image.astype(np.float32)
+    height = min(WIDTH * shown.shape[0] / shown.shape[1], 0.8 * WIDTH)
+    fig = Figure(figsize=(WIDTH, height + LOWER), layout="constrained")
+    FigureCanvasAgg(fig)
+    parts: Any = fig.subfigures(2, 1, height_ratios=[height, LOWER])
+    top, below = parts
+    ax = top.subplots()
+    ax.imshow(shown, cmap="gray", vmin=np.percentile(shown, 1), vmax=np.percentile(shown, 99))
+    drawn = ax.scatter(match.left[used, 0], match.left[used, 1], **shades)
+    top.colorbar(drawn, ax=ax, label="px below the line", pad=0.01, aspect=30)
+    ax.set_title(f"{name}, frame {frame}: epipolar residuals of the right image under the given rig", fontsize=10)
+    ax.set(xlabel="column", ylabel="row")
+    plots = below.subplots(1, 3)
+    for ax, axis, label in ((plots[0], 0, "column in the left image"), (plots[1], 1, "row in the left image")):
+        ax.scatter(match.left[used, axis], match.residual[used], s=3, color="0.3", linewidths=0)
+        ax.axhline(0.0, color="tab:red", linewidth=1)
+        ax.set(xlabel=label, ylabel="residual, px", ylim=(-1.5 * limit, 1.5 * limit))
+    plots[2].hist(match.residual[used], bins=60, range=(-1.5 * limit, 1.5 * limit), color="0.5")
+    plots[2].set(xlabel="residual, px", ylabel="matches")
+    try:
+        fig.savefig(path, dpi=110)
+    except OSError as error:
+        raise RilleError(
+            "RIL-016", f"cannot write {path}: {error.strerror}", remedy="choose another --output"
+        ) from error

@@ -1,0 +1,85 @@
+"""``rille init``: a commented manifest of what a folder of stereo images holds, and the commands that come next."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from datasets.inspection import Findings, inspect
+from datasets.manifest_text import counted, manifest_text, needs
+from datasets.names import derived_name
+from datasets.registry import hindrance
+from stages.core.errors import ConfigError, InputError
+
+COMPLETE = 0
+
+
+def init(directory: Path, output: Path | None = None, force: bool = False) -> int:
+    """Write a manifest for a folder and say what it still needs; a folder that opens as it is gets none unasked.
+
+    Parameters
+    ----------
+    directory : folder that holds the images, in it or below.
+    output : file to write; ``NAME.rille.toml`` in the present folder by default (data are often read-only).
+    force : whether an existing file may be overwritten.
+
+    Raises
+    ------
+    ConfigError
+        The file exists and ``force`` is not given.
+    InputError
+        The folder holds no stereo images, or the file cannot be written.
+    """
+    hindered = hindrance(directory)
+    if output is None and not force and directory.is_dir() and hindered is None:
+        print(f"{directory} opens as it is; --output or --force writes a manifest nevertheless")
+        print(f"\nnext:\n  rille check {directory}\n  rille reconstruct {directory}")
+        return COMPLETE
+    name = f"{derived_name(directory.resolve().name)}.rille.toml"
+    found = inspect(directory)
+    path = output if output is not None else Path(name)
+    if path.suffix != ".toml":
+        raise ConfigError("RIL-037", f"--output {path} is no .toml file", remedy=f"e.g. {name}")
+    if path.exists() and not force:
+        raise ConfigError(
+            "RIL-038", f"{path} exists", remedy="name another file by --output, or overwrite it by --force"
+        )
+    text = manifest_text(found, _root(directory, path))
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise InputError(
+            "RIL-039",
+            f"{path} cannot be written: {error.strerror}",
+            remedy=f"name another file, e.g. --output {name}",
+        ) from error
+    needed = needs(text)
+    left = hindrance(path) if not needed else None
+    if left is not None:
+        needed = [f"{left.message}: {left.remedy}" if left.remedy else left.message]
+    elif hindered is not None:
+        print(f"{directory} does not open as it is: {hindered.message}")
+    print("\n".join(_report(found, path, needed)))
+    return COMPLETE
+
+
+def _root(directory: Path, path: Path) -> str:
+    """The folder as seen from the manifest: relative where the manifest lies in or beside it."""
+    relative = os.path.relpath(directory.resolve(), path.resolve().parent)
+    return str(directory.resolve()) if relative.startswith(os.path.join("..", "..")) else Path(relative).as_posix()
+
+
+def _report(found: Findings, path: Path, needed: list[str]) -> list[str]:
+    """What was found, what is needed, and what to type next."""
+    views, calibration = found.views, found.calibration
+    size = f", {views.size[0]} x {views.size[1]} pixels" if views.pairs else ""
+    lines = [f"images       {counted(views.pairs, 'pair')}{size}: {views.left} and {views.right}"]
+    if calibration is not None:
+        baseline = f", baseline {calibration.baseline:.6g}" if calibration.baseline is not None else ""
+        lines.append(f"calibration  {' and '.join(calibration.files)}{baseline}")
+    lines += [f"{kind:12s} {', '.join(files)}" for kind, files in found.tables.items()]
+    lines += [f"wrote        {path}"]
+    lines += [f"needed       {line}" for line in needed]
+    first = [f"edit {path}"] if needed else []
+    steps = [*first, f"rille check {path}", f"rille reconstruct {path}"]
+    return lines + ["", "next:"] + [f"  {step}" for step in steps]

@@ -1,0 +1,180 @@
+"""``rille match``: any two images to a two-band disparity TIFF, without calibration or rectification."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TextIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.flow import config as configuration
+from pipeline.plain import raw
+from stages.core.errors import ConfigError, InputError
+
+if TYPE_CHECKING:
+    from stages.hfvm import Disparity
+
+COMPLETE, INCOMPLETE = 0, 3
+
+LARGE = 1_000_000
+"""Pixels: above, matching takes seconds, and says how far it is."""
+
+INTERVAL = 5.0
+"""Seconds between lines where stderr is no terminal."""
+
+FEW = 0.05
+"""Share of matched pixels at which two images have little to do with each other; unrelated ones stay below."""
+
+BLANK = 0.5
+"""Share of pixels without texture of which a user should hear, however well the others match."""
+
+Tell = Callable[[float, str], None]
+
+
+def match_files(
+    left: Path,
+    right: Path,
+    output: Path,
+    *,
+    preset: str | None,
+    dense: bool,
+    assignments: tuple[str, ...],
+    prior: Path | None = None,
+    confidence: Path | None = None,
+) -> int:
+    """Match two image files and write ``column_disparity`` and ``row_disparity``, float32 pixels, NaN undefined.
+
+    Without ``dense`` only what was matched and found consistent is written; with it, filled values too. ``prior``: a
+    disparity TIFF to start from. ``confidence``: TIFF for standard deviation, validity and back-matching error. What is
+    suspicious is said on stderr.
+
+    Returns
+    -------
+    0, or 3 where hardly a pixel matches (share below ``FEW``).
+
+    Raises
+    ------
+    ConfigError
+        An assignment is not one of the matcher's, or two outputs have one name.
+    InputError
+        An image or the prior cannot be read, or the prior is not of the left image's size.
+    """
+    from datasets.files import read_grey
+    from pipeline.export.writers import write_confidence, write_disparity
+
+    params = matcher_params(preset, assignments)
+    if confidence is not None and confidence.resolve() == output.resolve():
+        raise ConfigError("RIL-043", f"--confidence and --output are both {output}", remedy="give them two names")
+    images = read_grey(left), read_grey(right)
+    given = _prior(prior, images[0].shape) if prior is not None else None
+
+    from pipeline.flow import tiles
+    from stages.core.validity import matched
+    from stages.hfvm import match
+
+    side = tiles.side(tiles.Tiling(), params, (images[0].shape, images[1].shape))
+    with _progress(max(image.size for image in images), sys.stderr) as tell:
+        found = match(*images, params, prior=given, tell=tell, side=side)
+    kept = np.isfinite(found.column_disparity) if dense else matched(found.validity)
+    column = np.where(kept, found.column_disparity, np.nan)
+    row = np.where(kept, found.row_disparity, np.nan)
+    tags = {"LEFT": left.name, "RIGHT": right.name}
+    write_disparity(output, column, row, tags | {"FILLED": str(dense).lower()})
+    if confidence is not None:
+        write_confidence(confidence, found.disparity_std, found.validity, found.backmatch_error, tags)
+    for line in warnings(found):
+        print(f"rille: warning: {line}", file=sys.stderr)
+    share = float(matched(found.validity).mean())
+    typical = f", standard deviation {np.nanmedian(found.disparity_std):.2f} px (median)" if share else ""
+    figures = f"matched {100 * share:.1f} %, defined {100 * float(kept.mean()):.1f} % of {kept.size} pixels"
+    print(f"{output}  {figures}{typical}")
+    return COMPLETE if share >= FEW else INCOMPLETE
+
+
+def warnings(found: Disparity) -> list[str]:
+    """What is suspicious about two matched images, one line each with the figure."""
+    from stages.core.validity import Validity, has, matched
+    from stages.hfvm.order import swapped
+
+    ok = matched(found.validity)
+    share = float(ok.mean())
+    if share < FEW:
+        reasons = (
+            (Validity.NO_TEXTURE, "have no texture (black, saturated or blank)"),
+            (Validity.OUT_OF_IMAGE, "have their match outside the right image"),
+            (Validity.BACKMATCH_FAILED, "do not match back"),
+            (Validity.OVER_THRESHOLD, "look like nothing in the right image"),
+            (Validity.SPECKLE, "lie in isolated patches"),
+        )
+        shares = sorted(((float(has(found.validity, bit).mean()), words) for bit, words in reasons), reverse=True)
+        told = ", ".join(f"{100 * s:.0f} % {words}" for s, words in shares[:2] if s >= 0.005)
+        return [f"only {100 * share:.1f} % of the pixels match ({told}): do both images show one scene?"]
+    blank = float(has(found.validity, Validity.NO_TEXTURE).mean())
+    if blank > BLANK:
+        return [f"{100 * blank:.0f} % of the pixels have no texture (black, saturated or blank) and cannot match"]
+    if swapped(found.column_disparity, found.row_disparity, ok):
+        median = float(np.median(found.column_disparity[ok]))
+        return [
+            f"disparities have the sign of swapped images (median {median:+.1f} px, right minus left): if this is "
+            "a pair of a left and a right camera, give them in the other order"
+        ]
+    return []
+
+
+def _prior(path: Path, shape: tuple[int, ...]) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Prior disparities, checked against the left image's shape."""
+    from pipeline.export.writers import read_disparity
+
+    column, row = read_disparity(path, shape)
+    if not (np.isfinite(column) & np.isfinite(row)).any():
+        raise InputError(
+            "RIL-045", f"prior disparity {path} is undefined everywhere", remedy="leave --prior-disparity out"
+        )
+    return column, row
+
+
+def matcher_params(preset: str | None, assignments: tuple[str, ...]) -> Any:
+    """Parameters of the matcher from ``--preset`` and ``--set hfvm.key=value``."""
+    nested = configuration.parse_assignments(assignments)
+    if set(nested) - {"hfvm"}:
+        other = next(k for k in nested if k != "hfvm")
+        raise ConfigError(
+            "RIL-046", f"--set {other}: match has the section hfvm only", remedy="write --set hfvm.key=value"
+        )
+    values: dict[str, Any] = dict(nested.get("hfvm", {}))
+    if preset is not None:
+        values["preset"] = preset
+    return configuration.validate(configuration.stage("hfvm").params, values, ("hfvm",))
+
+
+@contextmanager
+def _progress(pixels: int, stream: TextIO) -> Iterator[Tell | None]:
+    """Callback that shows share and step of a large match: a bar on a terminal, a line now and then elsewhere."""
+    if pixels < LARGE:
+        yield None
+    elif stream.isatty():
+        from rich.console import Console
+        from rich.progress import Progress
+
+        with Progress(console=Console(file=raw(stream)), transient=True) as bar:
+            task = bar.add_task("matching", total=1.0)
+            yield lambda share, step: bar.update(task, completed=share, description=step)
+    else:
+        yield _lines(stream)
+
+
+def _lines(stream: TextIO) -> Tell:
+    shown = time.monotonic()
+
+    def tell(share: float, step: str) -> None:
+        nonlocal shown
+        if time.monotonic() - shown >= INTERVAL:
+            shown = time.monotonic()
+            print(f"rille: {step}, {100 * share:.0f} %", file=stream, flush=True)
+
+    return tell

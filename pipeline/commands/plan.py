@@ -1,0 +1,141 @@
+"""``rille plan``: what a run would compute, what it would take from the cache, and why; no work is done.
+
+What follows from results that are still to come (which pairs are basic, how far the world reaches) is laid out by the
+same results of the last run. A task behind one that is to be computed counts as to be computed; where its input turns
+out as before, to the bit, the run will find it in the cache all the same. The plan is thus an upper bound.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Iterable
+
+from pipeline.engine import scheduler
+from pipeline.engine.graph import Graph, Handle
+from pipeline.engine.memory import cost_model, limits
+from pipeline.engine.memory.admission import Account, Admission, account, forecast, largest
+from pipeline.engine.memory.cost_model import Costs, Foreseen, count
+from pipeline.engine.memory.limits import words
+from pipeline.engine.progress import recall_seconds
+from pipeline.engine.runtime.environment import cores
+from pipeline.engine.scheduler import Result
+from pipeline.engine.store.folder import at
+from pipeline.flow import unread
+from pipeline.flow.closed_loop import dataflow
+from pipeline.runs.session import Options, check_options, choose_frames, settings, warn
+from stages.core.errors import ConfigError
+
+REASONS = 3
+"""Different reasons told a stage; ``verbose`` tells each task's."""
+
+WIDTH = 80
+"""Characters of a reason in the table."""
+
+BEHIND = "input "
+"""Begin of the reason of a task that only follows from another one."""
+
+
+def plan(options: Options, *, verbose: bool = False) -> int:
+    """Print what ``reconstruct`` with the same options would do; gives the exit code."""
+    check_options(options)
+    settled = settings(options)
+    sequence, config = settled.sequence, settled.config
+    unread.refuse_unreadable(settled.given, config, sequence)
+    warn(sequence)
+    frames = choose_frames(options.frames, sequence.frames)
+    graph, store = Graph(), at(options.cache)
+    dataflow(graph, sequence, config, frames).build()
+    result = scheduler.run(graph, store, dry=True, force=options.force)
+    result.check()
+    lost = [] if result.unknown else unread.unread(settled.given, config, graph)
+    if lost:
+        told = f"{unread.values(lost, config)}: no task of this run reads it"
+        raise ConfigError("RIL-733", told, remedy=unread.remedy(lost, config))
+    jobs = options.jobs or cores()
+    hints = store.hints(graph.sequence)
+    for line in describe(graph, result, recall_seconds(hints), jobs, verbose=verbose):
+        print(line)
+    known = cost_model.recall(hints)
+    limit = None if options.memory_limit is None else limits.parse(options.memory_limit)
+    shares = account(known, limit, options.executor, jobs, largest(graph, known))
+    for line in needs(graph, known, shares):
+        print(line)
+    Admission(known, shares, automatic=limit is None).check(graph)
+    return 0
+
+
+def needs(graph: Graph, known: Costs, shares: Account) -> Iterable[str]:
+    """Lines on memory and bytes of what is to be computed; nothing where nothing is."""
+    foreseen = forecast(graph, known)
+    by_stage: dict[str, list[Foreseen]] = defaultdict(list)
+    for index, f in foreseen.items():
+        by_stage[graph.nodes[index].stage].append(f)
+    if not by_stage:
+        return
+    yield f"{'stage':16s} {'memory a task':>20s} {'results on disk':>16s}  how this is known"
+    for stage, tasks in by_stage.items():
+        most = max(tasks, key=lambda f: f.memory)
+        need = f"{words(most.memory)} +-{100 * most.spread:.0f} %"
+        sources = dict.fromkeys(f.source for f in tasks)
+        yield f"{stage:16s} {need:>20s} {words(sum(f.stored for f in tasks)):>16s}  {'; '.join(sources)}"
+    together = sorted((f.most for f in foreseen.values()), reverse=True)[: shares.workers]
+    tasks_most = min(sum(together), shares.budget)
+    peak = shares.own + shares.workers * shares.rest + tasks_most
+    parts = [f"this process {words(shares.own)}", f"running tasks {words(tasks_most)}"]
+    parts += [f"{count(shares.workers, 'worker')} {words(shares.rest)} each"] if shares.rest else []
+    yield f"about {words(sum(f.stored for f in foreseen.values()))} will be added to the cache"
+    yield f"memory at most {words(peak)} of {words(shares.limit)}: {', '.join(parts)}"
+    if sum(together) > shares.budget:
+        yield "the largest tasks will wait for one another: together they would exceed the limit"
+
+
+def describe(
+    graph: Graph, result: Result, seconds: dict[str, float], jobs: int, *, verbose: bool = False
+) -> Iterable[str]:
+    """Lines of the plan: a table by stage with reasons, totals, and what it rests on."""
+    by_stage: dict[str, list[Handle]] = defaultdict(list)
+    for handle in graph.nodes:
+        by_stage[handle.stage].append(handle)
+    yield f"{'stage':16s} {'cached':>7s} {'to do':>7s}  why"
+    for stage, handles in by_stage.items():
+        planned = [h for h in handles if h.status == "planned"]
+        told = [] if verbose else _reasons(planned)
+        yield f"{stage:16s} {len(handles) - len(planned):7d} {len(planned):7d}  {'; '.join(told)}".rstrip()
+        if verbose:
+            yield from (f"    {h.label}: {h.reason}" for h in planned)
+    yield from _totals(graph, result, seconds, jobs)
+
+
+def _reasons(planned: list[Handle]) -> list[str]:
+    """The reasons of a stage's tasks, own ones first, the most frequent first, with their number."""
+    own = Counter(h.reason for h in planned if not h.reason.startswith(BEHIND))
+    told = [f"{_short(reason)} ({n})" for reason, n in own.most_common(REASONS)]
+    if len(own) > REASONS:
+        told.append(f"{len(own) - REASONS} other reasons")
+    follow = len(planned) - own.total()
+    return told + ([f"an input is to be computed ({follow})"] if follow else [])
+
+
+def _short(reason: str) -> str:
+    return reason if len(reason) <= WIDTH else reason[: WIDTH - 3] + "..."
+
+
+def _totals(graph: Graph, result: Result, seconds: dict[str, float], jobs: int) -> Iterable[str]:
+    planned = [h for h in graph.nodes if h.status == "planned"]
+    cached = len(graph.nodes) - len(planned)
+    line = f"{len(graph.nodes)} tasks known: {cached} cached, {len(planned)} to do"
+    untimed = sorted({h.stage for h in planned if h.stage not in seconds})
+    work = sum(seconds.get(h.stage, 0.0) for h in planned)
+    if planned and len(untimed) < len({h.stage for h in planned}):
+        line += f", about {work / jobs:.0f} s with {jobs} workers by earlier runs"
+        line += f" (never timed: {', '.join(untimed)})" if untimed else ""
+    yield line
+    if result.assumed:
+        yield f"laid out by the last run's {_some(result.assumed)}, which will be computed anew: the layout may change"
+    if result.unknown:
+        yield f"more tasks follow, known only after {_some(result.unknown)}"
+
+
+def _some(labels: list[str]) -> str:
+    names = list(dict.fromkeys(labels))
+    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")

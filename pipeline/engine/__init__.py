@@ -1,0 +1,1 @@
+"""Cached tasks: graph, keys, scheduler, events."""

@@ -1,0 +1,218 @@
+"""What a stage's result depends on besides its inputs: its own source code (for packages:
+:mod:`pipeline.engine.packages`).
+
+The code digest of a module covers all *own* modules that it reaches by import statements, at any depth and also from
+within functions, with the ``__init__`` of every package on the way. Each counts as its syntax tree without
+docstrings, so comments, docstrings and formatting change nothing. Own are ``stages``, ``datasets`` and the top-level
+package of the module itself. Imports under ``if TYPE_CHECKING:`` never run and do not count; modules loaded by a
+computed name are not seen, and neither are data files beside the code: keep tables in modules.
+
+A file is read once a process: what is digested is what was imported, even while somebody edits. Parsing all of them
+takes most of a second, so what was found in a file is remembered by the bytes of the file (:func:`remember_in`).
+"""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import importlib.util
+import json
+import os
+import sys
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from pipeline.engine.keys import digest
+
+OWN = ("stages", "datasets")
+
+FORGET = 8
+"""States of the sources that are remembered, before those not in use are forgotten."""
+
+
+@dataclass(frozen=True)
+class _Source:
+    sha256: str
+    imports: tuple[str, ...]
+    """Absolute dotted names that the module may import (attributes among them)."""
+
+
+class _Memory:
+    """What was found in source files, by the bytes of each and of this module; a damaged file counts as none."""
+
+    def __init__(self) -> None:
+        self.path: Path | None = None
+        self.known: dict[str, list[Any]] = {}
+        self.used: set[str] = set()
+        self.new = False
+        self._reader = hashlib.sha256(f"{sys.version}\0".encode() + Path(__file__).read_bytes()).digest()
+
+    def load(self, path: Path) -> None:
+        self.path, self.known, self.new = path, {}, False
+        with suppress(OSError, ValueError, KeyError, TypeError, AttributeError):
+            found = json.loads(path.read_text(encoding="utf-8"))
+            self.known = found["sources"] if found["digest"] == digest(found["sources"]) else {}
+
+    def name(self, module: str, path: Path, data: bytes) -> str:
+        return hashlib.sha256(self._reader + f"{module}\0{path.name}\0".encode() + data).hexdigest()
+
+    def save(self) -> None:
+        """Best effort, as all hints are."""
+        if self.path is None or not self.new:
+            return
+        if len(self.known) > FORGET * len(self.used):
+            self.known = {name: self.known[name] for name in self.used}
+        temporary = self.path.with_name(f"{self.path.name}.{os.getpid()}.tmp")
+        with suppress(OSError):
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            temporary.write_text(json.dumps({"digest": digest(self.known), "sources": self.known}), encoding="utf-8")
+            temporary.replace(self.path)
+            self.new = False
+
+
+_memory = _Memory()
+
+
+def remember_in(path: Path) -> None:
+    """File that keeps from process to process what was found in source files; a hint, never a matter of correctness."""
+    _memory.load(path)
+
+
+def remember() -> None:
+    """Write that file, if there is anything new."""
+    _memory.save()
+
+
+def module_digests(module: str, own: Iterable[str] = OWN) -> dict[str, str]:
+    """Digest of each own module that ``module`` reaches, itself included, by dotted name.
+
+    Raises
+    ------
+    ModuleNotFoundError
+        ``module`` itself has no source file.
+    """
+    packages = tuple(sorted({*own, module.partition(".")[0]}))
+    return dict(_reachable(module, packages))
+
+
+def code_digest(module: str, own: Iterable[str] = OWN) -> str:
+    """One digest of :func:`module_digests`."""
+    return digest(module_digests(module, own))
+
+
+def tree_digest(own: Iterable[str] = OWN) -> str:
+    """One digest of all modules of the own packages, reached or not."""
+    found: dict[str, str] = {}
+    for package in own:
+        for root in _roots(package):
+            for path in root.rglob("*.py"):
+                parts = path.relative_to(root).with_suffix("").parts
+                name = ".".join([package, *(p for p in parts if p != "__init__")])
+                try:
+                    found[name] = _read(name, path).sha256
+                except SyntaxError:  # somebody is editing; it matters only to who imports it
+                    found[name] = hashlib.sha256(path.read_bytes()).hexdigest()
+    remember()
+    return digest(found)
+
+
+def external_imports(module: str, own: Iterable[str] = OWN) -> set[str]:
+    """Top-level names of what a module and all own modules that it reaches import from elsewhere, but from Python."""
+    packages = tuple(sorted({*own, module.partition(".")[0]}))
+    names = {
+        imported.partition(".")[0]
+        for name, _ in _reachable(module, packages)
+        if (path := _file(name)) is not None
+        for imported in _read(name, path).imports
+    }
+    return {name for name in names if name not in packages and name not in sys.stdlib_module_names}
+
+
+@cache
+def _reachable(module: str, packages: tuple[str, ...]) -> tuple[tuple[str, str], ...]:
+    if _file(module) is None:
+        raise ModuleNotFoundError(f"module {module} has no source file", name=module)
+    found: dict[str, str] = {}
+    queue = [module]
+    while queue:
+        name = queue.pop()
+        path = _file(name)
+        if name in found or path is None or name.partition(".")[0] not in packages:
+            continue
+        source = _read(name, path)
+        found[name] = source.sha256
+        queue += source.imports
+        queue += _parents(name)
+    return tuple(sorted(found.items()))
+
+
+def _parents(name: str) -> list[str]:
+    parts = name.split(".")
+    return [".".join(parts[:n]) for n in range(1, len(parts))]
+
+
+@cache
+def _roots(package: str) -> tuple[Path, ...]:
+    spec = importlib.util.find_spec(package)
+    if spec is None:
+        return ()
+    return tuple(Path(p) for p in spec.submodule_search_locations or ())
+
+
+@cache
+def _file(module: str) -> Path | None:
+    package, *rest = module.split(".")
+    for root in _roots(package):
+        base = root.joinpath(*rest)
+        for path in (base / "__init__.py", base.parent / f"{base.name}.py" if rest else None):
+            if path is not None and path.is_file():
+                return path
+    return None
+
+
+@cache
+def _read(name: str, path: Path) -> _Source:
+    data = path.read_bytes()
+    known = _memory.name(name, path, data)
+    _memory.used.add(known)
+    if known not in _memory.known:
+        tree = _Strip().visit(ast.parse(data))
+        package = name if path.name == "__init__.py" else name.rpartition(".")[0]
+        text = hashlib.sha256(ast.dump(tree).encode()).hexdigest()
+        _memory.known[known] = [text, sorted(set(_imports(tree, package)))]
+        _memory.new = True
+    sha256, imports = _memory.known[known]
+    return _Source(sha256, tuple(imports))
+
+
+def _imports(tree: ast.AST, package: str) -> Iterator[str]:
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            above = package.split(".")[: len(package.split(".")) - node.level + 1] if node.level else []
+            base = ".".join([*above, *([node.module] if node.module else [])])
+            yield base
+            yield from (f"{base}.{alias.name}" for alias in node.names)  # a submodule, or an attribute: no such file
+
+
+class _Strip(ast.NodeTransformer):
+    """Takes away what never runs: docstrings, and what stands under ``if TYPE_CHECKING:``."""
+
+    def visit_If(self, node: ast.If) -> ast.AST | list[ast.stmt]:
+        test = node.test
+        name = test.id if isinstance(test, ast.Name) else test.attr if isinstance(test, ast.Attribute) else ""
+        self.generic_visit(node)
+        return node.orelse if name == "TYPE_CHECKING" else node
+
+    def _documented(self, node: ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef) -> ast.AST:
+        if ast.get_docstring(node, clean=False) is not None:
+            node.body = node.body[1:]
+        self.generic_visit(node)
+        return node
+
+    visit_Module = visit_ClassDef = visit_FunctionDef = visit_AsyncFunctionDef = _documented

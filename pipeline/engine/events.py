@@ -1,0 +1,120 @@
+"""Ledger of a run: JSON lines, one for each node as soon as its fate is known, so that it survives a crash."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, TextIO
+
+from pipeline.engine.graph import Handle
+from pipeline.engine.memory.cost_model import input_bytes
+
+
+class Ledger:
+    """Writes to a file, or nowhere."""
+
+    def __init__(self, path: Path | None) -> None:
+        self._file: TextIO | None = None
+        if path is not None:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._file = path.open("w", encoding="utf-8", buffering=1)
+
+    def write(self, handle: Handle) -> None:
+        """What became of a node: where its inputs come from, why it was missed, what it took."""
+        if self._file is None:
+            return
+        row: dict[str, Any] = {"label": handle.label, "stage": handle.stage, "status": handle.status}
+        if handle.inputs:
+            row["inputs"] = {
+                p: [h.label for h in g] if isinstance(g, list) else g.label for p, g in handle.inputs.items()
+            }
+        if handle.reason:
+            row["reason"] = handle.reason
+        if handle.key:
+            row["key"] = handle.key
+        if handle.ref is not None:
+            row["digest"] = handle.ref.digest
+        if handle.status == "computed":
+            row |= _took(handle)
+        if handle.error is not None:
+            row["error"] = {"type": type(handle.error).__name__, "message": str(handle.error)}
+        self._line(row)
+
+    def note(self, label: str, status: str, reason: str) -> None:
+        """A line for what is no node: an expansion that could not be made."""
+        self._line({"label": label, "stage": "", "status": status, "reason": reason})
+
+    def expansion(self, after: Sequence[str], nodes: Sequence[str]) -> None:
+        """A line for nodes that could be laid out only after the results of others."""
+        self._line({"expansion": {"after": list(after), "nodes": list(nodes)}})
+
+    def run(self, **facts: Any) -> None:
+        """A line of facts about the run as a whole."""
+        self._line({"run": facts})
+
+    def _line(self, row: dict[str, Any]) -> None:
+        if self._file is not None:
+            self._file.write(json.dumps(row) + "\n")
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._file is not None:
+            self._file.close()
+
+
+def _took(handle: Handle) -> dict[str, Any]:
+    """Times (seconds; of day since 1970) and bytes of a computed task; see :class:`~pipeline.engine.task.Outcome`."""
+    assert handle.ref is not None
+    return {
+        "started": round(handle.started, 4),
+        "ended": round(handle.started + handle.seconds, 4),
+        "seconds": round(handle.seconds, 4),
+        "kernel": round(handle.kernel, 4),
+        "peak_rss": handle.peak_rss,
+        "memory": handle.memory,
+        "rest": handle.rest,
+        "first": handle.first,
+        "input_bytes": round(input_bytes(handle)),
+        "bytes": handle.ref.nbytes,
+        "stored": handle.ref.stored,
+    }
+
+
+def read(path: Path) -> list[dict[str, Any]]:
+    """Rows of a ledger, one a node; a last line cut short by a crash is left out."""
+    return [row for row in _lines(path) if "label" in row]
+
+
+def facts(path: Path) -> dict[str, Any]:
+    """What is said of the run as a whole; of one that was killed, what was known when it began."""
+    found: dict[str, Any] = {}
+    for row in _lines(path):
+        found |= row.get("run", {})
+    return found
+
+
+def add_facts(path: Path, **facts: Any) -> None:
+    """Add a line about the run as a whole to a ledger that is closed."""
+    with path.open("a", encoding="utf-8") as file:
+        file.write(json.dumps({"run": facts}) + "\n")
+
+
+def expansions(path: Path) -> list[tuple[list[str], list[str]]]:
+    """Labels of the nodes that were waited for, and of those laid out then."""
+    return [(e["after"], e["nodes"]) for row in _lines(path) if (e := row.get("expansion"))]
+
+
+def _lines(path: Path) -> list[dict[str, Any]]:
+    rows = []
+    for line in path.read_text(encoding="utf-8").splitlines():
+        try:
+            rows.append(json.loads(line))
+        except ValueError:
+            break
+    return rows
+
+
+def keys(path: Path) -> set[str]:
+    """Keys of all artifacts that the run of a ledger used: what clearing the cache must keep."""
+    return {row["key"] for row in read(path) if row["status"] in ("computed", "cached") and "key" in row}

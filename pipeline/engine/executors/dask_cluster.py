@@ -1,0 +1,232 @@
+"""Executor on a dask scheduler that others have started, and what its workers must be before they get a task.
+
+Every worker must have the source code, the Python and the packages of the client, use one thread a library, and see
+the same cache: a probe is written by each side and read by the other. One that differs is named with the difference,
+and the run does not begin. A worker that joins later is examined at its first task, which fails there.
+
+A worker that is lost in the midst of a task gives it back to the scheduler, which begins it elsewhere; after more
+deaths than its setting ``distributed.scheduler.allowed-failures`` (3) the task has failed. What had been committed
+before the worker was lost is found there, not computed again.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import time
+import uuid
+from collections.abc import Mapping
+from contextlib import suppress
+from functools import lru_cache
+from importlib import metadata
+from typing import Any
+
+from pipeline.engine.code_digest import OWN, tree_digest
+from pipeline.engine.packages import version
+from pipeline.engine.runtime.environment import prepare_environment
+from pipeline.engine.store.folder import Store, at
+from pipeline.engine.store.location import Location
+from pipeline.engine.store.s3 import ObjectStore
+from pipeline.engine.task import CodeChangedError
+from stages.core.errors import ConfigError, RilleError
+
+PACKAGES = (
+    *("dask", "distributed", "google-crc32c", "llvmlite", "numba", "numcodecs", "numpy", "obstore", "pydantic", "zarr"),
+    *("opencv-python-headless", "pycolmap", "pyogrio", "rasterio", "scipy"),
+)
+"""Distributions whose version must be the client's, and the kind of processor that they work for."""
+
+ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+
+NO_WORKERS = 30.0
+"""Seconds that a scheduler may be without workers, at the beginning or later, before the run is given up."""
+
+SILENCE = 20.0
+"""Seconds without an answer of the scheduler before it counts as gone."""
+
+Identity = Mapping[str, str]
+
+
+class ClusterError(RilleError):
+    """The scheduler or all of its workers are gone."""
+
+
+def identity() -> dict[str, str]:
+    """What must be the same on client and workers, by name; a package that is missing has no version."""
+    found = {"Python": platform.python_version(), "source code": tree_digest((*OWN, "pipeline"))[:12]}
+    for name in PACKAGES:
+        try:
+            found[name] = version(name)
+        except metadata.PackageNotFoundError:
+            found[name] = "none"
+    return found
+
+
+def unlike(theirs: Identity, ours: Identity) -> str:
+    """In what a worker differs, in words; empty if in nothing."""
+    return ", ".join(f"{n} {theirs.get(n, 'none')} instead of {ours[n]}" for n in ours if theirs.get(n) != ours[n])
+
+
+def introduce(location: Location, token: str, name: str) -> dict[str, Any]:
+    """Run on a worker: what it is, and whether it reads the client's probe and writes one of its own."""
+    threads = [v for v in ONE_THREAD if os.environ.get(v) != "1"]
+    facts: dict[str, Any] = {"identity": identity(), "threads": threads, "cache": ""}
+    try:
+        store = at(location)
+        if read_probe(store, token) != token.encode():
+            facts["cache"] = "the client's probe is not there"
+        write_probe(store, f"{token}-{name}")
+    except (OSError, RilleError) as error:
+        facts["cache"] = " ".join(str(error).split())
+    return facts
+
+
+def write_probe(store: Store, name: str) -> None:
+    """Leave a small file in the cache; clearing up takes what is forgotten."""
+    if isinstance(store, ObjectStore):
+        store.bucket.put(f"probe/{name}", name.encode())
+        return
+    store.root.mkdir(parents=True, exist_ok=True)
+    (store.root / f"probe-{name}.tmp").write_bytes(name.encode())
+
+
+def read_probe(store: Store, name: str) -> bytes | None:
+    """What was left; None if it is not to be seen."""
+    if isinstance(store, ObjectStore):
+        found = store.bucket.get(f"probe/{name}")
+        return None if found is None else found[0]
+    try:
+        return (store.root / f"probe-{name}.tmp").read_bytes()
+    except FileNotFoundError:
+        return None
+
+
+def _drop_probes(store: Store, names: list[str]) -> None:
+    if isinstance(store, ObjectStore):
+        store.bucket.delete(f"probe/{name}" for name in names)
+    for name in names:
+        (store.root / f"probe-{name}.tmp").unlink(missing_ok=True)
+
+
+def examine(client: Any, cache: Location) -> None:
+    """Refuse a cluster one of whose workers is not like this process, or does not share the cache.
+
+    Raises
+    ------
+    ConfigError
+        The first such worker, with the difference.
+    """
+    store, token, ours = at(cache), uuid.uuid4().hex, identity()
+    workers = {address: f"w{k}" for k, address in enumerate(sorted(client.nthreads()))}
+    names = [token, *(f"{token}-{short}" for short in workers.values())]
+    try:
+        write_probe(store, token)
+        for address, short in workers.items():
+            told = client.run(introduce, cache, token, short, workers=[address], on_error="return").get(address)
+            if told is not None:  # None is one that has left meanwhile
+                _judge(client, address, told, ours, cache)
+            if told is not None and read_probe(store, f"{token}-{short}") is None:
+                raise _no_cache(_name(client, address), cache, "its probe is not seen here")
+    finally:
+        with suppress(OSError, RilleError):
+            _drop_probes(store, names)
+
+
+def _judge(client: Any, address: str, told: Any, ours: Identity, cache: Location) -> None:
+    name = _name(client, address)
+    if isinstance(told, BaseException):
+        raise ConfigError(
+            "RIL-520",
+            f"{name} cannot run Rille: {type(told).__name__}: {' '.join(str(told).split())[:200]}",
+            remedy="install the same version there, and start the workers with it",
+        )
+    if difference := unlike(told["identity"], ours):
+        raise ConfigError(
+            "RIL-521", f"{name} differs: {difference}", remedy="install the same there, and start it again"
+        )
+    if told["threads"]:
+        raise ConfigError(
+            "RIL-522",
+            f"{name} may use several threads a library ({told['threads'][0]} is not 1)",
+            remedy="start it with OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1",
+        )
+    if told["cache"]:
+        raise _no_cache(name, cache, told["cache"])
+
+
+def _name(client: Any, address: str) -> str:
+    known = client.scheduler_info(n_workers=-1)["workers"].get(address, {}).get("name", "")
+    return f"worker {known} ({address})" if known and known != address else f"worker {address}"
+
+
+def _no_cache(name: str, cache: Location, why: str) -> ConfigError:
+    remedy = "give --cache a folder that all machines share, or s3://bucket/prefix"
+    return ConfigError("RIL-523", f"{name} does not share the cache {cache}: {why}", remedy=remedy)
+
+
+def ready(ours: tuple[tuple[str, str], ...]) -> None:
+    """On a worker before each task: prepared as our own workers are, and the same as the client.
+
+    Raises
+    ------
+    CodeChangedError
+        It is not.
+    """
+    if difference := _prepared(ours, os.getpid()):
+        raise CodeChangedError("RIL-524", f"worker {_here()} differs: {difference}", remedy="install the same there")
+
+
+@lru_cache(maxsize=4)
+def _prepared(ours: tuple[tuple[str, str], ...], process: int) -> str:
+    prepare_environment()
+    return unlike(identity(), dict(ours))
+
+
+def _here() -> str:
+    from distributed import get_worker
+
+    with suppress(ValueError):
+        return f"{get_worker().name} on {platform.node()}"
+    return platform.node()
+
+
+class Presence:
+    """Whether the scheduler answers, and has workers."""
+
+    def __init__(self, client: Any, address: str) -> None:
+        self._client, self._address = client, address
+        self._answered = self._manned = time.monotonic()
+
+    def threads(self) -> int:
+        """Threads of all workers now.
+
+        Raises
+        ------
+        ClusterError
+            The scheduler is gone, or had no workers for too long.
+        """
+        now = time.monotonic()
+        try:
+            threads = sum(self._client.sync(self._client.scheduler.ncores, callback_timeout=SILENCE / 2).values())
+        except Exception as error:
+            if self._client.status in ("closing", "closed") or time.monotonic() - self._answered > SILENCE:
+                raise self.gone() from error
+            return 0
+        self._answered = now
+        if threads:
+            self._manned = now
+        elif now - self._manned > NO_WORKERS:
+            raise ClusterError(
+                "RIL-525",
+                f"the dask scheduler at {self._address} had no workers for {NO_WORKERS:.0f} s",
+                remedy="start workers, and run the same command: what is committed stays",
+            )
+        return int(threads)
+
+    def gone(self) -> ClusterError:
+        """The scheduler is."""
+        return ClusterError(
+            "RIL-526",
+            f"the dask scheduler at {self._address} is gone",
+            remedy="start it again with its workers, and run the same command: what is committed stays",
+        )

@@ -1,0 +1,36 @@
+"""Failures of the machine and of libraries, in one line that says where and what to change."""
+
+from __future__ import annotations
+
+import errno
+
+from stages.core.errors import RilleError
+
+FULL = (errno.ENOSPC, errno.EDQUOT)
+CLOSED = (errno.EACCES, errno.EPERM, errno.EROFS)
+
+
+def told(error: BaseException) -> RilleError | None:
+    """The same failure as an error of Rille; None where nothing better than its own words can be said."""
+    if isinstance(error, RilleError):
+        return error
+    if isinstance(error, MemoryError):
+        remedy = "set --memory-limit or fewer --jobs, or match in tiles (tiling.memory)"
+        return RilleError("RIL-736", "memory is used up", remedy=remedy)
+    if isinstance(error, OSError) and error.errno is not None:
+        where = f"{error.filename}: " if error.filename else ""
+        return RilleError("RIL-737", f"{where}{error.strerror}", remedy=_remedy(error.errno))
+    library = type(error).__module__.split(".")[0]
+    if library == "cv2":
+        return RilleError("RIL-738", f"OpenCV cannot do this: {error}", remedy="check the images and their sizes")
+    if library == "rasterio":
+        return RilleError("RIL-739", f"cannot write or read a raster: {error}", remedy="check the space in --runs")
+    return None
+
+
+def _remedy(number: int) -> str:
+    if number in FULL:
+        return "free space, clear the cache, or choose other folders with --runs and --cache"
+    if number in CLOSED:
+        return "choose folders that may be written with --runs and --cache"
+    return "check the path; the same command resumes from here"

@@ -1,0 +1,1 @@
+"""What tasks cost, and what may run side by side."""

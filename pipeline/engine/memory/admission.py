@@ -1,0 +1,192 @@
+"""Which task may begin: those of a run together stay under a limit of memory, and in the order of their creation.
+
+What is held: by this process, by each worker between tasks, and by each running task as foreseen
+(:mod:`pipeline.engine.memory.cost_model`). A task begins where the sum stays under the limit; a later one may pass one
+that has to wait, but not for ever. One that does not fit even alone is refused, with the parameter that makes it
+smaller. On a cluster given by address the memory is the workers' own business, unless a limit is given for all of it.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+import time
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass
+
+from pipeline.engine.graph import Graph, Handle
+from pipeline.engine.memory import limits
+from pipeline.engine.memory.cost_model import Costs, Foreseen, input_bytes
+from pipeline.engine.memory.limits import words
+from stages.core.errors import ConfigError
+
+PATIENCE = 8
+"""Tasks that may pass one that waits for memory."""
+
+
+FRESH = 0.2
+"""Seconds that a look at the machine's free memory holds."""
+
+
+class MemoryRefusedError(ConfigError):
+    """A task needs more memory than the limit, all others aside."""
+
+
+@dataclass(frozen=True)
+class Account:
+    """How a limit is shared out, bytes: ``own`` is this process's, ``rest`` each of the ``workers``'."""
+
+    limit: float
+    own: float
+    rest: float
+    workers: int
+
+    @property
+    def budget(self) -> float:
+        """For all running tasks."""
+        return max(0.0, self.limit - self.own - self.workers * self.rest)
+
+    @property
+    def alone(self) -> float:
+        """For a task that has everything to itself, on one worker."""
+        return max(0.0, self.limit - self.own - self.rest)
+
+
+def account(costs: Costs, limit: float | None, executor: str, jobs: int, largest: float = 0.0) -> Account:
+    """The shares; with fewer workers than ``jobs`` where the largest task needs their place."""
+    own = limits.resident()
+    if "://" in executor and limit is None:
+        return Account(math.inf, own, 0.0, jobs)
+    limit = float(limit) if limit is not None else own + limits.SHARE * limits.free()
+    if executor != "processes":
+        return Account(limit, own, 0.0, 1 if executor == "inline" else jobs)
+    rest = costs.rest
+    fit = int((limit - own - largest) // rest)
+    return Account(limit, own, rest, max(1, min(jobs, fit)))
+
+
+class Admission:
+    """Keeps the sum of what runs under the budget of an account; ``automatic``: the limit was not given by the user."""
+
+    def __init__(self, costs: Costs, shares: Account, *, automatic: bool) -> None:
+        self.costs, self.shares, self.automatic = costs, shares, automatic
+        self._running: dict[str, float] = {}
+        self._foreseen: dict[int, Foreseen] = {}
+        self._free, self._asked = 0.0, -math.inf
+
+    def foresee(self, handle: Handle) -> Foreseen:
+        """What a task whose inputs are there will take."""
+        if handle.index not in self._foreseen:
+            self._foreseen[handle.index] = self.costs.foresee(handle.spec, input_bytes(handle))
+        return self._foreseen[handle.index]
+
+    def fits(self, handle: Handle) -> bool:
+        """Whether a task may begin now; alone it always may."""
+        if not self._running:
+            return True
+        most = self.foresee(handle).most
+        if sum(self._running.values()) + most > self.shares.budget:
+            return False
+        return not self.automatic or self._now() > most
+
+    def _now(self) -> float:
+        """What is free on the machine, by a look that is fresh enough."""
+        if time.monotonic() - self._asked > FRESH:
+            self._free, self._asked = limits.free(), time.monotonic()
+        return self._free
+
+    def begin(self, handle: Handle) -> None:
+        """A task has begun."""
+        self._running[handle.key] = self.foresee(handle).most
+        del self._foreseen[handle.index]
+
+    def end(self, key: str) -> None:
+        """It has ended."""
+        self._running.pop(key, None)
+
+    def refusal(self, handle: Handle, foreseen: Foreseen | None = None) -> MemoryRefusedError | None:
+        """Why a task cannot run here at all, if so."""
+        foreseen = foreseen or self.foresee(handle)
+        if foreseen.memory <= self.shares.alone:
+            return None
+        lower = handle.spec.stage.memory.lower
+        change = f"change {' or '.join(lower)}, or " if lower else ""
+        return MemoryRefusedError(
+            "RIL-500",
+            f"would need about {words(foreseen.memory)} ({foreseen.source}), and "
+            f"{words(self.shares.alone)} are left for a task of the limit of {words(self.shares.limit)} "
+            f"(the program itself and a worker hold {words(self.shares.own + self.shares.rest)})",
+            remedy=f"{change}give more with --memory-limit",
+        )
+
+    def check(self, graph: Graph) -> None:
+        """Raise where a planned task cannot run here at all."""
+        for index, foreseen in forecast(graph, self.costs).items():
+            error = self.refusal(graph.nodes[index], foreseen)
+            if error is not None:
+                raise error.at(graph.nodes[index].label)
+
+
+def forecast(graph: Graph, costs: Costs) -> dict[int, Foreseen]:
+    """What each planned task of a dry run will take, by index; results still to come count as foreseen."""
+    found: dict[int, Foreseen] = {}
+    results: dict[int, float] = {}
+    for handle in graph.nodes:  # inputs come before what they lead to
+        if handle.status == "planned":
+            size = input_bytes(handle, results)
+            found[handle.index] = foreseen = costs.foresee(handle.spec, size)
+            results[handle.index] = foreseen.result
+            inputs = [float(h.ref.nbytes) if h.ref else results.get(h.index, 0.0) for h in handle.upstream()]
+            if inputs and not foreseen.measured:  # guesses upon guesses would grow without end along a chain
+                results[handle.index] = min(foreseen.result, max(*inputs, size - sum(inputs)))
+    return found
+
+
+def largest(graph: Graph, costs: Costs) -> float:
+    """Memory of the greatest planned task, bytes."""
+    return max((f.most for f in forecast(graph, costs).values()), default=0.0)
+
+
+class Waiting:
+    """Tasks that wait for a worker: by stage, in order of creation."""
+
+    def __init__(self) -> None:
+        self._heaps: dict[str, list[int]] = {}
+        self._nodes: dict[int, Handle] = {}
+        self._passed = 0
+
+    def __len__(self) -> int:
+        return len(self._nodes)
+
+    def __iter__(self) -> Iterator[Handle]:
+        return iter(self._nodes.values())
+
+    def push(self, handle: Handle) -> None:
+        """Add a task."""
+        heapq.heappush(self._heaps.setdefault(handle.stage, []), handle.index)
+        self._nodes[handle.index] = handle
+
+    def clear(self) -> None:
+        """Forget all."""
+        self._heaps.clear()
+        self._nodes.clear()
+
+    def take(self, cold: Collection[str], fits: Callable[[Handle], bool]) -> Handle | None:
+        """The first that fits into memory, if there is one; of ``cold`` stages only where nothing else is left.
+
+        While a stage's first task compiles its kernels another process would compile the same ones; a moment later
+        it finds them on disk.
+        """
+        first = sorted((stage in cold, heap[0], stage) for stage, heap in self._heaps.items())
+        for place, (_, index, stage) in enumerate(first):
+            handle = self._nodes[index]
+            if fits(handle):
+                self._passed = self._passed + 1 if place else 0
+                heapq.heappop(self._heaps[stage])
+                if not self._heaps[stage]:
+                    del self._heaps[stage]
+                del self._nodes[index]
+                return handle
+            if self._passed >= PATIENCE:
+                return None
+        return None

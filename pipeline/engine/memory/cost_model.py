@@ -1,0 +1,256 @@
+"""What tasks cost in memory and bytes: remembered from earlier runs of a sequence, and foreseen for those to come.
+
+Each run leaves, for each stage and each set of its parameters, samples of what its tasks took: bytes of their inputs,
+memory, bytes of the result decoded and on disk (``costs.json``, a hint like the explanations: where it is missing or
+wrong, only estimates suffer). A task is foreseen from samples of like size, else by a line through all of them, else
+from other parameters of its stage, else by the guess of the stage's declaration; :attr:`Foreseen.source` says by which.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections import defaultdict
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from statistics import median
+from typing import TYPE_CHECKING, Any
+
+from pipeline.engine.keys import digest
+from stages.core.declare import Params
+
+if TYPE_CHECKING:
+    from pipeline.engine.graph import Handle
+    from pipeline.engine.task import Spec
+
+FILE = "costs.json"
+KEPT = 64
+"""Samples kept of a stage with one set of parameters, the newest."""
+
+EACH_RUN = 16
+"""Samples that one run adds to them, from the greatest to the least."""
+
+GROUPS = 6
+"""Sets of parameters remembered of a stage."""
+
+LIKE = 1.25
+"""Tasks are of like size if their inputs differ by no more than this factor."""
+
+SPREAD = 0.1
+"""Least relative uncertainty stated: allocators and the system do not repeat themselves better."""
+
+FEW = 0.4
+"""Added to it, over the number of like tasks that were measured."""
+
+GUESS = 0.5
+"""Relative uncertainty of a guess."""
+
+SLACK = 8e6
+"""Bytes added to each task's upper bound: the granularity of allocators."""
+
+REST = 250e6
+"""Bytes that a worker process holds between tasks, while none was measured: Python with NumPy, SciPy and numba."""
+
+Sample = tuple[float, float | None, float, float]
+"""Bytes of input, memory (None: not measured), bytes of result decoded, and on disk."""
+
+
+@dataclass(frozen=True)
+class Foreseen:
+    """What a task will take, bytes: memory beyond a resting worker's, relative uncertainty, result, and why."""
+
+    memory: float
+    spread: float
+    result: float
+    stored: float
+    source: str
+    measured: bool
+
+    @property
+    def most(self) -> float:
+        """Memory that it will hardly exceed."""
+        return self.memory * (1 + self.spread) + SLACK
+
+
+@dataclass
+class Group:
+    """Samples of one stage with one set of parameters, out of how many tasks and runs."""
+
+    runs: int = 0
+    tasks: int = 0
+    samples: list[Sample] = field(default_factory=list)
+
+
+class Costs:
+    """What is remembered on a cache."""
+
+    def __init__(self, groups: dict[str, dict[str, Group]] | None = None, rests: list[float] | None = None) -> None:
+        self.groups = groups or {}
+        self.rests = rests or []
+        self._names: dict[int, tuple[Params, str]] = {}
+        self._foreseen: dict[tuple[str, str, float], Foreseen] = {}
+
+    @property
+    def rest(self) -> float:
+        """Bytes that a worker holds between tasks: the greatest of nine in ten, or an assumption."""
+        known = sorted(self.rests)
+        return known[int(0.9 * (len(known) - 1))] if known else REST
+
+    def foresee(self, spec: Spec, size: float) -> Foreseen:
+        """What a task with ``size`` bytes of input will take."""
+        stage, params = spec.stage, self._name(spec.params)
+        asked = (stage.name, params, size)
+        if asked not in self._foreseen:
+            self._foreseen[asked] = self._compute(spec, params, size)
+        return self._foreseen[asked]
+
+    def _compute(self, spec: Spec, params: str, size: float) -> Foreseen:
+        stage = spec.stage
+        groups = self.groups.get(stage.name, {})
+        same, others = groups.get(params), [g for name, g in groups.items() if name != params]
+        guess = stage.memory
+        for group, remark in ((same, ""), (_joined(others), " with other parameters")):
+            measured = [] if group is None else [(s[0], s[1]) for s in group.samples if s[1] is not None]
+            if group is None or not measured:
+                continue
+            memory, spread = _at(measured, size)
+            result, _ = _at([(s[0], s[2]) for s in group.samples], size)
+            stored, _ = _at([(s[0], s[3]) for s in group.samples], size)
+            source = f"from {count(group.tasks, 'task')} of {count(group.runs, 'run')}{remark}"
+            if remark:
+                spread = max(spread, GUESS)
+            return Foreseen(memory, spread, result, stored, source, not remark)
+        result = guess.result * size
+        source = "no earlier run: a guess of the stage's declaration"
+        return Foreseen(guess.fixed + guess.factor * size, GUESS, result, result, source, False)
+
+    def _name(self, params: Params) -> str:
+        known = self._names.get(id(params))
+        if known is None:
+            known = self._names[id(params)] = (params, digest(params)[:16])  # held, so that its id stays its own
+        return known[1]
+
+    def learn(self, handles: Iterable[Handle]) -> None:
+        """Take in what was computed now."""
+        new: dict[tuple[str, str], list[Sample]] = defaultdict(list)
+        computed = [h for h in handles if h.status == "computed" and h.ref is not None]
+        warm = {(h.stage, self._name(h.spec.params)) for h in computed if not h.first and h.memory is not None}
+        for h in computed:
+            assert h.ref is not None
+            name = h.stage, self._name(h.spec.params)
+            measured = h.memory if not h.first or name not in warm else None  # imports and compiling are not its own
+            new[name].append((input_bytes(h), measured, float(h.ref.nbytes), float(h.ref.stored)))
+            self.rests += [] if h.rest is None else [float(h.rest)]
+        self.rests = self.rests[-KEPT:]
+        for (stage, params), samples in new.items():
+            groups = self.groups.setdefault(stage, {})
+            group = groups.pop(params, Group())
+            groups[params] = group  # the newest last
+            group.runs, group.tasks = group.runs + 1, group.tasks + len(samples)
+            group.samples = (group.samples + _thinned(samples))[-KEPT:]
+            for old in list(groups)[:-GROUPS]:
+                del groups[old]
+        self._foreseen.clear()
+
+
+def _thinned(samples: list[Sample]) -> list[Sample]:
+    """A few of them, from the least to the greatest memory."""
+    ranked = sorted(samples, key=lambda s: (s[1] is not None, s[1] or 0.0))
+    if len(ranked) <= EACH_RUN:
+        return ranked
+    return [ranked[round(k * (len(ranked) - 1) / (EACH_RUN - 1))] for k in range(EACH_RUN)]
+
+
+def _joined(groups: list[Group]) -> Group | None:
+    if not groups:
+        return None
+    runs = max(g.runs for g in groups)
+    return Group(runs, sum(g.tasks for g in groups), [s for g in groups for s in g.samples])
+
+
+def _at(samples: list[tuple[float, float]], size: float) -> tuple[float, float]:
+    """Value at a size, and its relative uncertainty, of samples ``(size, value)``."""
+    near = [y for x, y in samples if x == size or (x and size and 1 / LIKE <= x / size <= LIKE)]
+    if near:
+        middle = median(near)
+        off = max(abs(y - middle) for y in near) / middle if middle else 0.0
+        return middle, max(SPREAD + FEW / len(near), off)
+    sizes = [x for x, _ in samples]
+    if size > max(sizes) < 2 * min(sizes):  # too much of a kind to tell a slope: in proportion, which is safe
+        return median(y for _, y in samples) * size / median(sizes), GUESS
+    intercept, slope = _line(samples)
+    off = max((abs(y - intercept - slope * x) / y for x, y in samples if y), default=0.0)
+    typical = median(x for x, _ in samples)
+    beyond = max(size, typical) / max(min(size, typical), 1.0)
+    return intercept + slope * size, max(2 * SPREAD, off) + 0.1 * min(beyond - 1, 5.0)
+
+
+def _line(samples: list[tuple[float, float]]) -> tuple[float, float]:
+    """Least squares with neither intercept nor slope below zero; of one size only, in proportion."""
+    n = len(samples)
+    mx, my = sum(x for x, _ in samples) / n, sum(y for _, y in samples) / n
+    var = sum((x - mx) ** 2 for x, _ in samples)
+    slope = max(0.0, sum((x - mx) * (y - my) for x, y in samples) / var) if var > 0 else my / mx if mx else 0.0
+    intercept = my - slope * mx
+    if intercept >= 0:
+        return intercept, slope
+    return 0.0, sum(x * y for x, y in samples) / sum(x * x for x, _ in samples)
+
+
+def count(n: int, what: str) -> str:
+    """``1 task``, ``3 tasks``."""
+    return f"{n} {what}{'' if n == 1 else 's'}"
+
+
+def input_bytes(handle: Handle, expected: Mapping[int, float] | None = None) -> float:
+    """Bytes that a task works on: its inputs decoded, what it reads from outside, and what its stage adds.
+
+    ``expected`` are bytes of results still to come, by index of the node.
+    """
+    parts = (float(ref.nbytes) if (ref := h.ref) else (expected or {}).get(h.index, 0.0) for h in handle.upstream())
+    size = handle.expect + sum(parts)
+    more = handle.spec.stage.memory.size
+    if more is not None:
+        metas = {p: [_meta(h) for h in g] if isinstance(g, list) else _meta(g) for p, g in handle.inputs.items()}
+        with suppress(Exception):  # an estimate only, and facts may be still to come
+            size += more(handle.spec.params, handle.spec.args, metas)
+    return size
+
+
+def _meta(handle: Handle) -> Any:
+    ref = handle.ref or handle.earlier
+    return ref.meta if ref is not None else {}
+
+
+def recall(hints: Path) -> Costs:
+    """What is remembered in a sequence's folder of hints; nothing where that cannot be read."""
+    try:
+        known = json.loads((hints / FILE).read_text(encoding="utf-8"))
+        groups = {
+            stage: {
+                name: Group(int(g["runs"]), int(g["tasks"]), [(s[0], s[1], s[2], s[3]) for s in g["samples"]])
+                for name, g in named.items()
+            }
+            for stage, named in known["stages"].items()
+        }
+        return Costs(groups, [float(r) for r in known["rests"]])
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, IndexError):
+        return Costs()
+
+
+def remember(hints: Path, handles: Iterable[Handle]) -> None:
+    """Add what was computed now; best effort."""
+    computed = [h for h in handles if h.status == "computed"]
+    if not computed:
+        return
+    costs = recall(hints)
+    costs.learn(computed)
+    stages = {stage: {name: vars(g) for name, g in named.items()} for stage, named in costs.groups.items()}
+    path = hints / FILE
+    temporary = path.with_name(f"{FILE}.{os.getpid()}.tmp")
+    with suppress(OSError):
+        hints.mkdir(parents=True, exist_ok=True)
+        temporary.write_text(json.dumps({"stages": stages, "rests": costs.rests}), encoding="utf-8")
+        temporary.replace(path)

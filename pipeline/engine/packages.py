@@ -1,0 +1,106 @@
+"""Packages that a stage's result depends on: those that its modules import, with version and kind of processor.
+
+They are found by the same walk over import statements as the code digest (:mod:`pipeline.engine.code_digest`), so none
+can be forgotten. NumPy, SciPy and OpenCV choose code for the processor that they find, and sums of floats that are
+added in another order round to other bits: so the kind that each works for belongs to its version. (OpenBLAS by its
+core type, NumPy and OpenCV by the instruction sets in use; compiled kernels of numba add in the order in which they
+are written.)
+"""
+
+from __future__ import annotations
+
+import ctypes
+import importlib.metadata
+import importlib.util
+from collections.abc import Iterable
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
+
+from pipeline.engine.code_digest import OWN, external_imports
+from stages.core.errors import RilleError
+
+KNOWN = {
+    "cv2": ("opencv-python-headless", "opencv-contrib-python-headless", "opencv-python", "opencv-contrib-python"),
+    "yaml": ("pyyaml",),
+    "PIL": ("pillow",),
+}
+"""Import name to the distributions that may give it, where they are named otherwise: looking it up takes 0.2 s."""
+
+HARMLESS = frozenset({"pydantic", "pipeline"})
+"""What checks parameters, whose values are part of a key themselves; and the engine, whose format is."""
+
+CORE_NAMES = ("scipy_openblas_get_corename64_", "scipy_openblas_get_corename", "openblas_get_corename")
+
+
+class MissingPackageError(RilleError):
+    """A package that a stage imports is not installed."""
+
+
+def versions(module: str, own: Iterable[str] = OWN) -> dict[str, str]:
+    """Version and kind of each distribution that a module and what it reaches import, by the distribution's name.
+
+    Raises
+    ------
+    MissingPackageError
+        One of them is not installed.
+    """
+    names = external_imports(module, own) - HARMLESS
+    if "numba" in names:
+        names.add("llvmlite")  # generates the code
+    return dict(sorted(_version(name) for name in names))
+
+
+@cache
+def version(distribution: str) -> str:
+    """Exact installed version of a distribution, with the kind of processor that it works for, if that matters."""
+    found = importlib.metadata.version(distribution)
+    kind = _kind(distribution)
+    return f"{found} ({kind})" if kind else found
+
+
+@cache
+def _version(name: str) -> tuple[str, str]:
+    """Distribution that gives an import name, and its version."""
+    for distribution in KNOWN.get(name, (name,)):
+        with suppress(importlib.metadata.PackageNotFoundError):
+            return distribution, version(distribution)
+    for distribution in _distributions().get(name, ()):
+        return distribution, version(distribution)
+    raise MissingPackageError("RIL-530", f"package {name} is not installed", remedy="run `make install`")
+
+
+@cache
+def _distributions() -> dict[str, list[str]]:
+    return {name: list(given) for name, given in importlib.metadata.packages_distributions().items()}
+
+
+def _kind(distribution: str) -> str:
+    if distribution == "numpy":
+        import numpy as np
+
+        config = np.show_config(mode="dicts")
+        found = config["SIMD Extensions"] if isinstance(config, dict) else {}
+        return " ".join([*found.get("baseline", ()), *found.get("found", ()), _blas("numpy")]).strip()
+    if distribution == "scipy":
+        return _blas("scipy")
+    if distribution in KNOWN["cv2"]:
+        import cv2
+
+        line: str = cv2.getCPUFeaturesLine()
+        return " ".join(word.lstrip("*") for word in line.split() if not word.endswith("?"))
+    return ""
+
+
+def _blas(package: str) -> str:
+    """Core type that the OpenBLAS of a package has chosen; empty where it brings none."""
+    spec = importlib.util.find_spec(package)
+    for root in map(Path, (spec and spec.submodule_search_locations) or ()):
+        for path in (*root.parent.glob(f"{package}.libs/*openblas*"), *root.glob(".dylibs/*openblas*")):
+            library = ctypes.CDLL(str(path))  # the one that the package has loaded, or will
+            for name in CORE_NAMES:
+                if hasattr(library, name):
+                    function = getattr(library, name)
+                    function.restype = ctypes.c_char_p
+                    return f"OpenBLAS {(function() or b'').decode(errors='replace')}"
+    return ""

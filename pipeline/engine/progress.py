@@ -1,0 +1,261 @@
+"""Progress of a run on stderr: a bar with an estimate on a terminal, plain lines elsewhere, JSON lines, or nothing.
+
+The estimate weighs each task with the seconds that its stage took in earlier runs of the same sequence (a hint like
+the explanations); stages never seen count as the mean of the others.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol, TextIO
+
+from pipeline.plain import plain, raw
+from stages.core.errors import ConfigError
+
+if TYPE_CHECKING:
+    from pipeline.engine.graph import Graph, Handle
+    from pipeline.engine.scheduler import Counts, Result
+
+INTERVAL = 5.0
+"""Seconds between plain lines."""
+
+
+SLOW_COMPILE = 1.0
+"""Seconds of compilation that a user notices, and is told of."""
+
+
+class Progress(Protocol):
+    """What the driver tells; every method is called on the driver's thread."""
+
+    def open(self, graph: Graph, seconds: Mapping[str, float], jobs: int) -> None:
+        """The run begins; the graph may still grow."""
+
+    def running(self, handle: Handle) -> None:
+        """A task was given to a worker."""
+
+    def resolved(self, handle: Handle) -> None:
+        """The fate of a node is known."""
+
+    def failed(self, label: str, error: BaseException) -> None:
+        """A task or an expansion failed."""
+
+    def close(self, result: Result) -> None:
+        """The run has ended."""
+
+
+def make(mode: str = "auto", stream: TextIO | None = None) -> Progress:
+    """``auto`` (bar on a terminal, else plain), ``bar``, ``plain``, ``json`` or ``quiet``."""
+    stream = stream or sys.stderr
+    if mode == "auto":
+        mode = "bar" if stream.isatty() else "plain"
+    kinds: dict[str, Any] = {"bar": Bar, "plain": Plain, "json": Json, "quiet": Quiet}
+    if mode not in kinds:
+        raise ConfigError("RIL-568", f"progress {mode!r} is unknown", remedy=f"one of auto, {', '.join(kinds)}")
+    progress: Progress = kinds[mode](stream)
+    return progress
+
+
+class Quiet:
+    """Keeps the account that the others show, and says nothing."""
+
+    def __init__(self, stream: TextIO | None = None) -> None:
+        self.stream = stream or sys.stderr
+        self.graph: Graph | None = None
+        self.seconds: dict[str, float] = {}
+        self.jobs = 1
+        self.done = 0
+        self.work_done = 0.0
+        self.begin = time.monotonic()
+
+    def open(self, graph: Graph, seconds: Mapping[str, float], jobs: int) -> None:
+        """Remember the graph and the seconds each stage takes."""
+        self.graph, self.seconds, self.jobs = graph, dict(seconds), max(jobs, 1)
+
+    def running(self, handle: Handle) -> None:
+        """Not shown."""
+
+    def resolved(self, handle: Handle) -> None:
+        """Count it."""
+        self.done += 1
+        self.work_done += self._weight(handle)
+
+    def failed(self, label: str, error: BaseException) -> None:
+        """Not shown."""
+
+    def close(self, result: Result) -> None:
+        """Nothing to end."""
+
+    def total(self) -> int:
+        """Nodes known by now."""
+        return len(self.graph.nodes) if self.graph else 0
+
+    def left(self) -> float | None:
+        """Estimated seconds to go for the nodes known by now; None while no stage was ever timed."""
+        if self.graph is None or not self.seconds:
+            return None
+        work = sum(self._weight(h) for h in self.graph.nodes)
+        return max(0.0, work - self.work_done) / self.jobs
+
+    def _weight(self, handle: Handle) -> float:
+        mean = sum(self.seconds.values()) / len(self.seconds) if self.seconds else 1.0
+        return self.seconds.get(handle.stage, mean)
+
+
+class Plain(Quiet):
+    """A line every few seconds, and one for each failure: for logs."""
+
+    def open(self, graph: Graph, seconds: Mapping[str, float], jobs: int) -> None:
+        """Begin the clock."""
+        super().open(graph, seconds, jobs)
+        self.shown = time.monotonic()
+
+    def resolved(self, handle: Handle) -> None:
+        """Say where we are, now and then, and at once what was compiled."""
+        super().resolved(handle)
+        self._compiled(handle)
+        if time.monotonic() - self.shown >= INTERVAL:
+            self.shown = time.monotonic()
+            left = self.left()
+            self._say(
+                f"{self.done}/{self.total()} tasks, {handle.label} {handle.status}"
+                + (f", about {_clock(left)} left" if left is not None else "")
+            )
+
+    def _compiled(self, handle: Handle) -> None:
+        if handle.compiling >= SLOW_COMPILE:
+            self._say(f"{handle.stage}: compiling, once: {handle.compiling:.0f} s")
+
+    def failed(self, label: str, error: BaseException) -> None:
+        """Say so at once."""
+        self._say(f"{label} failed ({type(error).__name__})")
+
+    def close(self, result: Result) -> None:
+        """One closing line."""
+        self._say(summary(result))
+
+    def _say(self, text: str) -> None:
+        print(f"rille: {text}", file=self.stream, flush=True)
+
+
+class Json(Quiet):
+    """One JSON object a line for every step: for programs."""
+
+    def running(self, handle: Handle) -> None:
+        """``{"event": "running", ...}``."""
+        self._say(event="running", label=handle.label, stage=handle.stage, reason=handle.reason)
+
+    def resolved(self, handle: Handle) -> None:
+        """``{"event": "computed" | "cached" | "failed" | "skipped" | "planned", ...}``."""
+        super().resolved(handle)
+        self._say(
+            event=handle.status,
+            label=handle.label,
+            stage=handle.stage,
+            seconds=round(handle.seconds, 4),
+            done=self.done,
+            total=self.total(),
+            left=self.left(),
+        )
+
+    def failed(self, label: str, error: BaseException) -> None:
+        """``{"event": "error", ...}``."""
+        self._say(event="error", label=label, error=type(error).__name__, message=str(error))
+
+    def close(self, result: Result) -> None:
+        """``{"event": "end", ...}``."""
+        self._say(event="end", ok=result.ok, **vars(result.total()) | {"seconds": round(result.seconds, 3)})
+
+    def _say(self, **facts: Any) -> None:
+        print(json.dumps(facts), file=self.stream, flush=True)
+
+
+class Bar(Plain):
+    """A bar that moves with the estimated work done."""
+
+    def open(self, graph: Graph, seconds: Mapping[str, float], jobs: int) -> None:
+        """Show the bar."""
+        from rich.console import Console
+        from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
+        from rich.progress import Progress as RichProgress
+
+        super().open(graph, seconds, jobs)
+        columns = (
+            TextColumn("{task.fields[count]}"),
+            BarColumn(),
+            TimeElapsedColumn(),
+            TextColumn("{task.description}"),
+        )
+        self.rich = RichProgress(*columns, console=Console(file=raw(self.stream)), transient=True)
+        self.task = self.rich.add_task("", total=None, count="")
+        self.rich.start()
+
+    def running(self, handle: Handle) -> None:
+        """Name what runs."""
+        self._move(handle.label)
+
+    def resolved(self, handle: Handle) -> None:
+        """Move the bar."""
+        Quiet.resolved(self, handle)
+        self._compiled(handle)
+        self._move(handle.label)
+
+    def _move(self, label: str) -> None:
+        left = self.left()
+        total = sum(self._weight(h) for h in self.graph.nodes) if self.graph else 1.0
+        self.rich.update(
+            self.task,
+            completed=self.work_done,
+            total=total,
+            count=f"{self.done}/{self.total()}",
+            description=plain(label) + (f", about {_clock(left)} left" if left is not None else ""),
+        )
+
+    def close(self, result: Result) -> None:
+        """Take the bar away."""
+        if hasattr(self, "rich"):
+            self.rich.stop()
+        super().close(result)
+
+    def _say(self, text: str) -> None:
+        if hasattr(self, "rich"):
+            self.rich.console.print(f"rille: {plain(text)}", markup=False, highlight=False, soft_wrap=True)
+
+
+def summary(result: Result) -> str:
+    """``12 computed, 388 cached in 14.2 s``, with what failed or was left out."""
+    total = result.total()
+    parts = [f"{total.computed} computed", f"{total.cached} cached"]
+    parts += [f"{n} {what}" for what, n in (("planned", total.planned), ("failed", total.failed)) if n]
+    parts += [f"{total.skipped} left out"] if total.skipped else []
+    return f"{', '.join(parts)} in {result.seconds:.1f} s"
+
+
+def _clock(seconds: float) -> str:
+    return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min"
+
+
+def recall_seconds(hints: Path) -> dict[str, float]:
+    """Mean seconds of a task of each stage, from earlier runs; ``hints`` is the sequence's folder of them."""
+    try:
+        known = json.loads((hints / "seconds.json").read_text(encoding="utf-8"))
+        return {str(stage): float(seconds) for stage, seconds in known.items()}
+    except (OSError, ValueError, AttributeError, TypeError):
+        return {}
+
+
+def remember_seconds(hints: Path, counts: Mapping[str, Counts]) -> None:
+    """Note the mean seconds of what was computed now; best effort."""
+    new = {stage: round(c.seconds / c.computed, 4) for stage, c in counts.items() if c.computed}
+    if new:
+        path = hints / "seconds.json"
+        temporary = path.with_name(f"seconds.json.{os.getpid()}.tmp")
+        with suppress(OSError):
+            hints.mkdir(parents=True, exist_ok=True)
+            temporary.write_text(json.dumps(recall_seconds(hints) | new), encoding="utf-8")
+            temporary.replace(path)

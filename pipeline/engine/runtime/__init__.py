@@ -1,0 +1,1 @@
+"""The process that a task runs in: threads, compiled kernels, interrupts."""

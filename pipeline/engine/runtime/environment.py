@@ -1,0 +1,35 @@
+"""Environment of every process that runs stages; imports neither NumPy nor numba, which read it only once.
+
+Call :func:`prepare_environment` first thing in a program. Worker processes get the same variables before they start.
+"""
+
+from __future__ import annotations
+
+import os
+
+from pipeline.engine.code_digest import remember_in
+from pipeline.engine.runtime.numba_cache import guard
+from pipeline.engine.runtime.private import private_folder
+
+SINGLE = ("OMP", "OPENBLAS", "MKL", "NUMBA", "BLIS", "VECLIB_MAXIMUM", "NUMEXPR")
+
+
+def worker_environment() -> dict[str, str]:
+    """One thread a library."""
+    return {f"{name}_NUM_THREADS": "1" for name in SINGLE} | {
+        "OPENCV_FOR_THREADS_NUM": "1",
+        # a killed worker's semaphores are the tracker's business, not the user's
+        "PYTHONWARNINGS": os.environ.get("PYTHONWARNINGS") or "ignore:resource_tracker:UserWarning",
+    }
+
+
+def prepare_environment() -> None:
+    """Set this process up to run stages itself, and to start workers."""
+    remember_in(private_folder() / "sources.json")
+    os.environ.update(worker_environment())
+    guard()
+
+
+def cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -1,0 +1,169 @@
+"""Compiled kernels on disk: of this user alone, found by the code that they were made from, checked before they run.
+
+Numba 0.68 keeps a kernel by the path and the bytes of its own file. It does not notice that a callee in another file
+has changed (numba#1833), it trusts what it finds (a file cut short fails every later run, a flipped bit is executed),
+and two processes that compile two signatures of one function at once may both take the same number. Here
+
+- a kernel is known by the digest of its module and of all own modules that this one reaches
+(:mod:`pipeline.engine.code_digest`), so
+  that an edit compiles anew what it can change, and nothing else;
+- each entry is a file of its own, named by its key; it holds the key and a checksum, against damage;
+- all lie in :func:`pipeline.engine.runtime.private.private_folder`, because loading one executes it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.abc
+import importlib.util
+import os
+import pickle
+import sys
+import time
+from contextlib import suppress
+from importlib.machinery import ModuleSpec
+from pathlib import Path
+from types import CodeType, ModuleType
+from typing import Any
+
+from pipeline.engine.code_digest import OWN, code_digest
+from pipeline.engine.runtime.private import private_folder
+
+CACHING = "numba.core.caching"
+
+UNUSED_DAYS = 30
+"""A kernel that was not loaded for so long is removed by ``rille cache gc``."""
+
+
+class Compiling:
+    """Seconds for which kernels are compiled in this process, from the first that is not on disk to the last saved."""
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+        self.pending: set[str] = set()
+        self.since = 0.0
+
+    def begin(self, key: str) -> None:
+        """A kernel is not on disk: numba compiles it next, and whatever it calls in between."""
+        if not self.pending:
+            self.since = time.perf_counter()
+        self.pending.add(key)
+
+    def end(self, key: str) -> None:
+        """It is compiled and saved."""
+        known = key in self.pending
+        self.pending.discard(key)
+        if known and not self.pending:
+            self.seconds += time.perf_counter() - self.since
+
+    def take(self) -> float:
+        """The seconds since this was last asked."""
+        seconds, self.seconds = self.seconds, 0.0
+        self.pending.clear()
+        return seconds
+
+
+COMPILING = Compiling()
+
+
+def guard() -> None:
+    """Make the cache safe in this process, now or as soon as numba is imported; it is not imported for that."""
+    if CACHING in sys.modules:
+        _patch(sys.modules[CACHING])
+    elif not any(isinstance(finder, _Finder) for finder in sys.meta_path):
+        sys.meta_path.insert(0, _Finder())
+
+
+def folder() -> Path:
+    """Where the kernels of own modules lie."""
+    return private_folder() / "kernels"
+
+
+def unused(now: float | None = None) -> list[Path]:
+    """Kernels that nothing loaded for :data:`UNUSED_DAYS`."""
+    limit = (time.time() if now is None else now) - 86400 * UNUSED_DAYS
+    return [path for path in sorted(folder().glob("*")) if path.stat().st_mtime <= limit]
+
+
+class _Finder(importlib.abc.MetaPathFinder):
+    """Patches the module once it is there."""
+
+    def find_spec(self, name: str, path: Any, target: ModuleType | None = None) -> ModuleSpec | None:
+        if name != CACHING:
+            return None
+        sys.meta_path.remove(self)
+        spec = importlib.util.find_spec(name)
+        if spec is not None and spec.loader is not None:
+            run = spec.loader.exec_module
+
+            def run_and_patch(module: ModuleType) -> None:
+                run(module)
+                _patch(module)
+
+            spec.loader.exec_module = run_and_patch  # type: ignore[method-assign]
+        return spec
+
+
+class _Locator:
+    """Place and stamp of an own module's kernels (the interface of numba's locators)."""
+
+    def __init__(self, function: Any, file: str) -> None:
+        module = function.__module__
+        self._stamp = repr((module, function.__qualname__, code_digest(module), _content(function.__code__)))
+        self._py_file = file  # numba names it in a warning
+
+    @classmethod
+    def from_function(cls, function: Any, file: str) -> _Locator | None:
+        """None for functions of others: numba keeps these as it always does."""
+        own = function.__module__.partition(".")[0] in OWN
+        return cls(function, file) if own else None
+
+    def ensure_cache_path(self) -> None:
+        folder().mkdir(mode=0o700, exist_ok=True)
+
+    def get_cache_path(self) -> str:
+        return str(folder())
+
+    def get_source_stamp(self) -> str:
+        return self._stamp
+
+    def get_disambiguator(self) -> str:
+        return "own"
+
+
+def _content(code: CodeType) -> tuple[object, ...]:
+    """What tells apart two functions of one name that a factory makes; numba's key has the bytecode alone."""
+    return code.co_names, [_content(c) if isinstance(c, CodeType) else repr(c) for c in code.co_consts]
+
+
+def _patch(caching: Any) -> None:
+    kind = caching.IndexDataCacheFile
+    if getattr(kind, "guarded", False):
+        return
+
+    def path(self: Any, key: Any) -> Path:
+        name = hashlib.sha256(repr((self._version, self._source_stamp, key)).encode()).hexdigest()[:24]
+        return Path(self._data_path(f"{self._index_name.removesuffix('.nbi')}.{name}.nbc"))
+
+    def save(self: Any, key: Any, data: Any) -> None:
+        body = self._dump((self._version, self._source_stamp, key, data))
+        with self._open_for_write(str(path(self, key))) as file:
+            file.write(hashlib.sha256(body).digest() + body)
+        COMPILING.end(str(path(self, key)))
+
+    def load(self: Any, key: Any) -> Any:
+        file = path(self, key)
+        try:
+            content = file.read_bytes()
+        except OSError:
+            COMPILING.begin(str(file))
+            return None
+        if hashlib.sha256(content[32:]).digest() != content[:32]:
+            return None
+        with suppress(OSError):
+            os.utime(file)  # it is in use
+        *found, data = pickle.loads(content[32:])
+        return data if found == [self._version, self._source_stamp, key] else None
+
+    kind.save, kind.load, kind.flush, kind.guarded = save, load, lambda self: None, True
+    caching.CacheImpl._locator_classes.insert(0, _Locator)

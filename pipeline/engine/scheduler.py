@@ -1,0 +1,529 @@
+"""Runs a graph: looks everything up on the client, submits only what is missing, expands as results arrive.
+
+>>> result = run(graph, Store("cache"), executor="processes", jobs=2, progress=progress.make("auto"))
+>>> result.check()                       # raises the first failure, with its stage and label
+>>> result.counts["locus"].cached
+8
+
+A run that finds everything starts no worker. With ``dry=True`` nothing is computed: ``status`` of the handles is
+``cached`` or ``planned``, and ``reason`` says why (``rille plan``). What depends on results still to come is laid out
+by those of an earlier run where there was one (``Result.assumed``), else it is not known (``Result.unknown``).
+
+What a stage raises is not tried again, and what depends on it is skipped. Where the data do not determine an answer
+(:class:`~stages.core.errors.DegenerateError`) everything else finishes: the run has a hole. After any other error
+nothing new is begun, unless with ``keep_going``. An artifact that is found damaged, or gone, when a task reads it is
+computed again, and the task after it. A task whose worker process dies is tried three times. In every case the ledger
+has one line for each node that is missing, with the reason.
+"""
+
+from __future__ import annotations
+
+import gc
+import heapq
+import math
+import threading
+import time
+from collections import defaultdict
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from pipeline.engine import provenance
+from pipeline.engine.events import Ledger
+from pipeline.engine.executors.base import Executor, Failed, make
+from pipeline.engine.failures import told
+from pipeline.engine.graph import Expansion, Graph, Handle
+from pipeline.engine.keys import digest
+from pipeline.engine.memory import cost_model
+from pipeline.engine.memory.admission import Admission, Waiting, account, largest
+from pipeline.engine.memory.cost_model import input_bytes
+from pipeline.engine.progress import Progress, Quiet, recall_seconds, remember_seconds
+from pipeline.engine.runtime.environment import cores
+from pipeline.engine.runtime.interrupts import Interrupts
+from pipeline.engine.store.artifact import DamagedError
+from pipeline.engine.store.folder import GoneError, NonDeterministicError, Ref, Store
+from pipeline.engine.task import Outcome, key_of, recipe
+from stages.core.errors import DegenerateError, RilleError
+
+FEW = 20
+"""So many tasks, or one of so many, are few."""
+
+HEALS = 3
+"""Times that a task is put back because its input has gone."""
+
+
+class TaskError(RilleError):
+    """A task failed; its own error is the cause (``__cause__``)."""
+
+
+@dataclass
+class Counts:
+    """What became of the nodes of one stage; ``seconds`` is the sum over those computed now."""
+
+    computed: int = 0
+    cached: int = 0
+    failed: int = 0
+    skipped: int = 0
+    planned: int = 0
+    seconds: float = 0.0
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A task that failed: its label and stage, the original exception and the text of its traceback."""
+
+    label: str
+    stage: str
+    error: BaseException
+    traceback: str
+
+
+@dataclass
+class Result:
+    """What became of a run. ``keys`` are the artifacts it used (roots for clearing the cache).
+
+    Of a dry run: ``assumed`` are labels whose earlier result served to lay out what follows, ``unknown`` those that
+    hide it.
+    """
+
+    counts: dict[str, Counts] = field(default_factory=dict)
+    failures: list[Failure] = field(default_factory=list)
+    keys: set[str] = field(default_factory=set)
+    assumed: list[str] = field(default_factory=list)
+    unknown: list[str] = field(default_factory=list)
+    seconds: float = 0.0
+    executor_started: bool = False
+
+    @property
+    def ok(self) -> bool:
+        """Whether nothing failed and nothing was left out."""
+        return not self.failures and not any(c.skipped for c in self.counts.values())
+
+    def total(self) -> Counts:
+        """Counts over all stages."""
+        fields = ("computed", "cached", "failed", "skipped", "planned", "seconds")
+        return Counts(**{f: sum(getattr(c, f) for c in self.counts.values()) for f in fields})
+
+    def check(self, *, holes: bool = False) -> None:
+        """Raise the first failure as one line with its label: the original error of Rille, or what wraps another.
+
+        With ``holes`` failures that lie in the data are passed over.
+        """
+        failures = [f for f in self.failures if not (holes and is_hole(f.error))]
+        if failures:
+            first = failures[0]
+            error = first.error
+            if (known := told(error)) is not None:
+                raise known.at(first.label) from error
+            raise TaskError(
+                "RIL-534", f"{first.label} (stage {first.stage}): {type(error).__name__}: {error}"
+            ) from error
+
+
+def is_hole(error: BaseException) -> bool:
+    """Whether a failure lies in the data, so that what does not depend on it is delivered all the same."""
+    return isinstance(error, DegenerateError)
+
+
+def run(
+    graph: Graph,
+    store: Store,
+    *,
+    executor: str = "processes",
+    jobs: int | None = None,
+    keep_going: bool = False,
+    force: Collection[str] = (),
+    dry: bool = False,
+    ledger: Path | None = None,
+    progress: Progress | None = None,
+    memory_limit: float | None = None,
+    survey: Callable[[], Graph] | None = None,
+    meanwhile: Callable[[], None] | None = None,
+) -> Result:
+    """Bring every node of a graph to an artifact.
+
+    Parameters
+    ----------
+    graph : its handles are filled in; expansions may add nodes during the run.
+    store : where artifacts are.
+    executor : ``inline``, ``threads``, ``processes`` or the address of a running dask scheduler (``tcp://...``).
+    jobs : worker processes; None is one a core.
+    keep_going : finish what does not depend on a failure, of whatever kind.
+    force : names of stages to compute again though they are there; the digests must agree.
+    dry : look up only.
+    ledger : file of JSON lines, one a node, written as they resolve.
+    progress : told of every step.
+    memory_limit : bytes that this process and its workers may take together; None is what is free here.
+    survey : lays the same graph out anew, to look ahead: what cannot fit into memory is refused before anything runs.
+    meanwhile : done once, on a thread of this process, while worker processes compute the last tasks; not called where
+        there are no such.
+
+    Raises
+    ------
+    MemoryRefusedError
+        A task that can be foreseen does not fit, even alone.
+    KeyboardInterrupt
+        Interrupted; running tasks are killed, what is committed stays.
+    """
+    return _Run(
+        graph,
+        store,
+        executor,
+        jobs,
+        keep_going,
+        force,
+        dry,
+        ledger,
+        progress or Quiet(),
+        memory_limit,
+        survey,
+        meanwhile,
+    ).go()
+
+
+class _Run:
+    def __init__(
+        self,
+        graph: Graph,
+        store: Store,
+        executor: str,
+        jobs: int | None,
+        keep_going: bool,
+        force: Collection[str],
+        dry: bool,
+        ledger: Path | None,
+        progress: Progress,
+        memory_limit: float | None,
+        survey: Callable[[], Graph] | None,
+        meanwhile: Callable[[], None] | None,
+    ) -> None:
+        self.graph, self.store = graph, store
+        self.memory_limit, self.survey, self.meanwhile = memory_limit, survey, meanwhile
+        self.admission: Admission | None = None
+        self.executor_kind, self.jobs = executor, jobs
+        self.keep_going, self.force, self.dry = keep_going, frozenset(force), dry
+        self.ledger, self.progress = Ledger(ledger), progress
+        self.executor: Executor | None = None
+        self.result = Result()
+        self.stopped = ""
+        self.admitted = self.expanded = 0
+        self.waits: dict[int, int] = {}
+        """How many distinct inputs of a node are not resolved yet."""
+        self.dependants: dict[int, list[Handle]] = defaultdict(list)
+        self.ready: list[int] = []
+        self.begun: set[str] = set()
+        self.warm: set[str] = set()
+        """Stages of which a task was submitted, and of which one has come back."""
+        self.missing = Waiting()
+        """Looked up, not found, not submitted."""
+        self.flying: dict[str, list[Handle]] = {}
+        """Submitted, by key; further nodes of the same key wait for the first."""
+        self.patients: dict[str, set[str]] = {}
+        """Keys that must be computed again before the task of a key can be."""
+        self.put_back: dict[str, int] = defaultdict(int)
+        self.fates: dict[int, str] = {}
+        self.expansions: list[tuple[list[Handle], Expansion, bool]] = []
+        self.hints = store.hints(graph.sequence)
+        self.known = provenance.Known(self.hints, graph.choice)
+
+    def go(self) -> Result:
+        begin = time.perf_counter()
+        gc.freeze()  # what is there need not be searched for garbage again and again as the graph grows
+        try:
+            with Interrupts() as interrupts:
+                self._loop(interrupts)
+                self._leave_out()
+        except BaseException:
+            self._close(kill=True)
+            raise
+        else:
+            self._close(kill=False)
+            if not self.dry:
+                self.store.note(h.ref for h in self.graph.nodes if h.ref is not None)
+                remember_seconds(self.hints, self.result.counts)
+                cost_model.remember(self.hints, self.graph.nodes)
+        finally:
+            gc.unfreeze()
+            if not self.dry:
+                self.known.save(self.graph.nodes)
+            self.result.seconds = time.perf_counter() - begin
+            self.ledger.run(seconds=round(self.result.seconds, 3), ok=self.result.ok)
+            self.progress.close(self.result)
+            self.ledger.close()
+        return self.result
+
+    def _close(self, kill: bool) -> None:
+        if self.executor is not None:
+            self.executor.close(kill=kill)
+
+    def _loop(self, interrupts: Interrupts) -> None:
+        self.progress.open(self.graph, recall_seconds(self.hints), self.jobs or cores())
+        self.store.survey(_sequence(self.graph))
+        while True:
+            self._settle()
+            interrupts.check()
+            self._submit()
+            if not self.flying:
+                return
+            assert self.executor is not None
+            for key, outcome in self.executor.wait():
+                self._land(key, outcome)
+
+    # -- what needs no worker -----------------------------------------------------------------------------------
+
+    def _settle(self) -> None:
+        """Admit, look up and expand until only what must be computed is left."""
+        while not self.stopped:
+            self._admit()
+            if self.ready:
+                self._look_up(self.graph.nodes[heapq.heappop(self.ready)])
+            elif not self._expand():
+                return
+
+    def _admit(self) -> None:
+        for handle in self.graph.nodes[self.admitted :]:
+            self.admitted += 1
+            upstream = {h.index: h for h in handle.upstream()}
+            broken = next((h for h in upstream.values() if h.status in ("failed", "skipped", "planned")), None)
+            self.waits[handle.index] = 0
+            for up in upstream.values():
+                if up.status in ("pending", "running"):
+                    self.waits[handle.index] += 1
+                    self.dependants[up.index].append(handle)
+            if broken is not None:
+                self._break(handle, broken)
+            elif not self.waits[handle.index]:
+                heapq.heappush(self.ready, handle.index)
+        self.expansions += self.graph.expansions[self.expanded :]
+        self.expanded = len(self.graph.expansions)
+
+    def _look_up(self, handle: Handle) -> None:
+        refs = handle.refs()
+        handle.key = key = key_of(handle.spec, refs)
+        forced = handle.stage in self.force
+        ref = None if forced else self.store.lookup(handle.stage, key)
+        if ref is not None:
+            handle.ref = ref
+            self._resolve(handle, "cached")
+            return
+        made = recipe(handle.spec, refs)
+        handle.reason = "forced" if forced else self.known.reason(self.store, handle.stage, handle.label, key, made)
+        if self.dry:
+            self._resolve(handle, "planned")
+        elif key in self.flying:
+            self.flying[key].append(handle)
+        else:
+            self.flying[key] = [handle]
+            self.missing.push(handle)
+
+    def _expand(self) -> bool:
+        """Call the first expansion whose handles are done; whether there was one."""
+        for i, (handles, fn, holes) in enumerate(self.expansions):
+            if all(h.done or h.earlier or (holes and h.status in _FATE) for h in handles):
+                del self.expansions[i]
+                assumed = [h.label for h in handles if h.earlier and not h.done]
+                self.result.assumed += assumed
+                before = len(self.graph.nodes)
+                try:
+                    fn(*(h.ref or h.earlier for h in handles))
+                except Exception as error:
+                    if assumed:  # what was found with other parameters or images does not fit: no more can be said
+                        self.result.unknown += assumed
+                    else:
+                        self._failed(Failure(f"plan after {_labels(handles)}", "", error, Failed.of(error).traceback))
+                self.ledger.expansion([h.label for h in handles], [h.label for h in self.graph.nodes[before:]])
+                return True
+        return False
+
+    # -- what does ----------------------------------------------------------------------------------------------
+
+    def _submit(self) -> None:
+        """Keep every worker busy, and no more: what is not begun can still be left out."""
+        if self.missing and not self.stopped and self.executor is None:
+            self._begin()
+        while self.missing and not self.stopped and self.executor is not None and self.executor.idle():
+            assert self.admission is not None
+            handle = self.missing.take(self.begun - self.warm, self.admission.fits)
+            if handle is None:
+                break
+            refused = self.admission.refusal(handle)
+            if refused is not None:
+                self._land(handle.key, Failed(refused, ""))
+                continue
+            self.begun.add(handle.stage)
+            self.admission.begin(handle)
+            handle.status = "running"
+            self.progress.running(handle)
+            refs = {p: [_light(r) for r in g] if isinstance(g, list) else _light(g) for p, g in handle.refs().items()}
+            self.executor.submit(handle.key, self.store.location, handle.spec, refs, handle.stage in self.force)
+        self._finish_ahead()
+        if self.stopped:
+            for key in (*(handle.key for handle in self.missing), *self.patients):
+                for handle in self.flying.pop(key, ()):
+                    handle.status = self.fates.get(handle.index, "pending")
+            self.missing.clear()
+            self.patients.clear()
+
+    def _finish_ahead(self) -> None:
+        """Once the plan is complete and few of its tasks are left, begin what follows them."""
+        if self.meanwhile is None or self.executor is None or self.expansions or not (self.flying and self.warm):
+            return
+        total = len(self.graph.nodes)
+        if total - len(self.fates) <= max(FEW, total // FEW) and self.executor_kind not in ("inline", "threads"):
+            threading.Thread(target=self.meanwhile, daemon=True).start()
+            self.meanwhile = None
+
+    def _begin(self) -> None:
+        """Look ahead, share the memory out, and start the workers that it leaves room for."""
+        known, jobs = cost_model.recall(self.hints), self.jobs or cores()
+        ahead = self._look_ahead()
+        most = max(largest(ahead, known), *(known.foresee(h.spec, input_bytes(h)).most for h in self.missing))
+        shares = account(known, self.memory_limit, self.executor_kind, jobs, most)
+        self.admission = Admission(known, shares, automatic=self.memory_limit is None)
+        self.admission.check(ahead)
+        self.store.writable()
+        few = shares.workers < jobs and self.executor_kind == "processes"
+        amounts = {k: round(v) for k, v in vars(shares).items() if math.isfinite(v)}
+        self.ledger.run(executor=self.executor_kind, jobs=shares.workers, **amounts)
+        workers = shares.workers if few else self.jobs
+        modules = tuple(dict.fromkeys(h.spec.module for h in ahead.nodes if not h.done))
+        self.executor = make(self.executor_kind, workers, self.store.location, shares.limit, modules)
+        self.result.executor_started = True
+
+    def _look_ahead(self) -> Graph:
+        """The graph laid out anew and looked up, by what this run's survey of the store has found."""
+        ahead = Graph() if self.survey is None else self.survey()
+        dry = _Run(ahead, self.store, "inline", None, False, self.force, True, None, Quiet(), None, None, None)
+        dry._settle()
+        dry._leave_out()
+        return ahead
+
+    def _land(self, key: str, outcome: Outcome | Failed) -> None:
+        assert self.admission is not None
+        self.admission.end(key)
+        first, *others = self.flying[key]
+        self.warm.add(first.stage)
+        if isinstance(outcome, Failed) and self._heal(first, outcome.error):
+            return
+        del self.flying[key]
+        if not isinstance(outcome, Failed) and first.ref is not None and first.ref.digest != outcome.ref.digest:
+            error = NonDeterministicError(
+                "RIL-535", f"stage {first.stage} is not deterministic: another digest when healed"
+            )
+            outcome = Failed(error, "")
+        if isinstance(outcome, Failed):
+            for handle in (first, *others):
+                handle.error, handle.ref = outcome.error, None
+                handle.reason = f"{type(outcome.error).__name__}: {outcome.error}"
+                self._resolve(handle, "failed")
+            self._failed(Failure(first.label, first.stage, outcome.error, outcome.traceback))
+        else:
+            first.seconds, first.peak_rss, first.kernel = outcome.seconds, outcome.peak_rss, outcome.kernel
+            first.started, first.memory, first.rest = outcome.started, outcome.memory, outcome.rest
+            first.first, first.compiling = outcome.first, outcome.compiling
+            for handle in (first, *others):
+                handle.ref = outcome.ref
+                self._resolve(handle, "computed" if handle is first and not outcome.cached else "cached")
+        self._discharge(key, first)
+
+    def _heal(self, handle: Handle, error: BaseException) -> bool:
+        """Put a task back whose input was damaged or gone when it was read, behind what must be computed again."""
+        if not isinstance(error, DamagedError | GoneError) or self.put_back[handle.key] >= HEALS or self.stopped:
+            return False
+        self.put_back[handle.key] += 1
+        absent = {h.key: h for h in handle.upstream() if self.store.lookup(h.stage, h.key, fresh=True) is None}
+        for key, source in absent.items():
+            source.reason = "its artifact was found damaged, or gone, when it was read"
+            if key not in self.flying:
+                self.flying[key] = [source]
+                self.missing.push(source)
+        if absent:
+            self.patients[handle.key] = set(absent)
+        else:
+            self.missing.push(handle)
+        return True
+
+    def _discharge(self, key: str, source: Handle) -> None:
+        """Send on what waited for a key to be computed again."""
+        for patient in [p for p, keys in self.patients.items() if key in keys]:
+            first = self.flying[patient][0]
+            if not source.done:
+                del self.patients[patient]
+                for handle in self.flying.pop(patient):
+                    handle.status = "pending"
+                    self._break(handle, source)
+                continue
+            self.patients[patient].discard(key)
+            if not self.patients[patient]:
+                del self.patients[patient]
+                self.missing.push(first)
+
+    def _failed(self, failure: Failure) -> None:
+        self.result.failures.append(failure)
+        self.progress.failed(failure.label, failure.error)
+        if not self.keep_going and not is_hole(failure.error):
+            self.stopped = f"stopped after {failure.label} failed"
+
+    # -- what became of it --------------------------------------------------------------------------------------
+
+    def _resolve(self, handle: Handle, status: str) -> None:
+        handle.status = status
+        if status == "planned":
+            handle.earlier = self.known.latest(self.store, handle.stage, handle.label)
+        counts = self.result.counts.setdefault(handle.stage, Counts())
+        setattr(counts, status, getattr(counts, status) + 1)
+        counts.seconds += handle.seconds
+        if handle.ref is not None:
+            self.result.keys.add(handle.key)
+        self.ledger.write(handle)
+        before = self.fates.get(handle.index)
+        self.fates[handle.index] = status
+        if before is None:
+            self.progress.resolved(handle)
+        else:  # healed: it counts once, as what became of it last
+            setattr(counts, before, getattr(counts, before) - 1)
+        for dependant in self.dependants.pop(handle.index, []):
+            self.waits[dependant.index] -= 1
+            if not handle.done:
+                self._break(dependant, handle)
+            elif not self.waits[dependant.index] and dependant.status == "pending":
+                heapq.heappush(self.ready, dependant.index)
+
+    def _break(self, handle: Handle, by: Handle) -> None:
+        """An input of ``handle`` will not come, or in a plan is still to come."""
+        if handle.status != "pending":
+            return
+        planned = by.status == "planned"
+        handle.reason = f"input {by.label} is to be computed" if planned else f"{by.label} {_FATE[by.status]}"
+        self._resolve(handle, "planned" if planned else "skipped")
+
+    def _leave_out(self) -> None:
+        """Account for everything that was not even begun."""
+        self._admit()
+        for handle in self.graph.nodes:
+            if handle.status == "pending":
+                handle.reason = self.stopped
+                self._resolve(handle, "skipped")
+        for handles, *_ in self.expansions:
+            missing = [h for h in handles if not h.done]
+            self.result.unknown += [h.label for h in missing]
+            self.ledger.note(f"plan after {_labels(handles)}", "planned" if self.dry else "skipped", _labels(missing))
+
+
+def _sequence(graph: Graph) -> str:
+    """Name of what the graph works on: its first task reads the first image, or what all images are made from."""
+    first = graph.nodes[0].spec if graph.nodes else None
+    return digest(None if first is None else [first.module, first.params, dict(first.args)])[:16]
+
+
+def _light(ref: Ref) -> Ref:
+    """Without its facts, which a task reads from the store: those of a long trajectory would travel to every pair."""
+    return replace(ref, meta={})
+
+
+_FATE = {"failed": "failed", "skipped": "was skipped"}
+
+
+def _labels(handles: list[Handle]) -> str:
+    names = [h.label for h in handles[:3]]
+    return ", ".join(names) + (f" and {len(handles) - 3} more" if len(handles) > 3 else "")

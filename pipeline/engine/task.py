@@ -1,0 +1,219 @@
+"""The one body of every task: look up, and if absent compute, check, commit.
+
+A :class:`Spec` says what to compute: a stage module (its ``STAGE`` is taken), validated parameters, the arguments that
+identify the task, and hints (paths) that cannot change the result. The key is the digest of all of it but the hints
+and the label, of the code and packages behind the stage, and of the *output digests* of the inputs. Between
+tasks only :class:`~pipeline.engine.store.folder.Ref` travel.
+
+>>> spec = Spec("stages.odometry.keyframes", "select", SelectParams(), {"frames": 9})
+>>> outcome = ensure(Path("cache"), spec, {})
+>>> Store("cache").open(outcome.ref).meta["basic"]
+[0, 4, 8]
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import json
+import os
+import platform
+import resource
+import sys
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from pipeline.engine.code_digest import module_digests
+from pipeline.engine.keys import text
+from pipeline.engine.memory.limits import Meter
+from pipeline.engine.packages import versions
+from pipeline.engine.runtime.numba_cache import COMPILING, guard
+from pipeline.engine.store.folder import Ref, Store, at
+from stages.core.declare import Bundle, Params, Stage, check_outputs
+from stages.core.errors import RilleError
+
+__all__ = ["CodeChangedError", "Outcome", "Ref", "Refs", "Spec", "ensure", "recipe", "resolve"]
+
+FORMAT = 1
+"""Enters every key: raise it when the meaning of keys or artifacts changes."""
+
+TRIES = 3
+BACK_OFF = 0.2
+"""Seconds before the second try; four times as long before the third."""
+
+PERMANENT = (FileNotFoundError, PermissionError, IsADirectoryError, NotADirectoryError)
+
+Refs = Mapping[str, Ref | list[Ref]]
+"""Input port to the artifact given there, or to the list of them."""
+
+
+class CodeChangedError(RilleError):
+    """The source code or the packages of a worker are not those of the client."""
+
+
+@dataclass(frozen=True)
+class Spec:
+    """One task without its inputs. ``label`` names it to people (``locus/12``) and is not part of the key."""
+
+    module: str
+    label: str
+    params: Params
+    args: Mapping[str, Any] = field(default_factory=dict)
+    hints: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def stage(self) -> Stage:
+        """The declaration behind the module."""
+        return resolve(self.module)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a task: its artifact, whether it was there, seconds and peak memory (bytes) of the call.
+
+    ``kernel`` are the seconds of the stage itself, ``started`` is when the call began (seconds since 1970); ``memory``
+    and ``rest`` are a :class:`~pipeline.engine.memory.limits.Meter`'s figures, ``first`` says that the process had not
+    run the stage before (it imports, and compiles or loads kernels); ``compiling`` are the seconds for which it
+    compiled.
+    """
+
+    ref: Ref
+    cached: bool
+    seconds: float
+    peak_rss: int
+    started: float = 0.0
+    kernel: float = 0.0
+    memory: int | None = None
+    rest: int | None = None
+    first: bool = False
+    compiling: float = 0.0
+
+
+MANY = 4096
+"""Parameter models whose canonical form is kept."""
+
+_kept: dict[int, tuple[Params, str]] = {}
+"""By the id of the model, which is held so that the id stays its own."""
+
+_run: set[str] = set()
+"""Modules of the stages that this process has run."""
+
+
+@cache
+def resolve(module: str) -> Stage:
+    """``STAGE`` of a module; its source is digested just before the import, so that both see the same files."""
+    module_digests(module)
+    guard()
+    stage = importlib.import_module(module).STAGE
+    if "cv2" in sys.modules:
+        sys.modules["cv2"].setNumThreads(1)
+    if not isinstance(stage, Stage):
+        raise TypeError(f"{module}.STAGE is a {type(stage).__name__}, not a Stage")
+    return stage
+
+
+def recipe(spec: Spec, refs: Refs) -> dict[str, Any]:
+    """All that determines a result; its digest is the key."""
+    return {**_fixed(spec.module), "params": spec.params, "args": dict(spec.args), "inputs": _digests(refs)}
+
+
+def key_of(spec: Spec, refs: Refs) -> str:
+    """Key of a task, ``digest(recipe(spec, refs))``; what many tasks share is put into its canonical form only once."""
+    kept = _kept.get(id(spec.params))
+    if kept is None or kept[0] is not spec.params:
+        if len(_kept) > MANY:
+            _kept.clear()
+        kept = _kept[id(spec.params)] = (spec.params, text(spec.params, f"{spec.label}.params"))
+    before, after = _shared(spec.module)
+    args, inputs = text(dict(spec.args), f"{spec.label}.args"), text(_digests(refs))
+    parts = f'{{"args":{args},{before},"inputs":{inputs},"params":{kept[1]},{after}}}'
+    return hashlib.sha256(parts.encode()).hexdigest()
+
+
+@cache
+def _shared(module: str) -> tuple[str, str]:
+    """What all tasks of a stage have in common, in the order of the names: before the inputs, and after parameters."""
+    fixed = {name: text(value) for name, value in _fixed(module).items()}
+    before, after = ([f'"{name}":{fixed[name]}' for name in names] for names in (_FIXED[:3], _FIXED[3:]))
+    return ",".join(before), ",".join(after)
+
+
+_FIXED = ("code", "env", "format", "stage", "version")
+
+
+def _fixed(module: str) -> dict[str, Any]:
+    stage = resolve(module)
+    found = (module_digests(module), versions(module), FORMAT, stage.name, stage.version)
+    return dict(zip(_FIXED, found, strict=True))
+
+
+def _digests(refs: Refs) -> dict[str, Any]:
+    return {p: [r.digest for r in ref] if isinstance(ref, list) else ref.digest for p, ref in refs.items()}
+
+
+def ensure(root: Path | str, spec: Spec, refs: Refs, *, key: str | None = None, force: bool = False) -> Outcome:
+    """Give the artifact of a task, computing and committing it where it is absent (or ``force`` is set).
+
+    ``key`` is what the client expects; a worker that would compute another thing refuses. Failures of input and
+    output (``OSError``, ``TimeoutError``) are tried three times; what a stage raises otherwise is not tried again.
+    """
+    begin, started = time.perf_counter(), time.time()
+    own = key_of(spec, refs)
+    if key is not None and key != own:
+        raise CodeChangedError(
+            "RIL-581",
+            f"{spec.label}: source code or packages of the worker are not those the run began with",
+            remedy="run again, and edit nothing meanwhile",
+        )
+    store = at(root)
+    for trial in range(TRIES):
+        try:
+            ref = None if force else store.lookup(spec.stage.name, own)
+            if ref is not None:
+                return Outcome(ref, True, time.perf_counter() - begin, _peak_rss(), started)
+            first = spec.module not in _run
+            COMPILING.take()  # of what ran before in this process
+            with Meter() as meter:
+                ref, kernel = _compute(store, spec, refs, own)
+            seconds = time.perf_counter() - begin
+            _run.add(spec.module)
+            measured = (started, kernel, meter.memory, meter.rest, first, COMPILING.take())
+            return Outcome(ref, False, seconds, _peak_rss(), *measured)
+        except (OSError, TimeoutError) as error:
+            if isinstance(error, PERMANENT) or trial == TRIES - 1:
+                raise
+            time.sleep(BACK_OFF * 4**trial)
+    raise AssertionError("unreachable")
+
+
+def _compute(store: Store, spec: Spec, refs: Refs, key: str) -> tuple[Ref, float]:
+    stage = spec.stage
+    inputs = {p: [store.open(r) for r in ref] if isinstance(ref, list) else store.open(ref) for p, ref in refs.items()}
+    started = time.time()
+    begin = time.perf_counter()
+    result = stage.run(spec.params, {**spec.args, **spec.hints}, inputs)
+    kernel = time.perf_counter() - begin
+    if not isinstance(result, Bundle):
+        raise TypeError(f"{stage.name}: run gave a {type(result).__name__}, not a Bundle")
+    check_outputs(stage, result)
+    provenance = {
+        **recipe(spec, refs),
+        "params": spec.params.model_dump(mode="json"),
+        "hints": {k: str(v) for k, v in spec.hints.items()},
+        "host": {"name": platform.node(), "machine": platform.machine(), "cpus": os.cpu_count()},
+        "python": platform.python_version(),
+        "started": started,
+        "seconds": kernel,
+        "peak_rss": _peak_rss(),
+    }
+    ref = store.commit(stage, key, result, label=spec.label, provenance=json.loads(json.dumps(provenance)))
+    return ref, kernel
+
+
+def _peak_rss() -> int:
+    """Peak resident memory of this process, bytes."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)

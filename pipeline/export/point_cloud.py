@@ -1,0 +1,167 @@
+"""The terrain of a run as a point cloud (LAZ 1.4) and as a textured mesh (glTF 2.0 binary)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.export.read_dem import Raster, read_elevation, read_tiff
+from pipeline.export.writers import replacing
+from stages.core.errors import InputError
+
+MADE = date(2000, 1, 1)
+"""Date that every LAZ file states, so that equal clouds make equal files."""
+STEPS = 1000
+"""Steps of a LAZ coordinate in one cell."""
+MAX_FACES = 2_000_000
+"""Most triangles of a mesh: more make browsers and phones fail; a coarser one is made beyond, and said to be."""
+MAX_TEXTURE = 4096
+"""Greatest edge of the texture, pixels: what every WebGL implementation takes."""
+
+
+def export(run: Path, kind: str, output: Path | None) -> tuple[Path, str]:
+    """Write the terrain of a run in another form; gives the file and what is in it.
+
+    Parameters
+    ----------
+    run : folder of a run.
+    kind : name in :data:`FORMATS`.
+    output : file to write; by default ``cloud.laz`` or ``terrain.glb`` in the run's folder.
+
+    Raises
+    ------
+    InputError
+        The folder is no run with a terrain, or the file cannot be written.
+    """
+    default, write = FORMATS[kind]
+    if not run.is_dir():
+        raise InputError("RIL-600", f"{run} is not the folder of a run", remedy="give RUNS/sequence/latest")
+    target = output or run / default
+    terrain = read_elevation(run)
+    ortho, sigma = (_beside(run, name, terrain) for name in ("ortho", "dem_sigma"))
+    try:
+        return target, write(target, terrain, ortho, sigma)
+    except OSError as error:
+        raise InputError(
+            "RIL-601", f"{target} cannot be written: {error.strerror}", remedy="name another file with -o"
+        ) from error
+
+
+def _beside(run: Path, name: str, terrain: Raster) -> NDArray[np.float64] | None:
+    """Another raster of the run, on the same cells; None where there is none."""
+    path = run / f"{name}.tif"
+    if not path.is_file():
+        return None
+    found = read_tiff(path, length=False)
+    if found.values.shape != terrain.values.shape or found.transform != terrain.transform:
+        raise InputError("RIL-602", f"{path} and dem.tif have other cells", remedy="make the run again")
+    return found.values
+
+
+def write_laz(path: Path, terrain: Raster, ortho: NDArray[np.float64] | None, sigma: NDArray[np.float64] | None) -> str:
+    """Write a point for each known cell: x, y, z, grey value as intensity and colour, ``sigma`` of z (m).
+
+    LAS 1.4, point format 7, the CRS as WKT. A step of the coordinates is a thousandth of a cell or less, an elevation
+    is off by half a step at most.
+    """
+    import laspy
+    from laspy.vlrs.known import WktCoordinateSystemVlr
+
+    row, col = np.nonzero(np.isfinite(terrain.values))
+    x, y = terrain.transform @ (col + 0.5, row + 0.5)
+    header = laspy.LasHeader(point_format=7, version="1.4")
+    header.creation_date, header.generating_software, header.system_identifier = MADE, "Rille", "stereo"
+    header.offsets = [float(np.floor(v.min())) for v in (x, y, terrain.values[row, col])]
+    header.scales = np.full(3, 10.0 ** np.floor(np.log10(terrain.cell / STEPS)))
+    if terrain.crs:
+        header.vlrs.append(WktCoordinateSystemVlr(terrain.crs))
+        header.global_encoding.wkt = True
+    if sigma is not None:
+        about = laspy.ExtraBytesParams("sigma", type=np.float32, description="standard deviation of z, m")
+        header.add_extra_dim(about)
+    cloud = laspy.LasData(header)
+    cloud.x, cloud.y, cloud.z = x, y, terrain.values[row, col]
+    cloud.return_number[:] = cloud.number_of_returns[:] = 1
+    if ortho is not None:
+        grey = np.rint(np.clip(np.nan_to_num(ortho[row, col]), 0, 255) * 257).astype(np.uint16)
+        cloud.intensity = cloud.red = cloud.green = cloud.blue = grey
+    if sigma is not None:
+        cloud.sigma = sigma[row, col].astype(np.float32)
+    with replacing(path) as temporary:
+        cloud.write(str(temporary), do_compress=True)
+    return f"{row.size} points"
+
+
+def write_glb(path: Path, terrain: Raster, ortho: NDArray[np.float64] | None, sigma: NDArray[np.float64] | None) -> str:
+    """Write the triangles between known neighbouring cells, with the ortho image as texture.
+
+    glTF's axes are x right, y up, z towards the viewer: x = x, y = z, z = -y of the terrain's frame. Coordinates are
+    metres from the middle of the terrain, which the scene's ``extras`` name: as 32-bit floats, eastings would jump by
+    decimetres. Above :data:`MAX_FACES` triangles every second, third ... cell is left out.
+    """
+    import trimesh
+
+    step, (vertices, faces, uv) = 1, _mesh(terrain, 1)
+    while len(faces) > MAX_FACES:
+        step += 1
+        vertices, faces, uv = _mesh(terrain, step)
+    if not len(faces):
+        raise InputError(
+            "RIL-603", f"{terrain.name}: no four neighbouring cells are known", remedy="give a more complete one"
+        )
+    middle = np.round(0.5 * (vertices.min(axis=0) + vertices.max(axis=0)), 3)
+    local = vertices - middle
+    shown = np.column_stack([local[:, 0], local[:, 2], -local[:, 1]]).astype(np.float32)
+    look = _texture(ortho)
+    visual = trimesh.visual.TextureVisuals(uv=uv, material=look) if look is not None else None
+    mesh = trimesh.Trimesh(vertices=shown, faces=faces, visual=visual, process=False)
+    scene = trimesh.Scene({"terrain": mesh})
+    scene.metadata["origin_m"] = middle.tolist()
+    scene.metadata["axes"] = "x = x, y = z, z = -y of the terrain's frame, metres from origin_m"
+    scene.metadata["crs_wkt"] = terrain.crs
+    with replacing(path) as temporary:
+        temporary.write_bytes(scene.export(file_type="glb", include_normals=True))
+    every = "" if step == 1 else f", every {step}. cell (of more than {MAX_FACES} triangles)"
+    return f"{len(vertices)} vertices, {len(faces)} triangles{every}"
+
+
+def _mesh(terrain: Raster, step: int) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
+    """Vertices (n, 3) in the CRS, triangles (m, 3) seen from above anticlockwise, texture coordinates (n, 2)."""
+    z = terrain.values[::step, ::step]
+    known = np.isfinite(z)
+    quads = known[:-1, :-1] & known[1:, :-1] & known[:-1, 1:] & known[1:, 1:]
+    used = np.zeros_like(known)
+    for part in (used[:-1, :-1], used[1:, :-1], used[:-1, 1:], used[1:, 1:]):
+        part |= quads
+    number = np.cumsum(used.ravel()).reshape(used.shape) - 1
+    a, b, c, d = number[:-1, :-1][quads], number[1:, :-1][quads], number[:-1, 1:][quads], number[1:, 1:][quads]
+    faces = np.concatenate([np.column_stack([a, b, c]), np.column_stack([c, b, d])])
+    row, col = np.nonzero(used)
+    at = col * step + 0.5, row * step + 0.5
+    x, y = terrain.transform @ at
+    rows, cols = terrain.values.shape
+    return np.column_stack([x, y, z[used]]), faces, np.column_stack([at[0] / cols, 1.0 - at[1] / rows])
+
+
+def _texture(ortho: NDArray[np.float64] | None) -> Any:
+    if ortho is None:
+        return None
+    from PIL import Image
+    from trimesh.visual.material import PBRMaterial
+
+    image = Image.fromarray(np.rint(np.clip(np.nan_to_num(ortho), 0, 255)).astype(np.uint8))
+    if max(image.size) > MAX_TEXTURE:
+        image.thumbnail((MAX_TEXTURE, MAX_TEXTURE))
+    return PBRMaterial(
+        name="ortho", baseColorTexture=image.convert("RGB"), metallicFactor=0.0, roughnessFactor=1.0, doubleSided=True
+    )
+
+
+Writer = Callable[[Path, Raster, "NDArray[np.float64] | None", "NDArray[np.float64] | None"], str]
+FORMATS: dict[str, tuple[str, Writer]] = {"laz": ("cloud.laz", write_laz), "glb": ("terrain.glb", write_glb)}
+"""Default file name and writer of each form."""

@@ -1,0 +1,185 @@
+"""Elevation models read back: from a GeoTIFF, from a run's folder, or from a zarr group of Rille."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from affine import Affine
+from numpy.typing import NDArray
+
+from stages.core.errors import InputError
+
+METRE = ("m", "metre", "metres", "meter", "meters")
+
+
+@dataclass(frozen=True)
+class Raster:
+    """An elevation model of any program.
+
+    ``values`` (rows, cols) metres, NaN unknown. ``transform`` maps (column, row), corners of cells at integers, to the
+    CRS. ``crs`` WKT, empty where the file states none. ``viewpoints`` (n, 2) positions of the cameras in the CRS, where
+    they are known. ``warnings``: what is suspicious but possible.
+    """
+
+    name: str
+    values: NDArray[np.float64]
+    transform: Affine
+    crs: str
+    viewpoints: NDArray[np.float64] | None = None
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def cell(self) -> float:
+        """Side of a cell, metres."""
+        return float(np.sqrt(abs(self.transform.determinant)))
+
+    @property
+    def extent(self) -> tuple[float, float, float, float]:
+        """Outline x_min, x_max, y_min, y_max in the CRS."""
+        rows, cols = self.values.shape
+        corners = np.array([self.transform @ c for c in ((0, 0), (cols, 0), (0, rows), (cols, rows))])
+        return tuple(float(f(corners[:, k])) for k in (0, 1) for f in (np.min, np.max))  # type: ignore[return-value]
+
+
+def read_elevation(path: Path) -> Raster:
+    """The elevation model that ``path`` is or holds.
+
+    Parameters
+    ----------
+    path : GeoTIFF (its first band), folder of a run (its ``dem.tif``, with the cameras of ``trajectory.kitti``), or
+        zarr group with ``elevation`` and its coordinates ``x`` and ``y`` (``terrain.zarr`` of a run, an artifact).
+
+    Raises
+    ------
+    InputError
+        There is nothing, it is none of these, its unit is not the metre, or it has no known cell.
+    """
+    if not path.exists():
+        raise InputError(
+            "RIL-627", f"{path} does not exist", remedy="give a GeoTIFF, the folder of a run, or a zarr group"
+        )
+    if (path / "zarr.json").is_file():
+        found = _of_zarr(path)
+    elif path.is_dir():
+        found = _of_run(path)
+    else:
+        found = read_tiff(path)
+    if not np.isfinite(found.values).any():
+        raise InputError(
+            "RIL-628", f"{path} has no known cell among {found.values.size}", remedy="give another elevation model"
+        )
+    return found
+
+
+def read_tiff(path: Path, *, length: bool = True) -> Raster:
+    """First band of a GeoTIFF; ``length``: it holds metres.
+
+    Raises
+    ------
+    InputError
+        It cannot be read, has no geotransform, or has another unit.
+    """
+    import warnings
+
+    import rasterio
+    from rasterio.errors import NotGeoreferencedWarning, RasterioError
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", NotGeoreferencedWarning)
+            with rasterio.open(path) as file:
+                values = file.read(1, out_dtype="float64", masked=True).filled(np.nan)
+                crs, transform, unit = file.crs, file.transform, file.units[0]
+    except RasterioError as error:
+        raise InputError("RIL-629", f"{path} cannot be read as a raster ({error})", remedy="give a GeoTIFF") from error
+    if transform == Affine.identity():
+        raise InputError("RIL-630", f"{path} has no geotransform", remedy="give a raster that says where its cells are")
+    if not np.isclose(np.hypot(transform.a, transform.d), np.hypot(transform.b, transform.e), rtol=1e-6):
+        raise InputError(
+            "RIL-631",
+            f"{path} has cells of {np.hypot(transform.a, transform.d):g} x {np.hypot(transform.b, transform.e):g}",
+            remedy="resample it to square cells, e.g. with gdalwarp -tr",
+        )
+    told = []
+    if crs is not None and length:
+        _metric_crs(path, crs)
+    if length and unit and unit.lower() not in METRE:
+        raise InputError(
+            "RIL-632", f"{path} has elevations in {unit!r}, not in metres", remedy="convert it, e.g. with gdal_calc"
+        )
+    if length and not unit:
+        told.append(f"{path} states no unit of its elevations: taken as metres")
+    return Raster(
+        str(path), values, transform, "" if crs is None else crs.to_wkt(version="WKT2_2019"), None, tuple(told)
+    )
+
+
+def _metric_crs(path: Path, crs: Any) -> None:
+    if crs.is_geographic:
+        raise InputError(
+            "RIL-633", f"{path} is in degrees ({crs.to_string()})", remedy="project it, e.g. with gdalwarp -t_srs"
+        )
+    unit, factor = crs.linear_units_factor if crs.is_projected else ("metre", 1.0)
+    if factor != 1.0:
+        raise InputError("RIL-634", f"{path} has coordinates in {unit} of {factor:.6g} m", remedy="give one in metres")
+
+
+def _of_run(path: Path) -> Raster:
+    if not (path / "dem.tif").is_file():
+        raise InputError(
+            "RIL-635",
+            f"{path} has no dem.tif",
+            remedy="give the folder of a finished run, RUNS/sequence/latest, or a GeoTIFF",
+        )
+    found = read_tiff(path / "dem.tif")
+    return Raster(str(path), found.values, found.transform, found.crs, _cameras(path), found.warnings)
+
+
+def _cameras(run: Path) -> NDArray[np.float64] | None:
+    """Positions (n, 2) of the left camera in the CRS of the run's rasters."""
+    from datasets.georeference import Georeference
+
+    try:
+        poses = np.loadtxt(run / "trajectory.kitti", ndmin=2)
+        facts = json.loads((run / "frames.json").read_text(encoding="utf-8")).get("georeference")
+    except (OSError, ValueError):
+        return None
+    centres = poses[:, [3, 7, 11]][np.isfinite(poses[:, 3])]
+    if facts is not None:
+        centres = Georeference(facts["crs"], tuple(facts["origin"]), facts["azimuth"]).apply(centres)
+    return np.asarray(centres[:, :2], np.float64)
+
+
+def _of_zarr(path: Path) -> Raster:
+    import zarr
+    from zarr.storage import LocalStore
+
+    try:
+        group: Any = zarr.open_group(store=LocalStore(path, read_only=True), mode="r")
+        x, y, z = (np.asarray(group[name][...], np.float64) for name in ("x", "y", "elevation"))
+        unit = str(group["elevation"].attrs.get("units", "m"))
+        crs = str(group["spatial_ref"].attrs["crs_wkt"]) if "spatial_ref" in group else ""
+    except (KeyError, ValueError, OSError, TypeError) as error:
+        raise InputError(
+            "RIL-636",
+            f"{path} has no elevation with coordinates x and y ({error})",
+            remedy="give terrain.zarr of a run",
+        ) from error
+    if unit not in METRE:
+        raise InputError("RIL-637", f"{path} has elevations in {unit!r}, not in metres", remedy="give one in metres")
+    if z.shape != (y.size, x.size) or min(z.shape) < 2:
+        raise InputError(
+            "RIL-638", f"{path}: elevation is {z.shape}, its coordinates {(y.size, x.size)}", remedy="give another one"
+        )
+    steps = np.concatenate([np.diff(x), -np.diff(y)])
+    cell = float(np.median(steps))
+    if not cell > 0 or np.abs(steps - cell).max() > 1e-3 * cell:
+        raise InputError(
+            "RIL-639", f"{path}: cells are {steps.min():g} to {steps.max():g} m wide", remedy="give a regular one"
+        )
+    corner = Affine(cell, 0.0, x[0] - 0.5 * cell, 0.0, -cell, y[0] + 0.5 * cell)
+    return Raster(str(path), z, corner, crs, None)

@@ -1,0 +1,126 @@
+"""The merged terrain as one zarr group that ``xarray.open_zarr`` opens as it is, by the CF conventions.
+
+Dimensions are y (falling) and x, both with their coordinates; every variable has its unit, its long name, its frame
+and ``grid_mapping``; ``elevation`` names in ``ancillary_variables`` what says how good it is and where it comes from
+(standard deviation, spread, number of models, pair of the greatest weight). Where the sequence has a place on Earth, x
+and y stay those of the world frame, and ``easting`` and ``northing`` are two-dimensional coordinates.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from datasets.georeference import Georeference
+from pipeline.export.writers import ENGINEERING_CRS, FRAME
+from stages.core.declare import Array
+from stages.geometry.lattice import Lattice
+
+CONVENTIONS = "CF-1.11"
+CHUNK = 512
+UNITS = {"px": "1", "grey": "1"}
+"""Units that UDUNITS does not know; the long name has the word."""
+STANDARD_NAMES = {"elevation_std": "standard_error"}
+
+
+def write_terrain(
+    path: Path,
+    arrays: Mapping[str, tuple[Array, NDArray[Any]]],
+    lattice: Lattice,
+    place: Georeference | None,
+    facts: Mapping[str, Any],
+) -> None:
+    """Write the arrays (rows, cols) of a terrain, whole or not at all.
+
+    Parameters
+    ----------
+    arrays : declaration and values by name.
+    lattice : where the cells are, world frame.
+    place : of the world frame, where it is known.
+    facts : attributes of the whole group, e.g. ``title``, ``source``.
+    """
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    shutil.rmtree(temporary, ignore_errors=True)
+    try:
+        _write(temporary, arrays, lattice, place, facts)
+        if path.exists():
+            shutil.rmtree(path)
+        os.replace(temporary, path)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _write(
+    folder: Path,
+    arrays: Mapping[str, tuple[Array, NDArray[Any]]],
+    lattice: Lattice,
+    place: Georeference | None,
+    facts: Mapping[str, Any],
+) -> None:
+    import zarr
+    from zarr.storage import LocalStore
+
+    attributes = {"Conventions": CONVENTIONS, **facts, "frame": FRAME, "cell_size_m": lattice.cell}
+    if place is not None:
+        attributes["georeference"] = place.to_dict()
+    group = zarr.create_group(store=LocalStore(folder), zarr_format=3, attributes=attributes)
+    _coordinates(group, lattice, place)
+    extra = " easting northing" if place is not None else ""
+    for name, (spec, values) in arrays.items():
+        about: dict[str, Any] = {
+            "units": UNITS.get(spec.unit, spec.unit),
+            "long_name": spec.long_name,
+            "grid_mapping": "spatial_ref",
+            "coordinates": "spatial_ref" + extra,
+            "frame": spec.frame or "world",
+        }
+        if name == "elevation":
+            about |= {"positive": "up", "ancillary_variables": " ".join(n for n in arrays if n not in (name, "ortho"))}
+        if name in STANDARD_NAMES:
+            about["standard_name"] = STANDARD_NAMES[name]
+        if spec.unit in UNITS:
+            about["quantity"] = spec.unit
+        if values.dtype.kind != "f" and spec.nodata:
+            about["missing_value"] = int(spec.nodata)
+        _array(group, name, values, ("y", "x"), about)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # zarr says that readers of other languages may not know consolidated metadata
+        zarr.consolidate_metadata(LocalStore(folder))
+
+
+def _coordinates(group: Any, lattice: Lattice, place: Georeference | None) -> None:
+    for axis, values, words in (("x", lattice.xs(), "right"), ("y", lattice.ys(), "ahead")):
+        about = {"units": "m", "axis": axis.upper(), "standard_name": f"projection_{axis}_coordinate"}
+        about["long_name"] = f"{axis} of the cell centre, world frame, {words}"
+        _array(group, axis, values, (axis,), about)
+    name = "Rille world frame (local metres)"
+    reference = {"crs_wkt": ENGINEERING_CRS, "spatial_ref": ENGINEERING_CRS, "long_name": name}
+    half = 0.5 * lattice.cell
+    corner = lattice.x0 - half, lattice.cell, 0.0, lattice.y0 + half, 0.0, -lattice.cell
+    reference["GeoTransform"] = " ".join(f"{v:.17g}" for v in corner)
+    _array(group, "spatial_ref", np.array(0, np.int32), (), reference)
+    if place is not None:
+        there = place.apply(np.concatenate([lattice.xy(), np.zeros((*lattice.shape, 1))], axis=-1))
+        for k, axis in enumerate(("easting", "northing")):
+            _array(group, axis, there[..., k], ("y", "x"), {"units": "m", "long_name": axis, "crs": place.crs})
+
+
+def _array(group: Any, name: str, values: NDArray[Any], dims: tuple[str, ...], attributes: Mapping[str, Any]) -> None:
+    written = group.create_array(
+        name,
+        shape=values.shape,
+        dtype=values.dtype,
+        chunks=tuple(min(n, CHUNK) for n in values.shape) or (),
+        fill_value=np.nan if values.dtype.kind == "f" else 0,
+        dimension_names=dims,
+        attributes=dict(attributes),
+        config={"write_empty_chunks": True},
+    )
+    written[...] = values

@@ -1,0 +1,378 @@
+"""Files for other programs: GeoTIFFs with their QGIS styles, the path, the trajectory in KITTI's and TUM's formats.
+
+Every file is written beside its final name and moved there, so that a reader finds a whole file or none.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+import struct
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from importlib import resources
+from pathlib import Path
+from string import Template
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from datasets.files import MOST_BYTES
+from datasets.georeference import Georeference
+from datasets.reading import open_regular
+from pipeline.plain import plain
+from stages.core.errors import InputError
+from stages.geometry.lattice import Lattice
+
+FRAME = (
+    "right-handed, metres: origin at the first left camera's centre, z up, y the horizontal projection of its "
+    "optical axis, x right"
+)
+"""The world frame in words; every file repeats it where its format allows."""
+
+UNLEVELLED = (
+    "right-handed, metres: that of the first left camera, whose own up is z since nothing tells of the vertical; "
+    "origin at its centre, y its optical axis, x right"
+)
+"""The same where the vertical is not known."""
+
+ENGINEERING_CRS = (
+    'ENGCRS["Rille world frame (local metres)",EDATUM["centre of the first left camera"],CS[Cartesian,2],'
+    'AXIS["x",east,ORDER[1]],AXIS["y",north,ORDER[2]],LENGTHUNIT["metre",1]]'
+)
+"""WKT 2. A GeoPackage keeps it whole, a GeoTIFF its name, unit and directions: GDAL reads the axes of every local
+system back as easting and northing, so the tag AXES says what they are. rasterio's ``crs.is_valid`` is False for every
+engineering CRS: do not test that."""
+
+LINE_Z, POINT_Z = 1002, 1001
+"""Geometry types of ISO 19125 well-known binary."""
+GPKG_DATE = "2000-01-01T00:00:00.000Z"
+"""Written as time of change into every GeoPackage, so that equal paths make equal files."""
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Temporary name beside ``path`` that becomes ``path`` when the block ends without an error."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a UTF-8 text file, whole or not at all."""
+    with replacing(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def write_raster(
+    path: Path,
+    bands: Mapping[str, NDArray[Any]],
+    lattice: Lattice,
+    *,
+    unit: str | Mapping[str, str],
+    nodata: float | None,
+    tags: Mapping[str, str] | None = None,
+    place: Georeference | None = None,
+    overviews: str | None = None,
+) -> None:
+    """Write a cloud-optimised GeoTIFF in the engineering CRS, or in that of ``place``.
+
+    Parameters
+    ----------
+    path : file to write or replace.
+    bands : arrays (row, col) of one dtype on ``lattice``, by the band's name.
+    unit : unit of the values, or of each band by name; ``"m"`` is written as GDAL's ``metre``.
+    nodata : value of unknown cells (NaN for floats). None where every value means something; the overviews then take
+        the most frequent value, since classes have no mean.
+    tags : more metadata; the frame, the unit and the cell size are always there.
+    place : of the world frame. The raster is not resampled: its geotransform is turned by the azimuth. Elevations have
+        to be heights in its system already.
+    overviews : how they are resampled; None: the mean, or without ``nodata`` the most frequent value.
+
+    Raises
+    ------
+    InputError
+        An array does not fit the lattice.
+    """
+    import rasterio
+
+    for name, values in bands.items():
+        if values.shape != lattice.shape:
+            raise InputError("RIL-621", f"band {name} of {values.shape} cells does not fit its lattice {lattice.shape}")
+    profile = {
+        "driver": "COG",
+        "height": lattice.rows,
+        "width": lattice.cols,
+        "count": len(bands),
+        "dtype": next(iter(bands.values())).dtype.name,
+        "crs": rasterio.crs.CRS.from_user_input(ENGINEERING_CRS if place is None else place.crs),
+        "transform": raster_transform(lattice, place),
+        "nodata": nodata,
+        "compress": "deflate",
+        "level": 1,
+        "num_threads": "all_cpus",
+        "predictor": "yes",
+        "blocksize": 256,
+        "overview_resampling": overviews or ("mode" if nodata is None else "average"),
+    }
+    units = [unit if isinstance(unit, str) else unit[name] for name in bands]
+    facts = {
+        "FRAME": FRAME,
+        "AXES": _axes(place),
+        "UNIT": ", ".join(dict.fromkeys(units)),
+        "CELL_SIZE_M": f"{lattice.cell:.12g}",
+    }
+    with replacing(path) as temporary, rasterio.open(temporary, "w", **profile) as file:
+        for number, (name, values) in enumerate(bands.items(), start=1):
+            file.write(np.asarray(values), number)
+            file.set_band_description(number, name)
+        file.units = tuple("metre" if u == "m" else u for u in units)
+        file.update_tags(**facts, **{key.upper(): value for key, value in dict(tags or {}).items()})
+
+
+def raster_transform(lattice: Lattice, place: Georeference | None) -> Any:
+    """Affine transform from (column, row) of a raster, corners of cells at integers, to its CRS."""
+    from affine import Affine
+
+    half = 0.5 * lattice.cell
+    corner = Affine(lattice.cell, 0.0, lattice.x0 - half, 0.0, -lattice.cell, lattice.y0 + half)
+    if place is None:
+        return corner
+    (a, b), (c, d) = place.rotation
+    return Affine(a, b, place.origin[0], c, d, place.origin[1]) @ corner
+
+
+def _axes(place: Georeference | None) -> str:
+    if place is None:
+        return "the CRS's x and y are the world frame's; rows fall with y"
+    e, n, h = place.origin
+    return (
+        f"easting = {e:.3f} + x cos a + y sin a, northing = {n:.3f} - x sin a + y cos a, height = {h:.3f} + z with x, "
+        f"y, z of the frame and a = {np.degrees(place.azimuth):.6g} degrees, clockwise from grid north"
+    )
+
+
+def write_path_geojson(path: Path, vertices: NDArray[np.float64], facts: Mapping[str, Any]) -> None:
+    """Write the path as GeoJSON: a line, its start and its target; a feature without geometry where none was found.
+
+    RFC 7946 knows WGS 84 only. The coordinates here are local metres, which the properties say; a program that
+    overlooks it draws the path near latitude 0.
+
+    Parameters
+    ----------
+    vertices : (vertex, xyz) metres, world frame; empty where no path was found.
+    facts : JSON-able properties of the line.
+    """
+    common = {"crs_name": "local metres (not WGS 84)", "frame": FRAME, "unit": "m"}
+    coordinates = [[round(float(v), 6) for v in vertex] for vertex in vertices]
+    line = {"type": "LineString", "coordinates": coordinates} if len(coordinates) > 1 else None
+    features = [_feature(line, {"name": "path"} | dict(facts) | common)]
+    if coordinates:
+        for name, at in (("start", 0), ("target", -1)):
+            features.append(_feature({"type": "Point", "coordinates": coordinates[at]}, {"name": name} | common))
+    write_text(path, json.dumps({"type": "FeatureCollection", "features": features}, indent=1) + "\n")
+
+
+def _feature(geometry: Mapping[str, Any] | None, properties: Mapping[str, Any]) -> dict[str, Any]:
+    return {"type": "Feature", "geometry": geometry, "properties": dict(properties)}
+
+
+def write_path_gpkg(
+    path: Path, vertices: NDArray[np.float64], facts: Mapping[str, Any], place: Georeference | None = None
+) -> None:
+    """Write the path as GeoPackage: layers ``path`` (line) and ``ends`` (start, target).
+
+    Parameters
+    ----------
+    vertices : (vertex, xyz) metres, world frame; where no path was found they are empty, ``path`` holds a feature
+        without geometry, and there is no layer ``ends``.
+    facts : properties of the line; those that are no text, number or truth value are left out.
+    place : of the world frame; the coordinates are then those of its CRS, else of the engineering CRS.
+    """
+    import pyogrio
+    from pyogrio.raw import write
+
+    pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": GPKG_DATE})
+    given = {"name": "path", "frame": FRAME, "axes": _axes(place), "unit": "m"} | dict(facts)
+    kept = {name: value for name, value in given.items() if isinstance(value, str | int | float)}
+    columns = [np.array([value], dtype=object if isinstance(value, str) else None) for value in kept.values()]
+    common = {"driver": "GPKG", "crs": ENGINEERING_CRS if place is None else place.crs}
+    vertices = vertices if place is None else place.apply(vertices)
+    line = _wkb(LINE_Z, vertices) if len(vertices) > 1 else None
+    with replacing(path) as temporary:
+        lines = np.array([line], dtype=object)
+        write(temporary, lines, columns, list(kept), layer="path", geometry_type="LineString Z", **common)
+        if len(vertices):
+            ends = np.array([_wkb(POINT_Z, vertices[at]) for at in (0, -1)], dtype=object)
+            names = [np.array(["start", "target"], dtype=object)]
+            write(temporary, ends, names, ["name"], layer="ends", geometry_type="Point Z", append=True, **common)
+
+
+def _wkb(kind: int, points: NDArray[np.float64]) -> bytes:
+    """Well-known binary, little-endian, of a point (3,) or a line (n, 3)."""
+    count = struct.pack("<I", len(points)) if kind == LINE_Z else b""
+    return struct.pack("<BI", 1, kind) + count + np.ascontiguousarray(points, dtype="<f8").tobytes()
+
+
+def write_style(path: Path, name: str, values: Mapping[str, float] | None = None) -> None:
+    """Write the QGIS style ``name``; beside a raster of the same stem QGIS applies it on opening.
+
+    Parameters
+    ----------
+    values : numbers to fill in by the names that the style has for them.
+    """
+    text = resources.files("pipeline.export").joinpath("styles", f"{name}.qml").read_text(encoding="utf-8")
+    write_text(path, Template(text).substitute({key: f"{value:.6g}" for key, value in (values or {}).items()}))
+
+
+FORMULA = ("=", "+", "-", "@", "\t")
+"""A spreadsheet takes a cell that begins so for a formula, and runs it; behind an apostrophe it is text."""
+
+
+def write_table(path: Path, columns: Mapping[str, Sequence[Any]]) -> None:
+    """Write columns of equal length as CSV (RFC 4180, but lines end in a line feed); what is not known stays empty."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows([_cell(value) for value in row] for row in zip(*columns.values(), strict=True))
+    write_text(path, out.getvalue())
+
+
+def _cell(value: Any) -> str:
+    if value is None or (isinstance(value, float) and not np.isfinite(value)):
+        return ""
+    if isinstance(value, float):
+        return f"{value:.9g}"
+    text = plain(str(value))
+    return f"'{text}" if isinstance(value, str) and text.startswith(FORMULA) else text
+
+
+def write_trajectory_kitti(path: Path, poses: NDArray[np.float64]) -> None:
+    """Write the 3 x 4 of every frame, row by row, a line a frame; NaN where a frame has no pose.
+
+    Parameters
+    ----------
+    poses : (frame, 3, 4) T_world_left, metres; optical axes x right, y down, z forward.
+    """
+    write_text(path, "".join(_line(pose.reshape(-1)) for pose in poses))
+
+
+def write_trajectory_tum(path: Path, poses: NDArray[np.float64], times: Sequence[float], world: str = FRAME) -> None:
+    """Write ``time x y z qx qy qz qw``, a line for every frame with a pose.
+
+    Parameters
+    ----------
+    poses : (frame, 3, 4) T_world_left, metres; optical axes x right, y down, z forward.
+    times : of the frames, seconds; frame numbers where there is no clock.
+    world : the frame of reference in words.
+    """
+    head = f"# time x y z qx qy qz qw; world from left camera (x right, y down, z forward); world {world}\n"
+    lines = [
+        _line([time, *pose[:, 3], *Rotation.from_matrix(pose[:, :3]).as_quat(canonical=True)])
+        for time, pose in zip(times, poses, strict=True)
+        if np.isfinite(pose).all()
+    ]
+    write_text(path, head + "".join(lines))
+
+
+def _line(values: Sequence[float] | NDArray[np.float64]) -> str:
+    return " ".join(f"{value:.15g}" for value in values) + "\n"
+
+
+def write_disparity(path: Path, column: NDArray[Any], row: NDArray[Any], tags: Mapping[str, str]) -> None:
+    """Write the disparity of two images as a float32 TIFF: bands ``column_disparity`` and ``row_disparity``.
+
+    Parameters
+    ----------
+    column, row : (row, col) float32 pixels on the left image, right minus left, NaN undefined.
+    tags : more metadata.
+    """
+    bands = {"column_disparity": (column, "pixel"), "row_disparity": (row, "pixel")}
+    _write_image(path, bands, {"CONVENTION": "right minus left, pixels of the left image, NaN undefined"} | dict(tags))
+
+
+def write_confidence(
+    path: Path, std: NDArray[Any], validity: NDArray[Any], backmatch_error: NDArray[Any], tags: Mapping[str, str]
+) -> None:
+    """Write what is known about a disparity as a float32 TIFF: ``disparity_std``, ``validity``, ``backmatch_error``.
+
+    Parameters
+    ----------
+    std, backmatch_error : (row, col) float32 pixels, NaN undefined.
+    validity : (row, col) uint8, bits of :class:`stages.core.validity.Validity`; written as whole numbers, and as the
+    tag
+        ``VALIDITY`` says.
+    tags : more metadata.
+    """
+    from stages.core.validity import Validity
+
+    bits = ", ".join(f"{bit.value} {str(bit.name).lower()}" for bit in Validity)
+    bands = {"disparity_std": (std, "pixel"), "validity": (validity, ""), "backmatch_error": (backmatch_error, "pixel")}
+    _write_image(path, bands, {"VALIDITY": f"sum of {bits}"} | dict(tags))
+
+
+def _write_image(path: Path, bands: Mapping[str, tuple[NDArray[Any], str]], tags: Mapping[str, str]) -> None:
+    """Write arrays (row, col) on image pixels, with their units, as bands of a float32 TIFF, NaN undefined."""
+    import warnings
+
+    import rasterio
+    from rasterio.errors import NotGeoreferencedWarning
+
+    height, width = next(iter(bands.values()))[0].shape
+    profile = {"driver": "GTiff", "height": height, "width": width, "count": len(bands), "dtype": "float32"}
+    profile |= {"nodata": float("nan"), "compress": "deflate", "predictor": 3}
+    with replacing(path) as temporary, warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)  # an image has no place on the ground
+        with rasterio.open(temporary, "w", **profile) as file:
+            for number, (name, (values, _)) in enumerate(bands.items(), start=1):
+                file.write(np.asarray(values, dtype=np.float32), number)
+                file.set_band_description(number, name)
+            file.units = tuple(unit for _, unit in bands.values())
+            file.update_tags(**dict(tags))
+
+
+def read_disparity(path: Path, shape: tuple[int, ...] = ()) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Column and row disparity (row, col), float32 pixels, NaN undefined, of a TIFF as :func:`write_disparity` makes.
+
+    Parameters
+    ----------
+    shape : (rows, columns) that it must have; compared before anything is unpacked.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read, its two bands are not those, or it has another size.
+    """
+    import warnings
+
+    import rasterio
+    from rasterio.errors import NotGeoreferencedWarning, RasterioError
+
+    remedy = "give a TIFF with the bands column_disparity and row_disparity, as rille match writes"
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", NotGeoreferencedWarning)
+            open_regular(path, "disparity", MOST_BYTES).close()
+            with rasterio.open(path, driver="GTiff") as file:  # other drivers open other files, by name
+                names = tuple(name for name in file.descriptions if name)
+                if file.count != 2 or names not in ((), ("column_disparity", "row_disparity")):
+                    told = ", ".join(names) or "without names"
+                    raise InputError("RIL-622", f"{path} has {file.count} bands ({told}), no disparity", remedy=remedy)
+                if shape and file.shape != shape:
+                    raise InputError(
+                        "RIL-044",
+                        f"{path} has {file.width} x {file.height} pixels, the left image {shape[1]} x {shape[0]}",
+                        remedy="give a disparity of this left image",
+                    )
+                column, row = file.read(out_dtype="float32", masked=True).filled(np.nan)
+    except RasterioError as error:
+        raise InputError("RIL-623", f"{path} cannot be read as a TIFF ({error})", remedy=remedy) from error
+    return np.ascontiguousarray(column), np.ascontiguousarray(row)

@@ -1,0 +1,1 @@
+"""What is computed from what: reconstruction, closed loop, configuration."""

@@ -1,0 +1,307 @@
+"""Configuration: one section a stage, layered, strictly validated, and written back with every default filled.
+
+Layers, later ones win: defaults of the code, what suits the sequence (``Sequence.defaults``), ``--config FILE.toml``,
+``--set section.key=value``. The sections and their fields are the parameter models of the stages themselves.
+"""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import pkgutil
+import tomllib
+from collections.abc import Iterable, Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any, Literal
+
+import tomli_w
+from pydantic import Field, ValidationError, create_model
+
+from datasets import reading
+from stages.core.declare import Params, Stage
+from stages.core.errors import ConfigError, told
+
+STAGE_MODULES: dict[str, str] = {
+    "undistort": "stages.imaging.undistort",
+    "pyramid": "stages.imaging.pyramid",
+    "sight": "stages.imaging.image_quality",
+    "motion": "stages.odometry.motion",
+    "sides": "stages.calibration.swap_check",
+    "continuity": "stages.odometry.frame_screening",
+    "select": "stages.odometry.keyframes",
+    "hfvm": "stages.hfvm",
+    "orientation": "stages.calibration.orientation",
+    "rig": "stages.calibration.rig",
+    "calibration": "stages.calibration.calibration",
+    "level": "stages.terrain.ground_frame",
+    "locus": "stages.terrain.locus.stage",
+    "track": "stages.odometry.track",
+    "resect": "stages.odometry.resection.resect",
+    "refine": "stages.odometry.resection.refine",
+    "trajectory": "stages.odometry.resection.trajectory",
+    "pose": "stages.odometry.resection.pose",
+    "footprint": "stages.terrain.tile_index",
+    "seam": "stages.terrain.overlap_qa",
+    "seam_audit": "stages.terrain.overlap_audit",
+    "exposure": "stages.terrain.radiometry",
+    "merge": "stages.terrain.merge",
+    "risk": "stages.hazard.risk",
+    "path": "stages.planning.path",
+    "crosscheck": "stages.evaluation.crosscheck",
+    "crosscheck_join": "stages.evaluation.crosscheck_join",
+    "agreement": "stages.evaluation.agreement",
+    "truth": "stages.evaluation.truth",
+    "accuracy": "stages.evaluation.accuracy",
+    "position_accuracy": "stages.evaluation.position_accuracy",
+    "dem_accuracy": "stages.evaluation.dem_accuracy",
+    "path_check": "stages.evaluation.path_check",
+    "pad": "stages.terrain.start_area",
+    "ceiling": "stages.terrain.occlusion_bounds",
+    "leg": "stages.planning.local_planner.stage",
+    "safety": "stages.driving.fault_monitor",
+    "reflex": "stages.driving.obstacle_monitor",
+    "global_fix": "stages.terrain.map_localization",
+    "drive_check": "stages.evaluation.drive_check",
+}
+"""Every stage of the chain by name; a section of the configuration where the stage has parameters."""
+
+ACCURATE_TERRAIN: dict[str, Any] = {
+    "hfvm": {"preset": "accurate"},
+    "locus": {"both": True},
+    "track": {"points": 2000},
+    "merge": {"max_std_cells": 0.7},
+}
+"""What ``terrain.preset = "accurate"`` sets; a value given for any of these keys wins.
+
+So many points because models that are half as wrong show half as small an error of the poses that merge them.
+"""
+
+AND_THEN: tuple[tuple[str, str, Any, dict[str, Any]], ...] = (
+    ("hfvm", "preset", "accurate", {"locus": {"refined_share": 0.5}}),
+    ("locus", "both", True, {"hfvm": {"greatest_std": 100.0}, "locus": {"max_jump": 5.0}}),
+)
+"""The same, where this value of that section's key has not been overruled.
+
+With an accurate matcher the mean of what the disparity says and of what the images show is better than either. With
+both directions a cell's own standard deviation tells good from bad better than the matcher's limits do, so they leave
+it more to choose from: no greatest standard deviation of a match, and disparities may jump by 5 pixels (beyond that
+nothing is gained).
+"""
+
+
+class TerrainParams(Params):
+    """One choice for all stages that make elevations."""
+
+    preset: Literal["default", "accurate"] = Field(
+        default="default",
+        description="accurate: preset accurate of the matcher, elevations from both directions of matching, 2000 "
+        "tracked points, and merged cells of an own standard deviation above 0.7 cells left undefined: errors are "
+        "about two fifths smaller, matching takes many times as long",
+    )
+
+
+DATASET_SECTIONS = ("mockup", "misalign", "rover")
+"""Sections that belong to a kind of sequence; the sequence validates them."""
+
+
+def stage(name: str) -> Stage:
+    """Declaration of a stage by its name."""
+    found: Stage = importlib.import_module(STAGE_MODULES[name]).STAGE
+    return found
+
+
+def stage_names() -> set[str]:
+    """Names of all stages, of those that make or read images, too."""
+    import datasets
+    import stages
+
+    modules = [
+        importlib.import_module(found.name)
+        for package in (stages, datasets)
+        for found in pkgutil.walk_packages(package.__path__, f"{package.__name__}.")
+    ]
+    return {module.STAGE.name for module in modules if hasattr(module, "STAGE")}
+
+
+@cache
+def model() -> type[Params]:
+    """Model of the whole configuration, made of the stages' own parameter models."""
+    from pipeline.flow.closed_loop import DriveParams
+    from pipeline.flow.tiles import Tiling
+    from stages.hazard.vehicle import DEFAULT_VEHICLE, Vehicle
+
+    fields: dict[str, Any] = {
+        name: (stage(name).params, stage(name).params()) for name in STAGE_MODULES if stage(name).params.model_fields
+    }
+    fields["terrain"] = (TerrainParams, TerrainParams())
+    fields["tiling"] = (Tiling, Tiling())
+    fields["drive"] = (DriveParams, DriveParams())
+    fields["vehicle"] = (Vehicle, DEFAULT_VEHICLE)
+    return create_model("Config", __base__=Params, **fields)
+
+
+def parse_assignments(assignments: Iterable[str]) -> dict[str, Any]:
+    """``["locus.cell_size=0.002", ...]`` to a nested mapping; values are TOML, bare words are text.
+
+    Raises
+    ------
+    ConfigError
+        There is no ``=``, or no dot in the key.
+    """
+    nested: dict[str, Any] = {}
+    for text in assignments:
+        key, sep, value = text.partition("=")
+        key = key.strip()
+        if not sep or "." not in key:
+            raise ConfigError(
+                "RIL-024", f"--set {text!r} is not section.key=value", remedy="write e.g. --set locus.cell_size=0.002"
+            )
+        merge(nested, expand({key: _toml_value(value.strip())}))
+    return nested
+
+
+def _toml_value(text: str) -> Any:
+    try:
+        return tomllib.loads(f"v = {text}")["v"]
+    except (ValueError, RecursionError):  # also numbers of thousands of digits
+        return text
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Configuration file to a nested mapping."""
+    return reading.read_toml(path, "configuration")
+
+
+def expand(dotted: Mapping[str, Any]) -> dict[str, Any]:
+    """``{"a.b": 1}`` to ``{"a": {"b": 1}}``."""
+    nested: dict[str, Any] = {}
+    for key, value in dotted.items():
+        *sections, last = key.split(".")
+        at = nested
+        for part in sections:
+            at = at.setdefault(part, {})
+        at[last] = value
+    return nested
+
+
+def merge(into: dict[str, Any], layer: Mapping[str, Any]) -> dict[str, Any]:
+    """Lay a nested mapping over another one, in place."""
+    for key, value in layer.items():
+        if isinstance(value, Mapping) and isinstance(into.get(key), dict):
+            merge(into[key], value)
+        else:
+            into[key] = dict(value) if isinstance(value, Mapping) else value
+    return into
+
+
+def split_dataset(layers: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Part the sections of sequences from those of stages: ``(dataset sections, stage sections)``."""
+    ours = {k: v for k, v in layers.items() if k in DATASET_SECTIONS}
+    return ours, {k: v for k, v in layers.items() if k not in DATASET_SECTIONS}
+
+
+def build(*layers: Mapping[str, Any]) -> Params:
+    """Validated configuration of nested layers, later ones winning.
+
+    Raises
+    ------
+    ConfigError
+        A key is unknown or a value not permitted; the message has the dotted key, the value and what is permitted.
+    """
+    nested: dict[str, Any] = {}
+    for layer in layers:
+        merge(nested, layer)
+    nested = _with_accurate_terrain(nested)
+    _navigate(nested)
+    built: Params = validate(model(), nested, (), DATASET_SECTIONS)
+    return built
+
+
+def _with_accurate_terrain(nested: dict[str, Any]) -> dict[str, Any]:
+    terrain = nested.get("terrain")
+    if not isinstance(terrain, Mapping) or terrain.get("preset") != "accurate":
+        return nested
+    nested = merge(merge({}, ACCURATE_TERRAIN), nested)
+    for section, key, value, more in AND_THEN:
+        given = nested[section]
+        if isinstance(given, Mapping) and given[key] == value:
+            nested = merge(merge({}, more), nested)
+    return nested
+
+
+NAVIGATION: Mapping[str, Mapping[str, Any]] = {
+    "hfvm": {"preset": "fast"},
+    "motion": {"level": 3},
+    "track": {"points": 200},
+    "orientation": {"samples": 600},
+}
+"""What ``select.preset = "navigation"`` sets in other sections, where nothing is given there."""
+
+
+def _navigate(nested: dict[str, Any]) -> None:
+    """What a trajectory needs of disparities and displacements, half the resolution of each gives."""
+    select = nested.get("select")
+    if not isinstance(select, Mapping) or select.get("preset") != "navigation":
+        return
+    for section, values in NAVIGATION.items():
+        given = nested.setdefault(section, {})
+        if isinstance(given, dict):
+            nested[section] = {**values, **given}
+
+
+def validate(kind: type[Params], values: Mapping[str, Any], prefix: tuple[str, ...], also: Iterable[str] = ()) -> Any:
+    """``kind(**values)`` with pydantic's complaints turned into one :class:`ConfigError` line."""
+    try:
+        return kind.model_validate(dict(values))
+    except ValidationError as error:
+        raise ConfigError("RIL-027", told(error.errors(), lambda e: _complaint(kind, prefix, e, also))) from error
+
+
+def _complaint(kind: type[Params], prefix: tuple[str, ...], error: dict[str, Any], also: Iterable[str]) -> str:
+    loc = [str(part) for part in error["loc"]]
+    key = ".".join((*prefix, *loc))
+    if error["type"] == "extra_forbidden":
+        near = difflib.get_close_matches(key, [".".join((*prefix, k)) for k in known_keys(kind)] + list(also), n=1)
+        hint = f"did you mean {near[0]!r}?" if near else f"known here: {', '.join(_siblings(kind, loc))}"
+        return f"unknown key {key!r} (value {error['input']!r}): {hint}"
+    context = error.get("ctx", {})
+    reason = context["error"] if "error" in context else error["msg"]
+    where = key or "configuration"
+    return f"{where} = {error['input']!r} is not permitted: {str(reason)[0].lower() + str(reason)[1:]}"
+
+
+def _siblings(kind: type[Params], loc: list[str]) -> list[str]:
+    at: Any = kind
+    for part in loc[:-1]:
+        field = at.model_fields.get(part)
+        if field is None or not hasattr(field.annotation, "model_fields"):
+            break
+        at = field.annotation
+    return sorted(at.model_fields)
+
+
+def known_keys(kind: type[Params], prefix: str = "") -> list[str]:
+    """All dotted keys of a model, sections included."""
+    keys = []
+    for name, field in kind.model_fields.items():
+        keys.append(prefix + name)
+        if hasattr(field.annotation, "model_fields"):
+            keys += known_keys(field.annotation, f"{prefix}{name}.")  # type: ignore[arg-type]
+    return keys
+
+
+def to_toml(config: Params, extra: Mapping[str, Params] | None = None) -> str:
+    """Configuration as TOML with every default filled and each key explained; it can be given back by ``--config``."""
+    sections = {name: getattr(config, name) for name in type(config).model_fields} | dict(extra or {})
+    return "\n".join(_section(name, values) for name, values in sections.items())
+
+
+def _section(name: str, values: Params) -> str:
+    lines = [f"[{name}]"]
+    for key, value in values.model_dump(mode="json").items():
+        description = type(values).model_fields[key].description
+        if description:
+            lines.append("# " + " ".join(description.split()))
+        lines.append(f"# {key} is not set" if value is None else tomli_w.dumps({key: value}).strip())
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,106 @@
+"""Parameters that were set and that nothing reads: each is an error, said as early as it can be known.
+
+A parameter counts as set if it is in force with another value than it would have without ``--set`` and ``--config``:
+the ``config.toml`` of a run, which holds all parameters, can be given back. It is read if a task of the run has its
+section for parameters or arguments. What stands in a section that the user himself has switched off
+(``crosscheck.enabled=false``) may stay; a section that is off anyway reads nothing, and the remedy says how to switch
+it on.
+
+Before anything is computed it is known which sections no task of such a run can read (of a drive those of a
+reconstruction, and the other way round). The rest is known when all tasks are: then the run ends with its results, the
+line that names the parameter, and the exit code of a run with holes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from datasets.protocol import Sequence
+from pipeline.engine.graph import Graph
+from stages.core.declare import Params
+from stages.core.errors import ConfigError
+
+RECORDED = frozenset(
+    ("continuity", "select", "refine", "seam_audit", "exposure", "path", "crosscheck", "agreement", "undistort")
+)
+"""Sections that only a reconstruction reads."""
+
+DRIVEN = frozenset(("drive", "pad", "ceiling", "leg", "safety", "reflex", "global_fix"))
+"""Sections that only a drive reads."""
+
+CHECKED = frozenset(("undistort", "pyramid", "motion", "hfvm", "orientation"))
+"""Sections that ``rille check`` reads."""
+
+CHOICES = ("terrain.preset", "select.preset")
+"""Parameters that the configuration itself reads: they set others."""
+
+
+def set_by_user(given: Mapping[str, Any], config: Params, without: Params) -> tuple[str, ...]:
+    """Dotted keys of ``given`` that a task must read; ``without`` is the configuration as it would be without them."""
+    found = []
+    for section, values in given.items():
+        now, then = getattr(config, section), getattr(without, section)
+        off = not getattr(now, "enabled", True) and getattr(then, "enabled", False)
+        for name in values if not off else ():
+            key = f"{section}.{name}"
+            if getattr(now, name) != getattr(then, name) and key not in CHOICES:
+                found.append(key)
+    return tuple(found)
+
+
+def refuse_unreadable(keys: Iterable[str], config: Params, sequence: Sequence) -> None:
+    """Refuse what no task of any run of this kind reads.
+
+    Raises
+    ------
+    ConfigError
+        There is such a parameter.
+    """
+    driven = sequence.simulation is not None
+    foreign = RECORDED if driven else DRIVEN
+    lost = [key for key in keys if key.partition(".")[0] in foreign]
+    if sequence.simulation is None and sequence.lenses is None:
+        lost += [key for key in keys if key.startswith("undistort.")]
+    if lost:
+        who = "a drive" if driven else f"a reconstruction of {sequence.name}"
+        raise ConfigError("RIL-730", f"{values(lost, config)}: no task of {who} reads it", remedy="leave it out")
+
+
+def refuse_unchecked(keys: Iterable[str], config: Params) -> None:
+    """Refuse what ``rille check`` does not read.
+
+    Raises
+    ------
+    ConfigError
+        There is such a parameter.
+    """
+    lost = [key for key in keys if key.partition(".")[0] not in CHECKED]
+    if lost:
+        known = ", ".join(sorted(CHECKED))
+        raise ConfigError("RIL-731", f"{values(lost, config)}: check does not read it", remedy=f"it reads {known}")
+
+
+def unread(keys: Iterable[str], config: Params, graph: Graph) -> list[str]:
+    """Those of the keys that no task of a complete graph reads."""
+    kinds = {type(h.spec.params) for h in graph.nodes}
+    read = {name for name in type(config).model_fields if type(getattr(config, name)) in kinds}
+    read |= {"drive"} | {name for h in graph.nodes for name in h.spec.args if name in ("vehicle", "resect")}
+    read |= {"tiling"} if "hfvm" in read else set()
+    return [key for key in keys if key.partition(".")[0] not in read]
+
+
+def values(keys: Iterable[str], config: Params) -> str:
+    """``track.points = 300, merge.max_hole = 2``."""
+    words = []
+    for key in keys:
+        section, _, name = key.partition(".")
+        words.append(f"{key} = {getattr(getattr(config, section), name)}")
+    return ", ".join(words)
+
+
+def remedy(keys: Iterable[str], config: Params) -> str:
+    """What to do about parameters that nothing read."""
+    sections = dict.fromkeys(key.partition(".")[0] for key in keys)
+    off = [s for s in sections if not getattr(getattr(config, s), "enabled", True)]
+    return f"set {off[0]}.enabled=true, or leave it out" if off else "leave it out, or choose frames that need it"

@@ -1,0 +1,142 @@
+"""``rille timing RUN``: where the time of a run went, and how far it is from what its work allows.
+
+No schedule beats the greater of two figures: the seconds of all stages over the number of workers, and the longest
+chain of tasks of which each waits for the one before. The rest is starting, reading, committing, waiting, drawing.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pipeline.engine import events
+from pipeline.runs import lookup
+from pipeline.engine.memory.cost_model import count
+
+FACTOR, START = 1.15, 5.0
+"""A good cold run: this factor over the least possible time, and these seconds to start workers and draw results."""
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Seconds of a run: ``kernel`` of all stages together, ``tasks`` with reading and committing, the longest chain."""
+
+    wall: float
+    workers: int
+    kernel: float
+    tasks: float
+    computed: int
+    chain: tuple[tuple[str, float], ...]
+
+    @property
+    def longest(self) -> float:
+        """The longest chain."""
+        return sum(seconds for _, seconds in self.chain)
+
+    @property
+    def least(self) -> float:
+        """What no schedule beats."""
+        return max(self.kernel / self.workers, self.longest)
+
+    @property
+    def good(self) -> float:
+        """What a run should stay under."""
+        return FACTOR * self.least + START
+
+
+def timing(path: Path) -> Timing:
+    """Timing of a ledger."""
+    rows, facts = events.read(path), events.facts(path)
+    took = {r["label"]: float(r["kernel"]) for r in rows if r["status"] == "computed" and "kernel" in r}
+    span = [(r["started"], r["ended"]) for r in rows if "started" in r]
+    wall = facts.get("total", facts.get("seconds"))
+    if wall is None:  # it was killed
+        wall = max((end for _, end in span), default=0.0) - min((start for start, _ in span), default=0.0)
+    return Timing(
+        float(wall),
+        int(facts.get("jobs", 1)),
+        sum(took.values()),
+        sum(float(r["seconds"]) for r in rows if r["status"] == "computed"),
+        len(took),
+        _longest(rows, took, events.expansions(path)),
+    )
+
+
+def _longest(
+    rows: list[dict[str, Any]], took: Mapping[str, float], expansions: Iterable[tuple[list[str], list[str]]]
+) -> tuple[tuple[str, float], ...]:
+    """The chain of tasks, each waiting for the one before, with the greatest sum of seconds."""
+    waits: dict[str, list[str]] = defaultdict(list)
+    for row in rows:
+        for given in row.get("inputs", {}).values():
+            waits[row["label"]] += given if isinstance(given, list) else [given]
+    for number, (after, nodes) in enumerate(expansions):
+        waits[f"\0{number}"] += after  # one name for all, else it is each with each
+        for node in nodes:
+            waits[node].append(f"\0{number}")
+    until: dict[str, float] = {}
+    via: dict[str, str] = {}
+    for label in _in_order(waits, [row["label"] for row in rows]):
+        before = max(waits.get(label, ()), key=lambda w: until.get(w, 0.0), default="")
+        until[label] = took.get(label, 0.0) + until.get(before, 0.0)
+        via[label] = before
+    chain, at = [], max(until, key=lambda label: until[label], default="")
+    while at:
+        if took.get(at):
+            chain.append((at, took[at]))
+        at = via.get(at, "")
+    return tuple(reversed(chain))
+
+
+def _in_order(waits: Mapping[str, list[str]], labels: list[str]) -> Iterable[str]:
+    """Every label after those that it waits for."""
+    done: set[str] = set()
+    for label in labels:
+        stack = [label]
+        while stack:
+            at = stack[-1]
+            open_ = [w for w in waits.get(at, ()) if w not in done]
+            if at in done or not open_:
+                stack.pop()
+                if at not in done:
+                    done.add(at)
+                    yield at
+            else:
+                stack += open_
+
+
+def describe(run: Path) -> Iterable[str]:
+    """Lines on the time of a run."""
+    t = timing(run / lookup.LEDGER)
+    done = f"{count(t.computed, 'task')} computed with {count(t.workers, 'worker')}"
+    yield f"run {lookup.name(run)}: {t.wall:.1f} s, {done}"
+    if not t.computed:
+        yield "nothing was computed"
+        return
+    yield f"stages {t.kernel:.1f} s, over the workers {t.kernel / t.workers:.1f} s"
+    yield f"longest chain {t.longest:.1f} s: {_chain(t.chain)}"
+    share = 100 / (t.wall * t.workers)
+    yield (
+        f"of the workers' time: stages {share * t.kernel:.0f} %, reading and committing "
+        f"{share * (t.tasks - t.kernel):.0f} %, starting, waiting and drawing {100 - share * t.tasks:.0f} %"
+    )
+    verdict = "kept" if t.wall <= t.good else f"exceeded by {t.wall - t.good:.1f} s"
+    bound = f"{FACTOR} of it and {START:.0f} s are {t.good:.1f} s: {verdict}"
+    yield f"least possible {t.least:.1f} s, of which the run took {t.wall / max(t.least, 0.001):.2f}; {bound}"
+
+
+def _chain(chain: tuple[tuple[str, float], ...]) -> str:
+    """The chain's tasks, short ones only counted."""
+    told = [f"{label} {seconds:.1f}" for label, seconds in chain if seconds >= 0.05]
+    short = len(chain) - len(told)
+    return ", ".join(told) + (f" and {short} of less than 0.05 s" if short else "")
+
+
+def show(text: str, folder: Path) -> int:
+    """Print the timing of a run."""
+    for line in describe(lookup.find(text, folder)):
+        print(line)
+    return 0

@@ -1,0 +1,90 @@
+"""Finding runs by what a user types, and tasks of a run by their label."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+from pipeline.engine import events
+from stages.core.errors import ConfigError
+
+LEDGER = "ledger.jsonl"
+
+
+def all_runs(runs: Path) -> list[Path]:
+    """Folders of all runs that have a ledger, in order of time within each sequence."""
+    return sorted(p.parent for p in runs.glob(f"*/*/{LEDGER}") if not p.parent.is_symlink())
+
+
+def name(run: Path) -> str:
+    """``sequence/run id``."""
+    return f"{run.parent.name}/{run.name}"
+
+
+def find(text: str, runs: Path) -> Path:
+    """Folder of a run: a path, ``SEQUENCE`` (its latest), ``SEQUENCE/ID``, ``ID``, or ``latest`` of all.
+
+    Raises
+    ------
+    ConfigError
+        There is no such run; the message has the nearest names.
+    """
+    known = all_runs(runs)
+    if text == "latest" and known:
+        return max(known, key=lambda run: run.name)
+    for path in (Path(text), runs / text, runs / text / "latest"):
+        if (path / LEDGER).is_file():
+            return path.resolve()
+    for run in known:
+        if text in (run.name, name(run)):
+            return run
+    started = [run for run in known if run.parent.name == text]
+    if started:  # none of them came to its end
+        return started[-1]
+    names = [n for run in known for n in (name(run), run.parent.name, run.name)]
+    where = f"there are {_some(sorted({run.parent.name for run in known}))}" if known else f"{runs} holds none"
+    raise ConfigError("RIL-067", f"no run {text!r}", remedy=_near(text, names) or where)
+
+
+def row(rows: Iterable[dict[str, Any]], label: str, run: Path) -> dict[str, Any]:
+    """The line of a task in a ledger, as it ended.
+
+    Raises
+    ------
+    ConfigError
+        The run has no such task; the message has the nearest names.
+    """
+    by_label = {r["label"]: r for r in rows}
+    if label in by_label:
+        return by_label[label]
+    near = _near(label, by_label)
+    raise ConfigError(
+        "RIL-068", f"run {name(run)} has no task {label!r}", remedy=near or f"it has {_some(list(by_label))}"
+    )
+
+
+def _near(text: str, names: Iterable[str]) -> str:
+    known = list(dict.fromkeys(names))
+    within = [n for n in known if text and text in n]
+    found = difflib.get_close_matches(text, known, n=3, cutoff=0.5) or within[:3]
+    return f"did you mean {' or '.join(found)}?" if found else ""
+
+
+def _some(names: list[str]) -> str:
+    return ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
+
+
+def earlier(run: Path, *, of_any: bool = False) -> Iterator[Path]:
+    """Runs of the same sequence (or of any) before this one, the latest first."""
+    before = [r for r in all_runs(run.parent.parent) if r.name < run.name and (of_any or r.parent == run.parent)]
+    yield from sorted(before, key=lambda r: r.name, reverse=True)
+
+
+def keys(runs: Path) -> dict[str, str]:
+    """Each key that any run used, with the name of the last run (by time) that did."""
+    found: dict[str, str] = {}
+    for run in sorted(all_runs(runs), key=lambda r: r.name):
+        found |= dict.fromkeys(events.keys(run / LEDGER), name(run))
+    return found

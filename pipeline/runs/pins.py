@@ -1,0 +1,78 @@
+"""Pins: runs whose artifacts stay, whatever is cleared away, and even if the run's own folder goes."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+from pipeline.engine import events
+from pipeline.runs import lookup
+from pipeline.engine.store.folder import Store, StoreError
+from stages.core.errors import ConfigError
+
+FOLDER = "pins"
+
+
+def pin(store: Store, run: Path) -> int:
+    """Keep all artifacts that a run used; gives their number."""
+    keys = sorted(events.keys(run / lookup.LEDGER))
+    path = _path(store, lookup.name(run))
+    temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")
+    body = json.dumps({"run": lookup.name(run), "pinned": round(time.time()), "keys": keys})
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary.write_text(body, encoding="utf-8")
+        temporary.replace(path)
+    except OSError as error:
+        raise StoreError("RIL-562", f"cannot pin in {store.root}: {error.strerror}", remedy="check --cache") from error
+    return len(keys)
+
+
+def unpin(store: Store, text: str) -> str:
+    """Take the pin of a run away, given as ``SEQUENCE/ID``, ``ID`` or the run's folder; gives its name.
+
+    Raises
+    ------
+    ConfigError
+        It is not pinned.
+    """
+    pinned = [found["run"] for found in pins(store)]
+    wanted = {text, "/".join(Path(text).absolute().resolve().parts[-2:])}
+    for name in pinned:
+        if wanted & {name, name.rpartition("/")[2]}:
+            _path(store, name).unlink(missing_ok=True)
+            return str(name)
+    remedy = f"pinned are {', '.join(pinned)}" if pinned else "nothing is pinned in this cache"
+    raise ConfigError("RIL-563", f"run {text!r} is not pinned", remedy=remedy)
+
+
+def pins(store: Store) -> list[dict[str, Any]]:
+    """All pins: ``run``, ``pinned`` (seconds since 1970) and ``keys``.
+
+    Raises
+    ------
+    StoreError
+        A pin cannot be read: what it keeps is not known, so nothing may be cleared away.
+    """
+    found = []
+    for path in sorted((store.root / FOLDER).glob("*.json")):
+        try:
+            one = json.loads(path.read_text(encoding="utf-8"))
+            found.append({"run": str(one["run"]), "pinned": float(one["pinned"]), "keys": list(one["keys"])})
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise StoreError(
+                "RIL-564", f"the pin {path} cannot be read", remedy="pin that run again, or remove the file"
+            ) from error
+    return found
+
+
+def keys(store: Store) -> set[str]:
+    """Keys of all that pinned runs need."""
+    return {key for found in pins(store) for key in found["keys"]}
+
+
+def _path(store: Store, name: str) -> Path:
+    return store.root / FOLDER / f"{name.replace('/', '--')}.json"

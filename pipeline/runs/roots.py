@@ -1,0 +1,62 @@
+"""Folders of runs that use a cache, remembered in the cache: clearing up must keep what any of them refers to."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import platform
+from collections.abc import Iterator
+from pathlib import Path
+
+from pipeline.engine.store.folder import Store, StoreError
+
+FOLDER = "roots"
+
+
+def note(store: Store, runs: Path) -> None:
+    """Remember a folder of runs, once."""
+    folder = str(runs.absolute().resolve())
+    named = hashlib.sha256(f"{platform.node()}\0{folder}".encode()).hexdigest()[:16]
+    path = store.root / FOLDER / f"{named}.json"
+    if path.exists():
+        return
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")
+        temporary.write_text(json.dumps({"folder": folder, "host": platform.node()}), encoding="utf-8")
+        temporary.replace(path)
+    except OSError as error:
+        raise StoreError(
+            "RIL-741", f"cannot write in {store.root}: {error.strerror}", remedy="check --cache"
+        ) from error
+
+
+def folders(store: Store, runs: Path) -> list[Path]:
+    """``runs`` and all remembered folders that are there."""
+    return sorted({runs.absolute().resolve(), *(folder for folder, _, _ in _noted(store) if folder.is_dir())})
+
+
+def check_all_seen(store: Store) -> None:
+    """Raise where another machine's runs cannot be seen from here; folders of this machine that are gone hold none.
+
+    Raises
+    ------
+    StoreError
+        There is such a folder, or a note cannot be read.
+    """
+    for folder, host, path in _noted(store):
+        if not folder.is_dir() and host != platform.node():
+            remedy = f"clear up there, or remove {path} if they are gone"
+            raise StoreError("RIL-743", f"the runs in {folder} on {host} cannot be seen from here", remedy=remedy)
+
+
+def _noted(store: Store) -> Iterator[tuple[Path, str, Path]]:
+    """Folder of runs, machine, and the file that says so."""
+    for path in sorted((store.root / FOLDER).glob("*.json")):
+        try:
+            noted = json.loads(path.read_text(encoding="utf-8"))
+            yield Path(noted["folder"]), str(noted["host"]), path
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            remedy = "remove it, once you know that no run needs this cache"
+            raise StoreError("RIL-742", f"{path} cannot be read", remedy=remedy) from error

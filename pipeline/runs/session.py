@@ -1,0 +1,511 @@
+"""One run from options to a folder of results: open, configure, run the graph, write products and report.
+
+Everything that takes time is a cached task; what this module writes (rasters, trajectory, path, report) is rendered
+anew by each run into ``RUNS/<sequence>/<run id>/``. ``latest`` moves last, and only to a folder that is complete
+or whose holes are named in its report. A run that computes nothing, and would write what ``latest`` holds
+already, leaves no folder of its own: that one stands (:mod:`pipeline.runs.unchanged`).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from datasets.protocol import Sequence
+from pipeline.flow import config as configuration
+from pipeline.export.early import Ahead
+from pipeline.engine.store.artifact import DamagedError
+from pipeline.engine.code_digest import remember
+from pipeline.engine.graph import Graph
+from pipeline.engine.store.location import Location, hints_folder, locate
+from pipeline.engine.store.folder import GoneError, Store, at
+from stages.core.declare import Bundle
+from stages.core.errors import ConfigError, RilleError
+
+if TYPE_CHECKING:
+    from pipeline.engine.scheduler import Result
+    from pipeline.flow.reconstruction import Products
+    from pipeline.report import RunView
+
+COMPLETE, FAILED, HOLES = 0, 1, 3
+DISTRIBUTIONS = (
+    *("rille", "numpy", "numba", "scipy", "opencv-python-headless", "dask", "zarr", "rasterio", "pyogrio", "pycolmap"),
+    *("matplotlib", "jinja2"),
+)
+
+
+@dataclass(frozen=True)
+class Options:
+    """What the command line asks for."""
+
+    sequence: str
+    assignments: tuple[str, ...] = ()
+    config: Path | None = None
+    frames: str | None = None
+    jobs: int | None = None
+    executor: str = "processes"
+    keep_going: bool = False
+    force: frozenset[str] = frozenset()
+    runs: Path = Path("runs")
+    cache: Location = Path(".rille/cache")
+    progress: str = "auto"
+    fresh: bool = False
+    memory_limit: str | None = None
+    verb: str = "reconstruct"
+
+    def command(self) -> str:
+        """The command line that repeats this run."""
+        words = ["rille", self.verb, self.sequence]
+        words += [f"--config {self.config}"] if self.config else []
+        words += [f"--frames {self.frames}"] if self.frames else []
+        return " ".join(words + [f"--set {a}" for a in self.assignments])
+
+
+def choose_frames(text: str | None, count: int) -> tuple[int, ...]:
+    """Frame numbers of ``START:STOP[:STEP]``, or all.
+
+    Raises
+    ------
+    ConfigError
+        The range is no range, empty, or reaches beyond the sequence.
+    """
+    if text is None:
+        return tuple(range(count))
+    remedy = f"give START:STOP[:STEP] within 0:{count}"
+    try:
+        parts = [int(p) if p else None for p in text.split(":")]
+    except ValueError:
+        raise ConfigError("RIL-055", f"--frames {text!r} is not a range", remedy=remedy) from None
+    if not 2 <= len(parts) <= 3 or any(p is not None and p < 0 for p in parts) or parts[2:] == [0]:
+        raise ConfigError("RIL-056", f"--frames {text!r} is not a range", remedy=remedy)
+    if (parts[1] or 0) > count or (parts[0] or 0) >= count:
+        raise ConfigError("RIL-057", f"--frames {text!r} reaches beyond the sequence's {count} frames", remedy=remedy)
+    chosen = tuple(range(count)[slice(*parts)])
+    if not chosen:
+        raise ConfigError("RIL-058", f"--frames {text!r} leaves no frame", remedy="widen the range")
+    return chosen
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What a command works on: ``given`` are dotted keys that the user has set, ``vehicle_source`` who its limits."""
+
+    sequence: Sequence
+    config: Any
+    vehicle_source: str
+    given: tuple[str, ...]
+
+
+def settings(options: Options) -> Settings:
+    """Open a sequence and settle its configuration."""
+    from datasets.registry import open_sequence
+    from pipeline.flow import unread
+    from pipeline.commands.input_checks import judge_rig
+
+    read = configuration.read_toml(options.config) if options.config else {}
+    configuration.merge(read, configuration.parse_assignments(options.assignments))
+    for_dataset, for_stages = configuration.split_dataset(read)
+    sequence = open_sequence(options.sequence, for_dataset, hints_folder(locate(options.cache)) / "files.json")
+    doubts = [f"{v.text}: {v.remedy}" for v in judge_rig(sequence.rig) if v.level != "OK"]
+    if doubts and not any("baseline" in line for line in sequence.warnings):
+        sequence = replace(sequence, warnings=(*sequence.warnings, *doubts))
+    vehicle, source = {}, "default rover of the program (neither the sequence nor the user states one)"
+    if sequence.vehicle is not None:
+        vehicle, source = {"vehicle": sequence.vehicle.model_dump()}, f"sequence {sequence.name}"
+    if "vehicle" in for_stages:
+        source = "user"
+    layers = vehicle, configuration.expand(sequence.defaults)
+    config = configuration.build(*layers, for_stages)
+    given = unread.set_by_user(for_stages, config, configuration.build(*layers))
+    return Settings(sequence, config, source, given)
+
+
+def warn(sequence: Sequence) -> None:
+    """Say on stderr what is suspicious but possible in the input."""
+    for line in sequence.warnings:
+        print(f"rille: warning: {' '.join(line.split())}", file=sys.stderr)
+
+
+def warn_of_results(graph: Graph) -> None:
+    """Say on stderr what stages found suspicious, each thing once."""
+    for line in dict.fromkeys(w for h in graph.nodes if h.ref is not None for w in h.ref.meta.get("warnings", ())):
+        print(f"rille: warning: {' '.join(line.split())}", file=sys.stderr)
+
+
+def reconstruct(options: Options) -> int:
+    """Run the whole chain; gives the exit code. Running the same options again resumes."""
+    try:
+        return _reconstruct(options)
+    except (DamagedError, GoneError) as error:  # found when the results were drawn; it is set aside by now
+        print(f"rille: warning: {error.message}; computing it again", file=sys.stderr)
+        return _reconstruct(options)
+
+
+@dataclass(frozen=True)
+class _Opened:
+    """A run that is configured and laid out, with the folder that its results go to."""
+
+    options: Options
+    sequence: Sequence
+    frames: tuple[int, ...]
+    config: Any
+    text: str
+    settled: Settings
+    folder: Path
+    started: datetime
+    versions: dict[str, str]
+    store: Store
+    graph: Graph
+    flow: Any
+    products: Products
+
+    def view(self, **late: Any) -> RunView:
+        """What is drawn; ``late`` is what only the end of the run knows."""
+        from pipeline.export import run_files
+        from pipeline.report import RunView
+
+        return RunView(
+            run_id=self.folder.name,
+            sequence=self.sequence,
+            frames=self.frames,
+            products=self.products,
+            bundle=run_files.bundles(self.store),
+            config=self.config,
+            config_toml=self.text,
+            versions=self.versions,
+            command=self.options.command(),
+            vehicle_source=self.settled.vehicle_source,
+            started=self.started.strftime("%Y-%m-%dT%H:%M:%SZ"),
+            notes=self.sequence.notes,
+            **late,
+        )
+
+    def stamp(self) -> str:
+        """What the files of the run are rendered from, in one word."""
+        from pipeline.runs import unchanged
+
+        facts = {"config": self.text, "frames": self.frames, "vehicle": self.settled.vehicle_source}
+        return unchanged.stamp(self.graph, self.sequence, self.versions, **facts, command=self.options.command())
+
+
+def _reconstruct(options: Options) -> int:
+    opened = _open(options)
+    driven = opened.sequence.simulation is not None
+    with Ahead(opened.folder, lambda: opened.view(tasks=())) as ahead:
+        result = _compute(opened, None if driven else ahead.work)
+        if driven:
+            sequence, frames = opened.flow.taken()
+            opened = replace(opened, sequence=sequence, frames=frames)
+        stamped, earlier = opened.stamp(), opened.folder.parent / "latest"
+        remember()
+        if _stands(options, result, earlier, stamped):
+            shutil.rmtree(opened.folder)
+            warn_of_results(opened.graph)
+            cached = result.total().cached
+            arrived = _outcome(opened)
+            print(f"{earlier.parent / earlier.readlink()}  cached {cached}, nothing new: that run stands")
+            return max(arrived, _posed_all(opened.products), _all_read(opened, arrived))
+        _write(opened, result, ahead)
+    if result.ok:
+        from pipeline.runs import unchanged
+
+        unchanged.seal(opened.folder, stamped)
+    _point_latest(opened.folder)
+    warn_of_results(opened.graph)
+    arrived = _outcome(opened)
+    total = result.total()
+    print(f"{opened.folder}  computed {total.computed}, cached {total.cached}, missing {total.failed + total.skipped}")
+    if result.ok:
+        return max(arrived, _posed_all(opened.products), _all_read(opened, arrived))
+    _list_missing(opened.graph, opened.folder)
+    return HOLES
+
+
+def _open(options: Options) -> _Opened:
+    """Read the input and lay the run out."""
+    from pipeline.flow import unread
+    from pipeline.flow.closed_loop import dataflow
+
+    check_options(options)
+    started = datetime.now(UTC)
+    settled = settings(options)
+    sequence, config = settled.sequence, settled.config
+    unread.refuse_unreadable(settled.given, config, sequence)
+    warn(sequence)
+    if options.verb == "drive" and sequence.simulation is None:
+        raise ConfigError("RIL-059", f"{sequence.name} is recorded, it cannot be driven", remedy="drive mockup-loop")
+    frames = choose_frames(options.frames, sequence.frames)
+    text = _header(options) + configuration.to_toml(config, sequence.parameters)
+    folder = _make_folder(options.runs / sequence.name, started, text + repr(frames))
+    (folder / "config.toml").write_text(text, encoding="utf-8")
+    graph, store = Graph(), at(options.cache)
+    flow = dataflow(graph, sequence, config, frames)
+    return _Opened(
+        options, sequence, frames, config, text, settled, folder, started, _versions(), store, graph, flow,
+        flow.build(),
+    )  # fmt: skip
+
+
+def _compute(opened: _Opened, meanwhile: Callable[[], None] | None) -> Result:
+    """Bring every task to its artifact; raise the first failure unless the data are its cause and poses are there."""
+    from pipeline.engine import scheduler, progress
+    from pipeline.engine.memory import limits
+    from pipeline.runs import roots
+
+    options = opened.options
+    roots.note(opened.store, options.runs)
+    result = scheduler.run(
+        opened.graph,
+        opened.store,
+        executor=options.executor,
+        jobs=options.jobs,
+        keep_going=options.keep_going,
+        force=options.force,
+        ledger=opened.folder / "ledger.jsonl",
+        progress=progress.make(options.progress),
+        memory_limit=None if options.memory_limit is None else limits.parse(options.memory_limit),
+        survey=lambda: lay_out(opened.sequence, opened.config, opened.frames),
+        meanwhile=meanwhile,
+    )
+    trajectory = opened.products.trajectory
+    if not options.keep_going:
+        result.check(holes=opened.sequence.simulation is not None or (trajectory is not None and trajectory.done))
+    return result
+
+
+def _stands(options: Options, result: Result, earlier: Path, stamped: str) -> bool:
+    from pipeline.runs import unchanged
+
+    return result.ok and not result.total().computed and not options.fresh and unchanged.stands(earlier, stamped)
+
+
+def _write(opened: _Opened, result: Result, ahead: Ahead) -> None:
+    """Everything that the run leaves; nothing of it where an artifact was found damaged."""
+    from pipeline.engine import events
+    from pipeline.export import run_files
+
+    if not (opened.folder / "config.toml").exists():
+        raise RilleError(
+            "RIL-740",
+            f"{opened.folder} was removed while the run was under way",
+            remedy="run again: what was computed is in the cache",
+        )
+    whole = opened.view(tasks=run_files.task_rows(opened.graph, opened.store), seconds=result.seconds)
+    try:
+        run_files.write(opened.folder, whole, ahead.take())
+        total = (datetime.now(UTC) - opened.started).total_seconds()
+        events.add_facts(opened.folder / "ledger.jsonl", total=total)
+    except (DamagedError, GoneError):
+        shutil.rmtree(opened.folder)
+        raise
+
+
+def lay_out(sequence: Sequence, config: Any, frames: tuple[int, ...]) -> Graph:
+    """The graph of a reconstruction as far as it is known beforehand."""
+    from pipeline.flow.closed_loop import dataflow
+
+    graph = Graph()
+    dataflow(graph, sequence, config, frames).build()
+    return graph
+
+
+def _outcome(opened: _Opened) -> int:
+    """Say how a drive ended; the exit code, which is that of a run with holes where it did not reach its goal."""
+    if opened.sequence.simulation is None:
+        return COMPLETE
+    outcome, stops = opened.flow.outcome(), opened.flow.driven.stops
+    print(f"{': '.join(word for word in outcome if word)}  ({len(stops)} stops)")
+    return COMPLETE if outcome[0] == "goal" else HOLES
+
+
+def _posed_all(products: Products) -> int:
+    """Exit code of a run without failures: frames without a pose in the world are holes, too, and said on stderr."""
+    handle = products.trajectory
+    if handle is None or handle.ref is None:
+        return COMPLETE
+    meta = handle.ref.meta
+    posed, total = meta["posed"], len(meta["frames"])
+    if meta["in_world"] == total:
+        return COMPLETE
+    pieces = f", {meta['in_world']} in the world, in {len(meta['pieces'])} pieces" if posed > meta["in_world"] else ""
+    print(f"rille: incomplete: {posed} of {total} frames posed{pieces}; see the warnings", file=sys.stderr)
+    return HOLES
+
+
+def _all_read(opened: _Opened, arrived: int) -> int:
+    """Exit code of a run that came to its end: a parameter that no task of it read is an error, and named."""
+    from pipeline.flow import unread
+
+    if arrived != COMPLETE:
+        return COMPLETE
+    lost = unread.unread(opened.settled.given, opened.config, opened.graph)
+    if lost:
+        told = f"{unread.values(lost, opened.config)}: no task of this run read it"
+        print(f"rille: error RIL-732: {told}: {unread.remedy(lost, opened.config)}", file=sys.stderr)
+    idle = sorted(opened.options.force - {h.stage for h in opened.graph.nodes})
+    if idle:
+        told = f"--force {', '.join(idle)}: this run has no such task: leave it out"
+        print(f"rille: error RIL-735: {told}", file=sys.stderr)
+    return HOLES if lost or idle else COMPLETE
+
+
+def check_options(options: Options) -> None:
+    """Refuse a stage, an executor or an amount that cannot be, before anything is read or written."""
+    from pipeline.engine.memory import limits
+    from pipeline.engine.executors.base import known
+
+    _known_stages(options.force)
+    known(options.executor, options.jobs)
+    if options.memory_limit is not None:
+        limits.parse(options.memory_limit)
+
+
+def _known_stages(names: frozenset[str]) -> None:
+    """Refuse a stage to be forced that there is not."""
+    if not names:
+        return
+    known = configuration.stage_names()
+    for name in sorted(names - known):
+        raise ConfigError("RIL-060", f"--force {name!r} is no stage", remedy=f"one of {', '.join(sorted(known))}")
+
+
+def _header(options: Options) -> str:
+    return f"# {options.command()}\n# rille reconstruct SEQ --config THIS_FILE uses the same parameters.\n\n"
+
+
+def _make_folder(parent: Path, started: datetime, plan: str) -> Path:
+    """New folder named by time and a short digest of the plan."""
+    latest = parent / "latest"
+    if latest.exists() and not latest.is_symlink():
+        raise ConfigError(
+            "RIL-765", f"{latest} is no link to a run", remedy="move it away, or choose another --runs folder"
+        )
+    name = f"{started:%Y%m%dT%H%M%SZ}-{hashlib.sha256(plan.encode()).hexdigest()[:8]}"
+    for suffix in ["", *(f"-{i}" for i in range(2, 100))]:
+        folder = parent / (name + suffix)
+        try:
+            folder.mkdir(parents=True)
+        except FileExistsError:
+            continue
+        except OSError as error:
+            raise RilleError(
+                "RIL-061", f"cannot make {folder}: {error.strerror}", remedy="choose another --runs folder"
+            ) from error
+        return folder
+    raise RilleError("RIL-062", f"too many runs named {name}", remedy="remove some, or wait a second")
+
+
+def _point_latest(folder: Path) -> None:
+    """Move ``latest`` to a finished run in one step."""
+    link = folder.parent / f".latest-{os.getpid()}"
+    link.symlink_to(folder.name, target_is_directory=True)
+    link.replace(folder.parent / "latest")
+
+
+def _list_missing(graph: Graph, folder: Path) -> None:
+    """Say on stderr what is missing and why: failures in full, what was skipped for them counted."""
+    failed = [h for h in graph.nodes if h.status == "failed"]
+    skipped = [h for h in graph.nodes if h.status == "skipped"]
+    for h in failed:
+        print(f"rille: missing {h.label}: {' '.join(str(h.error).split())}", file=sys.stderr)
+    print(f"rille: {len(failed)} failed, {len(skipped)} left out; ledger: {folder / 'ledger.jsonl'}", file=sys.stderr)
+
+
+def _versions() -> dict[str, str]:
+    from importlib.metadata import version
+
+    python = ".".join(str(v) for v in sys.version_info[:3])
+    return {"python": python} | {name: version(name) for name in DISTRIBUTIONS}
+
+
+def export_dataset(name: str, directory: Path, assignments: tuple[str, ...], cache: Location) -> int:
+    """Write a built-in sequence as plain files; rendering is cached like any other work."""
+    from datasets.export import export
+    from datasets.protocol import Source
+    from datasets.registry import open_sequence
+    from pipeline.engine.task import Ref, Spec, ensure
+
+    for_dataset, others = configuration.split_dataset(configuration.parse_assignments(assignments))
+    if others:
+        raise ConfigError(
+            "RIL-063", f"--set {next(iter(others))}: not a section of a sequence", remedy="set mockup.key=value"
+        )
+    store = at(cache)
+
+    def materialise(source: Source) -> Bundle:
+        return store.open(artifact(source))
+
+    def artifact(source: Source) -> Ref:
+        refs = {port: artifact(upstream) for port, upstream in source.inputs.items()}
+        label = source.module.rsplit(".", 1)[-1]
+        return ensure(cache, Spec(source.module, label, source.params, source.args, source.hints), refs).ref
+
+    print(export(open_sequence(name, for_dataset), directory, materialise))
+    return COMPLETE
+
+
+def verify_cache(cache: Location, *, deep: bool = False) -> int:
+    """Compare checksums of all artifacts; exit code 1 where one is damaged."""
+    from pipeline.engine.store.maintenance import verify
+
+    sound, damaged = verify(at(cache), deep=deep)
+    for found in damaged:
+        print(f"rille: {found.label or found.key[:12]} ({found.stage}): {found.reason}; set aside", file=sys.stderr)
+    print(f"{sound} artifacts are sound, {len(damaged)} damaged")
+    return FAILED if damaged else COMPLETE
+
+
+def collect_garbage(cache: Location, runs: Path, *, dry_run: bool) -> int:
+    """Remove what no run in ``runs``, or in a folder that the cache knows, and no pinned run refers to.
+
+    A dry run says what that is.
+    """
+    from pipeline.engine import events
+    from pipeline.runs import pins, roots
+    from pipeline.engine.store import maintenance
+    from pipeline.engine.memory.limits import words
+
+    store = at(cache)
+    roots.check_all_seen(store)
+    kept = pins.keys(store)
+    for folder in roots.folders(store, runs):
+        for path in sorted(folder.glob("*/*/ledger.jsonl")):
+            kept |= events.keys(path)
+    if not kept:
+        raise ConfigError(
+            "RIL-744",
+            f"no run is known that uses the cache {cache}: all of it would go",
+            remedy="give the folder of your runs with --runs, or remove the cache yourself",
+        )
+    cleared = maintenance.gc(store, kept, dry_run=dry_run)
+    if dry_run:
+        for stage, (count, amount) in sorted(cleared.stages.items(), key=lambda item: -item[1][1]):
+            print(f"{stage:18s} {count:6d} {words(amount):>8s}")
+    verb = "would remove" if dry_run else "removed"
+    print(f"{verb} {cleared.artifacts} artifacts and {cleared.orphans} leftovers, {cleared.bytes / 2**20:.1f} MiB")
+    return COMPLETE
+
+
+def pin(cache: Location, text: str, runs: Path) -> int:
+    """Keep the artifacts of a run."""
+    from pipeline.runs import pins
+    from pipeline.runs import lookup as kept
+
+    run = kept.find(text, runs)
+    print(f"pinned {kept.name(run)}: {pins.pin(at(cache), run)} artifacts")
+    return COMPLETE
+
+
+def unpin(cache: Location, text: str) -> int:
+    """Keep them no longer."""
+    from pipeline.runs import pins
+
+    print(f"unpinned {pins.unpin(at(cache), text)}")
+    return COMPLETE

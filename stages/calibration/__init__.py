@@ -1,0 +1,1 @@
+"""How the two cameras stand and what they are: orientation, rig, lens targets, swapped sides."""

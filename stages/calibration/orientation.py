@@ -1,0 +1,174 @@
+"""Relative orientation of one stereo pair from its own correspondences (paper, section 5.2.2).
+
+The right camera's rotation and the direction of the baseline are adjusted to the disparity with the baseline's length
+held fixed, as far as the images of this one pair observe them (:mod:`stages.calibration.parameter_selection`). Dense
+matches are thinned first, for neighbours share their windows and so their errors; the thinned ones go on to the stage
+``rig``, which decides for the sequence.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
+from pydantic import Field
+
+from stages.calibration.parameter_selection import Decision, RelativeParams, decide
+from stages.calibration.relative_orientation import LEAST_MATCHES, RIG, Matches, rms
+from stages.core.declare import AnyArray, Array, Bundle, Inputs, Stage
+from stages.core.errors import InputError
+from stages.core.validity import matched
+from stages.geometry.epipolar import corrected, distances
+from stages.geometry.geometry import Rig
+
+Floats = NDArray[np.float64]
+
+
+class OrientationParams(RelativeParams):
+    """Parameters of the stage ``orientation``."""
+
+    samples: int = Field(
+        1500,
+        ge=100,
+        le=100_000,
+        description="cells that the left image is parted into; the best match of each is used. At some 20 px their "
+        "errors are nearly independent",
+    )
+
+
+def thin(
+    column: ArrayLike, row: ArrayLike, usable: NDArray[np.bool_], quality: ArrayLike, samples: int
+) -> tuple[Floats, Floats]:
+    """The best match of each square cell of the left image: points (n, 2), column and row, left and right.
+
+    Parameters
+    ----------
+    column, row : (rows, cols) disparity, right minus left, pixels.
+    usable : (rows, cols) pixels with a measured disparity.
+    quality : (rows, cols) error of matching there and back, pixels; the least counts as best, NaN as worst.
+    samples : number of cells.
+    """
+    u, v = np.asarray(column), np.asarray(row)
+    side = max(1, round(math.sqrt(usable.size / samples)))
+    best = _best_of_cells(usable, np.asarray(quality), side)
+    r, c = np.divmod(best[best >= 0], usable.shape[1])
+    left = np.stack([c, r], axis=-1).astype(np.float64)
+    return left, left + np.stack([u[r, c], v[r, c]], axis=-1).astype(np.float64)
+
+
+@njit(cache=True, nogil=True)
+def _best_of_cells(usable, quality, side):  # type: ignore[no-untyped-def]
+    """Flat index of the usable pixel of least error in each cell, the first of equals; -1 none. Cells in order."""
+    rows, cols = usable.shape
+    across = cols // side + 1
+    best = np.full((rows // side + 1) * across, -1, np.int64)
+    least = np.empty(len(best))
+    for r in range(rows):
+        for c in range(cols):
+            if not usable[r, c]:
+                continue
+            cell = (r // side) * across + c // side
+            error = quality[r, c]
+            if error != error:
+                error = np.inf
+            if best[cell] < 0 or error < least[cell]:
+                best[cell], least[cell] = r * cols + c, error
+    return best
+
+
+def orient(rig: Rig, matches: Matches, params: RelativeParams) -> tuple[dict[str, AnyArray], dict[str, Any]]:
+    """Residuals before and after, and facts of one pair's orientation; see the stage's outputs.
+
+    Returns
+    -------
+    arrays : ``residual_before``, ``residual_after`` (pixels), ``weight`` (n,) float32.
+    facts : ``matches``; ``parameters``, one mapping a parameter (name, value, asked, sigma, unit, observed, freed,
+        why); ``row_offset`` (pixels) and ``roll_deg`` by which the images contradict the given rig; ``words``;
+        ``residual_before_px``, ``residual_after_px`` (RMS) and ``median_before_px``, ``median_after_px``, inliers.
+    """
+    count = len(matches.left)
+    before, _ = distances(rig, np.zeros(RIG), matches.left, matches.right)
+    if count < LEAST_MATCHES:
+        words = f"not checked: {count} matches are fewer than {LEAST_MATCHES}"
+        weight = np.zeros(count)
+        return _arrays(before, before, weight), {"matches": count, "parameters": [], "words": words}
+    decision = decide(rig, [matches], params)
+    weight = decision.fit.weights[0]
+    after, _ = distances(corrected(rig, decision.correction), np.zeros(RIG), matches.left, matches.right)
+    inlier = weight > 0
+    facts = {
+        "matches": count,
+        "outliers": int(np.count_nonzero(~inlier)),
+        "parameters": [p.to_dict() for p in decision.parameters],
+        "row_offset": float(np.median(before[inlier])),
+        "roll_deg": math.degrees(decision.parameters[2].asked),
+        "words": misalignment(float(np.median(before[inlier])), decision),
+        "residual_before_px": rms(before, weight),
+        "residual_after_px": rms(after, weight),
+        "median_before_px": float(np.median(np.abs(before[inlier]))),
+        "median_after_px": float(np.median(np.abs(after[inlier]))),
+    }
+    return _arrays(before, after, weight), facts
+
+
+def misalignment(offset: float, decision: Decision) -> str:
+    """How the right image lies against the given rig: row offset (pixels), and what was freed, in words."""
+    parts = [f"rows of the right image lie {abs(offset):.2f} px too {'low' if offset > 0 else 'high'}"]
+    for p in decision.parameters:
+        degrees = math.degrees(p.value)
+        if p.freed and p.name == "roll":
+            parts.append(f"it is turned by {abs(degrees):.2f} degrees {'' if degrees > 0 else 'anti'}clockwise")
+        elif p.freed and p.name != "pitch":
+            parts.append(f"{p.name.replace('_', ' ')} is off by {degrees:+.2f} degrees")
+    return ", ".join(parts)
+
+
+def _arrays(before: Floats, after: Floats, weight: Floats) -> dict[str, AnyArray]:
+    named = {"residual_before": before, "residual_after": after, "weight": weight}
+    return {name: values.astype(np.float32) for name, values in named.items()}
+
+
+def _run(params: OrientationParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+    rig, disparity = Rig.from_dict(args["rig"]), inputs["disparity"]
+    if not rig.baseline > 0:
+        raise InputError(
+            "RIL-402", "the rig's baseline is 0 m", remedy="give T_right_left with a translation in metres"
+        )
+    usable = matched(np.asarray(disparity["validity"]))
+    if usable.shape != (rig.left.height, rig.left.width):
+        raise InputError(
+            "RIL-403",
+            f"the disparity is {usable.shape}, the left camera's image {(rig.left.height, rig.left.width)}",
+            remedy="give the camera's width and height as the images have them",
+        )
+    left, right = thin(
+        disparity["column_disparity"], disparity["row_disparity"], usable, disparity["backmatch_error"], params.samples
+    )
+    # what the stage rig will read, to the last bit
+    points = {"left": left.astype(np.float32), "right": right.astype(np.float32)}
+    pair = int(args["pair"])
+    matches = Matches(pair, points["left"].astype(np.float64), points["right"].astype(np.float64))
+    arrays, facts = orient(rig, matches, params)
+    return Bundle(points | arrays, {"pair": pair} | facts)
+
+
+_MATCH = ("match",)
+STAGE = Stage(
+    name="orientation",
+    version=1,
+    summary="relative orientation of the right camera from one pair's disparity",
+    params=OrientationParams,
+    inputs=("disparity",),
+    outputs=(
+        Array("left", ("match", "axis"), "float32", "px", "column and row in the left image", "", "left image"),
+        Array("right", ("match", "axis"), "float32", "px", "column and row in the right image", "", "right image"),
+        Array("residual_before", _MATCH, "float32", "px", "signed distance from the epipolar line, given rig"),
+        Array("residual_after", _MATCH, "float32", "px", "the same, rig adjusted to this pair"),
+        Array("weight", _MATCH, "float32", "1", "robust weight in the adjustment, 0 = outlier"),
+    ),
+    run=_run,
+)

@@ -1,0 +1,307 @@
+"""What of a rig the images may change: only what they observe, what they contradict, and what is worth it.
+
+A low epipolar residual does not show a right rig: toe-in of a parallel rig moves rows like a principal point that is a
+few pixels off, and a fit that frees it trades an honest residual for wrong depth. So a parameter is freed only if
+
+1. it is *observed*: with every other explanation allowed for (:mod:`stages.calibration.relative_orientation`), what
+remains unknown of it
+   costs little depth, or matches beyond infinity show that depth is wrong, and it explains them;
+2. it is *contradicted*: it differs from the calibration by several of its sigmas, and a principal point that is off is
+   not the likelier reason: that it is where a single angle departs and the others are as they were;
+3. it is *worth it*: the change moves rows, or depth, by more than a good calibration is out anyway.
+
+All others stay exactly as given. Angles are asked for before the baseline's direction: mounts turn, they do not shift.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from stages.calibration.relative_orientation import (
+    RIG,
+    Beliefs,
+    Fit,
+    Linear,
+    Matches,
+    adjust,
+    considered,
+    linearised,
+    settle,
+    solution,
+)
+from stages.core.declare import Params
+from stages.geometry.epipolar import NAMES, beyond_infinity, corrected, depth_sensitivity, distances
+from stages.geometry.geometry import Rig
+
+Floats = NDArray[np.float64]
+
+ANGLES = 3
+
+UNLIKELY = 2.0
+"""Sigmas at which a principal point that is off does no longer explain what an angle would."""
+
+BEYOND = 1.0
+BEYOND_SHARE = 0.1
+"""Share of matches more than ``BEYOND`` pixels beyond infinity that shows wrong depth; in the sky there are fewer."""
+
+BEYOND_LEFT = 0.03
+"""Share of them that may remain with what explains the others."""
+
+ROUNDS = 3
+
+
+class RelativeParams(Params):
+    """When a parameter of the rig may depart from the calibration."""
+
+    significance: float = Field(
+        4.0, ge=1, description="sigmas; the images contradict a value that they find so far away (systematic errors in)"
+    )
+    max_depth_error: float = Field(
+        0.03,
+        gt=0,
+        description="relative; a parameter is observed if its uncertainty costs less depth than this: well below what "
+        "a wrong toe-in does to a parallel rig (10 % and more), above what a convergent one leaves (1-2 %)",
+    )
+    least_rows: float = Field(
+        0.4,
+        ge=0,
+        description="pixels RMS; a change is worth it if it moves rows so far (KITTI's calibration is as near)",
+    )
+    least_depth: float = Field(0.005, ge=0, description="relative; a change is worth it, too, if it moves depth so far")
+    prior_rotation_deg: float = Field(
+        0.05, gt=0, description="degrees; error of each angle of a calibration that is intact"
+    )
+    prior_baseline_deg: float = Field(
+        0.2, gt=0, description="degrees; error of the baseline's direction of a calibration that is intact"
+    )
+    prior_principal: float = Field(
+        0.005,
+        gt=0,
+        description="share of the focal length; error of the principal point, usual for a calibration by a board. A "
+        "smaller figure lets more toe-in be seen",
+    )
+    systematic: float = Field(
+        0.1,
+        gt=0,
+        le=10,
+        description="pixels, RMS over the image; smooth row error that no rig explains and no number of matches "
+        "averages out: what lens model and rectification leave",
+    )
+
+    def beliefs(self, rig: Rig) -> Beliefs:
+        """The same in radians and pixels."""
+        return Beliefs(
+            math.radians(self.prior_rotation_deg),
+            math.radians(self.prior_baseline_deg),
+            self.prior_principal * rig.right.fx,
+            self.systematic,
+        )
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One parameter of the rig: its correction and sigma (radians), whether it was freed, and why or why not.
+
+    ``value`` is what is applied: 0 where held. ``asked`` is what the images alone ask for, ``sigma`` the error of that
+    figure: the error of ``value``, if it is free.
+    """
+
+    name: str
+    value: float
+    asked: float
+    sigma: float
+    observed: bool
+    freed: bool
+    why: str
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON form, in degrees."""
+        return {
+            "name": self.name,
+            "value": math.degrees(self.value),
+            "asked": math.degrees(self.asked),
+            "sigma": math.degrees(self.sigma),
+            "unit": "deg",
+            "observed": self.observed,
+            "freed": self.freed,
+            "why": self.why,
+        }
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What the images change: ``correction`` (5,) radians, the parameters in order, and the fit behind it.
+
+    ``start``: of each pair, what fits to it begin with.
+    """
+
+    correction: Floats
+    parameters: tuple[Parameter, ...]
+    fit: Fit
+    start: tuple[Linear, ...] = ()
+
+    @property
+    def changed(self) -> bool:
+        """Whether anything departs from the calibration."""
+        return bool(np.any(self.correction))
+
+    def free(self) -> list[bool]:
+        """Which parameters were freed."""
+        return [p.freed for p in self.parameters]
+
+
+def decide(rig: Rig, pairs: Sequence[Matches], params: RelativeParams) -> Decision:
+    """Which parameters of a rig the pairs change, and by how much."""
+    return _Chooser(rig, pairs, params).decision()
+
+
+class _Chooser:
+    """Chooses on the quadratic that a fit with everything free leaves, then fits once more with the chosen."""
+
+    def __init__(self, rig: Rig, pairs: Sequence[Matches], params: RelativeParams) -> None:
+        self.rig, self.pairs, self.params, self.beliefs = rig, pairs, params, params.beliefs(rig)
+        self.start = linearised(rig, pairs)
+        self.all = adjust(rig, pairs, [True] * RIG, self.beliefs, rival=True, start=self.start)
+        self.solved: dict[tuple[frozenset[int], bool], tuple[Floats, Floats, float]] = {}
+        near = corrected(rig, self.all.x[:RIG])
+        self.depth = np.mean([depth_sensitivity(near, m.left, m.right) for m in pairs], axis=0)
+        self.impossible = impossible_share(rig, pairs, self.all) > BEYOND_SHARE
+        self.rows = row_sensitivity(rig, pairs)
+
+    def decision(self) -> Decision:
+        chosen: list[int] = []
+        for _ in range(ROUNDS):  # what came first may be explained by what came later, and the other way round
+            before = sorted(chosen)
+            self._add(chosen, range(ANGLES))
+            self._add(chosen, range(ANGLES, RIG))
+            for i in sorted(chosen):
+                others = [k for k in chosen if k != i]
+                if self._refusal(i, others) is not None:
+                    chosen = others
+            if sorted(chosen) == before:
+                break
+        fit, correction = self._settled(chosen)
+        if chosen and not self._worth(correction):  # what was asked for singly may come to nothing together
+            chosen = []
+            fit, correction = self._settled(chosen)
+        parameters = tuple(self._parameter(i, chosen, fit) for i in range(RIG))
+        return Decision(correction, parameters, fit, tuple(self.start))
+
+    def _settled(self, chosen: Sequence[int]) -> tuple[Fit, Floats]:
+        """The fit with the chosen parameters free, and their correction (5,)."""
+        free = [i in chosen for i in range(RIG)]
+        fit = settle(self.rig, self.pairs, free, self.beliefs, self.start)
+        return fit, np.where(free, fit.x[:RIG], 0.0)
+
+    def _worth(self, correction: Floats) -> bool:
+        """Whether a correction (5,) moves rows or depth by more than a good calibration is out anyway."""
+        rows = float(np.max(np.abs(correction) * self.rows))
+        depth = math.sqrt(float(correction @ self.depth @ correction))
+        return self.impossible or rows >= self.params.least_rows or depth >= self.params.least_depth
+
+    def _add(self, chosen: list[int], group: Sequence[int]) -> None:
+        """Take up what the images change most, one after the other."""
+        while True:
+            able = [i for i in group if i not in chosen and self._refusal(i, chosen) is None]
+            if not able:
+                return
+            chosen.append(max(able, key=lambda i: self._gain(i, chosen)))
+
+    def _solve(self, chosen: Sequence[int], *, rival: bool) -> tuple[Floats, Floats, float]:
+        key = frozenset(chosen), rival
+        if key not in self.solved:
+            self.solved[key] = solution(self.all, [i in chosen for i in range(RIG)], self.beliefs, rival=rival)
+        return self.solved[key]
+
+    def _gain(self, i: int, chosen: list[int]) -> float:
+        return self._solve([*chosen, i], rival=False)[2]
+
+    def _depth_error(self, i: int, chosen: list[int]) -> float:
+        """Relative depth error that a parameter's uncertainty makes, principal point unknown."""
+        covariance = self._solve([*chosen, i], rival=True)[1]
+        return math.sqrt(float(self.depth[i, i] * covariance[i, i]))
+
+    def _knocked(self, i: int, chosen: list[int]) -> bool:
+        """Whether it was a turn: other angles changed, too, or the principal point cannot have made the difference."""
+        if self.impossible or any(k != i for k in chosen if k < ANGLES):
+            return True
+        x, covariance, _ = self._solve([*chosen, i], rival=True)
+        return abs(float(x[i])) >= UNLIKELY * math.sqrt(float(covariance[i, i]))
+
+    def _infinity(self, i: int, chosen: list[int]) -> bool:
+        """Whether many matches lie beyond infinity, so that depth is surely wrong, and this parameter explains them."""
+        if not self.impossible:
+            return False
+        x, _, _ = self._solve([*chosen, i], rival=False)
+        free = np.isin(np.arange(RIG), [*chosen, i])
+        return impossible_share(corrected(self.rig, np.where(free, x[:RIG], 0.0)), self.pairs, self.all) < BEYOND_LEFT
+
+    def _estimate(self, i: int, chosen: list[int]) -> tuple[float, float]:
+        """Value and sigma of a parameter if it were free with the chosen ones, cameras as given."""
+        x, covariance, _ = self._solve([*chosen, i], rival=False)
+        return float(x[i]), math.sqrt(float(covariance[i, i]))
+
+    def _refusal(self, i: int, chosen: list[int]) -> str | None:
+        """Why a parameter is held; None where it is to be freed."""
+        p = self.params
+        value, sigma = self._estimate(i, chosen)
+        rows, depth = abs(value) * self.rows[i], abs(value) * math.sqrt(float(self.depth[i, i]))
+        found = f"{math.degrees(value):+.3f} +- {math.degrees(sigma):.3f} degrees"
+        error = self._depth_error(i, chosen)
+        if error > p.max_depth_error and not self._infinity(i, chosen):
+            return (
+                f"not observed: a principal point that is {self.beliefs.principal:.1f} px off looks like it, so that "
+                f"{100 * error:.1f} % of depth would stay unknown; taken alone the images ask for {found}, "
+                f"which is {100 * depth:.1f} % of depth"
+            )
+        if abs(value) < p.significance * sigma:
+            return f"not contradicted: the images say {found}"
+        if not self._knocked(i, chosen):
+            return (
+                f"likelier a principal point that is off, with the right depth, for no other angle departs: the images "
+                f"say {found}, which is {100 * depth:.1f} % of depth"
+            )
+        if rows < p.least_rows and depth < p.least_depth:
+            return f"not worth it: the images say {found}, which moves rows by {rows:.2f} px, depth by {depth:.2%}"
+        return None
+
+    def _held(self, chosen: list[int]) -> Floats:
+        """How far (5,) the held parameters may be out, radians: as believed, or less where the images show it."""
+        shown = [math.hypot(*self._estimate(i, chosen)) for i in range(RIG)]
+        return np.minimum(self.beliefs.held(), shown)
+
+    def _parameter(self, i: int, chosen: list[int], fit: Fit) -> Parameter:
+        others = [k for k in chosen if k != i]
+        observed = self._depth_error(i, others) <= self.params.max_depth_error or i in chosen
+        if i not in chosen:
+            value, sigma = self._estimate(i, chosen)
+            why = self._refusal(i, chosen) or "not worth it: with the others it moves rows and depth by too little"
+            return Parameter(NAMES[i], 0.0, value, sigma, observed, False, why)
+        free = [k in chosen for k in range(RIG)]
+        sigma = math.sqrt(float(considered(fit, free, self.beliefs, self.all.smooth, self._held(chosen))[i, i]))
+        value = float(fit.x[i])
+        asked, certain = self._estimate(i, others)
+        why = (
+            f"contradicted by {abs(asked) / certain:.0f} sigmas: it moves rows by {abs(value) * self.rows[i]:.2f} px, "
+            f"depth by {abs(value) * math.sqrt(float(self.depth[i, i])):.2%}"
+        )
+        return Parameter(NAMES[i], value, value, sigma, observed, True, why)
+
+
+def impossible_share(rig: Rig, pairs: Sequence[Matches], fit: Fit) -> float:
+    """Share of the matches, outliers aside, that lie beyond infinity."""
+    beyond = np.concatenate([beyond_infinity(rig, m.left, m.right) for m in pairs])
+    return float(np.mean(beyond[np.concatenate(fit.weights) > 0] > BEYOND))
+
+
+def row_sensitivity(rig: Rig, pairs: Sequence[Matches]) -> Floats:
+    """Pixels RMS (5,) that matches move across their lines for a radian of each parameter."""
+    squares = [np.mean(distances(rig, np.zeros(RIG), m.left, m.right)[1] ** 2, axis=0) for m in pairs]
+    return np.asarray(np.sqrt(np.mean(squares, axis=0)), dtype=np.float64)

@@ -1,0 +1,293 @@
+"""Robust adjustment of a rig to correspondences of one or several pairs, with what no rig explains beside it.
+
+Beside the five parameters of the rig (:mod:`stages.geometry.epipolar`) the images hold errors that no number of
+matches averages out, and a fit without them claims a precision it does not have. They are estimated with a prior and
+then dropped:
+
+* ``principal``: the right principal point is off, and the calibration's rotation made up for it, so that the disparity
+  at infinity is right. On a parallel rig its rows look like toe-in, though the depth is right: without it a fit
+  "repairs" the toe-in of a sound calibration. Only a rig that converges (or a wide angle) can tell the two apart;
+* ``smooth``: a low polynomial of the row over the image: what lens model and rectification leave.
+
+Both are the same in all pairs. The noise of the matches is measured, pair by pair, with its correlation between
+neighbours. Weights are Tukey's, narrowed from the scatter about the given rig.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.calibration import relative_orientation_kernel
+from stages.geometry.epipolar import NAMES, distances, normals
+from stages.geometry.geometry import Rig
+
+Floats = NDArray[np.float64]
+
+RIG = len(NAMES)
+PRINCIPAL = 2
+DEGREE = 3
+TERMS = tuple((i, j) for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i))
+"""Degrees of the column and the row of the smooth error's polynomials."""
+
+SIZE = RIG + PRINCIPAL + len(TERMS)
+SMOOTH = slice(RIG + PRINCIPAL, SIZE)
+
+PARTNERS = ((NAMES.index("yaw"), 0), (NAMES.index("pitch"), 1))
+"""Angles, and the coordinate of the principal point that looks like each."""
+
+NO_SHIFT = 1e-3
+"""Pixels: deviation of a principal point that is taken as given."""
+
+EXACT = 1e-7
+"""Radians: deviation of a parameter that is held exactly."""
+
+LEAST_SMOOTH = 1e-3
+"""Pixels: deviation of a term of the smooth error, at least."""
+
+LEAST_MATCHES = 50
+LEAST_NOISE = 0.02
+"""Pixels: no match is better."""
+
+TUKEY = 4.685
+BLOCKS = 6
+"""Blocks along either side of the image whose means show how far errors of neighbours go together."""
+
+ITERATIONS = 30
+INNER = 10
+"""Rounds for the smooth error's size between two passes over the matches."""
+LINEAR = 1e-3
+"""Radians: corrections nearer than this share their derivatives; what is left out is below a thousandth of a pixel."""
+CONVERGED = 1e-2
+"""Share of a parameter's sigma."""
+
+
+@dataclass(frozen=True)
+class Matches:
+    """Corresponding points (n, 2) of one pair: column and row in the left and in the right image, pixels."""
+
+    pair: int
+    left: Floats
+    right: Floats
+
+
+@dataclass(frozen=True)
+class Beliefs:
+    """Deviations that the calibration is believed to have.
+
+    ``rotation``, ``baseline`` (radians): of an intact calibration's three angles and of its baseline's direction.
+    ``principal``: pixels, of the principal point. ``systematic``: pixels, RMS of the smooth error, at least.
+    """
+
+    rotation: float
+    baseline: float
+    principal: float
+    systematic: float
+
+    def held(self) -> Floats:
+        """Deviations (5,) of the rig's parameters, radians."""
+        return np.array([self.rotation] * 3 + [self.baseline] * 2)
+
+    @property
+    def term(self) -> float:
+        """Deviation of each term of the smooth error, pixels."""
+        return self.systematic / math.sqrt(len(TERMS))
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Result of :func:`adjust`.
+
+    ``x`` (SIZE,): the five corrections (radians), principal point (2, pixels), smooth error (pixels). ``normal`` and
+    ``pull``: the data's part of the normal equations ``normal @ x = pull``, linear about ``x``. ``smooth``: deviation
+    of each term of the smooth error, pixels. ``noise``: of each pair's matches, pixels. ``weights``: (n,) a pair.
+    """
+
+    x: Floats
+    normal: Floats
+    pull: Floats
+    smooth: float
+    noise: tuple[float, ...]
+    weights: tuple[Floats, ...]
+
+
+@dataclass(frozen=True)
+class Linear:
+    """Distances ``constant + design @ x`` (n,) of one pair, to first order about ``about``; the matches' blocks."""
+
+    constant: Floats
+    design: Floats
+    about: Floats
+    block: NDArray[np.int64]
+
+
+def linearised(rig: Rig, pairs: Sequence[Matches]) -> list[Linear]:
+    """What every fit of a rig to some pairs begins with."""
+    return [_linear(rig, m) for m in pairs]
+
+
+def adjust(
+    rig: Rig,
+    pairs: Sequence[Matches],
+    free: Sequence[bool],
+    beliefs: Beliefs,
+    *,
+    rival: bool,
+    start: list[Linear] | None = None,
+) -> Fit:
+    """Adjust a rig to pairs, everything that no rig explains allowed for.
+
+    ``free`` says which of the five parameters the images alone decide. The others are held by what the calibration is
+    believed to be good for: they take up their share of the error, so that the free ones do not have to. ``rival``: see
+    :func:`precision`. The smooth error's size is estimated, too (expectation maximisation, starting from the belief).
+    ``start``: what :func:`linearised` gives for them, where it is at hand.
+    """
+    prior = precision(free, beliefs, beliefs.term, rival=rival)
+    return _adjust(rig, pairs, prior, beliefs.term, start, estimate=True)
+
+
+def settle(
+    rig: Rig, pairs: Sequence[Matches], free: Sequence[bool], beliefs: Beliefs, start: list[Linear] | None = None
+) -> Fit:
+    """Adjust the free parameters to the smallest residuals of the rig that results.
+
+    In that rig the others are exactly as given and smooth errors stay in the images, so neither takes a share here.
+    """
+    nil = replace(beliefs, rotation=EXACT, baseline=EXACT)
+    prior = precision(free, nil, LEAST_SMOOTH, rival=False)
+    return _adjust(rig, pairs, prior, LEAST_SMOOTH, start, estimate=False)
+
+
+def considered(fit: Fit, free: Sequence[bool], beliefs: Beliefs, smooth: float, held: Floats) -> Floats:
+    """Covariance (5, 5) of a settled fit's free parameters; zero for the others.
+
+    What took no share is an error of the result (a consider covariance: Bierman 1977, chapter 8): held parameters with
+    deviations ``held`` (5,), radians; the smooth error with ``smooth`` pixels a term, but no less than is believed.
+    """
+    prior = precision(free, beliefs, max(beliefs.term, smooth), rival=False)
+    for i in np.flatnonzero(~np.asarray(free)):
+        prior[i, i] = held[i] ** -2.0
+    solved = np.array([*free, *[True] * PRINCIPAL, *[False] * len(TERMS)])
+    inverse = np.linalg.inv(fit.normal[np.ix_(solved, solved)] + prior[np.ix_(solved, solved)])
+    gain = -inverse @ fit.normal[np.ix_(solved, ~solved)]
+    covariance = np.zeros((SIZE, SIZE))
+    covariance[np.ix_(solved, solved)] = inverse + gain @ np.diag(1.0 / np.diag(prior)[~solved]) @ gain.T
+    return np.asarray(covariance[:RIG, :RIG], dtype=np.float64)
+
+
+def _adjust(
+    rig: Rig, pairs: Sequence[Matches], prior: Floats, smooth: float, start: list[Linear] | None, *, estimate: bool
+) -> Fit:
+    """Gauss-Newton with weights from the scatter; ``prior`` matrix, the smooth error's size kept or estimated."""
+    x, scales, linear = np.zeros(SIZE), [np.inf] * len(pairs), linearised(rig, pairs) if start is None else start
+    for _ in range(ITERATIONS):
+        if np.abs(x - linear[0].about)[:RIG].max() > LINEAR:
+            linear = [_linear(rig, m, x, one) for m, one in zip(pairs, linear, strict=True)]
+        parts = [_pair(one, scale, x) for one, scale in zip(linear, scales, strict=True)]
+        scales = [p.noise for p in parts]
+        normal = np.sum([p.normal for p in parts], axis=0)
+        pull = np.sum([p.pull for p in parts], axis=0)
+        last = x
+        x, variance, smooth = _maximised(normal, pull, prior, smooth, INNER if estimate else 0)
+        if bool(np.all(np.abs(x - last)[:RIG] < CONVERGED * np.sqrt(variance[:RIG]))):
+            break
+    return Fit(x, normal, pull, smooth, tuple(scales), tuple(p.weights for p in parts))
+
+
+def _maximised(normal: Floats, pull: Floats, prior: Floats, smooth: float, rounds: int) -> tuple[Floats, Floats, float]:
+    """Unknowns, their variances, and the smooth error's size by so many rounds of expectation maximisation.
+
+    The rounds need the normal equations alone, which took a pass over all matches.
+    """
+    total, terms = normal + prior, np.arange(SIZE)[SMOOTH]
+    for _ in range(rounds + 1):
+        total[terms, terms] = normal[terms, terms] + smooth**-2.0
+        covariance = np.linalg.inv(total)
+        x, variance = covariance @ pull, np.diag(covariance)
+        size = max(LEAST_SMOOTH, float(np.sqrt(np.mean(x[SMOOTH] ** 2 + variance[SMOOTH]))))
+        if rounds == 0 or abs(size - smooth) <= CONVERGED * smooth:
+            break
+        smooth = size
+    return x, variance, smooth
+
+
+def precision(free: Sequence[bool], beliefs: Beliefs, smooth: float, *, rival: bool) -> Floats:
+    """The priors' part (SIZE, SIZE) of the normal matrix.
+
+    ``rival``: a principal point that is off may stand in for a free angle, as it always may for a held one. With it,
+    what is knowable shows; without it, the angle takes all (lenses stay on their cameras when a mount turns).
+    """
+    sigma = np.concatenate(
+        [beliefs.held(), np.full(PRINCIPAL, beliefs.principal), np.full(len(TERMS), smooth)], dtype=np.float64
+    )
+    # Free means: anywhere within a radian, which keeps the matrix regular where a scene says nothing at all.
+    sigma[:RIG] = np.where(np.asarray(free), 1.0, sigma[:RIG])
+    for angle, coordinate in PARTNERS:
+        if free[angle] and not rival:
+            sigma[RIG + coordinate] = NO_SHIFT
+    return np.diag(sigma**-2.0)
+
+
+def solution(fit: Fit, free: Sequence[bool], beliefs: Beliefs, *, rival: bool) -> tuple[Floats, Floats, float]:
+    """Values (SIZE,), covariance and gain (half the drop of chi-square) of a fit's quadratic for another choice.
+
+    The smooth error counts with no less than is believed of it.
+    """
+    total = fit.normal + precision(free, beliefs, max(beliefs.term, fit.smooth), rival=rival)
+    covariance = np.asarray(np.linalg.inv(total), dtype=np.float64)
+    x = covariance @ fit.pull
+    return x, covariance, 0.5 * float(np.sum(fit.pull * x))
+
+
+@dataclass(frozen=True)
+class _Part:
+    normal: Floats
+    pull: Floats
+    noise: float
+    weights: Floats
+
+
+def _linear(rig: Rig, matches: Matches, x: Floats | None = None, before: Linear | None = None) -> Linear:
+    """Distances of a corrected rig with systematic errors about ``x``; what stays is taken from ``before``."""
+    x = np.zeros(SIZE) if x is None else x
+    distance, by_rig = distances(rig, x[:RIG], matches.left, matches.right)
+    # A principal point further right (down) by a pixel, its rotation made up for by yaw (pitch).
+    made_up = by_rig[:, [1, 0]] * [-1.0 / rig.right.fx, 1.0 / rig.right.fy]
+    shifts = made_up - normals(rig, x[:RIG], matches.left)
+    basis = _smooth_terms(rig, matches) if before is None else before.design[:, SMOOTH]
+    design = np.column_stack([by_rig, shifts, basis])
+    block = _blocks(rig, matches) if before is None else before.block
+    return Linear(distance - by_rig @ x[:RIG], design, x, block)
+
+
+def _blocks(rig: Rig, matches: Matches) -> NDArray[np.int64]:
+    """Block (n,) of the image that each left point lies in."""
+    column = np.minimum(matches.left[:, 0] * BLOCKS / rig.left.width, BLOCKS - 1).astype(np.int64)
+    row = np.minimum(matches.left[:, 1] * BLOCKS / rig.left.height, BLOCKS - 1).astype(np.int64)
+    return np.asarray(row * BLOCKS + column, dtype=np.int64)
+
+
+def _pair(linear: Linear, last: float, x: Floats) -> _Part:
+    """One pair's part of the normal equations, with weights from its own scatter (at most ``last``, pixels)."""
+    weights, normal, pull = np.empty(len(linear.constant)), np.empty((SIZE, SIZE)), np.empty(SIZE)
+    given = linear.constant, linear.design, x, linear.block
+    noise = relative_orientation_kernel.weigh(*given, BLOCKS**2, last, LEAST_NOISE, TUKEY, weights, normal, pull)
+    return _Part(normal, pull, float(noise), weights)
+
+
+def _smooth_terms(rig: Rig, matches: Matches) -> Floats:
+    """Normalised Legendre polynomials (n, terms) of the left pixel: RMS 1 over the image."""
+    u = 2.0 * matches.left[:, 0] / max(rig.left.width - 1, 1) - 1.0
+    v = 2.0 * matches.left[:, 1] / max(rig.left.height - 1, 1) - 1.0
+    across, down = (np.polynomial.legendre.legvander(a, DEGREE) for a in (u, v))
+    return np.column_stack([math.sqrt((2 * i + 1) * (2 * j + 1)) * across[:, i] * down[:, j] for i, j in TERMS])
+
+
+def rms(distance: Floats, weights: Floats) -> float:
+    """RMS of the distances that are no outliers, pixels; NaN where all are."""
+    used = weights > 0
+    return float(np.sqrt(np.mean(distance[used] ** 2))) if used.any() else float("nan")

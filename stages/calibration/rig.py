@@ -1,0 +1,285 @@
+"""The rig that a run reconstructs with: the given calibration, repaired only where the images contradict it.
+
+The relative orientation enters every later stage through this one artifact (paper, section 5.2.2: relative orientation
+with the baseline's length held fixed). The correspondences of all pairs are pooled; what they do not observe, do not
+contradict, or would change by too little to matter stays as given, to the last bit
+(:mod:`stages.calibration.parameter_selection`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from stages.calibration.orientation import misalignment
+from stages.calibration.parameter_selection import (
+    BEYOND_SHARE,
+    Decision,
+    Parameter,
+    RelativeParams,
+    decide,
+    impossible_share,
+)
+from stages.calibration.relative_orientation import BLOCKS, LEAST_MATCHES, RIG, Linear, Matches, adjust, rms, solution
+from stages.core.declare import Bundle, Inputs, Stage
+from stages.core.errors import InputError
+from stages.geometry.epipolar import NAMES, corrected, distances
+from stages.geometry.geometry import Rig
+
+Floats = NDArray[np.float64]
+
+MOST_MATCHES = 10_000
+"""Of all pairs together: beyond, systematic errors rule."""
+
+LEAST_OF_A_PAIR = 200
+
+LEAST_OF_A_BLOCK = 5
+"""Matches whose median is a block's."""
+
+BAD_ROWS = 1.0
+"""Pixels RMS of what no rig explains: an image whose lens distortion was not removed, or a wrong camera."""
+
+SWAPPED = 0.5
+"""Share of the matches beyond infinity that no error of a calibration explains."""
+
+
+class RigParams(RelativeParams):
+    """Parameters of the stage ``rig``."""
+
+    mode: Literal["pooled", "per_pair", "fixed"] = Field(
+        "pooled",
+        description="pooled: one rig from all pairs; per_pair: each pair its own (a rig that bends); fixed: as given, "
+        "contradictions are only told",
+    )
+
+
+def orient_rig(given: Rig, pairs: Sequence[Matches], params: RigParams) -> dict[str, Any]:
+    """Facts of the rig to be used.
+
+    Returns
+    -------
+    dict
+        ``rig`` (:meth:`Rig.to_dict`) to be used, ``given``; ``mode``; ``baseline`` (m); ``source`` in words;
+        ``changed``; ``parameters`` (name, value, asked, sigma, unit, observed, freed, why), ``held`` (name and reason
+        in words); ``per_pair`` (pair, values and sigma by name, degrees, of what is observed);
+        ``residual_before_px``, ``residual_after_px`` (RMS of inliers) and ``median_before_px``, ``median_after_px``,
+        of the same points; ``pairs``, ``matches``; ``warnings`` (lines). In mode ``fixed`` ``parameters`` say what
+        would be changed. Without a pair that can be used, there are only the first six and ``warnings``.
+
+    Raises
+    ------
+    InputError
+        The cameras share one projection centre, or their images are swapped.
+    """
+    if not given.baseline > 0:
+        raise InputError(
+            "RIL-427", "the rig's baseline is 0 m", remedy="give T_right_left with a translation in metres"
+        )
+    facts: dict[str, Any] = {
+        "rig": given.to_dict(),
+        "given": given.to_dict(),
+        "mode": params.mode,
+        "baseline": given.baseline,
+        "source": "given calibration",
+        "changed": False,
+        "warnings": [],
+    }
+    usable = [m for m in pairs if len(m.left) >= LEAST_MATCHES]
+    if usable:
+        facts |= _judged(given, _share(usable), params)
+        if len(usable) < len(pairs):
+            few = len(pairs) - len(usable)
+            facts["warnings"].insert(0, f"{few} of {len(pairs)} pairs have too few matches for the rig")
+    elif pairs:
+        facts["warnings"] = ["no pair has enough matches to check the calibration; it is used as given"]
+    return facts
+
+
+def _judged(given: Rig, pairs: list[Matches], params: RigParams) -> dict[str, Any]:
+    """What the pairs say on the given rig, and the rig that follows."""
+    decision = decide(given, pairs, params)
+    applied = params.mode != "fixed" and decision.changed
+    rig = corrected(given, decision.correction) if applied else given
+    per_pair = [_alone(given, m, one, decision, params) for m, one in zip(pairs, decision.start, strict=True)]
+    share = impossible_share(rig, pairs, decision.fit)
+    if share > SWAPPED:
+        raise InputError(
+            "RIL-428",
+            f"{100 * share:.0f} % of the matches lie beyond infinity: left and right are swapped, or the baseline "
+            "points the other way",
+            remedy="exchange the left and the right images, or the sign of the baseline",
+        )
+    residuals = _residuals(given, rig, pairs, decision)
+    warnings = _contradiction(given, pairs, decision, params.mode)
+    warnings += _doubts(share, residuals["residual_after_px"])
+    warnings += _drift(decision.start, per_pair, params)
+    return {
+        "rig": rig.to_dict(),
+        "source": _source(decision, applied, len(pairs)),
+        "changed": applied,
+        "parameters": [p.to_dict() for p in decision.parameters],
+        "held": [f"{_word(p)}: {p.why}" for p in decision.parameters if not p.freed],
+        "per_pair": per_pair,
+        "pairs": len(pairs),
+        "matches": sum(len(m.left) for m in pairs),
+        "warnings": warnings,
+        **residuals,
+    }
+
+
+def _share(pairs: list[Matches]) -> list[Matches]:
+    """Every so manieth match of each pair, so that many pairs together stay affordable."""
+    most = max(LEAST_OF_A_PAIR, MOST_MATCHES // len(pairs))
+    steps = [max(1, math.ceil(len(m.left) / most)) for m in pairs]
+    return [Matches(m.pair, m.left[::s], m.right[::s]) for m, s in zip(pairs, steps, strict=True)]
+
+
+def _alone(given: Rig, matches: Matches, start: Linear, decision: Decision, params: RigParams) -> dict[str, Any]:
+    """One pair's own values and sigmas, degrees, of all that the sequence observes."""
+    names = [p.name for p in decision.parameters if p.observed]
+    free = [p.observed for p in decision.parameters]
+    beliefs = params.beliefs(given)
+    fit = adjust(given, [matches], free, beliefs, rival=False, start=[start])
+    sigma = np.sqrt(np.diag(solution(fit, free, beliefs, rival=False)[1]))
+    return {
+        "pair": matches.pair,
+        "values": {n: math.degrees(fit.x[NAMES.index(n)]) for n in names},
+        "sigma": {n: math.degrees(sigma[NAMES.index(n)]) for n in names},
+    }
+
+
+def _residuals(given: Rig, rig: Rig, pairs: Sequence[Matches], decision: Decision) -> dict[str, float]:
+    weights = np.concatenate(decision.fit.weights)
+    found = {}
+    for name, used in (("before", given), ("after", rig)):
+        d = np.concatenate([distances(used, np.zeros(RIG), m.left, m.right)[0] for m in pairs])
+        found[f"residual_{name}_px"] = rms(d, weights)
+        found[f"median_{name}_px"] = float(np.median(np.abs(d[weights > 0])))
+    return found
+
+
+def _word(p: Parameter) -> str:
+    return p.name.replace("_", " ")
+
+
+def _source(decision: Decision, applied: bool, pairs: int) -> str:
+    if not applied:
+        return "given calibration"
+    names = " and ".join(_word(p) for p in decision.parameters if p.freed)
+    return f"given calibration, {names} repaired from {pairs} pair{'s' if pairs > 1 else ''}"
+
+
+def _contradiction(given: Rig, pairs: Sequence[Matches], decision: Decision, mode: str) -> list[str]:
+    """What a user should know of a calibration that the images contradict."""
+    if not decision.changed:
+        return []
+    signed = [distances(given, np.zeros(RIG), m.left, m.right)[0] for m in pairs]
+    inlier = np.concatenate(decision.fit.weights) > 0
+    words = misalignment(float(np.median(np.concatenate(signed)[inlier])), decision)
+    done = "kept because rig.mode = fixed" if mode == "fixed" else "repaired"
+    lines = [f"the calibration contradicts the images: {words}; {done}"]
+    hidden = [p for p in decision.parameters if not p.observed]
+    if hidden:
+        names = ", ".join(f"{_word(p)} (taken alone they ask for {math.degrees(p.asked):+.2f} degrees)" for p in hidden)
+        lines.append(
+            f"what these images cannot tell is held: {names}; if the camera was turned there, too, depth is wrong: "
+            "calibrate anew, or compare a known length"
+        )
+    return lines
+
+
+def _doubts(share: float, residual: float) -> list[str]:
+    """Signs that something other than the rig's orientation is wrong."""
+    lines = []
+    if residual > BAD_ROWS:
+        lines.append(
+            f"matches lie {residual:.1f} px RMS off their epipolar lines: is lens distortion left in the images, or "
+            "the wrong calibration given?"
+        )
+    if share > BEYOND_SHARE:
+        lines.append(f"{100 * share:.0f} % of the matches lie beyond infinity: the toe-in is wrong")
+    return lines
+
+
+def _drift(start: Sequence[Linear], per_pair: list[dict[str, Any]], params: RigParams) -> list[str]:
+    """Parameters that change from pair to pair by more than their errors, in pairs whose rows move enough to matter.
+
+    Over one scene parameters stand in for each other (a pitch for a baseline across, over flat ground), so it counts by
+    how much all that changed moves the rows together; and a rig that moves does so all over the image, mismatches on
+    one thing in view do not, so it counts by how much the blocks of the image show (:func:`_shown`).
+    """
+    names = list(per_pair[0]["values"]) if len(per_pair) > 2 else []
+    values = np.array([[p["values"][name] for name in names] for p in per_pair])
+    sigma = np.array([[p["sigma"][name] for name in names] for p in per_pair])
+    # of two states of the rig one, not the mean
+    usual = np.quantile(values, 0.5, axis=0, method="lower") if names else np.zeros(0)
+    departure = values - usual
+    moved = _shown(start, [NAMES.index(name) for name in names], np.radians(usual), np.radians(departure))
+    lines = []
+    for k, name in enumerate(names):
+        away = np.abs(departure[:, k])
+        odd = (away > params.significance * sigma[:, k]) & (moved > params.least_rows)
+        if odd.any():
+            worst = int(np.argmax(np.where(odd, away, 0.0)))
+            lines.append(
+                f"the rig moves: {name.replace('_', ' ')} of {int(odd.sum())} of {len(values)} pairs departs from the "
+                f"others', by {away[worst]:.2f} degrees at pair {per_pair[worst]['pair']}; try rig.mode = per_pair"
+            )
+    return lines
+
+
+def _shown(start: Sequence[Linear], columns: list[int], usual: Floats, departure: Floats) -> Floats:
+    """How far (pairs,) the rows of each pair moved against the others', pixels: the median over blocks of the image.
+
+    A block moved by what its median row error, beyond what the pairs' own parameters usually leave there, departs from
+    none, as far as the pair's own parameters claim so. Medians, of matches and of blocks: neither a part of a block's
+    matches nor less than half of the blocks, however wrong, moves a rig.
+
+    Parameters
+    ----------
+    columns : of the design, those of the parameters.
+    usual, departure : (parameters,) of all pairs and (pairs, parameters) of each against them, radians.
+    """
+    error, claimed, left = (np.full((len(start), BLOCKS**2), np.nan) for _ in range(3))
+    for k, (one, by) in enumerate(zip(start, departure, strict=True)):
+        design = one.design[:, columns]
+        off, shift = one.constant + design @ usual, -(design @ by)
+        for block in np.flatnonzero(np.bincount(one.block) >= LEAST_OF_A_BLOCK):
+            inside = one.block == block
+            error[k, block], claimed[k, block] = np.median(off[inside]), np.median(shift[inside])
+            left[k, block] = np.median((off - shift)[inside])
+    moved = np.zeros(len(start))
+    for k, (found, wanted) in enumerate(zip(error, claimed, strict=True)):
+        seen = np.isfinite(found)
+        if seen.any():
+            apart = (found[seen] - np.nanmedian(left[:, seen], axis=0)) * np.sign(wanted[seen])
+            moved[k] = np.median(np.clip(apart, 0.0, np.abs(wanted[seen])))
+    return moved
+
+
+def _run(params: RigParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+    pairs = [
+        Matches(
+            int(found.meta["pair"]),
+            np.asarray(found["left"], dtype=np.float64),
+            np.asarray(found["right"], dtype=np.float64),
+        )
+        for found in inputs.get("orientations", [])
+    ]
+    return Bundle({}, orient_rig(Rig.from_dict(args["rig"]), pairs, params))
+
+
+STAGE = Stage(
+    name="rig",
+    version=3,
+    summary="the rig: the given calibration, repaired where the images contradict it",
+    params=RigParams,
+    inputs=("orientations*?",),
+    outputs=(),
+    run=_run,
+)

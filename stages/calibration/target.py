@@ -1,0 +1,360 @@
+"""Calibration of two cameras and of their relative pose from views of one flat board.
+
+All corners of all views are adjusted together: both cameras with their distortion, the pose of the right camera in the
+left one's frame, and the pose of the board in each view. OpenCV gives the projection with its derivatives and the start
+of each camera (Zhang 2000, doi:10.1109/34.888718). The common adjustment is made here, because OpenCV's own tells no
+errors of the relative pose, and because a bad view must show in its residual and not spread over all others.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.core.errors import ConfigError, DegenerateError, InputError
+from stages.geometry.epipolar import distances
+from stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
+from stages.geometry.lens import Lens
+
+Floats = NDArray[np.float64]
+
+MODELS: Mapping[str, tuple[str, ...]] = {
+    "radtan": ("k1", "k2", "p1", "p2", "k3"),
+    "radtan4": ("k1", "k2", "p1", "p2"),
+    "rational": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    "fisheye": ("k1", "k2", "k3", "k4"),
+}
+"""Names of the coefficients of each model, in OpenCV's order; radtan4 is radtan without k3."""
+
+LEAST_VIEWS = 3
+"""Two views determine a camera only just, and nothing would tell a bad one."""
+
+CORNER_SCALE = 0.5
+"""Pixels; residuals beyond it lose weight in the first adjustment. Corners are found to 0.1 - 0.3 px."""
+
+BAD_RATIO, BAD_PX = 4.0, 0.5
+"""A view is bad whose RMS exceeds four times the views' median, and half a pixel."""
+
+MOST_STEPS, SETTLED = 100, 1e-10
+"""Steps of an adjustment, and the relative gain at which it is settled."""
+
+UNDETERMINED = "the views do not determine the cameras"
+MORE_VIEWS = (
+    "take ten views or more with the board tilted by up to 45 degrees, near and far, in all parts of both images"
+)
+
+SWAPPED = 0.5
+"""Share of the baseline by which a right camera may stand to the left: beyond, the sides are swapped."""
+
+
+@dataclass(frozen=True)
+class BoardView:
+    """Corners of the board in one pair: ``left, right`` (n, 2) column, row in the raw images, in the same order."""
+
+    name: str
+    left: Floats
+    right: Floats
+
+
+@dataclass(frozen=True)
+class ViewResidual:
+    """How one view fits: RMS in pixels of the corners in each image, and of their distances from epipolar lines."""
+
+    name: str
+    left: float
+    right: float
+    epipolar: float
+    used: bool = True
+
+    @property
+    def worst(self) -> float:
+        """The larger of both images' residuals."""
+        return max(self.left, self.right)
+
+
+@dataclass(frozen=True)
+class RigCalibration:
+    """What the views determine.
+
+    ``sigma``: standard deviation by name (``left fx`` in pixels, ``right k1``, ``rotation x`` in radians,
+    ``translation x`` and ``baseline`` in metres), from the residuals and the geometry of the views. ``rms``: pixels, of
+    all corners that were used. ``residuals``: one a view; those of views that were left out are the ones for which they
+    were.
+    """
+
+    left: Lens
+    right: Lens
+    T_right_left: RigidTransform
+    sigma: Mapping[str, float]
+    rms: float
+    residuals: tuple[ViewResidual, ...]
+
+
+def calibrate_rig(
+    board: Floats, views: Sequence[BoardView], size: tuple[int, int], model: str = "radtan", *, keep_bad: bool = False
+) -> RigCalibration:
+    """Both cameras and their relative pose.
+
+    Parameters
+    ----------
+    board : (n, 3) corners in the board's own frame, z = 0, metres.
+    views : at least ``LEAST_VIEWS``.
+    size : width and height of the images, pixels.
+    model : one of ``MODELS``.
+    keep_bad : use also views whose residuals are far above the others'.
+
+    Raises
+    ------
+    ConfigError
+        The model is unknown.
+    DegenerateError
+        There are too few views, or they do not determine the cameras.
+    InputError
+        The right camera stands on the left one's left.
+    """
+    if model not in MODELS:
+        raise ConfigError("RIL-308", f"distortion model {model!r} is unknown", remedy=f"one of {', '.join(MODELS)}")
+    _enough(views)
+    task = Adjustment(board, tuple(views), size, model)
+    x = task.solve(task.start(), robust=True)
+    first = task.residuals(x)
+    limit = max(BAD_PX, BAD_RATIO * float(np.median([r.worst for r in first])))
+    good = [k for k, r in enumerate(first) if keep_bad or r.worst <= limit]
+    used = Adjustment(board, tuple(views[k] for k in good), size, model)
+    _enough(used.views)
+    x = used.solve(np.concatenate([x[: used.shared], *(x[task.pose(k)] for k in good)]))
+    _sides(used.rig(x).T_right_left)
+    final = {r.name: r for r in used.residuals(x)}
+    rms, sigma = used.errors(x)
+    left, right = used.lenses(x)
+    return RigCalibration(
+        left,
+        right,
+        used.rig(x).T_right_left,
+        sigma,
+        rms,
+        tuple(final.get(r.name, ViewResidual(r.name, r.left, r.right, r.epipolar, used=False)) for r in first),
+    )
+
+
+def _enough(views: Sequence[BoardView]) -> None:
+    if len(views) < LEAST_VIEWS:
+        raise DegenerateError(
+            "RIL-309",
+            f"{len(views)} views of the board are too few to calibrate with",
+            remedy=MORE_VIEWS,
+        )
+
+
+def _sides(T_right_left: RigidTransform) -> None:
+    x = float(T_right_left.translation[0])
+    if x > SWAPPED * float(np.linalg.norm(T_right_left.translation)):
+        raise InputError(
+            "RIL-310",
+            f"the right camera stands {x:.4g} m to the left of the left one",
+            remedy="swap the two sets of images",
+        )
+
+
+@dataclass(frozen=True)
+class Adjustment:
+    """The unknowns of a set of views: left lens, right lens, rig, then the board's pose in each left image.
+
+    A lens has fx fy cx cy and its coefficients; a pose a rotation vector and a translation, of the transform from the
+    board to the left camera, or from the left to the right one.
+    """
+
+    board: Floats
+    views: tuple[BoardView, ...]
+    size: tuple[int, int]
+    model: str
+
+    @property
+    def lens(self) -> int:
+        """Unknowns of one lens."""
+        return 4 + len(MODELS[self.model])
+
+    @property
+    def shared(self) -> int:
+        """Unknowns that all views share."""
+        return 2 * self.lens + 6
+
+    def pose(self, k: int) -> slice:
+        """Where the board's pose in view ``k`` stands."""
+        return slice(self.shared + 6 * k, self.shared + 6 * k + 6)
+
+    def start(self) -> Floats:
+        """Each camera on its own, and the relative pose that agrees best with those of all views."""
+        left, left_poses = self._alone([v.left for v in self.views])
+        right, right_poses = self._alone([v.right for v in self.views])
+        between = [r @ ll.inverse() for ll, r in zip(left_poses, right_poses, strict=True)]
+        middle = min(between, key=lambda T: sum(_apart(T, other) for other in between))
+        return np.concatenate([left, right, *(_vector(T) for T in [middle, *left_poses])])
+
+    def _alone(self, points: list[Floats]) -> tuple[Floats, list[RigidTransform]]:
+        boards = [self.board.astype(np.float32).reshape(1, -1, 3)] * len(points)
+        flat = [p.astype(np.float32).reshape(1, -1, 2) for p in points]
+        try:
+            if self.model == "fisheye":
+                flags = cv2.CALIB_RECOMPUTE_EXTRINSIC | cv2.CALIB_FIX_SKEW
+                out = cv2.fisheye.calibrate(boards, flat, self.size, np.zeros((3, 3)), np.zeros(4), flags=flags)
+            else:
+                flags = {"rational": cv2.CALIB_RATIONAL_MODEL, "radtan4": cv2.CALIB_FIX_K3}.get(self.model, 0)
+                out = cv2.calibrateCamera(boards, flat, self.size, None, None, flags=flags)
+        except cv2.error as error:
+            raise DegenerateError(
+                "RIL-311", UNDETERMINED, remedy=f"{MORE_VIEWS}, or a model with fewer coefficients"
+            ) from error
+        _, k, d, rotations, translations = out
+        count = len(MODELS[self.model])
+        lens = np.concatenate([[k[0, 0], k[1, 1], k[0, 2], k[1, 2]], np.ravel(d)[:count]])
+        both = zip(rotations, translations, strict=True)
+        return lens, [RigidTransform(rotation_exp(np.ravel(r)), np.ravel(t)) for r, t in both]
+
+    def evaluate(self, x: Floats) -> tuple[Floats, Floats]:
+        """Residuals (4 n views,), found minus projected negative, pixels, left before right; and their Jacobian."""
+        n = 2 * len(self.board)
+        residual, jacobian = np.empty(2 * n * len(self.views)), np.zeros((2 * n * len(self.views), x.size))
+        lens, rig = self.lens, x[2 * self.lens : self.shared]
+        own, other, between = slice(0, lens), slice(lens, 2 * lens), slice(2 * lens, self.shared)
+        for k, view in enumerate(self.views):
+            pose, rows = self.pose(k), slice(2 * n * k, 2 * n * k + n)
+            residual[rows], by_lens, by_pose = self._project(x[own], x[pose], view.left)
+            jacobian[rows, own], jacobian[rows, pose] = by_lens, by_pose
+            composed, by_first, by_second = _compose(x[pose], rig)
+            rows = slice(rows.stop, rows.stop + n)
+            residual[rows], by_lens, by_pose = self._project(x[other], composed, view.right)
+            jacobian[rows, other] = by_lens
+            jacobian[rows, pose], jacobian[rows, between] = by_pose @ by_first, by_pose @ by_second
+        return residual, jacobian
+
+    def _project(self, lens: Floats, pose: Floats, found: Floats) -> tuple[Floats, Floats, Floats]:
+        k = np.array([[lens[0], 0.0, lens[2]], [0.0, lens[1], lens[3]], [0.0, 0.0, 1.0]])
+        d, board = lens[4:], self.board.reshape(1, -1, 3)
+        if self.model == "fisheye":
+            points, j = cv2.fisheye.projectPoints(board, pose[:3], pose[3:], k, d)
+            by_lens, by_pose = j[:, :8], j[:, 8:14]
+        else:
+            points, j = cv2.projectPoints(board, pose[:3], pose[3:], k, d)
+            by_lens, by_pose = j[:, 6 : 10 + d.size], j[:, :6]
+        return points.reshape(-1) - found.reshape(-1), by_lens, by_pose
+
+    def solve(self, x: Floats, *, robust: bool = False) -> Floats:
+        """Least squares from ``x`` (Levenberg and Marquardt); robust: Cauchy's loss, which bounds what a view can do.
+
+        Raises
+        ------
+        DegenerateError
+            The adjustment diverges.
+        """
+        damping, (cost, gradient, normal) = 1e-3, self._normal(x, robust)
+        for _ in range(MOST_STEPS):
+            step = np.linalg.lstsq(normal + damping * np.diag(np.diag(normal)), -gradient, rcond=None)[0]
+            ahead = self._normal(x + step, robust)
+            if ahead[0] <= cost:
+                gain, damping = cost - ahead[0], max(0.1 * damping, 1e-12)
+                x, (cost, gradient, normal) = x + step, ahead
+                if gain <= SETTLED * cost:
+                    break
+            else:
+                damping *= 10.0
+                if damping > 1e12:
+                    break
+        if not (np.isfinite(x).all() and min(x[0], x[1], x[self.lens], x[self.lens + 1]) > 0):
+            raise DegenerateError("RIL-312", "the adjustment of the cameras diverges", remedy=MORE_VIEWS)
+        return x
+
+    def _normal(self, x: Floats, robust: bool) -> tuple[float, Floats, Floats]:
+        """Cost, its gradient and its Gauss-Newton matrix, each scaled alike."""
+        residual, jacobian = self.evaluate(x)
+        if not np.isfinite(residual).all():
+            return math.inf, np.zeros(x.size), np.eye(x.size)
+        square = np.repeat((residual.reshape(-1, 2) ** 2).sum(1), 2) / CORNER_SCALE**2
+        weight = 1.0 / (1.0 + square) if robust else np.ones(residual.size)
+        cost = CORNER_SCALE**2 * float(np.log1p(square[::2]).sum()) if robust else float(residual @ residual)
+        weighted = jacobian * weight[:, None]
+        return cost, weighted.T @ residual, weighted.T @ jacobian
+
+    def lenses(self, x: Floats) -> tuple[Lens, Lens]:
+        """Left and right lens."""
+        left, right = (self._lens(x[k * self.lens : (k + 1) * self.lens]) for k in range(2))
+        return left, right
+
+    def _lens(self, x: Floats) -> Lens:
+        fx, fy, cx, cy, *coefficients = (float(v) for v in x)
+        name = "radtan" if self.model == "radtan4" else self.model
+        return Lens(Camera(fx, fy, cx, cy, *self.size), name, tuple(coefficients))
+
+    def rig(self, x: Floats) -> Rig:
+        """The rig with the cameras' pinhole parts."""
+        left, right = self.lenses(x)
+        pose = x[2 * self.lens : self.shared]
+        return Rig(left.camera, right.camera, RigidTransform(rotation_exp(pose[:3]), pose[3:]))
+
+    def residuals(self, x: Floats) -> tuple[ViewResidual, ...]:
+        """One a view."""
+        by_view = self.evaluate(x)[0].reshape(len(self.views), 2, -1, 2)
+        rms = np.sqrt((by_view**2).sum(-1).mean(-1))
+        rig, (left, right) = self.rig(x), self.lenses(x)
+        out = []
+        for view, (a, b) in zip(self.views, rms, strict=True):
+            ideal = left.undistort(view.left, rig.left), right.undistort(view.right, rig.right)
+            seen = np.isfinite(np.hstack(ideal)).all(axis=1)
+            off, _ = distances(rig, np.zeros(5), ideal[0][seen], ideal[1][seen])
+            epipolar = float(np.sqrt((off**2).mean())) if seen.any() else float("nan")
+            out.append(ViewResidual(view.name, float(a), float(b), epipolar))
+        return tuple(out)
+
+    def errors(self, x: Floats) -> tuple[float, dict[str, float]]:
+        """RMS of a corner, pixels, and standard deviations of what all views share, by name.
+
+        Raises
+        ------
+        DegenerateError
+            Some unknown changes no residual.
+        """
+        residual, jacobian = self.evaluate(x)
+        scale = np.linalg.norm(jacobian, axis=0)
+        scaled = jacobian / np.where(scale > 0, scale, 1.0)
+        normal = scaled.T @ scaled
+        if not scale.all() or np.linalg.cond(normal) > 1e15:
+            raise DegenerateError("RIL-313", UNDETERMINED, remedy=f"{MORE_VIEWS}, or a model with fewer coefficients")
+        variance = float(residual @ residual) / (residual.size - x.size)
+        covariance = variance * np.linalg.inv(normal) / np.outer(scale, scale)
+        deviation = np.sqrt(np.diag(covariance))
+        sigma = {name: float(deviation[k]) for k, name in enumerate(self.names())}
+        t = slice(self.shared - 3, self.shared)
+        direction = x[t] / np.linalg.norm(x[t])
+        sigma["baseline"] = float(np.sqrt(direction @ covariance[t, t] @ direction))
+        return float(np.sqrt(2.0 * (residual**2).mean())), sigma
+
+    def names(self) -> list[str]:
+        """Names of the unknowns that all views share, in order."""
+        lens = ("fx", "fy", "cx", "cy", *MODELS[self.model])
+        rig = [f"{kind} {axis}" for kind in ("rotation", "translation") for axis in "xyz"]
+        return [f"{side} {name}" for side in ("left", "right") for name in lens] + rig
+
+
+def _compose(first: Floats, second: Floats) -> tuple[Floats, Floats, Floats]:
+    """Pose ``second @ first`` as (6,), and its derivatives (6, 6) by each."""
+    out: tuple[Any, ...] = cv2.composeRT(first[:3], first[3:], second[:3], second[3:])
+    r, t, rr1, rt1, rr2, rt2, tr1, tt1, tr2, tt2 = out
+    by_first, by_second = np.block([[rr1, rt1], [tr1, tt1]]), np.block([[rr2, rt2], [tr2, tt2]])
+    return np.concatenate([r.ravel(), t.ravel()]), by_first, by_second
+
+
+def _vector(T: RigidTransform) -> Floats:
+    return np.concatenate([cv2.Rodrigues(T.rotation)[0].ravel(), T.translation])
+
+
+def _apart(a: RigidTransform, b: RigidTransform) -> float:
+    """How far two poses differ: angle in radians, and position relative to its size."""
+    angle = float(np.linalg.norm(cv2.Rodrigues(a.rotation @ b.rotation.T)[0]))
+    size = float(np.linalg.norm(a.translation) + np.linalg.norm(b.translation))
+    return angle + float(np.linalg.norm(a.translation - b.translation)) / max(size, 1e-12)

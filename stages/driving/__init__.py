@@ -1,0 +1,1 @@
+"""What watches a vehicle that drives: faults of its motion and obstacles laid in its way."""

@@ -1,0 +1,145 @@
+"""Safety stops of a drive (section 2.2): what the sensors and the tracking say, image by image, against thresholds.
+
+    attitude      the inclinometer's tilt of the body beyond what the vehicle may have
+    acceleration  a peak of the accelerometer: the vehicle has struck or dropped off something
+    lost          fewer landmarks are followed than a pose needs
+    slip          the way by the wheels and the way by vision differ by more than their errors explain
+
+An image is judged by itself and those before it alone, as on the vehicle: the first one that is beyond a threshold is
+where the vehicle has stopped.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from stages.core.declare import Bundle, Inputs, Params, Stage
+from stages.geometry.geometry import RigidTransform
+
+Floats = NDArray[np.float64]
+
+
+class SafetyParams(Params):
+    """Thresholds of the safety stops."""
+
+    max_tilt: float = Field(
+        1.0,
+        gt=0,
+        description="times the vehicle's max_slope_deg; the body averages over the wheels, so it is steep then",
+    )
+    max_acceleration: float = Field(
+        3.0, gt=0, description="m/s2; vertical peaks of driving over permitted steps stay below half of it"
+    )
+    least_landmarks: int = Field(12, ge=6, description="landmarks that agree with a pose; six determine it")
+    max_slip: float = Field(0.2, gt=0, description="share of the way by the wheels; usual soil slips by 0.05 to 0.15")
+    least_way: float = Field(
+        0.3, gt=0, description="wheel bases by the wheels before slip is judged: less is in the error of vision"
+    )
+    max_turn_deg: float = Field(8.0, gt=0, description="degrees between the turn by the wheels and by vision")
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """``stop``: index of the image at which the vehicle stopped, None; ``kind`` and ``reason`` why."""
+
+    stop: int | None
+    kind: str
+    reason: str
+
+
+def judge(
+    up: Floats,
+    acceleration: Floats,
+    odometry: Floats,
+    poses: Floats,
+    inliers: list[int],
+    T_vehicle_left: RigidTransform,
+    vehicle: Mapping[str, Any],
+    params: SafetyParams,
+) -> Verdict:
+    """The first image of a leg that is beyond a threshold.
+
+    Parameters
+    ----------
+    up : (frame, 3) direction of up in the left camera. ``acceleration`` (frame,) m/s2.
+    odometry : (frame, 3) x, y (m), heading (rad) by the wheels since the first frame.
+    poses : (frame, 3, 4) T_local_left by vision.
+    inliers : landmarks of each pose.
+    vehicle : its ``max_slope_deg`` and ``wheel_base``.
+    """
+    key = RigidTransform.from_matrix(poses[0]) @ T_vehicle_left.inverse()
+    steepest = params.max_tilt * float(vehicle["max_slope_deg"])
+    for k in range(1, len(poses)):
+        tilt = math.degrees(math.acos(min(1.0, float((T_vehicle_left.rotation @ up[k])[2]))))
+        if tilt > steepest:
+            return Verdict(k, "attitude", f"tilt of {tilt:.1f} degrees by the inclinometer, {steepest:.1f} permitted")
+        if acceleration[k] > params.max_acceleration:
+            limit = f"{params.max_acceleration:g} permitted"
+            return Verdict(k, "acceleration", f"peak of {acceleration[k]:.1f} m/s2 by the accelerometer, {limit}")
+        if inliers[k] < params.least_landmarks:
+            few = f"{inliers[k]} landmarks agree with the pose, {params.least_landmarks} are needed"
+            return Verdict(k, "lost", f"tracking is lost: {few}")
+        moved = key.inverse() @ (RigidTransform.from_matrix(poses[k]) @ T_vehicle_left.inverse())
+        found = _disagreement(odometry[k], moved, float(vehicle["wheel_base"]), params)
+        if found:
+            return Verdict(k, "slip", found)
+    return Verdict(None, "", "")
+
+
+def _disagreement(wheels: Floats, moved: RigidTransform, base: float, params: SafetyParams) -> str:
+    """In what way wheels and vision contradict each other, in words; empty: they do not."""
+    turn = math.atan2(-moved.rotation[0, 1], moved.rotation[1, 1])
+    apart = math.degrees(abs(math.remainder(turn - float(wheels[2]), 2 * math.pi)))
+    if apart > params.max_turn_deg:
+        return f"wheels and vision differ by {apart:.1f} degrees in heading, {params.max_turn_deg:g} permitted"
+    way, seen = float(np.hypot(wheels[0], wheels[1])), float(np.linalg.norm(moved.translation))
+    if way < params.least_way * base:
+        return ""
+    slip = 1.0 - seen / way
+    if abs(slip) <= params.max_slip:
+        return ""
+    return f"slip of {slip:.0%}: {1000 * way:.0f} mm by the wheels, {1000 * seen:.0f} mm by vision"
+
+
+def _run(params: SafetyParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+    sense, resect = inputs["sense"], inputs["resect"]
+    rows = [int(r) for r in args["rows"]]  # of the readings, those frames that were resected
+    wheels = np.asarray(sense["odometry"])[rows]
+    found = judge(
+        np.asarray(sense["up"])[rows],
+        np.asarray(sense["acceleration"])[rows],
+        _relative(wheels),
+        np.asarray(resect["poses"]),
+        [int(f["inliers"]) for f in resect.meta["per_frame"]],
+        RigidTransform.from_matrix(args["T_vehicle_left"]),
+        args["vehicle"],
+        params,
+    )
+    frames = [int(f["frame"]) for f in resect.meta["per_frame"]]
+    meta = {"stop": found.stop, "kind": found.kind, "reason": found.reason}
+    return Bundle({}, meta | {"frame": None if found.stop is None else frames[found.stop]})
+
+
+def _relative(wheels: Floats) -> Floats:
+    """Readings (frame, 3) since the first of them."""
+    x, y = (wheels[:, k] - wheels[0, k] for k in (0, 1))
+    c, s = math.cos(wheels[0, 2]), math.sin(wheels[0, 2])
+    return np.stack([c * x + s * y, c * y - s * x, wheels[:, 2] - wheels[0, 2]], axis=1)
+
+
+STAGE = Stage(
+    name="safety",
+    version=1,
+    summary="whether the vehicle stopped on a leg for its safety, where and why",
+    params=SafetyParams,
+    inputs=("sense", "resect"),
+    outputs=(),
+    run=_run,
+)

@@ -1,0 +1,259 @@
+"""Reflex detection of obstacles on the way: what rises above the last elevation model where none should be.
+
+The paper leaves it open (section 8). Between two stops there is one camera and its motion: coarse displacements between
+two images some centimetres of way apart (stage ``motion``) are a stereo pair along the drive, whose relative pose the
+resection has just found. For each cell of the last elevation model ahead of the vehicle the model predicts where its
+point goes; what the image shows instead is put down to another depth along the same ray,
+
+    e = (displacement found) - (displacement predicted),   t = e . g / |g|^2,   g = d(displacement) / dt,
+
+with t the share of the distance to the camera, and so to a point in space. It counts as raised where it lies higher
+than all of the model within reach of its errors, by more than half a wheel's radius and by more than its noise. Enough
+raised points together are an obstacle, at once where they are much of what is seen there, else where the next image
+shows them again: the vehicle stops and looks.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+from pydantic import Field
+from scipy.spatial import KDTree
+
+from stages.core.declare import Array, Bundle, Inputs, Params, Stage
+from stages.core.validity import matched
+from stages.geometry.geometry import Camera, Rig, RigidTransform
+from stages.geometry.lattice import Lattice
+from stages.hazard.vehicle import Vehicle
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+
+class ReflexParams(Params):
+    """Parameters of the stage ``reflex``; lengths in wheel diameters suit any scale."""
+
+    enabled: bool = Field(True, description="whether obstacles are looked for between stops")
+    level: int = Field(1, ge=0, le=4, description="pyramid level of the displacements: half the resolution is enough")
+    baseline: float = Field(1.6, gt=0, description="wheel diameters; way between the two images that are compared")
+    max_turn_deg: float = Field(
+        6.0,
+        gt=0,
+        description="degrees; images turned farther against each other are not used: at 7 and 8 degrees points rose "
+        "above ground that the model had right",
+    )
+    reach: float = Field(10.0, gt=0, description="wheel diameters ahead of the vehicle's centre that are watched")
+    aside: float = Field(0.5, ge=0, description="wheel diameters to either side of the wheels that are watched")
+    height: float = Field(0.25, gt=0, description="wheel diameters; rise over the model that counts: half a radius")
+    sigma: float = Field(0.5, gt=0, description="pixels of the displacements' level; their error")
+    sigmas: float = Field(2.0, gt=0, description="standard deviations of the rise that it must exceed as well")
+    blur: float = Field(0.5, ge=0, description="wheel diameters; the model's greatest height within this is compared")
+    points: int = Field(8, ge=1, description="raised points within one wheel diameter that make an obstacle")
+    share: float = Field(0.35, ge=0, le=1, description="and their share of all points there")
+    again_share: float = Field(
+        0.15, ge=0, le=1, description="the same where so many were raised there in the image compared before as well"
+    )
+
+
+@dataclass(frozen=True)
+class Surface:
+    """The last elevation model: heights (row, col), m, and the greatest of them within the blur, both NaN unknown."""
+
+    lattice: Lattice
+    height: Floats
+    top: Floats
+    points: Floats
+
+    @staticmethod
+    def of(elevation: NDArray[np.floating], lattice: Lattice, blur: float) -> Surface:
+        """From elevations, comparing within ``blur`` metres."""
+        z = np.asarray(elevation, np.float64)
+        side = 2 * round(blur / lattice.cell) + 1
+        top = scipy.ndimage.maximum_filter(np.where(np.isnan(z), -np.inf, z), side, mode="nearest")
+        known = np.isfinite(z)
+        return Surface(lattice, z, top, np.column_stack([lattice.xy()[known], z[known]]))
+
+    def top_at(self, xy: Floats) -> Floats:
+        """Greatest height near points (n, 2); -inf where nothing near is known, NaN outside."""
+        at = np.rint(self.lattice.index(np.nan_to_num(xy))).astype(np.int64)
+        inside = ((at >= 0) & (at < self.lattice.shape)).all(axis=1) & np.isfinite(xy).all(axis=1)
+        out = np.full(len(xy), np.nan)
+        out[inside] = self.top[at[inside, 0], at[inside, 1]]
+        return out
+
+
+@dataclass(frozen=True)
+class View:
+    """Two images of the way: T_local_left of both, and displacements of the first's level grid in level-0 pixels."""
+
+    before: RigidTransform
+    now: RigidTransform
+    column: NDArray[np.float32]
+    row: NDArray[np.float32]
+    matched: Bools
+    level: int
+
+
+@dataclass(frozen=True)
+class Points:
+    """Points ahead: ``place`` (n, 2) right and ahead of the vehicle, m; ``ground`` (n, 2) the same in the
+    model's frame; ``rise`` (n,) m over the model; ``raised``."""
+
+    place: Floats
+    ground: Floats
+    rise: Floats
+    raised: Bools
+
+
+@dataclass(frozen=True)
+class Obstacle:
+    """A group of raised points: how many, and ``place`` (2,) right and ahead of the vehicle, m."""
+
+    count: int
+    place: Floats
+
+
+def look(
+    view: View, surface: Surface, camera: Camera, T_vehicle_left: RigidTransform, vehicle: Vehicle, p: ReflexParams
+) -> Points:
+    """What the two images say of the ground ahead of the vehicle."""
+    wheel = vehicle.wheel_diameter
+    T_vehicle_local = T_vehicle_left @ view.now.inverse()
+    ahead = T_vehicle_local.apply(surface.points)
+    wide = 0.5 * vehicle.track + p.aside * wheel
+    near = (np.abs(ahead[:, 0]) <= wide) & (ahead[:, 1] > 0.5 * vehicle.wheel_base) & (ahead[:, 1] <= p.reach * wheel)
+    cells = surface.points[near]
+    T_now = view.now.inverse()
+    pixel, cells, first = _seen(view, cells, camera)
+    found = np.stack([view.column[pixel[:, 1], pixel[:, 0]], view.row[pixel[:, 1], pixel[:, 0]]], axis=1)
+    target = first + found.astype(np.float64)
+    to_camera = view.before.translation - cells
+    t = np.zeros(len(cells))
+    slope = np.ones((len(cells), 2))
+    for _ in range(3):
+        here = camera.project(T_now.apply(cells + t[:, None] * to_camera))
+        slope = (camera.project(T_now.apply(cells + (t + 1e-4)[:, None] * to_camera)) - here) / 1e-4
+        t = t + ((target - here) * slope).sum(1) / np.maximum((slope**2).sum(1), 1e-12)
+        t = np.clip(np.nan_to_num(t), -0.5, 0.8)
+    left_over = target - camera.project(T_now.apply(cells + t[:, None] * to_camera))
+    error = p.sigma * 2.0**view.level
+    along = np.hypot(left_over[:, 0], left_over[:, 1]) <= 3.0 * error
+    q = cells + t[:, None] * to_camera
+    rise = q[:, 2] - surface.top_at(q[:, :2])
+    noise = error / np.maximum(np.hypot(slope[:, 0], slope[:, 1]), 1e-9) * to_camera[:, 2]
+    raised = along & (rise > p.height * wheel) & (rise > p.sigmas * noise) & np.isfinite(rise)
+    place = T_vehicle_local.apply(q)[:, :2]
+    return Points(place[along], q[along, :2], rise[along], raised[along])
+
+
+def _seen(view: View, cells: Floats, camera: Camera) -> tuple[NDArray[np.intp], Floats, Floats]:
+    """Grid pixels (n, 2) that show a cell and have a displacement, the ground they show (n, 3), their centres (n, 2).
+
+    Of the cells that one pixel shows, the nearest one; its ground is where the pixel's ray meets the cell's height.
+    """
+    rows, cols = view.matched.shape
+    scale = 2.0**view.level
+    in_camera = view.before.inverse().apply(cells)
+    at = np.rint((np.nan_to_num(camera.project(in_camera), nan=-1e6) + 0.5) / scale - 0.5).astype(np.intp)
+    ok: Bools = np.asarray(((at >= 0) & (at < [cols, rows])).all(axis=1))
+    ok[ok] &= view.matched[at[ok, 1], at[ok, 0]]
+    at, cells, depth = at[ok], cells[ok], in_camera[ok, 2]
+    order = np.lexsort((depth, at[:, 0], at[:, 1]))
+    flat = (at[:, 1] * cols + at[:, 0])[order]
+    keep = order[np.concatenate([[True], np.diff(flat) != 0])] if len(order) else order
+    centre = (at[keep] + 0.5) * scale - 0.5
+    rays = camera.rays(centre) @ view.before.rotation.T
+    origin = view.before.translation
+    ground = origin + ((cells[keep, 2] - origin[2]) / rays[:, 2])[:, None] * rays
+    return np.asarray(at[keep]), np.asarray(ground), np.asarray(centre)
+
+
+def obstacle(points: Points, wheel: float, p: ReflexParams, before: Floats) -> tuple[Obstacle | None, Floats]:
+    """The largest group of raised points within one wheel's diameter that counts, and what counts if it is seen again.
+
+    ``before`` (n, 2) m, the model's frame: what counted so in the image before.
+    """
+    up, ground = points.place[points.raised], points.ground[points.raised]
+    if len(up) < p.points:
+        return None, np.zeros((0, 2))
+    raised, around = (
+        KDTree(some).query_ball_point(up, 0.5 * wheel, p=np.inf, return_length=True) for some in (up, points.place)
+    )
+    enough = raised >= p.points
+    doubtful = enough & (raised >= p.again_share * around)
+    apart = KDTree(before).query(ground)[0] if len(before) else np.full(len(up), np.inf)
+    counts = enough & (raised >= p.share * around) | doubtful & (apart <= 0.5 * wheel)
+    if not counts.any():
+        return None, ground[doubtful]
+    best = int(np.argmax(np.where(counts, raised, -1)))
+    return Obstacle(int(raised[best]), up[best]), ground[doubtful]
+
+
+def _run(params: ReflexParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+    dem, resect = inputs["dem"], inputs["resect"]
+    vehicle, camera = Vehicle.model_validate(args["vehicle"]), Rig.from_dict(inputs["rig"].meta["rig"]).left
+    T_vehicle_left = RigidTransform.from_matrix(args["T_vehicle_left"])
+    wheel = vehicle.wheel_diameter
+    lattice = Lattice.from_dict(dem.meta["lattice"])
+    surface = Surface.of(np.asarray(dem["elevation"]), lattice, params.blur * wheel)
+    poses = np.asarray(resect["poses"])  # NaN where tracking was lost, which is for the stage safety to judge
+    known = np.isfinite(poses).all(axis=(1, 2))
+    frames = [int(f["frame"]) for f in resect.meta["per_frame"]]
+    raised = np.zeros(len(frames), np.int32)
+    where = np.full((len(frames), 2), np.nan)
+    stop, reason, doubtful = None, "", np.zeros((0, 2))
+    for (i, j), motion in zip(args["pairs"], inputs["motions"], strict=True):
+        if not (known[i] and known[j]):
+            continue
+        ok = matched(np.asarray(motion["validity"]))
+        column, row = np.asarray(motion["column_disparity"]), np.asarray(motion["row_disparity"])
+        first, second = (RigidTransform.from_matrix(poses[k]) for k in (i, j))
+        view = View(first, second, column, row, ok, int(motion.meta["level"]))
+        points = look(view, surface, camera, T_vehicle_left, vehicle, params)
+        found, doubtful = obstacle(points, wheel, params, doubtful)
+        if found is None:
+            continue
+        raised[j], where[j] = found.count, found.place
+        if stop is None:
+            away = 1000.0 * (found.place[1] - 0.5 * vehicle.wheel_base - 0.5 * wheel)
+            stop = j
+            reason = f"obstacle {away:.0f} mm before the wheels: {found.count} points rise above the model"
+    meta = {"stop": stop, "frame": None if stop is None else frames[stop], "reason": reason, "frames": frames}
+    watched = [int(j) for i, j in args["pairs"] if known[i] and known[j]]
+    return Bundle({"raised": raised, "where": where}, meta | {"watched": watched})
+
+
+STAGE = Stage(
+    name="reflex",
+    version=2,
+    summary="obstacles that the last elevation model does not know, seen on the way",
+    params=ReflexParams,
+    inputs=("dem", "resect", "rig", "motions*"),
+    outputs=(
+        Array("raised", ("frame",), "int32", "1", "points of the largest raised group"),
+        Array("where", ("frame", "xy"), "float64", "m", "its place, right and ahead of the vehicle's centre", "nan"),
+    ),
+    run=_run,
+)
+
+
+def pairs(odometry: Floats, wheel: float, p: ReflexParams) -> list[tuple[int, int]]:
+    """Which images of a leg are compared: each with the last one before that is a baseline of way behind it.
+
+    ``odometry`` (frame, 3): x, y (m), heading (rad) by the wheels.
+    """
+    out = []
+    for j in range(1, len(odometry)):
+        for i in range(j - 1, -1, -1):
+            if math.degrees(abs(odometry[j, 2] - odometry[i, 2])) > p.max_turn_deg:
+                break
+            if math.hypot(*(odometry[j, :2] - odometry[i, :2])) >= p.baseline * wheel - 1e-9:
+                out.append((i, j))
+                break
+    return out

@@ -1,0 +1,1 @@
+"""Comparisons with ground truth and with other estimates. No estimate reads them."""

@@ -1,0 +1,257 @@
+"""Trajectory against truth: absolute and relative errors, displacements, drift (section 7.4, Figure 9).
+
+``P_i`` are estimated, ``Q_i`` true poses of the left camera. Frames without an estimate, and frames without truth, are
+counted and left out. Where truth has a gap, its path is taken to be straight, which is the least that it can be.
+
+* ATE: RMS distance of the positions after the best rotation and translation (Umeyama 1991,
+  doi:10.1109/34.88573, without scale), and after making the first poses equal;
+* RPE: ``(Q_i^-1 Q_i+1)^-1 (P_i^-1 P_i+1)`` of successive frames (Sturm et al. 2012, doi:10.1109/IROS.2012.6385773);
+* drift: error of the last position after making the first poses equal, over the true length of the path;
+* KITTI: relative error of all sections of 100, 200 ... 800 m that start every tenth frame, over their length
+  (Geiger et al. 2012, doi:10.1109/CVPR.2012.6248074, and its development kit); not over a gap of the truth.
+
+Relative errors over longer stretches, their causes and the claimed covariances:
+:mod:`stages.evaluation.trajectory_error`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
+from stages.core.errors import InputError
+from stages.evaluation.accuracy_parts import Metric, along, angle, inverse, metric, posed, rms, square
+from stages.evaluation.trajectory_error import against_claims, by_cause, by_shares, by_steps
+from stages.odometry.resection.trajectory import world_poses
+
+Floats = NDArray[np.float64]
+
+KITTI_LENGTHS = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
+KITTI_STEP = 10
+
+
+def trajectory_accuracy(
+    estimate: Floats, truth: Floats, covariance: Floats | None = None
+) -> tuple[dict[str, Floats], dict[str, Metric]]:
+    """Compare an estimated trajectory with the true one.
+
+    Parameters
+    ----------
+    estimate : (frame, 3, 4) T_world_left, metres; NaN where a frame has no pose.
+    truth : (frame, 3, 4) T_truth_left of the same frames; NaN where there is no truth.
+    covariance : (frame, 6, 6) of the estimate in the world, where it claims one; see
+    :mod:`stages.odometry.resection.resect`.
+
+    Returns
+    -------
+    Arrays ``position``, ``position_truth`` (frame, xyz) and ``displacement``, ``displacement_truth`` (step, xyz), all
+    in the world frame (truth brought there by the first frame that has both), and metrics by name.
+
+    Raises
+    ------
+    InputError
+        The numbers of frames differ, no frame has a pose, or none that has one has truth.
+    """
+    if estimate.shape != truth.shape:
+        raise InputError("RIL-300", f"{len(estimate)} estimated and {len(truth)} true poses do not match")
+    has_pose, has_truth = posed(estimate), posed(truth)
+    if not has_pose.any():
+        raise InputError("RIL-301", "no frame has a pose", remedy="see why tracking or resection failed")
+    judged = np.flatnonzero(has_pose & has_truth)
+    if len(judged) == 0:
+        raise InputError("RIL-302", "no frame with a pose has truth", remedy="give truth that covers the chosen frames")
+    P, Q = square(estimate), square(truth)
+    aligned = P[judged[0]] @ inverse(Q[judged[0]]) @ Q
+    arrays = {
+        "position": P[:, :3, 3].copy(),
+        "position_truth": aligned[:, :3, 3].copy(),
+        "displacement": np.diff(P[:, :3, 3], axis=0),
+        "displacement_truth": np.diff(aligned[:, :3, 3], axis=0),
+    }
+    metrics = _counts(has_pose, has_truth)
+    metrics |= _absolute(P[judged], Q[judged], aligned[judged])
+    metrics |= _drift(P, aligned, judged)
+    metrics |= _relative(P, Q)
+    metrics |= _displacement(arrays["displacement"], arrays["displacement_truth"])
+    metrics |= _kitti(P, Q) | by_steps(P, Q) | by_shares(P[judged], Q[judged]) | by_cause(P, Q)
+    if covariance is not None:
+        metrics |= against_claims(P, aligned, covariance)
+    return arrays, metrics
+
+
+def _counts(has_pose: NDArray[np.bool_], has_truth: NDArray[np.bool_]) -> dict[str, Metric]:
+    return {
+        "frames": metric(len(has_pose), "frames", "frames that were to be posed"),
+        "frames_missing": metric(int((~has_pose).sum()), "frames", "of them without a pose"),
+        "frames_without_truth": metric(int((~has_truth).sum()), "frames", "of them without truth, left out"),
+        "frames_judged": metric(int((has_pose & has_truth).sum()), "frames", "of them with a pose and truth"),
+    }
+
+
+def umeyama(source: Floats, target: Floats) -> tuple[Floats, Floats]:
+    """Rotation (3, 3) and translation (3,) that bring points (n, 3) nearest to others in the least-squares sense."""
+    a, b = source.mean(axis=0), target.mean(axis=0)
+    u, _, vt = np.linalg.svd((target - b).T @ (source - a))
+    sign = np.diag([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
+    rotation = u @ sign @ vt
+    return rotation, b - rotation @ a
+
+
+def _absolute(P: Floats, Q: Floats, aligned: Floats) -> dict[str, Metric]:
+    rotation, translation = umeyama(P[:, :3, 3], Q[:, :3, 3])
+    best = P[:, :3, 3] @ rotation.T + translation - Q[:, :3, 3]
+    first = P[:, :3, 3] - aligned[:, :3, 3]
+    return {
+        "ate_rmse": metric(rms(best), "m", "RMS position error after the best rotation and translation, no scale"),
+        "ate_first_frame_rmse": metric(rms(first), "m", "RMS position error with the first poses made equal"),
+        "ate_first_frame_max": metric(
+            float(np.linalg.norm(first, axis=1).max()), "m", "largest position error with the first poses made equal"
+        ),
+    }
+
+
+def _drift(P: Floats, aligned: Floats, judged: NDArray[np.intp]) -> dict[str, Metric]:
+    last = judged[-1]
+    way, gaps = along(aligned[judged[0] : last + 1])
+    length = float(way[-1])
+    error = float(np.linalg.norm(P[last, :3, 3] - aligned[last, :3, 3]))
+    turn = math.degrees(float(angle(inverse(aligned[last]) @ P[last])))
+    percent = 100.0 * error / length if length > 0 else None
+    how = "error of the last position with the first poses made equal"
+    bridged = f", straight over {gaps} gap{'s' if gaps > 1 else ''} of the truth" if gaps else ""
+    return {
+        "path_length": metric(length, "m", f"true length from the first to the last posed frame{bridged}"),
+        "final_error": metric(error, "m", how),
+        "final_rotation_error": metric(turn, "deg", "rotation error of the last pose, first poses made equal"),
+        "drift": metric(
+            percent, "%", f"{how}, over the true length{bridged}" if length > 0 else "the camera did not move"
+        ),
+    }
+
+
+def _relative(P: Floats, Q: Floats) -> dict[str, Metric]:
+    E = inverse(inverse(Q[:-1]) @ Q[1:]) @ (inverse(P[:-1]) @ P[1:])
+    E = E[np.isfinite(E).all(axis=(1, 2))]
+    if len(E) == 0:
+        none = "not applicable: no two successive frames have poses"
+        return {k: metric(None, u, none) for k, u in (("rpe_translation_rmse", "m"), ("rpe_rotation_rmse", "deg"))}
+    shift, turn = np.linalg.norm(E[:, :3, 3], axis=1), np.degrees(angle(E))
+    how = f"of the motion between successive frames, {len(E)} pairs"
+    return {
+        "rpe_translation_rmse": metric(rms(E[:, :3, 3]), "m", f"RMS error {how}"),
+        "rpe_translation_median": metric(float(np.median(shift)), "m", f"median error {how}"),
+        "rpe_translation_max": metric(float(shift.max()), "m", f"largest error {how}"),
+        "rpe_rotation_rmse": metric(float(np.sqrt(np.mean(turn**2))), "deg", f"RMS rotation error {how}"),
+    }
+
+
+def _displacement(estimate: Floats, truth: Floats) -> dict[str, Metric]:
+    """Figure 9: components of the displacement between successive frames in the first levelled camera frame."""
+    error = estimate - truth
+    error = error[np.isfinite(error).all(axis=1)]
+    return {
+        f"displacement_{axis}_rmse": metric(
+            float(np.sqrt(np.mean(error[:, k] ** 2))) if len(error) else None,
+            "m",
+            f"RMS error of the {axis} displacement between successive frames, {len(error)} pairs",
+        )
+        for k, axis in enumerate("xyz")
+    }
+
+
+def _kitti(P: Floats, Q: Floats) -> dict[str, Metric]:
+    way, _ = along(Q)
+    has_truth = np.isfinite(Q[:, 0, 0])
+    errors = []
+    for first in range(0, len(Q), KITTI_STEP):
+        for length in KITTI_LENGTHS:
+            last = int(np.searchsorted(way, way[first] + length, side="right"))
+            if last >= len(Q) or not np.isfinite(P[[first, last]]).all() or not has_truth[first : last + 1].all():
+                continue
+            E = inverse(inverse(P[first]) @ P[last]) @ (inverse(Q[first]) @ Q[last])
+            errors.append((np.linalg.norm(E[:3, 3]) / length, angle(E) / length))
+    if not errors:
+        why = f"not applicable: the true path is {way[-1]:.1f} m long, the shortest section 100 m"
+        if way[-1] > KITTI_LENGTHS[0]:
+            why = "not applicable: no section of 100 m has poses at both ends and truth throughout"
+        return {"kitti_translation": metric(None, "%", why), "kitti_rotation": metric(None, "deg/100 m", why)}
+    shift, turn = np.mean(np.array(errors), axis=0)
+    how = f"mean relative error of {len(errors)} sections of 100-800 m, one set every {KITTI_STEP} frames"
+    return {
+        "kitti_translation": metric(100.0 * float(shift), "%", how),
+        "kitti_rotation": metric(100.0 * math.degrees(float(turn)), "deg/100 m", how),
+    }
+
+
+def angles_between(a: Floats, b: Floats) -> Floats:
+    """Rotation angle (n,), radians, between the orientations of poses (n, 3, 4) and (n, 3, 4)."""
+    return angle(np.swapaxes(a[:, :, :3], 1, 2) @ b[:, :, :3])
+
+
+def by_frame(poses: Floats, frames: list[int], wanted: list[int]) -> Floats:
+    """Poses (frame, 3, 4) of the wanted frames, NaN where there is none."""
+    row = {frame: k for k, frame in enumerate(frames)}
+    out = np.full((len(wanted), 3, 4), np.nan)
+    for k, frame in enumerate(wanted):
+        if frame in row:
+            out[k] = poses[row[frame]]
+    return out
+
+
+def _nothing(estimate: Floats) -> dict[str, Floats]:
+    """What is drawn where no frame can be judged: the estimate alone."""
+    position = estimate[:, :, 3].copy()
+    none = np.full_like(position, np.nan)
+    displacement = np.diff(position, axis=0)
+    return {
+        "position": position,
+        "position_truth": none,
+        "displacement": displacement,
+        "displacement_truth": none[1:].copy(),
+    }
+
+
+def _claimed(trajectory: Bundle, given: list[int], wanted: list[int]) -> Floats | None:
+    """Covariances of the wanted frames, NaN where there is none; None of a trajectory that claims nothing."""
+    if "covariance" not in trajectory.arrays:
+        return None
+    row = {frame: k for k, frame in enumerate(given)}
+    none = np.full((6, 6), np.nan)
+    covariance = np.asarray(trajectory["covariance"])
+    return np.array([covariance[row[f]] if f in row else none for f in wanted])
+
+
+def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+    trajectory, truth = inputs["trajectory"], inputs["truth"]
+    given = list(trajectory.meta["frames"])
+    wanted = given if truth.meta["frames"] is None else list(truth.meta["frames"])
+    poses = world_poses(trajectory, int(args["piece"]) if "piece" in args else None)
+    estimate, true = by_frame(poses, given, wanted), np.asarray(truth["poses"])
+    has_pose, has_truth = posed(estimate), posed(true)
+    if len(estimate) == len(true) and not (has_pose & has_truth).any():
+        arrays, metrics = _nothing(estimate), _counts(has_pose, has_truth)
+    else:
+        claimed = _claimed(trajectory, given, wanted)
+        arrays, metrics = trajectory_accuracy(estimate, true, claimed)
+    return Bundle(arrays, {"metrics": metrics, "frames": wanted, "truth": truth.meta["source"]})
+
+
+STAGE = Stage(
+    name="accuracy",
+    version=4,
+    summary="trajectory against truth: ATE, RPE, displacements, drift, KITTI",
+    params=NoParams,
+    inputs=("trajectory", "truth"),
+    outputs=(
+        Array("position", ("frame", "xyz"), "float64", "m", "estimated position", "nan", "world"),
+        Array("position_truth", ("frame", "xyz"), "float64", "m", "true position, first poses equal", "nan", "world"),
+        Array("displacement", ("step", "xyz"), "float64", "m", "estimated displacement per frame", "nan", "world"),
+        Array("displacement_truth", ("step", "xyz"), "float64", "m", "true displacement per frame", "nan", "world"),
+    ),
+    run=_run,
+)

@@ -1,0 +1,236 @@
+"""Trajectory against the crosscheck's: how far apart two independent answers are, frame by frame.
+
+The crosscheck's poses are laid on ours by one rotation and translation, without scale (each unbroken piece by its
+own); what remains is the disagreement. It does not say who is wrong, but where the two part, one of them is. What both
+share, the given calibration, it cannot judge: a wrong baseline stretches both alike.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from stages.core.declare import AnyArray, Array, Bundle, Inputs, Params, Stage
+from stages.evaluation.accuracy import angles_between, by_frame
+from stages.evaluation.accuracy_parts import Metric, metric, posed
+from stages.evaluation.pose_alignment import align, moved, spread
+
+Floats = NDArray[np.float64]
+
+ORIENTATION_SHARE = 0.1
+"""Positions decide the alignment, as in an absolute trajectory error; orientations only where positions cannot."""
+
+REST = 10.0
+"""Spread of the positions over the noise of a step, below which a camera rests: its positions tell no direction."""
+
+REASONS: Mapping[str, tuple[int, str]] = {
+    "distance": (1, "position"),
+    "angle": (2, "rotation"),
+    "step_distance": (4, "motion since the frame before"),
+    "step_angle": (8, "rotation since the frame before"),
+}
+"""Disagreements by array: bit of ``flagged``, and the reason in words."""
+
+
+class AgreementParams(Params):
+    """When a frame is flagged."""
+
+    threshold: float = Field(
+        default=5.0,
+        gt=0,
+        description="robust standard deviations (1.4826 MAD) above the median at which a frame is flagged; drift is no "
+        "bell curve, hence more than the usual 3",
+    )
+    least_ratio: float = Field(
+        default=2.0, ge=1, description="multiple of the median below which nothing is flagged, however uniform the rest"
+    )
+    least_angle_deg: float = Field(
+        default=0.05, ge=0, description="degrees below which no rotation is flagged; a pixel at a focal length of 1100"
+    )
+
+
+def compare(ours: Floats, theirs: Floats, piece: NDArray[np.integer[Any]]) -> tuple[dict[str, Floats], dict[str, Any]]:
+    """Disagreement of two trajectories.
+
+    Parameters
+    ----------
+    ours : (frame, 3, 4) T_world_left, m; NaN where a frame has no pose.
+    theirs : (frame, 3, 4) T_piece_left of the same frames.
+    piece : (frame,) piece that a frame of ``theirs`` belongs to, -1 where it has none.
+
+    Returns
+    -------
+    Arrays ``poses`` (frame, 3, 4): theirs in the world; ``distance`` m, ``angle`` rad of each frame; ``step_distance``
+    m, ``step_angle`` rad of the motion since the frame before. NaN where not both have poses, or a piece shares fewer
+    than two frames with us. Facts: ``scale_ratio``, the scale that would fit theirs to ours best (None for a camera
+    at rest, whose orientations alone align it), and ``rmse_scaled_m`` with it.
+    """
+    n = len(ours)
+    arrays = {name: np.full(n, np.nan) for name in REASONS} | {"poses": np.full((n, 3, 4), np.nan)}
+    there, cross, square, left = posed(ours), 0.0, 0.0, []
+    for number in range(int(piece.max(initial=-1)) + 1):
+        rows = np.flatnonzero(there & (piece == number))
+        if len(rows) < 2:
+            continue
+        _steps(arrays, ours, theirs, rows)
+        rests = _at_rest(ours[rows], arrays["step_distance"][rows])
+        laid = moved(theirs, *align(theirs[rows], ours[rows], math.inf if rests else ORIENTATION_SHARE))
+        arrays["poses"][piece == number] = laid[piece == number]
+        arrays["distance"][rows] = np.linalg.norm(laid[rows, :, 3] - ours[rows, :, 3], axis=1)
+        arrays["angle"][rows] = angles_between(laid[rows], ours[rows])
+        a, b = (p[rows, :, 3] - p[rows, :, 3].mean(axis=0) for p in (laid, ours))
+        if not rests:
+            cross, square = cross + float(np.sum(a * b)), square + float(np.sum(a * a))
+            left.append((a, b))
+    scale = cross / square if square > 0 and cross > 0 else None
+    rest = np.concatenate([b - scale * a for a, b in left]) if scale is not None else None
+    scaled = None if rest is None else float(np.sqrt(np.mean(np.sum(rest**2, axis=1))))
+    return arrays, {"scale_ratio": scale, "rmse_scaled_m": scaled}
+
+
+def _at_rest(poses: Floats, step_distance: Floats) -> bool:
+    """Whether all positions lie within what the two trajectories differ by from step to step."""
+    known = step_distance[np.isfinite(step_distance)]
+    return bool(known.size and spread(poses) < REST * np.sqrt(np.mean(known**2)))
+
+
+def _steps(arrays: dict[str, Floats], ours: Floats, laid: Floats, rows: NDArray[np.intp]) -> None:
+    """Disagreement of the motions from frame to frame, in place; in the frame before, so free of the alignment."""
+    second = rows[1:][np.diff(rows) == 1]
+    moves = []
+    for poses in (ours, laid):
+        R = np.swapaxes(poses[second - 1, :, :3], 1, 2)
+        shift = R @ (poses[second, :, 3] - poses[second - 1, :, 3])[:, :, None]
+        moves.append(np.concatenate([R @ poses[second, :, :3], shift], axis=2))
+    arrays["step_distance"][second] = np.linalg.norm(moves[0][:, :, 3] - moves[1][:, :, 3], axis=1)
+    arrays["step_angle"][second] = angles_between(moves[0], moves[1])
+
+
+def flag(arrays: Mapping[str, Floats], params: AgreementParams) -> tuple[NDArray[np.uint8], dict[str, float | None]]:
+    """Bits of :data:`REASONS` for each frame that stands out, and the limit of each disagreement (None: no values).
+
+    The limit is the median plus ``threshold`` robust standard deviations, at least ``least_ratio`` medians, and for
+    rotations at least ``least_angle_deg``.
+    """
+    flags = np.zeros(len(arrays["distance"]), np.uint8)
+    limits: dict[str, float | None] = {}
+    for name, (bit, _) in REASONS.items():
+        values = arrays[name][np.isfinite(arrays[name])]
+        if values.size == 0:
+            limits[name] = None
+            continue
+        median = float(np.median(values))
+        sigma = 1.4826 * float(np.median(np.abs(values - median)))
+        least = math.radians(params.least_angle_deg) if "angle" in name else 1e-9  # rounding is no reason
+        limit = max(median + params.threshold * sigma, params.least_ratio * median, least)
+        limits[name] = limit
+        with np.errstate(invalid="ignore"):
+            flags[arrays[name] > limit] |= np.uint8(bit)
+    return flags, limits
+
+
+def unbroken(theirs: NDArray[np.int64], ours: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Pieces (frame,) that are unbroken in both trajectories, -1 where the other program has none.
+
+    A frame that we lost counts to our piece before it, so that the other program's pose of it is shown.
+    """
+    posed = np.flatnonzero(ours >= 0)
+    if not posed.size:
+        return theirs
+    before = posed[np.maximum(np.searchsorted(posed, np.arange(len(ours)), side="right") - 1, 0)]
+    both = np.stack([theirs, ours[before]])
+    known = theirs >= 0
+    piece = np.full(len(theirs), -1, dtype=np.int64)
+    piece[known] = np.unique(both[:, known], axis=1, return_inverse=True)[1].reshape(-1)
+    return piece
+
+
+def _metrics(arrays: Mapping[str, Floats], facts: Mapping[str, Any], length: float) -> dict[str, Metric]:
+    def rms(name: str) -> float | None:
+        values = arrays[name][np.isfinite(arrays[name])]
+        return float(np.sqrt(np.mean(values**2))) if values.size else None
+
+    distance, angle, step, step_angle = (rms(name) for name in REASONS)
+    after = "after one rotation and translation, no scale"
+    return {
+        "rmse": metric(distance, "m", f"RMS disagreement of positions {after}"),
+        "rmse_rotation": metric(_degrees(angle), "deg", f"RMS disagreement of orientations {after}"),
+        "step_rmse": metric(step, "m", "RMS disagreement of the motion between successive frames"),
+        "step_rmse_rotation": metric(_degrees(step_angle), "deg", "the same, rotation"),
+        "length": metric(length, "m", "length of our trajectory over the compared frames"),
+        "share": metric(
+            100.0 * distance / length if distance is not None and length > 0 else None, "%", "rmse over the length"
+        ),
+        "scale_ratio": metric(
+            facts["scale_ratio"], "1", "scale that would fit the crosscheck to ours best; 1 where both agree"
+        ),
+        "rmse_scaled": metric(facts["rmse_scaled_m"], "m", "RMS disagreement of positions with that scale"),
+    }
+
+
+def _degrees(angle: float | None) -> float | None:
+    return None if angle is None else math.degrees(angle)
+
+
+def _run(params: AgreementParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+    trajectory, other = inputs["trajectory"], inputs["crosscheck"]
+    frames, given = [int(f) for f in trajectory.meta["frames"]], [int(f) for f in other.meta["frames"]]
+    ours, theirs = np.asarray(trajectory["poses"]), by_frame(np.asarray(other["piece_poses"]), given, frames)
+    number = dict(zip(given, np.asarray(other["piece"]).tolist(), strict=True))
+    piece = np.array([number.get(f, -1) for f in frames], dtype=np.int64)
+    if "piece" in trajectory.arrays:
+        piece = unbroken(piece, np.asarray(trajectory["piece"], dtype=np.int64))
+    arrays, facts = compare(ours, theirs, piece)
+    flags, limits = flag(arrays, params)
+    compared = np.isfinite(arrays["distance"])
+    positions = ours[compared, :, 3]
+    length = float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
+    meta = {
+        "frames": frames,
+        "compared": int(compared.sum()),
+        "not_compared": [f for f, ok in zip(frames, compared, strict=True) if not ok],
+        "pieces": len(other.meta["pieces"]),
+        "metrics": _metrics(arrays, facts, length),
+        "rule": f"disagreement above the median by more than {params.threshold:g} robust standard deviations "
+        f"(1.4826 MAD), and above {params.least_ratio:g} medians; in position, rotation (from "
+        f"{params.least_angle_deg:g}° on), or the motion since the frame before",
+        "limits": {n: v if v is None or "angle" not in n else math.degrees(v) for n, v in limits.items()},
+        "limits_unit": {n: "deg" if "angle" in n else "m" for n in limits},
+        "flagged": [
+            {"frame": f, "why": [word for bit, word in REASONS.values() if bits & bit]}
+            for f, bits in zip(frames, flags.tolist(), strict=True)
+            if bits
+        ],
+    }
+    out: dict[str, AnyArray] = {
+        **arrays,
+        "position": ours[:, :, 3].copy(),
+        "position_crosscheck": arrays["poses"][:, :, 3].copy(),
+        "flagged": flags,
+    }
+    return Bundle(out, meta | facts)
+
+
+STAGE = Stage(
+    name="agreement",
+    version=2,
+    summary="trajectory against the crosscheck's",
+    params=AgreementParams,
+    inputs=("trajectory", "crosscheck"),
+    outputs=(
+        Array("poses", ("frame", "row", "col"), "float64", "m", "crosscheck's poses in the world", "nan", "world"),
+        Array("position", ("frame", "xyz"), "float64", "m", "position, ours", "nan", "world"),
+        Array("position_crosscheck", ("frame", "xyz"), "float64", "m", "position, crosscheck", "nan", "world"),
+        Array("distance", ("frame",), "float64", "m", "disagreement in position", "nan"),
+        Array("angle", ("frame",), "float64", "rad", "disagreement in rotation", "nan"),
+        Array("step_distance", ("frame",), "float64", "m", "disagreement in the motion since the frame before", "nan"),
+        Array("step_angle", ("frame",), "float64", "rad", "the same, rotation", "nan"),
+        Array("flagged", ("frame",), "uint8", "1", "bits: 1 position, 2 rotation, 4 motion, 8 rotation of a step"),
+    ),
+    run=_run,
+)

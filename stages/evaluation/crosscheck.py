@@ -1,0 +1,321 @@
+"""Camera poses by another program, for comparison: structure from motion by COLMAP over a window of stereo frames.
+
+Nothing of the chain enters. Features, verification of matches, registration, triangulation and bundle adjustment are
+pycolmap's (Schönberger & Frahm 2016, doi:10.1109/CVPR.2016.445; SIFT, Lowe 2004,
+doi:10.1023/B:VISI.0000029664.99615.94). What both share is the given calibration: the two cameras are one rig whose
+relative pose and intrinsics are held, so that the scale is metric. Everything runs in memory, on one thread and with
+given seeds, so that the same images give the same bytes.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from stages.core.declare import Array, Bundle, Inputs, Memory, Params, Stage
+from stages.geometry.geometry import Camera, Rig
+
+PIXEL_CENTRE = 0.5
+"""COLMAP puts the centre of the first pixel at (0.5, 0.5), we at (0, 0)."""
+
+UNIT_BYTES = 512.0
+"""Length of COLMAP's byte descriptors."""
+
+MASK_SCALES = 3.0
+"""A feature is dropped where the mask comes nearer than so many of its scales: it would be the mask's edge."""
+
+MIN_MATCHES = 15
+"""COLMAP's own limit for a pair of images to count."""
+
+
+class CrosscheckParams(Params):
+    """Parameters of the second opinion on the trajectory."""
+
+    enabled: bool = Field(default=True, description="compute poses by COLMAP too, and compare")
+    window: int = Field(
+        default=30,
+        ge=2,
+        description="frames adjusted together; the time of an adjustment grows faster than their number",
+    )
+    overlap: int = Field(default=6, ge=1, description="frames that successive windows share; they tie them together")
+    span: int = Field(default=3, ge=1, description="a frame is matched with so many following ones, in either camera")
+    max_features: int = Field(
+        default=2000, ge=100, description="positions of features an image, the largest first; matching is quadratic"
+    )
+    max_image_size: int = Field(
+        default=1400, ge=64, description="longer side in px to which larger images are reduced for the features"
+    )
+    first_octave: int = Field(
+        default=0,
+        ge=-1,
+        le=3,
+        description="-1 doubles the image: on a street an eighth nearer to the truth, at eight times the time",
+    )
+    init_min_tri_angle: float = Field(
+        default=1.0,
+        gt=0,
+        lt=90,
+        description="angle between the first two rays, degrees; COLMAP's 16 rejects every start of a forward drive",
+    )
+    seed: int = Field(default=0, ge=0, description="seed of all random sampling in COLMAP")
+
+    @model_validator(mode="after")
+    def _windows_advance(self) -> CrosscheckParams:
+        if self.overlap >= self.window:
+            raise ValueError(f"overlap {self.overlap} must be less than window {self.window}")
+        return self
+
+
+@dataclass(frozen=True)
+class Features:
+    """Of one image: ``points`` (n, 2) float64 column, row as COLMAP counts; ``descriptors`` (n, 128) float32, bytes."""
+
+    points: NDArray[np.float64]
+    descriptors: NDArray[np.float32]
+
+
+def windows(frames: Sequence[int], params: CrosscheckParams) -> list[list[int]]:
+    """Frames of each window, in order: as few as possible of at most ``window`` frames, all of nearly equal length."""
+    n, most, shared = len(frames), params.window, params.overlap
+    if n <= most:
+        return [list(frames)]
+    count = -(-(n - shared) // (most - shared))
+    edges = [k * (n - shared) // count for k in range(count + 1)]
+    return [list(frames[a : b + shared]) for a, b in itertools.pairwise(edges)]
+
+
+def grey_bytes(image: NDArray[Any]) -> NDArray[np.uint8]:
+    """Image (row, col) as uint8: uint16 is divided by 257, floats of 0..255 are rounded."""
+    if image.dtype == np.uint8:
+        return np.ascontiguousarray(image)
+    grey = image / 257.0 if image.dtype == np.uint16 else image
+    return np.clip(np.rint(np.nan_to_num(grey)), 0, 255).astype(np.uint8)
+
+
+def extract(image: NDArray[Any], valid: NDArray[Any], params: CrosscheckParams) -> Features:
+    """SIFT features of an image (row, col) where ``valid`` (row, col) is not 0."""
+    import pycolmap
+
+    height, width = image.shape
+    grey = grey_bytes(image)
+    reduction = max(width, height) / params.max_image_size
+    if reduction > 1:
+        size = (max(1, round(width / reduction)), max(1, round(height / reduction)))
+        grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+    keypoints, descriptors = _extractor(params).extract_from_uint8_array(grey)
+    if len(keypoints) == 0:
+        return Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32))
+    table = np.asarray(pycolmap.keypoints_to_matrix(keypoints), dtype=np.float64)
+    factor = np.array([width / grey.shape[1], height / grey.shape[0]])
+    points = table[:, :2] * factor
+    scale = table[:, 2] * factor[0]
+    keep = _away_from_mask(points, scale, valid)
+    return Features(points[keep], np.asarray(descriptors.data, np.float32)[keep])
+
+
+def _extractor(params: CrosscheckParams) -> Any:
+    import pycolmap
+
+    options = pycolmap.FeatureExtractionOptions()
+    options.use_gpu, options.num_threads = False, 1
+    options.sift.max_num_features, options.sift.first_octave = params.max_features, params.first_octave
+    return pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
+
+
+def _away_from_mask(points: NDArray[np.float64], scale: NDArray[np.float64], valid: NDArray[Any]) -> NDArray[np.bool_]:
+    if np.all(valid):
+        return np.ones(len(points), bool)
+    distance = cv2.distanceTransform((valid != 0).astype(np.uint8), cv2.DIST_L2, 5)
+    cols, rows = np.floor(points).astype(np.intp).T
+    inside = distance[np.clip(rows, 0, valid.shape[0] - 1), np.clip(cols, 0, valid.shape[1] - 1)]
+    return np.asarray(inside > MASK_SCALES * scale)
+
+
+def match(a: Features, b: Features, max_ratio: float = 0.8, max_distance: float = 0.7) -> NDArray[np.uint32]:
+    """Indices (m, 2) of matching features: nearest in both directions, and clearly nearer than the second.
+
+    The criteria and defaults are those of COLMAP's matcher, angles between descriptors in radians. Products of bytes
+    summed over 128 stay below 2**24 and are thus exact in float32, in any order of summation; a matrix product is
+    some ten times faster than COLMAP's loops.
+    """
+    if min(len(a.points), len(b.points)) == 0:
+        return np.zeros((0, 2), np.uint32)
+    forward = _nearest(a.descriptors @ b.descriptors.T, max_ratio, max_distance)
+    rows = np.flatnonzero(forward >= 0)
+    wanted, place = np.unique(forward[rows], return_inverse=True)
+    backward = _nearest(b.descriptors[wanted] @ a.descriptors.T, max_ratio, max_distance)
+    rows = rows[backward[place] == rows]
+    return np.stack([rows, forward[rows]], axis=1).astype(np.uint32)
+
+
+def _nearest(products: NDArray[np.float32], max_ratio: float, max_distance: float) -> NDArray[np.intp]:
+    """Column of the nearest descriptor of each row, -1 where there is no clear one; spoils ``products``."""
+    rows = np.arange(len(products))
+    best = products.argmax(axis=1)
+    first = products[rows, best]
+    products[rows, best] = -1.0
+    second = np.maximum(products.max(axis=1), 0.0)
+    near, next_near = (np.arccos(np.minimum(p / UNIT_BYTES**2, 1.0)) for p in (first, second))
+    return np.where((near <= max_distance) & (near < max_ratio * next_near), best, -1)
+
+
+def image_pairs(frames: int, span: int) -> list[tuple[int, int]]:
+    """Image numbers to match: left with right of a frame, and each camera with itself over ``span`` frames.
+
+    Image ``2 k + 1`` is the left one of frame k, ``2 k + 2`` the right one. Left against right of *other* frames is
+    left out: it takes time and adds no accuracy.
+    """
+    pairs = []
+    for k in range(frames):
+        pairs.append((2 * k + 1, 2 * k + 2))
+        for j in range(k + 1, min(k + span, frames - 1) + 1):
+            pairs += [(2 * k + 1, 2 * j + 1), (2 * k + 2, 2 * j + 2)]
+    return pairs
+
+
+def _run(params: CrosscheckParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+    import pycolmap
+
+    frames, rig = [int(f) for f in args["frames"]], Rig.from_dict(args["rig"])
+    pycolmap.logging.minloglevel = 3  # fatal: what goes wrong is said by the result
+    bundles = itertools.chain.from_iterable(zip(inputs["left"], inputs["right"], strict=True))
+    features = [extract(np.asarray(b["image"]), np.asarray(b["valid"]), params) for b in bundles]
+    with pycolmap.Database.open(":memory:") as database:
+        cameras = _write_rig(database, rig)
+        verified = _write_frames(database, cameras, features, params)
+        models = _map(database, params) if verified else []
+    poses, observations = np.full((len(frames), 3, 4), np.nan), np.zeros(len(frames), np.int32)
+    meta: dict[str, Any] = {
+        "frames": frames,
+        "features": float(np.median([len(f.points) for f in features])),
+        "pairs": len(image_pairs(len(frames), params.span)),
+        "pairs_verified": verified,
+        "models": len(models),
+        "points": 0,
+        "observations": 0,
+        "reprojection_px": None,
+    }
+    if models:
+        best = max(models, key=lambda m: m.num_reg_frames())
+        _read(best, poses, observations)
+        meta["points"], meta["observations"] = int(best.num_points3D()), int(observations.sum())
+        meta["reprojection_px"] = float(best.compute_mean_reprojection_error())
+    registered = np.isfinite(poses).all(axis=(1, 2))
+    meta["registered"] = int(registered.sum())
+    meta["unregistered"] = [f for f, ok in zip(frames, registered, strict=True) if not ok]
+    meta["reason"] = "" if models else _why(meta)
+    return Bundle({"poses": poses, "registered": registered.astype(np.uint8), "observations": observations}, meta)
+
+
+def _why(meta: Mapping[str, Any]) -> str:
+    if meta["pairs_verified"] == 0:
+        return f"no two images match (median {meta['features']:.0f} features an image)"
+    return f"{meta['pairs_verified']} of {meta['pairs']} image pairs match, but no two images start a model"
+
+
+def _write_rig(database: Any, rig: Rig) -> list[Any]:
+    import pycolmap
+
+    cameras = [_camera(number, camera) for number, camera in ((1, rig.left), (2, rig.right))]
+    for camera in cameras:
+        database.write_camera(camera, use_camera_id=True)
+    pose = rig.T_right_left
+    body = pycolmap.Rig(rig_id=1)
+    body.add_ref_sensor(cameras[0].sensor_id)
+    body.add_sensor(
+        cameras[1].sensor_id, pycolmap.Rigid3d(pycolmap.Rotation3d(np.array(pose.rotation)), np.array(pose.translation))
+    )
+    database.write_rig(body, use_rig_id=True)
+    return cameras
+
+
+def _camera(number: int, camera: Camera) -> Any:
+    import pycolmap
+
+    values = [camera.fx, camera.fy, camera.cx + PIXEL_CENTRE, camera.cy + PIXEL_CENTRE]
+    out = pycolmap.Camera(model="PINHOLE", width=camera.width, height=camera.height, params=values, camera_id=number)
+    out.has_prior_focal_length = True
+    return out
+
+
+def _write_frames(database: Any, cameras: list[Any], features: list[Features], params: CrosscheckParams) -> int:
+    """Features and verified matches to the database; the number of image pairs that match."""
+    import pycolmap
+
+    for k in range(len(features) // 2):
+        frame = pycolmap.Frame(frame_id=k + 1, rig_id=1)
+        for side, camera in enumerate(cameras):
+            number = 2 * k + side + 1
+            image = pycolmap.Image(name=f"{k:06d}/{side}", camera_id=side + 1, image_id=number)
+            database.write_image(image, use_image_id=True)
+            database.write_keypoints(number, features[number - 1].points.astype(np.float32))
+            frame.add_data_id(pycolmap.data_t(camera.sensor_id, number))
+        database.write_frame(frame, use_frame_id=True)
+    options = pycolmap.TwoViewGeometryOptions()
+    options.ransac.random_seed, options.ransac.num_threads = params.seed, 1
+    options.detect_watermark = False
+    verified = 0
+    for i, j in image_pairs(len(features) // 2, params.span):
+        a, b = features[i - 1], features[j - 1]
+        matches = match(a, b)
+        if len(matches) < MIN_MATCHES:
+            continue
+        geometry = pycolmap.estimate_two_view_geometry(
+            cameras[(i - 1) % 2], a.points, cameras[(j - 1) % 2], b.points, matches, options
+        )
+        database.write_matches(i, j, matches)
+        database.write_two_view_geometry(i, j, geometry)
+        verified += len(geometry.inlier_matches) >= MIN_MATCHES
+    return verified
+
+
+def _map(database: Any, params: CrosscheckParams) -> list[Any]:
+    """Incremental mapping with the rig and all intrinsics held."""
+    import pycolmap
+
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads = options.mapper.num_threads = 1
+    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = params.seed
+    options.ba_refine_focal_length = options.ba_refine_principal_point = False
+    options.ba_refine_extra_params = options.ba_refine_sensor_from_rig = False
+    options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
+    options.mapper.init_min_tri_angle = params.init_min_tri_angle
+    options.min_model_size, options.extract_colors = 2, False
+    pycolmap.set_random_seed(params.seed)
+    manager = pycolmap.ReconstructionManager()
+    pycolmap.IncrementalPipeline(options, database, manager).run()
+    return [manager.get(k) for k in range(manager.size())]
+
+
+def _read(model: Any, poses: NDArray[np.float64], observations: NDArray[np.int32]) -> None:
+    """Poses in the left camera frame of the first registered frame, and observations a frame, in place."""
+    numbers = sorted(model.reg_frame_ids())
+    first = model.frame(numbers[0]).rig_from_world
+    for number in numbers:
+        pose = first * model.frame(number).rig_from_world.inverse()
+        poses[number - 1] = pose.matrix()
+        images = (2 * number - 1, 2 * number)
+        observations[number - 1] = sum(int(model.image(i).num_points3D) for i in images if model.exists_image(i))
+
+
+STAGE = Stage(
+    name="crosscheck",
+    version=1,
+    summary="poses of a window of frames by COLMAP, for comparison",
+    params=CrosscheckParams,
+    inputs=("left*", "right*"),
+    outputs=(
+        Array("poses", ("frame", "row", "col"), "float64", "m", "pose [R | t] of the left camera", "nan", "window"),
+        Array("registered", ("frame",), "uint8", "1", "1 = the frame has a pose"),
+        Array("observations", ("frame",), "int32", "1", "adjusted image points of the frame, both cameras"),
+    ),
+    run=_run,
+    memory=Memory(factor=10.0, result=0.0, lower=("crosscheck.window", "crosscheck.max_image_size")),
+)

@@ -1,0 +1,93 @@
+"""Elevation model against truth: error and completeness together, so that leaving out hard cells is no progress.
+
+Truth is given in the frame of the model, by the true pose of the camera that carries it: a vertical that is off is no
+part of these errors, and stands beside them (``tilt``). Judged are the cells that both cameras see.
+NMAD = 1.4826 median(\\|e - median(e)\\|) is the robust standard deviation (Hoehle and Hoehle 2009,
+doi:10.1016/j.isprsjprs.2009.02.003).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
+from stages.core.errors import InputError
+from stages.evaluation.accuracy_parts import Metric, metric
+from stages.geometry.lattice import Lattice, mosaic
+
+
+def dem_accuracy(
+    elevation: NDArray[np.float32], truth: NDArray[np.float32], judged: NDArray[np.bool_]
+) -> dict[str, Metric]:
+    """Metrics by name.
+
+    Parameters
+    ----------
+    elevation, truth : (row, col) metres, NaN unknown.
+    judged : (row, col) the cells that count: seen by both cameras, and in the window.
+    """
+    judged = judged & np.isfinite(truth)
+    wanted = int(judged.sum())
+    error = (elevation.astype(np.float64) - truth)[judged]
+    error = error[np.isfinite(error)]
+    how = f"{len(error)} of {wanted} cells that both cameras see"
+    some = len(error) > 0
+    size = np.abs(error)
+    return {
+        "rmse": metric(float(np.sqrt(np.mean(error**2))) if some else None, "m", f"RMS elevation error, {how}"),
+        "nmad": metric(
+            1.4826 * float(np.median(np.abs(error - np.median(error)))) if some else None,
+            "m",
+            f"1.4826 times the median deviation from the median error, {how}",
+        ),
+        "p95": metric(float(np.percentile(size, 95)) if some else None, "m", f"95 % of the errors are smaller, {how}"),
+        "bias": metric(float(np.mean(error)) if some else None, "m", f"mean elevation error, {how}"),
+        "completeness": metric(len(error) / wanted if wanted else None, "1", f"share given: {how}"),
+    }
+
+
+def in_window(lattice: Lattice, window: Sequence[float] | None) -> NDArray[np.bool_]:
+    """Cells (row, col) whose centres lie in a window x_min, y_min, x_max, y_max, metres; all without one."""
+    if window is None:
+        return np.ones(lattice.shape, dtype=bool)
+    x_min, y_min, x_max, y_max = window
+    slack = 1e-6 * lattice.cell
+    x, y = lattice.xs(), lattice.ys()
+    inside_x = (x >= x_min - slack) & (x <= x_max + slack)
+    inside_y = (y >= y_min - slack) & (y <= y_max + slack)
+    return inside_y[:, None] & inside_x[None]
+
+
+def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+    truth: Bundle = inputs["truth"]
+    lattice = Lattice.from_dict(truth.meta["lattice"])
+    parts = [(Lattice.from_dict(dem.meta["lattice"]), np.asarray(dem["elevation"])) for dem in inputs["dem"]]
+    if not parts:
+        raise InputError("RIL-320", "no elevation model to compare with truth")
+    elevation = mosaic(parts, np.nan, lattice)
+    true = np.asarray(truth["elevation"])
+    judged = (np.asarray(truth["seen"]) != 0) & in_window(lattice, args.get("window"))
+    error = (elevation - true).astype(np.float32)
+    metrics = dem_accuracy(elevation, true, judged)
+    unseen = np.isfinite(elevation) & (np.asarray(truth["seen"]) == 0) & in_window(lattice, args.get("window"))
+    metrics["unseen"] = metric(int(unseen.sum()), "cells", "cells given that not both cameras see")
+    if "tilt_deg" in truth.meta:
+        how = "between the vertical of the model and the true one; the errors of elevation are against the tilted truth"
+        metrics["tilt"] = metric(float(truth.meta["tilt_deg"]), "deg", how)
+    meta = {"lattice": lattice.to_dict(), "window": args.get("window"), "metrics": metrics}
+    return Bundle({"error": error}, meta)
+
+
+STAGE = Stage(
+    name="dem_accuracy",
+    version=2,
+    summary="elevation model against truth: RMSE, NMAD, 95 %, bias and completeness",
+    params=NoParams,
+    inputs=("dem*", "truth"),
+    outputs=(Array("error", ("row", "col"), "float32", "m", "elevation minus truth", "nan"),),
+    run=_run,
+)

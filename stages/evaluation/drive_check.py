@@ -1,0 +1,100 @@
+"""A drive against the truth: how the wheels truly stood, how far the position was off, how long the way was.
+
+Each placement of the simulation (a few millimetres apart), however the drive ended, is judged against the vehicle's
+limits: a belly that strikes, a tilt beyond ``max_slope_deg``, a wheel on an edge above ``max_step``. What a drive that
+failed did not come to know, its positions or a way, is left out. Positions are compared after making the first
+pose equal, as everywhere (:mod:`stages.evaluation.accuracy`). The shortest way is the planner's on the exact
+elevations; where its margin, which is for what a vehicle does not know, closes every one, it is that within the limits
+alone.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
+from stages.evaluation.accuracy_parts import Metric, inverse, metric, square
+
+Floats = NDArray[np.float64]
+
+
+def judged(drive: Mapping[str, Any], row: int) -> dict[str, Floats]:
+    """What a drive to the image of this row (-1: the last one) has of placements."""
+    end = int(np.asarray(drive["frame_at"])[row]) + 1
+    return {name: np.asarray(drive[name])[:end] for name in ("trail", "tilt", "clearance", "step")}
+
+
+def placements(parts: Sequence[Mapping[str, Floats]], vehicle: Mapping[str, Any]) -> dict[str, Metric]:
+    """Violations by the true placements of all legs; each part has ``trail``, ``tilt``, ``clearance`` and ``step``."""
+    tilt, clearance, step = (np.concatenate([p[name] for p in parts]) for name in ("tilt", "clearance", "step"))
+    truly = "by the true placement of the wheels on the exact ground"
+    steepest, edge = math.radians(vehicle["max_slope_deg"]), vehicle["max_step"]
+    return {
+        "placements": metric(len(tilt), "placements", "of the vehicle along its true way that were judged"),
+        "clearance_violations": metric(int((clearance < 0).sum()), "placements", f"belly strikes the ground, {truly}"),
+        "tilt_violations": metric(int((tilt > steepest).sum()), "placements", f"tilt beyond max_slope_deg, {truly}"),
+        "step_violations": metric(
+            int((step > edge).sum()), "placements", f"a wheel on an edge above max_step, {truly}"
+        ),
+        "least_clearance": metric(float(clearance.min()), "m", f"under the belly, {truly}"),
+        "greatest_tilt": metric(float(np.degrees(tilt.max())), "deg", truly),
+        "greatest_step": metric(float(step.max()), "m", f"under a wheel, {truly}"),
+    }
+
+
+def way(parts: Sequence[Mapping[str, Floats]]) -> float:
+    """Length of the true way seen from above, m."""
+    return float(sum(np.hypot(*np.diff(p["trail"][:, :2, 3], axis=0).T).sum() for p in parts))
+
+
+def localisation(estimate: Floats, truth: Floats, length: float) -> tuple[Floats, dict[str, Metric]]:
+    """Error (frame,) m of the positions (frame, 3, 4), and the one at the end."""
+    P, Q = square(estimate), square(truth)
+    error = np.linalg.norm(P[:, :3, 3] - (P[0] @ inverse(Q[0]) @ Q)[:, :3, 3], axis=1)
+    last = float(error[-1])
+    how = "of the last position, after making the first poses equal"
+    return error, {
+        "localisation_error": metric(last, "m", how),
+        "localisation_share": metric(last / length if length > 0 else None, "1", f"{how}, over the true way"),
+        "greatest_error": metric(float(error.max()), "m", "of any position, after making the first poses equal"),
+    }
+
+
+def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+    parts = [judged(drive, int(row)) for drive, row in zip(inputs["drives"], args["rows"], strict=True)]
+    length, error = way(parts), np.zeros(0)
+    metrics = placements(parts, args["vehicle"])
+    metrics["way"] = metric(length, "m", "true way of the vehicle, seen from above")
+    facts: dict[str, Any] = {"metrics": metrics, "stops": len(parts), "path_exists": None, "with_margin": None}
+    if "trajectory" in inputs:
+        estimate, truth = (np.asarray(inputs[port]["poses"]) for port in ("trajectory", "truth"))
+        error, found = localisation(estimate, truth, length)
+        metrics |= found
+    if "best" in inputs:
+        best = inputs["best"].meta
+        shortest, margin = best["shortest_m"], best["shortest_margin_m"]
+        room = "with the vehicle's margin" if margin else "within its limits, but without its margin"
+        how = f"from start to goal over the risk map of the exact elevations, {room}"
+        metrics["shortest_way"] = metric(shortest, "m", how)
+        facts |= {"path_exists": shortest is not None, "with_margin": bool(shortest is not None and margin > 0)}
+    T = np.concatenate([p["trail"] for p in parts])
+    return Bundle({"error": error, "way": T[:, :, 3].copy()}, facts)
+
+
+STAGE = Stage(
+    name="drive_check",
+    version=3,
+    summary="a drive against the truth: placements, localisation, length",
+    params=NoParams,
+    inputs=("drives*", "trajectory?", "truth?", "best?"),
+    outputs=(
+        Array("error", ("frame",), "float64", "m", "distance of the estimated from the true position"),
+        Array("way", ("position", "xyz"), "float64", "m", "true position of the vehicle on the ground", frame="truth"),
+    ),
+    run=_run,
+)

@@ -1,0 +1,131 @@
+"""A planned path against the risk map of the exact elevations: does it cross what is truly hazardous, is it long?"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
+from stages.evaluation.accuracy_parts import Metric, metric
+from stages.geometry.lattice import Lattice
+from stages.hazard.risk import HAZARDOUS, UNKNOWN
+from stages.hazard.vehicle import Vehicle
+from stages.planning import grid8
+from stages.planning.path_ground import Ground, Maps
+from stages.planning.row_graph import UNREACHED
+from stages.planning.row_grid import RowGrid
+
+Floats = NDArray[np.float64]
+
+UNIT = 1000
+"""Cost of a step along an axis: a step aside costs 1414."""
+
+
+def crossed_cells(path: Floats, lattice: Lattice) -> NDArray[np.int64]:
+    """Cells (n, 2) row, column, each once, that a polyline (vertex, x y ...), metres, passes; it may leave the lattice.
+
+    The line is sampled at a quarter of a cell, so that it cannot pass more than a cell's corner unseen.
+    """
+    points = [path[:1, :2]]
+    for a, b in zip(path[:-1, :2], path[1:, :2], strict=True):
+        n = max(1, int(np.ceil(4.0 * np.hypot(*(b - a)) / lattice.cell)))
+        points.append(a + (b - a) * (np.arange(1, n + 1) / n)[:, None])
+    cells = np.rint(lattice.index(np.concatenate(points))).astype(np.int64)
+    return np.unique(cells, axis=0)
+
+
+def path_check(path: Floats, risk: NDArray[np.uint8], lattice: Lattice) -> tuple[NDArray[np.int64], dict[str, Metric]]:
+    """Crossed hazardous cells (n, 2) row, column, and metrics by name.
+
+    Parameters
+    ----------
+    path : (vertex, xyz) float64, metres, in the frame of the lattice; empty where no path was found.
+    risk : (row, col) classes from the exact elevations, on ``lattice``.
+    """
+    truth = "in the risk map of the exact elevations, same vehicle"
+    share = metric(float((risk == HAZARDOUS).mean()), "1", f"hazardous share of all cells {truth}")
+    if len(path) == 0:
+        names = {"hazard_cells": "cells", "unknown_cells": "cells", "crossed_cells": "cells", "path_length": "m"}
+        none = {name: metric(None, unit, "not applicable: no path was found") for name, unit in names.items()}
+        return np.empty((0, 2), dtype=np.int64), none | {"hazardous_share": share}
+    cells = crossed_cells(path, lattice)
+    inside = ((cells >= 0) & (cells < lattice.shape)).all(axis=1)
+    kinds = np.full(len(cells), UNKNOWN, dtype=np.uint8)
+    kinds[inside] = risk[cells[inside, 0], cells[inside, 1]]
+    hit = cells[kinds == HAZARDOUS]
+    length = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
+    return hit, {
+        "hazard_cells": metric(len(hit), "cells", f"crossed cells that are hazardous {truth}"),
+        "unknown_cells": metric(int((kinds == UNKNOWN).sum()), "cells", f"crossed cells that are unknown {truth}"),
+        "crossed_cells": metric(len(cells), "cells", "cells that the path crosses"),
+        "path_length": metric(length, "m", "length of the path, climbs included"),
+        "hazardous_share": share,
+    }
+
+
+def shortest(path: Floats, maps: Maps, lattice: Lattice, vehicle: Vehicle) -> dict[str, Metric]:
+    """The shortest way between the path's ends over the exact map, and how much longer the path is, from above.
+
+    It is one in steps to the eight neighbours as the path itself is, at no price but its length, where the vehicle
+    keeps its margin from hazards; where that closes every way, the one without it.
+
+    Parameters
+    ----------
+    path : (vertex, xyz) float64, metres, in the frame of the lattice; empty where no path was found.
+    maps : arrays (row, col) of stage ``risk`` from the exact elevations.
+    """
+    found, kept = None, vehicle.margin
+    for kept in (vehicle.margin, 0.0) if len(path) else ():
+        found = _shortest(path, maps, lattice, vehicle.model_copy(update={"margin": kept}))
+        if found is not None:
+            break
+    if found is None:
+        how = (
+            "not applicable: no path was found"
+            if len(path) == 0
+            else "none leads from one end of the path to the other"
+        )
+        return {"shortest_length": metric(None, "m", how), "length_ratio": metric(None, "1", how)}
+    room = "keeping the margin" if kept else "within the limits, but without the margin"
+    how = f"shortest way between the path's ends over the risk map of the exact elevations, {room}, seen from above"
+    length = float(np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1).sum())
+    return {
+        "shortest_length": metric(found, "m", how),
+        "length_ratio": metric(
+            length / found if found > 0 else None, "1", f"length of the path over that of the {how}"
+        ),
+    }
+
+
+def _shortest(path: Floats, maps: Maps, lattice: Lattice, vehicle: Vehicle) -> float | None:
+    ground = Ground(maps, lattice, RowGrid.over(lattice, (0.0, 1.0)), vehicle, unit=vehicle.max_step, caution=0.0)
+    ways = ground.ways("middle")
+    first, last = (ground.grid.index((float(path[k, 0]), float(path[k, 1]))) for k in (0, -1))
+    if not all(0 <= r < ways.shape[0] and 0 <= c < ways.shape[1] and ways[r, c] for r, c in (first, last)):
+        return None
+    level = np.zeros(ways.shape, np.int32)
+    cost, _ = grid8.cost_to_go(level, ways, last, first, UNIT, level.astype(np.int16))
+    return float(cost[first]) / UNIT * lattice.cell if cost[first] < UNREACHED else None
+
+
+def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+    path, risk = inputs["path"], inputs["risk"]
+    lattice = Lattice.from_dict(risk.meta["lattice"])
+    vertices, maps = np.asarray(path["path"]), {name: np.asarray(risk[name]) for name in risk.arrays}
+    hit, metrics = path_check(vertices, maps["risk"], lattice)
+    metrics |= shortest(vertices, maps, lattice, Vehicle.model_validate(risk.meta["vehicle"]))
+    return Bundle({"hazard_cell": hit.astype(np.int32)}, {"metrics": metrics})
+
+
+STAGE = Stage(
+    name="path_check",
+    version=2,
+    summary="planned path against the risk map of the exact elevations",
+    params=NoParams,
+    inputs=("path", "risk"),
+    outputs=(Array("hazard_cell", ("cell", "rowcol"), "int32", "1", "crossed cells that are truly hazardous"),),
+    run=_run,
+)

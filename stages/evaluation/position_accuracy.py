@@ -1,0 +1,310 @@
+"""Trajectory against true positions: truth without rotation, of a clock and of a frame of its own.
+
+A GNSS receiver or a total station says where, not how turned. Its frame shares the vertical with the world at most, its
+clock may be off by a constant. Truth is therefore moved rigidly in the plane (turned about the vertical and shifted; in
+height it is shifted alone) so that the squared distances are least, for each offset of its clock; the offset whose
+distances are least against the extent of both tracks is taken.
+
+With positions as complex numbers, ``a_i`` estimated and ``b_i`` true about their means, the best turn is
+``exp(i theta) = sum(conj(b_i) a_i) / |sum(conj(b_i) a_i)|``.
+
+An offset can only be found where speed or direction change: on a straight line at constant speed it is a shift of
+place. Stated with it is how far it may be moved until the squared error doubles: up to there it adds less than remains,
+and what remains (drift, scale) may have moved the best offset as far. Where this range does not end within what was
+searched, or takes half of it, the offset is not determined, and that of the stated clocks, 0, is kept if it lies in it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
+from stages.evaluation.accuracy import by_frame
+from stages.evaluation.accuracy_parts import Metric, metric
+from stages.odometry.resection.trajectory import world_poses
+
+Floats = NDArray[np.float64]
+
+LEAST = 4
+"""Frames with pose and truth: a turn, a shift and an offset leave something over to judge with."""
+
+REACH = 10.0
+"""s; clocks that have a time in common are believed to this: a longer search finds other stretches that look alike."""
+
+SHARE = 2 / 3
+"""Of the most frames that any offset compares, as many must be compared: few fit almost anywhere."""
+
+GROWTH = 2**0.5
+"""Of the least error: up to here another offset adds less than what remains, and which is right cannot be said."""
+
+WITHIN = 1e-6
+"""s; times that agree to this are the same."""
+
+WIDE = 0.5
+"""Of what was searched: offsets that all fit about as well tell nothing."""
+
+MOST = 20000
+"""Offsets that are tried at most before the best is refined."""
+
+MIRRORED = 0.5
+"""Of the error as given: where a mirrored plane leaves less than this, the axes are taken to be in another order."""
+
+
+@dataclass(frozen=True)
+class TruePositions:
+    """``positions`` (row, 2 or 3), m, x and y in the plane and z up; ``times`` (row,), s; rows are frames without.
+
+    Nothing is interpolated between rows that are more than ``max_gap`` s apart.
+    """
+
+    positions: Floats
+    times: Floats | None = None
+    max_gap: float = 0.5
+
+    def at(self, moments: Floats) -> Floats:
+        """Positions (moment, 2 or 3) on the straight line between two rows; NaN in longer gaps and beyond the ends."""
+        assert self.times is not None
+        t = self.times
+        moments = np.where(moments < t[0], np.minimum(moments + WITHIN, t[0]), moments)
+        moments = np.where(moments > t[-1], np.maximum(moments - WITHIN, t[-1]), moments)
+        after = np.clip(np.searchsorted(t, moments, side="left"), 1, max(len(t) - 1, 1))
+        known = (moments >= t[0]) & (moments <= t[-1])
+        if len(t) > 1:
+            known &= t[after] - t[after - 1] <= self.max_gap
+        moved = np.stack([np.interp(moments, t, axis) for axis in self.positions.T], axis=1)
+        return np.where(known[:, None], moved, np.nan)
+
+
+class Fit(NamedTuple):
+    """Truth moved into the world: (frame, 2 or 3) m; ``error``: RMS, m; ``relative``: over the extent of the tracks."""
+
+    moved: Floats
+    error: float
+    relative: float
+
+
+class Offset(NamedTuple):
+    """Seconds to add to the times of the truth; ``low`` and ``high``: until there the squared error at most doubles.
+
+    ``determined``: both ends lie within what was searched, and close enough together.
+    """
+
+    value: float
+    low: float
+    high: float
+    determined: bool
+
+
+def fit_in_plane(estimate: Floats, truth: Floats) -> Fit:
+    """Truth (frame, 2 or 3) turned about the vertical and shifted to the estimated positions (frame, 3), m.
+
+    Rows of NaN in either do not count, but are moved as well.
+    """
+    width = truth.shape[1]
+    both = np.isfinite(estimate).all(axis=1) & np.isfinite(truth).all(axis=1)
+    if not both.any():
+        return Fit(np.full_like(truth, np.nan), np.inf, np.inf)
+    centre, origin = estimate[both, :width].mean(axis=0), truth[both].mean(axis=0)
+    a, b = estimate[:, :width] - centre, truth - origin
+    cross = np.sum(np.conj(_plane(b[both])) * _plane(a[both]))
+    turned = _plane(b) * (cross / abs(cross) if abs(cross) > 0 else 1.0)
+    b[:, 0], b[:, 1] = turned.real, turned.imag
+    error = np.sqrt(np.mean(np.sum((a[both] - b[both]) ** 2, axis=1)))
+    extent = np.sqrt(np.mean(np.sum(a[both] ** 2, axis=1) + np.sum(b[both] ** 2, axis=1)))
+    return Fit(b + centre, float(error), float(error / extent) if extent > 0 else np.inf)
+
+
+def _plane(points: Floats) -> NDArray[np.complex128]:
+    return np.asarray(points[:, 0] + 1j * points[:, 1])
+
+
+def find_offset(moments: Floats, estimate: Floats, truth: TruePositions) -> Offset | None:
+    """The constant offset of the truth's clock against that of the images.
+
+    Parameters
+    ----------
+    moments : (frame,) s, of the images.
+    estimate : (frame, 3) m in the world, NaN of a frame without a pose.
+
+    Returns
+    -------
+    None where no offset makes :data:`LEAST` frames comparable.
+    """
+    tried = _candidates(moments, truth)
+    posed = np.isfinite(estimate).all(axis=1)
+    moments, estimate = moments[posed], estimate[posed]
+    counts = np.array([np.isfinite(truth.at(moments - offset)[:, 0]).sum() for offset in tried])
+    least = max(LEAST, SHARE * counts.max(initial=0))
+
+    def error(offset: float) -> float:
+        there = truth.at(moments - offset)
+        return fit_in_plane(estimate, there).relative if np.isfinite(there[:, 0]).sum() >= least else np.inf
+
+    errors = np.array([error(offset) for offset in tried])
+    if not np.isfinite(errors).any():
+        return None
+    best, step = int(np.argmin(errors)), float(tried[1] - tried[0])
+    value = float(tried[best])
+    for _ in range(4):  # each time ten times finer
+        near = value + np.linspace(-step, step, 21)
+        value, step = float(near[np.argmin([error(offset) for offset in near])]), step / 10
+    limit = GROWTH * error(value)
+    low, low_ends = _end(error, limit, value, tried[:best][::-1])
+    high, high_ends = _end(error, limit, value, tried[best + 1 :])
+    searched = np.ptp(tried[np.isfinite(errors)])
+    determined = bool(low_ends and high_ends and high - low < WIDE * searched)
+    return Offset(0.0 if not determined and low <= 0.0 <= high else value, low, high, determined)
+
+
+def _candidates(moments: Floats, truth: TruePositions) -> Floats:
+    """Offsets (n,) to try, s, half a frame apart: near 0 where the clocks have a time in common, else all."""
+    assert truth.times is not None
+    low, high = float(moments[0] - truth.times[-1]), float(moments[-1] - truth.times[0])
+    step = 0.5 * float(np.median(np.diff(moments))) if len(moments) > 1 else 0.1
+    if low < 0.0 < high:
+        low, high = max(low, -REACH), min(high, REACH)
+        step = max(step, (high - low) / MOST)
+        return np.asarray(step * np.arange(np.ceil(low / step), np.floor(high / step) + 1))
+    return np.linspace(low, high, int(np.clip((high - low) / step, 2, MOST)) + 1)
+
+
+def _end(error: Callable[[float], float], limit: float, start: float, outward: Floats) -> tuple[float, bool]:
+    """How far from ``start`` the error stays below the limit, and whether it grows above it in what was tried."""
+    inside = start
+    for tried in outward:
+        outside, found = float(tried), error(float(tried))
+        if not np.isfinite(found):
+            break
+        if found > limit and abs(outside - start) > 0:
+            for _ in range(20):
+                middle = 0.5 * (inside + outside)
+                inside, outside = (middle, outside) if error(middle) <= limit else (inside, middle)
+            return inside, True
+        inside = outside
+    return inside, False
+
+
+def position_accuracy(
+    estimate: Floats, truth: TruePositions, moments: Floats | None = None
+) -> tuple[Floats, dict[str, Metric], list[str]]:
+    """Compare estimated positions with true ones.
+
+    Parameters
+    ----------
+    estimate : (frame, 3) in the world, m; NaN where a frame has no pose.
+    truth : positions of a clock and frame of their own; one row a frame where there are no times.
+    moments : (frame,) s, of the images; None where either has no times.
+
+    Returns
+    -------
+    True positions (frame, 2 or 3) in the world, NaN where there are none; metrics by name; warnings.
+    """
+    offset, warnings = None, []
+    if moments is None or truth.times is None:
+        there, clock = truth.positions, "rows matched to frames one to one"
+    else:
+        offset = find_offset(moments, estimate, truth)
+        shift = 0.0 if offset is None else offset.value
+        there = truth.at(moments - shift)
+        clock = f"offset of {shift:.3f} s added to the times of the truth"
+        if offset is not None and not offset.determined:
+            kept = ", so 0 is kept" if shift == 0.0 else ""
+            clock += " (not determined)"
+            warnings.append(
+                f"offset in time of the truth: not determined{kept}; from {offset.low:.2f} to {offset.high:.2f} s the "
+                "tracks agree about as well: the motion changes too little"
+            )
+    fit = fit_in_plane(estimate, there)
+    both = np.asarray(np.isfinite(estimate).all(axis=1) & np.isfinite(there).all(axis=1))
+    if both.sum() >= LEAST and fit_in_plane(estimate, there * _flip(there)).error < MIRRORED * fit.error:
+        warnings.append(
+            "true positions fit far better mirrored: x and y may be swapped; seen from above y lies left of x"
+        )
+    how = f"positions only, after a rigid fit in the plane, {clock}"
+    metrics = _figures(estimate, fit.moved, both, how)
+    if offset is not None:
+        metrics |= _clock(offset)
+    return fit.moved, metrics, warnings
+
+
+def _flip(truth: Floats) -> Floats:
+    return np.array([1.0, -1.0, 1.0])[: truth.shape[1]]
+
+
+def _figures(estimate: Floats, truth: Floats, both: NDArray[np.bool_], how: str) -> dict[str, Metric]:
+    n, compared = len(estimate), int(both.sum())
+    missing = int((~np.isfinite(estimate).all(axis=1)).sum())
+    counts = {
+        "frames": metric(n, "frames", "frames that were to be posed"),
+        "frames_missing": metric(missing, "frames", "of them without a pose"),
+        "frames_judged": metric(compared, "frames", "of them with a pose and a true position"),
+    }
+    units = {
+        "position_rmse": "m",
+        "position_median": "m",
+        "position_max": "m",
+        "path_length": "m",
+        "position_drift": "%",
+    }
+    if compared < LEAST:
+        why = f"not applicable: {compared} frames have a pose and a true position, {LEAST} are needed"
+        return counts | {name: metric(None, unit, why) for name, unit in units.items()}
+    error = (estimate[:, : truth.shape[1]] - truth)[both]
+    away = np.linalg.norm(error, axis=1)
+    length = float(np.linalg.norm(np.diff(truth[both], axis=0), axis=1).sum())
+    apart = float(np.linalg.norm(error[-1] - error[0]))
+    axes = "in x, y and z" if truth.shape[1] == 3 else "in x and y"
+    values = {
+        "position_rmse": (float(np.sqrt(np.mean(away**2))), f"RMS error {axes}, {compared} of {n} frames, {how}"),
+        "position_median": (float(np.median(away)), f"median error {axes}, {how}"),
+        "position_max": (float(away.max()), f"largest error {axes}, {how}"),
+        "path_length": (length, "true length from the first to the last compared frame"),
+        "position_drift": (
+            100.0 * apart / length if length > 0 else None,
+            f"error of the way from the first to the last compared frame over the true length, {how}",
+        ),
+    }
+    return counts | {name: metric(value, units[name], words) for name, (value, words) in values.items()}
+
+
+def _clock(offset: Offset) -> dict[str, Metric]:
+    ends = f"from {offset.low:.3f} to {offset.high:.3f} s the squared error at most doubles"
+    if not offset.determined:
+        ends += ", most or the end of what was searched: not determined"
+    return {
+        "time_offset": metric(offset.value, "s", f"added to the times of the truth, where the error is least; {ends}"),
+        "time_offset_range": metric(
+            0.5 * (offset.high - offset.low), "s", f"half the range of offsets that fit about as well: {ends}"
+        ),
+    }
+
+
+def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+    trajectory, frames = inputs["trajectory"], list(args["frames"])
+    estimate = by_frame(world_poses(trajectory), list(trajectory.meta["frames"]), frames)[:, :, 3]
+    given = np.array(args["positions"], dtype=np.float64)
+    times, moments = (None if args[k] is None else np.array(args[k], dtype=np.float64) for k in ("times", "moments"))
+    there, metrics, warnings = position_accuracy(estimate, TruePositions(given, times, args["max_gap"]), moments)
+    whole = np.full((len(frames), 3), np.nan)
+    whole[:, : there.shape[1]] = there
+    facts = {"metrics": metrics, "frames": frames, "truth": args["source"], "warnings": warnings}
+    return Bundle({"position": estimate.copy(), "position_truth": whole}, facts)
+
+
+STAGE = Stage(
+    name="position_accuracy",
+    version=1,
+    summary="trajectory against positions without rotation, of a frame and a clock of their own",
+    params=NoParams,
+    inputs=("trajectory",),
+    outputs=(
+        Array("position", ("frame", "xyz"), "float64", "m", "estimated position", "nan", "world"),
+        Array("position_truth", ("frame", "xyz"), "float64", "m", "true position, moved in the plane", "nan", "world"),
+    ),
+    run=_run,
+)

@@ -1,0 +1,151 @@
+"""What the errors of a trajectory are made of: by length of the way, by cause, and against the errors it claims.
+
+Source of the relative errors: Sturm et al. 2012 (doi:10.1109/IROS.2012.6385773), over several numbers of frames;
+Geiger et al. 2012 (doi:10.1109/CVPR.2012.6248074) and Zhang and Scaramuzza 2018 (doi:10.1109/IROS.2018.8593941), over
+shares of the path, for paths shorter than KITTI's sections.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.evaluation.accuracy_parts import Metric, along, angle, inverse, metric, rms
+
+Floats = NDArray[np.float64]
+
+STEPS = (1, 2, 5, 10, 20, 50)
+"""Frames between the two poses of a relative error."""
+SHARES = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8)
+"""Of the path: lengths of its sections."""
+LEAST_MOVED = 1e-6
+"""m: below, a camera rests, and nothing is said of its scale."""
+MEANINGFUL = 3.0
+"""Standard errors that a systematic part must have to be named."""
+
+
+def by_steps(P: Floats, Q: Floats) -> dict[str, Metric]:
+    """Relative errors of poses (n, 4, 4) over several numbers of frames, all pairs that far apart."""
+    found: dict[str, Metric] = {}
+    for step in STEPS[1:]:
+        if step >= len(P):
+            continue
+        E = inverse(inverse(Q[:-step]) @ Q[step:]) @ (inverse(P[:-step]) @ P[step:])
+        E = E[np.isfinite(E).all(axis=(1, 2))]
+        if len(E) == 0:
+            continue
+        how = f"of the motion over {step} frames, {len(E)} pairs"
+        found[f"rpe_{step}_translation_rmse"] = metric(rms(E[:, :3, 3]), "m", f"RMS error {how}")
+        turn = float(np.sqrt(np.mean(np.degrees(angle(E)) ** 2)))
+        found[f"rpe_{step}_rotation_rmse"] = metric(turn, "deg", f"RMS rotation error {how}")
+    return found
+
+
+def by_shares(P: Floats, Q: Floats) -> dict[str, Metric]:
+    """Relative errors over sections of 10 to 80 % of the true path, from every frame: mean, over their length."""
+    way, gaps = along(Q)
+    total = float(way[-1])
+    if gaps or total < LEAST_MOVED:
+        why = "not applicable: the truth has gaps" if gaps else "not applicable: the camera did not move"
+        return {"sections_translation": metric(None, "%", why), "sections_rotation": metric(None, "deg/m", why)}
+    errors = []
+    for share in SHARES:
+        last = np.searchsorted(way, way + share * total, side="left")
+        first = np.flatnonzero(last < len(way))
+        last = last[first]
+        E = inverse(inverse(Q[first]) @ Q[last]) @ (inverse(P[first]) @ P[last])
+        length = way[last] - way[first]
+        known = np.isfinite(E).all(axis=(1, 2)) & (length > 0)
+        errors += list(np.stack([np.linalg.norm(E[known, :3, 3], axis=1), angle(E[known])], 1) / length[known, None])
+    if not errors:
+        why = "not applicable: no section has poses at both ends"
+        return {"sections_translation": metric(None, "%", why), "sections_rotation": metric(None, "deg/m", why)}
+    shift, turn = np.mean(errors, axis=0)
+    how = f"mean relative error of {len(errors)} sections of 10-80 % of the path, from every frame"
+    return {
+        "sections_translation": metric(100.0 * float(shift), "%", how),
+        "sections_rotation": metric(math.degrees(float(turn)), "deg/m", how),
+    }
+
+
+def by_cause(P: Floats, Q: Floats) -> dict[str, Metric]:
+    """Errors of the motion between successive frames, split: scale, direction, rotation, and what is left.
+
+    With p and q the estimated and the true displacement in the camera of the earlier frame: the scale is the
+    least-squares factor of q, the direction the angle between their means, and what remains scatters.
+    """
+    here = np.asarray(np.isfinite(P).all(axis=(1, 2)) & np.isfinite(Q).all(axis=(1, 2)))
+    both = here[:-1] & here[1:]
+    dP, dQ = (inverse(T[:-1][both]) @ T[1:][both] for T in (P, Q))
+    p, q = dP[:, :3, 3], dQ[:, :3, 3]
+    length = float(np.linalg.norm(q, axis=1).sum())
+    if len(p) < 3 or length < LEAST_MOVED:
+        why = "not applicable: fewer than three motions" if len(p) < 3 else "not applicable: the camera did not move"
+        return {"scale_error": metric(None, "%", why)}
+    scale = float((p * q).sum() / (q * q).sum())
+    rest = p - scale * q
+    bound = float(np.sqrt((rest**2).sum() / (3 * len(p) - 1) / (q * q).sum()))
+    swing = _between(q.mean(0), p.mean(0))
+    direction = math.degrees(float(np.linalg.norm(rotation_vectors(swing[None])[0])))
+    turns = rotation_vectors(np.swapaxes(dQ[:, :3, :3], 1, 2) @ dP[:, :3, :3])
+    mean, count = turns.mean(0), len(turns)
+    bias = float(np.linalg.norm(mean))
+    error = float(np.sqrt(((turns - mean) ** 2).sum() / max(count - 1, 1) / count))
+    per_metre = math.degrees(bias) * count / length
+    sure = "" if abs(scale - 1.0) > MEANINGFUL * bound else ", which is not told from chance"
+    steady = "" if bias > MEANINGFUL * error else ", which is not told from chance"
+    return {
+        "scale_error": metric(
+            100.0 * (scale - 1.0),
+            "%",
+            f"estimated over true length of the motions, +- {100.0 * bound:.2g}{sure}; hangs on baseline, toe-in and"
+            " focal length",
+        ),
+        "direction_error": metric(
+            direction, "deg", "between the mean motions, estimated and true, in the camera; hangs on mount and pitch"
+        ),
+        "rotation_bias": metric(
+            per_metre, "deg/m", f"mean rotation error{steady}; hangs on principal point and lens distortion"
+        ),
+        "scatter": metric(rms(p - scale * (q @ swing.T)), "m", "RMS of what remains of a frame's motion: tracking"),
+    }
+
+
+def _between(a: Floats, b: Floats) -> Floats:
+    """Least rotation (3, 3) from the direction of a to that of b; the identity where either is none."""
+    size = float(np.linalg.norm(a) * np.linalg.norm(b))
+    if size < LEAST_MOVED**2 or float(a @ b) <= 0:
+        return np.eye(3)
+    axis = np.cross(a, b) / size
+    k = np.array([[0.0, -axis[2], axis[1]], [axis[2], 0.0, -axis[0]], [-axis[1], axis[0], 0.0]])
+    return np.asarray(np.eye(3) + k + k @ k / (1.0 + float(a @ b) / size))
+
+
+def rotation_vectors(R: Floats) -> Floats:
+    """Rotation vectors (n, 3), radians, of rotations (n, 3, 3) below half a turn."""
+    axis = 0.5 * np.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], axis=-1)
+    sine = np.linalg.norm(axis, axis=1)
+    turn = np.arctan2(sine, 0.5 * (np.trace(R, axis1=1, axis2=2) - 1.0))
+    return np.asarray(axis * np.where(sine > 1e-12, turn / np.maximum(sine, 1e-300), 1.0)[:, None])
+
+
+def against_claims(P: Floats, aligned: Floats, covariance: Floats) -> dict[str, Metric]:
+    """Mean squared error over the claimed one, per degree of freedom (NEES): 1 where the claims are right.
+
+    ``covariance`` (n, 6, 6) of (position m, rotation rad) in the world whose origin is the first posed frame, which is
+    exact: ``aligned`` is the truth with the first poses made equal.
+    """
+    known = np.asarray(np.isfinite(P).all(axis=(1, 2)) & np.isfinite(aligned).all(axis=(1, 2)))
+    known = np.asarray(known & np.isfinite(covariance).all(axis=(1, 2)))
+    claimed = np.isfinite(P).all(axis=(1, 2)) & np.isfinite(covariance).all(axis=(1, 2))
+    rows, origin = np.flatnonzero(known)[1:], int(np.argmax(claimed))
+    if len(rows) == 0 or not known[origin] or not (np.linalg.eigvalsh(covariance[rows])[:, 0] > 0).all():
+        return {"nees": metric(None, "1", "not applicable: no covariances of frames behind the first")}
+    turn = rotation_vectors(aligned[rows, :3, :3] @ np.swapaxes(P[rows, :3, :3], 1, 2))
+    error = np.concatenate([aligned[rows, :3, 3] - P[rows, :3, 3], turn], axis=1)
+    weighed = np.linalg.solve(covariance[rows], error[..., None])[..., 0]
+    value = float((error * weighed).sum(1).mean()) / 6.0
+    how = "squared error over the claimed one per degree of freedom, mean over frames (NEES); 1 is right"
+    return {"nees": metric(value, "1", how)}

@@ -1,0 +1,1 @@
+"""Cameras, poses, surfaces and lattices."""

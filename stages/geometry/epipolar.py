@@ -1,0 +1,172 @@
+"""What the two images of a pair say about the rig: distances from epipolar lines, and what they cost in depth.
+
+A correction of a rig has five parameters, all zero for the rig as it is given; the length of the baseline is not one of
+them, for no image shows it. ``pitch``, ``yaw``, ``roll`` (radians) turn the right camera about the x, y and z axis of
+its own given frame, its centre held; ``baseline_across`` and ``baseline_forward`` (radians, to first order) swing that
+centre about the left camera's, across the baseline in the image plane and along the optical axis.
+
+The residual is the distance of the right point from the epipolar line of the left one, in pixels of the right image:
+the first-order (Sampson) error of a correspondence whose left pixel is exact, as it is in a disparity map of the left
+image (Hartley and Zisserman 2004, section 11.4.3). On a usual rig it is the row offset: positive where the right
+image's content lies below its line.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from stages.geometry.geometry import Rig, RigidTransform, rotation_exp
+from stages.terrain.ground import inverse_depth
+
+Floats = NDArray[np.float64]
+
+NAMES = ("pitch", "yaw", "roll", "baseline_across", "baseline_forward")
+"""The five parameters of a correction, in the order of every vector of them."""
+
+MAJORITY = 0.5
+"""Share of the matches that must fit the rig with its sides exchanged, and twice as many as the given one."""
+
+STEP = 1e-6
+"""Radians: step of the central differences of depth."""
+
+
+def corrected(rig: Rig, correction: Floats) -> Rig:
+    """The rig with a correction (5,) applied; the same object for a correction of zeros.
+
+    The length of the baseline is that of ``rig``.
+    """
+    if not np.any(correction):
+        return rig
+    rotation = rotation_exp(correction[:3]) @ rig.T_right_left.rotation
+    centre, _ = _centre(rig, correction)
+    return Rig(rig.left, rig.right, RigidTransform(rotation, -rotation @ centre))
+
+
+def distances(rig: Rig, correction: Floats, left: Floats, right: Floats) -> tuple[Floats, Floats]:
+    """Signed distances (n,) from the epipolar lines, pixels, and their derivatives (n, 5) in pixels per radian.
+
+    Parameters
+    ----------
+    correction : (5,) radians.
+    left, right : (n, 2) column and row of corresponding points.
+    """
+    centre, swings = _centre(rig, correction)
+    rotation = rotation_exp(correction[:3]) @ rig.T_right_left.rotation
+    # A line of the image with matrix K is K^-T times the normal R (c x ray) of the plane of sight.
+    to_line, to_ray = np.linalg.inv(rig.right.matrix).T, np.linalg.inv(rig.left.matrix)
+    turns = _left_jacobian(correction[:3])
+    upright = rotation @ _skew(centre)
+    to_slopes = [to_line @ _skew(turns[:, i]) @ upright @ to_ray for i in range(3)]
+    to_slopes += [to_line @ rotation @ _skew(swings[:, i]) @ to_ray for i in range(2)]
+    distance, slopes = np.empty(len(left)), np.empty((len(left), 5))
+    _distances(to_line @ upright @ to_ray, np.array(to_slopes), left, right, distance, slopes)
+    return distance, slopes
+
+
+@njit(cache=True, nogil=True)
+def _distances(to_line, to_slopes, left, right, distance, slopes):  # type: ignore[no-untyped-def]
+    """Distances (n,) from the lines ``to_line @ p`` of left pixels p, and their derivatives (n, 5)."""
+    line = np.empty(3)
+    for n in range(len(left)):
+        x, y, u, v = left[n, 0], left[n, 1], right[n, 0], right[n, 1]
+        for i in range(3):
+            line[i] = to_line[i, 0] * x + to_line[i, 1] * y + to_line[i, 2]
+        length = np.sqrt(line[0] ** 2 + line[1] ** 2)
+        if (line[0] if abs(line[0]) > abs(line[1]) else line[1]) < 0:
+            length = -length
+        d = (u * line[0] + v * line[1] + line[2]) / length
+        distance[n] = d
+        for p in range(5):
+            m = to_slopes[p]
+            a = m[0, 0] * x + m[0, 1] * y + m[0, 2]
+            b = m[1, 0] * x + m[1, 1] * y + m[1, 2]
+            c = m[2, 0] * x + m[2, 1] * y + m[2, 2]
+            slopes[n, p] = (u * a + v * b + c) / length - (line[0] * a + line[1] * b) * d / length**2
+
+
+def normals(rig: Rig, correction: Floats, left: Floats) -> Floats:
+    """Unit normals (n, 2) of the epipolar lines of left points: what a distance grows by for a pixel of column, row."""
+    centre, _ = _centre(rig, correction)
+    rotation = rotation_exp(correction[:3]) @ rig.T_right_left.rotation
+    line = np.einsum("nk,ik->ni", rig.left.rays(left), np.linalg.inv(rig.right.matrix).T @ rotation @ _skew(centre))
+    return np.asarray(line[:, :2] / _signed_length(line)[:, None], dtype=np.float64)
+
+
+def depth_sensitivity(rig: Rig, left: Floats, right: Floats) -> Floats:
+    """What a correction does to depth: matrix (5, 5) ``G`` with relative depth error RMS ``sqrt(c^T G c)``.
+
+    Points count as precisely as stereo measures their depth, so that near ones decide, as they do in navigation.
+    A turn of the right camera by 0.01 degrees across 27 px of mean disparity and 707 px of focal length makes 0.45 %.
+    """
+    rho, per_pixel = inverse_depth(rig, left, right - left)
+    slopes = np.empty((len(left), 5))
+    for i in range(5):
+        step = np.zeros(5)
+        step[i] = STEP
+        ahead, _ = inverse_depth(corrected(rig, step), left, right - left)
+        behind, _ = inverse_depth(corrected(rig, -step), left, right - left)
+        slopes[:, i] = (ahead - behind) / (2 * STEP)
+    scaled = slopes / per_pixel[:, None]
+    weighted = np.einsum("ni,nj->ij", scaled, scaled)
+    total = float(np.sum((np.maximum(rho, 0.0) / per_pixel) ** 2))
+    return np.asarray(weighted / max(total, 1e-12), dtype=np.float64)
+
+
+def beyond_infinity(rig: Rig, left: Floats, right: Floats) -> Floats:
+    """How far (n,) points lie beyond infinity, pixels of disparity; negative for points in front of the cameras."""
+    rho, per_pixel = inverse_depth(rig, left, right - left)
+    return np.asarray(-rho / per_pixel, dtype=np.float64)
+
+
+def fits(rig: Rig, left: Floats, right: Floats, tolerance: float) -> float:
+    """Share of the matches (n, 2), (n, 2) that lie within ``tolerance`` pixels of their epipolar lines, ahead."""
+    off, _ = distances(rig, np.zeros(len(NAMES)), left, right)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ahead = beyond_infinity(rig, left, right) < 0.5 * tolerance
+    return float(np.mean((np.abs(off) < tolerance) & ahead))
+
+
+def exchanged(as_given: float, other_way: float) -> bool:
+    """Whether left and right are exchanged, by the share of matches that fit the rig as given and the other way."""
+    return other_way > MAJORITY and other_way > 2.0 * as_given
+
+
+def _centre(rig: Rig, correction: Floats) -> tuple[Floats, Floats]:
+    """Right camera's centre (3,) in the left frame, metres, and its derivatives (3, 2) by the two swings."""
+    given = -rig.T_right_left.rotation.T @ rig.T_right_left.translation
+    unit = given / np.linalg.norm(given)
+    axis = np.array([0.0, 1.0, 0.0]) if abs(unit[1]) < math.cos(math.radians(45.0)) else np.array([1.0, 0.0, 0.0])
+    across = axis - unit * float(unit @ axis)
+    across /= np.linalg.norm(across)
+    forward = np.cross(unit, across)
+    if forward[2] < 0:
+        forward = -forward
+    swing = unit + correction[3] * across + correction[4] * forward
+    length = float(np.linalg.norm(swing))
+    direction = swing / length
+    tangent = (np.eye(3) - np.outer(direction, direction)) / length
+    return rig.baseline * direction, rig.baseline * tangent @ np.column_stack([across, forward])
+
+
+def _signed_length(line: Floats) -> Floats:
+    """Length of the normals of lines (n, 3), signed so that they point down the image (right, of steep lines)."""
+    steep = np.abs(line[:, 0]) > np.abs(line[:, 1])
+    return np.hypot(line[:, 0], line[:, 1]) * np.where(np.where(steep, line[:, 0], line[:, 1]) < 0, -1.0, 1.0)
+
+
+def _skew(v: Floats) -> Floats:
+    """Matrix of the cross product with v."""
+    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+
+
+def _left_jacobian(w: Floats) -> Floats:
+    """Columns: angular velocity of ``exp(w)`` for a change of each element of w."""
+    angle, k = float(np.linalg.norm(w)), _skew(w)
+    if angle < 1e-6:
+        return np.asarray(np.eye(3) + 0.5 * k, dtype=np.float64)
+    a, b = (1.0 - math.cos(angle)) / angle**2, (angle - math.sin(angle)) / angle**3
+    return np.asarray(np.eye(3) + a * k + b * (k @ k), dtype=np.float64)

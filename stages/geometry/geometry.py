@@ -1,0 +1,236 @@
+"""Cameras, rigid transforms and the paper's rotation angles.
+
+Conventions, said once for the whole project:
+
+* pixel centres are at integer coordinates; ``(column, row) = (0, 0)`` is the centre of the top left pixel;
+* ``T_dst_src`` maps coordinates: ``x_dst = R x_src + t``;
+* camera frames are optical: x right, y down, z forward; world and local frames: x right, y forward, z up;
+* lengths are metres and angles radians unless a name says otherwise.
+
+Source: Kolesnik, Paar, Bauer, Ulm (1999), section 5.2.2, Eq. 4 (projection) and Eq. 5 (rotation).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from stages.core.errors import InputError
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Ideal pinhole camera (distortion already removed).
+
+    ``fx, fy`` focal lengths and ``cx, cy`` principal point in pixels; ``width, height`` in pixels.
+    """
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+
+    def __post_init__(self) -> None:
+        if not (self.fx > 0 and self.fy > 0 and math.isfinite(self.fx) and math.isfinite(self.fy)):
+            raise InputError(
+                "RIL-329",
+                f"focal length fx={self.fx}, fy={self.fy} px is not positive",
+                remedy="give fx and fy in pixels",
+            )
+        if self.width < 1 or self.height < 1:
+            raise InputError(
+                "RIL-330", f"image size {self.width} x {self.height} is empty", remedy="check the image size"
+            )
+
+    @property
+    def matrix(self) -> Floats:
+        """3 x 3 calibration matrix K."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    def project(self, points: ArrayLike) -> Floats:
+        """Project points (..., 3) of the camera frame, metres, to (..., 2) column, row; NaN behind the camera."""
+        p = np.asarray(points, dtype=np.float64)
+        z = np.where(p[..., 2] > 0, p[..., 2], np.nan)
+        return np.stack([self.fx * p[..., 0] / z + self.cx, self.fy * p[..., 1] / z + self.cy], axis=-1)
+
+    def rays(self, pixels: ArrayLike) -> Floats:
+        """Directions (..., 3) with z = 1 in the camera frame, of pixels (..., 2) column, row."""
+        p = np.asarray(pixels, dtype=np.float64)
+        x = (p[..., 0] - self.cx) / self.fx
+        y = (p[..., 1] - self.cy) / self.fy
+        return np.stack([x, y, np.ones_like(x)], axis=-1)
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON form."""
+        return {
+            "fx": self.fx,
+            "fy": self.fy,
+            "cx": self.cx,
+            "cy": self.cy,
+            "width": self.width,
+            "height": self.height,
+        }
+
+    @staticmethod
+    def from_dict(d: Mapping[str, Any]) -> Camera:
+        """Inverse of :meth:`to_dict`."""
+        return Camera(**d)
+
+
+@dataclass(frozen=True)
+class RigidTransform:
+    """``x_dst = rotation @ x_src + translation``; the name of a variable says which frames (``T_dst_src``)."""
+
+    rotation: Floats
+    translation: Floats
+
+    def __post_init__(self) -> None:
+        r = np.array(self.rotation, dtype=np.float64)
+        t = np.array(self.translation, dtype=np.float64).reshape(-1)
+        if r.shape != (3, 3) or t.shape != (3,):
+            raise InputError("RIL-331", f"a rigid transform needs 3 x 3 and 3 numbers, not {r.shape} and {t.shape}")
+        if not (np.isfinite(r).all() and np.isfinite(t).all()):
+            raise InputError("RIL-332", "a rigid transform has a value that is not finite")
+        if np.abs(r @ r.T - np.eye(3)).max() > 1e-4 or np.linalg.det(r) < 0:
+            raise InputError(
+                "RIL-333",
+                "a pose's 3 x 3 part is not a rotation",
+                remedy="give rows of [R | t] with R orthonormal and det R = +1",
+            )
+        r.setflags(write=False)
+        t.setflags(write=False)
+        object.__setattr__(self, "rotation", r)
+        object.__setattr__(self, "translation", t)
+
+    def apply(self, points: ArrayLike) -> Floats:
+        """Map points (..., 3) of the source frame to the destination frame."""
+        return np.asarray(points, dtype=np.float64) @ self.rotation.T + self.translation
+
+    def __matmul__(self, other: RigidTransform) -> RigidTransform:
+        return RigidTransform(self.rotation @ other.rotation, self.rotation @ other.translation + self.translation)
+
+    def inverse(self) -> RigidTransform:
+        """The transform from destination to source."""
+        return RigidTransform(self.rotation.T, -self.rotation.T @ self.translation)
+
+    @property
+    def matrix34(self) -> Floats:
+        """3 x 4 matrix [R | t]."""
+        return np.hstack([self.rotation, self.translation[:, None]])
+
+    @staticmethod
+    def identity() -> RigidTransform:
+        """The neutral transform."""
+        return RigidTransform(np.eye(3), np.zeros(3))
+
+    @staticmethod
+    def from_matrix(m: ArrayLike) -> RigidTransform:
+        """From 12 numbers, a 3 x 4 or a 4 x 4 matrix."""
+        a = np.asarray(m, dtype=np.float64)
+        a = a.reshape(3, 4) if a.size == 12 else a.reshape(4, 4)[:3]
+        return RigidTransform(a[:, :3], a[:, 3])
+
+    def to_list(self) -> list[float]:
+        """Twelve numbers, rows of [R | t]."""
+        return [float(v) for v in self.matrix34.reshape(-1)]
+
+
+@dataclass(frozen=True)
+class Rig:
+    """Two pinhole cameras on one body; ``T_right_left`` maps the left camera frame to the right one, metres."""
+
+    left: Camera
+    right: Camera
+    T_right_left: RigidTransform
+
+    @property
+    def baseline(self) -> float:
+        """Distance of the two projection centres, metres."""
+        return float(np.linalg.norm(self.T_right_left.translation))
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON form."""
+        return {
+            "left": self.left.to_dict(),
+            "right": self.right.to_dict(),
+            "T_right_left": self.T_right_left.to_list(),
+        }
+
+    @staticmethod
+    def from_dict(d: Mapping[str, Any]) -> Rig:
+        """Inverse of :meth:`to_dict`."""
+        return Rig(
+            Camera.from_dict(d["left"]),
+            Camera.from_dict(d["right"]),
+            RigidTransform.from_matrix(d["T_right_left"]),
+        )
+
+
+def rotation_from_angles(omega: float, phi: float, kappa: float) -> Floats:
+    """Rotation matrix of the paper's pointing angles, radians (Eq. 5)."""
+    so, co = math.sin(omega), math.cos(omega)
+    sp, cp = math.sin(phi), math.cos(phi)
+    sk, ck = math.sin(kappa), math.cos(kappa)
+    return np.array(
+        [
+            [cp * ck, cp * sk, -sp],
+            [so * sp * ck - co * sk, so * sp * sk + co * ck, so * cp],
+            [co * sp * ck + so * sk, co * sp * sk - so * ck, co * cp],
+        ]
+    )
+
+
+def angles_from_rotation(rotation: ArrayLike) -> tuple[float, float, float]:
+    """Angles omega, phi, kappa, radians, of a rotation matrix (inverse of Eq. 5, ``|phi| < pi / 2``)."""
+    r = np.asarray(rotation, dtype=np.float64)
+    phi = math.asin(float(np.clip(-r[0, 2], -1.0, 1.0)))
+    return math.atan2(r[1, 2], r[2, 2]), phi, math.atan2(r[0, 1], r[0, 0])
+
+
+def rotation_exp(w: ArrayLike) -> Floats:
+    """Rotation matrix of a rotation vector (3,), radians (Rodrigues)."""
+    v = np.asarray(w, dtype=np.float64)
+    angle = float(np.linalg.norm(v))
+    k = np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+    if angle < 1e-9:
+        return np.asarray(np.eye(3) + k + 0.5 * (k @ k), dtype=np.float64)
+    a, b = math.sin(angle) / angle, (1.0 - math.cos(angle)) / angle**2
+    return np.asarray(np.eye(3) + a * k + b * (k @ k), dtype=np.float64)
+
+
+def orthonormal(matrix: ArrayLike) -> Floats:
+    """The nearest rotation to a 3 x 3 matrix (polar decomposition)."""
+    u, _, vt = np.linalg.svd(np.asarray(matrix, dtype=np.float64))
+    return np.asarray(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt, dtype=np.float64)
+
+
+def level_rotation(up_in_camera: ArrayLike) -> Floats:
+    """Rotation R_level_cam of the levelled frame: z up, y the horizontal projection of the optical axis, x right.
+
+    Parameters
+    ----------
+    up_in_camera : (3,) direction of "up" in the optical camera frame.
+
+    Raises
+    ------
+    InputError
+        The optical axis is vertical, so that it has no horizontal projection.
+    """
+    z = np.asarray(up_in_camera, dtype=np.float64)
+    z = z / np.linalg.norm(z)
+    forward = np.array([0.0, 0.0, 1.0])
+    y = forward - z * float(z @ forward)
+    norm = float(np.linalg.norm(y))
+    if norm < 1e-6:
+        raise InputError("RIL-334", "the optical axis is vertical", remedy="give an attitude whose heading is defined")
+    y = y / norm
+    return np.array([np.cross(y, z), y, z], dtype=np.float64)

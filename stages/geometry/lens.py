@@ -1,0 +1,223 @@
+"""Real optics: a camera with lens distortion, as calibration programs describe it.
+
+Models and the order of their coefficients are OpenCV's:
+
+* ``none``: no coefficients;
+* ``radtan`` (Brown 1966, Conrady 1919): k1 k2 p1 p2 [k3];
+* ``rational``: k1 k2 p1 p2 k3 k4 k5 k6 [s1 s2 s3 s4]; the last four are its thin prism;
+* ``fisheye`` (Kannala, Brandt 2006, doi:10.1109/TPAMI.2006.153): k1 k2 k3 k4; Kalibr calls it equidistant.
+
+Raw pixels are those of the image as it was taken; ideal pixels those of a pinhole camera in its place.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.polynomial import Polynomial
+from numpy.typing import ArrayLike, NDArray
+
+from stages.core.errors import InputError
+from stages.geometry.geometry import Camera
+
+Floats = NDArray[np.float64]
+
+COUNTS: Mapping[str, tuple[int, ...]] = {"none": (0,), "radtan": (4, 5), "rational": (8, 12), "fisheye": (4,)}
+"""How many coefficients each model takes."""
+
+LEAST_FOCAL = 0.7
+"""A fisheye's ideal camera keeps at least this share of its focal length, so half of the pixels at the centre."""
+
+SOLVED_PX = 1e-6
+"""Raw pixels by which the inverse may miss: far below what any match resolves."""
+
+REFINEMENTS = 10
+"""Newton steps of the inverse; they double the digits, and the start is right to a pixel."""
+
+NEGLIGIBLE = 1e-12
+"""Coefficient that moves no point of any image, and whose root lies beyond all of them."""
+
+CHUNK = 65536
+"""Points at a time: OpenCV's projection also writes its Jacobian, 30 numbers a point."""
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A camera as it is built: ``camera`` is its pinhole part (pixels of the raw image), the rest its distortion."""
+
+    camera: Camera
+    model: str = "none"
+    coefficients: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.model not in COUNTS:
+            raise InputError(
+                "RIL-369", f"distortion model {self.model!r} is unknown", remedy=f"one of {', '.join(COUNTS)}"
+            )
+        wanted = COUNTS[self.model]
+        if len(self.coefficients) not in wanted:
+            counts = " or ".join(str(n) for n in wanted)
+            raise InputError(
+                "RIL-370",
+                f"distortion {self.model} has {len(self.coefficients)} coefficients, it takes {counts}",
+                remedy="check the model's name, or the list of its coefficients",
+            )
+        if not all(math.isfinite(v) for v in self.coefficients):
+            raise InputError("RIL-371", "a distortion coefficient is not finite", remedy="correct the calibration")
+
+    @property
+    def ideal(self) -> bool:
+        """Whether the lens is free of distortion."""
+        return not any(self.coefficients) if self.model != "fisheye" else False
+
+    def ideal_camera(self) -> Camera:
+        """The pinhole camera of the undistorted image: same size and principal point as the raw one.
+
+        It has the raw focal length, so that the centre keeps its resolution, except for a fisheye: there the pinhole's
+        edges are far inside the raw image, and the focal length is shortened until the middle of each raw edge is seen,
+        but no further than to ``LEAST_FOCAL`` of itself. What lies beyond (more than 60 degrees off the axis) is lost.
+        """
+        c = self.camera
+        if self.model != "fisheye":
+            return c
+        w, h = c.width - 1.0, c.height - 1.0
+        edges = np.array([[0.0, c.cy], [w, c.cy], [c.cx, 0.0], [c.cx, h]])
+        far = np.hypot(*((self.undistort(edges, c) - [c.cx, c.cy]).T))
+        room = np.array([c.cx, w - c.cx, c.cy, h - c.cy])
+        # an edge without ideal position is 90 degrees off the axis or more
+        ratio = np.where(np.isfinite(far), room / np.maximum(far, 1e-9), 0.0)
+        factor = float(np.clip(ratio.min(), LEAST_FOCAL, 1.0))
+        return replace(c, fx=factor * c.fx, fy=factor * c.fy)
+
+    @cached_property
+    def reach(self) -> float:
+        """Tangent of the angle off the axis up to which the radial model grows; beyond it, it folds back."""
+        k = self.coefficients
+        if self.model == "none":
+            return math.inf
+        if self.model == "fisheye":
+            angle = _first_root(Polynomial([1.0, *((2 * n + 3) * v for n, v in enumerate(k))]))
+            return math.tan(angle) if angle < math.pi / 2 else math.inf
+        above = Polynomial([1.0, k[0], k[1], k[4] if len(k) > 4 else 0.0])
+        below = Polynomial([1.0, *k[5:8]])
+        s = Polynomial([0.0, 1.0])
+        growth = (above + 2 * s * above.deriv()) * below - 2 * s * above * below.deriv()
+        return min(_first_root(growth), _first_root(below))
+
+    def distort(self, points: ArrayLike, ideal: Camera | None = None) -> Floats:
+        """Raw pixels of ideal ones.
+
+        Parameters
+        ----------
+        points : (n, 2) column, row in the image of ``ideal``.
+        ideal : the pinhole camera of those points; None: :meth:`ideal_camera`.
+
+        Returns
+        -------
+        (n, 2) column, row in the raw image, perhaps outside; NaN where the model folds back (:attr:`reach`).
+        """
+        rays = (ideal or self.ideal_camera()).rays(_points(points))
+        raw = self._project(rays)
+        raw[~(np.hypot(rays[:, 0], rays[:, 1]) < self.reach)] = np.nan
+        return raw
+
+    def undistort(self, points: ArrayLike, ideal: Camera | None = None) -> Floats:
+        """Ideal pixels of raw ones: the inverse of :meth:`distort`.
+
+        OpenCV's fixed-point iteration, which stalls under strong distortion, polished by Newton steps.
+
+        Returns
+        -------
+        (n, 2) column, row in the image of ``ideal``; NaN where no ideal pixel has the raw position as its image.
+        """
+        raw = _points(points)
+        ideal = ideal or self.ideal_camera()
+        if self.model == "none" or not len(raw):
+            return ideal.project(self.camera.rays(raw))
+        rays = np.column_stack([self._start(raw), np.ones(len(raw))])
+        with np.errstate(all="ignore"):
+            todo = np.arange(len(raw))
+            for _ in range(REFINEMENTS):
+                here = self._project(rays[todo])
+                unsolved = ~(np.hypot(*(here - raw[todo]).T) < SOLVED_PX)
+                todo, here = todo[unsolved], here[unsolved]
+                if not todo.size:
+                    break
+                rays[todo, :2] -= self._step(rays[todo], here, raw[todo])
+            rays[todo] = np.nan
+            rays[~(np.hypot(rays[:, 0], rays[:, 1]) < self.reach)] = np.nan
+        return ideal.project(rays)
+
+    def maps(self, ideal: Camera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Raw column and row, (row, col) of ``ideal``'s image, of every ideal pixel; NaN where the model folds back."""
+        size = (ideal.width, ideal.height)
+        k, d = self.camera.matrix, np.array(self.coefficients)
+        if self.model == "fisheye":
+            x, y = cv2.fisheye.initUndistortRectifyMap(k, d, np.eye(3), ideal.matrix, size, cv2.CV_32FC1)
+        else:
+            x, y = cv2.initUndistortRectifyMap(k, d, None, ideal.matrix, size, cv2.CV_32FC1)
+        if math.isfinite(self.reach):
+            column = (np.arange(ideal.width) - ideal.cx) / ideal.fx
+            row = (np.arange(ideal.height) - ideal.cy) / ideal.fy
+            beyond = ~(np.hypot(column[None, :], row[:, None]) < self.reach)
+            x[beyond] = y[beyond] = np.nan
+        return x, y
+
+    def _project(self, rays: Floats) -> Floats:
+        k, d = self.camera.matrix, np.array(self.coefficients)
+        raw = np.empty((len(rays), 2))
+        for at in range(0, len(rays), CHUNK):
+            part = np.ascontiguousarray(rays[at : at + CHUNK])
+            if self.model == "fisheye":
+                out = cv2.fisheye.distortPoints(part[None, :, :2].copy(), k, d)
+            else:
+                out = cv2.projectPoints(part, np.zeros(3), np.zeros(3), k, d)[0]
+            raw[at : at + CHUNK] = out.reshape(-1, 2)
+        return raw
+
+    def _start(self, raw: Floats) -> Floats:
+        k, d = self.camera.matrix, np.array(self.coefficients)
+        if self.model == "fisheye":
+            return np.asarray(cv2.fisheye.undistortPoints(raw[None], k, d), dtype=np.float64).reshape(-1, 2)
+        return np.asarray(cv2.undistortPoints(raw[None], k, d), dtype=np.float64).reshape(-1, 2)
+
+    def _step(self, rays: Floats, here: Floats, raw: Floats) -> Floats:
+        """Newton step (n, 2) in ray coordinates, with the derivative by central differences."""
+        h = 1e-6
+        across, down = (np.array([h, 0.0, 0.0]), np.array([0.0, h, 0.0]))
+        a = (self._project(rays + across) - self._project(rays - across)) / (2 * h)
+        b = (self._project(rays + down) - self._project(rays - down)) / (2 * h)
+        miss = here - raw
+        det = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+        u = (miss[:, 0] * b[:, 1] - miss[:, 1] * b[:, 0]) / det
+        v = (a[:, 0] * miss[:, 1] - a[:, 1] * miss[:, 0]) / det
+        return np.stack([u, v], axis=1)
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON form."""
+        return {"camera": self.camera.to_dict(), "model": self.model, "coefficients": list(self.coefficients)}
+
+    @staticmethod
+    def from_dict(d: Mapping[str, Any]) -> Lens:
+        """Inverse of :meth:`to_dict`."""
+        return Lens(Camera.from_dict(d["camera"]), str(d["model"]), tuple(float(v) for v in d["coefficients"]))
+
+
+def _points(points: ArrayLike) -> Floats:
+    p = np.asarray(points, dtype=np.float64)
+    if p.ndim != 2 or p.shape[1] != 2:
+        raise InputError("RIL-372", f"points of shape {p.shape} are not (n, 2)", remedy="give column and row of each")
+    return p
+
+
+def _first_root(in_square: Polynomial) -> float:
+    """Least r > 0 where a polynomial in r squared vanishes; infinite where it does not."""
+    roots = in_square.trim(NEGLIGIBLE).roots()
+    real = roots.real[(np.abs(roots.imag) < 1e-9 * np.maximum(1.0, np.abs(roots))) & (roots.real > 0)]
+    return math.sqrt(float(real.min())) if real.size else math.inf

@@ -1,0 +1,28 @@
+"""How poses are stored, wherever a stage gives them: the frame of reference is the stage's to say."""
+
+from __future__ import annotations
+
+from stages.core.declare import Array
+
+NO_VERTICAL = "none"
+"""Source of the vertical of a frame that nothing tells of: the camera's own up stands for it."""
+
+POSES = Array("poses", ("frame", "row", "col"), "float64", "m", "pose [R | t] of the left camera", "nan")
+
+COVARIANCE = Array(
+    "covariance",
+    ("frame", "parameter", "parameter_b"),
+    "float64",
+    "m^2, m rad, rad^2",
+    "covariance of position and rotation vector",
+    "nan",
+)
+
+SHARED = Array(
+    "shared",
+    ("frame", "parameter", "source"),
+    "float64",
+    "m, rad",
+    "errors of position and rotation vector per standard deviation of what all segments share",
+    "nan",
+)

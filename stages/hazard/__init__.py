@@ -1,0 +1,1 @@
+"""From elevations to a risk map, for one vehicle."""

@@ -1,0 +1,215 @@
+"""A vehicle put down on the ground at every place and heading: tilt, slope of the footprint and rise under the belly.
+
+Places lie on a coarse grid, every seventh of a wheel; heights are first reduced to the highest and the lowest of each
+of its blocks, so that nothing is left out. A wheel *stands* on the highest ground in its contact patch, half a wheel
+wide;
+*ground* is the lowest there. At each place the vehicle is turned through ``HEADINGS`` headings. Four wheels touch in
+threes: of each three, two span the wheel base and two the track, so the plane through them has the gradient (difference
+along a side / wheel base, difference along an axle / track). The greatest over threes and headings is
+
+* tilt, from where the wheels stand (stones count), and
+* slope of the footprint's plane, from the ground beneath (stones narrower than a wheel do not).
+
+Rise under the belly is how far the ground there comes up from the plane of the wheels: for a point p between the axles
+with bilinear weights w of the four wheels, ``sum_i w_i max(0, z(p) - stand_i)``. It is the height of p over that plane
+where no wheel stands higher than p, and more where one does: a wheel that happens to stand high lifts the belly, but is
+not relied on, as in the bounds of Otsu et al. (2020), doi:10.1002/rob.21917 (ACE). On a plane of gradient g it is at
+most g wheel_base / 4 along, and as much across with the track.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from stages.hazard.vehicle import Vehicle
+from stages.numeric.extrema import running_max
+
+Floats32 = NDArray[np.float32]
+Ints = NDArray[np.int64]
+
+HEADINGS = 8
+"""Over half a turn, since the footprint is the same backwards: 22.5 degrees move a wheel by less than its diameter."""
+
+PLACES_PER_WHEEL = 7
+"""Places along a wheel's diameter, at least."""
+
+
+@dataclass(frozen=True)
+class Places:
+    """Results (row, col) on the coarse grid, float32: gradients ``tilt`` and ``slope`` (1), ``rise`` (m).
+
+    ``unstood``: of wheels and parts of the belly, over headings, the share with unknown ground below; what is there is
+    not in the others.
+    """
+
+    tilt: Floats32
+    slope: Floats32
+    rise: Floats32
+    unstood: Floats32
+
+
+@dataclass(frozen=True)
+class Stance:
+    """Offsets (row, col) in coarse cells: wheels (heading, 4, 2), belly (heading, point, 2), and sizes in coarse cells.
+
+    Wheels: front left, front right, rear left, rear right. ``spans`` (heading, 4) metres: left side, right side, front
+    axle, rear axle. ``weights`` (point, 4) of the wheels at the belly's points.
+    """
+
+    wheels: Ints
+    belly: Ints
+    spans: Floats32
+    weights: Floats32
+    wheel_reach: int
+    belly_reach: int
+
+    @staticmethod
+    def of(vehicle: Vehicle, cell: float) -> Stance:
+        """Of a vehicle on a grid of ``cell`` metres."""
+        half = np.array([[1.0, -1.0], [1.0, 1.0], [-1.0, -1.0], [-1.0, 1.0]]) / 2.0  # ahead, right
+        wheels = half * [vehicle.wheel_base, vehicle.track]
+        width = max(vehicle.track - vehicle.wheel_width, vehicle.wheel_width)
+        parts = _parts(vehicle.wheel_base, width), _parts(width, vehicle.wheel_base)
+        ahead, right = ((np.arange(n) + 0.5) / n - 0.5 for n in parts)
+        share = np.stack(np.meshgrid(ahead, right, indexing="ij"), axis=-1).reshape(-1, 2)
+        points = share * [vehicle.wheel_base, width]
+        along, across = share[:, :1], points[:, 1:] / vehicle.track
+        weights = (0.5 + 2.0 * along * half[:, 0]) * (0.5 + 2.0 * across * half[:, 1])
+        turns = [_rotation(k * math.pi / HEADINGS) for k in range(HEADINGS)]
+        at = np.stack([np.rint(wheels @ turn / cell) for turn in turns])
+        under = np.stack([np.rint(points @ turn / cell) for turn in turns])
+        pairs = ((0, 2), (1, 3), (0, 1), (2, 3))
+        spans = np.stack([np.hypot(*(at[:, a] - at[:, b]).T) for a, b in pairs], axis=1) * cell
+        part = max(vehicle.wheel_base / parts[0], width / parts[1])
+        return Stance(
+            at.astype(np.int64),
+            under.astype(np.int64),
+            np.maximum(spans, cell).astype(np.float32),
+            weights.astype(np.float32),
+            max(1, round(0.25 * vehicle.wheel_diameter / cell)),
+            max(1, round(0.5 * part / cell)),
+        )
+
+
+def _parts(length: float, other: float) -> int:
+    """Into how many about square parts a side is divided; the shorter one into two."""
+    return max(2, round(2.0 * length / min(length, other)))
+
+
+def _rotation(angle: float) -> NDArray[np.float64]:
+    """(ahead, right) to (row, col) of a raster whose rows fall ahead, turned clockwise."""
+    c, s = math.cos(angle), math.sin(angle)
+    return np.array([[-c, s], [s, c]])
+
+
+def stride(vehicle: Vehicle, cell: float) -> int:
+    """Cells from place to place."""
+    return max(1, int(vehicle.wheel_diameter / (PLACES_PER_WHEEL * cell) + 1e-6))
+
+
+def place(
+    high: Floats32, low: Floats32, vehicle: Vehicle, cell: float, whole: NDArray[np.bool_] | None = None
+) -> Places:
+    """Put the vehicle down everywhere.
+
+    Parameters
+    ----------
+    high, low : (row, col) float32, metres, highest and lowest ground in each coarse cell, NaN unknown.
+    cell : side of a coarse cell, metres.
+    whole : (row, col) coarse cells that are wholly known; None: those with a height.
+    """
+    stance = Stance.of(vehicle, cell)
+    gaps = np.isnan(high) if whole is None else ~whole
+    reach = int(max(np.abs(stance.wheels).max(), np.abs(stance.belly).max()))
+    stand, belly = (running_max(high, n) for n in (stance.wheel_reach, stance.belly_reach))
+    ground = -running_max(-low, stance.wheel_reach)
+    patchy = [running_max(gaps.astype(np.float32), n) > 0 for n in (stance.wheel_reach, stance.belly_reach)]
+    padded = [
+        np.pad(np.where(np.isfinite(a), a, np.float32(np.nan)), reach, constant_values=np.nan)
+        for a in (stand, ground, belly)
+    ]
+    padded += [np.pad(a.astype(np.uint16), reach, constant_values=1) for a in patchy]
+    out = [np.zeros(high.shape, dtype=np.float32) for _ in range(4)]
+    wheels, under = ((at + reach).astype(np.uint64) for at in (stance.wheels, stance.belly))
+    _place(*padded, wheels, under, stance.spans, stance.weights, *out)
+    return Places(np.sqrt(out[0]), np.sqrt(out[1]), out[2], out[3])
+
+
+# Lines are read in place, by offsets that are not signed: a line is short, and to make it an array of its own takes as
+# long as the work on it; and a signed index would be looked at for whether it counts from the end.
+
+
+@njit(cache=True, nogil=True)
+def _place(stand, ground, belly, gaps, gaps_below, wheels, under, spans, weights, tilt, slope, rise, unstood):  # type: ignore[no-untyped-def]
+    headings = wheels.shape[0]
+    parts = headings * (wheels.shape[1] + under.shape[1])
+    shares = np.zeros(parts + 1, dtype=np.float32)
+    for k in range(parts):
+        shares[k + 1] = shares[k] + np.float32(1.0 / parts)
+    missing = np.empty(tilt.shape[1], dtype=np.uint16)
+    for r in range(np.uint64(tilt.shape[0])):
+        missing[:] = 0
+        for k in range(headings):
+            _steepest(stand, wheels, spans, k, r, tilt)
+            _steepest(ground, wheels, spans, k, r, slope)
+            for j in range(0, wheels.shape[1], 2):
+                _count(gaps, wheels, k, j, r, missing)
+            for j in range(0, under.shape[1], 2):
+                _count(gaps_below, under, k, j, r, missing)
+                _rise(belly, stand, under, wheels, weights, k, j, r, rise)
+        for c in range(missing.shape[0]):
+            unstood[r, c] = shares[missing[c]]
+
+
+@njit(cache=True, nogil=True)
+def _steepest(a, wheels, spans, k, r, out):  # type: ignore[no-untyped-def]
+    """Raise ``out`` to the greatest squared gradient of the planes through three wheels, those that are known."""
+    y0, y1, y2, y3 = r + wheels[k, 0, 0], r + wheels[k, 1, 0], r + wheels[k, 2, 0], r + wheels[k, 3, 0]
+    x0, x1, x2, x3 = wheels[k, 0, 1], wheels[k, 1, 1], wheels[k, 2, 1], wheels[k, 3, 1]
+    one, zero = np.float32(1.0), np.float32(0.0)
+    left, right, front, rear = one / spans[k, 0], one / spans[k, 1], one / spans[k, 2], one / spans[k, 3]
+    for c in range(np.uint64(out.shape[1])):
+        fl, fr, rl, rr = a[y0, c + x0], a[y1, c + x1], a[y2, c + x2], a[y3, c + x3]
+        u, v = abs(fl - rl) * left, abs(fr - rr) * right
+        along = u if u > zero else zero
+        along = v if v > along else along
+        u, v = abs(fl - fr) * front, abs(rl - rr) * rear
+        across = u if u > zero else zero
+        across = v if v > across else across
+        square = along * along + across * across
+        out[r, c] = square if square > out[r, c] else out[r, c]
+
+
+@njit(cache=True, nogil=True)
+def _count(gaps, at, k, j, r, out):  # type: ignore[no-untyped-def]
+    """Add one for each of parts ``j`` and ``j + 1`` where there is a gap; of wheels and of the belly's parts there is
+    an even number."""
+    y0, y1, x0, x1 = r + at[k, j, 0], r + at[k, j + 1, 0], at[k, j, 1], at[k, j + 1, 1]
+    for c in range(np.uint64(out.shape[0])):
+        out[c] += gaps[y0, c + x0] + gaps[y1, c + x1]
+
+
+@njit(cache=True, nogil=True)
+def _rise(belly, stand, at, wheels, w, k, j, r, out):  # type: ignore[no-untyped-def]
+    """Raise ``out`` to the rise of points ``j`` and ``j + 1`` of the belly over the wheels' plane."""
+    y0, y1, y2, y3 = r + wheels[k, 0, 0], r + wheels[k, 1, 0], r + wheels[k, 2, 0], r + wheels[k, 3, 0]
+    x0, x1, x2, x3 = wheels[k, 0, 1], wheels[k, 1, 1], wheels[k, 2, 1], wheels[k, 3, 1]
+    y, x, v0, v1, v2, v3 = r + at[k, j, 0], at[k, j, 1], w[j, 0], w[j, 1], w[j, 2], w[j, 3]
+    z, s, w0, w1, w2, w3 = r + at[k, j + 1, 0], at[k, j + 1, 1], w[j + 1, 0], w[j + 1, 1], w[j + 1, 2], w[j + 1, 3]
+    zero = np.float32(0.0)
+    for c in range(np.uint64(out.shape[1])):
+        fl, fr, rl, rr = stand[y0, c + x0], stand[y1, c + x1], stand[y2, c + x2], stand[y3, c + x3]
+        p, q, most = belly[y, c + x], belly[z, c + s], out[r, c]
+        a, b, d, e = p - fl, p - fr, p - rl, p - rr
+        total = v0 * (a if a > zero else zero) + v1 * (b if b > zero else zero)
+        total += v2 * (d if d > zero else zero) + v3 * (e if e > zero else zero)
+        most = total if total > most else most
+        a, b, d, e = q - fl, q - fr, q - rl, q - rr
+        total = w0 * (a if a > zero else zero) + w1 * (b if b > zero else zero)
+        total += w2 * (d if d > zero else zero) + w3 * (e if e > zero else zero)
+        out[r, c] = total if total > most else most

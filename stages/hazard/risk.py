@@ -1,0 +1,224 @@
+"""Risk map: where a vehicle must not go, measure by measure against its limits (section 4.6).
+
+Classes, from the least to the greatest risk: *safe*; *caution*, where a measure comes near its limit, or exceeds it
+with a probability of more than ``max_p``, as beside unknown ground; *hazard*, where a measure exceeds its limit, or
+does with ``sigmas`` standard deviations added; and *unknown*, where too little of the window is known to say, which
+is never entered. The measures, their noise and the probability are those of :mod:`stages.hazard.hazards`; each that
+exceeds its limit has its bit in ``reason``.
+
+Where five cells are at most a wheel's radius, a 3 x 3 median first removes single wrong cells; coarser models keep
+every cell, since one cell may then be the top of a stone, or a post.
+
+Guarantees, each tested: of two elevation models the one with the greater relief (see :mod:`stages.hazard.hazards`), or
+with the greater standard deviations, is in no cell the safer one; nor is it with a larger ``sigmas``.
+
+Holes. A window is judged on what is known of it, so unknown does not grow; a hazard that is proven by a part is one.
+Small holes are closed with a flag. Their heights lie within the range of the rim (:mod:`stages.numeric.holes`),
+anywhere in it as far as is known, so they add no relief of their own, and their standard deviation is that of such a
+height.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from pydantic import Field
+
+from stages.core.declare import Array, Bundle, Inputs, Memory, Params, Stage
+from stages.core.errors import DegenerateError
+from stages.geometry.lattice import Lattice, mosaic, union
+from stages.hazard.classification import (
+    CAUTION,
+    DOUBT_BIT,
+    FILLED_BIT,
+    HAZARDOUS,
+    SAFE,
+    UNKNOWN,
+    UNKNOWN_BIT,
+    UNSEEN_BIT,
+    Rules,
+    classify,
+)
+from stages.hazard.hazards import BITS, measure, window_reach
+from stages.hazard.vehicle import DEFAULT_VEHICLE, Vehicle
+from stages.numeric.holes import close_into
+
+__all__ = ["BITS", "CAUTION", "DOUBT_BIT", "HAZARDOUS", "REASONS", "SAFE", "UNKNOWN", "UNKNOWN_BIT", "risk_map"]
+
+Floats32 = NDArray[np.float32]
+
+REASONS = BITS | {"unknown": UNKNOWN_BIT, "filled": FILLED_BIT, "uncertain": DOUBT_BIT, "unseen": UNSEEN_BIT}
+"""Bits of ``reason``: a measure over its limit; too little known to judge; elevation interpolated; over a limit only
+because of sigma; some of the ground that is looked at is unknown."""
+
+
+RIM = 1.0 / math.sqrt(12.0)
+"""Standard deviation of a height that lies anywhere within a range, of that range."""
+
+
+class RiskParams(Params):
+    """Parameters of ``risk``; the limits themselves are the vehicle's."""
+
+    window: float = Field(
+        default=1.0, gt=0, le=20, description="wheel diameters; side of the window, since a wheel bridges what is finer"
+    )
+    sigmas: float = Field(
+        default=1.25,
+        ge=0,
+        le=10,
+        description="standard deviations added to a measure before it is held against its limit",
+    )
+    caution: float = Field(
+        default=0.75, gt=0, le=1, description="share of a limit from which a cell asks for caution: the usual reserve"
+    )
+    max_p: float = Field(
+        default=0.02, gt=0, lt=0.5, description="probability of a hazard from which a cell asks for caution"
+    )
+    min_known: float = Field(
+        default=0.5, gt=0, le=1, description="share of the window that must be known; 0.5 is a straight border"
+    )
+    max_hole: float = Field(
+        default=0.5, ge=0, le=1, description="wheel diameters; gap closed, over which a wheel sinks by 0.07 diameters"
+    )
+
+
+def risk_map(
+    elevation: Floats32,
+    elevation_std: Floats32,
+    cell: float,
+    vehicle: Vehicle = DEFAULT_VEHICLE,
+    params: RiskParams | None = None,
+) -> dict[str, NDArray[Any]]:
+    """Classify every cell of an elevation model.
+
+    Parameters
+    ----------
+    elevation, elevation_std : (row, col) float32, metres, NaN unknown.
+    cell : side of a cell, metres.
+    vehicle : limits.
+    params : parameters; None for the defaults.
+
+    Returns
+    -------
+    ``risk`` uint8 (0 safe, 1 caution, 2 hazard, 3 unknown), ``reason`` uint16 bits; float32, NaN where unknown:
+    ``inclination``, ``slope``, ``tilt`` rad, ``height_range``, ``step``, ``roughness``, ``clearance`` (left under the
+    belly) m, ``p_hazard``; ``filled`` uint8, ``elevation`` float32 m (closed).
+
+    Raises
+    ------
+    DegenerateError
+        The vehicle is wider than the map.
+    """
+    p = params or RiskParams()
+    check_size(vehicle, elevation.shape, cell)
+    window = p.window * vehicle.wheel_diameter
+    z, s = elevation.copy(), np.empty(elevation.shape, dtype=np.float32)
+    _finite(np.ascontiguousarray(elevation_std, dtype=np.float32), s)
+    gap, side = p.max_hole * vehicle.wheel_diameter / cell, window_cells(window, cell)
+    filled = close_into(z, s, elevation, gap, side, p.min_known, rim=RIM)
+    measured = measure(elevation, z, s, cell, vehicle, window)
+    rules = Rules(p.sigmas, p.caution, p.max_p, p.min_known)
+    return classify(measured, z, filled, vehicle, window, cell, rules) | {"filled": filled, "elevation": z}
+
+
+@njit(cache=True, nogil=True)
+def _finite(source, out):  # type: ignore[no-untyped-def]
+    """A copy with 0 for what is not finite."""
+    for r in range(out.shape[0]):
+        line, target = source[r], out[r]
+        for c in range(out.shape[1]):
+            v = line[c]
+            target[c] = v if v - v == np.float32(0.0) else np.float32(0.0)
+
+
+def check_size(vehicle: Vehicle, shape: tuple[int, ...], cell: float) -> None:
+    """Refuse a vehicle that does not fit on the map at all."""
+    width, side = 2.0 * vehicle.half_width, min(shape) * cell
+    if width > side:
+        raise DegenerateError(
+            "RIL-431",
+            f"the vehicle is {width:.3g} m wide over its wheels, the map only {side:.3g} m",
+            remedy="give vehicle.track and vehicle.wheel_diameter in metres at the scale of the sequence",
+        )
+
+
+def window_cells(side: float, cell: float) -> int:
+    """Odd number of cells across a window of ``side`` metres, see :func:`stages.hazard.hazards.window_reach`."""
+    return 2 * window_reach(side, cell) + 1
+
+
+def _run(params: RiskParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+    dems: list[Bundle] = inputs["dem"]
+    lattices = [Lattice.from_dict(dem.meta["lattice"]) for dem in dems]
+    whole = union(lattices)
+    z = mosaic([(part, dem["elevation"]) for part, dem in zip(lattices, dems, strict=True)], np.nan, whole)
+    names = [next((n for n in ("relief_std", "elevation_std") if n in d.arrays), None) for d in dems]
+    stds = [(part, d[name]) for part, d, name in zip(lattices, dems, names, strict=True) if name is not None]
+    s = mosaic(stds, np.nan, whole) if stds else np.zeros(whole.shape, dtype=np.float32)
+    vehicle = Vehicle.model_validate(args["vehicle"]) if "vehicle" in args else DEFAULT_VEHICLE
+    arrays = risk_map(z.astype(np.float32), s.astype(np.float32), whole.cell, vehicle, params)
+    meta = {
+        "lattice": whole.to_dict(),
+        "frame": dems[0].meta.get("frame", "local"),
+        "vehicle": vehicle.model_dump(mode="json"),
+        "window_cells": window_cells(params.window * vehicle.wheel_diameter, whole.cell),
+        "shares": _shares(arrays),
+    }
+    return Bundle(arrays, meta)
+
+
+def _shares(arrays: Mapping[str, NDArray[Any]]) -> dict[str, float | None]:
+    """Shares of all cells, and of the judged ones, by class and cause."""
+    risk, reason = arrays["risk"], arrays["reason"]
+    judged, hazardous = int((risk != UNKNOWN).sum()), risk == HAZARDOUS
+    classes = (("safe", SAFE), ("caution", CAUTION), ("hazardous", HAZARDOUS), ("unknown", UNKNOWN))
+    shares: dict[str, float | None] = {name: float((risk == value).mean()) for name, value in classes}
+    shares["filled"] = float(arrays["filled"].mean())
+    hits = {"hazardous": hazardous, "uncertain": hazardous & ((reason & DOUBT_BIT) > 0)}
+    hits |= {name: hazardous & ((reason & bit) > 0) for name, bit in BITS.items()}
+    for name, hit in hits.items():
+        shares[f"{name}_of_judged"] = float(hit.sum()) / judged if judged else None
+    return shares
+
+
+_GRID = ("row", "col")
+
+STAGE = Stage(
+    name="risk",
+    version=5,
+    summary="safe, caution, hazard and unknown cells by seven measures against a vehicle's limits",
+    params=RiskParams,
+    inputs=("dem*",),
+    outputs=(
+        Array("risk", _GRID, "uint8", "1", "class: 0 safe, 1 caution, 2 hazard, 3 unknown"),
+        Array("reason", _GRID, "uint16", "1", "bits: " + ", ".join(f"{bit} {name}" for name, bit in REASONS.items())),
+        Array(
+            "inclination",
+            _GRID,
+            "float32",
+            "rad",
+            "highest minus lowest height in the wheel's window over its extent",
+            "nan",
+        ),
+        Array("height_range", _GRID, "float32", "m", "highest minus lowest height in the wheel's window", "nan"),
+        Array("step", _GRID, "float32", "m", "highest minus lowest height within a wheel's radius", "nan"),
+        Array("roughness", _GRID, "float32", "m", "RMS deviation of heights a quarter of a wheel apart", "nan"),
+        Array(
+            "slope", _GRID, "float32", "rad", "steepest plane of the footprint by the ground beneath the wheels", "nan"
+        ),
+        Array(
+            "tilt", _GRID, "float32", "rad", "greatest tilt of the vehicle over headings and three-wheel stands", "nan"
+        ),
+        Array("clearance", _GRID, "float32", "m", "least left under the belly, over headings", "nan"),
+        Array("p_hazard", _GRID, "float32", "1", "probability that a measure exceeds its limit", "nan"),
+        Array("filled", _GRID, "uint8", "1", "1 where the elevation was interpolated"),
+        Array("elevation", _GRID, "float32", "m", "elevation with small holes closed", "nan"),
+    ),
+    run=_run,
+    memory=Memory(factor=16.0, lower=("locus.cell_size",)),
+)

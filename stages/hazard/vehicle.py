@@ -1,0 +1,67 @@
+"""The vehicle whose limits decide what is hazardous: metres and degrees, at the scale of the sequence."""
+
+from __future__ import annotations
+
+from pydantic import Field, model_validator
+
+from stages.core.declare import Params
+
+
+class Vehicle(Params):
+    """Size and limits of a wheeled vehicle.
+
+    The defaults are a full-scale small rover of about 60 kg: what a 0.3 m wheel and a passive rocker climb at half of
+    their reach, so that they hold on loose ground too.
+    """
+
+    name: str = Field(default="default rover", min_length=1, description="words; names the limits in the report")
+    wheel_diameter: float = Field(
+        default=0.30,
+        gt=0,
+        description="m; side of the window in which terrain is judged, since a wheel bridges what is finer",
+    )
+    track: float = Field(default=0.60, gt=0, description="m; distance of the left from the right wheels")
+    wheel_base: float = Field(default=0.70, gt=0, description="m; distance of the front from the rear wheels")
+    clearance: float = Field(default=0.20, gt=0, description="m; height of the belly above flat ground")
+    max_slope_deg: float = Field(
+        default=20.0, gt=0, lt=90, description="degrees; steepest ground it drives, half of a usual tip-over angle"
+    )
+    max_step: float = Field(default=0.12, gt=0, description="m; highest edge that it climbs, 0.4 of the wheel")
+    max_roughness: float = Field(
+        default=0.04,
+        gt=0,
+        description="m; largest standard deviation from the plane under a wheel, a third of the step",
+    )
+    margin: float = Field(
+        default=0.15,
+        ge=0,
+        description="m; distance that a path keeps from hazards, half a wheel for what localisation errs",
+    )
+
+    @property
+    def wheel_width(self) -> float:
+        """Metres; half the diameter, as that of most rovers is."""
+        return 0.5 * self.wheel_diameter
+
+    @property
+    def half_width(self) -> float:
+        """Metres from the middle line to the outer face of the wheels."""
+        return 0.5 * (self.track + self.wheel_width)
+
+    @property
+    def half_length(self) -> float:
+        """Metres from the middle to the front of the front wheels."""
+        return 0.5 * (self.wheel_base + self.wheel_diameter)
+
+    @model_validator(mode="after")
+    def _belly_clears_what_wheels_climb(self) -> Vehicle:
+        if self.max_step > self.clearance:
+            raise ValueError(
+                f"max_step {self.max_step:g} m is higher than clearance {self.clearance:g} m: "
+                "the belly would strike what the wheels climb; lower max_step or raise clearance"
+            )
+        return self
+
+
+DEFAULT_VEHICLE = Vehicle()
+"""Used, and named in the report, where neither the sequence nor the user states a vehicle."""

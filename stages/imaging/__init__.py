@@ -1,0 +1,1 @@
+"""Images before they are matched: pyramids, undistortion, quality."""

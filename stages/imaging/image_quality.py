@@ -1,0 +1,113 @@
+"""What one stereo pair looks like, before anything is matched: grey values, sharpness, and whether it repeats another.
+
+Plain figures that tell a black, blurred or repeated image from a good one; what follows from them is decided over the
+whole sequence (:mod:`stages.odometry.frame_screening`).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.core.declare import Bundle, Inputs, NoParams, Stage
+from stages.imaging.pyramid import grey
+
+LOW, HIGH = 2.0, 253.0
+"""Grey values at which an 8-bit image is taken as clipped."""
+
+BANDS = (0.25, 0.5, 0.75)
+"""Of the height: where the strips lie whose sharpness stands for the image's."""
+STRIP = 32
+"""Rows of a strip: some ten thousand pixels, and thrice what the wider blur reaches."""
+
+
+@dataclass(frozen=True)
+class Look:
+    """One image in figures: mean grey 0..255, deviation, shares of dark and bright clipped pixels, sharpness.
+
+    ``detail`` is what lies between two and four pixels, RMS over the deviation: where even that is gone, noise alone
+    decides on the sharpness.
+    """
+
+    mean: float
+    deviation: float
+    dark: float
+    bright: float
+    sharpness: float
+    detail: float = 0.0
+
+
+def look(image: NDArray[Any], valid: NDArray[np.uint8]) -> Look:
+    """Figures of an image (row, col); ``valid`` not zero where usable."""
+    level = grey(image)
+    values = level[(valid != 0) & np.isfinite(level)]
+    if not values.size:
+        return Look(math.nan, 0.0, 0.0, 0.0, math.nan)
+    clipped = float((values <= LOW).mean()), float((values >= HIGH).mean())
+    return Look(float(values.mean()), float(values.std()), *clipped, *texture(image, valid))
+
+
+def texture(image: NDArray[Any], valid: NDArray[np.uint8]) -> tuple[float, float]:
+    """Sharpness and detail of an image (row, col); ``valid`` not zero where usable. NaN: nothing is.
+
+    Sharpness is the share of detail between one and two pixels in that between two and four, RMS: it hardly depends on
+    what is shown, but falls with blur. Detail is the latter over the deviation: where even that is gone, noise alone
+    decides on the sharpness.
+    """
+    level = grey(image)
+    usable = (valid != 0) & np.isfinite(level)
+    inner = None
+    if not usable.all():
+        if not usable.any():
+            return math.nan, 0.0
+        level = np.where(usable, level, level[usable].mean())
+        inner = cv2.erode(usable.astype(np.uint8), np.ones((13, 13), np.uint8))
+    once, twice = (cv2.GaussianBlur(level, (0, 0), sigma) for sigma in (1.0, 2.0))
+    count = math.sqrt(max(level.size if inner is None else int(np.count_nonzero(inner)), 1))
+    coarse, fine = (cv2.norm(a, b, cv2.NORM_L2, inner) / count for a, b in ((once, twice), (level, once)))
+    deviation = float(cv2.meanStdDev(level, mask=None if inner is None else usable.astype(np.uint8))[1][0, 0])
+    return fine / coarse if coarse > 0 else math.nan, coarse / deviation if deviation > 0 else 0.0
+
+
+def glance(image: NDArray[Any], valid: NDArray[np.uint8]) -> dict[str, Any]:
+    """Mean and deviation (grey), sharpness (None: none to tell) and detail of strips of an image, and its digest."""
+    rows = image.shape[0]
+    first = sorted({int(np.clip(share * rows - STRIP / 2, 0, max(rows - STRIP, 0))) for share in BANDS})
+    found = [texture(image[r : r + STRIP], valid[r : r + STRIP]) for r in first]
+    sharp = [s for s, _ in found if math.isfinite(s)]
+    some, mask = grey(np.ascontiguousarray(image[::2, ::2])), (valid[::2, ::2] != 0).astype(np.uint8)
+    (mean,), (deviation,) = (a.ravel() for a in cv2.meanStdDev(some, mask=mask))
+    return {
+        "mean": float(mean) if mask.any() else None,
+        "deviation": float(deviation),
+        "sharpness": float(np.median(sharp)) if sharp else None,
+        "detail": float(np.median([d for _, d in found])),
+        "digest": hashlib.sha256(np.ascontiguousarray(image).tobytes()).hexdigest(),
+    }
+
+
+def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+    facts = {
+        side: glance(np.asarray(inputs[side]["image"]), np.asarray(inputs[side]["valid"]))
+        for side in ("left", "right")
+        if side in inputs
+    }
+    return Bundle({}, {"frame": int(args["frame"])} | facts)
+
+
+STAGE = Stage(
+    name="sight",
+    version=1,
+    summary="grey values and sharpness of a pair, before anything is matched",
+    params=NoParams,
+    inputs=("left", "right"),
+    outputs=(),
+    run=_run,
+)

@@ -1,0 +1,185 @@
+"""Image pyramid: each level is the mean of 2 x 2 pixels of the one below (paper, 4.3.4).
+
+Pixel centres are at integers, so column ``x`` of level 0 lies at ``x_n = (x + 0.5) / 2**n - 0.5`` on level n. Odd sizes
+are completed by repeating the last row or column. A coarse pixel is valid if at least three of its four pixels are;
+its value is the mean of the valid ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from pydantic import Field
+
+from stages.core.declare import AnyArray, Array, Bundle, Inputs, Params, Stage
+from stages.core.errors import InputError
+from stages.core.validity import Mask
+
+Image = NDArray[np.float32]
+
+
+class PyramidParams(Params):
+    """Parameters of the image pyramid."""
+
+    levels: int = Field(
+        default=6, ge=1, le=10, description="images, level 0 included; three are too few beyond a megapixel"
+    )
+    min_side: int = Field(
+        default=8, ge=1, description="pixels; no level has a side below this (13-tap features need context)"
+    )
+
+
+@dataclass(frozen=True)
+class Pyramid:
+    """Grey images (0..255, float32) and masks (uint8, 1 = usable), level 0 first."""
+
+    images: tuple[Image, ...]
+    valid: tuple[Mask, ...]
+
+    @property
+    def levels(self) -> int:
+        """Number of images."""
+        return len(self.images)
+
+    @staticmethod
+    def from_bundle(bundle: Bundle) -> Pyramid:
+        """Pyramid out of the artifact of stage ``pyramid``."""
+        n = int(bundle.meta["levels"])
+        return Pyramid(
+            tuple(np.ascontiguousarray(bundle[f"level_{i}"]) for i in range(n)),
+            tuple(np.ascontiguousarray(bundle[f"valid_{i}"]) for i in range(n)),
+        )
+
+
+def grey(image: AnyArray) -> Image:
+    """Image (row, col) as float32 grey 0..255: uint8 as it is, uint16 over 257, floating point taken as 0..255.
+
+    Raises
+    ------
+    InputError
+        The array is not two-dimensional, is empty, or has another type.
+    """
+    if image.ndim != 2 or image.size == 0:
+        raise InputError("RIL-411", f"image of shape {image.shape} is not (row, col)", remedy="give one grey channel")
+    if image.dtype == np.uint16:
+        return image.astype(np.float32) * np.float32(1.0 / 257.0)
+    if image.dtype == np.uint8 or image.dtype.kind == "f":
+        return np.ascontiguousarray(image, dtype=np.float32)
+    raise InputError(
+        "RIL-412", f"image of type {image.dtype} has no known grey scale", remedy="give uint8, uint16 or float 0..255"
+    )
+
+
+def build(image: AnyArray, params: PyramidParams, valid: AnyArray | None = None) -> Pyramid:
+    """Pyramid of one grey image.
+
+    Parameters
+    ----------
+    image : (row, col) uint8, uint16 or floating point (0..255; not finite = not usable).
+    valid : (row, col), not zero where usable; None: everywhere.
+
+    Raises
+    ------
+    InputError
+        The image is not grey, or the mask has another shape.
+    """
+    level = grey(image)
+    if valid is not None and valid.shape != level.shape:
+        raise InputError(
+            "RIL-413", f"mask {valid.shape} and image {level.shape} differ", remedy="give a mask of the image's size"
+        )
+    whole = image.dtype.kind == "u"  # and so finite
+    mask = np.ones(level.shape, bool) if whole else np.isfinite(level)
+    if valid is not None:
+        mask &= valid != 0
+    levels, side = 1, min(level.shape)
+    while levels < params.levels and side >= 2 * params.min_side:
+        levels, side = levels + 1, (side + 1) // 2
+    if not (whole and valid is None):
+        level = np.where(mask, level, np.float32(0.0))
+    return halved(level, mask.view(np.uint8), levels)
+
+
+def halved(image: Image, mask: Mask, levels: int) -> Pyramid:
+    """Pyramid of so many levels of a float32 image (0 where masked) and its mask.
+
+    Of a window that starts and ends where a pixel of the top level does, it is a part of the image's pyramid.
+    """
+    images, masks = [image], [mask]
+    for _ in range(levels - 1):
+        image, mask = _halve(image, mask)
+        images.append(image)
+        masks.append(mask)
+    return Pyramid(tuple(images), tuple(masks))
+
+
+def _halve(image: Image, mask: Mask) -> tuple[Image, Mask]:
+    rows, cols = image.shape
+    coarse = np.empty(((rows + 1) // 2, (cols + 1) // 2), np.float32)
+    valid = np.empty(coarse.shape, np.uint8)
+    _means(image, mask, coarse, valid)
+    return coarse, valid
+
+
+@njit(cache=True, nogil=True)
+def _means(image, mask, coarse, valid):  # type: ignore[no-untyped-def]
+    """Indices without sign, so that the compiler need not mind negative ones and makes vector code of the loop."""
+    rows, cols = image.shape
+    nil, one, three = np.float32(0.0), np.float32(1.0), np.float32(3.0)
+    for y in range(coarse.shape[0]):
+        a, b = image[2 * y], image[min(2 * y + 1, rows - 1)]
+        p, q = mask[2 * y], mask[min(2 * y + 1, rows - 1)]
+        found, usable = coarse[y], valid[y]
+        for x in range(cols // 2):
+            i, k = np.uint64(2 * x), np.uint64(2 * x + 1)
+            count = (np.float32(p[i]) + np.float32(p[k])) + (np.float32(q[i]) + np.float32(q[k]))
+            found[x] = (a[i] + a[k] + b[i] + b[k]) / max(count, one) if count >= three else nil
+            usable[x] = count >= three
+        if cols % 2:
+            x, i = cols // 2, cols - 1
+            count = np.float32(2 * (p[i] + q[i]))
+            found[x] = (a[i] + a[i] + b[i] + b[i]) / max(count, one) if count >= three else nil
+            usable[x] = count >= three
+
+
+def filled(pyramid: Pyramid) -> tuple[Image, ...]:
+    """Images whose masked pixels carry the grey of the next valid level above, so that a mask's edge is no texture."""
+    images = list(pyramid.images)
+    for n in range(pyramid.levels - 1, -1, -1):
+        mask = pyramid.valid[n] != 0
+        if mask.all():
+            continue
+        if n + 1 < pyramid.levels:
+            rows, cols = images[n].shape
+            above = images[n + 1].repeat(2, axis=0)[:rows].repeat(2, axis=1)[:, :cols]
+        else:
+            above = np.full_like(images[n], images[n][mask].mean() if mask.any() else 0.0)
+        images[n] = np.where(mask, images[n], above)
+    return tuple(images)
+
+
+def _run(params: PyramidParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+    bundle: Bundle = inputs["image"]
+    pyramid = build(bundle["image"], params, bundle["valid"])
+    arrays: dict[str, AnyArray] = {f"level_{n}": image for n, image in enumerate(pyramid.images)}
+    arrays |= {f"valid_{n}": mask for n, mask in enumerate(pyramid.valid)}
+    return Bundle(arrays, {"levels": pyramid.levels})
+
+
+STAGE = Stage(
+    name="pyramid",
+    version=1,
+    summary="grey image pyramid by means of 2 x 2 pixels",
+    params=PyramidParams,
+    inputs=("image",),
+    outputs=(
+        Array("level_*", ("row", "col"), "float32", "1", "grey value 0..255, 0 where masked"),
+        Array("valid_*", ("row", "col"), "uint8", "1", "1 = usable"),
+    ),
+    run=_run,
+)

@@ -1,0 +1,101 @@
+"""Running extrema over octagons, and medians: what of a window is order, not mean.
+
+The window is a regular octagon rather than a square, since the highest minus the lowest height of a plane over a square
+is larger by a factor of 1.41 on the diagonal; over the octagon it is by at most 1.10 (:func:`octagon`), nowhere smaller
+than along an axis. An octagon is a square widened along both diagonals, so its running maximum is that of a square,
+then of two diagonal lines (``cv2.dilate``).
+
+Everything here commutes with any rising function of the heights: where relief is made greater, every difference of two
+of these results is (the argument is in :mod:`stages.hazard.hazards`).
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Floats32 = NDArray[np.float32]
+
+NOTHING = np.float32(-np.inf)
+"""Stands where no cell is known: every height is above it."""
+
+
+def octagon(reach: int) -> tuple[int, int]:
+    """Half side of the square and steps along either diagonal that make an octagon of ``reach`` cells from its middle.
+
+    It extends by exactly ``reach`` along the axes, and by one to 1.10 ``reach`` in every other direction: vertices
+    lie at (reach, side).
+    """
+    diagonal = int(reach / (2.0 + np.sqrt(2.0)))
+    return reach - 2 * diagonal, diagonal
+
+
+def running_range(surface: Floats32, reach: int) -> tuple[Floats32, Floats32]:
+    """Highest and lowest value (row, col) within the octagon; unknown (NaN) is left out, -inf and inf where all is."""
+    return running_max(surface, reach), -running_max(-surface, reach)
+
+
+def running_max(surface: Floats32, reach: int) -> Floats32:
+    """The highest value alone."""
+    return _inside(_widened(_padded(surface, reach), *octagon(reach)), reach)
+
+
+def relief(surface: Floats32, near: int, reach: int) -> tuple[Floats32, Floats32]:
+    """Highest minus lowest value (row, col) within two octagons, ``near`` and ``reach`` >= near.
+
+    It is 0 where all is unknown. The larger octagon is the smaller one widened once more, so it starts from that one's
+    extrema.
+    """
+    side, diagonal = octagon(near)
+    more, steps = (b - a for a, b in zip((side, diagonal), octagon(reach), strict=True))
+    if more < 0 or steps < 0:  # one octagon is not a widening of the other
+        small, large = ([running_max(z, n) for z in (surface, -surface)] for n in (near, reach))
+        return _above_zero(*small), _above_zero(*large)
+    small = [_widened(_padded(z, reach), side, diagonal) for z in (surface, -surface)]
+    large = [_widened(z, more, steps) for z in small]
+    return _above_zero(*(_inside(z, reach) for z in small)), _above_zero(*(_inside(z, reach) for z in large))
+
+
+def _above_zero(high: Floats32, depth: Floats32) -> Floats32:
+    """Highest minus lowest, which is the highest plus the greatest depth."""
+    relief: Floats32 = np.maximum(high + depth, np.float32(0.0))
+    return relief
+
+
+def _padded(surface: Floats32, by: int) -> Floats32:
+    """The surface with a border; the border and the unknown are :data:`NOTHING`."""
+    z = np.where(np.isnan(surface), NOTHING, surface)
+    padded: Floats32 = cv2.copyMakeBorder(z, by, by, by, by, cv2.BORDER_CONSTANT, value=float(NOTHING))
+    return padded
+
+
+def _inside(padded: Floats32, by: int) -> Floats32:
+    return np.ascontiguousarray(padded[by:-by, by:-by])
+
+
+def _widened(z: Floats32, side: int, diagonal: int) -> Floats32:
+    """Running maximum over a square of half side ``side``, then over both diagonals of ``diagonal`` steps."""
+    line = np.eye(2 * diagonal + 1, dtype=np.uint8)
+    for window in (np.ones((2 * side + 1, 2 * side + 1), dtype=np.uint8), line, line[:, ::-1].copy()):
+        if window.size > 1:
+            z = cv2.dilate(z, window, borderType=cv2.BORDER_CONSTANT, borderValue=float(NOTHING))
+    return z
+
+
+def median3(surface: Floats32) -> Floats32:
+    """Median (row, col) of the known cells in 3 x 3; unknown stays unknown.
+
+    Of an even number the upper one: the mean of two heights would not be one of the heights.
+    """
+    padded = np.pad(surface, 1, constant_values=np.nan)
+    out = np.ascontiguousarray(cv2.medianBlur(padded, 3)[1:-1, 1:-1])  # right where all nine are known
+    known = ~np.isnan(padded)
+    all_nine = cv2.erode(known.view(np.uint8), np.ones((3, 3), dtype=np.uint8)).view(bool)[1:-1, 1:-1]
+    row, col = np.nonzero(known[1:-1, 1:-1] & ~all_nine)
+    nine = np.stack([padded[row + i, col + j] for i in range(3) for j in range(3)], axis=1)
+    count = np.count_nonzero(~np.isnan(nine), axis=1)
+    nine.sort(axis=1)  # unknown comes last
+    out[row, col] = nine[np.arange(len(row)), count // 2]
+    out[~known[1:-1, 1:-1]] = np.nan
+    return out

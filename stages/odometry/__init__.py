@@ -1,0 +1,1 @@
+"""From images to camera motion: interest points, tracks, key frames."""

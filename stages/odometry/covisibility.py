@@ -1,0 +1,132 @@
+"""How much of what one frame shows is still seen some frames later, from coarse displacements alone.
+
+Blocks of the first frame are carried along the chain of displacements (stage ``motion``). The displacement of a block
+is the median of its matches; where too few of its pixels match, that of the surroundings is continued as an affinity.
+That matters most for a camera that drives ahead: what leaves the image below, the near ground, finds no match, and what
+was interpolated there is too short. Left out of the count, or counted by interpolated displacements, an overlap of 66 %
+looks like 85 %.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.core.declare import AnyArray, Bundle
+from stages.core.validity import Validity, matched
+from stages.odometry.track import fit_affinity, known_median
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+BLOCKS = 200
+"""Blocks of an image, about; more change the overlap by less than a per cent, and cost time with their square."""
+MATCHED_SHARE = 0.5
+"""Of the pixels of a block that must have matched for its median to be trusted: fewer may agree by chance."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """Coarse displacements from one frame to the next, pixels of level 0.
+
+    ``blocks`` (m, 2) centres (column, row) of all blocks of the image, ``side`` of a block; ``shift`` (m, 2) their
+    displacements, NaN not known; ``size`` (columns, rows) that the whole blocks cover; ``match_rate`` share of the
+    pixels with texture that have a displacement.
+    """
+
+    blocks: Floats
+    side: float
+    shift: Floats
+    size: tuple[float, float]
+    match_rate: float
+
+    @staticmethod
+    def from_bundle(bundle: Bundle) -> Step:
+        """From the result of stage ``motion``."""
+        validity = np.asarray(bundle["validity"])
+        known, scale = matched(validity), 2.0 ** int(bundle.meta["level"])
+        side = max(1, round((known.size / BLOCKS) ** 0.5))
+        inside = _blocks(known, side)
+        centres = [(np.arange(n) + 0.5) * side * scale - 0.5 for n in (inside.shape[1], inside.shape[0])]
+        enough = inside.mean(-1) >= MATCHED_SHARE
+        shift = np.full((*enough.shape, 2), np.nan)
+        for k, name in enumerate(("column_disparity", "row_disparity")):
+            values = np.where(inside, _blocks(np.asarray(bundle[name]), side), np.float32(np.nan))
+            shift[enough, k] = known_median(values[enough], inside[enough].sum(-1))
+        textured = validity & np.uint8(Validity.OUT_OF_IMAGE | Validity.NO_TEXTURE) == 0
+        n = int(np.count_nonzero(textured))
+        return Step(
+            np.stack(np.meshgrid(*centres), -1).reshape(-1, 2),
+            side * scale,
+            shift.reshape(-1, 2),
+            (enough.shape[1] * side * scale, enough.shape[0] * side * scale),
+            int(np.count_nonzero(known & textured)) / n if n else 0.0,
+        )
+
+    @property
+    def known(self) -> Bools:
+        """Which blocks (m,) have a displacement."""
+        return np.asarray(np.isfinite(self.shift).all(1))
+
+    def move(self, points: Floats) -> Floats:
+        """Where points (n, 2) of this frame lie in the next."""
+        ok = self.known
+        return (
+            points + fit_affinity(self.blocks[ok], (self.blocks + self.shift)[ok], np.ones(ok.sum(), bool), points)[1]
+        )
+
+    @property
+    def displacement(self) -> float | None:
+        """Median length of the displacements."""
+        return float(np.median(np.linalg.norm(self.shift[self.known], axis=1))) if self.known.any() else None
+
+
+def _blocks(values: AnyArray, side: int) -> AnyArray:
+    """(row, col) values as (block row, block column, pixel); rows and columns that fill no block are left out."""
+    rows, cols = (max(1, n // side) for n in values.shape)
+    whole = values[: rows * side, : cols * side]
+    return whole.reshape(rows, whole.shape[0] // rows, cols, -1).swapaxes(1, 2).reshape(rows, cols, -1)
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What a first frame and a later one have in common.
+
+    ``origin`` (n, 2) those blocks of the first frame that are still in the image, ``points`` (n, 2) where they are now,
+    ``part`` (n,) of each that is still seen; ``kept`` share of the first frame that is still seen; ``covered`` share of
+    the later frame that the first one saw.
+    """
+
+    origin: Floats
+    points: Floats
+    part: Floats
+    kept: float
+    covered: float
+
+    @staticmethod
+    def all_of(step: Step) -> Seen:
+        """Everything that the frame before a step shows."""
+        return Seen(step.blocks, step.blocks, np.ones(len(step.blocks)), 1.0, 1.0)
+
+    def after(self, step: Step) -> Seen:
+        """The same for the frame behind a step; what has left does not return."""
+        moved = step.move(self.points)
+        part = np.minimum(self.part, _part_inside(moved, step))
+        left = part > 0
+        origin, points, part = self.origin[left], moved[left], part[left]
+        _, back = fit_affinity(points, origin, np.ones(len(points), bool), step.blocks)
+        covered = float(np.mean(_part_inside(step.blocks + back, step)))
+        return Seen(origin, points, part, float(part.sum()) / len(step.blocks), covered)
+
+    @property
+    def overlap(self) -> float:
+        """The lesser share, 0..1: a camera that drives ahead loses what it saw, one that backs off sees new ground."""
+        return min(self.kept, self.covered)
+
+
+def _part_inside(centres: Floats, step: Step) -> Floats:
+    """Share (n,) of each block that lies in the image, by its centre (n, 2)."""
+    beyond = np.minimum(centres + 0.5, np.array(step.size) - 0.5 - centres)
+    return np.asarray(np.clip(beyond / step.side + 0.5, 0.0, 1.0).prod(axis=1), dtype=np.float64)

@@ -1,0 +1,265 @@
+"""Which frames the trajectory can go through: frames whose images show no motion are lost, and are bridged.
+
+A frame is *lost* where its left image shows nothing, where left and right are exchanged, or where neither the frame
+before nor the one behind is found in it while those two are found in each other. What is lost has no pose; tracking
+goes from the last good frame to the next. Where that bridge is no better, nothing speaks against the frame itself (the
+camera may have jumped): it stays, and resection decides.
+
+A pair of which one image is black, blurred, a copy of the other or of the one before is *unfit* as basic pair: it may
+be posed, but nothing is reconstructed from it.
+
+The stage is asked again with what it asks for: ``asks`` names bridges (motions between frames that are not
+neighbours) and frames whose sides are to be looked at; where both are empty the answer stands.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from stages.core.declare import Bundle, Inputs, Params, Stage
+from stages.core.errors import DegenerateError, InputError
+from stages.core.validity import matched
+from stages.imaging.image_quality import HIGH, LOW
+from stages.odometry.covisibility import Step
+from stages.odometry.keyframes import LEAST_BLOCKS
+
+Floats = NDArray[np.float64]
+Steps = Mapping[tuple[int, int], float]
+Asks = dict[str, list[Any]]
+
+SIDES = ("left", "right")
+QUIET = 0.25
+"""Quantile of the changes that is usual: one exchanged frame changes three steps, of a short sequence the half."""
+
+
+class ContinuityParams(Params):
+    """When a frame counts as lost, or as unfit to be basic."""
+
+    uniform: float = Field(
+        1.0, ge=0, description="grey levels; deviation over an image below which it shows nothing (noise has about one)"
+    )
+    blurred: float = Field(
+        0.6,
+        ge=0,
+        le=1,
+        description="share of the camera's usual sharpness below which a pair is no basic one; a Gaussian of one pixel"
+        " more takes that much",
+    )
+    min_matches: float = Field(
+        0.2,
+        ge=0,
+        le=1,
+        description="share of the pixels with texture that found a coarse displacement, below which two frames are not"
+        " found in each other",
+    )
+    jump: float = Field(
+        4.0,
+        gt=0,
+        description="pixels, and multiple of what is usual (lower quartile): median change of the displacements from"
+        " one step to the next at which the sides of the frames there are looked at",
+    )
+
+
+@dataclass
+class Judgement:
+    """``lost`` cause by frame; ``unfit`` why by frame; ``repeated`` frames like the one before; ``asks``."""
+
+    lost: dict[int, str] = field(default_factory=dict)
+    unfit: dict[int, str] = field(default_factory=dict)
+    repeated: list[tuple[int, int]] = field(default_factory=list)
+    asks: Asks = field(default_factory=lambda: {"bridges": [], "sides": []})
+
+
+def judge(
+    frames: Sequence[int],
+    sights: Mapping[int, Mapping[str, Any]],
+    steps: Steps,
+    jumps: Sequence[int],
+    sides: Mapping[int, Mapping[str, Any]],
+    params: ContinuityParams,
+) -> Judgement:
+    """What is known of the frames' continuity so far.
+
+    Parameters
+    ----------
+    frames : frame numbers in order.
+    sights : facts of stage ``sight`` by frame.
+    steps : share of matches by (frame, later frame); 0 where they tell nothing.
+    jumps : frames at which the displacements change abruptly.
+    sides : facts of stage ``sides`` by frame, as far as they were asked for.
+    """
+    out = Judgement()
+    _see(out, frames, sights, params)
+    for f in frames:
+        if f in sides and sides[f]["swapped"]:
+            out.lost.setdefault(f, _swapped(sides[f]))
+    doubted = set(jumps) | _neighbours(frames, {f for f in out.lost if f in sides})
+    out.asks["sides"] = [f for f in frames if f in doubted and f not in sides and f not in out.lost]
+    chain = [f for f in frames if f not in out.lost]
+    out.asks["bridges"] = [s for s in pairwise(chain) if s not in steps]
+    if any(out.asks.values()):
+        return out
+    good = [steps[s] >= params.min_matches for s in pairwise(chain)]
+    for i, j in _doubtful_runs(good):
+        bridge, inside = (chain[i], chain[j]), chain[i + 1 : j]
+        if bridge not in steps:
+            out.asks["bridges"].append(bridge)
+            continue
+        for f, (a, b) in zip(inside, zip(chain[i:], chain[i + 2 :], strict=False), strict=False):
+            if steps[bridge] >= params.min_matches or f in out.unfit:
+                out.lost[f] = _unmatched(out.unfit.get(f, ""), steps[a, f], steps[f, b])
+    _leading(out, [f for f in chain if f not in out.lost])
+    return out
+
+
+def _see(
+    out: Judgement, frames: Sequence[int], sights: Mapping[int, Mapping[str, Any]], params: ContinuityParams
+) -> None:
+    """What the images alone say."""
+    usual = {(s, what): _usual([sights[f][s][what] for f in frames]) for s in SIDES for what in ("sharpness", "detail")}
+    for f in frames:
+        for side in SIDES:
+            seen = sights[f][side]
+            if seen["deviation"] < params.uniform:
+                words = _uniform(seen, side)
+                (out.lost if side == "left" else out.unfit).setdefault(f, words)
+                continue
+            for what, limit in (("sharpness", params.blurred), ("detail", 0.5 * params.blurred)):
+                share = seen[what] / usual[side, what] if seen[what] is not None and usual[side, what] > 0 else 1.0
+                if share < limit:
+                    out.unfit.setdefault(f, f"blurred {side} image ({share:.0%} of the usual {what})")
+        if sights[f]["left"]["digest"] == sights[f]["right"]["digest"] and f not in out.lost:
+            out.unfit[f] = "left and right are one image"
+    for a, b in pairwise(frames):
+        same = {side: sights[a][side]["digest"] == sights[b][side]["digest"] for side in SIDES}
+        if a in out.lost or b in out.lost:
+            continue
+        if same["left"]:
+            out.repeated.append((a, b))
+        if same["left"] != same["right"]:
+            out.unfit.setdefault(b, f"its {'left' if same['left'] else 'right'} image is that of frame {a}")
+
+
+def _usual(values: Sequence[float | None]) -> float:
+    known = [v for v in values if v is not None]
+    return float(np.median(known)) if len(known) > 2 else 0.0
+
+
+def _uniform(seen: Mapping[str, Any], side: str) -> str:
+    mean = seen["mean"]
+    kind = "empty" if mean is None else "black" if mean <= LOW else "white" if mean >= HIGH else "uniform"
+    return f"{kind} {side} image (grey values deviate by {seen['deviation']:.1f} levels)"
+
+
+def _swapped(facts: Mapping[str, Any]) -> str:
+    return (
+        f"left and right are swapped ({facts['exchanged']:.0%} of its matches fit the rig with the sides exchanged,"
+        f" {facts['as_given']:.0%} as given)"
+    )
+
+
+def _unmatched(why: str, before: float, after: float) -> str:
+    shares = f"{before:.0%} of its pixels match the frame before, {after:.0%} the one behind"
+    return f"{why}, {shares}" if why else f"not found in its neighbours: {shares}"
+
+
+def _neighbours(frames: Sequence[int], of: set[int]) -> set[int]:
+    """Frames beside some others."""
+    return {n for a, b in pairwise(frames) for f, n in ((a, b), (b, a)) if f in of}
+
+
+def _doubtful_runs(good: Sequence[bool]) -> list[tuple[int, int]]:
+    """Places (i, j) of the frames before and behind each run of at least two doubtful steps between good ones."""
+    runs, first = [], None
+    for k, fine in enumerate([*good, True]):
+        if not fine and first is None:
+            first = k
+        if fine and first is not None:
+            if k - first >= 2:
+                runs.append((first, k))
+            first = None
+    return runs
+
+
+def _leading(out: Judgement, chain: list[int]) -> None:
+    """Frames before the first that may be basic are lost; refuse a sequence that has none."""
+    fit = next((f for f in chain if f not in out.unfit), None)
+    if fit is None:
+        first = next(iter((out.unfit | out.lost).items()), (0, "no images"))
+        raise DegenerateError(
+            "RIL-316",
+            f"no pair can be reconstructed from: frame {first[0]}: {first[1]}",
+            remedy="look at the images; the limits are those of [continuity]",
+        )
+    for f in chain[: chain.index(fit)]:
+        out.lost[f] = f"{out.unfit[f]}, and no good pair before it"
+
+
+def change(a: Bundle, b: Bundle) -> float:
+    """Median change of the displacements from one step to the next, pixels, where both are measured; 0: nowhere."""
+    both = matched(np.asarray(a["validity"])) & matched(np.asarray(b["validity"]))
+    if not both.any():
+        return 0.0
+    apart = [np.asarray(b[n])[both] - np.asarray(a[n])[both] for n in ("column_disparity", "row_disparity")]
+    return float(np.median(np.hypot(*apart)))
+
+
+def share(step: Step) -> float:
+    """Share of matches of a step; 0 where too few blocks of the image have one."""
+    return step.match_rate if int(step.known.sum()) >= LEAST_BLOCKS else 0.0
+
+
+def _jumps(frames: Sequence[int], changes: Sequence[float], params: ContinuityParams) -> list[int]:
+    """Frames at the abrupt changes; ``changes`` has one value a frame but the first and the last."""
+    if not changes:
+        return []
+    limit = max(params.jump, params.jump * float(np.quantile(changes, QUIET)))
+    found = {n for k, value in enumerate(changes) if value > limit for n in frames[k : k + 3]}
+    return [f for f in frames if f in found]
+
+
+def _run(params: ContinuityParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+    frames = [int(f) for f in args["frames"]]
+    motions, bridges = list(inputs.get("motions") or []), list(inputs.get("bridges") or [])
+    if len(motions) != len(frames) - 1 or len(inputs["sights"]) != len(frames):
+        raise InputError("RIL-317", f"{len(frames)} frames need as many sights and {len(frames) - 1} motions")
+    sights = {f: s.meta for f, s in zip(frames, inputs["sights"], strict=True)}
+    steps = {s: share(Step.from_bundle(m)) for s, m in zip(pairwise(frames), motions, strict=True)}
+    changes = [change(a, b) for a, b in pairwise(motions)]
+    spanned = [(int(a), int(b)) for a, b in args.get("bridges", ())]
+    steps |= {s: share(Step.from_bundle(m)) for s, m in zip(spanned, bridges, strict=True)}
+    sides = {int(s.meta["frame"]): s.meta for s in inputs.get("sides") or []}
+    found = judge(frames, sights, steps, _jumps(frames, changes, params), sides, params)
+    chain = [f for f in frames if f not in found.lost]
+    unfit = {f: why for f, why in found.unfit.items() if f in chain}
+    meta: dict[str, Any] = {
+        "asks": {"bridges": [list(s) for s in found.asks["bridges"]], "sides": found.asks["sides"]},
+        "chain": chain,
+        "lost": [{"frame": f, "cause": found.lost[f]} for f in frames if f in found.lost],
+        "unfit": [f for f in chain if f in unfit],
+        "match_rate": [steps[s] for s in pairwise(frames)],
+    }
+    if not any(found.asks.values()):
+        meta["warnings"] = [
+            *(f"frame {b} repeats the left image of frame {a}: no motion between them" for a, b in found.repeated),
+            *(f"frame {f} is not used as basic pair: {unfit[f]}" for f in chain if f in unfit),
+        ]
+    return Bundle({}, meta)
+
+
+STAGE = Stage(
+    name="continuity",
+    version=1,
+    summary="which frames are lost, and which may not be basic",
+    params=ContinuityParams,
+    inputs=("sights*", "motions*", "bridges*", "sides*"),
+    outputs=(),
+    run=_run,
+)

@@ -1,0 +1,219 @@
+"""Choice of the basic pairs: which stereo pairs become elevation models (paper, sections 7.2 and 7.4).
+
+Successive basic pairs bound a *segment*: the left images from one to the next are tracked and resected against the
+elevation model of the first. Positions behind the last basic pair are an open last segment.
+
+The paper takes every fourth pair of a camera that moves evenly. Here the next basic pair is the last one whose image
+still shows the wanted share of what the one before shows (:mod:`stages.odometry.covisibility`): poses are not known
+yet, the coarse displacements are. A camera that rests needs no new elevation model, one that turns needs them often.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from pydantic import Field, model_validator
+
+from stages.core.declare import Bundle, Inputs, Params, Stage
+from stages.core.errors import ConfigError, InputError
+from stages.odometry.covisibility import Seen, Step
+
+LEAST_BLOCKS = 12
+"""Blocks of the image with a displacement, below which the whole is not told by them."""
+
+LITTLE = 0.4
+"""Overlap below which a stride, which asks for none, is warned of: most landmarks of a segment leave the image."""
+
+NAVIGATION: Mapping[str, Any] = {"rule": "overlap", "overlap": 0.6}
+"""What preset ``navigation`` sets; a value given by the user wins."""
+
+
+class SelectParams(Params):
+    """Parameters of the choice of basic pairs."""
+
+    preset: Literal["terrain", "navigation"] = Field(
+        "terrain",
+        description="terrain: close pairs, so that elevation models share ground; navigation: rule overlap with 0.6,"
+        " fewer pairs to match for the trajectory alone, those with hfvm.preset fast; and motion.level, track.points,"
+        " orientation.samples are cheaper. What is given beside it wins, but for a mere stride",
+    )
+    rule: Literal["overlap", "stride"] = Field(
+        "overlap", description="overlap: as far apart as the wanted overlap permits; stride: evenly, as in the paper"
+    )
+    overlap: float = Field(
+        0.7,
+        gt=0,
+        lt=1,
+        description="share of what one basic pair sees that the next one sees too (rule overlap); below, landmarks and"
+        " common ground run out",
+    )
+    stride: int = Field(
+        4,
+        ge=1,
+        description="frames; every stride-th pair is basic (the paper's fourth intermediate frame, 7.4); given"
+        " alone, it sets the rule",
+    )
+    max_gap: int = Field(
+        16, ge=1, description="frames; most between two basic pairs under rule overlap: light and shadows change"
+    )
+    min_matches: float = Field(
+        0.2,
+        ge=0,
+        le=1,
+        description="share of the pixels with texture that found a coarse displacement; below, the displacement is not"
+        " trusted and both frames are basic (rule stride: the later one)",
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _stride_alone(cls, values: Any) -> Any:
+        """Who sets a stride and no rule wants the stride."""
+        if isinstance(values, Mapping) and "stride" in values and "rule" not in values:
+            return {"rule": "stride", **values}
+        return values
+
+    @model_validator(mode="before")
+    @classmethod
+    def _navigation(cls, values: Any) -> Any:
+        """What preset navigation sets. The validator written last runs first, so a mere stride changes nothing."""
+        if isinstance(values, Mapping) and values.get("preset") == "navigation":
+            return {**NAVIGATION, **values}
+        return values
+
+
+@dataclass(frozen=True)
+class Choice:
+    """``basic`` positions; ``why`` each is basic (first frame, stride, overlap, max_gap, few matches); ``overlap``.
+
+    ``overlap`` is that with the basic pair before, None for the first and where too few coarse matches tell of it.
+    """
+
+    basic: list[int]
+    why: list[str]
+    overlap: list[float | None]
+
+
+def by_stride(steps: Sequence[Step], params: SelectParams, unfit: frozenset[int] = frozenset()) -> Choice:
+    """Positions 0, stride, 2 stride ... of one more frame than there are steps; for an unfit one the next that is.
+
+    Behind a step that is not to be believed there is one, too: what follows can then be posed, though by itself.
+    """
+    count = len(steps) + 1
+    broken = [k + 1 for k, step in enumerate(steps) if doubtful(step, params)]
+    wanted = [*range(0, count, params.stride), *broken]
+    basic = sorted({b for k in wanted if (b := next((n for n in range(k, count) if n not in unfit), None)) is not None})
+    overlap = [_overlap(steps[a:b], params) for a, b in itertools.pairwise(basic)]
+    why = ["few matches" if k in broken and k % params.stride else "stride" for k in basic[1:]]
+    return Choice(basic, ["first frame", *why], [None, *overlap])
+
+
+def by_overlap(steps: Sequence[Step], params: SelectParams, unfit: frozenset[int] = frozenset()) -> Choice:
+    """Basic pairs as far apart as the wanted overlap permits; at least one frame apart.
+
+    Parameters
+    ----------
+    steps : coarse displacements from each frame to the next.
+    unfit : positions that may not be basic; the last one before that may takes their place, else the next one.
+    """
+    choice = Choice([0], ["first frame"], [None])
+    seen, k = (Seen.all_of(steps[0]) if steps else None), 0
+    while k < len(steps):
+        assert seen is not None
+        step, key = steps[k], choice.basic[-1]
+        ahead = seen.after(step)
+        reason = _why(steps, k, key, ahead, params)
+        fit = next((n for n in range(k, key, -1) if n not in unfit), None) if reason else None
+        if fit is not None:
+            choice.basic.append(fit)
+            choice.why.append(reason)
+            choice.overlap.append(_overlap(steps[key:fit], params))
+            k, step = fit, steps[fit]
+            ahead = Seen.all_of(step).after(step)
+        seen, k = ahead, k + 1
+    return choice
+
+
+def _why(steps: Sequence[Step], k: int, key: int, ahead: Seen, params: SelectParams) -> str:
+    """Why position ``k`` should be basic, given what ``ahead`` would still be seen one frame on; empty: it need not."""
+    if any(doubtful(step, params) for step in steps[max(k - 1, key) : k + 1]):
+        return "few matches"
+    if ahead.overlap < params.overlap:
+        return "overlap"
+    return "max_gap" if k + 1 - key > params.max_gap else ""
+
+
+def doubtful(step: Step, params: SelectParams) -> bool:
+    """Whether a step has too few matches to be believed."""
+    return step.match_rate < params.min_matches or int(step.known.sum()) < LEAST_BLOCKS
+
+
+def _overlap(steps: Sequence[Step], params: SelectParams) -> float | None:
+    """Overlap of the frames before and behind some steps; None where one of them is doubtful."""
+    if any(doubtful(step, params) for step in steps):
+        return None
+    seen = Seen.all_of(steps[0])
+    for step in steps:
+        seen = seen.after(step)
+    return seen.overlap
+
+
+def segments(basic: list[int], frames: int) -> list[list[int]]:
+    """Positions of each segment, from a basic pair to the next one inclusive; the last one reaches the end."""
+    ends = [*basic[1:], frames - 1]
+    return [list(range(a, b + 1)) for a, b in zip(basic, ends, strict=True) if b > a]
+
+
+def _run(params: SelectParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+    frames = int(args["frames"])
+    if frames < 1:
+        raise ConfigError("RIL-437", "no frame is chosen", remedy="choose at least one with --frames")
+    steps = [Step.from_bundle(b) for b in inputs.get("motions") or []]
+    if len(steps) != frames - 1:
+        raise InputError("RIL-438", f"{frames} frames need {frames - 1} motions, not {len(steps)}")
+    stride = params.rule == "stride"
+    choice = (by_stride if stride else by_overlap)(steps, params, frozenset(args.get("unfit", ())))
+    meta = {
+        "basic": choice.basic,
+        "segments": segments(choice.basic, frames),
+        "rule": f"every {params.stride}" if stride else f"overlap {params.overlap:g}",
+        "overlap": choice.overlap,
+        "why": choice.why,
+        "displacement": [step.displacement for step in steps],
+        "match_rate": [step.match_rate for step in steps],
+        "warnings": _warnings(steps, choice.overlap, params),
+    }
+    return Bundle({}, meta)
+
+
+def _warnings(steps: Sequence[Step], overlap: Sequence[float | None], params: SelectParams) -> list[str]:
+    """What the choice could not give."""
+    lines = []
+    blind = [k for k, step in enumerate(steps) if doubtful(step, params)]
+    if blind:
+        lines.append(
+            f"{len(blind)} of {len(steps)} steps between frames have too few coarse matches (at least"
+            f" {min(steps[k].match_rate for k in blind):.0%}), first behind the frame at position {blind[0]}: the"
+            " overlap there is not known, and the frames are tracked on a poor prediction"
+        )
+    least = min((v for v in overlap if v is not None), default=1.0)
+    wanted = params.overlap if params.rule == "overlap" else LITTLE
+    if least < wanted:
+        lines.append(
+            f"successive basic pairs overlap by as little as {least:.0%}, {wanted:.0%} are wanted:"
+            + (" set select.stride lower" if params.rule == "stride" else " the camera moves that far in one frame")
+        )
+    return lines
+
+
+STAGE = Stage(
+    name="select",
+    version=2,
+    summary="which stereo pairs become elevation models, and the segments between them",
+    params=SelectParams,
+    inputs=("motions*",),
+    outputs=(),
+    run=_run,
+)

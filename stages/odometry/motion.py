@@ -1,0 +1,244 @@
+"""Coarse displacement of all points from one left frame to the next (paper, 5.2.1, first iteration).
+
+The hierarchical matcher of stage ``hfvm``, stopped at a coarse level. There is no epipolar band: a camera that moves
+forward has radial flow, whose epipolar lines meet inside the image, where a band says nothing about the way along it.
+
+Where the rotation between the frames is known from a sensor, it is undone before matching
+(:mod:`stages.odometry.derotation`); where the matches are too few, the homography that features show
+(:mod:`stages.odometry.feature_homography`), or else an in-plane rotation that is looked for, is undone, as is one that
+the matches show (:mod:`stages.odometry.roll_search`). The displacements are those of the frames as they were taken all
+the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from stages.core.declare import AnyArray, Array, Bundle, Inputs, Params, Stage
+from stages.core.validity import Mask, Validity, defined, mark, matched
+from stages.geometry.geometry import Camera
+from stages.hfvm import consistency, hierarchy
+from stages.hfvm.params import HfvmParams
+from stages.hfvm.window import whole
+from stages.imaging.pyramid import Pyramid
+from stages.odometry import roll_search
+from stages.odometry.derotation import Derotation
+from stages.odometry.feature_homography import feature_homography
+
+
+class MotionParams(Params):
+    """Parameters of the coarse displacements between successive frames."""
+
+    level: int = Field(
+        default=2, ge=0, le=6, description="pyramid level of the result; 2 = a quarter of the resolution"
+    )
+    top_columns: float = Field(default=0.25, gt=0, le=1, description="share of the width searched at the top level")
+    top_rows: float = Field(default=0.25, gt=0, le=1, description="share of the height searched at the top level")
+    smoothness: int = Field(default=5, ge=0, description="byte steps a pixel of difference to each neighbour")
+    rounds: int = Field(default=6, ge=0, le=32, description="propagation rounds a level; more help little")
+    turn_below: float = Field(
+        default=0.5,
+        ge=0,
+        le=1,
+        description="share of the pixels with texture that match, below which a homography of features, or else a"
+        " rotation about the optical axis, is looked for; upright windows match three quarters of a street and a third"
+        " at 30 degrees; 0: no rotation is undone but an attitude's",
+    )
+    turn_range_deg: float = Field(
+        default=60.0, gt=0, le=180, description="degrees to either side; greatest rotation that is looked for"
+    )
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Displacements of the grid of pyramid level ``level`` of frame a, in pixels of **level 0**.
+
+    Grid pixel (row, col) stands for level-0 position ``(col + 0.5) * 2**level - 0.5`` (rows likewise). All arrays are
+    (row, col): ``column_disparity, row_disparity`` float32, b minus a, NaN undefined, interpolated ones
+    included; ``validity`` bits of :class:`~stages.core.validity.Validity`.
+    """
+
+    level: int
+    column_disparity: NDArray[np.float32]
+    row_disparity: NDArray[np.float32]
+    validity: Mask
+
+
+STILL = 2.0
+"""Pixels of the result's level: a rotation that moves no corner farther is left to the matcher."""
+
+
+def coarse_motion(a: Pyramid, b: Pyramid, params: MotionParams, turn: Derotation | None = None) -> Motion:
+    """Displacements from frame ``a`` to frame ``b``; of a shallower pyramid its top level.
+
+    Parameters
+    ----------
+    turn : the known rotation between the frames, undone before matching.
+    """
+    if turn is not None:
+        b = turn.apply(b)
+    level = min(params.level, a.levels - 1, b.levels - 1)
+    a, b = _above(a, level), _above(b, level)
+    hp = HfvmParams(
+        band=0.0,
+        fine_rounds=None if level else HfvmParams().fine_rounds,
+        back_rounds=params.rounds if level else HfvmParams().back_rounds,
+        top_columns=params.top_columns,
+        top_rows=params.top_rows,
+        search_columns=1,
+        centres=5,
+        smoothness=params.smoothness,
+        rounds=params.rounds,
+    )
+    pair = hierarchy.prepare(a, b, hp)
+    state = hierarchy.run(pair, hp, 0)
+    fine = hierarchy.fine(pair, state)
+    scale = np.float32(2.0**level)
+    validity = np.zeros(state.left.u.shape, np.uint8)
+    everywhere = whole(validity.shape)
+    textured = pair.deviation(0, everywhere) >= hp.texture
+    mark(validity, a.valid[0] == 0, Validity.OUT_OF_IMAGE)
+    mark(validity, ~textured, Validity.NO_TEXTURE)
+    mark(validity, ~hierarchy.consistent(pair, 0, state.left, state.right, everywhere), Validity.BACKMATCH_FAILED)
+    mark(validity, fine.distance > hp.threshold, Validity.OVER_THRESHOLD)
+    good = validity == 0
+    u, v, interpolated = fine.u.copy(), fine.v.copy(), np.zeros(good.shape, np.uint8)
+    consistency.fill_rows(u, v, good, hp.fill_reach, state.near_sign or -1.0, interpolated)
+    mark(validity, good, Validity.MATCHED)
+    mark(validity, interpolated != 0, Validity.INTERPOLATED)
+    u[~defined(validity)] = v[~defined(validity)] = np.nan
+    u, v = u * scale, v * scale
+    if turn is not None:
+        u, v = turn.compose(u, v, level)
+        validity[np.isnan(u)] &= ~np.uint8(Validity.MATCHED | Validity.INTERPOLATED)
+    return Motion(level, u, v, validity)
+
+
+def _above(pyramid: Pyramid, level: int) -> Pyramid:
+    """The pyramid from a level up: finer ones need no features."""
+    return Pyramid(pyramid.images[level:], pyramid.valid[level:])
+
+
+def match_share(found: Motion) -> float:
+    """Share of the pixels with texture that match; 0 where nothing has texture."""
+    textured = (found.validity & np.uint8(Validity.OUT_OF_IMAGE | Validity.NO_TEXTURE)) == 0
+    count = int(np.count_nonzero(textured))
+    return int(np.count_nonzero(matched(found.validity) & textured)) / count if count else 0.0
+
+
+def _rolled(
+    a: Pyramid, b: Pyramid, plain: Motion, params: MotionParams, turn: Derotation | None
+) -> tuple[Motion, Derotation, float] | None:
+    """Displacements after undoing a rotation found in the images, that rotation, and degrees; None: none is needed."""
+    share = match_share(plain)
+    if params.turn_below == 0 or not matched_texture(plain):
+        return None
+    shape = (a.images[0].shape[0], a.images[0].shape[1])
+
+    def attempt(homography: roll_search.Floats, which: MotionParams) -> tuple[Motion, Derotation]:
+        upright = Derotation(homography if turn is None else turn.homography @ homography, shape)
+        return coarse_motion(a, b, which, upright), upright
+
+    best, needed = plain, 1.0
+    if share < params.turn_below:
+        wide = feature_homography(a, b)
+        if wide is not None:
+            upright = Derotation(wide, shape)
+            found = coarse_motion(a, b, params, upright)
+            if match_share(found) > roll_search.GAIN * share:
+                degrees = -roll_search.relative((0.0, 1.0), wide, shape)[0]
+                known = np.eye(3) if turn is None else turn.homography
+                return found, upright, roll_search.relative((degrees, 1.0), known, shape)[0]
+        coarse, needed = params.model_copy(update={"level": params.level + 1}), roll_search.GAIN
+        for degrees in roll_search.candidates(params.turn_range_deg):
+            found, _ = attempt(roll_search.similarity(degrees, 1.0, shape), coarse)
+            best = max(best, found, key=match_share)
+    fitted = roll_search.fit(best.column_disparity, best.row_disparity, matched(best.validity), best.level)
+    if fitted is not None and turn is not None:  # what the attitude left over
+        fitted = roll_search.relative(fitted, turn.homography, shape)
+    if fitted is None or abs(fitted[0]) < roll_search.LEAST_DEG:
+        return None
+    found, upright = attempt(roll_search.similarity(fitted[0], fitted[1], shape), params)
+    return (found, upright, fitted[0]) if match_share(found) > needed * share else None
+
+
+def matched_texture(found: Motion) -> bool:
+    """Whether enough of the image has texture for a rotation to show."""
+    return int(np.count_nonzero((found.validity & np.uint8(Validity.NO_TEXTURE)) == 0)) >= roll_search.LEAST
+
+
+def known_turn(args: Mapping[str, Any], level: int) -> Derotation | None:
+    """The rotation among a task's arguments, where there is one and it moves the image noticeably.
+
+    Parameters
+    ----------
+    args : ``rotation`` (3 x 3 rows of R_b_a) and ``camera``, both or neither.
+    """
+    if "rotation" not in args:
+        return None
+    turn = Derotation.of(args["rotation"], Camera.from_dict(args["camera"]))
+    return turn if turn.reach > STILL * 2.0**level else None
+
+
+def _run(params: MotionParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+    turn = known_turn(args, params.level)
+    a, b = Pyramid.from_bundle(inputs["a"]), Pyramid.from_bundle(inputs["b"])
+    found = coarse_motion(a, b, params, turn)
+    rolled = _rolled(a, b, found, params, turn)
+    roll_deg = 0.0
+    if rolled is not None:
+        found, turn, roll_deg = rolled
+    ok = matched(found.validity)
+    rows, cols = ok.shape
+    scale = np.float32(2.0**found.level)
+    xb = np.arange(cols, dtype=np.float32) + found.column_disparity / scale
+    yb = np.arange(rows, dtype=np.float32)[:, None] + found.row_disparity / scale
+    seen = ok & (xb >= 0) & (xb <= cols - 1) & (yb >= 0) & (yb <= rows - 1)
+    u, v = found.column_disparity[ok], found.row_disparity[ok]
+    usable = int(np.count_nonzero(found.validity & np.uint8(Validity.OUT_OF_IMAGE) == 0))
+    meta = {
+        "level": found.level,
+        "median_column": float(np.median(u)) if u.size else None,
+        "median_row": float(np.median(v)) if u.size else None,
+        "median_length": float(np.median(np.hypot(u, v))) if u.size else None,
+        "match_rate": int(np.count_nonzero(ok)) / usable if usable else None,
+        "overlap": int(np.count_nonzero(seen)) / usable if usable else None,
+        "derotated": turn is not None,
+        "turn_found_deg": roll_deg,
+    }
+    arrays: dict[str, AnyArray] = {
+        "column_disparity": found.column_disparity,
+        "row_disparity": found.row_disparity,
+        "validity": found.validity,
+    }
+    return Bundle(arrays, meta)
+
+
+_GRID = ("row", "col")
+STAGE = Stage(
+    name="motion",
+    version=1,
+    summary="coarse displacements of all points from one left frame to the next",
+    params=MotionParams,
+    inputs=("a", "b"),
+    outputs=(
+        Array(
+            "column_disparity",
+            _GRID,
+            "float32",
+            "px",
+            "level-0 columns, frame b minus a",
+            "nan",
+            "coarse level of a",
+        ),
+        Array("row_disparity", _GRID, "float32", "px", "level-0 rows, frame b minus a", "nan", "coarse level of a"),
+        Array("validity", _GRID, "uint8", "1", "bit mask, see stages.core.validity", "", "coarse level of a"),
+    ),
+    run=_run,
+)

@@ -1,0 +1,220 @@
+"""Feature-vector matching of given points at full resolution (paper, 5.2.1, second iteration).
+
+A single pixel's distance finds a point to .27 px, distances summed over 7 x 7 pixels to .15 px. The template is
+resampled at the point's sub-pixel position, and under an affinity if one is given, so that a change of scale between
+the images does not spoil it. Found points are matched back.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from stages.geometry.cubic import cubic
+from stages.hfvm import features
+from stages.hfvm.features import distance
+from stages.hfvm.params import HfvmParams
+from stages.hfvm.subpixel import linear
+from stages.imaging.pyramid import Pyramid, filled
+
+Floats = NDArray[np.float64]
+
+SUM_RADIUS = 3
+SIDE = 2 * SUM_RADIUS + 1
+"""Pixels: distances are summed over 7 x 7."""
+
+BACKMATCH = 1.0
+"""Pixels: greatest distance between a point and where matching there and back leads (4.3.3)."""
+BACK_RADIUS = 3
+"""Pixels searched on the way back, at most: thrice what is allowed; fewer refuse too little."""
+
+DEFAULT_WEIGHTS = HfvmParams().weights
+
+
+@dataclass(frozen=True)
+class PointMatches:
+    """``points`` (n, 2) column, row in image b; ``distance`` (n,) mean, byte steps; both NaN where not ``ok``."""
+
+    points: Floats
+    distance: Floats
+    ok: NDArray[np.bool_]
+
+
+def match_points(
+    a: Pyramid, b: Pyramid, points: Floats, predicted: Floats, affinity: Floats | None = None, radius: int = 4
+) -> Floats:
+    """Positions (n, 2) in ``b`` of points of ``a``; NaN where not found. See :func:`find_points`."""
+    return find_points(a, b, points, predicted, affinity, radius).points
+
+
+def find_points(
+    a: Pyramid,
+    b: Pyramid,
+    points: Floats,
+    predicted: Floats,
+    affinity: Floats | None = None,
+    radius: int = 4,
+    *,
+    threshold: float = 90.0,
+    weights: tuple[float, ...] = DEFAULT_WEIGHTS,
+) -> PointMatches:
+    """Sub-pixel positions in image ``b`` of points of image ``a`` (level 0 of two pyramids).
+
+    Parameters
+    ----------
+    points, predicted : (n, 2) column, row in a, and about where in b, pixels; NaN rows are lost.
+    affinity : (n, 2, 2) maps offsets from the point in a to offsets in b (column, row); None: no change of shape.
+    radius : pixels searched to every side of the prediction.
+    threshold : mean distance, byte steps, above which a point is not matchable.
+    weights : of the eight features.
+
+    Notes
+    -----
+    A point is lost where its prediction, its template or its match leaves the image or lies on a masked pixel, where
+    the least distance exceeds the threshold or lies on the border of the search area, and where back-matching fails.
+    """
+    n = len(points)
+    a_image, b_image = filled(a)[0], filled(b)[0]
+    a_valid, b_valid = a.valid[0], b.valid[0]
+    shape = np.tile(np.eye(2), (n, 1, 1)) if affinity is None else np.asarray(affinity, dtype=np.float64)
+    usable = np.isfinite(np.concatenate([points, predicted, shape.reshape(n, 4)], axis=1)).all(axis=1)
+    usable &= np.abs(np.linalg.det(np.where(usable[:, None, None], shape, np.eye(2)))) > 0.1
+    found, cost, ok = np.full((n, 2), np.nan), np.full(n, np.nan), np.zeros(n, dtype=bool)
+    who = np.flatnonzero(usable)
+    there, there_cost = _search(a_image, b_image, points[who], predicted[who], shape[who], radius, weights)
+    good = np.isfinite(there_cost) & (there_cost <= threshold)
+    good &= _on_valid(a_valid, points[who]) & _on_valid(b_valid, there)
+    who, there, there_cost = who[good], there[good], there_cost[good]
+    inverse, reach = np.asarray(np.linalg.inv(shape[who])), min(radius, BACK_RADIUS)
+    back, _ = _search(b_image, a_image, there, points[who], inverse, reach, weights)
+    good = np.hypot(*(back - points[who]).T) <= BACKMATCH
+    who = who[good]
+    found[who], cost[who], ok[who] = there[good], there_cost[good], True
+    return PointMatches(found, cost, ok)
+
+
+def _on_valid(valid: NDArray[np.uint8], points: Floats) -> NDArray[np.bool_]:
+    """Whether the nearest pixel of each point exists and is usable."""
+    known = np.asarray(np.isfinite(points).all(axis=1))
+    x, y = np.rint(np.where(known[:, None], points, 0.0)).astype(np.int64).T
+    inside = known & (x >= 0) & (x < valid.shape[1]) & (y >= 0) & (y < valid.shape[0])
+    x, y = np.where(inside, x, 0), np.where(inside, y, 0)
+    return np.asarray(inside & (valid[y, x] != 0))
+
+
+def _search(
+    a: NDArray[np.float32],
+    b: NDArray[np.float32],
+    points: Floats,
+    predicted: Floats,
+    affinity: Floats,
+    radius: int,
+    weights: tuple[float, ...],
+) -> tuple[Floats, Floats]:
+    """Best positions (n, 2) and mean distances (n,), NaN where not found, one direction."""
+    whole = np.rint(predicted)
+    scale = np.asarray(weights, np.float32) * np.float32(features.STEPS_PER_UNIT)
+    offset, cost = np.zeros((len(points), 2)), np.full(len(points), -1.0)
+    inverse = np.ascontiguousarray(np.linalg.inv(affinity))
+    _search_all(a, b, np.ascontiguousarray(points), whole.astype(np.int64), inverse, radius, scale, offset, cost)
+    lost = cost < 0
+    return np.where(lost[:, None], np.nan, whole + offset), np.where(lost, np.nan, cost)
+
+
+@njit(cache=True, nogil=True)
+def _search_all(a, b, points, whole, shape, radius, scale, offset, cost):  # type: ignore[no-untyped-def]
+    """Each point by itself: its template, the area around its prediction, and where in it the template fits best."""
+    side = 2 * (SUM_RADIUS + features.RADIUS) + 1
+    wide = side + 2 * (radius + 1)
+    template, area = np.empty((side, side), np.float32), np.empty((wide, wide), np.float32)
+    m = wide - 2 * features.RADIUS
+    words, searched = np.empty((SIDE, SIDE), np.uint64), np.empty((m, m), np.uint64)
+    deviation = np.empty((m, m), np.float32)
+    for k in range(len(points)):
+        if not _cut(a, points[k, 0], points[k, 1], shape[k], template) or not _copy(b, whole[k], area):
+            continue
+        features.pack_rows(template, 0, scale, words, deviation)
+        features.pack_rows(area, 0, scale, searched, deviation)
+        cost[k] = _best(words.ravel(), searched.ravel(), radius + 1, offset[k])
+
+
+@njit(cache=True, nogil=True)
+def _cut(image, px, py, shape, out):  # type: ignore[no-untyped-def]
+    """Patch around a point, pixel offsets taken through ``shape``; False where its centre is off the image.
+
+    Positions beyond the border take the nearest inner one.
+    """
+    rows, cols = image.shape
+    side = out.shape[0]
+    if not (px >= 0 and px <= cols - 1 and py >= 0 and py <= rows - 1) or rows < 4 or cols < 4:
+        return False
+    for j in range(side):
+        for i in range(side):
+            dx, dy = i - side // 2, j - side // 2
+            x = px + shape[0, 0] * dx + shape[0, 1] * dy
+            y = py + shape[1, 0] * dx + shape[1, 1] * dy
+            x, y = min(max(x, 1.0), cols - 2.001), min(max(y, 1.0), rows - 2.001)
+            out[j, i] = cubic(image, x, y)
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _copy(image, point, out):  # type: ignore[no-untyped-def]
+    """As :func:`_cut`, around a whole pixel and without a change of shape."""
+    rows, cols = image.shape
+    half = out.shape[0] // 2
+    px, py = point
+    if not (px >= 0 and px <= cols - 1 and py >= 0 and py <= rows - 1 and rows >= 4 and cols >= 4):
+        return False
+    for j in range(out.shape[0]):
+        y = min(max(py + j - half, 1), rows - 2)
+        for i in range(out.shape[1]):
+            out[j, i] = image[y, min(max(px + i - half, 1), cols - 2)]
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _sum_at(words, area, wide, u, v, most):  # type: ignore[no-untyped-def]
+    """Summed distance at a place of the area; given up, and greater than ``most``, after the row that exceeds it.
+
+    Both in reading order, ``area`` in rows of ``wide``. Unsigned indices need no check for counting from the end.
+    """
+    total = np.int64(0)
+    k, at = np.uint64(0), np.uint64(v * wide + u)
+    for _ in range(SIDE):
+        for i in range(SIDE):
+            total += distance(words[k + np.uint64(i)], area[at + np.uint64(i)])
+        if total > most:
+            break
+        k, at = k + np.uint64(SIDE), at + np.uint64(wide)
+    return total
+
+
+@njit(cache=True, nogil=True)
+def _best(words, area, middle, offset):  # type: ignore[no-untyped-def]
+    """Mean distance of a template at its best place in an area, of equals the first in reading order; -1 at the border.
+
+    ``middle`` places to every side of the prediction; ``offset`` (2,) from there, with linear sub-pixel parts.
+    """
+    wide, all_of_it = 2 * middle + SIDE, np.int64(2**62)
+    most, bu, bv = all_of_it, middle, middle
+    # From the prediction outwards, so that most places are given up early.
+    for ring in range(middle + 1):
+        for v in range(middle - ring, middle + ring + 1):
+            step = 1 if abs(v - middle) == ring else max(2 * ring, 1)
+            for u in range(middle - ring, middle + ring + 1, step):
+                total = _sum_at(words, area, wide, u, v, most)
+                if total < most or (total == most and (v < bv or (v == bv and u < bu))):
+                    most, bu, bv = total, u, v
+    if min(bu, bv) < 1 or max(bu, bv) > 2 * middle - 1:
+        return -1.0
+    before = _sum_at(words, area, wide, bu - 1, bv, all_of_it)
+    behind = _sum_at(words, area, wide, bu + 1, bv, all_of_it)
+    above = _sum_at(words, area, wide, bu, bv - 1, all_of_it)
+    below = _sum_at(words, area, wide, bu, bv + 1, all_of_it)
+    offset[0] = bu - middle + linear(before, most, behind)
+    offset[1] = bv - middle + linear(above, most, below)
+    return most / (SIDE * SIDE)

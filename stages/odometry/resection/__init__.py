@@ -1,0 +1,1 @@
+"""From tracks and landmarks to poses: resection, bundle adjustment, trajectory."""

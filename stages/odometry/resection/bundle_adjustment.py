@@ -1,0 +1,332 @@
+"""Least squares of one segment or some: poses, depths of landmarks, and what all disparities share.
+
+Huber's weights, Levenberg-Marquardt. A landmark has one unknown (along its ray), so that its elimination (Schur's
+complement) is a division, and the system has the size of the poses (Triggs, McLauchlan, Hartley, Fitzgibbon 2000,
+doi:10.1007/3-540-44480-7_21). The result is never worse than its start by the same cost: where no step lowers it, the
+start is returned. The inverse of the same reduced system is the covariance of the poses (:func:`posterior`).
+
+Another error that disparities share shows over the whole sequence only (:func:`common_tilt`). A right image whose rows
+lie too low may have been turned (pitch), or have its principal point there; epipolar lines hardly tell the two apart,
+and a rig that is repaired takes the turn. The wrong choice tilts disparities: by ``f x y`` a radian, nothing along both
+axes of the image and most in its corners, which bends the path to one side. Tracks see depth once more, by parallax, so
+all segments together measure the tilt.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from stages.core.declare import Params
+from stages.geometry.geometry import Camera, Rig
+from stages.odometry.resection import bundle_adjustment_kernel as kernel
+from stages.odometry.resection.pnp import HUBER, cross_matrix, exponential
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+FIRST_DAMPING, MOST_DAMPING = 1e-4, 1e8
+
+
+class RefineParams(Params):
+    """Parameters of the joint refinement."""
+
+    enabled: bool = Field(
+        default=True,
+        description="refine the poses of segments jointly with their landmarks, where these are of the disparity",
+    )
+    window: int = Field(
+        default=1,
+        ge=0,
+        description="segments that are adjusted together, the last of them for good; 0: all of the sequence at once",
+    )
+    stereo: bool = Field(
+        default=False,
+        description="use the disparity of the basic pair at a segment's end as a second measurement; it shares its"
+        " errors with the first one, and gains little",
+    )
+    iterations: int = Field(default=20, ge=1, description="limit of Levenberg-Marquardt steps; five are usual")
+    pixel_sigma: float = Field(default=0.2, gt=0, description="pixels; expected error of a tracked position")
+    disparity_sigma: float = Field(default=0.2, gt=0, description="pixels; expected error of the next pair's disparity")
+    bias_sigma: float = Field(
+        default=0.1, ge=0, description="pixels; prior of the error that all disparities share (toe-in of the rig)"
+    )
+    tilt_sigma_deg: float = Field(
+        default=0.3,
+        ge=0,
+        description="degrees; prior of the pitch that may stand for a principal point's row: 0.5 % of the focal length,"
+        " as in rig.prior_principal; 0: none is looked for",
+    )
+    tilt_significance: float = Field(
+        default=4.0, ge=0, description="standard deviations, by the scatter of segments, from which on it is undone"
+    )
+
+
+@dataclass(frozen=True)
+class Views:
+    """Measurements of one segment.
+
+    ``position``, ``along`` (n, 3) of the landmarks in the local frame, and how they move with their disparity, m and
+    m/pixel; ``sigma`` (n,) of it, pixels. ``pixels`` (frame, n, 2) of the frames behind the key, ``seen`` (frame, n)
+    whether they count. ``right`` (n, 2) of the last frame, pixels, ``right_sigma`` (n,); NaN none. ``tilt`` (n,) pixels
+    of disparity a radian of pitch that stands for a principal point's row.
+    """
+
+    position: Floats
+    along: Floats
+    sigma: Floats
+    pixels: Floats
+    seen: Bools
+    right: Floats
+    right_sigma: Floats
+    camera: Camera
+    rig: Rig
+    tilt: Floats
+
+    def without_tilt(self, tilt: float) -> Views:
+        """With landmarks where they are if the disparities are tilted by so many radians."""
+        return replace(self, position=self.position + (tilt * self.tilt)[:, None] * self.along)
+
+
+@dataclass(frozen=True)
+class State:
+    """``R`` (frame, 3, 3), ``t`` (frame, 3) of T_cam_local behind the key; ``depth`` (n,) corrections, pixels."""
+
+    R: Floats
+    t: Floats
+    depth: Floats
+
+    def moved(self, pose: Floats, depth: Floats) -> State:
+        """After steps (frame, 6) ``v, w`` as in :mod:`stages.odometry.resection.pnp`, and (n,)."""
+        turn = exponential(pose[:, 3:])
+        t = np.einsum("fij,fj->fi", turn, self.t) + pose[:, :3]
+        return State(turn @ self.R, t, self.depth + depth)
+
+
+def _camera_errors(x: Floats, moves: Floats, camera: Camera, pixels: Floats) -> tuple[Floats, Floats, Floats]:
+    """Errors (..., 2), derivatives (..., 2, 3) by camera coordinates ``x``, and along ``moves`` (..., 2)."""
+    z = np.where(x[..., 2] > 1e-6, x[..., 2], np.nan)
+    u, v = x[..., 0] / z, x[..., 1] / z
+    error = np.stack([camera.fx * u + camera.cx, camera.fy * v + camera.cy], -1) - pixels
+    P = np.zeros((*z.shape, 2, 3))
+    P[..., 0, 0], P[..., 0, 2] = camera.fx / z, -camera.fx * u / z
+    P[..., 1, 1], P[..., 1, 2] = camera.fy / z, -camera.fy * v / z
+    return error, P, np.einsum("...ij,...j->...i", P, moves)
+
+
+def stereo_rows(views: Views, state: State, bias: float) -> tuple[Floats, Floats, Floats, Floats, Bools]:
+    """Disparities (along their epipolar lines) of the last frame's pair: only its right minus its left image counts.
+
+    Whitened errors (n,), derivatives by the last pose (n, 6), by depth and by bias (n,), use.
+    """
+    use = np.isfinite(views.right_sigma)
+    R = state.R[-1]
+    x = (views.position + (state.depth + bias)[:, None] * views.along) @ R.T + state.t[-1]
+    moves = views.along @ R.T
+    T, pixels = views.rig.T_right_left, views.pixels[-1]
+    left, P, g = _camera_errors(x, moves, views.camera, pixels)
+    right, Q, h = _camera_errors(x @ T.rotation.T + T.translation, moves @ T.rotation.T, views.rig.right, views.right)
+    rays = (x / np.where(x[:, 2:] > 0, x[:, 2:], np.nan)) @ T.rotation.T
+    _, _, slope = _camera_errors(x @ T.rotation.T + T.translation, rays, views.rig.right, views.right)
+    unit = slope / np.linalg.norm(slope, axis=-1, keepdims=True)
+    s = np.where(use, views.right_sigma, 1.0)
+    change = Q @ T.rotation - P
+    by_pose = np.concatenate([change, np.einsum("nij,njk->nik", change, -cross_matrix(x))], -1)
+    error = ((right - left) * unit).sum(-1) - bias
+    by_depth = ((h - g) * unit).sum(-1)
+    by_pose = np.einsum("ni,nij->nj", unit, by_pose) / s[:, None]
+    good = use & np.isfinite(error) & np.isfinite(by_pose).all(-1)
+    rows = (np.where(good, a, 0.0) for a in (error / s, by_depth / s, (by_depth - 1.0) / s))
+    error, by_depth, by_bias = rows
+    return error, np.where(good[:, None], by_pose, 0.0), by_depth, by_bias, good
+
+
+def _tracks(views: Views, state: State, bias: float, sigma: float) -> tuple[Any, ...]:
+    """What the compiled loops want of the tracks."""
+    camera = views.camera
+    cam = (float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy))
+    given = (views.position, views.along, views.pixels, views.seen, cam, float(sigma), HUBER)
+    return (*given, state.R, state.t, state.depth + bias)
+
+
+def cost_of(views: Views, state: State, bias: float, sigma: float) -> float:
+    """Huber's cost of a segment with its depths' priors (that of the bias is the window's)."""
+    total = 0.5 * float(((state.depth / views.sigma) ** 2).sum())
+    total += float(kernel.cost(*_tracks(views, state, bias, sigma)))
+    if np.isfinite(views.right_sigma).any():
+        error, *_, use = stereo_rows(views, state, bias)
+        norm = np.abs(error[use])
+        total += float(np.where(norm <= HUBER, 0.5 * norm**2, HUBER * norm - 0.5 * HUBER**2).sum())
+    return total
+
+
+def normal(views: Views, state: State, bias: float, sigma: float) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+    """``A`` (p, p), ``B`` (p, n), ``d`` (n,), gradients (p,) and (n,): p of the poses and the bias, n depths."""
+    m, n = len(state.R), len(state.depth)
+    A, B, d = np.zeros((6 * m + 1, 6 * m + 1)), np.zeros((6 * m + 1, n)), views.sigma**-2.0
+    ga, gd = np.zeros(6 * m + 1), state.depth * d
+    kernel.normal(*_tracks(views, state, bias, sigma), A, B, d, ga, gd)
+    if np.isfinite(views.right_sigma).any():
+        error, pose, g, c, use = stereo_rows(views, state, bias)
+        w = np.where(use, HUBER / np.maximum(np.abs(error), HUBER), 0.0)
+        J = np.zeros((n, 6 * m + 1))
+        J[:, 6 * (m - 1) : 6 * m], J[:, -1] = pose, c
+        weighted = J * w[:, None]
+        A += weighted.T @ J
+        B += weighted.T * g
+        ga += weighted.T @ error
+        d, gd = d + w * g**2, gd + w * g * error
+    return A, B, d, ga, gd
+
+
+def adjust(segments: Sequence[tuple[Views, State]], params: RefineParams) -> tuple[list[State], float, float, float]:
+    """Minimise the cost of some segments with one bias; states, bias (pixels), cost before and after."""
+    prior, sigma = _prior(params), params.pixel_sigma
+    views, states = [v for v, _ in segments], [s for _, s in segments]
+    bias, damping = 0.0, FIRST_DAMPING
+
+    def cost(at: Sequence[State], b: float) -> float:
+        return 0.5 * prior * b * b + sum(cost_of(v, s, b, sigma) for v, s in zip(views, at, strict=True))
+
+    first = now = cost(states, bias)
+    for _ in range(params.iterations):
+        parts = [normal(v, s, bias, sigma) for v, s in zip(views, states, strict=True)]
+        while damping < MOST_DAMPING:
+            step_bias, steps = _step(parts, prior, bias, damping)
+            ahead = [s.moved(pose, depth) for s, (pose, depth) in zip(states, steps, strict=True)]
+            then = cost(ahead, bias + step_bias)
+            if then < now:
+                break
+            damping *= 10.0
+        else:
+            break
+        finished = now - then <= 1e-9 * now
+        states, bias, now, damping = ahead, bias + step_bias, then, max(0.1 * damping, 1e-12)
+        if finished:
+            break
+    return states, bias, first, now
+
+
+def _prior(params: RefineParams) -> float:
+    """Information of the bias beforehand; below a ten thousandth of a pixel it is held."""
+    return 1.0 / max(params.bias_sigma, 1e-4) ** 2
+
+
+def _step(
+    parts: Sequence[tuple[Floats, Floats, Floats, Floats, Floats]], prior: float, bias: float, damping: float
+) -> tuple[float, list[tuple[Floats, Floats]]]:
+    """Damped steps: of the bias, and of poses (frame, 6) and depths (n,) of each segment."""
+    corner, right, kept = prior * (1.0 + damping), -prior * bias, []
+    for A, B, d, ga, gd in parts:
+        d = d * (1.0 + damping)
+        S = A + damping * np.diag(np.diag(A)) - (B / d) @ B.T
+        r = -(ga - B @ (gd / d))
+        solved = np.linalg.solve(S[:-1, :-1], np.column_stack([S[:-1, -1], r[:-1]]))
+        corner += S[-1, -1] - S[-1, :-1] @ solved[:, 0]
+        right += r[-1] - S[-1, :-1] @ solved[:, 1]
+        kept.append((solved, B, d, gd))
+    common = right / corner
+    steps = []
+    for solved, B, d, gd in kept:
+        pose = np.append(solved[:, 1] - common * solved[:, 0], common)
+        steps.append((pose[:-1].reshape(-1, 6), -(gd + B.T @ pose) / d))
+    return float(common), steps
+
+
+def scatter(views: Views, state: State, bias: float, sigma: float) -> float:
+    """Variance of the errors found over the one expected: weighted squares of a segment per degree of freedom.
+
+    Depths add one unknown and one measurement each (their disparity), so that tracks and poses decide the freedom.
+    """
+    x = np.einsum("fij,nj->fni", state.R, views.position + (state.depth + bias)[:, None] * views.along)
+    x += state.t[:, None]
+    error = _camera_errors(x, np.zeros_like(x), views.camera, views.pixels)[0] / sigma
+    use = views.seen & np.isfinite(error).all(-1)
+    squares = np.where(use, (error**2).sum(-1), 0.0)
+    total = float((squares * HUBER / np.maximum(np.sqrt(squares), HUBER)).sum())
+    total += float(((state.depth / views.sigma) ** 2).sum())
+    measured = 2 * int(use.sum())
+    if np.isfinite(views.right_sigma).any():
+        off, *_, good = stereo_rows(views, state, bias)
+        total += float((off**2 * HUBER / np.maximum(np.abs(off), HUBER)).sum())
+        measured += int(good.sum())
+    return max(total / max(measured - 6 * len(state.R), 1), 1e-12)
+
+
+def posterior(
+    parts: Sequence[tuple[Floats, Floats, Floats, Floats, Floats]],
+    factors: Sequence[float],
+    params: RefineParams,
+) -> list[tuple[Floats, Floats]]:
+    """Of the poses of each segment, depths and bias free: covariance (p, p), and error (p,) that windows share.
+
+    The covariance of the whole adjustment is the first plus the square of the second. Windows share the error of the
+    bias: what its prior leaves of it where each segment is adjusted alone; all of it where windows overlap, for then
+    they measure it with the same tracks.
+
+    Parameters
+    ----------
+    parts : normal equations of segments with one bias, as :func:`normal` gives them.
+    factors : variance of each segment's errors over the expected one.
+    """
+    prior, kept = _prior(params), []
+    corner = prior
+    for (A, B, d, *_), factor in zip(parts, factors, strict=True):
+        S = (A - (B / d) @ B.T) / factor
+        scale = np.sqrt(np.maximum(np.diag(S)[:-1], 1e-300))
+        values, vectors = np.linalg.eigh(S[:-1, :-1] / np.outer(scale, scale))
+        inverse = (vectors / np.maximum(values, 1e-12)) @ vectors.T / np.outer(scale, scale)
+        by_bias = inverse @ S[:-1, -1]
+        corner += float(S[-1, -1] - S[-1, :-1] @ by_bias)
+        kept.append((inverse, by_bias))
+    common = prior if params.window == 1 else corner
+    return [
+        (inverse + np.outer(by_bias, by_bias) * (corner - common) / corner**2, -by_bias * math.sqrt(common) / corner)
+        for inverse, by_bias in kept
+    ]
+
+
+def common_tilt(adjusted: Sequence[tuple[Views, State, float]], params: RefineParams) -> tuple[float, float]:
+    """Tilt that all disparities share and its standard deviation, radians, by adjusted segments and their biases.
+
+    To first order about the adjusted states. The segments' own values scatter by more than their errors, for their
+    landmarks are few and near each other; the scatter decides. Infinite deviation: fewer than three segments.
+    """
+    parts = np.array([_tilt_of(*one, params) for one in adjusted]).reshape(-1, 2)
+    parts = parts[parts[:, 0] > 0]
+    if len(parts) < 3:
+        return 0.0, float("inf")
+    information, value = parts[:, 0], parts[:, 1] / parts[:, 0]
+    for _ in range(5):  # of a segment that is far off, no more than of one at two deviations
+        tilt = float((information * value).sum() / information.sum())
+        off = np.abs(value - tilt) * np.sqrt(information)
+        spread = max(1.0, 1.4826 * float(np.median(off)))
+        information = parts[:, 0] * np.minimum(1.0, 2.0 * spread / np.maximum(off, 1e-12))
+    total = float(information.sum()) / spread**2
+    prior = math.radians(params.tilt_sigma_deg) ** -2.0
+    return tilt * total / (total + prior), (total + prior) ** -0.5
+
+
+def _tilt_of(views: Views, state: State, bias: float, params: RefineParams) -> tuple[float, float]:
+    """Information and pull of the tilt by one segment, its poses, depths and bias free."""
+    A, B, d, ga, gd = normal(views, state, bias, params.pixel_sigma)
+    prior = _prior(params)
+    A[-1, -1] += prior
+    ga[-1] += prior * bias
+    held, g = views.sigma**-2.0, views.tilt
+    by_depth = g * (d - held)
+    column = np.append(B @ g, g @ by_depth)
+    A = np.column_stack([np.vstack([A, column[:-1]]), column])
+    B = np.vstack([B, by_depth])
+    S = A - (B / d) @ B.T
+    S[np.diag_indices_from(S)] *= 1.0 + 1e-9  # landmarks that hardly fix a pose say nothing, and stop nothing
+    r = -(np.append(ga, g @ (gd - held * state.depth)) - B @ (gd / d))
+    solved = np.linalg.solve(S[:-1, :-1], np.column_stack([S[:-1, -1], r[:-1]]))
+    information, pull = S[-1, -1] - S[-1, :-1] @ solved[:, 0], r[-1] - S[-1, :-1] @ solved[:, 1]
+    return float(information), float(pull)

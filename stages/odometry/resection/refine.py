@@ -1,0 +1,279 @@
+"""Joint refinement of a segment: all its poses and the depths of its landmarks at once, and the next pair's stereo.
+
+Resection poses each frame by itself, with landmarks as the key pair's disparity has them. Here the landmarks' depths
+are unknowns, too, each held by its disparity: a point that four frames see from four places says more of its depth than
+its disparity alone. Where the segment ends at another basic pair, that pair's disparity at the tracked points is a
+second measurement of their depths. What all disparities share is one unknown of a window of segments, since one rig
+made them.
+
+The poses' covariances are those of this adjustment, by the same rules as the resection's
+(:mod:`stages.odometry.resection.resect`): the errors that are found set the scale, what the stated ones leave beyond
+them is shared by all segments.
+
+Another error that they share, a tilt, shows over the whole sequence only
+(:mod:`stages.odometry.resection.bundle_adjustment`). Where it is beyond doubt, landmarks are judged and all segments
+adjusted once more without it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.core.declare import Bundle, Inputs, Stage
+from stages.core.errors import ConfigError
+from stages.geometry.geometry import Rig, RigidTransform
+from stages.geometry.pose_arrays import COVARIANCE, POSES, SHARED
+from stages.odometry.resection.bundle_adjustment import (
+    RefineParams,
+    State,
+    Views,
+    adjust,
+    common_tilt,
+    normal,
+    posterior,
+    scatter,
+    stereo_rows,
+)
+from stages.odometry.resection.landmarks import Landmarks, matches_at, relief
+from stages.odometry.resection.pnp import HUBER, Observations, Poses, back_projection, norms
+from stages.odometry.resection.resect import SOURCES, ResectParams, coordinates, root, scatter_of_blocks
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+AGREES = 5.0
+"""Standard deviations within which the next pair's disparity must agree with the start to be used at all."""
+
+Segment = tuple[Views, State, list[int]]
+"""Measurements of a segment, where its adjustment starts, and which of its frames have a pose."""
+
+
+def views_of(
+    track: Bundle, resection: Bundle, landmarks: Landmarks, rig: Rig, after: Bundle | None, params: RefineParams
+) -> Segment | None:
+    """Measurements and start of a segment, and which of its frames are posed; None: fewer than one behind the key.
+
+    Parameters
+    ----------
+    landmarks : of all points of the track, in the local frame.
+    after : disparity of the pair at the segment's end, where there is one.
+    """
+    poses = np.asarray(resection["poses"])
+    frames = [j for j in range(1, len(poses)) if np.isfinite(poses[j]).all()]
+    inlier = np.asarray(resection["inlier"]) != 0
+    which = (
+        np.flatnonzero(np.isfinite(landmarks.position).all(1) & inlier[:, frames].any(1))
+        if frames
+        else np.zeros(0, np.intp)
+    )
+    if not len(which):
+        return None
+    points = np.asarray(track["points"], dtype=np.float64)[which]
+    known, pixels = landmarks.take(which), np.ascontiguousarray(np.swapaxes(points[:, frames], 0, 1))
+    right, sigma = np.full((len(which), 2), np.nan), np.full(len(which), np.nan)
+    if after is not None and params.stereo and frames[-1] == len(poses) - 1:
+        right, sigma = _stereo(pixels[-1], inlier[which, frames[-1]], after, params)
+    T = [RigidTransform.from_matrix(poses[j]).inverse() for j in frames]
+    state = State(np.array([p.rotation for p in T]), np.array([p.translation for p in T]), np.zeros(len(which)))
+    seen = np.ascontiguousarray(inlier[which][:, frames].T)
+    camera, tilt = rig.left, _tilt_pattern(known.position, RigidTransform.from_matrix(poses[0]), rig)
+    held = np.maximum(known.sigma, 1e-3)
+    views = Views(known.position, known.per_pixel, held, pixels, seen, right, sigma, camera, rig, tilt)
+    if np.isfinite(sigma).any():  # what disagrees altogether lies on another surface
+        error, *_, use = stereo_rows(views, state, 0.0)
+        views.right_sigma[~(use & (np.abs(error) < AGREES))] = np.nan
+    return views, state, frames
+
+
+def _tilt_pattern(position: Floats, T_local_key: RigidTransform, rig: Rig) -> Floats:
+    """Pixels (n,) along its line that a landmark's right image moves for a radian across it: ``f x y``."""
+    x, y, z = rig.T_right_left.apply(T_local_key.inverse().apply(position)).T
+    return np.asarray(np.where(z > 0, rig.right.fx * x * y / np.where(z > 0, z, 1.0) ** 2, 0.0))
+
+
+def _stereo(pixels: Floats, use: Bools, after: Bundle, params: RefineParams) -> tuple[Floats, Floats]:
+    """Right image (n, 2) of points of the last frame by its own pair's disparity, and the standard deviation of it."""
+    maps = [np.asarray(after[name]) for name in ("column_disparity", "row_disparity", "validity")]
+    shift, matched = matches_at(pixels, maps[0], maps[1], maps[2])
+    sigma = np.hypot(params.disparity_sigma, relief(pixels, maps[0], maps[1], maps[2]))
+    good = use & matched & np.isfinite(sigma)
+    return np.where(good[:, None], pixels + shift, np.nan), np.where(good, sigma, np.nan)
+
+
+def _run(params: RefineParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+    resect = ResectParams.model_validate(args["resect"])
+    if resect.landmarks != "disparity":
+        raise ConfigError(
+            "RIL-416",
+            "refine needs landmarks of the disparity",
+            remedy="set resect.landmarks=disparity or refine.enabled=false",
+        )
+    disparity = {int(k): b for k, b in zip(args["pairs"], inputs["disparities"], strict=True)}
+    rigs = {int(k): Rig.from_dict(b.meta["rig"]) for k, b in zip(args["pairs"], inputs["rigs"], strict=True)}
+    given: list[_Given] = []
+    out: list[SegmentOut] = []
+    for track, resection, level in zip(inputs["tracks"], inputs["resections"], inputs["levels"], strict=True):
+        frames = [int(f) for f in track.meta["frames"]]
+        rig, T = rigs[frames[0]], RigidTransform.from_matrix(level.meta["T_local_left"])
+        points = np.asarray(track["points"])[:, 0].astype(np.float64)
+        landmarks = coordinates(points, {"disparity": disparity[frames[0]]}, rig, T, resect)
+        given.append(_Given(track, resection, landmarks, rig, disparity.get(frames[-1])))
+        out.append(SegmentOut.of(resection))
+    found = [views_of(g.track, g.resection, g.landmarks, g.rig, g.after, params) for g in given]
+    facts, states = _adjusted(found, out, params)
+    tilt, sigma = 0.0, float("inf")
+    if params.tilt_sigma_deg > 0:
+        tilt, sigma = common_tilt([(one[0], *states[k]) for k, one in enumerate(found) if one is not None], params)
+    undone = abs(tilt) > params.tilt_significance * sigma
+    if undone:
+        again = [
+            None if one is None else (one[0].without_tilt(tilt), states[k][0], one[2]) for k, one in enumerate(found)
+        ]
+        _adjusted(again, out, params)
+        judged = [_anew(one, new.poses, tilt, resect, params) for one, new in zip(given, out, strict=True)]
+        facts, _ = _adjusted(judged, out, params)
+    same = sum(f["cost_after"] >= f["cost_before"] for f in facts)
+    words = [f"refinement lowers the residuals of {same} of {len(facts)} windows no further: they stay as resected"]
+    meta: dict[str, Any] = {
+        "frames": [len(one.poses) for one in out],
+        "adjustments": facts,
+        "notes": words if same else [],
+    }
+    if math.isfinite(sigma):
+        meta["tilt"] = {"deg": math.degrees(tilt), "sigma_deg": math.degrees(sigma), "undone": undone}
+    if undone:
+        meta["warnings"] = [_tilted(tilt, sigma, next(iter(rigs.values())))]
+    names = ("poses", "covariance", "shared")
+    return Bundle({name: np.concatenate([getattr(one, name) for one in out]) for name in names}, meta)
+
+
+@dataclass(frozen=True)
+class SegmentOut:
+    """What a segment's frames get: ``poses`` (frame, 3, 4), ``covariance`` (frame, 6, 6), ``shared`` (frame, 6, 7)."""
+
+    poses: Floats
+    covariance: Floats
+    shared: Floats
+
+    @staticmethod
+    def of(resection: Bundle) -> SegmentOut:
+        """As resected."""
+        return SegmentOut(*(np.array(resection[n], dtype=np.float64) for n in ("poses", "covariance", "shared")))
+
+
+@dataclass(frozen=True)
+class _Given:
+    """What :func:`views_of` wants of a segment."""
+
+    track: Bundle
+    resection: Bundle
+    landmarks: Landmarks
+    rig: Rig
+    after: Bundle | None
+
+
+def _anew(given: _Given, poses: Floats, tilt: float, resect: ResectParams, params: RefineParams) -> Segment | None:
+    """A segment without the tilt, its landmarks judged once more by poses: the tilt had made good ones inconsistent."""
+    tracked = np.isfinite(np.asarray(given.track["points"])).all(-1)
+    resection = Bundle({"poses": poses, "inlier": tracked.astype(np.uint8)}, {})
+    one = views_of(given.track, resection, given.landmarks, given.rig, given.after, params)
+    if one is None:
+        return None
+    (views, state, rows), most = one, resect.threshold / resect.pixel_sigma
+    views = views.without_tilt(tilt)
+    for f in range(len(rows)):
+        views.seen[f] &= norms(_frame(views, f, resect.pixel_sigma), _pose(state, f, 0.0))[0] <= most
+    return views, state, rows
+
+
+def _frame(views: Views, f: int, pixel_sigma: float) -> Observations:
+    """One frame of a segment by itself, landmarks as their disparities have them."""
+    given = views.position[None], views.along[None], views.sigma[None], views.pixels[f : f + 1]
+    return Observations(*given, views.camera, pixel_sigma, 0.0)
+
+
+def _pose(state: State, f: int, bias: float) -> Poses:
+    return Poses(state.R[f : f + 1], state.t[f : f + 1], np.array([bias]))
+
+
+def claims(segments: Sequence[tuple[Views, State]], bias: float, params: RefineParams) -> list[tuple[Floats, Floats]]:
+    """Covariances (frame, 6, 6) and shared errors (frame, 6, 7) of the poses of segments that were adjusted together.
+
+    Of position (m) and rotation vector (rad) of T_local_left, as in :mod:`stages.odometry.resection.resect`.
+    """
+    parts = [normal(views, state, bias, params.pixel_sigma) for views, state in segments]
+    factors = [scatter(views, state, bias, params.pixel_sigma) for views, state in segments]
+    found, stated = (posterior(parts, scale, params) for scale in (factors, [max(f, 1.0) for f in factors]))
+    out = []
+    for (views, state), (noise, _), (expected, by_bias) in zip(segments, found, stated, strict=True):
+        count = len(state.R)
+        covariance, shared, together = np.empty((count, 6, 6)), np.empty((count, 6, SOURCES)), list[float]()
+        for f in range(count):
+            turn, at = np.kron(np.eye(2), state.R[f].T), slice(6 * f, 6 * f + 6)
+            covariance[f] = turn @ noise[at, at] @ turn.T
+            seen = views.seen[f]
+            depth = float(np.median((views.position[seen] @ state.R[f].T + state.t[f])[:, 2]))
+            left = turn @ expected[at, at] @ turn.T - covariance[f]
+            shared[f] = np.column_stack([root(left, depth), turn @ by_bias[at]])
+            errors = back_projection(_frame(views, f, params.pixel_sigma), _pose(state, f, bias))
+            weight = HUBER / np.maximum(errors.norm[0], HUBER)
+            together.append(scatter_of_blocks(views.pixels[f][seen], errors.white[0][seen], weight[seen], views.camera))
+        covariance *= max(1.0, float(np.mean(together)))
+        out.append((covariance + shared @ np.swapaxes(shared, 1, 2), shared))
+    return out
+
+
+def _tilted(tilt: float, sigma: float, rig: Rig) -> str:
+    return (
+        f"the tracks contradict the disparities: {math.degrees(abs(tilt)):.2f} +- {math.degrees(sigma):.2f} degrees of"
+        f" pitch stand for a principal point that is {abs(tilt) * rig.right.fy:.1f} rows off; undone in the trajectory,"
+        " not in elevations: calibrate anew"
+    )
+
+
+def _adjusted(
+    found: Sequence[Segment | None], out: Sequence[SegmentOut], params: RefineParams
+) -> tuple[list[dict[str, float]], dict[int, tuple[State, float]]]:
+    """Windows adjusted, ``out`` written to; facts of the windows, and state and bias of each segment."""
+    facts: list[dict[str, float]] = []
+    last: dict[int, tuple[State, float]] = {}
+    for group, kept in _windows([k for k, one in enumerate(found) if one is not None], params.window):
+        parts = [one for k in group if (one := found[k]) is not None]
+        states, bias, before, after = adjust([(views, state) for views, state, _ in parts], params)
+        claimed = claims([(views, state) for (views, *_), state in zip(parts, states, strict=True)], bias, params)
+        for k, (_, _, rows), state, (covariance, shared) in zip(group, parts, states, claimed, strict=True):
+            if k in kept:
+                last[k] = state, bias
+                for row, R, t in zip(rows, state.R, state.t, strict=True):
+                    out[k].poses[row] = RigidTransform(R, t).inverse().matrix34
+                out[k].covariance[rows], out[k].shared[rows] = covariance, shared
+        facts.append({"bias_px": bias, "cost_before": before, "cost_after": after})
+    return facts, last
+
+
+def _windows(segments: list[int], window: int) -> list[tuple[list[int], list[int]]]:
+    """Segments that are adjusted together, and those of them that are kept: the last, or all of the one window."""
+    if window == 0:
+        return [(segments, segments)] if segments else []
+    return [(segments[max(0, k + 1 - window) : k + 1], [s]) for k, s in enumerate(segments)]
+
+
+STAGE = Stage(
+    name="refine",
+    version=2,
+    summary="poses of segments adjusted jointly with their landmarks",
+    params=RefineParams,
+    inputs=("tracks*", "resections*", "levels*", "disparities*", "rigs*"),
+    outputs=(
+        replace(POSES, long_name="poses of all segments, one after the other", frame="local"),
+        replace(COVARIANCE, frame="local"),
+        replace(SHARED, frame="local"),
+    ),
+    run=_run,
+)

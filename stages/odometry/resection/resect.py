@@ -1,0 +1,597 @@
+"""Resection: pose of each frame of a segment from landmarks whose 3-D coordinates are known (section 5.2.2).
+
+Source: Kolesnik, Paar, Bauer, Ulm (1999), section 5.2.2, Eq. 4-8: the six extrinsics that minimise the back-projection
+errors, intrinsics fixed; then "the calibration is iterated with the most inconsistent interest points removed, until
+this error gets below a certain threshold for all interest points".
+
+Departures: the start need not be good (hypotheses from four landmarks each compete with the prediction); errors are
+weighted by how exactly the landmark itself is known (see :mod:`stages.odometry.resection.pnp`), and "error" in the
+rule above is that weighted one in units of ``pixel_sigma``; for exact landmarks it is the paper's.
+
+Covariances here are 6 x 6 of ``(dt, dtheta)`` in the destination frame: position error in metres, then the rotation
+vector ``R_true = exp(dtheta) R`` in radians. They tell of the measurements and of a shared error of the disparities;
+errors of the calibration (focal length, direction of the camera in the vehicle) are not in them. They have two parts:
+
+* what the residuals show: the errors found, times what they go together by (:func:`scatter_of_blocks`). It begins anew
+  with the landmarks of every segment;
+* what they do not show, and every segment *shares* (``shared``): the error common to all disparities, and what the
+  stated errors of tracks and disparities leave once those found are subtracted. An error that all landmarks of a
+  neighbourhood have (of sub-pixel interpolation, of relief under a template) bends the pose and leaves no residual; the
+  same camera makes the same over the same kind of ground, so along a chain these errors add up, and not their squares.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+from scipy.special import bdtrc
+
+from stages.core.declare import AnyArray, Array, Bundle, Inputs, Params, Stage
+from stages.core.errors import DegenerateError, InputError
+from stages.geometry.geometry import Camera, Rig, RigidTransform
+from stages.geometry.lattice import Lattice
+from stages.geometry.pose_arrays import COVARIANCE, POSES, SHARED
+from stages.odometry.resection.landmarks import Landmarks, landmarks_from_dem, landmarks_from_disparity, relief
+from stages.odometry.resection.pnp import (
+    Observations,
+    Poses,
+    back_projection,
+    levenberg_marquardt,
+    normal_matrix,
+    norms,
+)
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+MINIMUM = 6
+"""Fewest landmarks of a pose: twelve equations for six unknowns, so that one wrong landmark shows."""
+FEW = "set track.points higher or choose basic pairs closer"
+MOST_BLOCKS = 6
+"""Blocks along either side of the image whose mean errors show how far neighbours' errors go together."""
+PER_BLOCK = 6
+"""Landmarks a block, at least on average."""
+MOVING = 0.3
+"""Share of the landmarks that agree with no pose, from which on it is warned of."""
+SOURCES = 7
+"""Errors that segments share: as many as the pose has parameters, and that of all disparities."""
+AT_ONCE = 8
+"""Of the landmarks above the threshold, one in so many (at least one) is removed before the pose is adjusted anew."""
+SEARCHED = 9.0
+"""Side of the square about a prediction, pixels, in which tracking finds a point, be it wrong: four either way."""
+PARTS = (0.25, 0.5, 1.0)
+"""Shares of the threshold at which agreement is counted."""
+FALSE_ALARMS = 0.01
+"""Poses that chance alone may offer in a frame without one right track: one of a hundred such frames gets a pose."""
+SAMPLE = 4
+"""Landmarks of one hypothesis: the fewest that fix a pose uniquely."""
+
+
+class ResectParams(Params):
+    """Parameters of the stage ``resect``."""
+
+    landmarks: Literal["disparity", "dem"] = Field(
+        "disparity",
+        description="source of the 3-D coordinates: the disparity (more exact) or, as in the paper, the DEM",
+    )
+    pixel_sigma: float = Field(
+        0.2, gt=0, description="pixels; expected error of a tracked position, feature vectors summed over 7 x 7"
+    )
+    disparity_sigma: float = Field(
+        0.2, ge=0, description="pixels; expected error of the disparity under a landmark, carried along its ray"
+    )
+    bias_sigma: float = Field(
+        0.1, ge=0, description="pixels; prior of the error that all disparities share (toe-in of the rig); 0: none"
+    )
+    threshold: float = Field(
+        1.0, gt=0, description="pixels; the most inconsistent landmark is removed until all are below: 5 pixel_sigma"
+    )
+    max_depth_ratio: float = Field(
+        0.2, gt=0, description="std of a landmark's distance over its distance; beyond it first-order errors fail"
+    )
+    max_position_ratio: float = Field(
+        0.02, gt=0, description="std of the position over the median distance of landmarks; beyond it: degenerate"
+    )
+    min_share: float = Field(
+        0.15,
+        ge=0,
+        le=1,
+        description="share of a frame's landmarks that must agree with one pose; a twentieth agrees with a wrong one by"
+        " chance, since all are searched near their predictions",
+    )
+    hypotheses: int = Field(
+        150, ge=1, description="samples of four landmarks; finds a clean one at half outliers with p = 0.9999"
+    )
+    iterations: int = Field(50, ge=1, description="limit of Levenberg-Marquardt steps; about ten are needed")
+    seed: int = Field(1999, ge=0, description="seed of the samples; any")
+
+
+@dataclass(frozen=True)
+class Resection:
+    """Pose of one frame.
+
+    ``T_local_left``; ``covariance`` (6, 6) of (position m, rotation rad) in the local frame, without what is shared;
+    ``shared`` (6, 7): pose errors per standard deviation of what all segments have in common; ``inlier`` (n,);
+    ``residual`` (n,) back-projection error, pixels, of every landmark (NaN: behind the camera); ``bias`` of the
+    disparities, pixels;
+    ``condition`` of the normal matrix with unit diagonal; ``together``: how many times as far as independent errors the
+    mean errors of image blocks scatter (variance), see :func:`scatter_of_blocks`.
+    """
+
+    T_local_left: RigidTransform
+    covariance: Floats
+    shared: Floats
+    inlier: Bools
+    residual: Floats
+    bias: float
+    iterations: int
+    condition: float
+    together: float
+
+    @property
+    def total(self) -> Floats:
+        """Covariance (6, 6) of the pose, all errors together."""
+        return np.asarray(self.covariance + self.shared @ self.shared.T)
+
+
+def resect(
+    landmarks: Landmarks,
+    pixels: Floats,
+    camera: Camera,
+    start: RigidTransform,
+    params: ResectParams,
+    rng: np.random.Generator,
+    *,
+    reckoned: RigidTransform | None = None,
+    where: str = "this frame",
+) -> Resection:
+    """Pose of a camera from landmarks and their image positions (Eq. 4-8), robustly.
+
+    Parameters
+    ----------
+    landmarks : n of them, in the local frame; all finite.
+    pixels : (n, 2) column, row.
+    start : prediction of T_local_left.
+    reckoned : another prediction, by dead reckoning; decides nothing but where the search starts.
+    where : words for error messages ("frame 12").
+
+    Raises
+    ------
+    DegenerateError
+        Fewer than six landmarks (in all, or consistent), all on a line, or a pose that they do not determine.
+    """
+    _enough(len(pixels), where, "have coordinates and were found", FEW)
+    _not_collinear(landmarks.position, where)
+    obs = Observations(
+        landmarks.position[None],
+        landmarks.per_pixel[None],
+        landmarks.sigma[None],
+        pixels[None],
+        camera,
+        params.pixel_sigma,
+        params.bias_sigma,
+    )
+    predictions = [Poses.of(T.inverse()) for T in (start, reckoned) if T is not None]
+    poses, near = _robust_start(obs, predictions, params, rng)
+    poses, active, steps = _remove_inconsistent(obs, poses, near, params, where)
+    if active.sum() < params.min_share * len(active):
+        raise DegenerateError(
+            "RIL-419",
+            f"{where}: only {int(active.sum())} of {len(active)} landmarks agree with one pose",
+            remedy="look at the image; or lower resect.min_share",
+        )
+    _not_by_chance(obs, poses, int(active.sum()), params, where)
+    _not_collinear(landmarks.position[active], where)
+    return _result(obs, poses, active, steps, params, where)
+
+
+def _robust_start(
+    obs: Observations, predictions: list[Poses], params: ResectParams, rng: np.random.Generator
+) -> tuple[Poses, Bools]:
+    """The hypothesis that most landmarks agree with, adjusted to those; and which agree (n,).
+
+    Locally optimised RANSAC (Chum, Matas, Kittler 2003, doi:10.1007/978-3-540-45243-0_31) with truncated squares as
+    the score. Each prediction competes with samples of four landmarks that are adjusted from it.
+    """
+    n = obs.landmarks.shape[1]
+    samples = _draw(rng, params.hypotheses, n)
+    every, sampled = np.ones(samples.shape, bool), obs.take(samples)
+    candidates = []
+    for prediction in predictions:
+        start = _repeat(prediction, params.hypotheses)
+        candidates += [prediction, levenberg_marquardt(sampled, start, every, 10, tolerance=1e-3)[0]]
+    hypotheses = Poses(
+        np.concatenate([c.R for c in candidates]),
+        np.concatenate([c.t for c in candidates]),
+        np.concatenate([c.bias for c in candidates]),
+    )
+    bound = 2.0 * params.threshold / params.pixel_sigma
+    score = (np.minimum(norms(obs, hypotheses), bound) ** 2).sum(1)
+    best = hypotheses.at(int(np.argmin(score)))
+    for _ in range(2):
+        active = norms(obs, best) <= bound
+        if active.sum() >= SAMPLE:
+            best, _ = levenberg_marquardt(obs, best, active, 10, tolerance=1e-6)
+    return best, norms(obs, best)[0] <= bound
+
+
+def _draw(rng: np.random.Generator, count: int, n: int) -> NDArray[np.intp]:
+    """``count`` samples of :data:`SAMPLE` different numbers below n."""
+    drawn = rng.random((count, n))
+    least = np.argpartition(drawn, SAMPLE - 1, axis=1)[:, :SAMPLE]
+    order = np.argsort(np.take_along_axis(drawn, least, axis=1), axis=1)
+    return np.take_along_axis(least, order, axis=1)
+
+
+def _repeat(poses: Poses, count: int) -> Poses:
+    return Poses(*(np.repeat(a, count, axis=0) for a in (poses.R, poses.t, poses.bias)))
+
+
+def _remove_inconsistent(
+    obs: Observations, poses: Poses, active: Bools, params: ResectParams, where: str
+) -> tuple[Poses, Bools, int]:
+    """The paper's rule: adjust, remove the most inconsistent, again until all are under the threshold."""
+    bound = params.threshold / params.pixel_sigma
+    steps = 0
+    while True:
+        _enough(int(active.sum()), where, "agree with one pose", "raise resect.threshold or choose basic pairs closer")
+        poses, done = levenberg_marquardt(obs, poses, active[None], params.iterations, tolerance=1e-6)
+        steps += done
+        usable = _first_order(obs, poses, params)
+        if (active & ~usable).any():
+            active = active & usable
+            continue
+        norm = np.where(active, norms(obs, poses)[0], -1.0)
+        beyond = int((norm > bound).sum())
+        if beyond == 0:
+            poses, done = levenberg_marquardt(obs, poses, active[None], params.iterations)
+            return poses, active, steps + done
+        active = active.copy()
+        active[np.argsort(-norm, kind="stable")[: math.ceil(beyond / AT_ONCE)]] = False
+
+
+def _first_order(obs: Observations, poses: Poses, params: ResectParams) -> Bools:
+    """Which landmarks (n,) are so far before the camera that first-order errors hold.
+
+    A camera that has come close to a landmark, or passed it, sees its error along the old ray at any size: such a
+    landmark agrees with everything, thousands of pixels off.
+    """
+    depth = (obs.landmarks[0] @ poses.R[0].T + poses.t[0])[:, 2]
+    return np.asarray(obs.sigma[0] * np.sqrt((obs.per_pixel[0] ** 2).sum(1)) <= params.max_depth_ratio * depth)
+
+
+def _result(obs: Observations, poses: Poses, active: Bools, steps: int, params: ResectParams, where: str) -> Resection:
+    errors = back_projection(obs, poses)
+    normal, _, weight = normal_matrix(obs, errors, active[None])
+    # A posteriori variance factor: the errors found, not the ones expected, set the scale.
+    squares = (weight[0] * np.where(active, errors.norm[0], 0.0) ** 2).sum()
+    factor = max(float(squares / (2 * active.sum() - 6)), 1e-12)
+    R = poses.R[0]
+    T = RigidTransform(R, poses.t[0]).inverse()
+    stated, bias, condition = _covariance(normal[0] / max(factor, 1.0), obs.prior, R)
+    depth = float(np.median((obs.landmarks[0][active] @ R.T + poses.t[0])[:, 2]))
+    expected, other, _ = _covariance(normal[0], obs.prior, R)
+    position_sigma = float(np.sqrt(np.trace(expected[:3, :3]) + (other[:3] ** 2).sum()))
+    if position_sigma > params.max_position_ratio * depth:
+        raise DegenerateError(
+            "RIL-420",
+            f"{where}: {int(active.sum())} landmarks at a median distance of {depth:.3g} m leave the position uncertain"
+            f" by {position_sigma:.2g} m (condition {condition:.1e})",
+            remedy="they are too far, too few or in one direction: set track.points higher or use nearer texture",
+        )
+    covariance, _, _ = _covariance(normal[0] / factor, obs.prior, R)
+    shared = np.column_stack([root(stated - covariance, depth), bias])
+    residual = np.where(np.isfinite(errors.norm[0]), np.sqrt((errors.pixels[0] ** 2).sum(-1)), np.nan)
+    together = scatter_of_blocks(obs.pixels[0][active], errors.white[0][active], weight[0][active], obs.camera)
+    return Resection(T, covariance, shared, active, residual, float(poses.bias[0]), steps, condition, together)
+
+
+def scatter_of_blocks(pixels: Floats, white: Floats, weight: Floats, camera: Camera) -> float:
+    """How many times as far (variance) block means of errors scatter as means of independent errors would; 1: as far.
+
+    Neighbouring landmarks share matches, texture and relief, so their errors go together, and many of them do not tell
+    as much as their number says. ``white`` (n, 2) whitened errors after adjustment at ``pixels`` (n, 2), ``weight``
+    (n,). The six unknowns of the pose take up as many degrees of freedom of the means.
+    """
+    side = min(MOST_BLOCKS, int(math.sqrt(len(pixels) / PER_BLOCK)))
+    if side < 3:
+        return 1.0
+    col = np.clip(pixels[:, 0] * side / camera.width, 0, side - 1).astype(np.intp)
+    row = np.clip(pixels[:, 1] * side / camera.height, 0, side - 1).astype(np.intp)
+    block = row * side + col
+    root = np.sqrt(weight)
+    count = np.bincount(block, minlength=side * side)
+    sums = np.stack([np.bincount(block, root * white[:, k], side * side) for k in range(2)])
+    used = count > 0
+    freedom = 2 * int(used.sum()) - 6
+    spread = float((weight[:, None] * white**2).sum()) / max(2 * len(pixels) - 6, 1)
+    if freedom < 6 or spread <= 0.0:
+        return 1.0
+    return float((sums[:, used] ** 2 / count[used]).sum()) / spread / freedom
+
+
+def _covariance(normal: Floats, prior: float, R_cam_local: Floats) -> tuple[Floats, Floats, float]:
+    """Of position and rotation in the local frame: covariance (6, 6) by the measurements, error (6,) by the bias.
+
+    The latter is that of one standard deviation of the prior: both together are the covariance of the adjustment. Also
+    the condition of its matrix with unit diagonal. ``C = -R^T t`` and ``R^T`` change by ``-R^T v`` and ``-R^T w`` under
+    a step (v, w).
+    """
+    full = normal + np.diag([0.0] * 6 + [prior])
+    scale = np.sqrt(np.maximum(np.diag(full), 1e-300))
+    values, vectors = np.linalg.eigh(full / np.outer(scale, scale))
+    inverse = (vectors / np.maximum(values, 1e-300)) @ vectors.T / np.outer(scale, scale)
+    turn = np.zeros((6, 6))
+    turn[:3, :3] = turn[3:, 3:] = R_cam_local.T
+    bias = math.sqrt(prior) * inverse[:6, 6]
+    noise = inverse[:6, :6] - np.outer(bias, bias)
+    return turn @ noise @ turn.T, turn @ bias, float(values[-1] / max(values[0], 1e-300))
+
+
+def root(covariance: Floats, depth: float) -> Floats:
+    """Symmetric root (6, 6) of a covariance, radians counted as what they move at a depth (m)."""
+    unit = np.array([1.0] * 3 + [depth] * 3)
+    values, vectors = np.linalg.eigh(covariance * np.outer(unit, unit))
+    return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T / unit[:, None])
+
+
+def _enough(count: int, where: str, what: str, remedy: str) -> None:
+    if count < MINIMUM:
+        raise DegenerateError(
+            "RIL-421", f"{where}: too few landmarks: {count} {what}, {MINIMUM} are needed", remedy=remedy
+        )
+
+
+def _not_by_chance(obs: Observations, poses: Poses, agree: int, params: ResectParams, where: str) -> None:
+    """Refuse a pose that as many landmarks may agree with though none was found where it is.
+
+    Any three landmarks fix a pose. Where the others were found by mistake, anywhere in what tracking searches, each
+    agrees with the share of that area that is below the threshold; the number of false alarms is that of triples times
+    the chance that so many others do (Desolneux, Moisan, Morel 2000, doi:10.1023/A:1026593302236), the least of some
+    thresholds times their number: right landmarks agree better than they need to. A few landmarks of many tell nothing
+    then, however small their residuals are.
+    """
+    n = obs.landmarks.shape[1]
+    along = back_projection(obs, poses).per_pixel[0] * obs.sigma[0][:, None]
+    stretch = np.sqrt(1.0 + (along**2).sum(1) / params.pixel_sigma**2)
+    stretch = stretch[np.isfinite(stretch)]
+    least = math.inf
+    for part in PARTS:
+        bound = part * params.threshold
+        count = int((norms(obs, poses)[0] <= bound / params.pixel_sigma).sum())
+        strip = min(2.0 * bound / SEARCHED, 1.0)  # the most that a long ellipse leaves of the square
+        share = float(np.minimum(math.pi * (bound / SEARCHED) ** 2 * stretch, strip).mean())
+        if share == 1.0:  # a threshold that every place passes was chosen so as to believe everything
+            return
+        if count >= MINIMUM:
+            least = min(least, len(PARTS) * math.comb(n, 3) * float(bdtrc(count - 4, n - 3, share)))
+    if least > FALSE_ALARMS:
+        raise DegenerateError(
+            "RIL-720",
+            f"{where}: {agree} of {n} landmarks agree with one pose, which as many may do by chance",
+            remedy="set track.points higher, or choose frames that are closer to each other",
+        )
+
+
+def _not_collinear(landmarks: Floats, where: str) -> None:
+    """A line of landmarks leaves the rotation about it free; below 1 % of their spread is a line in practice."""
+    spread = np.linalg.svd(landmarks - landmarks.mean(0), compute_uv=False)
+    if spread[1] < 0.01 * spread[0]:
+        raise DegenerateError(
+            "RIL-422",
+            f"{where}: the {len(landmarks)} landmarks are collinear, the rotation about their line is free",
+            remedy="set track.points higher so that landmarks cover the image",
+        )
+
+
+@dataclass(frozen=True)
+class SegmentPoses:
+    """Poses of a segment's frames; see the stage's outputs. A lost frame has NaN, and its fact ``lost`` says why."""
+
+    poses: Floats
+    covariance: Floats
+    shared: Floats
+    inlier: NDArray[np.uint8]
+    residual: NDArray[np.float32]
+    facts: list[dict[str, Any]]
+
+
+def resect_segment(
+    points: NDArray[np.float32],
+    landmarks: Landmarks,
+    camera: Camera,
+    T_local_key: RigidTransform,
+    frames: list[int],
+    params: ResectParams,
+    reckoned: Sequence[RigidTransform | None] | None = None,
+) -> SegmentPoses:
+    """Poses of the frames of a segment, the key frame's given. A frame that cannot be posed is lost, the others go on.
+
+    Parameters
+    ----------
+    points : (n, frames, 2) tracked column, row; NaN lost. Frame 0 is the key frame.
+    landmarks : of the same n points, in the local frame of the key; NaN none.
+    T_local_key : pose of the key frame's left camera.
+    frames : frame numbers, for messages and seeds.
+    reckoned : T_key_left of each frame by dead reckoning, where there is one; competes as a start.
+    """
+    n, count = points.shape[:2]
+    out = SegmentPoses(
+        np.full((count, 3, 4), np.nan),
+        np.full((count, 6, 6), np.nan),
+        np.full((count, 6, SOURCES), np.nan),
+        np.zeros((n, count), np.uint8),
+        np.full((n, count), np.nan, np.float32),
+        [],
+    )
+    known = np.isfinite(landmarks.position).all(1)
+    pose, together = T_local_key, list[float]()
+    out.poses[0], out.covariance[0], out.shared[0] = pose.matrix34, 0.0, 0.0
+    for j in range(count):
+        use = np.flatnonzero(known & np.isfinite(points[:, j]).all(1))
+        if j == 0:
+            out.inlier[use, 0], out.residual[use, 0] = 1, 0.0
+            out.facts.append(_facts(frames[0], use.size, use.size, 0.0, None))
+            continue
+        try:
+            found = _resect_one(
+                landmarks, points[:, j], use, camera, pose, params, frames[j], _reckoned(T_local_key, reckoned, j)
+            )
+        except DegenerateError as error:
+            cause = error.message.removeprefix(f"frame {frames[j]}: ")
+            out.facts.append(_facts(frames[j], use.size, 0, None, None) | {"lost": cause})
+            continue
+        pose = found.T_local_left
+        out.poses[j], out.covariance[j], out.shared[j] = pose.matrix34, found.covariance, found.shared
+        out.inlier[use, j], out.residual[use, j] = found.inlier, found.residual
+        rms = float(np.sqrt(np.mean(found.residual[found.inlier] ** 2)))
+        out.facts.append(_facts(frames[j], use.size, int(found.inlier.sum()), rms, found))
+        together.append(found.together)
+    # One frame's figure scatters by a fifth, a segment's frames share their landmarks.
+    out.covariance[:] *= max(1.0, float(np.mean(together))) if together else 1.0
+    out.covariance[:] += out.shared @ np.swapaxes(out.shared, 1, 2)
+    return out
+
+
+def _reckoned(
+    T_local_key: RigidTransform, reckoned: Sequence[RigidTransform | None] | None, j: int
+) -> RigidTransform | None:
+    return None if reckoned is None or (T := reckoned[j]) is None else T_local_key @ T
+
+
+def _resect_one(
+    landmarks: Landmarks,
+    points: NDArray[np.float32],
+    use: NDArray[np.intp],
+    camera: Camera,
+    start: RigidTransform,
+    params: ResectParams,
+    frame: int,
+    reckoned: RigidTransform | None,
+) -> Resection:
+    """One frame of a segment, by those of its points (n, 2) that are used."""
+    where = f"frame {frame}"
+    if use.size < MINIMUM:
+        what = f"of {len(points)} tracked points have coordinates and were found ({landmarks.summary()})"
+        _enough(use.size, where, what, FEW)
+    rng = np.random.default_rng([params.seed, frame])
+    pixels = points[use].astype(np.float64)
+    return resect(landmarks.take(use), pixels, camera, start, params, rng, reckoned=reckoned, where=where)
+
+
+def _facts(frame: int, seen: int, inliers: int, rms: float | None, found: Resection | None) -> dict[str, Any]:
+    return {
+        "frame": frame,
+        "landmarks": seen,
+        "inliers": inliers,
+        "rms_px": rms,
+        "iterations": found.iterations if found else 0,
+        "condition": found.condition if found else None,
+        "disparity_bias_px": found.bias if found else None,
+        "errors_together": found.together if found else None,
+    }
+
+
+def _run(params: ResectParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+    track, rig = inputs["track"], Rig.from_dict(inputs["rig"].meta["rig"])
+    T_local_key = RigidTransform.from_matrix(inputs["level"].meta["T_local_left"])
+    points = np.asarray(track["points"])
+    landmarks = coordinates(points[:, 0].astype(np.float64), inputs, rig, T_local_key, params)
+    frames = [int(f) for f in track.meta["frames"]]
+    reckoned = None
+    if "prediction" in args:
+        reckoned = [None if T is None else RigidTransform.from_matrix(T) for T in args["prediction"]]
+        if len(reckoned) != len(frames):
+            raise InputError("RIL-423", f"{len(frames)} frames need {len(frames)} predicted poses, not {len(reckoned)}")
+    found = resect_segment(points, landmarks, rig.left, T_local_key, frames, params, reckoned)
+    arrays: dict[str, AnyArray] = {
+        "poses": found.poses,
+        "covariance": found.covariance,
+        "shared": found.shared,
+        "inlier": found.inlier,
+        "landmarks": landmarks.position,
+        "residual": found.residual,
+    }
+    tracks, moving = moving_tracks(points, landmarks, found)
+    meta: dict[str, Any] = {
+        "per_frame": found.facts,
+        "landmark_source": params.landmarks,
+        "without_coordinates": landmarks.lost,
+    }
+    meta |= {"tracks": tracks, "moving_tracks": moving, "warnings": _moving_words(frames, tracks, moving)}
+    return Bundle(arrays, meta)
+
+
+def moving_tracks(points: NDArray[np.float32], landmarks: Landmarks, found: SegmentPoses) -> tuple[int, int]:
+    """How many landmarks were found in two posed frames or more, and how many of them agree with no pose.
+
+    What is followed well from frame to frame and never agrees does not stand on the ground: the vehicle's own shadow,
+    its wheels, other things that move; or its coordinates are wrong (a match on the edge of a rock).
+    """
+    posed = np.asarray(np.isfinite(found.poses).all(axis=(1, 2)))
+    posed[0] = False
+    known = np.asarray(np.isfinite(landmarks.position).all(axis=1))
+    seen = np.asarray(np.isfinite(points).all(axis=2)) & posed & known[:, None]
+    often = seen.sum(axis=1) >= 2
+    agrees = (found.inlier != 0) & seen
+    return int(often.sum()), int((often & ~agrees.any(axis=1)).sum())
+
+
+def _moving_words(frames: list[int], tracks: int, moving: int) -> list[str]:
+    if tracks == 0 or moving < MOVING * tracks:
+        return []
+    return [
+        f"frames {frames[0]}-{frames[-1]}: {moving} of {tracks} tracked landmarks agree with no pose: does something"
+        " move in view (a shadow, a wheel)?"
+    ]
+
+
+def coordinates(
+    points: Floats, inputs: Inputs, rig: Rig, T_local_key: RigidTransform, params: ResectParams
+) -> Landmarks:
+    """Landmarks of the key frame's points from the source that the parameters name."""
+    source, disparity = inputs.get(params.landmarks), inputs.get("disparity")
+    if source is None:
+        raise InputError(
+            "RIL-424",
+            f"resect.landmarks={params.landmarks!r} but no {params.landmarks} was computed",
+            remedy=f"connect the input {params.landmarks!r}",
+        )
+    sigma = np.full(len(points), params.disparity_sigma)
+    maps: list[Any] = []
+    if disparity is not None:
+        maps = [np.asarray(disparity[name]) for name in ("column_disparity", "row_disparity", "validity")]
+        sigma = np.hypot(sigma, relief(points, maps[0], maps[1], maps[2]))
+    if params.landmarks == "disparity":
+        return landmarks_from_disparity(
+            points, maps[0], maps[1], maps[2], rig, T_local_key, sigma, max_depth_ratio=params.max_depth_ratio
+        )
+    lattice = Lattice.from_dict(source.meta["lattice"])
+    elevation = np.asarray(source["elevation"])
+    return landmarks_from_dem(
+        points, elevation, lattice, rig, T_local_key, sigma, max_depth_ratio=params.max_depth_ratio
+    )
+
+
+STAGE = Stage(
+    name="resect",
+    version=3,
+    summary="poses of a segment's frames in the local frame of its basic pair",
+    params=ResectParams,
+    inputs=("track", "dem?", "disparity?", "level", "rig"),
+    outputs=(
+        replace(POSES, frame="local"),
+        replace(COVARIANCE, frame="local"),
+        replace(SHARED, frame="local"),
+        Array("inlier", ("point", "frame"), "uint8", "1", "landmark agrees with the pose", nodata="0"),
+        Array("landmarks", ("point", "xyz"), "float64", "m", "coordinates of the landmarks", "nan", "local"),
+        Array("residual", ("point", "frame"), "float32", "px", "back-projection error", nodata="nan"),
+    ),
+    run=_run,
+)

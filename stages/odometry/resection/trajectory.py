@@ -1,0 +1,284 @@
+"""Trajectory: the running product of the segments' poses (sections 5.2.2 and 7.4).
+
+Each segment is resected in the local frame of its own basic pair, which was levelled without any knowledge of the
+others; only the *relative* poses within it matter here. The world is the local frame of pair 0. With ``k`` the key
+frame of a segment and ``i`` another of its frames,
+
+    T_world_left(i) = T_world_left(k) T_local_left(k)^-1 T_local_left(i),
+
+so that ``T_world_local(k) = T_world_left(k) T_local_left(k)^-1`` whatever the levelling of pair k is. The next
+segment's key frame is the last frame of this one. Where that frame is lost the trajectory breaks: what follows is a
+piece of its own, in the local frame of its first basic pair.
+
+Where nothing tells of the vertical at a piece's first pair, that of its first pair that has one is carried back along
+the piece; where none has, the frame of the piece is that of its first camera, whose own up is z, and that is said.
+
+Of the covariances, what each segment has for itself adds up; of what all segments share, the errors add up, which grows
+with the length of the way and not with its root (:mod:`stages.odometry.resection.resect`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
+from stages.core.errors import InputError
+from stages.geometry.geometry import RigidTransform, level_rotation, orthonormal
+from stages.geometry.pose_arrays import COVARIANCE, NO_VERTICAL, POSES
+from stages.odometry.resection.pnp import cross_matrix
+
+Floats = NDArray[np.float64]
+Segment = tuple[Floats, Floats, Floats]
+
+
+@dataclass(frozen=True)
+class Chained:
+    """Poses of the frames in order, key frames once.
+
+    ``poses`` (frames, 3, 4) T_world_left, m, NaN of a lost frame; ``covariance`` (frames, 6, 6) of (position m,
+    rotation rad) in the world frame; ``segment`` (frames,) that posed the frame (a key frame belongs to the one
+    before it); ``piece`` (frames,) number of the unbroken piece, -1 of a lost frame.
+    """
+
+    poses: Floats
+    covariance: Floats
+    segment: NDArray[np.int16]
+    piece: NDArray[np.int16]
+
+
+def chain(segments: Sequence[Segment], levels: Sequence[RigidTransform]) -> Chained:
+    """Compose the poses of segments into one trajectory.
+
+    Where the last frame of a segment is lost, the next segment begins a new piece in the local frame of its own key.
+
+    Parameters
+    ----------
+    segments : poses (frames, 3, 4) T_local_left, covariances (frames, 6, 6) and the root (frames, 6, k) of the part of
+        them that all segments share, key frame first, NaN of a lost frame; none for a sequence of one pair.
+    levels : T_local_left of each segment's key frame by its own level stage; of the only pair without segments.
+
+    Raises
+    ------
+    InputError
+        Not one level a segment, or a segment whose key pose is not its level's.
+    """
+    if len(levels) != max(len(segments), 1):
+        raise InputError("RIL-450", f"{len(segments)} segments and {len(levels)} levels do not make a trajectory")
+    kinds = segments[0][2].shape[2] if segments else 0
+    nothing = np.zeros((6, 6)), np.zeros((6, kinds))
+    world, (own, common), broken, piece = levels[0], nothing, False, 0
+    poses, covariances, owner, pieces = [world.matrix34], [own], [0], [0]
+    for number, ((local, local_cov, shared), level) in enumerate(zip(segments, levels, strict=False)):
+        if np.abs(local[0] - level.matrix34).max() > 1e-9 * max(1.0, float(np.abs(local[0]).max())):
+            raise InputError("RIL-451", f"segment {number} was not resected in the local frame of its own basic pair")
+        if broken:
+            world, (own, common), piece = level, nothing, piece + 1
+            poses[-1], covariances[-1], owner[-1], pieces[-1] = world.matrix34, own, number, piece
+        T_world_local = _clean(world @ level.inverse())
+        key, key_own, key_common = world, own, common
+        for pose, pose_cov, pose_shared in zip(local[1:], local_cov[1:], shared[1:], strict=True):
+            broken = not np.isfinite(pose).all()
+            if not broken:
+                world = T_world_local @ RigidTransform.from_matrix(pose)
+                lever, turn = propagation(key, T_world_local, world)
+                alone = pose_cov - pose_shared @ pose_shared.T
+                own = _symmetric(lever @ key_own @ lever.T + turn @ alone @ turn.T)
+                common = lever @ key_common + turn @ pose_shared
+            poses.append(np.full((3, 4), np.nan) if broken else world.matrix34)
+            covariances.append(np.full((6, 6), np.nan) if broken else own + common @ common.T)
+            owner.append(-1 if broken else number)
+            pieces.append(-1 if broken else piece)
+    return _without_single_frames(
+        Chained(np.array(poses), np.array(covariances), np.array(owner, np.int16), np.array(pieces, np.int16))
+    )
+
+
+def _without_single_frames(found: Chained) -> Chained:
+    """A frame that is a piece by itself is lost like others, unless there is nothing else; pieces count on from 0."""
+    count = np.bincount(found.piece[found.piece >= 0])
+    kept = np.flatnonzero(count > 1) if (count > 1).any() else np.arange(1)
+    alone = ~np.isin(found.piece, kept)
+    number = np.full(len(count) + 1, -1, np.int16)  # the last is that of lost frames, -1
+    number[kept] = np.arange(len(kept))
+    poses, covariance, segment = found.poses.copy(), found.covariance.copy(), found.segment.copy()
+    poses[alone], covariance[alone], segment[alone] = np.nan, np.nan, -1
+    return Chained(poses, covariance, segment, number[found.piece])
+
+
+def propagation(key: RigidTransform, T_world_local: RigidTransform, world: RigidTransform) -> tuple[Floats, Floats]:
+    """How errors (6,) of the key frame in the world, and of a pose against it in the local frame, enter that pose.
+
+    The key's rotation error swings the frame about the key's position (first order): with the lever
+    ``r = C_frame - C_key``, ``dC = dC_key + dtheta_key x r + R dC_local`` and ``dtheta = dtheta_key + R dtheta_local``.
+    """
+    lever = np.eye(6)
+    lever[:3, 3:] = -cross_matrix(world.translation - key.translation)
+    turn = np.zeros((6, 6))
+    turn[:3, :3] = turn[3:, 3:] = T_world_local.rotation
+    return lever, turn
+
+
+def _symmetric(a: Floats) -> Floats:
+    return np.asarray(0.5 * (a + a.T))
+
+
+def _clean(T: RigidTransform) -> RigidTransform:
+    """Undo what rounding does to the rotation of a long product."""
+    return RigidTransform(orthonormal(T.rotation), T.translation)
+
+
+def largest(piece: NDArray[np.int16]) -> int:
+    """Number of the piece with the most frames, the first of equals."""
+    return int(np.argmax(np.bincount(piece[piece >= 0], minlength=1)))
+
+
+def world_poses(trajectory: Bundle, piece: int | None = None) -> Floats:
+    """Poses (frame, 3, 4) of the piece whose frame is the world, or of another one in its own; NaN elsewhere."""
+    poses = np.asarray(trajectory["poses"], dtype=np.float64)
+    if "piece" not in trajectory.arrays:
+        return poses
+    wanted = trajectory.meta.get("main", 0) if piece is None else piece
+    return np.where((np.asarray(trajectory["piece"]) == wanted)[:, None, None], poses, np.nan)
+
+
+def levelled(found: Chained, first: int, up: Floats) -> Chained:
+    """The same with the piece that begins in row ``first`` turned so that ``up`` (3,) of its frame becomes z."""
+    rows = np.flatnonzero(found.piece == found.piece[first])
+    R = found.poses[first, :, :3]
+    turn = level_rotation(R.T @ up) @ R.T
+    both = np.kron(np.eye(2), turn)
+    poses, covariance = found.poses.copy(), found.covariance.copy()
+    poses[rows] = turn @ poses[rows]
+    covariance[rows] = both @ covariance[rows] @ both.T
+    return replace(found, poses=poses, covariance=covariance)
+
+
+def _with_verticals(found: Chained, keys: Sequence[int], levels: Sequence[Bundle]) -> tuple[Chained, list[str]]:
+    """Pieces levelled by the first of their pairs that knows the vertical; the source of each piece's vertical.
+
+    ``keys`` are the rows of the pairs that ``levels`` are of.
+    """
+    sources = []
+    for piece in range(int(found.piece.max()) + 1):
+        mine = [(key, level) for key, level in zip(keys, levels, strict=True) if found.piece[key] == piece]
+        source = mine[0][1].meta.get("source", "") if mine else NO_VERTICAL
+        if source == NO_VERTICAL:
+            first = int(np.flatnonzero(found.piece == piece)[0])
+            known = ((key, level) for key, level in mine if level.meta["source"] != NO_VERTICAL)
+            for key, level in known:
+                R_local_left = RigidTransform.from_matrix(level.meta["T_local_left"]).rotation
+                found = levelled(found, first, found.poses[key, :, :3] @ R_local_left[2])
+                source = level.meta["source"]
+                break
+        sources.append(source)
+    return found, sources
+
+
+def _spread(found: Chained, at: NDArray[np.intp], count: int) -> Chained:
+    """The same with a row for each of ``count`` frames; ``at`` (n,) are the rows of those that were tracked."""
+    poses, covariance = np.full((count, 3, 4), np.nan), np.full((count, 6, 6), np.nan)
+    segment, piece = np.full(count, -1, np.int16), np.full(count, -1, np.int16)
+    poses[at], covariance[at] = found.poses, found.covariance
+    segment[at], piece[at] = found.segment, found.piece
+    return Chained(poses, covariance, segment, piece)
+
+
+def _account(frames: list[int], piece: NDArray[np.int16], causes: Mapping[int, str]) -> dict[str, Any]:
+    """Pieces, how many frames have a pose and how many in the world, lost frames with their causes; in words."""
+    posed = np.flatnonzero(piece >= 0)
+    pieces = [
+        [frames[rows[0]], frames[rows[-1]]]
+        for k in range(int(piece.max()) + 1)
+        if len(rows := np.flatnonzero(piece == k))
+    ]
+    lost, lines = [], []
+    for run in np.split(rows := np.flatnonzero(piece < 0), np.flatnonzero(np.diff(rows) > 1) + 1):
+        if not run.size:
+            continue
+        before, behind = posed[posed < run[0]], posed[posed > run[-1]]
+        bridged = None
+        if before.size and behind.size and piece[before[-1]] == piece[behind[0]]:
+            bridged = [frames[before[-1]], frames[behind[0]]]
+        for row in run:
+            cause = causes.get(frames[row], "no frame beside it could be posed with it")
+            lost.append({"frame": frames[row], "cause": cause, "bridged": bridged})
+            how = "no pose" if bridged is None else f"bridged from {bridged[0]} to {bridged[1]}"
+            lines.append(f"frame {frames[row]} lost: {cause}; {how}")
+    if len(pieces) > 1:
+        words = ", ".join(f"piece {k}: frames {a}-{b}" for k, (a, b) in enumerate(pieces, start=1))
+        where = ", ".join(f"before frame {a} ({causes.get(a, 'no motion found')})" for a, _ in pieces[1:])
+        world = f"each in its own frame, the world is that of piece {largest(piece) + 1}, the largest"
+        lines.append(f"the trajectory is broken {where}: {words}; {world}")
+    main = largest(piece)
+    counts = {"posed": len(posed), "in_world": int((piece == main).sum())}
+    return {"pieces": pieces, "main": main, **counts, "lost": lost, "warnings": lines}
+
+
+def _without_vertical(pieces: Sequence[Sequence[int]], verticals: Sequence[str]) -> list[str]:
+    return [
+        f"nothing tells of the vertical at frames {a}-{b}: their world is that of camera {a}, whose own up is z"
+        for (a, b), source in zip(pieces, verticals, strict=True)
+        if source == NO_VERTICAL
+    ]
+
+
+def _facts(segments: Sequence[Bundle]) -> list[dict[str, Any]]:
+    """Facts of each tracked frame; of a key frame those of the segment before, which posed it."""
+    facts: list[dict[str, Any]] = []
+    for bundle in segments:
+        facts += bundle.meta["per_frame"][1 if facts else 0 :]
+    return facts
+
+
+def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+    levels = [RigidTransform.from_matrix(b.meta["T_local_left"]) for b in inputs["levels"]]
+    segments = [
+        (np.asarray(b["poses"]), np.asarray(b["covariance"]), np.asarray(b["shared"])) for b in inputs["segments"]
+    ]
+    if "refined" in inputs:
+        ends = np.cumsum([len(poses) for poses, _, _ in segments])[:-1]
+        better = (np.split(np.asarray(inputs["refined"][name]), ends) for name in ("poses", "covariance", "shared"))
+        segments = list(zip(*better, strict=True))
+    frames = [int(f) for f in args["frames"]]
+    facts = _facts(inputs["segments"]) or [{"frame": frames[0], "inliers": 0}]
+    causes = {int(f["frame"]): str(f["cause"]) for f in args.get("lost", ())}
+    causes |= {int(f["frame"]): str(f["lost"]) for f in facts if "lost" in f}
+    row = {frame: k for k, frame in enumerate(frames)}
+    at = np.array([row[int(f["frame"])] for f in facts], dtype=np.intp)
+    found = _spread(chain(segments, levels), at, len(frames))
+    keys = [row[int(b.meta["per_frame"][0]["frame"])] for b in inputs["segments"]] or [int(at[0])]
+    found, verticals = _with_verticals(found, keys, inputs["levels"])
+    account = _account(frames, found.piece, causes)
+    account["warnings"] += _without_vertical(account["pieces"], verticals)
+    inliers = {int(f["frame"]): int(f["inliers"]) for f in facts}
+    return Bundle(
+        {"poses": found.poses, "covariance": found.covariance, "segment": found.segment, "piece": found.piece},
+        {
+            "frames": frames,
+            "inliers": [inliers.get(f, 0) for f in frames],
+            "positions": [[float(v) for v in p[:, 3]] if np.isfinite(p).all() else None for p in found.poses],
+            "verticals": verticals,
+        }
+        | account,
+    )
+
+
+STAGE = Stage(
+    name="trajectory",
+    version=2,
+    summary="poses of all left frames in the world frame",
+    params=NoParams,
+    inputs=("segments*", "levels*", "refined?"),
+    outputs=(
+        replace(POSES, frame="world"),
+        replace(COVARIANCE, frame="world"),
+        Array("segment", ("frame",), "int16", "1", "segment that posed the frame, -1: lost", "-1"),
+        Array("piece", ("frame",), "int16", "1", "unbroken piece, each in its own frame; -1: lost", "-1"),
+    ),
+    run=_run,
+)

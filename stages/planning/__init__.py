@@ -1,0 +1,1 @@
+"""Paths over a risk map: the row graph of the paper."""

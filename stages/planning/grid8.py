@@ -1,0 +1,176 @@
+"""Path in any direction over the eight-connected grid, for targets that the row graph cannot reach.
+
+Dijkstra's algorithm with a binary heap, from the target to the start: so the cost of every cell that was settled is its
+cost to go. The cost of an edge is its length and, weighted, its climb or descent and the toll of the cell entered; in
+whole numbers, so that sums are exact. Ties go to the lower cell index. scipy's Dijkstra wants the graph as a matrix, of
+15 million entries for a map of 1300 x 1500, which takes longer to build than this takes to search.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from stages.numeric.line import copy_line
+from stages.planning.local_planner.configuration_space import ACROSS, LEFT, RIGHT, STRAIGHT
+from stages.planning.row_graph import UNREACHED
+
+Ints = NDArray[np.int64]
+Whole = NDArray[np.integer[Any]]
+Bytes = NDArray[np.uint8]
+
+NEIGHBOURS = (
+    (-1, 0, STRAIGHT), (1, 0, STRAIGHT), (0, -1, ACROSS), (0, 1, ACROSS),
+    (-1, 1, RIGHT), (1, -1, RIGHT), (-1, -1, LEFT), (1, 1, LEFT),
+)  # fmt: skip
+"""Row, column and direction of the eight edges."""
+
+DIAGONAL = 1.4142135623730951
+
+
+def cost_to_go(
+    height: Whole, ways: Bytes, target: tuple[int, int], start: tuple[int, int] | None, unit: int, toll: Whole
+) -> tuple[Ints, NDArray[np.int8]]:
+    """Least cost from every cell to the target.
+
+    Parameters
+    ----------
+    height : (row, col) whole numbers, of which a difference of one costs one.
+    ways : (row, col) directions as bits in which the vehicle may stand
+    (:mod:`stages.planning.local_planner.configuration_space`). target, start : row and column; the search ends where
+    it meets ``start``, None: when all is settled. unit : cost of a straight step's length, at least 1.
+    toll : (row, col) whole numbers, cost of entering a cell.
+
+    Returns
+    -------
+    Cost (row, col) int64, ``UNREACHED`` where not reached; and index into :data:`NEIGHBOURS` of the next step, -1 at
+    the target and where not reached.
+    """
+    cost = np.full(height.shape, UNREACHED, dtype=np.int64)
+    step = np.full(height.shape, -1, dtype=np.int8)
+    end = -1 if start is None else start[0] * height.shape[1] + start[1]
+    lengths = np.array([unit if dr == 0 or dc == 0 else round(unit * DIAGONAL) for dr, dc, _ in NEIGHBOURS])
+    _search(np.ascontiguousarray(height), ways, toll, lengths, target[0] * height.shape[1] + target[1], end, cost, step)
+    return cost, step
+
+
+def trace(step: NDArray[np.int8], start: tuple[int, int]) -> Ints:
+    """Cells (vertex, 2) from a reached start to the target."""
+    cells = [start]
+    while step[cells[-1]] >= 0:
+        dr, dc, _ = NEIGHBOURS[step[cells[-1]]]
+        cells.append((cells[-1][0] + dr, cells[-1][1] + dc))
+    return np.array(cells, dtype=np.int64)
+
+
+def parts(ways: Bytes) -> tuple[NDArray[np.int32], Ints]:
+    """Ground that is connected by edges: its number of every cell (row, col), -1 where the vehicle may not stand; and
+    the first and the last row of each (number, 2), in reading order of their first cells."""
+    number = np.full(ways.shape, -1, dtype=np.int32)
+    spans = np.empty((1024, 2), dtype=np.int64)
+    count, spans = _flood(ways, number, spans)
+    return number, spans[:count]
+
+
+@njit(cache=True, nogil=True)
+def _flood(ways, number, spans):  # type: ignore[no-untyped-def]
+    rows, cols = ways.shape
+    stack = np.empty(ways.size, dtype=np.int64)
+    count = 0
+    for at in range(ways.size):
+        if ways[at // cols, at % cols] == 0 or number[at // cols, at % cols] >= 0:
+            continue
+        if count == spans.shape[0]:
+            more = np.empty((2 * count, 2), dtype=np.int64)
+            for k in range(count):
+                copy_line(spans[k], more[k])
+            spans = more
+        spans[count, 0] = spans[count, 1] = at // cols
+        number[at // cols, at % cols], stack[0], size = count, at, 1
+        while size:
+            size -= 1
+            r, c = stack[size] // cols, stack[size] % cols
+            spans[count, 1] = max(spans[count, 1], r)
+            for k in range(8):
+                dr, dc, way = NEIGHBOURS[k]
+                i, j = r + dr, c + dc
+                if i < 0 or j < 0 or i >= rows or j >= cols or number[i, j] >= 0:
+                    continue
+                if ways[r, c] & ways[i, j] & way:
+                    number[i, j], stack[size] = count, i * cols + j
+                    size += 1
+        count += 1
+    return count, spans
+
+
+@njit(cache=True, nogil=True)
+def _search(height, ways, toll, lengths, target, end, cost, step):  # type: ignore[no-untyped-def]
+    rows, cols = height.shape
+    keys, nodes = np.empty(1024, dtype=np.int64), np.empty(1024, dtype=np.int64)
+    size = 1
+    keys[0], nodes[0] = 0, target
+    cost[target // cols, target % cols] = 0
+    while size:
+        key, node = keys[0], nodes[0]
+        size -= 1
+        _sift_down(keys, nodes, size)
+        r, c = node // cols, node % cols
+        if key > cost[r, c]:
+            continue
+        if node == end:
+            break
+        for k in range(8):
+            dr, dc, way = NEIGHBOURS[k]
+            i, j = r - dr, c - dc  # the step from there leads here
+            if i < 0 or j < 0 or i >= rows or j >= cols or not ways[r, c] & ways[i, j] & way:
+                continue
+            total = key + lengths[k] + abs(height[r, c] - height[i, j]) + toll[r, c]
+            if total < cost[i, j]:
+                cost[i, j], step[i, j] = total, k
+                if size == keys.shape[0]:
+                    keys, nodes = _grown(keys), _grown(nodes)
+                _sift_up(keys, nodes, size, total, i * cols + j)
+                size += 1
+
+
+@njit(cache=True, nogil=True)
+def _grown(a):  # type: ignore[no-untyped-def]
+    out = np.empty(2 * a.shape[0], dtype=np.int64)
+    copy_line(a, out)
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _before(key, node, other_key, other_node):  # type: ignore[no-untyped-def]
+    return key < other_key or (key == other_key and node < other_node)
+
+
+@njit(cache=True, nogil=True)
+def _sift_up(keys, nodes, at, key, node):  # type: ignore[no-untyped-def]
+    """Put an entry at the end of the heap in its place."""
+    while at > 0:
+        parent = (at - 1) // 2
+        if not _before(key, node, keys[parent], nodes[parent]):
+            break
+        keys[at], nodes[at] = keys[parent], nodes[parent]
+        at = parent
+    keys[at], nodes[at] = key, node
+
+
+@njit(cache=True, nogil=True)
+def _sift_down(keys, nodes, size):  # type: ignore[no-untyped-def]
+    """Fill the top of the heap, of which ``size`` entries remain, by its last one."""
+    key, node = keys[size], nodes[size]
+    at = 0
+    while 2 * at + 1 < size:
+        child = 2 * at + 1
+        if child + 1 < size and _before(keys[child + 1], nodes[child + 1], keys[child], nodes[child]):
+            child += 1
+        if not _before(keys[child], nodes[child], key, node):
+            break
+        keys[at], nodes[at] = keys[child], nodes[child]
+        at = child
+    keys[at], nodes[at] = key, node

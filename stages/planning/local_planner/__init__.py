@@ -1,0 +1,1 @@
+"""The planner that drives a vehicle over ground that it sees as it goes."""

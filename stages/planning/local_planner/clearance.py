@@ -1,0 +1,220 @@
+"""Where a vehicle may stand on a risk map, at any place and heading: its wheels and its belly laid over the map.
+
+What is hazardous to a wheel was found in a window as large as the wheel, so it counts where the middle of a wheel is:
+the vehicle may pass a stone between its wheels, since what the belly cannot pass over (tilt, slope, rise, for the worst
+heading) is hazardous to its middle. Unknown ground may not be under the belly unless it is known to be low enough
+(:mod:`stages.planning.local_planner.underbody`), and the middles of the wheels keep the margin from it as from a
+hazard: what is unknown is mostly what is hidden by a stone, or the stone itself.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import scipy
+from numba import njit
+from numpy.typing import NDArray
+
+from stages.geometry.lattice import Lattice
+from stages.hazard.hazards import BITS
+from stages.hazard.risk import CAUTION, DOUBT_BIT, HAZARDOUS, UNKNOWN
+from stages.hazard.vehicle import Vehicle
+from stages.planning.local_planner.underbody import Straddle, clears, stands
+from stages.planning.path import WHEEL_BITS
+from stages.planning.wheels import wheel_positions
+from stages.terrain.occlusion_bounds import Bounds
+
+Floats = NDArray[np.float64]
+Floats32 = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+BODY_BITS = np.uint16(sum(BITS.values()) - int(WHEEL_BITS))
+"""Hazards to the vehicle with its middle on the cell."""
+
+NEAR_UNKNOWN = 0.5
+"""Cells; nearer than this a point of the belly lies in an unknown cell."""
+
+PARTS = 5
+"""Of a vehicle that stand on ground: its wheels and its middle."""
+
+DOUBT_WEIGHT = 60
+"""Of ground that is hazardous by sigma alone, or doubted, against caution: a wheel there makes a way more than three
+times as dear."""
+
+
+@dataclass(frozen=True)
+class Gaps:
+    """Of each pose, float32: ``gap`` m to the nearest hazard that is none by sigma alone (from wheel to what is
+    hazardous to wheels, from the middle to what is to the vehicle), ``doubtful`` m to those that are, ``proven`` m to
+    those that are proven, ``unknown`` m at least from the belly, and beyond the margin from the wheels, to unknown
+    ground (not positive: on it, or too near), ``frontier`` m to that of it where a wheel has room, ``caution`` share of
+    wheels and middle on caution ground. With its middle outside the map a vehicle is within a hazard."""
+
+    gap: Floats32
+    doubtful: Floats32
+    proven: Floats32
+    unknown: Floats32
+    frontier: Floats32
+    caution: Floats32
+
+
+@dataclass(frozen=True)
+class Footing:
+    """A risk map as a vehicle meets it: ``fields`` (6, row, col) m to hazards to a wheel that are none by sigma alone,
+    those that are, proven ones, and the same of hazards to the vehicle; ``unknown`` (row, col) m to unknown ground,
+    ``frontier`` to that of it where a wheel has room: the rest is mostly the shadows of stones; ``caution`` (row, col)
+    its weight there; ``straddle``: what of unknown ground the belly may pass over; ``glanced`` (row, col) where unknown
+    ground was seen, from afar; None: nowhere."""
+
+    lattice: Lattice
+    vehicle: Vehicle
+    fields: Floats32
+    unknown: Floats32
+    frontier: Floats32
+    caution: NDArray[np.uint8]
+    straddle: Straddle
+    glanced: Mask | None = None
+
+    @staticmethod
+    def of(
+        risk: NDArray[np.uint8],
+        reason: NDArray[np.uint16] | None,
+        lattice: Lattice,
+        vehicle: Vehicle,
+        p_hazard: NDArray[np.float32] | None = None,
+        sure: float = 0.5,
+        dare: float = 0.0,
+        unknown: Mask | None = None,
+        glanced: Mask | None = None,
+        doubted: Mask | None = None,
+        bounds: Bounds | None = None,
+    ) -> Footing:
+        """From classes and reason bits of :mod:`stages.hazard.risk`; without bits every hazard is one to a wheel.
+
+        ``unknown``: where the vehicle may not stand for what is not known; None: the unknown class. ``glanced``: where
+        of it something is known nevertheless; ``bounds`` of the ground, by which the belly may pass over it.
+
+        A hazard is proven where it is not one by sigma alone, and at least as probable as ``sure``. What is one by
+        sigma alone and less probable than ``dare`` is caution ground :data:`DOUBT_WEIGHT` times, if it is not unknown.
+        So is ``doubted`` ground, and what is within a quarter of a wheel of it, where its edge touches.
+        """
+        hazardous, cell = risk == HAZARDOUS, lattice.cell
+        unknown = risk == UNKNOWN if unknown is None else unknown
+        bits = np.full(risk.shape, WHEEL_BITS) if reason is None else reason
+        doubtful = hazardous & ((bits & DOUBT_BIT) > 0)
+        likely = proven = hazardous & ~doubtful
+        caution = (risk == CAUTION).astype(np.uint8)
+        if p_hazard is not None:
+            proven = likely & (p_hazard >= sure)
+            dared = doubtful & (p_hazard < dare)
+            doubtful &= ~dared
+            caution[dared & ~unknown] = DOUBT_WEIGHT
+        if doubted is not None:
+            caution[(_distance(doubted, cell) <= 0.25 * vehicle.wheel_diameter) & ~unknown] = DOUBT_WEIGHT
+        kinds = [(bits & which) > 0 for which in (WHEEL_BITS, BODY_BITS)]
+        fields = np.stack([_distance(mask & kind, cell) for kind in kinds for mask in (likely, doubtful, proven)])
+        wide = _opened(unknown, 0.5 * vehicle.wheel_diameter, cell)
+        void = _distance(unknown if bounds is None else unknown & np.isnan(bounds.upper), cell)
+        straddle = Straddle.of(void, bounds, vehicle, _belly(vehicle), cell)
+        unseen, frontier = _distance(unknown, cell), _distance(wide, cell)
+        return Footing(lattice, vehicle, fields, unseen, frontier, caution, straddle, glanced)
+
+    def gaps(self, x: Floats, y: Floats, heading: Floats) -> Gaps:
+        """At poses: x, y of the middle (m) and heading (rad to the left of y), arrays of one shape."""
+        at = self.lattice.index(np.stack([x, y], axis=-1)).reshape(-1, 2)
+        turn = np.broadcast_to(heading, np.shape(x)).reshape(-1)
+        out = np.empty((6, len(at)), np.float32)
+        cell = self.lattice.cell
+        # beyond the circle about the vehicle, and what rounding to cells takes, nothing is beneath it
+        around = 0.5 * math.hypot(self.vehicle.track, self.vehicle.wheel_base) + 1.5 * cell
+        reach = np.array([around + self.vehicle.margin, cell, self.vehicle.margin], np.float32)
+        _gaps(
+            at, np.cos(turn), np.sin(turn), wheel_positions(self.vehicle) / cell, _belly(self.vehicle) / cell,
+            self.fields, self.unknown, self.frontier, self.straddle, self.caution, reach, out,
+        )  # fmt: skip
+        out[3:5] -= NEAR_UNKNOWN * cell
+        return Gaps(*(a.reshape(np.shape(x)) for a in out))
+
+    def beneath(self, mask: Mask, stand: tuple[float, float, float]) -> Floats:
+        """Middles (n, 2), m, of the cells of a mask (row, col) that a vehicle at x, y (m), heading (rad) has under its
+        belly, or within its margin of the middles of its wheels: all that come too near to it, for it rounds to cells,
+        and what is a cell farther."""
+        x, y, heading = stand
+        cell, vehicle = self.lattice.cell, self.vehicle
+        reach = 0.5 * math.hypot(vehicle.track, vehicle.wheel_base) + vehicle.margin + 2.0 * cell
+        row, col = self.lattice.index((x, y))
+        n = math.ceil(reach / cell)
+        rows, cols = (slice(max(0, round(float(v)) - n), max(0, round(float(v)) + n + 1)) for v in (row, col))
+        at = self.lattice.xy()[rows, cols][mask[rows, cols]]
+        c, s = math.cos(heading), math.sin(heading)
+        right = c * (at[:, 0] - x) + s * (at[:, 1] - y)
+        ahead = c * (at[:, 1] - y) - s * (at[:, 0] - x)
+        under = (np.abs(right) <= 0.5 * vehicle.track + cell) & (np.abs(ahead) <= 0.5 * vehicle.wheel_base + cell)
+        for across, along in wheel_positions(vehicle):
+            under |= np.hypot(right - across, ahead - along) <= vehicle.margin + cell
+        return np.asarray(at[under])
+
+
+def _distance(mask: Mask, cell: float) -> Floats32:
+    far = scipy.ndimage.distance_transform_edt(~mask) * cell if mask.any() else np.full(mask.shape, np.inf)
+    return np.asarray(far, dtype=np.float32)
+
+
+def _opened(mask: Mask, radius: float, cell: float) -> Mask:
+    """What of a mask circles of this radius, m, cover that lie within it."""
+    inner = _distance(~mask, cell) - 0.5 * cell  # to the edge of the nearest cell without
+    return np.asarray(mask & (_distance(inner >= radius, cell) < radius + 0.5 * cell))
+
+
+def _belly(vehicle: Vehicle) -> Floats:
+    """Points (n, 2) right and ahead of the middle, m, at most half a wheel apart."""
+    sides = [np.linspace(-0.5, 0.5, 1 + math.ceil(v / (0.5 * vehicle.wheel_diameter))) * v
+             for v in (vehicle.track, vehicle.wheel_base)]  # fmt: skip
+    return np.stack(np.meshgrid(*sides), axis=-1).reshape(-1, 2)
+
+
+@njit(cache=True, nogil=True)
+def _gaps(at, cosine, sine, wheels, belly, fields, unknown, frontier, straddle, caution, reach, out):  # type: ignore[no-untyped-def]
+    rows, cols = unknown.shape
+    stand, heights = np.empty((4, 2), dtype=np.int64), np.empty(4)
+    for n in range(at.shape[0]):
+        row, col, c, s = at[n, 0], at[n, 1], cosine[n], sine[n]
+        for k in range(6):
+            out[k, n] = np.float32(-1.0) if k == 3 or k == 4 else np.float32(0.0)
+        i, j = math.floor(row + 0.5), math.floor(col + 0.5)
+        if i < 0 or j < 0 or i >= rows or j >= cols:
+            out[0, n] = out[1, n] = out[2, n] = -np.inf
+            continue
+        gap, doubtful, proven = fields[3, i, j], fields[4, i, j], fields[5, i, j]
+        share = np.float32(caution[i, j])
+        spare = unknown[i, j] - reach[0]
+        outside, least, wide = False, np.float32(np.inf), np.float32(np.inf)
+        for k in range(4):
+            a, b = wheels[k, 0], wheels[k, 1]
+            i, j = math.floor(row - (a * s + b * c) + 0.5), math.floor(col + (a * c - b * s) + 0.5)
+            if i < 0 or j < 0 or i >= rows or j >= cols:
+                outside = True
+                continue
+            stand[k, 0], stand[k, 1] = i, j
+            gap, doubtful = min(gap, fields[0, i, j]), min(doubtful, fields[1, i, j])
+            proven = min(proven, fields[2, i, j])
+            share += caution[i, j]
+            least, wide = min(least, unknown[i, j] - reach[2]), min(wide, frontier[i, j] - reach[2])
+        out[0, n], out[1, n], out[2, n], out[5, n] = gap, doubtful, proven, share / np.float32(PARTS)
+        if outside:
+            continue
+        if spare > 0:
+            out[3, n] = out[4, n] = spare + reach[1]
+            continue
+        steady = stands(straddle, stand, heights)
+        for k in range(belly.shape[0]):
+            a, b = belly[k, 0], belly[k, 1]
+            i, j = math.floor(row - (a * s + b * c) + 0.5), math.floor(col + (a * c - b * s) + 0.5)
+            i, j = min(max(i, 0), rows - 1), min(max(j, 0), cols - 1)
+            if steady and straddle.void[i, j] > unknown[i, j] and clears(straddle, k, i, j, heights):
+                least = min(least, straddle.void[i, j])
+            else:
+                least, wide = min(least, unknown[i, j]), min(wide, frontier[i, j])
+        out[3, n], out[4, n] = least, wide

@@ -1,0 +1,220 @@
+"""The map about a vehicle that plans its next leg: what may be driven on, what may be planned over, and at which price.
+
+See :mod:`stages.planning.local_planner.stage` for the rules. A way is found over poses on a grid through the vehicle;
+one that was planned before is looked at again on the map as it is now.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.planning.local_planner.clearance import DOUBT_WEIGHT, PARTS, Footing, Gaps
+from stages.planning.local_planner.params import LegParams
+from stages.planning.local_planner.route import STEP_TURN, Piece, pieces, turnable
+from stages.planning.local_planner.state_lattice import PoseGraph, PoseGrid
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Point = tuple[float, float]
+
+ASIDE = tuple(math.radians(d) for d in (3.0, -3.0, 6.0, -6.0, 9.0, -9.0))
+"""Headings off the present one from which a way is looked for where there is none: a graph's headings are some 20
+degrees apart, and out of a narrow place a way may lead at those between alone."""
+
+HERE = 0.3
+"""Wheel bases: ground so near to where it stands may be as that under it is."""
+NEARER = 2.0
+"""Times ``blind``: what is doubtful, farther than that, will be seen from nearer, where most doubts go."""
+
+
+class Ground:
+    """The map about a vehicle: what it may drive on, what it may plan over, and at which price."""
+
+    def __init__(
+        self,
+        footing: Footing,
+        start: Point,
+        heading: float,
+        p: LegParams,
+        closed: Sequence[Point] = (),
+        aside: float = 0.0,
+    ) -> None:
+        """``aside``: rad from the heading to the graph's first one."""
+        self.footing, self.start, self.heading, self.p, self.closed = footing, start, heading, p, tuple(closed)
+        self.vehicle, self.cell = footing.vehicle, footing.lattice.cell
+        at = footing.gaps(*(np.array([v]) for v in (*start, heading)))
+        # where it stands it may be: near there, ground that is no worse by more than a cell will do
+        margin = self.vehicle.margin
+        self.here = [
+            min(most, float(a[0]) - self.cell)
+            for most, a in ((margin, at.gap), (0.0, at.doubtful), (margin, at.proven))
+        ]
+        # rounded to cells, places less than half a cell apart may be a diagonal apart
+        self.unknown_here = min(0.0, float(at.unknown[0]) - 1.5 * self.cell)
+        spacing = max(p.spacing * self.vehicle.wheel_diameter, self.cell)
+        self.grid = PoseGrid.over(footing.lattice, start, heading + aside, spacing)
+        self._sure: list[Mask] = []
+        self.graph = PoseGraph.of(footing, self.grid, self._prices)
+
+    def _split(self, gaps: Gaps, x: Floats, y: Floats, slack: float = 0.0) -> tuple[Mask, Mask]:
+        """Poses that may be driven, and those that may be planned over; the margin may lack ``slack`` m.
+
+        Of what is hazardous by sigma alone no margin is kept: sigma is the room for error there.
+        """
+        near, margin = self._near(x, y), self.vehicle.margin
+        known = (gaps.gap > np.where(near, self.here[0], margin) - slack) & self._seen(gaps, near)
+        known &= gaps.doubtful > np.where(near, self.here[1], 0.0)
+        opened = gaps.proven > np.where(near, self.here[2], margin) - slack
+        for cx, cy in self.closed:
+            opened &= known | (np.hypot(x - cx, y - cy) > self.p.vain * self.vehicle.wheel_base)
+        return known, opened | known
+
+    def _near(self, x: Floats, y: Floats) -> Mask:
+        """Where it stands: ground there that is no worse than that under it will do."""
+        return np.asarray(self._away(x, y) <= HERE)
+
+    def _away(self, x: Floats, y: Floats) -> Floats:
+        """Wheel bases from where it stands."""
+        return np.asarray(np.hypot(x - self.start[0], y - self.start[1]) / self.vehicle.wheel_base)
+
+    def _seen(self, gaps: Gaps, near: Mask) -> Mask:
+        return np.asarray(gaps.unknown > np.where(near, self.unknown_here, 0.0))
+
+    def _prices(self, gaps: Gaps, x: Floats, y: Floats, heading: Floats) -> Floats:
+        known, price = self._price(gaps, x, y)
+        self._sure.append(known)
+        return price
+
+    def _price(self, gaps: Gaps, x: Floats, y: Floats, slack: float = 0.0) -> tuple[Mask, Floats]:
+        """Poses that may be driven, and the price of a metre, infinite where none may be planned."""
+        known, opened = self._split(gaps, x, y, slack)
+        away = self._away(x, y)
+        blind = away <= self.p.blind * np.where(gaps.unknown > 0, NEARER, 1.0)
+        unseen = np.full(x.shape, self.p.unknown_price)
+        if self.footing.glanced is not None:
+            unseen[~self._at(~self.footing.glanced, x, y)] = min(self.p.glance_price, self.p.unknown_price)
+        unknown = np.where(blind, np.maximum(self.p.blind_price, unseen), unseen)
+        stays = (gaps.gap <= self.vehicle.margin) | ((gaps.unknown <= 0) & (gaps.frontier > 0))
+        unknown = np.where(stays, np.maximum(self.p.doubt_price, unknown), unknown)
+        caution = self.p.caution_price * gaps.caution
+        # not dearer than if nothing were known of it
+        fades = (away > NEARER * self.p.blind) & ~stays
+        caution = np.where(fades, np.minimum(caution, self.p.unknown_price - 1.0), caution)
+        price = np.where(known, 1.0, unknown) + caution
+        if self.vehicle.margin > 0:
+            beside = np.minimum(gaps.gap / self.vehicle.margin - 1.0, gaps.doubtful / self.vehicle.margin)
+            price = price + self.p.near_price * np.clip(1.0 - beside, 0.0, 1.0)
+        return known, np.where(opened, price, np.inf)
+
+    def _at(self, mask: Mask, x: Floats, y: Floats) -> Mask:
+        """Values of a mask on the map at points; true outside."""
+        at = np.rint(self.footing.lattice.index(np.stack([x, y], axis=-1))).astype(np.int64)
+        inside = ((at >= 0) & (at < mask.shape)).all(axis=-1)
+        row, col = (np.where(inside, at[..., k], 0) for k in (0, 1))
+        return np.asarray(~inside | mask[row, col])
+
+    def known(self) -> tuple[Mask, ...]:
+        """Poses, steps and turns of the graph that may be driven, each (heading over half a turn, row, col)."""
+        return tuple(np.stack(self._sure[kind::3]) for kind in range(3))
+
+    def clear(self, x: Floats, y: Floats, heading: Floats) -> bool:
+        """Whether all of these poses may be driven."""
+        return bool(self.free(x, y, heading).all())
+
+    def plain(self, x: Floats, y: Floats, heading: Floats) -> bool:
+        """Whether all of these poses may be driven and no wheel stands on doubtful ground there."""
+        gaps = self.footing.gaps(x, y, heading)
+        return bool((self._split(gaps, x, y)[0] & (gaps.caution < DOUBT_WEIGHT / PARTS)).all())
+
+    def free(self, x: Floats, y: Floats, heading: Floats) -> Mask:
+        """Which of these poses may be driven."""
+        return self._split(self.footing.gaps(x, y, heading), x, y)[0]
+
+    def places(self) -> tuple[Floats, Floats]:
+        """x and y (row, col), m, of the graph's places."""
+        row, col = np.meshgrid(*(np.arange(n, dtype=np.float64) for n in self.grid.shape), indexing="ij")
+        return self.grid.xy(row, col)
+
+    def search(self, goal: Point, reach: float, *, whole: bool = False) -> tuple[Mask, Floats, NDArray[np.int8]]:
+        """Goals (row, col) within ``reach`` metres, cost and move (heading, row, col)."""
+        x, y = self.places()
+        goals: Mask = np.asarray(np.hypot(x - goal[0], y - goal[1]) <= reach)
+        turn = self.p.turn_price * self.vehicle.wheel_base
+        return goals, *self.graph.search(goals, turn, self.p.back_price, whole=whole)
+
+    def beside(self) -> Iterator[Ground]:
+        """The same from headings a little aside, as far as the wheels have room to turn there."""
+        for aside in ASIDE:
+            if turnable(self.start, self.heading, self.heading + aside, self.clear):
+                yield Ground(self.footing, self.start, self.heading, self.p, self.closed, aside)
+
+    def opens(self, goals: Mask) -> bool:
+        """Whether the vehicle may be at one of these places (row, col)."""
+        return bool(np.isfinite(self.graph.pose[:, goals]).any())
+
+    def from_start(self, cost: Floats) -> float:
+        """Cost of the way from the start, infinite where there is none."""
+        return float(cost[0, self.grid.origin[0], self.grid.origin[1]])
+
+    def way(self, move: NDArray[np.int8]) -> list[Piece]:
+        """The way from the start in steps."""
+        return pieces(self.graph, self.known(), self.graph.follow(move))
+
+    def again(self, way: Sequence[Piece]) -> tuple[list[Piece], float]:
+        """A way that was planned before, from the start: which of it is known now, and its cost at present prices.
+
+        It was looked at in steps of the places then; looked at more closely its margin may be short by a cell.
+        """
+        out, cost, heading = list[Piece](), 0.0, self.heading
+        for piece in way:
+            n, share, (x, y, angle) = self._along(piece, heading)
+            known, price = self._price(self.footing.gaps(x, y, angle), x, y, self.cell)
+            metres = piece.length * (self.p.back_price if piece.gear < 0 else 1.0)
+            if not np.isfinite(price).all():
+                return [], math.inf
+            cost += abs(piece.heading - heading) * self.p.turn_price * self.vehicle.wheel_base * float(price[:n].max())
+            cost += metres * float(price[n:].mean())
+            first = piece.length * float(share[np.argmin(known) - 1])  # metres before what is not known
+            if not known.all() and np.argmin(known) > n and first > 0:
+                out.append(replace(piece.cut(first), known=True))
+                piece = replace(piece, a=out[-1].b)
+            out.append(replace(piece, known=bool(known.all())))
+            heading = piece.heading
+        return out, cost
+
+    def _along(self, piece: Piece, before: float) -> tuple[int, Floats, tuple[Floats, Floats, Floats]]:
+        """Poses of a turn on the spot and a piece after it: how many of the turn, share of the piece, x, y, heading."""
+        turn, steps = abs(piece.heading - before) / STEP_TURN, 2.0 * piece.length / self.grid.spacing
+        n, m = (max(2, 1 + math.ceil(v)) for v in (turn, steps))
+        share = np.append(np.zeros(n), np.linspace(0.0, 1.0, m))
+        x, y = (piece.a[i] + share * (piece.b[i] - piece.a[i]) for i in (0, 1))
+        return n, share, (x, y, np.append(np.linspace(before, piece.heading, n), np.full(m, piece.heading)))
+
+    def lacking(self, way: Sequence[Piece], first: int) -> tuple[Floats, bool]:
+        """Middles (n, 2), m, of the cells for which the first piece of a way that is not known is not, at the first
+        pose at which it is so: those that were not seen from near, else hazards; and whether they were not seen."""
+        piece, before = way[first], way[first - 1].heading if first > 0 else self.heading
+        _, _, (x, y, angle) = self._along(piece.cut(self.grid.spacing), before)
+        gaps = self.footing.gaps(x, y, angle)
+        k = int(np.argmin(self._split(gaps, x, y)[0]))
+        stand = float(x[k]), float(y[k]), float(angle[k])
+        fields = self.footing.fields
+        for mask, unseen in ((self.footing.unknown == 0, True), ((fields[:2] == 0).any(axis=0), False)):
+            points = self.footing.beneath(mask, stand)
+            if len(points):
+                return points, unseen
+        return np.array([stand[:2]]), False
+
+    def on_map(self, cost: Floats) -> NDArray[np.float32]:
+        """Cost at the best heading on the cells of the map, NaN where it is not known."""
+        best = cost.min(axis=0)
+        xy = self.footing.lattice.xy()
+        row, col = (np.rint(v).astype(np.int64) for v in self.grid.index(xy[..., 0], xy[..., 1]))
+        inside = (row >= 0) & (col >= 0) & (row < self.grid.shape[0]) & (col < self.grid.shape[1])
+        found = np.where(inside, best[np.where(inside, row, 0), np.where(inside, col, 0)], np.inf)
+        return np.where(np.isfinite(found), found, np.nan).astype(np.float32)

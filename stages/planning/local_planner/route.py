@@ -1,0 +1,172 @@
+"""A way over a pose graph as straight pieces to drive, with turns on the spot between them."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.planning.local_planner.state_lattice import AHEAD, BACK, PoseGraph, angle_of
+
+Floats = NDArray[np.float64]
+Clear = Callable[[Floats, Floats, Floats], bool]
+"""Whether the vehicle may be at all of the poses x, y (m), heading (rad)."""
+
+STEP_TURN = math.radians(5.0)
+NOTHING = 1e-9
+"""m; a shorter piece is what rounding leaves over, and has no heading."""
+
+
+@dataclass(frozen=True)
+class Piece:
+    """A straight piece from ``a`` to ``b`` (m), driven with ``heading`` (rad, counted on over turns), ``gear`` 1 ahead
+    or -1 back; ``known``: the vehicle may drive there on what is known."""
+
+    a: tuple[float, float]
+    b: tuple[float, float]
+    heading: float
+    gear: int
+    known: bool = True
+
+    @property
+    def length(self) -> float:
+        """Metres."""
+        return math.hypot(self.b[0] - self.a[0], self.b[1] - self.a[1])
+
+    def cut(self, length: float) -> Piece:
+        """The first ``length`` metres."""
+        part = min(1.0, length / self.length)
+        b = (self.a[0] + part * (self.b[0] - self.a[0]), self.a[1] + part * (self.b[1] - self.a[1]))
+        return Piece(self.a, b, self.heading, self.gear, self.known)
+
+
+def pieces(
+    graph: PoseGraph, known: tuple[NDArray[np.bool_], ...], moves: Sequence[tuple[int, int, int, int]]
+) -> list[Piece]:
+    """Steps of a way as pieces; a turn over unknown ground makes the piece after it unknown.
+
+    ``known``: poses, steps and turns of the graph that are.
+    """
+    out: list[Piece] = []
+    grid, sure = graph.grid, True
+    for (k, r, c, m), (k1, r1, c1, _) in itertools.pairwise(moves):
+        if m in (AHEAD, BACK):
+            begin = (r, c) if (m == AHEAD) == (k % 16 < 8) else (r1, c1)
+            here = known[0][k % 8, r, c] and known[0][k % 8, r1, c1] and known[1][k % 8, begin[0], begin[1]]
+            x, y = grid.xy(np.array([r, r1], np.float64), np.array([c, c1], np.float64))
+            a, b = (float(x[0]), float(y[0])), (float(x[1]), float(y[1]))
+            out.append(Piece(a, b, grid.heading + angle_of(k), 1 if m == AHEAD else -1, bool(here and sure)))
+            sure = True
+        else:
+            sure = sure and bool(known[2][min(k, k1) % 8, r, c] and known[0][k1 % 8, r, c])
+    return out
+
+
+def straightened(way: Sequence[Piece], heading: float, clear: Clear, spacing: float) -> list[Piece]:
+    """Fewer and longer pieces of a known way: each as far as can be driven to directly, from ``heading`` on."""
+    out: list[Piece] = []
+    i = 0
+    while i < len(way):
+        last = i
+        while last + 1 < len(way) and way[last + 1].gear == way[i].gear:
+            last += 1
+        j, best = i, way[i]
+        for end in range(last, i, -1):
+            line = _line(way[i], way[end])
+            after = way[end + 1].heading if end + 1 < len(way) else line.heading
+            if abs(line.heading - way[i].heading) < 0.5 * math.pi and _drivable(line, heading, after, clear, spacing):
+                j, best = end, line
+                break
+        out.append(best)
+        heading, i = best.heading, j + 1
+    return out
+
+
+def _line(first: Piece, last: Piece) -> Piece:
+    dx, dy = first.gear * (last.b[0] - first.a[0]), first.gear * (last.b[1] - first.a[1])
+    turn = math.remainder(math.atan2(-dx, dy) - first.heading, 2 * math.pi)
+    return Piece(first.a, last.b, first.heading + turn, first.gear)
+
+
+def _drivable(line: Piece, before: float, after: float, clear: Clear, spacing: float) -> bool:
+    n = max(2, 1 + math.ceil(2.0 * line.length / spacing))
+    share = np.linspace(0.0, 1.0, n)
+    x, y = (line.a[i] + share * (line.b[i] - line.a[i]) for i in (0, 1))
+    return (
+        clear(x, y, np.full(n, line.heading))
+        and turnable(line.a, before, line.heading, clear)
+        and turnable(line.b, line.heading, after, clear)
+    )
+
+
+def turnable(at: tuple[float, float], before: float, after: float, clear: Clear) -> bool:
+    """Whether the vehicle may turn on the spot from one heading to another, in the direction of their difference."""
+    n = max(2, 1 + math.ceil(abs(after - before) / STEP_TURN))
+    return clear(np.full(n, at[0]), np.full(n, at[1]), np.linspace(before, after, n))
+
+
+def first_metres(way: Sequence[Piece], length: float) -> list[Piece]:
+    """The first ``length`` metres of a way."""
+    out: list[Piece] = []
+    for piece in way:
+        if length <= NOTHING:
+            break
+        out.append(piece.cut(length) if piece.length > length else piece)
+        length -= piece.length
+    return out
+
+
+def last_metres(way: Sequence[Piece], length: float) -> list[Piece]:
+    """What is left of a way after its first ``length`` metres."""
+    out: list[Piece] = []
+    for piece in way:
+        if length >= piece.length - NOTHING:
+            length -= piece.length
+            continue
+        out.append(replace(piece, a=piece.cut(length).b) if length > 0 else piece)
+        length = 0.0
+    return out
+
+
+def within_turn(way: Sequence[Piece], heading: float, bound: float) -> tuple[list[Piece], float]:
+    """The way as far as all its headings, the present one too, lie within a bound (rad) of each other; and the turn
+    (rad) at its end towards where it goes on, as far as that keeps to the bound too."""
+    out, low, high, now = list[Piece](), heading, heading, heading
+    for piece in way:
+        if max(high, piece.heading) - min(low, piece.heading) > bound + 1e-9:
+            right, left = room_to_turn(low, high, now, bound)
+            return out, max(-right, min(left, piece.heading - now))
+        low, high, now = min(low, piece.heading), max(high, piece.heading), piece.heading
+        out.append(piece)
+    return out, 0.0
+
+
+def room_to_turn(low: float, high: float, now: float, bound: float) -> tuple[float, float]:
+    """How far (rad) one may turn to the right and to the left so that all headings, from low to high so far, lie within
+    a bound of each other."""
+    return max(0.0, now - high + bound), max(0.0, low - now + bound)
+
+
+def length_of(way: Sequence[Piece]) -> float:
+    """Metres."""
+    return sum(piece.length for piece in way)
+
+
+def through(points: Floats, gear: NDArray[np.int8], heading: float) -> list[Piece]:
+    """Straight pieces between points (n, 2), m, each driven with its ``gear`` (n - 1,); headings are counted on from
+    the one given, by the shorter turn."""
+    out: list[Piece] = []
+    for a, b, g in zip(points[:-1].tolist(), points[1:].tolist(), gear.tolist(), strict=True):
+        dx, dy = g * (b[0] - a[0]), g * (b[1] - a[1])
+        heading += math.remainder(math.atan2(-dx, dy) - heading, 2 * math.pi)
+        out.append(Piece((a[0], a[1]), (b[0], b[1]), heading, g))
+    return out
+
+
+def vertices(way: Sequence[Piece], start: tuple[float, float]) -> Floats:
+    """Vertices (vertex, 2) metres, the start first."""
+    return np.array([start, *(piece.b for piece in way)], dtype=np.float64).reshape(-1, 2)

@@ -1,0 +1,153 @@
+"""The next leg of a drive to a goal, by the hazards that are known so far: stage ``leg``.
+
+What was seen from near may be driven on, what was seen from afar serves to plan
+(:mod:`stages.planning.local_planner.policy`). Far hazards close ground only once they are probable; where that closes
+every way, only what is next to certain does.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.core.declare import Array, Bundle, Inputs, Stage
+from stages.geometry.geometry import Rig, RigidTransform
+from stages.geometry.lattice import Lattice
+from stages.hazard.classification import HAZARDOUS, UNKNOWN, UNSEEN_BIT
+from stages.hazard.vehicle import Vehicle
+from stages.planning.local_planner.clearance import Footing
+from stages.planning.local_planner.memory import Memory
+from stages.planning.local_planner.params import LegParams
+from stages.planning.local_planner.policy import Before, Leg, plan_leg, shortest
+from stages.planning.local_planner.views import Stand, View
+from stages.terrain.occlusion_bounds import Bounds
+
+Mask = NDArray[np.bool_]
+Point = tuple[float, float]
+
+
+def next_leg(
+    near: Bundle,
+    far: Bundle | None,
+    stand: Stand,
+    goal: Point,
+    params: LegParams,
+    memory: Memory,
+    view: View,
+    before: Before | None = None,
+    bounds: Bounds | None = None,
+) -> Leg:
+    """The next leg on the hazards (:mod:`stages.hazard.risk`) of what was seen from near, and of all that was seen;
+    None: that is the same. The other parameters are those of :func:`stages.planning.local_planner.policy.plan_leg`."""
+    (classes, reason, chance), seen = seen_so_far(near, far, params)
+    lattice, vehicle = Lattice.from_dict(near.meta["lattice"]), Vehicle.model_validate(near.meta["vehicle"])
+    for sure in params.sure:
+        footing = Footing.of(classes, reason, lattice, vehicle, chance, sure, params.dare, bounds=bounds, **seen)
+        found = plan_leg(footing, stand, goal, params, memory, before, view)
+        if found.verdict == "goal" or len(found.way) > 1:
+            break
+    return found
+
+
+def shortest_way(risk: Bundle, stand: Stand, goal: Point, params: LegParams) -> tuple[float | None, float | None]:
+    """Length (m) of the shortest way where all is known, and the margin (m) that it keeps: the vehicle's, or none where
+    the margin, which is for what a vehicle does not know, closes every way. None: there is no way."""
+    lattice, vehicle = Lattice.from_dict(risk.meta["lattice"]), Vehicle.model_validate(risk.meta["vehicle"])
+    maps = (np.asarray(risk[name]) for name in ("risk", "reason", "p_hazard"))
+    classes, reason, chance = maps
+    for margin in (vehicle.margin, 0.0):
+        bare = vehicle.model_copy(update={"margin": margin})
+        allowed = Footing.of(classes, reason, lattice, bare, chance, params.sure[-1], params.dare)
+        best = shortest(allowed, stand, goal, params)
+        if best is not None:
+            return best, margin
+    return None, None
+
+
+def _run(params: LegParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+    risk = inputs["risk"]
+    T_world_left = RigidTransform.from_matrix(np.asarray(inputs["pose"]["poses"])[-1])
+    T_vehicle_left = RigidTransform.from_matrix(args["T_vehicle_left"])
+    T = T_world_left @ T_vehicle_left.inverse()
+    stand = float(T.translation[0]), float(T.translation[1]), math.atan2(-T.rotation[0, 1], T.rotation[1, 1])
+    goal = (float(args["goal"][0]), float(args["goal"][1]))
+    closed = [(float(x), float(y)) for x, y in args["closed"]]
+    stands = [(float(x), float(y), float(heading)) for x, y, heading in args["stands"]]
+    memory = Memory(looks=int(args["looks"]), closed=closed, stands=stands)
+    before = None
+    if "before" in inputs and len(inputs["before"]["rest_gear"]):
+        before = np.asarray(inputs["before"]["rest"]), np.asarray(inputs["before"]["rest_gear"])
+    view = View.of(Rig.from_dict(inputs["rig"].meta["rig"]), T_vehicle_left)
+    ceiling, bounds = inputs.get("ceiling"), None
+    if ceiling is not None:
+        bounds = Bounds(upper=np.asarray(ceiling["upper"]), lower=np.asarray(ceiling["lower"]))
+    found = next_leg(risk, inputs.get("far"), stand, goal, params, memory, view, before, bounds)
+    best, margin = shortest_way(risk, stand, goal, params) if args.get("whole") else (None, None)
+    meta = {
+        "shortest_m": best,
+        "shortest_margin_m": margin,
+        "verdict": found.verdict,
+        "reason": found.reason,
+        "turn": found.turn,
+        "where": None if found.where is None else list(found.where),
+        "start": list(stand),
+        "goal": list(goal),
+        "left_m": math.hypot(goal[0] - stand[0], goal[1] - stand[1]),
+        "length_m": _length(found.path),
+        "way_m": _length(found.way),
+    }
+    arrays: dict[str, NDArray[Any]] = {"path": found.path, "gear": found.gear, "way": found.way}
+    arrays |= {"rest": found.rest, "rest_gear": found.rest_gear, "cost_to_go": found.cost}
+    return Bundle(arrays, meta)
+
+
+def seen_so_far(near: Bundle, far: Bundle | None, p: LegParams) -> tuple[list[NDArray[Any]], dict[str, Mask | None]]:
+    """Classes, reasons and probabilities (row, col) of a map, of which only what was seen from near is driven on; and
+    how well each cell is known, as :meth:`stages.planning.local_planner.clearance.Footing.of` asks for it."""
+    names = ("risk", "reason", "p_hazard")
+    maps = [np.asarray(near[name]) for name in names]
+    unknown, glanced = maps[0] == UNKNOWN, None
+    if far is not None:
+        # at the rim of what is near, a window is cut off, which widens the doubt; all of it was seen from afar, which
+        # counts where it looks clearly free
+        chance = np.asarray(far["p_hazard"])
+        cut = unknown | (((maps[1] & UNSEEN_BIT) != 0) & (chance < p.clear))
+        maps = [np.where(cut, np.asarray(far[name]), seen) for name, seen in zip(names, maps, strict=True)]
+        unknown &= ~(maps[2] < p.clear)
+        glanced = unknown & (maps[0] < HAZARDOUS)
+    return maps, {"unknown": unknown, "glanced": glanced, "doubted": maps[2] >= p.avoid}
+
+
+def _length(path: NDArray[np.float64]) -> float:
+    return float(np.hypot(*np.diff(path, axis=0).T).sum()) if len(path) > 1 else 0.0
+
+
+STAGE = Stage(
+    name="leg",
+    version=10,
+    summary="the next leg of a drive to a goal, over ground that is known to be free",
+    params=LegParams,
+    inputs=("risk", "far?", "ceiling?", "pose", "rig", "before?"),
+    outputs=(
+        Array(
+            "path",
+            ("vertex", "xy"),
+            "float64",
+            "m",
+            "vertices of the leg, from where the vehicle stands",
+            frame="world",
+        ),
+        Array("gear", ("piece",), "int8", "1", "1 where the leg is driven ahead, -1 where it is driven back"),
+        Array("way", ("way_vertex", "xy"), "float64", "m", "vertices of the way to the goal as planned", frame="world"),
+        Array(
+            "rest", ("rest_vertex", "xy"), "float64", "m", "vertices of what is left of it after the leg", frame="world"
+        ),
+        Array("rest_gear", ("rest_piece",), "int8", "1", "1 where that is driven ahead, -1 where it is driven back"),
+        Array("cost_to_go", ("row", "col"), "float32", "m", "price of the way from each cell to the goal", "nan"),
+    ),
+    run=_run,
+)

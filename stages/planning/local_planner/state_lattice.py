@@ -1,0 +1,218 @@
+"""Ways of a vehicle that turns on the spot: places and headings as one graph, searched from the goal to the start.
+
+Places lie on a square grid through the start, turned with it, so that the start is exactly on it. Headings are the 16
+directions to the neighbours one and two steps away. From a pose the vehicle drives ahead or back by one step along its
+heading, or turns to the next heading. Each pose, the middle of each step and of each turn have a price a metre,
+infinite where the vehicle may not be; a step costs its length times the highest price on it. Dijkstra's algorithm;
+ties go to the lower pose.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from stages.geometry.lattice import Lattice
+from stages.planning.local_planner.clearance import Footing, Gaps
+
+Floats = NDArray[np.float64]
+Floats32 = NDArray[np.float32]
+Prices = Callable[[Gaps, Floats, Floats, Floats], Floats]
+"""Price a metre of poses: their gaps, x, y (m), heading (rad)."""
+
+HALF = 8
+STEPS = np.array([(-1, 0), (-2, -1), (-1, -1), (-1, -2), (0, -1), (1, -2), (1, -1), (2, -1)])
+STEPS = np.concatenate([STEPS, -STEPS])
+"""Row and column of one step along each heading, from ahead to the left."""
+ANGLES = np.mod(np.arctan2(-STEPS[:, 1], -STEPS[:, 0]), 2 * np.pi)
+LENGTHS = np.hypot(STEPS[:, 0], STEPS[:, 1])
+AHEAD, BACK, TO_LEFT, TO_RIGHT = 0, 1, 2, 3
+
+
+@dataclass(frozen=True)
+class PoseGrid:
+    """Places (row, col): ``middle + spacing * R(heading) (col - col0, row0 - row)``, metres."""
+
+    middle: tuple[float, float]
+    heading: float
+    spacing: float
+    shape: tuple[int, int]
+    origin: tuple[int, int]
+
+    @staticmethod
+    def over(lattice: Lattice, middle: tuple[float, float], heading: float, spacing: float) -> PoseGrid:
+        """All of a map."""
+        x0, x1, y0, y1 = lattice.bounds
+        corners = np.array([(x, y) for x in (x0, x1) for y in (y0, y1)]) - middle
+        c, s = math.cos(heading), math.sin(heading)
+        right, ahead = (corners @ [[c, -s], [s, c]] / spacing).T
+        row0, col0 = math.ceil(ahead.max()), math.ceil(-right.min())
+        shape = row0 + 1 + math.ceil(-ahead.min()), col0 + 1 + math.ceil(right.max())
+        return PoseGrid(middle, heading, spacing, shape, (row0, col0))
+
+    def xy(self, row: Floats, col: Floats) -> tuple[Floats, Floats]:
+        """Metres, of fractional rows and columns."""
+        right, ahead = (col - self.origin[1]) * self.spacing, (self.origin[0] - row) * self.spacing
+        c, s = math.cos(self.heading), math.sin(self.heading)
+        return self.middle[0] + c * right - s * ahead, self.middle[1] + s * right + c * ahead
+
+    def index(self, x: Floats, y: Floats) -> tuple[Floats, Floats]:
+        """Fractional rows and columns of points, metres."""
+        c, s = math.cos(self.heading), math.sin(self.heading)
+        dx, dy = x - self.middle[0], y - self.middle[1]
+        return self.origin[0] - (c * dy - s * dx) / self.spacing, self.origin[1] + (c * dx + s * dy) / self.spacing
+
+
+@dataclass(frozen=True)
+class PoseGraph:
+    """Prices (heading over half a turn, row, col): of poses, of the middles of steps ahead from them and of turns to
+    the left."""
+
+    grid: PoseGrid
+    pose: Floats
+    step: Floats
+    turn: Floats
+
+    @staticmethod
+    def of(footing: Footing, grid: PoseGrid, prices: Prices) -> PoseGraph:
+        """On a map; a vehicle needs the same ground backwards, so that half a turn of headings is enough."""
+        row, col = np.meshgrid(*(np.arange(n, dtype=np.float64) for n in grid.shape), indexing="ij")
+        out: list[list[Floats]] = [[], [], []]
+        for k in range(HALF):
+            after = ANGLES[k + 1]
+            dr, dc = 0.5 * STEPS[k]
+            for where, (r, c, angle) in enumerate(
+                ((0.0, 0.0, ANGLES[k]), (dr, dc, ANGLES[k]), (0.0, 0.0, 0.5 * (ANGLES[k] + after)))
+            ):
+                x, y = grid.xy(row + r, col + c)
+                heading = np.full(x.shape, grid.heading + angle)
+                out[where].append(prices(footing.gaps(x, y, heading), x, y, heading))
+        return PoseGraph(grid, *(np.stack(a) for a in out))
+
+    def search(
+        self, goals: NDArray[np.bool_], turn_price: float, back: float, *, whole: bool = False
+    ) -> tuple[Floats, NDArray[np.int8]]:
+        """Least cost of the poses (16, row, col) to a goal, and the move towards it, -1 none.
+
+        Parameters
+        ----------
+        goals : (row, col) places, at any heading.
+        turn_price : metres that a radian is worth. ``back``: price of driving back, ahead is 1.
+        whole : to all poses; else only as far as the start.
+        """
+        size = (2 * HALF, *self.grid.shape)
+        cost, move = np.full(size, np.inf), np.full(size, -1, np.int8)
+        r, c = self.grid.origin
+        end = -1 if whole else r * size[2] + c
+        angles = np.mod(np.diff(np.append(ANGLES, 2 * np.pi)), 2 * np.pi)
+        _search(
+            self.pose, self.step, self.turn, goals, STEPS, LENGTHS * self.grid.spacing, angles * turn_price,
+            back, end, cost, move,
+        )  # fmt: skip
+        return cost, move
+
+    def follow(self, move: NDArray[np.int8]) -> list[tuple[int, int, int, int]]:
+        """Poses and moves from the start: heading, counted on to the left (negative to the right), row, col, move."""
+        at, out = (0, *self.grid.origin), []
+        while True:
+            k, r, c = at
+            m = int(move[k % (2 * HALF), r, c])
+            out.append((k, r, c, m))
+            if m < 0:
+                return out
+            dr, dc = (int(v) for v in STEPS[k % (2 * HALF)])
+            at = {AHEAD: (k, r + dr, c + dc), BACK: (k, r - dr, c - dc), TO_LEFT: (k + 1, r, c)}.get(m, (k - 1, r, c))
+
+
+def angle_of(k: int) -> float:
+    """Angle (rad) of a heading that is counted on over full turns."""
+    turns, rest = divmod(k, 2 * HALF)
+    return 2 * math.pi * turns + float(ANGLES[rest])
+
+
+@njit(cache=True, nogil=True)
+def _before(key, node, other_key, other_node):  # type: ignore[no-untyped-def]
+    return key < other_key or (key == other_key and node < other_node)
+
+
+@njit(cache=True, nogil=True)
+def _push(keys, nodes, size, key, node):  # type: ignore[no-untyped-def]
+    """Add to the heap, which may move to larger arrays."""
+    if size == keys.shape[0]:
+        more_keys, more_nodes = np.empty(2 * size, np.float64), np.empty(2 * size, np.int64)
+        more_keys[:size], more_nodes[:size] = keys, nodes
+        keys, nodes = more_keys, more_nodes
+    at = size
+    while at > 0:
+        parent = (at - 1) // 2
+        if not _before(key, node, keys[parent], nodes[parent]):
+            break
+        keys[at], nodes[at] = keys[parent], nodes[parent]
+        at = parent
+    keys[at], nodes[at] = key, node
+    return keys, nodes, size + 1
+
+
+@njit(cache=True, nogil=True)
+def _pop(keys, nodes, size):  # type: ignore[no-untyped-def]
+    """Take the first entry off the heap; the number of those that remain."""
+    size -= 1
+    key, node = keys[size], nodes[size]
+    at = 0
+    while 2 * at + 1 < size:
+        child = 2 * at + 1
+        if child + 1 < size and _before(keys[child + 1], nodes[child + 1], keys[child], nodes[child]):
+            child += 1
+        if not _before(keys[child], nodes[child], key, node):
+            break
+        keys[at], nodes[at] = keys[child], nodes[child]
+        at = child
+    keys[at], nodes[at] = key, node
+    return size
+
+
+@njit(cache=True, nogil=True)
+def _search(pose, step, turn, goals, steps, lengths, turns, back, end, cost, move):  # type: ignore[no-untyped-def]
+    rows, cols = goals.shape
+    area = rows * cols
+    keys, nodes, size = np.empty(4096, np.float64), np.empty(4096, np.int64), 0
+    for k in range(16):
+        for r in range(rows):
+            for c in range(cols):
+                if goals[r, c] and pose[k % 8, r, c] < np.inf:
+                    cost[k, r, c] = 0.0
+                    keys, nodes, size = _push(keys, nodes, size, 0.0, k * area + r * cols + c)
+    while size:
+        key, node = keys[0], nodes[0]
+        size = _pop(keys, nodes, size)
+        k, r, c = node // area, node % area // cols, node % cols
+        if key > cost[k, r, c]:
+            continue
+        if node == end:
+            break
+        here = pose[k % 8, r, c]
+        for m in range(4):
+            before, i, j, scale = k, r, c, 1.0
+            if m < 2:
+                sign = -1 if m == 0 else 1
+                i, j = r + sign * steps[k, 0], c + sign * steps[k, 1]
+                if i < 0 or j < 0 or i >= rows or j >= cols:
+                    continue
+                # the step along heading k % 8 that joins both places begins at one of them
+                first = (m == 0) == (k < 8)
+                between = step[k % 8, i, j] if first else step[k % 8, r, c]
+                scale = lengths[k] * (back if m == 1 else 1.0)
+            else:
+                before = (k + 15) % 16 if m == 2 else (k + 1) % 16
+                lower = before if m == 2 else k
+                between, scale = turn[lower % 8, r, c], turns[lower]
+            price = max(here, pose[before % 8, i, j], between)
+            total = key + scale * price
+            if total < cost[before, i, j]:
+                cost[before, i, j], move[before, i, j] = total, m
+                keys, nodes, size = _push(keys, nodes, size, total, before * area + i * cols + j)

@@ -1,0 +1,262 @@
+"""Local path on a risk map (section 4.7), for a vehicle with a width.
+
+Two planners. ``rows`` is the paper's: a path that runs monotonically through the rows across the driving direction,
+with all targets of the far row from one sweep (:mod:`stages.planning.row_graph`). ``grid8`` goes in any direction and
+reaches what lies beside or behind an obstacle (:mod:`stages.planning.grid8`). ``auto`` takes the first, and the second
+where the first reaches no target that was asked for.
+
+The weight of an edge is the absolute height difference between the places where a wheel would stand: means over the
+wheel's window, rounded to a step that means nothing to the vehicle. ``grid8`` adds the length, since without rows to
+cross a path of no climb could be of any length. Caution ground costs a toll.
+
+Footprint. The middle of the vehicle never enters a hazardous or unknown cell; and in the direction of each edge its
+wheels keep the margin from ground that is hazardous to a wheel, and its middle keeps it from places where the vehicle
+as a whole would tilt or strike (:mod:`stages.planning.local_planner.configuration_space`). Of unknown ground three
+shares are tried: none under its outline, else none under its wheels, else none under its middle. The last happens
+where the elevation model is narrower than the vehicle, as beside the cameras; the result says so (``ground``).
+
+Rows lie across the driving direction: the elevation model's own rows where it is heading-aligned (row 0 farthest), or
+the rows of a grid turned by a heading or by the line from start to target, filled by nearest neighbour.
+
+An elevation model is fan-shaped and ragged: the first and last rows with a free cell hold a few, which may lead
+nowhere. So a start that is not given is, of the free cells within one vehicle length of the first row that lead on,
+the one nearest to that row's middle; the target likewise at the last row. A path counts as found when it comes within
+one vehicle length of the last row. A mission's map, on which the vehicle stands nowhere in particular, may be cut by
+ground that it cannot cross: then the connected ground over most rows is crossed, in any direction, and what is left out
+is told (``left_out_m``).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from stages.core.declare import Array, Bundle, Inputs, Memory, Params, Stage
+from stages.geometry.lattice import Lattice
+from stages.hazard.hazards import WHEEL_BITS
+from stages.hazard.risk import HAZARDOUS, check_size
+from stages.hazard.vehicle import Vehicle
+from stages.planning import grid8
+from stages.planning.path_ends import Point, check_end, chosen
+from stages.planning.path_ground import GROUNDS, Ground
+from stages.planning.path_words import Maps, Route, describe
+from stages.planning.row_graph import UNREACHED, Plan, plan, row_span
+from stages.planning.row_grid import RowGrid
+
+__all__ = ["STAGE", "WHEEL_BITS", "PathParams", "Route", "describe", "find_path"]
+
+Planner = Literal["rows", "grid8", "auto"]
+
+
+class PathParams(Params):
+    """Parameters of ``path``. ``start`` and ``target`` concern the path over the whole map, not those of each stop."""
+
+    start: Point | None = Field(
+        default=None,
+        description="m; x, y in the world frame; not set: the free cell nearest to the middle of the first row",
+    )
+    target: Point | None = Field(
+        default=None,
+        description="m; x, y in the world frame; not set: the free cell nearest to the middle of the last row",
+    )
+    planner: Planner = Field(
+        default="auto",
+        description="rows: ahead in every row, as in the paper; grid8: any direction; auto: grid8 where rows do not "
+        "reach the target, or do not lead over the map of a mission",
+    )
+    height_step: float = Field(
+        default=0.02, gt=0, le=1, description="share of max_step; smaller height differences count as none"
+    )
+    caution: float = Field(
+        default=0.2, ge=0, le=10, description="m of climb that a metre of caution ground is worth: a detour of a fifth"
+    )
+    doubt: float = Field(
+        default=5.0,
+        ge=0,
+        le=1000,
+        description="m of climb that a metre of ground is worth, times its probability of a hazard: at 0.1 a detour of "
+        "half of it",
+    )
+    sure: float = Field(
+        default=0.1,
+        gt=0,
+        le=1,
+        description="probability of a hazard above which ground is not driven on, though no measure exceeds its limit "
+        "by as many standard deviations as make a hazard; where this alone closes every way, the reason says so",
+    )
+
+
+def find_path(
+    maps: Maps,
+    lattice: Lattice,
+    vehicle: Vehicle,
+    *,
+    heading: Point = (0.0, 1.0),
+    start: Point | None = None,
+    target: Point | None = None,
+    stretch: bool = False,
+    params: PathParams | None = None,
+) -> Route:
+    """Path over a risk map.
+
+    Parameters
+    ----------
+    maps : arrays (row, col) of stage ``risk``: ``risk``, ``reason``, ``elevation``; the others serve messages.
+    heading : driving direction (dx, dy) in the frame of the lattice; start and target together override it.
+    start, target : x, y, metres; None: see the module. Those of ``params`` are not looked at.
+    stretch : with neither of them, cross the connected ground over most rows where no path leads over all of them.
+
+    Raises
+    ------
+    InputError
+        Start or target lies outside the map, in a hazard or on unknown ground, or they are the same cell; or the
+        vehicle is wider than the map.
+    """
+    p = params or PathParams()
+    check_size(vehicle, lattice.shape, lattice.cell)
+    for name, point in (("start", start), ("target", target)):
+        if point is not None:
+            check_end(maps, lattice, vehicle, name, point)
+    if start is not None and target is not None:
+        heading = (target[0] - start[0], target[1] - start[1])
+    found = _found(maps, lattice, vehicle, heading, start, target, stretch, p)
+    if len(found.cells) or p.sure >= 1 or "p_hazard" not in maps:
+        return found
+    other = _found(maps, lattice, vehicle, heading, start, target, stretch, p.model_copy(update={"sure": 1.0}))
+    if not len(other.cells):
+        return found
+    at = tuple(np.rint(lattice.index(other.xyz[:, :2])).astype(np.int64).T)
+    chance = math.ceil(1e3 * float(np.nanmax(maps["p_hazard"][at])) - 1e-3) / 1e3
+    reason = (
+        f"ground with a p_hazard above path.sure {p.sure:g} closes every way; without it one leads over ground of up "
+        f"to {chance:.3g}: raise path.sure to that to take it"
+    )
+    return replace(found, plan=replace(found.plan, reason=reason), doubt=chance)
+
+
+def _found(
+    maps: Maps,
+    lattice: Lattice,
+    vehicle: Vehicle,
+    heading: Point,
+    start: Point | None,
+    target: Point | None,
+    stretch: bool,
+    p: PathParams,
+) -> Route:
+    found = None
+    if p.planner != "grid8":
+        found = _by_rows(maps, lattice, vehicle, heading, start, target, p)
+    if p.planner == "grid8" or (
+        p.planner == "auto"
+        and found is not None
+        and not len(found.cells)
+        and (target is not None or (stretch and start is None))
+    ):
+        found = _by_grid(maps, lattice, vehicle, start, target, p, found)
+    assert found is not None
+    return found
+
+
+def _ground(maps: Maps, lattice: Lattice, grid: RowGrid, vehicle: Vehicle, p: PathParams) -> Ground:
+    unit = p.height_step * vehicle.max_step
+    return Ground(maps, lattice, grid, vehicle, unit=unit, caution=p.caution, doubt=p.doubt, sure=p.sure)
+
+
+def _by_rows(
+    maps: Maps,
+    lattice: Lattice,
+    vehicle: Vehicle,
+    heading: Point,
+    start: Point | None,
+    target: Point | None,
+    p: PathParams,
+) -> Route:
+    ground = _ground(maps, lattice, RowGrid.over(lattice, heading), vehicle, p)
+    grid = ground.grid
+    first, last = (None if point is None else grid.index(point) for point in (start, target))
+    tolerance = math.ceil((vehicle.wheel_base + vehicle.wheel_diameter) / lattice.cell)
+    span = row_span(~ground.closed)
+    for name in GROUNDS:
+        explain = name == GROUNDS[-1]
+        found = plan(
+            ground.height, ground.ways(name), tolerance, first, last, span=span, toll=ground.toll, explain=explain
+        )
+        if len(found.cells):
+            break
+    cost = ground.metres(found.cost, UNREACHED, grid.rows)
+    return Route(found.cells, ground.xyz(found.cells), found, grid, "rows", name, cost, span or (0, 0))
+
+
+def _by_grid(
+    maps: Maps,
+    lattice: Lattice,
+    vehicle: Vehicle,
+    start: Point | None,
+    target: Point | None,
+    p: PathParams,
+    before: Route | None,
+) -> Route:
+    ground = _ground(maps, lattice, RowGrid.over(lattice, (0.0, 1.0)), vehicle, p)
+    grid, unit = ground.grid, max(1, round(lattice.cell / ground.unit))
+    given = tuple(None if point is None else grid.index(point) for point in (start, target))
+    nothing = np.empty((0, 2), dtype=np.int64)
+    cells, cost, name = nothing, np.full(ground.height.shape, UNREACHED), GROUNDS[0]
+    for name in ground.worth() if given == (None, None) else GROUNDS:
+        ways = ground.ways(name)
+        first, last = chosen(ground, name, *given)
+        if first is None or last is None or not ways[first] or not ways[last]:
+            continue
+        cost, step = grid8.cost_to_go(ground.height, ways, last, first, unit, ground.toll)
+        if cost[first] < UNREACHED:
+            cells = grid8.trace(step, first)
+            break
+    reason = "" if len(cells) else "start and target are not connected by ground that the vehicle may cross"
+    base = before.plan if before is not None else Plan(nothing, cost, np.zeros(grid.cols, dtype=bool), 0)
+    found = replace(base, cells=cells, cost=cost, reachable=np.zeros(grid.cols, dtype=bool), reason=reason)
+    if len(cells):
+        found = replace(found, target_row=int(cells[-1, 0]), blocking_row=None)
+        found.reachable[cells[-1, 1]] = True
+    metres = ground.metres(cost, UNREACHED)
+    return Route(cells, ground.xyz(cells), found, grid, "grid8", name, metres, row_span(~ground.closed) or (0, 0))
+
+
+def _run(params: PathParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+    source: Bundle = inputs["risk"]
+    lattice, vehicle = Lattice.from_dict(source.meta["lattice"]), Vehicle.model_validate(source.meta["vehicle"])
+    local = args.get("use") == "local"
+    dx, dy = args.get("heading", (0.0, 1.0))
+    maps = {name: np.asarray(source[name]) for name in source.arrays}
+    ends = {} if local else {"start": params.start, "target": params.target}
+    route = find_path(maps, lattice, vehicle, heading=(dx, dy), stretch=not local, params=params, **ends)
+    arrays: dict[str, NDArray[Any]] = {
+        "path": route.xyz,
+        "cost_to_go": route.cost,
+        "reachable": route.plan.reachable.astype(np.uint8),
+    }
+    meta = describe(route, maps, lattice, vehicle) | {"frame": source.meta.get("frame", "local")}
+    if not local and not meta["found"] and (route.doubt is not None or not (maps["risk"] < HAZARDOUS).any()):
+        meta["warnings"] = [f"no path: {meta['reason']}"]
+    return Bundle(arrays, meta)
+
+
+STAGE = Stage(
+    name="path",
+    version=3,
+    summary="path of least height differences for a vehicle with a width: monotone in the rows, or any direction",
+    params=PathParams,
+    inputs=("risk",),
+    outputs=(
+        Array("path", ("vertex", "xyz"), "float64", "m", "vertices from start to target; z = mean under a wheel"),
+        Array("cost_to_go", ("row", "col"), "float32", "m", "rows: cost from the start; grid8: to the target", "nan"),
+        Array("reachable", ("col",), "uint8", "1", "1 where the target row can be reached"),
+    ),
+    run=_run,
+    memory=Memory(factor=6.0, lower=("locus.cell_size",)),
+)

@@ -1,0 +1,147 @@
+"""A risk map on the grid of a planner: where the vehicle may stand, what a step costs, which ground is connected."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from stages.geometry.lattice import Lattice
+from stages.hazard.hazards import BITS, WHEEL_BITS
+from stages.hazard.risk import CAUTION, HAZARDOUS, UNKNOWN, window_cells
+from stages.hazard.vehicle import Vehicle
+from stages.numeric.windows import window_mean
+from stages.planning import grid8
+from stages.planning.local_planner.configuration_space import Stand
+from stages.planning.row_grid import RowGrid
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.integer[Any]]
+Bytes = NDArray[np.uint8]
+Maps = Mapping[str, NDArray[Any]]
+
+GROUNDS = ("outline", "wheels", "middle")
+"""What of the vehicle stays on known ground, as tried in turn."""
+
+MOST = 0.5
+"""Share of the rows: a path that stays clearer of unknown ground is worth half of its length."""
+
+BODY_BITS = np.uint16(sum(BITS.values()) - int(WHEEL_BITS))
+
+LARGE = 1 << 30
+"""Heights above it are kept in 64 bits."""
+
+
+class Ground:
+    """The maps on a grid.
+
+    ``unit``: metres of height that cost one; ``stand`` (row, col) float32 m, mean height under a wheel; ``height`` the
+    same in units, 0 where closed; ``toll`` (row, col) units, of caution and doubtful ground; ``closed`` (row, col):
+    where the vehicle's middle may not be.
+    """
+
+    def __init__(
+        self,
+        maps: Maps,
+        lattice: Lattice,
+        grid: RowGrid,
+        vehicle: Vehicle,
+        *,
+        unit: float,
+        caution: float,
+        doubt: float = 0.0,
+        sure: float = 1.0,
+    ) -> None:
+        """
+        Parameters
+        ----------
+        maps : arrays (row, col) of stage ``risk`` on ``lattice``: ``risk``, ``reason``, ``elevation`` and, where
+            there is a price of doubt, ``p_hazard``.
+        unit : metres.
+        caution : metres of climb that a metre of caution ground costs.
+        doubt : metres of climb that a metre of ground costs times its probability of a hazard.
+        sure : probability of a hazard above which ground is closed.
+        """
+        self.grid, self.unit = grid, unit
+        risk = grid.sample(lattice, maps["risk"], UNKNOWN)
+        reason = grid.sample(lattice, maps["reason"], 0)
+        known = "p_hazard" in maps
+        chance = grid.sample(lattice, maps["p_hazard"], np.nan) if known else np.zeros(risk.shape, np.float32)
+        mean = window_mean(maps["elevation"], window_cells(vehicle.wheel_diameter, lattice.cell))
+        self.stand = grid.sample(lattice, mean, np.nan)
+        unknown, self.closed, wheels, body = (np.empty(risk.shape, dtype=np.bool_) for _ in range(4))
+        toll = round(caution * grid.cell / unit)
+        dearest = toll + round(doubt * grid.cell / unit)
+        self.height: Ints = np.empty(risk.shape, dtype=np.int32)
+        self.toll: Ints = np.empty(risk.shape, dtype=np.int16 if dearest <= np.iinfo(np.int16).max else np.int64)
+        prices = np.float32(unit), toll, np.float32(doubt * grid.cell / unit)
+        limit = np.float32(sure if sure < 1 else np.inf)
+        if _lay(risk, reason, chance, self.stand, limit, *prices, unknown, self.closed, wheels, body, self.height,
+                self.toll):  # fmt: skip
+            self.height = np.rint(np.where(self.closed, np.float32(0), self.stand) / np.float32(unit)).astype(np.int64)
+        self._stand = Stand(wheels, body, vehicle, grid.cell, unknown, self.closed)
+        self._ways: dict[str, Bytes] = {}
+        self._parts: dict[str, tuple[NDArray[np.int32], Ints]] = {}
+
+    def ways(self, below: str) -> Bytes:
+        """Directions (row, col) as bits with ``below``, one of :data:`GROUNDS`, on the known."""
+        if below not in self._ways:
+            self._ways[below] = self._stand.ways(below)
+        return self._ways[below]
+
+    def parts(self, below: str) -> tuple[NDArray[np.int32], Ints]:
+        """Connected ground, see :func:`stages.planning.grid8.parts`."""
+        if below not in self._parts:
+            self._parts[below] = grid8.parts(self.ways(below))
+        return self._parts[below]
+
+    def worth(self) -> tuple[str, ...]:
+        """Of :data:`GROUNDS` those on which connected ground covers most of the rows that it covers on any."""
+        spans = [self.parts(name)[1] for name in GROUNDS]
+        rows = [int((s[:, 1] - s[:, 0]).max(initial=0)) for s in spans]
+        return tuple(name for name, n in zip(GROUNDS, rows, strict=True) if n >= MOST * max(rows))
+
+    def metres(self, cost: Ints, unreached: int, each: int = 1) -> NDArray[np.float32]:
+        """A cost (row, col) of which ``each`` are a unit, rounded down to units, in metres; NaN where not reached."""
+        out = np.empty(cost.shape, dtype=np.float32)
+        _metres(cost, unreached, float(each), self.unit, out)
+        return out
+
+    def xyz(self, cells: NDArray[np.int64]) -> Floats:
+        """Points (vertex, 3), metres, of cells (vertex, 2)."""
+        row, col = cells[:, 0], cells[:, 1]
+        return np.column_stack([self.grid.xy(row, col), self.stand[row, col]])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _lay(risk, reason, chance, stand, sure, unit, caution, doubt, unknown, closed, wheels, body, height, toll):  # type: ignore[no-untyped-def]
+    """Masks of unknown ground, of all that is not entered, and of what is hazardous to a wheel and to the vehicle as a
+    whole; heights in units and tolls. Returns whether some height is too large."""
+    large = np.uint8(0)
+    for r in range(risk.shape[0]):
+        for c in range(risk.shape[1]):
+            unknown[r, c] = risk[r, c] == UNKNOWN
+            closed[r, c] = (risk[r, c] >= HAZARDOUS) | (chance[r, c] > sure)
+        for c in range(risk.shape[1]):
+            wheels[r, c] = (risk[r, c] == HAZARDOUS) & (reason[r, c] & WHEEL_BITS != 0)
+            body[r, c] = (risk[r, c] == HAZARDOUS) & (reason[r, c] & BODY_BITS != 0)
+        for c in range(risk.shape[1]):
+            v = np.rint(stand[r, c] / unit) if risk[r, c] < HAZARDOUS else np.float32(0.0)
+            height[r, c] = np.int32(v)
+            large |= np.uint8(abs(v) > np.float32(LARGE))
+        for c in range(risk.shape[1]):
+            # where nothing is known of it, which is closed, there is none of doubt
+            p = chance[r, c] if chance[r, c] > np.float32(0.0) else np.float32(0.0)
+            toll[r, c] = np.int64(np.rint(doubt * p)) + (caution if risk[r, c] == CAUTION else 0)
+    return large > 0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _metres(cost, unreached, each, unit, out):  # type: ignore[no-untyped-def]
+    for r in range(cost.shape[0]):
+        for c in range(cost.shape[1]):
+            v = cost[r, c]
+            out[r, c] = np.floor(v / each) * unit if v < unreached else np.nan

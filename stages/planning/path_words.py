@@ -1,0 +1,134 @@
+"""A path that was found, or why there is none: its facts, and hazards in words."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.geometry.lattice import Lattice
+from stages.hazard.hazards import BITS
+from stages.hazard.risk import CAUTION, HAZARDOUS, UNKNOWN
+from stages.hazard.vehicle import Vehicle
+from stages.planning.path_ground import GROUNDS
+from stages.planning.row_graph import Plan
+from stages.planning.row_grid import RowGrid
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Maps = Mapping[str, NDArray[Any]]
+
+WORDS = {
+    "inclination": ("inclination", "max_slope_deg", "deg"),
+    "step": ("step", "max_step", "m"),
+    "roughness": ("roughness", "max_roughness", "m"),
+    "slope": ("slope of the footprint", "max_slope_deg", "deg"),
+    "tilt": ("tilt", "max_slope_deg", "deg"),
+    "range": ("height range", "clearance", "m"),
+    "rise": ("rise under the belly", "clearance", "m"),
+}
+"""Measure: in words, the vehicle's limit, unit."""
+
+
+@dataclass(frozen=True)
+class Route:
+    """A path and how it was found.
+
+    ``cells`` (vertex, 2) on ``grid`` and ``xyz`` (vertex, 3) metres, z the mean height under a wheel, both empty where
+    there is none; ``plan`` of the row graph, ``planner`` that gave the path, ``ground`` one of :data:`GROUNDS`;
+    ``cost`` (row, col) metres: from the start by rows, to the target by grid8; NaN where not reached.
+    ``span``: farthest and nearest row of the grid that are free somewhere. ``doubt``: where there is none only because
+    ground is closed that is probably a hazard, greatest probability on a path that ignores it.
+    """
+
+    cells: Ints
+    xyz: Floats
+    plan: Plan
+    grid: RowGrid
+    planner: str
+    ground: str
+    cost: NDArray[np.float32]
+    span: tuple[int, int]
+    doubt: float | None = None
+
+
+def describe(route: Route, maps: Maps, lattice: Lattice, vehicle: Vehicle) -> dict[str, Any]:
+    """Facts of a route: length, climb, and the worst that it meets."""
+    found, grid, xyz = route.plan, route.grid, route.xyz
+    meta: dict[str, Any] = {
+        "found": len(xyz) > 0,
+        "planner": route.planner,
+        "ground": route.ground,
+        "reason": found.reason or "" if len(xyz) else _why(found, maps, vehicle),
+        "blocking_row": found.blocking_row,
+        "blocking_y": None if found.blocking_row is None else (grid.j0 - found.blocking_row) * grid.cell,
+        "beside_unknown": route.ground != GROUNDS[0],
+        "target_row": found.target_row,
+        "reachable_targets": int(found.reachable.sum()),
+        "vertices": len(xyz),
+        "grid": grid.to_dict(),
+    }
+    none = ("length_m", "climb_m", "max_inclination", "max_tilt", "least_clearance", "max_p_hazard", "caution_share")
+    if len(xyz) == 0:
+        return meta | dict.fromkeys((*none, "start", "target", "left_out_m"))
+    at = tuple(np.rint(lattice.index(xyz[:, :2])).astype(np.int64).T)
+    steps = np.diff(xyz, axis=0)
+    return meta | {
+        "length_m": float(np.sqrt((steps**2).sum(axis=1)).sum()),
+        "climb_m": float(np.maximum(steps[:, 2], 0.0).sum()),
+        "max_inclination": _worst(maps, "inclination", at, np.nanmax),
+        "max_tilt": _worst(maps, "tilt", at, np.nanmax),
+        "least_clearance": _worst(maps, "clearance", at, np.nanmin),
+        "max_p_hazard": _worst(maps, "p_hazard", at, np.nanmax),
+        "caution_share": float((maps["risk"][at] == CAUTION).mean()),
+        "left_out_m": _left_out(route),
+        "start": [float(v) for v in xyz[0]],
+        "target": [float(v) for v in xyz[-1]],
+    }
+
+
+def _left_out(route: Route) -> list[float]:
+    """Metres of rows with known ground before the start and beyond the target."""
+    span, rows = route.span, route.cells[[0, -1], 0]
+    return [float(span[1] - rows[0]) * route.grid.cell, float(rows[1] - span[0]) * route.grid.cell]
+
+
+def _worst(maps: Maps, name: str, at: Any, of: Any) -> float | None:
+    return float(of(maps[name][at])) if name in maps else None
+
+
+def _why(found: Plan, maps: Maps, vehicle: Vehicle) -> str:
+    """Why there is no path; where hazards leave nothing to drive on, the limit that does the most."""
+    risk = maps["risk"]
+    judged = int((risk != UNKNOWN).sum())
+    if judged == 0 or (risk[risk != UNKNOWN] < HAZARDOUS).any():
+        return found.reason
+    most = max(BITS, key=lambda name: int(((maps["reason"] & BITS[name]) > 0).sum()))
+    share = float(((maps["reason"] & BITS[most]) > 0).sum()) / judged
+    words, limit, _ = WORDS[most]
+    return (
+        f"all {judged} known cells are hazardous, {100 * share:.0f} % of them by {words}: "
+        f"is vehicle.{limit} {getattr(vehicle, limit):g} at the scale of the sequence?"
+    )
+
+
+def hazard_words(maps: Maps, at: tuple[int, int], vehicle: Vehicle) -> str:
+    """The measures over their limits at a cell, with both figures."""
+    band = {"range": "height_range", "rise": "clearance"}
+    told = []
+    for name, bit in BITS.items():
+        if not int(maps["reason"][at]) & bit:
+            continue
+        words, limit, unit = WORDS[name]
+        values = maps.get(band.get(name, name))
+        if values is None:
+            told.append(f"{words} over vehicle.{limit}")
+            continue
+        value = float(values[at])
+        value = vehicle.clearance - value if name == "rise" else math.degrees(value) if unit == "deg" else value
+        told.append(f"{words} {value:.3g} {unit}, vehicle.{limit} {getattr(vehicle, limit):g}")
+    return "; ".join(told)

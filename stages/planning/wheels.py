@@ -1,0 +1,176 @@
+"""How a vehicle stands on a surface: where its four wheels touch, how it tilts, and what is left under its belly.
+
+A wheel is a sphere of its diameter that rests on the surface (the highest position that the heights under it enforce).
+The body is the plane of least squares through the four contacts: averaging suspensions (rocker-bogie) keep to it.
+
+* tilt: angle of that plane to the horizontal;
+* clearance: least distance of the belly, ``vehicle.clearance`` above the plane between the wheels, to the surface;
+* step: range of the heights in a square as wide as half a wheel's diameter about the worst contact, the edge that it
+  climbs there. Heights between the nodes are bilinear, so that the square is as wide on every grid.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from stages.geometry.geometry import RigidTransform
+from stages.hazard.vehicle import Vehicle
+
+Floats = NDArray[np.float64]
+
+BELLY_POINTS = 9
+"""Samples along either side of the belly."""
+
+
+@dataclass(frozen=True)
+class Ground:
+    """Heights (row, col), metres, NaN unknown; node (row, col) is at x = x0 + col cell, y = y0 - row cell.
+
+    ``resting`` (row, col): height of a wheel's lowest point where it rests above the node; ``step`` (row, col): range
+    of the heights in the window of half a wheel's diameter.
+    """
+
+    x0: float
+    y0: float
+    cell: float
+    height: Floats
+    resting: Floats
+    step: Floats
+
+    @staticmethod
+    def of(height: NDArray[np.floating], x0: float, y0: float, cell: float, wheel_diameter: float) -> Ground:
+        """Ground with what a wheel makes of it."""
+        z = np.asarray(height, dtype=np.float64)
+        radius = 0.5 * wheel_diameter
+        n = int(radius / cell)
+        dy, dx = np.mgrid[-n : n + 1, -n : n + 1] * cell
+        inside = dx**2 + dy**2 <= radius**2
+        sphere = np.where(inside, np.sqrt(np.maximum(radius**2 - dx**2 - dy**2, 0.0)) - radius, 0.0)
+        low = np.where(np.isnan(z), -1e9, z)
+        resting = scipy.ndimage.grey_dilation(low, footprint=inside, structure=sphere, mode="nearest")
+        reach = 0.25 * wheel_diameter / cell
+        step = highest(z, reach) + highest(-z, reach)
+        unknown = np.isnan(z)
+        return Ground(x0, y0, cell, z, np.where(unknown, np.nan, resting), np.where(unknown, np.nan, step))
+
+    def at(self, what: Floats, points: Floats) -> Floats:
+        """Bilinear values (n,) of one of the arrays at points (n, 2); NaN outside or beside unknown nodes."""
+        row, col = (self.y0 - points[:, 1]) / self.cell, (points[:, 0] - self.x0) / self.cell
+        rows, cols = what.shape
+        inside = (row >= 0) & (col >= 0) & (row <= rows - 1) & (col <= cols - 1)
+        r = np.clip(np.floor(np.where(inside, row, 0.0)).astype(np.intp), 0, rows - 2)
+        c = np.clip(np.floor(np.where(inside, col, 0.0)).astype(np.intp), 0, cols - 2)
+        u, v = row - r, col - c
+        top = (1 - v) * what[r, c] + v * what[r, c + 1]
+        foot = (1 - v) * what[r + 1, c] + v * what[r + 1, c + 1]
+        return np.where(inside, (1 - u) * top + u * foot, np.nan)
+
+    def part(self, x: tuple[float, float], y: tuple[float, float], wheel_diameter: float) -> Ground:
+        """The ground of a box alone, wheels recomputed."""
+        c0, c1 = (int((v - self.x0) / self.cell) for v in x)
+        r0, r1 = (int((self.y0 - v) / self.cell) for v in (y[1], y[0]))
+        r0, r1 = max(r0, 0), min(r1 + 2, self.height.shape[0])
+        c0, c1 = max(c0, 0), min(c1 + 2, self.height.shape[1])
+        part = self.height[r0:r1, c0:c1]
+        return Ground.of(part, self.x0 + c0 * self.cell, self.y0 - r0 * self.cell, self.cell, wheel_diameter)
+
+
+def highest(z: Floats, reach: float) -> Floats:
+    """Largest bilinear height (row, col) in the square of ``reach`` cells to each side of a node; NaN is left out."""
+    filled = np.where(np.isnan(z), -np.inf, z)
+    inner, rims = _along(_highest_on_lines(filled, reach), reach, 1)[0], _along(filled, reach, 1)[1:]
+    return np.asarray(np.maximum.reduce([inner, *(_highest_on_lines(rim, reach) for rim in rims)]))
+
+
+def _highest_on_lines(z: Floats, reach: float) -> Floats:
+    return np.asarray(np.maximum.reduce(_along(z, reach, 0)))
+
+
+def _along(z: Floats, reach: float, axis: int) -> list[Floats]:
+    """Largest of the nodes within ``reach`` cells of each node along an axis, and the heights at both ends of that."""
+    whole = int(reach + 1e-6)
+    part = reach - whole
+    found = [scipy.ndimage.maximum_filter1d(z, 2 * whole + 1, axis=axis, mode="nearest")]
+    nodes = np.arange(z.shape[axis])
+    for side in (-1, 1) if part > 1e-6 else ():
+        near, far = (np.take(z, np.clip(nodes + side * (whole + k), 0, len(nodes) - 1), axis=axis) for k in (0, 1))
+        found.append((1.0 - part) * near + part * far)
+    return found
+
+
+@dataclass(frozen=True)
+class Stand:
+    """How a vehicle stands: pose of its frame (origin between the wheels on the ground, y ahead, z up), and measures.
+
+    ``tilt`` rad, ``clearance`` m (negative: the belly strikes), ``step`` m; NaN where a wheel stands on nothing known.
+    """
+
+    T_ground_vehicle: RigidTransform
+    tilt: float
+    clearance: float
+    step: float
+
+
+def wheel_positions(vehicle: Vehicle) -> Floats:
+    """Wheels (4, 2): right and ahead of the centre, m; front left, front right, rear left, rear right."""
+    a, b = 0.5 * vehicle.track, 0.5 * vehicle.wheel_base
+    return np.array([[-a, b], [a, b], [-a, -b], [a, -b]])
+
+
+@dataclass(frozen=True)
+class Measures:
+    """How a vehicle stands at poses (n,): ``middle`` m, ``rise`` and ``lean`` (gradients ahead and to the right) of the
+    plane between its wheels, and ``tilt`` rad, ``clearance`` m, ``step`` m as of :class:`Stand`; NaN off the ground."""
+
+    middle: Floats
+    rise: Floats
+    lean: Floats
+    tilt: Floats
+    clearance: Floats
+    step: Floats
+
+
+def measured(ground: Ground, x: Floats, y: Floats, heading: Floats, vehicle: Vehicle) -> Measures:
+    """The vehicle with its centre above points (n,), m, turned by ``heading`` (n,), rad to the left of y."""
+    c, s = np.cos(heading)[:, None], np.sin(heading)[:, None]
+
+    def at(what: Floats, points: Floats) -> Floats:
+        """Values (n, m) at points (m, 2) right and ahead of the centre."""
+        right, ahead = points.T
+        there = np.stack([x[:, None] + c * right - s * ahead, y[:, None] + s * right + c * ahead], axis=-1)
+        return ground.at(what, there.reshape(-1, 2)).reshape(len(x), -1)
+
+    wheels = wheel_positions(vehicle)
+    z = at(ground.resting, wheels)
+    rise = 0.5 * (z[:, 0] + z[:, 1] - z[:, 2] - z[:, 3]) / vehicle.wheel_base
+    lean = 0.5 * (z[:, 1] + z[:, 3] - z[:, 0] - z[:, 2]) / vehicle.track
+    middle = z.mean(axis=1)
+    half = np.linspace(-0.5, 0.5, BELLY_POINTS)
+    across, along = np.meshgrid(half * (vehicle.track - 0.2 * vehicle.wheel_diameter), half * vehicle.wheel_base)
+    belly = np.stack([across.ravel(), along.ravel()], axis=1)
+    plane = middle[:, None] + lean[:, None] * belly[:, 0] + rise[:, None] * belly[:, 1]
+    free = plane + vehicle.clearance - at(ground.height, belly)
+    clearance = np.where(np.isnan(free), np.inf, free).min(axis=1)
+    clearance = np.where(np.isfinite(middle) & np.isfinite(clearance), clearance, np.nan)
+    return Measures(middle, rise, lean, np.arctan(np.hypot(lean, rise)), clearance, at(ground.step, wheels).max(axis=1))
+
+
+def stand(ground: Ground, x: float, y: float, heading: float, vehicle: Vehicle) -> Stand | None:
+    """The vehicle with its centre above (x, y), turned by ``heading`` (rad, to the left of y); None: off the ground."""
+    found = measured(ground, np.array([x]), np.array([y]), np.array([heading]), vehicle)
+    if not np.isfinite(found.middle[0]):
+        return None
+    lean, rise = float(found.lean[0]), float(found.rise[0])
+    c, s = math.cos(heading), math.sin(heading)
+    up = np.array([-lean, -rise, 1.0]) / math.sqrt(1.0 + lean * lean + rise * rise)
+    ahead = np.array([0.0, 1.0, rise]) / math.sqrt(1.0 + rise * rise)
+    right = np.cross(ahead, up)
+    level = np.stack([right, ahead, up], axis=1)
+    R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    pose = RigidTransform(R @ level, np.array([x, y, float(found.middle[0])]))
+    return Stand(pose, float(found.tilt[0]), float(found.clearance[0]), float(found.step[0]))

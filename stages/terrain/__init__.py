@@ -1,0 +1,1 @@
+"""Elevation models: the ground frame, merging, checks of overlaps, shading."""

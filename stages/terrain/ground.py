@@ -1,0 +1,258 @@
+"""Ground plane of a stereo pair, straight from the disparity, and what of it the pair can reconstruct.
+
+The inverse depth 1/Z of a plane n . X = -h (camera frame, n up, h the camera's height above it) is linear in the ray
+r = (x, y, 1): 1/Z = theta . r with theta = -n / h. And the error of 1/Z is the disparity's, the same near and far. So
+the plane is a linear fit with uniform noise ("v-disparity" and its kin, Labayrade et al. 2002,
+doi:10.1109/IVS.2002.1188024), for any rig: the inverse depth comes from the projection on the local epipolar line.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from stages.core.errors import DegenerateError
+from stages.geometry.geometry import Rig
+
+Floats = NDArray[np.float64]
+
+
+def inverse_depth(rig: Rig, pixels: Floats, disparity: Floats) -> tuple[Floats, Floats]:
+    """Inverse depth 1/Z (n,) along the left camera's axis, 1/m, and its change per pixel of disparity (n,).
+
+    With p_r ~ Z m + epipole, m = K_r R r, the offset from the epipole is linear in 1/Z; the part of the disparity
+    across the epipolar line says nothing on depth and is left out.
+    """
+    to_right = rig.right.matrix @ rig.T_right_left.rotation
+    epipole = rig.right.matrix @ rig.T_right_left.translation
+    m = rig.left.rays(pixels) @ to_right.T
+    p = pixels + disparity
+    along = p * epipole[2] - epipole[:2]
+    offset = p * m[:, 2:] - m[:, :2]
+    length2 = np.maximum((along**2).sum(-1), 1e-300)
+    return -(offset * along).sum(-1) / length2, np.abs(m[:, 2]) / np.sqrt(length2)
+
+
+@dataclass(frozen=True)
+class GroundPlane:
+    """Plane of the left camera frame: ``up`` unit normal (3,), ``height`` of the camera above it in metres.
+
+    ``inliers``: share of the points that lie on it.
+    """
+
+    up: Floats
+    height: float
+    inliers: float
+
+
+def fit_plane(
+    rays: Floats,
+    rho: Floats,
+    sigma: Floats,
+    allowed: Callable[[Floats], NDArray[np.bool_]],
+    relief: float,
+    rng: np.random.Generator,
+) -> GroundPlane:
+    """Robust ground plane: RANSAC among the allowed normals, then iteratively re-weighted least squares.
+
+    Parameters
+    ----------
+    rays : (n, 3) with z = 1, left camera frame.
+    rho, sigma : (n,) inverse depth and its error, 1/m.
+    allowed : which of the normals (m, 3) pointing up may be the ground's.
+    relief : deviation from the plane that still counts as ground, as a share of the camera's height.
+    rng : generator of the samples.
+
+    Raises
+    ------
+    DegenerateError
+        No allowed plane holds a twentieth of the points.
+    """
+    if rays.shape[0] < MIN_POINTS:
+        raise DegenerateError(
+            "RIL-342",
+            f"only {rays.shape[0]} sampled pixels are matched: left and right have no texture in common",
+            remedy="check exposure and focus, and that left and right show one scene; or lower hfvm.texture",
+        )
+    # dh of height changes 1/Z by the share dh/h.
+    tolerance = np.sqrt((2.0 * sigma) ** 2 + (relief * rho) ** 2)
+    theta = _consensus(rays, rho, sigma, tolerance, allowed, rng)
+    if theta is not None:
+        information = tolerance**-2.0
+        for _ in range(20):
+            weight = np.maximum(0.0, 1.0 - 0.25 * (rho - rays @ theta) ** 2 * information) ** 2 * information
+            weighted = rays * weight[:, None]
+            last, theta = theta, np.asarray(np.linalg.solve(weighted.T @ rays, weighted.T @ rho), dtype=np.float64)
+            if np.abs(theta - last).max() <= SETTLED * np.abs(theta).max():
+                break
+        share = float(np.mean(_score(theta[None], rays, rho, sigma, tolerance) > 0))
+        length = float(np.linalg.norm(theta))
+        if share >= MIN_SHARE and bool(allowed(-theta[None] / length)[0]):
+            return GroundPlane(-theta / length, 1.0 / length, share)
+    raise DegenerateError(
+        "RIL-343",
+        "the disparity shows no ground plane below the camera",
+        remedy="give the rig's pitch or an attitude, or check left/right order and the rig's calibration",
+    )
+
+
+MIN_POINTS = 100
+SETTLED = 1e-9  # share of the plane's parameters: of a height of metres, nanometres
+MIN_SHARE = 0.05
+SCORED = 1200  # points, about, that planes are compared on: the best one is then fitted to all
+HYPOTHESES = 1000  # an all-ground sample of three is among them (p > .999) where a fifth of the pixels are ground
+
+
+def _score(theta: Floats, rays: Floats, rho: Floats, sigma: Floats, tolerance: Floats) -> Floats:
+    """Truncated quadratic agreement (m, n) of planes (m, 3); the horizon agrees with any: not counted."""
+    expected = theta @ rays.T
+    return np.where(expected > 5.0 * sigma, np.maximum(0.0, 1.0 - ((rho - expected) / tolerance) ** 2), 0.0)
+
+
+def _consensus(
+    rays: Floats,
+    rho: Floats,
+    sigma: Floats,
+    tolerance: Floats,
+    allowed: Callable[[Floats], NDArray[np.bool_]],
+    rng: np.random.Generator,
+) -> Floats | None:
+    """The allowed plane of most agreement among planes through three points; None: none is allowed."""
+    triples = rng.integers(0, rays.shape[0], size=(HYPOTHESES, 3))
+    volume = np.abs(np.linalg.det(rays[triples]))
+    triples = triples[volume > 1e-3 * np.ptp(rays[:, 0]) * np.ptp(rays[:, 1])]
+    if not len(triples):
+        return None
+    theta = np.linalg.solve(rays[triples], rho[triples][..., None])[..., 0]
+    length = np.maximum(np.linalg.norm(theta, axis=1, keepdims=True), 1e-300)
+    theta = theta[allowed(-theta / length)]
+    if not len(theta):
+        return None
+    totals, some = np.empty(len(theta)), slice(None, None, max(1, len(rays) // SCORED))
+    _totals(theta, rays[some], rho[some], 5.0 * sigma[some], tolerance[some] ** -2.0, totals)
+    return np.asarray(theta[int(np.argmax(totals))], dtype=np.float64)
+
+
+@njit(cache=True, nogil=True)
+def _totals(theta, rays, rho, horizon, information, out):  # type: ignore[no-untyped-def]
+    """Sums (m,) of :func:`_score` over the points."""
+    for m in range(len(theta)):
+        a, b, c = theta[m]
+        total = 0.0
+        for n in range(len(rays)):
+            expected = a * rays[n, 0] + b * rays[n, 1] + c * rays[n, 2]
+            off = rho[n] - expected
+            agreement = 1.0 - off * off * information[n]
+            if expected > horizon[n] and agreement > 0.0:
+                total += agreement
+        out[m] = total
+
+
+@dataclass(frozen=True)
+class GroundView:
+    """How the pair sees a plane: sampled pixels that hit it where both cameras see it.
+
+    ``xy`` (n, 2) metres, local frame; ``slant`` (n,) distance from the left camera, m; ``along``, ``across`` (n,)
+    size on the ground of one pixel, m per pixel; ``slope`` (n,) ds/dZ, pixels of disparity per metre of elevation.
+    """
+
+    xy: Floats
+    slant: Floats
+    along: Floats
+    across: Floats
+    slope: Floats
+
+    def cell_size(self) -> float:
+        """Pixel footprint (geometric mean of both directions) at twice the nearest distance, to 1, 2 or 5."""
+        near = self.slant <= 2.0 * self.slant.min()
+        return rounded_cell(float(np.sqrt(self.along * self.across)[near].max()))
+
+    def footprint(self, cell: float, max_cells: float, sigma_d: float, max_sigma: float) -> list[float]:
+        """Extent x_min, x_max, y_min, y_max, metres, of the ground that is seen well enough.
+
+        ``max_cells``: a pixel may cover so many cells along the range; ``max_sigma``: error of elevation, m, at
+        ``sigma_d`` pixels of disparity.
+        """
+        good = (self.along <= max_cells * cell) & (sigma_d <= max_sigma * self.slope)
+        if np.count_nonzero(good) < 3:
+            raise DegenerateError(
+                "RIL-344",
+                f"no ground is seen well enough for cells of {cell:g} m",
+                remedy="set locus.cell_size to a larger cell",
+            )
+        low, high = self.xy[good].min(axis=0), self.xy[good].max(axis=0)
+        return [float(low[0]), float(high[0]), float(low[1]), float(high[1])]
+
+
+def rounded_cell(size: float) -> float:
+    """The cell size of 1, 2 or 5 times a power of ten, m, that is nearest to ``size``."""
+    first = math.floor(math.log10(size))
+    return min((m * 10.0**e for e in (first, first + 1) for m in _125), key=lambda step: abs(math.log(step / size)))
+
+
+_125 = (1.0, 2.0, 5.0)
+
+
+def view_ground(rig: Rig, R_local_left: Floats, plane: Sequence[float]) -> GroundView:
+    """How the pair sees the plane z = c + a x + b y (``plane`` = a, b, c) of the local frame.
+
+    Raises
+    ------
+    DegenerateError
+        No pixel of the left camera sees the plane where the right one does, too.
+    """
+    cam = rig.left
+    cols, rows = np.linspace(1, cam.width - 2, 48), np.linspace(1, cam.height - 2, 256)
+    pixels = np.stack(np.meshgrid(cols, rows), axis=-1).reshape(-1, 2)
+    here = _meet(rig, R_local_left, plane, pixels)
+    right = rig.right.project(rig.T_right_left.apply(here @ R_local_left))
+    with np.errstate(invalid="ignore"):
+        both = ((right >= 0) & (right <= [rig.right.width - 1, rig.right.height - 1])).all(-1)
+    pixels, here = pixels[both], here[both]
+    steps = [_meet(rig, R_local_left, plane, pixels + step) - here for step in ([0.5, 0.0], [0.0, 0.5])]
+    jacobian = 2.0 * np.stack(steps, axis=-1)[:, :2]
+    slope = _elevation_slope(rig, R_local_left, plane, here)
+    good = np.isfinite(jacobian).all((1, 2)) & (slope > 0)
+    if not good.any():
+        raise DegenerateError(
+            "RIL-345",
+            "the two cameras see no common ground",
+            remedy="check the pitch, the left/right order and T_right_left",
+        )
+    size = _singular_values(jacobian[good])
+    return GroundView(here[good, :2], _length(here[good]), size[:, 0], size[:, 1], slope[good])
+
+
+def _singular_values(m: Floats) -> Floats:
+    """Singular values (n, 2), the greater first, of matrices (n, 2, 2)."""
+    a, b, c, d = m[:, 0, 0], m[:, 0, 1], m[:, 1, 0], m[:, 1, 1]
+    plus, minus = np.hypot(a + d, c - b), np.hypot(a - d, c + b)
+    return np.asarray(0.5 * np.stack([plus + minus, np.abs(plus - minus)], -1), dtype=np.float64)
+
+
+def _meet(rig: Rig, R_local_left: Floats, plane: Sequence[float], pixels: Floats) -> Floats:
+    """Points (n, 3) of the local frame where the rays of left pixels meet the plane; NaN where they do not."""
+    a, b, c = plane
+    v = rig.left.rays(pixels) @ R_local_left.T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        distance = c / (v[:, 2] - a * v[:, 0] - b * v[:, 1])
+    return np.where(distance > 0, distance, np.nan)[:, None] * v
+
+
+def _elevation_slope(rig: Rig, R_local_left: Floats, plane: Sequence[float], points: Floats) -> Floats:
+    """ds/dZ (n,) on the plane, pixels per metre: mismatch of a point lifted by a ten-thousandth of the distance."""
+    lift = 1e-4 * _length(points)
+    lifted = points + lift[:, None] * np.array([0.0, 0.0, 1.0])
+    behind = _meet(rig, R_local_left, plane, rig.left.project(lifted @ R_local_left))
+    seen = rig.right.project(rig.T_right_left.apply(behind @ R_local_left))
+    own = rig.right.project(rig.T_right_left.apply(lifted @ R_local_left))
+    return _length(seen - own) / lift
+
+
+def _length(vectors: Floats) -> Floats:
+    return np.asarray(np.linalg.norm(vectors, axis=-1), dtype=np.float64)

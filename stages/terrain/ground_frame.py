@@ -1,0 +1,292 @@
+"""Vertical and ground of one basic pair: the levelled local frame, without any pose of another frame.
+
+The local frame of a basic pair has its origin at the left camera's centre, z up, y along the horizontal projection of
+the optical axis (paper, sections 3.2 and 4.7: the local path is planned heading-aligned). Where "up" is comes from the
+best source at hand: a measured attitude, the given initial pose, the rig's stated pitch, else the ground plane that the
+disparity shows. The ground plane is fitted in any case: it gives the range of elevations that Locus searches.
+
+A trajectory needs neither. Where no ground is seen, no elevation model can be made (unless ``reference_height`` states
+a surface); where nothing tells of the vertical either, the local frame is that of the camera: its own up is z.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import Field
+
+from stages.core.declare import Bundle, Inputs, Params, Stage
+from stages.core.errors import DegenerateError, InputError
+from stages.core.validity import matched
+from stages.geometry.epipolar import exchanged, fits
+from stages.geometry.geometry import Rig, RigidTransform, level_rotation
+from stages.geometry.pose_arrays import NO_VERTICAL
+from stages.terrain.ground import MIN_POINTS, GroundPlane, fit_plane, inverse_depth, rounded_cell, view_ground
+
+Floats = NDArray[np.float64]
+Samples = tuple[Floats, Floats, Floats]
+"""Rays (n, 3) with z = 1 of the left camera, inverse depths (n,) and their standard deviations, 1/m."""
+
+DEFAULT_RANGE_CELLS = 6.0  # of the footprint in meta; the stage locus has its own parameter
+SAMPLES = 5000  # matched pixels that the plane is fitted to: three parameters need no more
+
+MARGIN = 0.05  # share of the camera's height that the range of elevations is widened by: a low rock, a kerb
+
+
+BEYOND = 3.0  # standard deviations that a match lies beyond infinity, which no noise explains
+NEAR = 2.0  # pixels: distance to its epipolar line at which a match fits a rig
+NEAREST = 0.05  # share of the matches that may be nearer than what counts as nearest: gross mismatches
+UNSEEN = 20.0  # baselines; distance that stands for what is not seen at all
+
+SWAPPED = 0.5  # share of such matches: nearly all where left and right are swapped
+
+
+class LevelParams(Params):
+    """Parameters of the stage ``level``."""
+
+    max_tilt_deg: float = Field(
+        30.0, gt=0, lt=90, description="degrees; greatest slope of the ground, and greatest roll of an unlevelled rig"
+    )
+    min_pitch_deg: float = Field(
+        -20.0, gt=-90, lt=90, description="degrees; least downward pitch of a rig without attitude (bumps, hills)"
+    )
+    max_pitch_deg: float = Field(
+        75.0, gt=-90, lt=90, description="degrees; greatest downward pitch of a rig without attitude: nearly nadir"
+    )
+    relief: float = Field(
+        0.02,
+        gt=0,
+        lt=1,
+        description="share of the camera's height; terrain this close to the plane counts as ground (less than a kerb: "
+        "road and pavement must not make one tilted plane)",
+    )
+    ceiling: float = Field(
+        1.0,
+        ge=0,
+        description="camera heights above the camera; elevations are not searched higher (no surface is seen from above"
+        " there, only walls and crowns)",
+    )
+    reference_height: float | None = Field(
+        None,
+        gt=0,
+        description="m; where no ground is seen, elevations are searched about a horizontal plane so far below the"
+        " camera; none: there is no elevation model",
+    )
+    sigma_disparity: float = Field(0.2, gt=0, description="pixels; error of a disparity after sub-pixel refinement")
+    seed: int = Field(1999, ge=0, description="seed of the ground plane's samples; any")
+
+
+def level(
+    column_disparity: ArrayLike,
+    row_disparity: ArrayLike,
+    usable: NDArray[np.bool_],
+    rig: Rig,
+    params: LevelParams,
+    *,
+    up: ArrayLike | None = None,
+    initial_up: ArrayLike | None = None,
+    pitch: float | None = None,
+) -> dict[str, Any]:
+    """Local frame and ground of one pair.
+
+    Parameters
+    ----------
+    column_disparity, row_disparity : (rows, cols) right minus left, pixels, of the left image.
+    usable : (rows, cols) pixels with a measured disparity.
+    up, initial_up : (3,) direction of up in the left camera frame, from an attitude and from an initial pose.
+    pitch : downward pitch of the optical axis, radians, roll 0. The first given of the three is used.
+
+    Returns
+    -------
+    dict
+        ``T_local_left`` (12 numbers), ``source`` of the vertical (``none``: unknown, z is the camera's own up);
+        ``ground_height`` z of the ground below the camera (m, negative); ``plane`` (a, b, c) of z = c + a x + b y;
+        ``tilt`` of the ground (rad); ``relief`` lowest and highest terrain against the plane (m); ``z_range`` (m);
+        ``cell_size`` (m) that suits the rig; ``footprint`` x_min, x_max, y_min, y_max (m) for it; ``ground_share`` of
+        the sampled pixels. All in the local frame. Where no ground is seen, ``no_ground`` says why, and what would
+        tell of it is None, but for ``cell_size``.
+
+    Raises
+    ------
+    DegenerateError
+        Left and right seem swapped, or the rig has no baseline.
+    """
+    rays, rho, sigma = _samples(np.asarray(column_disparity), np.asarray(row_disparity), usable, rig, params)
+    vertical, source = _given_vertical(up, initial_up, pitch)
+    samples = rays, rho, sigma
+    try:
+        ground = _fitted(samples, vertical, params)
+        R_local_left = level_rotation(ground.up if vertical is None else vertical)
+        return {"source": source or "ground plane"} | _on_ground(ground, R_local_left, samples, rig, params)
+    except DegenerateError as error:
+        why = error
+    up_known = np.array([0.0, -1.0, 0.0]) if vertical is None else vertical
+    facts, R_local_left = {"source": source or NO_VERTICAL}, level_rotation(up_known)
+    try:
+        if params.reference_height is not None:
+            ground = GroundPlane(up_known, params.reference_height, 0.0)
+            return facts | _on_ground(ground, R_local_left, samples, rig, params)
+    except DegenerateError as error:
+        why = error
+    nothing = dict.fromkeys(("ground_height", "plane", "tilt", "relief", "z_range", "footprint"))
+    cell, T_local_left = _cell_without_ground(rho[rho > BEYOND * sigma], rig), RigidTransform(R_local_left, np.zeros(3))
+    return (
+        facts
+        | nothing
+        | {"T_local_left": T_local_left.to_list(), "cell_size": cell, "ground_share": 0.0, "no_ground": str(why)}
+    )
+
+
+def _fitted(samples: Samples, vertical: Floats | None, params: LevelParams) -> GroundPlane:
+    """The ground plane that the samples show, under the limits of tilt."""
+    rng = np.random.default_rng(params.seed)
+    return fit_plane(*samples, lambda n: _allowed(n, vertical, params), params.relief, rng)
+
+
+def _on_ground(
+    ground: GroundPlane, R_local_left: Floats, samples: Samples, rig: Rig, params: LevelParams
+) -> dict[str, Any]:
+    """What :func:`level` says of a pair whose ground plane is known."""
+    rays, rho, _ = samples
+    plane = _local_plane(ground, R_local_left)
+    view = view_ground(rig, R_local_left, plane)
+    cell = view.cell_size()
+    footprint = view.footprint(cell, DEFAULT_RANGE_CELLS, params.sigma_disparity, cell)
+    points = (rays / np.maximum(rho, 1e-12)[:, None]) @ R_local_left.T
+    relief = _relief(points[rho > 0], plane, footprint, ground.height, params)
+    return {
+        "T_local_left": RigidTransform(R_local_left, np.zeros(3)).to_list(),
+        "ground_height": plane[2],
+        "plane": plane,
+        "tilt": math.atan(math.hypot(plane[0], plane[1])),
+        "relief": relief,
+        "z_range": z_range(plane, relief, footprint),
+        "cell_size": cell,
+        "footprint": footprint,
+        "ground_share": ground.inliers,
+    }
+
+
+def _cell_without_ground(rho: Floats, rig: Rig) -> float:
+    """Cell size, m, by what is seen instead, inverse depths ``rho`` (n,): a pixel at twice the nearest distance."""
+    near = 1.0 / float(np.quantile(rho, 1.0 - NEAREST)) if rho.size else UNSEEN * rig.baseline
+    return rounded_cell(2.0 * near / rig.left.fx)
+
+
+def z_range(plane: list[float], relief: list[float], extent: list[float]) -> list[float]:
+    """Lowest and highest elevation, m, of a plane with relief over an extent x_min, x_max, y_min, y_max."""
+    corners = [plane[2] + plane[0] * x + plane[1] * y for x in extent[:2] for y in extent[2:]]
+    return [min(corners) + relief[0], max(corners) + relief[1]]
+
+
+def _samples(
+    column: NDArray[Any], row: NDArray[Any], usable: NDArray[np.bool_], rig: Rig, params: LevelParams
+) -> Samples:
+    """Rays, inverse depths and their errors at a regular sparse grid of usable pixels."""
+    expected = (rig.left.height, rig.left.width)
+    if column.shape != expected:
+        raise InputError("RIL-376", f"the disparity is {column.shape}, the left camera's image {expected}")
+    if not rig.baseline > 0:
+        raise DegenerateError(
+            "RIL-377", "the rig's baseline is 0 m", remedy="give T_right_left with a translation in metres"
+        )
+    step = max(1, int(math.sqrt(column.size / (2 * SAMPLES))))
+    r, c = np.nonzero(usable[::step, ::step])
+    r, c = r * step, c * step
+    pixels = np.stack([c, r], axis=-1).astype(np.float64)
+    disparity = np.stack([column[r, c], row[r, c]], axis=-1).astype(np.float64)
+    rho, per_pixel = inverse_depth(rig, pixels, disparity)
+    sigma = per_pixel * params.sigma_disparity
+    if len(pixels) >= MIN_POINTS:
+        _refuse_swapped(rig, pixels, pixels + disparity, float(np.mean(rho < -BEYOND * sigma)))
+    return rig.left.rays(pixels), rho, sigma
+
+
+def _refuse_swapped(rig: Rig, left: Floats, right: Floats, beyond: float) -> None:
+    """Parallel cameras see everything ``beyond`` infinity (share) with their sides exchanged, others on wrong lines."""
+    remedy = "check left/right order, they seem swapped, and the sign of the baseline"
+    if beyond > SWAPPED:
+        raise DegenerateError("RIL-375", f"{beyond:.0%} of the matches lie beyond infinity", remedy=remedy)
+    as_given, other_way = fits(rig, left, right, NEAR), fits(rig, right, left, NEAR)
+    if exchanged(as_given, other_way):
+        raise DegenerateError(
+            "RIL-781",
+            f"{other_way:.0%} of the matches fit the rig with its sides exchanged, {as_given:.0%} as given",
+            remedy=remedy,
+        )
+
+
+def _given_vertical(
+    up: ArrayLike | None, initial_up: ArrayLike | None, pitch: float | None
+) -> tuple[Floats | None, str]:
+    for value, source in ((up, "attitude"), (initial_up, "initial pose")):
+        if value is not None:
+            v = np.asarray(value, dtype=np.float64)
+            length = float(np.linalg.norm(v))
+            if v.shape != (3,) or not math.isfinite(length) or length == 0.0:
+                raise InputError(
+                    "RIL-378", f"the {source}'s direction of up {value} is no direction", remedy="give three numbers"
+                )
+            return v / length, source
+    if pitch is not None:
+        return np.array([0.0, -math.cos(pitch), -math.sin(pitch)]), "pitch"
+    return None, ""
+
+
+def _allowed(normals: Floats, vertical: Floats | None, params: LevelParams) -> NDArray[np.bool_]:
+    """Which normals may be the ground's: near the known vertical, else within the limits of roll and pitch."""
+    tilt = math.radians(params.max_tilt_deg)
+    if vertical is not None:
+        return np.asarray(normals @ vertical >= math.cos(tilt))
+    pitch = np.degrees(np.arctan2(-normals[:, 2], -normals[:, 1]))
+    level_enough = np.abs(normals[:, 0]) <= math.sin(tilt)
+    return np.asarray(level_enough & (pitch >= params.min_pitch_deg) & (pitch <= params.max_pitch_deg))
+
+
+def _local_plane(ground: GroundPlane, R_local_left: Floats) -> list[float]:
+    n = R_local_left @ ground.up
+    return [float(-n[0] / n[2]), float(-n[1] / n[2]), float(-ground.height / n[2])]
+
+
+def _relief(points: Floats, plane: list[float], extent: list[float], height: float, params: LevelParams) -> list[float]:
+    """Robust lowest and highest terrain against the plane within the extent, metres, widened by a tenth."""
+    x, y, z = points.T
+    inside = (x >= extent[0]) & (x <= extent[1]) & (y >= extent[2]) & (y <= extent[3])
+    above = z - (plane[2] + plane[0] * x + plane[1] * y)
+    low, high = -MARGIN * height, MARGIN * height
+    if np.count_nonzero(inside) >= 20:
+        q = np.quantile(above[inside], [0.005, 0.995])
+        low, high = min(low, float(q[0])), max(high, float(q[1]))
+    margin = 0.1 * (high - low) + MARGIN * height
+    # Below, nothing is known that deep but mismatches; above, walls and crowns.
+    return [max(low - margin, -height), min(high + margin, (1.0 + params.ceiling) * height)]
+
+
+def _run(params: LevelParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+    disparity = inputs["disparity"]
+    facts = level(
+        disparity["column_disparity"],
+        disparity["row_disparity"],
+        matched(np.asarray(disparity["validity"])),
+        Rig.from_dict(inputs["rig"].meta["rig"]),
+        params,
+        up=args.get("up"),
+        initial_up=args.get("initial_up"),
+        pitch=args.get("pitch"),
+    )
+    return Bundle({}, facts)
+
+
+STAGE = Stage(
+    name="level",
+    version=1,
+    summary="vertical and ground plane of a basic pair",
+    params=LevelParams,
+    inputs=("disparity", "rig"),
+    outputs=(),
+    run=_run,
+)

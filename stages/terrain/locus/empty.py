@@ -1,0 +1,77 @@
+"""Why Locus found no cell at all: a surface behind the camera asks for another change than bad matches do."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.core.errors import DegenerateError
+from stages.geometry.geometry import Camera, Rig, RigidTransform
+from stages.geometry.surface import Surface
+
+SAMPLES = 64
+"""Cells along either side of the surface, and elevations, that are looked at."""
+
+
+FEW = 400
+"""Cells of a surface, 20 x 20, below which their size is the likely reason."""
+
+
+def explain(
+    rig: Rig, T_surface_left: RigidTransform, surface: Surface, z_range: tuple[float, float], usable: NDArray[np.bool_]
+) -> DegenerateError:
+    """The error to raise for an elevation model without any cell.
+
+    Parameters
+    ----------
+    rig, T_surface_left, surface, z_range, usable : as Locus got them.
+    """
+    pick = [np.unique(np.linspace(0, n - 1, SAMPLES).astype(np.intp)) for n in (surface.rows, surface.cols)]
+    feet, normals = surface.block(*pick)
+    z = np.linspace(*z_range, 9)[:, None, None, None]
+    points = T_surface_left.inverse().apply(feet + z * normals)
+    depth = points[..., 2]
+    if not (depth > 0).any():
+        return DegenerateError(
+            "RIL-387",
+            f"the reference surface lies behind the left camera: {depth.min():.3g} to {depth.max():.3g} m along its "
+            "optical axis",
+            remedy="check locus.extent (y is ahead), the vertical (world.up, world.pitch_deg), or T_surface_left",
+        )
+    seen = [_inside(camera, p) for camera, p in ((rig.left, points), (rig.right, rig.T_right_left.apply(points)))]
+    if not (seen[0] & seen[1]).any():
+        left, right = (100.0 * float(s.any(axis=0).mean()) for s in seen)
+        return DegenerateError(
+            "RIL-388",
+            f"the cameras look away from the reference surface: the left one sees {left:.0f} %, the right one "
+            f"{right:.0f} % of its cells, and no cell is seen by both",
+            remedy="check locus.extent, the vertical, the left/right order and T_right_left",
+        )
+    count = int(usable.sum())
+    if not count:
+        return DegenerateError(
+            "RIL-389",
+            f"none of {usable.size} disparities is valid, so no elevation can be found",
+            remedy="look at the disparity's validity: exposure, focus, left/right order; or raise locus.max_backmatch",
+        )
+    cells = surface.rows * surface.cols
+    if cells < FEW:
+        return DegenerateError(
+            "RIL-390",
+            f"no cell could be reconstructed, and there are {cells} only ({surface.rows} x {surface.cols}): they are "
+            "too coarse for what the cameras see",
+            remedy="lower locus.cell_size, or leave it out: then it follows from the rig",
+        )
+    return DegenerateError(
+        "RIL-391",
+        f"no cell could be reconstructed from {count} valid disparities of {usable.size}: they contradict the "
+        f"calibration, or lie outside of {z_range[0]:.4g} to {z_range[1]:.4g} m of elevation",
+        remedy="look at the rig's residuals in the report; or raise locus.max_residual or locus.max_sigma",
+    )
+
+
+def _inside(camera: Camera, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Which points (..., 3) of a camera's frame lie in its image."""
+    pixels = camera.project(points)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(((pixels >= 0) & (pixels <= [camera.width - 1, camera.height - 1])).all(axis=-1))

@@ -1,0 +1,219 @@
+"""Kernel of Locus reconstruction (paper, section 4.4): cells straight from the disparity.
+
+For a cell with foot F and normal N let P(Z) = F + Z N, p_l and p_r its projections and d the disparity vector. The
+paper minimises |g(Z)|, g = p_l(Z) + d(p_l(Z)) - p_r(Z). Here the *sign change* of s(Z) = g(Z) . e is solved, e being
+the direction at p_r in which a point moves when it recedes along the left camera's ray (the local epipolar line): the
+same solution with a tenth of the evaluations, and more exact, because a minimum is flat and a sign change is not.
+
+s > 0: the surface that the left camera sees behind P is farther than P, so P is in free space; s < 0: P is behind the
+surface. A terrain surface is a change from free (above) to behind (below) along the normal. Where the change happens
+across a depth jump between two pixels nothing was seen: the cell is occluded there.
+
+A few dozen cells are followed side by side, each in its own *lane*: their lines are divided into steps
+(:mod:`stages.terrain.locus.lines`), steps are looked at several at once (:mod:`stages.terrain.locus.points`) until s
+changes its sign, and the roots of all the changes found are solved together (:mod:`stages.terrain.locus.roots`). A
+lane whose root does not stand goes on from there.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from stages.terrain.locus.lines import BOTTOM, COUNT, DZ, FOOT, HIGH, LAST, LOW, NORMAL, START, TOP, clip, lines, spans
+from stages.terrain.locus.lines import PLANES as LINE_PLANES
+from stages.terrain.locus.points import LANES, POINT_PLANES, POINTS, STEPS, S, climb, meet, pixels
+from stages.terrain.locus.roots import PLANES as ROOT_PLANES
+from stages.terrain.locus.roots import accept, gather, roots, slopes
+
+Floats = NDArray[np.float64]
+Float32 = NDArray[np.float32]
+
+WAY, PLACE, LEVEL, FIRST, BRACKET = (k * LANES for k in range(LINE_PLANES, LINE_PLANES + 5))
+"""Planes of the search: -1 downwards, 1 upwards, 0 not begun; the step looked at last, and s there; s at the start; the
+bracket found (upper end, s there, lower end, s there)."""
+PLANES = LINE_PLANES + 8
+DONE, MORE, FOUND = 0, 1, 2
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def search(
+    feet: Floats,
+    normals: Floats,
+    low: Floats,
+    high: Floats,
+    z_min: float,
+    z_max: float,
+    left: Floats,
+    right: Floats,
+    epipole: Floats,
+    sizes: Floats,
+    disparity: Float32,
+    std: Floats,
+    image: Float32,
+    limits: Floats,
+    out: Floats,
+) -> None:
+    """Solve every cell of a block.
+
+    Parameters
+    ----------
+    feet, normals : (r, c, 3) metres, frame of the surface.
+    low, high : (r, c) interval of Z in which the search starts, metres; NaN: the cell is left out. The search may leave
+        it: upwards while the point is behind the surface, downwards while it is free.
+    z_min, z_max : limits of Z.
+    left, right : (3, 4) projections from the frame of the surface to pixels.
+    epipole : (3,) homogeneous projection of the left camera's centre into the right image.
+    sizes : (4,) width and height of the left, then of the right image.
+    disparity : (2 rows cols,) column and row disparity (right minus left) of each pixel of the left image in turn,
+        pixels, NaN where it must not be used.
+    std : (rows, cols) standard deviation of the disparities, pixels.
+    image : (rows, cols) grey values of the left image.
+    limits : (2,) greatest residual and greatest jump in the bilinear cell, pixels.
+    out : (r, c, 4) elevation (m), its standard deviation (m), residual (px) and grey value of the highest change from
+        free to behind that stands; to be filled with NaN before.
+    """
+    lanes, solved, room = np.zeros(PLANES * LANES), np.zeros(ROOT_PLANES * LANES), np.zeros(POINT_PLANES * POINTS)
+    active, found, cells = np.empty(LANES, np.int64), np.empty(LANES, np.int64), np.empty(LANES, np.int64)
+    foot, normal, rows = feet.reshape(-1, 3), normals.reshape(-1, 3), out.reshape(-1, 4)
+    lowest, highest = low.ravel(), high.ravel()
+    n, last = 0, low.size - 1
+    for i in range(low.size):
+        if not math.isnan(lowest[i]):
+            cells[n], lanes[LOW + n], lanes[HIGH + n] = i, lowest[i], highest[i]
+            for k in range(3):
+                lanes[FOOT + k * LANES + n], lanes[NORMAL + k * LANES + n] = foot[i, k], normal[i, k]
+            n += 1
+        if n == LANES or (n > 0 and i == last):
+            lines(n, left, right, lanes)
+            clip(n, sizes, z_min, z_max, lanes)
+            spans(n, lanes)
+            _solve(n, cells, active, found, lanes, solved, room, epipole, disparity, std, image, limits, rows)
+            n = 0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _solve(n, cells, active, found, lanes, solved, room, epipole, disparity, std, image, limits, out):  # type: ignore[no-untyped-def]
+    """Follow ``n`` lanes to the end; ``active``, ``found``, ``solved`` and ``room`` are room to work in."""
+    height, width = image.shape
+    count = 0
+    for m in range(n):
+        lanes[WAY + m], lanes[PLACE + m] = 0.0, lanes[START + m] + 1.0
+        if lanes[TOP + m] > lanes[BOTTOM + m]:
+            active[count] = m
+            count += 1
+    while count:
+        hits = 0
+        while count:
+            _look(active, count, lanes, width, height, room)
+            meet(STEPS * count, epipole, width, disparity, room)
+            count, hits = _scan(active, count, found, hits, lanes, room)
+        gather(found, hits, lanes, DZ, BRACKET, solved)
+        roots(hits, solved, epipole, width, height, disparity, room)
+        slopes(hits, solved, epipole, width, height, disparity, room)
+        refused = accept(hits, found, cells, solved, room, disparity, image, std, limits, out, active)
+        for t in range(refused):
+            if lanes[PLACE + active[t]] > 0.0:
+                active[count] = active[t]
+                count += 1
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _look(active, count, lanes, width, height, room):  # type: ignore[no-untyped-def]
+    """Project the next steps of the active lanes."""
+    for t in range(count):
+        m = active[t]
+        way = 1.0 if lanes[WAY + m] > 0.0 else -1.0
+        climb(
+            lanes, m, lanes[BOTTOM + m], lanes[PLACE + m] + way, way, lanes[DZ + m], width, height, room[STEPS * t :]
+        )  # fmt: skip
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _scan(active, count, found, hits, lanes, room):  # type: ignore[no-untyped-def]
+    """Follow s over the steps looked at: lanes that go on stay active, those with a bracket are added to ``found``."""
+    keep = 0
+    for t in range(count):
+        m, first = active[t], STEPS * t
+        fresh = lanes[WAY + m] == 0.0
+        if lanes[WAY + m] > 0.0:
+            outcome = _upwards(lanes, m, room, first)
+        elif fresh and _begin(lanes, m, room, first):
+            outcome = MORE
+        else:
+            outcome = _downwards(lanes, m, room, first, 1 if fresh else 0)
+        if outcome == MORE:
+            active[keep] = m
+            keep += 1
+        elif outcome == FOUND:
+            found[hits] = m
+            hits += 1
+    return keep, hits
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _begin(lanes, m, room, k):  # type: ignore[no-untyped-def]
+    """Take s at the start from point ``k``; whether the search begins upwards, because the point is behind."""
+    lanes[FIRST + m] = lanes[LEVEL + m] = pixels(room, S, k)
+    lanes[PLACE + m] = lanes[START + m]
+    upwards = (lanes[LEVEL + m] < 0.0) & (lanes[START + m] < lanes[COUNT + m])
+    lanes[WAY + m] = 1.0 if upwards else -1.0
+    return upwards
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _downwards(lanes, m, room, first, begin):  # type: ignore[no-untyped-def]
+    """Go down from free to behind, beyond the last step only while free."""
+    place, last, above, outcome = lanes[PLACE + m], lanes[LAST + m], lanes[LEVEL + m], MORE
+    for i in range(begin, STEPS):
+        place -= 1.0
+        s = room[S + first + i]
+        if place < 0.0:
+            outcome = DONE
+            break
+        if above >= 0.0 and s < 0.0:
+            upper = pixels(room, S, first + i - 1) if i else lanes[LEVEL + m]
+            lanes[LEVEL + m] = pixels(room, S, first + i)
+            _bracket(lanes, m, place + 1.0, upper, lanes[LEVEL + m])
+            lanes[PLACE + m] = place if place > last else 0.0
+            outcome = FOUND
+            break
+        if place <= last and not s >= 0.0:
+            outcome = DONE
+            break
+        above = s
+    if outcome == MORE:
+        lanes[PLACE + m], lanes[LEVEL + m] = place, pixels(room, S, first + STEPS - 1)
+    return outcome
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _upwards(lanes, m, room, first):  # type: ignore[no-untyped-def]
+    """Go up while behind; what comes after that, or after a bracket, is the way down from the start."""
+    place, outcome, turned = lanes[PLACE + m], MORE, False
+    for i in range(STEPS):
+        place += 1.0
+        s = room[S + first + i]
+        turned = place > lanes[COUNT + m] or not s < 0.0
+        if turned:
+            if place <= lanes[COUNT + m] and s >= 0.0:
+                below = pixels(room, S, first + i - 1) if i else lanes[LEVEL + m]
+                _bracket(lanes, m, place, pixels(room, S, first + i), below)
+                outcome = FOUND
+            break
+    if turned:
+        lanes[WAY + m], lanes[PLACE + m], lanes[LEVEL + m] = -1.0, lanes[START + m], lanes[FIRST + m]
+    else:
+        lanes[PLACE + m], lanes[LEVEL + m] = place, pixels(room, S, first + STEPS - 1)
+    return outcome
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _bracket(lanes, m, step, upper, lower):  # type: ignore[no-untyped-def]
+    """The step below ``step``, with s at both ends."""
+    lanes[BRACKET + m], lanes[BRACKET + LANES + m] = lanes[BOTTOM + m] + step * lanes[DZ + m], upper
+    z = lanes[BOTTOM + m] + (step - 1.0) * lanes[DZ + m]
+    lanes[BRACKET + 2 * LANES + m], lanes[BRACKET + 3 * LANES + m] = z, lower

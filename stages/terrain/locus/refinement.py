@@ -1,0 +1,196 @@
+"""Elevations refined where they belong: on the surface, by what both images show of it.
+
+Locus reads each cell from the disparity around one pixel. Here the elevations Z of all solved cells minimise together
+
+    sum a w (L(p_l) - R(p_r) - m)^2  +  stiffness sum s |second difference of Z|^2
+
+with p_l and p_r the cell's projections, m the local mean of the difference, a the share of a pixel that the cell is
+(a cell smaller than a pixel brings no more than that), w falling with the difference and s with the second difference
+found, so that neither a wrong cell nor an edge drags its neighbours along. It is object-space matching (Helava 1988;
+Wrobel 1987, facets stereo vision): no image is the master, the geometry is the calibrated one, and smoothness is that
+of the terrain and not of its perspective picture. A fixed number of Gauss-Newton steps, each solved by a fixed number
+of Gauss-Seidel sweeps in reading order.
+
+What remains says how far each cell may be trusted. With sigma_d / |ds/dZ| the standard deviation that the disparity
+brings, b the second difference of Z in 7 x 7 cells, t the step of Z from cell to cell there (both RMS) and r the
+correlation of both images' ortho gradients in 5 x 5 cells,
+
+    sigma_Z^2 = FLOOR^2 + FACTOR^2 ((sigma_d / |ds/dZ|)^2 + b^2 + t^2) / r^2        (FLOOR in pixels of disparity)
+
+b: windows on relief and beside what nobody saw answer for a part of each surface. t: a position that is wrong by a cell
+is an elevation that is wrong by its step. r: in a shadow noise finds noise to match, smoothly and wrongly; the noise of
+two images does not correlate.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from stages.geometry.surface import Surface
+from stages.numeric.windows import window_sum
+from stages.terrain.locus.sweep import sweep
+from stages.terrain.locus.views import Views, look
+
+Float32 = NDArray[np.float32]
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+STIFFNESS = 4000.0
+"""Squared grey levels for a bend of a pixel of disparity: strong against noise, weak against texture; the error is flat
+from 2000 to 16000."""
+BEND = 0.05
+"""Pixels of disparity: bend beyond which stiffness gives way to an edge."""
+SWEEPS = 20
+OVERSHOOT = 1.7
+"""Factor on each Gauss-Seidel step (successive over-relaxation), which stays convergent below 2."""
+FARTHEST = 1.0
+"""Pixels of disparity that a cell may move in all: beyond it, the images' likeness is another one."""
+
+MEAN_SIDE = 15
+"""Cells: window of the local mean; brightness varies more slowly."""
+MEAN_ROUNDS = 1
+RESIDUAL = 10.0
+"""Grey levels: difference that halves a cell's weight, well above camera noise."""
+LEAST_WEIGHT = 0.1
+
+FACTOR = 0.42
+"""Of the parts of the standard deviation."""
+FLOOR = 0.1
+"""Pixels of disparity: what remains where all is well. With both factors, set on three of the simulator's pairs, 70 to
+72 % of the errors of all ten are below one and 92 % below two standard deviations, whatever the matcher's preset."""
+RELIEF_SIDE, TEXTURE_SIDE = 7, 5
+UNKNOWN_BEND = 2.0
+"""Pixels of disparity that stand for the bend towards a neighbour that nobody saw."""
+LEAST_CORRELATION = 0.02
+
+
+def refine(views: Views, surface: Surface, elevation: Float32, steps: int) -> tuple[Float32, Float32]:
+    """Elevations that fit both images best, and what the images show there.
+
+    Parameters
+    ----------
+    elevation : (rows, cols) metres, NaN undefined; such cells stay so.
+    steps : Gauss-Newton steps.
+
+    Returns
+    -------
+    elevation (rows, cols), and what :func:`stages.terrain.locus.views.look` gives for it, the right image with the
+    left one's contrast.
+    """
+    start = elevation.astype(np.float64)
+    z, seen = start, look(views, surface, start)
+    gain = _gain(seen)
+    _level(seen, gain)
+    for _ in range(steps):
+        keep = np.isfinite(seen[3])
+        weight, rest = _misfit(seen, keep)
+        slope = np.where(keep, seen[5] - seen[2], 0.0)
+        scale = np.where(keep, seen[3], 0.0)
+        across, down = np.zeros_like(z), np.zeros_like(z)
+        _stiffness(z, scale, across, down)
+        moved = z.copy()
+        sweep(weight * slope * slope, weight * slope * rest, keep, across, down, z, moved, SWEEPS, OVERSHOOT)
+        reach = FARTHEST / np.where(keep, seen[3], np.inf)
+        z = np.where(keep, np.clip(moved, start - reach, start + reach), start)
+        seen = look(views, surface, z)
+        _level(seen, gain)
+    return z.astype(np.float32), seen
+
+
+def standard_deviation(elevation: Float32, seen: Float32, from_disparity: Floats) -> Floats:
+    """Standard deviation of refined elevations, metres, see the module; the disparity's part where a cell is not seen.
+
+    ``seen``: as :func:`refine` gives it. ``from_disparity``: (rows, cols) the disparity's part, metres.
+    """
+    known = np.isfinite(elevation) & np.isfinite(seen[3])
+    bend, step = np.zeros(elevation.shape), np.zeros(elevation.shape)
+    texture = np.zeros((3, *elevation.shape))
+    _neighbours(elevation.astype(np.float64), known, seen[0], seen[1], seen[3], bend, step, texture)
+    cells = window_sum(np.ones(elevation.shape), RELIEF_SIDE)
+    both, of_left, of_right = (np.maximum(window_sum(t, TEXTURE_SIDE), 0.0) for t in texture)
+    count = np.maximum(window_sum(known, RELIEF_SIDE), 1.0)
+    relief = window_sum(bend, RELIEF_SIDE) / cells + window_sum(step, RELIEF_SIDE) / count
+    alike = np.clip(both / np.maximum(np.sqrt(of_left * of_right), 1e-6), LEAST_CORRELATION, 1.0)
+    variance = FACTOR**2 * (from_disparity**2 + np.maximum(relief, 0.0)) / alike**2
+    std = np.sqrt(variance + np.square(FLOOR / np.where(known, seen[3], 1.0)))
+    return np.where(known, std, from_disparity)
+
+
+def _gain(seen: Float32) -> float:
+    """Factor that gives the right image the left one's contrast, from the gradients along the surface's axes."""
+    power = [
+        sum(float(np.nansum(np.square(np.diff(image, axis=k), dtype=np.float64))) for k in (0, 1)) for image in seen[:2]
+    ]
+    return float(np.sqrt(power[0] / power[1])) if min(power) > 0 else 1.0
+
+
+def _level(seen: Float32, gain: float) -> None:
+    """Scale what the right image shows, in place."""
+    seen[1] *= np.float32(gain)
+    seen[5] *= np.float32(gain)
+
+
+def _misfit(seen: Float32, keep: Mask) -> tuple[Floats, Floats]:
+    """Weight of each cell's equation, and difference of both images without its local mean; zero where not kept."""
+    rest = np.where(keep, seen[0] - seen[1], 0.0)
+    weight = keep.astype(np.float64)
+    for _ in range(MEAN_ROUNDS + 1):
+        mean = window_sum(weight * rest, MEAN_SIDE) / np.maximum(window_sum(weight, MEAN_SIDE), LEAST_WEIGHT)
+        weight = np.where(keep, 1.0 / (1.0 + np.square((rest - mean) / RESIDUAL)), 0.0)
+    return weight * np.where(keep, np.minimum(seen[4], 1.0), 0.0), np.where(keep, rest - mean, 0.0)
+
+
+@njit(cache=True, nogil=True)
+def _stiffness(z, scale, across, down):  # type: ignore[no-untyped-def]
+    """Weight of the second difference at each cell along its row and column, 0 where a neighbour is unknown.
+
+    ``scale``: pixels of disparity a metre of elevation.
+    """
+    rows, cols = z.shape
+    for r in range(rows):
+        for c in range(cols):
+            s = scale[r, c]
+            if not s > 0.0:
+                continue
+            if c > 0 and c < cols - 1:
+                d = s * (z[r, c - 1] - z[r, c] + z[r, c + 1] - z[r, c]) / BEND
+                if np.isfinite(d):
+                    across[r, c] = STIFFNESS * s * s / (1.0 + d * d)
+            if r > 0 and r < rows - 1:
+                d = s * (z[r - 1, c] - z[r, c] + z[r + 1, c] - z[r, c]) / BEND
+                if np.isfinite(d):
+                    down[r, c] = STIFFNESS * s * s / (1.0 + d * d)
+
+
+@njit(cache=True, nogil=True)
+def _neighbours(z, known, left, right, scale, bend, step, texture):  # type: ignore[no-untyped-def]
+    """Squared second difference and squared step of each known cell, m^2; products of the ortho gradients."""
+    rows, cols = z.shape
+    for r in range(rows):
+        for c in range(cols):
+            if not known[r, c]:
+                continue
+            total = 0.0
+            whole = True
+            for i, j in ((0, 1), (1, 0)):
+                if r - i < 0 or c - j < 0 or r + i >= rows or c + j >= cols:
+                    whole = False
+                elif known[r - i, c - j] and known[r + i, c + j]:
+                    total += abs(z[r - i, c - j] - 2.0 * z[r, c] + z[r + i, c + j])
+                else:
+                    whole = False
+                    total = UNKNOWN_BEND / scale[r, c]
+                    break
+            bend[r, c] = total * total
+            if not whole:
+                continue
+            for i, j in ((0, 1), (1, 0)):
+                dz = 0.5 * (z[r + i, c + j] - z[r - i, c - j])
+                a = 0.5 * (left[r + i, c + j] - left[r - i, c - j])
+                b = 0.5 * (right[r + i, c + j] - right[r - i, c - j])
+                step[r, c] += dz * dz
+                texture[0, r, c] += a * b
+                texture[1, r, c] += a * a
+                texture[2, r, c] += b * b

@@ -1,0 +1,158 @@
+"""Locus over a whole surface: cells from one disparity map, coarse to fine, and models of both directions joined.
+
+The kernel and its equations are in :mod:`stages.terrain.locus.kernel`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from stages.core.errors import DegenerateError, InputError
+from stages.geometry.geometry import Rig, RigidTransform
+from stages.geometry.surface import Surface
+from stages.terrain.locus.kernel import search
+
+Floats = NDArray[np.float64]
+Float32 = NDArray[np.float32]
+
+COARSE = 8  # cells a coarse cell is wide: a 64th of the cells search the whole range
+BLOCK_ROWS = 64  # rows of cells in one kernel call, so that a large surface stays small in memory
+ONE_SIDED = 2.0  # matched one way alone: errors of such cells are two to three times as large
+
+
+@dataclass(frozen=True)
+class Dem:
+    """Elevation model on a reference surface, arrays (rows, cols) float32, NaN undefined.
+
+    ``elevation`` and its standard deviation ``elevation_std`` in metres along the surface's normal, ``residual`` the
+    mismatch at the solution in pixels, ``ortho`` the grey value of the left image.
+    """
+
+    elevation: Float32
+    elevation_std: Float32
+    residual: Float32
+    ortho: Float32
+
+
+@dataclass(frozen=True)
+class Matches:
+    """Disparity vectors (rows, cols) of one image, the other one minus it, pixels; which of them may be used.
+
+    ``std``: standard deviation of the usable ones, pixels; None: not known.
+    """
+
+    column: ArrayLike
+    row: ArrayLike
+    usable: NDArray[np.bool_]
+    std: ArrayLike | None = None
+
+
+class Task:
+    """The arrays of one pair as the kernel wants them.
+
+    ``sigma``: standard deviation of disparities that have none of their own, pixels; ``limits``: greatest residual and
+    greatest jump in the bilinear cell, pixels.
+    """
+
+    def __init__(
+        self,
+        given: Matches,
+        image: ArrayLike,
+        rig: Rig,
+        T_surface_left: RigidTransform,
+        z_range: tuple[float, float],
+        sigma: float,
+        limits: tuple[float, float],
+    ) -> None:
+        if not rig.baseline > 0:
+            raise DegenerateError(
+                "RIL-394", "the rig's baseline is 0 m", remedy="give T_right_left with a translation in metres"
+            )
+        if not z_range[0] < z_range[1]:
+            raise InputError("RIL-395", f"the range of elevations {z_range[0]}..{z_range[1]} m is empty")
+        shape = (rig.left.height, rig.left.width)
+        maps = [np.asarray(a) for a in (given.column, given.row, image)]
+        for name, array in zip(("column disparity", "row disparity", "image"), maps, strict=True):
+            if array.shape != shape:
+                raise InputError("RIL-396", f"the {name} is {array.shape}, the left camera's image {shape}")
+        self.disparity = np.stack(maps[:2], axis=-1, dtype=np.float32, casting="unsafe")
+        self.disparity[~given.usable] = np.nan
+        self.image = np.ascontiguousarray(maps[2], np.float32)
+        std = np.full(shape, sigma) if given.std is None else given.std
+        self.std = np.ascontiguousarray(std, np.float64)
+        self.left, self.right = projections(rig, T_surface_left)
+        self.epipole = rig.right.matrix @ rig.T_right_left.translation
+        self.sizes = np.array([rig.left.width, rig.left.height, rig.right.width, rig.right.height], dtype=np.float64)
+        self.z_range = float(z_range[0]), float(z_range[1])
+        self.limits = np.array(limits)
+
+    def cells(self, surface: Surface, rows: ArrayLike, cols: ArrayLike, low: ArrayLike, high: ArrayLike) -> Floats:
+        """Kernel's output (r, c, 4) for the cells rows x cols, searched from low..high (NaN: left out)."""
+        feet, normals = surface.block(rows, cols)
+        shape = feet.shape[:2]
+        start = [np.array(np.broadcast_to(v, shape), dtype=np.float64, order="C") for v in (low, high)]
+        out = np.full((*shape, 4), np.nan)
+        search(
+            feet, normals, *start, *self.z_range, self.left, self.right, self.epipole, self.sizes,
+            self.disparity.ravel(), self.std, self.image, self.limits, out,
+        )  # fmt: skip
+        return out
+
+
+def solve(task: Task, surface: Surface) -> Dem:
+    """Every cell of a surface from one disparity map, coarse to fine: a few coarse cells search the whole range."""
+    cells = [np.unique(np.append(np.arange(0, n, COARSE), n - 1)) for n in (surface.rows, surface.cols)]
+    z_range = task.z_range
+    coarse = task.cells(surface, cells[0], cells[1], np.float64(z_range[0]), np.float64(z_range[1]))[..., 0]
+    out = Dem(*(np.full((surface.rows, surface.cols), np.nan, np.float32) for _ in range(4)))
+    low, high = _around(coarse)
+    cols = np.arange(surface.cols)
+    for start in range(0, surface.rows, BLOCK_ROWS):
+        rows = np.arange(start, min(start + BLOCK_ROWS, surface.rows))
+        at = np.ix_(rows // COARSE + 1, cols // COARSE + 1)
+        found = task.cells(surface, rows, cols, low[at], high[at])
+        block = slice(start, start + rows.size)
+        for k, array in enumerate((out.elevation, out.elevation_std, out.residual, out.ortho)):
+            array[block] = found[..., k]
+    return out
+
+
+def join(a: Dem, b: Dem) -> Dem:
+    """Elevations read from left to right and from right to left: their weighted mean where both are.
+
+    Its variance is the product of both standard deviations (they share the images: no gain) and the square of their
+    difference. What only one direction gave is most often beside an occlusion, and :data:`ONE_SIDED` times as
+    uncertain as it looks. The grey value is that of ``a``.
+    """
+    za, zb, sa, sb = (v.astype(np.float64) for v in (a.elevation, b.elevation, a.elevation_std, b.elevation_std))
+    only_a = np.isfinite(za)
+    both = only_a & np.isfinite(zb)
+    share = sb**2 / (sa**2 + sb**2)
+    z = np.where(both, zb + share * (za - zb), np.where(only_a, za, zb))
+    std = np.where(both, np.sqrt(sa * sb + (za - zb) ** 2), ONE_SIDED * np.where(only_a, sa, sb))
+    residual = np.where(only_a, a.residual, b.residual)
+    return Dem(z.astype(np.float32), std.astype(np.float32), residual, a.ortho)
+
+
+def projections(rig: Rig, T_surface_left: RigidTransform) -> tuple[Floats, Floats]:
+    """Projections (3, 4) from the frame of the surface to pixels of the left and the right image."""
+    T_left_surface = T_surface_left.inverse()
+    left = rig.left.matrix @ T_left_surface.matrix34
+    right = rig.right.matrix @ (rig.T_right_left @ T_left_surface).matrix34
+    return np.ascontiguousarray(left), np.ascontiguousarray(right)
+
+
+def _around(coarse: Floats) -> tuple[Floats, Floats]:
+    """Lowest and highest elevation of the 4 x 4 coarse cells around each gap between them; NaN where none has one."""
+    padded = np.pad(coarse, 2, constant_values=np.nan)
+    shape = padded.shape[0] - 3, padded.shape[1] - 3
+    low = np.full(shape, np.nan)
+    high = low.copy()
+    for i in range(4):
+        for j in range(4):
+            near = padded[i : i + shape[0], j : j + shape[1]]
+            low, high = np.fmin(low, near), np.fmax(high, near)
+    return low, high

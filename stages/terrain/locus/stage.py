@@ -1,0 +1,366 @@
+"""Locus reconstruction: elevation model and ortho image straight from the disparity (paper, section 4.4).
+
+The cells come first, not the image points: for each cell of a reference surface the straight line perpendicular to it
+is projected into both images (the left and right *locus*); the left locus, mapped through the disparity, meets the
+right one at the elevation. Nothing is rectified and no point cloud is made: rows and columns are those of the original
+images, for any orientation of the cameras. The kernel and its equations are in :mod:`stages.terrain.locus.kernel`;
+elevations are then refined by what both images show of the surface (:mod:`stages.terrain.locus.refinement`).
+
+The disparity's part of an elevation's error is ``sigma_d / |ds/dZ|``, with the disparity's own standard deviation at
+the pixel where the matcher gives one; what else makes it uncertain is seen on the surface.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import Field
+
+from stages.core.declare import Array, Bundle, Inputs, Memory, Params, Stage
+from stages.core.errors import ConfigError, DegenerateError, InputError
+from stages.core.validity import matched
+from stages.geometry.geometry import Rig, RigidTransform
+from stages.geometry.lattice import Lattice
+from stages.geometry.surface import Surface, plane
+from stages.terrain.ground import view_ground
+from stages.terrain.ground_frame import z_range as plane_z_range
+from stages.terrain.locus.empty import explain
+from stages.terrain.locus.refinement import refine, standard_deviation
+from stages.terrain.locus.solve import Dem, Matches, Task, join, projections, solve
+from stages.terrain.locus.uncertainty import from_both
+from stages.terrain.locus.views import Views, views
+
+Floats = NDArray[np.float64]
+Float32 = NDArray[np.float32]
+
+OWN_STD = 1.5  # times max_sigma: a cell's own standard deviation scatters about the typical one
+
+
+class LocusParams(Params):
+    """Parameters of the stage ``locus``."""
+
+    cell_size: float | None = Field(
+        None, gt=0, description="m; none: the pixel's size on the ground at twice the nearest distance, to 1, 2 or 5"
+    )
+    extent: tuple[float, float, float, float] | None = Field(
+        None, description="m; x_min, x_max, y_min, y_max of the local frame; none: the ground that both cameras see"
+    )
+    max_range_cells: float = Field(
+        6.0, gt=0, description="cells; the automatic extent ends where a pixel covers more of them along the range"
+    )
+    max_sigma: float | None = Field(
+        None,
+        gt=0,
+        description="m; the automatic extent ends where sigma_disparity makes a greater elevation error, and where the "
+        "matcher gives no standard deviations such cells are left undefined; none: one cell size",
+    )
+    max_std: float | None = Field(
+        None,
+        gt=0,
+        description="m; cells whose own standard deviation of elevation is greater are left undefined, where the "
+        "matcher gives one: most gross errors are among them; none: 1.5 max_sigma, which 5 to 10 % of the cells exceed",
+    )
+    sigma_disparity: float = Field(
+        0.2,
+        gt=0,
+        description="pixels; error of a typical disparity: bounds the automatic extent, and stands for each pixel's "
+        "own standard deviation where the matcher gives none",
+    )
+    max_residual: float = Field(
+        0.5, gt=0, description="pixels; greatest |p_l + d - p_r| at the solution: 2.5 sigma_disparity"
+    )
+    max_backmatch: float = Field(
+        1.0,
+        gt=0,
+        description="pixels; greatest error of back-matching (4.3.3); a stricter one leaves out more good cells than "
+        "bad ones, which max_std tells apart",
+    )
+    refine_steps: int = Field(
+        2,
+        ge=0,
+        le=20,
+        description="steps of refining the elevations by what both images show of the surface, a third gains a "
+        "hundredth; 0: none, and standard deviations are those of the disparity alone",
+    )
+    refined_share: float = Field(
+        1.0,
+        gt=0,
+        le=1,
+        description="share of the refined elevation in the result, the rest is what the disparity said: 0.5 where the "
+        "matcher is as sure as that (preset accurate), since both then err about as much and not alike; where it is "
+        "less sure, less than 1 only loses",
+    )
+    both: bool = Field(
+        False,
+        description="match from right to left as well and read elevations from both: more cells, and errors where the "
+        "two differ show; it doubles the time of matching",
+    )
+    max_jump: float = Field(
+        3.0,
+        gt=0,
+        description="pixels; range of the four disparities around a cell that is still one surface: relief seen at a "
+        "grazing angle changes by 1.5 px a pixel, twice that across the diagonal",
+    )
+
+
+def reconstruct(
+    column_disparity: ArrayLike,
+    row_disparity: ArrayLike,
+    usable: NDArray[np.bool_],
+    image: ArrayLike,
+    rig: Rig,
+    T_surface_left: RigidTransform,
+    surface: Surface,
+    z_range: tuple[float, float],
+    params: LocusParams,
+    *,
+    disparity_std: ArrayLike | None = None,
+    right: ArrayLike | None = None,
+    back: Matches | None = None,
+) -> Dem:
+    """Elevation and ortho image of every cell of a reference surface.
+
+    Parameters
+    ----------
+    column_disparity, row_disparity : (rows, cols) right minus left, pixels, of the left image.
+    usable : (rows, cols) pixels whose disparity may be used; a cell needs all four around its projection.
+    image : (rows, cols) grey values of the left image.
+    T_surface_left : pose of the left camera in the frame of the surface.
+    surface : feet and normals of the cells, metres.
+    z_range : lowest and highest elevation searched, metres.
+    params : thresholds; ``cell_size`` and ``extent`` are not used here.
+    disparity_std : (rows, cols) standard deviation of the usable disparities, pixels; None:
+        ``params.sigma_disparity`` everywhere.
+    right : (rows, cols) grey values of the right image, to refine the elevations with
+    (:mod:`stages.terrain.locus.refinement`);
+        None: they stay what the disparity says.
+    back : disparities of the right image, left minus right, to read elevations from as well (:func:`join`); they need
+        ``right``.
+
+    Returns
+    -------
+    Dem
+        A cell is undefined where a camera does not see it, where the disparity around it was not measured, jumps or
+        contradicts the calibration, or where its standard deviation is beyond ``max_std`` (``max_sigma`` without
+        ``disparity_std``).
+
+    Raises
+    ------
+    InputError
+        An array's shape differs from its camera's, ``z_range`` is empty, or ``right`` is missing.
+    DegenerateError
+        The baseline is zero.
+    """
+    maps = Matches(column_disparity, row_disparity, usable, disparity_std)
+    told = z_range, params.sigma_disparity, (params.max_residual, params.max_jump)
+    out = solve(Task(maps, image, rig, T_surface_left, *told), surface)
+    seen = None if right is None else _views(image, right, rig, T_surface_left)
+    apart = None
+    if back is not None:
+        if right is None:
+            raise InputError("RIL-381", "disparities of the right image are given without the image")
+        turned = Rig(rig.right, rig.left, rig.T_right_left.inverse())
+        T_surface_right = T_surface_left @ rig.T_right_left.inverse()
+        other = solve(Task(back, right, turned, T_surface_right, *told), surface)
+        apart = out.elevation.astype(np.float64) - other.elevation
+        out = join(out, other)
+    if seen is not None and (params.refine_steps or back is not None):
+        _refine(out, seen, surface, params, apart)
+    greatest = _greatest_std(params, disparity_std is not None)
+    if greatest is not None:
+        unsure = ~(out.elevation_std <= greatest)
+        for array in vars(out).values():
+            array[unsure] = np.nan
+    return out
+
+
+def _views(image: ArrayLike, right: ArrayLike, rig: Rig, T_surface_left: RigidTransform) -> Views:
+    """Both images as they see the surface."""
+    images = [np.array(a, dtype=np.float32, order="C") for a in (image, right)]
+    if images[1].shape != (rig.right.height, rig.right.width):
+        raise InputError(
+            "RIL-382", f"the right image is {images[1].shape}, its camera's {(rig.right.height, rig.right.width)}"
+        )
+    return views(*projections(rig, T_surface_left), images[0], images[1], T_surface_left.translation)
+
+
+def _refine(dem: Dem, views: Views, surface: Surface, params: LocusParams, apart: Floats | None) -> None:
+    """Refine a model in place: elevations, their standard deviations, grey values of the left image.
+
+    ``apart``: (rows, cols) difference of both directions of matching, metres; None: there was one.
+    """
+    elevation, seen = refine(views, surface, dem.elevation, params.refine_steps)
+    before = dem.elevation_std.astype(np.float64)
+    if apart is None:
+        dem.elevation_std[...] = standard_deviation(elevation, seen, before)
+    else:
+        moved = elevation.astype(np.float64) - dem.elevation
+        dem.elevation_std[...] = from_both(elevation, seen, moved, apart, before)
+    share = np.float32(params.refined_share)
+    dem.elevation[...] = share * elevation + (np.float32(1.0) - share) * dem.elevation
+    dem.ortho[...] = np.clip(seen[0], 0.0, 255.0)
+
+
+def _greatest_std(params: LocusParams, measured: bool) -> float | None:
+    """Standard deviation of elevation, m, up to which a cell is accepted; None: any."""
+    if measured and params.max_std is not None:
+        return params.max_std
+    if params.max_sigma is None:
+        return None
+    return OWN_STD * params.max_sigma if measured else params.max_sigma
+
+
+def local_lattice(rig: Rig, level: Mapping[str, Any], cell: float, params: LocusParams) -> Lattice:
+    """Lattice of a pair's local model: the stated extent, else the ground that both cameras see well enough."""
+    if params.extent is not None:
+        x_min, x_max, y_min, y_max = params.extent
+        if not (x_min < x_max and y_min < y_max):
+            raise ConfigError(
+                "RIL-383", f"locus.extent={list(params.extent)} is empty", remedy="give x_min, x_max, y_min, y_max"
+            )
+        return Lattice.snap(params.extent, cell)
+    R = RigidTransform.from_matrix(level["T_local_left"]).rotation
+    view = view_ground(rig, R, level["plane"])
+    sigma = params.max_sigma if params.max_sigma is not None else cell
+    return Lattice.snap(view.footprint(cell, params.max_range_cells, params.sigma_disparity, sigma), cell)
+
+
+def world_lattice(elevation: Float32, lattice: Lattice, T_world_local: RigidTransform) -> tuple[Lattice, list[float]]:
+    """Lattice and range of elevations in the world frame that hold a local elevation model.
+
+    Raises
+    ------
+    DegenerateError
+        The local model has no cell.
+    """
+    seen = np.isfinite(elevation)
+    if not seen.any():
+        raise DegenerateError(
+            "RIL-384",
+            "the local elevation model is empty",
+            remedy="look at the disparity's validity and at locus.max_residual",
+        )
+    points = T_world_local.apply(np.column_stack([lattice.xy()[seen], elevation[seen]]))
+    low, high = points.min(axis=0), points.max(axis=0)
+    margin = 0.05 * (high[2] - low[2]) + lattice.cell
+    bounds = (float(low[0]), float(high[0]), float(low[1]), float(high[1]))
+    return Lattice.snap(bounds, lattice.cell), [float(low[2] - margin), float(high[2] + margin)]
+
+
+def _run(params: LocusParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+    rig = Rig.from_dict(inputs["rig"].meta["rig"])
+    level = inputs["level"].meta
+    T_local_left = RigidTransform.from_matrix(level["T_local_left"])
+    if args["frame"] == "world":
+        T, lattice, z_range = _in_world(args, inputs, T_local_left)
+    else:
+        # One cell for the whole run: that which suits the first basic pair, where that pair is connected.
+        if level["plane"] is None:
+            raise DegenerateError(
+                "RIL-780",
+                f"no elevation model without ground: {level['no_ground']}",
+                remedy="or state a surface by level.reference_height",
+            )
+        cell = params.cell_size or inputs.get("reference", inputs["level"]).meta["cell_size"]
+        T, lattice = T_local_left, local_lattice(rig, level, cell, params)
+        z_range = plane_z_range(level["plane"], level["relief"], list(lattice.bounds))
+    if params.max_sigma is None:
+        params = params.model_copy(update={"max_sigma": lattice.cell})
+    disparity = inputs["disparity"]
+    good = usable(disparity["validity"], disparity["backmatch_error"], params)
+    dem = reconstruct(
+        disparity["column_disparity"],
+        disparity["row_disparity"],
+        good,
+        inputs["left"]["level_0"],
+        rig,
+        T,
+        plane(lattice),
+        (z_range[0], z_range[1]),
+        params,
+        disparity_std=disparity.arrays.get("disparity_std"),
+        right=inputs["right"]["level_0"] if "right" in inputs else None,
+        back=_backward(inputs["back"], params) if "back" in inputs else None,
+    )
+    if not np.isfinite(dem.elevation).any():
+        raise explain(rig, T, plane(lattice), (z_range[0], z_range[1]), good)
+    meta = {
+        "lattice": lattice.to_dict(),
+        "frame": args["frame"],
+        "pair": args["pair"],
+        "z_range": z_range,
+        "T_frame_left": T.to_list(),
+        "pixel_rad": 1.0 / rig.left.fx,
+        "defined": float(np.mean(np.isfinite(dem.elevation))),
+        "median_residual": _median(dem.residual),
+        "median_elevation_std": _median(dem.elevation_std),
+    }
+    if args["frame"] == "world" and "covariance" in inputs["trajectory"].arrays:
+        meta["pose_covariance"] = np.asarray(inputs["trajectory"]["covariance"])[int(args["row"])].ravel().tolist()
+    return Bundle(vars(dem), meta)
+
+
+def usable(validity: ArrayLike, backmatch_error: ArrayLike, params: LocusParams) -> NDArray[np.bool_]:
+    """Pixels that were measured, not filled, and match back to within ``max_backmatch`` pixels."""
+    with np.errstate(invalid="ignore"):
+        return matched(np.asarray(validity)) & (np.asarray(backmatch_error) <= params.max_backmatch)
+
+
+def _backward(disparity: Bundle, params: LocusParams) -> Matches:
+    good = usable(disparity["validity"], disparity["backmatch_error"], params)
+    maps = np.asarray(disparity["column_disparity"]), np.asarray(disparity["row_disparity"])
+    return Matches(*maps, good, disparity.arrays.get("disparity_std"))
+
+
+def _in_world(
+    args: Mapping[str, Any], inputs: Inputs, T_local_left: RigidTransform
+) -> tuple[RigidTransform, Lattice, list[float]]:
+    poses = np.asarray(inputs["trajectory"]["poses"])
+    T_world_left = RigidTransform.from_matrix(poses[int(args["row"])])
+    local = inputs["local"]
+    T_world_local = T_world_left @ T_local_left.inverse()
+    lattice, z_range = world_lattice(
+        np.asarray(local["elevation"]), Lattice.from_dict(local.meta["lattice"]), T_world_local
+    )
+    return T_world_left, lattice, z_range
+
+
+def _size(params: LocusParams, args: Mapping[str, Any], metas: Mapping[str, Any]) -> float:
+    """Bytes of the surface's arrays, four of float32, and a half more for refining them."""
+    if args["frame"] == "world":
+        lattice = Lattice.from_dict(metas["local"]["lattice"])
+    elif metas["level"]["plane"] is None:
+        return 0.0
+    else:
+        cell = params.cell_size or metas.get("reference", metas["level"])["cell_size"]
+        lattice = local_lattice(Rig.from_dict(metas["rig"]["rig"]), metas["level"], cell, params)
+    return 24.0 * lattice.rows * lattice.cols
+
+
+def _median(array: Float32) -> float | None:
+    values = array[np.isfinite(array)]
+    return float(np.median(values)) if values.size else None
+
+
+def _array(name: str, unit: str, long_name: str) -> Array:
+    return Array(name, ("row", "col"), "float32", unit, long_name, nodata="nan", frame="local or world (meta: frame)")
+
+
+STAGE = Stage(
+    name="locus",
+    version=5,
+    summary="elevation model and ortho image of a basic pair",
+    params=LocusParams,
+    inputs=("disparity", "rig", "left", "right?", "back?", "level", "reference?", "trajectory?", "local?"),
+    outputs=(
+        _array("elevation", "m", "elevation of the cell centre"),
+        _array("elevation_std", "m", "standard deviation of the elevation"),
+        _array("residual", "px", "mismatch of disparity and calibration at the elevation"),
+        _array("ortho", "grey", "grey value of the left image, 0..255"),
+    ),
+    run=_run,
+    memory=Memory(lower=("locus.cell_size", "locus.extent"), size=_size),
+)

@@ -1,0 +1,162 @@
+"""Both images seen through the elevations: grey values of each cell in the left and the right image.
+
+A cell with foot F, normal N and elevation Z is the point P = F + Z N; its projections p_l and p_r are read from the
+cubic splines through the images' pixels, so that detail is kept. With the terrain right, both show the same.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import scipy
+from numba import njit
+from numpy.typing import NDArray
+
+from stages.geometry.surface import Surface
+from stages.terrain.locus.spline import LANES, SPLINE, read
+from stages.terrain.locus.spline import PLANES as SPLINE_PLANES
+
+Float32 = NDArray[np.float32]
+Floats = NDArray[np.float64]
+
+BLOCK_ROWS = 64  # rows of cells in one call, so that a large surface's feet stay small in memory
+PLANES = 6
+
+
+@dataclass(frozen=True)
+class Views:
+    """Projections (3, 4) from the frame of the surface to pixels, splines of both images, the left camera's centre."""
+
+    left: Floats
+    right: Floats
+    splines: tuple[Float32, Float32]
+    centre: Floats
+
+
+def views(left: Floats, right: Floats, left_image: Float32, right_image: Float32, centre: Floats) -> Views:
+    """Views of two images (row, col), grey values; ``centre`` of the left camera in the frame of the surface, m."""
+    splines = [scipy.ndimage.spline_filter(image, 3, np.float32, mode="mirror") for image in (left_image, right_image)]
+    return Views(left, right, (splines[0], splines[1]), np.asarray(centre, np.float64))
+
+
+def look(views: Views, surface: Surface, elevation: Floats) -> Float32:
+    """What both images show at the elevations of the cells.
+
+    Parameters
+    ----------
+    elevation : (rows, cols) metres, NaN unknown.
+
+    Returns
+    -------
+    (6, rows, cols) float32: grey value of the left and of the right image; how the left one changes with the
+    elevation, per metre; disparity a metre of elevation, pixels; pixels of the left image that a cell covers; how the
+    right one changes with the elevation. NaN where a cell is unknown or not inside both images.
+    """
+    out = np.full((PLANES, surface.rows, surface.cols), np.nan, np.float32)
+    z, cols = np.ascontiguousarray(elevation, np.float64), np.arange(surface.cols)
+    for start in range(0, surface.rows, BLOCK_ROWS):
+        stop = min(start + BLOCK_ROWS, surface.rows)
+        # A row beyond either end, so that every cell has a neighbour below or above to measure its size with.
+        first, last = max(0, start - 1), min(surface.rows, stop + 1)
+        feet, normals = surface.block(np.arange(first, last), cols)
+        _look(feet, normals, z, first, start, stop, views.left, views.right, views.centre, *views.splines, out)
+    return out
+
+
+FOOT, NORMAL, Z, BESIDE, BELOW = (k * LANES for k in (SPLINE_PLANES, *(SPLINE_PLANES + k for k in (3, 6, 7, 10))))
+SEEN, WAYS = ((SPLINE_PLANES + k) * LANES for k in (13, 14))
+"""Planes of a buffer of lanes, a cell in each: its foot, normal and elevation, the steps to its neighbours' feet (3
+each); whether both images show it; the disparity, and for each image how a pixel moves with the elevation (2 each), and
+the pixels that the cell covers."""
+DISPARITY, LEFT_WAY, RIGHT_WAY, AREA = WAYS, WAYS + LANES, WAYS + 3 * LANES, WAYS + 5 * LANES
+LANE_PLANES = SPLINE_PLANES + 20
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _look(feet, normals, z, first, start, stop, left, right, centre, left_spline, right_spline, out):  # type: ignore[no-untyped-def]
+    """Rows ``start`` to ``stop``; feet and normals begin at row ``first``."""
+    lanes, taps, cells = np.zeros(LANE_PLANES * LANES), np.zeros(SPLINE * LANES, np.float32), np.zeros(LANES, np.int64)
+    rows, cols = feet.shape[:2]
+    planes = out.reshape(out.shape[0], -1)
+    n = 0
+    for r in range(start, stop):
+        for c in range(cols):
+            if np.isfinite(z[r, c]):
+                i = r - first
+                below, beside = (i + 1 if i + 1 < rows else i - 1), (c + 1 if c + 1 < cols else c - 1)
+                for k in range(3):
+                    lanes[FOOT + k * LANES + n], lanes[NORMAL + k * LANES + n] = feet[i, c, k], normals[i, c, k]
+                    lanes[BELOW + k * LANES + n] = feet[max(below, 0), c, k] - feet[i, c, k]
+                    lanes[BESIDE + k * LANES + n] = feet[i, max(beside, 0), k] - feet[i, c, k]
+                lanes[Z + n], cells[n] = z[r, c], r * cols + c
+                n += 1
+            if n == LANES or (n > 0 and r == stop - 1 and c == cols - 1):
+                _project(n, left, right, centre, left_spline.shape, right_spline.shape, lanes)
+                read(n, left_spline, right_spline, lanes, taps)
+                _write(n, cells, lanes, rows > 1 and cols > 1, planes)
+                n = 0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _motion(p0, p1, p2, x, y, depth, dx, dy, dz):  # type: ignore[no-untyped-def]
+    """Pixels that the projection (x, y) of a point moves by when the point moves by (dx, dy, dz)."""
+    d0 = p0[0] * dx + p0[1] * dy + p0[2] * dz
+    d1 = p1[0] * dx + p1[1] * dy + p1[2] * dz
+    d2 = p2[0] * dx + p2[1] * dy + p2[2] * dz
+    return (d0 - x * d2) / depth, (d1 - y * d2) / depth
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _project(n, left, right, centre, left_shape, right_shape, lanes):  # type: ignore[no-untyped-def]
+    """Where both images show each lane's point, and how that moves."""
+    l0, l1, l2 = _row(left, 0), _row(left, 1), _row(left, 2)
+    r0, r1, r2 = _row(right, 0), _row(right, 1), _row(right, 2)
+    cx, cy, cz = centre[0], centre[1], centre[2]
+    wl, hl, wr, hr = left_shape[1] - 2.0, left_shape[0] - 2.0, right_shape[1] - 2.0, right_shape[0] - 2.0
+    for m in range(n):
+        nx, ny, nz = lanes[NORMAL + m], lanes[NORMAL + LANES + m], lanes[NORMAL + 2 * LANES + m]
+        x = lanes[FOOT + m] + lanes[Z + m] * nx
+        y = lanes[FOOT + LANES + m] + lanes[Z + m] * ny
+        z = lanes[FOOT + 2 * LANES + m] + lanes[Z + m] * nz
+        vx, vy, vz = x - cx, y - cy, z - cz
+        toward = vx * nx + vy * ny + vz * nz
+        a2, b2 = l2[0] * x + l2[1] * y + l2[2] * z + l2[3], r2[0] * x + r2[1] * y + r2[2] * z + r2[3]
+        xl, yl = (l0[0] * x + l0[1] * y + l0[2] * z + l0[3]) / a2, (l1[0] * x + l1[1] * y + l1[2] * z + l1[3]) / a2
+        xr, yr = (r0[0] * x + r0[1] * y + r0[2] * z + r0[3]) / b2, (r1[0] * x + r1[1] * y + r1[2] * z + r1[3]) / b2
+        seen = (a2 > 0.0) & (b2 > 0.0) & (toward != 0.0)
+        seen = seen & (xl >= 1.0) & (yl >= 1.0) & (xl < wl) & (yl < hl)
+        seen = seen & (xr >= 1.0) & (yr >= 1.0) & (xr < wr) & (yr < hr)
+        lanes[SEEN + m] = 1.0 if seen else 0.0
+        lanes[m], lanes[LANES + m] = xl if seen else 1.0, yl if seen else 1.0
+        lanes[2 * LANES + m], lanes[3 * LANES + m] = xr if seen else 1.0, yr if seen else 1.0
+        # Along the left ray the left image stays: what the right one moves by is disparity.
+        u, v = _motion(r0, r1, r2, xr, yr, b2, vx / toward, vy / toward, vz / toward)
+        lanes[DISPARITY + m] = math.sqrt(u * u + v * v)
+        lanes[LEFT_WAY + m], lanes[LEFT_WAY + LANES + m] = _motion(l0, l1, l2, xl, yl, a2, nx, ny, nz)
+        lanes[RIGHT_WAY + m], lanes[RIGHT_WAY + LANES + m] = _motion(r0, r1, r2, xr, yr, b2, nx, ny, nz)
+        dx, dy, dz = lanes[BELOW + m], lanes[BELOW + LANES + m], lanes[BELOW + 2 * LANES + m]
+        down, across = _motion(l0, l1, l2, xl, yl, a2, dx, dy, dz)
+        dx, dy, dz = lanes[BESIDE + m], lanes[BESIDE + LANES + m], lanes[BESIDE + 2 * LANES + m]
+        u, v = _motion(l0, l1, l2, xl, yl, a2, dx, dy, dz)
+        lanes[AREA + m] = abs(down * v - across * u)
+
+
+@njit(cache=True, nogil=True)
+def _row(p, k):  # type: ignore[no-untyped-def]
+    return p[k, 0], p[k, 1], p[k, 2], p[k, 3]
+
+
+@njit(cache=True, nogil=True)
+def _write(n, cells, lanes, wide, out):  # type: ignore[no-untyped-def]
+    """What :func:`look` gives of each lane; ``wide``: cells have neighbours, so that their size is known."""
+    for m in range(n):
+        if lanes[SEEN + m] > 0.0:
+            i, grey = cells[m], 4 * LANES + m
+            out[0, i], out[1, i] = lanes[grey], lanes[grey + 3 * LANES]
+            gx, gy = lanes[grey + LANES], lanes[grey + 2 * LANES]
+            out[2, i] = gx * lanes[LEFT_WAY + m] + gy * lanes[LEFT_WAY + LANES + m]
+            gx, gy = lanes[grey + 4 * LANES], lanes[grey + 5 * LANES]
+            out[5, i] = gx * lanes[RIGHT_WAY + m] + gy * lanes[RIGHT_WAY + LANES + m]
+            out[3, i], out[4, i] = lanes[DISPARITY + m], lanes[AREA + m] if wide else 1.0

@@ -1,0 +1,341 @@
+"""Merge of the elevation models of several basic pairs in one world frame (paper, section 4.5).
+
+All models lie on one lattice, so a cell of the result has one value a model. With sigma the elevation's standard
+deviation and r its residual, a model's weight is
+
+    w = 1 / (sigma^2 (1 + (r / r0)^2))        (sigma^-2 is (ds/dZ)^2 but for the disparity's error, equal for all)
+
+Where three or more models meet, one re-weighting about their weighted median takes out the one that contradicts.
+
+The standard deviation of the result has three parts. Each model's own, independent of the others'; what the models
+have in common, since they saw the same light and the same shapes (``alike`` is the correlation of two models' errors);
+and that of the poses. With s_i the shares of the weights, p_i what the covariance of model i's pose says of the height
+there (dz = dC_z + dtheta_x (y - C_y) - dtheta_y (x - C_x)),
+
+    sigma^2 = (1 - alike) sum (s_i sigma_i)^2 + alike (sum s_i sigma_i)^2 + (sum s_i p_i)^2
+
+Poses of models that overlap have nearly all of their way in common, so that their errors neither average out over the
+models nor over the cells of one. ``relief_std`` is the first part alone (alike = 0): that of a cell against the ground
+around it, which is what slopes and steps are judged by.
+
+A tile is merged in strips of lines, of each model only the strip is read: what is in memory at once is bounded by
+:data:`STRIP_BYTES`, however many models meet and however large they are.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from stages.core.declare import Array, Bundle, Inputs, Memory, Params, Stage
+from stages.core.errors import InputError
+from stages.geometry.geometry import RigidTransform
+from stages.geometry.lattice import Lattice
+from stages.numeric.holes import close_holes
+from stages.terrain.merge_kernel import PLANES, merge_cells
+from stages.terrain.radiometry import STEP
+
+Float32 = NDArray[np.float32]
+Floats = NDArray[np.float64]
+
+ALIKE = 0.8
+"""Of the simulator's models at their true poses: then 70 % of the merged errors are below one standard deviation."""
+SHARPNESS = 8  # exponent of the ortho image's weights: the best image, but without a visible seam
+STRIP_BYTES = 1 << 26
+"""Bytes of the models that are in memory at once: 64 MiB are all of a usual tile, and a part where dozens meet."""
+MAPS = ("elevation", "elevation_std", "residual", "ortho")
+
+
+class MergeParams(Params):
+    """Parameters of the stage ``merge``."""
+
+    residual_scale: float = Field(
+        0.1, gt=0, description="pixels; residual that halves a model's weight: the disparity's error when it is good"
+    )
+    alike: float = Field(
+        ALIKE,
+        ge=0,
+        le=1,
+        description="correlation of the errors that two models have at one cell, beyond those of their poses; as found "
+        "with the simulator's true poses",
+    )
+    max_std_cells: float | None = Field(
+        None,
+        gt=0,
+        description="cells; merged cells whose standard deviation, the poses' part left out, is greater than so many "
+        "sides of a cell are left undefined; none: all are given",
+    )
+    max_footprint: float | None = Field(
+        None,
+        gt=0,
+        description="m; cells of a model where a pixel covers more ground along the range are left out, since a window "
+        "of some pixels smooths away what is smaller than it; none: all are merged",
+    )
+    max_hole: int = Field(
+        0,
+        ge=0,
+        le=64,
+        description="cells; widest hole that is closed by interpolation and flagged; none by default: what nobody saw "
+        "is not known",
+    )
+    hole_known: float = Field(
+        0.5, gt=0, le=1, description="share of the ground around a cell that must be known for it to be closed"
+    )
+
+    @property
+    def hole_window(self) -> int:
+        """Side of the window, cells, odd, that a hole's surroundings are judged by: a hole's width to either side."""
+        return 2 * self.max_hole + 3
+
+    @property
+    def margin(self) -> int:
+        """Cells around a tile that its closed holes depend on."""
+        return self.hole_window // 2 + self.max_hole + 1 if self.max_hole else 0
+
+
+@dataclass(frozen=True)
+class Placed:
+    """Error of a model's pose: ``centre`` (2,) x and y of its camera, m; ``covariance`` (3, 3) of the height of the
+    camera, m, and of its rotations about x and y, rad, in the world frame.
+    """
+
+    centre: Floats
+    covariance: Floats
+
+    @staticmethod
+    def of(meta: Mapping[str, Any]) -> Placed:
+        """As the model's facts say; exact where they do not."""
+        if meta.get("pose_covariance") is None:
+            return EXACT
+        full = np.array(meta["pose_covariance"], dtype=np.float64).reshape(6, 6)
+        at = RigidTransform.from_matrix(meta["T_frame_left"]).translation
+        return Placed(at[:2], full[2:5, 2:5])
+
+
+EXACT = Placed(np.zeros(2), np.zeros((3, 3)))
+
+
+def footprint(elevation: Float32, x: Floats, y: Floats, centre: Floats, angle: float) -> Floats:
+    """Ground (row, col) that a pixel covers along the range, m; infinite above the camera, NaN where nothing is known.
+
+    A pixel of ``angle`` (rad) at distance r covers ``r angle`` across the ray, and by r / h more on level ground that
+    lies h below the camera.
+
+    Parameters
+    ----------
+    elevation : (row, col) m, at ``x`` (col,), ``y`` (row,) m.
+    centre : (3,) m, of the camera.
+    """
+    below = centre[2] - elevation.astype(np.float64)
+    square = (x[None] - centre[0]) ** 2 + (y[:, None] - centre[1]) ** 2 + below**2
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(np.where(below <= 0, np.inf, angle * square / below))
+
+
+@dataclass(frozen=True)
+class Layer:
+    """One pair's model on ``lattice``: arrays (rows, cols), NaN undefined, those of
+    :class:`stages.terrain.locus.solve.Dem`.
+
+    ``gain``: factor of its grey values that levels its exposure with that of its neighbours; ``pose``: how exactly it
+    is placed.
+    """
+
+    pair: int
+    lattice: Lattice
+    elevation: Float32
+    elevation_std: Float32
+    residual: Float32
+    ortho: Float32
+    gain: float = 1.0
+    pose: Placed = EXACT
+
+    def part(self, name: str, window: tuple[slice, slice]) -> Float32:
+        """Part of an array."""
+        found: Float32 = getattr(self, name)[window]
+        return found
+
+
+@dataclass(frozen=True)
+class _Stored:
+    """The same of an artifact, read part by part."""
+
+    pair: int
+    lattice: Lattice
+    part: Callable[[str, tuple[slice, slice]], Any]
+    gain: float
+    pose: Placed
+
+
+@dataclass(frozen=True)
+class Merged:
+    """Result (rows, cols) on the tile.
+
+    ``elevation``, ``elevation_std`` and ``relief_std`` (of the weighted mean, see the module), ``spread`` (standard
+    deviation of the models about it; 0 for one model) in metres, NaN undefined; ``count`` of models; ``source`` pair
+    of the greatest weight, -1 none; ``ortho`` grey value; ``filled`` 1 where a small hole was closed (count 0, source
+    -1).
+    """
+
+    elevation: Float32
+    elevation_std: Float32
+    spread: Float32
+    count: NDArray[np.uint16]
+    source: NDArray[np.int16]
+    ortho: Float32
+    filled: NDArray[np.uint8]
+    relief_std: Float32
+
+
+def merge(layers: Sequence[Layer | _Stored], tile: Lattice, params: MergeParams) -> Merged:
+    """Merge elevation models on a tile of their common lattice.
+
+    The result does not depend, in any bit, on the order of the layers, nor on where tiles begin.
+
+    Raises
+    ------
+    InputError
+        Two layers are of the same pair, or a layer's cell differs from the tile's.
+    """
+    ordered = sorted(layers, key=lambda layer: layer.pair)
+    pairs = [layer.pair for layer in ordered]
+    if len(set(pairs)) != len(pairs):
+        raise InputError("RIL-399", f"two elevation models of one pair among {pairs}", remedy="merge each pair once")
+    m = params.margin
+    grown = Lattice.at(tile.i0 - m, tile.j0 + m, tile.cell, tile.rows + 2 * m, tile.cols + 2 * m) if m else tile
+    ordered = [layer for layer in ordered if grown.intersection(layer.lattice) is not None]
+    out = _empty(grown)
+    lines = max(1, STRIP_BYTES // (16 * max(len(ordered), 1) * grown.cols))
+    for start in range(0, grown.rows if ordered else 0, lines):
+        rows = slice(start, min(start + lines, grown.rows))
+        strip = Lattice.at(grown.i0, grown.j0 - start, grown.cell, rows.stop - start, grown.cols)
+        _merge_strip(ordered, strip, params, out, rows)
+    if m:
+        _close(out, params)
+        inside = grown.window(tile)
+        out = Merged(**{name: values[inside].copy() for name, values in vars(out).items()})
+    return out
+
+
+def _merge_strip(
+    layers: Sequence[Layer | _Stored], strip: Lattice, params: MergeParams, out: Merged, rows: slice
+) -> None:
+    """Merge the lines of one strip into ``out``."""
+    present = [layer for layer in layers if strip.intersection(layer.lattice) is not None]
+    if not present:
+        return
+    stacks = [_stacked(present, strip, name) for name in MAPS]
+    gain = np.array([layer.gain for layer in present])
+    centre, pose = (np.array([getattr(layer.pose, name) for layer in present]) for name in ("centre", "covariance"))
+    floats = np.empty((PLANES, *strip.shape), dtype=np.float32)
+    best = np.empty(strip.shape, dtype=np.int64)
+    worst = math.inf if params.max_std_cells is None else params.max_std_cells * strip.cell
+    merge_cells(
+        *stacks, gain, centre, pose, strip.xs(), strip.ys(), params.residual_scale, SHARPNESS, params.alike, worst,
+        floats, out.count[rows], best,
+    )  # fmt: skip
+    for name, values in zip(("elevation", "elevation_std", "spread", "ortho", "relief_std"), floats, strict=True):
+        getattr(out, name)[rows] = values
+    pairs = np.array([*(layer.pair for layer in present), -1])
+    out.source[rows] = pairs[best]
+
+
+def _stacked(layers: Sequence[Layer | _Stored], strip: Lattice, name: str) -> Float32:
+    out = np.full((len(layers), *strip.shape), np.nan, dtype=np.float32)
+    for target, layer in zip(out, layers, strict=True):
+        common = strip.intersection(layer.lattice)
+        assert common is not None
+        target[strip.window(common)] = layer.part(name, layer.lattice.window(common))
+    return out
+
+
+def _close(merged: Merged, params: MergeParams) -> None:
+    """Close the small holes in place; their grey value stays undefined, nobody took it."""
+    gap, window = float(params.max_hole), params.hole_window
+    stds = merged.elevation_std, merged.relief_std
+    closed = [close_holes(merged.elevation, std, gap, window, params.hole_known, judged=True) for std in stds]
+    for std, (z, sigma, filled) in zip(stds, closed, strict=True):
+        merged.elevation[...], std[...], merged.filled[...] = z, sigma, filled
+
+
+def _empty(tile: Lattice) -> Merged:
+    nan = np.full(tile.shape, np.nan, np.float32)
+    return Merged(
+        elevation=nan,
+        elevation_std=nan.copy(),
+        spread=nan.copy(),
+        count=np.zeros(tile.shape, np.uint16),
+        source=np.full(tile.shape, -1, np.int16),
+        ortho=nan.copy(),
+        filled=np.zeros(tile.shape, np.uint8),
+        relief_std=nan.copy(),
+    )
+
+
+def _fine(dem: Bundle, lattice: Lattice, most: float) -> Callable[[str, tuple[slice, slice]], Any]:
+    """Parts of a model without the elevations of cells whose footprint is greater than ``most`` metres."""
+    if "pixel_rad" not in dem.meta:  # nobody looked at it: vouched for
+        return dem.part
+    centre = RigidTransform.from_matrix(dem.meta["T_frame_left"]).translation
+    angle = float(dem.meta["pixel_rad"])
+
+    def part(name: str, window: tuple[slice, slice]) -> Any:
+        values = np.asarray(dem.part(name, window))
+        if name != "elevation":
+            return values
+        covered = footprint(values, lattice.xs()[window[1]], lattice.ys()[window[0]], centre, angle)
+        return np.where(covered <= most, values, np.float32(np.nan))
+
+    return part
+
+
+def _run(params: MergeParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+    tile = Lattice.from_dict(args["lattice"])
+    steps = args.get("exposure", {})
+    layers = []
+    for dem in inputs["dems"]:
+        pair = int(dem.meta["pair"])
+        gain = math.exp(STEP * int(steps.get(str(pair), 0)))
+        lattice = Lattice.from_dict(dem.meta["lattice"])
+        part = dem.part if params.max_footprint is None else _fine(dem, lattice, params.max_footprint)
+        layers.append(_Stored(pair, lattice, part, gain, Placed.of(dem.meta)))
+    merged = merge(layers, tile, params)
+    meta = {
+        "lattice": tile.to_dict(),
+        "frame": "world",
+        "pairs": sorted(layer.pair for layer in layers),
+        "defined": float(np.mean(merged.count > 0)),
+        "filled": int(merged.filled.sum()),
+    }
+    return Bundle(vars(merged), meta)
+
+
+def _array(name: str, dtype: str, unit: str, long_name: str, nodata: str) -> Array:
+    return Array(name, ("row", "col"), dtype, unit, long_name, nodata, "world")
+
+
+STAGE = Stage(
+    name="merge",
+    version=3,
+    summary="merged elevation model and ortho image of one tile of the world",
+    params=MergeParams,
+    inputs=("dems*",),
+    outputs=(
+        _array("elevation", "float32", "m", "elevation of the cell centre", "nan"),
+        _array("elevation_std", "float32", "m", "standard deviation of the elevation, poses included", "nan"),
+        _array("spread", "float32", "m", "standard deviation of the merged models about the elevation", "nan"),
+        _array("count", "uint16", "1", "number of merged models", "0"),
+        _array("source", "int16", "1", "pair of the greatest weight", "-1"),
+        _array("ortho", "float32", "grey", "grey value, 0..255", "nan"),
+        _array("relief_std", "float32", "m", "standard deviation of the elevation against that around", "nan"),
+        _array("filled", "uint8", "1", "1 where a small hole was closed by interpolation", ""),
+    ),
+    run=_run,
+    memory=Memory(lower=("locus.cell_size",)),
+)

@@ -1,0 +1,140 @@
+"""How high ground may be that was not seen: no higher than the lines of sight that pass over it.
+
+Behind a stone lies ground that no camera saw, but the ground beyond it was seen, so what lies between stays below the
+line from the camera to the first ground seen beyond:
+
+    z(u) <= z_C + (z(k) - z_C) |u - C| / |k - C|
+
+with C the camera's centre, k the cell seen beyond and u any cell between, distances along the ground. Of several models
+the least such height holds. How low the ground there is nobody knows: no wheel may stand on it, but the belly may pass
+over it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from pydantic import Field
+
+from stages.core.declare import Array, Bundle, Inputs, Params, Stage
+from stages.geometry.geometry import RigidTransform
+from stages.geometry.lattice import Lattice
+from stages.terrain.merge import footprint
+
+Floats = NDArray[np.float64]
+Floats32 = NDArray[np.float32]
+
+STEP = 0.5
+"""Cells from point to point of a line of sight."""
+
+
+class CeilingParams(Params):
+    """Parameters of the stage ``ceiling``."""
+
+    sigmas: float = Field(
+        default=1.25, ge=0, le=10, description="standard deviations between an elevation and the bounds of the ground"
+    )
+    max_footprint: float | None = Field(
+        None,
+        gt=0,
+        description="m; no line of sight is drawn to ground where a pixel covers more along the range; none: to all",
+    )
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """Between which heights (row, col) float32, m, the ground lies: ``lower``, NaN where it was not seen, and
+    ``upper``, NaN where nothing bounds it either."""
+
+    upper: Floats32
+    lower: Floats32
+
+    @staticmethod
+    def of(elevation: Floats32, doubt: Floats32, hidden: Floats32) -> Bounds:
+        """Of what was seen, give or take ``doubt``, m, NaN unknown; where it was not, at most ``hidden`` high."""
+        return Bounds(np.where(np.isnan(elevation), hidden, elevation + doubt), elevation - doubt)
+
+
+def ceiling(elevation: Floats32, lattice: Lattice, centre: Floats) -> Floats32:
+    """Height, m, above which nothing stands on the unknown cells of a model (row, col), NaN where no line of sight
+    passes.
+
+    Parameters
+    ----------
+    elevation : (row, col) float32, m, at most so high is what was seen; NaN unknown.
+    centre : (3,) m, of the camera.
+    """
+    out = np.full(elevation.shape, np.inf, dtype=np.float32)
+    row, col = lattice.index((centre[0], centre[1]))
+    _below(np.ascontiguousarray(elevation, dtype=np.float32), float(row), float(col), float(centre[2]), out)
+    return np.where(np.isfinite(out), out, np.float32(np.nan))
+
+
+@njit(cache=True, nogil=True)
+def _below(z, row, col, height, out):  # type: ignore[no-untyped-def]
+    """From each known cell towards the camera, until what is known again."""
+    rows, cols = z.shape
+    for r in range(rows):
+        for c in range(cols):
+            if math.isnan(z[r, c]):
+                continue
+            dr, dc = row - r, col - c
+            far = math.hypot(dr, dc)
+            for k in range(1, int(far / STEP)):
+                part = k * STEP / far
+                i, j = math.floor(r + part * dr + 0.5), math.floor(c + part * dc + 0.5)
+                if i == r and j == c:
+                    continue
+                if i < 0 or j < 0 or i >= rows or j >= cols or not math.isnan(z[i, j]):
+                    break
+                share = math.hypot(row - i, col - j) / far
+                out[i, j] = min(out[i, j], np.float32(height + (z[r, c] - height) * min(share, 1.0)))
+
+
+def _run(params: CeilingParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+    merged = inputs["merged"]
+    lattice = Lattice.from_dict(merged.meta["lattice"])
+    z, s = (np.asarray(merged[name], dtype=np.float32) for name in ("elevation", "relief_std"))
+    k = np.float32(params.sigmas)
+    least = np.full(lattice.shape, np.nan, dtype=np.float32)
+    for dem in inputs["dems"]:
+        own = Lattice.from_dict(dem.meta["lattice"])
+        centre = RigidTransform.from_matrix(dem.meta["T_frame_left"]).translation
+        seen, std = (np.asarray(dem[name], dtype=np.float32) for name in ("elevation", "elevation_std"))
+        if params.max_footprint is not None:
+            covered = footprint(seen, own.xs(), own.ys(), centre, float(dem.meta["pixel_rad"]))
+            seen = np.where(covered <= params.max_footprint, seen, np.float32(np.nan))
+        part = own.intersection(lattice)
+        if part is None:
+            continue
+        found = ceiling(seen + k * std, own, centre)[own.window(part)]
+        here = lattice.window(part)
+        least[here] = np.fmin(least[here], found)
+    bounds, unknown = Bounds.of(z, k * s, least), np.isnan(z)
+    shares = {"unknown": float(unknown.mean()), "bounded": float((unknown & np.isfinite(least)).mean())}
+    meta = {"lattice": lattice.to_dict(), "frame": "world", "shares": shares}
+    return Bundle({"upper": bounds.upper, "lower": bounds.lower}, meta)
+
+
+def _array(name: str, long_name: str) -> Array:
+    return Array(name, ("row", "col"), "float32", "m", long_name, nodata="nan", frame="world")
+
+
+STAGE = Stage(
+    name="ceiling",
+    version=1,
+    summary="between which heights the ground lies: where it was not seen, below the lines of sight over it",
+    params=CeilingParams,
+    inputs=("merged", "dems*"),
+    outputs=(
+        _array("upper", "height that the ground does not exceed"),
+        _array("lower", "height that it does not fall below, where it was seen"),
+    ),
+    run=_run,
+)

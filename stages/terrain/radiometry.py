@@ -1,0 +1,89 @@
+"""Levelling of exposures between elevation models, so that the merged ortho image has no seams of brightness.
+
+Each pair of overlapping models says by what factor one is brighter than the other (stage ``seam``). The factors g of
+all models follow by least squares on their logarithms,
+
+    sum over seams of (log g_b - log g_a + log(grey_b / grey_a) - v . (c_b - c_a))^2 + PULL * sum over models (log g)^2
+
+with the models' centres c. The gradient v takes up what is the same at every step: ground looks darker or brighter from
+near than from afar (fall-off of the lens, light), which is no exposure and would pile up along the way. The second term
+lets a lasting change fade within some models. Factors are rounded to steps that nobody sees: a model that moves a
+little then leaves those of the others as they are, to the bit, and with them every tile that it does not touch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from pydantic import Field
+
+from stages.core.declare import Bundle, Inputs, Params, Stage
+
+STEP = 0.01
+"""Step of log g: half a step is 0.6 of 128 grey values."""
+PULL = 0.05
+"""Weight of the second term: a lasting change fades by 1/e over sqrt(1 / PULL) = 4.5 models of a chain."""
+ACROSS = 0.01
+"""Share of the displacements' sum of squares below which a direction tells no gradient: sway is not the way."""
+MOST = 0.7
+"""Greatest size of log g, a factor of 2: beyond it is not exposure."""
+
+
+class ExposureParams(Params):
+    """Parameters of the stage ``exposure``."""
+
+    level: bool = Field(True, description="whether exposures are levelled in the merged ortho image")
+
+
+def level(centres: Mapping[int, Sequence[float]], ratios: Sequence[tuple[int, int, float]]) -> dict[int, int]:
+    """Steps of log g of each model that is not left as it is.
+
+    Parameters
+    ----------
+    centres : x, y of each model, metres.
+    ratios : (a, b, log(grey_b / grey_a)) of models that overlap.
+    """
+    from scipy.sparse import coo_array, diags_array
+    from scipy.sparse.linalg import spsolve
+
+    if not ratios:
+        return {}
+    at = {pair: i for i, pair in enumerate(sorted(centres))}
+    ordered, n = sorted(ratios), len(at)
+    moved = np.array([np.subtract(centres[b], centres[a]) for a, b, _ in ordered])
+    rows = np.repeat(np.arange(len(ordered)), 4)
+    cols = np.array([k for a, b, _ in ordered for k in (at[a], at[b], n, n + 1)])
+    values = np.column_stack([np.tile([-1.0, 1.0], (len(ordered), 1)), -moved]).ravel()
+    design = coo_array((values, (rows, cols)), shape=(len(ordered), n + 2)).tocsc()
+    wanted = -np.array([ratio for _, _, ratio in ordered])
+    small = ACROSS * max(float((moved**2).sum()), 1e-9)
+    ridge = diags_array(np.array([PULL] * n + [small] * 2))
+    solved = spsolve((design.T @ design + ridge).tocsc(), design.T @ wanted)[:n]
+    steps = np.rint(np.clip(solved, -MOST, MOST) / STEP).astype(int)
+    return {pair: int(steps[i]) for pair, i in at.items() if steps[i]}
+
+
+def _run(params: ExposureParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+    ratios = [
+        (int(seam["other"]), int(seam["pair"]), float(seam["log_ratio"]))
+        for bundle in inputs["seams"]
+        for seam in bundle.meta["seams"]
+        if seam["log_ratio"] is not None
+    ]
+    centres = {int(pair): centre for pair, centre in args["centres"].items()}
+    steps = level(centres, ratios) if params.level else {}
+    found = {str(pair): n for pair, n in sorted(steps.items())}
+    return Bundle({}, {"step": STEP, "steps": found, "seams": len(ratios)})
+
+
+STAGE = Stage(
+    name="exposure",
+    version=1,
+    summary="factors that level the exposures of overlapping elevation models' grey values",
+    params=ExposureParams,
+    inputs=("seams*",),
+    outputs=(),
+    run=_run,
+)

@@ -1,0 +1,90 @@
+"""Slope and shaded relief of an elevation model.
+
+The gradient is that of the plane fitted to the 3 x 3 cells around each, weighted 1, 2, 1 along both axes: Horn's (1981,
+doi:10.1109/PROC.1981.11918) where all nine are known, so that GDAL's and our slopes agree there. Elsewhere the same
+plane is fitted to the known ones, if they determine it.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from stages.core.errors import InputError
+
+Floats = NDArray[np.float64]
+
+LEAST = 6  # of nine cells: the plane has three unknowns, and twice as many do not lie on two lines only
+WEIGHT = (1.0, 2.0, 1.0)
+
+
+def gradient(elevation: ArrayLike, cell: float) -> Floats:
+    """Slope of the terrain towards greater x and greater y (2, rows, cols), metres per metre; NaN unknown.
+
+    Parameters
+    ----------
+    elevation : (rows, cols) metres, NaN unknown; row 0 at the greatest y.
+    cell : side of a cell, metres.
+
+    Raises
+    ------
+    InputError
+        The cell is not positive.
+    """
+    if not cell > 0:
+        raise InputError("RIL-441", f"the cell size {cell} m is not positive")
+    z = np.asarray(elevation, dtype=np.float64)
+    known = np.isfinite(z)
+    middle = np.where(known, z, 0.0)
+    inner = np.pad(np.where(known, z, np.nan), 1, constant_values=np.nan)
+    rows, cols = z.shape
+    # weighted sums of 1, x, y, xx, xy, yy and of z, xz, yz about the middle cell
+    sums = np.zeros((9, rows, cols))
+    count = np.zeros((rows, cols), np.int8)
+    for i, y in enumerate((1.0, 0.0, -1.0)):
+        for j, x in enumerate((-1.0, 0.0, 1.0)):
+            part = inner[i : i + rows, j : j + cols] - middle
+            there = np.isfinite(part)
+            w = np.where(there, WEIGHT[i] * WEIGHT[j], 0.0)
+            rise = np.where(there, part, 0.0)
+            count += there
+            for k, factor in enumerate((1.0, x, y, x * x, x * y, y * y)):
+                sums[k] += w * factor
+            for k, factor in enumerate((1.0, x, y), start=6):
+                sums[k] += w * factor * rise
+    n, sx, sy, xx, xy, yy, sz, xz, yz = sums
+    safe = np.maximum(n, 1.0)
+    xx, xy, yy = xx - sx * sx / safe, xy - sx * sy / safe, yy - sy * sy / safe
+    xz, yz = xz - sx * sz / safe, yz - sy * sz / safe
+    det = xx * yy - xy * xy
+    good = known & (count >= LEAST) & (det > 1e-9)
+    det = np.where(good, det, 1.0)
+    slopes = np.stack([(yy * xz - xy * yz) / det, (xx * yz - xy * xz) / det]) / cell
+    return np.where(good, slopes, np.nan)
+
+
+def slope_deg(elevation: ArrayLike, cell: float) -> NDArray[np.float32]:
+    """Inclination (rows, cols) of the terrain, degrees; NaN unknown."""
+    gx, gy = gradient(elevation, cell)
+    return np.asarray(np.degrees(np.arctan(np.hypot(gx, gy))), np.float32)
+
+
+def hillshade(
+    elevation: ArrayLike, cell: float, *, azimuth_deg: float = 315.0, altitude_deg: float = 45.0
+) -> NDArray[np.uint8]:
+    """Shaded relief (rows, cols), 1 (facing away) to 255 (facing the light), 0 unknown: GDAL's form.
+
+    Parameters
+    ----------
+    elevation, cell : as of :func:`gradient`.
+    azimuth_deg : where the light comes from, degrees clockwise from y; 315 is the upper left, as on maps.
+    altitude_deg : degrees above the horizon.
+    """
+    gx, gy = gradient(elevation, cell)
+    azimuth, altitude = math.radians(azimuth_deg), math.radians(altitude_deg)
+    light = np.cos(altitude) * np.sin(azimuth), np.cos(altitude) * np.cos(azimuth), np.sin(altitude)
+    facing = (light[2] - gx * light[0] - gy * light[1]) / np.sqrt(1.0 + gx * gx + gy * gy)
+    shade = 1.0 + 254.0 * np.maximum(facing, 0.0)
+    return np.where(np.isfinite(shade), np.rint(shade), 0.0).astype(np.uint8)

@@ -1,0 +1,73 @@
+"""The ground that the vehicle stands on at the start, as an elevation model of its own.
+
+No camera of a vehicle sees the ground under it. At the start nothing was seen before, so the operator vouches for a
+disk: the plane that the wheels stand on, with a standard deviation of its own. It is merged like any other model, so
+that what the cameras see of the disk outweighs it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from pydantic import Field
+
+from stages.core.declare import Array, Bundle, Inputs, Params, Stage
+from stages.geometry.geometry import RigidTransform
+from stages.geometry.lattice import Lattice
+
+NOBODY = -1
+"""Pair number of a model that no pair made."""
+
+
+class PadParams(Params):
+    """Parameters of the stage ``pad``."""
+
+    sigma: float = Field(0.03, gt=0, description="wheel diameters; standard deviation of the plane's elevations")
+
+
+def pad(T_world_vehicle: RigidTransform, radius: float, cell: float) -> tuple[Lattice, np.ndarray]:
+    """Elevations (row, col) float32, m, of the vehicle's own ground plane in a disk about it; NaN outside."""
+    x, y, z = T_world_vehicle.translation
+    lattice = Lattice.snap((x - radius, x + radius, y - radius, y + radius), cell)
+    xy = lattice.xy()
+    dx, dy = xy[..., 0] - x, xy[..., 1] - y
+    nx, ny, nz = T_world_vehicle.rotation[:, 2]
+    plane = z - (nx * dx + ny * dy) / nz
+    return lattice, np.where(np.hypot(dx, dy) <= radius, plane, np.nan).astype(np.float32)
+
+
+def _run(params: PadParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+    T_world_left = RigidTransform.from_matrix(np.asarray(inputs["pose"]["poses"])[-1])
+    T_world_vehicle = T_world_left @ RigidTransform.from_matrix(args["T_vehicle_left"]).inverse()
+    lattice, elevation = pad(T_world_vehicle, float(args["radius"]), float(inputs["like"].meta["lattice"]["cell"]))
+    known = np.isfinite(elevation)
+    sigma = np.float32(params.sigma * float(args["wheel_diameter"]))
+    arrays = {
+        "elevation": elevation,
+        "elevation_std": np.where(known, sigma, np.float32(np.nan)).astype(np.float32),
+        "residual": np.where(known, np.float32(0.0), np.float32(np.nan)).astype(np.float32),
+        "ortho": np.full(elevation.shape, np.nan, np.float32),
+    }
+    return Bundle(arrays, {"lattice": lattice.to_dict(), "frame": "world", "pair": NOBODY})
+
+
+def _array(name: str, unit: str, long_name: str) -> Array:
+    return Array(name, ("row", "col"), "float32", unit, long_name, nodata="nan", frame="world")
+
+
+STAGE = Stage(
+    name="pad",
+    version=1,
+    summary="the ground that the vehicle stands on at the start, as the operator vouches for it",
+    params=PadParams,
+    inputs=("pose", "like"),
+    outputs=(
+        _array("elevation", "m", "elevation of the cell centre"),
+        _array("elevation_std", "m", "standard deviation of the elevation"),
+        _array("residual", "px", "none: not measured"),
+        _array("ortho", "grey", "none: not seen"),
+    ),
+    run=_run,
+)

@@ -1,0 +1,90 @@
+"""Which tiles of the world an elevation model touches: known only once its pose is, and small enough to plan by.
+
+The world is cut once for all models, at multiples of a number of cells of the infinite lattice: tile (tx, ty) holds the
+columns ``tx * side .. (tx + 1) * side`` and the lines ``-y / cell`` of ``ty * side .. (ty + 1) * side``. A tile is the
+same one whatever models there are, and depends on those alone that have a defined cell in it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.core.declare import Bundle, Inputs, NoParams, Stage
+from stages.geometry.lattice import Lattice
+
+Tile = tuple[int, int]
+Box = tuple[int, int, int, int]
+"""First column, first line, columns and lines, cells of the infinite lattice (lines count downwards)."""
+
+
+def footprint(defined: NDArray[np.bool_], lattice: Lattice, side: int, margin: int = 0) -> dict[Tile, Box]:
+    """Tiles that have a defined cell, and the box of the defined cells in each.
+
+    Parameters
+    ----------
+    defined : (rows, cols) on ``lattice``.
+    side : cells; side of a tile.
+    margin : cells around a tile that count as its own: what its result may depend on. The box is cut to the tile.
+    """
+    found = {}
+    first_col, first_line = lattice.i0, -lattice.j0
+    for ty in range((first_line - margin) // side, (first_line + lattice.rows - 1 + margin) // side + 1):
+        rows = _span(ty, side, margin, first_line, lattice.rows)
+        for tx in range((first_col - margin) // side, (first_col + lattice.cols - 1 + margin) // side + 1):
+            cols = _span(tx, side, margin, first_col, lattice.cols)
+            inside = defined[rows, cols]
+            if inside.any():
+                lines, columns = (np.flatnonzero(inside.any(axis=axis)) for axis in (1, 0))
+                top, height = _extent(lines + first_line + rows.start, ty * side, side)
+                left, width = _extent(columns + first_col + cols.start, tx * side, side)
+                found[tx, ty] = (left, top, width, height)
+    return found
+
+
+def _span(tile: int, side: int, margin: int, first: int, count: int) -> slice:
+    start = max(tile * side - margin - first, 0)
+    return slice(start, max(min((tile + 1) * side + margin - first, count), start))
+
+
+def _extent(where: NDArray[np.intp], tile: int, side: int) -> tuple[int, int]:
+    """Start and length of what is there, cut to the tile; of what is there in the margin alone, a bare edge cell."""
+    low = min(max(int(where[0]), tile), tile + side - 1)
+    high = max(min(int(where[-1]), tile + side - 1), low)
+    return low, high - low + 1
+
+
+def tile_lattice(boxes: Iterable[Box], cell: float) -> Lattice:
+    """Smallest lattice that holds the boxes: what of a tile is worth computing."""
+    every = list(boxes)
+    left, top = min(b[0] for b in every), min(b[1] for b in every)
+    right, foot = max(b[0] + b[2] for b in every), max(b[1] + b[3] for b in every)
+    return Lattice.at(left, -top, cell, foot - top, right - left)
+
+
+def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+    dem = inputs["dem"]
+    lattice = Lattice.from_dict(dem.meta["lattice"])
+    defined = np.isfinite(dem["elevation"])
+    tiles = footprint(defined, lattice, int(args["side"]), int(args["margin"]))
+    rows, cols = (np.flatnonzero(defined.any(axis=axis)) for axis in (1, 0))
+    box = None
+    if rows.size:
+        shape = int(rows[-1] - rows[0]) + 1, int(cols[-1] - cols[0]) + 1
+        box = Lattice.at(lattice.i0 + int(cols[0]), lattice.j0 - int(rows[0]), lattice.cell, *shape).to_dict()
+    listed = [[*tile, *tiles[tile]] for tile in sorted(tiles)]
+    return Bundle({}, {"pair": dem.meta["pair"], "cell": lattice.cell, "box": box, "tiles": listed})
+
+
+STAGE = Stage(
+    name="footprint",
+    version=1,
+    summary="tiles of the world that an elevation model touches",
+    params=NoParams,
+    inputs=("dem",),
+    outputs=(),
+    run=_run,
+)

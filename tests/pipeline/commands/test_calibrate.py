@@ -1,0 +1,141 @@
+"""The calibration command: real boards against other programs' results, what it writes, and what it complains about."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from raising import raises
+
+from datasets.cameras import read_cameras, rig_of
+from pipeline.commands.calibrate import calibrate, cover
+
+BOARDS = {"chessboard_opencv": ("9x6", 0.025), "chessboard_bumblebee2": ("6x4", 0.03)}
+
+
+@pytest.fixture(scope="module")
+def results(data_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Both sets, calibrated once."""
+    out = {}
+    for name, (corners, square) in BOARDS.items():
+        out[name] = tmp_path_factory.mktemp("boards") / "rig.yaml"
+        sides = [data_dir / name / f"{side}*.jpg" for side in ("left", "right")]
+        assert calibrate(*sides, square=square, corners=corners, output=out[name]) == 0
+    return out
+
+
+@pytest.mark.data
+def test_focal_lengths_are_those_of_opencv(results, data_dir):
+    left, right = read_cameras(results["chessboard_opencv"])
+    reference = cv2.FileStorage(str(data_dir / "chessboard_opencv" / "left_intrinsics.yml"), cv2.FILE_STORAGE_READ)
+    k = reference.getNode("camera_matrix").mat()
+    assert left.lens.camera.fx == pytest.approx(k[0, 0], rel=0.01)
+    assert left.lens.camera.fy == pytest.approx(k[1, 1], rel=0.01)
+    rig, lenses = rig_of(left, right)
+    assert lenses is not None
+    # the right camera stands some 3.3 squares to the right, as the samples' own stereo calibration finds
+    assert rig.baseline == pytest.approx(0.0833, rel=0.01)
+    assert rig.T_right_left.translation[0] < 0
+
+
+@pytest.mark.data
+def test_rig_is_boofcvs(results, data_dir):
+    ours, _ = rig_of(*read_cameras(results["chessboard_bumblebee2"]))
+    other = rig_of(*read_cameras(data_dir / "chessboard_bumblebee2" / "stereo.yaml"))[0]
+    for a, b in ((ours.left, other.left), (ours.right, other.right)):
+        assert a.fx == pytest.approx(b.fx, rel=0.01)
+        assert a.fy == pytest.approx(b.fy, rel=0.01)
+    # BoofCV's lengths are millimetres
+    assert ours.baseline == pytest.approx(other.baseline / (1000 if other.baseline > 1 else 1), rel=0.005)
+    turn = cv2.Rodrigues(ours.T_right_left.rotation @ other.T_right_left.rotation.T)[0]
+    assert np.degrees(np.linalg.norm(turn)) < 0.3
+
+
+@pytest.mark.data
+def test_file_says_how_it_was_found(results):
+    text = results["chessboard_opencv"].read_text()
+    file = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+    assert file.getNode("views").size() == 13
+    assert 0 < file.getNode("standard_deviations").getNode("left_fx").real() < 1
+    assert file.getNode("avg_reprojection_error").real() < 0.25
+    assert file.getNode("square_size").real() == 0.025
+
+
+@pytest.mark.data
+def test_mispaired_view_and_stray_image_are_named(data_dir, tmp_path, capsys):
+    for k in (1, 2, 3, 4, 5, 6, 7):
+        shutil.copy(data_dir / "chessboard_bumblebee2" / f"left{k:02d}.jpg", tmp_path)
+        other = 5 if k == 4 else k  # the right image of another moment
+        source = data_dir / "chessboard_bumblebee2" / f"right{other:02d}.jpg"
+        shutil.copy(source, tmp_path / f"right{k:02d}.jpg")
+    for side in ("left", "right"):
+        cv2.imwrite(str(tmp_path / f"{side}99.jpg"), np.full((480, 640), 90, np.uint8))
+    assert calibrate(tmp_path, tmp_path, square=0.03, corners="6x4", model="radtan4", output=tmp_path / "r.yaml") == 0
+    shown = capsys.readouterr()
+    assert "view 04 is left out" in shown.err
+    assert re.search(r"^99 +left out: no whole board in the left nor in the right image", shown.out, re.MULTILINE)
+    assert "6 used" in shown.out
+    left, _ = read_cameras(tmp_path / "r.yaml")
+    assert left.lens.camera.fx == pytest.approx(524.6, rel=0.01)
+    assert 'file = "r.yaml"' in shown.out
+
+
+def images(folder: Path, count: int = 2) -> Path:
+    folder.mkdir()
+    for k in range(count):
+        for side in ("left", "right"):
+            cv2.imwrite(str(folder / f"{side}{k}.png"), np.full((48, 64), 128, np.uint8))
+    return folder
+
+
+def test_complaints_say_what_to_change(tmp_path):
+    folder = images(tmp_path / "flat")
+    given = {"square": 0.03, "output": tmp_path / "rig.yaml"}
+    with raises("RIL-152", "0.025"):
+        calibrate(folder, folder, **(given | {"square": 25}))
+    with raises("RIL-153"):
+        calibrate(folder, folder, **given)
+    with raises("RIL-309"):
+        calibrate(folder, folder, corners="9x6", **given)
+    with raises("RIL-011"):
+        calibrate(folder / "left*.bmp", folder, **given)
+    (tmp_path / "plain").mkdir()
+    (folder / "left0.png").rename(tmp_path / "plain" / "0.png")
+    with raises("RIL-010"):
+        calibrate(tmp_path / "plain", tmp_path / "plain", **given)
+    assert not (tmp_path / "rig.yaml").exists()
+
+
+def test_cover_is_the_share_of_the_hull():
+    square = np.array([[0, 0], [50, 0], [50, 40], [0, 40], [20, 20]], dtype=float)
+    assert cover([square], (100, 80)) == pytest.approx(0.25)
+
+
+@pytest.mark.data
+def test_pictures_of_a_street_show_no_board(data_dir, tmp_path):
+    sides = [tmp_path / "left", tmp_path / "right"]
+    for side, folder in zip(sides, ("image_l", "image_r"), strict=True):
+        side.mkdir()
+        for path in sorted((data_dir / "kitti06_51" / folder).iterdir())[::10]:
+            shutil.copy(path, side)
+    with raises("RIL-153"):
+        calibrate(*sides, square=0.1, output=tmp_path / "rig.yaml")
+    assert not (tmp_path / "rig.yaml").exists()
+
+
+@pytest.mark.data
+def test_views_of_no_flat_board_write_nothing(data_dir, tmp_path, monkeypatch):
+    """Left and right of different moments throughout: no single rig explains them."""
+    lefts, rights = (
+        [data_dir / "chessboard_bumblebee2" / f"{side}{k:02d}.jpg" for k in range(1, 8)] for side in ("left", "right")
+    )
+    for k, (left, right) in enumerate(zip(lefts, rights[3:] + rights[:3], strict=True)):
+        shutil.copy(left, tmp_path / f"left{k}.jpg")
+        shutil.copy(right, tmp_path / f"right{k}.jpg")
+    with raises("RIL-800", "6 x 4"):
+        calibrate(tmp_path, tmp_path, square=0.03, corners="6x4", keep_bad=True, output=tmp_path / "rig.yaml")
+    assert not (tmp_path / "rig.yaml").exists()

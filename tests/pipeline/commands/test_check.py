@@ -1,0 +1,141 @@
+"""The check on small folders of pairs, sound ones and ones with a fault each."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from raising import raises
+
+from datasets.registry import open_sequence
+from pipeline.commands.check import check
+
+ROWS, COLUMNS, MARGIN = 120, 200, 40
+
+
+def texture() -> np.ndarray:
+    rng = np.random.default_rng(3)
+    fine, coarse = (rng.standard_normal((ROWS + 2 * MARGIN, COLUMNS + 4 * MARGIN)) for _ in range(2))
+    mixed = 2.0 * cv2.GaussianBlur(fine, (0, 0), 1.2) + 6.0 * cv2.GaussianBlur(coarse, (0, 0), 5.0)
+    return 128 + 45 * mixed / mixed.std()
+
+
+def cut(image: np.ndarray, row: float, column: float) -> np.ndarray:
+    """A window whose top left pixel is at (row, column) of the texture."""
+    shift = np.array([[1.0, 0.0, -column], [0.0, 1.0, -row]])
+    moved = cv2.warpAffine(image, shift, (COLUMNS, ROWS), flags=cv2.INTER_CUBIC)
+    return np.clip(moved, 0, 255).round().astype(np.uint8)
+
+
+def folder(path: Path, *, rows: float = 0.0, frames: int = 4) -> Path:
+    """Pairs of a wall 4 m away: 8 px of disparity at f = 200 px and b = 0.16 m; it moves 5 px a frame."""
+    wall = texture()
+    for side in ("left", "right"):
+        (path / side).mkdir(parents=True)
+    for k in range(frames):
+        at = MARGIN + 5.0 * k
+        cv2.imwrite(str(path / "left" / f"{k:03d}.png"), cut(wall, MARGIN, at))
+        cv2.imwrite(str(path / "right" / f"{k:03d}.png"), cut(wall, MARGIN - rows, at + 8.0))
+    k = "200 0 99.5 {} 0 200 59.5 0 0 0 1 0\n"
+    (path / "calib.txt").write_text(k.format(0) + k.format(-200 * 0.16))
+    return path
+
+
+def run(path: Path, capsys: pytest.CaptureFixture[str], **kw) -> tuple[int, list[str]]:
+    sequence = open_sequence(str(path))
+    code = check(sequence, output=path.parent / "check.png", cache=path.parent / "cache", **kw)
+    return code, capsys.readouterr().out.splitlines()
+
+
+def line(lines: list[str], subject: str) -> str:
+    return next(text for text in lines if text[6:].startswith(subject))
+
+
+def test_a_sound_folder_passes(tmp_path, capsys):
+    code, lines = run(folder(tmp_path / "wall"), capsys)
+    assert code == 0
+    assert not [text for text in lines if text.startswith(("WARN", "FAIL"))]
+    assert "median 4 m" in line(lines, "matching")
+    assert "left is left" in line(lines, "sides")
+    assert "4 of 4 pairs" in line(lines, "sequence")
+    picture = cv2.imread(str(tmp_path / "check.png"))
+    assert min(picture.shape[:2]) > 300
+
+
+def test_swapped_folders_fail(tmp_path, capsys):
+    path = folder(tmp_path / "wall")
+    (path / "left").rename(path / "old")
+    (path / "right").rename(path / "left")
+    (path / "old").rename(path / "right")
+    code, lines = run(path, capsys)
+    assert code == 1
+    assert line(lines, "sides").startswith("FAIL")
+    assert "swapped" in line(lines, "sides")
+
+
+def test_rows_that_are_off_are_measured(tmp_path, capsys):
+    code, lines = run(folder(tmp_path / "wall", rows=3.0), capsys)
+    assert code == 0
+    text = line(lines, "epipolar")
+    assert text.startswith("WARN")
+    # the right image's content lies 3 px lower; matching on smooth texture errs by hundredths
+    assert float(text.split("row offset")[1].split()[0]) == pytest.approx(3.0, abs=0.1)
+
+
+def test_damaged_images_are_named_and_the_rest_is_looked_at(tmp_path, capsys):
+    path = folder(tmp_path / "wall")
+    broken = path / "right" / "000.png"
+    broken.write_bytes(broken.read_bytes()[:-200])
+    code, lines = run(path, capsys)
+    assert code == 1
+    assert any("000.png" in text and "truncated" in text for text in lines)
+    assert any("1 of 8 cannot be used" in text for text in lines)
+    assert line(lines, "matching").startswith("OK")
+
+
+def test_nothing_whole_is_no_crash(tmp_path, capsys):
+    path = folder(tmp_path / "wall", frames=1)
+    for side in ("left", "right"):
+        file = path / side / "000.png"
+        file.write_bytes(file.read_bytes()[:-200])
+    code, lines = run(path, capsys)
+    assert code == 1
+    assert any("no pair is whole" in text for text in lines)
+    assert not (tmp_path / "check.png").exists()
+
+
+def test_blurred_and_repeated_images(tmp_path, capsys):
+    path = folder(tmp_path / "wall")
+    blurred = path / "left" / "002.png"
+    cv2.imwrite(str(blurred), cv2.GaussianBlur(cv2.imread(str(blurred), 0), (0, 0), 2.0))
+    (path / "right" / "003.png").write_bytes((path / "right" / "002.png").read_bytes())
+    _, lines = run(path, capsys)
+    assert any("1 left images are blurred, the worst frame 002" in text for text in lines)
+    assert any("1 right images repeat the one before, first frame 003" in text for text in lines)
+
+
+def test_one_image_for_both_sides_fails(tmp_path, capsys):
+    path = folder(tmp_path / "wall", frames=2)
+    for k in range(2):
+        (path / "right" / f"{k:03d}.png").write_bytes((path / "left" / f"{k:03d}.png").read_bytes())
+    code, lines = run(path, capsys)
+    assert code == 1
+    assert any("one image in 2 pairs" in text for text in lines)
+
+
+def test_frames_are_chosen_and_warnings_repeated(tmp_path, capsys):
+    sequence = replace(open_sequence(str(folder(tmp_path / "wall"))), warnings=("the baseline is odd",))
+    assert check(sequence, output=tmp_path / "a.png", frames=(1, 3), cache=tmp_path / "cache") == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert "2 of 4 pairs" in line(lines, "sequence")
+    assert "WARN  input         the baseline is odd" in lines
+    assert "from frame 001 to 003" in line(lines, "motion")
+
+
+def test_a_picture_that_cannot_be_written_says_so(tmp_path, capsys):
+    sequence = open_sequence(str(folder(tmp_path / "wall", frames=1)))
+    with raises("RIL-016"):
+        check(sequence, output=tmp_path / "no" / "such" / "a.png", cache=tmp_path / "cache")

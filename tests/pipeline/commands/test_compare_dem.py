@@ -1,0 +1,130 @@
+"""``rille compare-dem``: figures with a known answer, and one clear line for what cannot be compared."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+from rasterio.transform import from_origin
+from terrain_runs import LATTICE, PLACE, elevation, finished, hills
+
+from pipeline import cli
+from pipeline.commands import compare_dem
+from pipeline.commands.compare_dem import compare
+from pipeline.export.terrain_zarr import write_terrain
+from stages.terrain import merge
+
+
+def tiff(path: Path, values: np.ndarray, cell: float, x0: float, y0: float, **more: object) -> Path:
+    """Raster of any program: upper left corner at (x0, y0)."""
+    unit = more.pop("unit", "metre")
+    about = {"height": values.shape[0], "width": values.shape[1], "transform": from_origin(x0, y0, cell, cell)} | more
+    with rasterio.open(path, "w", driver="GTiff", count=1, dtype="float32", nodata=-9999.0, **about) as file:
+        file.write(np.where(np.isfinite(values), values, -9999.0).astype(np.float32), 1)
+        file.units = (unit,)
+    return path
+
+
+def test_a_lifted_run_against_its_own_zarr(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = finished(tmp_path / "run", lift=0.25)
+    specs = {spec.name: spec for spec in merge.STAGE.outputs}
+    write_terrain(tmp_path / "b.zarr", {"elevation": (specs["elevation"], elevation())}, LATTICE, None, {})
+    assert compare(run, tmp_path / "b.zarr", output=tmp_path / "out") == 0
+    found = json.loads((tmp_path / "out.json").read_text())
+    assert found["figures"]["bias"] == pytest.approx(0.25, abs=1e-6)
+    assert found["figures"]["nmad"] == pytest.approx(0.0, abs=1e-6)
+    assert found["completeness"]["of_b"] == 1.0
+    assert found["resampling"] == "the same cells, nothing resampled"
+    assert sum(f["cells"] for f in found["by_range"]["bins"]) == np.isfinite(elevation()).sum()
+    # the camera of the run is at (0, 1): the farthest known cell
+    far = np.linalg.norm(LATTICE.xy() - [0.0, 1.0], axis=-1)[np.isfinite(elevation())].max()
+    assert found["by_range"]["bins"][-1]["to"] == pytest.approx(far, rel=1e-6)
+    assert "before" not in capsys.readouterr().out
+    assert (tmp_path / "out.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One picture in this file is enough."""
+    monkeypatch.setattr(compare_dem, "draw", lambda *_: None)
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_a_coarse_raster_of_another_program(tmp_path: Path) -> None:
+    x0, x1, _, y1 = LATTICE.bounds
+    centres = np.stack(np.meshgrid(x0 + 0.1 + 0.2 * np.arange(17), y1 - 0.1 - 0.2 * np.arange(15)), axis=-1)
+    coarse = tiff(tmp_path / "coarse.tif", hills(centres), 0.2, x0, y1)
+    assert x1 > centres[..., 0].max()
+    compare(finished(tmp_path / "run"), coarse, output=tmp_path / "out")
+    found = json.loads((tmp_path / "out.json").read_text())
+    assert "A averaged from 0.05 m to 0.2 m" in found["resampling"]
+    # mean over a cell against its centre: h^2/24 (z_xx + z_yy), z_xx <= 0.1 * 4, z_yy <= 0.1 * 2.25
+    assert found["figures"]["p95"] < 0.2**2 / 24 * 0.1 * (4 + 2.25) + 1e-6
+    # the unknown corner of A, 9 x 11 fine cells, takes 2 x 2 coarse cells and those that it covers by half or more
+    assert found["completeness"]["of_b"] == pytest.approx(1 - 2 * 3 / coarse_cells(found), abs=1e-9)
+    assert "states no CRS" in found["warnings"][0]
+
+
+def coarse_cells(found: dict) -> int:
+    return int(found["b"]["rows"] * found["b"]["cols"])
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_alignment_is_told_and_never_silent(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    a, b = finished(tmp_path / "a", lift=0.25), finished(tmp_path / "b")
+    compare(a, b, align="tilt", output=tmp_path / "out.png")
+    found = json.loads((tmp_path / "out.json").read_text())
+    assert found["alignment"]["motion_of_a"]["z_m"] == pytest.approx(-0.25, abs=1e-6)
+    assert set(found["alignment"]["motion_of_a"]) == {"z_m", "about_x_deg", "about_y_deg"}
+    assert found["before_alignment"]["bias"] == pytest.approx(0.25, abs=1e-6)
+    assert abs(found["figures"]["bias"]) < 1e-6
+    printed = capsys.readouterr().out
+    assert "aligned (tilt): A was moved by z_m -0.25" in printed
+    assert "before  RMSE 250 mm" in printed
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_georeferenced_runs_compare_in_their_own_system(tmp_path: Path) -> None:
+    a, b = finished(tmp_path / "a", PLACE, lift=0.5), finished(tmp_path / "b", PLACE)
+    compare(a, b, output=tmp_path / "out")
+    found = json.loads((tmp_path / "out.json").read_text())
+    assert found["figures"]["median"] == pytest.approx(0.5, abs=2e-4)
+    assert found["a"]["crs"] == "WGS 84 / UTM zone 33N"
+    assert found["by_range"]["bins"][-1]["to"] < 6.0
+
+
+def refused(capsys: pytest.CaptureFixture[str], *words: object) -> str:
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["compare-dem", *(str(w) for w in words)])
+    assert stop.value.code in (1, 2)
+    out, err = capsys.readouterr()
+    assert not out
+    assert err.count("\n") == 1
+    return err
+
+
+def test_one_clear_line_for_what_cannot_be_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run, z = finished(tmp_path / "run"), elevation()
+    away = tiff(tmp_path / "away.tif", z, 0.05, 1000.0, 2000.0)
+    utm = tiff(tmp_path / "utm.tif", z, 0.05, -1.0, 4.5, crs="EPSG:32633")
+    degrees = tiff(tmp_path / "degrees.tif", z, 0.05, -1.0, 4.5, crs="EPSG:4326")
+    feet = tiff(tmp_path / "feet.tif", z, 0.05, -1.0, 4.5, unit="foot")
+    empty = tiff(tmp_path / "empty.tif", np.full_like(z, np.nan), 0.05, -1.0, 4.5)
+    (tmp_path / "text.tif").write_text("no raster")
+    (tmp_path / "folder").mkdir()
+    assert "none.tif does not exist" in refused(capsys, run, tmp_path / "none.tif")
+    assert "no overlap: A is at x -1.025..2.475" in refused(capsys, run, away)
+    told = refused(capsys, run, utm)
+    assert "Rille world frame" in told
+    assert "UTM zone 33N" in told
+    assert "EPSG:4326" in refused(capsys, degrees, run)
+    assert "elevations in 'foot'" in refused(capsys, feet, run)
+    assert f"no known cell among {z.size}" in refused(capsys, empty, run)
+    assert "cannot be read as a raster" in refused(capsys, tmp_path / "text.tif", run)
+    assert "has no dem.tif" in refused(capsys, tmp_path / "folder", run)
+    shutil.copy(run / "dem.tif", tmp_path / "same.tif")
+    assert "too flat" not in refused(capsys, run, run, "--align", "nothing")

@@ -1,0 +1,126 @@
+"""``rille init``: where the manifest goes, what is printed, and that nothing is overwritten."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from raising import raises
+
+from datasets.files import Digests
+from datasets.manifest import open_manifest
+from pipeline.commands.init import init
+
+SETTINGS = """%YAML:1.0
+Camera.fx: 60.0
+Camera.fy: 60.0
+Camera.cx: 31.5
+Camera.cy: 23.5
+Camera.k1: 0.0
+Camera.k2: 0.0
+Camera.p1: 0.0
+Camera.p2: 0.0
+Camera.width: 64
+Camera.height: 48
+Camera.bf: 6.0
+"""
+
+
+@pytest.fixture
+def drive(tmp_path, monkeypatch) -> Path:
+    """A folder of two pairs, without calibration; the present folder is another one."""
+    folder = tmp_path / "drive"
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    for side in ("left", "right"):
+        (folder / side).mkdir(parents=True)
+        for k in range(2):
+            cv2.imwrite(str(folder / side / f"{k}.png"), np.zeros((48, 64), np.uint8))
+    return folder
+
+
+def test_a_calibrated_folder_needs_nothing_more(drive, capsys):
+    (drive / "calibration.yaml").write_text(SETTINGS)
+    assert init(drive) == 0
+    path = Path("drive.rille.toml")
+    printed = capsys.readouterr().out
+    assert "2 pairs, 64 x 48 pixels: left/*.png and right/*.png" in printed
+    assert "calibration.yaml, baseline 0.1" in printed
+    assert f"rille reconstruct {path}" in printed
+    assert "edit" not in printed
+    s = open_manifest(path, Digests())
+    assert (s.name, s.frames, s.rig.baseline) == ("drive", 2, pytest.approx(0.1))
+
+
+def test_what_is_needed_is_printed(drive, capsys):
+    init(drive)
+    printed = capsys.readouterr().out
+    assert "needed       no calibration was found" in printed
+    assert "edit drive.rille.toml" in printed
+
+
+@pytest.mark.parametrize(("place", "root"), [(".", "drive"), ("drive/left", ".."), ("far/away", None)])
+def test_elsewhere_the_manifest_still_finds_its_folder(drive, tmp_path, place, root):
+    (drive / "calibration.yaml").write_text(SETTINGS)
+    (tmp_path / place).mkdir(parents=True, exist_ok=True)
+    path = tmp_path / place / "m.toml"
+    init(drive, path)
+    assert f'root = "{root or drive}"' in path.read_text()
+    assert open_manifest(path, Digests()).frames == 2
+
+
+def test_nothing_is_overwritten_without_force(drive):
+    path = drive / "m.toml"
+    path.write_text("mine")
+    with raises("RIL-038", "m.toml"):
+        init(drive, path)
+    assert path.read_text() == "mine"
+    init(drive, path, force=True)
+    assert path.read_text() != "mine"
+    init(drive)
+    with raises("RIL-038", "drive.rille.toml"):
+        init(drive)
+    init(drive, force=True)
+
+
+def test_a_folder_that_opens_as_it_is_gets_no_manifest_unasked(drive, tmp_path, capsys):
+    rows = ["60 0 31.5 0 0 60 23.5 0 0 0 1 0", "60 0 31.5 -12 0 60 23.5 0 0 0 1 0"]
+    (drive / "calib.txt").write_text("\n".join(rows))
+    assert init(drive) == 0
+    printed = capsys.readouterr().out
+    assert f"{drive} opens as it is" in printed
+    assert f"rille reconstruct {drive}\n" in printed
+    assert not list(drive.glob("*.toml"))
+    init(drive, tmp_path / "m.toml")
+    assert (tmp_path / "m.toml").is_file()
+
+
+def test_what_does_not_open_is_not_said_to(drive, capsys):
+    (drive / "calib.txt").write_text("60 0 31.5\n")
+    assert init(drive) == 0
+    printed = capsys.readouterr().out
+    assert "opens as it is" not in printed
+    assert "calib.txt" in printed.splitlines()[0]
+    assert "needed" in printed
+
+
+@pytest.mark.parametrize("pair", [("image_00", "image_01"), ("image_02", "image_03")])
+def test_image_folders_of_raw_recordings_open_with_their_calibration(drive, capsys, pair):
+    rows = {1: "60 0 31.5 -12 0 60 23.5 0 0 0 1 0", 0: "60 0 31.5 0 0 60 23.5 0 0 0 1 0"}
+    for side, name in zip(("left", "right"), pair, strict=True):
+        (drive / side).rename(drive / name)
+    lines = ["calib_time: 09-Jan-2012 13:57:47", "S_00: 80 60", "K_00: 70 0 40 0 70 30 0 0 1"]
+    (drive / "calib.txt").write_text("\n".join(lines + [f"P_rect_0{k}: {rows[k % 2]}" for k in range(4)]))
+    assert init(drive) == 0
+    assert "opens as it is" in capsys.readouterr().out
+
+
+def test_places_that_cannot_be_written(drive, tmp_path):
+    with raises("RIL-039", "m.toml"):
+        init(drive, tmp_path / "nowhere" / "m.toml")
+    with raises("RIL-037", "m.yaml"):
+        init(drive, tmp_path / "m.yaml")
+    with raises("RIL-193"):
+        init(tmp_path / "nothing")

@@ -1,0 +1,190 @@
+"""Verdicts on hand-made figures: each threshold from both sides."""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+import pytest
+
+from datasets.protocol import Positions
+from pipeline.commands import input_checks
+from stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
+from stages.imaging.image_quality import Look, look
+
+CAMERA = Camera(500.0, 500.0, 160.0, 120.0, 320, 240)
+
+
+def levels(found):
+    return [v.level for v in found]
+
+
+def rig(x: float, right: Camera = CAMERA) -> Rig:
+    return Rig(CAMERA, right, RigidTransform(np.eye(3), np.array([x, 0.0, 0.0])))
+
+
+@pytest.mark.parametrize(
+    ("x", "level"), [(-0.12, "OK"), (-97.0, "WARN"), (-0.001, "WARN"), (0.12, "FAIL"), (-4.9, "OK")]
+)
+def test_baseline_and_sides(x, level):
+    assert levels(input_checks.judge_rig(rig(x))) == [level]
+
+
+def test_two_lenses():
+    assert levels(input_checks.judge_rig(rig(-0.1, Camera(700.0, 700.0, 160.0, 120.0, 320, 240)))) == ["WARN"]
+
+
+def test_times():
+    assert levels(input_checks.judge_times(None)) == levels(input_checks.judge_times([3.0])) == ["OK"]
+    assert "10 frames a second over 0.3 s" in input_checks.judge_times([0.0, 0.1, 0.2, 0.3])[0].text
+    (gap,) = input_checks.judge_times([0.0, 0.1, 0.2, 0.6, 0.7])
+    assert gap.level == "WARN"
+    assert "0.4 s from frame 2 to 3" in gap.text
+    (back,) = input_checks.judge_times([0.0, 0.1, 0.1, 0.2])
+    assert back.level == "FAIL"
+    assert "frame 1 to 2" in back.text
+
+
+def poses(count: int) -> list[RigidTransform]:
+    return [RigidTransform(rotation_exp([0.0, 0.1 * k, 0.0]), np.array([0.0, 0.0, 2.0 * k])) for k in range(count)]
+
+
+def test_truth_coverage_and_length():
+    assert "none" in input_checks.judge_truth(None, [0])[0].text
+    places = Positions(((0.0, 0.0), (3.0, 4.0)), (0.0, 1.0))
+    (alone,) = input_checks.judge_truth(None, range(4), places)
+    assert (alone.level, "positions only" in alone.text, "5 m" in alone.text) == ("OK", True, True)
+    (full,) = input_checks.judge_truth(poses(4), range(4))
+    assert (full.level, full.text) == ("OK", "4 of 4 frames, 6 m")
+    (part,) = input_checks.judge_truth([*poses(3), None], range(4))
+    assert part.level == "WARN"
+    assert "3 of 4" in part.text
+
+
+def test_attitude_against_truth():
+    truth = poses(4)
+    right = [tuple(map(tuple, T.rotation)) for T in truth]
+    reference = rotation_exp([0.3, -0.2, 1.0])  # any inertial frame
+    turned = [tuple(map(tuple, reference @ T.rotation)) for T in truth]
+    inverse = [tuple(map(tuple, T.rotation.T)) for T in truth]
+    assert input_checks.judge_attitude(None, truth, range(4)) == []
+    assert levels(input_checks.judge_attitude(right, truth, range(4))) == ["OK"]
+    assert levels(input_checks.judge_attitude(turned, truth, range(4))) == ["OK"]
+    (wrong,) = input_checks.judge_attitude(inverse, truth, range(4))
+    assert wrong.level == "FAIL"
+    assert f"{2 * math.degrees(0.1):.1f} degrees" in wrong.text
+    assert levels(input_checks.judge_attitude([*right[:3], None], truth, range(4))) == ["WARN"]
+
+
+def test_up_points_up():
+    assert input_checks.judge_up(None, [0]) == []
+    assert levels(input_checks.judge_up([(0.0, -1.0, 0.0)], [0])) == ["OK"]
+    assert levels(input_checks.judge_up([(0.0, 1.0, 0.0)], [0])) == ["WARN"]
+    assert levels(input_checks.judge_up([None], [0])) == ["WARN"]
+
+
+def test_look_of_a_known_image():
+    image = np.full((60, 80), 100, np.uint8)
+    image[:, :20] = 255
+    image[:, 20:25] = 0
+    found = look(image, np.ones(image.shape, np.uint8))
+    assert found.bright == pytest.approx(0.25)
+    assert found.dark == pytest.approx(0.0625)
+    assert found.mean == pytest.approx((20 * 255 + 55 * 100) / 80)
+    masked = np.ones(image.shape, np.uint8)
+    masked[:, :25] = 0
+    assert look(image, masked).deviation == 0
+    assert math.isnan(look(image, np.zeros_like(masked)).mean)
+    assert look(image.astype(np.uint16) * 257, np.ones(image.shape, np.uint8)).mean == pytest.approx(found.mean)
+
+
+def test_sharpness_falls_with_blur_and_not_with_contrast():
+    rng = np.random.default_rng(0)
+    image = 128 + 60 * cv2.GaussianBlur(rng.standard_normal((120, 160)), (0, 0), 0.8)
+    valid = np.ones(image.shape, np.uint8)
+    sharp = look(image, valid).sharpness
+    assert look(128 + 0.3 * (image - 128), valid).sharpness == pytest.approx(sharp, rel=1e-3)
+    blurred = look(cv2.GaussianBlur(image, (0, 0), 1.5), valid).sharpness
+    assert blurred < input_checks.BLURRED * sharp
+
+
+def looks(left: list[Look], right: list[Look]):
+    return {"left": dict(enumerate(left)), "right": dict(enumerate(right))}
+
+
+GOOD = Look(100.0, 40.0, 0.0, 0.0, 1.0)
+NAMES = [f"f{k}" for k in range(5)]
+
+
+def changed(**values: float) -> Look:
+    return Look(**{**GOOD.__dict__, **values})
+
+
+def test_good_images_give_two_lines():
+    assert levels(input_checks.judge_looks(looks([GOOD] * 5, [GOOD] * 5), NAMES)) == ["OK", "OK"]
+
+
+@pytest.mark.parametrize(
+    ("left", "right", "level", "words"),
+    [
+        ([GOOD] * 4 + [changed(sharpness=0.4)], [GOOD] * 5, "WARN", "frame f4 (40 % of usual)"),
+        ([GOOD] * 5, [changed(sharpness=0.5)] * 5, "WARN", "right is 0.50 as sharp"),
+        ([GOOD] * 5, [changed(mean=40.0)] * 5, "WARN", "right is 0.40 as bright"),
+        ([GOOD] * 3 + [changed(mean=180.0)] * 2, [GOOD] * 5, "WARN", "jumps by 1.80 from frame f2 to f3"),
+        ([changed(bright=0.5)] * 5, [GOOD] * 5, "WARN", "50 % of the left images is white"),
+        ([GOOD] * 5, [changed(deviation=0.1)] + [GOOD] * 4, "FAIL", "1 right images show nothing, first frame f0"),
+    ],
+)
+def test_bad_images_are_told(left, right, level, words):
+    found = input_checks.judge_looks(looks(left, right), NAMES)
+    assert any(v.level == level and words in v.text for v in found)
+
+
+@pytest.mark.parametrize(("share", "level"), [(0.0, "OK"), (0.2, "WARN"), (0.97, "FAIL")])
+def test_sides(share, level):
+    assert levels(input_checks.judge_sides(share)) == [level]
+
+
+def facts(before: float, after: float, offset: float = 0.0):
+    return {"residual_before_px": before, "residual_after_px": after, "row_offset": offset, "roll_deg": 0.1}
+
+
+@pytest.mark.parametrize(
+    ("given", "level", "words"),
+    [
+        (facts(0.3, 0.3), "OK", "roll +0.100"),
+        (facts(3.2, 0.4, 3.1), "WARN", "repairs"),
+        (facts(0.7, 0.4, -0.6), "WARN", "repairs"),
+        (facts(2.5, 2.0), "WARN", "distortion"),
+        (facts(40.0, 20.0), "FAIL", "no rig explains"),
+        ({"words": "not checked: 3 matches"}, "WARN", "3 matches"),
+    ],
+)
+def test_epipolar(given, level, words):
+    (found,) = input_checks.judge_epipolar(given)
+    assert found.level == level
+    assert words in str(found)
+
+
+def test_matching():
+    depths = np.linspace(2.0, 4.0, 101)
+    (good,) = input_checks.judge_matching(0.7, depths, 0.1)
+    assert good.level == "OK"
+    assert "depth 2.1 to 3.9 m, median 3 m" in good.text
+    assert levels(input_checks.judge_matching(0.1, depths, 0.1)) == ["WARN"]
+    assert levels(input_checks.judge_matching(0.001, depths, 0.1)) == ["FAIL"]
+    assert levels(input_checks.judge_matching(None, depths[:0], 0.1)) == ["FAIL"]
+    assert levels(input_checks.judge_matching(0.7, 100 * depths, 0.1)) == ["WARN"]
+
+
+@pytest.mark.parametrize(("overlap", "level"), [(0.8, "OK"), (0.3, "WARN"), (0.05, "FAIL"), (None, "FAIL")])
+def test_motion(overlap, level):
+    motions = {(0, 1): {"overlap": 0.8, "median_length": 12.0}, (1, 2): {"overlap": overlap, "median_length": None}}
+    (found,) = input_checks.judge_motion(motions, NAMES)
+    assert found.level == level
+    assert "12.0 px" in found.text
+
+
+def test_one_frame_has_no_motion():
+    assert levels(input_checks.judge_motion({}, NAMES)) == ["OK"]

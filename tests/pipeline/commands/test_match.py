@@ -1,0 +1,204 @@
+"""``rille match``: files in, two-band disparity out; prior, confidence, progress, warnings; one line where it fails."""
+
+import io
+
+import cv2
+import numpy as np
+import pytest
+import rasterio
+from raising import raises
+
+from pipeline.cli import main
+from pipeline.commands import match as command
+from pipeline.export.writers import read_disparity, write_disparity
+from stages.core.validity import Validity
+
+SHIFT = -9.0
+
+
+def texture(shape=(96, 140), seed=0):
+    rng = np.random.default_rng(seed)
+    image = cv2.GaussianBlur(rng.uniform(0, 255, shape), (0, 0), 1.6)
+    return np.clip(128 + 45 * (image - image.mean()) / image.std(), 0, 255).astype(np.uint8)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A left and a right image, the right one's content 9 columns to the left."""
+    wide = texture((96, 160))
+    cv2.imwrite(str(tmp_path / "left.png"), wide[:, :140])
+    cv2.imwrite(str(tmp_path / "right.png"), wide[:, 9:149])
+    return tmp_path
+
+
+def run(folder, left="left.png", right="right.png", **options):
+    options = {"preset": None, "dense": False, "assignments": ()} | options
+    return command.match_files(folder / left, folder / right, folder / "out.tif", **options)
+
+
+def test_writes_two_named_bands_and_says_what_it_found(folder, capsys):
+    assert run(folder) == 0
+    with rasterio.open(folder / "out.tif") as file:
+        assert file.descriptions == ("column_disparity", "row_disparity")
+        assert file.units == ("pixel", "pixel")
+        assert file.tags()["LEFT"] == "left.png"
+        column, row = file.read()
+    ok = np.isfinite(column)
+    assert ok.mean() > 0.8
+    assert np.median(column[ok]) == pytest.approx(SHIFT, abs=0.05)
+    assert np.median(np.abs(row[ok])) < 0.05
+    out = capsys.readouterr()
+    assert "matched" in out.out
+    assert "standard deviation 0.1" in out.out
+    assert out.err == ""
+
+
+def test_confidence_has_three_bands_that_fit_the_disparity(folder):
+    run(folder, confidence=folder / "sure.tif")
+    column, _ = read_disparity(folder / "out.tif")
+    with rasterio.open(folder / "sure.tif") as file:
+        assert file.descriptions == ("disparity_std", "validity", "backmatch_error")
+        assert "1 matched" in file.tags()["VALIDITY"]
+        std, validity, error = file.read()
+    bits = validity.astype(np.uint8)
+    np.testing.assert_array_equal(bits, validity)
+    ok = (bits & Validity.MATCHED) != 0
+    np.testing.assert_array_equal(ok, np.isfinite(column))
+    np.testing.assert_array_equal(ok, np.isfinite(std))
+    assert (error[ok] <= 1).all()
+    with raises("RIL-043"):
+        run(folder, confidence=folder / "out.tif")
+
+
+def test_prior_as_written_is_read_and_used(folder):
+    run(folder)
+    plain = read_disparity(folder / "out.tif")
+    (folder / "out.tif").rename(folder / "before.tif")
+    assert run(folder, prior=folder / "before.tif") == 0
+    led = read_disparity(folder / "out.tif")
+    both = np.isfinite(plain[0]) & np.isfinite(led[0])
+    assert both.sum() > 0.97 * np.isfinite(plain[0]).sum()
+    # A few pixels by the edge of a gap take the refinement's steps from another start.
+    apart = np.abs(plain[0][both] - led[0][both])
+    assert np.mean(apart > 0.1) < 0.002
+    assert apart.max() < 0.5
+
+
+def test_a_prior_decides_where_the_images_leave_the_choice(folder):
+    y, x = np.indices((100, 200), dtype=np.float64)
+    posts = lambda x: (128 + 40 * np.sin(np.pi * x / 8) + 25 * np.sin(y / 4)).astype(np.uint8)  # noqa: E731
+    for name, image in (("left.png", posts(x)), ("right.png", posts(x + 32))):
+        cv2.imwrite(str(folder / name), image)
+    write_disparity(folder / "prior.tif", np.full(x.shape, -31.0), np.zeros(x.shape), {})
+    run(folder, prior=folder / "prior.tif")
+    column, _ = read_disparity(folder / "out.tif")
+    assert np.nanmedian(column[20:80, 70:180]) == pytest.approx(-32, abs=0.3)
+
+
+def test_priors_that_are_none(folder):
+    write_disparity(folder / "small.tif", np.zeros((5, 6)), np.zeros((5, 6)), {})
+    with raises("RIL-044", "6 x 5", "140 x 96"):
+        run(folder, prior=folder / "small.tif")
+    nothing = np.full((96, 140), np.nan)
+    write_disparity(folder / "nothing.tif", nothing, nothing, {})
+    with raises("RIL-045"):
+        run(folder, prior=folder / "nothing.tif")
+    with raises("RIL-623"):
+        run(folder, prior=folder / "left.png")
+    (folder / "text.tif").write_text("no image")
+    for name, code in (("text.tif", "RIL-623"), ("absent.tif", "RIL-138")):
+        with raises(code, name):
+            run(folder, prior=folder / name)
+
+
+def test_swapped_images_are_said_to_be(folder, capsys):
+    run(folder)
+    assert capsys.readouterr().err == ""
+    run(folder, "right.png", "left.png")
+    err = capsys.readouterr().err
+    assert err.startswith("rille: warning: ")
+    assert "swapped" in err
+    assert "+9.0 px" in err
+    assert err.count("\n") == 1
+
+
+def test_a_mostly_blank_pair_says_why_little_matches(folder, capsys):
+    for side in ("left", "right"):
+        image = cv2.imread(str(folder / f"{side}.png"), cv2.IMREAD_GRAYSCALE)
+        image[40:] = 255
+        cv2.imwrite(str(folder / f"{side}.png"), image)
+    assert run(folder) == 0
+    out, err = capsys.readouterr()
+    assert err.startswith("rille: warning: ")
+    assert "% of the pixels have no texture" in err
+    assert float(out.split("matched ")[1].split(" ")[0]) > 20
+
+
+@pytest.mark.parametrize("what", ["other", "black", "white", "noise"])
+def test_unrelated_images_give_an_almost_empty_file_and_one_warning(folder, capsys, what):
+    image = {
+        "other": texture(seed=5),
+        "black": np.zeros((96, 140), np.uint8),
+        "white": np.full((96, 140), 255, np.uint8),
+        "noise": np.random.default_rng(2).integers(0, 256, (96, 140)).astype(np.uint8),
+    }[what]
+    cv2.imwrite(str(folder / "right.png"), image)
+    if what in ("black", "white"):
+        cv2.imwrite(str(folder / "left.png"), image)
+    assert run(folder) == 3
+    column, _ = read_disparity(folder / "out.tif")
+    assert np.isfinite(column).mean() <= 0.05
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1
+    assert "of the pixels match" in err
+    assert ("texture" in err) == (what in ("black", "white"))
+
+
+def test_colour_sixteen_bits_sizes_and_one_pixel(folder):
+    left = cv2.imread(str(folder / "left.png"), 0)
+    right = cv2.imread(str(folder / "right.png"), 0)
+    cv2.imwrite(str(folder / "colour.png"), cv2.merge([left] * 3))
+    cv2.imwrite(str(folder / "deep.png"), right[:, :120].astype(np.uint16) * 257)
+    assert run(folder, "colour.png", "deep.png") == 0
+    column, _ = read_disparity(folder / "out.tif")
+    assert column.shape == (96, 140)
+    assert np.nanmedian(column) == pytest.approx(SHIFT, abs=0.05)
+    cv2.imwrite(str(folder / "pixel.png"), left[:1, :1])
+    assert run(folder, "pixel.png", "pixel.png") == 3
+    assert read_disparity(folder / "out.tif")[0].shape == (1, 1)
+
+
+def test_command_line_has_it_all(folder, capsys):
+    files = [str(folder / name) for name in ("left.png", "right.png", "out.tif", "sure.tif")]
+    line = ["match", *files[:2], "-o", files[2], "--confidence", files[3], "--preset", "paper", "--dense"]
+    for arguments, code in (
+        (line, 0),
+        ([*line, "--prior-disparity", files[2]], 0),
+        (["match", *files[:2], "-o", files[2], "--preset", "quick"], 2),
+        (["match", files[0], str(folder / "gone.png"), "-o", files[2]], 2),
+    ):
+        with pytest.raises(SystemExit) as end:
+            main(arguments)
+        assert end.value.code == code
+    assert "gone.png" in capsys.readouterr().err
+
+
+def test_progress_is_for_large_pairs_only(monkeypatch):
+    stream = io.StringIO()
+    with command._progress(command.LARGE - 1, stream) as tell:
+        assert tell is None
+    clock = iter([0.0, 1.0, 6.0, 6.0, 7.0])
+    monkeypatch.setattr(command.time, "monotonic", lambda: next(clock))
+    with command._progress(command.LARGE, stream) as tell:
+        tell(0.1, "features")
+        tell(0.4, "level 0")
+        tell(0.5, "refinement")
+    assert stream.getvalue() == "rille: level 0, 40 %\n"
+
+
+def test_progress_is_a_bar_on_a_terminal(monkeypatch):
+    stream = io.StringIO()
+    monkeypatch.setattr(stream, "isatty", lambda: True, raising=False)
+    with command._progress(command.LARGE, stream) as tell:
+        tell(0.5, "level 0")
+    assert "level 0" in stream.getvalue()

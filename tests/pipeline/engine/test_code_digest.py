@@ -1,0 +1,140 @@
+"""Digest of the code behind a module: what can change a result changes it, what cannot does not."""
+
+from __future__ import annotations
+
+import sys
+
+import pytest
+
+from pipeline.engine import code_digest
+
+FILES = {
+    "__init__.py": '"""Package."""\n',
+    "main.py": '"""Main."""\nimport numpy\nfrom own_toy.near import half\n'
+    'def run(x):\n    """Run."""\n    return half(x)\n',
+    "near.py": "def half(x):\n    from .deep import inner\n    return inner.third(x) / 2\n",
+    "deep/__init__.py": "",
+    "deep/inner.py": "from ..sibling import LIMIT\ndef third(x):\n    return min(x / 3, LIMIT)\n",
+    "sibling.py": "LIMIT = 5\n",
+    "typed.py": "X = 1\n",
+    "stranger.py": "Y = 1\n",
+}
+
+
+@pytest.fixture
+def package(tmp_path, monkeypatch):
+    """Gives ``change(file, old, new)``, which edits and returns the digest as a new process would see it."""
+    root = tmp_path / "own_toy"
+    for name, text in FILES.items():
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_text(text)
+    monkeypatch.syspath_prepend(tmp_path)
+
+    def change(name="main.py", old="", new=""):
+        text = (root / name).read_text()
+        assert old in text
+        (root / name).write_text(text.replace(old, new) if old else text + new)
+        for cached in (code_digest._read, code_digest._file, code_digest._roots, code_digest._reachable):
+            cached.cache_clear()
+        return code_digest.code_digest("own_toy.main")
+
+    yield change
+    for cached in (code_digest._read, code_digest._file, code_digest._roots, code_digest._reachable):
+        cached.cache_clear()
+    assert not any(name.startswith("own_toy.") for name in sys.modules), "digesting must not import"
+
+
+def test_reaches_helpers_at_any_depth_and_no_strangers(package):
+    package()
+    assert set(code_digest.module_digests("own_toy.main")) == {
+        "own_toy", "own_toy.main", "own_toy.near", "own_toy.deep", "own_toy.deep.inner", "own_toy.sibling",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new"),
+    [
+        ("main.py", "", "\n# a comment\n"),
+        ("main.py", '"""Run."""', '"""Runs it, with other words."""'),
+        ("main.py", '    """Run."""\n', ""),
+        ("main.py", "return half(x)", "return (  half( x ) )"),
+        ("__init__.py", '"""Package."""', '"""Other."""'),
+        ("sibling.py", "5", "5  # metres"),
+        ("stranger.py", "1", "2"),
+        ("main.py", "", "\nfrom typing import TYPE_CHECKING\n"),
+    ],
+)
+def test_what_cannot_change_a_result(package, name, old, new):
+    before = package()
+    after = package(name, old, new)
+    assert (after == before) == ("TYPE_CHECKING" not in new), "an import that runs counts, all else does not"
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new"),
+    [
+        ("main.py", "half(x)", "half(x + 0)"),
+        ("near.py", "/ 2", "/ 2.0"),
+        ("deep/inner.py", "x / 3", "x / 4"),
+        ("sibling.py", "5", "6"),
+        ("deep/__init__.py", "", "SWITCH = 1\n"),
+        ("main.py", "", "\nimport own_toy.stranger\n"),
+    ],
+)
+def test_what_can_change_a_result(package, name, old, new):
+    before = package()
+    assert package(name, old, new) != before
+    if old:
+        assert package(name, new, old) == before
+
+
+def test_imports_for_type_checkers_do_not_count(package):
+    before = package("main.py", "import numpy\n", "from typing import TYPE_CHECKING\nimport numpy\n")
+    assert package("main.py", "import numpy\n", "import numpy\nif TYPE_CHECKING:\n    import own_toy.typed\n") == before
+
+
+def test_a_running_process_keeps_what_it_read(package, tmp_path):
+    before = package()
+    (tmp_path / "own_toy" / "sibling.py").write_text("LIMIT = 7\n")
+    assert code_digest.code_digest("own_toy.main") == before
+
+
+def test_every_stage_reaches_the_declarations():
+    assert {"stages", "stages.core.declare", "stages.odometry.keyframes", "stages.core.errors"} <= set(
+        code_digest.module_digests("stages.odometry.keyframes")
+    )
+    assert not any(name.startswith("pipeline") for name in code_digest.module_digests("stages.odometry.keyframes"))
+
+
+def test_an_unknown_module_is_named():
+    with pytest.raises(ModuleNotFoundError, match=r"stages\.nowhere"):
+        code_digest.code_digest("stages.nowhere")
+
+
+def test_what_was_found_in_sources_is_remembered_by_their_bytes(package, tmp_path, monkeypatch):
+    monkeypatch.setattr(code_digest, "_memory", code_digest._Memory())
+    file = tmp_path / "cache" / "sources.json"
+    code_digest.remember_in(file)
+    first, edited = package(), package("sibling.py", "5", "6")
+    code_digest.remember()
+    monkeypatch.setattr(code_digest.ast, "parse", lambda _: pytest.fail("a file was parsed again"))
+    code_digest.remember_in(file)
+    assert package() == edited
+    assert package("sibling.py", "6", "5") == first
+
+
+def test_a_damaged_memory_of_sources_is_none(package, tmp_path, monkeypatch):
+    monkeypatch.setattr(code_digest, "_memory", code_digest._Memory())
+    file = tmp_path / "cache" / "sources.json"
+    code_digest.remember_in(file)
+    first = package()
+    code_digest.remember()
+    whole = file.read_bytes()
+    for damaged in (b"", whole[:-20], b"[]", b"{}", whole.replace(b"own_toy.near.half", b"own_toy.near.hall")):
+        file.write_bytes(damaged)
+        code_digest.remember_in(file)
+        assert code_digest._memory.known == {}
+        assert package() == first
+    file.write_bytes(whole)
+    code_digest.remember_in(file)
+    assert code_digest._memory.known

@@ -1,0 +1,111 @@
+"""A dask scheduler and two worker processes started by hand, on loopback."""
+
+from __future__ import annotations
+
+import os
+import signal
+
+import pytest
+from hands import by_hand
+from raising import raises
+from toys import chain
+
+from pipeline.engine import scheduler
+from pipeline.engine.executors import base, dask_cluster
+from pipeline.engine.graph import Graph
+from pipeline.engine.store.folder import Store
+
+
+@pytest.fixture(scope="module")
+def hands(tmp_path_factory):
+    """A scheduler with two workers."""
+    with by_hand(tmp_path_factory.mktemp("cluster")) as hands:
+        hands.worker("first")
+        hands.worker("second")
+        yield hands
+
+
+def run(cache, where="inline"):
+    graph = Graph()
+    chain.build(graph)
+    scheduler.run(graph, Store(cache), executor=where).check()
+    return {h.key: h.ref.digest for h in graph.nodes}
+
+
+def test_a_cluster_gives_what_one_process_gives(hands, tmp_path):
+    assert run(tmp_path / "cluster", hands.address) == run(tmp_path / "inline")
+    assert not list((tmp_path / "cluster").glob("*.tmp")), "probes are cleared away"
+
+
+def test_a_cache_that_is_not_shared_is_refused(hands, tmp_path, monkeypatch):
+    monkeypatch.setattr(dask_cluster, "write_probe", lambda store, name: None)  # the workers see another folder
+    with raises("RIL-523"):
+        run(tmp_path / "cache", hands.address)
+
+
+def test_other_versions_are_refused_by_name(hands, tmp_path, monkeypatch):
+    ours = dask_cluster.identity()
+    monkeypatch.setattr(dask_cluster, "identity", lambda: {**ours, "numpy": "9.9", "source code": "feed"})
+    with raises("RIL-521") as wrong:
+        run(tmp_path / "cache", hands.address)
+    assert "worker first" in str(wrong.value) or "worker second" in str(wrong.value)
+    assert f"differs: source code {ours['source code']} instead of feed, numpy {ours['numpy']} instead of 9.9" in str(
+        wrong.value
+    )
+
+
+@pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "tcp://no-such-host.invalid:8786"])
+def test_no_scheduler(tmp_path, address, monkeypatch):
+    monkeypatch.setattr(base, "CONNECT", 1.0)
+    with raises("RIL-541", "tcp://"):
+        run(tmp_path / "cache", address)
+
+
+@pytest.mark.parametrize("kind", ["proceses", "tcp://", "tcp://host", "http://host:80", "tcp:host:80"])
+def test_unknown_executors(kind):
+    with raises("RIL-539"):
+        base.known(kind)
+
+
+def test_differences_in_words():
+    ours = {"Python": "3.11.7", "numpy": "2.4.6", "zarr": "3.1.6"}
+    assert dask_cluster.unlike(ours, ours) == ""
+    assert dask_cluster.unlike({"Python": "3.11.7", "numpy": "2.4.5"}, ours) == (
+        "numpy 2.4.5 instead of 2.4.6, zarr none instead of 3.1.6"
+    )
+
+
+def test_threads_of_libraries_are_refused(tmp_path):
+    told = {"identity": {}, "threads": ["OMP_NUM_THREADS"], "cache": ""}
+
+    class Client:
+        def scheduler_info(self, n_workers):
+            return {"workers": {"tcp://a": {"name": "big"}}}
+
+    with raises("RIL-522", "tcp://a"):
+        dask_cluster._judge(Client(), "tcp://a", told, {}, tmp_path)
+
+
+@pytest.mark.slow
+def test_no_workers_and_a_scheduler_that_leaves(tmp_path, monkeypatch):
+    monkeypatch.setattr(dask_cluster, "NO_WORKERS", 2.0)
+    with by_hand(tmp_path) as hands:
+        with raises("RIL-525"):
+            run(tmp_path / "cache", hands.address)
+        hands.worker("only")
+        graph = Graph()
+        chain.build(graph)
+        from stages.core.declare import NoParams
+
+        graph.node("toys.mischief", "sleep/0", NoParams(), {"what": "sleep", "seconds": 60, "i": 0})
+        monkeypatch.setattr(dask_cluster, "NO_WORKERS", 30.0)
+        begun = scheduler.make
+
+        def make(*given):
+            made = begun(*given)
+            os.killpg(hands.processes[0].pid, signal.SIGKILL)
+            return made
+
+        monkeypatch.setattr(scheduler, "make", make)
+        with raises("RIL-526"):
+            scheduler.run(graph, Store(tmp_path / "cache"), executor=hands.address)

@@ -1,0 +1,190 @@
+"""Worker processes, crashes, interruptions and edits, with programs of their own."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+from raising import raises
+from toys import waiting
+from toys.chain import build
+
+from pipeline.engine import scheduler
+from pipeline.engine.executors.base import WorkerDiedError
+from pipeline.engine.executors.processes import Workers
+from pipeline.engine.graph import Graph
+from pipeline.engine.store import maintenance
+from pipeline.engine.store.folder import Store
+from stages.core.declare import NoParams
+
+HERE = Path(__file__).resolve().parent.parent
+
+
+def start(cache, environment, *words, **options):
+    command = [sys.executable, "-m", "toys.chain", str(cache), *words]
+    return subprocess.Popen(
+        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options
+    )
+
+
+def finish(process):
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 0, err
+    return json.loads(out.splitlines()[-1])["nodes"]
+
+
+HANGS = 50.0
+"""Seconds after which a program counts as hanging; how soon it leaves is timed by the torture of the engine."""
+
+
+def gone(children, within=HANGS):
+    """Whether all processes have ended."""
+    left = psutil.wait_procs(children, timeout=within)[1]
+    return not [p for p in left if p.status() != psutil.STATUS_ZOMBIE]
+
+
+def test_workers_give_the_same_bits_die_alone_and_leave_nobody_behind(cache, tmp_path):
+    """One pool for several questions, because starting it is what takes the time."""
+    plain = Graph()
+    build(plain)
+    scheduler.run(plain, Store(cache / "inline"), executor="inline")
+
+    graph, tally = Graph(), tmp_path / "tally"
+    build(graph)
+    die = graph.node("toys.mischief", "die", NoParams(), {"what": "die", "tally": str(tally)})
+    graph.node("toys.mischief", "after", NoParams(), {"what": "fine"}, inputs={"after": die})
+    graph.node("toys.mischief", "unpicklable", NoParams(), {"what": "unpicklable"})
+    result = scheduler.run(graph, Store(cache / "workers"), executor="processes", jobs=2, keep_going=True)
+
+    found = {h.label: h for h in graph.nodes}
+    assert {h.label: h.ref.digest for h in plain.nodes} == {
+        n: found[n].ref.digest for n in (h.label for h in plain.nodes)
+    }
+    assert tally.read_text() == "xxx", "tried on three workers"
+    assert isinstance(found["die"].error, WorkerDiedError)
+    assert found["after"].reason == "die failed"
+    assert "UnpicklableError: 1 and 2" in str(found["unpicklable"].error)
+    assert (result.total().failed, result.total().skipped) == (2, 1)
+    workers = [p for p in psutil.Process().children(recursive=True) if "spawn_main" in " ".join(p.cmdline())]
+    assert gone(workers)
+
+
+def test_interruption_while_workers_start_leaves_without_a_word(cache, program_environment):
+    process = start(cache, program_environment, "processes", "sleep", start_new_session=True)
+    process.stdout.readline()
+    deadline = time.monotonic() + 30
+    while len(children := psutil.Process(process.pid).children()) < 2 and time.monotonic() < deadline:
+        time.sleep(0.01)
+    os.killpg(process.pid, signal.SIGINT)
+    _, err = process.communicate(timeout=HANGS)
+    assert (process.returncode, err) == (130, "")
+    assert gone(children)
+
+
+@pytest.mark.parametrize("executor", ["inline", "threads", "processes"])
+def test_interruption_leaves_nobody_behind(cache, program_environment, executor):
+    process = start(cache, program_environment, executor, "sleep", start_new_session=True)
+    process.stdout.readline()
+    deadline = time.monotonic() + 30
+    while len(list(cache.glob("artifacts/*/*/*/manifest.json"))) < 4 and time.monotonic() < deadline:
+        time.sleep(0.05)
+    time.sleep(0.2)  # now the sleepers run
+    children = psutil.Process(process.pid).children(recursive=True)
+    assert (len(children) >= 2) == (executor == "processes")
+    os.killpg(process.pid, signal.SIGINT)
+    _, err = process.communicate(timeout=HANGS)  # the tasks sleep for longer
+    assert process.returncode == 130
+    assert err == ""
+    assert gone(children)
+    assert maintenance.verify(Store(cache))[1] == []
+
+
+def test_killed_at_any_moment_a_run_resumes_to_the_same_digests(cache, tmp_path, program_environment):
+    undisturbed = {n: v[1] for n, v in finish(start(tmp_path / "calm", program_environment, "inline", "many")).items()}
+    manifests = []
+    for delay in (0.05, 0.13, 0.21):
+        process = start(cache, program_environment, "inline", "many")
+        process.stdout.readline()
+        time.sleep(delay)
+        process.kill()
+        process.communicate()
+        manifests.append(len(list(cache.glob("artifacts/*/*/*/manifest.json"))))
+    assert maintenance.verify(Store(cache))[1] == []
+    resumed = finish(start(cache, program_environment, "inline", "many"))
+    assert {n: v[1] for n, v in resumed.items()} == undisturbed
+    assert sum(v[0] == "cached" for v in resumed.values()) == manifests[-1]
+    assert manifests == sorted(manifests)
+
+
+def test_workers_end_when_the_program_is_killed(cache, program_environment):
+    process = start(cache, program_environment, "processes", "sleep", start_new_session=True)
+    deadline = time.monotonic() + 30
+    while len(list(cache.glob("artifacts/*/*/*/manifest.json"))) < 4 and time.monotonic() < deadline:
+        time.sleep(0.05)
+    children = psutil.Process(process.pid).children(recursive=True)
+    process.kill()
+    process.communicate()
+    assert len(children) >= 2
+    assert gone(children)
+
+
+@pytest.fixture
+def editable(tmp_path, program_environment):
+    """A copy of the toys that a test may edit: ``run(old, new)`` gives the nodes of a run after the edit."""
+    shutil.copytree(HERE / "toys", tmp_path / "lib" / "toys", ignore=shutil.ignore_patterns("__pycache__"))
+    environment = program_environment | {
+        "PYTHONPATH": os.pathsep.join([str(tmp_path / "lib"), str(HERE.parent.parent)])
+    }
+
+    def run(file="helper.py", old="", new=""):
+        path = tmp_path / "lib" / "toys" / file
+        assert old in path.read_text()
+        path.write_text(path.read_text().replace(old, new) if old else path.read_text() + new)
+        return finish(start(tmp_path / "edited", environment))
+
+    return run
+
+
+def test_an_edit_computes_again_exactly_what_it_can_change(editable):
+    first = editable()
+    comment = editable(new="\n# only words\n")
+    assert {v[0] for v in comment.values()} == {"cached"}
+    neutral = editable(old="values * SCALE", new="SCALE * values")
+    assert {n for n, v in neutral.items() if v[0] == "computed"} == {f"scale/{i}" for i in range(4)}
+    assert {n: v[1] for n, v in neutral.items()} == {n: v[1] for n, v in first.items()}, "early cut-off"
+    assert neutral["scale/2"][2] == "code: toys/helper.py changed"
+    real = editable(old="SCALE = 2.0", new="SCALE = 3.0")
+    assert {n for n, v in real.items() if v[0] == "computed"} == {*(f"scale/{i}" for i in range(4)), "total"}
+    assert real["total"][2] == "input parts changed (4 of 4)"
+
+
+def test_a_worker_that_waits_prepares_what_is_to_come(cache, tmp_path):
+    names = [str(tmp_path / name) for name in ("first", "bad", "last")]
+    workers = Workers(1, waiting.answer, prepare=waiting.note, names=names)
+    try:
+        until = time.monotonic() + HANGS
+        while len(list(tmp_path.iterdir())) < len(names) and time.monotonic() < until:
+            time.sleep(0.01)
+        assert {p.name for p in tmp_path.iterdir()} >= {"first", "bad", "last"}
+        workers.give("key", ("word",))
+        assert workers.wait() == [("key", "WORD")]
+    finally:
+        workers.close(kill=True)
+
+
+def test_a_preparation_that_kills_workers_ends_the_run(cache, tmp_path, monkeypatch):
+    monkeypatch.setattr("pipeline.engine.executors.processes.UNREADY", 1)
+    workers = Workers(1, waiting.answer, prepare=waiting.note, names=[str(tmp_path / "deadly")])
+    try:
+        with raises("RIL-585"):
+            workers.wait()
+    finally:
+        workers.close(kill=True)

@@ -1,0 +1,95 @@
+"""Failures of the machine end in one line with the place and the remedy, and a non-zero exit."""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+import pytest
+from raising import raises
+
+from pipeline.cli import main
+from pipeline.engine import scheduler
+from pipeline.engine.failures import told
+from pipeline.engine.graph import Graph
+from pipeline.engine.store.folder import Store
+
+
+def opencv_error() -> cv2.error:
+    with pytest.raises(cv2.error) as caught:
+        cv2.cvtColor(np.zeros((2, 2), np.uint8), cv2.COLOR_BGR2GRAY)
+    return caught.value
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "words"),
+    [
+        (MemoryError("std::bad_alloc"), "RIL-736", "--memory-limit"),
+        (OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "/there/file"), "RIL-737", "/there/file"),
+        (PermissionError(errno.EACCES, os.strerror(errno.EACCES), "/there"), "RIL-737", "--runs"),
+        (opencv_error(), "RIL-738", "OpenCV"),
+    ],
+)
+def test_what_a_machine_or_a_library_refuses_is_told_in_one_line(monkeypatch, capsys, error, code, words):
+    assert words in str(told(error))
+    monkeypatch.setattr("pipeline.commands.init.init", lambda *_: (_ for _ in ()).throw(error))
+    with pytest.raises(SystemExit) as end:
+        main(["init", "."])
+    line = capsys.readouterr().err
+    assert end.value.code == 1
+    assert line.startswith(f"rille: error {code}: ")
+    assert line.count("\n") == 1
+
+
+def test_other_errors_are_left_as_they_are():
+    assert told(ZeroDivisionError()) is None
+
+
+def test_a_cache_that_cannot_be_written_is_refused_before_anything_is_computed(tmp_path, monkeypatch):
+    from toys.chain import build
+
+    store, graph = Store(tmp_path / "cache"), Graph()
+    build(graph)
+
+    def refuse(*_, **__):
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    monkeypatch.setattr("pipeline.engine.store.folder.tempfile.TemporaryFile", refuse)
+    ended = []
+    monkeypatch.setattr(scheduler, "make", lambda *_: ended.append("an executor was started"))
+    with raises("RIL-575", "may not be used"):
+        scheduler.run(graph, store)
+    assert not ended
+    (tmp_path / "file").touch()
+    with raises("RIL-576", "not a folder"):
+        Store(tmp_path / "file" / "cache").writable()
+
+
+SMALL = ["--frames", "0:2", "--set", "crosscheck.enabled=false", "--set", "hfvm.preset=fast"]
+
+
+def test_a_run_whose_folder_is_removed_meanwhile_is_no_success(tmp_path, monkeypatch, capsys):
+    folders = ["--cache", str(tmp_path / "cache"), "--runs", str(tmp_path / "runs"), "--executor", "inline"]
+    known = scheduler.run
+
+    def run(*args, **options):
+        found = known(*args, **options)
+        shutil.rmtree(tmp_path / "runs")
+        return found
+
+    monkeypatch.setattr(scheduler, "run", run)
+    with pytest.raises(SystemExit) as end:
+        main(["reconstruct", "mockup-short", *SMALL, *folders, "--quiet"])
+    assert end.value.code == 1
+    assert "RIL-740" in capsys.readouterr().err
+
+
+def test_a_reader_that_has_enough_is_no_failure_to_talk_about(tmp_path):
+    program = f"{sys.executable} -m pipeline.cli plan mockup-short --cache {tmp_path} | head -1"
+    done = subprocess.run(["bash", "-c", program], capture_output=True, text=True, check=True)
+    assert done.stderr == ""

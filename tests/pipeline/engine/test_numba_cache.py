@@ -1,0 +1,179 @@
+"""Compiled kernels on disk: what is damaged, or another's, is compiled anew and never run."""
+
+from __future__ import annotations
+
+import io
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from numba.core import caching
+from toys.numbers import NumbersParams
+
+from pipeline.engine import progress
+from pipeline.engine.graph import Graph
+from pipeline.engine.runtime import numba_cache
+from pipeline.engine.runtime.numba_cache import COMPILING, guard
+
+ROOT = Path(__file__).resolve().parents[3]
+KERNEL = """
+from pipeline.engine.runtime.numba_cache import guard
+guard()
+import numba
+@numba.njit(cache=True)
+def twice(x):
+    return x * 2
+print(twice(21), twice(2.5), sum(twice.stats.cache_hits.values()))
+"""
+
+
+@pytest.fixture
+def entry(tmp_path):
+    guard()
+    made = caching.IndexDataCacheFile(str(tmp_path), "kernel", (1.0, 2))
+    made.save(("int64", "x86"), ("code", 1))
+    (file,) = tmp_path.iterdir()
+    return made, file
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda d: b"",
+        lambda d: d[:-3],
+        lambda d: bytes(len(d)),
+        lambda d: d[:20],
+        lambda d: d[:40] + bytes([d[40] ^ 4]) + d[41:],
+        lambda d: bytes([d[0] ^ 1]) + d[1:],
+    ],
+)
+def test_a_damaged_entry_is_none_and_is_written_anew(entry, damage):
+    cache, file = entry
+    assert cache.load(("int64", "x86")) == ("code", 1)
+    file.write_bytes(damage(file.read_bytes()))
+    assert cache.load(("int64", "x86")) is None
+    cache.save(("int64", "x86"), ("code", 2))
+    assert cache.load(("int64", "x86")) == ("code", 2)
+
+
+def test_entries_do_not_meet(entry, tmp_path):
+    cache, file = entry
+    cache.save(("float64", "x86"), ("other", 1))
+    assert cache.load(("int64", "x86")) == ("code", 1)
+    assert caching.IndexDataCacheFile(str(tmp_path), "kernel", (9.0, 2)).load(("int64", "x86")) is None
+    (strange,) = set(tmp_path.iterdir()) - {file}
+    strange.replace(file)
+    assert cache.load(("int64", "x86")) is None, "a file that holds another key"
+
+
+def test_numba_itself_finds_its_kernels_and_survives_damage(tmp_path):
+    script = tmp_path / "kernel.py"
+    script.write_text(KERNEL)
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "numba"), "PYTHONPATH": str(ROOT)}
+
+    def said():
+        done = subprocess.run([sys.executable, script], env=environment, capture_output=True, text=True, check=True)
+        return done.stdout.split()
+
+    assert said() == ["42", "5.0", "0"]
+    assert said() == ["42", "5.0", "2"]
+    first, *_ = (tmp_path / "numba").rglob("*.nbc")
+    first.write_bytes(b"")
+    assert said() == ["42", "5.0", "1"]
+    assert said() == ["42", "5.0", "2"]
+
+
+CALLEE = "import numba\n@numba.njit(cache=True)\ndef twice(x):\n    return x * 2\n"
+CALLER = "import numba\nfrom stages.callee import twice\n@numba.njit(cache=True)\ndef f(x):\n    return twice(x) + 1\n"
+RUN = """
+from pipeline.engine.runtime.environment import prepare_environment
+prepare_environment()
+from stages.caller import f
+print(f(21), sum(f.stats.cache_hits.values()))
+"""
+
+
+@pytest.fixture
+def checkout(tmp_path):
+    """``checkout(name)``: own modules in which one kernel calls another file's; ``said`` runs it as a new process."""
+    environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path / "user")}
+
+    def make(name):
+        stages = tmp_path / name / "stages"
+        stages.mkdir(parents=True)
+        for file, text in {"__init__": "", "callee": CALLEE, "caller": CALLER}.items():
+            (stages / f"{file}.py").write_text(text)
+        shutil.copy(ROOT / "stages" / "errors.py", stages)
+
+        def said():
+            path = os.pathsep.join([str(tmp_path / name), str(ROOT)])
+            done = subprocess.run(
+                [sys.executable, "-c", RUN],
+                env={**environment, "PYTHONPATH": path},
+                cwd=tmp_path,
+                capture_output=True,
+                text=True,
+                check=True,
+            )
+            return done.stdout.split()
+
+        return stages, said
+
+    return make
+
+
+def test_a_kernel_is_compiled_anew_when_another_file_changes_that_it_calls(checkout):
+    stages, said = checkout("one")
+    assert said() == ["43", "0"]
+    assert said() == ["43", "1"]
+    (stages / "callee.py").write_text(CALLEE.replace("x * 2", "x * 3"))
+    assert said() == ["64", "0"]
+
+
+def test_an_edit_beside_it_compiles_nothing_and_checkouts_share(checkout, tmp_path):
+    _, said = checkout("one")
+    said()
+    stages, said = checkout("two")
+    (stages / "other.py").write_text("X = 1\n")
+    (stages / "caller.py").write_text(f'"""Words."""\n\n# and a comment\n{CALLER}')
+    assert said() == ["43", "1"]
+    assert {path.parent for path in tmp_path.rglob("*.nbc")} == {tmp_path / "user" / "rille" / "kernels"}
+
+
+def test_kernels_that_nothing_loads_are_cleared(tmp_path, monkeypatch):
+    monkeypatch.setattr(numba_cache, "folder", lambda: tmp_path)
+    old, new = tmp_path / "old.nbc", tmp_path / "new.nbc"
+    for path in (old, new):
+        path.write_bytes(b"")
+    os.utime(old, (0, 0))
+    assert numba_cache.unused() == [old]
+
+
+def test_seconds_of_compiling_end_with_the_outermost_kernel(entry, monkeypatch):
+    cache, _ = entry
+    clock = iter([10.0, 41.0, 50.0])
+    monkeypatch.setattr(numba_cache.time, "perf_counter", lambda: next(clock))
+    COMPILING.take()
+    assert cache.load("outer") is None
+    assert cache.load("callee") is None
+    cache.save("callee", 1)
+    assert COMPILING.seconds == 0
+    cache.save("outer", 1)
+    assert cache.load("outer") == 1
+    assert COMPILING.take() == 31.0
+    assert COMPILING.take() == 0.0
+
+
+def test_a_run_says_what_it_compiled():
+    stream = io.StringIO()
+    shown = progress.Plain(stream)
+    handle = Graph().node("toys.numbers", "n", NumbersParams(), {"frame": 0})
+    shown.open(Graph(), {}, 1)
+    shown.resolved(handle)
+    assert stream.getvalue() == ""
+    handle.compiling = 31.2
+    shown.resolved(handle)
+    assert stream.getvalue() == "rille: numbers: compiling, once: 31 s\n"

@@ -1,0 +1,372 @@
+"""Runs of toy graphs in this process: what is computed, what is cached, what is said about it."""
+
+from __future__ import annotations
+
+import io
+import json
+import signal
+import time
+
+import numpy as np
+import pytest
+from raising import raises
+from toys.chain import build
+from toys.numbers import NumbersParams
+from toys.scale import ScaleParams
+
+from pipeline.engine import events as ledger
+from pipeline.engine import packages, progress, scheduler
+from pipeline.engine.graph import Graph
+from pipeline.engine.store import maintenance
+from pipeline.engine.store.folder import Store
+from pipeline.engine.task import Spec, ensure, recipe
+from stages.core.declare import NoParams
+
+NO = NoParams()
+
+
+def run(cache, *, make=build, **options):
+    graph = Graph()
+    kwargs = {k: options.pop(k) for k in ("frames", "seed", "size", "offset") if k in options}
+    make(graph, **kwargs)
+    result = scheduler.run(graph, Store(cache), executor=options.pop("executor", "inline"), **options)
+    return graph, result
+
+
+def statuses(graph):
+    return {h.label: h.status for h in graph.nodes}
+
+
+def digests(graph):
+    return {h.label: h.ref.digest for h in graph.nodes}
+
+
+def mischief(*what, after=True, **args):
+    def make(graph):
+        for w in what:
+            node = graph.node("toys.mischief", w, NO, {"what": w, **args})
+            if after:
+                second = graph.node("toys.mischief", f"{w}/after", NO, {"what": "", "w": w}, inputs={"after": node})
+                graph.node("toys.mischief", f"{w}/third", NO, {"what": "", "w": f"{w}/3"}, inputs={"after": second})
+
+    return make
+
+
+def test_computes_what_numpy_computes(cache):
+    graph, result = run(cache)
+    assert result.ok
+    assert statuses(graph) == dict.fromkeys(statuses(graph), "computed")
+    assert [h.label for h in graph.nodes][-2:] == ["scale/3", "total"]
+    total = graph.nodes[-1]
+    for frame, found in enumerate(Store(cache).open(total.ref)["sums"]):
+        values = np.random.default_rng([0, frame]).normal(size=(40, 40)).astype(np.float32)
+        values[0, 0] = np.nan
+        assert found == np.nansum(2 * values, dtype=np.float64)
+    assert total.ref.meta == {"count": 4, "extra": False}
+
+
+def test_a_second_run_computes_nothing_and_starts_no_executor(cache, monkeypatch):
+    first, _ = run(cache)
+    monkeypatch.setattr(scheduler, "make", lambda *_: pytest.fail("an executor was started"))
+    second, result = run(cache, executor="processes")
+    assert set(statuses(second).values()) == {"cached"}
+    assert digests(second) == digests(first)
+    assert (result.total().cached, result.executor_started) == (9, False)
+
+
+@pytest.mark.parametrize(
+    ("change", "computed", "reason"),
+    [
+        ({"offset": 1.0}, {"scale", "total"}, "params.offset 0.0 -> 1.0"),
+        ({"seed": 1}, {"numbers", "scale", "total"}, "input values changed"),
+        ({"frames": 5}, {"numbers", "scale", "total"}, "never computed"),
+    ],
+)
+def test_exactly_what_changed_is_computed_again_and_why_is_said(cache, change, computed, reason):
+    run(cache)
+    graph, result = run(cache, **change)
+    assert {s for s, c in result.counts.items() if c.computed} == computed
+    assert reason in {h.reason for h in graph.nodes if h.stage == "scale"}
+    if change == {"frames": 5}:
+        assert [h.label for h in graph.nodes if h.status == "computed"] == ["numbers/4", "scale/4", "total"]
+        assert graph.nodes[-1].reason == "input parts has 5 instead of 4"
+    else:
+        assert graph.nodes[-1].reason == "input parts changed (4 of 4)"
+    back, _ = run(cache)
+    assert set(statuses(back).values()) == {"cached"}
+
+
+def test_a_damaged_artifact_is_computed_again_and_nothing_else(cache):
+    graph, _ = run(cache)
+    before = digests(graph)
+    victim = graph.nodes[1].ref
+    next((cache / victim.path).rglob("c.0.0")).write_bytes(b"")
+    graph, _ = run(cache)
+    assert [h.label for h in graph.nodes if h.status == "computed"] == ["numbers/1"]
+    assert graph.nodes[1].reason == "was computed before, its artifact is gone or damaged"
+    assert digests(graph) == before
+
+
+def test_dry_run_computes_nothing_and_explains(cache):
+    graph, result = run(cache, dry=True)
+    assert statuses(graph) == {f"numbers/{i}": "planned" for i in range(4)}
+    assert not cache.exists()
+    assert not result.executor_started
+    run(cache)
+    graph, _ = run(cache, dry=True, offset=0.5)
+    assert {h.status for h in graph.nodes if h.stage == "scale"} == {"planned"}
+    assert [h.reason for h in graph.nodes[-2:]] == ["params.offset 0.0 -> 0.5", "input scale/0 is to be computed"]
+
+
+def test_hints_and_labels_are_no_part_of_the_key(cache):
+    a = Spec("toys.numbers", "a", NumbersParams(), {"frame": 1}, {"path": "/one"})
+    b = Spec("toys.numbers", "b", NumbersParams(), {"frame": 1}, {"path": "/two"})
+    c = Spec("toys.numbers", "a", NumbersParams(), {"frame": 2}, {"path": "/one"})
+    assert not ensure(cache, a, {}).cached
+    assert ensure(cache, b, {}).cached
+    assert not ensure(cache, c, {}).cached
+
+
+def test_two_nodes_of_one_key_are_computed_once(cache):
+    def make(graph):
+        for i in range(3):
+            graph.node("toys.numbers", f"n/{i}", NumbersParams(), {"frame": 7})
+
+    graph, _ = run(cache, make=make, executor="threads")
+    assert sorted(statuses(graph).values()) == ["cached", "cached", "computed"]
+
+
+def test_without_keep_going_nothing_new_is_begun(cache, tmp_path):
+    graph, result = run(cache, make=mischief("value", "fine"), ledger=tmp_path / "ledger.jsonl")
+    assert statuses(graph) == {"value": "failed"} | dict.fromkeys(
+        ("value/after", "value/third", "fine", "fine/after", "fine/third"), "skipped"
+    )
+    assert not result.ok
+    rows = {r["label"]: r for r in ledger.read(tmp_path / "ledger.jsonl")}
+    assert rows["value"]["error"] == {"type": "ValueError", "message": "negative depth"}
+    assert rows["value/after"]["reason"] == "value failed"
+    assert rows["value/third"]["reason"] == "value/after was skipped"
+    assert rows["fine"]["reason"] == "stopped after value failed"
+
+
+def test_with_keep_going_the_rest_finishes_and_the_ledger_accounts_for_all(cache, tmp_path):
+    file = tmp_path / "ledger.jsonl"
+    graph, result = run(cache, make=mischief("value", "degenerate", "fine"), keep_going=True, ledger=file)
+    assert {h.label for h in graph.nodes if h.done} == {"fine", "fine/after", "fine/third"}
+    assert (result.total().computed, result.total().failed, result.total().skipped) == (3, 2, 4)
+    rows = ledger.read(file)
+    assert sorted(r["label"] for r in rows) == sorted(h.label for h in graph.nodes)
+    assert ledger.keys(file) == result.keys == {h.key for h in graph.nodes if h.done}
+    assert all(r["digest"] and r["seconds"] > 0 for r in rows if r["status"] == "computed")
+
+
+def test_what_the_data_do_not_determine_is_a_hole(cache):
+    told = []
+
+    def make(graph):
+        mischief("degenerate", "fine")(graph)
+        graph.expand([graph.nodes[1], graph.nodes[4]], lambda *refs: told.append([r is None for r in refs]), holes=True)
+        graph.expand([graph.nodes[1], graph.nodes[4]], lambda *refs: told.append("no holes"))
+
+    graph, result = run(cache, make=make)
+    assert {h.label for h in graph.nodes if h.done} == {"fine", "fine/after", "fine/third"}
+    assert told == [[True, False]]
+    result.check(holes=True)
+    with raises("RIL-899"):
+        result.check()
+    _, result = run(cache, make=mischief("degenerate", "value"))
+    with raises("RIL-534"):
+        result.check(holes=True)
+
+
+def test_the_users_error_is_the_original_with_its_place(cache):
+    _, result = run(cache, make=mischief("degenerate"))
+    with raises("RIL-899") as caught:
+        result.check()
+    assert str(caught.value) == "degenerate: no texture in frame 7: choose other frames"
+    _, result = run(cache, make=mischief("value"))
+    with raises("RIL-534") as caught:
+        result.check()
+    assert isinstance(caught.value.__cause__, ValueError)
+    assert "mischief.py" in result.failures[0].traceback
+
+
+def test_input_output_errors_are_tried_three_times_others_once(cache, tmp_path, monkeypatch):
+    monkeypatch.setattr("pipeline.engine.task.BACK_OFF", 0.001)
+    _, result = run(cache, make=mischief("disk", tally=str(tmp_path / "disk")))
+    assert result.ok
+    assert (tmp_path / "disk").read_text() == "xxx"
+    _, result = run(cache, make=mischief("value", tally=str(tmp_path / "value")))
+    assert not result.ok
+    assert (tmp_path / "value").read_text() == "x"
+
+
+def test_an_expansion_that_fails_is_a_failure_and_one_that_cannot_be_made_is_noted(cache, tmp_path):
+    def make(graph):
+        node = graph.node("toys.numbers", "n", NumbersParams(), {"frame": 0})
+        bad = graph.node("toys.mischief", "value", NO, {"what": "value"})
+        graph.expand([node], lambda ref: {}["basic"])
+        graph.expand([bad], lambda ref: pytest.fail("called"))
+
+    _, result = run(cache, make=make, keep_going=True, ledger=tmp_path / "l")
+    assert [f.label for f in result.failures] == ["plan after n", "value"]
+    assert ledger.read(tmp_path / "l")[-1] == {
+        "label": "plan after value",
+        "stage": "",
+        "status": "skipped",
+        "reason": "value",
+    }
+
+
+@pytest.fixture
+def interruptible():
+    """SIGINT as Python handles it: a shell's background job ignores it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+def test_an_interrupt_where_python_forgets_it_stops_the_run_all_the_same(cache, capfd, interruptible):
+    class Forgotten:
+        def __del__(self):
+            signal.raise_signal(signal.SIGINT)
+            time.sleep(0)  # the handler runs between two instructions
+
+    done = []
+
+    def make(graph):
+        first = graph.node("toys.numbers", "first", NumbersParams(), {"frame": 0})
+
+        def rest(ref):
+            Forgotten()
+            done.append(graph.node("toys.numbers", "second", NumbersParams(), {"frame": 1}))
+
+        graph.expand([first], rest)
+
+    with pytest.raises(KeyboardInterrupt):
+        run(cache, make=make)
+    assert [node.status for node in done] == ["pending"], "the expansion went on, the run did not"
+    assert capfd.readouterr().err == ""
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    found, _ = run(cache, make=lambda graph: graph.node("toys.numbers", "first", NumbersParams(), {"frame": 0}))
+    assert statuses(found) == {"first": "cached"}
+
+
+def test_what_was_created_first_runs_first(cache, tmp_path):
+    def make(graph):
+        first = graph.node("toys.numbers", "a", NumbersParams(), {"frame": 0})
+        graph.node("toys.scale", "b", ScaleParams(), inputs={"values": first})
+        for frame, label in enumerate("cd", 1):
+            graph.node("toys.numbers", label, NumbersParams(), {"frame": frame})
+
+    run(cache, make=make, ledger=tmp_path / "l")
+    assert [row["label"] for row in ledger.read(tmp_path / "l")] == ["a", "b", "c", "d"]
+
+
+def test_a_miss_is_explained_against_the_most_similar_artifact(cache):
+    run(cache)
+    run(cache, seed=1, size=41)
+    graph, _ = run(cache, size=42, dry=True)
+    assert graph.nodes[0].reason == "params.size 40 -> 42"
+    graph, _ = run(cache, seed=1, size=42, dry=True)
+    assert graph.nodes[0].reason == "params.size 41 -> 42"
+
+
+def test_force_computes_again_and_keeps_the_artifact(cache):
+    first, _ = run(cache)
+    second, result = run(cache, force={"scale"})
+    assert {s: c.computed for s, c in result.counts.items()} == {"numbers": 0, "scale": 4, "total": 0}
+    assert [h.ref for h in second.nodes] == [h.ref for h in first.nodes]
+    assert second.nodes[4].reason == "forced"
+
+
+def test_force_finds_a_stage_that_is_not_deterministic(cache):
+    _, result = run(cache, make=mischief("random", after=False))
+    assert result.ok
+    _, result = run(cache, make=mischief("random", after=False), force={"mischief"})
+    with raises("RIL-577"):
+        result.check()
+    assert maintenance.verify(Store(cache)) == (1, [])
+
+
+def test_a_worker_with_other_code_refuses(cache):
+    with raises("RIL-581"):
+        ensure(cache, Spec("toys.numbers", "n", NumbersParams(), {"frame": 0}), {}, key="0" * 64)
+
+
+def test_manifest_says_where_a_result_comes_from(cache):
+    graph, _ = run(cache)
+    scale = graph.nodes[4]
+    about = Store(cache).manifest("scale", scale.key)["provenance"]
+    assert about["params"] == {"offset": 0.0}
+    assert about["inputs"] == {"values": graph.nodes[0].ref.digest}
+    assert set(about["code"]) >= {"toys.scale", "toys.helper", "stages.core.declare"}
+    assert about["env"] == {"numpy": packages.version("numpy")}
+    assert about["seconds"] >= 0
+    assert about["peak_rss"] > 1e6
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda g, n: g.node("toys.numbers", "n", NumbersParams(), {"frame": 1}), "'n' is taken"),
+        (lambda g, n: g.node("toys.numbers", "m", ScaleParams(), {}), "params are ScaleParams, not NumbersParams"),
+        (lambda g, n: g.node("toys.scale", "m", ScaleParams()), r"missing inputs \['values'\]"),
+        (lambda g, n: g.node("toys.scale", "m", ScaleParams(), inputs={"value": n}), r"unknown inputs \['value'\]"),
+        (lambda g, n: g.node("toys.scale", "m", ScaleParams(), inputs={"values": [n]}), "values takes one handle"),
+        (lambda g, n: g.node("toys.total", "m", NO, inputs={"parts": n}), "parts takes a list"),
+    ],
+)
+def test_mistakes_in_the_graph_are_refused_at_once(call, words):
+    graph = Graph()
+    node = graph.node("toys.numbers", "n", NumbersParams(), {"frame": 0})
+    with pytest.raises((ValueError, TypeError), match=words):
+        call(graph, node)
+
+
+def test_arguments_without_canonical_form_are_named(cache):
+    spec = Spec("toys.numbers", "numbers/3", NumbersParams(), {"frame": np.int64(3)})
+    with pytest.raises(TypeError, match=r"numbers/3\.args\.frame is a int64"):
+        ensure(cache, spec, {})
+    assert "hints" not in recipe(spec, {})
+
+
+@pytest.mark.parametrize("mode", ["plain", "json", "quiet", "bar"])
+def test_progress_speaks_on_its_stream_alone(cache, mode, capsys, monkeypatch):
+    monkeypatch.setattr(progress, "INTERVAL", 0.0)
+    stream = io.StringIO()
+    _, result = run(cache, make=mischief("fine", "value"), progress=progress.make(mode, stream))
+    text = stream.getvalue()
+    if mode == "json":
+        events = [json.loads(line) for line in text.splitlines()]
+        assert [e["event"] for e in events if e.get("label") == "value"] == ["running", "failed", "error"]
+        assert events[-1]["event"] == "end"
+        assert events[-1]["computed"] == result.total().computed
+    elif mode == "quiet":
+        assert text == ""
+    else:
+        assert "value failed (ValueError)" in text
+        assert "left out" in text
+    assert capsys.readouterr() == ("", "")
+
+
+def test_estimate_weighs_stages_by_their_earlier_seconds(cache):
+    run(cache)
+    seconds = progress.recall_seconds(Store(cache).hints(""))
+    assert set(seconds) == {"numbers", "scale", "total"}
+    seen = progress.Quiet()
+    graph = Graph()
+    build(graph)
+    seen.open(graph, {"numbers": 3.0}, jobs=2)
+    assert seen.left() == pytest.approx(4 * 3.0 / 2)
+    seen.resolved(graph.nodes[0])
+    assert seen.left() == pytest.approx(3 * 3.0 / 2)
+
+
+def test_unknown_modes_and_executors_are_refused(cache):
+    with raises("RIL-568"):
+        progress.make("loud")
+    with raises("RIL-539", "'cloud'"):
+        run(cache, executor="cloud")
+    with raises("RIL-540"):
+        run(cache, jobs=0)

@@ -1,0 +1,260 @@
+"""Written files, read back by the programs they are for."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import json
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pyogrio
+import pyproj
+import pytest
+import rasterio
+from evo.tools import file_interface
+from raising import raises
+from toys.finished import FRAMES, bundles, checked, checks, view
+
+from datasets.georeference import Georeference
+from pipeline.export import run_files
+from pipeline.export.early import Early
+from pipeline.export.frames_json import FILES, describe
+from pipeline.export.writers import (
+    replacing,
+    write_path_geojson,
+    write_path_gpkg,
+    write_raster,
+    write_style,
+    write_table,
+    write_trajectory_kitti,
+    write_trajectory_tum,
+)
+from stages.geometry.geometry import rotation_exp
+from stages.geometry.lattice import Lattice
+
+LATTICE = Lattice.at(-40, 700, 0.001, 600, 700)
+
+
+def poses(n: int) -> np.ndarray:
+    rng = np.random.default_rng(3)
+    return np.array([np.hstack([rotation_exp(rng.normal(size=3)), rng.normal(size=(3, 1))]) for _ in range(n)])
+
+
+def test_an_elevation_raster_keeps_values_place_and_crs(tmp_path: Path) -> None:
+    z = np.random.default_rng(0).normal(size=LATTICE.shape).astype(np.float32)
+    z[100:200, 50:90] = np.nan
+    write_raster(tmp_path / "run" / "dem.tif", {"elevation": z}, LATTICE, unit="m", nodata=float("nan"))
+    with rasterio.open(tmp_path / "run" / "dem.tif") as file:
+        np.testing.assert_array_equal(file.read(1), z)
+        np.testing.assert_array_equal(file.read_masks(1) == 0, np.isnan(z))
+        # the centre of row 0, column 0, and the middle of the last cell
+        assert file.xy(0, 0) == pytest.approx((-0.040, 0.700), abs=1e-9)
+        assert file.index(-0.040 + 0.699, 0.700 - 0.599) == (599, 699)
+        assert np.isnan(file.nodata)
+        wkt = file.crs.to_wkt(version="WKT2_2019")
+        assert wkt.startswith('ENGCRS["Rille world frame')
+        assert "metre" in wkt
+        assert file.descriptions == ("elevation",)
+        assert file.units == ("metre",)
+        assert "z up" in file.tags()["FRAME"]
+        assert file.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"
+        assert file.overviews(1)
+
+
+def test_the_engineering_crs_is_in_metres_and_says_how_axes_lie(tmp_path: Path) -> None:
+    write_raster(tmp_path / "a.tif", {"a": np.zeros(LATTICE.shape, np.uint8)}, LATTICE, unit="1", nodata=None)
+    with rasterio.open(tmp_path / "a.tif") as file:
+        crs = pyproj.CRS.from_wkt(file.crs.to_wkt(version="WKT2_2019"))
+        assert "x and y are the world frame's" in file.tags()["AXES"]
+    assert crs.is_engineering
+    # GeoTIFF has no key for the names of axes: GDAL reads every local system back as easting and northing
+    assert [(a.direction, a.unit_name) for a in crs.axis_info] == [("east", "metre"), ("north", "metre")]
+    write_path_gpkg(tmp_path / "path.gpkg", VERTICES, {"found": True})
+    crs = pyproj.CRS.from_wkt(pyogrio.raw.read(tmp_path / "path.gpkg", layer="path")[0]["crs"])
+    assert crs.is_engineering
+    assert [(a.name.lower(), a.direction, a.unit_name) for a in crs.axis_info] == [
+        ("x", "east", "metre"),
+        ("y", "north", "metre"),
+    ]
+
+
+def test_a_raster_with_a_place_is_turned_and_not_resampled(tmp_path: Path) -> None:
+    place = Georeference("EPSG:32633", (500100.0, 5200200.0, 1800.0), 0.7)
+    z = np.random.default_rng(0).normal(size=LATTICE.shape).astype(np.float32)
+    write_raster(tmp_path / "dem.tif", {"elevation": z}, LATTICE, unit="m", nodata=float("nan"), place=place)
+    with rasterio.open(tmp_path / "dem.tif") as file:
+        assert file.crs.to_epsg() == 32633
+        np.testing.assert_array_equal(file.read(1), z)
+        at = LATTICE.xs()[123], LATTICE.ys()[45], 0.0
+        assert file.xy(45, 123) == pytest.approx(tuple(place.apply(at)[:2]), abs=1e-6)
+        assert "clockwise from grid north" in file.tags()["AXES"]
+    write_path_gpkg(tmp_path / "path.gpkg", VERTICES, {"found": True}, place)
+    meta, _, geometry, _ = pyogrio.raw.read(tmp_path / "path.gpkg", layer="path")
+    assert meta["crs"] == "EPSG:32633"
+    np.testing.assert_allclose(np.frombuffer(geometry[0][9:], "<f8").reshape(-1, 3), place.apply(VERTICES), atol=1e-9)
+
+
+def test_classes_are_not_averaged_in_overviews(tmp_path: Path) -> None:
+    risk = np.zeros(LATTICE.shape, dtype=np.uint8)
+    risk[:, 351:] = 2  # not on the border of an overview's cells
+    bands = {"class": risk, "reason": risk * 4, "filled": np.zeros_like(risk)}
+    write_raster(tmp_path / "risk.tif", bands, LATTICE, unit="1", nodata=None, tags={"classes": "0 safe"})
+    with rasterio.open(tmp_path / "risk.tif") as file:
+        assert file.descriptions == ("class", "reason", "filled")
+        np.testing.assert_array_equal(file.read(2), risk * 4)
+        assert file.nodata is None
+        assert file.tags()["CLASSES"] == "0 safe"
+    with rasterio.open(tmp_path / "risk.tif", overview_level=0) as small:
+        assert set(np.unique(small.read(1))) == {0, 2}
+
+
+def test_a_raster_that_does_not_fit_is_refused(tmp_path: Path) -> None:
+    with raises("RIL-621"):
+        write_raster(tmp_path / "a.tif", {"a": np.zeros((2, 2), np.uint8)}, LATTICE, unit="1", nodata=None)
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path: Path) -> None:
+    target = tmp_path / "a.txt"
+    target.write_text("old")
+
+    def fail() -> None:
+        with replacing(target) as temporary:
+            temporary.write_text("half")
+            raise RuntimeError("killed")
+
+    with pytest.raises(RuntimeError, match="killed"):
+        fail()
+    assert target.read_text() == "old"
+    assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
+
+
+def test_the_path_says_that_it_is_not_wgs84(tmp_path: Path) -> None:
+    vertices = np.array([[0.1, 0.2, -0.18], [0.1, 0.3, -0.181], [0.11, 0.4, -0.18]])
+    write_path_geojson(tmp_path / "path.geojson", vertices, {"found": True, "length_m": 0.2})
+    data = json.loads((tmp_path / "path.geojson").read_text())
+    line, start, target = data["features"]
+    assert line["geometry"] == {"type": "LineString", "coordinates": vertices.tolist()}
+    assert line["properties"]["length_m"] == 0.2
+    assert "not WGS 84" in line["properties"]["crs_name"]
+    assert start["geometry"]["coordinates"] == vertices[0].tolist()
+    assert target["geometry"]["coordinates"] == vertices[-1].tolist()
+
+
+def test_no_path_has_no_geometry_but_a_reason(tmp_path: Path) -> None:
+    write_path_geojson(tmp_path / "p.geojson", np.empty((0, 3)), {"found": False, "blocking_row": 7})
+    (feature,) = json.loads((tmp_path / "p.geojson").read_text())["features"]
+    assert feature["geometry"] is None
+    assert feature["properties"]["blocking_row"] == 7
+
+
+def test_evo_reads_the_trajectories(tmp_path: Path) -> None:
+    P = poses(7)
+    write_trajectory_kitti(tmp_path / "trajectory.kitti", P)
+    read = np.array(file_interface.read_kitti_poses_file(tmp_path / "trajectory.kitti").poses_se3)
+    np.testing.assert_allclose(read[:, :3], P, atol=1e-14)
+    P[3] = np.nan
+    write_trajectory_tum(tmp_path / "trajectory.tum", P, [0.5 * k for k in range(7)])
+    tum = file_interface.read_tum_trajectory_file(tmp_path / "trajectory.tum")
+    kept = [0, 1, 2, 4, 5, 6]
+    np.testing.assert_array_equal(tum.timestamps, [0.5 * k for k in kept])
+    # seven digits of time and place would not do: quaternions are written with fifteen
+    np.testing.assert_allclose(np.array(tum.poses_se3)[:, :3], P[kept], atol=1e-13)
+
+
+VERTICES = np.array([[0.1, 0.2, -0.18], [0.1, 0.3, -0.181], [0.11, 0.4, -0.18]])
+
+
+def test_gdal_reads_the_path_in_its_own_coordinate_system(tmp_path: Path) -> None:
+    facts = {"found": True, "length_m": 0.2, "reason": None, "grid": {"cell": 1}}
+    write_path_gpkg(tmp_path / "path.gpkg", VERTICES, facts)
+    meta, _, geometry, values = pyogrio.raw.read(tmp_path / "path.gpkg", layer="path")
+    assert meta["geometry_type"] == "LineString Z"
+    assert "local metres" in meta["crs"]
+    assert "WGS" not in meta["crs"]
+    np.testing.assert_array_equal(np.frombuffer(geometry[0][9:], "<f8").reshape(-1, 3), VERTICES)
+    fields = dict(zip(meta["fields"], values, strict=True))
+    assert fields["length_m"][0] == 0.2
+    assert fields["found"][0]
+    assert {"reason", "grid"}.isdisjoint(fields)
+    _, _, ends, (names,) = pyogrio.raw.read(tmp_path / "path.gpkg", layer="ends")
+    assert list(names) == ["start", "target"]
+    np.testing.assert_array_equal([np.frombuffer(p[5:], "<f8") for p in ends], VERTICES[[0, -1]])
+
+
+def test_no_path_is_a_layer_without_geometry(tmp_path: Path) -> None:
+    write_path_gpkg(tmp_path / "path.gpkg", np.empty((0, 3)), {"found": False, "reason": "blocked"})
+    meta, _, geometry, values = pyogrio.raw.read(tmp_path / "path.gpkg")
+    assert geometry[0] is None
+    assert dict(zip(meta["fields"], values, strict=True))["reason"][0] == "blocked"
+    assert [name for name, _ in pyogrio.list_layers(tmp_path / "path.gpkg")] == ["path"]
+
+
+def test_equal_paths_make_equal_files(tmp_path: Path) -> None:
+    for name in "ab":
+        write_path_gpkg(tmp_path / name / "path.gpkg", VERTICES, {"found": True})
+    digests = {hashlib.sha256((tmp_path / name / "path.gpkg").read_bytes()).hexdigest() for name in "ab"}
+    assert len(digests) == 1
+    assert [p.name for p in (tmp_path / "a").iterdir()] == ["path.gpkg"]
+
+
+def test_styles_name_the_classes_and_span_the_elevations(tmp_path: Path) -> None:
+    write_style(tmp_path / "risk.qml", "risk")
+    entries = ElementTree.parse(tmp_path / "risk.qml").findall(".//paletteEntry")
+    assert [(e.get("value"), (e.get("label") or "").split()[0]) for e in entries] == [
+        ("0", "safe"),
+        ("1", "caution"),
+        ("2", "hazard"),
+        ("3", "unknown"),
+    ]
+    write_style(tmp_path / "dem.qml", "dem", {f"e{k}": -1.0 + k / 4 for k in range(9)})
+    style = ElementTree.parse(tmp_path / "dem.qml")
+    assert [float(e.get("value") or "nan") for e in style.findall(".//item")] == [-1.0 + k / 4 for k in range(9)]
+    shader = style.find(".//colorrampshader")
+    assert shader is not None
+    assert (shader.get("minimumValue"), shader.get("maximumValue")) == ("-1", "1")
+
+
+def test_tables_leave_empty_what_is_not_known(tmp_path: Path) -> None:
+    write_table(
+        tmp_path / "a.csv", {"frame": [1, 2], "name": ["a,b", "c"], "x_m": [0.25, float("nan")], "y": [None, 3]}
+    )
+    rows = list(csv.DictReader((tmp_path / "a.csv").open()))
+    assert rows == [
+        {"frame": "1", "name": "a,b", "x_m": "0.25", "y": ""},
+        {"frame": "2", "name": "c", "x_m": "", "y": "3"},
+    ]
+
+
+def test_a_run_writes_the_files_that_it_describes(tmp_path: Path) -> None:
+    made = bundles() | checks()
+    run_files.write(tmp_path, view(made, products=checked()), Early())
+    facts = json.loads((tmp_path / "frames.json").read_text())
+    assert set(facts["files"]) == set(FILES) == {p.name for p in tmp_path.iterdir()} & set(FILES)
+    assert [f["frame"] for f in facts["frames"]] == list(FRAMES)
+    assert facts["frames"][4] == {"frame": 4, "name": "left004", "time": 4.0}
+    assert facts["units"]["time"] == "frame number"
+    assert facts["frames_of_reference"]["world"]["handedness"] == "right"
+    assert "scalar last" in facts["files"]["trajectory.tum"]["quaternion"]
+    rows = list(csv.DictReader((tmp_path / "agreement.csv").open()))
+    assert [row["flagged"] for row in rows] == ["0", "0", "0", "1", "0", "0"]
+    assert [row["flagged_for"] for row in rows] == ["", "", "", "position; rotation", "", ""]
+    assert float(rows[3]["disagreement_m"]) == 0.002
+    assert float(rows[3]["crosscheck_x_m"]) - float(rows[3]["x_m"]) == pytest.approx(0.002)
+    assert float(rows[4]["y_m"]) == pytest.approx(0.12)
+    assert (rows[5]["disagreement_m"], rows[5]["crosscheck_error_m"]) == ("", "")
+    crosscheck = file_interface.read_tum_trajectory_file(tmp_path / "crosscheck.tum")
+    np.testing.assert_array_equal(crosscheck.timestamps, range(5))
+
+
+def test_only_what_was_written_is_described() -> None:
+    facts = describe(["dem.tif", "notes.txt"], [3], ["left003"], [0.5], clock=True)
+    assert list(facts["files"]) == ["dem.tif"]
+    assert facts["units"]["time"] == "s"
+    assert facts["georeference"] is None
+    place = Georeference("EPSG:32633", (1.0, 2.0, 3.0), 0.5)
+    placed = describe(["dem.tif", "path.geojson"], [3], ["left003"], [0.5], clock=True, place=place)
+    assert placed["files"]["dem.tif"]["frame"] == "georeference"
+    assert placed["files"]["path.geojson"]["frame"] == "world"
+    assert placed["georeference"]["origin"] == [1.0, 2.0, 3.0]

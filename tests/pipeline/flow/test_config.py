@@ -1,0 +1,89 @@
+"""Configuration: layers, strictness, and the file that is written back."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from raising import raises
+
+from pipeline.flow import config
+
+
+def test_layers_win_in_order() -> None:
+    built = config.build(
+        config.expand({"select.stride": 2}), {"select": {"stride": 3}}, config.parse_assignments(["select.stride=5"])
+    )
+    assert built.select.stride == 5
+
+
+def test_one_setting_makes_terrain_accurate_and_what_is_given_beside_it_wins() -> None:
+    plain = config.build()
+    assert (plain.hfvm.preset, plain.locus.both, plain.merge.max_std_cells) == ("default", False, None)
+    built = config.build({"locus": {"cell_size": 0.01}}, config.parse_assignments(["terrain.preset=accurate"]))
+    assert (built.hfvm.preset, built.locus.both, built.merge.max_std_cells) == ("accurate", True, 0.7)
+    assert (plain.locus.refined_share, built.locus.refined_share) == (1.0, 0.5)
+    assert (built.locus.cell_size, built.locus.max_jump, built.hfvm.greatest_std) == (0.01, 5.0, 100.0)
+    assert (plain.track.points, built.track.points) == (400, 2000)
+    assert config.build({"hfvm": {"preset": "accurate"}}).hfvm.greatest_std == 1.1
+    assert built.hfvm.relief_steps == config.build({"hfvm": {"preset": "accurate"}}).hfvm.relief_steps
+    built = config.build({"terrain": {"preset": "accurate"}}, config.parse_assignments(["locus.both=false"]))
+    assert (built.hfvm.preset, built.locus.both) == ("accurate", False)
+    assert (built.hfvm.greatest_std, built.locus.max_jump) == (1.1, plain.locus.max_jump), "limits as without both"
+    built = config.build({"terrain": {"preset": "accurate"}, "hfvm": {"preset": "default"}})
+    assert (built.locus.refined_share, built.locus.max_jump) == (1.0, 5.0), "one of each"
+    assert config.build().locus.both is False, "the preset itself is not changed by what is laid over it"
+    with raises("RIL-027", "terrain.preset", "'best'"):
+        config.build({"terrain": {"preset": "best"}})
+
+
+def test_navigation_matches_fast_unless_told_otherwise(tmp_path: Path) -> None:
+    assert config.build({}).hfvm.preset == "default"
+    built = config.build(config.parse_assignments(["select.preset=navigation"]))
+    assert (built.hfvm.preset, built.hfvm.finest, built.select.overlap) == ("fast", 1, 0.6)
+    assert (built.motion.level, built.track.points) == (3, 200)
+    assert config.build(config.parse_assignments(["select.preset=navigation", "track.points=300"])).track.points == 300
+    for given in ("hfvm.preset=default", "hfvm.preset=accurate"):
+        kept = config.build(config.parse_assignments(["select.preset=navigation", given]))
+        assert kept.hfvm == config.build(config.parse_assignments([given])).hfvm
+    assert config.build(config.parse_assignments(["select.preset=navigation", "hfvm.finest=0"])).hfvm.finest == 0
+    path = tmp_path / "config.toml"
+    path.write_text(config.to_toml(built))
+    assert config.build(config.read_toml(path)) == built
+
+
+def test_unknown_key_names_the_nearest() -> None:
+    with raises("RIL-027", "'select.strid'", "'select.stride'"):
+        config.build(config.parse_assignments(["select.strid=2"]))
+    with raises("RIL-027", "'locsu'", "'locus'"):
+        config.build({"locsu": {"cell_size": 1.0}})
+
+
+def test_value_out_of_range_says_what_is_permitted() -> None:
+    with raises("RIL-027", "select.stride"):
+        config.build(config.parse_assignments(["select.stride=0"]))
+    with raises("RIL-027", "select.stride", "'many'"):
+        config.build(config.parse_assignments(["select.stride=many"]))
+
+
+def test_assignment_without_key_or_value() -> None:
+    for text in ("select.stride", "stride=3"):
+        with raises("RIL-024"):
+            config.parse_assignments([text])
+
+
+def test_written_configuration_reads_back_as_the_same(tmp_path: Path) -> None:
+    built = config.build(config.parse_assignments(["select.stride=7", "vehicle.max_step=0.05"]))
+    path = tmp_path / "config.toml"
+    path.write_text(config.to_toml(built))
+    again = config.build(config.read_toml(path))
+    assert again == built
+    assert again.vehicle.max_step == 0.05
+
+
+def test_unreadable_files(tmp_path: Path) -> None:
+    with raises("RIL-138"):
+        config.read_toml(tmp_path / "none.toml")
+    bad = tmp_path / "bad.toml"
+    bad.write_text("[select\nstride=1")
+    with raises("RIL-026"):
+        config.read_toml(bad)

@@ -1,0 +1,113 @@
+"""Large pairs as tasks: equal digests, whatever the tiles; which pairs are tiled."""
+
+import hashlib
+
+import cv2
+import numpy as np
+import pytest
+
+from pipeline.engine import scheduler
+from pipeline.engine.graph import Graph
+from pipeline.engine.store.folder import Store
+from pipeline.flow import tiles
+from pipeline.flow.config import build
+from pipeline.flow.tiles import Tiling
+from stages.core.declare import NoParams
+from stages.hfvm import HfvmParams
+from stages.imaging.pyramid import PyramidParams
+
+SHAPE = (150, 190)
+
+
+@pytest.fixture(scope="module")
+def images(tmp_path_factory):
+    """Textured PNG files, the left one sheared against the right one, so that a plane aligns them."""
+    rng = np.random.default_rng(0)
+    right = cv2.GaussianBlur(rng.normal(0, 1, SHAPE), (0, 0), 1.6)
+    right = np.clip(128 + 35 * right / right.std(), 0, 255).astype(np.uint8)
+    y, x = np.indices(SHAPE, np.float32)
+    left = cv2.remap(right, x + 10 - np.float32(0.5) * y, y + 1, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+    folder = tmp_path_factory.mktemp("images")
+    paths = {"left": folder / "left.png", "right": folder / "right.png"}
+    for camera, image in (("left", left), ("right", right)):
+        cv2.imwrite(str(paths[camera]), image)
+    return paths
+
+
+def pyramids(graph, images):
+    found = {}
+    for camera, path in images.items():
+        args = {"path": str(path), "sha256": hashlib.sha256(path.read_bytes()).hexdigest(), "frame": 0}
+        args |= {"camera": camera, "width": SHAPE[1], "height": SHAPE[0], "depth": 8}
+        image = graph.node("datasets.files", f"image/{camera}", NoParams(), args)
+        found[camera] = graph.node(
+            "stages.imaging.pyramid", f"pyramid/{camera}", PyramidParams(), inputs={"image": image}
+        )
+    return found
+
+
+def disparity(store, images, params, side):
+    graph = Graph()
+    given = pyramids(graph, images)
+    if side is None:
+        node = graph.node("stages.hfvm", "hfvm", params, inputs=given)
+    else:
+        node = tiles.Tiles(graph, params, PyramidParams(), given, (SHAPE, SHAPE), side, "hfvm").build()
+    scheduler.run(graph, store, executor="inline").check()
+    return node.ref
+
+
+@pytest.mark.parametrize(("preset", "side"), [("default", 96), ("fast", 50)])
+def test_the_artifact_is_that_of_the_pair_matched_whole(tmp_path, images, preset, side):
+    store, params = Store(tmp_path), HfvmParams(preset=preset)
+    once = disparity(store, images, params, None)
+    assert once.meta["aligned"]
+    assert once.meta["match_rate"] > 0.4
+    found = disparity(store, images, params, side)
+    assert found.key != once.key
+    assert found.digest == once.digest
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("preset", ["default", "fast"])
+def test_mockup_in_tiles_of_256_has_the_digest_of_the_whole(tmp_path, preset):
+    from pipeline.flow.reconstruction import Reconstruction
+    from pipeline.runs.session import Options, settings
+
+    digests = []
+    for side in (0, 256):
+        sequence, config, _ = settings(Options("mockup-short", (f"hfvm.preset={preset}", f"tiling.tile={side}")))
+        graph = Graph()
+        chain = Reconstruction(graph, sequence, config, (0,))
+        products = chain.build()
+        del graph.nodes[products.disparity[0].index + 1 :]
+        graph.expansions.clear()
+        scheduler.run(graph, Store(tmp_path), executor="inline").check()
+        digests.append(products.disparity[0].ref.digest)
+    assert digests[0] == digests[1]
+
+
+def test_wrong_size_of_the_camera_is_one_clear_line(tmp_path, images):
+    graph = Graph()
+    given = pyramids(graph, images)
+    less = (SHAPE[0] // 2, SHAPE[1] // 2)
+    tiles.Tiles(graph, HfvmParams(), PyramidParams(), given, (less, less), 50, "hfvm").build()
+    result = scheduler.run(graph, Store(tmp_path), executor="inline")
+    assert "does not have the size that its camera states" in str(result.failures[0].error)
+
+
+def test_tiles_follow_size_and_memory():
+    small, large, params = ((600, 800),) * 2, ((4300, 5800),) * 2, HfvmParams()
+    assert tiles.side(Tiling(), params, small) is None
+    side = tiles.side(Tiling(), params, large)
+    assert side is not None
+    assert tiles.TILE_BYTES * side**2 <= 1e9
+    assert tiles.side(Tiling(memory=300), params, large) < side
+    assert tiles.side(Tiling(tile=0), params, large) is None
+    assert tiles.side(Tiling(tile=256), params, small) == 256
+    assert tiles.side(Tiling(tile=800), params, small) is None
+    assert tiles.side(Tiling(tile=256), HfvmParams(preset="accurate"), large) is None
+
+
+def test_tiling_is_a_section_of_the_configuration():
+    assert build({"tiling": {"tile": 256}}).tiling == Tiling(tile=256)

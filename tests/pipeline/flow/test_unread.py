@@ -1,0 +1,101 @@
+"""A parameter that was set and that nothing reads is an error that names it."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+
+import pytest
+from raising import raises
+from toys.chain import build as toy
+
+from datasets.registry import open_sequence
+from pipeline.cli import main
+from pipeline.engine.graph import Graph
+from pipeline.flow import config as configuration
+from pipeline.flow import unread
+from pipeline.runs import session
+
+
+def settled(tmp_path: Path, sequence: str, *assignments: str, config: Path | None = None) -> session.Settings:
+    return session.settings(session.Options(sequence, assignments, config=config, cache=tmp_path / "cache"))
+
+
+def test_only_values_that_differ_from_what_would_be_in_force_count(tmp_path):
+    assert settled(tmp_path, "mockup", "track.points=300", "select.stride=4").given == ("track.points",), "4 it is"
+    assert settled(tmp_path, "mockup", "terrain.preset=accurate", "select.preset=navigation").given == ()
+
+
+@pytest.mark.parametrize("name", ["mockup", "mockup-loop"])
+def test_the_configuration_of_a_run_can_be_given_back(tmp_path, name):
+    more = ("locus.cell_size=0.008", "vehicle.max_step=0.01")
+    first = settled(tmp_path, name, *more)
+    path = tmp_path / "config.toml"
+    path.write_text(configuration.to_toml(first.config, first.sequence.parameters))
+    again = settled(tmp_path, name, config=path)
+    assert sorted(again.given) == sorted(more_key.partition("=")[0] for more_key in more)
+    assert again.config == first.config
+    assert "crosscheck" in tomllib.loads(path.read_text())
+    unread.refuse_unreadable(again.given, again.config, again.sequence)
+
+
+def test_what_a_user_has_switched_off_himself_may_stay(tmp_path):
+    assert settled(tmp_path, "mockup", "crosscheck.enabled=false", "crosscheck.window=20").given == ()
+    off = settled(tmp_path, "mockup-loop", "crosscheck.window=20")
+    assert off.given == ("crosscheck.window",), "it is off in a drive anyway"
+
+
+@pytest.mark.parametrize(
+    ("name", "assignment"),
+    [
+        ("mockup", "leg.length=0.3"),
+        ("mockup", "drive.goal=[0.0,1.0]"),
+        ("mockup", "undistort.interpolation=linear"),
+        ("mockup-loop", "refine.window=3"),
+        ("mockup-loop", "crosscheck.enabled=true"),
+    ],
+)
+def test_what_no_such_run_can_read_is_refused_before_anything_is_computed(tmp_path, name, assignment, capsys):
+    folders = "--cache", str(tmp_path / "cache"), "--runs", str(tmp_path / "runs")
+    with pytest.raises(SystemExit) as end:
+        main(["reconstruct", name, "--set", assignment, *folders])
+    assert end.value.code == 2
+    told = capsys.readouterr().err
+    assert "RIL-730" in told
+    assert assignment.partition("=")[0] in told
+    assert not (tmp_path / "cache" / "artifacts").exists()
+
+
+@pytest.mark.parametrize("assignment", ["mockup.forward=0.1", "mockup.frames=3"])
+def test_a_drive_refuses_how_a_recorded_rig_moves(assignment):
+    given = configuration.parse_assignments([assignment])
+    with raises("RIL-734", assignment.partition("=")[0]):
+        open_sequence("mockup-loop", given)
+    with raises("RIL-281", "misalign"):
+        open_sequence("mockup-loop", {"misalign": {"rows": 3.0}})
+
+
+def test_check_refuses_what_it_does_not_read(tmp_path):
+    config = configuration.build({})
+    unread.refuse_unchecked(["hfvm.preset", "motion.level"], config)
+    with raises("RIL-731", "locus.both"):
+        unread.refuse_unchecked(["hfvm.preset", "locus.both"], config)
+
+
+def test_sections_without_a_task_in_the_graph_are_told():
+    config = configuration.build({})
+    graph = Graph()
+    toy(graph)
+    assert unread.unread(["track.points", "drive.goal"], config, graph) == ["track.points"]
+    graph.node(
+        "stages.odometry.motion",
+        "motion",
+        config.motion,
+        {"vehicle": {}},
+        inputs={"a": graph.nodes[0], "b": graph.nodes[0]},
+    )
+    keys = ["motion.level", "vehicle.track", "tiling.tile", "refine.window"]
+    assert unread.unread(keys, config, graph) == ["tiling.tile", "refine.window"]
+    assert unread.remedy(["refine.window"], config).startswith("leave it out")
+    off = configuration.build({"refine": {"enabled": False}})
+    assert unread.remedy(["refine.window"], off) == "set refine.enabled=true, or leave it out"

@@ -1,0 +1,366 @@
+"""The report on synthetic artifacts: what it says, what it admits, and that it needs nothing but itself."""
+
+from __future__ import annotations
+
+import os
+import re
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from toys.finished import TASKS, Written, bundles, products, view, written
+
+from datasets.mockup.sequence import vehicle_at_scale
+from pipeline.flow.closed_loop import Driven
+from pipeline.flow.reconstruction import Products
+from pipeline.report import TaskRow, canvas, figures, tables, words, write_report
+from pipeline.runs import session
+from stages.core.declare import Bundle
+from stages.core.errors import RilleError
+from stages.hazard.risk import RiskParams
+from stages.odometry.resection.trajectory import _account
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Written:
+    """The report of a run that lacks nothing, written once."""
+    return written(tmp_path_factory.mktemp("whole"), view(), pictures=True)
+
+
+def test_a_whole_run_has_every_figure_and_nothing_missing(whole: Written) -> None:
+    facts, page_, html, folder = whole
+    assert facts["missing"] == []
+    assert facts["complete"] is True
+    assert facts["absent"] == []
+    said = "Complete: 6 of 6 frames posed, 2 of 2 elevation models, 2 of 2 local paths, a path of 0.49 m."
+    assert facts["verdict"] == said
+    everything = "every task was done, every frame has a pose, every stop has a local path, a path over the merged"
+    assert f"Nothing is missing: {everything} terrain was found." in page_.text
+    for anchor in (
+        "figure-6",
+        "figure-7",
+        "risk-map",
+        "figure-3",
+        "figure-8",
+        "figure-9",
+        "terrain",
+        "overlap",
+        "elevation-error",
+    ):
+        assert anchor in page_.ids
+    assert len(page_.images) == 4 + 2 + 2 + 2 + 4 + 2 + 3 + 2 + 1
+    assert facts["warnings"] == []
+    assert "warnings-box" not in page_.ids
+    assert all(image["alt"] for image in page_.images)
+    assert len(html) < 5_000_000
+    assert {p.name for p in folder.iterdir()} == {"report.html", "report.json"}
+
+
+def test_the_page_needs_nothing_but_itself(whole: Written) -> None:
+    _, page_, html, _ = whole
+    assert page_.addresses
+    assert all(a.startswith(("data:image/", "#")) for a in page_.addresses)
+    assert {a[1:] for a in page_.addresses if a.startswith("#")} <= set(page_.ids)
+    assert not re.search(r"https?:|//[a-z]+\.|@import|url\(", re.sub(r"data:image/[^\"]+", "", html))
+
+
+def test_text_from_outside_is_escaped(whole: Written) -> None:
+    _, page_, html, _ = whole
+    assert "Rendered for test <1>." in page_.text
+    assert "<1>" not in html
+    assert "<m>" not in html
+
+
+def test_report_json_has_the_promised_shape(whole: Written) -> None:
+    facts, _, _, _ = whole
+    for key in ("run", "command", "missing", "sequence", "truth", "metrics", "stages", "versions", "seconds", "frames"):
+        assert key in facts
+    for name, metric in facts["metrics"].items():
+        assert set(metric) >= {"label", "value", "unit", "how", "truth", "completeness"}, name
+        assert metric["how"]
+    assert facts["stages"]["hfvm"] == {
+        "computed": 1,
+        "cached": 1,
+        "failed": 0,
+        "skipped": 0,
+        "seconds": 2.0,
+        "seconds_when_computed": 6.0,
+    }
+    assert facts["metrics"]["path_length"]["value"] == 0.49
+    # 5 x 9 of the 60 x 80 cells of 1 cm are undefined.
+    assert facts["metrics"]["mapped_area"]["value"] == pytest.approx((60 * 80 - 45) * 1e-4)
+    assert facts["metrics"]["unknown"]["value"] == pytest.approx(45 / 4800)
+
+
+def test_truth_is_aligned_by_the_first_frame_alone(whole: Written) -> None:
+    facts, page_, _, _ = whole
+    # The estimate equals the truth up to the truth's own world frame.
+    assert [r["error_m"] for r in facts["frames"]] == pytest.approx([0.0] * 6, abs=1e-12)
+    assert facts["truth"] == {"used": True, "source": "exact poses"}
+    assert "exact poses" in page_.text
+
+
+def test_error_never_without_completeness(whole: Written) -> None:
+    facts, _, _, _ = whole
+    found = facts["metrics"]
+    assert found["dem_pairs_rmse_max"]["value"] == pytest.approx(5e-3)
+    assert found["dem_pairs_rmse_median"]["value"] == pytest.approx(3e-3)
+    assert found["dem_pairs_completeness_min"]["value"] == pytest.approx(0.7)
+    assert found["dem_merged_rmse"]["value"] == pytest.approx(4e-4, rel=1e-3)
+    assert found["path_check_hazard_cells"]["value"] == 0
+    for name, metric in found.items():
+        if metric["truth"] and not name.startswith("path_check"):
+            assert metric["completeness"], name
+    assert found["trajectory_kitti_translation"]["value"] is None
+    assert "not applicable" in found["trajectory_kitti_translation"]["how"]
+
+
+def test_without_truth_it_says_so_and_shows_no_errors(tmp_path: Path) -> None:
+    made = {k: v for k, v in bundles().items() if "accuracy" not in k and k != "path_check"}
+    facts, page_, html, _ = written(tmp_path, view(made, truth=False))
+    assert facts["complete"] is True
+    assert facts["missing"] == []
+    assert [m["kind"] for m in facts["absent"]] == ["no truth"]
+    assert 'class="note missing"' not in html, "what every user's own data have is no fault"
+    assert page_.text.index("Nothing is missing") < page_.text.index("Not asked for, or not available No truth")
+    assert all(metric["truth"] is None for metric in facts["metrics"].values())
+    assert all(r["error_m"] is None for r in facts["frames"])
+    assert "not assessed against truth" in page_.text
+    assert "elevation-error" not in page_.ids
+
+
+def test_what_is_missing_comes_first(tmp_path: Path) -> None:
+    made = {
+        k: v for k, v in bundles().items() if k not in {"trajectory", "tile", "risk", "path", "resect1", "local_dem4"}
+    }
+    tasks = (
+        *TASKS,
+        TaskRow("resect/4", "resect", "failed", None, "frame 5: 3 landmarks, 6 are needed: set track.points higher"),
+        TaskRow("trajectory", "trajectory", "skipped", None, "resect/4 failed"),
+        TaskRow("risk/world", "risk", "skipped", None, "resect/4 failed"),
+    )
+    facts, page_, _, _ = written(tmp_path, view(made, tasks=tasks))
+    assert facts["complete"] is False
+    assert facts["verdict"].startswith(
+        "Incomplete: 0 of 6 frames posed, 1 of 2 elevation models, 2 of 2 local paths, no path"
+    )
+    kinds = [m["kind"] for m in facts["missing"]]
+    assert kinds[:4] == ["failed", "skipped", "no pose", "no path"]
+    skipped = facts["missing"][1]
+    assert skipped["what"] == "trajectory, risk/world"
+    text = page_.text
+    assert text.index("3 landmarks, 6 are needed") < text.index("Key figures Quantity")
+    assert page_.ids[0] == "missing-box"
+    assert "figure-9" not in page_.ids
+
+
+def test_frames_without_a_pose_are_named(tmp_path: Path) -> None:
+    made = bundles()
+    poses = made["trajectory"]["poses"].copy()
+    poses[[2, 3, 5]] = np.nan
+    made["trajectory"] = Bundle({**made["trajectory"].arrays, "poses": poses}, made["trajectory"].meta)
+    facts, _, _, _ = written(tmp_path, view(made))
+    lost = next(m for m in facts["missing"] if m["kind"] == "no pose")
+    assert lost["what"] == "3 of 6 frames have no pose"
+    assert lost["why"] == "frames 2-3, 5"
+    assert facts["frames"][2]["x_m"] is None
+    assert facts["complete"] is False
+
+
+def test_frames_posed_are_counted_alike_on_stderr_and_in_the_report(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of six frames five have a pose, three of them in the world; the other two are a piece of their own."""
+    made = bundles()
+    arrays, piece = dict(made["trajectory"].arrays), np.array([0, 0, 0, -1, 1, 1], dtype=np.int16)
+    arrays["poses"] = np.where((piece < 0)[:, None, None], np.nan, arrays["poses"])
+    account = _account([0, 1, 2, 3, 4, 5], piece, {3: "black"})
+    made["trajectory"] = Bundle(arrays | {"piece": piece}, {"frames": [0, 1, 2, 3, 4, 5]} | account)
+    made_by: Any = SimpleNamespace(trajectory=SimpleNamespace(ref=SimpleNamespace(meta=made["trajectory"].meta)))
+    assert session._posed_all(made_by) == session.HOLES
+    assert "incomplete: 5 of 6 frames posed, 3 in the world, in 2 pieces" in capsys.readouterr().err
+    facts, page_, _, _ = written(tmp_path, view(made))
+    assert facts["metrics"]["frames_posed"]["value"] == 5
+    assert facts["metrics"]["frames_in_world"]["value"] == 3
+    assert facts["verdict"].startswith("Incomplete: 5 of 6 frames posed, 3 of them in the world")
+    assert [(m["kind"], m["why"]) for m in facts["missing"]] == [("no pose", "frame 3"), ("piece", "frames 4-5")]
+    assert [(r["posed"], r["piece"]) for r in facts["frames"]] == [(True, 1)] * 3 + [(False, None)] + [(True, 2)] * 2
+    assert "5 of 6 frames posed" in page_.text
+    assert "a pose in piece 2, not in the world" in page_.text
+
+
+def test_no_path_names_the_row_that_blocks(tmp_path: Path) -> None:
+    made = bundles()
+    meta = {"found": False, "reason": "no free cell of this row can be entered", "blocking_row": 17, "blocking_y": 0.63}
+    meta |= {"target_row": 0, "length_m": None, "climb_m": None, "max_inclination": None}
+    arrays = {**made["path"].arrays, "path": np.empty((0, 3))}
+    made["path"] = made["local_path0"] = made["local_path4"] = Bundle(arrays, meta)
+    facts, page_, _, _ = written(tmp_path, view(made))
+    assert facts["complete"] is True  # an answer, not a hole
+    reason = "no free cell of this row can be entered"
+    assert facts["missing"] == [
+        {"kind": "no path", "what": "2 of 2 stops have no local path", "why": f"{reason} (frames 0, 4)"},
+        {"kind": "no path", "what": "No path", "why": f"{reason}; blocked at row 17, 0.63 m ahead"},
+    ]
+    assert facts["metrics"]["local_paths"]["value"] == 0
+    assert "0 of 2 local paths, no path" in facts["verdict"]
+    assert "path_length" not in facts["metrics"]
+    assert "path_start" not in facts["metrics"]
+    assert f"There is no path: {reason}." in page_.text
+    assert "risk-map" in page_.ids
+
+
+def test_one_stop_without_a_local_path_is_not_nothing_missing(tmp_path: Path) -> None:
+    made = bundles()
+    meta = {**made["path"].meta, "found": False, "reason": "no free cell", "length_m": None}
+    made["local_path4"] = Bundle({**made["path"].arrays, "path": np.empty((0, 3))}, meta)
+    facts, page_, _, _ = written(tmp_path, view(made))
+    assert [(m["what"], m["why"]) for m in facts["missing"]] == [
+        ("1 of 2 stops have no local path", "no free cell (frame 4)")
+    ]
+    assert "Nothing is missing" not in page_.text
+    assert "every stop has a local path" not in facts["delivered"]
+    assert facts["complete"] is True  # it was looked for: that is an answer
+
+
+def test_a_path_says_where_it_starts_when_that_is_not_at_the_vehicle(tmp_path: Path) -> None:
+    """It starts 0.21 m ahead of the camera: within the length of the default rover, but two of a rover at 1:10."""
+    config = SimpleNamespace(vehicle=vehicle_at_scale(), risk=RiskParams())
+    facts, page_, _, _ = written(tmp_path, view(config=config))
+    assert facts["metrics"]["path_start"]["value"] == pytest.approx(0.21)
+    assert facts["verdict"].endswith("a path of 0.49 m, which starts 0.210 m from the first camera.")
+    assert "a path over the merged terrain was found, which starts 0.210 m from the first camera" in page_.text
+    assert "no unknown ground comes under its outline. It starts 0.210 m from the first camera." in page_.text
+    near, _, _, _ = written(tmp_path, view())
+    assert "which starts" not in near["verdict"]
+
+
+@pytest.mark.parametrize("verdict", ["goal", "no path"])
+def test_a_drive_that_arrived_does_not_say_that_there_is_no_path(tmp_path: Path, verdict: str) -> None:
+    made = products()
+    made.path, made.local_path = None, {}
+    made.drive = Driven(verdict=verdict, reason="" if verdict == "goal" else "hazards all around")
+    facts, page_, _, _ = written(tmp_path, view(products=made))
+    assert "There is no path" not in page_.text
+    missing = [m["what"] for m in facts["missing"] if m["kind"] == "no path"]
+    if verdict == "goal":
+        assert "Risk map and path of the whole run" in page_.text
+        assert "The goal was reached; no path is planned over the whole map" in page_.text
+        assert "the goal was reached" in facts["delivered"]
+        assert missing == []
+    else:
+        assert "No path leads to the goal: hazards all around" in page_.text
+        assert missing == ["Drive: no path"]
+
+
+def test_nothing_at_all_still_makes_a_page(tmp_path: Path) -> None:
+    facts, page_, _, _ = written(tmp_path, view({}, tasks=(), products=Products()))
+    assert facts["complete"] is False
+    assert page_.images == []
+    assert any(m["kind"] == "no pose" for m in facts["missing"])
+
+
+def test_a_figure_that_cannot_be_drawn_is_admitted(tmp_path: Path) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(figures, "disparity", lambda *a: 1 / 0)
+        facts, page_, _, _ = written(tmp_path, view(bundles()))
+    assert "figure-6" not in page_.ids
+    assert "figure-7" in page_.ids
+    assert any(m["kind"] == "figure" and "ZeroDivisionError" in m["why"] for m in facts["missing"])
+
+
+def test_table_2_sums_the_units_of_a_cycle() -> None:
+    rows, together = tables.table_2(view())
+    assert [t.in_1999 for t in rows] == [40, 20, 1, 1, 5, 5]
+    hfvm = rows[0]
+    assert (hfvm.unit, hfvm.total, hfvm.computed, hfvm.cached) == (3.0, 6.0, 1, 1)
+    assert rows[1].tasks == 2  # the world's Locus is not among the local ones
+    assert together.in_1999 == 72
+    assert together.unit == pytest.approx(3.0 + 1.0 + 0.1 + 0.1 + 0.3 + 0.2)
+    assert [t.name for t in tables.other_stages(view())] == ["locus/world", "pyramid"]
+
+
+def test_a_failed_write_leaves_the_old_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "report.html").write_text("old")
+
+    def broken(source: object, target: object) -> None:
+        raise OSError("disk full")
+
+    monkeypatch.setattr(os, "replace", broken)
+    with pytest.raises((OSError, RilleError), match="disk full"):
+        write_report(tmp_path, view({}, tasks=(), products=Products()))
+    assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
+    assert (tmp_path / "report.html").read_text() == "old"
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "text"),
+    [
+        (0.0004312, "m", "0.431 mm"),
+        (1.234567, "m", "1.23 m"),
+        (-0.00012, "m", "−0.120 mm"),
+        (12, "frames", "12 frames"),
+        (1, "frames", "1 frame"),
+        (0.0, "m", "0 m"),
+        (17.25, "deg", "17.2°"),
+        (None, "m", "–"),
+        ("pitch", "", "pitch"),
+        (1234.5678, "s", "1235 s"),
+        (0.1234, "1", "12.3 %"),
+        (3.1e-17, "m", "0 m"),
+        (3.1e-7, "%", "3e−07 %"),
+    ],
+)
+def test_numbers_have_sensible_digits(value: Any, unit: str, text: str) -> None:
+    assert words.quantity(value, unit) == text
+
+
+def test_shrinking_averages_what_is_defined() -> None:
+    a = np.array([[1.0, 3.0, np.nan, np.nan], [5.0, np.nan, np.nan, np.nan]], dtype=np.float32)
+    np.testing.assert_allclose(canvas.shrink(a, 2), [[3.0, np.nan]])
+    assert canvas.shrink(a, 4) is not None
+    assert canvas.shrink(np.ones((5, 9, 3)), 3).shape == (1, 3, 3)
+
+
+def test_limits_are_robust_and_never_empty() -> None:
+    values = np.concatenate([np.linspace(0, 1, 1000), [1e6]])
+    assert canvas.limits(values)[1] < 1.0
+    for constant in (np.full(5, np.nan), np.zeros(5), np.full(5, 3.0)):
+        low, high = canvas.limits(constant)
+        assert high > low
+
+
+def test_measured_and_interpolated_are_told_apart() -> None:
+    bits = np.array([[1, 2, 2 | 4, 8, 0]], dtype=np.uint8)
+    np.testing.assert_array_equal(figures.validity_classes(bits), [[0, 1, 1, 2, 2]])
+
+
+def test_ground_limits_ignore_crowns() -> None:
+    ground = np.linspace(-1.7, -1.6, 900)
+    crowns = np.full(90, 2.0)
+    low, high = canvas.ground_limits(np.concatenate([ground, crowns]))
+    # The ground spreads by 0.1 m: its robust deviation is 0.037 m, five of them 0.19 m.
+    assert -1.7 <= low < -1.69
+    assert -1.6 <= high < -1.4
+
+
+def test_shading_is_bright_towards_the_light() -> None:
+    x, y = np.meshgrid(np.arange(9.0), -np.arange(9.0))  # row 0 at the greatest y
+    towards, away = figures._shade(0.5 * (x - y), 1.0), figures._shade(-0.5 * (x - y), 1.0)
+    assert towards[4, 4] > figures._shade(0 * x, 1.0)[4, 4] > away[4, 4]
+
+
+def test_spans() -> None:
+    assert words.spans([1, 2, 3, 7, 9, 10]) == "1-3, 7, 9-10"
+
+
+def test_frames_without_truth_are_counted_where_errors_are_stated(tmp_path: Path) -> None:
+    base = view()
+    assert base.sequence.truth is not None
+    truth = tuple(None if k in (1, 3) else pose for k, pose in enumerate(base.sequence.truth))
+    facts, _, _, _ = written(tmp_path, replace(base, sequence=replace(base.sequence, truth=truth)))
+    assert facts["metrics"]["trajectory_ate_rmse"]["completeness"] == "6 of 6 frames, truth for 4"
+    assert facts["metrics"]["frames_posed"]["completeness"] == "6 of 6 frames"

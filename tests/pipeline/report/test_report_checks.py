@@ -1,0 +1,202 @@
+"""How the report shows that a run checks itself: rig, other program, overlaps, gaps of the truth, a single pair."""
+
+from __future__ import annotations
+
+import base64
+import io
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from toys.finished import (
+    BASIC,
+    FRAMES,
+    REPAIRED,
+    STEP,
+    Written,
+    bundles,
+    checked,
+    checks,
+    level_pose,
+    products,
+    view,
+    written,
+)
+
+from pipeline.report import artifacts, canvas, figures, gather
+from stages.core.declare import Bundle
+from stages.hazard.risk import RiskParams
+from stages.hazard.vehicle import Vehicle
+
+
+@pytest.fixture(scope="module")
+def self_checked(tmp_path_factory: pytest.TempPathFactory) -> Written:
+    """The report of a run with a repaired rig and another program's poses."""
+    made = bundles() | checks()
+    return written(tmp_path_factory.mktemp("checked"), view(made, products=checked()), pictures=True)
+
+
+def test_the_rig_is_shown_before_and_after(self_checked: Written) -> None:
+    facts, page_, _, _ = self_checked
+    assert {"rig", "basic-pairs", "crosscheck"} <= set(page_.ids)
+    found = facts["metrics"]
+    # At infinity a pitch of 0.01 rad moves rows by 60 px tan(0.01 + a) - tan(a): 0.6 px at the centre, more outside.
+    assert found["rig_residual_given"]["value"] == pytest.approx(0.6, abs=0.06)
+    assert found["rig_residual"]["value"] == pytest.approx(0.0, abs=1e-4)
+    assert found["rig_residual"]["completeness"] == "2 basic pairs, 68 matches"
+    text = page_.text
+    assert "pitch freed +0.5730° +0.5730° 0.0010° contradicted" in text
+    assert "yaw held as given +0.5730° 0.0010° not observed <>" in text
+    assert "before and after its repair" in text
+
+
+def test_suspicions_stand_before_the_figures(self_checked: Written) -> None:
+    facts, page_, _, _ = self_checked
+    assert facts["warnings"] == [
+        "the calibration contradicts the images: rows are off by 0.60 px; repaired",
+        "trajectory and COLMAP disagree more than elsewhere at 1 of 6 frames: frame 3",
+    ]
+    text = page_.text
+    assert text.index("rows are off by 0.60 px") < text.index("Key figures Quantity")
+
+
+def test_the_other_program_is_compared_frame_by_frame(self_checked: Written) -> None:
+    facts, page_, _, _ = self_checked
+    rows, found = facts["frames"], facts["metrics"]
+    assert [r["flagged"] for r in rows] == [False, False, False, True, False, False]
+    assert rows[3]["disagreement_m"] == 0.002
+    assert rows[3]["disagreement_deg"] == pytest.approx(0.5)
+    assert rows[5]["disagreement_m"] is None
+    assert found["agreement_rmse"]["value"] == 9e-4
+    assert found["agreement_rmse"]["completeness"] == "5 of 6 frames"
+    assert found["agreement_scale"]["value"] == pytest.approx(0.002)
+    assert found["agreement_flagged"]["value"] == 1
+    assert "Flagged: frame 3 (position, rotation)." in page_.text
+    assert "COLMAP has used the rig as it was given" in page_.text
+    assert found["crosscheck_drift"]["completeness"] == "5 of 6 frames"
+    assert found["crosscheck_drift"]["group"] == "COLMAP against truth"
+    assert [m["what"] for m in facts["missing"]] == ["1 of 6 frames are not compared with another program"]
+    assert facts["missing"][0]["why"] == "COLMAP has no pose of frame 5"
+    assert facts["complete"] is True
+    assert "Against the truth ours COLMAP" in page_.text
+
+
+def test_overlapping_models_and_the_choice_of_pairs_are_tabled(self_checked: Written) -> None:
+    facts, _, _, _ = self_checked
+    first, second = facts["pairs"]
+    assert (first["overlap"], first["why_basic"], first["difference_m"]) == (None, "first frame", None)
+    assert (second["overlap"], second["why_basic"], second["epipolar_px"]) == (0.72, "overlap", 0.6)
+    assert second["difference_m"] == pytest.approx(0.003, abs=1e-6)
+    assert second["difference_deviation_m"] == pytest.approx(0.0, abs=1e-6)
+    assert facts["metrics"]["overlap_median"]["value"] == pytest.approx(0.003, abs=1e-6)
+
+
+def test_consumers_survive_facts_that_are_not_there(tmp_path: Path) -> None:
+    made = bundles() | checks()
+    rig, agreement = made["rig"].meta, made["agreement"]
+    made["rig"] = Bundle({}, {"rig": rig["rig"], "mode": "fixed", "baseline": 0.097, "source": "given calibration"})
+    made["select"] = Bundle({}, {"basic": list(BASIC)})
+    made["agreement"] = Bundle(agreement.arrays, {})
+    del made["crosscheck_accuracy"], made["orientation4"]
+    facts, page_, _, _ = written(tmp_path, view(made, products=checked()))
+    assert not [m for m in facts["missing"] if m["kind"] == "figure"]
+    assert {"rig", "basic-pairs", "crosscheck"} <= set(page_.ids)
+    assert facts["pairs"][1]["overlap"] is None
+
+
+def test_a_broken_comparison_says_why(tmp_path: Path) -> None:
+    made = bundles() | checks()
+    windows = [{"reason": ""}, {"reason": "no two images match (median 12 features an image)"}]
+    meta = {"pieces": [[0, 1, 2, 3], [4]], "unregistered": [5], "windows": windows}
+    made["crosscheck"] = Bundle(made["crosscheck"].arrays, made["crosscheck"].meta | meta)
+    facts, _, _, _ = written(tmp_path, view(made, products=checked()))
+    (missing,) = facts["missing"]
+    assert missing["why"] == (
+        "COLMAP has no pose of frame 5; its trajectory falls into 2 pieces, each laid on ours by itself; "
+        "no two images match (median 12 features an image)"
+    )
+
+
+def test_no_comparison_is_told_only_where_it_was_switched_off(tmp_path: Path) -> None:
+    config = SimpleNamespace(vehicle=Vehicle(), risk=RiskParams(), crosscheck=SimpleNamespace(enabled=False))
+    facts, _, html, _ = written(tmp_path, view(config=config))
+    assert facts["missing"] == []
+    assert [m["kind"] for m in facts["absent"]] == ["crosscheck"]
+    assert "crosscheck.enabled = false" in facts["absent"][0]["why"]
+    assert 'class="note missing"' not in html
+    assert 'class="note neutral"' in html
+    assert facts["complete"] is True
+
+
+def test_gaps_of_the_truth_are_told_and_bridged(tmp_path: Path) -> None:
+    base = view()
+    truth = list(base.sequence.truth or ())
+    truth[0] = truth[3] = None
+    facts, _, _, _ = written(tmp_path, replace(base, sequence=replace(base.sequence, truth=tuple(truth))))
+    gaps = [m for m in facts["absent"] if m["kind"] == "no truth"]
+    assert gaps == [{"kind": "no truth", "what": "2 of 6 frames have no truth", "why": "frames 0, 3"}]
+    errors = [r["error_m"] for r in facts["frames"]]
+    assert [e is None for e in errors] == [True, False, False, True, False, False]
+    assert [e for e in errors if e is not None] == pytest.approx([0.0] * 4, abs=1e-12)
+    assert facts["truth"]["used"] is True
+    assert facts["complete"] is True
+
+
+def test_truth_outside_of_the_chosen_frames_is_no_truth(tmp_path: Path) -> None:
+    base = view({k: v for k, v in bundles().items() if k != "accuracy"})
+    truth = (*[None] * 5, (base.sequence.truth or ())[5])
+    run = replace(base, sequence=replace(base.sequence, truth=truth), frames=FRAMES[:5])
+    facts, _, _, _ = written(tmp_path, run)
+    assert facts["truth"]["used"] is False
+    assert "not assessed against truth" in facts["verdict"]
+
+
+def test_a_single_pair_has_no_trajectory_and_lacks_none(tmp_path: Path) -> None:
+    made = bundles()
+    trajectory = made["trajectory"]
+    made["trajectory"] = Bundle({k: v[:1] for k, v in trajectory.arrays.items()}, {"frames": [0]})
+    one: Any = products()
+    for name in ("disparity", "level", "local_dem", "local_risk", "local_path", "world_dem", "local_dem_accuracy"):
+        setattr(one, name, {0: getattr(one, name)[0]})
+    one.tracks, one.resections = [], []
+    made["tile"] = Bundle({k: v for k, v in made["tile"].arrays.items() if k != "spread"}, made["tile"].meta)
+    facts, page_, _, _ = written(tmp_path, view(made, products=one, frames=(0,)))
+    assert facts["missing"] == []
+    assert (
+        facts["verdict"] == "Complete: one stereo pair, 1 of 1 elevation models, 1 of 1 local paths, a path of 0.49 m."
+    )
+    assert not {"figure-8", "figure-9", "crosscheck", "overlap", "basic-pairs"} & set(page_.ids)
+    assert "trajectory_drift" not in facts["metrics"]
+
+
+def test_images_free_of_distortion_are_shown_and_the_used_rig_places_the_right_camera() -> None:
+    made = bundles() | checks()
+    made["ideal0"] = Bundle({"image": np.zeros((48, 64), dtype=np.float32)}, {})
+    handles = checked()
+    handles.undistorted = {0: "ideal0"}  # type: ignore[dict-item]
+    run = view(made, products=handles)
+    assert artifacts.image(run, 0) is made["ideal0"]
+    assert artifacts.image(run, 1) is made["image1"]
+    right = gather.trajectory(run).right
+    expected = (level_pose(0 * STEP) @ REPAIRED.T_right_left.inverse()).translation
+    np.testing.assert_allclose(right[0], expected, atol=1e-12)
+
+
+def test_trails_end_where_the_landmark_is() -> None:
+    image = np.zeros((48, 64), dtype=np.uint8)
+    panel = figures.tracks(image, [np.array([[10.0, 10.0], [40.0, 30.0]])], [True], "")
+    pixels = decoded(panel)
+    scale = pixels.shape[1] / 64
+    at = (np.array([30.5, 40.5]) * scale).astype(int)
+    assert pixels[at[0], at[1], 0] > 200  # yellow
+    assert pixels[at[0], at[1], 2] < 140
+    assert pixels[int(10.5 * scale), int(50 * scale)].max() < 40
+
+
+def decoded(panel: canvas.Panel) -> np.ndarray:
+    """Pixels of an encoded panel."""
+    return np.asarray(Image.open(io.BytesIO(base64.b64decode(panel.uri.split(",")[1]))).convert("RGB"))

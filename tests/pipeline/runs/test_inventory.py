@@ -1,0 +1,96 @@
+"""What the cache holds, for which runs; pins; and what clearing leaves."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+
+import pytest
+from raising import raises
+from test_why import run
+
+from pipeline.runs import inventory, pins, lookup
+from pipeline.engine.store import maintenance
+from pipeline.runs import session as commands
+from pipeline.engine.store.folder import Store
+
+
+def grow_old(folder):
+    for path in (folder / "cache").rglob("*"):
+        os.utime(path, (1.0, 1.0))
+
+
+@pytest.fixture
+def two(tmp_path):
+    return tmp_path, run(tmp_path, "1"), run(tmp_path, "2", seed=1)
+
+
+def test_the_cache_is_listed_by_the_run_that_used_it_last(two, capsys):
+    folder, first, _ = two
+    store = Store(folder / "cache")
+    rows = {(r.sequence, r.stage): r for r in inventory.holdings(store, folder / "runs")}
+    assert rows["toy", "numbers"].artifacts == 8
+    assert rows["toy", "numbers"].bytes == 8 * 40 * 40 * 5
+    assert rows["toy", "numbers"].last_run == "toy/2"
+    on_disk = sum(p.stat().st_size for p in (folder / "cache/artifacts").rglob("a-*/**/*") if p.is_file())
+    assert sum(r.stored for r in rows.values()) == on_disk
+    shutil.rmtree(first)
+    rows = {(r.sequence, r.stage): r for r in inventory.holdings(store, folder / "runs")}
+    assert rows["-", "numbers"].artifacts == rows["toy", "numbers"].artifacts == 4
+    assert inventory.ls(folder / "cache", folder / "runs", as_json=False) == 0
+    assert "no kept run" in capsys.readouterr().out
+    inventory.ls(folder / "cache", folder / "runs", as_json=True)
+    assert {r["stage"] for r in json.loads(capsys.readouterr().out)} == {"numbers", "scale", "total"}
+
+
+def test_a_pin_outlives_the_folder_of_its_run(two, capsys):
+    folder, first, _ = two
+    store = Store(folder / "cache")
+    before = set(maintenance.artifacts(store))
+    assert pins.pin(store, first) == 9
+    shutil.rmtree(folder / "runs")
+    grow_old(folder)
+    assert commands.collect_garbage(folder / "cache", folder / "runs", dry_run=True) == 0
+    printed = capsys.readouterr().out
+    assert "would remove 9 artifacts" in printed
+    assert {line.split()[0]: line.split()[1] for line in printed.splitlines()[:3]} == {
+        "numbers": "4",
+        "scale": "4",
+        "total": "1",
+    }
+    assert set(maintenance.artifacts(store)) == before, "it was only said"
+    commands.collect_garbage(folder / "cache", folder / "runs", dry_run=False)
+    assert {key for _, key in maintenance.artifacts(store)} == pins.keys(store)
+    assert maintenance.verify(store, deep=True) == (9, [])
+    with raises("RIL-563", "'2'", "toy/1"):
+        pins.unpin(store, "2")
+    assert pins.unpin(store, "toy/1") == "toy/1"
+    with raises("RIL-744", "no run is known"):
+        commands.collect_garbage(folder / "cache", folder / "runs", dry_run=False)
+    assert len(set(maintenance.artifacts(store))) == 9
+
+
+def test_nothing_is_cleared_away_while_a_pin_cannot_be_read(two):
+    folder, first, _ = two
+    store = Store(folder / "cache")
+    pins.pin(store, first)
+    next((folder / "cache/pins").iterdir()).write_text("{")
+    with raises("RIL-564"):
+        commands.collect_garbage(folder / "cache", folder / "runs", dry_run=False)
+
+
+def test_deep_verification_decodes_what_was_computed(two, capsys):
+    """A wrong digest in a manifest that is whole by itself: no checksum of files sees it."""
+    folder, _, _ = two
+    store = Store(folder / "cache")
+    stage, key = next(iter(maintenance.artifacts(store)))
+    path = store.home(stage, key) / "manifest.json"
+    manifest = store.manifest(stage, key)
+    manifest["arrays"]["mask"]["sha256"] = "0" * 64
+    path.unlink()
+    store._publish(path.parent, manifest)
+    assert maintenance.verify(store) == (18, [])
+    assert commands.verify_cache(folder / "cache", deep=True) == 1
+    assert f"{manifest['label']} (numbers): mask decoded to another digest; set aside" in capsys.readouterr().err
+    assert lookup.keys(folder / "runs")[key].startswith("toy/")

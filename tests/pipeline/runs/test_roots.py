@@ -1,0 +1,64 @@
+"""A cache knows the folders of the runs that use it, so that clearing up from anywhere keeps what they need."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+from raising import raises
+from toys import chain
+
+from pipeline.engine import scheduler
+from pipeline.runs import pins, roots, session
+from pipeline.engine.graph import Graph
+from pipeline.engine.store.folder import Store
+from pipeline.engine.store.maintenance import artifacts
+
+
+@pytest.fixture
+def used(tmp_path: Path) -> Store:
+    """A cache whose artifacts are all older than the grace; a run under ``work/runs`` refers to them."""
+    store, folder, graph = Store(tmp_path / "cache"), tmp_path / "work" / "runs", Graph()
+    (folder / "toy" / "1").mkdir(parents=True)
+    chain.build(graph)
+    scheduler.run(graph, store, executor="inline", ledger=folder / "toy" / "1" / "ledger.jsonl")
+    roots.note(store, folder)
+    for path in store.root.glob("artifacts/*/*/*/manifest.json"):
+        os.utime(path, (0, 0))
+    return store
+
+
+def collect(store: Store, runs: Path) -> int:
+    session.collect_garbage(store.root, runs, dry_run=False)
+    return len(list(artifacts(store)))
+
+
+def test_clearing_up_from_elsewhere_keeps_what_known_runs_need(used, tmp_path):
+    assert collect(used, tmp_path / "elsewhere" / "runs") == 9
+    roots.note(used, tmp_path / "work" / "runs")
+    assert len(list((used.root / "roots").iterdir())) == 1, "noted once"
+
+
+def test_where_no_run_is_known_nothing_is_cleared(used, tmp_path):
+    shutil.rmtree(tmp_path / "work")
+    with raises("RIL-744", "no run is known"):
+        collect(used, tmp_path / "elsewhere")
+    assert len(list(artifacts(used))) == 9
+
+
+def test_runs_of_another_machine_that_cannot_be_seen_stop_it(used, tmp_path):
+    (used.root / "roots" / "other.json").write_text(json.dumps({"folder": "/nowhere/runs", "host": "other"}))
+    with raises("RIL-743", "/nowhere/runs on other"):
+        collect(used, tmp_path / "work" / "runs")
+    (used.root / "roots" / "other.json").write_text("{")
+    with raises("RIL-742", "other.json"):
+        collect(used, tmp_path / "work" / "runs")
+
+
+def test_a_pin_alone_is_enough_to_clear_the_rest(used, tmp_path):
+    pins.pin(used, tmp_path / "work" / "runs" / "toy" / "1")
+    shutil.rmtree(tmp_path / "work")
+    assert collect(used, tmp_path / "elsewhere") == 9

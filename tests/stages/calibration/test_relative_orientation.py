@@ -1,0 +1,123 @@
+"""The adjustment itself: noise and its correlation as measured, priors that hold what they should."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from rig_scenes import knocked, matches, street_depth, street_rig
+
+from stages.calibration.relative_orientation import Beliefs, Matches, adjust, considered, settle, solution
+from stages.calibration.relative_orientation_kernel import weigh
+from stages.geometry.epipolar import distances
+
+BELIEFS = Beliefs(rotation=np.radians(0.05), baseline=np.radians(0.2), principal=3.5, systematic=0.1)
+ANGLES = [True, True, True, False, False]
+
+
+def test_noise_is_measured_past_outliers():
+    m = matches(street_rig(), street_depth, noise=0.3, outliers=0.1)
+    fit = adjust(street_rig(), [m], ANGLES, BELIEFS, rival=True)
+    # the median of all is the 0.5 / 0.9 quantile of the good ones: 0.765 instead of 0.674 deviations
+    assert fit.noise[0] == pytest.approx(0.3 * 0.765 / 0.674, rel=0.1)
+    assert 0.07 < np.mean(fit.weights[0] == 0) < 0.13
+
+
+def test_matches_that_err_together_do_not_count_again():
+    """Each match four times over: the information is that of one."""
+    rig = street_rig()
+    once = matches(rig, street_depth)
+    often = Matches(0, np.repeat(once.left, 4, axis=0), np.repeat(once.right, 4, axis=0))
+    one, four = (adjust(rig, [m], ANGLES, BELIEFS, rival=True).normal for m in (once, often))
+    ratio = np.diag(four)[:5] / np.diag(one)[:5]
+    assert np.all((ratio > 0.7) & (ratio < 1.5))
+
+
+def test_smooth_error_is_told_from_the_rig():
+    def field(u, v):
+        return u**2 * v
+
+    m = matches(knocked(street_rig(), pitch_deg=0.3), street_depth, field=field)
+    fit = adjust(street_rig(), [m], ANGLES, BELIEFS, rival=True)
+    assert np.degrees(fit.x[0]) == pytest.approx(0.3, abs=0.01)
+    assert fit.smooth > BELIEFS.term / 2
+
+
+def test_images_without_smooth_error_are_used_to_the_full():
+    pairs = [matches(knocked(street_rig(), pitch_deg=0.3), street_depth, pair=k) for k in range(2)]
+    fit = adjust(street_rig(), pairs, [True, False, True, False, False], BELIEFS, rival=False)
+    assert fit.smooth < 0.5 * BELIEFS.term
+    sigma = np.sqrt(np.diag(solution(fit, ANGLES, BELIEFS, rival=False)[1]))
+    # but no sigma is smaller than what is believed of rows: 0.03 px of 707 px
+    assert sigma[0] > 0.5 * BELIEFS.term / 707.0
+
+
+def test_held_parameters_take_their_share_only():
+    m = matches(knocked(street_rig(), roll_deg=0.5), street_depth)
+    fit = adjust(street_rig(), [m], [True, False, True, False, False], BELIEFS, rival=False)
+    assert np.degrees(fit.x[2]) == pytest.approx(0.5, abs=0.01)
+    assert abs(np.degrees(fit.x[1])) < 0.05
+
+
+def test_settled_rig_has_the_least_residuals_beside_what_is_held():
+    """The baseline is off and held, and rows are bent: pitch and roll must not be traded for either."""
+    rig = street_rig()
+    free = [True, False, True, False, False]
+    m = matches(
+        knocked(rig, pitch_deg=0.3, roll_deg=0.3, across_deg=-0.3), street_depth, field=lambda u, v: 0.3 * u * u
+    )
+    x = settle(rig, [m], free, BELIEFS).x[:5]
+    assert x[[1, 3, 4]] == pytest.approx(0.0, abs=1e-6)
+
+    def spread(c):
+        return np.mean(np.clip(np.abs(distances(rig, c, m.left, m.right)[0]), 0, 2.0) ** 2)
+
+    for i in (0, 2):
+        for step in (-np.radians(0.02), np.radians(0.02)):
+            assert spread(x) < spread(x + step * np.eye(5)[i])
+
+
+def test_what_took_no_share_is_an_error_of_the_result():
+    rig = street_rig()
+    free = [True, False, False, False, False]
+    m = matches(knocked(rig, pitch_deg=0.3), street_depth)
+    fit = settle(rig, [m], free, BELIEFS)
+    sure = np.full(5, 1e-7)
+    covariance = considered(fit, free, BELIEFS, 0.0, sure)
+    # the constant term alone, 0.032 px of rows; pitch moves them by 707 px a radian and more
+    assert covariance[0, 0] > (0.5 * BELIEFS.term / 707.0) ** 2
+    assert not covariance[1:].any()
+    assert considered(fit, free, BELIEFS, 10 * BELIEFS.term, sure)[0, 0] > 20 * covariance[0, 0]
+    assert considered(fit, free, BELIEFS, 0.0, BELIEFS.held())[0, 0] > 1.1 * covariance[0, 0]
+
+
+def test_the_pair_order_does_not_matter_to_rounding():
+    pairs = [matches(knocked(street_rig(), pitch_deg=0.3), street_depth, pair=k) for k in range(3)]
+    here, there = (adjust(street_rig(), p, ANGLES, BELIEFS, rival=True).x for p in (pairs, pairs[::-1]))
+    np.testing.assert_allclose(here, there, rtol=0, atol=1e-6)
+
+
+def test_normal_equations_and_weights_by_plain_numpy():
+    rng = np.random.default_rng(5)
+    n, m, blocks = 300, 4, 9
+    constant, design = rng.normal(0.0, 0.4, n), rng.normal(size=(n, m))
+    constant[:20] += 30.0
+    x, block = 0.1 * rng.normal(size=m), rng.integers(0, blocks, n)
+    weights, normal, pull = np.empty(n), np.empty((m, m)), np.empty(m)
+    noise = weigh(constant, design, x, block, blocks, np.inf, 0.02, 4.685, weights, normal, pull)
+    rest = constant + design @ x
+    assert noise == pytest.approx(1.4826 * np.median(np.abs(rest)))
+    expected = np.maximum(0.0, 1.0 - (rest / (4.685 * noise)) ** 2) ** 2
+    np.testing.assert_allclose(weights, expected, atol=1e-12)
+    assert (weights[:20] == 0).all()
+    count, total = (np.bincount(block, w, blocks) for w in (expected, expected * rest))
+    information = expected / (noise**2 * max(1.0, np.mean(total**2 / count) / noise**2))
+    np.testing.assert_allclose(normal, design.T @ (design * information[:, None]), rtol=1e-9)
+    np.testing.assert_allclose(pull, -design.T @ (information * constant), rtol=1e-9)
+
+
+def test_a_large_correction_is_found_though_derivatives_are_shared():
+    """Half a degree is far beyond what one linearisation serves: the distances of the corrected rig vanish."""
+    given, m = street_rig(), matches(knocked(street_rig(), pitch_deg=0.5, roll_deg=-0.5), street_depth, noise=0.0)
+    fit = settle(given, [m], [True, False, True, False, False], BELIEFS)
+    off, _ = distances(given, fit.x[:5], m.left, m.right)
+    assert np.abs(off).max() < 0.01

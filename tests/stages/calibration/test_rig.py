@@ -1,0 +1,248 @@
+"""The rig of a sequence: pooled over its pairs, repaired or kept, with words for both."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from raising import raises
+from rig_scenes import bed_depth, bed_rig, knocked, matches, street_depth, street_rig
+from terrain_scenes import toed_in_rig
+
+from stages.calibration import rig as rig_stage
+from stages.calibration.relative_orientation import RIG, Matches, linearised
+from stages.calibration.rig import RigParams, _drift, orient_rig
+from stages.core.declare import Bundle
+from stages.geometry.epipolar import NAMES
+from stages.geometry.geometry import Rig, RigidTransform
+
+
+def facts(rig: Rig, pairs, **params):
+    found = orient_rig(rig, pairs, RigParams(**params))
+    json.dumps(found, allow_nan=False)
+    return found
+
+
+def moves(found):
+    return [line for line in found["warnings"] if "the rig moves" in line]
+
+
+def street(count=4, noise=0.2, **knock):
+    true = knocked(street_rig(), **knock)
+    return [matches(true, street_depth, pair=10 * k, noise=noise, samples=800) for k in range(count)]
+
+
+@pytest.mark.parametrize("inputs", [{}, {"orientations": []}])
+def test_without_pairs_the_given_rig_passes_through(inputs):
+    rig = toed_in_rig()
+    meta = rig_stage.STAGE.run(RigParams(), {"rig": rig.to_dict()}, inputs).meta
+    assert meta["rig"] == rig.to_dict()
+    assert (meta["changed"], meta["warnings"], meta["mode"]) == (False, [], "pooled")
+    assert meta["baseline"] == pytest.approx((0.1**2 + 0.004**2 + 0.003**2) ** 0.5)
+
+
+def test_no_baseline_is_refused():
+    rig = toed_in_rig()
+    with raises("RIL-427"):
+        facts(Rig(rig.left, rig.right, RigidTransform.identity()), [])
+
+
+def test_stage_reads_what_orientation_writes():
+    rig = street_rig()
+    bundles = [
+        Bundle({"left": m.left.astype(np.float32), "right": m.right.astype(np.float32)}, {"pair": m.pair})
+        for m in street(pitch_deg=0.3)
+    ]
+    meta = rig_stage.STAGE.run(RigParams(), {"rig": rig.to_dict()}, {"orientations": bundles}).meta
+    assert meta["changed"]
+    assert [p["pair"] for p in meta["per_pair"]] == [0, 10, 20, 30]
+
+
+def test_a_sound_rig_stays_to_the_bit_and_nothing_is_warned_of():
+    rig = street_rig()
+    found = facts(rig, street())
+    assert found["rig"] == found["given"] == rig.to_dict()
+    assert (found["changed"], found["source"], found["warnings"]) == (False, "given calibration", [])
+    assert found["residual_before_px"] == found["residual_after_px"] == pytest.approx(0.2, rel=0.1)
+    assert len(found["held"]) == 5
+
+
+def test_a_knock_is_repaired_and_told():
+    found = facts(street_rig(), street(pitch_deg=-0.24, roll_deg=0.3))
+    assert found["source"] == "given calibration, pitch and roll repaired from 4 pairs"
+    used = Rig.from_dict(found["rig"])
+    true = knocked(street_rig(), pitch_deg=-0.24, roll_deg=0.3)
+    np.testing.assert_allclose(used.T_right_left.rotation, true.T_right_left.rotation, atol=2e-4)  # 0.01 degrees
+    assert used.baseline == pytest.approx(0.54, rel=1e-12)
+    assert found["residual_after_px"] < 0.25 < 2.0 < found["residual_before_px"]
+    first, second = found["warnings"]
+    assert "contradicts the images" in first
+    assert "turned by 0.30 degrees clockwise; repaired" in first
+    assert "held: yaw" in second
+    assert found["held"][0].startswith("yaw: not observed")
+
+
+def test_mode_fixed_only_tells():
+    rig = street_rig()
+    found = facts(rig, street(pitch_deg=-0.24), mode="fixed")
+    assert found["rig"] == rig.to_dict()
+    assert not found["changed"]
+    assert found["warnings"][0].endswith("kept because rig.mode = fixed")
+    assert found["parameters"][0]["value"] == pytest.approx(-0.24, abs=0.01)
+
+
+def test_convergent_rig_with_a_wrong_toe_in():
+    rig = bed_rig()
+    pairs = [matches(knocked(rig, 0.5, 0.5, 0.5), bed_depth, noise=0.1, pair=k) for k in range(4)]
+    found = facts(rig, pairs)
+    values = {p["name"]: p["value"] for p in found["parameters"]}
+    np.testing.assert_allclose([values[n] for n in ("pitch", "yaw", "roll")], 0.5, atol=0.035)
+    for p in found["per_pair"]:
+        for name, value in p["values"].items():
+            expected = 0.5 if name in ("pitch", "yaw", "roll") else 0.0
+            assert abs(value - expected) < 4 * p["sigma"][name]
+
+
+def test_one_bad_pair_among_good_ones_does_not_pull():
+    pairs = street(5, pitch_deg=-0.24)
+    rng = np.random.default_rng(0)
+    pairs[2] = Matches(20, pairs[2].left, pairs[2].right + rng.uniform(-20, 20, pairs[2].right.shape))
+    found = facts(street_rig(), pairs)
+    assert found["parameters"][0]["value"] == pytest.approx(-0.24, abs=0.01)
+
+
+def test_a_rig_that_moves_is_told():
+    rig = street_rig()
+    pairs = street(4)
+    pairs.append(matches(knocked(rig, roll_deg=0.4), street_depth, pair=99, samples=800))
+    lines = [line for line in facts(rig, pairs)["warnings"] if "the rig moves" in line]
+    assert len(lines) == 1
+    assert "roll" in lines[0]
+    assert "pair 99" in lines[0]
+
+
+def with_patch(pairs, at, patch=(400, 180), seed=0):
+    """The same with gross mismatches in a corner of one pair: 30 % of its matches 1 to 3 px off in the row."""
+    rng = np.random.default_rng([seed, at])
+    m = pairs[at]
+    corner = (m.left < patch).all(1) if seed % 2 == 0 else (m.left > [m.left[:, 0].max() - patch[0], 0]).all(1)
+    wrong = corner & (rng.random(len(m.left)) < 0.3)
+    right = m.right.copy()
+    right[wrong, 1] += rng.uniform(1.0, 3.0, int(wrong.sum()))
+    return [*pairs[:at], Matches(m.pair, m.left, right), *pairs[at + 1 :]]
+
+
+SCENES = {"street": (street_rig, street_depth), "bed": (bed_rig, bed_depth)}
+
+
+@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize("seed", range(2))
+def test_a_patch_of_gross_mismatches_moves_no_rig(scene, seed):
+    rig, depth = SCENES[scene][0](), SCENES[scene][1]
+    pairs = [matches(rig, depth, pair=k, seed=seed, samples=1500) for k in range(10)]
+    assert moves(facts(rig, with_patch(pairs, 4, seed=seed))) == []
+
+
+def test_a_near_thing_that_mismatches_wholly_moves_no_rig():
+    """A reflecting object in a corner, all its rows off alike: the baseline across would explain them."""
+    rig = street_rig()
+
+    def depth(rays, rng):
+        z = street_depth(rays, rng)
+        return np.where((rays[:, 0] < -0.45) & (rays[:, 1] > 0.0), np.minimum(z, 2.0), z)
+
+    pairs = [matches(rig, depth, pair=k, samples=1500) for k in range(10)]
+    m = pairs[3]
+    thing = (m.left[:, 0] - m.right[:, 0]) > 120
+    assert thing.sum() > 40
+    pairs[3] = Matches(m.pair, m.left, m.right + np.outer(thing, [0.0, 2.0]))
+    assert moves(facts(rig, pairs)) == []
+
+
+@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize("angle", ["pitch", "roll"])
+@pytest.mark.parametrize("first", [2, 5, 9])
+def test_a_knock_from_some_pair_on_is_found_beside_a_patch(scene, angle, first):
+    rig, depth = SCENES[scene][0](), SCENES[scene][1]
+    after = knocked(rig, **{f"{angle}_deg": 0.3})
+    pairs = [matches(after if k >= first else rig, depth, pair=k, samples=1500) for k in range(10)]
+    assert any(f"the rig moves: {angle}" in line for line in moves(facts(rig, with_patch(pairs, 4))))
+
+
+def test_parameters_that_stand_in_for_each_other_do_not_move_the_rig():
+    start = linearised(street_rig(), street(5))
+    design = start[-1].design[:, :RIG]
+    away = np.linalg.svd(design)[2][-1]  # of all directions the one in which rows move least
+    away *= 0.6 / np.sqrt(np.mean((design * away) ** 2, axis=0)).max()  # pixels by one parameter alone
+    strong = int(np.argmax(np.mean((design * away) ** 2, axis=0)))
+    assert np.sqrt(np.mean((design @ away) ** 2)) < RigParams().least_rows < 0.6
+
+    def told(by, shown):
+        degrees = np.degrees([0.0 * by] * 4 + [by])
+        rows = [
+            {"pair": k, "values": dict(zip(NAMES, row, strict=True)), "sigma": dict.fromkeys(NAMES, 1e-3)}
+            for k, row in enumerate(degrees)
+        ]
+        last = replace(start[-1], constant=start[-1].constant - design @ by) if shown else start[-1]
+        return _drift([*start[:-1], last], rows, RigParams())
+
+    alone = 2.0 * np.where(np.arange(RIG) == strong, away, 0.0)
+    assert told(away, shown=True) == []
+    assert told(alone, shown=False) == []  # what the pair's own values claim and its rows do not show
+    assert told(alone, shown=True)[0].startswith(f"the rig moves: {NAMES[strong].replace('_', ' ')} of 1 of 5 pairs")
+
+
+def test_swapped_images_lie_beyond_infinity():
+    pairs = [Matches(m.pair, m.right, m.left) for m in street(2)]
+    with raises("RIL-428"):
+        facts(street_rig(), pairs)
+
+
+def test_distortion_that_was_left_is_told():
+    rig = street_rig()
+
+    def barrel(u, v):
+        return 12.0 * v * (u**2 + 0.1 * v**2)
+
+    pairs = [matches(rig, street_depth, pair=k, field=barrel) for k in range(2)]
+    assert any("lens distortion" in line for line in facts(rig, pairs)["warnings"])
+
+
+def test_pairs_with_few_matches_are_passed_over_and_told():
+    pairs = street(2)
+    few = Matches(5, pairs[0].left[:20], pairs[0].right[:20])
+    found = facts(street_rig(), [*pairs, few])
+    assert found["pairs"] == 2
+    assert found["warnings"] == ["1 of 3 pairs have too few matches for the rig"]
+    alone = facts(street_rig(), [few])
+    assert "used as given" in alone["warnings"][0]
+    assert "parameters" not in alone
+
+
+@pytest.mark.data
+def test_street_of_kitti_is_left_alone_and_repaired_when_knocked(data_dir):
+    from datasets.misalign import MisalignParams, warp
+    from datasets.registry import open_sequence
+    from stages.calibration.orientation import thin
+    from stages.core.validity import matched
+    from stages.geometry.lens import Lens
+    from stages.hfvm import match
+
+    sequence = open_sequence(str(data_dir / "kitti06_51"))
+    left, right = (_image(sequence.image(20, camera)) for camera in ("left", "right"))
+    knock = MisalignParams(rows=3.0, roll_deg=0.3)
+    bent, valid = warp(right, np.ones_like(right), Lens(sequence.rig.right), knock)
+    for image, mask, repaired in ((right, None, []), (bent, valid, ["pitch", "roll"])):
+        d = match(left, image, right_valid=mask)
+        points = thin(d.column_disparity, d.row_disparity, matched(d.validity), d.backmatch_error, 1500)
+        found = facts(sequence.rig, [Matches(20, *points)])
+        assert [p["name"] for p in found["parameters"] if p["freed"]] == repaired
+        assert found["residual_after_px"] < 0.7
+
+
+def _image(source):
+    import cv2
+
+    return cv2.imread(source.hints["path"], cv2.IMREAD_GRAYSCALE)

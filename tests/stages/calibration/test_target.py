@@ -1,0 +1,164 @@
+"""Calibration from a board: exact on exact corners, errors as they are claimed, and bad views seen."""
+
+import cv2
+import numpy as np
+import pytest
+from raising import raises
+
+from stages.calibration.target import MODELS, Adjustment, BoardView, calibrate_rig
+from stages.core.errors import DegenerateError
+from stages.geometry.geometry import RigidTransform, rotation_exp
+
+SIZE = (640, 480)
+ROWS, COLUMNS = np.indices((6, 9))
+BOARD = 0.03 * np.stack([COLUMNS, ROWS, np.zeros(ROWS.shape)], axis=-1).reshape(-1, 3)
+LENSES = {
+    "radtan": (
+        (500.0, 502.0, 321.0, 238.0, -0.3, 0.12, 1e-3, -5e-4, 0.02),
+        (505.0, 506.0, 316.0, 243.0, -0.28) + (0,) * 4,
+    ),
+    "radtan4": ((500.0, 502.0, 321.0, 238.0, -0.3, 0.12, 1e-3, -5e-4), (505.0, 506.0, 316.0, 243.0, -0.28) + (0,) * 3),
+    "fisheye": ((300.0, 301.0, 321.0, 238.0, 0.05, -0.01, 0.002, 0.0), (302.0, 303.0, 316.0, 243.0, 0.04, 0, 0, 0)),
+}
+RIG = RigidTransform(rotation_exp([0.004, -0.02, 0.01]), np.array([-0.12, 0.001, 0.002]))
+
+
+def scene(model: str, count: int = 10, noise: float = 0.0, rig: RigidTransform = RIG) -> list[BoardView]:
+    rng = np.random.default_rng(7)
+    views = []
+    for k in range(count):
+        tilt = rng.uniform(-0.6, 0.6, 3)
+        away = np.array([rng.uniform(-0.15, 0.05), rng.uniform(-0.12, -0.03), rng.uniform(0.35, 0.6)])
+        pose = np.concatenate([tilt, away])
+        task = Adjustment(BOARD, (), SIZE, model)
+        T = rig @ RigidTransform(rotation_exp(tilt), away)
+        other = np.concatenate([cv2.Rodrigues(T.rotation)[0].ravel(), T.translation])
+        zero = np.zeros((len(BOARD), 2))
+        left, right = (
+            task._project(np.array(lens), where, zero)[0].reshape(-1, 2)
+            for lens, where in zip(LENSES[model], (pose, other), strict=True)
+        )
+        views.append(BoardView(f"v{k}", *(p + noise * rng.standard_normal(p.shape) for p in (left, right))))
+    return views
+
+
+@pytest.mark.parametrize("model", sorted(LENSES))
+def test_exact_corners_give_the_rig_back(model):
+    found = calibrate_rig(BOARD, scene(model), SIZE, model)
+    assert found.rms < 1e-4  # corners enter OpenCV's start as float32, but not the adjustment
+    for lens, true in zip((found.left, found.right), LENSES[model], strict=True):
+        got = [lens.camera.fx, lens.camera.fy, lens.camera.cx, lens.camera.cy]
+        np.testing.assert_allclose(got, true[:4], atol=1e-2)
+        np.testing.assert_allclose(lens.coefficients, true[4:], atol=1e-3)
+    np.testing.assert_allclose(found.T_right_left.matrix34, RIG.matrix34, atol=1e-5)
+    assert max(r.epipolar for r in found.residuals) < 1e-3
+
+
+@pytest.mark.parametrize("model", [*sorted(LENSES), "rational"])
+def test_jacobian_against_central_differences(model):
+    lenses = LENSES.get(model) or tuple((*lens, 0.02, 0.01, 0.003) for lens in LENSES["radtan"])
+    views = tuple(BoardView("v", v.left, v.right) for v in scene("radtan4", 2))
+    task = Adjustment(BOARD, views, SIZE, model)
+    rng = np.random.default_rng(1)
+    poses = [np.concatenate([rng.uniform(-0.3, 0.3, 3), [-0.1, -0.05, 0.5]]) for _ in views]
+    between = np.concatenate([[0.01, -0.02, 0.03], [-0.12, 0.0, 0.01]])
+    x = np.concatenate([*(np.array(lens) for lens in lenses), between, *poses])
+    _, jacobian = task.evaluate(x)
+    for k in range(x.size):
+        step = np.zeros(x.size)
+        step[k] = 1e-6 * max(1.0, abs(x[k]))
+        slope = (task.evaluate(x + step)[0] - task.evaluate(x - step)[0]) / (2 * step[k])
+        np.testing.assert_allclose(jacobian[:, k], slope, atol=1e-5 * max(1.0, np.abs(slope).max()))
+
+
+def test_claimed_errors_are_those_that_noise_makes():
+    """Errors over claimed sigmas have a mean square of one.
+
+    Of 22 correlated unknowns at least five vary on their own, so that 60 trials make 300 degrees of freedom: four
+    standard deviations of the mean square are 4 sqrt(2 / 300) = 0.33.
+    """
+    exact = scene("radtan4", 6)
+    true = Adjustment(BOARD, tuple(exact), SIZE, "radtan4")
+    x = true.solve(true.start())
+    squares = []
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        pairs = [(p + 0.1 * rng.standard_normal(p.shape) for p in (v.left, v.right)) for v in exact]
+        noisy = Adjustment(BOARD, tuple(BoardView(f"v{k}", *p) for k, p in enumerate(pairs)), SIZE, "radtan4")
+        found = noisy.solve(x)
+        rms, sigma = noisy.errors(found)
+        pulls = (found - x)[: noisy.shared] / [sigma[name] for name in noisy.names()]
+        length = np.linalg.norm(found[noisy.shared - 3 : noisy.shared]) - np.linalg.norm(RIG.translation)
+        squares.append([*pulls**2, (length / sigma["baseline"]) ** 2])
+        assert rms == pytest.approx(0.1 * np.sqrt(2), rel=0.1)  # both coordinates; a tenth is four sigmas of 1300
+    assert np.mean(squares) == pytest.approx(1, abs=0.33)
+    assert np.mean(squares, axis=0)[-1] == pytest.approx(1, abs=4 * np.sqrt(2 / 60))
+
+
+def test_agrees_with_opencv_on_one_rig():
+    views = scene("radtan", 8, noise=0.1)
+    found = calibrate_rig(BOARD, views, SIZE, "radtan")
+    boards = [BOARD.astype(np.float32)] * len(views)
+    sides = [[getattr(v, side).astype(np.float32) for v in views] for side in ("left", "right")]
+    alone = [cv2.calibrateCamera(boards, points, SIZE, None, None) for points in sides]
+    criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 200, 1e-12)
+    guess = cv2.CALIB_USE_INTRINSIC_GUESS
+    _, k1, _, k2, _, R, T, *_ = cv2.stereoCalibrate(
+        boards, *sides, *alone[0][1:3], *alone[1][1:3], SIZE, flags=guess, criteria=criteria
+    )
+    # both minimise the same sum; what is left is where they stop, far below a sigma of 0.3 px and 30 um
+    np.testing.assert_allclose(found.left.camera.matrix, k1, atol=0.05)
+    np.testing.assert_allclose(found.right.camera.matrix, k2, atol=0.05)
+    np.testing.assert_allclose(found.T_right_left.translation, T.ravel(), atol=1e-5)
+    np.testing.assert_allclose(found.T_right_left.rotation, R, atol=1e-4)
+
+
+def spoiled(views: list[BoardView], k: int) -> list[BoardView]:
+    """View ``k`` with a right image of another moment: the board stands elsewhere."""
+    bad = BoardView(views[k].name, views[k].left, views[k].right + np.array([12.0, -7.0]))
+    return [*views[:k], bad, *views[k + 1 :]]
+
+
+def test_a_bad_view_is_named_and_left_out_and_does_no_harm():
+    views = scene("radtan4", 10, noise=0.1)
+    good, bad = calibrate_rig(BOARD, views, SIZE, "radtan4"), calibrate_rig(BOARD, spoiled(views, 4), SIZE, "radtan4")
+    assert [r.name for r in bad.residuals if not r.used] == ["v4"]
+    assert bad.residuals[4].worst > 2
+    assert all(r.used for r in good.residuals)
+    assert bad.left.camera.fx == pytest.approx(good.left.camera.fx, abs=3 * good.sigma["left fx"])
+    np.testing.assert_allclose(bad.T_right_left.matrix34, good.T_right_left.matrix34, atol=3e-4)
+
+
+def test_a_bad_view_stays_where_that_is_asked_for():
+    views = spoiled(scene("radtan4", 10, noise=0.1), 4)
+    kept = calibrate_rig(BOARD, views, SIZE, "radtan4", keep_bad=True)
+    assert all(r.used for r in kept.residuals)
+    assert kept.rms > 1
+
+
+def test_what_cannot_be_calibrated_says_so():
+    views = scene("radtan4", 6)
+    with raises("RIL-309"):
+        calibrate_rig(BOARD, views[:2], SIZE, "radtan4")
+    with raises("RIL-308"):
+        calibrate_rig(BOARD, views, SIZE, "barrel")
+    swapped = [BoardView(v.name, v.right, v.left) for v in views]
+    with raises("RIL-310"):
+        calibrate_rig(BOARD, swapped, SIZE, "radtan4")
+
+
+def test_one_view_repeated_is_refused_or_its_vagueness_told():
+    one = scene("radtan4", 1, noise=0.1)[0]
+    again = [BoardView(f"v{k}", one.left, one.right) for k in range(5)]
+    found = calibrate_rig(BOARD, scene("radtan4", 10, noise=0.1), SIZE, "radtan4")
+    try:
+        vague = calibrate_rig(BOARD, again, SIZE, "radtan4")
+    except DegenerateError:
+        return
+    assert vague.sigma["left fx"] > 5 * found.sigma["left fx"]
+
+
+def test_names_stand_for_all_shared_unknowns():
+    for model in MODELS:
+        task = Adjustment(BOARD, (), SIZE, model)
+        assert len(task.names()) == task.shared == len(set(task.names()))

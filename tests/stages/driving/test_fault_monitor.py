@@ -1,0 +1,80 @@
+"""Safety stops: each reason at the image where it shows, none before, none without."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from stages.driving.fault_monitor import SafetyParams, Verdict, judge
+from stages.geometry.geometry import RigidTransform, rotation_exp
+
+OPTICAL = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+T_VEHICLE_LEFT = RigidTransform(rotation_exp([-0.5, 0.0, 0.0]) @ OPTICAL, np.array([0.0, 0.05, 0.18]))
+VEHICLE = {"max_slope_deg": 20.0, "wheel_base": 0.1}
+P = SafetyParams()
+STEP = 0.025
+
+
+def leg(n: int = 5, slip: float = 0.05, turn: float = 0.0) -> dict[str, Any]:
+    """A straight leg of which everything is in order; the world is turned against the vehicle."""
+    world = RigidTransform(rotation_exp([0.0, 0.0, 0.7]), np.array([1.0, 2.0, 0.0]))
+    poses = []
+    for k in range(n):
+        moved = RigidTransform(rotation_exp([0, 0, turn * k]), np.array([0.0, (1 - slip) * STEP * k, 0.0]))
+        poses.append((world @ moved @ T_VEHICLE_LEFT).matrix34)
+    up = np.tile(T_VEHICLE_LEFT.rotation[2], (n, 1))
+    odometry = np.array([[0.0, STEP * k, 0.0] for k in range(n)])
+    return {
+        "up": up,
+        "acceleration": np.full(n, 0.1),
+        "odometry": odometry,
+        "poses": np.array(poses),
+        "inliers": [99] * n,
+    }
+
+
+def judged(**changes: Any) -> Verdict:
+    return judge(**{**leg(), **changes}, T_vehicle_left=T_VEHICLE_LEFT, vehicle=VEHICLE, params=P)
+
+
+def test_a_leg_in_order_is_driven_to_its_end() -> None:
+    assert judged() == Verdict(None, "", "")
+
+
+def test_a_tilt_beyond_the_vehicles_stops() -> None:
+    up = leg()["up"].copy()
+    up[3] = T_VEHICLE_LEFT.rotation.T @ rotation_exp([math.radians(21.0), 0, 0]) @ [0.0, 0.0, 1.0]
+    found = judged(up=up)
+    assert (found.stop, found.kind) == (3, "attitude")
+    assert found.reason == "tilt of 21.0 degrees by the inclinometer, 20.0 permitted"
+    up[3] = T_VEHICLE_LEFT.rotation.T @ rotation_exp([math.radians(19.0), 0, 0]) @ [0.0, 0.0, 1.0]
+    assert judged(up=up).stop is None
+
+
+def test_a_bump_stops() -> None:
+    found = judged(acceleration=np.array([9.0, 0.1, 0.1, 0.1, 3.5]))
+    assert (found.stop, found.kind) == (4, "acceleration")  # what came before the leg is not its own
+    assert "3.5 m/s2" in found.reason
+
+
+def test_too_few_landmarks_stop() -> None:
+    found = judged(inliers=[99, 50, 11, 50, 50])
+    assert (found.stop, found.kind) == (2, "lost")
+    assert "11 landmarks agree with the pose, 12 are needed" in found.reason
+
+
+@pytest.mark.parametrize(("slip", "stop"), [(0.05, None), (0.15, None), (0.3, 2), (-0.3, 2)])
+def test_slip_stops_as_soon_as_the_way_tells(slip: float, stop: int | None) -> None:
+    found = judged(**leg(slip=slip))
+    assert found.stop == stop
+    if slip == 0.3:
+        assert found.reason == "slip of 30%: 50 mm by the wheels, 35 mm by vision"
+
+
+def test_a_heading_that_the_wheels_do_not_know_stops() -> None:
+    found = judged(**leg(turn=math.radians(3.0)))
+    assert (found.stop, found.kind) == (3, "slip")
+    assert "9.0 degrees in heading" in found.reason

@@ -1,0 +1,237 @@
+"""Crosscheck: an analytic scene is recovered in metres, masks hold, and two runs give the same bytes."""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from stages.core.declare import Bundle, check_outputs
+from stages.evaluation.accuracy import angles_between, posed
+from stages.evaluation.crosscheck import (
+    STAGE,
+    CrosscheckParams,
+    Features,
+    _camera,
+    _extractor,
+    extract,
+    grey_bytes,
+    image_pairs,
+    match,
+    windows,
+)
+from stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
+
+CAMERA = Camera(300.0, 300.0, 159.5, 119.5, 320, 240)
+BASELINE = 0.2
+RIG = Rig(CAMERA, CAMERA, RigidTransform(rotation_exp([0.0, 0.01, 0.005]), [-BASELINE, 0.002, 0.0]))
+PARAMS = CrosscheckParams(span=2)
+
+
+def board() -> list[tuple[np.ndarray, np.ndarray]]:
+    """Textured squares that face the camera at rest: (corner and edges (3, 3), texture), far ones first."""
+    rng = np.random.default_rng(0)
+    squares = []
+    for depth in np.sort(rng.uniform(2.0, 6.0, 130))[::-1]:
+        texture = cv2.GaussianBlur(rng.normal(size=(48, 48)), (0, 0), 2.5)
+        texture = np.clip(128 + 45 * texture / texture.std(), 0, 255).astype(np.float32)
+        side = 0.16 * depth
+        corner = np.array([rng.uniform(-0.65, 0.65) * depth, rng.uniform(-0.5, 0.5) * depth, depth])
+        # texel (u, v) lies at corner + side / 47 * (u, v)
+        squares.append((np.column_stack([[side / 47, 0, 0], [0, side / 47, 0], corner]), texture))
+    return squares
+
+
+SQUARES = board()
+
+
+def render(T_camera_scene: RigidTransform) -> np.ndarray:
+    """Image (240, 320) uint8: each plane by its exact homography."""
+    out = np.full((240, 320), 90.0, np.float32)
+    for plane, texture in SQUARES:
+        H = CAMERA.matrix @ (T_camera_scene.rotation @ plane + np.outer(T_camera_scene.translation, [0, 0, 1]))
+        drawn = cv2.warpPerspective(texture, H, (320, 240), flags=cv2.INTER_LINEAR, borderValue=-1e4)
+        out = np.where(drawn >= 0, drawn, out)
+    return np.rint(out).astype(np.uint8)
+
+
+def drive(n: int) -> list[RigidTransform]:
+    """T_scene_left: 0.1 m forward and 0.03 m aside a frame, turning."""
+    return [RigidTransform(rotation_exp([0.0, 0.01 * k, 0.004 * k]), [0.03 * k, 0.0, 0.1 * k]) for k in range(n)]
+
+
+def bundle(image: np.ndarray, valid: np.ndarray | None = None) -> Bundle:
+    return Bundle({"image": image, "valid": np.ones(image.shape, np.uint8) if valid is None else valid}, {})
+
+
+@pytest.fixture(scope="module")
+def scene() -> tuple[list[RigidTransform], dict[str, list[Bundle]]]:
+    poses = drive(4)
+    left = [bundle(render(T.inverse())) for T in poses]
+    right = [bundle(render(RIG.T_right_left @ T.inverse())) for T in poses]
+    return poses, {"left": left, "right": right}
+
+
+def run(inputs: Any, frames: list[int], params: CrosscheckParams = PARAMS) -> Bundle:
+    out = STAGE.run(params, {"frames": frames, "rig": RIG.to_dict()}, inputs)
+    check_outputs(STAGE, out)
+    return out
+
+
+def test_poses_are_metric_and_repeat_bit_by_bit(scene: Any) -> None:
+    poses, inputs = scene
+    out, again = run(inputs, [3, 4, 5, 6]), run(inputs, [3, 4, 5, 6])
+    for name, array in out.arrays.items():
+        np.testing.assert_array_equal(array, again[name])
+    assert out.meta == again.meta
+    assert out.meta["unregistered"] == []
+    assert out["registered"].tolist() == [1] * 4
+    assert out["observations"].sum() == out.meta["observations"] > 0
+    np.testing.assert_allclose(out["poses"][0], np.eye(3, 4), atol=1e-12)
+    true = np.array([(poses[0].inverse() @ T).matrix34 for T in poses])
+    # the rig sees depth at 4 m to 4^2 / (300 * 0.2) m a pixel: 27 mm for features of 0.1 px, 1.5 mm over 300 of them
+    assert np.linalg.norm(out["poses"][:, :, 3] - true[:, :, 3], axis=1).max() < 2 * 1.5e-3
+    # 0.1 px are 0.02 degrees of one feature
+    assert np.degrees(angles_between(out["poses"], true)).max() < 2 * 0.02
+
+
+def test_a_wrong_rig_is_held_not_repaired(scene: Any) -> None:
+    """Half a degree of roll puts rows of the right camera off by 1.3 px at the rim: it must stay in the residuals."""
+    inputs = {side: bundles[:3] for side, bundles in scene[1].items()}
+    wrong = Rig(CAMERA, CAMERA, RigidTransform(rotation_exp([0.0, 0.0, 0.009]), np.zeros(3)) @ RIG.T_right_left)
+    good, bad = (
+        STAGE.run(PARAMS, {"frames": [0, 1, 2], "rig": rig.to_dict()}, inputs).meta["reprojection_px"]
+        for rig in (RIG, wrong)
+    )
+    assert good < 0.5
+    assert bad > 1.5 * good
+
+
+def test_a_frame_that_fits_nowhere_is_listed_and_the_rest_stays(scene: Any) -> None:
+    _, inputs = scene
+    noise = np.random.default_rng(1).integers(0, 255, (2, 240, 320), dtype=np.uint8)
+    left, right = list(inputs["left"]), list(inputs["right"])
+    left[2], right[2] = bundle(noise[0]), bundle(noise[1])
+    out = run({"left": left, "right": right}, [0, 1, 2, 3])
+    assert out.meta["unregistered"] == [2]
+    assert posed(out["poses"]).tolist() == [True, True, False, True]
+    assert out["observations"][2] == 0
+
+
+@pytest.mark.parametrize("kind", ["blank", "noise"])
+def test_a_window_without_a_model_is_a_fact(kind: str) -> None:
+    rng = np.random.default_rng(2)
+    images = [
+        bundle(
+            np.full((240, 320), 80, np.uint8) if kind == "blank" else rng.integers(0, 255, (240, 320), dtype=np.uint8)
+        )
+        for _ in range(4)
+    ]
+    out = run({"left": images[:2], "right": images[2:]}, [0, 1])
+    assert np.isnan(out["poses"]).all()
+    assert out.meta["registered"] == 0
+    assert out.meta["unregistered"] == [0, 1]
+    assert "no two images" in out.meta["reason"]
+    assert out.meta["reprojection_px"] is None
+
+
+def test_features_keep_away_from_what_is_masked(scene: Any) -> None:
+    image = scene[1]["left"][0]["image"]
+    valid = np.ones(image.shape, np.uint8)
+    valid[:, 100:] = 0
+    dark = np.where(valid, image, 0).astype(np.uint8)
+    everywhere, masked = extract(dark, np.ones_like(valid), PARAMS), extract(dark, valid, PARAMS)
+    assert 20 < len(masked.points) < len(everywhere.points)
+    assert everywhere.points[:, 0].max() > 100  # the edge itself has features, were it not for the mask
+    assert masked.points[:, 0].max() < 100 - 3 * 1.6  # SIFT's smallest scale
+    assert len(extract(dark, np.zeros_like(valid), PARAMS).points) == 0
+
+
+def test_the_first_pixel_s_centre_is_at_one_half() -> None:
+    """A blob of 4 px about pixel (row 60, column 100); COLMAP's camera is shifted as its positions are."""
+    rows, cols = np.mgrid[:240, :320]
+    image = 40 + 150 * np.exp(-((rows - 60) ** 2 + (cols - 100) ** 2) / (2 * 4.0**2))
+    points = extract(image.astype(np.float32), np.ones(image.shape, np.uint8), PARAMS).points
+    assert np.abs(points - (100.5, 60.5)).max() < 0.05
+    camera = _camera(1, CAMERA)
+    assert (camera.principal_point_x, camera.principal_point_y) == (CAMERA.cx + 0.5, CAMERA.cy + 0.5)
+    np.testing.assert_allclose(camera.img_from_cam(np.array([0.0, 0.0, 1.0])), [CAMERA.cx + 0.5, CAMERA.cy + 0.5])
+
+
+def test_a_reduced_image_gives_positions_of_the_full_one(scene: Any) -> None:
+    image = scene[1]["left"][0]["image"]
+    twice = cv2.resize(image, (640, 480), interpolation=cv2.INTER_CUBIC)
+    small = extract(image, np.ones_like(image), PARAMS)
+    large = extract(twice, np.ones_like(twice), CrosscheckParams(max_image_size=320))
+    pairs = match(small, large)
+    assert len(pairs) > 50
+    # COLMAP's (0, 0) is the corner of the image, so that a doubled image doubles positions
+    error = large.points[pairs[:, 1]] - 2 * small.points[pairs[:, 0]]
+    assert np.abs(np.median(error, axis=0)).max() < 0.1
+
+
+def test_matching_equals_colmap_s_own_matcher(scene: Any) -> None:
+    images = [scene[1]["left"][k]["image"] for k in (0, 1)]
+    native = [_extractor(PARAMS).extract_from_uint8_array(image) for image in images]
+    options = pycolmap.FeatureMatchingOptions()
+    options.use_gpu, options.num_threads = False, 1
+    matcher = pycolmap.FeatureMatcher.create(options, pycolmap.Device.cpu)
+    expected = matcher.match(native[0][0], native[0][1], native[1][0], native[1][1])
+    ours = match(*(extract(image, np.ones_like(image), PARAMS) for image in images))
+    assert len(expected) > 50
+    assert {tuple(row) for row in ours.tolist()} == {tuple(row) for row in expected.tolist()}
+
+
+def test_matching_of_nothing_and_of_one() -> None:
+    nothing = Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32))
+    one = Features(np.zeros((1, 2)), np.full((1, 128), 512 / np.sqrt(128), np.float32))
+    assert match(nothing, one).shape == (0, 2)
+    assert match(one, one).tolist() == [[0, 0]]
+
+
+def test_grey_of_each_kind() -> None:
+    assert grey_bytes(np.array([[0, 257, 65535]], np.uint16)).tolist() == [[0, 1, 255]]
+    assert grey_bytes(np.array([[-3.0, 1.6, 300.0, np.nan]], np.float32)).tolist() == [[0, 2, 255, 0]]
+    assert grey_bytes(np.array([[7]], np.uint8)).tolist() == [[7]]
+
+
+def test_pairs_by_hand() -> None:
+    assert image_pairs(3, 1) == [(1, 2), (1, 3), (2, 4), (3, 4), (3, 5), (4, 6), (5, 6)]
+    assert (1, 7) not in image_pairs(4, 2)
+    assert (1, 7) in image_pairs(4, 3)
+
+
+@given(st.integers(1, 200), st.integers(2, 40), st.integers(1, 39))
+def test_windows_cover_all_frames_and_share_enough(n: int, window: int, overlap: int) -> None:
+    if overlap >= window:
+        with pytest.raises(ValidationError, match="must be less than window"):
+            CrosscheckParams(window=window, overlap=overlap)
+        return
+    frames = list(range(5, 5 + n))
+    parts = windows(frames, CrosscheckParams(window=window, overlap=overlap))
+    assert sorted({f for part in parts for f in part}) == frames
+    assert max(len(part) for part in parts) <= window
+    for a, b in itertools.pairwise(parts):
+        assert a[-overlap:] == b[:overlap]
+    assert max(map(len, parts)) - min(map(len, parts)) <= 1
+
+
+@pytest.mark.data
+@pytest.mark.slow
+def test_devon_island_is_registered_throughout(data_dir: Any) -> None:
+    camera = Camera(969.0, 969.0, 635.139, 463.537, 1280, 960)
+    rig = Rig(camera, camera, RigidTransform(np.eye(3), [-0.234, 0.0, 0.0]))
+    inputs = {}
+    for side in ("left", "right"):
+        files = sorted((data_dir / "devon_island" / side).iterdir())
+        inputs[side] = [bundle(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)) for path in files]
+    n = len(inputs["left"])
+    out = STAGE.run(PARAMS, {"frames": list(range(n)), "rig": rig.to_dict()}, inputs)
+    assert (n, out.meta["unregistered"]) == (10, [])

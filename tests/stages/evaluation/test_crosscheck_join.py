@@ -1,0 +1,88 @@
+"""Windows to one trajectory: exact poses come back, and a broken chain stays broken."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from stages.core.declare import Bundle, NoParams, check_outputs
+from stages.evaluation.accuracy import posed
+from stages.evaluation.crosscheck_join import STAGE, join
+from stages.evaluation.pose_alignment import moved
+from stages.geometry.geometry import rotation_exp
+
+
+def drive(n: int) -> np.ndarray:
+    """A drive in a curve, a metre a frame."""
+    poses, pose = [], np.eye(4)
+    motion = np.eye(4)
+    motion[:3, :3], motion[:3, 3] = rotation_exp([0.01, 0.05, 0.0]), [0.0, 0.0, 1.0]
+    for _ in range(n):
+        poses.append(pose[:3].copy())
+        pose = pose @ motion
+    return np.array(poses)
+
+
+def cut(poses: np.ndarray, frames: list[int], seed: int) -> tuple[list[int], np.ndarray]:
+    """Some frames, in a frame of reference of their own."""
+    rng = np.random.default_rng(seed)
+    return frames, moved(poses[frames], rotation_exp(rng.normal(size=3)), rng.normal(size=3))
+
+
+def bundle(part: tuple[list[int], np.ndarray]) -> Bundle:
+    registered = int(posed(part[1]).sum())
+    return Bundle({"poses": part[1]}, {"frames": part[0], "registered": registered, "points": 7, "reason": ""})
+
+
+def test_windows_of_exact_poses_make_the_whole() -> None:
+    true = drive(14)
+    parts = [cut(true, list(range(a, a + 6)), a) for a in (0, 4, 8)]
+    poses, piece, ties = join(range(14), parts)
+    assert piece.tolist() == [0] * 14
+    np.testing.assert_allclose(moved(poses, poses[0, :, :3].T, -poses[0, :, :3].T @ poses[0, :, 3]), true, atol=1e-9)
+    assert [t["frames"] for t in ties] == [[4, 5], [8, 9]]
+    assert max(t["rms_m"] for t in ties) < 1e-9
+
+
+def test_a_tie_says_by_how_much_the_windows_differ() -> None:
+    """The later window is 10 % too long: three shared frames a metre apart miss by 0.1, 0 and 0.1 m. It stays so."""
+    true = np.tile(np.eye(3, 4), (8, 1, 1))
+    true[:, 2, 3] = np.arange(8)
+    later = true[3:].copy()
+    later[:, 2, 3] *= 1.1
+    poses, _, ties = join(range(8), [(list(range(6)), true[:6]), (list(range(3, 8)), later)])
+    assert ties[0]["rms_m"] == pytest.approx(np.sqrt(0.02 / 3))
+    assert ties[0]["rms_deg"] == pytest.approx(0.0, abs=1e-6)
+    # of 2.9, 4.0, 5.1 m of the later window, a quarter, a half and three quarters count
+    np.testing.assert_allclose(poses[:, 2, 3], [0, 1, 2, 2.975, 4, 5.075, 6.2, 7.3], atol=1e-9)
+    np.testing.assert_allclose(poses[:, :, :3], np.tile(np.eye(3), (8, 1, 1)), atol=1e-9)
+
+
+def test_a_broken_chain_names_its_pieces_and_keeps_the_longest() -> None:
+    true = drive(12)
+    first, second, third = (
+        cut(true, f, k) for k, f in enumerate(([0, 1, 2, 3], [2, 3, 4, 5, 6], [5, 6, 7, 8, 9, 10, 11]))
+    )
+    second[1][:2] = np.nan  # shares no posed frame with the first
+    third[1][2] = np.nan
+    out = STAGE.run(NoParams(), {"frames": list(range(12))}, {"windows": [bundle(p) for p in (first, second, third)]})
+    check_outputs(STAGE, out)
+    assert out.meta["pieces"] == [[0, 1, 2, 3], [4, 5, 6, 8, 9, 10, 11]]
+    assert out.meta["longest"] == 1
+    assert out.meta["unregistered"] == [7]
+    assert out.meta["registered"] == 11
+    assert out.meta["points"] == 21
+    assert posed(out["poses"]).tolist() == [False] * 4 + [True] * 3 + [False] + [True] * 4
+    assert posed(out["piece_poses"]).tolist() == [True] * 7 + [False] + [True] * 4
+    assert out["piece"].tolist() == [0] * 4 + [1] * 3 + [-1] + [1] * 4
+    assert out.meta["positions"][0] is None
+
+
+def test_no_window_with_a_model_is_a_fact() -> None:
+    nothing = ([0, 1, 2], np.full((3, 3, 4), np.nan))
+    out = STAGE.run(NoParams(), {"frames": [0, 1, 2]}, {"windows": [bundle(nothing)]})
+    check_outputs(STAGE, out)
+    assert out.meta["pieces"] == []
+    assert out.meta["registered"] == 0
+    assert out.meta["unregistered"] == [0, 1, 2]
+    assert np.isnan(out["poses"]).all()

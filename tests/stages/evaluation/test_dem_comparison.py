@@ -1,0 +1,135 @@
+"""Comparison of elevation models: resampling, figures and alignment with known answers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from raising import raises
+
+from stages.evaluation.dem_comparison import Grid, align, binned, cell_means, common, errors, figures, interpolate
+from stages.geometry.geometry import RigidTransform, rotation_exp
+
+
+def grid(values: np.ndarray, cell: float = 1.0, x0: float = 0.0, y0: float = 0.0, turn: float = 0.0) -> Grid:
+    c, s = np.cos(turn), np.sin(turn)
+    return Grid(np.asarray(values, float), np.array([[c * cell, s * cell, x0], [s * cell, -c * cell, y0]]))
+
+
+def hills(xy: np.ndarray) -> np.ndarray:
+    x, y = xy[..., 0], xy[..., 1]
+    return 0.8 * np.sin(x / 5.0) * np.cos(y / 7.0) + 0.3 * np.sin(0.31 * x + 0.17 * y) + 0.02 * x
+
+
+def terrain(shape: tuple[int, int] = (80, 100), **where: float) -> Grid:
+    empty = grid(np.zeros(shape), **where)
+    return Grid(hills(empty.centres()), empty.matrix)
+
+
+def test_figures_by_hand() -> None:
+    f = figures(np.array([1.0, -1.0, 3.0, np.nan, 1.0]))
+    assert f["rmse"] == pytest.approx(np.sqrt(12 / 4))
+    assert f["bias"] == pytest.approx(1.0)
+    assert f["median"] == 1.0
+    assert f["nmad"] == pytest.approx(1.4826 * 1.0)
+    assert f["p95"] == pytest.approx(np.percentile([1, 1, 1, 3], 95))
+    assert f["cells"] == 4
+    assert figures(np.array([np.nan])) == {"cells": 0.0}
+
+
+def test_bilinear_needs_the_cells_that_count_and_no_others() -> None:
+    z = np.arange(12.0).reshape(3, 4)
+    z[1, 2] = np.nan
+    g = grid(z, cell=2.0, x0=10.0, y0=20.0)
+    at = np.array([[10.0, 20.0], [11.0, 19.0], [13.0, 18.0], [12.0, 18.0], [16.0, 16.0], [17.0, 16.0]])
+    found = interpolate(g, at)
+    np.testing.assert_allclose(found[[0, 1, 3, 4]], [0.0, 2.5, 5.0, 11.0])
+    assert np.isnan(found[[2, 5]]).all()  # beside an unknown cell, and outside
+
+
+def test_the_finer_model_is_averaged_where_it_knows_half_a_cell() -> None:
+    fine = np.arange(16.0).reshape(4, 4)
+    fine[:2, 2:] = np.nan
+    fine[0, 2] = 50.0  # a quarter known
+    fine[2, 0] = fine[2, 1] = np.nan  # half known
+    g = grid(fine, cell=1.0, x0=0.5, y0=-0.5)
+    target = grid(np.zeros((2, 2)), cell=2.0, x0=1.0, y0=-1.0)
+    means = cell_means(g, target)
+    np.testing.assert_allclose(
+        means[[0, 1, 1], [0, 0, 1]], [(0 + 1 + 4 + 5) / 4, (12 + 13) / 2, (10 + 11 + 14 + 15) / 4]
+    )
+    assert np.isnan(means[0, 1])
+    a, b, how = common(g, target)
+    np.testing.assert_array_equal(a.values, means)
+    assert b is target
+    assert how.startswith("A averaged")
+    assert common(target, g)[2].startswith("B averaged")
+
+
+def test_equal_cells_are_not_resampled_and_turned_ones_are_interpolated() -> None:
+    whole = terrain()
+    part = Grid(whole.values[10:40, 20:60], whole.matrix + np.array([[0, 0, 20.0], [0, 0, -10.0]]))
+    a, b, how = common(part, whole)
+    assert "nothing resampled" in how
+    assert np.nanmax(np.abs(errors(a, b))) == 0.0
+    assert np.isfinite(errors(a, b)).sum() == part.values.size
+    turned = terrain((60, 60), turn=0.4, x0=30.0, y0=-10.0)
+    a, b, how = common(turned, whole)
+    assert "bilinearly" in how
+    # bilinear: an eighth of the second derivatives of both axes, each at most 0.8/25 + 0.8/49 + 0.3 * 0.1
+    assert np.nanmax(np.abs(errors(a, b))) < 2 * (0.8 / 25 + 0.8 / 49 + 0.3 * 0.31**2) / 8
+    with raises("RIL-323"):
+        common(grid(np.ones((3, 3))), grid(np.ones((3, 3)), x0=100.0))
+
+
+def moved(T: RigidTransform, shape: tuple[int, int] = (80, 100)) -> Grid:
+    """What a model is called whose every surface point p was at T p: solved for at the cell centres."""
+    g = terrain(shape)
+    xy = g.centres()
+    z = hills(xy)
+    for _ in range(60):  # the point above (x, y) whose image lies on the hills
+        image = T.apply(np.concatenate([xy, z[..., None]], axis=-1))
+        z = z - (image[..., 2] - hills(image[..., :2]))
+    return Grid(z, g.matrix)
+
+
+@pytest.mark.parametrize("kind", ["shift", "tilt", "rigid"])
+def test_a_known_motion_is_found(kind: str) -> None:
+    shift, turn = {
+        "shift": ([0.6, -0.4, 0.25], [0.0, 0.0, 0.0]),
+        "tilt": ([0.0, 0.0, 0.25], [0.004, -0.003, 0.0]),
+        "rigid": ([0.6, -0.4, 0.25], [0.004, -0.003, 0.01]),
+    }[kind]
+    b, middle = terrain(), terrain().centres().mean(axis=(0, 1))
+    centre = np.array([*middle, 0.0])
+    R = rotation_exp(turn)
+    T = RigidTransform(R, centre + shift - R @ centre)
+    a = moved(T)
+    rng = np.random.default_rng(5)
+    a.values[rng.random(a.values.shape) < 0.02] += 30.0  # gross errors must not matter
+    found = align(a, b, kind)  # type: ignore[arg-type]
+    points = np.concatenate([a.centres(), hills(a.centres())[..., None]], axis=-1)
+    # bilinear B against the smooth hills is off by 15 mm at most, and mostly by less: the mean motion by a tenth of it
+    off = np.linalg.norm(found.apply(points) - T.apply(points), axis=-1)
+    assert off.max() < 0.02
+    assert found.sigma[3:].any() == (kind != "shift")
+    after = errors(a, b, found)
+    assert figures(after)["nmad"] < 0.01 < 0.1 < abs(figures(a.values - b.values)["median"])
+
+
+def test_a_motion_that_the_terrain_does_not_show_is_refused() -> None:
+    rng = np.random.default_rng(0)
+    flat = grid(np.zeros((50, 60)))
+    noisy = Grid(flat.values + 0.1, flat.matrix)
+    for kind in ("shift", "rigid"):
+        with raises("RIL-326"):
+            align(noisy, flat, kind)  # type: ignore[arg-type]
+    assert align(noisy, flat, "tilt").translation == pytest.approx([0, 0, -0.1], abs=1e-9)
+    few = Grid(np.where(rng.random((50, 60)) < 0.002, 1.0, np.nan), flat.matrix)
+    with raises("RIL-325"):
+        align(few, flat, "tilt")
+
+
+def test_bins_leave_out_what_is_empty() -> None:
+    found = binned(np.array([1.0, 3.0, -2.0, np.nan]), np.array([0.5, 0.6, 9.0, 0.1]), np.array([0.0, 1.0, 5.0, 10.0]))
+    assert [(f["from"], f["to"], f["cells"]) for f in found] == [(0.0, 1.0, 2), (5.0, 10.0, 1)]
+    assert found[0]["bias"] == 2.0

@@ -1,0 +1,138 @@
+"""Truth of positions alone: offset and turn of synthetic drives are found, and what cannot be found is said."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from stages.core.declare import Bundle, NoParams, check_outputs
+from stages.evaluation.position_accuracy import STAGE, TruePositions, find_offset, fit_in_plane, position_accuracy
+
+RATE = 10.0
+MOMENTS = np.arange(80) / RATE
+
+
+def drive(t: np.ndarray) -> np.ndarray:
+    """Places (n, 3), m, at times t, s, of a street with bends, a hill and a speed that changes."""
+    s = 5.0 * t + 3.0 * np.sin(0.9 * t)
+    heading = 0.4 * np.sin(0.1 * s)
+    step = np.diff(s, prepend=s[0])
+    return np.stack(
+        [np.cumsum(step * np.cos(heading)), np.cumsum(step * np.sin(heading)), 0.3 * np.sin(0.2 * s)], axis=1
+    )
+
+
+def elsewhere(points: np.ndarray, turn: float) -> np.ndarray:
+    """The same in a frame turned about the vertical and shifted far away."""
+    c, s = np.cos(turn), np.sin(turn)
+    return points @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T + [4.5e5, 5.4e6, 120.0]
+
+
+FINE = np.arange(-20.0, 30.0, 0.01)
+PATH = drive(FINE)
+
+
+def at(moments: np.ndarray) -> np.ndarray:
+    return np.stack([np.interp(moments, FINE, axis) for axis in PATH.T], axis=1)
+
+
+def truth(width: int, offset: float, turn: float = 2.0, start: float = -2.0, end: float = 10.0) -> TruePositions:
+    """Recorded 20 times a second by a clock that is ``offset`` s behind."""
+    moments = np.arange(start, end, 0.05)
+    return TruePositions(elsewhere(at(moments), turn)[:, :width], moments - offset, 0.2)
+
+
+@pytest.mark.parametrize("width", [2, 3])
+@pytest.mark.parametrize("offset", [0.7, -1.33, 1.4e9])
+def test_offset_and_turn_are_found(width, offset):
+    moved, metrics, warnings = position_accuracy(at(MOMENTS), truth(width, offset), MOMENTS)
+    assert metrics["time_offset"]["value"] == pytest.approx(offset, abs=2e-3)
+    assert metrics["position_rmse"]["value"] < 0.01  # chords of rows .05 s apart
+    assert metrics["frames_judged"]["value"] == len(MOMENTS)
+    assert np.abs(moved - at(MOMENTS)[:, :width]).max() < 0.03
+    assert warnings == []
+
+
+def test_noise_widens_the_range_of_the_offset_and_is_the_error():
+    rng = np.random.default_rng(3)
+    noisy = at(MOMENTS) + rng.normal(scale=0.2, size=(len(MOMENTS), 3))
+    _, metrics, _ = position_accuracy(noisy, truth(2, 0.7), MOMENTS)
+    # two axes of .2 m; the fit takes 4 of 160 degrees of freedom
+    assert metrics["position_rmse"]["value"] == pytest.approx(0.2 * np.sqrt(2), rel=0.15)
+    assert metrics["time_offset"]["value"] == pytest.approx(0.7, abs=0.1)
+    assert 0.01 < metrics["time_offset_range"]["value"] < 0.5
+
+
+def test_an_error_of_scale_stays_an_error():
+    _, metrics, _ = position_accuracy(1.05 * at(MOMENTS), truth(2, 0.7), MOMENTS)
+    assert metrics["position_rmse"]["value"] > 0.3
+    assert metrics["position_drift"]["value"] == pytest.approx(5.0, rel=0.2)
+
+
+def test_a_straight_line_at_constant_speed_determines_no_offset():
+    line = np.stack([8.0 * MOMENTS, 0 * MOMENTS, 0 * MOMENTS], axis=1)
+    moments = np.arange(-5.0, 15.0, 0.1)
+    known = TruePositions(np.stack([8.0 * moments, 0 * moments], axis=1), moments, 0.2)
+    noisy = line + np.random.default_rng(0).normal(scale=0.01, size=line.shape)
+    _, metrics, warnings = position_accuracy(noisy, known, MOMENTS)
+    assert metrics["time_offset"]["value"] == 0.0
+    (warning,) = warnings
+    assert "not determined" in warning
+
+
+def test_rows_are_frames_where_there_are_no_times():
+    places = elsewhere(at(MOMENTS), 1.0)[:, :2]
+    estimate = at(MOMENTS)
+    estimate[5] = np.nan
+    moved, metrics, _ = position_accuracy(estimate, TruePositions(places))
+    assert metrics["frames_judged"]["value"] == len(MOMENTS) - 1
+    assert metrics["position_max"]["value"] < 1e-6
+    assert "time_offset" not in metrics
+    assert moved[5] == pytest.approx(at(MOMENTS)[5, :2], abs=1e-6)
+
+
+def test_mirrored_axes_are_said():
+    places = elsewhere(at(MOMENTS), 1.0)[:, [1, 0]]
+    _, _, warnings = position_accuracy(at(MOMENTS), TruePositions(places))
+    (warning,) = warnings
+    assert "mirrored" in warning
+
+
+def test_height_is_shifted_and_never_tilted():
+    places = at(MOMENTS)
+    tilted = places.copy()
+    tilted[:, 2] += 0.1 * places[:, 0]
+    assert fit_in_plane(places, tilted).error > 0.5
+    assert fit_in_plane(places, places + np.array([0, 0, 7.0])).error < 1e-9
+
+
+def test_gaps_and_few_frames():
+    known = truth(2, 0.0)
+    rows = (known.times < 2.0) | (known.times > 3.0)
+    gap = TruePositions(known.positions[rows], known.times[rows], 0.2)
+    there = gap.at(MOMENTS)
+    assert np.isnan(there[(MOMENTS > 2.0) & (MOMENTS < 3.0)]).all()
+    few = np.full((len(MOMENTS), 3), np.nan)
+    few[:3] = at(MOMENTS)[:3]
+    assert find_offset(MOMENTS, few, known) is None
+    _, metrics, _ = position_accuracy(few, known, MOMENTS)
+    assert metrics["position_rmse"]["value"] is None
+    assert metrics["frames_judged"]["value"] == 3
+
+
+def test_stage():
+    poses = np.concatenate([np.broadcast_to(np.eye(3), (len(MOMENTS), 3, 3)), at(MOMENTS)[:, :, None]], axis=2)
+    known = truth(2, 0.7)
+    frames = list(range(len(MOMENTS)))
+    args = {
+        "positions": known.positions.tolist(),
+        "times": known.times.tolist(),
+        "moments": MOMENTS.tolist(),
+        "max_gap": known.max_gap,
+        "frames": frames,
+        "source": "gnss",
+    }
+    out = STAGE.run(NoParams(), args, {"trajectory": Bundle({"poses": poses}, {"frames": frames})})
+    check_outputs(STAGE, out)
+    assert np.isnan(out["position_truth"][:, 2]).all()
+    assert "positions only, after a rigid fit in the plane" in out.meta["metrics"]["position_rmse"]["how"]

@@ -1,0 +1,78 @@
+"""The vehicle put down: planes exact, one stone under a wheel and under the belly by hand."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from vehicles import MODEL
+
+from stages.hazard.placement import Stance, place, stride
+
+CELL = 0.004
+
+
+@pytest.mark.parametrize("direction", np.linspace(0, 2 * math.pi, 9)[:-1])
+def test_on_a_plane_tilt_and_slope_are_its_gradient(direction: float) -> None:
+    y, x = np.mgrid[:90, :90] * CELL
+    z = (0.3 * (x * math.cos(direction) + y * math.sin(direction))).astype(np.float32)
+    found = place(z, z, MODEL, CELL)
+    inner = np.s_[32:-32, 32:-32]
+    # wheels are put on the nearest cell, so a side and an axle are not quite at right angles: half a cell of 80 mm
+    for values in (found.tilt[inner], found.slope[inner]):
+        np.testing.assert_allclose(values, 0.3, rtol=0.035)
+        assert values.min() >= 0.3 - 1e-4
+    # at most g B / 4 along and g T / 4 across, and what the belly's patches are wider than the wheels'
+    assert found.rise[inner].max() <= 0.3 * (0.25 * math.hypot(0.1, 0.08) + 0.02)
+    assert found.unstood[inner].max() == 0.0
+    assert found.unstood[0, 0] > 0.7
+
+
+def stone(row: int, col: int, height: float) -> tuple[np.ndarray, np.ndarray]:
+    high = np.zeros((61, 61), dtype=np.float32)
+    high[row, col] = height
+    return high, np.zeros_like(high)
+
+
+def test_a_stone_under_a_wheel_tilts_the_vehicle_as_three_wheels_do() -> None:
+    at = Stance.of(MODEL, CELL)
+    row, col = (int(v) for v in at.wheels[0, 0])
+    high, low = stone(30 + row, 30 + col, 0.01)
+    found = place(high, low, MODEL, CELL)
+    span = 2 * abs(row) * CELL, 2 * abs(col) * CELL
+    assert found.tilt[30, 30] == pytest.approx(math.hypot(0.01 / span[0], 0.01 / span[1]), rel=0.01)
+    assert found.slope[30, 30] == 0.0  # the ground beneath is level
+
+
+def test_a_stone_under_the_belly_rises_by_its_height_and_tilts_nothing() -> None:
+    high, low = stone(30, 30, 0.02)
+    found = place(high, low, MODEL, CELL)
+    assert found.rise[30, 30] == pytest.approx(0.02, rel=1e-5)
+    assert found.tilt[30, 30] == 0.0
+    assert found.rise[0, 0] == 0.0
+
+
+def test_wheels_that_stand_higher_than_the_ground_below_count_as_level_with_it() -> None:
+    """A pit under the belly: the wheels stand 10 mm above it at every heading, and nothing rises."""
+    high = np.zeros((61, 61), dtype=np.float32)
+    y, x = np.mgrid[-30:31, -30:31] * CELL
+    high[np.hypot(x, y) < 0.04] = -0.01
+    assert place(high, high, MODEL, CELL).rise[30, 30] == 0.0
+
+
+def test_unknown_ground_under_one_wheel_is_told_and_the_others_are_still_judged() -> None:
+    at = Stance.of(MODEL, CELL)
+    high, low = stone(*(int(v) + 30 for v in at.wheels[0, 0]), 0.01)
+    r, c = (int(v) + 30 for v in at.wheels[0, 3])
+    high[r - 4 : r + 5, c - 4 : c + 5] = low[r - 4 : r + 5, c - 4 : c + 5] = np.nan
+    found = place(high, low, MODEL, CELL)
+    assert 0.0 < found.unstood[30, 30] < 1.0
+    assert found.tilt[30, 30] > 0.1
+
+
+def test_bilinear_weights_and_places() -> None:
+    at = Stance.of(MODEL, CELL)
+    np.testing.assert_allclose(at.weights.sum(axis=1), 1.0, rtol=1e-6)
+    np.testing.assert_allclose(at.weights @ at.wheels[0], at.belly[0], atol=0.75)  # cells, both rounded
+    assert (stride(MODEL, 0.001), stride(MODEL, 0.1)) == (4, 1)

@@ -1,0 +1,24 @@
+"""The vehicle's limits are refused where they contradict each other."""
+
+from __future__ import annotations
+
+import pytest
+from pydantic import ValidationError
+
+from stages.hazard.vehicle import DEFAULT_VEHICLE, Vehicle
+
+
+def test_the_default_is_named() -> None:
+    assert DEFAULT_VEHICLE.name == "default rover"
+    assert all(field.description for field in Vehicle.model_fields.values())
+
+
+def test_a_belly_lower_than_the_step_is_refused() -> None:
+    with pytest.raises(ValidationError, match=r"max_step 0.12 m is higher than clearance 0.1 m"):
+        Vehicle(clearance=0.1)
+
+
+@pytest.mark.parametrize("bad", [{"max_slope_deg": 90.0}, {"wheel_diameter": 0.0}, {"margin": -0.1}, {"wheels": 6}])
+def test_nonsense_is_refused(bad: dict) -> None:
+    with pytest.raises(ValidationError):
+        Vehicle(**bad)

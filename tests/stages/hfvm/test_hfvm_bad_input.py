@@ -1,0 +1,243 @@
+"""What the matcher makes of images that are no good pair: nothing, or what there is to find, and never a crash."""
+
+import cv2
+import numpy as np
+import pytest
+from matching_scenes import convergent_rig, pair, rig_displacement, seen
+from raising import raises
+
+from stages.core.errors import InputError
+from stages.core.validity import Validity, defined, has, matched
+from stages.hfvm import HfvmParams, match
+from stages.hfvm.consistency import patches, unsupported
+from stages.hfvm.order import swapped
+from stages.hfvm.refine import contrast
+
+BORDER = 8
+MOST_CHANCE = 0.05
+"""Share of pixels of two unrelated images that may claim to be matched."""
+
+
+def byte(image):
+    return np.clip(np.rint(image), 0, 255).astype(np.uint8)
+
+
+def share_within(found, u, v, right_shape, pixels):
+    both = matched(found.validity) & seen(u, v, right_shape, BORDER)
+    error = np.hypot(found.column_disparity - u, found.row_disparity - v)[both]
+    return float(np.mean(error < pixels)), both.sum() / seen(u, v, right_shape, BORDER).sum()
+
+
+@pytest.mark.parametrize("value", [0, 128, 255])
+def test_images_without_texture_are_said_to_have_none(value):
+    flat = np.full((90, 120), value, np.uint8)
+    found = match(flat, flat)
+    assert not defined(found.validity).any()
+    assert has(found.validity, Validity.NO_TEXTURE).all()
+    assert np.isnan(found.disparity_std).all()
+
+
+def test_one_black_image():
+    left, *_ = pair(lambda x, y: (-5.0, 0.0))
+    for images in ((left, np.zeros_like(left)), (np.zeros_like(left), left)):
+        assert not matched(match(*images).validity).any()
+
+
+def test_saturated_parts_do_not_match_and_the_rest_does():
+    left, right, *_ = pair(lambda x, y: (-6.0, 1.0), (160, 200))
+    left[50:110, 70:140] += 250
+    right[51:111, 64:134] += 250
+    found = match(byte(left), byte(right))
+    assert not matched(found.validity)[60:100, 80:130].any()
+    assert has(found.validity[60:100, 80:130], Validity.NO_TEXTURE).all()
+    ok = matched(found.validity)
+    ok[40:120, 60:150] = False
+    assert np.mean(np.abs(found.column_disparity + 6.0)[ok] < 0.3) > 0.99
+    assert ok.sum() > 0.9 * (144 * 178 - 80 * 90)
+
+
+@pytest.mark.parametrize("ratio", [0.5, 2.0])
+def test_exposure_ratio_of_two(ratio):
+    # Mean 64 and contrast 18 on one side, 128 and 35 on the other, a little noise on both.
+    left, right, u, v = pair(lambda x, y: (-7.3 + np.sin(x / 25), 0.6))
+    dark, bright = (left, right) if ratio == 2.0 else (right, left)
+    rng = np.random.default_rng(0)
+    dark, bright = (byte(a + rng.normal(0, 1, a.shape)) for a in (0.5 * dark, bright))
+    found = match(*((dark, bright) if ratio == 2.0 else (bright, dark)))
+    good, complete = share_within(found, u, v, right.shape, 0.5)
+    assert good > 0.97
+    assert complete > 0.9
+
+
+def test_contrast_is_levelled_only_where_it_differs_grossly():
+    left, right, u, v = pair(lambda x, y: (-7.0, 1.0))
+    maps = np.int16(u), np.int16(v), np.ones(u.shape, bool)
+    assert contrast(left, right, *maps) == 1
+    assert contrast(left, right * np.float32(0.85), *maps) == 1
+    assert contrast(left, 0.4 * right + 90, *maps) == pytest.approx(2.5, rel=0.02)
+    assert contrast(left, 0.4 * right + 90, u, v, np.zeros(u.shape, bool)) == 1
+
+
+@pytest.mark.parametrize("shapes", [((97, 141), (60, 300)), ((40, 40), (200, 220)), ((150, 33), (33, 150))])
+def test_sizes_may_differ(shapes):
+    left, right, u, v = pair(lambda x, y: (-3.0, 2.0), *shapes)
+    found = match(left, right)
+    assert found.column_disparity.shape == shapes[0]
+    good, _ = share_within(found, u, v, right.shape, 0.5)
+    assert good > 0.95
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 37), (37, 1), (2, 2), (5, 3), (17, 19), (63, 65), (129, 127)])
+@pytest.mark.parametrize("preset", ["default", "paper"])
+def test_any_size_is_answered(shape, preset):
+    texture = byte(pair(lambda x, y: (0.0, 0.0), shape)[0])
+    found = match(texture, texture, HfvmParams(preset=preset))
+    assert found.validity.shape == shape
+    ok = matched(found.validity)
+    np.testing.assert_array_equal(np.isfinite(found.disparity_std), ok)
+    if ok.any():
+        assert np.percentile(np.abs(found.column_disparity[ok]), 90) < 0.5
+
+
+def test_displacement_beyond_the_width_finds_nothing():
+    left, right, *_ = pair(lambda x, y: (-260.0, 0.0), (140, 180))
+    assert matched(match(left, right).validity).mean() < MOST_CHANCE
+
+
+def test_colour_and_integers_are_refused_in_one_line():
+    for image in (np.zeros((20, 30, 3), np.uint8), np.zeros((20, 30), np.int32), np.zeros((0, 30), np.uint8)):
+        with pytest.raises(InputError) as caught:
+            match(image, image)
+        assert "\n" not in str(caught.value)
+
+
+def test_sixteen_bits_are_matched_with_eight():
+    left, right, u, v = pair(lambda x, y: (-8.0, 1.0))
+    found = match(byte(left), byte(right).astype(np.uint16) * 257)
+    good, complete = share_within(found, u, v, right.shape, 0.3)
+    assert good > 0.98
+    assert complete > 0.95
+
+
+def test_what_is_not_finite_is_masked():
+    left, right, *_ = pair(lambda x, y: (-8.0, 1.0))
+    left[50:70, 60:90] = np.nan
+    right[20:30, 60:90] = np.inf
+    found = match(left, right)
+    assert not defined(found.validity[50:70, 60:90]).any()
+    assert matched(found.validity).mean() > 0.6
+
+
+def test_order_of_two_images_is_known_where_geometry_tells_it():
+    depth = lambda x, y: 0.9 - 0.0035 * (y - 70) + 0.03 * np.sin(x / 15.0) * np.sin(y / 14.0)  # noqa: E731
+    parallel = lambda x, y: (-14.0 + 4 * np.sin(y / 20), 0.0)  # noqa: E731
+    order = {}
+    for name, displacement in (("parallel", parallel), ("convergent", rig_displacement(convergent_rig(), depth))):
+        left, right, *_ = pair(displacement)
+        for images in ((left, right), (right, left)):
+            found = match(*images)
+            ok = matched(found.validity)
+            told = swapped(found.column_disparity, found.row_disparity, ok)
+            order.setdefault(name, []).append((told, float(np.sign(np.median(found.column_disparity[ok])))))
+    # The convergent pair is in order although its disparities are positive: near things move by less than far ones.
+    assert order == {"parallel": [(False, -1), (True, 1)], "convergent": [(False, 1), (False, -1)]}
+
+
+def test_keystone_tells_swapped_convergent_cameras_and_none_of_the_rest_is_enough():
+    y, x = np.indices((200, 300), dtype=np.float64)
+    rng = np.random.default_rng(0)
+    k = -30.0 / 300**2  # far things at -30 px for a focal length of one width
+    keystone = k * (x - 149.5) * (y - 99.5) + rng.normal(0, 0.2, x.shape)
+    ok, relief = np.ones(x.shape, bool), rng.uniform(0, 3, x.shape)
+    assert swapped(2.0 + relief, keystone, ok)
+    assert not swapped(-200.0 + relief, keystone, ok)
+    assert not swapped(2.0 + relief, -keystone, ok)
+    assert not swapped(-2.0 + relief, 0 * keystone, ok)
+    # Depth that grows along the columns makes a keystone, too: then nobody can know.
+    assert not swapped(2.0 + x / 100, keystone, ok)
+    assert not swapped(20.0 + relief, keystone, ok & (x < 0))
+
+
+@pytest.mark.parametrize("blur", [0.0, 1.5, 4.0])
+def test_two_seeds_of_noise_match_hardly_anywhere(blur):
+    rng = np.random.default_rng(0)
+    images = []
+    for _ in range(2):
+        image = rng.uniform(0, 256, (180, 240))
+        if blur:
+            image = cv2.GaussianBlur(image, (0, 0), blur)
+            image = 128 + 45 / image.std() * (image - image.mean())
+        images.append(byte(image))
+    assert matched(match(*images).validity).mean() < MOST_CHANCE
+
+
+def test_patches_of_chance_go_where_nearly_all_are_small_and_stay_beside_a_large_one():
+    u = np.zeros((160, 200), np.float32)
+    keep = np.zeros(u.shape, bool)
+    keep[10:20, 10:20] = keep[40:48, 100:110] = keep[90:101, 30:40] = True
+    assert patches(u, u, keep)[keep].min() >= 40
+    np.testing.assert_array_equal(unsupported(u, u, keep, 40), keep)
+    keep[110:150, 60:160] = True
+    assert not unsupported(u, u, keep, 40).any()
+    assert not unsupported(u, u, keep, 1).any()
+
+
+def test_prior_chooses_among_repetitions_and_is_refined():
+    # A row of equal posts: any multiple of 16 columns fits as well, and the search takes the least.
+    y, x = np.indices((120, 200), dtype=np.float64)
+    posts = lambda x: 128 + 40 * np.sin(2 * np.pi * x / 16) + 25 * np.sin(2 * np.pi * y / 23)  # noqa: E731
+    left, right = posts(x), posts(x + 32.4)
+    inside = np.s_[20:100, 70:180]
+    prior = np.full(left.shape, -31.0, np.float32), np.zeros(left.shape, np.float32)
+    plain, led = match(left, right), match(left, right, prior=prior)
+    assert np.nanmedian(np.abs(plain.column_disparity[inside] + 32.4)) > 8
+    ok = matched(led.validity)[inside]
+    assert ok.mean() > 0.8
+    assert np.median(np.abs(led.column_disparity[inside] + 32.4)[ok]) < 0.1
+
+
+def test_exact_and_partial_prior_change_little_on_a_plain_pair():
+    left, right, u, v = pair(lambda x, y: (-9.0 + 3 * np.sin(x / 30), 1.0), noise=1.0)
+    plain = match(left, right)
+    prior = np.where(np.arange(u.shape[1]) < 90, u, np.nan), np.broadcast_to(v, u.shape)
+    led = match(left, right, prior=prior)
+    both = matched(plain.validity) & matched(led.validity)
+    assert both.sum() > 0.97 * matched(plain.validity).sum()
+    assert np.percentile(np.abs(plain.column_disparity - led.column_disparity)[both], 95) < 0.05
+
+
+def test_prior_is_carried_over_to_the_aligned_image():
+    left, right, u, v = pair(lambda x, y: (10.0 - 0.55 * y, 0.01 * x), (160, 200), (160, 220), noise=1.0)
+    led = match(left, right, prior=(u, v))
+    assert led.aligned
+    good, complete = share_within(led, u, v, right.shape, 0.5)
+    assert good > 0.97
+    assert complete > 0.93
+
+
+def test_prior_of_another_size_or_beyond_all_bounds():
+    left, right, *_ = pair(lambda x, y: (-5.0, 0.0))
+    with raises("RIL-348"):
+        match(left, right, prior=(np.zeros((3, 3)), np.zeros((3, 3))))
+    absurd = np.full(left.shape, 1e9), np.full(left.shape, -np.inf)
+    np.testing.assert_array_equal(match(left, right, prior=absurd).validity, match(left, right).validity)
+
+
+def test_progress_grows_from_nothing_to_all():
+    left, right, *_ = pair(lambda x, y: (-5.0, 0.0))
+    told = []
+    match(left, right, tell=lambda share, step: told.append((share, step)))
+    shares = [share for share, _ in told]
+    assert shares[0] == 0
+    assert shares == sorted(shares)
+    assert shares[-1] < 1
+    assert any("level 0" in step for _, step in told)
+
+
+@pytest.mark.data
+def test_unrelated_photographs_match_hardly_anywhere(data_dir):
+    cones = cv2.imread(str(data_dir / "cones" / "cones_image_02.png"), 0)
+    motorcycle = cv2.imread(str(data_dir / "motorcycle" / "motorcycle_right.png"), 0)
+    rows, cols = cones.shape
+    for row, col in ((0, 0), (60, 140), (120, 280)):
+        assert matched(match(cones, motorcycle[row : row + rows, col : col + cols]).validity).mean() < MOST_CHANCE

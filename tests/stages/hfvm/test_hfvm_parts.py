@@ -1,0 +1,296 @@
+"""Consistency, epipolar band, plane, refinement and look-up table of the matcher, each alone."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from matching_scenes import convergent_rig, pair, rig_displacement
+from scipy import ndimage
+
+from stages.geometry.geometry import Rig
+from stages.hfvm import consistency, epipolar, hierarchy, lookup, plane, refine, rowwise
+from stages.hfvm.params import HfvmParams
+from stages.hfvm.window import whole
+from stages.imaging.pyramid import PyramidParams, build
+
+
+def zeros(*shape):
+    return np.zeros(shape, np.float32)
+
+
+class TestConsistency:
+    def backmatch(self, lu, lv, ru, rv, valid=None):
+        error = np.full(lu.shape, consistency.FAILED, np.float32)
+        valid = np.ones(ru.shape, np.uint8) if valid is None else valid
+        consistency.backmatch(lu, lv, ru, rv, valid, error, 0, 0, 0, 0, *ru.shape)
+        return error
+
+    def test_by_hand(self):
+        lu, lv, ru, rv = zeros(1, 4), zeros(1, 4), zeros(1, 4), zeros(1, 4)
+        lu[0] = [1, 1, 0.5, 1]
+        ru[0] = [0, -1, -3, -1]
+        error = self.backmatch(lu, lv, ru, rv)
+        # 0 -> 1 -> 0; 1 -> 2 -> -1: two off; 2.5: nearest is 3 (half rounds up), -1 + 0.5; 3 leaves
+        np.testing.assert_allclose(error[0, :3], [0, 2, 0.5])
+        assert error[0, 3] == consistency.FAILED
+
+    def test_rows_count_and_masked_targets_fail(self):
+        lu, lv = zeros(2, 2), zeros(2, 2)
+        lv[0] = 1
+        error = self.backmatch(lu, lv, zeros(2, 2), zeros(2, 2), np.array([[1, 1], [1, 0]], np.uint8))
+        np.testing.assert_array_equal(error, [[1, consistency.FAILED], [0, consistency.FAILED]])
+
+    def test_median_against_scipy(self):
+        a = np.random.default_rng(0).integers(-3000, 3000, (20, 30)).astype(np.int16)
+        np.testing.assert_array_equal(consistency.median(a, 5), ndimage.median_filter(a, 5, mode="nearest"))
+
+    def test_small_patches_are_isolated_by_either_component(self):
+        u, v = zeros(10, 10), zeros(10, 10)
+        v[2:4, 2:4] = 5
+        u[7, 7] = -3
+        keep = np.ones((10, 10), bool)
+        sizes = consistency.patches(u, v, keep)
+        assert (sizes[2:4, 2:4] == 4).all()
+        assert sizes[7, 7] == 1
+        assert np.count_nonzero(sizes == 95) == 95
+
+    @settings(max_examples=30, deadline=None)
+    @given(st.integers(0, 10**6))
+    def test_patches_against_scipy(self, seed):
+        rng = np.random.default_rng(seed)
+        shape = rng.integers(1, 14, 2)
+        u, keep = 5 * rng.integers(0, 2, shape).astype(np.int16), rng.random(shape) < 0.7
+        expected = np.zeros(shape, int)
+        for value in (0, 5):
+            label, _ = ndimage.label(keep & (u == value))
+            expected += np.where(label > 0, np.bincount(label.ravel())[label], 0)
+        np.testing.assert_array_equal(consistency.patches(np.zeros_like(u), u, keep), expected)
+
+    @pytest.mark.parametrize(("near_sign", "expected"), [(-1.0, -2), (1.0, -20)])
+    def test_an_occlusion_gets_its_background(self, near_sign, expected):
+        u, v, filled = np.array([[-2, 9, 9, -20]], np.float32), zeros(1, 4), np.zeros((1, 4), np.uint8)
+        consistency.fill_rows(u, v, np.array([[True, False, False, True]]), 10, near_sign, filled)
+        np.testing.assert_array_equal(u[0, 1:3], expected)
+        np.testing.assert_array_equal(filled, [[0, 1, 1, 0]])
+
+    def test_a_failed_match_gets_the_line_and_no_value_travels_far(self):
+        u, v, filled = zeros(1, 12), zeros(1, 12), np.zeros((1, 12), np.uint8)
+        keep = np.zeros((1, 12), bool)
+        keep[0, [2, 5]] = True
+        u[0, 2], u[0, 5] = 1.0, 2.5
+        consistency.fill_rows(u, v, keep, 3, -1.0, filled)
+        np.testing.assert_allclose(u[0, :9], [1, 1, 1, 1.5, 2, 2.5, 2.5, 2.5, 2.5])
+        np.testing.assert_array_equal(filled[0], [1, 1, 0, 1, 1, 0, 1, 1, 1, 0, 0, 0])
+
+
+def rig_matches(rig, seed=0, n=800, outliers=0.2):
+    """Displacement maps of random depths with outliers, and the true ones."""
+    rng = np.random.default_rng(seed)
+    shape = (rig.left.height, rig.left.width)
+    y, x = np.indices(shape, dtype=float)
+    u, v = rig_displacement(rig, lambda x, y: rng.uniform(0.4, 1.5, shape))(x, y)
+    wanted = np.zeros(shape, bool)
+    wanted.flat[rng.choice(wanted.size, n, replace=False)] = True
+    wild = wanted & (rng.uniform(size=shape) < outliers)
+    return np.where(wild, rng.uniform(-40, 40, shape), u), np.where(wild, rng.uniform(-40, 40, shape), v), wanted, u, v
+
+
+def turned(rig):
+    """The rig with both cameras rolled by a right angle: its baseline lies along the columns."""
+    turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    t = rig.T_right_left
+    return Rig(rig.left, rig.right, type(t)(turn @ t.rotation @ turn.T, turn @ t.translation))
+
+
+class TestEpipolar:
+    @pytest.mark.parametrize("change", [lambda r: r, turned], ids=["along rows", "along columns"])
+    def test_lines_of_a_convergent_rig_despite_outliers(self, change):
+        u, v, wanted, true_u, true_v = rig_matches(change(convergent_rig()))
+        f, spread = epipolar.fit(u, v, wanted, wanted.shape)
+        line = epipolar.lines(f, wanted.shape)
+        off = np.abs(line[..., 0] * true_u + line[..., 1] * true_v + line[..., 2])
+        # The weak prior pulls exact matches off by a small part of the half pixel that a match is good for.
+        assert np.percentile(off, 95) < 0.1
+        assert spread < 0.1
+
+    def test_too_few_matches_give_no_band(self):
+        wanted = np.zeros((50, 60), bool)
+        wanted[0, :30] = True
+        assert epipolar.fit(zeros(50, 60), zeros(50, 60), wanted, (50, 60)) is None
+
+    def test_finer_level_keeps_the_constraint(self):
+        u, v, wanted, *_ = rig_matches(convergent_rig(), outliers=0.0)
+        f, _ = epipolar.fit(u, v, wanted, wanted.shape)
+        y, x = np.nonzero(wanted)
+        fine = 2 * np.stack([x + 0.5, y + 0.5]) - 0.5
+        fine_right = 2 * np.stack([x + u[wanted] + 0.5, y + v[wanted] + 0.5]) - 0.5
+        one = np.ones((1, len(x)))
+        a = np.einsum("in,ij,jn->n", np.vstack([x + u[wanted], y + v[wanted], one[0]]), f, np.vstack([x, y, one[0]]))
+        b = np.einsum("in,ij,jn->n", np.vstack([fine_right, one]), epipolar.finer(f), np.vstack([fine, one]))
+        np.testing.assert_allclose(a, b, atol=1e-9)
+
+    def test_near_things_lie_left_in_the_right_image_also_with_toe_in(self):
+        rig = convergent_rig()
+        u, v, wanted, *_ = rig_matches(rig, outliers=0.0)
+        assert np.median(u[wanted]) > 0  # beyond the crossing of the axes: the sign of u alone would mislead
+        f, _ = epipolar.fit(u, v, wanted, wanted.shape)
+        assert epipolar.near_sign(f, u[wanted], wanted.shape, wanted.shape) == -1.0
+        swapped = Rig(rig.right, rig.left, rig.T_right_left.inverse())
+        u, v, wanted, *_ = rig_matches(swapped, outliers=0.0)
+        f, _ = epipolar.fit(u, v, wanted, wanted.shape)
+        assert epipolar.near_sign(f, u[wanted], wanted.shape, wanted.shape) == 1.0
+
+
+class TestPlane:
+    H = np.array([[0.93, -0.55, 40.0], [-0.01, 1.03, -3.0], [-2e-4, 5e-5, 1.0]])
+
+    def displacement(self, x, y):
+        q = np.einsum("ij,j...->i...", self.H, np.stack([x, y, np.ones_like(x)]))
+        return q[0] / q[2] - x, q[1] / q[2] - y
+
+    def test_finds_the_plane_of_the_majority(self):
+        y, x = np.indices((60, 80), dtype=float)
+        u, v = self.displacement(x, y)
+        rng = np.random.default_rng(0)
+        wild = rng.uniform(size=u.shape) < 0.3
+        u, v = np.where(wild, u - rng.uniform(5, 20, u.shape), u), v + rng.normal(0, 0.1, v.shape)
+        h, share = plane.fit_plane(u, v, np.ones(u.shape, bool), 1.0)
+        corners = np.array([[0, 79, 0, 79], [0, 0, 59, 59], [1, 1, 1, 1]])
+        a, b = h @ corners, self.H @ corners
+        # Noise 0.1 px over 3000 matches: hundredths; the robust weights leave a little of the outliers.
+        np.testing.assert_allclose(a[:2] / a[2], b[:2] / b[2], atol=0.3)
+        assert share == pytest.approx(0.7, abs=0.02)
+
+    def test_level_change_keeps_the_mapping(self):
+        h = plane.to_level_0(self.H, 2)
+        x = np.array([10.0, 20.0])
+        coarse = self.H @ [*((x + 0.5) / 4 - 0.5), 1]
+        fine = h @ [*x, 1]
+        np.testing.assert_allclose((fine[:2] / fine[2] + 0.5) / 4 - 0.5, coarse[:2] / coarse[2])
+
+    def test_aligned_image_is_the_left_one_and_displacements_compose_back(self):
+        left, right, u, v = pair(self.displacement, (100, 120), (120, 170))
+        aligned = plane.align(build(right, PyramidParams()), self.H, left.shape, PyramidParams())
+        m = plane.margin(left.shape)
+        inner = aligned.images[0][m:-m, m:-m]
+        seen = aligned.valid[0][m:-m, m:-m] == 1
+        assert seen.mean() > 0.5
+        # Cubic interpolation of wavelengths from 5 px, grey range 200: about a percent of it.
+        assert np.abs(inner - left)[seen].mean() < 2.0
+        back_u, back_v = plane.compose(self.H, np.full(u.shape, m, np.float32), np.full(u.shape, m, np.float32))
+        np.testing.assert_allclose(back_u, u, atol=1e-3)
+        np.testing.assert_allclose(back_v, v, atol=1e-3)
+
+    def test_distortion_is_the_shear(self):
+        assert plane.distortion(np.eye(3), (50, 60)) == 0
+        assert plane.distortion(np.array([[1, -0.5, 3], [0, 1, 0], [0, 0, 1.0]]), (50, 60)) == pytest.approx(0.5)
+
+
+class TestRefine:
+    def test_recovers_sub_pixel_displacements_to_the_noise_limit(self):
+        noise, window = 1.0, 5
+        left, right, u, v = pair(lambda x, y: (-6.0 + 0.05 * y, 1.3 + 0.02 * x), noise=noise)
+        start_u, start_v = (u + 0.3).astype(np.float32), (v - 0.3).astype(np.float32)
+        keep, valid = np.ones(u.shape, bool), np.ones(right.shape, np.uint8)
+        found_u, found_v, rest, _ = refine.refine(
+            left, right, valid, start_u, start_v, keep, HfvmParams(refine_steps=2)
+        )
+        inner = np.s_[12:-12, 12:-12]
+        gradient = np.sqrt(np.mean(np.gradient(right)[1] ** 2))
+        # Least squares over the window: sqrt(2) noise / (gradient * window); the median of |error| is .67 of it, and
+        # weakly textured windows cost a factor below two.
+        limit = 2 * 0.67 * np.sqrt(2) * noise / (gradient * window)
+        assert np.median(np.abs(found_u - u)[inner]) < limit
+        assert np.median(np.abs(found_v - v)[inner]) < limit
+        assert np.median(rest[inner]) == pytest.approx(2 * noise**2, rel=0.3)
+
+    def test_keeps_what_it_cannot_improve(self):
+        left, right, *_ = pair(lambda x, y: (-6.0, 0.0))
+        wrong = np.full(left.shape, 20.0, np.float32)
+        found_u, _, _, _ = refine.refine(
+            left, right, np.ones(right.shape, np.uint8), wrong, wrong, np.zeros(left.shape, bool), HfvmParams()
+        )
+        np.testing.assert_array_equal(found_u, wrong)
+
+    def test_correlation_tells_noise_from_texture(self):
+        rng = np.random.default_rng(0)
+        signal, a, b = rng.normal(0, 10, (3, 60, 60))
+        keep = np.ones((60, 60), bool)
+        mean = lambda z: ndimage.uniform_filter(z, 5)  # noqa: E731
+        variance = lambda z: mean(z * z) - mean(z) ** 2  # noqa: E731
+        found = [
+            refine.surroundings(variance(d).astype(np.float32), np.sqrt(variance(s)).astype(np.float32), keep)
+            for d, s in ((0.1 * a - 0.1 * b, signal + 0.1 * a), (a - b, a))
+        ]
+        (same, _), (none, around) = found
+        assert same.min() > 0.9
+        # 81 overlapping windows of 25 noise values each: the deviation of a correlation is about a tenth.
+        assert np.abs(none[8:-8, 8:-8]).max() < 0.5
+        assert around[30, 30] == pytest.approx(variance(a - b)[26:35, 26:35].mean(), rel=1e-5)
+
+
+def test_local_mean_takes_only_like_neighbours():
+    u, v = zeros(5, 5), zeros(5, 5)
+    u[:, 3:] = 10
+    u[2, 2] = 0.9
+    keep = np.ones((5, 5), bool)
+    keep[0, 0] = False
+    out_u, out_v = np.empty((2, 5, 5), np.float32)
+    rowwise.local_mean(u, v, keep, 1, 1, out_u, out_v)
+    assert out_u[2, 2] == pytest.approx(0.9 / 6)
+    assert out_u[2, 3] == 10
+    assert out_u[0, 0] == 0
+
+
+@pytest.mark.parametrize("radius", [1, 4])
+def test_window_sums_do_not_depend_on_where_the_array_begins(radius):
+    planes = np.random.default_rng(0).uniform(0, 1e4, (2, 17, 23)).astype(np.float32)
+    sums, part = np.empty_like(planes), np.empty((2, 14, 18), np.float32)
+    rowwise.box(planes, radius, sums)
+    size = 2 * radius + 1
+    expected = ndimage.uniform_filter(planes.astype(np.float64), (1, size, size), mode="constant") * size**2
+    np.testing.assert_allclose(sums, expected, rtol=1e-5)
+    rowwise.box(np.ascontiguousarray(planes[:, 3:, 5:]), radius, part)
+    np.testing.assert_array_equal(part[:, radius:, radius:], sums[:, 3 + radius :, 5 + radius :])
+
+
+class TestLookup:
+    def test_learnt_table_makes_its_sample_uniform(self):
+        rng = np.random.default_rng(0)
+        true = rng.uniform(-0.5, 0.5, 20000)
+        found = true - 0.1 * np.sin(2 * np.pi * true)
+        even = lookup.even(found, lookup.learn(found))
+        counts, _ = np.histogram(even, 10, (-0.5, 0.5))
+        assert np.ptp(np.histogram(found, 10, (-0.5, 0.5))[0]) > 1000
+        # 2000 a bin, five standard deviations, and linear interpolation inside sixteenths.
+        np.testing.assert_allclose(counts, 2000, atol=5 * np.sqrt(2000) + 100)
+
+    def test_table_maps_the_interval_onto_itself_oddly(self):
+        x = np.linspace(-0.5, 0.5, 101)
+        y = lookup.even(x)
+        assert (y[0], y[50], y[-1]) == (-0.5, 0.0, 0.5)
+        assert (np.diff(y) > 0).all()
+        np.testing.assert_allclose(y, -y[::-1], atol=1e-7)
+
+    def test_no_sample_no_change(self):
+        np.testing.assert_allclose(lookup.even([0.3], lookup.learn([])), [0.3], atol=1e-6)
+
+    def test_default_table_is_what_textured_noise_teaches(self):
+        p = HfvmParams(preset="paper", top_columns=0.05, top_rows=0.05)
+        rng = np.random.default_rng(5)
+        frequency = np.hypot(*np.meshgrid(np.fft.fftfreq(512), np.fft.fftfreq(256)))
+        frequency[0, 0] = 1
+        spectrum = np.fft.fft2(rng.normal(size=(256, 512))) / frequency**1.3
+        y, x = np.indices((256, 512), dtype=float)
+        grey = np.fft.ifft2(spectrum).real
+        grey = (grey - grey.mean()) / grey.std() * 40 + 128
+        moved = ndimage.map_coordinates(grey, [y, x - 2.5 - (x - 256) * 0.012 - (y - 128) * 0.004], mode="nearest")
+        images = [(a + rng.normal(0, 1, a.shape)).clip(0, 255)[16:-16, 32:-32] for a in (grey, moved)]
+        single = [build(a, PyramidParams(levels=1)) for a in images]
+        prepared = hierarchy.prepare(*single, p)
+        state = hierarchy.run(prepared, p, 0)
+        patches = [seen.patch(0, whole(images[0].shape)) for seen in (prepared.left, prepared.right)]
+        _, _, _, offset = prepared.solver.search(*patches, state.left.u, state.left.v, 0, 0)
+        table = lookup.learn(offset[..., 0][state.left_ok])
+        # One of six images of the lesson: a few hundredths.
+        np.testing.assert_allclose(table, lookup.DEFAULT_TABLE, atol=0.03)

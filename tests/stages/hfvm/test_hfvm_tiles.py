@@ -1,0 +1,140 @@
+"""Tiles of any size, in any order, give what the whole image gives, bit for bit; windows and rasters by themselves."""
+
+import random
+
+import numpy as np
+import pytest
+from matching_scenes import pair
+
+from stages.hfvm import HfvmParams, plane, tiled
+from stages.hfvm.views import Aligned, Plain
+from stages.hfvm.window import Mosaic, Window, bounded, gather, pick, thinned, tiles, whole
+from stages.imaging.pyramid import PyramidParams, build
+
+
+def quiet(share, step):
+    return None
+
+
+def misaligned():
+    """Waves of 4 px, rows shifted by two, noise, a patch of unlike texture, a masked corner, half the contrast."""
+    left, right, *_ = pair(lambda x, y: (-9 + 4 * np.sin(x / 30) * np.cos(y / 25), 2 + np.cos(x / 40)), (150, 211))
+    rng = np.random.default_rng(3)
+    left, right = (a + rng.normal(0, 1.5, a.shape).astype(np.float32) for a in (left, right))
+    right[60:100, 90:150] = rng.normal(128, 30, (40, 60))
+    left[:35, 160:] = np.nan
+    return left, 0.6 * right
+
+
+def sheared():
+    """Ground that pre-alignment by a plane is made for; the right image is wider."""
+    left, right, *_ = pair(lambda x, y: (10.0 - 0.55 * y, 0.01 * x), (160, 200), (160, 220), noise=1.0)
+    return left, right
+
+
+def both(scene):
+    return [Plain.of(build(image, PyramidParams())) for image in scene()]
+
+
+def in_tiles(views, params, side, seed):
+    shuffle = random.Random(seed)
+    return tiled.match(*views, params, None, quiet, side, lambda windows: shuffle.sample(windows, len(windows)))
+
+
+@pytest.mark.parametrize(("scene", "aligned"), [(misaligned, False), (sheared, True)])
+@pytest.mark.parametrize("preset", ["default", "fast", "paper"])
+def test_tiles_of_any_size_and_order_give_the_bits_of_the_whole(scene, aligned, preset):
+    views, params = both(scene), HfvmParams(preset=preset)
+    once = tiled.match(*views, params, None, quiet, None)
+    assert once.aligned == (aligned and preset != "paper")
+    # the paper compares grey levels as they are: of half the contrast little matches
+    assert np.mean(once.arrays["validity"] & 1) > (0.005 if preset == "paper" else 0.5)
+    for side in (64, 100, 37):
+        found = in_tiles(views, params, side, side)
+        assert found.aligned == once.aligned
+        for name, values in once.arrays.items():
+            assert values.tobytes() == found.arrays[name].tobytes(), (name, side)
+
+
+def test_parameters_that_widen_the_reach_widen_the_surroundings():
+    """Rounds, median, refinement and filling reach farther than by default; so do centres far apart."""
+    views = both(misaligned)
+    more = {"rounds": 6, "fine_rounds": 5, "median": 5, "refine_steps": 3, "refine_radius": 4, "search_columns": 4}
+    params = HfvmParams(**more, search_rows=3, fill_reach=15, crowd=0.4, guided_fill=True, centres=5)
+    once = tiled.match(*views, params, None, quiet, None)
+    found = in_tiles(views, params, 53, 0)
+    for name, values in once.arrays.items():
+        assert values.tobytes() == found.arrays[name].tobytes(), name
+
+
+def test_presets_that_reach_over_the_image_are_matched_whole():
+    assert tiled.is_whole(HfvmParams(preset="accurate"))
+    assert not any(tiled.is_whole(HfvmParams(preset=p)) for p in ("default", "fast", "paper"))
+
+
+def test_aligned_windows_are_parts_of_the_aligned_pyramid():
+    left, right = both(sheared)
+    mask = np.array(right.masks[0])
+    mask[40:90, 60:150] = 0
+    right = Plain.of(build(right.images[0], PyramidParams(), mask))
+    h = np.array([[1.0, -0.5, 12.0], [0.01, 1.0, 0.0], [0.0, 1e-4, 1.0]])
+    expected = Plain.of(plane.align(right_pyramid(right), h, left.shapes[0], PyramidParams(levels=len(left.shapes))))
+    kept = Aligned.of(right, h, left, 0, None)
+    bare = Aligned.again(right, h, left, kept.blank)
+    some = Aligned.of(right, h, left, 2, 50)
+    assert kept.blank == expected.blank
+    for view in (kept, bare, some):
+        for level, shape in enumerate(expected.shapes):
+            window = Window(shape[0] // 5, shape[0] - 1, shape[1] // 3, shape[1])
+            for read in ("grey", "valid", "filled"):
+                np.testing.assert_array_equal(
+                    getattr(view, read)(level, window), getattr(expected, read)(level, window)
+                )
+
+
+def right_pyramid(view):
+    from stages.imaging.pyramid import Pyramid
+
+    return Pyramid(tuple(np.asarray(a) for a in view.images), tuple(np.asarray(a) for a in view.masks))
+
+
+class Elsewhere:
+    """A raster that is no array."""
+
+    def __init__(self, array):
+        self.array, self.shape = array, array.shape
+
+    def __getitem__(self, at):
+        return self.array[at]
+
+
+def test_mosaic_is_the_image_it_was_cut_from():
+    a = np.arange(35 * 52).reshape(35, 52)
+    windows = tiles(a.shape, 10)
+    mosaic = Mosaic(a.shape, windows, [Elsewhere(a[w.slices]) for w in windows])
+    np.testing.assert_array_equal(mosaic[3:28, 9:51], a[3:28, 9:51])
+    y, x = np.array([0, 34, 17, 9]), np.array([51, 0, 10, 9])
+    np.testing.assert_array_equal(pick(mosaic, y, x), a[y, x])
+    np.testing.assert_array_equal(gather(a.shape, [(w, {"a": a[w.slices]}) for w in reversed(windows)])["a"], a)
+
+
+@pytest.mark.parametrize("up", [False, True])
+def test_thinned_pixels_are_every_nth_of_all_however_it_is_read(monkeypatch, up):
+    monkeypatch.setattr("stages.hfvm.window.BLOCK", 7)
+    marked = np.random.default_rng(0).random((45, 31)) < 0.3
+    found = thinned(Elsewhere(marked), 50, lambda a: a, up)
+    places = np.flatnonzero(marked)
+    step = 1 + len(places) // 50 if up else len(places) // 50
+    np.testing.assert_array_equal(found, places[::step])
+    np.testing.assert_array_equal(thinned(marked, 50, lambda a: a, up), found)
+
+
+def test_windows():
+    assert tiles((5, 7), 4) == [Window(0, 4, 0, 4), Window(0, 4, 4, 7), Window(4, 5, 0, 4), Window(4, 5, 4, 7)]
+    assert tiles((5, 7), None) == tiles((5, 7), 7) == [whole((5, 7))]
+    assert Window(3, 9, 1, 4).align(4, (10, 7)) == Window(0, 10, 0, 4)
+    assert Window(3, 9, 1, 4).grow(2, 5, (10, 7)) == Window(1, 10, 0, 7)
+    assert Window(2, 9, 4, 7).parent() == Window(1, 5, 2, 4)
+    assert Window(1, 5, 2, 4).child((9, 7)) == Window(2, 9, 4, 7)
+    # nothing of it lies in the image: still a pixel, which no place can mean
+    assert bounded(-9, -5, 20, 30, (10, 7), 2) == Window(0, 1, 6, 7)

@@ -1,0 +1,102 @@
+"""Standard deviation of disparities: a hand-computed window, what it must follow, and that it holds against truth."""
+
+import numpy as np
+import pytest
+from matching_scenes import pair
+
+from stages.core.validity import matched
+from stages.hfvm import HfvmParams, match, refine
+from stages.hfvm.uncertainty import REFINED, neighbours, standard_deviation
+
+PARAMS = HfvmParams()
+
+
+def test_noise_part_is_the_inverse_structure_tensor_of_the_window():
+    image = np.random.default_rng(0).uniform(0, 255, (15, 17)).astype(np.float32)
+    keep, valid = np.ones(image.shape, bool), np.ones(image.shape, np.uint8)
+    nothing = np.zeros(image.shape, np.float32)
+    per_noise = refine.refine(image, image, valid, nothing, nothing, keep, PARAMS)[3]
+    y, x = 7, 8
+    window = np.s_[y - 2 : y + 3, x - 2 : x + 3]
+    gy, gx = np.gradient(image.astype(np.float64))
+    g = np.stack([gx[window].ravel(), gy[window].ravel()])
+    tensor = 25 * np.cov(g, bias=True) + 25 * PARAMS.refine_noise * np.eye(2)
+    assert per_noise[y, x] == pytest.approx(np.linalg.inv(tensor)[0, 0], rel=1e-4)
+
+
+def test_relief_and_border_parts_by_their_definition():
+    rng = np.random.default_rng(1)
+    y, x = np.indices((12, 14), dtype=np.float64)
+    keep = rng.random(x.shape) < 0.9
+    tilted = (rng.normal(0, 0.3, x.shape) + 0.4 * x - 0.7 * y - 50).astype(np.float32)
+    relief, border = neighbours(tilted, keep)
+    squares = []
+    for j, i in np.ndindex(5, 5):
+        cross = [(4 + j, 5 + i), (2 + j, 5 + i), (6 + j, 5 + i), (4 + j, 3 + i), (4 + j, 7 + i)]
+        if all(keep[p] for p in cross):
+            squares.append((tilted[cross[0]] - np.mean([tilted[p] for p in cross[1:]])) ** 2)
+    assert 3 < len(squares) < 25
+    assert relief[6, 7] == pytest.approx(np.mean(squares), rel=1e-4)
+    assert border[6, 7] == pytest.approx(1 - keep[2:11, 3:12].mean(), abs=1e-6)
+    plane = (0.4 * x - 0.7 * y - 50).astype(np.float32)
+    relief, border = neighbours(plane, np.ones(x.shape, bool))
+    assert relief.max() < 1e-9
+    np.testing.assert_array_equal(border, 0)
+
+
+def test_undefined_exactly_where_nothing_was_matched():
+    left, right, *_ = pair(lambda x, y: (-8.0, 1.0), noise=3.0)
+    found = match(left, right)
+    np.testing.assert_array_equal(np.isfinite(found.disparity_std), matched(found.validity))
+    assert np.nanmin(found.disparity_std) >= REFINED.floor
+
+
+def test_no_kept_pixel_gives_no_number_and_no_warning():
+    image = np.zeros((6, 7), np.float32)
+    std = standard_deviation(image, image, np.zeros(image.shape, bool), PARAMS)
+    assert np.isnan(std).all()
+
+
+def test_edges_along_the_rows_leave_the_column_uncertain():
+    x = np.indices((60, 60), dtype=np.float64)[1]
+    keep, valid, flat = np.ones(x.shape, bool), np.ones(x.shape, np.uint8), np.zeros(x.shape, np.float32)
+    found = []
+    for image in (across := (128 + 60 * np.sin(x)).astype(np.float32), across.T.copy()):
+        noise = 150.0 * refine.refine(image, image, valid, flat, flat, keep, PARAMS)[3]
+        found.append(standard_deviation(noise, flat, keep, PARAMS)[30, 30])
+    up, along = found
+    assert along > 3 * up
+
+
+def test_depth_edge_noise_and_weak_texture_are_less_certain():
+    step = lambda x, y: (np.where(x < 90, -4.0, -7.0), 0.0)  # noqa: E731
+    calm = match(*pair(step)[:2]).disparity_std
+    noisy = match(*pair(step, noise=6.0)[:2]).disparity_std
+    rng = np.random.default_rng(0)
+    weak = match(*(128 + 0.1 * (a - 128) + rng.normal(0, 1.2, a.shape) for a in pair(step)[:2])).disparity_std
+    inside = np.s_[20:120, 30:70]
+    assert np.nanmedian(noisy[inside]) > 1.2 * np.nanmedian(calm[inside])
+    assert np.nanmedian(weak[inside]) > 1.2 * np.nanmedian(calm[inside])
+    assert np.nanmedian(calm[20:120, 80:100]) > 1.5 * np.nanmedian(calm[inside])
+
+
+def test_stated_errors_hold_against_exact_displacements_on_relief_and_noise():
+    bumps = lambda x, y: (-9.0 + 2.0 * np.sin(x / 11) * np.sin(y / 9) + np.where(x > 120, 7.0, 0.0), 0.5)  # noqa: E731
+    for seed in (3, 4):
+        left, right, u, _ = pair(bumps, (180, 240), seed=seed, noise=4.0)
+        found = match(left, right)
+        ok = matched(found.validity)
+        ratio = np.abs(found.column_disparity - u)[ok] / found.disparity_std[ok]
+        # Not the scenes that it was fitted on: never too sure of itself, and no more than twice too careful.
+        assert np.mean(ratio <= 1) > 0.61
+        assert np.mean(ratio <= 2) > 0.91
+        assert np.mean(ratio <= 0.5) < 0.68
+
+
+@pytest.mark.parametrize("params", [HfvmParams(preset="paper"), HfvmParams(refine=False)])
+def test_unrefined_disparities_have_one_too(params):
+    left, right, u, _ = pair(lambda x, y: (-6.4, 1.3), noise=3.0)
+    found = match(left, right, params)
+    ok = matched(found.validity)
+    inside = np.abs(found.column_disparity - u)[ok] <= found.disparity_std[ok]
+    assert 0.55 < inside.mean() < 0.95

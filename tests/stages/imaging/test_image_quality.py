@@ -1,0 +1,39 @@
+"""Glances at images: black, blurred, blurred beyond all detail, equal."""
+
+import cv2
+import numpy as np
+
+from stages.core.declare import Bundle, NoParams, check_outputs
+from stages.imaging.image_quality import STAGE, glance
+
+
+def picture(seed=1, shape=(200, 300)):
+    rng = np.random.default_rng(seed)
+    noise = cv2.GaussianBlur(rng.normal(0, 1, shape), (0, 0), 1.2)
+    return np.clip(110 + 40 * noise / noise.std() + rng.normal(0, 1.5, shape), 0, 255).astype(np.uint8)
+
+
+def test_blur_takes_sharpness_and_strong_blur_takes_detail():
+    image = picture()
+    valid = np.ones(image.shape, np.uint8)
+    sharp = glance(image, valid)
+    soft = glance(cv2.GaussianBlur(image, (0, 0), 2.5), valid)
+    gone = glance(cv2.GaussianBlur(image, (0, 0), 15), valid)
+    assert soft["sharpness"] < 0.6 * sharp["sharpness"]
+    assert gone["detail"] < 0.3 * sharp["detail"]
+    dark = glance((0.3 * image).astype(np.uint8), valid)  # exposure is no blur
+    assert dark["sharpness"] > 0.8 * sharp["sharpness"]
+    assert dark["detail"] > 0.8 * sharp["detail"]
+
+
+def test_a_black_image_deviates_by_nothing_and_equal_images_have_one_digest():
+    image = picture()
+    both = {"left": Bundle({"image": 0 * image, "valid": np.ones_like(image)}, {})}
+    both["right"] = Bundle({"image": image, "valid": np.ones_like(image)}, {})
+    out = STAGE.run(NoParams(), {"frame": 4}, both)
+    check_outputs(STAGE, out)
+    assert out.meta["frame"] == 4
+    assert out.meta["left"]["deviation"] == out.meta["left"]["mean"] == 0.0
+    assert out.meta["right"]["digest"] == glance(image.copy(), np.ones_like(image))["digest"]
+    assert out.meta["right"]["digest"] != out.meta["left"]["digest"]
+    assert glance(image, np.zeros_like(image))["mean"] is None

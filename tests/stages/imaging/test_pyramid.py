@@ -1,0 +1,106 @@
+import numpy as np
+import pytest
+from raising import raises
+from scipy import ndimage
+
+from stages.core.declare import Bundle, check_outputs
+from stages.core.errors import InputError
+from stages.imaging import pyramid
+from stages.imaging.pyramid import Pyramid, PyramidParams
+
+
+def params(levels=6, min_side=1):
+    return PyramidParams(levels=levels, min_side=min_side)
+
+
+def test_means_by_hand_with_odd_sides_completed_by_their_edge():
+    image = np.array([[0, 2, 10], [4, 6, 30], [8, 0, 50]], np.float32)
+    first = pyramid.build(image, params(levels=2)).images[1]
+    # (0+2+4+6)/4, (10+10+30+30)/4; last row twice: (8+0+8+0)/4, 50
+    np.testing.assert_array_equal(first, [[3, 20], [4, 50]])
+
+
+def test_levels_against_reduction_of_the_whole_image():
+    image = np.random.default_rng(0).uniform(0, 255, (64, 96)).astype(np.float32)
+    found = pyramid.build(image, params(levels=4))
+    for n in range(4):
+        k = 2**n
+        expected = image.reshape(64 // k, k, 96 // k, k).mean((1, 3))
+        np.testing.assert_allclose(found.images[n], expected, rtol=1e-6)
+
+
+def test_coarse_pixel_lies_where_the_docstring_says():
+    x = np.arange(64, dtype=np.float32)
+    found = pyramid.build(np.tile(x, (64, 1)), params(levels=4))
+    for n, level in enumerate(found.images):
+        at = (x + 0.5) / 2**n - 0.5
+        inner = (at >= 0) & (at <= level.shape[1] - 1)
+        values = ndimage.map_coordinates(level, [np.zeros(inner.sum()), at[inner]], order=1)
+        np.testing.assert_allclose(values, x[inner], atol=1e-4)
+
+
+def test_mask_needs_three_of_four_and_masked_grey_does_not_leak():
+    image = np.full((4, 4), 10, np.float32)
+    valid = np.ones((4, 4), np.uint8)
+    valid[0, 0] = valid[0, 2] = valid[1, 3] = 0
+    image[valid == 0] = 250
+    found = pyramid.build(image, params(levels=3), valid)
+    np.testing.assert_array_equal(found.valid[1], [[1, 0], [1, 1]])
+    np.testing.assert_array_equal(found.images[1], [[10, 0], [10, 10]])
+    assert found.valid[2][0, 0] == 1
+    assert found.images[2][0, 0] == 10
+
+
+def test_filled_images_carry_no_edge_of_the_mask():
+    image = np.full((32, 32), 100, np.float32)
+    valid = np.ones((32, 32), np.uint8)
+    valid[:, 20:] = 0
+    for level in pyramid.filled(pyramid.build(image, params(levels=4), valid)):
+        np.testing.assert_array_equal(level, 100)
+
+
+def test_sixteen_bits_scale_to_eight():
+    image = np.arange(256, dtype=np.uint8).reshape(16, 16)
+    wide = image.astype(np.uint16) * 257
+    np.testing.assert_allclose(
+        pyramid.build(wide, params()).images[0], pyramid.build(image, params()).images[0], rtol=1e-6
+    )
+
+
+def test_not_finite_pixels_are_masked():
+    image = np.ones((4, 4), np.float32)
+    image[1, 1] = np.nan
+    found = pyramid.build(image, params())
+    assert found.valid[0].sum() == 15
+    assert np.isfinite(found.images[1]).all()
+
+
+def test_number_of_levels_is_bounded_by_the_smaller_side():
+    assert [a.shape for a in pyramid.build(np.zeros((35, 70), np.uint8), PyramidParams(min_side=8)).images] == [
+        (35, 70),
+        (18, 35),
+        (9, 18),
+    ]
+    assert pyramid.build(np.zeros((1, 1), np.uint8), PyramidParams()).levels == 1
+
+
+@pytest.mark.parametrize("image", [np.zeros((2, 2, 3), np.uint8), np.zeros((0, 4), np.uint8), np.zeros((2, 2), int)])
+def test_refuses_what_is_no_grey_image(image):
+    with pytest.raises(InputError):
+        pyramid.build(image, PyramidParams())
+
+
+def test_refuses_a_mask_of_another_size():
+    with raises("RIL-413"):
+        pyramid.build(np.zeros((4, 4), np.uint8), PyramidParams(), np.ones((4, 5), np.uint8))
+
+
+def test_stage_gives_what_it_declares_and_reads_it_back():
+    image = np.random.default_rng(0).integers(0, 255, (40, 50)).astype(np.uint8)
+    bundle = pyramid.STAGE.run(
+        PyramidParams(), {}, {"image": Bundle({"image": image, "valid": np.ones((40, 50), np.uint8)}, {})}
+    )
+    check_outputs(pyramid.STAGE, bundle)
+    found = Pyramid.from_bundle(bundle)
+    assert found.levels == 3
+    np.testing.assert_array_equal(found.images[0], image)

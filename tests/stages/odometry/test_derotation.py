@@ -1,0 +1,73 @@
+"""Undoing a known rotation: where pixels go, and back."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from matching_scenes import Texture
+from raising import raises
+
+from stages.geometry.geometry import Camera, rotation_exp
+from stages.imaging.pyramid import PyramidParams, build
+from stages.odometry.derotation import MARGIN, Derotation
+
+CAMERA = Camera(150.0, 160.0, 79.0, 61.0, 160, 120)
+ANGLE = st.floats(-0.4, 0.4)
+
+
+def test_a_far_point_moves_as_the_cameras_say():
+    R_b_a = rotation_exp([0.1, -0.2, 0.3])
+    point = np.array([0.2, -0.1, 1.0]) * 1e6
+    x, y = CAMERA.project(point)
+    p = Derotation.of(R_b_a, CAMERA).homography @ [x, y, 1.0]
+    np.testing.assert_allclose(p[:2] / p[2], CAMERA.project(R_b_a @ point), rtol=1e-9)
+
+
+def test_the_later_frame_is_held_like_the_earlier_one():
+    """The texture is frame a itself; b shows it turned."""
+    R_b_a = rotation_exp([0.05, -0.08, 0.35])
+    turn = Derotation.of(R_b_a, CAMERA)
+    texture = Texture(waves=40)
+    rows, cols = np.indices((CAMERA.height, CAMERA.width), dtype=np.float64)
+    p = np.einsum("ij,jrc->irc", np.linalg.inv(turn.homography), np.stack([cols, rows, np.ones_like(cols)]))
+    b = build(texture(p[0] / p[2], p[1] / p[2]), PyramidParams(levels=3))
+    back = turn.apply(b)
+    part = np.s_[MARGIN:-MARGIN, MARGIN:-MARGIN]
+    ok = back.valid[0][part] != 0
+    assert 0.6 < ok.mean() < 0.95
+    # Shortest wave 5 pixels, twice through cubic interpolation at most: a few grey levels of 35.
+    difference = (back.images[0][part] - texture(cols, rows))[ok]
+    assert np.sqrt(np.mean(difference**2)) < 3.0
+
+
+@settings(deadline=None, max_examples=30)
+@given(ANGLE, ANGLE, ANGLE, st.sampled_from([0, 1, 2]))
+def test_composed_displacements_lead_where_the_point_is(rx, ry, rz, level):
+    turn = Derotation.of(rotation_exp([rx, ry, rz]), CAMERA)
+    scale = 2**level
+    u = np.full((CAMERA.height // scale, CAMERA.width // scale), 5.0, np.float32)
+    v = np.full_like(u, -3.0)
+    u[0, 0] = np.nan
+    column, row = turn.compose(u + MARGIN, v + MARGIN, level)
+    assert column.dtype == np.float32
+    assert np.isnan(column[0, 0])
+    assert np.isnan(row[0, 0])
+    r, c = u.shape[0] // 2, u.shape[1] // 3
+    x, y = (c + 0.5) * scale - 0.5, (r + 0.5) * scale - 0.5
+    p = turn.homography @ [x + 5.0, y - 3.0, 1.0]
+    np.testing.assert_allclose([x + column[r, c], y + row[r, c]], p[:2] / p[2], atol=1e-4)
+
+
+def test_reach_is_what_the_farthest_corner_moves():
+    # Roll about the optical axis, equal focal lengths: a chord of the farthest corner's circle.
+    camera = Camera(150.0, 150.0, 79.0, 61.0, 160, 120)
+    corner = np.hypot(80.0, 61.0)
+    assert Derotation.of(rotation_exp([0, 0, 0.2]), camera).reach == pytest.approx(2 * corner * np.sin(0.1))
+    assert Derotation.of(np.eye(3), camera).reach == pytest.approx(0.0, abs=1e-9)
+    assert Derotation.of(rotation_exp([0, 1.5, 0]), camera).reach == np.inf
+
+
+@pytest.mark.parametrize("bad", [np.zeros((3, 3)), np.eye(2), np.full((3, 3), np.nan), 2 * np.eye(3)])
+def test_no_rotation_is_refused(bad):
+    with raises("RIL-305"):
+        Derotation.of(bad, CAMERA)

@@ -1,0 +1,140 @@
+"""Which frames are lost: by hand-made figures, and the stage on known displacements."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from motion_scenes import motion, shift
+from raising import raises
+
+from stages.core.declare import Bundle, check_outputs
+from stages.odometry.frame_screening import STAGE, ContinuityParams, judge
+
+PARAMS = ContinuityParams()
+
+
+def sight(k, **left):
+    good = {"mean": 100.0, "deviation": 40.0, "sharpness": 0.5, "detail": 0.1}
+    return {"left": good | {"digest": f"L{k}"} | left, "right": good | {"digest": f"R{k}"}}
+
+
+def found(steps, sights=None, jumps=(), sides=None, n=7):
+    """Judgement of ``n`` frames; steps not given match well."""
+    rates = dict.fromkeys(itertools.pairwise(range(n)), 0.7) | steps
+    return judge(range(n), sights or {k: sight(k) for k in range(n)}, rates, jumps, sides or {}, PARAMS)
+
+
+def test_good_frames_are_kept_and_nothing_is_asked():
+    out = found({})
+    assert not out.lost
+    assert not out.unfit
+    assert not any(out.asks.values())
+
+
+def test_a_frame_that_neither_neighbour_is_found_in_is_bridged_if_the_bridge_holds():
+    alone = {(2, 3): 0.05, (3, 4): 0.04}
+    assert found(alone).asks["bridges"] == [(2, 4)]
+    out = found(alone | {(2, 4): 0.5})
+    assert out.lost == {3: "not found in its neighbours: 5% of its pixels match the frame before, 4% the one behind"}
+    # nothing speaks against the frame itself where the bridge is as bad: the camera may have jumped
+    assert not found(alone | {(2, 4): 0.05}).lost
+
+
+def test_two_foreign_frames_are_bridged_together():
+    alone = {(2, 3): 0.05, (3, 4): 0.1, (4, 5): 0.04}
+    assert found(alone).asks["bridges"] == [(2, 5)]
+    assert list(found(alone | {(2, 5): 0.5}).lost) == [3, 4]
+
+
+def test_one_doubtful_step_is_a_jump_and_loses_no_frame():
+    out = found({(2, 3): 0.01})
+    assert not out.lost
+    assert not out.asks["bridges"]
+
+
+def test_a_black_frame_is_lost_whatever_matches_and_is_bridged():
+    sights = {k: sight(k) for k in range(7)} | {3: sight(3, mean=0.0, deviation=0.2)}
+    assert found({}, sights).asks["bridges"] == [(2, 4)]
+    out = found({(2, 4): 0.6}, sights)
+    assert out.lost == {3: "black left image (grey values deviate by 0.2 levels)"}
+
+
+def test_a_blurred_frame_is_posed_but_not_basic_unless_nothing_matches_it():
+    sights = {k: sight(k) for k in range(7)} | {3: sight(3, sharpness=0.2)}
+    out = found({}, sights)
+    assert out.unfit == {3: "blurred left image (40% of the usual sharpness)"}
+    assert not out.lost
+    alone = {(2, 3): 0.05, (3, 4): 0.05, (2, 4): 0.1}
+    assert "blurred left image" in found(alone, sights).lost[3]
+
+
+def test_a_blur_beyond_all_detail_is_told_though_noise_looks_sharp():
+    sights = {k: sight(k) for k in range(7)} | {3: sight(3, detail=0.02, sharpness=0.9)}
+    assert found({}, sights).unfit == {3: "blurred left image (20% of the usual detail)"}
+
+
+def test_blurred_frames_before_the_first_good_pair_are_lost():
+    sights = {k: sight(k, **({"sharpness": 0.2} if k < 2 else {})) for k in range(7)}
+    out = found({}, sights)
+    assert list(out.lost) == [0, 1]
+    assert "no good pair before it" in out.lost[0]
+
+
+def test_a_sequence_without_a_good_pair_is_refused():
+    sights = {k: sight(k) for k in range(7)}
+    for k in range(7):
+        sights[k]["right"] = sights[k]["right"] | {"deviation": 0.0, "mean": 0.0}
+    with raises("RIL-316", "frame 0"):
+        found({}, sights)
+
+
+def test_a_repeated_frame_is_told_and_a_stuck_camera_makes_no_basic_pair():
+    sights = {k: sight(k) for k in range(7)}
+    sights[3] = {side: sights[3][side] | {"digest": sights[2][side]["digest"]} for side in ("left", "right")}
+    out = found({}, sights)
+    assert out.repeated == [(2, 3)]
+    assert not out.unfit
+    sights[5]["right"] = sights[5]["right"] | {"digest": sights[4]["right"]["digest"]}
+    assert found({}, sights).unfit == {5: "its right image is that of frame 4"}
+
+
+def test_exchanged_sides_are_looked_for_at_jumps_and_beside_each_other():
+    looked = {"swapped": False, "as_given": 0.9, "exchanged": 0.0}
+    swapped = {"swapped": True, "as_given": 0.02, "exchanged": 0.95}
+    assert found({}, jumps=[3]).asks["sides"] == [3]
+    asked = found({}, jumps=[3], sides={3: swapped}).asks
+    assert asked == {"sides": [2, 4], "bridges": [(2, 4)]}
+    out = found({(2, 4): 0.6}, jumps=[3], sides={2: looked, 3: swapped, 4: looked})
+    assert list(out.lost) == [3]
+    assert "left and right are swapped (95% of its matches fit the rig with the sides exchanged" in out.lost[3]
+    assert not found({}, jumps=[3], sides={3: looked}).lost
+
+
+def test_the_stage_asks_then_answers():
+    frames = list(range(5))
+    blind = motion(shift(0.0), unmatched=lambda x, y: x > 20)
+    motions = [motion(shift(9.0)), blind, blind, motion(shift(9.0))]
+    sights = [Bundle({}, {"frame": k} | sight(k)) for k in frames]
+    inputs = {"sights": sights, "motions": motions, "bridges": [], "sides": []}
+    first = STAGE.run(PARAMS, {"frames": frames}, inputs)
+    check_outputs(STAGE, first)
+    assert first.meta["asks"]["bridges"] == [[1, 3]]
+    args = {"frames": frames, "bridges": [[1, 3]]}
+    last = STAGE.run(PARAMS, args, inputs | {"bridges": [motion(shift(18.0))]})
+    assert last.meta["chain"] == [0, 1, 3, 4]
+    assert [item["frame"] for item in last.meta["lost"]] == [2]
+    assert not any(last.meta["asks"].values())
+
+
+def test_the_stage_looks_at_the_sides_where_displacements_jump():
+    steps = [motion(shift(u)) for u in (9.0, 9.5, 9.0, 60.0, -42.0, 9.0)]
+    sights = [Bundle({}, {"frame": k} | sight(k)) for k in range(7)]
+    inputs = {"sights": sights, "motions": steps, "bridges": [], "sides": []}
+    asks = STAGE.run(PARAMS, {"frames": list(range(7))}, inputs).meta["asks"]
+    assert 4 in asks["sides"]
+    assert 0 not in asks["sides"]
+    still = STAGE.run(PARAMS, {"frames": list(range(7))}, inputs | {"motions": [motion(shift(9.0))] * 6}).meta
+    assert not still["asks"]["sides"]
+    assert still["match_rate"] == pytest.approx([np.mean(still["match_rate"])] * 6)

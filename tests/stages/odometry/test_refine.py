@@ -1,0 +1,325 @@
+"""Joint refinement: derivatives against differences, what it gains, that it never loses, and the stage's wiring."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from raising import raises
+
+from stages.core.declare import Bundle, check_outputs
+from stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
+from stages.odometry.resection.bundle_adjustment import (
+    RefineParams,
+    State,
+    Views,
+    adjust,
+    common_tilt,
+    cost_of,
+    normal,
+    posterior,
+    scatter,
+)
+from stages.odometry.resection.landmarks import landmarks_from_disparity
+from stages.odometry.resection.refine import STAGE, _tilt_pattern, claims, views_of
+from stages.odometry.resection.resect import ResectParams
+
+CAMERA = Camera(500.0, 500.0, 299.5, 199.5, 600, 400)
+RIG = Rig(CAMERA, CAMERA, RigidTransform(np.eye(3), np.array([-0.2, 0.0, 0.0])))
+PARAMS = RefineParams(stereo=True)
+
+
+def scene(seed, n=150, frames=4, bias=0.0, noise=0.2, stereo=True):
+    """Views of a segment with noisy depths and tracks, the true state, and a start as resection would give it."""
+    rng = np.random.default_rng(seed)
+    key = rng.uniform([20, 20], [580, 380], (n, 2))
+    depth = rng.uniform(2.0, 6.0, n)
+    X = CAMERA.rays(key) * depth[:, None]
+    per_pixel = (depth**2 / (500.0 * 0.2))[:, None] * CAMERA.rays(key)
+    error = noise * rng.standard_normal(n)
+    T = [
+        RigidTransform(rotation_exp(0.01 * k * np.array([1, -2, 1])), np.array([0.02, 0.01, -0.1]) * k)
+        for k in range(1, frames)
+    ]
+    pixels = np.array([CAMERA.project(P.apply(X)) for P in T]) + noise * rng.standard_normal((frames - 1, n, 2))
+    right, sigma = np.full((n, 2), np.nan), np.full(n, np.nan)
+    if stereo:
+        last = T[-1].apply(X)
+        seen_right = CAMERA.project(RIG.T_right_left.apply(last)) + pixels[-1] - CAMERA.project(last)
+        # a bias makes every disparity point to a depth that lies too near by so many pixels
+        right = seen_right - [bias, 0.0] + noise * rng.standard_normal((n, 1)) * [1.0, 0.0]
+        sigma = np.full(n, noise)
+    views = Views(
+        X - (error + bias)[:, None] * per_pixel,
+        per_pixel,
+        np.full(n, noise),
+        pixels,
+        np.ones((frames - 1, n), bool),
+        right,
+        sigma,
+        CAMERA,
+        RIG,
+        500.0 * np.prod(CAMERA.rays(key)[:, :2], axis=1),
+    )
+    start = [P @ RigidTransform(rotation_exp(1e-4 * rng.standard_normal(3)), 3e-3 * rng.standard_normal(3)) for P in T]
+    return views, State(np.array([P.rotation for P in start]), np.array([P.translation for P in start]), np.zeros(n)), T
+
+
+def error_of(state, T):
+    return float(
+        np.sqrt(
+            np.mean(
+                [np.sum((-R.T @ t - P.inverse().translation) ** 2) for R, t, P in zip(state.R, state.t, T, strict=True)]
+            )
+        )
+    )
+
+
+def test_gradient_is_that_of_the_cost():
+    views, state, _ = scene(1, n=20)
+    state = replace(state, depth=np.linspace(-0.3, 0.3, 20))
+    _, _, _, pose, depth = normal(views, state, 0.0, 0.2)
+    base = np.zeros((3, 6))
+
+    def cost(step, depths=0.0, bias=0.0):
+        return cost_of(views, state.moved(step, depths * np.ones(20)), bias, 0.2)
+
+    numeric = []
+    for k in range(18):
+        e = base.copy()
+        e.flat[k] = 1e-6
+        numeric.append((cost(e) - cost(-e)) / 2e-6)
+    numeric.append((cost(base, bias=1e-6) - cost(base, bias=-1e-6)) / 2e-6)
+    np.testing.assert_allclose(pose, numeric, rtol=1e-3, atol=0.5)
+    assert depth.sum() == pytest.approx((cost(base, 1e-6) - cost(base, -1e-6)) / 2e-6, rel=1e-4)
+
+
+def test_without_noise_the_truth_is_found():
+    views, start, T = scene(2, noise=1e-6)
+    views = replace(views, sigma=np.full(150, 0.2), right_sigma=np.full(150, 0.2))
+    (state,), bias, before, after = adjust([(views, start)], PARAMS)
+    assert error_of(state, T) < 1e-6
+    assert abs(bias) < 1e-4
+    assert after < 1e-6 * before
+
+
+def test_stereo_at_the_end_and_shared_depths_lower_the_error():
+    gains = []
+    for seed in range(8):
+        views, start, T = scene(10 + seed)
+        (alone,), _, _, _ = adjust([(replace(views, right_sigma=np.full(150, np.nan)), start)], PARAMS)
+        (state,), _, before, after = adjust([(views, start)], PARAMS)
+        assert after <= before
+        gains.append([error_of(state, T), error_of(alone, T)])
+    both, tracks = np.sqrt(np.mean(np.square(gains), axis=0))
+    assert both < tracks
+
+
+def test_a_bias_of_all_disparities_is_found_by_many_segments():
+    parts = [scene(30 + k, bias=0.3) for k in range(5)]
+    _, bias, _, _ = adjust([(v, s) for v, s, _ in parts], RefineParams(bias_sigma=1.0, stereo=True))
+    assert bias == pytest.approx(0.3, abs=0.1)
+
+
+def test_the_cost_never_rises_and_an_optimum_stays():
+    views, start, _ = scene(3)
+    (state,), *_ = adjust([(views, start)], PARAMS)
+    (again,), _, before, after = adjust([(views, state)], RefineParams(iterations=1, stereo=True))
+    assert after <= before
+    np.testing.assert_allclose(again.t, state.t, atol=1e-4)
+
+
+def test_the_covariance_is_the_inverse_of_the_whole_normal_matrix():
+    """Depths and bias as unknowns among the others, none eliminated, derivatives by differences: the same blocks."""
+    views, state, _ = scene(4, n=25, frames=3)
+    (state,), bias, *_ = adjust([(views, state)], PARAMS)
+    n, m = 25, 2
+
+    def residuals(x):
+        """Whitened errors of tracks, of the next pair's disparities, of depths and of the bias."""
+        moved, b = state.moved(x[:12].reshape(m, 6), x[12 : 12 + n]), bias + x[-1]
+        X = views.position + (moved.depth + b)[:, None] * views.along
+        tracks = [
+            (CAMERA.project(X @ R.T + t) - p) / 0.2 for R, t, p in zip(moved.R, moved.t, views.pixels, strict=True)
+        ]
+        last = X @ moved.R[-1].T + moved.t[-1]
+        apart = CAMERA.project(RIG.T_right_left.apply(last)) - CAMERA.project(last) - (views.right - views.pixels[-1])
+        stereo = (apart[:, 0] - b) / views.right_sigma  # the second pair shares the bias
+        return np.concatenate([*(t.ravel() for t in tracks), stereo, moved.depth / views.sigma, [b / 0.1]])
+
+    steps = 1e-6 * np.eye(12 + n + 1)
+    J = np.array([(residuals(e) - residuals(-e)) / 2e-6 for e in steps]).T
+    size = np.linalg.norm(residuals(np.zeros(12 + n + 1))[: 2 * m * n].reshape(-1, 2), axis=1)
+    alone = np.abs(residuals(np.zeros(12 + n + 1))[2 * m * n : 2 * m * n + n])
+    weight = np.concatenate([np.repeat(np.minimum(1, 2.5 / size), 2), np.minimum(1, 2.5 / alone), np.ones(n + 1)])
+    dense = np.linalg.inv(J.T @ (weight[:, None] * J))[:12, :12]
+    ((noise, by_bias),) = posterior([normal(views, state, bias, 0.2)], [1.0], PARAMS)
+    np.testing.assert_allclose(noise + np.outer(by_bias, by_bias), dense, rtol=1e-4, atol=1e-6 * np.abs(dense).max())
+    # Of a window over the whole sequence all of the bias' error is shared; the sum is the same.
+    ((own, shared),) = posterior([normal(views, state, bias, 0.2)], [1.0], PARAMS.model_copy(update={"window": 0}))
+    np.testing.assert_allclose(own + np.outer(shared, shared), noise + np.outer(by_bias, by_bias), rtol=1e-9)
+    assert (np.abs(shared) > np.abs(by_bias)).all()
+
+
+@pytest.mark.parametrize("window", [1, 0])
+def test_claimed_covariances_are_those_of_the_errors(window):
+    """Squared errors over the claimed ones of many segments, noise as it is stated."""
+    params = RefineParams(window=window)
+    ratios = []
+    for seed in range(60):
+        rng = np.random.default_rng([seed, 1])
+        views, start, T = scene(200 + seed, n=120, bias=0.1 * rng.standard_normal(), stereo=False)
+        (state,), bias, *_ = adjust([(views, start)], params)
+        ((covariance, _),) = claims([(views, state)], bias, params)
+        for R, t, true, claimed in zip(state.R, state.t, T, covariance, strict=True):
+            found, right = RigidTransform(R, t).inverse(), true.inverse()
+            turn = right.rotation @ found.rotation.T
+            w = 0.5 * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
+            error = np.concatenate([right.translation - found.translation, w])
+            ratios.append(error @ np.linalg.solve(claimed, error) / 6)
+    # Frames of a segment share landmarks, so some 60 independent sums of six squares: deviation of the mean 0.08.
+    assert 0.75 < np.mean(ratios) < 1.3
+
+
+def test_errors_larger_than_stated_widen_the_covariance():
+    for noise in (0.1, 0.2, 0.3):
+        views, start, _ = scene(5, noise=noise, stereo=False)
+        views = replace(views, sigma=np.full(150, 0.2))
+        (state,), bias, *_ = adjust([(views, start)], PARAMS)
+        assert scatter(views, state, bias, 0.2) == pytest.approx((noise / 0.2) ** 2, rel=0.25)
+
+
+def tilted(seed, tilt, frames=4):
+    """Views whose landmarks lie where disparities put them that are tilted by so many radians, adjusted once."""
+    views, start, T = scene(seed, n=120, frames=frames, noise=0.05, stereo=False)
+    views = replace(views, sigma=np.full(120, 0.2)).without_tilt(-tilt)
+    (state,), bias, _, _ = adjust([(views, start)], PARAMS)
+    return views, state, bias, T
+
+
+def test_a_tilt_of_all_disparities_is_found_by_many_segments_and_undone():
+    parts = [tilted(60 + k, 0.004) for k in range(12)]
+    tilt, sigma = common_tilt([part[:3] for part in parts], PARAMS)
+    assert tilt == pytest.approx(0.004, abs=4 * sigma)
+    assert sigma < 0.001
+    errors = []
+    for views, state, _, T in parts:
+        (again,), *_ = adjust([(views.without_tilt(tilt), state)], PARAMS)
+        errors.append([error_of(state, T), error_of(again, T)])
+    before, after = np.sqrt(np.mean(np.square(errors), axis=0))
+    assert after < 0.8 * before
+
+
+def test_a_tilt_that_is_not_there_is_not_believed():
+    parts = [tilted(90 + k, 0.0)[:3] for k in range(12)]
+    tilt, sigma = common_tilt(parts, PARAMS)
+    assert abs(tilt) < PARAMS.tilt_significance * sigma
+    # Two segments say nothing of their scatter.
+    assert common_tilt(parts[:2], PARAMS) == (0.0, float("inf"))
+
+
+def test_the_stage_undoes_a_tilt_and_says_so():
+    def stage(tilt):
+        """Ten segments of three frames ahead of a wall; each right image as a camera turned by ``tilt`` has it."""
+        one = bundles()
+        rows, cols = np.mgrid[0:400, 0:600]
+        x, y = (cols - 299.5) / 500.0, (rows - 199.5) / 500.0
+        for k, depth in enumerate((4.0, 3.8)):
+            bent = -500.0 * 0.2 / depth + tilt * 500.0 * (x - 0.2 / depth) * y
+            one["disparities"][k] = Bundle({**one["disparities"][k].arrays, "column_disparity": np.float32(bent)}, {})
+        rng, many = np.random.default_rng(8), {}
+        many["tracks"] = []
+        for _ in range(10):
+            points = np.asarray(one["tracks"][0]["points"]) + 0.1 * rng.standard_normal((80, 3, 2))
+            many["tracks"].append(Bundle({"points": points.astype(np.float32)}, {"frames": [0, 1, 2]}))
+        many |= {"resections": one["resections"] * 10, "levels": one["levels"] * 10}
+        args = {"pairs": [0, 2], "resect": ResectParams().model_dump(mode="json")}
+        return STAGE.run(RefineParams(), args, one | many)
+
+    plain, bent = stage(0.0), stage(0.006)
+    assert not plain.meta["tilt"]["undone"]
+    assert "warnings" not in plain.meta
+    assert bent.meta["tilt"]["undone"]
+    assert np.radians(abs(bent.meta["tilt"]["deg"])) == pytest.approx(0.006, rel=0.2)
+    assert "degrees of pitch stand for a principal point" in bent.meta["warnings"][0]
+    straight = np.arange(3) * 0.1
+    off = [np.abs(np.asarray(out["poses"])[:, 2, 3].reshape(10, 3) - straight).max() for out in (plain, bent)]
+    assert off[1] < 3 * off[0] + 0.002
+
+
+def test_the_pattern_of_a_tilt_is_what_a_turned_camera_and_a_moved_row_make():
+    X = np.random.default_rng(3).uniform([-2.0, -1.0, 3.0], [2.0, 1.0, 6.0], (50, 3))
+    theta = 1e-5
+    turned = CAMERA.project(RIG.T_right_left.apply(X) @ rotation_exp([theta, 0.0, 0.0]).T)
+    straight = CAMERA.project(RIG.T_right_left.apply(X))
+    pattern = _tilt_pattern(X, RigidTransform.identity(), RIG)
+    np.testing.assert_allclose(np.abs(turned - straight)[:, 0] / theta, np.abs(pattern), rtol=1e-3, atol=1e-2)
+    # The whole of it is one sign: a tilt of either sign fits.
+    sign = np.sign((turned - straight)[:, 0] * pattern)
+    assert np.all(sign[np.abs(pattern) > 1.0] == sign[np.abs(pattern) > 1.0][0])
+
+
+def bundles(tracks_of_last=True):
+    """A segment of three frames ahead of a textured wall, as the stages hand it over."""
+    rng = np.random.default_rng(5)
+    disparity = np.full((400, 600), -500.0 * 0.2 / 4.0, np.float32)
+    pair = Bundle(
+        {"column_disparity": disparity, "row_disparity": 0 * disparity, "validity": np.ones((400, 600), np.uint8)}, {}
+    )
+    later = Bundle({**pair.arrays, "column_disparity": np.full((400, 600), -500.0 * 0.2 / 3.8, np.float32)}, {})
+    key = rng.uniform([60, 60], [540, 340], (80, 2))
+    X = CAMERA.rays(key) * 4.0
+    points = np.stack([CAMERA.project(X - [0.0, 0.0, 0.1 * j]) for j in range(3)], 1).astype(np.float32)
+    poses = np.array([np.hstack([np.eye(3), [[0.0], [0.0], [0.1 * j + 0.002 * (j > 0)]]]) for j in range(3)])
+    track = Bundle({"points": points}, {"frames": [0, 1, 2]})
+    claimed = {"covariance": np.zeros((3, 6, 6)), "shared": np.zeros((3, 6, 7))}
+    resection = Bundle({"poses": poses, "inlier": np.ones((80, 3), np.uint8)} | claimed, {})
+    level = Bundle({}, {"T_local_left": RigidTransform.identity().to_list()})
+    rig = Bundle({}, {"rig": RIG.to_dict()})
+    return {
+        "tracks": [track],
+        "resections": [resection],
+        "levels": [level],
+        "disparities": [pair, later],
+        "rigs": [rig] * 2,
+    }
+
+
+@pytest.mark.parametrize("window", [0, 1])
+def test_the_stage_gives_the_poses_of_all_segments(window):
+    inputs = bundles()
+    args = {"pairs": [0, 2], "resect": ResectParams().model_dump(mode="json")}
+    out = STAGE.run(RefineParams(window=window, stereo=True), args, inputs)
+    check_outputs(STAGE, out)
+    assert out.meta["frames"] == [3]
+    np.testing.assert_allclose(out["poses"][:, :, 3], [[0, 0, 0], [0, 0, 0.1], [0, 0, 0.2]], atol=2e-4)
+    assert not out["covariance"][0].any()
+    assert (np.linalg.eigvalsh(out["covariance"][1:])[:, 0] > 0).all()
+    with raises("RIL-416"):
+        STAGE.run(RefineParams(), args | {"resect": ResectParams(landmarks="dem").model_dump(mode="json")}, inputs)
+
+
+def test_a_lost_frame_stays_lost_and_disagreeing_stereo_is_left_out():
+    inputs = bundles()
+    for name in ("poses", "covariance", "shared"):
+        inputs["resections"][0].arrays[name][1] = np.nan
+    inputs["disparities"][1].arrays["column_disparity"][:, :300] = -5.0  # another surface
+    args = {"pairs": [0, 2], "resect": ResectParams().model_dump(mode="json")}
+    out = STAGE.run(PARAMS, args, inputs)
+    for name in ("poses", "covariance", "shared"):
+        assert np.isnan(out[name][1]).all()
+        assert np.isfinite(out[name][[0, 2]]).all()
+    assert out["poses"][2, 2, 3] == pytest.approx(0.2, abs=3e-4)
+    track, resection = inputs["tracks"][0], inputs["resections"][0]
+    known = landmarks_from_disparity(
+        np.asarray(track["points"])[:, 0].astype(float),
+        *inputs["disparities"][0].arrays.values(),
+        RIG,
+        RigidTransform.identity(),
+        np.full(80, 0.2),
+        max_depth_ratio=0.2,
+    )
+    views, _, frames = views_of(track, resection, known, RIG, inputs["disparities"][1], PARAMS)
+    assert frames == [2]
+    used = np.isfinite(views.right_sigma)
+    assert used.any()
+    assert (views.pixels[-1][used, 0] > 295).all()

@@ -1,0 +1,468 @@
+"""Resection: Eq. 4, 5, 7, 8; Jacobian; exact, noisy and contaminated data; covariance; degenerate cases by name."""
+
+import numpy as np
+import pytest
+from raising import raises
+from scipy.optimize import least_squares
+from scipy.stats import chi2
+
+from stages.core.errors import DegenerateError
+from stages.geometry.geometry import Camera, RigidTransform, angles_from_rotation, rotation_exp, rotation_from_angles
+from stages.odometry.resection.landmarks import Landmarks
+from stages.odometry.resection.pnp import (
+    Observations,
+    Poses,
+    back_projection,
+    derivatives,
+    levenberg_marquardt,
+    normal_matrix,
+    norms,
+)
+from stages.odometry.resection.resect import ResectParams, moving_tracks, resect, resect_segment
+
+CAMERA = Camera(600.0, 610.0, 300.0, 250.0, 600, 500)
+PARAMS = ResectParams()
+
+
+def scene(rng, n=60, near=4.0, far=12.0):
+    """Landmarks in the field of view of a pose near the identity (camera frame = local frame)."""
+    pixels = rng.uniform([20, 20], [580, 480], (n, 2))
+    return CAMERA.rays(pixels) * rng.uniform(near, far, (n, 1))
+
+
+def true_pose(rng):
+    return RigidTransform(rotation_exp(rng.normal(0, 0.05, 3)), rng.normal(0, 0.3, 3))
+
+
+def seen(T_local_left, landmarks):
+    return CAMERA.project(T_local_left.inverse().apply(landmarks))
+
+
+def solve(landmarks, pixels, *, per_pixel=None, sigma=0.0, params=PARAMS, seed=0):
+    """Resect from the identity; landmarks are exact unless told how they move with their disparity."""
+    per_pixel = np.zeros_like(landmarks) if per_pixel is None else per_pixel
+    known = Landmarks(landmarks, per_pixel, np.broadcast_to(sigma, len(landmarks)).astype(float), {})
+    start = RigidTransform.identity()
+    return resect(known, pixels, CAMERA, start, params, np.random.default_rng(seed), where="frame 7")
+
+
+def test_projection_is_eq_4_with_t_the_translation_and_the_position_minus_rt_t():
+    omega, phi, kappa = 0.1, -0.2, 0.3
+    R, t = rotation_from_angles(omega, phi, kappa), np.array([0.1, -0.2, 0.5])
+    T = CAMERA.matrix @ np.column_stack([R, t])  # Eq. 4
+    X = np.array([[0.3, 0.4, 6.0], [-1.0, 0.5, 5.0]])
+    h = np.column_stack([X, np.ones(2)]) @ T.T
+    by_eq_7_and_8 = h[:, :2] / h[:, 2:]
+    obs = Observations(X[None], np.zeros((1, 2, 3)), np.zeros((1, 2)), np.zeros((1, 2, 2)), CAMERA, 1.0, 0.1)
+    by_us = back_projection(obs, Poses.of(RigidTransform(R, t))).pixels[0]
+    np.testing.assert_allclose(by_us, by_eq_7_and_8, rtol=1e-12)
+    rng = np.random.default_rng(0)
+    landmarks = scene(rng)
+    h = np.column_stack([landmarks, np.ones(len(landmarks))]) @ T.T
+    found = solve(landmarks, h[:, :2] / h[:, 2:])
+    np.testing.assert_allclose(found.T_local_left.translation, -R.T @ t, atol=1e-9)
+    np.testing.assert_allclose(angles_from_rotation(found.T_local_left.rotation.T), (omega, phi, kappa), atol=1e-9)
+
+
+def test_jacobian_against_central_differences():
+    rng = np.random.default_rng(1)
+    landmarks = scene(rng, 5)
+    per_pixel = 0.1 * landmarks * rng.uniform(0.5, 2.0, (5, 1))
+    sigma = np.array([0.0, 0.1, 0.2, 0.3, 0.5])
+    T = true_pose(rng).inverse()
+    poses = Poses(T.rotation[None], T.translation[None], np.array([0.05]))
+    obs = Observations(landmarks[None], per_pixel[None], sigma[None], rng.uniform(0, 500, (1, 5, 2)), CAMERA, 0.3, 0.1)
+    errors = back_projection(obs, poses)
+    analytic = derivatives(obs, errors)[0]
+    h = 1e-6
+    along = errors.per_pixel[0] * sigma[:, None]
+    S = 0.3**2 * np.eye(2) + along[:, :, None] * along[:, None, :]
+    for k in range(7):
+        step = np.zeros((1, 7))
+        step[0, k] = h
+        numeric = (back_projection(obs, poses.moved(step)).pixels - back_projection(obs, poses.moved(-step)).pixels)[0]
+        for i in range(5):
+            values, vectors = np.linalg.eigh(S[i])
+            root = vectors / np.sqrt(values) @ vectors.T  # held fixed within a step, as in reweighted least squares
+            np.testing.assert_allclose(analytic[i, :, k], root @ numeric[i] / (2 * h), rtol=1e-5, atol=1e-4)
+
+
+def test_exact_data_give_the_exact_pose():
+    rng = np.random.default_rng(2)
+    for _ in range(5):
+        T, landmarks = true_pose(rng), scene(rng)
+        found = solve(landmarks, seen(T, landmarks))
+        np.testing.assert_allclose(found.T_local_left.matrix34, T.matrix34, atol=1e-9)
+        assert found.inlier.all()
+        assert found.residual.max() < 1e-6
+
+
+def test_large_motion_needs_no_good_start():
+    rng = np.random.default_rng(3)
+    T = RigidTransform(rotation_exp(np.array([0.1, 0.5, -0.2])), np.array([1.0, -0.5, 1.5]))
+    landmarks = T.apply(scene(rng))
+    pixels = seen(T, landmarks)
+    pixels[:18] = rng.uniform([0, 0], [600, 500], (18, 2))
+    found = solve(landmarks, pixels)
+    np.testing.assert_allclose(found.T_local_left.matrix34, T.matrix34, atol=1e-8)
+
+
+def test_thirty_percent_outliers_are_removed_and_no_more():
+    rng = np.random.default_rng(4)
+    T, landmarks = true_pose(rng), scene(rng, 200)
+    pixels = seen(T, landmarks) + 0.2 * rng.standard_normal((200, 2))
+    wrong = rng.permutation(200)[:60]
+    pixels[wrong] += rng.choice([-1, 1], (60, 2)) * rng.uniform(3, 40, (60, 2))
+    found = solve(landmarks, pixels)
+    good = np.ones(200, bool)
+    good[wrong] = False
+    np.testing.assert_array_equal(found.inlier, good)  # threshold: 5 sigma
+    error = found.T_local_left.translation - T.translation
+    assert error @ np.linalg.solve(found.total[:3, :3], error) < chi2.ppf(0.999, 3)
+
+
+def test_landmarks_just_over_the_threshold_go_one_by_one():
+    rng = np.random.default_rng(16)
+    T, landmarks = true_pose(rng), scene(rng, 80)
+    pixels = seen(T, landmarks) + 0.05 * rng.standard_normal((80, 2))
+    pixels[:16] += [1.4, 0.0]  # within reach of the robust start, and pulling all one way
+    found = solve(landmarks, pixels)
+    assert not found.inlier[:16].any()
+    assert found.inlier[16:].all()
+    assert found.residual[found.inlier].max() <= PARAMS.threshold
+
+
+def test_same_minimum_as_scipy():
+    rng = np.random.default_rng(5)
+    T, landmarks = true_pose(rng), scene(rng, 40)
+    pixels = seen(T, landmarks) + 0.2 * rng.standard_normal((40, 2))
+    # Threshold and Huber bound far away: plain least squares of Eq. 6 in both.
+    found = solve(landmarks, pixels, params=ResectParams(pixel_sigma=5.0, threshold=50.0))
+
+    def errors(x):
+        T_cam_local = RigidTransform(rotation_from_angles(*x[:3]), x[3:])
+        return (CAMERA.project(T_cam_local.apply(landmarks)) - pixels).ravel()
+
+    best = least_squares(errors, np.zeros(6), xtol=1e-14, ftol=1e-14, gtol=1e-14)
+    expected = RigidTransform(rotation_from_angles(*best.x[:3]), best.x[3:]).inverse()
+    np.testing.assert_allclose(found.T_local_left.matrix34, expected.matrix34, atol=1e-7)
+    factor = 2 * best.cost / (2 * 40 - 6)
+    J = best.jac
+    # The angles and (v, w) parametrise the same pose: the position's covariance is the same.
+    numeric = np.zeros((3, 6))
+    for k in range(6):
+        h = np.zeros(6)
+        h[k] = 1e-6
+        ends = [
+            RigidTransform(rotation_from_angles(*(best.x + s * h)[:3]), (best.x + s * h)[3:]).inverse().translation
+            for s in (1, -1)
+        ]
+        numeric[:, k] = (ends[0] - ends[1]) / 2e-6
+    np.testing.assert_allclose(
+        found.covariance[:3, :3], numeric @ np.linalg.inv(J.T @ J) @ numeric.T * factor, rtol=1e-3, atol=1e-12
+    )
+
+
+def stereo(landmarks, f_times_baseline):
+    """How landmarks move with their disparity: Z^2 / (f B) along the ray, per pixel."""
+    return landmarks * landmarks[:, 2:] / f_times_baseline
+
+
+def normalised_square(T, found):
+    turn = T.rotation @ found.T_local_left.rotation.T
+    w = 0.5 * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
+    x = np.concatenate([T.translation - found.T_local_left.translation, w])
+    return float(x @ np.linalg.solve(found.total, x))
+
+
+@pytest.mark.parametrize("bias_sigma", [0.0, 0.3])
+def test_covariance_is_calibrated(bias_sigma):
+    """Normalised squared error of 200 noisy resections: chi-square of 6 degrees of freedom each."""
+    rng = np.random.default_rng(6)
+    trials, total = 200, 0.0
+    params = ResectParams(pixel_sigma=0.3, threshold=2.0, hypotheses=20, bias_sigma=bias_sigma)
+    for trial in range(trials):
+        T, landmarks = true_pose(rng), scene(rng, 50)
+        per_pixel = stereo(landmarks, 400.0)  # depths good to 1 % a pixel: first-order theory holds
+        pixels = seen(T, landmarks) + 0.3 * rng.standard_normal((50, 2))
+        wrong = landmarks + per_pixel * (0.2 * rng.standard_normal((50, 1)) + bias_sigma * rng.standard_normal())
+        total += normalised_square(T, solve(wrong, pixels, per_pixel=per_pixel, sigma=0.2, params=params, seed=trial))
+    # Huber's weights cost 2 %, and a variance factor below 1 (it has 94 degrees of freedom: 1 +- 0.15) is not believed:
+    # -6 %.
+    low, high = chi2.ppf([0.001, 0.999], 6 * trials)
+    assert low < total / 0.96 < high
+
+
+def test_an_error_that_all_disparities_share_is_found():
+    rng = np.random.default_rng(14)
+    T = RigidTransform(np.eye(3), np.array([0.0, 0.0, 2.0]))
+    landmarks = scene(rng, 150, near=5.0, far=30.0)
+    per_pixel = stereo(landmarks, 300.0)
+    pixels = seen(T, landmarks) + 0.05 * rng.standard_normal((150, 2))
+    wrong = landmarks + 0.2 * per_pixel  # all disparities 0.2 pixel short
+    held = solve(wrong, pixels, per_pixel=per_pixel, sigma=0.05, params=ResectParams(bias_sigma=0.0))
+    free = solve(wrong, pixels, per_pixel=per_pixel, sigma=0.05, params=ResectParams(bias_sigma=0.3))
+    assert free.bias == pytest.approx(-0.2, abs=0.03)
+    assert held.bias == pytest.approx(0.0, abs=1e-4)
+    error = [np.linalg.norm(f.T_local_left.translation - T.translation) for f in (free, held)]
+    assert error[0] < 0.3 * error[1]
+
+
+def test_without_motion_the_bias_stays_at_its_prior():
+    rng = np.random.default_rng(15)
+    landmarks = scene(rng, 100)
+    pixels = seen(RigidTransform.identity(), landmarks) + 0.2 * rng.standard_normal((100, 2))
+    found = solve(landmarks, pixels, per_pixel=stereo(landmarks, 100.0), sigma=0.2)
+    assert abs(found.bias) < 0.05
+    assert np.linalg.norm(found.T_local_left.translation) < 4 * np.sqrt(np.trace(found.total[:3, :3]))
+
+
+def test_uncertain_landmarks_count_less():
+    rng = np.random.default_rng(7)
+    T, landmarks = RigidTransform(np.eye(3), np.array([0.0, 0.0, 1.0])), scene(rng, 100)
+    sigma = np.where(np.arange(100) < 50, 5.0, 0.1)
+    per_pixel = 0.01 * landmarks
+    noisy = landmarks + per_pixel * (sigma * rng.standard_normal(100))[:, None]
+    pixels = seen(T, landmarks)
+    weighted = solve(noisy, pixels, per_pixel=per_pixel, sigma=sigma)
+    plain = solve(noisy, pixels, params=ResectParams(threshold=100.0))
+    assert np.linalg.norm(weighted.T_local_left.translation - T.translation) < 0.3 * np.linalg.norm(
+        plain.T_local_left.translation - T.translation
+    )
+
+
+def test_same_seed_same_bits():
+    rng = np.random.default_rng(8)
+    T, landmarks = true_pose(rng), scene(rng)
+    pixels = seen(T, landmarks) + 0.3 * rng.standard_normal((60, 2))
+    a, b = solve(landmarks, pixels), solve(landmarks, pixels)
+    assert a.T_local_left.to_list() == b.T_local_left.to_list()
+    np.testing.assert_array_equal(a.covariance, b.covariance)
+
+
+def test_too_few_landmarks_are_named_with_frame_and_remedy():
+    rng = np.random.default_rng(9)
+    landmarks = scene(rng, 5)
+    with raises("RIL-421", "frame 7", "track.points"):
+        solve(landmarks, seen(RigidTransform.identity(), landmarks))
+
+
+def test_no_common_pose_is_named():
+    rng = np.random.default_rng(10)
+    landmarks = scene(rng, 12)
+    with raises("RIL-421", "frame 7"):
+        solve(landmarks, rng.uniform([0, 0], [600, 500], (12, 2)))
+
+
+def test_collinear_landmarks_are_named():
+    landmarks = np.linspace([-2.0, -1.0, 5.0], [2.0, 1.5, 9.0], 30)
+    with raises("RIL-422", "frame 7"):
+        solve(landmarks, seen(RigidTransform.identity(), landmarks))
+
+
+def test_landmarks_too_far_for_a_position_are_named():
+    rng = np.random.default_rng(11)
+    landmarks = CAMERA.rays(rng.uniform([298, 248], [302, 252], (40, 2))) * rng.uniform(1000, 1002, (40, 1))
+    pixels = seen(RigidTransform.identity(), landmarks) + 0.2 * rng.standard_normal((40, 2))
+    with raises("RIL-420", "frame 7"):
+        solve(landmarks, pixels)
+
+
+def test_a_landmark_behind_the_camera_is_no_inlier():
+    rng = np.random.default_rng(12)
+    landmarks = scene(rng, 40)
+    pixels = seen(RigidTransform.identity(), landmarks)
+    landmarks[0] = -landmarks[0]
+    found = solve(landmarks, pixels)
+    assert not found.inlier[0]
+    assert found.inlier[1:].all()
+    assert np.isnan(found.residual[0])
+
+
+def test_segment_keeps_the_key_pose_and_poses_each_frame():
+    rng = np.random.default_rng(13)
+    key = RigidTransform(rotation_exp(np.array([-1.8, 0.1, 0.0])), np.zeros(3))
+    steps = [
+        RigidTransform(rotation_exp(np.array([0, 0.02 * i, 0])), np.array([0.02 * i, 0, 0.3 * i])) for i in range(4)
+    ]
+    truth = [key @ s for s in steps]
+    landmarks = key.apply(scene(rng, 80))
+    points = np.stack([seen(T, landmarks) for T in truth], 1).astype(np.float32)
+    points[:30, 2] = np.nan  # lost
+    position = landmarks.copy()
+    position[75:] = np.nan  # without coordinates
+    known = Landmarks(position, np.zeros_like(position), np.zeros(80), {"too far": 3})
+    found = resect_segment(points, known, CAMERA, key, [4, 5, 6, 7], PARAMS)
+    np.testing.assert_array_equal(found.poses[0], key.matrix34)
+    np.testing.assert_allclose(found.poses, [T.matrix34 for T in truth], atol=1e-5)  # float32 pixels: 3e-5 px
+    assert not found.covariance[0].any()
+    assert found.inlier.sum(0).tolist() == [75, 75, 45, 75]
+    assert [f["landmarks"] for f in found.facts] == [75, 75, 45, 75]
+    points[:, 3] = np.nan
+
+
+def test_a_frame_that_cannot_be_posed_is_lost_and_the_next_one_is_posed():
+    rng = np.random.default_rng(17)
+    steps = [RigidTransform(rotation_exp([0, 0.02 * i, 0]), np.array([0.02 * i, 0, 0.3 * i])) for i in range(4)]
+    landmarks = scene(rng, 80)
+    points = np.stack([seen(T, landmarks) for T in steps], 1).astype(np.float32)
+    points[:, 1] = np.nan  # nothing found
+    points[:, 2] = rng.uniform([0, 0], [600, 500], (80, 2))  # nothing but chance
+    known = Landmarks(landmarks, np.zeros_like(landmarks), np.zeros(80), {"too far": 3})
+    found = resect_segment(points, known, CAMERA, steps[0], [4, 5, 6, 7], PARAMS)
+    assert np.isnan(found.poses[1:3]).all()
+    assert np.isnan(found.covariance[1:3]).all()
+    assert "too few landmarks: 0 of 80 tracked points" in found.facts[1]["lost"]
+    assert "3 too far" in found.facts[1]["lost"]
+    assert "agree with one pose" in found.facts[2]["lost"]
+    assert not found.inlier[:, 1:3].any()
+    assert "lost" not in found.facts[3]
+    np.testing.assert_allclose(found.poses[3], steps[3].matrix34, atol=1e-5)
+
+
+def test_solver_stands_still_on_singular_data():
+    """One landmark seen many times: the damping keeps the step finite."""
+    one = np.tile([[[0.0, 0.0, 5.0]]], (1, 8, 1))
+    obs = Observations(one, 0.1 * one, np.zeros((1, 8)), np.full((1, 8, 2), 300.0), CAMERA, 1.0, 0.1)
+    poses, _ = levenberg_marquardt(obs, Poses.of(RigidTransform.identity()), np.ones((1, 8), bool), 20)
+    assert np.isfinite(poses.t).all()
+    assert np.abs(poses.t).max() < 5.0
+
+
+def test_dead_reckoning_finds_a_pose_that_the_last_one_does_not():
+    """The camera has turned about: from the last pose all landmarks lie behind the image."""
+    rng = np.random.default_rng(14)
+    truth = RigidTransform(rotation_exp([0.0, 2.9, 0.0]), np.array([0.2, -0.1, 0.3]))
+    landmarks = truth.apply(scene(rng, 80))
+    pixels = seen(truth, landmarks)
+    pixels[:16] += rng.uniform(-60, 60, (16, 2))
+    reckoned = truth @ RigidTransform(rotation_exp([0.05, -0.05, 0.05]), np.array([0.1, 0.1, -0.1]))
+    known = Landmarks(landmarks, np.zeros_like(landmarks), np.zeros(80), {})
+
+    def from_identity(**kw):
+        start = RigidTransform.identity()
+        return resect(known, pixels, CAMERA, start, PARAMS, np.random.default_rng(0), where="frame 7", **kw)
+
+    with raises("RIL-421", "frame 7"):
+        from_identity()
+    found = from_identity(reckoned=reckoned)
+    np.testing.assert_allclose(found.T_local_left.matrix34, truth.matrix34, atol=1e-6)
+    assert not found.inlier[:16].any()
+
+
+def test_wrong_dead_reckoning_does_no_harm():
+    rng = np.random.default_rng(15)
+    truth = true_pose(rng)
+    landmarks = scene(rng)
+    pixels = seen(truth, landmarks) + rng.normal(0, 0.2, (60, 2))
+    known = Landmarks(landmarks, np.zeros_like(landmarks), np.zeros(60), {})
+    astray = RigidTransform(rotation_exp([0.0, 1.5, 0.0]), np.array([3.0, 2.0, -4.0]))
+    plain, misled = (
+        resect(known, pixels, CAMERA, RigidTransform.identity(), PARAMS, np.random.default_rng(0), reckoned=r)
+        for r in (None, astray)
+    )
+    np.testing.assert_allclose(misled.T_local_left.matrix34, plain.T_local_left.matrix34, atol=1e-9)
+    np.testing.assert_array_equal(misled.inlier, plain.inlier)
+
+
+def test_a_segment_takes_predictions_relative_to_its_key_frame():
+    rng = np.random.default_rng(16)
+    key = RigidTransform(rotation_exp([0.2, 2.5, 0.1]), np.array([1.0, 2.0, 3.0]))
+    about = RigidTransform(rotation_exp([0.0, 2.9, 0.0]), np.array([0.1, 0.0, 0.2]))
+    near = RigidTransform(rotation_exp([0.0, 0.02, 0.0]), np.array([0.0, 0.0, 0.1]))
+    steps = [RigidTransform.identity(), near, about]
+    groups = [(key @ step).apply(scene(rng, 40)) for step in (near, about)]  # what each way of looking shows
+    landmarks = np.concatenate(groups)
+    points = np.full((80, 3, 2), np.nan, np.float32)
+    points[:, 0] = 100.0
+    points[:40, 1], points[40:, 2] = seen(key @ near, groups[0]), seen(key @ about, groups[1])
+    known = Landmarks(landmarks, np.zeros_like(landmarks), np.zeros(80), {})
+    assert resect_segment(points, known, CAMERA, key, [0, 1, 2], PARAMS).facts[2]["lost"]
+    found = resect_segment(points, known, CAMERA, key, [0, 1, 2], PARAMS, [None, None, about])
+    np.testing.assert_allclose(found.poses, [(key @ step).matrix34 for step in steps], atol=1e-5)
+
+
+def test_compiled_errors_are_those_of_the_arrays():
+    rng = np.random.default_rng(12)
+    n = 30
+    landmarks = rng.uniform([-2, -2, 2], [2, 2, 9], (n, 3))
+    landmarks[0, 2] = -1.0  # behind
+    obs = Observations(
+        landmarks[None],
+        rng.normal(0, 0.1, (1, n, 3)),
+        np.where(np.arange(n) % 3 == 0, 0.0, rng.uniform(0.1, 1.0, n))[None],
+        rng.uniform(0, 400, (1, n, 2)),
+        Camera(300.0, 310.0, 200.0, 150.0, 400, 300),
+        0.2,
+        0.1,
+    )
+    steps = np.concatenate([np.zeros((1, 7)), rng.normal(0, 0.05, (4, 7))])
+    one = Poses.of(RigidTransform.identity())
+    poses = Poses(*(np.repeat(a, 5, axis=0) for a in (one.R, one.t, one.bias))).moved(steps)
+    np.testing.assert_allclose(norms(obs, poses), back_projection(obs, poses).norm, rtol=1e-9)
+    # Newton's step of the arrays' normal equations is what one undamped compiled step does.
+    active = np.arange(n)[None] > 0
+    normal, gradient, _ = normal_matrix(obs, back_projection(obs, one), active)
+    normal[:, 6, 6] += obs.prior
+    expected = -np.linalg.solve(normal[0] + 1e-4 * np.diag(np.diag(normal[0])), gradient[0])
+    moved, done = levenberg_marquardt(obs, one, active, 1)
+    by_arrays = one.moved(expected[None])
+    assert done == 1
+    np.testing.assert_allclose(moved.t, by_arrays.t, rtol=1e-6)
+    np.testing.assert_allclose(moved.R, by_arrays.R, atol=1e-9)
+    np.testing.assert_allclose(moved.bias, by_arrays.bias, rtol=1e-6)
+
+
+def test_errors_smaller_than_stated_leave_what_residuals_do_not_show_to_the_shared_part():
+    rng = np.random.default_rng(21)
+    params = ResectParams(pixel_sigma=0.4, threshold=2.0, hypotheses=20, bias_sigma=0.0)
+    T, landmarks = true_pose(rng), scene(rng, 400)
+    pixels = seen(T, landmarks) + 0.2 * rng.standard_normal((400, 2))
+    found = solve(landmarks, pixels, params=params)
+    own, shared = found.covariance, found.shared @ found.shared.T
+    # a quarter of the stated variance is seen; the rest, three times as much, is not
+    np.testing.assert_allclose(np.diag(shared), 3 * np.diag(own), rtol=0.3)
+    assert normalised_square(T, found) < chi2.ppf(0.999, 6)
+
+
+def test_what_moves_by_itself_is_counted():
+    """Twelve of eighty landmarks are carried along with the camera; five are lost behind the key frame."""
+    rng = np.random.default_rng(22)
+    steps = [RigidTransform(rotation_exp([0, 0.01 * i, 0]), np.array([0.0, 0, 0.3 * i])) for i in range(4)]
+    landmarks = scene(rng, 80)
+    points = np.stack([seen(T, landmarks) for T in steps], 1).astype(np.float32)
+    points[:12] = points[:12, :1]
+    points[75:, 1:] = np.nan
+    known = Landmarks(landmarks, np.zeros_like(landmarks), np.zeros(80), {})
+    found = resect_segment(points, known, CAMERA, steps[0], [0, 1, 2, 3], PARAMS)
+    assert moving_tracks(points, known, found) == (75, 12)
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize(("right", "n"), [(0, 17), (0, 23), (0, 60), (20, 40)])
+def test_a_pose_by_chance_is_refused_and_a_right_one_is_not(right, n, seed):
+    rng = np.random.default_rng([seed, right, n])
+    landmarks, pose = scene(rng, n), true_pose(rng)
+    pixels = seen(pose, landmarks) + rng.normal(0, 0.2, (n, 2))
+    pixels[right:] = seen(RigidTransform.identity(), landmarks[right:]) + rng.uniform(-4, 4, (n - right, 2))
+    params = ResectParams(min_share=0.0, max_position_ratio=10.0)
+    if right:
+        found = solve(landmarks, pixels, params=params, seed=seed)
+        np.testing.assert_allclose(found.T_local_left.translation, pose.translation, atol=0.1)
+        return
+    with pytest.raises(DegenerateError) as caught:
+        solve(landmarks, pixels, params=params, seed=seed)
+    assert caught.value.code in ("RIL-720", "RIL-421")  # as many as by chance, or fewer than a pose needs
+
+
+def test_a_landmark_that_the_camera_has_nearly_reached_agrees_with_nothing():
+    """Its error along the old ray is of any size in the new image: it would agree thousands of pixels off."""
+    rng = np.random.default_rng(4)
+    landmarks, pose = scene(rng), RigidTransform(np.eye(3), np.array([0.0, 0.0, 3.5]))
+    landmarks[0] = [0.3, 0.2, 3.502]  # 2 mm before the camera's plane
+    pixels = seen(pose, landmarks)
+    pixels[0] = seen(pose, 1.02 * landmarks[:1])[0]  # as its disparity's error of a sigma has it
+    found = solve(landmarks, pixels, per_pixel=0.1 * landmarks, sigma=0.2)
+    assert not found.inlier[0]
+    assert found.residual[found.inlier].max() < 1e-3
+    np.testing.assert_allclose(found.T_local_left.translation, pose.translation, atol=1e-6)

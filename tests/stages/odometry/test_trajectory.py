@@ -1,0 +1,212 @@
+"""The scan over segments against composing by hand, with tilted local frames; covariance against sampling."""
+
+import numpy as np
+from raising import raises
+
+from stages.core.declare import Bundle, NoParams, check_outputs
+from stages.geometry.geometry import RigidTransform, rotation_exp
+from stages.odometry.resection.trajectory import STAGE, chain
+
+NONE = np.zeros((9, 6, 2))
+"""Nothing is shared."""
+
+
+def pose(rng, scale=1.0):
+    return RigidTransform(rotation_exp(rng.normal(0, 0.4, 3)), scale * rng.normal(0, 1, 3))
+
+
+def level(rng):
+    """T_local_left: a rotation only, another tilt for every pair."""
+    return RigidTransform(rotation_exp(rng.normal([-1.9, 0, 0], 0.3)), np.zeros(3))
+
+
+def test_scan_equals_composition_by_hand_whatever_the_tilt_of_the_local_frames():
+    rng = np.random.default_rng(5)
+    truth = [pose(rng, 3.0) for _ in range(8)]  # T_any_left of eight frames
+    cuts = [(0, 3), (3, 6), (6, 7)]  # an open last segment
+    levels = [level(rng) for _ in cuts]
+    segments = []
+    for (a, b), T_local_key in zip(cuts, levels, strict=True):
+        local = [T_local_key @ truth[a].inverse() @ truth[i] for i in range(a, b + 1)]
+        segments.append((np.array([T.matrix34 for T in local]), np.zeros((b - a + 1, 6, 6)), NONE[: b - a + 1]))
+    found = chain(segments, levels)
+    poses, covariance, segment = found.poses, found.covariance, found.segment
+    assert not found.piece.any()
+    expected = [levels[0] @ truth[0].inverse() @ T for T in truth]
+    np.testing.assert_allclose(poses, [T.matrix34 for T in expected], atol=1e-12)
+    assert segment.tolist() == [0, 0, 0, 0, 1, 1, 1, 2]
+    assert not covariance.any()
+    np.testing.assert_array_equal(poses[0], levels[0].matrix34)
+
+
+def test_a_segment_of_another_local_frame_is_refused():
+    rng = np.random.default_rng(6)
+    T = level(rng)
+    with raises("RIL-451", "segment 0"):
+        chain([(np.array([level(rng).matrix34, pose(rng).matrix34]), np.zeros((2, 6, 6)), NONE[:2])], [T])
+    with raises("RIL-450"):
+        chain([], [])
+
+
+def test_one_pair_alone_stands_at_its_own_level():
+    T = level(np.random.default_rng(8))
+    found = chain([], [T])
+    np.testing.assert_array_equal(found.poses, [T.matrix34])
+    assert found.covariance.shape == (1, 6, 6)
+    assert found.segment.tolist() == found.piece.tolist() == [0]
+
+
+def test_covariance_is_that_of_sampled_trajectories():
+    rng = np.random.default_rng(7)
+    levels = [level(rng) for _ in range(3)]
+    local = [np.array([T.matrix34, (T @ pose(rng, 0.5)).matrix34]) for T in levels]
+    spread = np.diag([2e-3, 1e-3, 3e-3, 1e-3, 2e-3, 5e-4]) ** 2
+    covs = [np.array([np.zeros((6, 6)), spread])] * 3
+    found = chain([(p, c, NONE[:2]) for p, c in zip(local, covs, strict=True)], levels)
+    mean, covariance = found.poses, found.covariance
+    samples = []
+    for _ in range(1500):
+        noisy = []
+        for poses in local:
+            d = np.sqrt(np.diag(spread)) * rng.standard_normal(6)
+            T = RigidTransform(rotation_exp(d[3:]) @ poses[1][:, :3], poses[1][:, 3] + d[:3])
+            noisy.append((np.array([poses[0], T.matrix34]), covs[0], NONE[:2]))
+        end = chain(noisy, levels).poses[-1]
+        turn = end[:, :3] @ mean[-1][:, :3].T
+        w = 0.5 * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
+        samples.append(np.concatenate([end[:, 3] - mean[-1][:, 3], w]))
+    measured = np.cov(np.array(samples).T)
+    scale = np.sqrt(np.outer(np.diag(covariance[-1]), np.diag(covariance[-1])))
+    # The standard error of a correlation from 1500 samples is 0.026, of a variance 0.037.
+    np.testing.assert_allclose(measured / scale, covariance[-1] / scale, atol=0.13)
+
+
+def broken_run(lost_rows, frames=8, cuts=((0, 3), (3, 6), (6, 7))):
+    """True poses of eight frames in three segments of which some frames are lost; and what the stage makes of them."""
+    rng = np.random.default_rng(9)
+    truth = [pose(rng, 3.0) for _ in range(frames)]
+    levels = [level(rng) for _ in cuts]
+    segments = []
+    for (a, b), T_local_key in zip(cuts, levels, strict=True):
+        local = np.array([(T_local_key @ truth[a].inverse() @ truth[i]).matrix34 for i in range(a, b + 1)])
+        facts = [{"frame": i, "inliers": 9} for i in range(a, b + 1)]
+        for i in range(a + 1, b + 1):
+            if i in lost_rows:
+                local[i - a], facts[i - a] = np.nan, {"frame": i, "inliers": 0, "lost": "too few landmarks"}
+        arrays = {"poses": local, "covariance": np.zeros((b - a + 1, 6, 6)), "shared": NONE[: b - a + 1]}
+        segments.append(Bundle(arrays, {"per_frame": facts}))
+    inputs = {"segments": segments, "levels": [Bundle({}, {"T_local_left": T.to_list()}) for T in levels]}
+    out = STAGE.run(NoParams(), {"frames": list(range(frames))}, inputs)
+    check_outputs(STAGE, out)
+    return truth, levels, out
+
+
+def test_a_frame_lost_within_a_segment_is_bridged():
+    truth, levels, out = broken_run({4})
+    assert out["piece"].tolist() == [0, 0, 0, 0, -1, 0, 0, 0]
+    assert out.meta["lost"] == [{"frame": 4, "cause": "too few landmarks", "bridged": [3, 5]}]
+    assert out.meta["warnings"] == ["frame 4 lost: too few landmarks; bridged from 3 to 5"]
+    T = levels[0] @ truth[0].inverse()
+    there = [k for k in range(8) if k != 4]
+    np.testing.assert_allclose(out["poses"][there], [(T @ truth[k]).matrix34 for k in there], atol=1e-12)
+    assert np.isnan(out["poses"][4]).all()
+
+
+def test_a_lost_key_frame_breaks_the_trajectory_into_named_pieces():
+    truth, levels, out = broken_run({3})
+    assert out["piece"].tolist() == [0, 0, 0, 1, 1, 1, 1, 1]
+    assert out.meta["pieces"] == [[0, 2], [3, 7]]
+    assert out.meta["main"] == 1
+    assert "piece 1: frames 0-2, piece 2: frames 3-7" in out.meta["warnings"][-1]
+    T = levels[1] @ truth[3].inverse()
+    np.testing.assert_allclose(out["poses"][3:], [(T @ truth[k]).matrix34 for k in range(3, 8)], atol=1e-12)
+    assert not out["covariance"][3].any()
+
+
+def test_a_frame_that_is_a_piece_alone_is_lost():
+    _, _, out = broken_run({1, 2, 3, 7})
+    assert out["piece"].tolist() == [-1, -1, -1, 0, 0, 0, 0, -1]
+    assert out.meta["pieces"] == [[3, 6]]
+    assert [f["frame"] for f in out.meta["lost"]] == [0, 1, 2, 7]
+    assert all(f["bridged"] is None for f in out.meta["lost"])
+    _, _, nothing = broken_run({1, 2, 3, 4, 5, 6, 7})
+    assert nothing["piece"].tolist() == [0] + [-1] * 7
+
+
+def test_what_segments_share_adds_up_and_what_they_do_not_adds_squared():
+    """Four equal segments straight ahead, one frame each: one kind of error along the way, 2 mm shared, 3 mm not."""
+    step = np.hstack([np.eye(3), [[0.0], [0.0], [1.0]]])
+    start = np.hstack([np.eye(3), np.zeros((3, 1))])
+    shared = np.zeros((2, 6, 1))
+    shared[1, 2, 0] = 2e-3
+    own = np.zeros((2, 6, 6))
+    own[1, 2, 2] = 3e-3**2
+    one = (np.array([start, step]), own + shared @ np.swapaxes(shared, 1, 2), shared)
+    found = chain([one] * 4, [RigidTransform.identity()] * 4)
+    np.testing.assert_allclose(found.covariance[:, 2, 2], [k * 3e-3**2 + (k * 2e-3) ** 2 for k in range(5)], atol=1e-15)
+
+
+def test_refined_poses_and_their_covariances_take_the_place_of_resected_ones():
+    truth, levels, _ = broken_run(set())
+    segments, better = [], []
+    for (a, b), T_local_key in zip(((0, 3), (3, 6), (6, 7)), levels, strict=True):
+        local = np.array([(T_local_key @ truth[a].inverse() @ truth[i]).matrix34 for i in range(a, b + 1)])
+        better.append(local)
+        rough = local.copy()
+        rough[1:, :, 3] += 0.01
+        n = b - a + 1
+        arrays = {"poses": rough, "covariance": np.zeros((n, 6, 6)), "shared": NONE[:n]}
+        segments.append(Bundle(arrays, {"per_frame": [{"frame": i, "inliers": 9} for i in range(a, b + 1)]}))
+    inputs = {"segments": segments, "levels": [Bundle({}, {"T_local_left": T.to_list()}) for T in levels]}
+    rows, claimed = sum(len(local) for local in better), np.diag([1e-6] * 3 + [1e-8] * 3)
+    inputs["refined"] = Bundle(
+        {
+            "poses": np.concatenate(better),
+            "covariance": np.tile(claimed, (rows, 1, 1)),
+            "shared": np.zeros((rows, 6, 2)),
+        },
+        {},
+    )
+    out = STAGE.run(NoParams(), {"frames": list(range(8))}, inputs)
+    # Of a frame of the first segment it is what was claimed, in the world: both parts are the same about all axes.
+    np.testing.assert_allclose(out["covariance"][1], claimed, atol=1e-18)
+    assert np.trace(out["covariance"][7][:3, :3]) > 2 * np.trace(claimed[:3, :3])
+    expected = [(levels[0] @ truth[0].inverse() @ T).matrix34 for T in truth]
+    np.testing.assert_allclose(out["poses"], expected, atol=1e-12)
+
+
+def resected(frames, poses):
+    count = len(frames)
+    arrays = {"poses": np.array([T.matrix34 for T in poses]), "covariance": np.zeros((count, 6, 6))}
+    facts = [{"frame": f, "inliers": 9} for f in frames]
+    return Bundle(arrays | {"shared": np.zeros((count, 6, 2))}, {"per_frame": facts})
+
+
+def test_the_vertical_of_a_later_pair_is_carried_back_where_the_first_has_none():
+    rng = np.random.default_rng(11)
+    true = [pose(rng) for _ in range(5)]  # T_true_left; true z is up
+    unlevelled = RigidTransform(np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]), np.zeros(3))
+    up = true[2].rotation.T[:, 2]
+    along = np.array([0.0, 0.0, 1.0]) - up * up[2]
+    along /= np.linalg.norm(along)
+    level_2 = RigidTransform(np.array([np.cross(along, up), along, up]), np.zeros(3))
+    levels = [Bundle({}, {"T_local_left": T.to_list(), "source": s}) for T, s in ((unlevelled, "none"), (level_2, "x"))]
+    segments = [
+        resected(part, [T @ true[part[0]].inverse() @ true[i] for i in part])
+        for part, T in (([0, 1, 2], unlevelled), ([2, 3, 4], level_2))
+    ]
+    frames = {"frames": [0, 1, 2, 3, 4]}
+    found = STAGE.run(NoParams(), frames, {"segments": segments, "levels": levels})
+    assert found.meta["verticals"] == ["x"]
+    assert not found.meta["warnings"]
+    for got, T in zip(np.asarray(found["poses"]), true, strict=True):
+        np.testing.assert_allclose(got[2, :3], T.rotation[2], atol=1e-9)  # z is up
+        np.testing.assert_allclose(got[2, 3], T.translation[2] - true[0].translation[2], atol=1e-9)
+    axis = np.asarray(found["poses"])[0, :, 2]
+    assert abs(axis[0]) < 1e-9 < axis[1]  # y is the first camera's axis, levelled
+
+    levels[1].meta["source"] = "none"
+    blind = STAGE.run(NoParams(), frames, {"segments": segments, "levels": levels})
+    assert blind.meta["verticals"] == ["none"]
+    assert "nothing tells of the vertical at frames 0-4" in blind.meta["warnings"][0]
+    np.testing.assert_array_equal(np.asarray(blind["poses"])[0], unlevelled.matrix34)

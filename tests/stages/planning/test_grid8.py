@@ -1,0 +1,90 @@
+"""Path in any direction: costs equal networkx and scipy, paths are as cheap as their costs, ties are stable."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import networkx as nx
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import dijkstra
+
+from stages.planning.grid8 import NEIGHBOURS, cost_to_go, parts, trace
+from stages.planning.row_graph import UNREACHED
+
+UNIT = 5
+
+
+def edges(height: np.ndarray, ways: np.ndarray, toll: np.ndarray) -> list[tuple[tuple[int, int], tuple[int, int], int]]:
+    """Every step that both its ends allow: length 5, or 7 on a diagonal, plus the climb or descent and the toll."""
+    rows, cols = height.shape
+    return [
+        (
+            (r, c),
+            (r + dr, c + dc),
+            (UNIT if 0 in (dr, dc) else 7)
+            + abs(int(height[r, c] - height[r + dr, c + dc]))
+            + int(toll[r + dr, c + dc]),
+        )
+        for r in range(rows)
+        for c in range(cols)
+        for dr, dc, way in NEIGHBOURS
+        if 0 <= r + dr < rows and 0 <= c + dc < cols and ways[r, c] & ways[r + dr, c + dc] & way
+    ]
+
+
+@settings(max_examples=40, deadline=None)
+@given(seed=st.integers(0, 9999), rows=st.integers(1, 11), cols=st.integers(1, 11), blocked=st.floats(0.0, 0.6))
+def test_costs_equal_networkx_and_scipy(seed: int, rows: int, cols: int, blocked: float) -> None:
+    rng = np.random.default_rng(seed)
+    height, toll = rng.integers(0, 9, (rows, cols)), rng.integers(0, 3, (rows, cols))
+    ways = np.where(rng.random((rows, cols)) < blocked, 0, rng.integers(1, 16, (rows, cols))).astype(np.uint8)
+    target = int(rng.integers(rows)), int(rng.integers(cols))
+    cost, step = cost_to_go(height, ways, target, None, UNIT, toll)
+    graph = nx.DiGraph()
+    graph.add_node(target)
+    listed = edges(height, ways, toll)
+    graph.add_weighted_edges_from((b, a, w) for a, b, w in listed)  # to the target
+    expected = nx.single_source_dijkstra_path_length(graph, target)
+    reached = {(int(r), int(c)): int(cost[r, c]) for r, c in np.argwhere(cost < UNREACHED)}
+    assert reached == expected
+    if listed:
+        i, j, w = zip(*((b[0] * cols + b[1], a[0] * cols + a[1], w) for a, b, w in listed), strict=True)
+        distance = dijkstra(csr_matrix((w, (i, j)), shape=(rows * cols,) * 2), indices=target[0] * cols + target[1])
+        np.testing.assert_array_equal(np.where(cost < UNREACHED, cost, np.inf).ravel(), distance)
+    weight = {(a, b): w for a, b, w in listed}
+    for start in reached:
+        cells = [tuple(int(v) for v in cell) for cell in trace(step, start)]
+        assert cells[-1] == target
+        assert sum(weight[a, b] for a, b in pairwise(cells)) == cost[start]
+
+
+def test_the_search_ends_at_the_start_and_its_cost_is_the_same() -> None:
+    rng = np.random.default_rng(2)
+    height, toll = rng.integers(0, 9, (60, 70)), np.zeros((60, 70), dtype=np.int64)
+    ways = np.full((60, 70), 15, dtype=np.uint8)
+    whole, _ = cost_to_go(height, ways, (50, 60), None, UNIT, toll)
+    part, step = cost_to_go(height, ways, (50, 60), (48, 55), UNIT, toll)
+    assert part[48, 55] == whole[48, 55]
+    assert (part == UNREACHED).sum() > 1000
+    assert len(trace(step, (48, 55))) >= 6
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 9999), rows=st.integers(1, 11), cols=st.integers(1, 11))
+def test_connected_parts_equal_networkx(seed: int, rows: int, cols: int) -> None:
+    rng = np.random.default_rng(seed)
+    ways = np.where(rng.random((rows, cols)) < 0.5, 0, rng.integers(1, 16, (rows, cols))).astype(np.uint8)
+    nothing = np.zeros((rows, cols), dtype=np.int64)
+    graph = nx.Graph()
+    graph.add_nodes_from((int(r), int(c)) for r, c in np.argwhere(ways > 0))
+    graph.add_edges_from((a, b) for a, b, _ in edges(nothing, ways, nothing))
+    number, spans = parts(ways)
+    assert (number >= 0).sum() == graph.number_of_nodes()
+    expected = sorted(nx.connected_components(graph), key=min)
+    assert len(spans) == len(expected)
+    for k, cells in enumerate(expected):
+        assert {(int(r), int(c)) for r, c in np.argwhere(number == k)} == cells
+        assert spans[k].tolist() == [min(cells)[0], max(r for r, _ in cells)]

@@ -1,0 +1,80 @@
+"""Where a vehicle looks: what comes into view from there, by its cameras, and was not in view before."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from leg_scenes import CAMERAS, GOAL, LATTICE, ROVER, START, P, X, Y, ground
+
+from stages.hazard.risk import HAZARDOUS, UNKNOWN
+from stages.planning.local_planner.ground import Ground
+from stages.planning.local_planner.look import SIDE, STEP, Target, free_back
+from stages.planning.local_planner.route import Piece, first_metres, length_of
+
+FREE = Ground(ground(), START, 0.0, P)
+BOUND = math.radians(P.max_turn_deg)
+
+
+def target(points: list[tuple[float, float]], before: list[tuple[float, float]] | None = None) -> Target:
+    return Target(FREE, CAMERAS, np.array(points), True, before or [])
+
+
+@pytest.mark.parametrize("side", [-0.15, 0.0, 0.2, 0.35])
+def test_it_turns_no_more_than_it_must(side: float) -> None:
+    aim = target([(side, 0.3)])
+    turn = aim.turn(START, 0.0, BOUND, BOUND)
+    assert turn is not None
+    assert CAMERAS.sees(aim.points, (*START, turn)).all()
+    if turn != 0.0:
+        assert math.copysign(1.0, turn) == math.copysign(1.0, -side)
+        assert not CAMERAS.sees(aim.points, (*START, turn - math.copysign(STEP, turn))).any()
+    assert aim.turn(START, 0.0, 0.0, 0.0) == (0.0 if turn == 0.0 else None)
+
+
+def test_a_leg_is_driven_as_far_as_the_target_stays_in_view() -> None:
+    leg = [Piece(START, (0.0, 0.1), 0.0, 1), Piece((0.0, 0.1), (0.0, 0.4), 0.0, 1)]
+    for points in ([(0.0, 0.35)], [(0.1, 0.3), (0.12, 0.3)]):
+        seen = target(points).last_view(leg, BOUND)
+        assert seen is not None
+        y = first_metres(leg, seen[0])[-1].b[1]
+        assert CAMERAS.sees(np.array(points), (0.0, y, seen[1])).all()
+        beyond = [CAMERAS.sees(np.array(points), (0.0, y + 2.1 * LATTICE.cell, k * STEP)).all() for k in range(-8, 9)]
+        assert not any(beyond)
+    assert target([(0.0, -0.1)]).last_view(leg, BOUND) is None
+
+
+def test_what_was_in_view_from_the_same_side_and_no_farther_is_not_shown_again() -> None:
+    point, side = (0.0, 0.3), -math.pi / 2  # seen from START
+    for before, shows in (
+        ([], True),
+        ([(side, 0.3)], False),
+        ([(side, 0.2)], False),
+        ([(side, 0.5)], True),
+        ([(side + 0.9 * SIDE, 0.3)], False),
+        ([(side + 1.1 * SIDE, 0.3)], True),
+        ([(side - 2 * math.pi, 0.3)], False),
+    ):
+        assert target([point], before).shows((*START, 0.0)) == shows, before
+    assert target([point], [(side, 0.3)]).shows((*START, 0.0), looks=2)
+
+
+def test_ways_back_end_where_it_is_not_free() -> None:
+    wall = Ground(ground((Y < -0.15, HAZARDOUS)), (0.0, 0.1), 0.0, P)
+    ways = free_back(wall, 0.3)
+    lengths = [length_of([way]) for way in ways]
+    assert lengths == sorted(lengths)
+    assert all(way.gear == -1 and way.a == (0.0, 0.1) for way in ways)
+    rear = 0.1 - lengths[-1] - 0.5 * ROVER.wheel_base
+    assert -0.15 + ROVER.margin - LATTICE.cell <= rear <= -0.15 + ROVER.margin + 2 * LATTICE.cell
+
+
+def test_the_target_is_what_is_not_known_beneath_the_first_pose_that_is_not() -> None:
+    spot = np.hypot(X - 0.04, Y - 0.4) < 0.015
+    on = Ground(ground((spot, UNKNOWN)), START, 0.0, P)
+    way = [Piece(START, (0.0, 0.33), 0.0, 1), Piece((0.0, 0.33), GOAL, 0.0, 1, known=False)]
+    aim = Target.of(on, way, 1, CAMERAS, [(0.0, 0.1, 0.0), (0.0, 0.1, math.pi)])
+    assert aim.unseen
+    assert np.hypot(*(aim.points - (0.04, 0.4)).T).max() < 0.015
+    assert len(aim.before) == 2, "from where it stands, and from one of the two stands"

@@ -1,0 +1,276 @@
+"""Local path: what is never entered, the margin, unknown ground, both planners, and ends that are refused."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from raising import raises
+from vehicles import SHORT
+
+from stages.core.declare import Bundle, check_outputs
+from stages.geometry.lattice import Lattice
+from stages.hazard.risk import BITS, CAUTION, HAZARDOUS, UNKNOWN
+from stages.hazard.vehicle import Vehicle
+from stages.planning.path import STAGE, PathParams, Route, describe, find_path
+
+CELL = 0.01
+
+
+def maps(risk: np.ndarray, z: np.ndarray, bit: str = "step") -> dict[str, np.ndarray]:
+    """A risk map whose hazards are all of one measure."""
+    reason = np.where(risk == HAZARDOUS, BITS[bit], 0).astype(np.uint16)
+    return {"risk": risk.astype(np.uint8), "reason": reason, "elevation": z.astype(np.float32)}
+
+
+def level(lattice: Lattice) -> tuple[np.ndarray, np.ndarray]:
+    return np.zeros(lattice.shape, dtype=np.uint8), np.zeros(lattice.shape, dtype=np.float32)
+
+
+def terrain(seed: int, lattice: Lattice) -> tuple[np.ndarray, np.ndarray]:
+    """Random islands of caution, hazard and unknown on gently rolling ground."""
+    rng = np.random.default_rng(seed)
+    risk, _ = level(lattice)
+    for kind in (CAUTION, HAZARDOUS, UNKNOWN):
+        for _ in range(4):
+            r, c = rng.integers(0, lattice.rows), rng.integers(0, lattice.cols)
+            risk[r : r + 4, c : c + 4] = kind
+    y, x = np.mgrid[: lattice.rows, : lattice.cols]
+    z = (0.003 * np.sin(x / 5 + seed) * np.cos(y / 7)).astype(np.float32)
+    return risk, np.where(risk == UNKNOWN, np.float32(np.nan), z)
+
+
+def wheels_of(route: Route, vehicle: Vehicle) -> np.ndarray:
+    """Wheel middles (n, 2) x, y at the vertices, heading along the edge that led there."""
+    out = []
+    for a, b in zip(route.xyz[:-1, :2], route.xyz[1:, :2], strict=True):
+        ahead = (b - a) / np.hypot(*(b - a))
+        aside = np.array([ahead[1], -ahead[0]])
+        for f, g in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
+            out.append(b + 0.5 * f * vehicle.wheel_base * ahead + 0.5 * g * vehicle.track * aside)
+    return np.array(out)
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 999), angle=st.floats(-math.pi, math.pi), planner=st.sampled_from(["rows", "grid8"]))
+def test_unknown_and_hazard_are_never_entered(seed: int, angle: float, planner: str) -> None:
+    lattice = Lattice.at(-20, 30, CELL, 40, 36)
+    risk, z = terrain(seed, lattice)
+    heading = (math.sin(angle), math.cos(angle))
+    route = find_path(maps(risk, z), lattice, SHORT, heading=heading, params=PathParams(planner=planner))
+    xyz = route.xyz
+    if len(xyz):
+        at = np.rint(lattice.index(xyz[:, :2])).astype(int)
+        assert (risk[at[:, 0], at[:, 1]] < HAZARDOUS).all()
+        assert np.isfinite(xyz).all()
+        if planner == "rows":
+            np.testing.assert_allclose(np.diff(xyz[:, :2], axis=0) @ heading, CELL, atol=1e-9)
+    else:
+        assert route.plan.reason
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 999), margin=st.sampled_from([0.0, 0.01, 0.025]), planner=st.sampled_from(["rows", "grid8"]))
+def test_wheels_keep_the_margin_from_hazards(seed: int, margin: float, planner: str) -> None:
+    lattice = Lattice.at(-20, 30, CELL, 60, 56)
+    risk, z = terrain(seed, lattice)
+    vehicle = SHORT.model_copy(update={"margin": margin})
+    route = find_path(maps(risk, z), lattice, vehicle, params=PathParams(planner=planner))
+    hazards = lattice.xy()[risk == HAZARDOUS]
+    if len(route.xyz) < 2:
+        return
+    wheels = wheels_of(route, vehicle)
+    nearest = np.hypot(*(wheels[:, None] - hazards[None]).transpose(2, 0, 1)).min()
+    # a wheel is put on the nearest cell: half a diagonal
+    assert nearest >= margin - 0.71 * CELL
+    assert margin == 0.0 or nearest > 0.3 * CELL
+
+
+@pytest.mark.parametrize(("gap", "ground"), [(9, "outline"), (7, "wheels"), (2, "middle")])
+def test_what_stays_on_known_ground_is_told(gap: int, ground: str) -> None:
+    lattice = Lattice.at(-15, 60, CELL, 40, 31)
+    risk, z = level(lattice)
+    risk[15:25] = UNKNOWN
+    risk[15:25, 15 - gap // 2 : 15 - gap // 2 + gap] = 0
+    vehicle = SHORT.model_copy(update={"track": 0.05})  # 6.5 cells over the wheels
+    route = find_path(maps(risk, z), lattice, vehicle)
+    assert route.ground == ground
+    assert len(route.xyz) > 30
+
+
+def test_caution_ground_is_avoided_where_the_detour_is_short() -> None:
+    lattice = Lattice.at(-20, 60, CELL, 60, 41)
+    risk, z = level(lattice)
+    risk[25:35, 12:24] = CAUTION
+    found = {
+        toll: describe(
+            find_path(maps(risk, z), lattice, SHORT, params=PathParams(caution=toll)), maps(risk, z), lattice, SHORT
+        )
+        for toll in (0.0, 0.2)
+    }
+    assert found[0.0]["caution_share"] > 0.1
+    assert found[0.2]["caution_share"] == 0.0
+
+
+@pytest.mark.parametrize(("chance", "crossed"), [(0.0, True), (0.09, False), (0.5, False)])
+def test_ground_that_may_be_a_hazard_is_gone_round(chance: float, crossed: bool) -> None:
+    lattice = Lattice.at(-30, 60, CELL, 61, 61)
+    given = maps(*level(lattice)) | {"p_hazard": np.zeros(lattice.shape, dtype=np.float32)}
+    given["p_hazard"][25:36, 24:37] = chance
+    ends = {"start": (0.0, 0.1), "target": (0.0, 0.5)}
+    route = find_path(given, lattice, SHORT, **ends, params=PathParams(doubt=20.0))
+    assert bool((given["p_hazard"][route.cells[:, 0], route.cells[:, 1]] == np.float32(chance)).all()) == crossed
+    assert len(route.cells) > 30
+
+
+def test_ground_that_is_probably_a_hazard_closes_the_way() -> None:
+    lattice = Lattice.at(-30, 60, CELL, 61, 61)
+    given = maps(*level(lattice)) | {"p_hazard": np.zeros(lattice.shape, dtype=np.float32)}
+    given["p_hazard"][30] = 0.2
+    ends = {"start": (0.0, 0.1), "target": (0.0, 0.5)}
+    closed = find_path(given, lattice, SHORT, **ends)
+    assert not len(closed.cells)
+    assert "above path.sure 0.1 closes every way; without it one leads over ground of up to 0.2:" in closed.plan.reason
+    assert len(find_path(given, lattice, SHORT, **ends, params=PathParams(sure=0.2)).cells) > 30
+    given["risk"][30] = HAZARDOUS  # then it is not for what may be hazardous
+    assert find_path(given, lattice, SHORT, **ends).doubt is None
+
+
+def test_ground_that_is_probably_a_hazard_everywhere_is_a_warning_with_the_figure() -> None:
+    lattice = Lattice.at(0, 40, CELL, 40, 30)
+    arrays = maps(*level(lattice)) | {"p_hazard": np.full(lattice.shape, 0.15, dtype=np.float32)}
+    source = Bundle(arrays, {"lattice": lattice.to_dict(), "vehicle": SHORT.model_dump()})
+    (line,) = STAGE.run(PathParams(), {}, {"risk": source}).meta["warnings"]
+    assert line.startswith("no path: ground with a p_hazard above path.sure 0.1 closes every way")
+    assert "up to 0.15" in line
+
+
+def test_from_start_to_target_in_metres() -> None:
+    lattice = Lattice.at(-50, 50, CELL, 101, 101)
+    given = maps(*level(lattice))
+    xyz = find_path(given, lattice, SHORT, start=(-0.3, -0.2), target=(0.3, 0.25)).xyz
+    # ends are moved to the centres of their cells on the turned grid: half a diagonal
+    assert np.hypot(*(xyz[0, :2] - [-0.3, -0.2])) < 0.71 * CELL
+    assert np.hypot(*(xyz[-1, :2] - [0.3, 0.25])) < 0.71 * CELL
+    assert (np.hypot(*np.diff(xyz[:, :2], axis=0).T)).sum() == pytest.approx(0.75, abs=2 * CELL)
+    with raises("RIL-406", "path.target", "-0.505"):
+        find_path(given, lattice, SHORT, start=(-0.3, -0.2), target=(2.0, 0.0))
+    with raises("RIL-434"):
+        find_path(given, lattice, SHORT, start=(0.1, 0.1), target=(0.1, 0.1))
+
+
+def test_behind_a_wall_rows_fail_and_grid8_goes_round() -> None:
+    lattice = Lattice.at(-30, 60, CELL, 61, 61)
+    risk, z = level(lattice)
+    risk[20, 8:53] = risk[20:45, 8] = risk[20:45, 52] = HAZARDOUS  # a cup that opens to the near side
+    ends = {"start": (0.0, 0.25), "target": (0.0, 0.55)}
+    by_rows = find_path(maps(risk, z), lattice, SHORT, **ends, params=PathParams(planner="rows"))
+    assert len(by_rows.xyz) == 0
+    route = find_path(maps(risk, z), lattice, SHORT, **ends)
+    assert route.planner == "grid8"
+    np.testing.assert_allclose(route.xyz[[0, -1], :2], [[0.0, 0.25], [0.0, 0.55]], atol=1e-9)
+    assert np.diff(route.xyz[:, 1]).min() < 0  # it goes back
+
+
+@pytest.mark.parametrize("datum", [0.0, 3e5])
+def test_heights_far_from_the_datum_cost_what_they_differ(datum: float) -> None:
+    """300 km are 1.5e9 steps of 0.2 mm, which are kept in 64 bits; float32 there tells 0.03 m apart."""
+    lattice = Lattice.at(-15, 60, CELL, 40, 31)
+    risk, z = level(lattice)
+    z[:20] = 0.5
+    route = find_path(maps(risk, z + np.float32(datum)), lattice, SHORT)
+    assert len(route.xyz) > 30
+    assert route.cost[route.cells[-1, 0], route.cells[-1, 1]] == pytest.approx(0.5, abs=0.03)
+
+
+def test_a_map_that_is_cut_is_crossed_on_its_longer_side() -> None:
+    lattice = Lattice.at(-30, 60, CELL, 100, 61)
+    risk, z = level(lattice)
+    risk[70:74] = HAZARDOUS  # from edge to edge: 70 rows ahead of it, 26 before
+    given = maps(risk, z)
+    assert not describe(find_path(given, lattice, SHORT), given, lattice, SHORT)["found"]
+    facts = describe(find_path(given, lattice, SHORT, stretch=True), given, lattice, SHORT)
+    assert facts["planner"] == "grid8"
+    before, beyond = facts["left_out_m"]
+    assert 0.30 <= before <= 0.30 + 2 * SHORT.half_length
+    assert beyond <= 2 * SHORT.half_length
+
+
+@pytest.mark.parametrize(
+    ("kind", "expected"),
+    [
+        (HAZARDOUS, ("RIL-408", "path.start", "0.02", "vehicle.max_step", "0.01")),
+        (UNKNOWN, ("RIL-407", "path.start", "0.05")),
+    ],
+)
+def test_a_start_that_cannot_be_stood_on_is_refused_with_the_figure(kind: int, expected: tuple[str, ...]) -> None:
+    lattice = Lattice.at(-20, 40, CELL, 41, 41)
+    risk, z = level(lattice)
+    risk[30:39, 15:26] = kind
+    given = maps(risk, z) | {"step": np.full(lattice.shape, 0.02, dtype=np.float32)}
+    with raises(*expected):
+        find_path(given, lattice, SHORT, start=(0.0, 0.06))
+
+
+def test_a_vehicle_wider_than_the_map_is_refused() -> None:
+    lattice = Lattice.at(0, 40, CELL, 40, 5)
+    with raises("RIL-431", "0.095", "0.05"):
+        find_path(maps(*level(lattice)), lattice, SHORT.model_copy(update={"track": 0.08}))
+
+
+def test_limits_that_leave_nothing_to_drive_on_are_named() -> None:
+    lattice = Lattice.at(0, 40, CELL, 40, 30)
+    risk, z = level(lattice)
+    given = maps(np.full_like(risk, HAZARDOUS), z, "tilt")
+    facts = describe(find_path(given, lattice, SHORT), given, lattice, SHORT)
+    assert facts["found"] is False
+    assert "all 1200 known cells are hazardous, 100 % of them by tilt: is vehicle.max_slope_deg 20" in facts["reason"]
+
+
+def test_limits_that_leave_nothing_are_a_warning_of_the_whole_map_alone() -> None:
+    lattice = Lattice.at(0, 40, CELL, 40, 30)
+    risk, z = level(lattice)
+    arrays = maps(np.full_like(risk, HAZARDOUS), z, "tilt")
+    source = Bundle(arrays, {"lattice": lattice.to_dict(), "vehicle": SHORT.model_dump()})
+    (line,) = STAGE.run(PathParams(), {}, {"risk": source}).meta["warnings"]
+    assert line.startswith("no path: all 1200 known cells are hazardous")
+    assert "warnings" not in STAGE.run(PathParams(), {"use": "local"}, {"risk": source}).meta
+
+
+@pytest.mark.parametrize("blocked", [False, True])
+def test_the_stage(blocked: bool) -> None:
+    lattice = Lattice.at(-10, 60, CELL, 50, 21)
+    risk = np.zeros(lattice.shape, dtype=np.uint8)
+    if blocked:
+        risk[20] = HAZARDOUS
+    y = lattice.ys()[:, None] + np.zeros(lattice.cols)
+    arrays = maps(risk, 0.1 * y) | {
+        "inclination": np.full(lattice.shape, math.atan(0.1), dtype=np.float32),
+        "tilt": np.full(lattice.shape, 0.2, dtype=np.float32),
+        "clearance": np.full(lattice.shape, 0.02, dtype=np.float32),
+        "p_hazard": np.full(lattice.shape, 0.01, dtype=np.float32),
+    }
+    arrays["clearance"][30, 10] = 0.015
+    source = Bundle(arrays, {"lattice": lattice.to_dict(), "vehicle": SHORT.model_dump(), "frame": "local"})
+    out = STAGE.run(PathParams(start=(9.0, 9.0)), {"use": "local"}, {"risk": source})
+    check_outputs(STAGE, out)
+    assert out.meta["found"] is not blocked
+    if blocked:
+        # the front wheels stand half a wheel base ahead
+        assert out.meta["blocking_row"] in (20, 21, 22)
+        assert out["path"].shape == (0, 3)
+        return
+    outside = 2 * math.ceil(SHORT.half_length / CELL)  # rows at which the outline leaves the map
+    assert 50 - outside <= out.meta["vertices"] <= 50
+    assert out.meta["max_inclination"] == pytest.approx(math.atan(0.1))
+    assert out.meta["least_clearance"] == pytest.approx(0.015)
+    assert out.meta["max_tilt"] == pytest.approx(0.2)
+    assert out.meta["max_p_hazard"] == pytest.approx(0.01)
+    steps = out.meta["vertices"] - 1
+    # a wheel's mean at the first and last row leans on what lies inside: half a cell of its three
+    assert out.meta["climb_m"] == pytest.approx(0.1 * steps * CELL, abs=0.1 * CELL + 1e-6)
+    assert out.meta["length_m"] == pytest.approx(steps * CELL * math.hypot(1, 0.1), rel=1e-3)
+    assert out["reachable"].any()

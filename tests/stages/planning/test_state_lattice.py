@@ -1,0 +1,95 @@
+"""Places and headings as a graph: its costs are another program's, its grid lies through the start."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import networkx
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from stages.geometry.lattice import Lattice
+from stages.planning.local_planner.state_lattice import ANGLES, STEPS, PoseGraph, PoseGrid, angle_of
+
+
+def networked(graph: PoseGraph, turn_price: float, back: float) -> networkx.DiGraph:
+    """The same graph, edge by edge from its words."""
+    out = networkx.DiGraph()
+    rows, cols = graph.grid.shape
+    for k in range(16):
+        for r in range(rows):
+            for c in range(cols):
+                out.add_node((k, r, c))
+                i, j = r + int(STEPS[k][0]), c + int(STEPS[k][1])
+                if 0 <= i < rows and 0 <= j < cols:
+                    middle = graph.step[k, r, c] if k < 8 else graph.step[k - 8, i, j]
+                    price = max(graph.pose[k % 8, r, c], graph.pose[k % 8, i, j], middle)
+                    length = math.hypot(i - r, j - c) * graph.grid.spacing
+                    if math.isfinite(price):
+                        out.add_edge((k, r, c), (k, i, j), weight=price * length)
+                        out.add_edge((k, i, j), (k, r, c), weight=price * length * back)
+                left = (k + 1) % 16
+                price = max(graph.pose[k % 8, r, c], graph.pose[left % 8, r, c], graph.turn[k % 8, r, c])
+                if math.isfinite(price):
+                    turn = (ANGLES[left] - ANGLES[k]) % (2 * math.pi)
+                    out.add_edge((k, r, c), (left, r, c), weight=price * turn * turn_price)
+                    out.add_edge((left, r, c), (k, r, c), weight=price * turn * turn_price)
+    return out
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 2**31), st.integers(3, 6), st.integers(3, 6))
+def test_costs_are_those_of_networkx(seed: int, rows: int, cols: int) -> None:
+    rng = np.random.default_rng(seed)
+    prices = [
+        np.where(rng.random((8, rows, cols)) < 0.25, np.inf, rng.uniform(1, 3, (8, rows, cols))) for _ in range(3)
+    ]
+    origin = int(rng.integers(rows)), int(rng.integers(cols))
+    graph = PoseGraph(PoseGrid((0.0, 0.0), 0.0, 0.5, (rows, cols), origin), *prices)
+    goals = np.zeros((rows, cols), bool)
+    goal = int(rng.integers(rows)), int(rng.integers(cols))
+    goals[goal] = True
+    cost, move = graph.search(goals, 0.3, 2.0, whole=True)
+    sources = {(k, *goal) for k in range(16) if math.isfinite(prices[0][k % 8, goal[0], goal[1]])}
+    other = networked(graph, 0.3, 2.0)
+    lengths = networkx.multi_source_dijkstra_path_length(other.reverse(), sources) if sources else {}
+    for pose in other:
+        assert cost[pose] == pytest.approx(lengths.get(pose, math.inf))
+    early, first = graph.search(goals, 0.3, 2.0)
+    assert early[0][origin] == cost[0][origin]
+    if math.isfinite(cost[0][origin]):
+        way = graph.follow(first)
+        assert way == graph.follow(move)
+        assert way[0][:3] == (0, *origin)
+        assert way[-1][1:3] == goal
+        edges = [((a[0] % 16, *a[1:3]), (b[0] % 16, *b[1:3])) for a, b in itertools.pairwise(way)]
+        assert sum(other.edges[e]["weight"] for e in edges) == pytest.approx(cost[0][origin])
+
+
+def test_headings_go_once_round_to_the_left() -> None:
+    assert np.diff(ANGLES).min() > math.radians(18)
+    assert math.degrees(ANGLES[2]) == pytest.approx(45.0)
+    assert STEPS[4].tolist() == [0, -1]
+    assert angle_of(18) == pytest.approx(2 * math.pi + ANGLES[2])
+    assert angle_of(-2) == pytest.approx(-ANGLES[2])
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.floats(-0.2, 0.2), st.floats(-0.1, 0.5), st.floats(-3.1, 3.1))
+def test_the_grid_lies_through_the_start_and_covers_the_map(x: float, y: float, heading: float) -> None:
+    lattice = Lattice.snap((-0.4, 0.4, -0.2, 1.0), 0.02)
+    grid = PoseGrid.over(lattice, (x, y), heading, 0.03)
+    at = np.array([float(v) for v in grid.origin])
+    assert np.hypot(*(np.array(grid.xy(at[0], at[1])) - (x, y))) < 1e-12
+    ahead = np.array(grid.xy(at[0] - 1, at[1])) - (x, y)
+    assert ahead == pytest.approx([-0.03 * math.sin(heading), 0.03 * math.cos(heading)], abs=1e-12)
+    xy = lattice.xy()
+    row, col = grid.index(xy[..., 0], xy[..., 1])
+    assert row.min() >= 0
+    assert col.min() >= 0
+    assert row.max() <= grid.shape[0] - 1
+    assert col.max() <= grid.shape[1] - 1
+    assert np.abs(np.array(grid.xy(row, col)) - xy.transpose(2, 0, 1)).max() < 1e-12

@@ -1,0 +1,205 @@
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from raising import raises
+from terrain_scenes import ball, box, disparity, nearest, pitched, plane, smooth_noise, toed_in_rig
+
+from stages.core.declare import Bundle
+from stages.core.validity import Validity
+from stages.geometry.geometry import Camera, Rig, RigidTransform
+from stages.terrain import ground_frame as level_stage
+from stages.terrain.ground import _singular_values, inverse_depth
+from stages.terrain.ground_frame import LevelParams, level
+
+RIG = toed_in_rig()
+PARAMS = LevelParams()
+PITCH, ROLL, HEIGHT = 18.0, 2.0, 0.18
+POSE = pitched(PITCH, ROLL)
+FLAT = disparity(RIG, POSE, plane(0.0, 0.0, -HEIGHT))
+
+
+def up_of(facts: dict) -> np.ndarray:
+    return RigidTransform.from_matrix(facts["T_local_left"]).rotation[2]
+
+
+def test_inverse_depth_against_the_projection() -> None:
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(-0.3, 0.3, 50), rng.uniform(-0.3, 0.3, 50), rng.uniform(0.5, 4.0, 50)])
+    left = RIG.left.project(points)
+    right = RIG.right.project(RIG.T_right_left.apply(points))
+    rho, per_pixel = inverse_depth(RIG, left, right - left)
+    np.testing.assert_allclose(rho, 1.0 / points[:, 2], rtol=1e-10)
+    step = 1e-6  # of inverse depth: how far does the right image move?
+    nearer = RIG.right.project(RIG.T_right_left.apply(points * (rho / (rho + step))[:, None]))
+    np.testing.assert_allclose(step / np.linalg.norm(nearer - right, axis=1), per_pixel, rtol=0.2)
+
+
+def test_ground_plane_gives_attitude_and_height() -> None:
+    noise = smooth_noise(FLAT[0].shape, PARAMS.sigma_disparity, np.random.default_rng(0))
+    facts = level(FLAT[0] + noise, *FLAT[1:], RIG, PARAMS)
+    assert facts["source"] == "ground plane"
+    # Noise of 0.2 px over thousands of pixels, correlated over some 30: a milliradian at most.
+    assert math.acos(min(1.0, float(up_of(facts) @ POSE.rotation[2]))) < 2e-3
+    assert facts["ground_height"] == pytest.approx(-HEIGHT, rel=5e-3)
+    assert facts["tilt"] < 1e-9
+    assert facts["ground_share"] > 0.9
+
+
+def test_each_source_and_their_order() -> None:
+    slope = math.radians(8.0)
+    maps = disparity(RIG, pitched(PITCH), plane(0.0, math.tan(slope), -HEIGHT))  # the ground rises ahead
+    level_up = pitched(PITCH).rotation[2]
+    given = {"up": level_up, "initial_up": level_up, "pitch": math.radians(PITCH)}
+    for source, keys in (
+        ("attitude", ("up", "initial_up", "pitch")),
+        ("initial pose", ("initial_up", "pitch")),
+        ("pitch", ("pitch",)),
+    ):
+        facts = level(*maps, RIG, PARAMS, **{k: given[k] for k in keys})
+        assert facts["source"] == source
+        np.testing.assert_allclose(up_of(facts), level_up, atol=1e-12)
+        np.testing.assert_allclose(facts["plane"], [0.0, math.tan(slope), -HEIGHT], atol=1e-3)
+        assert facts["tilt"] == pytest.approx(slope, abs=1e-3)
+    without = level(*maps, RIG, PARAMS)
+    assert math.acos(float(up_of(without) @ level_up)) == pytest.approx(slope, abs=1e-3)
+
+
+def test_local_frame() -> None:
+    T = RigidTransform.from_matrix(level(*FLAT, RIG, PARAMS, up=POSE.rotation[2])["T_local_left"])
+    np.testing.assert_allclose(T.translation, 0.0)
+    axis = T.rotation @ [0.0, 0.0, 1.0]
+    assert abs(axis[0]) < 1e-12
+    assert axis[1] > 0
+    np.testing.assert_allclose(T.rotation, POSE.rotation, atol=1e-12)
+
+
+def test_street_with_more_walls_than_road() -> None:
+    """Camera 1.65 m high, level axis: walls on both sides, one of them near, and a car."""
+    cam = Camera(700.0, 700.0, 400.0, 120.0, 800, 260)
+    rig = Rig(cam, cam, RigidTransform(np.eye(3), [-0.54, 0.0, 0.0]))
+    walls = [box((-9.0, 0.0, -1.65), (-5.0, 200.0, 9.0)), box((4.0, 0.0, -1.65), (9.0, 200.0, 9.0))]
+    scene = nearest(plane(0.0, 0.0, -1.65), *walls, box((1.5, 12.0, -1.65), (3.5, 16.0, -0.2)))
+    column, row, usable = disparity(rig, pitched(1.0), scene)
+    column = column + smooth_noise(column.shape, 0.3, np.random.default_rng(0))
+    facts = level(column, row, usable, rig, PARAMS)
+    assert facts["ground_share"] < 0.5
+    assert facts["ground_height"] == pytest.approx(-1.65, abs=0.02)
+    assert math.acos(float(up_of(facts) @ pitched(1.0).rotation[2])) < math.radians(0.3)
+    low, high = facts["z_range"]
+    assert low < -1.65 - 0.05
+    assert high > -0.2
+    assert high <= 1.652 + abs(facts["footprint"][3]) * math.tan(facts["tilt"])
+    x_min, x_max, y_min, y_max = facts["footprint"]
+    assert x_min < -4.0
+    assert x_max > 4.0
+    nearest_row = math.atan(139 / 700) + math.radians(1.0)  # below the horizon
+    assert y_min == pytest.approx(1.65 / math.tan(nearest_row), rel=0.05)
+    assert y_max > 15.0
+
+
+def test_the_far_background_is_not_ground() -> None:
+    ground, wall = plane(0.0, 0.0, -0.6), box((-900.0, 100.0, -900.0), (900.0, 200.0, 900.0))
+    T = pitched(3.0)
+    column, row, usable = disparity(RIG, T, nearest(ground, wall))
+    column = column + smooth_noise(column.shape, 0.2, np.random.default_rng(0))
+    facts = level(column, row, usable, RIG, PARAMS)
+    cols, rows = np.meshgrid(np.arange(RIG.left.width), np.arange(RIG.left.height))
+    v = RIG.left.rays(np.stack([cols, rows], -1)[usable]) @ T.rotation.T
+    # Ground beyond 5 sigma of inverse depth, 5 * 0.2 px / (f B), cannot be told from the background.
+    on_ground = ground(np.zeros(3), v) < RIG.left.fx * RIG.baseline
+    assert facts["ground_share"] == pytest.approx(on_ground.mean(), abs=0.05)
+    assert facts["ground_height"] == pytest.approx(-0.6, rel=0.02)
+
+
+def test_relief_holds_the_rocks() -> None:
+    rocks = nearest(plane(0.0, 0.0, -HEIGHT), ball((0.0, 0.35, -HEIGHT), 0.05), ball((-0.1, 0.5, -HEIGHT), 0.06))
+    facts = level(*disparity(RIG, POSE, rocks), RIG, PARAMS, up=POSE.rotation[2])
+    assert facts["ground_height"] == pytest.approx(-HEIGHT, rel=0.02)
+    assert facts["z_range"][0] < -HEIGHT
+    assert facts["z_range"][1] > -HEIGHT + 0.055
+    assert facts["relief"][0] < 0.0 < facts["relief"][1]
+
+
+def test_without_ground_the_pair_is_levelled_all_the_same() -> None:
+    wall = disparity(RIG, pitched(0.0), box((-9.0, 1.0, -9.0), (9.0, 2.0, 9.0)))
+    facts = level(*wall, RIG, PARAMS)
+    assert facts["source"] == "none"
+    assert "no ground plane" in facts["no_ground"]
+    assert facts["plane"] is facts["footprint"] is None
+    T = RigidTransform.from_matrix(facts["T_local_left"])
+    np.testing.assert_allclose(T.rotation, [[1, 0, 0], [0, 0, 1], [0, -1, 0]], atol=1e-12)
+    # The wall stands a metre ahead: a pixel covers 2 m / f at twice that.
+    assert facts["cell_size"] == pytest.approx(2.0 / RIG.left.fx, rel=0.6)
+    assert level(*wall, RIG, PARAMS, up=[0.0, -1.0, 0.1])["source"] == "attitude"
+
+    stated = level(*wall, RIG, PARAMS.model_copy(update={"reference_height": 0.3}))
+    np.testing.assert_allclose(stated["plane"], [0.0, 0.0, -0.3], atol=1e-12)
+    assert stated["source"] == "none"
+    away = level(*wall, RIG, PARAMS.model_copy(update={"reference_height": 0.3}), up=[0.0, -0.17, 0.98])
+    assert away["plane"] is None  # it looks up: that surface is not in view
+    assert away["source"] == "attitude"
+
+    far = disparity(RIG, pitched(0.0), box((-900.0, 100.0, -900.0), (900.0, 200.0, 900.0)))
+    patch = np.zeros_like(far[2])
+    patch[150:190, 150:190] = True
+    for seed in range(5):  # so far away every plane fits, chance sets its tilt
+        noisy = far[0] + smooth_noise(far[0].shape, 0.2, np.random.default_rng(seed))
+        assert level(noisy, far[1], patch, RIG, PARAMS)["plane"] is None
+    assert "texture in common" in level(FLAT[0], FLAT[1], np.zeros_like(FLAT[2]), RIG, PARAMS)["no_ground"]
+
+
+def test_what_no_frame_can_be_posed_from_is_said_with_a_remedy() -> None:
+    swapped = Rig(RIG.right, RIG.left, RIG.T_right_left)
+    with raises("RIL-375"):
+        level(-FLAT[0], FLAT[1], FLAT[2], swapped, PARAMS)
+    # Turned inward, the cameras see far ground ahead with their sides exchanged, too, but off the epipolar lines.
+    inside_out = disparity(Rig(RIG.right, RIG.left, RIG.T_right_left.inverse()), POSE, plane(0.0, 0.0, -8.0 * HEIGHT))
+    with raises("RIL-781"):
+        level(*inside_out, RIG, PARAMS)
+    with raises("RIL-377"):
+        level(*FLAT, Rig(RIG.left, RIG.right, RigidTransform.identity()), PARAMS)
+    with raises("RIL-378"):
+        level(*FLAT, RIG, PARAMS, up=[0.0, 0.0, 0.0])
+    with raises("RIL-376"):
+        level(FLAT[0][:-1], FLAT[1], FLAT[2], RIG, PARAMS)
+
+
+def test_stage_uses_only_measured_pixels_and_is_repeatable() -> None:
+    column, row, usable = (np.array(m) for m in FLAT)
+    filled = np.zeros_like(usable)
+    filled[:, :60] = True
+    column[filled] -= 20.0  # filled disparities may be anything
+    validity = np.where(filled, Validity.INTERPOLATED, np.where(usable, Validity.MATCHED, 0)).astype(np.uint8)
+    maps = {"column_disparity": column.astype("f4"), "row_disparity": row.astype("f4"), "validity": validity}
+    inputs = {"disparity": Bundle(maps, {}), "rig": Bundle({}, {"rig": RIG.to_dict()})}
+    facts = level_stage.STAGE.run(PARAMS, {"pitch": math.radians(PITCH)}, inputs).meta
+    assert facts["ground_height"] == pytest.approx(-HEIGHT, rel=1e-3)
+    assert facts == level_stage.STAGE.run(PARAMS, {"pitch": math.radians(PITCH)}, inputs).meta
+    json.dumps(facts, allow_nan=False)
+
+
+@pytest.mark.data
+def test_kitti_street(data_dir: Path) -> None:
+    """The cameras of the KITTI car are mounted 1.65 m above the road, level to a degree or two."""
+    import cv2
+
+    folder = data_dir / "kitti06_51"
+    P = np.array((folder / "calib.txt").read_text().split(), float).reshape(2, 3, 4)
+    left, right = (cv2.imread(str(sorted((folder / f"image_{c}").iterdir())[25]), 0) for c in "lr")
+    matcher = cv2.StereoSGBM_create(0, 128, 5, 200, 800, 1, 63, 10, 100, 2, cv2.STEREO_SGBM_MODE_SGBM_3WAY)
+    d = matcher.compute(left, right).astype(np.float32) / 16
+    cam = Camera(P[0, 0, 0], P[0, 1, 1], P[0, 0, 2], P[0, 1, 2], left.shape[1], left.shape[0])
+    rig = Rig(cam, cam, RigidTransform(np.eye(3), [P[1, 0, 3] / P[1, 0, 0], 0.0, 0.0]))
+    facts = level(-d, np.zeros_like(d), d > 0, rig, PARAMS)
+    assert facts["ground_height"] == pytest.approx(-1.65, abs=0.12)
+    assert math.degrees(math.acos(-float(up_of(facts)[1]))) < 3.0
+
+
+def test_singular_values_of_small_matrices():
+    m = np.random.default_rng(4).normal(size=(50, 2, 2))
+    np.testing.assert_allclose(_singular_values(m), np.linalg.svd(m, compute_uv=False), rtol=1e-9, atol=1e-12)

@@ -1,0 +1,423 @@
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+from raising import raises
+from terrain_scenes import ball, box, disparity, interpolation_error, nearest, pitched, plane, smooth_noise, toed_in_rig
+
+from stages.core.declare import Bundle, check_outputs
+from stages.core.validity import Validity
+from stages.geometry.geometry import Rig, RigidTransform
+from stages.geometry.lattice import Lattice
+from stages.geometry.surface import Surface, cylinder, inclined, sphere
+from stages.geometry.surface import plane as reference_plane
+from stages.terrain import ground_frame as level_stage
+from stages.terrain.locus import roots, stage
+from stages.terrain.locus import solve as locus_solve
+from stages.terrain.locus.stage import Dem, LocusParams, reconstruct
+
+RIG = toed_in_rig()
+T_LOCAL_LEFT = pitched(30.0, roll_deg=3.0)
+HEIGHT = 0.6
+LATTICE = Lattice.snap((-0.3, 0.3, 0.5, 1.3), 0.01)
+PARAMS = LocusParams()
+IMAGE = np.add.outer(np.arange(RIG.left.height), 2.0 * np.arange(RIG.left.width)).astype(np.float32)
+
+
+def solve(maps: tuple[np.ndarray, np.ndarray, np.ndarray], z: tuple[float, float], rig: Rig = RIG) -> Dem:
+    column, row, usable = maps
+    return reconstruct(column, row, usable, IMAGE, rig, T_LOCAL_LEFT, reference_plane(LATTICE), z, PARAMS)
+
+
+def tolerance(maps: tuple[np.ndarray, np.ndarray, np.ndarray], points: np.ndarray) -> np.ndarray:
+    """Error of elevation, m, of the bilinear disparity: 3 Z^2 / (f B) of it, and of the solver's own 1e-3 px."""
+    errors = interpolation_error(*(np.where(maps[2], m, np.nan) for m in maps[:2])) + 1e-3
+    distance2 = (points**2).sum(-1)
+    return 3.0 * distance2 / (RIG.left.fx * RIG.baseline) * errors
+
+
+def on_lattice(z: np.ndarray) -> np.ndarray:
+    return np.dstack([LATTICE.xy(), z])
+
+
+def test_tilted_plane_with_exact_disparity() -> None:
+    a, b = 0.15, -0.1
+    maps = disparity(RIG, T_LOCAL_LEFT, plane(a, b, -HEIGHT))
+    assert np.ptp(maps[1][maps[2]]) > 5.0  # rows differ: this pair is far from rectified
+    xy = LATTICE.xy()
+    truth = -HEIGHT + a * xy[..., 0] + b * xy[..., 1]
+    dem = solve(maps, (-1.0, -0.3))
+    seen = np.isfinite(dem.elevation)
+    assert seen.mean() > 0.75
+    error = np.abs(dem.elevation - truth)[seen]
+    assert (error <= tolerance(maps, on_lattice(truth))[seen]).all()
+    assert error.max() < 1e-3  # the tolerance is itself a tight one
+    # Every cell that both cameras see (a pixel inside) is found.
+    points = on_lattice(truth)
+    left = RIG.left.project(T_LOCAL_LEFT.inverse().apply(points))
+    right = RIG.right.project((RIG.T_right_left @ T_LOCAL_LEFT.inverse()).apply(points))
+    size = np.array([RIG.left.width, RIG.left.height])
+    both = ((left > 2) & (left < size - 3) & (right > 2) & (right < size - 3)).all(-1)
+    assert seen[both].all()
+
+
+def test_a_rig_whose_right_camera_is_ahead() -> None:
+    """Baseline along the optical axis: epipolar lines run radially, disparity has every direction and a zero inside."""
+    rig = Rig(RIG.left, RIG.left, RigidTransform(np.eye(3), [0.0, 0.0, -0.1]))
+    maps = disparity(rig, T_LOCAL_LEFT, plane(0.1, 0.0, -HEIGHT))
+    dem = solve(maps, (-1.0, -0.3), rig)
+    truth = -HEIGHT + 0.1 * LATTICE.xy()[..., 0]
+    seen = np.isfinite(dem.elevation)
+    assert seen.mean() > 0.6
+    # Here the baseline that counts is its part across the ray, so the bound is the kernel's own sensitivity.
+    errors = interpolation_error(*(np.where(maps[2], m, np.nan) for m in maps[:2])) + 1e-3
+    assert (np.abs(dem.elevation - truth) <= 1.5 * dem.elevation_std * errors / PARAMS.sigma_disparity)[seen].all()
+
+
+def test_ortho_image_is_the_grey_value_of_the_left_projection() -> None:
+    maps = disparity(RIG, T_LOCAL_LEFT, plane(0.0, 0.0, -HEIGHT))
+    dem = solve(maps, (-1.0, -0.3))
+    seen = np.isfinite(dem.elevation)
+    pixels = RIG.left.project(T_LOCAL_LEFT.inverse().apply(on_lattice(dem.elevation.astype(float))[seen]))
+    np.testing.assert_allclose(dem.ortho[seen], pixels[:, 1] + 2.0 * pixels[:, 0], atol=2e-3)
+
+
+def test_against_the_literal_minimum_of_the_paper() -> None:
+    """Oracle: the Z of least |p_l + d - p_r| on a fine grid of Z, in plain NumPy."""
+    maps = disparity(RIG, T_LOCAL_LEFT, nearest(plane(0.0, 0.1, -HEIGHT), ball((0.05, 0.9, -0.75), 0.3)))
+    dem = solve(maps, (-0.7, -0.3))
+    usable = np.where(maps[2], maps[0], np.nan)
+    step = 2e-4
+    heights = np.arange(-0.7, -0.3, step)
+    rng = np.random.default_rng(1)
+    cells = np.argwhere(np.isfinite(dem.elevation))
+    for r, c in cells[rng.permutation(len(cells))[:200]]:
+        x, y = LATTICE.xy()[r, c]
+        points = np.column_stack([np.full(heights.size, x), np.full(heights.size, y), heights])
+        p = RIG.left.project(T_LOCAL_LEFT.inverse().apply(points))
+        q = RIG.right.project((RIG.T_right_left @ T_LOCAL_LEFT.inverse()).apply(points))
+        d = np.stack([bilinear(usable, p), bilinear(maps[1], p)], -1)
+        g = np.linalg.norm(p + d - q, axis=1)
+        assert abs(heights[np.nanargmin(g)] - dem.elevation[r, c]) <= step
+
+
+def bilinear(a: np.ndarray, p: np.ndarray) -> np.ndarray:
+    inside = (p[:, 0] >= 0) & (p[:, 1] >= 0) & (p[:, 0] < a.shape[1] - 1) & (p[:, 1] < a.shape[0] - 1)
+    x, y = np.where(inside, p[:, 0], 0.0), np.where(inside, p[:, 1], 0.0)
+    c, r = x.astype(int), y.astype(int)
+    fx, fy = x - c, y - r
+    top, bottom = a[r, c] * (1 - fx) + a[r, c + 1] * fx, a[r + 1, c] * (1 - fx) + a[r + 1, c + 1] * fx
+    return np.where(inside, top * (1 - fy) + bottom * fy, np.nan)
+
+
+def test_dome_with_exact_disparity() -> None:
+    centre, radius = np.array([0.05, 0.9, -1.1]), 0.6
+    maps = disparity(RIG, T_LOCAL_LEFT, nearest(plane(0.0, 0.0, -HEIGHT), ball(tuple(centre), radius)))
+    dem = solve(maps, (-0.8, -0.3))
+    xy = LATTICE.xy()
+    inner = ((xy - centre[:2]) ** 2).sum(-1) < 0.2**2  # slopes of 19 degrees: both cameras see the far side, too
+    truth = centre[2] + np.sqrt(np.maximum(radius**2 - ((xy - centre[:2]) ** 2).sum(-1), 0.0))
+    seen = inner & np.isfinite(dem.elevation)
+    assert seen.sum() > 0.9 * inner.sum()
+    error = np.abs(dem.elevation - truth)[seen]
+    # Besides the bare plane's part, the chord of a bilinear cell lies (footprint / 2)^2 / (2 radius) under the dome,
+    # in each of two directions; a pixel's footprint grows as the ray grazes.
+    points = on_lattice(truth)[seen]
+    distance = np.linalg.norm(points, axis=1)
+    grazing = -((points - centre) / radius * points).sum(1) / distance
+    chord = 2.0 * (distance / (RIG.left.fx * grazing)) ** 2 / (8.0 * radius)
+    slope = PARAMS.sigma_disparity / dem.elevation_std[seen]
+    assert (error <= (interpolation_error(*smooth_part()) + 1e-3) / slope + chord).all()
+    assert np.median(error) < 1e-4
+
+
+def smooth_part() -> list[np.ndarray]:
+    """The disparity of the bare plane: its interpolation error, without edges."""
+    flat = disparity(RIG, T_LOCAL_LEFT, plane(0.0, 0.0, -HEIGHT))
+    return [np.where(flat[2], m, np.nan) for m in flat[:2]]
+
+
+def test_nothing_is_invented_where_a_box_hides_the_ground() -> None:
+    low, high = (-0.1, 0.8, -HEIGHT), (0.1, 0.95, -0.4)
+    maps = disparity(RIG, T_LOCAL_LEFT, nearest(plane(0.0, 0.0, -HEIGHT), box(low, high)))
+    visible = maps[2] | np.isfinite(maps[0])  # even with the disparity of pixels that the right camera cannot see
+    dem = solve((maps[0], maps[1], visible), (-0.7, -0.3))
+    x, y = LATTICE.xy()[..., 0], LATTICE.xy()[..., 1]
+    gap = 0.02  # two cells around the walls, where one bilinear cell holds wall and ground
+    on_box = (x > low[0] + gap) & (x < high[0] - gap) & (y > low[1] + gap) & (y < high[1] - gap)
+    off_box = (x < low[0] - gap) | (x > high[0] + gap) | (y < low[1] - gap) | (y > high[1] + gap)
+    truth = np.where(on_box, high[2], -HEIGHT)
+    clear = (on_box | off_box) & np.isfinite(dem.elevation)
+    points = on_lattice(truth)
+    flat = interpolation_error(*smooth_part()) + 1e-3
+    bound = 3.0 * (points**2).sum(-1) / (RIG.left.fx * RIG.baseline) * flat
+    assert (np.abs(dem.elevation - truth)[clear] <= bound[clear]).all()
+    assert np.isfinite(dem.elevation[on_box]).all()
+    # Ground that the left camera cannot see: the ray from it meets the box first.
+    ground = on_lattice(np.full(LATTICE.shape, -HEIGHT)).reshape(-1, 3)
+    hidden = (box(low, high)(np.zeros(3), ground) < 1.0 - 1e-6).reshape(LATTICE.shape) & off_box & (y > high[1])
+    assert hidden.sum() > 50
+    deep = hidden & np.roll(hidden, 3, 0) & np.roll(hidden, -3, 0) & np.roll(hidden, 3, 1) & np.roll(hidden, -3, 1)
+    assert not np.isfinite(dem.elevation[deep]).any()
+
+
+def test_elevation_std_is_calibrated() -> None:
+    rng = np.random.default_rng(5)
+    sigma = PARAMS.sigma_disparity
+    column, row, usable = disparity(RIG, T_LOCAL_LEFT, plane(0.1, 0.05, -HEIGHT))
+    truth = -HEIGHT + 0.1 * LATTICE.xy()[..., 0] + 0.05 * LATTICE.xy()[..., 1]
+    scores = []
+    for _ in range(4):
+        # Across the epipolar line nothing but the residual changes, so only the column carries noise.
+        dem = solve((column + smooth_noise(column.shape, sigma, rng), row, usable), (-1.0, -0.3))
+        scores.append(((dem.elevation - truth) / dem.elevation_std)[np.isfinite(dem.elevation)])
+    z = np.concatenate(scores)
+    assert 0.8 < z.std() < 1.25
+    assert abs(z.mean()) < 0.2
+
+
+def test_cells_of_a_great_standard_deviation_of_their_own_are_left_out() -> None:
+    column, row, usable = disparity(RIG, T_LOCAL_LEFT, plane(0.0, 0.0, -HEIGHT))
+    noisy = np.zeros(column.shape, bool)
+    noisy[100:140, 140:180] = True
+    std = np.where(noisy, 1.0, 0.1).astype(np.float32)
+
+    def dem(**limits: float) -> Dem:
+        params = LocusParams(**limits)
+        surface = reference_plane(LATTICE)
+        return reconstruct(
+            column, row, usable, IMAGE, RIG, T_LOCAL_LEFT, surface, (-1.0, -0.3), params, disparity_std=std
+        )
+
+    whole = dem()
+    seen = np.isfinite(whole.elevation)
+    # Ten times the disparity's standard deviation is ten times the elevation's; the bound lies between both.
+    low = np.nanmax(whole.elevation_std[whole.elevation_std < 5.0 * np.nanmin(whole.elevation_std)])
+    for name, bound in (("max_std", float(low) * 1.0001), ("max_sigma", float(low) * 1.0001 / stage.OWN_STD)):
+        kept = np.isfinite(dem(**{name: bound}).elevation)
+        assert np.array_equal(kept, seen & (whole.elevation_std <= low)), name
+        assert 0 < np.count_nonzero(seen & ~kept) < 0.5 * np.count_nonzero(seen)
+
+
+def test_an_unusable_pixel_takes_the_cells_around_it_and_no_others() -> None:
+    column, row, usable = disparity(RIG, T_LOCAL_LEFT, plane(0.0, 0.0, -HEIGHT))
+    whole = solve((column, row, usable), (-1.0, -0.3))
+    holed = usable.copy()
+    holed[120, 160] = False
+    dem = solve((column, row, holed), (-1.0, -0.3))
+    pixels = RIG.left.project(T_LOCAL_LEFT.inverse().apply(on_lattice(np.full(LATTICE.shape, -HEIGHT))))
+    touched = (np.abs(pixels - [160, 120]) < 1).all(-1)
+    assert touched.any()
+    lost = np.isfinite(whole.elevation) & ~np.isfinite(dem.elevation)
+    assert np.array_equal(lost, touched)
+    kept = np.isfinite(dem.elevation)
+    np.testing.assert_allclose(dem.elevation[kept], whole.elevation[kept], atol=1e-5)
+
+
+def test_disparity_that_contradicts_the_calibration_is_left_out() -> None:
+    column, row, usable = disparity(RIG, T_LOCAL_LEFT, plane(0.0, 0.0, -HEIGHT))
+    off = solve((column, row + 0.3, usable), (-1.0, -0.3))
+    seen = np.isfinite(off.elevation)
+    assert seen.any()
+    assert np.median(off.residual[seen]) == pytest.approx(0.3, abs=0.02)
+    assert not np.isfinite(solve((column, row + 0.6, usable), (-1.0, -0.3)).elevation).any()
+
+
+def test_the_scene_scales_with_the_baseline() -> None:
+    """The same images with all lengths doubled: elevation and its error double, residual and ortho stay."""
+    maps = disparity(RIG, T_LOCAL_LEFT, nearest(plane(0.0, 0.1, -HEIGHT), ball((0.05, 0.9, -0.75), 0.3)))
+    small = solve(maps, (-0.8, -0.3))
+    T = RIG.T_right_left
+    rig = Rig(RIG.left, RIG.right, RigidTransform(T.rotation, 2.0 * T.translation))
+    lattice = Lattice.at(LATTICE.i0, LATTICE.j0, 2 * LATTICE.cell, LATTICE.rows, LATTICE.cols)
+    large = reconstruct(*maps, IMAGE, rig, T_LOCAL_LEFT, reference_plane(lattice), (-1.6, -0.6), PARAMS)
+    np.testing.assert_allclose(large.elevation, 2.0 * small.elevation, rtol=1e-5)
+    np.testing.assert_allclose(large.elevation_std, 2.0 * small.elevation_std, rtol=1e-3)
+    np.testing.assert_allclose(large.ortho, small.ortho, rtol=1e-4)
+
+
+def test_an_inclined_reference_plane_and_a_callable_of_ones_own() -> None:
+    """A slope seen from its own parallel plane 4 cm below it; and the same cells by a function written out."""
+    a, b, below = 0.2, -0.15, 0.04
+    maps = disparity(RIG, T_LOCAL_LEFT, plane(a, b, -HEIGHT))
+    normal = np.array([-a, -b, 1.0]) / math.sqrt(1.0 + a * a + b * b)
+    across = np.cross([0.0, 1.0, 0.0], normal)
+    across /= np.linalg.norm(across)
+    along = np.cross(normal, across)
+    foot = np.array([0.0, 0.9, -HEIGHT + 0.9 * b]) - below * normal
+    T = RigidTransform(np.column_stack([across, along, normal]), foot)
+    lattice = Lattice.snap((-0.2, 0.2, -0.2, 0.3), 0.01)
+
+    def own(rows: np.ndarray, cols: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        x, y = lattice.xs()[cols.astype(int)], lattice.ys()[rows.astype(int)]
+        return foot + np.outer(x, across) + np.outer(y, along), np.tile(normal, (rows.size, 1))
+
+    found = [
+        reconstruct(*maps, IMAGE, RIG, T_LOCAL_LEFT, surface, (-0.1, 0.2), PARAMS)
+        for surface in (inclined(lattice, T), Surface(lattice.rows, lattice.cols, own))
+    ]
+    seen = np.isfinite(found[0].elevation)
+    assert seen.mean() > 0.9
+    points = T.apply(np.dstack([lattice.xy(), np.full(lattice.shape, below)]).reshape(-1, 3)).reshape(*lattice.shape, 3)
+    assert (np.abs(found[0].elevation - below) <= tolerance(maps, points))[seen].all()
+    np.testing.assert_allclose(found[0].elevation, found[1].elevation, atol=1e-5)
+
+
+def test_other_reference_surfaces() -> None:
+    """The inside of a ball of radius 2 m seen from its middle: 5 cm inside a cylinder and a sphere of 2.05 m."""
+    radius, reference = 2.0, 2.05
+    column, row, usable = disparity(RIG, T_LOCAL_LEFT, lambda o, v: inside_ball(o, v, radius))
+    centre = np.zeros(3)
+    azimuth, latitude = np.radians(np.arange(75, 105, 0.5)), np.radians(np.arange(-35, -20, 0.5))
+    surfaces: list[tuple[Surface, float]] = [
+        (sphere(centre, reference, azimuth, latitude, inside=True), 1.0),
+        (cylinder(centre, reference, azimuth, reference * np.sin(latitude), inside=True), 0.0),
+    ]
+    for surface, is_sphere in surfaces:
+        dem = reconstruct(column, row, usable, IMAGE, RIG, T_LOCAL_LEFT, surface, (-0.3, 0.8), PARAMS)
+        seen = np.isfinite(dem.elevation)
+        assert seen.mean() > 0.5
+        z = np.repeat((reference * np.sin(latitude))[:, None], azimuth.size, axis=1)
+        truth = np.where(is_sphere, reference - radius, reference - np.sqrt(radius**2 - z**2))
+        errors = interpolation_error(np.where(usable, column, np.nan), np.where(usable, row, np.nan)) + 1e-3
+        bound = 3.0 * radius**2 / (RIG.left.fx * RIG.baseline) * errors
+        assert np.abs(dem.elevation - truth)[seen].max() <= bound
+
+
+def inside_ball(o: np.ndarray, v: np.ndarray, radius: float) -> np.ndarray:
+    a, b, c = (v**2).sum(-1), v @ o, o @ o - radius**2
+    return np.asarray((-b + np.sqrt(b * b - a * c)) / a)
+
+
+def test_a_block_border_shows_nowhere() -> None:
+    assert LATTICE.rows > locus_solve.BLOCK_ROWS
+    maps = disparity(RIG, T_LOCAL_LEFT, plane(0.1, 0.1, -HEIGHT))
+    whole = solve(maps, (-1.0, -0.3))
+    coarse_start = Lattice.at(LATTICE.i0, LATTICE.j0 - 16, LATTICE.cell, LATTICE.rows - 16, LATTICE.cols)
+    part = reconstruct(*maps, IMAGE, RIG, T_LOCAL_LEFT, reference_plane(coarse_start), (-1.0, -0.3), PARAMS)
+    for name in ("elevation", "residual", "ortho"):
+        assert np.allclose(getattr(whole, name)[16:], getattr(part, name), equal_nan=True, atol=2e-3), name
+
+
+def test_degraded_input() -> None:
+    column, row, usable = disparity(RIG, T_LOCAL_LEFT, plane(0.0, 0.0, -HEIGHT))
+    nothing = solve((np.full_like(column, np.nan), row, usable), (-1.0, -0.3))
+    assert not np.isfinite(nothing.elevation).any()
+    assert not np.isfinite(solve((column, row, np.zeros_like(usable)), (-1.0, -0.3)).ortho).any()
+    behind = Lattice.snap((-0.3, 0.3, -1.3, -0.5), 0.01)
+    dem = reconstruct(column, row, usable, IMAGE, RIG, T_LOCAL_LEFT, reference_plane(behind), (-1.0, 1.0), PARAMS)
+    assert not np.isfinite(dem.elevation).any()
+    away = Rig(RIG.left, RIG.right, RigidTransform(np.diag([-1.0, 1.0, -1.0]), [0.1, 0.0, 0.0]))
+    assert not np.isfinite(solve((column, row, usable), (-1.0, -0.3), away).elevation).any()
+    with raises("RIL-394"):
+        solve((column, row, usable), (-1.0, -0.3), Rig(RIG.left, RIG.right, RigidTransform.identity()))
+    with raises("RIL-396"):
+        solve((column[:-1], row, usable), (-1.0, -0.3))
+    with raises("RIL-395"):
+        solve((column, row, usable), (-0.3, -1.0))
+
+
+def bundles(rig: Rig, height: float, noise: np.random.Generator) -> dict[str, Bundle]:
+    column, row, usable = disparity(rig, T_LOCAL_LEFT, plane(0.0, 0.0, -height))
+    column = column + smooth_noise(column.shape, 0.1, noise)
+    arrays = {
+        "column_disparity": column.astype(np.float32),
+        "row_disparity": row.astype(np.float32),
+        "validity": np.where(usable, Validity.MATCHED, Validity.INTERPOLATED).astype(np.uint8),
+        "backmatch_error": np.where(usable, 0.1, np.nan).astype(np.float32),
+    }
+    arrays["backmatch_error"][:, :40] = 1.2
+    inputs = {"disparity": Bundle(arrays, {}), "rig": Bundle({}, {"rig": rig.to_dict()})}
+    up = T_LOCAL_LEFT.rotation[2].tolist()
+    level = level_stage.STAGE.run(level_stage.LevelParams(), {"up": up}, inputs)
+    return inputs | {"level": level, "left": Bundle({"level_0": IMAGE}, {})}
+
+
+def test_stage_in_both_frames() -> None:
+    inputs = bundles(RIG, HEIGHT, np.random.default_rng(2))
+    local = stage.STAGE.run(LocusParams(cell_size=0.01), {"pair": 3, "frame": "local"}, inputs)
+    check_outputs(stage.STAGE, local)
+    lattice = Lattice.from_dict(local.meta["lattice"])
+    assert lattice.cell == 0.01
+    assert local.meta["defined"] > 0.3
+    turn = RigidTransform(np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.array([2.0, 3.0, 0.25]))
+    poses = np.stack([np.full((3, 4), np.nan), (turn @ T_LOCAL_LEFT).matrix34])
+    world = stage.STAGE.run(
+        LocusParams(cell_size=0.01),
+        {"pair": 3, "frame": "world", "row": 1},
+        inputs | {"trajectory": Bundle({"poses": poses}, {}), "local": local},
+    )
+    check_outputs(stage.STAGE, world)
+    json.dumps([local.meta, world.meta], allow_nan=False)
+    assert "pose_covariance" not in world.meta
+    assert "pose_covariance" not in local.meta
+    # A quarter turn maps cells on cells: the same surface, computed anew, not resampled.
+    rows, cols = np.nonzero(np.isfinite(local["elevation"]))
+    xyz = turn.apply(np.column_stack([lattice.xy()[rows, cols], local["elevation"][rows, cols]]))
+    index = np.round(Lattice.from_dict(world.meta["lattice"]).index(xyz[:, :2])).astype(int)
+    found = world["elevation"][index[:, 0], index[:, 1]]
+    assert np.isfinite(found).mean() > 0.99
+    solved = roots.SOLVED_PX / LocusParams().sigma_disparity * local["elevation_std"][rows, cols]
+    assert np.nanmean(np.abs(found - xyz[:, 2]) <= 2.0 * solved + 1e-6) > 0.99
+    # Pixels that fail back-matching by 1.2 px are not used.
+    p = RIG.left.project(T_LOCAL_LEFT.inverse().apply(np.dstack([lattice.xy(), local["elevation"]])))
+    assert np.nanmin(p[..., 0]) >= 40
+
+
+def test_each_cell_has_the_error_of_its_own_pixel_where_the_matcher_gives_one() -> None:
+    inputs = bundles(RIG, HEIGHT, np.random.default_rng(2))
+    args, params = {"pair": 0, "frame": "local"}, LocusParams(cell_size=0.01)
+    plain = stage.STAGE.run(params, args, inputs)
+    shape = inputs["disparity"]["column_disparity"].shape
+    std = np.full(shape, 0.1, np.float32)
+    std[:, shape[1] // 2 :] = 0.6
+    disparity = Bundle({**inputs["disparity"].arrays, "disparity_std": std}, {})
+    own = stage.STAGE.run(params.model_copy(update={"max_std": 1.0}), args, inputs | {"disparity": disparity})
+    both = np.isfinite(plain["elevation"])  # which the typical error bounds, and here a metre does not
+    np.testing.assert_array_equal(own["elevation"][both], plain["elevation"][both])
+    lattice = Lattice.from_dict(own.meta["lattice"])
+    pixels = RIG.left.project(T_LOCAL_LEFT.inverse().apply(np.dstack([lattice.xy(), own["elevation"]])))
+    ratio = own["elevation_std"] / plain["elevation_std"] * LocusParams().sigma_disparity
+    for side, expected in ((pixels[..., 0] < shape[1] // 2 - 1, 0.1), (pixels[..., 0] > shape[1] // 2, 0.6)):
+        assert np.isfinite(ratio[side]).sum() > 100
+        np.testing.assert_allclose(ratio[side & np.isfinite(ratio)], expected, rtol=1e-5)
+
+
+def test_stage_parameters_of_the_lattice() -> None:
+    inputs = bundles(RIG, HEIGHT, np.random.default_rng(2))
+    args = {"pair": 0, "frame": "local"}
+    auto = stage.STAGE.run(LocusParams(), args, inputs)
+    assert auto.meta["lattice"]["cell"] == inputs["level"].meta["cell_size"]
+    first = Bundle({}, inputs["level"].meta | {"cell_size": 0.02})
+    shared = stage.STAGE.run(LocusParams(), args, inputs | {"reference": first})
+    assert shared.meta["lattice"]["cell"] == 0.02
+    extent = stage.STAGE.run(LocusParams(cell_size=0.01, extent=(-0.1, 0.1, 0.6, 0.9)), args, inputs)
+    assert Lattice.from_dict(extent.meta["lattice"]) == Lattice.snap((-0.1, 0.1, 0.6, 0.9), 0.01)
+    with raises("RIL-391"):
+        stage.STAGE.run(LocusParams(max_sigma=1e-6, extent=(-0.1, 0.1, 0.6, 0.9)), args, inputs)
+    with raises("RIL-387"):
+        stage.STAGE.run(LocusParams(cell_size=0.01, extent=(-0.3, 0.3, -5.0, -4.0)), args, inputs)
+    with raises("RIL-356"):
+        stage.STAGE.run(LocusParams(cell_size=1e-5, extent=(-1, 1, 0, 1)), args, inputs)
+    with raises("RIL-383"):
+        stage.STAGE.run(LocusParams(extent=(1, -1, 0, 1)), args, inputs)
+    empty = Bundle({"elevation": np.full((3, 3), np.nan, np.float32)}, {"lattice": Lattice.at(0, 0, 1, 3, 3).to_dict()})
+    poses = Bundle({"poses": T_LOCAL_LEFT.matrix34[None]}, {})
+    with raises("RIL-384"):
+        stage.STAGE.run(
+            LocusParams(), {"pair": 0, "frame": "world", "row": 0}, inputs | {"trajectory": poses, "local": empty}
+        )
+
+
+def test_the_automatic_extent_ends_where_pixels_cover_too_many_cells() -> None:
+    """Camera 1.65 m above a street: a pixel at y covers y^2 / (f h) along the range."""
+    rig = toed_in_rig()
+    straight = Rig(rig.left, rig.left, RigidTransform(np.eye(3), [-0.5, 0.0, 0.0]))
+    level = {"T_local_left": pitched(0.0).to_list(), "plane": [0.0, 0.0, -1.65]}
+    lattice = stage.local_lattice(straight, level, 0.1, LocusParams(max_range_cells=5.0))
+    assert lattice.bounds[3] == pytest.approx(math.sqrt(5 * 0.1 * rig.left.fy * 1.65), rel=0.05)
+    near = 1.65 * rig.left.fy / (rig.left.height - 1 - rig.left.cy)
+    assert lattice.bounds[2] == pytest.approx(near, rel=0.05)

@@ -1,0 +1,115 @@
+"""Lanes and steps of the Locus kernel against plain loops over single points."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from stages.terrain.locus import points
+from stages.terrain.locus.lines import (
+    BOTTOM,
+    COUNT,
+    DZ,
+    FOOT,
+    HIGH,
+    LAST,
+    LOW,
+    MARGIN,
+    NORMAL,
+    START,
+    TOP,
+    clip,
+    lines,
+    spans,
+)
+from stages.terrain.locus.lines import PLANES as LINE_PLANES
+from stages.terrain.locus.points import LANES, POINT_PLANES, POINTS, STEPS, Z, climb, meet, pixels, project
+
+WIDTH, HEIGHT = 40, 30
+LEFT = np.array([[50.0, 0.0, 20.0, 3.0], [0.0, 50.0, 15.0, -2.0], [0.0, 0.0, 1.0, 1.0]])
+RIGHT = np.array([[50.0, 0.0, 20.0, -4.0], [0.0, 50.0, 15.0, -1.0], [0.0, 0.0, 1.0, 1.02]])
+EPIPOLE = np.array([-7.0, 1.0, 0.02])
+SIZES = np.array([WIDTH, HEIGHT, WIDTH, HEIGHT], float)
+
+
+def cells(n: int = 20, spread: float = 0.3) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Feet and normals (n, 3), and lanes that hold them and their lines."""
+    rng = np.random.default_rng(1)
+    feet, normals = rng.uniform(-spread, spread, (n, 3)), rng.normal(size=(n, 3)) * 0.2 + [0.0, 0.0, 1.0]
+    lanes = np.zeros(LINE_PLANES * LANES)
+    for k in range(3):
+        lanes[FOOT + k * LANES :][:n], lanes[NORMAL + k * LANES :][:n] = feet[:, k], normals[:, k]
+    lines(n, LEFT, RIGHT, lanes)
+    return feet, normals, lanes
+
+
+def pixel(projection: np.ndarray, point: np.ndarray) -> np.ndarray:
+    h = projection[:, :3] @ point + projection[:, 3]
+    return h[:2] / h[2]
+
+
+def mismatch(point: np.ndarray, disparity: np.ndarray) -> tuple[float, float]:
+    p, q = pixel(LEFT, point), pixel(RIGHT, point)
+    if not (0 <= p[0] < WIDTH - 1 and 0 <= p[1] < HEIGHT - 1):
+        return np.nan, np.nan
+    (c, r), (fx, fy) = p.astype(int), p % 1
+    d = (1 - fy) * ((1 - fx) * disparity[r, c] + fx * disparity[r, c + 1])
+    d = d + fy * ((1 - fx) * disparity[r + 1, c] + fx * disparity[r + 1, c + 1])
+    g, e = p + d - q, q * EPIPOLE[2] - EPIPOLE[:2]
+    e /= np.linalg.norm(e)
+    return float(g @ e), float(g[1] * e[0] - g[0] * e[1])
+
+
+def test_points_of_lanes_and_of_steps_equal_single_points() -> None:
+    feet, normals, lanes = cells()
+    rng = np.random.default_rng(2)
+    disparity = rng.normal(size=(HEIGHT, WIDTH, 2)).astype(np.float32)
+    disparity[10:12, 5:9] = np.nan
+    flat, room = disparity.ravel(), np.zeros(POINT_PLANES * POINTS)
+    step, dz, found = 3.0, 0.02, 0
+    for way in (-1.0, 1.0):
+        for k in range(len(feet)):
+            climb(lanes, k, -0.2, step, way, dz, WIDTH, HEIGHT, room[STEPS * k :])
+        meet(STEPS * len(feet), EPIPOLE, WIDTH, flat, room)
+        steps = room.copy()
+        for m in range(STEPS):
+            z = -0.2 + (step + way * m) * dz
+            lanes[Z : Z + len(feet)] = z
+            project(lanes, len(feet), WIDTH, HEIGHT, room)
+            meet(len(feet), EPIPOLE, WIDTH, flat, room)
+            for k in range(len(feet)):
+                expected = mismatch(feet[k] + z * normals[k], disparity)
+                for plane, value in zip((points.S, points.ACROSS), expected, strict=True):
+                    one, among = pixels(room, plane, k), pixels(steps, plane, STEPS * k + m)
+                    assert one == pytest.approx(value, abs=1e-9, nan_ok=True)
+                    assert np.array_equal(one, among, equal_nan=True)
+                found += np.isfinite(expected[0])
+    assert 0.1 < found / (2 * STEPS * len(feet)) < 0.98
+
+
+def test_lines_end_where_an_image_does_and_steps_are_a_pixel_at_most() -> None:
+    feet, normals, lanes = cells(30, 0.6)
+    n = len(feet)
+    lanes[LOW : LOW + n], lanes[HIGH : HIGH + n] = 0.05, 0.1
+    clip(n, SIZES, -0.4, 2.0, lanes)
+    spans(n, lanes)
+    short = 0
+    for k in range(n):
+        bottom, top, dz, count = (lanes[plane + k] for plane in (BOTTOM, TOP, DZ, COUNT))
+        z = np.linspace(-0.4, 2.0, 4001)
+        ends = [[pixel(p, feet[k] + v * normals[k]) for v in z] for p in (LEFT, RIGHT)]
+        inside = np.all([(p >= 0) & (p <= [WIDTH - 1, HEIGHT - 1]) for p in np.array(ends)], axis=(0, 2))
+        if not inside.any():
+            assert top - bottom < 1e-3
+            continue
+        assert bottom == pytest.approx(z[inside][0], abs=1e-3)
+        assert top == pytest.approx(z[inside][-1], abs=1e-3)
+        short += top < 2.0 or bottom > -0.4
+        assert count * dz == pytest.approx(top - bottom)
+        for p in (LEFT, RIGHT):
+            line = np.array([pixel(p, feet[k] + v * normals[k]) for v in np.linspace(bottom, top, int(count) + 1)])
+            assert np.linalg.norm(np.diff(line, axis=0), axis=1).max() <= 1.0 + 1e-9
+        start, last = (bottom + lanes[plane + k] * dz for plane in (START, LAST))
+        assert start >= min(0.1 + MARGIN * dz, top) - 1e-9
+        assert last <= 0.05 - MARGIN * dz
+    assert short > n // 2

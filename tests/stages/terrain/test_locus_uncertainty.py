@@ -1,0 +1,93 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from stages.terrain.locus.uncertainty import ALONE, APART, FLOOR, LEAST_GRADIENT, MOVED, REST, SHADE, STEP, from_both
+
+SHAPE = (40, 50)
+SCALE = 500.0
+CONTRAST, AREA, NOISE, GREY = 8.0, 0.5, 2.0, 100.0
+RISE, AWAY, SHIFT = 2e-4, 1.5e-4, 1e-4
+
+
+def ground(rise: float = RISE) -> tuple[np.ndarray, np.ndarray]:
+    """A slope across the rows' cells, and two images whose difference is a chequerboard of +-NOISE."""
+    rows, cols = np.indices(SHAPE)
+    elevation = (rise * cols).astype(np.float32)
+    seen = np.empty((6, *SHAPE), np.float32)
+    seen[0] = GREY
+    seen[1] = GREY - NOISE * np.where((rows + cols) % 2, 1.0, -1.0)
+    seen[2], seen[5] = 0.0, CONTRAST * SCALE
+    seen[3], seen[4] = SCALE, AREA
+    return elevation, seen
+
+
+def uniform(value: float) -> np.ndarray:
+    return np.full(SHAPE, value)
+
+
+def std(elevation: np.ndarray, seen: np.ndarray, moved: float = 0.0, apart: float | np.ndarray = 0.0) -> np.ndarray:
+    return from_both(elevation, seen, uniform(moved), uniform(1.0) * apart, uniform(0.5))
+
+
+def expected(*, rise: float = RISE, grey: float = GREY, apart: float = 0.0, moved: float = 0.0) -> float:
+    """By hand: the chequerboard's median difference is its height, its local mean nearly nothing."""
+    noise = 1.4826 * NOISE
+    variance = FLOOR**2 + STEP * (SCALE * rise) ** 2 + REST * NOISE**2 / (25 * (CONTRAST**2 * AREA + LEAST_GRADIENT))
+    variance += (SHADE * noise / grey) ** 2 + (APART * SCALE * apart) ** 2 + (MOVED * SCALE * moved) ** 2
+    return float(np.sqrt(variance) / SCALE)
+
+
+@pytest.mark.parametrize("term", [{}, {"apart": AWAY}, {"moved": SHIFT}, {"apart": AWAY, "moved": SHIFT}])
+def test_variances_add_up_as_by_hand(term: dict[str, float]) -> None:
+    np.testing.assert_allclose(std(*ground(), **term)[20, 25], expected(**term), rtol=5e-3)
+
+
+def test_each_part_counts() -> None:
+    """Of what the figures above are made: none of the parts is lost among the others."""
+    whole = expected(apart=AWAY, moved=SHIFT)
+    for less in (
+        expected(apart=0.0, moved=SHIFT),
+        expected(apart=AWAY, moved=0.0),
+        expected(rise=0.0, apart=AWAY, moved=SHIFT),
+        expected(grey=1e6, apart=AWAY, moved=SHIFT),
+    ):
+        assert less < 0.99 * whole
+
+
+def test_in_the_dark_there_is_no_contrast_to_match() -> None:
+    """Gradients as strong as in the light, but of grey values that cannot hold them: noise."""
+    elevation, seen = ground()
+    seen[:2, :, 30:] += 8.0 - GREY
+    found = std(elevation, seen)
+    np.testing.assert_allclose(found[20, 15], expected(), rtol=5e-3)
+    np.testing.assert_allclose(found[20, 42], expected(grey=8.0), rtol=5e-3)
+    assert found[20, 42] > 3.0 * found[20, 15]
+
+
+def test_where_one_direction_found_nothing_a_difference_is_supposed() -> None:
+    apart = uniform(AWAY)
+    apart[:, 20:] = np.nan
+    found = std(*ground(), apart=apart)
+    np.testing.assert_allclose(found[20, 40], expected(apart=ALONE / SCALE), rtol=5e-3)
+    np.testing.assert_allclose(found[20, 20], expected(apart=AWAY), rtol=5e-3)  # its neighbours have both
+    np.testing.assert_allclose(found[20, 10], expected(apart=AWAY), rtol=5e-3)
+
+
+def test_cells_that_the_images_do_not_show_keep_theirs() -> None:
+    elevation, seen = ground()
+    elevation[5:8, 5:8] = np.nan
+    seen[:, 30:33, 30:33] = np.nan
+    found = std(elevation, seen)
+    np.testing.assert_array_equal(found[5:8, 5:8], 0.5)
+    np.testing.assert_array_equal(found[30:33, 30:33], 0.5)
+    assert np.isfinite(found).all()
+    assert found[4, 6] < 0.01
+    np.testing.assert_array_equal(std(uniform(np.nan).astype(np.float32), seen), 0.5)
+
+
+def test_images_without_noise_or_contrast_leave_the_rest() -> None:
+    elevation, seen = ground(rise=0.0)
+    seen[1], seen[5] = seen[0], 0.0
+    np.testing.assert_allclose(std(elevation, seen)[20, 25], FLOOR / SCALE, rtol=1e-3)

@@ -1,0 +1,119 @@
+"""The audit names the model that was planted with an error, tells pose from noise, and is silent where all is well."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+from seam_scenes import SIGMA, along
+
+from stages.core.declare import Bundle, NoParams, check_outputs
+from stages.geometry.lattice import Lattice
+from stages.terrain import overlap_audit as audit_stage
+from stages.terrain import overlap_qa as seam_stage
+from stages.terrain.overlap_audit import SeamAuditParams
+
+PLANTED = 12
+
+
+def audited(dems: dict[int, Bundle]) -> tuple[list[Bundle], dict]:
+    seams, pairs = [], sorted(dems)
+    for i, pair in enumerate(pairs):
+        inputs = {"dem": dems[pair], "others": [dems[other] for other in pairs[:i]][::-1]}
+        seams.append(seam_stage.STAGE.run(NoParams(), {}, inputs))
+        check_outputs(seam_stage.STAGE, seams[-1])
+        json.dumps(seams[-1].meta, allow_nan=False)
+    centres = {str(p): Lattice.from_dict(b.meta["lattice"]).xy().mean(axis=(0, 1)).tolist() for p, b in dems.items()}
+    found = audit_stage.STAGE.run(SeamAuditParams(), {"centres": centres}, {"seams": seams})
+    json.dumps(found.meta, allow_nan=False)
+    return seams, dict(found.meta)
+
+
+def test_models_that_agree_are_not_suspected() -> None:
+    seams, meta = audited(along(7))
+    assert [m["pair"] for m in meta["models"] if m["found"] or m["contradicts"]] == []
+    assert meta["warnings"] == []
+    assert meta["variance_factor"] < 2.5
+    facts = [s for bundle in seams for s in bundle.meta["seams"]]
+    assert len(facts) == 6 + 5 + 4  # each model reaches over the next three steps
+    for s in facts:
+        # noise of both models, and their sigma, are SIGMA
+        assert s["cells"] < 5000 or s["noise"] == pytest.approx(math.sqrt(2) * SIGMA, rel=0.15)
+        assert s["expected"] == pytest.approx(math.sqrt(2) * SIGMA, rel=1e-5)
+
+
+@pytest.mark.parametrize("where", [0, PLANTED, 24])
+def test_a_planted_bias_of_half_a_millimetre_is_found_and_named(where: int) -> None:
+    _, meta = audited(along(7, bias={where: 5e-4}))
+    assert [m["pair"] for m in meta["models"] if m["found"]] == [where]
+    worst = meta["models"][0]
+    assert worst["pair"] == where
+    assert worst["bias"] == pytest.approx(5e-4, abs=4 * worst["sigma"][0])
+    assert worst["sigma"][0] < 1e-4
+    assert not worst["contradicts"]  # it is less than the sigma of a cell allows
+    assert meta["warnings"] == []
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_planted_tilt_of_a_twentieth_of_a_degree_is_found_and_named(axis: int) -> None:
+    tilt = [0.0, 0.0]
+    tilt[axis] = math.radians(0.05)
+    _, meta = audited(along(7, tilt={PLANTED: tilt}))
+    assert [m["pair"] for m in meta["models"] if m["found"]] == [PLANTED]
+    worst = meta["models"][0]
+    for got, true, sigma in zip(worst["tilt"], tilt, worst["sigma"][1:], strict=True):
+        assert got == pytest.approx(true, abs=4 * sigma)
+    assert worst["sigma"][1 + axis] < math.radians(0.02)
+
+
+def test_a_model_beyond_its_sigma_is_warned_of_by_name_and_figure() -> None:
+    _, meta = audited(along(7, bias={PLANTED: 0.01}))
+    (line,) = meta["warnings"]
+    assert line.startswith("1 of 7 elevation models contradict")
+    assert f"pair {PLANTED} against pairs 0, 4, 8, 16, ...: 10 mm where sigma allows 0.71 mm" in line
+    assert "either may be wrong" not in line
+    assert [m["pair"] for m in meta["models"] if m["contradicts"]] == [PLANTED]
+    assert PLANTED in (meta["seams"][0]["pair"], meta["seams"][0]["other"])
+
+
+def test_of_two_models_nobody_can_tell_which_is_wrong() -> None:
+    _, meta = audited(along(2, bias={4: 0.01}))
+    assert "either may be wrong" in meta["warnings"][0]
+
+
+def test_two_wrong_models_are_both_named() -> None:
+    _, meta = audited(along(12, bias={PLANTED: 0.002, 32: -0.003}))
+    assert [m["pair"] for m in meta["models"][:2]] == [32, PLANTED]
+    assert {m["pair"] for m in meta["models"] if m["found"]} == {32, PLANTED}
+
+
+def test_noise_that_sigma_does_not_know_is_no_error_of_pose() -> None:
+    dems = along(7)
+    rough = dems[PLANTED]
+    rng = np.random.default_rng(5)
+    z = rough["elevation"] + rng.normal(0, 4 * SIGMA, rough["elevation"].shape).astype(np.float32)
+    seams, meta = audited({**dems, PLANTED: Bundle({**rough.arrays, "elevation": z}, rough.meta)})
+    assert not any(m["found"] for m in meta["models"])
+    for s in (s for bundle in seams for s in bundle.meta["seams"]):
+        excess = s["noise"] / s["expected"]
+        assert (excess > 2.5) == (PLANTED in (s["pair"], s["other"]))
+
+
+def test_exposure_is_read_from_the_same_cells() -> None:
+    seams, _ = audited(along(3, grey={4: 130.0}))
+    got = {(s["pair"], s["other"]): s["log_ratio"] for b in seams for s in b.meta["seams"]}
+    wanted = {(4, 0): math.log(1.3), (8, 4): -math.log(1.3), (8, 0): 0.0}
+    assert got == {k: pytest.approx(v, abs=0.005) for k, v in wanted.items()}
+
+
+def test_the_map_holds_the_difference() -> None:
+    dems = along(2, rows=400, cols=330, step=100, bias={4: 0.3})
+    (bundle,) = audited(dems)[0][1:]
+    (facts,) = bundle.meta["seams"]
+    drawn = bundle["difference_0"]
+    assert max(drawn.shape) <= 160
+    assert np.nanmedian(drawn) == pytest.approx(0.3, abs=1e-4)
+    x_min, x_max, _, _ = facts["map"]["bounds"]
+    assert drawn.shape[1] == math.ceil((x_max - x_min) / facts["map"]["step"] - 1e-9)
