@@ -43,7 +43,7 @@ from pipeline.commands.options import (
     options,
     prepare,
 )
-from pipeline.plain import plain_output, raw
+from pipeline.engine.plain import plain_output, raw
 
 LONGEST = 1000
 """Characters of a complaint."""

@@ -11,6 +11,24 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 MAY_IMPORT = {"stages": {"stages"}, "datasets": {"datasets", "stages"}, "pipeline": {"pipeline", "datasets", "stages"}}
+FLOORS = (
+    "stages.core",
+    "stages.geometry stages.numeric",
+    "stages.imaging stages.hazard stages.terrain",
+    "stages.hfvm stages.terrain.locus stages.planning stages.driving",
+    "stages.odometry stages.planning.local_planner",
+    "stages.odometry.resection stages.calibration",
+    "stages.evaluation",
+    "datasets",
+    "pipeline.engine",
+    "pipeline.flow",
+    "pipeline.export",
+    "pipeline.report",
+    "pipeline.runs",
+    "pipeline.commands",
+    "pipeline",
+)
+"""Rooms from the ground up: a module imports from its own room and from the floors below it."""
 NOT_IN_STAGES = {"zarr", "dask", "distributed", "pathlib", "os", "time", "datetime", "logging", "rich", "random"}
 CODE = re.compile(r"RIL-\d{3}")
 MODULES = sorted(p for name in MAY_IMPORT for p in (ROOT / name).rglob("*.py"))
@@ -32,6 +50,46 @@ def test_imports_point_one_way(path: Path) -> None:
     package = path.relative_to(ROOT).parts[0]
     ours = imported(path) & (set(MAY_IMPORT) | {"."})
     assert ours <= MAY_IMPORT[package]
+
+
+def room(module: str) -> str:
+    """The longest name in the table that a module's name begins with."""
+    return max((r for floor in FLOORS for r in floor.split() if f"{module}.".startswith(f"{r}.")), key=len)
+
+
+def floor(name: str) -> int:
+    """Number of a room's floor."""
+    return next(k for k, floor in enumerate(FLOORS) if name in floor.split())
+
+
+def upwards(module: str, text: str) -> list[str]:
+    """Modules of other rooms that a module imports and that are not below it."""
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            found |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+    ours = {n for n in found if n in NAMES}
+    return sorted(n for n in ours if room(n) != room(module) and floor(room(n)) >= floor(room(module)))
+
+
+def name_of(path: Path) -> str:
+    """Dotted name of a module."""
+    return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+
+
+NAMES = {name_of(p) for p in MODULES if p.name != "__init__.py"}
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_imports_point_downwards(path: Path) -> None:
+    assert not upwards(name_of(path), path.read_text(encoding="utf-8"))
+
+
+def test_the_table_itself_sees_an_import_upwards() -> None:
+    assert upwards("stages.geometry.lens", "from stages.terrain import merge") == ["stages.terrain.merge"]
+    assert upwards("pipeline.engine.task", "def f():\n    import pipeline.cli") == ["pipeline.cli"]
 
 
 @pytest.mark.parametrize("path", [p for p in MODULES if p.relative_to(ROOT).parts[0] == "stages"], ids=lambda p: p.stem)

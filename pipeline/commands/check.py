@@ -17,18 +17,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datasets.protocol import CAMERAS, Sequence, Source
-from pipeline.commands import input_checks as verdicts
-from pipeline.commands import synchrony
-from pipeline.commands.input_checks import Verdict
 from pipeline.engine.store.folder import Ref, Store, at
 from pipeline.engine.store.location import Location
 from pipeline.engine.task import Refs, Spec, ensure
 from pipeline.flow import config as configuration
+from pipeline.runs import input_checks as verdicts
+from pipeline.runs import synchrony
+from pipeline.runs.input_checks import Verdict
 from stages.core.declare import NoParams
 from stages.core.errors import RilleError
 from stages.geometry.epipolar import beyond_infinity
+from stages.geometry.triangulation import inverse_depth
 from stages.imaging.image_quality import Look, look
-from stages.terrain.ground import inverse_depth
 
 Floats = NDArray[np.float64]
 

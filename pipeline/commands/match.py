@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, TextIO
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.engine.plain import raw
 from pipeline.flow import config as configuration
-from pipeline.plain import raw
 from stages.core.errors import ConfigError, InputError
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, TextIO
 
-from pipeline.plain import plain, raw
+from pipeline.engine.plain import plain, raw
 from stages.core.errors import ConfigError
 
 if TYPE_CHECKING:

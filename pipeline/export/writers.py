@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 from datasets.files import MOST_BYTES
 from datasets.georeference import Georeference
 from datasets.reading import open_regular
-from pipeline.plain import plain
+from pipeline.engine.plain import plain
 from stages.core.errors import InputError
 from stages.geometry.lattice import Lattice
 

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 from datasets.protocol import Sequence
 from pipeline.flow import config as configuration
-from pipeline.export.early import Ahead
+from pipeline.runs.early import Ahead
 from pipeline.engine.store.artifact import DamagedError
 from pipeline.engine.code_digest import remember
 from pipeline.engine.graph import Graph
@@ -107,7 +107,7 @@ def settings(options: Options) -> Settings:
     """Open a sequence and settle its configuration."""
     from datasets.registry import open_sequence
     from pipeline.flow import unread
-    from pipeline.commands.input_checks import judge_rig
+    from pipeline.runs.input_checks import judge_rig
 
     read = configuration.read_toml(options.config) if options.config else {}
     configuration.merge(read, configuration.parse_assignments(options.assignments))
@@ -168,7 +168,7 @@ class _Opened:
 
     def view(self, **late: Any) -> RunView:
         """What is drawn; ``late`` is what only the end of the run knows."""
-        from pipeline.export import run_files
+        from pipeline.runs import run_files
         from pipeline.report import RunView
 
         return RunView(
@@ -289,7 +289,7 @@ def _stands(options: Options, result: Result, earlier: Path, stamped: str) -> bo
 def _write(opened: _Opened, result: Result, ahead: Ahead) -> None:
     """Everything that the run leaves; nothing of it where an artifact was found damaged."""
     from pipeline.engine import events
-    from pipeline.export import run_files
+    from pipeline.runs import run_files
 
     if not (opened.folder / "config.toml").exists():
         raise RilleError(

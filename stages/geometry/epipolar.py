@@ -20,7 +20,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from stages.geometry.geometry import Rig, RigidTransform, rotation_exp
-from stages.terrain.ground import inverse_depth
+from stages.geometry.triangulation import inverse_depth
 
 Floats = NDArray[np.float64]
 

@@ -11,7 +11,7 @@ cross a path of no climb could be of any length. Caution ground costs a toll.
 
 Footprint. The middle of the vehicle never enters a hazardous or unknown cell; and in the direction of each edge its
 wheels keep the margin from ground that is hazardous to a wheel, and its middle keeps it from places where the vehicle
-as a whole would tilt or strike (:mod:`stages.planning.local_planner.configuration_space`). Of unknown ground three
+as a whole would tilt or strike (:mod:`stages.planning.configuration_space`). Of unknown ground three
 shares are tried: none under its outline, else none under its wheels, else none under its middle. The last happens
 where the elevation model is narrower than the vehicle, as beside the cameras; the result says so (``ground``).
 

@@ -15,7 +15,7 @@ from stages.hazard.risk import CAUTION, HAZARDOUS, UNKNOWN, window_cells
 from stages.hazard.vehicle import Vehicle
 from stages.numeric.windows import window_mean
 from stages.planning import grid8
-from stages.planning.local_planner.configuration_space import Stand
+from stages.planning.configuration_space import Stand
 from stages.planning.row_grid import RowGrid
 
 Floats = NDArray[np.float64]

@@ -25,7 +25,8 @@ from stages.core.validity import matched
 from stages.geometry.epipolar import exchanged, fits
 from stages.geometry.geometry import Rig, RigidTransform, level_rotation
 from stages.geometry.pose_arrays import NO_VERTICAL
-from stages.terrain.ground import MIN_POINTS, GroundPlane, fit_plane, inverse_depth, rounded_cell, view_ground
+from stages.geometry.triangulation import inverse_depth
+from stages.terrain.ground import MIN_POINTS, GroundPlane, fit_plane, rounded_cell, view_ground
 
 Floats = NDArray[np.float64]
 Samples = tuple[Floats, Floats, Floats]

@@ -129,7 +129,7 @@ def test_where_nothing_is_new_the_latest_run_stands(
     folders = set(stands.parent.iterdir())
     capsys.readouterr()
     with monkeypatch.context() as patch:
-        patch.setattr("pipeline.export.run_files.write", lambda *_: pytest.fail("something was drawn"))
+        patch.setattr("pipeline.runs.run_files.write", lambda *_: pytest.fail("something was drawn"))
         assert session.reconstruct(options(cold)) == 0
     assert capsys.readouterr().out.split()[0] == str(stands)
     assert set(stands.parent.iterdir()) == folders

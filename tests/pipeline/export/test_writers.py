@@ -18,8 +18,6 @@ from raising import raises
 from toys.finished import FRAMES, bundles, checked, checks, view
 
 from datasets.georeference import Georeference
-from pipeline.export import run_files
-from pipeline.export.early import Early
 from pipeline.export.frames_json import FILES, describe
 from pipeline.export.writers import (
     replacing,
@@ -31,6 +29,8 @@ from pipeline.export.writers import (
     write_trajectory_kitti,
     write_trajectory_tum,
 )
+from pipeline.runs import run_files
+from pipeline.runs.early import Early
 from stages.geometry.geometry import rotation_exp
 from stages.geometry.lattice import Lattice
 

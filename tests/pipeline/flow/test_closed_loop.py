@@ -115,8 +115,8 @@ def test_driven_again_nothing_is_computed_and_all_is_the_same(arrived: tuple[Dri
 @pytest.mark.slow
 def test_killed_in_the_middle_it_goes_on_to_the_same_bits(arrived: tuple[Drive, Result], tmp_path: Path) -> None:
     here, cache = Path(__file__).parent, tmp_path / "cache"
-    program = "import sys, pathlib, test_drive; test_drive.drive(pathlib.Path(sys.argv[1]))"
-    paths = os.pathsep.join(map(str, (here, *here.parents[:2])))
+    program = "import sys, pathlib, test_closed_loop; test_closed_loop.drive(pathlib.Path(sys.argv[1]))"
+    paths = os.pathsep.join(map(str, (here, *here.parents[:3])))
     driving = subprocess.Popen([sys.executable, "-c", program, str(cache)], env=os.environ | {"PYTHONPATH": paths})
     try:
         while len(list(cache.glob("artifacts/leg/*/*/manifest.json"))) < 2:

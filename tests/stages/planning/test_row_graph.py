@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
-from stages.planning.local_planner.configuration_space import LEFT, RIGHT, STRAIGHT
+from stages.planning.configuration_space import LEFT, RIGHT, STRAIGHT
 from stages.planning.row_graph import UNREACHED, leading, plan, sweep
 
 

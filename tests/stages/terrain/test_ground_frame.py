@@ -12,8 +12,9 @@ from terrain_scenes import ball, box, disparity, nearest, pitched, plane, smooth
 from stages.core.declare import Bundle
 from stages.core.validity import Validity
 from stages.geometry.geometry import Camera, Rig, RigidTransform
+from stages.geometry.triangulation import inverse_depth
 from stages.terrain import ground_frame as level_stage
-from stages.terrain.ground import _singular_values, inverse_depth
+from stages.terrain.ground import _singular_values
 from stages.terrain.ground_frame import LevelParams, level
 
 RIG = toed_in_rig()

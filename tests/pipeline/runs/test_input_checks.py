@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from datasets.protocol import Positions
-from pipeline.commands import input_checks
+from pipeline.runs import input_checks
 from stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
 from stages.imaging.image_quality import Look, look
 

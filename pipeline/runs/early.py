@@ -94,7 +94,7 @@ class Ahead:
             return self._made
 
     def _tasks(self) -> dict[str, Callable[[], None]]:
-        from pipeline.export import run_files
+        from pipeline.runs import run_files
         from pipeline.report import gallery
         from pipeline.report.gather import Scene
 

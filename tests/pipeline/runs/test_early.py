@@ -14,9 +14,9 @@ from toys.finished import bundles, view
 from pipeline.engine import scheduler
 from pipeline.engine.graph import Graph
 from pipeline.engine.store.folder import Store
-from pipeline.export import early as ahead_module
-from pipeline.export import run_files
-from pipeline.export.early import Ahead, Early
+from pipeline.runs import early as ahead_module
+from pipeline.runs import run_files
+from pipeline.runs.early import Ahead, Early
 from pipeline.report import canvas, gallery
 from pipeline.report.block import Block
 from pipeline.report.gather import Scene

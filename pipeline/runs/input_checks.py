@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datasets.protocol import Positions, Rows
-from pipeline.commands.synchrony import best_shift
+from pipeline.runs.synchrony import best_shift
 from stages.geometry.geometry import Rig, RigidTransform
 from stages.imaging.image_quality import Look
 
@@ -291,7 +291,7 @@ def judge_epipolar(facts: Mapping[str, Any]) -> list[Verdict]:
 
 def judge_synchrony(spreads: Mapping[int, list[float | None]]) -> list[Verdict]:
     """Whether the right images are of the same moments; ``spreads`` [px] by shift, see
-    :mod:`pipeline.commands.synchrony`."""
+    :mod:`pipeline.runs.synchrony`."""
     named = [value for value in spreads[0] if value is not None]
     if not named:
         return []

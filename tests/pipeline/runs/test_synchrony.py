@@ -6,8 +6,8 @@ import cv2
 import pytest
 
 from datasets.registry import open_sequence
-from pipeline.commands import synchrony
-from pipeline.commands.input_checks import judge_synchrony
+from pipeline.runs import synchrony
+from pipeline.runs.input_checks import judge_synchrony
 
 
 @pytest.mark.data

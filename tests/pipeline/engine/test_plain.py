@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline import cli
+from pipeline.engine.plain import UNSEEN, Plain, plain, plain_output
 from pipeline.export.writers import write_table
-from pipeline.plain import UNSEEN, Plain, plain, plain_output
 
 ESCAPE = "\x1b]0;owned\x07\x1b[2J\u202etxt.\x9b1m"
 

@@ -13,12 +13,12 @@ import numpy as np
 from pipeline.engine.graph import Graph, Handle
 from pipeline.engine.store.folder import GoneError, Store
 from pipeline.export import writers as files
-from pipeline.export.early import Early
 from pipeline.export.frames_json import describe
 from pipeline.export.terrain_zarr import write_terrain
 from pipeline.report import RunView, TaskRow, draw, write_report
 from pipeline.report.canvas import ground_limits
 from pipeline.report.comparison import compare
+from pipeline.runs.early import Early
 from stages.core.declare import Array, Bundle
 from stages.geometry.lattice import Lattice, mosaic, union
 from stages.geometry.pose_arrays import NO_VERTICAL
