@@ -39,7 +39,7 @@ def test_a_computed_task_tells_all_that_it_was_made_from(three):
     assert lines[0] == "scale/2: stage scale, computed in run toy/3"
     assert lines[1] == "why           params.offset 0.0 -> 0.5"
     text = "\n".join(lines)
-    numbers = next(r for r in lookup.ledger.read(third / "ledger.jsonl") if r["label"] == "numbers/2")
+    numbers = next(r for r in lookup.events.read(third / "ledger.jsonl") if r["label"] == "numbers/2")
     assert f"input         values       numbers/2                digest {numbers['digest'][:12]}, cached" in lines
     assert "parameter     scale.offset = 0.5" in text
     assert "stages.core.declare" in text

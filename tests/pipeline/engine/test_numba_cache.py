@@ -106,7 +106,7 @@ def checkout(tmp_path):
         stages.mkdir(parents=True)
         for file, text in {"__init__": "", "callee": CALLEE, "caller": CALLER}.items():
             (stages / f"{file}.py").write_text(text)
-        shutil.copy(ROOT / "stages" / "errors.py", stages)
+        shutil.copytree(ROOT / "stages" / "core", stages / "core")
 
         def said():
             path = os.pathsep.join([str(tmp_path / name), str(ROOT)])
