@@ -41,6 +41,10 @@ edges, and as many pixels as that leaves. Half of it doubles the noise, twice of
 LEAST_CONTRAST = 0.1
 """Between squares that touch, as a share of the range of all squares: print under a shadow keeps more."""
 
+MOST_BEND = 0.35
+"""Change from one step between corners to the next, as a share of their mean length. A board tilted by 45 degrees at
+three times its width, or seen through a wide lens, stays below 0.2; corners of clutter exceed 0.5."""
+
 SETTLED = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-4)
 
 
@@ -102,7 +106,7 @@ def find_size(images: Iterable[Grey]) -> tuple[int, int]:
     votes: Counter[tuple[int, int]] = Counter()
     for image in images:
         found, points, pattern = cv2.findChessboardCornersSBWithMeta(image, (LEAST_SIDE, LEAST_SIDE), flags)
-        if found and min(pattern.shape) >= LEAST_SIDE and alternates(image, points, pattern.shape[::-1]):
+        if found and min(pattern.shape) >= LEAST_SIDE and is_board(image, points, pattern.shape[::-1]):
             votes[max(pattern.shape), min(pattern.shape)] += 1
     agreed = {size: count for size, count in votes.items() if count > 1}
     if not agreed:
@@ -119,9 +123,26 @@ def find_corners(image: Grey, corners: tuple[int, int]) -> Floats | None:
     attempts = [(cv2.findChessboardCorners, QUICK), *((cv2.findChessboardCornersSB, flags) for flags in THOROUGH)]
     for find, flags in attempts:
         found, points = find(image, corners, flags=flags)
-        if found and alternates(image, points, corners):
+        if found and is_board(image, points, corners):
             return refine(image, points, corners)
     return None
+
+
+def is_board(image: Grey, points: AnyArray, corners: tuple[int, int]) -> bool:
+    """Whether corners (n, 2) are those of a chessboard: steady steps, and squares dark and bright by turns."""
+    return steady(points, corners) and alternates(image, points, corners)
+
+
+def steady(points: AnyArray, corners: tuple[int, int]) -> bool:
+    """Whether the steps between corners (n, 2) along rows and columns change slowly, as those of a plane do."""
+    grid = np.asarray(points, dtype=np.float64).reshape(corners[1], corners[0], 2)
+    for along in (grid, grid.transpose(1, 0, 2)):
+        steps = np.diff(along, axis=0)
+        length = np.linalg.norm(steps, axis=-1)
+        bend = np.linalg.norm(np.diff(steps, axis=0), axis=-1)
+        if (bend > MOST_BEND * (length[1:] + length[:-1]) / 2).any():
+            return False
+    return True
 
 
 def alternates(image: Grey, points: AnyArray, corners: tuple[int, int]) -> bool:

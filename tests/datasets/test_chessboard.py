@@ -5,7 +5,16 @@ import numpy as np
 import pytest
 from raising import raises
 
-from datasets.chessboard import alternates, board_points, eight_bit, find_corners, find_size, parse_corners, same_order
+from datasets.chessboard import (
+    alternates,
+    board_points,
+    eight_bit,
+    find_corners,
+    find_size,
+    parse_corners,
+    same_order,
+    steady,
+)
 
 
 def render(corners=(9, 6), side=24.0, turn=0.1, shift=(50.0, 30.0), size=(230, 300), tilt=0.0004):
@@ -116,3 +125,13 @@ def test_sixteen_bits_become_eight():
 def test_size_of_real_boards(data_dir, folder, size):
     files = sorted((data_dir / folder).glob("left[0-9]*.jpg"))[:8]
     assert find_size(cv2.imread(str(f), 0) for f in files) == size
+
+
+@pytest.mark.parametrize(("moved", "expected"), [(0.1, True), (0.6, False)])
+def test_corners_of_a_board_lie_in_steady_steps(moved: float, expected: bool) -> None:
+    grid = np.stack(np.meshgrid(30.0 * np.arange(5), 30.0 * np.arange(4)), axis=-1)
+    homography = np.array([[1.0, 0.1, 20.0], [-0.1, 0.9, 30.0], [1e-3, 5e-4, 1.0]])
+    ahead = grid @ homography[:, :2].T + homography[:, 2]
+    seen = ahead[..., :2] / ahead[..., 2:]
+    seen[1, 2] += moved * 15.0
+    assert steady(seen.reshape(-1, 2), (5, 4)) is expected
