@@ -7,14 +7,14 @@ import importlib
 import numpy as np
 import pytest
 
-from pipeline.flow.config import STAGE_MODULES, stage
+from pipeline.flow.config import modules, stage
 
 UNITS = {"1", "px", "m", "rad", "grey", "m^2, m rad, rad^2", "m, rad"}
 DATASET_STAGES = ("files", "files16", "mockup.scene", "mockup.render", "mockup.truth", "mockup.truth_dem")
 DRIVE_STAGES = ("mockup.rover", "mockup.sense", "mockup.site", "mockup.obstacle", "mockup.overview")
 TILE_STAGES = ("tile_stage", "join_stage")
 DECLARED = (
-    {name: stage(name) for name in STAGE_MODULES}
+    {name: stage(name) for name in modules()}
     | {name: importlib.import_module(f"stages.hfvm.{name}").STAGE for name in TILE_STAGES}
     | {name: importlib.import_module(f"datasets.{name}").STAGE for name in (*DATASET_STAGES, *DRIVE_STAGES)}
 )
@@ -23,7 +23,7 @@ DECLARED = (
 @pytest.mark.parametrize("name", DECLARED)
 def test_declaration(name: str) -> None:
     s = DECLARED[name]
-    assert name not in STAGE_MODULES or s.name == name
+    assert name not in modules() or s.name == name
     assert s.version >= 1
     assert s.summary
     assert len(set(s.inputs)) == len(s.inputs)

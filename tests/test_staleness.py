@@ -29,7 +29,7 @@ from pipeline.engine.keys import digest
 from pipeline.engine.store.folder import Ref, Store
 from pipeline.flow import config as configuration
 from pipeline.flow import unread
-from pipeline.flow.reconstruction import Reconstruction
+from pipeline.flow.closed_loop import dataflow
 from stages.core.errors import RilleError
 from stages.geometry.geometry import RigidTransform, rotation_exp
 from stages.geometry.lens import Lens
@@ -200,7 +200,7 @@ class Chain:
     def plan(self, given: dict[str, Any]) -> Graph:
         graph = Graph()
         config = configuration.build(configuration.expand(self.sequence.defaults), given)
-        Reconstruction(graph, self.sequence, config, FRAMES).build()
+        dataflow(graph, self.sequence, config, FRAMES)
         result = scheduler.run(graph, self.store, dry=True)
         assert not result.failures
         return graph

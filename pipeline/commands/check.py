@@ -1,13 +1,13 @@
 """``rille check``: open everything of a sequence, match its first pair, and say in one line each what to expect.
 
-Images, disparity and motions are the tasks of a reconstruction with the same parameters: what is computed here is
-cached for it.
+Images, disparity and motions are the tasks of a reconstruction with the same parameters, made by the same builder: what
+is computed here is cached for it.
 """
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Generator, Iterable, Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -16,21 +16,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets.protocol import CAMERAS, Sequence, Source
-from pipeline.engine.store.folder import Ref, Store, at
+from datasets.protocol import CAMERAS, Sequence
+from pipeline.engine import scheduler
+from pipeline.engine.graph import Graph, Handle, Maybe, MissingError, Wait
+from pipeline.engine.scheduler import Result
+from pipeline.engine.store.folder import Store, at
 from pipeline.engine.store.location import Location
-from pipeline.engine.task import Refs, Spec, ensure
 from pipeline.flow import config as configuration
+from pipeline.flow.builders import Builder, name
 from pipeline.runs import input_checks as verdicts
 from pipeline.runs import synchrony
 from pipeline.runs.input_checks import Verdict
-from stages.core.declare import NoParams
 from stages.core.errors import RilleError
 from stages.geometry.epipolar import beyond_infinity
 from stages.geometry.triangulation import inverse_depth
 from stages.imaging.image_quality import Look, look
 
 Floats = NDArray[np.float64]
+Steps = Generator[Wait, Any, None]
 
 COMPLETE, FAILED = 0, 1
 
@@ -80,12 +83,14 @@ def check(
     chosen = frames if frames is not None else tuple(range(sequence.frames))
     if config is None:
         config = configuration.build(configuration.expand(sequence.defaults))
-    inspection = Inspection(sequence, config, chosen, at(cache))
+    graph, store = Graph(), at(cache)
+    name(graph, sequence, chosen)
+    inspection = Inspection(Builder(graph, sequence, config), chosen, store)
     path = output if output is not None else Path(f"{sequence.name}-check.png")
-    found = []
-    for verdict in inspection.verdicts():
-        print(verdict, flush=True)
-        found.append(verdict)
+    graph.flow(inspection.steps())
+    result = scheduler.run(graph, store, executor="inline", keep_going=True)
+    Result(failures=[f for f in result.failures if not (f.stage and isinstance(f.error, RilleError))]).check()
+    found = inspection.found
     if inspection.match is not None and len(inspection.match.left):
         draw(path, sequence.name, sequence.frame_names[inspection.frames[0]], inspection.match)
         print(f"picture       {path}")
@@ -109,69 +114,77 @@ class Match:
 
 @dataclass
 class Inspection:
-    """Measures one thing after the other, so that each verdict is printed as soon as it is known."""
+    """A flow that says each verdict as soon as it is known."""
 
-    sequence: Sequence
-    config: Any
+    make: Builder
     frames: tuple[int, ...]
     store: Store
     match: Match | None = None
+    found: list[Verdict] = field(default_factory=list)
     broken: dict[tuple[int, str], RilleError] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        self.sequence = self.make.sequence
         self.lost = {f: why for f, why in self.sequence.lost.items() if f in self.frames}
         self.frames = tuple(f for f in self.frames if f not in self.lost)
-        self._shared: dict[str, Ref] = {}
 
-    def verdicts(self) -> Any:
-        """All verdicts, the cheap ones first."""
+    def say(self, verdicts: Iterable[Verdict]) -> None:
+        """Print what was found."""
+        for verdict in verdicts:
+            print(verdict, flush=True)
+            self.found.append(verdict)
+
+    def steps(self) -> Steps:
+        """Look at everything, the cheap things first."""
         s = self.sequence
-        yield Verdict("OK", "sequence", f"{s.name}, {len(self.frames)} of {s.frames} pairs")
+        self.say([Verdict("OK", "sequence", f"{s.name}, {len(self.frames)} of {s.frames} pairs")])
         for frame, why in self.lost.items():
-            yield Verdict("WARN", "images", f"frame {s.frame_names[frame]}: {why}", "it will have no pose; bridged")
-        yield from (Verdict("WARN", "input", line) for line in s.warnings)
-        yield from verdicts.judge_rig(s.rig)
-        yield from verdicts.judge_times(None if s.times is None else [s.times[k] for k in self.frames])
-        yield from verdicts.judge_truth(s.truth, self.frames, s.truth_positions)
-        yield from verdicts.judge_attitude(s.attitude, s.truth, self.frames)
-        yield from verdicts.judge_up(s.up, self.frames)
+            text = f"frame {s.frame_names[frame]}: {why}"
+            self.say([Verdict("WARN", "images", text, "it will have no pose; bridged")])
+        self.say(Verdict("WARN", "input", line) for line in s.warnings)
+        self.say(verdicts.judge_rig(s.rig))
+        self.say(verdicts.judge_times(None if s.times is None else [s.times[k] for k in self.frames]))
+        self.say(verdicts.judge_truth(s.truth, self.frames, s.truth_positions))
+        self.say(verdicts.judge_attitude(s.attitude, s.truth, self.frames))
+        self.say(verdicts.judge_up(s.up, self.frames))
         yield from self._images()
         whole = [k for k in self.frames if not any((k, camera) in self.broken for camera in CAMERAS)]
         if not whole:
-            yield Verdict("FAIL", "matching", "no pair is whole")
+            self.say([Verdict("FAIL", "matching", "no pair is whole")])
             return
         yield from self._first_pair(whole[0])
         yield from self._motions()
         yield from self._simultaneous()
 
-    def _images(self) -> Any:
+    def _images(self) -> Steps:
         """Open every image: sizes, repetitions, exposure, sharpness."""
         looks: dict[str, dict[int, Look]] = {camera: {} for camera in CAMERAS}
         digests: dict[str, dict[int, str]] = {camera: {} for camera in CAMERAS}
         sizes = set()
-        for frame in self.frames:
-            for camera in CAMERAS:
-                try:
-                    bundle = self.store.open(
-                        self._source(self.sequence.image(frame, camera), f"image/{camera}/{frame}")
-                    )
-                except RilleError as error:
-                    self.broken[frame, camera] = error
-                    continue
-                image = np.asarray(bundle["image"])
-                sizes.add((image.shape[1], image.shape[0], str(image.dtype)))
-                looks[camera][frame] = look(image, np.asarray(bundle["valid"]))
-                digests[camera][frame] = hashlib.sha256(image.tobytes()).hexdigest()
+        images = {(frame, camera): self.make.taken(frame, camera) for frame in self.frames for camera in CAMERAS}
+        yield Maybe(list(images.values()))
+        for (frame, camera), handle in images.items():
+            try:
+                if handle.ref is None:
+                    raise _cause(handle)
+                bundle = self.store.open(handle.ref)
+            except RilleError as error:
+                self.broken[frame, camera] = error
+                continue
+            image = np.asarray(bundle["image"])
+            sizes.add((image.shape[1], image.shape[0], str(image.dtype)))
+            looks[camera][frame] = look(image, np.asarray(bundle["valid"]))
+            digests[camera][frame] = hashlib.sha256(image.tobytes()).hexdigest()
         for damage in list(self.broken.values())[:FIRST_NAMED]:
-            yield Verdict("FAIL", "images", damage.message, damage.remedy)
+            self.say([Verdict("FAIL", "images", damage.message, damage.remedy)])
         total = len(self.frames) * len(CAMERAS)
         if self.broken:
-            yield Verdict("FAIL", "images", f"{len(self.broken)} of {total} cannot be used")
+            self.say([Verdict("FAIL", "images", f"{len(self.broken)} of {total} cannot be used")])
         else:
             words = " and ".join(f"{w} x {h} {kind}" for w, h, kind in sorted(sizes))
-            yield Verdict("OK", "images", f"all {total} open, {words}")
-        yield from self._repeated(digests)
-        yield from verdicts.judge_looks(looks, self.sequence.frame_names)
+            self.say([Verdict("OK", "images", f"all {total} open, {words}")])
+        self.say(self._repeated(digests))
+        self.say(verdicts.judge_looks(looks, self.sequence.frame_names))
 
     def _repeated(self, digests: Mapping[str, Mapping[int, str]]) -> list[Verdict]:
         names, out = self.sequence.frame_names, []
@@ -187,112 +200,82 @@ class Inspection:
                 out.append(Verdict("WARN", "images", text, "was a frame copied, or did the camera hang?"))
         return out
 
-    def _first_pair(self, pair: int) -> Any:
+    def _first_pair(self, pair: int) -> Steps:
         """Match one pair, and compare it with the rig."""
+        tasks = [self.make.image(pair, "left"), self.make.disparity(pair), self.make.orientation(pair)]
         try:
-            self.match = self._matched(pair)
-        except RilleError as error:
-            yield Verdict("FAIL", "matching", f"frame {self.sequence.frame_names[pair]}: {error.message}", error.remedy)
+            image, disparity, oriented = yield tasks
+            found = self.store.open(oriented)
+            points = {name: np.asarray(found[name], dtype=np.float64) for name in ("left", "right")}
+            self.match = m = Match(
+                np.asarray(self.store.open(image)["image"]),
+                points["left"],
+                points["right"],
+                np.asarray(found["residual_before"], dtype=np.float64),
+                np.asarray(found["weight"], dtype=np.float64),
+                found.meta,
+                disparity.meta["match_rate"],
+            )
+        except (MissingError, RilleError) as missing:
+            error = _cause(missing.handles[0]) if isinstance(missing, MissingError) else missing
+            text = f"frame {self.sequence.frame_names[pair]}: {error.message}"
+            self.say([Verdict("FAIL", "matching", text, error.remedy)])
             return
-        m, rig = self.match, self.sequence.rig
+        rig = self.sequence.rig
         rho, _ = inverse_depth(rig, m.left, m.right - m.left)
         inlier = m.weight > 0 if (m.weight > 0).any() else np.ones(len(m.left), bool)
         ahead = inlier & (rho > 0)
-        yield from verdicts.judge_matching(m.rate, 1.0 / rho[ahead], rig.baseline)
+        self.say(verdicts.judge_matching(m.rate, 1.0 / rho[ahead], rig.baseline))
         if len(m.left):
             beyond = beyond_infinity(rig, m.left[inlier], m.right[inlier])
-            yield from verdicts.judge_sides(float((beyond > BEYOND).mean()))
-        yield from verdicts.judge_epipolar(m.facts)
+            self.say(verdicts.judge_sides(float((beyond > BEYOND).mean())))
+        self.say(verdicts.judge_epipolar(m.facts))
 
-    def _matched(self, pair: int) -> Match:
-        disparity = self._node(
-            "hfvm", f"hfvm/{pair}", {"pair": pair}, left=self._pyramid(pair, "left"), right=self._pyramid(pair, "right")
-        )
-        args = {"pair": pair, "rig": self.sequence.rig.to_dict()}
-        found = self.store.open(self._node("orientation", f"orientation/{pair}", args, disparity=disparity))
-        points = {name: np.asarray(found[name], dtype=np.float64) for name in ("left", "right")}
-        return Match(
-            np.asarray(self.store.open(self._image(pair, "left"))["image"]),
-            points["left"],
-            points["right"],
-            np.asarray(found["residual_before"], dtype=np.float64),
-            np.asarray(found["weight"], dtype=np.float64),
-            found.meta,
-            self.store.open(disparity).meta["match_rate"],
-        )
-
-    def _motions(self) -> Any:
+    def _motions(self) -> Steps:
         """Overlap of some successive left images."""
         pairs = list(pairwise(self.frames))
         chosen = sorted({int(k) for k in np.linspace(0, len(pairs) - 1, MOST_MOTIONS).round()}) if pairs else []
-        motions: dict[tuple[int, int], Mapping[str, Any]] = {}
-        for a, b in (pairs[k] for k in chosen):
-            if (a, "left") in self.broken or (b, "left") in self.broken:
-                continue
-            try:
-                ports = {"a": self._pyramid(a, "left"), "b": self._pyramid(b, "left")}
-                motions[a, b] = self.store.open(self._node("motion", f"motion/{a}-{b}", self._turn(a, b), **ports)).meta
-            except RilleError as error:
-                yield Verdict("FAIL", "motion", error.message, error.remedy)
-        yield from verdicts.judge_motion(motions, self.sequence.frame_names)
+        whole = [pairs[k] for k in chosen if not any((frame, "left") in self.broken for frame in pairs[k])]
+        tasks = {(a, b): self.make.motion(a, b) for a, b in whole}
+        yield Maybe(list(tasks.values()))
+        for error in (_cause(task) for task in tasks.values() if task.ref is None):
+            self.say([Verdict("FAIL", "motion", error.message, error.remedy)])
+        motions = {step: task.ref.meta for step, task in tasks.items() if task.ref is not None}
+        self.say(verdicts.judge_motion(motions, self.sequence.frame_names))
 
-    def _simultaneous(self) -> Any:
+    def _simultaneous(self) -> Steps:
         """Rows of some pairs over the whole sequence, with the right images as named and shifted in time."""
         last = max(self.frames)
         inner = [k for k in self.frames if k - 2 >= 0 and k + 2 <= last]
         chosen = sorted({inner[int(k)] for k in np.linspace(0, len(inner) - 1, MOST_PAIRS).round()}) if inner else []
         spreads: dict[int, list[float | None]] = {shift: [] for shift in synchrony.SHIFTS}
         for frame in chosen:
-            left = self._features(frame, "left")
+            left = yield from self._features(frame, "left")
             for shift, values in spreads.items():
-                right = self._features(frame + shift, "right")
+                right = yield from self._features(frame + shift, "right")
                 values.append(synchrony.row_spread(self.sequence.rig, left, right))
-        yield from verdicts.judge_synchrony(spreads)
+        self.say(verdicts.judge_synchrony(spreads))
 
-    def _features(self, frame: int, camera: str) -> tuple[Any, Any] | None:
+    def _features(self, frame: int, camera: str) -> Generator[Wait, Any, tuple[Any, Any] | None]:
         if frame in self.lost or (frame, camera) in self.broken or frame not in self.frames:
             return None
-        return synchrony.features(np.asarray(self.store.open(self._image(frame, camera))["image"]))
+        image = yield self.make.image(frame, camera)
+        return synchrony.features(np.asarray(self.store.open(image)["image"]))
 
-    def _turn(self, a: int, b: int) -> dict[str, Any]:
-        known = self.sequence.attitude
-        first, second = (None, None) if known is None else (known[a], known[b])
-        if first is None or second is None:
-            return {"frames": [a, b]}
-        rotation = np.transpose(second) @ np.array(first)
-        return {"frames": [a, b], "rotation": rotation.tolist(), "camera": self.sequence.rig.left.to_dict()}
 
-    def _pyramid(self, frame: int, camera: str) -> Ref:
-        return self._node("pyramid", f"pyramid/{camera}/{frame}", {}, image=self._image(frame, camera))
+def _cause(handle: Handle) -> RilleError:
+    """Why a task has no artifact.
 
-    def _image(self, frame: int, camera: str) -> Ref:
-        """One image without its lens distortion."""
-        image = self._source(self.sequence.image(frame, camera), f"image/{camera}/{frame}")
-        lens = (self.sequence.lenses or {}).get(camera)
-        if lens is None:
-            return image
-        ideal = self.sequence.rig.left if camera == "left" else self.sequence.rig.right
-        args = {"lens": lens.to_dict(), "camera": ideal.to_dict(), "frame": frame, "camera_name": camera}
-        return self._node("undistort", f"undistort/{camera}/{frame}", args, image=image)
-
-    def _source(self, source: Source, label: str) -> Ref:
-        refs: Refs = {port: self._shared_source(upstream) for port, upstream in source.inputs.items()}
-        return ensure(
-            self.store.location, Spec(source.module, label, source.params, source.args, source.hints), refs
-        ).ref
-
-    def _shared_source(self, source: Source) -> Ref:
-        """What is the same for all frames (a rendered scene) is looked up once."""
-        label = source.module.rsplit(".", 1)[-1]
-        if source.args:
-            return self._source(source, label)
-        if label not in self._shared:
-            self._shared[label] = self._source(source, label)
-        return self._shared[label]
-
-    def _node(self, name: str, label: str, args: Mapping[str, Any], **inputs: Ref) -> Ref:
-        params = getattr(self.config, name, NoParams())
-        return ensure(self.store.location, Spec(configuration.STAGE_MODULES[name], label, params, args), inputs).ref
+    Raises
+    ------
+    Exception
+        What no stage should raise.
+    """
+    while handle.error is None:
+        handle = next(upstream for upstream in handle.upstream() if not upstream.done)
+    if not isinstance(handle.error, RilleError):
+        raise handle.error
+    return handle.error
 
 
 def draw(path: Path, name: str, frame: str, match: Match) -> None:

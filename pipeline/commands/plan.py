@@ -44,7 +44,7 @@ def plan(options: Options, *, verbose: bool = False) -> int:
     warn(sequence)
     frames = choose_frames(options.frames, sequence.frames)
     graph, store = Graph(), at(options.cache)
-    dataflow(graph, sequence, config, frames).build()
+    dataflow(graph, sequence, config, frames)
     result = scheduler.run(graph, store, dry=True, force=options.force)
     result.check()
     lost = [] if result.unknown else unread.unread(settled.given, config, graph)

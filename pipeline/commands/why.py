@@ -13,7 +13,7 @@ from pipeline.engine.keys import digest
 from pipeline.engine.memory.limits import words
 from pipeline.engine.store.folder import Store, at
 from pipeline.engine.store.location import Location
-from pipeline.flow.config import STAGE_MODULES, stage
+from pipeline.flow.config import modules, stage
 from pipeline.runs import lookup
 
 SHORT = 12
@@ -111,7 +111,7 @@ def _recipe(made: Mapping[str, Any]) -> Iterable[str]:
 
 
 def _defaults(name: str) -> dict[str, Any]:
-    if name not in STAGE_MODULES:
+    if name not in modules():
         return {}
     found: dict[str, Any] = json.loads(stage(name).params().model_dump_json())
     return found

@@ -1,11 +1,13 @@
-"""The task graph: nodes that name a stage, and expansions that add nodes once earlier results are known.
+"""The task graph: nodes that name a stage, and flows that add nodes once earlier results are known.
 
+>>> def chain(graph: Graph) -> Generator[Wait, Any, list[Handle]]:
+...     select = yield graph.node(keyframes, "select", SelectParams(), {"frames": 9})
+...     return [graph.node(hfvm, f"hfvm/{k}", params, {"pair": k}, inputs=images[k]) for k in select.meta["basic"]]
 >>> graph = Graph()
->>> select = graph.node("stages.odometry.keyframes", "select", SelectParams(), {"frames": 9})
->>> def pairs(selected: Ref) -> None:
-...     for k in selected.meta["basic"]:
-...         graph.node("stages.hfvm", f"hfvm/{k}", params, {"pair": k}, inputs={"left": left[k], "right": right[k]})
->>> graph.expand([select], pairs)
+>>> matched = graph.flow(chain(graph))
+
+A flow is a generator: it yields what it waits for, and goes on with the references of that once they are there
+(:meth:`Graph.flow`). Several run side by side, and one may wait for what others return.
 
 A :class:`Handle` stands for a node; after (or during) the run its ``status`` and ``ref`` say what became of it.
 Order of creation is priority: what is created first runs first.
@@ -13,16 +15,18 @@ Order of creation is priority: what is created first runs first.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
-from typing import Any
+from types import ModuleType
+from typing import Any, Generic, TypeVar
 
 from pipeline.engine.store.folder import Ref
 from pipeline.engine.task import Refs, Spec
 from stages.core.declare import Params
 
 Expansion = Callable[..., None]
+T = TypeVar("T")
 
 
 @dataclass(eq=False)
@@ -80,6 +84,36 @@ class Handle:
         return {p: [_ref(h) for h in g] if isinstance(g, list) else _ref(g) for p, g in self.inputs.items()}
 
 
+class MissingError(Exception):
+    """What a flow waits for will never have an artifact: these failed, or were left out."""
+
+    def __init__(self, handles: Sequence[Handle]) -> None:
+        super().__init__(", ".join(handle.label for handle in handles))
+        self.handles = list(handles)
+
+
+@dataclass(frozen=True)
+class Maybe:
+    """To wait until it is known what became of all handles; what will never have an artifact is given as None."""
+
+    handles: Sequence[Handle]
+
+
+@dataclass(eq=False)
+class Flow(Generic[T]):
+    """A generator on its way, and once it is ``done`` what it returned, or what it missed."""
+
+    steps: Generator[Wait, Any, T]
+    done: bool = False
+    value: T | None = None
+    missed: MissingError | None = None
+    followers: list[Callable[[], None]] = field(default_factory=list)
+
+
+Wait = Handle | Maybe | Sequence[Handle] | Flow[Any] | Sequence[Flow[Any]]
+"""What a flow may yield."""
+
+
 @dataclass
 class Graph:
     """Nodes in order of creation, and expansions that wait for some of them."""
@@ -93,7 +127,7 @@ class Graph:
 
     def node(
         self,
-        module: str,
+        stage: ModuleType | str,
         label: str,
         params: Params,
         args: Mapping[str, Any] | None = None,
@@ -103,8 +137,9 @@ class Graph:
     ) -> Handle:
         """Add a task and give its handle.
 
-        ``inputs`` maps each port of the stage to a handle, or to a list of them for a port declared ``name*``;
-        ``expect`` are decoded bytes of what it reads from outside, for estimates.
+        ``stage`` is the module that declares it, or its dotted name. ``inputs`` maps each port of the stage to a
+        handle, or to a list of them for a port declared ``name*``; ``expect`` are decoded bytes of what it reads from
+        outside, for estimates.
 
         Raises
         ------
@@ -115,6 +150,7 @@ class Graph:
         """
         if label in self._labels:
             raise ValueError(f"the label {label!r} is taken: labels of nodes are unique")
+        module = stage if isinstance(stage, str) else stage.__name__
         spec = Spec(module, label, params, dict(args or {}), dict(hints or {}))
         given = {p: h if isinstance(h, Handle) else list(h) for p, h in (inputs or {}).items()}
         _check_ports(spec, given)
@@ -123,12 +159,52 @@ class Graph:
         self.nodes.append(handle)
         return handle
 
-    def expand(self, handles: Sequence[Handle], fn: Expansion, *, holes: bool = False) -> None:
-        """Call ``fn(ref, ref, ...)`` on the client as soon as all ``handles`` have artifacts; it adds nodes.
+    def flow(self, steps: Generator[Wait, Any, T]) -> Flow[T]:
+        """Run a generator on the client until it waits, and again when what it waits for is there.
 
-        With ``holes`` it is called, too, when some of them will never have one: it gets None for each of these.
+        It yields a handle, a list of handles, :class:`Maybe`, a flow, or a list of flows, and gets a reference, a list
+        of references, or what the flows returned. Where one will never be, ``MissingError`` is raised in it.
         """
-        self.expansions.append((list(handles), fn, holes))
+        flow = Flow(steps)
+        self._go_on(flow, lambda: next(steps))
+        return flow
+
+    def _go_on(self, flow: Flow[Any], step: Callable[[], Wait]) -> None:
+        try:
+            wanted = step()
+        except StopIteration as end:
+            flow.done, flow.value = True, end.value
+        except MissingError as error:
+            flow.done, flow.missed = True, error
+            self.expansions.append((error.handles, lambda *_: None, False))  # the run's end says what it waited for
+        else:
+            self._wait(flow, wanted)
+        for follower in flow.followers if flow.done else ():
+            follower()
+
+    def _wait(self, flow: Flow[Any], wanted: Wait) -> None:
+        one, maybe = isinstance(wanted, Handle | Flow), isinstance(wanted, Maybe)
+        several: Any = wanted.handles if isinstance(wanted, Maybe) else wanted
+        parts: list[Any] = [wanted] if one else list(several)
+
+        def answer(values: list[Any], missed: MissingError | None) -> None:
+            if missed is not None:
+                self._go_on(flow, lambda: flow.steps.throw(missed))
+            else:
+                self._go_on(flow, lambda: flow.steps.send(values[0] if one else values))
+
+        def resume(*refs: Ref | None) -> None:
+            lost = [h for h, ref in zip(parts, refs, strict=True) if ref is None]
+            answer(list(refs), MissingError(lost) if lost and not maybe else None)
+
+        if not any(isinstance(part, Flow) for part in parts):
+            self.expansions.append((parts, resume, True))
+            return
+        behind = next((part for part in parts if not part.done), None)
+        if behind is not None:
+            behind.followers.append(lambda: self._wait(flow, wanted))
+        else:
+            answer([part.value for part in parts], next((p.missed for p in parts if p.missed is not None), None))
 
 
 def _check_ports(spec: Spec, given: Mapping[str, Handle | list[Handle]]) -> None:

@@ -13,6 +13,7 @@ import tomllib
 from collections.abc import Iterable, Mapping
 from functools import cache
 from pathlib import Path
+from types import ModuleType
 from typing import Any, Literal
 
 import tomli_w
@@ -21,50 +22,6 @@ from pydantic import Field, ValidationError, create_model
 from datasets import reading
 from stages.core.declare import Params, Stage
 from stages.core.errors import ConfigError, told
-
-STAGE_MODULES: dict[str, str] = {
-    "undistort": "stages.imaging.undistort",
-    "pyramid": "stages.imaging.pyramid",
-    "sight": "stages.imaging.image_quality",
-    "motion": "stages.odometry.motion",
-    "sides": "stages.calibration.swap_check",
-    "continuity": "stages.odometry.frame_screening",
-    "select": "stages.odometry.keyframes",
-    "hfvm": "stages.hfvm",
-    "orientation": "stages.calibration.orientation",
-    "rig": "stages.calibration.rig",
-    "calibration": "stages.calibration.calibration",
-    "level": "stages.terrain.ground_frame",
-    "locus": "stages.terrain.locus.stage",
-    "track": "stages.odometry.track",
-    "resect": "stages.odometry.resection.resect",
-    "refine": "stages.odometry.resection.refine",
-    "trajectory": "stages.odometry.resection.trajectory",
-    "pose": "stages.odometry.resection.pose",
-    "footprint": "stages.terrain.tile_index",
-    "seam": "stages.terrain.overlap_qa",
-    "seam_audit": "stages.terrain.overlap_audit",
-    "exposure": "stages.terrain.radiometry",
-    "merge": "stages.terrain.merge",
-    "risk": "stages.hazard.risk",
-    "path": "stages.planning.path",
-    "crosscheck": "stages.evaluation.crosscheck",
-    "crosscheck_join": "stages.evaluation.crosscheck_join",
-    "agreement": "stages.evaluation.agreement",
-    "truth": "stages.evaluation.truth",
-    "accuracy": "stages.evaluation.accuracy",
-    "position_accuracy": "stages.evaluation.position_accuracy",
-    "dem_accuracy": "stages.evaluation.dem_accuracy",
-    "path_check": "stages.evaluation.path_check",
-    "pad": "stages.terrain.start_area",
-    "ceiling": "stages.terrain.occlusion_bounds",
-    "leg": "stages.planning.local_planner.stage",
-    "safety": "stages.driving.fault_monitor",
-    "reflex": "stages.driving.obstacle_monitor",
-    "global_fix": "stages.terrain.map_localization",
-    "drive_check": "stages.evaluation.drive_check",
-}
-"""Every stage of the chain by name; a section of the configuration where the stage has parameters."""
 
 ACCURATE_TERRAIN: dict[str, Any] = {
     "hfvm": {"preset": "accurate"},
@@ -105,9 +62,19 @@ DATASET_SECTIONS = ("mockup", "misalign", "rover")
 """Sections that belong to a kind of sequence; the sequence validates them."""
 
 
+@cache
+def modules() -> dict[str, ModuleType]:
+    """The stage modules that the flows import, by the stage's name: each with parameters has a section."""
+    from pipeline.flow import assessment, builders, closed_loop, reconstruction
+
+    flows = builders, reconstruction, closed_loop, assessment
+    found = [m for flow in flows for m in vars(flow).values() if isinstance(m, ModuleType) and hasattr(m, "STAGE")]
+    return {module.STAGE.name: module for module in found}
+
+
 def stage(name: str) -> Stage:
     """Declaration of a stage by its name."""
-    found: Stage = importlib.import_module(STAGE_MODULES[name]).STAGE
+    found: Stage = modules()[name].STAGE
     return found
 
 
@@ -132,7 +99,7 @@ def model() -> type[Params]:
     from stages.hazard.vehicle import DEFAULT_VEHICLE, Vehicle
 
     fields: dict[str, Any] = {
-        name: (stage(name).params, stage(name).params()) for name in STAGE_MODULES if stage(name).params.model_fields
+        name: (stage(name).params, stage(name).params()) for name in modules() if stage(name).params.model_fields
     }
     fields["terrain"] = (TerrainParams, TerrainParams())
     fields["tiling"] = (Tiling, Tiling())

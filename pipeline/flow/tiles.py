@@ -10,14 +10,12 @@ from pydantic import Field
 
 from pipeline.engine.graph import Graph, Handle
 from stages.core.declare import Params
-from stages.hfvm import tiled
+from stages.hfvm import join_stage, tile_stage, tiled
 from stages.hfvm.params import HfvmParams
 from stages.hfvm.plane import margin
 from stages.hfvm.views import pyramid_shapes
 from stages.hfvm.window import Shape, tiles
 from stages.imaging.pyramid import PyramidParams
-
-TILE, JOIN = "stages.hfvm.tile_stage", "stages.hfvm.join_stage"
 
 WHOLE_BYTES, TILE_BYTES = 170, 300
 """Room for matching a pixel, bytes: of images that are matched whole, and of a tile, whose surroundings it includes.
@@ -104,7 +102,7 @@ class Tiles:
         final = self._tiles("final", {}, "", fine=fine, checked=checked, refined=refined, patches=patches, **facts)
         args = {"side": self.side}
         given: dict[str, Handle | list[Handle]] = {**self.images, "coarse": self.coarse, "tiles": final}
-        return self.graph.node(JOIN, self.label, self.params, args, {}, given)
+        return self.graph.node(join_stage, self.label, self.params, args, {}, given)
 
     def _each(self, level: int, way: str, inputs: dict[str, Handle | list[Handle]]) -> list[Handle]:
         args = {"level": level, "way": way}
@@ -125,4 +123,4 @@ class Tiles:
 
     def _node(self, step: str, label: str, args: dict[str, object], **inputs: Handle | list[Handle]) -> Handle:
         args = {"step": step, "side": self.side, **args}
-        return self.graph.node(TILE, f"{self.label}/{label}", self.params, args, {}, {**self.images, **inputs})
+        return self.graph.node(tile_stage, f"{self.label}/{label}", self.params, args, {}, {**self.images, **inputs})

@@ -17,7 +17,7 @@ from stages.geometry.geometry import RigidTransform
 from stages.geometry.lattice import Lattice
 
 if TYPE_CHECKING:
-    from pipeline.flow.closed_loop import Driven
+    from pipeline.flow.products import Driven
 
 Floats = NDArray[Any]
 

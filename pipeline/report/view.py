@@ -10,7 +10,7 @@ from stages.core.declare import Bundle
 
 if TYPE_CHECKING:
     from datasets.protocol import Sequence
-    from pipeline.flow.reconstruction import Products
+    from pipeline.flow.products import Products
 
 Status = Literal["computed", "cached", "failed", "skipped"]
 

@@ -31,7 +31,8 @@ from stages.core.errors import ConfigError, RilleError
 
 if TYPE_CHECKING:
     from pipeline.engine.scheduler import Result
-    from pipeline.flow.reconstruction import Products
+    from pipeline.flow.closed_loop import Drive
+    from pipeline.flow.products import Products
     from pipeline.report import RunView
 
 COMPLETE, FAILED, HOLES = 0, 1, 3
@@ -163,7 +164,7 @@ class _Opened:
     versions: dict[str, str]
     store: Store
     graph: Graph
-    flow: Any
+    drive: Drive | None
     products: Products
 
     def view(self, **late: Any) -> RunView:
@@ -197,11 +198,11 @@ class _Opened:
 
 def _reconstruct(options: Options) -> int:
     opened = _open(options)
-    driven = opened.sequence.simulation is not None
+    drive = opened.drive
     with Ahead(opened.folder, lambda: opened.view(tasks=())) as ahead:
-        result = _compute(opened, None if driven else ahead.work)
-        if driven:
-            sequence, frames = opened.flow.taken()
+        result = _compute(opened, None if drive is not None else ahead.work)
+        if drive is not None:
+            sequence, frames = drive.taken()
             opened = replace(opened, sequence=sequence, frames=frames)
         stamped, earlier = opened.stamp(), opened.folder.parent / "latest"
         remember()
@@ -246,10 +247,10 @@ def _open(options: Options) -> _Opened:
     folder = _make_folder(options.runs / sequence.name, started, text + repr(frames))
     (folder / "config.toml").write_text(text, encoding="utf-8")
     graph, store = Graph(), at(options.cache)
-    flow = dataflow(graph, sequence, config, frames)
+    products, drive = dataflow(graph, sequence, config, frames)
     return _Opened(
-        options, sequence, frames, config, text, settled, folder, started, _versions(), store, graph, flow,
-        flow.build(),
+        options, sequence, frames, config, text, settled, folder, started, _versions(), store, graph, drive,
+        products,
     )  # fmt: skip
 
 
@@ -312,15 +313,15 @@ def lay_out(sequence: Sequence, config: Any, frames: tuple[int, ...]) -> Graph:
     from pipeline.flow.closed_loop import dataflow
 
     graph = Graph()
-    dataflow(graph, sequence, config, frames).build()
+    dataflow(graph, sequence, config, frames)
     return graph
 
 
 def _outcome(opened: _Opened) -> int:
     """Say how a drive ended; the exit code, which is that of a run with holes where it did not reach its goal."""
-    if opened.sequence.simulation is None:
+    if opened.drive is None:
         return COMPLETE
-    outcome, stops = opened.flow.outcome(), opened.flow.driven.stops
+    outcome, stops = opened.drive.outcome(), opened.drive.driven.stops
     print(f"{': '.join(word for word in outcome if word)}  ({len(stops)} stops)")
     return COMPLETE if outcome[0] == "goal" else HOLES
 

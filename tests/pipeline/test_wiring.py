@@ -10,8 +10,7 @@ import pytest
 from datasets.registry import open_sequence
 from pipeline.engine.graph import Graph
 from pipeline.flow import config
-from pipeline.flow.closed_loop import Drive
-from pipeline.flow.reconstruction import Reconstruction
+from pipeline.flow.closed_loop import Drive, dataflow
 
 HERE = [1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0]
 BOX = {"x0": 0.0, "y0": 0.0, "cell": 0.01, "rows": 4, "cols": 4}
@@ -37,14 +36,13 @@ APART = {"trajectory": {"refined"}}
 """Ports that one flow alone has, by stage: a drive goes on before there is anything to be adjusted jointly."""
 
 
-def grown(flow: Reconstruction, failing: str = "") -> Graph:
-    """All tasks of a flow, none of them run; those of a stage that fails have no results, nor has what reads them."""
-    flow.build()
-    waiting, legs = flow.graph.expansions, 0
+def grown(graph: Graph, failing: str = "") -> Graph:
+    """All tasks of a dataflow, none of them run; those of a stage that fails have no results, nor what reads them."""
+    waiting, legs = graph.expansions, 0
     while waiting:
         handles, grow, holes = waiting.pop(0)
         facts: list[SimpleNamespace | None] = []
-        for handle in flow.graph.nodes:
+        for handle in graph.nodes:
             if handle.stage == failing or any(up.status == "failed" for up in handle.upstream()):
                 handle.status = "failed"
         for handle in handles:
@@ -60,13 +58,20 @@ def grown(flow: Reconstruction, failing: str = "") -> Graph:
             facts.append(handle.ref)  # type: ignore[arg-type]
         if all(facts) or holes:
             grow(*facts)
-    return flow.graph
+    return graph
+
+
+def driving() -> Drive:
+    """The closed loop as the program drives it by default, at its start."""
+    sequence = open_sequence("mockup-loop")
+    flow = Drive(Graph(), sequence, config.build(config.expand(sequence.defaults)))
+    flow.build()
+    return flow
 
 
 def test_a_drive_that_fails_on_a_leg_is_judged_with_that_leg() -> None:
-    sequence = open_sequence("mockup-loop")
-    flow = Drive(Graph(), sequence, config.build(config.expand(sequence.defaults)))
-    grown(flow, failing="safety")
+    flow = driving()
+    grown(flow.graph, failing="safety")
     check = flow.driven.check
     assert check is not None
     drives = check.inputs["drives"]
@@ -76,9 +81,8 @@ def test_a_drive_that_fails_on_a_leg_is_judged_with_that_leg() -> None:
 
 
 def test_a_drive_that_fails_at_the_start_is_judged_where_it_stands() -> None:
-    sequence = open_sequence("mockup-loop")
-    flow = Drive(Graph(), sequence, config.build(config.expand(sequence.defaults)))
-    grown(flow, failing="level")
+    flow = driving()
+    grown(flow.graph, failing="level")
     check = flow.driven.check
     assert check is not None
     assert set(check.inputs) == {"drives"}
@@ -89,12 +93,11 @@ def test_a_drive_that_fails_at_the_start_is_judged_where_it_stands() -> None:
 def test_a_safety_stop_of_a_look_around_where_there_is_no_way_is_no_path(
     way_m: float, verdict: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    sequence = open_sequence("mockup-loop")
-    flow = Drive(Graph(), sequence, config.build(config.expand(sequence.defaults)))
+    flow = driving()
     found = {"verdict": "look", "way_m": way_m, "reason": "hazards close every way"}
     monkeypatch.setitem(FACTS, "leg", found)
     monkeypatch.setitem(FACTS, "safety", {"stop": 1, "kind": "lost", "reason": "0 landmarks"})
-    grown(flow)
+    grown(flow.graph)
     assert flow.driven.verdict == verdict
     assert flow.driven.reason.endswith("0 landmarks")
     assert flow.driven.check is not None
@@ -115,8 +118,10 @@ def test_each_stage_gets_the_same_ports_in_a_drive_as_in_a_reconstruction(landma
     driven, recorded = open_sequence("mockup-loop"), open_sequence("mockup-short", {"mockup": {"frames": 3}})
     more = {"resect": {"landmarks": landmarks}, "locus": {"both": both}}
     settings = config.build(config.expand(driven.defaults), more)
-    loop = ports(grown(Drive(Graph(), driven, settings)))
-    chain = ports(grown(Reconstruction(Graph(), recorded, settings, (0, 1, 2))))
+    graphs = Graph(), Graph()
+    dataflow(graphs[0], driven, settings, (0,))
+    dataflow(graphs[1], recorded, settings, (0, 1, 2))
+    loop, chain = (ports(grown(graph)) for graph in graphs)
     shared = set(loop) & set(chain)
     assert shared >= {
         "hfvm",

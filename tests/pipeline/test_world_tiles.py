@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
+from toys import dem
 
 from pipeline.engine import events, scheduler
 from pipeline.engine.graph import Graph
 from pipeline.engine.store.folder import Store
-from pipeline.flow.config import STAGE_MODULES
-from pipeline.flow.reconstruction import merge_tiles
+from pipeline.flow.builders import merge_tiles
 from stages.core.declare import NoParams
+from stages.terrain import merge, tile_index
 from stages.terrain.merge import MergeParams
 
 SIDE = 16
@@ -31,14 +34,18 @@ def run(
     """Labels of the tiles merged by this run, digest of each tile, and all nodes by label."""
     graph, merging = Graph(), params or MergeParams()
 
-    def node(stage: str, label: str, args: dict[str, Any], **inputs: Any) -> Any:
-        module = "toys.dem" if stage == "dem" else STAGE_MODULES[stage]
-        return graph.node(module, label, merging if stage == "merge" else NoParams(), args, {}, inputs)
+    def node(stage: ModuleType, label: str, args: Mapping[str, Any], **inputs: Any) -> Any:
+        return graph.node(stage, label, merging if stage is merge else NoParams(), args, {}, inputs)
 
-    dems = {k: node("dem", f"dem/{k}", {"pair": k, "i0": i, "j0": j}) for k, (i, j) in places.items()}
+    dems = {k: node(dem, f"dem/{k}", {"pair": k, "i0": i, "j0": j}) for k, (i, j) in places.items()}
     cut = {"side": SIDE, "margin": merging.margin}
-    prints = [node("footprint", f"footprint/{k}", cut, dem=dem) for k, dem in dems.items()]
-    graph.expand(prints, lambda *found: merge_tiles(node, [f.meta for f in found], dems, steps or {}) and None)
+    prints = [node(tile_index, f"footprint/{k}", cut, dem=model) for k, model in dems.items()]
+
+    def follow() -> Iterator[Any]:
+        found: Any = yield prints
+        merge_tiles(node, [f.meta for f in found], dems, steps or {})
+
+    graph.flow(follow())  # type: ignore[arg-type]
     scheduler.run(graph, Store(cache), executor=executor, jobs=2, ledger=cache / "ledger.jsonl").check()
     rows = events.read(cache / "ledger.jsonl")
     again = {r["label"] for r in rows if r["stage"] == "merge" and r["status"] == "computed"}

@@ -99,7 +99,12 @@ def test_an_earlier_result_that_does_not_fit_hides_what_follows(cache):
     def lay_out(seed, wanted):
         graph = Graph()
         build(graph, frames=1, seed=seed)
-        graph.expand(graph.nodes[:1], lambda ref: {0: "known"}[wanted])
+
+        def fitting():
+            yield graph.nodes[0]
+            return {0: "known"}[wanted]
+
+        graph.flow(fitting())
         return graph
 
     scheduler.run(lay_out(0, 0), Store(cache), executor="inline").check()

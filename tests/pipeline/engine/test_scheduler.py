@@ -16,7 +16,7 @@ from toys.scale import ScaleParams
 
 from pipeline.engine import events as ledger
 from pipeline.engine import packages, progress, scheduler
-from pipeline.engine.graph import Graph
+from pipeline.engine.graph import Graph, Maybe
 from pipeline.engine.store import maintenance
 from pipeline.engine.store.folder import Store
 from pipeline.engine.task import Spec, ensure, recipe
@@ -163,10 +163,14 @@ def test_with_keep_going_the_rest_finishes_and_the_ledger_accounts_for_all(cache
 def test_what_the_data_do_not_determine_is_a_hole(cache):
     told = []
 
+    def follow(wanted):
+        refs = yield wanted
+        told.append([ref is None for ref in refs])
+
     def make(graph):
         mischief("degenerate", "fine")(graph)
-        graph.expand([graph.nodes[1], graph.nodes[4]], lambda *refs: told.append([r is None for r in refs]), holes=True)
-        graph.expand([graph.nodes[1], graph.nodes[4]], lambda *refs: told.append("no holes"))
+        graph.flow(follow(Maybe([graph.nodes[1], graph.nodes[4]])))
+        graph.flow(follow([graph.nodes[1], graph.nodes[4]]))
 
     graph, result = run(cache, make=make)
     assert {h.label for h in graph.nodes if h.done} == {"fine", "fine/after", "fine/third"}
@@ -201,12 +205,16 @@ def test_input_output_errors_are_tried_three_times_others_once(cache, tmp_path, 
     assert (tmp_path / "value").read_text() == "x"
 
 
-def test_an_expansion_that_fails_is_a_failure_and_one_that_cannot_be_made_is_noted(cache, tmp_path):
+def test_a_flow_that_fails_is_a_failure_and_one_that_cannot_go_on_is_noted(cache, tmp_path):
+    def follow(handle, then):
+        yield handle
+        then()
+
     def make(graph):
         node = graph.node("toys.numbers", "n", NumbersParams(), {"frame": 0})
         bad = graph.node("toys.mischief", "value", NO, {"what": "value"})
-        graph.expand([node], lambda ref: {}["basic"])
-        graph.expand([bad], lambda ref: pytest.fail("called"))
+        graph.flow(follow(node, lambda: {}["basic"]))
+        graph.flow(follow(bad, lambda: pytest.fail("called")))
 
     _, result = run(cache, make=make, keep_going=True, ledger=tmp_path / "l")
     assert [f.label for f in result.failures] == ["plan after n", "value"]
@@ -237,15 +245,16 @@ def test_an_interrupt_where_python_forgets_it_stops_the_run_all_the_same(cache, 
     def make(graph):
         first = graph.node("toys.numbers", "first", NumbersParams(), {"frame": 0})
 
-        def rest(ref):
+        def rest():
+            yield first
             Forgotten()
             done.append(graph.node("toys.numbers", "second", NumbersParams(), {"frame": 1}))
 
-        graph.expand([first], rest)
+        graph.flow(rest())
 
     with pytest.raises(KeyboardInterrupt):
         run(cache, make=make)
-    assert [node.status for node in done] == ["pending"], "the expansion went on, the run did not"
+    assert [node.status for node in done] == ["pending"], "the flow went on, the run did not"
     assert capfd.readouterr().err == ""
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     found, _ = run(cache, make=lambda graph: graph.node("toys.numbers", "first", NumbersParams(), {"frame": 0}))

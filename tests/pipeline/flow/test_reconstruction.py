@@ -8,7 +8,8 @@ from typing import Any
 from datasets.registry import open_sequence
 from pipeline.engine.graph import Graph
 from pipeline.flow import config
-from pipeline.flow.reconstruction import Products, Reconstruction
+from pipeline.flow.closed_loop import dataflow
+from pipeline.flow.products import Products
 
 FRAMES = 8
 
@@ -23,13 +24,14 @@ def lay_out(
     """The graph as it grows with these facts of the stages."""
     sequence = open_sequence("mockup-short", {"mockup": {"frames": FRAMES}})
     graph, settings = Graph(), config.build(config.expand(sequence.defaults), given)
-    products = Reconstruction(graph, sequence, settings, tuple(range(FRAMES))).build()
+    products, _ = dataflow(graph, sequence, settings, tuple(range(FRAMES)))
     nothing = {"asks": {"bridges": [], "sides": []}}
     for meta in [*({"asks": asks} for asks in asked), nothing | answer, chosen]:
-        graph.expansions[-1][1](SimpleNamespace(meta=meta))
-    for handles, grow, _ in list(graph.expansions):
+        deciding = [w for w in graph.expansions if w[0][0].stage in ("continuity", "select")]
+        deciding[-1][1](SimpleNamespace(meta=meta))
+    for handles, go_on, _ in list(graph.expansions):
         if handles == [products.trajectory]:
-            grow(SimpleNamespace(meta=trajectory))
+            go_on(SimpleNamespace(meta=trajectory))
     return graph, products
 
 

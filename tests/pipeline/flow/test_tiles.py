@@ -71,19 +71,16 @@ def test_the_artifact_is_that_of_the_pair_matched_whole(tmp_path, images, preset
 @pytest.mark.slow
 @pytest.mark.parametrize("preset", ["default", "fast"])
 def test_mockup_in_tiles_of_256_has_the_digest_of_the_whole(tmp_path, preset):
-    from pipeline.flow.reconstruction import Reconstruction
+    from pipeline.flow.builders import Builder
     from pipeline.runs.session import Options, settings
 
     digests = []
     for side in (0, 256):
         sequence, config, _ = settings(Options("mockup-short", (f"hfvm.preset={preset}", f"tiling.tile={side}")))
         graph = Graph()
-        chain = Reconstruction(graph, sequence, config, (0,))
-        products = chain.build()
-        del graph.nodes[products.disparity[0].index + 1 :]
-        graph.expansions.clear()
+        disparity = Builder(graph, sequence, config).disparity(0)
         scheduler.run(graph, Store(tmp_path), executor="inline").check()
-        digests.append(products.disparity[0].ref.digest)
+        digests.append(disparity.ref.digest)
     assert digests[0] == digests[1]
 
 

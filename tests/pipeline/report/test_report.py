@@ -14,8 +14,7 @@ import pytest
 from toys.finished import TASKS, Written, bundles, products, view, written
 
 from datasets.mockup.sequence import vehicle_at_scale
-from pipeline.flow.closed_loop import Driven
-from pipeline.flow.reconstruction import Products
+from pipeline.flow.products import Driven, Products
 from pipeline.report import TaskRow, canvas, figures, tables, words, write_report
 from pipeline.runs import session
 from stages.core.declare import Bundle

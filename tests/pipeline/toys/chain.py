@@ -17,14 +17,15 @@ def build(graph, frames=4, seed=0, size=40, offset=0.0):
         for f in range(frames)
     ]
 
-    def rest(*refs):
+    def rest():
+        yield first
         parts = [
             graph.node("toys.scale", f"scale/{f}", ScaleParams(offset=offset), inputs={"values": h})
             for f, h in enumerate(first)
         ]
         graph.node("toys.total", "total", NoParams(), inputs={"parts": parts})
 
-    graph.expand(first, rest)
+    graph.flow(rest())
 
 
 def main(cache, executor="inline", what="", ledger=""):

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from datasets.protocol import Sequence
-from pipeline.flow.reconstruction import Products
+from pipeline.flow.products import Products
 from pipeline.report import RunView, TaskRow, canvas, write_report
 from stages.core.declare import Bundle
 from stages.evaluation.accuracy import trajectory_accuracy

@@ -30,14 +30,15 @@ def build(graph, *, frames=FRAMES, size=150, shuffle=None, sleepers=0, sabotage=
     for f in shuffled(range(frames)):
         first[f] = graph.node("toys.numbers", f"numbers/{f}", NumbersParams(size=size), {"frame": f})
 
-    def rest(*refs):
+    def rest():
+        yield [first[f] for f in range(frames)]
         for f in shuffled(range(frames)):
             scaled[f] = graph.node("toys.scale", f"scale/{f}", ScaleParams(), inputs={"values": first[f]})
         halves = [[scaled[f] for f in range(frames) if f % 2 == k] for k in (0, 1)]
         for k in shuffled((0, 1)):
             graph.node("toys.total", f"total/{k}", NoParams(), inputs={"parts": halves[k]})
 
-    graph.expand([first[f] for f in range(frames)], rest)
+    graph.flow(rest())
     for what in sabotage:
         hints = {"tally": str(Path(tally) / what.replace(":", "-"))}
         graph.node("torn.saboteur", f"saboteur/{what}", NoParams(), {"what": what.partition("#")[0], "n": what}, hints)

@@ -1,0 +1,112 @@
+"""Estimates against truth: of a recorded sequence these tasks alone read it, and no estimate reads them.
+
+::
+
+    trajectory (each unbroken piece), crosscheck --> accuracy, position_accuracy <-- truth
+    trajectory, crosscheck ------------------------> agreement (it needs none)
+    locus (local), merge --------------------------> dem_accuracy <-- truth_dem (exact elevations)
+    path ------------------------------------------> path_check <-- risk (of these)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Sequence
+from typing import Any
+
+from datasets.protocol import Positions
+from pipeline.engine.graph import Handle, Wait
+from pipeline.engine.task import Ref
+from pipeline.flow.builders import Builder, Pair
+from stages.evaluation import accuracy, agreement, dem_accuracy, path_check, position_accuracy, truth
+from stages.geometry.geometry import RigidTransform
+from stages.geometry.lattice import Lattice, union
+
+Steps = Generator[Wait, Any, None]
+
+
+def of_trajectory(make: Builder, frames: Sequence[int]) -> Steps:
+    """Against the other program's, and against truth where there is one: each unbroken piece, or all of it."""
+    p, s = make.products, make.sequence
+    assert p.trajectory is not None
+    if p.crosscheck is not None:
+        p.agreement = make.node(agreement, "agreement", {}, trajectory=p.trajectory, crosscheck=p.crosscheck)
+    if s.truth_positions is not None:
+        args = _positions(make, s.truth_positions, frames)
+        p.position_accuracy = make.node(position_accuracy, "position_accuracy", args, trajectory=p.trajectory)
+    true = [_truth(make, f) for f in frames]
+    if all(pose is None for pose in true):
+        return
+    poses = [None if pose is None else pose.to_list() for pose in true]
+    known = make.node(truth, "truth", {"poses": poses, "source": s.truth_source, "frames": list(frames)})
+    if p.crosscheck is not None:
+        make.graph.flow(_of_crosscheck(make, p.crosscheck, known))
+    found = yield p.trajectory
+    pieces, main = found.meta["pieces"], found.meta["main"]
+    for number in range(len(pieces)):
+        label = "accuracy" if number == main else f"accuracy/piece/{number + 1}"
+        args = {"piece": number} if len(pieces) > 1 else {}
+        p.accuracy_pieces[number] = make.node(accuracy, label, args, trajectory=p.trajectory, truth=known)
+    p.accuracy = p.accuracy_pieces.get(main)
+
+
+def _of_crosscheck(make: Builder, joined: Handle, known: Handle) -> Steps:
+    """The other program's trajectory against truth, where it has one there."""
+    found = yield joined
+    posed = [f for f, position in zip(found.meta["frames"], found.meta["positions"], strict=True) if position]
+    if any(_truth(make, frame) is not None for frame in posed):
+        make.products.crosscheck_accuracy = make.node(
+            accuracy, "accuracy/crosscheck", {}, trajectory=joined, truth=known
+        )
+
+
+def of_pair(make: Builder, pair: Pair) -> Steps:
+    """The local elevation model of a pair."""
+    if make.sequence.truth_dem is None or _truth(make, pair.frame) is None:
+        return
+    level, dem = yield [pair.level, pair.dem]
+    exact = _truth_dem(make, Lattice.from_dict(dem.meta["lattice"]), pair.frame, level, (pair.frame,), "local")
+    args: dict[str, Any] = {"pair": pair.frame}
+    if make.sequence.evaluation_window is not None:
+        args["window"] = list(make.sequence.evaluation_window)
+    make.products.local_dem_accuracy[pair.frame] = make.node(
+        dem_accuracy, f"dem_accuracy/local/{pair.frame}", args, dem=[pair.dem], truth=exact
+    )
+
+
+def of_world(make: Builder, pairs: Sequence[Pair]) -> Steps:
+    """The merged elevation model, and the path over it on the hazards of the exact one."""
+    p, first = make.products, pairs[0]
+    if make.sequence.truth_dem is None or _truth(make, first.frame) is None:
+        return
+    assert p.path is not None
+    level = yield first.level
+    whole = union(Lattice.from_dict(tile.spec.args["lattice"]) for tile in p.tiles)
+    exact = _truth_dem(make, whole, first.frame, level, tuple(pair.frame for pair in pairs), "world")
+    p.dem_accuracy = make.node(dem_accuracy, "dem_accuracy/world", {}, dem=p.tiles, truth=exact)
+    p.truth_risk = make.hazards("risk/truth", [exact])
+    p.path_check = make.node(path_check, "path_check", {}, path=p.path, risk=p.truth_risk)
+
+
+def _truth(make: Builder, frame: int) -> RigidTransform | None:
+    return None if make.sequence.truth is None else make.sequence.truth[frame]
+
+
+def _positions(make: Builder, true: Positions, frames: Sequence[int]) -> dict[str, Any]:
+    """Arguments of the comparison with true positions: of the chosen frames, where rows are frames."""
+    s = make.sequence
+    args, moments = true.to_dict(), None
+    if true.times is None:
+        args["positions"] = [args["positions"][f] for f in frames]
+    elif s.times is not None:
+        moments = [s.times[f] for f in frames]
+    return args | {"moments": moments, "frames": list(frames), "source": s.truth_source}
+
+
+def _truth_dem(make: Builder, lattice: Lattice, pair: int, level: Ref, seen_by: tuple[int, ...], scope: str) -> Handle:
+    """Exact elevations in the levelled frame of ``pair`` (for the first pair: the world)."""
+    T_truth_left, exact = _truth(make, pair), make.sequence.truth_dem
+    assert T_truth_left is not None
+    assert exact is not None
+    T_local_left = RigidTransform.from_matrix(level.meta["T_local_left"])
+    T_truth_local = T_truth_left @ T_local_left.inverse()
+    return make.source(exact(lattice.to_dict(), T_truth_local, seen_by), f"truth_dem/{scope}/{pair}")

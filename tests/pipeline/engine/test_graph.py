@@ -1,0 +1,105 @@
+"""Flows: generators that add tasks and go on when what they wait for is there."""
+
+from __future__ import annotations
+
+import pytest
+from toys import mischief, numbers, scale, total
+from toys.numbers import NumbersParams
+from toys.scale import ScaleParams
+
+from pipeline.engine import scheduler
+from pipeline.engine.graph import Graph, Maybe, MissingError
+from pipeline.engine.store.folder import Store
+from stages.core.declare import NoParams
+
+NO = NoParams()
+
+
+def number(graph, frame):
+    return graph.node(numbers, f"numbers/{frame}", NumbersParams(size=8), {"frame": frame})
+
+
+def broken(graph, what="degenerate"):
+    return graph.node(mischief, f"broken/{what}", NO, {"what": what})
+
+
+def run(graph, tmp_path, **options):
+    return scheduler.run(graph, Store(tmp_path / "cache"), executor="inline", **options)
+
+
+def test_a_flow_gets_what_it_yielded_and_several_run_side_by_side(tmp_path):
+    graph, told = Graph(), []
+
+    def scaled(frame):
+        ref = yield number(graph, frame)
+        told.append(ref.meta["frame"])
+        again = yield [graph.node(scale, f"scale/{frame}", ScaleParams(), inputs={"values": graph.nodes[frame]})]
+        return again[0].meta["levels"] + frame
+
+    def whole():
+        levels = yield [graph.flow(scaled(0)), graph.flow(scaled(1))]
+        alone = yield graph.flow(scaled(2))
+        parts = [handle for handle in graph.nodes if handle.stage == "scale"]
+        found = yield graph.node(total, "total", NO, inputs={"parts": parts})
+        return levels, alone, found.meta["count"], (yield [])
+
+    flow = graph.flow(whole())
+    assert [handle.label for handle in graph.nodes] == ["numbers/0", "numbers/1"], "both have begun"
+    assert run(graph, tmp_path).ok
+    assert flow.done
+    assert flow.value == ([2, 3], 4, 3, [])
+    assert told == [0, 1, 2]
+
+
+def test_what_is_missing_is_none_or_raises_where_it_is_waited_for(tmp_path):
+    graph, told = Graph(), []
+
+    def careful():
+        told.append([ref is None for ref in (yield Maybe([number(graph, 0), bad]))])
+
+    def catching():
+        try:
+            yield [graph.nodes[0], bad]
+        except MissingError as error:
+            told.append(str(error))
+        again = yield number(graph, 1)
+        told.append(again.meta["frame"])
+
+    def careless():
+        yield after
+        pytest.fail("went on")
+
+    def waiting():
+        with pytest.raises(MissingError):
+            yield lost
+        told.append("the other flow missed it")
+
+    bad = broken(graph)
+    after = graph.node(mischief, "after", NO, {"what": "fine"}, inputs={"after": bad})
+    graph.flow(careful())
+    graph.flow(catching())
+    lost = graph.flow(careless())
+    graph.flow(waiting())
+    result = run(graph, tmp_path, ledger=tmp_path / "ledger.jsonl")
+    assert [failure.label for failure in result.failures] == ["broken/degenerate"]
+    assert sorted(map(str, told)) == sorted(["1", "[False, True]", "broken/degenerate", "the other flow missed it"])
+    assert "plan after after" in (tmp_path / "ledger.jsonl").read_text(), "the run says what never followed"
+
+
+def test_an_error_of_a_flow_is_a_failure_of_the_run(tmp_path):
+    graph = Graph()
+
+    def wrong():
+        yield number(graph, 0)
+        raise ValueError("no such pair")
+
+    graph.flow(wrong())
+    assert [f"{f.label}: {f.error}" for f in run(graph, tmp_path).failures] == ["plan after numbers/0: no such pair"]
+
+
+def test_a_stage_is_named_by_its_module(tmp_path):
+    graph = Graph()
+    a, b = number(graph, 0), graph.node("toys.numbers", "b", NumbersParams(size=8), {"frame": 0})
+    assert a.spec.module == b.spec.module
+    assert run(graph, tmp_path).ok
+    assert a.key == b.key
