@@ -31,9 +31,10 @@ def test_a_flow_gets_what_it_yielded_and_several_run_side_by_side(tmp_path):
     graph, told = Graph(), []
 
     def scaled(frame):
-        ref = yield number(graph, frame)
+        values = number(graph, frame)
+        ref = yield values
         told.append(ref.meta["frame"])
-        again = yield [graph.node(scale, f"scale/{frame}", ScaleParams(), inputs={"values": graph.nodes[frame]})]
+        again = yield [graph.node(scale, f"scale/{frame}", ScaleParams(), inputs={"values": values})]
         return again[0].meta["levels"] + frame
 
     def whole():
@@ -55,11 +56,11 @@ def test_what_is_missing_is_none_or_raises_where_it_is_waited_for(tmp_path):
     graph, told = Graph(), []
 
     def careful():
-        told.append([ref is None for ref in (yield Maybe([number(graph, 0), bad]))])
+        told.append([ref is None for ref in (yield Maybe([fine, bad]))])
 
     def catching():
         try:
-            yield [graph.nodes[0], bad]
+            yield [fine, bad]
         except MissingError as error:
             told.append(str(error))
         again = yield number(graph, 1)
@@ -74,7 +75,7 @@ def test_what_is_missing_is_none_or_raises_where_it_is_waited_for(tmp_path):
             yield lost
         told.append("the other flow missed it")
 
-    bad = broken(graph)
+    fine, bad = number(graph, 0), broken(graph)
     after = graph.node(mischief, "after", NO, {"what": "fine"}, inputs={"after": bad})
     graph.flow(careful())
     graph.flow(catching())
