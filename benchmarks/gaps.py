@@ -67,30 +67,27 @@ def trajectory(folder: Path, frames: tuple[int, ...], cache: Path) -> Any:
     """The trajectory of some frames of a folder, without elevation models; None where there is none."""
     from datasets.registry import open_sequence
     from pipeline.engine import scheduler
-    from pipeline.engine.graph import Graph
+    from pipeline.engine.graph import Graph, Handle
     from pipeline.engine.store.folder import at
     from pipeline.flow import config
-    from pipeline.flow.reconstruction import Reconstruction
+    from pipeline.flow.closed_loop import dataflow
+    from stages.evaluation import truth
+    from stages.terrain.locus import stage as locus
 
-    class Odometry(Reconstruction):
-        """A reconstruction that ends with its trajectory."""
+    class Odometry(Graph):
+        """Leaves out elevation models, truth, and what would follow from them."""
 
-        def _basic_pair(self, pair: int) -> None:
-            known = {"disparity": self.products.disparity[pair], "rig": self.calibration[pair]}
-            self.products.level[pair] = self._node("level", f"level/{pair}", self._vertical(pair), **known)
+        def node(self, stage: Any, *args: Any, **more: Any) -> Handle:
+            handle = super().node(stage, *args, **more)
+            if stage in (locus, truth) or any(h not in self.nodes for h in handle.upstream()):
+                self.nodes.remove(handle)
+            return handle
 
-        def _assess_trajectory(self) -> None:
-            pass
-
-        def _after_trajectory(self, _: Any) -> None:
-            pass
-
-    graph, store = Graph(), at(cache)
-    sequence = open_sequence(str(folder))
-    flow = Odometry(graph, sequence, config.build({"crosscheck": {"enabled": False}}), frames)
-    flow.build()
+    graph, store = Odometry(), at(cache)
+    settings = config.build({"crosscheck": {"enabled": False}})
+    products, _ = dataflow(graph, open_sequence(str(folder)), settings, frames)
     scheduler.run(graph, store, executor="inline")
-    handle = flow.products.trajectory
+    handle = products.trajectory
     return None if handle is None or handle.ref is None else store.open(handle.ref)
 
 

@@ -65,19 +65,25 @@ def merged(cache: Path, where: list[tuple[int, int]], cells: int, jobs: int, led
     from pipeline.engine import scheduler
     from pipeline.engine.graph import Graph
     from pipeline.engine.store.folder import Store
-    from pipeline.flow.config import STAGE_MODULES
-    from pipeline.flow.reconstruction import TILE_CELLS, merge_tiles
-    from stages.terrain.merge import MergeParams
+    from pipeline.flow.builders import merge_tiles
+    from pipeline.flow.reconstruction import TILE_CELLS
+    from stages.terrain import merge, tile_index
 
     graph = Graph()
 
-    def node(stage: str, label: str, args: dict[str, Any], **inputs: Any) -> Any:
-        params = MergeParams() if stage == "merge" else NoParams()
-        return graph.node(STAGE_MODULES.get(stage, "benchmarks.merge_scale"), label, params, args, {}, inputs)
+    def node(stage: Any, label: str, args: Any, **inputs: Any) -> Any:
+        params = merge.MergeParams() if stage is merge else NoParams()
+        return graph.node(stage, label, params, args, {}, inputs)
 
-    dems = {k: node("", f"dem/{k}", {"pair": k, "i0": i, "j0": -j, "cells": cells}) for k, (i, j) in enumerate(where)}
-    prints = [node("footprint", f"footprint/{k}", {"side": TILE_CELLS, "margin": 0}, dem=d) for k, d in dems.items()]
-    graph.expand(prints, lambda *found: merge_tiles(node, [ref.meta for ref in found], dems, {}) and None)
+    here = "benchmarks.merge_scale"
+    dems = {k: node(here, f"dem/{k}", {"pair": k, "i0": i, "j0": -j, "cells": cells}) for k, (i, j) in enumerate(where)}
+    prints = [node(tile_index, f"footprint/{k}", {"side": TILE_CELLS, "margin": 0}, dem=d) for k, d in dems.items()]
+
+    def follow() -> Any:
+        found = yield prints
+        merge_tiles(node, [ref.meta for ref in found], dems, {})
+
+    graph.flow(follow())
     begin = time.perf_counter()
     result = scheduler.run(graph, Store(cache), jobs=jobs, ledger=ledger)
     result.check()

@@ -146,23 +146,30 @@ def image_stage() -> Any:
 
 def write_stages(folder: Path) -> None:
     """The package ``idle`` of stages that do nothing."""
-    from pipeline.flow.config import STAGE_MODULES
+    from pipeline.flow.config import modules
 
     package = folder / "idle"
     package.mkdir(parents=True)
     (package / "__init__.py").write_text('"""Stages that do nothing."""\n')
     (package / "image.py").write_text(IMAGE_MODULE)
-    for name, real in STAGE_MODULES.items():
-        (package / f"{name}.py").write_text(STAGE_MODULE.format(real=real, name=name))
+    for name, real in modules().items():
+        (package / f"{name}.py").write_text(STAGE_MODULE.format(real=real.__name__, name=name))
 
 
 def graph_of(pairs: int) -> Any:
     """The real dataflow over a sequence of so many pairs."""
     from datasets.protocol import Sequence, Source
-    from pipeline.engine.graph import Graph
-    from pipeline.flow import config, reconstruction
+    from pipeline.engine.graph import Graph, Handle
+    from pipeline.flow import config
+    from pipeline.flow.closed_loop import dataflow
     from stages.core.declare import NoParams
     from stages.geometry.geometry import Camera, Rig, RigidTransform
+
+    class Idle(Graph):
+        """Takes for each stage the one that does nothing."""
+
+        def node(self, stage: Any, *args: Any, **more: Any) -> Handle:
+            return super().node(stage if isinstance(stage, str) else f"idle.{stage.STAGE.name}", *args, **more)
 
     camera = Camera(60.0, 60.0, 31.5, 23.5, 64, 48)
     rig = Rig(camera, camera, RigidTransform(np.eye(3), np.array([-0.1, 0.0, 0.0])))
@@ -171,9 +178,8 @@ def graph_of(pairs: int) -> Any:
         return Source("idle.image", NoParams(), {"frame": frame, "camera": which})
 
     sequence = Sequence("scale", rig, pairs, image, tuple(str(k) for k in range(pairs)))
-    reconstruction.STAGE_MODULES = {name: f"idle.{name}" for name in config.STAGE_MODULES}
-    graph = Graph()
-    reconstruction.Reconstruction(graph, sequence, config.build({}), tuple(range(pairs))).build()
+    graph = Idle()
+    dataflow(graph, sequence, config.build({}), tuple(range(pairs)))
     return graph
 
 

@@ -30,12 +30,14 @@ def trial(settings: list[str]) -> dict[str, Any]:
     from pipeline.engine import scheduler
     from pipeline.engine.graph import Graph
     from pipeline.engine.store.folder import at
-    from pipeline.flow.closed_loop import Drive
+    from pipeline.flow.closed_loop import Drive, EndedError, Stand
+    from pipeline.flow.products import Stop
 
     class OneLeg(Drive):
-        def _stop(self, *where: Any) -> None:
-            if not self.driven.stops:
-                super()._stop(*where)
+        def _look(self, at: Stand) -> Stop:
+            if self.driven.stops:
+                raise EndedError("stops", "one leg is enough")
+            return super()._look(at)
 
     begin = time.perf_counter()
     sequence, layers = prepared(settings)
