@@ -1,4 +1,5 @@
-"""Standard deviation of disparities against exact ones: the factors of ``stages.hfvm.uncertainty`` and their check.
+"""Standard deviation of disparities against exact ones: the factors of ``stages.hfvm.finish.uncertainty`` and their
+check.
 
 ``python benchmarks/disparity_std.py`` renders pairs of the built-in mockup (kept in ``--cache``), matches them and
 prints how many of the matched pixels err by less than one and two standard deviations. ``motorcycle`` and ``cones`` of
@@ -85,8 +86,9 @@ def judged(
     preset: str, left: Any, right: Any, truth: Any, left_valid: Any = None, right_valid: Any = None
 ) -> tuple[Floats, Floats, Floats]:
     """Parts (1, N, R, M) x n, absolute errors (n,) and standard deviations (n,) of the matched pixels with truth."""
-    from stages import hfvm
-    from stages.hfvm import HfvmParams, uncertainty
+    from stages.hfvm import stage as hfvm
+    from stages.hfvm.finish import uncertainty
+    from stages.hfvm.images.params import HfvmParams
 
     parts: list[Any] = []
     original = uncertainty.standard_deviation

@@ -135,7 +135,7 @@ def main() -> None:
     from pipeline.engine.runtime.environment import prepare_environment
     from pipeline.engine.store.folder import Store
     from pipeline.flow import tiles
-    from stages.hfvm import HfvmParams
+    from stages.hfvm.images.params import HfvmParams
     from stages.imaging.pyramid import PyramidParams
 
     with tempfile.TemporaryDirectory(prefix="rille-large-") as folder:
@@ -150,7 +150,9 @@ def main() -> None:
         print(f"{shape[1]} x {shape[0]}, preset {options.preset}, tiles of {side}", flush=True)
         graph = Graph()
         pyramids = lay_out(graph, paths, shape)
-        whole = graph.node("stages.hfvm", "whole", params, inputs=pyramids) if options.whole or side is None else None
+        whole = (
+            graph.node("stages.hfvm.stage", "whole", params, inputs=pyramids) if options.whole or side is None else None
+        )
         if side is not None:
             other = Graph()
             args = (params, PyramidParams(), lay_out(other, paths, shape), (shape, shape), side, "hfvm")

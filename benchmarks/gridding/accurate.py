@@ -9,7 +9,7 @@ import numpy as np
 
 from pipeline.flow import config
 from stages.geometry.surface import plane
-from stages.hfvm import match
+from stages.hfvm.stage import match
 from stages.terrain.locus.solve import Matches
 from stages.terrain.locus.stage import reconstruct, usable
 

@@ -76,7 +76,7 @@ def match(scene: Scene, preset: str = "default") -> Disparities:
     """Disparities by the matcher with a preset."""
     from pipeline.flow import config
     from stages.core.validity import matched
-    from stages.hfvm import match as hfvm
+    from stages.hfvm.stage import match as hfvm
 
     params = config.build({"hfvm": {"preset": preset}}).hfvm
     found = hfvm(scene.left, scene.right, params, left_valid=scene.valid[0], right_valid=scene.valid[1])

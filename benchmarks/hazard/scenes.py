@@ -26,7 +26,7 @@ from stages.geometry.geometry import Rig, RigidTransform
 from stages.geometry.lattice import Lattice
 from stages.geometry.surface import plane
 from stages.hazard.vehicle import Vehicle
-from stages.hfvm import match
+from stages.hfvm.stage import match
 from stages.terrain.ground_frame import LevelParams, level, z_range
 from stages.terrain.locus.solve import Matches
 from stages.terrain.locus.stage import LocusParams, local_lattice, reconstruct, usable
@@ -43,7 +43,7 @@ ATTITUDE_DEG = 0.2
 """Error of the inclinometer about each axis, degrees, as that of the simulated rover."""
 
 MADE_BY = (
-    "benchmarks/hazard/scenes.py", "pipeline/flow/config.py", "datasets/mockup/*.py", "stages/hfvm/*.py",
+    "benchmarks/hazard/scenes.py", "pipeline/flow/config.py", "datasets/mockup/*.py", "stages/hfvm/**/*.py",
     "stages/terrain/ground_frame.py", "stages/terrain/ground.py", "stages/terrain/locus/*.py",
     "stages/geometry/surface.py",
     "stages/geometry/lattice.py", "stages/core/validity.py",

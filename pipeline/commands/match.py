@@ -17,7 +17,7 @@ from pipeline.flow import config as configuration
 from stages.core.errors import ConfigError, InputError
 
 if TYPE_CHECKING:
-    from stages.hfvm import Disparity
+    from stages.hfvm.stage import Disparity
 
 COMPLETE, INCOMPLETE = 0, 3
 
@@ -75,7 +75,7 @@ def match_files(
 
     from pipeline.flow import tiles
     from stages.core.validity import matched
-    from stages.hfvm import match
+    from stages.hfvm.stage import match
 
     side = tiles.side(tiles.Tiling(), params, (images[0].shape, images[1].shape))
     with _progress(max(image.size for image in images), sys.stderr) as tell:
@@ -99,7 +99,7 @@ def match_files(
 def warnings(found: Disparity) -> list[str]:
     """What is suspicious about two matched images, one line each with the figure."""
     from stages.core.validity import Validity, has, matched
-    from stages.hfvm.order import swapped
+    from stages.hfvm.swap_check import swapped
 
     ok = matched(found.validity)
     share = float(ok.mean())

@@ -19,10 +19,10 @@ from pipeline.engine.graph import Graph, Handle
 from pipeline.engine.keys import digest
 from pipeline.flow import tiles
 from pipeline.flow.products import Products
-from stages import hfvm
 from stages.calibration import calibration, orientation, rig, swap_check
 from stages.core.declare import NoParams, Params
 from stages.hazard import risk
+from stages.hfvm import stage as hfvm
 from stages.imaging import pyramid, undistort
 from stages.odometry import motion, track
 from stages.odometry.resection import pose, resect

@@ -11,10 +11,10 @@ from pydantic import Field
 from pipeline.engine.graph import Graph, Handle
 from stages.core.declare import Params
 from stages.hfvm import join_stage, tile_stage, tiled
-from stages.hfvm.params import HfvmParams
-from stages.hfvm.plane import margin
-from stages.hfvm.views import pyramid_shapes
-from stages.hfvm.window import Shape, tiles
+from stages.hfvm.images.params import HfvmParams
+from stages.hfvm.images.plane import margin
+from stages.hfvm.images.views import pyramid_shapes
+from stages.hfvm.images.window import Shape, tiles
 from stages.imaging.pyramid import PyramidParams
 
 WHOLE_BYTES, TILE_BYTES = 170, 300

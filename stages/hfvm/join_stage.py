@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 
 from stages.core.declare import AnyArray, Bundle, Inputs, Stage
-from stages.hfvm import OUTPUTS, facts, tiled
-from stages.hfvm.params import HfvmParams
+from stages.hfvm import tiled
+from stages.hfvm.images.params import HfvmParams
+from stages.hfvm.images.window import Mosaic, Shape, cut, strips, tiles, whole
+from stages.hfvm.stage import OUTPUTS, facts
 from stages.hfvm.tile_stage import mosaic, views
-from stages.hfvm.window import Mosaic, Shape, cut, strips, tiles, whole
 
 
 @dataclass(frozen=True)

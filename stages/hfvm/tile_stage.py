@@ -15,12 +15,14 @@ import numpy as np
 
 from stages.core.declare import AnyArray, Array, Bundle, Inputs, Stage
 from stages.core.errors import InputError
-from stages.hfvm import OUTPUTS, hierarchy, tiled
-from stages.hfvm.finish import Finish
-from stages.hfvm.hierarchy import Band, Map, Prepared, State
-from stages.hfvm.params import HfvmParams
-from stages.hfvm.views import Aligned, Plain, View
-from stages.hfvm.window import Mosaic, Results, Shape, Window, tiles
+from stages.hfvm import tiled
+from stages.hfvm.coarse_to_fine import hierarchy
+from stages.hfvm.coarse_to_fine.hierarchy import Band, Map, Prepared, State
+from stages.hfvm.finish.finish import Finish
+from stages.hfvm.images.params import HfvmParams
+from stages.hfvm.images.views import Aligned, Plain, View
+from stages.hfvm.images.window import Mosaic, Results, Shape, Window, tiles
+from stages.hfvm.stage import OUTPUTS
 
 MAP = ("u", "v", "undefined")
 

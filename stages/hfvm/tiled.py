@@ -18,12 +18,14 @@ import numpy as np
 
 from stages.core.declare import AnyArray
 from stages.core.validity import matched
-from stages.hfvm import accurate, hierarchy, plane, refine, resample, start
-from stages.hfvm.finish import Finish
-from stages.hfvm.hierarchy import Prepared, State
-from stages.hfvm.params import HfvmParams
-from stages.hfvm.views import Aligned, Plain, Seen, View
-from stages.hfvm.window import Raster, Results, Shape, Window, cut, gather, tiles, whole
+from stages.hfvm.coarse_to_fine import accurate, hierarchy, start
+from stages.hfvm.coarse_to_fine.hierarchy import Prepared, State
+from stages.hfvm.finish import refine
+from stages.hfvm.finish.finish import Finish
+from stages.hfvm.images import plane, resample
+from stages.hfvm.images.params import HfvmParams
+from stages.hfvm.images.views import Aligned, Plain, Seen, View
+from stages.hfvm.images.window import Raster, Results, Shape, Window, cut, gather, tiles, whole
 
 Tell = Callable[[float, str], None]
 """Called with the share of the work done, 0..1, and what comes next in words."""
@@ -99,7 +101,7 @@ def coarse(left: View, right: View, params: HfvmParams, side: int | None, prior:
 
 
 def contrast(pair: Prepared, state: State) -> float:
-    """Factor for the right image, see :func:`stages.hfvm.refine.contrast`."""
+    """Factor for the right image, see :func:`stages.hfvm.finish.refine.contrast`."""
     a, b = (seen.view.grey(state.level, whole(seen.view.shapes[state.level])) for seen in (pair.left, pair.right))
     return refine.contrast(a, b, state.left.u, state.left.v, state.left_ok)
 

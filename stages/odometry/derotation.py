@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from stages.core.errors import InputError
 from stages.geometry.geometry import Camera
-from stages.hfvm.plane import translation, warp
+from stages.hfvm.images.plane import translation, warp
 from stages.imaging import pyramid
 from stages.imaging.pyramid import Pyramid, PyramidParams
 

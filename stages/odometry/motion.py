@@ -23,9 +23,10 @@ from pydantic import Field
 from stages.core.declare import AnyArray, Array, Bundle, Inputs, Params, Stage
 from stages.core.validity import Mask, Validity, defined, mark, matched
 from stages.geometry.geometry import Camera
-from stages.hfvm import consistency, hierarchy
-from stages.hfvm.params import HfvmParams
-from stages.hfvm.window import whole
+from stages.hfvm.coarse_to_fine import hierarchy
+from stages.hfvm.images.params import HfvmParams
+from stages.hfvm.images.window import whole
+from stages.hfvm.level import consistency
 from stages.imaging.pyramid import Pyramid
 from stages.odometry import roll_search
 from stages.odometry.derotation import Derotation

@@ -14,10 +14,10 @@ from numba import njit
 from numpy.typing import NDArray
 
 from stages.geometry.cubic import cubic
-from stages.hfvm import features
-from stages.hfvm.features import distance
-from stages.hfvm.params import HfvmParams
-from stages.hfvm.subpixel import linear
+from stages.hfvm.images.params import HfvmParams
+from stages.hfvm.level import features
+from stages.hfvm.level.features import distance
+from stages.hfvm.level.subpixel import linear
 from stages.imaging.pyramid import Pyramid, filled
 
 Floats = NDArray[np.float64]

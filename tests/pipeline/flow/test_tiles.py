@@ -13,7 +13,7 @@ from pipeline.flow import tiles
 from pipeline.flow.config import build
 from pipeline.flow.tiles import Tiling
 from stages.core.declare import NoParams
-from stages.hfvm import HfvmParams
+from stages.hfvm.images.params import HfvmParams
 from stages.imaging.pyramid import PyramidParams
 
 SHAPE = (150, 190)
@@ -50,7 +50,7 @@ def disparity(store, images, params, side):
     graph = Graph()
     given = pyramids(graph, images)
     if side is None:
-        node = graph.node("stages.hfvm", "hfvm", params, inputs=given)
+        node = graph.node("stages.hfvm.stage", "hfvm", params, inputs=given)
     else:
         node = tiles.Tiles(graph, params, PyramidParams(), given, (SHAPE, SHAPE), side, "hfvm").build()
     scheduler.run(graph, store, executor="inline").check()

@@ -228,7 +228,7 @@ def test_street_of_kitti_is_left_alone_and_repaired_when_knocked(data_dir):
     from stages.calibration.orientation import thin
     from stages.core.validity import matched
     from stages.geometry.lens import Lens
-    from stages.hfvm import match
+    from stages.hfvm.stage import match
 
     sequence = open_sequence(str(data_dir / "kitti06_51"))
     left, right = (_image(sequence.image(20, camera)) for camera in ("left", "right"))

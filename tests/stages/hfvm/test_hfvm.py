@@ -8,10 +8,11 @@ import pytest
 from matching_scenes import convergent_rig, pair, rig_displacement, seen
 from raising import raises
 
-from stages import hfvm
 from stages.core.declare import Bundle, check_outputs
 from stages.core.validity import Validity, counts, defined, has, matched
-from stages.hfvm import HfvmParams, match
+from stages.hfvm import stage as hfvm
+from stages.hfvm.images.params import HfvmParams
+from stages.hfvm.stage import match
 from stages.imaging import pyramid
 from stages.imaging.pyramid import PyramidParams
 

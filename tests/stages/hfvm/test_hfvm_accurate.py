@@ -8,9 +8,12 @@ from matching_scenes import Texture, pair, seen
 
 from stages.core.errors import RilleError
 from stages.core.validity import Validity, has, matched
-from stages.hfvm import HfvmParams, compact, consistency, guided, match, path_lanes, paths, relief
-from stages.hfvm.params import ACCURATE
-from stages.hfvm.propagation import pack_map
+from stages.hfvm.coarse_to_fine import compact, path_simd, paths
+from stages.hfvm.finish import guided, variational_refinement
+from stages.hfvm.images.params import ACCURATE, HfvmParams
+from stages.hfvm.level import consistency
+from stages.hfvm.level.propagation import pack_map
+from stages.hfvm.stage import match
 from stages.imaging.pyramid import PyramidParams, build
 
 ACC = HfvmParams(preset="accurate")
@@ -19,7 +22,7 @@ NO_LINES = np.zeros((1, 1, 3), np.float32)
 
 
 def view(image):
-    from stages.hfvm import features
+    from stages.hfvm.level import features
 
     words, _ = features.pack(image, ACC.weights)
     return paths.View(words, compact.pack(image), image)
@@ -176,13 +179,13 @@ def test_candidates_and_their_costs_are_those_of_the_definition(mu, with_up):
         there = cost[y, x] != paths.NONE
         assert list(zip(cu[y, x, there].tolist(), cv[y, x, there].tolist(), strict=True)) == want
         for k, (i, j) in enumerate(want):
-            expected = path_lanes.OUTSIDE
+            expected = path_simd.OUTSIDE
             if 0 <= x + i < right.shape[1] and 0 <= y + j < right.shape[0]:
                 other = y + j, x + i
                 expected = 4 * apart(a.words[y, x], b.words[other]) + 8 * apart(a.compact[y, x], b.compact[other])
             n = lines[y, x].astype(np.float64)
             expected += int(12 * mu * abs(n[0] * i + n[1] * j + n[2]))
-            assert cost[y, x, k] == min(expected, 2 * path_lanes.OUTSIDE)
+            assert cost[y, x, k] == min(expected, 2 * path_simd.OUTSIDE)
 
 
 def bytes_of(word):
@@ -233,7 +236,7 @@ def test_relief_restores_a_slanted_plane():
     keep = seen(u, v, right.shape, 8)
     rng = np.random.default_rng(0)
     start = [(a + rng.normal(0, 0.2, a.shape)).astype(np.float32) for a in (u, v)]
-    found_u, found_v = relief.fit(left, right, np.ones(right.shape, np.uint8), *start, keep, ACC)
+    found_u, found_v = variational_refinement.fit(left, right, np.ones(right.shape, np.uint8), *start, keep, ACC)
     error = np.hypot(found_u - u, found_v - v)
     # A plane bends nowhere. One pixel tells sqrt(2) noise / gradient = .4 px (gradient about 7 a pixel in either
     # direction); stiffness averages some 7 x 7 pixels: .06 px.
@@ -249,7 +252,7 @@ def test_matches_far_off_their_line_are_led_to_it():
     astray[30:40, 50:60] = astray[60:63, 80:83] = True
     assert keep[astray].all()
     start = u.astype(np.float32), np.where(astray, v + 2.0, v).astype(np.float32)
-    found_u, found_v = relief.fit(left, right, np.ones(right.shape, np.uint8), *start, keep, ACC)
+    found_u, found_v = variational_refinement.fit(left, right, np.ones(right.shape, np.uint8), *start, keep, ACC)
     # As far off as the others, whose rows the lines fitted to all of them hold.
     assert np.abs(found_v - v)[astray].max() < 0.1
     assert np.hypot(found_u - u, found_v - v)[astray].max() < 1.0
@@ -259,7 +262,7 @@ def test_relief_keeps_a_step():
     left, right, u, occluded = stairs()
     keep = ~occluded & seen(u, 0 * u, left.shape, 4)
     start = (u.astype(np.float32), np.zeros(u.shape, np.float32))
-    found, _ = relief.fit(left, right, np.ones(right.shape, np.uint8), *start, keep, ACC)
+    found, _ = variational_refinement.fit(left, right, np.ones(right.shape, np.uint8), *start, keep, ACC)
     # Four times the bend beyond which stiffness gives way; a linear smoother would leave pixels here.
     assert np.abs(found - u)[keep].max() < 0.5
     assert np.median(np.abs(found - u)[keep]) < 0.02
@@ -269,10 +272,10 @@ def test_relief_of_nothing_is_nothing():
     left, right, u, v = slanted(noise=0.0)
     start = (u.astype(np.float32), v.astype(np.float32))
     none = np.zeros(u.shape, bool)
-    found = relief.fit(left, right, np.ones(right.shape, np.uint8), *start, none, ACC)
+    found = variational_refinement.fit(left, right, np.ones(right.shape, np.uint8), *start, none, ACC)
     np.testing.assert_array_equal(found[0], start[0])
     flat = np.full_like(left, 7.0), np.full_like(right, 7.0)
-    found = relief.fit(*flat, np.ones(right.shape, np.uint8), *start, ~none, ACC)
+    found = variational_refinement.fit(*flat, np.ones(right.shape, np.uint8), *start, ~none, ACC)
     assert np.isfinite(found[0]).all()
     assert np.abs(found[0] - start[0]).max() < 0.05
 

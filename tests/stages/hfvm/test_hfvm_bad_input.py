@@ -8,10 +8,11 @@ from raising import raises
 
 from stages.core.errors import InputError
 from stages.core.validity import Validity, defined, has, matched
-from stages.hfvm import HfvmParams, match
-from stages.hfvm.consistency import patches, unsupported
-from stages.hfvm.order import swapped
-from stages.hfvm.refine import contrast
+from stages.hfvm.finish.refine import contrast
+from stages.hfvm.images.params import HfvmParams
+from stages.hfvm.level.consistency import patches, unsupported
+from stages.hfvm.stage import match
+from stages.hfvm.swap_check import swapped
 
 BORDER = 8
 MOST_CHANCE = 0.05

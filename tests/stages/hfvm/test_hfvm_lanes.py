@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from numba import njit
 
-from stages.hfvm import lanes, strip_lanes
-from stages.hfvm.resample import sample_cubic
+from stages.hfvm.images.resample import sample_cubic
+from stages.hfvm.level import simd, strip_simd
 
-WIDTHS = sorted({0, lanes.widest()})
+WIDTHS = sorted({0, simd.widest()})
 
 
 def words(n, seed):
@@ -20,7 +20,7 @@ def sad(a, b):
 
 @pytest.mark.parametrize("width", WIDTHS)
 def test_sums_over_windows(width):
-    sums = lanes.make_sums(width)
+    sums = simd.make_sums(width)
 
     @njit
     def call(left, right, at_left, at_right, count, four, last):
@@ -47,9 +47,9 @@ def test_all_widths_search_alike():
     found = []
     for width in WIDTHS:
         four, settle, dense = (
-            strip_lanes.make_four(width),
-            lanes.make_settle(width),
-            lanes.make_settle(width, dense=True),
+            strip_simd.make_four(width),
+            simd.make_settle(width),
+            simd.make_settle(width, dense=True),
         )
 
         @njit
@@ -82,7 +82,7 @@ def test_cubic_interpolation_equals_the_plain_form():
     def call(image, x, y):
         i, j = int(x), int(y)
         t, s = x - np.float32(i), y - np.float32(j)
-        return lanes.cubic(image.ravel(), j * image.shape[1] + i, image.shape[1], t, s)
+        return simd.cubic(image.ravel(), j * image.shape[1] + i, image.shape[1], t, s)
 
     image = np.random.default_rng(8).uniform(0, 255, (9, 10)).astype(np.float32)
     for x, y in np.random.default_rng(9).uniform(2, 6, (50, 2)).astype(np.float32):

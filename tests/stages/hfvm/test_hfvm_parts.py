@@ -8,9 +8,12 @@ from matching_scenes import convergent_rig, pair, rig_displacement
 from scipy import ndimage
 
 from stages.geometry.geometry import Rig
-from stages.hfvm import consistency, epipolar, hierarchy, lookup, plane, refine, rowwise
-from stages.hfvm.params import HfvmParams
-from stages.hfvm.window import whole
+from stages.hfvm.coarse_to_fine import hierarchy
+from stages.hfvm.finish import refine
+from stages.hfvm.images import plane
+from stages.hfvm.images.params import HfvmParams
+from stages.hfvm.images.window import whole
+from stages.hfvm.level import consistency, epipolar, rowwise, subpixel_lut
 from stages.imaging.pyramid import PyramidParams, build
 
 
@@ -259,7 +262,7 @@ class TestLookup:
         rng = np.random.default_rng(0)
         true = rng.uniform(-0.5, 0.5, 20000)
         found = true - 0.1 * np.sin(2 * np.pi * true)
-        even = lookup.even(found, lookup.learn(found))
+        even = subpixel_lut.even(found, subpixel_lut.learn(found))
         counts, _ = np.histogram(even, 10, (-0.5, 0.5))
         assert np.ptp(np.histogram(found, 10, (-0.5, 0.5))[0]) > 1000
         # 2000 a bin, five standard deviations, and linear interpolation inside sixteenths.
@@ -267,13 +270,13 @@ class TestLookup:
 
     def test_table_maps_the_interval_onto_itself_oddly(self):
         x = np.linspace(-0.5, 0.5, 101)
-        y = lookup.even(x)
+        y = subpixel_lut.even(x)
         assert (y[0], y[50], y[-1]) == (-0.5, 0.0, 0.5)
         assert (np.diff(y) > 0).all()
         np.testing.assert_allclose(y, -y[::-1], atol=1e-7)
 
     def test_no_sample_no_change(self):
-        np.testing.assert_allclose(lookup.even([0.3], lookup.learn([])), [0.3], atol=1e-6)
+        np.testing.assert_allclose(subpixel_lut.even([0.3], subpixel_lut.learn([])), [0.3], atol=1e-6)
 
     def test_default_table_is_what_textured_noise_teaches(self):
         p = HfvmParams(preset="paper", top_columns=0.05, top_rows=0.05)
@@ -291,6 +294,6 @@ class TestLookup:
         state = hierarchy.run(prepared, p, 0)
         patches = [seen.patch(0, whole(images[0].shape)) for seen in (prepared.left, prepared.right)]
         _, _, _, offset = prepared.solver.search(*patches, state.left.u, state.left.v, 0, 0)
-        table = lookup.learn(offset[..., 0][state.left_ok])
+        table = subpixel_lut.learn(offset[..., 0][state.left_ok])
         # One of six images of the lesson: a few hundredths.
-        np.testing.assert_allclose(table, lookup.DEFAULT_TABLE, atol=0.03)
+        np.testing.assert_allclose(table, subpixel_lut.DEFAULT_TABLE, atol=0.03)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stages.hfvm import epipolar, lanes, paper, propagation, search, subpixel
+from stages.hfvm.level import epipolar, paper, propagation, search, simd, subpixel
 
 ROWS, COLS = 11, 13
 
@@ -34,7 +34,7 @@ def line(f, y, x, length):
 
 def off_line(f, y, x, u, v, mu):
     a, b, c = line(f, y, x, mu)
-    return min(int(abs(a * np.float32(u) + b * np.float32(v) + c)), lanes.FARTHEST_OFF)
+    return min(int(abs(a * np.float32(u) + b * np.float32(v) + c)), simd.FARTHEST_OFF)
 
 
 def test_terms_of_a_row_make_its_lines():
@@ -65,7 +65,7 @@ def centre(up_u, up_v, f, j, i, mu):
     """Doubled displacement of a coarse pixel, the border repeated, moved to its line by a pixel at most."""
     j, i = min(max(j, 0), 5), min(max(i, 0), 6)
     u, v = 2 * int(up_u[j, i]), 2 * int(up_v[j, i])
-    if mu >= lanes.SHARP:
+    if mu >= simd.SHARP:
         a, b, c = line(f, 2 * j + 0.5, 2 * i + 0.5, 1.0)
         e = np.float32(np.clip(a * np.float32(u) + b * np.float32(v) + c, -1, 1))
         u, v = u - int(np.rint(e * a)), v - int(np.rint(e * b))
@@ -74,7 +74,7 @@ def centre(up_u, up_v, f, j, i, mu):
 
 def candidates(centres, reach_x, reach_y, mu):
     """Displacements that a pixel tries, in the order in which equal ones win."""
-    (u, v), sharp = centres[0], mu >= lanes.SHARP
+    (u, v), sharp = centres[0], mu >= simd.SHARP
     if not sharp or reach_x > 3:
         for m, (cu, cv) in enumerate(dict.fromkeys(centres)):
             for dv in range(-reach_y, reach_y + 1) if not sharp or m == 0 else [0]:
@@ -112,7 +112,7 @@ def test_descend_finds_the_first_of_the_best_around_its_centres(mu, reach_x, rea
         j, i = y // 2, x // 2
         near = [(0, 0), (0, -1), (0, 1), (-1, 0), (1, 0), (-1, -1), (-1, 1), (1, -1), (1, 1)][:count]
         centres = [centre(up_u, up_v, f, j + dj, i + di, mu) for dj, di in near]
-        best = (*centres[0], lanes.FAR)
+        best = (*centres[0], simd.FAR)
         for u, v in candidates(centres, reach_x, reach_y, mu):
             if 0 <= x + u < 24 and 0 <= y + v < 12:
                 cost = sad(left[y, x], right[y + v, x + u]) + off_line(f, 2 * j + 0.5, 2 * i + 0.5, u, v, mu)
@@ -175,7 +175,7 @@ def test_propagation_equals_slow_numpy_over_several_rounds(mu, beside, monkeypat
 
 def costs(left, right, u, v, f, mu):
     """Cost of every pixel's displacement without smoothness."""
-    found = np.full((ROWS, COLS), lanes.FAR, np.int32)
+    found = np.full((ROWS, COLS), simd.FAR, np.int32)
     for y, x in np.ndindex(ROWS, COLS):
         i, j = x + int(u[y, x]), y + int(v[y, x])
         if 0 <= i < right.shape[1] and 0 <= j < right.shape[0]:

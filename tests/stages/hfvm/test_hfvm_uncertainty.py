@@ -5,8 +5,10 @@ import pytest
 from matching_scenes import pair
 
 from stages.core.validity import matched
-from stages.hfvm import HfvmParams, match, refine
-from stages.hfvm.uncertainty import REFINED, neighbours, standard_deviation
+from stages.hfvm.finish import refine
+from stages.hfvm.finish.uncertainty import REFINED, neighbours, standard_deviation
+from stages.hfvm.images.params import HfvmParams
+from stages.hfvm.stage import match
 
 PARAMS = HfvmParams()
 

@@ -13,12 +13,15 @@ import numpy as np
 
 from stages.core.declare import AnyArray
 from stages.core.validity import Validity, mark
-from stages.hfvm import consistency, epipolar, guided, hierarchy, lanes, plane, refine, relief, rowwise, uncertainty
-from stages.hfvm.hierarchy import Band, Map, Prepared
-from stages.hfvm.lanes import SUM_RADIUS
-from stages.hfvm.params import HfvmParams
-from stages.hfvm.views import View
-from stages.hfvm.window import Raster, Results, Window, around, blocks, cut, strips, whole
+from stages.hfvm.coarse_to_fine import hierarchy
+from stages.hfvm.coarse_to_fine.hierarchy import Band, Map, Prepared
+from stages.hfvm.finish import guided, refine, uncertainty, variational_refinement
+from stages.hfvm.images import plane
+from stages.hfvm.images.params import HfvmParams
+from stages.hfvm.images.views import View
+from stages.hfvm.images.window import Raster, Results, Window, around, blocks, cut, strips, whole
+from stages.hfvm.level import consistency, epipolar, rowwise, simd
+from stages.hfvm.level.simd import SUM_RADIUS
 
 Rasters = Mapping[str, Raster]
 
@@ -106,7 +109,7 @@ class Finish:
     def refine(self, window: Window, checked: Rasters) -> Results:
         """Refined ``u, v``, ``validity``, and the variance ``noise`` that the grey values' noise makes.
 
-        Reach: :func:`stages.hfvm.refine.reach`.
+        Reach: :func:`stages.hfvm.finish.refine.reach`.
         """
         p, shape = self.refining, self.right.shapes[0]
         reach = refine.reach(p)
@@ -128,7 +131,7 @@ class Finish:
             mark(bits, keep & (alike < p.correlation), Validity.OVER_THRESHOLD)
         noise *= variance
         if p.relief_steps:
-            u, v = relief.fit(left, image, valid, u, v, bits == 0, p)
+            u, v = variational_refinement.fit(left, image, valid, u, v, bits == 0, p)
         keep, found = bits == 0, np.zeros(outer.shape, bool)
         consistency.lands(u, v, keep, valid, found, *place)
         mark(bits, keep & ~found, Validity.OUT_OF_IMAGE)
@@ -182,7 +185,7 @@ class Finish:
         interpolated[valid == 0] = 0
         if p.guided_fill:
             u, v = guided.median(u, v, keep, interpolated, left)
-        if self.band.mu >= lanes.SHARP:
+        if self.band.mu >= simd.SHARP:
             # A filled pixel has its neighbour's depth, not its row: between turned cameras rows change along a row.
             epipolar.settle_rows(self._lines(), u, v, interpolated, outer.x0, outer.y0)
         error, distance = cut(checked["error"], outer).copy(), cut(fine["distance"], outer).copy()

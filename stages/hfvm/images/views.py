@@ -9,9 +9,10 @@ from typing import Protocol
 import numpy as np
 
 from stages.core.declare import AnyArray
-from stages.hfvm import features, paper, plane
-from stages.hfvm.params import HfvmParams
-from stages.hfvm.window import Raster, Shape, Window, cut, tiles, whole
+from stages.hfvm.images import plane
+from stages.hfvm.images.params import HfvmParams
+from stages.hfvm.images.window import Raster, Shape, Window, cut, tiles, whole
+from stages.hfvm.level import features, paper
 from stages.imaging import pyramid
 from stages.imaging.pyramid import Pyramid
 

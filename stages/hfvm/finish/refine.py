@@ -11,8 +11,8 @@ import numpy as np
 from numba import njit
 
 from stages.core.declare import AnyArray
-from stages.hfvm import rowwise
-from stages.hfvm.params import HfvmParams
+from stages.hfvm.images.params import HfvmParams
+from stages.hfvm.level import rowwise
 
 Place = tuple[int, int, int, int, int, int]
 """First column and row of the left and of the right window, rows and columns of the whole right image."""

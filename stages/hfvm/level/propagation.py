@@ -10,9 +10,9 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from stages.hfvm import epipolar, lanes, strip_lanes
-from stages.hfvm.features import distance
-from stages.hfvm.lanes import LANES, SHARP
+from stages.hfvm.level import epipolar, simd, strip_simd
+from stages.hfvm.level.features import distance
+from stages.hfvm.level.simd import LANES, SHARP
 from stages.numeric.line import copy_line
 
 MOST_STRIPS = 512
@@ -77,14 +77,14 @@ def descend(left, right, up_u, up_v, reach_x, reach_y, count, f, mu, packed, dat
             x, y = 2 * i, 2 * j
             whole = x + 1 < cols and y + 1 < rows
             best[0] = best[1] = best[2] = best[3] = near[at]
-            least[0] = least[1] = least[2] = least[3] = lanes.FAR
+            least[0] = least[1] = least[2] = least[3] = simd.FAR
             line = lines[0, i], lines[1, i], lines[2, i]
             for k in range(planned):
                 u, size, centre, v, cross = plan[k, 0], plan[k, 1], plan[k, 2], plan[k, 3], plan[k, 4]
                 xr, yr = x + ox + u, y + oy + v
                 if whole and xr >= 0 and xr + LANES < rcols and yr >= cross and yr + 1 + cross < rrows:
                     start, target, place = y * cols + x, yr * rcols + xr, (u, centre, v)
-                    strip_lanes.four(here, there, line, start, target, sizes, place, (size, cross), best, least)
+                    strip_simd.four(here, there, line, start, target, sizes, place, (size, cross), best, least)
                 else:
                     _singly(here, there, line, x, y, (rows, cols), (rrows, rcols), ox, oy, plan, k, best, least)
             packed[y, x], data[y, x] = best[0], least[0]
@@ -104,7 +104,7 @@ def _singly(here, there, line, x0, y0, shape, other, ox, oy, plan, at, best, lea
     u, count, centre, v, cross = plan[at, 0], plan[at, 1], plan[at, 2], plan[at, 3], plan[at, 4]
     rows, cols = shape
     rrows, rcols = other
-    most = np.float32(lanes.FARTHEST_OFF)
+    most = np.float32(simd.FARTHEST_OFF)
     for n in range(4):
         x, y = x0 + (n & 1), y0 + (n >> 1)
         if x >= cols or y >= rows:
@@ -279,12 +279,12 @@ def _turn(flat, dirty, y, turn, line, shape, yr, smoothness, once, room):  # typ
         a, b = np.int64(todo[k]), np.int64(todo[k + LANES - 1])
         args = start, above * cols, below * cols, yr
         if k + LANES <= n and b - a == 2 * LANES - 2 and a > 0 and b + 2 < cols:
-            lanes.settle_dense(
+            simd.settle_dense(
                 here, there, packed, cost, line, todo, k, args[0], args[1], args[2], args[3], shape, smoothness, new,
                 found,
             )  # fmt: skip
         else:
-            lanes.settle(
+            simd.settle(
                 here, there, packed, cost, line, todo, k, args[0], args[1], args[2], args[3], shape, smoothness, new,
                 found,
             )  # fmt: skip

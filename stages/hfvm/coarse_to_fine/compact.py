@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from stages.core.declare import AnyArray
-from stages.hfvm.features import Words
+from stages.hfvm.level.features import Words
 
 NEIGHBOURS = ((0, -1), (0, 1), (-1, 0), (1, 0), (-1, -1), (-1, 1), (1, -1), (1, 1))
 """Rows and columns to the neighbour of each byte, lowest byte first."""

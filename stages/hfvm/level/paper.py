@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 
 from stages.core.declare import AnyArray
-from stages.hfvm.subpixel import linear
+from stages.hfvm.level.subpixel import linear
 
 
 def weighted(planes: AnyArray, weights: tuple[float, ...]) -> AnyArray:

@@ -27,8 +27,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from stages.core.declare import AnyArray
-from stages.hfvm import rowwise
-from stages.hfvm.params import HfvmParams
+from stages.hfvm.images.params import HfvmParams
+from stages.hfvm.level import rowwise
 
 RADIUS = 2
 """Pixels: the windows of sub-pixel search and refinement are 5 x 5."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from stages.hfvm import lanes
+from stages.hfvm.level import simd
 from stages.numeric.line import copy_line
 
 PLANES = 10
@@ -104,7 +104,7 @@ def _products(  # type: ignore[no-untyped-def]
     """Row ``y`` of the planes whose window sums a step needs, zero where a pixel takes no part.
 
     ``out`` (PLANES, radius + col + radius): count, gx, gy, r, gx gx, gx gy, gy gy, gx r, gy r, r r, with the gradient
-    of the left image. Windows as in :func:`stages.hfvm.consistency.backmatch`. Reach: a pixel.
+    of the left image. Windows as in :func:`stages.hfvm.level.consistency.backmatch`. Reach: a pixel.
     """
     rows, cols = left.shape
     width = right.shape[1]
@@ -126,7 +126,7 @@ def _products(  # type: ignore[no-untyped-def]
             continue
         i, j = np.int64(xr), np.int64(yr)
         at = (j - ry0) * width + i - rx0
-        value = lanes.cubic(flat, at, width, xr - np.float32(i), yr - np.float32(j))
+        value = simd.cubic(flat, at, width, xr - np.float32(i), yr - np.float32(j))
         n[x], rest[x] = one, grey[x] - value
     above, below = left[max(y - 1, 0)], left[min(y + 1, rows - 1)]
     gx[0], gx[cols - 1] = half * (grey[min(1, cols - 1)] - grey[0]), half * (grey[cols - 1] - grey[max(cols - 2, 0)])
@@ -150,7 +150,8 @@ def lucas_kanade(  # type: ignore[no-untyped-def]
 
     The gradient is the left image's (inverse compositional form). ``per_noise``: variance of the column displacement
     for a unit of variance of the grey levels. float32 throughout: every window is summed afresh, so nothing adds up.
-    Windows as in :func:`stages.hfvm.consistency.backmatch`. Reach: ``radius``, and of the left image a pixel more.
+    Windows as in :func:`stages.hfvm.level.consistency.backmatch`. Reach: ``radius``, and of the left image a pixel
+    more.
     """
     rows, cols = left.shape
     size = 2 * radius + 1

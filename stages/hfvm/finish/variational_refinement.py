@@ -9,8 +9,8 @@ with r the difference of the left image and the right one warped by the last ste
 warped gradient, both of the cubic spline through the pixels, which keeps detail that a local cubic kernel blurs; w
 falling with r and s with the second difference found, so that neither a wrong pixel nor an edge drags its neighbours
 along. Stiffness starts weak and tolerant of bends: from the first, it would take the errors that windows make beside
-edges for relief. The lines are fitted to the matches themselves (:mod:`stages.hfvm.epipolar`); k gives way where they
-do not lie on lines. Solved by a fixed number of Gauss-Seidel sweeps in reading order.
+edges for relief. The lines are fitted to the matches themselves (:mod:`stages.hfvm.level.epipolar`); k gives way where
+they do not lie on lines. Solved by a fixed number of Gauss-Seidel sweeps in reading order.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ import scipy
 from numba import njit
 
 from stages.core.declare import AnyArray
-from stages.hfvm import epipolar
-from stages.hfvm.hierarchy import evenly
-from stages.hfvm.params import HfvmParams
-from stages.hfvm.refine import FARTHEST
+from stages.hfvm.coarse_to_fine.hierarchy import evenly
+from stages.hfvm.finish.refine import FARTHEST
+from stages.hfvm.images.params import HfvmParams
+from stages.hfvm.level import epipolar
 from stages.numeric.windows import window_sum
 
 MEAN_SIDE = 9
@@ -74,9 +74,9 @@ def fit(
 
     Notes
     -----
-    A pixel that is led farther than :data:`stages.hfvm.refine.FARTHEST` from where it started stays there. Only the way
-    along its line counts: a match that was found rows off its line is on the same thing more often than not, and the
-    lines know its row.
+    A pixel that is led farther than :data:`stages.hfvm.finish.refine.FARTHEST` from where it started stays there. Only
+    the way along its line counts: a match that was found rows off its line is on the same thing more often than not,
+    and the lines know its row.
     """
     start_u, start_v = u, v
     u, v = np.where(keep, u, np.float32(0)), np.where(keep, v, np.float32(0))

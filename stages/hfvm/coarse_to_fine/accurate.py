@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from stages.core.declare import AnyArray
-from stages.hfvm import compact, paths
-from stages.hfvm.hierarchy import Band, FastSolver, Fine, Map, Solver, solver
-from stages.hfvm.params import HfvmParams
-from stages.hfvm.views import Patch
-from stages.hfvm.window import Shape
+from stages.hfvm.coarse_to_fine import compact, paths
+from stages.hfvm.coarse_to_fine.hierarchy import Band, FastSolver, Fine, Map, Solver, solver
+from stages.hfvm.images.params import HfvmParams
+from stages.hfvm.images.views import Patch
+from stages.hfvm.images.window import Shape
 
 
 @dataclass(frozen=True)

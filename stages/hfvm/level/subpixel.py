@@ -9,9 +9,9 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from stages.hfvm import lanes
-from stages.hfvm.features import distance
-from stages.hfvm.lanes import SUM_RADIUS
+from stages.hfvm.level import simd
+from stages.hfvm.level.features import distance
+from stages.hfvm.level.simd import SUM_RADIUS
 
 NOTHING, ALONE, SUMMED = 0, 1, 2
 """What a pixel has: no distance, its own, those of its window."""
@@ -74,7 +74,7 @@ def _windows(here, there, y, us, vs, wanted, shapes, ox, oy, four, last, state):
             x += 1
             continue
         inside = min(x, y, rows - 1 - y) >= SUM_RADIUS and min(xr, yr, rrows - 1 - yr) >= far
-        most = min(lanes.SIDE_BY_SIDE, cols - SUM_RADIUS - x, rcols - far - xr) if inside else 0
+        most = min(simd.SIDE_BY_SIDE, cols - SUM_RADIUS - x, rcols - far - xr) if inside else 0
         if most <= 0:
             state[x], four[x] = ALONE, distance(here[y * cols + x], there[yr * rcols + xr])
             x += 1
@@ -82,6 +82,6 @@ def _windows(here, there, y, us, vs, wanted, shapes, ox, oy, four, last, state):
         n = 1
         while n < most and us[x + n] == u and vs[x + n] == v and wanted[x + n]:
             n += 1
-        lanes.sums(here, there, y * cols + x, yr * rcols + xr, cols, rcols, n, four, last, x)
+        simd.sums(here, there, y * cols + x, yr * rcols + xr, cols, rcols, n, four, last, x)
         state[x : x + n] = SUMMED
         x += n

@@ -14,8 +14,8 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from stages.hfvm import lanes
-from stages.hfvm.lanes import LANES
+from stages.hfvm.level import simd
+from stages.hfvm.level.simd import LANES
 
 ABOVE, BELOW = LANES + 1, LANES + 2
 """Ranks of the two candidates that lie a row less and a row more."""
@@ -44,12 +44,12 @@ def make_four(width: int) -> Any:
     def four(typingctx, left, right, line, here, there, sizes, place, counts, best, least):  # type: ignore[no-untyped-def]
         i64 = types.int64
         signature = types.void(
-            lanes.WORDS, lanes.WORDS, types.UniTuple(types.float32, 3), i64, i64, types.UniTuple(i64, 2),
-            types.UniTuple(i64, 3), types.UniTuple(i64, 2), lanes.PAIRS, lanes.PAIRS,
+            simd.WORDS, simd.WORDS, types.UniTuple(types.float32, 3), i64, i64, types.UniTuple(i64, 2),
+            types.UniTuple(i64, 3), types.UniTuple(i64, 2), simd.PAIRS, simd.PAIRS,
         )  # fmt: skip
 
         def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
-            splat, vector = lanes._splat, lanes._vector
+            splat, vector = simd._splat, simd._vector
             left, right, line, here, there = args[:5]
             cols, rcols = cgutils.unpack_tuple(builder, args[5])
             u, centre, v = (builder.trunc(n, _I32) for n in cgutils.unpack_tuple(builder, args[6]))
@@ -57,8 +57,8 @@ def make_four(width: int) -> Any:
             a, b, c = (splat(builder, n) for n in cgutils.unpack_tuple(builder, line))
 
             def load(k: int, array: Any, index: Any, kind: Any) -> Any:
-                pointer = lanes._pointer(context, builder, sig.args[k], array, index)
-                return builder.load(lanes._as(builder, pointer, kind), align=8)
+                pointer = simd._pointer(context, builder, sig.args[k], array, index)
+                return builder.load(simd._as(builder, pointer, kind), align=8)
 
             def moved(index: Any, rows: int, columns: int, wide: Any) -> Any:
                 index = builder.add(index, builder.mul(wide, ir.Constant(_I64, rows)))
@@ -69,15 +69,15 @@ def make_four(width: int) -> Any:
                 off = builder.fadd(
                     builder.fmul(a, builder.sitofp(columns, _FLOATS)), builder.fmul(b, builder.sitofp(rows, _FLOATS))
                 )
-                return shorts(lanes.band_cost(builder, builder.fadd(off, c)), rank)
+                return shorts(simd.band_cost(builder, builder.fadd(off, c)), rank)
 
             def shorts(cost: Any, rank: Any) -> Any:
                 four_bits = vector(_INTS, [4] * LANES)
                 return builder.trunc(builder.or_(builder.shl(cost, four_bits), rank), _SHORTS)
 
             def cost(distance: Any, other: Any) -> Any:
-                near = builder.trunc(builder.shl(distance, vector(lanes._WORDS, [4] * LANES)), _SHORTS)
-                return lanes._call(builder, "llvm.uadd.sat.v8i16", _SHORTS, near, other)
+                near = builder.trunc(builder.shl(distance, vector(simd._WORDS, [4] * LANES)), _SHORTS)
+                return simd._call(builder, "llvm.uadd.sat.v8i16", _SHORTS, near, other)
 
             lane = vector(_INTS, range(LANES))
             is_own = builder.icmp_signed("==", lane, splat(builder, builder.sub(centre, u)))
@@ -88,9 +88,9 @@ def make_four(width: int) -> Any:
             words = [load(0, left, moved(here, j, i, cols), _I64) for j, i in _CHILDREN]
             key = ir.Constant(_FOUR, ir.Undefined)
             for k, word in enumerate(words):
-                found = load(1, right, moved(there, *_CHILDREN[k], rcols), lanes._WORDS)
-                one = cost(lanes._distances(builder, splat(builder, word), found, width), other)
-                one = lanes._call(builder, "llvm.vector.reduce.umin.v8i16", _I16, one)
+                found = load(1, right, moved(there, *_CHILDREN[k], rcols), simd._WORDS)
+                one = cost(simd._distances(builder, splat(builder, word), found, width), other)
+                one = simd._call(builder, "llvm.vector.reduce.umin.v8i16", _I16, one)
                 key = builder.insert_element(key, builder.zext(one, _I32), ir.Constant(_I32, k))
             slot = cgutils.alloca_once_value(builder, key)
             with builder.if_then(builder.icmp_signed("!=", cross, ir.Constant(_I64, 0))):
@@ -100,12 +100,12 @@ def make_four(width: int) -> Any:
                 less, more = (_pairs(builder, rows[k], rows[k + 1], (0, 1, 2, 3)) for k in (0, 2))
                 found = _pairs(builder, less, more, tuple(range(8)))
 
-                own = ir.Constant(lanes._WORDS, ir.Undefined)
+                own = ir.Constant(simd._WORDS, ir.Undefined)
                 for k, word in enumerate([*words, *words]):
                     own = builder.insert_element(own, word, ir.Constant(_I32, k))
                 away = builder.add(splat(builder, v), vector(_INTS, [-1] * 4 + [1] * 4))
                 other = band(splat(builder, centre), away, vector(_INTS, [ABOVE] * 4 + [BELOW] * 4))
-                other = cost(lanes._distances(builder, own, found, width), other)
+                other = cost(simd._distances(builder, own, found, width), other)
                 other = builder.zext(other, _INTS)
                 for pick in ((0, 1, 2, 3), (4, 5, 6, 7)):
                     one, least_key = _pairs(builder, other, other, pick), builder.load(slot)
@@ -128,7 +128,7 @@ def make_four(width: int) -> Any:
             tried = builder.or_(rows, builder.and_(columns, vector(_FOUR, [0xFFFF] * 4)))
             total = builder.lshr(key, vector(_FOUR, [4] * 4))
             pointers = [
-                lanes._as(builder, lanes._pointer(context, builder, sig.args[k], args[k], ir.Constant(_I64, 0)), _FOUR)
+                simd._as(builder, simd._pointer(context, builder, sig.args[k], args[k], ir.Constant(_I64, 0)), _FOUR)
                 for k in (8, 9)
             ]
             before = builder.load(pointers[1], align=4)
@@ -142,15 +142,15 @@ def make_four(width: int) -> Any:
     return four
 
 
-four = make_four(lanes.widest())
+four = make_four(simd.widest())
 """``four(left, right, line, here, there, (cols, right cols), (u, centre, v), (count, cross), best, least)``:
 the best candidate, cost << 4 | rank, of each pixel of a square of two by two.
 
 ``left[here]``: word of the first pixel; ``right[there]``: the one it meets at column displacement ``u``, row
 displacement ``v``. Candidates are the column displacements ``u + k`` for k < ``count``, at most eight; where ``cross``,
 also ``centre`` a row less and a row more. Eight words from the first one on are read for each pixel, whatever
-``count``. ``cols``: columns of the left image; ``line``: the square's (:func:`stages.hfvm.epipolar.line`). Rank 0 is
-the candidate of column ``centre``, 1 + k the others; ABOVE and BELOW those of the other rows. Of equal ones the least
-rank wins.
+``count``. ``cols``: columns of the left image; ``line``: the square's (:func:`stages.hfvm.level.epipolar.line`). Rank
+0 is the candidate of column ``centre``, 1 + k the others; ABOVE and BELOW those of the other rows. Of equal ones the
+least rank wins.
 ``best, least``: packed displacement and cost of the best so far, replaced where this one costs less.
 """

@@ -7,7 +7,7 @@ least total wins. So evidence travels over weak texture as far as it must, and s
 truncated, the sooner the greater the grey step.
 
 All costs are integers, candidates come in a fixed order and only a strictly lower cost wins. The vector code of both
-steps is in :mod:`stages.hfvm.path_lanes`.
+steps is in :mod:`stages.hfvm.coarse_to_fine.path_simd`.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ import numpy as np
 from numba import njit
 
 from stages.core.declare import AnyArray
-from stages.hfvm import path_lanes
-from stages.hfvm.features import Words
-from stages.hfvm.path_lanes import MOST, NONE, UNIT
-from stages.hfvm.propagation import pack_map, unpack
+from stages.hfvm.coarse_to_fine import path_simd
+from stages.hfvm.coarse_to_fine.path_simd import MOST, NONE, UNIT
+from stages.hfvm.level.features import Words
+from stages.hfvm.level.propagation import pack_map, unpack
 
 OFFSETS = np.array(
     [[0, -1], [0, 1], [-1, 0], [1, 0], [-3, -3], [-3, 3], [3, -3], [3, 3], [0, -8], [0, 8], [-8, 0], [8, 0]], np.int64
@@ -130,7 +130,7 @@ def _gather(  # type: ignore[no-untyped-def]
                 places[others + k] = place if has_above else at
             if mu > 0:
                 a, b, c = lines[y, x, 0], lines[y, x, 1], lines[y, x, 2]
-            path_lanes.gather(
+            path_simd.gather(
                 words, right_words, compact, right_compact, share, rrows, rcols, x, y, at, packed, coarse, places,
                 a, b, c, (UNIT + share) * mu, cu[y, x], cv[y, x], cost[y, x]
             )  # fmt: skip
@@ -162,7 +162,7 @@ def _sweep(cu, cv, cost, grey, small, large, half, backward, total):  # type: ig
                 change = abs(grey[y, x] - grey[j, i])
                 far = np.int64(max(np.float32(large) / (np.float32(1.0) + change / np.float32(half)), 2 * small))
                 there = (j * cols + i) * MOST
-                path_lanes.step(us, vs, costs, path, there, after[d, x], 0, totals, at, small, far)
+                path_simd.step(us, vs, costs, path, there, after[d, x], 0, totals, at, small, far)
         before, after = after, before
 
 

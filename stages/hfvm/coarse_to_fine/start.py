@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from stages.core.declare import AnyArray
 from stages.core.errors import InputError
-from stages.hfvm import hierarchy, plane
-from stages.hfvm.window import whole
+from stages.hfvm.coarse_to_fine import hierarchy
+from stages.hfvm.images import plane
+from stages.hfvm.images.window import whole
 
 MOST = 16000
 """Pixels: displacements of a level are 16-bit and doubled from level to level."""
@@ -53,7 +54,7 @@ def check(prior: tuple[AnyArray, AnyArray] | None, shape: tuple[int, ...]) -> Pr
 
 
 def align(prior: Prior | None, h: plane.Matrix) -> Prior | None:
-    """The prior towards the aligned right image: inverse of :func:`stages.hfvm.plane.compose`."""
+    """The prior towards the aligned right image: inverse of :func:`stages.hfvm.images.plane.compose`."""
     if prior is None:
         return None
     g = np.linalg.inv(h @ plane.translation(-plane.margin(prior.u.shape)))

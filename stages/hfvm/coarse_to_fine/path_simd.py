@@ -14,7 +14,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from stages.hfvm import lanes
+from stages.hfvm.level import simd
 
 MOST = 8
 """Candidates a pixel; further ones are left out. Sixteen cost twice the time and change bad-2 by less than .002."""
@@ -59,7 +59,7 @@ def _costs(context: Any, builder: Any, sig: Any, views: Any, place: Any, found: 
     rows, cols, x, y, at = place
     sixteen = _all(found.type, 16)
     u, v = builder.ashr(builder.shl(found, sixteen), sixteen), builder.ashr(found, sixteen)
-    splat = lanes._splat
+    splat = simd._splat
     rows, cols, x, y = (splat(builder, builder.trunc(n, _I32)) for n in (rows, cols, x, y))
     xr, yr = builder.add(x, u), builder.add(y, v)
     inside = builder.and_(builder.icmp_unsigned("<", xr, cols), builder.icmp_unsigned("<", yr, rows))
@@ -71,8 +71,8 @@ def _costs(context: Any, builder: Any, sig: Any, views: Any, place: Any, found: 
     ):
         word = builder.load(_at(context, builder, kinds[0], here, at, _I64))
         data = context.make_array(kinds[1])(context, builder, there).data
-        words = lanes._gather(builder, data, index, lanes._WORDS, inside)
-        d = lanes._distances(builder, splat(builder, word), words, lanes.widest())
+        words = simd._gather(builder, data, index, simd._WORDS, inside)
+        d = simd._distances(builder, splat(builder, word), words, simd.widest())
         d = builder.mul(d, splat(builder, factor))
         total = d if total is None else builder.add(total, d)
     total = builder.trunc(total, found.type)
@@ -82,11 +82,11 @@ def _costs(context: Any, builder: Any, sig: Any, views: Any, place: Any, found: 
 def _band(builder: Any, u: Any, v: Any, line: Any, mu: Any) -> Any:
     """trunc(mu |a u + b v + c|) as eight 64-bit integers; ``u, v`` vectors of 32-bit integers."""
     doubles = ir.VectorType(ir.DoubleType(), MOST)
-    a, b, c = (lanes._splat(builder, builder.fpext(x, ir.DoubleType())) for x in line)
+    a, b, c = (simd._splat(builder, builder.fpext(x, ir.DoubleType())) for x in line)
     x, y = builder.sitofp(u, doubles), builder.sitofp(v, doubles)
     e = builder.fadd(builder.fadd(builder.fmul(a, x), builder.fmul(b, y)), c)
-    size = lanes._call(builder, f"llvm.fabs.v{MOST}f64", doubles, e)
-    return builder.fptosi(builder.fmul(lanes._splat(builder, mu), size), ir.VectorType(_I64, MOST))
+    size = simd._call(builder, f"llvm.fabs.v{MOST}f64", doubles, e)
+    return builder.fptosi(builder.fmul(simd._splat(builder, mu), size), ir.VectorType(_I64, MOST))
 
 
 @intrinsic
@@ -123,7 +123,7 @@ def gather(  # type: ignore[no-untyped-def]
         rows32, cols32, x32, y32 = (builder.trunc(n, _I32) for n in (rows, cols, x, y))
         sixteen = ir.Constant(_I32, 16)
         for k, value in enumerate(values):
-            all_of_it = lanes._splat(builder, value, MOST)
+            all_of_it = simd._splat(builder, value, MOST)
             wanted = ir.Constant(ir.IntType(1), 1)
             if k:
                 u = builder.ashr(builder.shl(value, sixteen), sixteen)
@@ -136,7 +136,7 @@ def gather(  # type: ignore[no-untyped-def]
                 same = builder.bitcast(equal, ir.IntType(MOST))
                 wanted = builder.and_(wanted, builder.icmp_signed("==", same, ir.Constant(ir.IntType(MOST), 0)))
             slot = builder.select(wanted, count, ir.Constant(_I32, MOST))
-            here = builder.icmp_signed("==", lane, lanes._splat(builder, slot, MOST))
+            here = builder.icmp_signed("==", lane, simd._splat(builder, slot, MOST))
             found = builder.select(here, all_of_it, found)
             count = builder.add(count, builder.zext(wanted, _I32))
         views, place = (left, right, near, right_near, share), (rows, cols, x, y, at)
@@ -147,8 +147,8 @@ def gather(  # type: ignore[no-untyped-def]
             more = builder.trunc(_band(builder, u, v, (a, b, c), mu), total.type)
             builder.store(builder.add(total, more), slot)
         most = _all(_INTS, 2 * OUTSIDE)
-        total = lanes._call(builder, f"llvm.smin.v{MOST}i32", _INTS, builder.load(slot), most)
-        there = builder.icmp_signed("<", lane, lanes._splat(builder, count, MOST))
+        total = simd._call(builder, f"llvm.smin.v{MOST}i32", _INTS, builder.load(slot), most)
+        there = builder.icmp_signed("<", lane, simd._splat(builder, count, MOST))
         total = builder.select(there, total, _all(_INTS, NONE))
         zero = ir.Constant(_I64, 0)
         for array, kind, value in (
@@ -184,31 +184,31 @@ def step(typingctx, cu, cv, cost, path, there, out, here, total, at, small, far)
             return builder.load(_at(context, builder, kind, array, index, vector), align=2)
 
         def call(name: str, *operands: Any) -> Any:
-            return lanes._call(builder, f"llvm.{name}.v{MOST}i16", _SHORTS, *operands)
+            return simd._call(builder, f"llvm.{name}.v{MOST}i16", _SHORTS, *operands)
 
         zero = ir.Constant(_I64, 0)
         u, v, own = (load(kind, array, at, _SHORTS) for kind, array in zip(sig.args[:3], (cu, cv, cost), strict=True))
         before = load(sig.args[3], path, zero, _SHORTS)
-        least = lanes._call(builder, f"llvm.vector.reduce.smin.v{MOST}i16", _I16, before)
+        least = simd._call(builder, f"llvm.vector.reduce.smin.v{MOST}i16", _I16, before)
         far16, small16 = builder.trunc(far, _I16), builder.trunc(small, _I16)
-        most = lanes._splat(builder, far16, MOST)
+        most = simd._splat(builder, far16, MOST)
         # Beyond this many pixels the difference costs the most anyway, and the product would not fit.
         reach = builder.trunc(builder.add(builder.sdiv(far, small), ir.Constant(_I64, 1)), _I16)
-        reach, cost_of_one = lanes._splat(builder, reach, MOST), lanes._splat(builder, small16, MOST)
-        best = call("sadd.sat", lanes._splat(builder, least, MOST), most)
+        reach, cost_of_one = simd._splat(builder, reach, MOST), simd._splat(builder, small16, MOST)
+        best = call("sadd.sat", simd._splat(builder, least, MOST), most)
         no_poison = ir.Constant(ir.IntType(1), 0)
         for m in range(MOST):
             k = ir.Constant(_I64, m)
             gap = None
             for kind, array, mine in ((sig.args[0], cu, u), (sig.args[1], cv, v)):
                 one = builder.load(_at(context, builder, kind, array, builder.add(there, k), _I16))
-                part = call("ssub.sat", lanes._splat(builder, one, MOST), mine)
-                part = lanes._call(builder, f"llvm.abs.v{MOST}i16", _SHORTS, part, no_poison)
+                part = call("ssub.sat", simd._splat(builder, one, MOST), mine)
+                part = simd._call(builder, f"llvm.abs.v{MOST}i16", _SHORTS, part, no_poison)
                 gap = part if gap is None else call("umin", call("uadd.sat", gap, part), reach)
             way = call("smin", builder.mul(gap, cost_of_one), most)
             so_far = builder.load(_at(context, builder, sig.args[3], path, k, _I16))
-            best = call("smin", best, call("sadd.sat", lanes._splat(builder, so_far, MOST), way))
-        best = builder.sub(best, lanes._splat(builder, least, MOST))
+            best = call("smin", best, call("sadd.sat", simd._splat(builder, so_far, MOST), way))
+        best = builder.sub(best, simd._splat(builder, least, MOST))
         result = call("sadd.sat", own, best)
         builder.store(result, _at(context, builder, sig.args[5], out, here, _SHORTS), align=2)
         pointer = _at(context, builder, sig.args[7], total, at, _INTS)

@@ -16,10 +16,10 @@ from numba import njit
 from numpy.typing import NDArray
 
 from stages.core.declare import AnyArray
-from stages.hfvm.epipolar import residuals, typical, weighted_normal
-from stages.hfvm.params import HfvmParams
-from stages.hfvm.resample import sample_cubic
-from stages.hfvm.window import Shape, Window, bounded, whole
+from stages.hfvm.images.params import HfvmParams
+from stages.hfvm.images.resample import sample_cubic
+from stages.hfvm.images.window import Shape, Window, bounded, whole
+from stages.hfvm.level.epipolar import residuals, typical, weighted_normal
 from stages.imaging import pyramid
 from stages.imaging.pyramid import Pyramid, PyramidParams
 

@@ -19,11 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.core.declare import AnyArray
-from stages.hfvm import consistency, epipolar, lookup, paper, propagation, search, subpixel
-from stages.hfvm.lanes import SUM_RADIUS
-from stages.hfvm.params import HfvmParams
-from stages.hfvm.views import Patch, Plain, Seen
-from stages.hfvm.window import (
+from stages.hfvm.images.params import HfvmParams
+from stages.hfvm.images.views import Patch, Plain, Seen
+from stages.hfvm.images.window import (
     Raster,
     Results,
     Shape,
@@ -37,6 +35,8 @@ from stages.hfvm.window import (
     tiles,
     whole,
 )
+from stages.hfvm.level import consistency, epipolar, paper, propagation, search, subpixel, subpixel_lut
+from stages.hfvm.level.simd import SUM_RADIUS
 from stages.imaging.pyramid import Pyramid
 
 FIT_SAMPLES = 500
@@ -208,13 +208,13 @@ class PaperSolver:
     def fine(self, a: Patch, b: Patch, m: Map, wanted: AnyArray) -> Fine:
         """Linear sub-pixel interpolation around the median-filtered map, evened by the look-up table."""
         _, _, distance, found = self.search(a, b, np.asarray(m.u), np.asarray(m.v), 0, 0)
-        found = lookup.even(found)
+        found = subpixel_lut.even(found)
         return Fine(m.u + found[..., 0], m.v + found[..., 1], distance)
 
     def search(
         self, a: Patch, b: Patch, cu: AnyArray, cv: AnyArray, reach_x: int, reach_y: int
     ) -> tuple[AnyArray, ...]:
-        """Displacements, distance, and sub-pixel offsets (row, col, 2) of :func:`stages.hfvm.paper.search`."""
+        """Displacements, distance, and sub-pixel offsets (row, col, 2) of :func:`stages.hfvm.level.paper.search`."""
         shape = a.window.shape
         u, v = np.empty(shape, np.int16), np.empty(shape, np.int16)
         distance, found = np.empty(shape, np.float32), np.empty((*shape, 2), np.float32)

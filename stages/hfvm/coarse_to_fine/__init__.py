@@ -1,0 +1,1 @@
+"""From the top of the pyramid to the finest level, with either solver of a level."""

@@ -1,0 +1,1 @@
+"""The finest level: sub-pixel refinement, standard deviations, filling."""

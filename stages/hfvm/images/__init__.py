@@ -1,0 +1,1 @@
+"""Images as the matcher reads them, window by window, and its parameters."""

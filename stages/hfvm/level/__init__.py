@@ -1,0 +1,1 @@
+"""Matching on one level of the pyramid: features, search, consistency."""
