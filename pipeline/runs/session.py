@@ -60,6 +60,8 @@ class Options:
     fresh: bool = False
     memory_limit: str | None = None
     verb: str = "reconstruct"
+    opened: Sequence | None = None
+    """The sequence itself, where it is open already."""
 
     def command(self) -> str:
         """The command line that repeats this run."""
@@ -113,7 +115,13 @@ def settings(options: Options) -> Settings:
     read = configuration.read_toml(options.config) if options.config else {}
     configuration.merge(read, configuration.parse_assignments(options.assignments))
     for_dataset, for_stages = configuration.split_dataset(read)
-    sequence = open_sequence(options.sequence, for_dataset, hints_folder(locate(options.cache)) / "files.json")
+    if options.opened is None:
+        sequence = open_sequence(options.sequence, for_dataset, hints_folder(locate(options.cache)) / "files.json")
+    elif for_dataset:
+        told = f"{next(iter(for_dataset))}: the sequence is open already"
+        raise ConfigError("RIL-860", told, remedy="give its parameters to open_sequence")
+    else:
+        sequence = options.opened
     doubts = [f"{v.text}: {v.remedy}" for v in judge_rig(sequence.rig) if v.level != "OK"]
     if doubts and not any("baseline" in line for line in sequence.warnings):
         sequence = replace(sequence, warnings=(*sequence.warnings, *doubts))
@@ -142,6 +150,11 @@ def warn_of_results(graph: Graph) -> None:
 
 def reconstruct(options: Options) -> int:
     """Run the whole chain; gives the exit code. Running the same options again resumes."""
+    return perform(options)[0]
+
+
+def perform(options: Options) -> tuple[int, Path]:
+    """Run the whole chain; gives the exit code and the folder of the results."""
     try:
         return _reconstruct(options)
     except (DamagedError, GoneError) as error:  # found when the results were drawn; it is set aside by now
@@ -196,7 +209,7 @@ class _Opened:
         return unchanged.stamp(self.graph, self.sequence, self.versions, **facts, command=self.options.command())
 
 
-def _reconstruct(options: Options) -> int:
+def _reconstruct(options: Options) -> tuple[int, Path]:
     opened = _open(options)
     drive = opened.drive
     with Ahead(opened.folder, lambda: opened.view(tasks=())) as ahead:
@@ -212,7 +225,7 @@ def _reconstruct(options: Options) -> int:
             cached = result.total().cached
             arrived = _outcome(opened)
             print(f"{earlier.parent / earlier.readlink()}  cached {cached}, nothing new: that run stands")
-            return max(arrived, _posed_all(opened.products), _all_read(opened, arrived))
+            return max(arrived, _posed_all(opened.products), _all_read(opened, arrived)), earlier.resolve()
         _write(opened, result, ahead)
     if result.ok:
         from pipeline.runs import unchanged
@@ -224,9 +237,9 @@ def _reconstruct(options: Options) -> int:
     total = result.total()
     print(f"{opened.folder}  computed {total.computed}, cached {total.cached}, missing {total.failed + total.skipped}")
     if result.ok:
-        return max(arrived, _posed_all(opened.products), _all_read(opened, arrived))
+        return max(arrived, _posed_all(opened.products), _all_read(opened, arrived)), opened.folder
     _list_missing(opened.graph, opened.folder)
-    return HOLES
+    return HOLES, opened.folder
 
 
 def _open(options: Options) -> _Opened:

@@ -76,9 +76,9 @@ def test_mockup_in_tiles_of_256_has_the_digest_of_the_whole(tmp_path, preset):
 
     digests = []
     for side in (0, 256):
-        sequence, config, _ = settings(Options("mockup-short", (f"hfvm.preset={preset}", f"tiling.tile={side}")))
+        found = settings(Options("mockup-short", (f"hfvm.preset={preset}", f"tiling.tile={side}")))
         graph = Graph()
-        disparity = Builder(graph, sequence, config).disparity(0)
+        disparity = Builder(graph, found.sequence, found.config).disparity(0)
         scheduler.run(graph, Store(tmp_path), executor="inline").check()
         digests.append(disparity.ref.digest)
     assert digests[0] == digests[1]

@@ -1,0 +1,228 @@
+"""Reconstruct from Python: the same tasks, cache and files as ``rille reconstruct``.
+
+>>> import pipeline
+>>> sequence = pipeline.open_sequence("mockup-short", mockup={"frames": 3})
+>>> sequence.frames, round(sequence.rig.baseline, 3)
+(3, 0.097)
+>>> run = pipeline.reconstruct(sequence, hfvm={"preset": "fast"})  # doctest: +SKIP
+>>> run.terrain.elevation.sel(x=0.0, y=0.5, method="nearest")  # doctest: +SKIP
+>>> run.trajectory.position.sel(axis="y")  # doctest: +SKIP
+>>> run.metrics["trajectory_drift"]["value"]  # doctest: +SKIP
+>>> pipeline.open_run("runs/mockup-short/latest").show()  # doctest: +SKIP
+
+A program that starts workers needs the usual ``if __name__ == "__main__":`` around what it does.
+"""
+
+from __future__ import annotations
+
+import json
+import webbrowser
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import tomli_w
+
+from datasets import registry
+from datasets.protocol import Sequence
+from stages.core.errors import ConfigError, InputError
+
+if TYPE_CHECKING:
+    import xarray
+
+AXES = ("x", "y", "z")
+Settings = Mapping[str, Any]
+
+
+def open_sequence(path: str | Path, **settings: Settings) -> Sequence:
+    """Open a sequence of stereo pairs.
+
+    Parameters
+    ----------
+    path : a name from ``rille datasets``, a folder, or a manifest.
+    settings : parameters of the sequence by section, e.g. ``mockup={"frames": 5}``.
+
+    Raises
+    ------
+    InputError
+        There is no such sequence, or it cannot be used.
+    ConfigError
+        A parameter is unknown, or not permitted.
+
+    >>> open_sequence("mockup-short").frame_names[:2]
+    ('000000', '000001')
+    """
+    return registry.open_sequence(str(path), settings)
+
+
+def reconstruct(
+    seq: Sequence | str | Path,
+    client: Any = None,
+    *,
+    frames: str | None = None,
+    runs: str | Path = "runs",
+    cache: str | Path | None = None,
+    executor: str = "",
+    **settings: Settings,
+) -> Run:
+    """Run the whole chain, or what of it is not cached yet, and write its files and its report.
+
+    Parameters
+    ----------
+    seq : an open sequence, or what :func:`open_sequence` takes.
+    client : ``distributed.Client`` of the cluster that computes; None: workers of this machine, one a core.
+    frames : ``START:STOP[:STEP]``; all by default.
+    runs : folder of the results.
+    cache : folder or bucket of the artifacts; ``RILLE_CACHE`` or ``.rille/cache`` by default.
+    executor : as ``--executor``, where there is no client.
+    settings : parameters by section, e.g. ``locus={"cell_size": 0.002}``.
+
+    Raises
+    ------
+    RilleError
+        The input, a parameter or the machine does not permit it; the message says what, where, and what to do.
+    """
+    from pipeline.commands.options import cache_folder, prepare
+
+    prepare()
+    from pipeline.runs import session
+
+    given: dict[str, Any] = {"executor": executor} if executor else {}
+    if client is not None:
+        given["executor"] = client.scheduler.address
+    opened = seq if isinstance(seq, Sequence) else None
+    options = session.Options(
+        str(seq) if opened is None else opened.name,
+        assignments=tuple(assignments(settings)),
+        frames=frames,
+        runs=Path(runs),
+        cache=cache_folder(cache),
+        opened=opened,
+        **given,
+    )
+    return Run(session.perform(options)[1])
+
+
+def assignments(settings: Mapping[str, Settings]) -> list[str]:
+    """What ``--set`` takes for the same settings.
+
+    >>> assignments({"locus": {"cell_size": 0.002, "both": True}, "drive": {"goal": (0.1, 2.0)}})
+    ['locus.cell_size=0.002', 'locus.both=true', 'drive.goal=[ 0.1, 2.0, ]']
+    """
+    found = []
+    for section, values in settings.items():
+        if not isinstance(values, Mapping):
+            raise ConfigError(
+                "RIL-861", f"{section}={values!r} is no section", remedy=f'give {section}={{"name": value}}'
+            )
+        for name, value in values.items():
+            words = tomli_w.dumps({"v": list(value) if isinstance(value, tuple) else value}).strip()
+            found.append(f"{section}.{name}={' '.join(words.removeprefix('v = ').split())}")
+    return found
+
+
+def open_run(path: str | Path, runs: str | Path = "runs") -> Run:
+    """Open the results of a run.
+
+    Parameters
+    ----------
+    path : its folder, or as a command takes it: ``SEQUENCE`` (the latest of it), ``SEQUENCE/ID``, ``ID``, ``latest``.
+    runs : folder of all runs.
+
+    Raises
+    ------
+    ConfigError
+        There is no such run.
+    """
+    from pipeline.runs import lookup
+
+    return Run(lookup.find(str(path), Path(runs)))
+
+
+@dataclass(frozen=True)
+class Run:
+    """The results of a run, in its ``folder``; each is read when it is asked for."""
+
+    folder: Path
+
+    @cached_property
+    def report(self) -> Mapping[str, Any]:
+        """All facts of the report (``report.json``)."""
+        found: dict[str, Any] = json.loads(self._file("report.json").read_text(encoding="utf-8"))
+        return found
+
+    @property
+    def complete(self) -> bool:
+        """Whether nothing is missing."""
+        return bool(self.report["complete"])
+
+    @property
+    def metrics(self) -> Mapping[str, Any]:
+        """Figures by name: each has ``value``, ``unit`` and ``how`` it is found."""
+        found: dict[str, Any] = self.report["metrics"]
+        return found
+
+    @property
+    def terrain(self) -> xarray.Dataset:
+        """The merged terrain: ``elevation``, its standard deviation and more on (y, x), metres in the world frame.
+
+        Raises
+        ------
+        InputError
+            The run has none.
+        """
+        import xarray
+
+        found: xarray.Dataset = xarray.open_zarr(self._file("terrain.zarr"))
+        return found
+
+    @property
+    def trajectory(self) -> xarray.Dataset:
+        """Poses of the left camera: ``position`` (frame, axis), metres, and ``rotation`` (frame, axis, camera_axis).
+
+        ``rotation`` turns optical axes (x right, y down, z forward) to the world (x right, y ahead, z up); NaN where a
+        frame has no pose. Coordinates are the frame's number, its ``name`` and its ``time``, seconds.
+
+        Raises
+        ------
+        InputError
+            The run has none.
+        """
+        import numpy as np
+        import xarray
+
+        poses = np.loadtxt(self._file("trajectory.kitti"), ndmin=2).reshape(-1, 3, 4)
+        facts = json.loads(self._file("frames.json").read_text(encoding="utf-8"))
+        frames, about = facts["frames"], facts["frames_of_reference"]["world"]
+        return xarray.Dataset(
+            {
+                "position": (
+                    ("frame", "axis"),
+                    poses[:, :, 3],
+                    {"units": "m", "long_name": "centre of the left camera"},
+                ),
+                "rotation": (("frame", "axis", "camera_axis"), poses[:, :, :3], {"units": "1"}),
+            },
+            {
+                "frame": [frame["frame"] for frame in frames],
+                "name": ("frame", [frame["name"] for frame in frames]),
+                "time": ("frame", [frame["time"] for frame in frames], {"units": "s"}),
+                "axis": list(AXES),
+                "camera_axis": list(AXES),
+            },
+            {"frame": about["definition"]},
+        )
+
+    def show(self) -> None:
+        """Open the report in the web browser."""
+        webbrowser.open(self._file("report.html").resolve().as_uri())
+
+    def _file(self, name: str) -> Path:
+        path = self.folder / name
+        if not path.exists():
+            raise InputError(
+                "RIL-862", f"{self.folder} has no {name}", remedy="the report says what is missing, or run again"
+            )
+        return path

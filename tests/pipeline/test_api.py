@@ -1,0 +1,93 @@
+"""The same reconstruction from Python as by the command line, and its results as arrays with coordinates and units."""
+
+from __future__ import annotations
+
+import doctest
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from raising import raises
+
+import pipeline
+from pipeline import api
+from pipeline.engine import code_digest, events
+
+MOCKUP = {"frames": 3, "image_width": 285, "image_height": 260, "focal_length": 300.0}
+STAGES = {"select": {"stride": 2}, "locus": {"cell_size": 0.004}, "hfvm": {"preset": "fast"}}
+
+
+def digests(run: Path) -> dict[str, str]:
+    return {row["label"]: row["digest"] for row in events.read(run / "ledger.jsonl")}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> pipeline.Run:
+    folder = tmp_path_factory.mktemp("api")
+    sequence = pipeline.open_sequence("mockup-short", mockup=MOCKUP)
+    places = {"runs": folder / "runs", "cache": folder / "cache"}
+    return pipeline.reconstruct(sequence, **places, executor="inline", **STAGES)  # type: ignore[arg-type]
+
+
+def test_it_gives_the_digests_of_the_command_line(run: pipeline.Run) -> None:
+    folder = run.folder.parents[2]
+    given = [f"--set={word}" for word in api.assignments({"mockup": MOCKUP, **STAGES})]
+    where = ["--runs", str(folder / "again"), "--cache", str(folder / "cache"), "--executor", "inline", "--quiet"]
+    command = [sys.executable, "-m", "pipeline.cli", "reconstruct", "mockup-short", *given, *where]
+    said = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    assert "computed 0," in said, "all that it needs was computed from Python"
+    assert digests(folder / "again/mockup-short/latest") == digests(run.folder)
+    assert len(digests(run.folder)) > 30
+
+
+def test_terrain_and_trajectory_have_coordinates_and_units(run: pipeline.Run) -> None:
+    assert run.complete, run.report["missing"]
+    terrain = run.terrain
+    assert set(terrain.elevation.dims) == {"x", "y"}
+    assert terrain.elevation.units == terrain.x.units == terrain.y.units == "m"
+    assert terrain.cell_size_m == pytest.approx(0.004)
+    here = float(terrain.elevation.sel(x=0.0, y=0.5, method="nearest"))
+    assert -0.25 < here < -0.11, "the camera stands 0.18 m above the bed"
+    trajectory = run.trajectory
+    assert trajectory.position.units == "m"
+    assert trajectory.time.units == "s"
+    assert trajectory.sel(frame=0).position.values == pytest.approx(np.zeros(3), abs=1e-9)
+    assert float(trajectory.position.sel(frame=2, axis="y")) > 0.01, "it drives ahead"
+    each = trajectory.rotation.values
+    assert each @ each.transpose(0, 2, 1) == pytest.approx(np.broadcast_to(np.eye(3), each.shape), abs=1e-9)
+    assert run.metrics["trajectory_drift"]["unit"] == "%"
+
+
+def test_a_run_is_opened_and_shown(run: pipeline.Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    again = pipeline.open_run("mockup-short", run.folder.parents[1])
+    assert again == run
+    assert pipeline.open_run(run.folder) == run
+    shown: list[str] = []
+    monkeypatch.setattr(api.webbrowser, "open", shown.append)
+    again.show()
+    assert shown == [(run.folder / "report.html").resolve().as_uri()]
+
+
+def test_what_cannot_be_is_one_clear_line(tmp_path: Path) -> None:
+    sequence = pipeline.open_sequence("mockup-short", mockup=MOCKUP)
+    with raises("RIL-860"):
+        pipeline.reconstruct(sequence, runs=tmp_path, cache=tmp_path / "cache", mockup={"frames": 4})
+    with raises("RIL-861"):
+        pipeline.reconstruct(sequence, locus=0.002)  # type: ignore[arg-type]
+    with raises("RIL-862"):
+        _ = pipeline.Run(tmp_path).terrain
+    with pytest.raises(AttributeError):
+        _ = pipeline.nothing
+
+
+def test_its_examples_run() -> None:
+    found = doctest.testmod(api)
+    assert found.attempted >= 4
+    assert not found.failed
+
+
+def test_no_stage_of_the_package_depends_on_it() -> None:
+    assert "pipeline" in (found := code_digest.module_digests("pipeline.engine.plain"))
+    assert "pipeline.api" not in found
