@@ -63,13 +63,15 @@ DATASET_SECTIONS = ("mockup", "misalign", "rover")
 
 
 @cache
-def modules() -> dict[str, ModuleType]:
-    """The stage modules that the flows import, by the stage's name: each with parameters has a section."""
-    from pipeline.flow import assessment, builders, closed_loop, reconstruction
+def modules(*flows: str) -> dict[str, ModuleType]:
+    """The stage modules that the flows import (all flows by default), by the stage's name.
 
-    flows = builders, reconstruction, closed_loop, assessment
-    found = [m for flow in flows for m in vars(flow).values() if isinstance(m, ModuleType) and hasattr(m, "STAGE")]
-    return {module.STAGE.name: module for module in found}
+    Each stage with parameters has a section.
+    """
+    every = "builders", "reconstruction", "closed_loop", "assessment"
+    found = [vars(importlib.import_module(f"pipeline.flow.{flow}")).values() for flow in flows or every]
+    used = [module for names in found for module in names if isinstance(module, ModuleType)]
+    return {module.STAGE.name: module for module in used if hasattr(module, "STAGE")}
 
 
 def stage(name: str) -> Stage:

@@ -246,6 +246,7 @@ def another_program(make: Builder, whole: list[int]) -> Handle:
         )
         for window in crosscheck.windows(whole, make.config.crosscheck)
     ]
+    make.products.crosschecks = parts
     return make.node(crosscheck_join, "crosscheck_join", {"frames": whole}, windows=parts)
 
 

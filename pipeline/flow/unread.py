@@ -14,20 +14,29 @@ line that names the parameter, and the exit code of a run with holes.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from functools import cache
 from typing import Any
 
 from datasets.protocol import Sequence
 from pipeline.engine.graph import Graph
+from pipeline.flow.config import modules
 from stages.core.declare import Params
 from stages.core.errors import ConfigError
 
-RECORDED = frozenset(
-    ("continuity", "select", "refine", "seam_audit", "exposure", "path", "crosscheck", "agreement", "undistort")
-)
-"""Sections that only a reconstruction reads."""
 
-DRIVEN = frozenset(("drive", "pad", "ceiling", "leg", "safety", "reflex", "global_fix"))
-"""Sections that only a drive reads."""
+@cache
+def recorded() -> frozenset[str]:
+    """Stages, and so sections, that only a reconstruction has."""
+    of_both = {*modules("builders"), *modules("closed_loop")} - {"undistort"}
+    return frozenset({*modules("builders", "reconstruction", "assessment")} - of_both)
+
+
+@cache
+def driven() -> frozenset[str]:
+    """Stages, and so sections, that only a drive has."""
+    of_both = modules("builders", "reconstruction", "assessment")
+    return frozenset({"drive", *modules("closed_loop")} - {*of_both})
+
 
 CHECKED = frozenset(("undistort", "pyramid", "motion", "hfvm", "orientation"))
 """Sections that ``rille check`` reads."""
@@ -57,13 +66,13 @@ def refuse_unreadable(keys: Iterable[str], config: Params, sequence: Sequence) -
     ConfigError
         There is such a parameter.
     """
-    driven = sequence.simulation is not None
-    foreign = RECORDED if driven else DRIVEN
+    simulated = sequence.simulation is not None
+    foreign = recorded() if simulated else driven()
     lost = [key for key in keys if key.partition(".")[0] in foreign]
     if sequence.simulation is None and sequence.lenses is None:
         lost += [key for key in keys if key.startswith("undistort.")]
     if lost:
-        who = "a drive" if driven else f"a reconstruction of {sequence.name}"
+        who = "a drive" if simulated else f"a reconstruction of {sequence.name}"
         raise ConfigError("RIL-730", f"{values(lost, config)}: no task of {who} reads it", remedy="leave it out")
 
 
