@@ -43,6 +43,10 @@ ROOM = {"locus.cell_size": 0.05}
 0.11 m, so that finer cells stay empty. No vehicle, and no rule for the choice of pairs, suits them all."""
 
 
+FORMS = (("FOLDER", "EuRoC: mav0/cam0, mav0/cam1, each with sensor.yaml and data; imu0, state_groundtruth_estimate0"),)
+"""What a user may give."""
+
+
 @dataclass(frozen=True)
 class Layout:
     """Where the parts of a recording lie; ``truth`` is a folder with ``data.csv``, ``imu`` likewise."""
@@ -83,6 +87,18 @@ def recognise(path: Path) -> Layout | None:
     imu = folder / "imu0"
     name = folder.parent.name if folder.name == "mav0" else folder.name
     return Layout(derived_name(name), folder, truth, imu if (imu / "data.csv").is_file() else None)
+
+
+def open_layout(path: Path, number: str | None, digests: files.Digests) -> Sequence | None:
+    """The sequence of a folder, or None where it has not this layout.
+
+    Raises
+    ------
+    InputError
+        What is there cannot be used.
+    """
+    layout = recognise(path) if number is None else None
+    return None if layout is None else open_euroc(layout, digests)
 
 
 def open_euroc(layout: Layout, digests: files.Digests) -> Sequence:

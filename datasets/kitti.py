@@ -49,6 +49,13 @@ CAR = 0.3
 """m, baseline from which a rig is taken for a car's: of a smaller one the cells follow from what its pixels resolve."""
 
 
+FORMS = (
+    ("FOLDER", "two image folders (image_0/1, image_2/3, image_l/r or left/right), calib.txt; poses.txt, times.txt"),
+    ("ROOT:NN", "KITTI odometry: ROOT/sequences/NN and ROOT/poses/NN.txt"),
+)
+"""What a user may give."""
+
+
 @dataclass(frozen=True)
 class Layout:
     """Where the parts of a sequence lie."""
@@ -104,6 +111,26 @@ def recognise(path: Path, number: str | None = None) -> Layout | None:
         poses=poses,
         times=times if times.is_file() else None,
     )
+
+
+def open_layout(path: Path, number: str | None, digests: files.Digests) -> Sequence | None:
+    """The sequence of a folder, or None where it has not this layout.
+
+    Raises
+    ------
+    InputError
+        There are several and none is chosen, or what is there cannot be used.
+    """
+    layout = recognise(path, number)
+    if layout is None:
+        return None
+    if not layout.calib.is_file():
+        raise InputError(
+            "RIL-278",
+            f"{path} has image folders {' and '.join(layout.pair)}, but no {layout.calib.name}",
+            remedy=f"`rille init {path}` writes a manifest that says what is needed",
+        )
+    return open_kitti(layout, digests)
 
 
 def _first(names: list[str]) -> str:

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import difflib
+import pkgutil
 from collections.abc import Mapping
+from functools import cache
+from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from pydantic import ValidationError
 
-from datasets import euroc, kitti
 from datasets.files import Digests
 from datasets.manifest import open_manifest
 from datasets.misalign import MisalignParams, misalign
@@ -33,18 +36,32 @@ MANIFESTS: dict[str, str] = {
 }
 """Manifests that come with the program, in the folder beside this module."""
 
-LAYOUTS = (
+MANIFEST_FORMS = (
     ("FILE.toml", "a manifest of any folder of stereo images; `rille init FOLDER` writes one"),
     ("FOLDER", "with a manifest (NAME.rille.toml or manifest.toml) in it"),
-    ("FOLDER", "two image folders (image_0/1, image_2/3, image_l/r or left/right), calib.txt; poses.txt, times.txt"),
-    ("FOLDER", "EuRoC: mav0/cam0, mav0/cam1, each with sensor.yaml and data; imu0, state_groundtruth_estimate0"),
-    ("ROOT:NN", "KITTI odometry: ROOT/sequences/NN and ROOT/poses/NN.txt"),
 )
+
+
+@cache
+def layouts() -> tuple[ModuleType, ...]:
+    """Modules beside this one that open folders of a certain layout, by name.
+
+    Each has ``FORMS``, what a user may give and in words what that is, and ``open_layout(path, number, digests)``,
+    which gives None where the folder is none of its own; ``number`` chooses one of several (``FOLDER:NUMBER``).
+    """
+    names = [found.name for found in pkgutil.iter_modules([str(Path(__file__).parent)]) if not found.ispkg]
+    modules = [import_module(f"datasets.{name}") for name in sorted(names)]
+    return tuple(module for module in modules if hasattr(module, "open_layout"))
+
+
+def forms() -> list[tuple[str, str]]:
+    """Each form that a path may have, and in words what that is."""
+    return [*MANIFEST_FORMS, *(form for module in layouts() for form in module.FORMS)]
 
 
 def catalogue() -> list[tuple[str, str]]:
     """Name and description of each built-in sequence and each form that a path may have."""
-    return [(name, words) for name, (words, _) in BUILT_IN.items()] + [*MANIFESTS.items(), *LAYOUTS]
+    return [(name, words) for name, (words, _) in BUILT_IN.items()] + [*MANIFESTS.items(), *forms()]
 
 
 def open_sequence(
@@ -101,32 +118,19 @@ def _of_files(name_or_path: str, digests: Digests) -> Sequence:
         return open_manifest(path, digests)
     if not path.is_dir():
         raise InputError("RIL-276", f"no sequence {name_or_path!r}", remedy=_suggestion(name_or_path))
-    layout = _recognised(path, number)
-    if layout is None:
-        forms = "; or ".join(f"{form}: {words}" for form, words in LAYOUTS)
-        raise InputError(
-            "RIL-277",
-            f"{name_or_path} has no layout that is recognised",
-            remedy=f"try `rille init {name_or_path}`; forms: {forms}",
-        )
-    if isinstance(layout, Path):
-        return open_manifest(layout, digests)
-    if isinstance(layout, euroc.Layout):
-        return euroc.open_euroc(layout, digests)
-    if not layout.calib.is_file():
-        raise InputError(
-            "RIL-278",
-            f"{name_or_path} has image folders {' and '.join(layout.pair)}, but no {layout.calib.name}",
-            remedy=f"`rille init {name_or_path}` writes a manifest that says what is needed",
-        )
-    return kitti.open_kitti(layout, digests)
-
-
-def _recognised(path: Path, number: str | None) -> Path | euroc.Layout | kitti.Layout | None:
-    """The manifest in a folder, else the layout that it has; a number asks for one of several sequences."""
-    if number is not None:
-        return kitti.recognise(path, number)
-    return folder_manifest(path) or euroc.recognise(path) or kitti.recognise(path)
+    manifest = folder_manifest(path) if number is None else None
+    if manifest is not None:
+        return open_manifest(manifest, digests)
+    for module in layouts():
+        sequence: Sequence | None = module.open_layout(path, number, digests)
+        if sequence is not None:
+            return sequence
+    known = "; or ".join(f"{form}: {words}" for form, words in forms())
+    raise InputError(
+        "RIL-277",
+        f"{name_or_path} has no layout that is recognised",
+        remedy=f"try `rille init {name_or_path}`; forms: {known}",
+    )
 
 
 def hindrance(place: Path) -> RilleError | None:
