@@ -11,12 +11,12 @@ from collections import Counter, defaultdict
 from collections.abc import Iterable
 
 from pipeline.engine import scheduler
+from pipeline.engine.forecast import Kinds, kind, recall
 from pipeline.engine.graph import Graph, Handle
 from pipeline.engine.memory import cost_model, limits
 from pipeline.engine.memory.admission import Account, Admission, account, forecast, largest
 from pipeline.engine.memory.cost_model import Costs, Foreseen, count
 from pipeline.engine.memory.limits import words
-from pipeline.engine.progress import recall_seconds
 from pipeline.engine.runtime.environment import cores
 from pipeline.engine.scheduler import Result
 from pipeline.engine.store.folder import at
@@ -53,7 +53,7 @@ def plan(options: Options, *, verbose: bool = False) -> int:
         raise ConfigError("RIL-733", told, remedy=unread.remedy(lost, config))
     jobs = options.jobs or cores()
     hints = store.hints(graph.sequence)
-    for line in describe(graph, result, recall_seconds(hints), jobs, verbose=verbose):
+    for line in describe(graph, result, recall(hints) or {}, jobs, verbose=verbose):
         print(line)
     known = cost_model.recall(hints)
     limit = None if options.memory_limit is None else limits.parse(options.memory_limit)
@@ -89,9 +89,7 @@ def needs(graph: Graph, known: Costs, shares: Account) -> Iterable[str]:
         yield "the largest tasks will wait for one another: together they would exceed the limit"
 
 
-def describe(
-    graph: Graph, result: Result, seconds: dict[str, float], jobs: int, *, verbose: bool = False
-) -> Iterable[str]:
+def describe(graph: Graph, result: Result, earlier: Kinds, jobs: int, *, verbose: bool = False) -> Iterable[str]:
     """Lines of the plan: a table by stage with reasons, totals, and what it rests on."""
     by_stage: dict[str, list[Handle]] = defaultdict(list)
     for handle in graph.nodes:
@@ -103,7 +101,7 @@ def describe(
         yield f"{stage:16s} {len(handles) - len(planned):7d} {len(planned):7d}  {'; '.join(told)}".rstrip()
         if verbose:
             yield from (f"    {h.label}: {h.reason}" for h in planned)
-    yield from _totals(graph, result, seconds, jobs)
+    yield from _totals(graph, result, earlier, jobs)
 
 
 def _reasons(planned: list[Handle]) -> list[str]:
@@ -120,12 +118,12 @@ def _short(reason: str) -> str:
     return reason if len(reason) <= WIDTH else reason[: WIDTH - 3] + "..."
 
 
-def _totals(graph: Graph, result: Result, seconds: dict[str, float], jobs: int) -> Iterable[str]:
+def _totals(graph: Graph, result: Result, earlier: Kinds, jobs: int) -> Iterable[str]:
     planned = [h for h in graph.nodes if h.status == "planned"]
     cached = len(graph.nodes) - len(planned)
     line = f"{len(graph.nodes)} tasks known: {cached} cached, {len(planned)} to do"
-    untimed = sorted({h.stage for h in planned if h.stage not in seconds})
-    work = sum(seconds.get(h.stage, 0.0) for h in planned)
+    untimed = sorted({h.stage for h in planned if kind(h.label) not in earlier})
+    work = sum(earlier.get(kind(h.label), (0.0, 0.0, 0.0))[1] for h in planned)
     if planned and len(untimed) < len({h.stage for h in planned}):
         line += f", about {work / jobs:.0f} s with {jobs} workers by earlier runs"
         line += f" (never timed: {', '.join(untimed)})" if untimed else ""

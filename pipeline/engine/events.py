@@ -75,6 +75,7 @@ def _took(handle: Handle) -> dict[str, Any]:
         "memory": handle.memory,
         "rest": handle.rest,
         "first": handle.first,
+        "compiling": round(handle.compiling, 4),
         "input_bytes": round(input_bytes(handle)),
         "bytes": handle.ref.nbytes,
         "stored": handle.ref.stored,

@@ -1,26 +1,22 @@
 """Progress of a run on stderr: a bar with an estimate on a terminal, plain lines elsewhere, JSON lines, or nothing.
 
-The estimate weighs each task with the seconds that its stage took in earlier runs of the same sequence (a hint like
-the explanations); stages never seen count as the mean of the others.
+The estimate of the time left is that of :mod:`pipeline.engine.forecast`.
 """
 
 from __future__ import annotations
 
 import json
-import os
 import sys
 import time
-from collections.abc import Mapping
-from contextlib import suppress
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, TextIO
 
+from pipeline.engine.forecast import Forecast, Kinds
 from pipeline.engine.plain import plain, raw
 from stages.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from pipeline.engine.graph import Graph, Handle
-    from pipeline.engine.scheduler import Counts, Result
+    from pipeline.engine.scheduler import Result
 
 INTERVAL = 5.0
 """Seconds between plain lines."""
@@ -33,7 +29,9 @@ SLOW_COMPILE = 1.0
 class Progress(Protocol):
     """What the driver tells; every method is called on the driver's thread."""
 
-    def open(self, graph: Graph, seconds: Mapping[str, float], jobs: int) -> None:
+    forecast: Forecast
+
+    def open(self, graph: Graph, earlier: Kinds | None, jobs: int) -> None:
         """The run begins; the graph may still grow."""
 
     def running(self, handle: Handle) -> None:
@@ -67,23 +65,26 @@ class Quiet:
     def __init__(self, stream: TextIO | None = None) -> None:
         self.stream = stream or sys.stderr
         self.graph: Graph | None = None
-        self.seconds: dict[str, float] = {}
-        self.jobs = 1
+        self.forecast = Forecast([], None, 1)
+        self.seen = 0
         self.done = 0
-        self.work_done = 0.0
-        self.begin = time.monotonic()
 
-    def open(self, graph: Graph, seconds: Mapping[str, float], jobs: int) -> None:
-        """Remember the graph and the seconds each stage takes."""
-        self.graph, self.seconds, self.jobs = graph, dict(seconds), max(jobs, 1)
+    def open(self, graph: Graph, earlier: Kinds | None, jobs: int) -> None:
+        """Begin the forecast with the tasks that are laid out."""
+        self.graph, self.seen = graph, len(graph.nodes)
+        self.forecast = Forecast([h.label for h in graph.nodes], earlier, max(jobs, 1))
 
     def running(self, handle: Handle) -> None:
         """Not shown."""
 
     def resolved(self, handle: Handle) -> None:
-        """Count it."""
+        """Count it, and what was laid out meanwhile."""
         self.done += 1
-        self.work_done += self._weight(handle)
+        if self.graph is not None:
+            for added in self.graph.nodes[self.seen :]:
+                self.forecast.added(added.label)
+            self.seen = len(self.graph.nodes)
+        self.forecast.ended(handle)
 
     def failed(self, label: str, error: BaseException) -> None:
         """Not shown."""
@@ -95,24 +96,13 @@ class Quiet:
         """Nodes known by now."""
         return len(self.graph.nodes) if self.graph else 0
 
-    def left(self) -> float | None:
-        """Estimated seconds to go for the nodes known by now; None while no stage was ever timed."""
-        if self.graph is None or not self.seconds:
-            return None
-        work = sum(self._weight(h) for h in self.graph.nodes)
-        return max(0.0, work - self.work_done) / self.jobs
-
-    def _weight(self, handle: Handle) -> float:
-        mean = sum(self.seconds.values()) / len(self.seconds) if self.seconds else 1.0
-        return self.seconds.get(handle.stage, mean)
-
 
 class Plain(Quiet):
     """A line every few seconds, and one for each failure: for logs."""
 
-    def open(self, graph: Graph, seconds: Mapping[str, float], jobs: int) -> None:
+    def open(self, graph: Graph, earlier: Kinds | None, jobs: int) -> None:
         """Begin the clock."""
-        super().open(graph, seconds, jobs)
+        super().open(graph, earlier, jobs)
         self.shown = time.monotonic()
 
     def resolved(self, handle: Handle) -> None:
@@ -121,7 +111,7 @@ class Plain(Quiet):
         self._compiled(handle)
         if time.monotonic() - self.shown >= INTERVAL:
             self.shown = time.monotonic()
-            left = self.left()
+            left = self.forecast.left()
             self._say(
                 f"{self.done}/{self.total()} tasks, {handle.label} {handle.status}"
                 + (f", about {_clock(left)} left" if left is not None else "")
@@ -160,7 +150,7 @@ class Json(Quiet):
             seconds=round(handle.seconds, 4),
             done=self.done,
             total=self.total(),
-            left=self.left(),
+            left=self.forecast.left(),
         )
 
     def failed(self, label: str, error: BaseException) -> None:
@@ -178,13 +168,13 @@ class Json(Quiet):
 class Bar(Plain):
     """A bar that moves with the estimated work done."""
 
-    def open(self, graph: Graph, seconds: Mapping[str, float], jobs: int) -> None:
+    def open(self, graph: Graph, earlier: Kinds | None, jobs: int) -> None:
         """Show the bar."""
         from rich.console import Console
         from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
         from rich.progress import Progress as RichProgress
 
-        super().open(graph, seconds, jobs)
+        super().open(graph, earlier, jobs)
         columns = (
             TextColumn("{task.fields[count]}"),
             BarColumn(),
@@ -193,6 +183,7 @@ class Bar(Plain):
         )
         self.rich = RichProgress(*columns, console=Console(file=raw(self.stream)), transient=True)
         self.task = self.rich.add_task("", total=None, count="")
+        self.begin = time.monotonic()
         self.rich.start()
 
     def running(self, handle: Handle) -> None:
@@ -206,12 +197,12 @@ class Bar(Plain):
         self._move(handle.label)
 
     def _move(self, label: str) -> None:
-        left = self.left()
-        total = sum(self._weight(h) for h in self.graph.nodes) if self.graph else 1.0
+        left = self.forecast.left()
+        gone = time.monotonic() - self.begin
         self.rich.update(
             self.task,
-            completed=self.work_done,
-            total=total,
+            completed=gone,
+            total=None if left is None else gone + left,
             count=f"{self.done}/{self.total()}",
             description=plain(label) + (f", about {_clock(left)} left" if left is not None else ""),
         )
@@ -238,24 +229,3 @@ def summary(result: Result) -> str:
 
 def _clock(seconds: float) -> str:
     return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min"
-
-
-def recall_seconds(hints: Path) -> dict[str, float]:
-    """Mean seconds of a task of each stage, from earlier runs; ``hints`` is the sequence's folder of them."""
-    try:
-        known = json.loads((hints / "seconds.json").read_text(encoding="utf-8"))
-        return {str(stage): float(seconds) for stage, seconds in known.items()}
-    except (OSError, ValueError, AttributeError, TypeError):
-        return {}
-
-
-def remember_seconds(hints: Path, counts: Mapping[str, Counts]) -> None:
-    """Note the mean seconds of what was computed now; best effort."""
-    new = {stage: round(c.seconds / c.computed, 4) for stage, c in counts.items() if c.computed}
-    if new:
-        path = hints / "seconds.json"
-        temporary = path.with_name(f"seconds.json.{os.getpid()}.tmp")
-        with suppress(OSError):
-            hints.mkdir(parents=True, exist_ok=True)
-            temporary.write_text(json.dumps(recall_seconds(hints) | new), encoding="utf-8")
-            temporary.replace(path)

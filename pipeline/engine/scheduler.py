@@ -28,7 +28,7 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from pipeline.engine import provenance
+from pipeline.engine import forecast, provenance
 from pipeline.engine.events import Ledger
 from pipeline.engine.executors.base import Executor, Failed, make
 from pipeline.engine.failures import told
@@ -37,7 +37,7 @@ from pipeline.engine.keys import digest
 from pipeline.engine.memory import cost_model
 from pipeline.engine.memory.admission import Admission, Waiting, account, largest
 from pipeline.engine.memory.cost_model import input_bytes
-from pipeline.engine.progress import Progress, Quiet, recall_seconds, remember_seconds
+from pipeline.engine.progress import Progress, Quiet
 from pipeline.engine.runtime.environment import cores
 from pipeline.engine.runtime.interrupts import Interrupts
 from pipeline.engine.store.artifact import DamagedError
@@ -240,7 +240,7 @@ class _Run:
             self._close(kill=False)
             if not self.dry:
                 self.store.note(h.ref for h in self.graph.nodes if h.ref is not None)
-                remember_seconds(self.hints, self.result.counts)
+                forecast.remember(self.hints, self.progress.forecast)
                 cost_model.remember(self.hints, self.graph.nodes)
         finally:
             gc.unfreeze()
@@ -257,7 +257,7 @@ class _Run:
             self.executor.close(kill=kill)
 
     def _loop(self, interrupts: Interrupts) -> None:
-        self.progress.open(self.graph, recall_seconds(self.hints), self.jobs or cores())
+        self.progress.open(self.graph, forecast.recall(self.hints), self.jobs or cores())
         self.store.survey(_sequence(self.graph))
         while True:
             self._settle()

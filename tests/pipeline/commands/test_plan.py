@@ -7,14 +7,14 @@ from toys.chain import build
 
 from datasets.registry import open_sequence
 from pipeline.commands import plan
-from pipeline.engine import progress, scheduler
+from pipeline.engine import forecast, scheduler
 from pipeline.engine.graph import Graph
 from pipeline.engine.memory import cost_model
 from pipeline.engine.store.folder import Store
 from pipeline.flow import config as configuration
 from pipeline.flow.closed_loop import dataflow
 
-SECONDS = {"numbers": 2.0, "scale": 3.0, "total": 1.0}
+SECONDS = {"numbers": (0.0, 2.0, 0.0), "scale": (0.0, 3.0, 0.0), "total": (0.0, 1.0, 0.0)}
 
 
 def lines(cache, *, verbose=False, sequence="", choice="", **changed):
@@ -64,7 +64,7 @@ def test_hints_belong_to_their_sequence(cache):
     store = Store(cache)
     assert lines(cache, sequence="short", frames=3, seed=1)[1].endswith("never computed (3)")
     assert lines(cache, sequence="long", frames=6, seed=1)[1].endswith("params.seed 0 -> 1 (6)")
-    for recall, empty in ((progress.recall_seconds, {}), (lambda hints: cost_model.recall(hints).groups, {})):
+    for recall, empty in ((forecast.recall, None), (lambda hints: cost_model.recall(hints).groups, {})):
         assert recall(store.hints("long"))
         assert recall(store.hints("short")) == empty
 

@@ -359,19 +359,6 @@ def test_progress_speaks_on_its_stream_alone(cache, mode, capsys, monkeypatch):
     assert capsys.readouterr() == ("", "")
 
 
-def test_estimate_weighs_stages_by_their_earlier_seconds(cache):
-    run(cache)
-    seconds = progress.recall_seconds(Store(cache).hints(""))
-    assert set(seconds) == {"numbers", "scale", "total"}
-    seen = progress.Quiet()
-    graph = Graph()
-    build(graph)
-    seen.open(graph, {"numbers": 3.0}, jobs=2)
-    assert seen.left() == pytest.approx(4 * 3.0 / 2)
-    seen.resolved(graph.nodes[0])
-    assert seen.left() == pytest.approx(3 * 3.0 / 2)
-
-
 def test_unknown_modes_and_executors_are_refused(cache):
     with raises("RIL-568"):
         progress.make("loud")
