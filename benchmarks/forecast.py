@@ -87,10 +87,8 @@ def main() -> None:
     if options.write:
         return write(*options.ledgers)
     for path in options.ledgers:
-        cells = [
-            f"{mark:.0%} {told / true if true else 0:.2f}" for mark, told, true in replay(path, options.jobs, True)
-        ]
-        print(f"{path}: " + "  ".join(cells))
+        found = replay(path, options.jobs)
+        print(f"{path}: " + "  ".join(f"{mark:.0%} {told / true:.2f}" for mark, told, true in found if true))
     return None
 
 
