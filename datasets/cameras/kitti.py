@@ -2,7 +2,8 @@
 
 Odometry has ``P0 ... P3``, the raw recordings ``P_rect_00 ... P_rect_03`` beside the cameras before rectification
 (``K_00``, ``D_00``, ``R_00``, ``T_00``), the older Karlsruhe sequences ``P1_roi`` and ``P2_roi``. Projections
-P = K [R | t] are those of the rectified images, and are taken where the file has them.
+P = K [R | t] are those of the rectified images, and are taken where the file has them. Files of two to four rows of
+twelve numbers without labels are projections, too, in the order of the cameras.
 """
 
 from __future__ import annotations
@@ -20,18 +21,36 @@ from stages.geometry.lens import Lens
 
 PROJECTION = re.compile(r"P(\d)(?:_roi)?|P_rect_(\d\d)")
 LINE = re.compile(r"^[ \t]*(P\d(?:_roi)?|P_rect_\d\d|K_\d\d)[ \t]*:", re.MULTILINE)
+LEAST_FOCAL = 2.0
+"""Pixels; rows of a pose have the same twelve numbers, but the first three of them are at most 1."""
+
 RAW = re.compile(r"K_(\d\d)")
 
 
 def is_kitti(text: str) -> bool:
-    """Whether a line has the label of a projection or of a raw camera."""
-    return LINE.search(text[:100_000]) is not None
+    """Whether a line has the label of a projection or of a raw camera, or all are projections without labels."""
+    return LINE.search(text[:100_000]) is not None or bool(_nameless(text))
+
+
+def _nameless(text: str) -> dict[str, list[str]]:
+    """Rows of projections without labels, by the labels that they would have; none if any row is something else."""
+    rows = [line.split() for line in text[:100_000].splitlines() if line.strip()]
+    if not 2 <= len(rows) <= 4 or any(len(row) != 12 for row in rows):
+        return {}
+    try:
+        first = np.array([[float(number) for number in row[:3]] for row in rows])
+    except ValueError:
+        return {}
+    if not (np.isfinite(first).all() and (np.abs(first).max(axis=1) > LEAST_FOCAL).all()):
+        return {}
+    return {f"P{k}": row for k, row in enumerate(rows)}
 
 
 def kitti(text: str, path: Path) -> list[CalibratedCamera]:
     """All cameras of the file, by the labels of their projections (or of K), in order."""
     lines = (line.partition(":") for line in text.splitlines())
-    fields = Fields({label.strip(): numbers.split() for label, _, numbers in lines if numbers.strip()}, str(path))
+    labelled = {label.strip(): numbers.split() for label, _, numbers in lines if numbers.strip()}
+    fields = Fields(labelled or _nameless(text), str(path))
     labels = sorted(label for label in fields.values if PROJECTION.fullmatch(label))
     if any(label.endswith("_roi") for label in labels):  # of the part that the images show
         labels = [label for label in labels if label.endswith("_roi")]

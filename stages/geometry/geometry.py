@@ -100,7 +100,7 @@ class RigidTransform:
             raise InputError("RIL-331", f"a rigid transform needs 3 x 3 and 3 numbers, not {r.shape} and {t.shape}")
         if not (np.isfinite(r).all() and np.isfinite(t).all()):
             raise InputError("RIL-332", "a rigid transform has a value that is not finite")
-        if np.abs(r @ r.T - np.eye(3)).max() > 1e-4 or np.linalg.det(r) < 0:
+        if np.abs(r).max() > 2 or np.abs(r @ r.T - np.eye(3)).max() > 1e-4 or np.linalg.det(r) < 0:
             raise InputError(
                 "RIL-333",
                 "a pose's 3 x 3 part is not a rotation",

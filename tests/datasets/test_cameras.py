@@ -553,3 +553,15 @@ def test_chessboards_of_other_programs(data_dir):
     rig, _ = rig_of(*read_cameras(data_dir / "chessboard_bumblebee2" / "stereo.yaml"))
     # In millimetres, as its target: a Bumblebee 2 has 120 mm.
     assert rig.baseline == pytest.approx(120.05, abs=0.01)
+
+
+def test_projections_without_labels_are_kittis_and_poses_are_none(tmp_path):
+    file = tmp_path / "calib.txt"
+    file.write_text("700 0 320 0 0 700 120 0 0 0 1 0\n700 0 320 -350 0 700 120 0 0 0 1 0\n")
+    left, right = read_cameras(file)
+    rig, *_ = rig_of(left, right, (640, 240))
+    assert rig.left.fx == 700
+    assert rig.baseline == pytest.approx(0.5)
+    file.write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 2)
+    with raises("RIL-100"):
+        read_cameras(file)
