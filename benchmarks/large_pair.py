@@ -77,7 +77,7 @@ def lay_out(graph: Any, paths: dict[str, Path], shape: tuple[int, int]) -> dict[
     for camera, path in paths.items():
         args = {"path": str(path), "sha256": hashlib.sha256(path.read_bytes()).hexdigest(), "frame": 0}
         args |= {"camera": camera, "width": shape[1], "height": shape[0], "depth": 8}
-        image = graph.node("datasets.files", f"image/{camera}", NoParams(), args)
+        image = graph.node("datasets.images.files", f"image/{camera}", NoParams(), args)
         pyramids[camera] = graph.node(
             "stages.imaging.pyramid", f"pyramid/{camera}", PyramidParams(), inputs={"image": image}
         )

@@ -14,18 +14,18 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from datasets import files
 from datasets.cameras import CalibratedCamera, read_cameras, rig_of
 from datasets.cameras.fields import Fields
 from datasets.cameras.text import parse_yaml
+from datasets.images import files
+from datasets.images.pairing import Pair, common_size
 from datasets.imu import Inertial, at_frames, read_imu
-from datasets.names import derived_name
-from datasets.pairing import Pair, common_size
 from datasets.poses import coverage, interpolate, read_poses
 from datasets.protocol import CAMERAS, Sequence, Source
-from datasets.reading import read_text
-from datasets.tables import read_table
-from datasets.times import seconds
+from datasets.text.names import derived_name
+from datasets.text.reading import read_text
+from datasets.text.tables import read_table
+from datasets.text.times import seconds
 from stages.core.errors import InputError
 from stages.geometry.geometry import RigidTransform
 

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from datasets.poses import coverage
 from datasets.protocol import Rows
-from datasets.tables import Table, read_table
-from datasets.times import GAP, seconds
+from datasets.text.tables import Table, read_table
+from datasets.text.times import GAP, seconds
 from stages.core.errors import InputError
 from stages.geometry.geometry import RigidTransform, orthonormal, rotation_exp
 
@@ -106,7 +106,7 @@ def read_imu(path: Path, *, unit: str = "auto") -> Imu:
 
     Parameters
     ----------
-    unit : of the times, see :func:`datasets.times.seconds`.
+    unit : of the times, see :func:`datasets.text.times.seconds`.
 
     Raises
     ------

@@ -16,9 +16,9 @@ from pathlib import Path
 import numpy as np
 
 from datasets.cameras import CalibratedCamera, read_cameras
-from datasets.pairing import SIDES, SUFFIXES, common_size, natural, pair_up, side_of
+from datasets.images.pairing import SIDES, SUFFIXES, common_size, natural, pair_up, side_of
 from datasets.poses import read_positions
-from datasets.reading import Search, is_file, read_lines
+from datasets.text.reading import Search, is_file, read_lines
 from stages.core.errors import InputError, RilleError
 
 DEPTH = 4

@@ -18,13 +18,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets import files
-from datasets.manifest_rig import LONGEST_BASELINE, off_centre
-from datasets.names import derived_name
-from datasets.pairing import ends
+from datasets.images import files
+from datasets.images.pairing import ends
+from datasets.manifest.rig import LONGEST_BASELINE, off_centre
 from datasets.protocol import CAMERAS, Sequence, Source
-from datasets.reading import read_lines
-from datasets.times import seconds
+from datasets.text.names import derived_name
+from datasets.text.reading import read_lines
+from datasets.text.times import seconds
 from stages.core.errors import InputError
 from stages.geometry.geometry import Camera, Rig, RigidTransform, orthonormal
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
 from datasets.georeference import Georeference
-from datasets.names import check_name
+from datasets.text.names import check_name
 from stages.core.declare import Params
 from stages.core.errors import InputError
 from stages.geometry.geometry import Rig, RigidTransform

@@ -13,9 +13,9 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from datasets.files import Digests
-from datasets.manifest import open_manifest
-from datasets.misalign import MisalignParams, misalign
+from datasets.images.files import Digests
+from datasets.images.misalign import MisalignParams, misalign
+from datasets.manifest.opening import open_manifest
 from datasets.mockup.loop import LOOP, mockup_loop
 from datasets.mockup.params import RECORDED_ONLY, SHORT, MockupParams
 from datasets.mockup.rover import RoverParams

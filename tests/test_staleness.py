@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from datasets.misalign import MisalignParams
+from datasets.images.misalign import MisalignParams
 from datasets.mockup.params import SHORT, MockupParams
 from datasets.protocol import Positions, Sequence
 from datasets.registry import open_sequence

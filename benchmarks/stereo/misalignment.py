@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from datasets.misalign import MisalignParams, warp
+from datasets.images.misalign import MisalignParams, warp
 from stages.geometry.geometry import Camera, rotation_exp
 from stages.geometry.lens import Lens
 

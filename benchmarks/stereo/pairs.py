@@ -66,7 +66,7 @@ def measured(name: str, left: Grey, right: Grey, truth: Truth, high: int | None 
 
 def read_image(path: Path) -> Grey:
     """Image file as 8-bit grey."""
-    from datasets.files import read_grey
+    from datasets.images.files import read_grey
 
     image = read_grey(path)
     return image if image.dtype == np.uint8 else np.rint(image / 257.0).astype(np.uint8)

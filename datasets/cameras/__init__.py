@@ -10,7 +10,7 @@ from datasets.cameras.fields import Fields
 from datasets.cameras.model import UNKNOWN_SIZE, CalibratedCamera
 from datasets.cameras.pair import rig_of
 from datasets.cameras.text import parse_xml, parse_yaml
-from datasets.reading import read_text
+from datasets.text.reading import read_text
 from stages.core.errors import InputError
 
 __all__ = ["UNKNOWN_SIZE", "CalibratedCamera", "read_cameras", "rig_of"]

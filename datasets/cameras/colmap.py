@@ -11,7 +11,7 @@ import numpy as np
 
 from datasets.cameras.fields import Fields
 from datasets.cameras.model import CalibratedCamera
-from datasets.reading import read_text
+from datasets.text.reading import read_text
 from stages.geometry.geometry import RigidTransform
 from stages.geometry.lens import Lens
 

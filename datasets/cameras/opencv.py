@@ -9,7 +9,7 @@ import numpy as np
 from datasets.cameras.fields import Fields, by_count
 from datasets.cameras.model import CalibratedCamera
 from datasets.cameras.text import parse_xml, parse_yaml
-from datasets.reading import read_text
+from datasets.text.reading import read_text
 from stages.core.errors import InputError
 from stages.geometry.geometry import RigidTransform
 from stages.geometry.lens import Lens

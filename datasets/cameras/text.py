@@ -9,7 +9,7 @@ from xml.etree import ElementTree
 
 import yaml
 
-from datasets.reading import DEEPEST
+from datasets.text.reading import DEEPEST
 from stages.core.errors import InputError
 
 MOST_VALUES = 100_000

@@ -18,8 +18,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets import chessboard, pairing
-from datasets.files import read_grey
+from datasets.images import chessboard, pairing
+from datasets.images.files import read_grey
 from stages.calibration.target import MODELS, BoardView, RigCalibration, calibrate_rig
 from stages.core.errors import InputError, RilleError
 

@@ -6,9 +6,9 @@ import os
 from pathlib import Path
 
 from datasets.inspection import Findings, inspect
-from datasets.manifest_text import counted, manifest_text, needs
-from datasets.names import derived_name
+from datasets.manifest.text import counted, manifest_text, needs
 from datasets.registry import hindrance
+from datasets.text.names import derived_name
 from stages.core.errors import ConfigError, InputError
 
 COMPLETE = 0

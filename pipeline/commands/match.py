@@ -64,7 +64,7 @@ def match_files(
     InputError
         An image or the prior cannot be read, or the prior is not of the left image's size.
     """
-    from datasets.files import read_grey
+    from datasets.images.files import read_grey
     from pipeline.export.writers import write_confidence, write_disparity
 
     params = matcher_params(preset, assignments)

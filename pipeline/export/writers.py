@@ -21,9 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from datasets.files import MOST_BYTES
 from datasets.georeference import Georeference
-from datasets.reading import open_regular
+from datasets.images.files import MOST_BYTES
+from datasets.text.reading import open_regular
 from pipeline.engine.plain import plain
 from stages.core.errors import InputError
 from stages.geometry.lattice import Lattice

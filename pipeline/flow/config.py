@@ -19,7 +19,7 @@ from typing import Any, Literal
 import tomli_w
 from pydantic import Field, ValidationError, create_model
 
-from datasets import reading
+from datasets.text import reading
 from stages.core.declare import Params, Stage
 from stages.core.errors import ConfigError, told
 

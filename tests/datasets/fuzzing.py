@@ -20,10 +20,10 @@ from pathlib import Path
 import google_crc32c
 from folders import CAMERAS, RIG, write_images
 
-from datasets import files
 from datasets.cameras import read_cameras, rig_of
+from datasets.images import files
 from datasets.inspection import inspect
-from datasets.manifest import open_manifest
+from datasets.manifest.opening import open_manifest
 from datasets.registry import open_sequence
 from pipeline.engine.store import folder as store
 from pipeline.engine.store import s3

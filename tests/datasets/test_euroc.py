@@ -8,7 +8,7 @@ import pytest
 from raising import raises
 
 from datasets.euroc import open_euroc, recognise
-from datasets.files import Digests
+from datasets.images.files import Digests
 from stages.geometry.geometry import RigidTransform, rotation_exp
 
 START = 1403715273262142976

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from raising import raises
 
-from datasets import files, files16
-from datasets.files import Digests
+from datasets.images import files, files16
+from datasets.images.files import Digests
 from stages.core.declare import NoParams, check_outputs
 from stages.core.errors import InputError
 

@@ -9,7 +9,7 @@ import pytest
 from raising import raises
 
 from datasets.georeference import georeference
-from datasets.manifest_model import World
+from datasets.manifest.model import World
 
 ORIGIN = (500100.0, 5200200.0, 1800.0)
 

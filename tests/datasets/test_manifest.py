@@ -11,11 +11,11 @@ import pytest
 from folders import CAMERAS, write_images, write_lines, write_sequence
 from raising import raises
 
-from datasets.files import Digests
 from datasets.georeference import Georeference
-from datasets.manifest import dotted, open_manifest
-from datasets.manifest_model import Manifest, known_keys, read_manifest, tables
-from datasets.manifest_rig import off_centre
+from datasets.images.files import Digests
+from datasets.manifest.model import Manifest, known_keys, read_manifest, tables
+from datasets.manifest.opening import dotted, open_manifest
+from datasets.manifest.rig import off_centre
 from datasets.protocol import Sequence
 from stages.geometry.geometry import Camera, RigidTransform, rotation_exp
 

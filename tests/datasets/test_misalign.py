@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from datasets import misalign as module
-from datasets import misalign16
-from datasets.misalign import MisalignParams, misalign, origins, warp
+from datasets.images import misalign as module
+from datasets.images import misalign16
+from datasets.images.misalign import MisalignParams, misalign, origins, warp
 from datasets.mockup.params import SHORT, MockupParams
 from datasets.mockup.sequence import mockup
 from datasets.protocol import Source
@@ -103,7 +103,7 @@ def test_only_the_right_images_change():
     assert bent.image(3, "left") == plain.image(3, "left")
     source = bent.image(3, "right")
     assert source.inputs["image"] == plain.image(3, "right")
-    assert (source.module, source.params, source.args["frame"]) == ("datasets.misalign", ALL, 3)
+    assert (source.module, source.params, source.args["frame"]) == ("datasets.images.misalign", ALL, 3)
     assert bent.rig == plain.rig
     assert bent.truth == plain.truth
     assert bent.truth_disparity is None
@@ -137,6 +137,6 @@ def test_stage_keeps_the_depth(dtype, stage):
 def test_deep_images_go_to_their_own_stage():
     deep = replace(
         mockup(MockupParams(**SHORT)),
-        image=lambda frame, camera: Source("datasets.files16", NoParams(), {"frame": frame}),
+        image=lambda frame, camera: Source("datasets.images.files16", NoParams(), {"frame": frame}),
     )
-    assert misalign(deep, ALL).image(0, "right").module == "datasets.misalign16"
+    assert misalign(deep, ALL).image(0, "right").module == "datasets.images.misalign16"

@@ -7,7 +7,7 @@ from raising import raises
 
 from datasets.mockup.params import MockupParams
 from datasets.mockup.sequence import mockup
-from datasets.names import check_name, derived_name
+from datasets.text.names import check_name, derived_name
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from raising import raises
 
-from datasets.pairing import common_size, natural, pair_up, side_of
+from datasets.images.pairing import common_size, natural, pair_up, side_of
 
 
 def paths(*names: str) -> list[Path]:

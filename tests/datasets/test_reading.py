@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from fuzzing import LONGEST, within
 
-from datasets import files, reading
 from datasets.cameras import read_cameras
-from datasets.headers import read_header
-from datasets.reading import Search, read_bytes, read_lines, read_toml
+from datasets.images import files
+from datasets.images.headers import read_header
+from datasets.text import reading
+from datasets.text.reading import Search, read_bytes, read_lines, read_toml
 from stages.core.errors import InputError
 
 

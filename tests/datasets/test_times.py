@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from raising import raises
 
-from datasets.times import UNITS, gaps, seconds
+from datasets.text.times import UNITS, gaps, seconds
 from stages.core.errors import InputError
 
 

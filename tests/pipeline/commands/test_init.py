@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from raising import raises
 
-from datasets.files import Digests
-from datasets.manifest import open_manifest
+from datasets.images.files import Digests
+from datasets.manifest.opening import open_manifest
 from pipeline.commands.init import init
 
 SETTINGS = """%YAML:1.0

@@ -223,7 +223,7 @@ def test_pairs_with_few_matches_are_passed_over_and_told():
 
 @pytest.mark.data
 def test_street_of_kitti_is_left_alone_and_repaired_when_knocked(data_dir):
-    from datasets.misalign import MisalignParams, warp
+    from datasets.images.misalign import MisalignParams, warp
     from datasets.registry import open_sequence
     from stages.calibration.orientation import thin
     from stages.core.validity import matched

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from datasets import misalign
+from datasets.images import misalign
 from stages.core.declare import Array
 
 STAGE = replace(

@@ -1,4 +1,4 @@
-"""Any folder of stereo images as a sequence, described by a manifest (TOML, see :mod:`datasets.manifest_model`).
+"""Any folder of stereo images as a sequence, described by a manifest (TOML, see :mod:`datasets.manifest.model`).
 
 The manifest says which files are the pairs, what the cameras are, and what else is known: times, truth, attitude,
 odometry, IMU, vehicle. Nothing is repaired silently: what cannot be is an error with the key, what is merely suspicious
@@ -14,15 +14,15 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from datasets import files
 from datasets.georeference import georeference
-from datasets.manifest_model import Images, read_manifest
-from datasets.manifest_motion import read_motion
-from datasets.manifest_rig import read_optics
-from datasets.names import derived_name
-from datasets.pairing import Pair, common_size, pair_up
+from datasets.images import files
+from datasets.images.pairing import Pair, common_size, pair_up
+from datasets.manifest.model import Images, read_manifest
+from datasets.manifest.motion import read_motion
+from datasets.manifest.rig import read_optics
 from datasets.protocol import Sequence, Source
-from datasets.reading import Search
+from datasets.text.names import derived_name
+from datasets.text.reading import Search
 from stages.core.errors import InputError
 
 VARIABLE = re.compile(r"\$\{(\w+)\}")

@@ -10,14 +10,14 @@ from typing import cast
 
 import numpy as np
 
+from datasets.images.pairing import Pair, ends
 from datasets.imu import at_frames, read_imu
-from datasets.manifest_model import Attitude, Imu, Manifest, PoseFile, Times, Truth
-from datasets.manifest_rig import direction
-from datasets.pairing import Pair, ends
+from datasets.manifest.model import Attitude, Imu, Manifest, PoseFile, Times, Truth
+from datasets.manifest.rig import direction
 from datasets.poses import coverage, interpolate, read_poses, read_positions
 from datasets.protocol import Positions, Rows
-from datasets.reading import read_lines
-from datasets.times import seconds
+from datasets.text.reading import read_lines
+from datasets.text.times import seconds
 from stages.core.errors import InputError
 from stages.geometry.geometry import RigidTransform
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from datasets.cameras import CalibratedCamera, read_cameras, rig_of
-from datasets.manifest_model import Cameras, Manifest, PinholeLens, RigSection
+from datasets.manifest.model import Cameras, Manifest, PinholeLens, RigSection
 from stages.core.errors import InputError
 from stages.geometry.geometry import Camera, Rig, RigidTransform
 from stages.geometry.lens import Lens

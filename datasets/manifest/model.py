@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BeforeValidator, Discriminator, Field, Tag, ValidationError, model_validator
 
-from datasets.reading import read_lines, read_toml
+from datasets.text.reading import read_lines, read_toml
 from stages.core.declare import Params
 from stages.core.errors import InputError, told
 from stages.geometry.geometry import RigidTransform

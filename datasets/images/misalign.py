@@ -84,7 +84,7 @@ def _module(source: Source) -> str:
     """A stage declares one type for an array, so there is one for each depth of images."""
     outputs: tuple[Array, ...] = importlib.import_module(source.module).STAGE.outputs
     deep = next(a.dtype for a in outputs if a.name == "image") == "uint16"
-    return "datasets.misalign16" if deep else "datasets.misalign"
+    return "datasets.images.misalign16" if deep else "datasets.images.misalign"
 
 
 def origins(lens: Lens, params: MisalignParams) -> tuple[Floats, Floats]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from datasets import files
+from datasets.images import files
 from stages.core.declare import Array
 
 STAGE = replace(

@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets.headers import PNG_SIGNATURE, Header, read_header
+from datasets.images.headers import PNG_SIGNATURE, Header, read_header
 from datasets.protocol import Source
-from datasets.reading import open_regular, read_bytes
+from datasets.text.reading import open_regular, read_bytes
 from stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
 from stages.core.errors import InputError
 
@@ -199,7 +199,7 @@ def image_source(path: Path, frame: int, camera: str, size: tuple[int, int, int]
         "height": height,
         "depth": depth,
     }
-    module = "datasets.files16" if depth == 16 else "datasets.files"
+    module = "datasets.images.files16" if depth == 16 else "datasets.images.files"
     return Source(module, NoParams(), args, hints={"path": str(path.resolve())})
 
 

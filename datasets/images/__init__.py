@@ -1,0 +1,1 @@
+"""Image files: pairs, headers, calibration boards, and the stages that read them."""

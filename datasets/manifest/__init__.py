@@ -1,0 +1,1 @@
+"""A sequence described by a file of the user's: ``NAME.rille.toml``."""

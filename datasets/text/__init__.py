@@ -1,0 +1,1 @@
+"""Text files that are read with care: bounded, checked, and named in every complaint."""
