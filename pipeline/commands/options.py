@@ -74,9 +74,6 @@ class Settings:
 class Results:
     """Where results are written, and what is said on the way."""
 
-    fresh: Annotated[bool, flag("Write a new folder of results even if nothing is new and the latest run stands.")] = (
-        False
-    )
     runs: Runs = RUNS
     progress: Annotated[
         Literal["auto", "bar", "plain", "json", "quiet"], Parameter(help="How progress is shown on stderr.")
@@ -110,7 +107,6 @@ def options(
         runs=results.runs,
         cache=cache_folder(settings.cache),
         progress="quiet" if results.quiet else results.progress,
-        fresh=results.fresh,
         memory_limit=memory_limit,
         verb=verb,
     )

@@ -123,6 +123,8 @@ class Graph:
     choice: str = ""
     nodes: list[Handle] = field(default_factory=list)
     expansions: list[tuple[list[Handle], Expansion, bool]] = field(default_factory=list)
+    last: Callable[[], None] | None = None
+    """Called once nothing else will be laid out: adds what reads all of it."""
     _labels: set[str] = field(default_factory=set)
 
     def node(

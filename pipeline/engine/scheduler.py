@@ -277,7 +277,7 @@ class _Run:
             self._admit()
             if self.ready:
                 self._look_up(self.graph.nodes[heapq.heappop(self.ready)])
-            elif not self._expand():
+            elif not self._expand() and not self._end_plan():
                 return
 
     def _admit(self) -> None:
@@ -334,6 +334,15 @@ class _Run:
                 self.ledger.expansion([h.label for h in handles], [h.label for h in self.graph.nodes[before:]])
                 return True
         return False
+
+    def _end_plan(self) -> bool:
+        """Lay out what comes last, once everything else is laid out or will never be; whether there was such."""
+        last = self.graph.last
+        if last is None or self.dry or (self.expansions and self.flying):
+            return False
+        self.graph.last = None
+        last()
+        return True
 
     # -- what does ----------------------------------------------------------------------------------------------
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from datasets.georeference import Georeference
+from pipeline.export.catalogue import OUTPUTS
 from pipeline.export.writers import FRAME, UNLEVELLED
 from stages.geometry.pose_arrays import NO_VERTICAL
 
@@ -26,62 +27,12 @@ FRAMES: dict[str, dict[str, Any]] = {
     },
 }
 
-_POSES = {"frame": "world", "of": "left camera", "transform": "T_world_left: x_world = R x_left + t"}
-_TUM = {
-    **_POSES,
-    "columns": "time x y z qx qy qz qw",
-    "quaternion": "x y z w (scalar last), Hamilton, w >= 0, rotates from the left camera to the world",
-    "missing": "frames without a pose have no line",
-}
-_RASTER = {
-    "frame": "world",
-    "crs": "engineering CRS, metres",
-    "raster": "row 0 at the greatest y; the geotransform gives the corner of the first cell; north is y",
-}
-
 IN_PLACE = (".tif", ".gpkg")
 """Endings of the files whose coordinates are those of the sequence's CRS where it has one."""
 _PLACED = {
     "frame": "georeference",
     "crs": "that of georeference: easting, northing, height; metres; rasters are turned by the azimuth, not resampled",
 }
-
-FILES: dict[str, dict[str, str]] = {
-    "trajectory.kitti": {
-        **_POSES,
-        "columns": "3 x 4 matrix [R | t], row by row",
-        "lines": "one a frame, in the order of `frames` here",
-        "missing": "nan",
-    },
-    "trajectory.tum": _TUM,
-    "crosscheck.tum": {
-        **_TUM,
-        "source": "structure from motion by COLMAP with the given calibration; brought to the world by one rigid "
-        "transform (no scale) fitted to trajectory.tum",
-    },
-    "agreement.csv": {
-        "frame": "world",
-        "columns": "frame number, name, time; positions of both trajectories; disagreement of pose and of the motion "
-        "since the frame before; flagged 0 or 1, and for what; distance of either from the truth, where there is truth",
-        "units": "s, m, deg as the column's name ends",
-        "missing": "empty",
-    },
-    "dem.tif": {**_RASTER, "values": "elevation z of the cell centre, m", "missing": "nan"},
-    "dem_sigma.tif": {**_RASTER, "values": "standard deviation of the elevation, m", "missing": "nan"},
-    "ortho.tif": {**_RASTER, "values": "grey value 0..255", "missing": "nan"},
-    "slope.tif": {**_RASTER, "values": "inclination of the terrain, degrees", "missing": "nan"},
-    "hillshade.tif": {**_RASTER, "values": "shaded relief 1..255, light from the upper left", "missing": "0"},
-    "terrain.zarr": {
-        "frame": "world",
-        "crs": "engineering CRS, metres; easting and northing beside x and y where the sequence has a place on Earth",
-        "values": "all merged arrays as one zarr 3 group, by the CF conventions; units with each",
-        "opens_with": "xarray.open_zarr",
-    },
-    "risk.tif": {**_RASTER, "values": "class 0 safe, 1 caution, 2 hazard, 3 unknown; reason bits; p_hazard; measures"},
-    "path.gpkg": {"frame": "world", "crs": "engineering CRS, metres", "coordinates": "x y z, m"},
-    "path.geojson": {"frame": "world", "crs": "none: local metres, not WGS 84", "coordinates": "x y z, m"},
-}
-"""By file: its frame, and what a reader has to know beside the format's own rules."""
 
 
 def describe(
@@ -108,7 +59,7 @@ def describe(
     if vertical == NO_VERTICAL:
         world |= {"axes": {"x": "right", "y": "optical axis of the first camera", "z": "that camera's up"}}
         world |= {"definition": UNLEVELLED}
-    known = {name: FILES[name] for name in FILES if name in written}
+    known = {output.name: output.about for output in OUTPUTS if output.name in written and output.about}
     if place is not None:
         known = {name: facts | _PLACED if name.endswith(IN_PLACE) else facts for name, facts in known.items()}
     return {

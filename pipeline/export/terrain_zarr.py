@@ -19,9 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datasets.georeference import Georeference
+from pipeline.export.output import Output, stage
+from pipeline.export.rasters import whole
 from pipeline.export.writers import ENGINEERING_CRS, FRAME
 from stages.core.declare import Array
 from stages.geometry.lattice import Lattice
+from stages.terrain import merge
+from stages.terrain.shading import slope_deg
 
 CONVENTIONS = "CF-1.11"
 CHUNK = 512
@@ -124,3 +128,42 @@ def _array(group: Any, name: str, values: NDArray[Any], dims: tuple[str, ...], a
         config={"write_empty_chunks": True},
     )
     written[...] = values
+
+
+SLOPE = Array("slope", ("row", "col"), "float32", "degree", "inclination of the terrain", "nan", "world")
+
+
+def _write_output(folder: Path, view: Any) -> None:
+    """All merged arrays, put together of the world tiles, and the slope."""
+    tiles, arrays = list(map(view.bundle, view.products.tiles)), {}
+    for spec in merge.STAGE.outputs:
+        if spec.dims == ("row", "col") and all(spec.name in tile.arrays for tile in tiles):
+            nodata = np.nan if spec.nodata == "nan" else float(spec.nodata or 0)
+            lattice, values = whole(tiles, spec.name, nodata)
+            arrays[spec.name] = (spec, values)
+    arrays["slope"] = (SLOPE, slope_deg(arrays["elevation"][1], lattice.cell))
+    about = {
+        "title": f"Merged terrain of the sequence {view.sequence.name}",
+        "source": "stereo images: disparity by HFVM, elevation models by Locus, merged; Rille",
+    }
+    write_terrain(folder / "terrain.zarr", arrays, lattice, view.sequence.georeference, about)
+
+
+OUTPUTS = (
+    Output(
+        "terrain.zarr",
+        "all merged arrays with units and coordinates",
+        "xarray.open_zarr",
+        _write_output,
+        ("tiles",),
+        knows=("sequence.georeference", "sequence.name"),
+        frame="world",
+        facts={
+            "crs": "engineering CRS, metres; easting and northing beside x and y where the sequence has a place on "
+            "Earth",
+            "values": "all merged arrays as one zarr 3 group, by the CF conventions; units with each",
+            "opens_with": "xarray.open_zarr",
+        },
+    ),
+)
+STAGE = stage("output.terrain", "The merged terrain as one zarr group", OUTPUTS)

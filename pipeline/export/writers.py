@@ -12,7 +12,6 @@ import os
 import struct
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from importlib import resources
 from pathlib import Path
 from string import Template
 from typing import Any
@@ -222,15 +221,14 @@ def _wkb(kind: int, points: NDArray[np.float64]) -> bytes:
     return struct.pack("<BI", 1, kind) + count + np.ascontiguousarray(points, dtype="<f8").tobytes()
 
 
-def write_style(path: Path, name: str, values: Mapping[str, float] | None = None) -> None:
-    """Write the QGIS style ``name``; beside a raster of the same stem QGIS applies it on opening.
+def write_style(path: Path, style: str, values: Mapping[str, float] | None = None) -> None:
+    """Write a QGIS style; beside a raster of the same stem QGIS applies it on opening.
 
     Parameters
     ----------
     values : numbers to fill in by the names that the style has for them.
     """
-    text = resources.files("pipeline.export").joinpath("styles", f"{name}.qml").read_text(encoding="utf-8")
-    write_text(path, Template(text).substitute({key: f"{value:.6g}" for key, value in (values or {}).items()}))
+    write_text(path, Template(style).substitute({key: f"{value:.6g}" for key, value in (values or {}).items()}))
 
 
 FORMULA = ("=", "+", "-", "@", "\t")

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from pipeline.report.canvas import Panel
 
@@ -38,8 +40,21 @@ class Block:
 
 
 @dataclass(frozen=True)
-class Gallery:
-    """The figures that could be drawn, and why others could not: ``(title, reason)``."""
+class Figure:
+    """What became of a figure: its block, or why there is none; neither where nobody expects it."""
 
-    blocks: tuple[Block, ...]
-    absent: tuple[tuple[str, str], ...]
+    title: str
+    block: Block | None = None
+    why: str = ""
+
+    @staticmethod
+    def from_dict(d: Mapping[str, Any]) -> Figure:
+        """What ``dataclasses.asdict`` has taken apart."""
+        given = d["block"]
+        if given is None:
+            return Figure(d["title"], None, d["why"])
+        table = given["table"]
+        if table is not None:
+            table = Table(tuple(table["head"]), tuple(map(tuple, table["rows"])), frozenset(table["numbers"]))
+        parts = {"panels": tuple(Panel(**panel) for panel in given["panels"]), "table": table}
+        return Figure(d["title"], Block(**{**given, **parts, "legend": tuple(map(tuple, given["legend"]))}), d["why"])

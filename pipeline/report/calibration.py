@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.report.artifacts import Floats, used_rig
-from pipeline.report.view import RunView
+from pipeline.export.artifacts import Floats, used_rig
+from pipeline.export.view import RunView
 from stages.geometry.epipolar import distances
 
 

@@ -16,6 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.export import ranges
+
 Image = NDArray[Any]
 Extent = tuple[float, float, float, float]
 """x_min, x_max, y_min, y_max."""
@@ -202,38 +204,9 @@ def shrink(array: Image, limit: int = MAX_PIXELS) -> Image:
     return np.where(count > 0, total / np.maximum(count, 1), np.nan).astype(np.float32)
 
 
-def sample(values: Image) -> Image:
-    """Finite values, about fifty thousand of them, evenly spread: enough for a percentile."""
-    step = max(1, math.isqrt(values.size // 50_000)) if values.ndim == 2 else 1
-    part = values[::step, ::step] if step > 1 else values
-    finite = part[np.isfinite(part)]
-    return finite if finite.size or step == 1 else values[np.isfinite(values)]
-
-
-def limits(values: Image, low: float = 2.0, high: float = 98.0) -> tuple[float, float]:
-    """Robust range of the finite values: percentiles, never empty."""
-    finite = sample(values)
-    if finite.size == 0:
-        return 0.0, 1.0
-    a, b = (float(v) for v in np.percentile(finite, [low, high]))
-    pad = 1e-6 * max(abs(a), abs(b), 1e-6)
-    return (a, b) if b - a > pad else (a - 10 * pad, b + 10 * pad)
-
-
-def ground_limits(elevation: Image) -> tuple[float, float]:
-    """Range of elevations that shows the ground where crowns and walls rise above it: five robust deviations."""
-    finite = sample(elevation)
-    low, high = limits(elevation)
-    if finite.size == 0:
-        return low, high
-    middle = float(np.median(finite))
-    reach = max(5 * 1.4826 * float(np.median(np.abs(finite - middle))), 1e-3 * (high - low))
-    return max(low, middle - reach), min(high, middle + reach)
-
-
 def metres_or_mm(values: Image) -> tuple[float, str]:
     """Factor and unit that suit lengths in metres: mm where nearly all are below 0.2 m."""
-    finite = np.abs(sample(values))
+    finite = np.abs(ranges.sample(values))
     return (1000.0, "mm") if finite.size and float(np.percentile(finite, 98)) < 0.2 else (1.0, "m")
 
 

@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.export import ranges
+from pipeline.export.artifacts import chain
+from pipeline.export.comparison import Comparison
 from pipeline.report import canvas, curves, figures
-from pipeline.report.artifacts import chain
 from pipeline.report.block import Block, Table
 from pipeline.report.calibration import Calibration
-from pipeline.report.comparison import Comparison
 from pipeline.report.gather import Scene
 from pipeline.report.words import length, quantity, spans, spread
 
@@ -58,7 +59,7 @@ def _residuals(scene: Scene, found: Calibration) -> list[canvas.Panel]:
     if not len(found.before):
         return []
     left = scene.view.sequence.rig.left
-    size, bound = (left.width, left.height), max(0.3, canvas.limits(np.abs(found.before), 0, 99)[1])
+    size, bound = (left.width, left.height), max(0.3, ranges.limits(np.abs(found.before), 0, 99)[1])
     parts = [("given rig", canvas.REFERENCE, found.before)]
     parts += [("used rig", canvas.ESTIMATE, found.after)] if found.changed else []
     panels = []
@@ -273,15 +274,15 @@ def overlaps(scene: Scene) -> Block | None:
     if differences:
         rows = np.array([(d.median, d.deviation, d.predicted) for d in differences])
         pairs = [d.pair for d in differences]
-        ranges = f"median {spread(rows[:, 0])} m, deviation {spread(rows[:, 1])} m"
-        alt = f"Elevation differences of successive models: {ranges}"
+        words_ = f"median {spread(rows[:, 0])} m, deviation {spread(rows[:, 1])} m"
+        alt = f"Elevation differences of successive models: {words_}"
         panels.append(curves.differences(pairs, rows[:, 0], rows[:, 1], rows[:, 2], alt))
     if not panels:
         return None
     words = []
     if several is not None and np.isfinite(several).any():
         share = float(np.isfinite(several).sum()) / max(int((world.arrays["count"] > 0).sum()), 1)  # type: ignore[union-attr]
-        median = float(np.median(canvas.sample(several)))
+        median = float(np.median(ranges.sample(several)))
         words.append(
             f"First: standard deviation of the models that were merged in a cell ({share:.0%} of the mapped cells have "
             f"more than one), median {length(median)}."

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.export.artifacts import Floats
 from pipeline.report import canvas
-from pipeline.report.artifacts import Floats
 from pipeline.report.canvas import Panel
 
 CELLS = 24

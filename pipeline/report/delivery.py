@@ -6,14 +6,15 @@ for granted. Truth that the data do not have and a comparison that is switched o
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from pipeline.report.block import Gallery
+from pipeline.export.view import RunView
+from pipeline.report.block import Figure
 from pipeline.report.gather import Scene
-from pipeline.report.view import RunView
 from pipeline.report.words import metres, spans
 
 Rows = list[dict[str, Any]]
@@ -37,12 +38,20 @@ class Delivery:
         return all(m["kind"] in ANSWERS for m in self.missing)
 
 
-def account(scene: Scene, frames: Rows, pairs: Rows, gallery: Gallery) -> Delivery:
-    """All that a reader might take for granted, in one of the three states."""
+def account(scene: Scene, frames: Rows, pairs: Rows) -> dict[str, Any]:
+    """What the artifacts tell of the three states: ``delivered``, ``absent`` and ``missing``."""
     view = scene.view
-    missing = _failures(view) + _poses(frames) + _local_paths(pairs) + _path(view) + _crosscheck_lost(scene)
-    missing += [_item("figure", title, reason) for title, reason in gallery.absent]
-    return Delivery(_delivered(view, frames, pairs), _truth(view) + _crosscheck_off(view), missing)
+    missing = _poses(frames) + _local_paths(pairs) + _path(view) + _crosscheck_lost(scene)
+    found = {"delivered": _delivered(view, frames, pairs), "missing": missing}
+    return found | {"absent": _truth(view) + _crosscheck_off(view)}
+
+
+def complete(found: Mapping[str, Any], view: RunView, figures: Sequence[Figure]) -> Delivery:
+    """All that a reader might take for granted, in one of the three states: with what became of tasks and figures."""
+    done = ["every task was done"] if view.tasks else []
+    lost = [_item("figure", figure.title, figure.why) for figure in figures if figure.why]
+    missing = [*_failures(view), *found["missing"], *lost]
+    return Delivery([*done, *found["delivered"]], found["absent"], missing)
 
 
 def has_truth(view: RunView) -> list[bool]:
@@ -83,8 +92,7 @@ def start_words(view: RunView, lead: str = ", which ") -> str:
 
 
 def _delivered(view: RunView, frames: Rows, pairs: Rows) -> list[str]:
-    words = ["every task was done"] if view.tasks else []
-    words += ["every frame has a pose"] if len(frames) > 1 and all(r["in_world"] for r in frames) else []
+    words = ["every frame has a pose"] if len(frames) > 1 and all(r["in_world"] for r in frames) else []
     found, asked = local_paths(pairs)
     words += ["every stop has a local path"] if asked and found == asked else []
     drive, away = view.products.drive, start_of_path(view)

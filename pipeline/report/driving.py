@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.export import ranges
 from pipeline.report import canvas
 from pipeline.report.block import Block, Table
 from pipeline.report.canvas import Extent, Panel
@@ -191,7 +192,7 @@ def column(s: Shown, alt: str) -> Panel:
     if len(s.path) > 1:
         axes[1].plot(s.path[:, 0], s.path[:, 1], color="white", linewidth=4)
         axes[1].plot(s.path[:, 0], s.path[:, 1], color=canvas.MARK, linewidth=2)
-    low, high = canvas.ground_limits(s.elevation)
+    low, high = ranges.ground_limits(s.elevation)
     _map(axes[2], s.elevation, whole, whole, cmap=canvas.color_map("gray", "white"), vmin=low, vmax=high)
     for track, shade, width in ((s.truth, canvas.REFERENCE, 4.0), (s.estimate, canvas.ESTIMATE, 1.6)):
         if track is not None:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.export import ranges
 from pipeline.report import canvas
 from pipeline.report.canvas import Extent, Panel
 from stages.core.validity import defined, matched
@@ -29,7 +30,7 @@ def photo(image: Floats, alt: str) -> Panel:
 def disparity(values: Floats, label: str, alt: str) -> Panel:
     """One component of the disparity (row, col), pixels, NaN undefined, with its colour bar (Figure 6)."""
     fig, ax, cax = canvas.image_axes(values.shape, bar=True)
-    low, high = canvas.limits(values)
+    low, high = ranges.limits(values)
     style = {"cmap": canvas.color_map("viridis"), "vmin": low, "vmax": high, "interpolation": "nearest"}
     drawn = ax.imshow(canvas.shrink(values), aspect="auto", **style)
     canvas.color_bar(drawn, cax, label)
@@ -50,7 +51,7 @@ def validity(classes: Bytes, alt: str) -> Panel:
 def ortho(grey: Floats, extent: Extent, alt: str) -> Panel:
     """Ortho image (row, col), grey 0..255, NaN white (Figure 7, left)."""
     fig, ax, _ = canvas.map_axes(extent)
-    low, high = canvas.limits(grey, 0.5, 99.5)
+    low, high = ranges.limits(grey, 0.5, 99.5)
     _show(ax, grey, extent, cmap=canvas.color_map("gray", "white"), vmin=low, vmax=high)
     canvas.scale_bar(ax, extent)
     return canvas.encode(fig, alt, photo=True)
@@ -63,7 +64,7 @@ def elevation_with_path(elevation: Floats, risk: Bytes | None, path: Floats | No
     factor, unit = canvas.metres_or_mm(elevation)
     # The grey scale starts well above black, so that black means "not to be driven" only.
     shown = np.where(blocked, np.nan, elevation * factor)
-    low, high = canvas.ground_limits(shown)
+    low, high = ranges.ground_limits(shown)
     drawn = _show(ax, shown, extent, cmap=_greys(), vmin=low, vmax=high)
     if path is not None and len(path):
         canvas.polyline(ax, path, color=canvas.HAZARDOUS)
@@ -96,7 +97,7 @@ def cost_to_go(cost: Floats, path: Floats | None, extent: Extent, alt: str) -> P
     finite = np.where(np.isfinite(cost), cost, np.nan)
     factor, unit = canvas.metres_or_mm(finite)
     drawn = _show(
-        ax, finite * factor, extent, cmap=canvas.color_map("cividis"), vmin=0, vmax=canvas.limits(finite)[1] * factor
+        ax, finite * factor, extent, cmap=canvas.color_map("cividis"), vmin=0, vmax=ranges.limits(finite)[1] * factor
     )
     if path is not None and len(path):
         canvas.polyline(ax, path)
@@ -190,7 +191,7 @@ def hillshade(elevation: Floats, cell: float, extent: Extent, alt: str) -> Panel
     step = cell * elevation.shape[1] / max(z.shape[1], 1)
     shade = _shade(z, step)
     factor, unit = canvas.metres_or_mm(elevation)
-    low, high = (v * factor for v in canvas.ground_limits(elevation))
+    low, high = (v * factor for v in ranges.ground_limits(elevation))
     norm = matplotlib.colors.Normalize(low, high)
     tint = matplotlib.colormaps["cividis"](norm(np.nan_to_num(z * factor)))[..., :3]
     rgb = np.clip(tint * (0.35 + 0.9 * shade[..., None]), 0, 1)
@@ -205,7 +206,7 @@ def scalar_map(values: Floats, extent: Extent, label: str, alt: str, *, length: 
     """A measured quantity (row, col); ``length``: metres, shown in mm where that fits; the unit is added."""
     fig, ax, cax = canvas.map_axes(extent, bar=True)
     factor, unit = canvas.metres_or_mm(values) if length else (1.0, "")
-    low, high = (v * factor for v in canvas.limits(values))
+    low, high = (v * factor for v in ranges.limits(values))
     drawn = _show(ax, values * factor, extent, cmap=canvas.color_map("viridis"), vmin=min(low, 0.0), vmax=high)
     canvas.color_bar(drawn, cax, f"{label}, {unit}" if unit else label, integer=not length)
     return canvas.encode(fig, alt, photo=True)
@@ -217,7 +218,7 @@ def error_map(
     """Difference of elevations (row, col), m, symmetric about zero; colours end at ``bound``, m, or where 3 % lie."""
     fig, ax, cax = canvas.map_axes(extent, bar=True)
     factor, unit = canvas.metres_or_mm(error)
-    bound = factor * (canvas.limits(np.abs(error), 0, 97)[1] if bound is None else bound)
+    bound = factor * (ranges.limits(np.abs(error), 0, 97)[1] if bound is None else bound)
     drawn = _show(ax, error * factor, extent, cmap=canvas.color_map("PuOr"), vmin=-bound, vmax=bound)
     canvas.color_bar(drawn, cax, f"{label}, {unit}")
     return canvas.encode(fig, alt, photo=True)

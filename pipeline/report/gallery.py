@@ -2,38 +2,52 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import json
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from pipeline.report import artifacts, canvas, checks, driving, figures, gather, seams
-from pipeline.report.block import Block, Gallery
+from pipeline.export import artifacts
+from pipeline.export.output import Output, stage
+from pipeline.report import canvas, checks, driving, figures, gather, seams
+from pipeline.report.block import Block, Figure
 from pipeline.report.delivery import start_words
 from pipeline.report.gather import Scene
 from pipeline.report.words import length, spread
 from stages.core.declare import Bundle
+from stages.core.errors import RilleError
+
+Maker = Callable[[Scene], Block | None]
+Condition = Callable[[Scene], bool]
 
 
-def draw(scene: Scene, drawn: Mapping[str, Block] | None = None) -> Gallery:
-    """Draw every figure whose artifacts are there, but those that are ``drawn`` (by title)."""
-    blocks, absent = [], []
-    for title, maker, expected in _FIGURES:
-        try:
-            block = (drawn or {}).get(title) or maker(scene)
-        except Exception as error:  # a figure must not cost the run its report; the failure is shown in it
-            absent.append((title, f"drawing failed, {type(error).__name__}: {error}"))
-            continue
-        if block is not None:
-            blocks.append(block)
-        elif expected(scene):
-            absent.append((title, "what it shows was not computed"))
-    return Gallery(tuple(blocks), tuple(absent))
+def draw(view: Any) -> list[Figure]:
+    """Draw every figure whose artifacts are there, in the order of the page."""
+    scene = Scene(view)
+    return [_drawn(title, maker, expected, scene) for title, maker, expected, *_ in _FIGURES]
 
 
-def makers() -> list[tuple[str, Callable[[Scene], Block | None]]]:
-    """Title of each figure that a report can have, and what draws it."""
-    return [(title, maker) for title, maker, _ in _FIGURES]
+def _drawn(title: str, maker: Maker, expected: Condition, scene: Scene) -> Figure:
+    try:
+        block = maker(scene)
+    except (OSError, MemoryError, RilleError):  # not the figure's own fault: another try may draw it
+        raise
+    except Exception as error:  # a figure must not cost the run its report; the failure is shown in it
+        return Figure(title, why=f"drawing failed, {type(error).__name__}: {error}")
+    return Figure(title, block, "what it shows was not computed" if block is None and expected(scene) else "")
+
+
+def _output(title: str, maker: Maker, expected: Condition, reads: str, knows: str) -> Output:
+    """Record of a figure: a part of the page, kept as JSON."""
+
+    def write(folder: Path, view: Any) -> None:
+        drawn = _drawn(title, maker, expected, Scene(view))
+        (folder / "figure.json").write_text(json.dumps(asdict(drawn), default=sorted), encoding="utf-8")
+
+    return Output(title, "", "", write, (), tuple(reads.split()), ("frames", *knows.split()))
 
 
 def _disparities(scene: Scene) -> Block | None:
@@ -311,21 +325,50 @@ def _planned(scene: Scene) -> bool:
     return scene.view.products.drive is None
 
 
-_FIGURES: tuple[tuple[str, Callable[[Scene], Block | None], Callable[[Scene], bool]], ...] = (
-    ("Drive", driving.strip, lambda scene: scene.view.products.drive is not None),
-    ("Figure 6. Disparities", _disparities, _always),
-    ("Rig", checks.rig, lambda scene: bool(scene.view.products.rigs)),
-    ("Figure 7. Ortho image and path", _terrain, _always),
-    ("Risk map", _risk, _always),
-    ("Figure 3. Local risk map", _local, _planned),
-    ("Figure 8. Tracks", _tracks, _several),
-    ("Figure 9. Trajectory", _trajectory, _several),
-    ("Crosscheck", checks.crosscheck, lambda scene: scene.view.products.agreement is not None),
-    ("Basic pairs", checks.basic_pairs, lambda scene: _several(scene) and scene.view.products.select is not None),
-    ("Terrain", _quality, _always),
-    ("Overlap", checks.overlaps, lambda scene: len(scene.view.products.world_dem) > 1),
-    ("Seams", seams.worst, lambda scene: bool(scene.view.products.seams)),
-    ("Seam audit", seams.models, lambda scene: bool(scene.view.products.seams)),
-    ("Elevation error", _dem_error, lambda scene: False),
+_COMPARED = "trajectory agreement accuracy crosscheck_accuracy"
+_TRUTH = "sequence.truth sequence.truth_positions sequence.truth_source"
+_FIGURES: tuple[tuple[str, Maker, Condition, str, str], ...] = (
+    (
+        "Drive",
+        driving.strip,
+        lambda scene: scene.view.products.drive is not None,
+        "drive images trajectory",
+        "sequence.truth sequence.simulation.T_vehicle_left",
+    ),
+    ("Figure 6. Disparities", _disparities, _always, "disparity images undistorted", ""),
+    ("Rig", checks.rig, lambda scene: bool(scene.view.products.rigs), "rigs orientations", "sequence.rig"),
+    ("Figure 7. Ortho image and path", _terrain, _always, "tiles world_dem risk path", "config.vehicle"),
+    ("Risk map", _risk, _always, "risk path drive", "config.vehicle config.risk.sigmas"),
+    ("Figure 3. Local risk map", _local, _planned, "local_path local_risk drive", ""),
+    ("Figure 8. Tracks", _tracks, _several, "images undistorted tracks resections", ""),
+    (
+        "Figure 9. Trajectory",
+        _trajectory,
+        _several,
+        f"disparity rigs {_COMPARED}",
+        f"{_TRUTH} sequence.rig",
+    ),
+    (
+        "Crosscheck",
+        checks.crosscheck,
+        lambda scene: scene.view.products.agreement is not None,
+        f"rigs orientations {_COMPARED}",
+        "sequence.rig",
+    ),
+    (
+        "Basic pairs",
+        checks.basic_pairs,
+        lambda scene: _several(scene) and scene.view.products.select is not None,
+        "select continuity",
+        "config.select.rule config.select.overlap",
+    ),
+    ("Terrain", _quality, _always, "tiles", ""),
+    ("Overlap", checks.overlaps, lambda scene: len(scene.view.products.world_dem) > 1, "tiles world_dem", ""),
+    ("Seams", seams.worst, lambda scene: bool(scene.view.products.seams), "seam_audit seams", ""),
+    ("Seam audit", seams.models, lambda scene: bool(scene.view.products.seams), "seam_audit seams", ""),
+    ("Elevation error", _dem_error, lambda scene: False, "dem_accuracy", ""),
 )
-"""Title, how it is drawn, and whether a run lacks something without it."""
+"""Title, how it is drawn, whether a run lacks something without it, the artifacts that it reads, and facts."""
+
+OUTPUTS = tuple(_output(*row) for row in _FIGURES)
+STAGE = stage("output.figures", "Figures of the report", OUTPUTS)

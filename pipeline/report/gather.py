@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.report.artifacts import Floats, image, used_rig
+from pipeline.export.artifacts import Floats, image, used_rig
+from pipeline.export.comparison import Comparison, compare
+from pipeline.export.view import RunView
 from pipeline.report.calibration import Calibration, calibration
 from pipeline.report.canvas import Extent
-from pipeline.report.comparison import Comparison, compare
 from pipeline.report.overlap import Difference, differences
-from pipeline.report.view import RunView
 from stages.core.declare import Bundle
 from stages.geometry.geometry import RigidTransform
 from stages.geometry.lattice import Lattice, mosaic, union

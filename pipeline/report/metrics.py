@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.export.view import RunView
 from pipeline.report import delivery, tables
 from pipeline.report.gather import Scene
-from pipeline.report.view import RunView
 from stages.evaluation.trajectory_error import STEPS
 
 Metric = dict[str, Any]
@@ -408,10 +408,4 @@ def _run(view: RunView) -> dict[str, Metric]:
     rig = view.sequence.rig
     return {
         "baseline": _metric("Stereo baseline", rig.baseline, "m", "given calibration; sets the scale"),
-        "wall_clock": _metric(
-            "Time of this run's tasks",
-            view.seconds,
-            "s",
-            "wall clock, without writing files; what is cached costs no time",
-        ),
     }

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.report import canvas
-from pipeline.report.view import RunView
+from pipeline.export import ranges
+from pipeline.export.view import RunView
 from stages.geometry.lattice import Lattice
 
 LEAST_CELLS = 100
@@ -59,8 +59,8 @@ def _difference(view: RunView, before: int, pair: int) -> Difference | None:
     cells = int(np.isfinite(difference).sum())
     if cells < LEAST_CELLS:
         return None
-    sampled = canvas.sample(difference)
+    sampled = ranges.sample(difference)
     median = float(np.median(sampled))
     deviation = 1.4826 * float(np.median(np.abs(sampled - median)))
-    predicted = canvas.sample(np.where(np.isfinite(difference), expected, np.nan))
+    predicted = ranges.sample(np.where(np.isfinite(difference), expected, np.nan))
     return Difference(before, pair, cells, median, deviation, float(np.median(predicted)))

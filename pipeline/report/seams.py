@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.export import ranges
 from pipeline.report import canvas, figures
 from pipeline.report.block import Block, Table
 from pipeline.report.gather import Scene
@@ -47,7 +48,7 @@ def worst(scene: Scene) -> Block | None:
     step = at["map"]["step"]
     extent = (x_min, x_min + step * difference.shape[1], y_max - step * difference.shape[0], y_max)
     left = difference - _plane(at, extent, difference.shape)
-    bound = canvas.limits(np.abs(difference), 0, 97)[1]
+    bound = ranges.limits(np.abs(difference), 0, 97)[1]
     name = f"pair {first['pair']} minus pair {first['other']}"
     panels = (
         figures.error_map(difference, extent, f"Elevation of {name}, {spread(difference)} m", label=name, bound=bound),

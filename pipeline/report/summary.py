@@ -2,50 +2,82 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
+from pipeline.export.output import Output, stage
+from pipeline.export.view import RunView
 from pipeline.report import delivery, seams, tables
-from pipeline.report.block import Gallery
-from pipeline.report.delivery import Delivery
+from pipeline.report.block import Figure
 from pipeline.report.gather import Scene
 from pipeline.report.metrics import metrics
-from pipeline.report.view import RunView
 
 FORMAT = 2
 """Raised when the meaning of a key of report.json changes."""
 
 
-def summarise(scene: Scene, gallery: Gallery) -> dict[str, Any]:
-    """Everything that ``report.json`` holds; the page is rendered from the same numbers."""
-    view = scene.view
+def gather(view: Any) -> dict[str, Any]:
+    """What the artifacts tell: everything of ``report.json`` that is the same whenever and wherever a run is made."""
+    scene = Scene(view)
     frames, pairs = tables.frames(scene), tables.pairs(scene)
-    found = delivery.account(scene, frames, pairs, gallery)
     assessed = any(delivery.has_truth(view))
+    return {
+        "verdict": _verdict(view, frames, pairs),
+        **delivery.account(scene, frames, pairs),
+        "warnings": find_warnings(scene),
+        "seams": seams.facts(scene),
+        "sequence": _sequence(view),
+        "truth": {"used": assessed, "source": view.sequence.truth_source if assessed else "no truth"},
+        "metrics": metrics(scene, frames, pairs),
+        "frames": frames,
+        "pairs": pairs,
+        "vehicle": view.config.vehicle.model_dump(mode="json"),
+        "notes": list(view.sequence.notes),
+        "compared": scene.comparison is not None,
+    }
+
+
+def summarise(view: RunView, facts: Mapping[str, Any], figures: Sequence[Figure]) -> dict[str, Any]:
+    """Everything that ``report.json`` holds, with what this run alone knows; the page has the same numbers."""
+    found = delivery.complete(facts, view, figures)
+    failed = any(m["kind"] in ("failed", "skipped") for m in found.missing)
+    whole = not failed and all(row["in_world"] for row in facts["frames"])
     rows, together = tables.table_2(view)
+    clock = {
+        "group": "Run",
+        "truth": None,
+        "label": "Time of this run's tasks",
+        "value": view.seconds,
+        "unit": "s",
+        "how": "wall clock, without writing the page; what is cached costs no time",
+        "completeness": None,
+        "key": False,
+    }
     return {
         "format": FORMAT,
         "run": view.run_id,
         "started": view.started,
         "command": view.command,
         "complete": found.complete,
-        "verdict": _verdict(view, frames, pairs, found),
+        **{key: value for key, value in facts.items() if key != "compared"},
+        "verdict": ("Complete: " if whole else "Incomplete: ") + facts["verdict"],
         "delivered": found.delivered,
         "absent": found.absent,
         "missing": found.missing,
-        "warnings": find_warnings(scene),
-        "seams": seams.facts(scene),
-        "sequence": _sequence(view),
-        "truth": {"used": assessed, "source": view.sequence.truth_source if assessed else "no truth"},
-        "metrics": metrics(scene, frames, pairs),
+        "metrics": {**facts["metrics"], "wall_clock": clock},
         "stages": _stages(view),
         "table_2": [vars(t) for t in (*rows, together)],
-        "frames": frames,
-        "pairs": pairs,
         "seconds": round(view.seconds, 3),
         "versions": dict(view.versions),
-        "vehicle": {**view.config.vehicle.model_dump(mode="json"), "source": view.vehicle_source},
-        "notes": list(dict.fromkeys([*view.sequence.notes, *view.notes])),
+        "vehicle": {**facts["vehicle"], "source": view.vehicle_source},
+        "notes": list(dict.fromkeys([*facts["notes"], *view.notes])),
     }
+
+
+def _write(folder: Path, view: Any) -> None:
+    (folder / "facts.json").write_text(json.dumps(gather(view), allow_nan=False), encoding="utf-8")
 
 
 def find_warnings(scene: Scene) -> list[str]:
@@ -76,7 +108,7 @@ def find_warnings(scene: Scene) -> list[str]:
     return list(dict.fromkeys(" ".join(str(line).split()) for line in lines))
 
 
-def _verdict(view: RunView, frames: list[dict[str, Any]], pairs: list[dict[str, Any]], found: Delivery) -> str:
+def _verdict(view: RunView, frames: list[dict[str, Any]], pairs: list[dict[str, Any]]) -> str:
     """One line: what there is, of how much."""
     posed, placed = (sum(r[key] for r in frames) for key in ("posed", "in_world"))
     models = sum(r["modelled"] for r in pairs)
@@ -91,8 +123,7 @@ def _verdict(view: RunView, frames: list[dict[str, Any]], pairs: list[dict[str, 
         _way_words(view, length),
         *([] if any(delivery.has_truth(view)) else ["not assessed against truth"]),
     ]
-    failures = sum(m["kind"] in ("failed", "skipped") for m in found.missing)
-    return ("Incomplete: " if failures or placed < len(frames) else "Complete: ") + ", ".join(parts) + "."
+    return ", ".join(parts) + "."
 
 
 def _way_words(view: RunView, length: float | None) -> str:
@@ -132,3 +163,17 @@ def _stages(view: RunView) -> dict[str, dict[str, Any]]:
     for row in found.values():
         row["seconds"], row["seconds_when_computed"] = round(row["seconds"], 3), round(row["seconds_when_computed"], 3)
     return found
+
+
+READS = (
+    "continuity select refined crosschecks crosscheck agreement crosscheck_accuracy trajectory accuracy "
+    "position_accuracy accuracy_pieces seam_audit disparity orientations rigs level local_dem local_risk local_path "
+    "local_dem_accuracy resections world_dem tiles risk path dem_accuracy path_check drive"
+)
+KNOWS = (
+    "frames config.vehicle config.crosscheck.enabled sequence.name sequence.frames sequence.frame_names sequence.rig "
+    "sequence.truth sequence.truth_source sequence.truth_positions sequence.warnings sequence.notes "
+    "sequence.evaluation_window"
+)
+OUTPUTS = (Output("facts", "", "", _write, (), tuple(READS.split()), tuple(KNOWS.split())),)
+STAGE = stage("output.facts", "Figures and tables of the report in numbers", OUTPUTS)

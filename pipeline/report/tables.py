@@ -5,14 +5,13 @@ from __future__ import annotations
 import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from pipeline.export.artifacts import chain
+from pipeline.export.view import RunView, TaskRow
 from pipeline.report import gather
-from pipeline.report.artifacts import chain
-from pipeline.report.view import RunView, TaskRow
 
 TABLE_2: tuple[tuple[str, str, float, tuple[str, ...]], ...] = (
     ("Stereo matching (HFVM)", "one stereo pair, every pixel", 40.0, ("hfvm",)),
@@ -29,45 +28,6 @@ TABLE_2: tuple[tuple[str, str, float, tuple[str, ...]], ...] = (
 )
 """The paper's modules, our unit of work, seconds in 1999 on a Pentium 166 MHz, and the labels of our tasks: the first
 one's is one unit, further ones are its preparation (the coarse disparities of tracking, section 5.2.1)."""
-
-FILES: dict[str, tuple[str, str]] = {
-    "report.html": ("this page", "any browser"),
-    "report.json": ("every number of this page, for programs", "any text editor, jq"),
-    "trajectory.kitti": (
-        "pose of each left camera, a 3 x 4 matrix a line, world from camera, m",
-        "evo (evo_traj kitti), any text editor",
-    ),
-    "trajectory.tum": ("the same as time, position and quaternion x y z w", "evo (evo_traj tum), CloudCompare"),
-    "crosscheck.tum": (
-        "the trajectory by COLMAP in the same form, laid on ours without a change of scale",
-        "evo (evo_ape tum trajectory.tum crosscheck.tum)",
-    ),
-    "agreement.csv": (
-        "each frame: our position, COLMAP's, their disagreement, whether it is flagged, errors where there is truth",
-        "LibreOffice Calc, any text editor",
-    ),
-    "frames.json": (
-        "frames, handedness, quaternion order and units of every file; the frames' names",
-        "any text editor",
-    ),
-    "dem.tif": ("merged elevation, m, NaN undefined", "QGIS, GDAL"),
-    "dem.qml": ("colours of dem.tif, which QGIS applies by itself", "QGIS"),
-    "dem_sigma.tif": ("standard deviation of the elevation, m", "QGIS, GDAL"),
-    "slope.tif": ("inclination of the terrain, degrees", "QGIS, GDAL"),
-    "hillshade.tif": ("shaded relief of the terrain", "QGIS, GDAL"),
-    "terrain.zarr": ("all merged arrays with units and coordinates", "xarray.open_zarr"),
-    "ortho.tif": ("merged ortho image, grey 0..255", "QGIS, GDAL"),
-    "risk.tif": (
-        "risk map; bands: class (0 safe, 1 caution, 2 hazard, 3 unknown), reason (bits), p_hazard, filled, measures",
-        "QGIS, GDAL",
-    ),
-    "risk.qml": ("colours and names of the classes of risk.tif, which QGIS applies by itself", "QGIS"),
-    "path.gpkg": ("path over the merged terrain, its start and target, with their coordinate system", "QGIS, GDAL"),
-    "path.geojson": ("the same in metres of the world frame (not longitude and latitude)", "any text editor, QGIS"),
-    "config.toml": ("every parameter in force; give it back with --config", "any text editor"),
-    "ledger.jsonl": ("what became of every task, a JSON object a line", "any text editor, jq"),
-}
-"""What a run's folder holds: what each file is, and a free program that opens it."""
 
 
 @dataclass(frozen=True)
@@ -233,14 +193,6 @@ def _pair(view: RunView, pair: int) -> dict[str, Any]:
         "completeness": assessed.get("completeness", {}).get("value"),
         "tilt_deg": assessed.get("tilt", {}).get("value"),
     }
-
-
-def files(folder: Path) -> list[tuple[str, str, str]]:
-    """Name, meaning and program of each file of the run's folder, in the order of :data:`FILES`, others behind."""
-    there = {p.name for p in folder.iterdir() if p.is_file() and not p.name.startswith(".")}
-    there |= {"report.html", "report.json"}
-    known = [(name, *FILES[name]) for name in FILES if name in there]
-    return known + [(name, "", "") for name in sorted(there - set(FILES))]
 
 
 def finite(value: Any) -> float | None:

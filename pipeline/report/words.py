@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.report import canvas
+from pipeline.export import ranges
 
 SMALL = {"m": ("mm", 1000.0, 0.1), "m²": ("cm²", 10000.0, 0.01)}
 """Unit for small values: its name, the factor and the bound below which it is used."""
@@ -67,7 +67,7 @@ def seconds(value: Any) -> str:
 
 def spread(values: Any) -> str:
     """``low to high`` of nearly all values, for alternative texts."""
-    finite = canvas.sample(np.asarray(values))
+    finite = ranges.sample(np.asarray(values))
     if not finite.size:
         return "nothing defined"
     low, high = np.percentile(finite, [1, 99])

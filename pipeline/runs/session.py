@@ -1,9 +1,8 @@
 """One run from options to a folder of results: open, configure, run the graph, write products and report.
 
-Everything that takes time is a cached task; what this module writes (rasters, trajectory, path, report) is rendered
-anew by each run into ``RUNS/<sequence>/<run id>/``. ``latest`` moves last, and only to a folder that is complete
-or whose holes are named in its report. A run that computes nothing, and would write what ``latest`` holds
-already, leaves no folder of its own: that one stands (:mod:`pipeline.runs.unchanged`).
+Everything that takes time is a cached task, files and figures among them; each run copies them into its folder
+``RUNS/<sequence>/<run id>/`` and renders the page around them. ``latest`` moves last, and only to a folder that is
+complete or whose holes are named in its report.
 """
 
 from __future__ import annotations
@@ -12,7 +11,6 @@ import hashlib
 import os
 import shutil
 import sys
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -20,7 +18,6 @@ from typing import TYPE_CHECKING, Any
 
 from datasets.protocol import Sequence
 from pipeline.flow import config as configuration
-from pipeline.runs.early import Ahead
 from pipeline.engine.store.artifact import DamagedError
 from pipeline.engine.code_digest import remember
 from pipeline.engine.graph import Graph
@@ -31,9 +28,10 @@ from stages.core.errors import ConfigError, RilleError
 
 if TYPE_CHECKING:
     from pipeline.engine.scheduler import Result
+    from pipeline.export.view import RunView
     from pipeline.flow.closed_loop import Drive
     from pipeline.flow.products import Products
-    from pipeline.report import RunView
+    from pipeline.runs import run_files
 
 COMPLETE, FAILED, HOLES = 0, 1, 3
 DISTRIBUTIONS = (
@@ -57,7 +55,6 @@ class Options:
     runs: Path = Path("runs")
     cache: Location = Path(".rille/cache")
     progress: str = "auto"
-    fresh: bool = False
     memory_limit: str | None = None
     verb: str = "reconstruct"
     opened: Sequence | None = None
@@ -180,17 +177,22 @@ class _Opened:
     drive: Drive | None
     products: Products
 
+    def told(self) -> _Opened:
+        """With the frames that a drive has taken, once it is over."""
+        if self.drive is None:
+            return self
+        sequence, frames = self.drive.taken()
+        return replace(self, sequence=sequence, frames=frames)
+
     def view(self, **late: Any) -> RunView:
         """What is drawn; ``late`` is what only the end of the run knows."""
-        from pipeline.runs import run_files
-        from pipeline.report import RunView
+        from pipeline.export.view import RunView
 
         return RunView(
             run_id=self.folder.name,
             sequence=self.sequence,
             frames=self.frames,
             products=self.products,
-            bundle=run_files.bundles(self.store),
             config=self.config,
             config_toml=self.text,
             versions=self.versions,
@@ -201,36 +203,16 @@ class _Opened:
             **late,
         )
 
-    def stamp(self) -> str:
-        """What the files of the run are rendered from, in one word."""
-        from pipeline.runs import unchanged
-
-        facts = {"config": self.text, "frames": self.frames, "vehicle": self.settled.vehicle_source}
-        return unchanged.stamp(self.graph, self.sequence, self.versions, **facts, command=self.options.command())
-
 
 def _reconstruct(options: Options) -> tuple[int, Path]:
-    opened = _open(options)
-    drive = opened.drive
-    with Ahead(opened.folder, lambda: opened.view(tasks=())) as ahead:
-        result = _compute(opened, None if drive is not None else ahead.work)
-        if drive is not None:
-            sequence, frames = drive.taken()
-            opened = replace(opened, sequence=sequence, frames=frames)
-        stamped, earlier = opened.stamp(), opened.folder.parent / "latest"
-        remember()
-        if _stands(options, result, earlier, stamped):
-            shutil.rmtree(opened.folder)
-            warn_of_results(opened.graph)
-            cached = result.total().cached
-            arrived = _outcome(opened)
-            print(f"{earlier.parent / earlier.readlink()}  cached {cached}, nothing new: that run stands")
-            return max(arrived, _posed_all(opened.products), _all_read(opened, arrived)), earlier.resolve()
-        _write(opened, result, ahead)
-    if result.ok:
-        from pipeline.runs import unchanged
+    from pipeline.runs import run_files
 
-        unchanged.seal(opened.folder, stamped)
+    opened = _open(options)
+    made: run_files.Made = {}
+    opened.graph.last = lambda: run_files.lay_out(opened.graph, opened.told().view(tasks=()), made)
+    result = _compute(opened)
+    remember()
+    _write(opened.told(), result, made)
     _point_latest(opened.folder)
     warn_of_results(opened.graph)
     arrived = _outcome(opened)
@@ -267,7 +249,7 @@ def _open(options: Options) -> _Opened:
     )  # fmt: skip
 
 
-def _compute(opened: _Opened, meanwhile: Callable[[], None] | None) -> Result:
+def _compute(opened: _Opened) -> Result:
     """Bring every task to its artifact; raise the first failure unless the data are its cause and poses are there."""
     from pipeline.engine import scheduler, progress
     from pipeline.engine.memory import limits
@@ -286,7 +268,6 @@ def _compute(opened: _Opened, meanwhile: Callable[[], None] | None) -> Result:
         progress=progress.make(options.progress),
         memory_limit=None if options.memory_limit is None else limits.parse(options.memory_limit),
         survey=lambda: lay_out(opened.sequence, opened.config, opened.frames),
-        meanwhile=meanwhile,
     )
     trajectory = opened.products.trajectory
     if not options.keep_going:
@@ -294,13 +275,7 @@ def _compute(opened: _Opened, meanwhile: Callable[[], None] | None) -> Result:
     return result
 
 
-def _stands(options: Options, result: Result, earlier: Path, stamped: str) -> bool:
-    from pipeline.runs import unchanged
-
-    return result.ok and not result.total().computed and not options.fresh and unchanged.stands(earlier, stamped)
-
-
-def _write(opened: _Opened, result: Result, ahead: Ahead) -> None:
+def _write(opened: _Opened, result: Result, made: run_files.Made) -> None:
     """Everything that the run leaves; nothing of it where an artifact was found damaged."""
     from pipeline.engine import events
     from pipeline.runs import run_files
@@ -313,7 +288,7 @@ def _write(opened: _Opened, result: Result, ahead: Ahead) -> None:
         )
     whole = opened.view(tasks=run_files.task_rows(opened.graph, opened.store), seconds=result.seconds)
     try:
-        run_files.write(opened.folder, whole, ahead.take())
+        run_files.write(opened.folder, whole, made, opened.store)
         total = (datetime.now(UTC) - opened.started).total_seconds()
         events.add_facts(opened.folder / "ledger.jsonl", total=total)
     except (DamagedError, GoneError):

@@ -14,6 +14,7 @@ import hashlib
 import os
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor, wait
+from copy import copy
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -253,6 +254,12 @@ class LazyArrays(Mapping[str, AnyArray]):
         if name not in self._loaded:
             self._loaded[name] = self._read(name, (...,))
         return self._loaded[name]
+
+    def anew(self) -> LazyArrays:
+        """The same arrays, of which nothing is read yet and held."""
+        other = copy(self)
+        other._loaded = {}
+        return other
 
     def part(self, name: str, window: tuple[Any, ...]) -> AnyArray:
         """Part of an array, which is not kept: only the chunks that hold it are read."""

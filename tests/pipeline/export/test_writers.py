@@ -18,6 +18,7 @@ from raising import raises
 from toys.finished import FRAMES, bundles, checked, checks, view
 
 from datasets.georeference import Georeference
+from pipeline.export import styles
 from pipeline.export.frames_json import FILES, describe
 from pipeline.export.writers import (
     replacing,
@@ -200,7 +201,7 @@ def test_equal_paths_make_equal_files(tmp_path: Path) -> None:
 
 
 def test_styles_name_the_classes_and_span_the_elevations(tmp_path: Path) -> None:
-    write_style(tmp_path / "risk.qml", "risk")
+    write_style(tmp_path / "risk.qml", styles.RISK)
     entries = ElementTree.parse(tmp_path / "risk.qml").findall(".//paletteEntry")
     assert [(e.get("value"), (e.get("label") or "").split()[0]) for e in entries] == [
         ("0", "safe"),
@@ -208,7 +209,7 @@ def test_styles_name_the_classes_and_span_the_elevations(tmp_path: Path) -> None
         ("2", "hazard"),
         ("3", "unknown"),
     ]
-    write_style(tmp_path / "dem.qml", "dem", {f"e{k}": -1.0 + k / 4 for k in range(9)})
+    write_style(tmp_path / "dem.qml", styles.DEM, {f"e{k}": -1.0 + k / 4 for k in range(9)})
     style = ElementTree.parse(tmp_path / "dem.qml")
     assert [float(e.get("value") or "nan") for e in style.findall(".//item")] == [-1.0 + k / 4 for k in range(9)]
     shader = style.find(".//colorrampshader")

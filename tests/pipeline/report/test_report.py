@@ -14,6 +14,7 @@ import pytest
 from toys.finished import TASKS, Written, bundles, products, view, written
 
 from datasets.mockup.sequence import vehicle_at_scale
+from pipeline.export import ranges
 from pipeline.flow.products import Driven, Products
 from pipeline.report import TaskRow, canvas, figures, tables, words, write_report
 from pipeline.runs import session
@@ -326,9 +327,9 @@ def test_shrinking_averages_what_is_defined() -> None:
 
 def test_limits_are_robust_and_never_empty() -> None:
     values = np.concatenate([np.linspace(0, 1, 1000), [1e6]])
-    assert canvas.limits(values)[1] < 1.0
+    assert ranges.limits(values)[1] < 1.0
     for constant in (np.full(5, np.nan), np.zeros(5), np.full(5, 3.0)):
-        low, high = canvas.limits(constant)
+        low, high = ranges.limits(constant)
         assert high > low
 
 
@@ -340,7 +341,7 @@ def test_measured_and_interpolated_are_told_apart() -> None:
 def test_ground_limits_ignore_crowns() -> None:
     ground = np.linspace(-1.7, -1.6, 900)
     crowns = np.full(90, 2.0)
-    low, high = canvas.ground_limits(np.concatenate([ground, crowns]))
+    low, high = ranges.ground_limits(np.concatenate([ground, crowns]))
     # The ground spreads by 0.1 m: its robust deviation is 0.037 m, five of them 0.19 m.
     assert -1.7 <= low < -1.69
     assert -1.6 <= high < -1.4

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.report.view import RunView
+from pipeline.export.view import RunView
 from stages.core.declare import Bundle
 from stages.geometry.geometry import Rig
 

@@ -45,9 +45,9 @@ class RunView:
     sequence : what was reconstructed (:class:`datasets.protocol.Sequence`).
     frames : chosen frame numbers, in order.
     products : handles of what the run was to deliver; those of failed tasks lead to no bundle.
-    bundle : the artifact of a handle, None where there is none (also for None).
     tasks : every task of the plan.
     config : validated configuration with all defaults, one section a stage, and ``vehicle``.
+    bundle : the artifact of a handle, None where there is none (also for None); only what makes outputs needs it.
     config_toml : the same, as it was written to ``config.toml``.
     seconds : wall-clock time of the run so far.
     versions : distribution or program to version.
@@ -61,9 +61,9 @@ class RunView:
     sequence: Sequence
     frames: tuple[int, ...]
     products: Products
-    bundle: Callable[[Any], Bundle | None]
     tasks: tuple[TaskRow, ...]
     config: Any
+    bundle: Callable[[Any], Bundle | None] = lambda _: None
     config_toml: str = ""
     seconds: float = 0.0
     versions: Mapping[str, str] = field(default_factory=dict)

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.report.artifacts import Floats, by_frame
-from pipeline.report.view import RunView
+from pipeline.export.artifacts import Floats, by_frame
+from pipeline.export.view import RunView
 from stages.core.declare import Bundle
 
 

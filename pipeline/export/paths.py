@@ -1,0 +1,50 @@
+"""The path over the merged terrain as files for GIS programs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.export.output import Output, stage
+from pipeline.export.writers import write_path_geojson, write_path_gpkg
+from stages.core.declare import Bundle
+
+
+def _facts(path: Bundle) -> dict[str, Any]:
+    return {k: v for k, v in path.meta.items() if not isinstance(v, dict)}
+
+
+def _write_gpkg(folder: Path, view: Any) -> None:
+    path = view.bundle(view.products.path)
+    write_path_gpkg(folder / "path.gpkg", np.asarray(path["path"]), _facts(path), view.sequence.georeference)
+
+
+def _write_geojson(folder: Path, view: Any) -> None:
+    path = view.bundle(view.products.path)
+    write_path_geojson(folder / "path.geojson", np.asarray(path["path"]), _facts(path))
+
+
+OUTPUTS = (
+    Output(
+        "path.gpkg",
+        "path over the merged terrain, its start and target, with their coordinate system",
+        "QGIS, GDAL",
+        _write_gpkg,
+        ("path",),
+        knows=("sequence.georeference",),
+        frame="world",
+        facts={"crs": "engineering CRS, metres", "coordinates": "x y z, m"},
+    ),
+    Output(
+        "path.geojson",
+        "the same in metres of the world frame (not longitude and latitude)",
+        "any text editor, QGIS",
+        _write_geojson,
+        ("path",),
+        frame="world",
+        facts={"crs": "none: local metres, not WGS 84", "coordinates": "x y z, m"},
+    ),
+)
+STAGE = stage("output.paths", "The path as files", OUTPUTS)

@@ -1,0 +1,40 @@
+"""Ranges of values in which a raster is shown: robust, so that few outliers do not take all the contrast."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Image = NDArray[Any]
+
+
+def sample(values: Image) -> Image:
+    """Finite values, about fifty thousand of them, evenly spread: enough for a percentile."""
+    step = max(1, math.isqrt(values.size // 50_000)) if values.ndim == 2 else 1
+    part = values[::step, ::step] if step > 1 else values
+    finite = part[np.isfinite(part)]
+    return finite if finite.size or step == 1 else values[np.isfinite(values)]
+
+
+def limits(values: Image, low: float = 2.0, high: float = 98.0) -> tuple[float, float]:
+    """Robust range of the finite values: percentiles, never empty."""
+    finite = sample(values)
+    if finite.size == 0:
+        return 0.0, 1.0
+    a, b = (float(v) for v in np.percentile(finite, [low, high]))
+    pad = 1e-6 * max(abs(a), abs(b), 1e-6)
+    return (a, b) if b - a > pad else (a - 10 * pad, b + 10 * pad)
+
+
+def ground_limits(elevation: Image) -> tuple[float, float]:
+    """Range of elevations that shows the ground where crowns and walls rise above it: five robust deviations."""
+    finite = sample(elevation)
+    low, high = limits(elevation)
+    if finite.size == 0:
+        return low, high
+    middle = float(np.median(finite))
+    reach = max(5 * 1.4826 * float(np.median(np.abs(finite - middle))), 1e-3 * (high - low))
+    return max(low, middle - reach), min(high, middle + reach)

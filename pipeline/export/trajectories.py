@@ -1,0 +1,141 @@
+"""The trajectory as files, that of the crosscheck beside it, and how far both agree."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from pipeline.export import writers
+from pipeline.export.comparison import compare
+from pipeline.export.output import Output, stage
+from pipeline.export.writers import write_table, write_trajectory_kitti, write_trajectory_tum
+from stages.core.declare import Bundle
+from stages.geometry.pose_arrays import NO_VERTICAL
+from stages.odometry.resection.trajectory import world_poses
+
+POSES = {"of": "left camera", "transform": "T_world_left: x_world = R x_left + t"}
+TUM = {
+    **POSES,
+    "columns": "time x y z qx qy qz qw",
+    "quaternion": "x y z w (scalar last), Hamilton, w >= 0, rotates from the left camera to the world",
+    "missing": "frames without a pose have no line",
+}
+WHEN = ("frames", "sequence.times")
+
+
+def stamps(view: Any) -> list[float]:
+    """Time of each chosen frame, seconds; its number where there is no clock."""
+    times = view.sequence.times
+    return [float(f) if times is None else times[f] for f in view.frames]
+
+
+def _world(trajectory: Bundle, piece: int) -> str:
+    """Frame of a piece in words."""
+    verticals = list(trajectory.meta.get("verticals", [""]))
+    return writers.UNLEVELLED if verticals[piece] == NO_VERTICAL else writers.FRAME
+
+
+def _write_kitti(folder: Path, view: Any) -> None:
+    write_trajectory_kitti(folder / "trajectory.kitti", world_poses(view.bundle(view.products.trajectory)))
+
+
+def _write_tum(folder: Path, view: Any) -> None:
+    trajectory = view.bundle(view.products.trajectory)
+    world = _world(trajectory, int(trajectory.meta.get("main", 0)))
+    write_trajectory_tum(folder / "trajectory.tum", world_poses(trajectory), stamps(view), world)
+
+
+def _write_pieces(folder: Path, view: Any) -> None:
+    trajectory = view.bundle(view.products.trajectory)
+    for number in range(len(trajectory.meta.get("verticals", [""]))):
+        if number != int(trajectory.meta.get("main", 0)):
+            path, world = folder / f"trajectory.piece{number + 1}.tum", _world(trajectory, number)
+            write_trajectory_tum(path, world_poses(trajectory, number), stamps(view), world)
+
+
+def _write_crosscheck(folder: Path, view: Any) -> None:
+    compared = compare(view)
+    assert compared is not None
+    write_trajectory_tum(folder / "crosscheck.tum", compared.poses, stamps(view))
+
+
+def _write_agreement(folder: Path, view: Any) -> None:
+    compared, trajectory = compare(view), view.bundle(view.products.trajectory)
+    assert compared is not None
+    names = [view.sequence.frame_names[f] for f in view.frames]
+    columns: dict[str, list[Any]] = {"frame": list(view.frames), "name": names, "time_s": stamps(view)}
+    if trajectory is not None:
+        positions = world_poses(trajectory)[:, :, 3]
+        columns |= {f"{a}_m": positions[:, k].tolist() for k, a in enumerate("xyz")}
+    columns |= {f"crosscheck_{a}_m": compared.poses[:, k, 3].tolist() for k, a in enumerate("xyz")}
+    write_table(folder / "agreement.csv", columns | compared.columns())
+
+
+COMPARED = ("trajectory", "accuracy", "crosscheck_accuracy")
+OUTPUTS = (
+    Output(
+        "trajectory.kitti",
+        "pose of each left camera, a 3 x 4 matrix a line, world from camera, m",
+        "evo (evo_traj kitti), any text editor",
+        _write_kitti,
+        ("trajectory",),
+        frame="world",
+        facts={
+            **POSES,
+            "columns": "3 x 4 matrix [R | t], row by row",
+            "lines": "one a frame, in the order of `frames` here",
+            "missing": "nan",
+        },
+    ),
+    Output(
+        "trajectory.tum",
+        "the same as time, position and quaternion x y z w",
+        "evo (evo_traj tum), CloudCompare",
+        _write_tum,
+        ("trajectory",),
+        knows=WHEN,
+        frame="world",
+        facts=TUM,
+    ),
+    Output(
+        "trajectory.piece*.tum",
+        "another unbroken piece of the trajectory, in a frame of its own",
+        "evo (evo_traj tum), CloudCompare",
+        _write_pieces,
+        ("trajectory",),
+        knows=WHEN,
+    ),
+    Output(
+        "crosscheck.tum",
+        "the trajectory by COLMAP in the same form, laid on ours without a change of scale",
+        "evo (evo_ape tum trajectory.tum crosscheck.tum)",
+        _write_crosscheck,
+        ("agreement",),
+        COMPARED,
+        WHEN,
+        "world",
+        {
+            **TUM,
+            "source": "structure from motion by COLMAP with the given calibration; brought to the world by one rigid "
+            "transform (no scale) fitted to trajectory.tum",
+        },
+    ),
+    Output(
+        "agreement.csv",
+        "each frame: our position, COLMAP's, their disagreement, whether it is flagged, errors where there is truth",
+        "LibreOffice Calc, any text editor",
+        _write_agreement,
+        ("agreement",),
+        COMPARED,
+        (*WHEN, "sequence.frame_names"),
+        "world",
+        {
+            "columns": "frame number, name, time; positions of both trajectories; disagreement of pose and of the "
+            "motion since the frame before; flagged 0 or 1, and for what; distance of either from the truth, where "
+            "there is truth",
+            "units": "s, m, deg as the column's name ends",
+            "missing": "empty",
+        },
+    ),
+)
+STAGE = stage("output.trajectories", "Trajectories as files", OUTPUTS)
