@@ -18,7 +18,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from datasets.georeference import Georeference
 from datasets.images.files import MOST_BYTES
@@ -272,6 +271,8 @@ def write_trajectory_tum(path: Path, poses: NDArray[np.float64], times: Sequence
     times : of the frames, seconds; frame numbers where there is no clock.
     world : the frame of reference in words.
     """
+    from scipy.spatial.transform import Rotation
+
     head = f"# time x y z qx qy qz qw; world from left camera (x right, y down, z forward); world {world}\n"
     lines = [
         _line([time, *pose[:, 3], *Rotation.from_matrix(pose[:, :3]).as_quat(canonical=True)])

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Generator
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
-from pipeline.engine.graph import Graph, Handle
-from pipeline.engine.store.folder import Ref, Store
+from pipeline.engine.graph import Graph, Handle, Maybe, Wait
+from pipeline.engine.store.folder import Store
 from pipeline.export import catalogue
 from pipeline.export.frames_json import describe
 from pipeline.export.output import Output, handles, place, task, unpack
@@ -32,19 +34,16 @@ def lay_out(graph: Graph, view: RunView, made: Made) -> None:
     """
     for module in MODULES:
         for output in module.OUTPUTS:
-            _wait(graph, view, module.__name__, output, made)
+            graph.flow(_make(graph, view, module, output, made))
 
 
-def _wait(graph: Graph, view: RunView, module: str, output: Output, made: Made) -> None:
-    def add(*_: Ref | None) -> None:
-        found = task(output, view)
-        if found is not None:
-            args, inputs = found
-            label = f"output/{output.name}"
-            made[output.name] = graph.node(module, label, NoParams(), args, {}, {"read": inputs})
-
+def _make(graph: Graph, view: RunView, module: ModuleType, output: Output, made: Made) -> Generator[Wait, Any, None]:
     # what was laid out last is there last: looked at first, it spares looking at all others
-    graph.expand(handles(output, view.products)[::-1], add, holes=True)
+    yield Maybe(handles(output, view.products)[::-1])
+    found = task(output, view)
+    if found is not None:
+        args, inputs = found
+        made[output.name] = graph.node(module, f"output/{output.name}", NoParams(), args, {}, {"read": inputs})
 
 
 def task_rows(graph: Graph, store: Store) -> tuple[TaskRow, ...]:

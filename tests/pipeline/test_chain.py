@@ -18,12 +18,10 @@ import rasterio
 import xarray
 from raising import raises
 
-from datasets.registry import open_sequence
 from pipeline.engine.events import read
-from pipeline.engine.graph import Graph
 from pipeline.engine.store.folder import Store
 from pipeline.engine.store.maintenance import artifacts
-from pipeline.runs import session, unchanged
+from pipeline.runs import session
 
 SMALL = (
     "mockup.frames=5",
@@ -115,76 +113,50 @@ def test_the_same_again_computes_nothing(cold: Path, monkeypatch: pytest.MonkeyP
 
     monkeypatch.setattr("pipeline.engine.scheduler.make", no_worker)
     before = digests(cold)
-    assert session.reconstruct(options(cold, executor="processes", fresh=True)) == 0
+    assert session.reconstruct(options(cold, executor="processes")) == 0
     assert computed(cold) == set()
     assert digests(cold) == before
 
 
-def test_where_nothing_is_new_the_latest_run_stands(
-    cold: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_is_done_to_the_files_of_a_run_reaches_neither_the_cache_nor_the_next_run(cold: Path) -> None:
     assert session.reconstruct(options(cold)) == 0
-    stands = latest(cold)
-    written = contents(stands)
-    folders = set(stands.parent.iterdir())
-    capsys.readouterr()
-    with monkeypatch.context() as patch:
-        patch.setattr("pipeline.runs.run_files.write", lambda *_: pytest.fail("something was drawn"))
-        assert session.reconstruct(options(cold)) == 0
-    assert capsys.readouterr().out.split()[0] == str(stands)
-    assert set(stands.parent.iterdir()) == folders
-    assert contents(stands) == written
-
-    def draws(why: str, **options_: Any) -> None:
-        before = latest(cold)
-        assert session.reconstruct(options(cold, **options_)) == 0
-        assert latest(cold) != before, why
-
-    (stands / "path.geojson").write_text("edited")
-    draws("a file was edited")
-    (latest(cold) / "dem.qml").unlink()
-    draws("a file has gone")
-    (latest(cold) / "terrain.zarr" / "elevation" / "zarr.json").unlink()
-    draws("a file in a folder of the run has gone")
-    draws("it was asked for", fresh=True)
-    draws("a stage was forced", force=frozenset({"select"}))
-    monkeypatch.setattr("pipeline.runs.session._versions", lambda: {"matplotlib": "0"})
-    draws("another version of a package")
+    first = latest(cold)
+    written = contents(first)
+    for path in first.rglob("*"):
+        if path.is_file():
+            path.write_bytes(b"edited in place")
+    assert session.reconstruct(options(cold)) == 0
+    assert latest(cold) != first
+    assert computed(cold) == set()
+    again = contents(latest(cold))
+    assert again.keys() == written.keys()
+    rendered = {"report.html", "report.json", "ledger.jsonl"}
+    assert {name for name in written if again[name] != written[name]} == rendered
 
 
-def test_what_is_found_damaged_when_it_is_drawn_is_computed_again(
-    cold: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_damaged_output_is_drawn_again(cold: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert session.reconstruct(options(cold)) == 0
     before = digests(cold)
-    chunk = next((cold / "cache").glob("artifacts/merge/*/*/a-*/ortho/c.0.0"))
+    chunk = next((cold / "cache").glob("artifacts/output.paths/*/*/a-*/content/c*"))
     chunk.write_bytes(bytes(chunk.stat().st_size))
-    assert session.reconstruct(options(cold, fresh=True)) == 0
+    assert session.reconstruct(options(cold)) == 0
     assert "is damaged" in capsys.readouterr().err
-    assert {label.split("/")[0] for label in computed(cold)} == {"merge"}
+    assert {label.split("/")[0] for label in computed(cold)} == {"output"}
     assert digests(cold) == before
-
-
-def test_a_stamp_sees_what_no_key_sees(cold: Path) -> None:
-    sequence = open_sequence("mockup-short")
-    stamps = {
-        unchanged.stamp(Graph(), s, {}, command="a")
-        for s in (sequence, replace(sequence, notes=("other",)), replace(sequence, times=(0.0,) * 9))
-    }
-    stamps |= {unchanged.stamp(Graph(), sequence, {}, command="b"), unchanged.stamp(Graph(), sequence, {"x": "1"})}
-    assert len(stamps) == 5
-    assert unchanged.stamp(Graph(), open_sequence("mockup-short"), {}, command="a") in stamps
 
 
 def test_one_risk_parameter_reruns_risk_path_and_what_reads_them(cold: Path) -> None:
     assert session.reconstruct(options(cold, "risk.max_hole=0.25")) == 0
-    stages = {label.split("/")[0] for label in computed(cold)}
-    assert stages == {"risk", "path", "path_check"}
+    labels = computed(cold)
+    assert {label.split("/")[0] for label in labels} == {"risk", "path", "path_check", "output"}
+    drawn = {label.removeprefix("output/") for label in labels if label.startswith("output/")}
+    assert {"risk.tif", "Risk map", "facts"} <= drawn
+    assert not drawn & {"dem.tif", "terrain.zarr", "trajectory.tum", "Figure 9. Trajectory", "Seams"}
 
 
 def test_one_vehicle_limit_reruns_the_same(cold: Path) -> None:
     assert session.reconstruct(options(cold, "vehicle.max_slope_deg=12")) == 0
-    assert {label.split("/")[0] for label in computed(cold)} == {"risk", "path", "path_check"}
+    assert {label.split("/")[0] for label in computed(cold)} == {"risk", "path", "path_check", "output"}
 
 
 def test_what_the_data_do_not_determine_is_missing_and_the_rest_is_delivered(cold: Path, tmp_path: Path) -> None:
@@ -214,7 +186,6 @@ def test_written_configuration_repeats_the_run(cold: Path) -> None:
         cache=cold / "cache",
         executor="inline",
         progress="quiet",
-        fresh=True,
     )
     assert session.reconstruct(again) == 0
     assert computed(cold) == set()

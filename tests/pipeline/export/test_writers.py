@@ -15,11 +15,10 @@ import pytest
 import rasterio
 from evo.tools import file_interface
 from raising import raises
-from toys.finished import FRAMES, bundles, checked, checks, view
 
 from datasets.georeference import Georeference
 from pipeline.export import styles
-from pipeline.export.frames_json import FILES, describe
+from pipeline.export.frames_json import describe
 from pipeline.export.writers import (
     replacing,
     write_path_geojson,
@@ -30,8 +29,6 @@ from pipeline.export.writers import (
     write_trajectory_kitti,
     write_trajectory_tum,
 )
-from pipeline.runs import run_files
-from pipeline.runs.early import Early
 from stages.geometry.geometry import rotation_exp
 from stages.geometry.lattice import Lattice
 
@@ -226,27 +223,6 @@ def test_tables_leave_empty_what_is_not_known(tmp_path: Path) -> None:
         {"frame": "1", "name": "a,b", "x_m": "0.25", "y": ""},
         {"frame": "2", "name": "c", "x_m": "", "y": "3"},
     ]
-
-
-def test_a_run_writes_the_files_that_it_describes(tmp_path: Path) -> None:
-    made = bundles() | checks()
-    run_files.write(tmp_path, view(made, products=checked()), Early())
-    facts = json.loads((tmp_path / "frames.json").read_text())
-    assert set(facts["files"]) == set(FILES) == {p.name for p in tmp_path.iterdir()} & set(FILES)
-    assert [f["frame"] for f in facts["frames"]] == list(FRAMES)
-    assert facts["frames"][4] == {"frame": 4, "name": "left004", "time": 4.0}
-    assert facts["units"]["time"] == "frame number"
-    assert facts["frames_of_reference"]["world"]["handedness"] == "right"
-    assert "scalar last" in facts["files"]["trajectory.tum"]["quaternion"]
-    rows = list(csv.DictReader((tmp_path / "agreement.csv").open()))
-    assert [row["flagged"] for row in rows] == ["0", "0", "0", "1", "0", "0"]
-    assert [row["flagged_for"] for row in rows] == ["", "", "", "position; rotation", "", ""]
-    assert float(rows[3]["disagreement_m"]) == 0.002
-    assert float(rows[3]["crosscheck_x_m"]) - float(rows[3]["x_m"]) == pytest.approx(0.002)
-    assert float(rows[4]["y_m"]) == pytest.approx(0.12)
-    assert (rows[5]["disagreement_m"], rows[5]["crosscheck_error_m"]) == ("", "")
-    crosscheck = file_interface.read_tum_trajectory_file(tmp_path / "crosscheck.tum")
-    np.testing.assert_array_equal(crosscheck.timestamps, range(5))
 
 
 def test_only_what_was_written_is_described() -> None:

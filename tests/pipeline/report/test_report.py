@@ -11,12 +11,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from toys.finished import TASKS, Written, bundles, products, view, written
+from toys.finished import TASKS, Written, bundles, products, report, view, written
 
 from datasets.mockup.sequence import vehicle_at_scale
 from pipeline.export import ranges
+from pipeline.export.view import TaskRow
 from pipeline.flow.products import Driven, Products
-from pipeline.report import TaskRow, canvas, figures, tables, words, write_report
+from pipeline.report import canvas, figures, tables, words
 from pipeline.runs import session
 from stages.core.declare import Bundle
 from stages.core.errors import RilleError
@@ -291,7 +292,7 @@ def test_a_failed_write_leaves_the_old_page(tmp_path: Path, monkeypatch: pytest.
 
     monkeypatch.setattr(os, "replace", broken)
     with pytest.raises((OSError, RilleError), match="disk full"):
-        write_report(tmp_path, view({}, tasks=(), products=Products()))
+        report(tmp_path, view({}, tasks=(), products=Products()))
     assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
     assert (tmp_path / "report.html").read_text() == "old"
 

@@ -13,8 +13,10 @@ import numpy as np
 import pytest
 
 from datasets.protocol import Sequence
+from pipeline.export.view import RunView, TaskRow
 from pipeline.flow.products import Products
-from pipeline.report import RunView, TaskRow, canvas, write_report
+from pipeline.report import canvas, gallery, summary
+from pipeline.report.page import write_report
 from stages.core.declare import Bundle
 from stages.evaluation.accuracy import trajectory_accuracy
 from stages.evaluation.accuracy_parts import metric as figure
@@ -314,6 +316,11 @@ def _blank(fig: object, alt: str, *, photo: bool = False) -> canvas.Panel:
     return canvas.Panel("data:image/png;base64,", alt, 1, 1)
 
 
+def report(folder: Path, run: RunView) -> None:
+    """Both files of the report, of artifacts as they are."""
+    write_report(folder, run, summary.gather(run), gallery.draw(run))
+
+
 Written = tuple[dict[str, Any], Page, str, Path]
 
 
@@ -322,6 +329,6 @@ def written(folder: Path, run: RunView, *, pictures: bool = False) -> Written:
     with pytest.MonkeyPatch.context() as patch:
         if not pictures:
             patch.setattr(canvas, "encode", _blank)
-        write_report(folder, run)
+        report(folder, run)
     html = (folder / "report.html").read_text(encoding="utf-8")
     return json.loads((folder / "report.json").read_text(encoding="utf-8")), Page(html), html, folder

@@ -1,0 +1,181 @@
+"""Every output by its record: made by its task of what the record names alone, described, listed, in the docs."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from evo.tools import file_interface
+from toys.finished import FRAMES, bundles, checked, checks, sequence, view
+
+from datasets.georeference import Georeference
+from pipeline.engine.keys import digest
+from pipeline.export import catalogue
+from pipeline.export.frames_json import FRAMES as REFERENCES
+from pipeline.export.frames_json import describe
+from pipeline.export.output import Output, handles, pack, place, task, unpack
+from pipeline.report import canvas, gallery
+from pipeline.report.block import Figure
+from pipeline.runs import run_files
+from stages.core.declare import Bundle
+
+ROOT = Path(__file__).parents[3]
+PAGE = ROOT / "docs" / "outputs.md"
+PLACE = Georeference("EPSG:32633", (1.0, 2.0, 3.0), 0.5)
+BEGIN, END = "<!-- table -->\n", "<!-- end of table -->\n"
+
+
+@dataclass(eq=False)
+class Handle:
+    """What stands for an artifact in a graph."""
+
+    name: str
+    ref: str | None
+    spec: str = ""
+
+
+def run(place: Georeference | None = None) -> Any:
+    """A finished run whose products are handles, and their bundles by reference."""
+    made = bundles() | checks()
+    known: dict[str, Handle] = {}
+
+    def handle(value: Any) -> Any:
+        if isinstance(value, str):
+            return known.setdefault(value, Handle(value, value if value in made else None))
+        if isinstance(value, dict):
+            return {k: handle(v) for k, v in value.items()}
+        return [handle(v) for v in value] if isinstance(value, list) else value
+
+    products = checked()
+    for name, value in vars(products).items():
+        setattr(products, name, handle(value))
+    where = replace(sequence(truth=True), georeference=place)
+    config = SimpleNamespace(**vars(view().config), select=SimpleNamespace(rule="overlap", overlap=0.7))
+    bundle = lambda found: None if found is None or found.ref is None else made[found.ref]  # noqa: E731
+    return view(products=products, sequence=where, config=config, bundle=bundle), made
+
+
+def outputs() -> Iterator[tuple[Any, Output]]:
+    for module in run_files.MODULES:
+        for output in module.OUTPUTS:
+            yield module, output
+
+
+@pytest.fixture(autouse=True)
+def _unpainted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Figures are laid out, but not painted."""
+    monkeypatch.setattr(canvas, "encode", lambda _, alt, *, photo=False: canvas.Panel(f"{photo}", alt, 1, 1))
+
+
+@pytest.mark.parametrize(
+    "georeference", [None, Georeference("EPSG:32633", (1.0, 2.0, 3.0), 0.5)], ids=["local", "placed"]
+)
+@pytest.mark.parametrize(("module", "output"), outputs(), ids=lambda value: getattr(value, "name", ""))
+def test_a_task_makes_of_what_its_record_names_what_the_whole_run_would(
+    module: Any, output: Output, georeference: Georeference | None, tmp_path: Path
+) -> None:
+    whole, made = run(georeference)
+    assert output.write is not None
+    output.write(tmp_path, whole)
+    laid_out = task(output, whole)
+    assert laid_out is not None
+    args, inputs = laid_out
+    digest(args)  # it is part of a key
+    given = json.loads(json.dumps(args))
+    found = module.STAGE.run(module.STAGE.params(), given, {"read": [made[handle.ref] for handle in inputs]})
+    assert unpack(found) == unpack(pack(tmp_path))
+    if module is gallery:
+        figure = Figure.from_dict(json.loads(unpack(found)["figure.json"]))
+        assert "failed" not in figure.why
+        assert figure in gallery.draw(whole)
+
+
+def test_what_a_record_does_not_name_is_out_of_reach() -> None:
+    whole, made = run()
+
+    def curious(folder: Path, given: Any) -> None:
+        assert given.bundle(given.products.risk) is made["risk"]
+        with pytest.raises(AttributeError):
+            given.products.path  # noqa: B018
+        with pytest.raises(AttributeError):
+            given.sequence.truth  # noqa: B018
+
+    output = Output("a", "", "", curious, ("risk",), (), ("sequence.name",))
+    laid_out = task(output, whole)
+    assert laid_out is not None
+    from pipeline.export.output import restore
+
+    curious(Path(), restore(laid_out[0], [made[handle.ref] for handle in laid_out[1]]))
+
+
+def test_nothing_is_made_without_what_it_needs_and_holes_are_passed_on() -> None:
+    whole, _ = run()
+    whole.products.path.ref = None
+    path = next(o for _, o in outputs() if o.name == "path.gpkg")
+    assert [handle.name for handle in handles(path, whole.products)] == ["path"]
+    assert task(path, whole) is None
+    risk = next(o for _, o in outputs() if o.name == "Risk map")
+    laid_out = task(risk, whole)
+    assert laid_out is not None
+    assert laid_out[0]["products"]["path"] is None
+    assert [handle.name for handle in laid_out[1]] == ["risk"]
+
+
+def test_files_come_out_of_an_artifact_as_they_went_in(tmp_path: Path) -> None:
+    (tmp_path / "a" / "deep").mkdir(parents=True)
+    for name, size in {"b.txt": 0, "a/deep/c.bin": 3000, "d": 1024}.items():
+        (tmp_path / "a").joinpath(name).parent.mkdir(exist_ok=True, parents=True)
+        (tmp_path / "a" / name).write_bytes(bytes(range(256)) * 12 if size == 3000 else b"x" * size)
+    bundle = pack(tmp_path / "a")
+    place(Bundle(dict(bundle.arrays), json.loads(json.dumps(dict(bundle.meta)))), tmp_path / "b")
+    assert unpack(pack(tmp_path / "b")) == unpack(bundle)
+    assert len(unpack(bundle)) == 3
+
+
+def test_a_run_writes_the_files_that_it_describes(tmp_path: Path) -> None:
+    whole, _ = run()
+    for module in catalogue.MADE:
+        for output in module.OUTPUTS:
+            output.write(tmp_path, whole)
+    names = [p.name for p in tmp_path.iterdir()]
+    facts = describe(names, FRAMES, [f"left{f:03d}" for f in FRAMES], [float(f) for f in FRAMES], clock=False)
+    described = [o.name for o in catalogue.OUTPUTS if o.frame]
+    assert list(facts["files"]) == described
+    assert set(described) | {"dem.qml", "risk.qml"} == set(names)
+    assert {about["frame"] for about in facts["files"].values()} <= REFERENCES.keys()
+    assert facts["frames"][4] == {"frame": 4, "name": "left004", "time": 4.0}
+    assert facts["units"]["time"] == "frame number"
+    assert facts["frames_of_reference"]["world"]["handedness"] == "right"
+    assert "scalar last" in facts["files"]["trajectory.tum"]["quaternion"]
+    assert [name for name, *_ in catalogue.listed(tmp_path)][:3] == ["report.html", "report.json", "trajectory.kitti"]
+    assert all(words and programs for _, words, programs in catalogue.listed(tmp_path))
+    rows = list(csv.DictReader((tmp_path / "agreement.csv").open()))
+    assert [row["flagged"] for row in rows] == ["0", "0", "0", "1", "0", "0"]
+    assert [row["flagged_for"] for row in rows] == ["", "", "", "position; rotation", "", ""]
+    assert float(rows[3]["disagreement_m"]) == 0.002
+    assert float(rows[3]["crosscheck_x_m"]) - float(rows[3]["x_m"]) == pytest.approx(0.002)
+    assert float(rows[4]["y_m"]) == pytest.approx(0.12)
+    assert (rows[5]["disagreement_m"], rows[5]["crosscheck_error_m"]) == ("", "")
+    crosscheck = file_interface.read_tum_trajectory_file(tmp_path / "crosscheck.tum")
+    np.testing.assert_array_equal(crosscheck.timestamps, range(5))
+
+
+def table() -> str:
+    """All files of a run, as the docs list them."""
+    rows = ["| file | what it is | frame | opens with |", "|---|---|---|---|"]
+    rows += [f"| `{o.name}` | {o.what} | {o.frame} | {o.opens} |" for o in catalogue.OUTPUTS]
+    return "\n".join(rows) + "\n"
+
+
+def test_the_docs_list_every_file() -> None:
+    text = PAGE.read_text(encoding="utf-8")
+    assert text[text.index(BEGIN) + len(BEGIN) : text.index(END)] == table(), (
+        "python tests/pipeline/export/test_output.py"
+    )
