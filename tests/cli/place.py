@@ -75,7 +75,6 @@ PREPARATION = {
     "mockup again": ["reconstruct", *MOCKUP, "--progress", "plain"],
     "other": ["reconstruct", *OTHER, "--progress", "json"],
     "other again": ["reconstruct", *OTHER, "--progress", "json"],
-    "mockup fresh": ["reconstruct", *MOCKUP, "--progress", "quiet", "--fresh"],
     "drive": ["drive", "mockup-loop", *sets(DRIVE), "--jobs", "1", "--progress", "plain"],
     "drive again": ["drive", "mockup-loop", *sets(DRIVE), "--jobs", "1", "--progress", "plain"],
     "check": ["check", "other"],

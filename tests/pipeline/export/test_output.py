@@ -74,10 +74,8 @@ def _unpainted(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(canvas, "encode", lambda _, alt, *, photo=False: canvas.Panel(f"{photo}", alt, 1, 1))
 
 
-@pytest.mark.parametrize(
-    "georeference", [None, Georeference("EPSG:32633", (1.0, 2.0, 3.0), 0.5)], ids=["local", "placed"]
-)
-@pytest.mark.parametrize(("module", "output"), outputs(), ids=lambda value: getattr(value, "name", ""))
+@pytest.mark.parametrize("georeference", [None, PLACE], ids=["local", "placed"])
+@pytest.mark.parametrize(("module", "output"), list(outputs()), ids=lambda value: getattr(value, "name", ""))
 def test_a_task_makes_of_what_its_record_names_what_the_whole_run_would(
     module: Any, output: Output, georeference: Georeference | None, tmp_path: Path
 ) -> None:

@@ -27,7 +27,8 @@ from toys.finished import (
     written,
 )
 
-from pipeline.report import artifacts, canvas, figures, gather
+from pipeline.export import artifacts
+from pipeline.report import canvas, figures, gather
 from stages.core.declare import Bundle
 from stages.hazard.risk import RiskParams
 from stages.hazard.vehicle import Vehicle
