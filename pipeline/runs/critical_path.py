@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.engine import events
-from pipeline.runs import lookup
 from pipeline.engine.memory.cost_model import count
+from pipeline.runs import lookup
 
 FACTOR, START = 1.15, 5.0
 """A good cold run: this factor over the least possible time, and these seconds to start workers and draw results."""

@@ -8,11 +8,11 @@ from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from pipeline.runs import pins, roots, lookup
-from pipeline.engine.store.location import Location
 from pipeline.engine.memory.limits import words
 from pipeline.engine.store.folder import Store, at, sizes
+from pipeline.engine.store.location import Location
 from pipeline.engine.store.maintenance import artifacts
+from pipeline.runs import lookup, pins, roots
 
 NOBODY = "-"
 """Stands for the sequence of artifacts that no kept run refers to: clearing up would remove them."""

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.engine import events
-from pipeline.runs import lookup
 from pipeline.engine.store.folder import Store, StoreError
+from pipeline.runs import lookup
 from stages.core.errors import ConfigError
 
 FOLDER = "pins"

@@ -17,12 +17,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from datasets.protocol import Sequence
-from pipeline.flow import config as configuration
-from pipeline.engine.store.artifact import DamagedError
 from pipeline.engine.code_digest import remember
 from pipeline.engine.graph import Graph
-from pipeline.engine.store.location import Location, hints_folder, locate
+from pipeline.engine.store.artifact import DamagedError
 from pipeline.engine.store.folder import GoneError, Store, at
+from pipeline.engine.store.location import Location, hints_folder, locate
+from pipeline.flow import config as configuration
 from stages.core.declare import Bundle
 from stages.core.errors import ConfigError, RilleError
 
@@ -251,7 +251,7 @@ def _open(options: Options) -> _Opened:
 
 def _compute(opened: _Opened) -> Result:
     """Bring every task to its artifact; raise the first failure unless the data are its cause and poses are there."""
-    from pipeline.engine import scheduler, progress
+    from pipeline.engine import progress, scheduler
     from pipeline.engine.memory import limits
     from pipeline.runs import roots
 
@@ -347,8 +347,8 @@ def _all_read(opened: _Opened, arrived: int) -> int:
 
 def check_options(options: Options) -> None:
     """Refuse a stage, an executor or an amount that cannot be, before anything is read or written."""
-    from pipeline.engine.memory import limits
     from pipeline.engine.executors.base import known
+    from pipeline.engine.memory import limits
 
     _known_stages(options.force)
     known(options.executor, options.jobs)
@@ -457,9 +457,9 @@ def collect_garbage(cache: Location, runs: Path, *, dry_run: bool) -> int:
     A dry run says what that is.
     """
     from pipeline.engine import events
-    from pipeline.runs import pins, roots
-    from pipeline.engine.store import maintenance
     from pipeline.engine.memory.limits import words
+    from pipeline.engine.store import maintenance
+    from pipeline.runs import pins, roots
 
     store = at(cache)
     roots.check_all_seen(store)
@@ -484,8 +484,8 @@ def collect_garbage(cache: Location, runs: Path, *, dry_run: bool) -> int:
 
 def pin(cache: Location, text: str, runs: Path) -> int:
     """Keep the artifacts of a run."""
-    from pipeline.runs import pins
     from pipeline.runs import lookup as kept
+    from pipeline.runs import pins
 
     run = kept.find(text, runs)
     print(f"pinned {kept.name(run)}: {pins.pin(at(cache), run)} artifacts")

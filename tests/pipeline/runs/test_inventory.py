@@ -10,10 +10,10 @@ import pytest
 from raising import raises
 from test_why import run
 
-from pipeline.runs import inventory, pins, lookup
 from pipeline.engine.store import maintenance
-from pipeline.runs import session as commands
 from pipeline.engine.store.folder import Store
+from pipeline.runs import inventory, lookup, pins
+from pipeline.runs import session as commands
 
 
 def grow_old(folder):

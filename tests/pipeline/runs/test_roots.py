@@ -12,10 +12,10 @@ from raising import raises
 from toys import chain
 
 from pipeline.engine import scheduler
-from pipeline.runs import pins, roots, session
 from pipeline.engine.graph import Graph
 from pipeline.engine.store.folder import Store
 from pipeline.engine.store.maintenance import artifacts
+from pipeline.runs import pins, roots, session
 
 
 @pytest.fixture

@@ -1,0 +1,1 @@
+"""A run: its folder, its pins, what it left."""
