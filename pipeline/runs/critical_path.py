@@ -22,7 +22,11 @@ FACTOR, START = 1.15, 5.0
 
 @dataclass(frozen=True)
 class Timing:
-    """Seconds of a run: ``kernel`` of all stages together, ``tasks`` with reading and committing, the longest chain."""
+    """Seconds of a run: ``kernel`` of all stages together, ``tasks`` with reading and committing, the longest chain.
+
+    ``compiling`` is the part of ``kernel`` that compiled kernels (or waited for another worker that did), by stage,
+    the most first.
+    """
 
     wall: float
     workers: int
@@ -30,6 +34,7 @@ class Timing:
     tasks: float
     computed: int
     chain: tuple[tuple[str, float], ...]
+    compiling: tuple[tuple[str, float], ...]
 
     @property
     def longest(self) -> float:
@@ -62,7 +67,17 @@ def timing(path: Path) -> Timing:
         sum(float(r["seconds"]) for r in rows if r["status"] == "computed"),
         len(took),
         _longest(rows, took, events.expansions(path)),
+        _compiling(rows),
     )
+
+
+def _compiling(rows: Iterable[Mapping[str, Any]]) -> tuple[tuple[str, float], ...]:
+    """Seconds of compiling by stage, the most first; none of stages that compiled nothing."""
+    seconds: dict[str, float] = defaultdict(float)
+    for row in rows:
+        if row.get("compiling"):
+            seconds[row["stage"]] += row["compiling"]
+    return tuple(sorted(seconds.items(), key=lambda item: (-item[1], item[0])))
 
 
 def _longest(
@@ -126,6 +141,8 @@ def describe(run: Path) -> Iterable[str]:
     verdict = "kept" if t.wall <= t.good else f"exceeded by {t.wall - t.good:.1f} s"
     bound = f"{FACTOR} of it and {START:.0f} s are {t.good:.1f} s: {verdict}"
     yield f"least possible {t.least:.1f} s, of which the run took {t.wall / max(t.least, 0.001):.2f}; {bound}"
+    if t.compiling:
+        yield f"compiling, once a user, {sum(s for _, s in t.compiling):.1f} s of the stages': {_chain(t.compiling)}"
 
 
 def _chain(chain: tuple[tuple[str, float], ...]) -> str:

@@ -8,11 +8,13 @@ and two processes that compile two signatures of one function at once may both t
 (:mod:`pipeline.engine.code_digest`), so
   that an edit compiles anew what it can change, and nothing else;
 - each entry is a file of its own, named by its key; it holds the key and a checksum, against damage;
+- of processes that need the same kernel at once one compiles it, the others wait and load it;
 - all lie in :func:`pipeline.engine.runtime.private.private_folder`, because loading one executes it.
 """
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import importlib.abc
 import importlib.util
@@ -21,6 +23,7 @@ import pickle
 import sys
 import time
 from contextlib import suppress
+from functools import cache
 from importlib.machinery import ModuleSpec
 from pathlib import Path
 from types import CodeType, ModuleType
@@ -35,8 +38,15 @@ UNUSED_DAYS = 30
 """A kernel that was not loaded for so long is removed by ``rille cache gc``."""
 
 
+PATIENCE, PAUSE = 120.0, 0.02
+"""Seconds that a process waits for another that compiles the same kernel, and between two looks."""
+
+
 class Compiling:
-    """Seconds for which kernels are compiled in this process, from the first that is not on disk to the last saved."""
+    """Seconds for which kernels are compiled in this process, from the first that is not on disk to the last saved.
+
+    Waiting for another process that compiles the same kernel counts as compiling.
+    """
 
     def __init__(self) -> None:
         self.seconds = 0.0
@@ -48,22 +58,65 @@ class Compiling:
         if not self.pending:
             self.since = time.perf_counter()
         self.pending.add(key)
+        _lock(key)
 
     def end(self, key: str) -> None:
-        """It is compiled and saved."""
+        """It is compiled and saved, by this process or another."""
         known = key in self.pending
         self.pending.discard(key)
+        _unlock(key)
         if known and not self.pending:
             self.seconds += time.perf_counter() - self.since
 
     def take(self) -> float:
         """The seconds since this was last asked."""
         seconds, self.seconds = self.seconds, 0.0
+        for key in self.pending:  # numba failed to compile them
+            _unlock(key)
         self.pending.clear()
         return seconds
 
 
 COMPILING = Compiling()
+
+
+@cache
+def _locks() -> int:
+    """Descriptor of the file whose bytes are locked; open as long as the process, for closing it frees every lock."""
+    return os.open(private_folder() / "compiling", os.O_RDWR | os.O_CREAT, 0o600)
+
+
+def _byte(key: str) -> int:
+    """The byte that stands for a kernel; the file stays empty."""
+    return int.from_bytes(hashlib.sha256(key.encode()).digest()[:7], "big")
+
+
+def _lock(key: str) -> None:
+    """Wait until no other process compiles the kernel; the system frees the byte when that process ends.
+
+    Waiting is no more than thrift: where files cannot be locked, or the other stands still, both compile. A kernel is
+    locked before those that it calls, so that no two processes wait for each other.
+    """
+    until = time.monotonic() + PATIENCE
+    while True:
+        try:
+            import fcntl  # not on every system
+
+            fcntl.lockf(_locks(), fcntl.LOCK_EX | fcntl.LOCK_NB, 1, _byte(key))
+            return
+        except ImportError:
+            return
+        except OSError as error:
+            if error.errno not in (errno.EACCES, errno.EAGAIN) or time.monotonic() > until:
+                return
+        time.sleep(PAUSE)
+
+
+def _unlock(key: str) -> None:
+    with suppress(ImportError, OSError):
+        import fcntl
+
+        fcntl.lockf(_locks(), fcntl.LOCK_UN, 1, _byte(key))
 
 
 def guard() -> None:
@@ -153,10 +206,16 @@ def _patch(caching: Any) -> None:
 
     def load(self: Any, key: Any) -> Any:
         file = path(self, key)
+        if (data := read(self, key, file)) is None:
+            COMPILING.begin(str(file))
+            if (data := read(self, key, file)) is not None:  # another process compiled it meanwhile
+                COMPILING.end(str(file))
+        return data
+
+    def read(self: Any, key: Any, file: Path) -> Any:
         try:
             content = file.read_bytes()
         except OSError:
-            COMPILING.begin(str(file))
             return None
         if hashlib.sha256(content[32:]).digest() != content[:32]:
             return None

@@ -7,6 +7,7 @@ import os
 import shutil
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -165,6 +166,45 @@ def test_seconds_of_compiling_end_with_the_outermost_kernel(entry, monkeypatch):
     assert cache.load("outer") == 1
     assert COMPILING.take() == 31.0
     assert COMPILING.take() == 0.0
+
+
+LATER = """
+import sys
+from pipeline.engine.runtime.numba_cache import guard
+guard()
+from numba.core import caching
+print("asks", flush=True)
+print(caching.IndexDataCacheFile(sys.argv[1], "kernel", (1.0, 2)).load("late"))
+"""
+
+
+def test_of_two_processes_that_need_a_kernel_the_second_loads_what_the_first_compiled(entry, tmp_path):
+    cache, _ = entry
+    assert cache.load("late") is None, "this process compiles it from here on"
+    command = [sys.executable, "-c", LATER, str(tmp_path)]
+    with subprocess.Popen(command, env={**os.environ, "PYTHONPATH": str(ROOT)}, stdout=subprocess.PIPE) as other:
+        assert other.stdout.readline() == b"asks\n"
+        time.sleep(0.5)
+        assert other.poll() is None
+        cache.save("late", "compiled once")
+        assert other.stdout.read() == b"compiled once\n"
+
+
+@pytest.mark.parametrize("end", ["take", "patience"])
+def test_a_process_that_failed_to_compile_holds_nobody_up(entry, tmp_path, end):
+    cache, _ = entry
+    assert cache.load("late") is None
+    script = LATER
+    if end == "take":
+        COMPILING.take()
+    else:
+        script = script.replace(
+            "guard()\n", "guard()\nfrom pipeline.engine.runtime import numba_cache as n\nn.PATIENCE = 0.1\n"
+        )
+    command = [sys.executable, "-c", script, str(tmp_path)]
+    done = subprocess.run(command, env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, timeout=100)
+    COMPILING.take()
+    assert done.stdout == b"asks\nNone\n"
 
 
 def test_a_run_says_what_it_compiled():

@@ -44,6 +44,15 @@ def test_a_run_that_was_killed_is_timed_by_its_tasks_and_the_whole_command_where
     assert critical_path.timing(ledger(tmp_path / "l", rows, seconds=4.5, total=6.0)).wall == 6.0
 
 
+def test_seconds_of_compiling_are_told_by_stage(tmp_path):
+    row = {"inputs": {}, "status": "computed", "kernel": 9.0, "seconds": 9.0, "started": 1.0, "ended": 10.0}
+    compiled = [("track/1", "track", 2.5), ("hfvm/1", "hfvm", 4.0), ("track/2", "track", 2.0), ("rig", "rig", 0.0)]
+    rows = [row | {"label": label, "stage": stage, "compiling": s} for label, stage, s in compiled]
+    path = tmp_path / "l"
+    path.write_text("".join(json.dumps(line) + "\n" for line in rows))
+    assert critical_path.timing(path).compiling == (("track", 4.5), ("hfvm", 4.0))
+
+
 def test_a_real_ledger_is_told_in_words(tmp_path):
     first, second = run(tmp_path, "1"), run(tmp_path, "2")
     told = list(critical_path.describe(first))
