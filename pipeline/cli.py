@@ -178,6 +178,25 @@ def timing(run: str = "latest", *, runs: Runs = RUNS, debug: Debug = False) -> i
 
 
 @app.command
+def params(
+    section: str = "",
+    *,
+    markdown: Annotated[bool, flag("As tables of Markdown.")] = False,
+    debug: Debug = False,
+) -> int:
+    """Print all parameters, or those of one section: default, what is permitted, and meaning.
+
+    Parameters
+    ----------
+    section
+        Such as locus; all by default.
+    """
+    from pipeline.commands import params as command
+
+    return command.show(section, markdown=markdown)
+
+
+@app.command
 def check(
     seq: str,
     *,

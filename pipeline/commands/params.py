@@ -1,0 +1,92 @@
+"""``rille params``: the reference of all parameters, from the models that validate them."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Iterable, Iterator
+from typing import Any, Literal, get_args, get_origin
+
+import tomli_w
+from pydantic.fields import FieldInfo
+
+from pipeline.flow import config
+from stages.core.declare import Params
+from stages.core.errors import ConfigError
+
+WIDTH = 100
+SIGNS = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<"}
+
+
+def sections() -> dict[str, Params]:
+    """Every section of the configuration with its defaults: stages in the order of the flow, then sequences."""
+    from datasets.images.misalign import MisalignParams
+    from datasets.mockup.params import MockupParams
+    from datasets.mockup.rover import RoverParams
+
+    known = config.build()
+    return {name: getattr(known, name) for name in type(known).model_fields} | {
+        "mockup": MockupParams.model_validate({}),
+        "rover": RoverParams.model_validate({}),
+        "misalign": MisalignParams.model_validate({}),
+    }
+
+
+def show(name: str = "", *, markdown: bool = False) -> int:
+    """Print one section, or all of them.
+
+    Raises
+    ------
+    ConfigError
+        There is no such section.
+    """
+    known = sections()
+    if name and name not in known:
+        raise ConfigError("RIL-920", f"there is no section {name!r}", remedy=f"one of {', '.join(sorted(known))}")
+    chosen = {name: known[name]} if name else known
+    print("\n".join(page(chosen) if markdown else plain(chosen)))
+    return 0
+
+
+def plain(chosen: dict[str, Params]) -> Iterator[str]:
+    """Lines for a terminal."""
+    for name, values in chosen.items():
+        for key, default, permitted, words in rows(values):
+            yield f"{name}.{key} = {default}" + (f"    [{permitted}]" if permitted else "")
+            yield from textwrap.wrap(words, WIDTH, initial_indent="    ", subsequent_indent="    ")
+        yield ""
+
+
+def page(chosen: dict[str, Params]) -> Iterator[str]:
+    """Lines of Markdown: a table a section."""
+    yield "# Parameters\n\nSet one by `--set section.key=value`, or in a TOML file given by `--config`.\n"
+    for name, values in chosen.items():
+        yield f"## {name}\n\n| key | default | permitted | meaning |\n|---|---|---|---|"
+        for row in rows(values):
+            key, default, permitted, words = (cell.replace("|", "\\|") for cell in row)
+            yield f"| `{key}` | `{default}` | {permitted} | {words} |"
+        yield ""
+
+
+def rows(values: Params) -> Iterator[tuple[str, str, str, str]]:
+    """Key, default as TOML, what is permitted, and meaning of each parameter of a section."""
+    for key, value in values.model_dump(mode="json").items():
+        field = type(values).model_fields[key]
+        default = "not set" if value is None else tomli_w.dumps({key: value}, indent=0).partition("=")[2].strip()
+        yield key, " ".join(default.split()), _permitted(field), " ".join((field.description or "").split())
+
+
+def _permitted(field: FieldInfo) -> str:
+    """Choices or bounds in words."""
+    choices = [repr(c) for kind in _kinds(field.annotation) for c in get_args(kind) if get_origin(kind) is Literal]
+    bounds = [
+        f"{sign} {getattr(limit, name):g}"
+        for limit in field.metadata
+        for name, sign in SIGNS.items()
+        if hasattr(limit, name)
+    ]
+    return ", ".join([*choices, *bounds])
+
+
+def _kinds(annotation: Any) -> Iterable[Any]:
+    """An annotation, and the members of a union."""
+    return (annotation, *get_args(annotation))

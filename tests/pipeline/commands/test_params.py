@@ -1,0 +1,32 @@
+"""The reference of parameters: the page in the documentation is the one that the command prints."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from raising import raises
+
+from pipeline.commands import params
+from pipeline.flow import config
+
+PAGE = Path(__file__).resolve().parents[3] / "docs" / "parameters.md"
+
+
+def test_the_page_in_the_documentation_is_current(capsys: pytest.CaptureFixture[str]) -> None:
+    assert params.show(markdown=True) == 0
+    assert PAGE.read_text(encoding="utf-8") == capsys.readouterr().out, "rille params --markdown > docs/parameters.md"
+
+
+def test_every_section_and_key_of_the_configuration_is_there() -> None:
+    keys = {f"{name}.{row[0]}" for name, values in params.sections().items() for row in params.rows(values)}
+    assert {key for key in config.known_keys(config.model()) if "." in key} <= keys
+
+
+def test_choices_and_bounds_are_told(capsys: pytest.CaptureFixture[str]) -> None:
+    params.show("hfvm")
+    told = capsys.readouterr().out
+    assert 'hfvm.preset = "default"    [\'' in told
+    assert "merge." not in told
+    with raises("RIL-920", "'nope'"):
+        params.show("nope")
