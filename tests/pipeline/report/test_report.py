@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from toys.finished import TASKS, Written, bundles, products, report, view, written
 
+from datasets.georeference import Georeference
 from datasets.mockup.sequence import vehicle_at_scale
 from pipeline.export import ranges
 from pipeline.export.view import TaskRow
@@ -365,3 +366,12 @@ def test_frames_without_truth_are_counted_where_errors_are_stated(tmp_path: Path
     facts, _, _, _ = written(tmp_path, replace(base, sequence=replace(base.sequence, truth=truth)))
     assert facts["metrics"]["trajectory_ate_rmse"]["completeness"] == "6 of 6 frames, truth for 4"
     assert facts["metrics"]["frames_posed"]["completeness"] == "6 of 6 frames"
+
+
+def test_the_page_says_where_the_files_lie(tmp_path: Path) -> None:
+    base = view()
+    assert "the place on the planet is not known" in written(tmp_path, base)[1].text
+    place = Georeference("EPSG:32633", (1.0, 2.0, 3.0), 0.5)
+    page_ = written(tmp_path, replace(base, sequence=replace(base.sequence, georeference=place)))[1]
+    assert "Rasters and path.gpkg are in EPSG:32633" in page_.text
+    assert "not known" not in page_.text
