@@ -91,3 +91,18 @@ def test_its_examples_run() -> None:
 def test_no_stage_of_the_package_depends_on_it() -> None:
     assert "pipeline" in (found := code_digest.module_digests("pipeline.engine.plain"))
     assert "pipeline.api" not in found
+
+
+@pytest.mark.slow
+def test_a_client_that_is_handed_in_computes_the_same_bits(run: pipeline.Run, tmp_path: Path) -> None:
+    from distributed import Client, LocalCluster
+
+    sequence = pipeline.open_sequence("mockup-short", mockup=MOCKUP)
+    with (
+        LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster,
+        Client(cluster) as client,
+    ):
+        again = pipeline.reconstruct(sequence, client, runs=tmp_path / "runs", cache=tmp_path / "cache", **STAGES)  # type: ignore[arg-type]
+    statuses = {row["status"] for row in events.read(again.folder / "ledger.jsonl")}
+    assert statuses == {"computed"}
+    assert digests(again.folder) == digests(run.folder)
