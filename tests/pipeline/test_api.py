@@ -99,7 +99,7 @@ def test_a_client_that_is_handed_in_computes_the_same_bits(run: pipeline.Run, tm
 
     sequence = pipeline.open_sequence("mockup-short", mockup=MOCKUP)
     with (
-        LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster,
+        LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=":0") as cluster,
         Client(cluster) as client,
     ):
         again = pipeline.reconstruct(sequence, client, runs=tmp_path / "runs", cache=tmp_path / "cache", **STAGES)  # type: ignore[arg-type]
