@@ -9,6 +9,7 @@ and two processes that compile two signatures of one function at once may both t
   that an edit compiles anew what it can change, and nothing else;
 - each entry is a file of its own, named by its key; it holds the key and a checksum, against damage;
 - of processes that need the same kernel at once one compiles it, the others wait and load it;
+- a kernel has no wrapper for callers in C: nobody calls it, and small kernels compile a sixth to a quarter faster;
 - all lie in :func:`pipeline.engine.runtime.private.private_folder`, because loading one executes it.
 """
 
@@ -32,7 +33,8 @@ from typing import Any
 from pipeline.engine.code_digest import OWN, code_digest
 from pipeline.engine.runtime.private import private_folder
 
-CACHING = "numba.core.caching"
+DISPATCHER = "numba.core.dispatcher"
+"""Imports ``numba.core.caching``; nothing is compiled before it is there."""
 
 UNUSED_DAYS = 30
 """A kernel that was not loaded for so long is removed by ``rille cache gc``."""
@@ -121,8 +123,8 @@ def _unlock(key: str) -> None:
 
 def guard() -> None:
     """Make the cache safe in this process, now or as soon as numba is imported; it is not imported for that."""
-    if CACHING in sys.modules:
-        _patch(sys.modules[CACHING])
+    if DISPATCHER in sys.modules:
+        _patch(sys.modules[DISPATCHER])
     elif not any(isinstance(finder, _Finder) for finder in sys.meta_path):
         sys.meta_path.insert(0, _Finder())
 
@@ -142,7 +144,7 @@ class _Finder(importlib.abc.MetaPathFinder):
     """Patches the module once it is there."""
 
     def find_spec(self, name: str, path: Any, target: ModuleType | None = None) -> ModuleSpec | None:
-        if name != CACHING:
+        if name != DISPATCHER:
             return None
         sys.meta_path.remove(self)
         spec = importlib.util.find_spec(name)
@@ -168,8 +170,7 @@ class _Locator:
     @classmethod
     def from_function(cls, function: Any, file: str) -> _Locator | None:
         """None for functions of others: numba keeps these as it always does."""
-        own = function.__module__.partition(".")[0] in OWN
-        return cls(function, file) if own else None
+        return cls(function, file) if _is_own(function) else None
 
     def ensure_cache_path(self) -> None:
         folder().mkdir(mode=0o700, exist_ok=True)
@@ -184,15 +185,29 @@ class _Locator:
         return "own"
 
 
+def _is_own(function: Any) -> bool:
+    return function.__module__.partition(".")[0] in OWN
+
+
 def _content(code: CodeType) -> tuple[object, ...]:
     """What tells apart two functions of one name that a factory makes; numba's key has the bytecode alone."""
     return code.co_names, [_content(c) if isinstance(c, CodeType) else repr(c) for c in code.co_consts]
 
 
-def _patch(caching: Any) -> None:
+def _patch(module: Any) -> None:
+    from numba.core import caching
+
     kind = caching.IndexDataCacheFile
     if getattr(kind, "guarded", False):
         return
+    cached = module.Dispatcher.enable_caching
+
+    def enable_caching(self: Any) -> None:
+        if _is_own(self.py_func):
+            self.targetoptions.setdefault("no_cfunc_wrapper", True)
+        cached(self)
+
+    module.Dispatcher.enable_caching = enable_caching
 
     def path(self: Any, key: Any) -> Path:
         name = hashlib.sha256(repr((self._version, self._source_stamp, key)).encode()).hexdigest()[:24]

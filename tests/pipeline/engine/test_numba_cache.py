@@ -168,6 +168,20 @@ def test_seconds_of_compiling_end_with_the_outermost_kernel(entry, monkeypatch):
     assert COMPILING.take() == 0.0
 
 
+WRAPPERS = """
+from pipeline.engine.runtime.environment import prepare_environment
+prepare_environment()
+from stages.caller import f
+f(21)
+print("cfunc" in " ".join(f.inspect_llvm().values()), "cpython" in " ".join(f.inspect_llvm().values()))
+"""
+
+
+def test_own_kernels_are_compiled_without_the_wrapper_for_c(checkout, monkeypatch):
+    monkeypatch.setattr(sys.modules[__name__], "RUN", WRAPPERS)
+    assert checkout("one")[1]() == ["False", "True"]
+
+
 LATER = """
 import sys
 from pipeline.engine.runtime.numba_cache import guard
