@@ -48,7 +48,7 @@ def rendered(cache: Path, parameters: dict[str, Any], frame: int) -> tuple[Any, 
     """Left and right image, the exact column disparity, and both images' masks, of one mockup pair."""
     from datasets.mockup.params import MockupParams
     from datasets.mockup.sequence import mockup
-    from pipeline.engine.store.folder import Store
+    from pipeline.engine.store.base import Store
     from pipeline.engine.task import Spec, ensure
 
     store, sequence = Store(cache), mockup(MockupParams(**parameters))

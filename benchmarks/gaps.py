@@ -68,7 +68,7 @@ def trajectory(folder: Path, frames: tuple[int, ...], cache: Path) -> Any:
     from datasets.registry import open_sequence
     from pipeline.engine import scheduler
     from pipeline.engine.graph import Graph, Handle
-    from pipeline.engine.store.folder import at
+    from pipeline.engine.store.base import at
     from pipeline.flow import config
     from pipeline.flow.closed_loop import dataflow
     from stages.evaluation import truth

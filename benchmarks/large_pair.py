@@ -133,7 +133,7 @@ def main() -> None:
 
     from pipeline.engine.graph import Graph
     from pipeline.engine.runtime.environment import prepare_environment
-    from pipeline.engine.store.folder import Store
+    from pipeline.engine.store.base import Store
     from pipeline.flow import tiles
     from stages.hfvm.images.params import HfvmParams
     from stages.imaging.pyramid import PyramidParams

@@ -50,7 +50,7 @@ def drive(settings: list[str]) -> dict[str, Any]:
 
     from pipeline.engine import scheduler
     from pipeline.engine.graph import Graph
-    from pipeline.engine.store.folder import at
+    from pipeline.engine.store.base import at
     from pipeline.flow.closed_loop import Drive
 
     begin = time.perf_counter()

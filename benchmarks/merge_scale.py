@@ -64,7 +64,7 @@ def merged(cache: Path, where: list[tuple[int, int]], cells: int, jobs: int, led
     """Run the merge of models at ``where``; label to digest of every tile."""
     from pipeline.engine import scheduler
     from pipeline.engine.graph import Graph
-    from pipeline.engine.store.folder import Store
+    from pipeline.engine.store.base import Store
     from pipeline.flow.builders import merge_tiles
     from pipeline.flow.reconstruction import TILE_CELLS
     from stages.terrain import merge, tile_index

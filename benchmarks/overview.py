@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from datasets.protocol import Source
 from datasets.registry import open_sequence
 from pipeline.commands.options import cache_folder
-from pipeline.engine.store.folder import Store
+from pipeline.engine.store.base import Store
 from pipeline.engine.task import Ref, Spec, ensure
 
 RISK = np.array([[0.36, 0.72, 0.60], [0.90, 0.80, 0.45], [0.80, 0.28, 0.10], [1.0, 1.0, 1.0]])

@@ -187,7 +187,7 @@ def measure(pairs: int, cache: Path, executor: str, jobs: int, what: str) -> dic
     """One cold run, or one plan of what is cached, in this process."""
     from pipeline.engine import scheduler
     from pipeline.engine.memory.limits import resident
-    from pipeline.engine.store.folder import Store
+    from pipeline.engine.store.base import Store
 
     before = resident()
     from pipeline.engine.code_digest import tree_digest

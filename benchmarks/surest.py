@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from pipeline.engine.store.folder import Store
+    from pipeline.engine.store.base import Store
 
     Floats = NDArray[np.floating[Any]]
 
@@ -111,7 +111,7 @@ def main() -> None:
     start_process(1)
     from pipeline.commands.options import cache_folder
     from pipeline.engine import events
-    from pipeline.engine.store.folder import at
+    from pipeline.engine.store.base import at
     from pipeline.runs import lookup
     from pipeline.runs.session import Options, reconstruct
 

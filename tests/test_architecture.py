@@ -108,7 +108,7 @@ def test_every_module_says_what_it_is(path: Path) -> None:
 
 def test_the_check_itself_sees_a_wrong_import(tmp_path: Path) -> None:
     bad = tmp_path / "bad.py"
-    bad.write_text("def f():\n    from pipeline.engine.store.folder import Store\n    import zarr\n")
+    bad.write_text("def f():\n    from pipeline.engine.store.base import Store\n    import zarr\n")
     assert imported(bad) == {"pipeline", "zarr"}
 
 

@@ -26,7 +26,8 @@ from datasets.registry import open_sequence
 from pipeline.engine import code_digest, provenance, scheduler, task
 from pipeline.engine.graph import Graph, Handle
 from pipeline.engine.keys import digest
-from pipeline.engine.store.folder import Ref, Store
+from pipeline.engine.store.base import Store
+from pipeline.engine.store.manifest import Ref
 from pipeline.flow import config as configuration
 from pipeline.flow import unread
 from pipeline.flow.closed_loop import dataflow

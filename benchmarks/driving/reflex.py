@@ -29,7 +29,7 @@ def trial(settings: list[str]) -> dict[str, Any]:
     """One leg with a stone on it; figures of the stone."""
     from pipeline.engine import scheduler
     from pipeline.engine.graph import Graph
-    from pipeline.engine.store.folder import at
+    from pipeline.engine.store.base import at
     from pipeline.flow.closed_loop import Drive, EndedError, Stand
     from pipeline.flow.products import Stop
 

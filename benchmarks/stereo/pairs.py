@@ -159,7 +159,7 @@ def _data(name: str) -> Path | None:
 
 def fetcher(cache: Path) -> Callable[[Any], Any]:
     """Function that computes a source once and then reads it from the cache."""
-    from pipeline.engine.store.folder import Store
+    from pipeline.engine.store.base import Store
     from pipeline.engine.task import Spec, ensure
 
     def artifact(source: Any) -> Any:

@@ -20,7 +20,7 @@ from datasets.protocol import CAMERAS, Sequence
 from pipeline.engine import scheduler
 from pipeline.engine.graph import Graph, Handle, Maybe, MissingError, Wait
 from pipeline.engine.scheduler import Result
-from pipeline.engine.store.folder import Store, at
+from pipeline.engine.store.base import Store, at
 from pipeline.engine.store.location import Location
 from pipeline.flow import config as configuration
 from pipeline.flow.builders import Builder, name

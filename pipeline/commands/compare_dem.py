@@ -12,8 +12,9 @@ from affine import Affine
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from pipeline.engine.runtime import atomic
 from pipeline.export.read_dem import Raster, read_elevation
-from pipeline.export.writers import ENGINEERING_CRS, replacing, write_text
+from pipeline.export.writers import ENGINEERING_CRS
 from stages.core.errors import InputError
 from stages.evaluation.dem_comparison import FREE, Alignment, Grid, align, binned, common, errors, figures
 
@@ -43,7 +44,7 @@ def compare(path_a: Path, path_b: Path, *, align: str = "none", output: Path = P
     _print(found)
     target = output.with_name(output.name.removesuffix(".png").removesuffix(".json"))
     try:
-        write_text(target.with_name(target.name + ".json"), json.dumps(found, indent=1, allow_nan=False) + "\n")
+        atomic.write(target.with_name(target.name + ".json"), json.dumps(found, indent=1, allow_nan=False) + "\n")
         draw(target.with_name(target.name + ".png"), found, error, slope, distance)
     except OSError as problem:
         raise InputError(
@@ -229,5 +230,5 @@ def draw(path: Path, found: dict[str, Any], error: Floats, slope: Floats, distan
         axis.set(xlabel=words, ylabel="mm", title=f"{found[name]['unit']}" if not bins else "")
         axis.grid(alpha=0.3)
         axis.legend(fontsize=8)
-    with replacing(path) as temporary:
+    with atomic.replacing(path) as temporary:
         figure.savefig(temporary, dpi=110, metadata={"Software": None})

@@ -149,7 +149,7 @@ def export(
 def _export(run: Path, kind: Literal["laz", "glb", "colmap"], output: Path | None, cache: str | None) -> str:
     """Write one form; what was written, in words."""
     if kind == "colmap":
-        from pipeline.engine.store.folder import at
+        from pipeline.engine.store.base import at
         from pipeline.export import colmap
 
         return str(colmap.export_run(run, output or run / kind, at(cache_folder(cache))))

@@ -19,7 +19,7 @@ from pipeline.engine.memory.cost_model import Costs, Foreseen, count
 from pipeline.engine.memory.limits import words
 from pipeline.engine.runtime.environment import cores
 from pipeline.engine.scheduler import Result
-from pipeline.engine.store.folder import at
+from pipeline.engine.store.base import at
 from pipeline.flow import unread
 from pipeline.flow.closed_loop import dataflow
 from pipeline.runs.session import Options, check_options, choose_frames, settings, warn

@@ -11,8 +11,9 @@ from typing import Any
 from pipeline.engine import events, provenance
 from pipeline.engine.keys import digest
 from pipeline.engine.memory.limits import words
-from pipeline.engine.store.folder import Store, at
+from pipeline.engine.store.base import Store, at
 from pipeline.engine.store.location import Location
+from pipeline.engine.store.manifest import artifact_path
 from pipeline.flow.config import modules, stage
 from pipeline.runs import lookup
 
@@ -66,8 +67,8 @@ def _fate(row: Mapping[str, Any], run: Path, made: Mapping[str, Any] | None) -> 
         yield f"key           {row['key'][:SHORT]} (stage, code, packages, parameters, arguments, inputs' digests)"
         facts = ""
         if made is not None:
-            size = sum(n for n, _ in made["files"].values())
-            facts = f", {words(size)} in {made['path']}: {', '.join(made['arrays']) or 'metadata only'}"
+            path = artifact_path(made["stage"], made["key"])
+            facts = f", {words(made['size'])} in {path}: {', '.join(made['arrays']) or 'metadata only'}"
         yield f"result        digest {row['digest'][:SHORT]}{facts}"
 
 

@@ -17,7 +17,6 @@ import ast
 import hashlib
 import importlib.util
 import json
-import os
 import sys
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
@@ -27,6 +26,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.engine.keys import digest
+from pipeline.engine.runtime import atomic
 
 OWN = ("stages", "datasets")
 
@@ -66,11 +66,8 @@ class _Memory:
             return
         if len(self.known) > FORGET * len(self.used):
             self.known = {name: self.known[name] for name in self.used}
-        temporary = self.path.with_name(f"{self.path.name}.{os.getpid()}.tmp")
         with suppress(OSError):
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            temporary.write_text(json.dumps({"digest": digest(self.known), "sources": self.known}), encoding="utf-8")
-            temporary.replace(self.path)
+            atomic.write(self.path, json.dumps({"digest": digest(self.known), "sources": self.known}))
             self.new = False
 
 

@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
@@ -27,6 +26,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipeline.engine.reference import REFERENCE
+from pipeline.engine.runtime import atomic
 
 if TYPE_CHECKING:
     from pipeline.engine.graph import Handle
@@ -148,8 +148,5 @@ def recall(hints: Path) -> dict[str, tuple[float, float, float]] | None:
 def remember(hints: Path, forecast: Forecast) -> None:
     """Leave it for the next run; best effort."""
     if forecast.begun:
-        temporary = hints / f"{FILE}.{os.getpid()}.tmp"
         with suppress(OSError):
-            hints.mkdir(parents=True, exist_ok=True)
-            temporary.write_text(json.dumps((recall(hints) or {}) | forecast.summary()), encoding="utf-8")
-            temporary.replace(hints / FILE)
+            atomic.write(hints / FILE, json.dumps((recall(hints) or {}) | forecast.summary()))

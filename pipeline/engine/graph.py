@@ -21,7 +21,7 @@ from functools import cache
 from types import ModuleType
 from typing import Any, Generic, TypeVar
 
-from pipeline.engine.store.folder import Ref
+from pipeline.engine.store.manifest import Ref
 from pipeline.engine.task import Refs, Spec
 from stages.core.declare import Params
 

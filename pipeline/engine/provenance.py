@@ -7,16 +7,18 @@ the end of a run, and where it is wrong or missing only the words suffer.
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pipeline.engine.runtime import atomic
+
 if TYPE_CHECKING:
     from pipeline.engine.graph import Handle
-    from pipeline.engine.store.folder import Ref, Store
+    from pipeline.engine.store.base import Store
+    from pipeline.engine.store.manifest import Ref
 
 KEPT = 4
 """Earlier keys remembered per label: enough for a user who goes back and forth between a few settings."""
@@ -77,11 +79,8 @@ class Known:
         if all(known.get(name, [""])[0] == key for name, key in used.items()):
             return
         known |= {name: [key, *(k for k in known.get(name, []) if k != key)][:KEPT] for name, key in used.items()}
-        temporary = self._path.with_name(f"{self._path.name}.{os.getpid()}.tmp")
         with suppress(OSError):
-            self._path.parent.mkdir(parents=True, exist_ok=True)
-            temporary.write_text(json.dumps(known), encoding="utf-8")
-            temporary.replace(self._path)
+            atomic.write(self._path, json.dumps(known))
 
 
 def differences(then: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:

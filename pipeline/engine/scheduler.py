@@ -41,7 +41,8 @@ from pipeline.engine.progress import Progress, Quiet
 from pipeline.engine.runtime.environment import cores
 from pipeline.engine.runtime.interrupts import Interrupts
 from pipeline.engine.store.artifact import DamagedError
-from pipeline.engine.store.folder import GoneError, NonDeterministicError, Ref, Store
+from pipeline.engine.store.base import GoneError, NonDeterministicError, Store
+from pipeline.engine.store.manifest import Ref
 from pipeline.engine.task import Outcome, key_of, recipe
 from stages.core.errors import DegenerateError, RilleError
 

@@ -3,7 +3,7 @@
 A :class:`Spec` says what to compute: a stage module (its ``STAGE`` is taken), validated parameters, the arguments that
 identify the task, and hints (paths) that cannot change the result. The key is the digest of all of it but the hints
 and the label, of the code and packages behind the stage, and of the *output digests* of the inputs. Between
-tasks only :class:`~pipeline.engine.store.folder.Ref` travel.
+tasks only :class:`~pipeline.engine.store.manifest.Ref` travel.
 
 >>> spec = Spec("stages.odometry.keyframes", "select", SelectParams(), {"frames": 9})
 >>> outcome = ensure(Path("cache"), spec, {})
@@ -32,13 +32,14 @@ from pipeline.engine.keys import text
 from pipeline.engine.memory.limits import Meter
 from pipeline.engine.packages import versions
 from pipeline.engine.runtime.numba_cache import COMPILING, guard
-from pipeline.engine.store.folder import Ref, Store, at
+from pipeline.engine.store.base import Store, at
+from pipeline.engine.store.manifest import Ref
 from stages.core.declare import Bundle, Params, Stage, check_outputs
 from stages.core.errors import RilleError
 
 __all__ = ["CodeChangedError", "Outcome", "Ref", "Refs", "Spec", "ensure", "recipe", "resolve"]
 
-FORMAT = 1
+FORMAT = 2
 """Enters every key: raise it when the meaning of keys or artifacts changes."""
 
 TRIES = 3

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.engine import events
-from pipeline.engine.store.folder import Store
+from pipeline.engine.store.base import Store
 from stages.core.declare import Bundle
 from stages.core.errors import InputError
 from stages.evaluation.crosscheck import PIXEL_CENTRE

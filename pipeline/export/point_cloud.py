@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.engine.runtime import atomic
 from pipeline.export.read_dem import Raster, read_elevation, read_tiff
-from pipeline.export.writers import replacing
 from stages.core.errors import InputError
 
 MADE = date(2000, 1, 1)
@@ -92,7 +92,7 @@ def write_laz(path: Path, terrain: Raster, ortho: NDArray[np.float64] | None, si
         cloud.intensity = cloud.red = cloud.green = cloud.blue = grey
     if sigma is not None:
         cloud.sigma = sigma[row, col].astype(np.float32)
-    with replacing(path) as temporary:
+    with atomic.replacing(path) as temporary:
         cloud.write(str(temporary), do_compress=True)
     return f"{row.size} points"
 
@@ -124,7 +124,7 @@ def write_glb(path: Path, terrain: Raster, ortho: NDArray[np.float64] | None, si
     scene.metadata["origin_m"] = middle.tolist()
     scene.metadata["axes"] = "x = x, y = z, z = -y of the terrain's frame, metres from origin_m"
     scene.metadata["crs_wkt"] = terrain.crs
-    with replacing(path) as temporary:
+    with atomic.replacing(path) as temporary:
         temporary.write_bytes(scene.export(file_type="glb", include_normals=True))
     every = "" if step == 1 else f", every {step}. cell (of more than {MAX_FACES} triangles)"
     return f"{len(vertices)} vertices, {len(faces)} triangles{every}"

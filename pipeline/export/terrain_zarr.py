@@ -8,8 +8,6 @@ and y stay those of the world frame, and ``easting`` and ``northing`` are two-di
 
 from __future__ import annotations
 
-import os
-import shutil
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
@@ -19,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datasets.georeference import Georeference
+from pipeline.engine.runtime import atomic
 from pipeline.export.output import Output, stage
 from pipeline.export.rasters import whole
 from pipeline.export.writers import ENGINEERING_CRS, FRAME
@@ -50,15 +49,8 @@ def write_terrain(
     place : of the world frame, where it is known.
     facts : attributes of the whole group, e.g. ``title``, ``source``.
     """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    shutil.rmtree(temporary, ignore_errors=True)
-    try:
+    with atomic.replacing(path) as temporary:
         _write(temporary, arrays, lattice, place, facts)
-        if path.exists():
-            shutil.rmtree(path)
-        os.replace(temporary, path)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def _write(

@@ -8,10 +8,8 @@ from __future__ import annotations
 import csv
 import io
 import json
-import os
 import struct
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from string import Template
 from typing import Any
@@ -23,6 +21,7 @@ from datasets.georeference import Georeference
 from datasets.images.files import MOST_BYTES
 from datasets.text.reading import open_regular
 from pipeline.engine.plain import plain
+from pipeline.engine.runtime import atomic
 from stages.core.errors import InputError
 from stages.geometry.lattice import Lattice
 
@@ -50,24 +49,6 @@ LINE_Z, POINT_Z = 1002, 1001
 """Geometry types of ISO 19125 well-known binary."""
 GPKG_DATE = "2000-01-01T00:00:00.000Z"
 """Written as time of change into every GeoPackage, so that equal paths make equal files."""
-
-
-@contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """Temporary name beside ``path`` that becomes ``path`` when the block ends without an error."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
-    try:
-        yield temporary
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a UTF-8 text file, whole or not at all."""
-    with replacing(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
 
 
 def write_raster(
@@ -128,7 +109,7 @@ def write_raster(
         "UNIT": ", ".join(dict.fromkeys(units)),
         "CELL_SIZE_M": f"{lattice.cell:.12g}",
     }
-    with replacing(path) as temporary, rasterio.open(temporary, "w", **profile) as file:
+    with atomic.replacing(path) as temporary, rasterio.open(temporary, "w", **profile) as file:
         for number, (name, values) in enumerate(bands.items(), start=1):
             file.write(np.asarray(values), number)
             file.set_band_description(number, name)
@@ -176,7 +157,7 @@ def write_path_geojson(path: Path, vertices: NDArray[np.float64], facts: Mapping
     if coordinates:
         for name, at in (("start", 0), ("target", -1)):
             features.append(_feature({"type": "Point", "coordinates": coordinates[at]}, {"name": name} | common))
-    write_text(path, json.dumps({"type": "FeatureCollection", "features": features}, indent=1) + "\n")
+    atomic.write(path, json.dumps({"type": "FeatureCollection", "features": features}, indent=1) + "\n")
 
 
 def _feature(geometry: Mapping[str, Any] | None, properties: Mapping[str, Any]) -> dict[str, Any]:
@@ -205,7 +186,7 @@ def write_path_gpkg(
     common = {"driver": "GPKG", "crs": ENGINEERING_CRS if place is None else place.crs}
     vertices = vertices if place is None else place.apply(vertices)
     line = _wkb(LINE_Z, vertices) if len(vertices) > 1 else None
-    with replacing(path) as temporary:
+    with atomic.replacing(path) as temporary:
         lines = np.array([line], dtype=object)
         write(temporary, lines, columns, list(kept), layer="path", geometry_type="LineString Z", **common)
         if len(vertices):
@@ -227,7 +208,7 @@ def write_style(path: Path, style: str, values: Mapping[str, float] | None = Non
     ----------
     values : numbers to fill in by the names that the style has for them.
     """
-    write_text(path, Template(style).substitute({key: f"{value:.6g}" for key, value in (values or {}).items()}))
+    atomic.write(path, Template(style).substitute({key: f"{value:.6g}" for key, value in (values or {}).items()}))
 
 
 FORMULA = ("=", "+", "-", "@", "\t")
@@ -240,7 +221,7 @@ def write_table(path: Path, columns: Mapping[str, Sequence[Any]]) -> None:
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(columns)
     writer.writerows([_cell(value) for value in row] for row in zip(*columns.values(), strict=True))
-    write_text(path, out.getvalue())
+    atomic.write(path, out.getvalue())
 
 
 def _cell(value: Any) -> str:
@@ -259,7 +240,7 @@ def write_trajectory_kitti(path: Path, poses: NDArray[np.float64]) -> None:
     ----------
     poses : (frame, 3, 4) T_world_left, metres; optical axes x right, y down, z forward.
     """
-    write_text(path, "".join(_line(pose.reshape(-1)) for pose in poses))
+    atomic.write(path, "".join(_line(pose.reshape(-1)) for pose in poses))
 
 
 def write_trajectory_tum(path: Path, poses: NDArray[np.float64], times: Sequence[float], world: str = FRAME) -> None:
@@ -279,7 +260,7 @@ def write_trajectory_tum(path: Path, poses: NDArray[np.float64], times: Sequence
         for time, pose in zip(times, poses, strict=True)
         if np.isfinite(pose).all()
     ]
-    write_text(path, head + "".join(lines))
+    atomic.write(path, head + "".join(lines))
 
 
 def _line(values: Sequence[float] | NDArray[np.float64]) -> str:
@@ -328,7 +309,7 @@ def _write_image(path: Path, bands: Mapping[str, tuple[NDArray[Any], str]], tags
     height, width = next(iter(bands.values()))[0].shape
     profile = {"driver": "GTiff", "height": height, "width": width, "count": len(bands), "dtype": "float32"}
     profile |= {"nodata": float("nan"), "compress": "deflate", "predictor": 3}
-    with replacing(path) as temporary, warnings.catch_warnings():
+    with atomic.replacing(path) as temporary, warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)  # an image has no place on the ground
         with rasterio.open(temporary, "w", **profile) as file:
             for number, (name, (values, _)) in enumerate(bands.items(), start=1):

@@ -11,9 +11,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from pipeline.engine.runtime import atomic
 from pipeline.export.catalogue import listed
 from pipeline.export.view import RunView
-from pipeline.export.writers import write_text
 from pipeline.report import tables
 from pipeline.report.block import Figure
 from pipeline.report.summary import summarise
@@ -31,9 +31,9 @@ def write_report(folder: Path, view: RunView, facts: Mapping[str, Any], figures:
     figures : in the order of the page.
     """
     whole = summarise(view, facts, figures)
-    write_text(folder / "report.json", json.dumps(whole, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
+    atomic.write(folder / "report.json", json.dumps(whole, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
     page = render(view, whole, figures, list(listed(folder)), compared=facts["compared"])
-    write_text(folder / "report.html", page)
+    atomic.write(folder / "report.html", page)
 
 
 def render(

@@ -9,9 +9,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from pipeline.engine.memory.limits import words
-from pipeline.engine.store.folder import Store, at, sizes
+from pipeline.engine.store.base import Store, at
 from pipeline.engine.store.location import Location
 from pipeline.engine.store.maintenance import artifacts
+from pipeline.engine.store.manifest import reference
 from pipeline.runs import lookup, pins, roots
 
 NOBODY = "-"
@@ -45,12 +46,12 @@ def holdings(store: Store, folder: Path) -> list[Holding]:
         manifest = store.manifest(stage, key)
         if manifest is None:
             continue
-        nbytes, stored = sizes(manifest)
+        ref = reference(manifest)
         run = used.get(key) or pinned_by.get(key, NOBODY)
         sequence = run.partition("/")[0]
         row = found.setdefault((sequence, stage), Holding(sequence, stage))
         made = float(manifest["provenance"].get("started", 0.0))
-        row.artifacts, row.bytes, row.stored = row.artifacts + 1, row.bytes + nbytes, row.stored + stored
+        row.artifacts, row.bytes, row.stored = row.artifacts + 1, row.bytes + ref.nbytes, row.stored + ref.stored
         row.oldest, row.newest = min(row.oldest, made), max(row.newest, made)
         row.last_run = max(row.last_run, run, key=lambda r: r.rpartition("/")[2])
         row.pinned += key in kept

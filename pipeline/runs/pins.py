@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
-import os
 import time
 from pathlib import Path
 from typing import Any
 
 from pipeline.engine import events
-from pipeline.engine.store.folder import Store, StoreError
+from pipeline.engine.runtime import atomic
+from pipeline.engine.store.base import Store
+from pipeline.engine.store.folder import StoreError
 from pipeline.runs import lookup
 from stages.core.errors import ConfigError
 
@@ -20,12 +21,9 @@ def pin(store: Store, run: Path) -> int:
     """Keep all artifacts that a run used; gives their number."""
     keys = sorted(events.keys(run / lookup.LEDGER))
     path = _path(store, lookup.name(run))
-    temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")
     body = json.dumps({"run": lookup.name(run), "pinned": round(time.time()), "keys": keys})
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary.write_text(body, encoding="utf-8")
-        temporary.replace(path)
+        atomic.write(path, body)
     except OSError as error:
         raise StoreError("RIL-562", f"cannot pin in {store.root}: {error.strerror}", remedy="check --cache") from error
     return len(keys)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import platform
 from collections.abc import Iterator
 from pathlib import Path
 
-from pipeline.engine.store.folder import Store, StoreError
+from pipeline.engine.runtime import atomic
+from pipeline.engine.store.base import Store
+from pipeline.engine.store.folder import StoreError
 
 FOLDER = "roots"
 
@@ -22,10 +23,7 @@ def note(store: Store, runs: Path) -> None:
     if path.exists():
         return
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")
-        temporary.write_text(json.dumps({"folder": folder, "host": platform.node()}), encoding="utf-8")
-        temporary.replace(path)
+        atomic.write(path, json.dumps({"folder": folder, "host": platform.node()}))
     except OSError as error:
         raise StoreError(
             "RIL-741", f"cannot write in {store.root}: {error.strerror}", remedy="check --cache"

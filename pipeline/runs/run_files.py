@@ -9,13 +9,13 @@ from types import ModuleType
 from typing import Any
 
 from pipeline.engine.graph import Graph, Handle, Maybe, Wait
-from pipeline.engine.store.folder import Store
+from pipeline.engine.runtime import atomic
+from pipeline.engine.store.base import Store
 from pipeline.export import catalogue
 from pipeline.export.frames_json import describe
 from pipeline.export.output import Output, handles, place, task, unpack
 from pipeline.export.trajectories import stamps
 from pipeline.export.view import RunView, TaskRow
-from pipeline.export.writers import write_text
 from pipeline.report import gallery, summary
 from pipeline.report.block import Figure
 from pipeline.report.page import write_report
@@ -67,7 +67,7 @@ def write(folder: Path, view: RunView, made: Made, store: Store) -> None:
             place(store.open(ref), folder)
     trajectory = view.products.trajectory
     meta = {} if trajectory is None or trajectory.ref is None else trajectory.ref.meta
-    write_text(folder / "frames.json", json.dumps(_frames(folder, view, meta), indent=1) + "\n")
+    atomic.write(folder / "frames.json", json.dumps(_frames(folder, view, meta), indent=1) + "\n")
     facts = _content(made["facts"], store)
     figures = [Figure.from_dict(_content(made[o.name], store)) for o in gallery.OUTPUTS if made[o.name].ref is not None]
     write_report(folder, view, facts, figures)

@@ -20,7 +20,7 @@ from datasets.protocol import Sequence
 from pipeline.engine.code_digest import remember
 from pipeline.engine.graph import Graph
 from pipeline.engine.store.artifact import DamagedError
-from pipeline.engine.store.folder import GoneError, Store, at
+from pipeline.engine.store.base import GoneError, Store, at
 from pipeline.engine.store.location import Location, hints_folder, locate
 from pipeline.flow import config as configuration
 from stages.core.declare import Bundle

@@ -7,7 +7,6 @@ takes long or much memory, is a fault of the reader.
 from __future__ import annotations
 
 import gzip
-import hashlib
 import json
 import random
 import shutil
@@ -25,9 +24,10 @@ from datasets.images import files
 from datasets.inspection import inspect
 from datasets.manifest.opening import open_manifest
 from datasets.registry import open_sequence
-from pipeline.engine.store import folder as store
-from pipeline.engine.store import s3
-from pipeline.engine.store.index import Catalogue, _head
+from pipeline.engine.store import manifest as stored
+from pipeline.engine.store.folder import Folder
+from pipeline.engine.store.index import Index, pack
+from pipeline.engine.store.place import Item
 from pipeline.export.writers import read_disparity
 from pipeline.flow import config
 from stages.core.errors import RilleError
@@ -104,29 +104,27 @@ def euroc(path: Path) -> None:
 
 
 def packed(path: Path) -> None:
-    data = path.read_bytes()
-    _values_alone(lambda: s3._unpack("index", data))
+    _index(path, path.read_bytes())
 
 
 def index(path: Path) -> None:
     """Content that is wrong behind a checksum that is right."""
-    data = path.read_bytes()
-    _values_alone(lambda: s3._unpack("index", gzip.compress(hashlib.sha256(data).digest() + data, 1)))
+    _index(path, gzip.compress(path.read_bytes(), 1))
+
+
+def _index(path: Path, data: bytes) -> None:
+    apart = path.parent / "index" / "s"
+    apart.mkdir(parents=True, exist_ok=True)
+    (apart / "made").write_bytes(data)
+    known = Index(Folder(path.parent), "s")
+    for key, line in list(known.lines.items()):
+        known.get("numbers", Item("p", 1, line[2:].partition('"')[0], 0.0), key)
 
 
 def artifact(path: Path) -> None:
     data = path.read_bytes()
-    _values_alone(lambda: store.sizes(store.unframe(store._HEAD % google_crc32c.value(data) + data + b"}\n")))
-
-
-def catalogue(path: Path) -> None:
-    data = path.read_bytes()
-    path.write_bytes(_head(data) + b"\n" + data)
-    known = Catalogue.load(path)
-    for key, line in known.lines.items():
-        numbers = line[1:].split(",")[:4]
-        if all(n.isdecimal() and len(n) < 20 for n in numbers) and len(numbers) == 4:
-            known.get(key, tuple(map(int, numbers)))  # type: ignore[arg-type]
+    line = stored._HEAD % (google_crc32c.value(data), len(data)) + data + b"}\n"
+    _values_alone(lambda: stored.reference(stored.unframe(line[: stored.length(line)])))
 
 
 def _values_alone(read: Callable[[], object]) -> None:
@@ -152,7 +150,6 @@ READERS: dict[str, Callable[[Path], None]] = {
     "packed": packed,
     "index": index,
     "artifact": artifact,
-    "catalogue": catalogue,
 }
 
 
@@ -165,17 +162,18 @@ MANIFEST = {
     "digest": "b" * 64,
     "arrays": {"values": {"dtype": "<f4", "shape": [3, 4], "sha256": "c" * 64}},
     "meta": {"frame": 0},
-    "files": {"values/c.0.0": [120, "0badcafe"], "zarr.json": [300, "00000000"]},
+    "attempt": "0" * 32,
+    "files": {"values/c.0.0": [44, 120, "0badcafe"], "zarr.json": [210, 300, "00000000"]},
+    "archive": [700, "0badcafe"],
     "provenance": {"reason": "new"},
-    "path": f"artifacts/numbers/aa/{'a' * 64}/a-0123456789abcdef",
 }
-ENTRY = [1, 2, 3, 4, "b" * 64, "p", 48, 420, {"frame": 0}, {"zarr.json": 300}]
+ENTRY = ["1.2.3", "b" * 64, 48, 420, {"frame": 0}]
+LINES = [f"{k:064d} {json.dumps(ENTRY, separators=(',', ':'))}\n" for k in range(3)]
 
 MADE: dict[str, bytes] = {
     "artifact/made": json.dumps(MANIFEST).encode(),
-    "index/made": json.dumps({f"manifests/numbers/{'a' * 64}.json": ["etag", MANIFEST]}).encode(),
-    "packed/made": s3._pack({f"manifests/numbers/{'a' * 64}.json": ("etag", MANIFEST)})[1],
-    "catalogue/made": "".join(f"{k:064d} {json.dumps(ENTRY, separators=(',', ':'))}\n" for k in range(3)).encode(),
+    "index/made": "".join(LINES).encode(),
+    "packed/made": pack(LINES),
 }
 """Seeds of what Rille itself writes, without the checksum in front."""
 

@@ -53,7 +53,7 @@ class Proxy:
 
     def __init__(self, port, trouble):
         self.upstream, self.trouble = port, trouble
-        self.requests, self.troubled = [], 0
+        self.requests, self.ranges, self.troubled = [], [], 0
         self._lock = threading.Lock()
         proxy = self
 
@@ -81,6 +81,7 @@ class Proxy:
         body = handler.rfile.read(int(handler.headers.get("Content-Length") or 0))
         with self._lock:
             self.requests.append((handler.command, handler.path))
+            self.ranges += handler.headers.get_all("Range", [])
             what = self.trouble(handler.command, handler.path, len(self.requests))
             self.troubled += bool(what)
         headers = {k: v for k, v in handler.headers.items() if k.lower() != "content-length"}

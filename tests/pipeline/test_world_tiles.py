@@ -13,7 +13,7 @@ from toys import dem
 
 from pipeline.engine import events, scheduler
 from pipeline.engine.graph import Graph
-from pipeline.engine.store.folder import Store
+from pipeline.engine.store.base import Store
 from pipeline.flow.builders import merge_tiles
 from stages.core.declare import NoParams
 from stages.terrain import merge, tile_index

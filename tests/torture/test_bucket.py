@@ -11,8 +11,8 @@ from torn import chain, look
 
 from pipeline.engine import scheduler
 from pipeline.engine.graph import Graph
-from pipeline.engine.store import s3_client as requests
-from pipeline.engine.store.folder import at
+from pipeline.engine.store import s3 as requests
+from pipeline.engine.store.base import at
 
 METHODS = {"refuse": ("GET", "PUT", "POST"), "deafen": ("PUT",), "cut": ("GET",)}
 WORDS = {
@@ -70,13 +70,13 @@ def test_a_store_that_ignores_conditional_puts_is_refused(calm, bucket, through,
     graph = Graph()
     chain.build(graph, frames=2, size=20)
     scheduler.run(graph, at(prefix), executor="inline").check()
-    before = {e.path: e.etag for e in at(prefix).bucket.list("")}
+    before = {e.path: e.mark for e in at(prefix).place.list("")}
     proxy = through(lambda *_: "blind")
     for place in (prefix, f"{prefix}/new"):
         with raises("RIL-516"):
             at(place)
     wrote = [path for method, path in proxy.requests if method == "PUT" and "/probe/" not in path]
     proxy.trouble = lambda *_: ""
-    after = {e.path: e.etag for e in at(prefix).bucket.list("") if e.path.startswith(("data", "manifests"))}
-    lost = [path for path, etag in before.items() if path.startswith(("data", "manifests")) and after.get(path) != etag]
+    after = {e.path: e.mark for e in at(prefix).place.list("") if e.path.startswith("artifacts")}
+    lost = [path for path, etag in before.items() if path.startswith("artifacts") and after.get(path) != etag]
     row("bucket that ignores conditional puts", 2, lost, wrote, 0, 0, "refused before anything is computed")

@@ -17,8 +17,10 @@ from torn.faults import Faults
 
 from pipeline.engine import scheduler
 from pipeline.engine.graph import Graph
-from pipeline.engine.store import index, maintenance
-from pipeline.engine.store.folder import NonDeterministicError, Store, StoreError
+from pipeline.engine.store import folder, maintenance
+from pipeline.engine.store.base import NonDeterministicError, Store
+from pipeline.engine.store.folder import StoreError
+from pipeline.engine.store.manifest import artifact_path
 from stages.core.declare import NoParams
 
 WAYS = {
@@ -30,16 +32,18 @@ WAYS = {
 }
 
 KINDS = {
-    "manifest": "artifacts/numbers/*/{key}/manifest.json",
-    "group": "artifacts/numbers/*/{key}/a-*/zarr.json",
-    "array": "artifacts/numbers/*/{key}/a-*/values/zarr.json",
-    "chunk": "artifacts/numbers/*/{key}/a-*/values/c.0.0",
-    "other chunk": "artifacts/numbers/*/{key}/a-*/mask/c.0.0",
+    "manifest": "",
+    "group": "zarr.json",
+    "array": "values/zarr.json",
+    "chunk": "values/c.0.0",
+    "other chunk": "mask/c.0.0",
+    "directory": "",
     "label": "hints/-/keys-.json",
     "seconds": "hints/-/seconds.json",
     "costs": "hints/-/costs.json",
-    "index": "index/*",
+    "index": "index/*/*",
 }
+"""Members of an artifact's file, and what is beside the artifacts."""
 HINTS = ("label", "seconds", "costs", "index")
 READ = ("manifest", "array", "chunk")
 """Kinds that a task which reads ``values`` sees."""
@@ -58,7 +62,7 @@ SMALL = 3
 @pytest.fixture(autouse=True)
 def _no_waiting_for_the_disk(monkeypatch):
     monkeypatch.setattr(os, "fsync", lambda handle: None)
-    monkeypatch.setattr(index, "RACY", 0)  # a run lies between a copy and its damage
+    monkeypatch.setattr(folder, "RACY", 0)  # a run lies between a copy and its damage
 
 
 @pytest.fixture(scope="module")
@@ -89,13 +93,18 @@ def damaged(calm, cache, kind, way, rng):
     """A copy of the undisturbed cache with one file damaged; whether its size tells."""
     shutil.copytree(calm["cache"], cache)
     run(cache)  # so that its index is up to date
-    (path,) = cache.glob(KINDS[kind].format(key=calm["nodes"]["numbers/1"]["key"]))
+    key = calm["nodes"]["numbers/1"]["key"]
+    found = cache.glob(KINDS[kind] if kind in HINTS else artifact_path("numbers", key))
+    path = max(found, key=lambda p: p.stat().st_mtime_ns)  # of the indices the newest
     data = path.read_bytes()
     change = WAYS[way]
     if change is None:
         path.unlink()
         return True
-    path.write_bytes(change(data, rng))
+    start, stop = 0, len(data)
+    if kind not in HINTS and way in ("zeros", "flip"):
+        start, stop = look.span(data, kind, KINDS[kind])
+    path.write_bytes(data[:start] + change(data[start:stop], rng) + data[stop:])
     return path.stat().st_size != len(data)
 
 
@@ -175,8 +184,7 @@ def test_disk_full_at_a_step(small, tmp_path, row, monkeypatch, code, every):
             cleared = maintenance.gc(Store(cache), found, grace=-1.0)
             orphans += cleared.orphans
             assert cleared.artifacts == 0
-            left = [p for p in cache.rglob("*") if p.suffix == ".tmp" or ".partial" in p.name]
-            left += [p for p in cache.glob("artifacts/*/*/*/a-*") if p.parent.name not in found]
+            left = [p for p in cache.rglob("*") if ".tmp" in p.name or ".partial" in p.name]
             assert not left, (faults.steps[step - 1], left)
             graph, result = run(cache)
             wrong += look.wrong(digests(graph), small["digests"])
@@ -227,7 +235,7 @@ def test_read_only_cache(small, tmp_path, row, monkeypatch):
     shutil.copytree(small["cache"], warm)
     shutil.copytree(small["cache"], part)
     missing = small["nodes"]["total/1"]["key"]
-    shutil.rmtree(part / "artifacts" / "total" / missing[:2] / missing)
+    (part / artifact_path("total", missing)).unlink()
     before = {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()}
     with monkeypatch.context() as patch:
         Faults(patch, tmp_path, code=errno.EROFS, fail_at=1, onwards=True)
@@ -276,8 +284,9 @@ def test_a_stage_that_is_not_deterministic_is_detected(tmp_path, row):
     store = Store(cache)
     ref = store.lookup("mischief", graph.nodes[0].key)
     assert ref.digest == digest, "the first one stays"
-    (chunk,) = (cache / ref.path).glob("value/c.0")
-    chunk.write_bytes(bytes(chunk.stat().st_size))
+    path = cache / ref.path
+    start, stop = look.span(path.read_bytes(), "chunk", "value/c.0")
+    path.write_bytes(path.read_bytes()[:start] + bytes(stop - start) + path.read_bytes()[stop:])
     _, result = attempt(force={"reader"})
     assert caught == 2
     row("planted non-deterministic stage", 2, [], [], caught, 2, "detected: forced; healed")

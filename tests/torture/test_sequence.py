@@ -21,7 +21,9 @@ from torn import look
 
 from pipeline.engine import events
 from pipeline.engine.store.artifact import DamagedError, array_digests, output_digest
-from pipeline.engine.store.folder import Store
+from pipeline.engine.store.base import Store
+from pipeline.engine.store.maintenance import artifacts
+from pipeline.engine.store.manifest import artifact_path, reference
 
 SMALL = (
     *("mockup.frames=5", "mockup.image_width=285", "mockup.image_height=260", "mockup.focal_length=300.0"),
@@ -93,8 +95,8 @@ def test_small_mockup_killed_on_its_way(whole, tmp_path, row):
 def one_of_each_stage(store):
     """The first artifact of each stage: its manifest."""
     found = {}
-    for path in sorted(store.root.glob("artifacts/*/*/*/manifest.json")):
-        found.setdefault(path.parents[2].name, store.manifest(path.parents[2].name, path.parent.name))
+    for stage, key in artifacts(store):
+        found.setdefault(stage, store.manifest(stage, key))
     return found
 
 
@@ -103,7 +105,7 @@ def test_an_artifact_of_each_stage_opens_with_xarray_and_has_units(whole):
     made = one_of_each_stage(store)
     assert len(made) > 25
     for stage, manifest in made.items():
-        opened = xarray.open_zarr(store.root / manifest["path"], consolidated=False)
+        opened = xarray.open_zarr(store.path(reference(manifest)))
         assert set(opened.data_vars) == set(manifest["arrays"]), stage
         for name in opened.data_vars:
             assert opened[name].attrs["units"], (stage, name)
@@ -128,20 +130,29 @@ def test_an_artifact_of_each_stage_damaged_is_seen_or_read_as_it_was(whole, tmp_
     store, tries, seen, wrong = Store(cache), 0, 0, []
     made = one_of_each_stage(store)
     for stage, manifest in made.items():
-        home = store.home(stage, manifest["key"])
-        shutil.copytree(home, tmp_path / "kept")
-        for way, change in WAYS.items():
-            for name in ("manifest.json", *(f"{Path(manifest['path']).name}/{f}" for f in manifest["files"])):
-                data, tries = (home / name).read_bytes(), tries + 1
-                (home / name).unlink() if change is None else (home / name).write_bytes(change(data, rng))
+        path = cache / artifact_path(stage, manifest["key"])
+        whole_file = path.read_bytes()
+        for way in WAYS:
+            for name in ("manifest", *manifest["files"], "directory"):
+                tries += 1
+                damage(path, way, name, rng)
                 found = value(Store(cache), manifest)
                 seen += found is None
                 if found not in (None, manifest["digest"]):
                     wrong.append((stage, way, name))
-                shutil.rmtree(home, ignore_errors=True)
-                shutil.copytree(tmp_path / "kept", home)
-        shutil.rmtree(tmp_path / "kept")
+                path.parent.mkdir(exist_ok=True)
+                path.write_bytes(whole_file)
     row("each file of an artifact of each stage", tries, [], wrong, 0, 0, f"{len(made)} stages, {seen} seen when read")
+
+
+def damage(path, way, name, rng):
+    """A part of a file changed, or the whole of it cut short or removed."""
+    data, change = path.read_bytes(), WAYS[way]
+    if change is None:
+        path.unlink()
+        return
+    start, stop = look.span(data, name, name) if way in ("zeros", "flip") else (0, len(data))
+    path.write_bytes(data[:start] + change(data[start:stop], rng) + data[stop:])
 
 
 def test_a_run_heals_an_artifact_of_each_stage(whole, tmp_path, row):
@@ -151,9 +162,8 @@ def test_a_run_heals_an_artifact_of_each_stage(whole, tmp_path, row):
     made = one_of_each_stage(store)
     for turn, manifest in enumerate(made.values()):
         way = list(WAYS)[turn % len(WAYS)]
-        path = store.root / manifest["path"] / rng.choice(sorted(manifest["files"]))
-        data = path.read_bytes()
-        path.unlink() if WAYS[way] is None else path.write_bytes(WAYS[way](data, rng))
+        path = cache / artifact_path(manifest["stage"], manifest["key"])
+        damage(path, way, rng.choice(sorted(manifest["files"])), rng)
         certain += way in ("truncate", "empty", "delete")
     subprocess.run(command(tmp_path), check=True, stdout=subprocess.DEVNULL)
     healed = rows(tmp_path)
@@ -161,7 +171,7 @@ def test_a_run_heals_an_artifact_of_each_stage(whole, tmp_path, row):
     wrong += same_files(whole, tmp_path)
     lost = sorted(set(whole.right) - set(look.manifests(cache)))
     # not by the ledger: what is found when the results are drawn is computed by a second run
-    computed = sum(store.manifest(m["stage"], m["key"])["path"] != m["path"] for m in made.values())
+    computed = sum(store.manifest(m["stage"], m["key"])["attempt"] != m["attempt"] for m in made.values())
     row("one artifact of each stage damaged", len(made), lost, wrong, computed, range(certain, len(made) + 1),
         "what keeps its size counts where it is read")  # fmt: skip
 

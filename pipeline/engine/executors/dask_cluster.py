@@ -24,9 +24,8 @@ from typing import Any
 from pipeline.engine.code_digest import OWN, tree_digest
 from pipeline.engine.packages import version
 from pipeline.engine.runtime.environment import prepare_environment
-from pipeline.engine.store.folder import Store, at
+from pipeline.engine.store.base import Store, at
 from pipeline.engine.store.location import Location
-from pipeline.engine.store.s3 import ObjectStore
 from pipeline.engine.task import CodeChangedError
 from stages.core.errors import ConfigError, RilleError
 
@@ -83,29 +82,12 @@ def introduce(location: Location, token: str, name: str) -> dict[str, Any]:
 
 def write_probe(store: Store, name: str) -> None:
     """Leave a small file in the cache; clearing up takes what is forgotten."""
-    if isinstance(store, ObjectStore):
-        store.bucket.put(f"probe/{name}", name.encode())
-        return
-    store.root.mkdir(parents=True, exist_ok=True)
-    (store.root / f"probe-{name}.tmp").write_bytes(name.encode())
+    store.place.write(f"probe/{name}", name.encode())
 
 
 def read_probe(store: Store, name: str) -> bytes | None:
     """What was left; None if it is not to be seen."""
-    if isinstance(store, ObjectStore):
-        found = store.bucket.get(f"probe/{name}")
-        return None if found is None else found[0]
-    try:
-        return (store.root / f"probe-{name}.tmp").read_bytes()
-    except FileNotFoundError:
-        return None
-
-
-def _drop_probes(store: Store, names: list[str]) -> None:
-    if isinstance(store, ObjectStore):
-        store.bucket.delete(f"probe/{name}" for name in names)
-    for name in names:
-        (store.root / f"probe-{name}.tmp").unlink(missing_ok=True)
+    return store.place.read(f"probe/{name}")
 
 
 def examine(client: Any, cache: Location) -> None:
@@ -129,7 +111,7 @@ def examine(client: Any, cache: Location) -> None:
                 raise _no_cache(_name(client, address), cache, "its probe is not seen here")
     finally:
         with suppress(OSError, RilleError):
-            _drop_probes(store, names)
+            store.place.delete(f"probe/{name}" for name in names)
 
 
 def _judge(client: Any, address: str, told: Any, ours: Identity, cache: Location) -> None:

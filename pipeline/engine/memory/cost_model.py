@@ -9,7 +9,6 @@ from other parameters of its stage, else by the guess of the stage's declaration
 from __future__ import annotations
 
 import json
-import os
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
@@ -19,6 +18,7 @@ from statistics import median
 from typing import TYPE_CHECKING, Any
 
 from pipeline.engine.keys import digest
+from pipeline.engine.runtime import atomic
 from stages.core.declare import Params
 
 if TYPE_CHECKING:
@@ -248,9 +248,5 @@ def remember(hints: Path, handles: Iterable[Handle]) -> None:
     costs = recall(hints)
     costs.learn(computed)
     stages = {stage: {name: vars(g) for name, g in named.items()} for stage, named in costs.groups.items()}
-    path = hints / FILE
-    temporary = path.with_name(f"{FILE}.{os.getpid()}.tmp")
     with suppress(OSError):
-        hints.mkdir(parents=True, exist_ok=True)
-        temporary.write_text(json.dumps({"stages": stages, "rests": costs.rests}), encoding="utf-8")
-        temporary.replace(path)
+        atomic.write(hints / FILE, json.dumps({"stages": stages, "rests": costs.rests}))

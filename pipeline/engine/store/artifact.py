@@ -3,37 +3,30 @@
 The output digest is taken over the *decoded* arrays (type, shape, little-endian bytes, one NaN) and the metadata: a
 change of codec or of chunking changes no key, and an upstream change that does not change a result stops there.
 
-Chunks are lz4-compressed with byte shuffle and carry a crc32c that is checked on every read; ``dimension_names``,
-``units`` and ``long_name`` are set, so ``xarray.open_zarr`` reads an artifact's folder as it is. Members of a family
-(``level_*``) differ in size, so their dimensions are told apart by the member's suffix (``row_0``, ``row_1`` ...).
+Chunks are lz4-compressed with byte shuffle, and their crc32c in the manifest is compared on every read;
+``dimension_names``, ``units`` and ``long_name`` are set, so ``xarray.open_zarr`` reads an artifact as it is. Members of
+a family (``level_*``) differ in size, so their dimensions are told apart by the suffix (``row_0``, ``row_1`` ...).
 """
 
 from __future__ import annotations
 
 import hashlib
-import os
+import json
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor, wait
 from copy import copy
 from dataclasses import dataclass
-from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
-import google_crc32c
 import numpy as np
 
 from pipeline.engine.keys import canonical, digest
 from pipeline.engine.store import cf_coordinates
+from pipeline.engine.store.manifest import checksum
 from stages.core.declare import AnyArray, Array, Bundle, Stage
 from stages.core.errors import RilleError
 
 CHUNK = 1024
 """Greatest chunk edge, cells: 4 MB of float32, so that a usual image is a few files to write and to sync."""
-
-
-SYNCS = 8
-"""Files flushed at once."""
 
 
 class DamagedError(RilleError):
@@ -104,12 +97,24 @@ def encode(stage: Stage, bundle: Bundle) -> tuple[dict[str, bytes], dict[str, An
                 chunk_key_encoding={"name": "default", "separator": "."},
             )  # fmt: skip
             at[...] = values
-    return {name: chunk.to_bytes() for name, chunk in chunks.items()}, described
+    files = {name: chunk.to_bytes() for name, chunk in chunks.items()}
+    _consolidate(files)
+    return files, described
+
+
+def _consolidate(files: dict[str, bytes]) -> None:
+    """Describe all arrays in the group's own file too, so that opening it reads nothing else."""
+    about = {
+        name.removesuffix("/zarr.json"): json.loads(data) for name, data in files.items() if name.endswith("/zarr.json")
+    }
+    group = json.loads(files["zarr.json"])
+    group["consolidated_metadata"] = {"kind": "inline", "must_understand": False, "metadata": about}
+    files["zarr.json"] = json.dumps(group).encode()
 
 
 def _add(group: Any, name: str, stage: Stage, bundle: Bundle, lattice: Any) -> dict[str, Any]:
     """Write one array into a group; its description."""
-    from zarr.codecs import BloscCodec, Crc32cCodec
+    from zarr.codecs import BloscCodec
 
     array = np.asarray(bundle.arrays[name])
     about = _describe(name, array, next(a for a in stage.outputs if a.matches(name)))
@@ -118,7 +123,7 @@ def _add(group: Any, name: str, stage: Stage, bundle: Bundle, lattice: Any) -> d
         shape=array.shape,
         dtype=array.dtype.newbyteorder("<"),
         chunks=tuple(min(max(n, 1), CHUNK) for n in array.shape),
-        compressors=(BloscCodec(cname="lz4", clevel=5, shuffle="shuffle"), Crc32cCodec()),
+        compressors=BloscCodec(cname="lz4", clevel=5, shuffle="shuffle"),
         fill_value=np.nan if array.dtype.kind == "f" else 0,
         dimension_names=about["dims"],
         chunk_key_encoding={"name": "default", "separator": "."},  # no folders within, which would need flushing
@@ -143,82 +148,6 @@ def _describe(name: str, array: AnyArray, spec: Array) -> dict[str, Any]:
     }
 
 
-def spill(folder: Path, files: Mapping[str, bytes]) -> None:
-    """Write files below a folder that is there, and flush them and all folders to the disk."""
-    within = sorted({folder / parent for name in files for parent in Path(name).parents})
-    for place in within[1:]:
-        place.mkdir()
-    pool = _writers(os.getpid())  # the file system takes those that wait together
-    under_way = [pool.submit(_write, folder / name, data) for name, data in files.items()]
-    try:
-        for one in under_way:
-            one.result()
-        under_way = [pool.submit(fsync, place) for place in within]
-        for one in under_way:
-            one.result()
-    finally:
-        wait(under_way)  # none may come after what the caller clears away
-
-
-@lru_cache(maxsize=1)
-def _writers(process: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(SYNCS)
-
-
-def _write(path: Path, data: bytes) -> None:
-    with path.open("wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-
-
-def fsync(path: Path) -> None:
-    """Flush a file, or the entries of a folder, to the disk."""
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
-
-
-def checksum(data: bytes) -> str:
-    """CRC32C, 8 hexadecimal digits."""
-    return f"{google_crc32c.value(data):08x}"
-
-
-def crc32c(path: Path) -> str:
-    """Checksum of a file."""
-    return checksum(path.read_bytes())
-
-
-def damage(folder: Path | str, files: Mapping[str, list[Any]], checksums: Callable[[str], bool]) -> str:
-    """What is wrong with the files of an artifact, in words; empty if nothing.
-
-    Sizes are always compared, contents where ``checksums(relative path)`` says so.
-    """
-    for name, (size, crc) in files.items():
-        if wrong := resized(str(folder), {name: size}):
-            return wrong
-        try:
-            if checksums(name) and crc32c(Path(folder, name)) != crc:
-                return f"{name} has another checksum"
-        except (FileNotFoundError, NotADirectoryError):
-            return f"{name} is missing"
-    return ""
-
-
-def resized(folder: str, files: Mapping[str, int]) -> str:
-    """The first file that has not the given size, in words; empty if there is none."""
-    for name, size in files.items():
-        try:
-            found = os.stat(f"{folder}/{name}").st_size
-        except (FileNotFoundError, NotADirectoryError):
-            return f"{name} is missing"
-        if found != size:
-            return f"{name} has {found} bytes instead of {size}"
-    return ""
-
-
 @dataclass(frozen=True)
 class LazyRaster:
     """An array of an artifact of which only the chunks are read that a window touches."""
@@ -232,13 +161,20 @@ class LazyRaster:
         return self.arrays.part(self.name, at)
 
 
+Read = Callable[[int, int], bytes | None]
+"""Bytes of an artifact's file from one offset to another; None if the file has gone."""
+
+
 class LazyArrays(Mapping[str, AnyArray]):
     """Arrays of an artifact, each read at its first access; ``damaged(reason)`` is called before the error."""
 
-    def __init__(self, folder: Path, manifest: Mapping[str, Any], damaged: Callable[[str], None]) -> None:
-        self._folder = folder
+    def __init__(
+        self, read: Read, manifest: Mapping[str, Any], damaged: Callable[[str], None], *, slow: bool = False
+    ) -> None:
+        self._fetch = read
         self._manifest = manifest
         self._damaged = damaged
+        self._slow = slow
         self._loaded: dict[str, AnyArray] = {}
 
     def __iter__(self) -> Iterator[str]:
@@ -274,10 +210,13 @@ class LazyArrays(Mapping[str, AnyArray]):
     def _read(self, name: str, window: tuple[Any, ...]) -> AnyArray:
         if name not in self:
             raise KeyError(f"{self._manifest['stage']} has no array {name!r}, only {', '.join(self) or 'metadata'}")
-        files = {f: v for f, v in self._manifest["files"].items() if f.startswith(f"{name}/")}
-        values, wrong = self._load(name, files, window)
-        if not wrong:
-            return values
+        import zarr
+
+        try:
+            store = _reading(lambda key: self._member(f"{name}/{key}"), self._slow)
+            return np.asarray(zarr.open_array(store=store, mode="r")[window])
+        except _WrongError as error:
+            wrong = str(error)
         self._damaged(wrong)
         raise DamagedError(
             "RIL-504",
@@ -285,21 +224,35 @@ class LazyArrays(Mapping[str, AnyArray]):
             remedy="run again: it will be recomputed",
         )
 
-    def _load(self, name: str, files: Mapping[str, list[Any]], window: tuple[Any, ...]) -> tuple[AnyArray, str]:
-        """Values of a part of an array, and what is wrong with its files, in words."""
-        import zarr
-        from zarr.storage import LocalStore
+    def _member(self, name: str) -> bytes | None:
+        """Content of a member, compared with the manifest; None where zarr asks for one that there never was."""
+        if name not in self._manifest["files"]:
+            return None
+        start, size, crc = self._manifest["files"][name]
+        data = self._fetch(start, start + size)
+        if data is None:
+            raise _WrongError("its file is missing")
+        if len(data) != size:
+            raise _WrongError(f"{name} has {len(data)} bytes instead of {size}")
+        if checksum(data) != crc:
+            raise _WrongError(f"{name} has another checksum")
+        return data
 
-        nothing: AnyArray = np.empty(0)
-        if wrong := damage(self._folder, files, lambda file: file.endswith("zarr.json")):
-            return nothing, wrong
-        try:
-            array = zarr.open_array(store=LocalStore(self._folder / name, read_only=True), mode="r")
-            values = np.asarray(array[window])
-            # zarr fills in for a chunk that has gone while it read (by clearing up, say) without a word
-            return values, damage(self._folder, files, lambda _: False)
-        except Exception as error:  # a chunk's own checksum, and whatever a vanishing file leads to
-            wrong = damage(self._folder, files, lambda _: True)
-            if not wrong:
-                raise
-            return nothing, f"{wrong} ({type(error).__name__} on reading)"
+
+class _WrongError(Exception):
+    """What is wrong with a member, in words."""
+
+
+def _reading(member: Callable[[str], bytes | None], slow: bool) -> Any:
+    """A store of zarr's that asks for each member when it is read: of a window, only the chunks that it touches."""
+    import asyncio
+
+    from zarr.core.buffer import cpu
+    from zarr.storage import MemoryStore
+
+    class Reading(MemoryStore):
+        async def get(self, key: str, prototype: Any = None, byte_range: Any = None) -> Any:
+            data = await asyncio.to_thread(member, key) if slow else member(key)
+            return None if data is None else cpu.Buffer.from_bytes(data)
+
+    return Reading(read_only=True)

@@ -1,115 +1,128 @@
-"""What a sequence's last run found in a folder of artifacts: manifests that nobody touched need not be read again.
+"""What the runs of a sequence found in a store: manifests that nobody touched since need not be read again.
 
-A hint beside the artifacts, ``index/<sequence>``: a line for each artifact with the inode, size and times of its
-manifest, and what the manifest says of digest, facts and file sizes. A look-up compares the manifest's status with the
-line's, and the files' sizes with those of the line; where anything differs, or the index is damaged, the manifest is
-read as if there were no index. Any writing to a file changes its time of change, which nobody can set.
+A hint beside the artifacts, ``index/<sequence>/<name>``, written at the end of a run: a gzip of lines, one for each
+artifact that it used, with the mark of its file (:class:`~pipeline.engine.store.place.Item`) and what the manifest says
+of digest, sizes and facts. Where the mark is another one, or the index is damaged, the manifest is read as if there
+were no index. Clearing up spares what an index names that is younger than its grace.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
-import os
+import sys
 import time
-from collections.abc import Iterable
-from contextlib import suppress
-from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any
+import zlib
+from collections.abc import Iterable, Mapping
+from urllib.parse import quote
 
-import google_crc32c
+from pipeline.engine.store.manifest import Ref, parsed
+from pipeline.engine.store.place import Item, Place
+from stages.core.errors import RilleError
 
-RACY = 100_000_000
-"""Nanoseconds: a manifest that was changed so short a time ago might change again without another time of change."""
+AREA = "index"
 
-SPARE = 3
-"""Lines kept of artifacts that a run did not use, for each one that it did."""
+NEWEST = 4
+"""Indices read of a sequence."""
 
+MOST = 256_000_000
+"""Bytes that all of them may unpack to: a small object may unpack to any size."""
+
+PIECE = 1 << 20
 KEY = 64
 """Digits of a key."""
 
-Status = tuple[int, int, int, int]
+FRESH = 3600.0
+"""Seconds after which a run writes again that it used the same artifacts."""
 
 
-def status(stat: os.stat_result) -> Status:
-    """What changes whenever a file does."""
-    return stat.st_ino, stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns
+class Index:
+    """Lines by key, of the newest indices of a sequence."""
 
+    def __init__(self, place: Place, sequence: str) -> None:
+        self._place = place
+        name = quote(sequence, safe="").replace(".", "%2E")  # no name leads out of it
+        self._folder = f"{AREA}/{name or '-'}"
+        self._written: dict[str, float] = {}
+        self.lines: dict[str, str] = {}
+        room = MOST
+        for item in sorted(place.list(self._folder), key=lambda i: -i.modified)[:NEWEST]:
+            try:
+                room -= _read(place, item, self.lines, room)
+                self._written[item.path] = item.modified
+            except ValueError as error:
+                print(f"rille: {item.path} in the cache is passed over: {error}", file=sys.stderr)
 
-@dataclass(frozen=True)
-class Entry:
-    """What a manifest says, as far as a look-up asks."""
-
-    status: Status
-    digest: str
-    path: str
-    nbytes: int
-    stored: int
-    meta: dict[str, Any]
-    files: dict[str, int]
-
-    def line(self) -> str:
-        """JSON of all of it."""
-        found = [*self.status, self.digest, self.path, self.nbytes, self.stored, self.meta, self.files]
-        return json.dumps(found, separators=(",", ":"))
-
-    @staticmethod
-    def read(line: str) -> Entry:
-        """Of such a line."""
-        ino, size, modified, changed, *rest = json.loads(line)
-        return Entry((ino, size, modified, changed), *rest)
-
-
-@dataclass
-class Catalogue:
-    """Lines by key; ``found`` are those that were read from manifests since, with the manifest's time of change."""
-
-    path: Path
-    lines: dict[str, str] = field(default_factory=dict)
-    found: dict[str, tuple[int, str]] = field(default_factory=dict)
-
-    @staticmethod
-    def load(path: Path) -> Catalogue:
-        """Of a file; a damaged one counts as empty."""
-        with suppress(OSError, ValueError):
-            data = path.read_bytes()
-            head, _, body = data.partition(b"\n")
-            if head == _head(body):
-                return Catalogue(path, {line[:KEY]: line[KEY + 1 :] for line in body.decode().splitlines()})
-        return Catalogue(path)
-
-    def get(self, key: str, now: Status) -> Entry | None:
-        """The entry of a key if its manifest still has that status."""
-        line = self.lines.get(key)
-        if line is None or not line.startswith(f"[{now[0]},{now[1]},{now[2]},{now[3]},"):
+    def get(self, stage: str, item: Item, key: str) -> Ref | None:
+        """What was found in a file, if it still is that."""
+        line = self.lines.get(key, "")
+        if not line.startswith(f'["{item.mark}",'):
+            self.lines.pop(key, None)
             return None
         try:
-            return Entry.read(line)
-        except (ValueError, TypeError, RecursionError):
+            _, digest, nbytes, stored, meta = parsed(line)
+        except (ValueError, TypeError):
             return None
+        return Ref(key, stage, digest, item.path, meta, nbytes, stored)
 
-    def enter(self, key: str, entry: Entry) -> None:
-        """Take in what a manifest says that was read."""
-        self.found[key] = entry.status[3], entry.line()
-
-    def save(self, used: Iterable[str]) -> None:
-        """Write the file where manifests were read; ``used`` are the keys that a run asked for. Best effort."""
-        settled = time.time_ns() - RACY
-        new = {key: line for key, (changed, line) in self.found.items() if changed < settled}
-        if not new:
-            return
-        lines = self.lines | new
-        chosen = {key: lines[key] for key in used if key in lines}
-        others = [key for key in lines if key not in chosen]
-        chosen |= {key: lines[key] for key in others[: SPARE * len(chosen)]}
-        body = "".join(f"{key} {line}\n" for key, line in chosen.items()).encode()
-        temporary = self.path.with_name(f"{self.path.name}.{os.getpid()}.tmp")
-        with suppress(OSError):
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            temporary.write_bytes(_head(body) + b"\n" + body)
-            temporary.replace(self.path)
-            self.lines, self.found = chosen, {}
+    def note(self, used: Mapping[str, Ref]) -> None:
+        """Write what a run used, unless an index says so that is young."""
+        known = {key: self.lines[key] for key in used if key in self.lines}
+        if len(known) < len(used):
+            self._place.survey()
+            for key in used.keys() - known.keys():
+                ref = used[key]
+                item = self._place.status(ref.path)
+                if item is not None and item.mark and item.size == ref.stored:
+                    known[key] = _line(item.mark, ref)
+        # named by what it says: of runs that use the same there is one
+        lines = [f"{key} {known[key]}\n" for key in sorted(known)]
+        name = hashlib.sha256("".join(lines).encode()).hexdigest()[:32]
+        path = f"{self._folder}/{name}"
+        if known and self._written.get(path, 0.0) < time.time() - FRESH:
+            self._place.write(path, pack(lines))
+            self.lines |= known
 
 
-def _head(body: bytes) -> bytes:
-    return b"rille 1 %08x %d" % (google_crc32c.value(body), len(body))
+def _line(mark: str, ref: Ref) -> str:
+    return json.dumps([mark, ref.digest, ref.nbytes, ref.stored, ref.meta], separators=(",", ":"))
+
+
+def pack(lines: Iterable[str]) -> bytes:
+    """Compress line by line."""
+    packer = zlib.compressobj(5, wbits=zlib.MAX_WBITS | 16)
+    return b"".join([*(packer.compress(line.encode()) for line in lines), packer.flush()])
+
+
+def _read(place: Place, item: Item, lines: dict[str, str], room: int) -> int:
+    """Take lines in that are not known yet; gives the bytes of all. Raises ValueError where it is none of ours."""
+    data, unpacker, size = place.read(item.path), zlib.decompressobj(wbits=zlib.MAX_WBITS | 16), 0
+    found: dict[str, str] = {}
+    rest = b""
+    try:
+        while data and not unpacker.eof:
+            piece = unpacker.decompress(data, PIECE)
+            size, data = size + len(piece), unpacker.unconsumed_tail
+            if size > room:
+                raise ValueError(f"it unpacks to more than {room / 1e6:.0f} MB")
+            *whole, rest = (rest + piece).split(b"\n")
+            found |= {line[:KEY].decode("ascii"): line[KEY + 1 :].decode() for line in whole}
+    except zlib.error as error:
+        raise ValueError(f"it is damaged ({error})") from None
+    if not unpacker.eof or rest:
+        raise ValueError("it is cut short")
+    for key, line in found.items():
+        lines.setdefault(key, line)
+    return size
+
+
+def used_since(place: Place, limit: float) -> set[str]:
+    """Keys that indices name which were written after a time."""
+    keys: dict[str, str] = {}
+    for item in place.list(AREA):
+        if item.modified > limit:
+            try:
+                _read(place, item, keys, MOST)
+            except (ValueError, RilleError):
+                continue
+    return keys.keys() | set()

@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import time
 from collections.abc import Collection, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
-from pathlib import Path
 
 from pipeline.engine.runtime import numba_cache
-from pipeline.engine.store import s3_maintenance
-from pipeline.engine.store.artifact import DamagedError, LazyArrays, array_digests, damage, output_digest
-from pipeline.engine.store.folder import Manifest, Store
-from pipeline.engine.store.s3 import ObjectStore
+from pipeline.engine.store import index
+from pipeline.engine.store.artifact import DamagedError, LazyArrays, array_digests, output_digest
+from pipeline.engine.store.base import Store
+from pipeline.engine.store.manifest import STAGE, Manifest, artifact_path, damage, length, unframe
 
 GRACE = 24 * 3600.0
-"""Seconds before an attempt without a manifest counts as an orphan: no single task takes a day."""
+"""Seconds before what no run is known to use goes: no single task takes a day."""
+
+ARTIFACT = re.compile(rf"artifacts/({STAGE})/(\w\w)/(\w+)\.zarr\.zip")
+PASSING = re.compile(rf"(?:{index.AREA}|quarantine|probe)/.+")
+LEFTOVER = re.compile(
+    r"(?:.+/)?\.tmp-\w+(?:/.+)?"  # of a writer that was killed
+    rf"|artifacts/{STAGE}/\w\w/\w{{64}}/.+|manifests/{STAGE}/\w+\.json|data/{STAGE}/\w+/a-\w+/.+"  # of earlier formats
+)
 
 
 @dataclass(frozen=True)
@@ -40,39 +47,43 @@ class Cleared:
     """Number and bytes of the artifacts, by stage."""
 
 
+def artifacts(store: Store) -> Iterator[tuple[str, str]]:
+    """Stage and key of everything committed; files of other names are not ours."""
+    for item in store.place.list("artifacts"):
+        if found := ARTIFACT.fullmatch(item.path):
+            yield found[1], found[3]
+
+
 def verify(store: Store, *, deep: bool = False) -> tuple[int, list[Damage]]:
-    """Compare every file of every artifact with its recorded checksum; damaged ones are set aside.
+    """Compare every byte of every artifact with the recorded checksums; damaged ones are set aside.
 
     ``deep`` decodes every chunk as well and compares the digests (SHA-256) of what was computed.
 
     Returns the number of sound artifacts, and the damaged ones.
     """
-    if isinstance(store, ObjectStore):
-        judged = list(s3_maintenance.verify(store))
-        return sum(not reason for *_, reason in judged), [Damage(*found) for found in judged if found[-1]]
     sound, found = 0, []
     for stage, key in artifacts(store):
-        manifest = store.manifest(stage, key)
-        if manifest is None and not (store.home(stage, key) / "manifest.json").exists():
+        data = store.place.read(artifact_path(stage, key))
+        if data is None:
             continue  # cleared away, or set aside by a run, just now
-        if manifest is None:
-            reason, label = "manifest.json is not readable", ""
+        manifest = None
+        with suppress(ValueError):
+            manifest = unframe(data[: length(data)])
+        if manifest is None or (manifest["stage"], manifest["key"]) != (stage, key):
+            reason = "the manifest is not readable"
         else:
-            reason = damage(store.root / manifest["path"], manifest["files"], lambda _: True)
-            reason = reason or (_decoded(store, manifest) if deep else "")
-            label = manifest["label"]
+            reason = damage(manifest, data) or (_decoded(manifest, data) if deep else "")
         if reason:
             store.set_aside(stage, key, manifest, reason)
-            found.append(Damage(stage, key, label, reason))
-        else:
-            sound += 1
+            found.append(Damage(stage, key, manifest["label"] if manifest else "", reason))
+        sound += not reason
     return sound, found
 
 
-def _decoded(store: Store, manifest: Manifest) -> str:
+def _decoded(manifest: Manifest, data: bytes) -> str:
     """What is wrong with the decoded arrays or the metadata of an artifact; empty if nothing."""
     try:
-        digests = array_digests(LazyArrays(store.root / manifest["path"], manifest, lambda _: None))
+        digests = array_digests(LazyArrays(lambda start, stop: data[start:stop], manifest, lambda _: None))
     except DamagedError as error:
         return error.message
     wrong = [name for name, found in digests.items() if found != manifest["arrays"][name]["sha256"]]
@@ -82,75 +93,33 @@ def _decoded(store: Store, manifest: Manifest) -> str:
 
 
 def gc(store: Store, keep: Collection[str], *, grace: float = GRACE, dry_run: bool = False) -> Cleared:
-    """Remove artifacts whose key is not in ``keep``, orphans, quarantine, and this user's kernels that nothing uses.
+    """Remove artifacts whose key is not in ``keep``, leftovers, quarantine, and this user's kernels that nothing uses.
 
-    Only what was neither made nor used within ``grace`` seconds goes (a run may be under way). The manifest goes first,
-    so that an interruption leaves an orphan and never half an artifact. ``keep`` are the keys of the kept runs
-    (:func:`pipeline.engine.events.keys`).
+    Only what was neither made nor used within ``grace`` seconds goes (a run may be under way); what a run used is told
+    by its index. ``keep`` are the keys of the kept runs (:func:`pipeline.engine.events.keys`). The ages of a bucket are
+    by the server's clock against this machine's: keep the grace well above their difference.
     """
-    if isinstance(store, ObjectStore):
-        return Cleared(*s3_maintenance.gc(store, keep, grace=grace, dry_run=dry_run))
-    cleared = Cleared()
-    limit = time.time() - grace
-    kept = set(keep)
-    for home in sorted(store.root.glob("artifacts/*/*/*")):
-        _clear_home(store, home, home.name in kept, limit, cleared, dry_run)
-    for path in (*store.root.glob("*.tmp"), *store.root.glob("hints/*/*.tmp")):
-        if _written(path) <= limit:
+    limit, cleared, doomed = time.time() - grace, Cleared(), []
+    kept = set(keep) | index.used_since(store.place, limit)
+    for item in store.place.list(""):
+        if item.modified > limit:
+            continue
+        if found := ARTIFACT.fullmatch(item.path):
+            if found[3] in kept:
+                continue
+            cleared.artifacts += 1
+            stage = cleared.stages.setdefault(found[1], [0, 0])
+            stage[0], stage[1] = stage[0] + 1, stage[1] + item.size
+        elif LEFTOVER.fullmatch(item.path):
             cleared.orphans += 1
-            _remove(path, cleared, dry_run)
-    for path in (*store.root.glob("quarantine/*"), *store.root.glob("index/*")):
-        if _written(path) <= limit:
-            _remove(path, cleared, dry_run)
+        elif not PASSING.fullmatch(item.path):
+            continue
+        cleared.bytes += item.size
+        doomed.append(item.path)
     for path in numba_cache.unused():
-        _remove(path, cleared, dry_run)
-    return cleared
-
-
-def _clear_home(store: Store, home: Path, kept: bool, limit: float, cleared: Cleared, dry_run: bool) -> None:
-    published = home / "manifest.json"
-    manifest = store.manifest(home.parents[1].name, home.name)
-    mine = home / Path(manifest["path"]).name if manifest else None
-    if mine is not None and not kept and _written(published) <= limit:
-        cleared.artifacts += 1
-        before = cleared.bytes
-        _remove(published, cleared, dry_run)
-        _remove(mine, cleared, dry_run)
-        stage = cleared.stages.setdefault(home.parents[1].name, [0, 0])
-        stage[0], stage[1] = stage[0] + 1, stage[1] + cleared.bytes - before
-    for path in (*home.glob("a-*"), *home.glob("m-*.tmp")):
-        if path != mine and _written(path) <= limit:
-            cleared.orphans += 1
-            _remove(path, cleared, dry_run)
+        cleared.bytes += sum(file.stat().st_size for file in ([path] if path.is_file() else path.rglob("*")))
+        if not dry_run:
+            shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
     if not dry_run:
-        with suppress(OSError):
-            home.rmdir()  # only where nothing is left
-
-
-def artifacts(store: Store) -> Iterator[tuple[str, str]]:
-    """Stage and key of everything committed."""
-    if isinstance(store, ObjectStore):
-        yield from s3_maintenance.artifacts(store)
-        return
-    for path in sorted(store.root.glob("artifacts/*/*/*/manifest.json")):
-        yield path.parents[2].name, path.parent.name
-
-
-def _written(path: Path) -> float:
-    try:
-        return path.stat().st_mtime
-    except OSError:
-        return float("inf")
-
-
-def _remove(path: Path, cleared: Cleared, dry_run: bool) -> None:
-    with suppress(OSError):  # somebody else clears away too
-        for file in [path] if path.is_file() else path.rglob("*"):
-            with suppress(OSError):
-                cleared.bytes += file.stat().st_size if file.is_file() else 0
-    if dry_run:
-        return
-    if path.is_file():
-        path.unlink(missing_ok=True)
-    else:
-        shutil.rmtree(path, ignore_errors=True)
+        store.place.delete(doomed)
+    return cleared

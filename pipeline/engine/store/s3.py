@@ -1,319 +1,335 @@
-"""Artifacts in a bucket of an S3-compatible server: the same commit as on disk, with few requests.
+"""A prefix of a bucket of an S3-compatible server as a place for a store, and what to say when it fails.
 
-Objects below the prefix::
+Credentials, region and endpoint come from the environment alone (``AWS_ACCESS_KEY_ID``, ``AWS_SECRET_ACCESS_KEY``,
+``AWS_SESSION_TOKEN``, ``AWS_REGION``, ``AWS_ENDPOINT_URL`` ...) and are never written anywhere; of what a server
+answers only its error code is told. Server errors and lost connections are tried again for half a minute, at the first
+contact for a few seconds.
 
-    manifests/<stage>/<key>.json        the only commit point: written with If-None-Match: *
-    data/<stage>/<key>/a-<unique>/      one attempt: an immutable zarr 3 group
-    index/<digest>.json.gz              manifests that a run used: what it read, and that it used them
-    quarantine/...                      manifests of damaged artifacts, with the reason
-    rille.json                          the server was tried (pipeline.engine.store.s3_client)
-
-All objects of an attempt are there before its manifest is written, and a manifest names each with size and crc32c,
-which are compared with every object read. Killed at any instant, a run leaves a whole artifact or an orphan that nobody
-reads. A writer that does not know whether its manifest arrived leaves its attempt to clearing up. A look-up trusts the
-manifest and does not ask for each object: an object store writes whole objects only, and what was deleted from outside
-is found when it is read, set aside and computed again, or by :func:`pipeline.engine.store.s3_maintenance.verify`.
-
-A survey lists the manifests (a request a thousand) and takes what they say from the indices of the last runs, where the
-ETag is the same: a run that finds everything asks four times, however many artifacts there are.
+A commit relies on ``If-None-Match: *``: of two that write a manifest one must be refused. A server that ignores it
+would let the second overwrite what was published, so the first contact with a prefix tries it, and refuses the server
+if both writes succeed. That it passed is noted in the object ``rille.json`` with the endpoint it was tried at.
+An artifact is one object, and an object is there whole or not at all: nothing is left over, whenever a run is killed.
 """
 
 from __future__ import annotations
 
-import gzip
-import hashlib
 import json
 import os
-import time
+import re
 import uuid
-import zlib
-from collections.abc import Callable, Iterable, Mapping
-from contextlib import suppress
-from pathlib import Path
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
+from datetime import timedelta
+from functools import lru_cache
+from typing import Any, TypeVar
 
-import numpy as np
+from pipeline.engine.store.place import FORMAT, MARK, Item
+from stages.core.errors import ConfigError, RilleError
 
-from pipeline.engine.store.artifact import LazyArrays, checksum
-from pipeline.engine.store.folder import (
-    USED,
-    Manifest,
-    Ref,
-    Store,
-    StoreError,
-    frame,
-    parsed,
-    reference,
-    sound,
-    unframe,
-)
-from pipeline.engine.store.location import hints_folder
-from pipeline.engine.store.s3_client import Bucket, BucketError, Entry, OddNameError, connect
-from stages.core.declare import AnyArray
+AT_ONCE = 200
+"""Objects deleted in one go."""
 
-MOST_UNPACKED = 256_000_000
-"""Bytes of an index; one of a hundred thousand artifacts has less, and a small object may unpack to any size."""
+PATIENT = {"max_retries": 8, "retry_timeout": timedelta(seconds=30)}
+HASTY = {"max_retries": 2, "retry_timeout": timedelta(seconds=5)}
+"""For the first contact, where a wrong address is likelier than a server in trouble."""
 
-INDICES = 8
-"""Indices read by a survey, the newest."""
+BROKEN = 3
+"""Answers broken off, of one reading, before the last try."""
+
+BACK_OFF = {"init_backoff": timedelta(milliseconds=100), "max_backoff": timedelta(seconds=4), "base": 2}
 
 
-class ObjectStore(Store):
-    """Artifacts at ``s3://bucket/prefix``; see :class:`~pipeline.engine.store.folder.Store`."""
+T = TypeVar("T")
 
-    def __init__(self, url: str) -> None:
-        super().__init__(hints_folder(url))
+
+class BucketError(RilleError):
+    """The object store does not do what is asked of it."""
+
+
+class OddNameError(BucketError):
+    """An object has a name that no listing gives: with ``..``, an empty part or a control character."""
+
+
+class Bucket:
+    """Objects below a prefix, and the credentials to reach it; see :class:`~pipeline.engine.store.place.Place`."""
+
+    slow = True
+
+    def __init__(self, url: str, retry: dict[str, Any] = PATIENT) -> None:
         self.location = url
-        self.bucket = connect(url)
-        self._listed: dict[str, str] | None = None
-        """ETags of the manifests that were there at the survey."""
-        self._known: dict[str, tuple[str, Manifest]] = {}
-        """Manifests with their ETags, by path."""
-        self._indices: dict[str, Entry] = {}
+        self._store = _store(url, retry)
+        self._listed: dict[str, Item] | None = None
+        self._earlier = False
 
-    # -- looking up ---------------------------------------------------------------------------------------------
-
-    def survey(self, sequence: str) -> None:
-        """List the manifests, and read the newest indices (a copy of each is kept on this machine)."""
-        try:
-            self._listed = {e.path: e.etag for e in self.bucket.list("manifests")}
-            self._indices = {e.path: e for e in self.bucket.list("index")}
-        except OddNameError:
-            return  # then each manifest is asked for
-        for entry in sorted(self._indices.values(), key=lambda e: -e.modified)[:INDICES]:
-            for path, (etag, manifest) in self._index(entry.path).items():
-                if self._listed.get(path) == etag:
-                    self._known.setdefault(path, (etag, manifest))
-
-    def writable(self) -> None:
+    def begin(self) -> None:
         """The server says so at the first commit."""
 
-    def _index(self, path: str) -> dict[str, tuple[str, Manifest]]:
-        """A damaged index counts as empty, as does a damaged copy."""
-        copy = self.root / path
-        with suppress(OSError, ValueError):
-            return _unpack(path, copy.read_bytes())
-        found = self.bucket.get(path)
-        with suppress(OSError, ValueError):
-            if found is not None:
-                index = _unpack(path, found[0])
-                _keep(copy, found[0])
-                return index
-        return {}
+    def earlier(self) -> bool:
+        """As the mark said."""
+        return self._earlier
 
-    def _fetch(self, path: str) -> Manifest | None:
-        """Read a manifest. Raises ValueError where its content is not what was written."""
-        found = self.bucket.get(path)
-        if found is None:
-            self._known.pop(path, None)
-            return None
-        manifest = unframe(found[0])
-        self._known[path] = (found[1], manifest)
-        return manifest
+    def survey(self) -> None:
+        """List the artifacts: a request a thousand. Where an object of another has an odd name, each is asked for."""
+        with suppress(OddNameError):
+            self._listed = {item.path: item for item in self.list("artifacts")}
 
-    def _find(self, path: str, fresh: bool = False) -> Manifest | None:
-        if not fresh and path in self._known:
-            return self._known[path][1]
-        if not fresh and self._listed is not None and path not in self._listed:
-            return None
-        return self._fetch(path)
+    def status(self, path: str, *, fresh: bool = False) -> Item | None:
+        """As of the survey, else by a request."""
+        import obstore
 
-    def lookup(self, stage: str, key: str, *, fresh: bool = False) -> Ref | None:
-        """The artifact of a key, as of the survey if there was one and not ``fresh``."""
-        try:
-            manifest = self._find(manifest_path(stage, key), fresh)
-        except ValueError:
-            self.set_aside(stage, key, None, "the manifest is not readable")
-            return None
-        return None if manifest is None else reference(manifest)
+        if not fresh and self._listed is not None:
+            return self._listed.get(path)
 
-    def manifest(self, stage: str, key: str) -> Manifest | None:
-        """Manifest of a key; None if absent or not readable."""
-        try:
-            return self._find(manifest_path(stage, key))
-        except ValueError:
-            return None
-
-    def note(self, refs: Iterable[Ref]) -> None:
-        """Write an index of what a run used, unless the same was written within the hour. Best effort."""
-        paths = sorted({manifest_path(ref.stage, ref.key) for ref in refs})
-        with suppress(BucketError, ValueError):  # the credentials may permit reading alone
-            for path, found in self.bucket.get_all(p for p in paths if p not in self._known).items():
-                if found is not None:
-                    self._known[path] = (found[1], unframe(found[0]))
-            name, data = _pack({p: self._known[p] for p in paths if p in self._known})
-            before = self._indices.get(name)
-            if before is None or before.modified < time.time() - USED:
-                self.bucket.put(name, data)
-                with suppress(OSError):
-                    _keep(self.root / name, data)
-
-    # -- reading ------------------------------------------------------------------------------------------------
-
-    def path(self, ref: Ref) -> Path:
-        """Artifacts here are not files."""
-        raise StoreError(
-            "RIL-557", f"{ref.path} is in {self.location}, not in a folder", remedy="open it with zarr and obstore"
-        )
-
-    def _current(self, ref: Ref) -> Manifest | None:
-        path = manifest_path(ref.stage, ref.key)
-        with suppress(ValueError):
-            return self._known[path][1] if path in self._known else self._fetch(path)
-        return None
-
-    def _arrays(self, manifest: Manifest, damaged: Callable[[str], None]) -> LazyArrays:
-        return RemoteArrays(self.bucket, manifest, damaged)
-
-    # -- writing ------------------------------------------------------------------------------------------------
-
-    def _write(self, manifest: Manifest, files: Mapping[str, bytes]) -> Manifest | None:
-        manifest["path"] = f"data/{manifest['stage']}/{manifest['key']}/a-{uuid.uuid4().hex[:16]}"
-        objects = {f"{manifest['path']}/{name}": data for name, data in files.items()}
-        try:
-            self.bucket.put_all(objects)
-        except BaseException:
-            self._discard(objects)
-            raise
-        there = self._create(manifest, frame(manifest))
-        if there is not None:
-            self._discard(objects)
-        return there
-
-    def _create(self, manifest: Manifest, framed: bytes) -> Manifest | None:
-        """Write the manifest unless there is one; returns the one that was there before, if any."""
-        stage, key = manifest["stage"], manifest["key"]
-        path = manifest_path(stage, key)
-        for _ in range(3):
-            if self.bucket.create(path, framed):
-                return None
+        def ask() -> Item | None:
             try:
-                there = self._fetch(path)
-            except ValueError:
-                self.set_aside(stage, key, None, "the manifest is not readable")
-                continue
-            if there is not None:  # it may be this one, whose first answer was lost
-                return None if there["path"] == manifest["path"] else there
-        raise StoreError(
-            "RIL-558", f"cannot publish {path} in {self.location}", remedy="remove that object and run again"
-        )
+                return _item(obstore.head(self._store, path))
+            except FileNotFoundError as error:
+                if _code(error) == "NoSuchBucket":
+                    raise
+                return None
 
-    def _discard(self, objects: Iterable[str]) -> None:
-        with suppress(BucketError):
-            self.bucket.delete(objects)
+        found = self._again(ask)
+        if self._listed is not None and found is not None:
+            self._listed[path] = found
+        elif self._listed is not None:
+            self._listed.pop(path, None)
+        return found
 
-    def set_aside(self, stage: str, key: str, manifest: Manifest | None, reason: str) -> None:
-        """Take the manifest of a damaged artifact away; its objects stay as an orphan. Best effort.
+    def read(self, path: str, start: int = 0, stop: int | None = None) -> bytes | None:
+        """Read an object, or a range of it."""
+        import obstore
 
-        Another run may have done so before, and have published a sound one meanwhile: that one stays.
+        if start == stop:
+            return b""
+
+        def fetch() -> bytes | None:
+            try:
+                options: Any = {} if stop is None else {"options": {"range": (start, stop)}}
+                return bytes(obstore.get(self._store, path, **options).bytes())
+            except FileNotFoundError as error:
+                if _code(error) == "NoSuchBucket":
+                    raise
+                return None
+
+        return self._again(fetch)
+
+    def _again(self, read: Callable[[], T]) -> T:
+        """Read once more where the connection broke within an answer: that is not tried again below."""
+        import obstore
+
+        with self._clear_errors():
+            for _ in range(BROKEN):
+                with suppress(obstore.exceptions.GenericError):
+                    return read()
+            return read()
+
+    def write(self, path: str, data: bytes) -> None:
+        """Write an object, whatever was there."""
+        import obstore
+
+        with self._clear_errors():
+            obstore.put(self._store, path, data, use_multipart=False)
+
+    def create(self, path: str, pieces: Iterable[bytes]) -> bool:
+        """Write an object unless there is one.
+
+        False may also mean that an earlier try of this very call was carried out, and its answer lost.
         """
-        path = manifest_path(stage, key)
-        self._known.pop(path, None)
+        import obstore
+
+        with self._clear_errors():
+            try:
+                obstore.put(self._store, path, b"".join(pieces), mode="create", use_multipart=False)
+            except obstore.exceptions.AlreadyExistsError:
+                return False
+        return True
+
+    def delete(self, paths: Iterable[str]) -> None:
+        """Remove objects."""
+        import obstore
+
+        chosen = list(paths)
+        for start in range(0, len(chosen), AT_ONCE):
+            with self._clear_errors(), suppress(FileNotFoundError):
+                obstore.delete(self._store, chosen[start : start + AT_ONCE])
+
+    def move(self, path: str, to: str) -> None:
+        """Copy an object within the server, and remove it."""
+        import obstore
+
+        with self._clear_errors(), suppress(FileNotFoundError):
+            obstore.copy(self._store, path, to)
+        self.delete([path])
         if self._listed is not None:
             self._listed.pop(path, None)
-        with suppress(BucketError):
-            found = self.bucket.get(path)
-            if found is None:
-                return
-            with suppress(ValueError):
-                if manifest is None or unframe(found[0])["path"] != manifest["path"]:
-                    return
-            name = f"quarantine/{stage}-{key[:16]}-{uuid.uuid4().hex[:8]}"
-            self.bucket.put_all({f"{name}/manifest.json": found[0], f"{name}/reason.txt": f"{reason}\n".encode()})
-            self.bucket.delete([path])
 
+    def list(self, area: str) -> list[Item]:
+        """All objects."""
+        import obstore
 
-class RemoteArrays(LazyArrays):
-    """Arrays of an artifact in a bucket."""
+        def pages() -> list[Item]:
+            return [_item(found) for page in obstore.list(self._store, area or None, chunk_size=1000) for found in page]
 
-    def __init__(self, bucket: Bucket, manifest: Mapping[str, Any], damaged: Callable[[str], None]) -> None:
-        super().__init__(Path(manifest["path"]), manifest, damaged)
-        self._bucket = bucket
+        return self._again(pages)
 
-    def _load(self, name: str, files: Mapping[str, list[Any]], window: tuple[Any, ...]) -> tuple[AnyArray, str]:
-        import zarr
+    def url(self, path: str) -> str:
+        """Of an archive, as fsspec writes it (which needs s3fs)."""
+        return f"zip::{self.location}/{path}"
 
-        def fetch(key: str) -> bytes | None:
-            file = f"{name}/{key}"
-            if file not in files:
-                return None
-            found = self._bucket.get(f"{self._manifest['path']}/{file}")
-            data = None if found is None else found[0]
-            if wrong := damaged_objects({file: files[file]}, {file: data}):
-                raise _WrongError(wrong)
-            return data
+    @contextmanager
+    def _clear_errors(self) -> Iterator[None]:
+        import obstore
 
         try:
-            array = zarr.open_array(store=_reading(fetch), mode="r")
-            return np.asarray(array[window]), ""
-        except _WrongError as error:
-            return np.empty(0), str(error)
+            yield
+        except (obstore.exceptions.BaseError, FileNotFoundError, PermissionError) as error:
+            raise self._told(error) from None  # the original has the request at length
+
+    def _told(self, error: BaseException) -> BucketError:
+        import obstore
+
+        text, code, bucket = str(error), _code(error), self.location.split("/")[2]
+        endpoint = _endpoint()
+        if isinstance(error, obstore.exceptions.InvalidPathError):
+            name = re.search(r'path: (".*?")', text)
+            return OddNameError(
+                "RIL-766",
+                f"objects of {self.location} cannot be listed: one is named {name[1] if name else 'oddly'}",
+                remedy="remove it by another program; it is none of Rille's",
+            )
+        if code == "NoSuchBucket":
+            return BucketError(
+                "RIL-508", f"bucket {bucket} does not exist at {endpoint}", remedy="make it, or correct --cache"
+            )
+        if "169.254.169.254" in text or "169.254.170.2" in text:
+            remedy = "set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_PROFILE"
+            return BucketError("RIL-509", f"no credentials for {self.location} in the environment", remedy=remedy)
+        if re.search(r"\b40[13] ", text) or isinstance(error, PermissionError):
+            remedy = "check AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY, AWS_SESSION_TOKEN and the bucket's policy"
+            return BucketError(
+                "RIL-510",
+                f"{endpoint} refuses the credentials for {self.location} ({code or 'forbidden'})",
+                remedy=remedy,
+            )
+        if status := re.search(r"status code: (\d{3}[^:\n]{0,40})", text):
+            what = f"answers {status[1].strip()}" + (f" ({code})" if code else "")
+            return BucketError(
+                "RIL-511", f"{endpoint} {what} for {self.location}", remedy="try later: what is committed stays"
+            )
+        return BucketError(
+            "RIL-512", f"no object store answers at {endpoint} for {self.location}", remedy="check AWS_ENDPOINT_URL"
+        )
 
 
-class _WrongError(Exception):
-    """What is wrong with an object."""
+def _item(found: Any) -> Item:
+    return Item(found["path"], found["size"], str(found["e_tag"]).strip('"'), found["last_modified"].timestamp())
 
 
-def _reading(fetch: Callable[[str], bytes | None]) -> Any:
-    """A store of zarr's that asks for each object when it is read: of a window, only the chunks that it touches."""
-    import asyncio
-
-    from zarr.core.buffer import cpu
-    from zarr.storage import MemoryStore
-
-    class Reading(MemoryStore):
-        async def get(self, key: str, prototype: Any = None, byte_range: Any = None) -> Any:
-            data = await asyncio.to_thread(fetch, key)  # several at once
-            return None if data is None else cpu.Buffer.from_bytes(data)
-
-    return Reading(read_only=True)
+def _code(error: BaseException) -> str:
+    found = re.search(r"<Code>(\w{1,60})</Code>", str(error))
+    return found[1] if found else ""
 
 
-def manifest_path(stage: str, key: str) -> str:
-    """Object whose being there makes an artifact."""
-    return f"manifests/{stage}/{key}.json"
+def _endpoint() -> str:
+    """Host and port alone: a URL may hold a password."""
+    url = os.environ.get("AWS_ENDPOINT_URL_S3") or os.environ.get("AWS_ENDPOINT_URL") or os.environ.get("AWS_ENDPOINT")
+    return re.sub(r"^\w+://(.*@)?", "", url).split("/")[0] if url else "AWS"
 
 
-def damaged_objects(files: Mapping[str, list[Any]], contents: Mapping[str, bytes | None]) -> str:
-    """What is wrong with the objects of an artifact, in words; empty if nothing."""
-    for name, (size, crc) in files.items():
-        data = contents[name]
-        if data is None:
-            return f"{name} is missing"
-        if len(data) != size:
-            return f"{name} has {len(data)} bytes instead of {size}"
-        if checksum(data) != crc:
-            return f"{name} has another checksum"
-    return ""
+def _store(url: str, retry: dict[str, Any]) -> Any:
+    from obstore.store import S3Store
 
-
-def _pack(index: dict[str, tuple[str, Manifest]]) -> tuple[str, bytes]:
-    """Name and content of an index; equal ones have one name."""
-    name = hashlib.sha256(json.dumps([[path, etag] for path, (etag, _) in index.items()]).encode()).hexdigest()[:32]
-    data = json.dumps(index).encode()
-    return f"index/{name}.json.gz", gzip.compress(hashlib.sha256(data).digest() + data, 5, mtime=0)
-
-
-def _unpack(path: str, packed: bytes) -> dict[str, tuple[str, Manifest]]:
-    """Raises ValueError or OSError where it is damaged."""
-    unpacker = zlib.decompressobj(wbits=zlib.MAX_WBITS | 16)
+    bucket, _, prefix = url.removeprefix("s3://").partition("/")
+    endpoint = os.environ.get("AWS_ENDPOINT_URL_S3") or os.environ.get("AWS_ENDPOINT_URL") or ""
+    options: Any = {"timeout": "30s", "connect_timeout": "4s"}
+    if endpoint.startswith("http://"):
+        options["allow_http"] = True
+    config: Any = {"endpoint": endpoint} if endpoint else {}
+    if "AWS_REGION" not in os.environ:
+        config["region"] = os.environ.get("AWS_DEFAULT_REGION") or "us-east-1"
+    patience: Any = {**retry, "backoff": BACK_OFF}
+    extra: dict[str, Any] = {}
+    if os.environ.get("AWS_PROFILE") and not os.environ.get("AWS_ACCESS_KEY_ID"):
+        extra["credential_provider"] = _profile()
     try:
-        data = unpacker.decompress(packed, MOST_UNPACKED)
-    except zlib.error as error:
-        raise ValueError(f"{path} is damaged: {error}") from None
-    if not unpacker.eof:
-        raise ValueError(f"{path} is cut short, or unpacks to more than {MOST_UNPACKED} bytes")
-    if hashlib.sha256(data[32:]).digest() != data[:32]:
-        raise ValueError(f"{path} is damaged")
-    index = parsed(data[32:])
+        return S3Store(
+            bucket,
+            prefix=prefix or None,
+            config=config,
+            client_options=options,
+            retry_config=patience,
+            **extra,
+        )
+    except Exception as error:
+        reason = str(error).splitlines()[0][:120]
+        raise ConfigError(
+            "RIL-513", f"the environment does not describe an object store: {reason}", remedy="check AWS_*"
+        ) from None
+
+
+def _profile() -> Any:
     try:
-        return {name: (str(etag), sound(manifest)) for name, (etag, manifest) in index.items()}
-    except (TypeError, AttributeError) as error:
-        raise ValueError(f"{path} is damaged: {error}") from None
+        from obstore.auth.boto3 import Boto3CredentialProvider
+    except ImportError:
+        raise ConfigError(
+            "RIL-514",
+            "AWS_PROFILE is read with boto3, which is not installed",
+            remedy="pip install boto3, or set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY",
+        ) from None
+    try:
+        return Boto3CredentialProvider()
+    except Exception as error:
+        raise ConfigError(
+            "RIL-515", f"AWS_PROFILE: {str(error).splitlines()[0][:120]}", remedy="check ~/.aws/config"
+        ) from None
 
 
-def _keep(copy: Path, data: bytes) -> None:
-    copy.parent.mkdir(parents=True, exist_ok=True)
-    temporary = copy.with_name(f"{copy.name}.{os.getpid()}.tmp")
-    temporary.write_bytes(data)
-    temporary.replace(copy)
+def connect(url: str) -> Bucket:
+    """The bucket of a cache, its server tried; once a process.
+
+    Raises
+    ------
+    BucketError
+        The server does not answer, refuses, has no such bucket, or ignores ``If-None-Match``.
+    """
+    return _connect(url, os.getpid(), _endpoint())
+
+
+@lru_cache(maxsize=8)
+def _connect(url: str, process: int, endpoint: str) -> Bucket:
+    earlier = _try(Bucket(url, HASTY), endpoint)
+    bucket = Bucket(url)
+    bucket._earlier = earlier
+    return bucket
+
+
+def _try(bucket: Bucket, endpoint: str) -> bool:
+    """Whether artifacts of an earlier format were there; the mark is written where it says anything else than now."""
+    mark, now = bucket.read(MARK), {"format": FORMAT, "create_if_absent": endpoint}
+    found: dict[str, Any] = {}
+    with suppress(ValueError, TypeError):
+        found = dict(json.loads(mark or b"{}"))
+    earlier = bool(found.get("format", FORMAT) != FORMAT)
+    if found.get("create_if_absent") == endpoint:
+        if earlier:
+            with suppress(BucketError):  # the credentials may permit reading alone
+                bucket.write(MARK, json.dumps(now).encode())
+        return earlier
+    path, first = f"probe/{uuid.uuid4().hex}", os.urandom(16)
+    refused = False
+    try:
+        bucket.create(path, [first])
+        refused = not bucket.create(path, [first[::-1]])
+        kept = bucket.read(path)
+    finally:
+        with suppress(BucketError):
+            bucket.delete([path])
+    if not refused or kept != first:
+        raise BucketError(
+            "RIL-516",
+            f"{endpoint} ignores If-None-Match: of two runs on {bucket.location} one could overwrite what the other has"
+            " published, so this store is not used",
+            remedy="use a server that honours it (AWS S3, MinIO, Ceph, R2 in recent versions), or a folder as cache",
+        )
+    bucket.write(MARK, json.dumps(now).encode())
+    return earlier

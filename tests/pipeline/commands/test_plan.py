@@ -10,7 +10,7 @@ from pipeline.commands import plan
 from pipeline.engine import forecast, scheduler
 from pipeline.engine.graph import Graph
 from pipeline.engine.memory import cost_model
-from pipeline.engine.store.folder import Store
+from pipeline.engine.store.base import Store
 from pipeline.flow import config as configuration
 from pipeline.flow.closed_loop import dataflow
 

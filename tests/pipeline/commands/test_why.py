@@ -11,7 +11,7 @@ from toys.chain import build
 from pipeline.commands import why
 from pipeline.engine import scheduler
 from pipeline.engine.graph import Graph
-from pipeline.engine.store.folder import Store
+from pipeline.engine.store.base import Store
 from pipeline.runs import lookup
 
 

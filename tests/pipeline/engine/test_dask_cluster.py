@@ -13,7 +13,7 @@ from toys import chain
 from pipeline.engine import scheduler
 from pipeline.engine.executors import base, dask_cluster
 from pipeline.engine.graph import Graph
-from pipeline.engine.store.folder import Store
+from pipeline.engine.store.base import Store
 
 
 @pytest.fixture(scope="module")

@@ -22,7 +22,7 @@ from pipeline.engine.executors.base import WorkerDiedError
 from pipeline.engine.executors.processes import Workers
 from pipeline.engine.graph import Graph
 from pipeline.engine.store import maintenance
-from pipeline.engine.store.folder import Store
+from pipeline.engine.store.base import Store
 from stages.core.declare import NoParams
 
 HERE = Path(__file__).resolve().parent.parent
@@ -94,7 +94,7 @@ def test_interruption_leaves_nobody_behind(cache, program_environment, executor)
     process = start(cache, program_environment, executor, "sleep", start_new_session=True)
     process.stdout.readline()
     deadline = time.monotonic() + 30
-    while len(list(cache.glob("artifacts/*/*/*/manifest.json"))) < 4 and time.monotonic() < deadline:
+    while len(list(cache.glob("artifacts/*/*/*.zip"))) < 4 and time.monotonic() < deadline:
         time.sleep(0.05)
     time.sleep(0.2)  # now the sleepers run
     children = psutil.Process(process.pid).children(recursive=True)
@@ -116,7 +116,7 @@ def test_killed_at_any_moment_a_run_resumes_to_the_same_digests(cache, tmp_path,
         time.sleep(delay)
         process.kill()
         process.communicate()
-        manifests.append(len(list(cache.glob("artifacts/*/*/*/manifest.json"))))
+        manifests.append(len(list(cache.glob("artifacts/*/*/*.zip"))))
     assert maintenance.verify(Store(cache))[1] == []
     resumed = finish(start(cache, program_environment, "inline", "many"))
     assert {n: v[1] for n, v in resumed.items()} == undisturbed
@@ -127,7 +127,7 @@ def test_killed_at_any_moment_a_run_resumes_to_the_same_digests(cache, tmp_path,
 def test_workers_end_when_the_program_is_killed(cache, program_environment):
     process = start(cache, program_environment, "processes", "sleep", start_new_session=True)
     deadline = time.monotonic() + 30
-    while len(list(cache.glob("artifacts/*/*/*/manifest.json"))) < 4 and time.monotonic() < deadline:
+    while len(list(cache.glob("artifacts/*/*/*.zip"))) < 4 and time.monotonic() < deadline:
         time.sleep(0.05)
     children = psutil.Process(process.pid).children(recursive=True)
     process.kill()

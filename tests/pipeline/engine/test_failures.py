@@ -17,7 +17,7 @@ from pipeline.cli import main
 from pipeline.engine import scheduler
 from pipeline.engine.failures import told
 from pipeline.engine.graph import Graph
-from pipeline.engine.store.folder import Store
+from pipeline.engine.store.base import Store
 
 
 def opencv_error() -> cv2.error:

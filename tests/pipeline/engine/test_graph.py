@@ -9,7 +9,7 @@ from toys.scale import ScaleParams
 
 from pipeline.engine import scheduler
 from pipeline.engine.graph import Graph, Maybe, MissingError
-from pipeline.engine.store.folder import Store
+from pipeline.engine.store.base import Store
 from stages.core.declare import NoParams
 
 NO = NoParams()

@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
+import gzip
 import os
 import shutil
+import tracemalloc
 
 import pytest
 from toys import chain
 
 from pipeline.engine import scheduler
 from pipeline.engine.graph import Graph
-from pipeline.engine.store import folder as store_module
-from pipeline.engine.store import index as catalogue
-from pipeline.engine.store.folder import Store
-from pipeline.engine.store.index import Catalogue, Entry, status
+from pipeline.engine.store import folder, index
+from pipeline.engine.store.base import Store
+from pipeline.engine.store.folder import Folder
+from pipeline.engine.store.manifest import Ref
+from pipeline.engine.store.place import Item
+
+NODES = 9
 
 
 @pytest.fixture(autouse=True)
 def _at_once(monkeypatch):
-    monkeypatch.setattr(catalogue, "RACY", 0)
+    monkeypatch.setattr(folder, "RACY", 0.0)
 
 
 def run(cache, **options):
@@ -26,45 +31,43 @@ def run(cache, **options):
     graph, store, read = Graph(), Store(cache), []
     chain.build(graph, **options)
     real = store._read_manifest
-    store._read_manifest = lambda home: read.append(str(home)) or real(home)
+    store._read_manifest = lambda stage, key: read.append(key) or real(stage, key)
     result = scheduler.run(graph, store, executor="inline")
     return {h.label: (h.status, h.ref) for h in graph.nodes}, read, result
 
 
-def index(cache):
-    (path,) = (cache / "index").iterdir()
-    return path
+def indices(cache):
+    return sorted(p for p in (cache / "index").rglob("*") if p.is_file())
 
 
 def test_a_second_run_reads_no_manifest_and_finds_the_same(cache):
     run(cache)
-    assert len(index(cache).read_text().splitlines()) == 1 + 9
-    before = index(cache).stat().st_mtime_ns
+    (path,) = indices(cache)
+    assert len(gzip.decompress(path.read_bytes()).splitlines()) == NODES
+    before = path.stat().st_mtime_ns
     with_index, read, result = run(cache)
-    assert (read, result.total().cached) == ([], 9)
-    assert index(cache).stat().st_mtime_ns == before, "nothing new, nothing written"
+    assert (read, result.total().cached) == ([], NODES)
+    assert [p.stat().st_mtime_ns for p in indices(cache)] == [before], "nothing new, nothing written"
     shutil.rmtree(cache / "index")
     without, read, _ = run(cache)
-    assert len(read) == 9
+    assert len(read) == NODES
     assert with_index == without
 
 
-def test_a_run_that_marks_its_artifacts_as_used_reads_no_manifest_either(cache, monkeypatch):
-    """After an hour each look-up touches the manifest: then, and in the run after it, the index still holds."""
+def test_a_run_says_anew_that_it_used_the_same(cache, monkeypatch):
     run(cache)
-    monkeypatch.setattr(store_module, "USED", -1.0)
-    for _ in range(3):
-        before = {path: path.stat().st_mtime_ns for path in cache.glob("artifacts/*/*/*/manifest.json")}
-        _, read, result = run(cache)
-        assert (read, result.total().cached) == ([], 9)
-        assert all(path.stat().st_mtime_ns > then for path, then in before.items())
+    (path,) = indices(cache)
+    before = path.stat().st_mtime_ns
+    monkeypatch.setattr(index, "FRESH", -1.0)
+    assert run(cache)[1] == []
+    assert [p.stat().st_mtime_ns > before for p in indices(cache)] == [True]
 
 
 @pytest.mark.parametrize("way", ["touched", "rewritten", "replaced", "flipped"])
-def test_a_manifest_that_was_changed_is_read_again(cache, way):
+def test_a_file_that_was_changed_is_read_again(cache, way):
     nodes, _, _ = run(cache)
     ref = nodes["scale/1"][1]
-    path = Store(cache).home("scale", ref.key) / "manifest.json"
+    path = cache / ref.path
     data, times = path.read_bytes(), (path.stat().st_atime_ns, path.stat().st_mtime_ns)
     if way == "touched":
         os.utime(path)
@@ -80,36 +83,39 @@ def test_a_manifest_that_was_changed_is_read_again(cache, way):
     assert len(read) >= 1
     assert again["scale/1"][1].digest == ref.digest
     assert result.total().computed == (way == "flipped")
+    assert run(cache)[1] == [], "it has a line again"
 
 
-def test_sizes_of_files_are_compared_with_the_index_too(cache):
+def test_a_file_that_was_cut_short_is_seen_by_its_size(cache):
     nodes, _, _ = run(cache)
     ref = nodes["numbers/2"][1]
-    chunk = cache / ref.path / "values" / "c.0.0"
-    chunk.write_bytes(chunk.read_bytes()[:-1])
+    path = cache / ref.path
+    path.write_bytes(path.read_bytes()[:-1])
     again, _, result = run(cache)
     assert again["numbers/2"][0] == "computed"
     assert again["numbers/2"][1].digest == ref.digest
-    assert "has" in next((cache / "quarantine").glob("*/reason.txt")).read_text()
+    assert "bytes instead of" in next((cache / "quarantine").glob("*.txt")).read_text()
     assert result.total().computed == 1
 
 
 @pytest.mark.parametrize(
     "damage", [lambda d: b"", lambda d: d[:-3], lambda d: d[:70] + b"9" + d[71:], lambda d: b"\xff" * 99]
 )
-def test_a_damaged_index_counts_as_none(cache, damage):
+def test_a_damaged_index_counts_as_none(cache, damage, capsys):
     nodes, _, _ = run(cache)
-    index(cache).write_bytes(damage(index(cache).read_bytes()))
+    (path,) = indices(cache)
+    path.write_bytes(damage(path.read_bytes()))
     again, read, _ = run(cache)
-    assert len(read) == 9
+    assert len(read) == NODES
+    assert capsys.readouterr().err.count("is passed over") == 1
     assert {label: ref for label, (_, ref) in again.items()} == {label: ref for label, (_, ref) in nodes.items()}
     assert run(cache)[1] == [], "it was written anew"
 
 
 def test_what_was_changed_a_moment_ago_is_not_entered(cache, monkeypatch):
-    monkeypatch.setattr(catalogue, "RACY", 3600 * 10**9)
+    monkeypatch.setattr(folder, "RACY", 3600.0)
     run(cache)
-    assert not (cache / "index").exists()
+    assert not indices(cache)
 
 
 def test_sequences_have_an_index_each_and_parameters_share_one(cache):
@@ -121,12 +127,37 @@ def test_sequences_have_an_index_each_and_parameters_share_one(cache):
     assert len(list((cache / "index").iterdir())) == 2
 
 
-def test_lines_that_no_run_uses_any_more_go(tmp_path):
-    made = os.stat(tmp_path)
-    entry = Entry(status(made), "d", "p", 1, 2, {"a": [1.5, None]}, {"zarr.json": 3})
-    assert Entry.read(entry.line()) == entry
-    book = Catalogue(tmp_path / "index" / "x")
-    for k in range(20):
-        book.enter(f"{k:064d}", entry)
-    book.save([f"{k:064d}" for k in range(2)])
-    assert len(Catalogue.load(book.path).lines) == 2 * (1 + catalogue.SPARE)
+def test_an_index_is_never_unpacked_beyond_its_bound(cache, monkeypatch, capsys):
+    """A hundred megabytes of nothing in a hundred kilobytes: one line, and no memory."""
+    bomb = gzip.compress(bytes(100_000_000))
+    assert len(bomb) < 100_000
+    (cache / "index/s").mkdir(parents=True)
+    (cache / "index/s/bomb").write_bytes(bomb)
+    monkeypatch.setattr(index, "MOST", 1_000_000)
+    store = Store(cache)
+    tracemalloc.start()
+    store.survey("s")
+    assert tracemalloc.get_traced_memory()[1] < 10_000_000
+    tracemalloc.stop()
+    assert store._index.lines == {}
+    assert capsys.readouterr().err == "rille: index/s/bomb in the cache is passed over: it unpacks to more than 1 MB\n"
+
+
+def test_an_index_is_compact(tmp_path):
+    """Of an artifact: key, digest and mark, which cannot be compressed further, and what its facts need."""
+
+    class Place(Folder):
+        def status(self, path, *, fresh=False):
+            return Item(path, 20_000, f"{hash(path) & (1 << 64) - 1:x}.4e20", 0.0)
+
+    place, refs = Place(tmp_path), {}
+    for k in range(5000):
+        key, digest = (f"{hash((k, what)) & (1 << 256) - 1:064x}".replace("0000", f"{k:04x}") for what in "kd")
+        refs[key] = Ref(key, "hfvm", digest, f"artifacts/{k}", {"frame": k, "valid": k / 3}, 30_000 + k, 20_000)
+    made = index.Index(place, "s")
+    made.note(refs)
+    (path,) = indices(tmp_path)
+    assert path.stat().st_size < 140 * len(refs)
+    again = index.Index(place, "s")
+    key = next(iter(refs))
+    assert again.get("hfvm", place.status(refs[key].path), key) == refs[key]

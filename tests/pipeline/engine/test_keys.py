@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from toys.scale import ScaleParams
 
 from pipeline.engine.keys import canonical, digest, text
-from pipeline.engine.store.folder import Ref
+from pipeline.engine.store.manifest import Ref
 from pipeline.engine.task import Spec, key_of, recipe
 from stages.core.declare import Params
 

@@ -16,7 +16,7 @@ from pipeline.engine.graph import Graph
 from pipeline.engine.memory import cost_model, limits
 from pipeline.engine.memory.admission import Account, MemoryRefusedError, Waiting, account, forecast
 from pipeline.engine.memory.cost_model import Costs, Group
-from pipeline.engine.store.folder import Store
+from pipeline.engine.store.base import Store
 from pipeline.engine.task import Spec
 from stages.core.declare import NoParams
 

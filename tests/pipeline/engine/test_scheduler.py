@@ -18,7 +18,7 @@ from pipeline.engine import events as ledger
 from pipeline.engine import packages, progress, scheduler
 from pipeline.engine.graph import Graph, Maybe
 from pipeline.engine.store import maintenance
-from pipeline.engine.store.folder import Store
+from pipeline.engine.store.base import Store
 from pipeline.engine.task import Spec, ensure, recipe
 from stages.core.declare import NoParams
 
@@ -100,7 +100,7 @@ def test_a_damaged_artifact_is_computed_again_and_nothing_else(cache):
     graph, _ = run(cache)
     before = digests(graph)
     victim = graph.nodes[1].ref
-    next((cache / victim.path).rglob("c.0.0")).write_bytes(b"")
+    (cache / victim.path).write_bytes(b"")
     graph, _ = run(cache)
     assert [h.label for h in graph.nodes if h.status == "computed"] == ["numbers/1"]
     assert graph.nodes[1].reason == "was computed before, its artifact is gone or damaged"

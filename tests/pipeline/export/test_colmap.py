@@ -4,7 +4,7 @@ import numpy as np
 import pycolmap
 from raising import raises
 
-from pipeline.engine.store.folder import Store
+from pipeline.engine.store.base import Store
 from pipeline.export.colmap import build, export_run
 from stages.core.declare import Bundle
 from stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp

@@ -10,7 +10,7 @@ import pyproj
 import xarray
 from terrain_runs import LATTICE, PLACE, elevation
 
-from pipeline.engine.store.artifact import encode, spill
+from pipeline.engine.store.base import Store
 from pipeline.export.terrain_zarr import write_terrain
 from stages.core.declare import Bundle
 from stages.terrain import merge
@@ -24,12 +24,12 @@ def arrays() -> dict:
     return {spec.name: (spec, found[spec.name]) for spec in merge.STAGE.outputs if spec.name in found}
 
 
-def write(path: Path, bundle: Bundle) -> None:
-    path.mkdir()
-    spill(path, encode(merge.STAGE, bundle)[0])
+def write(path: Path, bundle: Bundle) -> str:
+    store = Store(path)
+    return store.path(store.commit(merge.STAGE, "a" * 64, bundle))
 
 
-def opened(path: Path) -> xarray.Dataset:
+def opened(path: Path | str) -> xarray.Dataset:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         return xarray.open_zarr(path)
@@ -70,8 +70,7 @@ def test_a_place_on_earth_gives_every_cell_its_easting_and_northing(tmp_path: Pa
 
 def test_an_artifact_on_a_lattice_has_coordinates_too(tmp_path: Path) -> None:
     found = {name: values for name, (_, values) in arrays().items()}
-    write(tmp_path / "a", Bundle(found, {"lattice": LATTICE.to_dict(), "frame": "world"}))
-    data = xarray.open_zarr(tmp_path / "a", consolidated=False)
+    data = opened(write(tmp_path / "a", Bundle(found, {"lattice": LATTICE.to_dict(), "frame": "world"})))
     assert set(data.elevation.coords) == {"x", "y"}
     np.testing.assert_array_equal(data.x.values, LATTICE.xs())
     assert data.y.dims == ("row",)
@@ -82,5 +81,4 @@ def test_an_artifact_on_a_lattice_has_coordinates_too(tmp_path: Path) -> None:
 
 def test_an_artifact_without_a_lattice_is_left_alone(tmp_path: Path) -> None:
     found = {name: values[:3] for name, (_, values) in arrays().items()}
-    write(tmp_path / "a", Bundle(found, {"lattice": "none"}))
-    assert not xarray.open_zarr(tmp_path / "a", consolidated=False).coords
+    assert not opened(write(tmp_path / "a", Bundle(found, {"lattice": "none"}))).coords

@@ -20,7 +20,6 @@ from datasets.georeference import Georeference
 from pipeline.export import styles
 from pipeline.export.frames_json import describe
 from pipeline.export.writers import (
-    replacing,
     write_path_geojson,
     write_path_gpkg,
     write_raster,
@@ -111,21 +110,6 @@ def test_classes_are_not_averaged_in_overviews(tmp_path: Path) -> None:
 def test_a_raster_that_does_not_fit_is_refused(tmp_path: Path) -> None:
     with raises("RIL-621"):
         write_raster(tmp_path / "a.tif", {"a": np.zeros((2, 2), np.uint8)}, LATTICE, unit="1", nodata=None)
-
-
-def test_a_failed_write_leaves_the_old_file(tmp_path: Path) -> None:
-    target = tmp_path / "a.txt"
-    target.write_text("old")
-
-    def fail() -> None:
-        with replacing(target) as temporary:
-            temporary.write_text("half")
-            raise RuntimeError("killed")
-
-    with pytest.raises(RuntimeError, match="killed"):
-        fail()
-    assert target.read_text() == "old"
-    assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
 
 
 def test_the_path_says_that_it_is_not_wgs84(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import pytest
 
 from pipeline.engine import scheduler
 from pipeline.engine.graph import Graph
-from pipeline.engine.store.folder import Store
+from pipeline.engine.store.base import Store
 from pipeline.flow import tiles
 from pipeline.flow.config import build
 from pipeline.flow.tiles import Tiling

@@ -35,7 +35,7 @@ def main(cache, executor="inline", what="", ledger=""):
     prepare_environment()
     from pipeline.engine import scheduler
     from pipeline.engine.graph import Graph
-    from pipeline.engine.store.folder import Store
+    from pipeline.engine.store.base import Store
     from stages.core.declare import NoParams
 
     graph = Graph()

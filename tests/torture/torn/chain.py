@@ -53,7 +53,7 @@ def run(cache, executor="inline", ledger=None, jobs=2, memory=None, environment=
     os.environ.update(environment or {})
     from pipeline.engine import scheduler
     from pipeline.engine.graph import Graph
-    from pipeline.engine.store.folder import at
+    from pipeline.engine.store.base import at
 
     graph = Graph()
     build(graph, **options)
@@ -77,7 +77,7 @@ def clear(cache, runs, until, grace, environment=None):
     os.environ.update(environment or {})
     from pipeline.engine import events as ledger
     from pipeline.engine.store import maintenance
-    from pipeline.engine.store.folder import at
+    from pipeline.engine.store.base import at
 
     times = removed = 0
     while not Path(until).exists():

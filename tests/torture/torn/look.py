@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import time
+from contextlib import suppress
 from pathlib import Path
 
-from pipeline.engine.store.artifact import array_digests, damage, output_digest
-from pipeline.engine.store.folder import Store, at, unframe
-from pipeline.engine.store.s3_maintenance import _damage
+from pipeline.engine.store.artifact import array_digests, output_digest
+from pipeline.engine.store.base import Store
+from pipeline.engine.store.maintenance import artifacts
+from pipeline.engine.store.manifest import artifact_path, damage, length, unframe
 
 HERE = Path(__file__).parent.parent
 PLACES = [str(HERE), str(HERE.parent / "pipeline"), str(HERE.parent.parent)]
@@ -15,44 +17,44 @@ PLACES = [str(HERE), str(HERE.parent / "pipeline"), str(HERE.parent.parent)]
 
 
 def published(cache):
-    """Digest by key of every artifact whose manifest and files are whole."""
-    if str(cache).startswith("s3://"):
-        bucket = at(cache).bucket
-        made = [unframe(bucket.get(entry.path)[0]) for entry in bucket.list("manifests")]
-        return {manifest["key"]: manifest["digest"] for manifest in made if not _damage(at(cache), manifest)}
-    store = Store(cache)
-    found = {}
-    for path in Path(cache).glob("artifacts/*/*/*/manifest.json"):
-        manifest = store.manifest(path.parents[2].name, path.parent.name)
-        if manifest and not damage(store.root / manifest["path"], manifest["files"], lambda _: True):
-            found[manifest["key"]] = manifest["digest"]
+    """Digest by key of every artifact that is whole."""
+    place, found = Store(cache).place, {}
+    for stage, key in artifacts(Store(cache)):
+        data = place.read(artifact_path(stage, key))
+        with suppress(ValueError):
+            manifest = unframe(data[: length(data)])
+            if not damage(manifest, data):
+                found[manifest["key"]] = manifest["digest"]
     return found
+
+
+def span(data, kind, member):
+    """Where in an artifact's file a part lies: its manifest, a member, or the directory of the archive."""
+    size = length(data)
+    if kind in ("manifest", "directory"):
+        return (0, size) if kind == "manifest" else (data.rindex(b"PK\x01\x02"), len(data))
+    start, length_, _ = unframe(data[:size])["files"][member]
+    return start, start + length_
 
 
 def settled(cache):
     """Wait until a server has carried out what a killed program still asked of it."""
     if str(cache).startswith("s3://"):
-        bucket, before = at(cache).bucket, None
-        while (now := sorted((e.path, e.etag) for e in bucket.list(""))) != before:
+        place, before = Store(cache).place, None
+        while (now := sorted((e.path, e.mark) for e in place.list(""))) != before:
             before = now
             time.sleep(0.1)
 
 
 def manifests(cache):
-    """Keys that have a manifest, sound or not."""
-    if str(cache).startswith("s3://"):
-        return {Path(entry.path).stem for entry in at(cache).bucket.list("manifests")}
-    return {path.parent.name for path in Path(cache).glob("artifacts/*/*/*/manifest.json")}
+    """Keys that have an artifact, sound or not."""
+    return {key for _, key in artifacts(Store(cache))}
 
 
 def decoded(cache):
     """Digest by key, taken over what is really read."""
-    store, found = at(cache), {}
-    if str(cache).startswith("s3://"):
-        there = [(Path(e.path).parent.name, Path(e.path).stem) for e in store.bucket.list("manifests")]
-    else:
-        there = [(p.parents[2].name, p.parent.name) for p in Path(cache).glob("artifacts/*/*/*/manifest.json")]
-    for stage, key in there:
+    store, found = Store(cache), {}
+    for stage, key in artifacts(store):
         ref = store.lookup(stage, key)
         if ref is not None:
             bundle = store.open(ref)

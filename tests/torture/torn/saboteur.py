@@ -1,7 +1,7 @@
 """Kills the process that runs it: while it computes, in its commit, or by its memory; the first times only.
 
-``what`` is ``task``, ``fsync:3``, ``link:1`` ... (the process dies before that call of the commit), ``linked:1`` (after
-it), ``put:2``, ``create:1``, ``created:1`` (the same of a commit to a bucket), ``poison`` (each time), ``memory`` (it
+``what`` is ``task``, ``fsync:2``, ``link:1`` ... (the process dies before that call of the commit), ``linked:1`` (after
+it), ``create:1``, ``created:1`` (the same of a commit to a bucket), ``poison`` (each time), ``memory`` (it
 takes more than the worker may have), ``random`` (no death, but another result in each process, once two are there).
 """
 
@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.engine.store.s3_client import Bucket
+from pipeline.engine.store.s3 import Bucket
 from stages.core.declare import Array, Bundle, NoParams, Stage
 
 

@@ -6,6 +6,8 @@ import errno
 import os
 import threading
 import time
+import warnings
+import zipfile
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -13,15 +15,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray
+import zarr
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as st_numpy
 from raising import raises
 
-from pipeline.engine.store import artifact, maintenance, s3_maintenance
-from pipeline.engine.store import folder as store
+from pipeline.engine.store import artifact, folder, maintenance, manifest
 from pipeline.engine.store.artifact import array_digests, output_digest
-from pipeline.engine.store.folder import Store
+from pipeline.engine.store.base import Store
 from stages.core.declare import Array, Bundle, NoParams, Stage
 
 STAGE = Stage(
@@ -65,6 +67,29 @@ def files(cache):
     return sorted(p for p in (cache / "artifacts").rglob("*") if p.is_file())
 
 
+def file_of(cache):
+    (path,) = files(cache)
+    return path
+
+
+def span(cache, kind):
+    """Where in the file of an artifact a part lies: its manifest, a member, or the directory of the archive."""
+    data = file_of(cache).read_bytes()
+    size = manifest.length(data)
+    if kind in ("manifest", "directory"):
+        return (0, size) if kind == "manifest" else (data.rindex(b"PK\x01\x02"), len(data))
+    start, length, _ = manifest.unframe(data[:size])["files"][kind]
+    return start, start + length
+
+
+def patch(cache, kind, change):
+    """Rewrite a part of the file, of the same size."""
+    start, stop = span(cache, kind)
+    data = bytearray(file_of(cache).read_bytes())
+    data[start:stop] = change(bytes(data[start:stop]))
+    file_of(cache).write_bytes(data)
+
+
 def test_round_trip_keeps_every_bit_and_the_digest(cache):
     ref = commit(cache)
     there = Store(cache).lookup("toy", KEY)
@@ -81,9 +106,12 @@ def test_round_trip_keeps_every_bit_and_the_digest(cache):
     assert maintenance.verify(Store(cache)) == (1, [])
 
 
-def test_xarray_reads_the_folder(cache):
+def test_xarray_opens_it(cache):
     ref = commit(cache)
-    with xarray.open_zarr(Store(cache).path(ref), consolidated=False) as data:
+    for way in (Store(cache).path(ref), zarr.storage.ZipStore(cache / ref.path, mode="r")):
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            data = xarray.open_zarr(way)
         assert data["elevation"].dims == ("row", "col")
         assert data["elevation"].attrs["units"] == "m"
         assert data["elevation"].attrs["long_name"] == "elevation of the cell"
@@ -91,12 +119,36 @@ def test_xarray_reads_the_folder(cache):
         np.testing.assert_array_equal(data["elevation"].values, bundle()["elevation"])
 
 
+def test_an_artifact_is_one_file_that_any_reader_of_zip_files_finds_sound(cache):
+    ref = commit(cache)
+    assert len(files(cache)) == 1
+    with zipfile.ZipFile(cache / ref.path) as archive:
+        assert archive.testzip() is None
+        assert {"zarr.json", "elevation/zarr.json", "elevation/c.0.0"} <= set(archive.namelist())
+        assert {m.compress_type for m in archive.infolist()} == {zipfile.ZIP_STORED}
+    assert ref.stored == (cache / ref.path).stat().st_size
+
+
+def test_equal_arrays_make_equal_archives(tmp_path):
+    made = []
+    for name, provenance in (("a", {"host": "x"}), ("b", {"host": "another"})):
+        ref = Store(tmp_path / name).commit(STAGE, KEY, bundle(), provenance=provenance)
+        data = (tmp_path / name / ref.path).read_bytes()
+        made.append(data[manifest.length(data) :])
+    assert made[0] == made[1]
+
+
+def test_a_manifest_may_be_long(cache):
+    ref = commit(cache, many=list(range(20_000)))
+    assert manifest.length((cache / ref.path).read_bytes()) > 2 * manifest.FIRST
+    assert Store(cache).lookup("toy", KEY) == ref
+    assert Store(cache).open(ref)["count"] == 3
+
+
 def test_arrays_are_read_on_access_only(cache):
     read = Store(cache).open(commit(cache))
-    chunk = next(p for p in files(cache) if "elevation/c." in p.as_posix())
-    chunk.unlink()
-    assert read["count"] == 3
-    with raises("RIL-504"):
+    file_of(cache).unlink()
+    with raises("RIL-504", "missing"):
         read["elevation"]
     with pytest.raises(KeyError, match=r"no array 'height', only count"):
         read["height"]
@@ -133,7 +185,7 @@ def test_a_race_publishes_one_and_compares_the_others(cache):
     with ThreadPoolExecutor(6) as pool:
         refs = list(pool.map(one, range(6)))
     assert len({r.path for r in refs}) == 1
-    assert len(list((cache / "artifacts/toy" / KEY[:2] / KEY).iterdir())) == 2, "one manifest, one attempt"
+    assert len(files(cache)) == 1, "the losers have cleared up"
 
 
 def test_another_result_for_the_same_key_is_an_error_of_its_own(cache):
@@ -146,27 +198,21 @@ def test_another_result_for_the_same_key_is_an_error_of_its_own(cache):
     assert maintenance.verify(Store(cache)) == (1, [])
 
 
-KINDS = ("manifest.json", "/zarr.json", "elevation/zarr.json", "elevation/c.0.0", "flag/c.0.0")
+KINDS = ("manifest", "zarr.json", "elevation/zarr.json", "elevation/c.0.0", "flag/c.0.0", "directory")
 
 
-def find(cache, kind):
-    return next(p for p in files(cache) if p.as_posix().endswith(kind))
-
-
-@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("how", ["truncate", "empty", "delete", "lengthen"])
-def test_damage_that_changes_a_size_is_a_miss_and_heals(cache, kind, how):
+def test_damage_that_changes_the_size_is_a_miss_and_heals(cache, how):
     ref = commit(cache)
-    path = find(cache, kind)
+    path = file_of(cache)
     data = path.read_bytes()
     if how == "delete":
         path.unlink()
     else:
         path.write_bytes({"truncate": data[:-1], "empty": b"", "lengthen": data + b" "}[how])
     assert Store(cache).lookup("toy", KEY) is None
-    assert len(list((cache / "quarantine").glob("*"))) == (0 if (kind, how) == ("manifest.json", "delete") else 1)
-    again = commit(cache)
-    assert (again.digest, again.path == ref.path) == (ref.digest, False)
+    assert len(list((cache / "quarantine").glob("*.txt"))) == (how != "delete")
+    assert commit(cache) == ref
     assert maintenance.verify(Store(cache)) == (1, [])
 
 
@@ -175,11 +221,7 @@ def test_any_flipped_bit_is_found_by_verify(cache, kind):
     rng = np.random.default_rng(3)
     for _ in range(4):
         digest = commit(cache).digest
-        path = find(cache, kind)
-        data = bytearray(path.read_bytes())
-        at = rng.integers(len(data))
-        data[at] ^= 1 << rng.integers(8)
-        path.write_bytes(data)
+        patch(cache, kind, lambda data: flipped(data, rng))
         sound, found = maintenance.verify(Store(cache))
         assert sound == 0
         assert [d.key for d in found] == [KEY]
@@ -188,15 +230,17 @@ def test_any_flipped_bit_is_found_by_verify(cache, kind):
         assert maintenance.verify(Store(cache)) == (1, [])
 
 
+def flipped(data, rng):
+    at = rng.integers(len(data))
+    return data[:at] + bytes([data[at] ^ (1 << int(rng.integers(8)))]) + data[at + 1 :]
+
+
 @pytest.mark.parametrize("kind", ["elevation/zarr.json", "elevation/c.0.0"])
 def test_a_flipped_bit_never_reaches_a_reader(cache, kind):
     rng = np.random.default_rng(4)
     for _ in range(6):
         ref = commit(cache)
-        path = find(cache, kind)
-        data = bytearray(path.read_bytes())
-        data[rng.integers(len(data))] ^= 1 << rng.integers(8)
-        path.write_bytes(data)
+        patch(cache, kind, lambda data: flipped(data, rng))
         with raises("RIL-504", "toy/1"):
             Store(cache).open(ref)["elevation"]
         assert Store(cache).lookup("toy", KEY) is None
@@ -205,19 +249,46 @@ def test_a_flipped_bit_never_reaches_a_reader(cache, kind):
 @pytest.mark.parametrize(("old", "new"), [(b"5,", b"4,"), (b'"units": "m"', b'"units": "k"')])
 def test_a_description_that_is_plausible_but_wrong_never_reaches_a_reader(cache, old, new):
     ref = commit(cache)
-    path = find(cache, "elevation/zarr.json")
-    assert old in path.read_bytes()
-    path.write_bytes(path.read_bytes().replace(old, new, 1))
+    start, stop = span(cache, "elevation/zarr.json")
+    assert old in file_of(cache).read_bytes()[start:stop]
+    patch(cache, "elevation/zarr.json", lambda data: data.replace(old, new, 1))
     with raises("RIL-504"):
         Store(cache).open(ref)["elevation"]
 
 
+def test_what_another_run_has_put_right_meanwhile_is_not_set_aside(cache):
+    """A reader of the damaged file learns of it when a sound one is there again."""
+    ref = commit(cache)
+    patch(cache, "elevation/c.0.0", lambda data: bytes(len(data)))
+    maintenance.verify(Store(cache))
+    assert commit(cache) == ref
+    Store(cache).set_aside("toy", KEY, {"attempt": "that of the damaged one"}, "reason")
+    assert Store(cache).lookup("toy", KEY) == ref
+
+
+def test_artifacts_of_an_earlier_format_are_said_once_and_cleared(cache, capsys):
+    old = cache / "artifacts/toy" / KEY[:2] / KEY
+    (old / "a-01").mkdir(parents=True)
+    (old / "manifest.json").write_bytes(b"{}")
+    (old / "a-01/zarr.json").write_bytes(b"{}")
+    store = Store(cache)
+    store.survey("s")
+    assert "earlier format" in capsys.readouterr().err
+    assert store.lookup("toy", KEY) is None
+    store.writable()
+    ref = commit(cache)
+    Store(cache).survey("s")
+    assert capsys.readouterr().err == ""
+    cleared = maintenance.gc(store, {KEY}, grace=-1.0)
+    assert (cleared.artifacts, cleared.orphans) == (0, 2)
+    assert files(cache) == [cache / ref.path]
+
+
 def test_an_attempt_that_fails_leaves_nothing(cache, monkeypatch):
-    def full(folder, files):
-        artifact.spill(folder, files)
+    def full(handle):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(store, "spill", full)
+    monkeypatch.setattr(os, "fsync", full)
     with raises("RIL-574"):
         commit(cache)
     assert files(cache) == []
@@ -230,8 +301,9 @@ def test_a_cache_that_may_not_be_written_is_one_line_and_still_read(cache, monke
         raise OSError(errno.EROFS, "Read-only file system")
 
     monkeypatch.setattr(Path, "mkdir", refuse)
+    monkeypatch.setattr(os, "rename", refuse)
     assert Store(cache).lookup("toy", KEY) == ref
-    find(cache, "elevation/c.0.0").write_bytes(b"")
+    file_of(cache).write_bytes(b"")
     assert Store(cache).lookup("toy", KEY) is None, "damaged, though it cannot be set aside"
     with raises("RIL-575") as caught:
         commit(cache)
@@ -245,37 +317,30 @@ def test_a_file_in_place_of_the_cache_is_said(tmp_path):
             use()
 
 
-def test_everything_is_on_the_disk_before_the_manifest_is(cache, monkeypatch):
-    """Every file, every folder of the attempt, then the link, then the folders above."""
+def test_the_file_is_on_the_disk_before_it_can_be_seen(cache, monkeypatch):
+    """The file, then the link, then the folders that have a new entry."""
     log = []
     synced, link = os.fsync, os.link
-
-    def linking(a, b):
-        if Path(b).name == "manifest.json":
-            log.append("link")
-        link(a, b)
-
     monkeypatch.setattr(os, "fsync", lambda fd: (log.append(os.readlink(f"/proc/self/fd/{fd}")), synced(fd)))
-    monkeypatch.setattr(os, "link", linking)
-    ref = commit(cache)
-    before, after = log[: log.index("link")], log[log.index("link") + 1 :]
-    attempt = cache / ref.path
-    wanted = {str(attempt), *(str(p) for p in attempt.rglob("*"))}
-    assert wanted <= set(before)
-    assert any(name.endswith(".tmp") for name in before)
-    assert {str(attempt.parent), str(attempt.parent.parent)} <= set(after)
+    monkeypatch.setattr(os, "link", lambda a, b: (log.append("link"), link(a, b)))
+    path = cache / commit(cache).path
+    temporary, linked, *after = log
+    assert Path(temporary).name.startswith(".tmp-")
+    assert linked == "link"
+    assert after == [str(path.parent), str(path.parents[1]), str(path.parents[2]), str(path.parents[3])]
+    del log[:]
+    Store(cache).commit(STAGE, "ab" + "c" * 62, bundle())
+    assert log[2:] == [str(path.parent)], "nothing new above"
 
 
 def test_gc_keeps_what_is_named_or_young(cache):
     ref = commit(cache)
-    orphan = cache / "artifacts/toy" / KEY[:2] / KEY / "a-orphan"
-    orphan.mkdir()
-    (orphan / "x").write_bytes(b"123")
-    assert vars(maintenance.gc(Store(cache), set())) == {"artifacts": 0, "orphans": 0, "bytes": 0, "stages": {}}, (
-        "all is young"
-    )
+    orphan = cache / "artifacts/toy" / KEY[:2] / ".tmp-00ff"
+    orphan.write_bytes(b"123")
+    nothing = {"artifacts": 0, "orphans": 0, "bytes": 0, "stages": {}}
+    assert vars(maintenance.gc(Store(cache), set())) == nothing, "all is young"
     old = time.time() - 10
-    for path in (orphan, cache / "artifacts/toy" / KEY[:2] / KEY / "manifest.json"):
+    for path in (orphan, cache / ref.path):
         os.utime(path, (old, old))
     cleared = maintenance.gc(Store(cache), {KEY}, grace=5, dry_run=True)
     assert (cleared.artifacts, cleared.orphans, cleared.bytes) == (0, 1, 3)
@@ -285,21 +350,39 @@ def test_gc_keeps_what_is_named_or_young(cache):
     gone = maintenance.gc(Store(cache), set(), grace=5)
     assert (gone.artifacts, gone.orphans) == (1, 0)
     assert gone.bytes > 1000
-    assert list((cache / "artifacts/toy" / KEY[:2]).iterdir()) == []
+    assert list((cache / "artifacts").iterdir()) == []
+
+
+def test_gc_keeps_what_a_run_used_lately(cache, monkeypatch):
+    monkeypatch.setattr(folder, "RACY", 0.0)
+    store = Store(cache)
+    ref = commit(cache)
+    old = time.time() - 10
+    os.utime(cache / ref.path, (old, old))
+    store.survey("s")
+    store.note([ref])
+    assert maintenance.gc(store, set(), grace=5).artifacts == 0
+    for path in (cache / "index").rglob("*"):
+        os.utime(path, (old, old))
+    assert maintenance.gc(store, set(), grace=5).artifacts == 1
+
+
+def chunks(cache):
+    return [name for name in zipfile.ZipFile(file_of(cache)).namelist() if "/c." in name]
 
 
 def test_large_arrays_are_chunked(cache):
     rng = np.random.default_rng(0)
     big = rng.normal(size=(artifact.CHUNK + 10, 30)).astype(np.float32)
     ref = Store(cache).commit(STAGE, KEY, Bundle({"elevation": big}, {}))
-    assert len([p for p in files(cache) if "/c." in p.as_posix()]) == 2
+    assert len(chunks(cache)) == 2
     np.testing.assert_array_equal(Store(cache).open(ref)["elevation"], big)
 
 
-def test_chunks_of_nothing_are_files_too(cache):
+def test_chunks_of_nothing_are_members_too(cache):
     nothing = {"elevation": np.full((2, 2), np.nan, np.float32), "flag": np.zeros((2, 2), bool)}
     Store(cache).commit(STAGE, KEY, Bundle(nothing, {}))
-    assert len([p for p in files(cache) if "/c." in p.as_posix()]) == 2
+    assert len(chunks(cache)) == 2
 
 
 @pytest.mark.parametrize("name", ["locus", "mockup.scene"])
@@ -307,5 +390,4 @@ def test_the_name_of_a_stage_may_have_a_point(cache, name):
     """On disk and in a bucket: those of the simulator have one."""
     Store(cache).commit(replace(STAGE, name=name), KEY, bundle(), label="here")
     assert Store(cache).lookup(name, KEY) is not None
-    assert s3_maintenance.MANIFEST.fullmatch(f"manifests/{name}/{KEY}.json")[1] == name
-    assert s3_maintenance.ATTEMPT.match(f"data/{name}/{KEY}/a-0f/zarr.json")[1] == name
+    assert list(maintenance.artifacts(Store(cache))) == [(name, KEY)]

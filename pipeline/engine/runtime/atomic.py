@@ -1,0 +1,93 @@
+"""Files that appear whole or not at all: the one place that writes beside, flushes, and moves into place.
+
+What an interruption leaves behind is named ``.tmp-...``, which no pattern of ours matches; clearing up takes it.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import uuid
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+LEFTOVER = ".tmp-"
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Temporary path of the same name, of a file or folder that becomes ``path`` if the block ends without an error.
+
+    A folder that was there is removed first: for a moment there is none, but never a mixture.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    apart = _beside(path)
+    apart.mkdir()
+    try:
+        yield apart / path.name
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        os.replace(apart / path.name, path)
+    finally:
+        shutil.rmtree(apart, ignore_errors=True)
+
+
+def write(path: Path, data: bytes | str) -> None:
+    """Replace a file (text is UTF-8). It is not flushed: for what may be lost, but not be half."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = _beside(path)
+    try:
+        temporary.write_bytes(data.encode() if isinstance(data, str) else data)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def create(path: Path, pieces: Iterable[bytes]) -> bool:
+    """Write a file unless there is one, and flush it to the disk before it can be seen; whether it was written."""
+    temporary = _beside(path)
+    made = _folder(path.parent, temporary)
+    try:
+        with temporary.open("wb") as file:
+            file.writelines(pieces)
+            file.flush()
+            os.fsync(file.fileno())
+        try:
+            os.link(temporary, path)
+        except FileExistsError:
+            return False
+    finally:
+        temporary.unlink(missing_ok=True)
+    try:
+        for folder in [path.parent, *made]:
+            _fsync(folder)
+    except OSError:
+        pass  # it is there: at worst a power failure takes it back as a whole
+    return True
+
+
+def _folder(folder: Path, temporary: Path) -> list[Path]:
+    """Make a folder, and the temporary file in it, which keeps it; gives the folders above that have a new entry."""
+    for turn in range(100):
+        above = [parent for parent in list(folder.parents)[:3] if not folder.exists()]
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            temporary.touch()
+            return above
+        except FileNotFoundError:  # clearing up takes empty folders away just as they are made
+            if turn == 99:
+                raise
+    raise AssertionError
+
+
+def _beside(path: Path) -> Path:
+    return path.with_name(f"{LEFTOVER}{uuid.uuid4().hex[:16]}")
+
+
+def _fsync(path: Path) -> None:
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

@@ -1,0 +1,253 @@
+"""Content-addressed store of artifacts: look-up, commit, quarantine; the same in a folder and in a bucket.
+
+Files, in the cache folder or below the prefix of a bucket::
+
+    artifacts/<stage>/<k>/<key>.zarr.zip    an artifact, one file; <k> are the key's first two digits
+    quarantine/<stage>-<key>-<unique>.*     a damaged artifact, and the reason, set aside
+    index/<sequence>/<digest>               what a run used (pipeline.engine.store.index)
+    rille.json                              the format
+
+and on this machine (:func:`~pipeline.engine.store.location.hints_folder`)::
+
+    hints/<sequence>/                       of its earlier runs, for explanations and estimates; never a matter
+                                            of correctness
+    pins/<run>.json                         keys that clearing up leaves alone
+    roots/<digest>.json                     folders of runs that use the cache
+
+The file of an artifact (:mod:`pipeline.engine.store.manifest`) is its own commit: it is on the disk as a whole before
+it gets its name, and gets it only if nobody has it (a link; in a bucket ``If-None-Match: *``). Killed at any instant, a
+run leaves a whole artifact or none. Of two that commit one key the second is compared and thrown away: another digest
+is a :class:`NonDeterministicError`. The size of the file is compared at each look-up, checksums of what is read on each
+reading, and all of them by :func:`pipeline.engine.store.maintenance.verify`. What is damaged is set aside, counts as
+absent and is computed again.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import uuid
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+from pipeline.engine.store.artifact import LazyArrays, array_digests, encode, output_digest
+from pipeline.engine.store.folder import Folder, StoreError
+from pipeline.engine.store.index import Index
+from pipeline.engine.store.location import Location, hints_folder, locate
+from pipeline.engine.store.manifest import (
+    FIRST,
+    Manifest,
+    Ref,
+    artifact_path,
+    difference,
+    length,
+    pack,
+    reference,
+    unframe,
+)
+from pipeline.engine.store.place import Place
+from stages.core.declare import Bundle, Stage
+from stages.core.errors import RilleError
+
+
+class NonDeterministicError(RilleError):
+    """A stage gave two different results for one key."""
+
+
+class GoneError(StoreError):
+    """An artifact that was there has gone: cleared away, or set aside as damaged by another run."""
+
+
+class Store:
+    """Artifacts in a folder, or at ``s3://bucket/prefix``.
+
+    ``location`` is what another process opens the store by; ``root`` is the local folder of its hints, for a folder
+    the same.
+
+    Raises
+    ------
+    RilleError
+        There is no such place, or it may not be used.
+    """
+
+    def __init__(self, cache: Path | str) -> None:
+        where = locate(cache)
+        self.location: Location = where if isinstance(where, str) else where.absolute()
+        self.root = hints_folder(self.location).absolute()
+        self.place: Place = _place(self.location)
+        self._index: Index | None = None
+
+    def __fspath__(self) -> str:
+        return str(self.root)
+
+    def hints(self, sequence: str) -> Path:
+        """Folder of what earlier runs of a sequence leave for explanations and estimates."""
+        name = quote(sequence, safe="").replace(".", "%2E")  # no name leads out of it
+        return self.root / "hints" / (name or "-")
+
+    def survey(self, sequence: str) -> None:
+        """Before many look-ups: find out at once what is there, with few requests or readings.
+
+        ``sequence`` names what runs over the same images, whatever their parameters.
+        """
+        if self.place.earlier():
+            remedy = "'rille cache gc' removes them"
+            print(f"rille: artifacts of an earlier format in {self.location} are not read: {remedy}", file=sys.stderr)
+        self.place.survey()
+        self._index = Index(self.place, sequence)
+
+    def note(self, refs: Iterable[Ref]) -> None:
+        """At the end of a run: what it used, for later surveys and for clearing up. Best effort."""
+        if self._index is not None:
+            with suppress(OSError, RilleError):  # it may permit reading alone
+                self._index.note({ref.key: ref for ref in refs})
+
+    def writable(self) -> None:
+        """Raise if nothing can be written here.
+
+        Raises
+        ------
+        StoreError
+            The folder cannot be made, is full or may not be written.
+        """
+        self.place.begin()
+
+    def lookup(self, stage: str, key: str, *, fresh: bool = False) -> Ref | None:
+        """The artifact of a key, the size of its file checked; a damaged one is set aside and counts as absent.
+
+        ``fresh`` does not rely on a survey.
+        """
+        item = self.place.status(artifact_path(stage, key), fresh=fresh)
+        if item is None:
+            return None
+        known = None if fresh or self._index is None else self._index.get(stage, item, key)
+        if known is not None:
+            return known
+        try:
+            manifest = self._read_manifest(stage, key)
+        except ValueError:
+            self.set_aside(stage, key, None, "the manifest is not readable")
+            return None
+        if manifest is None:
+            return None
+        if item.size != manifest["size"]:
+            self.set_aside(stage, key, manifest, f"it has {item.size} bytes instead of {manifest['size']}")
+            return None
+        return reference(manifest)
+
+    def manifest(self, stage: str, key: str) -> Manifest | None:
+        """Manifest of a key as it was committed, no check of the arrays; None if absent or not readable."""
+        try:
+            return self._read_manifest(stage, key)
+        except (OSError, ValueError, StoreError):
+            return None
+
+    def _read_manifest(self, stage: str, key: str) -> Manifest | None:
+        """Raises ValueError where the content is not what was written."""
+        path = artifact_path(stage, key)
+        line = self.place.read(path, 0, FIRST)
+        if line is None:
+            return None
+        size = length(line)
+        if size > len(line):
+            line += self.place.read(path, len(line), size) or b""
+        manifest = unframe(line[:size])
+        if (manifest["stage"], manifest["key"]) != (stage, key):
+            raise ValueError("the manifest is that of another artifact")
+        return manifest
+
+    def path(self, ref: Ref) -> str:
+        """What ``xarray.open_zarr`` opens an artifact by."""
+        return self.place.url(ref.path)
+
+    def open(self, ref: Ref) -> Bundle:
+        """The bundle behind a reference; each array is read, and its chunks' checksums compared, at first access.
+
+        Raises
+        ------
+        GoneError
+            The artifact has gone since it was looked up.
+        """
+        manifest = self.manifest(ref.stage, ref.key)
+        if manifest is None or manifest["digest"] != ref.digest:
+            raise GoneError(
+                "RIL-572", f"artifact {ref.stage} {ref.key[:12]} has gone from {self.location}", remedy="run again"
+            )
+
+        def damaged(reason: str) -> None:
+            self.set_aside(ref.stage, ref.key, manifest, reason)
+
+        def read(start: int, stop: int) -> bytes | None:
+            return self.place.read(ref.path, start, stop)
+
+        return Bundle(LazyArrays(read, manifest, damaged, slow=self.place.slow), manifest["meta"])
+
+    def commit(
+        self, stage: Stage, key: str, bundle: Bundle, *, label: str = "", provenance: Mapping[str, Any] | None = None
+    ) -> Ref:
+        """Write a result and publish it under its key; what another one has published before stays.
+
+        Raises
+        ------
+        NonDeterministicError
+            The key is there already, with another digest.
+        StoreError
+            The disk is full or may not be written.
+        BucketError
+            The server does not answer, or refuses.
+        """
+        digests = array_digests(bundle.arrays)
+        digest = output_digest(digests, bundle.meta)
+        files, arrays = encode(stage, bundle)
+        manifest: Manifest = {
+            "stage": stage.name,
+            "label": label,
+            "key": key,
+            "digest": digest,
+            "attempt": uuid.uuid4().hex,
+            "arrays": {name: {**about, "sha256": digests[name]} for name, about in arrays.items()},
+            "meta": json.loads(json.dumps(bundle.meta)),
+            "provenance": dict(provenance or {}),
+        }
+        pieces = pack(manifest, files)
+        path = artifact_path(stage.name, key)
+        for _ in range(3):
+            if self.place.create(path, pieces):
+                return reference(manifest)
+            there = self.lookup(stage.name, key, fresh=True)  # a damaged one is set aside
+            if there is not None and there.digest == digest:
+                return there
+            old = self.manifest(stage.name, key)
+            if there is not None and old is not None:
+                raise NonDeterministicError("RIL-577", difference(label or key[:12], manifest, old))
+        raise StoreError(
+            "RIL-573", f"cannot publish {path} in {self.location}", remedy="remove that file and run again"
+        )
+
+    def set_aside(self, stage: str, key: str, manifest: Manifest | None, reason: str) -> None:
+        """Move a damaged artifact out of the way. Best effort: a cache may be read-only.
+
+        Another run may have done so before, and have published a sound one meanwhile: that one stays.
+        """
+        path, aside = artifact_path(stage, key), f"quarantine/{stage}-{key[:16]}-{uuid.uuid4().hex[:8]}"
+        with suppress(OSError, RilleError):
+            with suppress(ValueError):
+                found = self._read_manifest(stage, key)
+                if found is None or manifest is None or found["attempt"] != manifest["attempt"]:
+                    return
+            self.place.move(path, f"{aside}.zarr.zip")
+            self.place.write(f"{aside}.txt", f"{reason}\n".encode())
+
+
+def _place(location: Location) -> Place:
+    if isinstance(location, Path):
+        return Folder(location)
+    from pipeline.engine.store.s3 import connect
+
+    return connect(location)
+
+
+at = Store

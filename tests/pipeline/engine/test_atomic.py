@@ -1,0 +1,59 @@
+"""Files appear whole or not at all, and by one module."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from pipeline.engine.runtime import atomic
+
+PIPELINE = Path(__file__).parents[3] / "pipeline"
+
+
+def names(folder):
+    return sorted(p.name for p in folder.rglob("*"))
+
+
+def test_a_file_is_replaced_or_left(tmp_path, monkeypatch):
+    path = tmp_path / "deep" / "a.json"
+    atomic.write(path, "one")
+    atomic.write(path, b"two")
+    assert path.read_bytes() == b"two"
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(atomic.os, "replace", full)
+    with pytest.raises(OSError, match="No space"):
+        atomic.write(path, "three")
+    assert (path.read_bytes(), names(path.parent)) == (b"two", ["a.json"])
+
+
+def test_of_two_that_create_a_file_one_does(tmp_path):
+    path = tmp_path / "a" / "b"
+    assert atomic.create(path, [b"on", b"e"])
+    assert not atomic.create(path, [b"two"])
+    assert (path.read_bytes(), names(path.parent)) == (b"one", ["b"])
+
+
+def test_a_block_that_fails_leaves_what_was_there(tmp_path):
+    for name in ("file.tif", "folder.zarr"):
+        path = tmp_path / name
+        for turn in range(2):
+            with atomic.replacing(path) as temporary:
+                assert temporary.name == name
+                place = temporary if name == "file.tif" else temporary / "x"
+                place.parent.mkdir(exist_ok=True)
+                place.write_text(f"{turn}")
+        with pytest.raises(ValueError, match="half"), atomic.replacing(path) as temporary:
+            raise ValueError("half")
+        assert (path if path.is_file() else path / "x").read_text() == "1"
+    assert names(tmp_path) == ["file.tif", "folder.zarr", "x"]
+
+
+def test_no_other_module_moves_files_into_place():
+    pattern = re.compile(r"os\.(replace|link|fsync)\(|\.tmp\b|temporary\.(replace|rename)\(")
+    found = [p for p in PIPELINE.rglob("*.py") if p.name != "atomic.py" and pattern.search(p.read_text("utf-8"))]
+    assert [p.name for p in found] == ["maintenance.py"], "which clears away what is left over"
