@@ -119,7 +119,7 @@ def test_timing(place: Place) -> None:
         first, second = place.rille("timing", name), place.rille("timing", name)
         assert (first.status, first.err) == (0, "")
         assert first.lines[0].startswith(f"run {name}: ")
-        assert first.last.startswith("least possible ")
+        assert any(line.startswith("least possible ") for line in first.lines[-2:])  # compiling may follow
         assert first == second
     assert place.rille("timing").lines[0].startswith("run mockup-loop/")
 
@@ -270,8 +270,10 @@ def test_cache_verify_names_what_is_damaged(place: Place, tmp_path: Path) -> Non
     assert re.fullmatch(r"\d+ artifacts are sound, 0 damaged", sound.last)
     copy = tmp_path / "cache"
     shutil.copytree(place.folder / ".rille/cache", copy)
-    (chunk, *_) = sorted(p for p in (copy / "artifacts" / "trajectory").rglob("c*") if p.is_file())
-    chunk.write_bytes(chunk.read_bytes()[:-1] + b"\0\0")
+    (artifact, *_) = sorted((copy / "artifacts" / "trajectory").rglob("*.zarr.zip"))
+    data = bytearray(artifact.read_bytes())
+    data[len(data) // 2] ^= 255
+    artifact.write_bytes(data)
     damaged = place.rille("cache", "verify", "--cache", copy)
     assert damaged.status == 1
     assert damaged.last.endswith(" 1 damaged")
@@ -292,3 +294,10 @@ def test_cache_pin_and_unpin(place: Place, tmp_path: Path) -> None:
     again = place.rille("cache", "unpin", run, "--cache", copy)
     assert again.status == 2
     assert again.complaint.startswith("rille: error RIL-563: ")
+
+
+def test_params(place: Place) -> None:
+    first, second = place.rille("params", "locus"), place.rille("params", "locus")
+    assert (first.status, first.err) == (0, "")
+    assert first.lines[0].startswith("locus.cell_size = ")
+    assert first == second

@@ -53,6 +53,7 @@ WRONG = {
         ("other no-such-task", "RIL-068"),
         ("other trajectory --no-such-option", "RIL-001"),
     ],
+    "params": [("no-such-section", "RIL-920"), ("--no-such-flag", "RIL-001")],
     "timing": [("no-such-run", "RIL-067"), ("--runs no-such-folder", "RIL-067"), ("other other", "RIL-001")],
     "check": [
         ("", "RIL-001"),
