@@ -21,7 +21,7 @@ from raising import raises
 from pipeline.engine.events import read
 from pipeline.engine.store.base import Store
 from pipeline.engine.store.maintenance import artifacts
-from pipeline.engine.store.manifest import reference
+from pipeline.engine.store.manifest import length, reference, unframe
 from pipeline.runs import session
 
 SMALL = (
@@ -137,8 +137,11 @@ def test_what_is_done_to_the_files_of_a_run_reaches_neither_the_cache_nor_the_ne
 def test_a_damaged_output_is_drawn_again(cold: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert session.reconstruct(options(cold)) == 0
     before = digests(cold)
-    chunk = next((cold / "cache").glob("artifacts/output.paths/*/*/a-*/content/c*"))
-    chunk.write_bytes(bytes(chunk.stat().st_size))
+    path = next((cold / "cache").glob("artifacts/output.paths/*/*.zip"))
+    data = path.read_bytes()
+    members = unframe(data[: length(data)])["files"]
+    start, size, _ = next(where for name, where in members.items() if name.startswith("content/c"))
+    path.write_bytes(data[:start] + bytes(size) + data[start + size :])
     assert session.reconstruct(options(cold)) == 0
     assert "is damaged" in capsys.readouterr().err
     assert {label.split("/")[0] for label in computed(cold)} == {"output"}
