@@ -20,6 +20,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -37,14 +38,14 @@ from dataclasses import replace
 
 from {real} import STAGE as REAL
 
-from benchmarks.scale import nothing
+from idle.source import nothing
 
 STAGE = replace(REAL, run=nothing("{name}"))
 '''
 
 IMAGE_MODULE = '''"""An image of a few pixels."""
 
-from benchmarks.scale import image_stage
+from idle.source import image_stage
 
 STAGE = image_stage()
 '''
@@ -141,7 +142,7 @@ def image_stage() -> Any:
         return Bundle({"image": np.zeros((4, 4), dtype=np.uint8)}, {"of": [args["frame"], args["camera"]]})
 
     arrays = (Array("image", ("row", "col"), "uint8", "1", "grey value"),)
-    return Stage("image", 1, "nothing", NoParams, (), arrays, (), run)
+    return Stage("image", 1, "nothing", NoParams, (), arrays, run=run)
 
 
 def write_stages(folder: Path) -> None:
@@ -151,6 +152,7 @@ def write_stages(folder: Path) -> None:
     package = folder / "idle"
     package.mkdir(parents=True)
     (package / "__init__.py").write_text('"""Stages that do nothing."""\n')
+    shutil.copyfile(__file__, package / "source.py")  # a stage's own modules lie in its package
     (package / "image.py").write_text(IMAGE_MODULE)
     for name, real in modules().items():
         (package / f"{name}.py").write_text(STAGE_MODULE.format(real=real.__name__, name=name))
