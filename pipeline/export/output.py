@@ -35,6 +35,7 @@ CONTENT = Array("content", ("block", "byte"), "uint8", "1", "bytes of the files,
 RESTORE: Mapping[str, Callable[[Any], Any]] = {
     "frames": tuple,
     "sequence.rig": Rig.from_dict,
+    "sequence.simulation.T_vehicle_left": RigidTransform.from_matrix,
     "sequence.georeference": lambda d: Georeference(d["crs"], tuple(d["origin"]), d["azimuth"]),
     "sequence.truth": lambda poses: [None if pose is None else RigidTransform.from_matrix(pose) for pose in poses],
     "config.vehicle": Vehicle.model_validate,

@@ -41,18 +41,22 @@ class Block:
 
 @dataclass(frozen=True)
 class Figure:
-    """What became of a figure: its block, or why there is none; neither where nobody expects it."""
+    """What became of a figure: its block, or why there is none; neither where nobody expects it.
+
+    ``failed``: drawing it raised an error, so that the run lacks what it could have shown.
+    """
 
     title: str
     block: Block | None = None
     why: str = ""
+    failed: bool = False
 
     @staticmethod
     def from_dict(d: Mapping[str, Any]) -> Figure:
         """What ``dataclasses.asdict`` has taken apart."""
         given = d["block"]
         if given is None:
-            return Figure(d["title"], None, d["why"])
+            return Figure(d["title"], None, d["why"], d["failed"])
         table = given["table"]
         if table is not None:
             table = Table(tuple(table["head"]), tuple(map(tuple, table["rows"])), frozenset(table["numbers"]))

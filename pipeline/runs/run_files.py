@@ -59,8 +59,13 @@ def task_rows(graph: Graph, store: Store) -> tuple[TaskRow, ...]:
     return tuple(rows)
 
 
-def write(folder: Path, view: RunView, made: Made, store: Store) -> None:
-    """All files of a run; what has no artifact is left out (the report says so)."""
+def write(folder: Path, view: RunView, made: Made, store: Store) -> list[str]:
+    """Write all files of a run; what has no artifact is left out (the report says so).
+
+    Returns
+    -------
+    Title and reason of each figure whose drawing failed.
+    """
     for output in (output for module in catalogue.MADE for output in module.OUTPUTS):
         ref = made[output.name].ref if output.name in made else None
         if ref is not None:
@@ -71,6 +76,7 @@ def write(folder: Path, view: RunView, made: Made, store: Store) -> None:
     facts = _content(made["facts"], store)
     figures = [Figure.from_dict(_content(made[o.name], store)) for o in gallery.OUTPUTS if made[o.name].ref is not None]
     write_report(folder, view, facts, figures)
+    return [f"{figure.title}: {figure.why}" for figure in figures if figure.failed]
 
 
 def _frames(folder: Path, view: RunView, trajectory: Any) -> dict[str, Any]:

@@ -212,14 +212,18 @@ def _reconstruct(options: Options) -> tuple[int, Path]:
     opened.graph.last = lambda: run_files.lay_out(opened.graph, opened.told().view(tasks=()), made)
     result = _compute(opened)
     remember()
-    _write(opened.told(), result, made)
+    undrawn = _write(opened.told(), result, made)
     _point_latest(opened.folder)
     warn_of_results(opened.graph)
     arrived = _outcome(opened)
     total = result.total()
-    print(f"{opened.folder}  computed {total.computed}, cached {total.cached}, missing {total.failed + total.skipped}")
+    missing = total.failed + total.skipped + len(undrawn)
+    print(f"{opened.folder}  computed {total.computed}, cached {total.cached}, missing {missing}")
+    for line in undrawn:
+        print(f"rille: missing figure {line}", file=sys.stderr)
     if result.ok:
-        return max(arrived, _posed_all(opened.products), _all_read(opened, arrived)), opened.folder
+        drawn = HOLES if undrawn else COMPLETE
+        return max(arrived, drawn, _posed_all(opened.products), _all_read(opened, arrived)), opened.folder
     _list_missing(opened.graph, opened.folder)
     return HOLES, opened.folder
 
@@ -275,8 +279,8 @@ def _compute(opened: _Opened) -> Result:
     return result
 
 
-def _write(opened: _Opened, result: Result, made: run_files.Made) -> None:
-    """Everything that the run leaves; nothing of it where an artifact was found damaged."""
+def _write(opened: _Opened, result: Result, made: run_files.Made) -> list[str]:
+    """Write everything that the run leaves, nothing of it where an artifact was found damaged; give what is undrawn."""
     from pipeline.engine import events
     from pipeline.runs import run_files
 
@@ -288,12 +292,13 @@ def _write(opened: _Opened, result: Result, made: run_files.Made) -> None:
         )
     whole = opened.view(tasks=run_files.task_rows(opened.graph, opened.store), seconds=result.seconds)
     try:
-        run_files.write(opened.folder, whole, made, opened.store)
+        undrawn = run_files.write(opened.folder, whole, made, opened.store)
         total = (datetime.now(UTC) - opened.started).total_seconds()
         events.add_facts(opened.folder / "ledger.jsonl", total=total)
     except (DamagedError, GoneError):
         shutil.rmtree(opened.folder)
         raise
+    return undrawn
 
 
 def lay_out(sequence: Sequence, config: Any, frames: tuple[int, ...]) -> Graph:

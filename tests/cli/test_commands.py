@@ -66,6 +66,8 @@ def test_drive(place: Place) -> None:
     folder, again = place.runs("mockup-loop")
     assert {p.name for p in folder.iterdir()} == {p.name for p in again.iterdir()}
     assert {p.name for p in folder.iterdir()} >= {"report.html", "report.json", "config.toml", "ledger.jsonl"}
+    report = json.loads((folder / "report.json").read_text(encoding="utf-8"))
+    assert report["complete"], report["missing"]
 
 
 @pytest.mark.parametrize("words", [MOCKUP, OTHER], ids=lambda words: words[0])

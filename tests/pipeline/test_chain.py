@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,8 @@ from pipeline.engine.events import read
 from pipeline.engine.store.base import Store
 from pipeline.engine.store.maintenance import artifacts
 from pipeline.engine.store.manifest import length, reference, unframe
+from pipeline.report import gallery
+from pipeline.report.block import Figure
 from pipeline.runs import session
 
 SMALL = (
@@ -146,6 +148,18 @@ def test_a_damaged_output_is_drawn_again(cold: Path, capsys: pytest.CaptureFixtu
     assert "is damaged" in capsys.readouterr().err
     assert {label.split("/")[0] for label in computed(cold)} == {"output"}
     assert digests(cold) == before
+
+
+def test_a_figure_that_cannot_be_drawn_is_missing(
+    cold: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = Figure.from_dict(asdict(gallery._drawn("Seams", lambda _: 1 / 0, lambda _: True, None)))  # type: ignore
+    monkeypatch.setattr(Figure, "from_dict", lambda d: made if d["title"] == "Seams" else Figure(d["title"]))
+    assert session.reconstruct(options(cold)) == 3
+    told = capsys.readouterr()
+    assert "rille: missing figure Seams: drawing failed, ZeroDivisionError" in told.err
+    assert told.out.rstrip().endswith("missing 1")
+    assert not json.loads((latest(cold) / "report.json").read_text())["complete"]
 
 
 def test_one_risk_parameter_reruns_risk_path_and_what_reads_them(cold: Path) -> None:
