@@ -21,7 +21,6 @@ from __future__ import annotations
 import gc
 import heapq
 import math
-import threading
 import time
 from collections import defaultdict
 from collections.abc import Callable, Collection
@@ -45,9 +44,6 @@ from pipeline.engine.store.base import GoneError, NonDeterministicError, Store
 from pipeline.engine.store.manifest import Ref
 from pipeline.engine.task import Outcome, key_of, recipe
 from stages.core.errors import DegenerateError, RilleError
-
-FEW = 20
-"""So many tasks, or one of so many, are few."""
 
 HEALS = 3
 """Times that a task is put back because its input has gone."""
@@ -139,7 +135,6 @@ def run(
     progress: Progress | None = None,
     memory_limit: float | None = None,
     survey: Callable[[], Graph] | None = None,
-    meanwhile: Callable[[], None] | None = None,
 ) -> Result:
     """Bring every node of a graph to an artifact.
 
@@ -156,8 +151,6 @@ def run(
     progress : told of every step.
     memory_limit : bytes that this process and its workers may take together; None is what is free here.
     survey : lays the same graph out anew, to look ahead: what cannot fit into memory is refused before anything runs.
-    meanwhile : done once, on a thread of this process, while worker processes compute the last tasks; not called where
-        there are no such.
 
     Raises
     ------
@@ -178,7 +171,6 @@ def run(
         progress or Quiet(),
         memory_limit,
         survey,
-        meanwhile,
     ).go()
 
 
@@ -196,10 +188,9 @@ class _Run:
         progress: Progress,
         memory_limit: float | None,
         survey: Callable[[], Graph] | None,
-        meanwhile: Callable[[], None] | None,
     ) -> None:
         self.graph, self.store = graph, store
-        self.memory_limit, self.survey, self.meanwhile = memory_limit, survey, meanwhile
+        self.memory_limit, self.survey = memory_limit, survey
         self.admission: Admission | None = None
         self.executor_kind, self.jobs = executor, jobs
         self.keep_going, self.force, self.dry = keep_going, frozenset(force), dry
@@ -366,22 +357,12 @@ class _Run:
             self.progress.running(handle)
             refs = {p: [_light(r) for r in g] if isinstance(g, list) else _light(g) for p, g in handle.refs().items()}
             self.executor.submit(handle.key, self.store.location, handle.spec, refs, handle.stage in self.force)
-        self._finish_ahead()
         if self.stopped:
             for key in (*(handle.key for handle in self.missing), *self.patients):
                 for handle in self.flying.pop(key, ()):
                     handle.status = self.fates.get(handle.index, "pending")
             self.missing.clear()
             self.patients.clear()
-
-    def _finish_ahead(self) -> None:
-        """Once the plan is complete and few of its tasks are left, begin what follows them."""
-        if self.meanwhile is None or self.executor is None or self.expansions or not (self.flying and self.warm):
-            return
-        total = len(self.graph.nodes)
-        if total - len(self.fates) <= max(FEW, total // FEW) and self.executor_kind not in ("inline", "threads"):
-            threading.Thread(target=self.meanwhile, daemon=True).start()
-            self.meanwhile = None
 
     def _begin(self) -> None:
         """Look ahead, share the memory out, and start the workers that it leaves room for."""
@@ -403,7 +384,7 @@ class _Run:
     def _look_ahead(self) -> Graph:
         """The graph laid out anew and looked up, by what this run's survey of the store has found."""
         ahead = Graph() if self.survey is None else self.survey()
-        dry = _Run(ahead, self.store, "inline", None, False, self.force, True, None, Quiet(), None, None, None)
+        dry = _Run(ahead, self.store, "inline", None, False, self.force, True, None, Quiet(), None, None)
         dry._settle()
         dry._leave_out()
         return ahead
