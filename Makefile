@@ -4,6 +4,7 @@ PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
+TYPES  := $(VENV)/types/rille# the package as mypy finds it
 
 SEQ    ?= mockup
 FRAMES ?=
@@ -27,7 +28,7 @@ $(STAMP): pyproject.toml constraints.txt
 	  || { echo "rille needs Python 3.11 or newer; say which with PYTHON=..." >&2; exit 2; }
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
-	@$(BIN)/python -m compileall -q pipeline stages datasets
+	@$(BIN)/python -m compileall -q rille pipeline stages datasets
 	@touch $@
 
 reconstruct: $(STAMP) ## a sequence to terrain, trajectory, risk map, path and report: SEQ= FRAMES= JOBS= SET="key=value ..."
@@ -48,6 +49,7 @@ bench: $(STAMP) ## side-by-side measurements: every figure of the README; ONLY=m
 	@for b in $(or $(ONLY),$(BENCHMARKS)); do echo "== $$b"; $(BIN)/python benchmarks/$$b.py $(ARGS) || exit 1; done
 
 lint: $(STAMP) ## ruff and mypy
+	@mkdir -p $(TYPES) && ln -sfn $(addprefix ../../../,rille/__init__.py rille/py.typed pipeline stages datasets) $(TYPES)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy

@@ -40,7 +40,16 @@ def sequences() -> list[str]:
 def report(sequence: str, settings: list[str], cold: bool) -> dict[str, Any]:
     with tempfile.TemporaryDirectory(prefix="rille-bench-") as folder:
         cache = ["--cache", f"{folder}/cache"] if cold else []
-        command = [sys.executable, "-m", "pipeline.cli", "reconstruct", sequence, "--runs", f"{folder}/runs", *cache]
+        command = [
+            sys.executable,
+            "-m",
+            "rille.pipeline.cli",
+            "reconstruct",
+            sequence,
+            "--runs",
+            f"{folder}/runs",
+            *cache,
+        ]
         command += [word for setting in settings for word in ("--set", setting)]
         subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
         path = next(Path(folder).glob("runs/*/latest/report.json"))

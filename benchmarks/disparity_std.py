@@ -1,5 +1,5 @@
-"""Standard deviation of disparities against exact ones: the factors of ``stages.hfvm.finish.uncertainty`` and their
-check.
+"""Standard deviation of disparities against exact ones: the factors of ``rille.stages.hfvm.finish.uncertainty`` and
+their check.
 
 ``python benchmarks/disparity_std.py`` renders pairs of the built-in mockup (kept in ``--cache``), matches them and
 prints how many of the matched pixels err by less than one and two standard deviations. ``motorcycle`` and ``cones`` of
@@ -46,10 +46,10 @@ Floats = NDArray[np.float64]
 
 def rendered(cache: Path, parameters: dict[str, Any], frame: int) -> tuple[Any, ...]:
     """Left and right image, the exact column disparity, and both images' masks, of one mockup pair."""
-    from datasets.mockup.params import MockupParams
-    from datasets.mockup.sequence import mockup
-    from pipeline.engine.store.base import Store
-    from pipeline.engine.task import Spec, ensure
+    from rille.datasets.mockup.params import MockupParams
+    from rille.datasets.mockup.sequence import mockup
+    from rille.pipeline.engine.store.base import Store
+    from rille.pipeline.engine.task import Spec, ensure
 
     store, sequence = Store(cache), mockup(MockupParams(**parameters))
 
@@ -86,9 +86,9 @@ def judged(
     preset: str, left: Any, right: Any, truth: Any, left_valid: Any = None, right_valid: Any = None
 ) -> tuple[Floats, Floats, Floats]:
     """Parts (1, N, R, M) x n, absolute errors (n,) and standard deviations (n,) of the matched pixels with truth."""
-    from stages.hfvm import stage as hfvm
-    from stages.hfvm.finish import uncertainty
-    from stages.hfvm.images.params import HfvmParams
+    from rille.stages.hfvm import stage as hfvm
+    from rille.stages.hfvm.finish import uncertainty
+    from rille.stages.hfvm.images.params import HfvmParams
 
     parts: list[Any] = []
     original = uncertainty.standard_deviation
@@ -135,7 +135,7 @@ def main() -> None:
     parser.add_argument("--preset", default="default")
     parser.add_argument("--fit", action="store_true")
     options = parser.parse_args()
-    from pipeline.engine.runtime.environment import prepare_environment
+    from rille.pipeline.engine.runtime.environment import prepare_environment
 
     prepare_environment()
     pairs = {name: rendered(options.cache, p, frame) for name, (p, frame, _) in PAIRS.items()} | photographs()

@@ -38,12 +38,12 @@ def drive(sequence: Any, config: Any, goal: tuple[float, float]) -> dict[str, An
     import numpy as np
     from driving.exact_bed import ExactBed, place_of
 
-    from stages.core.declare import Bundle
-    from stages.hazard.risk import risk_map
-    from stages.planning.local_planner.memory import Memory
-    from stages.planning.local_planner.stage import next_leg, shortest_way
-    from stages.planning.local_planner.views import View
-    from stages.terrain.occlusion_bounds import Bounds, ceiling
+    from rille.stages.core.declare import Bundle
+    from rille.stages.hazard.risk import risk_map
+    from rille.stages.planning.local_planner.memory import Memory
+    from rille.stages.planning.local_planner.stage import next_leg, shortest_way
+    from rille.stages.planning.local_planner.views import View
+    from rille.stages.terrain.occlusion_bounds import Bounds, ceiling
 
     bed, vehicle, p = ExactBed.of(sequence, config, goal), config.vehicle, config.leg
     fine = vehicle.wheel_diameter / config.drive.detail
@@ -100,7 +100,7 @@ def table(rows: list[dict[str, Any]]) -> list[str]:
 
 def main() -> None:
     """Drive what is not there yet, and print the table."""
-    from pipeline.engine.runtime.environment import prepare_environment
+    from rille.pipeline.engine.runtime.environment import prepare_environment
 
     given = arguments()
     prepare_environment()

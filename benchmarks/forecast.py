@@ -24,7 +24,7 @@ TENTHS = (0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 0.9)
 
 def replay(path: Path, jobs: int) -> list[tuple[float, float, float]]:
     """Share of tasks that ended, seconds estimated and true, at each of ``TENTHS``."""
-    from pipeline.engine.forecast import Forecast
+    from rille.pipeline.engine.forecast import Forecast
 
     rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
     later = {label for r in rows for label in r.get("expansion", {}).get("nodes", [])}
@@ -49,7 +49,7 @@ def replay(path: Path, jobs: int) -> list[tuple[float, float, float]]:
 
 def table(warm: Path, cold: Path) -> dict[str, tuple[float, float, float]]:
     """The reference from two runs of the mockup."""
-    from pipeline.engine.forecast import kind
+    from rille.pipeline.engine.forecast import kind
 
     found: dict[str, tuple[float, float, float]] = {}
     rows = [json.loads(line) for line in warm.read_text(encoding="utf-8").splitlines()]
@@ -73,7 +73,7 @@ def write(warm: Path, cold: Path) -> None:
         f'"""Seconds of the mockup\'s tasks, for runs of which nothing is known yet (benchmarks/forecast.py, '
         f'{date.today()})."""\n\nfrom __future__ import annotations\n\n'
         f"REFERENCE: dict[str, tuple[float, float, float]] = {{\n{lines}}}\n"
-        '"""See :data:`pipeline.engine.forecast.Kinds`; one core, images of 570 x 520."""\n',
+        '"""See :data:`rille.pipeline.engine.forecast.Kinds`; one core, images of 570 x 520."""\n',
         encoding="utf-8",
     )
 

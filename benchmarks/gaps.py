@@ -65,14 +65,14 @@ def spoil(good: Path, folder: Path, first: int, gap: int) -> int:
 
 def trajectory(folder: Path, frames: tuple[int, ...], cache: Path) -> Any:
     """The trajectory of some frames of a folder, without elevation models; None where there is none."""
-    from datasets.registry import open_sequence
-    from pipeline.engine import scheduler
-    from pipeline.engine.graph import Graph, Handle
-    from pipeline.engine.store.base import at
-    from pipeline.flow import config
-    from pipeline.flow.closed_loop import dataflow
-    from stages.evaluation import truth
-    from stages.terrain.locus import stage as locus
+    from rille.datasets.registry import open_sequence
+    from rille.pipeline.engine import scheduler
+    from rille.pipeline.engine.graph import Graph, Handle
+    from rille.pipeline.engine.store.base import at
+    from rille.pipeline.flow import config
+    from rille.pipeline.flow.closed_loop import dataflow
+    from rille.stages.evaluation import truth
+    from rille.stages.terrain.locus import stage as locus
 
     class Odometry(Graph):
         """Leaves out elevation models, truth, and what would follow from them."""
@@ -125,7 +125,7 @@ def words(row: dict[str, Any]) -> str:
 def main() -> int:
     import os
 
-    from pipeline.engine.runtime.environment import prepare_environment
+    from rille.pipeline.engine.runtime.environment import prepare_environment
 
     given = arguments()
     prepare_environment()

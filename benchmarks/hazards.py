@@ -62,7 +62,7 @@ def judge(scene: Any, exact: Any, found: Any) -> dict[str, Any]:
     """Counts of cells, and of p_hazard's bins: how many, their mean probability and how many are truly hazardous."""
     import numpy as np
 
-    from stages.hazard.risk import CAUTION, HAZARDOUS, SAFE, UNKNOWN
+    from rille.stages.hazard.risk import CAUTION, HAZARDOUS, SAFE, UNKNOWN
 
     risk, truth = found["risk"], scene.crop(exact["risk"])
     observed = (risk != UNKNOWN) & (truth != UNKNOWN)
@@ -82,8 +82,8 @@ def judge(scene: Any, exact: Any, found: Any) -> dict[str, Any]:
 
 def path_of(scene: Any, exact: Any, found: Any) -> dict[str, Any]:
     """Length of a path over a map, the shortest between its ends over the exact one, and what it truly crosses."""
-    from stages.evaluation.path_check import path_check, shortest
-    from stages.planning.path import find_path
+    from rille.stages.evaluation.path_check import path_check, shortest
+    from rille.stages.planning.path import find_path
 
     path = find_path(found, scene.lattice, scene.vehicle, stretch=True)
     true = shortest(path.xyz, exact, scene.wide, scene.vehicle)
@@ -98,7 +98,7 @@ def one(seed: int, cover: float, slope: float, folder: Path | None, preset: str)
     from hazard.blend import blend
     from hazard.scenes import CELL, kept
 
-    from stages.hazard.risk import risk_map
+    from rille.stages.hazard.risk import risk_map
 
     scene = kept(folder, seed, cover, slope, preset)
     exact = risk_map(scene.exact, np.zeros_like(scene.exact), CELL, scene.vehicle)
@@ -121,7 +121,7 @@ def total(scenes: list[dict[str, Any]], way: str) -> dict[str, float]:
 
 
 def show(scenes: list[dict[str, Any]], covers: list[float]) -> None:
-    from stages.hazard.vehicle import Vehicle  # noqa: F401  (the package must import before the tables)
+    from rille.stages.hazard.vehicle import Vehicle  # noqa: F401  (the package must import before the tables)
 
     thin = 100 * 80  # cells of a footprint: what errs together
     headings = ["cover", "way", "scenes", "observed", "safe", "caution", "false safe, %", "95 %", "enterable hazard, %",

@@ -70,16 +70,16 @@ def make_pair(folder: Path, shape: tuple[int, int]) -> dict[str, Path]:
 
 def lay_out(graph: Any, paths: dict[str, Path], shape: tuple[int, int]) -> dict[str, Any]:
     """Nodes of both pyramids."""
-    from stages.core.declare import NoParams
-    from stages.imaging.pyramid import PyramidParams
+    from rille.stages.core.declare import NoParams
+    from rille.stages.imaging.pyramid import PyramidParams
 
     pyramids = {}
     for camera, path in paths.items():
         args = {"path": str(path), "sha256": hashlib.sha256(path.read_bytes()).hexdigest(), "frame": 0}
         args |= {"camera": camera, "width": shape[1], "height": shape[0], "depth": 8}
-        image = graph.node("datasets.images.files", f"image/{camera}", NoParams(), args)
+        image = graph.node("rille.datasets.images.files", f"image/{camera}", NoParams(), args)
         pyramids[camera] = graph.node(
-            "stages.imaging.pyramid", f"pyramid/{camera}", PyramidParams(), inputs={"image": image}
+            "rille.stages.imaging.pyramid", f"pyramid/{camera}", PyramidParams(), inputs={"image": image}
         )
     return pyramids
 
@@ -98,7 +98,7 @@ def table(graph: Any, seconds: float) -> None:
 
 def judge(store: Any, ref: Any, shape: tuple[int, int]) -> None:
     """Errors against the displacements that the pair was made with."""
-    from stages.core.validity import matched
+    from rille.stages.core.validity import matched
 
     bundle = store.open(ref)
     u, ok = bundle["column_disparity"], matched(bundle["validity"])
@@ -114,7 +114,7 @@ def judge(store: Any, ref: Any, shape: tuple[int, int]) -> None:
 
 
 def run(graph: Any, store: Any, jobs: int) -> float:
-    from pipeline.engine import scheduler
+    from rille.pipeline.engine import scheduler
 
     result = scheduler.run(graph, store, executor="processes", jobs=jobs)
     result.check()
@@ -131,12 +131,12 @@ def main() -> None:
     parser.add_argument("--whole", action="store_true", help="match it untiled too, and compare")
     options = parser.parse_args()
 
-    from pipeline.engine.graph import Graph
-    from pipeline.engine.runtime.environment import prepare_environment
-    from pipeline.engine.store.base import Store
-    from pipeline.flow import tiles
-    from stages.hfvm.images.params import HfvmParams
-    from stages.imaging.pyramid import PyramidParams
+    from rille.pipeline.engine.graph import Graph
+    from rille.pipeline.engine.runtime.environment import prepare_environment
+    from rille.pipeline.engine.store.base import Store
+    from rille.pipeline.flow import tiles
+    from rille.stages.hfvm.images.params import HfvmParams
+    from rille.stages.imaging.pyramid import PyramidParams
 
     with tempfile.TemporaryDirectory(prefix="rille-large-") as folder:
         prepare_environment()
@@ -151,7 +151,9 @@ def main() -> None:
         graph = Graph()
         pyramids = lay_out(graph, paths, shape)
         whole = (
-            graph.node("stages.hfvm.stage", "whole", params, inputs=pyramids) if options.whole or side is None else None
+            graph.node("rille.stages.hfvm.stage", "whole", params, inputs=pyramids)
+            if options.whole or side is None
+            else None
         )
         if side is not None:
             other = Graph()

@@ -37,8 +37,8 @@ def terrain(rows: int, cols: int, cover: float) -> tuple[Any, Any]:
     """Elevation and its standard deviation (row, col), metres."""
     import numpy as np
 
-    from datasets.mockup.params import MockupParams
-    from datasets.mockup.scene import build_scene
+    from rille.datasets.mockup.params import MockupParams
+    from rille.datasets.mockup.scene import build_scene
 
     bed = MockupParams(bed_width=(cols + 1) * CELL, bed_length=(rows + 1) * CELL, rock_cover=cover, seed=2)
     z = build_scene(bed.scene())["height"][:rows, :cols].astype(np.float32)
@@ -52,10 +52,10 @@ def one(rows: int, cols: int, cover: float, rounds: int) -> list[Any]:
     """A row of the table."""
     import numpy as np
 
-    from datasets.mockup.sequence import vehicle_at_scale
-    from stages.geometry.lattice import Lattice
-    from stages.hazard.risk import risk_map
-    from stages.planning.path import find_path
+    from rille.datasets.mockup.sequence import vehicle_at_scale
+    from rille.stages.geometry.lattice import Lattice
+    from rille.stages.hazard.risk import risk_map
+    from rille.stages.planning.path import find_path
 
     z, s = terrain(rows, cols, cover)
     vehicle, lattice = vehicle_at_scale(), Lattice.at(-cols // 2, rows, CELL, rows, cols)

@@ -48,10 +48,10 @@ def drive(settings: list[str]) -> dict[str, Any]:
     from driving.exact_bed import ExactBed
     from driving.limits import shortest_within_limits
 
-    from pipeline.engine import scheduler
-    from pipeline.engine.graph import Graph
-    from pipeline.engine.store.base import at
-    from pipeline.flow.closed_loop import Drive
+    from rille.pipeline.engine import scheduler
+    from rille.pipeline.engine.graph import Graph
+    from rille.pipeline.engine.store.base import at
+    from rille.pipeline.flow.closed_loop import Drive
 
     begin = time.perf_counter()
     sequence, layers = prepared(settings)
@@ -133,7 +133,7 @@ def worst(rows: list[dict[str, Any]]) -> list[str]:
 
 def main() -> None:
     """Run what is not there yet, and print the table."""
-    from pipeline.engine.runtime.environment import SINGLE, prepare_environment
+    from rille.pipeline.engine.runtime.environment import SINGLE, prepare_environment
 
     given = arguments()
     prepare_environment()

@@ -85,7 +85,7 @@ def arguments() -> argparse.Namespace:
 
 def start_process(threads: int) -> None:
     """Place of compiled kernels and number of threads, before NumPy and numba are imported."""
-    from pipeline.engine.runtime.environment import SINGLE, prepare_environment
+    from rille.pipeline.engine.runtime.environment import SINGLE, prepare_environment
 
     prepare_environment()
     os.environ.update({f"{name}_NUM_THREADS": str(threads) for name in SINGLE})
@@ -224,7 +224,7 @@ def main() -> None:
     start_process(given.threads)
     from pydantic import ValidationError
 
-    from stages.core.errors import RilleError
+    from rille.stages.core.errors import RilleError
 
     try:
         measure(given)

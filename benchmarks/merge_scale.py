@@ -19,8 +19,8 @@ from typing import Any
 
 import numpy as np
 
-from stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
-from stages.geometry.lattice import Lattice
+from rille.stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
+from rille.stages.geometry.lattice import Lattice
 
 HERE = Path(__file__).parent
 CELLS = 1500
@@ -62,12 +62,12 @@ def places(side: int, models: int, cells: int) -> list[tuple[int, int]]:
 
 def merged(cache: Path, where: list[tuple[int, int]], cells: int, jobs: int, ledger: Path) -> dict[str, str]:
     """Run the merge of models at ``where``; label to digest of every tile."""
-    from pipeline.engine import scheduler
-    from pipeline.engine.graph import Graph
-    from pipeline.engine.store.base import Store
-    from pipeline.flow.builders import merge_tiles
-    from pipeline.flow.reconstruction import TILE_CELLS
-    from stages.terrain import merge, tile_index
+    from rille.pipeline.engine import scheduler
+    from rille.pipeline.engine.graph import Graph
+    from rille.pipeline.engine.store.base import Store
+    from rille.pipeline.flow.builders import merge_tiles
+    from rille.pipeline.flow.reconstruction import TILE_CELLS
+    from rille.stages.terrain import merge, tile_index
 
     graph = Graph()
 
@@ -94,7 +94,7 @@ def merged(cache: Path, where: list[tuple[int, int]], cells: int, jobs: int, led
 
 def tiles_of(cells: int, at: tuple[int, int], cache: Path) -> set[str]:
     """Labels of the tiles that a model's cells touch, cell by cell."""
-    from pipeline.flow.reconstruction import TILE_CELLS
+    from rille.pipeline.flow.reconstruction import TILE_CELLS
 
     z = _run(NoParams(), {"pair": 0, "i0": at[0], "j0": -at[1], "cells": cells}, {})["elevation"]
     rows, cols = np.nonzero(np.isfinite(z))
@@ -114,8 +114,8 @@ def main() -> int:
     sys.path.insert(0, str(HERE.parent))
     os.environ["PYTHONPATH"] = str(HERE.parent)
     with tempfile.TemporaryDirectory() as temporary:
-        from pipeline.engine import events as ledger
-        from pipeline.engine.executors.base import prepare_environment
+        from rille.pipeline.engine import events as ledger
+        from rille.pipeline.engine.executors.base import prepare_environment
 
         cache = args.cache or Path(temporary) / "cache"
         prepare_environment()

@@ -54,7 +54,7 @@ def arguments() -> argparse.Namespace:
 
 def start_process() -> None:
     """Place of compiled kernels, and one thread each, before NumPy and numba are imported."""
-    from pipeline.engine.runtime.environment import SINGLE, prepare_environment
+    from rille.pipeline.engine.runtime.environment import SINGLE, prepare_environment
 
     prepare_environment()
     os.environ.update({f"{name}_NUM_THREADS": "1" for name in SINGLE})
@@ -77,8 +77,8 @@ def compare(name: str, given: argparse.Namespace) -> list[dict[str, Any]]:
     from odometry import chain, colmap, opencv
     from odometry.measures import judge
 
-    from datasets.registry import open_sequence
-    from pipeline.flow import config as configuration
+    from rille.datasets.registry import open_sequence
+    from rille.pipeline.flow import config as configuration
 
     overrides, _ = configuration.split_dataset(configuration.parse_assignments(given.set))
     sequence = open_sequence(name, overrides)
@@ -134,7 +134,7 @@ def main() -> None:
     start_process()
     import cv2
 
-    from stages.core.errors import RilleError
+    from rille.stages.core.errors import RilleError
 
     cv2.setNumThreads(1)
     everything = []

@@ -18,11 +18,11 @@ from matplotlib import pyplot as plt
 from matplotlib.colors import LightSource
 from numpy.typing import NDArray
 
-from datasets.protocol import Source
-from datasets.registry import open_sequence
-from pipeline.commands.options import cache_folder
-from pipeline.engine.store.base import Store
-from pipeline.engine.task import Ref, Spec, ensure
+from rille.datasets.protocol import Source
+from rille.datasets.registry import open_sequence
+from rille.pipeline.commands.options import cache_folder
+from rille.pipeline.engine.store.base import Store
+from rille.pipeline.engine.task import Ref, Spec, ensure
 
 RISK = np.array([[0.36, 0.72, 0.60], [0.90, 0.80, 0.45], [0.80, 0.28, 0.10], [1.0, 1.0, 1.0]])
 
@@ -49,7 +49,7 @@ def main() -> None:
     parser.add_argument("--output", type=Path, default=Path("docs/overview.jpg"))
     given = parser.parse_args()
     if not given.run.exists():
-        subprocess.run([sys.executable, "-m", "pipeline.cli", "reconstruct", given.run.parent.name], check=True)
+        subprocess.run([sys.executable, "-m", "rille.pipeline.cli", "reconstruct", given.run.parent.name], check=True)
     run = given.run.resolve()
 
     z, extent = raster(run / "dem.tif")

@@ -31,7 +31,11 @@ def rille(*words: str, environment: dict[str, str]) -> tuple[float, float, str]:
     """Wall and processor time, s, of a command with all that it starts, and what it printed."""
     before, begin = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
     done = subprocess.run(
-        [sys.executable, "-m", "pipeline.cli", *words], env=environment, capture_output=True, text=True, check=False
+        [sys.executable, "-m", "rille.pipeline.cli", *words],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
     )
     wall, after = time.perf_counter() - begin, resource.getrusage(resource.RUSAGE_CHILDREN)
     if done.returncode:

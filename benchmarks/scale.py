@@ -67,7 +67,7 @@ def nothing(name: str) -> Any:
     """``run`` of a stage of the chain: zeros of the declared arrays, and the facts by which the graph grows."""
 
     def run(params: Any, args: Any, inputs: Any) -> Any:
-        from stages.core.declare import Bundle
+        from rille.stages.core.declare import Bundle
 
         stage = _real(name)
         arrays = {
@@ -89,7 +89,7 @@ def _of(args: Any, inputs: Any) -> list[Any]:
 
 
 def _real(name: str) -> Any:
-    from pipeline.flow.config import stage
+    from rille.pipeline.flow.config import stage
 
     return stage(name)
 
@@ -107,7 +107,7 @@ def _facts(name: str, args: Any, inputs: Any) -> dict[str, Any]:
         positions = [[0.0, SPACING * k, 0.0] for k in range(len(frames))]
         return {"frames": frames, "positions": positions, "pieces": [[frames[0], frames[-1]]], "main": 0}
     if name == "locus":
-        from stages.geometry.lattice import Lattice
+        from rille.stages.geometry.lattice import Lattice
 
         y = SPACING * args["pair"]
         return {"lattice": Lattice.snap((-0.8, 0.8, y, y + 1.6), CELL).to_dict(), "pair": args["pair"]}
@@ -136,7 +136,7 @@ def _tiles(lattice: Any, side: int) -> Iterator[list[int]]:
 
 def image_stage() -> Any:
     """Source of the images."""
-    from stages.core.declare import Array, Bundle, NoParams, Stage
+    from rille.stages.core.declare import Array, Bundle, NoParams, Stage
 
     def run(params: Any, args: Any, inputs: Any) -> Any:
         return Bundle({"image": np.zeros((4, 4), dtype=np.uint8)}, {"of": [args["frame"], args["camera"]]})
@@ -147,7 +147,7 @@ def image_stage() -> Any:
 
 def write_stages(folder: Path) -> None:
     """The package ``idle`` of stages that do nothing."""
-    from pipeline.flow.config import modules
+    from rille.pipeline.flow.config import modules
 
     package = folder / "idle"
     package.mkdir(parents=True)
@@ -160,12 +160,12 @@ def write_stages(folder: Path) -> None:
 
 def graph_of(pairs: int) -> Any:
     """The real dataflow over a sequence of so many pairs."""
-    from datasets.protocol import Sequence, Source
-    from pipeline.engine.graph import Graph, Handle
-    from pipeline.flow import config
-    from pipeline.flow.closed_loop import dataflow
-    from stages.core.declare import NoParams
-    from stages.geometry.geometry import Camera, Rig, RigidTransform
+    from rille.datasets.protocol import Sequence, Source
+    from rille.pipeline.engine.graph import Graph, Handle
+    from rille.pipeline.flow import config
+    from rille.pipeline.flow.closed_loop import dataflow
+    from rille.stages.core.declare import NoParams
+    from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 
     class Idle(Graph):
         """Takes for each stage the one that does nothing."""
@@ -187,12 +187,12 @@ def graph_of(pairs: int) -> Any:
 
 def measure(pairs: int, cache: Path, executor: str, jobs: int, what: str) -> dict[str, float]:
     """One cold run, or one plan of what is cached, in this process."""
-    from pipeline.engine import scheduler
-    from pipeline.engine.memory.limits import resident
-    from pipeline.engine.store.base import Store
+    from rille.pipeline.engine import scheduler
+    from rille.pipeline.engine.memory.limits import resident
+    from rille.pipeline.engine.store.base import Store
 
     before = resident()
-    from pipeline.engine.code_digest import tree_digest
+    from rille.pipeline.engine.code_digest import tree_digest
 
     tree_digest()  # once a process, whatever its size: reading the sources
     cpu, wall = time.process_time(), time.perf_counter()
@@ -279,7 +279,7 @@ def main() -> None:
     parser.add_argument("--what", choices=("all", "run", "plan"), default="all", help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.what != "all":
-        from pipeline.engine.runtime.environment import prepare_environment
+        from rille.pipeline.engine.runtime.environment import prepare_environment
 
         prepare_environment()
         print(json.dumps(measure(given.pairs, given.folder / "cache", given.executor, given.jobs, given.what)))

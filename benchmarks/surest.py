@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from pipeline.engine.store.base import Store
+    from rille.pipeline.engine.store.base import Store
 
     Floats = NDArray[np.floating[Any]]
 
@@ -59,8 +59,8 @@ def judged(store: Store, rows: Mapping[str, Any], row: Mapping[str, Any]) -> tup
     """Errors and standard deviations (n,) of what a task ``dem_accuracy`` has judged, and how many cells it wanted."""
     import numpy as np
 
-    from stages.evaluation.dem_accuracy import in_window
-    from stages.geometry.lattice import Lattice, mosaic
+    from rille.stages.evaluation.dem_accuracy import in_window
+    from rille.stages.geometry.lattice import Lattice, mosaic
 
     def found(label: str) -> Any:
         ref = store.lookup(rows[label]["stage"], rows[label]["key"])
@@ -109,11 +109,11 @@ def main() -> None:
     from matching import say, start_process, table
 
     start_process(1)
-    from pipeline.commands.options import cache_folder
-    from pipeline.engine import events
-    from pipeline.engine.store.base import at
-    from pipeline.runs import lookup
-    from pipeline.runs.session import Options, reconstruct
+    from rille.pipeline.commands.options import cache_folder
+    from rille.pipeline.engine import events
+    from rille.pipeline.engine.store.base import at
+    from rille.pipeline.runs import lookup
+    from rille.pipeline.runs.session import Options, reconstruct
 
     cache = cache_folder(given.cache)
     if given.run is None and reconstruct(Options(SEQUENCE, (PRESET,), runs=given.runs, cache=cache)):

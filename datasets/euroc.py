@@ -14,20 +14,20 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from datasets.cameras import CalibratedCamera, read_cameras, rig_of
-from datasets.cameras.fields import Fields
-from datasets.cameras.text import parse_yaml
-from datasets.images import files
-from datasets.images.pairing import Pair, common_size
-from datasets.imu import Inertial, at_frames, read_imu
-from datasets.poses import coverage, interpolate, read_poses
-from datasets.protocol import CAMERAS, Sequence, Source
-from datasets.text.names import derived_name
-from datasets.text.reading import read_text
-from datasets.text.tables import read_table
-from datasets.text.times import seconds
-from stages.core.errors import InputError
-from stages.geometry.geometry import RigidTransform
+from rille.datasets.cameras import CalibratedCamera, read_cameras, rig_of
+from rille.datasets.cameras.fields import Fields
+from rille.datasets.cameras.text import parse_yaml
+from rille.datasets.images import files
+from rille.datasets.images.pairing import Pair, common_size
+from rille.datasets.imu import Inertial, at_frames, read_imu
+from rille.datasets.poses import coverage, interpolate, read_poses
+from rille.datasets.protocol import CAMERAS, Sequence, Source
+from rille.datasets.text.names import derived_name
+from rille.datasets.text.reading import read_text
+from rille.datasets.text.tables import read_table
+from rille.datasets.text.times import seconds
+from rille.stages.core.errors import InputError
+from rille.stages.geometry.geometry import RigidTransform
 
 FOLDERS = {"left": "cam0", "right": "cam1"}
 

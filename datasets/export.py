@@ -12,10 +12,10 @@ from typing import Any
 import cv2
 import numpy as np
 
-from datasets.protocol import CAMERAS, Sequence, Source
-from stages.core.declare import Bundle
-from stages.core.errors import InputError
-from stages.geometry.geometry import Camera, RigidTransform, level_rotation
+from rille.datasets.protocol import CAMERAS, Sequence, Source
+from rille.stages.core.declare import Bundle
+from rille.stages.core.errors import InputError
+from rille.stages.geometry.geometry import Camera, RigidTransform, level_rotation
 
 Materialise = Callable[[Source], Bundle]
 

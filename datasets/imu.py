@@ -18,12 +18,12 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets.poses import coverage
-from datasets.protocol import Rows
-from datasets.text.tables import Table, read_table
-from datasets.text.times import GAP, seconds
-from stages.core.errors import InputError
-from stages.geometry.geometry import RigidTransform, orthonormal, rotation_exp
+from rille.datasets.poses import coverage
+from rille.datasets.protocol import Rows
+from rille.datasets.text.tables import Table, read_table
+from rille.datasets.text.times import GAP, seconds
+from rille.stages.core.errors import InputError
+from rille.stages.geometry.geometry import RigidTransform, orthonormal, rotation_exp
 
 Floats = NDArray[np.float64]
 Up = tuple[float, float, float] | None
@@ -106,7 +106,7 @@ def read_imu(path: Path, *, unit: str = "auto") -> Imu:
 
     Parameters
     ----------
-    unit : of the times, see :func:`datasets.text.times.seconds`.
+    unit : of the times, see :func:`rille.datasets.text.times.seconds`.
 
     Raises
     ------

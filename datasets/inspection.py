@@ -15,11 +15,11 @@ from pathlib import Path
 
 import numpy as np
 
-from datasets.cameras import CalibratedCamera, read_cameras
-from datasets.images.pairing import SIDES, SUFFIXES, common_size, natural, pair_up, side_of
-from datasets.poses import read_positions
-from datasets.text.reading import Search, is_file, read_lines
-from stages.core.errors import InputError, RilleError
+from rille.datasets.cameras import CalibratedCamera, read_cameras
+from rille.datasets.images.pairing import SIDES, SUFFIXES, common_size, natural, pair_up, side_of
+from rille.datasets.poses import read_positions
+from rille.datasets.text.reading import Search, is_file, read_lines
+from rille.stages.core.errors import InputError, RilleError
 
 DEPTH = 4
 """Folders below the given one that are looked into; more is another data set."""

@@ -18,15 +18,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets.images import files
-from datasets.images.pairing import ends
-from datasets.manifest.rig import LONGEST_BASELINE, off_centre
-from datasets.protocol import CAMERAS, Sequence, Source
-from datasets.text.names import derived_name
-from datasets.text.reading import read_lines
-from datasets.text.times import seconds
-from stages.core.errors import InputError
-from stages.geometry.geometry import Camera, Rig, RigidTransform, orthonormal
+from rille.datasets.images import files
+from rille.datasets.images.pairing import ends
+from rille.datasets.manifest.rig import LONGEST_BASELINE, off_centre
+from rille.datasets.protocol import CAMERAS, Sequence, Source
+from rille.datasets.text.names import derived_name
+from rille.datasets.text.reading import read_lines
+from rille.datasets.text.times import seconds
+from rille.stages.core.errors import InputError
+from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, orthonormal
 
 PAIRS = (
     ("image_0", "image_1"),

@@ -24,10 +24,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets.text.tables import Table, read_table
-from datasets.text.times import seconds
-from stages.core.errors import InputError
-from stages.geometry.geometry import RigidTransform, orthonormal
+from rille.datasets.text.tables import Table, read_table
+from rille.datasets.text.times import seconds
+from rille.stages.core.errors import InputError
+from rille.stages.geometry.geometry import RigidTransform, orthonormal
 
 Floats = NDArray[np.float64]
 
@@ -84,7 +84,7 @@ def read_poses(path: Path, format: str = "auto", *, unit: str = "auto") -> Timed
     ----------
     format : one of the forms; ``auto`` takes the columns' names where there are any, else 12 or 16 numbers a row for
         ``kitti``, commas for ``euroc`` and blanks for ``tum``.
-    unit : of the times, see :func:`datasets.text.times.seconds`.
+    unit : of the times, see :func:`rille.datasets.text.times.seconds`.
 
     Raises
     ------

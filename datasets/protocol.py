@@ -11,15 +11,15 @@ from collections.abc import Sequence as Sequence_
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
-from datasets.georeference import Georeference
-from datasets.text.names import check_name
-from stages.core.declare import Params
-from stages.core.errors import InputError
-from stages.geometry.geometry import Rig, RigidTransform
-from stages.geometry.lens import Lens
+from rille.datasets.georeference import Georeference
+from rille.datasets.text.names import check_name
+from rille.stages.core.declare import Params
+from rille.stages.core.errors import InputError
+from rille.stages.geometry.geometry import Rig, RigidTransform
+from rille.stages.geometry.lens import Lens
 
 if TYPE_CHECKING:
-    from stages.hazard.vehicle import Vehicle
+    from rille.stages.hazard.vehicle import Vehicle
 
 CAMERAS = ("left", "right")
 

@@ -13,16 +13,16 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from datasets.images.files import Digests
-from datasets.images.misalign import MisalignParams, misalign
-from datasets.manifest.opening import open_manifest
-from datasets.mockup.loop import LOOP, mockup_loop
-from datasets.mockup.params import RECORDED_ONLY, SHORT, MockupParams
-from datasets.mockup.rover import RoverParams
-from datasets.mockup.sequence import mockup
-from datasets.protocol import Sequence
-from stages.core.declare import Params
-from stages.core.errors import ConfigError, InputError, RilleError, told
+from rille.datasets.images.files import Digests
+from rille.datasets.images.misalign import MisalignParams, misalign
+from rille.datasets.manifest.opening import open_manifest
+from rille.datasets.mockup.loop import LOOP, mockup_loop
+from rille.datasets.mockup.params import RECORDED_ONLY, SHORT, MockupParams
+from rille.datasets.mockup.rover import RoverParams
+from rille.datasets.mockup.sequence import mockup
+from rille.datasets.protocol import Sequence
+from rille.stages.core.declare import Params
+from rille.stages.core.errors import ConfigError, InputError, RilleError, told
 
 BUILT_IN: dict[str, tuple[str, Mapping[str, Any]]] = {
     "mockup": ("the paper's experiment, simulated: 40 pairs over a lunar bed at 1:10, with exact truth", {}),
@@ -50,7 +50,7 @@ def layouts() -> tuple[ModuleType, ...]:
     which gives None where the folder is none of its own; ``number`` chooses one of several (``FOLDER:NUMBER``).
     """
     names = [found.name for found in pkgutil.iter_modules([str(Path(__file__).parent)]) if not found.ispkg]
-    modules = [import_module(f"datasets.{name}") for name in sorted(names)]
+    modules = [import_module(f"rille.datasets.{name}") for name in sorted(names)]
     return tuple(module for module in modules if hasattr(module, "open_layout"))
 
 

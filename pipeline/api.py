@@ -1,14 +1,14 @@
 """Reconstruct from Python: the same tasks, cache and files as ``rille reconstruct``.
 
->>> import pipeline
->>> sequence = pipeline.open_sequence("mockup-short", mockup={"frames": 3})
+>>> import rille
+>>> sequence = rille.open_sequence("mockup-short", mockup={"frames": 3})
 >>> sequence.frames, round(sequence.rig.baseline, 3)
 (3, 0.097)
->>> run = pipeline.reconstruct(sequence, hfvm={"preset": "fast"})  # doctest: +SKIP
+>>> run = rille.reconstruct(sequence, hfvm={"preset": "fast"})  # doctest: +SKIP
 >>> run.terrain.elevation.sel(x=0.0, y=0.5, method="nearest")  # doctest: +SKIP
 >>> run.trajectory.position.sel(axis="y")  # doctest: +SKIP
 >>> run.metrics["trajectory_drift"]["value"]  # doctest: +SKIP
->>> pipeline.open_run("runs/mockup-short/latest").show()  # doctest: +SKIP
+>>> rille.open_run("runs/mockup-short/latest").show()  # doctest: +SKIP
 
 A program that starts workers needs the usual ``if __name__ == "__main__":`` around what it does.
 """
@@ -25,9 +25,9 @@ from typing import TYPE_CHECKING, Any
 
 import tomli_w
 
-from datasets import registry
-from datasets.protocol import Sequence
-from stages.core.errors import ConfigError, InputError
+from rille.datasets import registry
+from rille.datasets.protocol import Sequence
+from rille.stages.core.errors import ConfigError, InputError
 
 if TYPE_CHECKING:
     import xarray
@@ -84,10 +84,10 @@ def reconstruct(
     RilleError
         The input, a parameter or the machine does not permit it; the message says what, where, and what to do.
     """
-    from pipeline.commands.options import cache_folder, prepare
+    from rille.pipeline.commands.options import cache_folder, prepare
 
     prepare()
-    from pipeline.runs import session
+    from rille.pipeline.runs import session
 
     given: dict[str, Any] = {"executor": executor} if executor else {}
     if client is not None:
@@ -136,7 +136,7 @@ def open_run(path: str | Path, runs: str | Path = "runs") -> Run:
     ConfigError
         There is no such run.
     """
-    from pipeline.runs import lookup
+    from rille.pipeline.runs import lookup
 
     return Run(lookup.find(str(path), Path(runs)))
 

@@ -18,10 +18,10 @@ from typing import Annotated, Literal
 from cyclopts import App, CycloptsError
 from rich.console import Console
 
-from pipeline.commands import cache as cache_commands
-from pipeline.commands import datasets as datasets_commands
-from pipeline.commands import files
-from pipeline.commands.options import (
+from rille.pipeline.commands import cache as cache_commands
+from rille.pipeline.commands import datasets as datasets_commands
+from rille.pipeline.commands import files
+from rille.pipeline.commands.options import (
     COMPLETE,
     FAILED,
     INTERRUPTED,
@@ -43,7 +43,7 @@ from pipeline.commands.options import (
     options,
     prepare,
 )
-from pipeline.engine.plain import plain_output, raw
+from rille.pipeline.engine.plain import plain_output, raw
 
 LONGEST = 1000
 """Characters of a complaint."""
@@ -84,7 +84,7 @@ def reconstruct(
         A name from `rille datasets`, or a folder whose layout is recognised.
     """
     prepare()
-    from pipeline.runs import session as run
+    from rille.pipeline.runs import session as run
 
     given = options(
         seq, settings, results, frames=frames, executor=executor, keep_going=keep_going, memory_limit=memory_limit
@@ -111,7 +111,7 @@ def drive(
         A simulated sequence; mockup-loop.
     """
     prepare()
-    from pipeline.runs import session as run
+    from rille.pipeline.runs import session as run
 
     return run.reconstruct(options(seq, settings, results, executor=executor, verb="drive"))
 
@@ -136,7 +136,7 @@ def plan(
         Where tasks would run.
     """
     prepare()
-    from pipeline.commands import plan as command
+    from rille.pipeline.commands import plan as command
 
     given = options(seq, settings, _RESULTS, frames=frames, executor=executor, memory_limit=memory_limit)
     return command.plan(given, verbose=verbose)
@@ -158,7 +158,7 @@ def why(
     task
         The task's label, as in the run's ledger.jsonl: hfvm/12, locus/world/12, trajectory.
     """
-    from pipeline.commands import why as command
+    from rille.pipeline.commands import why as command
 
     return command.why(run, task, folder=runs, cache=cache_folder(cache))
 
@@ -172,7 +172,7 @@ def timing(run: str = "latest", *, runs: Runs = RUNS, debug: Debug = False) -> i
     run
         SEQUENCE (its latest run), SEQUENCE/ID, or the run's folder; the latest of all by default.
     """
-    from pipeline.runs import critical_path as command
+    from rille.pipeline.runs import critical_path as command
 
     return command.show(run, runs)
 
@@ -191,7 +191,7 @@ def params(
     section
         Such as locus; all by default.
     """
-    from pipeline.commands import params as command
+    from rille.pipeline.commands import params as command
 
     return command.show(section, markdown=markdown)
 
@@ -216,10 +216,10 @@ def check(
         PNG to write; SEQUENCE-check.png by default.
     """
     prepare()
-    from pipeline.commands import check as command
-    from pipeline.flow.unread import refuse_unchecked
-    from pipeline.runs.session import choose_frames
-    from pipeline.runs.session import settings as settle
+    from rille.pipeline.commands import check as command
+    from rille.pipeline.flow.unread import refuse_unchecked
+    from rille.pipeline.runs.session import choose_frames
+    from rille.pipeline.runs.session import settings as settle
 
     given = options(seq, Settings(assignments=assignments, cache=cache), _RESULTS, frames=frames)
     settled = settle(given)
@@ -258,8 +258,8 @@ def _run(argv: list[str] | None) -> int:
 
 def _complain(error: Exception, debug: bool) -> int:
     """One line that says what to change; the traceback on request."""
-    from pipeline.engine.failures import told
-    from stages.core.errors import ConfigError, InputError
+    from rille.pipeline.engine.failures import told
+    from rille.stages.core.errors import ConfigError, InputError
 
     if debug:
         traceback.print_exception(error)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.engine.runtime.environment import prepare_environment
+from rille.pipeline.engine.runtime.environment import prepare_environment
 
 prepare_environment()  # before NumPy and numba
 

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from stages.core.errors import RilleError
+from rille.stages.core.errors import RilleError
 
 
 @contextmanager

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.driving.ratios import HEADINGS, Ratios, share, wilson
-from stages.planning.wheels import Ground
+from rille.stages.planning.wheels import Ground
 
 WAYS = [(1.0, 1.0), (3.0, 2.0), (2.3, 2.0), (0.9, 1.0)]
 

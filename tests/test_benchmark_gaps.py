@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from stages.core.declare import Bundle
+from rille.stages.core.declare import Bundle
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "benchmarks"))
 

@@ -15,7 +15,7 @@ from benchmarks.stereo import limits, methods, pairs
 from benchmarks.stereo.measures import Found, Truth, fill, judge, locking
 from benchmarks.stereo.misalignment import camera_of, conditions, knocked
 from benchmarks.stereo.pairs import Pair, measured, parallel, read_truth
-from datasets.images.misalign import MisalignParams
+from rille.datasets.images.misalign import MisalignParams
 
 NONE = np.nan
 

@@ -7,8 +7,8 @@ import pytest
 from benchmarks.odometry.limits import lines
 from benchmarks.odometry.measures import judge
 from benchmarks.odometry.opencv import Odometry
-from stages.core.declare import Bundle
-from stages.geometry.geometry import Camera, Rig, RigidTransform
+from rille.stages.core.declare import Bundle
+from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 
 
 def straight(n=30, step=0.5):

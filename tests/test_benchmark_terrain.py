@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stages.geometry.geometry import Camera, Rig, RigidTransform
-from stages.geometry.lattice import Lattice
-from stages.terrain.locus.roots import SOLVED_PX
+from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
+from rille.stages.geometry.lattice import Lattice
+from rille.stages.terrain.locus.roots import SOLVED_PX
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 

@@ -7,7 +7,7 @@ import importlib
 import numpy as np
 import pytest
 
-from pipeline.flow.config import modules, stage
+from rille.pipeline.flow.config import modules, stage
 
 UNITS = {"1", "px", "m", "rad", "grey", "m^2, m rad, rad^2", "m, rad"}
 DATASET_STAGES = ("images.files", "images.files16", "mockup.scene", "mockup.render", "mockup.truth", "mockup.truth_dem")
@@ -15,8 +15,8 @@ DRIVE_STAGES = ("mockup.rover", "mockup.sense", "mockup.site", "mockup.obstacle"
 TILE_STAGES = ("tile_stage", "join_stage")
 DECLARED = (
     {name: stage(name) for name in modules()}
-    | {name: importlib.import_module(f"stages.hfvm.{name}").STAGE for name in TILE_STAGES}
-    | {name: importlib.import_module(f"datasets.{name}").STAGE for name in (*DATASET_STAGES, *DRIVE_STAGES)}
+    | {name: importlib.import_module(f"rille.stages.hfvm.{name}").STAGE for name in TILE_STAGES}
+    | {name: importlib.import_module(f"rille.datasets.{name}").STAGE for name in (*DATASET_STAGES, *DRIVE_STAGES)}
 )
 
 

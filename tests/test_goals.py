@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import yaml
 
-from pipeline.commands.init import init
-from pipeline.runs import session
+from rille.pipeline.commands.init import init
+from rille.pipeline.runs import session
 
 pytestmark = pytest.mark.slow
 

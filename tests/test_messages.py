@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.cli import main
-from pipeline.engine.store.base import GoneError
+from rille.pipeline.cli import main
+from rille.pipeline.engine.store.base import GoneError
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGE = ROOT / "docs" / "messages.md"
@@ -109,7 +109,7 @@ def test_an_error_of_the_program_itself_has_a_code(
     def broken(*_: object) -> None:
         raise ZeroDivisionError("division by zero")
 
-    monkeypatch.setattr("datasets.registry.catalogue", broken)
+    monkeypatch.setattr("rille.datasets.registry.catalogue", broken)
     with pytest.raises(SystemExit) as ended:
         main(["datasets"])
     assert ended.value.code == 1

@@ -19,21 +19,21 @@ from typing import Any
 import numpy as np
 import pytest
 
-from datasets.images.misalign import MisalignParams
-from datasets.mockup.params import SHORT, MockupParams
-from datasets.protocol import Positions, Sequence
-from datasets.registry import open_sequence
-from pipeline.engine import code_digest, provenance, scheduler, task
-from pipeline.engine.graph import Graph, Handle
-from pipeline.engine.keys import digest
-from pipeline.engine.store.base import Store
-from pipeline.engine.store.manifest import Ref
-from pipeline.flow import config as configuration
-from pipeline.flow import unread
-from pipeline.flow.closed_loop import dataflow
-from stages.core.errors import RilleError
-from stages.geometry.geometry import RigidTransform, rotation_exp
-from stages.geometry.lens import Lens
+from rille.datasets.images.misalign import MisalignParams
+from rille.datasets.mockup.params import SHORT, MockupParams
+from rille.datasets.protocol import Positions, Sequence
+from rille.datasets.registry import open_sequence
+from rille.pipeline.engine import code_digest, provenance, scheduler, task
+from rille.pipeline.engine.graph import Graph, Handle
+from rille.pipeline.engine.keys import digest
+from rille.pipeline.engine.store.base import Store
+from rille.pipeline.engine.store.manifest import Ref
+from rille.pipeline.flow import config as configuration
+from rille.pipeline.flow import unread
+from rille.pipeline.flow.closed_loop import dataflow
+from rille.stages.core.errors import RilleError
+from rille.stages.geometry.geometry import RigidTransform, rotation_exp
+from rille.stages.geometry.lens import Lens
 
 ROOT = Path(__file__).resolve().parent.parent
 FRAMES = (0, 1, 2, 3, 4)
@@ -479,7 +479,7 @@ def edited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
         text = path.read_text()
         assert old in text
         path.write_text(text.replace(old, new, 1) if old else text + new)
-        monkeypatch.setattr(code_digest, "_roots", lambda package: (tmp_path / package,))
+        monkeypatch.setattr(code_digest, "_roots", lambda package: (tmp_path / package.removeprefix("rille."),))
         for cached in caches:
             cached.cache_clear()
 

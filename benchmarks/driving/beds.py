@@ -16,9 +16,9 @@ def choose_goal(bed: Any, config: Any) -> tuple[float, float] | None:
     (:class:`driving.exact_bed.ExactBed` to :data:`NOMINAL`), and where there is room to turn."""
     import numpy as np
 
-    from stages.hazard.risk import risk_map
-    from stages.planning.local_planner.clearance import Footing
-    from stages.planning.local_planner.ground import Ground
+    from rille.stages.hazard.risk import risk_map
+    from rille.stages.planning.local_planner.clearance import Footing
+    from rille.stages.planning.local_planner.ground import Ground
 
     cell = config.locus.cell_size
     judged = risk_map(bed.elevation, np.zeros_like(bed.elevation), cell, config.vehicle, config.risk)
@@ -35,8 +35,8 @@ def choose_goal(bed: Any, config: Any) -> tuple[float, float] | None:
 
 def prepared(settings: list[str]) -> tuple[Any, list[dict[str, Any]]]:
     """The sequence and the layers of the configuration."""
-    from datasets.registry import open_sequence
-    from pipeline.flow import config
+    from rille.datasets.registry import open_sequence
+    from rille.pipeline.flow import config
 
     for_dataset, for_stages = config.split_dataset(config.parse_assignments(settings))
     sequence = open_sequence("mockup-loop", for_dataset)
@@ -47,6 +47,6 @@ def prepared(settings: list[str]) -> tuple[Any, list[dict[str, Any]]]:
 
 def config_of(layers: list[dict[str, Any]]) -> Any:
     """The configuration of layers."""
-    from pipeline.flow import config
+    from rille.pipeline.flow import config
 
     return config.build(*layers)

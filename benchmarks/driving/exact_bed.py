@@ -9,19 +9,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets.mockup import scene as bed
-from datasets.mockup.raycast import HeightField
-from datasets.mockup.rover import bed_ground, heading_of
-from datasets.mockup.sequence import true_rig
-from datasets.mockup.site import prepare
-from datasets.mockup.truth_dem import seen_by, true_dem
-from pipeline.flow.closed_loop import arena
-from stages.core.declare import Bundle
-from stages.geometry.geometry import RigidTransform, level_rotation
-from stages.geometry.lattice import Lattice
-from stages.hazard.vehicle import Vehicle
-from stages.planning.wheels import Ground, stand
-from stages.terrain.merge import footprint
+from rille.datasets.mockup import scene as bed
+from rille.datasets.mockup.raycast import HeightField
+from rille.datasets.mockup.rover import bed_ground, heading_of
+from rille.datasets.mockup.sequence import true_rig
+from rille.datasets.mockup.site import prepare
+from rille.datasets.mockup.truth_dem import seen_by, true_dem
+from rille.pipeline.flow.closed_loop import arena
+from rille.stages.core.declare import Bundle
+from rille.stages.geometry.geometry import RigidTransform, level_rotation
+from rille.stages.geometry.lattice import Lattice
+from rille.stages.hazard.vehicle import Vehicle
+from rille.stages.planning.wheels import Ground, stand
+from rille.stages.terrain.merge import footprint
 
 REACH = 3.0
 """m; ground about the start, all of every bed."""

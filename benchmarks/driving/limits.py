@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets.mockup.rover import heading_of
 from driving.exact_bed import ExactBed
-from stages.geometry.lattice import Lattice
-from stages.hazard.vehicle import Vehicle
-from stages.planning.local_planner.route import length_of, pieces, straightened
-from stages.planning.local_planner.state_lattice import PoseGraph, PoseGrid
-from stages.planning.wheels import Ground, measured
+from rille.datasets.mockup.rover import heading_of
+from rille.stages.geometry.lattice import Lattice
+from rille.stages.hazard.vehicle import Vehicle
+from rille.stages.planning.local_planner.route import length_of, pieces, straightened
+from rille.stages.planning.local_planner.state_lattice import PoseGraph, PoseGrid
+from rille.stages.planning.wheels import Ground, measured
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -29,7 +29,7 @@ Mask = NDArray[np.bool_]
 @dataclass
 class Limits:
     """Ground (bed frame) as a vehicle may stand on it; takes the place of
-    :class:`stages.planning.local_planner.clearance.Footing`."""
+    :class:`rille.stages.planning.local_planner.clearance.Footing`."""
 
     ground: Ground
     vehicle: Vehicle

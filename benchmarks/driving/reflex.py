@@ -27,11 +27,11 @@ def settings_of(k: int) -> list[str]:
 
 def trial(settings: list[str]) -> dict[str, Any]:
     """One leg with a stone on it; figures of the stone."""
-    from pipeline.engine import scheduler
-    from pipeline.engine.graph import Graph
-    from pipeline.engine.store.base import at
-    from pipeline.flow.closed_loop import Drive, EndedError, Stand
-    from pipeline.flow.products import Stop
+    from rille.pipeline.engine import scheduler
+    from rille.pipeline.engine.graph import Graph
+    from rille.pipeline.engine.store.base import at
+    from rille.pipeline.flow.closed_loop import Drive, EndedError, Stand
+    from rille.pipeline.flow.products import Stop
 
     class OneLeg(Drive):
         def _look(self, at: Stand) -> Stop:

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.flow import config
-from stages.geometry.surface import plane
-from stages.hfvm.stage import match
-from stages.terrain.locus.solve import Matches
-from stages.terrain.locus.stage import reconstruct, usable
+from rille.pipeline.flow import config
+from rille.stages.geometry.surface import plane
+from rille.stages.hfvm.stage import match
+from rille.stages.terrain.locus.solve import Matches
+from rille.stages.terrain.locus.stage import reconstruct, usable
 
 from .scenes import Scene
 

@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from stages.geometry.lattice import Lattice
+from rille.stages.geometry.lattice import Lattice
 
 Floats = NDArray[np.float64]
 

@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.geometry.surface import plane
-from stages.terrain.locus.stage import LocusParams, reconstruct
+from rille.stages.geometry.surface import plane
+from rille.stages.terrain.locus.stage import LocusParams, reconstruct
 
 from .mesh import rasterise, without_jumps
 from .scenes import Scene, pixels_of
@@ -45,8 +45,8 @@ class Method:
 
 
 def locus(scene: Scene, max_backmatch: float, bounded: bool, *, images: bool = True) -> Model:
-    """Cells first: :mod:`stages.terrain.locus.stage`; ``images``: refined on the surface, as a run does it (not true
-    disparities)."""
+    """Cells first: :mod:`rille.stages.terrain.locus.stage`; ``images``: refined on the surface, as a run does it (not
+    true disparities)."""
     params = DEFAULT.model_copy(update={"max_sigma": scene.max_sigma if bounded else None})
     d = scene.disparities
     right = scene.right if images and d.std is not None else None

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from stereo.pairs import fetcher, read_image, read_truth
 
-from stages.geometry.geometry import Camera, Rig, RigidTransform, level_rotation
-from stages.geometry.lattice import Lattice
+from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, level_rotation
+from rille.stages.geometry.lattice import Lattice
 
 from .mesh import rasterise, without_jumps
 
@@ -74,9 +74,9 @@ class Scene:
 
 def match(scene: Scene, preset: str = "default") -> Disparities:
     """Disparities by the matcher with a preset."""
-    from pipeline.flow import config
-    from stages.core.validity import matched
-    from stages.hfvm.stage import match as hfvm
+    from rille.pipeline.flow import config
+    from rille.stages.core.validity import matched
+    from rille.stages.hfvm.stage import match as hfvm
 
     params = config.build({"hfvm": {"preset": preset}}).hfvm
     found = hfvm(scene.left, scene.right, params, left_valid=scene.valid[0], right_valid=scene.valid[1])
@@ -86,8 +86,8 @@ def match(scene: Scene, preset: str = "default") -> Disparities:
 
 def mockup(pairs: int | None = None) -> Iterator[Scene]:
     """Basic pairs of the built-in simulator with its true disparities, in the window that its accuracy is judged in."""
-    from datasets.registry import open_sequence
-    from pipeline.commands.options import cache_folder
+    from rille.datasets.registry import open_sequence
+    from rille.pipeline.commands.options import cache_folder
 
     sequence, fetch = open_sequence("mockup"), fetcher(cache_folder(None))
     assert sequence.truth is not None
@@ -117,7 +117,7 @@ def _simulated(sequence: Any, fetch: Any, frame: int) -> Scene:
 
 
 def _searched(rig: Rig, found: Disparities, up: Floats, lattice: Lattice) -> tuple[float, float]:
-    from stages.terrain.ground_frame import LevelParams, level, z_range
+    from rille.stages.terrain.ground_frame import LevelParams, level, z_range
 
     facts = level(found.column, found.row, found.measured, rig, LevelParams(), up=up)
     low, high = z_range(facts["plane"], facts["relief"], list(lattice.bounds))

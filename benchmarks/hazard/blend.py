@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.hazard.risk import HAZARDOUS, SAFE, UNKNOWN
-from stages.numeric.windows import fit_planes, running_max, running_min
+from rille.stages.hazard.risk import HAZARDOUS, SAFE, UNKNOWN
+from rille.stages.numeric.windows import fit_planes, running_max, running_min
 
 from .scenes import CELL, Scene
 

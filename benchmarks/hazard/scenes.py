@@ -17,19 +17,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets.mockup.params import MockupParams
-from datasets.mockup.sequence import mockup
-from datasets.protocol import Source
-from pipeline.flow import config
-from stages.core.validity import matched
-from stages.geometry.geometry import Rig, RigidTransform
-from stages.geometry.lattice import Lattice
-from stages.geometry.surface import plane
-from stages.hazard.vehicle import Vehicle
-from stages.hfvm.stage import match
-from stages.terrain.ground_frame import LevelParams, level, z_range
-from stages.terrain.locus.solve import Matches
-from stages.terrain.locus.stage import LocusParams, local_lattice, reconstruct, usable
+from rille.datasets.mockup.params import MockupParams
+from rille.datasets.mockup.sequence import mockup
+from rille.datasets.protocol import Source
+from rille.pipeline.flow import config
+from rille.stages.core.validity import matched
+from rille.stages.geometry.geometry import Rig, RigidTransform
+from rille.stages.geometry.lattice import Lattice
+from rille.stages.geometry.surface import plane
+from rille.stages.hazard.vehicle import Vehicle
+from rille.stages.hfvm.stage import match
+from rille.stages.terrain.ground_frame import LevelParams, level, z_range
+from rille.stages.terrain.locus.solve import Matches
+from rille.stages.terrain.locus.stage import LocusParams, local_lattice, reconstruct, usable
 
 Floats32 = NDArray[np.float32]
 

@@ -16,10 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from datasets.protocol import Sequence, Source
-from pipeline.flow import config as configuration
-from stages.core.declare import Bundle, NoParams
-from stages.odometry.resection.trajectory import world_poses
+from rille.datasets.protocol import Sequence, Source
+from rille.pipeline.flow import config as configuration
+from rille.stages.core.declare import Bundle, NoParams
+from rille.stages.odometry.resection.trajectory import world_poses
 
 MATCHING = ("hfvm", "orientation", "rig", "calibration", "level")
 """Stages of the basic pairs; all others see every frame."""

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.flow import config as configuration
-from stages.evaluation.accuracy import by_frame
-from stages.evaluation.crosscheck import windows
+from rille.pipeline.flow import config as configuration
+from rille.stages.evaluation.accuracy import by_frame
+from rille.stages.evaluation.crosscheck import windows
 
 from .chain import Clock, Images, Navigated
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from stages.evaluation.accuracy import posed, trajectory_accuracy, umeyama
+from rille.stages.evaluation.accuracy import posed, trajectory_accuracy, umeyama
 
 FIRST = 20
 """Frames of the shorter alignment: on a street some twenty metres, where odometry has not drifted yet."""

@@ -154,7 +154,7 @@ def _read_pandora(raw: Any, pair: Pair) -> Found:
 
 def hfvm(variants: list[str], threads: int) -> list[Method]:
     """Every preset of the matcher's parameters, and variants ``key=value key=value ...`` of them."""
-    from stages.hfvm.images.params import HfvmParams
+    from rille.stages.hfvm.images.params import HfvmParams
 
     presets = [str(p) for p in get_args(HfvmParams.model_fields["preset"].annotation)]
     found = [_hfvm(f"HFVM {p}", {"preset": p}, threads) for p in presets]
@@ -168,9 +168,9 @@ def hfvm(variants: list[str], threads: int) -> list[Method]:
 
 
 def _hfvm(name: str, values: dict[str, Any], threads: int) -> Method:
-    from stages.core.validity import matched
-    from stages.hfvm.images.params import HfvmParams
-    from stages.hfvm.stage import match
+    from rille.stages.core.validity import matched
+    from rille.stages.hfvm.images.params import HfvmParams
+    from rille.stages.hfvm.stage import match
 
     params = HfvmParams(**values)
     extra: dict[str, Any] = {"threads": threads} if "threads" in inspect.signature(match).parameters else {}

@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from datasets.images.misalign import MisalignParams, warp
-from stages.geometry.geometry import Camera, rotation_exp
-from stages.geometry.lens import Lens
+from rille.datasets.images.misalign import MisalignParams, warp
+from rille.stages.geometry.geometry import Camera, rotation_exp
+from rille.stages.geometry.lens import Lens
 
 from .measures import Truth, judge
 from .methods import Method

@@ -66,7 +66,7 @@ def measured(name: str, left: Grey, right: Grey, truth: Truth, high: int | None 
 
 def read_image(path: Path) -> Grey:
     """Image file as 8-bit grey."""
-    from datasets.images.files import read_grey
+    from rille.datasets.images.files import read_grey
 
     image = read_grey(path)
     return image if image.dtype == np.uint8 else np.rint(image / 257.0).astype(np.uint8)
@@ -112,8 +112,8 @@ def with_truth() -> list[Pair]:
 
 def mockup() -> Pair:
     """First pair of the built-in simulator, 570 x 520 as in the paper, and its exact truth."""
-    from datasets.registry import open_sequence
-    from pipeline.commands.options import cache_folder
+    from rille.datasets.registry import open_sequence
+    from rille.pipeline.commands.options import cache_folder
 
     sequence, fetch = open_sequence("mockup"), fetcher(cache_folder(None))
     assert sequence.truth_disparity is not None
@@ -159,8 +159,8 @@ def _data(name: str) -> Path | None:
 
 def fetcher(cache: Path) -> Callable[[Any], Any]:
     """Function that computes a source once and then reads it from the cache."""
-    from pipeline.engine.store.base import Store
-    from pipeline.engine.task import Spec, ensure
+    from rille.pipeline.engine.store.base import Store
+    from rille.pipeline.engine.task import Spec, ensure
 
     def artifact(source: Any) -> Any:
         refs = {port: artifact(upstream) for port, upstream in source.inputs.items()}

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from datasets.cameras import boofcv, colmap, kitti, middlebury, opencv, slam, tsai
-from datasets.cameras.fields import Fields
-from datasets.cameras.model import UNKNOWN_SIZE, CalibratedCamera
-from datasets.cameras.pair import rig_of
-from datasets.cameras.text import parse_xml, parse_yaml
-from datasets.text.reading import read_text
-from stages.core.errors import InputError
+from rille.datasets.cameras import boofcv, colmap, kitti, middlebury, opencv, slam, tsai
+from rille.datasets.cameras.fields import Fields
+from rille.datasets.cameras.model import UNKNOWN_SIZE, CalibratedCamera
+from rille.datasets.cameras.pair import rig_of
+from rille.datasets.cameras.text import parse_xml, parse_yaml
+from rille.datasets.text.reading import read_text
+from rille.stages.core.errors import InputError
 
 __all__ = ["UNKNOWN_SIZE", "CalibratedCamera", "read_cameras", "rig_of"]
 

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from datasets.cameras.fields import Fields
-from datasets.cameras.model import CalibratedCamera
-from stages.geometry.geometry import RigidTransform
-from stages.geometry.lens import Lens
+from rille.datasets.cameras.fields import Fields
+from rille.datasets.cameras.model import CalibratedCamera
+from rille.stages.geometry.geometry import RigidTransform
+from rille.stages.geometry.lens import Lens
 
 MODELS = ("pinhole", "pinhole_radial_tangential")
 MOST_RADIAL = 3

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from datasets.cameras.fields import Fields
-from datasets.cameras.model import CalibratedCamera
-from datasets.text.reading import read_text
-from stages.geometry.geometry import RigidTransform
-from stages.geometry.lens import Lens
+from rille.datasets.cameras.fields import Fields
+from rille.datasets.cameras.model import CalibratedCamera
+from rille.datasets.text.reading import read_text
+from rille.stages.geometry.geometry import RigidTransform
+from rille.stages.geometry.lens import Lens
 
 PARAMETERS = {
     "SIMPLE_PINHOLE": "f cx cy",

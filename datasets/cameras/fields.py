@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets.cameras.model import UNKNOWN_SIZE
-from stages.core.errors import InputError
-from stages.geometry.geometry import Camera, RigidTransform
-from stages.geometry.lens import Lens
+from rille.datasets.cameras.model import UNKNOWN_SIZE
+from rille.stages.core.errors import InputError
+from rille.stages.geometry.geometry import Camera, RigidTransform
+from rille.stages.geometry.lens import Lens
 
 Floats = NDArray[np.float64]
 
@@ -37,7 +37,7 @@ MODELS: Mapping[str, str] = {
     "kannala-brandt": "fisheye",
     "kb4": "fisheye",
 }
-"""Names that programs have for the lens models of :mod:`stages.geometry.lens`, in lower case with hyphens."""
+"""Names that programs have for the lens models of :mod:`rille.stages.geometry.lens`, in lower case with hyphens."""
 
 
 class Fields:
@@ -134,14 +134,14 @@ class Fields:
             raise self.error(error.code, key, f"gives no camera: {error.message}", error.remedy) from error
 
     def lens(self, key: str, camera: Camera, model: str, coefficients: tuple[float, ...]) -> Lens:
-        """Lens with a model of :mod:`stages.geometry.lens`; ``key`` is where the coefficients stand."""
+        """Lens with a model of :mod:`rille.stages.geometry.lens`; ``key`` is where the coefficients stand."""
         try:
             return Lens(camera, model, coefficients)
         except InputError as error:
             raise self.error(error.code, key, f"is wrong: {error.message}", error.remedy) from error
 
     def model(self, key: str, default: str) -> str:
-        """Lens model of :mod:`stages.geometry.lens` by the name that the file has for it."""
+        """Lens model of :mod:`rille.stages.geometry.lens` by the name that the file has for it."""
         stated = self.text(key, default)
         word = stated.lower().replace("_", "-").replace(" ", "-")
         if word not in MODELS:

@@ -13,11 +13,11 @@ from pathlib import Path
 
 import numpy as np
 
-from datasets.cameras.fields import Fields
-from datasets.cameras.model import UNKNOWN_SIZE, CalibratedCamera
-from stages.core.errors import InputError
-from stages.geometry.geometry import RigidTransform, orthonormal
-from stages.geometry.lens import Lens
+from rille.datasets.cameras.fields import Fields
+from rille.datasets.cameras.model import UNKNOWN_SIZE, CalibratedCamera
+from rille.stages.core.errors import InputError
+from rille.stages.geometry.geometry import RigidTransform, orthonormal
+from rille.stages.geometry.lens import Lens
 
 PROJECTION = re.compile(r"P(\d)(?:_roi)?|P_rect_(\d\d)")
 LINE = re.compile(r"^[ \t]*(P\d(?:_roi)?|P_rect_\d\d|K_\d\d)[ \t]*:", re.MULTILINE)
@@ -60,7 +60,7 @@ def kitti(text: str, path: Path) -> list[CalibratedCamera]:
 
 
 def _rectified(fields: Fields, label: str) -> CalibratedCamera:
-    from datasets.kitti import decompose
+    from rille.datasets.kitti import decompose
 
     try:
         k, T_camera_reference = decompose(fields.matrix(label, 3, 4), label)

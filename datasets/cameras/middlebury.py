@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from datasets.cameras.fields import Fields
-from datasets.cameras.model import CalibratedCamera
-from datasets.cameras.text import assignments
-from stages.geometry.geometry import RigidTransform
-from stages.geometry.lens import Lens
+from rille.datasets.cameras.fields import Fields
+from rille.datasets.cameras.model import CalibratedCamera
+from rille.datasets.cameras.text import assignments
+from rille.stages.geometry.geometry import RigidTransform
+from rille.stages.geometry.lens import Lens
 
 
 def is_middlebury(text: str) -> bool:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from stages.geometry.geometry import RigidTransform
-from stages.geometry.lens import Lens
+from rille.stages.geometry.geometry import RigidTransform
+from rille.stages.geometry.lens import Lens
 
 UNKNOWN_SIZE = (1, 1)
 """Width and height, pixels, of a camera whose file does not say how large its images are."""

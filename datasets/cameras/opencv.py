@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
-from datasets.cameras.fields import Fields, by_count
-from datasets.cameras.model import CalibratedCamera
-from datasets.cameras.text import parse_xml, parse_yaml
-from datasets.text.reading import read_text
-from stages.core.errors import InputError
-from stages.geometry.geometry import RigidTransform
-from stages.geometry.lens import Lens
+from rille.datasets.cameras.fields import Fields, by_count
+from rille.datasets.cameras.model import CalibratedCamera
+from rille.datasets.cameras.text import parse_xml, parse_yaml
+from rille.datasets.text.reading import read_text
+from rille.stages.core.errors import InputError
+from rille.stages.geometry.geometry import RigidTransform
+from rille.stages.geometry.lens import Lens
 
 SIDES = (
     (("M1", "D1"), ("M2", "D2")),

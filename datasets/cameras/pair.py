@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from datasets.cameras.model import CalibratedCamera
-from stages.core.errors import InputError
-from stages.geometry.geometry import Rig
-from stages.geometry.lens import Lens
+from rille.datasets.cameras.model import CalibratedCamera
+from rille.stages.core.errors import InputError
+from rille.stages.geometry.geometry import Rig
+from rille.stages.geometry.lens import Lens
 
 LEAST_BASELINE = 1e-6
 """Below this, in any unit of length in use, both cameras stand in one place."""
@@ -28,7 +28,8 @@ def rig_of(
 
     Returns
     -------
-    rig : with ideal cameras (:meth:`stages.geometry.lens.Lens.ideal_camera`), in the calibration's unit of length.
+    rig : with ideal cameras (:meth:`rille.stages.geometry.lens.Lens.ideal_camera`), in the calibration's unit of
+        length.
     lenses : by camera, ``"left"`` and ``"right"``, only where there is distortion; None where there is none at all.
 
     Raises

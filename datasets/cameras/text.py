@@ -9,8 +9,8 @@ from xml.etree import ElementTree
 
 import yaml
 
-from datasets.text.reading import DEEPEST
-from stages.core.errors import InputError
+from rille.datasets.text.reading import DEEPEST
+from rille.stages.core.errors import InputError
 
 MOST_VALUES = 100_000
 """Of a YAML file; a stereo calibration has a hundred, with the corners of all its views some ten thousand."""

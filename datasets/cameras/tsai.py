@@ -14,11 +14,11 @@ from pathlib import Path
 
 import numpy as np
 
-from datasets.cameras.fields import Fields
-from datasets.cameras.model import UNKNOWN_SIZE, CalibratedCamera
-from datasets.cameras.text import assignments
-from stages.geometry.geometry import Camera
-from stages.geometry.lens import Lens
+from rille.datasets.cameras.fields import Fields
+from rille.datasets.cameras.model import UNKNOWN_SIZE, CalibratedCamera
+from rille.datasets.cameras.text import assignments
+from rille.stages.geometry.geometry import Camera
+from rille.stages.geometry.lens import Lens
 
 HEADER = re.compile(r"(VERSION_\d+|PINHOLE)?")
 

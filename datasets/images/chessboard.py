@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.core.declare import AnyArray
-from stages.core.errors import ConfigError, InputError
+from rille.stages.core.declare import AnyArray
+from rille.stages.core.errors import ConfigError, InputError
 
 Floats = NDArray[np.float64]
 Grey = NDArray[np.uint8]

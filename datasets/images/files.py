@@ -14,11 +14,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets.images.headers import PNG_SIGNATURE, Header, read_header
-from datasets.protocol import Source
-from datasets.text.reading import open_regular, read_bytes
-from stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
-from stages.core.errors import InputError
+from rille.datasets.images.headers import PNG_SIGNATURE, Header, read_header
+from rille.datasets.protocol import Source
+from rille.datasets.text.reading import open_regular, read_bytes
+from rille.stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
+from rille.stages.core.errors import InputError
 
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # what it says on stderr, an error says here
 
@@ -199,7 +199,7 @@ def image_source(path: Path, frame: int, camera: str, size: tuple[int, int, int]
         "height": height,
         "depth": depth,
     }
-    module = "datasets.images.files16" if depth == 16 else "datasets.images.files"
+    module = "rille.datasets.images.files16" if depth == 16 else "rille.datasets.images.files"
     return Source(module, NoParams(), args, hints={"path": str(path.resolve())})
 
 

@@ -17,10 +17,10 @@ import scipy
 from numpy.typing import NDArray
 from pydantic import Field
 
-from datasets.protocol import Sequence, Source
-from stages.core.declare import AnyArray, Array, Bundle, Inputs, Params, Stage
-from stages.geometry.geometry import rotation_exp
-from stages.geometry.lens import Lens
+from rille.datasets.protocol import Sequence, Source
+from rille.stages.core.declare import AnyArray, Array, Bundle, Inputs, Params, Stage
+from rille.stages.geometry.geometry import rotation_exp
+from rille.stages.geometry.lens import Lens
 
 Floats = NDArray[np.float64]
 
@@ -84,7 +84,7 @@ def _module(source: Source) -> str:
     """A stage declares one type for an array, so there is one for each depth of images."""
     outputs: tuple[Array, ...] = importlib.import_module(source.module).STAGE.outputs
     deep = next(a.dtype for a in outputs if a.name == "image") == "uint16"
-    return "datasets.images.misalign16" if deep else "datasets.images.misalign"
+    return "rille.datasets.images.misalign16" if deep else "rille.datasets.images.misalign"
 
 
 def origins(lens: Lens, params: MisalignParams) -> tuple[Floats, Floats]:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from datasets.images import misalign
-from stages.core.declare import Array
+from rille.datasets.images import misalign
+from rille.stages.core.declare import Array
 
 STAGE = replace(
     misalign.STAGE,

@@ -8,8 +8,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from datasets.images import files
-from stages.core.errors import InputError
+from rille.datasets.images import files
+from rille.stages.core.errors import InputError
 
 SUFFIXES = (*files.SUFFIXES, ".ppm", ".bmp")
 """Kinds of image that are looked for where no pattern is given."""
@@ -194,7 +194,7 @@ def _named(pairs: list[tuple[Path, Path]]) -> tuple[Pair, ...]:
 
 
 def common_size(pairs: Sequence[Pair]) -> tuple[int, int, int]:
-    """Width, height and bits that all images share (see :func:`datasets.images.files.common_header`).
+    """Width, height and bits that all images share (see :func:`rille.datasets.images.files.common_header`).
 
     Pairs of which a file is absent are left out.
     """

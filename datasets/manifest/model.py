@@ -11,11 +11,11 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BeforeValidator, Discriminator, Field, Tag, ValidationError, model_validator
 
-from datasets.text.reading import read_lines, read_toml
-from stages.core.declare import Params
-from stages.core.errors import InputError, told
-from stages.geometry.geometry import RigidTransform
-from stages.hazard.vehicle import Vehicle
+from rille.datasets.text.reading import read_lines, read_toml
+from rille.stages.core.declare import Params
+from rille.stages.core.errors import InputError, told
+from rille.stages.geometry.geometry import RigidTransform
+from rille.stages.hazard.vehicle import Vehicle
 
 
 def _pose(value: Any) -> tuple[float, ...]:

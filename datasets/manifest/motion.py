@@ -10,16 +10,16 @@ from typing import cast
 
 import numpy as np
 
-from datasets.images.pairing import Pair, ends
-from datasets.imu import at_frames, read_imu
-from datasets.manifest.model import Attitude, Imu, Manifest, PoseFile, Times, Truth
-from datasets.manifest.rig import direction
-from datasets.poses import coverage, interpolate, read_poses, read_positions
-from datasets.protocol import Positions, Rows
-from datasets.text.reading import read_lines
-from datasets.text.times import seconds
-from stages.core.errors import InputError
-from stages.geometry.geometry import RigidTransform
+from rille.datasets.images.pairing import Pair, ends
+from rille.datasets.imu import at_frames, read_imu
+from rille.datasets.manifest.model import Attitude, Imu, Manifest, PoseFile, Times, Truth
+from rille.datasets.manifest.rig import direction
+from rille.datasets.poses import coverage, interpolate, read_poses, read_positions
+from rille.datasets.protocol import Positions, Rows
+from rille.datasets.text.reading import read_lines
+from rille.datasets.text.times import seconds
+from rille.stages.core.errors import InputError
+from rille.stages.geometry.geometry import RigidTransform
 
 Poses = tuple[RigidTransform | None, ...]
 Ups = tuple[tuple[float, float, float] | None, ...]
@@ -30,7 +30,7 @@ NEEDS_TIMES = "give [times] with file, names = true or rate_hz"
 
 @dataclass
 class Motion:
-    """One entry a pair, as in :class:`datasets.protocol.Sequence`; ``warnings`` collects what is suspicious."""
+    """One entry a pair, as in :class:`rille.datasets.protocol.Sequence`; ``warnings`` collects what is suspicious."""
 
     times: Seconds | None
     truth: Poses | None = None

@@ -1,4 +1,4 @@
-"""Any folder of stereo images as a sequence, described by a manifest (TOML, see :mod:`datasets.manifest.model`).
+"""Any folder of stereo images as a sequence, described by a manifest (TOML, see :mod:`rille.datasets.manifest.model`).
 
 The manifest says which files are the pairs, what the cameras are, and what else is known: times, truth, attitude,
 odometry, IMU, vehicle. Nothing is repaired silently: what cannot be is an error with the key, what is merely suspicious
@@ -14,16 +14,16 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from datasets.georeference import georeference
-from datasets.images import files
-from datasets.images.pairing import Pair, common_size, pair_up
-from datasets.manifest.model import Images, read_manifest
-from datasets.manifest.motion import read_motion
-from datasets.manifest.rig import read_optics
-from datasets.protocol import Sequence, Source
-from datasets.text.names import derived_name
-from datasets.text.reading import Search
-from stages.core.errors import InputError
+from rille.datasets.georeference import georeference
+from rille.datasets.images import files
+from rille.datasets.images.pairing import Pair, common_size, pair_up
+from rille.datasets.manifest.model import Images, read_manifest
+from rille.datasets.manifest.motion import read_motion
+from rille.datasets.manifest.rig import read_optics
+from rille.datasets.protocol import Sequence, Source
+from rille.datasets.text.names import derived_name
+from rille.datasets.text.reading import Search
+from rille.stages.core.errors import InputError
 
 VARIABLE = re.compile(r"\$\{(\w+)\}")
 

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from datasets.cameras import CalibratedCamera, read_cameras, rig_of
-from datasets.manifest.model import Cameras, Manifest, PinholeLens, RigSection
-from stages.core.errors import InputError
-from stages.geometry.geometry import Camera, Rig, RigidTransform
-from stages.geometry.lens import Lens
+from rille.datasets.cameras import CalibratedCamera, read_cameras, rig_of
+from rille.datasets.manifest.model import Cameras, Manifest, PinholeLens, RigSection
+from rille.stages.core.errors import InputError
+from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
+from rille.stages.geometry.lens import Lens
 
 LONGEST_BASELINE = 20.0
 """m; no vehicle carries a longer one, but 97 (mm) is a common slip."""

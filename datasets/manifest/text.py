@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import tomli_w
 
-from datasets.inspection import Calibration, Findings
-from datasets.manifest.rig import LONGEST_BASELINE
-from datasets.text.names import derived_name
+from rille.datasets.inspection import Calibration, Findings
+from rille.datasets.manifest.rig import LONGEST_BASELINE
+from rille.datasets.text.names import derived_name
 
 NEEDED = "NEEDED"
 """Marks a line that must be filled in before the manifest opens."""

@@ -7,15 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from datasets import protocol
-from datasets.mockup.params import MockupParams
-from datasets.mockup.rover import RoverParams
-from datasets.mockup.sequence import given_rig, mount, true_rig, vehicle_at_scale
-from datasets.protocol import Simulation, Source
-from stages.core.declare import NoParams
-from stages.core.errors import InputError
-from stages.geometry.geometry import RigidTransform
-from stages.hazard.vehicle import Vehicle
+from rille.datasets import protocol
+from rille.datasets.mockup.params import MockupParams
+from rille.datasets.mockup.rover import RoverParams
+from rille.datasets.mockup.sequence import given_rig, mount, true_rig, vehicle_at_scale
+from rille.datasets.protocol import Simulation, Source
+from rille.stages.core.declare import NoParams
+from rille.stages.core.errors import InputError
+from rille.stages.geometry.geometry import RigidTransform
+from rille.stages.hazard.vehicle import Vehicle
 
 LOOP: Mapping[str, Any] = {
     "frames": 1,
@@ -57,7 +57,7 @@ def mockup_loop(p: MockupParams, rover: RoverParams, name: str = "mockup-loop") 
 
     def leg(body: Vehicle, number: int, **more: int) -> Source:
         args = {"leg": number, **more, "vehicle": body.model_dump(mode="json"), **mounted}
-        return Source("datasets.mockup.rover", rover, args)
+        return Source("rille.datasets.mockup.rover", rover, args)
 
     def image(frame: int, camera: str, T_bed_left: RigidTransform) -> Source:
         T_bed_camera = T_bed_left if camera == "left" else T_bed_left @ T_left_right
@@ -65,26 +65,29 @@ def mockup_loop(p: MockupParams, rover: RoverParams, name: str = "mockup-loop") 
         if frame in rover.lost_frames:
             sensor = sensor.model_copy(update={"exposure": 1e-3})
         args = {"frame": frame, "camera": camera, "geometry": cameras[camera].to_dict()}
-        return Source("datasets.mockup.render", sensor, args | {"T_bed_camera": T_bed_camera.to_list()})
+        return Source("rille.datasets.mockup.render", sensor, args | {"T_bed_camera": T_bed_camera.to_list()})
 
     def change(leg: int, row: int) -> Source | None:
         if leg != rover.obstacle_leg:
             return None
-        return Source("datasets.mockup.obstacle", rover, {"leg": leg, "row": row, **mounted})
+        return Source("rille.datasets.mockup.obstacle", rover, {"leg": leg, "row": row, **mounted})
 
     def dem(lattice: Mapping[str, Any], T_truth_world: RigidTransform, stops: Sequence[RigidTransform]) -> Source:
         args = {"lattice": dict(lattice), "T_bed_world": T_truth_world.to_list(), "rig": rig.to_dict()}
-        return Source("datasets.mockup.truth_dem", NoParams(), args | {"pairs": [T.to_list() for T in stops]})
+        return Source("rille.datasets.mockup.truth_dem", NoParams(), args | {"pairs": [T.to_list() for T in stops]})
 
     pad = [*rover.start, rover.pad] if rover.pad > 0 else None
     site = {"pad": pad, "blank": None if rover.blank is None else list(rover.blank)}
     simulation = Simulation(
         scene=Source(
-            "datasets.mockup.site", NoParams(), site, inputs={"scene": Source("datasets.mockup.scene", p.scene())}
+            "rille.datasets.mockup.site",
+            NoParams(),
+            site,
+            inputs={"scene": Source("rille.datasets.mockup.scene", p.scene())},
         ),
         place=lambda body: leg(body, -1),
         drive=lambda body, number, row: leg(body, number, row=row),
-        sense=lambda leg: Source("datasets.mockup.sense", rover, {"leg": leg}),
+        sense=lambda leg: Source("rille.datasets.mockup.sense", rover, {"leg": leg}),
         change=change,
         image=image,
         truth_dem=dem,
@@ -92,7 +95,7 @@ def mockup_loop(p: MockupParams, rover: RoverParams, name: str = "mockup-loop") 
         pad=rover.pad,
         overview=None
         if rover.map_cell is None
-        else Source("datasets.mockup.overview", rover, {"cell": rover.map_cell}),
+        else Source("rille.datasets.mockup.overview", rover, {"cell": rover.map_cell}),
     )
 
     def nothing(frame: int, camera: str) -> Source:

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from datasets.mockup import scene as bed
-from datasets.mockup import terrain
-from datasets.mockup.params import SceneParams
-from datasets.mockup.rover import RoverParams, heading_of
-from stages.core.declare import Bundle, Inputs, Stage
-from stages.geometry.geometry import RigidTransform
+from rille.datasets.mockup import scene as bed
+from rille.datasets.mockup import terrain
+from rille.datasets.mockup.params import SceneParams
+from rille.datasets.mockup.rover import RoverParams, heading_of
+from rille.stages.core.declare import Bundle, Inputs, Stage
+from rille.stages.geometry.geometry import RigidTransform
 
 
 def on_path(path: np.ndarray, way: float, aside: float) -> tuple[float, float]:

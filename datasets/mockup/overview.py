@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from datasets.mockup.rover import RoverParams
-from stages.core.declare import Array, Bundle, Inputs, Stage
-from stages.geometry.lattice import Lattice
+from rille.datasets.mockup.rover import RoverParams
+from rille.stages.core.declare import Array, Bundle, Inputs, Stage
+from rille.stages.geometry.lattice import Lattice
 
 
 def _run(params: RoverParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:

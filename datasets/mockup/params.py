@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from stages.core.declare import Params
+from rille.stages.core.declare import Params
 
 
 class SceneParams(Params):

@@ -16,12 +16,12 @@ import scipy
 from numba import njit
 from numpy.typing import NDArray
 
-from datasets.mockup.params import RenderParams
-from datasets.mockup.raycast import HeightField
-from datasets.mockup.scene import height_field
-from datasets.mockup.terrain import EMISSION
-from stages.core.declare import Array, Bundle, Inputs, Memory, Stage
-from stages.geometry.geometry import Camera, RigidTransform
+from rille.datasets.mockup.params import RenderParams
+from rille.datasets.mockup.raycast import HeightField
+from rille.datasets.mockup.scene import height_field
+from rille.datasets.mockup.terrain import EMISSION
+from rille.stages.core.declare import Array, Bundle, Inputs, Memory, Stage
+from rille.stages.geometry.geometry import Camera, RigidTransform
 
 LUNAR = 0.6
 """McEwen's L near 70 degrees of phase angle, the usual one here."""

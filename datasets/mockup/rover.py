@@ -2,8 +2,8 @@
 
 It is told a path in the frame of its own estimate and where it believes to stand; it turns towards each vertex and
 drives there by its wheels. What its wheels do and what it does are not the same: it slips and drifts off its heading.
-The body follows the wheels over the ground (:mod:`stages.planning.wheels`). Nothing of what this stage gives is known
-to the rover; what its sensors tell of it is stage ``mockup.sense``.
+The body follows the wheels over the ground (:mod:`rille.stages.planning.wheels`). Nothing of what this stage gives is
+known to the rover; what its sensors tell of it is stage ``mockup.sense``.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from stages.core.declare import AnyArray, Array, Bundle, Inputs, Params, Stage
-from stages.core.errors import InputError
-from stages.geometry.geometry import RigidTransform
-from stages.hazard.vehicle import Vehicle
-from stages.planning.wheels import Ground, Stand, stand
+from rille.stages.core.declare import AnyArray, Array, Bundle, Inputs, Params, Stage
+from rille.stages.core.errors import InputError
+from rille.stages.geometry.geometry import RigidTransform
+from rille.stages.hazard.vehicle import Vehicle
+from rille.stages.planning.wheels import Ground, Stand, stand
 
 Floats = NDArray[np.float64]
 

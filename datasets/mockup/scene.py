@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from datasets.mockup import terrain
-from datasets.mockup.params import SceneParams
-from datasets.mockup.raycast import HeightField
-from stages.core.declare import Array, Bundle, Inputs, Stage
+from rille.datasets.mockup import terrain
+from rille.datasets.mockup.params import SceneParams
+from rille.datasets.mockup.raycast import HeightField
+from rille.stages.core.declare import Array, Bundle, Inputs, Stage
 
 MIPS = 7
 """Levels of the albedo: 0.5 mm texels up to 32 mm, more than any footprint on the bed."""

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from datasets.mockup.rover import RoverParams
-from stages.core.declare import Array, Bundle, Inputs, Stage
-from stages.geometry.geometry import rotation_exp
+from rille.datasets.mockup.rover import RoverParams
+from rille.stages.core.declare import Array, Bundle, Inputs, Stage
+from rille.stages.geometry.geometry import rotation_exp
 
 
 def _run(params: RoverParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:

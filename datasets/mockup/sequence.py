@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets.mockup.params import MockupParams
-from datasets.protocol import CAMERAS, Rows, Sequence, Source
-from stages.core.declare import NoParams
-from stages.core.errors import ConfigError
-from stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
+from rille.datasets.mockup.params import MockupParams
+from rille.datasets.protocol import CAMERAS, Rows, Sequence, Source
+from rille.stages.core.declare import NoParams
+from rille.stages.core.errors import ConfigError
+from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
 
 Floats = NDArray[np.float64]
 
@@ -135,7 +135,7 @@ def mockup(p: MockupParams, name: str = "mockup") -> Sequence:
     rig = true_rig(p)
     cameras = {"left": rig.left, "right": rig.right}
     poses = {c: [body @ mount(p, c) for body in bodies] for c in CAMERAS}
-    scene = Source("datasets.mockup.scene", p.scene())
+    scene = Source("rille.datasets.mockup.scene", p.scene())
 
     def image(frame: int, camera: str) -> Source:
         args = {
@@ -144,14 +144,14 @@ def mockup(p: MockupParams, name: str = "mockup") -> Sequence:
             "geometry": cameras[camera].to_dict(),
             "T_bed_camera": poses[camera][frame].to_list(),
         }
-        return Source("datasets.mockup.render", p.render(), args, inputs={"scene": scene})
+        return Source("rille.datasets.mockup.render", p.render(), args, inputs={"scene": scene})
 
     def pair(frame: int) -> list[list[float]]:
         return [poses[c][frame].to_list() for c in CAMERAS]
 
     def disparity(frame: int) -> Source:
         args = {"frame": frame, "rig": rig.to_dict(), "T_bed_left": poses["left"][frame].to_list()}
-        return Source("datasets.mockup.truth", NoParams(), args, inputs={"scene": scene})
+        return Source("rille.datasets.mockup.truth", NoParams(), args, inputs={"scene": scene})
 
     def dem(lattice: Mapping[str, Any], T_truth_world: RigidTransform, pairs: tuple[int, ...] = ()) -> Source:
         args = {
@@ -160,7 +160,7 @@ def mockup(p: MockupParams, name: str = "mockup") -> Sequence:
             "rig": rig.to_dict(),
             "pairs": [poses["left"][k].to_list() for k in pairs],
         }
-        return Source("datasets.mockup.truth_dem", NoParams(), args, inputs={"scene": scene})
+        return Source("rille.datasets.mockup.truth_dem", NoParams(), args, inputs={"scene": scene})
 
     attitude = _attitude(p, poses["left"])
     up = _up(p, poses["left"]) if attitude is None else tuple(rows[2] for rows in attitude)
@@ -190,7 +190,7 @@ def mockup(p: MockupParams, name: str = "mockup") -> Sequence:
 
 def vehicle_at_scale() -> Any:
     """The rover at 1:10: a 0.8 m wide, 1 m long one with 0.3 m wheels at full scale."""
-    from stages.hazard.vehicle import Vehicle
+    from rille.stages.hazard.vehicle import Vehicle
 
     return Vehicle(
         name="rover at 1:10",

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets.mockup import scene as bed
-from datasets.mockup import terrain
-from datasets.mockup.params import SceneParams
-from stages.core.declare import Bundle, Inputs, NoParams, Stage
+from rille.datasets.mockup import scene as bed
+from rille.datasets.mockup import terrain
+from rille.datasets.mockup.params import SceneParams
+from rille.stages.core.declare import Bundle, Inputs, NoParams, Stage
 
 EDGE = 0.06
 """m; over which the pad passes into the ground around it."""

@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from datasets.mockup.params import SceneParams
+from rille.datasets.mockup.params import SceneParams
 
 Floats32 = NDArray[np.float32]
 

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets.mockup.raycast import HeightField
-from datasets.mockup.render import camera_rays, transform
-from datasets.mockup.scene import height_field
-from stages.core.declare import AnyArray, Array, Bundle, Inputs, NoParams, Stage
-from stages.geometry.geometry import Camera, Rig, RigidTransform
+from rille.datasets.mockup.raycast import HeightField
+from rille.datasets.mockup.render import camera_rays, transform
+from rille.datasets.mockup.scene import height_field
+from rille.stages.core.declare import AnyArray, Array, Bundle, Inputs, NoParams, Stage
+from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 
 TOLERANCE = 1e-5
 """m: a point is hidden when its line of sight ends more than this in front of it; far below any truth's use."""

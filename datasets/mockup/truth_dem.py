@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets.mockup.raycast import HeightField
-from datasets.mockup.render import transform
-from datasets.mockup.scene import height_field
-from datasets.mockup.truth import visible
-from stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
-from stages.geometry.geometry import Rig, RigidTransform
+from rille.datasets.mockup.raycast import HeightField
+from rille.datasets.mockup.render import transform
+from rille.datasets.mockup.scene import height_field
+from rille.datasets.mockup.truth import visible
+from rille.stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
+from rille.stages.geometry.geometry import Rig, RigidTransform
 
 
 def true_dem(

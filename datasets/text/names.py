@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from stages.core.errors import InputError
+from rille.stages.core.errors import InputError
 
 LONGEST = 80
 """Characters."""

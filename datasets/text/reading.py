@@ -18,7 +18,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from stages.core.errors import InputError
+from rille.stages.core.errors import InputError
 
 SMALL = 1_000_000
 """Bytes of a manifest, a configuration or a calibration, which have kilobytes."""

@@ -11,7 +11,7 @@ from decimal import Decimal, InvalidOperation
 
 import numpy as np
 
-from stages.core.errors import InputError
+from rille.stages.core.errors import InputError
 
 UNITS = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}
 """How many of each make a second."""

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from cyclopts import App
 
-from pipeline.commands.options import RUNS, CacheFolder, Debug, Run, Runs, cache_folder, flag
+from rille.pipeline.commands.options import RUNS, CacheFolder, Debug, Run, Runs, cache_folder, flag
 
 app = App(name="cache", help="Look after the cache of artifacts.")
 
@@ -19,7 +19,7 @@ def verify(
     debug: Debug = False,
 ) -> int:
     """Read every artifact and compare its checksums; damaged ones are named and recomputed by the next run."""
-    from pipeline.runs import session as run
+    from rille.pipeline.runs import session as run
 
     return run.verify_cache(cache_folder(cache), deep=deep)
 
@@ -33,7 +33,7 @@ def gc(
     debug: Debug = False,
 ) -> int:
     """Remove artifacts that no kept and no pinned run refers to, and leftovers of interrupted runs."""
-    from pipeline.runs import session as run
+    from rille.pipeline.runs import session as run
 
     return run.collect_garbage(cache_folder(cache), runs, dry_run=dry_run)
 
@@ -47,7 +47,7 @@ def ls(
     debug: Debug = False,
 ) -> int:
     """Say what the cache holds, by sequence and stage: number, sizes, age, and the run that used it last."""
-    from pipeline.runs import inventory
+    from rille.pipeline.runs import inventory
 
     return inventory.ls(cache_folder(cache), runs, as_json=as_json)
 
@@ -61,7 +61,7 @@ def pin(
     debug: Debug = False,
 ) -> int:
     """Keep all artifacts of a run, whatever is cleared away, even if the run's folder is removed."""
-    from pipeline.runs import session as commands
+    from rille.pipeline.runs import session as commands
 
     return commands.pin(cache_folder(cache), run, runs)
 
@@ -75,6 +75,6 @@ def unpin(run: str, *, cache: CacheFolder = None, debug: Debug = False) -> int:
     run
         SEQUENCE/ID, or ID.
     """
-    from pipeline.runs import session as commands
+    from rille.pipeline.runs import session as commands
 
     return commands.unpin(cache_folder(cache), run)

@@ -18,10 +18,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets.images import chessboard, pairing
-from datasets.images.files import read_grey
-from stages.calibration.target import MODELS, BoardView, RigCalibration, calibrate_rig
-from stages.core.errors import InputError, RilleError
+from rille.datasets.images import chessboard, pairing
+from rille.datasets.images.files import read_grey
+from rille.stages.calibration.target import MODELS, BoardView, RigCalibration, calibrate_rig
+from rille.stages.core.errors import InputError, RilleError
 
 COMPLETE = 0
 
@@ -66,7 +66,7 @@ def calibrate(
     left, right : folder or glob of each camera's images; the same folder for both where the names tell the sides.
     square : side of a square, metres.
     corners : inner corners, ``COLUMNSxROWS``; None: found.
-    model : distortion model, see :data:`stages.calibration.target.MODELS`.
+    model : distortion model, see :data:`rille.stages.calibration.target.MODELS`.
     output : YAML file to write.
     keep_bad : use also views whose residuals are far above the others'; without it they are left out, and named.
 

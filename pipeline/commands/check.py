@@ -16,21 +16,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets.protocol import CAMERAS, Sequence
-from pipeline.engine import scheduler
-from pipeline.engine.graph import Graph, Handle, Maybe, MissingError, Wait
-from pipeline.engine.scheduler import Result
-from pipeline.engine.store.base import Store, at
-from pipeline.engine.store.location import Location
-from pipeline.flow import config as configuration
-from pipeline.flow.builders import Builder, name
-from pipeline.runs import input_checks as verdicts
-from pipeline.runs import synchrony
-from pipeline.runs.input_checks import Verdict
-from stages.core.errors import RilleError
-from stages.geometry.epipolar import beyond_infinity
-from stages.geometry.triangulation import inverse_depth
-from stages.imaging.image_quality import Look, look
+from rille.datasets.protocol import CAMERAS, Sequence
+from rille.pipeline.engine import scheduler
+from rille.pipeline.engine.graph import Graph, Handle, Maybe, MissingError, Wait
+from rille.pipeline.engine.scheduler import Result
+from rille.pipeline.engine.store.base import Store, at
+from rille.pipeline.engine.store.location import Location
+from rille.pipeline.flow import config as configuration
+from rille.pipeline.flow.builders import Builder, name
+from rille.pipeline.runs import input_checks as verdicts
+from rille.pipeline.runs import synchrony
+from rille.pipeline.runs.input_checks import Verdict
+from rille.stages.core.errors import RilleError
+from rille.stages.geometry.epipolar import beyond_infinity
+from rille.stages.geometry.triangulation import inverse_depth
+from rille.stages.imaging.image_quality import Look, look
 
 Floats = NDArray[np.float64]
 Steps = Generator[Wait, Any, None]

@@ -12,11 +12,11 @@ from affine import Affine
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from pipeline.engine.runtime import atomic
-from pipeline.export.read_dem import Raster, read_elevation
-from pipeline.export.writers import ENGINEERING_CRS
-from stages.core.errors import InputError
-from stages.evaluation.dem_comparison import FREE, Alignment, Grid, align, binned, common, errors, figures
+from rille.pipeline.engine.runtime import atomic
+from rille.pipeline.export.read_dem import Raster, read_elevation
+from rille.pipeline.export.writers import ENGINEERING_CRS
+from rille.stages.core.errors import InputError
+from rille.stages.evaluation.dem_comparison import FREE, Alignment, Grid, align, binned, common, errors, figures
 
 Floats = NDArray[np.float64]
 SLOPES_DEG = np.array([0.0, 2.0, 5.0, 10.0, 20.0, 30.0, 45.0, 60.0, 90.0])

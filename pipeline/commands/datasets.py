@@ -6,7 +6,7 @@ from pathlib import Path
 
 from cyclopts import App
 
-from pipeline.commands.options import COMPLETE, Assignments, CacheFolder, Debug, cache_folder, prepare
+from rille.pipeline.commands.options import COMPLETE, Assignments, CacheFolder, Debug, cache_folder, prepare
 
 app = App(name="datasets", help="Sequences that Rille knows: list them, or export one for other tools.")
 
@@ -14,7 +14,7 @@ app = App(name="datasets", help="Sequences that Rille knows: list them, or expor
 @app.default
 def list_datasets() -> int:
     """List the built-in sequences and the folder layouts that are recognised."""
-    from datasets.registry import catalogue
+    from rille.datasets.registry import catalogue
 
     for name, words in catalogue():
         print(f"{name:16s} {words}")
@@ -40,6 +40,6 @@ def export(
         Folder to make; it must not exist yet or be empty.
     """
     prepare()
-    from pipeline.runs import session
+    from rille.pipeline.runs import session
 
     return session.export_dataset(seq, directory, tuple(assignments or ()), cache_folder(cache))

@@ -7,7 +7,16 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from pipeline.commands.options import COMPLETE, Assignments, CacheFolder, Debug, Output, cache_folder, flag, prepare
+from rille.pipeline.commands.options import (
+    COMPLETE,
+    Assignments,
+    CacheFolder,
+    Debug,
+    Output,
+    cache_folder,
+    flag,
+    prepare,
+)
 
 
 def init(
@@ -26,7 +35,7 @@ def init(
     output
         Manifest to write; by default DIRECTORY's name with .rille.toml, in the present folder.
     """
-    from pipeline.commands import init as command
+    from rille.pipeline.commands import init as command
 
     return command.init(directory, output, force)
 
@@ -59,7 +68,7 @@ def calibrate(
     output
         YAML file to write.
     """
-    from pipeline.commands import calibrate as command
+    from rille.pipeline.commands import calibrate as command
 
     return command.calibrate(left, right, square=square, corners=corners, model=model, output=output, keep_bad=keep_bad)
 
@@ -100,7 +109,7 @@ def match(
         backmatch_error (pixels).
     """
     prepare()
-    from pipeline.commands import match as command
+    from rille.pipeline.commands import match as command
 
     return command.match_files(
         left,
@@ -134,7 +143,7 @@ def export(
     output
         What to write, for one form only; by default cloud.laz, terrain.glb or the folder colmap in the run's folder.
     """
-    from stages.core.errors import ConfigError
+    from rille.stages.core.errors import ConfigError
 
     if output is not None and len(to) > 1:
         raise ConfigError(
@@ -149,11 +158,11 @@ def export(
 def _export(run: Path, kind: Literal["laz", "glb", "colmap"], output: Path | None, cache: str | None) -> str:
     """Write one form; what was written, in words."""
     if kind == "colmap":
-        from pipeline.engine.store.base import at
-        from pipeline.export import colmap
+        from rille.pipeline.engine.store.base import at
+        from rille.pipeline.export import colmap
 
         return str(colmap.export_run(run, output or run / kind, at(cache_folder(cache))))
-    from pipeline.export import point_cloud
+    from rille.pipeline.export import point_cloud
 
     path, words = point_cloud.export(run, kind, output)
     return f"{path}  {words}"
@@ -184,6 +193,6 @@ def compare_dem(
         Files to write, without ending.
     """
     prepare()
-    from pipeline.commands import compare_dem as command
+    from rille.pipeline.commands import compare_dem as command
 
     return command.compare(a, b, align=align, output=output)

@@ -5,11 +5,11 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from datasets.inspection import Findings, inspect
-from datasets.manifest.text import counted, manifest_text, needs
-from datasets.registry import hindrance
-from datasets.text.names import derived_name
-from stages.core.errors import ConfigError, InputError
+from rille.datasets.inspection import Findings, inspect
+from rille.datasets.manifest.text import counted, manifest_text, needs
+from rille.datasets.registry import hindrance
+from rille.datasets.text.names import derived_name
+from rille.stages.core.errors import ConfigError, InputError
 
 COMPLETE = 0
 

@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Any, TextIO
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.engine.plain import raw
-from pipeline.flow import config as configuration
-from stages.core.errors import ConfigError, InputError
+from rille.pipeline.engine.plain import raw
+from rille.pipeline.flow import config as configuration
+from rille.stages.core.errors import ConfigError, InputError
 
 if TYPE_CHECKING:
-    from stages.hfvm.stage import Disparity
+    from rille.stages.hfvm.stage import Disparity
 
 COMPLETE, INCOMPLETE = 0, 3
 
@@ -64,8 +64,8 @@ def match_files(
     InputError
         An image or the prior cannot be read, or the prior is not of the left image's size.
     """
-    from datasets.images.files import read_grey
-    from pipeline.export.writers import write_confidence, write_disparity
+    from rille.datasets.images.files import read_grey
+    from rille.pipeline.export.writers import write_confidence, write_disparity
 
     params = matcher_params(preset, assignments)
     if confidence is not None and confidence.resolve() == output.resolve():
@@ -73,9 +73,9 @@ def match_files(
     images = read_grey(left), read_grey(right)
     given = _prior(prior, images[0].shape) if prior is not None else None
 
-    from pipeline.flow import tiles
-    from stages.core.validity import matched
-    from stages.hfvm.stage import match
+    from rille.pipeline.flow import tiles
+    from rille.stages.core.validity import matched
+    from rille.stages.hfvm.stage import match
 
     side = tiles.side(tiles.Tiling(), params, (images[0].shape, images[1].shape))
     with _progress(max(image.size for image in images), sys.stderr) as tell:
@@ -98,8 +98,8 @@ def match_files(
 
 def warnings(found: Disparity) -> list[str]:
     """What is suspicious about two matched images, one line each with the figure."""
-    from stages.core.validity import Validity, has, matched
-    from stages.hfvm.swap_check import swapped
+    from rille.stages.core.validity import Validity, has, matched
+    from rille.stages.hfvm.swap_check import swapped
 
     ok = matched(found.validity)
     share = float(ok.mean())
@@ -128,7 +128,7 @@ def warnings(found: Disparity) -> list[str]:
 
 def _prior(path: Path, shape: tuple[int, ...]) -> tuple[NDArray[Any], NDArray[Any]]:
     """Prior disparities, checked against the left image's shape."""
-    from pipeline.export.writers import read_disparity
+    from rille.pipeline.export.writers import read_disparity
 
     column, row = read_disparity(path, shape)
     if not (np.isfinite(column) & np.isfinite(row)).any():

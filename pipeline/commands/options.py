@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Parameter
 
 if TYPE_CHECKING:
-    from pipeline.runs.session import Options
+    from rille.pipeline.runs.session import Options
 
 COMPLETE, FAILED, USAGE, HOLES, INTERRUPTED = 0, 1, 2, 3, 130
 
@@ -92,8 +92,8 @@ def options(
     keep_going: bool = False,
     memory_limit: str | None = None,
 ) -> Options:
-    """What was given on the command line, for :mod:`pipeline.runs.session`."""
-    from pipeline.runs.session import Options
+    """What was given on the command line, for :mod:`rille.pipeline.runs.session`."""
+    from rille.pipeline.runs.session import Options
 
     return Options(
         sequence=seq,
@@ -114,13 +114,13 @@ def options(
 
 def cache_folder(given: str | Path | None) -> Path | str:
     """Where the artifact cache is: ``--cache``, else ``RILLE_CACHE``, else ``.rille/cache`` here."""
-    from pipeline.engine.store.location import locate
+    from rille.pipeline.engine.store.location import locate
 
     return locate(given or os.environ.get("RILLE_CACHE") or Path(".rille/cache"))
 
 
 def prepare() -> None:
     """One thread a library, and safe kernels, before NumPy and numba are imported."""
-    from pipeline.engine.runtime.environment import prepare_environment
+    from rille.pipeline.engine.runtime.environment import prepare_environment
 
     prepare_environment()

@@ -9,9 +9,9 @@ from typing import Any, Literal, get_args, get_origin
 import tomli_w
 from pydantic.fields import FieldInfo
 
-from pipeline.flow import config
-from stages.core.declare import Params
-from stages.core.errors import ConfigError
+from rille.pipeline.flow import config
+from rille.stages.core.declare import Params
+from rille.stages.core.errors import ConfigError
 
 WIDTH = 100
 SIGNS = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<"}
@@ -19,9 +19,9 @@ SIGNS = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<"}
 
 def sections() -> dict[str, Params]:
     """Every section of the configuration with its defaults: stages in the order of the flow, then sequences."""
-    from datasets.images.misalign import MisalignParams
-    from datasets.mockup.params import MockupParams
-    from datasets.mockup.rover import RoverParams
+    from rille.datasets.images.misalign import MisalignParams
+    from rille.datasets.mockup.params import MockupParams
+    from rille.datasets.mockup.rover import RoverParams
 
     known = config.build()
     return {name: getattr(known, name) for name in type(known).model_fields} | {

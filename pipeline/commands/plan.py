@@ -10,20 +10,20 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Iterable
 
-from pipeline.engine import scheduler
-from pipeline.engine.forecast import Kinds, kind, recall
-from pipeline.engine.graph import Graph, Handle
-from pipeline.engine.memory import cost_model, limits
-from pipeline.engine.memory.admission import Account, Admission, account, forecast, largest
-from pipeline.engine.memory.cost_model import Costs, Foreseen, count
-from pipeline.engine.memory.limits import words
-from pipeline.engine.runtime.environment import cores
-from pipeline.engine.scheduler import Result
-from pipeline.engine.store.base import at
-from pipeline.flow import unread
-from pipeline.flow.closed_loop import dataflow
-from pipeline.runs.session import Options, check_options, choose_frames, settings, warn
-from stages.core.errors import ConfigError
+from rille.pipeline.engine import scheduler
+from rille.pipeline.engine.forecast import Kinds, kind, recall
+from rille.pipeline.engine.graph import Graph, Handle
+from rille.pipeline.engine.memory import cost_model, limits
+from rille.pipeline.engine.memory.admission import Account, Admission, account, forecast, largest
+from rille.pipeline.engine.memory.cost_model import Costs, Foreseen, count
+from rille.pipeline.engine.memory.limits import words
+from rille.pipeline.engine.runtime.environment import cores
+from rille.pipeline.engine.scheduler import Result
+from rille.pipeline.engine.store.base import at
+from rille.pipeline.flow import unread
+from rille.pipeline.flow.closed_loop import dataflow
+from rille.pipeline.runs.session import Options, check_options, choose_frames, settings, warn
+from rille.stages.core.errors import ConfigError
 
 REASONS = 3
 """Different reasons told a stage; ``verbose`` tells each task's."""

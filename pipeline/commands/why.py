@@ -8,14 +8,14 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from pipeline.engine import events, provenance
-from pipeline.engine.keys import digest
-from pipeline.engine.memory.limits import words
-from pipeline.engine.store.base import Store, at
-from pipeline.engine.store.location import Location
-from pipeline.engine.store.manifest import artifact_path
-from pipeline.flow.config import modules, stage
-from pipeline.runs import lookup
+from rille.pipeline.engine import events, provenance
+from rille.pipeline.engine.keys import digest
+from rille.pipeline.engine.memory.limits import words
+from rille.pipeline.engine.store.base import Store, at
+from rille.pipeline.engine.store.location import Location
+from rille.pipeline.engine.store.manifest import artifact_path
+from rille.pipeline.flow.config import modules, stage
+from rille.pipeline.runs import lookup
 
 SHORT = 12
 """Hexadecimal digits of a digest that are shown."""

@@ -1,9 +1,9 @@
 """What a stage's result depends on besides its inputs: its own source code (for packages:
-:mod:`pipeline.engine.packages`).
+:mod:`rille.pipeline.engine.packages`).
 
 The code digest of a module covers all *own* modules that it reaches by import statements, at any depth and also from
 within functions, with the ``__init__`` of every package on the way. Each counts as its syntax tree without
-docstrings, so comments, docstrings and formatting change nothing. Own are ``stages``, ``datasets`` and the top-level
+docstrings, so comments, docstrings and formatting change nothing. Own are ``rille.stages``, ``rille.datasets`` and the
 package of the module itself. Imports under ``if TYPE_CHECKING:`` never run and do not count; modules loaded by a
 computed name are not seen, and neither are data files beside the code: keep tables in modules.
 
@@ -25,10 +25,10 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from pipeline.engine.keys import digest
-from pipeline.engine.runtime import atomic
+from rille.pipeline.engine.keys import digest
+from rille.pipeline.engine.runtime import atomic
 
-OWN = ("stages", "datasets")
+OWN = ("rille.stages", "rille.datasets")
 
 FORGET = 8
 """States of the sources that are remembered, before those not in use are forgotten."""
@@ -84,6 +84,11 @@ def remember() -> None:
     _memory.save()
 
 
+def package_of(module: str) -> str:
+    """Package that a module belongs to: ``rille.stages`` of one of Rille's own, else the first part of its name."""
+    return ".".join(module.split(".")[: 2 if module.startswith("rille.") else 1])
+
+
 def module_digests(module: str, own: Iterable[str] = OWN) -> dict[str, str]:
     """Digest of each own module that ``module`` reaches, itself included, by dotted name.
 
@@ -92,7 +97,7 @@ def module_digests(module: str, own: Iterable[str] = OWN) -> dict[str, str]:
     ModuleNotFoundError
         ``module`` itself has no source file.
     """
-    packages = tuple(sorted({*own, module.partition(".")[0]}))
+    packages = tuple(sorted({*own, package_of(module)}))
     return dict(_reachable(module, packages))
 
 
@@ -119,14 +124,14 @@ def tree_digest(own: Iterable[str] = OWN) -> str:
 
 def external_imports(module: str, own: Iterable[str] = OWN) -> set[str]:
     """Top-level names of what a module and all own modules that it reaches import from elsewhere, but from Python."""
-    packages = tuple(sorted({*own, module.partition(".")[0]}))
-    names = {
+    packages = tuple(sorted({*own, package_of(module)}))
+    return {
         imported.partition(".")[0]
         for name, _ in _reachable(module, packages)
         if (path := _file(name)) is not None
         for imported in _read(name, path).imports
+        if package_of(imported) not in packages and imported.partition(".")[0] not in sys.stdlib_module_names
     }
-    return {name for name in names if name not in packages and name not in sys.stdlib_module_names}
 
 
 @cache
@@ -138,7 +143,7 @@ def _reachable(module: str, packages: tuple[str, ...]) -> tuple[tuple[str, str],
     while queue:
         name = queue.pop()
         path = _file(name)
-        if name in found or path is None or name.partition(".")[0] not in packages:
+        if name in found or path is None or package_of(name) not in packages:
             continue
         source = _read(name, path)
         found[name] = source.sha256
@@ -162,7 +167,8 @@ def _roots(package: str) -> tuple[Path, ...]:
 
 @cache
 def _file(module: str) -> Path | None:
-    package, *rest = module.split(".")
+    package = package_of(module)
+    rest = module.split(".")[package.count(".") + 1 :]
     for root in _roots(package):
         base = root.joinpath(*rest)
         for path in (base / "__init__.py", base.parent / f"{base.name}.py" if rest else None):

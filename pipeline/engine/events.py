@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TextIO
 
-from pipeline.engine.graph import Handle
-from pipeline.engine.memory.cost_model import input_bytes
+from rille.pipeline.engine.graph import Handle
+from rille.pipeline.engine.memory.cost_model import input_bytes
 
 
 class Ledger:
@@ -64,7 +64,8 @@ class Ledger:
 
 
 def _took(handle: Handle) -> dict[str, Any]:
-    """Times (seconds; of day since 1970) and bytes of a computed task; see :class:`~pipeline.engine.task.Outcome`."""
+    """Times (seconds; of day since 1970) and bytes of a computed task; see
+    :class:`~rille.pipeline.engine.task.Outcome`."""
     assert handle.ref is not None
     return {
         "started": round(handle.started, 4),

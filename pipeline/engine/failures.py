@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import errno
 
-from stages.core.errors import RilleError
+from rille.stages.core.errors import RilleError
 
 FULL = (errno.ENOSPC, errno.EDQUOT)
 CLOSED = (errno.EACCES, errno.EPERM, errno.EROFS)

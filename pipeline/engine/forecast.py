@@ -25,11 +25,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipeline.engine.reference import REFERENCE
-from pipeline.engine.runtime import atomic
+from rille.pipeline.engine.reference import REFERENCE
+from rille.pipeline.engine.runtime import atomic
 
 if TYPE_CHECKING:
-    from pipeline.engine.graph import Handle
+    from rille.pipeline.engine.graph import Handle
 
 Kinds = Mapping[str, tuple[float, float, float]]
 """Of each kind of task: tasks over those laid out when the run opened, mean seconds of a task without compiling, and

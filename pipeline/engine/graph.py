@@ -21,9 +21,9 @@ from functools import cache
 from types import ModuleType
 from typing import Any, Generic, TypeVar
 
-from pipeline.engine.store.manifest import Ref
-from pipeline.engine.task import Refs, Spec
-from stages.core.declare import Params
+from rille.pipeline.engine.store.manifest import Ref
+from rille.pipeline.engine.task import Refs, Spec
+from rille.stages.core.declare import Params
 
 Expansion = Callable[..., None]
 T = TypeVar("T")
@@ -37,8 +37,8 @@ class Handle:
     ``reason`` says in words why it was not found in the cache, or why it was skipped. ``earlier``, of a planned node,
     is what the same label led to before: a plan takes its facts for what is to come. ``expect`` are bytes (decoded)
     that it reads from outside. Of a computed node: ``seconds`` of the call and of the stage's own ``kernel``, when it
-    ``started`` (seconds since 1970), and the figures of a :class:`pipeline.engine.memory.limits.Meter` (``first``:
-    with imports and kernels; ``compiling``: seconds for which kernels were compiled).
+    ``started`` (seconds since 1970), and the figures of a :class:`rille.pipeline.engine.memory.limits.Meter`
+    (``first``: with imports and kernels; ``compiling``: seconds for which kernels were compiled).
     """
 
     index: int

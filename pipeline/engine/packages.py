@@ -1,7 +1,7 @@
 """Packages that a stage's result depends on: those that its modules import, with version and kind of processor.
 
-They are found by the same walk over import statements as the code digest (:mod:`pipeline.engine.code_digest`), so none
-can be forgotten. NumPy, SciPy and OpenCV choose code for the processor that they find, and sums of floats that are
+They are found by the same walk over import statements as the code digest (:mod:`rille.pipeline.engine.code_digest`), so
+none can be forgotten. NumPy, SciPy and OpenCV choose code for the processor that they find, and sums of floats that are
 added in another order round to other bits: so the kind that each works for belongs to its version. (OpenBLAS by its
 core type, NumPy and OpenCV by the instruction sets in use; compiled kernels of numba add in the order in which they
 are written.)
@@ -17,8 +17,8 @@ from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
-from pipeline.engine.code_digest import OWN, external_imports
-from stages.core.errors import RilleError
+from rille.pipeline.engine.code_digest import OWN, external_imports
+from rille.stages.core.errors import RilleError
 
 KNOWN = {
     "cv2": ("opencv-python-headless", "opencv-contrib-python-headless", "opencv-python", "opencv-contrib-python"),
@@ -27,7 +27,7 @@ KNOWN = {
 }
 """Import name to the distributions that may give it, where they are named otherwise: looking it up takes 0.2 s."""
 
-HARMLESS = frozenset({"pydantic", "pipeline"})
+HARMLESS = frozenset({"pydantic", "rille"})
 """What checks parameters, whose values are part of a key themselves; and the engine, whose format is."""
 
 CORE_NAMES = ("scipy_openblas_get_corename64_", "scipy_openblas_get_corename", "openblas_get_corename")

@@ -1,6 +1,6 @@
 """Progress of a run on stderr: a bar with an estimate on a terminal, plain lines elsewhere, JSON lines, or nothing.
 
-The estimate of the time left is that of :mod:`pipeline.engine.forecast`.
+The estimate of the time left is that of :mod:`rille.pipeline.engine.forecast`.
 """
 
 from __future__ import annotations
@@ -10,13 +10,13 @@ import sys
 import time
 from typing import TYPE_CHECKING, Any, Protocol, TextIO
 
-from pipeline.engine.forecast import Forecast, Kinds
-from pipeline.engine.plain import plain, raw
-from stages.core.errors import ConfigError
+from rille.pipeline.engine.forecast import Forecast, Kinds
+from rille.pipeline.engine.plain import plain, raw
+from rille.stages.core.errors import ConfigError
 
 if TYPE_CHECKING:
-    from pipeline.engine.graph import Graph, Handle
-    from pipeline.engine.scheduler import Result
+    from rille.pipeline.engine.graph import Graph, Handle
+    from rille.pipeline.engine.scheduler import Result
 
 INTERVAL = 5.0
 """Seconds between plain lines."""

@@ -13,12 +13,12 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.engine.runtime import atomic
+from rille.pipeline.engine.runtime import atomic
 
 if TYPE_CHECKING:
-    from pipeline.engine.graph import Handle
-    from pipeline.engine.store.base import Store
-    from pipeline.engine.store.manifest import Ref
+    from rille.pipeline.engine.graph import Handle
+    from rille.pipeline.engine.store.base import Store
+    from rille.pipeline.engine.store.manifest import Ref
 
 KEPT = 4
 """Earlier keys remembered per label: enough for a user who goes back and forth between a few settings."""

@@ -42,4 +42,4 @@ REFERENCE: dict[str, tuple[float, float, float]] = {
     "truth_dem/local": (0.049, 0.4237, 0.0),
     "truth_dem/world": (0.0049, 7.6964, 0.0),
 }
-"""See :data:`pipeline.engine.forecast.Kinds`; one core, images of 570 x 520."""
+"""See :data:`rille.pipeline.engine.forecast.Kinds`; one core, images of 570 x 520."""

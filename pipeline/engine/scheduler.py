@@ -10,7 +10,7 @@ A run that finds everything starts no worker. With ``dry=True`` nothing is compu
 by those of an earlier run where there was one (``Result.assumed``), else it is not known (``Result.unknown``).
 
 What a stage raises is not tried again, and what depends on it is skipped. Where the data do not determine an answer
-(:class:`~stages.core.errors.DegenerateError`) everything else finishes: the run has a hole. After any other error
+(:class:`~rille.stages.core.errors.DegenerateError`) everything else finishes: the run has a hole. After any other error
 nothing new is begun, unless with ``keep_going``. An artifact that is found damaged, or gone, when a task reads it is
 computed again, and the task after it. A task whose worker process dies is tried three times. In every case the ledger
 has one line for each node that is missing, with the reason.
@@ -27,23 +27,23 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from pipeline.engine import forecast, provenance
-from pipeline.engine.events import Ledger
-from pipeline.engine.executors.base import Executor, Failed, make
-from pipeline.engine.failures import told
-from pipeline.engine.graph import Expansion, Graph, Handle
-from pipeline.engine.keys import digest
-from pipeline.engine.memory import cost_model
-from pipeline.engine.memory.admission import Admission, Waiting, account, largest
-from pipeline.engine.memory.cost_model import input_bytes
-from pipeline.engine.progress import Progress, Quiet
-from pipeline.engine.runtime.environment import cores
-from pipeline.engine.runtime.interrupts import Interrupts
-from pipeline.engine.store.artifact import DamagedError
-from pipeline.engine.store.base import GoneError, NonDeterministicError, Store
-from pipeline.engine.store.manifest import Ref
-from pipeline.engine.task import Outcome, key_of, recipe
-from stages.core.errors import DegenerateError, RilleError
+from rille.pipeline.engine import forecast, provenance
+from rille.pipeline.engine.events import Ledger
+from rille.pipeline.engine.executors.base import Executor, Failed, make
+from rille.pipeline.engine.failures import told
+from rille.pipeline.engine.graph import Expansion, Graph, Handle
+from rille.pipeline.engine.keys import digest
+from rille.pipeline.engine.memory import cost_model
+from rille.pipeline.engine.memory.admission import Admission, Waiting, account, largest
+from rille.pipeline.engine.memory.cost_model import input_bytes
+from rille.pipeline.engine.progress import Progress, Quiet
+from rille.pipeline.engine.runtime.environment import cores
+from rille.pipeline.engine.runtime.interrupts import Interrupts
+from rille.pipeline.engine.store.artifact import DamagedError
+from rille.pipeline.engine.store.base import GoneError, NonDeterministicError, Store
+from rille.pipeline.engine.store.manifest import Ref
+from rille.pipeline.engine.task import Outcome, key_of, recipe
+from rille.stages.core.errors import DegenerateError, RilleError
 
 HEALS = 3
 """Times that a task is put back because its input has gone."""

@@ -3,9 +3,9 @@
 A :class:`Spec` says what to compute: a stage module (its ``STAGE`` is taken), validated parameters, the arguments that
 identify the task, and hints (paths) that cannot change the result. The key is the digest of all of it but the hints
 and the label, of the code and packages behind the stage, and of the *output digests* of the inputs. Between
-tasks only :class:`~pipeline.engine.store.manifest.Ref` travel.
+tasks only :class:`~rille.pipeline.engine.store.manifest.Ref` travel.
 
->>> spec = Spec("stages.odometry.keyframes", "select", SelectParams(), {"frames": 9})
+>>> spec = Spec("rille.stages.odometry.keyframes", "select", SelectParams(), {"frames": 9})
 >>> outcome = ensure(Path("cache"), spec, {})
 >>> Store("cache").open(outcome.ref).meta["basic"]
 [0, 4, 8]
@@ -27,15 +27,15 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from pipeline.engine.code_digest import module_digests
-from pipeline.engine.keys import text
-from pipeline.engine.memory.limits import Meter
-from pipeline.engine.packages import versions
-from pipeline.engine.runtime.numba_cache import COMPILING, guard
-from pipeline.engine.store.base import Store, at
-from pipeline.engine.store.manifest import Ref
-from stages.core.declare import Bundle, Params, Stage, check_outputs
-from stages.core.errors import RilleError
+from rille.pipeline.engine.code_digest import module_digests
+from rille.pipeline.engine.keys import text
+from rille.pipeline.engine.memory.limits import Meter
+from rille.pipeline.engine.packages import versions
+from rille.pipeline.engine.runtime.numba_cache import COMPILING, guard
+from rille.pipeline.engine.store.base import Store, at
+from rille.pipeline.engine.store.manifest import Ref
+from rille.stages.core.declare import Bundle, Params, Stage, check_outputs
+from rille.stages.core.errors import RilleError
 
 __all__ = ["CodeChangedError", "Outcome", "Ref", "Refs", "Spec", "ensure", "recipe", "resolve"]
 
@@ -77,8 +77,8 @@ class Outcome:
     """What became of a task: its artifact, whether it was there, seconds and peak memory (bytes) of the call.
 
     ``kernel`` are the seconds of the stage itself, ``started`` is when the call began (seconds since 1970); ``memory``
-    and ``rest`` are a :class:`~pipeline.engine.memory.limits.Meter`'s figures, ``first`` says that the process had not
-    run the stage before (it imports, and compiles or loads kernels); ``compiling`` are the seconds for which it
+    and ``rest`` are a :class:`~rille.pipeline.engine.memory.limits.Meter`'s figures, ``first`` says that the process
+    had not run the stage before (it imports, and compiles or loads kernels); ``compiling`` are the seconds for which it
     compiled.
     """
 

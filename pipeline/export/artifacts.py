@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.export.view import RunView
-from stages.core.declare import Bundle
-from stages.geometry.geometry import Rig
+from rille.pipeline.export.view import RunView
+from rille.stages.core.declare import Bundle
+from rille.stages.geometry.geometry import Rig
 
 Floats = NDArray[Any]
 

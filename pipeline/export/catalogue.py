@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from fnmatch import fnmatchcase
 from pathlib import Path
 
-from pipeline.export import paths, rasters, terrain_zarr, trajectories
-from pipeline.export.output import Output
+from rille.pipeline.export import paths, rasters, terrain_zarr, trajectories
+from rille.pipeline.export.output import Output
 
 MADE = (trajectories, rasters, terrain_zarr, paths)
 """Modules whose outputs are tasks."""

@@ -13,13 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.engine import events
-from pipeline.engine.store.base import Store
-from stages.core.declare import Bundle
-from stages.core.errors import InputError
-from stages.evaluation.crosscheck import PIXEL_CENTRE
-from stages.geometry.geometry import Camera, Rig, RigidTransform
-from stages.odometry.resection.trajectory import world_poses
+from rille.pipeline.engine import events
+from rille.pipeline.engine.store.base import Store
+from rille.stages.core.declare import Bundle
+from rille.stages.core.errors import InputError
+from rille.stages.evaluation.crosscheck import PIXEL_CENTRE
+from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
+from rille.stages.odometry.resection.trajectory import world_poses
 
 LEFT, RIGHT = 1, 2
 """Numbers of the two cameras; the rig has number 1, too, and the left camera is its origin."""

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.export.artifacts import Floats, by_frame
-from pipeline.export.view import RunView
-from stages.core.declare import Bundle
+from rille.pipeline.export.artifacts import Floats, by_frame
+from rille.pipeline.export.view import RunView
+from rille.stages.core.declare import Bundle
 
 
 @dataclass(frozen=True)

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from datasets.georeference import Georeference
-from pipeline.export.catalogue import OUTPUTS
-from pipeline.export.writers import FRAME, UNLEVELLED
-from stages.geometry.pose_arrays import NO_VERTICAL
+from rille.datasets.georeference import Georeference
+from rille.pipeline.export.catalogue import OUTPUTS
+from rille.pipeline.export.writers import FRAME, UNLEVELLED
+from rille.stages.geometry.pose_arrays import NO_VERTICAL
 
 FORMAT = 1
 """Raised when the meaning of a key of frames.json changes."""

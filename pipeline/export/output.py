@@ -22,10 +22,10 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel
 
-from datasets.georeference import Georeference
-from stages.core.declare import Array, Bundle, Memory, NoParams, Stage
-from stages.geometry.geometry import Rig, RigidTransform
-from stages.hazard.vehicle import Vehicle
+from rille.datasets.georeference import Georeference
+from rille.stages.core.declare import Array, Bundle, Memory, NoParams, Stage
+from rille.stages.geometry.geometry import Rig, RigidTransform
+from rille.stages.hazard.vehicle import Vehicle
 
 BLOCK = 1024
 """Bytes a row of the array that holds a file: a chunk of an artifact is 1024 x 1024 then."""
@@ -54,10 +54,10 @@ class Output:
     opens : free programs that open it.
     write : ``write(folder, view)`` writes it; None for what each run renders. It may write nothing, or for a name with
         a ``*`` several files.
-    needs : fields of :class:`pipeline.flow.products.Products` whose artifacts must all be there.
+    needs : fields of :class:`rille.pipeline.flow.products.Products` whose artifacts must all be there.
     reads : further ones, which may lack some.
     knows : facts of the view that it uses, such as ``sequence.georeference``; others it cannot reach.
-    frame : frame of reference of its values, a key of :data:`pipeline.export.frames_json.FRAMES`; empty: none.
+    frame : frame of reference of its values, a key of :data:`rille.pipeline.export.frames_json.FRAMES`; empty: none.
     facts : what else a program has to know to read it, for ``frames.json``: units, columns, what is missing.
     """
 

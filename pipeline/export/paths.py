@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.export.output import Output, stage
-from pipeline.export.writers import write_path_geojson, write_path_gpkg
-from stages.core.declare import Bundle
+from rille.pipeline.export.output import Output, stage
+from rille.pipeline.export.writers import write_path_geojson, write_path_gpkg
+from rille.stages.core.declare import Bundle
 
 
 def _facts(path: Bundle) -> dict[str, Any]:

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.engine.runtime import atomic
-from pipeline.export.read_dem import Raster, read_elevation, read_tiff
-from stages.core.errors import InputError
+from rille.pipeline.engine.runtime import atomic
+from rille.pipeline.export.read_dem import Raster, read_elevation, read_tiff
+from rille.stages.core.errors import InputError
 
 MADE = date(2000, 1, 1)
 """Date that every LAZ file states, so that equal clouds make equal files."""

@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.export import ranges, styles
-from pipeline.export.output import Output, stage
-from pipeline.export.writers import write_raster, write_style
-from stages.core.declare import Bundle
-from stages.geometry.lattice import Lattice, mosaic, union
-from stages.hazard.risk import REASONS
-from stages.hazard.risk import STAGE as RISK
-from stages.terrain.shading import hillshade, slope_deg
+from rille.pipeline.export import ranges, styles
+from rille.pipeline.export.output import Output, stage
+from rille.pipeline.export.writers import write_raster, write_style
+from rille.stages.core.declare import Bundle
+from rille.stages.geometry.lattice import Lattice, mosaic, union
+from rille.stages.hazard.risk import REASONS
+from rille.stages.hazard.risk import STAGE as RISK
+from rille.stages.terrain.shading import hillshade, slope_deg
 
 NAN = float("nan")
 LIGHT = {"light": "from the upper left (315 degrees), 45 degrees high"}

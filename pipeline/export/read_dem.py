@@ -11,7 +11,7 @@ import numpy as np
 from affine import Affine
 from numpy.typing import NDArray
 
-from stages.core.errors import InputError
+from rille.stages.core.errors import InputError
 
 METRE = ("m", "metre", "metres", "meter", "meters")
 
@@ -141,7 +141,7 @@ def _of_run(path: Path) -> Raster:
 
 def _cameras(run: Path) -> NDArray[np.float64] | None:
     """Positions (n, 2) of the left camera in the CRS of the run's rasters."""
-    from datasets.georeference import Georeference
+    from rille.datasets.georeference import Georeference
 
     try:
         poses = np.loadtxt(run / "trajectory.kitti", ndmin=2)

@@ -16,15 +16,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets.georeference import Georeference
-from pipeline.engine.runtime import atomic
-from pipeline.export.output import Output, stage
-from pipeline.export.rasters import whole
-from pipeline.export.writers import ENGINEERING_CRS, FRAME
-from stages.core.declare import Array
-from stages.geometry.lattice import Lattice
-from stages.terrain import merge
-from stages.terrain.shading import slope_deg
+from rille.datasets.georeference import Georeference
+from rille.pipeline.engine.runtime import atomic
+from rille.pipeline.export.output import Output, stage
+from rille.pipeline.export.rasters import whole
+from rille.pipeline.export.writers import ENGINEERING_CRS, FRAME
+from rille.stages.core.declare import Array
+from rille.stages.geometry.lattice import Lattice
+from rille.stages.terrain import merge
+from rille.stages.terrain.shading import slope_deg
 
 CONVENTIONS = "CF-1.11"
 CHUNK = 512

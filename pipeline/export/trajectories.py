@@ -5,13 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from pipeline.export import writers
-from pipeline.export.comparison import compare
-from pipeline.export.output import Output, stage
-from pipeline.export.writers import write_table, write_trajectory_kitti, write_trajectory_tum
-from stages.core.declare import Bundle
-from stages.geometry.pose_arrays import NO_VERTICAL
-from stages.odometry.resection.trajectory import world_poses
+from rille.pipeline.export import writers
+from rille.pipeline.export.comparison import compare
+from rille.pipeline.export.output import Output, stage
+from rille.pipeline.export.writers import write_table, write_trajectory_kitti, write_trajectory_tum
+from rille.stages.core.declare import Bundle
+from rille.stages.geometry.pose_arrays import NO_VERTICAL
+from rille.stages.odometry.resection.trajectory import world_poses
 
 POSES = {"of": "left camera", "transform": "T_world_left: x_world = R x_left + t"}
 TUM = {

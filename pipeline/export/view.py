@@ -6,11 +6,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
-from stages.core.declare import Bundle
+from rille.stages.core.declare import Bundle
 
 if TYPE_CHECKING:
-    from datasets.protocol import Sequence
-    from pipeline.flow.products import Products
+    from rille.datasets.protocol import Sequence
+    from rille.pipeline.flow.products import Products
 
 Status = Literal["computed", "cached", "failed", "skipped"]
 
@@ -42,7 +42,7 @@ class RunView:
     Attributes
     ----------
     run_id : name of the run's folder.
-    sequence : what was reconstructed (:class:`datasets.protocol.Sequence`).
+    sequence : what was reconstructed (:class:`rille.datasets.protocol.Sequence`).
     frames : chosen frame numbers, in order.
     products : handles of what the run was to deliver; those of failed tasks lead to no bundle.
     tasks : every task of the plan.

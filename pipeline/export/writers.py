@@ -17,13 +17,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets.georeference import Georeference
-from datasets.images.files import MOST_BYTES
-from datasets.text.reading import open_regular
-from pipeline.engine.plain import plain
-from pipeline.engine.runtime import atomic
-from stages.core.errors import InputError
-from stages.geometry.lattice import Lattice
+from rille.datasets.georeference import Georeference
+from rille.datasets.images.files import MOST_BYTES
+from rille.datasets.text.reading import open_regular
+from rille.pipeline.engine.plain import plain
+from rille.pipeline.engine.runtime import atomic
+from rille.stages.core.errors import InputError
+from rille.stages.geometry.lattice import Lattice
 
 FRAME = (
     "right-handed, metres: origin at the first left camera's centre, z up, y the horizontal projection of its "
@@ -287,12 +287,12 @@ def write_confidence(
     Parameters
     ----------
     std, backmatch_error : (row, col) float32 pixels, NaN undefined.
-    validity : (row, col) uint8, bits of :class:`stages.core.validity.Validity`; written as whole numbers, and as the
-    tag
+    validity : (row, col) uint8, bits of :class:`rille.stages.core.validity.Validity`; written as whole numbers, and as
+    the tag
         ``VALIDITY`` says.
     tags : more metadata.
     """
-    from stages.core.validity import Validity
+    from rille.stages.core.validity import Validity
 
     bits = ", ".join(f"{bit.value} {str(bit.name).lower()}" for bit in Validity)
     bands = {"disparity_std": (std, "pixel"), "validity": (validity, ""), "backmatch_error": (backmatch_error, "pixel")}

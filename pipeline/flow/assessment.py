@@ -13,13 +13,13 @@ from __future__ import annotations
 from collections.abc import Generator, Sequence
 from typing import Any
 
-from datasets.protocol import Positions
-from pipeline.engine.graph import Handle, Wait
-from pipeline.engine.task import Ref
-from pipeline.flow.builders import Builder, Pair
-from stages.evaluation import accuracy, agreement, dem_accuracy, path_check, position_accuracy, truth
-from stages.geometry.geometry import RigidTransform
-from stages.geometry.lattice import Lattice, union
+from rille.datasets.protocol import Positions
+from rille.pipeline.engine.graph import Handle, Wait
+from rille.pipeline.engine.task import Ref
+from rille.pipeline.flow.builders import Builder, Pair
+from rille.stages.evaluation import accuracy, agreement, dem_accuracy, path_check, position_accuracy, truth
+from rille.stages.geometry.geometry import RigidTransform
+from rille.stages.geometry.lattice import Lattice, union
 
 Steps = Generator[Wait, Any, None]
 

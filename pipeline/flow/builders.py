@@ -14,21 +14,21 @@ from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import numpy as np
 
-from datasets.protocol import Sequence, Source
-from pipeline.engine.graph import Graph, Handle
-from pipeline.engine.keys import digest
-from pipeline.flow import tiles
-from pipeline.flow.products import Products
-from stages.calibration import calibration, orientation, rig, swap_check
-from stages.core.declare import NoParams, Params
-from stages.hazard import risk
-from stages.hfvm import stage as hfvm
-from stages.imaging import pyramid, undistort
-from stages.odometry import motion, track
-from stages.odometry.resection import pose, resect
-from stages.terrain import ground_frame, merge
-from stages.terrain.locus import stage as locus
-from stages.terrain.tile_index import Box, tile_lattice
+from rille.datasets.protocol import Sequence, Source
+from rille.pipeline.engine.graph import Graph, Handle
+from rille.pipeline.engine.keys import digest
+from rille.pipeline.flow import tiles
+from rille.pipeline.flow.products import Products
+from rille.stages.calibration import calibration, orientation, rig, swap_check
+from rille.stages.core.declare import NoParams, Params
+from rille.stages.hazard import risk
+from rille.stages.hfvm import stage as hfvm
+from rille.stages.imaging import pyramid, undistort
+from rille.stages.odometry import motion, track
+from rille.stages.odometry.resection import pose, resect
+from rille.stages.terrain import ground_frame, merge
+from rille.stages.terrain.locus import stage as locus
+from rille.stages.terrain.tile_index import Box, tile_lattice
 
 P = ParamSpec("P")
 T = TypeVar("T")

@@ -1,7 +1,7 @@
 """The closed loop, top to bottom: stop, think, drive, and again, as tasks like all others.
 
-Pair, world model, segment and hazards are those of a reconstruction (:mod:`pipeline.flow.builders`). ``Drive.legs`` is
-the loop: it yields tasks and goes on with their results.
+Pair, world model, segment and hazards are those of a reconstruction (:mod:`rille.pipeline.flow.builders`).
+``Drive.legs`` is the loop: it yields tasks and goes on with their results.
 
 ::
 
@@ -37,23 +37,23 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field
 
-from datasets.protocol import Sequence, Simulation
-from pipeline.engine.graph import Graph, Handle, MissingError, Wait
-from pipeline.engine.task import Ref
-from pipeline.flow.builders import Builder, Pair, Segment, name
-from pipeline.flow.products import Driven, Products, Stop
-from pipeline.flow.reconstruction import reconstruction
-from stages.core.declare import Params
-from stages.core.errors import ConfigError, DegenerateError
-from stages.driving import fault_monitor, obstacle_monitor
-from stages.evaluation import accuracy, dem_accuracy, drive_check, truth
-from stages.geometry.geometry import RigidTransform
-from stages.geometry.lattice import Lattice
-from stages.odometry import motion
-from stages.odometry.resection import trajectory
-from stages.planning.local_planner import stage as local_planner
-from stages.planning.local_planner.memory import Memory
-from stages.terrain import map_localization, merge, occlusion_bounds, start_area
+from rille.datasets.protocol import Sequence, Simulation
+from rille.pipeline.engine.graph import Graph, Handle, MissingError, Wait
+from rille.pipeline.engine.task import Ref
+from rille.pipeline.flow.builders import Builder, Pair, Segment, name
+from rille.pipeline.flow.products import Driven, Products, Stop
+from rille.pipeline.flow.reconstruction import reconstruction
+from rille.stages.core.declare import Params
+from rille.stages.core.errors import ConfigError, DegenerateError
+from rille.stages.driving import fault_monitor, obstacle_monitor
+from rille.stages.evaluation import accuracy, dem_accuracy, drive_check, truth
+from rille.stages.geometry.geometry import RigidTransform
+from rille.stages.geometry.lattice import Lattice
+from rille.stages.odometry import motion
+from rille.stages.odometry.resection import trajectory
+from rille.stages.planning.local_planner import stage as local_planner
+from rille.stages.planning.local_planner.memory import Memory
+from rille.stages.terrain import map_localization, merge, occlusion_bounds, start_area
 
 
 class DriveParams(Params):

@@ -19,9 +19,9 @@ from typing import Any, Literal
 import tomli_w
 from pydantic import Field, ValidationError, create_model
 
-from datasets.text import reading
-from stages.core.declare import Params, Stage
-from stages.core.errors import ConfigError, told
+from rille.datasets.text import reading
+from rille.stages.core.declare import Params, Stage
+from rille.stages.core.errors import ConfigError, told
 
 ACCURATE_TERRAIN: dict[str, Any] = {
     "hfvm": {"preset": "accurate"},
@@ -69,7 +69,7 @@ def modules(*flows: str) -> dict[str, ModuleType]:
     Each stage with parameters has a section.
     """
     every = "builders", "reconstruction", "closed_loop", "assessment"
-    found = [vars(importlib.import_module(f"pipeline.flow.{flow}")).values() for flow in flows or every]
+    found = [vars(importlib.import_module(f"rille.pipeline.flow.{flow}")).values() for flow in flows or every]
     used = [module for names in found for module in names if isinstance(module, ModuleType)]
     return {module.STAGE.name: module for module in used if hasattr(module, "STAGE")}
 
@@ -82,8 +82,7 @@ def stage(name: str) -> Stage:
 
 def stage_names() -> set[str]:
     """Names of all stages, of those that make or read images, too."""
-    import datasets
-    import stages
+    from rille import datasets, stages
 
     modules = [
         importlib.import_module(found.name)
@@ -96,9 +95,9 @@ def stage_names() -> set[str]:
 @cache
 def model() -> type[Params]:
     """Model of the whole configuration, made of the stages' own parameter models."""
-    from pipeline.flow.closed_loop import DriveParams
-    from pipeline.flow.tiles import Tiling
-    from stages.hazard.vehicle import DEFAULT_VEHICLE, Vehicle
+    from rille.pipeline.flow.closed_loop import DriveParams
+    from rille.pipeline.flow.tiles import Tiling
+    from rille.stages.hazard.vehicle import DEFAULT_VEHICLE, Vehicle
 
     fields: dict[str, Any] = {
         name: (stage(name).params, stage(name).params()) for name in modules() if stage(name).params.model_fields

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from pipeline.engine.graph import Handle
+from rille.pipeline.engine.graph import Handle
 
 
 @dataclass

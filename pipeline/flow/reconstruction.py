@@ -26,7 +26,7 @@ cheap scan (``trajectory``), and Locus then runs a second time, straight on the 
 resampled. Locus reads both pyramids' finest images, and with ``locus.both`` the disparities of both (``hfvm/back``).
 What depends on data (which pairs are basic, how far the world reaches) follows as results arrive: ``reconstruction``
 is a generator that yields tasks and goes on with their results. The ports of ``hfvm`` to ``locus``, ``track`` and
-``resect`` are in :mod:`pipeline.flow.builders`, the leaves in :mod:`pipeline.flow.assessment`.
+``resect`` are in :mod:`rille.pipeline.flow.builders`, the leaves in :mod:`rille.pipeline.flow.assessment`.
 
 The world is cut into tiles once and for all; a tile's task has those models alone as inputs that have a cell in it. A
 pair that is added, or moved by another pose, is thus merged anew in the tiles that it touches and touched, no others:
@@ -39,17 +39,17 @@ from collections.abc import Generator, Mapping
 from itertools import pairwise
 from typing import Any
 
-from pipeline.engine.graph import Handle, Maybe, Wait
-from pipeline.engine.task import Ref
-from pipeline.flow import assessment
-from pipeline.flow.builders import Builder, Pair, Segment, merge_tiles
-from stages.core.errors import DegenerateError, InputError
-from stages.evaluation import crosscheck, crosscheck_join
-from stages.imaging import image_quality
-from stages.odometry import frame_screening, keyframes
-from stages.odometry.resection import refine, trajectory
-from stages.planning import path
-from stages.terrain import overlap_audit, overlap_qa, radiometry, tile_index
+from rille.pipeline.engine.graph import Handle, Maybe, Wait
+from rille.pipeline.engine.task import Ref
+from rille.pipeline.flow import assessment
+from rille.pipeline.flow.builders import Builder, Pair, Segment, merge_tiles
+from rille.stages.core.errors import DegenerateError, InputError
+from rille.stages.evaluation import crosscheck, crosscheck_join
+from rille.stages.imaging import image_quality
+from rille.stages.odometry import frame_screening, keyframes
+from rille.stages.odometry.resection import refine, trajectory
+from rille.stages.planning import path
+from rille.stages.terrain import overlap_audit, overlap_qa, radiometry, tile_index
 
 TILE_CELLS = 512
 """Side of a world tile, cells: 512 x 512 float32 is 1 MiB an array, small enough to recompute alone."""

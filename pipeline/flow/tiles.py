@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from pipeline.engine.graph import Graph, Handle
-from stages.core.declare import Params
-from stages.hfvm import join_stage, tile_stage, tiled
-from stages.hfvm.images.params import HfvmParams
-from stages.hfvm.images.plane import margin
-from stages.hfvm.images.views import pyramid_shapes
-from stages.hfvm.images.window import Shape, tiles
-from stages.imaging.pyramid import PyramidParams
+from rille.pipeline.engine.graph import Graph, Handle
+from rille.stages.core.declare import Params
+from rille.stages.hfvm import join_stage, tile_stage, tiled
+from rille.stages.hfvm.images.params import HfvmParams
+from rille.stages.hfvm.images.plane import margin
+from rille.stages.hfvm.images.views import pyramid_shapes
+from rille.stages.hfvm.images.window import Shape, tiles
+from rille.stages.imaging.pyramid import PyramidParams
 
 WHOLE_BYTES, TILE_BYTES = 170, 300
 """Room for matching a pixel, bytes: of images that are matched whole, and of a tile, whose surroundings it includes.

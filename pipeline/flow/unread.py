@@ -17,11 +17,11 @@ from collections.abc import Iterable, Mapping
 from functools import cache
 from typing import Any
 
-from datasets.protocol import Sequence
-from pipeline.engine.graph import Graph
-from pipeline.flow.config import modules
-from stages.core.declare import Params
-from stages.core.errors import ConfigError
+from rille.datasets.protocol import Sequence
+from rille.pipeline.engine.graph import Graph
+from rille.pipeline.flow.config import modules
+from rille.stages.core.declare import Params
+from rille.stages.core.errors import ConfigError
 
 
 @cache

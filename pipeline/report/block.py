@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from pipeline.report.canvas import Panel
+from rille.pipeline.report.canvas import Panel
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.export.artifacts import Floats, used_rig
-from pipeline.export.view import RunView
-from stages.geometry.epipolar import distances
+from rille.pipeline.export.artifacts import Floats, used_rig
+from rille.pipeline.export.view import RunView
+from rille.stages.geometry.epipolar import distances
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.export import ranges
+from rille.pipeline.export import ranges
 
 Image = NDArray[Any]
 Extent = tuple[float, float, float, float]

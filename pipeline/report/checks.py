@@ -7,14 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.export import ranges
-from pipeline.export.artifacts import chain
-from pipeline.export.comparison import Comparison
-from pipeline.report import canvas, curves, figures
-from pipeline.report.block import Block, Table
-from pipeline.report.calibration import Calibration
-from pipeline.report.gather import Scene
-from pipeline.report.words import length, quantity, spans, spread
+from rille.pipeline.export import ranges
+from rille.pipeline.export.artifacts import chain
+from rille.pipeline.export.comparison import Comparison
+from rille.pipeline.report import canvas, curves, figures
+from rille.pipeline.report.block import Block, Table
+from rille.pipeline.report.calibration import Calibration
+from rille.pipeline.report.gather import Scene
+from rille.pipeline.report.words import length, quantity, spans, spread
 
 MOST_CURVES = 3
 """Parameters of the rig whose change over the pairs is drawn."""

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.export.artifacts import Floats
-from pipeline.report import canvas
-from pipeline.report.canvas import Panel
+from rille.pipeline.export.artifacts import Floats
+from rille.pipeline.report import canvas
+from rille.pipeline.report.canvas import Panel
 
 CELLS = 24
 """Cells along the longer side of the image in which residuals are averaged."""

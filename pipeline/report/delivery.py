@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.export.view import RunView
-from pipeline.report.block import Figure
-from pipeline.report.gather import Scene
-from pipeline.report.words import metres, spans
+from rille.pipeline.export.view import RunView
+from rille.pipeline.report.block import Figure
+from rille.pipeline.report.gather import Scene
+from rille.pipeline.report.words import metres, spans
 
 Rows = list[dict[str, Any]]
 Items = list[dict[str, str]]

@@ -8,17 +8,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.export import ranges
-from pipeline.report import canvas
-from pipeline.report.block import Block, Table
-from pipeline.report.canvas import Extent, Panel
-from pipeline.report.gather import Scene
-from pipeline.report.words import metres
-from stages.geometry.geometry import RigidTransform
-from stages.geometry.lattice import Lattice
+from rille.pipeline.export import ranges
+from rille.pipeline.report import canvas
+from rille.pipeline.report.block import Block, Table
+from rille.pipeline.report.canvas import Extent, Panel
+from rille.pipeline.report.gather import Scene
+from rille.pipeline.report.words import metres
+from rille.stages.geometry.geometry import RigidTransform
+from rille.stages.geometry.lattice import Lattice
 
 if TYPE_CHECKING:
-    from pipeline.flow.products import Driven
+    from rille.pipeline.flow.products import Driven
 
 Floats = NDArray[Any]
 

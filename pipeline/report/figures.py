@@ -1,4 +1,4 @@
-"""The figures, one function each: plain arrays in, one encoded :class:`~pipeline.report.canvas.Panel` out.
+"""The figures, one function each: plain arrays in, one encoded :class:`~rille.pipeline.report.canvas.Panel` out.
 
 Maps have metres on both axes, row 0 at the greatest y; images have row 0 on top. What is undefined is light grey in
 maps of measured values and white in an ortho image (as in the paper). Large arrays are averaged before drawing.
@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.export import ranges
-from pipeline.report import canvas
-from pipeline.report.canvas import Extent, Panel
-from stages.core.validity import defined, matched
-from stages.hazard.risk import HAZARDOUS
+from rille.pipeline.export import ranges
+from rille.pipeline.report import canvas
+from rille.pipeline.report.canvas import Extent, Panel
+from rille.stages.core.validity import defined, matched
+from rille.stages.hazard.risk import HAZARDOUS
 
 Floats = NDArray[Any]
 Bytes = NDArray[np.uint8]

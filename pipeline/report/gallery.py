@@ -10,15 +10,15 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.export import artifacts
-from pipeline.export.output import Output, stage
-from pipeline.report import canvas, checks, driving, figures, gather, seams
-from pipeline.report.block import Block, Figure
-from pipeline.report.delivery import start_words
-from pipeline.report.gather import Scene
-from pipeline.report.words import length, spread
-from stages.core.declare import Bundle
-from stages.core.errors import RilleError
+from rille.pipeline.export import artifacts
+from rille.pipeline.export.output import Output, stage
+from rille.pipeline.report import canvas, checks, driving, figures, gather, seams
+from rille.pipeline.report.block import Block, Figure
+from rille.pipeline.report.delivery import start_words
+from rille.pipeline.report.gather import Scene
+from rille.pipeline.report.words import length, spread
+from rille.stages.core.declare import Bundle
+from rille.stages.core.errors import RilleError
 
 Maker = Callable[[Scene], Block | None]
 Condition = Callable[[Scene], bool]

@@ -10,16 +10,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.export.artifacts import Floats, image, used_rig
-from pipeline.export.comparison import Comparison, compare
-from pipeline.export.view import RunView
-from pipeline.report.calibration import Calibration, calibration
-from pipeline.report.canvas import Extent
-from pipeline.report.overlap import Difference, differences
-from stages.core.declare import Bundle
-from stages.geometry.geometry import RigidTransform
-from stages.geometry.lattice import Lattice, mosaic, union
-from stages.odometry.resection.trajectory import world_poses
+from rille.pipeline.export.artifacts import Floats, image, used_rig
+from rille.pipeline.export.comparison import Comparison, compare
+from rille.pipeline.export.view import RunView
+from rille.pipeline.report.calibration import Calibration, calibration
+from rille.pipeline.report.canvas import Extent
+from rille.pipeline.report.overlap import Difference, differences
+from rille.stages.core.declare import Bundle
+from rille.stages.geometry.geometry import RigidTransform
+from rille.stages.geometry.lattice import Lattice, mosaic, union
+from rille.stages.odometry.resection.trajectory import world_poses
 
 NODATA: Mapping[str, float] = {"count": 0, "source": -1}
 """Of the arrays of merged terrain that are not floats."""

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.export.view import RunView
-from pipeline.report import delivery, tables
-from pipeline.report.gather import Scene
-from stages.evaluation.trajectory_error import STEPS
+from rille.pipeline.export.view import RunView
+from rille.pipeline.report import delivery, tables
+from rille.pipeline.report.gather import Scene
+from rille.stages.evaluation.trajectory_error import STEPS
 
 Metric = dict[str, Any]
 Rows = list[dict[str, Any]]

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.export import ranges
-from pipeline.export.view import RunView
-from stages.geometry.lattice import Lattice
+from rille.pipeline.export import ranges
+from rille.pipeline.export.view import RunView
+from rille.stages.geometry.lattice import Lattice
 
 LEAST_CELLS = 100
 """Common cells below which a median says little."""

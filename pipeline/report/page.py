@@ -11,13 +11,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pipeline.engine.runtime import atomic
-from pipeline.export.catalogue import listed
-from pipeline.export.view import RunView
-from pipeline.report import tables
-from pipeline.report.block import Figure
-from pipeline.report.summary import summarise
-from pipeline.report.words import coordinate, metres, number, quantity, seconds, share
+from rille.pipeline.engine.runtime import atomic
+from rille.pipeline.export.catalogue import listed
+from rille.pipeline.export.view import RunView
+from rille.pipeline.report import tables
+from rille.pipeline.report.block import Figure
+from rille.pipeline.report.summary import summarise
+from rille.pipeline.report.words import coordinate, metres, number, quantity, seconds, share
 
 
 def write_report(folder: Path, view: RunView, facts: Mapping[str, Any], figures: Sequence[Figure]) -> None:
@@ -27,7 +27,7 @@ def write_report(folder: Path, view: RunView, facts: Mapping[str, Any], figures:
     ----------
     folder : the run's folder; what it holds already is listed and explained in the report.
     view : the run.
-    facts : as :func:`pipeline.report.summary.gather` gives them.
+    facts : as :func:`rille.pipeline.report.summary.gather` gives them.
     figures : in the order of the page.
     """
     whole = summarise(view, facts, figures)
@@ -48,7 +48,7 @@ def render(
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     env = Environment(
-        loader=PackageLoader("pipeline.report", "."),
+        loader=PackageLoader("rille.pipeline.report", "."),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,

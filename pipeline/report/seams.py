@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.export import ranges
-from pipeline.report import canvas, figures
-from pipeline.report.block import Block, Table
-from pipeline.report.gather import Scene
-from pipeline.report.words import number, spread
+from rille.pipeline.export import ranges
+from rille.pipeline.report import canvas, figures
+from rille.pipeline.report.block import Block, Table
+from rille.pipeline.report.gather import Scene
+from rille.pipeline.report.words import number, spread
 
 Facts = Mapping[str, Any]
 

@@ -7,12 +7,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pipeline.export.output import Output, stage
-from pipeline.export.view import RunView
-from pipeline.report import delivery, seams, tables
-from pipeline.report.block import Figure
-from pipeline.report.gather import Scene
-from pipeline.report.metrics import metrics
+from rille.pipeline.export.output import Output, stage
+from rille.pipeline.export.view import RunView
+from rille.pipeline.report import delivery, seams, tables
+from rille.pipeline.report.block import Figure
+from rille.pipeline.report.gather import Scene
+from rille.pipeline.report.metrics import metrics
 
 FORMAT = 2
 """Raised when the meaning of a key of report.json changes."""

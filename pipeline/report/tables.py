@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.export.artifacts import chain
-from pipeline.export.view import RunView, TaskRow
-from pipeline.report import gather
+from rille.pipeline.export.artifacts import chain
+from rille.pipeline.export.view import RunView, TaskRow
+from rille.pipeline.report import gather
 
 TABLE_2: tuple[tuple[str, str, float, tuple[str, ...]], ...] = (
     ("Stereo matching (HFVM)", "one stereo pair, every pixel", 40.0, ("hfvm",)),

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.export import ranges
+from rille.pipeline.export import ranges
 
 SMALL = {"m": ("mm", 1000.0, 0.1), "m²": ("cm²", 10000.0, 0.01)}
 """Unit for small values: its name, the factor and the bound below which it is used."""

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pipeline.engine import events
-from pipeline.engine.memory.cost_model import count
-from pipeline.runs import lookup
+from rille.pipeline.engine import events
+from rille.pipeline.engine.memory.cost_model import count
+from rille.pipeline.runs import lookup
 
 FACTOR, START = 1.15, 5.0
 """A good cold run: this factor over the least possible time, and these seconds to start workers and draw results."""

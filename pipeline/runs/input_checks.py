@@ -1,6 +1,6 @@
 """What the figures of a sequence mean for its reconstruction: one verdict each, with what to do.
 
-Plain numbers in, verdicts out; who measures them is :mod:`pipeline.commands.check`. FAIL is what makes a
+Plain numbers in, verdicts out; who measures them is :mod:`rille.pipeline.commands.check`. FAIL is what makes a
 reconstruction useless or impossible, WARN what makes it worse or is probably a mistake.
 """
 
@@ -16,10 +16,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets.protocol import Positions, Rows
-from pipeline.runs.synchrony import best_shift
-from stages.geometry.geometry import Rig, RigidTransform
-from stages.imaging.image_quality import Look
+from rille.datasets.protocol import Positions, Rows
+from rille.pipeline.runs.synchrony import best_shift
+from rille.stages.geometry.geometry import Rig, RigidTransform
+from rille.stages.imaging.image_quality import Look
 
 Floats = NDArray[np.float64]
 Level = Literal["OK", "WARN", "FAIL"]
@@ -291,7 +291,7 @@ def judge_epipolar(facts: Mapping[str, Any]) -> list[Verdict]:
 
 def judge_synchrony(spreads: Mapping[int, list[float | None]]) -> list[Verdict]:
     """Whether the right images are of the same moments; ``spreads`` [px] by shift, see
-    :mod:`pipeline.runs.synchrony`."""
+    :mod:`rille.pipeline.runs.synchrony`."""
     named = [value for value in spreads[0] if value is not None]
     if not named:
         return []

@@ -8,12 +8,12 @@ from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from pipeline.engine.memory.limits import words
-from pipeline.engine.store.base import Store, at
-from pipeline.engine.store.location import Location
-from pipeline.engine.store.maintenance import artifacts
-from pipeline.engine.store.manifest import reference
-from pipeline.runs import lookup, pins, roots
+from rille.pipeline.engine.memory.limits import words
+from rille.pipeline.engine.store.base import Store, at
+from rille.pipeline.engine.store.location import Location
+from rille.pipeline.engine.store.maintenance import artifacts
+from rille.pipeline.engine.store.manifest import reference
+from rille.pipeline.runs import lookup, pins, roots
 
 NOBODY = "-"
 """Stands for the sequence of artifacts that no kept run refers to: clearing up would remove them."""

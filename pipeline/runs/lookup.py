@@ -7,8 +7,8 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-from pipeline.engine import events
-from stages.core.errors import ConfigError
+from rille.pipeline.engine import events
+from rille.stages.core.errors import ConfigError
 
 LEDGER = "ledger.jsonl"
 

@@ -7,12 +7,12 @@ import time
 from pathlib import Path
 from typing import Any
 
-from pipeline.engine import events
-from pipeline.engine.runtime import atomic
-from pipeline.engine.store.base import Store
-from pipeline.engine.store.folder import StoreError
-from pipeline.runs import lookup
-from stages.core.errors import ConfigError
+from rille.pipeline.engine import events
+from rille.pipeline.engine.runtime import atomic
+from rille.pipeline.engine.store.base import Store
+from rille.pipeline.engine.store.folder import StoreError
+from rille.pipeline.runs import lookup
+from rille.stages.core.errors import ConfigError
 
 FOLDER = "pins"
 

@@ -8,9 +8,9 @@ import platform
 from collections.abc import Iterator
 from pathlib import Path
 
-from pipeline.engine.runtime import atomic
-from pipeline.engine.store.base import Store
-from pipeline.engine.store.folder import StoreError
+from rille.pipeline.engine.runtime import atomic
+from rille.pipeline.engine.store.base import Store
+from rille.pipeline.engine.store.folder import StoreError
 
 FOLDER = "roots"
 

@@ -8,18 +8,18 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from pipeline.engine.graph import Graph, Handle, Maybe, Wait
-from pipeline.engine.runtime import atomic
-from pipeline.engine.store.base import Store
-from pipeline.export import catalogue
-from pipeline.export.frames_json import describe
-from pipeline.export.output import Output, handles, place, task, unpack
-from pipeline.export.trajectories import stamps
-from pipeline.export.view import RunView, TaskRow
-from pipeline.report import gallery, summary
-from pipeline.report.block import Figure
-from pipeline.report.page import write_report
-from stages.core.declare import NoParams
+from rille.pipeline.engine.graph import Graph, Handle, Maybe, Wait
+from rille.pipeline.engine.runtime import atomic
+from rille.pipeline.engine.store.base import Store
+from rille.pipeline.export import catalogue
+from rille.pipeline.export.frames_json import describe
+from rille.pipeline.export.output import Output, handles, place, task, unpack
+from rille.pipeline.export.trajectories import stamps
+from rille.pipeline.export.view import RunView, TaskRow
+from rille.pipeline.report import gallery, summary
+from rille.pipeline.report.block import Figure
+from rille.pipeline.report.page import write_report
+from rille.stages.core.declare import NoParams
 
 MODULES = (*catalogue.MADE, gallery, summary)
 Made = dict[str, Handle]

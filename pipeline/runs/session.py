@@ -16,22 +16,22 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from datasets.protocol import Sequence
-from pipeline.engine.code_digest import remember
-from pipeline.engine.graph import Graph
-from pipeline.engine.store.artifact import DamagedError
-from pipeline.engine.store.base import GoneError, Store, at
-from pipeline.engine.store.location import Location, hints_folder, locate
-from pipeline.flow import config as configuration
-from stages.core.declare import Bundle
-from stages.core.errors import ConfigError, RilleError
+from rille.datasets.protocol import Sequence
+from rille.pipeline.engine.code_digest import remember
+from rille.pipeline.engine.graph import Graph
+from rille.pipeline.engine.store.artifact import DamagedError
+from rille.pipeline.engine.store.base import GoneError, Store, at
+from rille.pipeline.engine.store.location import Location, hints_folder, locate
+from rille.pipeline.flow import config as configuration
+from rille.stages.core.declare import Bundle
+from rille.stages.core.errors import ConfigError, RilleError
 
 if TYPE_CHECKING:
-    from pipeline.engine.scheduler import Result
-    from pipeline.export.view import RunView
-    from pipeline.flow.closed_loop import Drive
-    from pipeline.flow.products import Products
-    from pipeline.runs import run_files
+    from rille.pipeline.engine.scheduler import Result
+    from rille.pipeline.export.view import RunView
+    from rille.pipeline.flow.closed_loop import Drive
+    from rille.pipeline.flow.products import Products
+    from rille.pipeline.runs import run_files
 
 COMPLETE, FAILED, HOLES = 0, 1, 3
 DISTRIBUTIONS = (
@@ -105,9 +105,9 @@ class Settings:
 
 def settings(options: Options) -> Settings:
     """Open a sequence and settle its configuration."""
-    from datasets.registry import open_sequence
-    from pipeline.flow import unread
-    from pipeline.runs.input_checks import judge_rig
+    from rille.datasets.registry import open_sequence
+    from rille.pipeline.flow import unread
+    from rille.pipeline.runs.input_checks import judge_rig
 
     read = configuration.read_toml(options.config) if options.config else {}
     configuration.merge(read, configuration.parse_assignments(options.assignments))
@@ -186,7 +186,7 @@ class _Opened:
 
     def view(self, **late: Any) -> RunView:
         """What is drawn; ``late`` is what only the end of the run knows."""
-        from pipeline.export.view import RunView
+        from rille.pipeline.export.view import RunView
 
         return RunView(
             run_id=self.folder.name,
@@ -205,7 +205,7 @@ class _Opened:
 
 
 def _reconstruct(options: Options) -> tuple[int, Path]:
-    from pipeline.runs import run_files
+    from rille.pipeline.runs import run_files
 
     opened = _open(options)
     made: run_files.Made = {}
@@ -230,8 +230,8 @@ def _reconstruct(options: Options) -> tuple[int, Path]:
 
 def _open(options: Options) -> _Opened:
     """Read the input and lay the run out."""
-    from pipeline.flow import unread
-    from pipeline.flow.closed_loop import dataflow
+    from rille.pipeline.flow import unread
+    from rille.pipeline.flow.closed_loop import dataflow
 
     check_options(options)
     started = datetime.now(UTC)
@@ -255,9 +255,9 @@ def _open(options: Options) -> _Opened:
 
 def _compute(opened: _Opened) -> Result:
     """Bring every task to its artifact; raise the first failure unless the data are its cause and poses are there."""
-    from pipeline.engine import progress, scheduler
-    from pipeline.engine.memory import limits
-    from pipeline.runs import roots
+    from rille.pipeline.engine import progress, scheduler
+    from rille.pipeline.engine.memory import limits
+    from rille.pipeline.runs import roots
 
     options = opened.options
     roots.note(opened.store, options.runs)
@@ -281,8 +281,8 @@ def _compute(opened: _Opened) -> Result:
 
 def _write(opened: _Opened, result: Result, made: run_files.Made) -> list[str]:
     """Write everything that the run leaves, nothing of it where an artifact was found damaged; give what is undrawn."""
-    from pipeline.engine import events
-    from pipeline.runs import run_files
+    from rille.pipeline.engine import events
+    from rille.pipeline.runs import run_files
 
     if not (opened.folder / "config.toml").exists():
         raise RilleError(
@@ -303,7 +303,7 @@ def _write(opened: _Opened, result: Result, made: run_files.Made) -> list[str]:
 
 def lay_out(sequence: Sequence, config: Any, frames: tuple[int, ...]) -> Graph:
     """The graph of a reconstruction as far as it is known beforehand."""
-    from pipeline.flow.closed_loop import dataflow
+    from rille.pipeline.flow.closed_loop import dataflow
 
     graph = Graph()
     dataflow(graph, sequence, config, frames)
@@ -335,7 +335,7 @@ def _posed_all(products: Products) -> int:
 
 def _all_read(opened: _Opened, arrived: int) -> int:
     """Exit code of a run that came to its end: a parameter that no task of it read is an error, and named."""
-    from pipeline.flow import unread
+    from rille.pipeline.flow import unread
 
     if arrived != COMPLETE:
         return COMPLETE
@@ -352,8 +352,8 @@ def _all_read(opened: _Opened, arrived: int) -> int:
 
 def check_options(options: Options) -> None:
     """Refuse a stage, an executor or an amount that cannot be, before anything is read or written."""
-    from pipeline.engine.executors.base import known
-    from pipeline.engine.memory import limits
+    from rille.pipeline.engine.executors.base import known
+    from rille.pipeline.engine.memory import limits
 
     _known_stages(options.force)
     known(options.executor, options.jobs)
@@ -421,10 +421,10 @@ def _versions() -> dict[str, str]:
 
 def export_dataset(name: str, directory: Path, assignments: tuple[str, ...], cache: Location) -> int:
     """Write a built-in sequence as plain files; rendering is cached like any other work."""
-    from datasets.export import export
-    from datasets.protocol import Source
-    from datasets.registry import open_sequence
-    from pipeline.engine.task import Ref, Spec, ensure
+    from rille.datasets.export import export
+    from rille.datasets.protocol import Source
+    from rille.datasets.registry import open_sequence
+    from rille.pipeline.engine.task import Ref, Spec, ensure
 
     for_dataset, others = configuration.split_dataset(configuration.parse_assignments(assignments))
     if others:
@@ -447,7 +447,7 @@ def export_dataset(name: str, directory: Path, assignments: tuple[str, ...], cac
 
 def verify_cache(cache: Location, *, deep: bool = False) -> int:
     """Compare checksums of all artifacts; exit code 1 where one is damaged."""
-    from pipeline.engine.store.maintenance import verify
+    from rille.pipeline.engine.store.maintenance import verify
 
     sound, damaged = verify(at(cache), deep=deep)
     for found in damaged:
@@ -461,10 +461,10 @@ def collect_garbage(cache: Location, runs: Path, *, dry_run: bool) -> int:
 
     A dry run says what that is.
     """
-    from pipeline.engine import events
-    from pipeline.engine.memory.limits import words
-    from pipeline.engine.store import maintenance
-    from pipeline.runs import pins, roots
+    from rille.pipeline.engine import events
+    from rille.pipeline.engine.memory.limits import words
+    from rille.pipeline.engine.store import maintenance
+    from rille.pipeline.runs import pins, roots
 
     store = at(cache)
     roots.check_all_seen(store)
@@ -489,8 +489,8 @@ def collect_garbage(cache: Location, runs: Path, *, dry_run: bool) -> int:
 
 def pin(cache: Location, text: str, runs: Path) -> int:
     """Keep the artifacts of a run."""
-    from pipeline.runs import lookup as kept
-    from pipeline.runs import pins
+    from rille.pipeline.runs import lookup as kept
+    from rille.pipeline.runs import pins
 
     run = kept.find(text, runs)
     print(f"pinned {kept.name(run)}: {pins.pin(at(cache), run)} artifacts")
@@ -499,7 +499,7 @@ def pin(cache: Location, text: str, runs: Path) -> int:
 
 def unpin(cache: Location, text: str) -> int:
     """Keep them no longer."""
-    from pipeline.runs import pins
+    from rille.pipeline.runs import pins
 
     print(f"unpinned {pins.unpin(at(cache), text)}")
     return COMPLETE

@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.geometry.epipolar import distances
-from stages.geometry.geometry import Rig
+from rille.stages.geometry.epipolar import distances
+from rille.stages.geometry.geometry import Rig
 
 Floats = NDArray[np.float64]
 

@@ -10,8 +10,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from stages.core.declare import Bundle, Inputs, NoParams, Stage
-from stages.geometry.geometry import Rig
+from rille.stages.core.declare import Bundle, Inputs, NoParams, Stage
+from rille.stages.geometry.geometry import Rig
 
 
 def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:

@@ -1,9 +1,9 @@
 """Relative orientation of one stereo pair from its own correspondences (paper, section 5.2.2).
 
 The right camera's rotation and the direction of the baseline are adjusted to the disparity with the baseline's length
-held fixed, as far as the images of this one pair observe them (:mod:`stages.calibration.parameter_selection`). Dense
-matches are thinned first, for neighbours share their windows and so their errors; the thinned ones go on to the stage
-``rig``, which decides for the sequence.
+held fixed, as far as the images of this one pair observe them (:mod:`rille.stages.calibration.parameter_selection`).
+Dense matches are thinned first, for neighbours share their windows and so their errors; the thinned ones go on to the
+stage ``rig``, which decides for the sequence.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
-from stages.calibration.parameter_selection import Decision, RelativeParams, decide
-from stages.calibration.relative_orientation import LEAST_MATCHES, RIG, Matches, rms
-from stages.core.declare import AnyArray, Array, Bundle, Inputs, Stage
-from stages.core.errors import InputError
-from stages.core.validity import matched
-from stages.geometry.epipolar import corrected, distances
-from stages.geometry.geometry import Rig
+from rille.stages.calibration.parameter_selection import Decision, RelativeParams, decide
+from rille.stages.calibration.relative_orientation import LEAST_MATCHES, RIG, Matches, rms
+from rille.stages.core.declare import AnyArray, Array, Bundle, Inputs, Stage
+from rille.stages.core.errors import InputError
+from rille.stages.core.validity import matched
+from rille.stages.geometry.epipolar import corrected, distances
+from rille.stages.geometry.geometry import Rig
 
 Floats = NDArray[np.float64]
 

@@ -3,8 +3,8 @@
 A low epipolar residual does not show a right rig: toe-in of a parallel rig moves rows like a principal point that is a
 few pixels off, and a fit that frees it trades an honest residual for wrong depth. So a parameter is freed only if
 
-1. it is *observed*: with every other explanation allowed for (:mod:`stages.calibration.relative_orientation`), what
-remains unknown of it
+1. it is *observed*: with every other explanation allowed for (:mod:`rille.stages.calibration.relative_orientation`),
+what remains unknown of it
    costs little depth, or matches beyond infinity show that depth is wrong, and it explains them;
 2. it is *contradicted*: it differs from the calibration by several of its sigmas, and a principal point that is off is
    not the likelier reason: that it is where a single angle departs and the others are as they were;
@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from stages.calibration.relative_orientation import (
+from rille.stages.calibration.relative_orientation import (
     RIG,
     Beliefs,
     Fit,
@@ -36,9 +36,9 @@ from stages.calibration.relative_orientation import (
     settle,
     solution,
 )
-from stages.core.declare import Params
-from stages.geometry.epipolar import NAMES, beyond_infinity, corrected, depth_sensitivity, distances
-from stages.geometry.geometry import Rig
+from rille.stages.core.declare import Params
+from rille.stages.geometry.epipolar import NAMES, beyond_infinity, corrected, depth_sensitivity, distances
+from rille.stages.geometry.geometry import Rig
 
 Floats = NDArray[np.float64]
 

@@ -1,6 +1,6 @@
 """Robust adjustment of a rig to correspondences of one or several pairs, with what no rig explains beside it.
 
-Beside the five parameters of the rig (:mod:`stages.geometry.epipolar`) the images hold errors that no number of
+Beside the five parameters of the rig (:mod:`rille.stages.geometry.epipolar`) the images hold errors that no number of
 matches averages out, and a fit without them claims a precision it does not have. They are estimated with a prior and
 then dropped:
 
@@ -22,9 +22,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.calibration import relative_orientation_kernel
-from stages.geometry.epipolar import NAMES, distances, normals
-from stages.geometry.geometry import Rig
+from rille.stages.calibration import relative_orientation_kernel
+from rille.stages.geometry.epipolar import NAMES, distances, normals
+from rille.stages.geometry.geometry import Rig
 
 Floats = NDArray[np.float64]
 

@@ -1,5 +1,5 @@
-"""Compiled loops of :mod:`stages.calibration.relative_orientation`: weights and normal equations of one pair, sums in
-the matches' order."""
+"""Compiled loops of :mod:`rille.stages.calibration.relative_orientation`: weights and normal equations of one pair,
+sums in the matches' order."""
 
 from __future__ import annotations
 

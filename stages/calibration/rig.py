@@ -3,7 +3,7 @@
 The relative orientation enters every later stage through this one artifact (paper, section 5.2.2: relative orientation
 with the baseline's length held fixed). The correspondences of all pairs are pooled; what they do not observe, do not
 contradict, or would change by too little to matter stays as given, to the last bit
-(:mod:`stages.calibration.parameter_selection`).
+(:mod:`rille.stages.calibration.parameter_selection`).
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from stages.calibration.orientation import misalignment
-from stages.calibration.parameter_selection import (
+from rille.stages.calibration.orientation import misalignment
+from rille.stages.calibration.parameter_selection import (
     BEYOND_SHARE,
     Decision,
     Parameter,
@@ -25,11 +25,20 @@ from stages.calibration.parameter_selection import (
     decide,
     impossible_share,
 )
-from stages.calibration.relative_orientation import BLOCKS, LEAST_MATCHES, RIG, Linear, Matches, adjust, rms, solution
-from stages.core.declare import Bundle, Inputs, Stage
-from stages.core.errors import InputError
-from stages.geometry.epipolar import NAMES, corrected, distances
-from stages.geometry.geometry import Rig
+from rille.stages.calibration.relative_orientation import (
+    BLOCKS,
+    LEAST_MATCHES,
+    RIG,
+    Linear,
+    Matches,
+    adjust,
+    rms,
+    solution,
+)
+from rille.stages.core.declare import Bundle, Inputs, Stage
+from rille.stages.core.errors import InputError
+from rille.stages.geometry.epipolar import NAMES, corrected, distances
+from rille.stages.geometry.geometry import Rig
 
 Floats = NDArray[np.float64]
 

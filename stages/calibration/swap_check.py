@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.core.declare import Bundle, Inputs, NoParams, Stage
-from stages.core.validity import matched
-from stages.geometry.epipolar import exchanged, fits
-from stages.geometry.geometry import Rig
-from stages.imaging.pyramid import Pyramid
-from stages.odometry.motion import MotionParams, coarse_motion
+from rille.stages.core.declare import Bundle, Inputs, NoParams, Stage
+from rille.stages.core.validity import matched
+from rille.stages.geometry.epipolar import exchanged, fits
+from rille.stages.geometry.geometry import Rig
+from rille.stages.imaging.pyramid import Pyramid
+from rille.stages.odometry.motion import MotionParams, coarse_motion
 
 Floats = NDArray[np.float64]
 

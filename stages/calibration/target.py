@@ -17,10 +17,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.core.errors import ConfigError, DegenerateError, InputError
-from stages.geometry.epipolar import distances
-from stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
-from stages.geometry.lens import Lens
+from rille.stages.core.errors import ConfigError, DegenerateError, InputError
+from rille.stages.geometry.epipolar import distances
+from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
+from rille.stages.geometry.lens import Lens
 
 Floats = NDArray[np.float64]
 

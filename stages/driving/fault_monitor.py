@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from stages.core.declare import Bundle, Inputs, Params, Stage
-from stages.geometry.geometry import RigidTransform
+from rille.stages.core.declare import Bundle, Inputs, Params, Stage
+from rille.stages.geometry.geometry import RigidTransform
 
 Floats = NDArray[np.float64]
 

@@ -26,11 +26,11 @@ from numpy.typing import NDArray
 from pydantic import Field
 from scipy.spatial import KDTree
 
-from stages.core.declare import Array, Bundle, Inputs, Params, Stage
-from stages.core.validity import matched
-from stages.geometry.geometry import Camera, Rig, RigidTransform
-from stages.geometry.lattice import Lattice
-from stages.hazard.vehicle import Vehicle
+from rille.stages.core.declare import Array, Bundle, Inputs, Params, Stage
+from rille.stages.core.validity import matched
+from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
+from rille.stages.geometry.lattice import Lattice
+from rille.stages.hazard.vehicle import Vehicle
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]

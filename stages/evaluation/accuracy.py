@@ -11,7 +11,7 @@ counted and left out. Where truth has a gap, its path is taken to be straight, w
   (Geiger et al. 2012, doi:10.1109/CVPR.2012.6248074, and its development kit); not over a gap of the truth.
 
 Relative errors over longer stretches, their causes and the claimed covariances:
-:mod:`stages.evaluation.trajectory_error`.
+:mod:`rille.stages.evaluation.trajectory_error`.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
-from stages.core.errors import InputError
-from stages.evaluation.accuracy_parts import Metric, along, angle, inverse, metric, posed, rms, square
-from stages.evaluation.trajectory_error import against_claims, by_cause, by_shares, by_steps
-from stages.odometry.resection.trajectory import world_poses
+from rille.stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
+from rille.stages.core.errors import InputError
+from rille.stages.evaluation.accuracy_parts import Metric, along, angle, inverse, metric, posed, rms, square
+from rille.stages.evaluation.trajectory_error import against_claims, by_cause, by_shares, by_steps
+from rille.stages.odometry.resection.trajectory import world_poses
 
 Floats = NDArray[np.float64]
 
@@ -45,7 +45,7 @@ def trajectory_accuracy(
     estimate : (frame, 3, 4) T_world_left, metres; NaN where a frame has no pose.
     truth : (frame, 3, 4) T_truth_left of the same frames; NaN where there is no truth.
     covariance : (frame, 6, 6) of the estimate in the world, where it claims one; see
-    :mod:`stages.odometry.resection.resect`.
+    :mod:`rille.stages.odometry.resection.resect`.
 
     Returns
     -------

@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from stages.core.declare import AnyArray, Array, Bundle, Inputs, Params, Stage
-from stages.evaluation.accuracy import angles_between, by_frame
-from stages.evaluation.accuracy_parts import Metric, metric, posed
-from stages.evaluation.pose_alignment import align, moved, spread
+from rille.stages.core.declare import AnyArray, Array, Bundle, Inputs, Params, Stage
+from rille.stages.evaluation.accuracy import angles_between, by_frame
+from rille.stages.evaluation.accuracy_parts import Metric, metric, posed
+from rille.stages.evaluation.pose_alignment import align, moved, spread
 
 Floats = NDArray[np.float64]
 

@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from stages.core.declare import Array, Bundle, Inputs, Memory, Params, Stage
-from stages.geometry.geometry import Camera, Rig
+from rille.stages.core.declare import Array, Bundle, Inputs, Memory, Params, Stage
+from rille.stages.geometry.geometry import Camera, Rig
 
 PIXEL_CENTRE = 0.5
 """COLMAP puts the centre of the first pixel at (0.5, 0.5), we at (0, 0)."""

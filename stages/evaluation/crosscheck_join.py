@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
-from stages.evaluation.accuracy import angles_between
-from stages.evaluation.accuracy_parts import posed
-from stages.evaluation.pose_alignment import align, moved
-from stages.geometry.geometry import orthonormal
+from rille.stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
+from rille.stages.evaluation.accuracy import angles_between
+from rille.stages.evaluation.accuracy_parts import posed
+from rille.stages.evaluation.pose_alignment import align, moved
+from rille.stages.geometry.geometry import orthonormal
 
 Floats = NDArray[np.float64]
 

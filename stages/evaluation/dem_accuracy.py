@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
-from stages.core.errors import InputError
-from stages.evaluation.accuracy_parts import Metric, metric
-from stages.geometry.lattice import Lattice, mosaic
+from rille.stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
+from rille.stages.core.errors import InputError
+from rille.stages.evaluation.accuracy_parts import Metric, metric
+from rille.stages.geometry.lattice import Lattice, mosaic
 
 
 def dem_accuracy(

@@ -16,9 +16,9 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from stages.core.errors import DegenerateError, InputError
-from stages.geometry.geometry import orthonormal, rotation_exp
-from stages.terrain.shading import gradient
+from rille.stages.core.errors import DegenerateError, InputError
+from rille.stages.geometry.geometry import orthonormal, rotation_exp
+from rille.stages.terrain.shading import gradient
 
 Floats = NDArray[np.float64]
 Align = Literal["shift", "tilt", "rigid"]

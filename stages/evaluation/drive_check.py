@@ -3,7 +3,7 @@
 Each placement of the simulation (a few millimetres apart), however the drive ended, is judged against the vehicle's
 limits: a belly that strikes, a tilt beyond ``max_slope_deg``, a wheel on an edge above ``max_step``. What a drive that
 failed did not come to know, its positions or a way, is left out. Positions are compared after making the first
-pose equal, as everywhere (:mod:`stages.evaluation.accuracy`). The shortest way is the planner's on the exact
+pose equal, as everywhere (:mod:`rille.stages.evaluation.accuracy`). The shortest way is the planner's on the exact
 elevations; where its margin, which is for what a vehicle does not know, closes every one, it is that within the limits
 alone.
 """
@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
-from stages.evaluation.accuracy_parts import Metric, inverse, metric, square
+from rille.stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
+from rille.stages.evaluation.accuracy_parts import Metric, inverse, metric, square
 
 Floats = NDArray[np.float64]
 

@@ -8,15 +8,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
-from stages.evaluation.accuracy_parts import Metric, metric
-from stages.geometry.lattice import Lattice
-from stages.hazard.risk import HAZARDOUS, UNKNOWN
-from stages.hazard.vehicle import Vehicle
-from stages.planning import grid8
-from stages.planning.path_ground import Ground, Maps
-from stages.planning.row_graph import UNREACHED
-from stages.planning.row_grid import RowGrid
+from rille.stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
+from rille.stages.evaluation.accuracy_parts import Metric, metric
+from rille.stages.geometry.lattice import Lattice
+from rille.stages.hazard.risk import HAZARDOUS, UNKNOWN
+from rille.stages.hazard.vehicle import Vehicle
+from rille.stages.planning import grid8
+from rille.stages.planning.path_ground import Ground, Maps
+from rille.stages.planning.row_graph import UNREACHED
+from rille.stages.planning.row_grid import RowGrid
 
 Floats = NDArray[np.float64]
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.evaluation.accuracy import umeyama
+from rille.stages.evaluation.accuracy import umeyama
 
 Floats = NDArray[np.float64]
 

@@ -23,10 +23,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
-from stages.evaluation.accuracy import by_frame
-from stages.evaluation.accuracy_parts import Metric, metric
-from stages.odometry.resection.trajectory import world_poses
+from rille.stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
+from rille.stages.evaluation.accuracy import by_frame
+from rille.stages.evaluation.accuracy_parts import Metric, metric
+from rille.stages.odometry.resection.trajectory import world_poses
 
 Floats = NDArray[np.float64]
 

@@ -12,7 +12,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.evaluation.accuracy_parts import Metric, along, angle, inverse, metric, rms
+from rille.stages.evaluation.accuracy_parts import Metric, along, angle, inverse, metric, rms
 
 Floats = NDArray[np.float64]
 

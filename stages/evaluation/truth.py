@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
+from rille.stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
 
 
 def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:

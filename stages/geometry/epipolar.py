@@ -19,8 +19,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from stages.geometry.geometry import Rig, RigidTransform, rotation_exp
-from stages.geometry.triangulation import inverse_depth
+from rille.stages.geometry.geometry import Rig, RigidTransform, rotation_exp
+from rille.stages.geometry.triangulation import inverse_depth
 
 Floats = NDArray[np.float64]
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stages.core.errors import ConfigError, InputError
+from rille.stages.core.errors import ConfigError, InputError
 
 Floats = NDArray[np.float64]
 Window = tuple[slice, slice]

@@ -23,8 +23,8 @@ import numpy as np
 from numpy.polynomial import Polynomial
 from numpy.typing import ArrayLike, NDArray
 
-from stages.core.errors import InputError
-from stages.geometry.geometry import Camera
+from rille.stages.core.errors import InputError
+from rille.stages.geometry.geometry import Camera
 
 Floats = NDArray[np.float64]
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from stages.core.declare import Array
+from rille.stages.core.declare import Array
 
 NO_VERTICAL = "none"
 """Source of the vertical of a frame that nothing tells of: the camera's own up stands for it."""

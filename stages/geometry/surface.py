@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stages.core.errors import InputError
-from stages.geometry.geometry import RigidTransform
-from stages.geometry.lattice import Lattice
+from rille.stages.core.errors import InputError
+from rille.stages.geometry.geometry import RigidTransform
+from rille.stages.geometry.lattice import Lattice
 
 Floats = NDArray[np.float64]
 

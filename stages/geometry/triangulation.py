@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.geometry.geometry import Rig
+from rille.stages.geometry.geometry import Rig
 
 Floats = NDArray[np.float64]
 

@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from stages.numeric.line import copy_line
+from rille.stages.numeric.line import copy_line
 
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]

@@ -14,8 +14,8 @@ import scipy
 from numba import njit
 from numpy.typing import NDArray
 
-from stages.hazard.hazards import BITS, FREEDOM, HIDDEN, LIFT, MEASURES, Measured, limits, noise_factors
-from stages.hazard.vehicle import Vehicle
+from rille.stages.hazard.hazards import BITS, FREEDOM, HIDDEN, LIFT, MEASURES, Measured, limits, noise_factors
+from rille.stages.hazard.vehicle import Vehicle
 
 Floats32 = NDArray[np.float32]
 
@@ -62,7 +62,7 @@ def classify(
     cell: float,
     rules: Rules,
 ) -> dict[str, NDArray]:
-    """Classes and bands (row, col) of :func:`stages.hazard.risk.risk_map`; ``measured`` is used up.
+    """Classes and bands (row, col) of :func:`rille.stages.hazard.risk.risk_map`; ``measured`` is used up.
 
     Parameters
     ----------

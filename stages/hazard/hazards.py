@@ -12,8 +12,8 @@ tilt         the same, by where the wheels stand, at the worst heading          
 rise         of the ground under the belly over the plane of the wheels         clearance
 ============ ================================================================== ================
 
-The first three are the paper's (section 4.6), by running extrema over octagons (:mod:`stages.numeric.extrema`); the
-last three put the vehicle down at every place and heading (:mod:`stages.hazard.placement`). RMS deviation is
+The first three are the paper's (section 4.6), by running extrema over octagons (:mod:`rille.stages.numeric.extrema`);
+the last three put the vehicle down at every place and heading (:mod:`rille.stages.hazard.placement`). RMS deviation is
 ``sqrt(mean((z(x + d) - z(x))^2) / 2)`` over both axes: the standard deviation of ground without slope, and little of a
 slope's (Shepard et al. 2001, doi:10.1029/2000JE001429).
 
@@ -43,11 +43,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.hazard.block_statistics import reduce_to_blocks
-from stages.hazard.placement import place, stride
-from stages.hazard.vehicle import Vehicle
-from stages.numeric.extrema import median3, relief
-from stages.numeric.windows import window_sum
+from rille.stages.hazard.block_statistics import reduce_to_blocks
+from rille.stages.hazard.placement import place, stride
+from rille.stages.hazard.vehicle import Vehicle
+from rille.stages.numeric.extrema import median3, relief
+from rille.stages.numeric.windows import window_sum
 
 Floats32 = NDArray[np.float32]
 

@@ -26,8 +26,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from stages.hazard.vehicle import Vehicle
-from stages.numeric.extrema import running_max
+from rille.stages.hazard.vehicle import Vehicle
+from rille.stages.numeric.extrema import running_max
 
 Floats32 = NDArray[np.float32]
 Ints = NDArray[np.int64]

@@ -3,17 +3,18 @@
 Classes, from the least to the greatest risk: *safe*; *caution*, where a measure comes near its limit, or exceeds it
 with a probability of more than ``max_p``, as beside unknown ground; *hazard*, where a measure exceeds its limit, or
 does with ``sigmas`` standard deviations added; and *unknown*, where too little of the window is known to say, which
-is never entered. The measures, their noise and the probability are those of :mod:`stages.hazard.hazards`; each that
-exceeds its limit has its bit in ``reason``.
+is never entered. The measures, their noise and the probability are those of :mod:`rille.stages.hazard.hazards`; each
+that exceeds its limit has its bit in ``reason``.
 
 Where five cells are at most a wheel's radius, a 3 x 3 median first removes single wrong cells; coarser models keep
 every cell, since one cell may then be the top of a stone, or a post.
 
-Guarantees, each tested: of two elevation models the one with the greater relief (see :mod:`stages.hazard.hazards`), or
-with the greater standard deviations, is in no cell the safer one; nor is it with a larger ``sigmas``.
+Guarantees, each tested: of two elevation models the one with the greater relief (see
+:mod:`rille.stages.hazard.hazards`), or with the greater standard deviations, is in no cell the safer one; nor is it
+with a larger ``sigmas``.
 
 Holes. A window is judged on what is known of it, so unknown does not grow; a hazard that is proven by a part is one.
-Small holes are closed with a flag. Their heights lie within the range of the rim (:mod:`stages.numeric.holes`),
+Small holes are closed with a flag. Their heights lie within the range of the rim (:mod:`rille.stages.numeric.holes`),
 anywhere in it as far as is known, so they add no relief of their own, and their standard deviation is that of such a
 height.
 """
@@ -29,10 +30,10 @@ from numba import njit
 from numpy.typing import NDArray
 from pydantic import Field
 
-from stages.core.declare import Array, Bundle, Inputs, Memory, Params, Stage
-from stages.core.errors import DegenerateError
-from stages.geometry.lattice import Lattice, mosaic, union
-from stages.hazard.classification import (
+from rille.stages.core.declare import Array, Bundle, Inputs, Memory, Params, Stage
+from rille.stages.core.errors import DegenerateError
+from rille.stages.geometry.lattice import Lattice, mosaic, union
+from rille.stages.hazard.classification import (
     CAUTION,
     DOUBT_BIT,
     FILLED_BIT,
@@ -44,9 +45,9 @@ from stages.hazard.classification import (
     Rules,
     classify,
 )
-from stages.hazard.hazards import BITS, measure, window_reach
-from stages.hazard.vehicle import DEFAULT_VEHICLE, Vehicle
-from stages.numeric.holes import close_into
+from rille.stages.hazard.hazards import BITS, measure, window_reach
+from rille.stages.hazard.vehicle import DEFAULT_VEHICLE, Vehicle
+from rille.stages.numeric.holes import close_into
 
 __all__ = ["BITS", "CAUTION", "DOUBT_BIT", "HAZARDOUS", "REASONS", "SAFE", "UNKNOWN", "UNKNOWN_BIT", "risk_map"]
 
@@ -148,7 +149,7 @@ def check_size(vehicle: Vehicle, shape: tuple[int, ...], cell: float) -> None:
 
 
 def window_cells(side: float, cell: float) -> int:
-    """Odd number of cells across a window of ``side`` metres, see :func:`stages.hazard.hazards.window_reach`."""
+    """Odd number of cells across a window of ``side`` metres, see :func:`rille.stages.hazard.hazards.window_reach`."""
     return 2 * window_reach(side, cell) + 1
 
 

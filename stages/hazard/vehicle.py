@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field, model_validator
 
-from stages.core.declare import Params
+from rille.stages.core.declare import Params
 
 
 class Vehicle(Params):

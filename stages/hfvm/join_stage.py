@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from stages.core.declare import AnyArray, Bundle, Inputs, Stage
-from stages.hfvm import tiled
-from stages.hfvm.images.params import HfvmParams
-from stages.hfvm.images.window import Mosaic, Shape, cut, strips, tiles, whole
-from stages.hfvm.stage import OUTPUTS, facts
-from stages.hfvm.tile_stage import mosaic, views
+from rille.stages.core.declare import AnyArray, Bundle, Inputs, Stage
+from rille.stages.hfvm import tiled
+from rille.stages.hfvm.images.params import HfvmParams
+from rille.stages.hfvm.images.window import Mosaic, Shape, cut, strips, tiles, whole
+from rille.stages.hfvm.stage import OUTPUTS, facts
+from rille.stages.hfvm.tile_stage import mosaic, views
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """Hierarchical feature vector matching: dense two-dimensional disparities of any two images (paper, 4.3).
 
 Nothing is rectified and no calibration is used. ``match`` works on plain arrays; see
-:class:`~stages.hfvm.images.params.HfvmParams` for the presets. The rooms, in the order of the dataflow:
+:class:`~rille.stages.hfvm.images.params.HfvmParams` for the presets. The rooms, in the order of the dataflow:
 
 - ``tiled`` composes the matcher of windows: for images in memory here, as tasks in ``tile_stage`` and ``join_stage``.
 - ``images`` holds the parameters, and gives each window its grey values, masks and features.
@@ -19,15 +19,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.core.declare import AnyArray, Array, Bundle, Inputs, Memory, Stage
-from stages.core.validity import Mask, counts, matched
-from stages.hfvm import tiled
-from stages.hfvm.coarse_to_fine import start
-from stages.hfvm.images.params import HfvmParams
-from stages.hfvm.images.views import Plain
-from stages.hfvm.tiled import Tell
-from stages.imaging import pyramid
-from stages.imaging.pyramid import Pyramid, PyramidParams
+from rille.stages.core.declare import AnyArray, Array, Bundle, Inputs, Memory, Stage
+from rille.stages.core.validity import Mask, counts, matched
+from rille.stages.hfvm import tiled
+from rille.stages.hfvm.coarse_to_fine import start
+from rille.stages.hfvm.images.params import HfvmParams
+from rille.stages.hfvm.images.views import Plain
+from rille.stages.hfvm.tiled import Tell
+from rille.stages.imaging import pyramid
+from rille.stages.imaging.pyramid import Pyramid, PyramidParams
 
 __all__ = ["OUTPUTS", "STAGE", "Disparity", "HfvmParams", "facts", "match", "match_pyramids"]
 
@@ -39,12 +39,12 @@ class Disparity:
     """Disparity vectors of the left image, right minus left: ``x_right = x_left + column_disparity``.
 
     All arrays are (row, col) of the left image. ``column_disparity, row_disparity``: float32 pixels, NaN undefined;
-    interpolated ones included. ``validity``: bits of :class:`~stages.core.validity.Validity`. ``backmatch_error``:
-    float32 pixels, NaN where the match leaves the right image. ``distance``: float32 mean feature distance at the
-    whole-pixel match (byte steps; preset ``paper``: Eq. 1, grey levels), NaN where back-matching failed by far.
-    ``disparity_std``:
-    float32 pixels, standard deviation of the column disparity (see :mod:`~stages.hfvm.finish.uncertainty`), NaN where
-    not ``MATCHED``. ``aligned``: whether the right image was pre-aligned by a plane.
+    interpolated ones included. ``validity``: bits of :class:`~rille.stages.core.validity.Validity`.
+    ``backmatch_error``: float32 pixels, NaN where the match leaves the right image. ``distance``: float32 mean feature
+    distance at the whole-pixel match (byte steps; preset ``paper``: Eq. 1, grey levels), NaN where back-matching failed
+    by far. ``disparity_std``:
+    float32 pixels, standard deviation of the column disparity (see :mod:`~rille.stages.hfvm.finish.uncertainty`), NaN
+    where not ``MATCHED``. ``aligned``: whether the right image was pre-aligned by a plane.
     """
 
     column_disparity: Map
@@ -75,7 +75,7 @@ def match(
     params : matcher's parameters; None: preset ``default``.
     left_valid, right_valid : (row, col), not zero where usable; None: everywhere.
     prior : column and row disparities of the left image, pixels, NaN undefined, to start from (see
-        :mod:`stages.hfvm.coarse_to_fine.start`); None: nothing is known.
+        :mod:`rille.stages.hfvm.coarse_to_fine.start`); None: nothing is known.
     tell : told of the progress.
     side : pixels of a tile; None: whole. The result does not depend on it, the room for it does. Presets ``accurate``
         and those with a relief are matched whole.

@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.core.declare import AnyArray
+from rille.stages.core.declare import AnyArray
 
 FOCAL = 0.5, 3.0
 """Bounds of the focal length in image widths: fields of view of 90 and 19 degrees."""

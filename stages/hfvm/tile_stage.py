@@ -1,4 +1,4 @@
-"""One step of matching a large pair, for one tile: what :mod:`stages.hfvm.tiled` composes, as tasks.
+"""One step of matching a large pair, for one tile: what :mod:`rille.stages.hfvm.tiled` composes, as tasks.
 
 ``args``: ``step``, ``side`` (pixels of a tile), ``tile`` (its number in reading order) and, where there is a choice,
 ``level`` and ``way`` (``left``: of the left image onto the right one, or ``right``). Tiles of all levels have the same
@@ -13,16 +13,16 @@ from typing import Any
 
 import numpy as np
 
-from stages.core.declare import AnyArray, Array, Bundle, Inputs, Stage
-from stages.core.errors import InputError
-from stages.hfvm import tiled
-from stages.hfvm.coarse_to_fine import hierarchy
-from stages.hfvm.coarse_to_fine.hierarchy import Band, Map, Prepared, State
-from stages.hfvm.finish.finish import Finish
-from stages.hfvm.images.params import HfvmParams
-from stages.hfvm.images.views import Aligned, Plain, View
-from stages.hfvm.images.window import Mosaic, Results, Shape, Window, tiles
-from stages.hfvm.stage import OUTPUTS
+from rille.stages.core.declare import AnyArray, Array, Bundle, Inputs, Stage
+from rille.stages.core.errors import InputError
+from rille.stages.hfvm import tiled
+from rille.stages.hfvm.coarse_to_fine import hierarchy
+from rille.stages.hfvm.coarse_to_fine.hierarchy import Band, Map, Prepared, State
+from rille.stages.hfvm.finish.finish import Finish
+from rille.stages.hfvm.images.params import HfvmParams
+from rille.stages.hfvm.images.views import Aligned, Plain, View
+from rille.stages.hfvm.images.window import Mosaic, Results, Shape, Window, tiles
+from rille.stages.hfvm.stage import OUTPUTS
 
 MAP = ("u", "v", "undefined")
 

@@ -1,5 +1,5 @@
 """The matcher as a composition of windows: of images in memory here, as tasks of the engine in
-``stages.hfvm.tile_stage``.
+``rille.stages.hfvm.tile_stage``.
 
 ::
 
@@ -16,16 +16,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stages.core.declare import AnyArray
-from stages.core.validity import matched
-from stages.hfvm.coarse_to_fine import accurate, hierarchy, start
-from stages.hfvm.coarse_to_fine.hierarchy import Prepared, State
-from stages.hfvm.finish import refine
-from stages.hfvm.finish.finish import Finish
-from stages.hfvm.images import plane, resample
-from stages.hfvm.images.params import HfvmParams
-from stages.hfvm.images.views import Aligned, Plain, Seen, View
-from stages.hfvm.images.window import Raster, Results, Shape, Window, cut, gather, tiles, whole
+from rille.stages.core.declare import AnyArray
+from rille.stages.core.validity import matched
+from rille.stages.hfvm.coarse_to_fine import accurate, hierarchy, start
+from rille.stages.hfvm.coarse_to_fine.hierarchy import Prepared, State
+from rille.stages.hfvm.finish import refine
+from rille.stages.hfvm.finish.finish import Finish
+from rille.stages.hfvm.images import plane, resample
+from rille.stages.hfvm.images.params import HfvmParams
+from rille.stages.hfvm.images.views import Aligned, Plain, Seen, View
+from rille.stages.hfvm.images.window import Raster, Results, Shape, Window, cut, gather, tiles, whole
 
 Tell = Callable[[float, str], None]
 """Called with the share of the work done, 0..1, and what comes next in words."""
@@ -43,7 +43,7 @@ Order = Callable[[list[Window]], list[Window]]
 
 @dataclass(frozen=True)
 class Found:
-    """Arrays of :class:`stages.hfvm.Disparity` by name, and whether the right image was pre-aligned."""
+    """Arrays of :class:`rille.stages.hfvm.Disparity` by name, and whether the right image was pre-aligned."""
 
     arrays: Results
     aligned: bool
@@ -101,7 +101,7 @@ def coarse(left: View, right: View, params: HfvmParams, side: int | None, prior:
 
 
 def contrast(pair: Prepared, state: State) -> float:
-    """Factor for the right image, see :func:`stages.hfvm.finish.refine.contrast`."""
+    """Factor for the right image, see :func:`rille.stages.hfvm.finish.refine.contrast`."""
     a, b = (seen.view.grey(state.level, whole(seen.view.shapes[state.level])) for seen in (pair.left, pair.right))
     return refine.contrast(a, b, state.left.u, state.left.v, state.left_ok)
 

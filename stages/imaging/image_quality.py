@@ -1,7 +1,7 @@
 """What one stereo pair looks like, before anything is matched: grey values, sharpness, and whether it repeats another.
 
 Plain figures that tell a black, blurred or repeated image from a good one; what follows from them is decided over the
-whole sequence (:mod:`stages.odometry.frame_screening`).
+whole sequence (:mod:`rille.stages.odometry.frame_screening`).
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.core.declare import Bundle, Inputs, NoParams, Stage
-from stages.imaging.pyramid import grey
+from rille.stages.core.declare import Bundle, Inputs, NoParams, Stage
+from rille.stages.imaging.pyramid import grey
 
 LOW, HIGH = 2.0, 253.0
 """Grey values at which an 8-bit image is taken as clipped."""

@@ -16,9 +16,9 @@ from numba import njit
 from numpy.typing import NDArray
 from pydantic import Field
 
-from stages.core.declare import AnyArray, Array, Bundle, Inputs, Params, Stage
-from stages.core.errors import InputError
-from stages.core.validity import Mask
+from rille.stages.core.declare import AnyArray, Array, Bundle, Inputs, Params, Stage
+from rille.stages.core.errors import InputError
+from rille.stages.core.validity import Mask
 
 Image = NDArray[np.float32]
 

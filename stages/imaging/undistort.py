@@ -18,11 +18,11 @@ from numba import njit
 from numpy.typing import NDArray
 from pydantic import Field
 
-from stages.core.declare import AnyArray, Array, Bundle, Inputs, Params, Stage
-from stages.core.errors import InputError
-from stages.geometry.geometry import Camera
-from stages.geometry.lens import Lens
-from stages.imaging.pyramid import grey
+from rille.stages.core.declare import AnyArray, Array, Bundle, Inputs, Params, Stage
+from rille.stages.core.errors import InputError
+from rille.stages.geometry.geometry import Camera
+from rille.stages.geometry.lens import Lens
+from rille.stages.imaging.pyramid import grey
 
 Float32 = NDArray[np.float32]
 Floats = NDArray[np.float64]

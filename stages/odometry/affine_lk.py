@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from stages.geometry.cubic import cubic
+from rille.stages.geometry.cubic import cubic
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]

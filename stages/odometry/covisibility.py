@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.core.declare import AnyArray, Bundle
-from stages.core.validity import Validity, matched
-from stages.odometry.track import fit_affinity, known_median
+from rille.stages.core.declare import AnyArray, Bundle
+from rille.stages.core.validity import Validity, matched
+from rille.stages.odometry.track import fit_affinity, known_median
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]

@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stages.core.errors import InputError
-from stages.geometry.geometry import Camera
-from stages.hfvm.images.plane import translation, warp
-from stages.imaging import pyramid
-from stages.imaging.pyramid import Pyramid, PyramidParams
+from rille.stages.core.errors import InputError
+from rille.stages.geometry.geometry import Camera
+from rille.stages.hfvm.images.plane import translation, warp
+from rille.stages.imaging import pyramid
+from rille.stages.imaging.pyramid import Pyramid, PyramidParams
 
 Floats = NDArray[np.float64]
 

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.imaging.pyramid import Pyramid
+from rille.stages.imaging.pyramid import Pyramid
 
 Floats = NDArray[np.float64]
 

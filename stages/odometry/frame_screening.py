@@ -23,12 +23,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from stages.core.declare import Bundle, Inputs, Params, Stage
-from stages.core.errors import DegenerateError, InputError
-from stages.core.validity import matched
-from stages.imaging.image_quality import HIGH, LOW
-from stages.odometry.covisibility import Step
-from stages.odometry.keyframes import LEAST_BLOCKS
+from rille.stages.core.declare import Bundle, Inputs, Params, Stage
+from rille.stages.core.errors import DegenerateError, InputError
+from rille.stages.core.validity import matched
+from rille.stages.imaging.image_quality import HIGH, LOW
+from rille.stages.odometry.covisibility import Step
+from rille.stages.odometry.keyframes import LEAST_BLOCKS
 
 Floats = NDArray[np.float64]
 Steps = Mapping[tuple[int, int], float]

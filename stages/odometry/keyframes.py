@@ -4,8 +4,9 @@ Successive basic pairs bound a *segment*: the left images from one to the next a
 elevation model of the first. Positions behind the last basic pair are an open last segment.
 
 The paper takes every fourth pair of a camera that moves evenly. Here the next basic pair is the last one whose image
-still shows the wanted share of what the one before shows (:mod:`stages.odometry.covisibility`): poses are not known
-yet, the coarse displacements are. A camera that rests needs no new elevation model, one that turns needs them often.
+still shows the wanted share of what the one before shows (:mod:`rille.stages.odometry.covisibility`): poses are not
+known yet, the coarse displacements are. A camera that rests needs no new elevation model, one that turns needs them
+often.
 """
 
 from __future__ import annotations
@@ -17,9 +18,9 @@ from typing import Any, Literal
 
 from pydantic import Field, model_validator
 
-from stages.core.declare import Bundle, Inputs, Params, Stage
-from stages.core.errors import ConfigError, InputError
-from stages.odometry.covisibility import Seen, Step
+from rille.stages.core.declare import Bundle, Inputs, Params, Stage
+from rille.stages.core.errors import ConfigError, InputError
+from rille.stages.odometry.covisibility import Seen, Step
 
 LEAST_BLOCKS = 12
 """Blocks of the image with a displacement, below which the whole is not told by them."""

@@ -4,10 +4,10 @@ The hierarchical matcher of stage ``hfvm``, stopped at a coarse level. There is 
 forward has radial flow, whose epipolar lines meet inside the image, where a band says nothing about the way along it.
 
 Where the rotation between the frames is known from a sensor, it is undone before matching
-(:mod:`stages.odometry.derotation`); where the matches are too few, the homography that features show
-(:mod:`stages.odometry.feature_homography`), or else an in-plane rotation that is looked for, is undone, as is one that
-the matches show (:mod:`stages.odometry.roll_search`). The displacements are those of the frames as they were taken all
-the same.
+(:mod:`rille.stages.odometry.derotation`); where the matches are too few, the homography that features show
+(:mod:`rille.stages.odometry.feature_homography`), or else an in-plane rotation that is looked for, is undone, as is one
+that the matches show (:mod:`rille.stages.odometry.roll_search`). The displacements are those of the frames as they were
+taken all the same.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from stages.core.declare import AnyArray, Array, Bundle, Inputs, Params, Stage
-from stages.core.validity import Mask, Validity, defined, mark, matched
-from stages.geometry.geometry import Camera
-from stages.hfvm.coarse_to_fine import hierarchy
-from stages.hfvm.images.params import HfvmParams
-from stages.hfvm.images.window import whole
-from stages.hfvm.level import consistency
-from stages.imaging.pyramid import Pyramid
-from stages.odometry import roll_search
-from stages.odometry.derotation import Derotation
-from stages.odometry.feature_homography import feature_homography
+from rille.stages.core.declare import AnyArray, Array, Bundle, Inputs, Params, Stage
+from rille.stages.core.validity import Mask, Validity, defined, mark, matched
+from rille.stages.geometry.geometry import Camera
+from rille.stages.hfvm.coarse_to_fine import hierarchy
+from rille.stages.hfvm.images.params import HfvmParams
+from rille.stages.hfvm.images.window import whole
+from rille.stages.hfvm.level import consistency
+from rille.stages.imaging.pyramid import Pyramid
+from rille.stages.odometry import roll_search
+from rille.stages.odometry.derotation import Derotation
+from rille.stages.odometry.feature_homography import feature_homography
 
 
 class MotionParams(Params):
@@ -62,7 +62,7 @@ class Motion:
 
     Grid pixel (row, col) stands for level-0 position ``(col + 0.5) * 2**level - 0.5`` (rows likewise). All arrays are
     (row, col): ``column_disparity, row_disparity`` float32, b minus a, NaN undefined, interpolated ones
-    included; ``validity`` bits of :class:`~stages.core.validity.Validity`.
+    included; ``validity`` bits of :class:`~rille.stages.core.validity.Validity`.
     """
 
     level: int

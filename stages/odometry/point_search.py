@@ -13,12 +13,12 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from stages.geometry.cubic import cubic
-from stages.hfvm.images.params import HfvmParams
-from stages.hfvm.level import features
-from stages.hfvm.level.features import distance
-from stages.hfvm.level.subpixel import linear
-from stages.imaging.pyramid import Pyramid, filled
+from rille.stages.geometry.cubic import cubic
+from rille.stages.hfvm.images.params import HfvmParams
+from rille.stages.hfvm.level import features
+from rille.stages.hfvm.level.features import distance
+from rille.stages.hfvm.level.subpixel import linear
+from rille.stages.imaging.pyramid import Pyramid, filled
 
 Floats = NDArray[np.float64]
 

@@ -4,8 +4,8 @@ Source: Kolesnik, Paar, Bauer, Ulm (1999), section 5.2.1. Two iterations as ther
 between successive frames (stage ``motion``) predict where an interest point went; feature vectors find it at full
 resolution. Two steps of ours follow: the affinity by which the surroundings of a point changed is fitted to the
 displacements of its neighbours, and the template of the frame in which the point was *born* is aligned under it
-(:mod:`stages.odometry.affine_lk`). Errors do not accumulate along the chain, since each frame is measured against the
-first.
+(:mod:`rille.stages.odometry.affine_lk`). Errors do not accumulate along the chain, since each frame is measured against
+the first.
 
 A point that is lost keeps its predicted position and may be found again. Buckets of the image that have run empty get
 new points at intermediate frames; such a point is looked up backwards in the key frame, where its coordinates are
@@ -23,12 +23,12 @@ from numba import njit
 from numpy.typing import NDArray
 from pydantic import Field
 
-from stages.core.declare import Array, Bundle, Inputs, Params, Stage
-from stages.core.errors import InputError
-from stages.imaging.pyramid import Pyramid
-from stages.odometry.affine_lk import HALF, align
-from stages.odometry.moravec import clear_of_mask, interest_points
-from stages.odometry.point_search import match_points
+from rille.stages.core.declare import Array, Bundle, Inputs, Params, Stage
+from rille.stages.core.errors import InputError
+from rille.stages.imaging.pyramid import Pyramid
+from rille.stages.odometry.affine_lk import HALF, align
+from rille.stages.odometry.moravec import clear_of_mask, interest_points
+from rille.stages.odometry.point_search import match_points
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]

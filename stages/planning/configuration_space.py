@@ -12,9 +12,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.hazard.vehicle import Vehicle
-from stages.numeric.extrema import octagon
-from stages.numeric.packed import Canvas, codes
+from rille.stages.hazard.vehicle import Vehicle
+from rille.stages.numeric.extrema import octagon
+from rille.stages.numeric.packed import Canvas, codes
 
 Mask = NDArray[np.bool_]
 Bytes = NDArray[np.uint8]

@@ -14,9 +14,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from stages.numeric.line import copy_line
-from stages.planning.configuration_space import ACROSS, LEFT, RIGHT, STRAIGHT
-from stages.planning.row_graph import UNREACHED
+from rille.stages.numeric.line import copy_line
+from rille.stages.planning.configuration_space import ACROSS, LEFT, RIGHT, STRAIGHT
+from rille.stages.planning.row_graph import UNREACHED
 
 Ints = NDArray[np.int64]
 Whole = NDArray[np.integer[Any]]
@@ -40,7 +40,7 @@ def cost_to_go(
     ----------
     height : (row, col) whole numbers, of which a difference of one costs one.
     ways : (row, col) directions as bits in which the vehicle may stand
-    (:mod:`stages.planning.configuration_space`). target, start : row and column; the search ends where
+    (:mod:`rille.stages.planning.configuration_space`). target, start : row and column; the search ends where
     it meets ``start``, None: when all is settled. unit : cost of a straight step's length, at least 1.
     toll : (row, col) whole numbers, cost of entering a cell.
 

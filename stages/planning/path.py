@@ -1,9 +1,9 @@
 """Local path on a risk map (section 4.7), for a vehicle with a width.
 
 Two planners. ``rows`` is the paper's: a path that runs monotonically through the rows across the driving direction,
-with all targets of the far row from one sweep (:mod:`stages.planning.row_graph`). ``grid8`` goes in any direction and
-reaches what lies beside or behind an obstacle (:mod:`stages.planning.grid8`). ``auto`` takes the first, and the second
-where the first reaches no target that was asked for.
+with all targets of the far row from one sweep (:mod:`rille.stages.planning.row_graph`). ``grid8`` goes in any direction
+and reaches what lies beside or behind an obstacle (:mod:`rille.stages.planning.grid8`). ``auto`` takes the first, and
+the second where the first reaches no target that was asked for.
 
 The weight of an edge is the absolute height difference between the places where a wheel would stand: means over the
 wheel's window, rounded to a step that means nothing to the vehicle. ``grid8`` adds the length, since without rows to
@@ -11,7 +11,7 @@ cross a path of no climb could be of any length. Caution ground costs a toll.
 
 Footprint. The middle of the vehicle never enters a hazardous or unknown cell; and in the direction of each edge its
 wheels keep the margin from ground that is hazardous to a wheel, and its middle keeps it from places where the vehicle
-as a whole would tilt or strike (:mod:`stages.planning.configuration_space`). Of unknown ground three
+as a whole would tilt or strike (:mod:`rille.stages.planning.configuration_space`). Of unknown ground three
 shares are tried: none under its outline, else none under its wheels, else none under its middle. The last happens
 where the elevation model is narrower than the vehicle, as beside the cameras; the result says so (``ground``).
 
@@ -37,17 +37,17 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from stages.core.declare import Array, Bundle, Inputs, Memory, Params, Stage
-from stages.geometry.lattice import Lattice
-from stages.hazard.hazards import WHEEL_BITS
-from stages.hazard.risk import HAZARDOUS, check_size
-from stages.hazard.vehicle import Vehicle
-from stages.planning import grid8
-from stages.planning.path_ends import Point, check_end, chosen
-from stages.planning.path_ground import GROUNDS, Ground
-from stages.planning.path_words import Maps, Route, describe
-from stages.planning.row_graph import UNREACHED, Plan, plan, row_span
-from stages.planning.row_grid import RowGrid
+from rille.stages.core.declare import Array, Bundle, Inputs, Memory, Params, Stage
+from rille.stages.geometry.lattice import Lattice
+from rille.stages.hazard.hazards import WHEEL_BITS
+from rille.stages.hazard.risk import HAZARDOUS, check_size
+from rille.stages.hazard.vehicle import Vehicle
+from rille.stages.planning import grid8
+from rille.stages.planning.path_ends import Point, check_end, chosen
+from rille.stages.planning.path_ground import GROUNDS, Ground
+from rille.stages.planning.path_words import Maps, Route, describe
+from rille.stages.planning.row_graph import UNREACHED, Plan, plan, row_span
+from rille.stages.planning.row_grid import RowGrid
 
 __all__ = ["STAGE", "WHEEL_BITS", "PathParams", "Route", "describe", "find_path"]
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.core.errors import InputError
-from stages.geometry.lattice import Lattice
-from stages.hazard.risk import HAZARDOUS, UNKNOWN
-from stages.hazard.vehicle import Vehicle
-from stages.planning.path_ground import Ground
-from stages.planning.path_words import Maps, hazard_words
-from stages.planning.row_graph import nearest_middle, row_span
+from rille.stages.core.errors import InputError
+from rille.stages.geometry.lattice import Lattice
+from rille.stages.hazard.risk import HAZARDOUS, UNKNOWN
+from rille.stages.hazard.vehicle import Vehicle
+from rille.stages.planning.path_ground import Ground
+from rille.stages.planning.path_words import Maps, hazard_words
+from rille.stages.planning.row_graph import nearest_middle, row_span
 
 Point = tuple[float, float]
 Cell = tuple[int, int]
@@ -53,7 +53,7 @@ def chosen(ground: Ground, below: str, start: Cell | None, target: Cell | None) 
 
     Parameters
     ----------
-    below : of :data:`stages.planning.path_ground.GROUNDS`, what stays on known ground.
+    below : of :data:`rille.stages.planning.path_ground.GROUNDS`, what stays on known ground.
     """
     span = row_span(ground.ways(below) > 0)
     if span is None or (start is not None and target is not None):

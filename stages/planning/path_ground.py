@@ -9,14 +9,14 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from stages.geometry.lattice import Lattice
-from stages.hazard.hazards import BITS, WHEEL_BITS
-from stages.hazard.risk import CAUTION, HAZARDOUS, UNKNOWN, window_cells
-from stages.hazard.vehicle import Vehicle
-from stages.numeric.windows import window_mean
-from stages.planning import grid8
-from stages.planning.configuration_space import Stand
-from stages.planning.row_grid import RowGrid
+from rille.stages.geometry.lattice import Lattice
+from rille.stages.hazard.hazards import BITS, WHEEL_BITS
+from rille.stages.hazard.risk import CAUTION, HAZARDOUS, UNKNOWN, window_cells
+from rille.stages.hazard.vehicle import Vehicle
+from rille.stages.numeric.windows import window_mean
+from rille.stages.planning import grid8
+from rille.stages.planning.configuration_space import Stand
+from rille.stages.planning.row_grid import RowGrid
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.integer[Any]]
@@ -93,7 +93,7 @@ class Ground:
         return self._ways[below]
 
     def parts(self, below: str) -> tuple[NDArray[np.int32], Ints]:
-        """Connected ground, see :func:`stages.planning.grid8.parts`."""
+        """Connected ground, see :func:`rille.stages.planning.grid8.parts`."""
         if below not in self._parts:
             self._parts[below] = grid8.parts(self.ways(below))
         return self._parts[below]

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.geometry.lattice import Lattice
-from stages.hazard.hazards import BITS
-from stages.hazard.risk import CAUTION, HAZARDOUS, UNKNOWN
-from stages.hazard.vehicle import Vehicle
-from stages.planning.path_ground import GROUNDS
-from stages.planning.row_graph import Plan
-from stages.planning.row_grid import RowGrid
+from rille.stages.geometry.lattice import Lattice
+from rille.stages.hazard.hazards import BITS
+from rille.stages.hazard.risk import CAUTION, HAZARDOUS, UNKNOWN
+from rille.stages.hazard.vehicle import Vehicle
+from rille.stages.planning.path_ground import GROUNDS
+from rille.stages.planning.row_graph import Plan
+from rille.stages.planning.row_grid import RowGrid
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -18,7 +18,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from stages.planning.configuration_space import ALL, LEFT, RIGHT, STRAIGHT
+from rille.stages.planning.configuration_space import ALL, LEFT, RIGHT, STRAIGHT
 
 Ints = NDArray[np.integer[Any]]
 Mask = NDArray[np.bool_]

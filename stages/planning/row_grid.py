@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.core.errors import InputError
-from stages.geometry.lattice import Lattice
+from rille.stages.core.errors import InputError
+from rille.stages.geometry.lattice import Lattice
 
 Floats = NDArray[np.float64]
 Point = tuple[float, float]

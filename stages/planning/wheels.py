@@ -18,8 +18,8 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from stages.geometry.geometry import RigidTransform
-from stages.hazard.vehicle import Vehicle
+from rille.stages.geometry.geometry import RigidTransform
+from rille.stages.hazard.vehicle import Vehicle
 
 Floats = NDArray[np.float64]
 

@@ -16,8 +16,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from stages.core.errors import DegenerateError
-from stages.geometry.geometry import Rig
+from rille.stages.core.errors import DegenerateError
+from rille.stages.geometry.geometry import Rig
 
 Floats = NDArray[np.float64]
 

@@ -19,14 +19,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
-from stages.core.declare import Bundle, Inputs, Params, Stage
-from stages.core.errors import DegenerateError, InputError
-from stages.core.validity import matched
-from stages.geometry.epipolar import exchanged, fits
-from stages.geometry.geometry import Rig, RigidTransform, level_rotation
-from stages.geometry.pose_arrays import NO_VERTICAL
-from stages.geometry.triangulation import inverse_depth
-from stages.terrain.ground import MIN_POINTS, GroundPlane, fit_plane, rounded_cell, view_ground
+from rille.stages.core.declare import Bundle, Inputs, Params, Stage
+from rille.stages.core.errors import DegenerateError, InputError
+from rille.stages.core.validity import matched
+from rille.stages.geometry.epipolar import exchanged, fits
+from rille.stages.geometry.geometry import Rig, RigidTransform, level_rotation
+from rille.stages.geometry.pose_arrays import NO_VERTICAL
+from rille.stages.geometry.triangulation import inverse_depth
+from rille.stages.terrain.ground import MIN_POINTS, GroundPlane, fit_plane, rounded_cell, view_ground
 
 Floats = NDArray[np.float64]
 Samples = tuple[Floats, Floats, Floats]

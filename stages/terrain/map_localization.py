@@ -20,10 +20,10 @@ from numba import njit
 from numpy.typing import NDArray
 from pydantic import Field
 
-from stages.core.declare import Bundle, Inputs, Params, Stage
-from stages.core.errors import DegenerateError, InputError
-from stages.geometry.geometry import RigidTransform, rotation_exp
-from stages.geometry.lattice import Lattice
+from rille.stages.core.declare import Bundle, Inputs, Params, Stage
+from rille.stages.core.errors import DegenerateError, InputError
+from rille.stages.geometry.geometry import RigidTransform, rotation_exp
+from rille.stages.geometry.lattice import Lattice
 
 Floats = NDArray[np.float64]
 

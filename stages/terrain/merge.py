@@ -33,13 +33,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from stages.core.declare import Array, Bundle, Inputs, Memory, Params, Stage
-from stages.core.errors import InputError
-from stages.geometry.geometry import RigidTransform
-from stages.geometry.lattice import Lattice
-from stages.numeric.holes import close_holes
-from stages.terrain.merge_kernel import PLANES, merge_cells
-from stages.terrain.radiometry import STEP
+from rille.stages.core.declare import Array, Bundle, Inputs, Memory, Params, Stage
+from rille.stages.core.errors import InputError
+from rille.stages.geometry.geometry import RigidTransform
+from rille.stages.geometry.lattice import Lattice
+from rille.stages.numeric.holes import close_holes
+from rille.stages.terrain.merge_kernel import PLANES, merge_cells
+from rille.stages.terrain.radiometry import STEP
 
 Float32 = NDArray[np.float32]
 Floats = NDArray[np.float64]
@@ -141,7 +141,7 @@ def footprint(elevation: Float32, x: Floats, y: Floats, centre: Floats, angle: f
 @dataclass(frozen=True)
 class Layer:
     """One pair's model on ``lattice``: arrays (rows, cols), NaN undefined, those of
-    :class:`stages.terrain.locus.solve.Dem`.
+    :class:`rille.stages.terrain.locus.solve.Dem`.
 
     ``gain``: factor of its grey values that levels its exposure with that of its neighbours; ``pose``: how exactly it
     is placed.

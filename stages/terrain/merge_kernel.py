@@ -22,7 +22,7 @@ def merge_cells(  # type: ignore[no-untyped-def]
     z, sigma, residual, ortho, gain, centre, pose, x, y, scale, sharpness, alike, worst, out, count, best
 ):
     """Merge models (n, rows, cols) float32, NaN undefined; weights and equations are those of
-    :mod:`stages.terrain.merge`.
+    :mod:`rille.stages.terrain.merge`.
 
     ``gain`` (n,) of the grey values; ``centre`` (n, 2) and ``pose`` (n, 3, 3): where each camera stands, m, and the
     covariance of its height and its rotations about x and y; ``x`` (cols,), ``y`` (rows,) of the cells, m; ``alike``:

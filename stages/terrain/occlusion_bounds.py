@@ -22,10 +22,10 @@ from numba import njit
 from numpy.typing import NDArray
 from pydantic import Field
 
-from stages.core.declare import Array, Bundle, Inputs, Params, Stage
-from stages.geometry.geometry import RigidTransform
-from stages.geometry.lattice import Lattice
-from stages.terrain.merge import footprint
+from rille.stages.core.declare import Array, Bundle, Inputs, Params, Stage
+from rille.stages.geometry.geometry import RigidTransform
+from rille.stages.geometry.lattice import Lattice
+from rille.stages.terrain.merge import footprint
 
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]

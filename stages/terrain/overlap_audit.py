@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from stages.core.declare import Bundle, Inputs, Params, Stage
+from rille.stages.core.declare import Bundle, Inputs, Params, Stage
 
 Floats = NDArray[np.float64]
 Facts = Mapping[str, Any]

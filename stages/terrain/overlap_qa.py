@@ -1,9 +1,9 @@
 """Audit of the seams of one elevation model: its difference from each earlier model that saw the same ground.
 
-A difference has three parts, told apart by :mod:`stages.terrain.overlap_fit`: a bias and a tilt about two axes, which
-come from the poses (or the rig); and noise, which comes from the matching and is compared with what both models' own
-standard deviations let expect. The factor between both models' grey values is a by-product
-(:mod:`stages.terrain.radiometry`).
+A difference has three parts, told apart by :mod:`rille.stages.terrain.overlap_fit`: a bias and a tilt about two axes,
+which come from the poses (or the rig); and noise, which comes from the matching and is compared with what both models'
+own standard deviations let expect. The factor between both models' grey values is a by-product
+(:mod:`rille.stages.terrain.radiometry`).
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
-from stages.geometry.lattice import Lattice
-from stages.terrain.overlap_fit import LEAST_CELLS, fit_seam
+from rille.stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
+from rille.stages.geometry.lattice import Lattice
+from rille.stages.terrain.overlap_fit import LEAST_CELLS, fit_seam
 
 Float32 = NDArray[np.float32]
 

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from stages.core.declare import Bundle, Inputs, Params, Stage
+from rille.stages.core.declare import Bundle, Inputs, Params, Stage
 
 STEP = 0.01
 """Step of log g: half a step is 0.6 of 128 grey values."""

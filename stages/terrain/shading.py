@@ -12,7 +12,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stages.core.errors import InputError
+from rille.stages.core.errors import InputError
 
 Floats = NDArray[np.float64]
 

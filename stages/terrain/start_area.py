@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from stages.core.declare import Array, Bundle, Inputs, Params, Stage
-from stages.geometry.geometry import RigidTransform
-from stages.geometry.lattice import Lattice
+from rille.stages.core.declare import Array, Bundle, Inputs, Params, Stage
+from rille.stages.geometry.geometry import RigidTransform
+from rille.stages.geometry.lattice import Lattice
 
 NOBODY = -1
 """Pair number of a model that no pair made."""

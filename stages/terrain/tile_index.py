@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.core.declare import Bundle, Inputs, NoParams, Stage
-from stages.geometry.lattice import Lattice
+from rille.stages.core.declare import Bundle, Inputs, NoParams, Stage
+from rille.stages.geometry.lattice import Lattice
 
 Tile = tuple[int, int]
 Box = tuple[int, int, int, int]

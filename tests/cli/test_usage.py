@@ -8,7 +8,7 @@ import pytest
 from cyclopts import App
 from place import Place
 
-from pipeline.cli import app
+from rille.pipeline.cli import app
 
 WRONG = {
     "": [("no-such-command", "RIL-001"), ("--no-such-option", "RIL-001")],

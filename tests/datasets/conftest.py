@@ -7,9 +7,9 @@ import json
 
 import pytest
 
-from datasets.mockup.params import MockupParams
-from datasets.protocol import Source
-from stages.core.declare import Bundle, check_outputs
+from rille.datasets.mockup.params import MockupParams
+from rille.datasets.protocol import Source
+from rille.stages.core.declare import Bundle, check_outputs
 
 TINY = {
     "frames": 3,

@@ -19,18 +19,18 @@ from pathlib import Path
 import google_crc32c
 from folders import CAMERAS, RIG, write_images
 
-from datasets.cameras import read_cameras, rig_of
-from datasets.images import files
-from datasets.inspection import inspect
-from datasets.manifest.opening import open_manifest
-from datasets.registry import open_sequence
-from pipeline.engine.store import manifest as stored
-from pipeline.engine.store.folder import Folder
-from pipeline.engine.store.index import Index, pack
-from pipeline.engine.store.place import Item
-from pipeline.export.writers import read_disparity
-from pipeline.flow import config
-from stages.core.errors import RilleError
+from rille.datasets.cameras import read_cameras, rig_of
+from rille.datasets.images import files
+from rille.datasets.inspection import inspect
+from rille.datasets.manifest.opening import open_manifest
+from rille.datasets.registry import open_sequence
+from rille.pipeline.engine.store import manifest as stored
+from rille.pipeline.engine.store.folder import Folder
+from rille.pipeline.engine.store.index import Index, pack
+from rille.pipeline.engine.store.place import Item
+from rille.pipeline.export.writers import read_disparity
+from rille.pipeline.flow import config
+from rille.stages.core.errors import RilleError
 
 SEEDS = Path(__file__).parents[1] / "seeds"
 

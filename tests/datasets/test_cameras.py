@@ -3,9 +3,9 @@ import numpy as np
 import pytest
 from raising import raises
 
-from datasets.cameras import UNKNOWN_SIZE, CalibratedCamera, read_cameras, rig_of
-from stages.geometry.geometry import Camera, RigidTransform, rotation_exp
-from stages.geometry.lens import Lens
+from rille.datasets.cameras import UNKNOWN_SIZE, CalibratedCamera, read_cameras, rig_of
+from rille.stages.geometry.geometry import Camera, RigidTransform, rotation_exp
+from rille.stages.geometry.lens import Lens
 
 SIZE = (640, 480)
 ROTATION = rotation_exp([0.01, -0.02, 0.03])

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from raising import raises
 
-from datasets.images.chessboard import (
+from rille.datasets.images.chessboard import (
     alternates,
     board_points,
     eight_bit,

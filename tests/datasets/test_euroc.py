@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from raising import raises
 
-from datasets.euroc import open_euroc, recognise
-from datasets.images.files import Digests
-from stages.geometry.geometry import RigidTransform, rotation_exp
+from rille.datasets.euroc import open_euroc, recognise
+from rille.datasets.images.files import Digests
+from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 
 START = 1403715273262142976
 STEP = 50_000_000

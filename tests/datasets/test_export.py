@@ -10,10 +10,10 @@ import pytest
 from raising import raises
 from scipy.ndimage import map_coordinates
 
-from datasets.export import export
-from datasets.mockup import sequence as seq
-from datasets.registry import open_sequence
-from stages.geometry.geometry import Rig, RigidTransform
+from rille.datasets.export import export
+from rille.datasets.mockup import sequence as seq
+from rille.datasets.registry import open_sequence
+from rille.stages.geometry.geometry import Rig, RigidTransform
 
 
 @pytest.fixture(scope="module")

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from raising import raises
 
-from datasets.images import files, files16
-from datasets.images.files import Digests
-from stages.core.declare import NoParams, check_outputs
-from stages.core.errors import InputError
+from rille.datasets.images import files, files16
+from rille.datasets.images.files import Digests
+from rille.stages.core.declare import NoParams, check_outputs
+from rille.stages.core.errors import InputError
 
 
 @pytest.fixture

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from raising import raises
 
-from datasets.georeference import georeference
-from datasets.manifest.model import World
+from rille.datasets.georeference import georeference
+from rille.datasets.manifest.model import World
 
 ORIGIN = (500100.0, 5200200.0, 1800.0)
 

@@ -7,8 +7,8 @@ import pytest
 from raising import raises
 from scipy.spatial.transform import Rotation
 
-from datasets.imu import Imu, at_frames, integrate, read_imu, resting_bias
-from stages.geometry.geometry import RigidTransform, rotation_exp
+from rille.datasets.imu import Imu, at_frames, integrate, read_imu, resting_bias
+from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 
 IDENTITY = RigidTransform.identity()
 T_IMU_LEFT = RigidTransform(rotation_exp([0.3, -1.2, 0.7]), np.array([0.1, 0.2, 0.3]))

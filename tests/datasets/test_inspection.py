@@ -9,11 +9,11 @@ import pytest
 from folders import SIZE, write_images, write_lines
 from raising import raises
 
-from datasets.images.files import Digests
-from datasets.inspection import find_views, inspect, pattern, table_kind
-from datasets.manifest.opening import open_manifest
-from datasets.manifest.text import manifest_text, needs
-from datasets.text.names import derived_name
+from rille.datasets.images.files import Digests
+from rille.datasets.inspection import find_views, inspect, pattern, table_kind
+from rille.datasets.manifest.opening import open_manifest
+from rille.datasets.manifest.text import manifest_text, needs
+from rille.datasets.text.names import derived_name
 
 ORB_SETTINGS = """%YAML:1.0
 Camera.fx: 60.0

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from raising import raises
 
-from datasets.registry import open_sequence
-from stages.geometry.geometry import rotation_exp
+from rille.datasets.registry import open_sequence
+from rille.stages.geometry.geometry import rotation_exp
 
 K = np.array([[100.0, 0.0, 31.5], [0.0, 100.0, 23.5], [0.0, 0.0, 1.0]])
 P_LEFT = np.hstack([K, np.zeros((3, 1))])

@@ -11,13 +11,13 @@ import pytest
 from folders import CAMERAS, write_images, write_lines, write_sequence
 from raising import raises
 
-from datasets.georeference import Georeference
-from datasets.images.files import Digests
-from datasets.manifest.model import Manifest, known_keys, read_manifest, tables
-from datasets.manifest.opening import dotted, open_manifest
-from datasets.manifest.rig import off_centre
-from datasets.protocol import Sequence
-from stages.geometry.geometry import Camera, RigidTransform, rotation_exp
+from rille.datasets.georeference import Georeference
+from rille.datasets.images.files import Digests
+from rille.datasets.manifest.model import Manifest, known_keys, read_manifest, tables
+from rille.datasets.manifest.opening import dotted, open_manifest
+from rille.datasets.manifest.rig import off_centre
+from rille.datasets.protocol import Sequence
+from rille.stages.geometry.geometry import Camera, RigidTransform, rotation_exp
 
 
 def opened(path: Path) -> Sequence:

@@ -8,15 +8,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from datasets.images import misalign as module
-from datasets.images import misalign16
-from datasets.images.misalign import MisalignParams, misalign, origins, warp
-from datasets.mockup.params import SHORT, MockupParams
-from datasets.mockup.sequence import mockup
-from datasets.protocol import Source
-from stages.core.declare import Bundle, NoParams, check_outputs
-from stages.geometry.geometry import Camera, rotation_exp
-from stages.geometry.lens import Lens
+from rille.datasets.images import misalign as module
+from rille.datasets.images import misalign16
+from rille.datasets.images.misalign import MisalignParams, misalign, origins, warp
+from rille.datasets.mockup.params import SHORT, MockupParams
+from rille.datasets.mockup.sequence import mockup
+from rille.datasets.protocol import Source
+from rille.stages.core.declare import Bundle, NoParams, check_outputs
+from rille.stages.geometry.geometry import Camera, rotation_exp
+from rille.stages.geometry.lens import Lens
 
 CAMERA = Camera(120.0, 118.0, 47.0, 31.0, 96, 64)
 PINHOLE = Lens(CAMERA)
@@ -103,7 +103,7 @@ def test_only_the_right_images_change():
     assert bent.image(3, "left") == plain.image(3, "left")
     source = bent.image(3, "right")
     assert source.inputs["image"] == plain.image(3, "right")
-    assert (source.module, source.params, source.args["frame"]) == ("datasets.images.misalign", ALL, 3)
+    assert (source.module, source.params, source.args["frame"]) == ("rille.datasets.images.misalign", ALL, 3)
     assert bent.rig == plain.rig
     assert bent.truth == plain.truth
     assert bent.truth_disparity is None
@@ -137,6 +137,6 @@ def test_stage_keeps_the_depth(dtype, stage):
 def test_deep_images_go_to_their_own_stage():
     deep = replace(
         mockup(MockupParams(**SHORT)),
-        image=lambda frame, camera: Source("datasets.images.files16", NoParams(), {"frame": frame}),
+        image=lambda frame, camera: Source("rille.datasets.images.files16", NoParams(), {"frame": frame}),
     )
-    assert misalign(deep, ALL).image(0, "right").module == "datasets.images.misalign16"
+    assert misalign(deep, ALL).image(0, "right").module == "rille.datasets.images.misalign16"

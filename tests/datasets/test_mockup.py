@@ -9,13 +9,13 @@ import pytest
 from raising import raises
 from scipy.ndimage import binary_erosion, map_coordinates
 
-from datasets.mockup import sequence as seq
-from datasets.mockup import terrain
-from datasets.mockup.params import MockupParams, SceneParams
-from datasets.mockup.scene import build_scene, height_field
-from datasets.mockup.truth import HIDDEN, NO_BED, OUTSIDE, SEEN, true_disparity
-from datasets.mockup.truth_dem import seen_by, true_dem
-from stages.geometry.geometry import RigidTransform, level_rotation, rotation_exp
+from rille.datasets.mockup import sequence as seq
+from rille.datasets.mockup import terrain
+from rille.datasets.mockup.params import MockupParams, SceneParams
+from rille.datasets.mockup.scene import build_scene, height_field
+from rille.datasets.mockup.truth import HIDDEN, NO_BED, OUTSIDE, SEEN, true_disparity
+from rille.datasets.mockup.truth_dem import seen_by, true_dem
+from rille.stages.geometry.geometry import RigidTransform, level_rotation, rotation_exp
 
 
 @pytest.fixture(scope="module")
@@ -339,7 +339,7 @@ def test_a_sloped_bed_is_seen_as_a_level_one_is() -> None:
 
 
 def test_bed_challenges_the_rover():
-    from stages.hazard.risk import risk_map
+    from rille.stages.hazard.risk import risk_map
 
     for kind in ({}, {"seed": 7}):
         p = SceneParams(bed_width=1.0, bed_length=1.0, **kind)

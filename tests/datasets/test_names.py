@@ -5,9 +5,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from raising import raises
 
-from datasets.mockup.params import MockupParams
-from datasets.mockup.sequence import mockup
-from datasets.text.names import check_name, derived_name
+from rille.datasets.mockup.params import MockupParams
+from rille.datasets.mockup.sequence import mockup
+from rille.datasets.text.names import check_name, derived_name
 
 
 @pytest.mark.parametrize(

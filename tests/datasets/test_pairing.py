@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from raising import raises
 
-from datasets.images.pairing import common_size, natural, pair_up, side_of
+from rille.datasets.images.pairing import common_size, natural, pair_up, side_of
 
 
 def paths(*names: str) -> list[Path]:

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from raising import raises
 from scipy.spatial.transform import Rotation
 
-from datasets.poses import TimedPoses, coverage, interpolate, read_poses
-from stages.geometry.geometry import RigidTransform, rotation_exp
+from rille.datasets.poses import TimedPoses, coverage, interpolate, read_poses
+from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 
 TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 """90 degrees about z: quaternion w = z = sqrt(1/2)."""

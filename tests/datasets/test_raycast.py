@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from datasets.mockup.raycast import HeightField
+from rille.datasets.mockup.raycast import HeightField
 
 
 def bilinear(field: HeightField, x, y):

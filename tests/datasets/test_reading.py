@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from fuzzing import LONGEST, within
 
-from datasets.cameras import read_cameras
-from datasets.images import files
-from datasets.images.headers import read_header
-from datasets.text import reading
-from datasets.text.reading import Search, read_bytes, read_lines, read_toml
-from stages.core.errors import InputError
+from rille.datasets.cameras import read_cameras
+from rille.datasets.images import files
+from rille.datasets.images.headers import read_header
+from rille.datasets.text import reading
+from rille.datasets.text.reading import Search, read_bytes, read_lines, read_toml
+from rille.stages.core.errors import InputError
 
 
 def refused(code, call, *args):

@@ -7,8 +7,8 @@ import pytest
 from folders import write_lines, write_sequence
 from raising import raises
 
-from datasets.registry import MANIFESTS, catalogue, open_sequence
-from pipeline.flow import config as configuration
+from rille.datasets.registry import MANIFESTS, catalogue, open_sequence
+from rille.pipeline.flow import config as configuration
 
 
 def test_every_listed_name_opens():
@@ -29,7 +29,7 @@ def test_every_listed_name_opens():
 
 
 def test_windows_of_successive_basic_pairs_overlap_by_more_than_half():
-    from stages.geometry.geometry import level_rotation
+    from rille.stages.geometry.geometry import level_rotation
 
     s = open_sequence("mockup")
     a, b = s.truth[0], s.truth[int(s.defaults["select.stride"])]

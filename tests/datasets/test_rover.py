@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from raising import raises
 
-from datasets.mockup.obstacle import on_path
-from datasets.mockup.rover import RoverParams, drive_leg, heading_of, images_at
-from datasets.mockup.sequence import vehicle_at_scale
-from stages.planning.wheels import Ground
+from rille.datasets.mockup.obstacle import on_path
+from rille.datasets.mockup.rover import RoverParams, drive_leg, heading_of, images_at
+from rille.datasets.mockup.sequence import vehicle_at_scale
+from rille.stages.planning.wheels import Ground
 
 VEHICLE = vehicle_at_scale()
 EXACT = RoverParams(slip=0.0, slip_sigma=0.0, heading_sigma_deg=0.0, turn_sigma=0.0)

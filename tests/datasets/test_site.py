@@ -7,9 +7,9 @@ import math
 import numpy as np
 import pytest
 
-from datasets.mockup.params import SceneParams
-from datasets.mockup.scene import build_scene
-from datasets.mockup.site import EDGE, prepare
+from rille.datasets.mockup.params import SceneParams
+from rille.datasets.mockup.scene import build_scene
+from rille.datasets.mockup.site import EDGE, prepare
 
 PAD = (0.0, 0.3, 0.15)
 

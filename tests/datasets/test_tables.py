@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from raising import raises
 
-from datasets.text.tables import read_table
+from rille.datasets.text.tables import read_table
 
 
 def table(tmp_path, text, encoding="utf-8"):

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from raising import raises
 
-from datasets.text.times import UNITS, gaps, seconds
-from stages.core.errors import InputError
+from rille.datasets.text.times import UNITS, gaps, seconds
+from rille.stages.core.errors import InputError
 
 
 @pytest.mark.parametrize(

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from datasets.georeference import Georeference
-from pipeline.export.writers import write_raster, write_trajectory_kitti
-from stages.geometry.lattice import Lattice
+from rille.datasets.georeference import Georeference
+from rille.pipeline.export.writers import write_raster, write_trajectory_kitti
+from rille.stages.geometry.lattice import Lattice
 
 LATTICE = Lattice.at(-20, 90, 0.05, 60, 70)
 PLACE = Georeference("EPSG:32633", (500100.0, 5200200.0, 1800.0), 0.6)

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from raising import raises
 
-import pipeline
-from pipeline import api
-from pipeline.engine import code_digest, events
+import rille
+from rille.pipeline import api
+from rille.pipeline.engine import code_digest, events
 
 MOCKUP = {"frames": 3, "image_width": 285, "image_height": 260, "focal_length": 300.0}
 STAGES = {"select": {"stride": 2}, "locus": {"cell_size": 0.004}, "hfvm": {"preset": "fast"}}
@@ -24,25 +24,25 @@ def digests(run: Path) -> dict[str, str]:
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> pipeline.Run:
+def run(tmp_path_factory: pytest.TempPathFactory) -> rille.Run:
     folder = tmp_path_factory.mktemp("api")
-    sequence = pipeline.open_sequence("mockup-short", mockup=MOCKUP)
+    sequence = rille.open_sequence("mockup-short", mockup=MOCKUP)
     places = {"runs": folder / "runs", "cache": folder / "cache"}
-    return pipeline.reconstruct(sequence, **places, executor="inline", **STAGES)  # type: ignore[arg-type]
+    return rille.reconstruct(sequence, **places, executor="inline", **STAGES)  # type: ignore[arg-type]
 
 
-def test_it_gives_the_digests_of_the_command_line(run: pipeline.Run) -> None:
+def test_it_gives_the_digests_of_the_command_line(run: rille.Run) -> None:
     folder = run.folder.parents[2]
     given = [f"--set={word}" for word in api.assignments({"mockup": MOCKUP, **STAGES})]
     where = ["--runs", str(folder / "again"), "--cache", str(folder / "cache"), "--executor", "inline", "--quiet"]
-    command = [sys.executable, "-m", "pipeline.cli", "reconstruct", "mockup-short", *given, *where]
+    command = [sys.executable, "-m", "rille.pipeline.cli", "reconstruct", "mockup-short", *given, *where]
     said = subprocess.run(command, check=True, capture_output=True, text=True).stdout
     assert "computed 0," in said, "all that it needs was computed from Python"
     assert digests(folder / "again/mockup-short/latest") == digests(run.folder)
     assert len(digests(run.folder)) > 30
 
 
-def test_terrain_and_trajectory_have_coordinates_and_units(run: pipeline.Run) -> None:
+def test_terrain_and_trajectory_have_coordinates_and_units(run: rille.Run) -> None:
     assert run.complete, run.report["missing"]
     terrain = run.terrain
     assert set(terrain.elevation.dims) == {"x", "y"}
@@ -60,10 +60,10 @@ def test_terrain_and_trajectory_have_coordinates_and_units(run: pipeline.Run) ->
     assert run.metrics["trajectory_drift"]["unit"] == "%"
 
 
-def test_a_run_is_opened_and_shown(run: pipeline.Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    again = pipeline.open_run("mockup-short", run.folder.parents[1])
+def test_a_run_is_opened_and_shown(run: rille.Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    again = rille.open_run("mockup-short", run.folder.parents[1])
     assert again == run
-    assert pipeline.open_run(run.folder) == run
+    assert rille.open_run(run.folder) == run
     shown: list[str] = []
     monkeypatch.setattr(api.webbrowser, "open", shown.append)
     again.show()
@@ -71,15 +71,15 @@ def test_a_run_is_opened_and_shown(run: pipeline.Run, monkeypatch: pytest.Monkey
 
 
 def test_what_cannot_be_is_one_clear_line(tmp_path: Path) -> None:
-    sequence = pipeline.open_sequence("mockup-short", mockup=MOCKUP)
+    sequence = rille.open_sequence("mockup-short", mockup=MOCKUP)
     with raises("RIL-860"):
-        pipeline.reconstruct(sequence, runs=tmp_path, cache=tmp_path / "cache", mockup={"frames": 4})
+        rille.reconstruct(sequence, runs=tmp_path, cache=tmp_path / "cache", mockup={"frames": 4})
     with raises("RIL-861"):
-        pipeline.reconstruct(sequence, locus=0.002)  # type: ignore[arg-type]
+        rille.reconstruct(sequence, locus=0.002)  # type: ignore[arg-type]
     with raises("RIL-862"):
-        _ = pipeline.Run(tmp_path).terrain
+        _ = rille.Run(tmp_path).terrain
     with pytest.raises(AttributeError):
-        _ = pipeline.nothing
+        _ = rille.nothing
 
 
 def test_its_examples_run() -> None:
@@ -89,20 +89,20 @@ def test_its_examples_run() -> None:
 
 
 def test_no_stage_of_the_package_depends_on_it() -> None:
-    assert "pipeline" in (found := code_digest.module_digests("pipeline.engine.plain"))
-    assert "pipeline.api" not in found
+    assert "rille.pipeline" in (found := code_digest.module_digests("rille.pipeline.engine.plain"))
+    assert "rille.pipeline.api" not in found
 
 
 @pytest.mark.slow
-def test_a_client_that_is_handed_in_computes_the_same_bits(run: pipeline.Run, tmp_path: Path) -> None:
+def test_a_client_that_is_handed_in_computes_the_same_bits(run: rille.Run, tmp_path: Path) -> None:
     from distributed import Client, LocalCluster
 
-    sequence = pipeline.open_sequence("mockup-short", mockup=MOCKUP)
+    sequence = rille.open_sequence("mockup-short", mockup=MOCKUP)
     with (
         LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=":0") as cluster,
         Client(cluster) as client,
     ):
-        again = pipeline.reconstruct(sequence, client, runs=tmp_path / "runs", cache=tmp_path / "cache", **STAGES)  # type: ignore[arg-type]
+        again = rille.reconstruct(sequence, client, runs=tmp_path / "runs", cache=tmp_path / "cache", **STAGES)  # type: ignore[arg-type]
     statuses = {row["status"] for row in events.read(again.folder / "ledger.jsonl")}
     assert statuses == {"computed"}
     assert digests(again.folder) == digests(run.folder)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from raising import raises
 
-from pipeline.runs import session
+from rille.pipeline.runs import session
 
 pytestmark = pytest.mark.slow
 

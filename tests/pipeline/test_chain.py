@@ -18,13 +18,13 @@ import rasterio
 import xarray
 from raising import raises
 
-from pipeline.engine.events import read
-from pipeline.engine.store.base import Store
-from pipeline.engine.store.maintenance import artifacts
-from pipeline.engine.store.manifest import length, reference, unframe
-from pipeline.report import gallery
-from pipeline.report.block import Figure
-from pipeline.runs import session
+from rille.pipeline.engine.events import read
+from rille.pipeline.engine.store.base import Store
+from rille.pipeline.engine.store.maintenance import artifacts
+from rille.pipeline.engine.store.manifest import length, reference, unframe
+from rille.pipeline.report import gallery
+from rille.pipeline.report.block import Figure
+from rille.pipeline.runs import session
 
 SMALL = (
     "mockup.frames=5",
@@ -113,7 +113,7 @@ def test_the_same_again_computes_nothing(cold: Path, monkeypatch: pytest.MonkeyP
     def no_worker(*args: object, **kw: object) -> None:
         raise AssertionError("a worker was started")
 
-    monkeypatch.setattr("pipeline.engine.scheduler.make", no_worker)
+    monkeypatch.setattr("rille.pipeline.engine.scheduler.make", no_worker)
     before = digests(cold)
     assert session.reconstruct(options(cold, executor="processes")) == 0
     assert computed(cold) == set()
@@ -211,7 +211,7 @@ def test_written_configuration_repeats_the_run(cold: Path) -> None:
 
 def test_two_workers_killed_on_the_way_give_the_same_bits(cold: Path, tmp_path: Path) -> None:
     assert session.reconstruct(options(cold)) == 0
-    command = [sys.executable, "-m", "pipeline.cli", "reconstruct", "mockup-short", "--jobs", "2", "--quiet"]
+    command = [sys.executable, "-m", "rille.pipeline.cli", "reconstruct", "mockup-short", "--jobs", "2", "--quiet"]
     command += [w for a in SMALL for w in ("--set", a)]
     command += ["--cache", str(tmp_path / "cache"), "--runs", str(tmp_path / "runs")]
     process = subprocess.Popen(command, start_new_session=True, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)

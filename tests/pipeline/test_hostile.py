@@ -53,7 +53,7 @@ def folder(tmp_path):
 
 def rille(folder, *words):
     """Exit code, lines on stderr and peak memory of a program, kB."""
-    argv = [sys.executable, "-m", "pipeline.cli", *map(str, words)]
+    argv = [sys.executable, "-m", "rille.pipeline.cli", *map(str, words)]
     root = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
     env = os.environ | {"PYTHONPATH": root}
     before = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss

@@ -1,7 +1,7 @@
 """Ctrl-C in a command: the documented sentence, and exit code 130."""
 
-from pipeline import cli
-from pipeline.runs import session
+from rille.pipeline import cli
+from rille.pipeline.runs import session
 
 
 def test_ctrl_c_says_what_the_documents_say(monkeypatch, capsys):

@@ -7,10 +7,10 @@ from typing import Any
 
 import pytest
 
-from datasets.registry import open_sequence
-from pipeline.engine.graph import Graph
-from pipeline.flow import config
-from pipeline.flow.closed_loop import Drive, dataflow
+from rille.datasets.registry import open_sequence
+from rille.pipeline.engine.graph import Graph
+from rille.pipeline.flow import config
+from rille.pipeline.flow.closed_loop import Drive, dataflow
 
 HERE = [1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0]
 BOX = {"x0": 0.0, "y0": 0.0, "cell": 0.01, "rows": 4, "cols": 4}

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from toys import dem
 
-from pipeline.engine import events, scheduler
-from pipeline.engine.graph import Graph
-from pipeline.engine.store.base import Store
-from pipeline.flow.builders import merge_tiles
-from stages.core.declare import NoParams
-from stages.terrain import merge, tile_index
-from stages.terrain.merge import MergeParams
+from rille.pipeline.engine import events, scheduler
+from rille.pipeline.engine.graph import Graph
+from rille.pipeline.engine.store.base import Store
+from rille.pipeline.flow.builders import merge_tiles
+from rille.stages.core.declare import NoParams
+from rille.stages.terrain import merge, tile_index
+from rille.stages.terrain.merge import MergeParams
 
 SIDE = 16
 PLACES = {0: (0, 0), 4: (9, 3), 8: (22, -5), 12: (40, 2), 16: (-14, -30), 20: (33, -28)}
@@ -95,7 +95,7 @@ def test_order_of_models_and_number_of_workers_change_no_bit(tmp_path: Path, hol
 
 def test_closed_holes_do_not_see_the_cut_into_tiles(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The same world cut otherwise is the same, to the bit, though holes lie across the cuts."""
-    from stages.geometry.lattice import Lattice, mosaic
+    from rille.stages.geometry.lattice import Lattice, mosaic
 
     all_ = Lattice.at(-20, 10, 0.5, 70, 90)
 

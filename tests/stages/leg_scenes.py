@@ -6,13 +6,13 @@ import math
 
 import numpy as np
 
-from stages.geometry.geometry import Camera, Rig, RigidTransform
-from stages.geometry.lattice import Lattice
-from stages.hazard.risk import SAFE
-from stages.hazard.vehicle import Vehicle
-from stages.planning.local_planner.clearance import Footing
-from stages.planning.local_planner.params import LegParams
-from stages.planning.local_planner.views import View
+from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
+from rille.stages.geometry.lattice import Lattice
+from rille.stages.hazard.risk import SAFE
+from rille.stages.hazard.vehicle import Vehicle
+from rille.stages.planning.local_planner.clearance import Footing
+from rille.stages.planning.local_planner.params import LegParams
+from rille.stages.planning.local_planner.views import View
 
 ROVER = Vehicle(
     wheel_diameter=0.03, track=0.08, wheel_base=0.10, clearance=0.025, max_step=0.012, max_roughness=0.004, margin=0.01

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
+from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
 
 
 class Texture:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from stages.core.declare import Bundle
-from stages.core.validity import Validity
-from stages.geometry.geometry import Camera
+from rille.stages.core.declare import Bundle
+from rille.stages.core.validity import Validity
+from rille.stages.geometry.geometry import Camera
 
 CAMERA = Camera(300.0, 300.0, 239.5, 159.5, 480, 320)
 LEVEL = 2

@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 
-from stages.calibration.relative_orientation import Matches
-from stages.geometry.epipolar import corrected
-from stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
+from rille.stages.calibration.relative_orientation import Matches
+from rille.stages.geometry.epipolar import corrected
+from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
 
 
 def street_rig() -> Rig:

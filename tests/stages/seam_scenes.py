@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from stages.core.declare import Bundle
-from stages.geometry.lattice import Lattice
+from rille.stages.core.declare import Bundle
+from rille.stages.geometry.lattice import Lattice
 
 CELL = 0.005
 SIGMA = 0.0005

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from stages.geometry.geometry import Camera, Rig, RigidTransform, level_rotation, rotation_exp
+from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, level_rotation, rotation_exp
 
 SIZE = (240, 320)
 

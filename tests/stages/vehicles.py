@@ -1,6 +1,6 @@
 """Vehicles that several tests put on their ground."""
 
-from stages.hazard.vehicle import Vehicle
+from rille.stages.hazard.vehicle import Vehicle
 
 MODEL = Vehicle(
     name="model",

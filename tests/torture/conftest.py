@@ -92,7 +92,7 @@ class Program:
 def programs(tmp_path_factory: pytest.TempPathFactory):
     """``programs(n)`` gives n of them; they are kept for all tests."""
     made: list[Program] = []
-    from pipeline.engine.runtime.environment import worker_environment
+    from rille.pipeline.engine.runtime.environment import worker_environment
 
     folder = tmp_path_factory.mktemp("programs")
     environment = {**os.environ, **worker_environment(), "PYTHONPATH": os.pathsep.join(PLACES)}

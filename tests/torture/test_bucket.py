@@ -9,10 +9,10 @@ import servers
 from raising import raises
 from torn import chain, look
 
-from pipeline.engine import scheduler
-from pipeline.engine.graph import Graph
-from pipeline.engine.store import s3 as requests
-from pipeline.engine.store.base import at
+from rille.pipeline.engine import scheduler
+from rille.pipeline.engine.graph import Graph
+from rille.pipeline.engine.store import s3 as requests
+from rille.pipeline.engine.store.base import at
 
 METHODS = {"refuse": ("GET", "PUT", "POST"), "deafen": ("PUT",), "cut": ("GET",)}
 WORDS = {

@@ -15,13 +15,13 @@ import pytest
 from torn import chain, look
 from torn.faults import Faults
 
-from pipeline.engine import scheduler
-from pipeline.engine.graph import Graph
-from pipeline.engine.store import folder, maintenance
-from pipeline.engine.store.base import NonDeterministicError, Store
-from pipeline.engine.store.folder import StoreError
-from pipeline.engine.store.manifest import artifact_path
-from stages.core.declare import NoParams
+from rille.pipeline.engine import scheduler
+from rille.pipeline.engine.graph import Graph
+from rille.pipeline.engine.store import folder, maintenance
+from rille.pipeline.engine.store.base import NonDeterministicError, Store
+from rille.pipeline.engine.store.folder import StoreError
+from rille.pipeline.engine.store.manifest import artifact_path
+from rille.stages.core.declare import NoParams
 
 WAYS = {
     "truncate": lambda data, rng: data[: rng.randrange(len(data))],

@@ -13,8 +13,8 @@ import psutil
 import pytest
 from torn import look
 
-from pipeline.engine.store import maintenance
-from pipeline.engine.store.base import Store
+from rille.pipeline.engine.store import maintenance
+from rille.pipeline.engine.store.base import Store
 
 WITHIN = 5.0
 """Seconds that an interrupted program may take to leave; held to where all cases are tried."""

@@ -19,11 +19,11 @@ import xarray
 from test_damage import WAYS
 from torn import look
 
-from pipeline.engine import events
-from pipeline.engine.store.artifact import DamagedError, array_digests, output_digest
-from pipeline.engine.store.base import Store
-from pipeline.engine.store.maintenance import artifacts
-from pipeline.engine.store.manifest import artifact_path, reference
+from rille.pipeline.engine import events
+from rille.pipeline.engine.store.artifact import DamagedError, array_digests, output_digest
+from rille.pipeline.engine.store.base import Store
+from rille.pipeline.engine.store.maintenance import artifacts
+from rille.pipeline.engine.store.manifest import artifact_path, reference
 
 SMALL = (
     *("mockup.frames=5", "mockup.image_width=285", "mockup.image_height=260", "mockup.focal_length=300.0"),
@@ -34,7 +34,17 @@ pytestmark = pytest.mark.slow
 
 
 def command(where, *more, progress="quiet"):
-    words = [sys.executable, "-m", "pipeline.cli", "reconstruct", "mockup-short", "--jobs", "2", "--progress", progress]
+    words = [
+        sys.executable,
+        "-m",
+        "rille.pipeline.cli",
+        "reconstruct",
+        "mockup-short",
+        "--jobs",
+        "2",
+        "--progress",
+        progress,
+    ]
     words += [w for a in SMALL for w in ("--set", a)]
     return [*words, "--cache", str(where / "cache"), "--runs", str(where / "runs"), *more]
 
@@ -202,6 +212,6 @@ def test_workers_killed_mid_tile(whole, tmp_path, row):
 
 
 def upkeep_finds_nothing(cache):
-    from pipeline.engine.store import maintenance
+    from rille.pipeline.engine.store import maintenance
 
     return maintenance.verify(Store(cache), deep=True)[1] == []

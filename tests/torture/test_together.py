@@ -10,7 +10,7 @@ import time
 import pytest
 from torn import look
 
-from pipeline.engine import events
+from rille.pipeline.engine import events
 
 RUNS = 3
 

@@ -1,12 +1,12 @@
 """Where tasks run: in this process, on its threads, on worker processes, or on a running dask cluster.
 
 :func:`make` is the one factory. All executors are the same three verbs: ``submit``, ``wait``, ``close``. Processes of
-this machine are :mod:`pipeline.engine.executors.processes`: a task costs them tenths of a millisecond beside itself,
-where distributed's scheduler takes seven of a core that the workers need. A cluster given by address is dask's, and
-examined first (:mod:`pipeline.engine.executors.dask_cluster`).
+this machine are :mod:`rille.pipeline.engine.executors.processes`: a task costs them tenths of a millisecond beside
+itself, where distributed's scheduler takes seven of a core that the workers need. A cluster given by address is dask's,
+and examined first (:mod:`rille.pipeline.engine.executors.dask_cluster`).
 
-Programs call :func:`pipeline.engine.runtime.environment.prepare_environment` first thing, so that this process and the
-workers run alike.
+Programs call :func:`rille.pipeline.engine.runtime.environment.prepare_environment` first thing, so that this process
+and the workers run alike.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from pipeline.engine.executors import dask_cluster
-from pipeline.engine.executors.processes import WorkerDiedError, Workers, died
-from pipeline.engine.runtime.environment import cores, prepare_environment
-from pipeline.engine.store.location import Location
-from pipeline.engine.task import Outcome, Refs, Spec, ensure, resolve
-from stages.core.errors import ConfigError, RilleError
+from rille.pipeline.engine.executors import dask_cluster
+from rille.pipeline.engine.executors.processes import WorkerDiedError, Workers, died
+from rille.pipeline.engine.runtime.environment import cores, prepare_environment
+from rille.pipeline.engine.store.location import Location
+from rille.pipeline.engine.task import Outcome, Refs, Spec, ensure, resolve
+from rille.stages.core.errors import ConfigError, RilleError
 
 __all__ = ["Executor", "Failed", "WorkerDiedError", "make", "prepare_environment"]
 
@@ -74,7 +74,7 @@ Landed = list[tuple[str, Outcome | Failed]]
 
 
 class Executor(Protocol):
-    """Runs :func:`~pipeline.engine.task.ensure`; ``key`` names the task."""
+    """Runs :func:`~rille.pipeline.engine.task.ensure`; ``key`` names the task."""
 
     def idle(self) -> bool:
         """Whether one more task would start at once."""
@@ -259,7 +259,7 @@ class _Client(_Futures):
 
 class Cluster(_Client):
     """A dask scheduler that is running already, with workers like this process
-    (:mod:`pipeline.engine.executors.dask_cluster`)."""
+    (:mod:`rille.pipeline.engine.executors.dask_cluster`)."""
 
     def __init__(self, address: str, cache: Location) -> None:
         super().__init__(address)
@@ -300,7 +300,7 @@ def _elsewhere(
 
 
 class Processes:
-    """Worker processes of our own, one thread each (:mod:`pipeline.engine.executors.processes`)."""
+    """Worker processes of our own, one thread each (:mod:`rille.pipeline.engine.executors.processes`)."""
 
     def __init__(self, jobs: int, cache: Location, memory: float = math.inf, modules: Sequence[str] = ()) -> None:
         self._workers = Workers(jobs, _attempt, memory, resolve, modules)

@@ -21,13 +21,13 @@ from functools import lru_cache
 from importlib import metadata
 from typing import Any
 
-from pipeline.engine.code_digest import OWN, tree_digest
-from pipeline.engine.packages import version
-from pipeline.engine.runtime.environment import prepare_environment
-from pipeline.engine.store.base import Store, at
-from pipeline.engine.store.location import Location
-from pipeline.engine.task import CodeChangedError
-from stages.core.errors import ConfigError, RilleError
+from rille.pipeline.engine.code_digest import OWN, tree_digest
+from rille.pipeline.engine.packages import version
+from rille.pipeline.engine.runtime.environment import prepare_environment
+from rille.pipeline.engine.store.base import Store, at
+from rille.pipeline.engine.store.location import Location
+from rille.pipeline.engine.task import CodeChangedError
+from rille.stages.core.errors import ConfigError, RilleError
 
 PACKAGES = (
     *("dask", "distributed", "google-crc32c", "llvmlite", "numba", "numcodecs", "numpy", "obstore", "pydantic", "zarr"),
@@ -52,7 +52,7 @@ class ClusterError(RilleError):
 
 def identity() -> dict[str, str]:
     """What must be the same on client and workers, by name; a package that is missing has no version."""
-    found = {"Python": platform.python_version(), "source code": tree_digest((*OWN, "pipeline"))[:12]}
+    found = {"Python": platform.python_version(), "source code": tree_digest((*OWN, "rille.pipeline"))[:12]}
     for name in PACKAGES:
         try:
             found[name] = version(name)

@@ -21,10 +21,10 @@ from typing import Any
 
 import psutil
 
-from pipeline.engine.code_digest import remember_in
-from pipeline.engine.runtime.environment import worker_environment
-from pipeline.engine.runtime.private import private_folder
-from stages.core.errors import RilleError
+from rille.pipeline.engine.code_digest import remember_in
+from rille.pipeline.engine.runtime.environment import worker_environment
+from rille.pipeline.engine.runtime.private import private_folder
+from rille.stages.core.errors import RilleError
 
 DEATHS = 3
 """Worker processes that one task may take along."""

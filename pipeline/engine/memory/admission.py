@@ -1,9 +1,10 @@
 """Which task may begin: those of a run together stay under a limit of memory, and in the order of their creation.
 
 What is held: by this process, by each worker between tasks, and by each running task as foreseen
-(:mod:`pipeline.engine.memory.cost_model`). A task begins where the sum stays under the limit; a later one may pass one
-that has to wait, but not for ever. One that does not fit even alone is refused, with the parameter that makes it
-smaller. On a cluster given by address the memory is the workers' own business, unless a limit is given for all of it.
+(:mod:`rille.pipeline.engine.memory.cost_model`). A task begins where the sum stays under the limit; a later one may
+pass one that has to wait, but not for ever. One that does not fit even alone is refused, with the parameter that makes
+it smaller. On a cluster given by address the memory is the workers' own business, unless a limit is given for all of
+it.
 """
 
 from __future__ import annotations
@@ -14,11 +15,11 @@ import time
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 
-from pipeline.engine.graph import Graph, Handle
-from pipeline.engine.memory import limits
-from pipeline.engine.memory.cost_model import Costs, Foreseen, input_bytes
-from pipeline.engine.memory.limits import words
-from stages.core.errors import ConfigError
+from rille.pipeline.engine.graph import Graph, Handle
+from rille.pipeline.engine.memory import limits
+from rille.pipeline.engine.memory.cost_model import Costs, Foreseen, input_bytes
+from rille.pipeline.engine.memory.limits import words
+from rille.stages.core.errors import ConfigError
 
 PATIENCE = 8
 """Tasks that may pass one that waits for memory."""

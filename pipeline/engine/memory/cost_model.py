@@ -17,13 +17,13 @@ from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
-from pipeline.engine.keys import digest
-from pipeline.engine.runtime import atomic
-from stages.core.declare import Params
+from rille.pipeline.engine.keys import digest
+from rille.pipeline.engine.runtime import atomic
+from rille.stages.core.declare import Params
 
 if TYPE_CHECKING:
-    from pipeline.engine.graph import Handle
-    from pipeline.engine.task import Spec
+    from rille.pipeline.engine.graph import Handle
+    from rille.pipeline.engine.task import Spec
 
 FILE = "costs.json"
 KEPT = 64

@@ -21,7 +21,7 @@ from typing import Any
 
 import psutil
 
-from stages.core.errors import ConfigError
+from rille.stages.core.errors import ConfigError
 
 SHARE = 0.9
 """Part of what is free that a run takes by itself: page cache for its files, and others that grow, need the rest."""

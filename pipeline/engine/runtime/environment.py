@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import os
 
-from pipeline.engine.code_digest import remember_in
-from pipeline.engine.runtime.numba_cache import guard
-from pipeline.engine.runtime.private import private_folder
+from rille.pipeline.engine.code_digest import remember_in
+from rille.pipeline.engine.runtime.numba_cache import guard
+from rille.pipeline.engine.runtime.private import private_folder
 
 SINGLE = ("OMP", "OPENBLAS", "MKL", "NUMBA", "BLIS", "VECLIB_MAXIMUM", "NUMEXPR")
 

@@ -5,12 +5,12 @@ has changed (numba#1833), it trusts what it finds (a file cut short fails every 
 and two processes that compile two signatures of one function at once may both take the same number. Here
 
 - a kernel is known by the digest of its module and of all own modules that this one reaches
-(:mod:`pipeline.engine.code_digest`), so
+(:mod:`rille.pipeline.engine.code_digest`), so
   that an edit compiles anew what it can change, and nothing else;
 - each entry is a file of its own, named by its key; it holds the key and a checksum, against damage;
 - of processes that need the same kernel at once one compiles it, the others wait and load it;
 - a kernel has no wrapper for callers in C: nobody calls it, and small kernels compile a sixth to a quarter faster;
-- all lie in :func:`pipeline.engine.runtime.private.private_folder`, because loading one executes it.
+- all lie in :func:`rille.pipeline.engine.runtime.private.private_folder`, because loading one executes it.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ from pathlib import Path
 from types import CodeType, ModuleType
 from typing import Any
 
-from pipeline.engine.code_digest import OWN, code_digest
-from pipeline.engine.runtime.private import private_folder
+from rille.pipeline.engine.code_digest import OWN, code_digest, package_of
+from rille.pipeline.engine.runtime.private import private_folder
 
 DISPATCHER = "numba.core.dispatcher"
 """Imports ``numba.core.caching``; nothing is compiled before it is there."""
@@ -186,7 +186,7 @@ class _Locator:
 
 
 def _is_own(function: Any) -> bool:
-    return function.__module__.partition(".")[0] in OWN
+    return package_of(function.__module__) in OWN
 
 
 def _content(code: CodeType) -> tuple[object, ...]:

@@ -19,11 +19,11 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.engine.keys import canonical, digest
-from pipeline.engine.store import cf_coordinates
-from pipeline.engine.store.manifest import checksum
-from stages.core.declare import AnyArray, Array, Bundle, Stage
-from stages.core.errors import RilleError
+from rille.pipeline.engine.keys import canonical, digest
+from rille.pipeline.engine.store import cf_coordinates
+from rille.pipeline.engine.store.manifest import checksum
+from rille.stages.core.declare import AnyArray, Array, Bundle, Stage
+from rille.stages.core.errors import RilleError
 
 CHUNK = 1024
 """Greatest chunk edge, cells: 4 MB of float32, so that a usual image is a few files to write and to sync."""

@@ -4,22 +4,22 @@ Files, in the cache folder or below the prefix of a bucket::
 
     artifacts/<stage>/<k>/<key>.zarr.zip    an artifact, one file; <k> are the key's first two digits
     quarantine/<stage>-<key>-<unique>.*     a damaged artifact, and the reason, set aside
-    index/<sequence>/<digest>               what a run used (pipeline.engine.store.index)
+    index/<sequence>/<digest>               what a run used (rille.pipeline.engine.store.index)
     rille.json                              the format
 
-and on this machine (:func:`~pipeline.engine.store.location.hints_folder`)::
+and on this machine (:func:`~rille.pipeline.engine.store.location.hints_folder`)::
 
     hints/<sequence>/                       of its earlier runs, for explanations and estimates; never a matter
                                             of correctness
     pins/<run>.json                         keys that clearing up leaves alone
     roots/<digest>.json                     folders of runs that use the cache
 
-The file of an artifact (:mod:`pipeline.engine.store.manifest`) is its own commit: it is on the disk as a whole before
-it gets its name, and gets it only if nobody has it (a link; in a bucket ``If-None-Match: *``). Killed at any instant, a
-run leaves a whole artifact or none. Of two that commit one key the second is compared and thrown away: another digest
-is a :class:`NonDeterministicError`. The size of the file is compared at each look-up, checksums of what is read on each
-reading, and all of them by :func:`pipeline.engine.store.maintenance.verify`. What is damaged is set aside, counts as
-absent and is computed again.
+The file of an artifact (:mod:`rille.pipeline.engine.store.manifest`) is its own commit: it is on the disk as a whole
+before it gets its name, and gets it only if nobody has it (a link; in a bucket ``If-None-Match: *``). Killed at any
+instant, a run leaves a whole artifact or none. Of two that commit one key the second is compared and thrown away:
+another digest is a :class:`NonDeterministicError`. The size of the file is compared at each look-up, checksums of what
+is read on each reading, and all of them by :func:`rille.pipeline.engine.store.maintenance.verify`. What is damaged is
+set aside, counts as absent and is computed again.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from pipeline.engine.store.artifact import LazyArrays, array_digests, encode, output_digest
-from pipeline.engine.store.folder import Folder, StoreError
-from pipeline.engine.store.index import Index
-from pipeline.engine.store.location import Location, hints_folder, locate
-from pipeline.engine.store.manifest import (
+from rille.pipeline.engine.store.artifact import LazyArrays, array_digests, encode, output_digest
+from rille.pipeline.engine.store.folder import Folder, StoreError
+from rille.pipeline.engine.store.index import Index
+from rille.pipeline.engine.store.location import Location, hints_folder, locate
+from rille.pipeline.engine.store.manifest import (
     FIRST,
     Manifest,
     Ref,
@@ -48,9 +48,9 @@ from pipeline.engine.store.manifest import (
     reference,
     unframe,
 )
-from pipeline.engine.store.place import Place
-from stages.core.declare import Bundle, Stage
-from stages.core.errors import RilleError
+from rille.pipeline.engine.store.place import Place
+from rille.stages.core.declare import Bundle, Stage
+from rille.stages.core.errors import RilleError
 
 
 class NonDeterministicError(RilleError):
@@ -245,7 +245,7 @@ class Store:
 def _place(location: Location) -> Place:
     if isinstance(location, Path):
         return Folder(location)
-    from pipeline.engine.store.s3 import connect
+    from rille.pipeline.engine.store.s3 import connect
 
     return connect(location)
 

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.core.declare import Stage
-from stages.geometry.lattice import Lattice
+from rille.stages.core.declare import Stage
+from rille.stages.geometry.lattice import Lattice
 
 DIMS = ["row", "col"]
 

@@ -1,4 +1,4 @@
-"""A folder that holds the files of a store; see :class:`~pipeline.engine.store.place.Place`."""
+"""A folder that holds the files of a store; see :class:`~rille.pipeline.engine.store.place.Place`."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from pipeline.engine.runtime import atomic
-from pipeline.engine.store.place import FORMAT, MARK, Item
-from stages.core.errors import RilleError
+from rille.pipeline.engine.runtime import atomic
+from rille.pipeline.engine.store.place import FORMAT, MARK, Item
+from rille.stages.core.errors import RilleError
 
 
 class StoreError(RilleError):

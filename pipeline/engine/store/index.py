@@ -1,9 +1,9 @@
 """What the runs of a sequence found in a store: manifests that nobody touched since need not be read again.
 
 A hint beside the artifacts, ``index/<sequence>/<name>``, written at the end of a run: a gzip of lines, one for each
-artifact that it used, with the mark of its file (:class:`~pipeline.engine.store.place.Item`) and what the manifest says
-of digest, sizes and facts. Where the mark is another one, or the index is damaged, the manifest is read as if there
-were no index. Clearing up spares what an index names that is younger than its grace.
+artifact that it used, with the mark of its file (:class:`~rille.pipeline.engine.store.place.Item`) and what the
+manifest says of digest, sizes and facts. Where the mark is another one, or the index is damaged, the manifest is read
+as if there were no index. Clearing up spares what an index names that is younger than its grace.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ import zlib
 from collections.abc import Iterable, Mapping
 from urllib.parse import quote
 
-from pipeline.engine.store.manifest import Ref, parsed
-from pipeline.engine.store.place import Item, Place
-from stages.core.errors import RilleError
+from rille.pipeline.engine.store.manifest import Ref, parsed
+from rille.pipeline.engine.store.place import Item, Place
+from rille.stages.core.errors import RilleError
 
 AREA = "index"
 

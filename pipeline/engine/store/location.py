@@ -11,7 +11,7 @@ import re
 from pathlib import Path
 from urllib.parse import urlsplit
 
-from stages.core.errors import ConfigError
+from rille.stages.core.errors import ConfigError
 
 Location = Path | str
 """A folder, or the URL of a bucket with a prefix."""

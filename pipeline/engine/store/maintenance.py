@@ -9,11 +9,11 @@ from collections.abc import Collection, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 
-from pipeline.engine.runtime import numba_cache
-from pipeline.engine.store import index
-from pipeline.engine.store.artifact import DamagedError, LazyArrays, array_digests, output_digest
-from pipeline.engine.store.base import Store
-from pipeline.engine.store.manifest import STAGE, Manifest, artifact_path, damage, length, unframe
+from rille.pipeline.engine.runtime import numba_cache
+from rille.pipeline.engine.store import index
+from rille.pipeline.engine.store.artifact import DamagedError, LazyArrays, array_digests, output_digest
+from rille.pipeline.engine.store.base import Store
+from rille.pipeline.engine.store.manifest import STAGE, Manifest, artifact_path, damage, length, unframe
 
 GRACE = 24 * 3600.0
 """Seconds before what no run is known to use goes: no single task takes a day."""
@@ -96,8 +96,8 @@ def gc(store: Store, keep: Collection[str], *, grace: float = GRACE, dry_run: bo
     """Remove artifacts whose key is not in ``keep``, leftovers, quarantine, and this user's kernels that nothing uses.
 
     Only what was neither made nor used within ``grace`` seconds goes (a run may be under way); what a run used is told
-    by its index. ``keep`` are the keys of the kept runs (:func:`pipeline.engine.events.keys`). The ages of a bucket are
-    by the server's clock against this machine's: keep the grace well above their difference.
+    by its index. ``keep`` are the keys of the kept runs (:func:`rille.pipeline.engine.events.keys`). The ages of a
+    bucket are by the server's clock against this machine's: keep the grace well above their difference.
     """
     limit, cleared, doomed = time.time() - grace, Cleared(), []
     kept = set(keep) | index.used_since(store.place, limit)

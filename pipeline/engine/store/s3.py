@@ -23,8 +23,8 @@ from datetime import timedelta
 from functools import lru_cache
 from typing import Any, TypeVar
 
-from pipeline.engine.store.place import FORMAT, MARK, Item
-from stages.core.errors import ConfigError, RilleError
+from rille.pipeline.engine.store.place import FORMAT, MARK, Item
+from rille.stages.core.errors import ConfigError, RilleError
 
 AT_ONCE = 200
 """Objects deleted in one go."""
@@ -51,7 +51,8 @@ class OddNameError(BucketError):
 
 
 class Bucket:
-    """Objects below a prefix, and the credentials to reach it; see :class:`~pipeline.engine.store.place.Place`."""
+    """Objects below a prefix, and the credentials to reach it; see
+    :class:`~rille.pipeline.engine.store.place.Place`."""
 
     slow = True
 

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stages.core.declare import AnyArray
-from stages.hfvm.coarse_to_fine import compact, paths
-from stages.hfvm.coarse_to_fine.hierarchy import Band, FastSolver, Fine, Map, Solver, solver
-from stages.hfvm.images.params import HfvmParams
-from stages.hfvm.images.views import Patch
-from stages.hfvm.images.window import Shape
+from rille.stages.core.declare import AnyArray
+from rille.stages.hfvm.coarse_to_fine import compact, paths
+from rille.stages.hfvm.coarse_to_fine.hierarchy import Band, FastSolver, Fine, Map, Solver, solver
+from rille.stages.hfvm.images.params import HfvmParams
+from rille.stages.hfvm.images.views import Patch
+from rille.stages.hfvm.images.window import Shape
 
 
 @dataclass(frozen=True)

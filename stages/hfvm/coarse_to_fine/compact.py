@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from stages.core.declare import AnyArray
-from stages.hfvm.level.features import Words
+from rille.stages.core.declare import AnyArray
+from rille.stages.hfvm.level.features import Words
 
 NEIGHBOURS = ((0, -1), (0, 1), (-1, 0), (1, 0), (-1, -1), (-1, 1), (1, -1), (1, 1))
 """Rows and columns to the neighbour of each byte, lowest byte first."""

@@ -18,10 +18,10 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.core.declare import AnyArray
-from stages.hfvm.images.params import HfvmParams
-from stages.hfvm.images.views import Patch, Plain, Seen
-from stages.hfvm.images.window import (
+from rille.stages.core.declare import AnyArray
+from rille.stages.hfvm.images.params import HfvmParams
+from rille.stages.hfvm.images.views import Patch, Plain, Seen
+from rille.stages.hfvm.images.window import (
     Raster,
     Results,
     Shape,
@@ -35,9 +35,9 @@ from stages.hfvm.images.window import (
     tiles,
     whole,
 )
-from stages.hfvm.level import consistency, epipolar, paper, propagation, search, subpixel, subpixel_lut
-from stages.hfvm.level.simd import SUM_RADIUS
-from stages.imaging.pyramid import Pyramid
+from rille.stages.hfvm.level import consistency, epipolar, paper, propagation, search, subpixel, subpixel_lut
+from rille.stages.hfvm.level.simd import SUM_RADIUS
+from rille.stages.imaging.pyramid import Pyramid
 
 FIT_SAMPLES = 500
 """Matches that a band or plane is fitted to; more change nothing that matters and cost time."""
@@ -214,7 +214,8 @@ class PaperSolver:
     def search(
         self, a: Patch, b: Patch, cu: AnyArray, cv: AnyArray, reach_x: int, reach_y: int
     ) -> tuple[AnyArray, ...]:
-        """Displacements, distance, and sub-pixel offsets (row, col, 2) of :func:`stages.hfvm.level.paper.search`."""
+        """Displacements, distance, and sub-pixel offsets (row, col, 2) of
+        :func:`rille.stages.hfvm.level.paper.search`."""
         shape = a.window.shape
         u, v = np.empty(shape, np.int16), np.empty(shape, np.int16)
         distance, found = np.empty(shape, np.float32), np.empty((*shape, 2), np.float32)

@@ -14,7 +14,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from stages.hfvm.level import simd
+from rille.stages.hfvm.level import simd
 
 MOST = 8
 """Candidates a pixel; further ones are left out. Sixteen cost twice the time and change bad-2 by less than .002."""

@@ -7,7 +7,7 @@ least total wins. So evidence travels over weak texture as far as it must, and s
 truncated, the sooner the greater the grey step.
 
 All costs are integers, candidates come in a fixed order and only a strictly lower cost wins. The vector code of both
-steps is in :mod:`stages.hfvm.coarse_to_fine.path_simd`.
+steps is in :mod:`rille.stages.hfvm.coarse_to_fine.path_simd`.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from stages.core.declare import AnyArray
-from stages.hfvm.coarse_to_fine import path_simd
-from stages.hfvm.coarse_to_fine.path_simd import MOST, NONE, UNIT
-from stages.hfvm.level.features import Words
-from stages.hfvm.level.propagation import pack_map, unpack
+from rille.stages.core.declare import AnyArray
+from rille.stages.hfvm.coarse_to_fine import path_simd
+from rille.stages.hfvm.coarse_to_fine.path_simd import MOST, NONE, UNIT
+from rille.stages.hfvm.level.features import Words
+from rille.stages.hfvm.level.propagation import pack_map, unpack
 
 OFFSETS = np.array(
     [[0, -1], [0, 1], [-1, 0], [1, 0], [-3, -3], [-3, 3], [3, -3], [3, 3], [0, -8], [0, 8], [-8, 0], [8, 0]], np.int64

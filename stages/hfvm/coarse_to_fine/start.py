@@ -14,11 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.core.declare import AnyArray
-from stages.core.errors import InputError
-from stages.hfvm.coarse_to_fine import hierarchy
-from stages.hfvm.images import plane
-from stages.hfvm.images.window import whole
+from rille.stages.core.declare import AnyArray
+from rille.stages.core.errors import InputError
+from rille.stages.hfvm.coarse_to_fine import hierarchy
+from rille.stages.hfvm.images import plane
+from rille.stages.hfvm.images.window import whole
 
 MOST = 16000
 """Pixels: displacements of a level are 16-bit and doubled from level to level."""
@@ -54,7 +54,7 @@ def check(prior: tuple[AnyArray, AnyArray] | None, shape: tuple[int, ...]) -> Pr
 
 
 def align(prior: Prior | None, h: plane.Matrix) -> Prior | None:
-    """The prior towards the aligned right image: inverse of :func:`stages.hfvm.images.plane.compose`."""
+    """The prior towards the aligned right image: inverse of :func:`rille.stages.hfvm.images.plane.compose`."""
     if prior is None:
         return None
     g = np.linalg.inv(h @ plane.translation(-plane.margin(prior.u.shape)))

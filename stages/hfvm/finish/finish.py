@@ -11,17 +11,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stages.core.declare import AnyArray
-from stages.core.validity import Validity, mark
-from stages.hfvm.coarse_to_fine import hierarchy
-from stages.hfvm.coarse_to_fine.hierarchy import Band, Map, Prepared
-from stages.hfvm.finish import guided, refine, uncertainty, variational_refinement
-from stages.hfvm.images import plane
-from stages.hfvm.images.params import HfvmParams
-from stages.hfvm.images.views import View
-from stages.hfvm.images.window import Raster, Results, Window, around, blocks, cut, strips, whole
-from stages.hfvm.level import consistency, epipolar, rowwise, simd
-from stages.hfvm.level.simd import SUM_RADIUS
+from rille.stages.core.declare import AnyArray
+from rille.stages.core.validity import Validity, mark
+from rille.stages.hfvm.coarse_to_fine import hierarchy
+from rille.stages.hfvm.coarse_to_fine.hierarchy import Band, Map, Prepared
+from rille.stages.hfvm.finish import guided, refine, uncertainty, variational_refinement
+from rille.stages.hfvm.images import plane
+from rille.stages.hfvm.images.params import HfvmParams
+from rille.stages.hfvm.images.views import View
+from rille.stages.hfvm.images.window import Raster, Results, Window, around, blocks, cut, strips, whole
+from rille.stages.hfvm.level import consistency, epipolar, rowwise, simd
+from rille.stages.hfvm.level.simd import SUM_RADIUS
 
 Rasters = Mapping[str, Raster]
 
@@ -109,7 +109,7 @@ class Finish:
     def refine(self, window: Window, checked: Rasters) -> Results:
         """Refined ``u, v``, ``validity``, and the variance ``noise`` that the grey values' noise makes.
 
-        Reach: :func:`stages.hfvm.finish.refine.reach`.
+        Reach: :func:`rille.stages.hfvm.finish.refine.reach`.
         """
         p, shape = self.refining, self.right.shapes[0]
         reach = refine.reach(p)
@@ -158,7 +158,7 @@ class Finish:
         return np.ascontiguousarray(np.linalg.inv(g).T @ self.band.f)
 
     def final(self, window: Window, fine: Rasters, checked: Rasters, refined: Rasters, gone: Raster) -> Results:
-        """Everything that :class:`~stages.hfvm.Disparity` has.
+        """Everything that :class:`~rille.stages.hfvm.Disparity` has.
 
         Reach: that of filling along rows, of the uncertainty and of what counts as lonely.
         """

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from stages.core.declare import AnyArray
+from rille.stages.core.declare import AnyArray
 
 RADIUS = 7
 """Pixels: reach of the median; beyond it a neighbour says little."""

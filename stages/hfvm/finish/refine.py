@@ -10,9 +10,9 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from stages.core.declare import AnyArray
-from stages.hfvm.images.params import HfvmParams
-from stages.hfvm.level import rowwise
+from rille.stages.core.declare import AnyArray
+from rille.stages.hfvm.images.params import HfvmParams
+from rille.stages.hfvm.level import rowwise
 
 Place = tuple[int, int, int, int, int, int]
 """First column and row of the left and of the right window, rows and columns of the whole right image."""

@@ -26,9 +26,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from stages.core.declare import AnyArray
-from stages.hfvm.images.params import HfvmParams
-from stages.hfvm.level import rowwise
+from rille.stages.core.declare import AnyArray
+from rille.stages.hfvm.images.params import HfvmParams
+from rille.stages.hfvm.level import rowwise
 
 RADIUS = 2
 """Pixels: the windows of sub-pixel search and refinement are 5 x 5."""

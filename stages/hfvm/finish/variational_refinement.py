@@ -9,8 +9,8 @@ with r the difference of the left image and the right one warped by the last ste
 warped gradient, both of the cubic spline through the pixels, which keeps detail that a local cubic kernel blurs; w
 falling with r and s with the second difference found, so that neither a wrong pixel nor an edge drags its neighbours
 along. Stiffness starts weak and tolerant of bends: from the first, it would take the errors that windows make beside
-edges for relief. The lines are fitted to the matches themselves (:mod:`stages.hfvm.level.epipolar`); k gives way where
-they do not lie on lines. Solved by a fixed number of Gauss-Seidel sweeps in reading order.
+edges for relief. The lines are fitted to the matches themselves (:mod:`rille.stages.hfvm.level.epipolar`); k gives way
+where they do not lie on lines. Solved by a fixed number of Gauss-Seidel sweeps in reading order.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ import numpy as np
 import scipy
 from numba import njit
 
-from stages.core.declare import AnyArray
-from stages.hfvm.coarse_to_fine.hierarchy import evenly
-from stages.hfvm.finish.refine import FARTHEST
-from stages.hfvm.images.params import HfvmParams
-from stages.hfvm.level import epipolar
-from stages.numeric.windows import window_sum
+from rille.stages.core.declare import AnyArray
+from rille.stages.hfvm.coarse_to_fine.hierarchy import evenly
+from rille.stages.hfvm.finish.refine import FARTHEST
+from rille.stages.hfvm.images.params import HfvmParams
+from rille.stages.hfvm.level import epipolar
+from rille.stages.numeric.windows import window_sum
 
 MEAN_SIDE = 9
 """Pixels: window of the local mean; brightness varies more slowly."""
@@ -74,9 +74,9 @@ def fit(
 
     Notes
     -----
-    A pixel that is led farther than :data:`stages.hfvm.finish.refine.FARTHEST` from where it started stays there. Only
-    the way along its line counts: a match that was found rows off its line is on the same thing more often than not,
-    and the lines know its row.
+    A pixel that is led farther than :data:`rille.stages.hfvm.finish.refine.FARTHEST` from where it started stays there.
+    Only the way along its line counts: a match that was found rows off its line is on the same thing more often than
+    not, and the lines know its row.
     """
     start_u, start_v = u, v
     u, v = np.where(keep, u, np.float32(0)), np.where(keep, v, np.float32(0))

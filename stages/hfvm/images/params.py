@@ -7,8 +7,8 @@ from typing import Any, Literal
 
 from pydantic import Field, model_validator
 
-from stages.core.declare import Params
-from stages.hfvm.level.features import PAPER_WEIGHTS
+from rille.stages.core.declare import Params
+from rille.stages.hfvm.level.features import PAPER_WEIGHTS
 
 Weights = tuple[float, float, float, float, float, float, float, float]
 

@@ -15,13 +15,13 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from stages.core.declare import AnyArray
-from stages.hfvm.images.params import HfvmParams
-from stages.hfvm.images.resample import sample_cubic
-from stages.hfvm.images.window import Shape, Window, bounded, whole
-from stages.hfvm.level.epipolar import residuals, typical, weighted_normal
-from stages.imaging import pyramid
-from stages.imaging.pyramid import Pyramid, PyramidParams
+from rille.stages.core.declare import AnyArray
+from rille.stages.hfvm.images.params import HfvmParams
+from rille.stages.hfvm.images.resample import sample_cubic
+from rille.stages.hfvm.images.window import Shape, Window, bounded, whole
+from rille.stages.hfvm.level.epipolar import residuals, typical, weighted_normal
+from rille.stages.imaging import pyramid
+from rille.stages.imaging.pyramid import Pyramid, PyramidParams
 
 Matrix = NDArray[np.float64]
 

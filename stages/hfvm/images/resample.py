@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from stages.core.validity import Validity
+from rille.stages.core.validity import Validity
 
 MATCHED, OUT_OF_IMAGE = np.uint8(Validity.MATCHED), np.uint8(Validity.OUT_OF_IMAGE)
 FOUND = np.uint8(Validity.MATCHED | Validity.INTERPOLATED)

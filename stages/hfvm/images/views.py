@@ -8,13 +8,13 @@ from typing import Protocol
 
 import numpy as np
 
-from stages.core.declare import AnyArray
-from stages.hfvm.images import plane
-from stages.hfvm.images.params import HfvmParams
-from stages.hfvm.images.window import Raster, Shape, Window, cut, tiles, whole
-from stages.hfvm.level import features, paper
-from stages.imaging import pyramid
-from stages.imaging.pyramid import Pyramid
+from rille.stages.core.declare import AnyArray
+from rille.stages.hfvm.images import plane
+from rille.stages.hfvm.images.params import HfvmParams
+from rille.stages.hfvm.images.window import Raster, Shape, Window, cut, tiles, whole
+from rille.stages.hfvm.level import features, paper
+from rille.stages.imaging import pyramid
+from rille.stages.imaging.pyramid import Pyramid
 
 STRIP = 256
 """Rows whose features are computed at once where many are wanted: their room is small beside the result."""
@@ -39,7 +39,7 @@ class View(Protocol):
 
     def filled(self, level: int, window: Window) -> AnyArray:
         """As ``grey``; masked pixels carry the grey of the next valid level above
-        (:func:`stages.imaging.pyramid.filled`)."""
+        (:func:`rille.stages.imaging.pyramid.filled`)."""
 
 
 @dataclass(frozen=True)
@@ -183,7 +183,7 @@ class Aligned:
 
 
 def pyramid_shapes(shape: Shape, levels: int, min_side: int = pyramid.PyramidParams().min_side) -> list[Shape]:
-    """Rows and columns of the levels of :func:`stages.imaging.pyramid.build` for at most so many levels."""
+    """Rows and columns of the levels of :func:`rille.stages.imaging.pyramid.build` for at most so many levels."""
     found = [shape]
     while len(found) < levels and min(found[-1]) >= 2 * min_side:
         found.append(((found[-1][0] + 1) // 2, (found[-1][1] + 1) // 2))

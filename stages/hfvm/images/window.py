@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.core.declare import AnyArray
+from rille.stages.core.declare import AnyArray
 
 BLOCK = 1024
 """Pixels: side of the pieces in which scattered pixels of a raster are read."""

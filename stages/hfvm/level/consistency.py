@@ -7,9 +7,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from stages.core.declare import AnyArray
-from stages.core.validity import Validity
-from stages.numeric.windows import window_sum
+from rille.stages.core.declare import AnyArray
+from rille.stages.core.validity import Validity
+from rille.stages.numeric.windows import window_sum
 
 Map = NDArray[np.float32]
 
@@ -81,7 +81,7 @@ def backmatch(lu, lv, ru, rv, right_valid, error, x0, y0, rx0, ry0, rrows, rcols
 
 @njit(cache=True, nogil=True)
 def reasons(distance, deviation, valid, error, threshold, texture, backmatch, bits):  # type: ignore[no-untyped-def]
-    """Bits of :class:`~stages.core.validity.Validity` that speak against each pixel, 0 where it is consistent."""
+    """Bits of :class:`~rille.stages.core.validity.Validity` that speak against each pixel, 0 where it is consistent."""
     nil = np.uint8(0)
     for y in range(bits.shape[0]):
         d, local, usable, e, found = distance[y], deviation[y], valid[y], error[y], bits[y]

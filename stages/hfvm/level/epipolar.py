@@ -17,7 +17,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from stages.core.declare import AnyArray
+from rille.stages.core.declare import AnyArray
 
 Matrix = NDArray[np.float64]
 

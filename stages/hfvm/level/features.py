@@ -18,8 +18,8 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 from numpy.typing import ArrayLike, NDArray
 
-from stages.core.declare import AnyArray
-from stages.numeric.line import copy_line
+from rille.stages.core.declare import AnyArray
+from rille.stages.numeric.line import copy_line
 
 Words = NDArray[np.uint64]
 Planes = NDArray[np.float32]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from stages.core.declare import AnyArray
-from stages.hfvm.level.subpixel import linear
+from rille.stages.core.declare import AnyArray
+from rille.stages.hfvm.level.subpixel import linear
 
 
 def weighted(planes: AnyArray, weights: tuple[float, ...]) -> AnyArray:

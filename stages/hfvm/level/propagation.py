@@ -10,10 +10,10 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from stages.hfvm.level import epipolar, simd, strip_simd
-from stages.hfvm.level.features import distance
-from stages.hfvm.level.simd import LANES, SHARP
-from stages.numeric.line import copy_line
+from rille.stages.hfvm.level import epipolar, simd, strip_simd
+from rille.stages.hfvm.level.features import distance
+from rille.stages.hfvm.level.simd import LANES, SHARP
+from rille.stages.numeric.line import copy_line
 
 MOST_STRIPS = 512
 """Room for the strips that a pixel searches: 9 centres, 17 rows each, 17 columns in three pieces."""

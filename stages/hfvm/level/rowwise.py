@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from stages.hfvm.level import simd
-from stages.numeric.line import copy_line
+from rille.stages.hfvm.level import simd
+from rille.stages.numeric.line import copy_line
 
 PLANES = 10
 
@@ -104,7 +104,7 @@ def _products(  # type: ignore[no-untyped-def]
     """Row ``y`` of the planes whose window sums a step needs, zero where a pixel takes no part.
 
     ``out`` (PLANES, radius + col + radius): count, gx, gy, r, gx gx, gx gy, gy gy, gx r, gy r, r r, with the gradient
-    of the left image. Windows as in :func:`stages.hfvm.level.consistency.backmatch`. Reach: a pixel.
+    of the left image. Windows as in :func:`rille.stages.hfvm.level.consistency.backmatch`. Reach: a pixel.
     """
     rows, cols = left.shape
     width = right.shape[1]
@@ -150,8 +150,8 @@ def lucas_kanade(  # type: ignore[no-untyped-def]
 
     The gradient is the left image's (inverse compositional form). ``per_noise``: variance of the column displacement
     for a unit of variance of the grey levels. float32 throughout: every window is summed afresh, so nothing adds up.
-    Windows as in :func:`stages.hfvm.level.consistency.backmatch`. Reach: ``radius``, and of the left image a pixel
-    more.
+    Windows as in :func:`rille.stages.hfvm.level.consistency.backmatch`. Reach: ``radius``, and of the left image a
+    pixel more.
     """
     rows, cols = left.shape
     size = 2 * radius + 1

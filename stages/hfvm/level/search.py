@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from stages.hfvm.level.features import distance
-from stages.hfvm.level.simd import FAR
+from rille.stages.hfvm.level.features import distance
+from rille.stages.hfvm.level.simd import FAR
 
 NONE = np.iinfo(np.int32).max
 """Cost above every cost."""

@@ -5,7 +5,7 @@ the bytes of each word in one instruction (``psadbw``, in 512, 256 or 128 bits).
 generic vector code; both give the same integers.
 
 Costs: distance + min(trunc(|a u + b v + c|), 2047), with the epipolar line (a, b, c), its normal as long as a pixel off
-it costs (:func:`stages.hfvm.level.epipolar.line`), and the sum in float32.
+it costs (:func:`rille.stages.hfvm.level.epipolar.line`), and the sum in float32.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from numba import types
 from numba.core import cgutils, config
 from numba.extending import intrinsic
 
-from stages.hfvm.level.epipolar import LEAST_NORMAL
+from rille.stages.hfvm.level.epipolar import LEAST_NORMAL
 
 LANES = 8
 
@@ -197,7 +197,7 @@ def _every_other(builder: Any, pointer: Any, kind: Any) -> Any:
 
 
 def _lines(builder: Any, terms: Any, x: Any) -> tuple[Any, Any, Any]:
-    """:func:`stages.hfvm.level.epipolar.line` of eight columns; ``terms``: the row's, and the length."""
+    """:func:`rille.stages.hfvm.level.epipolar.line` of eight columns; ``terms``: the row's, and the length."""
     *t, length = (_splat(builder, n) for n in cgutils.unpack_tuple(builder, terms))
     a, b = (builder.fadd(t[k], builder.fmul(t[k + 1], x)) for k in (0, 2))
     c = builder.fadd(t[4], builder.fmul(x, builder.fadd(t[5], builder.fmul(x, t[6]))))
@@ -313,9 +313,9 @@ neighbours.
 
 ``todo[at : at + 8]``: columns of the pixels, no two of them neighbours. All arrays are flat: words of both images;
 ``packed`` displacements, v << 16 | u, and their costs without smoothness. ``line``: the row's terms of
-:func:`stages.hfvm.level.epipolar.line`, and the length of a normal. ``here, above, below``: index at which the row and
-its neighbours begin. ``shape``: rows and columns of the right image, columns of the left one, the column of the left
-one's first pixel in the right one, as ``y`` is the row there (both may be windows), its column in the whole left
+:func:`rille.stages.hfvm.level.epipolar.line`, and the length of a normal. ``here, above, below``: index at which the
+row and its neighbours begin. ``shape``: rows and columns of the right image, columns of the left one, the column of the
+left one's first pixel in the right one, as ``y`` is the row there (both may be windows), its column in the whole left
 image, and what beside the own one is tried: nothing, columns (1), rows too (2). In this order: own, own a column less,
 more, a row less, more, then up, west, east, down, but for those that lie a column beside the own one; the first of
 equal ones wins. Costs have ``smooth`` times the roughness added. ``new[at : at + 8]`` gets the best ones and ``cost``

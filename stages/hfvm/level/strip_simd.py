@@ -14,8 +14,8 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from stages.hfvm.level import simd
-from stages.hfvm.level.simd import LANES
+from rille.stages.hfvm.level import simd
+from rille.stages.hfvm.level.simd import LANES
 
 ABOVE, BELOW = LANES + 1, LANES + 2
 """Ranks of the two candidates that lie a row less and a row more."""
@@ -149,8 +149,8 @@ the best candidate, cost << 4 | rank, of each pixel of a square of two by two.
 ``left[here]``: word of the first pixel; ``right[there]``: the one it meets at column displacement ``u``, row
 displacement ``v``. Candidates are the column displacements ``u + k`` for k < ``count``, at most eight; where ``cross``,
 also ``centre`` a row less and a row more. Eight words from the first one on are read for each pixel, whatever
-``count``. ``cols``: columns of the left image; ``line``: the square's (:func:`stages.hfvm.level.epipolar.line`). Rank
-0 is the candidate of column ``centre``, 1 + k the others; ABOVE and BELOW those of the other rows. Of equal ones the
-least rank wins.
+``count``. ``cols``: columns of the left image; ``line``: the square's (:func:`rille.stages.hfvm.level.epipolar.line`).
+Rank 0 is the candidate of column ``centre``, 1 + k the others; ABOVE and BELOW those of the other rows. Of equal ones
+the least rank wins.
 ``best, least``: packed displacement and cost of the best so far, replaced where this one costs less.
 """

@@ -9,9 +9,9 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from stages.hfvm.level import simd
-from stages.hfvm.level.features import distance
-from stages.hfvm.level.simd import SUM_RADIUS
+from rille.stages.hfvm.level import simd
+from rille.stages.hfvm.level.features import distance
+from rille.stages.hfvm.level.simd import SUM_RADIUS
 
 NOTHING, ALONE, SUMMED = 0, 1, 2
 """What a pixel has: no distance, its own, those of its window."""

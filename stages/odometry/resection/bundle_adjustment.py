@@ -23,10 +23,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from stages.core.declare import Params
-from stages.geometry.geometry import Camera, Rig
-from stages.odometry.resection import bundle_adjustment_kernel as kernel
-from stages.odometry.resection.pnp import HUBER, cross_matrix, exponential
+from rille.stages.core.declare import Params
+from rille.stages.geometry.geometry import Camera, Rig
+from rille.stages.odometry.resection import bundle_adjustment_kernel as kernel
+from rille.stages.odometry.resection.pnp import HUBER, cross_matrix, exponential
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -103,7 +103,7 @@ class State:
     depth: Floats
 
     def moved(self, pose: Floats, depth: Floats) -> State:
-        """After steps (frame, 6) ``v, w`` as in :mod:`stages.odometry.resection.pnp`, and (n,)."""
+        """After steps (frame, 6) ``v, w`` as in :mod:`rille.stages.odometry.resection.pnp`, and (n,)."""
         turn = exponential(pose[:, 3:])
         t = np.einsum("fij,fj->fi", turn, self.t) + pose[:, :3]
         return State(turn @ self.R, t, self.depth + depth)

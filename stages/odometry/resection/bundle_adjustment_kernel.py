@@ -1,5 +1,5 @@
-"""Compiled loops of :mod:`stages.odometry.resection.bundle_adjustment`: cost and normal equations of tracks, sums in
-their order."""
+"""Compiled loops of :mod:`rille.stages.odometry.resection.bundle_adjustment`: cost and normal equations of tracks, sums
+in their order."""
 
 from __future__ import annotations
 

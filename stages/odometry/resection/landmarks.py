@@ -14,8 +14,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from stages.geometry.geometry import Rig, RigidTransform
-from stages.geometry.lattice import Lattice
+from rille.stages.geometry.geometry import Rig, RigidTransform
+from rille.stages.geometry.lattice import Lattice
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]

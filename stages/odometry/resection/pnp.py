@@ -24,8 +24,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.geometry.geometry import Camera, RigidTransform
-from stages.odometry.resection import pnp_kernel as kernel
+from rille.stages.geometry.geometry import Camera, RigidTransform
+from rille.stages.odometry.resection import pnp_kernel as kernel
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]

@@ -1,4 +1,4 @@
-"""Compiled loops of :mod:`stages.odometry.resection.pnp`: weighted errors, and Levenberg-Marquardt of many small
+"""Compiled loops of :mod:`rille.stages.odometry.resection.pnp`: weighted errors, and Levenberg-Marquardt of many small
 problems.
 
 One problem's arithmetic does not depend on the others in its batch, and sums run in the order of the landmarks.

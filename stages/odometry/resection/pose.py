@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from stages.core.declare import Bundle, Inputs, NoParams, Stage
-from stages.geometry.pose_arrays import COVARIANCE, POSES
+from rille.stages.core.declare import Bundle, Inputs, NoParams, Stage
+from rille.stages.geometry.pose_arrays import COVARIANCE, POSES
 
 
 def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:

@@ -7,12 +7,12 @@ second measurement of their depths. What all disparities share is one unknown of
 made them.
 
 The poses' covariances are those of this adjustment, by the same rules as the resection's
-(:mod:`stages.odometry.resection.resect`): the errors that are found set the scale, what the stated ones leave beyond
-them is shared by all segments.
+(:mod:`rille.stages.odometry.resection.resect`): the errors that are found set the scale, what the stated ones leave
+beyond them is shared by all segments.
 
 Another error that they share, a tilt, shows over the whole sequence only
-(:mod:`stages.odometry.resection.bundle_adjustment`). Where it is beyond doubt, landmarks are judged and all segments
-adjusted once more without it.
+(:mod:`rille.stages.odometry.resection.bundle_adjustment`). Where it is beyond doubt, landmarks are judged and all
+segments adjusted once more without it.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.core.declare import Bundle, Inputs, Stage
-from stages.core.errors import ConfigError
-from stages.geometry.geometry import Rig, RigidTransform
-from stages.geometry.pose_arrays import COVARIANCE, POSES, SHARED
-from stages.odometry.resection.bundle_adjustment import (
+from rille.stages.core.declare import Bundle, Inputs, Stage
+from rille.stages.core.errors import ConfigError
+from rille.stages.geometry.geometry import Rig, RigidTransform
+from rille.stages.geometry.pose_arrays import COVARIANCE, POSES, SHARED
+from rille.stages.odometry.resection.bundle_adjustment import (
     RefineParams,
     State,
     Views,
@@ -40,9 +40,9 @@ from stages.odometry.resection.bundle_adjustment import (
     scatter,
     stereo_rows,
 )
-from stages.odometry.resection.landmarks import Landmarks, matches_at, relief
-from stages.odometry.resection.pnp import HUBER, Observations, Poses, back_projection, norms
-from stages.odometry.resection.resect import SOURCES, ResectParams, coordinates, root, scatter_of_blocks
+from rille.stages.odometry.resection.landmarks import Landmarks, matches_at, relief
+from rille.stages.odometry.resection.pnp import HUBER, Observations, Poses, back_projection, norms
+from rille.stages.odometry.resection.resect import SOURCES, ResectParams, coordinates, root, scatter_of_blocks
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -205,7 +205,7 @@ def _pose(state: State, f: int, bias: float) -> Poses:
 def claims(segments: Sequence[tuple[Views, State]], bias: float, params: RefineParams) -> list[tuple[Floats, Floats]]:
     """Covariances (frame, 6, 6) and shared errors (frame, 6, 7) of the poses of segments that were adjusted together.
 
-    Of position (m) and rotation vector (rad) of T_local_left, as in :mod:`stages.odometry.resection.resect`.
+    Of position (m) and rotation vector (rad) of T_local_left, as in :mod:`rille.stages.odometry.resection.resect`.
     """
     parts = [normal(views, state, bias, params.pixel_sigma) for views, state in segments]
     factors = [scatter(views, state, bias, params.pixel_sigma) for views, state in segments]

@@ -5,8 +5,8 @@ errors, intrinsics fixed; then "the calibration is iterated with the most incons
 this error gets below a certain threshold for all interest points".
 
 Departures: the start need not be good (hypotheses from four landmarks each compete with the prediction); errors are
-weighted by how exactly the landmark itself is known (see :mod:`stages.odometry.resection.pnp`), and "error" in the
-rule above is that weighted one in units of ``pixel_sigma``; for exact landmarks it is the paper's.
+weighted by how exactly the landmark itself is known (see :mod:`rille.stages.odometry.resection.pnp`), and "error" in
+the rule above is that weighted one in units of ``pixel_sigma``; for exact landmarks it is the paper's.
 
 Covariances here are 6 x 6 of ``(dt, dtheta)`` in the destination frame: position error in metres, then the rotation
 vector ``R_true = exp(dtheta) R`` in radians. They tell of the measurements and of a shared error of the disparities;
@@ -32,13 +32,13 @@ from numpy.typing import NDArray
 from pydantic import Field
 from scipy.special import bdtrc
 
-from stages.core.declare import AnyArray, Array, Bundle, Inputs, Params, Stage
-from stages.core.errors import DegenerateError, InputError
-from stages.geometry.geometry import Camera, Rig, RigidTransform
-from stages.geometry.lattice import Lattice
-from stages.geometry.pose_arrays import COVARIANCE, POSES, SHARED
-from stages.odometry.resection.landmarks import Landmarks, landmarks_from_dem, landmarks_from_disparity, relief
-from stages.odometry.resection.pnp import (
+from rille.stages.core.declare import AnyArray, Array, Bundle, Inputs, Params, Stage
+from rille.stages.core.errors import DegenerateError, InputError
+from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
+from rille.stages.geometry.lattice import Lattice
+from rille.stages.geometry.pose_arrays import COVARIANCE, POSES, SHARED
+from rille.stages.odometry.resection.landmarks import Landmarks, landmarks_from_dem, landmarks_from_disparity, relief
+from rille.stages.odometry.resection.pnp import (
     Observations,
     Poses,
     back_projection,

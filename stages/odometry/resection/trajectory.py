@@ -14,7 +14,7 @@ Where nothing tells of the vertical at a piece's first pair, that of its first p
 the piece; where none has, the frame of the piece is that of its first camera, whose own up is z, and that is said.
 
 Of the covariances, what each segment has for itself adds up; of what all segments share, the errors add up, which grows
-with the length of the way and not with its root (:mod:`stages.odometry.resection.resect`).
+with the length of the way and not with its root (:mod:`rille.stages.odometry.resection.resect`).
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
-from stages.core.errors import InputError
-from stages.geometry.geometry import RigidTransform, level_rotation, orthonormal
-from stages.geometry.pose_arrays import COVARIANCE, NO_VERTICAL, POSES
-from stages.odometry.resection.pnp import cross_matrix
+from rille.stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
+from rille.stages.core.errors import InputError
+from rille.stages.geometry.geometry import RigidTransform, level_rotation, orthonormal
+from rille.stages.geometry.pose_arrays import COVARIANCE, NO_VERTICAL, POSES
+from rille.stages.odometry.resection.pnp import cross_matrix
 
 Floats = NDArray[np.float64]
 Segment = tuple[Floats, Floats, Floats]

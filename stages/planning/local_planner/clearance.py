@@ -3,7 +3,7 @@
 What is hazardous to a wheel was found in a window as large as the wheel, so it counts where the middle of a wheel is:
 the vehicle may pass a stone between its wheels, since what the belly cannot pass over (tilt, slope, rise, for the worst
 heading) is hazardous to its middle. Unknown ground may not be under the belly unless it is known to be low enough
-(:mod:`stages.planning.local_planner.underbody`), and the middles of the wheels keep the margin from it as from a
+(:mod:`rille.stages.planning.local_planner.underbody`), and the middles of the wheels keep the margin from it as from a
 hazard: what is unknown is mostly what is hidden by a stone, or the stone itself.
 """
 
@@ -17,14 +17,14 @@ import scipy
 from numba import njit
 from numpy.typing import NDArray
 
-from stages.geometry.lattice import Lattice
-from stages.hazard.hazards import BITS
-from stages.hazard.risk import CAUTION, DOUBT_BIT, HAZARDOUS, UNKNOWN
-from stages.hazard.vehicle import Vehicle
-from stages.planning.local_planner.underbody import Straddle, clears, stands
-from stages.planning.path import WHEEL_BITS
-from stages.planning.wheels import wheel_positions
-from stages.terrain.occlusion_bounds import Bounds
+from rille.stages.geometry.lattice import Lattice
+from rille.stages.hazard.hazards import BITS
+from rille.stages.hazard.risk import CAUTION, DOUBT_BIT, HAZARDOUS, UNKNOWN
+from rille.stages.hazard.vehicle import Vehicle
+from rille.stages.planning.local_planner.underbody import Straddle, clears, stands
+from rille.stages.planning.path import WHEEL_BITS
+from rille.stages.planning.wheels import wheel_positions
+from rille.stages.terrain.occlusion_bounds import Bounds
 
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
@@ -91,7 +91,7 @@ class Footing:
         doubted: Mask | None = None,
         bounds: Bounds | None = None,
     ) -> Footing:
-        """From classes and reason bits of :mod:`stages.hazard.risk`; without bits every hazard is one to a wheel.
+        """From classes and reason bits of :mod:`rille.stages.hazard.risk`; without bits every hazard is one to a wheel.
 
         ``unknown``: where the vehicle may not stand for what is not known; None: the unknown class. ``glanced``: where
         of it something is known nevertheless; ``bounds`` of the ground, by which the belly may pass over it.

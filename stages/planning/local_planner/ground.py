@@ -1,7 +1,7 @@
 """The map about a vehicle that plans its next leg: what may be driven on, what may be planned over, and at which price.
 
-See :mod:`stages.planning.local_planner.stage` for the rules. A way is found over poses on a grid through the vehicle;
-one that was planned before is looked at again on the map as it is now.
+See :mod:`rille.stages.planning.local_planner.stage` for the rules. A way is found over poses on a grid through the
+vehicle; one that was planned before is looked at again on the map as it is now.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.planning.local_planner.clearance import DOUBT_WEIGHT, PARTS, Footing, Gaps
-from stages.planning.local_planner.params import LegParams
-from stages.planning.local_planner.route import STEP_TURN, Piece, pieces, turnable
-from stages.planning.local_planner.state_lattice import PoseGraph, PoseGrid
+from rille.stages.planning.local_planner.clearance import DOUBT_WEIGHT, PARTS, Footing, Gaps
+from rille.stages.planning.local_planner.params import LegParams
+from rille.stages.planning.local_planner.route import STEP_TURN, Piece, pieces, turnable
+from rille.stages.planning.local_planner.state_lattice import PoseGraph, PoseGrid
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]

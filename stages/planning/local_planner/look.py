@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.planning.local_planner.ground import Ground
-from stages.planning.local_planner.route import Piece, length_of, room_to_turn
-from stages.planning.local_planner.views import Stand, View, bearing, looked
+from rille.stages.planning.local_planner.ground import Ground
+from rille.stages.planning.local_planner.route import Piece, length_of, room_to_turn
+from rille.stages.planning.local_planner.views import Stand, View, bearing, looked
 
 Floats = NDArray[np.float64]
 Point = tuple[float, float]

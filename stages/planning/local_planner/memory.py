@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from stages.planning.local_planner.views import Stand
+from rille.stages.planning.local_planner.views import Stand
 
 Place = tuple[float, float]
 
@@ -22,8 +22,8 @@ class Memory:
     reopened: bool = False
 
     def after(self, verdict: str, stand: Stand, where: Place | None = None) -> Literal["end", "again", "drive"]:
-        """What follows a leg (:class:`stages.planning.local_planner.stage.Leg`): the end, another plan from where it
-        stands, or the drive.
+        """What follows a leg (:class:`rille.stages.planning.local_planner.stage.Leg`): the end, another plan from where
+        it stands, or the drive.
 
         Parameters
         ----------

@@ -13,7 +13,8 @@ none. This is the usual free-space assumption (Koenig, Tovey, Smirnov 2003, doi:
 anew at each stop.
 
 The vehicle drives ahead, or back at a higher price, and turns on the spot where its wheels have room to
-(:mod:`stages.planning.local_planner.state_lattice`): it may pass between two hazards between which it could not turn.
+(:mod:`rille.stages.planning.local_planner.state_lattice`): it may pass between two hazards between which it could not
+turn.
 """
 
 from __future__ import annotations
@@ -25,14 +26,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.core.errors import InputError
-from stages.geometry.lattice import Lattice
-from stages.planning.local_planner.clearance import Footing
-from stages.planning.local_planner.ground import Ground
-from stages.planning.local_planner.look import ROUND, TWICE, Target
-from stages.planning.local_planner.memory import Memory
-from stages.planning.local_planner.params import LegParams
-from stages.planning.local_planner.route import (
+from rille.stages.core.errors import InputError
+from rille.stages.geometry.lattice import Lattice
+from rille.stages.planning.local_planner.clearance import Footing
+from rille.stages.planning.local_planner.ground import Ground
+from rille.stages.planning.local_planner.look import ROUND, TWICE, Target
+from rille.stages.planning.local_planner.memory import Memory
+from rille.stages.planning.local_planner.params import LegParams
+from rille.stages.planning.local_planner.route import (
     Piece,
     first_metres,
     last_metres,
@@ -43,7 +44,7 @@ from stages.planning.local_planner.route import (
     vertices,
     within_turn,
 )
-from stages.planning.local_planner.views import AHEAD, Stand, View
+from rille.stages.planning.local_planner.views import AHEAD, Stand, View
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]

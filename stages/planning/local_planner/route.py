@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.planning.local_planner.state_lattice import AHEAD, BACK, PoseGraph, angle_of
+from rille.stages.planning.local_planner.state_lattice import AHEAD, BACK, PoseGraph, angle_of
 
 Floats = NDArray[np.float64]
 Clear = Callable[[Floats, Floats, Floats], bool]

@@ -1,8 +1,8 @@
 """The next leg of a drive to a goal, by the hazards that are known so far: stage ``leg``.
 
 What was seen from near may be driven on, what was seen from afar serves to plan
-(:mod:`stages.planning.local_planner.policy`). Far hazards close ground only once they are probable; where that closes
-every way, only what is next to certain does.
+(:mod:`rille.stages.planning.local_planner.policy`). Far hazards close ground only once they are probable; where that
+closes every way, only what is next to certain does.
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.core.declare import Array, Bundle, Inputs, Stage
-from stages.geometry.geometry import Rig, RigidTransform
-from stages.geometry.lattice import Lattice
-from stages.hazard.classification import HAZARDOUS, UNKNOWN, UNSEEN_BIT
-from stages.hazard.vehicle import Vehicle
-from stages.planning.local_planner.clearance import Footing
-from stages.planning.local_planner.memory import Memory
-from stages.planning.local_planner.params import LegParams
-from stages.planning.local_planner.policy import Before, Leg, plan_leg, shortest
-from stages.planning.local_planner.views import Stand, View
-from stages.terrain.occlusion_bounds import Bounds
+from rille.stages.core.declare import Array, Bundle, Inputs, Stage
+from rille.stages.geometry.geometry import Rig, RigidTransform
+from rille.stages.geometry.lattice import Lattice
+from rille.stages.hazard.classification import HAZARDOUS, UNKNOWN, UNSEEN_BIT
+from rille.stages.hazard.vehicle import Vehicle
+from rille.stages.planning.local_planner.clearance import Footing
+from rille.stages.planning.local_planner.memory import Memory
+from rille.stages.planning.local_planner.params import LegParams
+from rille.stages.planning.local_planner.policy import Before, Leg, plan_leg, shortest
+from rille.stages.planning.local_planner.views import Stand, View
+from rille.stages.terrain.occlusion_bounds import Bounds
 
 Mask = NDArray[np.bool_]
 Point = tuple[float, float]
@@ -41,8 +41,9 @@ def next_leg(
     before: Before | None = None,
     bounds: Bounds | None = None,
 ) -> Leg:
-    """The next leg on the hazards (:mod:`stages.hazard.risk`) of what was seen from near, and of all that was seen;
-    None: that is the same. The other parameters are those of :func:`stages.planning.local_planner.policy.plan_leg`."""
+    """The next leg on the hazards (:mod:`rille.stages.hazard.risk`) of what was seen from near, and of all that was
+    seen; None: that is the same. The other parameters are those of
+    :func:`rille.stages.planning.local_planner.policy.plan_leg`."""
     (classes, reason, chance), seen = seen_so_far(near, far, params)
     lattice, vehicle = Lattice.from_dict(near.meta["lattice"]), Vehicle.model_validate(near.meta["vehicle"])
     for sure in params.sure:
@@ -107,7 +108,7 @@ def _run(params: LegParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
 
 def seen_so_far(near: Bundle, far: Bundle | None, p: LegParams) -> tuple[list[NDArray[Any]], dict[str, Mask | None]]:
     """Classes, reasons and probabilities (row, col) of a map, of which only what was seen from near is driven on; and
-    how well each cell is known, as :meth:`stages.planning.local_planner.clearance.Footing.of` asks for it."""
+    how well each cell is known, as :meth:`rille.stages.planning.local_planner.clearance.Footing.of` asks for it."""
     names = ("risk", "reason", "p_hazard")
     maps = [np.asarray(near[name]) for name in names]
     unknown, glanced = maps[0] == UNKNOWN, None

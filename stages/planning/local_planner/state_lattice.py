@@ -17,8 +17,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from stages.geometry.lattice import Lattice
-from stages.planning.local_planner.clearance import Footing, Gaps
+from rille.stages.geometry.lattice import Lattice
+from rille.stages.planning.local_planner.clearance import Footing, Gaps
 
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]

@@ -1,12 +1,12 @@
 """Ground that was not seen, under the belly: passed over where all that may be there leaves the belly its clearance.
 
-How high it may be is known where lines of sight pass over it (:mod:`stages.terrain.occlusion_bounds`). A vehicle whose
-wheels all stand on ground that was seen then has, at each point of its belly, a rise below it of at most
+How high it may be is known where lines of sight pass over it (:mod:`rille.stages.terrain.occlusion_bounds`). A vehicle
+whose wheels all stand on ground that was seen then has, at each point of its belly, a rise below it of at most
 
     sum_i w_i max(0, top - stand_i)
 
 with the weights w_i of the wheels there, ``stand_i`` the least height at which wheel i stands, and ``top`` the greatest
-that ground may have about that point; see :mod:`stages.hazard.placement` for the rise. Tilt is judged by the same
+that ground may have about that point; see :mod:`rille.stages.hazard.placement` for the rise. Tilt is judged by the same
 heights.
 """
 
@@ -19,10 +19,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from stages.hazard.vehicle import Vehicle
-from stages.numeric.extrema import running_max
-from stages.planning.wheels import wheel_positions
-from stages.terrain.occlusion_bounds import Bounds
+from rille.stages.hazard.vehicle import Vehicle
+from rille.stages.numeric.extrema import running_max
+from rille.stages.planning.wheels import wheel_positions
+from rille.stages.terrain.occlusion_bounds import Bounds
 
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.geometry.geometry import Camera, Rig, RigidTransform
+from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]

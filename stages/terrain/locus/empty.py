@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.core.errors import DegenerateError
-from stages.geometry.geometry import Camera, Rig, RigidTransform
-from stages.geometry.surface import Surface
+from rille.stages.core.errors import DegenerateError
+from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
+from rille.stages.geometry.surface import Surface
 
 SAMPLES = 64
 """Cells along either side of the surface, and elevations, that are looked at."""

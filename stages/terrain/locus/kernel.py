@@ -10,9 +10,9 @@ surface. A terrain surface is a change from free (above) to behind (below) along
 across a depth jump between two pixels nothing was seen: the cell is occluded there.
 
 A few dozen cells are followed side by side, each in its own *lane*: their lines are divided into steps
-(:mod:`stages.terrain.locus.lines`), steps are looked at several at once (:mod:`stages.terrain.locus.points`) until s
-changes its sign, and the roots of all the changes found are solved together (:mod:`stages.terrain.locus.roots`). A
-lane whose root does not stand goes on from there.
+(:mod:`rille.stages.terrain.locus.lines`), steps are looked at several at once
+(:mod:`rille.stages.terrain.locus.points`) until s changes its sign, and the roots of all the changes found are solved
+together (:mod:`rille.stages.terrain.locus.roots`). A lane whose root does not stand goes on from there.
 """
 
 from __future__ import annotations
@@ -23,11 +23,25 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from stages.terrain.locus.lines import BOTTOM, COUNT, DZ, FOOT, HIGH, LAST, LOW, NORMAL, START, TOP, clip, lines, spans
-from stages.terrain.locus.lines import PLANES as LINE_PLANES
-from stages.terrain.locus.points import LANES, POINT_PLANES, POINTS, STEPS, S, climb, meet, pixels
-from stages.terrain.locus.roots import PLANES as ROOT_PLANES
-from stages.terrain.locus.roots import accept, gather, roots, slopes
+from rille.stages.terrain.locus.lines import (
+    BOTTOM,
+    COUNT,
+    DZ,
+    FOOT,
+    HIGH,
+    LAST,
+    LOW,
+    NORMAL,
+    START,
+    TOP,
+    clip,
+    lines,
+    spans,
+)
+from rille.stages.terrain.locus.lines import PLANES as LINE_PLANES
+from rille.stages.terrain.locus.points import LANES, POINT_PLANES, POINTS, STEPS, S, climb, meet, pixels
+from rille.stages.terrain.locus.roots import PLANES as ROOT_PLANES
+from rille.stages.terrain.locus.roots import accept, gather, roots, slopes
 
 Floats = NDArray[np.float64]
 Float32 = NDArray[np.float32]

@@ -1,4 +1,5 @@
-"""Lines of cells, and the steps in which :mod:`stages.terrain.locus.kernel` searches them, for many cells at once."""
+"""Lines of cells, and the steps in which :mod:`rille.stages.terrain.locus.kernel` searches them, for many cells at
+once."""
 
 from __future__ import annotations
 
@@ -7,7 +8,7 @@ import math
 import numpy as np
 from numba import njit
 
-from stages.terrain.locus.points import LANES, LINE, NEAR
+from rille.stages.terrain.locus.points import LANES, LINE, NEAR
 
 STEP_PX = 1.0  # search step: disparity is bilinear between pixels, so nothing hides in a shorter one
 MARGIN = 2  # steps that the interval handed down from the coarse level is widened by

@@ -1,4 +1,5 @@
-"""Mismatch of disparity and calibration at many points of cells' lines at once, for :mod:`stages.terrain.locus.kernel`.
+"""Mismatch of disparity and calibration at many points of cells' lines at once, for
+:mod:`rille.stages.terrain.locus.kernel`.
 
 Values lie in *planes* of a buffer, one behind the other, whose sizes are constants: so the compiler knows that they do
 not overlap, and computes several points side by side. What vectors cannot do, reading the disparity, is a loop of its

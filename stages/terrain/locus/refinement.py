@@ -28,10 +28,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from stages.geometry.surface import Surface
-from stages.numeric.windows import window_sum
-from stages.terrain.locus.sweep import sweep
-from stages.terrain.locus.views import Views, look
+from rille.stages.geometry.surface import Surface
+from rille.stages.numeric.windows import window_sum
+from rille.stages.terrain.locus.sweep import sweep
+from rille.stages.terrain.locus.views import Views, look
 
 Float32 = NDArray[np.float32]
 Floats = NDArray[np.float64]
@@ -76,8 +76,8 @@ def refine(views: Views, surface: Surface, elevation: Float32, steps: int) -> tu
 
     Returns
     -------
-    elevation (rows, cols), and what :func:`stages.terrain.locus.views.look` gives for it, the right image with the
-    left one's contrast.
+    elevation (rows, cols), and what :func:`rille.stages.terrain.locus.views.look` gives for it, the right image with
+    the left one's contrast.
     """
     start = elevation.astype(np.float64)
     z, seen = start, look(views, surface, start)

@@ -1,6 +1,6 @@
 """Roots of s in the brackets that the search found, for many cells at once, and which of them stand.
 
-See :mod:`stages.terrain.locus.kernel`.
+See :mod:`rille.stages.terrain.locus.kernel`.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import math
 import numpy as np
 from numba import njit
 
-from stages.terrain.locus.points import ACROSS, FX, FY, LANES, LINE, PIXEL, S, X, Y, Z, meet, pixels, project
+from rille.stages.terrain.locus.points import ACROSS, FX, FY, LANES, LINE, PIXEL, S, X, Y, Z, meet, pixels, project
 
 SOLVED_PX = 1e-3  # |s| of a solution: a hundredth of the disparity's own noise
 TURNS = 16

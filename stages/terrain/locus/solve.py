@@ -1,6 +1,6 @@
 """Locus over a whole surface: cells from one disparity map, coarse to fine, and models of both directions joined.
 
-The kernel and its equations are in :mod:`stages.terrain.locus.kernel`.
+The kernel and its equations are in :mod:`rille.stages.terrain.locus.kernel`.
 """
 
 from __future__ import annotations
@@ -10,10 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stages.core.errors import DegenerateError, InputError
-from stages.geometry.geometry import Rig, RigidTransform
-from stages.geometry.surface import Surface
-from stages.terrain.locus.kernel import search
+from rille.stages.core.errors import DegenerateError, InputError
+from rille.stages.geometry.geometry import Rig, RigidTransform
+from rille.stages.geometry.surface import Surface
+from rille.stages.terrain.locus.kernel import search
 
 Floats = NDArray[np.float64]
 Float32 = NDArray[np.float32]

@@ -1,4 +1,5 @@
-"""Values and gradients of two cubic splines at the pixels of many lanes at once, for :mod:`stages.terrain.locus.views`.
+"""Values and gradients of two cubic splines at the pixels of many lanes at once, for
+:mod:`rille.stages.terrain.locus.views`.
 
 Reading the coefficients is a loop of its own; with them in planes of a buffer, one behind the other, several lanes are
 computed side by side.

@@ -3,8 +3,9 @@
 The cells come first, not the image points: for each cell of a reference surface the straight line perpendicular to it
 is projected into both images (the left and right *locus*); the left locus, mapped through the disparity, meets the
 right one at the elevation. Nothing is rectified and no point cloud is made: rows and columns are those of the original
-images, for any orientation of the cameras. The kernel and its equations are in :mod:`stages.terrain.locus.kernel`;
-elevations are then refined by what both images show of the surface (:mod:`stages.terrain.locus.refinement`).
+images, for any orientation of the cameras. The kernel and its equations are in
+:mod:`rille.stages.terrain.locus.kernel`; elevations are then refined by what both images show of the surface
+(:mod:`rille.stages.terrain.locus.refinement`).
 
 The disparity's part of an elevation's error is ``sigma_d / |ds/dZ|``, with the disparity's own standard deviation at
 the pixel where the matcher gives one; what else makes it uncertain is seen on the surface.
@@ -19,19 +20,19 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
-from stages.core.declare import Array, Bundle, Inputs, Memory, Params, Stage
-from stages.core.errors import ConfigError, DegenerateError, InputError
-from stages.core.validity import matched
-from stages.geometry.geometry import Rig, RigidTransform
-from stages.geometry.lattice import Lattice
-from stages.geometry.surface import Surface, plane
-from stages.terrain.ground import view_ground
-from stages.terrain.ground_frame import z_range as plane_z_range
-from stages.terrain.locus.empty import explain
-from stages.terrain.locus.refinement import refine, standard_deviation
-from stages.terrain.locus.solve import Dem, Matches, Task, join, projections, solve
-from stages.terrain.locus.uncertainty import from_both
-from stages.terrain.locus.views import Views, views
+from rille.stages.core.declare import Array, Bundle, Inputs, Memory, Params, Stage
+from rille.stages.core.errors import ConfigError, DegenerateError, InputError
+from rille.stages.core.validity import matched
+from rille.stages.geometry.geometry import Rig, RigidTransform
+from rille.stages.geometry.lattice import Lattice
+from rille.stages.geometry.surface import Surface, plane
+from rille.stages.terrain.ground import view_ground
+from rille.stages.terrain.ground_frame import z_range as plane_z_range
+from rille.stages.terrain.locus.empty import explain
+from rille.stages.terrain.locus.refinement import refine, standard_deviation
+from rille.stages.terrain.locus.solve import Dem, Matches, Task, join, projections, solve
+from rille.stages.terrain.locus.uncertainty import from_both
+from rille.stages.terrain.locus.views import Views, views
 
 Floats = NDArray[np.float64]
 Float32 = NDArray[np.float32]
@@ -135,7 +136,7 @@ def reconstruct(
     disparity_std : (rows, cols) standard deviation of the usable disparities, pixels; None:
         ``params.sigma_disparity`` everywhere.
     right : (rows, cols) grey values of the right image, to refine the elevations with
-    (:mod:`stages.terrain.locus.refinement`);
+    (:mod:`rille.stages.terrain.locus.refinement`);
         None: they stay what the disparity says.
     back : disparities of the right image, left minus right, to read elevations from as well (:func:`join`); they need
         ``right``.

@@ -21,7 +21,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.numeric.windows import window_sum
+from rille.stages.numeric.windows import window_sum
 
 Float32 = NDArray[np.float32]
 Floats = NDArray[np.float64]
@@ -50,7 +50,7 @@ def from_both(elevation: Float32, seen: Float32, moved: Floats, apart: Floats, o
     Parameters
     ----------
     elevation : (rows, cols) metres, NaN undefined.
-    seen : as :func:`stages.terrain.locus.refinement.refine` gives it for these elevations.
+    seen : as :func:`rille.stages.terrain.locus.refinement.refine` gives it for these elevations.
     moved : (rows, cols) what the refinement moved each cell by, metres.
     apart : (rows, cols) difference of both directions' elevations, metres, NaN where not both gave one.
     otherwise : (rows, cols) the standard deviation of cells that the images do not show, metres.

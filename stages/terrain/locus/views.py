@@ -14,9 +14,9 @@ import scipy
 from numba import njit
 from numpy.typing import NDArray
 
-from stages.geometry.surface import Surface
-from stages.terrain.locus.spline import LANES, SPLINE, read
-from stages.terrain.locus.spline import PLANES as SPLINE_PLANES
+from rille.stages.geometry.surface import Surface
+from rille.stages.terrain.locus.spline import LANES, SPLINE, read
+from rille.stages.terrain.locus.spline import PLANES as SPLINE_PLANES
 
 Float32 = NDArray[np.float32]
 Floats = NDArray[np.float64]

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from raising import raises
 
-from datasets.cameras import read_cameras, rig_of
-from pipeline.commands.calibrate import calibrate, cover
+from rille.datasets.cameras import read_cameras, rig_of
+from rille.pipeline.commands.calibrate import calibrate, cover
 
 BOARDS = {"chessboard_opencv": ("9x6", 0.025), "chessboard_bumblebee2": ("6x4", 0.03)}
 

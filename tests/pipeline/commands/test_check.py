@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from raising import raises
 
-from datasets.registry import open_sequence
-from pipeline.commands.check import check
+from rille.datasets.registry import open_sequence
+from rille.pipeline.commands.check import check
 
 ROWS, COLUMNS, MARGIN = 120, 200, 40
 

@@ -12,11 +12,11 @@ import rasterio
 from rasterio.transform import from_origin
 from terrain_runs import LATTICE, PLACE, elevation, finished, hills
 
-from pipeline import cli
-from pipeline.commands import compare_dem
-from pipeline.commands.compare_dem import compare
-from pipeline.export.terrain_zarr import write_terrain
-from stages.terrain import merge
+from rille.pipeline import cli
+from rille.pipeline.commands import compare_dem
+from rille.pipeline.commands.compare_dem import compare
+from rille.pipeline.export.terrain_zarr import write_terrain
+from rille.stages.terrain import merge
 
 
 def tiff(path: Path, values: np.ndarray, cell: float, x0: float, y0: float, **more: object) -> Path:

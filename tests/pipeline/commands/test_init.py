@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from raising import raises
 
-from datasets.images.files import Digests
-from datasets.manifest.opening import open_manifest
-from pipeline.commands.init import init
+from rille.datasets.images.files import Digests
+from rille.datasets.manifest.opening import open_manifest
+from rille.pipeline.commands.init import init
 
 SETTINGS = """%YAML:1.0
 Camera.fx: 60.0

@@ -8,10 +8,10 @@ import pytest
 import rasterio
 from raising import raises
 
-from pipeline.cli import main
-from pipeline.commands import match as command
-from pipeline.export.writers import read_disparity, write_disparity
-from stages.core.validity import Validity
+from rille.pipeline.cli import main
+from rille.pipeline.commands import match as command
+from rille.pipeline.export.writers import read_disparity, write_disparity
+from rille.stages.core.validity import Validity
 
 SHIFT = -9.0
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 from raising import raises
 
-from pipeline.commands import params
-from pipeline.flow import config
+from rille.pipeline.commands import params
+from rille.pipeline.flow import config
 
 PAGE = Path(__file__).resolve().parents[3] / "docs" / "parameters.md"
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 import pytest
 from toys.chain import build
 
-from datasets.registry import open_sequence
-from pipeline.commands import plan
-from pipeline.engine import forecast, scheduler
-from pipeline.engine.graph import Graph
-from pipeline.engine.memory import cost_model
-from pipeline.engine.store.base import Store
-from pipeline.flow import config as configuration
-from pipeline.flow.closed_loop import dataflow
+from rille.datasets.registry import open_sequence
+from rille.pipeline.commands import plan
+from rille.pipeline.engine import forecast, scheduler
+from rille.pipeline.engine.graph import Graph
+from rille.pipeline.engine.memory import cost_model
+from rille.pipeline.engine.store.base import Store
+from rille.pipeline.flow import config as configuration
+from rille.pipeline.flow.closed_loop import dataflow
 
 SECONDS = {"numbers": (0.0, 2.0, 0.0), "scale": (0.0, 3.0, 0.0), "total": (0.0, 1.0, 0.0)}
 

@@ -8,11 +8,11 @@ import pytest
 from raising import raises
 from toys.chain import build
 
-from pipeline.commands import why
-from pipeline.engine import scheduler
-from pipeline.engine.graph import Graph
-from pipeline.engine.store.base import Store
-from pipeline.runs import lookup
+from rille.pipeline.commands import why
+from rille.pipeline.engine import scheduler
+from rille.pipeline.engine.graph import Graph
+from rille.pipeline.engine.store.base import Store
+from rille.pipeline.runs import lookup
 
 
 def run(folder, name, sequence="toy", **kw):
@@ -42,7 +42,7 @@ def test_a_computed_task_tells_all_that_it_was_made_from(three):
     numbers = next(r for r in lookup.events.read(third / "ledger.jsonl") if r["label"] == "numbers/2")
     assert f"input         values       numbers/2                digest {numbers['digest'][:12]}, cached" in lines
     assert "parameter     scale.offset = 0.5" in text
-    assert "stages.core.declare" in text
+    assert "rille.stages.core.declare" in text
     assert "packages      numpy " in text
     assert lines[-1] == "since         toy/2: params.offset 0.0 -> 0.5"
     assert told(folder, second, "scale/2")[-1] == "since         toy/1: nothing changed, the key is the same"
@@ -76,14 +76,14 @@ def test_many_inputs_are_counted_and_an_artifact_that_has_gone_is_said(tmp_path)
 
 
 def test_differences_from_the_programs_defaults_are_marked():
-    from pipeline.flow.config import stage
+    from rille.pipeline.flow.config import stage
 
     made = {
         "stage": "locus",
         "provenance": {
             "params": stage("locus").params(max_residual=0.7).model_dump(mode="json"),
             "args": {"pair": 3},
-            "code": {"stages.terrain.locus.stage": "0"},
+            "code": {"rille.stages.terrain.locus.stage": "0"},
             "env": {},
             "started": 0.0,
             "python": "3.11.7",

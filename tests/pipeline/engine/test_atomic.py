@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.engine.runtime import atomic
+from rille.pipeline.engine.runtime import atomic
 
 PIPELINE = Path(__file__).parents[3] / "pipeline"
 

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from pipeline.engine import code_digest
+from rille.pipeline.engine import code_digest
 
 FILES = {
     "__init__.py": '"""Package."""\n',
@@ -100,15 +100,20 @@ def test_a_running_process_keeps_what_it_read(package, tmp_path):
 
 
 def test_every_stage_reaches_the_declarations():
-    assert {"stages", "stages.core.declare", "stages.odometry.keyframes", "stages.core.errors"} <= set(
-        code_digest.module_digests("stages.odometry.keyframes")
+    assert {
+        "rille.stages",
+        "rille.stages.core.declare",
+        "rille.stages.odometry.keyframes",
+        "rille.stages.core.errors",
+    } <= set(code_digest.module_digests("rille.stages.odometry.keyframes"))
+    assert not any(
+        name.startswith("rille.pipeline") for name in code_digest.module_digests("rille.stages.odometry.keyframes")
     )
-    assert not any(name.startswith("pipeline") for name in code_digest.module_digests("stages.odometry.keyframes"))
 
 
 def test_an_unknown_module_is_named():
     with pytest.raises(ModuleNotFoundError, match=r"stages\.nowhere"):
-        code_digest.code_digest("stages.nowhere")
+        code_digest.code_digest("rille.stages.nowhere")
 
 
 def test_what_was_found_in_sources_is_remembered_by_their_bytes(package, tmp_path, monkeypatch):

@@ -10,10 +10,10 @@ from hands import by_hand
 from raising import raises
 from toys import chain
 
-from pipeline.engine import scheduler
-from pipeline.engine.executors import base, dask_cluster
-from pipeline.engine.graph import Graph
-from pipeline.engine.store.base import Store
+from rille.pipeline.engine import scheduler
+from rille.pipeline.engine.executors import base, dask_cluster
+from rille.pipeline.engine.graph import Graph
+from rille.pipeline.engine.store.base import Store
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +95,7 @@ def test_no_workers_and_a_scheduler_that_leaves(tmp_path, monkeypatch):
         hands.worker("only")
         graph = Graph()
         chain.build(graph)
-        from stages.core.declare import NoParams
+        from rille.stages.core.declare import NoParams
 
         graph.node("toys.mischief", "sleep/0", NoParams(), {"what": "sleep", "seconds": 60, "i": 0})
         monkeypatch.setattr(dask_cluster, "NO_WORKERS", 30.0)

@@ -17,13 +17,13 @@ from raising import raises
 from toys import waiting
 from toys.chain import build
 
-from pipeline.engine import scheduler
-from pipeline.engine.executors.base import WorkerDiedError
-from pipeline.engine.executors.processes import Workers
-from pipeline.engine.graph import Graph
-from pipeline.engine.store import maintenance
-from pipeline.engine.store.base import Store
-from stages.core.declare import NoParams
+from rille.pipeline.engine import scheduler
+from rille.pipeline.engine.executors.base import WorkerDiedError
+from rille.pipeline.engine.executors.processes import Workers
+from rille.pipeline.engine.graph import Graph
+from rille.pipeline.engine.store import maintenance
+from rille.pipeline.engine.store.base import Store
+from rille.stages.core.declare import NoParams
 
 HERE = Path(__file__).resolve().parent.parent
 
@@ -181,7 +181,7 @@ def test_a_worker_that_waits_prepares_what_is_to_come(cache, tmp_path):
 
 
 def test_a_preparation_that_kills_workers_ends_the_run(cache, tmp_path, monkeypatch):
-    monkeypatch.setattr("pipeline.engine.executors.processes.UNREADY", 1)
+    monkeypatch.setattr("rille.pipeline.engine.executors.processes.UNREADY", 1)
     workers = Workers(1, waiting.answer, prepare=waiting.note, names=[str(tmp_path / "deadly")])
     try:
         with raises("RIL-585"):

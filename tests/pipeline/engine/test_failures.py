@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 from raising import raises
 
-from pipeline.cli import main
-from pipeline.engine import scheduler
-from pipeline.engine.failures import told
-from pipeline.engine.graph import Graph
-from pipeline.engine.store.base import Store
+from rille.pipeline.cli import main
+from rille.pipeline.engine import scheduler
+from rille.pipeline.engine.failures import told
+from rille.pipeline.engine.graph import Graph
+from rille.pipeline.engine.store.base import Store
 
 
 def opencv_error() -> cv2.error:
@@ -37,7 +37,7 @@ def opencv_error() -> cv2.error:
 )
 def test_what_a_machine_or_a_library_refuses_is_told_in_one_line(monkeypatch, capsys, error, code, words):
     assert words in str(told(error))
-    monkeypatch.setattr("pipeline.commands.init.init", lambda *_: (_ for _ in ()).throw(error))
+    monkeypatch.setattr("rille.pipeline.commands.init.init", lambda *_: (_ for _ in ()).throw(error))
     with pytest.raises(SystemExit) as end:
         main(["init", "."])
     line = capsys.readouterr().err
@@ -59,7 +59,7 @@ def test_a_cache_that_cannot_be_written_is_refused_before_anything_is_computed(t
     def refuse(*_, **__):
         raise OSError(errno.EROFS, os.strerror(errno.EROFS))
 
-    monkeypatch.setattr("pipeline.engine.store.folder.tempfile.TemporaryFile", refuse)
+    monkeypatch.setattr("rille.pipeline.engine.store.folder.tempfile.TemporaryFile", refuse)
     ended = []
     monkeypatch.setattr(scheduler, "make", lambda *_: ended.append("an executor was started"))
     with raises("RIL-575", "may not be used"):

@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from pipeline.engine import forecast
-from pipeline.engine.forecast import Forecast, kind
-from pipeline.engine.reference import REFERENCE
+from rille.pipeline.engine import forecast
+from rille.pipeline.engine.forecast import Forecast, kind
+from rille.pipeline.engine.reference import REFERENCE
 
 EARLIER = {"image": (0.5, 0.1, 0.0), "match": (0.5, 1.0, 4.0), "map": (0.25, 2.0, 6.0)}
 OPENED = [f"image/{k}" for k in range(4)] + [f"match/{k}" for k in range(4)]

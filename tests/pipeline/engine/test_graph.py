@@ -7,10 +7,10 @@ from toys import mischief, numbers, scale, total
 from toys.numbers import NumbersParams
 from toys.scale import ScaleParams
 
-from pipeline.engine import scheduler
-from pipeline.engine.graph import Graph, Maybe, MissingError
-from pipeline.engine.store.base import Store
-from stages.core.declare import NoParams
+from rille.pipeline.engine import scheduler
+from rille.pipeline.engine.graph import Graph, Maybe, MissingError
+from rille.pipeline.engine.store.base import Store
+from rille.stages.core.declare import NoParams
 
 NO = NoParams()
 

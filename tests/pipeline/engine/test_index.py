@@ -10,13 +10,13 @@ import tracemalloc
 import pytest
 from toys import chain
 
-from pipeline.engine import scheduler
-from pipeline.engine.graph import Graph
-from pipeline.engine.store import folder, index
-from pipeline.engine.store.base import Store
-from pipeline.engine.store.folder import Folder
-from pipeline.engine.store.manifest import Ref
-from pipeline.engine.store.place import Item
+from rille.pipeline.engine import scheduler
+from rille.pipeline.engine.graph import Graph
+from rille.pipeline.engine.store import folder, index
+from rille.pipeline.engine.store.base import Store
+from rille.pipeline.engine.store.folder import Folder
+from rille.pipeline.engine.store.manifest import Ref
+from rille.pipeline.engine.store.place import Item
 
 NODES = 9
 

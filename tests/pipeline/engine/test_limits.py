@@ -10,15 +10,15 @@ from raising import raises
 from toys.chain import build
 from toys.numbers import NumbersParams
 
-from pipeline.commands import plan
-from pipeline.engine import events, scheduler
-from pipeline.engine.graph import Graph
-from pipeline.engine.memory import cost_model, limits
-from pipeline.engine.memory.admission import Account, MemoryRefusedError, Waiting, account, forecast
-from pipeline.engine.memory.cost_model import Costs, Group
-from pipeline.engine.store.base import Store
-from pipeline.engine.task import Spec
-from stages.core.declare import NoParams
+from rille.pipeline.commands import plan
+from rille.pipeline.engine import events, scheduler
+from rille.pipeline.engine.graph import Graph
+from rille.pipeline.engine.memory import cost_model, limits
+from rille.pipeline.engine.memory.admission import Account, MemoryRefusedError, Waiting, account, forecast
+from rille.pipeline.engine.memory.cost_model import Costs, Group
+from rille.pipeline.engine.store.base import Store
+from rille.pipeline.engine.task import Spec
+from rille.stages.core.declare import NoParams
 
 MB = 1_000_000
 HOG = 60 * MB

@@ -14,14 +14,14 @@ import pytest
 from numba.core import caching
 from toys.numbers import NumbersParams
 
-from pipeline.engine import progress
-from pipeline.engine.graph import Graph
-from pipeline.engine.runtime import numba_cache
-from pipeline.engine.runtime.numba_cache import COMPILING, guard
+from rille.pipeline.engine import progress
+from rille.pipeline.engine.graph import Graph
+from rille.pipeline.engine.runtime import numba_cache
+from rille.pipeline.engine.runtime.numba_cache import COMPILING, guard
 
 ROOT = Path(__file__).resolve().parents[3]
 KERNEL = """
-from pipeline.engine.runtime.numba_cache import guard
+from rille.pipeline.engine.runtime.numba_cache import guard
 guard()
 import numba
 @numba.njit(cache=True)
@@ -88,11 +88,17 @@ def test_numba_itself_finds_its_kernels_and_survives_damage(tmp_path):
 
 
 CALLEE = "import numba\n@numba.njit(cache=True)\ndef twice(x):\n    return x * 2\n"
-CALLER = "import numba\nfrom stages.callee import twice\n@numba.njit(cache=True)\ndef f(x):\n    return twice(x) + 1\n"
+CALLER = """
+import numba
+from rille.stages.callee import twice
+@numba.njit(cache=True)
+def f(x):
+    return twice(x) + 1
+"""
 RUN = """
-from pipeline.engine.runtime.environment import prepare_environment
+from rille.pipeline.engine.runtime.environment import prepare_environment
 prepare_environment()
-from stages.caller import f
+from rille.stages.caller import f
 print(f(21), sum(f.stats.cache_hits.values()))
 """
 
@@ -108,12 +114,13 @@ def checkout(tmp_path):
         for file, text in {"__init__": "", "callee": CALLEE, "caller": CALLER}.items():
             (stages / f"{file}.py").write_text(text)
         shutil.copytree(ROOT / "stages" / "core", stages / "core")
+        for same in ("rille", "pipeline"):
+            shutil.copytree(ROOT / same, tmp_path / name / same)
 
         def said():
-            path = os.pathsep.join([str(tmp_path / name), str(ROOT)])
             done = subprocess.run(
                 [sys.executable, "-c", RUN],
-                env={**environment, "PYTHONPATH": path},
+                env={**environment, "PYTHONPATH": str(tmp_path / name)},
                 cwd=tmp_path,
                 capture_output=True,
                 text=True,
@@ -169,9 +176,9 @@ def test_seconds_of_compiling_end_with_the_outermost_kernel(entry, monkeypatch):
 
 
 WRAPPERS = """
-from pipeline.engine.runtime.environment import prepare_environment
+from rille.pipeline.engine.runtime.environment import prepare_environment
 prepare_environment()
-from stages.caller import f
+from rille.stages.caller import f
 f(21)
 print("cfunc" in " ".join(f.inspect_llvm().values()), "cpython" in " ".join(f.inspect_llvm().values()))
 """
@@ -184,7 +191,7 @@ def test_own_kernels_are_compiled_without_the_wrapper_for_c(checkout, monkeypatc
 
 LATER = """
 import sys
-from pipeline.engine.runtime.numba_cache import guard
+from rille.pipeline.engine.runtime.numba_cache import guard
 guard()
 from numba.core import caching
 print("asks", flush=True)
@@ -213,7 +220,7 @@ def test_a_process_that_failed_to_compile_holds_nobody_up(entry, tmp_path, end):
         COMPILING.take()
     else:
         script = script.replace(
-            "guard()\n", "guard()\nfrom pipeline.engine.runtime import numba_cache as n\nn.PATIENCE = 0.1\n"
+            "guard()\n", "guard()\nfrom rille.pipeline.engine.runtime import numba_cache as n\nn.PATIENCE = 0.1\n"
         )
     command = [sys.executable, "-c", script, str(tmp_path)]
     done = subprocess.run(command, env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, timeout=100)

@@ -13,9 +13,8 @@ from pathlib import Path
 import pytest
 from raising import raises
 
-import datasets
-import stages
-from pipeline.engine import code_digest, packages
+from rille import datasets, stages
+from rille.pipeline.engine import code_digest, packages
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -57,7 +56,7 @@ def test_packages_come_from_the_imports_of_all_that_is_reached(tmp_path, monkeyp
 
 
 KINDS = """
-from pipeline.engine.packages import version
+from rille.pipeline.engine.packages import version
 print([version(name) for name in ("numpy", "scipy", "opencv-python-headless")])
 """
 

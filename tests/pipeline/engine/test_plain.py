@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline import cli
-from pipeline.engine.plain import UNSEEN, Plain, plain, plain_output
-from pipeline.export.writers import write_table
+from rille.pipeline import cli
+from rille.pipeline.engine.plain import UNSEEN, Plain, plain, plain_output
+from rille.pipeline.export.writers import write_table
 
 ESCAPE = "\x1b]0;owned\x07\x1b[2J\u202etxt.\x9b1m"
 

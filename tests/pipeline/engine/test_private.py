@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.engine.runtime import private
-from pipeline.engine.runtime.private import private_folder
+from rille.pipeline.engine.runtime import private
+from rille.pipeline.engine.runtime.private import private_folder
 
 
 @pytest.fixture

@@ -16,14 +16,14 @@ import pytest
 import servers
 from toys import chain
 
-from pipeline.engine import scheduler
-from pipeline.engine.graph import Graph
-from pipeline.engine.store import maintenance, manifest, s3
-from pipeline.engine.store.base import at
-from pipeline.engine.store.folder import Folder
-from pipeline.engine.store.location import hints_folder, locate
-from pipeline.engine.store.manifest import artifact_path
-from stages.core.declare import Bundle
+from rille.pipeline.engine import scheduler
+from rille.pipeline.engine.graph import Graph
+from rille.pipeline.engine.store import maintenance, manifest, s3
+from rille.pipeline.engine.store.base import at
+from rille.pipeline.engine.store.folder import Folder
+from rille.pipeline.engine.store.location import hints_folder, locate
+from rille.pipeline.engine.store.manifest import artifact_path
+from rille.stages.core.declare import Bundle
 
 from toys import numbers  # isort: skip
 from raising import raises
@@ -264,7 +264,7 @@ def test_no_secret_is_written_anywhere(url, tmp_path, capfd, proxied):
 
 
 def rille(url, environment, *words):
-    command = [sys.executable, "-m", "pipeline.cli", "cache", "verify", "--cache", url, *words]
+    command = [sys.executable, "-m", "rille.pipeline.cli", "cache", "verify", "--cache", url, *words]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60)
     return done.returncode, done.stderr.strip()
 

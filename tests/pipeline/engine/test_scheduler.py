@@ -14,13 +14,13 @@ from toys.chain import build
 from toys.numbers import NumbersParams
 from toys.scale import ScaleParams
 
-from pipeline.engine import events as ledger
-from pipeline.engine import packages, progress, scheduler
-from pipeline.engine.graph import Graph, Maybe
-from pipeline.engine.store import maintenance
-from pipeline.engine.store.base import Store
-from pipeline.engine.task import Spec, ensure, recipe
-from stages.core.declare import NoParams
+from rille.pipeline.engine import events as ledger
+from rille.pipeline.engine import packages, progress, scheduler
+from rille.pipeline.engine.graph import Graph, Maybe
+from rille.pipeline.engine.store import maintenance
+from rille.pipeline.engine.store.base import Store
+from rille.pipeline.engine.task import Spec, ensure, recipe
+from rille.stages.core.declare import NoParams
 
 NO = NoParams()
 
@@ -196,7 +196,7 @@ def test_the_users_error_is_the_original_with_its_place(cache):
 
 
 def test_input_output_errors_are_tried_three_times_others_once(cache, tmp_path, monkeypatch):
-    monkeypatch.setattr("pipeline.engine.task.BACK_OFF", 0.001)
+    monkeypatch.setattr("rille.pipeline.engine.task.BACK_OFF", 0.001)
     _, result = run(cache, make=mischief("disk", tally=str(tmp_path / "disk")))
     assert result.ok
     assert (tmp_path / "disk").read_text() == "xxx"
@@ -309,7 +309,7 @@ def test_manifest_says_where_a_result_comes_from(cache):
     about = Store(cache).manifest("scale", scale.key)["provenance"]
     assert about["params"] == {"offset": 0.0}
     assert about["inputs"] == {"values": graph.nodes[0].ref.digest}
-    assert set(about["code"]) >= {"toys.scale", "toys.helper", "stages.core.declare"}
+    assert set(about["code"]) >= {"toys.scale", "toys.helper", "rille.stages.core.declare"}
     assert about["env"] == {"numpy": packages.version("numpy")}
     assert about["seconds"] >= 0
     assert about["peak_rss"] > 1e6

@@ -21,10 +21,10 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as st_numpy
 from raising import raises
 
-from pipeline.engine.store import artifact, folder, maintenance, manifest
-from pipeline.engine.store.artifact import array_digests, output_digest
-from pipeline.engine.store.base import Store
-from stages.core.declare import Array, Bundle, NoParams, Stage
+from rille.pipeline.engine.store import artifact, folder, maintenance, manifest
+from rille.pipeline.engine.store.artifact import array_digests, output_digest
+from rille.pipeline.engine.store.base import Store
+from rille.stages.core.declare import Array, Bundle, NoParams, Stage
 
 STAGE = Stage(
     name="toy",

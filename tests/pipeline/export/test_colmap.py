@@ -4,10 +4,10 @@ import numpy as np
 import pycolmap
 from raising import raises
 
-from pipeline.engine.store.base import Store
-from pipeline.export.colmap import build, export_run
-from stages.core.declare import Bundle
-from stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
+from rille.pipeline.engine.store.base import Store
+from rille.pipeline.export.colmap import build, export_run
+from rille.stages.core.declare import Bundle
+from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
 
 CAMERA = Camera(400.0, 410.0, 319.5, 239.5, 640, 480)
 RIG = Rig(CAMERA, CAMERA, RigidTransform(rotation_exp([0.0, 0.1, 0.0]), np.array([-0.2, 0.0, 0.01])))

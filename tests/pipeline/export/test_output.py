@@ -15,16 +15,16 @@ import pytest
 from evo.tools import file_interface
 from toys.finished import FRAMES, bundles, checked, checks, sequence, view
 
-from datasets.georeference import Georeference
-from pipeline.engine.keys import digest
-from pipeline.export import catalogue
-from pipeline.export.frames_json import FRAMES as REFERENCES
-from pipeline.export.frames_json import describe
-from pipeline.export.output import Output, handles, pack, place, task, unpack
-from pipeline.report import canvas, gallery
-from pipeline.report.block import Figure
-from pipeline.runs import run_files
-from stages.core.declare import Bundle
+from rille.datasets.georeference import Georeference
+from rille.pipeline.engine.keys import digest
+from rille.pipeline.export import catalogue
+from rille.pipeline.export.frames_json import FRAMES as REFERENCES
+from rille.pipeline.export.frames_json import describe
+from rille.pipeline.export.output import Output, handles, pack, place, task, unpack
+from rille.pipeline.report import canvas, gallery
+from rille.pipeline.report.block import Figure
+from rille.pipeline.runs import run_files
+from rille.stages.core.declare import Bundle
 
 ROOT = Path(__file__).parents[3]
 PAGE = ROOT / "docs" / "outputs.md"
@@ -108,7 +108,7 @@ def test_what_a_record_does_not_name_is_out_of_reach() -> None:
     output = Output("a", "", "", curious, ("risk",), (), ("sequence.name",))
     laid_out = task(output, whole)
     assert laid_out is not None
-    from pipeline.export.output import restore
+    from rille.pipeline.export.output import restore
 
     curious(Path(), restore(laid_out[0], [made[handle.ref] for handle in laid_out[1]]))
 

@@ -10,11 +10,11 @@ import pyproj
 import xarray
 from terrain_runs import LATTICE, PLACE, elevation
 
-from pipeline.engine.store.base import Store
-from pipeline.export.terrain_zarr import write_terrain
-from stages.core.declare import Bundle
-from stages.terrain import merge
-from stages.terrain.merge import Layer, MergeParams
+from rille.pipeline.engine.store.base import Store
+from rille.pipeline.export.terrain_zarr import write_terrain
+from rille.stages.core.declare import Bundle
+from rille.stages.terrain import merge
+from rille.stages.terrain.merge import Layer, MergeParams
 
 
 def arrays() -> dict:

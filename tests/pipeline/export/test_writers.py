@@ -16,10 +16,10 @@ import rasterio
 from evo.tools import file_interface
 from raising import raises
 
-from datasets.georeference import Georeference
-from pipeline.export import styles
-from pipeline.export.frames_json import describe
-from pipeline.export.writers import (
+from rille.datasets.georeference import Georeference
+from rille.pipeline.export import styles
+from rille.pipeline.export.frames_json import describe
+from rille.pipeline.export.writers import (
     write_path_geojson,
     write_path_gpkg,
     write_raster,
@@ -28,8 +28,8 @@ from pipeline.export.writers import (
     write_trajectory_kitti,
     write_trajectory_tum,
 )
-from stages.geometry.geometry import rotation_exp
-from stages.geometry.lattice import Lattice
+from rille.stages.geometry.geometry import rotation_exp
+from rille.stages.geometry.lattice import Lattice
 
 LATTICE = Lattice.at(-40, 700, 0.001, 600, 700)
 

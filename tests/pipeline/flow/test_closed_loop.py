@@ -15,14 +15,14 @@ import numpy as np
 import pytest
 from raising import raises
 
-from datasets.registry import open_sequence
-from pipeline.engine import scheduler
-from pipeline.engine.graph import Graph, Handle
-from pipeline.engine.scheduler import Result
-from pipeline.engine.store.base import Store
-from pipeline.flow import config, unread
-from pipeline.flow.closed_loop import Drive
-from pipeline.runs import session
+from rille.datasets.registry import open_sequence
+from rille.pipeline.engine import scheduler
+from rille.pipeline.engine.graph import Graph, Handle
+from rille.pipeline.engine.scheduler import Result
+from rille.pipeline.engine.store.base import Store
+from rille.pipeline.flow import config, unread
+from rille.pipeline.flow.closed_loop import Drive
+from rille.pipeline.runs import session
 
 SMALL = (
     "mockup.image_width=160",

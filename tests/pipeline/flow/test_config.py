@@ -6,7 +6,7 @@ from pathlib import Path
 
 from raising import raises
 
-from pipeline.flow import config
+from rille.pipeline.flow import config
 
 
 def test_layers_win_in_order() -> None:

@@ -5,11 +5,11 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any
 
-from datasets.registry import open_sequence
-from pipeline.engine.graph import Graph
-from pipeline.flow import config
-from pipeline.flow.closed_loop import dataflow
-from pipeline.flow.products import Products
+from rille.datasets.registry import open_sequence
+from rille.pipeline.engine.graph import Graph
+from rille.pipeline.flow import config
+from rille.pipeline.flow.closed_loop import dataflow
+from rille.pipeline.flow.products import Products
 
 FRAMES = 8
 

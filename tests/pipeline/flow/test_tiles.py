@@ -6,15 +6,15 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.engine import scheduler
-from pipeline.engine.graph import Graph
-from pipeline.engine.store.base import Store
-from pipeline.flow import tiles
-from pipeline.flow.config import build
-from pipeline.flow.tiles import Tiling
-from stages.core.declare import NoParams
-from stages.hfvm.images.params import HfvmParams
-from stages.imaging.pyramid import PyramidParams
+from rille.pipeline.engine import scheduler
+from rille.pipeline.engine.graph import Graph
+from rille.pipeline.engine.store.base import Store
+from rille.pipeline.flow import tiles
+from rille.pipeline.flow.config import build
+from rille.pipeline.flow.tiles import Tiling
+from rille.stages.core.declare import NoParams
+from rille.stages.hfvm.images.params import HfvmParams
+from rille.stages.imaging.pyramid import PyramidParams
 
 SHAPE = (150, 190)
 
@@ -39,9 +39,9 @@ def pyramids(graph, images):
     for camera, path in images.items():
         args = {"path": str(path), "sha256": hashlib.sha256(path.read_bytes()).hexdigest(), "frame": 0}
         args |= {"camera": camera, "width": SHAPE[1], "height": SHAPE[0], "depth": 8}
-        image = graph.node("datasets.images.files", f"image/{camera}", NoParams(), args)
+        image = graph.node("rille.datasets.images.files", f"image/{camera}", NoParams(), args)
         found[camera] = graph.node(
-            "stages.imaging.pyramid", f"pyramid/{camera}", PyramidParams(), inputs={"image": image}
+            "rille.stages.imaging.pyramid", f"pyramid/{camera}", PyramidParams(), inputs={"image": image}
         )
     return found
 
@@ -50,7 +50,7 @@ def disparity(store, images, params, side):
     graph = Graph()
     given = pyramids(graph, images)
     if side is None:
-        node = graph.node("stages.hfvm.stage", "hfvm", params, inputs=given)
+        node = graph.node("rille.stages.hfvm.stage", "hfvm", params, inputs=given)
     else:
         node = tiles.Tiles(graph, params, PyramidParams(), given, (SHAPE, SHAPE), side, "hfvm").build()
     scheduler.run(graph, store, executor="inline").check()
@@ -71,8 +71,8 @@ def test_the_artifact_is_that_of_the_pair_matched_whole(tmp_path, images, preset
 @pytest.mark.slow
 @pytest.mark.parametrize("preset", ["default", "fast"])
 def test_mockup_in_tiles_of_256_has_the_digest_of_the_whole(tmp_path, preset):
-    from pipeline.flow.builders import Builder
-    from pipeline.runs.session import Options, settings
+    from rille.pipeline.flow.builders import Builder
+    from rille.pipeline.runs.session import Options, settings
 
     digests = []
     for side in (0, 256):

@@ -9,12 +9,12 @@ import pytest
 from raising import raises
 from toys.chain import build as toy
 
-from datasets.registry import open_sequence
-from pipeline.cli import main
-from pipeline.engine.graph import Graph
-from pipeline.flow import config as configuration
-from pipeline.flow import unread
-from pipeline.runs import session
+from rille.datasets.registry import open_sequence
+from rille.pipeline.cli import main
+from rille.pipeline.engine.graph import Graph
+from rille.pipeline.flow import config as configuration
+from rille.pipeline.flow import unread
+from rille.pipeline.runs import session
 
 
 def settled(tmp_path: Path, sequence: str, *assignments: str, config: Path | None = None) -> session.Settings:
@@ -88,7 +88,7 @@ def test_sections_without_a_task_in_the_graph_are_told():
     toy(graph)
     assert unread.unread(["track.points", "drive.goal"], config, graph) == ["track.points"]
     graph.node(
-        "stages.odometry.motion",
+        "rille.stages.odometry.motion",
         "motion",
         config.motion,
         {"vehicle": {}},

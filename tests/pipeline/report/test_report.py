@@ -13,17 +13,17 @@ import numpy as np
 import pytest
 from toys.finished import TASKS, Written, bundles, products, report, view, written
 
-from datasets.georeference import Georeference
-from datasets.mockup.sequence import vehicle_at_scale
-from pipeline.export import ranges
-from pipeline.export.view import TaskRow
-from pipeline.flow.products import Driven, Products
-from pipeline.report import canvas, figures, tables, words
-from pipeline.runs import session
-from stages.core.declare import Bundle
-from stages.core.errors import RilleError
-from stages.hazard.risk import RiskParams
-from stages.odometry.resection.trajectory import _account
+from rille.datasets.georeference import Georeference
+from rille.datasets.mockup.sequence import vehicle_at_scale
+from rille.pipeline.export import ranges
+from rille.pipeline.export.view import TaskRow
+from rille.pipeline.flow.products import Driven, Products
+from rille.pipeline.report import canvas, figures, tables, words
+from rille.pipeline.runs import session
+from rille.stages.core.declare import Bundle
+from rille.stages.core.errors import RilleError
+from rille.stages.hazard.risk import RiskParams
+from rille.stages.odometry.resection.trajectory import _account
 
 
 @pytest.fixture(scope="module")

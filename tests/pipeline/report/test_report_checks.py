@@ -27,11 +27,11 @@ from toys.finished import (
     written,
 )
 
-from pipeline.export import artifacts
-from pipeline.report import canvas, figures, gather
-from stages.core.declare import Bundle
-from stages.hazard.risk import RiskParams
-from stages.hazard.vehicle import Vehicle
+from rille.pipeline.export import artifacts
+from rille.pipeline.report import canvas, figures, gather
+from rille.stages.core.declare import Bundle
+from rille.stages.hazard.risk import RiskParams
+from rille.stages.hazard.vehicle import Vehicle
 
 
 @pytest.fixture(scope="module")

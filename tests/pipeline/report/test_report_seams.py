@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pipeline.report import seams
-from stages.core.declare import Bundle, NoParams
-from stages.geometry.lattice import Lattice
-from stages.terrain import overlap_audit, overlap_qa
-from stages.terrain.overlap_audit import SeamAuditParams
+from rille.pipeline.report import seams
+from rille.stages.core.declare import Bundle, NoParams
+from rille.stages.geometry.lattice import Lattice
+from rille.stages.terrain import overlap_audit, overlap_qa
+from rille.stages.terrain.overlap_audit import SeamAuditParams
 
 TILT = math.radians(0.2)
 

@@ -7,7 +7,7 @@ import json
 import pytest
 from test_why import run
 
-from pipeline.runs import critical_path
+from rille.pipeline.runs import critical_path
 
 
 def ledger(path, rows, **facts):

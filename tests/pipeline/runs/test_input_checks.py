@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 import pytest
 
-from datasets.protocol import Positions
-from pipeline.runs import input_checks
-from stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
-from stages.imaging.image_quality import Look, look
+from rille.datasets.protocol import Positions
+from rille.pipeline.runs import input_checks
+from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
+from rille.stages.imaging.image_quality import Look, look
 
 CAMERA = Camera(500.0, 500.0, 160.0, 120.0, 320, 240)
 

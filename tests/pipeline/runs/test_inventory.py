@@ -10,11 +10,11 @@ import pytest
 from raising import raises
 from test_why import run
 
-from pipeline.engine.store import maintenance
-from pipeline.engine.store.base import Store
-from pipeline.engine.store.manifest import artifact_path, frame, length
-from pipeline.runs import inventory, lookup, pins
-from pipeline.runs import session as commands
+from rille.pipeline.engine.store import maintenance
+from rille.pipeline.engine.store.base import Store
+from rille.pipeline.engine.store.manifest import artifact_path, frame, length
+from rille.pipeline.runs import inventory, lookup, pins
+from rille.pipeline.runs import session as commands
 
 
 def grow_old(folder):

@@ -11,11 +11,11 @@ import pytest
 from raising import raises
 from toys import chain
 
-from pipeline.engine import scheduler
-from pipeline.engine.graph import Graph
-from pipeline.engine.store.base import Store
-from pipeline.engine.store.maintenance import artifacts
-from pipeline.runs import pins, roots, session
+from rille.pipeline.engine import scheduler
+from rille.pipeline.engine.graph import Graph
+from rille.pipeline.engine.store.base import Store
+from rille.pipeline.engine.store.maintenance import artifacts
+from rille.pipeline.runs import pins, roots, session
 
 
 @pytest.fixture

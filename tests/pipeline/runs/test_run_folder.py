@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 import pytest
 from raising import raises
 
-from pipeline.runs import session
+from rille.pipeline.runs import session
 
 NOW = datetime(2026, 1, 2, tzinfo=UTC)
 

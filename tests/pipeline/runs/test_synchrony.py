@@ -5,9 +5,9 @@ from __future__ import annotations
 import cv2
 import pytest
 
-from datasets.registry import open_sequence
-from pipeline.runs import synchrony
-from pipeline.runs.input_checks import judge_synchrony
+from rille.datasets.registry import open_sequence
+from rille.pipeline.runs import synchrony
+from rille.pipeline.runs.input_checks import judge_synchrony
 
 
 @pytest.mark.data

@@ -8,7 +8,7 @@ from pathlib import Path
 
 def build(graph, frames=4, seed=0, size=40, offset=0.0):
     """Numbers -> scale (per frame) -> total, the parts by expansion."""
-    from stages.core.declare import NoParams
+    from rille.stages.core.declare import NoParams
     from toys.numbers import NumbersParams
     from toys.scale import ScaleParams
 
@@ -30,13 +30,13 @@ def build(graph, frames=4, seed=0, size=40, offset=0.0):
 
 def main(cache, executor="inline", what="", ledger=""):
     """Run it, and say what became of it."""
-    from pipeline.engine.executors.base import prepare_environment
+    from rille.pipeline.engine.executors.base import prepare_environment
 
     prepare_environment()
-    from pipeline.engine import scheduler
-    from pipeline.engine.graph import Graph
-    from pipeline.engine.store.base import Store
-    from stages.core.declare import NoParams
+    from rille.pipeline.engine import scheduler
+    from rille.pipeline.engine.graph import Graph
+    from rille.pipeline.engine.store.base import Store
+    from rille.stages.core.declare import NoParams
 
     graph = Graph()
     build(graph, frames=12 if what == "many" else 4, size=400 if what == "many" else 40)

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from stages.core.declare import Array, Bundle, NoParams, Stage
-from stages.geometry.lattice import Lattice
+from rille.stages.core.declare import Array, Bundle, NoParams, Stage
+from rille.stages.geometry.lattice import Lattice
 
 
 def _run(params, args, inputs):

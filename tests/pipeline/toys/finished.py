@@ -12,21 +12,21 @@ from typing import Any
 import numpy as np
 import pytest
 
-from datasets.protocol import Sequence
-from pipeline.export.view import RunView, TaskRow
-from pipeline.flow.products import Products
-from pipeline.report import canvas, gallery, summary
-from pipeline.report.page import write_report
-from stages.core.declare import Bundle
-from stages.evaluation.accuracy import trajectory_accuracy
-from stages.evaluation.accuracy_parts import metric as figure
-from stages.evaluation.dem_accuracy import dem_accuracy
-from stages.evaluation.path_check import path_check
-from stages.geometry.epipolar import corrected
-from stages.geometry.geometry import Camera, Rig, RigidTransform
-from stages.geometry.lattice import Lattice
-from stages.hazard.risk import RiskParams
-from stages.hazard.vehicle import Vehicle
+from rille.datasets.protocol import Sequence
+from rille.pipeline.export.view import RunView, TaskRow
+from rille.pipeline.flow.products import Products
+from rille.pipeline.report import canvas, gallery, summary
+from rille.pipeline.report.page import write_report
+from rille.stages.core.declare import Bundle
+from rille.stages.evaluation.accuracy import trajectory_accuracy
+from rille.stages.evaluation.accuracy_parts import metric as figure
+from rille.stages.evaluation.dem_accuracy import dem_accuracy
+from rille.stages.evaluation.path_check import path_check
+from rille.stages.geometry.epipolar import corrected
+from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
+from rille.stages.geometry.lattice import Lattice
+from rille.stages.hazard.risk import RiskParams
+from rille.stages.hazard.vehicle import Vehicle
 
 CELL, ROWS, COLS = 0.01, 60, 80
 LATTICE = {"x0": -0.4, "y0": 0.8, "cell": CELL, "rows": ROWS, "cols": COLS}

@@ -4,7 +4,7 @@ import time
 
 import numpy as np
 
-from stages.core.declare import Array, Bundle, Memory, NoParams, Stage
+from rille.stages.core.declare import Array, Bundle, Memory, NoParams, Stage
 
 
 def _run(params, args, inputs):

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from stages.core.declare import Array, Bundle, NoParams, Stage
-from stages.core.errors import DegenerateError
+from rille.stages.core.declare import Array, Bundle, NoParams, Stage
+from rille.stages.core.errors import DegenerateError
 
 
 class UnpicklableError(Exception):

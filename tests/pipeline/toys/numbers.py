@@ -3,7 +3,7 @@
 import numpy as np
 from pydantic import Field
 
-from stages.core.declare import Array, Bundle, Params, Stage
+from rille.stages.core.declare import Array, Bundle, Params, Stage
 
 
 class NumbersParams(Params):

@@ -2,7 +2,7 @@
 
 from pydantic import Field
 
-from stages.core.declare import Array, Bundle, Params, Stage
+from rille.stages.core.declare import Array, Bundle, Params, Stage
 
 
 class ScaleParams(Params):

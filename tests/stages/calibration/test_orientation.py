@@ -10,12 +10,12 @@ from raising import raises
 from rig_scenes import knocked, matches, street_depth, street_rig
 from terrain_scenes import box, disparity, nearest, pitched, plane, smooth_noise, toed_in_rig
 
-from stages.calibration import orientation
-from stages.calibration.orientation import OrientationParams, orient, thin
-from stages.calibration.parameter_selection import RelativeParams
-from stages.core.declare import Bundle, check_outputs
-from stages.core.validity import Validity
-from stages.geometry.geometry import Rig, RigidTransform
+from rille.stages.calibration import orientation
+from rille.stages.calibration.orientation import OrientationParams, orient, thin
+from rille.stages.calibration.parameter_selection import RelativeParams
+from rille.stages.core.declare import Bundle, check_outputs
+from rille.stages.core.validity import Validity
+from rille.stages.geometry.geometry import Rig, RigidTransform
 
 
 def test_thin_takes_the_best_match_of_each_cell():

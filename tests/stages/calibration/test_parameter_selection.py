@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from rig_scenes import bed_depth, bed_rig, knocked, matches, street_depth, street_rig
 
-from stages.calibration import parameter_selection
-from stages.calibration.parameter_selection import RelativeParams, decide
-from stages.geometry.epipolar import NAMES, distances
-from stages.geometry.geometry import Rig, RigidTransform
+from rille.stages.calibration import parameter_selection
+from rille.stages.calibration.parameter_selection import RelativeParams, decide
+from rille.stages.geometry.epipolar import NAMES, distances
+from rille.stages.geometry.geometry import Rig, RigidTransform
 
 PARAMS = RelativeParams()
 SCENES = {"street": (street_rig(), street_depth), "bed": (bed_rig(), bed_depth)}

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from rig_scenes import knocked, matches, street_depth, street_rig
 
-from stages.calibration.relative_orientation import Beliefs, Matches, adjust, considered, settle, solution
-from stages.calibration.relative_orientation_kernel import weigh
-from stages.geometry.epipolar import distances
+from rille.stages.calibration.relative_orientation import Beliefs, Matches, adjust, considered, settle, solution
+from rille.stages.calibration.relative_orientation_kernel import weigh
+from rille.stages.geometry.epipolar import distances
 
 BELIEFS = Beliefs(rotation=np.radians(0.05), baseline=np.radians(0.2), principal=3.5, systematic=0.1)
 ANGLES = [True, True, True, False, False]

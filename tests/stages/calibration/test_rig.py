@@ -11,12 +11,12 @@ from raising import raises
 from rig_scenes import bed_depth, bed_rig, knocked, matches, street_depth, street_rig
 from terrain_scenes import toed_in_rig
 
-from stages.calibration import rig as rig_stage
-from stages.calibration.relative_orientation import RIG, Matches, linearised
-from stages.calibration.rig import RigParams, _drift, orient_rig
-from stages.core.declare import Bundle
-from stages.geometry.epipolar import NAMES
-from stages.geometry.geometry import Rig, RigidTransform
+from rille.stages.calibration import rig as rig_stage
+from rille.stages.calibration.relative_orientation import RIG, Matches, linearised
+from rille.stages.calibration.rig import RigParams, _drift, orient_rig
+from rille.stages.core.declare import Bundle
+from rille.stages.geometry.epipolar import NAMES
+from rille.stages.geometry.geometry import Rig, RigidTransform
 
 
 def facts(rig: Rig, pairs, **params):
@@ -223,12 +223,12 @@ def test_pairs_with_few_matches_are_passed_over_and_told():
 
 @pytest.mark.data
 def test_street_of_kitti_is_left_alone_and_repaired_when_knocked(data_dir):
-    from datasets.images.misalign import MisalignParams, warp
-    from datasets.registry import open_sequence
-    from stages.calibration.orientation import thin
-    from stages.core.validity import matched
-    from stages.geometry.lens import Lens
-    from stages.hfvm.stage import match
+    from rille.datasets.images.misalign import MisalignParams, warp
+    from rille.datasets.registry import open_sequence
+    from rille.stages.calibration.orientation import thin
+    from rille.stages.core.validity import matched
+    from rille.stages.geometry.lens import Lens
+    from rille.stages.hfvm.stage import match
 
     sequence = open_sequence(str(data_dir / "kitti06_51"))
     left, right = (_image(sequence.image(20, camera)) for camera in ("left", "right"))

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from stages.geometry.epipolar import fits
-from stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
+from rille.stages.geometry.epipolar import fits
+from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
 
 CAMERA = Camera(400.0, 400.0, 319.5, 239.5, 640, 480)
 

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from raising import raises
 
-from stages.calibration.target import MODELS, Adjustment, BoardView, calibrate_rig
-from stages.core.errors import DegenerateError
-from stages.geometry.geometry import RigidTransform, rotation_exp
+from rille.stages.calibration.target import MODELS, Adjustment, BoardView, calibrate_rig
+from rille.stages.core.errors import DegenerateError
+from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 
 SIZE = (640, 480)
 ROWS, COLUMNS = np.indices((6, 9))

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from stages.driving.fault_monitor import SafetyParams, Verdict, judge
-from stages.geometry.geometry import RigidTransform, rotation_exp
+from rille.stages.driving.fault_monitor import SafetyParams, Verdict, judge
+from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 
 OPTICAL = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 T_VEHICLE_LEFT = RigidTransform(rotation_exp([-0.5, 0.0, 0.0]) @ OPTICAL, np.array([0.0, 0.05, 0.18]))

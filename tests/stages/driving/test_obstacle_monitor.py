@@ -8,12 +8,22 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from stages.core.declare import Bundle
-from stages.core.validity import Validity
-from stages.driving.obstacle_monitor import STAGE, Obstacle, Points, ReflexParams, Surface, View, look, obstacle, pairs
-from stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
-from stages.geometry.lattice import Lattice
-from stages.hazard.vehicle import Vehicle
+from rille.stages.core.declare import Bundle
+from rille.stages.core.validity import Validity
+from rille.stages.driving.obstacle_monitor import (
+    STAGE,
+    Obstacle,
+    Points,
+    ReflexParams,
+    Surface,
+    View,
+    look,
+    obstacle,
+    pairs,
+)
+from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
+from rille.stages.geometry.lattice import Lattice
+from rille.stages.hazard.vehicle import Vehicle
 
 Floats = NDArray[np.float64]
 ROVER = Vehicle(

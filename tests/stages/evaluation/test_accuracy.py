@@ -13,10 +13,10 @@ from evo.core.trajectory import PosePath3D
 from raising import raises
 from scipy.spatial.transform import Rotation
 
-from stages.core.declare import Bundle, NoParams, check_outputs
-from stages.evaluation import truth
-from stages.evaluation.accuracy import STAGE, by_frame, trajectory_accuracy
-from stages.geometry.geometry import rotation_exp
+from rille.stages.core.declare import Bundle, NoParams, check_outputs
+from rille.stages.evaluation import truth
+from rille.stages.evaluation.accuracy import STAGE, by_frame, trajectory_accuracy
+from rille.stages.geometry.geometry import rotation_exp
 
 
 def walk(seed: int, n: int, step: float = 1.0, turn: float = 0.02) -> np.ndarray:

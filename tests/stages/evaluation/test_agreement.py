@@ -9,10 +9,10 @@ import pytest
 from evo.core import metrics as evo_metrics
 from evo.core.trajectory import PosePath3D
 
-from stages.core.declare import Bundle, check_outputs
-from stages.evaluation.agreement import STAGE, AgreementParams, compare, flag
-from stages.evaluation.pose_alignment import moved
-from stages.geometry.geometry import rotation_exp
+from rille.stages.core.declare import Bundle, check_outputs
+from rille.stages.evaluation.agreement import STAGE, AgreementParams, compare, flag
+from rille.stages.evaluation.pose_alignment import moved
+from rille.stages.geometry.geometry import rotation_exp
 
 RNG = np.random.default_rng
 

@@ -13,9 +13,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from stages.core.declare import Bundle, check_outputs
-from stages.evaluation.accuracy import angles_between, posed
-from stages.evaluation.crosscheck import (
+from rille.stages.core.declare import Bundle, check_outputs
+from rille.stages.evaluation.accuracy import angles_between, posed
+from rille.stages.evaluation.crosscheck import (
     STAGE,
     CrosscheckParams,
     Features,
@@ -27,7 +27,7 @@ from stages.evaluation.crosscheck import (
     match,
     windows,
 )
-from stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
+from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
 
 CAMERA = Camera(300.0, 300.0, 159.5, 119.5, 320, 240)
 BASELINE = 0.2

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stages.core.declare import Bundle, NoParams, check_outputs
-from stages.evaluation.accuracy import posed
-from stages.evaluation.crosscheck_join import STAGE, join
-from stages.evaluation.pose_alignment import moved
-from stages.geometry.geometry import rotation_exp
+from rille.stages.core.declare import Bundle, NoParams, check_outputs
+from rille.stages.evaluation.accuracy import posed
+from rille.stages.evaluation.crosscheck_join import STAGE, join
+from rille.stages.evaluation.pose_alignment import moved
+from rille.stages.geometry.geometry import rotation_exp
 
 
 def drive(n: int) -> np.ndarray:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stages.core.declare import Bundle, NoParams, check_outputs
-from stages.evaluation.dem_accuracy import STAGE, dem_accuracy, in_window
-from stages.geometry.lattice import Lattice
+from rille.stages.core.declare import Bundle, NoParams, check_outputs
+from rille.stages.evaluation.dem_accuracy import STAGE, dem_accuracy, in_window
+from rille.stages.geometry.lattice import Lattice
 
 CELL = 0.5
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from raising import raises
 
-from stages.evaluation.dem_comparison import Grid, align, binned, cell_means, common, errors, figures, interpolate
-from stages.geometry.geometry import RigidTransform, rotation_exp
+from rille.stages.evaluation.dem_comparison import Grid, align, binned, cell_means, common, errors, figures, interpolate
+from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 
 
 def grid(values: np.ndarray, cell: float = 1.0, x0: float = 0.0, y0: float = 0.0, turn: float = 0.0) -> Grid:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from stages.core.declare import Bundle, NoParams
-from stages.evaluation.drive_check import STAGE
-from stages.hazard.vehicle import Vehicle
+from rille.stages.core.declare import Bundle, NoParams
+from rille.stages.evaluation.drive_check import STAGE
+from rille.stages.hazard.vehicle import Vehicle
 
 VEHICLE = Vehicle(wheel_diameter=0.03, track=0.08, wheel_base=0.1, clearance=0.025, max_step=0.012, max_slope_deg=20.0)
 

@@ -7,12 +7,12 @@ import math
 import numpy as np
 import pytest
 
-from stages.core.declare import Bundle, NoParams, check_outputs
-from stages.evaluation.path_check import STAGE, crossed_cells, path_check, shortest
-from stages.geometry.lattice import Lattice
-from stages.hazard.hazards import BITS
-from stages.hazard.risk import HAZARDOUS
-from stages.hazard.vehicle import Vehicle
+from rille.stages.core.declare import Bundle, NoParams, check_outputs
+from rille.stages.evaluation.path_check import STAGE, crossed_cells, path_check, shortest
+from rille.stages.geometry.lattice import Lattice
+from rille.stages.hazard.hazards import BITS
+from rille.stages.hazard.risk import HAZARDOUS
+from rille.stages.hazard.vehicle import Vehicle
 
 LATTICE = Lattice.at(0, 9, 1.0, 10, 10)  # x 0 .. 9, y 9 .. 0
 

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stages.evaluation.accuracy import posed
-from stages.evaluation.pose_alignment import align, moved, spread
-from stages.geometry.geometry import rotation_exp
+from rille.stages.evaluation.accuracy import posed
+from rille.stages.evaluation.pose_alignment import align, moved, spread
+from rille.stages.geometry.geometry import rotation_exp
 
 small = st.floats(-2.0, 2.0)
 vectors = st.tuples(small, small, small)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stages.core.declare import Bundle, NoParams, check_outputs
-from stages.evaluation.position_accuracy import STAGE, TruePositions, find_offset, fit_in_plane, position_accuracy
+from rille.stages.core.declare import Bundle, NoParams, check_outputs
+from rille.stages.evaluation.position_accuracy import STAGE, TruePositions, find_offset, fit_in_plane, position_accuracy
 
 RATE = 10.0
 MOMENTS = np.arange(80) / RATE

@@ -6,10 +6,10 @@ from evo.core import metrics as evo_metrics
 from evo.core.metrics import PoseRelation, StatisticsType
 from test_accuracy import disturbed, evo_path, evo_value, walk
 
-from stages.evaluation.accuracy import trajectory_accuracy
-from stages.evaluation.accuracy_parts import square
-from stages.evaluation.trajectory_error import against_claims, by_cause, by_shares, rotation_vectors
-from stages.geometry.geometry import rotation_exp
+from rille.stages.evaluation.accuracy import trajectory_accuracy
+from rille.stages.evaluation.accuracy_parts import square
+from rille.stages.evaluation.trajectory_error import against_claims, by_cause, by_shares, rotation_vectors
+from rille.stages.geometry.geometry import rotation_exp
 
 
 @pytest.mark.parametrize("step", [2, 5, 20])

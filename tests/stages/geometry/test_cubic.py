@@ -1,7 +1,7 @@
 import numpy as np
 
-from stages.geometry.cubic import cubic
-from stages.hfvm.images.resample import sample_cubic
+from rille.stages.geometry.cubic import cubic
+from rille.stages.hfvm.images.resample import sample_cubic
 
 
 def test_the_value_is_that_with_derivatives_to_the_bit():

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from rig_scenes import bed_depth, bed_rig, knocked, matches, street_depth, street_rig
 from terrain_scenes import toed_in_rig
 
-from stages.geometry.epipolar import NAMES, beyond_infinity, corrected, depth_sensitivity, distances, normals
-from stages.geometry.geometry import Rig, RigidTransform
+from rille.stages.geometry.epipolar import NAMES, beyond_infinity, corrected, depth_sensitivity, distances, normals
+from rille.stages.geometry.geometry import Rig, RigidTransform
 
 RIGS = {"street": street_rig(), "bed": bed_rig(), "unequal cameras": toed_in_rig()}
 ANGLE = st.floats(-0.1, 0.1)
@@ -103,7 +103,7 @@ def test_cost_of_depth_is_what_a_knock_does():
     cost = depth_sensitivity(rig, m.left, m.right)
     step = np.zeros(5)
     step[NAMES.index("yaw")] = math.radians(0.1)
-    from stages.geometry.triangulation import inverse_depth
+    from rille.stages.geometry.triangulation import inverse_depth
 
     true, per_pixel = inverse_depth(rig, m.left, m.right - m.left)
     wrong, _ = inverse_depth(corrected(rig, step), m.left, m.right - m.left)

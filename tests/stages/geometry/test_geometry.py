@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from raising import raises
 from scipy.spatial.transform import Rotation
 
-from stages.core.errors import InputError
-from stages.geometry.geometry import (
+from rille.stages.core.errors import InputError
+from rille.stages.geometry.geometry import (
     Camera,
     Rig,
     RigidTransform,

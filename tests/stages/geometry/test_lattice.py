@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from raising import raises
 
-from stages.geometry.lattice import Lattice, mosaic, union
+from rille.stages.geometry.lattice import Lattice, mosaic, union
 
 CELLS = st.sampled_from([0.0005, 0.001, 0.002, 0.02, 0.1, 0.25, 1.0])
 INDEX = st.integers(-3000, 3000)

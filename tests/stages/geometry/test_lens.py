@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from raising import raises
 
-from stages.geometry.geometry import Camera
-from stages.geometry.lens import LEAST_FOCAL, Lens
+from rille.stages.geometry.geometry import Camera
+from rille.stages.geometry.lens import LEAST_FOCAL, Lens
 
 UNIT = Camera(100.0, 200.0, 50.0, 40.0, 101, 81)
 RAW = Camera(460.0, 458.0, 367.2, 248.4, 752, 480)

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from raising import raises
 
-from stages.geometry.lattice import Lattice
-from stages.geometry.surface import cylinder, plane, sphere
+from rille.stages.geometry.lattice import Lattice
+from rille.stages.geometry.surface import cylinder, plane, sphere
 
 
 def test_plane_is_the_lattice() -> None:

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stages.hazard.block_statistics import reduce_to_blocks
+from rille.stages.hazard.block_statistics import reduce_to_blocks
 
 
 @settings(max_examples=20, deadline=None)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from vehicles import MODEL
 
-from stages.hazard.classification import (
+from rille.stages.hazard.classification import (
     CAUTION,
     DOUBT_BIT,
     FARTHEST,
@@ -17,7 +17,7 @@ from stages.hazard.classification import (
     _table,
     classify,
 )
-from stages.hazard.hazards import BITS, MEASURES, Measured, limits, noise_factors
+from rille.stages.hazard.hazards import BITS, MEASURES, Measured, limits, noise_factors
 
 RULES = Rules(sigmas=1.25, caution=0.75, max_p=0.02, min_known=0.5)
 

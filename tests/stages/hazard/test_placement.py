@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from vehicles import MODEL
 
-from stages.hazard.placement import Stance, place, stride
+from rille.stages.hazard.placement import Stance, place, stride
 
 CELL = 0.004
 

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from raising import raises
 from vehicles import MODEL
 
-from stages.core.declare import Bundle, check_outputs
-from stages.geometry.lattice import Lattice
-from stages.hazard.hazards import BITS, measure
-from stages.hazard.risk import (
+from rille.stages.core.declare import Bundle, check_outputs
+from rille.stages.geometry.lattice import Lattice
+from rille.stages.hazard.hazards import BITS, measure
+from rille.stages.hazard.risk import (
     CAUTION,
     FILLED_BIT,
     HAZARDOUS,
@@ -27,7 +27,7 @@ from stages.hazard.risk import (
     risk_map,
     window_cells,
 )
-from stages.hazard.vehicle import DEFAULT_VEHICLE, Vehicle
+from rille.stages.hazard.vehicle import DEFAULT_VEHICLE, Vehicle
 
 FINE = 0.001
 COARSE = 0.005

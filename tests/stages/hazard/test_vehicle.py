@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from pydantic import ValidationError
 
-from stages.hazard.vehicle import DEFAULT_VEHICLE, Vehicle
+from rille.stages.hazard.vehicle import DEFAULT_VEHICLE, Vehicle
 
 
 def test_the_default_is_named() -> None:

@@ -8,13 +8,13 @@ import pytest
 from matching_scenes import convergent_rig, pair, rig_displacement, seen
 from raising import raises
 
-from stages.core.declare import Bundle, check_outputs
-from stages.core.validity import Validity, counts, defined, has, matched
-from stages.hfvm import stage as hfvm
-from stages.hfvm.images.params import HfvmParams
-from stages.hfvm.stage import match
-from stages.imaging import pyramid
-from stages.imaging.pyramid import PyramidParams
+from rille.stages.core.declare import Bundle, check_outputs
+from rille.stages.core.validity import Validity, counts, defined, has, matched
+from rille.stages.hfvm import stage as hfvm
+from rille.stages.hfvm.images.params import HfvmParams
+from rille.stages.hfvm.stage import match
+from rille.stages.imaging import pyramid
+from rille.stages.imaging.pyramid import PyramidParams
 
 BORDER = 8
 """Pixels: features and windows reach over the edge of an image there."""

@@ -6,15 +6,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from matching_scenes import Texture, pair, seen
 
-from stages.core.errors import RilleError
-from stages.core.validity import Validity, has, matched
-from stages.hfvm.coarse_to_fine import compact, path_simd, paths
-from stages.hfvm.finish import guided, variational_refinement
-from stages.hfvm.images.params import ACCURATE, HfvmParams
-from stages.hfvm.level import consistency
-from stages.hfvm.level.propagation import pack_map
-from stages.hfvm.stage import match
-from stages.imaging.pyramid import PyramidParams, build
+from rille.stages.core.errors import RilleError
+from rille.stages.core.validity import Validity, has, matched
+from rille.stages.hfvm.coarse_to_fine import compact, path_simd, paths
+from rille.stages.hfvm.finish import guided, variational_refinement
+from rille.stages.hfvm.images.params import ACCURATE, HfvmParams
+from rille.stages.hfvm.level import consistency
+from rille.stages.hfvm.level.propagation import pack_map
+from rille.stages.hfvm.stage import match
+from rille.stages.imaging.pyramid import PyramidParams, build
 
 ACC = HfvmParams(preset="accurate")
 WEIGHTS = paths.Weights(ACC.path_compact, ACC.path_small, ACC.path_large, ACC.path_grey)
@@ -22,7 +22,7 @@ NO_LINES = np.zeros((1, 1, 3), np.float32)
 
 
 def view(image):
-    from stages.hfvm.level import features
+    from rille.stages.hfvm.level import features
 
     words, _ = features.pack(image, ACC.weights)
     return paths.View(words, compact.pack(image), image)

@@ -6,13 +6,13 @@ import pytest
 from matching_scenes import convergent_rig, pair, rig_displacement, seen
 from raising import raises
 
-from stages.core.errors import InputError
-from stages.core.validity import Validity, defined, has, matched
-from stages.hfvm.finish.refine import contrast
-from stages.hfvm.images.params import HfvmParams
-from stages.hfvm.level.consistency import patches, unsupported
-from stages.hfvm.stage import match
-from stages.hfvm.swap_check import swapped
+from rille.stages.core.errors import InputError
+from rille.stages.core.validity import Validity, defined, has, matched
+from rille.stages.hfvm.finish.refine import contrast
+from rille.stages.hfvm.images.params import HfvmParams
+from rille.stages.hfvm.level.consistency import patches, unsupported
+from rille.stages.hfvm.stage import match
+from rille.stages.hfvm.swap_check import swapped
 
 BORDER = 8
 MOST_CHANCE = 0.05

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from numba import njit
 
-from stages.hfvm.images.resample import sample_cubic
-from stages.hfvm.level import simd, strip_simd
+from rille.stages.hfvm.images.resample import sample_cubic
+from rille.stages.hfvm.level import simd, strip_simd
 
 WIDTHS = sorted({0, simd.widest()})
 

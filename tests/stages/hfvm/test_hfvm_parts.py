@@ -7,14 +7,14 @@ from hypothesis import strategies as st
 from matching_scenes import convergent_rig, pair, rig_displacement
 from scipy import ndimage
 
-from stages.geometry.geometry import Rig
-from stages.hfvm.coarse_to_fine import hierarchy
-from stages.hfvm.finish import refine
-from stages.hfvm.images import plane
-from stages.hfvm.images.params import HfvmParams
-from stages.hfvm.images.window import whole
-from stages.hfvm.level import consistency, epipolar, rowwise, subpixel_lut
-from stages.imaging.pyramid import PyramidParams, build
+from rille.stages.geometry.geometry import Rig
+from rille.stages.hfvm.coarse_to_fine import hierarchy
+from rille.stages.hfvm.finish import refine
+from rille.stages.hfvm.images import plane
+from rille.stages.hfvm.images.params import HfvmParams
+from rille.stages.hfvm.images.window import whole
+from rille.stages.hfvm.level import consistency, epipolar, rowwise, subpixel_lut
+from rille.stages.imaging.pyramid import PyramidParams, build
 
 
 def zeros(*shape):

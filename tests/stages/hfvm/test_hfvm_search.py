@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stages.hfvm.level import epipolar, paper, propagation, search, simd, subpixel
+from rille.stages.hfvm.level import epipolar, paper, propagation, search, simd, subpixel
 
 ROWS, COLS = 11, 13
 

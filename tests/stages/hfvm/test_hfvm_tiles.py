@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from matching_scenes import pair
 
-from stages.hfvm import tiled
-from stages.hfvm.images import plane
-from stages.hfvm.images.params import HfvmParams
-from stages.hfvm.images.views import Aligned, Plain
-from stages.hfvm.images.window import Mosaic, Window, bounded, gather, pick, thinned, tiles, whole
-from stages.imaging.pyramid import PyramidParams, build
+from rille.stages.hfvm import tiled
+from rille.stages.hfvm.images import plane
+from rille.stages.hfvm.images.params import HfvmParams
+from rille.stages.hfvm.images.views import Aligned, Plain
+from rille.stages.hfvm.images.window import Mosaic, Window, bounded, gather, pick, thinned, tiles, whole
+from rille.stages.imaging.pyramid import PyramidParams, build
 
 
 def quiet(share, step):
@@ -95,7 +95,7 @@ def test_aligned_windows_are_parts_of_the_aligned_pyramid():
 
 
 def right_pyramid(view):
-    from stages.imaging.pyramid import Pyramid
+    from rille.stages.imaging.pyramid import Pyramid
 
     return Pyramid(tuple(np.asarray(a) for a in view.images), tuple(np.asarray(a) for a in view.masks))
 
@@ -122,7 +122,7 @@ def test_mosaic_is_the_image_it_was_cut_from():
 
 @pytest.mark.parametrize("up", [False, True])
 def test_thinned_pixels_are_every_nth_of_all_however_it_is_read(monkeypatch, up):
-    monkeypatch.setattr("stages.hfvm.images.window.BLOCK", 7)
+    monkeypatch.setattr("rille.stages.hfvm.images.window.BLOCK", 7)
     marked = np.random.default_rng(0).random((45, 31)) < 0.3
     found = thinned(Elsewhere(marked), 50, lambda a: a, up)
     places = np.flatnonzero(marked)

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from matching_scenes import pair
 
-from stages.core.validity import matched
-from stages.hfvm.finish import refine
-from stages.hfvm.finish.uncertainty import REFINED, neighbours, standard_deviation
-from stages.hfvm.images.params import HfvmParams
-from stages.hfvm.stage import match
+from rille.stages.core.validity import matched
+from rille.stages.hfvm.finish import refine
+from rille.stages.hfvm.finish.uncertainty import REFINED, neighbours, standard_deviation
+from rille.stages.hfvm.images.params import HfvmParams
+from rille.stages.hfvm.stage import match
 
 PARAMS = HfvmParams()
 

@@ -3,8 +3,8 @@
 import cv2
 import numpy as np
 
-from stages.core.declare import Bundle, NoParams, check_outputs
-from stages.imaging.image_quality import STAGE, glance
+from rille.stages.core.declare import Bundle, NoParams, check_outputs
+from rille.stages.imaging.image_quality import STAGE, glance
 
 
 def picture(seed=1, shape=(200, 300)):

@@ -3,10 +3,10 @@ import pytest
 from raising import raises
 from scipy import ndimage
 
-from stages.core.declare import Bundle, check_outputs
-from stages.core.errors import InputError
-from stages.imaging import pyramid
-from stages.imaging.pyramid import Pyramid, PyramidParams
+from rille.stages.core.declare import Bundle, check_outputs
+from rille.stages.core.errors import InputError
+from rille.stages.imaging import pyramid
+from rille.stages.imaging.pyramid import Pyramid, PyramidParams
 
 
 def params(levels=6, min_side=1):

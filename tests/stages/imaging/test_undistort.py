@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from raising import raises
 
-from stages.core.declare import Bundle, check_outputs
-from stages.geometry.geometry import Camera
-from stages.geometry.lens import Lens
-from stages.imaging import undistort
-from stages.imaging.undistort import KERNELS, PHASES, UndistortParams, weights
+from rille.stages.core.declare import Bundle, check_outputs
+from rille.stages.geometry.geometry import Camera
+from rille.stages.geometry.lens import Lens
+from rille.stages.imaging import undistort
+from rille.stages.imaging.undistort import KERNELS, PHASES, UndistortParams, weights
 
 RAW = Camera(230.0, 229.0, 184.0, 124.0, 376, 240)
 LENSES = {

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stages.numeric.extrema import median3, octagon, relief, running_max, running_range
+from rille.stages.numeric.extrema import median3, octagon, relief, running_max, running_range
 
 
 def offsets(reach: int) -> np.ndarray:

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import distance_transform_cdt, gaussian_filter
 
-from stages.numeric.holes import candidates, close_holes
+from rille.stages.numeric.holes import candidates, close_holes
 
 
 def plane(rows: int, cols: int) -> np.ndarray:

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stages.numeric.packed import Canvas
+from rille.stages.numeric.packed import Canvas
 
 
 @settings(max_examples=30, deadline=None)

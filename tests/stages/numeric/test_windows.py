@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stages.numeric.windows import window_mean, window_sum
+from rille.stages.numeric.windows import window_mean, window_sum
 
 
 @pytest.mark.parametrize("n", [1, 3, 7, 25])

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stages.odometry.affine_lk import align
+from rille.stages.odometry.affine_lk import align
 
 
 def texture(x, y, seed=0, wavelengths=(6.0, 40.0)):

@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 from matching_scenes import Texture
 from raising import raises
 
-from stages.geometry.geometry import Camera, rotation_exp
-from stages.imaging.pyramid import PyramidParams, build
-from stages.odometry.derotation import MARGIN, Derotation
+from rille.stages.geometry.geometry import Camera, rotation_exp
+from rille.stages.imaging.pyramid import PyramidParams, build
+from rille.stages.odometry.derotation import MARGIN, Derotation
 
 CAMERA = Camera(150.0, 160.0, 79.0, 61.0, 160, 120)
 ANGLE = st.floats(-0.4, 0.4)

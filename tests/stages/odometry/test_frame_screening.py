@@ -9,8 +9,8 @@ import pytest
 from motion_scenes import motion, shift
 from raising import raises
 
-from stages.core.declare import Bundle, check_outputs
-from stages.odometry.frame_screening import STAGE, ContinuityParams, judge
+from rille.stages.core.declare import Bundle, check_outputs
+from rille.stages.odometry.frame_screening import STAGE, ContinuityParams, judge
 
 PARAMS = ContinuityParams()
 

@@ -10,13 +10,13 @@ from hypothesis import strategies as st
 from motion_scenes import CAMERA, drive, motion, share_kept, shift, turned
 from raising import raises
 
-from stages.core.declare import Bundle, check_outputs
-from stages.geometry.geometry import rotation_exp
-from stages.imaging.pyramid import PyramidParams, build
-from stages.odometry import keyframes
-from stages.odometry.keyframes import SelectParams, segments
-from stages.odometry.motion import STAGE as MOTION
-from stages.odometry.motion import MotionParams
+from rille.stages.core.declare import Bundle, check_outputs
+from rille.stages.geometry.geometry import rotation_exp
+from rille.stages.imaging.pyramid import PyramidParams, build
+from rille.stages.odometry import keyframes
+from rille.stages.odometry.keyframes import SelectParams, segments
+from rille.stages.odometry.motion import STAGE as MOTION
+from rille.stages.odometry.motion import MotionParams
 
 
 def run(motions, frames=None, **params):

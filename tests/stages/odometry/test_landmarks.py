@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
-from stages.geometry.lattice import Lattice
-from stages.odometry.resection.landmarks import intersect, landmarks_from_dem, landmarks_from_disparity, relief
+from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
+from rille.stages.geometry.lattice import Lattice
+from rille.stages.odometry.resection.landmarks import intersect, landmarks_from_dem, landmarks_from_disparity, relief
 
 CAMERA = Camera(400.0, 400.0, 159.5, 119.5, 320, 240)
 TOE_IN = RigidTransform(rotation_exp(np.array([0.01, 0.15, 0.02])), np.array([-0.1, 0.003, 0.008]))

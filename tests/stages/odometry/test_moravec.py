@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stages.odometry.moravec import clear_of_mask, interest_operator, interest_points
+from rille.stages.odometry.moravec import clear_of_mask, interest_operator, interest_points
 
 
 def test_flat_and_edge_give_nothing_and_a_corner_does():

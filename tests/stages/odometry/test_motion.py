@@ -4,14 +4,14 @@ import pytest
 from matching_scenes import Texture, pair
 from raising import raises
 
-from stages.core.declare import Bundle, check_outputs
-from stages.core.validity import defined, matched
-from stages.geometry.geometry import Camera, rotation_exp
-from stages.imaging.pyramid import PyramidParams, build
-from stages.odometry import motion
-from stages.odometry.derotation import Derotation
-from stages.odometry.feature_homography import feature_homography
-from stages.odometry.motion import MotionParams, coarse_motion
+from rille.stages.core.declare import Bundle, check_outputs
+from rille.stages.core.validity import defined, matched
+from rille.stages.geometry.geometry import Camera, rotation_exp
+from rille.stages.imaging.pyramid import PyramidParams, build
+from rille.stages.odometry import motion
+from rille.stages.odometry.derotation import Derotation
+from rille.stages.odometry.feature_homography import feature_homography
+from rille.stages.odometry.motion import MotionParams, coarse_motion
 
 
 def forward_flow(x, y):

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from matching_scenes import pair
 
-from stages.imaging.pyramid import PyramidParams, build
-from stages.odometry.point_search import find_points, match_points
+from rille.stages.imaging.pyramid import PyramidParams, build
+from rille.stages.odometry.point_search import find_points, match_points
 
 
 def pyramids(displacement, noise=0.0, valid=None):

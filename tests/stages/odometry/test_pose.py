@@ -2,9 +2,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from stages.core.declare import Bundle, NoParams, check_outputs
-from stages.odometry.resection import pose
-from stages.terrain import merge
+from rille.stages.core.declare import Bundle, NoParams, check_outputs
+from rille.stages.odometry.resection import pose
+from rille.stages.terrain import merge
 
 
 def test_one_pose_with_its_covariance() -> None:

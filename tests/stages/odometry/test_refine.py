@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from raising import raises
 
-from stages.core.declare import Bundle, check_outputs
-from stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
-from stages.odometry.resection.bundle_adjustment import (
+from rille.stages.core.declare import Bundle, check_outputs
+from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
+from rille.stages.odometry.resection.bundle_adjustment import (
     RefineParams,
     State,
     Views,
@@ -19,9 +19,9 @@ from stages.odometry.resection.bundle_adjustment import (
     posterior,
     scatter,
 )
-from stages.odometry.resection.landmarks import landmarks_from_disparity
-from stages.odometry.resection.refine import STAGE, _tilt_pattern, claims, views_of
-from stages.odometry.resection.resect import ResectParams
+from rille.stages.odometry.resection.landmarks import landmarks_from_disparity
+from rille.stages.odometry.resection.refine import STAGE, _tilt_pattern, claims, views_of
+from rille.stages.odometry.resection.resect import ResectParams
 
 CAMERA = Camera(500.0, 500.0, 299.5, 199.5, 600, 400)
 RIG = Rig(CAMERA, CAMERA, RigidTransform(np.eye(3), np.array([-0.2, 0.0, 0.0])))

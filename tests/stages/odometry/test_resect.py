@@ -6,10 +6,16 @@ from raising import raises
 from scipy.optimize import least_squares
 from scipy.stats import chi2
 
-from stages.core.errors import DegenerateError
-from stages.geometry.geometry import Camera, RigidTransform, angles_from_rotation, rotation_exp, rotation_from_angles
-from stages.odometry.resection.landmarks import Landmarks
-from stages.odometry.resection.pnp import (
+from rille.stages.core.errors import DegenerateError
+from rille.stages.geometry.geometry import (
+    Camera,
+    RigidTransform,
+    angles_from_rotation,
+    rotation_exp,
+    rotation_from_angles,
+)
+from rille.stages.odometry.resection.landmarks import Landmarks
+from rille.stages.odometry.resection.pnp import (
     Observations,
     Poses,
     back_projection,
@@ -18,7 +24,7 @@ from stages.odometry.resection.pnp import (
     normal_matrix,
     norms,
 )
-from stages.odometry.resection.resect import ResectParams, moving_tracks, resect, resect_segment
+from rille.stages.odometry.resection.resect import ResectParams, moving_tracks, resect, resect_segment
 
 CAMERA = Camera(600.0, 610.0, 300.0, 250.0, 600, 500)
 PARAMS = ResectParams()

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from test_motion import CAMERA, held, judge, run, taken
 
-from stages.geometry.geometry import rotation_exp
-from stages.odometry import roll_search
-from stages.odometry.derotation import Derotation
-from stages.odometry.motion import Motion
+from rille.stages.geometry.geometry import rotation_exp
+from rille.stages.odometry import roll_search
+from rille.stages.odometry.derotation import Derotation
+from rille.stages.odometry.motion import Motion
 
 SHAPE = (280, 400)
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from raising import raises
 
-from stages.core.declare import Bundle, check_outputs
-from stages.imaging.pyramid import PyramidParams, build
-from stages.odometry.track import (
+from rille.stages.core.declare import Bundle, check_outputs
+from rille.stages.imaging.pyramid import PyramidParams, build
+from rille.stages.odometry.track import (
     STAGE,
     Motion,
     TrackParams,

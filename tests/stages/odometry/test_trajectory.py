@@ -3,9 +3,9 @@
 import numpy as np
 from raising import raises
 
-from stages.core.declare import Bundle, NoParams, check_outputs
-from stages.geometry.geometry import RigidTransform, rotation_exp
-from stages.odometry.resection.trajectory import STAGE, chain
+from rille.stages.core.declare import Bundle, NoParams, check_outputs
+from rille.stages.geometry.geometry import RigidTransform, rotation_exp
+from rille.stages.odometry.resection.trajectory import STAGE, chain
 
 NONE = np.zeros((9, 6, 2))
 """Nothing is shared."""

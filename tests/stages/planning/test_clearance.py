@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stages.geometry.lattice import Lattice
-from stages.hazard.risk import CAUTION, HAZARDOUS, REASONS, SAFE, UNKNOWN
-from stages.hazard.vehicle import Vehicle
-from stages.planning.local_planner.clearance import DOUBT_WEIGHT, Footing
+from rille.stages.geometry.lattice import Lattice
+from rille.stages.hazard.risk import CAUTION, HAZARDOUS, REASONS, SAFE, UNKNOWN
+from rille.stages.hazard.vehicle import Vehicle
+from rille.stages.planning.local_planner.clearance import DOUBT_WEIGHT, Footing
 
 ROVER = Vehicle(
     wheel_diameter=0.03, track=0.08, wheel_base=0.10, clearance=0.025, max_step=0.012, max_roughness=0.004, margin=0.01

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from vehicles import SHORT
 
-from stages.planning.configuration_space import ACROSS, STEPS, STRAIGHT, Stand, grown, widened
+from rille.stages.planning.configuration_space import ACROSS, STEPS, STRAIGHT, Stand, grown, widened
 
 CELL = 0.01
 

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
-from stages.planning.grid8 import NEIGHBOURS, cost_to_go, parts, trace
-from stages.planning.row_graph import UNREACHED
+from rille.stages.planning.grid8 import NEIGHBOURS, cost_to_go, parts, trace
+from rille.stages.planning.row_graph import UNREACHED
 
 UNIT = 5
 

@@ -12,18 +12,18 @@ from hypothesis import strategies as st
 from leg_scenes import AT, CAMERAS, GOAL, LATTICE, ROVER, START, P, X, Y, ground
 from raising import raises
 
-from stages.core.declare import Bundle
-from stages.hazard.risk import HAZARDOUS, REASONS, SAFE, UNKNOWN
-from stages.planning.local_planner.clearance import DOUBT_WEIGHT, PARTS, Footing
-from stages.planning.local_planner.ground import Ground
-from stages.planning.local_planner.memory import Memory
-from stages.planning.local_planner.params import LegParams
-from stages.planning.local_planner.policy import Leg, plan_leg, shortest
-from stages.planning.local_planner.route import length_of, through
-from stages.planning.local_planner.stage import next_leg, seen_so_far, shortest_way
-from stages.planning.local_planner.views import AHEAD as ANYWHERE
-from stages.planning.local_planner.views import Stand, View
-from stages.terrain.occlusion_bounds import Bounds
+from rille.stages.core.declare import Bundle
+from rille.stages.hazard.risk import HAZARDOUS, REASONS, SAFE, UNKNOWN
+from rille.stages.planning.local_planner.clearance import DOUBT_WEIGHT, PARTS, Footing
+from rille.stages.planning.local_planner.ground import Ground
+from rille.stages.planning.local_planner.memory import Memory
+from rille.stages.planning.local_planner.params import LegParams
+from rille.stages.planning.local_planner.policy import Leg, plan_leg, shortest
+from rille.stages.planning.local_planner.route import length_of, through
+from rille.stages.planning.local_planner.stage import next_leg, seen_so_far, shortest_way
+from rille.stages.planning.local_planner.views import AHEAD as ANYWHERE
+from rille.stages.planning.local_planner.views import Stand, View
+from rille.stages.terrain.occlusion_bounds import Bounds
 
 SEEN = P.model_copy(update={"blind": 0.0})
 """Without the rule for what is near, which on this small map is half of it."""

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from leg_scenes import CAMERAS, GOAL, LATTICE, ROVER, START, P, X, Y, ground
 
-from stages.hazard.risk import HAZARDOUS, UNKNOWN
-from stages.planning.local_planner.ground import Ground
-from stages.planning.local_planner.look import SIDE, STEP, Target, free_back
-from stages.planning.local_planner.route import Piece, first_metres, length_of
+from rille.stages.hazard.risk import HAZARDOUS, UNKNOWN
+from rille.stages.planning.local_planner.ground import Ground
+from rille.stages.planning.local_planner.look import SIDE, STEP, Target, free_back
+from rille.stages.planning.local_planner.route import Piece, first_metres, length_of
 
 FREE = Ground(ground(), START, 0.0, P)
 BOUND = math.radians(P.max_turn_deg)

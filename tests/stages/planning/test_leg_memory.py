@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from stages.planning.local_planner.memory import Memory
+from rille.stages.planning.local_planner.memory import Memory
 
 HERE, THERE = (0.1, 0.2, 0.5), (0.3, 0.9)
 

@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 from raising import raises
 from vehicles import SHORT
 
-from stages.core.declare import Bundle, check_outputs
-from stages.geometry.lattice import Lattice
-from stages.hazard.risk import BITS, CAUTION, HAZARDOUS, UNKNOWN
-from stages.hazard.vehicle import Vehicle
-from stages.planning.path import STAGE, PathParams, Route, describe, find_path
+from rille.stages.core.declare import Bundle, check_outputs
+from rille.stages.geometry.lattice import Lattice
+from rille.stages.hazard.risk import BITS, CAUTION, HAZARDOUS, UNKNOWN
+from rille.stages.hazard.vehicle import Vehicle
+from rille.stages.planning.path import STAGE, PathParams, Route, describe, find_path
 
 CELL = 0.01
 

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stages.planning.local_planner.route import (
+from rille.stages.planning.local_planner.route import (
     Piece,
     first_metres,
     last_metres,

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
-from stages.planning.configuration_space import LEFT, RIGHT, STRAIGHT
-from stages.planning.row_graph import UNREACHED, leading, plan, sweep
+from rille.stages.planning.configuration_space import LEFT, RIGHT, STRAIGHT
+from rille.stages.planning.row_graph import UNREACHED, leading, plan, sweep
 
 
 def edges(height: np.ndarray, free: np.ndarray) -> list[tuple[tuple[int, int], tuple[int, int], int]]:

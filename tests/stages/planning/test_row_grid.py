@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from raising import raises
 
-from stages.geometry.lattice import Lattice
-from stages.planning.row_grid import RowGrid
+from rille.stages.geometry.lattice import Lattice
+from rille.stages.planning.row_grid import RowGrid
 
 CELL = 0.01
 

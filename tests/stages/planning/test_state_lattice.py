@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stages.geometry.lattice import Lattice
-from stages.planning.local_planner.state_lattice import ANGLES, STEPS, PoseGraph, PoseGrid, angle_of
+from rille.stages.geometry.lattice import Lattice
+from rille.stages.planning.local_planner.state_lattice import ANGLES, STEPS, PoseGraph, PoseGrid, angle_of
 
 
 def networked(graph: PoseGraph, turn_price: float, back: float) -> networkx.DiGraph:

@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stages.geometry.lattice import Lattice
-from stages.hazard.risk import SAFE, UNKNOWN
-from stages.hazard.vehicle import Vehicle
-from stages.planning.local_planner.clearance import Footing
-from stages.terrain.occlusion_bounds import Bounds
+from rille.stages.geometry.lattice import Lattice
+from rille.stages.hazard.risk import SAFE, UNKNOWN
+from rille.stages.hazard.vehicle import Vehicle
+from rille.stages.planning.local_planner.clearance import Footing
+from rille.stages.terrain.occlusion_bounds import Bounds
 
 ROVER = Vehicle(
     wheel_diameter=0.03, track=0.08, wheel_base=0.10, clearance=0.025, max_step=0.012, max_roughness=0.004, margin=0.01

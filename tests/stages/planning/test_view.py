@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_from_angles
-from stages.planning.local_planner.views import RIM, View, looked
+from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_from_angles
+from rille.stages.planning.local_planner.views import RIM, View, looked
 
 LEFT = Camera(180.0, 175.0, 150.0, 125.0, 320, 240)
 RIGHT = Camera(190.0, 190.0, 159.5, 119.5, 320, 240)

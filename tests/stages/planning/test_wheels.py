@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from stages.hazard.vehicle import Vehicle
-from stages.planning.wheels import Ground, highest, stand
+from rille.stages.hazard.vehicle import Vehicle
+from rille.stages.planning.wheels import Ground, highest, stand
 
 ROVER = Vehicle(
     wheel_diameter=0.03, track=0.08, wheel_base=0.10, clearance=0.025, max_step=0.012, max_roughness=0.004, margin=0.01

@@ -9,13 +9,13 @@ import pytest
 from raising import raises
 from terrain_scenes import ball, box, disparity, nearest, pitched, plane, smooth_noise, toed_in_rig
 
-from stages.core.declare import Bundle
-from stages.core.validity import Validity
-from stages.geometry.geometry import Camera, Rig, RigidTransform
-from stages.geometry.triangulation import inverse_depth
-from stages.terrain import ground_frame as level_stage
-from stages.terrain.ground import _singular_values
-from stages.terrain.ground_frame import LevelParams, level
+from rille.stages.core.declare import Bundle
+from rille.stages.core.validity import Validity
+from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
+from rille.stages.geometry.triangulation import inverse_depth
+from rille.stages.terrain import ground_frame as level_stage
+from rille.stages.terrain.ground import _singular_values
+from rille.stages.terrain.ground_frame import LevelParams, level
 
 RIG = toed_in_rig()
 PARAMS = LevelParams()

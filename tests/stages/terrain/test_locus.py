@@ -8,16 +8,16 @@ import pytest
 from raising import raises
 from terrain_scenes import ball, box, disparity, interpolation_error, nearest, pitched, plane, smooth_noise, toed_in_rig
 
-from stages.core.declare import Bundle, check_outputs
-from stages.core.validity import Validity
-from stages.geometry.geometry import Rig, RigidTransform
-from stages.geometry.lattice import Lattice
-from stages.geometry.surface import Surface, cylinder, inclined, sphere
-from stages.geometry.surface import plane as reference_plane
-from stages.terrain import ground_frame as level_stage
-from stages.terrain.locus import roots, stage
-from stages.terrain.locus import solve as locus_solve
-from stages.terrain.locus.stage import Dem, LocusParams, reconstruct
+from rille.stages.core.declare import Bundle, check_outputs
+from rille.stages.core.validity import Validity
+from rille.stages.geometry.geometry import Rig, RigidTransform
+from rille.stages.geometry.lattice import Lattice
+from rille.stages.geometry.surface import Surface, cylinder, inclined, sphere
+from rille.stages.geometry.surface import plane as reference_plane
+from rille.stages.terrain import ground_frame as level_stage
+from rille.stages.terrain.locus import roots, stage
+from rille.stages.terrain.locus import solve as locus_solve
+from rille.stages.terrain.locus.stage import Dem, LocusParams, reconstruct
 
 RIG = toed_in_rig()
 T_LOCAL_LEFT = pitched(30.0, roll_deg=3.0)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from terrain_scenes import pitched, toed_in_rig
 
-from stages.geometry.geometry import Rig, RigidTransform
-from stages.geometry.lattice import Lattice
-from stages.geometry.surface import plane
-from stages.terrain.locus.empty import explain
+from rille.stages.geometry.geometry import Rig, RigidTransform
+from rille.stages.geometry.lattice import Lattice
+from rille.stages.geometry.surface import plane
+from rille.stages.terrain.locus.empty import explain
 
 RIG, T_LOCAL_LEFT = toed_in_rig(), pitched(35.0)
 AHEAD = Lattice.snap((-0.2, 0.2, 0.6, 1.0), 0.01)

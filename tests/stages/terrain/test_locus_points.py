@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stages.terrain.locus import points
-from stages.terrain.locus.lines import (
+from rille.stages.terrain.locus import points
+from rille.stages.terrain.locus.lines import (
     BOTTOM,
     COUNT,
     DZ,
@@ -22,8 +22,8 @@ from stages.terrain.locus.lines import (
     lines,
     spans,
 )
-from stages.terrain.locus.lines import PLANES as LINE_PLANES
-from stages.terrain.locus.points import LANES, POINT_PLANES, POINTS, STEPS, Z, climb, meet, pixels, project
+from rille.stages.terrain.locus.lines import PLANES as LINE_PLANES
+from rille.stages.terrain.locus.points import LANES, POINT_PLANES, POINTS, STEPS, Z, climb, meet, pixels, project
 
 WIDTH, HEIGHT = 40, 30
 LEFT = np.array([[50.0, 0.0, 20.0, 3.0], [0.0, 50.0, 15.0, -2.0], [0.0, 0.0, 1.0, 1.0]])

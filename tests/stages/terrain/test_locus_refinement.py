@@ -5,14 +5,14 @@ import pytest
 from raising import raises
 from terrain_scenes import disparity, pitched, plane, smooth_noise, toed_in_rig
 
-from stages.geometry.geometry import Camera, Rig, RigidTransform
-from stages.geometry.lattice import Lattice
-from stages.geometry.surface import plane as reference_plane
-from stages.terrain.locus import views as locus_views
-from stages.terrain.locus.refinement import UNKNOWN_BEND, refine, standard_deviation
-from stages.terrain.locus.solve import ONE_SIDED, Dem, Matches, join
-from stages.terrain.locus.stage import LocusParams, reconstruct
-from stages.terrain.locus.views import Views, look, views
+from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
+from rille.stages.geometry.lattice import Lattice
+from rille.stages.geometry.surface import plane as reference_plane
+from rille.stages.terrain.locus import views as locus_views
+from rille.stages.terrain.locus.refinement import UNKNOWN_BEND, refine, standard_deviation
+from rille.stages.terrain.locus.solve import ONE_SIDED, Dem, Matches, join
+from rille.stages.terrain.locus.stage import LocusParams, reconstruct
+from rille.stages.terrain.locus.views import Views, look, views
 
 RIG = toed_in_rig()
 T_LOCAL_LEFT = pitched(35.0, roll_deg=3.0)

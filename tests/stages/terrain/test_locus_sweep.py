@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stages.terrain.locus.sweep import sweep
+from rille.stages.terrain.locus.sweep import sweep
 
 
 def reading_order(power, pull, keep, across, down, start, z, sweeps, overshoot):  # type: ignore[no-untyped-def]

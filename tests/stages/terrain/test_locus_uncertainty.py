@@ -3,7 +3,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stages.terrain.locus.uncertainty import ALONE, APART, FLOOR, LEAST_GRADIENT, MOVED, REST, SHADE, STEP, from_both
+from rille.stages.terrain.locus.uncertainty import (
+    ALONE,
+    APART,
+    FLOOR,
+    LEAST_GRADIENT,
+    MOVED,
+    REST,
+    SHADE,
+    STEP,
+    from_both,
+)
 
 SHAPE = (40, 50)
 SCALE = 500.0

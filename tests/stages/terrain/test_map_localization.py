@@ -10,8 +10,8 @@ import pytest
 from numpy.typing import NDArray
 from raising import raises
 
-from stages.geometry.lattice import Lattice
-from stages.terrain.map_localization import GlobalFixParams, fix, thin
+from rille.stages.geometry.lattice import Lattice
+from rille.stages.terrain.map_localization import GlobalFixParams, fix, thin
 
 Floats = NDArray[np.float64]
 CELL = 0.04

@@ -9,10 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from raising import raises
 
-from stages.core.declare import Bundle, check_outputs
-from stages.geometry.lattice import Lattice, mosaic
-from stages.terrain import merge as merge_stage
-from stages.terrain.merge import EXACT, Layer, Merged, MergeParams, Placed, footprint, merge
+from rille.stages.core.declare import Bundle, check_outputs
+from rille.stages.geometry.lattice import Lattice, mosaic
+from rille.stages.terrain import merge as merge_stage
+from rille.stages.terrain.merge import EXACT, Layer, Merged, MergeParams, Placed, footprint, merge
 
 TILE = Lattice.at(0, 0, 0.1, 4, 5)
 PARAMS = MergeParams()

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stages.core.declare import Bundle
-from stages.geometry.geometry import RigidTransform
-from stages.geometry.lattice import Lattice
-from stages.terrain.occlusion_bounds import STAGE, CeilingParams, ceiling
+from rille.stages.core.declare import Bundle
+from rille.stages.geometry.geometry import RigidTransform
+from rille.stages.geometry.lattice import Lattice
+from rille.stages.terrain.occlusion_bounds import STAGE, CeilingParams, ceiling
 
 LATTICE = Lattice.snap((-0.2, 0.2, 0.0, 0.8), 0.004)
 X, Y = LATTICE.xy()[..., 0], LATTICE.xy()[..., 1]

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from seam_scenes import SIGMA, along
 
-from stages.core.declare import Bundle, NoParams, check_outputs
-from stages.geometry.lattice import Lattice
-from stages.terrain import overlap_audit as audit_stage
-from stages.terrain import overlap_qa as seam_stage
-from stages.terrain.overlap_audit import SeamAuditParams
+from rille.stages.core.declare import Bundle, NoParams, check_outputs
+from rille.stages.geometry.lattice import Lattice
+from rille.stages.terrain import overlap_audit as audit_stage
+from rille.stages.terrain import overlap_qa as seam_stage
+from rille.stages.terrain.overlap_audit import SeamAuditParams
 
 PLANTED = 12
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from stages.core.declare import Bundle
-from stages.terrain import radiometry as stage
-from stages.terrain.radiometry import PULL, STEP, ExposureParams, level
+from rille.stages.core.declare import Bundle
+from rille.stages.terrain import radiometry as stage
+from rille.stages.terrain.radiometry import PULL, STEP, ExposureParams, level
 
 CHAIN = {4 * k: (0.02 * (k % 2), 0.3 * k) for k in range(12)}
 

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from raising import raises
 
-from stages.terrain.shading import gradient, hillshade, slope_deg
+from rille.stages.terrain.shading import gradient, hillshade, slope_deg
 
 
 def plane(a: float, b: float, cell: float = 0.5, shape: tuple[int, int] = (7, 9)) -> np.ndarray:

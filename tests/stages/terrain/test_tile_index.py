@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stages.core.declare import Bundle, NoParams
-from stages.geometry.lattice import Lattice
-from stages.terrain import tile_index as stage
-from stages.terrain.tile_index import footprint, tile_lattice
+from rille.stages.core.declare import Bundle, NoParams
+from rille.stages.geometry.lattice import Lattice
+from rille.stages.terrain import tile_index as stage
+from rille.stages.terrain.tile_index import footprint, tile_lattice
 
 
 def test_by_hand() -> None:

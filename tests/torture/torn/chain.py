@@ -18,7 +18,7 @@ def build(graph, *, frames=FRAMES, size=150, shuffle=None, sleepers=0, sabotage=
     from toys.numbers import NumbersParams
     from toys.scale import ScaleParams
 
-    from stages.core.declare import NoParams
+    from rille.stages.core.declare import NoParams
 
     def shuffled(items):
         items = list(items)
@@ -51,9 +51,9 @@ def run(cache, executor="inline", ledger=None, jobs=2, memory=None, environment=
     if memory is not None:
         resource.setrlimit(resource.RLIMIT_RSS, (memory, memory))  # the engine heeds it, the kernel does not
     os.environ.update(environment or {})
-    from pipeline.engine import scheduler
-    from pipeline.engine.graph import Graph
-    from pipeline.engine.store.base import at
+    from rille.pipeline.engine import scheduler
+    from rille.pipeline.engine.graph import Graph
+    from rille.pipeline.engine.store.base import at
 
     graph = Graph()
     build(graph, **options)
@@ -75,9 +75,9 @@ def run(cache, executor="inline", ledger=None, jobs=2, memory=None, environment=
 def clear(cache, runs, until, grace, environment=None):
     """Clear the cache again and again beside the runs, as ``rille cache gc`` does; how often, and what went."""
     os.environ.update(environment or {})
-    from pipeline.engine import events as ledger
-    from pipeline.engine.store import maintenance
-    from pipeline.engine.store.base import at
+    from rille.pipeline.engine import events as ledger
+    from rille.pipeline.engine.store import maintenance
+    from rille.pipeline.engine.store.base import at
 
     times = removed = 0
     while not Path(until).exists():

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from stages.core.declare import Array, Bundle, NoParams, Stage
+from rille.stages.core.declare import Array, Bundle, NoParams, Stage
 
 
 def _run(params, args, inputs):

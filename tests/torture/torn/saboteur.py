@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.engine.store.s3 import Bucket
-from stages.core.declare import Array, Bundle, NoParams, Stage
+from rille.pipeline.engine.store.s3 import Bucket
+from rille.stages.core.declare import Array, Bundle, NoParams, Stage
 
 
 def _die():

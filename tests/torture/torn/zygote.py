@@ -17,10 +17,10 @@ import zarr
 import zarr.codecs
 import zarr.storage  # noqa: F401
 
-import pipeline.engine.code_digest
-import pipeline.engine.events
-import pipeline.engine.scheduler
-import pipeline.engine.store.maintenance
+import rille.pipeline.engine.code_digest
+import rille.pipeline.engine.events
+import rille.pipeline.engine.scheduler
+import rille.pipeline.engine.store.maintenance
 import torn.saboteur  # noqa: F401
 from torn import chain
 
@@ -57,7 +57,7 @@ def _child(line, alone):
 
 def main():
     """Say the process id, wait for its end, say how it ended."""
-    pipeline.engine.code_digest.tree_digest()  # reads all sources, once for all
+    rille.pipeline.engine.code_digest.tree_digest()  # reads all sources, once for all
     for line in sys.stdin:
         seen, alone = os.pipe()
         pid = os.fork()
