@@ -43,6 +43,12 @@ STEADY_RATE = 0.02
 LARGEST_BIAS = 0.15
 """rad/s; the mean rate of a resting sensor. Cheap gyroscopes have 0.08, faster ones turn indeed."""
 
+FASTEST = 200.0
+"""rad/s; the fastest gyroscopes reach 70 (4000 degrees a second). A larger number is damage."""
+
+HARDEST = 5000.0
+"""m/s^2; accelerometers for shocks reach 500 times gravity."""
+
 SLOW = 0.15
 """rad/s; while it turns faster, the mean force is not trusted: the sensor stands off the axis."""
 
@@ -111,7 +117,8 @@ def read_imu(path: Path, *, unit: str = "auto") -> Imu:
     Raises
     ------
     InputError
-        Columns are missing, exchanged, or in multiples of gravity; a row or a time cannot be used.
+        Columns are missing, exchanged, or in multiples of gravity; a row or a time cannot be used; a value is beyond
+        what such a sensor can measure.
     """
     table = read_table(path, "IMU record")
     if table.columns < 7:
@@ -126,6 +133,8 @@ def read_imu(path: Path, *, unit: str = "auto") -> Imu:
     rates, forces = table.numbers(gyro), table.numbers(accelerometer)
     if any("deg" in table.header[k] for k in gyro if table.header):
         rates = np.deg2rad(rates)
+    _possible(rates, FASTEST, "rad/s", table)
+    _possible(forces, HARDEST, "m/s^2", table)
     _plausible(rates, forces, table.name)
     return Imu(np.array(times), rates, forces, table.name, warnings)
 
@@ -134,6 +143,18 @@ def _named(table: Table, starts: tuple[str, ...]) -> list[int]:
     """The three columns whose names begin so, x y z; none where there are not just three."""
     found = [k for k, name in enumerate(table.header) if name.startswith(starts)]
     return found if len(found) == 3 else []
+
+
+def _possible(values: Floats, greatest: float, unit: str, table: Table) -> None:
+    wrong = np.argwhere(np.abs(values) > greatest)
+    if wrong.size:
+        row, axis = wrong[0]
+        raise InputError(
+            "RIL-854",
+            f"{table.name}, line {table.lines[row]}: {values[row, axis]:.3g} {unit} is beyond any sensor "
+            f"({greatest:g} {unit})",
+            remedy="correct or remove that line; give rates in rad/s and accelerations in m/s^2, or name the unit deg",
+        )
 
 
 def _plausible(rates: Floats, forces: Floats, name: str) -> None:

@@ -230,3 +230,12 @@ def test_what_cannot_be_is_refused(tmp_path, row, code):
     with raises(code) as caught:
         read_imu(record_file(tmp_path, "", [row, (1, *row[1:])]))
     assert caught.value.remedy
+
+
+@pytest.mark.parametrize(("column", "value", "unit"), [(2, "1e300", "rad/s"), (6, "-6e3", "m/s^2")])
+def test_a_value_beyond_any_sensor_is_refused_with_its_line(tmp_path, column, value, unit):
+    rows = [["0.0", "0", "0", "0", "0", "0", "9.81"], ["0.1", "0", "0", "0", "0", "0", "9.81"]]
+    rows[1][column] = value
+    (tmp_path / "imu.csv").write_text("".join(",".join(row) + "\n" for row in rows))
+    with raises("RIL-854", "line 2", unit):
+        read_imu(tmp_path / "imu.csv", unit="s")
