@@ -87,9 +87,14 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
     chain = list(found.meta["chain"])
     missing = [{"frame": f, "cause": why} for f, why in make.sequence.lost.items() if f in frames]
     lost = sorted([*missing, *found.meta["lost"]], key=lambda item: item["frame"])
-    unfit = {"unfit": [chain.index(f) for f in found.meta["unfit"]]} if found.meta["unfit"] else {}
+    marked = {
+        "unfit": [chain.index(f) for f in found.meta["unfit"]],
+        "behind": [k for k, (a, b) in enumerate(pairwise(chain), 1) if frames.index(b) > frames.index(a) + 1],
+    }
     steps = [make.motion(a, b) for a, b in pairwise(chain)]
-    p.select = make.node(keyframes, "select", {"frames": len(chain)} | unfit, motions=steps)
+    p.select = make.node(
+        keyframes, "select", {"frames": len(chain)} | {name: at for name, at in marked.items() if at}, motions=steps
+    )
     chosen = yield p.select
     basic = [chain[i] for i in chosen.meta["basic"]]
 

@@ -87,7 +87,8 @@ class SelectParams(Params):
 
 @dataclass(frozen=True)
 class Choice:
-    """``basic`` positions; ``why`` each is basic (first frame, stride, overlap, max_gap, few matches); ``overlap``.
+    """``basic`` positions; ``why`` each is basic (first frame, stride, overlap, max_gap, few matches, behind a gap);
+    ``overlap``.
 
     ``overlap`` is that with the basic pair before, None for the first and where too few coarse matches tell of it.
     """
@@ -97,27 +98,54 @@ class Choice:
     overlap: list[float | None]
 
 
-def by_stride(steps: Sequence[Step], params: SelectParams, unfit: frozenset[int] = frozenset()) -> Choice:
+@dataclass(frozen=True)
+class Marked:
+    """Positions that the choice must respect, whatever the steps show.
+
+    ``unfit`` may not be basic; ``behind`` a gap of lost frames are: if the bridge over the gap is refused, what follows
+    is posed as a piece of its own.
+    """
+
+    unfit: frozenset[int] = frozenset()
+    behind: frozenset[int] = frozenset()
+
+    @classmethod
+    def of(cls, args: Mapping[str, Any], frames: int) -> Marked:
+        """From the arguments of the stage; behind a gap the first position that may be basic counts."""
+        unfit = frozenset(args.get("unfit", ()))
+        fit = [k for k in range(frames) if k not in unfit]
+        return cls(unfit, frozenset(n for k in args.get("behind", ()) for n in [n for n in fit if n >= k][:1]))
+
+
+UNMARKED = Marked()
+
+
+def by_stride(steps: Sequence[Step], params: SelectParams, marked: Marked = UNMARKED) -> Choice:
     """Positions 0, stride, 2 stride ... of one more frame than there are steps; for an unfit one the next that is.
 
     Behind a step that is not to be believed there is one, too: what follows can then be posed, though by itself.
     """
     count = len(steps) + 1
     broken = [k + 1 for k, step in enumerate(steps) if doubtful(step, params)]
-    wanted = [*range(0, count, params.stride), *broken]
-    basic = sorted({b for k in wanted if (b := next((n for n in range(k, count) if n not in unfit), None)) is not None})
+    wanted = dict.fromkeys(marked.behind, "behind a gap") | dict.fromkeys(broken, "few matches")
+    wanted |= dict.fromkeys(range(0, count, params.stride), "stride")
+    chosen: dict[int, str] = {}
+    for k in sorted(wanted):
+        fit = next((n for n in range(k, count) if n not in marked.unfit), None)
+        if fit is not None:
+            chosen.setdefault(fit, wanted[k])
+    basic, (_, *why) = list(chosen), chosen.values()
     overlap = [_overlap(steps[a:b], params) for a, b in itertools.pairwise(basic)]
-    why = ["few matches" if k in broken and k % params.stride else "stride" for k in basic[1:]]
     return Choice(basic, ["first frame", *why], [None, *overlap])
 
 
-def by_overlap(steps: Sequence[Step], params: SelectParams, unfit: frozenset[int] = frozenset()) -> Choice:
+def by_overlap(steps: Sequence[Step], params: SelectParams, marked: Marked = UNMARKED) -> Choice:
     """Basic pairs as far apart as the wanted overlap permits; at least one frame apart.
 
     Parameters
     ----------
     steps : coarse displacements from each frame to the next.
-    unfit : positions that may not be basic; the last one before that may takes their place, else the next one.
+    marked : in place of an unfit position the last one before that may be basic, else the next one.
     """
     choice = Choice([0], ["first frame"], [None])
     seen, k = (Seen.all_of(steps[0]) if steps else None), 0
@@ -125,8 +153,8 @@ def by_overlap(steps: Sequence[Step], params: SelectParams, unfit: frozenset[int
         assert seen is not None
         step, key = steps[k], choice.basic[-1]
         ahead = seen.after(step)
-        reason = _why(steps, k, key, ahead, params)
-        fit = next((n for n in range(k, key, -1) if n not in unfit), None) if reason else None
+        reason = "behind a gap" if k in marked.behind else _why(steps, k, key, ahead, params)
+        fit = next((n for n in range(k, key, -1) if n not in marked.unfit), None) if reason else None
         if fit is not None:
             choice.basic.append(fit)
             choice.why.append(reason)
@@ -175,7 +203,8 @@ def _run(params: SelectParams, args: Mapping[str, Any], inputs: Inputs) -> Bundl
     if len(steps) != frames - 1:
         raise InputError("RIL-438", f"{frames} frames need {frames - 1} motions, not {len(steps)}")
     stride = params.rule == "stride"
-    choice = (by_stride if stride else by_overlap)(steps, params, frozenset(args.get("unfit", ())))
+    marked = Marked.of(args, frames)
+    choice = (by_stride if stride else by_overlap)(steps, params, marked)
     meta = {
         "basic": choice.basic,
         "segments": segments(choice.basic, frames),
@@ -211,7 +240,7 @@ def _warnings(steps: Sequence[Step], overlap: Sequence[float | None], params: Se
 
 STAGE = Stage(
     name="select",
-    version=2,
+    version=3,
     summary="which stereo pairs become elevation models, and the segments between them",
     params=SelectParams,
     inputs=("motions*",),

@@ -49,7 +49,7 @@ def test_a_lost_frame_is_bridged_and_no_pyramid_is_made_twice() -> None:
     assert labels(graph, "continuity") == ["continuity", "continuity/1", "continuity/2"]
     assert labels(graph, "sides") == ["sides/2", "sides/3", "sides/4", "sides/5"]
     assert products.select is not None
-    assert products.select.spec.args == {"frames": 7, "unfit": [4]}
+    assert products.select.spec.args == {"frames": 7, "unfit": [4], "behind": [3]}
     motions = products.tracks[0].inputs["motions"]
     assert isinstance(motions, list)
     assert [h.label for h in motions] == ["motion/0-1", "motion/1-2", "motion/2-4"]

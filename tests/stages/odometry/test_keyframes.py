@@ -133,6 +133,15 @@ def test_a_stride_has_a_basic_pair_behind_a_step_with_few_matches():
     assert meta["segments"] == [[0, 1, 2, 3], [3, 4, 5], [5, 6], [6, 7]]
 
 
+@pytest.mark.parametrize("rule", ["overlap", "stride"])
+def test_behind_a_gap_is_a_basic_pair_so_that_a_refused_bridge_begins_a_piece(rule):
+    args = {"frames": 9, "behind": [3, 6], "unfit": [6]}
+    steps = {"motions": [motion(shift(2.0))] * 8}
+    meta = keyframes.STAGE.run(SelectParams(rule=rule, stride=16), args, steps).meta
+    assert meta["basic"] == [0, 3, 7]
+    assert meta["why"] == ["first frame", "behind a gap", "behind a gap"]
+
+
 def test_too_little_overlap_is_named():
     meta = run([motion(shift(240.0))] * 3)
     assert meta["basic"] == [0, 1, 2]
