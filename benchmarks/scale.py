@@ -97,6 +97,8 @@ def _real(name: str) -> Any:
 def _facts(name: str, args: Any, inputs: Any) -> dict[str, Any]:
     if name == "continuity":
         return {"asks": {}, "chain": args["frames"], "lost": [], "unfit": []}
+    if name == "common_tilt":
+        return {"undone": False}
     if name == "select":
         n = args["frames"]
         return {"basic": list(range(n)), "segments": [[k, k + 1] for k in range(n - 1)]}

@@ -145,16 +145,31 @@ class Chain:
                 pair = {c: self._pyramid(f, c) for c in ("left", "right")}
                 sides[f] = self._stage("sides", {"frame": f, "rig": self.sequence.rig.to_dict()}, **pair)
 
-    def _refined(self, basic: list[int], segments: list[tuple[Bundle, Bundle, Bundle]]) -> Bundle:
-        return self._stage(
-            "refine",
-            {"pairs": basic, "resect": self.config.resect.model_dump(mode="json")},
-            tracks=[track for _, _, track in segments],
-            resections=[r for r, _, _ in segments],
-            levels=[level for _, level, _ in segments],
-            disparities=[self.disparity[k] for k in basic],
-            rigs=[self.calibration] * len(basic),
-        )
+    def _refined(self, basic: list[int], segments: list[tuple[Bundle, Bundle, Bundle]]) -> list[Bundle]:
+        params = self.config.refine
+        windows = [segments]
+        if params.window:
+            windows = [segments[max(0, k + 1 - params.window) : k + 1] for k in range(len(segments))]
+
+        def adjusted(window: list[tuple[Bundle, Bundle, Bundle]], **tilt: Bundle) -> Bundle:
+            return self._stage(
+                "refine",
+                {"pairs": basic, "resect": self.config.resect.model_dump(mode="json")},
+                tracks=[track for _, _, track in window],
+                resections=[r for r, _, _ in window],
+                levels=[level for _, level, _ in window],
+                disparities=[self.disparity[k] for k in basic],
+                rigs=[self.calibration] * len(basic),
+                **tilt,
+            )
+
+        found = [adjusted(window) for window in windows]
+        if params.tilt_sigma_deg > 0:
+            args = {"sigma_deg": params.tilt_sigma_deg, "significance": params.tilt_significance}
+            tilt = self._stage("common_tilt", args, segments=found, rig=self.calibration)
+            if tilt.meta["undone"]:
+                found = [adjusted(window, tilt=tilt) for window in windows]
+        return found
 
     def _motion(self, a: int, b: int) -> Bundle:
         s, args = self.sequence, {"frames": [a, b]}

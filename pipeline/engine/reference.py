@@ -5,6 +5,7 @@ from __future__ import annotations
 REFERENCE: dict[str, tuple[float, float, float]] = {
     "accuracy": (0.0049, 0.0325, 0.0),
     "calibration": (0.0049, 0.018, 0.0),
+    "common_tilt": (0.0049, 0.01, 0.0),
     "continuity": (0.0049, 0.1668, 0.0),
     "dem_accuracy/local": (0.049, 0.0414, 0.0),
     "dem_accuracy/world": (0.0049, 0.0836, 0.0),
@@ -25,7 +26,7 @@ REFERENCE: dict[str, tuple[float, float, float]] = {
     "pose": (0.049, 0.0208, 0.0),
     "pyramid/left": (0.1961, 0.0421, 0.29),
     "pyramid/right": (0.049, 0.0423, 0.0),
-    "refine": (0.0049, 0.3552, 1.49),
+    "refine": (0.049, 0.05, 1.49),
     "resect": (0.049, 0.061, 7.43),
     "rig": (0.0049, 0.1233, 0.0),
     "risk/local": (0.049, 0.1435, 11.7),

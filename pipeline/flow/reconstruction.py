@@ -21,12 +21,13 @@ Frames that show no motion (black, foreign, sides exchanged) are lost: ``continu
 each pair looks like), the motions, and where it asks for them bridges (motions over a lost frame) and ``sides`` (left
 against right).
 
-A segment needs landmarks only relative to its own basic pair, so all segments run at once; absolute poses are one
-cheap scan (``trajectory``), and Locus then runs a second time, straight on the shared world lattice: nothing is
-resampled. Locus reads both pyramids' finest images, and with ``locus.both`` the disparities of both (``hfvm/back``).
-What depends on data (which pairs are basic, how far the world reaches) follows as results arrive: ``reconstruction``
-is a generator that yields tasks and goes on with their results. The ports of ``hfvm`` to ``locus``, ``track`` and
-``resect`` are in :mod:`rille.pipeline.flow.builders`, the leaves in :mod:`rille.pipeline.flow.assessment`.
+A segment needs landmarks only relative to its own basic pair, so all segments are resected and refined at once (and
+refined again, where ``common_tilt`` finds a tilt of all disparities); absolute poses are one cheap scan
+(``trajectory``), and Locus then runs a second time, straight on the shared world lattice: nothing is resampled. Locus
+reads both pyramids' finest images, and with ``locus.both`` the disparities of both (``hfvm/back``). What depends on
+data (which pairs are basic, how far the world reaches) follows as results arrive: ``reconstruction`` is a generator
+that yields tasks and goes on with their results. The ports of ``hfvm`` to ``locus``, ``track`` and ``resect`` are in
+:mod:`rille.pipeline.flow.builders`, the leaves in :mod:`rille.pipeline.flow.assessment`.
 
 The world is cut into tiles once and for all; a tile's task has those models alone as inputs that have a cell in it. A
 pair that is added, or moved by another pose, is thus merged anew in the tiles that it touches and touched, no others:
@@ -47,7 +48,7 @@ from rille.stages.core.errors import DegenerateError, InputError
 from rille.stages.evaluation import crosscheck, crosscheck_join
 from rille.stages.imaging import image_quality
 from rille.stages.odometry import frame_screening, keyframes
-from rille.stages.odometry.resection import refine, trajectory
+from rille.stages.odometry.resection import common_tilt, refine, trajectory
 from rille.stages.planning import path
 from rille.stages.terrain import overlap_audit, overlap_qa, radiometry, tile_index
 
@@ -113,7 +114,7 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
         {"frames": list(frames)} | ({"lost": lost} if lost else {}),
         segments=p.resections,
         levels=[pairs[s.frames[0]].level for s in segments] or [pairs[basic[0]].level],
-        **refined(make, pairs, segments),
+        **(yield from refined(make, pairs, segments)),
     )
     flow(assessment.of_trajectory(make, frames))
     posed = yield p.trajectory
@@ -220,22 +221,41 @@ def dead_reckoning(make: Builder, segment: list[int]) -> dict[str, Any]:
     return {"prediction": [None if T is None else (key.inverse() @ T).to_list() for T in poses]}
 
 
-def refined(make: Builder, pairs: Mapping[int, Pair], segments: list[Segment]) -> dict[str, Handle]:
-    """All segments adjusted jointly with their landmarks, where that is wanted."""
+def refined(
+    make: Builder, pairs: Mapping[int, Pair], segments: list[Segment]
+) -> Generator[Wait, Any, dict[str, list[Handle]]]:
+    """Segments adjusted with their landmarks in windows, where that is wanted; again if disparities are tilted."""
     p, config = make.products, make.config
     if not (config.refine.enabled and segments and config.resect.landmarks == "disparity"):
         return {}
-    p.refined = make.node(
-        refine,
-        "refine",
-        {"pairs": list(pairs), "resect": config.resect.model_dump(mode="json")},
-        tracks=p.tracks,
-        resections=p.resections,
-        levels=[pairs[s.frames[0]].level for s in segments],
-        disparities=[pair.disparity for pair in pairs.values()],
-        rigs=[pair.rig for pair in pairs.values()],
-    )
-    return {"refined": p.refined}
+    params, count = config.refine, config.refine.window or len(segments)
+    windows = [segments[max(0, k - count) : k] for k in (range(1, len(segments) + 1) if params.window else [count])]
+
+    def adjusted(label: str, window: list[Segment], **tilt: Handle) -> Handle:
+        keys = [pairs[s.frames[0]] for s in window]
+        ends = [pairs[f] for f in (window[-1].frames[-1],) if params.stereo and f in pairs]
+        read = [*keys, *ends]
+        return make.node(
+            refine,
+            f"{label}/{keys[-1].frame}",
+            {"pairs": [pair.frame for pair in read], "resect": config.resect.model_dump(mode="json")},
+            tracks=[s.track for s in window],
+            resections=[s.resection for s in window],
+            levels=[pair.level for pair in keys],
+            disparities=[pair.disparity for pair in read],
+            rigs=[pair.rig for pair in read],
+            **tilt,
+        )
+
+    found = [adjusted("refine", window) for window in windows]
+    if params.tilt_sigma_deg > 0:
+        args = {"sigma_deg": params.tilt_sigma_deg, "significance": params.tilt_significance}
+        tilt = p.common_tilt = make.node(
+            common_tilt, "common_tilt", args, segments=found, rig=pairs[segments[0].frames[0]].rig
+        )
+        if (yield tilt).meta["undone"]:
+            found = [adjusted("refine/untilted", window, tilt=tilt) for window in windows]
+    return {"refined": found}
 
 
 def another_program(make: Builder, whole: list[int]) -> Handle:

@@ -89,7 +89,7 @@ def find_warnings(scene: Scene) -> list[str]:
     for handle in (
         p.continuity,
         p.select,
-        p.refined,
+        p.common_tilt,
         *p.crosschecks,
         p.crosscheck,
         p.agreement,
@@ -166,7 +166,7 @@ def _stages(view: RunView) -> dict[str, dict[str, Any]]:
 
 
 READS = (
-    "continuity select refined crosschecks crosscheck agreement crosscheck_accuracy trajectory accuracy "
+    "continuity select common_tilt crosschecks crosscheck agreement crosscheck_accuracy trajectory accuracy "
     "position_accuracy accuracy_pieces seam_audit disparity orientations rigs level local_dem local_risk local_path "
     "local_dem_accuracy resections world_dem tiles risk path dem_accuracy path_check drive"
 )

@@ -5,11 +5,8 @@ complement) is a division, and the system has the size of the poses (Triggs, McL
 doi:10.1007/3-540-44480-7_21). The result is never worse than its start by the same cost: where no step lowers it, the
 start is returned. The inverse of the same reduced system is the covariance of the poses (:func:`posterior`).
 
-Another error that disparities share shows over the whole sequence only (:func:`common_tilt`). A right image whose rows
-lie too low may have been turned (pitch), or have its principal point there; epipolar lines hardly tell the two apart,
-and a rig that is repaired takes the turn. The wrong choice tilts disparities: by ``f x y`` a radian, nothing along both
-axes of the image and most in its corners, which bends the path to one side. Tracks see depth once more, by parallax, so
-all segments together measure the tilt.
+Another error that disparities share, a tilt, shows over the whole sequence only: :func:`tilt_of` is what one segment
+tells of it (:mod:`rille.stages.odometry.resection.common_tilt`).
 """
 
 from __future__ import annotations
@@ -292,28 +289,7 @@ def posterior(
     ]
 
 
-def common_tilt(adjusted: Sequence[tuple[Views, State, float]], params: RefineParams) -> tuple[float, float]:
-    """Tilt that all disparities share and its standard deviation, radians, by adjusted segments and their biases.
-
-    To first order about the adjusted states. The segments' own values scatter by more than their errors, for their
-    landmarks are few and near each other; the scatter decides. Infinite deviation: fewer than three segments.
-    """
-    parts = np.array([_tilt_of(*one, params) for one in adjusted]).reshape(-1, 2)
-    parts = parts[parts[:, 0] > 0]
-    if len(parts) < 3:
-        return 0.0, float("inf")
-    information, value = parts[:, 0], parts[:, 1] / parts[:, 0]
-    for _ in range(5):  # of a segment that is far off, no more than of one at two deviations
-        tilt = float((information * value).sum() / information.sum())
-        off = np.abs(value - tilt) * np.sqrt(information)
-        spread = max(1.0, 1.4826 * float(np.median(off)))
-        information = parts[:, 0] * np.minimum(1.0, 2.0 * spread / np.maximum(off, 1e-12))
-    total = float(information.sum()) / spread**2
-    prior = math.radians(params.tilt_sigma_deg) ** -2.0
-    return tilt * total / (total + prior), (total + prior) ** -0.5
-
-
-def _tilt_of(views: Views, state: State, bias: float, params: RefineParams) -> tuple[float, float]:
+def tilt_of(views: Views, state: State, bias: float, params: RefineParams) -> tuple[float, float]:
     """Information and pull of the tilt by one segment, its poses, depths and bias free."""
     A, B, d, ga, gd = normal(views, state, bias, params.pixel_sigma)
     prior = _prior(params)

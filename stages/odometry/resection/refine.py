@@ -4,20 +4,19 @@ Resection poses each frame by itself, with landmarks as the key pair's disparity
 are unknowns, too, each held by its disparity: a point that four frames see from four places says more of its depth than
 its disparity alone. Where the segment ends at another basic pair, that pair's disparity at the tracked points is a
 second measurement of their depths. What all disparities share is one unknown of a window of segments, since one rig
-made them.
+made them. A task adjusts one window and gives the poses of its last segment.
 
 The poses' covariances are those of this adjustment, by the same rules as the resection's
 (:mod:`rille.stages.odometry.resection.resect`): the errors that are found set the scale, what the stated ones leave
 beyond them is shared by all segments.
 
-Another error that they share, a tilt, shows over the whole sequence only
-(:mod:`rille.stages.odometry.resection.bundle_adjustment`). Where it is beyond doubt, landmarks are judged and all
-segments adjusted once more without it.
+Another error that they share, a tilt, shows over the whole sequence only: each task says what its segment tells of it
+(:mod:`rille.stages.odometry.resection.common_tilt`). Where it is beyond doubt, landmarks are judged and all segments
+adjusted once more without it.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -34,11 +33,11 @@ from rille.stages.odometry.resection.bundle_adjustment import (
     State,
     Views,
     adjust,
-    common_tilt,
     normal,
     posterior,
     scatter,
     stereo_rows,
+    tilt_of,
 )
 from rille.stages.odometry.resection.landmarks import Landmarks, matches_at, relief
 from rille.stages.odometry.resection.pnp import HUBER, Observations, Poses, back_projection, norms
@@ -125,32 +124,23 @@ def _run(params: RefineParams, args: Mapping[str, Any], inputs: Inputs) -> Bundl
         landmarks = coordinates(points, {"disparity": disparity[frames[0]]}, rig, T, resect)
         given.append(_Given(track, resection, landmarks, rig, disparity.get(frames[-1])))
         out.append(SegmentOut.of(resection))
+    kept = slice(0, None) if params.window == 0 else slice(-1, None)
     found = [views_of(g.track, g.resection, g.landmarks, g.rig, g.after, params) for g in given]
     facts, states = _adjusted(found, out, params)
-    tilt, sigma = 0.0, float("inf")
-    if params.tilt_sigma_deg > 0:
-        tilt, sigma = common_tilt([(one[0], *states[k]) for k, one in enumerate(found) if one is not None], params)
-    undone = abs(tilt) > params.tilt_significance * sigma
-    if undone:
-        again = [
-            None if one is None else (one[0].without_tilt(tilt), states[k][0], one[2]) for k, one in enumerate(found)
-        ]
+    meta: dict[str, Any] = {}
+    if "tilt" in inputs:
+        tilt = float(inputs["tilt"].meta["tilt_rad"])
+        again = [None if one is None else (one[0].without_tilt(tilt), states[k], one[2]) for k, one in enumerate(found)]
         _adjusted(again, out, params)
         judged = [_anew(one, new.poses, tilt, resect, params) for one, new in zip(given, out, strict=True)]
         facts, _ = _adjusted(judged, out, params)
-    same = sum(f["cost_after"] >= f["cost_before"] for f in facts)
-    words = [f"refinement lowers the residuals of {same} of {len(facts)} windows no further: they stay as resected"]
-    meta: dict[str, Any] = {
-        "frames": [len(one.poses) for one in out],
-        "adjustments": facts,
-        "notes": words if same else [],
-    }
-    if math.isfinite(sigma):
-        meta["tilt"] = {"deg": math.degrees(tilt), "sigma_deg": math.degrees(sigma), "undone": undone}
-    if undone:
-        meta["warnings"] = [_tilted(tilt, sigma, next(iter(rigs.values())))]
+    elif params.tilt_sigma_deg > 0:
+        of = [(one[0], states[k]) for k, one in list(enumerate(found))[kept] if one is not None]
+        told = [tilt_of(views, state, facts["bias_px"], params) for views, state in of]
+        meta["tilt"] = [list(pair) for pair in told if np.isfinite(pair).all()]
+    meta |= {"frames": [len(one.poses) for one in out[kept]], "adjustment": facts}
     names = ("poses", "covariance", "shared")
-    return Bundle({name: np.concatenate([getattr(one, name) for one in out]) for name in names}, meta)
+    return Bundle({name: np.concatenate([getattr(one, name) for one in out[kept]]) for name in names}, meta)
 
 
 @dataclass(frozen=True)
@@ -229,49 +219,30 @@ def claims(segments: Sequence[tuple[Views, State]], bias: float, params: RefineP
     return out
 
 
-def _tilted(tilt: float, sigma: float, rig: Rig) -> str:
-    return (
-        f"the tracks contradict the disparities: {math.degrees(abs(tilt)):.2f} +- {math.degrees(sigma):.2f} degrees of"
-        f" pitch stand for a principal point that is {abs(tilt) * rig.right.fy:.1f} rows off; undone in the trajectory,"
-        " not in elevations: calibrate anew"
-    )
-
-
 def _adjusted(
     found: Sequence[Segment | None], out: Sequence[SegmentOut], params: RefineParams
-) -> tuple[list[dict[str, float]], dict[int, tuple[State, float]]]:
-    """Windows adjusted, ``out`` written to; facts of the windows, and state and bias of each segment."""
-    facts: list[dict[str, float]] = []
-    last: dict[int, tuple[State, float]] = {}
-    for group, kept in _windows([k for k, one in enumerate(found) if one is not None], params.window):
-        parts = [one for k in group if (one := found[k]) is not None]
-        states, bias, before, after = adjust([(views, state) for views, state, _ in parts], params)
-        claimed = claims([(views, state) for (views, *_), state in zip(parts, states, strict=True)], bias, params)
-        for k, (_, _, rows), state, (covariance, shared) in zip(group, parts, states, claimed, strict=True):
-            if k in kept:
-                last[k] = state, bias
-                for row, R, t in zip(rows, state.R, state.t, strict=True):
-                    out[k].poses[row] = RigidTransform(R, t).inverse().matrix34
-                out[k].covariance[rows], out[k].shared[rows] = covariance, shared
-        facts.append({"bias_px": bias, "cost_before": before, "cost_after": after})
-    return facts, last
-
-
-def _windows(segments: list[int], window: int) -> list[tuple[list[int], list[int]]]:
-    """Segments that are adjusted together, and those of them that are kept: the last, or all of the one window."""
-    if window == 0:
-        return [(segments, segments)] if segments else []
-    return [(segments[max(0, k + 1 - window) : k + 1], [s]) for k, s in enumerate(segments)]
+) -> tuple[dict[str, float], dict[int, State]]:
+    """A window adjusted, ``out`` written to; facts of the adjustment, and the state of each segment."""
+    group = {k: one for k, one in enumerate(found) if one is not None}
+    starts = [(views, state) for views, state, _ in group.values()]
+    states, bias, before, after = adjust(starts, params)
+    claimed = claims([(views, state) for (views, _), state in zip(starts, states, strict=True)], bias, params)
+    for (k, (_, _, rows)), state, (covariance, shared) in zip(group.items(), states, claimed, strict=True):
+        for row, R, t in zip(rows, state.R, state.t, strict=True):
+            out[k].poses[row] = RigidTransform(R, t).inverse().matrix34
+        out[k].covariance[rows], out[k].shared[rows] = covariance, shared
+    facts = {"bias_px": bias, "cost_before": before, "cost_after": after}
+    return facts, dict(zip(group, states, strict=True))
 
 
 STAGE = Stage(
     name="refine",
-    version=2,
-    summary="poses of segments adjusted jointly with their landmarks",
+    version=3,
+    summary="poses of a segment adjusted jointly with its landmarks",
     params=RefineParams,
-    inputs=("tracks*", "resections*", "levels*", "disparities*", "rigs*"),
+    inputs=("tracks*", "resections*", "levels*", "disparities*", "rigs*", "tilt?"),
     outputs=(
-        replace(POSES, long_name="poses of all segments, one after the other", frame="local"),
+        replace(POSES, long_name="poses of a segment, of several one after the other", frame="local"),
         replace(COVARIANCE, frame="local"),
         replace(SHARED, frame="local"),
     ),

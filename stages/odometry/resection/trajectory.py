@@ -242,7 +242,8 @@ def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     ]
     if "refined" in inputs:
         ends = np.cumsum([len(poses) for poses, _, _ in segments])[:-1]
-        better = (np.split(np.asarray(inputs["refined"][name]), ends) for name in ("poses", "covariance", "shared"))
+        names = ("poses", "covariance", "shared")
+        better = (np.split(np.concatenate([b[name] for b in inputs["refined"]]), ends) for name in names)
         segments = list(zip(*better, strict=True))
     frames = [int(f) for f in args["frames"]]
     facts = _facts(inputs["segments"]) or [{"frame": frames[0], "inliers": 0}]
@@ -273,7 +274,7 @@ STAGE = Stage(
     version=2,
     summary="poses of all left frames in the world frame",
     params=NoParams,
-    inputs=("segments*", "levels*", "refined?"),
+    inputs=("segments*", "levels*", "refined*?"),
     outputs=(
         replace(POSES, frame="world"),
         replace(COVARIANCE, frame="world"),

@@ -19,6 +19,7 @@ def lay_out(
     answer: dict[str, Any],
     chosen: dict[str, Any],
     trajectory: dict[str, Any],
+    tilted: bool = False,
     **given: Any,
 ) -> tuple[Graph, Products]:
     """The graph as it grows with these facts of the stages."""
@@ -29,9 +30,10 @@ def lay_out(
     for meta in [*({"asks": asks} for asks in asked), nothing | answer, chosen]:
         deciding = [w for w in graph.expansions if w[0][0].stage in ("continuity", "select")]
         deciding[-1][1](SimpleNamespace(meta=meta))
-    for handles, go_on, _ in list(graph.expansions):
-        if handles == [products.trajectory]:
-            go_on(SimpleNamespace(meta=trajectory))
+    for stage, meta in (("common_tilt", {"undone": tilted}), ("trajectory", trajectory)):
+        for handles, go_on, _ in list(graph.expansions):
+            if handles[0].label == stage:
+                go_on(SimpleNamespace(meta=meta))
     return graph, products
 
 
@@ -75,11 +77,16 @@ def test_the_world_is_that_of_the_largest_piece_and_each_piece_is_judged() -> No
 
 
 def test_a_first_frame_that_is_lost_leaves_no_pair_behind() -> None:
-    _, products = lay_out(
+    graph, products = lay_out(
         [],
         {"chain": list(range(1, 8)), "lost": [{"frame": 0, "cause": "black"}], "unfit": []},
         {"basic": [0, 3], "segments": [[0, 1, 2, 3], [3, 4, 5, 6]]},
         {"frames": list(range(8)), "pieces": [[1, 7]], "main": 0, "positions": [None, *([0, 0, k] for k in range(7))]},
+        tilted=True,
     )
     assert list(products.disparity) == [1, 4]
-    assert products.refined is not None
+    assert labels(graph, "refine") == ["refine/1", "refine/4", "refine/untilted/1", "refine/untilted/4"]
+    assert products.trajectory is not None
+    refined = products.trajectory.inputs["refined"]
+    assert isinstance(refined, list)
+    assert [h.label for h in refined] == ["refine/untilted/1", "refine/untilted/4"]

@@ -6,19 +6,21 @@ import numpy as np
 import pytest
 from raising import raises
 
-from rille.stages.core.declare import Bundle, check_outputs
+from rille.stages.core.declare import Bundle, NoParams, check_outputs
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
+from rille.stages.odometry.resection import common_tilt as tilt_stage
 from rille.stages.odometry.resection.bundle_adjustment import (
     RefineParams,
     State,
     Views,
     adjust,
-    common_tilt,
     cost_of,
     normal,
     posterior,
     scatter,
+    tilt_of,
 )
+from rille.stages.odometry.resection.common_tilt import common_tilt
 from rille.stages.odometry.resection.landmarks import landmarks_from_disparity
 from rille.stages.odometry.resection.refine import STAGE, _tilt_pattern, claims, views_of
 from rille.stages.odometry.resection.resect import ResectParams
@@ -196,9 +198,17 @@ def tilted(seed, tilt, frames=4):
     return views, state, bias, T
 
 
+SIGMA = np.radians(PARAMS.tilt_sigma_deg)
+
+
+def told(adjusted):
+    """Information and pull (segment, 2) of the tilt by adjusted segments."""
+    return np.array([tilt_of(*one, PARAMS) for one in adjusted])
+
+
 def test_a_tilt_of_all_disparities_is_found_by_many_segments_and_undone():
     parts = [tilted(60 + k, 0.004) for k in range(12)]
-    tilt, sigma = common_tilt([part[:3] for part in parts], PARAMS)
+    tilt, sigma = common_tilt(told(part[:3] for part in parts), SIGMA)
     assert tilt == pytest.approx(0.004, abs=4 * sigma)
     assert sigma < 0.001
     errors = []
@@ -210,11 +220,11 @@ def test_a_tilt_of_all_disparities_is_found_by_many_segments_and_undone():
 
 
 def test_a_tilt_that_is_not_there_is_not_believed():
-    parts = [tilted(90 + k, 0.0)[:3] for k in range(12)]
-    tilt, sigma = common_tilt(parts, PARAMS)
+    parts = told(tilted(90 + k, 0.0)[:3] for k in range(12))
+    tilt, sigma = common_tilt(parts, SIGMA)
     assert abs(tilt) < PARAMS.tilt_significance * sigma
     # Two segments say nothing of their scatter.
-    assert common_tilt(parts[:2], PARAMS) == (0.0, float("inf"))
+    assert common_tilt(parts[:2], SIGMA) == (0.0, float("inf"))
 
 
 def test_the_stage_undoes_a_tilt_and_says_so():
@@ -226,23 +236,26 @@ def test_the_stage_undoes_a_tilt_and_says_so():
         for k, depth in enumerate((4.0, 3.8)):
             bent = -500.0 * 0.2 / depth + tilt * 500.0 * (x - 0.2 / depth) * y
             one["disparities"][k] = Bundle({**one["disparities"][k].arrays, "column_disparity": np.float32(bent)}, {})
-        rng, many = np.random.default_rng(8), {}
-        many["tracks"] = []
+        rng, many = np.random.default_rng(8), []
         for _ in range(10):
             points = np.asarray(one["tracks"][0]["points"]) + 0.1 * rng.standard_normal((80, 3, 2))
-            many["tracks"].append(Bundle({"points": points.astype(np.float32)}, {"frames": [0, 1, 2]}))
-        many |= {"resections": one["resections"] * 10, "levels": one["levels"] * 10}
+            many.append(one | {"tracks": [Bundle({"points": points.astype(np.float32)}, {"frames": [0, 1, 2]})]})
         args = {"pairs": [0, 2], "resect": ResectParams().model_dump(mode="json")}
-        return STAGE.run(RefineParams(), args, one | many)
+        found = [STAGE.run(RefineParams(), args, given) for given in many]
+        how = {"sigma_deg": PARAMS.tilt_sigma_deg, "significance": PARAMS.tilt_significance}
+        common = tilt_stage.STAGE.run(NoParams(), how, {"segments": found, "rig": one["rigs"][0]})
+        if common.meta["undone"]:
+            found = [STAGE.run(RefineParams(), args, given | {"tilt": common}) for given in many]
+        return common.meta, found
 
     plain, bent = stage(0.0), stage(0.006)
-    assert not plain.meta["tilt"]["undone"]
-    assert "warnings" not in plain.meta
-    assert bent.meta["tilt"]["undone"]
-    assert np.radians(abs(bent.meta["tilt"]["deg"])) == pytest.approx(0.006, rel=0.2)
-    assert "degrees of pitch stand for a principal point" in bent.meta["warnings"][0]
+    assert not plain[0]["undone"]
+    assert "warnings" not in plain[0]
+    assert bent[0]["undone"]
+    assert abs(bent[0]["tilt_rad"]) == pytest.approx(0.006, rel=0.2)
+    assert "degrees of pitch stand for a principal point" in bent[0]["warnings"][0]
     straight = np.arange(3) * 0.1
-    off = [np.abs(np.asarray(out["poses"])[:, 2, 3].reshape(10, 3) - straight).max() for out in (plain, bent)]
+    off = [max(np.abs(out["poses"][:, 2, 3] - straight).max() for out in found) for _, found in (plain, bent)]
     assert off[1] < 3 * off[0] + 0.002
 
 
@@ -285,15 +298,17 @@ def bundles(tracks_of_last=True):
 
 
 @pytest.mark.parametrize("window", [0, 1])
-def test_the_stage_gives_the_poses_of_all_segments(window):
-    inputs = bundles()
+def test_the_stage_gives_the_poses_of_the_last_segment_or_of_all(window):
+    one = bundles()
+    inputs = {port: given * (1 if port in ("disparities", "rigs") else 2) for port, given in one.items()}
     args = {"pairs": [0, 2], "resect": ResectParams().model_dump(mode="json")}
     out = STAGE.run(RefineParams(window=window, stereo=True), args, inputs)
     check_outputs(STAGE, out)
-    assert out.meta["frames"] == [3]
-    np.testing.assert_allclose(out["poses"][:, :, 3], [[0, 0, 0], [0, 0, 0.1], [0, 0, 0.2]], atol=2e-4)
-    assert not out["covariance"][0].any()
-    assert (np.linalg.eigvalsh(out["covariance"][1:])[:, 0] > 0).all()
+    count = 2 if window == 0 else 1
+    assert out.meta["frames"] == [3] * count
+    np.testing.assert_allclose(out["poses"][:, :, 3], [[0, 0, 0], [0, 0, 0.1], [0, 0, 0.2]] * count, atol=2e-4)
+    assert not out["covariance"][::3].any()
+    assert (np.linalg.eigvalsh(np.delete(out["covariance"], slice(0, None, 3), 0))[:, 0] > 0).all()
     with raises("RIL-416"):
         STAGE.run(RefineParams(), args | {"resect": ResectParams(landmarks="dem").model_dump(mode="json")}, inputs)
 

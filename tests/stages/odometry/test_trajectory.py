@@ -159,14 +159,15 @@ def test_refined_poses_and_their_covariances_take_the_place_of_resected_ones():
         segments.append(Bundle(arrays, {"per_frame": [{"frame": i, "inliers": 9} for i in range(a, b + 1)]}))
     inputs = {"segments": segments, "levels": [Bundle({}, {"T_local_left": T.to_list()}) for T in levels]}
     rows, claimed = sum(len(local) for local in better), np.diag([1e-6] * 3 + [1e-8] * 3)
-    inputs["refined"] = Bundle(
-        {
-            "poses": np.concatenate(better),
-            "covariance": np.tile(claimed, (rows, 1, 1)),
-            "shared": np.zeros((rows, 6, 2)),
-        },
-        {},
-    )
+    whole = {
+        "poses": np.concatenate(better),
+        "covariance": np.tile(claimed, (rows, 1, 1)),
+        "shared": np.zeros((rows, 6, 2)),
+    }
+    first = len(better[0])
+    inputs["refined"] = [
+        Bundle({n: a[part] for n, a in whole.items()}, {}) for part in (slice(first), slice(first, None))
+    ]
     out = STAGE.run(NoParams(), {"frames": list(range(8))}, inputs)
     # Of a frame of the first segment it is what was claimed, in the world: both parts are the same about all axes.
     np.testing.assert_allclose(out["covariance"][1], claimed, atol=1e-18)

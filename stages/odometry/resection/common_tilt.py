@@ -1,0 +1,77 @@
+"""Tilt that all disparities share, by what each adjusted segment tells of it.
+
+A right image whose rows lie too low may have been turned (pitch), or have its principal point there; epipolar lines
+hardly tell the two apart, and a rig that is repaired takes the turn. The wrong choice tilts disparities: by ``f x y`` a
+radian, nothing along both axes of the image and most in its corners, which bends the path to one side. Tracks see depth
+once more, by parallax, so all segments together measure the tilt
+(:func:`rille.stages.odometry.resection.bundle_adjustment.tilt_of`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rille.stages.core.declare import Bundle, Inputs, NoParams, Stage
+from rille.stages.geometry.geometry import Rig
+
+Floats = NDArray[np.float64]
+
+
+def common_tilt(parts: Floats, prior_sigma: float) -> tuple[float, float]:
+    """Tilt that all disparities share and its standard deviation, radians.
+
+    The segments' own values scatter by more than their errors, for their landmarks are few and near each other; the
+    scatter decides. Infinite deviation: fewer than three segments.
+
+    Parameters
+    ----------
+    parts : (segment, 2) information and pull of the tilt.
+    prior_sigma : radians.
+    """
+    parts = parts[parts[:, 0] > 0]
+    if len(parts) < 3:
+        return 0.0, float("inf")
+    information, value = parts[:, 0], parts[:, 1] / parts[:, 0]
+    for _ in range(5):  # of a segment that is far off, no more than of one at two deviations
+        tilt = float((information * value).sum() / information.sum())
+        off = np.abs(value - tilt) * np.sqrt(information)
+        spread = max(1.0, 1.4826 * float(np.median(off)))
+        information = parts[:, 0] * np.minimum(1.0, 2.0 * spread / np.maximum(off, 1e-12))
+    total = float(information.sum()) / spread**2
+    prior = prior_sigma**-2.0
+    return tilt * total / (total + prior), (total + prior) ** -0.5
+
+
+def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+    told = [pair for segment in inputs["segments"] for pair in segment.meta["tilt"]]
+    tilt, sigma = common_tilt(np.array(told).reshape(-1, 2), math.radians(args["sigma_deg"]))
+    if not math.isfinite(sigma):
+        return Bundle({}, {"undone": False})
+    undone = abs(tilt) > args["significance"] * sigma
+    rig = Rig.from_dict(inputs["rig"].meta["rig"])
+    warnings = {"warnings": [_words(tilt, sigma, rig)]} if undone else {}
+    return Bundle({}, {"tilt_rad": tilt, "sigma_rad": sigma, "undone": undone, **warnings})
+
+
+def _words(tilt: float, sigma: float, rig: Rig) -> str:
+    return (
+        f"the tracks contradict the disparities: {math.degrees(abs(tilt)):.2f} +- {math.degrees(sigma):.2f} degrees of"
+        f" pitch stand for a principal point that is {abs(tilt) * rig.right.fy:.1f} rows off; undone in the trajectory,"
+        " not in elevations: calibrate anew"
+    )
+
+
+STAGE = Stage(
+    name="common_tilt",
+    version=1,
+    summary="tilt that the disparities of all segments share",
+    params=NoParams,
+    inputs=("segments*", "rig"),
+    outputs=(),
+    run=_run,
+)
