@@ -50,12 +50,18 @@ TOUCHED = (
 """World tiles of the three models: the second shares one with the first, the third another one with the second."""
 
 META: dict[str, dict[str, Any]] = {
-    "select": {"basic": list(BASIC), "segments": [[0, 1, 2], [2, 3, 4]]},
+    "select": {
+        "basic": list(BASIC),
+        "segments": [[0, 1, 2], [2, 3, 4]],
+        "displacement": [1.0] * 4,
+        "match_rate": [1.0] * 4,
+    },
     "level": {"T_local_left": IDENTITY},
     "locus": {"lattice": LATTICE},
     "continuity": {"asks": {"bridges": [], "sides": []}, "chain": list(FRAMES), "unfit": [], "lost": []},
     "trajectory": {"frames": list(FRAMES), "positions": [[0.0, 0.0, 0.0]] * 5, "pieces": [[0, 4]], "main": 0},
     "crosscheck_join": {"frames": list(FRAMES), "positions": [[0.0, 0.0, 0.0]] * 5},
+    "common_tilt": {"undone": False},
     "exposure": {"steps": {"2": 3}},
 }
 EACH: dict[str, Callable[[int], dict[str, Any]]] = {

@@ -36,6 +36,7 @@ world models depend on their own pose only, and what comes out as before is not 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Generator, Mapping
 from itertools import pairwise
 from typing import Any
@@ -111,7 +112,7 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
     p.trajectory = make.node(
         trajectory,
         "trajectory",
-        {"frames": list(frames)} | ({"lost": lost} if lost else {}),
+        {"frames": list(frames), "steps": steps_of(make, chosen)} | ({"lost": lost} if lost else {}),
         segments=p.resections,
         levels=[pairs[s.frames[0]].level for s in segments] or [pairs[basic[0]].level],
         **(yield from refined(make, pairs, segments)),
@@ -209,6 +210,14 @@ def vertical(make: Builder, pair: int, first: bool) -> dict[str, Any]:
     if s.pitch is not None:
         args["pitch"] = s.pitch
     return args
+
+
+def steps_of(make: Builder, chosen: Ref) -> list[list[float | None]]:
+    """How far the view moves from each frame to the next (radians, as of a camera that only turns), and the share of it
+    that is found again."""
+    lengths, focal = chosen.meta["displacement"], make.sequence.rig.left.fx
+    turns = [None if length is None else round(math.atan(length / focal), 4) for length in lengths]
+    return [[turn, share] for turn, share in zip(turns, chosen.meta["match_rate"], strict=True)]
 
 
 def dead_reckoning(make: Builder, segment: list[int]) -> dict[str, Any]:

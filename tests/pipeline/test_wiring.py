@@ -18,7 +18,8 @@ LEG = {"start": [0.0, 0.0, 0.0], "where": None, "reason": "", "left_m": 1.0, "wa
 
 FACTS: dict[str, dict[str, Any]] = {
     "continuity": {"asks": {"bridges": [], "sides": []}, "chain": [0, 1, 2], "lost": [], "unfit": []},
-    "select": {"basic": [0, 2], "segments": [[0, 1, 2]]},
+    "select": {"basic": [0, 2], "segments": [[0, 1, 2]], "displacement": [1.0, 1.0], "match_rate": [1.0, 1.0]},
+    "common_tilt": {"undone": False},
     "trajectory": {"pieces": [[0, 2]], "main": 0, "frames": [0, 1, 2], "positions": [[0, k, 0] for k in range(3)]},
     "exposure": {"steps": {}},
     "footprint": {"tiles": [(0, 0, 0, 0, 4, 4)], "box": BOX, "cell": 0.01},

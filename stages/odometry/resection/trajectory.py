@@ -19,8 +19,10 @@ with the length of the way and not with its root (:mod:`rille.stages.odometry.re
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -219,6 +221,15 @@ def _account(frames: list[int], piece: NDArray[np.int16], causes: Mapping[int, s
     return {"pieces": pieces, "main": main, **counts, "lost": lost, "warnings": lines}
 
 
+def _moved(frames: list[int], steps: Sequence[tuple[float | None, float]]) -> dict[int, list[str]]:
+    """How far the view of each frame lies from that of the frame before, in words: radians and share found again."""
+    return {
+        b: [f"the view moves by {math.degrees(turn):.0f} degrees from frame {a}, {share:.0%} of it is found again"]
+        for (a, b), (turn, share) in zip(pairwise(frames), steps, strict=True)
+        if turn is not None
+    }
+
+
 def _without_vertical(pieces: Sequence[Sequence[int]], verticals: Sequence[str]) -> list[str]:
     return [
         f"nothing tells of the vertical at frames {a}-{b}: their world is that of camera {a}, whose own up is z"
@@ -249,6 +260,10 @@ def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     facts = _facts(inputs["segments"]) or [{"frame": frames[0], "inliers": 0}]
     causes = {int(f["frame"]): str(f["cause"]) for f in args.get("lost", ())}
     causes |= {int(f["frame"]): str(f["lost"]) for f in facts if "lost" in f}
+    if "steps" in args:
+        through = [f for f in frames if f not in {int(lost["frame"]) for lost in args.get("lost", ())}]
+        moved = _moved(through, args["steps"])
+        causes = {f: "; ".join([cause, *moved.get(f, ())]) for f, cause in causes.items()}
     row = {frame: k for k, frame in enumerate(frames)}
     at = np.array([row[int(f["frame"])] for f in facts], dtype=np.intp)
     found = _spread(chain(segments, levels), at, len(frames))
@@ -271,7 +286,7 @@ def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
 
 STAGE = Stage(
     name="trajectory",
-    version=2,
+    version=3,
     summary="poses of all left frames in the world frame",
     params=NoParams,
     inputs=("segments*", "levels*", "refined*?"),

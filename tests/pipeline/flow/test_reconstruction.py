@@ -27,7 +27,9 @@ def lay_out(
     graph, settings = Graph(), config.build(config.expand(sequence.defaults), given)
     products, _ = dataflow(graph, sequence, settings, tuple(range(FRAMES)))
     nothing = {"asks": {"bridges": [], "sides": []}}
-    for meta in [*({"asks": asks} for asks in asked), nothing | answer, chosen]:
+    steps = len(answer["chain"]) - 1
+    found = chosen | {"displacement": [1.0] * steps, "match_rate": [1.0] * steps}
+    for meta in [*({"asks": asks} for asks in asked), nothing | answer, found]:
         deciding = [w for w in graph.expansions if w[0][0].stage in ("continuity", "select")]
         deciding[-1][1](SimpleNamespace(meta=meta))
     for stage, meta in (("common_tilt", {"undone": tilted}), ("trajectory", trajectory)):

@@ -81,7 +81,7 @@ def test_covariance_is_that_of_sampled_trajectories():
     np.testing.assert_allclose(measured / scale, covariance[-1] / scale, atol=0.13)
 
 
-def broken_run(lost_rows, frames=8, cuts=((0, 3), (3, 6), (6, 7))):
+def broken_run(lost_rows, frames=8, cuts=((0, 3), (3, 6), (6, 7)), moved=False):
     """True poses of eight frames in three segments of which some frames are lost; and what the stage makes of them."""
     rng = np.random.default_rng(9)
     truth = [pose(rng, 3.0) for _ in range(frames)]
@@ -96,9 +96,15 @@ def broken_run(lost_rows, frames=8, cuts=((0, 3), (3, 6), (6, 7))):
         arrays = {"poses": local, "covariance": np.zeros((b - a + 1, 6, 6)), "shared": NONE[: b - a + 1]}
         segments.append(Bundle(arrays, {"per_frame": facts}))
     inputs = {"segments": segments, "levels": [Bundle({}, {"T_local_left": T.to_list()}) for T in levels]}
-    out = STAGE.run(NoParams(), {"frames": list(range(frames))}, inputs)
+    steps = {"steps": [[0.2, 0.3]] * (frames - 1)} if moved else {}
+    out = STAGE.run(NoParams(), {"frames": list(range(frames))} | steps, inputs)
     check_outputs(STAGE, out)
     return truth, levels, out
+
+
+def test_a_break_says_how_far_the_view_moves_there():
+    _, _, out = broken_run({3}, moved=True)
+    assert "(too few landmarks; the view moves by 11 degrees from frame 2, 30% of it is" in out.meta["warnings"][-1]
 
 
 def test_a_frame_lost_within_a_segment_is_bridged():
