@@ -76,12 +76,12 @@ MERGED = {"merge", "risk/world", "path/world", "dem_accuracy/world", "path_check
 MODELS = {"locus/world", "footprint", "seam", "seam_audit", "exposure"}
 MISSION = MODELS | MERGED
 LOCAL = {"locus/local", "risk/local", "path/local", "dem_accuracy/local"}
-REFINED = {"refine", "trajectory", "agreement", "accuracy", "pose"} | MISSION
+REFINED = {"refine", "common_tilt", "trajectory", "agreement", "accuracy", "pose"} | MISSION
 POSES = {"resect"} | REFINED
 LEVELLED = {"level"} | LOCAL | POSES
 RIG = {"rig", "calibration"} | LEVELLED
 MATCHED = {"hfvm", "orientation"} | RIG
-MOVED = {"motion", "continuity", "select", "track"} | POSES
+MOVED = {"motion", "steps", "continuity", "select", "track"} | POSES
 COUNTERCHECK = {"crosscheck", "crosscheck_join", "agreement", "accuracy/crosscheck"}
 PYRAMIDS = {"pyramid/left", "pyramid/right"} | MATCHED | MOVED
 RISK = {"risk/local", "risk/world", "risk/truth", "path/local", "path/world", "path_check"}
@@ -121,8 +121,8 @@ EXCEPTIONS: dict[str, set[str]] = {
     "locus.both": {"hfvm/back"} | LOCAL | MISSION,  # the other direction is matched as well
     # limits of matches and number of points, with which all begins that is not an image
     "terrain.preset": {"hfvm/back", "track"} | MATCHED | POSES | LOCAL | MISSION,
-    "refine.enabled": REFINED - {"refine"},  # without it there is less to compute
-    "resect.landmarks": POSES - {"refine"},  # refined are landmarks of the disparity alone
+    "refine.enabled": REFINED - {"refine", "common_tilt"},  # without it there is less to compute
+    "resect.landmarks": POSES - {"refine", "common_tilt"},  # refined are landmarks of the disparity alone
     "crosscheck.enabled": set(),  # without it there is less to compute
     "merge.max_hole": {"footprint"} | MERGED,  # how far beyond its edge a tile depends on what is there
     "tiling.memory": set(),  # small pairs are matched whole with some more or less of it
@@ -165,7 +165,7 @@ SEQUENCE: dict[str, set[str]] = {
     **dict.fromkeys([f"mockup.{name}" for name in CAMERA], EVERYTHING - {"scene", "truth"}),
     "mockup.slope_deg": EVERYTHING,  # the cameras go along with the ground
     "mockup.up_noise_deg": LEVELLED,
-    "mockup.attitude_noise_deg": {"motion", "continuity", "select", "track"} | LEVELLED,
+    "mockup.attitude_noise_deg": {"motion", "steps", "continuity", "select", "track"} | LEVELLED,
     "mockup.focal_error": {"undistort/left", "undistort/right", "sight"}
     | PYRAMIDS
     | COUNTERCHECK,  # by the ideal camera

@@ -107,9 +107,9 @@ class Chain:
         frames = [f for f in self.frames if f not in self.sequence.lost]
         self.motion = {step: self._motion(*step) for step in itertools.pairwise(frames)}
         chain, lost, unfit = self._continuity(frames)
-        motions = [self.motion[step] for step in itertools.pairwise(chain)]
+        steps = self._steps(chain)
         where = {"unfit": [chain.index(f) for f in unfit]} if unfit else {}
-        select = self._stage("select", {"frames": len(chain)} | where, motions=motions)
+        select = self._stage("select", {"frames": len(chain)} | where, steps=steps)
         basic = [chain[i] for i in select.meta["basic"]]
         parts = [[chain[i] for i in part] for part in select.meta["segments"]]
         self.disparity = {k: self._match(k) for k in basic}
@@ -128,11 +128,11 @@ class Chain:
         sights = [
             self._stage("sight", {"frame": f}, **{c: self._image(f, c) for c in ("left", "right")}) for f in frames
         ]
-        motions = [self.motion[step] for step in itertools.pairwise(frames)]
+        steps = self._steps(frames)
         sides: dict[int, Bundle] = {}
         bridges: list[tuple[int, int]] = []
         while True:
-            given = {"motions": motions, "bridges": [self.motion[s] for s in bridges], "sides": list(sides.values())}
+            given = {"steps": steps, "bridges": [self.motion[s] for s in bridges], "sides": list(sides.values())}
             found = self._stage("continuity", {"frames": frames, "bridges": bridges}, sights=sights, **given)
             asks = found.meta["asks"]
             if not any(asks.values()):
@@ -144,6 +144,10 @@ class Chain:
             for f in asks["sides"]:
                 pair = {c: self._pyramid(f, c) for c in ("left", "right")}
                 sides[f] = self._stage("sides", {"frame": f, "rig": self.sequence.rig.to_dict()}, **pair)
+
+    def _steps(self, frames: list[int]) -> list[Bundle]:
+        motions = [self.motion[step] for step in itertools.pairwise(frames)]
+        return [self._stage("steps", {}, motions=motions)] if motions else []
 
     def _refined(self, basic: list[int], segments: list[tuple[Bundle, Bundle, Bundle]]) -> list[Bundle]:
         params = self.config.refine

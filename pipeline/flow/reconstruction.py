@@ -2,7 +2,7 @@
 
 ::
 
-    image -> undistort -> pyramid -+-> motion (N, N+1) -+-> continuity -> select: which pairs are basic
+    image -> undistort -> pyramid -+-> motion (N, N+1) -+-> steps -> continuity -> select: which pairs are basic
              (if needed)           |                    +-> track (segment) --+
                                    |                                          |
                                    +-> hfvm (basic pair) -+-> level ----------+-> resect (segment) -> trajectory
@@ -38,7 +38,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Generator, Mapping
-from itertools import pairwise
+from itertools import groupby, pairwise
 from typing import Any
 
 from rille.pipeline.engine.graph import Handle, Maybe, Wait
@@ -48,13 +48,16 @@ from rille.pipeline.flow.builders import Builder, Pair, Segment, merge_tiles
 from rille.stages.core.errors import DegenerateError, InputError
 from rille.stages.evaluation import crosscheck, crosscheck_join
 from rille.stages.imaging import image_quality
-from rille.stages.odometry import frame_screening, keyframes
+from rille.stages.odometry import frame_screening, keyframes, step_table
 from rille.stages.odometry.resection import common_tilt, refine, trajectory
 from rille.stages.planning import path
 from rille.stages.terrain import overlap_audit, overlap_qa, radiometry, tile_index
 
 TILE_CELLS = 512
 """Side of a world tile, cells: 512 x 512 float32 is 1 MiB an array, small enough to recompute alone."""
+
+TABLE_FRAMES = 100
+"""Motions that one table of steps holds."""
 
 Steps = Generator[Wait, Any, None]
 Facts = Mapping[str, Any]
@@ -93,10 +96,8 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
         "unfit": [chain.index(f) for f in found.meta["unfit"]],
         "behind": [k for k, (a, b) in enumerate(pairwise(chain), 1) if frames.index(b) > frames.index(a) + 1],
     }
-    steps = [make.motion(a, b) for a, b in pairwise(chain)]
-    p.select = make.node(
-        keyframes, "select", {"frames": len(chain)} | {name: at for name, at in marked.items() if at}, motions=steps
-    )
+    marks = {name: at for name, at in marked.items() if at}
+    p.select = make.node(keyframes, "select", {"frames": len(chain)} | marks, steps=steps(make, chain))
     chosen = yield p.select
     basic = [chain[i] for i in chosen.meta["basic"]]
 
@@ -122,9 +123,10 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
 
     # The world is that of the largest unbroken piece: its models, straight on the world lattice.
     start, end = posed.meta["pieces"][posed.meta["main"]]
-    there = [k for k in basic if start <= k <= end and posed.meta["positions"][frames.index(k)]]
+    row = {frame: k for k, frame in enumerate(frames)}
+    there = [k for k in basic if start <= k <= end and posed.meta["positions"][row[k]]]
     for k in there:
-        _, p.world_dem[k] = make.world_model(pairs[k], pairs[there[0]], frames.index(k), p.trajectory)
+        _, p.world_dem[k] = make.world_model(pairs[k], pairs[there[0]], row[k], p.trajectory)
     args = {"side": TILE_CELLS, "margin": make.config.merge.margin}
     prints = [make.node(tile_index, f"footprint/{k}", args, dem=dem) for k, dem in p.world_dem.items()]
     laid = yield Maybe(prints)
@@ -145,6 +147,20 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
     yield from assessment.of_world(make, [pairs[k] for k in there])
 
 
+def steps(make: Builder, frames: list[int]) -> list[Handle]:
+    """Motions along some frames in tables, cut by frame numbers: where a frame is left out, the other tables stay."""
+    made: dict[tuple[int, ...], list[Handle]] = make.made.setdefault("steps", {})
+    if tuple(frames) not in made:
+        taken = "steps/bridged" if made else "steps"
+        parts = [list(part) for _, part in groupby(pairwise(frames), lambda step: step[0] // TABLE_FRAMES)]
+        last = [{}, *({"before": make.motion(*part[-1])} for part in parts)]
+        made[tuple(frames)] = [
+            make.node(step_table, f"{taken}/{part[0][0]}", {}, motions=[make.motion(*step) for step in part], **before)
+            for part, before in zip(parts, last, strict=False)
+        ]
+    return made[tuple(frames)]
+
+
 def screened(make: Builder, whole: list[int]) -> Generator[Wait, Any, Ref]:
     """Ask which frames are lost; while more is to be known for the answer, find that and ask again."""
     sights = [
@@ -156,7 +172,7 @@ def screened(make: Builder, whole: list[int]) -> Generator[Wait, Any, Ref]:
         )
         for frame in whole
     ]
-    motions = [make.motion(a, b) for a, b in pairwise(whole)]
+    along = steps(make, whole)
     bridges: dict[tuple[int, int], Handle] = {}
     sides: dict[int, Handle] = {}
     turn = 0
@@ -166,7 +182,7 @@ def screened(make: Builder, whole: list[int]) -> Generator[Wait, Any, Ref]:
             f"continuity/{turn}" if turn else "continuity",
             {"frames": whole} | ({"bridges": list(bridges)} if bridges else {}),
             sights=sights,
-            motions=motions,
+            steps=along,
             bridges=list(bridges.values()),
             sides=list(sides.values()),
         )

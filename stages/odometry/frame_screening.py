@@ -25,10 +25,10 @@ from pydantic import Field
 
 from rille.stages.core.declare import Bundle, Inputs, Params, Stage
 from rille.stages.core.errors import DegenerateError, InputError
-from rille.stages.core.validity import matched
 from rille.stages.imaging.image_quality import HIGH, LOW
 from rille.stages.odometry.covisibility import Step
 from rille.stages.odometry.keyframes import LEAST_BLOCKS
+from rille.stages.odometry.step_table import changes_of, steps_of
 
 Floats = NDArray[np.float64]
 Steps = Mapping[tuple[int, int], float]
@@ -202,15 +202,6 @@ def _leading(out: Judgement, chain: list[int]) -> None:
         out.lost[f] = f"{out.unfit[f]}, and no good pair before it"
 
 
-def change(a: Bundle, b: Bundle) -> float:
-    """Median change of the displacements from one step to the next, pixels, where both are measured; 0: nowhere."""
-    both = matched(np.asarray(a["validity"])) & matched(np.asarray(b["validity"]))
-    if not both.any():
-        return 0.0
-    apart = [np.asarray(b[n])[both] - np.asarray(a[n])[both] for n in ("column_disparity", "row_disparity")]
-    return float(np.median(np.hypot(*apart)))
-
-
 def share(step: Step) -> float:
     """Share of matches of a step; 0 where too few blocks of the image have one."""
     return step.match_rate if int(step.known.sum()) >= LEAST_BLOCKS else 0.0
@@ -227,12 +218,12 @@ def _jumps(frames: Sequence[int], changes: Sequence[float], params: ContinuityPa
 
 def _run(params: ContinuityParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     frames = [int(f) for f in args["frames"]]
-    motions, bridges = list(inputs.get("motions") or []), list(inputs.get("bridges") or [])
-    if len(motions) != len(frames) - 1 or len(inputs["sights"]) != len(frames):
-        raise InputError("RIL-317", f"{len(frames)} frames need as many sights and {len(frames) - 1} motions")
+    along, bridges = steps_of(inputs["steps"]), list(inputs.get("bridges") or [])
+    if len(along) != len(frames) - 1 or len(inputs["sights"]) != len(frames):
+        raise InputError("RIL-317", f"{len(frames)} frames need as many sights and {len(frames) - 1} steps")
     sights = {f: s.meta for f, s in zip(frames, inputs["sights"], strict=True)}
-    steps = {s: share(Step.from_bundle(m)) for s, m in zip(pairwise(frames), motions, strict=True)}
-    changes = [change(a, b) for a, b in pairwise(motions)]
+    steps = {s: share(step) for s, step in zip(pairwise(frames), along, strict=True)}
+    changes = changes_of(inputs["steps"])
     spanned = [(int(a), int(b)) for a, b in args.get("bridges", ())]
     steps |= {s: share(Step.from_bundle(m)) for s, m in zip(spanned, bridges, strict=True)}
     sides = {int(s.meta["frame"]): s.meta for s in inputs.get("sides") or []}
@@ -259,7 +250,7 @@ STAGE = Stage(
     version=1,
     summary="which frames are lost, and which may not be basic",
     params=ContinuityParams,
-    inputs=("sights*", "motions*", "bridges*", "sides*"),
+    inputs=("sights*", "steps*", "bridges*", "sides*"),
     outputs=(),
     run=_run,
 )

@@ -14,6 +14,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import reduce
 from typing import Any, Literal
 
 from pydantic import Field, model_validator
@@ -21,6 +22,7 @@ from pydantic import Field, model_validator
 from rille.stages.core.declare import Bundle, Inputs, Params, Stage
 from rille.stages.core.errors import ConfigError, InputError
 from rille.stages.odometry.covisibility import Seen, Step
+from rille.stages.odometry.step_table import steps_of
 
 LEAST_BLOCKS = 12
 """Blocks of the image with a displacement, below which the whole is not told by them."""
@@ -158,7 +160,7 @@ def by_overlap(steps: Sequence[Step], params: SelectParams, marked: Marked = UNM
         if fit is not None:
             choice.basic.append(fit)
             choice.why.append(reason)
-            choice.overlap.append(_overlap(steps[key:fit], params))
+            choice.overlap.append(_overlap(steps[key:fit], params, seen if fit == k else None))
             k, step = fit, steps[fit]
             ahead = Seen.all_of(step).after(step)
         seen, k = ahead, k + 1
@@ -179,14 +181,11 @@ def doubtful(step: Step, params: SelectParams) -> bool:
     return step.match_rate < params.min_matches or int(step.known.sum()) < LEAST_BLOCKS
 
 
-def _overlap(steps: Sequence[Step], params: SelectParams) -> float | None:
-    """Overlap of the frames before and behind some steps; None where one of them is doubtful."""
+def _overlap(steps: Sequence[Step], params: SelectParams, seen: Seen | None = None) -> float | None:
+    """Overlap of the frames before and behind some steps, by what is ``seen`` there; None: one of them is doubtful."""
     if any(doubtful(step, params) for step in steps):
         return None
-    seen = Seen.all_of(steps[0])
-    for step in steps:
-        seen = seen.after(step)
-    return seen.overlap
+    return (seen or reduce(Seen.after, steps, Seen.all_of(steps[0]))).overlap
 
 
 def segments(basic: list[int], frames: int) -> list[list[int]]:
@@ -199,9 +198,9 @@ def _run(params: SelectParams, args: Mapping[str, Any], inputs: Inputs) -> Bundl
     frames = int(args["frames"])
     if frames < 1:
         raise ConfigError("RIL-437", "no frame is chosen", remedy="choose at least one with --frames")
-    steps = [Step.from_bundle(b) for b in inputs.get("motions") or []]
+    steps = steps_of(inputs["steps"])
     if len(steps) != frames - 1:
-        raise InputError("RIL-438", f"{frames} frames need {frames - 1} motions, not {len(steps)}")
+        raise InputError("RIL-438", f"{frames} frames need {frames - 1} steps, not {len(steps)}")
     stride = params.rule == "stride"
     marked = Marked.of(args, frames)
     choice = (by_stride if stride else by_overlap)(steps, params, marked)
@@ -243,7 +242,7 @@ STAGE = Stage(
     version=3,
     summary="which stereo pairs become elevation models, and the segments between them",
     params=SelectParams,
-    inputs=("motions*",),
+    inputs=("steps*",),
     outputs=(),
     run=_run,
 )

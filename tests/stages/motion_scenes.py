@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from rille.stages.core.declare import Bundle
+from rille.stages.core.declare import Bundle, NoParams
 from rille.stages.core.validity import Validity
 from rille.stages.geometry.geometry import Camera
+from rille.stages.odometry import step_table
 
 CAMERA = Camera(300.0, 300.0, 239.5, 159.5, 480, 320)
 LEVEL = 2
@@ -75,3 +76,14 @@ def share_kept(flow):
     x, y = grid()
     u, v = flow(x, y)
     return np.mean((x + u > -0.5) & (x + u < CAMERA.width - 0.5) & (y + v > -0.5) & (y + v < CAMERA.height - 0.5))
+
+
+def tables(motions, rows=3):
+    """Tables of steps of so many motions each, as the flow cuts them."""
+    cuts = range(0, len(motions), rows)
+    return [
+        step_table.STAGE.run(
+            NoParams(), {}, {"motions": motions[k : k + rows]} | ({"before": motions[k - 1]} if k else {})
+        )
+        for k in cuts
+    ]

@@ -248,14 +248,11 @@ def _facts(segments: Sequence[Bundle]) -> list[dict[str, Any]]:
 
 def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     levels = [RigidTransform.from_matrix(b.meta["T_local_left"]) for b in inputs["levels"]]
-    segments = [
-        (np.asarray(b["poses"]), np.asarray(b["covariance"]), np.asarray(b["shared"])) for b in inputs["segments"]
-    ]
-    if "refined" in inputs:
-        ends = np.cumsum([len(poses) for poses, _, _ in segments])[:-1]
-        names = ("poses", "covariance", "shared")
-        better = (np.split(np.concatenate([b[name] for b in inputs["refined"]]), ends) for name in names)
-        segments = list(zip(*better, strict=True))
+    names = ("poses", "covariance", "shared")
+    posed = inputs.get("refined", inputs["segments"])
+    ends = np.cumsum([len(b.meta["per_frame"]) for b in inputs["segments"]])[:-1]
+    parts = [np.split(np.concatenate([b[name] for b in posed]), ends) for name in names] if posed else [[]] * 3
+    segments = list(zip(*parts, strict=True))
     frames = [int(f) for f in args["frames"]]
     facts = _facts(inputs["segments"]) or [{"frame": frames[0], "inliers": 0}]
     causes = {int(f["frame"]): str(f["cause"]) for f in args.get("lost", ())}

@@ -6,7 +6,7 @@ import itertools
 
 import numpy as np
 import pytest
-from motion_scenes import motion, shift
+from motion_scenes import motion, shift, tables
 from raising import raises
 
 from rille.stages.core.declare import Bundle, check_outputs
@@ -117,7 +117,7 @@ def test_the_stage_asks_then_answers():
     blind = motion(shift(0.0), unmatched=lambda x, y: x > 20)
     motions = [motion(shift(9.0)), blind, blind, motion(shift(9.0))]
     sights = [Bundle({}, {"frame": k} | sight(k)) for k in frames]
-    inputs = {"sights": sights, "motions": motions, "bridges": [], "sides": []}
+    inputs = {"sights": sights, "steps": tables(motions), "bridges": [], "sides": []}
     first = STAGE.run(PARAMS, {"frames": frames}, inputs)
     check_outputs(STAGE, first)
     assert first.meta["asks"]["bridges"] == [[1, 3]]
@@ -131,10 +131,10 @@ def test_the_stage_asks_then_answers():
 def test_the_stage_looks_at_the_sides_where_displacements_jump():
     steps = [motion(shift(u)) for u in (9.0, 9.5, 9.0, 60.0, -42.0, 9.0)]
     sights = [Bundle({}, {"frame": k} | sight(k)) for k in range(7)]
-    inputs = {"sights": sights, "motions": steps, "bridges": [], "sides": []}
+    inputs = {"sights": sights, "steps": tables(steps), "bridges": [], "sides": []}
     asks = STAGE.run(PARAMS, {"frames": list(range(7))}, inputs).meta["asks"]
     assert 4 in asks["sides"]
     assert 0 not in asks["sides"]
-    still = STAGE.run(PARAMS, {"frames": list(range(7))}, inputs | {"motions": [motion(shift(9.0))] * 6}).meta
+    still = STAGE.run(PARAMS, {"frames": list(range(7))}, inputs | {"steps": tables([motion(shift(9.0))] * 6)}).meta
     assert not still["asks"]["sides"]
     assert still["match_rate"] == pytest.approx([np.mean(still["match_rate"])] * 6)

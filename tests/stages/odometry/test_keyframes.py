@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from motion_scenes import CAMERA, drive, motion, share_kept, shift, turned
+from motion_scenes import CAMERA, drive, motion, share_kept, shift, tables, turned
 from raising import raises
 
 from rille.stages.core.declare import Bundle, check_outputs
@@ -22,7 +22,7 @@ from rille.stages.odometry.motion import MotionParams
 def run(motions, frames=None, **params):
     """Meta of the stage for motions between successive frames."""
     args = {"frames": len(motions) + 1 if frames is None else frames}
-    out = keyframes.STAGE.run(SelectParams(**params), args, {"motions": motions})
+    out = keyframes.STAGE.run(SelectParams(**params), args, {"steps": tables(motions)})
     check_outputs(keyframes.STAGE, out)
     return out.meta
 
@@ -136,7 +136,7 @@ def test_a_stride_has_a_basic_pair_behind_a_step_with_few_matches():
 @pytest.mark.parametrize("rule", ["overlap", "stride"])
 def test_behind_a_gap_is_a_basic_pair_so_that_a_refused_bridge_begins_a_piece(rule):
     args = {"frames": 9, "behind": [3, 6], "unfit": [6]}
-    steps = {"motions": [motion(shift(2.0))] * 8}
+    steps = {"steps": tables([motion(shift(2.0))] * 8)}
     meta = keyframes.STAGE.run(SelectParams(rule=rule, stride=16), args, steps).meta
     assert meta["basic"] == [0, 3, 7]
     assert meta["why"] == ["first frame", "behind a gap", "behind a gap"]
