@@ -37,7 +37,9 @@ world models depend on their own pose only, and what comes out as before is not 
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Generator, Mapping
+from collections.abc import Sequence as Series
 from itertools import groupby, pairwise
 from typing import Any
 
@@ -55,6 +57,12 @@ from rille.stages.terrain import overlap_audit, overlap_qa, radiometry, tile_ind
 
 TILE_CELLS = 512
 """Side of a world tile, cells: 512 x 512 float32 is 1 MiB an array, small enough to recompute alone."""
+
+RIG_PAIRS = 200
+"""Pairs that one rig is found from: its time grows with their number, its errors are systematic long before."""
+
+SEAMS = 24
+"""Earlier models that a model is compared with: enough to tell which is off, however often a place is seen again."""
 
 TABLE_FRAMES = 100
 """Motions that one table of steps holds."""
@@ -204,7 +212,7 @@ def basic_pairs(make: Builder, basic: list[int], first: int) -> dict[int, Pair]:
     if make.config.rig.mode == "per_pair":
         rigs = {k: make.rig([k], f"/{k}") for k in basic}
     else:
-        rigs = dict.fromkeys(basic, make.rig(basic))
+        rigs = dict.fromkeys(basic, make.rig(spread(basic, RIG_PAIRS)))
     for k in basic:
         p.rigs[k], known = rigs[k]
         pair = pairs[k] = make.pair(k, vertical(make, k, k == first), known, pairs.get(basic[0]))
@@ -301,18 +309,32 @@ def another_program(make: Builder, whole: list[int]) -> Handle:
 
 
 def overlaps(make: Builder, footprints: list[Facts]) -> dict[int, Handle]:
-    """Each model against the earlier ones with which it shares a tile."""
+    """Each model against the earlier ones with which it shares a tile, of many those with most ground in common."""
     models, seams = make.products.world_dem, dict[int, Handle]()
-    present: dict[tuple[int, int], list[int]] = {}
+    present: dict[tuple[int, int], list[tuple[int, list[int]]]] = {}
     for meta in footprints:
-        pair, near = meta["pair"], set[int]()
-        for tx, ty, *_ in meta["tiles"]:
-            near.update(present.get((tx, ty), ()))
-            present.setdefault((tx, ty), []).append(pair)
-        if near:
-            others = [models[other] for other in sorted(near)]
+        pair, shared = meta["pair"], Counter[int]()
+        for tx, ty, *box in meta["tiles"]:
+            here = present.setdefault((tx, ty), [])
+            for other, theirs in here:
+                shared[other] += cells_in_both(box, theirs)
+            here.append((pair, box))
+        if shared:
+            nearest = sorted(shared, key=lambda other: (-shared[other], -other))[:SEAMS]
+            others = [models[other] for other in sorted(nearest)]
             seams[pair] = make.node(overlap_qa, f"seam/{pair}", {}, dem=models[pair], others=others)
     return seams
+
+
+def cells_in_both(a: Series[int], b: Series[int]) -> int:
+    """Cells that two boxes (first column, first line, columns, lines) have in common."""
+    columns, lines = (min(a[k] + a[k + 2], b[k] + b[k + 2]) - max(a[k], b[k]) for k in (0, 1))
+    return max(columns, 0) * max(lines, 0)
+
+
+def spread(pairs: list[int], most: int) -> list[int]:
+    """At most so many of the pairs, evenly apart, the first among them."""
+    return pairs[:: -(-len(pairs) // most)]
 
 
 def centre(box: Mapping[str, Any]) -> list[float]:

@@ -5,11 +5,16 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any
 
+import pytest
+
 from rille.datasets.registry import open_sequence
-from rille.pipeline.engine.graph import Graph
+from rille.pipeline.engine.graph import Graph, Handle
 from rille.pipeline.flow import config
+from rille.pipeline.flow.builders import Builder
 from rille.pipeline.flow.closed_loop import dataflow
 from rille.pipeline.flow.products import Products
+from rille.pipeline.flow.reconstruction import SEAMS, cells_in_both, overlaps, spread
+from rille.stages.terrain.tile_index import Box
 
 FRAMES = 8
 
@@ -61,6 +66,35 @@ def test_a_lost_frame_is_bridged_and_no_pyramid_is_made_twice() -> None:
     assert products.trajectory.spec.args["lost"] == [{"frame": 3, "cause": "black"}]
     assert list(products.world_dem) == [0, 4, 6]
     assert labels(graph, "accuracy") == ["accuracy"]
+
+
+def test_a_model_is_compared_with_those_that_share_most_ground_however_often_a_place_is_seen() -> None:
+    make = Builder(Graph(), open_sequence("mockup-short", {}), config.build({}))
+    named: Any = [SimpleNamespace(label=str(k)) for k in range(60)]
+    make.products.world_dem = {k: Handle(k, spec, {}) for k, spec in enumerate(named)}
+    shifts = [3 * (k % 30) for k in range(60)]  # there and there again: each place is seen twice
+    seams = overlaps(make, [{"pair": k, "tiles": [[0, 0, shift, 0, 100, 50]]} for k, shift in enumerate(shifts)])
+    assert list(seams) == list(range(1, 60)), "the first has no earlier one"
+    others = {pair: [int(handle.label) for handle in seam.upstream()[1:]] for pair, seam in seams.items()}
+    assert others[20] == list(range(20))
+    assert others[59] == [*range(18, 30), *range(47, 59)], "the nearest of both times"
+    assert len(others[59]) == SEAMS
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "cells"),
+    [((0, 0, 10, 5), (7, 3, 10, 5), 6), ((0, 0, 10, 5), (12, 0, 10, 5), 0), ((0, 0, 10, 5), (2, 1, 3, 2), 6)],
+)
+def test_cells_of_two_boxes(a: Box, b: Box, cells: int) -> None:
+    assert cells_in_both(a, b) == cells_in_both(b, a) == cells
+
+
+@pytest.mark.parametrize(("count", "found"), [(1, 1), (200, 200), (201, 101), (5000, 200)])
+def test_a_rig_is_found_from_pairs_over_the_whole_sequence(count: int, found: int) -> None:
+    some = spread(list(range(count)), 200)
+    assert len(some) == found
+    assert some[0] == 0
+    assert some[-1] >= count - max(count // found + 1, 1)
 
 
 def test_the_world_is_that_of_the_largest_piece_and_each_piece_is_judged() -> None:
