@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from rille.stages.core.declare import AnyArray, Bundle
 from rille.stages.core.validity import Validity, matched
-from rille.stages.odometry.track import fit_affinity, known_median
+from rille.stages.odometry.affinity import fit_affinity, known_median
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]

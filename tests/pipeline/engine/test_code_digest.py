@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -109,6 +111,46 @@ def test_every_stage_reaches_the_declarations():
     assert not any(
         name.startswith("rille.pipeline") for name in code_digest.module_digests("rille.stages.odometry.keyframes")
     )
+
+
+def modules():
+    """Own modules by name, without those of the pipeline."""
+    root = Path(__file__).parents[3]
+    return {
+        f"rille.{'.'.join(path.relative_to(root).with_suffix('').parts)}": path.read_text(encoding="utf-8")
+        for room in ("stages", "datasets")
+        for path in (root / room).rglob("*.py")
+        if path.name != "__init__.py"
+    }
+
+
+def test_an_edit_of_the_planner_compiles_no_kernel_of_another_room():
+    kernels = [name for name, text in modules().items() if "@njit" in text or "cache=True" in text]
+    others = [name for name in kernels if not name.startswith(("rille.stages.planning", "rille.stages.driving"))]
+    assert len(others) > 30
+    for name in others:
+        assert not any(".planning" in reached for reached in code_digest.module_digests(name)), name
+
+
+def test_what_walks_the_whole_sequence_hangs_on_no_matcher():
+    for name in ("step_table", "keyframes", "frame_screening"):
+        reached = code_digest.module_digests(f"rille.stages.odometry.{name}")
+        assert not any(".hfvm" in module for module in reached), name
+
+
+def test_no_stage_loads_code_or_tables_that_its_digest_does_not_see():
+    """Modules by computed names, files beside the code: the digest knows of neither."""
+    hidden = re.compile(r"\b(import_module|__import__|importlib\.resources|exec|eval)\(|__file__")
+    reached = {
+        module
+        for name, text in modules().items()
+        if re.search(r"^STAGE = ", text, re.MULTILINE)
+        for module in code_digest.module_digests(name)
+    }
+    found = {name for name, text in modules().items() if name in reached and hidden.search(text)}
+    # it asks for the declaration of the images that it changes, whose values are its input
+    assert found <= {"rille.datasets.images.misalign"}
+    assert len(reached) > 150
 
 
 def test_an_unknown_module_is_named():

@@ -8,14 +8,12 @@ from raising import raises
 
 from rille.stages.core.declare import Bundle, check_outputs
 from rille.stages.imaging.pyramid import PyramidParams, build
+from rille.stages.odometry.affinity import common_similarity, fit_affinity, known_median
 from rille.stages.odometry.track import (
     STAGE,
     Motion,
     TrackParams,
-    common_similarity,
     displacement_at,
-    fit_affinity,
-    known_median,
     track,
 )
 
