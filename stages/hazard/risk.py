@@ -3,14 +3,14 @@
 Classes, from the least to the greatest risk: *safe*; *caution*, where a measure comes near its limit, or exceeds it
 with a probability of more than ``max_p``, as beside unknown ground; *hazard*, where a measure exceeds its limit, or
 does with ``sigmas`` standard deviations added; and *unknown*, where too little of the window is known to say, which
-is never entered. The measures, their noise and the probability are those of :mod:`rille.stages.hazard.hazards`; each
+is never entered. The measures, their noise and the probability are those of :mod:`rille.stages.hazard.measures`; each
 that exceeds its limit has its bit in ``reason``.
 
 Where five cells are at most a wheel's radius, a 3 x 3 median first removes single wrong cells; coarser models keep
 every cell, since one cell may then be the top of a stone, or a post.
 
 Guarantees, each tested: of two elevation models the one with the greater relief (see
-:mod:`rille.stages.hazard.hazards`), or with the greater standard deviations, is in no cell the safer one; nor is it
+:mod:`rille.stages.hazard.measures`), or with the greater standard deviations, is in no cell the safer one; nor is it
 with a larger ``sigmas``.
 
 Holes. A window is judged on what is known of it, so unknown does not grow; a hazard that is proven by a part is one.
@@ -45,7 +45,7 @@ from rille.stages.hazard.classification import (
     Rules,
     classify,
 )
-from rille.stages.hazard.hazards import BITS, measure, window_reach
+from rille.stages.hazard.measures import BITS, MEASURES, Terrain, window_reach
 from rille.stages.hazard.vehicle import DEFAULT_VEHICLE, Vehicle
 from rille.stages.numeric.holes import close_into
 
@@ -122,9 +122,9 @@ def risk_map(
     _finite(np.ascontiguousarray(elevation_std, dtype=np.float32), s)
     gap, side = p.max_hole * vehicle.wheel_diameter / cell, window_cells(window, cell)
     filled = close_into(z, s, elevation, gap, side, p.min_known, rim=RIM)
-    measured = measure(elevation, z, s, cell, vehicle, window)
     rules = Rules(p.sigmas, p.caution, p.max_p, p.min_known)
-    return classify(measured, z, filled, vehicle, window, cell, rules) | {"filled": filled, "elevation": z}
+    classes = classify(Terrain(elevation, z, s, cell, vehicle, window), filled, rules)
+    return classes | {"filled": filled, "elevation": z}
 
 
 @njit(cache=True, nogil=True)
@@ -149,7 +149,7 @@ def check_size(vehicle: Vehicle, shape: tuple[int, ...], cell: float) -> None:
 
 
 def window_cells(side: float, cell: float) -> int:
-    """Odd number of cells across a window of ``side`` metres, see :func:`rille.stages.hazard.hazards.window_reach`."""
+    """Odd number of cells across a window of ``side`` metres, see :func:`rille.stages.hazard.measures.window_reach`."""
     return 2 * window_reach(side, cell) + 1
 
 
@@ -198,24 +198,7 @@ STAGE = Stage(
     outputs=(
         Array("risk", _GRID, "uint8", "1", "class: 0 safe, 1 caution, 2 hazard, 3 unknown"),
         Array("reason", _GRID, "uint16", "1", "bits: " + ", ".join(f"{bit} {name}" for name, bit in REASONS.items())),
-        Array(
-            "inclination",
-            _GRID,
-            "float32",
-            "rad",
-            "highest minus lowest height in the wheel's window over its extent",
-            "nan",
-        ),
-        Array("height_range", _GRID, "float32", "m", "highest minus lowest height in the wheel's window", "nan"),
-        Array("step", _GRID, "float32", "m", "highest minus lowest height within a wheel's radius", "nan"),
-        Array("roughness", _GRID, "float32", "m", "RMS deviation of heights a quarter of a wheel apart", "nan"),
-        Array(
-            "slope", _GRID, "float32", "rad", "steepest plane of the footprint by the ground beneath the wheels", "nan"
-        ),
-        Array(
-            "tilt", _GRID, "float32", "rad", "greatest tilt of the vehicle over headings and three-wheel stands", "nan"
-        ),
-        Array("clearance", _GRID, "float32", "m", "least left under the belly, over headings", "nan"),
+        *(Array(m.band, _GRID, "float32", "rad" if m.in_degrees else "m", m.description, "nan") for m in MEASURES),
         Array("p_hazard", _GRID, "float32", "1", "probability that a measure exceeds its limit", "nan"),
         Array("filled", _GRID, "uint8", "1", "1 where the elevation was interpolated"),
         Array("elevation", _GRID, "float32", "m", "elevation with small holes closed", "nan"),

@@ -6,7 +6,7 @@ than along an axis. An octagon is a square widened along both diagonals, so its 
 then of two diagonal lines (``cv2.dilate``).
 
 Everything here commutes with any rising function of the heights: where relief is made greater, every difference of two
-of these results is (the argument is in :mod:`rille.stages.hazard.hazards`).
+of these results is (the argument is in :mod:`rille.stages.hazard.measures`).
 """
 
 from __future__ import annotations

@@ -39,7 +39,6 @@ from pydantic import Field
 
 from rille.stages.core.declare import Array, Bundle, Inputs, Memory, Params, Stage
 from rille.stages.geometry.lattice import Lattice
-from rille.stages.hazard.hazards import WHEEL_BITS
 from rille.stages.hazard.risk import HAZARDOUS, check_size
 from rille.stages.hazard.vehicle import Vehicle
 from rille.stages.planning import grid8
@@ -49,7 +48,7 @@ from rille.stages.planning.path_words import Maps, Route, describe
 from rille.stages.planning.row_graph import UNREACHED, Plan, plan, row_span
 from rille.stages.planning.row_grid import RowGrid
 
-__all__ = ["STAGE", "WHEEL_BITS", "PathParams", "Route", "describe", "find_path"]
+__all__ = ["STAGE", "PathParams", "Route", "describe", "find_path"]
 
 Planner = Literal["rows", "grid8", "auto"]
 

@@ -10,7 +10,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rille.stages.geometry.lattice import Lattice
-from rille.stages.hazard.hazards import BITS, WHEEL_BITS
+from rille.stages.hazard.measures import BODY_BITS, WHEEL_BITS
 from rille.stages.hazard.risk import CAUTION, HAZARDOUS, UNKNOWN, window_cells
 from rille.stages.hazard.vehicle import Vehicle
 from rille.stages.numeric.windows import window_mean
@@ -28,8 +28,6 @@ GROUNDS = ("outline", "wheels", "middle")
 
 MOST = 0.5
 """Share of the rows: a path that stays clearer of unknown ground is worth half of its length."""
-
-BODY_BITS = np.uint16(sum(BITS.values()) - int(WHEEL_BITS))
 
 LARGE = 1 << 30
 """Heights above it are kept in 64 bits."""

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rille.stages.geometry.lattice import Lattice
-from rille.stages.hazard.hazards import BITS
+from rille.stages.hazard.measures import MEASURES
 from rille.stages.hazard.risk import CAUTION, HAZARDOUS, UNKNOWN
 from rille.stages.hazard.vehicle import Vehicle
 from rille.stages.planning.path_ground import GROUNDS
@@ -21,17 +21,6 @@ from rille.stages.planning.row_grid import RowGrid
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Maps = Mapping[str, NDArray[Any]]
-
-WORDS = {
-    "inclination": ("inclination", "max_slope_deg", "deg"),
-    "step": ("step", "max_step", "m"),
-    "roughness": ("roughness", "max_roughness", "m"),
-    "slope": ("slope of the footprint", "max_slope_deg", "deg"),
-    "tilt": ("tilt", "max_slope_deg", "deg"),
-    "range": ("height range", "clearance", "m"),
-    "rise": ("rise under the belly", "clearance", "m"),
-}
-"""Measure: in words, the vehicle's limit, unit."""
 
 
 @dataclass(frozen=True)
@@ -107,28 +96,25 @@ def _why(found: Plan, maps: Maps, vehicle: Vehicle) -> str:
     judged = int((risk != UNKNOWN).sum())
     if judged == 0 or (risk[risk != UNKNOWN] < HAZARDOUS).any():
         return found.reason
-    most = max(BITS, key=lambda name: int(((maps["reason"] & BITS[name]) > 0).sum()))
-    share = float(((maps["reason"] & BITS[most]) > 0).sum()) / judged
-    words, limit, _ = WORDS[most]
+    counts = [int(((maps["reason"] & m.bit) > 0).sum()) for m in MEASURES]
+    most, count = max(zip(MEASURES, counts, strict=True), key=lambda found: found[1])
     return (
-        f"all {judged} known cells are hazardous, {100 * share:.0f} % of them by {words}: "
-        f"is vehicle.{limit} {getattr(vehicle, limit):g} at the scale of the sequence?"
+        f"all {judged} known cells are hazardous, {100 * count / judged:.0f} % of them by {most.words}: "
+        f"is vehicle.{most.limit} {getattr(vehicle, most.limit):g} at the scale of the sequence?"
     )
 
 
 def hazard_words(maps: Maps, at: tuple[int, int], vehicle: Vehicle) -> str:
     """The measures over their limits at a cell, with both figures."""
-    band = {"range": "height_range", "rise": "clearance"}
     told = []
-    for name, bit in BITS.items():
-        if not int(maps["reason"][at]) & bit:
+    for m in MEASURES:
+        if not int(maps["reason"][at]) & m.bit:
             continue
-        words, limit, unit = WORDS[name]
-        values = maps.get(band.get(name, name))
-        if values is None:
-            told.append(f"{words} over vehicle.{limit}")
+        limit = getattr(vehicle, m.limit)
+        if m.band not in maps:
+            told.append(f"{m.words} over vehicle.{m.limit}")
             continue
-        value = float(values[at])
-        value = vehicle.clearance - value if name == "rise" else math.degrees(value) if unit == "deg" else value
-        told.append(f"{words} {value:.3g} {unit}, vehicle.{limit} {getattr(vehicle, limit):g}")
+        value, unit = float(maps[m.band][at]), "deg" if m.in_degrees else "m"
+        value = limit - value if m.left else math.degrees(value) if m.in_degrees else value
+        told.append(f"{m.words} {value:.3g} {unit}, vehicle.{m.limit} {limit:g}")
     return "; ".join(told)

@@ -18,20 +18,16 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rille.stages.geometry.lattice import Lattice
-from rille.stages.hazard.hazards import BITS
+from rille.stages.hazard.measures import BODY_BITS, WHEEL_BITS
 from rille.stages.hazard.risk import CAUTION, DOUBT_BIT, HAZARDOUS, UNKNOWN
 from rille.stages.hazard.vehicle import Vehicle
 from rille.stages.planning.local_planner.underbody import Straddle, clears, stands
-from rille.stages.planning.path import WHEEL_BITS
 from rille.stages.planning.wheels import wheel_positions
 from rille.stages.terrain.occlusion_bounds import Bounds
 
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
 Mask = NDArray[np.bool_]
-
-BODY_BITS = np.uint16(sum(BITS.values()) - int(WHEEL_BITS))
-"""Hazards to the vehicle with its middle on the cell."""
 
 NEAR_UNKNOWN = 0.5
 """Cells; nearer than this a point of the belly lies in an unknown cell."""

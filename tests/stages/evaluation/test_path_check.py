@@ -10,7 +10,7 @@ import pytest
 from rille.stages.core.declare import Bundle, NoParams, check_outputs
 from rille.stages.evaluation.path_check import STAGE, crossed_cells, path_check, shortest
 from rille.stages.geometry.lattice import Lattice
-from rille.stages.hazard.hazards import BITS
+from rille.stages.hazard.measures import BITS
 from rille.stages.hazard.risk import HAZARDOUS
 from rille.stages.hazard.vehicle import Vehicle
 

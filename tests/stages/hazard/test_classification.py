@@ -17,59 +17,79 @@ from rille.stages.hazard.classification import (
     _table,
     classify,
 )
-from rille.stages.hazard.hazards import BITS, MEASURES, Measured, limits, noise_factors
+from rille.stages.hazard.measures import MEASURES, Measure, Terrain
+from rille.stages.numeric.extrema import running_max
 
 RULES = Rules(sigmas=1.25, caution=0.75, max_p=0.02, min_known=0.5)
 
 
+def random_terrain(seed: int, stride: int) -> Terrain:
+    """Cells whose measures are all below and above their limits somewhere, with gaps."""
+    rng = np.random.default_rng(seed)
+    cell = 0.001 if stride == 4 else 0.005
+    z = np.cumsum(rng.normal(scale=0.0012 if stride == 4 else 0.002, size=(70, 90)), axis=1).astype(np.float32)
+    z[rng.random(z.shape) < 0.1] = np.nan
+    z[:9] = np.nan
+    std = rng.uniform(0.0, 0.002, z.shape).astype(np.float32)
+    return Terrain(z, z, std, cell, MODEL, 0.03)
+
+
 @pytest.mark.parametrize("stride", [1, 4])
 def test_classes_and_reasons_equal_a_plain_calculation(stride: int) -> None:
-    rng = np.random.default_rng(stride)
-    shape, cell, window = (14, 21), 0.001, 0.03
-    coarse = tuple(-(-n // stride) for n in shape)
-
-    def random(size: tuple[int, ...], most: float) -> np.ndarray:
-        return (most * rng.random(size)).astype(np.float32)
-
-    limit = limits(MODEL)
-    blocks = {name: random(coarse, 1.2 * limit[name]) for name in ("roughness", "slope", "tilt", "rise")}
-    measured = Measured(
-        random(shape, 0.018), random(shape, 0.012), blocks, random(coarse, 2e-3), random(coarse, 2e-3),
-        random(coarse, 1.0), random(coarse, 0.1), stride, window,
-    )  # fmt: skip
+    terrain = random_terrain(stride, stride)
+    shape = terrain.closed.shape
+    assert terrain.stride == stride
 
     def spread(a: np.ndarray) -> np.ndarray:
         return np.repeat(np.repeat(a, stride, axis=0), stride, axis=1)[: shape[0], : shape[1]].astype(float)
 
-    values = {name: spread(a) for name, a in blocks.items()}
-    values |= {"step": measured.step.astype(float), "range": measured.range.astype(float)}
-    values["inclination"] = values["range"] / window
-    noise, under, share = spread(measured.noise), spread(measured.noise_under), spread(measured.share)
-    closed = random(shape, 1.0)
-    closed[:3] = np.nan
-    out = classify(measured, closed, np.zeros(shape, np.uint8), MODEL, window, cell, RULES)
+    noises = [spread(a) for a in (terrain.window_noise(), terrain.footprint_noise())]
+    values = {m.name: spread(v) if m.on_blocks else v.astype(float) for m in MEASURES for v in [m.kernel(terrain)]}
+    share = spread(terrain.known_share())
+    out = classify(terrain, np.zeros(shape, np.uint8), RULES)
 
-    factors = noise_factors(MODEL, window, cell)
     bits, hopeful = np.zeros(shape, int), np.ones(shape, bool)
     most = np.zeros(shape)
-    for name in MEASURES:
-        bias, wide = factors[name]
-        s = under if name in ("slope", "tilt", "rise") else noise
-        load = (values[name] + max(0.0, 1.25 * wide - bias) * s) / limit[name]
-        bits += BITS[name] * (load > 1)
+    for m in MEASURES:
+        bias, wide = m.bias / m.length(terrain), m.spread / m.length(terrain)
+        load = (values[m.name] + max(0.0, 1.25 * wide - bias) * noises[m.below]) / m.greatest(MODEL)
+        bits += m.bit * (load > 1)
         most = np.maximum(most, load)
-        hopeful &= values[name] - bias * s <= limit[name]
-    hazard = (most > 1) & ~np.isnan(closed)
+        hopeful &= values[m.name] - bias * noises[m.below] <= m.greatest(MODEL)
+    hazard = (most > 1) & ~np.isnan(terrain.closed)
     np.testing.assert_array_equal(out["risk"] == HAZARDOUS, hazard)
     np.testing.assert_array_equal(out["reason"] & 127, np.where(hazard, bits, 0))
     np.testing.assert_array_equal((out["reason"] & DOUBT_BIT) > 0, hazard & hopeful)
-    unknown = np.isnan(closed) | ((share < 0.5) & ~hazard)
+    unknown = np.isnan(terrain.closed) | ((share < 0.5) & ~hazard)
     np.testing.assert_array_equal(out["risk"] == UNKNOWN, unknown)
     near = ~hazard & ~unknown & ((most > 0.75) | (out["p_hazard"] > 0.02))
     np.testing.assert_array_equal(out["risk"] == CAUTION, near)
     np.testing.assert_array_equal(np.isnan(out["tilt"]), unknown)
     np.testing.assert_allclose(out["tilt"][~unknown], np.arctan(values["tilt"])[~unknown], rtol=1e-6)
     assert 0 < hazard.mean() < 0.9
+
+
+def test_a_new_measure_is_one_row_and_its_kernel() -> None:
+    """A negative obstacle: ground that falls away within two wheels, measured from the cell down."""
+
+    def drop(terrain: Terrain) -> np.ndarray:
+        low = -running_max(-terrain.surface, 2 * terrain.reach)
+        return np.nan_to_num(np.maximum(terrain.surface - low, 0.0))
+
+    row = Measure("drop", 1 << 11, drop, "max_step", 0.05, 0.9, "drop", "drop", "height above the lowest ground near")
+    z = np.zeros((120, 120), np.float32)
+    z[:, 60:] = -0.02  # down by more than the 15 mm that the wheels climb
+    terrain = Terrain(z, z, np.zeros_like(z), 0.001, MODEL, 0.03)
+    out = classify(terrain, np.zeros(z.shape, np.uint8), RULES, (*MEASURES, row))
+    near = np.zeros(z.shape, bool)
+    near[:, 30:60] = True  # two wheel radii of 15 mm before the edge, and nothing below it
+    np.testing.assert_array_equal((out["reason"] & row.bit) > 0, near)
+    assert (out["risk"][near] == HAZARDOUS).all()
+    np.testing.assert_allclose(out["drop"][near], 0.02, atol=1e-7)
+    assert np.nanmax(out["drop"][~near]) == 0.0
+    without = classify(Terrain(z, z, np.zeros_like(z), 0.001, MODEL, 0.03), np.zeros(z.shape, np.uint8), RULES)
+    assert (without["risk"] <= out["risk"]).all()
+    assert (without["risk"][:, 31] < HAZARDOUS).all()
 
 
 def test_the_probability_rises_from_0_to_1_and_is_a_half_near_the_limit() -> None:
