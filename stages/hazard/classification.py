@@ -156,9 +156,9 @@ def classify(
 
 
 def _limit(m: Measure, terrain: Terrain, sigmas: float) -> Limit:
-    bias, spread = (v / m.length(terrain) for v in (m.bias, m.spread))
-    numbers = m.greatest(terrain.vehicle), bias, spread, max(0.0, sigmas * spread - bias)
-    return Limit(*(np.float32(v) for v in numbers), np.uint16(m.bit), np.int64(2 if m.below else 0))
+    f, bias, spread = np.float32, m.bias / m.length(terrain), m.spread / m.length(terrain)
+    added, noise = max(0.0, sigmas * spread - bias), 2 if m.below else 0
+    return Limit(f(m.greatest(terrain.vehicle)), f(bias), f(spread), f(added), np.uint16(m.bit), np.int64(noise))
 
 
 def _wider(noise: Floats32, hidden: NDArray[np.floating]) -> Floats32:
