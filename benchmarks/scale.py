@@ -101,7 +101,8 @@ def _facts(name: str, args: Any, inputs: Any) -> dict[str, Any]:
         return {"undone": False}
     if name == "select":
         n = args["frames"]
-        return {"basic": list(range(n)), "segments": [[k, k + 1] for k in range(n - 1)]}
+        steps = {"displacement": [1.0] * (n - 1), "match_rate": [1.0] * (n - 1)}
+        return {"basic": list(range(n)), "segments": [[k, k + 1] for k in range(n - 1)], **steps}
     if name == "level":
         return {"T_local_left": np.eye(4)[:3].tolist(), "pair": args["pair"]}
     if name == "trajectory":

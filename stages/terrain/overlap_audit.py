@@ -44,24 +44,37 @@ class SeamAuditParams(Params):
     )
 
 
-@dataclass
-class _Seam:
-    """One seam as the audit sees it: what is left of its plane, and the weight of that."""
+@dataclass(frozen=True)
+class _Model:
+    """A model as the audit sees it: its seams, and how its plane (bias at its centre, tilts) shows in each.
 
-    facts: Facts
-    left: Floats
-    weight: Floats
+    ``seams`` (n,) numbers; ``design`` (n, 3, 3) its plane to that of the seam, at the seam's centre; ``pull`` (n, 3, 3)
+    design transposed times weight; ``covariance`` (3, 3) of the plane that explains the seams best.
+    """
+
+    seams: NDArray[np.intp]
+    design: Floats
+    pull: Floats
+    covariance: Floats
 
     @staticmethod
-    def of(facts: Facts) -> _Seam:
-        plane = np.array([facts["bias"], *facts["tilt"]])
-        return _Seam(facts, plane, np.linalg.pinv(np.array(facts["covariance"]), hermitian=True))
+    def of(
+        pair: int, numbers: Sequence[int], every: Sequence[Facts], weight: Floats, centre: Sequence[float]
+    ) -> _Model:
+        seams = np.array(numbers)
+        design = np.zeros((len(seams), 3, 3))
+        for k, number in enumerate(numbers):
+            dx, dy = (a - b for a, b in zip(every[number]["centre"], centre, strict=True))
+            sign = 1.0 if pair == every[number]["pair"] else -1.0
+            design[k] = sign * np.array([[1.0, dx, dy], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+        pull = np.swapaxes(design, 1, 2) @ weight[seams]
+        return _Model(seams, design, pull, np.linalg.pinv((pull @ design).sum(0), hermitian=True))
 
-    def design(self, pair: int, centre: Sequence[float]) -> Floats:
-        """How the plane (bias at ``centre``, tilts) of a model shows at the centre of this seam."""
-        dx, dy = (a - b for a, b in zip(self.facts["centre"], centre, strict=True))
-        sign = 1.0 if pair == self.facts["pair"] else -1.0
-        return sign * np.array([[1.0, dx, dy], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    def explain(self, left: Floats) -> tuple[Floats, float]:
+        """Plane that explains best what is ``left`` of all seams (n, 3), and by how much chi-square falls."""
+        right = (self.pull @ left[self.seams, :, None]).sum(0)[:, 0]
+        plane = np.asarray(self.covariance @ right)
+        return plane, float(plane @ right)
 
 
 def audit(seams: Sequence[Facts], centres: Mapping[int, Sequence[float]]) -> tuple[float, list[dict[str, Any]]]:
@@ -78,71 +91,64 @@ def audit(seams: Sequence[Facts], centres: Mapping[int, Sequence[float]]) -> tup
     both over its seams, m), ``expected`` (what its and its neighbours' sigma let a cell differ, m), ``score``
     (``chi2`` over the variance factor), ``found``, ``neighbours`` and ``either``: nothing tells it from its only one.
     """
-    every = [_Seam.of(s) for s in sorted(seams, key=lambda s: (s["pair"], s["other"]))]
-    sizes = [(float(s.left @ s.weight @ s.left), {s.facts["pair"], s.facts["other"]}) for s in every]
-    of: dict[int, list[_Seam]] = defaultdict(list)
-    for s in every:
-        of[s.facts["pair"]].append(s)
-        of[s.facts["other"]].append(s)
-    solved = {pair: _explain(pair, mine, centres[pair]) for pair, mine in sorted(of.items())}
+    every = sorted(seams, key=lambda s: (s["pair"], s["other"]))
+    ends = np.array([(s["pair"], s["other"]) for s in every]).reshape(-1, 2)
+    left = np.array([[s["bias"], *s["tilt"]] for s in every]).reshape(-1, 3)
+    weight = np.linalg.pinv(np.array([s["covariance"] for s in every]).reshape(-1, 3, 3), hermitian=True)
+    sizes = np.einsum("ni,nij,nj->n", left, weight, left)
+    of: dict[int, list[int]] = defaultdict(list)
+    for number, s in enumerate(every):
+        of[s["pair"]].append(number)
+        of[s["other"]].append(number)
+    models = {pair: _Model.of(pair, mine, every, weight, centres[pair]) for pair, mine in sorted(of.items())}
+    solved = {pair: model.explain(left) for pair, model in models.items()}
     listed: list[dict[str, Any]] = []
+    blamed = np.zeros(len(every), bool)  # seams that a model which was found has part in
     while solved:
-        worst = max(solved, key=lambda pair: solved[pair][2])
-        plane, covariance, chi2 = solved.pop(worst)
-        factor = _factor(sizes, {m["pair"] for m in listed if m["found"]} or {worst})
-        listed.append(_entry(worst, (plane, covariance, chi2), factor, of, centres[worst]))
-        for s in of[worst]:
-            s.left = s.left - s.design(worst, centres[worst]) @ plane
-        for pair in {s.facts[end] for s in of[worst] for end in ("pair", "other")} & set(solved):
-            solved[pair] = _explain(pair, of[pair], centres[pair])
-    return _factor(sizes, set()), listed
+        worst = max(solved, key=lambda pair: solved[pair][1])
+        model, (plane, chi2) = models[worst], solved.pop(worst)
+        near = np.isin(np.arange(len(every)), model.seams)
+        factor = _factor(sizes, blamed if blamed.any() else near)
+        others = sorted({int(end) for end in ends[model.seams].ravel()} - {worst})
+        entry = _entry(model, plane, [every[number] for number in of[worst]])
+        listed.append(
+            {"pair": worst}
+            | entry
+            | {
+                "chi2": chi2,
+                "score": chi2 / factor,
+                "found": chi2 / factor > STANDS_OUT,
+                "neighbours": others,
+                "either": len(others) == 1 and len(of[others[0]]) == len(model.seams),
+            }
+        )
+        blamed |= near & listed[-1]["found"]
+        left[model.seams] -= model.design @ plane
+        for pair in set(others) & set(solved):
+            solved[pair] = models[pair].explain(left)
+    return _factor(sizes, np.zeros(len(every), bool)), listed
 
 
-def _factor(sizes: Sequence[tuple[float, set[int]]], without: set[int]) -> float:
+def _factor(sizes: Floats, without: NDArray[np.bool_]) -> float:
     """How much more than noise seams differ: the median of those that some models have no part in, if there are any."""
-    others = [size for size, pairs in sizes if not pairs & without]
-    chosen = others if len(others) >= LEAST_OTHERS else [size for size, _ in sizes]
-    return max(1.0, float(np.median(chosen)) / MEDIAN) if chosen else 1.0
+    others = sizes[~without]
+    chosen = others if len(others) >= LEAST_OTHERS else sizes
+    return max(1.0, float(np.median(chosen)) / MEDIAN) if len(chosen) else 1.0
 
 
-def _explain(pair: int, seams: Sequence[_Seam], centre: Sequence[float]) -> tuple[Floats, Floats, float]:
-    """Plane of one model that explains its seams best, its covariance, and by how much chi-square falls."""
-    normal, right = np.zeros((3, 3)), np.zeros(3)
-    for s in seams:
-        a = s.design(pair, centre)
-        normal += a.T @ s.weight @ a
-        right += a.T @ s.weight @ s.left
-    covariance = np.asarray(np.linalg.pinv(normal, hermitian=True), dtype=np.float64)
-    plane = covariance @ right
-    return plane, covariance, float(plane @ right)
-
-
-def _entry(
-    pair: int,
-    solved: tuple[Floats, Floats, float],
-    factor: float,
-    of: Mapping[int, list[_Seam]],
-    centre: Sequence[float],
-) -> dict[str, Any]:
-    (plane, covariance, chi2), mine = solved, of[pair]
-    others = sorted({s.facts[end] for s in mine for end in ("pair", "other")} - {pair})
-    cells = np.array([s.facts["cells"] for s in mine], dtype=np.float64)
+def _entry(model: _Model, plane: Floats, mine: Sequence[Facts]) -> dict[str, Any]:
+    """A model's own error."""
+    cells = np.array([s["cells"] for s in mine], dtype=np.float64)
     # over a seam the plane is its value at the centre, and what the tilt adds over half its width
-    at = np.array([(s.design(pair, centre) @ plane)[0] for s in mine])
-    half = np.array([math.sqrt(s.facts["area"]) for s in mine]) / math.sqrt(12.0)
+    at = (model.design @ plane)[:, 0]
+    half = np.array([math.sqrt(s["area"]) for s in mine]) / math.sqrt(12.0)
     square = at**2 + half**2 * float(plane[1:] @ plane[1:])
     return {
-        "pair": pair,
         "bias": float(plane[0]),
         "tilt": plane[1:].tolist(),
-        "sigma": np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist(),
+        "sigma": np.sqrt(np.maximum(np.diag(model.covariance), 0.0)).tolist(),
         "systematic": math.sqrt(float(np.average(square, weights=cells))),
-        "expected": float(np.median([s.facts["expected"] for s in mine])),
-        "chi2": chi2,
-        "score": chi2 / factor,
-        "found": chi2 / factor > STANDS_OUT,
-        "neighbours": others,
-        "either": len(others) == 1 and len(of[others[0]]) == len(mine),
+        "expected": float(np.median([s["expected"] for s in mine])),
     }
 
 
