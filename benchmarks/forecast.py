@@ -62,7 +62,8 @@ def table(warm: Path, cold: Path) -> dict[str, tuple[float, float, float]]:
         seconds = [t["seconds"] - t.get("compiling", 0.0) for t in mine if "seconds" in t]
         compiling = sum(r.get("compiling", 0.0) for r in first if kind(r.get("label", "")) == name)
         mean = sum(seconds) / len(seconds) if seconds else 0.0
-        found[name] = (round(len(mine) / opened, 4), round(mean, 4), round(compiling, 2))
+        share = sum(t["label"] in later for t in mine) / opened
+        found[name] = (round(share, 6), round(mean, 4), round(compiling, 2))
     return found
 
 

@@ -3,8 +3,8 @@
 A kind of task is its label without numbers, such as ``locus/world``. The time left is the sum over kinds of *tasks to
 come x seconds a task*, over the workers, and of the seconds for which kernels are still to be compiled:
 
-- Tasks to come are those laid out already, or as many as a run of this size has: all kinds grow with the number of
-  tasks that are laid out when it opens. Of a kind some of whose tasks were found in the cache after
+- Tasks to come are those laid out already, or as many as a run of this size has: what is laid out on the way grows with
+  the number of tasks that are laid out when it opens. Of a kind some of whose tasks were found in the cache after
   computing began, the same share of the rest is expected to be found.
 - Seconds a task are the mean of those measured in this run. For a kind that has not run yet they are the earlier ones
   times the pace: the median of measured over earlier seconds, each kind weighed by the root of its seconds.
@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from rille.pipeline.engine.graph import Handle
 
 Kinds = Mapping[str, tuple[float, float, float]]
-"""Of each kind of task: tasks over those laid out when the run opened, mean seconds of a task without compiling, and
-seconds of compiling."""
+"""Of each kind of task: tasks laid out on the way over all those laid out when the run opened, mean seconds of a task
+without compiling, and seconds of compiling."""
 
 
 FILE = "seconds.json"
@@ -62,8 +62,9 @@ class Forecast:
     """Estimates the seconds left of one run. ``earlier`` is None where nothing like it is known."""
 
     def __init__(self, opened: Iterable[str], earlier: Kinds | None, jobs: int) -> None:
-        self.known = Counter(map(kind, opened))
-        self.opened = sum(self.known.values())
+        self.at_first = Counter(map(kind, opened))
+        self.known = self.at_first.copy()
+        self.opened = self.at_first.total()
         self.earlier = dict(earlier or {})
         if earlier is None and self.known["motion"]:  # a reconstruction; how long a drive takes, its ground decides
             rendered = "scene" in self.known
@@ -98,7 +99,7 @@ class Forecast:
             share, before, first = self.earlier.get(name, (0.0, 0.0, 0.0))
             tally = self.tallies[name]
             mean = tally.seconds / tally.computed if tally.computed else pace * before
-            to_come = max(self.known[name], share * self.opened) - tally.ended
+            to_come = max(self.known[name], self.at_first[name] + int(share * self.opened + 0.01)) - tally.ended
             missed = (tally.computed + 1) / (tally.computed + tally.found + 1)
             work += max(0.0, to_come) * missed * mean
             compiling += cold * first if to_come > 0 and not tally.computed else 0.0
@@ -132,7 +133,8 @@ class Forecast:
             if tally.computed:
                 seconds = round(tally.seconds / tally.computed, 4)
                 compiling = round(max(compiling, tally.compiling), 2)
-            found[name] = (round(self.known[name] / self.opened, 4), seconds, compiling)
+            later = self.known[name] - self.at_first[name]
+            found[name] = (round(later / self.opened, 6), seconds, compiling)
         return found
 
 

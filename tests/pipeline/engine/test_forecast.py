@@ -11,7 +11,7 @@ from rille.pipeline.engine import forecast
 from rille.pipeline.engine.forecast import Forecast, kind
 from rille.pipeline.engine.reference import REFERENCE
 
-EARLIER = {"image": (0.5, 0.1, 0.0), "match": (0.5, 1.0, 4.0), "map": (0.25, 2.0, 6.0)}
+EARLIER = {"image": (0.0, 0.1, 0.0), "match": (0.0, 1.0, 4.0), "map": (0.25, 2.0, 6.0)}
 OPENED = [f"image/{k}" for k in range(4)] + [f"match/{k}" for k in range(4)]
 
 
@@ -67,10 +67,16 @@ def test_what_a_run_leaves_is_what_the_next_one_starts_from(tmp_path: Any) -> No
     end(run, "map/0", 5.0)
     forecast.remember(tmp_path, run)
     found = forecast.recall(tmp_path)
-    assert found == {"image": (0.5, 1.0, 4.0), "match": (0.5, 1.0, 4.0), "map": (0.125, 5.0, 0.0)}
+    assert found == {"image": (0.0, 1.0, 4.0), "match": (0.0, 1.0, 4.0), "map": (0.125, 5.0, 0.0)}
     (tmp_path / forecast.FILE).write_text('{"image": 3}')
     assert forecast.recall(tmp_path) is None
 
 
+def test_a_kind_that_is_switched_off_is_not_expected() -> None:
+    run = Forecast(OPENED, EARLIER | {"crosscheck": (0.0, 16.0, 0.0)}, 1)
+    end(run, "image/0", 0.1)
+    assert run.left() == pytest.approx(3 * 0.1 + 4 * 1.0 + 2 * 2.0)
+
+
 def test_the_reference_has_all_that_a_reconstruction_spends_its_time_on() -> None:
-    assert {"hfvm", "locus/world", "motion", "merge", "resect", "path/local", "risk/world"} <= REFERENCE.keys()
+    assert {"hfvm", "locus/world", "motion", "merge", "resect", "path/local", "risk/world", "crosscheck", "output"} <= REFERENCE.keys()
