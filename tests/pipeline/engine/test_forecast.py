@@ -79,4 +79,14 @@ def test_a_kind_that_is_switched_off_is_not_expected() -> None:
 
 
 def test_the_reference_has_all_that_a_reconstruction_spends_its_time_on() -> None:
-    assert {"hfvm", "locus/world", "motion", "merge", "resect", "path/local", "risk/world", "crosscheck", "output"} <= REFERENCE.keys()
+    assert {
+        "hfvm",
+        "locus/world",
+        "motion",
+        "merge",
+        "resect",
+        "path/local",
+        "risk/world",
+        "crosscheck",
+        "output",
+    } <= REFERENCE.keys()
