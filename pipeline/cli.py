@@ -1,4 +1,4 @@
-"""The command line: ``rille reconstruct | drive | plan | why | timing | check | init | calibrate | match | ...``.
+"""The command line: ``rille reconstruct | drive | plan | runs | why | timing | check | init | match | ...``.
 
 Exit codes: 0 complete; 1 failed; 2 usage, configuration or input; 3 finished, but not all of it: what the data do not
 determine, failures under ``--keep-going``, frames without a pose, images that do not match, a drive that did not reach
@@ -11,7 +11,6 @@ from __future__ import annotations
 import os
 import sys
 import traceback
-from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -48,10 +47,23 @@ from rille.pipeline.engine.plain import plain_output, raw
 LONGEST = 1000
 """Characters of a complaint."""
 
+
+def _versions() -> str:
+    """Version of the program, of what its results depend on, and the machine's kind; one a line."""
+    import platform
+
+    from rille.pipeline.engine.packages import installed
+
+    found = installed()
+    found = {"rille": found["rille"], **found, "system": f"{platform.system()} {platform.machine()}"}
+    return "\n".join(f"{name:24s} {version}" for name, version in found.items())
+
+
 app = App(
     name="rille",
-    suppress_keyboard_interrupt=False,  # else it ends the program without a word
-    version=version("rille"),
+    suppress_keyboard_interrupt=False,  # cyclopts would end the program without a word
+    version=_versions,
+    version_format="plaintext",
     help="Stereo image sequences to terrain, trajectory, risk map and safe path, without rectification.",
 )
 app.command(datasets_commands.app)
@@ -59,6 +71,8 @@ app.command(cache_commands.app)
 for command in (files.init, files.calibrate, files.match, files.compare_dem):
     app.command(command)
 app.command(files.export, name="export")
+
+app.register_install_completion_command(help="Install completion of commands and options for your shell.")
 
 _SETTINGS, _RESULTS = Settings(), Results()
 
@@ -164,17 +178,25 @@ def why(
 
 
 @app.command
-def timing(run: str = "latest", *, runs: Runs = RUNS, debug: Debug = False) -> int:
-    """Say where the time of a run went, and how far it is from what its tasks allow.
-
-    Parameters
-    ----------
-    run
-        SEQUENCE (its latest run), SEQUENCE/ID, or the run's folder; the latest of all by default.
-    """
+def timing(run: Run = "latest", *, runs: Runs = RUNS, debug: Debug = False) -> int:
+    """Say where the time of a run went, and how far it is from what its tasks allow."""
     from rille.pipeline.runs import critical_path as command
 
     return command.show(run, runs)
+
+
+@app.command(name="runs")
+def list_runs(sequence: str = "", *, runs: Runs = RUNS, debug: Debug = False) -> int:
+    """List runs, the latest last: name, state, tasks computed and cached, seconds.
+
+    Parameters
+    ----------
+    sequence
+        Runs of this sequence only; all by default.
+    """
+    from rille.pipeline.runs import lookup
+
+    return lookup.show(sequence, runs)
 
 
 @app.command

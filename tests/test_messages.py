@@ -23,20 +23,18 @@ HEAD = """# Messages
 
 Every error has a code that stays when its words change: `rille: error RIL-214: what, where: what to change`. Here an
 ellipsis stands for what the program fills in. 001-099 command line and configuration, 100-299 input, 300-499 stages,
-500-599 engine and store, 600-699 outputs, 700-899 what came later; RIL-999 is an error of the program itself.
+500-599 engine and store, 600-639 outputs, 640-699 findings of `rille check` and warnings, 700-998 what came later;
+RIL-999 is an error of the program itself.
 
 | code | message | what to change |
 |---|---|---|
 """
 
 
-def constants(tree: ast.Module) -> dict[str, ast.expr]:
-    """Names that a module gives to one text."""
-    found: dict[str, list[ast.expr]] = {}
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
-            found.setdefault(node.targets[0].id, []).append(node.value)
-    return {name: values[0] for name, values in found.items() if len(values) == 1}
+def texts(scope: ast.AST) -> list[tuple[str, ast.Assign]]:
+    """Assignments of a module or function to one name each, in order of their lines."""
+    found = [node for node in ast.walk(scope) if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name)]
+    return [(node.targets[0].id, node) for node in sorted(found, key=lambda node: node.lineno)]
 
 
 def words(node: ast.expr | None, names: Mapping[str, ast.expr]) -> str:
@@ -54,10 +52,14 @@ def words(node: ast.expr | None, names: Mapping[str, ast.expr]) -> str:
 
 def messages(tree: ast.Module) -> Iterator[tuple[str, str, str]]:
     """Code, message and remedy of each call whose first argument is a code."""
-    names = constants(tree)
+    scopes = [tree, *(node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef))]
+    named: dict[ast.AST, list[tuple[str, ast.Assign]]] = {}  # each node's by its innermost function: the last one
+    for scope in scopes:
+        named |= dict.fromkeys(ast.walk(scope), texts(scope))
     for call in ast.walk(tree):
         if not isinstance(call, ast.Call) or len(call.args) < 2:
             continue
+        names = {name: found.value for name, found in (*named[tree], *named[call]) if found.lineno < call.lineno}
         code, *told = call.args
         if not isinstance(code, ast.Constant) or not CODE.fullmatch(str(code.value)):
             continue

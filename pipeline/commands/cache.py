@@ -73,7 +73,7 @@ def unpin(run: str, *, cache: CacheFolder = None, debug: Debug = False) -> int:
     Parameters
     ----------
     run
-        SEQUENCE/ID, or ID.
+        SEQUENCE (its latest pin), SEQUENCE/ID, or ID.
     """
     from rille.pipeline.runs import session as commands
 

@@ -24,9 +24,9 @@ from rille.pipeline.engine.store.base import Store, at
 from rille.pipeline.engine.store.location import Location
 from rille.pipeline.flow import config as configuration
 from rille.pipeline.flow.builders import Builder, name
-from rille.pipeline.runs import input_checks as verdicts
+from rille.pipeline.runs import input_checks as judge
 from rille.pipeline.runs import synchrony
-from rille.pipeline.runs.input_checks import Verdict
+from rille.pipeline.runs.input_checks import Finding, doubt, fault, fine
 from rille.stages.core.errors import RilleError
 from rille.stages.geometry.epipolar import beyond_infinity
 from rille.stages.geometry.triangulation import inverse_depth
@@ -114,13 +114,13 @@ class Match:
 
 @dataclass
 class Inspection:
-    """A flow that says each verdict as soon as it is known."""
+    """A flow that prints each finding as soon as it is known."""
 
     make: Builder
     frames: tuple[int, ...]
     store: Store
     match: Match | None = None
-    found: list[Verdict] = field(default_factory=list)
+    found: list[Finding] = field(default_factory=list)
     broken: dict[tuple[int, str], RilleError] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -128,29 +128,29 @@ class Inspection:
         self.lost = {f: why for f, why in self.sequence.lost.items() if f in self.frames}
         self.frames = tuple(f for f in self.frames if f not in self.lost)
 
-    def say(self, verdicts: Iterable[Verdict]) -> None:
+    def say(self, findings: Iterable[Finding]) -> None:
         """Print what was found."""
-        for verdict in verdicts:
-            print(verdict, flush=True)
-            self.found.append(verdict)
+        for finding in findings:
+            print(finding, flush=True)
+            self.found.append(finding)
 
     def steps(self) -> Steps:
         """Look at everything, the cheap things first."""
         s = self.sequence
-        self.say([Verdict("OK", "sequence", f"{s.name}, {len(self.frames)} of {s.frames} pairs")])
+        self.say([fine("sequence", f"{s.name}, {len(self.frames)} of {s.frames} pairs")])
         for frame, why in self.lost.items():
             text = f"frame {s.frame_names[frame]}: {why}"
-            self.say([Verdict("WARN", "images", text, "it will have no pose; bridged")])
-        self.say(Verdict("WARN", "input", line) for line in s.warnings)
-        self.say(verdicts.judge_rig(s.rig))
-        self.say(verdicts.judge_times(None if s.times is None else [s.times[k] for k in self.frames]))
-        self.say(verdicts.judge_truth(s.truth, self.frames, s.truth_positions))
-        self.say(verdicts.judge_attitude(s.attitude, s.truth, self.frames))
-        self.say(verdicts.judge_up(s.up, self.frames))
+            self.say([doubt("RIL-668", text, "images", remedy="it gets no pose; its neighbours are joined across it")])
+        self.say(Finding("", line, "input", "WARN") for line in s.warnings)  # it begins with its code
+        self.say(judge.judge_rig(s.rig))
+        self.say(judge.judge_times(None if s.times is None else [s.times[k] for k in self.frames]))
+        self.say(judge.judge_truth(s.truth, self.frames, s.truth_positions))
+        self.say(judge.judge_attitude(s.attitude, s.truth, self.frames))
+        self.say(judge.judge_up(s.up, self.frames))
         yield from self._images()
         whole = [k for k in self.frames if not any((k, camera) in self.broken for camera in CAMERAS)]
         if not whole:
-            self.say([Verdict("FAIL", "matching", "no pair is whole")])
+            self.say([fault("RIL-669", "no pair of images is whole", "matching")])
             return
         yield from self._first_pair(whole[0])
         yield from self._motions()
@@ -176,28 +176,28 @@ class Inspection:
             looks[camera][frame] = look(image, np.asarray(bundle["valid"]))
             digests[camera][frame] = hashlib.sha256(image.tobytes()).hexdigest()
         for damage in list(self.broken.values())[:FIRST_NAMED]:
-            self.say([Verdict("FAIL", "images", damage.message, damage.remedy)])
+            self.say([fault(damage.code, damage.message, "images", remedy=damage.remedy)])
         total = len(self.frames) * len(CAMERAS)
         if self.broken:
-            self.say([Verdict("FAIL", "images", f"{len(self.broken)} of {total} cannot be used")])
+            self.say([fault("RIL-670", f"{len(self.broken)} of {total} images cannot be used", "images")])
         else:
             words = " and ".join(f"{w} x {h} {kind}" for w, h, kind in sorted(sizes))
-            self.say([Verdict("OK", "images", f"all {total} open, {words}")])
+            self.say([fine("images", f"all {total} open, {words}")])
         self.say(self._repeated(digests))
-        self.say(verdicts.judge_looks(looks, self.sequence.frame_names))
+        self.say(judge.judge_looks(looks, self.sequence.frame_names))
 
-    def _repeated(self, digests: Mapping[str, Mapping[int, str]]) -> list[Verdict]:
+    def _repeated(self, digests: Mapping[str, Mapping[int, str]]) -> list[Finding]:
         names, out = self.sequence.frame_names, []
         same = [k for k, d in digests["left"].items() if digests["right"].get(k) == d]
         if same:
             text = f"left and right are one image in {len(same)} pairs, first frame {names[same[0]]}"
-            out.append(Verdict("FAIL", "images", text, "give the right camera's images"))
+            out.append(fault("RIL-671", text, "images", remedy="give the right camera's images"))
         for camera, of in digests.items():
             frames = list(of)
             stuck = [b for a, b in pairwise(frames) if of[a] == of[b]]
             if stuck:
                 text = f"{len(stuck)} {camera} images repeat the one before, first frame {names[stuck[0]]}"
-                out.append(Verdict("WARN", "images", text, "was a frame copied, or did the camera hang?"))
+                out.append(doubt("RIL-672", text, "images", remedy="was a frame copied, or did the camera hang?"))
         return out
 
     def _first_pair(self, pair: int) -> Steps:
@@ -219,17 +219,17 @@ class Inspection:
         except (MissingError, RilleError) as missing:
             error = _cause(missing.handles[0]) if isinstance(missing, MissingError) else missing
             text = f"frame {self.sequence.frame_names[pair]}: {error.message}"
-            self.say([Verdict("FAIL", "matching", text, error.remedy)])
+            self.say([fault(error.code, text, "matching", remedy=error.remedy)])
             return
         rig = self.sequence.rig
         rho, _ = inverse_depth(rig, m.left, m.right - m.left)
         inlier = m.weight > 0 if (m.weight > 0).any() else np.ones(len(m.left), bool)
         ahead = inlier & (rho > 0)
-        self.say(verdicts.judge_matching(m.rate, 1.0 / rho[ahead], rig.baseline))
+        self.say(judge.judge_matching(m.rate, 1.0 / rho[ahead], rig.baseline))
         if len(m.left):
             beyond = beyond_infinity(rig, m.left[inlier], m.right[inlier])
-            self.say(verdicts.judge_sides(float((beyond > BEYOND).mean())))
-        self.say(verdicts.judge_epipolar(m.facts))
+            self.say(judge.judge_sides(float((beyond > BEYOND).mean())))
+        self.say(judge.judge_epipolar(m.facts))
 
     def _motions(self) -> Steps:
         """Overlap of some successive left images."""
@@ -239,9 +239,9 @@ class Inspection:
         tasks = {(a, b): self.make.motion(a, b) for a, b in whole}
         yield Maybe(list(tasks.values()))
         for error in (_cause(task) for task in tasks.values() if task.ref is None):
-            self.say([Verdict("FAIL", "motion", error.message, error.remedy)])
+            self.say([fault(error.code, error.message, "motion", remedy=error.remedy)])
         motions = {step: task.ref.meta for step, task in tasks.items() if task.ref is not None}
-        self.say(verdicts.judge_motion(motions, self.sequence.frame_names))
+        self.say(judge.judge_motion(motions, self.sequence.frame_names))
 
     def _simultaneous(self) -> Steps:
         """Rows of some pairs over the whole sequence, with the right images as named and shifted in time."""
@@ -254,7 +254,7 @@ class Inspection:
             for shift, values in spreads.items():
                 right = yield from self._features(frame + shift, "right")
                 values.append(synchrony.row_spread(self.sequence.rig, left, right))
-        self.say(verdicts.judge_synchrony(spreads))
+        self.say(judge.judge_synchrony(spreads))
 
     def _features(self, frame: int, camera: str) -> Generator[Wait, Any, tuple[Any, Any] | None]:
         if frame in self.lost or (frame, camera) in self.broken or frame not in self.frames:

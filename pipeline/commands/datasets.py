@@ -12,6 +12,7 @@ app = App(name="datasets", help="Sequences that Rille knows: list them, or expor
 
 
 @app.default
+@app.command(name="list")
 def list_datasets() -> int:
     """List the built-in sequences and the folder layouts that are recognised."""
     from rille.datasets.registry import catalogue

@@ -9,10 +9,13 @@ from cyclopts import Parameter
 
 from rille.pipeline.commands.options import (
     COMPLETE,
+    RUNS,
     Assignments,
     CacheFolder,
     Debug,
     Output,
+    Run,
+    Runs,
     cache_folder,
     flag,
     prepare,
@@ -124,10 +127,11 @@ def match(
 
 
 def export(
-    run: Path,
+    run: Run,
     *,
     to: Annotated[list[Literal["laz", "glb", "colmap"]], Parameter(negative="")],
     output: Annotated[Path | None, Output] = None,
+    runs: Runs = RUNS,
     cache: CacheFolder = None,
     debug: Debug = False,
 ) -> int:
@@ -135,8 +139,6 @@ def export(
 
     Parameters
     ----------
-    run
-        Folder of a run, for example runs/mockup/latest.
     to
         laz: CloudCompare, PDAL, QGIS; glb: any glTF viewer, Blender; colmap: cameras, rig, poses and tracked points.
         May be repeated.
@@ -150,8 +152,11 @@ def export(
             "RIL-020", f"--output names one place for {len(to)} forms", remedy="give one --to, or leave --output out"
         )
     prepare()
+    from rille.pipeline.runs import lookup
+
+    folder = lookup.find(run, runs)
     for kind in to:
-        print(_export(run, kind, output, cache))
+        print(_export(folder, kind, output, cache))
     return COMPLETE
 
 
@@ -169,11 +174,12 @@ def _export(run: Path, kind: Literal["laz", "glb", "colmap"], output: Path | Non
 
 
 def compare_dem(
-    a: Path,
-    b: Path,
+    a: str,
+    b: str,
     *,
     align: Literal["none", "shift", "tilt", "rigid"] = "none",
     output: Annotated[Path, Output] = Path("dem_comparison"),
+    runs: Runs = RUNS,
     debug: Debug = False,
 ) -> int:
     """Compare elevation model A with reference B: errors, completeness, error against range and slope.
@@ -184,7 +190,7 @@ def compare_dem(
     Parameters
     ----------
     a
-        GeoTIFF, folder of a run, or zarr group with elevation, x and y.
+        GeoTIFF, zarr group with elevation, x and y, or a run: its folder or name (mockup, latest).
     b
         Reference, likewise.
     align
@@ -194,5 +200,6 @@ def compare_dem(
     """
     prepare()
     from rille.pipeline.commands import compare_dem as command
+    from rille.pipeline.runs import lookup
 
-    return command.compare(a, b, align=align, output=output)
+    return command.compare(*(lookup.elevation(text, runs) for text in (a, b)), align=align, output=output)

@@ -50,7 +50,9 @@ MemoryLimit = Annotated[
     ),
 ]
 Output = Parameter(name=["--output", "-o"])
-Run = Annotated[str, Parameter(help="SEQUENCE (its latest run), SEQUENCE/ID, or the run's folder.")]
+Run = Annotated[
+    str, Parameter(help="A run by name: SEQUENCE (its latest), SEQUENCE/ID, ID, latest (of all); or its folder.")
+]
 Runs = Annotated[Path, Parameter(help="Folder of results; each run makes RUNS/sequence/run-id.")]
 
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 import ctypes
 import importlib.metadata
 import importlib.util
+import platform
 from collections.abc import Iterable
 from contextlib import suppress
 from functools import cache
@@ -29,6 +30,12 @@ KNOWN = {
 
 HARMLESS = frozenset({"pydantic", "rille"})
 """What checks parameters, whose values are part of a key themselves; and the engine, whose format is."""
+
+NAMED = (
+    *("rille", "numpy", "numba", "scipy", "opencv-python-headless", "dask", "zarr", "rasterio", "pyogrio", "pycolmap"),
+    *("matplotlib", "jinja2"),
+)
+"""Distributions that ``rille --version`` and reports name."""
 
 CORE_NAMES = ("scipy_openblas_get_corename64_", "scipy_openblas_get_corename", "openblas_get_corename")
 
@@ -49,6 +56,11 @@ def versions(module: str, own: Iterable[str] = OWN) -> dict[str, str]:
     if "numba" in names:
         names.add("llvmlite")  # generates the code
     return dict(sorted(_version(name) for name in names))
+
+
+def installed() -> dict[str, str]:
+    """Versions for people: of Python and of :data:`NAMED`; no stage depends on this."""
+    return {"python": platform.python_version()} | {name: importlib.metadata.version(name) for name in NAMED}
 
 
 @cache

@@ -1,7 +1,7 @@
-"""What the figures of a sequence mean for its reconstruction: one verdict each, with what to do.
+"""Judge the figures of a sequence: one finding each, with a code and a remedy where something is wrong.
 
-Plain numbers in, verdicts out; who measures them is :mod:`rille.pipeline.commands.check`. FAIL is what makes a
-reconstruction useless or impossible, WARN what makes it worse or is probably a mistake.
+Plain numbers in, findings out; :mod:`rille.pipeline.commands.check` measures them. FAIL: a reconstruction is useless or
+impossible. WARN: it gets worse, or the input is probably a mistake.
 """
 
 from __future__ import annotations
@@ -63,56 +63,79 @@ ATTITUDE_DEG = 2.0
 
 
 @dataclass(frozen=True)
-class Verdict:
-    """One line: what was looked at, the figure, and what to do about it."""
+class Finding:
+    """One line of ``rille check``: a figure of ``subject`` in words, and what to do; ``code`` where it is not OK."""
 
-    level: Level
-    subject: str
+    code: str
     text: str
+    subject: str
+    level: Level = "OK"
     remedy: str = ""
 
     def __str__(self) -> str:
-        return f"{self.level:4s}  {self.subject:12s}  {self.text}" + (f": {self.remedy}" if self.remedy else "")
+        code = f"{self.code}: " if self.code else ""
+        return f"{self.level:4s}  {self.subject:12s}  {code}{self.text}" + (f": {self.remedy}" if self.remedy else "")
 
 
-def judge_rig(rig: Rig) -> list[Verdict]:
+def fine(subject: str, text: str) -> Finding:
+    """A figure that is as it should be."""
+    return Finding("", text, subject)
+
+
+def doubt(code: str, text: str, subject: str, *, remedy: str) -> Finding:
+    """A figure that makes the results worse, or is probably a mistake."""
+    return Finding(code, text, subject, "WARN", remedy)
+
+
+def fault(code: str, text: str, subject: str, *, remedy: str = "") -> Finding:
+    """A figure with which a reconstruction is useless or impossible."""
+    return Finding(code, text, subject, "FAIL", remedy)
+
+
+def judge_rig(rig: Rig) -> list[Finding]:
     """Baseline and sides, as the calibration has them."""
     b, x = rig.baseline, float(rig.T_right_left.translation[0])
     f = rig.left.fx
     if x > 0.5 * b:
-        return [Verdict("FAIL", "rig", f"the right camera stands {x:g} m to the left", "swap left and right")]
+        return [fault("RIL-640", f"the right camera stands {x:g} m to the left", "rig", remedy="swap left and right")]
     words = f"baseline {b:g} m, focal length {f:g} px, {rig.left.width} x {rig.left.height}"
     if not SMALL_BASELINE <= b <= LARGE_BASELINE:
-        return [Verdict("WARN", "rig", words, "is the baseline in metres?")]
+        return [doubt("RIL-641", words, "rig", remedy="is the baseline in metres?")]
     ratio = max(rig.left.fx / rig.right.fx, rig.right.fx / rig.left.fx)
     if ratio > 1.2:
-        return [Verdict("WARN", "rig", f"{words}; the right camera's is {rig.right.fx:g} px", "two different lenses?")]
-    return [Verdict("OK", "rig", words)]
+        return [
+            doubt(
+                "RIL-642", f"{words}; the right camera's is {rig.right.fx:g} px", "rig", remedy="two different lenses?"
+            )
+        ]
+    return [fine("rig", words)]
 
 
-def judge_times(times: Sequence[float] | None) -> list[Verdict]:
+def judge_times(times: Sequence[float] | None) -> list[Finding]:
     """Order, rate and gaps of the frames' times, s."""
     if times is None:
-        return [Verdict("OK", "times", "none: frames count as equally spaced")]
+        return [fine("times", "none: frames count as equally spaced")]
     steps = np.diff(np.asarray(times, dtype=np.float64))
     if not steps.size:
-        return [Verdict("OK", "times", "one frame")]
+        return [fine("times", "one frame")]
     if (steps <= 0).any():
         k = int(np.argmax(steps <= 0))
-        return [Verdict("FAIL", "times", f"time goes back or rests from frame {k} to {k + 1}", "correct the times")]
+        return [
+            fault("RIL-643", f"time goes back or rests from frame {k} to {k + 1}", "times", remedy="correct the times")
+        ]
     usual = float(np.median(steps))
     words = f"{1 / usual:.3g} frames a second over {float(steps.sum()):.4g} s"
     gaps = np.nonzero(steps > GAP * usual)[0]
     if gaps.size:
         worst = int(gaps[np.argmax(steps[gaps])])
         text = f"{words}; {gaps.size} gaps, the longest {steps[worst]:.3g} s from frame {worst} to {worst + 1}"
-        return [Verdict("WARN", "times", text, "frames may be missing; is the overlap kept there?")]
-    return [Verdict("OK", "times", words)]
+        return [doubt("RIL-644", text, "times", remedy="frames may be missing; is the overlap kept there?")]
+    return [fine("times", words)]
 
 
 def judge_truth(
     truth: Sequence[RigidTransform | None] | None, frames: Sequence[int], positions: Positions | None = None
-) -> list[Verdict]:
+) -> list[Finding]:
     """How many frames have truth, and how long the way is."""
     if truth is None and positions is not None:
         places, times = np.array(positions.positions), positions.times
@@ -122,28 +145,27 @@ def judge_truth(
         words = (
             f"positions only ({axes}), {len(places)} rows, {length:.4g} m, {when}; compared after a fit in the plane"
         )
-        return [Verdict("OK", "truth", words)]
+        return [fine("truth", words)]
     if truth is None:
-        return [Verdict("OK", "truth", "none: accuracy is only known against the cross-check")]
+        return [fine("truth", "none: accuracy is only known against the cross-check")]
     known = [T for T in (truth[k] for k in frames) if T is not None]
     length = sum(float(np.linalg.norm(b.translation - a.translation)) for a, b in pairwise(known))
     words = f"{len(known)} of {len(frames)} frames, {length:.4g} m"
     if len(known) < len(frames):
-        return [Verdict("WARN", "truth", words, "frames without truth are left out of the accuracy")]
-    return [Verdict("OK", "truth", words)]
+        return [doubt("RIL-645", words, "truth", remedy="frames without truth are left out of the accuracy")]
+    return [fine("truth", words)]
 
 
 def judge_attitude(
     attitude: Sequence[Rows | None] | None,
     truth: Sequence[RigidTransform | None] | None,
     frames: Sequence[int],
-) -> list[Verdict]:
+) -> list[Finding]:
     """Coverage of the attitude, and whether it turns as truth does."""
     if attitude is None:
         return []
     known = [k for k in frames if attitude[k] is not None]
     words = f"{len(known)} of {len(frames)} frames"
-    level: Level = "OK" if len(known) == len(frames) else "WARN"
     apart = []
     for a, b in pairwise(known):
         before, after = (None, None) if truth is None else (truth[a], truth[b])
@@ -154,43 +176,51 @@ def judge_attitude(
         apart.append(math.degrees(float(np.linalg.norm(cv2.Rodrigues(sensed @ true.T)[0]))))
     if apart and float(np.median(apart)) > ATTITUDE_DEG:
         text = f"{words}; between frames it turns {np.median(apart):.1f} degrees otherwise than truth"
-        return [Verdict("FAIL", "attitude", text, "check T_body_left, the axes and degrees or radians")]
+        return [fault("RIL-646", text, "attitude", remedy="check T_body_left, the axes and degrees or radians")]
     if apart:
         words += f"; turns as truth does, to {np.median(apart):.2g} degrees a frame"
-    return [Verdict(level, "attitude", words, "" if level == "OK" else "the others are matched without it")]
+    if len(known) < len(frames):
+        return [doubt("RIL-647", words, "attitude", remedy="the other frames are matched without it")]
+    return [fine("attitude", words)]
 
 
-def judge_up(up: Sequence[tuple[float, float, float] | None] | None, frames: Sequence[int]) -> list[Verdict]:
+def judge_up(up: Sequence[tuple[float, float, float] | None] | None, frames: Sequence[int]) -> list[Finding]:
     """Whether the stated vertical can be one."""
     if up is None:
         return []
     known = [up[k] for k in frames if up[k] is not None]
     if not known:
-        return [Verdict("WARN", "up", f"known of 0 of {len(frames)} frames", "the ground is levelled by its own plane")]
+        return [
+            doubt(
+                "RIL-648", f"known of 0 of {len(frames)} frames", "up", remedy="the ground is levelled by its own plane"
+            )
+        ]
     down = float(np.mean([v[1] for v in known if v is not None]))
     text = f"known of {len(known)} of {len(frames)} frames"
     if down > 0:
-        return [Verdict("WARN", "up", f"{text}; it points down in the images", "held upside down, or a wrong sign?")]
-    return [Verdict("OK", "up", text)]
+        return [
+            doubt("RIL-649", f"{text}; it points down in the images", "up", remedy="held upside down, or a wrong sign?")
+        ]
+    return [fine("up", text)]
 
 
-def judge_looks(looks: Mapping[str, Mapping[int, Look]], names: Sequence[str]) -> list[Verdict]:
+def judge_looks(looks: Mapping[str, Mapping[int, Look]], names: Sequence[str]) -> list[Finding]:
     """Exposure and sharpness of all images, by camera and frame."""
     opened = {camera: of for camera, of in looks.items() if of}
     return [*_uniform(opened, names), *_exposure(opened, names), *_sharpness(opened, names)]
 
 
-def _uniform(looks: Mapping[str, Mapping[int, Look]], names: Sequence[str]) -> list[Verdict]:
+def _uniform(looks: Mapping[str, Mapping[int, Look]], names: Sequence[str]) -> list[Finding]:
     out = []
     for camera, of in looks.items():
         empty = [k for k, v in of.items() if v.deviation < UNIFORM]
         if empty:
             text = f"{len(empty)} {camera} images show nothing, first frame {names[empty[0]]}"
-            out.append(Verdict("FAIL", "images", text, "leave these frames out with --frames"))
+            out.append(fault("RIL-650", text, "images", remedy="leave these frames out with --frames"))
     return out
 
 
-def _exposure(looks: Mapping[str, Mapping[int, Look]], names: Sequence[str]) -> list[Verdict]:
+def _exposure(looks: Mapping[str, Mapping[int, Look]], names: Sequence[str]) -> list[Finding]:
     out = []
     for camera, of in looks.items():
         for what, share in (
@@ -199,7 +229,9 @@ def _exposure(looks: Mapping[str, Mapping[int, Look]], names: Sequence[str]) -> 
         ):
             if share > CLIPPED:
                 text = f"{100 * share:.0f} % of the {camera} images is {what}"
-                out.append(Verdict("WARN", "exposure", text, "such areas cannot be matched; mask them or expose anew"))
+                out.append(
+                    doubt("RIL-651", text, "exposure", remedy="such areas cannot be matched; mask them or expose anew")
+                )
         frames, means = list(of), np.maximum([v.mean for v in of.values()], 1.0)
         ratio = np.exp(np.abs(np.diff(np.log(means))))
         if ratio.size and ratio.max() > UNLIKE_GREY:
@@ -207,19 +239,20 @@ def _exposure(looks: Mapping[str, Mapping[int, Look]], names: Sequence[str]) -> 
             text = (
                 f"{camera} brightness jumps by {ratio[k]:.2f} from frame {names[frames[k]]} to {names[frames[k + 1]]}"
             )
-            out.append(Verdict("WARN", "exposure", text, "auto exposure? tracks may break there"))
+            out.append(doubt("RIL-652", text, "exposure", remedy="auto exposure? tracks may break there"))
     both = [k for k in looks.get("left", {}) if k in looks.get("right", {})]
     if both and not out:
         pairs = [(looks["left"][k].mean, looks["right"][k].mean) for k in both]
         ratio_of_sides = float(np.median([max(b, 1.0) / max(a, 1.0) for a, b in pairs]))
         text = f"right is {ratio_of_sides:.2f} as bright as left, mean grey {np.median(pairs):.0f}"
-        fair = 1 / UNLIKE_GREY < ratio_of_sides < UNLIKE_GREY
-        remedy = "" if fair else "couple the exposure of both cameras"
-        out.append(Verdict("OK" if fair else "WARN", "exposure", text, remedy))
+        if 1 / UNLIKE_GREY < ratio_of_sides < UNLIKE_GREY:
+            out.append(fine("exposure", text))
+        else:
+            out.append(doubt("RIL-653", text, "exposure", remedy="couple the exposure of both cameras"))
     return out
 
 
-def _sharpness(looks: Mapping[str, Mapping[int, Look]], names: Sequence[str]) -> list[Verdict]:
+def _sharpness(looks: Mapping[str, Mapping[int, Look]], names: Sequence[str]) -> list[Finding]:
     out, usual = [], {}
     for camera, of in looks.items():
         values = {k: v.sharpness for k, v in of.items() if math.isfinite(v.sharpness)}
@@ -233,63 +266,75 @@ def _sharpness(looks: Mapping[str, Mapping[int, Look]], names: Sequence[str]) ->
             text = (
                 f"{len(blurred)} {camera} images are blurred, the worst frame {names[worst]} ({share:.0f} % of usual)"
             )
-            out.append(Verdict("WARN", "sharpness", text, "leave them out, or expect a weak pose there"))
+            out.append(doubt("RIL-654", text, "sharpness", remedy="leave them out, or expect a weak pose there"))
     if len(usual) == 2:
         ratio = usual["right"] / usual["left"]
         text = f"right is {ratio:.2f} as sharp as left"
         if not UNLIKE_SHARP < ratio < 1 / UNLIKE_SHARP:
             side = "right" if ratio < 1 else "left"
-            out.append(Verdict("WARN", "sharpness", text, f"is the {side} camera out of focus, or its lens dirty?"))
+            out.append(
+                doubt("RIL-655", text, "sharpness", remedy=f"is the {side} camera out of focus, or its lens dirty?")
+            )
         elif not out:
-            out.append(Verdict("OK", "sharpness", f"{text}, no image far below the others"))
+            out.append(fine("sharpness", f"{text}, no image far below the others"))
     return out
 
 
-def judge_matching(rate: float | None, depths: Floats, baseline: float) -> list[Verdict]:
+def judge_matching(rate: float | None, depths: Floats, baseline: float) -> list[Finding]:
     """Share of usable pixels that are matched, and how far away they lie (m)."""
     share = rate or 0.0
     if share < NO_MATCH:
         text = f"{100 * share:.1f} % of the first pair is matched"
-        return [Verdict("FAIL", "matching", text, "do both images show one scene, taken at one time, and sharp?")]
+        return [
+            fault("RIL-656", text, "matching", remedy="do both images show one scene, taken at one time, and sharp?")
+        ]
     near, middle, far = (float(v) for v in np.percentile(depths, [5, 50, 95])) if depths.size else (math.nan,) * 3
     text = f"{100 * share:.0f} % of the first pair is matched, depth {near:.3g} to {far:.3g} m, median {middle:.3g} m"
     if share < POOR_MATCH:
-        return [Verdict("WARN", "matching", text, "little texture, or little overlap of left and right")]
+        return [doubt("RIL-657", text, "matching", remedy="little texture, or little overlap of left and right")]
     if depths.size and middle > 200 * baseline:
         remedy = f"at {middle / baseline:.0f} baselines depth is a guess; is the baseline right?"
-        return [Verdict("WARN", "matching", text, remedy)]
-    return [Verdict("OK", "matching", text)]
+        return [doubt("RIL-658", text, "matching", remedy=remedy)]
+    return [fine("matching", text)]
 
 
-def judge_sides(beyond: float) -> list[Verdict]:
+def judge_sides(beyond: float) -> list[Finding]:
     """Share of the matches that lie beyond infinity under the given rig."""
     text = f"{100 * beyond:.1f} % of the matches lie beyond infinity"
     if beyond > SWAPPED:
-        return [Verdict("FAIL", "sides", text, "left and right are swapped, or the baseline has the wrong sign")]
+        return [
+            fault("RIL-659", text, "sides", remedy="left and right are swapped, or the baseline has the wrong sign")
+        ]
     if beyond > DOUBTFUL:
-        return [Verdict("WARN", "sides", text, "the toe-in of the calibration, or its principal points, are wrong")]
-    return [Verdict("OK", "sides", f"left is left: {text}")]
+        return [
+            doubt("RIL-660", text, "sides", remedy="the toe-in of the calibration, or its principal points, are wrong")
+        ]
+    return [fine("sides", f"left is left: {text}")]
 
 
-def judge_epipolar(facts: Mapping[str, Any]) -> list[Verdict]:
+def judge_epipolar(facts: Mapping[str, Any]) -> list[Finding]:
     """Epipolar residuals under the given rig, and after adjusting it (facts of stage ``orientation``)."""
     if "residual_before_px" not in facts:
-        return [Verdict("WARN", "epipolar", str(facts.get("words", "not checked")), "see the matching")]
+        return [doubt("RIL-661", str(facts.get("words", "not checked")), "epipolar", remedy="see the matching")]
     before, after = float(facts["residual_before_px"]), float(facts["residual_after_px"])
     offset, roll = float(facts["row_offset"]), float(facts["roll_deg"])
     words = f"row offset {offset:+.2f} px, roll {roll:+.3f} degrees, residual {before:.2f} px RMS, adjusted {after:.2f}"
     if after > HOPELESS:
         remedy = "no rig explains these images; wrong calibration file, or lens distortion left in"
-        return [Verdict("FAIL", "epipolar", words, remedy)]
+        return [fault("RIL-662", words, "epipolar", remedy=remedy)]
     if after > ROOM:
-        return [Verdict("WARN", "epipolar", words, "is lens distortion left in the images, or the wrong file given?")]
+        return [
+            doubt(
+                "RIL-663", words, "epipolar", remedy="is lens distortion left in the images, or the wrong file given?"
+            )
+        ]
     if before > ROOM or abs(offset) > ROWS_OK:
         remedy = "the calibration is off; reconstruct repairs what the images tell, `rille calibrate` the rest"
-        return [Verdict("WARN", "epipolar", words, remedy)]
-    return [Verdict("OK", "epipolar", words)]
+        return [doubt("RIL-664", words, "epipolar", remedy=remedy)]
+    return [fine("epipolar", words)]
 
 
-def judge_synchrony(spreads: Mapping[int, list[float | None]]) -> list[Verdict]:
+def judge_synchrony(spreads: Mapping[int, list[float | None]]) -> list[Finding]:
     """Whether the right images are of the same moments; ``spreads`` [px] by shift, see
     :mod:`rille.pipeline.runs.synchrony`."""
     named = [value for value in spreads[0] if value is not None]
@@ -298,22 +343,22 @@ def judge_synchrony(spreads: Mapping[int, list[float | None]]) -> list[Verdict]:
     found = best_shift(spreads)
     words = f"rows of {len(named)} pairs over the sequence spread by {float(np.median(named)):.2f} px"
     if found is None:
-        return [Verdict("OK", "simultaneous", f"{words}; no shift in time explains them better")]
+        return [fine("simultaneous", f"{words}; no shift in time explains them better")]
     shift, as_named, shifted = found
     text = (
         f"not simultaneous: left i with right i{shift:+d} spreads rows by {shifted:.2f} px, as named {as_named:.2f} px"
     )
-    return [Verdict("FAIL", "simultaneous", text, f"pair each left image with the right one {_frames(shift)}")]
+    return [fault("RIL-665", text, "simultaneous", remedy=f"pair each left image with the right one {_frames(shift)}")]
 
 
 def _frames(shift: int) -> str:
     return f"{abs(shift)} frame{'s' if abs(shift) > 1 else ''} {'before' if shift < 0 else 'after'} it"
 
 
-def judge_motion(motions: Mapping[tuple[int, int], Mapping[str, Any]], names: Sequence[str]) -> list[Verdict]:
+def judge_motion(motions: Mapping[tuple[int, int], Mapping[str, Any]], names: Sequence[str]) -> list[Finding]:
     """Overlap of successive left images, of stage ``motion``'s facts."""
     if not motions:
-        return [Verdict("OK", "motion", "one frame: no trajectory")]
+        return [fine("motion", "one frame: no trajectory")]
     overlap = {k: float(m["overlap"] or 0.0) for k, m in motions.items()}
     length = [float(m["median_length"]) for m in motions.values() if m["median_length"] is not None]
     (a, b), least = min(overlap.items(), key=lambda kv: kv[1])
@@ -322,7 +367,9 @@ def judge_motion(motions: Mapping[tuple[int, int], Mapping[str, Any]], names: Se
         f"from frame {names[a]} to {names[b]}; motion {np.median(length) if length else math.nan:.1f} px"
     )
     if least < NO_OVERLAP:
-        return [Verdict("FAIL", "motion", text, "the trajectory breaks there; add the frames between, or split it")]
+        return [
+            fault("RIL-666", text, "motion", remedy="the trajectory breaks there; add the frames between, or split it")
+        ]
     if least < LITTLE_OVERLAP:
-        return [Verdict("WARN", "motion", text, "take every frame, or expect weak poses there")]
-    return [Verdict("OK", "motion", text)]
+        return [doubt("RIL-667", text, "motion", remedy="take every frame, or expect weak poses there")]
+    return [fine("motion", text)]

@@ -1,8 +1,9 @@
-"""Finding runs by what a user types, and tasks of a run by their label."""
+"""Runs by the names that users type, the list of all runs, and tasks of a run by their labels."""
 
 from __future__ import annotations
 
 import difflib
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -46,6 +47,47 @@ def find(text: str, runs: Path) -> Path:
     names = [n for run in known for n in (name(run), run.parent.name, run.name)]
     where = f"there are {_some(sorted({run.parent.name for run in known}))}" if known else f"{runs} holds none"
     raise ConfigError("RIL-067", f"no run {text!r}", remedy=_near(text, names) or where)
+
+
+def elevation(text: str, runs: Path) -> Path:
+    """Path of an elevation model: the file, zarr group or folder of that name, else the run of that name."""
+    path = Path(text)
+    if path.is_file() or any((path / name).exists() for name in ("zarr.json", "dem.tif")):
+        return path
+    try:
+        return find(text, runs)
+    except ConfigError:
+        return path  # what reads it says what it may be
+
+
+def describe(chosen: Iterable[Path]) -> Iterator[str]:
+    """Lines of the table of runs, the latest last."""
+    yield f"{'run':44s} {'state':12s} {'computed':>8s} {'cached':>8s} {'seconds':>8s}"
+    for run in sorted(chosen, key=lambda r: r.name):
+        ended = Counter(row["status"] for row in events.read(run / LEDGER))
+        facts = events.facts(run / LEDGER)
+        seconds = facts.get("total", facts.get("seconds"))
+        missing = ended["failed"] + ended["skipped"]
+        state = "interrupted" if "ok" not in facts else f"{missing} missing" if missing else "complete"
+        took = "" if seconds is None else f"{seconds:.1f}"
+        yield f"{name(run):44s} {state:12s} {ended['computed']:8d} {ended['cached']:8d} {took:>8s}"
+
+
+def show(sequence: str, runs: Path) -> int:
+    """Print the runs of a sequence, or all of them.
+
+    Raises
+    ------
+    ConfigError
+        There is none.
+    """
+    chosen = [run for run in all_runs(runs) if sequence in ("", run.parent.name)]
+    if not chosen:
+        raise ConfigError(
+            "RIL-880", f"{runs} holds no run{f' of {sequence}' if sequence else ''}", remedy="check --runs"
+        )
+    print("\n".join(describe(chosen)))
+    return 0
 
 
 def row(rows: Iterable[dict[str, Any]], label: str, run: Path) -> dict[str, Any]:

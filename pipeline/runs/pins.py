@@ -30,7 +30,12 @@ def pin(store: Store, run: Path) -> int:
 
 
 def unpin(store: Store, text: str) -> str:
-    """Take the pin of a run away, given as ``SEQUENCE/ID``, ``ID`` or the run's folder; gives its name.
+    """Take the pin of a run away, given as ``SEQUENCE`` (its latest pin), ``SEQUENCE/ID``, ``ID`` or its folder.
+
+    Returns
+    -------
+    The name of the run.
+
 
     Raises
     ------
@@ -39,8 +44,8 @@ def unpin(store: Store, text: str) -> str:
     """
     pinned = [found["run"] for found in pins(store)]
     wanted = {text, "/".join(Path(text).absolute().resolve().parts[-2:])}
-    for name in pinned:
-        if wanted & {name, name.rpartition("/")[2]}:
+    for name in sorted(pinned, reverse=True):
+        if wanted & {name, *name.split("/")}:
             _path(store, name).unlink(missing_ok=True)
             return str(name)
     remedy = f"pinned are {', '.join(pinned)}" if pinned else "nothing is pinned in this cache"

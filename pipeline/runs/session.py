@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 from rille.datasets.protocol import Sequence
 from rille.pipeline.engine.code_digest import remember
 from rille.pipeline.engine.graph import Graph
+from rille.pipeline.engine.packages import installed
 from rille.pipeline.engine.store.artifact import DamagedError
 from rille.pipeline.engine.store.base import GoneError, Store, at
 from rille.pipeline.engine.store.location import Location, hints_folder, locate
@@ -34,10 +35,6 @@ if TYPE_CHECKING:
     from rille.pipeline.runs import run_files
 
 COMPLETE, FAILED, HOLES = 0, 1, 3
-DISTRIBUTIONS = (
-    *("rille", "numpy", "numba", "scipy", "opencv-python-headless", "dask", "zarr", "rasterio", "pyogrio", "pycolmap"),
-    *("matplotlib", "jinja2"),
-)
 
 
 @dataclass(frozen=True)
@@ -248,7 +245,7 @@ def _open(options: Options) -> _Opened:
     graph, store = Graph(), at(options.cache)
     products, drive = dataflow(graph, sequence, config, frames)
     return _Opened(
-        options, sequence, frames, config, text, settled, folder, started, _versions(), store, graph, drive,
+        options, sequence, frames, config, text, settled, folder, started, installed(), store, graph, drive,
         products,
     )  # fmt: skip
 
@@ -410,13 +407,6 @@ def _list_missing(graph: Graph, folder: Path) -> None:
     for h in failed:
         print(f"rille: missing {h.label}: {' '.join(str(h.error).split())}", file=sys.stderr)
     print(f"rille: {len(failed)} failed, {len(skipped)} left out; ledger: {folder / 'ledger.jsonl'}", file=sys.stderr)
-
-
-def _versions() -> dict[str, str]:
-    from importlib.metadata import version
-
-    python = ".".join(str(v) for v in sys.version_info[:3])
-    return {"python": python} | {name: version(name) for name in DISTRIBUTIONS}
 
 
 def export_dataset(name: str, directory: Path, assignments: tuple[str, ...], cache: Location) -> int:

@@ -10,6 +10,8 @@ from pathlib import Path
 import pytest
 from place import MOCKUP, OTHER, SEQUENCE, Place, sets
 
+from rille.pipeline.cli import app
+
 RUN_ID = r"\d{8}T\d{6}Z-[0-9a-f]{8}"
 RECONSTRUCTED = {"report.html", "report.json", "config.toml", "ledger.jsonl", "trajectory.tum", "trajectory.kitti"}
 RECONSTRUCTED |= {"dem.tif", "dem_sigma.tif", "hillshade.tif", "ortho.tif", "risk.tif", "path.geojson", "terrain.zarr"}
@@ -19,7 +21,9 @@ SAME_IN_EACH_RUN = ("trajectory.tum", "trajectory.kitti", "dem.tif", "dem_sigma.
 def test_the_version_and_the_commands(place: Place) -> None:
     version = place.rille("--version")
     assert (version.status, version.err) == (0, "")
-    assert re.fullmatch(r"\d+\.\d+\.\d+", version.last)
+    found = dict(line.split(maxsplit=1) for line in version.lines)
+    assert version.lines[0].startswith("rille ")
+    assert {"python", "numpy", "numba", "opencv-python-headless", "dask", "zarr", "system"} <= found.keys()
     bare = place.rille()
     assert (bare.status, bare.err) == (0, "")
     assert bare.lines[0] == "Usage: rille COMMAND"
@@ -115,6 +119,26 @@ def test_why_tells_of_its_own_sequence(place: Place, sequence: str, task: str) -
     assert first == second
 
 
+def test_runs(place: Place) -> None:
+    first, second = place.rille("runs"), place.rille("runs")
+    assert (first.status, first.err) == (0, "")
+    assert first == second
+    rows = {line.split()[0]: line.split()[1:] for line in first.lines[1:]}
+    assert len(rows) == 6
+    for run in place.runs("other"):
+        state, computed, cached, seconds = rows[f"other/{run.name}"]
+        assert state == "complete"
+        assert (int(computed) > 0) == (run == place.runs("other")[0])
+        assert int(computed) + int(cached) > 0 < float(seconds)
+    assert place.rille("runs", "other").lines[1:] == [line for line in first.lines[1:] if line.startswith("other/")]
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_completion_knows_commands_and_options(shell: str) -> None:
+    script = app.generate_completion(shell=shell)
+    assert {"reconstruct", "compare-dem", "prior-disparity"} <= set(re.findall(r"[a-z]+(?:-[a-z]+)*", script))
+
+
 def test_timing(place: Place) -> None:
     for run in ("mockup-loop", "other"):
         name = f"{run}/{place.runs(run)[0].name}"  # the one that has computed
@@ -198,7 +222,7 @@ def test_match(place: Place, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("kind", "made"), [("laz", "cloud.laz"), ("glb", "terrain.glb")])
 def test_export(place: Place, kind: str, made: str, tmp_path: Path) -> None:
-    words = ["export", place.runs("other")[-1], "--to", kind, "--output", tmp_path / made]
+    words = ["export", "other", "--to", kind, "--output", tmp_path / made]
     first, files = place.rille(*words), contents(tmp_path)
     assert (first.status, first.err) == (0, "")
     assert first.last.startswith(f"{tmp_path / made}  ")
@@ -227,6 +251,10 @@ def contents(folder: Path) -> dict[str, bytes]:
 def test_compare_dem(place: Place, tmp_path: Path) -> None:
     first_run, last_run = place.runs("mockup-short")
     first = place.rille("compare-dem", first_run, last_run / "dem.tif", folder=tmp_path)
+    named = place.rille("compare-dem", "mockup-short", last_run / "dem.tif", "--output", tmp_path / "named")
+    assert named.lines[2:-1] == first.lines[2:-1]
+    for path in tmp_path.glob("named.*"):
+        path.unlink()
     assert (first.status, first.err) == (0, "")
     assert first.last == "dem_comparison.png  dem_comparison.json"
     found = contents(tmp_path)
@@ -237,7 +265,8 @@ def test_compare_dem(place: Place, tmp_path: Path) -> None:
 
 
 def test_datasets(place: Place, tmp_path: Path) -> None:
-    listed = place.rille("datasets")
+    listed = place.rille("datasets", "list")
+    assert listed == place.rille("datasets")
     assert (listed.status, listed.err) == (0, "")
     assert [line.split()[0] for line in listed.lines[:3]] == ["mockup", "mockup-short", "mockup-loop"]
     exported = place.said["export"]
@@ -292,7 +321,7 @@ def test_cache_pin_and_unpin(place: Place, tmp_path: Path) -> None:
         assert (pinned.status, pinned.err) == (0, "")
         assert re.fullmatch(rf"pinned {run}: \d+ artifacts", pinned.last)
     assert place.rille("cache", "ls", "--cache", copy).last == f"pinned: {run}"
-    assert place.rille("cache", "unpin", run, "--cache", copy).status == 0
+    assert place.rille("cache", "unpin", "other", "--cache", copy).last == f"unpinned {run}"
     again = place.rille("cache", "unpin", run, "--cache", copy)
     assert again.status == 2
     assert again.complaint.startswith("rille: error RIL-563: ")

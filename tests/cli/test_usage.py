@@ -54,6 +54,7 @@ WRONG = {
         ("other trajectory --no-such-option", "RIL-001"),
     ],
     "params": [("no-such-section", "RIL-920"), ("--no-such-flag", "RIL-001")],
+    "runs": [("no-such-sequence", "RIL-880"), ("--runs no-such-folder", "RIL-880"), ("other other", "RIL-001")],
     "timing": [("no-such-run", "RIL-067"), ("--runs no-such-folder", "RIL-067"), ("other other", "RIL-001")],
     "check": [
         ("", "RIL-001"),
@@ -84,8 +85,8 @@ WRONG = {
     "export": [
         ("other", "RIL-001"),
         ("other --to obj", "RIL-001"),
-        ("no-such-run --to laz", "RIL-600"),
-        ("other --to colmap", "RIL-608"),
+        ("no-such-run --to laz", "RIL-067"),
+        ("runs/other --to colmap", "RIL-067"),
         ("runs/other/latest --to laz --to glb -o x", "RIL-020"),
     ],
     "compare-dem": [
@@ -95,6 +96,7 @@ WRONG = {
         ("runs/other/latest runs/other/latest --align shear", "RIL-001"),
     ],
     "datasets": [("no-such-dataset", "RIL-001"), ("--no-such-option", "RIL-001")],
+    "datasets list": [("other", "RIL-001")],
     "datasets export": [
         ("mockup-short", "RIL-001"),
         ("no-such-dataset x", "RIL-276"),

@@ -92,7 +92,7 @@ def test_damaged_images_are_named_and_the_rest_is_looked_at(tmp_path, capsys):
     code, lines = run(path, capsys)
     assert code == 1
     assert any("000.png" in text and "truncated" in text for text in lines)
-    assert any("1 of 8 cannot be used" in text for text in lines)
+    assert any("RIL-670: 1 of 8 images" in text for text in lines)
     assert line(lines, "matching").startswith("OK")
 
 
@@ -103,7 +103,7 @@ def test_nothing_whole_is_no_crash(tmp_path, capsys):
         file.write_bytes(file.read_bytes()[:-200])
     code, lines = run(path, capsys)
     assert code == 1
-    assert any("no pair is whole" in text for text in lines)
+    assert any("RIL-669" in text for text in lines)
     assert not (tmp_path / "check.png").exists()
 
 
