@@ -1,8 +1,8 @@
 """Reconstruct from Python: the same tasks, cache and files as ``rille reconstruct``.
 
 >>> import rille
->>> sequence = rille.open_sequence("mockup-short", mockup={"frames": 3})
->>> sequence.frames, round(sequence.rig.baseline, 3)
+>>> sequence = rille.open("mockup-short", mockup={"frames": 3})
+>>> len(sequence), round(sequence.rig.baseline, 3)
 (3, 0.097)
 >>> run = rille.reconstruct(sequence, hfvm={"preset": "fast"})  # doctest: +SKIP
 >>> run.terrain.elevation.sel(x=0.0, y=0.5, method="nearest")  # doctest: +SKIP
@@ -25,8 +25,7 @@ from typing import TYPE_CHECKING, Any
 
 import tomli_w
 
-from rille.datasets import registry
-from rille.datasets.protocol import Sequence
+from rille.pipeline.steps import StereoSequence
 from rille.stages.core.errors import ConfigError, InputError
 
 if TYPE_CHECKING:
@@ -36,29 +35,8 @@ AXES = ("x", "y", "z")
 Settings = Mapping[str, Any]
 
 
-def open_sequence(path: str | Path, **settings: Settings) -> Sequence:
-    """Open a sequence of stereo pairs.
-
-    Parameters
-    ----------
-    path : a name from ``rille datasets``, a folder, or a manifest.
-    settings : parameters of the sequence by section, e.g. ``mockup={"frames": 5}``.
-
-    Raises
-    ------
-    InputError
-        There is no such sequence, or it cannot be used.
-    ConfigError
-        A parameter is unknown, or not permitted.
-
-    >>> open_sequence("mockup-short").frame_names[:2]
-    ('000000', '000001')
-    """
-    return registry.open_sequence(str(path), settings)
-
-
 def reconstruct(
-    seq: Sequence | str | Path,
+    seq: StereoSequence | str | Path,
     client: Any = None,
     *,
     frames: str | None = None,
@@ -71,7 +49,7 @@ def reconstruct(
 
     Parameters
     ----------
-    seq : an open sequence, or what :func:`open_sequence` takes.
+    seq : an open sequence, or what :func:`rille.open` takes.
     client : ``distributed.Client`` of the cluster that computes; None: workers of this machine, one a core.
     frames : ``START:STOP[:STEP]``; all by default.
     runs : folder of the results.
@@ -92,7 +70,7 @@ def reconstruct(
     given: dict[str, Any] = {"executor": executor} if executor else {}
     if client is not None:
         given["executor"] = client.scheduler.address
-    opened = seq if isinstance(seq, Sequence) else None
+    opened = seq.source if isinstance(seq, StereoSequence) else None
     options = session.Options(
         str(seq) if opened is None else opened.name,
         assignments=tuple(assignments(settings)),

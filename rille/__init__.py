@@ -1,6 +1,7 @@
 """Stereo image sequences to terrain, trajectory, risk map and safe path.
 
-``open_sequence``, ``reconstruct``, ``open_run``: see :mod:`rille.pipeline.api`.
+One pair, step by step: ``open``, ``match``, ``terrain``, ``hazards``, ``path`` (:mod:`rille.pipeline.steps`). A whole
+sequence: ``reconstruct``, ``open_run`` (:mod:`rille.pipeline.api`).
 """
 
 from importlib import import_module
@@ -8,9 +9,21 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from rille.pipeline.api import Run, open_run, open_sequence, reconstruct
+    from rille.pipeline.api import Run, open_run, reconstruct
+    from rille.pipeline.steps import StereoPair, StereoSequence, hazards, match, open, path, terrain
 
-__all__ = ["Run", "open_run", "open_sequence", "reconstruct"]
+__all__ = [
+    "Run",
+    "StereoPair",
+    "StereoSequence",
+    "hazards",
+    "match",
+    "open",
+    "open_run",
+    "path",
+    "reconstruct",
+    "terrain",
+]
 
 _HERE = Path(__file__).resolve().parent
 if not (_HERE / "stages").is_dir():  # a checkout: the packages lie beside this folder; a wheel has them in it
@@ -20,4 +33,5 @@ if not (_HERE / "stages").is_dir():  # a checkout: the packages lie beside this 
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module {__name__} has no attribute {name}")
-    return getattr(import_module("rille.pipeline.api"), name)
+    home = "api" if name in ("Run", "open_run", "reconstruct") else "steps"
+    return getattr(import_module(f"rille.pipeline.{home}"), name)

@@ -26,7 +26,7 @@ def digests(run: Path) -> dict[str, str]:
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> rille.Run:
     folder = tmp_path_factory.mktemp("api")
-    sequence = rille.open_sequence("mockup-short", mockup=MOCKUP)
+    sequence = rille.open("mockup-short", mockup=MOCKUP)
     places = {"runs": folder / "runs", "cache": folder / "cache"}
     return rille.reconstruct(sequence, **places, executor="inline", **STAGES)  # type: ignore[arg-type]
 
@@ -71,7 +71,7 @@ def test_a_run_is_opened_and_shown(run: rille.Run, monkeypatch: pytest.MonkeyPat
 
 
 def test_what_cannot_be_is_one_clear_line(tmp_path: Path) -> None:
-    sequence = rille.open_sequence("mockup-short", mockup=MOCKUP)
+    sequence = rille.open("mockup-short", mockup=MOCKUP)
     with raises("RIL-860"):
         rille.reconstruct(sequence, runs=tmp_path, cache=tmp_path / "cache", mockup={"frames": 4})
     with raises("RIL-861"):
@@ -97,7 +97,7 @@ def test_no_stage_of_the_package_depends_on_it() -> None:
 def test_a_client_that_is_handed_in_computes_the_same_bits(run: rille.Run, tmp_path: Path) -> None:
     from distributed import Client, LocalCluster
 
-    sequence = rille.open_sequence("mockup-short", mockup=MOCKUP)
+    sequence = rille.open("mockup-short", mockup=MOCKUP)
     with (
         LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=":0") as cluster,
         Client(cluster) as client,

@@ -1,0 +1,375 @@
+"""One stereo pair, one step at a time from Python: images to disparity, elevation model, hazards and path.
+
+Each function lays out the tasks that a run lays out for the same step, and computes them in this process without a
+cache: the values are those of a run, to the bit. Datasets are those of the stages' outputs, with coordinates and units;
+their attributes carry the facts and settings that the next step needs.
+
+>>> import rille
+>>> small = {"frames": 1, "image_width": 190, "image_height": 174, "focal_length": 200}
+>>> pair = rille.open("mockup-short", mockup=small)[0]
+>>> disparity = rille.match(pair.left, pair.right)
+>>> disparity.column_disparity.dims, disparity.column_disparity.units
+(('row', 'col'), 'px')
+>>> dem = rille.terrain(disparity, pair, cell_size=0.005)
+>>> hazards = rille.hazards(dem)
+>>> path = rille.path(hazards)
+>>> dem.elevation.units, hazards.risk.dtype, path.path.dims
+('m', dtype('uint8'), ('vertex', 'xyz'))
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rille.datasets import registry
+from rille.datasets.protocol import Sequence
+from rille.stages.core.declare import Bundle, NoParams, Stage
+from rille.stages.core.errors import InputError
+from rille.stages.geometry.geometry import Rig
+
+if TYPE_CHECKING:
+    import xarray
+
+    from rille.pipeline.engine.graph import Handle
+    from rille.pipeline.flow.builders import Builder
+
+Settings = Mapping[str, Any]
+Known = dict["Handle", Bundle]
+
+
+@dataclass(frozen=True)
+class StereoSequence:
+    """A calibrated stereo sequence; ``sequence[k]`` is its pair number k, ``len(sequence)`` how many there are."""
+
+    source: Sequence
+    drawn: dict[str, Bundle] = field(default_factory=dict, repr=False, compare=False)
+    """Images that were read or rendered already, by label."""
+
+    @property
+    def name(self) -> str:
+        """Short name, also of the folder of its runs."""
+        return self.source.name
+
+    @property
+    def rig(self) -> Rig:
+        """The cameras, without lens distortion, and how they stand to each other, as given."""
+        return self.source.rig
+
+    def __len__(self) -> int:
+        return self.source.frames
+
+    def __getitem__(self, frame: int) -> StereoPair:
+        number = frame + len(self) if frame < 0 else frame
+        if not 0 <= number < len(self):
+            raise IndexError(f"pair {frame} of {len(self)}")
+        if number in self.source.lost:
+            raise InputError(
+                "RIL-863", f"frame {number} of {self.name}: {self.source.lost[number]}", remedy="take another frame"
+            )
+        return StereoPair(self, number)
+
+    def __iter__(self) -> Iterator[StereoPair]:
+        return (self[k] for k in range(len(self)) if k not in self.source.lost)
+
+
+@dataclass(frozen=True)
+class StereoPair:
+    """Both images of a pair, free of lens distortion, and what is known of it."""
+
+    sequence: StereoSequence
+    frame: int
+
+    @property
+    def left(self) -> xarray.DataArray:
+        """Left image (row, col), grey values; its coordinate ``valid`` is not zero where a pixel may be used."""
+        return self._image("left")
+
+    @property
+    def right(self) -> xarray.DataArray:
+        """Right image (row, col), as :attr:`left`."""
+        return self._image("right")
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Parameters that suit the sequence, by section; what is given to a function wins."""
+        from rille.pipeline.flow import config
+
+        source = self.sequence.source
+        vehicle = {} if source.vehicle is None else {"vehicle": source.vehicle.model_dump(mode="json")}
+        return config.merge(vehicle, config.expand(source.defaults))
+
+    def _image(self, camera: str) -> xarray.DataArray:
+        import xarray
+
+        found = _computed(_builder(self, self.settings).image(self.frame, camera), {}, self.sequence.drawn)
+        valid = found.arrays.get("valid")
+        return xarray.DataArray(
+            np.asarray(found["image"]),
+            dims=("row", "col"),
+            coords={} if valid is None else {"valid": (("row", "col"), np.asarray(valid))},
+            name=f"{camera}_image",
+            attrs={"units": "1", "long_name": f"{camera} image of pair {self.frame}", **_carried({}, self.settings)},
+        )
+
+
+def open(path: str | Path, **settings: Settings) -> StereoSequence:
+    """Open a sequence of stereo pairs.
+
+    Parameters
+    ----------
+    path : a name from ``rille datasets``, a folder, or a manifest.
+    settings : parameters of the sequence by section, e.g. ``mockup={"frames": 5}``.
+
+    Raises
+    ------
+    InputError
+        There is no such sequence, or it cannot be used.
+    ConfigError
+        A parameter is unknown, or not permitted.
+
+    >>> len(open("mockup-short"))
+    9
+    """
+    return StereoSequence(registry.open_sequence(str(path), settings))
+
+
+def match(left: Any, right: Any, **hfvm: Any) -> xarray.Dataset:
+    """Match two images of any two cameras, as ``rille match`` does and, of a pair, a run.
+
+    Parameters
+    ----------
+    left, right : images of a :class:`StereoPair`, or arrays (row, col), uint8, uint16 or floating point 0..255.
+    hfvm : parameters of section ``hfvm``, e.g. ``preset="fast"``.
+
+    Returns
+    -------
+    xarray.Dataset
+        ``column_disparity``, ``row_disparity``, ``disparity_std`` (pixels, right minus left), ``validity`` (bits) and
+        more, each (row, col) of the left image.
+
+    Raises
+    ------
+    InputError
+        An image is not grey.
+    ConfigError
+        A parameter is unknown, or not permitted.
+    """
+    _prepare()
+    from rille.pipeline.flow import config, tiles
+    from rille.stages.hfvm import stage as hfvm_stage
+    from rille.stages.imaging import pyramid
+
+    carried = _settings(left)
+    built: Any = config.build(carried, {"hfvm": hfvm})
+    images = [np.asarray(image) for image in (left, right)]
+    valid = [np.asarray(image.valid) if "valid" in getattr(image, "coords", ()) else None for image in (left, right)]
+    first, second = (pyramid.build(image, built.pyramid, mask) for image, mask in zip(images, valid, strict=True))
+    side = tiles.side(built.tiling, built.hfvm, (images[0].shape, images[1].shape))
+    found = hfvm_stage.match_pyramids(first, second, built.hfvm, side=side)
+    arrays = {name: value for name, value in vars(found).items() if name != "aligned"}
+    meta = hfvm_stage.facts(arrays, built.hfvm, found.aligned, int(np.count_nonzero(first.valid[0])))
+    return _dataset(hfvm_stage.STAGE, Bundle(arrays, meta), config.merge(carried, {"hfvm": hfvm}))
+
+
+def terrain(disparity: xarray.Dataset, pair: StereoPair, **locus: Any) -> xarray.Dataset:
+    """Reconstruct the elevation model of a pair (Locus), in the pair's own frame: x right, y ahead, z up, metres.
+
+    The origin is the left camera's centre. The relative orientation is repaired where the matches contradict it, and
+    the vertical is found, as in a run that has this pair alone.
+
+    Parameters
+    ----------
+    disparity : of :func:`match`, of this pair.
+    locus : parameters of section ``locus``, e.g. ``cell_size=0.01``.
+
+    Returns
+    -------
+    xarray.Dataset
+        ``elevation``, ``elevation_std`` (m), ``ortho`` (grey) and more, each (row, col), with ``x`` and ``y`` (m).
+
+    Raises
+    ------
+    DegenerateError
+        The pair shows no ground.
+    InputError
+        The disparity is not that of an image of this size.
+    """
+    from rille.pipeline.flow.reconstruction import vertical
+    from rille.stages.terrain.locus import stage as locus_stage
+
+    given, size = _bundle(disparity, "rille.match"), (pair.sequence.rig.left.height, pair.sequence.rig.left.width)
+    if disparity.column_disparity.shape != size:
+        raise InputError(
+            "RIL-865",
+            f"disparity of {disparity.column_disparity.shape} pixels, the pair's images have {size}",
+            remedy="give the disparity that rille.match finds for this pair",
+        )
+    settings = _merged(disparity, pair.settings, {"locus": locus})
+    make = _builder(pair, settings)
+    _, known = make.rig([pair.frame])
+    model = make.pair(pair.frame, vertical(make, pair.frame, pair.frame == 0), known, None)
+    found = _computed(model.dem, {model.disparity: given}, pair.sequence.drawn)
+    return _dataset(locus_stage.STAGE, found, settings)
+
+
+def hazards(dem: xarray.Dataset, vehicle: Settings | str | Path | None = None, **risk: Any) -> xarray.Dataset:
+    """Classify the ground of an elevation model for a vehicle.
+
+    Parameters
+    ----------
+    dem : of :func:`terrain`.
+    vehicle : limits and sizes (metres, degrees), as in section ``vehicle``, or a TOML file of them; None: that of the
+        sequence.
+    risk : parameters of section ``risk``.
+
+    Returns
+    -------
+    xarray.Dataset
+        ``risk`` (0 safe, 1 caution, 2 hazard, 3 unknown), ``p_hazard``, ``reason`` (bits) and the measures.
+    """
+    from rille.pipeline.flow import config
+    from rille.stages.hazard import risk as risk_stage
+
+    limits: dict[str, Any] = {}
+    if isinstance(vehicle, str | Path):
+        read = config.read_toml(Path(vehicle))
+        limits = read.get("vehicle", read)
+    elif vehicle is not None:
+        limits = dict(vehicle)
+    settings = _merged(dem, {"vehicle": limits, "risk": risk})
+    make, given = _builder(None, settings), _placeholder("dem")
+    found = _computed(make.hazards("risk", [given]), {given: _bundle(dem, "rille.terrain")}, {})
+    return _dataset(risk_stage.STAGE, found, settings)
+
+
+def path(
+    hazards: xarray.Dataset,
+    goal: tuple[float, float] | None = None,
+    start: tuple[float, float] | None = None,
+    **path: Any,
+) -> xarray.Dataset:
+    """Plan a path of least height differences that keeps the vehicle off hazards.
+
+    Parameters
+    ----------
+    hazards : of :func:`hazards`.
+    goal, start : x, y, metres, in the frame of the elevation model; None: the last row ahead, the first row.
+    path : parameters of section ``path``.
+
+    Returns
+    -------
+    xarray.Dataset
+        ``path`` (vertex, xyz), metres, empty where there is none; the attribute ``reason`` says why.
+
+    Raises
+    ------
+    InputError
+        Goal or start lies outside the map, in a hazard or on unknown ground.
+    """
+    from rille.stages.planning import path as path_stage
+
+    ends = {name: list(end) for name, end in (("target", goal), ("start", start)) if end is not None}
+    settings = _merged(hazards, {"path": {**path, **ends}})
+    make, given = _builder(None, settings), _placeholder("risk")
+    planned = make.node(path_stage, "path", {} if ends else {"use": "local"}, risk=given)
+    found = _computed(planned, {given: _bundle(hazards, "rille.hazards")}, {})
+    return _dataset(path_stage.STAGE, found, settings)
+
+
+# -- tasks in this process ----------------------------------------------------------------------------------------
+
+
+def _prepare() -> None:
+    from rille.pipeline.commands.options import prepare
+    from rille.pipeline.engine.runtime.numba_cache import guard
+
+    prepare()
+    guard()
+
+
+def _builder(pair: StereoPair | None, settings: Settings) -> Builder:
+    _prepare()
+    from rille.pipeline.engine.graph import Graph
+    from rille.pipeline.flow import config
+    from rille.pipeline.flow.builders import Builder
+
+    sequence: Any = None if pair is None else pair.sequence.source  # what needs none is given its inputs
+    return Builder(Graph(), sequence, config.build(settings))
+
+
+def _placeholder(label: str) -> Handle:
+    """A task whose result is known."""
+    from rille.pipeline.engine.graph import Handle
+    from rille.pipeline.engine.task import Spec
+
+    return Handle(-1, Spec("", label, NoParams()), {})
+
+
+def _computed(handle: Handle, known: Known, drawn: dict[str, Bundle]) -> Bundle:
+    """Result of a task; of those that it needs what is ``known``, or an image that was ``drawn`` before, is taken."""
+    if handle in known:
+        return known[handle]
+    spec, recorded = handle.spec, handle.spec.module.startswith("rille.datasets.")
+    if recorded and handle.label in drawn:
+        return drawn[handle.label]
+    inputs = {
+        port: [_computed(h, known, drawn) for h in given] if isinstance(given, list) else _computed(given, known, drawn)
+        for port, given in handle.inputs.items()
+    }
+    found = known[handle] = spec.stage.run(spec.params, {**spec.args, **spec.hints}, inputs)
+    if recorded:
+        drawn[handle.label] = found
+    return found
+
+
+# -- datasets -----------------------------------------------------------------------------------------------------
+
+
+def _carried(meta: Settings, settings: Settings) -> dict[str, str]:
+    return {"rille": json.dumps({"meta": dict(meta), "settings": dict(settings)})}
+
+
+def _settings(data: Any) -> dict[str, Any]:
+    text = getattr(data, "attrs", {}).get("rille")
+    return {} if text is None else dict(json.loads(text)["settings"])
+
+
+def _merged(data: xarray.Dataset, *more: Settings) -> dict[str, Any]:
+    """Settings of the step before, and what is given now over them."""
+    from rille.pipeline.flow import config
+
+    settings: dict[str, Any] = {}
+    for layer in (*more[:-1], _settings(data), more[-1]):
+        config.merge(settings, layer)
+    return settings
+
+
+def _bundle(data: xarray.Dataset, maker: str) -> Bundle:
+    if "rille" not in data.attrs:
+        raise InputError("RIL-864", "the dataset has no attribute rille", remedy=f"give what {maker} returns")
+    arrays = {str(name): np.asarray(array) for name, array in data.data_vars.items()}
+    return Bundle(arrays, json.loads(data.attrs["rille"])["meta"])
+
+
+def _dataset(stage: Stage, found: Bundle, settings: Settings) -> xarray.Dataset:
+    """Arrays with the dimensions, units and words that the stage declares, and coordinates of their lattice."""
+    import xarray
+
+    from rille.pipeline.engine.store.cf_coordinates import DIMS, coordinates, lattice_of
+
+    variables, lattice = {}, lattice_of(found.meta)
+    for name, values in found.arrays.items():
+        about = next(array for array in stage.outputs if array.matches(name))
+        attrs = {"units": about.unit, "long_name": about.long_name}
+        variables[name] = (about.dims, np.asarray(values), attrs)
+    places = {} if lattice is None else coordinates(lattice, str(found.meta.get("frame", "local")))
+    coords = {name: (dims, values, attrs) for name, (values, dims, attrs) in places.items()}
+    told = {k: v for k, v in found.meta.items() if isinstance(v, str | int | float) and not isinstance(v, bool)}
+    kept = coords if lattice is not None and any(list(v[0]) == DIMS for v in variables.values()) else {}
+    return xarray.Dataset(variables, kept, {**told, **_carried(found.meta, settings)})

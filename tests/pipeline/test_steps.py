@@ -1,0 +1,108 @@
+"""Step by step from Python: the values of a run and of the command line, to the bit."""
+
+from __future__ import annotations
+
+import doctest
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from raising import raises
+
+import rille
+from rille.pipeline import steps
+from rille.pipeline.cli import main
+from rille.pipeline.engine import events
+from rille.pipeline.engine.store.base import Store
+from rille.pipeline.export.writers import read_disparity
+
+MOCKUP = {"frames": 3, "image_width": 285, "image_height": 260, "focal_length": 300.0}
+VEHICLE = {"wheel_diameter": 0.05, "track": 0.08, "wheel_base": 0.1, "clearance": 0.03, "max_step": 0.012}
+
+
+@pytest.fixture(scope="module")
+def pair() -> rille.StereoPair:
+    return rille.open("mockup-short", mockup=MOCKUP)[0]
+
+
+@pytest.fixture(scope="module")
+def disparity(pair: rille.StereoPair) -> Any:
+    return rille.match(pair.left, pair.right, preset="fast")
+
+
+@pytest.fixture(scope="module")
+def dem(pair: rille.StereoPair, disparity: Any) -> Any:
+    return rille.terrain(disparity, pair, cell_size=0.004)
+
+
+def test_its_example_runs() -> None:
+    found = doctest.testmod(steps)
+    assert found.attempted >= 8
+    assert not found.failed
+
+
+def test_each_step_has_the_values_of_a_run(pair: rille.StereoPair, disparity: Any, dem: Any, tmp_path: Path) -> None:
+    given: Any = {"hfvm": {"preset": "fast"}, "locus": {"cell_size": 0.004}}
+    places: Any = {"runs": tmp_path / "runs", "cache": tmp_path / "cache", "executor": "inline"}
+    run = rille.reconstruct(pair.sequence, **places, **given)
+    keys = {row["label"]: (row["stage"], row["key"]) for row in events.read(run.folder / "ledger.jsonl")}
+    store = Store(tmp_path / "cache")
+    hazards = rille.hazards(dem)
+    ours = {"hfvm/0": disparity, "locus/local/0": dem, "risk/local/0": hazards, "path/local/0": rille.path(hazards)}
+    for label, found in ours.items():
+        stored = store.open(store.lookup(*keys[label]))
+        assert set(stored.arrays) == set(found.data_vars)
+        for name in stored.arrays:
+            np.testing.assert_array_equal(found[name], stored[name], err_msg=f"{label} {name}")
+
+
+def test_match_has_the_values_of_the_command(pair: rille.StereoPair, tmp_path: Path) -> None:
+    import cv2
+
+    for camera in ("left", "right"):
+        cv2.imwrite(str(tmp_path / f"{camera}.png"), np.asarray(getattr(pair, camera)))
+    out = tmp_path / "d.tif"
+    with pytest.raises(SystemExit, match="0"):
+        main(["match", *(str(tmp_path / f"{c}.png") for c in ("left", "right")), "--dense", "-o", str(out)])
+    images = [cv2.imread(str(tmp_path / f"{c}.png"), cv2.IMREAD_GRAYSCALE) for c in ("left", "right")]
+    found = rille.match(*images)
+    column, row = read_disparity(out, images[0].shape)
+    np.testing.assert_array_equal(found.column_disparity, column)
+    np.testing.assert_array_equal(found.row_disparity, row)
+
+
+def test_places_and_goals_are_in_metres(dem: Any) -> None:
+    assert float(dem.x[1] - dem.x[0]) == pytest.approx(0.004)
+    assert dem.elevation.units == "m"
+    hazards = rille.hazards(dem, vehicle=VEHICLE)
+    free = np.argwhere(np.asarray(hazards.risk) == 0)
+    goal = tuple(float(v) for v in (hazards.x[free[0, 1]], hazards.y[free[0, 0]]))
+    found = rille.path(hazards, goal=goal)
+    if found.sizes["vertex"]:
+        assert np.asarray(found.path[-1, :2]) == pytest.approx(goal, abs=0.004)
+    else:
+        assert found.attrs["reason"]
+
+
+def test_the_vehicle_may_be_a_file(dem: Any, tmp_path: Path) -> None:
+    (tmp_path / "rover.toml").write_text("[vehicle]\n" + "".join(f"{k} = {v}\n" for k, v in VEHICLE.items()))
+    one, other = rille.hazards(dem, vehicle=tmp_path / "rover.toml"), rille.hazards(dem, vehicle=VEHICLE)
+    np.testing.assert_array_equal(one.risk, other.risk)
+
+
+def test_what_does_not_fit_is_one_clear_line(pair: rille.StereoPair, disparity: Any, dem: Any) -> None:
+    import xarray
+
+    with pytest.raises(IndexError):
+        pair.sequence[3]
+    assert pair.sequence[-1].frame == 2
+    assert [p.frame for p in pair.sequence] == [0, 1, 2]
+    with raises("RIL-864", "rille.terrain"):
+        rille.hazards(xarray.Dataset())
+    with raises("RIL-865", "(260, 285)"):
+        rille.terrain(disparity.isel(row=slice(5)), pair)
+    with raises("RIL-027", "hfvm.no"):
+        rille.match(pair.left, pair.right, no=1)
+    with raises("RIL-027", "vehicle.wings"):
+        rille.hazards(dem, vehicle={"wings": 2})
