@@ -20,8 +20,10 @@ from rille.pipeline.engine.memory.limits import words
 from rille.pipeline.engine.runtime.environment import cores
 from rille.pipeline.engine.scheduler import Result
 from rille.pipeline.engine.store.base import at
+from rille.pipeline.export.view import RunView
 from rille.pipeline.flow import unread
 from rille.pipeline.flow.closed_loop import dataflow
+from rille.pipeline.runs import run_files
 from rille.pipeline.runs.session import Options, check_options, choose_frames, settings, warn
 from rille.stages.core.errors import ConfigError
 
@@ -44,7 +46,15 @@ def plan(options: Options, *, verbose: bool = False) -> int:
     warn(sequence)
     frames = choose_frames(options.frames, sequence.frames)
     graph, store = Graph(), at(options.cache)
-    dataflow(graph, sequence, config, frames)
+    products, drive = dataflow(graph, sequence, config, frames)
+
+    def outputs() -> None:
+        if graph.unfinished:  # what they would read is not all known: they belong to the tasks that follow
+            return
+        taken = (sequence, frames) if drive is None else drive.taken()
+        run_files.plan(graph, RunView("", *taken, products, (), config, vehicle_source=settled.vehicle_source))
+
+    graph.last = outputs
     result = scheduler.run(graph, store, dry=True, force=options.force)
     result.check()
     lost = [] if result.unknown else unread.unread(settled.given, config, graph)
@@ -72,12 +82,12 @@ def needs(graph: Graph, known: Costs, shares: Account) -> Iterable[str]:
         by_stage[graph.nodes[index].stage].append(f)
     if not by_stage:
         return
-    yield f"{'stage':16s} {'memory a task':>20s} {'results on disk':>16s}  how this is known"
+    yield f"{'stage':19s} {'memory a task':>20s} {'results on disk':>16s}  how this is known"
     for stage, tasks in by_stage.items():
         most = max(tasks, key=lambda f: f.memory)
         need = f"{words(most.memory)} +-{100 * most.spread:.0f} %"
         sources = dict.fromkeys(f.source for f in tasks)
-        yield f"{stage:16s} {need:>20s} {words(sum(f.stored for f in tasks)):>16s}  {'; '.join(sources)}"
+        yield f"{stage:19s} {need:>20s} {words(sum(f.stored for f in tasks)):>16s}  {'; '.join(sources)}"
     together = sorted((f.most for f in foreseen.values()), reverse=True)[: shares.workers]
     tasks_most = min(sum(together), shares.budget)
     peak = shares.own + shares.workers * shares.rest + tasks_most
@@ -94,11 +104,11 @@ def describe(graph: Graph, result: Result, earlier: Kinds, jobs: int, *, verbose
     by_stage: dict[str, list[Handle]] = defaultdict(list)
     for handle in graph.nodes:
         by_stage[handle.stage].append(handle)
-    yield f"{'stage':16s} {'cached':>7s} {'to do':>7s}  why"
+    yield f"{'stage':19s} {'cached':>7s} {'to do':>7s}  why"
     for stage, handles in by_stage.items():
         planned = [h for h in handles if h.status == "planned"]
         told = [] if verbose else _reasons(planned)
-        yield f"{stage:16s} {len(handles) - len(planned):7d} {len(planned):7d}  {'; '.join(told)}".rstrip()
+        yield f"{stage:19s} {len(handles) - len(planned):7d} {len(planned):7d}  {'; '.join(told)}".rstrip()
         if verbose:
             yield from (f"    {h.label}: {h.reason}" for h in planned)
     yield from _totals(graph, result, earlier, jobs)

@@ -125,6 +125,8 @@ class Graph:
     expansions: list[tuple[list[Handle], Expansion, bool]] = field(default_factory=list)
     last: Callable[[], None] | None = None
     """Called once nothing else will be laid out: adds what reads all of it."""
+    unfinished: int = 0
+    """Flows that wait for something: where a plan ends with some, it does not know all tasks."""
     _labels: set[str] = field(default_factory=set)
 
     def node(
@@ -168,6 +170,7 @@ class Graph:
         of references, or what the flows returned. Where one will never be, ``MissingError`` is raised in it.
         """
         flow = Flow(steps)
+        self.unfinished += 1
         self._go_on(flow, lambda: next(steps))
         return flow
 
@@ -181,8 +184,10 @@ class Graph:
             self.expansions.append((error.handles, lambda *_: None, False))  # the run's end says what it waited for
         else:
             self._wait(flow, wanted)
-        for follower in flow.followers if flow.done else ():
-            follower()
+        if flow.done:
+            self.unfinished -= 1
+            for follower in flow.followers:
+                follower()
 
     def _wait(self, flow: Flow[Any], wanted: Wait) -> None:
         one, maybe = isinstance(wanted, Handle | Flow), isinstance(wanted, Maybe)

@@ -330,7 +330,7 @@ class _Run:
     def _end_plan(self) -> bool:
         """Lay out what comes last, once everything else is laid out or will never be; whether there was such."""
         last = self.graph.last
-        if last is None or self.dry or (self.expansions and self.flying):
+        if last is None or (self.expansions and self.flying):
             return False
         self.graph.last = None
         last()

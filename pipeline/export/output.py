@@ -106,12 +106,17 @@ def task(output: Output, view: Any) -> tuple[dict[str, Any], list[Any]] | None:
     """Arguments and inputs of the task that makes an output; None where what it needs is not there."""
     for name in output.needs:
         needed = list(_handles(getattr(view.products, name)))
-        if not needed or any(handle.ref is None for handle in needed):
+        if not needed or not all(map(_due, needed)):
             return None
     there: dict[int, tuple[int, Any]] = {}
     layout = {name: _layout(getattr(view.products, name), there) for name in sorted({*output.needs, *output.reads})}
     facts = {name: plain(_get(view, name)) for name in output.knows}
     return {"file": output.name, "products": layout, "facts": facts}, [handle for _, handle in there.values()]
+
+
+def _due(handle: Any) -> bool:
+    """Whether there is an artifact; a plan counts on those that are to be computed."""
+    return handle.ref is not None or handle.status == "planned"
 
 
 def restore(args: Mapping[str, Any], bundles: Sequence[Bundle]) -> Any:
@@ -171,12 +176,12 @@ def _handles(value: Any) -> Iterator[Any]:
 
 
 def _layout(value: Any, there: dict[int, tuple[int, Any]]) -> Any:
-    """Plain form of what holds handles; those that have an artifact are collected in ``there`` and told by number.
+    """Plain form of what holds handles; those of artifacts are collected in ``there`` and replaced by their number.
 
     A dictionary is sorted: tasks are laid out in the order in which results come, which is not always the same.
     """
     if hasattr(value, "spec") and hasattr(value, "ref"):
-        if value.ref is None:
+        if not _due(value):
             return None
         return {"read": there.setdefault(id(value), (len(there), value))[0]}
     if isinstance(value, Mapping):

@@ -37,9 +37,20 @@ def lay_out(graph: Graph, view: RunView, made: Made) -> None:
             graph.flow(_make(graph, view, module, output, made))
 
 
+def plan(graph: Graph, view: RunView) -> None:
+    """Add the task of each output that a run would make; ``view`` holds what is known without computing anything."""
+    for module in MODULES:
+        for output in module.OUTPUTS:
+            _add(graph, view, module, output, {})
+
+
 def _make(graph: Graph, view: RunView, module: ModuleType, output: Output, made: Made) -> Generator[Wait, Any, None]:
     # what was laid out last is there last: looked at first, it spares looking at all others
     yield Maybe(handles(output, view.products)[::-1])
+    _add(graph, view, module, output, made)
+
+
+def _add(graph: Graph, view: RunView, module: ModuleType, output: Output, made: Made) -> None:
     found = task(output, view)
     if found is not None:
         args, inputs = found

@@ -39,6 +39,7 @@ class Handle:
     name: str
     ref: str | None
     spec: str = ""
+    status: str = "computed"
 
 
 def run(place: Georeference | None = None) -> Any:
