@@ -33,7 +33,7 @@ def compute(cache, *, sequence="", choice="", **kw):
 
 def test_of_an_empty_cache_says_what_it_cannot_know(cache):
     told = lines(cache)
-    assert told[1].split() == "numbers 0 4 never computed (4)".split()
+    assert told[1].split() == ["numbers", "0", "4", "never", "computed", "(4)"]
     assert told[-2] == "4 tasks known: 0 cached, 4 to do, about 4 s with 2 workers by earlier runs"
     assert told[-1].startswith("more tasks follow, known only after numbers/0, numbers/1, numbers/2")
 
@@ -46,7 +46,7 @@ def test_when_all_is_cached_nothing_is_to_do(cache):
 def test_a_changed_parameter_is_named_and_what_follows_is_laid_out_by_the_last_run(cache):
     compute(cache)
     told = lines(cache, seed=1)
-    assert told[1].split() == "numbers 0 4 params.seed 0 -> 1 (4)".split()
+    assert told[1].split() == ["numbers", "0", "4", "params.seed", "0", "->", "1", "(4)"]
     assert told[2].endswith("an input is to be computed (4)")
     assert "9 tasks known: 0 cached, 9 to do" in told[-2]
     assert told[-1].startswith("laid out by the last run's numbers/0")
