@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rille.stages.numeric.robust import mad_sigma
+
 from .methods import DEFAULT, Method, Model
 from .scenes import Scene
 
@@ -37,7 +39,7 @@ def judge(scene: Scene, model: Model, most: float = np.inf) -> Judged:
     share = error.size / scene.judged.sum()
     if not error.size:
         return Judged(share, np.nan, np.nan, np.nan, np.nan)
-    spread = 1.4826 * float(np.median(np.abs(error - np.median(error))))
+    spread = mad_sigma(error)
     rmse, p95 = float(np.sqrt(np.mean(error**2))), float(np.percentile(np.abs(error), 95))
     return Judged(share, rmse, spread, p95, float(np.mean(error)))
 

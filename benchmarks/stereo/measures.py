@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rille.stages.numeric.robust import mad_sigma
+
 Map = NDArray[np.float64]
 
 THRESHOLDS = (1, 2, 3)
@@ -143,7 +145,7 @@ def _spread(off: Map, std: Map | None) -> dict[str, float | None]:
     """Figures of matched columns: NMAD, and shares within one and two standard deviations."""
     if not off.size:
         return {"nmad": None, "within_1": None, "within_2": None}
-    nmad = 1.4826 * float(np.median(np.abs(off - np.median(off))))
+    nmad = mad_sigma(off)
     within = {f"within_{k}": None if std is None else float(np.mean(np.abs(off) <= k * std)) for k in (1, 2)}
     return {"nmad": nmad, **within}
 

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rille.stages.numeric.robust import mad_sigma
+
 Image = NDArray[Any]
 
 
@@ -36,5 +38,5 @@ def ground_limits(elevation: Image) -> tuple[float, float]:
     if finite.size == 0:
         return low, high
     middle = float(np.median(finite))
-    reach = max(5 * 1.4826 * float(np.median(np.abs(finite - middle))), 1e-3 * (high - low))
+    reach = max(5 * mad_sigma(finite), 1e-3 * (high - low))
     return max(low, middle - reach), min(high, middle + reach)

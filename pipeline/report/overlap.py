@@ -10,6 +10,7 @@ import numpy as np
 from rille.pipeline.export import ranges
 from rille.pipeline.export.view import RunView
 from rille.stages.geometry.lattice import Lattice
+from rille.stages.numeric.robust import mad_sigma
 
 LEAST_CELLS = 100
 """Common cells below which a median says little."""
@@ -61,6 +62,6 @@ def _difference(view: RunView, before: int, pair: int) -> Difference | None:
         return None
     sampled = ranges.sample(difference)
     median = float(np.median(sampled))
-    deviation = 1.4826 * float(np.median(np.abs(sampled - median)))
+    deviation = mad_sigma(sampled)
     predicted = ranges.sample(np.where(np.isfinite(difference), expected, np.nan))
     return Difference(before, pair, cells, median, deviation, float(np.median(predicted)))

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from rille.stages.geometry.epipolar import distances
 from rille.stages.geometry.geometry import Rig
+from rille.stages.numeric.robust import mad_sigma
 
 Floats = NDArray[np.float64]
 
@@ -65,7 +66,7 @@ def row_spread(rig: Rig, left: tuple[Floats, Any] | None, right: tuple[Floats, A
     apart = apart[np.abs(apart) < REACH * rig.left.height]
     if len(apart) < LEAST:
         return None
-    return float(1.4826 * np.median(np.abs(apart - np.median(apart))))
+    return mad_sigma(apart)
 
 
 def best_shift(spreads: Mapping[int, list[float | None]]) -> tuple[int, float, float] | None:

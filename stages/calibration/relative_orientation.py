@@ -20,11 +20,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
-from rille.stages.calibration import relative_orientation_kernel
 from rille.stages.geometry.epipolar import NAMES, distances, normals
 from rille.stages.geometry.geometry import Rig
+from rille.stages.numeric.robust import MAD_TO_SIGMA, TUKEY_BISQUARE, bisquare
 
 Floats = NDArray[np.float64]
 
@@ -53,7 +54,6 @@ LEAST_MATCHES = 50
 LEAST_NOISE = 0.02
 """Pixels: no match is better."""
 
-TUKEY = 4.685
 BLOCKS = 6
 """Blocks along either side of the image whose means show how far errors of neighbours go together."""
 
@@ -274,9 +274,58 @@ def _blocks(rig: Rig, matches: Matches) -> NDArray[np.int64]:
 def _pair(linear: Linear, last: float, x: Floats) -> _Part:
     """One pair's part of the normal equations, with weights from its own scatter (at most ``last``, pixels)."""
     weights, normal, pull = np.empty(len(linear.constant)), np.empty((SIZE, SIZE)), np.empty(SIZE)
-    given = linear.constant, linear.design, x, linear.block
-    noise = relative_orientation_kernel.weigh(*given, BLOCKS**2, last, LEAST_NOISE, TUKEY, weights, normal, pull)
+    noise = _weigh(linear.constant, linear.design, linear.block, x, last, (weights, normal, pull))
     return _Part(normal, pull, float(noise), weights)
+
+
+@njit(cache=True, nogil=True)
+def _weigh(constant, design, block, x, last, out):  # type: ignore[no-untyped-def]
+    """Fill ``out`` with one pair's normal equations about ``x`` (m,); returns the scale, pixels.
+
+    Sums run in the order of the matches.
+
+    Parameters
+    ----------
+    constant, design : residuals ``constant + design @ x``, (n,) and (n, m), pixels.
+    block : (n,) block of the image, below ``BLOCKS`` squared.
+    last : pixels; greatest scale.
+    out : weights (n,), normal matrix (m, m) and right side (m,).
+    """
+    weights, normal, pull = out
+    count, unknowns = design.shape
+    rest = np.empty(count)
+    for n in range(count):
+        total = constant[n]
+        for k in range(unknowns):
+            total += design[n, k] * x[k]
+        rest[n] = total
+    noise = max(LEAST_NOISE, min(last, MAD_TO_SIGMA * np.median(np.abs(rest))))
+    # Errors of neighbours go together: means of blocks scatter by more than the matches in them explain.
+    number, sums = np.zeros(BLOCKS**2), np.zeros(BLOCKS**2)
+    for n in range(count):
+        weights[n] = bisquare(rest[n] / (TUKEY_BISQUARE * noise))
+        number[block[n]] += weights[n]
+        sums[block[n]] += weights[n] * rest[n]
+    together, used = 0.0, 0
+    for k in range(BLOCKS**2):
+        if number[k] >= 5.0:
+            together += sums[k] ** 2 / number[k]
+            used += 1
+    spread = max(1.0, together / used / noise**2) if used else 1.0
+    normal[:], pull[:] = 0.0, 0.0
+    for n in range(count):
+        information = weights[n] / (noise**2 * spread)
+        if information == 0.0:
+            continue
+        for i in range(unknowns):
+            a = information * design[n, i]
+            pull[i] -= a * constant[n]
+            for k in range(i + 1):
+                normal[i, k] += a * design[n, k]
+    for i in range(unknowns):
+        for k in range(i):
+            normal[k, i] = normal[i, k]
+    return noise
 
 
 def _smooth_terms(rig: Rig, matches: Matches) -> Floats:

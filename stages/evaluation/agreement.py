@@ -19,6 +19,7 @@ from rille.stages.core.declare import AnyArray, Array, Bundle, Inputs, Params, S
 from rille.stages.evaluation.accuracy import angles_between, by_frame
 from rille.stages.evaluation.accuracy_parts import Metric, metric, posed
 from rille.stages.evaluation.pose_alignment import align, moved, spread
+from rille.stages.numeric.robust import mad_sigma
 
 Floats = NDArray[np.float64]
 
@@ -125,7 +126,7 @@ def flag(arrays: Mapping[str, Floats], params: AgreementParams) -> tuple[NDArray
             limits[name] = None
             continue
         median = float(np.median(values))
-        sigma = 1.4826 * float(np.median(np.abs(values - median)))
+        sigma = mad_sigma(values)
         least = math.radians(params.least_angle_deg) if "angle" in name else 1e-9  # rounding is no reason
         limit = max(median + params.threshold * sigma, params.least_ratio * median, least)
         limits[name] = limit

@@ -18,6 +18,7 @@ from rille.stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
 from rille.stages.core.errors import InputError
 from rille.stages.evaluation.accuracy_parts import Metric, metric
 from rille.stages.geometry.lattice import Lattice, mosaic
+from rille.stages.numeric.robust import mad_sigma
 
 
 def dem_accuracy(
@@ -40,7 +41,7 @@ def dem_accuracy(
     return {
         "rmse": metric(float(np.sqrt(np.mean(error**2))) if some else None, "m", f"RMS elevation error, {how}"),
         "nmad": metric(
-            1.4826 * float(np.median(np.abs(error - np.median(error)))) if some else None,
+            mad_sigma(error) if some else None,
             "m",
             f"1.4826 times the median deviation from the median error, {how}",
         ),

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from rille.stages.core.errors import DegenerateError, InputError
 from rille.stages.geometry.geometry import orthonormal, rotation_exp
+from rille.stages.numeric.robust import TUKEY_BISQUARE, bisquare, mad_sigma
 from rille.stages.terrain.shading import gradient
 
 Floats = NDArray[np.float64]
@@ -26,7 +27,6 @@ Align = Literal["shift", "tilt", "rigid"]
 MEANS_FROM = 1.5  # ratio of cells from which the finer model's cells are averaged instead of interpolated
 LEAST_SHARE = 0.5  # of a coarse cell's area that the finer cells must know
 FREE = {"shift": [0, 1, 2], "tilt": [2, 3, 4], "rigid": [0, 1, 2, 3, 4, 5]}  # of tx ty tz wx wy wz
-BIWEIGHT = 4.685  # Tukey's constant: 95 % efficiency where the errors are normal
 MOST_POINTS = 300_000  # that an alignment uses: six unknowns need no more
 ITERATIONS = 50
 WORST_CONDITION = 1e7  # of the normal matrix in units of cells: beyond, the terrain is flat for what is asked
@@ -195,8 +195,8 @@ def _gauss_newton(
     r, n = difference[good], normal[good]
     q = moved[good] - state.centre - state.translation
     J = np.column_stack([n, np.cross(q, n)])[:, free] * unit
-    scale = max(1.4826 * float(np.median(np.abs(r - np.median(r)))), 1e-9)
-    w = np.maximum(0.0, 1.0 - (r / (BIWEIGHT * scale)) ** 2) ** 2
+    scale = max(mad_sigma(r), 1e-9)
+    w = bisquare(r / (TUKEY_BISQUARE * scale))
     N = (J * w[:, None]).T @ J
     values = np.linalg.eigvalsh(N)
     if not values[0] * WORST_CONDITION > values[-1]:
@@ -234,7 +234,7 @@ def figures(error: Floats) -> dict[str, float]:
     middle = float(np.median(e))
     return {
         "rmse": float(np.sqrt(np.mean(e * e))),
-        "nmad": 1.4826 * float(np.median(np.abs(e - middle))),
+        "nmad": mad_sigma(e),
         "p95": float(np.percentile(np.abs(e), 95)),
         "bias": float(np.mean(e)),
         "median": middle,

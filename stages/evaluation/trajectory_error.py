@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rille.stages.evaluation.accuracy_parts import Metric, along, angle, inverse, metric, rms
+from rille.stages.geometry.geometry import cross_matrix, rotation_log
 
 Floats = NDArray[np.float64]
 
@@ -88,8 +89,8 @@ def by_cause(P: Floats, Q: Floats) -> dict[str, Metric]:
     rest = p - scale * q
     bound = float(np.sqrt((rest**2).sum() / (3 * len(p) - 1) / (q * q).sum()))
     swing = _between(q.mean(0), p.mean(0))
-    direction = math.degrees(float(np.linalg.norm(rotation_vectors(swing[None])[0])))
-    turns = rotation_vectors(np.swapaxes(dQ[:, :3, :3], 1, 2) @ dP[:, :3, :3])
+    direction = math.degrees(float(np.linalg.norm(rotation_log(swing[None])[0])))
+    turns = rotation_log(np.swapaxes(dQ[:, :3, :3], 1, 2) @ dP[:, :3, :3])
     mean, count = turns.mean(0), len(turns)
     bias = float(np.linalg.norm(mean))
     error = float(np.sqrt(((turns - mean) ** 2).sum() / max(count - 1, 1) / count))
@@ -118,17 +119,8 @@ def _between(a: Floats, b: Floats) -> Floats:
     size = float(np.linalg.norm(a) * np.linalg.norm(b))
     if size < LEAST_MOVED**2 or float(a @ b) <= 0:
         return np.eye(3)
-    axis = np.cross(a, b) / size
-    k = np.array([[0.0, -axis[2], axis[1]], [axis[2], 0.0, -axis[0]], [-axis[1], axis[0], 0.0]])
+    k = cross_matrix(np.cross(a, b) / size)
     return np.asarray(np.eye(3) + k + k @ k / (1.0 + float(a @ b) / size))
-
-
-def rotation_vectors(R: Floats) -> Floats:
-    """Rotation vectors (n, 3), radians, of rotations (n, 3, 3) below half a turn."""
-    axis = 0.5 * np.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], axis=-1)
-    sine = np.linalg.norm(axis, axis=1)
-    turn = np.arctan2(sine, 0.5 * (np.trace(R, axis1=1, axis2=2) - 1.0))
-    return np.asarray(axis * np.where(sine > 1e-12, turn / np.maximum(sine, 1e-300), 1.0)[:, None])
 
 
 def against_claims(P: Floats, aligned: Floats, covariance: Floats) -> dict[str, Metric]:
@@ -143,7 +135,7 @@ def against_claims(P: Floats, aligned: Floats, covariance: Floats) -> dict[str, 
     rows, origin = np.flatnonzero(known)[1:], int(np.argmax(claimed))
     if len(rows) == 0 or not known[origin] or not (np.linalg.eigvalsh(covariance[rows])[:, 0] > 0).all():
         return {"nees": metric(None, "1", "not applicable: no covariances of frames behind the first")}
-    turn = rotation_vectors(aligned[rows, :3, :3] @ np.swapaxes(P[rows, :3, :3], 1, 2))
+    turn = rotation_log(aligned[rows, :3, :3] @ np.swapaxes(P[rows, :3, :3], 1, 2))
     error = np.concatenate([aligned[rows, :3, 3] - P[rows, :3, 3], turn], axis=1)
     weighed = np.linalg.solve(covariance[rows], error[..., None])[..., 0]
     value = float((error * weighed).sum(1).mean()) / 6.0

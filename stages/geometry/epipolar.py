@@ -19,7 +19,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rille.stages.geometry.geometry import Rig, RigidTransform, rotation_exp
+from rille.stages.geometry.geometry import Rig, RigidTransform, cross_matrix, left_jacobian, rotation_exp
 from rille.stages.geometry.triangulation import inverse_depth
 
 Floats = NDArray[np.float64]
@@ -58,10 +58,10 @@ def distances(rig: Rig, correction: Floats, left: Floats, right: Floats) -> tupl
     rotation = rotation_exp(correction[:3]) @ rig.T_right_left.rotation
     # A line of the image with matrix K is K^-T times the normal R (c x ray) of the plane of sight.
     to_line, to_ray = np.linalg.inv(rig.right.matrix).T, np.linalg.inv(rig.left.matrix)
-    turns = _left_jacobian(correction[:3])
-    upright = rotation @ _skew(centre)
-    to_slopes = [to_line @ _skew(turns[:, i]) @ upright @ to_ray for i in range(3)]
-    to_slopes += [to_line @ rotation @ _skew(swings[:, i]) @ to_ray for i in range(2)]
+    turns = left_jacobian(correction[:3])
+    upright = rotation @ cross_matrix(centre)
+    to_slopes = [to_line @ cross_matrix(turns[:, i]) @ upright @ to_ray for i in range(3)]
+    to_slopes += [to_line @ rotation @ cross_matrix(swings[:, i]) @ to_ray for i in range(2)]
     distance, slopes = np.empty(len(left)), np.empty((len(left), 5))
     _distances(to_line @ upright @ to_ray, np.array(to_slopes), left, right, distance, slopes)
     return distance, slopes
@@ -92,7 +92,8 @@ def normals(rig: Rig, correction: Floats, left: Floats) -> Floats:
     """Unit normals (n, 2) of the epipolar lines of left points: what a distance grows by for a pixel of column, row."""
     centre, _ = _centre(rig, correction)
     rotation = rotation_exp(correction[:3]) @ rig.T_right_left.rotation
-    line = np.einsum("nk,ik->ni", rig.left.rays(left), np.linalg.inv(rig.right.matrix).T @ rotation @ _skew(centre))
+    to_line = np.linalg.inv(rig.right.matrix).T @ rotation @ cross_matrix(centre)
+    line = np.einsum("nk,ik->ni", rig.left.rays(left), to_line)
     return np.asarray(line[:, :2] / _signed_length(line)[:, None], dtype=np.float64)
 
 
@@ -156,17 +157,3 @@ def _signed_length(line: Floats) -> Floats:
     """Length of the normals of lines (n, 3), signed so that they point down the image (right, of steep lines)."""
     steep = np.abs(line[:, 0]) > np.abs(line[:, 1])
     return np.hypot(line[:, 0], line[:, 1]) * np.where(np.where(steep, line[:, 0], line[:, 1]) < 0, -1.0, 1.0)
-
-
-def _skew(v: Floats) -> Floats:
-    """Matrix of the cross product with v."""
-    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
-
-
-def _left_jacobian(w: Floats) -> Floats:
-    """Columns: angular velocity of ``exp(w)`` for a change of each element of w."""
-    angle, k = float(np.linalg.norm(w)), _skew(w)
-    if angle < 1e-6:
-        return np.asarray(np.eye(3) + 0.5 * k, dtype=np.float64)
-    a, b = (1.0 - math.cos(angle)) / angle**2, (angle - math.sin(angle)) / angle**3
-    return np.asarray(np.eye(3) + a * k + b * (k @ k), dtype=np.float64)

@@ -196,14 +196,41 @@ def angles_from_rotation(rotation: ArrayLike) -> tuple[float, float, float]:
     return math.atan2(r[1, 2], r[2, 2]), phi, math.atan2(r[0, 1], r[0, 0])
 
 
+def cross_matrix(v: Floats) -> Floats:
+    """[v]x (..., 3, 3) of vectors (..., 3): ``[v]x u = v x u``."""
+    z = np.zeros(v.shape[:-1])
+    x, y, w = v[..., 0], v[..., 1], v[..., 2]
+    return np.stack([np.stack([z, -w, y], -1), np.stack([w, z, -x], -1), np.stack([-y, x, z], -1)], -2)
+
+
 def rotation_exp(w: ArrayLike) -> Floats:
-    """Rotation matrix of a rotation vector (3,), radians (Rodrigues)."""
+    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3), radians (Rodrigues)."""
     v = np.asarray(w, dtype=np.float64)
-    angle = float(np.linalg.norm(v))
-    k = np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
-    if angle < 1e-9:
-        return np.asarray(np.eye(3) + k + 0.5 * (k @ k), dtype=np.float64)
-    a, b = math.sin(angle) / angle, (1.0 - math.cos(angle)) / angle**2
+    angle = np.sqrt((v * v).sum(-1))
+    safe = np.where(angle < 1e-9, 1.0, angle)
+    a = np.where(angle < 1e-9, 1.0, np.sin(safe) / safe)[..., None, None]
+    b = np.where(angle < 1e-9, 0.5, (1.0 - np.cos(safe)) / safe**2)[..., None, None]
+    k = cross_matrix(v)
+    return np.asarray(np.eye(3) + a * k + b * (k @ k))
+
+
+def rotation_log(R: Floats) -> Floats:
+    """Rotation vectors (..., 3), radians, of rotations (..., 3, 3) below half a turn: inverse of :func:`rotation_exp`.
+
+    The angle is ``atan2(sine, cosine)``, exact near zero, unlike the arc cosine of the trace.
+    """
+    axis = 0.5 * np.stack([R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], -1)
+    sine = np.linalg.norm(axis, axis=-1)
+    angle = np.arctan2(sine, 0.5 * (np.trace(R, axis1=-2, axis2=-1) - 1.0))
+    return np.asarray(axis * np.where(sine > 1e-12, angle / np.maximum(sine, 1e-300), 1.0)[..., None])
+
+
+def left_jacobian(w: Floats) -> Floats:
+    """Left Jacobian (3, 3) of SO(3): ``exp(w + dw) = exp(J dw) exp(w)`` to first order, ``w`` (3,) radians."""
+    angle, k = float(np.linalg.norm(w)), cross_matrix(w)
+    if angle < 1e-6:
+        return np.asarray(np.eye(3) + 0.5 * k, dtype=np.float64)
+    a, b = (1.0 - math.cos(angle)) / angle**2, (angle - math.sin(angle)) / angle**3
     return np.asarray(np.eye(3) + a * k + b * (k @ k), dtype=np.float64)
 
 

@@ -11,10 +11,10 @@ import math
 import numpy as np
 from numba import njit
 
+from rille.stages.numeric.robust import MAD_TO_SIGMA, TUKEY_BISQUARE, bisquare
+
 PLANES = 5
 """Maps that :func:`merge_cells` fills."""
-BICUBIC = 4.685  # Tukey's constant: 95 % efficiency where the errors are normal
-CONSISTENT = 1.4826  # median absolute deviation to standard deviation, of normal errors
 
 
 @njit(cache=True, nogil=True)
@@ -112,10 +112,9 @@ def _agree(h, s, w, d, order, m):  # type: ignore[no-untyped-def]
     centre = _median(h, w, order, m, False)
     for i in range(m):
         d[i] = abs(h[i] - centre)
-    typical = CONSISTENT * _median(d, w, order, m, True)
+    typical = MAD_TO_SIGMA * _median(d, w, order, m, True)
     for i in range(m):
-        u = d[i] / (BICUBIC * max(typical, s[i]))
-        w[i] *= max(0.0, 1.0 - u * u) ** 2
+        w[i] *= bisquare(d[i] / (TUKEY_BISQUARE * max(typical, s[i])))
 
 
 @njit(cache=True, nogil=True)

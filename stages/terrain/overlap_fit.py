@@ -17,6 +17,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from rille.stages.numeric.robust import TUKEY_BISQUARE, bisquare, mad_sigma
+
 Floats = NDArray[np.float64]
 
 BLOCKS = 400
@@ -30,8 +32,6 @@ ALIKE = 0.2
 """Correlation of neighbouring blocks above which they are made larger, until each stands for itself."""
 REACH = 2
 """Blocks to either side whose errors may be alike still."""
-BICUBIC = 4.685
-CONSISTENT = 1.4826
 ROUNDS = 20
 
 
@@ -86,7 +86,7 @@ def fit_seam(difference: Floats, x: Floats, y: Floats) -> SeamFit | None:
         return None
     surface = fit.at(x[None], y[:, None])[seen]
     left = np.abs(difference[seen] - surface)
-    noise, systematic = CONSISTENT * float(np.median(left)), math.sqrt(float(np.mean(surface**2)))
+    noise, systematic = mad_sigma(left, 0.0), math.sqrt(float(np.mean(surface**2)))
     return replace(fit, noise=noise, systematic=systematic)
 
 
@@ -141,14 +141,14 @@ def _robust(design: Floats, value: Floats, weight: Floats) -> tuple[Floats, Floa
     for turn in range(ROUNDS):
         residual = value - design @ plane
         size = np.abs(residual)
-        scale = CONSISTENT * float(np.median(size[weight > 0]))
+        scale = mad_sigma(size[weight > 0], 0.0)
         if scale <= 1e-12 * float(np.abs(value).max()):
             break
         absolute = 1.0 / np.maximum(size, 0.01 * scale)
-        biweight = np.maximum(0.0, 1.0 - (residual / (BICUBIC * scale)) ** 2) ** 2
+        biweight = bisquare(residual / (TUKEY_BISQUARE * scale))
         plane = _solve(design, value, weight * (absolute if turn < ROUNDS // 2 else biweight))
     residual = value - design @ plane
-    return plane, residual, CONSISTENT * float(np.median(np.abs(residual)[weight > 0]))
+    return plane, residual, mad_sigma(residual[weight > 0], 0.0)
 
 
 def _solve(design: Floats, value: Floats, weight: Floats) -> Floats:
@@ -161,7 +161,7 @@ def _covariance(design: Floats, residual: Floats, weight: Floats, scale: float) 
     """Covariance of the plane from the scatter of the blocks, those nearby taken together."""
     if scale <= 0:
         return np.zeros((3, 3))
-    u = np.clip((residual / (BICUBIC * scale)) ** 2, 0.0, 1.0)
+    u = np.clip((residual / (TUKEY_BISQUARE * scale)) ** 2, 0.0, 1.0)
     slope, psi = (1.0 - u) * (1.0 - 5.0 * u), residual * (1.0 - u) ** 2
     bread = np.einsum("rc,rci,rcj->ij", weight * slope, design, design)
     score = design * (weight * psi)[..., None]

@@ -14,16 +14,18 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from pydantic import Field
 
 from rille.stages.core.declare import Params
-from rille.stages.geometry.geometry import Camera, Rig
-from rille.stages.odometry.resection import bundle_adjustment_kernel as kernel
-from rille.stages.odometry.resection.pnp import HUBER, cross_matrix, exponential
+from rille.stages.geometry.geometry import Camera, rotation_exp
+from rille.stages.geometry.projection import NEAREST, Pinhole, linearise, project, rotated, to_camera
+from rille.stages.numeric.robust import huber_cost, huber_weight
+from rille.stages.odometry.resection.pnp import HUBER
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -43,14 +45,8 @@ class RefineParams(Params):
         ge=0,
         description="segments that are adjusted together, the last of them for good; 0: all of the sequence at once",
     )
-    stereo: bool = Field(
-        default=False,
-        description="use the disparity of the basic pair at a segment's end as a second measurement; it shares its"
-        " errors with the first one, and gains little",
-    )
     iterations: int = Field(default=20, ge=1, description="limit of Levenberg-Marquardt steps; five are usual")
     pixel_sigma: float = Field(default=0.2, gt=0, description="pixels; expected error of a tracked position")
-    disparity_sigma: float = Field(default=0.2, gt=0, description="pixels; expected error of the next pair's disparity")
     bias_sigma: float = Field(
         default=0.1, ge=0, description="pixels; prior of the error that all disparities share (toe-in of the rig)"
     )
@@ -66,13 +62,12 @@ class RefineParams(Params):
 
 
 @dataclass(frozen=True)
-class Views:
+class SegmentTracks:
     """Measurements of one segment.
 
     ``position``, ``along`` (n, 3) of the landmarks in the local frame, and how they move with their disparity, m and
     m/pixel; ``sigma`` (n,) of it, pixels. ``pixels`` (frame, n, 2) of the frames behind the key, ``seen`` (frame, n)
-    whether they count. ``right`` (n, 2) of the last frame, pixels, ``right_sigma`` (n,); NaN none. ``tilt`` (n,) pixels
-    of disparity a radian of pitch that stands for a principal point's row.
+    whether they count. ``tilt`` (n,) pixels of disparity a radian of pitch that stands for a principal point's row.
     """
 
     position: Floats
@@ -80,115 +75,136 @@ class Views:
     sigma: Floats
     pixels: Floats
     seen: Bools
-    right: Floats
-    right_sigma: Floats
     camera: Camera
-    rig: Rig
     tilt: Floats
 
-    def without_tilt(self, tilt: float) -> Views:
+    def without_tilt(self, tilt: float) -> SegmentTracks:
         """With landmarks where they are if the disparities are tilted by so many radians."""
         return replace(self, position=self.position + (tilt * self.tilt)[:, None] * self.along)
 
 
 @dataclass(frozen=True)
-class State:
+class SegmentState:
     """``R`` (frame, 3, 3), ``t`` (frame, 3) of T_cam_local behind the key; ``depth`` (n,) corrections, pixels."""
 
     R: Floats
     t: Floats
     depth: Floats
 
-    def moved(self, pose: Floats, depth: Floats) -> State:
+    def moved(self, pose: Floats, depth: Floats) -> SegmentState:
         """After steps (frame, 6) ``v, w`` as in :mod:`rille.stages.odometry.resection.pnp`, and (n,)."""
-        turn = exponential(pose[:, 3:])
+        turn = rotation_exp(pose[:, 3:])
         t = np.einsum("fij,fj->fi", turn, self.t) + pose[:, :3]
-        return State(turn @ self.R, t, self.depth + depth)
+        return SegmentState(turn @ self.R, t, self.depth + depth)
 
 
-def _camera_errors(x: Floats, moves: Floats, camera: Camera, pixels: Floats) -> tuple[Floats, Floats, Floats]:
-    """Errors (..., 2), derivatives (..., 2, 3) by camera coordinates ``x``, and along ``moves`` (..., 2)."""
-    z = np.where(x[..., 2] > 1e-6, x[..., 2], np.nan)
-    u, v = x[..., 0] / z, x[..., 1] / z
-    error = np.stack([camera.fx * u + camera.cx, camera.fy * v + camera.cy], -1) - pixels
-    P = np.zeros((*z.shape, 2, 3))
-    P[..., 0, 0], P[..., 0, 2] = camera.fx / z, -camera.fx * u / z
-    P[..., 1, 1], P[..., 1, 2] = camera.fy / z, -camera.fy * v / z
-    return error, P, np.einsum("...ij,...j->...i", P, moves)
+class _Tracks(NamedTuple):
+    """Tracks of a segment for the compiled loops: landmarks, where they were seen, and the poses of the frames."""
+
+    position: Any
+    along: Any
+    pixels: Any
+    seen: Any
+    camera: Any
+    sigma: Any
+    R: Any
+    t: Any
+    shift: Any
 
 
-def stereo_rows(views: Views, state: State, bias: float) -> tuple[Floats, Floats, Floats, Floats, Bools]:
-    """Disparities (along their epipolar lines) of the last frame's pair: only its right minus its left image counts.
-
-    Whitened errors (n,), derivatives by the last pose (n, 6), by depth and by bias (n,), use.
-    """
-    use = np.isfinite(views.right_sigma)
-    R = state.R[-1]
-    x = (views.position + (state.depth + bias)[:, None] * views.along) @ R.T + state.t[-1]
-    moves = views.along @ R.T
-    T, pixels = views.rig.T_right_left, views.pixels[-1]
-    left, P, g = _camera_errors(x, moves, views.camera, pixels)
-    right, Q, h = _camera_errors(x @ T.rotation.T + T.translation, moves @ T.rotation.T, views.rig.right, views.right)
-    rays = (x / np.where(x[:, 2:] > 0, x[:, 2:], np.nan)) @ T.rotation.T
-    _, _, slope = _camera_errors(x @ T.rotation.T + T.translation, rays, views.rig.right, views.right)
-    unit = slope / np.linalg.norm(slope, axis=-1, keepdims=True)
-    s = np.where(use, views.right_sigma, 1.0)
-    change = Q @ T.rotation - P
-    by_pose = np.concatenate([change, np.einsum("nij,njk->nik", change, -cross_matrix(x))], -1)
-    error = ((right - left) * unit).sum(-1) - bias
-    by_depth = ((h - g) * unit).sum(-1)
-    by_pose = np.einsum("ni,nij->nj", unit, by_pose) / s[:, None]
-    good = use & np.isfinite(error) & np.isfinite(by_pose).all(-1)
-    rows = (np.where(good, a, 0.0) for a in (error / s, by_depth / s, (by_depth - 1.0) / s))
-    error, by_depth, by_bias = rows
-    return error, np.where(good[:, None], by_pose, 0.0), by_depth, by_bias, good
+def _tracks(views: SegmentTracks, state: SegmentState, bias: float, sigma: float) -> _Tracks:
+    camera = Pinhole.of(views.camera)
+    given = (views.position, views.along, views.pixels, views.seen, camera, float(sigma))
+    return _Tracks(*given, state.R, state.t, state.depth + bias)
 
 
-def _tracks(views: Views, state: State, bias: float, sigma: float) -> tuple[Any, ...]:
-    """What the compiled loops want of the tracks."""
-    camera = views.camera
-    cam = (float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy))
-    given = (views.position, views.along, views.pixels, views.seen, cam, float(sigma), HUBER)
-    return (*given, state.R, state.t, state.depth + bias)
+@njit(cache=True, nogil=True)
+def _observe(data, f, n, j):  # type: ignore[no-untyped-def]
+    """Fill ``j`` (2, 8), pixels, for landmark ``n`` in frame ``f`` (see :func:`linearise`); whether it was seen."""
+    if not data.seen[f, n]:
+        return False
+    x = to_camera(data.R[f], data.t[f], data.position[n], data.along[n], data.shift[n])
+    if not x[2] > NEAREST:
+        return False
+    linearise(data.camera, x, rotated(data.R[f], data.along[n]), data.pixels[f, n], j)
+    return True
 
 
-def cost_of(views: Views, state: State, bias: float, sigma: float) -> float:
-    """Huber's cost of a segment with its depths' priors (that of the bias is the window's)."""
-    total = 0.5 * float(((state.depth / views.sigma) ** 2).sum())
-    total += float(kernel.cost(*_tracks(views, state, bias, sigma)))
-    if np.isfinite(views.right_sigma).any():
-        error, *_, use = stereo_rows(views, state, bias)
-        norm = np.abs(error[use])
-        total += float(np.where(norm <= HUBER, 0.5 * norm**2, HUBER * norm - 0.5 * HUBER**2).sum())
+@njit(cache=True, nogil=True)
+def _track_cost(data):  # type: ignore[no-untyped-def]
+    """Huber's cost of the tracks."""
+    j = np.empty((2, 8))
+    total = 0.0
+    for f in range(len(data.R)):
+        for n in range(len(data.position)):
+            if _observe(data, f, n, j):
+                total += huber_cost(np.sqrt(j[0, 7] ** 2 + j[1, 7] ** 2) / data.sigma, HUBER)
     return total
 
 
-def normal(views: Views, state: State, bias: float, sigma: float) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+@njit(cache=True, nogil=True)
+def _track_normal(data, out):  # type: ignore[no-untyped-def]
+    """Add the tracks' part of the normal equations to ``out``, as :func:`normal` gives them.
+
+    The sums run in the order of frames and landmarks. A shift of one depth and that of all depths move a pixel alike,
+    so the last row of ``B`` collects what the depths' own diagonal does, and the shared unknown's part follows.
+    """
+    A, B, d, ga, gd = out
+    j, last = np.empty((2, 8)), len(A) - 1
+    for f in range(len(data.R)):
+        at = 6 * f
+        for n in range(len(data.position)):
+            if not _observe(data, f, n, j):
+                continue
+            r = np.sqrt(j[0, 7] ** 2 + j[1, 7] ** 2) / data.sigma
+            weight = huber_weight(r, HUBER) / (data.sigma * data.sigma)
+            for i in range(6):
+                p, q = weight * j[0, i], weight * j[1, i]
+                for k in range(i + 1):
+                    A[at + i, at + k] += p * j[0, k] + q * j[1, k]
+                B[at + i, n] += p * j[0, 6] + q * j[1, 6]
+                ga[at + i] += p * j[0, 7] + q * j[1, 7]
+            square = weight * (j[0, 6] * j[0, 6] + j[1, 6] * j[1, 6])
+            slope = weight * (j[0, 6] * j[0, 7] + j[1, 6] * j[1, 7])
+            d[n] += square
+            gd[n] += slope
+            B[last, n] += square
+            ga[last] += slope
+    for n in range(len(data.position)):
+        A[last, last] += B[last, n]
+        for i in range(last):
+            A[last, i] += B[i, n]
+    for i in range(last + 1):
+        for k in range(i):
+            A[k, i] = A[i, k]
+
+
+def cost_of(views: SegmentTracks, state: SegmentState, bias: float, sigma: float) -> float:
+    """Huber's cost of a segment with its depths' priors (that of the bias is the window's)."""
+    total = 0.5 * float(((state.depth / views.sigma) ** 2).sum())
+    return total + float(_track_cost(_tracks(views, state, bias, sigma)))
+
+
+def normal(
+    views: SegmentTracks, state: SegmentState, bias: float, sigma: float
+) -> tuple[Floats, Floats, Floats, Floats, Floats]:
     """``A`` (p, p), ``B`` (p, n), ``d`` (n,), gradients (p,) and (n,): p of the poses and the bias, n depths."""
     m, n = len(state.R), len(state.depth)
     A, B, d = np.zeros((6 * m + 1, 6 * m + 1)), np.zeros((6 * m + 1, n)), views.sigma**-2.0
     ga, gd = np.zeros(6 * m + 1), state.depth * d
-    kernel.normal(*_tracks(views, state, bias, sigma), A, B, d, ga, gd)
-    if np.isfinite(views.right_sigma).any():
-        error, pose, g, c, use = stereo_rows(views, state, bias)
-        w = np.where(use, HUBER / np.maximum(np.abs(error), HUBER), 0.0)
-        J = np.zeros((n, 6 * m + 1))
-        J[:, 6 * (m - 1) : 6 * m], J[:, -1] = pose, c
-        weighted = J * w[:, None]
-        A += weighted.T @ J
-        B += weighted.T * g
-        ga += weighted.T @ error
-        d, gd = d + w * g**2, gd + w * g * error
+    _track_normal(_tracks(views, state, bias, sigma), (A, B, d, ga, gd))
     return A, B, d, ga, gd
 
 
-def adjust(segments: Sequence[tuple[Views, State]], params: RefineParams) -> tuple[list[State], float, float, float]:
+def adjust(
+    segments: Sequence[tuple[SegmentTracks, SegmentState]], params: RefineParams
+) -> tuple[list[SegmentState], float, float, float]:
     """Minimise the cost of some segments with one bias; states, bias (pixels), cost before and after."""
     prior, sigma = _prior(params), params.pixel_sigma
     views, states = [v for v, _ in segments], [s for _, s in segments]
     bias, damping = 0.0, FIRST_DAMPING
 
-    def cost(at: Sequence[State], b: float) -> float:
+    def cost(at: Sequence[SegmentState], b: float) -> float:
         return 0.5 * prior * b * b + sum(cost_of(v, s, b, sigma) for v, s in zip(views, at, strict=True))
 
     first = now = cost(states, bias)
@@ -236,23 +252,20 @@ def _step(
     return float(common), steps
 
 
-def scatter(views: Views, state: State, bias: float, sigma: float) -> float:
+def scatter(views: SegmentTracks, state: SegmentState, bias: float, sigma: float) -> float:
     """Variance of the errors found over the one expected: weighted squares of a segment per degree of freedom.
 
     Depths add one unknown and one measurement each (their disparity), so that tracks and poses decide the freedom.
     """
     x = np.einsum("fij,nj->fni", state.R, views.position + (state.depth + bias)[:, None] * views.along)
     x += state.t[:, None]
-    error = _camera_errors(x, np.zeros_like(x), views.camera, views.pixels)[0] / sigma
-    use = views.seen & np.isfinite(error).all(-1)
+    image, _, behind = project(views.camera, x)
+    error = (image - views.pixels) / sigma
+    use = views.seen & ~behind & np.isfinite(error).all(-1)
     squares = np.where(use, (error**2).sum(-1), 0.0)
     total = float((squares * HUBER / np.maximum(np.sqrt(squares), HUBER)).sum())
     total += float(((state.depth / views.sigma) ** 2).sum())
     measured = 2 * int(use.sum())
-    if np.isfinite(views.right_sigma).any():
-        off, *_, good = stereo_rows(views, state, bias)
-        total += float((off**2 * HUBER / np.maximum(np.abs(off), HUBER)).sum())
-        measured += int(good.sum())
     return max(total / max(measured - 6 * len(state.R), 1), 1e-12)
 
 
@@ -289,7 +302,7 @@ def posterior(
     ]
 
 
-def tilt_of(views: Views, state: State, bias: float, params: RefineParams) -> tuple[float, float]:
+def tilt_of(views: SegmentTracks, state: SegmentState, bias: float, params: RefineParams) -> tuple[float, float]:
     """Information and pull of the tilt by one segment, its poses, depths and bias free."""
     A, B, d, ga, gd = normal(views, state, bias, params.pixel_sigma)
     prior = _prior(params)

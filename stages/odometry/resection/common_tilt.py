@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from rille.stages.core.declare import Bundle, Inputs, NoParams, Stage
 from rille.stages.geometry.geometry import Rig
+from rille.stages.numeric.robust import huber_weight, mad_sigma
 
 Floats = NDArray[np.float64]
 
@@ -40,8 +41,8 @@ def common_tilt(parts: Floats, prior_sigma: float) -> tuple[float, float]:
     for _ in range(5):  # of a segment that is far off, no more than of one at two deviations
         tilt = float((information * value).sum() / information.sum())
         off = np.abs(value - tilt) * np.sqrt(information)
-        spread = max(1.0, 1.4826 * float(np.median(off)))
-        information = parts[:, 0] * np.minimum(1.0, 2.0 * spread / np.maximum(off, 1e-12))
+        spread = max(1.0, mad_sigma(off, 0.0))
+        information = parts[:, 0] * huber_weight(off, 2.0 * spread)
     total = float(information.sum()) / spread**2
     prior = prior_sigma**-2.0
     return tilt * total / (total + prior), (total + prior) ** -0.5

@@ -19,19 +19,21 @@ the covariance contains it.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
-from rille.stages.geometry.geometry import Camera, RigidTransform
-from rille.stages.odometry.resection import pnp_kernel as kernel
+from rille.stages.geometry.geometry import Camera, RigidTransform, cross_matrix, rotation_exp
+from rille.stages.geometry.projection import NEAREST, Pinhole, linearise, project, rotated, to_camera
+from rille.stages.numeric.robust import huber_cost, huber_weight
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
-NEAREST = 1e-6
-"""Depth, metres, below which a landmark counts as behind the camera."""
+UNKNOWNS = 7
+"""Translation, rotation, and the error that all disparities share."""
 HUBER = 2.5
 """Huber's bound in standard deviations: 4 % of Gaussian errors in two dimensions lie beyond it."""
 
@@ -88,7 +90,7 @@ class Poses:
 
     def moved(self, step: Floats) -> Poses:
         """After steps (b, 7): ``v``, ``w``, and that of the bias."""
-        turn = exponential(step[:, 3:6])
+        turn = rotation_exp(step[:, 3:6])
         t = np.einsum("bij,bj->bi", turn, self.t) + step[:, :3]
         return Poses(turn @ self.R, t, self.bias + step[:, 6])
 
@@ -110,35 +112,12 @@ class Errors:
     per_pixel: Floats
 
 
-def exponential(w: Floats) -> Floats:
-    """Rotation matrices (b, 3, 3) of rotation vectors (b, 3), radians (Rodrigues)."""
-    angle = np.sqrt((w * w).sum(-1))
-    safe = np.where(angle < 1e-9, 1.0, angle)
-    a = np.where(angle < 1e-9, 1.0, np.sin(safe) / safe)[:, None, None]
-    b = np.where(angle < 1e-9, 0.5, (1.0 - np.cos(safe)) / safe**2)[:, None, None]
-    k = cross_matrix(w)
-    return np.asarray(np.eye(3) + a * k + b * (k @ k))
-
-
-def cross_matrix(v: Floats) -> Floats:
-    """[v]x (..., 3, 3) of vectors (..., 3)."""
-    z = np.zeros(v.shape[:-1])
-    x, y, w = v[..., 0], v[..., 1], v[..., 2]
-    return np.stack([np.stack([z, -w, y], -1), np.stack([w, z, -x], -1), np.stack([-y, x, z], -1)], -2)
-
-
 def back_projection(obs: Observations, poses: Poses) -> Errors:
     """Eq. 7 and 8 at each pose; observations of a batch of one serve any number of poses."""
-    camera = obs.camera
     landmarks = obs.landmarks + poses.bias[:, None, None] * obs.per_pixel
     x = np.einsum("bij,bnj->bni", poses.R, landmarks) + poses.t[:, None]
-    behind = x[..., 2] < NEAREST
-    z = np.where(behind, 1.0, x[..., 2])
-    u, v = x[..., 0] / z, x[..., 1] / z
-    pixels = np.stack([camera.fx * u + camera.cx, camera.fy * v + camera.cy], -1) - obs.pixels
-    projection = np.zeros((*z.shape, 2, 3))
-    projection[..., 0, 0], projection[..., 0, 2] = camera.fx / z, -camera.fx * u / z
-    projection[..., 1, 1], projection[..., 1, 2] = camera.fy / z, -camera.fy * v / z
+    image, projection, behind = project(obs.camera, x)
+    pixels = image - obs.pixels
     turned = np.einsum("bij,bnj->bni", poses.R, np.broadcast_to(obs.per_pixel, x.shape))
     per_pixel = np.einsum("bnij,bnj->bni", projection, turned)
     white = _whiten(pixels[..., None], per_pixel * obs.sigma[..., None], obs.pixel_sigma)[..., 0]
@@ -165,7 +144,7 @@ def _whiten(a: Floats, g: Floats, sigma: float) -> Floats:
 def normal_matrix(obs: Observations, errors: Errors, active: Bools) -> tuple[Floats, Floats, Floats]:
     """Weighted normal matrix (b, 7, 7), gradient (b, 7) and weights (b, n) of Huber's cost, without the prior."""
     usable = active & np.isfinite(errors.norm)
-    weight = np.where(usable, HUBER / np.maximum(np.where(usable, errors.norm, 1.0), HUBER), 0.0)
+    weight = np.where(usable, huber_weight(np.where(usable, errors.norm, 1.0), HUBER), 0.0)
     jacobian = derivatives(obs, errors)
     weighted = jacobian * weight[..., None, None]
     normal = np.einsum("bnik,bnil->bkl", weighted, jacobian)
@@ -175,7 +154,7 @@ def normal_matrix(obs: Observations, errors: Errors, active: Bools) -> tuple[Flo
 def norms(obs: Observations, poses: Poses) -> Floats:
     """Mahalanobis lengths (b, n) of the errors, as :func:`back_projection` has them, and nothing else."""
     out = np.empty((len(poses.t), obs.landmarks.shape[1]))
-    kernel.norms(*_data(obs), *_pose_arrays(poses), out)
+    _norms(_problems(obs), _pose_arrays(poses), out)
     return out
 
 
@@ -188,23 +167,222 @@ def levenberg_marquardt(
     Marquardt's (scaled by the diagonal), which also holds a singular problem still instead of letting it fly off.
     """
     poses = _pose_arrays(start)
-    done = kernel.minimise(*_data(obs), HUBER, obs.prior, np.ascontiguousarray(active), iterations, tolerance, *poses)
+    done = _minimise(_problems(obs), np.ascontiguousarray(active), iterations, tolerance, poses)
     return Poses(*poses), int(done)
 
 
-def _data(obs: Observations) -> tuple[Any, ...]:
-    """What the compiled loops want of observations."""
-    camera = obs.camera
+class _Problems(NamedTuple):
+    """:class:`Observations` for the compiled loops."""
+
+    landmarks: Any
+    per_pixel: Any
+    sigma: Any
+    pixels: Any
+    camera: Any
+    pixel_sigma: Any
+    prior: Any
+
+
+class _Pose(NamedTuple):
+    """One pose of :class:`Poses` for the compiled loops."""
+
+    R: Any
+    t: Any
+    bias: Any
+
+
+def _problems(obs: Observations) -> _Problems:
     arrays = (obs.landmarks, obs.per_pixel, obs.sigma, obs.pixels)
-    return (
-        *(np.ascontiguousarray(a, dtype=np.float64) for a in arrays),
-        (float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy)),
-        float(obs.pixel_sigma),
-        NEAREST,
-    )
+    landmarks, per_pixel, sigma, pixels = (np.ascontiguousarray(a, dtype=np.float64) for a in arrays)
+    camera = Pinhole.of(obs.camera)
+    return _Problems(landmarks, per_pixel, sigma, pixels, camera, float(obs.pixel_sigma), float(obs.prior))
 
 
 def _pose_arrays(poses: Poses) -> tuple[Floats, Floats, Floats]:
     """Copies that may be written to."""
     R, t, bias = (np.array(a, dtype=np.float64, order="C") for a in (poses.R, poses.t, poses.bias))
     return R, t, bias
+
+
+# Compiled loops. One problem's arithmetic does not depend on the others in its batch, and sums run in the order of the
+# landmarks, so that results do not depend on how problems are grouped. ``o, n``: problem and landmark.
+
+
+@njit(cache=True, nogil=True)
+def _in_camera(data, o, n, pose):  # type: ignore[no-untyped-def]
+    """Camera coordinates of a landmark, and of what it moves by a pixel of disparity; three numbers each."""
+    along = data.per_pixel[o, n]
+    return to_camera(pose.R, pose.t, data.landmarks[o, n], along, pose.bias), rotated(pose.R, along)
+
+
+@njit(cache=True, nogil=True)
+def _observe(data, o, n, pose, j):  # type: ignore[no-untyped-def]
+    """Fill ``j`` (2, 8) with whitened Jacobian (2, 7) and error (2) of a landmark; its length, infinite if behind."""
+    x, along = _in_camera(data, o, n, pose)
+    if not x[2] >= NEAREST:
+        return np.inf
+    linearise(data.camera, x, along, data.pixels[o, n], j)
+    gu, gv, sigma, sigma_d = j[0, 6], j[1, 6], data.pixel_sigma, data.sigma[o, n]
+    length2 = (gu * gu + gv * gv) * sigma_d * sigma_d
+    if length2 > 0.0:
+        # S^-1/2: along g divide by the longer standard deviation
+        size = np.sqrt(gu * gu + gv * gv)
+        eu, ev = gu / size, gv / size
+        shrink = 1.0 / sigma - 1.0 / np.sqrt(sigma * sigma + length2)
+        for k in range(8):
+            lost = shrink * (eu * j[0, k] + ev * j[1, k])
+            j[0, k], j[1, k] = j[0, k] / sigma - eu * lost, j[1, k] / sigma - ev * lost
+    else:
+        for k in range(8):
+            j[0, k], j[1, k] = j[0, k] / sigma, j[1, k] / sigma
+    return np.sqrt(j[0, 7] ** 2 + j[1, 7] ** 2)
+
+
+@njit(cache=True, nogil=True)
+def _square(data, o, n, pose):  # type: ignore[no-untyped-def]
+    """Squared length of a landmark's whitened error, infinite if behind: ``e^T (sigma^2 I + g g^T)^-1 e``.
+
+    By Sherman and Morrison, without the derivatives: samples of the robust start need lengths alone.
+    """
+    (x, y, z), (wx, wy, wz) = _in_camera(data, o, n, pose)
+    if not z >= NEAREST:
+        return np.inf
+    fx, fy, cx, cy = data.camera
+    sigma, sigma_d, pixel = data.pixel_sigma, data.sigma[o, n], data.pixels[o, n]
+    u, v = x / z, y / z
+    gu, gv = sigma_d * fx / z * (wx - u * wz), sigma_d * fy / z * (wy - v * wz)
+    eu, ev = fx * u + cx - pixel[0], fy * v + cy - pixel[1]
+    mixed = gu * eu + gv * ev
+    return (eu * eu + ev * ev - mixed * mixed / (sigma * sigma + gu * gu + gv * gv)) / (sigma * sigma)
+
+
+@njit(cache=True, nogil=True)
+def _norms(data, poses, out):  # type: ignore[no-untyped-def]
+    """Weighted error lengths ``out`` (b, n) at poses (b); observations of one problem serve all, or of each its own."""
+    R, t, bias = poses
+    for b in range(len(out)):
+        o = b if len(data.landmarks) > 1 else 0
+        pose = _Pose(R[b], t[b], bias[b])
+        for n in range(out.shape[1]):
+            out[b, n] = np.sqrt(_square(data, o, n, pose))
+
+
+@njit(cache=True, nogil=True)
+def _cost(data, o, active, pose):  # type: ignore[no-untyped-def]
+    """Huber's cost of the active landmarks and of the prior; infinite if one is behind the camera."""
+    total = 0.5 * data.prior * pose.bias * pose.bias
+    for n in range(len(active)):
+        if active[n]:
+            total += huber_cost(np.sqrt(_square(data, o, n, pose)), HUBER)
+    return total
+
+
+@njit(cache=True, nogil=True)
+def _normal(data, o, active, pose, j, out):  # type: ignore[no-untyped-def]
+    """Fill ``out``: weighted normal matrix (7, 7) and gradient (7), with the prior of the bias."""
+    normal, gradient = out
+    normal[:] = 0.0
+    gradient[:] = 0.0
+    for n in range(len(active)):
+        if not active[n]:
+            continue
+        r = _observe(data, o, n, pose, j)
+        if r == np.inf:
+            continue
+        w = huber_weight(r, HUBER)
+        for i in range(UNKNOWNS):
+            a, b = w * j[0, i], w * j[1, i]
+            for k in range(i, UNKNOWNS):
+                normal[i, k] += a * j[0, k] + b * j[1, k]
+            gradient[i] += a * j[0, 7] + b * j[1, 7]
+    for i in range(UNKNOWNS):
+        for k in range(i):
+            normal[i, k] = normal[k, i]
+    normal[6, 6] += data.prior
+    gradient[6] += data.prior * pose.bias
+
+
+@njit(cache=True, nogil=True)
+def _step(normal, gradient, damping, lower, step):  # type: ignore[no-untyped-def]
+    """Damped step by Cholesky's factors; False where the matrix is not positive."""
+    most = 0.0
+    for i in range(UNKNOWNS):
+        most = max(most, normal[i, i])
+    floor = 1e-12 * most + 1e-300
+    for i in range(UNKNOWNS):
+        for k in range(i + 1):
+            total = normal[i, k]
+            if i == k:
+                total += damping * normal[i, i] + floor
+            for m in range(k):
+                total -= lower[i, m] * lower[k, m]
+            if i == k:
+                if not total > 0.0:
+                    return False
+                lower[i, i] = np.sqrt(total)
+            else:
+                lower[i, k] = total / lower[k, k]
+    for i in range(UNKNOWNS):
+        total = -gradient[i]
+        for m in range(i):
+            total -= lower[i, m] * step[m]
+        step[i] = total / lower[i, i]
+    for i in range(UNKNOWNS - 1, -1, -1):
+        total = step[i]
+        for m in range(i + 1, UNKNOWNS):
+            total -= lower[m, i] * step[m]
+        step[i] = total / lower[i, i]
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _moved(R, t, step, out_R, out_t):  # type: ignore[no-untyped-def]
+    """Pose after a left perturbation: ``R <- exp(w) R, t <- exp(w) t + v``."""
+    x, y, z = step[3], step[4], step[5]
+    angle2 = x * x + y * y + z * z
+    angle = np.sqrt(angle2)
+    a, b = (1.0, 0.5) if angle < 1e-9 else (np.sin(angle) / angle, (1.0 - np.cos(angle)) / angle2)
+    turn = np.empty((3, 3))
+    turn[0, 0], turn[0, 1], turn[0, 2] = 1.0 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y
+    turn[1, 0], turn[1, 1], turn[1, 2] = b * x * y + a * z, 1.0 - b * (x * x + z * z), b * y * z - a * x
+    turn[2, 0], turn[2, 1], turn[2, 2] = b * x * z - a * y, b * y * z + a * x, 1.0 - b * (x * x + y * y)
+    for i in range(3):
+        for k in range(3):
+            out_R[i, k] = turn[i, 0] * R[0, k] + turn[i, 1] * R[1, k] + turn[i, 2] * R[2, k]
+        out_t[i] = turn[i, 0] * t[0] + turn[i, 1] * t[1] + turn[i, 2] * t[2] + step[i]
+
+
+@njit(cache=True, nogil=True)
+def _minimise(data, active, iterations, tolerance, poses):  # type: ignore[no-untyped-def]
+    """Levenberg-Marquardt of each problem, ``poses`` (b) in place; the greatest number of iterations that one took."""
+    R, t, bias = poses
+    j, normal = np.empty((2, UNKNOWNS + 1)), np.empty((UNKNOWNS, UNKNOWNS))
+    lower, gradient, step = np.zeros((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS), np.empty(UNKNOWNS)
+    new_R, new_t = np.empty((3, 3)), np.empty(3)
+    most = 0
+    for b in range(len(R)):
+        o = b if len(data.landmarks) > 1 else 0
+        damping = 1e-4
+        cost = _cost(data, o, active[b], _Pose(R[b], t[b], bias[b]))
+        for done in range(iterations):
+            most = max(most, done + 1)
+            _normal(data, o, active[b], _Pose(R[b], t[b], bias[b]), j, (normal, gradient))
+            if not _step(normal, gradient, damping, lower, step):
+                damping *= 10.0
+                continue
+            _moved(R[b], t[b], step, new_R, new_t)
+            new_bias = bias[b] + step[6]
+            new_cost = _cost(data, o, active[b], _Pose(new_R, new_t, new_bias))
+            promised = 0.0
+            for k in range(UNKNOWNS):
+                promised -= 0.5 * gradient[k] * step[k]
+            finished = promised <= tolerance * (cost if cost < np.inf else 0.0) + 1e-20
+            if new_cost < cost:
+                R[b], t[b], bias[b] = new_R, new_t, new_bias
+                cost = new_cost
+                damping = max(damping * 0.1, 1e-12)
+            else:
+                damping *= 10.0
+            if finished:
+                break
+    return most

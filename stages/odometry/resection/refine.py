@@ -1,9 +1,9 @@
-"""Joint refinement of a segment: all its poses and the depths of its landmarks at once, and the next pair's stereo.
+"""Joint refinement of a segment: all its poses and the depths of its landmarks at once (bundle adjustment).
 
 Resection poses each frame by itself, with landmarks as the key pair's disparity has them. Here the landmarks' depths
 are unknowns, too, each held by its disparity: a point that four frames see from four places says more of its depth than
-its disparity alone. Where the segment ends at another basic pair, that pair's disparity at the tracked points is a
-second measurement of their depths. What all disparities share is one unknown of a window of segments, since one rig
+its disparity alone. The disparity of the basic pair at the segment's end is no second measurement: it shares its
+errors with the first and gains little. What all disparities share is one unknown of a window of segments, since one rig
 made them. A task adjusts one window and gives the poses of its last segment.
 
 The poses' covariances are those of this adjustment, by the same rules as the resection's
@@ -28,40 +28,32 @@ from rille.stages.core.declare import Bundle, Inputs, Stage
 from rille.stages.core.errors import ConfigError
 from rille.stages.geometry.geometry import Rig, RigidTransform
 from rille.stages.geometry.pose_arrays import COVARIANCE, POSES, SHARED
+from rille.stages.numeric.robust import huber_weight
 from rille.stages.odometry.resection.bundle_adjustment import (
     RefineParams,
-    State,
-    Views,
+    SegmentState,
+    SegmentTracks,
     adjust,
     normal,
     posterior,
     scatter,
-    stereo_rows,
     tilt_of,
 )
-from rille.stages.odometry.resection.landmarks import Landmarks, matches_at, relief
+from rille.stages.odometry.resection.landmarks import Landmarks
 from rille.stages.odometry.resection.pnp import HUBER, Observations, Poses, back_projection, norms
 from rille.stages.odometry.resection.resect import SOURCES, ResectParams, coordinates, root, scatter_of_blocks
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
-AGREES = 5.0
-"""Standard deviations within which the next pair's disparity must agree with the start to be used at all."""
-
-Segment = tuple[Views, State, list[int]]
+Segment = tuple[SegmentTracks, SegmentState, list[int]]
 """Measurements of a segment, where its adjustment starts, and which of its frames have a pose."""
 
 
-def views_of(
-    track: Bundle, resection: Bundle, landmarks: Landmarks, rig: Rig, after: Bundle | None, params: RefineParams
-) -> Segment | None:
+def views_of(track: Bundle, resection: Bundle, landmarks: Landmarks, rig: Rig) -> Segment | None:
     """Measurements and start of a segment, and which of its frames are posed; None: fewer than one behind the key.
 
-    Parameters
-    ----------
-    landmarks : of all points of the track, in the local frame.
-    after : disparity of the pair at the segment's end, where there is one.
+    ``landmarks`` are those of all points of the track, in the local frame.
     """
     poses = np.asarray(resection["poses"])
     frames = [j for j in range(1, len(poses)) if np.isfinite(poses[j]).all()]
@@ -75,18 +67,12 @@ def views_of(
         return None
     points = np.asarray(track["points"], dtype=np.float64)[which]
     known, pixels = landmarks.take(which), np.ascontiguousarray(np.swapaxes(points[:, frames], 0, 1))
-    right, sigma = np.full((len(which), 2), np.nan), np.full(len(which), np.nan)
-    if after is not None and params.stereo and frames[-1] == len(poses) - 1:
-        right, sigma = _stereo(pixels[-1], inlier[which, frames[-1]], after, params)
     T = [RigidTransform.from_matrix(poses[j]).inverse() for j in frames]
-    state = State(np.array([p.rotation for p in T]), np.array([p.translation for p in T]), np.zeros(len(which)))
+    state = SegmentState(np.array([p.rotation for p in T]), np.array([p.translation for p in T]), np.zeros(len(which)))
     seen = np.ascontiguousarray(inlier[which][:, frames].T)
-    camera, tilt = rig.left, _tilt_pattern(known.position, RigidTransform.from_matrix(poses[0]), rig)
+    tilt = _tilt_pattern(known.position, RigidTransform.from_matrix(poses[0]), rig)
     held = np.maximum(known.sigma, 1e-3)
-    views = Views(known.position, known.per_pixel, held, pixels, seen, right, sigma, camera, rig, tilt)
-    if np.isfinite(sigma).any():  # what disagrees altogether lies on another surface
-        error, *_, use = stereo_rows(views, state, 0.0)
-        views.right_sigma[~(use & (np.abs(error) < AGREES))] = np.nan
+    views = SegmentTracks(known.position, known.per_pixel, held, pixels, seen, rig.left, tilt)
     return views, state, frames
 
 
@@ -94,15 +80,6 @@ def _tilt_pattern(position: Floats, T_local_key: RigidTransform, rig: Rig) -> Fl
     """Pixels (n,) along its line that a landmark's right image moves for a radian across it: ``f x y``."""
     x, y, z = rig.T_right_left.apply(T_local_key.inverse().apply(position)).T
     return np.asarray(np.where(z > 0, rig.right.fx * x * y / np.where(z > 0, z, 1.0) ** 2, 0.0))
-
-
-def _stereo(pixels: Floats, use: Bools, after: Bundle, params: RefineParams) -> tuple[Floats, Floats]:
-    """Right image (n, 2) of points of the last frame by its own pair's disparity, and the standard deviation of it."""
-    maps = [np.asarray(after[name]) for name in ("column_disparity", "row_disparity", "validity")]
-    shift, matched = matches_at(pixels, maps[0], maps[1], maps[2])
-    sigma = np.hypot(params.disparity_sigma, relief(pixels, maps[0], maps[1], maps[2]))
-    good = use & matched & np.isfinite(sigma)
-    return np.where(good[:, None], pixels + shift, np.nan), np.where(good, sigma, np.nan)
 
 
 def _run(params: RefineParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
@@ -122,17 +99,17 @@ def _run(params: RefineParams, args: Mapping[str, Any], inputs: Inputs) -> Bundl
         rig, T = rigs[frames[0]], RigidTransform.from_matrix(level.meta["T_local_left"])
         points = np.asarray(track["points"])[:, 0].astype(np.float64)
         landmarks = coordinates(points, {"disparity": disparity[frames[0]]}, rig, T, resect)
-        given.append(_Given(track, resection, landmarks, rig, disparity.get(frames[-1])))
+        given.append(_Given(track, resection, landmarks, rig))
         out.append(SegmentOut.of(resection))
     kept = slice(0, None) if params.window == 0 else slice(-1, None)
-    found = [views_of(g.track, g.resection, g.landmarks, g.rig, g.after, params) for g in given]
+    found = [views_of(g.track, g.resection, g.landmarks, g.rig) for g in given]
     facts, states = _adjusted(found, out, params)
     meta: dict[str, Any] = {}
     if "tilt" in inputs:
         tilt = float(inputs["tilt"].meta["tilt_rad"])
         again = [None if one is None else (one[0].without_tilt(tilt), states[k], one[2]) for k, one in enumerate(found)]
         _adjusted(again, out, params)
-        judged = [_anew(one, new.poses, tilt, resect, params) for one, new in zip(given, out, strict=True)]
+        judged = [_anew(one, new.poses, tilt, resect) for one, new in zip(given, out, strict=True)]
         facts, _ = _adjusted(judged, out, params)
     elif params.tilt_sigma_deg > 0:
         of = [(one[0], states[k]) for k, one in list(enumerate(found))[kept] if one is not None]
@@ -165,14 +142,13 @@ class _Given:
     resection: Bundle
     landmarks: Landmarks
     rig: Rig
-    after: Bundle | None
 
 
-def _anew(given: _Given, poses: Floats, tilt: float, resect: ResectParams, params: RefineParams) -> Segment | None:
+def _anew(given: _Given, poses: Floats, tilt: float, resect: ResectParams) -> Segment | None:
     """A segment without the tilt, its landmarks judged once more by poses: the tilt had made good ones inconsistent."""
     tracked = np.isfinite(np.asarray(given.track["points"])).all(-1)
     resection = Bundle({"poses": poses, "inlier": tracked.astype(np.uint8)}, {})
-    one = views_of(given.track, resection, given.landmarks, given.rig, given.after, params)
+    one = views_of(given.track, resection, given.landmarks, given.rig)
     if one is None:
         return None
     (views, state, rows), most = one, resect.threshold / resect.pixel_sigma
@@ -182,17 +158,19 @@ def _anew(given: _Given, poses: Floats, tilt: float, resect: ResectParams, param
     return views, state, rows
 
 
-def _frame(views: Views, f: int, pixel_sigma: float) -> Observations:
+def _frame(views: SegmentTracks, f: int, pixel_sigma: float) -> Observations:
     """One frame of a segment by itself, landmarks as their disparities have them."""
     given = views.position[None], views.along[None], views.sigma[None], views.pixels[f : f + 1]
     return Observations(*given, views.camera, pixel_sigma, 0.0)
 
 
-def _pose(state: State, f: int, bias: float) -> Poses:
+def _pose(state: SegmentState, f: int, bias: float) -> Poses:
     return Poses(state.R[f : f + 1], state.t[f : f + 1], np.array([bias]))
 
 
-def claims(segments: Sequence[tuple[Views, State]], bias: float, params: RefineParams) -> list[tuple[Floats, Floats]]:
+def claims(
+    segments: Sequence[tuple[SegmentTracks, SegmentState]], bias: float, params: RefineParams
+) -> list[tuple[Floats, Floats]]:
     """Covariances (frame, 6, 6) and shared errors (frame, 6, 7) of the poses of segments that were adjusted together.
 
     Of position (m) and rotation vector (rad) of T_local_left, as in :mod:`rille.stages.odometry.resection.resect`.
@@ -212,7 +190,7 @@ def claims(segments: Sequence[tuple[Views, State]], bias: float, params: RefineP
             left = turn @ expected[at, at] @ turn.T - covariance[f]
             shared[f] = np.column_stack([root(left, depth), turn @ by_bias[at]])
             errors = back_projection(_frame(views, f, params.pixel_sigma), _pose(state, f, bias))
-            weight = HUBER / np.maximum(errors.norm[0], HUBER)
+            weight = huber_weight(errors.norm[0], HUBER)
             together.append(scatter_of_blocks(views.pixels[f][seen], errors.white[0][seen], weight[seen], views.camera))
         covariance *= max(1.0, float(np.mean(together)))
         out.append((covariance + shared @ np.swapaxes(shared, 1, 2), shared))
@@ -221,7 +199,7 @@ def claims(segments: Sequence[tuple[Views, State]], bias: float, params: RefineP
 
 def _adjusted(
     found: Sequence[Segment | None], out: Sequence[SegmentOut], params: RefineParams
-) -> tuple[dict[str, float], dict[int, State]]:
+) -> tuple[dict[str, float], dict[int, SegmentState]]:
     """A window adjusted, ``out`` written to; facts of the adjustment, and the state of each segment."""
     group = {k: one for k, one in enumerate(found) if one is not None}
     starts = [(views, state) for views, state, _ in group.values()]

@@ -30,9 +30,8 @@ from numpy.typing import NDArray
 
 from rille.stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
 from rille.stages.core.errors import InputError
-from rille.stages.geometry.geometry import RigidTransform, level_rotation, orthonormal
+from rille.stages.geometry.geometry import RigidTransform, cross_matrix, level_rotation, orthonormal
 from rille.stages.geometry.pose_arrays import COVARIANCE, NO_VERTICAL, POSES
-from rille.stages.odometry.resection.pnp import cross_matrix
 
 Floats = NDArray[np.float64]
 Segment = tuple[Floats, Floats, Floats]

@@ -21,6 +21,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from rille.stages.numeric.robust import mad_sigma
 from rille.stages.numeric.windows import window_sum
 
 Float32 = NDArray[np.float32]
@@ -61,7 +62,7 @@ def from_both(elevation: Float32, seen: Float32, moved: Floats, apart: Floats, o
     scale = np.where(known, seen[3], 1.0).astype(np.float64)
     rest = np.where(known, seen[0] - seen[1], 0.0).astype(np.float64)
     rest = np.where(known, rest - _mean(rest, known, MEAN_SIDE), 0.0)
-    noise = 1.4826 * float(np.median(np.abs(rest[known])))
+    noise = mad_sigma(rest[known], 0.0)
     grey = np.maximum(_mean(np.where(known, seen[0], 0.0), known, NEAR_SIDE), max(noise, 1.0))
     both = known & np.isfinite(apart)
     differ = _mean(np.where(both, np.square(scale * apart), 0.0), both, NEAR_SIDE)

@@ -6,8 +6,16 @@ import numpy as np
 import pytest
 from rig_scenes import knocked, matches, street_depth, street_rig
 
-from rille.stages.calibration.relative_orientation import Beliefs, Matches, adjust, considered, settle, solution
-from rille.stages.calibration.relative_orientation_kernel import weigh
+from rille.stages.calibration.relative_orientation import (
+    BLOCKS,
+    Beliefs,
+    Matches,
+    _weigh,
+    adjust,
+    considered,
+    settle,
+    solution,
+)
 from rille.stages.geometry.epipolar import distances
 
 BELIEFS = Beliefs(rotation=np.radians(0.05), baseline=np.radians(0.2), principal=3.5, systematic=0.1)
@@ -98,19 +106,20 @@ def test_the_pair_order_does_not_matter_to_rounding():
 
 def test_normal_equations_and_weights_by_plain_numpy():
     rng = np.random.default_rng(5)
-    n, m, blocks = 300, 4, 9
+    n, m, blocks = 300, 4, BLOCKS**2
     constant, design = rng.normal(0.0, 0.4, n), rng.normal(size=(n, m))
     constant[:20] += 30.0
-    x, block = 0.1 * rng.normal(size=m), rng.integers(0, blocks, n)
+    x, block = 0.1 * rng.normal(size=m), rng.integers(0, 9, n)
     weights, normal, pull = np.empty(n), np.empty((m, m)), np.empty(m)
-    noise = weigh(constant, design, x, block, blocks, np.inf, 0.02, 4.685, weights, normal, pull)
+    noise = _weigh(constant, design, block, x, np.inf, (weights, normal, pull))
     rest = constant + design @ x
     assert noise == pytest.approx(1.4826 * np.median(np.abs(rest)))
     expected = np.maximum(0.0, 1.0 - (rest / (4.685 * noise)) ** 2) ** 2
     np.testing.assert_allclose(weights, expected, atol=1e-12)
     assert (weights[:20] == 0).all()
     count, total = (np.bincount(block, w, blocks) for w in (expected, expected * rest))
-    information = expected / (noise**2 * max(1.0, np.mean(total**2 / count) / noise**2))
+    together = np.mean(total[count > 0] ** 2 / count[count > 0])
+    information = expected / (noise**2 * max(1.0, together / noise**2))
     np.testing.assert_allclose(normal, design.T @ (design * information[:, None]), rtol=1e-9)
     np.testing.assert_allclose(pull, -design.T @ (information * constant), rtol=1e-9)
 

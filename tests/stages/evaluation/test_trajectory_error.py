@@ -8,8 +8,8 @@ from test_accuracy import disturbed, evo_path, evo_value, walk
 
 from rille.stages.evaluation.accuracy import trajectory_accuracy
 from rille.stages.evaluation.accuracy_parts import square
-from rille.stages.evaluation.trajectory_error import against_claims, by_cause, by_shares, rotation_vectors
-from rille.stages.geometry.geometry import rotation_exp
+from rille.stages.evaluation.trajectory_error import against_claims, by_cause, by_shares
+from rille.stages.geometry.geometry import rotation_exp, rotation_log
 
 
 @pytest.mark.parametrize("step", [2, 5, 20])
@@ -97,7 +97,7 @@ def test_right_claims_give_one_and_halved_deviations_four():
 def test_rotation_vectors_invert_the_exponential():
     vectors = np.random.default_rng(3).normal(0, 0.8, (50, 3))
     vectors[0] = 0.0
-    np.testing.assert_allclose(rotation_vectors(np.array([rotation_exp(v) for v in vectors])), vectors, atol=1e-9)
+    np.testing.assert_allclose(rotation_log(np.array([rotation_exp(v) for v in vectors])), vectors, atol=1e-9)
 
 
 def test_covariances_reach_the_figures():

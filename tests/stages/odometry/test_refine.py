@@ -11,8 +11,8 @@ from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, rotation
 from rille.stages.odometry.resection import common_tilt as tilt_stage
 from rille.stages.odometry.resection.bundle_adjustment import (
     RefineParams,
-    State,
-    Views,
+    SegmentState,
+    SegmentTracks,
     adjust,
     cost_of,
     normal,
@@ -27,11 +27,11 @@ from rille.stages.odometry.resection.resect import ResectParams
 
 CAMERA = Camera(500.0, 500.0, 299.5, 199.5, 600, 400)
 RIG = Rig(CAMERA, CAMERA, RigidTransform(np.eye(3), np.array([-0.2, 0.0, 0.0])))
-PARAMS = RefineParams(stereo=True)
+PARAMS = RefineParams()
 
 
-def scene(seed, n=150, frames=4, bias=0.0, noise=0.2, stereo=True):
-    """Views of a segment with noisy depths and tracks, the true state, and a start as resection would give it."""
+def scene(seed, n=150, frames=4, bias=0.0, noise=0.2):
+    """A segment with noisy depths and tracks, the true state, and a start as resection would give it."""
     rng = np.random.default_rng(seed)
     key = rng.uniform([20, 20], [580, 380], (n, 2))
     depth = rng.uniform(2.0, 6.0, n)
@@ -43,27 +43,21 @@ def scene(seed, n=150, frames=4, bias=0.0, noise=0.2, stereo=True):
         for k in range(1, frames)
     ]
     pixels = np.array([CAMERA.project(P.apply(X)) for P in T]) + noise * rng.standard_normal((frames - 1, n, 2))
-    right, sigma = np.full((n, 2), np.nan), np.full(n, np.nan)
-    if stereo:
-        last = T[-1].apply(X)
-        seen_right = CAMERA.project(RIG.T_right_left.apply(last)) + pixels[-1] - CAMERA.project(last)
-        # a bias makes every disparity point to a depth that lies too near by so many pixels
-        right = seen_right - [bias, 0.0] + noise * rng.standard_normal((n, 1)) * [1.0, 0.0]
-        sigma = np.full(n, noise)
-    views = Views(
+    views = SegmentTracks(
         X - (error + bias)[:, None] * per_pixel,
         per_pixel,
         np.full(n, noise),
         pixels,
         np.ones((frames - 1, n), bool),
-        right,
-        sigma,
         CAMERA,
-        RIG,
         500.0 * np.prod(CAMERA.rays(key)[:, :2], axis=1),
     )
     start = [P @ RigidTransform(rotation_exp(1e-4 * rng.standard_normal(3)), 3e-3 * rng.standard_normal(3)) for P in T]
-    return views, State(np.array([P.rotation for P in start]), np.array([P.translation for P in start]), np.zeros(n)), T
+    return (
+        views,
+        SegmentState(np.array([P.rotation for P in start]), np.array([P.translation for P in start]), np.zeros(n)),
+        T,
+    )
 
 
 def error_of(state, T):
@@ -97,35 +91,34 @@ def test_gradient_is_that_of_the_cost():
 
 def test_without_noise_the_truth_is_found():
     views, start, T = scene(2, noise=1e-6)
-    views = replace(views, sigma=np.full(150, 0.2), right_sigma=np.full(150, 0.2))
+    views = replace(views, sigma=np.full(150, 0.2))
     (state,), bias, before, after = adjust([(views, start)], PARAMS)
     assert error_of(state, T) < 1e-6
     assert abs(bias) < 1e-4
     assert after < 1e-6 * before
 
 
-def test_stereo_at_the_end_and_shared_depths_lower_the_error():
+def test_shared_depths_lower_the_error():
     gains = []
     for seed in range(8):
         views, start, T = scene(10 + seed)
-        (alone,), _, _, _ = adjust([(replace(views, right_sigma=np.full(150, np.nan)), start)], PARAMS)
         (state,), _, before, after = adjust([(views, start)], PARAMS)
         assert after <= before
-        gains.append([error_of(state, T), error_of(alone, T)])
-    both, tracks = np.sqrt(np.mean(np.square(gains), axis=0))
-    assert both < tracks
+        gains.append([error_of(state, T), error_of(start, T)])
+    found, given = np.sqrt(np.mean(np.square(gains), axis=0))
+    assert found < 0.5 * given
 
 
 def test_a_bias_of_all_disparities_is_found_by_many_segments():
     parts = [scene(30 + k, bias=0.3) for k in range(5)]
-    _, bias, _, _ = adjust([(v, s) for v, s, _ in parts], RefineParams(bias_sigma=1.0, stereo=True))
+    _, bias, _, _ = adjust([(v, s) for v, s, _ in parts], RefineParams(bias_sigma=1.0))
     assert bias == pytest.approx(0.3, abs=0.1)
 
 
 def test_the_cost_never_rises_and_an_optimum_stays():
     views, start, _ = scene(3)
     (state,), *_ = adjust([(views, start)], PARAMS)
-    (again,), _, before, after = adjust([(views, state)], RefineParams(iterations=1, stereo=True))
+    (again,), _, before, after = adjust([(views, state)], RefineParams(iterations=1))
     assert after <= before
     np.testing.assert_allclose(again.t, state.t, atol=1e-4)
 
@@ -137,22 +130,18 @@ def test_the_covariance_is_the_inverse_of_the_whole_normal_matrix():
     n, m = 25, 2
 
     def residuals(x):
-        """Whitened errors of tracks, of the next pair's disparities, of depths and of the bias."""
+        """Whitened errors of tracks, of depths and of the bias."""
         moved, b = state.moved(x[:12].reshape(m, 6), x[12 : 12 + n]), bias + x[-1]
         X = views.position + (moved.depth + b)[:, None] * views.along
         tracks = [
             (CAMERA.project(X @ R.T + t) - p) / 0.2 for R, t, p in zip(moved.R, moved.t, views.pixels, strict=True)
         ]
-        last = X @ moved.R[-1].T + moved.t[-1]
-        apart = CAMERA.project(RIG.T_right_left.apply(last)) - CAMERA.project(last) - (views.right - views.pixels[-1])
-        stereo = (apart[:, 0] - b) / views.right_sigma  # the second pair shares the bias
-        return np.concatenate([*(t.ravel() for t in tracks), stereo, moved.depth / views.sigma, [b / 0.1]])
+        return np.concatenate([*(t.ravel() for t in tracks), moved.depth / views.sigma, [b / 0.1]])
 
     steps = 1e-6 * np.eye(12 + n + 1)
     J = np.array([(residuals(e) - residuals(-e)) / 2e-6 for e in steps]).T
     size = np.linalg.norm(residuals(np.zeros(12 + n + 1))[: 2 * m * n].reshape(-1, 2), axis=1)
-    alone = np.abs(residuals(np.zeros(12 + n + 1))[2 * m * n : 2 * m * n + n])
-    weight = np.concatenate([np.repeat(np.minimum(1, 2.5 / size), 2), np.minimum(1, 2.5 / alone), np.ones(n + 1)])
+    weight = np.concatenate([np.repeat(np.minimum(1, 2.5 / size), 2), np.ones(n + 1)])
     dense = np.linalg.inv(J.T @ (weight[:, None] * J))[:12, :12]
     ((noise, by_bias),) = posterior([normal(views, state, bias, 0.2)], [1.0], PARAMS)
     np.testing.assert_allclose(noise + np.outer(by_bias, by_bias), dense, rtol=1e-4, atol=1e-6 * np.abs(dense).max())
@@ -169,7 +158,7 @@ def test_claimed_covariances_are_those_of_the_errors(window):
     ratios = []
     for seed in range(60):
         rng = np.random.default_rng([seed, 1])
-        views, start, T = scene(200 + seed, n=120, bias=0.1 * rng.standard_normal(), stereo=False)
+        views, start, T = scene(200 + seed, n=120, bias=0.1 * rng.standard_normal())
         (state,), bias, *_ = adjust([(views, start)], params)
         ((covariance, _),) = claims([(views, state)], bias, params)
         for R, t, true, claimed in zip(state.R, state.t, T, covariance, strict=True):
@@ -184,15 +173,15 @@ def test_claimed_covariances_are_those_of_the_errors(window):
 
 def test_errors_larger_than_stated_widen_the_covariance():
     for noise in (0.1, 0.2, 0.3):
-        views, start, _ = scene(5, noise=noise, stereo=False)
+        views, start, _ = scene(5, noise=noise)
         views = replace(views, sigma=np.full(150, 0.2))
         (state,), bias, *_ = adjust([(views, start)], PARAMS)
         assert scatter(views, state, bias, 0.2) == pytest.approx((noise / 0.2) ** 2, rel=0.25)
 
 
 def tilted(seed, tilt, frames=4):
-    """Views whose landmarks lie where disparities put them that are tilted by so many radians, adjusted once."""
-    views, start, T = scene(seed, n=120, frames=frames, noise=0.05, stereo=False)
+    """Tracks whose landmarks lie where disparities put them that are tilted by so many radians, adjusted once."""
+    views, start, T = scene(seed, n=120, frames=frames, noise=0.05)
     views = replace(views, sigma=np.full(120, 0.2)).without_tilt(-tilt)
     (state,), bias, _, _ = adjust([(views, start)], PARAMS)
     return views, state, bias, T
@@ -302,7 +291,7 @@ def test_the_stage_gives_the_poses_of_the_last_segment_or_of_all(window):
     one = bundles()
     inputs = {port: given * (1 if port in ("disparities", "rigs") else 2) for port, given in one.items()}
     args = {"pairs": [0, 2], "resect": ResectParams().model_dump(mode="json")}
-    out = STAGE.run(RefineParams(window=window, stereo=True), args, inputs)
+    out = STAGE.run(RefineParams(window=window), args, inputs)
     check_outputs(STAGE, out)
     count = 2 if window == 0 else 1
     assert out.meta["frames"] == [3] * count
@@ -313,11 +302,10 @@ def test_the_stage_gives_the_poses_of_the_last_segment_or_of_all(window):
         STAGE.run(RefineParams(), args | {"resect": ResectParams(landmarks="dem").model_dump(mode="json")}, inputs)
 
 
-def test_a_lost_frame_stays_lost_and_disagreeing_stereo_is_left_out():
+def test_a_lost_frame_stays_lost():
     inputs = bundles()
     for name in ("poses", "covariance", "shared"):
         inputs["resections"][0].arrays[name][1] = np.nan
-    inputs["disparities"][1].arrays["column_disparity"][:, :300] = -5.0  # another surface
     args = {"pairs": [0, 2], "resect": ResectParams().model_dump(mode="json")}
     out = STAGE.run(PARAMS, args, inputs)
     for name in ("poses", "covariance", "shared"):
@@ -333,8 +321,5 @@ def test_a_lost_frame_stays_lost_and_disagreeing_stereo_is_left_out():
         np.full(80, 0.2),
         max_depth_ratio=0.2,
     )
-    views, _, frames = views_of(track, resection, known, RIG, inputs["disparities"][1], PARAMS)
+    _, _, frames = views_of(track, resection, known, RIG)
     assert frames == [2]
-    used = np.isfinite(views.right_sigma)
-    assert used.any()
-    assert (views.pixels[-1][used, 0] > 295).all()
