@@ -35,7 +35,7 @@ class OrientationParams(RelativeParams):
         1500,
         ge=100,
         le=100_000,
-        description="cells that the left image is parted into; the best match of each is used. At some 20 px their "
+        description="number of image cells; the best match of each is used; 1500: cells of some 20 pixels, whose "
         "errors are nearly independent",
     )
 

@@ -61,38 +61,44 @@ class RelativeParams(Params):
     """When a parameter of the rig may depart from the calibration."""
 
     significance: float = Field(
-        4.0, ge=1, description="sigmas; the images contradict a value that they find so far away (systematic errors in)"
+        4.0,
+        ge=1,
+        description="standard deviations, systematic errors included, by which the images must contradict a "
+        "calibrated value to change it",
     )
     max_depth_error: float = Field(
         0.03,
         gt=0,
-        description="relative; a parameter is observed if its uncertainty costs less depth than this: well below what "
-        "a wrong toe-in does to a parallel rig (10 % and more), above what a convergent one leaves (1-2 %)",
+        description="largest relative depth error that the uncertainty of an observed parameter may cause; a wrong "
+        "toe-in of a parallel rig causes 0.1 and more, of a convergent rig 0.01 to 0.02",
     )
     least_rows: float = Field(
         0.4,
         ge=0,
-        description="pixels RMS; a change is worth it if it moves rows so far (KITTI's calibration is as near)",
+        description="change of row offsets [pixels RMS] from which on a correction is applied; KITTI's calibration is"
+        " good to 0.4",
     )
-    least_depth: float = Field(0.005, ge=0, description="relative; a change is worth it, too, if it moves depth so far")
+    least_depth: float = Field(
+        0.005, ge=0, description="relative change of depth from which on a correction is applied, too"
+    )
     prior_rotation_deg: float = Field(
-        0.05, gt=0, description="degrees; error of each angle of a calibration that is intact"
+        0.05, gt=0, description="standard deviation [degrees] of each rotation angle of an intact calibration"
     )
     prior_baseline_deg: float = Field(
-        0.2, gt=0, description="degrees; error of the baseline's direction of a calibration that is intact"
+        0.2, gt=0, description="standard deviation [degrees] of the baseline's direction of an intact calibration"
     )
     prior_principal: float = Field(
         0.005,
         gt=0,
-        description="share of the focal length; error of the principal point, usual for a calibration by a board. A "
-        "smaller figure lets more toe-in be seen",
+        description="standard deviation of the principal point over the focal length; 0.005 is usual for a "
+        "calibration with a target; smaller values make more toe-in observable",
     )
     systematic: float = Field(
         0.1,
         gt=0,
         le=10,
-        description="pixels, RMS over the image; smooth row error that no rig explains and no number of matches "
-        "averages out: what lens model and rectification leave",
+        description="smooth row error [pixels RMS over the image] that no rig explains and more matches do not "
+        "reduce: remains of lens model and rectification",
     )
 
     def beliefs(self, rig: Rig) -> Beliefs:

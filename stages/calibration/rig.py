@@ -62,8 +62,8 @@ class RigParams(RelativeParams):
 
     mode: Literal["pooled", "per_pair", "fixed"] = Field(
         "pooled",
-        description="pooled: one rig from all pairs; per_pair: each pair its own (a rig that bends); fixed: as given, "
-        "contradictions are only told",
+        description="pooled: one rig from all pairs; per_pair: a rig for each pair (a rig that bends); fixed: keep "
+        "the given rig, report contradictions only",
     )
 
 

@@ -44,14 +44,15 @@ class AgreementParams(Params):
     threshold: float = Field(
         default=5.0,
         gt=0,
-        description="robust standard deviations (1.4826 MAD) above the median at which a frame is flagged; drift is no "
-        "bell curve, hence more than the usual 3",
+        description="robust standard deviations (1.4826 MAD) above the median from which on a frame is flagged; 5, "
+        "not 3: drift is not normally distributed",
     )
-    least_ratio: float = Field(
-        default=2.0, ge=1, description="multiple of the median below which nothing is flagged, however uniform the rest"
-    )
+    least_ratio: float = Field(default=2.0, ge=1, description="multiple of the median below which no frame is flagged")
     least_angle_deg: float = Field(
-        default=0.05, ge=0, description="degrees below which no rotation is flagged; a pixel at a focal length of 1100"
+        default=0.05,
+        ge=0,
+        description="rotation difference [degrees] below which no frame is flagged; 0.05: one pixel at a focal length"
+        " of 1100",
     )
 
 

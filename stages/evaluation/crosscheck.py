@@ -38,33 +38,37 @@ MIN_MATCHES = 15
 class CrosscheckParams(Params):
     """Parameters of the second opinion on the trajectory."""
 
-    enabled: bool = Field(default=True, description="compute poses by COLMAP too, and compare")
+    enabled: bool = Field(default=True, description="compute the trajectory with COLMAP as well, and compare")
     window: int = Field(
         default=30,
         ge=2,
-        description="frames adjusted together; the time of an adjustment grows faster than their number",
+        description="frames per bundle adjustment; its time grows faster than their number",
     )
-    overlap: int = Field(default=6, ge=1, description="frames that successive windows share; they tie them together")
-    span: int = Field(default=3, ge=1, description="a frame is matched with so many following ones, in either camera")
+    overlap: int = Field(default=6, ge=1, description="frames common to successive windows; they join the windows")
+    span: int = Field(default=3, ge=1, description="match each frame with this many following frames, in both cameras")
     max_features: int = Field(
-        default=2000, ge=100, description="positions of features an image, the largest first; matching is quadratic"
+        default=2000, ge=100, description="features per image, largest first; matching time grows with their square"
     )
     max_image_size: int = Field(
-        default=1400, ge=64, description="longer side in px to which larger images are reduced for the features"
+        default=1400,
+        ge=64,
+        description="reduce images whose longer side exceeds this [pixels] before features are detected",
     )
     first_octave: int = Field(
         default=0,
         ge=-1,
         le=3,
-        description="-1 doubles the image: on a street an eighth nearer to the truth, at eight times the time",
+        description="first octave of the feature detector; -1 doubles the image: on a street 1/8 nearer to the truth "
+        "at 8 times the time",
     )
     init_min_tri_angle: float = Field(
         default=1.0,
         gt=0,
         lt=90,
-        description="angle between the first two rays, degrees; COLMAP's 16 rejects every start of a forward drive",
+        description="smallest triangulation angle [degrees] of COLMAP's first two images; its default of 16 rejects "
+        "every start of a forward drive",
     )
-    seed: int = Field(default=0, ge=0, description="seed of all random sampling in COLMAP")
+    seed: int = Field(default=0, ge=0, description="seed of COLMAP's random sampling")
 
     @model_validator(mode="after")
     def _windows_advance(self) -> CrosscheckParams:

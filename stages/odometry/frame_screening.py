@@ -43,27 +43,29 @@ class ContinuityParams(Params):
     """When a frame counts as lost, or as unfit to be basic."""
 
     uniform: float = Field(
-        1.0, ge=0, description="grey levels; deviation over an image below which it shows nothing (noise has about one)"
+        1.0,
+        ge=0,
+        description="standard deviation [grey levels] over an image below which the frame counts as blank; image "
+        "noise has about 1",
     )
     blurred: float = Field(
         0.6,
         ge=0,
         le=1,
-        description="share of the camera's usual sharpness below which a pair is no basic one; a Gaussian of one pixel"
-        " more takes that much",
+        description="share of the camera's usual sharpness below which a pair cannot be a basic pair; a Gaussian blur"
+        " of one pixel costs 0.4",
     )
     min_matches: float = Field(
         0.2,
         ge=0,
         le=1,
-        description="share of the pixels with texture that found a coarse displacement, below which two frames are not"
-        " found in each other",
+        description="share of the textured pixels that must find a displacement for two frames to count as overlapping",
     )
     jump: float = Field(
         4.0,
         gt=0,
-        description="pixels, and multiple of what is usual (lower quartile): median change of the displacements from"
-        " one step to the next at which the sides of the frames there are looked at",
+        description="change of the displacements between two steps, both in pixels and in multiples of the lower "
+        "quartile, from which on the frames there are tested for swapped left and right images",
     )
 
 

@@ -39,35 +39,39 @@ class SelectParams(Params):
 
     preset: Literal["terrain", "navigation"] = Field(
         "terrain",
-        description="terrain: close pairs, so that elevation models share ground; navigation: rule overlap with 0.6,"
-        " fewer pairs to match for the trajectory alone, those with hfvm.preset fast; and motion.level, track.points,"
-        " orientation.samples are cheaper. What is given beside it wins, but for a mere stride",
+        description="terrain: close basic pairs, whose elevation models overlap; navigation: trajectory only, with "
+        "rule overlap at 0.6, hfvm.preset fast, and cheaper motion.level, track.points and "
+        "orientation.samples; keys set explicitly win, except select.stride without select.rule",
     )
     rule: Literal["overlap", "stride"] = Field(
-        "overlap", description="overlap: as far apart as the wanted overlap permits; stride: evenly, as in the paper"
+        "overlap",
+        description="overlap: basic pairs as far apart as select.overlap permits; stride: every stride-th frame, as "
+        "in the paper",
     )
     overlap: float = Field(
         0.7,
         gt=0,
         lt=1,
-        description="share of what one basic pair sees that the next one sees too (rule overlap); below, landmarks and"
-        " common ground run out",
+        description="share of a basic pair's view that the next basic pair must see too (rule overlap); with less, "
+        "landmarks and common terrain run out",
     )
     stride: int = Field(
         4,
         ge=1,
-        description="frames; every stride-th pair is basic (the paper's fourth intermediate frame, 7.4); given"
-        " alone, it sets the rule",
+        description="frames between basic pairs (rule stride; 4 in the paper, section 7.4); setting it without "
+        "select.rule selects rule stride",
     )
     max_gap: int = Field(
-        16, ge=1, description="frames; most between two basic pairs under rule overlap: light and shadows change"
+        16,
+        ge=1,
+        description="largest number of frames between basic pairs under rule overlap; light and shadows change",
     )
     min_matches: float = Field(
         0.2,
         ge=0,
         le=1,
-        description="share of the pixels with texture that found a coarse displacement; below, the displacement is not"
-        " trusted and both frames are basic (rule stride: the later one)",
+        description="share of the textured pixels that must find a displacement; below, both frames become basic "
+        "pairs (rule stride: the later one)",
     )
 
     @model_validator(mode="before")

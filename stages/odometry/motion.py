@@ -37,22 +37,35 @@ class MotionParams(Params):
     """Parameters of the coarse displacements between successive frames."""
 
     level: int = Field(
-        default=2, ge=0, le=6, description="pyramid level of the result; 2 = a quarter of the resolution"
+        default=2, ge=0, le=6, description="pyramid level of the displacement map; 2: a quarter of the resolution"
     )
-    top_columns: float = Field(default=0.25, gt=0, le=1, description="share of the width searched at the top level")
-    top_rows: float = Field(default=0.25, gt=0, le=1, description="share of the height searched at the top level")
-    smoothness: int = Field(default=5, ge=0, description="byte steps a pixel of difference to each neighbour")
-    rounds: int = Field(default=6, ge=0, le=32, description="propagation rounds a level; more help little")
+    top_columns: float = Field(
+        default=0.25,
+        gt=0,
+        le=1,
+        description="share of the image width searched to either side at the top pyramid level",
+    )
+    top_rows: float = Field(
+        default=0.25, gt=0, le=1, description="share of the image height searched up and down at the top pyramid level"
+    )
+    smoothness: int = Field(
+        default=5,
+        ge=0,
+        description="cost [feature byte steps] of a displacement difference of one pixel to each neighbour",
+    )
+    rounds: int = Field(
+        default=6, ge=0, le=32, description="propagation rounds at each pyramid level; more than 6 change little"
+    )
     turn_below: float = Field(
         default=0.5,
         ge=0,
         le=1,
-        description="share of the pixels with texture that match, below which a homography of features, or else a"
-        " rotation about the optical axis, is looked for; upright windows match three quarters of a street and a third"
-        " at 30 degrees; 0: no rotation is undone but an attitude's",
+        description="if fewer than this share of the textured pixels match, undo a homography fitted to features, "
+        "else an image rotation, and match again; an upright window matches 3/4 of a street scene and 1/3"
+        " when turned by 30 degrees; 0: undo only a rotation that an attitude sensor gives",
     )
     turn_range_deg: float = Field(
-        default=60.0, gt=0, le=180, description="degrees to either side; greatest rotation that is looked for"
+        default=60.0, gt=0, le=180, description="largest image rotation [degrees] tried to either side"
     )
 
 

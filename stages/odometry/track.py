@@ -41,17 +41,35 @@ class TrackParams(Params):
     """Parameters of the stage ``track``."""
 
     points: int = Field(
-        400, ge=6, description="interest points of the key frame; the paper: about 200, the error falls with the root"
+        400,
+        ge=6,
+        description="interest points of the key frame (paper: about 200); the pose error falls with the square root "
+        "of their number",
     )
-    noise: float = Field(1.5, gt=0, description="grey levels; noise of one image, no texture below thrice its effect")
-    radius: int = Field(4, ge=1, description="pixels; search around the prediction: one pixel of the coarse level")
+    noise: float = Field(
+        1.5,
+        gt=0,
+        description="grey value noise [grey levels] of one image; patches whose contrast is below three times its "
+        "effect get no point",
+    )
+    radius: int = Field(
+        4,
+        ge=1,
+        description="search radius [pixels] around the predicted position; 4: one pixel of the coarse displacement map",
+    )
     affinity_sigma: float = Field(
-        0.1, gt=0, description="expected departure of a template's affinity from its neighbours', per element"
+        0.1,
+        gt=0,
+        description="standard deviation of each element of a template's affinity about the one fitted to its "
+        "neighbours",
     )
     max_scale: float = Field(
-        2.0, gt=1, description="change of scale since birth up to which its template is used; then the last frame's"
+        2.0,
+        gt=1,
+        description="scale change since a point's first frame up to which that frame's template is used; beyond, the "
+        "previous frame's",
     )
-    reseed: bool = Field(True, description="new points in empty buckets of intermediate frames")
+    reseed: bool = Field(True, description="add points in empty parts of intermediate frames")
 
 
 @dataclass(frozen=True)

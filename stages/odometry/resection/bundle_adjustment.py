@@ -38,26 +38,33 @@ class RefineParams(Params):
 
     enabled: bool = Field(
         default=True,
-        description="refine the poses of segments jointly with their landmarks, where these are of the disparity",
+        description="adjust poses and landmark depths of a segment jointly; needs resect.landmarks = disparity",
     )
     window: int = Field(
         default=1,
         ge=0,
-        description="segments that are adjusted together, the last of them for good; 0: all of the sequence at once",
+        description="number of successive segments adjusted together, of which the last is kept; 0: the whole "
+        "sequence at once",
     )
-    iterations: int = Field(default=20, ge=1, description="limit of Levenberg-Marquardt steps; five are usual")
-    pixel_sigma: float = Field(default=0.2, gt=0, description="pixels; expected error of a tracked position")
+    iterations: int = Field(default=20, ge=1, description="limit of Levenberg-Marquardt iterations; 5 are usual")
+    pixel_sigma: float = Field(default=0.2, gt=0, description="standard deviation [pixels] of a tracked position")
     bias_sigma: float = Field(
-        default=0.1, ge=0, description="pixels; prior of the error that all disparities share (toe-in of the rig)"
+        default=0.1,
+        ge=0,
+        description="prior standard deviation [pixels] of an error common to all disparities (toe-in of the rig)",
     )
     tilt_sigma_deg: float = Field(
         default=0.3,
         ge=0,
-        description="degrees; prior of the pitch that may stand for a principal point's row: 0.5 % of the focal length,"
-        " as in rig.prior_principal; 0: none is looked for",
+        description="prior standard deviation [degrees] of a pitch of the right camera that is really a shift of its "
+        "principal point; 0.3: 0.5 % of the focal length, as in rig.prior_principal; 0: do not estimate "
+        "it",
     )
     tilt_significance: float = Field(
-        default=4.0, ge=0, description="standard deviations, by the scatter of segments, from which on it is undone"
+        default=4.0,
+        ge=0,
+        description="standard deviations (from the scatter of segments) from which on an estimated tilt of the "
+        "disparities is removed",
     )
 
 

@@ -78,38 +78,54 @@ class ResectParams(Params):
 
     landmarks: Literal["disparity", "dem"] = Field(
         "disparity",
-        description="source of the 3-D coordinates: the disparity (more exact) or, as in the paper, the DEM",
+        description="source of landmark coordinates; disparity: triangulated match (more exact); dem: intersection "
+        "with the elevation model, as in the paper",
     )
-    pixel_sigma: float = Field(
-        0.2, gt=0, description="pixels; expected error of a tracked position, feature vectors summed over 7 x 7"
-    )
+    pixel_sigma: float = Field(0.2, gt=0, description="standard deviation [pixels] of a tracked position")
     disparity_sigma: float = Field(
-        0.2, ge=0, description="pixels; expected error of the disparity under a landmark, carried along its ray"
+        0.2,
+        ge=0,
+        description="standard deviation [pixels] of the disparity under a landmark; moves the landmark along its ray",
     )
     bias_sigma: float = Field(
-        0.1, ge=0, description="pixels; prior of the error that all disparities share (toe-in of the rig); 0: none"
+        0.1,
+        ge=0,
+        description="prior standard deviation [pixels] of an error common to all disparities (toe-in of the rig); 0: "
+        "no such error",
     )
     threshold: float = Field(
-        1.0, gt=0, description="pixels; the most inconsistent landmark is removed until all are below: 5 pixel_sigma"
+        1.0,
+        gt=0,
+        description="largest back-projection error [pixels] of an inlier; the worst landmarks are removed until all "
+        "are below; 1.0: 5 pixel_sigma",
     )
     max_depth_ratio: float = Field(
-        0.2, gt=0, description="std of a landmark's distance over its distance; beyond it first-order errors fail"
+        0.2,
+        gt=0,
+        description="largest standard deviation of a landmark's distance over the distance; beyond, first-order error"
+        " propagation fails",
     )
     max_position_ratio: float = Field(
-        0.02, gt=0, description="std of the position over the median distance of landmarks; beyond it: degenerate"
+        0.02,
+        gt=0,
+        description="largest standard deviation of the camera position over the landmarks' median distance; beyond, "
+        "the pose counts as degenerate",
     )
     min_share: float = Field(
         0.15,
         ge=0,
         le=1,
-        description="share of a frame's landmarks that must agree with one pose; a twentieth agrees with a wrong one by"
-        " chance, since all are searched near their predictions",
+        description="share of a frame's landmarks that must agree with its pose; 0.05 agree with a wrong pose by "
+        "chance, since all are searched near their predictions",
     )
     hypotheses: int = Field(
-        150, ge=1, description="samples of four landmarks; finds a clean one at half outliers with p = 0.9999"
+        150,
+        ge=1,
+        description="random samples of four landmarks; 150 contain one without outliers with probability 0.9999 if "
+        "half of the landmarks are outliers",
     )
-    iterations: int = Field(50, ge=1, description="limit of Levenberg-Marquardt steps; about ten are needed")
-    seed: int = Field(1999, ge=0, description="seed of the samples; any")
+    iterations: int = Field(50, ge=1, description="limit of Levenberg-Marquardt iterations; about 10 suffice")
+    seed: int = Field(1999, ge=0, description="seed of the random samples")
 
 
 @dataclass(frozen=True)
