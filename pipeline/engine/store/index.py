@@ -13,7 +13,9 @@ import json
 import sys
 import time
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from functools import cached_property
+from typing import Any
 from urllib.parse import quote
 
 from rille.pipeline.engine.store.manifest import Ref, parsed
@@ -34,6 +36,27 @@ KEY = 64
 
 FRESH = 3600.0
 """Seconds after which a run writes again that it used the same artifacts."""
+
+
+class Facts(Mapping[str, Any]):
+    """Facts that are read once somebody asks: of most artifacts of a long sequence nobody does."""
+
+    def __init__(self, line: str, start: int) -> None:
+        self._line, self._start = line, start
+
+    @cached_property
+    def _read(self) -> Mapping[str, Any]:
+        found: Mapping[str, Any] = parsed(self._line[self._start : -1])
+        return found
+
+    def __getitem__(self, name: str) -> Any:
+        return self._read[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._read)
+
+    def __len__(self) -> int:
+        return len(self._read)
 
 
 class Index:
@@ -59,11 +82,12 @@ class Index:
         if not line.startswith(f'["{item.mark}",'):
             self.lines.pop(key, None)
             return None
+        end = line.find(",{")
         try:
-            _, digest, nbytes, stored, meta = parsed(line)
+            _, digest, nbytes, stored = parsed(f"{line[:end]}]")
         except (ValueError, TypeError):
             return None
-        return Ref(key, stage, digest, item.path, meta, nbytes, stored)
+        return Ref(key, stage, digest, item.path, Facts(line, end + 1), nbytes, stored)
 
     def note(self, used: Mapping[str, Ref]) -> None:
         """Write what a run used, unless an index says so that is young."""

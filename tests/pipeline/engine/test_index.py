@@ -54,6 +54,22 @@ def test_a_second_run_reads_no_manifest_and_finds_the_same(cache):
     assert with_index == without
 
 
+def test_facts_of_what_is_found_are_read_only_where_somebody_asks(cache, monkeypatch):
+    nodes, _, _ = run(cache)
+    asked, real = [], index.parsed
+    monkeypatch.setattr(index, "parsed", lambda text: asked.append(text) or real(text))
+    store, (label, (_, given)) = Store(cache), next(item for item in nodes.items() if item[1][1].meta)
+    run(cache)
+    assert not any(text.startswith("{") for text in asked), "the flow of these tasks asks for none"
+    store.survey(indices(cache)[0].parent.name)
+    asked.clear()
+    found = store.lookup(given.stage, given.key)
+    assert found == given, label
+    assert [text[0] for text in asked] == ["[", "{"]
+    assert dict(found.meta) == given.meta
+    assert len(asked) == 2, "once"
+
+
 def test_a_run_says_anew_that_it_used_the_same(cache, monkeypatch):
     run(cache)
     (path,) = indices(cache)
