@@ -69,7 +69,7 @@ def reconstruct(
 
     given: dict[str, Any] = {"executor": executor} if executor else {}
     if client is not None:
-        given["executor"] = client.scheduler.address
+        given["executor"] = client
     opened = seq.source if isinstance(seq, StereoSequence) else None
     options = session.Options(
         str(seq) if opened is None else opened.name,

@@ -136,7 +136,7 @@ def plan(
     *,
     settings: Settings = _SETTINGS,
     frames: Frames = None,
-    executor: Literal["processes", "threads", "inline"] = "processes",
+    executor: Literal["processes", "dask", "inline"] = "processes",
     memory_limit: MemoryLimit = None,
     verbose: Annotated[bool, flag("Each task with its reason.", "--verbose", "-v")] = False,
 ) -> int:

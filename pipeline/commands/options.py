@@ -40,7 +40,9 @@ CacheFolder = Annotated[
 Debug = Annotated[bool, flag("Show tracebacks.")]
 Executor = Annotated[
     str,
-    Parameter(help="Where tasks run: processes, threads, inline, or the address of a dask scheduler, tcp://host:port."),
+    Parameter(
+        help="Where tasks run: processes, dask (a cluster of this machine), inline, or a dask scheduler, tcp://host:port."
+    ),
 ]
 Frames = Annotated[str | None, Parameter(help="Frame range START:STOP[:STEP], as in Python; all by default.")]
 MemoryLimit = Annotated[

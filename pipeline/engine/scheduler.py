@@ -1,13 +1,15 @@
 """Runs a graph: looks everything up on the client, submits only what is missing, expands as results arrive.
 
->>> result = run(graph, Store("cache"), executor="processes", jobs=2, progress=progress.make("auto"))
+>>> result = run(graph, Store("cache"), jobs=2, progress=progress.make("auto"))
 >>> result.check()                       # raises the first failure, with its stage and label
 >>> result.counts["locus"].cached
 8
 
-A run that finds everything starts no worker. With ``dry=True`` nothing is computed: ``status`` of the handles is
-``cached`` or ``planned``, and ``reason`` says why (``rille plan``). What depends on results still to come is laid out
-by those of an earlier run where there was one (``Result.assumed``), else it is not known (``Result.unknown``).
+What is known of the graph is submitted ahead: a task whose inputs are with the executor, too, waits there for them, so
+that workers need not wait for this process. A run that finds everything starts no worker. With ``dry=True`` nothing is
+computed: ``status`` of the handles is ``cached`` or ``planned``, and ``reason`` says why (``rille plan``). What depends
+on results still to come is laid out by those of an earlier run where there was one (``Result.assumed``), else it is not
+known (``Result.unknown``).
 
 What a stage raises is not tried again, and what depends on it is skipped. Where the data do not determine an answer
 (:class:`~rille.stages.core.errors.DegenerateError`) everything else finishes: the run has a hole. After any other error
@@ -23,13 +25,15 @@ import heapq
 import math
 import time
 from collections import defaultdict
-from collections.abc import Callable, Collection
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from rille.pipeline.engine import forecast, provenance
 from rille.pipeline.engine.events import Ledger
-from rille.pipeline.engine.executors.base import Executor, Failed, make
+from rille.pipeline.engine.executors.base import Executor, Failed, Given, NotBegun, Task, light, make
+from rille.pipeline.engine.executors.base import known as check
 from rille.pipeline.engine.failures import told
 from rille.pipeline.engine.graph import Expansion, Graph, Handle
 from rille.pipeline.engine.keys import digest
@@ -41,8 +45,7 @@ from rille.pipeline.engine.runtime.environment import cores
 from rille.pipeline.engine.runtime.interrupts import Interrupts
 from rille.pipeline.engine.store.artifact import DamagedError
 from rille.pipeline.engine.store.base import GoneError, NonDeterministicError, Store
-from rille.pipeline.engine.store.manifest import Ref
-from rille.pipeline.engine.task import Outcome, key_of, recipe
+from rille.pipeline.engine.task import CodeChangedError, Outcome, Refs, key_of, recipe
 from rille.stages.core.errors import DegenerateError, RilleError
 
 HEALS = 3
@@ -126,7 +129,7 @@ def run(
     graph: Graph,
     store: Store,
     *,
-    executor: str = "processes",
+    executor: Any = "processes",
     jobs: int | None = None,
     keep_going: bool = False,
     force: Collection[str] = (),
@@ -142,7 +145,8 @@ def run(
     ----------
     graph : its handles are filled in; expansions may add nodes during the run.
     store : where artifacts are.
-    executor : ``inline``, ``threads``, ``processes`` or the address of a running dask scheduler (``tcp://...``).
+    executor : ``processes`` of this machine, ``dask`` (the same as a cluster of dask), the address of a running dask
+        scheduler (``tcp://...``), a ``Client`` of dask, or ``inline``.
     jobs : worker processes; None is one a core.
     keep_going : finish what does not depend on a failure, of whatever kind.
     force : names of stages to compute again though they are there; the digests must agree.
@@ -179,7 +183,7 @@ class _Run:
         self,
         graph: Graph,
         store: Store,
-        executor: str,
+        executor: Any,
         jobs: int | None,
         keep_going: bool,
         force: Collection[str],
@@ -201,6 +205,8 @@ class _Run:
         self.admitted = self.expanded = 0
         self.waits: dict[int, int] = {}
         """How many distinct inputs of a node are not resolved yet."""
+        self.out: dict[int, Handle] = {}
+        """With the executor."""
         self.dependants: dict[int, list[Handle]] = defaultdict(list)
         self.ready: list[int] = []
         self.begun: set[str] = set()
@@ -208,8 +214,10 @@ class _Run:
         """Stages of which a task was submitted, and of which one has come back."""
         self.missing = Waiting()
         """Looked up, not found, not submitted."""
+        self.chainable = Waiting()
+        """Nodes that wait only for what is with the executor."""
         self.flying: dict[str, list[Handle]] = {}
-        """Submitted, by key; further nodes of the same key wait for the first."""
+        """To be computed, by key; further nodes of the same key wait for the first."""
         self.patients: dict[str, set[str]] = {}
         """Keys that must be computed again before the task of a key can be."""
         self.put_back: dict[str, int] = defaultdict(int)
@@ -255,11 +263,11 @@ class _Run:
             self._settle()
             interrupts.check()
             self._submit()
-            if not self.flying:
+            if not self.out:
                 return
             assert self.executor is not None
-            for key, outcome in self.executor.wait():
-                self._land(key, outcome)
+            for number, outcome in self.executor.wait():
+                self._arrive(self.out.pop(number), outcome)
 
     # -- what needs no worker -----------------------------------------------------------------------------------
 
@@ -286,6 +294,8 @@ class _Run:
                 self._break(handle, broken)
             elif not self.waits[handle.index]:
                 heapq.heappush(self.ready, handle.index)
+            else:
+                self._chain(handle)
         self.expansions += self.graph.expansions[self.expanded :]
         self.expanded = len(self.graph.expansions)
 
@@ -298,8 +308,7 @@ class _Run:
             handle.ref = ref
             self._resolve(handle, "cached")
             return
-        made = recipe(handle.spec, refs)
-        handle.reason = "forced" if forced else self.known.reason(self.store, handle.stage, handle.label, key, made)
+        self._explain(handle, refs)
         if self.dry:
             self._resolve(handle, "planned")
         elif key in self.flying:
@@ -307,6 +316,11 @@ class _Run:
         else:
             self.flying[key] = [handle]
             self.missing.push(handle)
+
+    def _explain(self, handle: Handle, refs: Refs) -> None:
+        made, forced = recipe(handle.spec, refs), handle.stage in self.force
+        told = "forced" if forced else self.known.reason(self.store, handle.stage, handle.label, handle.key, made)
+        handle.reason = told
 
     def _expand(self) -> bool:
         """Call the first expansion whose handles are done; whether there was one."""
@@ -330,7 +344,7 @@ class _Run:
     def _end_plan(self) -> bool:
         """Lay out what comes last, once everything else is laid out or will never be; whether there was such."""
         last = self.graph.last
-        if last is None or (self.expansions and self.flying):
+        if last is None or (self.expansions and (self.flying or self.out)):
             return False
         self.graph.last = None
         last()
@@ -339,33 +353,108 @@ class _Run:
     # -- what does ----------------------------------------------------------------------------------------------
 
     def _submit(self) -> None:
-        """Keep every worker busy, and no more: what is not begun can still be left out."""
+        """Keep the executor supplied, with many tasks at a time: what is missing, and what waits for tasks it has."""
         if self.missing and not self.stopped and self.executor is None:
             self._begin()
-        while self.missing and not self.stopped and self.executor is not None and self.executor.idle():
-            assert self.admission is not None
-            handle = self.missing.take(self.begun - self.warm, self.admission.fits)
-            if handle is None:
-                break
-            refused = self.admission.refusal(handle)
-            if refused is not None:
-                self._land(handle.key, Failed(refused, ""))
-                continue
-            self.begun.add(handle.stage)
-            self.admission.begin(handle)
-            handle.status = "running"
-            self.progress.running(handle)
-            refs = {p: [_light(r) for r in g] if isinstance(g, list) else _light(g) for p, g in handle.refs().items()}
-            self.executor.submit(handle.key, self.store.location, handle.spec, refs, handle.stage in self.force)
         if self.stopped:
-            for key in (*(handle.key for handle in self.missing), *self.patients):
-                for handle in self.flying.pop(key, ()):
-                    handle.status = self.fates.get(handle.index, "pending")
             self.missing.clear()
+            self.chainable.clear()
             self.patients.clear()
+        if self.executor is not None and not self.stopped and self.executor.free():
+            batch = [self._send(handle) for handle in self._choose(self.executor)]
+            if batch:
+                self.executor.submit(batch)
+
+    def _choose(self, executor: Executor) -> Iterator[Handle]:
+        """Tasks to be sent now, each when the one before is; none until there is room for several."""
+        assert self.admission is not None
+        admission, most = self.admission, executor.slots * executor.depth
+        admission.together = executor.slots
+        at_work, few = sum(not self.waits[index] for index in self.out), most - most // 4
+        if at_work < few:
+            while at_work < most and not self.stopped:
+                handle = self.missing.take(self.begun - self.warm, admission.fits, last=at_work < executor.slots)
+                if handle is None:
+                    break
+                if (refused := admission.refusal(handle)) is not None:
+                    self._land(handle, Failed(refused, ""))
+                else:
+                    at_work += 1
+                    yield handle
+        if len(self.out) < few:
+            while len(self.out) < most and not self.stopped:
+                handle = self.chainable.take(self.begun - self.warm, admission.fits, last=False)
+                if handle is None:
+                    break
+                if self._waits_for_sent(handle) and admission.refusal(handle) is None:
+                    yield handle
+
+    def _waits_for_sent(self, handle: Handle) -> bool:
+        """Whether all that a node waits for is with the executor."""
+        return 0 < self.waits[handle.index] <= len(self.out) and all(
+            h.done or h.index in self.out for h in handle.upstream()
+        )
+
+    def _chain(self, handle: Handle) -> None:
+        if not self.dry and self._waits_for_sent(handle):
+            self.chainable.push(handle)
+
+    def _send(self, handle: Handle) -> Task:
+        assert self.admission is not None
+        self.begun.add(handle.stage)
+        self.admission.begin(handle)
+        handle.status = "running"
+        self.out[handle.index] = handle
+        self.progress.running(handle)
+        for dependant in self.dependants.get(handle.index, ()):
+            if dependant.status == "pending":
+                self._chain(dependant)
+        refs = {p: [_given(h) for h in g] if isinstance(g, list) else _given(g) for p, g in handle.inputs.items()}
+        root, force = self.store.location, handle.stage in self.force
+        return Task(handle.index, root, handle.spec, refs, handle.key, force)
+
+    def _arrive(self, handle: Handle, outcome: Outcome | Failed | NotBegun) -> None:
+        """Take up what the executor gives back."""
+        assert self.admission is not None
+        self.admission.end(handle)
+        handle.status = "pending"
+        chained, all_known = not handle.key, not self.waits[handle.index]
+        if chained and all_known and self._broken(handle) is None:
+            handle.key = key_of(handle.spec, handle.refs())
+        if isinstance(outcome, Outcome):
+            if handle.key and outcome.ref.key != handle.key:
+                outcome = Failed(CodeChangedError("RIL-870", "a worker's source code is not that of this process"), "")
+            else:
+                handle.key = outcome.ref.key
+                if chained and all_known and not outcome.cached:
+                    self._explain(handle, handle.refs())
+        if isinstance(outcome, NotBegun) or not handle.key:
+            self._take_back(handle)
+        else:
+            self._land(handle, outcome)
+
+    def _take_back(self, handle: Handle) -> None:
+        """Treat a task that was not begun, or whose input is not known here yet, as if it had never been sent."""
+        again = [handle, *(h for h in self.flying.pop(handle.key, ()) if h is not handle)]
+        handle.key = ""
+        broken = self._broken(handle)
+        if broken is not None:
+            self._break(handle, broken)
+        for each in again:
+            if each.status != "pending":
+                continue
+            if self.waits[each.index]:
+                self._chain(each)
+            else:
+                heapq.heappush(self.ready, each.index)
+
+    @staticmethod
+    def _broken(handle: Handle) -> Handle | None:
+        return next((h for h in handle.upstream() if h.status in _FATE), None)
 
     def _begin(self) -> None:
         """Look ahead, share the memory out, and start the workers that it leaves room for."""
+        check(self.executor_kind, self.jobs)
         known, jobs = cost_model.recall(self.hints), self.jobs or cores()
         ahead = self._look_ahead()
         most = max(largest(ahead, known), *(known.foresee(h.spec, input_bytes(h)).most for h in self.missing))
@@ -373,12 +462,11 @@ class _Run:
         self.admission = Admission(known, shares, automatic=self.memory_limit is None)
         self.admission.check(ahead)
         self.store.writable()
-        few = shares.workers < jobs and self.executor_kind == "processes"
         amounts = {k: round(v) for k, v in vars(shares).items() if math.isfinite(v)}
-        self.ledger.run(executor=self.executor_kind, jobs=shares.workers, **amounts)
-        workers = shares.workers if few else self.jobs
+        name = self.executor_kind if isinstance(self.executor_kind, str) else self.executor_kind.scheduler.address
+        self.ledger.run(executor=name, jobs=shares.workers, **amounts)
         modules = tuple(dict.fromkeys(h.spec.module for h in ahead.nodes if not h.done))
-        self.executor = make(self.executor_kind, workers, self.store.location, shares.limit, modules)
+        self.executor = make(self.executor_kind, shares.workers, self.store.location, shares.limit, modules)
         self.result.executor_started = True
 
     def _look_ahead(self) -> Graph:
@@ -389,14 +477,12 @@ class _Run:
         dry._leave_out()
         return ahead
 
-    def _land(self, key: str, outcome: Outcome | Failed) -> None:
-        assert self.admission is not None
-        self.admission.end(key)
-        first, *others = self.flying[key]
+    def _land(self, first: Handle, outcome: Outcome | Failed) -> None:
+        key = first.key
         self.warm.add(first.stage)
         if isinstance(outcome, Failed) and self._heal(first, outcome.error):
             return
-        del self.flying[key]
+        others = [h for h in self.flying.pop(key, ()) if h is not first and h.index not in self.out]
         if not isinstance(outcome, Failed) and first.ref is not None and first.ref.digest != outcome.ref.digest:
             error = NonDeterministicError(
                 "RIL-535", f"stage {first.stage} is not deterministic: another digest when healed"
@@ -422,11 +508,13 @@ class _Run:
         if not isinstance(error, DamagedError | GoneError) or self.put_back[handle.key] >= HEALS or self.stopped:
             return False
         self.put_back[handle.key] += 1
+        self.flying.setdefault(handle.key, [handle])
         absent = {h.key: h for h in handle.upstream() if self.store.lookup(h.stage, h.key, fresh=True) is None}
         for key, source in absent.items():
             source.reason = "its artifact was found damaged, or gone, when it was read"
             if key not in self.flying:
                 self.flying[key] = [source]
+                source.status = "pending"
                 self.missing.push(source)
         if absent:
             self.patients[handle.key] = set(absent)
@@ -454,11 +542,14 @@ class _Run:
         self.progress.failed(failure.label, failure.error)
         if not self.keep_going and not is_hole(failure.error):
             self.stopped = f"stopped after {failure.label} failed"
+            if self.executor is not None:
+                self.executor.halt()
 
     # -- what became of it --------------------------------------------------------------------------------------
 
     def _resolve(self, handle: Handle, status: str) -> None:
         handle.status = status
+        self.chainable.discard(handle)
         if status == "planned":
             handle.earlier = self.known.latest(self.store, handle.stage, handle.label)
         counts = self.result.counts.setdefault(handle.stage, Counts())
@@ -478,6 +569,7 @@ class _Run:
             if not handle.done:
                 self._break(dependant, handle)
             elif not self.waits[dependant.index] and dependant.status == "pending":
+                self.chainable.discard(dependant)
                 heapq.heappush(self.ready, dependant.index)
 
     def _break(self, handle: Handle, by: Handle) -> None:
@@ -492,7 +584,9 @@ class _Run:
         """Account for everything that was not even begun."""
         self._admit()
         for handle in self.graph.nodes:
-            if handle.status == "pending":
+            if handle.status == "pending" and handle.index in self.fates:  # it was to be healed
+                handle.status = self.fates[handle.index]
+            elif handle.status == "pending":
                 handle.reason = self.stopped
                 self._resolve(handle, "skipped")
         for handles, *_ in self.expansions:
@@ -507,9 +601,9 @@ def _sequence(graph: Graph) -> str:
     return digest(None if first is None else [first.module, first.params, dict(first.args)])[:16]
 
 
-def _light(ref: Ref) -> Ref:
-    """Without its facts, which a task reads from the store: those of a long trajectory would travel to every pair."""
-    return replace(ref, meta={})
+def _given(handle: Handle) -> Given:
+    """An input as it is handed over: what it is, or the number of the task that makes it."""
+    return handle.index if handle.ref is None else light(handle.ref)
 
 
 _FATE = {"failed": "failed", "skipped": "was skipped"}

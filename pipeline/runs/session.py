@@ -46,7 +46,8 @@ class Options:
     config: Path | None = None
     frames: str | None = None
     jobs: int | None = None
-    executor: str = "processes"
+    executor: Any = "processes"
+    """A kind, the address of a dask scheduler, or a ``Client`` of dask."""
     keep_going: bool = False
     force: frozenset[str] = frozenset()
     runs: Path = Path("runs")

@@ -115,7 +115,7 @@ def test_the_same_again_computes_nothing(cold: Path, monkeypatch: pytest.MonkeyP
 
     monkeypatch.setattr("rille.pipeline.engine.scheduler.make", no_worker)
     before = digests(cold)
-    assert session.reconstruct(options(cold, executor="processes")) == 0
+    assert session.reconstruct(options(cold, executor="dask")) == 0
     assert computed(cold) == set()
     assert digests(cold) == before
 

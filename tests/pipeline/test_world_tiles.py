@@ -90,7 +90,7 @@ def test_order_of_models_and_number_of_workers_change_no_bit(tmp_path: Path, hol
     params = MergeParams(max_hole=hole)
     first = run(tmp_path / "a", PLACES, params=params)[1]
     backwards = dict(reversed(PLACES.items()))
-    assert run(tmp_path / "b", backwards, params=params, executor="threads")[1] == first
+    assert run(tmp_path / "b", backwards, params=params, executor="dask")[1] == first
 
 
 def test_closed_holes_do_not_see_the_cut_into_tiles(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -54,7 +54,7 @@ def test_a_server_in_trouble(calm, bucket, through, row, monkeypatch, how):
         for _ in range(2):  # cold, then warm
             graph = Graph()
             chain.build(graph)
-            result = scheduler.run(graph, at(f"{prefix}/{trial}"), executor="threads", jobs=3)
+            result = scheduler.run(graph, at(f"{prefix}/{trial}"), executor="inline", jobs=3)
             computed += result.total().computed
             wrong += [h.label for h in graph.nodes if h.ref is None or h.ref.digest != calm["labels"][h.label]]
         found = look.published(f"{prefix}/{trial}")

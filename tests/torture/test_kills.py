@@ -94,6 +94,7 @@ def torment(program, calm, folder, executor, tries, seed, environment=None):
         ("inline", 8),
         pytest.param("inline", 50, marks=pytest.mark.slow),
         pytest.param("processes", 50, marks=pytest.mark.slow),
+        pytest.param("dask", 30, marks=pytest.mark.slow),
     ],
 )
 def test_killed_at_random_moments(programs, calm, tmp_path, row, executor, tries):
@@ -114,10 +115,9 @@ def test_killed_at_random_moments_with_the_cache_in_a_bucket(programs, calm, buc
     ("executor", "tries"),
     [
         ("inline", 3),
-        ("threads", 2),
         pytest.param("inline", 20, marks=pytest.mark.slow),
-        pytest.param("threads", 20, marks=pytest.mark.slow),
         pytest.param("processes", 20, marks=pytest.mark.slow),
+        pytest.param("dask", 20, marks=pytest.mark.slow),
     ],
 )
 def test_interrupted_at_random_moments(programs, calm, tmp_path, row, executor, tries):
@@ -128,7 +128,7 @@ def test_interrupted_at_random_moments(programs, calm, tmp_path, row, executor, 
         within = WITHIN * max(1.0, os.getloadavg()[0] / len(os.sched_getaffinity(0)))
     for trial in range(tries):
         cache = tmp_path / str(trial)
-        span = 1.2 * calm["seconds"] if executor != "processes" else 5.0
+        span = 1.2 * calm["seconds"] if executor == "inline" else 5.0
         pid = program.start(cache=str(cache), executor=executor, sleepers=3)
         time.sleep(rng.uniform(0.0, span))
         children = psutil.Process(pid).children(recursive=True)
@@ -153,6 +153,7 @@ def test_interrupted_at_random_moments(programs, calm, tmp_path, row, executor, 
 DEATHS = ("task", "mkdir:1", "fsync:1", "link:1", "linked:1", "fsync:2", "replace:1")
 PUBLISHED = ("linked:1", "fsync:2", "created:1", "replace:1")
 """When these deaths come, the artifact is there."""
+POOLS = ("processes", "dask")
 DEATHS_IN_A_BUCKET = ("task", "create:1", "created:1")
 
 
@@ -178,16 +179,17 @@ def die(program, calm, cache, tally, row, deaths, executor, environment=None):
 
 
 @pytest.mark.slow
-def test_workers_that_die_at_their_work_and_in_their_commit(programs, calm, tmp_path, row):
+@pytest.mark.parametrize("executor", POOLS)
+def test_workers_that_die_at_their_work_and_in_their_commit(programs, calm, tmp_path, row, executor):
     (program,) = programs(1)
-    die(program, calm, tmp_path / "cache", tmp_path / "tally", row, DEATHS, "processes")
+    die(program, calm, tmp_path / "cache", tmp_path / "tally", row, DEATHS, executor)
 
 
 @pytest.mark.slow
 def test_workers_that_die_with_the_cache_in_a_bucket(programs, calm, tmp_path, bucket, row):
     (program,) = programs(1)
     prefix, environment = bucket
-    die(program, calm, f"{prefix}/cache", tmp_path / "tally", row, DEATHS_IN_A_BUCKET, "processes", environment)
+    die(program, calm, f"{prefix}/cache", tmp_path / "tally", row, DEATHS_IN_A_BUCKET, "dask", environment)
 
 
 @pytest.mark.slow
@@ -202,26 +204,38 @@ def test_workers_of_a_cluster_that_die(programs, calm, tmp_path, row):
 
 
 @pytest.mark.slow
-def test_poison_takes_three_workers_each_and_nothing_else_along(programs, calm, tmp_path, row):
+@pytest.mark.parametrize("executor", POOLS)
+def test_poison_takes_three_workers_each_and_nothing_else_along(programs, calm, tmp_path, row, executor):
     (program,) = programs(1)
     cache, tally = tmp_path / "cache", tmp_path / "tally"
     poison = ("poison#1", "poison#2", "poison#3")
-    found = program.run(cache=str(cache), executor="processes", sabotage=poison, tally=str(tally))
+    found = program.run(cache=str(cache), executor=executor, sabotage=poison, tally=str(tally))
     failed = {label: n["why"] for label, n in found["nodes"].items() if n["status"] == "failed"}
     assert set(failed) == {f"saboteur/{p}" for p in poison}
     assert all(why.startswith("WorkerDiedError: 3 worker processes died") for why in failed.values())
-    assert {p.name: p.stat().st_size for p in tally.iterdir()} == dict.fromkeys(poison, 3)
+    deaths = {p.name: p.stat().st_size for p in tally.iterdir()}
+    assert set(deaths) == set(poison)
+    assert set(deaths.values()) <= ({3} if executor == "processes" else {3, 4}), "one that others were blamed for, too"
     wrong = [n for n, digest in calm["labels"].items() if found["nodes"][n]["digest"] != digest]
     computed = statuses(found, "computed")
-    row("poison: a task kills each worker", 3, [], wrong, computed, len(calm["digests"]), "9 workers died")
+    row(
+        f"poison: a task kills each worker, {executor}",
+        3,
+        [],
+        wrong,
+        computed,
+        len(calm["digests"]),
+        f"{sum(deaths.values())} workers died",
+    )
 
 
 @pytest.mark.slow
-def test_a_worker_out_of_memory_is_named_with_its_memory(programs, calm, tmp_path, row):
+@pytest.mark.parametrize("executor", POOLS)
+def test_a_worker_out_of_memory_is_named_with_its_memory(programs, calm, tmp_path, row, executor):
     (program,) = programs(1)
     cache = tmp_path / "cache"
     found = program.run(
-        cache=str(cache), executor="processes", sabotage=("memory",), tally=str(tmp_path / "tally"), memory=800_000_000
+        cache=str(cache), executor=executor, sabotage=("memory",), tally=str(tmp_path / "tally"), memory=800_000_000
     )
     hog = found["nodes"]["saboteur/memory"]
     assert hog["status"] == "failed"
@@ -229,6 +243,12 @@ def test_a_worker_out_of_memory_is_named_with_its_memory(programs, calm, tmp_pat
     wrong = [n for n, digest in calm["labels"].items() if found["nodes"][n]["digest"] != digest]
     computed = statuses(found, "computed")
     row(
-        "a worker runs out of memory", 1, [], wrong, computed, len(calm["digests"]), hog["why"].split(":", 1)[1].strip()
+        f"a worker runs out of memory, {executor}",
+        1,
+        [],
+        wrong,
+        computed,
+        len(calm["digests"]),
+        hog["why"].split(":", 1)[1].strip(),
     )
     assert maintenance.verify(Store(cache))[1] == []

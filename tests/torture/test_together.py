@@ -32,7 +32,7 @@ def together(programs, cache, runs, executors, grace, **options):
     return [program.found() for program in three], cleaner.found()
 
 
-EXECUTORS = ("inline", "threads", "inline")
+EXECUTORS = ("inline", "dask", "inline")
 
 
 @pytest.mark.parametrize("tries", [1, pytest.param(12, marks=pytest.mark.slow)])

@@ -1,9 +1,9 @@
-"""Where tasks run: in this process, on its threads, on worker processes, or on a running dask cluster.
+"""Where tasks run: on workers of dask, on a pool of processes without it, or one after the other in this process.
 
-:func:`make` is the one factory. All executors are the same three verbs: ``submit``, ``wait``, ``close``. Processes of
-this machine are :mod:`rille.pipeline.engine.executors.processes`: a task costs them tenths of a millisecond beside
-itself, where distributed's scheduler takes seven of a core that the workers need. A cluster given by address is dask's,
-and examined first (:mod:`rille.pipeline.engine.executors.dask_cluster`).
+:func:`make` is the one factory. Workers of dask are those of a cluster of this machine (one process a core, one thread
+each), of a scheduler that others have started, or behind a ``Client`` that was handed in: the same code path
+(:mod:`rille.pipeline.engine.executors.dask_client`). The pool gets one task at a time and worker
+(:mod:`rille.pipeline.engine.executors.processes`).
 
 Programs call :func:`rille.pipeline.engine.runtime.environment.prepare_environment` first thing, so that this process
 and the workers run alike.
@@ -11,45 +11,67 @@ and the workers run alike.
 
 from __future__ import annotations
 
-import logging
-import math
-import os
 import pickle
-import queue
 import re
-import threading
-import time
 import traceback
 import warnings
-from collections.abc import Sequence
-from concurrent.futures import Future
-from contextlib import suppress
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
-from rille.pipeline.engine.executors import dask_cluster
-from rille.pipeline.engine.executors.processes import WorkerDiedError, Workers, died
-from rille.pipeline.engine.runtime.environment import cores, prepare_environment
+from rille.pipeline.engine.executors.processes import Workers
+from rille.pipeline.engine.runtime.environment import prepare_environment
 from rille.pipeline.engine.store.location import Location
-from rille.pipeline.engine.task import Outcome, Refs, Spec, ensure, resolve
+from rille.pipeline.engine.store.manifest import Ref
+from rille.pipeline.engine.task import Outcome, Spec, ensure, resolve
 from rille.stages.core.errors import ConfigError, RilleError
 
-__all__ = ["Executor", "Failed", "WorkerDiedError", "make", "prepare_environment"]
+__all__ = ["Executor", "Failed", "NotBegun", "Task", "light", "make", "prepare_environment"]
 
-WATCH = 0.5
-"""Seconds until something else than an end of a task is looked after."""
+KINDS = ("processes", "dask", "inline")
 
-CONNECT = 10.0
-"""Seconds until a scheduler must have answered."""
+Given = Ref | int
+"""An input: the artifact, or the number of the task in flight that makes it."""
 
-LOOK = 2.0
-"""Seconds between looks at the scheduler of others."""
 
-GRACE = 2.0
-"""Seconds to take leave of a scheduler at the end of a run."""
+def light(ref: Ref) -> Ref:
+    """Without its facts, which a task reads from the store: those of a long trajectory would travel to every pair."""
+    return replace(ref, meta={})
 
-HURRY = 0.5
-"""The same for an interrupted run."""
+
+@dataclass(frozen=True)
+class Task:
+    """A call of :func:`~rille.pipeline.engine.task.ensure`; ``key`` is empty while an input is still to come.
+
+    The least ``number`` runs first.
+    """
+
+    number: int
+    root: Location
+    spec: Spec
+    refs: Mapping[str, Given | list[Given]]
+    key: str = ""
+    force: bool = False
+
+    def upstream(self) -> list[int]:
+        """Numbers of the tasks in flight that it waits for."""
+        given = [g for port in self.refs.values() for g in (port if isinstance(port, list) else [port])]
+        return list(dict.fromkeys(g for g in given if isinstance(g, int)))
+
+    def run(self, made: Mapping[int, Ref]) -> Outcome | Failed:
+        """Run it here, with the artifacts of the tasks that it waited for."""
+
+        def ref(given: Given) -> Ref:
+            return made[given] if isinstance(given, int) else given
+
+        refs = {
+            port: [ref(g) for g in given] if isinstance(given, list) else ref(given)
+            for port, given in self.refs.items()
+        }
+        try:
+            return ensure(self.root, self.spec, refs, key=self.key or None, force=self.force)
+        except Exception as error:
+            return Failed.of(error)
 
 
 @dataclass(frozen=True)
@@ -70,267 +92,132 @@ class Failed:
         return Failed(error, text)
 
 
-Landed = list[tuple[str, Outcome | Failed]]
+class NotBegun:
+    """In the place of an outcome: an input did not come, the run was stopped, or the worker died."""
+
+
+Landed = list[tuple[int, Outcome | Failed | NotBegun]]
 
 
 class Executor(Protocol):
-    """Runs :func:`~rille.pipeline.engine.task.ensure`; ``key`` names the task."""
+    """Runs tasks, each known by its number."""
 
-    def idle(self) -> bool:
-        """Whether one more task would start at once."""
+    slots: int
+    """Tasks that run at a time."""
+    depth: int
+    """Tasks that it may have for each slot: enough that workers need not wait for this process."""
 
-    def submit(self, key: str, root: Location, spec: Spec, refs: Refs, force: bool) -> None:
-        """Start a task."""
+    def free(self) -> bool:
+        """Whether it takes more tasks now."""
+
+    def submit(self, tasks: Sequence[Task]) -> None:
+        """Start tasks, each after those in flight that it waits for."""
 
     def wait(self) -> Landed:
         """Block until at least one task has ended."""
+
+    def halt(self) -> None:
+        """Begin nothing more; what was submitted and not begun comes back so."""
 
     def close(self, kill: bool = False) -> None:
         """Leave nothing behind; ``kill`` does not wait for what is running."""
 
 
-KINDS = ("processes", "threads", "inline")
-
-
-def known(kind: str, jobs: int | None = None) -> None:
+def known(kind: Any, jobs: int | None = None) -> None:
     """Refuse an executor that there is not, before any work.
 
     Raises
     ------
     ConfigError
-        It is neither one of the kinds nor an address, or there are no ``jobs``.
+        It is neither one of the kinds nor an address nor a ``Client`` of dask, or there are no ``jobs``.
     """
-    if kind not in KINDS and not re.fullmatch(r"(tcp|tls)://[^/\s]+:\d+", kind):
+    if isinstance(kind, str) and kind not in KINDS and not re.fullmatch(r"(tcp|tls)://[^/\s]+:\d+", kind):
         raise ConfigError("RIL-539", f"executor {kind!r} is unknown", remedy=f"{', '.join(KINDS)} or tcp://host:port")
     if jobs is not None and jobs < 1:
         raise ConfigError("RIL-540", f"{jobs} jobs are not permitted", remedy="give 1 or more")
 
 
-def make(
-    kind: str, jobs: int | None, cache: Location, memory: float = math.inf, modules: Sequence[str] = ()
-) -> Executor:
-    """``inline``, ``threads``, ``processes`` or a scheduler's address; ``jobs`` None is one a core.
+def make(kind: Any, jobs: int, cache: Location, memory: float, modules: Sequence[str] = ()) -> Executor:
+    """``processes``, ``dask``, the address of a scheduler, a ``Client`` of dask, or ``inline``.
 
-    A worker process of our own that takes more than ``memory`` bytes by itself is ended, before the system ends others.
-    ``modules`` are those of the stages to come, in their order: a worker that has nothing to do imports them.
+    ``jobs`` and ``memory`` are for workers of our own: how many, and bytes beyond which one that takes so many by
+    itself is ended, before the system ends others. ``modules`` are those of the stages to come, in their order: a
+    process that has nothing to do imports them.
 
     Raises
     ------
     ConfigError
         There is no such executor, or the cluster does not answer.
     """
-    known(kind, jobs)
-    jobs = jobs or cores()
     if kind == "inline":
         return Inline()
-    if kind == "threads":
-        return Threads(jobs)
     if kind == "processes":
-        return Processes(jobs, cache, memory, modules)
-    return Cluster(kind, cache)
+        return Processes(jobs, memory, modules)
+    from rille.pipeline.engine.executors import dask_client
+
+    return dask_client.here(jobs, cache, memory) if kind == "dask" else dask_client.elsewhere(kind, cache)
 
 
-def _attempt(key: str, root: Location, spec: Spec, refs: Refs, force: bool) -> Outcome | Failed:
-    try:
-        return ensure(root, spec, refs, key=key, force=force)
-    except Exception as error:
-        return Failed.of(error)
-
-
-class Inline:
-    """One task after the other in this process: for debugging, and where one core is all there is."""
-
-    def __init__(self) -> None:
-        self._task: tuple[Any, ...] | None = None
-
-    def idle(self) -> bool:
-        """Whether nothing waits to be run."""
-        return self._task is None
-
-    def submit(self, key: str, root: Location, spec: Spec, refs: Refs, force: bool) -> None:
-        """Remember the task; :meth:`wait` runs it."""
-        self._task = (key, root, spec, refs, force)
-
-    def wait(self) -> Landed:
-        """Run the task."""
-        assert self._task is not None
-        task, self._task = self._task, None
-        return [(task[0], _attempt(*task))]
-
-    def close(self, kill: bool = False) -> None:
-        """Nothing to leave."""
-        if kill:
-            _leave_unsaid()
-
-
-class _Futures:
-    """Executors whose futures call back when they are done."""
-
-    def __init__(self, slots: int) -> None:
-        self._slots = slots
-        self._flying: dict[str, Any] = {}
-        self._done: queue.SimpleQueue[str] = queue.SimpleQueue()
-
-    def _start(self, key: str, *task: Any) -> Any:
-        raise NotImplementedError
-
-    def idle(self) -> bool:
-        """Whether a worker has nothing to do."""
-        return len(self._flying) < self._slots
-
-    def submit(self, key: str, root: Location, spec: Spec, refs: Refs, force: bool) -> None:
-        """Start the task."""
-        self._flying[key] = future = self._start(key, root, spec, refs, force)
-        future.add_done_callback(lambda _: self._done.put(key))
-
-    def wait(self) -> Landed:
-        """Block until a task has ended; all that have ended meanwhile are given."""
-        landed: Landed = []
-        while not landed or not self._done.empty():
-            with suppress(queue.Empty):
-                key = self._done.get(timeout=WATCH)
-                outcome = self._result(key, self._flying.pop(key))
-                landed += [] if outcome is None else [(key, outcome)]
-            self._watch()
-        return landed
-
-    def _watch(self) -> None:
-        """Called now and then while tasks run."""
-
-    def _result(self, key: str, future: Any) -> Outcome | Failed | None:
-        """What became of a task; None if it was begun anew."""
-        try:
-            landed: Outcome | Failed = future.result()
-        except Exception as error:
-            return Failed.of(error)
-        return landed
-
-
-class Threads(_Futures):
-    """Threads of this process; kernels release the lock. What runs at an interruption ends with the process."""
-
-    def _start(self, key: str, *task: Any) -> Any:
-        future: Future[Outcome | Failed] = Future()
-        threading.Thread(target=lambda: future.set_result(_attempt(key, *task)), daemon=True).start()
-        return future
-
-    def close(self, kill: bool = False) -> None:
-        """Nothing to leave."""
-        if kill:
-            _leave_unsaid()
-
-
-class _Client(_Futures):
-    """Tasks on workers of a dask scheduler."""
-
-    def __init__(self, address: str) -> None:
-        _quiet()
-        from distributed import Client
-
-        try:
-            self._client = Client(address, set_as_default=False, timeout=CONNECT)
-        except (OSError, TimeoutError, ValueError) as error:
-            raise ConfigError(
-                "RIL-541", f"no dask scheduler answers at {address}", remedy="check the address"
-            ) from error
-        super().__init__(max(1, sum(self._client.nthreads().values())))
-        self._submitted = 0
-
-    def _send(self, task: tuple[Any, ...], key: str, run: Any, *first: Any) -> Any:
-        self._submitted += 1
-        name = f"{task[1].label}-{key[:12]}-{os.getpid()}-{self._submitted}"
-        return self._client.submit(run, *first, key, *task, key=name, pure=False, priority=-self._submitted)
-
-    def _result(self, key: str, future: Any) -> Outcome | Failed | None:
-        from distributed import KilledWorker
-
-        if future.status == "error" and isinstance(error := future.exception(), KilledWorker):
-            return self._killed(key, str(error.task))
-        return super()._result(key, future)
-
-    def _killed(self, key: str, task: str) -> Failed | None:
-        return Failed(died("RIL-542", "worker processes died that had it"), "")
-
-    def close(self, kill: bool = False) -> None:
-        """Leave the cluster as it is."""
-        with suppress(Exception):
-            self._client.close(timeout=HURRY if kill else GRACE)
-
-
-class Cluster(_Client):
-    """A dask scheduler that is running already, with workers like this process
-    (:mod:`rille.pipeline.engine.executors.dask_cluster`)."""
-
-    def __init__(self, address: str, cache: Location) -> None:
-        super().__init__(address)
-        self._identity, self._cache = tuple(dask_cluster.identity().items()), cache
-        self._presence, self._looked = dask_cluster.Presence(self._client, address), time.monotonic()
-        try:
-            while not (threads := self._presence.threads()):
-                time.sleep(WATCH)
-            dask_cluster.examine(self._client, cache)
-        except BaseException:
-            self.close(kill=True)
-            raise
-        self._slots = threads
-
-    def _start(self, key: str, *task: Any) -> Any:
-        return self._send(task, key, _elsewhere, self._identity)
-
-    def _result(self, key: str, future: Any) -> Outcome | Failed | None:
-        if future.status in ("cancelled", "lost"):
-            raise self._presence.gone()
-        return super()._result(key, future)
-
-    def _watch(self) -> None:
-        if time.monotonic() - self._looked > LOOK:
-            self._slots = self._presence.threads() or self._slots
-            self._looked = time.monotonic()
-
-
-def _elsewhere(
-    identity: tuple[tuple[str, str], ...], key: str, root: Location, spec: Spec, refs: Refs, force: bool
-) -> Outcome | Failed:
-    """Run a task on a worker that somebody else has started."""
-    try:
-        dask_cluster.ready(identity)
-    except Exception as error:
-        return Failed.of(error)
-    return _attempt(key, root, spec, refs, force)
+def _run(task: Task) -> Outcome | Failed:
+    return task.run({})
 
 
 class Processes:
-    """Worker processes of our own, one thread each (:mod:`rille.pipeline.engine.executors.processes`)."""
+    """Worker processes that are told over a pipe (:mod:`rille.pipeline.engine.executors.processes`)."""
 
-    def __init__(self, jobs: int, cache: Location, memory: float = math.inf, modules: Sequence[str] = ()) -> None:
-        self._workers = Workers(jobs, _attempt, memory, resolve, modules)
+    depth = 1
 
-    def idle(self) -> bool:
+    def __init__(self, jobs: int, memory: float, modules: Sequence[str]) -> None:
+        self.slots, self._workers = jobs, Workers(jobs, _run, memory, resolve, modules)
+
+    def free(self) -> bool:
         """Whether a worker has nothing to do; it may still be starting."""
         return self._workers.idle()
 
-    def submit(self, key: str, root: Location, spec: Spec, refs: Refs, force: bool) -> None:
-        """Start the task."""
-        self._workers.give(key, (key, root, spec, refs, force))
+    def submit(self, tasks: Sequence[Task]) -> None:
+        """Give each to a worker."""
+        for task in tasks:
+            self._workers.give(str(task.number), (task,))
 
     def wait(self) -> Landed:
         """Block until a task has ended; a worker that dies is replaced, and its task begun anew."""
-        return [(key, Failed(a, "") if isinstance(a, RilleError) else a) for key, a in self._workers.wait()]
+        landed = self._workers.wait()
+        return [(int(key), Failed(a, "") if isinstance(a, RilleError) else a) for key, a in landed]
+
+    def halt(self) -> None:
+        """Nothing is submitted that is not begun."""
 
     def close(self, kill: bool = False) -> None:
         """End the workers, at once if ``kill``; none is left behind."""
         self._workers.close(kill)
 
 
-def _leave_unsaid() -> None:
-    """Python would warn at exit of each read or write of zarr's that an interruption caught before it began."""
-    warnings.filterwarnings("ignore", message="coroutine .* was never awaited", category=RuntimeWarning)
+class Inline:
+    """One task after the other in this process: for debugging, and where one core is all there is."""
 
+    slots = depth = 1
 
-def _quiet() -> None:
-    """Silence distributed's log: what matters comes back as an exception, the rest is noise at shutdown."""
-    import dask
+    def __init__(self) -> None:
+        self._task: Task | None = None
 
-    dask.config.set({"distributed.logging": {"distributed": "critical"}})
-    for name in ("distributed", "distributed.nanny", "distributed.worker", "distributed.scheduler", "tornado"):
-        logging.getLogger(name).setLevel(logging.CRITICAL)
+    def free(self) -> bool:
+        """Whether nothing waits to be run."""
+        return self._task is None
+
+    def submit(self, tasks: Sequence[Task]) -> None:
+        """Remember the task; :meth:`wait` runs it."""
+        (self._task,) = tasks
+
+    def wait(self) -> Landed:
+        """Run the task."""
+        assert self._task is not None
+        task, self._task = self._task, None
+        return [(task.number, task.run({}))]
+
+    def halt(self) -> None:
+        """Nothing is submitted that is not run."""
+
+    def close(self, kill: bool = False) -> None:
+        """Nothing to leave."""
+        if kill:  # Python would warn at exit of each read or write of zarr's that was interrupted before it began
+            warnings.filterwarnings("ignore", message="coroutine .* was never awaited", category=RuntimeWarning)

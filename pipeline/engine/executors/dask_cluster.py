@@ -17,16 +17,13 @@ import time
 import uuid
 from collections.abc import Mapping
 from contextlib import suppress
-from functools import lru_cache
 from importlib import metadata
 from typing import Any
 
 from rille.pipeline.engine.code_digest import OWN, tree_digest
 from rille.pipeline.engine.packages import version
-from rille.pipeline.engine.runtime.environment import prepare_environment
 from rille.pipeline.engine.store.base import Store, at
 from rille.pipeline.engine.store.location import Location
-from rille.pipeline.engine.task import CodeChangedError
 from rille.stages.core.errors import ConfigError, RilleError
 
 PACKAGES = (
@@ -146,37 +143,11 @@ def _no_cache(name: str, cache: Location, why: str) -> ConfigError:
     return ConfigError("RIL-523", f"{name} does not share the cache {cache}: {why}", remedy=remedy)
 
 
-def ready(ours: tuple[tuple[str, str], ...]) -> None:
-    """On a worker before each task: prepared as our own workers are, and the same as the client.
-
-    Raises
-    ------
-    CodeChangedError
-        It is not.
-    """
-    if difference := _prepared(ours, os.getpid()):
-        raise CodeChangedError("RIL-524", f"worker {_here()} differs: {difference}", remedy="install the same there")
-
-
-@lru_cache(maxsize=4)
-def _prepared(ours: tuple[tuple[str, str], ...], process: int) -> str:
-    prepare_environment()
-    return unlike(identity(), dict(ours))
-
-
-def _here() -> str:
-    from distributed import get_worker
-
-    with suppress(ValueError):
-        return f"{get_worker().name} on {platform.node()}"
-    return platform.node()
-
-
 class Presence:
     """Whether the scheduler answers, and has workers."""
 
-    def __init__(self, client: Any, address: str) -> None:
-        self._client, self._address = client, address
+    def __init__(self, client: Any) -> None:
+        self._client, self._address = client, client.scheduler.address
         self._answered = self._manned = time.monotonic()
 
     def threads(self) -> int:

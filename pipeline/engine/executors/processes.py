@@ -45,10 +45,13 @@ class WorkerDiedError(RilleError):
     """A task took several worker processes along: out of memory, or a crash in native code."""
 
 
-def died(code: str, what: str) -> WorkerDiedError:
-    """The error, with what to do."""
-    remedy = "give it more memory with fewer --jobs, or run it with --executor inline to see the crash"
-    return WorkerDiedError(code, what, remedy=remedy)
+REMEDY = "give it more memory with fewer --jobs, or run it with --executor inline to see the crash"
+
+
+def given_up(seen: float) -> WorkerDiedError:
+    """The error of a task that took too many; ``seen`` is the greatest memory of its worker, bytes, if known."""
+    last = f", last seen with {seen / 1e6:.0f} MB" if seen else ""
+    return WorkerDiedError("RIL-586", f"{DEATHS} worker processes died while they ran it{last}", remedy=REMEDY)
 
 
 @dataclass(eq=False)
@@ -154,7 +157,7 @@ class Workers:
         if not worker.ready or key is None:
             self._unready += 1
             if self._unready > UNREADY:
-                raise died("RIL-585", f"{UNREADY} worker processes died without a task")
+                raise WorkerDiedError("RIL-585", f"{UNREADY} worker processes died without a task", remedy=REMEDY)
         with _interrupts_deferred():
             self._workers[self._workers.index(worker)] = another = self._start()
         if key is None:
@@ -164,8 +167,7 @@ class Workers:
             self._send(another, key)
             return []
         del self._tasks[key]
-        seen = f", last seen with {self._seen[key] / 1e6:.0f} MB" if self._seen.get(key) else ""
-        return [(key, died("RIL-586", f"{DEATHS} worker processes died while they ran it{seen}"))]
+        return [(key, given_up(self._seen.get(key, 0)))]
 
     def _watch(self) -> None:
         """Note what memory the workers have, now and then; end one that has too much before the system ends others."""

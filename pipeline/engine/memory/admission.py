@@ -5,6 +5,9 @@ What is held: by this process, by each worker between tasks, and by each running
 pass one that has to wait, but not for ever. One that does not fit even alone is refused, with the parameter that makes
 it smaller. On a cluster given by address the memory is the workers' own business, unless a limit is given for all of
 it.
+
+Executors get more tasks than they run at a time, so that workers need not wait: what counts is the sum of the greatest
+so many of all that they have, whichever run together.
 """
 
 from __future__ import annotations
@@ -14,6 +17,7 @@ import math
 import time
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 from rille.pipeline.engine.graph import Graph, Handle
 from rille.pipeline.engine.memory import limits
@@ -53,13 +57,14 @@ class Account:
         return max(0.0, self.limit - self.own - self.rest)
 
 
-def account(costs: Costs, limit: float | None, executor: str, jobs: int, largest: float = 0.0) -> Account:
+def account(costs: Costs, limit: float | None, executor: Any, jobs: int, largest: float = 0.0) -> Account:
     """The shares; with fewer workers than ``jobs`` where the largest task needs their place."""
     own = limits.resident()
-    if "://" in executor and limit is None:
+    local = executor in ("dask", "processes")
+    if not local and executor != "inline" and limit is None:
         return Account(math.inf, own, 0.0, jobs)
     limit = float(limit) if limit is not None else own + limits.SHARE * limits.free()
-    if executor != "processes":
+    if not local:
         return Account(limit, own, 0.0, 1 if executor == "inline" else jobs)
     rest = costs.rest
     fit = int((limit - own - largest) // rest)
@@ -71,22 +76,27 @@ class Admission:
 
     def __init__(self, costs: Costs, shares: Account, *, automatic: bool) -> None:
         self.costs, self.shares, self.automatic = costs, shares, automatic
-        self._running: dict[str, float] = {}
-        self._foreseen: dict[int, Foreseen] = {}
+        self.together = shares.workers
+        """Tasks that may run side by side."""
+        self._running: dict[int, Foreseen] = {}
+        self._foreseen: dict[tuple[int, bool], Foreseen] = {}
         self._free, self._asked = 0.0, -math.inf
 
     def foresee(self, handle: Handle) -> Foreseen:
-        """What a task whose inputs are there will take."""
-        if handle.index not in self._foreseen:
-            self._foreseen[handle.index] = self.costs.foresee(handle.spec, input_bytes(handle))
-        return self._foreseen[handle.index]
+        """What a task will take; results of tasks that run count as foreseen."""
+        asked = handle.index, bool(handle.key)
+        if asked not in self._foreseen:
+            results = {h.index: f.result for h in handle.upstream() if (f := self._running.get(h.index)) is not None}
+            self._foreseen[asked] = self.costs.foresee(handle.spec, input_bytes(handle, results))
+        return self._foreseen[asked]
 
     def fits(self, handle: Handle) -> bool:
         """Whether a task may begin now; alone it always may."""
         if not self._running:
             return True
         most = self.foresee(handle).most
-        if sum(self._running.values()) + most > self.shares.budget:
+        together = heapq.nlargest(self.together, [most, *(f.most for f in self._running.values())])
+        if sum(together) > self.shares.budget:
             return False
         return not self.automatic or self._now() > most
 
@@ -98,12 +108,13 @@ class Admission:
 
     def begin(self, handle: Handle) -> None:
         """A task has begun."""
-        self._running[handle.key] = self.foresee(handle).most
-        del self._foreseen[handle.index]
+        self._running[handle.index] = self.foresee(handle)
+        for known in (False, True):
+            self._foreseen.pop((handle.index, known), None)
 
-    def end(self, key: str) -> None:
+    def end(self, handle: Handle) -> None:
         """It has ended."""
-        self._running.pop(key, None)
+        self._running.pop(handle.index, None)
 
     def refusal(self, handle: Handle, foreseen: Foreseen | None = None) -> MemoryRefusedError | None:
         """Why a task cannot run here at all, if so."""
@@ -167,25 +178,33 @@ class Waiting:
         heapq.heappush(self._heaps.setdefault(handle.stage, []), handle.index)
         self._nodes[handle.index] = handle
 
+    def discard(self, handle: Handle) -> None:
+        """Take out what need not wait any more."""
+        self._nodes.pop(handle.index, None)
+
     def clear(self) -> None:
         """Forget all."""
         self._heaps.clear()
         self._nodes.clear()
 
-    def take(self, cold: Collection[str], fits: Callable[[Handle], bool]) -> Handle | None:
-        """The first that fits into memory, if there is one; of ``cold`` stages only where nothing else is left.
+    def take(self, cold: Collection[str], fits: Callable[[Handle], bool], last: bool = True) -> Handle | None:
+        """The first that fits into memory, if there is one; of ``cold`` stages only as the ``last`` resort.
 
-        While a stage's first task compiles its kernels another process would compile the same ones; a moment later
-        it finds them on disk.
+        While a stage's first task compiles its kernels another worker would wait for the same ones.
         """
+        for stage, heap in list(self._heaps.items()):
+            while heap and heap[0] not in self._nodes:
+                heapq.heappop(heap)
+            if not heap:
+                del self._heaps[stage]
         first = sorted((stage in cold, heap[0], stage) for stage, heap in self._heaps.items())
-        for place, (_, index, stage) in enumerate(first):
+        for place, (is_cold, index, stage) in enumerate(first):
             handle = self._nodes[index]
+            if is_cold and not last:
+                return None
             if fits(handle):
                 self._passed = self._passed + 1 if place else 0
                 heapq.heappop(self._heaps[stage])
-                if not self._heaps[stage]:
-                    del self._heaps[stage]
                 del self._nodes[index]
                 return handle
             if self._passed >= PATIENCE:

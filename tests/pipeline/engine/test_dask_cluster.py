@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
+from collections import Counter
+from contextlib import ExitStack
 
 import pytest
 from hands import by_hand
@@ -11,7 +13,7 @@ from raising import raises
 from toys import chain
 
 from rille.pipeline.engine import scheduler
-from rille.pipeline.engine.executors import base, dask_cluster
+from rille.pipeline.engine.executors import base, dask_client, dask_cluster
 from rille.pipeline.engine.graph import Graph
 from rille.pipeline.engine.store.base import Store
 
@@ -25,16 +27,39 @@ def hands(tmp_path_factory):
         yield hands
 
 
-def run(cache, where="inline"):
+def run(cache, where="inline", jobs=2):
     graph = Graph()
     chain.build(graph)
-    scheduler.run(graph, Store(cache), executor=where).check()
+    scheduler.run(graph, Store(cache), executor=where, jobs=jobs).check()
     return {h.key: h.ref.digest for h in graph.nodes}
 
 
 def test_a_cluster_gives_what_one_process_gives(hands, tmp_path):
     assert run(tmp_path / "cluster", hands.address) == run(tmp_path / "inline")
     assert not list((tmp_path / "cluster").glob("*.tmp")), "probes are cleared away"
+
+
+@pytest.mark.parametrize("inside", [False, pytest.param(True, id="in-process")])
+def test_a_client_handed_in_runs_the_tasks_on_its_workers_and_stays_open(hands, tmp_path, inside):
+    from distributed import Client, LocalCluster
+
+    with ExitStack() as stack:
+        where = hands.address
+        if inside:
+            where = stack.enter_context(LocalCluster(2, processes=False, threads_per_worker=1, dashboard_address=":0"))
+        client = stack.enter_context(Client(where, set_as_default=False))
+        client.get_task_stream()  # from here on
+        made = run(tmp_path / "cluster", client)
+        ran = client.get_task_stream()
+        assert client.status == "running"
+        assert {row["worker"] for row in ran} <= set(client.nthreads())
+    assert Counter(row["key"].partition("-")[0] for row in ran) == {"numbers": 4, "scale": 4, "total": 1}
+    assert made == run(tmp_path / "inline")
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_a_cluster_of_this_machine_gives_what_one_process_gives(tmp_path, jobs):
+    assert run(tmp_path / "dask", "dask", jobs=jobs) == run(tmp_path / "inline")
 
 
 def test_a_cache_that_is_not_shared_is_refused(hands, tmp_path, monkeypatch):
@@ -56,7 +81,7 @@ def test_other_versions_are_refused_by_name(hands, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "tcp://no-such-host.invalid:8786"])
 def test_no_scheduler(tmp_path, address, monkeypatch):
-    monkeypatch.setattr(base, "CONNECT", 1.0)
+    monkeypatch.setattr(dask_client, "CONNECT", 1.0)
     with raises("RIL-541", "tcp://"):
         run(tmp_path / "cache", address)
 

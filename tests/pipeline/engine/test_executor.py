@@ -18,8 +18,7 @@ from toys import waiting
 from toys.chain import build
 
 from rille.pipeline.engine import scheduler
-from rille.pipeline.engine.executors.base import WorkerDiedError
-from rille.pipeline.engine.executors.processes import Workers
+from rille.pipeline.engine.executors.processes import WorkerDiedError, Workers
 from rille.pipeline.engine.graph import Graph
 from rille.pipeline.engine.store import maintenance
 from rille.pipeline.engine.store.base import Store
@@ -51,7 +50,8 @@ def gone(children, within=HANGS):
     return not [p for p in left if p.status() != psutil.STATUS_ZOMBIE]
 
 
-def test_workers_give_the_same_bits_die_alone_and_leave_nobody_behind(cache, tmp_path):
+@pytest.mark.parametrize("executor", ["processes", "dask"])
+def test_workers_give_the_same_bits_die_alone_and_leave_nobody_behind(cache, tmp_path, executor):
     """One pool for several questions, because starting it is what takes the time."""
     plain = Graph()
     build(plain)
@@ -62,7 +62,7 @@ def test_workers_give_the_same_bits_die_alone_and_leave_nobody_behind(cache, tmp
     die = graph.node("toys.mischief", "die", NoParams(), {"what": "die", "tally": str(tally)})
     graph.node("toys.mischief", "after", NoParams(), {"what": "fine"}, inputs={"after": die})
     graph.node("toys.mischief", "unpicklable", NoParams(), {"what": "unpicklable"})
-    result = scheduler.run(graph, Store(cache / "workers"), executor="processes", jobs=2, keep_going=True)
+    result = scheduler.run(graph, Store(cache / "workers"), executor=executor, jobs=2, keep_going=True)
 
     found = {h.label: h for h in graph.nodes}
     assert {h.label: h.ref.digest for h in plain.nodes} == {
@@ -78,7 +78,7 @@ def test_workers_give_the_same_bits_die_alone_and_leave_nobody_behind(cache, tmp
 
 
 def test_interruption_while_workers_start_leaves_without_a_word(cache, program_environment):
-    process = start(cache, program_environment, "processes", "sleep", start_new_session=True)
+    process = start(cache, program_environment, "dask", "sleep", start_new_session=True)
     process.stdout.readline()
     deadline = time.monotonic() + 30
     while len(children := psutil.Process(process.pid).children()) < 2 and time.monotonic() < deadline:
@@ -89,7 +89,7 @@ def test_interruption_while_workers_start_leaves_without_a_word(cache, program_e
     assert gone(children)
 
 
-@pytest.mark.parametrize("executor", ["inline", "threads", "processes"])
+@pytest.mark.parametrize("executor", ["inline", "dask"])
 def test_interruption_leaves_nobody_behind(cache, program_environment, executor):
     process = start(cache, program_environment, executor, "sleep", start_new_session=True)
     process.stdout.readline()
@@ -98,7 +98,7 @@ def test_interruption_leaves_nobody_behind(cache, program_environment, executor)
         time.sleep(0.05)
     time.sleep(0.2)  # now the sleepers run
     children = psutil.Process(process.pid).children(recursive=True)
-    assert (len(children) >= 2) == (executor == "processes")
+    assert (len(children) >= 2) == (executor == "dask")
     os.killpg(process.pid, signal.SIGINT)
     _, err = process.communicate(timeout=HANGS)  # the tasks sleep for longer
     assert process.returncode == 130
@@ -125,7 +125,7 @@ def test_killed_at_any_moment_a_run_resumes_to_the_same_digests(cache, tmp_path,
 
 
 def test_workers_end_when_the_program_is_killed(cache, program_environment):
-    process = start(cache, program_environment, "processes", "sleep", start_new_session=True)
+    process = start(cache, program_environment, "dask", "sleep", start_new_session=True)
     deadline = time.monotonic() + 30
     while len(list(cache.glob("artifacts/*/*/*.zip"))) < 4 and time.monotonic() < deadline:
         time.sleep(0.05)

@@ -184,22 +184,20 @@ def run(graph, store, executor, limit):
     return result, path
 
 
-@pytest.mark.parametrize("executor", ["threads", "processes"])
-def test_a_limit_keeps_tasks_apart_that_do_not_fit_together(learned, executor):
+def test_a_limit_keeps_tasks_apart_that_do_not_fit_together(learned):
     make, digests = learned
     store = make("tight")
-    rest = cost_model.recall(store.hints("")).rest if executor == "processes" else 0.0
+    rest = cost_model.recall(store.hints("")).rest
     limit = limits.resident() + 2 * rest + 1.5 * HOG + 2 * cost_model.SLACK
     graph = hogs()
-    result, path = run(graph, store, executor, limit)
+    result, path = run(graph, store, "dask", limit)
     assert result.ok
     assert {h.label: h.ref.digest for h in graph.nodes} == digests
     assert overlaps(path) == 0
     assert events.facts(path)["jobs"] == 2
-    if executor == "threads":  # the limit it was, and nothing else
-        result, path = run(hogs(), make("wide"), executor, None)
-        assert result.ok
-        assert overlaps(path) > 0
+    result, path = run(hogs(seconds=2.0), make("wide"), "dask", None)
+    assert result.ok
+    assert overlaps(path) > 0, "the limit it was, and nothing else"
 
 
 def lay_out():
@@ -228,11 +226,11 @@ def test_what_could_not_be_foreseen_is_refused_when_its_turn_comes(cache):
 def test_fewer_workers_start_where_their_own_memory_would_take_the_tasks_place():
     kept = Costs(rests=[100 * MB])
     own = limits.resident()
-    assert account(kept, own + 400 * MB, "processes", 4).workers == 4
-    assert account(kept, own + 400 * MB, "processes", 4, largest=150 * MB).workers == 2
-    assert account(kept, own + 150 * MB, "processes", 4, largest=150 * MB).workers == 1
-    assert account(kept, own + 400 * MB, "threads", 4, largest=150 * MB).workers == 4
-    shares = account(kept, own + 400 * MB, "processes", 4, largest=150 * MB)
+    assert account(kept, own + 400 * MB, "dask", 4).workers == 4
+    assert account(kept, own + 400 * MB, "dask", 4, largest=150 * MB).workers == 2
+    assert account(kept, own + 150 * MB, "dask", 4, largest=150 * MB).workers == 1
+    assert account(kept, own + 400 * MB, "tcp://host:1", 4, largest=150 * MB).workers == 4
+    shares = account(kept, own + 400 * MB, "dask", 4, largest=150 * MB)
     assert shares.budget == pytest.approx(200 * MB, abs=5 * MB)
     assert shares.alone == pytest.approx(300 * MB, abs=5 * MB)
     assert account(kept, None, "tcp://host:1", 4).budget == float("inf")
@@ -251,7 +249,8 @@ def test_tasks_leave_in_their_order_but_pass_one_that_must_wait_and_not_for_ever
         passed.append(taken)
     assert passed == small[:8], "then the workers are left to become free"
     assert waiting.take((), lambda h: True) is big
-    assert waiting.take({"numbers"}, lambda h: True) is small[8], "of a cold stage if there is nothing else"
+    assert waiting.take({"numbers"}, lambda h: True, last=False) is None, "not of a cold stage"
+    assert waiting.take({"numbers"}, lambda h: True) is small[8], "unless a worker has nothing else"
     waiting.push(big)
     assert waiting.take({"hog"}, lambda h: True) is small[9], "else another"
     waiting.clear()

@@ -68,7 +68,7 @@ def test_computes_what_numpy_computes(cache):
 def test_a_second_run_computes_nothing_and_starts_no_executor(cache, monkeypatch):
     first, _ = run(cache)
     monkeypatch.setattr(scheduler, "make", lambda *_: pytest.fail("an executor was started"))
-    second, result = run(cache, executor="processes")
+    second, result = run(cache, executor="dask")
     assert set(statuses(second).values()) == {"cached"}
     assert digests(second) == digests(first)
     assert (result.total().cached, result.executor_started) == (9, False)
@@ -132,7 +132,7 @@ def test_two_nodes_of_one_key_are_computed_once(cache):
         for i in range(3):
             graph.node("toys.numbers", f"n/{i}", NumbersParams(), {"frame": 7})
 
-    graph, _ = run(cache, make=make, executor="threads")
+    graph, _ = run(cache, make=make, executor="inline")
     assert sorted(statuses(graph).values()) == ["cached", "cached", "computed"]
 
 
