@@ -266,17 +266,15 @@ def refined(
 
     def adjusted(label: str, window: list[Segment], **tilt: Handle) -> Handle:
         keys = [pairs[s.frames[0]] for s in window]
-        ends = [pairs[f] for f in (window[-1].frames[-1],) if params.stereo and f in pairs]
-        read = [*keys, *ends]
         return make.node(
             refine,
             f"{label}/{keys[-1].frame}",
-            {"pairs": [pair.frame for pair in read], "resect": config.resect.model_dump(mode="json")},
+            {"pairs": [pair.frame for pair in keys], "resect": config.resect.model_dump(mode="json")},
             tracks=[s.track for s in window],
             resections=[s.resection for s in window],
             levels=[pair.level for pair in keys],
-            disparities=[pair.disparity for pair in read],
-            rigs=[pair.rig for pair in read],
+            disparities=[pair.disparity for pair in keys],
+            rigs=[pair.rig for pair in keys],
             **tilt,
         )
 
