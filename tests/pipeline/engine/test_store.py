@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 import threading
 import time
@@ -377,6 +378,34 @@ def test_large_arrays_are_chunked(cache):
     ref = Store(cache).commit(STAGE, KEY, Bundle({"elevation": big}, {}))
     assert len(chunks(cache)) == 2
     np.testing.assert_array_equal(Store(cache).open(ref)["elevation"], big)
+
+
+@pytest.mark.parametrize("shape", [(7, 5), (3,), (artifact.CHUNK, 2), (2, 3, 4)])
+@pytest.mark.parametrize("dtype", ["float32", "float64", "int16", "uint8", "bool"])
+def test_an_array_of_one_chunk_is_what_zarr_reads(cache, monkeypatch, shape, dtype):
+    values = (np.random.default_rng(0).normal(size=shape) * 9).astype(dtype)
+    stage = replace(STAGE, outputs=(Array("values", tuple("abc"[: len(shape)]), dtype, "1", "values"),))
+    ref = Store(cache).commit(stage, KEY, Bundle({"values": values}, {}))
+    by_zarr = zarr.open_group(zarr.storage.ZipStore(file_of(cache), mode="r"), mode="r")["values"][...]
+    monkeypatch.setattr(zarr, "open_array", None)
+    found = Store(cache).open(ref)
+    np.testing.assert_array_equal(found["values"], by_zarr)
+    assert found["values"].dtype == values.dtype
+    assert found["values"].flags.writeable
+    window = (slice(1, 3), *[slice(0, 2)] * (len(shape) - 1))
+    np.testing.assert_array_equal(found.part("values", window), values[window])
+    assert found.part("values", window).base is None, "a window keeps no more than itself"
+
+
+def test_an_array_with_other_codecs_is_read_by_zarr(cache, monkeypatch):
+    """As one would be that another version has written."""
+    ref = commit(cache)
+    monkeypatch.setattr(json, "loads", lambda text, real=json.loads: _with_codecs(real(text), ["bytes", "zstd"]))
+    assert Store(cache).open(ref).arrays._one_chunk("elevation") is None
+
+
+def _with_codecs(found, names):
+    return {**found, "codecs": [{"name": name} for name in names]} if "codecs" in found else found
 
 
 def test_chunks_of_nothing_are_members_too(cache):
