@@ -26,6 +26,7 @@ from rille.datasets.text.names import derived_name
 from rille.datasets.text.reading import read_text
 from rille.datasets.text.tables import read_table
 from rille.datasets.text.times import seconds
+from rille.datasets.text.warning import warning
 from rille.stages.core.errors import InputError
 from rille.stages.geometry.geometry import RigidTransform
 
@@ -162,9 +163,8 @@ def list_frames(layout: Layout) -> Frames:
             remedy="give both cameras of one recording; stamps of a pair must be equal",
         )
     if any(left_out):
-        warnings.append(
-            f"images without a partner of the same time are left out: {left_out[0]} of cam0, {left_out[1]} of cam1"
-        )
+        apart = f"{left_out[0]} of cam0, {left_out[1]} of cam1"
+        warnings.append(warning("RIL-680", f"images without a partner of the same time are left out: {apart}"))
     pairs = tuple(Pair(taken["left"][s][0].stem, taken["left"][s][0], taken["right"][s][0]) for s in common)
     lines = [taken["left"][s][1] for s in common]
     times, more = seconds(common, str(layout.folder / "cam0" / "data.csv"), lines=lines)
@@ -200,7 +200,9 @@ def _images(folder: Path, warnings: list[str]) -> dict[str, tuple[Path, int]]:
             "RIL-160", f"none of the {lost} images that {listed} lists is there", remedy=f"check {folder / 'data'}"
         )
     if lost:
-        warnings.append(f"{lost} of {len(table.rows)} images that {listed} lists are not there: left out")
+        warnings.append(
+            warning("RIL-681", f"{lost} of {len(table.rows)} images that {listed} lists are not there: left out")
+        )
     return out
 
 
@@ -235,8 +237,9 @@ def body_pose(folder: Path) -> RigidTransform | None:
 def _movement(layout: Layout, times: tuple[float, ...], left: CalibratedCamera) -> Movement:
     """Truth and IMU, brought to the left camera by the sensors' places in the body."""
     if left.T_camera_reference is None:
-        words = "does not say where the camera stands in the body (T_BS): truth and IMU are not used"
-        return Movement(warnings=(f"{layout.folder / 'cam0' / 'sensor.yaml'} {words}",))
+        path = layout.folder / "cam0" / "sensor.yaml"
+        text = f"{path} does not say where the camera stands in the body (T_BS): truth and IMU are not used"
+        return Movement(warnings=(warning("RIL-682", text),))
     T_body_left = left.T_camera_reference.inverse()
     warnings: list[str] = []
     truth, source = _truth(layout, times, T_body_left, warnings)
@@ -244,7 +247,8 @@ def _movement(layout: Layout, times: tuple[float, ...], left: CalibratedCamera) 
     if layout.imu is not None:
         T_body_imu = body_pose(layout.imu)
         if T_body_imu is None:
-            warnings.append(f"{layout.imu} does not say how the IMU stands in the body (T_BS): it is not used")
+            text = f"{layout.imu} does not say how the IMU stands in the body (T_BS): it is not used"
+            warnings.append(warning("RIL-683", text))
         else:
             imu = read_imu(layout.imu / "data.csv")
             inertial = at_frames(imu, times, T_body_imu.inverse() @ T_body_left)
@@ -258,12 +262,14 @@ def _truth(
     """T_truth_left of each frame, and what it is."""
     if layout.truth is None:
         if (layout.folder / "leica0").is_dir():
-            warnings.append("leica0 tracks a point without its rotation: it is not used as truth")
+            text = "leica0 tracks a point without its rotation: it is not used as truth"
+            warnings.append(warning("RIL-684", text))
         return None, ""
     folder = layout.truth
     T_body_marker = body_pose(folder)
     if T_body_marker is None and not TRUTH[folder.name]:
-        warnings.append(f"{folder} does not say how its markers stand in the body (T_BS): it is not used as truth")
+        text = f"{folder} does not say how its markers stand in the body (T_BS): it is not used as truth"
+        warnings.append(warning("RIL-685", text))
         return None, ""
     T_marker_left = T_body_left if T_body_marker is None else T_body_marker.inverse() @ T_body_left
     timed = read_poses(folder / "data.csv", "auto")

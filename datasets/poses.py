@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from rille.datasets.text.tables import Table, read_table
 from rille.datasets.text.times import seconds
+from rille.datasets.text.warning import warning
 from rille.stages.core.errors import InputError
 from rille.stages.geometry.geometry import RigidTransform, orthonormal
 
@@ -337,4 +338,4 @@ def coverage(found: Sequence[object | None], at: Sequence[float], what: str) -> 
     start = at[0]
     spans = f"first at {at[without[0]] - start:.2f} s, last at {at[without[-1]] - start:.2f} s of the sequence"
     stretches = "1 stretch" if runs == 1 else f"{runs} stretches"
-    return (f"no {what} for {len(without)} of {len(found)} frames, in {stretches}: {spans}",)
+    return (warning("RIL-688", f"no {what} for {len(without)} of {len(found)} frames, in {stretches}: {spans}"),)

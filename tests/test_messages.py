@@ -23,7 +23,7 @@ HEAD = """# Messages
 
 Every error has a code that stays when its words change: `rille: error RIL-214: what, where: what to change`. Here an
 ellipsis stands for what the program fills in. 001-099 command line and configuration, 100-299 input, 300-499 stages,
-500-599 engine and store, 600-639 outputs, 640-699 findings of `rille check` and warnings, 700-998 what came later;
+500-599 engine and store, 600-639 outputs, 640-709 findings of `rille check` and warnings, 710-998 what came later;
 RIL-999 is an error of the program itself.
 
 | code | message | what to change |

@@ -10,6 +10,7 @@ import numpy as np
 
 from rille.datasets.cameras import CalibratedCamera, read_cameras, rig_of
 from rille.datasets.manifest.model import Cameras, Manifest, PinholeLens, RigSection
+from rille.datasets.text.warning import warning
 from rille.stages.core.errors import InputError
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 from rille.stages.geometry.lens import Lens
@@ -206,7 +207,8 @@ def _placed(
     if stated is not None and of_files is not None:
         ours, theirs = (float(np.linalg.norm(T.translation)) for T in (stated, of_files))
         if theirs > 0 and abs(ours - theirs) > SAME * theirs:
-            lines.append(f"baseline {ours:g} m of the manifest is used; the calibration file says {theirs:g} m")
+            text = f"baseline {ours:g} m of the manifest is used; the calibration file says {theirs:g} m"
+            lines.append(warning("RIL-693", text))
     placed = replace(left, T_camera_reference=RigidTransform.identity())
     return placed, replace(right, T_camera_reference=chosen), lines
 
@@ -243,7 +245,8 @@ def _check_baseline(baseline: float, section: RigSection, name: str) -> list[str
         )
     low, high = USUAL_BASELINE
     if not low <= baseline <= high:
-        return [f"baseline {baseline:g} m is unusual ({low:g} to {high:g} m is common): lengths are in metres"]
+        text = f"baseline {baseline:g} m is unusual ({low:g} to {high:g} m is common): lengths are in metres"
+        return [warning("RIL-692", text)]
     return []
 
 
@@ -257,11 +260,10 @@ def off_centre(camera: Camera, side: str, size: tuple[int, int]) -> list[str]:
         return []
     scaled = [(width, round(width * size[1] / size[0])) for width in COMMON_WIDTHS if width != size[0]]
     width, height = min(scaled, key=lambda s: off(*s))
-    text = f"{side} camera: principal point ({camera.cx:g}, {camera.cy:g}) px is far from the centre of "
-    text += f"{size[0]} x {size[1]} images"
-    if off(width, height) < OFF_CENTRE / 2:
-        text += f": it fits {width} x {height}, scale by {size[0] / width:.4g}"
-    return [text]
+    fits = off(width, height) < OFF_CENTRE / 2
+    hint = f": it fits {width} x {height}, scale by {size[0] / width:.4g}" if fits else ""
+    place = f"({camera.cx:g}, {camera.cy:g}) px is far from the centre of {size[0]} x {size[1]} images"
+    return [warning("RIL-689", f"{side} camera: principal point {place}{hint}")]
 
 
 def _unusual(camera: Camera, side: str, size: tuple[int, int]) -> list[str]:
@@ -269,10 +271,10 @@ def _unusual(camera: Camera, side: str, size: tuple[int, int]) -> list[str]:
     lines = []
     view = math.degrees(2 * math.atan(size[0] / 2 / camera.fx))
     if not USUAL_VIEW_DEG[0] <= view <= USUAL_VIEW_DEG[1]:
-        lines.append(
-            f"{side} camera: fx = {camera.fx:g} px gives an angle of view of {view:.3g} degrees; is it in pixels?"
-        )
+        text = f"{side} camera: fx = {camera.fx:g} px gives an angle of view of {view:.3g} degrees; is it in pixels?"
+        lines.append(warning("RIL-690", text))
     lines += off_centre(camera, side, size)
     if not 0.8 < camera.fx / camera.fy < 1.25:
-        lines.append(f"{side} camera: fx = {camera.fx:g} and fy = {camera.fy:g} px differ much: no square pixels")
+        text = f"{side} camera: fx = {camera.fx:g} and fy = {camera.fy:g} px differ much: no square pixels"
+        lines.append(warning("RIL-691", text))
     return lines

@@ -11,6 +11,7 @@ from decimal import Decimal, InvalidOperation
 
 import numpy as np
 
+from rille.datasets.text.warning import warning
 from rille.stages.core.errors import InputError
 
 UNITS = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}
@@ -89,7 +90,8 @@ def gaps(times: Sequence[float], what: str, lines: Sequence[int] | None = None) 
     longest = int(wide[np.argmax(steps[wide])])
     where = f" after line {lines[longest]}" if lines is not None else ""
     count = "1 gap" if wide.size == 1 else f"{wide.size} gaps, the longest"
-    return (f"times of {what}: {count} of {steps[longest]:.4g} s{where} where {usual:.4g} s is usual",)
+    text = f"times of {what}: {count} of {steps[longest]:.4g} s{where} where {usual:.4g} s is usual"
+    return (warning("RIL-686", text),)
 
 
 def _decimal(value: str | int | float, what: str, line: int) -> Decimal:
@@ -152,4 +154,5 @@ def _unusual(times: Sequence[float], unit: str, what: str) -> tuple[str, ...]:
     usual = float(np.median(np.diff(np.asarray(times))))
     if usual <= SLOW:
         return ()
-    return (f"times of {what} are {usual:.4g} s apart, taken for {unit}: state the unit if they are not",)
+    text = f"times of {what} are {usual:.4g} s apart, taken for {unit}: state the unit if they are not"
+    return (warning("RIL-687", text),)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import glob
 import math
-import sys
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -20,6 +19,8 @@ from numpy.typing import NDArray
 
 from rille.datasets.images import chessboard, pairing
 from rille.datasets.images.files import read_grey
+from rille.datasets.text.warning import warning
+from rille.pipeline.engine.plain import warn
 from rille.stages.calibration.target import MODELS, BoardView, RigCalibration, calibrate_rig
 from rille.stages.core.errors import InputError, RilleError
 
@@ -90,7 +91,7 @@ def calibrate(
     print(f"board        {boards.corners[0]} x {boards.corners[1]} inner corners ({origin}), squares of {square:g} m")
     print("\n".join([*_views(found, boards), "", *_parameters(found, model), ""]))
     for line in doubts(found, boards, model):
-        print(f"rille: warning: {line}", file=sys.stderr)
+        warn(line)
     print(f'wrote        {output}\nnext         in the manifest of the sequence:\n\n[cameras]\nfile = "{output.name}"')
     return COMPLETE
 
@@ -170,19 +171,22 @@ def cover(points: Sequence[NDArray[np.float64]], size: tuple[int, int]) -> float
 def doubts(found: RigCalibration, boards: Boards, model: str) -> list[str]:
     """What the user should know before trusting the result, one line each with its figure."""
     lines = [
-        f"view {r.name} is left out: its corners miss by {r.worst:.2f} px RMS; remove or retake it"
+        warning("RIL-695", f"view {r.name} is left out: its corners miss by {r.worst:.2f} px RMS; remove or retake it")
         for r in found.residuals
         if not r.used
     ]
     if found.rms > MANY_BAD_PX:
-        lines.append(f"corners miss by {found.rms:.2f} px RMS: is the board flat, are the images paired rightly?")
+        text = f"corners miss by {found.rms:.2f} px RMS: is the board flat, are the images paired rightly?"
+        lines.append(warning("RIL-696", text))
     for side, lens in (("left", found.left), ("right", found.right)):
         share = found.sigma[f"{side} fx"] / lens.camera.fx
         if share > VAGUE_FOCAL:
-            lines.append(f"{side} focal length is known to {100 * share:.1f} % only; take views with the board tilted")
+            text = f"{side} focal length is known to {100 * share:.1f} % only; take views with the board tilted"
+            lines.append(warning("RIL-697", text))
         seen = cover([v.left if side == "left" else v.right for v in boards.views], boards.size)
         if seen < LEAST_COVER:
-            lines.append(f"the corners span {100 * seen:.0f} % of the {side} image; distortion beyond is a guess")
+            text = f"the corners span {100 * seen:.0f} % of the {side} image; distortion beyond is a guess"
+            lines.append(warning("RIL-698", text))
         vague = [
             name
             for name, value in zip(MODELS[model], lens.coefficients, strict=True)
@@ -190,7 +194,8 @@ def doubts(found: RigCalibration, boards: Boards, model: str) -> list[str]:
         ]
         if vague:
             fewer = "radtan" if model == "rational" else "radtan4"
-            lines.append(f"{side} {', '.join(vague)} cannot be told from 0 with these views; try --model {fewer}")
+            text = f"{side} {', '.join(vague)} cannot be told from 0 with these views; try --model {fewer}"
+            lines.append(warning("RIL-699", text))
     return lines
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +11,8 @@ from affine import Affine
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from rille.datasets.text.warning import warning
+from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.export.read_dem import Raster, read_elevation
 from rille.pipeline.export.writers import ENGINEERING_CRS
@@ -39,7 +40,7 @@ def compare(path_a: Path, path_b: Path, *, align: str = "none", output: Path = P
     a, b = read_elevation(path_a), read_elevation(path_b)
     check(a, b)
     for line in (*a.warnings, *b.warnings):
-        print(f"rille: warning: {line}", file=sys.stderr)
+        warn(line)
     found, error, slope, distance = measure(a, b, align)
     _print(found)
     target = output.with_name(output.name.removesuffix(".png").removesuffix(".json"))
@@ -139,9 +140,9 @@ def _about(raster: Raster) -> dict[str, Any]:
 
 
 def _missing_crs(a: Raster, b: Raster) -> list[str]:
-    lines = [f"{r.name} states no CRS: taken as the other's" for r in (a, b) if not r.crs]
+    lines = [warning("RIL-694", f"{r.name} states no CRS: taken as the other's") for r in (a, b) if not r.crs]
     for line in lines:
-        print(f"rille: warning: {line}", file=sys.stderr)
+        warn(line)
     return [*lines, *a.warnings, *b.warnings]
 
 

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any, TextIO
 import numpy as np
 from numpy.typing import NDArray
 
-from rille.pipeline.engine.plain import raw
+from rille.datasets.text.warning import warning
+from rille.pipeline.engine.plain import raw, warn
 from rille.pipeline.flow import config as configuration
 from rille.stages.core.errors import ConfigError, InputError
 
@@ -88,7 +89,7 @@ def match_files(
     if confidence is not None:
         write_confidence(confidence, found.disparity_std, found.validity, found.backmatch_error, tags)
     for line in warnings(found):
-        print(f"rille: warning: {line}", file=sys.stderr)
+        warn(line)
     share = float(matched(found.validity).mean())
     typical = f", standard deviation {np.nanmedian(found.disparity_std):.2f} px (median)" if share else ""
     figures = f"matched {100 * share:.1f} %, defined {100 * float(kept.mean()):.1f} % of {kept.size} pixels"
@@ -113,16 +114,19 @@ def warnings(found: Disparity) -> list[str]:
         )
         shares = sorted(((float(has(found.validity, bit).mean()), words) for bit, words in reasons), reverse=True)
         told = ", ".join(f"{100 * s:.0f} % {words}" for s, words in shares[:2] if s >= 0.005)
-        return [f"only {100 * share:.1f} % of the pixels match ({told}): do both images show one scene?"]
+        text = f"only {100 * share:.1f} % of the pixels match ({told}): do both images show one scene?"
+        return [warning("RIL-700", text)]
     blank = float(has(found.validity, Validity.NO_TEXTURE).mean())
     if blank > BLANK:
-        return [f"{100 * blank:.0f} % of the pixels have no texture (black, saturated or blank) and cannot match"]
+        text = f"{100 * blank:.0f} % of the pixels have no texture (black, saturated or blank) and cannot match"
+        return [warning("RIL-701", text)]
     if swapped(found.column_disparity, found.row_disparity, ok):
         median = float(np.median(found.column_disparity[ok]))
-        return [
+        text = (
             f"disparities have the sign of swapped images (median {median:+.1f} px, right minus left): if this is "
             "a pair of a left and a right camera, give them in the other order"
-        ]
+        )
+        return [warning("RIL-702", text)]
     return []
 
 

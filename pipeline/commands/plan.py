@@ -24,7 +24,7 @@ from rille.pipeline.export.view import RunView
 from rille.pipeline.flow import unread
 from rille.pipeline.flow.closed_loop import dataflow
 from rille.pipeline.runs import run_files
-from rille.pipeline.runs.session import Options, check_options, choose_frames, settings, warn
+from rille.pipeline.runs.session import Options, check_options, choose_frames, settings, warn_of_input
 from rille.stages.core.errors import ConfigError
 
 REASONS = 3
@@ -43,7 +43,7 @@ def plan(options: Options, *, verbose: bool = False) -> int:
     settled = settings(options)
     sequence, config = settled.sequence, settled.config
     unread.refuse_unreadable(settled.given, config, sequence)
-    warn(sequence)
+    warn_of_input(sequence)
     frames = choose_frames(options.frames, sequence.frames)
     graph, store = Graph(), at(options.cache)
     products, drive = dataflow(graph, sequence, config, frames)

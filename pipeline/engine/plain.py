@@ -41,6 +41,11 @@ def raw(stream: Any) -> Any:
     return stream.raw if isinstance(stream, Plain) else stream
 
 
+def warn(line: str) -> None:
+    """Print a warning on stderr; a line that begins with a code (``RIL-680: ...``) shows it where an error would."""
+    print(f"rille: warning{' ' if line.startswith('RIL-') else ': '}{' '.join(line.split())}", file=sys.stderr)
+
+
 @contextmanager
 def plain_output() -> Iterator[None]:
     """Everything that is printed within is plain."""

@@ -20,6 +20,7 @@ from rille.datasets.protocol import Sequence
 from rille.pipeline.engine.code_digest import remember
 from rille.pipeline.engine.graph import Graph
 from rille.pipeline.engine.packages import installed
+from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.store.artifact import DamagedError
 from rille.pipeline.engine.store.base import GoneError, Store, at
 from rille.pipeline.engine.store.location import Location, hints_folder, locate
@@ -117,7 +118,7 @@ def settings(options: Options) -> Settings:
         raise ConfigError("RIL-860", told, remedy="give its parameters to open_sequence")
     else:
         sequence = options.opened
-    doubts = [f"{v.text}: {v.remedy}" for v in judge_rig(sequence.rig) if v.level != "OK"]
+    doubts = [f"{v.code}: {v.text}: {v.remedy}" for v in judge_rig(sequence.rig) if v.level != "OK"]
     if doubts and not any("baseline" in line for line in sequence.warnings):
         sequence = replace(sequence, warnings=(*sequence.warnings, *doubts))
     vehicle, source = {}, "default rover of the program (neither the sequence nor the user states one)"
@@ -131,16 +132,16 @@ def settings(options: Options) -> Settings:
     return Settings(sequence, config, source, given)
 
 
-def warn(sequence: Sequence) -> None:
-    """Say on stderr what is suspicious but possible in the input."""
+def warn_of_input(sequence: Sequence) -> None:
+    """Print what is suspicious but possible in the input."""
     for line in sequence.warnings:
-        print(f"rille: warning: {' '.join(line.split())}", file=sys.stderr)
+        warn(line)
 
 
 def warn_of_results(graph: Graph) -> None:
-    """Say on stderr what stages found suspicious, each thing once."""
+    """Print what stages found suspicious, each thing once."""
     for line in dict.fromkeys(w for h in graph.nodes if h.ref is not None for w in h.ref.meta.get("warnings", ())):
-        print(f"rille: warning: {' '.join(line.split())}", file=sys.stderr)
+        warn(line)
 
 
 def reconstruct(options: Options) -> int:
@@ -153,7 +154,7 @@ def perform(options: Options) -> tuple[int, Path]:
     try:
         return _reconstruct(options)
     except (DamagedError, GoneError) as error:  # found when the results were drawn; it is set aside by now
-        print(f"rille: warning: {error.message}; computing it again", file=sys.stderr)
+        warn(f"{error.code}: {error.message}; computing it again")
         return _reconstruct(options)
 
 
@@ -236,7 +237,7 @@ def _open(options: Options) -> _Opened:
     settled = settings(options)
     sequence, config = settled.sequence, settled.config
     unread.refuse_unreadable(settled.given, config, sequence)
-    warn(sequence)
+    warn_of_input(sequence)
     if options.verb == "drive" and sequence.simulation is None:
         raise ConfigError("RIL-059", f"{sequence.name} is recorded, it cannot be driven", remedy="drive mockup-loop")
     frames = choose_frames(options.frames, sequence.frames)

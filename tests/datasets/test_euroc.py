@@ -158,7 +158,7 @@ def test_images_without_a_partner_are_left_out_and_counted(flight):
     assert str(START + 2 * STEP) not in s.frame_names
     assert s.image(2, "right").hints["path"].endswith(f"{START + 3 * STEP}.png")
     assert "1 of 5 images" in s.warnings[0]
-    assert s.warnings[1] == "images without a partner of the same time are left out: 1 of cam0, 0 of cam1"
+    assert s.warnings[1] == "RIL-680: images without a partner of the same time are left out: 1 of cam0, 0 of cam1"
 
 
 def test_without_imu_truth_or_lists(flight):
