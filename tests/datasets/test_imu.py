@@ -169,7 +169,8 @@ def test_after_a_gap_the_reference_is_lost_but_not_the_vertical():
     assert [a is not None for a in found.attitude] == [True, True, True, False, False, False]
     assert [u is not None for u in found.up] == [True, True, True, False, True, True]
     assert found.warnings == (
-        "RIL-688: no attitude from imu0 for 3 of 6 frames, in 1 stretch: first at 5.20 s, last at 7.00 s of the sequence",
+        "RIL-688: no attitude from imu0 for 3 of 6 frames, in 1 stretch: "
+        "first at 5.20 s, last at 7.00 s of the sequence",
     )
 
 
