@@ -276,7 +276,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--pairs", type=int, default=2000, help="of the largest size; a quarter of it comes first")
     parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--executor", choices=("processes", "dask", "inline"), default="dask")
+    parser.add_argument("--executor", choices=("dask", "inline"), default="dask")
     parser.add_argument("--folder", type=Path, help="where to work (kept); a temporary one by default")
     parser.add_argument("--flush", action="store_true", help="flush to the disk, as a real run does")
     parser.add_argument("--what", choices=("all", "run", "plan"), default="all", help=argparse.SUPPRESS)

@@ -84,7 +84,7 @@ def reconstruct(
     settings: Settings = _SETTINGS,
     results: Results = _RESULTS,
     frames: Frames = None,
-    executor: Executor = "processes",
+    executor: Executor = "dask",
     keep_going: Annotated[
         bool, flag("Finish what does not depend on a task that failed for whatever reason; the exit status is then 3.")
     ] = False,
@@ -112,7 +112,7 @@ def drive(
     *,
     settings: Settings = _SETTINGS,
     results: Results = _RESULTS,
-    executor: Executor = "processes",
+    executor: Executor = "dask",
 ) -> int:
     """Drive a simulated rover to a goal in a closed loop: stop, think, drive, localise, and again.
 
@@ -136,7 +136,7 @@ def plan(
     *,
     settings: Settings = _SETTINGS,
     frames: Frames = None,
-    executor: Literal["processes", "dask", "inline"] = "processes",
+    executor: Literal["dask", "inline"] = "dask",
     memory_limit: MemoryLimit = None,
     verbose: Annotated[bool, flag("Each task with its reason.", "--verbose", "-v")] = False,
 ) -> int:

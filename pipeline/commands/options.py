@@ -41,7 +41,7 @@ Debug = Annotated[bool, flag("Show tracebacks.")]
 Executor = Annotated[
     str,
     Parameter(
-        help="Where tasks run: processes, dask (a cluster of this machine), inline, or a dask scheduler, tcp://host:port."
+        help="Where tasks run: dask (a cluster of this machine), inline, or a dask scheduler's address, tcp://host:port."
     ),
 ]
 Frames = Annotated[str | None, Parameter(help="Frame range START:STOP[:STEP], as in Python; all by default.")]
@@ -91,7 +91,7 @@ def options(
     results: Results,
     *,
     verb: str = "reconstruct",
-    executor: str = "processes",
+    executor: str = "dask",
     frames: str | None = None,
     keep_going: bool = False,
     memory_limit: str | None = None,

@@ -129,7 +129,7 @@ def run(
     graph: Graph,
     store: Store,
     *,
-    executor: Any = "processes",
+    executor: Any = "dask",
     jobs: int | None = None,
     keep_going: bool = False,
     force: Collection[str] = (),
@@ -145,8 +145,8 @@ def run(
     ----------
     graph : its handles are filled in; expansions may add nodes during the run.
     store : where artifacts are.
-    executor : ``processes`` of this machine, ``dask`` (the same as a cluster of dask), the address of a running dask
-        scheduler (``tcp://...``), a ``Client`` of dask, or ``inline``.
+    executor : ``dask`` (a cluster of this machine), the address of a running dask scheduler (``tcp://...``), a
+        ``Client`` of dask, or ``inline``.
     jobs : worker processes; None is one a core.
     keep_going : finish what does not depend on a failure, of whatever kind.
     force : names of stages to compute again though they are there; the digests must agree.
@@ -465,8 +465,7 @@ class _Run:
         amounts = {k: round(v) for k, v in vars(shares).items() if math.isfinite(v)}
         name = self.executor_kind if isinstance(self.executor_kind, str) else self.executor_kind.scheduler.address
         self.ledger.run(executor=name, jobs=shares.workers, **amounts)
-        modules = tuple(dict.fromkeys(h.spec.module for h in ahead.nodes if not h.done))
-        self.executor = make(self.executor_kind, shares.workers, self.store.location, shares.limit, modules)
+        self.executor = make(self.executor_kind, shares.workers, self.store.location, shares.limit)
         self.result.executor_started = True
 
     def _look_ahead(self) -> Graph:

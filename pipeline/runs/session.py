@@ -47,7 +47,7 @@ class Options:
     config: Path | None = None
     frames: str | None = None
     jobs: int | None = None
-    executor: Any = "processes"
+    executor: Any = "dask"
     """A kind, the address of a dask scheduler, or a ``Client`` of dask."""
     keep_going: bool = False
     force: frozenset[str] = frozenset()

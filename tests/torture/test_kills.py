@@ -93,7 +93,6 @@ def torment(program, calm, folder, executor, tries, seed, environment=None):
     [
         ("inline", 8),
         pytest.param("inline", 50, marks=pytest.mark.slow),
-        pytest.param("processes", 50, marks=pytest.mark.slow),
         pytest.param("dask", 30, marks=pytest.mark.slow),
     ],
 )
@@ -116,7 +115,6 @@ def test_killed_at_random_moments_with_the_cache_in_a_bucket(programs, calm, buc
     [
         ("inline", 3),
         pytest.param("inline", 20, marks=pytest.mark.slow),
-        pytest.param("processes", 20, marks=pytest.mark.slow),
         pytest.param("dask", 20, marks=pytest.mark.slow),
     ],
 )
@@ -153,7 +151,6 @@ def test_interrupted_at_random_moments(programs, calm, tmp_path, row, executor, 
 DEATHS = ("task", "mkdir:1", "fsync:1", "link:1", "linked:1", "fsync:2", "replace:1")
 PUBLISHED = ("linked:1", "fsync:2", "created:1", "replace:1")
 """When these deaths come, the artifact is there."""
-POOLS = ("processes", "dask")
 DEATHS_IN_A_BUCKET = ("task", "create:1", "created:1")
 
 
@@ -179,10 +176,9 @@ def die(program, calm, cache, tally, row, deaths, executor, environment=None):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("executor", POOLS)
-def test_workers_that_die_at_their_work_and_in_their_commit(programs, calm, tmp_path, row, executor):
+def test_workers_that_die_at_their_work_and_in_their_commit(programs, calm, tmp_path, row):
     (program,) = programs(1)
-    die(program, calm, tmp_path / "cache", tmp_path / "tally", row, DEATHS, executor)
+    die(program, calm, tmp_path / "cache", tmp_path / "tally", row, DEATHS, "dask")
 
 
 @pytest.mark.slow
@@ -204,22 +200,21 @@ def test_workers_of_a_cluster_that_die(programs, calm, tmp_path, row):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("executor", POOLS)
-def test_poison_takes_three_workers_each_and_nothing_else_along(programs, calm, tmp_path, row, executor):
+def test_poison_takes_three_workers_each_and_nothing_else_along(programs, calm, tmp_path, row):
     (program,) = programs(1)
     cache, tally = tmp_path / "cache", tmp_path / "tally"
     poison = ("poison#1", "poison#2", "poison#3")
-    found = program.run(cache=str(cache), executor=executor, sabotage=poison, tally=str(tally))
+    found = program.run(cache=str(cache), executor="dask", sabotage=poison, tally=str(tally))
     failed = {label: n["why"] for label, n in found["nodes"].items() if n["status"] == "failed"}
     assert set(failed) == {f"saboteur/{p}" for p in poison}
     assert all(why.startswith("WorkerDiedError: 3 worker processes died") for why in failed.values())
     deaths = {p.name: p.stat().st_size for p in tally.iterdir()}
     assert set(deaths) == set(poison)
-    assert set(deaths.values()) <= ({3} if executor == "processes" else {3, 4}), "one that others were blamed for, too"
+    assert set(deaths.values()) <= {3, 4}, "one that others were blamed for, too"
     wrong = [n for n, digest in calm["labels"].items() if found["nodes"][n]["digest"] != digest]
     computed = statuses(found, "computed")
     row(
-        f"poison: a task kills each worker, {executor}",
+        "poison: a task kills each worker",
         3,
         [],
         wrong,
@@ -230,12 +225,11 @@ def test_poison_takes_three_workers_each_and_nothing_else_along(programs, calm, 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("executor", POOLS)
-def test_a_worker_out_of_memory_is_named_with_its_memory(programs, calm, tmp_path, row, executor):
+def test_a_worker_out_of_memory_is_named_with_its_memory(programs, calm, tmp_path, row):
     (program,) = programs(1)
     cache = tmp_path / "cache"
     found = program.run(
-        cache=str(cache), executor=executor, sabotage=("memory",), tally=str(tmp_path / "tally"), memory=800_000_000
+        cache=str(cache), executor="dask", sabotage=("memory",), tally=str(tmp_path / "tally"), memory=800_000_000
     )
     hog = found["nodes"]["saboteur/memory"]
     assert hog["status"] == "failed"
@@ -243,7 +237,7 @@ def test_a_worker_out_of_memory_is_named_with_its_memory(programs, calm, tmp_pat
     wrong = [n for n, digest in calm["labels"].items() if found["nodes"][n]["digest"] != digest]
     computed = statuses(found, "computed")
     row(
-        f"a worker runs out of memory, {executor}",
+        "a worker runs out of memory",
         1,
         [],
         wrong,

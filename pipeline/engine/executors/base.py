@@ -1,9 +1,8 @@
-"""Where tasks run: on workers of dask, on a pool of processes without it, or one after the other in this process.
+"""Where tasks run: on workers of dask, or one after the other in this process.
 
-:func:`make` is the one factory. Workers of dask are those of a cluster of this machine (one process a core, one thread
+:func:`make` is the one factory. Workers are those of a cluster of this machine (one process a core, one thread
 each), of a scheduler that others have started, or behind a ``Client`` that was handed in: the same code path
-(:mod:`rille.pipeline.engine.executors.dask_client`). The pool gets one task at a time and worker
-(:mod:`rille.pipeline.engine.executors.processes`).
+(:mod:`rille.pipeline.engine.executors.dask_client`).
 
 Programs call :func:`rille.pipeline.engine.runtime.environment.prepare_environment` first thing, so that this process
 and the workers run alike.
@@ -19,16 +18,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
-from rille.pipeline.engine.executors.processes import Workers
 from rille.pipeline.engine.runtime.environment import prepare_environment
 from rille.pipeline.engine.store.location import Location
 from rille.pipeline.engine.store.manifest import Ref
-from rille.pipeline.engine.task import Outcome, Spec, ensure, resolve
-from rille.stages.core.errors import ConfigError, RilleError
+from rille.pipeline.engine.task import Outcome, Spec, ensure
+from rille.stages.core.errors import ConfigError
 
 __all__ = ["Executor", "Failed", "NotBegun", "Task", "light", "make", "prepare_environment"]
 
-KINDS = ("processes", "dask", "inline")
+KINDS = ("dask", "inline")
 
 Given = Ref | int
 """An input: the artifact, or the number of the task in flight that makes it."""
@@ -137,12 +135,11 @@ def known(kind: Any, jobs: int | None = None) -> None:
         raise ConfigError("RIL-540", f"{jobs} jobs are not permitted", remedy="give 1 or more")
 
 
-def make(kind: Any, jobs: int, cache: Location, memory: float, modules: Sequence[str] = ()) -> Executor:
-    """``processes``, ``dask``, the address of a scheduler, a ``Client`` of dask, or ``inline``.
+def make(kind: Any, jobs: int, cache: Location, memory: float) -> Executor:
+    """``dask``, the address of a scheduler, a ``Client`` of dask, or ``inline``.
 
     ``jobs`` and ``memory`` are for workers of our own: how many, and bytes beyond which one that takes so many by
-    itself is ended, before the system ends others. ``modules`` are those of the stages to come, in their order: a
-    process that has nothing to do imports them.
+    itself is ended, before the system ends others.
 
     Raises
     ------
@@ -151,45 +148,9 @@ def make(kind: Any, jobs: int, cache: Location, memory: float, modules: Sequence
     """
     if kind == "inline":
         return Inline()
-    if kind == "processes":
-        return Processes(jobs, memory, modules)
     from rille.pipeline.engine.executors import dask_client
 
     return dask_client.here(jobs, cache, memory) if kind == "dask" else dask_client.elsewhere(kind, cache)
-
-
-def _run(task: Task) -> Outcome | Failed:
-    return task.run({})
-
-
-class Processes:
-    """Worker processes that are told over a pipe (:mod:`rille.pipeline.engine.executors.processes`)."""
-
-    depth = 1
-
-    def __init__(self, jobs: int, memory: float, modules: Sequence[str]) -> None:
-        self.slots, self._workers = jobs, Workers(jobs, _run, memory, resolve, modules)
-
-    def free(self) -> bool:
-        """Whether a worker has nothing to do; it may still be starting."""
-        return self._workers.idle()
-
-    def submit(self, tasks: Sequence[Task]) -> None:
-        """Give each to a worker."""
-        for task in tasks:
-            self._workers.give(str(task.number), (task,))
-
-    def wait(self) -> Landed:
-        """Block until a task has ended; a worker that dies is replaced, and its task begun anew."""
-        landed = self._workers.wait()
-        return [(int(key), Failed(a, "") if isinstance(a, RilleError) else a) for key, a in landed]
-
-    def halt(self) -> None:
-        """Nothing is submitted that is not begun."""
-
-    def close(self, kill: bool = False) -> None:
-        """End the workers, at once if ``kill``; none is left behind."""
-        self._workers.close(kill)
 
 
 class Inline:

@@ -35,19 +35,24 @@ from distributed import Client, KilledWorker, LocalCluster, WorkerPlugin, get_wo
 
 from rille.pipeline.engine.executors import dask_cluster
 from rille.pipeline.engine.executors.base import Failed, Landed, NotBegun, Task, light
-from rille.pipeline.engine.executors.processes import DEATHS, given_up
 from rille.pipeline.engine.runtime.environment import prepare_environment, worker_environment
 from rille.pipeline.engine.runtime.private import private_folder
 from rille.pipeline.engine.store.location import Location
 from rille.pipeline.engine.store.manifest import Ref
 from rille.pipeline.engine.task import CodeChangedError, Outcome
-from rille.stages.core.errors import ConfigError
+from rille.stages.core.errors import ConfigError, RilleError
 
 DEPTH = 16
 """Tasks in flight for each worker, so that it need not wait for this process."""
 
 WATCH = 0.2
 """Seconds until something else than an end of a task is looked after."""
+
+DEATHS = 3
+"""Worker processes that one task may take along."""
+
+BIRTH = 120.0
+"""Seconds that workers of our own may take to start, on a machine that others use."""
 
 CONNECT = 10.0
 """Seconds until a scheduler must have answered."""
@@ -57,6 +62,10 @@ LOOK = 2.0
 
 GRACE, HURRY = 2.0, 0.5
 """Seconds to take leave of a scheduler at the end of a run, and of an interrupted one."""
+
+
+class WorkerDiedError(RilleError):
+    """A task took several worker processes along: out of memory, or a crash in native code."""
 
 
 def here(jobs: int, cache: Location, memory: float) -> Dask:
@@ -89,7 +98,7 @@ def elsewhere(where: Any, cache: Location) -> Dask:
             client = Client(where, set_as_default=False, timeout=CONNECT)
         except (OSError, TimeoutError, ValueError) as error:
             raise ConfigError("RIL-541", f"no dask scheduler answers at {where}", remedy="check the address") from error
-    presence = dask_cluster.Presence(client)
+    presence = dask_cluster.Presence(client, dask_cluster.NO_WORKERS)
     try:
         while not (threads := presence.threads()):
             time.sleep(WATCH)
@@ -109,7 +118,10 @@ class Dask:
     def __init__(self, client: Any, cache: Location, slots: int, cluster: Any, *, ours: bool = True) -> None:
         self._client, self.slots, self._cluster, self._ours = client, slots, cluster, ours
         self._run, self._submitted = f"rille-{uuid.uuid4().hex}", 0
-        self._presence, self._looked = dask_cluster.Presence(client), time.monotonic()
+        self._presence, self._looked = (
+            dask_cluster.Presence(client, BIRTH if cluster else dask_cluster.NO_WORKERS),
+            time.monotonic(),
+        )
         self._futures: dict[int, Any] = {}
         self._gone: set[Any] = set()
         self._events: queue.SimpleQueue[bytes] = queue.SimpleQueue()
@@ -202,7 +214,10 @@ class Dask:
         self._deaths[number] += alone  # else it is a suspect, and no more
         if self._deaths[number] < DEATHS:
             return NotBegun()
-        return Failed(given_up(self._seen[number]), "")
+        seen = f", last seen with {self._seen[number] / 1e6:.0f} MB" if self._seen[number] else ""
+        remedy = "give it more memory with fewer --jobs, or run it with --executor inline to see the crash"
+        text = f"{DEATHS} worker processes died while they ran it{seen}"
+        return Failed(WorkerDiedError("RIL-586", text, remedy=remedy), "")
 
     def _pids(self) -> list[int]:
         return [pid for nanny in getattr(self._cluster, "workers", {}).values() if (pid := getattr(nanny, "pid", None))]

@@ -146,8 +146,8 @@ def _no_cache(name: str, cache: Location, why: str) -> ConfigError:
 class Presence:
     """Whether the scheduler answers, and has workers."""
 
-    def __init__(self, client: Any) -> None:
-        self._client, self._address = client, client.scheduler.address
+    def __init__(self, client: Any, patience: float) -> None:
+        self._client, self._address, self._patience = client, client.scheduler.address, patience
         self._answered = self._manned = time.monotonic()
 
     def threads(self) -> int:
@@ -168,10 +168,10 @@ class Presence:
         self._answered = now
         if threads:
             self._manned = now
-        elif now - self._manned > NO_WORKERS:
+        elif now - self._manned > self._patience:
             raise ClusterError(
                 "RIL-525",
-                f"the dask scheduler at {self._address} had no workers for {NO_WORKERS:.0f} s",
+                f"the dask scheduler at {self._address} had no workers for {self._patience:.0f} s",
                 remedy="start workers, and run the same command: what is committed stays",
             )
         return int(threads)

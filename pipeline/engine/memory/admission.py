@@ -60,11 +60,10 @@ class Account:
 def account(costs: Costs, limit: float | None, executor: Any, jobs: int, largest: float = 0.0) -> Account:
     """The shares; with fewer workers than ``jobs`` where the largest task needs their place."""
     own = limits.resident()
-    local = executor in ("dask", "processes")
-    if not local and executor != "inline" and limit is None:
+    if executor not in ("dask", "inline") and limit is None:
         return Account(math.inf, own, 0.0, jobs)
     limit = float(limit) if limit is not None else own + limits.SHARE * limits.free()
-    if not local:
+    if executor != "dask":
         return Account(limit, own, 0.0, 1 if executor == "inline" else jobs)
     rest = costs.rest
     fit = int((limit - own - largest) // rest)

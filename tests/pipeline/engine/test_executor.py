@@ -13,12 +13,10 @@ from pathlib import Path
 
 import psutil
 import pytest
-from raising import raises
-from toys import waiting
 from toys.chain import build
 
 from rille.pipeline.engine import scheduler
-from rille.pipeline.engine.executors.processes import WorkerDiedError, Workers
+from rille.pipeline.engine.executors.dask_client import WorkerDiedError
 from rille.pipeline.engine.graph import Graph
 from rille.pipeline.engine.store import maintenance
 from rille.pipeline.engine.store.base import Store
@@ -50,8 +48,7 @@ def gone(children, within=HANGS):
     return not [p for p in left if p.status() != psutil.STATUS_ZOMBIE]
 
 
-@pytest.mark.parametrize("executor", ["processes", "dask"])
-def test_workers_give_the_same_bits_die_alone_and_leave_nobody_behind(cache, tmp_path, executor):
+def test_workers_give_the_same_bits_die_alone_and_leave_nobody_behind(cache, tmp_path):
     """One pool for several questions, because starting it is what takes the time."""
     plain = Graph()
     build(plain)
@@ -62,13 +59,13 @@ def test_workers_give_the_same_bits_die_alone_and_leave_nobody_behind(cache, tmp
     die = graph.node("toys.mischief", "die", NoParams(), {"what": "die", "tally": str(tally)})
     graph.node("toys.mischief", "after", NoParams(), {"what": "fine"}, inputs={"after": die})
     graph.node("toys.mischief", "unpicklable", NoParams(), {"what": "unpicklable"})
-    result = scheduler.run(graph, Store(cache / "workers"), executor=executor, jobs=2, keep_going=True)
+    result = scheduler.run(graph, Store(cache / "workers"), executor="dask", jobs=2, keep_going=True)
 
     found = {h.label: h for h in graph.nodes}
     assert {h.label: h.ref.digest for h in plain.nodes} == {
         n: found[n].ref.digest for n in (h.label for h in plain.nodes)
     }
-    assert tally.read_text() == "xxx", "tried on three workers"
+    assert tally.read_text() in ("xxx", "xxxx"), "three workers, and one on which others were suspected, too"
     assert isinstance(found["die"].error, WorkerDiedError)
     assert found["after"].reason == "die failed"
     assert "UnpicklableError: 1 and 2" in str(found["unpicklable"].error)
@@ -164,27 +161,3 @@ def test_an_edit_computes_again_exactly_what_it_can_change(editable):
     real = editable(old="SCALE = 2.0", new="SCALE = 3.0")
     assert {n for n, v in real.items() if v[0] == "computed"} == {*(f"scale/{i}" for i in range(4)), "total"}
     assert real["total"][2] == "input parts changed (4 of 4)"
-
-
-def test_a_worker_that_waits_prepares_what_is_to_come(cache, tmp_path):
-    names = [str(tmp_path / name) for name in ("first", "bad", "last")]
-    workers = Workers(1, waiting.answer, prepare=waiting.note, names=names)
-    try:
-        until = time.monotonic() + HANGS
-        while len(list(tmp_path.iterdir())) < len(names) and time.monotonic() < until:
-            time.sleep(0.01)
-        assert {p.name for p in tmp_path.iterdir()} >= {"first", "bad", "last"}
-        workers.give("key", ("word",))
-        assert workers.wait() == [("key", "WORD")]
-    finally:
-        workers.close(kill=True)
-
-
-def test_a_preparation_that_kills_workers_ends_the_run(cache, tmp_path, monkeypatch):
-    monkeypatch.setattr("rille.pipeline.engine.executors.processes.UNREADY", 1)
-    workers = Workers(1, waiting.answer, prepare=waiting.note, names=[str(tmp_path / "deadly")])
-    try:
-        with raises("RIL-585"):
-            workers.wait()
-    finally:
-        workers.close(kill=True)
