@@ -82,7 +82,7 @@ def _fit_all(origin, moved_by, common, at, affinity, displacement):  # type: ign
             normal[0, 0] += PULL**2 * total
             normal[1, 1] += PULL**2 * total
             normal[2, 2] += 1e-6
-            _solve_3(normal, right)
+            solve_3(normal, right)
             for k in range(count):
                 square = 0.0
                 for i in range(2):
@@ -112,7 +112,7 @@ def _nearest(points, x, y, who, far):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _solve_3(a, b):  # type: ignore[no-untyped-def]
+def solve_3(a, b):  # type: ignore[no-untyped-def]
     """Solve a x = b (3, 2) in place for a symmetric positive matrix."""
     for i in range(3):
         for j in range(i + 1, 3):

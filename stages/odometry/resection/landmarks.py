@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from rille.stages.geometry.geometry import Rig, RigidTransform
 from rille.stages.geometry.lattice import Lattice
+from rille.stages.odometry.affinity import solve_3
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -158,7 +159,8 @@ def _relief(centre, column, row, validity, rms):  # type: ignore[no-untyped-def]
         a[1, 0], a[2, 0], a[2, 1] = a[0, 1], a[0, 2], a[1, 2]
         for k in range(3):
             a[k, k] += 1e-9
-        plane = np.linalg.solve(a, b)
+        solve_3(a, b)
+        plane = b  # solved in place
         total = 0.0
         for j in range(max(y0 - TEMPLATE, 0), min(y0 + TEMPLATE + 1, rows)):
             for i in range(max(x0 - TEMPLATE, 0), min(x0 + TEMPLATE + 1, cols)):
