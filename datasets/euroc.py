@@ -18,7 +18,7 @@ from rille.datasets.cameras import CalibratedCamera, read_cameras, rig_of
 from rille.datasets.cameras.fields import Fields
 from rille.datasets.cameras.text import parse_yaml
 from rille.datasets.images import files
-from rille.datasets.images.pairing import Pair, common_size
+from rille.datasets.images.pairing import ImagePair, common_size
 from rille.datasets.imu import Inertial, at_frames, read_imu
 from rille.datasets.poses import coverage, interpolate, read_poses
 from rille.datasets.protocol import CAMERAS, Sequence, Source
@@ -49,7 +49,7 @@ FORMS = (("FOLDER", "EuRoC: mav0/cam0, mav0/cam1, each with sensor.yaml and data
 
 
 @dataclass(frozen=True)
-class Layout:
+class EurocLayout:
     """Where the parts of a recording lie; ``truth`` is a folder with ``data.csv``, ``imu`` likewise."""
 
     name: str
@@ -62,7 +62,7 @@ class Layout:
 class Frames:
     """The pairs of a recording: files, times in seconds, and what was left out, one line each."""
 
-    pairs: tuple[Pair, ...]
+    pairs: tuple[ImagePair, ...]
     times: tuple[float, ...]
     warnings: tuple[str, ...]
 
@@ -78,7 +78,7 @@ class Movement:
     notes: tuple[str, ...] = ()
 
 
-def recognise(path: Path) -> Layout | None:
+def recognise(path: Path) -> EurocLayout | None:
     """Layout of a folder (that of ``mav0``, or ``mav0`` itself), or None where it is not of this kind."""
     path = path.resolve()
     folder = path / "mav0" if (path / "mav0").is_dir() else path
@@ -87,7 +87,7 @@ def recognise(path: Path) -> Layout | None:
     truth = next((folder / name for name in TRUTH if (folder / name / "data.csv").is_file()), None)
     imu = folder / "imu0"
     name = folder.parent.name if folder.name == "mav0" else folder.name
-    return Layout(derived_name(name), folder, truth, imu if (imu / "data.csv").is_file() else None)
+    return EurocLayout(derived_name(name), folder, truth, imu if (imu / "data.csv").is_file() else None)
 
 
 def open_layout(path: Path, number: str | None, digests: files.Digests) -> Sequence | None:
@@ -102,7 +102,7 @@ def open_layout(path: Path, number: str | None, digests: files.Digests) -> Seque
     return None if layout is None else open_euroc(layout, digests)
 
 
-def open_euroc(layout: Layout, digests: files.Digests) -> Sequence:
+def open_euroc(layout: EurocLayout, digests: files.Digests) -> Sequence:
     """The sequence in a folder.
 
     Raises
@@ -143,7 +143,7 @@ def open_euroc(layout: Layout, digests: files.Digests) -> Sequence:
 # -- images ------------------------------------------------------------------------------------------------------------
 
 
-def list_frames(layout: Layout) -> Frames:
+def list_frames(layout: EurocLayout) -> Frames:
     """Pairs of images that both cameras took at one time, in order.
 
     Raises
@@ -165,7 +165,7 @@ def list_frames(layout: Layout) -> Frames:
     if any(left_out):
         apart = f"{left_out[0]} of cam0, {left_out[1]} of cam1"
         warnings.append(warning("RIL-680", f"images without a partner of the same time are left out: {apart}"))
-    pairs = tuple(Pair(taken["left"][s][0].stem, taken["left"][s][0], taken["right"][s][0]) for s in common)
+    pairs = tuple(ImagePair(taken["left"][s][0].stem, taken["left"][s][0], taken["right"][s][0]) for s in common)
     lines = [taken["left"][s][1] for s in common]
     times, more = seconds(common, str(layout.folder / "cam0" / "data.csv"), lines=lines)
     return Frames(pairs, times, (*warnings, *more))
@@ -234,7 +234,7 @@ def body_pose(folder: Path) -> RigidTransform | None:
     return fields.pose("T_BS") if "T_BS" in fields else None
 
 
-def _movement(layout: Layout, times: tuple[float, ...], left: CalibratedCamera) -> Movement:
+def _movement(layout: EurocLayout, times: tuple[float, ...], left: CalibratedCamera) -> Movement:
     """Truth and IMU, brought to the left camera by the sensors' places in the body."""
     if left.T_camera_reference is None:
         path = layout.folder / "cam0" / "sensor.yaml"
@@ -257,7 +257,7 @@ def _movement(layout: Layout, times: tuple[float, ...], left: CalibratedCamera) 
 
 
 def _truth(
-    layout: Layout, times: tuple[float, ...], T_body_left: RigidTransform, warnings: list[str]
+    layout: EurocLayout, times: tuple[float, ...], T_body_left: RigidTransform, warnings: list[str]
 ) -> tuple[tuple[RigidTransform | None, ...] | None, str]:
     """T_truth_left of each frame, and what it is."""
     if layout.truth is None:

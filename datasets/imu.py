@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from rille.datasets.poses import coverage
 from rille.datasets.protocol import Rows
-from rille.datasets.text.tables import Table, read_table
+from rille.datasets.text.tables import TextTable, read_table
 from rille.datasets.text.times import GAP, seconds
 from rille.stages.core.errors import InputError
 from rille.stages.geometry.geometry import RigidTransform, orthonormal, rotation_exp
@@ -70,7 +70,7 @@ BRIDGE = 0.1
 
 
 @dataclass(frozen=True)
-class Imu:
+class ImuRecord:
     """A record: times (n,), s; rates (n, 3), rad/s, and specific forces (n, 3), m/s^2, along the sensor's axes."""
 
     times: Floats
@@ -104,7 +104,7 @@ class Inertial:
 # -- reading -----------------------------------------------------------------------------------------------------------
 
 
-def read_imu(path: Path, *, unit: str = "auto") -> Imu:
+def read_imu(path: Path, *, unit: str = "auto") -> ImuRecord:
     """Table of time, rates about x y z and specific forces along them.
 
     Columns are told by their names (``w_RS_S_x [rad s^-1]``, ``gyro_x``, ``acc_x`` ...), else they stand in this
@@ -136,16 +136,16 @@ def read_imu(path: Path, *, unit: str = "auto") -> Imu:
     _possible(rates, FASTEST, "rad/s", table)
     _possible(forces, HARDEST, "m/s^2", table)
     _plausible(rates, forces, table.name)
-    return Imu(np.array(times), rates, forces, table.name, warnings)
+    return ImuRecord(np.array(times), rates, forces, table.name, warnings)
 
 
-def _named(table: Table, starts: tuple[str, ...]) -> list[int]:
+def _named(table: TextTable, starts: tuple[str, ...]) -> list[int]:
     """The three columns whose names begin so, x y z; none where there are not just three."""
     found = [k for k, name in enumerate(table.header) if name.startswith(starts)]
     return found if len(found) == 3 else []
 
 
-def _possible(values: Floats, greatest: float, unit: str, table: Table) -> None:
+def _possible(values: Floats, greatest: float, unit: str, table: TextTable) -> None:
     wrong = np.argwhere(np.abs(values) > greatest)
     if wrong.size:
         row, axis = wrong[0]
@@ -210,7 +210,7 @@ class Stretch:
         return mean if steady and slow and abs(np.linalg.norm(mean) - GRAVITY) <= FORCE_MARGIN else None
 
 
-def at_frames(imu: Imu, at: Sequence[float], T_imu_left: RigidTransform) -> Inertial:
+def at_frames(imu: ImuRecord, at: Sequence[float], T_imu_left: RigidTransform) -> Inertial:
     """Attitude and vertical of the left camera at the moments of the frames.
 
     Parameters
@@ -242,7 +242,7 @@ def at_frames(imu: Imu, at: Sequence[float], T_imu_left: RigidTransform) -> Iner
     return Inertial(tuple(attitude), tuple(up), known, warnings, notes)
 
 
-def stretches(imu: Imu, bias: Floats | None, start: float, end: float) -> list[Stretch]:
+def stretches(imu: ImuRecord, bias: Floats | None, start: float, end: float) -> list[Stretch]:
     """The parts of a record from ``start`` to ``end`` (s) without gaps, each of two samples at least."""
     usual = float(np.median(np.diff(imu.times)))
     bridge = max(BRIDGE, GAP * usual)
@@ -267,7 +267,7 @@ def integrate(times: Floats, rates: Floats) -> Floats:
     return out
 
 
-def resting_bias(imu: Imu, start: float, end: float) -> tuple[Floats | None, tuple[str, ...]]:
+def resting_bias(imu: ImuRecord, start: float, end: float) -> tuple[Floats | None, tuple[str, ...]]:
     """What the gyroscope reads in rest (3,), rad/s, and a note on how it was found; None without rest.
 
     Rest is a second in which means over 0.1 s of rate and force are steady, the force is as large as gravity and the
@@ -313,7 +313,7 @@ def bins(values: Floats, times: Floats) -> Floats:
     return np.asarray(values[: count * size].reshape(count, -1, values.shape[1]).mean(axis=1), dtype=np.float64)
 
 
-def _overlap(imu: Imu, at: Sequence[float]) -> None:
+def _overlap(imu: ImuRecord, at: Sequence[float]) -> None:
     if len(imu.times) < 2:
         raise InputError("RIL-189", f"{imu.name} has one sample", remedy="give the whole record")
     first, last = float(imu.times[0]), float(imu.times[-1])

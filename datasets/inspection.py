@@ -36,7 +36,7 @@ NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 
 
 @dataclass(frozen=True)
-class Views:
+class FoundImages:
     """The images: patterns relative to the folder, number of pairs, image size, and why they are taken so.
 
     ``trouble`` says what does not fit; ``stamped`` whether the names are times since an epoch.
@@ -53,7 +53,7 @@ class Views:
 
 
 @dataclass(frozen=True)
-class Calibration:
+class FoundCalibration:
     """Calibration files that suit: one for both cameras or one each, relative to the folder.
 
     ``names``: which two of its cameras, where the file has more.
@@ -71,8 +71,8 @@ class Findings:
     """Everything that was found in a folder; paths are relative to it."""
 
     folder: Path
-    views: Views
-    calibration: Calibration | None = None
+    views: FoundImages
+    calibration: FoundCalibration | None = None
     others: list[str] = field(default_factory=list)
     tables: dict[str, list[str]] = field(default_factory=dict)
     unread: list[str] = field(default_factory=list)
@@ -120,7 +120,7 @@ def _relative(path: Path, folder: Path) -> str:
 # -- images ------------------------------------------------------------------------------------------------------------
 
 
-def find_views(folder: Path, images: list[Path]) -> Views:
+def find_views(folder: Path, images: list[Path]) -> FoundImages:
     """The two sets of images, by the tokens in their names that make most pairs.
 
     Raises
@@ -150,7 +150,7 @@ def find_views(folder: Path, images: list[Path]) -> Views:
     except InputError as error:
         trouble = str(error)
     tokens = SIDES[key[0]]
-    return Views(
+    return FoundImages(
         pattern(left, folder),
         pattern(right, folder),
         pairs,
@@ -238,12 +238,12 @@ def _two_sides(names: list[str]) -> Iterable[tuple[str, str]]:
     return [(pair[0], pair[1]) for pair in sides.values() if len(pair) == 2]
 
 
-def _calibration(names: tuple[str, ...], cameras: list[CalibratedCamera]) -> Calibration:
+def _calibration(names: tuple[str, ...], cameras: list[CalibratedCamera]) -> FoundCalibration:
     poses = [camera.T_camera_reference for camera in cameras]
     baseline = None
     if len(poses) == 2 and poses[0] is not None and poses[1] is not None:
         baseline = float(np.linalg.norm((poses[1] @ poses[0].inverse()).translation))
-    return Calibration(names, cameras[0].size, baseline, len(cameras))
+    return FoundCalibration(names, cameras[0].size, baseline, len(cameras))
 
 
 # -- tables ------------------------------------------------------------------------------------------------------------

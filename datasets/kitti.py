@@ -57,7 +57,7 @@ FORMS = (
 
 
 @dataclass(frozen=True)
-class Layout:
+class KittiLayout:
     """Where the parts of a sequence lie."""
 
     name: str
@@ -73,7 +73,7 @@ def image_folders(folder: Path) -> tuple[str, str] | None:
     return next((p for p in PAIRS if all((folder / side).is_dir() for side in p)), None)
 
 
-def recognise(path: Path, number: str | None = None) -> Layout | None:
+def recognise(path: Path, number: str | None = None) -> KittiLayout | None:
     """Layout of a folder, or None where it is none of ours.
 
     Raises
@@ -103,7 +103,7 @@ def recognise(path: Path, number: str | None = None) -> Layout | None:
     standard = path.parent.name == "sequences"
     poses = next((p for p in (path / "poses.txt", *([beside] if standard else [])) if p.is_file()), None)
     times = path / "times.txt"
-    return Layout(
+    return KittiLayout(
         name=derived_name(f"kitti-{path.name}" if standard else path.name),
         folder=path,
         pair=pair,
@@ -220,7 +220,7 @@ def decompose(projection: NDArray[np.float64], name: str) -> tuple[NDArray[np.fl
     return k, RigidTransform(orthonormal(r), t)
 
 
-def read_rig(layout: Layout, width: int, height: int) -> tuple[Rig, RigidTransform]:
+def read_rig(layout: KittiLayout, width: int, height: int) -> tuple[Rig, RigidTransform]:
     """The rig, and T_reference_left (poses are those of the reference frame)."""
     cameras, poses = [], []
     for projection, name in zip(read_projections(layout.calib, layout.pair), layout.pair, strict=True):
@@ -271,7 +271,7 @@ class Listing:
     lost: dict[int, str]
 
 
-def list_pairs(layout: Layout) -> Listing:
+def list_pairs(layout: KittiLayout) -> Listing:
     """The frames of both folders.
 
     A frame of which one image is missing is lost, and so is a number that is left out of a running count. Where more
@@ -347,7 +347,7 @@ def _times(path: Path, listing: Listing) -> tuple[tuple[float, ...], tuple[str, 
     return tuple(float(t) for t in np.interp(np.arange(len(rows)), known, found)), warnings
 
 
-def open_kitti(layout: Layout, digests: files.Digests) -> Sequence:
+def open_kitti(layout: KittiLayout, digests: files.Digests) -> Sequence:
     """The sequence in a folder.
 
     Raises

@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from rille.datasets.text.tables import Table, read_table
+from rille.datasets.text.tables import TextTable, read_table
 from rille.datasets.text.times import seconds
 from rille.datasets.text.warning import warning
 from rille.stages.core.errors import InputError
@@ -173,7 +173,7 @@ def read_positions(path: Path, format: str, columns: Mapping[str, str | int]) ->
     return TimedPositions(at, tuple(tuple(float(v) for v in row) for row in rows), table.name, warnings)
 
 
-def _column(table: Table, told: str | int) -> int:
+def _column(table: TextTable, told: str | int) -> int:
     """Number from 0 of a column that the manifest names or numbers."""
     if isinstance(told, str) and told.strip().lower() in table.header:
         return table.header.index(told.strip().lower())
@@ -186,13 +186,13 @@ def _column(table: Table, told: str | int) -> int:
     )
 
 
-def _named(table: Table) -> dict[str, int]:
+def _named(table: TextTable) -> dict[str, int]:
     """Columns by what their names mean; a unit in brackets or at the end is no part of a name."""
     found = _meanings(table)
     return found if _complete(found) else {}
 
 
-def _meanings(table: Table) -> dict[str, int]:
+def _meanings(table: TextTable) -> dict[str, int]:
     found: dict[str, int] = {}
     for k, name in enumerate(table.header):
         bare = re.sub(r"[\[(].*?[\])]|[_ ](deg|rad|m|s|ns|us|ms)$", "", name).strip()
@@ -208,7 +208,7 @@ def _complete(columns: Mapping[str, int]) -> bool:
     return all(q in columns for q in QUATERNION) or all(a in columns for a in ANGLES)
 
 
-def _columns(table: Table, format: str) -> dict[str, int]:
+def _columns(table: TextTable, format: str) -> dict[str, int]:
     named = _named(table)
     if format == "csv" and not named:
         raise InputError(
@@ -229,7 +229,7 @@ def _columns(table: Table, format: str) -> dict[str, int]:
     return {name: k for k, name in enumerate(order)}
 
 
-def _angle_unit(table: Table, columns: Mapping[str, int]) -> str:
+def _angle_unit(table: TextTable, columns: Mapping[str, int]) -> str:
     """``deg`` or ``rad``: as the names say, or degrees where the figures can be nothing else."""
     said = {unit for a in ANGLES for unit in ("deg", "rad") if unit in table.header[columns[a]]}
     if len(said) == 1:
@@ -244,7 +244,7 @@ def _angle_unit(table: Table, columns: Mapping[str, int]) -> str:
     )
 
 
-def _quaternions(table: Table, columns: Mapping[str, int]) -> Floats:
+def _quaternions(table: TextTable, columns: Mapping[str, int]) -> Floats:
     """Rotation matrices (n, 3, 3) of unit quaternions."""
     from scipy.spatial.transform import Rotation
 
@@ -261,7 +261,7 @@ def _quaternions(table: Table, columns: Mapping[str, int]) -> Floats:
     return np.asarray(Rotation.from_quat(q).as_matrix(), dtype=np.float64)
 
 
-def _matrices(table: Table) -> tuple[RigidTransform, ...]:
+def _matrices(table: TextTable) -> tuple[RigidTransform, ...]:
     """Poses of rows of [R | t]; written with few digits, so that their rotations are made orthonormal."""
     if table.columns not in (12, 16):
         raise InputError(

@@ -32,7 +32,7 @@ SIDES: tuple[tuple[str, str], ...] = (
 
 
 @dataclass(frozen=True)
-class Pair:
+class ImagePair:
     """One stereo pair: its name and both files; ``absent`` says which of them is missing, empty: none."""
 
     name: str
@@ -81,7 +81,9 @@ def _number(stem: str) -> int | None:
     return int(digits[-1]) if digits else None
 
 
-def pair_up(left: Sequence[Path], right: Sequence[Path], rule: str = "auto", *, gaps: bool = False) -> tuple[Pair, ...]:
+def pair_up(
+    left: Sequence[Path], right: Sequence[Path], rule: str = "auto", *, gaps: bool = False
+) -> tuple[ImagePair, ...]:
     """Pairs in the natural order of the left names.
 
     Parameters
@@ -119,7 +121,7 @@ def pair_up(left: Sequence[Path], right: Sequence[Path], rule: str = "auto", *, 
     return _named([(path, by_key[1][key]) for key, path in by_key[0].items()])
 
 
-def _with_gaps(by_key: list[dict[str, Path]]) -> tuple[Pair, ...]:
+def _with_gaps(by_key: list[dict[str, Path]]) -> tuple[ImagePair, ...]:
     """Pairs of all keys; a file that is not there has the name that it would have."""
     whole = next(key for key in by_key[0] if key in by_key[1])
     keys = sorted({**by_key[0], **by_key[1]}, key=natural)
@@ -183,17 +185,17 @@ def _all_partnered(by_key: list[dict[str, Path]], rule: str, found: tuple[Sequen
             )
 
 
-def _named(pairs: list[tuple[Path, Path]]) -> tuple[Pair, ...]:
+def _named(pairs: list[tuple[Path, Path]]) -> tuple[ImagePair, ...]:
     """Name each pair by what its files share; by the left file where that would not be unique."""
     names = [without_side(path.stem, 0).replace("*", "").strip("_-. ") for path, _ in pairs]
     if len(set(names)) < len(names) or not all(names):
         names = [path.stem for path, _ in pairs]
     if len(set(names)) < len(names):
         names = [str(k) for k in range(len(pairs))]
-    return tuple(Pair(name, *pair) for name, pair in zip(names, pairs, strict=True))
+    return tuple(ImagePair(name, *pair) for name, pair in zip(names, pairs, strict=True))
 
 
-def common_size(pairs: Sequence[Pair]) -> tuple[int, int, int]:
+def common_size(pairs: Sequence[ImagePair]) -> tuple[int, int, int]:
     """Width, height and bits that all images share (see :func:`rille.datasets.images.files.common_header`).
 
     Pairs of which a file is absent are left out.

@@ -10,7 +10,7 @@ from typing import cast
 
 import numpy as np
 
-from rille.datasets.images.pairing import Pair, ends
+from rille.datasets.images.pairing import ImagePair, ends
 from rille.datasets.imu import at_frames, read_imu
 from rille.datasets.manifest.model import Attitude, Imu, Manifest, PoseFile, Times, Truth
 from rille.datasets.manifest.rig import direction
@@ -29,7 +29,7 @@ NEEDS_TIMES = "give [times] with file, names = true or rate_hz"
 
 
 @dataclass
-class Motion:
+class KnownMotion:
     """One entry a pair, as in :class:`rille.datasets.protocol.Sequence`; ``warnings`` collects what is suspicious."""
 
     times: Seconds | None
@@ -42,7 +42,7 @@ class Motion:
     warnings: tuple[str, ...] = ()
 
 
-def read_motion(manifest: Manifest, root: Path, name: str, pairs: Sequence[Pair]) -> Motion:
+def read_motion(manifest: Manifest, root: Path, name: str, pairs: Sequence[ImagePair]) -> KnownMotion:
     """Everything that the manifest's tables ``times``, ``truth``, ``odometry``, ``attitude`` and ``imu`` state.
 
     Raises
@@ -50,7 +50,7 @@ def read_motion(manifest: Manifest, root: Path, name: str, pairs: Sequence[Pair]
     InputError
         A file cannot be used, does not belong to these pairs, or needs times where the pairs have none.
     """
-    motion = Motion(None)
+    motion = KnownMotion(None)
     if manifest.times is not None:
         motion.times, motion.warnings = pair_times(manifest.times, root, name, pairs)
     if manifest.truth is not None:
@@ -71,7 +71,7 @@ def read_motion(manifest: Manifest, root: Path, name: str, pairs: Sequence[Pair]
 # -- times -------------------------------------------------------------------------------------------------------------
 
 
-def pair_times(section: Times, root: Path, name: str, pairs: Sequence[Pair]) -> tuple[Seconds, tuple[str, ...]]:
+def pair_times(section: Times, root: Path, name: str, pairs: Sequence[ImagePair]) -> tuple[Seconds, tuple[str, ...]]:
     """Time of each pair, s, and warning lines.
 
     Raises
@@ -89,7 +89,7 @@ def pair_times(section: Times, root: Path, name: str, pairs: Sequence[Pair]) -> 
     return seconds(stamps, str(path), unit=section.unit, lines=lines)
 
 
-def _stamp(pair: Pair, name: str) -> str:
+def _stamp(pair: ImagePair, name: str) -> str:
     """The time stamp in an image's name: its last number, with its decimals."""
     found = re.findall(r"\d+(?:\.\d+)?", pair.left.stem)
     if not found:
@@ -121,7 +121,7 @@ def _times_of_file(path: Path, names: Sequence[str]) -> tuple[list[str], list[in
 
 
 def _poses(
-    section: PoseFile | Attitude, table: str, root: Path, name: str, motion: Motion, count: int
+    section: PoseFile | Attitude, table: str, root: Path, name: str, motion: KnownMotion, count: int
 ) -> tuple[RigidTransform | None, ...]:
     """T_reference_left of each pair from a file of poses of a body; warnings go to ``motion``."""
     path = root / section.file
@@ -149,7 +149,7 @@ def _poses(
     return tuple(None if pose is None else pose @ T_body_left for pose in poses)
 
 
-def _truth(section: Truth, root: Path, name: str, motion: Motion, count: int) -> None:
+def _truth(section: Truth, root: Path, name: str, motion: KnownMotion, count: int) -> None:
     """Poses of each pair, or positions alone with their own times."""
     alone = read_positions(root / section.file, section.format, {str(k): v for k, v in section.columns.items()})
     motion.truth_source = section.source or f"{'positions' if alone else 'poses'} of {section.file}, as recorded"
@@ -183,7 +183,7 @@ def _truth(section: Truth, root: Path, name: str, motion: Motion, count: int) ->
     motion.warnings += alone.warnings
 
 
-def _attitude(section: Attitude, root: Path, name: str, motion: Motion, count: int) -> None:
+def _attitude(section: Attitude, root: Path, name: str, motion: KnownMotion, count: int) -> None:
     poses = _poses(section, "attitude", root, name, motion, count)
     motion.attitude = tuple(None if pose is None else _rows(pose) for pose in poses)
     if section.up is not None:
@@ -195,7 +195,7 @@ def _rows(pose: RigidTransform) -> Rows:
     return cast(Rows, tuple(tuple(float(v) for v in row) for row in np.asarray(pose.rotation)))
 
 
-def _imu(section: Imu, root: Path, name: str, motion: Motion) -> None:
+def _imu(section: Imu, root: Path, name: str, motion: KnownMotion) -> None:
     if motion.times is None:
         raise InputError("RIL-232", f"{name}: [imu] needs times, but the pairs have none", remedy=NEEDS_TIMES)
     imu = read_imu(root / section.file)

@@ -16,7 +16,7 @@ from typing import Any
 
 from rille.datasets.georeference import georeference
 from rille.datasets.images import files
-from rille.datasets.images.pairing import Pair, common_size, pair_up
+from rille.datasets.images.pairing import ImagePair, common_size, pair_up
 from rille.datasets.manifest.model import Images, read_manifest
 from rille.datasets.manifest.motion import read_motion
 from rille.datasets.manifest.rig import read_optics
@@ -108,8 +108,8 @@ def root_folder(text: str, path: Path) -> Path:
     return root
 
 
-def find_pairs(images: Images, root: Path, name: str) -> tuple[Pair, ...]:
-    """The pairs that the patterns find; where files are paired by name, some may lack one (``Pair.absent``).
+def find_pairs(images: Images, root: Path, name: str) -> tuple[ImagePair, ...]:
+    """The pairs that the patterns find; where files are paired by name, some may lack one (``ImagePair.absent``).
 
     Raises
     ------

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tomli_w
 
-from rille.datasets.inspection import Calibration, Findings
+from rille.datasets.inspection import Findings, FoundCalibration
 from rille.datasets.manifest.rig import LONGEST_BASELINE
 from rille.datasets.text.names import derived_name
 
@@ -74,7 +74,7 @@ def _cameras(found: Findings) -> str:
     return "\n".join([*lines, *_calibration_lines(calibration, found)]) + "\n"
 
 
-def _calibration_lines(calibration: Calibration, found: Findings) -> list[str]:
+def _calibration_lines(calibration: FoundCalibration, found: Findings) -> list[str]:
     lines = []
     if calibration.size is not None and calibration.size != found.views.size:
         size = "{} x {}".format(*calibration.size)

@@ -22,7 +22,7 @@ NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$|[-+]?(nan|inf)$", r
 
 
 @dataclass(frozen=True)
-class Table:
+class TextTable:
     """Rows of equal length; ``header`` is empty where the file has no names, ``lines`` are the rows' line numbers."""
 
     name: str
@@ -68,7 +68,7 @@ def number(cell: str, name: str, line: int) -> float:
     return value
 
 
-def read_table(path: Path, what: str) -> Table:
+def read_table(path: Path, what: str) -> TextTable:
     """Table in a text file.
 
     Parameters
@@ -106,7 +106,7 @@ def read_table(path: Path, what: str) -> Table:
         raise InputError("RIL-286", f"{what} {path} has no rows of numbers", remedy="check that it is the right file")
     header = split(names, separator) if names else ()
     header = header if len(header) == len(rows[0]) else ()
-    return Table(str(path), tuple(name.lower() for name in header), tuple(rows), tuple(at), separator is not None)
+    return TextTable(str(path), tuple(name.lower() for name in header), tuple(rows), tuple(at), separator is not None)
 
 
 def split(text: str, separator: str | None) -> tuple[str, ...]:

@@ -121,7 +121,7 @@ def _images(place: Path) -> list[Path]:
     return images
 
 
-def find_boards(pairs: Sequence[pairing.Pair], corners: tuple[int, int] | None) -> Boards:
+def find_boards(pairs: Sequence[pairing.ImagePair], corners: tuple[int, int] | None) -> Boards:
     """The board in all pairs; its size is found where it is not given.
 
     Raises

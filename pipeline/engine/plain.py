@@ -21,7 +21,7 @@ def plain(text: str) -> str:
     return UNSEEN.sub(lambda found: ascii(found[0])[1:-1], text)
 
 
-class Plain:
+class PlainStream:
     """A stream that writes plain text; ``raw`` is the one behind it, for bars and colours of our own."""
 
     def __init__(self, raw: TextIO) -> None:
@@ -38,7 +38,7 @@ class Plain:
 
 def raw(stream: Any) -> Any:
     """The stream behind a plain one."""
-    return stream.raw if isinstance(stream, Plain) else stream
+    return stream.raw if isinstance(stream, PlainStream) else stream
 
 
 def warn(line: str) -> None:
@@ -49,5 +49,5 @@ def warn(line: str) -> None:
 @contextmanager
 def plain_output() -> Iterator[None]:
     """Everything that is printed within is plain."""
-    with redirect_stdout(Plain(sys.stdout)), redirect_stderr(Plain(sys.stderr)):
+    with redirect_stdout(PlainStream(sys.stdout)), redirect_stderr(PlainStream(sys.stderr)):
         yield

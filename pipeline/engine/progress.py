@@ -52,7 +52,7 @@ def make(mode: str = "auto", stream: TextIO | None = None) -> Progress:
     stream = stream or sys.stderr
     if mode == "auto":
         mode = "bar" if stream.isatty() else "plain"
-    kinds: dict[str, Any] = {"bar": Bar, "plain": Plain, "json": Json, "quiet": Quiet}
+    kinds: dict[str, Any] = {"bar": Bar, "plain": Lines, "json": Json, "quiet": Quiet}
     if mode not in kinds:
         raise ConfigError("RIL-568", f"progress {mode!r} is unknown", remedy=f"one of auto, {', '.join(kinds)}")
     progress: Progress = kinds[mode](stream)
@@ -97,7 +97,7 @@ class Quiet:
         return len(self.graph.nodes) if self.graph else 0
 
 
-class Plain(Quiet):
+class Lines(Quiet):
     """A line every few seconds, and one for each failure: for logs."""
 
     def open(self, graph: Graph, earlier: Kinds | None, jobs: int) -> None:
@@ -165,7 +165,7 @@ class Json(Quiet):
         print(json.dumps(facts), file=self.stream, flush=True)
 
 
-class Bar(Plain):
+class Bar(Lines):
     """A bar that moves with the estimated work done."""
 
     def open(self, graph: Graph, earlier: Kinds | None, jobs: int) -> None:

@@ -21,7 +21,7 @@ FACTOR, START = 1.15, 5.0
 
 
 @dataclass(frozen=True)
-class Timing:
+class RunTiming:
     """Seconds of a run: ``kernel`` of all stages together, ``tasks`` with reading and committing, the longest chain.
 
     ``compiling`` is the part of ``kernel`` that compiled kernels (or waited for another worker that did), by stage,
@@ -52,7 +52,7 @@ class Timing:
         return FACTOR * self.least + START
 
 
-def timing(path: Path) -> Timing:
+def timing(path: Path) -> RunTiming:
     """Timing of a ledger."""
     rows, facts = events.read(path), events.facts(path)
     took = {r["label"]: float(r["kernel"]) for r in rows if r["status"] == "computed" and "kernel" in r}
@@ -60,7 +60,7 @@ def timing(path: Path) -> Timing:
     wall = facts.get("total", facts.get("seconds"))
     if wall is None:  # it was killed
         wall = max((end for _, end in span), default=0.0) - min((start for start, _ in span), default=0.0)
-    return Timing(
+    return RunTiming(
         float(wall),
         int(facts.get("jobs", 1)),
         sum(took.values()),

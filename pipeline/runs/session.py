@@ -93,7 +93,7 @@ def choose_frames(text: str | None, count: int) -> tuple[int, ...]:
 
 
 @dataclass(frozen=True)
-class Settings:
+class Settled:
     """What a command works on: ``given`` are dotted keys that the user has set, ``vehicle_source`` who its limits."""
 
     sequence: Sequence
@@ -102,7 +102,7 @@ class Settings:
     given: tuple[str, ...]
 
 
-def settings(options: Options) -> Settings:
+def settings(options: Options) -> Settled:
     """Open a sequence and settle its configuration."""
     from rille.datasets.registry import open_sequence
     from rille.pipeline.flow import unread
@@ -129,7 +129,7 @@ def settings(options: Options) -> Settings:
     layers = vehicle, configuration.expand(sequence.defaults)
     config = configuration.build(*layers, for_stages)
     given = unread.set_by_user(for_stages, config, configuration.build(*layers))
-    return Settings(sequence, config, source, given)
+    return Settled(sequence, config, source, given)
 
 
 def warn_of_input(sequence: Sequence) -> None:
@@ -167,7 +167,7 @@ class _Opened:
     frames: tuple[int, ...]
     config: Any
     text: str
-    settled: Settings
+    settled: Settled
     folder: Path
     started: datetime
     versions: dict[str, str]

@@ -7,7 +7,7 @@ import pytest
 from raising import raises
 from scipy.spatial.transform import Rotation
 
-from rille.datasets.imu import Imu, at_frames, integrate, read_imu, resting_bias
+from rille.datasets.imu import ImuRecord, at_frames, integrate, read_imu, resting_bias
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 
 IDENTITY = RigidTransform.identity()
@@ -37,13 +37,13 @@ def resting(seconds=4.0, rate=200.0, R=None, bias=BIAS, noise=0.0, seed=0):
     rng = np.random.default_rng(seed)
     force = (np.eye(3) if R is None else R).T @ G
     shape = (len(t), 3)
-    return Imu(t, bias + noise * rng.standard_normal(shape), force + 10 * noise * rng.standard_normal(shape))
+    return ImuRecord(t, bias + noise * rng.standard_normal(shape), force + 10 * noise * rng.standard_normal(shape))
 
 
 def test_rates_become_the_rotation_between_frames():
     t = np.arange(0, 4.0, 0.005)
     at = np.array([0.5, 1.0, 1.0025, 1.7312, 3.9])
-    found = at_frames(Imu(t, nodding_rates(t), np.tile(G * 3, (len(t), 1))), at, T_IMU_LEFT)
+    found = at_frames(ImuRecord(t, nodding_rates(t), np.tile(G * 3, (len(t), 1))), at, T_IMU_LEFT)
     truth = nodding(at) @ T_IMU_LEFT.rotation
     ours = np.array(found.attitude)
     for k in range(1, len(at)):
@@ -72,7 +72,7 @@ def test_bias_is_what_a_resting_sensor_reads():
 def test_bias_is_removed_before_the_rotation():
     rest = resting(2.0)
     t = np.arange(0, 4.0, 0.005)
-    moved = Imu(
+    moved = ImuRecord(
         np.concatenate([rest.times, 2.0 + t]),
         np.concatenate([rest.rates, nodding_rates(t) + BIAS]),
         np.concatenate([rest.forces, nodding(t).transpose(0, 2, 1) @ G]),
@@ -86,7 +86,7 @@ def test_bias_is_removed_before_the_rotation():
 
 def test_a_steady_turn_is_not_taken_for_a_bias_where_a_quieter_rest_is():
     still, turning = resting(3.0, noise=0.001), resting(3.0, bias=BIAS + np.array([0, 0, 0.05]), noise=0.01, seed=1)
-    record = Imu(
+    record = ImuRecord(
         np.concatenate([still.times, 3.0 + turning.times]),
         np.concatenate([still.rates, turning.rates]),
         np.concatenate([still.forces, turning.forces]),
@@ -102,7 +102,7 @@ def test_a_turn_faster_than_any_bias_is_no_rest():
 
 def test_the_rest_nearest_to_the_frames_counts():
     early, late = resting(10.0), resting(10.0, bias=BIAS + 0.001)
-    record = Imu(
+    record = ImuRecord(
         np.concatenate([early.times, 10.0 + late.times]),
         np.concatenate([early.rates, late.rates]),
         np.concatenate([early.forces, late.forces]),
@@ -124,7 +124,7 @@ def test_up_is_carried_to_the_frame_of_a_sensor_that_turns_slowly():
     t = np.arange(0, 6.0, 0.005)
     rate = np.array([0.1, 0.0, 0.0])
     R = Rotation.from_rotvec(t[:, None] * rate).as_matrix()
-    found = at_frames(Imu(t, np.tile(rate, (len(t), 1)), R.transpose(0, 2, 1) @ G), [3.0, 5.999], IDENTITY)
+    found = at_frames(ImuRecord(t, np.tile(rate, (len(t), 1)), R.transpose(0, 2, 1) @ G), [3.0, 5.999], IDENTITY)
     # the force turns, so that there is no rest and no bias; at the end the mean over one side is carried all the same
     for moment, up in zip((3.0, 5.999), found.up, strict=True):
         np.testing.assert_allclose(up, [0, np.sin(0.1 * moment), np.cos(0.1 * moment)], atol=1e-3)
@@ -133,7 +133,7 @@ def test_up_is_carried_to_the_frame_of_a_sensor_that_turns_slowly():
 def test_vibration_does_not_matter():
     record = resting(4.0)
     shake = np.sin(2 * np.pi * 43.0 * record.times)[:, None] * [1.0, 0.5, 0.7]
-    found = at_frames(Imu(record.times, record.rates, record.forces + shake), [2.0], IDENTITY)
+    found = at_frames(ImuRecord(record.times, record.rates, record.forces + shake), [2.0], IDENTITY)
     np.testing.assert_allclose(found.up[0], [0, 0, 1], atol=0.003)
 
 
@@ -153,7 +153,7 @@ def _heavy(t):
 def test_no_up_from_an_accelerated_body(more):
     record = resting(4.0)
     forces = record.forces + more(record.times)
-    assert at_frames(Imu(record.times, record.rates, forces), [2.0], IDENTITY).up == (None,)
+    assert at_frames(ImuRecord(record.times, record.rates, forces), [2.0], IDENTITY).up == (None,)
 
 
 def test_no_up_from_a_body_that_turns_fast():
@@ -164,7 +164,7 @@ def test_no_up_from_a_body_that_turns_fast():
 def test_after_a_gap_the_reference_is_lost_but_not_the_vertical():
     record = resting(10.0)
     keep = (record.times < 6.0) | (record.times > 6.5)
-    cut = Imu(record.times[keep], record.rates[keep], record.forces[keep], "imu0")
+    cut = ImuRecord(record.times[keep], record.rates[keep], record.forces[keep], "imu0")
     found = at_frames(cut, [1.0, 3.0, 5.0, 6.2, 7.7, 8.0], IDENTITY)
     assert [a is not None for a in found.attitude] == [True, True, True, False, False, False]
     assert [u is not None for u in found.up] == [True, True, True, False, True, True]
@@ -177,7 +177,7 @@ def test_after_a_gap_the_reference_is_lost_but_not_the_vertical():
 def test_a_short_gap_is_bridged():
     t = np.arange(0, 4.0, 0.005)
     t = t[(t < 1.0) | (t > 1.05)]
-    found = at_frames(Imu(t, nodding_rates(t), nodding(t).transpose(0, 2, 1) @ G), [0.5, 3.0], IDENTITY)
+    found = at_frames(ImuRecord(t, nodding_rates(t), nodding(t).transpose(0, 2, 1) @ G), [0.5, 3.0], IDENTITY)
     a, b = (np.array(r) for r in found.attitude)
     truth = nodding(np.array([0.5, 3.0]))
     assert angle((a.T @ b).T @ (truth[0].T @ truth[1])) < 0.1

@@ -230,7 +230,7 @@ def test_a_process_that_failed_to_compile_holds_nobody_up(entry, tmp_path, end):
 
 def test_a_run_says_what_it_compiled():
     stream = io.StringIO()
-    shown = progress.Plain(stream)
+    shown = progress.Lines(stream)
     handle = Graph().node("toys.numbers", "n", NumbersParams(), {"frame": 0})
     shown.open(Graph(), {}, 1)
     shown.resolved(handle)

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rille.pipeline import cli
-from rille.pipeline.engine.plain import UNSEEN, Plain, plain, plain_output
+from rille.pipeline.engine.plain import UNSEEN, PlainStream, plain, plain_output
 from rille.pipeline.export.writers import write_table
 
 ESCAPE = "\x1b]0;owned\x07\x1b[2J\u202etxt.\x9b1m"
@@ -17,7 +17,7 @@ ESCAPE = "\x1b]0;owned\x07\x1b[2J\u202etxt.\x9b1m"
 @given(st.text(st.characters(codec=None)))
 def test_nothing_that_a_terminal_obeys_is_printed(text):
     stream = io.StringIO()
-    assert Plain(stream).write(text) == len(text)
+    assert PlainStream(stream).write(text) == len(text)
     assert not UNSEEN.search(stream.getvalue())
     assert plain(text) == text or UNSEEN.search(text)
     stream.getvalue().encode()  # bytes of names that are no UTF-8 included

@@ -17,7 +17,7 @@ from rille.pipeline.flow import unread
 from rille.pipeline.runs import session
 
 
-def settled(tmp_path: Path, sequence: str, *assignments: str, config: Path | None = None) -> session.Settings:
+def settled(tmp_path: Path, sequence: str, *assignments: str, config: Path | None = None) -> session.Settled:
     return session.settings(session.Options(sequence, assignments, config=config, cache=tmp_path / "cache"))
 
 
