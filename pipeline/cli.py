@@ -157,6 +157,30 @@ def plan(
 
 
 @app.command
+def graph(
+    seq: str = "mockup",
+    *,
+    output: Annotated[Path, Output] = Path("graph.svg"),
+    settings: Settings = _SETTINGS,
+    frames: Frames = None,
+    tasks: Annotated[bool, flag("Each task, not each stage.")] = False,
+) -> int:
+    """Draw the tasks of a run and what each reads, by stage.
+
+    Parameters
+    ----------
+    seq
+        As for reconstruct.
+    output
+        The drawing, .svg, or .dot for Graphviz.
+    """
+    prepare()
+    from rille.pipeline.commands import graph as command
+
+    return command.graph(options(seq, settings, _RESULTS, frames=frames), output, tasks=tasks)
+
+
+@app.command
 def why(
     run: Run,
     task: str,
