@@ -58,6 +58,11 @@ class TerrainParams(Params):
     )
 
 
+REPLACED: Mapping[str, str] = {
+    "refine.stereo": "it gained little and is gone: leave it out",
+}
+"""Keys of earlier versions, with what to write now: a ``config.toml`` of an old run is refused with this advice."""
+
 DATASET_SECTIONS = ("mockup", "misalign", "rover")
 """Sections that belong to a kind of sequence; the sequence validates them."""
 
@@ -230,6 +235,8 @@ def _complaint(kind: type[Params], prefix: tuple[str, ...], error: dict[str, Any
     loc = [str(part) for part in error["loc"]]
     key = ".".join((*prefix, *loc))
     if error["type"] == "extra_forbidden":
+        if key in REPLACED:
+            return f"{key} is a key of an earlier version: {REPLACED[key]}"
         near = difflib.get_close_matches(key, [".".join((*prefix, k)) for k in known_keys(kind)] + list(also), n=1)
         hint = f"did you mean {near[0]!r}?" if near else f"known here: {', '.join(_siblings(kind, loc))}"
         return f"unknown key {key!r} (value {error['input']!r}): {hint}"

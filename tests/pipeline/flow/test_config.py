@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
 from raising import raises
 
 from rille.pipeline.flow import config
@@ -87,3 +88,10 @@ def test_unreadable_files(tmp_path: Path) -> None:
     bad.write_text("[select\nstride=1")
     with raises("RIL-026"):
         config.read_toml(bad)
+
+
+@pytest.mark.parametrize("key", config.REPLACED)
+def test_a_key_of_an_earlier_version_is_refused_with_what_to_write_now(key):
+    assert key not in config.known_keys(config.model())
+    with raises("RIL-027", key, config.REPLACED[key]):
+        config.build(config.expand({key: True}))
