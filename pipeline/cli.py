@@ -86,7 +86,7 @@ def reconstruct(
     frames: Frames = None,
     executor: Executor = "dask",
     keep_going: Annotated[
-        bool, flag("Finish what does not depend on a task that failed for whatever reason; the exit status is then 3.")
+        bool, flag("After a failure, finish all tasks that do not depend on it; the exit status is then 3.")
     ] = False,
     memory_limit: MemoryLimit = None,
 ) -> int:
@@ -114,7 +114,7 @@ def drive(
     results: Results = _RESULTS,
     executor: Executor = "dask",
 ) -> int:
-    """Drive a simulated rover to a goal in a closed loop: stop, think, drive, localise, and again.
+    """Drive a simulated rover to a goal in a closed loop: stop, map, plan, drive, localise, repeat.
 
     Prints how it ended (goal, no path, safety stop and why) and the folder of the report. What the rover does is set
     like any parameter: rover.slip=0.3, drive.goal=[0.2,1.1].
@@ -140,7 +140,7 @@ def plan(
     memory_limit: MemoryLimit = None,
     verbose: Annotated[bool, flag("Each task with its reason.", "--verbose", "-v")] = False,
 ) -> int:
-    """Say what `reconstruct` would compute, what is cached, and why each miss; nothing is computed.
+    """Show what `reconstruct` would compute and why, and what is cached; nothing is computed.
 
     Parameters
     ----------
@@ -189,7 +189,7 @@ def why(
     cache: CacheFolder = None,
     debug: Debug = False,
 ) -> int:
-    """Say of one task of a run where its inputs come from, why it was computed or not, with what, and what has changed.
+    """Explain one task of a run: its inputs, why it was computed, its parameters and code, what changed since.
 
     Parameters
     ----------
@@ -203,7 +203,7 @@ def why(
 
 @app.command
 def timing(run: Run = "latest", *, runs: Runs = RUNS, debug: Debug = False) -> int:
-    """Say where the time of a run went, and how far it is from what its tasks allow."""
+    """Show where the time of a run went, against the least time that its tasks permit."""
     from rille.pipeline.runs import critical_path as command
 
     return command.show(run, runs)
@@ -252,7 +252,7 @@ def check(
     cache: CacheFolder = None,
     debug: Debug = False,
 ) -> int:
-    """Open everything of a sequence and judge it, one line each; a picture shows the first pair's epipolar residuals.
+    """Check a sequence: one finding a line, and a picture of the first pair's epipolar residuals.
 
     Parameters
     ----------

@@ -29,7 +29,7 @@ def gc(
     *,
     cache: CacheFolder = None,
     runs: Runs = RUNS,
-    dry_run: Annotated[bool, flag("Say what would go, by stage, and keep it.")] = False,
+    dry_run: Annotated[bool, flag("List by stage what would be removed, and remove nothing.")] = False,
     debug: Debug = False,
 ) -> int:
     """Remove artifacts that no kept and no pinned run refers to, and leftovers of interrupted runs."""
@@ -46,7 +46,7 @@ def ls(
     runs: Runs = RUNS,
     debug: Debug = False,
 ) -> int:
-    """Say what the cache holds, by sequence and stage: number, sizes, age, and the run that used it last."""
+    """List what the cache holds by sequence and stage: number, sizes, age, and the run that used it last."""
     from rille.pipeline.runs import inventory
 
     return inventory.ls(cache_folder(cache), runs, as_json=as_json)
@@ -60,7 +60,7 @@ def pin(
     runs: Runs = RUNS,
     debug: Debug = False,
 ) -> int:
-    """Keep all artifacts of a run, whatever is cleared away, even if the run's folder is removed."""
+    """Keep all artifacts of a run: gc leaves them alone, even if the run's folder is removed."""
     from rille.pipeline.runs import session as commands
 
     return commands.pin(cache_folder(cache), run, runs)
@@ -68,7 +68,7 @@ def pin(
 
 @app.command
 def unpin(run: str, *, cache: CacheFolder = None, debug: Debug = False) -> int:
-    """Take the pin of a run away; its artifacts stay until they are cleared away.
+    """Remove the pin of a run; its artifacts stay until the next gc.
 
     Parameters
     ----------

@@ -29,7 +29,7 @@ def init(
     force: Annotated[bool, flag("Replace a manifest that is there.")] = False,
     debug: Debug = False,
 ) -> int:
-    """Look at a folder of stereo images and write a commented manifest: what was found, and what is still needed.
+    """Write a commented manifest of a folder of stereo images: what was found, and what is still needed.
 
     Parameters
     ----------
@@ -51,7 +51,7 @@ def calibrate(
     corners: str | None = None,
     model: Literal["radtan", "radtan4", "rational", "fisheye"] = "radtan",
     output: Annotated[Path, Output] = Path("rig.yaml"),
-    keep_bad: Annotated[bool, flag("Use views too whose residuals are far above the others'.")] = False,
+    keep_bad: Annotated[bool, flag("Keep views whose residuals are far above the others'.")] = False,
     debug: Debug = False,
 ) -> int:
     """Calibrate a stereo rig from pictures of a chessboard; prints the residual of each view.
@@ -65,7 +65,7 @@ def calibrate(
     square
         Side of a square, metres.
     corners
-        Inner corners, COLUMNSxROWS, for example 9x6; found by itself if not given.
+        Inner corners, COLUMNSxROWS, for example 9x6; detected by default.
     model
         Distortion model.
     output
@@ -194,7 +194,7 @@ def compare_dem(
     b
         Reference, likewise.
     align
-        Move A onto B first: shift (x, y, z), tilt (z and two inclinations) or rigid (all six); what was moved is told.
+        Move A onto B first: shift (x, y, z), tilt (z and two inclinations) or rigid (all six); the motion is printed.
     output
         Files to write, without ending.
     """

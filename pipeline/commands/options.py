@@ -47,9 +47,7 @@ Executor = Annotated[
 Frames = Annotated[str | None, Parameter(help="Frame range START:STOP[:STEP], as in Python; all by default.")]
 MemoryLimit = Annotated[
     str | None,
-    Parameter(
-        help="Memory that a run may take in all, 6GB or 75% for example; nine tenths of what is free by default."
-    ),
+    Parameter(help="Memory that a run may use in total, for example 6GB or 75%; by default 90 % of what is free."),
 ]
 Output = Parameter(name=["--output", "-o"])
 Run = Annotated[
@@ -82,7 +80,7 @@ class Results:
     progress: Annotated[
         Literal["auto", "bar", "plain", "json", "quiet"], Parameter(help="How progress is shown on stderr.")
     ] = "auto"
-    quiet: Annotated[bool, flag("No progress; complaints only.", "--quiet", "-q")] = False
+    quiet: Annotated[bool, flag("No progress; warnings and errors only.", "--quiet", "-q")] = False
 
 
 def options(

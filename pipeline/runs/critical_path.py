@@ -1,7 +1,8 @@
-"""``rille timing RUN``: where the time of a run went, and how far it is from what its work allows.
+"""``rille timing RUN``: where the time of a run went, against the least possible time.
 
-No schedule beats the greater of two figures: the seconds of all stages over the number of workers, and the longest
-chain of tasks of which each waits for the one before. The rest is starting, reading, committing, waiting, drawing.
+The least possible time is the greater of two figures: the sum of all stages' seconds over the number of workers, and
+the critical path (the longest chain of tasks that wait for each other). All else is overhead: starting workers, reading
+inputs, committing results, waiting.
 """
 
 from __future__ import annotations

@@ -25,41 +25,41 @@ Floats = NDArray[np.float64]
 Level = Literal["OK", "WARN", "FAIL"]
 
 SMALL_BASELINE, LARGE_BASELINE = 0.01, 5.0
-"""m; rigs beyond are rare, lengths in other units common."""
+"""Usual baselines [m]. Outside of them, lengths in another unit are likelier than such a rig."""
 
 BLURRED = 0.6
-"""Share of a camera's usual sharpness: a Gaussian of one pixel more takes that much."""
+"""Share of a camera's median sharpness; a Gaussian blur of one more pixel reduces it to this."""
 
 UNLIKE_SHARP = 0.7
 UNLIKE_GREY = 1.5
-"""Ratio of mean greys of the two cameras, or of successive frames. The matcher removes the mean, noise it cannot."""
+"""Ratio of mean greys of two cameras or successive frames. The matcher removes the mean, but not the noise."""
 
 CLIPPED = 0.2
-"""Share of pixels at either end of the scale; sky may be white, the ground may not."""
+"""Share of black or of white pixels. A white sky takes less than this; more means clipped ground."""
 
 UNIFORM = 1.0
-"""Grey levels of deviation over an image, below which it shows nothing."""
+"""Standard deviation of an image [grey levels], below which it is blank."""
 
 GAP = 2.5
-"""Intervals of time, in medians, that count as a gap."""
+"""A step of time above this many median steps is a gap."""
 
 ROWS_OK, ROOM = 0.5, 1.0
-"""Pixels: a row offset that costs nothing; a residual that no rig should leave, lens distortion does."""
+"""Greatest harmless row offset [px], and greatest residual [px] of a rig whose lens distortion is removed."""
 
 HOPELESS = 5.0
-"""Pixels of residual after adjustment: not the cameras that were calibrated, or not a pair."""
+"""Residual [px] after adjustment above which the calibration is of other cameras, or the images are no pair."""
 
 SWAPPED, DOUBTFUL = 0.5, 0.1
-"""Share of matches beyond infinity: nearly all where left and right are swapped."""
+"""Share of matches beyond infinity. It is near 1 where left and right are swapped."""
 
 POOR_MATCH, NO_MATCH = 0.3, 0.02
-"""Share of usable pixels that are matched."""
+"""Share of usable pixels that are matched: poor below the first, useless below the second."""
 
 LITTLE_OVERLAP, NO_OVERLAP = 0.4, 0.1
-"""Share of a left image that the next one shows still; tracks need most of it."""
+"""Share of a left image that the next left image still shows; tracking needs most of it."""
 
 ATTITUDE_DEG = 2.0
-"""Degrees by which an attitude may differ from truth between successive frames."""
+"""Greatest permitted difference [degrees] of the rotations between successive frames, attitude against truth."""
 
 
 @dataclass(frozen=True)

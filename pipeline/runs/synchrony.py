@@ -1,7 +1,7 @@
-"""Whether left and right of a pair were taken at one moment: which shift of the right images the rows fit best.
+"""Test whether left and right images are simultaneous: find the time shift of the right images that fits rows best.
 
-Where the vehicle moves, a right image of another moment departs from the epipolar lines by pixels, and the one of the
-same moment does not. At rest all shifts fit alike, and nothing is said.
+While the vehicle moves, matches of a right image of another time lie pixels off their epipolar lines; those of the
+simultaneous image do not. At rest all shifts fit equally, and no finding results.
 """
 
 from __future__ import annotations
