@@ -22,7 +22,7 @@ class Table:
 class Block:
     """One figure: panels side by side under a title, what one sees, a legend of ``(colour, words)`` and a table.
 
-    ``strip``: the panels are narrow columns.
+    ``strip``: the panels are narrow columns. ``data``: what the page's script draws in their place, as plain JSON.
     """
 
     name: str
@@ -32,6 +32,7 @@ class Block:
     legend: tuple[tuple[str, str], ...] = ()
     table: Table | None = None
     strip: bool = False
+    data: Mapping[str, Any] | None = None
 
     @property
     def anchor(self) -> str:

@@ -161,6 +161,14 @@ def color_map(name: str, undefined: str = UNDEFINED) -> Any:
     return matplotlib.colormaps[name].with_extremes(bad=undefined)
 
 
+def ramp(name: str) -> NDArray[np.uint8]:
+    """The 256 colours (256, 3) of a colour map of matplotlib."""
+    import matplotlib
+
+    colors = matplotlib.colormaps[name](np.arange(256))[:, :3]
+    return np.asarray(np.rint(255 * colors), dtype=np.uint8)
+
+
 def scale_bar(ax: Any, extent: Extent) -> None:
     """Bar of a round length near a quarter of the width, at the lower left."""
     length = round_length(0.25 * (extent[1] - extent[0]))

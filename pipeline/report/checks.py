@@ -10,10 +10,9 @@ import numpy as np
 from rille.pipeline.export import ranges
 from rille.pipeline.export.artifacts import chain
 from rille.pipeline.export.comparison import Comparison
-from rille.pipeline.report import canvas, curves, figures
+from rille.pipeline.report import canvas, figures
 from rille.pipeline.report.block import Block, Table
-from rille.pipeline.report.calibration import Calibration
-from rille.pipeline.report.gather import Scene
+from rille.pipeline.report.gather import Calibration, Scene
 from rille.pipeline.report.words import length, quantity, spans, spread
 
 MOST_CURVES = 3
@@ -66,9 +65,9 @@ def _residuals(scene: Scene, found: Calibration) -> list[canvas.Panel]:
     for name, _, values in parts:
         label = f"distance from epipolar line, px: {name}"
         alt = f"Epipolar residuals over the left image, {name}: {spread(values)} px"
-        panels.append(curves.residual_map(found.points, values, size, bound, label, alt))
+        panels.append(figures.residual_map(found.points, values, size, bound, label, alt))
     alt = f"Distribution of epipolar residuals of {len(found.before)} matches"
-    panels.append(curves.histogram(parts, bound, "distance from epipolar line, px", alt))
+    panels.append(figures.histogram(parts, bound, "distance from epipolar line, px", alt))
     return panels
 
 
@@ -89,7 +88,7 @@ def _drift(found: Calibration) -> canvas.Panel | None:
     far = {name: abs(float(np.median(values[name] / np.maximum(sigmas[name], 1e-9)))) for name in names}
     shown = sorted(names, key=lambda name: (name not in used, -far[name]))[:MOST_CURVES]
     words = ", ".join(f"{name.replace('_', ' ')} {spread(values[name])} degrees" for name in shown)
-    return curves.drift(
+    return figures.drift(
         [p["pair"] for p in pairs],
         {name: values[name] for name in shown},
         {name: sigmas[name] for name in shown},
@@ -144,7 +143,7 @@ def basic_pairs(scene: Scene) -> Block | None:
     known = overlap[np.isfinite(overlap)]
     shares = f"{known.min():.0%} to {known.max():.0%}" if len(known) else "not known"
     alt = f"Overlap of successive basic pairs {shares}; displacement between frames {spread(moved)} px"
-    panel = curves.basic_pairs(pairs, overlap, wanted, tracked[1:], moved, alt)
+    panel = figures.basic_pairs(pairs, overlap, wanted, tracked[1:], moved, alt)
     why = _reasons(meta.get("why") or ())
     caption = (
         f"{len(pairs)} of {len(view.frames)} pairs are basic by the rule “{meta.get('rule', '')}”{why}; each became an "
@@ -193,10 +192,10 @@ def crosscheck(scene: Scene) -> Block | None:
     ]
     degrees = f"{spread(np.degrees(found.angle))} degrees"
     panels = (
-        curves.disagreement(
+        figures.disagreement(
             view.frames, poses, flagged, lost, f"Disagreement of poses: {spread(found.distance)} m, {degrees}"
         ),
-        curves.disagreement(
+        figures.disagreement(
             view.frames, motions, flagged, lost, f"Disagreement of motions: {spread(found.step_distance)} m"
         ),
     )
@@ -276,7 +275,7 @@ def overlaps(scene: Scene) -> Block | None:
         pairs = [d.pair for d in differences]
         words_ = f"median {spread(rows[:, 0])} m, deviation {spread(rows[:, 1])} m"
         alt = f"Elevation differences of successive models: {words_}"
-        panels.append(curves.differences(pairs, rows[:, 0], rows[:, 1], rows[:, 2], alt))
+        panels.append(figures.differences(pairs, rows[:, 0], rows[:, 1], rows[:, 2], alt))
     if not panels:
         return None
     words = []

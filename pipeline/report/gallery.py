@@ -12,7 +12,7 @@ import numpy as np
 
 from rille.pipeline.export import artifacts
 from rille.pipeline.export.output import Output, stage
-from rille.pipeline.report import canvas, checks, driving, figures, gather, seams
+from rille.pipeline.report import canvas, checks, driving, figures, gather, seams, terrain_map
 from rille.pipeline.report.block import Block, Figure
 from rille.pipeline.report.delivery import start_words
 from rille.pipeline.report.gather import Scene
@@ -110,28 +110,34 @@ def _terrain(scene: Scene) -> Block | None:
     )
 
 
-def _risk(scene: Scene) -> Block | None:
-    if scene.risk is None:
+def _map(scene: Scene) -> Block | None:
+    """The layered map; its still picture is the risk map, or the elevations where nothing was judged."""
+    found, world, risk = terrain_map.data(scene), scene.world, scene.risk
+    if risk is None and (world is None or found is None):
         return None
-    risk = scene.risk.arrays["risk"]
-    shares = [float((risk == k).mean()) for k in range(4)]
-    words = f"{shares[0]:.0%} safe, {shares[1]:.0%} caution, {shares[2]:.0%} hazard, {shares[3]:.0%} unknown"
-    vehicle = scene.view.config.vehicle
-    panels = [figures.risk_map(risk, scene.path, scene.risk.extent, f"Risk map seen from above: {words}")]
-    slope = scene.risk.get("inclination")
-    if slope is not None:
-        degrees = np.degrees(slope)
-        alt = f"Local inclination, {spread(degrees)} degrees"
-        label = "local inclination, degrees"
-        panels.append(figures.scalar_map(degrees, scene.risk.extent, label, alt, length=False))
-    caption = (
-        f"Of all cells {words}. Limits of {vehicle.name}: slope and tilt {vehicle.max_slope_deg:g}°, "
-        f"step {length(vehicle.max_step)}, roughness {length(vehicle.max_roughness)}, clearance "
-        f"{length(vehicle.clearance)}; a hazard is what exceeds one within {scene.view.config.risk.sigmas:g} standard "
-        f"deviations, caution what comes near it. {_path_words(scene)} Second: the local inclination, over a wheel's "
-        f"diameter ({length(vehicle.wheel_diameter)})."
-    )
-    return Block("Risk map", "Risk map and path of the whole run", caption, tuple(panels), _legend(shares))
+    words, shares, caption = "not judged", [], ""
+    if risk is not None:
+        classes, vehicle = risk.arrays["risk"], scene.view.config.vehicle
+        shares = [float((classes == k).mean()) for k in range(4)]
+        words = f"{shares[0]:.0%} safe, {shares[1]:.0%} caution, {shares[2]:.0%} hazard, {shares[3]:.0%} unknown"
+        panel = figures.risk_map(classes, scene.path, risk.extent, f"Risk map seen from above: {words}")
+        caption = (
+            f"Of all cells {words}. Limits of {vehicle.name}: slope and tilt {vehicle.max_slope_deg:g}°, "
+            f"step {length(vehicle.max_step)}, roughness {length(vehicle.max_roughness)}, clearance "
+            f"{length(vehicle.clearance)}; a hazard is what exceeds one within {scene.view.config.risk.sigmas:g} "
+            f"standard deviations, caution what comes near it. {_path_words(scene)} "
+        )
+    else:
+        assert world is not None
+        panel = figures.elevation_with_path(world.arrays["elevation"], None, scene.path, world.extent, "Elevation")
+    if found is not None:
+        caption += (
+            "σ: standard deviation of the elevation as predicted from the disparity's error, the rig's geometry, how "
+            "well both images agree and the poses' covariances; models: how many basic pairs saw a cell."
+        )
+    if found is not None and found["thinned"] > 1:
+        caption += f" The map shows every {found['thinned']}th cell along both axes; the GeoTIFFs have all."
+    return Block("Map", "Map", caption, (panel,), _legend(shares) if shares else (), data=found)
 
 
 def _path_words(scene: Scene) -> str:
@@ -278,28 +284,6 @@ def _trajectory(scene: Scene) -> Block | None:
     return Block("Figure 9", "Figure 9. Trajectory and displacements", caption, tuple(panels), tuple(legend))
 
 
-def _quality(scene: Scene) -> Block | None:
-    world = scene.world
-    if world is None or world.get("elevation") is None:
-        return None
-    z, sigma, count = world.arrays["elevation"], world.get("elevation_std"), world.get("count")
-    panels = [figures.hillshade(z, world.lattice.cell, world.extent, f"Shaded relief of the terrain, {spread(z)} m")]
-    if sigma is not None:
-        alt = f"Standard deviation of the elevation, {spread(sigma)} m"
-        panels.append(figures.scalar_map(sigma, world.extent, "standard deviation", alt))
-    if count is not None:
-        seen = np.where(count > 0, count, np.nan).astype(np.float32)
-        alt = f"Number of elevation models per cell, up to {int(count.max())}"
-        panels.append(figures.scalar_map(seen, world.extent, "models per cell", alt, length=False))
-    caption = (
-        "Shaded relief (light from the upper left, tinted by elevation); standard deviation of the elevation as "
-        "predicted from the disparity's error, the rig's geometry, how well both images agree and the poses' "
-        "covariances; number of basic pairs that saw a cell. "
-        "Undefined: light grey."
-    )
-    return Block("Terrain", "Terrain, its standard deviation and its coverage", caption, tuple(panels))
-
-
 def _dem_error(scene: Scene) -> Block | None:
     error = gather.terrain(scene.view.bundle(scene.view.products.dem_accuracy), "error")
     if error is None or error.get("error") is None:
@@ -329,6 +313,13 @@ _COMPARED = "trajectory agreement accuracy crosscheck_accuracy"
 _TRUTH = "sequence.truth sequence.truth_positions sequence.truth_source"
 _FIGURES: tuple[tuple[str, Maker, Condition, str, str], ...] = (
     (
+        "Map",
+        _map,
+        _always,
+        "tiles risk path drive trajectory disparity rigs",
+        "config.vehicle config.risk.sigmas sequence.rig sequence.truth",
+    ),
+    (
         "Drive",
         driving.strip,
         lambda scene: scene.view.products.drive is not None,
@@ -338,7 +329,6 @@ _FIGURES: tuple[tuple[str, Maker, Condition, str, str], ...] = (
     ("Figure 6. Disparities", _disparities, _always, "disparity images undistorted", ""),
     ("Rig", checks.rig, lambda scene: bool(scene.view.products.rigs), "rigs orientations", "sequence.rig"),
     ("Figure 7. Ortho image and path", _terrain, _always, "tiles world_dem risk path", "config.vehicle"),
-    ("Risk map", _risk, _always, "risk path drive", "config.vehicle config.risk.sigmas"),
     ("Figure 3. Local risk map", _local, _planned, "local_path local_risk drive", ""),
     ("Figure 8. Tracks", _tracks, _several, "images undistorted tracks resections", ""),
     (
@@ -362,7 +352,6 @@ _FIGURES: tuple[tuple[str, Maker, Condition, str, str], ...] = (
         "select continuity",
         "config.select.rule config.select.overlap",
     ),
-    ("Terrain", _quality, _always, "tiles", ""),
     ("Overlap", checks.overlaps, lambda scene: len(scene.view.products.world_dem) > 1, "tiles world_dem", ""),
     ("Seams", seams.worst, lambda scene: bool(scene.view.products.seams), "seam_audit seams", ""),
     ("Seam audit", seams.models, lambda scene: bool(scene.view.products.seams), "seam_audit seams", ""),

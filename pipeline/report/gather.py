@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -10,15 +11,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rille.pipeline.export import ranges
 from rille.pipeline.export.artifacts import Floats, image, used_rig
 from rille.pipeline.export.comparison import Comparison, compare
 from rille.pipeline.export.view import RunView
-from rille.pipeline.report.calibration import Calibration, calibration
 from rille.pipeline.report.canvas import Extent
-from rille.pipeline.report.overlap import Difference, differences
 from rille.stages.core.declare import Bundle
+from rille.stages.geometry.epipolar import distances
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.lattice import Lattice, mosaic, union
+from rille.stages.numeric.robust import mad_sigma
 from rille.stages.odometry.resection.trajectory import world_poses
 
 NODATA: Mapping[str, float] = {"count": 0, "source": -1}
@@ -68,6 +70,49 @@ class Track:
     def in_world(self) -> NDArray[np.bool_]:
         """Which frames have a pose in the world."""
         return np.asarray(np.isfinite(self.left).all(axis=1))
+
+
+LEAST_CELLS = 100
+"""Common cells below which a median says little."""
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Elevation of the model of ``pair`` minus that of ``before``, in the world, over their common cells, m.
+
+    ``median``; ``deviation`` robust (1.4826 times the median absolute deviation); ``predicted`` median over the cells
+    of what both models' own standard deviations let expect, errors of pose left out.
+    """
+
+    before: int
+    pair: int
+    cells: int
+    median: float
+    deviation: float
+    predicted: float
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """The rig's facts by rig (one pooled, or one a pair), and what the matches of all basic pairs say about it.
+
+    ``points`` (n, 2): column, row in the left image; ``before``, ``after`` (n,): signed distance of the right point
+    from the epipolar line, px, under the given rig and under the one that was used. Outliers are left out.
+    """
+
+    facts: tuple[Mapping[str, Any], ...]
+    points: Floats
+    before: Floats
+    after: Floats
+
+    @property
+    def changed(self) -> bool:
+        """Whether any rig that was used differs from the given one."""
+        return any(bool(facts.get("changed")) for facts in self.facts)
+
+    def collected(self, key: str) -> list[Any]:
+        """The entries of a list that each rig's facts have."""
+        return [entry for facts in self.facts for entry in facts.get(key) or ()]
 
 
 class Scene:
@@ -219,3 +264,66 @@ def consecutive(view: RunView, count: int = 4) -> tuple[int, ...]:
     """The first ``count`` successive frames whose images are there (fewer where there are fewer)."""
     have = [f for f in view.frames[: 4 * count] if image(view, f) is not None]
     return tuple(have[:count])
+
+
+def calibration(view: RunView) -> Calibration | None:
+    """What became of the rig; None where nothing looked at it."""
+    p = view.products
+    handles = list({id(handle): handle for handle in p.rigs.values()}.values())
+    facts = tuple(bundle.meta for bundle in map(view.bundle, handles) if bundle is not None)
+    if not facts:
+        return None
+    parts = [_residuals(view, pair) for pair in p.orientations]
+    points, before, after = (np.concatenate([part[k] for part in parts if part] or [_NONE[k]]) for k in range(3))
+    return Calibration(facts, points, before, after)
+
+
+_NONE = (np.empty((0, 2)), np.empty(0), np.empty(0))
+
+
+def _residuals(view: RunView, pair: int) -> tuple[Floats, Floats, Floats] | None:
+    """Left points of a pair's inliers, and their epipolar residuals under the given and the used rig, px."""
+    bundle = view.bundle(view.products.orientations.get(pair))
+    if bundle is None:
+        return None
+    left, right = (np.asarray(bundle[name], dtype=np.float64) for name in ("left", "right"))
+    kept = np.asarray(bundle["weight"]) > 0
+    left, right, given, used = left[kept], right[kept], view.sequence.rig, used_rig(view, pair)
+    before = distances(given, np.zeros(5), left, right)[0]
+    after = before if used.to_dict() == given.to_dict() else distances(used, np.zeros(5), left, right)[0]
+    return left, before, after
+
+
+def differences(view: RunView) -> list[Difference]:
+    """Of each two successive models that overlap, in the order of the pairs."""
+    found = []
+    present = [pair for pair, handle in view.products.world_dem.items() if view.bundle(handle) is not None]
+    for before, pair in itertools.pairwise(present):
+        one = _difference(view, before, pair)
+        if one is not None:
+            found.append(one)
+    return found
+
+
+def _difference(view: RunView, before: int, pair: int) -> Difference | None:
+    a, b = (view.bundle(view.products.world_dem[k]) for k in (before, pair))
+    if a is None or b is None or "lattice" not in a.meta or "lattice" not in b.meta:
+        return None
+    lattices = [Lattice.from_dict(m.meta["lattice"]) for m in (a, b)]
+    common = lattices[0].intersection(lattices[1])
+    if common is None:
+        return None
+    windows = [lattice.window(common) for lattice in lattices]
+    z, sigma = (
+        [np.asarray(m[name][window], dtype=np.float64) for m, window in zip((a, b), windows, strict=True)]
+        for name in ("elevation", "elevation_std")
+    )
+    difference, expected = z[1] - z[0], np.hypot(*sigma)
+    cells = int(np.isfinite(difference).sum())
+    if cells < LEAST_CELLS:
+        return None
+    sampled = ranges.sample(difference)
+    median = float(np.median(sampled))
+    deviation = mad_sigma(sampled)
+    predicted = ranges.sample(np.where(np.isfinite(difference), expected, np.nan))
+    return Difference(before, pair, cells, median, deviation, float(np.median(predicted)))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,29 @@ from rille.pipeline.report import tables
 from rille.pipeline.report.block import Figure
 from rille.pipeline.report.summary import summarise
 from rille.pipeline.report.words import coordinate, metres, number, quantity, seconds, share
+
+TILES = (
+    ("frames_posed",),
+    ("trajectory_drift", "agreement_share"),
+    ("dem_merged_rmse", "elevation_sigma"),
+    ("mapped_area",),
+    ("path_length", "drive_way"),
+)
+"""Metrics of the opening screen: of each row the first that has a value."""
+
+CHAPTERS = (
+    ("Trajectory", "trajectory", ("Crosscheck",)),
+    ("Terrain", "terrain", ("Elevation error", "Overlap", "Seams", "Seam audit")),
+    ("Hazards and path", "hazards", ("Drive",)),
+    ("Rig", "rig-chapter", ("Rig",)),
+    ("Matching", "matching", ("Basic pairs",)),
+    ("Accuracy", "key-figures", ()),
+    ("Times", "times", ()),
+    ("The paper's figures", "paper", ("Figure 3", "Figure 6", "Figure 7", "Figure 8", "Figure 9")),
+)
+"""Title, anchor and figures of each chapter, in the order in which a user asks."""
+ALWAYS = ("trajectory", "matching", "key-figures", "times", "paper")
+"""Chapters that hold more than figures."""
 
 
 def write_report(folder: Path, view: RunView, facts: Mapping[str, Any], figures: Sequence[Figure]) -> None:
@@ -62,10 +86,15 @@ def render(
         "metres": metres,
         "coordinate": coordinate,
     }
+    blocks = {figure.block.name: figure.block for figure in figures if figure.block is not None}
+    chapters = [(title, anchor, [blocks[n] for n in names if n in blocks]) for title, anchor, names in CHAPTERS]
     rows, together = tables.table_2(view)
     return env.get_template("template.html").render(
         facts=facts,
-        blocks=[figure.block for figure in figures if figure.block is not None],
+        map=blocks.get("Map"),
+        chapters=[c for c in chapters if c[2] or c[1] in ALWAYS],
+        tiles=_tiles(facts["metrics"]),
+        script=resources.files("rille.pipeline.report").joinpath("map.js").read_text(encoding="utf-8"),
         files=files,
         table_2=rows,
         together=together,
@@ -75,3 +104,8 @@ def render(
         compared=compared,
         place=view.sequence.georeference,
     )
+
+
+def _tiles(metrics: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    known = {name: metric for name, metric in metrics.items() if metric["value"] is not None}
+    return [known[found] for names in TILES if (found := next((n for n in names if n in known), None))]

@@ -167,7 +167,7 @@ def test_one_risk_parameter_reruns_risk_path_and_what_reads_them(cold: Path) -> 
     labels = computed(cold)
     assert {label.split("/")[0] for label in labels} == {"risk", "path", "path_check", "output"}
     drawn = {label.removeprefix("output/") for label in labels if label.startswith("output/")}
-    assert {"risk.tif", "Risk map", "facts"} <= drawn
+    assert {"risk.tif", "Map", "facts"} <= drawn
     assert not drawn & {"dem.tif", "terrain.zarr", "trajectory.tum", "Figure 9. Trajectory", "Seams"}
 
 

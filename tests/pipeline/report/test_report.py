@@ -44,16 +44,16 @@ def test_a_whole_run_has_every_figure_and_nothing_missing(whole: Written) -> Non
     for anchor in (
         "figure-6",
         "figure-7",
-        "risk-map",
+        "map",
+        "map-view",
         "figure-3",
         "figure-8",
         "figure-9",
-        "terrain",
         "overlap",
         "elevation-error",
     ):
         assert anchor in page_.ids
-    assert len(page_.images) == 4 + 2 + 2 + 2 + 4 + 2 + 3 + 2 + 1
+    assert len(page_.images) == 1 + 4 + 2 + 2 + 4 + 2 + 2 + 1
     assert facts["warnings"] == []
     assert "warnings-box" not in page_.ids
     assert all(image["alt"] for image in page_.images)
@@ -154,8 +154,8 @@ def test_what_is_missing_comes_first(tmp_path: Path) -> None:
     skipped = facts["missing"][1]
     assert skipped["what"] == "trajectory, risk/world"
     text = page_.text
-    assert text.index("3 landmarks, 6 are needed") < text.index("Key figures Quantity")
-    assert page_.ids[0] == "missing-box"
+    assert text.index("3 landmarks, 6 are needed") < text.index("Accuracy Quantity")
+    assert page_.ids.index("missing-box") < page_.ids.index("trajectory")
     assert "figure-9" not in page_.ids
 
 
@@ -212,7 +212,7 @@ def test_no_path_names_the_row_that_blocks(tmp_path: Path) -> None:
     assert "path_length" not in facts["metrics"]
     assert "path_start" not in facts["metrics"]
     assert f"There is no path: {reason}." in page_.text
-    assert "risk-map" in page_.ids
+    assert "map" in page_.ids
 
 
 def test_one_stop_without_a_local_path_is_not_nothing_missing(tmp_path: Path) -> None:
@@ -249,7 +249,7 @@ def test_a_drive_that_arrived_does_not_say_that_there_is_no_path(tmp_path: Path,
     assert "There is no path" not in page_.text
     missing = [m["what"] for m in facts["missing"] if m["kind"] == "no path"]
     if verdict == "goal":
-        assert "Risk map and path of the whole run" in page_.text
+        assert "map-still" in page_.ids
         assert "The goal was reached; no path is planned over the whole map" in page_.text
         assert "the goal was reached" in facts["delivered"]
         assert missing == []
@@ -347,12 +347,6 @@ def test_ground_limits_ignore_crowns() -> None:
     # The ground spreads by 0.1 m: its robust deviation is 0.037 m, five of them 0.19 m.
     assert -1.7 <= low < -1.69
     assert -1.6 <= high < -1.4
-
-
-def test_shading_is_bright_towards_the_light() -> None:
-    x, y = np.meshgrid(np.arange(9.0), -np.arange(9.0))  # row 0 at the greatest y
-    towards, away = figures._shade(0.5 * (x - y), 1.0), figures._shade(-0.5 * (x - y), 1.0)
-    assert towards[4, 4] > figures._shade(0 * x, 1.0)[4, 4] > away[4, 4]
 
 
 def test_spans() -> None:

@@ -62,7 +62,7 @@ def test_suspicions_stand_before_the_figures(self_checked: Written) -> None:
         "trajectory and COLMAP disagree more than elsewhere at 1 of 6 frames: frame 3",
     ]
     text = page_.text
-    assert text.index("rows are off by 0.60 px") < text.index("Key figures Quantity")
+    assert text.index("rows are off by 0.60 px") < text.index("Accuracy Quantity")
 
 
 def test_the_other_program_is_compared_frame_by_frame(self_checked: Written) -> None:

@@ -294,14 +294,14 @@ class Page(HTMLParser):
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         found = dict(attrs)
-        self._hidden = tag == "style"
+        self._hidden = tag in ("style", "script")
         self.addresses += [str(found[k]) for k in ("src", "href", "srcset", "action", "data", "poster") if k in found]
         self.ids += [str(found["id"])] if "id" in found else []
         self.images += [found] if tag == "img" else []
-        assert tag not in {"script", "link", "iframe", "object", "embed"}
+        assert tag not in {"link", "iframe", "object", "embed"}
 
     def handle_endtag(self, tag: str) -> None:
-        self._hidden = self._hidden and tag != "style"
+        self._hidden = self._hidden and tag not in ("style", "script")
 
     def handle_data(self, data: str) -> None:
         if not self._hidden:

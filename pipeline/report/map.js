@@ -1,0 +1,335 @@
+"use strict";
+(async () => {
+  const box = document.getElementById("map-view"), source = document.getElementById("map-data");
+  if (!box || !source) return;
+  const D = JSON.parse(source.textContent), N = D.rows * D.cols, $ = (name) => box.querySelector(`[data-at="${name}"]`);
+
+  /* -- values: bytes of the pictures, read back by a canvas ------------------------------------------------ */
+  const pixels = async (uri) => {
+    const picture = new Image();
+    picture.src = uri;
+    await picture.decode();
+    const c = document.createElement("canvas");
+    c.width = D.cols; c.height = D.rows;
+    const p = c.getContext("2d", { willReadFrequently: true, colorSpace: "srgb" });
+    p.drawImage(picture, 0, 0);
+    return p.getImageData(0, 0, D.cols, D.rows).data;
+  };
+  const [A, B, C, photo] = await Promise.all([...D.planes, D.ortho].map(pixels));
+  const height = (k) => { const v = A[4 * k] * 256 + A[4 * k + 1]; return v ? D.z[0] + (v - 1) / 65534 * D.z[1] : NaN; };
+  const byte = (v, low, span) => v ? low + (v - 1) / 254 * span : NaN;
+  const value = {
+    elevation: height,
+    slope: (k) => byte(C[4 * k + 1], 0, 90),
+    sigma: (k) => A[4 * k + 2] ? D.sigma[0] * Math.exp(byte(A[4 * k + 2], 0, D.sigma[1])) : NaN,
+    p_hazard: (k) => byte(C[4 * k], 0, 1),
+    models: (k) => (B[4 * k] >> 2) || NaN,
+    risk: (k) => B[4 * k] & 3,
+    reason: (k) => B[4 * k + 1] * 256 + B[4 * k + 2],
+  };
+  const CLASSES = ["safe", "caution", "hazard", "unknown"];
+  const why = (bits) => Object.entries(D.reasons).filter(([, bit]) => bits & bit).map(([name]) => name);
+  const metres = (v) => Number.isNaN(v) || v == null ? "–" : Math.abs(v) < 0.1 ? (1000 * v).toFixed(1) + " mm" : v.toFixed(3) + " m";
+  const at = (x, y) => {
+    const col = Math.round((x - D.x0) / D.cell), row = Math.round((D.y0 - y) / D.cell);
+    return col >= 0 && row >= 0 && col < D.cols && row < D.rows ? row * D.cols + col : -1;
+  };
+  const answer = (x, y) => {
+    const k = at(x, y), found = { x, y, cell: k };
+    if (k >= 0) for (const name of Object.keys(value)) found[name] = value[name](k);
+    return found;
+  };
+
+  /* -- colours of the layers ------------------------------------------------------------------------------- */
+  const ramp = Uint8Array.from(atob(D.ramp), (c) => c.charCodeAt(0));
+  const rgb = (hex) => [1, 3, 5].map((i) => parseInt(hex.slice(i, i + 2), 16));
+  const classes = D.colors.map(rgb);
+  const range = { slope: [0, 45], p_hazard: [0, 1], elevation: D.shown, models: [0, 1], sigma: [0, 1] };
+  for (const name of ["sigma", "models"]) {
+    const all = [];
+    for (let k = 0; k < N; k += Math.max(1, N >> 14)) { const v = value[name](k); if (v === v) all.push(v); }
+    all.sort((a, b) => a - b);
+    range[name] = name === "models" ? [1, Math.max(2, all[all.length - 1] || 2)] : [0, all[Math.floor(0.97 * all.length)] || 1];
+  }
+  const shade = (k) => {
+    const row = Math.floor(k / D.cols), col = k % D.cols;
+    const d = (a, b) => { const v = height(a) - height(b); return v === v ? v / (2 * D.cell) : 0; };
+    const gx = d(row * D.cols + Math.min(col + 1, D.cols - 1), row * D.cols + Math.max(col - 1, 0));
+    const gy = d(Math.max(row - 1, 0) * D.cols + col, Math.min(row + 1, D.rows - 1) * D.cols + col);
+    return 255 * Math.max(0, (0.54 * gx - 0.54 * gy + 0.64) / Math.sqrt(gx * gx + gy * gy + 1));
+  };
+  const sheet = document.createElement("canvas");
+  sheet.width = D.cols; sheet.height = D.rows;
+  const state = { base: "ortho", layer: D.judged ? "risk" : "elevation", opacity: 0.45, by: "plain", ruler: [], measuring: false, three: false };
+  const paint = () => {
+    const pen = sheet.getContext("2d"), out = pen.createImageData(D.cols, D.rows), o = out.data, name = state.layer;
+    for (let k = 0; k < N; k++) {
+      const known = A[4 * k] || A[4 * k + 1];
+      let c = [0, 0, 0], mix = 0;
+      if (name === "risk") { c = classes[value.risk(k)]; mix = state.opacity; }
+      else if (name === "reason") {
+        const bits = value.reason(k), first = Object.values(D.reasons).findIndex((bit) => bits & bit);
+        if (first >= 0) { const i = 3 * Math.round(255 * first / Math.max(1, Object.keys(D.reasons).length - 1)); c = [ramp[i], ramp[i + 1], ramp[i + 2]]; mix = state.opacity; }
+      } else if (name !== "none") {
+        const v = value[name](k), [low, high] = range[name];
+        if (v === v) { const i = 3 * Math.round(255 * Math.min(1, Math.max(0, (v - low) / (high - low)))); c = [ramp[i], ramp[i + 1], ramp[i + 2]]; mix = state.opacity; }
+      }
+      const grey = state.base === "ortho" ? photo[4 * k] : known ? shade(k) : 0;
+      for (let i = 0; i < 3; i++) o[4 * k + i] = grey * (1 - mix) + c[i] * mix;
+      o[4 * k + 3] = known ? 255 : 0;
+    }
+    pen.putImageData(out, 0, 0);
+    legend();
+  };
+  const gradient = () => "linear-gradient(90deg," + [0, 64, 128, 191, 255].map((i) => `rgb(${ramp[3 * i]},${ramp[3 * i + 1]},${ramp[3 * i + 2]})`) + ")";
+  const legend = () => {
+    const spot = $("legend"), name = state.layer;
+    spot.replaceChildren();
+    const add = (color, words) => { const li = document.createElement("li"), i = document.createElement("i"); i.style.background = color; li.append(i, words); spot.append(li); };
+    const bar = (words) => { add(gradient(), words); spot.lastChild.firstChild.style.width = "6em"; };
+    if (name === "risk") D.colors.forEach((c, i) => add(c, CLASSES[i]));
+    else if (name === "reason") Object.keys(D.reasons).forEach((words, n, all) => { const i = 3 * Math.round(255 * n / Math.max(1, all.length - 1)); add(`rgb(${ramp[i]},${ramp[i + 1]},${ramp[i + 2]})`, words); });
+    else if (name !== "none") {
+      const [low, high] = range[name], show = { slope: (v) => v + "°", p_hazard: String, models: String }[name] || metres;
+      bar(`${name}: ${show(low)} to ${show(high)}`);
+    }
+    if (state.by !== "plain") bar(`trajectory, ${state.by}: 0 to ${metres(most())}`);
+  };
+
+  /* -- the map --------------------------------------------------------------------------------------------- */
+  const flat = $("flat"), pen = flat.getContext("2d"), view = { x: 0, y: 0, scale: 1 };
+  const wide = () => flat.clientWidth, tall = () => flat.clientHeight;
+  const fit = () => {
+    const xs = [D.x0, D.x0 + D.cell * (D.cols - 1), ...D.track.map((t) => t[1])], ys = [D.y0, D.y0 - D.cell * (D.rows - 1), ...D.track.map((t) => t[2])];
+    const [left, right, low, high] = [Math.min(...xs), Math.max(...xs), Math.min(...ys), Math.max(...ys)];
+    view.x = (left + right) / 2; view.y = (low + high) / 2;
+    view.scale = Math.min(wide() / (right - left + D.cell), tall() / (high - low + D.cell)) * 0.95;
+  };
+  const screen = (x, y) => [wide() / 2 + (x - view.x) * view.scale, tall() / 2 - (y - view.y) * view.scale];
+  const world = (px, py) => [view.x + (px - wide() / 2) / view.scale, view.y - (py - tall() / 2) / view.scale];
+  const column = () => state.by === "error" ? 5 : 4;
+  const most = () => Math.max(1e-9, ...D.track.map((t) => t[column()] || 0));
+  const trackColor = (t) => {
+    if (state.by === "plain") return "#0b4f8a";
+    const v = t[column()];
+    if (v == null) return "#8d8f98";
+    const i = 3 * Math.round(255 * Math.min(1, v / most()));
+    return `rgb(${ramp[i]},${ramp[i + 1]},${ramp[i + 2]})`;
+  };
+  const line = (points, color, width) => {
+    pen.beginPath();
+    points.forEach((p, i) => { const [a, b] = screen(p[0], p[1]); if (i) pen.lineTo(a, b); else pen.moveTo(a, b); });
+    pen.strokeStyle = color; pen.lineWidth = width; pen.stroke();
+  };
+  const round = (v) => { const p = 10 ** Math.floor(Math.log10(v)); return [5, 2, 1].map((s) => s * p).find((s) => s <= v * 1.000001); };
+  const draw = () => {
+    const ratio = window.devicePixelRatio || 1;
+    if (flat.width !== Math.round(wide() * ratio) || flat.height !== Math.round(tall() * ratio)) { flat.width = Math.round(wide() * ratio); flat.height = Math.round(tall() * ratio); }
+    pen.setTransform(ratio, 0, 0, ratio, 0, 0);
+    pen.clearRect(0, 0, wide(), tall());
+    pen.imageSmoothingEnabled = view.scale * D.cell < 1;
+    const [a, b] = screen(D.x0 - D.cell / 2, D.y0 + D.cell / 2);
+    pen.drawImage(sheet, a, b, D.cols * D.cell * view.scale, D.rows * D.cell * view.scale);
+    pen.lineJoin = pen.lineCap = "round";
+    if ($("path").checked && D.path.length) {
+      line(D.path, "#fff", 5); line(D.path, "#111", 2.5);
+      const p = D.path[0], q = D.path.find((v) => Math.hypot(v[0] - p[0], v[1] - p[1]) > D.vehicle[0] / 2) || D.path[D.path.length - 1], turn = Math.atan2(q[1] - p[1], q[0] - p[0]);
+      const [u, v] = screen(p[0], p[1]);
+      pen.save(); pen.translate(u, v); pen.rotate(-turn);
+      const [l, w] = D.vehicle.map((s) => s * view.scale);
+      pen.fillStyle = "#ffd34dcc"; pen.strokeStyle = "#111"; pen.lineWidth = 1.5;
+      pen.beginPath(); pen.rect(-l / 2, -w / 2, l, w); pen.fill(); pen.stroke(); pen.restore();
+    }
+    if ($("track").checked && D.track.length) {
+      line(D.track.map((t) => t.slice(1)), "#fff", 4);
+      D.track.forEach((t, i) => { if (i) line([D.track[i - 1].slice(1), t.slice(1)], trackColor(t), 2.4); });
+      for (const t of D.track) { const [u, v] = screen(t[1], t[2]); pen.beginPath(); pen.arc(u, v, 3, 0, 7); pen.fillStyle = trackColor(t); pen.fill(); pen.strokeStyle = "#fff"; pen.lineWidth = 0.8; pen.stroke(); }
+    }
+    if (state.ruler.length) line(state.ruler, "#c0167a", 2.5);
+    const long = round(0.25 * wide() / view.scale), words = long < 1 ? 100 * long + " cm" : long + " m";
+    pen.fillStyle = "#fffffff0"; pen.fillRect(8, tall() - 34, long * view.scale + 12, 28);
+    pen.fillStyle = "#111"; pen.fillRect(14, tall() - 14, long * view.scale, 3); pen.font = "12px system-ui, sans-serif"; pen.fillText(words, 14, tall() - 18);
+  };
+  const say = (x, y) => {
+    const f = answer(x, y);
+    const words = [`x ${x.toFixed(3)} m`, `y ${y.toFixed(3)} m`];
+    if (f.cell < 0 || Number.isNaN(f.elevation)) words.push("unknown ground");
+    else {
+      words.push(`z ${f.elevation.toFixed(3)} m`, `σ ${metres(f.sigma)}`, `slope ${f.slope.toFixed(1)}°`);
+      if (D.judged) words.push(CLASSES[f.risk] + (f.reason ? ` (${why(f.reason).join(", ")})` : ""));
+    }
+    if (state.ruler.length === 2) words.push(`ruler ${metres(Math.hypot(state.ruler[1][0] - state.ruler[0][0], state.ruler[1][1] - state.ruler[0][1]))}`);
+    $("hover").textContent = words.join(" · ");
+  };
+  const zoom = (factor, px = wide() / 2, py = tall() / 2) => {
+    const [x, y] = world(px, py);
+    view.scale *= factor;
+    view.x = x - (px - wide() / 2) / view.scale; view.y = y + (py - tall() / 2) / view.scale;
+    draw();
+  };
+  const fingers = new Map();
+  const place = (e) => { const r = flat.getBoundingClientRect(); return [e.clientX - r.left, e.clientY - r.top]; };
+  flat.addEventListener("pointerdown", (e) => {
+    flat.setPointerCapture(e.pointerId); fingers.set(e.pointerId, place(e));
+    if (state.measuring) state.ruler = [world(...place(e))];
+  });
+  flat.addEventListener("pointermove", (e) => {
+    const now = place(e), before = fingers.get(e.pointerId);
+    if (before) {
+      if (state.measuring) state.ruler[1] = world(...now);
+      else if (fingers.size === 1) { view.x -= (now[0] - before[0]) / view.scale; view.y += (now[1] - before[1]) / view.scale; }
+      else {
+        const other = [...fingers].find(([id]) => id !== e.pointerId)[1], gap = (p) => Math.hypot(p[0] - other[0], p[1] - other[1]);
+        zoom(gap(now) / Math.max(1, gap(before)), (now[0] + other[0]) / 2, (now[1] + other[1]) / 2);
+      }
+      fingers.set(e.pointerId, now);
+      draw();
+    }
+    say(...world(...now));
+  });
+  for (const name of ["pointerup", "pointercancel"]) flat.addEventListener(name, (e) => fingers.delete(e.pointerId));
+  flat.addEventListener("wheel", (e) => { e.preventDefault(); zoom(Math.exp(-0.0015 * e.deltaY), ...place(e)); }, { passive: false });
+  flat.addEventListener("keydown", (e) => {
+    const move = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] }[e.key];
+    if (move) { view.x += 30 * move[0] / view.scale; view.y += 30 * move[1] / view.scale; draw(); }
+    else if (e.key === "+" || e.key === "=") zoom(1.3);
+    else if (e.key === "-") zoom(1 / 1.3);
+    else if (e.key === "0") { fit(); draw(); }
+    else return;
+    e.preventDefault();
+    say(view.x, view.y);
+  });
+
+  /* -- height and slope along the path ---------------------------------------------------------------------- */
+  const profile = () => {
+    const c = $("profile");
+    if (!c || D.path.length < 2) return;
+    const ratio = window.devicePixelRatio || 1, w = c.clientWidth, h = c.clientHeight, p = c.getContext("2d");
+    c.width = w * ratio; c.height = h * ratio; p.scale(ratio, ratio);
+    const s = [0];
+    for (let i = 1; i < D.path.length; i++) s.push(s[i - 1] + Math.hypot(D.path[i][0] - D.path[i - 1][0], D.path[i][1] - D.path[i - 1][1]));
+    const zs = D.path.map((q) => q[2]), low = Math.min(...zs), high = Math.max(...zs), top = Math.max(high - low, 1e-6);
+    const slopes = D.path.map((q) => { const k = at(q[0], q[1]); return k < 0 ? NaN : value.slope(k); });
+    const X = (i) => 44 + (w - 88) * s[i] / s[s.length - 1], ink = getComputedStyle(box).color;
+    const curve = (y, color) => { p.beginPath(); let pen_ = false; zs.forEach((_, i) => { const v = y(i); if (v !== v) { pen_ = false; return; } if (pen_) p.lineTo(X(i), v); else p.moveTo(X(i), v); pen_ = true; }); p.strokeStyle = color; p.lineWidth = 1.8; p.stroke(); };
+    const steep = Math.max(10, ...slopes.filter((v) => v === v));
+    curve((i) => h - 20 - (h - 34) * slopes[i] / steep, "#d1731a");
+    curve((i) => h - 20 - (h - 34) * (zs[i] - low) / top, "#4a90c8");
+    p.font = "11px system-ui, sans-serif"; p.fillStyle = ink;
+    p.fillText(metres(high), 0, 16); p.fillText(metres(low), 0, h - 20); p.fillText(steep.toFixed(0) + "°", w - 40, 16); p.fillText("0°", w - 40, h - 20);
+    p.fillText("height (blue), slope (orange) along the path of " + metres(s[s.length - 1]), 44, h - 4);
+  };
+
+  /* -- the view in space ------------------------------------------------------------------------------------ */
+  let space = null;
+  const eye = { turn: -0.6, tilt: 0.75, far: 0.8, tall: 1 };
+  const open = () => {
+    const c = $("space"), gl = c.getContext("webgl2", { antialias: true, preserveDrawingBuffer: true });
+    if (!gl) { $("hover").textContent = "This browser has no WebGL2: the map stays flat."; return null; }
+    const make = (vertex, fragment) => {
+      const program = gl.createProgram();
+      for (const [kind, text] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
+        const s = gl.createShader(kind);
+        gl.shaderSource(s, "#version 300 es\nprecision highp float;\n" + text); gl.compileShader(s);
+        if (!gl.getShaderParameter(s, gl.COMPILE_STATUS)) throw new Error(gl.getShaderInfoLog(s));
+        gl.attachShader(program, s);
+      }
+      gl.linkProgram(program);
+      return program;
+    };
+    const ground = make(
+      "in vec3 p; in vec2 t; uniform mat4 m; uniform float e; out vec2 uv; out float z; void main(){ uv=t; z=p.z; gl_Position=m*vec4(p.xy,p.z*e,1.); }",
+      "in vec2 uv; in float z; uniform sampler2D s; out vec4 c; void main(){ c=vec4(texture(s,uv).rgb,1.); }");
+    const strokes = make(
+      "in vec3 p; uniform mat4 m; uniform float e; void main(){ gl_Position=m*vec4(p.xy,p.z*e,1.); gl_Position.z-=.002*gl_Position.w; }",
+      "uniform vec3 k; out vec4 c; void main(){ c=vec4(k,1.); }");
+    const skip = Math.max(1, Math.ceil(Math.max(D.rows, D.cols) / 400)), R = Math.floor((D.rows - 1) / skip) + 1, Q = Math.floor((D.cols - 1) / skip) + 1;
+    const size = Math.max(D.rows, D.cols) * D.cell, cx = D.x0 + D.cell * (D.cols - 1) / 2, cy = D.y0 - D.cell * (D.rows - 1) / 2, cz = (D.shown[0] + D.shown[1]) / 2;
+    const local = (q) => [(q[0] - cx) / size * 2, (q[1] - cy) / size * 2, (q[2] - cz) / size * 2];
+    const vertices = [], faces = [], known = [];
+    for (let i = 0; i < R; i++) for (let j = 0; j < Q; j++) {
+      const row = i * skip, col = j * skip, z = height(row * D.cols + col);
+      known.push(z === z);
+      vertices.push(...local([D.x0 + col * D.cell, D.y0 - row * D.cell, z === z ? z : cz]), (col + 0.5) / D.cols, (row + 0.5) / D.rows);
+    }
+    for (let i = 0; i + 1 < R; i++) for (let j = 0; j + 1 < Q; j++) {
+      const a = i * Q + j, b = a + 1, d = a + Q, f = d + 1;
+      if (known[a] && known[b] && known[d]) faces.push(a, d, b);
+      if (known[b] && known[d] && known[f]) faces.push(b, d, f);
+    }
+    const buffer = (kind, data) => { const b = gl.createBuffer(); gl.bindBuffer(kind, b); gl.bufferData(kind, data, gl.STATIC_DRAW); return b; };
+    const V = buffer(gl.ARRAY_BUFFER, new Float32Array(vertices)), F = buffer(gl.ELEMENT_ARRAY_BUFFER, new Uint32Array(faces)), T = gl.createTexture();
+    const strip = (points, color, kind) => ({ b: buffer(gl.ARRAY_BUFFER, new Float32Array(points.flatMap(local))), n: points.length, color, kind });
+    const lift = (q) => [q[0], q[1], q[2] + 0.002 * size];
+    const lines = [strip(D.path.map(lift), [1, 0.83, 0.2], gl.LINE_STRIP), strip(D.track.map((t) => t.slice(1, 4)), [0.2, 0.6, 1], gl.LINE_STRIP)];
+    for (const f of D.frusta) lines.push(strip([0, 1, 0, 2, 0, 3, 0, 4, 1, 2, 2, 3, 3, 4, 4, 1].map((i) => f[i]), [1, 0.4, 0.2], gl.LINES));
+    const texture = () => { gl.bindTexture(gl.TEXTURE_2D, T); gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA, gl.RGBA, gl.UNSIGNED_BYTE, sheet); gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR); gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_S, gl.CLAMP_TO_EDGE); gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE); };
+    const render = () => {
+      const ratio = window.devicePixelRatio || 1;
+      c.width = c.clientWidth * ratio; c.height = c.clientHeight * ratio;
+      gl.viewport(0, 0, c.width, c.height);
+      gl.clearColor(0, 0, 0, 0); gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT); gl.enable(gl.DEPTH_TEST);
+      /* rows of world turned about z, tilted, moved away, then perspective */
+      const [ct, st, cp, sp] = [Math.cos(eye.turn), Math.sin(eye.turn), Math.cos(eye.tilt), Math.sin(eye.tilt)], g = 1.8 / Math.min(1, c.width / c.height), aspect = c.width / c.height, d = 2.6 * eye.far;
+      const right = [ct, st, 0], up = [-st * sp, ct * sp, cp], back = [st * cp, -ct * cp, sp], near = 0.02, distant = 20;
+      const k = -(distant + near) / (distant - near), q = -2 * distant * near / (distant - near), m = [];
+      for (let i = 0; i < 3; i++) m.push(g / aspect * right[i], g * up[i], k * back[i], -back[i]);
+      m.push(0, 0, -k * d + q, d);
+      const set = (program) => { gl.useProgram(program); gl.uniformMatrix4fv(gl.getUniformLocation(program, "m"), false, m); gl.uniform1f(gl.getUniformLocation(program, "e"), eye.tall); };
+      const attribute = (program, name, n, stride, offset) => { const a = gl.getAttribLocation(program, name); gl.enableVertexAttribArray(a); gl.vertexAttribPointer(a, n, gl.FLOAT, false, stride, offset); };
+      set(ground); gl.bindBuffer(gl.ARRAY_BUFFER, V); attribute(ground, "p", 3, 20, 0); attribute(ground, "t", 2, 20, 12);
+      gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, F); gl.drawElements(gl.TRIANGLES, faces.length, gl.UNSIGNED_INT, 0);
+      gl.disableVertexAttribArray(1); gl.disableVertexAttribArray(0);
+      set(strokes);
+      for (const l of lines) { if (!l.n) continue; gl.bindBuffer(gl.ARRAY_BUFFER, l.b); attribute(strokes, "p", 3, 0, 0); gl.uniform3fv(gl.getUniformLocation(strokes, "k"), l.color); gl.drawArrays(l.kind, 0, l.n); }
+    };
+    let held = null;
+    c.addEventListener("pointerdown", (e) => { c.setPointerCapture(e.pointerId); held = [e.clientX, e.clientY]; });
+    c.addEventListener("pointermove", (e) => { if (!held) return; eye.turn -= 0.008 * (e.clientX - held[0]); eye.tilt = Math.min(1.57, Math.max(0.05, eye.tilt + 0.008 * (e.clientY - held[1]))); held = [e.clientX, e.clientY]; render(); });
+    for (const name of ["pointerup", "pointercancel"]) c.addEventListener(name, () => { held = null; });
+    c.addEventListener("wheel", (e) => { e.preventDefault(); eye.far = Math.min(4, Math.max(0.1, eye.far * Math.exp(0.0012 * e.deltaY))); render(); }, { passive: false });
+    c.addEventListener("keydown", (e) => {
+      const turn = { ArrowLeft: [0.1, 0], ArrowRight: [-0.1, 0], ArrowUp: [0, 0.1], ArrowDown: [0, -0.1] }[e.key];
+      if (turn) { eye.turn += turn[0]; eye.tilt = Math.min(1.57, Math.max(0.05, eye.tilt + turn[1])); }
+      else if (e.key === "+" || e.key === "=") eye.far /= 1.2;
+      else if (e.key === "-") eye.far *= 1.2;
+      else return;
+      e.preventDefault(); render();
+    });
+    return { render, texture };
+  };
+
+  /* -- controls --------------------------------------------------------------------------------------------- */
+  const refresh = () => {
+    paint();
+    if (state.three && space) { space.texture(); space.render(); } else draw();
+  };
+  $("base").addEventListener("change", (e) => { state.base = e.target.value; refresh(); });
+  $("layer").value = state.layer;
+  $("layer").addEventListener("change", (e) => { state.layer = e.target.value; refresh(); });
+  $("opacity").addEventListener("input", (e) => { state.opacity = e.target.value / 100; refresh(); });
+  $("by").addEventListener("change", (e) => { state.by = e.target.value; legend(); draw(); });
+  for (const name of ["track", "path"]) $(name).addEventListener("change", draw);
+  $("in").addEventListener("click", () => zoom(1.4));
+  $("out").addEventListener("click", () => zoom(1 / 1.4));
+  $("fit").addEventListener("click", () => { fit(); draw(); });
+  $("ruler").addEventListener("click", (e) => { state.measuring = !state.measuring; if (!state.measuring) state.ruler = []; e.target.setAttribute("aria-pressed", state.measuring); draw(); });
+  $("tall").addEventListener("input", (e) => { eye.tall = +e.target.value; if (space) space.render(); });
+  $("three").addEventListener("click", (e) => {
+    state.three = !state.three;
+    flat.hidden = state.three; $("space").hidden = !state.three;
+    if (state.three && !space) space = open();
+    if (state.three && !space) { state.three = false; flat.hidden = false; $("space").hidden = true; }
+    e.target.setAttribute("aria-pressed", state.three);
+    for (const name of ["in", "out", "fit", "ruler"]) $(name).disabled = state.three;
+    refresh();
+  });
+  document.getElementById("map-still").hidden = true;
+  box.hidden = false;
+  if (!D.track.some((t) => t[5] != null)) $("by").querySelector('[value="error"]').remove();
+  if (!D.path.length) $("profile").hidden = true;
+  fit(); paint(); draw(); profile();
+  addEventListener("resize", () => { if (state.three && space) space.render(); else draw(); profile(); });
+  box.answer = answer;
+  box.dataset.ready = "1";
+})();

@@ -1,0 +1,173 @@
+"""The map of the report: values of every cell as pictures that the page's script reads, and what lies on them.
+
+A picture has three bytes a pixel, kept without loss, and each is a plane of whole numbers: the script reads them back
+by a canvas. Heights take two bytes; standard deviations one, in steps of equal ratio, as their range is wide. Terrain
+of more than ``MOST_CELLS`` cells is thinned: the value shown is then that of one cell, not a mean, so that the map and
+the GeoTIFF never disagree.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rille.pipeline.export import ranges
+from rille.pipeline.export.artifacts import Floats
+from rille.pipeline.report import canvas
+from rille.pipeline.report.gather import Scene, Terrain
+from rille.stages.geometry.geometry import RigidTransform
+from rille.stages.hazard.risk import REASONS, UNKNOWN
+from rille.stages.odometry.resection.trajectory import world_poses
+from rille.stages.terrain.shading import slope_deg
+
+Bytes = NDArray[np.uint8]
+
+MOST_CELLS = 350_000
+"""Cells of the map; three pictures of these and the ortho image are about 2 MB in the page."""
+STEPS = 65534
+"""Steps of a height; 0 is undefined."""
+FINE = 254
+"""Steps of a value of one byte; 0 is undefined."""
+
+
+def data(scene: Scene) -> dict[str, Any] | None:
+    """What the script draws, as plain JSON; None without merged terrain.
+
+    ``planes``: pictures with the bytes (height high, height low, sigma), (class and models, reason high, reason low),
+    (p_hazard, slope, 0). ``track`` (frame): number, x, y, z, sigma, error or null. All lengths are metres, world frame.
+    """
+    world = scene.world
+    if world is None or world.get("elevation") is None or not np.isfinite(world.arrays["elevation"]).any():
+        return None
+    step = max(1, math.ceil(math.sqrt(world.arrays["elevation"].size / MOST_CELLS)))
+    z = world.arrays["elevation"][::step, ::step]
+    low, high = float(np.nanmin(z)), float(np.nanmax(z))
+    height = _steps(z, low, max(high - low, 1e-9), STEPS)
+    sigma, sigmas = _ratios(_plane(world, "elevation_std", step))
+    risk, reason, p_hazard = (_of_risk(scene, name, missing)[::step, ::step] for name, missing in _RISK)
+    count = np.minimum(np.nan_to_num(_plane(world, "count", step)), 63).astype(np.uint8)
+    slope = _steps(slope_deg(world.arrays["elevation"], world.lattice.cell)[::step, ::step], 0.0, 90.0, FINE)
+    bits = np.asarray(reason, np.uint16)
+    return {
+        "planes": [
+            _picture(height >> 8, height & 255, sigma),
+            _picture(np.asarray(risk, np.uint8) | (count << 2), bits >> 8, bits & 255),
+            _picture(_steps(p_hazard, 0.0, 1.0, FINE), slope, np.zeros_like(slope)),
+        ],
+        "ortho": _photo(_plane(world, "ortho", step)),
+        "rows": z.shape[0],
+        "cols": z.shape[1],
+        "x0": world.lattice.x0,
+        "y0": world.lattice.y0,
+        "cell": world.lattice.cell * step,
+        "thinned": step,
+        "z": [low, max(high - low, 1e-9)],
+        "shown": [float(v) for v in ranges.ground_limits(z)],
+        "sigma": sigmas,
+        "judged": scene.risk is not None,
+        "reasons": {name: int(bit) for name, bit in REASONS.items()},
+        "colors": [canvas.SAFE, canvas.CAUTION, canvas.HAZARDOUS, canvas.UNKNOWN],
+        "ramp": base64.b64encode(canvas.ramp("viridis").tobytes()).decode("ascii"),
+        "track": _track(scene),
+        "frusta": _frusta(scene),
+        "path": [] if scene.path is None else np.round(scene.path, 4).tolist(),
+        "vehicle": _vehicle(scene),
+    }
+
+
+_RISK = (("risk", UNKNOWN), ("reason", 0), ("p_hazard", np.nan))
+
+
+def _plane(world: Terrain, name: str, step: int) -> Floats:
+    values = world.get(name)
+    return np.full_like(world.arrays["elevation"], np.nan)[::step, ::step] if values is None else values[::step, ::step]
+
+
+def _of_risk(scene: Scene, name: str, missing: float) -> Floats:
+    """An array of the risk map on the cells of the terrain."""
+    assert scene.world is not None
+    shape = scene.world.lattice.shape
+    found = None if scene.risk is None else scene.risk.get(name)
+    if scene.risk is None or found is None:
+        return np.full(shape, missing)
+    out = np.full(shape, missing, dtype=found.dtype)
+    common = scene.world.lattice.intersection(scene.risk.lattice)
+    if common is not None:
+        out[scene.world.lattice.window(common)] = found[scene.risk.lattice.window(common)]
+    return out
+
+
+def _steps(values: Floats, low: float, span: float, steps: int) -> NDArray[np.int64]:
+    """1 .. ``steps`` + 1 from ``low`` to ``low + span``, 0 undefined."""
+    whole = 1 + np.rint(np.clip((np.nan_to_num(values, nan=low) - low) / span, 0, 1) * steps).astype(np.int64)
+    return np.where(np.isfinite(values), whole, 0)
+
+
+def _ratios(values: Floats) -> tuple[NDArray[np.int64], list[float]]:
+    """Steps of equal ratio of positive values, with the least value and the logarithm of the range."""
+    there = values[np.isfinite(values) & (values > 0)]
+    if not there.size:
+        return np.zeros(values.shape, np.int64), [1.0, 1.0]
+    low, span = float(there.min()), max(math.log(float(there.max()) / float(there.min())), 1e-9)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return _steps(np.log(np.where(values > 0, values, np.nan) / low), 0.0, span, FINE), [low, span]
+
+
+def _picture(*planes: NDArray[Any]) -> str:
+    """Three planes (row, col) of bytes as a picture without loss."""
+    from PIL import Image
+
+    out = io.BytesIO()
+    Image.fromarray(np.stack([np.asarray(p, np.uint8) for p in planes], axis=-1)).save(out, "PNG", compress_level=9)
+    return "data:image/png;base64," + base64.b64encode(out.getvalue()).decode("ascii")
+
+
+def _photo(grey: Floats) -> str:
+    from PIL import Image
+
+    low, high = ranges.limits(grey, 0.5, 99.5)
+    out, bytes_ = io.BytesIO(), np.clip((np.nan_to_num(grey, nan=low) - low) / (high - low) * 255, 0, 255)
+    Image.fromarray(bytes_.astype(np.uint8)).save(out, "JPEG", quality=82)
+    return "data:image/jpeg;base64," + base64.b64encode(out.getvalue()).decode("ascii")
+
+
+def _track(scene: Scene) -> list[list[Any]]:
+    track = scene.track
+    error = np.full(len(track.left), np.nan)
+    if track.truth is not None:
+        error = np.linalg.norm(track.left - track.truth, axis=1)
+    rows = np.column_stack([track.left, track.sigma, error])[track.in_world]
+    frames = np.array(scene.view.frames)[track.in_world]
+    return [
+        [int(f), *(round(float(v), 5) if np.isfinite(v) else None for v in row)]
+        for f, row in zip(frames, rows, strict=True)
+    ]
+
+
+def _frusta(scene: Scene) -> list[Any]:
+    """Projection centre and the corners of the image at some distance, of the left camera at each basic pair."""
+    view = scene.view
+    bundle = view.bundle(view.products.trajectory)
+    if bundle is None:
+        return []
+    camera, found = view.sequence.rig.left, []
+    far = 2.0 * view.sequence.rig.baseline
+    corners = [(0, 0), (camera.width, 0), (camera.width, camera.height), (0, camera.height)]
+    rays = np.array([((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, 1.0) for u, v in corners])
+    points = np.vstack([np.zeros(3), far * rays])
+    poses = world_poses(bundle)
+    for frame, pose in zip(bundle.meta.get("frames", view.frames[: len(poses)]), poses, strict=False):
+        if frame in view.products.disparity and np.isfinite(pose).all():
+            found.append(np.round(RigidTransform.from_matrix(pose).apply(points), 4).tolist())
+    return found
+
+
+def _vehicle(scene: Scene) -> list[float]:
+    """Length and width of the vehicle over its wheels, m."""
+    vehicle = scene.view.config.vehicle
+    return [vehicle.wheel_base + vehicle.wheel_diameter, vehicle.track]

@@ -1,0 +1,95 @@
+"""The page in a real browser: it needs nothing but itself, its map answers with the rasters' values, 3-D draws."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from toys.browser import BROWSER, Browser
+from toys.finished import COLS, LATTICE, ROWS, bundles, report, view
+
+pytestmark = pytest.mark.skipif(BROWSER is None, reason="chromium is not installed")
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("page")
+    report(folder, view())
+    return folder / "report.html"
+
+
+@pytest.fixture
+def browser(page: Path, tmp_path: Path) -> Iterator[Browser]:
+    found = Browser(tmp_path)
+    found.open(page)
+    yield found
+    found.close()
+
+
+def _click(browser: Browser, name: str) -> None:
+    browser.run(f"document.querySelector('[data-at={name}]').click()")
+
+
+def _pixels(png: bytes) -> np.ndarray:
+    return np.asarray(Image.open(io.BytesIO(png)).convert("RGB"), dtype=np.int64)
+
+
+def test_it_opens_from_disk_without_a_request_or_a_message(browser: Browser, page: Path) -> None:
+    assert browser.messages == []
+    assert [a for a in browser.requests if not a.startswith("data:")] == [page.resolve().as_uri()]
+
+
+def test_the_map_answers_with_the_values_of_the_cells(browser: Browser) -> None:
+    made = bundles()
+    z, sigma, risk = made["tile"]["elevation"], made["tile"]["elevation_std"], made["risk"]["risk"]
+    step = float(np.nanmax(z) - np.nanmin(z)) / 65534
+    draw = np.random.default_rng(7)
+    for row, col in zip(draw.integers(0, ROWS, 10), draw.integers(0, COLS, 10), strict=True):
+        x, y = LATTICE["x0"] + LATTICE["cell"] * col, LATTICE["y0"] - LATTICE["cell"] * row
+        found = browser.run(f"document.getElementById('map-view').answer({x}, {y})")
+        assert found["cell"] == row * COLS + col
+        assert found["risk"] == risk[row, col]
+        assert found["reason"] == made["risk"]["reason"][row, col]
+        if np.isfinite(z[row, col]):
+            assert found["elevation"] == pytest.approx(float(z[row, col]), abs=step)
+            assert found["sigma"] == pytest.approx(float(sigma[row, col]), rel=0.02)
+        else:
+            assert not found["elevation"]
+
+
+def test_layers_switch_and_3d_draws_and_turns(browser: Browser) -> None:
+    shown = []
+    for layer in ("none", "elevation", "risk"):
+        browser.run(
+            f"(() => {{ const s = document.querySelector('[data-at=layer]'); s.value = '{layer}';"
+            " s.dispatchEvent(new Event('change')); })()"
+        )
+        shown.append(_pixels(browser.picture()))
+    assert (shown[0] != shown[1]).any()
+    assert (shown[1] != shown[2]).any()
+    _click(browser, "three")
+    drawn = "(() => { const c = document.querySelector('[data-at=space]'), g = c.getContext('webgl2'), "
+    drawn += "p = new Uint8Array(4 * c.width * c.height); g.readPixels(0, 0, c.width, c.height, g.RGBA, "
+    drawn += "g.UNSIGNED_BYTE, p); let n = 0; for (let i = 3; i < p.length; i += 4) n += p[i] > 0; "
+    drawn += "return n / c.width / c.height; })()"
+    assert browser.run(drawn) > 0.05
+    before = _pixels(browser.picture())
+    key = "new KeyboardEvent('keydown', {key: 'ArrowLeft'})"
+    browser.run(f"document.querySelector('[data-at=space]').dispatchEvent({key})")
+    assert (before != _pixels(browser.picture())).any()
+    assert browser.messages == []
+
+
+def test_a_phone_in_the_dark_shows_no_page_wider_than_itself(page: Path, tmp_path: Path) -> None:
+    phone = Browser(tmp_path, 390, 844, dark=True)
+    try:
+        phone.open(page)
+        assert phone.run("document.documentElement.scrollWidth") <= 390
+        assert phone.run("getComputedStyle(document.body).backgroundColor") == "rgb(21, 23, 27)"
+        assert phone.run("document.querySelector('[data-at=flat]').clientHeight") > 200
+    finally:
+        phone.close()
