@@ -46,6 +46,12 @@ WRONG = {
         ("other --force no-such-stage", "RIL-060"),
         ("other --memory-limit lots", "RIL-553"),
     ],
+    "graph": [
+        ("no-such-sequence", "RIL-276"),
+        ("--no-such-option", "RIL-001"),
+        ("other --frames 7:9", "RIL-057"),
+        ("other -o graph.png", "RIL-871"),
+    ],
     "why": [
         ("", "RIL-001"),
         ("other", "RIL-001"),
