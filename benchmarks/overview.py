@@ -1,4 +1,4 @@
-"""The README's picture, drawn from a run: left image, merged ortho image, hillshaded elevation with risk and path.
+"""The README's picture, drawn from a run: stereo pair, disparity, shaded terrain, risk with path.
 
 ``python benchmarks/overview.py [RUN_FOLDER] [--output docs/overview.jpg]``; the run is the mockup's latest by default.
 """
@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -18,23 +16,9 @@ from matplotlib import pyplot as plt
 from matplotlib.colors import LightSource
 from numpy.typing import NDArray
 
-from rille.datasets.protocol import Source
-from rille.datasets.registry import open_sequence
-from rille.pipeline.commands.options import cache_folder
-from rille.pipeline.engine.store.base import Store
-from rille.pipeline.engine.task import Ref, Spec, ensure
+import rille
 
 RISK = np.array([[0.36, 0.72, 0.60], [0.90, 0.80, 0.45], [0.80, 0.28, 0.10], [1.0, 1.0, 1.0]])
-
-
-def artifact(source: Source) -> Ref:
-    refs = {port: artifact(upstream) for port, upstream in source.inputs.items()}
-    spec = Spec(source.module, source.module, source.params, source.args, source.hints)
-    return ensure(cache_folder(None), spec, refs).ref
-
-
-def left_image(name: str) -> NDArray[Any]:
-    return np.asarray(Store(cache_folder(None)).open(artifact(open_sequence(name).image(0, "left")))["image"])
 
 
 def raster(path: Path) -> tuple[NDArray[Any], tuple[float, float, float, float]]:
@@ -48,12 +32,11 @@ def main() -> None:
     parser.add_argument("run", nargs="?", type=Path, default=Path("runs/mockup/latest"))
     parser.add_argument("--output", type=Path, default=Path("docs/overview.jpg"))
     given = parser.parse_args()
-    if not given.run.exists():
-        subprocess.run([sys.executable, "-m", "rille.pipeline.cli", "reconstruct", given.run.parent.name], check=True)
-    run = given.run.resolve()
+    run = given.run.resolve() if given.run.exists() else rille.reconstruct(given.run.parent.name).folder.resolve()
+    pair = rille.open(run.parent.name)[0]
+    disparity = rille.match(pair.left, pair.right).column_disparity
 
     z, extent = raster(run / "dem.tif")
-    ortho, _ = raster(run / "ortho.tif")
     risk, _ = raster(run / "risk.tif")
     cell = (extent[1] - extent[0]) / z.shape[1]
     filled = np.where(np.isnan(z), np.nanmedian(z), z)
@@ -62,16 +45,20 @@ def main() -> None:
     features = json.loads((run / "path.geojson").read_text(encoding="utf-8"))["features"]
     line = next(f["geometry"]["coordinates"] for f in features if f["geometry"]["type"] == "LineString")
 
-    figure, axes = plt.subplots(1, 3, figsize=(13, 5.2), width_ratios=(1.5, 1, 1), layout="constrained")
-    axes[0].imshow(left_image(run.parent.name), cmap="gray")
-    axes[0].set_title("left image of a stereo pair (not rectified)")
-    axes[1].imshow(ortho, cmap="gray", extent=extent)
-    axes[1].set_title("ortho image, ten pairs merged")
-    axes[2].imshow(colour, extent=extent)
-    axes[2].plot(*np.array(line).T[:2], color="black", linewidth=2)
-    axes[2].set_title("safe, hazardous, path; metres")
-    axes[0].axis("off")
-    axes[1].axis("off")
+    figure, axes = plt.subplots(1, 5, figsize=(16, 4.3), width_ratios=(1.1, 1.1, 1.1, 1, 1), layout="constrained")
+    for ax, image, title in zip(axes[:2], (pair.left, pair.right), ("left image", "right image"), strict=True):
+        ax.imshow(image, cmap="gray")
+        ax.set_title(title)
+    axes[2].imshow(disparity, cmap="viridis")
+    axes[2].set_title("disparity, nothing rectified")
+    relief = plt.get_cmap("terrain")((filled - np.nanmin(z)) / np.ptp(z[np.isfinite(z)]))[..., :3]
+    axes[3].imshow(np.where(np.isnan(z)[..., None], 1.0, relief * (0.35 + 0.65 * shade)[..., None]), extent=extent)
+    axes[3].set_title("terrain, ten pairs merged")
+    axes[4].imshow(colour, extent=extent)
+    axes[4].plot(*np.array(line).T[:2], color="black", linewidth=2)
+    axes[4].set_title("safe, caution, hazard; path")
+    for ax in axes:
+        ax.axis("off")
     given.output.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(given.output, dpi=100, pil_kwargs={"quality": 88})
     print(given.output)

@@ -424,6 +424,7 @@ def export_dataset(name: str, directory: Path, assignments: tuple[str, ...], cac
             "RIL-063", f"--set {next(iter(others))}: not a section of a sequence", remedy="set mockup.key=value"
         )
     store = at(cache)
+    store.writable()
 
     def materialise(source: Source) -> Bundle:
         return store.open(artifact(source))

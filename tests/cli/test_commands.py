@@ -276,6 +276,10 @@ def test_datasets(place: Place, tmp_path: Path) -> None:
     again = place.rille("datasets", "export", place.folder / "other", "copy", folder=tmp_path)
     assert (again.status, again.last) == (0, "copy")
     assert (tmp_path / "copy/left/000000.png").is_file()
+    small = [f"--set={word}" for word in ("mockup.frames=1", "mockup.image_width=95", "mockup.image_height=87")]
+    first = place.rille("datasets", "export", "mockup-short", "one", "--cache", "new", *small, folder=tmp_path)
+    assert first.status == 0
+    assert "earlier format" not in place.rille("plan", "mockup-short", "--cache", tmp_path / "new").err
 
 
 def test_cache_ls_names_each_sequence_and_its_run(place: Place) -> None:
