@@ -12,13 +12,18 @@ from PIL import Image
 from toys.browser import BROWSER, Browser
 from toys.finished import COLS, LATTICE, ROWS, bundles, report, view
 
+from rille.stages.core.declare import Bundle
+
 pytestmark = pytest.mark.skipif(BROWSER is None, reason="chromium is not installed")
 
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("page")
-    report(folder, view())
+    folder, made = tmp_path_factory.mktemp("page"), bundles()
+    reason, p_hazard = (np.arange(ROWS * COLS).reshape(ROWS, COLS) % n for n in (2048, 101))
+    arrays = {"reason": reason.astype(np.uint16), "p_hazard": (p_hazard / 100).astype(np.float32)}
+    made["risk"] = Bundle({**made["risk"].arrays, **arrays}, made["risk"].meta)
+    report(folder, view(made))
     return folder / "report.html"
 
 
@@ -53,7 +58,8 @@ def test_the_map_answers_with_the_values_of_the_cells(browser: Browser) -> None:
         found = browser.run(f"document.getElementById('map-view').answer({x}, {y})")
         assert found["cell"] == row * COLS + col
         assert found["risk"] == risk[row, col]
-        assert found["reason"] == made["risk"]["reason"][row, col]
+        assert found["reason"] == (row * COLS + col) % 2048
+        assert found["p_hazard"] == pytest.approx((row * COLS + col) % 101 / 100, abs=0.5 / 254 + 1e-6)
         if np.isfinite(z[row, col]):
             assert found["elevation"] == pytest.approx(float(z[row, col]), abs=step)
             assert found["sigma"] == pytest.approx(float(sigma[row, col]), rel=0.02)
