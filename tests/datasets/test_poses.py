@@ -143,7 +143,7 @@ def test_gaps_and_ends_have_no_pose():
     found = interpolate(timed, at, 1.0)
     assert [f is not None for f in found] == [False, True, True, True, False, False, True, True, True, False]
     assert coverage(found, at, "truth") == (
-        "no truth for 4 of 10 frames, in 3 stretches: first at 0.00 s, last at 5.20 s of the sequence",
+        "RIL-688: no truth for 4 of 10 frames, in 3 stretches: first at 0.00 s, last at 5.20 s of the sequence",
     )
     assert coverage(found[1:4], at[1:4], "truth") == ()
 

@@ -47,16 +47,16 @@ def test_small_stamps_are_seconds_unless_stated():
 
 def test_small_stamps_in_a_larger_unit_are_conspicuous():
     _, warnings = seconds([0, 50_000_000, 100_000_000], "t")
-    assert warnings == ("times of t are 5e+07 s apart, taken for s: state the unit if they are not",)
+    assert warnings == ("RIL-687: times of t are 5e+07 s apart, taken for s: state the unit if they are not",)
 
 
 def test_a_gap_is_a_line_with_its_figure():
     t = [0.0, 0.1, 0.2, 1.7, 1.8, 2.3, 2.4, 2.5]
     _, warnings = seconds(t, "times.txt", lines=range(11, 19))
-    assert warnings == ("times of times.txt: 2 gaps, the longest of 1.5 s after line 13 where 0.1 s is usual",)
+    assert warnings == ("RIL-686: times of times.txt: 2 gaps, the longest of 1.5 s after line 13 where 0.1 s is usual",)
     # one missing frame is common
     assert gaps([0, 1, 2, 4, 5], "t") == ()
-    assert gaps([0, 1, 2, 5, 6], "t") == ("times of t: 1 gap of 3 s where 1 s is usual",)
+    assert gaps([0, 1, 2, 5, 6], "t") == ("RIL-686: times of t: 1 gap of 3 s where 1 s is usual",)
 
 
 @pytest.mark.parametrize(
