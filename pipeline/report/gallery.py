@@ -136,7 +136,7 @@ def _map(scene: Scene) -> Block | None:
             "well both images agree and the poses' covariances; models: how many basic pairs saw a cell."
         )
     if found is not None and found["thinned"] > 1:
-        caption += f" The map shows every {found['thinned']}th cell along both axes; the GeoTIFFs have all."
+        caption += f" The map shows one of {found['thinned']} cells along each axis; the GeoTIFFs have all."
     return Block("Map", "Map", caption, (panel,), _legend(shares) if shares else (), data=found)
 
 
@@ -167,8 +167,8 @@ def _path_words(scene: Scene) -> str:
         "middle": "its middle stays on known ground, its wheels do not everywhere",
     }.get(ground, "unknown ground is not entered")
     return (
-        f"The path (black line, ring: start, disk: target) is that of the vehicle's middle; its wheels keep {margin} "
-        f"from hazards; {known}.{rest}"
+        "The path (black line; the vehicle stands at its start) is that of the vehicle's middle; its wheels keep "
+        f"{margin} from hazards; {known}.{rest}"
     )
 
 
