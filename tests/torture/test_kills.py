@@ -219,7 +219,8 @@ def test_poison_takes_three_workers_each_and_nothing_else_along(programs, calm, 
         [],
         wrong,
         computed,
-        len(calm["digests"]),
+        # what a worker commits just before it dies with a poison is found in the cache when it is tried again
+        range(len(calm["digests"]) - len(poison), len(calm["digests"]) + 1),
         f"{sum(deaths.values())} workers died",
     )
 
