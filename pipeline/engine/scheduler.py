@@ -303,7 +303,7 @@ class _Run:
         refs = handle.refs()
         handle.key = key = key_of(handle.spec, refs)
         forced = handle.stage in self.force
-        ref = None if forced else self.store.lookup(handle.stage, key)
+        ref = None if forced else self.store.lookup(handle.stage, key, use=not self.dry)
         if ref is not None:
             handle.ref = ref
             self._resolve(handle, "cached")

@@ -115,16 +115,21 @@ class Store:
         """
         self.place.begin()
 
-    def lookup(self, stage: str, key: str, *, fresh: bool = False) -> Ref | None:
+    def lookup(self, stage: str, key: str, *, fresh: bool = False, use: bool = True) -> Ref | None:
         """The artifact of a key, the size of its file checked; a damaged one is set aside and counts as absent.
 
-        ``fresh`` does not rely on a survey.
+        ``fresh`` does not rely on a survey. With ``use`` clearing up leaves it alone from now on.
         """
         item = self.place.status(artifact_path(stage, key), fresh=fresh)
         if item is None:
             return None
         known = None if fresh or self._index is None else self._index.get(stage, item, key)
+        touched = self.place.use(item) if use else item
+        if touched is None:
+            return None
         if known is not None:
+            if touched.mark != item.mark and self._index is not None:
+                self._index.forget(key)
             return known
         try:
             manifest = self._read_manifest(stage, key)

@@ -7,6 +7,7 @@ import json
 import os
 import tempfile
 import time
+import uuid
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -22,6 +23,10 @@ class StoreError(RilleError):
 
 RACY = 0.1
 """Seconds: a file that was changed so short a time ago might change again within one tick of the clock."""
+
+
+USED = 3600.0
+"""Seconds after which a look-up touches a file again, well below the grace of clearing up."""
 
 
 class Folder:
@@ -56,6 +61,18 @@ class Folder:
                 return _item(path, os.stat(f"{self.root}/{path}"))  # no Path: a plan asks tens of thousands of times
             except FileNotFoundError:
                 return None
+
+    def use(self, item: Item) -> Item | None:
+        """Touch a file that nobody touched for :data:`USED`."""
+        if item.modified > time.time() - USED:
+            return item
+        try:
+            os.utime(f"{self.root}/{item.path}")
+        except FileNotFoundError:
+            return None
+        except OSError:
+            return item  # it may permit reading alone: then nobody clears it up by these rights
+        return self.status(item.path)
 
     def read(self, path: str, start: int = 0, stop: int | None = None) -> bytes | None:
         """Read a part of a file."""
@@ -102,6 +119,22 @@ class Folder:
                 (self.root / path).unlink(missing_ok=True)
                 for above in list(Path(path).parents)[:-2]:  # the areas themselves stay
                     (self.root / above).rmdir()
+
+    def clear(self, items: Iterable[Item]) -> None:
+        """Remove files as :meth:`delete` does.
+
+        Each is moved aside before its time is compared: a run that found it before has touched it and gets it back, and
+        one that comes later does not find it. Between looking and removing nobody can come.
+        """
+        for item in items:
+            path = self.root / item.path
+            aside = path.with_name(f"{atomic.LEFTOVER}{uuid.uuid4().hex[:16]}")
+            with suppress(OSError):
+                os.rename(path, aside)
+                if os.stat(aside).st_mtime != item.modified:
+                    with suppress(FileExistsError):  # made anew meanwhile
+                        os.link(aside, path)
+                self.delete([aside.relative_to(self.root).as_posix()])
 
     def url(self, path: str) -> str:
         """Of an archive, as fsspec writes it."""

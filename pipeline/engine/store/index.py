@@ -89,6 +89,10 @@ class Index:
             return None
         return Ref(key, stage, digest, item.path, Facts(line, end + 1), nbytes, stored)
 
+    def forget(self, key: str) -> None:
+        """Drop a line whose mark has changed though the file has not: it is written anew at the end."""
+        self.lines.pop(key, None)
+
     def note(self, used: Mapping[str, Ref]) -> None:
         """Write what a run used, unless an index says so that is young."""
         known = {key: self.lines[key] for key in used if key in self.lines}

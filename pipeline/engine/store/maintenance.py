@@ -115,11 +115,11 @@ def gc(store: Store, keep: Collection[str], *, grace: float = GRACE, dry_run: bo
         elif not PASSING.fullmatch(item.path):
             continue
         cleared.bytes += item.size
-        doomed.append(item.path)
+        doomed.append(item)
     for path in numba_cache.unused():
         cleared.bytes += sum(file.stat().st_size for file in ([path] if path.is_file() else path.rglob("*")))
         if not dry_run:
             shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
     if not dry_run:
-        store.place.delete(doomed)
+        store.place.clear(doomed)
     return cleared

@@ -42,6 +42,9 @@ class Place(Protocol):
     def status(self, path: str, *, fresh: bool = False) -> Item | None:
         """What is at a path, None if nothing; ``fresh`` does not rely on a survey."""
 
+    def use(self, item: Item) -> Item | None:
+        """Note that a file is in use, if the place can: from then on :meth:`clear` spares it. None if it has gone."""
+
     def read(self, path: str, start: int = 0, stop: int | None = None) -> bytes | None:
         """Bytes of a file from ``start`` to ``stop``, fewer where it ends before; None if it is not there."""
 
@@ -59,6 +62,9 @@ class Place(Protocol):
 
     def delete(self, paths: Iterable[str]) -> None:
         """Remove files; one that is not there is no error."""
+
+    def clear(self, items: Iterable[Item]) -> None:
+        """Remove files, but those that were changed or used since they were listed, if the place can tell."""
 
     def url(self, path: str) -> str:
         """What ``xarray.open_zarr`` opens an artifact by."""

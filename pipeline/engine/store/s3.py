@@ -154,6 +154,14 @@ class Bucket:
             with self._clear_errors(), suppress(FileNotFoundError):
                 obstore.delete(self._store, chosen[start : start + AT_ONCE])
 
+    def use(self, item: Item) -> Item | None:
+        """Nothing: the index of a run tells what it used."""
+        return item
+
+    def clear(self, items: Iterable[Item]) -> None:
+        """Remove objects: a server compares no times, the grace must do."""
+        self.delete(item.path for item in items)
+
     def move(self, path: str, to: str) -> None:
         """Copy an object within the server, and remove it."""
         import obstore

@@ -368,6 +368,40 @@ def test_gc_keeps_what_a_run_used_lately(cache, monkeypatch):
     assert maintenance.gc(store, set(), grace=5).artifacts == 1
 
 
+@pytest.mark.parametrize("use", [True, False])
+def test_gc_gives_back_what_a_run_finds_after_it_has_looked(cache, monkeypatch, use):
+    """A plan only asks, and protects nothing."""
+    ref = commit(cache)
+    old = time.time() - 1e6
+    os.utime(cache / ref.path, (old, old))
+    real = folder.Folder.clear
+
+    def meanwhile(self, items):
+        assert Store(cache).lookup("toy", KEY, use=use) == ref
+        real(self, items)
+
+    monkeypatch.setattr(folder.Folder, "clear", meanwhile)
+    maintenance.gc(Store(cache), set(), grace=3600)
+    assert (Store(cache).lookup("toy", KEY) == ref) is use
+    assert not list(cache.rglob(".tmp-*"))
+
+
+def test_a_run_does_not_find_what_gc_is_removing(cache, monkeypatch):
+    ref = commit(cache)
+    old = time.time() - 1e6
+    os.utime(cache / ref.path, (old, old))
+    real, found = os.utime, []
+
+    def late(path, *args):
+        maintenance.gc(Store(cache), set(), grace=3600)
+        found.append(path)
+        real(path, *args)
+
+    monkeypatch.setattr(os, "utime", late)
+    assert Store(cache).lookup("toy", KEY) is None
+    assert len(found) == 1
+
+
 def chunks(cache):
     return [name for name in zipfile.ZipFile(file_of(cache)).namelist() if "/c." in name]
 
