@@ -151,11 +151,15 @@ def reconstruct(options: Options) -> int:
 
 def perform(options: Options) -> tuple[int, Path]:
     """Run the whole chain; gives the exit code and the folder of the results."""
-    try:
-        return _reconstruct(options)
-    except (DamagedError, GoneError) as error:  # found when the results were drawn; it is set aside by now
-        warn(f"{error.code}: {error.message}; computing it again")
-        return _reconstruct(options)
+    healed: set[str] = set()
+    while True:
+        try:
+            return _reconstruct(options)
+        except (DamagedError, GoneError) as error:  # found when the results were drawn; it is set aside by now
+            if error.message in healed:
+                raise
+            healed.add(error.message)
+            warn(f"{error.code}: {error.message}; computing it again")
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 from rille.pipeline.engine.runtime.environment import prepare_environment
+from rille.pipeline.engine.runtime.interrupts import held
 from rille.pipeline.engine.store.location import Location
 from rille.pipeline.engine.store.manifest import Ref
 from rille.pipeline.engine.task import Outcome, Spec, ensure
@@ -159,7 +160,11 @@ class Inline:
     slots = depth = 1
 
     def __init__(self) -> None:
+        import zarr
+
         self._task: Task | None = None
+        with held():  # zarr makes its event loop when it is first used
+            zarr.create_group(zarr.storage.MemoryStore())
 
     def free(self) -> bool:
         """Whether nothing waits to be run."""

@@ -6,7 +6,8 @@ of dask, which costs a fraction of fetching a result. Measured with trivial task
 1.6 ms of processor a task so, 2.2 one by one with results fetched.
 
 A worker that dies takes along what it was given, of which it ran one at most: all come back as not begun, and each of
-them is then submitted alone. Who is alone for the third time when a worker dies is the culprit. On this machine the
+them is then submitted alone. Who is alone for the third time when its worker dies is the culprit, unless idle workers
+died with it: then somebody killed them all. On this machine the
 workers are spawned, never forked; they never see Ctrl-C, end with this process, and speak TLS on the loopback with keys
 of this run alone, because whoever reaches a scheduler of dask can run code as its user.
 """
@@ -48,8 +49,8 @@ DEPTH = 16
 WATCH = 0.2
 """Seconds until something else than an end of a task is looked after."""
 
-DEATHS = 3
-"""Worker processes that one task may take along."""
+DEATHS, TRIES = 3, 10
+"""Worker processes that one task may take along; times that it is tried at most, whoever kills them."""
 
 BIRTH = 120.0
 """Seconds that workers of our own may take to start, on a machine that others use."""
@@ -127,7 +128,12 @@ class Dask:
         self._events: queue.SimpleQueue[bytes] = queue.SimpleQueue()
         self._held: dict[int, Task] = {}
         """Suspects, which are sent when they are alone."""
+        self._refused: set[int] = set()
+        """Tasks that were submitted together with a suspect that they wait for: they come back as not begun."""
         self._deaths: Counter[int] = Counter()
+        self._tries: Counter[int] = Counter()
+        self._beside: set[int] = set()
+        """Processes of workers while a suspect runs alone."""
         self._seen: Counter[int] = Counter()
         """Greatest memory of a worker while a suspect ran alone, bytes."""
         client.subscribe_topic(self._run, lambda event: self._events.put(event[1]))
@@ -144,9 +150,15 @@ class Dask:
 
     def submit(self, tasks: Sequence[Task]) -> None:
         """Start tasks as one graph, each after those in flight that it waits for."""
-        suspects = {t.number: t for t in tasks if t.number in self._deaths}
-        self._held |= suspects
-        self._send([task for task in tasks if task.number not in suspects])
+        chosen: list[Task] = []
+        for task in tasks:
+            if task.number in self._deaths:
+                self._held[task.number] = task
+            elif self._held.keys().isdisjoint(task.upstream()) and self._refused.isdisjoint(task.upstream()):
+                chosen.append(task)
+            else:
+                self._refused.add(task.number)
+        self._send(chosen)
 
     def _send(self, tasks: Sequence[Task]) -> None:
         names = {number: future.key for number, future in self._futures.items()}
@@ -164,9 +176,11 @@ class Dask:
 
     def wait(self) -> Landed:
         """Block until a task has ended; all that have ended meanwhile are given."""
-        landed: Landed = []
+        landed: Landed = [(number, NotBegun()) for number in sorted(self._refused)]
+        self._refused.clear()
         while not landed:
             if self._held and not self._futures:
+                self._beside = {pid for pid in self._pids() if _resident(pid)}
                 self._send([self._held.pop(min(self._held))])
             with suppress(queue.Empty):
                 landed += self._hear(self._events.get(timeout=WATCH))
@@ -185,7 +199,9 @@ class Dask:
     def _watch(self) -> Landed:
         """Look at what was lost; now and then at the memory of a suspect's worker, and whether there are workers."""
         if len(self._futures) == 1 and (number := next(iter(self._futures))) in self._deaths:
-            self._seen[number] = max(self._seen[number], *(_resident(pid) for pid in self._pids()), 0)
+            pids = self._pids()
+            self._beside |= set(pids)
+            self._seen[number] = max(self._seen[number], *(_resident(pid) for pid in pids), 0)
         if time.monotonic() - self._looked > LOOK:
             threads = self._presence.threads()
             if self._cluster is None:
@@ -211,12 +227,15 @@ class Dask:
             return Failed.of(error)
         if str(error.task) != future.key:  # one that it waited for
             return NotBegun()
-        self._deaths[number] += alone  # else it is a suspect, and no more
-        if self._deaths[number] < DEATHS:
+        others = sum(not _resident(pid) for pid in self._beside) > 1
+        self._deaths[number] += alone and not others  # else it is a suspect, and no more
+        self._tries[number] += 1
+        if self._deaths[number] < DEATHS and self._tries[number] < TRIES:
             return NotBegun()
         seen = f", last seen with {self._seen[number] / 1e6:.0f} MB" if self._seen[number] else ""
         remedy = "give it more memory with fewer --jobs, or run it with --executor inline to see the crash"
-        text = f"{DEATHS} worker processes died while they ran it{seen}"
+        died = DEATHS if self._deaths[number] >= DEATHS else TRIES
+        text = f"{died} worker processes died while they ran it{seen}"
         return Failed(WorkerDiedError("RIL-586", text, remedy=remedy), "")
 
     def _pids(self) -> list[int]:

@@ -11,11 +11,14 @@ import pytest
 from hands import by_hand
 from raising import raises
 from toys import chain
+from toys.numbers import NumbersParams
+from toys.scale import ScaleParams
 
 from rille.pipeline.engine import scheduler
 from rille.pipeline.engine.executors import base, dask_client, dask_cluster
 from rille.pipeline.engine.graph import Graph
 from rille.pipeline.engine.store.base import Store
+from rille.pipeline.engine.task import Outcome
 
 
 @pytest.fixture(scope="module")
@@ -55,6 +58,27 @@ def test_a_client_handed_in_runs_the_tasks_on_its_workers_and_stays_open(hands, 
         assert {row["worker"] for row in ran} <= set(client.nthreads())
     assert Counter(row["key"].partition("-")[0] for row in ran) == {"numbers": 4, "scale": 4, "total": 1}
     assert made == run(tmp_path / "inline")
+
+
+def test_what_waits_for_a_suspect_of_the_same_batch_comes_back(hands, tmp_path):
+    from distributed import Client
+
+    graph = Graph()
+    first = graph.node("toys.numbers", "numbers/0", NumbersParams(size=5), {"frame": 0})
+    scaled = graph.node("toys.scale", "scale/0", ScaleParams(), inputs={"values": first})
+    tasks = [
+        base.Task(0, tmp_path, first.spec, {}),
+        base.Task(1, tmp_path, scaled.spec, {"values": 0}),
+        base.Task(2, tmp_path, scaled.spec, {"values": 1}),
+    ]
+    with Client(hands.address, set_as_default=False) as client:
+        workers = dask_client.Dask(client, tmp_path, 2, None, ours=False)
+        workers._deaths[0] = 1  # a worker died with it before
+        workers.submit(tasks)
+        back, (made,) = workers.wait(), workers.wait()
+        workers.close()
+    assert [(number, type(outcome)) for number, outcome in back] == [(1, base.NotBegun), (2, base.NotBegun)]
+    assert (made[0], type(made[1])) == (0, Outcome)
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
