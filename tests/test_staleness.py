@@ -185,7 +185,7 @@ class Everything(Store):
         self.learning = True
         self.asked: Counter[str] = Counter()
 
-    def lookup(self, stage: str, key: str) -> Ref | None:
+    def lookup(self, stage: str, key: str, *, use: bool = True) -> Ref | None:
         if self.learning:
             facts = EACH[stage](self.asked[stage]) if stage in EACH else META.get(stage, {})
             self.asked[stage] += 1

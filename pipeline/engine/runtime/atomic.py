@@ -67,6 +67,23 @@ def create(path: Path, pieces: Iterable[bytes]) -> bool:
     return True
 
 
+def remove(path: Path, modified: float) -> None:
+    """Remove a file unless its time of change is another than ``modified`` (seconds since 1970).
+
+    It is moved aside before the times are compared. Whoever found it before and touched it gets it back, and whoever
+    comes later does not find it: between looking and removing nobody can come.
+    """
+    aside = _beside(path)
+    os.rename(path, aside)
+    try:
+        if os.stat(aside).st_mtime != modified:
+            os.link(aside, path)
+    except FileExistsError:
+        pass  # made anew meanwhile
+    finally:
+        aside.unlink()
+
+
 def _folder(folder: Path, temporary: Path) -> list[Path]:
     """Make a folder, and the temporary file in it, which keeps it; gives the folders above that have a new entry."""
     for turn in range(100):

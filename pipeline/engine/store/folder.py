@@ -7,7 +7,6 @@ import json
 import os
 import tempfile
 import time
-import uuid
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -117,24 +116,18 @@ class Folder:
         for path in paths:
             with suppress(OSError):
                 (self.root / path).unlink(missing_ok=True)
-                for above in list(Path(path).parents)[:-2]:  # the areas themselves stay
-                    (self.root / above).rmdir()
+                self._prune(path)
 
     def clear(self, items: Iterable[Item]) -> None:
-        """Remove files as :meth:`delete` does.
-
-        Each is moved aside before its time is compared: a run that found it before has touched it and gets it back, and
-        one that comes later does not find it. Between looking and removing nobody can come.
-        """
+        """Remove files as :meth:`delete` does, but those that somebody used or changed since they were listed."""
         for item in items:
-            path = self.root / item.path
-            aside = path.with_name(f"{atomic.LEFTOVER}{uuid.uuid4().hex[:16]}")
             with suppress(OSError):
-                os.rename(path, aside)
-                if os.stat(aside).st_mtime != item.modified:
-                    with suppress(FileExistsError):  # made anew meanwhile
-                        os.link(aside, path)
-                self.delete([aside.relative_to(self.root).as_posix()])
+                atomic.remove(self.root / item.path, item.modified)
+                self._prune(item.path)
+
+    def _prune(self, path: str) -> None:
+        for above in list(Path(path).parents)[:-2]:  # the areas themselves stay
+            (self.root / above).rmdir()
 
     def url(self, path: str) -> str:
         """Of an archive, as fsspec writes it."""
