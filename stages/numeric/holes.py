@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import math
 
+import cv2
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
 Flags = NDArray[np.uint8]
 
 LEAST_TRIALS = 8
 """Known cells nearby that must tell the error of an interpolation; with fewer, half the range of its rim stands in."""
-
-PART = 64
-"""Cells of a row that are passed over together where all are known."""
 
 
 def close_holes(
@@ -68,75 +67,41 @@ def close_into(
     filled = np.zeros(elevation.shape, dtype=np.uint8)
     cells = candidates(elevation, n, min_known)
     if len(cells) and max_gap > 0:
-        _close(
-            np.ascontiguousarray(elevation),
-            np.ascontiguousarray(s),
-            cells,
-            float(max_gap),
-            n // 2 if judged else 0,
-            rim,
-            z,
-            s,
-            filled,
-        )
+        known = np.ascontiguousarray(elevation), np.ascontiguousarray(s)
+        _close(known, cells, (STEPS, *_rays(max_gap)), (n // 2 if judged else 0, rim), (z, s, filled))
     return filled
 
 
 def candidates(elevation: Floats32, n: int, min_known: float) -> NDArray[np.int64]:
     """Unknown cells, counted row by row, of whose n x n window at least ``min_known`` is known."""
-    return np.asarray(_candidates(np.ascontiguousarray(elevation), n // 2, min_known * n * n), dtype=np.int64)
+    unknown = np.isnan(elevation)
+    if not unknown.any():
+        return np.empty(0, dtype=np.int64)
+    known = cv2.boxFilter(
+        (~unknown).view(np.uint8), cv2.CV_32S, (n, n), normalize=False, borderType=cv2.BORDER_CONSTANT
+    )
+    return np.flatnonzero(unknown & (known >= min_known * n * n))
+
+
+STEPS = np.array([[0, 1], [1, 0], [1, 1], [1, -1]])
+"""Rows and columns from a cell to the next one of its row, its column and its two diagonals."""
+
+
+def _rays(max_gap: float) -> tuple[NDArray[np.int64], Floats]:
+    """Cells that a gap may span along each of :data:`STEPS`, and the inverse distance to the k-th cell of each."""
+    units = np.sqrt((STEPS * STEPS).sum(axis=1).astype(np.float64))
+    with np.errstate(divide="ignore"):
+        inverse = 1.0 / (units[:, None] * np.arange(int(max_gap + 1e-9) + 2))
+    return (max_gap / units + 1e-9).astype(np.int64), inverse
 
 
 @njit(cache=True, nogil=True)
-def _candidates(z, half, least):  # type: ignore[no-untyped-def]
-    """Columns' counts move down with the window; along a row they are added up only where a cell is unknown."""
-    rows, cols = z.shape
-    n = 2 * half + 1
-    line = np.zeros(cols + n, dtype=np.int32)  # behind the line's start and beyond its end there is nothing
-    total = line[half + 1 : half + 1 + cols]
-    upto, nothing = np.zeros(cols + n, dtype=np.int32), np.full(cols, np.nan, dtype=z.dtype)
-    out, m = np.empty(cols, dtype=np.int64), 0
-    for r in range(-half, rows):
-        _tally(z[r + half] if r + half < rows else nothing, z[r - half - 1] if r > half else nothing, total)
-        if r < 0 or not _any_unknown(z, r, 0, cols):
-            continue
-        if m + cols > out.shape[0]:
-            more = np.empty(2 * out.shape[0] + cols, dtype=np.int64)
-            more[:m] = out[:m]
-            out = more
-        for c in range(1, cols + n):
-            upto[c] = upto[c - 1] + line[c]
-        for first in range(0, cols, PART):
-            end = min(first + PART, cols)
-            if _any_unknown(z, r, first, end):
-                for c in range(first, end):
-                    if z[r, c] != z[r, c] and upto[c + n] - upto[c] >= least:
-                        out[m] = r * cols + c
-                        m += 1
-    return out[:m]
-
-
-@njit(cache=True, nogil=True)
-def _tally(enters, leaves, total):  # type: ignore[no-untyped-def]
-    for c in range(total.shape[0]):
-        total[c] += np.int32(enters[c] == enters[c]) - np.int32(leaves[c] == leaves[c])
-
-
-@njit(cache=True, nogil=True)
-def _any_unknown(z, r, first, end):  # type: ignore[no-untyped-def]
-    row, left, unknown = np.uint64(r), np.uint64(first), np.uint8(0)
-    for c in range(np.uint64(end - first)):
-        unknown |= np.uint8(z[row, left + c] != z[row, left + c])
-    return unknown > 0
-
-
-@njit(cache=True, nogil=True)
-def _close(z_in, s_in, cells, max_gap, window, rim, z, s, filled):  # type: ignore[no-untyped-def]
+def _close(known, cells, rays, trial, closed):  # type: ignore[no-untyped-def]
+    z_in, s_in = known
+    steps, reaches, inverse = rays
+    window, rim = trial
+    z, s, filled = closed
     rows, cols = z_in.shape
-    steps = np.array([[0, 1], [1, 0], [1, 1], [1, -1]])
-    units = np.sqrt((steps * steps).sum(axis=1).astype(np.float64))
-    reaches = (max_gap / units + 1e-9).astype(np.int64)
-    inverse = 1.0 / (units.reshape(4, 1) * np.arange(int(max_gap + 1e-9) + 2))
     lines = np.empty((4, 4), dtype=np.int64)
     weights = np.empty((4, 2))
     heights, noise = z_in.reshape(-1), s_in.reshape(-1)

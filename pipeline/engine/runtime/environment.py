@@ -18,6 +18,7 @@ def worker_environment() -> dict[str, str]:
     """One thread a library."""
     return {f"{name}_NUM_THREADS": "1" for name in SINGLE} | {
         "OPENCV_FOR_THREADS_NUM": "1",
+        "NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING": "1",  # numba colours a hundred thousand errors that nobody sees
         # a killed worker's semaphores are the tracker's business, not the user's
         "PYTHONWARNINGS": os.environ.get("PYTHONWARNINGS") or "ignore:resource_tracker:UserWarning",
     }

@@ -41,6 +41,9 @@ UNUSED_DAYS = 30
 """A kernel that was not loaded for so long is removed by ``rille cache gc``."""
 
 
+SELDOM = (100_000, 20, 100)
+"""Thresholds of Python's search for garbage while a kernel is compiled (usually 700, 10, 10)."""
+
 PATIENCE, PAUSE = 120.0, 0.02
 """Seconds that a process waits for another that compiles the same kernel, and between two looks."""
 
@@ -48,7 +51,7 @@ PATIENCE, PAUSE = 120.0, 0.02
 class Compiling:
     """Seconds for which kernels are compiled in this process, from the first that is not on disk to the last saved.
 
-    Waiting for another process that compiles the same kernel counts as compiling. Nothing is searched for garbage
+    Waiting for another process that compiles the same kernel counts as compiling. Garbage is searched for seldom
     meanwhile: numba makes millions of small objects that live until a kernel is done, and a ninth of its time would go
     into looking at them.
     """
@@ -57,12 +60,14 @@ class Compiling:
         self.seconds = 0.0
         self.pending: set[str] = set()
         self.since = 0.0
+        self.usual = gc.get_threshold()
 
     def begin(self, key: str) -> None:
         """A kernel is not on disk: numba compiles it next, and whatever it calls in between."""
         if not self.pending:
             self.since = time.perf_counter()
-            gc.disable()
+            self.usual = gc.get_threshold()
+            gc.set_threshold(*SELDOM)
         self.pending.add(key)
         _lock(key)
 
@@ -73,7 +78,7 @@ class Compiling:
         _unlock(key)
         if known and not self.pending:
             self.seconds += time.perf_counter() - self.since
-            gc.enable()
+            gc.set_threshold(*self.usual)
 
     def take(self) -> float:
         """The seconds since this was last asked."""
@@ -81,7 +86,7 @@ class Compiling:
         for key in self.pending:  # numba failed to compile them
             _unlock(key)
         self.pending.clear()
-        gc.enable()
+        gc.set_threshold(*self.usual)
         return seconds
 
 
