@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
-PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
+PAGES = [p for p in sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]) if "_build" not in p.parts]
 QUOTED = [(page.name, line) for page in PAGES for line in page.read_text().splitlines() if line.startswith("rille: ")]
 
 SHORTEST = 6
