@@ -40,21 +40,21 @@ def drive(sequence: Any, config: Any, goal: tuple[float, float]) -> dict[str, An
 
     from rille.stages.core.declare import Bundle
     from rille.stages.hazard.risk import risk_map
-    from rille.stages.planning.local_planner.memory import Memory
+    from rille.stages.planning.local_planner.memory import PlannerMemory
     from rille.stages.planning.local_planner.stage import next_leg, shortest_way
-    from rille.stages.planning.local_planner.views import View
+    from rille.stages.planning.local_planner.views import FieldOfView
     from rille.stages.terrain.occlusion_bounds import Bounds, ceiling
 
     bed, vehicle, p = ExactBed.of(sequence, config, goal), config.vehicle, config.leg
     fine = vehicle.wheel_diameter / config.drive.detail
-    view = View.of(sequence.rig, sequence.simulation.T_vehicle_left)
+    view = FieldOfView.of(sequence.rig, sequence.simulation.T_vehicle_left)
     meta = {"lattice": bed.lattice.to_dict(), "vehicle": vehicle.model_dump(mode="json")}
 
     def judged(known: Any) -> Bundle:
         z = np.where(known, bed.elevation, np.float32(np.nan))
         return Bundle(risk_map(z, np.zeros_like(z), bed.lattice.cell, vehicle, config.risk), meta)
 
-    T, memory, before = bed.T_world_vehicle, Memory(), None
+    T, memory, before = bed.T_world_vehicle, PlannerMemory(), None
     (start, heading), whole = bed.start(), judged(np.isfinite(bed.elevation))
     best, _ = shortest_way(whole, (*start, heading), goal, p)
     far = bed.under(T, sequence.parameters["rover"].pad)

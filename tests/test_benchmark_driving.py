@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.driving.ratios import HEADINGS, Ratios, share, wilson
-from rille.stages.planning.wheels import Ground
+from rille.stages.planning.wheels import HeightGrid
 
 WAYS = [(1.0, 1.0), (3.0, 2.0), (2.3, 2.0), (0.9, 1.0)]
 
@@ -72,5 +72,5 @@ def test_by_the_limits_alone_the_way_is_straight_where_nothing_stands_in_it(monk
     assert found == pytest.approx(math.hypot(goal[0] - x, goal[1] - y) - reach, abs=0.01)
     wall = bed.ground.height.copy()
     wall[120:125] += 0.05
-    walled = replace(bed, ground=Ground.of(wall, bed.ground.x0, bed.ground.y0, bed.ground.cell, 0.03))
+    walled = replace(bed, ground=HeightGrid.of(wall, bed.ground.x0, bed.ground.y0, bed.ground.cell, 0.03))
     assert shortest_within_limits(walled, goal, config.leg) is None

@@ -20,7 +20,7 @@ from rille.stages.core.declare import Bundle
 from rille.stages.geometry.geometry import RigidTransform, level_rotation
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.vehicle import Vehicle
-from rille.stages.planning.wheels import Ground, stand
+from rille.stages.planning.wheels import HeightGrid, stand
 from rille.stages.terrain.merge import footprint
 
 REACH = 3.0
@@ -34,7 +34,7 @@ class ExactBed:
 
     sequence: Any
     vehicle: Vehicle
-    ground: Ground
+    ground: HeightGrid
     field: HeightField
     lattice: Lattice
     elevation: NDArray[np.float32]

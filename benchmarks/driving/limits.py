@@ -20,7 +20,7 @@ from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.vehicle import Vehicle
 from rille.stages.planning.local_planner.route import length_of, pieces, straightened
 from rille.stages.planning.local_planner.state_lattice import PoseGraph, PoseGrid
-from rille.stages.planning.wheels import Ground, measured
+from rille.stages.planning.wheels import HeightGrid, measured
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -31,7 +31,7 @@ class Limits:
     """Ground (bed frame) as a vehicle may stand on it; takes the place of
     :class:`rille.stages.planning.local_planner.clearance.Footing`."""
 
-    ground: Ground
+    ground: HeightGrid
     vehicle: Vehicle
 
     def gaps(self, x: Floats, y: Floats, heading: Floats) -> Mask:

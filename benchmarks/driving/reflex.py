@@ -30,11 +30,11 @@ def trial(settings: list[str]) -> dict[str, Any]:
     from rille.pipeline.engine import scheduler
     from rille.pipeline.engine.graph import Graph
     from rille.pipeline.engine.store.base import at
-    from rille.pipeline.flow.closed_loop import Drive, EndedError, Stand
+    from rille.pipeline.flow.closed_loop import Drive, EndedError, TrueStand
     from rille.pipeline.flow.products import Stop
 
     class OneLeg(Drive):
-        def _look(self, at: Stand) -> Stop:
+        def _look(self, at: TrueStand) -> Stop:
             if self.driven.stops:
                 raise EndedError("stops", "one leg is enough")
             return super()._look(at)

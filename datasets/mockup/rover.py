@@ -21,7 +21,7 @@ from rille.stages.core.declare import AnyArray, Array, Bundle, Inputs, Params, S
 from rille.stages.core.errors import InputError
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.hazard.vehicle import Vehicle
-from rille.stages.planning.wheels import Ground, Stand, stand
+from rille.stages.planning.wheels import HeightGrid, Stand, stand
 
 Floats = NDArray[np.float64]
 
@@ -76,7 +76,7 @@ class RoverParams(Params):
 class _Drive:
     """The true motion in the making: where it is, how it stood on the way, and what its wheels did."""
 
-    ground: Ground
+    ground: HeightGrid
     vehicle: Vehicle
     x: float
     y: float
@@ -105,7 +105,7 @@ def heading_of(T: RigidTransform) -> float:
 
 
 def drive_leg(
-    ground: Ground,
+    ground: HeightGrid,
     vehicle: Vehicle,
     before: tuple[float, float, float],
     believed: tuple[float, float, float],
@@ -171,10 +171,12 @@ def images_at(wheels: Floats, p: RoverParams) -> list[int]:
     return at
 
 
-def bed_ground(scene: Bundle, vehicle: Vehicle, at: tuple[float, float], reach: float) -> Ground:
+def bed_ground(scene: Bundle, vehicle: Vehicle, at: tuple[float, float], reach: float) -> HeightGrid:
     """The bed around a point."""
     lattice = scene.meta["lattice"]
-    whole = Ground(lattice["x0"], lattice["y0"], lattice["cell"], np.asarray(scene["height"], np.float64), *2 * [_NONE])
+    whole = HeightGrid(
+        lattice["x0"], lattice["y0"], lattice["cell"], np.asarray(scene["height"], np.float64), *2 * [_NONE]
+    )
     box = [(v - reach, v + reach) for v in at]
     return whole.part(box[0], box[1], vehicle.wheel_diameter)
 

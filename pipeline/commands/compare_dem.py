@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from rille.datasets.text.warning import warning
 from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.runtime import atomic
-from rille.pipeline.export.read_dem import Raster, read_elevation
+from rille.pipeline.export.read_dem import DemFile, read_elevation
 from rille.pipeline.export.writers import ENGINEERING_CRS
 from rille.stages.core.errors import InputError
 from rille.stages.evaluation.dem_comparison import FREE, Alignment, Grid, align, binned, common, errors, figures
@@ -55,7 +55,7 @@ def compare(path_a: Path, path_b: Path, *, align: str = "none", output: Path = P
     return 0
 
 
-def check(a: Raster, b: Raster) -> None:
+def check(a: DemFile, b: DemFile) -> None:
     """Refuse models that are not comparable.
 
     Raises
@@ -90,12 +90,12 @@ def _crs_name(wkt: str) -> str:
     return wkt.split('"')[1] if '"' in wkt else wkt
 
 
-def _grid(raster: Raster) -> Grid:
+def _grid(raster: DemFile) -> Grid:
     t = raster.transform @ Affine.translation(0.5, 0.5)
     return Grid(raster.values, np.array([[t.a, t.b, t.c], [t.d, t.e, t.f]]))
 
 
-def measure(a: Raster, b: Raster, kind: str = "none") -> tuple[dict[str, Any], Floats, Floats, Floats | None]:
+def measure(a: DemFile, b: DemFile, kind: str = "none") -> tuple[dict[str, Any], Floats, Floats, Floats | None]:
     """All figures (JSON-able); error, slope of B in degrees and range (rows, cols) of the common cells."""
     on_a, on_b, how = common(_grid(a), _grid(b))
     found: dict[str, Any] = {
@@ -134,12 +134,12 @@ def measure(a: Raster, b: Raster, kind: str = "none") -> tuple[dict[str, Any], F
     return found, error, slope, distance
 
 
-def _about(raster: Raster) -> dict[str, Any]:
+def _about(raster: DemFile) -> dict[str, Any]:
     rows, cols = raster.values.shape
     return {"path": raster.name, "rows": rows, "cols": cols, "cell_m": raster.cell, "crs": _crs_name(raster.crs)}
 
 
-def _missing_crs(a: Raster, b: Raster) -> list[str]:
+def _missing_crs(a: DemFile, b: DemFile) -> list[str]:
     lines = [warning("RIL-694", f"{r.name} states no CRS: taken as the other's") for r in (a, b) if not r.crs]
     for line in lines:
         warn(line)
@@ -164,14 +164,14 @@ def _told(found: Alignment, kind: str) -> dict[str, Any]:
     }
 
 
-def _within(target: Grid, a: Raster) -> NDArray[np.bool_]:
+def _within(target: Grid, a: DemFile) -> NDArray[np.bool_]:
     """Target cells (rows, cols) whose centres lie in the outline of A."""
     rows, cols = a.values.shape
     index = _grid(a).index(target.centres())
     return np.asarray(((index >= -0.5) & (index <= np.array([rows, cols]) - 0.5)).all(axis=-1))
 
 
-def _range(target: Grid, a: Raster, b: Raster, found: dict[str, Any]) -> Floats | None:
+def _range(target: Grid, a: DemFile, b: DemFile, found: dict[str, Any]) -> Floats | None:
     """Horizontal distance (rows, cols) from the nearest camera; None (and why) where no camera is known."""
     cameras = a.viewpoints if a.viewpoints is not None else b.viewpoints
     told = "m, from the nearest position of the left camera"

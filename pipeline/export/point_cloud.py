@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rille.pipeline.engine.runtime import atomic
-from rille.pipeline.export.read_dem import Raster, read_elevation, read_tiff
+from rille.pipeline.export.read_dem import DemFile, read_elevation, read_tiff
 from rille.stages.core.errors import InputError
 
 MADE = date(2000, 1, 1)
@@ -52,7 +52,7 @@ def export(run: Path, kind: str, output: Path | None) -> tuple[Path, str]:
         ) from error
 
 
-def _beside(run: Path, name: str, terrain: Raster) -> NDArray[np.float64] | None:
+def _beside(run: Path, name: str, terrain: DemFile) -> NDArray[np.float64] | None:
     """Another raster of the run, on the same cells; None where there is none."""
     path = run / f"{name}.tif"
     if not path.is_file():
@@ -63,7 +63,9 @@ def _beside(run: Path, name: str, terrain: Raster) -> NDArray[np.float64] | None
     return found.values
 
 
-def write_laz(path: Path, terrain: Raster, ortho: NDArray[np.float64] | None, sigma: NDArray[np.float64] | None) -> str:
+def write_laz(
+    path: Path, terrain: DemFile, ortho: NDArray[np.float64] | None, sigma: NDArray[np.float64] | None
+) -> str:
     """Write a point for each known cell: x, y, z, grey value as intensity and colour, ``sigma`` of z (m).
 
     LAS 1.4, point format 7, the CRS as WKT. A step of the coordinates is a thousandth of a cell or less, an elevation
@@ -97,7 +99,9 @@ def write_laz(path: Path, terrain: Raster, ortho: NDArray[np.float64] | None, si
     return f"{row.size} points"
 
 
-def write_glb(path: Path, terrain: Raster, ortho: NDArray[np.float64] | None, sigma: NDArray[np.float64] | None) -> str:
+def write_glb(
+    path: Path, terrain: DemFile, ortho: NDArray[np.float64] | None, sigma: NDArray[np.float64] | None
+) -> str:
     """Write the triangles between known neighbouring cells, with the ortho image as texture.
 
     glTF's axes are x right, y up, z towards the viewer: x = x, y = z, z = -y of the terrain's frame. Coordinates are
@@ -130,7 +134,7 @@ def write_glb(path: Path, terrain: Raster, ortho: NDArray[np.float64] | None, si
     return f"{len(vertices)} vertices, {len(faces)} triangles{every}"
 
 
-def _mesh(terrain: Raster, step: int) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
+def _mesh(terrain: DemFile, step: int) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
     """Vertices (n, 3) in the CRS, triangles (m, 3) seen from above anticlockwise, texture coordinates (n, 2)."""
     z = terrain.values[::step, ::step]
     known = np.isfinite(z)
@@ -162,6 +166,6 @@ def _texture(ortho: NDArray[np.float64] | None) -> Any:
     )
 
 
-Writer = Callable[[Path, Raster, "NDArray[np.float64] | None", "NDArray[np.float64] | None"], str]
+Writer = Callable[[Path, DemFile, "NDArray[np.float64] | None", "NDArray[np.float64] | None"], str]
 FORMATS: dict[str, tuple[str, Writer]] = {"laz": ("cloud.laz", write_laz), "glb": ("terrain.glb", write_glb)}
 """Default file name and writer of each form."""

@@ -17,7 +17,7 @@ METRE = ("m", "metre", "metres", "meter", "meters")
 
 
 @dataclass(frozen=True)
-class Raster:
+class DemFile:
     """An elevation model of any program.
 
     ``values`` (rows, cols) metres, NaN unknown. ``transform`` maps (column, row), corners of cells at integers, to the
@@ -45,7 +45,7 @@ class Raster:
         return tuple(float(f(corners[:, k])) for k in (0, 1) for f in (np.min, np.max))  # type: ignore[return-value]
 
 
-def read_elevation(path: Path) -> Raster:
+def read_elevation(path: Path) -> DemFile:
     """The elevation model that ``path`` is or holds.
 
     Parameters
@@ -75,7 +75,7 @@ def read_elevation(path: Path) -> Raster:
     return found
 
 
-def read_tiff(path: Path, *, length: bool = True) -> Raster:
+def read_tiff(path: Path, *, length: bool = True) -> DemFile:
     """First band of a GeoTIFF; ``length``: it holds metres.
 
     Raises
@@ -113,7 +113,7 @@ def read_tiff(path: Path, *, length: bool = True) -> Raster:
         )
     if length and not unit:
         told.append(f"{path} states no unit of its elevations: taken as metres")
-    return Raster(
+    return DemFile(
         str(path), values, transform, "" if crs is None else crs.to_wkt(version="WKT2_2019"), None, tuple(told)
     )
 
@@ -128,7 +128,7 @@ def _metric_crs(path: Path, crs: Any) -> None:
         raise InputError("RIL-634", f"{path} has coordinates in {unit} of {factor:.6g} m", remedy="give one in metres")
 
 
-def _of_run(path: Path) -> Raster:
+def _of_run(path: Path) -> DemFile:
     if not (path / "dem.tif").is_file():
         raise InputError(
             "RIL-635",
@@ -136,7 +136,7 @@ def _of_run(path: Path) -> Raster:
             remedy="give the folder of a finished run, RUNS/sequence/latest, or a GeoTIFF",
         )
     found = read_tiff(path / "dem.tif")
-    return Raster(str(path), found.values, found.transform, found.crs, _cameras(path), found.warnings)
+    return DemFile(str(path), found.values, found.transform, found.crs, _cameras(path), found.warnings)
 
 
 def _cameras(run: Path) -> NDArray[np.float64] | None:
@@ -154,7 +154,7 @@ def _cameras(run: Path) -> NDArray[np.float64] | None:
     return np.asarray(centres[:, :2], np.float64)
 
 
-def _of_zarr(path: Path) -> Raster:
+def _of_zarr(path: Path) -> DemFile:
     import zarr
     from zarr.storage import LocalStore
 
@@ -182,4 +182,4 @@ def _of_zarr(path: Path) -> Raster:
             "RIL-639", f"{path}: cells are {steps.min():g} to {steps.max():g} m wide", remedy="give a regular one"
         )
     corner = Affine(cell, 0.0, x[0] - 0.5 * cell, 0.0, -cell, y[0] + 0.5 * cell)
-    return Raster(str(path), z, corner, crs, None)
+    return DemFile(str(path), z, corner, crs, None)

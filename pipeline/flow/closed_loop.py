@@ -52,7 +52,7 @@ from rille.stages.geometry.lattice import Lattice
 from rille.stages.odometry import motion
 from rille.stages.odometry.resection import trajectory
 from rille.stages.planning.local_planner import stage as local_planner
-from rille.stages.planning.local_planner.memory import Memory
+from rille.stages.planning.local_planner.memory import PlannerMemory
 from rille.stages.terrain import map_localization, merge, occlusion_bounds, start_area
 
 
@@ -101,7 +101,7 @@ def arena(goal: tuple[float, float], around: float, cell: float) -> Lattice:
 
 
 @dataclass(frozen=True)
-class Stand:
+class TrueStand:
     """Where the vehicle truly stands: the ``frame`` taken there, in this row of the artifact ``before``; its up."""
 
     frame: int
@@ -159,7 +159,7 @@ class Drive:
         self.true: dict[int, tuple[float, ...]] = {}
         self.rows: dict[int, int] = {}
         self.scene = self.make.source(self.simulation.scene, "site")
-        self.memory = Memory()
+        self.memory = PlannerMemory()
         self.pairs: list[Pair] = []
         self.poses: list[Handle] = []
         self.pads: list[Handle] = []
@@ -199,7 +199,7 @@ class Drive:
         )
         there, said = yield [place, make.source(self.simulation.sense(-1), "sense/start", {"drive": place})]
         self.true[0] = tuple(there.meta["poses"][0])
-        at = Stand(0, place, 0, said.meta["up"][0])
+        at = TrueStand(0, place, 0, said.meta["up"][0])
         while True:
             stop = self._look(at)
             if stop.index == 0 and self.config.drive.frame == "map":
@@ -211,7 +211,7 @@ class Drive:
 
     # -- a stop -------------------------------------------------------------------------------------------------
 
-    def _look(self, at: Stand) -> Stop:
+    def _look(self, at: TrueStand) -> Stop:
         """Stereo pair to local model."""
         p, make, frame = self.products, self.make, at.frame
         stop = Stop(len(self.driven.stops), frame)
@@ -324,14 +324,14 @@ class Drive:
             raise EndedError("stops", f"{stop.index + 1} stops and {1000 * leg['left_m']:.0f} mm from the goal")
         self.planned, stop.event = stop.leg, leg["reason"]
 
-    def _leg(self, label: str, memory: Memory, more: dict[str, Any], **inputs: Handle) -> Handle:
+    def _leg(self, label: str, memory: PlannerMemory, more: dict[str, Any], **inputs: Handle) -> Handle:
         args: dict[str, Any] = {"goal": list(self.goal), "looks": memory.looks, **self.mounting}
         args |= {"closed": [list(p) for p in memory.closed], "stands": [list(p) for p in memory.stands]}
         return self.make.node(local_planner, label, args | more, rig=self.pairs[0].rig, **inputs)
 
     # -- a leg --------------------------------------------------------------------------------------------------
 
-    def _drive(self, stop: Stop, at: Stand) -> Generator[Wait, Any, Way]:
+    def _drive(self, stop: Stop, at: TrueStand) -> Generator[Wait, Any, Way]:
         """The true motion, what the sensors say of it, and the images on the way that are not lost."""
         k, s, make = stop.index, self.simulation, self.make
         assert stop.leg is not None
@@ -376,7 +376,7 @@ class Drive:
             raise EndedError("safety stop", "tracking is lost: " + stop.event)
         return kept
 
-    def _judge(self, stop: Stop, way: Way) -> Generator[Wait, Any, Stand]:
+    def _judge(self, stop: Stop, way: Way) -> Generator[Wait, Any, TrueStand]:
         """Track and resect the images of a leg: it is over at its end, or where a safety stop or an obstacle was."""
         frames, rows, key = way.frames, way.rows, self.pairs[-1]
         segment = self.make.segment(frames, key)
@@ -415,7 +415,7 @@ class Drive:
             raise EndedError("safety stop", reason + often)
         assert stop.drive is not None
         end = frames[-1]
-        return Stand(end, stop.drive, rows[end], way.said.meta["up"][rows[end]])
+        return TrueStand(end, stop.drive, rows[end], way.said.meta["up"][rows[end]])
 
     def _obstacles(self, stop: Stop, way: Way, segment: Segment, key: Pair) -> Handle:
         """Whether the images on the way show what the last model does not."""
@@ -453,7 +453,7 @@ class Drive:
         p.dem_accuracy = make.node(dem_accuracy, "dem_accuracy/world", {}, dem=p.tiles, truth=exact)
         p.truth_risk = make.hazards("risk/truth", [exact])
         self.driven.truth_leg = best = self._leg(
-            "leg/truth", Memory(), {"whole": True}, risk=p.truth_risk, pose=self.poses[0]
+            "leg/truth", PlannerMemory(), {"whole": True}, risk=p.truth_risk, pose=self.poses[0]
         )
         self._check({"trajectory": p.trajectory, "truth": true, "best": best})
 

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
 from rille.stages.calibration.parameter_selection import Decision, RelativeParams, decide
-from rille.stages.calibration.relative_orientation import LEAST_MATCHES, RIG, Matches, rms
+from rille.stages.calibration.relative_orientation import LEAST_MATCHES, RIG, PointPairs, rms
 from rille.stages.core.declare import AnyArray, Array, Bundle, Inputs, Stage
 from rille.stages.core.errors import InputError
 from rille.stages.core.validity import matched
@@ -80,7 +80,7 @@ def _best_of_cells(usable, quality, side):  # type: ignore[no-untyped-def]
     return best
 
 
-def orient(rig: Rig, matches: Matches, params: RelativeParams) -> tuple[dict[str, AnyArray], dict[str, Any]]:
+def orient(rig: Rig, matches: PointPairs, params: RelativeParams) -> tuple[dict[str, AnyArray], dict[str, Any]]:
     """Residuals before and after, and facts of one pair's orientation; see the stage's outputs.
 
     Returns
@@ -151,7 +151,7 @@ def _run(params: OrientationParams, args: Mapping[str, Any], inputs: Inputs) -> 
     # what the stage rig will read, to the last bit
     points = {"left": left.astype(np.float32), "right": right.astype(np.float32)}
     pair = int(args["pair"])
-    matches = Matches(pair, points["left"].astype(np.float64), points["right"].astype(np.float64))
+    matches = PointPairs(pair, points["left"].astype(np.float64), points["right"].astype(np.float64))
     arrays, facts = orient(rig, matches, params)
     return Bundle(points | arrays, {"pair": pair} | facts)
 

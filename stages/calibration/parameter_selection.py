@@ -27,9 +27,9 @@ from pydantic import Field
 from rille.stages.calibration.relative_orientation import (
     RIG,
     Beliefs,
-    Fit,
     Linear,
-    Matches,
+    OrientationFit,
+    PointPairs,
     adjust,
     considered,
     linearised,
@@ -150,7 +150,7 @@ class Decision:
 
     correction: Floats
     parameters: tuple[Parameter, ...]
-    fit: Fit
+    fit: OrientationFit
     start: tuple[Linear, ...] = ()
 
     @property
@@ -163,7 +163,7 @@ class Decision:
         return [p.freed for p in self.parameters]
 
 
-def decide(rig: Rig, pairs: Sequence[Matches], params: RelativeParams) -> Decision:
+def decide(rig: Rig, pairs: Sequence[PointPairs], params: RelativeParams) -> Decision:
     """Which parameters of a rig the pairs change, and by how much."""
     return _Chooser(rig, pairs, params).decision()
 
@@ -171,7 +171,7 @@ def decide(rig: Rig, pairs: Sequence[Matches], params: RelativeParams) -> Decisi
 class _Chooser:
     """Chooses on the quadratic that a fit with everything free leaves, then fits once more with the chosen."""
 
-    def __init__(self, rig: Rig, pairs: Sequence[Matches], params: RelativeParams) -> None:
+    def __init__(self, rig: Rig, pairs: Sequence[PointPairs], params: RelativeParams) -> None:
         self.rig, self.pairs, self.params, self.beliefs = rig, pairs, params, params.beliefs(rig)
         self.start = linearised(rig, pairs)
         self.all = adjust(rig, pairs, [True] * RIG, self.beliefs, rival=True, start=self.start)
@@ -200,7 +200,7 @@ class _Chooser:
         parameters = tuple(self._parameter(i, chosen, fit) for i in range(RIG))
         return Decision(correction, parameters, fit, tuple(self.start))
 
-    def _settled(self, chosen: Sequence[int]) -> tuple[Fit, Floats]:
+    def _settled(self, chosen: Sequence[int]) -> tuple[OrientationFit, Floats]:
         """The fit with the chosen parameters free, and their correction (5,)."""
         free = [i in chosen for i in range(RIG)]
         fit = settle(self.rig, self.pairs, free, self.beliefs, self.start)
@@ -283,7 +283,7 @@ class _Chooser:
         shown = [math.hypot(*self._estimate(i, chosen)) for i in range(RIG)]
         return np.minimum(self.beliefs.held(), shown)
 
-    def _parameter(self, i: int, chosen: list[int], fit: Fit) -> Parameter:
+    def _parameter(self, i: int, chosen: list[int], fit: OrientationFit) -> Parameter:
         others = [k for k in chosen if k != i]
         observed = self._depth_error(i, others) <= self.params.max_depth_error or i in chosen
         if i not in chosen:
@@ -301,13 +301,13 @@ class _Chooser:
         return Parameter(NAMES[i], value, value, sigma, observed, True, why)
 
 
-def impossible_share(rig: Rig, pairs: Sequence[Matches], fit: Fit) -> float:
+def impossible_share(rig: Rig, pairs: Sequence[PointPairs], fit: OrientationFit) -> float:
     """Share of the matches, outliers aside, that lie beyond infinity."""
     beyond = np.concatenate([beyond_infinity(rig, m.left, m.right) for m in pairs])
     return float(np.mean(beyond[np.concatenate(fit.weights) > 0] > BEYOND))
 
 
-def row_sensitivity(rig: Rig, pairs: Sequence[Matches]) -> Floats:
+def row_sensitivity(rig: Rig, pairs: Sequence[PointPairs]) -> Floats:
     """Pixels RMS (5,) that matches move across their lines for a radian of each parameter."""
     squares = [np.mean(distances(rig, np.zeros(RIG), m.left, m.right)[1] ** 2, axis=0) for m in pairs]
     return np.asarray(np.sqrt(np.mean(squares, axis=0)), dtype=np.float64)

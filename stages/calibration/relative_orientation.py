@@ -67,7 +67,7 @@ CONVERGED = 1e-2
 
 
 @dataclass(frozen=True)
-class Matches:
+class PointPairs:
     """Corresponding points (n, 2) of one pair: column and row in the left and in the right image, pixels."""
 
     pair: int
@@ -99,7 +99,7 @@ class Beliefs:
 
 
 @dataclass(frozen=True)
-class Fit:
+class OrientationFit:
     """Result of :func:`adjust`.
 
     ``x`` (SIZE,): the five corrections (radians), principal point (2, pixels), smooth error (pixels). ``normal`` and
@@ -125,20 +125,20 @@ class Linear:
     block: NDArray[np.int64]
 
 
-def linearised(rig: Rig, pairs: Sequence[Matches]) -> list[Linear]:
+def linearised(rig: Rig, pairs: Sequence[PointPairs]) -> list[Linear]:
     """What every fit of a rig to some pairs begins with."""
     return [_linear(rig, m) for m in pairs]
 
 
 def adjust(
     rig: Rig,
-    pairs: Sequence[Matches],
+    pairs: Sequence[PointPairs],
     free: Sequence[bool],
     beliefs: Beliefs,
     *,
     rival: bool,
     start: list[Linear] | None = None,
-) -> Fit:
+) -> OrientationFit:
     """Adjust a rig to pairs, everything that no rig explains allowed for.
 
     ``free`` says which of the five parameters the images alone decide. The others are held by what the calibration is
@@ -151,8 +151,8 @@ def adjust(
 
 
 def settle(
-    rig: Rig, pairs: Sequence[Matches], free: Sequence[bool], beliefs: Beliefs, start: list[Linear] | None = None
-) -> Fit:
+    rig: Rig, pairs: Sequence[PointPairs], free: Sequence[bool], beliefs: Beliefs, start: list[Linear] | None = None
+) -> OrientationFit:
     """Adjust the free parameters to the smallest residuals of the rig that results.
 
     In that rig the others are exactly as given and smooth errors stay in the images, so neither takes a share here.
@@ -162,7 +162,7 @@ def settle(
     return _adjust(rig, pairs, prior, LEAST_SMOOTH, start, estimate=False)
 
 
-def considered(fit: Fit, free: Sequence[bool], beliefs: Beliefs, smooth: float, held: Floats) -> Floats:
+def considered(fit: OrientationFit, free: Sequence[bool], beliefs: Beliefs, smooth: float, held: Floats) -> Floats:
     """Covariance (5, 5) of a settled fit's free parameters; zero for the others.
 
     What took no share is an error of the result (a consider covariance: Bierman 1977, chapter 8): held parameters with
@@ -180,8 +180,8 @@ def considered(fit: Fit, free: Sequence[bool], beliefs: Beliefs, smooth: float, 
 
 
 def _adjust(
-    rig: Rig, pairs: Sequence[Matches], prior: Floats, smooth: float, start: list[Linear] | None, *, estimate: bool
-) -> Fit:
+    rig: Rig, pairs: Sequence[PointPairs], prior: Floats, smooth: float, start: list[Linear] | None, *, estimate: bool
+) -> OrientationFit:
     """Gauss-Newton with weights from the scatter; ``prior`` matrix, the smooth error's size kept or estimated."""
     x, scales, linear = np.zeros(SIZE), [np.inf] * len(pairs), linearised(rig, pairs) if start is None else start
     for _ in range(ITERATIONS):
@@ -195,7 +195,7 @@ def _adjust(
         x, variance, smooth = _maximised(normal, pull, prior, smooth, INNER if estimate else 0)
         if bool(np.all(np.abs(x - last)[:RIG] < CONVERGED * np.sqrt(variance[:RIG]))):
             break
-    return Fit(x, normal, pull, smooth, tuple(scales), tuple(p.weights for p in parts))
+    return OrientationFit(x, normal, pull, smooth, tuple(scales), tuple(p.weights for p in parts))
 
 
 def _maximised(normal: Floats, pull: Floats, prior: Floats, smooth: float, rounds: int) -> tuple[Floats, Floats, float]:
@@ -232,7 +232,9 @@ def precision(free: Sequence[bool], beliefs: Beliefs, smooth: float, *, rival: b
     return np.diag(sigma**-2.0)
 
 
-def solution(fit: Fit, free: Sequence[bool], beliefs: Beliefs, *, rival: bool) -> tuple[Floats, Floats, float]:
+def solution(
+    fit: OrientationFit, free: Sequence[bool], beliefs: Beliefs, *, rival: bool
+) -> tuple[Floats, Floats, float]:
     """Values (SIZE,), covariance and gain (half the drop of chi-square) of a fit's quadratic for another choice.
 
     The smooth error counts with no less than is believed of it.
@@ -251,7 +253,7 @@ class _Part:
     weights: Floats
 
 
-def _linear(rig: Rig, matches: Matches, x: Floats | None = None, before: Linear | None = None) -> Linear:
+def _linear(rig: Rig, matches: PointPairs, x: Floats | None = None, before: Linear | None = None) -> Linear:
     """Distances of a corrected rig with systematic errors about ``x``; what stays is taken from ``before``."""
     x = np.zeros(SIZE) if x is None else x
     distance, by_rig = distances(rig, x[:RIG], matches.left, matches.right)
@@ -264,7 +266,7 @@ def _linear(rig: Rig, matches: Matches, x: Floats | None = None, before: Linear 
     return Linear(distance - by_rig @ x[:RIG], design, x, block)
 
 
-def _blocks(rig: Rig, matches: Matches) -> NDArray[np.int64]:
+def _blocks(rig: Rig, matches: PointPairs) -> NDArray[np.int64]:
     """Block (n,) of the image that each left point lies in."""
     column = np.minimum(matches.left[:, 0] * BLOCKS / rig.left.width, BLOCKS - 1).astype(np.int64)
     row = np.minimum(matches.left[:, 1] * BLOCKS / rig.left.height, BLOCKS - 1).astype(np.int64)
@@ -328,7 +330,7 @@ def _weigh(constant, design, block, x, last, out):  # type: ignore[no-untyped-de
     return noise
 
 
-def _smooth_terms(rig: Rig, matches: Matches) -> Floats:
+def _smooth_terms(rig: Rig, matches: PointPairs) -> Floats:
     """Normalised Legendre polynomials (n, terms) of the left pixel: RMS 1 over the image."""
     u = 2.0 * matches.left[:, 0] / max(rig.left.width - 1, 1) - 1.0
     v = 2.0 * matches.left[:, 1] / max(rig.left.height - 1, 1) - 1.0

@@ -30,7 +30,7 @@ from rille.stages.calibration.relative_orientation import (
     LEAST_MATCHES,
     RIG,
     Linear,
-    Matches,
+    PointPairs,
     adjust,
     rms,
     solution,
@@ -67,7 +67,7 @@ class RigParams(RelativeParams):
     )
 
 
-def orient_rig(given: Rig, pairs: Sequence[Matches], params: RigParams) -> dict[str, Any]:
+def orient_rig(given: Rig, pairs: Sequence[PointPairs], params: RigParams) -> dict[str, Any]:
     """Facts of the rig to be used.
 
     Returns
@@ -109,7 +109,7 @@ def orient_rig(given: Rig, pairs: Sequence[Matches], params: RigParams) -> dict[
     return facts
 
 
-def _judged(given: Rig, pairs: list[Matches], params: RigParams) -> dict[str, Any]:
+def _judged(given: Rig, pairs: list[PointPairs], params: RigParams) -> dict[str, Any]:
     """What the pairs say on the given rig, and the rig that follows."""
     decision = decide(given, pairs, params)
     applied = params.mode != "fixed" and decision.changed
@@ -141,14 +141,14 @@ def _judged(given: Rig, pairs: list[Matches], params: RigParams) -> dict[str, An
     }
 
 
-def _share(pairs: list[Matches]) -> list[Matches]:
+def _share(pairs: list[PointPairs]) -> list[PointPairs]:
     """Every so manieth match of each pair, so that many pairs together stay affordable."""
     most = max(LEAST_OF_A_PAIR, MOST_MATCHES // len(pairs))
     steps = [max(1, math.ceil(len(m.left) / most)) for m in pairs]
-    return [Matches(m.pair, m.left[::s], m.right[::s]) for m, s in zip(pairs, steps, strict=True)]
+    return [PointPairs(m.pair, m.left[::s], m.right[::s]) for m, s in zip(pairs, steps, strict=True)]
 
 
-def _alone(given: Rig, matches: Matches, start: Linear, decision: Decision, params: RigParams) -> dict[str, Any]:
+def _alone(given: Rig, matches: PointPairs, start: Linear, decision: Decision, params: RigParams) -> dict[str, Any]:
     """One pair's own values and sigmas, degrees, of all that the sequence observes."""
     names = [p.name for p in decision.parameters if p.observed]
     free = [p.observed for p in decision.parameters]
@@ -162,7 +162,7 @@ def _alone(given: Rig, matches: Matches, start: Linear, decision: Decision, para
     }
 
 
-def _residuals(given: Rig, rig: Rig, pairs: Sequence[Matches], decision: Decision) -> dict[str, float]:
+def _residuals(given: Rig, rig: Rig, pairs: Sequence[PointPairs], decision: Decision) -> dict[str, float]:
     weights = np.concatenate(decision.fit.weights)
     found = {}
     for name, used in (("before", given), ("after", rig)):
@@ -183,7 +183,7 @@ def _source(decision: Decision, applied: bool, pairs: int) -> str:
     return f"given calibration, {names} repaired from {pairs} pair{'s' if pairs > 1 else ''}"
 
 
-def _contradiction(given: Rig, pairs: Sequence[Matches], decision: Decision, mode: str) -> list[str]:
+def _contradiction(given: Rig, pairs: Sequence[PointPairs], decision: Decision, mode: str) -> list[str]:
     """What a user should know of a calibration that the images contradict."""
     if not decision.changed:
         return []
@@ -273,7 +273,7 @@ def _shown(start: Sequence[Linear], columns: list[int], usual: Floats, departure
 
 def _run(params: RigParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     pairs = [
-        Matches(
+        PointPairs(
             int(found.meta["pair"]),
             np.asarray(found["left"], dtype=np.float64),
             np.asarray(found["right"], dtype=np.float64),

@@ -62,7 +62,7 @@ class ReflexParams(Params):
 
 
 @dataclass(frozen=True)
-class Surface:
+class LastModel:
     """The last elevation model: heights (row, col), m, and the greatest of them within the blur, both NaN unknown."""
 
     lattice: Lattice
@@ -71,13 +71,13 @@ class Surface:
     points: Floats
 
     @staticmethod
-    def of(elevation: NDArray[np.floating], lattice: Lattice, blur: float) -> Surface:
+    def of(elevation: NDArray[np.floating], lattice: Lattice, blur: float) -> LastModel:
         """From elevations, comparing within ``blur`` metres."""
         z = np.asarray(elevation, np.float64)
         side = 2 * round(blur / lattice.cell) + 1
         top = scipy.ndimage.maximum_filter(np.where(np.isnan(z), -np.inf, z), side, mode="nearest")
         known = np.isfinite(z)
-        return Surface(lattice, z, top, np.column_stack([lattice.xy()[known], z[known]]))
+        return LastModel(lattice, z, top, np.column_stack([lattice.xy()[known], z[known]]))
 
     def top_at(self, xy: Floats) -> Floats:
         """Greatest height near points (n, 2); -inf where nothing near is known, NaN outside."""
@@ -89,7 +89,7 @@ class Surface:
 
 
 @dataclass(frozen=True)
-class View:
+class ViewPair:
     """Two images of the way: T_local_left of both, and displacements of the first's level grid in level-0 pixels."""
 
     before: RigidTransform
@@ -120,7 +120,12 @@ class Obstacle:
 
 
 def look(
-    view: View, surface: Surface, camera: Camera, T_vehicle_left: RigidTransform, vehicle: Vehicle, p: ReflexParams
+    view: ViewPair,
+    surface: LastModel,
+    camera: Camera,
+    T_vehicle_left: RigidTransform,
+    vehicle: Vehicle,
+    p: ReflexParams,
 ) -> Points:
     """What the two images say of the ground ahead of the vehicle."""
     wheel = vehicle.wheel_diameter
@@ -152,7 +157,7 @@ def look(
     return Points(place[along], q[along, :2], rise[along], raised[along])
 
 
-def _seen(view: View, cells: Floats, camera: Camera) -> tuple[NDArray[np.intp], Floats, Floats]:
+def _seen(view: ViewPair, cells: Floats, camera: Camera) -> tuple[NDArray[np.intp], Floats, Floats]:
     """Grid pixels (n, 2) that show a cell and have a displacement, the ground they show (n, 3), their centres (n, 2).
 
     Of the cells that one pixel shows, the nearest one; its ground is where the pixel's ray meets the cell's height.
@@ -201,7 +206,7 @@ def _run(params: ReflexParams, args: Mapping[str, Any], inputs: Inputs) -> Bundl
     T_vehicle_left = RigidTransform.from_matrix(args["T_vehicle_left"])
     wheel = vehicle.wheel_diameter
     lattice = Lattice.from_dict(dem.meta["lattice"])
-    surface = Surface.of(np.asarray(dem["elevation"]), lattice, params.blur * wheel)
+    surface = LastModel.of(np.asarray(dem["elevation"]), lattice, params.blur * wheel)
     poses = np.asarray(resect["poses"])  # NaN where tracking was lost, which is for the stage safety to judge
     known = np.isfinite(poses).all(axis=(1, 2))
     frames = [int(f["frame"]) for f in resect.meta["per_frame"]]
@@ -214,7 +219,7 @@ def _run(params: ReflexParams, args: Mapping[str, Any], inputs: Inputs) -> Bundl
         ok = matched(np.asarray(motion["validity"]))
         column, row = np.asarray(motion["column_disparity"]), np.asarray(motion["row_disparity"])
         first, second = (RigidTransform.from_matrix(poses[k]) for k in (i, j))
-        view = View(first, second, column, row, ok, int(motion.meta["level"]))
+        view = ViewPair(first, second, column, row, ok, int(motion.meta["level"]))
         points = look(view, surface, camera, T_vehicle_left, vehicle, params)
         found, doubtful = obstacle(points, wheel, params, doubtful)
         if found is None:

@@ -24,7 +24,7 @@ import scipy
 from numba import njit
 from numpy.typing import NDArray
 
-from rille.stages.hazard.measures import MEASURES, Measure, Terrain
+from rille.stages.hazard.measures import MEASURES, HazardInput, Measure
 from rille.stages.numeric.line import copy_line
 
 Floats32 = NDArray[np.float32]
@@ -74,7 +74,7 @@ class Rules(NamedTuple):
 
 class Limit(NamedTuple):
     """One measure's limit, bias and spread as above; ``added`` standard deviations of its load; its bit; and ``noise``:
-    the index of its noise (:attr:`Blocks.noise`), after which comes the index of its doubt."""
+    the index of its noise (:attr:`ClassifiedBlocks.noise`), after which comes the index of its doubt."""
 
     limit: np.float32
     bias: np.float32
@@ -84,7 +84,7 @@ class Limit(NamedTuple):
     noise: np.int64
 
 
-class Blocks(NamedTuple):
+class ClassifiedBlocks(NamedTuple):
     """Arrays (row, col) of blocks, float32 and uint16.
 
     ``load`` and ``excess``: greatest ones of the measures on blocks; ``over``: bits of those above their limits;
@@ -115,7 +115,7 @@ class Cells(NamedTuple):
 
 
 def classify(
-    terrain: Terrain, filled: NDArray[np.uint8], rules: Rules, measures: tuple[Measure, ...] = MEASURES
+    terrain: HazardInput, filled: NDArray[np.uint8], rules: Rules, measures: tuple[Measure, ...] = MEASURES
 ) -> dict[str, NDArray]:
     """Classes, reasons and rasters (row, col) of :func:`rille.stages.hazard.risk.risk_map`.
 
@@ -141,7 +141,7 @@ def classify(
         _add_bits(*lines[:2], limits[m.name], over.ravel())
     flags = np.where((share < WHOLE) | (patchy > 0), np.uint16(UNSEEN_BIT), np.uint16(0))
     bands = {m.name: _band(m, values[m.name], vehicle.clearance) for m in on_blocks}
-    blocks = Blocks(load, excess, over, flags, noises, share, tuple(bands.values()))
+    blocks = ClassifiedBlocks(load, excess, over, flags, noises, share, tuple(bands.values()))
     fields = tuple(values[m.name] for m in on_cells)
     del terrain, values  # blocks of a large map take as much memory as all rasters together
     shape = closed.shape
@@ -155,7 +155,7 @@ def classify(
     return {"risk": risk, "reason": reason} | {m.band: rasters[m.name] for m in measures} | {"p_hazard": p}
 
 
-def _limit(m: Measure, terrain: Terrain, sigmas: float) -> Limit:
+def _limit(m: Measure, terrain: HazardInput, sigmas: float) -> Limit:
     f, bias, spread = np.float32, m.bias / m.length(terrain), m.spread / m.length(terrain)
     added, noise = max(0.0, sigmas * spread - bias), 2 if m.below else 0
     return Limit(f(m.greatest(terrain.vehicle)), f(bias), f(spread), f(added), np.uint16(m.bit), np.int64(noise))

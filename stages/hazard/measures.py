@@ -1,10 +1,10 @@
 """Measures of hazard, one row each of :data:`MEASURES`: each has its own limit of a vehicle, and none is blended.
 
-To add a measure, write its kernel, ``(Terrain) -> array``, and add its row: classification, reasons, raster, messages
-and the probability of a hazard loop over the table. Inputs are an elevation model with its standard deviations and the
-vehicle; outputs are metres or gradients, float32 without NaN. The first three measures are those of the paper (section
-4.6), by running extrema over octagons (:mod:`rille.stages.numeric.extrema`); the last three put the vehicle down at
-every place and heading (:mod:`rille.stages.hazard.placement`). Roughness is the RMS deviation
+To add a measure, write its kernel, ``(HazardInput) -> array``, and add its row: classification, reasons, raster,
+messages and the probability of a hazard loop over the table. Inputs are an elevation model with its standard deviations
+and the vehicle; outputs are metres or gradients, float32 without NaN. The first three measures are those of the paper
+(section 4.6), by running extrema over octagons (:mod:`rille.stages.numeric.extrema`); the last three put the vehicle
+down at every place and heading (:mod:`rille.stages.hazard.placement`). Roughness is the RMS deviation
 ``sqrt(mean((z(x + d) - z(x))^2) / 2)`` over both axes: the standard deviation of ground without slope, and little of a
 slope's (Shepard et al. 2001, doi:10.1029/2000JE001429).
 
@@ -45,7 +45,7 @@ FINE = 5
 """Cells along a wheel's radius from which a 3 x 3 median is taken: at most three wrong cells are no stone there."""
 
 
-class Terrain:
+class HazardInput:
     """An elevation model and a vehicle; derived arrays are computed once, when a measure asks for them.
 
     Parameters
@@ -114,21 +114,21 @@ def _rms(squares: Floats, count: Floats, side: int) -> Floats32:
     return np.sqrt(mean).astype(np.float32)
 
 
-def _roughness(terrain: Terrain) -> Floats32:
+def _roughness(terrain: HazardInput) -> Floats32:
     sums = (window_sum(a, terrain.side) for a in (terrain.blocks.deviation, terrain.blocks.pairs))
     deviation, pairs = (np.maximum(a, 0.0) for a in sums)
     return np.sqrt(0.5 * deviation / np.maximum(pairs, 1.0)).astype(np.float32)
 
 
-def _inclination(terrain: Terrain) -> Floats32:
+def _inclination(terrain: HazardInput) -> Floats32:
     return terrain.relief[1] * np.float32(1.0 / terrain.extent)
 
 
-def _metre(terrain: Terrain) -> float:
+def _metre(terrain: HazardInput) -> float:
     return 1.0
 
 
-def _wheel_distance(terrain: Terrain) -> float:
+def _wheel_distance(terrain: HazardInput) -> float:
     return min(terrain.vehicle.track, terrain.vehicle.wheel_base)
 
 
@@ -136,7 +136,7 @@ class Measure(NamedTuple):
     """One measure of hazard.
 
     ``bit`` of ``reason``, for good: a bit never changes its meaning. ``kernel`` gives metres or gradients, float32
-    without NaN: of the cells, or ``on_blocks`` of :attr:`Terrain.stride` cells. ``limit`` is the parameter of the
+    without NaN: of the cells, or ``on_blocks`` of :attr:`HazardInput.stride` cells. ``limit`` is the parameter of the
     vehicle; a limit in degrees makes the measure a gradient. ``bias`` and ``spread`` of its heights by noise are
     divided by ``length``, metres, to be those of the measure. ``below``: it looks at all ground below the vehicle
     rather than at the wheel's window, so it is a hazard to the vehicle's middle rather than to a wheel. ``words`` name
@@ -146,14 +146,14 @@ class Measure(NamedTuple):
 
     name: str
     bit: int
-    kernel: Callable[[Terrain], Floats32]
+    kernel: Callable[[HazardInput], Floats32]
     limit: str
     bias: float
     spread: float
     words: str
     band: str
     description: str
-    length: Callable[[Terrain], float] = _metre
+    length: Callable[[HazardInput], float] = _metre
     on_blocks: bool = False
     below: bool = False
     left: bool = False

@@ -45,7 +45,7 @@ from rille.stages.hazard.classification import (
     Rules,
     classify,
 )
-from rille.stages.hazard.measures import BITS, MEASURES, Terrain, window_reach
+from rille.stages.hazard.measures import BITS, MEASURES, HazardInput, window_reach
 from rille.stages.hazard.vehicle import DEFAULT_VEHICLE, Vehicle
 from rille.stages.numeric.holes import close_into
 
@@ -123,7 +123,7 @@ def risk_map(
     gap, side = p.max_hole * vehicle.wheel_diameter / cell, window_cells(window, cell)
     filled = close_into(z, s, elevation, gap, side, p.min_known, rim=RIM)
     rules = Rules(p.sigmas, p.caution, p.max_p, p.min_known)
-    classes = classify(Terrain(elevation, z, s, cell, vehicle, window), filled, rules)
+    classes = classify(HazardInput(elevation, z, s, cell, vehicle, window), filled, rules)
     return classes | {"filled": filled, "elevation": z}
 
 

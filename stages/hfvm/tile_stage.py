@@ -64,7 +64,7 @@ class Agreeing:
 
 
 @dataclass(frozen=True)
-class Task:
+class TileInputs:
     """The inputs of one task, opened."""
 
     params: HfvmParams
@@ -75,10 +75,10 @@ class Task:
     half: bool
 
     @staticmethod
-    def of(params: HfvmParams, args: Mapping[str, Any], inputs: Inputs) -> Task:
+    def of(params: HfvmParams, args: Mapping[str, Any], inputs: Inputs) -> TileInputs:
         """Open what a task has been given."""
         left, right, half = views(inputs, params)
-        return Task(tiled.halved_params(params) if half else params, args, inputs, left, right, half)
+        return TileInputs(tiled.halved_params(params) if half else params, args, inputs, left, right, half)
 
     @property
     def facts(self) -> Mapping[str, Any]:
@@ -168,7 +168,7 @@ def told(state: State) -> dict[str, Any]:
     }
 
 
-def _coarse(task: Task) -> Bundle:
+def _coarse(task: TileInputs) -> Bundle:
     found = tiled.coarse(task.left, task.right, task.params, task.args["side"])
     s = found.state
     arrays: Results = {}
@@ -185,7 +185,7 @@ def _coarse(task: Task) -> Bundle:
     return Bundle(arrays, meta | told(s))
 
 
-def _level(task: Task) -> Bundle:
+def _level(task: TileInputs) -> Bundle:
     pair, level = task.pair(), task.args["level"]
     above = task.state(pair, level + 1)
     if task.args["way"] == "right":
@@ -199,13 +199,13 @@ def _level(task: Task) -> Bundle:
     return Bundle({f"map_{name}": np.ascontiguousarray(a) for name, a in found.items()}, {})
 
 
-def _band(task: Task) -> Bundle:
+def _band(task: TileInputs) -> Bundle:
     pair = task.pair()
     state = replace(task.state(pair, task.args["level"]), band=hierarchy.FREE)
     return Bundle({}, told(hierarchy.with_band(pair, state)))
 
 
-def _fine(task: Task) -> Bundle:
+def _fine(task: TileInputs) -> Bundle:
     steps = task.finish()
     shapes = steps.pair.shapes(0)
     if task.args["way"] == "left":
@@ -219,7 +219,7 @@ def _fine(task: Task) -> Bundle:
     return Bundle(steps.back(window, task.map("right_map", shapes[1])), {})
 
 
-def _check(task: Task) -> Bundle:
+def _check(task: TileInputs) -> Bundle:
     steps = task.finish()
     shapes, window = steps.pair.shapes(0), task.window(steps.shape)
     assert window is not None
@@ -227,20 +227,20 @@ def _check(task: Task) -> Bundle:
     return Bundle(steps.check(window, fine, task.rasters("back", ("u", "v"), shapes[1])), {})
 
 
-def _refine(task: Task) -> Bundle:
+def _refine(task: TileInputs) -> Bundle:
     steps = task.finish()
     window = task.window(steps.shape)
     assert window is not None
     return Bundle(steps.refine(window, task.rasters("checked", ("u", "v", "validity"), steps.shape)), {})
 
 
-def _patches(task: Task) -> Bundle:
+def _patches(task: TileInputs) -> Bundle:
     steps = task.finish()
     refined = task.rasters("refined", ("validity",), steps.shape)
     return Bundle({"gone": steps.patches(task.map("left_map", steps.shape), refined)}, {})
 
 
-def _final(task: Task) -> Bundle:
+def _final(task: TileInputs) -> Bundle:
     steps = task.finish()
     shape, window = steps.shape, task.window(steps.shape)
     assert window is not None
@@ -258,7 +258,7 @@ def _final(task: Task) -> Bundle:
     return Bundle(found, {})
 
 
-STEPS: Mapping[str, Callable[[Task], Bundle]] = {
+STEPS: Mapping[str, Callable[[TileInputs], Bundle]] = {
     "coarse": _coarse,
     "level": _level,
     "band": _band,
@@ -271,7 +271,7 @@ STEPS: Mapping[str, Callable[[Task], Bundle]] = {
 
 
 def _run(params: HfvmParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
-    return STEPS[args["step"]](Task.of(params, args, inputs))
+    return STEPS[args["step"]](TileInputs.of(params, args, inputs))
 
 
 _GRID = ("row", "col")

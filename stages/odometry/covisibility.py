@@ -91,7 +91,7 @@ def _blocks(values: AnyArray, side: int) -> AnyArray:
 
 
 @dataclass(frozen=True)
-class Seen:
+class Covisibility:
     """What a first frame and a later one have in common.
 
     ``origin`` (n, 2) those blocks of the first frame that are still in the image, ``points`` (n, 2) where they are now,
@@ -106,11 +106,11 @@ class Seen:
     covered: float
 
     @staticmethod
-    def all_of(step: Step) -> Seen:
+    def all_of(step: Step) -> Covisibility:
         """Everything that the frame before a step shows."""
-        return Seen(step.blocks, step.blocks, np.ones(len(step.blocks)), 1.0, 1.0)
+        return Covisibility(step.blocks, step.blocks, np.ones(len(step.blocks)), 1.0, 1.0)
 
-    def after(self, step: Step) -> Seen:
+    def after(self, step: Step) -> Covisibility:
         """The same for the frame behind a step; what has left does not return."""
         moved = step.move(self.points)
         part = np.minimum(self.part, _part_inside(moved, step))
@@ -118,7 +118,7 @@ class Seen:
         origin, points, part = self.origin[left], moved[left], part[left]
         _, back = fit_affinity(points, origin, np.ones(len(points), bool), step.blocks)
         covered = float(np.mean(_part_inside(step.blocks + back, step)))
-        return Seen(origin, points, part, float(part.sum()) / len(step.blocks), covered)
+        return Covisibility(origin, points, part, float(part.sum()) / len(step.blocks), covered)
 
     @property
     def overlap(self) -> float:

@@ -21,7 +21,7 @@ from pydantic import Field, model_validator
 
 from rille.stages.core.declare import Bundle, Inputs, Params, Stage
 from rille.stages.core.errors import ConfigError, InputError
-from rille.stages.odometry.covisibility import Seen, Step
+from rille.stages.odometry.covisibility import Covisibility, Step
 from rille.stages.odometry.step_table import steps_of
 
 LEAST_BLOCKS = 12
@@ -154,7 +154,7 @@ def by_overlap(steps: Sequence[Step], params: SelectParams, marked: Marked = UNM
     marked : in place of an unfit position the last one before that may be basic, else the next one.
     """
     choice = Choice([0], ["first frame"], [None])
-    seen, k = (Seen.all_of(steps[0]) if steps else None), 0
+    seen, k = (Covisibility.all_of(steps[0]) if steps else None), 0
     while k < len(steps):
         assert seen is not None
         step, key = steps[k], choice.basic[-1]
@@ -166,12 +166,12 @@ def by_overlap(steps: Sequence[Step], params: SelectParams, marked: Marked = UNM
             choice.why.append(reason)
             choice.overlap.append(_overlap(steps[key:fit], params, seen if fit == k else None))
             k, step = fit, steps[fit]
-            ahead = Seen.all_of(step).after(step)
+            ahead = Covisibility.all_of(step).after(step)
         seen, k = ahead, k + 1
     return choice
 
 
-def _why(steps: Sequence[Step], k: int, key: int, ahead: Seen, params: SelectParams) -> str:
+def _why(steps: Sequence[Step], k: int, key: int, ahead: Covisibility, params: SelectParams) -> str:
     """Why position ``k`` should be basic, given what ``ahead`` would still be seen one frame on; empty: it need not."""
     if any(doubtful(step, params) for step in steps[max(k - 1, key) : k + 1]):
         return "few matches"
@@ -185,11 +185,11 @@ def doubtful(step: Step, params: SelectParams) -> bool:
     return step.match_rate < params.min_matches or int(step.known.sum()) < LEAST_BLOCKS
 
 
-def _overlap(steps: Sequence[Step], params: SelectParams, seen: Seen | None = None) -> float | None:
+def _overlap(steps: Sequence[Step], params: SelectParams, seen: Covisibility | None = None) -> float | None:
     """Overlap of the frames before and behind some steps, by what is ``seen`` there; None: one of them is doubtful."""
     if any(doubtful(step, params) for step in steps):
         return None
-    return (seen or reduce(Seen.after, steps, Seen.all_of(steps[0]))).overlap
+    return (seen or reduce(Covisibility.after, steps, Covisibility.all_of(steps[0]))).overlap
 
 
 def segments(basic: list[int], frames: int) -> list[list[int]]:

@@ -73,7 +73,7 @@ class TrackParams(Params):
 
 
 @dataclass(frozen=True)
-class Motion:
+class LevelDisplacements:
     """Coarse displacements (rows, cols) of a pyramid level, in level 0 pixels, NaN undefined."""
 
     column: NDArray[np.float32]
@@ -90,7 +90,7 @@ class Tracks:
     distance: NDArray[np.float32]
 
 
-def track(frames: Sequence[Pyramid], motions: Sequence[Motion], params: TrackParams) -> Tracks:
+def track(frames: Sequence[Pyramid], motions: Sequence[LevelDisplacements], params: TrackParams) -> Tracks:
     """Follow interest points of the first frame, and later ones, through all frames.
 
     Parameters
@@ -142,7 +142,7 @@ class _State:
         )
 
 
-def _advance(state: _State, frames: Sequence[Pyramid], motion: Motion, j: int, params: TrackParams) -> None:
+def _advance(state: _State, frames: Sequence[Pyramid], motion: LevelDisplacements, j: int, params: TrackParams) -> None:
     """Find all points of frame j - 1 in frame j."""
     predicted = state.expected + displacement_at(motion, state.expected)
     smooth, _ = fit_affinity(state.expected, predicted, _known(predicted), state.expected)
@@ -204,7 +204,7 @@ def _align(
     return np.where(good[:, None], place, np.nan), np.where(good, error, np.nan)
 
 
-def displacement_at(motion: Motion, points: Floats) -> Floats:
+def displacement_at(motion: LevelDisplacements, points: Floats) -> Floats:
     """Coarse displacement (n, 2) at points (n, 2), pixels: median of the defined ones among 3 x 3; NaN none."""
     k = 0.5**motion.level
     rows, cols = motion.column.shape
@@ -222,7 +222,7 @@ def displacement_at(motion: Motion, points: Floats) -> Floats:
 def _run(params: TrackParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     frames = [Pyramid.from_bundle(b) for b in inputs["frames"]]
     motions = [
-        Motion(np.asarray(b["column_disparity"]), np.asarray(b["row_disparity"]), int(b.meta["level"]))
+        LevelDisplacements(np.asarray(b["column_disparity"]), np.asarray(b["row_disparity"]), int(b.meta["level"]))
         for b in inputs["motions"]
     ]
     found = track(frames, motions, params)

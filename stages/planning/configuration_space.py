@@ -74,7 +74,7 @@ def _grow(canvas: Canvas, reach: float) -> None:
         canvas.spread(n, dr, dc)
 
 
-class Stand:
+class FreePlaces:
     """Where the vehicle may stand: its wheels and its middle laid over hazards once, for whatever is below it."""
 
     def __init__(

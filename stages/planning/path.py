@@ -43,7 +43,7 @@ from rille.stages.hazard.risk import HAZARDOUS, check_size
 from rille.stages.hazard.vehicle import Vehicle
 from rille.stages.planning import grid8
 from rille.stages.planning.path_ends import Point, check_end, chosen
-from rille.stages.planning.path_ground import GROUNDS, Ground
+from rille.stages.planning.path_ground import GROUNDS, PathMaps
 from rille.stages.planning.path_words import Maps, Route, describe
 from rille.stages.planning.row_graph import UNREACHED, Plan, plan, row_span
 from rille.stages.planning.row_grid import RowGrid
@@ -163,9 +163,9 @@ def _found(
     return found
 
 
-def _ground(maps: Maps, lattice: Lattice, grid: RowGrid, vehicle: Vehicle, p: PathParams) -> Ground:
+def _ground(maps: Maps, lattice: Lattice, grid: RowGrid, vehicle: Vehicle, p: PathParams) -> PathMaps:
     unit = p.height_step * vehicle.max_step
-    return Ground(maps, lattice, grid, vehicle, unit=unit, caution=p.caution, doubt=p.doubt, sure=p.sure)
+    return PathMaps(maps, lattice, grid, vehicle, unit=unit, caution=p.caution, doubt=p.doubt, sure=p.sure)
 
 
 def _by_rows(

@@ -9,7 +9,7 @@ from rille.stages.core.errors import InputError
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.risk import HAZARDOUS, UNKNOWN
 from rille.stages.hazard.vehicle import Vehicle
-from rille.stages.planning.path_ground import Ground
+from rille.stages.planning.path_ground import PathMaps
 from rille.stages.planning.path_words import Maps, hazard_words
 from rille.stages.planning.row_graph import nearest_middle, row_span
 
@@ -47,7 +47,7 @@ def _away(cells: NDArray[np.intp], row: int, col: int, cell: float) -> float:
     return float(np.hypot(cells[:, 0] - row, cells[:, 1] - col).min()) * cell
 
 
-def chosen(ground: Ground, below: str, start: Cell | None, target: Cell | None) -> tuple[Cell | None, Cell | None]:
+def chosen(ground: PathMaps, below: str, start: Cell | None, target: Cell | None) -> tuple[Cell | None, Cell | None]:
     """Ends as given; else, of the connected ground over most rows (that of the end that is given), the cell nearest to
     the middle of the first row, and the one nearest to that of the last.
 

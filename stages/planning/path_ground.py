@@ -15,7 +15,7 @@ from rille.stages.hazard.risk import CAUTION, HAZARDOUS, UNKNOWN, window_cells
 from rille.stages.hazard.vehicle import Vehicle
 from rille.stages.numeric.windows import window_mean
 from rille.stages.planning import grid8
-from rille.stages.planning.configuration_space import Stand
+from rille.stages.planning.configuration_space import FreePlaces
 from rille.stages.planning.row_grid import RowGrid
 
 Floats = NDArray[np.float64]
@@ -33,7 +33,7 @@ LARGE = 1 << 30
 """Heights above it are kept in 64 bits."""
 
 
-class Ground:
+class PathMaps:
     """The maps on a grid.
 
     ``unit``: metres of height that cost one; ``stand`` (row, col) float32 m, mean height under a wheel; ``height`` the
@@ -80,7 +80,7 @@ class Ground:
         if _lay(risk, reason, chance, self.stand, limit, *prices, unknown, self.closed, wheels, body, self.height,
                 self.toll):  # fmt: skip
             self.height = np.rint(np.where(self.closed, np.float32(0), self.stand) / np.float32(unit)).astype(np.int64)
-        self._stand = Stand(wheels, body, vehicle, grid.cell, unknown, self.closed)
+        self._stand = FreePlaces(wheels, body, vehicle, grid.cell, unknown, self.closed)
         self._ways: dict[str, Bytes] = {}
         self._parts: dict[str, tuple[NDArray[np.int32], Ints]] = {}
 

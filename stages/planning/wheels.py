@@ -28,7 +28,7 @@ BELLY_POINTS = 9
 
 
 @dataclass(frozen=True)
-class Ground:
+class HeightGrid:
     """Heights (row, col), metres, NaN unknown; node (row, col) is at x = x0 + col cell, y = y0 - row cell.
 
     ``resting`` (row, col): height of a wheel's lowest point where it rests above the node; ``step`` (row, col): range
@@ -43,7 +43,7 @@ class Ground:
     step: Floats
 
     @staticmethod
-    def of(height: NDArray[np.floating], x0: float, y0: float, cell: float, wheel_diameter: float) -> Ground:
+    def of(height: NDArray[np.floating], x0: float, y0: float, cell: float, wheel_diameter: float) -> HeightGrid:
         """Ground with what a wheel makes of it."""
         z = np.asarray(height, dtype=np.float64)
         radius = 0.5 * wheel_diameter
@@ -56,7 +56,7 @@ class Ground:
         reach = 0.25 * wheel_diameter / cell
         step = highest(z, reach) + highest(-z, reach)
         unknown = np.isnan(z)
-        return Ground(x0, y0, cell, z, np.where(unknown, np.nan, resting), np.where(unknown, np.nan, step))
+        return HeightGrid(x0, y0, cell, z, np.where(unknown, np.nan, resting), np.where(unknown, np.nan, step))
 
     def at(self, what: Floats, points: Floats) -> Floats:
         """Bilinear values (n,) of one of the arrays at points (n, 2); NaN outside or beside unknown nodes."""
@@ -70,14 +70,14 @@ class Ground:
         foot = (1 - v) * what[r + 1, c] + v * what[r + 1, c + 1]
         return np.where(inside, (1 - u) * top + u * foot, np.nan)
 
-    def part(self, x: tuple[float, float], y: tuple[float, float], wheel_diameter: float) -> Ground:
+    def part(self, x: tuple[float, float], y: tuple[float, float], wheel_diameter: float) -> HeightGrid:
         """The ground of a box alone, wheels recomputed."""
         c0, c1 = (int((v - self.x0) / self.cell) for v in x)
         r0, r1 = (int((self.y0 - v) / self.cell) for v in (y[1], y[0]))
         r0, r1 = max(r0, 0), min(r1 + 2, self.height.shape[0])
         c0, c1 = max(c0, 0), min(c1 + 2, self.height.shape[1])
         part = self.height[r0:r1, c0:c1]
-        return Ground.of(part, self.x0 + c0 * self.cell, self.y0 - r0 * self.cell, self.cell, wheel_diameter)
+        return HeightGrid.of(part, self.x0 + c0 * self.cell, self.y0 - r0 * self.cell, self.cell, wheel_diameter)
 
 
 def highest(z: Floats, reach: float) -> Floats:
@@ -135,7 +135,7 @@ class Measures:
     step: Floats
 
 
-def measured(ground: Ground, x: Floats, y: Floats, heading: Floats, vehicle: Vehicle) -> Measures:
+def measured(ground: HeightGrid, x: Floats, y: Floats, heading: Floats, vehicle: Vehicle) -> Measures:
     """The vehicle with its centre above points (n,), m, turned by ``heading`` (n,), rad to the left of y."""
     c, s = np.cos(heading)[:, None], np.sin(heading)[:, None]
 
@@ -160,7 +160,7 @@ def measured(ground: Ground, x: Floats, y: Floats, heading: Floats, vehicle: Veh
     return Measures(middle, rise, lean, np.arctan(np.hypot(lean, rise)), clearance, at(ground.step, wheels).max(axis=1))
 
 
-def stand(ground: Ground, x: float, y: float, heading: float, vehicle: Vehicle) -> Stand | None:
+def stand(ground: HeightGrid, x: float, y: float, heading: float, vehicle: Vehicle) -> Stand | None:
     """The vehicle with its centre above (x, y), turned by ``heading`` (rad, to the left of y); None: off the ground."""
     found = measured(ground, np.array([x]), np.array([y]), np.array([heading]), vehicle)
     if not np.isfinite(found.middle[0]):

@@ -12,13 +12,13 @@ from raising import raises
 from rille.datasets.mockup.obstacle import on_path
 from rille.datasets.mockup.rover import RoverParams, drive_leg, heading_of, images_at
 from rille.datasets.mockup.sequence import vehicle_at_scale
-from rille.stages.planning.wheels import Ground
+from rille.stages.planning.wheels import HeightGrid
 
 VEHICLE = vehicle_at_scale()
 EXACT = RoverParams(slip=0.0, slip_sigma=0.0, heading_sigma_deg=0.0, turn_sigma=0.0)
 PATH = np.array([[0.0, 0.0], [0.0, 0.1], [0.1, 0.2]])
 X, Y = np.meshgrid(np.arange(-0.5, 0.501, 0.004), np.arange(0.5, -0.501, -0.004))
-FLAT = Ground.of(0.0 * X, -0.5, 0.5, 0.004, VEHICLE.wheel_diameter)
+FLAT = HeightGrid.of(0.0 * X, -0.5, 0.5, 0.004, VEHICLE.wheel_diameter)
 
 
 def driven(p: RoverParams, turn: float = 0.0, seed: int = 0, believed: tuple[float, float, float] = (0.0, 0.0, 0.0)):

@@ -12,7 +12,7 @@ from rille.stages.hazard.risk import SAFE
 from rille.stages.hazard.vehicle import Vehicle
 from rille.stages.planning.local_planner.clearance import Footing
 from rille.stages.planning.local_planner.params import LegParams
-from rille.stages.planning.local_planner.views import View
+from rille.stages.planning.local_planner.views import FieldOfView
 
 ROVER = Vehicle(
     wheel_diameter=0.03, track=0.08, wheel_base=0.10, clearance=0.025, max_step=0.012, max_roughness=0.004, margin=0.01
@@ -24,13 +24,13 @@ X, Y = LATTICE.xy()[..., 0], LATTICE.xy()[..., 1]
 P = LegParams()
 
 
-def cameras() -> View:
+def cameras() -> FieldOfView:
     """Two of 83 degrees, 0.18 m above the ground and 0.1 m apart, which see it from 0.14 m before the middle on."""
     camera = Camera(180.0, 180.0, 159.5, 119.5, 320, 240)
     rig = Rig(camera, camera, RigidTransform(np.eye(3), np.array([-0.1, 0.0, 0.0])))
     c, s = math.cos(math.radians(32.0)), math.sin(math.radians(32.0))
     down = np.array([[1.0, 0.0, 0.0], [0.0, -s, c], [0.0, -c, -s]])
-    return View.of(rig, RigidTransform(down, np.array([-0.05, 0.05, 0.18])))
+    return FieldOfView.of(rig, RigidTransform(down, np.array([-0.05, 0.05, 0.18])))
 
 
 CAMERAS = cameras()

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from rille.stages.calibration.relative_orientation import Matches
+from rille.stages.calibration.relative_orientation import PointPairs
 from rille.stages.geometry.epipolar import corrected
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
 
@@ -42,7 +42,7 @@ def bed_depth(rays: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         return np.where(down > 0.09, height / down, np.inf)
 
 
-def matches(rig, depth, *, noise=0.2, seed=0, pair=0, samples=1200, outliers=0.0, field=None) -> Matches:
+def matches(rig, depth, *, noise=0.2, seed=0, pair=0, samples=1200, outliers=0.0, field=None) -> PointPairs:
     """Matches of the images that ``rig`` takes; ``field(u, v)`` is a row error over the image, -1..1 either way."""
     rng = np.random.default_rng([seed, pair])
     side = math.sqrt(rig.left.width * rig.left.height / samples)
@@ -60,7 +60,7 @@ def matches(rig, depth, *, noise=0.2, seed=0, pair=0, samples=1200, outliers=0.0
     left, right = left[inside], right[inside]
     wrong = rng.random(len(left)) < outliers
     right[wrong] += rng.uniform(-30, 30, (int(wrong.sum()), 2))
-    return Matches(pair, left, right)
+    return PointPairs(pair, left, right)
 
 
 def knocked(rig: Rig, pitch_deg=0.0, yaw_deg=0.0, roll_deg=0.0, across_deg=0.0, forward_deg=0.0) -> Rig:

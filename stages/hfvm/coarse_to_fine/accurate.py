@@ -59,6 +59,6 @@ def choose(params: HfvmParams) -> Solver:
     return AccurateSolver(plain, params)
 
 
-def _view(patch: Patch) -> paths.View:
+def _view(patch: Patch) -> paths.LevelView:
     assert patch.grey is not None
-    return paths.View(patch.words, compact.pack(patch.grey), np.ascontiguousarray(patch.grey))
+    return paths.LevelView(patch.words, compact.pack(patch.grey), np.ascontiguousarray(patch.grey))

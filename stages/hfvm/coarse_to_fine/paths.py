@@ -34,7 +34,7 @@ UP = 9
 
 
 @dataclass(frozen=True)
-class View:
+class LevelView:
     """What is known of one image at one level: both feature sets, grey values (float32)."""
 
     words: Words
@@ -57,8 +57,8 @@ class Weights:
 
 
 def propagate(
-    left: View,
-    right: View,
+    left: LevelView,
+    right: LevelView,
     start: tuple[AnyArray, AnyArray],
     up: tuple[AnyArray, AnyArray] | None,
     lines: AnyArray,

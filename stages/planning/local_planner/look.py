@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from rille.stages.planning.local_planner.ground import Ground
 from rille.stages.planning.local_planner.route import Piece, length_of, room_to_turn
-from rille.stages.planning.local_planner.views import Stand, View, bearing, looked
+from rille.stages.planning.local_planner.views import FieldOfView, Stand, bearing, looked
 
 Floats = NDArray[np.float64]
 Point = tuple[float, float]
@@ -39,13 +39,13 @@ class Target:
     (m) from which it was looked at already; ``unseen``: never from near, else it is doubtful though it was."""
 
     ground: Ground
-    view: View
+    view: FieldOfView
     points: Floats
     unseen: bool
     before: list[tuple[float, float]]
 
     @staticmethod
-    def of(ground: Ground, way: Sequence[Piece], first: int, view: View, stands: Sequence[Stand]) -> Target:
+    def of(ground: Ground, way: Sequence[Piece], first: int, view: FieldOfView, stands: Sequence[Stand]) -> Target:
         """What the first piece of a way that is not known needs; ``stands``: from where it looked so far."""
         points, unseen = ground.lacking(way, first)
         return Target(ground, view, points, unseen, looked(view, [*stands, (*ground.start, ground.heading)], points))

@@ -11,7 +11,7 @@ Place = tuple[float, float]
 
 
 @dataclass
-class Memory:
+class PlannerMemory:
     """``looks`` around since the last leg that was driven; ``closed`` places (m) about which unknown ground was looked
     at in vain; ``stands`` from which it has looked; ``reopened``: the closed places were tried once more, as the last
     way that is left."""

@@ -31,7 +31,7 @@ from rille.stages.geometry.lattice import Lattice
 from rille.stages.planning.local_planner.clearance import Footing
 from rille.stages.planning.local_planner.ground import Ground
 from rille.stages.planning.local_planner.look import ROUND, TWICE, Target
-from rille.stages.planning.local_planner.memory import Memory
+from rille.stages.planning.local_planner.memory import PlannerMemory
 from rille.stages.planning.local_planner.params import LegParams
 from rille.stages.planning.local_planner.route import (
     Piece,
@@ -44,7 +44,7 @@ from rille.stages.planning.local_planner.route import (
     vertices,
     within_turn,
 )
-from rille.stages.planning.local_planner.views import AHEAD, Stand, View
+from rille.stages.planning.local_planner.views import AHEAD, FieldOfView, Stand
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -86,9 +86,9 @@ def plan_leg(
     stand: Stand,
     goal: Point,
     params: LegParams,
-    memory: Memory | None = None,
+    memory: PlannerMemory | None = None,
     before: Before | None = None,
-    view: View = AHEAD,
+    view: FieldOfView = AHEAD,
 ) -> Leg:
     """The next leg.
 
@@ -107,7 +107,7 @@ def plan_leg(
     InputError
         Start or goal lies outside the map.
     """
-    start, heading, memory = (stand[0], stand[1]), stand[2], memory or Memory()
+    start, heading, memory = (stand[0], stand[1]), stand[2], memory or PlannerMemory()
     looks = memory.looks
     for name, point in (("start", start), ("goal", goal)):
         _check(footing.lattice, name, point)

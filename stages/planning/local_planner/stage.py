@@ -20,10 +20,10 @@ from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.classification import HAZARDOUS, UNKNOWN, UNSEEN_BIT
 from rille.stages.hazard.vehicle import Vehicle
 from rille.stages.planning.local_planner.clearance import Footing
-from rille.stages.planning.local_planner.memory import Memory
+from rille.stages.planning.local_planner.memory import PlannerMemory
 from rille.stages.planning.local_planner.params import LegParams
 from rille.stages.planning.local_planner.policy import Before, Leg, plan_leg, shortest
-from rille.stages.planning.local_planner.views import Stand, View
+from rille.stages.planning.local_planner.views import FieldOfView, Stand
 from rille.stages.terrain.occlusion_bounds import Bounds
 
 Mask = NDArray[np.bool_]
@@ -36,8 +36,8 @@ def next_leg(
     stand: Stand,
     goal: Point,
     params: LegParams,
-    memory: Memory,
-    view: View,
+    memory: PlannerMemory,
+    view: FieldOfView,
     before: Before | None = None,
     bounds: Bounds | None = None,
 ) -> Leg:
@@ -78,11 +78,11 @@ def _run(params: LegParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     goal = (float(args["goal"][0]), float(args["goal"][1]))
     closed = [(float(x), float(y)) for x, y in args["closed"]]
     stands = [(float(x), float(y), float(heading)) for x, y, heading in args["stands"]]
-    memory = Memory(looks=int(args["looks"]), closed=closed, stands=stands)
+    memory = PlannerMemory(looks=int(args["looks"]), closed=closed, stands=stands)
     before = None
     if "before" in inputs and len(inputs["before"]["rest_gear"]):
         before = np.asarray(inputs["before"]["rest"]), np.asarray(inputs["before"]["rest_gear"])
-    view = View.of(Rig.from_dict(inputs["rig"].meta["rig"]), T_vehicle_left)
+    view = FieldOfView.of(Rig.from_dict(inputs["rig"].meta["rig"]), T_vehicle_left)
     ceiling, bounds = inputs.get("ceiling"), None
     if ceiling is not None:
         bounds = Bounds(upper=np.asarray(ceiling["upper"]), lower=np.asarray(ceiling["lower"]))

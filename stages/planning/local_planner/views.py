@@ -24,20 +24,20 @@ MOST = 0.9
 
 
 @dataclass(frozen=True)
-class View:
+class FieldOfView:
     """The ground that all cameras see from a vehicle on level ground: where ``edges @ (right, ahead, 1)`` is positive,
     edges (edge, 3), metres in the vehicle's frame."""
 
     edges: Floats
 
     @staticmethod
-    def of(rig: Rig, T_vehicle_left: RigidTransform) -> View:
+    def of(rig: Rig, T_vehicle_left: RigidTransform) -> FieldOfView:
         """Of two cameras: a border of an image and the camera's centre span a plane; its line on the ground is an edge.
 
         ``T_vehicle_left``: of the left camera in the vehicle's frame, x right, y ahead, z up from the ground.
         """
         right = T_vehicle_left @ rig.T_right_left.inverse()
-        return View(np.concatenate([_edges(rig.left, T_vehicle_left), _edges(rig.right, right)]))
+        return FieldOfView(np.concatenate([_edges(rig.left, T_vehicle_left), _edges(rig.right, right)]))
 
     def sees(self, points: Floats, stand: Stand) -> Mask:
         """Which points (n, 2), m, lie in view from a place."""
@@ -61,11 +61,11 @@ def _edges(camera: Camera, T_vehicle_camera: RigidTransform) -> Floats:
     return np.column_stack([planes[:, :2], -planes @ T_vehicle_camera.translation])
 
 
-AHEAD = View(np.array([[0.0, 1.0, 0.0]]))
+AHEAD = FieldOfView(np.array([[0.0, 1.0, 0.0]]))
 """All that is before the middle of the vehicle."""
 
 
-def looked(view: View, stands: Iterable[Stand], points: Floats) -> list[tuple[float, float]]:
+def looked(view: FieldOfView, stands: Iterable[Stand], points: Floats) -> list[tuple[float, float]]:
     """From where points (n, 2), m, were in view: direction (rad) and distance (m) from their middle to those places."""
     return [bearing(points, stand) for stand in stands if view.holds(points, stand)]
 

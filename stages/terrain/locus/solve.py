@@ -50,7 +50,7 @@ class Matches:
     std: ArrayLike | None = None
 
 
-class Task:
+class PairArrays:
     """The arrays of one pair as the kernel wants them.
 
     ``sigma``: standard deviation of disparities that have none of their own, pixels; ``limits``: greatest residual and
@@ -102,7 +102,7 @@ class Task:
         return out
 
 
-def solve(task: Task, surface: Surface) -> Dem:
+def solve(task: PairArrays, surface: Surface) -> Dem:
     """Every cell of a surface from one disparity map, coarse to fine: a few coarse cells search the whole range."""
     cells = [np.unique(np.append(np.arange(0, n, COARSE), n - 1)) for n in (surface.rows, surface.cols)]
     z_range = task.z_range

@@ -30,7 +30,7 @@ from rille.stages.terrain.ground import view_ground
 from rille.stages.terrain.ground_frame import z_range as plane_z_range
 from rille.stages.terrain.locus.empty import explain
 from rille.stages.terrain.locus.refinement import refine, standard_deviation
-from rille.stages.terrain.locus.solve import Dem, Matches, Task, join, projections, solve
+from rille.stages.terrain.locus.solve import Dem, Matches, PairArrays, join, projections, solve
 from rille.stages.terrain.locus.uncertainty import from_both
 from rille.stages.terrain.locus.views import Views, views
 
@@ -157,7 +157,7 @@ def reconstruct(
     """
     maps = Matches(column_disparity, row_disparity, usable, disparity_std)
     told = z_range, params.sigma_disparity, (params.max_residual, params.max_jump)
-    out = solve(Task(maps, image, rig, T_surface_left, *told), surface)
+    out = solve(PairArrays(maps, image, rig, T_surface_left, *told), surface)
     seen = None if right is None else _views(image, right, rig, T_surface_left)
     apart = None
     if back is not None:
@@ -165,7 +165,7 @@ def reconstruct(
             raise InputError("RIL-381", "disparities of the right image are given without the image")
         turned = Rig(rig.right, rig.left, rig.T_right_left.inverse())
         T_surface_right = T_surface_left @ rig.T_right_left.inverse()
-        other = solve(Task(back, right, turned, T_surface_right, *told), surface)
+        other = solve(PairArrays(back, right, turned, T_surface_right, *told), surface)
         apart = out.elevation.astype(np.float64) - other.elevation
         out = join(out, other)
     if seen is not None and (params.refine_steps or back is not None):

@@ -9,7 +9,7 @@ from rig_scenes import knocked, matches, street_depth, street_rig
 from rille.stages.calibration.relative_orientation import (
     BLOCKS,
     Beliefs,
-    Matches,
+    PointPairs,
     _weigh,
     adjust,
     considered,
@@ -34,7 +34,7 @@ def test_matches_that_err_together_do_not_count_again():
     """Each match four times over: the information is that of one."""
     rig = street_rig()
     once = matches(rig, street_depth)
-    often = Matches(0, np.repeat(once.left, 4, axis=0), np.repeat(once.right, 4, axis=0))
+    often = PointPairs(0, np.repeat(once.left, 4, axis=0), np.repeat(once.right, 4, axis=0))
     one, four = (adjust(rig, [m], ANGLES, BELIEFS, rival=True).normal for m in (once, often))
     ratio = np.diag(four)[:5] / np.diag(one)[:5]
     assert np.all((ratio > 0.7) & (ratio < 1.5))

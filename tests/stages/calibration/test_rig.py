@@ -12,7 +12,7 @@ from rig_scenes import bed_depth, bed_rig, knocked, matches, street_depth, stree
 from terrain_scenes import toed_in_rig
 
 from rille.stages.calibration import rig as rig_stage
-from rille.stages.calibration.relative_orientation import RIG, Matches, linearised
+from rille.stages.calibration.relative_orientation import RIG, PointPairs, linearised
 from rille.stages.calibration.rig import RigParams, _drift, orient_rig
 from rille.stages.core.declare import Bundle
 from rille.stages.geometry.epipolar import NAMES
@@ -108,7 +108,7 @@ def test_convergent_rig_with_a_wrong_toe_in():
 def test_one_bad_pair_among_good_ones_does_not_pull():
     pairs = street(5, pitch_deg=-0.24)
     rng = np.random.default_rng(0)
-    pairs[2] = Matches(20, pairs[2].left, pairs[2].right + rng.uniform(-20, 20, pairs[2].right.shape))
+    pairs[2] = PointPairs(20, pairs[2].left, pairs[2].right + rng.uniform(-20, 20, pairs[2].right.shape))
     found = facts(street_rig(), pairs)
     assert found["parameters"][0]["value"] == pytest.approx(-0.24, abs=0.01)
 
@@ -131,7 +131,7 @@ def with_patch(pairs, at, patch=(400, 180), seed=0):
     wrong = corner & (rng.random(len(m.left)) < 0.3)
     right = m.right.copy()
     right[wrong, 1] += rng.uniform(1.0, 3.0, int(wrong.sum()))
-    return [*pairs[:at], Matches(m.pair, m.left, right), *pairs[at + 1 :]]
+    return [*pairs[:at], PointPairs(m.pair, m.left, right), *pairs[at + 1 :]]
 
 
 SCENES = {"street": (street_rig, street_depth), "bed": (bed_rig, bed_depth)}
@@ -157,7 +157,7 @@ def test_a_near_thing_that_mismatches_wholly_moves_no_rig():
     m = pairs[3]
     thing = (m.left[:, 0] - m.right[:, 0]) > 120
     assert thing.sum() > 40
-    pairs[3] = Matches(m.pair, m.left, m.right + np.outer(thing, [0.0, 2.0]))
+    pairs[3] = PointPairs(m.pair, m.left, m.right + np.outer(thing, [0.0, 2.0]))
     assert moves(facts(rig, pairs)) == []
 
 
@@ -195,7 +195,7 @@ def test_parameters_that_stand_in_for_each_other_do_not_move_the_rig():
 
 
 def test_swapped_images_lie_beyond_infinity():
-    pairs = [Matches(m.pair, m.right, m.left) for m in street(2)]
+    pairs = [PointPairs(m.pair, m.right, m.left) for m in street(2)]
     with raises("RIL-428"):
         facts(street_rig(), pairs)
 
@@ -212,7 +212,7 @@ def test_distortion_that_was_left_is_told():
 
 def test_pairs_with_few_matches_are_passed_over_and_told():
     pairs = street(2)
-    few = Matches(5, pairs[0].left[:20], pairs[0].right[:20])
+    few = PointPairs(5, pairs[0].left[:20], pairs[0].right[:20])
     found = facts(street_rig(), [*pairs, few])
     assert found["pairs"] == 2
     assert found["warnings"] == ["1 of 3 pairs have too few matches for the rig"]
@@ -237,7 +237,7 @@ def test_street_of_kitti_is_left_alone_and_repaired_when_knocked(data_dir):
     for image, mask, repaired in ((right, None, []), (bent, valid, ["pitch", "roll"])):
         d = match(left, image, right_valid=mask)
         points = thin(d.column_disparity, d.row_disparity, matched(d.validity), d.backmatch_error, 1500)
-        found = facts(sequence.rig, [Matches(20, *points)])
+        found = facts(sequence.rig, [PointPairs(20, *points)])
         assert [p["name"] for p in found["parameters"] if p["freed"]] == repaired
         assert found["residual_after_px"] < 0.7
 

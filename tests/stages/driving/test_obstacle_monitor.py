@@ -12,11 +12,11 @@ from rille.stages.core.declare import Bundle
 from rille.stages.core.validity import Validity
 from rille.stages.driving.obstacle_monitor import (
     STAGE,
+    LastModel,
     Obstacle,
     Points,
     ReflexParams,
-    Surface,
-    View,
+    ViewPair,
     look,
     obstacle,
     pairs,
@@ -59,7 +59,7 @@ def hit(pose: RigidTransform, pixels: Floats, block: tuple[float, float, float, 
     return points
 
 
-def view(y0: float, y1: float, block: tuple[float, float, float, float] | None, noise: float = 0.4) -> View:
+def view(y0: float, y1: float, block: tuple[float, float, float, float] | None, noise: float = 0.4) -> ViewPair:
     """Exact displacements of level 1 with noise, pixels of level 0."""
     rows, cols = 120, 160
     c, r = np.meshgrid((np.arange(cols) + 0.5) * 2 - 0.5, (np.arange(rows) + 0.5) * 2 - 0.5)
@@ -68,21 +68,21 @@ def view(y0: float, y1: float, block: tuple[float, float, float, float] | None, 
     moved += noise * np.random.default_rng(5).standard_normal(moved.shape)
     known = np.isfinite(moved).all(axis=1).reshape(rows, cols)
     u, v = (moved[:, k].reshape(rows, cols).astype(np.float32) for k in (0, 1))
-    return View(at(y0), at(y1), u, v, known, 1)
+    return ViewPair(at(y0), at(y1), u, v, known, 1)
 
 
-def surface(block: tuple[float, float, float, float] | None = None) -> Surface:
+def surface(block: tuple[float, float, float, float] | None = None) -> LastModel:
     z = np.zeros(LATTICE.shape)
     if block is not None:
         xy = LATTICE.xy()
         z[(np.abs(xy[..., 0] - block[0]) < block[2]) & (np.abs(xy[..., 1] - block[1]) < block[2])] = block[3]
-    return Surface.of(z, LATTICE, P.blur * ROVER.wheel_diameter)
+    return LastModel.of(z, LATTICE, P.blur * ROVER.wheel_diameter)
 
 
 NOTHING = np.zeros((0, 2))
 
 
-def found(v: View, s: Surface) -> Obstacle | None:
+def found(v: ViewPair, s: LastModel) -> Obstacle | None:
     return obstacle(look(v, s, CAMERA, T_VEHICLE_LEFT, ROVER, P), ROVER.wheel_diameter, P, NOTHING)[0]
 
 

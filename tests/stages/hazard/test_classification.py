@@ -17,13 +17,13 @@ from rille.stages.hazard.classification import (
     _table,
     classify,
 )
-from rille.stages.hazard.measures import MEASURES, Measure, Terrain
+from rille.stages.hazard.measures import MEASURES, HazardInput, Measure
 from rille.stages.numeric.extrema import running_max
 
 RULES = Rules(sigmas=1.25, caution=0.75, max_p=0.02, min_known=0.5)
 
 
-def random_terrain(seed: int, stride: int) -> Terrain:
+def random_terrain(seed: int, stride: int) -> HazardInput:
     """Cells whose measures are all below and above their limits somewhere, with gaps."""
     rng = np.random.default_rng(seed)
     cell = 0.001 if stride == 4 else 0.005
@@ -31,7 +31,7 @@ def random_terrain(seed: int, stride: int) -> Terrain:
     z[rng.random(z.shape) < 0.1] = np.nan
     z[:9] = np.nan
     std = rng.uniform(0.0, 0.002, z.shape).astype(np.float32)
-    return Terrain(z, z, std, cell, MODEL, 0.03)
+    return HazardInput(z, z, std, cell, MODEL, 0.03)
 
 
 @pytest.mark.parametrize("stride", [1, 4])
@@ -72,14 +72,14 @@ def test_classes_and_reasons_equal_a_plain_calculation(stride: int) -> None:
 def test_a_new_measure_is_one_row_and_its_kernel() -> None:
     """A negative obstacle: ground that falls away within two wheels, measured from the cell down."""
 
-    def drop(terrain: Terrain) -> np.ndarray:
+    def drop(terrain: HazardInput) -> np.ndarray:
         low = -running_max(-terrain.surface, 2 * terrain.reach)
         return np.nan_to_num(np.maximum(terrain.surface - low, 0.0))
 
     row = Measure("drop", 1 << 11, drop, "max_step", 0.05, 0.9, "drop", "drop", "height above the lowest ground near")
     z = np.zeros((120, 120), np.float32)
     z[:, 60:] = -0.02  # down by more than the 15 mm that the wheels climb
-    terrain = Terrain(z, z, np.zeros_like(z), 0.001, MODEL, 0.03)
+    terrain = HazardInput(z, z, np.zeros_like(z), 0.001, MODEL, 0.03)
     out = classify(terrain, np.zeros(z.shape, np.uint8), RULES, (*MEASURES, row))
     near = np.zeros(z.shape, bool)
     near[:, 30:60] = True  # two wheel radii of 15 mm before the edge, and nothing below it
@@ -87,7 +87,7 @@ def test_a_new_measure_is_one_row_and_its_kernel() -> None:
     assert (out["risk"][near] == HAZARDOUS).all()
     np.testing.assert_allclose(out["drop"][near], 0.02, atol=1e-7)
     assert np.nanmax(out["drop"][~near]) == 0.0
-    without = classify(Terrain(z, z, np.zeros_like(z), 0.001, MODEL, 0.03), np.zeros(z.shape, np.uint8), RULES)
+    without = classify(HazardInput(z, z, np.zeros_like(z), 0.001, MODEL, 0.03), np.zeros(z.shape, np.uint8), RULES)
     assert (without["risk"] <= out["risk"]).all()
     assert (without["risk"][:, 31] < HAZARDOUS).all()
 

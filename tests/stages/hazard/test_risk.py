@@ -13,7 +13,7 @@ from vehicles import MODEL
 
 from rille.stages.core.declare import Bundle, check_outputs
 from rille.stages.geometry.lattice import Lattice
-from rille.stages.hazard.measures import BITS, MEASURES, Terrain
+from rille.stages.hazard.measures import BITS, MEASURES, HazardInput
 from rille.stages.hazard.risk import (
     CAUTION,
     FILLED_BIT,
@@ -293,6 +293,6 @@ def test_the_stage_assembles_tiles() -> None:
 def test_flat_ground_beside_rough_ground_has_every_measure() -> None:
     z = np.zeros((120, 120), dtype=np.float32)
     z[:40, :40] = np.random.default_rng(0).normal(0.0, 1e-3, (40, 40))  # running sums round; behind it nothing is left
-    terrain = Terrain(z, z, np.zeros_like(z), 0.002, MODEL, 0.06)
+    terrain = HazardInput(z, z, np.zeros_like(z), 0.002, MODEL, 0.06)
     assert all(np.isfinite(m.kernel(terrain)).all() for m in MEASURES)
     assert np.isfinite(terrain.window_noise()).all()

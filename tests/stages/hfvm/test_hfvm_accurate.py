@@ -25,7 +25,7 @@ def view(image):
     from rille.stages.hfvm.level import features
 
     words, _ = features.pack(image, ACC.weights)
-    return paths.View(words, compact.pack(image), image)
+    return paths.LevelView(words, compact.pack(image), image)
 
 
 def stairs(shape=(60, 120), near=-12, far=-4, edges=(40, 80)):

@@ -5,7 +5,7 @@ import pytest
 from motion_scenes import CAMERA, drive, motion, share_kept, shift, turned, zoom
 
 from rille.stages.geometry.geometry import rotation_exp
-from rille.stages.odometry.covisibility import Seen, Step
+from rille.stages.odometry.covisibility import Covisibility, Step
 
 # The edge of the image cuts blocks, of which the part inside is taken by the distance of the centre: exact for shifts,
 # and off by a few per cent of a block (17 x 12 of them) where they are scaled or turned.
@@ -14,7 +14,7 @@ CUT = 0.015
 
 def after(*bundles):
     steps = [Step.from_bundle(b) for b in bundles]
-    seen = Seen.all_of(steps[0])
+    seen = Covisibility.all_of(steps[0])
     for step in steps:
         seen = seen.after(step)
     return seen

@@ -11,7 +11,7 @@ from rille.stages.imaging.pyramid import PyramidParams, build
 from rille.stages.odometry.affinity import common_similarity, fit_affinity, known_median
 from rille.stages.odometry.track import (
     STAGE,
-    Motion,
+    LevelDisplacements,
     TrackParams,
     displacement_at,
     track,
@@ -56,7 +56,7 @@ def motions(places, error=0.0):
         scale = here(centre + 1.0)[0] - here(centre)[0]  # undo "here" to reach the first frame
         first = centre + (grid - here(centre)) / scale
         d = (there(first) - grid + error).astype(np.float32)
-        out.append(Motion(d[..., 0].copy(), d[..., 1].copy(), 2))
+        out.append(LevelDisplacements(d[..., 0].copy(), d[..., 1].copy(), 2))
     return out
 
 
@@ -129,7 +129,7 @@ def test_holes_in_the_motion_are_bridged_or_lose_the_point():
 
 def test_untextured_frames_give_no_track_and_no_error():
     flat = build(np.full((ROWS, COLS), 90.0, np.float32), PyramidParams(levels=3))
-    still = Motion(np.zeros((50, 65), np.float32), np.zeros((50, 65), np.float32), 2)
+    still = LevelDisplacements(np.zeros((50, 65), np.float32), np.zeros((50, 65), np.float32), 2)
     found = track([flat, flat], [still], PARAMS)
     assert found.points.shape == (0, 2, 2)
 
@@ -143,7 +143,7 @@ def test_number_of_motions_must_fit():
 def test_displacement_is_looked_up_at_the_pixel_centre_of_the_coarse_level():
     column = np.full((5, 5), 7.0, np.float32)
     column[2, 2] = np.nan
-    motion = Motion(column, np.arange(25, dtype=np.float32).reshape(5, 5), 2)
+    motion = LevelDisplacements(column, np.arange(25, dtype=np.float32).reshape(5, 5), 2)
     # Coarse pixel 2 reaches from 7.5 to 11.5.
     at = np.array([[7.6, 7.6], [1.5, 1.5], [np.nan, 3.0]])
     found = displacement_at(motion, at)
@@ -219,7 +219,7 @@ def test_a_turn_that_goes_on_does_not_lose_the_points():
     for a, b in itertools.pairwise(angles):
         middle = np.array([COLS / 2, ROWS / 2])
         d = ((grid - middle) @ in_plane(b - a).T + middle - grid + 1.0).reshape(*cols.shape, 2)
-        steps.append(Motion(d[..., 0].astype(np.float32), d[..., 1].astype(np.float32), 2))
+        steps.append(LevelDisplacements(d[..., 0].astype(np.float32), d[..., 1].astype(np.float32), 2))
     found = track(frames, steps, PARAMS)
     off = errors(found, places)
     first = found.birth == 0

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from vehicles import SHORT
 
-from rille.stages.planning.configuration_space import ACROSS, STEPS, STRAIGHT, Stand, grown, widened
+from rille.stages.planning.configuration_space import ACROSS, STEPS, STRAIGHT, FreePlaces, grown, widened
 
 CELL = 0.01
 
@@ -57,7 +57,8 @@ def test_a_wider_margin_frees_no_cell(seed: int, margins: tuple[float, float], b
     rng = np.random.default_rng(seed)
     wheel, body, unknown = (rng.random((30, 34)) < 0.02 for _ in range(3))
     narrow, wide = (
-        Stand(wheel, body, SHORT.model_copy(update={"margin": m}), CELL, unknown).ways(below) for m in sorted(margins)
+        FreePlaces(wheel, body, SHORT.model_copy(update={"margin": m}), CELL, unknown).ways(below)
+        for m in sorted(margins)
     )
     assert ((wide & ~narrow) == 0).all()
 
@@ -68,14 +69,14 @@ def test_where_a_vehicle_may_stand_by_hand() -> None:
     wheel[10, 10] = True
     vehicle = SHORT.model_copy(update={"wheel_base": 0.04, "track": 0.06})
     none = np.zeros_like(wheel)
-    ways = Stand(wheel, none, vehicle, CELL).ways()
+    ways = FreePlaces(wheel, none, vehicle, CELL).ways()
     expected = {STRAIGHT: {(8, 7), (8, 13), (12, 7), (12, 13)}, ACROSS: {(7, 8), (13, 8), (7, 12), (13, 12)}}
     for way, cells in expected.items():
         assert {(int(r), int(c)) for r, c in np.argwhere((ways & way) == 0)} == cells
     # a hazard to the whole vehicle closes its own cell alone; the outline is 7 cells long and 8 wide, rounded outwards
-    np.testing.assert_array_equal(np.argwhere(Stand(none, wheel, vehicle, CELL).ways() == 0), [[10, 10]])
+    np.testing.assert_array_equal(np.argwhere(FreePlaces(none, wheel, vehicle, CELL).ways() == 0), [[10, 10]])
     wide = np.zeros((41, 41), dtype=bool)
-    ways = Stand(wide, wide, vehicle, CELL, np.pad(wheel, 10)).ways("outline")
+    ways = FreePlaces(wide, wide, vehicle, CELL, np.pad(wheel, 10)).ways("outline")
     inner = (ways & STRAIGHT)[10:31, 10:31]
     assert np.abs(np.argwhere(inner == 0) - 10).max(axis=0).tolist() == [4, 4]
     assert not ways[:4].any()  # off the map
@@ -88,7 +89,7 @@ def test_where_a_vehicle_may_stand_equals_a_look_at_every_wheel(seed: int, margi
     rng = np.random.default_rng(seed)
     wheel, body, unknown = (rng.random((23, cols)) < 0.03 for _ in range(3))
     vehicle = SHORT.model_copy(update={"wheel_base": 0.07, "track": 0.05, "margin": margin})
-    stand = Stand(wheel, body, vehicle, CELL, unknown)
+    stand = FreePlaces(wheel, body, vehicle, CELL, unknown)
     near, middle = grown(wheel, margin / CELL), grown(body, margin / CELL)
     found = {below: stand.ways(below) for below in ("outline", "wheels", "middle")}
     for bit, dr, dc in STEPS:

@@ -16,18 +16,18 @@ from rille.stages.core.declare import Bundle
 from rille.stages.hazard.risk import HAZARDOUS, REASONS, SAFE, UNKNOWN
 from rille.stages.planning.local_planner.clearance import DOUBT_WEIGHT, PARTS, Footing
 from rille.stages.planning.local_planner.ground import Ground
-from rille.stages.planning.local_planner.memory import Memory
+from rille.stages.planning.local_planner.memory import PlannerMemory
 from rille.stages.planning.local_planner.params import LegParams
 from rille.stages.planning.local_planner.policy import Leg, plan_leg, shortest
 from rille.stages.planning.local_planner.route import length_of, through
 from rille.stages.planning.local_planner.stage import next_leg, seen_so_far, shortest_way
 from rille.stages.planning.local_planner.views import AHEAD as ANYWHERE
-from rille.stages.planning.local_planner.views import Stand, View
+from rille.stages.planning.local_planner.views import FieldOfView, Stand
 from rille.stages.terrain.occlusion_bounds import Bounds
 
 SEEN = P.model_copy(update={"blind": 0.0})
 """Without the rule for what is near, which on this small map is half of it."""
-TIRED = Memory(looks=P.looks)
+TIRED = PlannerMemory(looks=P.looks)
 """Of a vehicle that has looked as often as it may."""
 
 
@@ -63,7 +63,7 @@ def test_over_a_hole_between_walls_it_goes_where_lines_of_sight_pass_low_enough(
 
     def driven(top: float) -> Leg:
         bounds = Bounds(np.where(hole, np.float32(top), seen), seen)
-        return next_leg(Bundle(maps, meta), None, AT, GOAL, P, Memory(), CAMERAS, bounds=bounds)
+        return next_leg(Bundle(maps, meta), None, AT, GOAL, P, PlannerMemory(), CAMERAS, bounds=bounds)
 
     over, before = driven(0.9 * ROVER.clearance), driven(1.1 * ROVER.clearance)
     assert over.path[-1, 1] > 0.16
@@ -156,9 +156,9 @@ def test_it_looks_around_then_closes_what_stays_unknown_and_goes_another_way() -
     risk = ground(((np.abs(Y - 0.15) < 0.07) & (X < 0.1), UNKNOWN))
     start, goal = (-0.3, 0.0, 0.0), (-0.3, 0.8)
     for looks in range(P.looks):
-        assert plan_leg(risk, start, goal, SEEN, Memory(looks)).verdict == "look"
+        assert plan_leg(risk, start, goal, SEEN, PlannerMemory(looks)).verdict == "look"
     places: list[tuple[float, float]] = []
-    while (leg := plan_leg(risk, start, goal, SEEN, Memory(P.looks, places))).where is not None:
+    while (leg := plan_leg(risk, start, goal, SEEN, PlannerMemory(P.looks, places))).where is not None:
         places.append(leg.where)
         assert len(places) < 12
     assert leg.verdict in ("turn", "drive")
@@ -170,7 +170,7 @@ def test_it_looks_around_then_closes_what_stays_unknown_and_goes_another_way() -
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 2**31), st.floats(-math.pi, math.pi), st.sampled_from([ANYWHERE, CAMERAS]))
 def test_no_leg_comes_near_a_hazard_or_onto_unknown_ground_or_turns_too_far(
-    seed: int, heading: float, view: View
+    seed: int, heading: float, view: FieldOfView
 ) -> None:
     rng = np.random.default_rng(seed)
     risk = np.full(LATTICE.shape, SAFE, np.uint8)
@@ -252,7 +252,7 @@ def test_a_kept_way_is_not_given_up_for_rounding() -> None:
     beside = ground((X > 0.045, HAZARDOUS))  # the right wheels of a way straight ahead lack a part of the margin
     straight, even = np.array([START, GOAL]), P.model_copy(update={"near_price": 0.0})
     for closed in ([], [(0.0, 0.25)]):
-        leg = plan_leg(beside, AT, GOAL, even, Memory(closed=closed), before=(straight, AHEAD[:1]))
+        leg = plan_leg(beside, AT, GOAL, even, PlannerMemory(closed=closed), before=(straight, AHEAD[:1]))
         assert leg.verdict == "drive"
         assert leg.path == pytest.approx(np.array([START, (0.0, P.length * ROVER.wheel_base)]))
     # but never onto what is hazardous by sigma alone
@@ -273,7 +273,7 @@ def judged(hazardous: np.ndarray, chance: float) -> Bundle:
 def test_where_probable_hazards_close_every_way_those_next_to_certain_do() -> None:
     wall = np.abs(Y - 0.3) < 0.03
     for chance, verdict in ((0.93, "drive"), (0.999, "look")):
-        leg = next_leg(judged(wall, chance), None, AT, GOAL, P, Memory(), CAMERAS)
+        leg = next_leg(judged(wall, chance), None, AT, GOAL, P, PlannerMemory(), CAMERAS)
         assert leg.verdict == verdict
         assert (len(leg.way) > 1) == (verdict == "drive")
 
@@ -450,9 +450,9 @@ def test_what_lies_nearer_than_its_view_is_looked_at_from_farther_back() -> None
     assert CAMERAS.sees(beneath, (x, y, leg.turn)).all()
     assert not CAMERAS.sees(beneath, (x, y + 0.02, leg.turn)).all(), "and no farther than that"
     # what it saw from there already, and from nearer, is not looked at again
-    vain = plan_leg(before, AT, GOAL, P, Memory(stands=[(x, y, leg.turn)]), view=CAMERAS)
+    vain = plan_leg(before, AT, GOAL, P, PlannerMemory(stands=[(x, y, leg.turn)]), view=CAMERAS)
     assert vain.verdict == "closed"
-    aside = plan_leg(before, AT, GOAL, P, Memory(stands=[(x - 0.15, y, -0.5)]), view=CAMERAS)
+    aside = plan_leg(before, AT, GOAL, P, PlannerMemory(stands=[(x - 0.15, y, -0.5)]), view=CAMERAS)
     assert aside.gear.tolist() == [-1], "from another side it may show"
     blocked = ground((band, UNKNOWN), (walls | (Y < -0.08), HAZARDOUS))
     assert plan_leg(blocked, AT, GOAL, P, view=CAMERAS).gear.tolist() == []
@@ -485,7 +485,9 @@ def test_it_turns_to_what_comes_next_before_it_is_too_near_to_see_it_and_then_dr
     assert len(leg.path) == 1
     assert not CAMERAS.sees(FIRST, (*start, 0.0)).any()
     assert CAMERAS.sees(FIRST, (*start, leg.turn)).any()
-    again = plan_leg(around_a_corner(), (*start, leg.turn), goal, P, Memory(1, stands=[(*start, 0.0)]), view=CAMERAS)
+    again = plan_leg(
+        around_a_corner(), (*start, leg.turn), goal, P, PlannerMemory(1, stands=[(*start, 0.0)]), view=CAMERAS
+    )
     assert again.verdict == "drive", "it did not help"
 
 

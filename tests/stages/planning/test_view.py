@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_from_angles
-from rille.stages.planning.local_planner.views import RIM, View, looked
+from rille.stages.planning.local_planner.views import RIM, FieldOfView, looked
 
 LEFT = Camera(180.0, 175.0, 150.0, 125.0, 320, 240)
 RIGHT = Camera(190.0, 190.0, 159.5, 119.5, 320, 240)
@@ -44,14 +44,14 @@ def test_what_is_in_view_lies_in_both_images(toe: float, roll: float, stand: tup
     there = np.column_stack([right, ahead, np.zeros(len(points))])
     in_left = T_vehicle_left.inverse().apply(there)
     want = inside(rig.left, in_left, RIM) & inside(rig.right, rig.T_right_left.apply(in_left), RIM)
-    seen = View.of(rig, T_vehicle_left).sees(points, stand)
+    seen = FieldOfView.of(rig, T_vehicle_left).sees(points, stand)
     assert 20 < want.sum() < 1500
     assert (seen != want).sum() <= 1, "but for rounding at an edge"
 
 
 def test_from_where_points_were_in_view_has_a_side_and_a_distance() -> None:
     rig, T_vehicle_left = rig_of(0.0, 0.0)
-    view, points = View.of(rig, T_vehicle_left), np.array([(0.0, 0.3), (0.02, 0.3), (-0.02, 0.3)])
+    view, points = FieldOfView.of(rig, T_vehicle_left), np.array([(0.0, 0.3), (0.02, 0.3), (-0.02, 0.3)])
     ahead, beside, beyond = (0.0, 0.0, 0.0), (0.3, 0.0, math.pi / 4), (0.0, 0.6, 0.0)
     assert looked(view, [ahead, beside, beyond], points) == [
         pytest.approx((-math.pi / 2, 0.3)),

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rille.stages.hazard.vehicle import Vehicle
-from rille.stages.planning.wheels import Ground, highest, stand
+from rille.stages.planning.wheels import HeightGrid, highest, stand
 
 ROVER = Vehicle(
     wheel_diameter=0.03, track=0.08, wheel_base=0.10, clearance=0.025, max_step=0.012, max_roughness=0.004, margin=0.01
@@ -17,8 +17,8 @@ CELL = 0.002
 X, Y = np.meshgrid(np.arange(-0.2, 0.2001, CELL), np.arange(0.2, -0.2001, -CELL))
 
 
-def ground(z: np.ndarray) -> Ground:
-    return Ground.of(z, -0.2, 0.2, CELL, ROVER.wheel_diameter)
+def ground(z: np.ndarray) -> HeightGrid:
+    return HeightGrid.of(z, -0.2, 0.2, CELL, ROVER.wheel_diameter)
 
 
 @pytest.mark.parametrize(("gx", "gy"), [(0.0, 0.0), (0.1, 0.0), (0.0, -0.2), (0.15, 0.1)])
@@ -69,7 +69,7 @@ def test_beside_the_ground_it_does_not_stand() -> None:
 def test_the_step_is_judged_over_half_a_wheel_on_every_grid(cell: float) -> None:
     x = np.arange(-0.2, 0.2001, cell)
     z = np.tile(0.4 * np.abs(x), (len(x), 1))  # a valley along which it drives with its left wheels
-    found = stand(Ground.of(z, -0.2, 0.2, cell, ROVER.wheel_diameter), 0.1, 0.0, 0.0, ROVER)
+    found = stand(HeightGrid.of(z, -0.2, 0.2, cell, ROVER.wheel_diameter), 0.1, 0.0, 0.0, ROVER)
     assert found is not None
     assert found.step == pytest.approx(0.4 * 0.5 * ROVER.wheel_diameter, abs=1e-9)
 
