@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 import tempfile
+from typing import Any
 
+from rille.pipeline.cli import app as commands
 from rille.pipeline.engine.packages import installed
 
 FAST = "RILLE_DOCS_FAST" in os.environ
@@ -27,7 +29,6 @@ extensions = [
     "sphinx.ext.autodoc",
     "sphinx.ext.napoleon",
     "sphinx_gallery.gen_gallery",
-    "cyclopts.ext.sphinx",
 ]
 exclude_patterns = ["_build", "gallery", "examples/*.ipynb", "**/sg_execution_times.rst", "sg_execution_times.rst"]
 
@@ -72,3 +73,16 @@ sphinx_gallery_conf = {
     "show_signature": False,
     "plot_gallery": not FAST,
 }
+
+
+def command_line(_app: Any, page: str, source: list[str]) -> None:
+    """Put the reference of all commands, as the program's own parser describes them, into their page."""
+    if page == "reference/command-line":
+        text = commands.generate_docs(heading_level=2, flatten_commands=True, usage_name="rille")
+        text = text[text.index("**Commands**") :].replace("#rille-install", "#rille---install")
+        source[0] = source[0].replace("<!-- commands -->", text)
+
+
+def setup(app: Any) -> None:
+    """Connect what Sphinx calls."""
+    app.connect("source-read", command_line)

@@ -1,15 +1,5 @@
 """Reconstruct from Python: the same tasks, cache and files as ``rille reconstruct``.
 
->>> import rille
->>> sequence = rille.open("mockup-short", mockup={"frames": 3})
->>> len(sequence), round(sequence.rig.baseline, 3)
-(3, 0.097)
->>> run = rille.reconstruct(sequence, hfvm={"preset": "fast"})  # doctest: +SKIP
->>> run.terrain.elevation.sel(x=0.0, y=0.5, method="nearest")  # doctest: +SKIP
->>> run.trajectory.position.sel(axis="y")  # doctest: +SKIP
->>> run.metrics["trajectory_drift"]["value"]  # doctest: +SKIP
->>> rille.open_run("runs/mockup-short/latest").show()  # doctest: +SKIP
-
 A program that starts workers needs the usual ``if __name__ == "__main__":`` around what it does.
 """
 
@@ -49,18 +39,42 @@ def reconstruct(
 
     Parameters
     ----------
-    seq : an open sequence, or what :func:`rille.open` takes.
-    client : ``distributed.Client`` of the cluster that computes; None: workers of this machine, one a core.
-    frames : ``START:STOP[:STEP]``; all by default.
-    runs : folder of the results.
-    cache : folder or bucket of the artifacts; ``RILLE_CACHE`` or ``.rille/cache`` by default.
-    executor : as ``--executor``, where there is no client.
-    settings : parameters by section, e.g. ``locus={"cell_size": 0.002}``.
+    seq
+        An open sequence, or what :func:`rille.open` takes.
+    client
+        ``distributed.Client`` of the cluster that computes; None: workers of this machine, one a core.
+    frames
+        ``START:STOP[:STEP]``; all by default.
+    runs
+        Folder of the results.
+    cache
+        Folder or bucket of the artifacts; ``RILLE_CACHE`` or ``.rille/cache`` by default.
+    executor
+        As ``--executor``, where there is no client.
+    settings
+        Parameters by section, e.g. ``locus={"cell_size": 0.002}``.
 
     Raises
     ------
     RilleError
         The input, a parameter or the machine does not permit it; the message says what, where, and what to do.
+
+    Examples
+    --------
+    >>> import rille, tempfile
+    >>> small = {"frames": 2, "image_width": 190, "image_height": 174, "focal_length": 200.0}
+    >>> with tempfile.TemporaryDirectory() as folder:  # doctest: +ELLIPSIS
+    ...     run = rille.reconstruct(
+    ...         rille.open("mockup-short", mockup=small),
+    ...         runs=folder,
+    ...         cache=f"{folder}/cache",
+    ...         executor="inline",
+    ...         locus={"cell_size": 0.005},
+    ...     )
+    ...     again = rille.open_run(run.folder)
+    ...     print(again.trajectory.sizes["frame"], again.terrain.elevation.units)
+    /...computed..., cached 0, missing 0
+    2 m
     """
     from rille.pipeline.commands.options import cache_folder, prepare
 
@@ -106,13 +120,22 @@ def open_run(path: str | Path, runs: str | Path = "runs") -> Run:
 
     Parameters
     ----------
-    path : its folder, or as a command takes it: ``SEQUENCE`` (the latest of it), ``SEQUENCE/ID``, ``ID``, ``latest``.
-    runs : folder of all runs.
+    path
+        Its folder, or as a command takes it: ``SEQUENCE`` (the latest of it), ``SEQUENCE/ID``, ``ID``, ``latest``.
+    runs
+        Folder of all runs.
 
     Raises
     ------
     ConfigError
         There is no such run.
+
+    Examples
+    --------
+    >>> import rille
+    >>> rille.open_run("mockup-shrot", runs="no/such/folder")
+    Traceback (most recent call last):
+    rille.stages.core.errors.ConfigError: no run 'mockup-shrot': no/such/folder holds none
     """
     from rille.pipeline.runs import lookup
 

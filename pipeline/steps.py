@@ -123,8 +123,10 @@ def open(path: str | Path, **settings: Settings) -> StereoSequence:
 
     Parameters
     ----------
-    path : a name from ``rille datasets``, a folder, or a manifest.
-    settings : parameters of the sequence by section, e.g. ``mockup={"frames": 5}``.
+    path
+        A name from ``rille datasets``, a folder, or a manifest.
+    settings
+        Parameters of the sequence by section, e.g. ``mockup={"frames": 5}``.
 
     Raises
     ------
@@ -133,8 +135,12 @@ def open(path: str | Path, **settings: Settings) -> StereoSequence:
     ConfigError
         A parameter is unknown, or not permitted.
 
-    >>> len(open("mockup-short"))
-    9
+    Examples
+    --------
+    >>> import rille
+    >>> sequence = rille.open("mockup-short")
+    >>> len(sequence), sequence[0].left.dims
+    (9, ('row', 'col'))
     """
     return StereoSequence(registry.open_sequence(str(path), settings))
 
@@ -144,8 +150,10 @@ def match(left: Any, right: Any, **hfvm: Any) -> xarray.Dataset:
 
     Parameters
     ----------
-    left, right : images of a :class:`StereoPair`, or arrays (row, col), uint8, uint16 or floating point 0..255.
-    hfvm : parameters of section ``hfvm``, e.g. ``preset="fast"``.
+    left, right
+        Images of a :class:`StereoPair`, or arrays (row, col), uint8, uint16 or floating point 0..255.
+    hfvm
+        Parameters of section ``hfvm``, e.g. ``preset="fast"``.
 
     Returns
     -------
@@ -159,6 +167,16 @@ def match(left: Any, right: Any, **hfvm: Any) -> xarray.Dataset:
         An image is not grey.
     ConfigError
         A parameter is unknown, or not permitted.
+
+    Examples
+    --------
+    Any two arrays do; here the right image shows the same, 7 columns to the left and 2 rows down.
+
+    >>> import numpy as np, rille
+    >>> left = np.random.default_rng(1).integers(0, 256, (120, 160)).astype(np.uint8)
+    >>> disparity = rille.match(left, np.roll(left, (2, -7), (0, 1)))
+    >>> [round(float(disparity[name].median()), 1) for name in ("column_disparity", "row_disparity")]
+    [-7.0, 2.0]
     """
     _prepare()
     from rille.pipeline.flow import config, tiles
@@ -185,8 +203,10 @@ def terrain(disparity: xarray.Dataset, pair: StereoPair, **locus: Any) -> xarray
 
     Parameters
     ----------
-    disparity : of :func:`match`, of this pair.
-    locus : parameters of section ``locus``, e.g. ``cell_size=0.01``.
+    disparity
+        Of :func:`match`, of this pair.
+    locus
+        Parameters of section ``locus``, e.g. ``cell_size=0.01``.
 
     Returns
     -------
@@ -199,6 +219,17 @@ def terrain(disparity: xarray.Dataset, pair: StereoPair, **locus: Any) -> xarray
         The pair shows no ground.
     InputError
         The disparity is not that of an image of this size.
+
+    Examples
+    --------
+    The cameras stand 0.18 m above the ground.
+
+    >>> import rille
+    >>> small = {"frames": 1, "image_width": 190, "image_height": 174, "focal_length": 200}
+    >>> pair = rille.open("mockup-short", mockup=small)[0]
+    >>> dem = rille.terrain(rille.match(pair.left, pair.right, preset="fast"), pair, cell_size=0.005)
+    >>> round(float(dem.elevation.median()), 2), dem.elevation.units
+    (-0.18, 'm')
     """
     from rille.pipeline.flow.reconstruction import vertical
     from rille.stages.terrain.locus import stage as locus_stage
@@ -223,15 +254,29 @@ def hazards(dem: xarray.Dataset, vehicle: Settings | str | Path | None = None, *
 
     Parameters
     ----------
-    dem : of :func:`terrain`.
-    vehicle : limits and sizes (metres, degrees), as in section ``vehicle``, or a TOML file of them; None: that of the
+    dem
+        Of :func:`terrain`.
+    vehicle
+        Limits and sizes (metres, degrees), as in section ``vehicle``, or a TOML file of them; None: that of the
         sequence.
-    risk : parameters of section ``risk``.
+    risk
+        Parameters of section ``risk``.
 
     Returns
     -------
     xarray.Dataset
         ``risk`` (0 safe, 1 caution, 2 hazard, 3 unknown), ``p_hazard``, ``reason`` (bits) and the measures.
+
+    Examples
+    --------
+    >>> import rille
+    >>> small = {"frames": 1, "image_width": 190, "image_height": 174, "focal_length": 200}
+    >>> pair = rille.open("mockup-short", mockup=small)[0]
+    >>> dem = rille.terrain(rille.match(pair.left, pair.right, preset="fast"), pair, cell_size=0.005)
+    >>> agile = rille.hazards(dem, vehicle={"max_slope_deg": 30, "max_step": 0.02})
+    >>> timid = rille.hazards(dem, vehicle={"max_slope_deg": 5, "max_step": 0.005})
+    >>> bool((agile.risk == 2).sum() < (timid.risk == 2).sum())
+    True
     """
     from rille.pipeline.flow import config
     from rille.stages.hazard import risk as risk_stage
@@ -258,9 +303,12 @@ def path(
 
     Parameters
     ----------
-    hazards : of :func:`hazards`.
-    goal, start : x, y, metres, in the frame of the elevation model; None: the last row ahead, the first row.
-    path : parameters of section ``path``.
+    hazards
+        Of :func:`hazards`.
+    goal, start
+        X, y, metres, in the frame of the elevation model; None: the last row ahead, the first row.
+    path
+        Parameters of section ``path``.
 
     Returns
     -------
@@ -271,6 +319,18 @@ def path(
     ------
     InputError
         Goal or start lies outside the map, in a hazard or on unknown ground.
+
+    Examples
+    --------
+    >>> import rille
+    >>> small = {"frames": 1, "image_width": 190, "image_height": 174, "focal_length": 200}
+    >>> pair = rille.open("mockup-short", mockup=small)[0]
+    >>> dem = rille.terrain(rille.match(pair.left, pair.right, preset="fast"), pair, cell_size=0.005)
+    >>> rover = {"wheel_diameter": 0.02, "track": 0.04, "wheel_base": 0.04, "clearance": 0.02, "max_step": 0.015}
+    >>> hazards = rille.hazards(dem, vehicle={**rover, "max_slope_deg": 30, "max_roughness": 0.01, "margin": 0.0})
+    >>> found = rille.path(hazards, start=(0.05, 0.59), goal=(0.195, 0.63))
+    >>> found.path[-1].values.round(3)[:2].tolist()
+    [0.195, 0.63]
     """
     from rille.stages.planning import path as path_stage
 
