@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterator
+from importlib import resources
 from pathlib import Path
 
 import numpy as np
@@ -99,3 +100,18 @@ def test_a_phone_in_the_dark_shows_no_page_wider_than_itself(page: Path, tmp_pat
         assert phone.run("document.querySelector('[data-at=flat]').clientHeight") > 200
     finally:
         phone.close()
+
+
+@pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
+@pytest.mark.parametrize("width", [390, 1280])
+def test_axe_finds_no_violation(page: Path, tmp_path: Path, width: int, dark: bool) -> None:
+    axe = resources.files("axe_core_python").joinpath("axe.min.js").read_text(encoding="utf-8")
+    shown = Browser(tmp_path, width, 844, dark=dark)
+    try:
+        shown.open(page)
+        shown.run("document.querySelectorAll('details').forEach((d) => { d.open = true; })")
+        shown.run(axe + "; 0")
+        found = shown.run("axe.run().then((r) => r.violations.map((v) => [v.id, v.nodes[0].html]))")
+        assert found == []
+    finally:
+        shown.close()
