@@ -66,5 +66,5 @@ $(VENV)/.docs: $(STAMP)
 	@touch $@
 
 clean: ## remove caches of tools and build leftovers; keeps .venv, runs and artifacts
-	rm -rf build dist docs/_build docs/examples .pytest_cache .mypy_cache .ruff_cache
+	rm -rf build dist docs/_build docs/examples docs/gallery/runs .pytest_cache .mypy_cache .ruff_cache
 	find . -name __pycache__ -not -path './$(VENV)/*' -prune -exec rm -rf {} +

@@ -13,10 +13,9 @@ FAST = "RILLE_DOCS_FAST" in os.environ
 """Whether examples are shown and not executed."""
 
 WORK = tempfile.TemporaryDirectory(prefix="rille-docs-")
-"""Folder of the runs and the cache of all examples."""
+"""Folder of the cache of all examples."""
 
 os.environ["RILLE_CACHE"] = f"{WORK.name}/cache"
-os.environ["RILLE_EXAMPLES"] = WORK.name
 os.environ.pop("RILLE_DATA", None)  # the site needs no data
 
 project = "Rille"
@@ -52,6 +51,7 @@ myst_heading_anchors = 3
 nb_execution_mode = "off" if FAST else "force"
 nb_execution_timeout = 300
 nb_execution_raise_on_error = True
+nb_execution_in_temp = True
 nb_merge_streams = True
 
 autodoc_typehints = "description"

@@ -68,6 +68,7 @@ def run_blocks(page: Path, folder: Path, cache: Path, data: Path | None) -> None
     """Run the blocks of a page one after the other in a folder, as a reader would."""
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
     env = {**os.environ, "PATH": path, "RILLE_CACHE": str(cache), "MPLBACKEND": "agg"}
+    env.pop("RILLE_DATA", None)  # a reader has the folders that the page names, and no more
     for number, block in enumerate(b for b in blocks(page) if not b.reason):
         for wanted in block.data:
             if data is None or not (data / wanted).is_dir():

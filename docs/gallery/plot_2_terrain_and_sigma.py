@@ -28,7 +28,9 @@ figure, axes = plt.subplots(1, 3, figsize=(11, 4), layout="constrained")
 axes[0].imshow(pair.left, cmap="gray")
 axes[0].set_title("left image")
 axes[0].axis("off")
-for ax, name, cmap in zip(axes[1:], ("elevation", "elevation_std"), ("terrain", "magma"), strict=True):
+for ax, name, cmap in zip(
+    axes[1:], ("elevation", "elevation_std"), ("terrain", "magma"), strict=True
+):
     drawn = ax.imshow(1000 * dem[name], cmap=cmap, extent=extent)
     figure.colorbar(drawn, ax=ax, label="mm")
     ax.set(title=name, xlabel="x [m]", ylabel="y [m]")

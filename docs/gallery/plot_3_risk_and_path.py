@@ -9,7 +9,6 @@ Five pairs are merged into one terrain. The ground is judged for a vehicle, and 
 # Reconstruct a short sequence. The vehicle's limits are in metres and degrees.
 
 import json
-import os
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -21,12 +20,22 @@ small = {"frames": 5, "image_width": 285, "image_height": 260, "focal_length": 3
 run = rille.reconstruct(
     rille.open("mockup-short", mockup=small),
     executor="inline",
-    runs=os.path.join(os.environ.get("RILLE_EXAMPLES", "."), "runs"),
     locus={"cell_size": 0.004},
-    vehicle={"name": "toy rover", "wheel_diameter": 0.03, "track": 0.08, "wheel_base": 0.1, "clearance": 0.03},
+    vehicle={
+        "name": "toy rover",
+        "wheel_diameter": 0.03,
+        "track": 0.08,
+        "wheel_base": 0.1,
+        "clearance": 0.03,
+    },
     crosscheck={"enabled": False},
 )
-print({name: run.metrics[name]["value"] for name in ("safe", "caution", "hazardous", "unknown")})
+print(
+    {
+        name: run.metrics[name]["value"]
+        for name in ("safe", "caution", "hazardous", "unknown")
+    }
+)
 
 # %%
 # ``risk.tif`` holds the class of each cell and the probability that the exact ground breaks a limit.
@@ -35,9 +44,15 @@ with rasterio.open(run.folder / "risk.tif") as source:
     names, box = source.descriptions, source.bounds
     bands = dict(zip(names, source.read(), strict=True))
 features = json.loads((run.folder / "path.geojson").read_text())["features"]
-lines = [np.array(f["geometry"]["coordinates"]) for f in features if f["geometry"]["type"] == "LineString"]
+lines = [
+    np.array(f["geometry"]["coordinates"])
+    for f in features
+    if f["geometry"]["type"] == "LineString"
+]
 
-colours = np.array([(0.45, 0.72, 0.42), (0.96, 0.80, 0.32), (0.80, 0.25, 0.20), (0.88, 0.88, 0.88)])
+colours = np.array(
+    [(0.45, 0.72, 0.42), (0.96, 0.80, 0.32), (0.80, 0.25, 0.20), (0.88, 0.88, 0.88)]
+)
 extent = (box.left, box.right, box.bottom, box.top)
 figure, axes = plt.subplots(1, 2, figsize=(9, 5), layout="constrained")
 axes[0].imshow(colours[bands["class"].astype(int)], extent=extent)

@@ -9,8 +9,6 @@ overlapping pair of models, and compares them with what the standard deviations 
 # %%
 # Reconstruct nine frames and read the audit from the report.
 
-import os
-
 import matplotlib.pyplot as plt
 import numpy as np
 
@@ -20,7 +18,6 @@ small = {"frames": 9, "image_width": 285, "image_height": 260, "focal_length": 3
 run = rille.reconstruct(
     rille.open("mockup-short", mockup=small),
     executor="inline",
-    runs=os.path.join(os.environ.get("RILLE_EXAMPLES", "."), "runs"),
     locus={"cell_size": 0.004},
     select={"stride": 2},
     crosscheck={"enabled": False},
@@ -41,6 +38,12 @@ for seam in seams:
 labels = [f"{seam['other']}-{seam['pair']}" for seam in seams]
 figure, ax = plt.subplots(figsize=(8, 3.5), layout="constrained")
 ax.bar(labels, [1000 * seam["systematic"] for seam in seams], label="bias and tilt, RMS")
-ax.plot(labels, [1000 * seam["expected"] for seam in seams], "k_", markersize=18, label="expected difference of a cell")
+ax.plot(
+    labels,
+    [1000 * seam["expected"] for seam in seams],
+    "k_",
+    markersize=18,
+    label="expected difference of a cell",
+)
 ax.set(xlabel="pair of models", ylabel="[mm]")
 ax.legend()

@@ -10,7 +10,6 @@ does not grow with the length of the sequence. ``terrain.zarr`` keeps the tiles 
 # Cells of 1 mm give several tiles.
 
 import json
-import os
 
 import matplotlib.pyplot as plt
 
@@ -20,7 +19,6 @@ small = {"frames": 9, "image_width": 285, "image_height": 260, "focal_length": 3
 run = rille.reconstruct(
     rille.open("mockup-short", mockup=small),
     executor="inline",
-    runs=os.path.join(os.environ.get("RILLE_EXAMPLES", "."), "runs"),
     locus={"cell_size": 0.001},
     select={"stride": 2},
     crosscheck={"enabled": False},
@@ -32,7 +30,9 @@ run = rille.reconstruct(
 rows = [json.loads(line) for line in (run.folder / "ledger.jsonl").read_text().splitlines()]
 tiles = [row for row in rows if row.get("stage") == "merge"]
 for tile in tiles:
-    print(f"{tile['label']}: models {len(tile['inputs']['dems'])}, writes {tile['bytes'] / 1e6:.1f} MB")
+    print(
+        f"{tile['label']}: models {len(tile['inputs']['dems'])}, writes {tile['bytes'] / 1e6:.1f} MB"
+    )
 
 # %%
 # ``run.terrain`` reads nothing yet: its arrays are dask arrays, a chunk a tile.
