@@ -1,7 +1,8 @@
 """Paper for the figures: axes of a known size without layout passes, colours, units, limits, encoding.
 
 Matplotlib is imported when the first figure is drawn. Every panel is one image, so that panels stand beside each other
-on a wide screen and below each other on a phone.
+on a wide screen and below each other on a phone. Drawings are SVG, sharp on any screen; their paper is clear and their
+ink follows the reader's theme, see ``DARK``.
 """
 
 from __future__ import annotations
@@ -9,9 +10,11 @@ from __future__ import annotations
 import base64
 import io
 import math
+import re
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,9 +25,9 @@ Image = NDArray[Any]
 Extent = tuple[float, float, float, float]
 """x_min, x_max, y_min, y_max."""
 
-DPI = 160
+DPI = 240
 WIDTH = 4.6
-"""Inches; 736 pixels, about twice what a panel takes on the screen."""
+"""Inches; 1104 pixels, twice what a panel takes on the screen."""
 MAX_PIXELS = 700
 """Longest side of an array that is drawn; larger ones are averaged first."""
 UNDEFINED = "#e9e9ec"
@@ -34,6 +37,22 @@ MEASURED, INTERPOLATED = "#2f6f9f", "#f0b84a"
 ESTIMATE, REFERENCE, MARK = "#0b4f8a", "#d1731a", "#111111"
 OTHER, RIGHT = "#2c8a5b", "#333333"
 """Another program's answer, the right camera."""
+INK, PAPER = "#1d1f24", "#fffffe"
+ON_MAP, TRUE_ON_MAP = "#124f90", "#d9781e"
+"""Estimate and truth on a map: maps have the same colours by day and by night."""
+DARK = {
+    INK: "#e6e4df",
+    PAPER: "#1d2026",
+    "#333333": "#d8d6d1",
+    "#444444": "#b9bcc3",
+    "#555555": "#8b9099",
+    "#dddddd": "#383c45",
+    UNDEFINED: "#2b2f37",
+    ESTIMATE: "#7db7ea",
+    REFERENCE: "#f0a050",
+    OTHER: "#6cc79b",
+}
+"""What a dark theme puts in the place of a colour of a drawing and its legend."""
 
 
 @dataclass(frozen=True)
@@ -60,6 +79,11 @@ def _style() -> None:
         {
             "font.size": 9,
             "font.family": ["DejaVu Sans"],
+            "svg.fonttype": "none",  # letters stay letters, in the reader's font where this one is not there
+            "svg.hashsalt": "rille",
+            "text.color": INK,
+            "legend.facecolor": PAPER,
+            "axes.facecolor": "none",
             "axes.edgecolor": "#555555",
             "axes.linewidth": 0.7,
             "axes.labelcolor": "#333333",
@@ -75,7 +99,7 @@ def figure(width: float, height: float) -> Any:
     from matplotlib.figure import Figure
 
     _style()
-    fig = Figure(figsize=(width, height), dpi=DPI, facecolor="white")
+    fig = Figure(figsize=(width, height), dpi=DPI, facecolor="none")
     FigureCanvasAgg(fig)
     return fig
 
@@ -139,6 +163,8 @@ def _wiped(sheet: tuple[Any, Any, Any]) -> tuple[Any, Any, Any]:
     for ax in sheet[1:]:
         for artist in [] if ax is None else [*ax.images, *ax.lines, *ax.collections, *ax.texts]:
             artist.remove()
+        if ax is not None:
+            ax.set_facecolor("none")
     return sheet
 
 
@@ -148,17 +174,19 @@ def color_bar(drawn: Any, cax: Any, label: str, *, integer: bool = False) -> Non
 
     low, high = drawn.get_clim()
     strip = np.linspace(low, high, 256)[None]
-    cax.imshow(strip, cmap=drawn.cmap, vmin=low, vmax=high, extent=(low, high, 0, 1), aspect="auto")
+    cax.imshow(
+        strip, cmap=drawn.cmap, vmin=low, vmax=high, extent=(low, high, 0, 1), aspect="auto", interpolation="none"
+    )
     cax.set_yticks([])
     cax.xaxis.set_major_locator(MaxNLocator(nbins=6, integer=integer))
     cax.set_xlabel(label, labelpad=1)
 
 
-def color_map(name: str, undefined: str = UNDEFINED) -> Any:
-    """Colour map of matplotlib, with a colour for what is undefined."""
+def color_map(name: str) -> Any:
+    """Colour map of matplotlib; what is undefined is clear."""
     import matplotlib
 
-    return matplotlib.colormaps[name].with_extremes(bad=undefined)
+    return matplotlib.colormaps[name].with_extremes(bad="none")
 
 
 def ramp(name: str) -> NDArray[np.uint8]:
@@ -178,7 +206,7 @@ def scale_bar(ax: Any, extent: Extent) -> None:
     ax.plot([x, x + length], [y, y], color=MARK, linewidth=2.5, solid_capstyle="butt", zorder=10)
     words = f"{length:g} m" if length >= 1 else f"{100 * length:g} cm"
     box = {"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": "none", "alpha": 0.8}
-    ax.annotate(words, (x, y), (0, 5), textcoords="offset points", fontsize=8, zorder=10, bbox=box)
+    ax.annotate(words, (x, y), (0, 5), textcoords="offset points", fontsize=8, color=MARK, zorder=10, bbox=box)
 
 
 def round_length(value: float) -> float:
@@ -219,9 +247,46 @@ def metres_or_mm(values: Image) -> tuple[float, str]:
 
 
 def encode(fig: Any, alt: str, *, photo: bool = False) -> Panel:
-    """Figure to a :class:`Panel`: PNG with at most 256 colours for drawings, JPEG for photographs."""
-    fig.canvas.draw()
-    return panel(np.ascontiguousarray(np.asarray(fig.canvas.buffer_rgba())[..., :3]), alt, photo=photo)
+    """Figure to a :class:`Panel`: SVG, its pictures with loss where ``photo``."""
+    out = io.StringIO()
+    fig.savefig(out, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
+    text = re.sub(r'"data:image/png;base64,([^"]+)"', lambda m: f'"{_smaller(m[1], photo)}"', out.getvalue())
+    text = text[text.index("<svg") :].replace("<defs>", f"<defs><style>{theme()}</style>", 1)
+    width, height = (round(96 * inches) for inches in fig.get_size_inches())
+    return Panel("data:image/svg+xml," + quote(themed(text), safe=" !$&'()*+,-./:;=?@[]{}|"), alt, width, height)
+
+
+def _smaller(png: str, photo: bool) -> str:
+    from PIL import Image as Pillow
+
+    return _address(Pillow.open(io.BytesIO(base64.b64decode(png))), photo)
+
+
+def _address(picture: Any, photo: bool, quality: int = 82) -> str:
+    """Picture as the ``data:`` address of a WebP, with loss where ``photo``."""
+    out = io.BytesIO()
+    picture.save(out, "WEBP", lossless=not photo, quality=quality if photo else 60, method=2)
+    return "data:image/webp;base64," + base64.b64encode(out.getvalue()).decode("ascii")
+
+
+def themed(text: str) -> str:
+    """Text of SVG or CSS with the colours of ``DARK`` by name, so that they follow the theme."""
+    for color in DARK:
+        text = text.replace(color, f"var(--c{color[1:]})")
+    return text
+
+
+def theme() -> str:
+    """Rules of CSS that say the names of :func:`themed` for either theme."""
+    light, dark = (
+        ":root{" + "".join(f"--c{c[1:]}:{_rgb(shown)};" for c, shown in pairs) + "}"
+        for pairs in (((c, c) for c in DARK), DARK.items())
+    )
+    return f"{light}@media(prefers-color-scheme:dark){{{dark}}}"
+
+
+def _rgb(color: str) -> str:
+    return "rgb({},{},{})".format(*(int(color[k : k + 2], 16) for k in (1, 3, 5)))
 
 
 def panel(rgb: Image, alt: str, *, photo: bool = False) -> Panel:
@@ -229,17 +294,7 @@ def panel(rgb: Image, alt: str, *, photo: bool = False) -> Panel:
     from PIL import Image as Pillow
 
     height, width = rgb.shape[:2]
-    picture = Pillow.fromarray(rgb)
-    out = io.BytesIO()
-    if photo:
-        picture.save(out, "JPEG", quality=82)
-    else:
-        picture.quantize(256, method=Pillow.Quantize.FASTOCTREE, dither=Pillow.Dither.NONE).save(
-            out, "PNG", optimize=False
-        )
-    kind = "jpeg" if photo else "png"
-    uri = f"data:image/{kind};base64,{base64.b64encode(out.getvalue()).decode('ascii')}"
-    return Panel(uri, alt, round(width * 96 / DPI), round(height * 96 / DPI))
+    return Panel(_address(Pillow.fromarray(rgb), photo), alt, round(width * 96 / DPI), round(height * 96 / DPI))
 
 
 def fitted(pixels: Image, *, scale: int = 1) -> Image:

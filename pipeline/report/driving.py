@@ -112,8 +112,8 @@ def strip(scene: Scene) -> Block | None:
         (canvas.CAUTION, "caution"),
         (canvas.HAZARDOUS, "hazardous"),
         (canvas.UNKNOWN, "unknown"),
-        (canvas.ESTIMATE, "estimated track"),
-        (canvas.REFERENCE, "true track"),
+        (canvas.ON_MAP, "estimated track"),
+        (canvas.TRUE_ON_MAP, "true track"),
     )
     table = Table(head, tuple(rows), frozenset({0, 1, 2, 4, 5}))
     return Block("Drive", "The drive, stop by stop", caption, tuple(panels), legend, table, strip=True)
@@ -193,8 +193,8 @@ def column(s: Shown, alt: str) -> Panel:
         axes[1].plot(s.path[:, 0], s.path[:, 1], color="white", linewidth=4)
         axes[1].plot(s.path[:, 0], s.path[:, 1], color=canvas.MARK, linewidth=2)
     low, high = ranges.ground_limits(s.elevation)
-    _map(axes[2], s.elevation, whole, whole, cmap=canvas.color_map("gray", "white"), vmin=low, vmax=high)
-    for track, shade, width in ((s.truth, canvas.REFERENCE, 4.0), (s.estimate, canvas.ESTIMATE, 1.6)):
+    _map(axes[2], s.elevation, whole, whole, cmap=canvas.color_map("gray"), vmin=low, vmax=high)
+    for track, shade, width in ((s.truth, canvas.TRUE_ON_MAP, 4.0), (s.estimate, canvas.ON_MAP, 1.6)):
         if track is not None:
             axes[2].plot(track[:, 0], track[:, 1], color=shade, linewidth=width)
     for ax in axes[1:]:
@@ -208,7 +208,7 @@ def _near(at: tuple[float, float], reach: float) -> Extent:
 
 
 def _map(ax: Any, values: Floats, extent: Extent, shown: Extent, **style: Any) -> None:
-    ax.imshow(values, extent=extent, aspect="auto", interpolation="nearest", **style)
+    ax.imshow(values, extent=extent, aspect="auto", interpolation="none", **style)
     ax.set_xlim(shown[0], shown[1])
     ax.set_ylim(shown[2], shown[3])
 

@@ -1,7 +1,7 @@
 """The figures, one function each: plain arrays in, one encoded :class:`~rille.pipeline.report.canvas.Panel` out.
 
-Maps have metres on both axes, row 0 at the greatest y; images have row 0 on top. What is undefined is light grey in
-maps of measured values and white in an ortho image (as in the paper). Large arrays are averaged before drawing.
+Maps have metres on both axes, row 0 at the greatest y; images have row 0 on top. What is undefined is clear: a
+light grey by day, a dark one by night. Large arrays are averaged before drawing.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def disparity(values: Floats, label: str, alt: str) -> Panel:
     """One component of the disparity (row, col), pixels, NaN undefined, with its colour bar (Figure 6)."""
     fig, ax, cax = canvas.image_axes(values.shape, bar=True)
     low, high = ranges.limits(values)
-    style = {"cmap": canvas.color_map("viridis"), "vmin": low, "vmax": high, "interpolation": "nearest"}
+    style = {"cmap": canvas.color_map("viridis"), "vmin": low, "vmax": high, "interpolation": "none"}
     drawn = ax.imshow(canvas.shrink(values), aspect="auto", **style)
     canvas.color_bar(drawn, cax, label)
     return canvas.encode(fig, alt, photo=True)
@@ -52,10 +52,10 @@ def validity(classes: Bytes, alt: str) -> Panel:
 
 
 def ortho(grey: Floats, extent: Extent, alt: str) -> Panel:
-    """Ortho image (row, col), grey 0..255, NaN white (Figure 7, left)."""
+    """Ortho image (row, col), grey 0..255, NaN clear (Figure 7, left)."""
     fig, ax, _ = canvas.map_axes(extent)
     low, high = ranges.limits(grey, 0.5, 99.5)
-    _show(ax, grey, extent, cmap=canvas.color_map("gray", "white"), vmin=low, vmax=high)
+    _show(ax, grey, extent, cmap=canvas.color_map("gray"), vmin=low, vmax=high)
     canvas.scale_bar(ax, extent)
     return canvas.encode(fig, alt, photo=True)
 
@@ -89,7 +89,7 @@ def risk_map(risk: Bytes, path: Floats | None, extent: Extent, alt: str, *, far:
         size = max(2.0, min(12.0, 500.0 / len(far)))
         yes, no = far[far[:, 2] > 0], far[far[:, 2] <= 0]
         ax.scatter(no[:, 0], no[:, 1], s=size, marker="s", color="#3b3b3b", linewidths=0, zorder=5)
-        ax.scatter(yes[:, 0], yes[:, 1], s=size, marker="s", color=canvas.ESTIMATE, linewidths=0, zorder=5)
+        ax.scatter(yes[:, 0], yes[:, 1], s=size, marker="s", color=canvas.ON_MAP, linewidths=0, zorder=5)
     canvas.scale_bar(ax, extent)
     return canvas.encode(fig, alt)
 
@@ -208,7 +208,8 @@ def error_map(
 
 
 def _show(ax: Any, values: Floats, extent: Extent, **style: Any) -> Any:
-    return ax.imshow(canvas.shrink(values), extent=extent, aspect="auto", zorder=1, interpolation="nearest", **style)
+    ax.set_facecolor(canvas.UNDEFINED)
+    return ax.imshow(canvas.shrink(values), extent=extent, aspect="auto", zorder=1, interpolation="none", **style)
 
 
 def _greys() -> Any:
@@ -277,7 +278,7 @@ def residual_map(points: Floats, values: Floats, size: tuple[int, int], bound: f
     fig, ax, cax = canvas.image_axes((size[1], size[0]), bar=True)
     colors = canvas.color_map("PuOr")
     drawn = ax.imshow(
-        grid.reshape(rows, cols), cmap=colors, vmin=-bound, vmax=bound, aspect="auto", interpolation="nearest"
+        grid.reshape(rows, cols), cmap=colors, vmin=-bound, vmax=bound, aspect="auto", interpolation="none"
     )
     canvas.color_bar(drawn, cax, label)
     return canvas.encode(fig, alt)

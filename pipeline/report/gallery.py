@@ -71,7 +71,7 @@ def _disparities(scene: Scene) -> Block | None:
     panels.append(figures.validity(classes, f"How the disparity of each pixel of {name} came about: {words}"))
     caption = (
         f"Left image of the first basic pair ({name}); row and column disparities of its pixels, right minus left, in "
-        "pixels, light grey where undefined; and which of them were measured in both directions, which interpolated. "
+        "pixels, blank where undefined; and which of them were measured in both directions, which interpolated. "
         "Nothing was rectified, so rows may differ too."
     )
     colors = (canvas.MEASURED, canvas.INTERPOLATED, canvas.UNDEFINED)
@@ -102,7 +102,7 @@ def _terrain(scene: Scene) -> Block | None:
     )
     caption = (
         f"First: ortho image merged from {pairs} basic pairs, cells of {length(world.lattice.cell)}; undefined and "
-        "occluded cells are white. Second: elevation, bright is high; unknown and hazardous cells are "
+        "occluded cells are blank. Second: elevation, bright is high; unknown and hazardous cells are "
         f"black{path}. World frame: x right and y ahead of the first left camera, which is at (0, 0)."
     )
     return Block(

@@ -15,7 +15,7 @@ from typing import Any
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.export.catalogue import listed
 from rille.pipeline.export.view import RunView
-from rille.pipeline.report import tables
+from rille.pipeline.report import canvas, tables
 from rille.pipeline.report.block import Figure
 from rille.pipeline.report.summary import summarise
 from rille.pipeline.report.words import coordinate, metres, number, quantity, seconds, share
@@ -85,12 +85,14 @@ def render(
         "share": share,
         "metres": metres,
         "coordinate": coordinate,
+        "themed": canvas.themed,
     }
     blocks = {figure.block.name: figure.block for figure in figures if figure.block is not None}
     chapters = [(title, anchor, [blocks[n] for n in names if n in blocks]) for title, anchor, names in CHAPTERS]
     rows, together = tables.table_2(view)
     return env.get_template("template.html").render(
         facts=facts,
+        theme=canvas.theme(),
         map=blocks.get("Map"),
         chapters=[c for c in chapters if c[2] or c[1] in ALWAYS],
         tiles=_tiles(facts["metrics"]),
