@@ -57,12 +57,16 @@ DARK = {
 
 @dataclass(frozen=True)
 class Panel:
-    """One encoded image: ``uri`` is a ``data:`` address, ``width`` and ``height`` are CSS pixels."""
+    """One encoded image: ``uri`` is a ``data:`` address, ``width`` and ``height`` are CSS pixels.
+
+    ``frame``: the stop that it shows, -1 for pictures of something else.
+    """
 
     uri: str
     alt: str
     width: int
     height: int
+    frame: int = -1
 
     @property
     def size(self) -> int:
@@ -259,10 +263,10 @@ def encode(fig: Any, alt: str, *, photo: bool = False) -> Panel:
 def _smaller(png: str, photo: bool) -> str:
     from PIL import Image as Pillow
 
-    return _address(Pillow.open(io.BytesIO(base64.b64decode(png))), photo)
+    return address(Pillow.open(io.BytesIO(base64.b64decode(png))), photo)
 
 
-def _address(picture: Any, photo: bool, quality: int = 82) -> str:
+def address(picture: Any, photo: bool, quality: int = 82) -> str:
     """Picture as the ``data:`` address of a WebP, with loss where ``photo``."""
     out = io.BytesIO()
     picture.save(out, "WEBP", lossless=not photo, quality=quality if photo else 60, method=2)
@@ -294,7 +298,7 @@ def panel(rgb: Image, alt: str, *, photo: bool = False) -> Panel:
     from PIL import Image as Pillow
 
     height, width = rgb.shape[:2]
-    return Panel(_address(Pillow.fromarray(rgb), photo), alt, round(width * 96 / DPI), round(height * 96 / DPI))
+    return Panel(address(Pillow.fromarray(rgb), photo), alt, round(width * 96 / DPI), round(height * 96 / DPI))
 
 
 def fitted(pixels: Image, *, scale: int = 1) -> Image:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rille.pipeline.export import ranges
-from rille.pipeline.report import canvas
+from rille.pipeline.report import canvas, stops
 from rille.pipeline.report.block import Block, Table
 from rille.pipeline.report.canvas import Extent, Panel
 from rille.pipeline.report.gather import Scene
@@ -83,7 +83,7 @@ def strip(scene: Scene) -> Block | None:
             stop.event != "" and meta["verdict"] != "goal",
         )
         alt = f"Stop {stop.index} at frame {stop.frame}, {metres(meta['left_m'])} from the goal: {meta['verdict']}"
-        panels.append(column(shown, alt))
+        panels.append(replace(column(shown, alt), frame=stop.frame))
         off = None if truth is None else float(np.hypot(*(estimate[upto - 1] - truth[upto - 1])))
         rows.append(
             (
@@ -107,6 +107,9 @@ def strip(scene: Scene) -> Block | None:
         "far with the vehicle's track, estimated (blue) and true (orange)."
     )
     caption += _fixed(scene)
+    every, panels = len(panels), stops.within(panels)
+    if len(panels) < every:
+        caption += f" {len(panels)} of {every} stops are shown, so that the page stays below 5 MB."
     legend = (
         (canvas.SAFE, "safe"),
         (canvas.CAUTION, "caution"),
@@ -183,7 +186,7 @@ def column(s: Shown, alt: str) -> Panel:
         ax.set_axis_off()
         axes.append(ax)
         edge -= gap
-    color = canvas.HAZARDOUS if s.event else canvas.MARK
+    color = canvas.HAZARDOUS if s.event else canvas.INK
     fig.text(0.5, 1 - 0.6 * top / total, s.title, ha="center", va="center", fontsize=9, color=color)
     axes[0].imshow(s.image, cmap="gray", vmin=0, vmax=255, aspect="auto")
     colors = np.array([_rgb(c) for c in (canvas.SAFE, canvas.CAUTION, canvas.HAZARDOUS, canvas.UNKNOWN)])
@@ -200,7 +203,7 @@ def column(s: Shown, alt: str) -> Panel:
     for ax in axes[1:]:
         ax.plot(*s.at, "o", markersize=5, markerfacecolor=canvas.MARK, markeredgecolor="white")
         ax.plot(*s.goal, "*", markersize=9, markerfacecolor="#ffd34d", markeredgecolor=canvas.MARK)
-    return canvas.encode(fig, alt)
+    return canvas.encode(fig, alt, photo=True)
 
 
 def _near(at: tuple[float, float], reach: float) -> Extent:

@@ -27,7 +27,7 @@ CELLS = 24
 
 def photo(image: Floats, alt: str) -> Panel:
     """A camera image; ``image`` (row, col) grey or (row, col, 3), of 8 or 16 bits or float 0..255."""
-    return canvas.panel(canvas.fitted(_grey(image)), alt, photo=True)
+    return canvas.panel(canvas.fitted(grey(image)), alt, photo=True)
 
 
 def disparity(values: Floats, label: str, alt: str) -> Panel:
@@ -47,7 +47,7 @@ def validity_classes(bits: Bytes) -> Bytes:
 
 def validity(classes: Bytes, alt: str) -> Panel:
     """Which disparities were measured; ``classes`` (row, col) of :func:`validity_classes`."""
-    colors = _paint(classes, canvas.MEASURED, canvas.INTERPOLATED, canvas.UNDEFINED)
+    colors = paint(classes, canvas.MEASURED, canvas.INTERPOLATED, canvas.UNDEFINED)
     return canvas.panel(canvas.fitted((255 * colors).round().astype(np.uint8)), alt)
 
 
@@ -82,7 +82,7 @@ def risk_map(risk: Bytes, path: Floats | None, extent: Extent, alt: str, *, far:
     ``far`` (n, 3): x, y of a cell of the far row, m, and 1 where a path leads there.
     """
     fig, ax, _ = canvas.map_axes(extent)
-    _show(ax, _paint(risk, canvas.SAFE, canvas.CAUTION, canvas.HAZARDOUS, canvas.UNKNOWN), extent)
+    _show(ax, paint(risk, canvas.SAFE, canvas.CAUTION, canvas.HAZARDOUS, canvas.UNKNOWN), extent)
     if path is not None and len(path):
         canvas.polyline(ax, path)
     if far is not None and len(far):
@@ -114,7 +114,7 @@ def tracks(image: Floats, trails: Sequence[Floats], inlier: Sequence[bool], alt:
     from PIL import ImageDraw
 
     fine = 2  # drawn twice as large and averaged, for smooth lines
-    ground = canvas.fitted(_grey(image), scale=fine)
+    ground = canvas.fitted(grey(image), scale=fine)
     picture = Pillow.fromarray(ground).convert("RGB")
     pen, factor = ImageDraw.Draw(picture), ground.shape[1] / image.shape[1]
     for trail, good in zip(trails, inlier, strict=True):
@@ -218,7 +218,7 @@ def _greys() -> Any:
     return LinearSegmentedColormap.from_list("greys", ["#5a5a5a", "#ffffff"]).with_extremes(bad="black")
 
 
-def _grey(image: Floats) -> Bytes:
+def grey(image: Floats) -> Bytes:
     """8 bits of an image of 8 or 16 bits, or of float 0..255 (NaN black)."""
     if image.dtype == np.uint8:
         return np.asarray(image)
@@ -226,7 +226,7 @@ def _grey(image: Floats) -> Bytes:
     return np.asarray(np.clip(np.rint(values), 0, 255), dtype=np.uint8)
 
 
-def _paint(classes: Bytes, *colors: str) -> Floats:
+def paint(classes: Bytes, *colors: str) -> Floats:
     """Colours (row, col, 3) in 0..1 of classes 0, 1, 2 ..."""
     from matplotlib.colors import to_rgb
 

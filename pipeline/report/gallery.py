@@ -12,7 +12,7 @@ import numpy as np
 
 from rille.pipeline.export import artifacts
 from rille.pipeline.export.output import Output, stage
-from rille.pipeline.report import canvas, checks, driving, figures, gather, seams, terrain_map
+from rille.pipeline.report import canvas, checks, driving, figures, gather, seams, stops, terrain_map
 from rille.pipeline.report.block import Block, Figure
 from rille.pipeline.report.delivery import start_words
 from rille.pipeline.report.gather import Scene
@@ -327,6 +327,7 @@ _FIGURES: tuple[tuple[str, Maker, Condition, str, str], ...] = (
         "sequence.truth sequence.simulation.T_vehicle_left",
     ),
     ("Figure 6. Disparities", _disparities, _always, "disparity images undistorted", ""),
+    ("Stops", stops.strip, _planned, "disparity images undistorted local_dem local_risk local_path drive", ""),
     ("Rig", checks.rig, lambda scene: bool(scene.view.products.rigs), "rigs orientations", "sequence.rig"),
     ("Figure 7. Ortho image and path", _terrain, _always, "tiles world_dem risk path", "config.vehicle"),
     ("Figure 3. Local risk map", _local, _planned, "local_path local_risk drive", ""),

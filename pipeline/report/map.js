@@ -122,6 +122,22 @@
     pen.strokeStyle = color; pen.lineWidth = width; pen.stroke();
   };
   const round = (v) => { const p = 10 ** Math.floor(Math.log10(v)); return [5, 2, 1].map((s) => s * p).find((s) => s <= v * 1.000001); };
+  const columns = [...document.querySelectorAll("[data-frame]")].map((column) => ({ column, frame: +column.dataset.frame }));
+  const stops = columns.filter((c) => c.column.parentElement === columns[0].column.parentElement); /* a drive's, or the pairs */
+  for (const s of stops) s.at = D.track.find((t) => t[0] === s.frame);
+  const go = (i) => {
+    state.stop = i;
+    const s = stops[i];
+    for (const { column, frame } of columns) {
+      const film = column.parentElement;
+      column.classList.toggle("here", frame === s.frame);
+      if (frame === s.frame) film.scrollTo({ left: column.offsetLeft - (film.clientWidth - column.clientWidth) / 2 });
+    }
+    $("stop").setAttribute("aria-valuetext", `frame ${s.frame}`);
+    draw();
+    if (s.at) say(s.at[1], s.at[2]);
+    $("hover").prepend(`stop ${i + 1} of ${stops.length}, frame ${s.frame}: `);
+  };
   const draw = () => {
     const ratio = window.devicePixelRatio || 1;
     if (flat.width !== Math.round(wide() * ratio) || flat.height !== Math.round(tall() * ratio)) { flat.width = Math.round(wide() * ratio); flat.height = Math.round(tall() * ratio); }
@@ -144,6 +160,12 @@
       line(D.track.map((t) => t.slice(1)), "#fff", 4);
       D.track.forEach((t, i) => { if (i) line([D.track[i - 1].slice(1), t.slice(1)], trackColor(t), 2.4); });
       for (const t of D.track) { const [u, v] = screen(t[1], t[2]); pen.beginPath(); pen.arc(u, v, 3, 0, 7); pen.fillStyle = trackColor(t); pen.fill(); pen.strokeStyle = "#fff"; pen.lineWidth = 0.8; pen.stroke(); }
+    }
+    const stop = stops[state.stop];
+    for (const [frame, leg] of Object.entries(D.legs)) if (!stop || +frame <= stop.frame) { const here = stop && +frame === stop.frame; line(leg, "#fff", here ? 6 : 3); line(leg, here ? "#c0167a" : "#111", here ? 3.5 : 1.5); }
+    if (stop && stop.at) {
+      const [u, v] = screen(stop.at[1], stop.at[2]);
+      pen.beginPath(); pen.arc(u, v, 8, 0, 7); pen.strokeStyle = "#fff"; pen.lineWidth = 5; pen.stroke(); pen.strokeStyle = "#c0167a"; pen.lineWidth = 3; pen.stroke();
     }
     if (state.ruler.length) line(state.ruler, "#c0167a", 2.5);
     const long = round(0.25 * wide() / view.scale), words = long < 1 ? 100 * long + " cm" : long + " m";
@@ -310,6 +332,11 @@
   $("opacity").addEventListener("input", (e) => { state.opacity = e.target.value / 100; refresh(); });
   $("by").addEventListener("change", (e) => { state.by = e.target.value; legend(); draw(); });
   for (const name of ["track", "path"]) $(name).addEventListener("change", draw);
+  if (stops.length > 1) {
+    $("stops").hidden = false;
+    $("stop").max = stops.length - 1;
+    $("stop").addEventListener("input", (e) => go(+e.target.value));
+  }
   $("in").addEventListener("click", () => zoom(1.4));
   $("out").addEventListener("click", () => zoom(1 / 1.4));
   $("fit").addEventListener("click", () => { fit(); draw(); });

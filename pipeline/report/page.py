@@ -34,7 +34,7 @@ CHAPTERS = (
     ("Terrain", "terrain", ("Elevation error", "Overlap", "Seams", "Seam audit")),
     ("Hazards and path", "hazards", ("Drive",)),
     ("Rig", "rig-chapter", ("Rig",)),
-    ("Matching", "matching", ("Basic pairs",)),
+    ("Matching", "matching", ("Stops", "Basic pairs")),
     ("Accuracy", "key-figures", ()),
     ("Times", "times", ()),
     ("The paper's figures", "paper", ("Figure 3", "Figure 6", "Figure 7", "Figure 8", "Figure 9")),

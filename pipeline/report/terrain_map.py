@@ -77,6 +77,7 @@ def data(scene: Scene) -> dict[str, Any] | None:
         "frusta": _frusta(scene),
         "path": [] if scene.path is None else np.round(scene.path, 4).tolist(),
         "vehicle": _vehicle(scene),
+        "legs": _legs(scene),
     }
 
 
@@ -164,6 +165,16 @@ def _frusta(scene: Scene) -> list[Any]:
     for frame, pose in zip(bundle.meta.get("frames", view.frames[: len(poses)]), poses, strict=False):
         if frame in view.products.disparity and np.isfinite(pose).all():
             found.append(np.round(RigidTransform.from_matrix(pose).apply(points), 4).tolist())
+    return found
+
+
+def _legs(scene: Scene) -> dict[str, Any]:
+    """What was driven from each stop of a drive (vertex, 2) m, by the frame that it stands at."""
+    drive, found = scene.view.products.drive, {}
+    for stop in [] if drive is None else drive.stops:
+        leg = scene.view.bundle(stop.leg)
+        if leg is not None and len(leg["path"]):
+            found[str(stop.frame)] = np.round(np.asarray(leg["path"])[:, :2], 4).tolist()
     return found
 
 

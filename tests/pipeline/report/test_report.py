@@ -11,14 +11,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from toys.finished import TASKS, Written, bundles, products, report, view, written
+from toys.finished import BASIC, TASKS, Written, bundles, products, report, view, written
 
 from rille.datasets.georeference import Georeference
 from rille.datasets.mockup.sequence import vehicle_at_scale
 from rille.pipeline.export import ranges
 from rille.pipeline.export.view import TaskRow
 from rille.pipeline.flow.products import Driven, Products
-from rille.pipeline.report import canvas, figures, tables, words
+from rille.pipeline.report import canvas, figures, gather, stops, tables, words
 from rille.pipeline.runs import session
 from rille.stages.core.declare import Bundle
 from rille.stages.core.errors import RilleError
@@ -43,6 +43,7 @@ def test_a_whole_run_has_every_figure_and_nothing_missing(whole: Written) -> Non
     assert f"Nothing is missing: {everything} terrain was found." in page_.text
     for anchor in (
         "figure-6",
+        "stops",
         "figure-7",
         "map",
         "map-view",
@@ -53,12 +54,30 @@ def test_a_whole_run_has_every_figure_and_nothing_missing(whole: Written) -> Non
         "elevation-error",
     ):
         assert anchor in page_.ids
-    assert len(page_.images) == 1 + 4 + 2 + 2 + 4 + 2 + 2 + 1
+    assert len(page_.images) == 1 + 4 + 2 + 2 + 4 + 2 + 2 + 1 + len(BASIC)
     assert facts["warnings"] == []
     assert "warnings-box" not in page_.ids
     assert all(image["alt"] for image in page_.images)
     assert len(html) < 5_000_000
     assert {p.name for p in folder.iterdir()} == {"report.html", "report.json"}
+
+
+def test_pictures_of_the_pairs_keep_to_their_budget(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene: Any = gather.Scene(view())
+    whole = stops.strip(scene)
+    assert whole is not None
+    assert [p.frame for p in whole.panels] == list(BASIC)
+    size = sum(p.size for p in whole.panels)
+    assert size <= stops.BUDGET
+    monkeypatch.setattr(stops, "BUDGET", size // 2)
+    smaller = stops.strip(scene)
+    assert smaller is not None
+    assert smaller.panels[0].width < whole.panels[0].width
+    monkeypatch.setattr(stops, "BUDGET", 3000)
+    fewer = stops.strip(scene)
+    assert fewer is not None
+    assert len(fewer.panels) == 1
+    assert "1 of 2 pairs are shown" in fewer.caption
 
 
 def test_the_page_needs_nothing_but_itself(whole: Written) -> None:

@@ -91,6 +91,18 @@ def test_layers_switch_and_3d_draws_and_turns(browser: Browser) -> None:
     assert browser.messages == []
 
 
+def test_the_slider_goes_from_stop_to_stop(browser: Browser) -> None:
+    before = _pixels(browser.picture())
+    browser.run(
+        "(() => { const s = document.querySelector('[data-at=stop]'); s.value = 1;"
+        " s.dispatchEvent(new Event('input')); })()"
+    )
+    assert browser.run("document.querySelector('.strip .here').dataset.frame") == "4"
+    assert browser.run("document.querySelector('[data-at=hover]').textContent").startswith("stop 2 of 2, frame 4")
+    assert (before != _pixels(browser.picture())).any()
+    assert browser.messages == []
+
+
 def test_a_phone_in_the_dark_shows_no_page_wider_than_itself(page: Path, tmp_path: Path) -> None:
     phone = Browser(tmp_path, 390, 844, dark=True)
     try:
