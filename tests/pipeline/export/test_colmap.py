@@ -5,8 +5,9 @@ import pycolmap
 from raising import raises
 
 from rille.pipeline.engine.store.base import Store
-from rille.pipeline.export.colmap import build, export_run
+from rille.pipeline.export.colmap import Segment, build, export_run
 from rille.stages.core.declare import Bundle
+from rille.stages.core.validity import Validity
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
 
 CAMERA = Camera(400.0, 410.0, 319.5, 239.5, 640, 480)
@@ -35,25 +36,40 @@ def parts():
         },
         {},
     )
-    return Bundle({"poses": given}, {"frames": FRAMES}), [(track, resection)], poses, world
+    matches = disparities(pixels[:, 0], RIG.right.project((RIG.T_right_left @ poses[0].inverse()).apply(world)))
+    return Bundle({"poses": given}, {"frames": FRAMES}), [Segment(track, resection, {FRAMES[0]: matches})], poses, world
+
+
+def disparities(left, right):
+    """Matches of the four pixels around each point, but around the last one."""
+    column, row = (np.full((480, 640), np.nan, np.float32) for _ in range(2))
+    validity = np.zeros((480, 640), np.uint8)
+    for (x, y), (dx, dy) in zip(left[:-1].astype(int), (right - left)[:-1], strict=True):
+        here = slice(y, y + 2), slice(x, x + 2)
+        column[here], row[here], validity[here] = dx, dy, Validity.MATCHED
+    return Bundle({"column_disparity": column, "row_disparity": row, "validity": validity}, {})
 
 
 def test_the_model_read_again_has_our_cameras_poses_and_points(tmp_path):
     trajectory, segments, poses, world = parts()
-    model, count = build(RIG, trajectory, {3: "a.png"}, segments)
-    model.write_text(str(tmp_path))
+    shade = Bundle({"image": np.full((480, 640), 77, np.uint8)}, {})
+    build(RIG, trajectory, {3: "a.png"}, segments, {3: shade}).write_text(str(tmp_path))
     again = pycolmap.Reconstruction(str(tmp_path))
     assert again.num_reg_frames() == 2  # the lost frame is left out
-    assert count == again.num_points3D() == 40
+    assert again.num_points3D() == 40
     left = {image.name: image for image in again.images.values()}
-    assert sorted(left) == ["left/000005", "left/a.png", "right/000005", "right/a.png"]
-    for name, T in (("a.png", poses[0]), ("000005", poses[2])):
+    assert sorted(left) == ["left/000005.png", "left/a.png", "right/000005.png", "right/a.png"]
+    for name, T in (("a.png", poses[0]), ("000005.png", poses[2])):
         np.testing.assert_allclose(left[f"left/{name}"].cam_from_world().matrix(), T.inverse().matrix34, atol=1e-9)
         right = RIG.T_right_left @ T.inverse()
         np.testing.assert_allclose(left[f"right/{name}"].cam_from_world().matrix(), right.matrix34, atol=1e-9)
     found = np.array([p.xyz for p in again.points3D.values()])
     np.testing.assert_allclose(found[np.lexsort(found.T)], world[np.lexsort(world.T)], atol=1e-6)
-    assert sum(p.track.length() for p in again.points3D.values()) == 79
+    assert sum(p.track.length() for p in again.points3D.values()) == 79 + 39, (
+        "left images, and the key frame's right one"
+    )
+    assert {tuple(p.color) for p in again.points3D.values()} == {(77, 77, 77)}
+    assert max(p.error for p in again.points3D.values()) < 1e-2
     for point in again.points3D.values():
         for element in point.track.elements:
             image = again.images[element.image_id]
@@ -61,6 +77,21 @@ def test_the_model_read_again_has_our_cameras_poses_and_points(tmp_path):
             np.testing.assert_allclose(
                 image.project_point(point.xyz), seen, atol=1e-3
             )  # float32 pixels, digits of text
+
+
+def test_an_adjustment_of_the_model_keeps_its_scale():
+    trajectory, segments, poses, _ = parts()
+    noise = np.random.default_rng(1).normal(0, 0.3, segments[0].track["points"].shape)
+    track = Bundle({"points": segments[0].track["points"] + noise.astype(np.float32)}, segments[0].track.meta)
+    model = build(RIG, trajectory, {}, [segments[0]._replace(track=track)])
+    for point in model.points3D.values():
+        point.xyz *= 1.05
+    options = pycolmap.BundleAdjustmentOptions()
+    options.refine_focal_length = options.refine_extra_params = options.refine_sensor_from_rig = False
+    pycolmap.bundle_adjustment(model, options)
+    first, last = (model.frames[k].rig_from_world.inverse().translation for k in (1, 2))
+    true = poses[2].translation - poses[0].translation
+    assert abs(np.linalg.norm(last - first) / np.linalg.norm(true) - 1.0) < 0.02
 
 
 def test_what_is_no_run_or_has_content_is_said(tmp_path):
