@@ -41,7 +41,7 @@ def main() -> None:
     cell = (extent[1] - extent[0]) / z.shape[1]
     filled = np.where(np.isnan(z), np.nanmedian(z), z)
     shade = LightSource(315, 45).hillshade(filled, vert_exag=1.5, dx=cell, dy=cell)
-    colour = RISK[risk.astype(int)] * np.where(risk == 3, 1.0, 0.35 + 0.65 * shade)[..., None]
+    colour = RISK[risk] * np.where(risk == 3, 1.0, 0.35 + 0.65 * shade)[..., None]
     features = json.loads((run / "path.geojson").read_text(encoding="utf-8"))["features"]
     line = next(f["geometry"]["coordinates"] for f in features if f["geometry"]["type"] == "LineString")
 

@@ -38,11 +38,12 @@ print(
 )
 
 # %%
-# ``risk.tif`` holds the class of each cell and the probability that the exact ground breaks a limit.
+# ``risk.tif`` holds the class of each cell, ``hazard.tif`` the probability that the exact ground breaks a limit.
 
 with rasterio.open(run.folder / "risk.tif") as source:
-    names, box = source.descriptions, source.bounds
-    bands = dict(zip(names, source.read(), strict=True))
+    classes, box = source.read(1), source.bounds
+with rasterio.open(run.folder / "hazard.tif") as source:
+    p_hazard = source.read(source.descriptions.index("p_hazard") + 1)
 features = json.loads((run.folder / "path.geojson").read_text())["features"]
 lines = [
     np.array(f["geometry"]["coordinates"])
@@ -55,9 +56,9 @@ colours = np.array(
 )
 extent = (box.left, box.right, box.bottom, box.top)
 figure, axes = plt.subplots(1, 2, figsize=(9, 5), layout="constrained")
-axes[0].imshow(colours[bands["class"].astype(int)], extent=extent)
+axes[0].imshow(colours[classes], extent=extent)
 axes[0].set_title("safe, caution, hazard, unknown; path")
-drawn = axes[1].imshow(bands["p_hazard"], cmap="magma_r", vmin=0, vmax=1, extent=extent)
+drawn = axes[1].imshow(p_hazard, cmap="magma_r", vmin=0, vmax=1, extent=extent)
 axes[1].set_title("probability of a hazard")
 figure.colorbar(drawn, ax=axes[1], shrink=0.8)
 for ax in axes:

@@ -40,7 +40,7 @@ drawn = axes[0].imshow(
     1000 * terrain.elevation, cmap="terrain", extent=(x[0], x[-1], y[-1], y[0])
 )
 figure.colorbar(drawn, ax=axes[0], label="elevation [mm]", shrink=0.8)
-axes[1].imshow(colours[risk.astype(int)], extent=extent)
+axes[1].imshow(colours[risk], extent=extent)
 axes[1].set_title("safe, caution, hazard, unknown")
 for ax in axes:
     ax.plot(position.sel(axis="x"), position.sel(axis="y"), "k.-", label="left camera")

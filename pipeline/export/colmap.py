@@ -193,9 +193,9 @@ def _points(
         np.clip(np.nan_to_num(pixels[:, 0, k]).astype(int), 0, n - 1) for k, n in enumerate(grey.shape[::-1])
     )
     values = grey[rows, columns] >> (8 * (grey.itemsize - 1))
-    for k in np.flatnonzero(np.isfinite(world).all(1) & (agrees.sum(1) + twice.sum(1) > 1)):
+    for k in map(int, np.flatnonzero(np.isfinite(world).all(1) & (agrees.sum(1) + twice.sum(1) > 1))):
         elements = []
-        for j in np.flatnonzero(agrees[k]):
+        for j in map(int, np.flatnonzero(agrees[k])):
             left_view, right_view = views[frames[j]]
             elements.append(left_view.element(pixels[k, j]))
             if twice[k, j]:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.export import ranges, styles
 from rille.pipeline.export.output import Output, stage
 from rille.pipeline.export.writers import write_raster, write_style
@@ -78,23 +79,57 @@ def _write_dem_style(folder: Path, view: Any) -> None:
     write_style(folder / "dem.qml", styles.DEM, {f"e{k}": low + (high - low) * k / 8 for k in range(9)})
 
 
+CLASSES = {"safe": "#a6d7c3", "caution": "#f0d68a", "hazard": "#c8501e", "unknown (never entered)": "#8d8f98"}
+"""Names and colours of the classes 0, 1, 2 and 3."""
+
+BITS = 12
+"""Significant bits of a written measure: 0.02 %, finer than any is known."""
+
+
 def _write_risk(folder: Path, view: Any) -> None:
-    """Class, measures in metres and degrees, probability and reasons in one file, so all of one type (float32)."""
+    """Write the class of each cell as a byte, with its colour and, beside it, its name."""
+    risk = view.bundle(view.products.risk)
+    tags = {"classes": ", ".join(f"{k} {name}" for k, name in enumerate(CLASSES))} | _vehicle(risk)
+    lattice, place = Lattice.from_dict(risk.meta["lattice"]), view.sequence.georeference
+    bands, colours = {"class": np.asarray(risk["risk"], np.uint8)}, list(CLASSES.values())
+    write_raster(folder / "risk.tif", bands, lattice, unit="", nodata=None, tags=tags, place=place, colours=colours)
+
+
+def _write_class_names(folder: Path, view: Any) -> None:
+    names = "".join(f"<Category>{name}</Category>" for name in CLASSES)
+    text = f'<PAMDataset><PAMRasterBand band="1"><CategoryNames>{names}</CategoryNames></PAMRasterBand></PAMDataset>'
+    atomic.write(folder / "risk.tif.aux.xml", text)
+
+
+def _write_reasons(folder: Path, view: Any) -> None:
+    risk = view.bundle(view.products.risk)
+    bands = {"reason": np.asarray(risk["reason"], np.uint16), "filled": np.asarray(risk["filled"], np.uint16)}
+    tags = {"reason_bits": ", ".join(f"{bit} {name}" for name, bit in REASONS.items())}
+    lattice, place = Lattice.from_dict(risk.meta["lattice"]), view.sequence.georeference
+    write_raster(folder / "reason.tif", bands, lattice, unit="", nodata=None, tags=tags, place=place)
+
+
+def _write_hazard(folder: Path, view: Any) -> None:
+    """Write the probability of a hazard and the measures, in metres and degrees."""
     risk = view.bundle(view.products.risk)
     units = {a.name: a.unit for a in RISK.outputs if a.unit in ("m", "rad") and a.name != "elevation"}
-    bands = {"class": risk["risk"], "reason": risk["reason"], "p_hazard": risk["p_hazard"], "filled": risk["filled"]}
+    bands = {"p_hazard": risk["p_hazard"]}
     bands |= {name: np.degrees(risk[name]) if unit == "rad" else risk[name] for name, unit in units.items()}
     unit = {name: {"rad": "degree"}.get(units.get(name, ""), units.get(name, "")) for name in bands}
-    tags = {
-        "classes": "0 safe, 1 caution, 2 hazard, 3 unknown (never entered)",
-        "reason_bits": ", ".join(f"{bit} {name}" for name, bit in REASONS.items()),
-        "vehicle": json.dumps(risk.meta.get("vehicle", {})),
-    }
-    given = {name: np.asarray(values, dtype=np.float32) for name, values in bands.items()}
+    given = {name: rounded(np.asarray(values, dtype=np.float32), BITS) for name, values in bands.items()}
     lattice, place = Lattice.from_dict(risk.meta["lattice"]), view.sequence.georeference
-    write_raster(
-        folder / "risk.tif", given, lattice, unit=unit, nodata=NAN, tags=tags, place=place, overviews="nearest"
-    )
+    write_raster(folder / "hazard.tif", given, lattice, unit=unit, nodata=NAN, tags=_vehicle(risk), place=place)
+
+
+def _vehicle(risk: Bundle) -> dict[str, str]:
+    return {"vehicle": json.dumps(risk.meta.get("vehicle", {}))}
+
+
+def rounded(values: NDArray[np.float32], bits: int) -> NDArray[np.float32]:
+    """Round float32 to this many significant bits, so that it packs well; NaN and infinity stay."""
+    mantissa, exponent = np.frexp(values)
+    scale = np.float32(2**bits)
+    return np.asarray(np.ldexp(np.rint(mantissa * scale) / scale, exponent), dtype=np.float32)
 
 
 def _write_risk_style(folder: Path, view: Any) -> None:
@@ -105,6 +140,11 @@ def _of_terrain(name: str, what: str, write: Callable[..., None], values: str, m
     """Record of a raster of the merged terrain: a hole in the run must not look like unknown terrain."""
     facts = {**CRS, "values": values, "missing": missing}
     return Output(name, what, GIS, write, ("tiles",), (), ("sequence.georeference",), "world", facts)
+
+
+def _of_risk(name: str, what: str, write: Callable[..., None]) -> Output:
+    """Record of a raster of the hazards."""
+    return Output(name, what, GIS, write, ("risk",), (), ("sequence.georeference",), "world", {**CRS, "values": what})
 
 
 OUTPUTS = (
@@ -147,16 +187,10 @@ OUTPUTS = (
         _raster("ortho.tif", "ortho", "", _merged("ortho")),
         "grey value 0..255",
     ),
-    Output(
-        "risk.tif",
-        "risk map; bands: class (0 safe, 1 caution, 2 hazard, 3 unknown), reason (bits), p_hazard, filled, measures",
-        GIS,
-        _write_risk,
-        ("risk",),
-        knows=("sequence.georeference",),
-        frame="world",
-        facts={**CRS, "values": "class 0 safe, 1 caution, 2 hazard, 3 unknown; reason bits; p_hazard; measures"},
-    ),
+    _of_risk("risk.tif", "risk map: class 0 safe, 1 caution, 2 hazard, 3 unknown, with colours", _write_risk),
+    Output("risk.tif.aux.xml", "names of the classes of risk.tif", GIS, _write_class_names, ("risk",)),
+    _of_risk("hazard.tif", "probability of a hazard, and the measures in metres and degrees", _write_hazard),
+    _of_risk("reason.tif", "bits of the limits that a cell breaks; whether it was filled", _write_reasons),
     Output(
         "risk.qml",
         "colours and names of the classes of risk.tif, which QGIS applies by itself",

@@ -60,7 +60,7 @@ def write_raster(
     nodata: float | None,
     tags: Mapping[str, str] | None = None,
     place: Georeference | None = None,
-    overviews: str | None = None,
+    colours: Sequence[str] | None = None,
 ) -> None:
     """Write a cloud-optimised GeoTIFF in the engineering CRS, or in that of ``place``.
 
@@ -74,7 +74,7 @@ def write_raster(
     tags : more metadata; the frame, the unit and the cell size are always there.
     place : of the world frame. The raster is not resampled: its geotransform is turned by the azimuth. Elevations have
         to be heights in its system already.
-    overviews : how they are resampled; None: the mean, or without ``nodata`` the most frequent value.
+    colours : of the values 0, 1, ... of the one band, ``#rrggbb``.
 
     Raises
     ------
@@ -100,7 +100,7 @@ def write_raster(
         "num_threads": "all_cpus",
         "predictor": "yes",
         "blocksize": 256,
-        "overview_resampling": overviews or ("mode" if nodata is None else "average"),
+        "overview_resampling": "mode" if nodata is None else "average",
     }
     units = [unit if isinstance(unit, str) else unit[name] for name in bands]
     facts = {
@@ -113,6 +113,8 @@ def write_raster(
         for number, (name, values) in enumerate(bands.items(), start=1):
             file.write(np.asarray(values), number)
             file.set_band_description(number, name)
+        if colours is not None:
+            file.write_colormap(1, {k: tuple(bytes.fromhex(c[1:])) for k, c in enumerate(colours)})
         file.units = tuple("metre" if u == "m" else u for u in units)
         file.update_tags(**facts, **{key.upper(): value for key, value in dict(tags or {}).items()})
 

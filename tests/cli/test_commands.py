@@ -14,7 +14,17 @@ from rille.pipeline.cli import app
 
 RUN_ID = r"\d{8}T\d{6}Z-[0-9a-f]{8}"
 RECONSTRUCTED = {"report.html", "report.json", "config.toml", "ledger.jsonl", "trajectory.tum", "trajectory.kitti"}
-RECONSTRUCTED |= {"dem.tif", "dem_sigma.tif", "hillshade.tif", "ortho.tif", "risk.tif", "path.geojson", "terrain.zarr"}
+RECONSTRUCTED |= {
+    "dem.tif",
+    "dem_sigma.tif",
+    "hillshade.tif",
+    "ortho.tif",
+    "risk.tif",
+    "hazard.tif",
+    "reason.tif",
+    "path.geojson",
+    "terrain.zarr",
+}
 SAME_IN_EACH_RUN = ("trajectory.tum", "trajectory.kitti", "dem.tif", "dem_sigma.tif", "ortho.tif", "risk.tif")
 
 

@@ -67,7 +67,8 @@ def cold(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_outputs_are_all_there_and_sound(cold: Path) -> None:
     folder = latest(cold)
-    wanted = {"trajectory.kitti", "trajectory.tum", "dem.tif", "dem_sigma.tif", "ortho.tif", "risk.tif"}
+    wanted = {"trajectory.kitti", "trajectory.tum", "dem.tif", "dem_sigma.tif", "ortho.tif", "risk.tif", "hazard.tif"}
+    wanted |= {"reason.tif", "risk.tif.aux.xml"}
     wanted |= {"path.gpkg", "frames.json", "dem.qml", "risk.qml", "crosscheck.tum", "agreement.csv"}
     wanted |= {"slope.tif", "hillshade.tif", "terrain.zarr"}
     wanted |= {"path.geojson", "config.toml", "report.json", "report.html", "ledger.jsonl"}

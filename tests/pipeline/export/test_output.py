@@ -147,7 +147,7 @@ def test_a_run_writes_the_files_that_it_describes(tmp_path: Path) -> None:
     facts = describe(names, FRAMES, [f"left{f:03d}" for f in FRAMES], [float(f) for f in FRAMES], clock=False)
     described = [o.name for o in catalogue.OUTPUTS if o.frame]
     assert list(facts["files"]) == described
-    assert set(described) | {"dem.qml", "risk.qml"} == set(names)
+    assert set(described) | {"dem.qml", "risk.qml", "risk.tif.aux.xml"} == set(names)
     assert {about["frame"] for about in facts["files"].values()} <= REFERENCES.keys()
     assert facts["frames"][4] == {"frame": 4, "name": "left004", "time": 4.0}
     assert facts["units"]["time"] == "frame number"
