@@ -68,10 +68,12 @@ sphinx_gallery_conf = {
     "within_subsection_order": "FileNameSortKey",
     "abort_on_example_error": True,
     "remove_config_comments": True,
+    "capture_repr": ("_repr_html_",),
     "show_memory": False,
     "download_all_examples": False,
     "show_signature": False,
     "plot_gallery": not FAST,
+    "run_stale_examples": True,  # a script depends on the program, too
 }
 
 
