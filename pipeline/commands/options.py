@@ -81,6 +81,7 @@ class Results:
         Literal["auto", "bar", "plain", "json", "quiet"], Parameter(help="How progress is shown on stderr.")
     ] = "auto"
     quiet: Annotated[bool, flag("No progress; warnings and errors only.", "--quiet", "-q")] = False
+    verbose: Annotated[bool, flag("Say where to watch dask at work.", "--verbose", "-v")] = False
 
 
 def options(
@@ -111,6 +112,7 @@ def options(
         progress="quiet" if results.quiet else results.progress,
         memory_limit=memory_limit,
         verb=verb,
+        verbose=results.verbose,
     )
 
 

@@ -43,24 +43,30 @@ class Progress(Protocol):
     def failed(self, label: str, error: BaseException) -> None:
         """A task or an expansion failed."""
 
+    def detail(self, text: str) -> None:
+        """A word for who asks for more of them."""
+
     def close(self, result: Result) -> None:
         """The run has ended."""
 
 
-def make(mode: str = "auto", stream: TextIO | None = None) -> Progress:
-    """``auto`` (bar on a terminal, else plain), ``bar``, ``plain``, ``json`` or ``quiet``."""
+def make(mode: str = "auto", stream: TextIO | None = None, *, verbose: bool = False) -> Progress:
+    """``auto`` (bar on a terminal, else plain), ``bar``, ``plain``, ``json``, ``quiet``; ``verbose``: with details."""
     stream = stream or sys.stderr
     if mode == "auto":
         mode = "bar" if stream.isatty() else "plain"
-    kinds: dict[str, Any] = {"bar": Bar, "plain": Lines, "json": Json, "quiet": Quiet}
+    kinds: dict[str, type[Quiet]] = {"bar": Bar, "plain": Lines, "json": Json, "quiet": Quiet}
     if mode not in kinds:
         raise ConfigError("RIL-568", f"progress {mode!r} is unknown", remedy=f"one of auto, {', '.join(kinds)}")
-    progress: Progress = kinds[mode](stream)
+    progress = kinds[mode](stream)
+    progress.verbose = verbose
     return progress
 
 
 class Quiet:
     """Keeps the account that the others show, and says nothing."""
+
+    verbose = False
 
     def __init__(self, stream: TextIO | None = None) -> None:
         self.stream = stream or sys.stderr
@@ -73,6 +79,11 @@ class Quiet:
         """Begin the forecast with the tasks that are laid out."""
         self.graph, self.seen = graph, len(graph.nodes)
         self.forecast = Forecast([h.label for h in graph.nodes], earlier, max(jobs, 1))
+
+    def detail(self, text: str) -> None:
+        """Print it where that was asked for."""
+        if self.verbose:
+            print(f"rille: {plain(text)}", file=self.stream, flush=True)
 
     def running(self, handle: Handle) -> None:
         """Not shown."""

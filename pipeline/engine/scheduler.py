@@ -467,6 +467,8 @@ class _Run:
         self.ledger.run(executor=name, jobs=shares.workers, **amounts)
         self.executor = make(self.executor_kind, shares.workers, self.store.location, shares.limit)
         self.result.executor_started = True
+        if self.executor.pages:
+            self.progress.detail(self.executor.pages)
 
     def _look_ahead(self) -> Graph:
         """The graph laid out anew and looked up, by what this run's survey of the store has found."""

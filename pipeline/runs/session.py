@@ -56,6 +56,7 @@ class Options:
     progress: str = "auto"
     memory_limit: str | None = None
     verb: str = "reconstruct"
+    verbose: bool = False
     opened: Sequence | None = None
     """The sequence itself, where it is open already."""
 
@@ -272,7 +273,7 @@ def _compute(opened: _Opened) -> Result:
         keep_going=options.keep_going,
         force=options.force,
         ledger=opened.folder / "ledger.jsonl",
-        progress=progress.make(options.progress),
+        progress=progress.make(options.progress, verbose=options.verbose),
         memory_limit=None if options.memory_limit is None else limits.parse(options.memory_limit),
         survey=lambda: lay_out(opened.sequence, opened.config, opened.frames),
     )

@@ -106,6 +106,10 @@ class Executor(Protocol):
     depth: int
     """Tasks that it may have for each slot: enough that workers need not wait for this process."""
 
+    @property
+    def pages(self) -> str:
+        """Where to watch it, in words; empty if nowhere."""
+
     def free(self) -> bool:
         """Whether it takes more tasks now."""
 
@@ -158,6 +162,7 @@ class Inline:
     """One task after the other in this process: for debugging, and where one core is all there is."""
 
     slots = depth = 1
+    pages = ""
 
     def __init__(self) -> None:
         import zarr

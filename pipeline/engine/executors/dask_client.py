@@ -24,6 +24,7 @@ import uuid
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from importlib.util import find_spec
 from multiprocessing import resource_tracker
 from typing import Any
 
@@ -140,9 +141,11 @@ class Dask:
         client.register_plugin(SetUp(self._run, {} if cluster else dask_cluster.identity()), self._run)
 
     @property
-    def dashboard(self) -> str:
-        """Address of the scheduler's pages."""
-        return str(self._client.dashboard_link)
+    def pages(self) -> str:
+        """Where to watch dask's scheduler at work; its pages are drawn by bokeh, if the scheduler's machine has it."""
+        if self._cluster is not None and find_spec("bokeh") is None:
+            return "dask has pages to watch once bokeh is installed: pip install bokeh"
+        return f"dask at work: {self._client.dashboard_link}"
 
     def free(self) -> bool:
         """Not beside a suspect."""
