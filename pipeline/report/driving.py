@@ -146,7 +146,10 @@ def _fixed(scene: Scene) -> str:
 
 
 def tracks(scene: Scene) -> tuple[Floats, Floats | None]:
-    """Track (frame, 2) m of the centre of the wheels in the world, estimated and true (first poses made equal)."""
+    """Track (frame, 2) m of the centre of the wheels in the world, estimated and true, made equal at the first of both.
+
+    NaN where a frame has no pose.
+    """
     view = scene.view
     simulation, trajectory = view.sequence.simulation, view.bundle(view.products.trajectory)
     assert simulation is not None
@@ -155,14 +158,15 @@ def tracks(scene: Scene) -> tuple[Floats, Floats | None]:
     found = np.full((n, 2), np.nan)
     if trajectory is None:
         return found, None
-    poses = [RigidTransform.from_matrix(m) for m in np.asarray(trajectory["poses"])]
-    for k, pose in enumerate(poses):
-        found[k] = (pose @ T_left_vehicle).translation[:2]
+    at_wheels = np.append(T_left_vehicle.translation, 1.0)
+    poses = np.asarray(trajectory["poses"])
+    found[: len(poses)] = (poses @ at_wheels)[:, :2]  # NaN of a lost frame
     true = [None if view.sequence.truth is None else view.sequence.truth[f] for f in view.frames]
-    first = true[0]
-    if first is None:
+    both = ((pose, t) for pose, t in zip(poses, true, strict=False) if t is not None and np.isfinite(pose).all())
+    pose, first = next(both, (None, None))
+    if pose is None or first is None:
         return found, None
-    T_world_truth = poses[0] @ first.inverse()
+    T_world_truth = RigidTransform.from_matrix(pose) @ first.inverse()
     truth = np.full((n, 2), np.nan)
     for k, pose_ in enumerate(true):
         if pose_ is not None:
