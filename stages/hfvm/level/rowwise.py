@@ -9,7 +9,6 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from rille.stages.hfvm.level import simd
 from rille.stages.numeric.line import copy_line
 
 PLANES = 10
@@ -98,6 +97,40 @@ def box(planes, radius, out):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
+def cubic(image, at, width, t, s):  # type: ignore[no-untyped-def]
+    """Catmull-Rom value of a flat float32 image of ``width`` columns: sum_k sum_m w_k(s) w_m(t) image[k, m].
+
+    ``at``: index of the pixel above and left of the point's own; ``t, s``: the point's distance right of and below it,
+    within a pixel. 4 x 4 pixels from ``at - width - 1`` on are read.
+    """
+    across, down = _catmull_rom(t), _catmull_rom(s)
+    nil = np.float32(0.0)
+    c0, c1, c2, c3 = nil, nil, nil, nil
+    for k in range(4):
+        # Unsigned indices need no check for counting from the end.
+        i = np.uint64(at + (k - 1) * width - 1)
+        c0 += down[k] * image[i]
+        c1 += down[k] * image[i + np.uint64(1)]
+        c2 += down[k] * image[i + np.uint64(2)]
+        c3 += down[k] * image[i + np.uint64(3)]
+    # Rows first, then pairs of columns: this order fixes the rounding of published artifacts.
+    return (across[0] * c0 + across[2] * c2) + (across[1] * c1 + across[3] * c3)
+
+
+@njit(cache=True, nogil=True)
+def _catmull_rom(t):  # type: ignore[no-untyped-def]
+    """Weights of the samples at -1, 0, 1, 2 for a point at ``t``, 0..1; polynomials in Horner's form."""
+    half, one, two = np.float32(0.5), np.float32(1.0), np.float32(2.0)
+    three_halves, five_halves = np.float32(1.5), np.float32(2.5)
+    return (
+        ((-half * t + one) * t - half) * t,
+        (three_halves * t - five_halves) * t * t + one,
+        ((-three_halves * t + two) * t + half) * t,
+        (half * t - half) * t * t,
+    )
+
+
+@njit(cache=True, nogil=True)
 def _products(  # type: ignore[no-untyped-def]
     left, right, right_valid, u, v, keep, y, radius, out, x0, y0, rx0, ry0, rrows, rcols
 ):
@@ -126,7 +159,7 @@ def _products(  # type: ignore[no-untyped-def]
             continue
         i, j = np.int64(xr), np.int64(yr)
         at = (j - ry0) * width + i - rx0
-        value = simd.cubic(flat, at, width, xr - np.float32(i), yr - np.float32(j))
+        value = cubic(flat, at, width, xr - np.float32(i), yr - np.float32(j))
         n[x], rest[x] = one, grey[x] - value
     above, below = left[max(y - 1, 0)], left[min(y + 1, rows - 1)]
     gx[0], gx[cols - 1] = half * (grey[min(1, cols - 1)] - grey[0]), half * (grey[cols - 1] - grey[max(cols - 2, 0)])

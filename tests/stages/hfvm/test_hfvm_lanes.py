@@ -5,7 +5,7 @@ import pytest
 from numba import njit
 
 from rille.stages.hfvm.images.resample import sample_cubic
-from rille.stages.hfvm.level import simd, strip_simd
+from rille.stages.hfvm.level import rowwise, simd, strip_simd
 
 WIDTHS = sorted({0, simd.widest()})
 
@@ -82,7 +82,7 @@ def test_cubic_interpolation_equals_the_plain_form():
     def call(image, x, y):
         i, j = int(x), int(y)
         t, s = x - np.float32(i), y - np.float32(j)
-        return simd.cubic(image.ravel(), j * image.shape[1] + i, image.shape[1], t, s)
+        return rowwise.cubic(image.ravel(), j * image.shape[1] + i, image.shape[1], t, s)
 
     image = np.random.default_rng(8).uniform(0, 255, (9, 10)).astype(np.float32)
     for x, y in np.random.default_rng(9).uniform(2, 6, (50, 2)).astype(np.float32):
