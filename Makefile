@@ -13,7 +13,7 @@ SET    ?=
 ONLY   ?=
 ARGS   ?=
 
-BENCHMARKS := $(sort $(basename $(notdir $(wildcard benchmarks/*.py))))
+BENCHMARKS := $(filter-out record,$(sort $(basename $(notdir $(wildcard benchmarks/*.py)))))
 
 .DEFAULT_GOAL := help
 .PHONY: help install reconstruct test check torture bench lint docs docs-fast clean
@@ -46,7 +46,7 @@ torture: $(STAMP) ## kills, damage, full disks, races: what the engine endures, 
 
 bench: $(STAMP) ## side-by-side measurements: every figure of the README; ONLY=matching: one of them, ARGS=--help: its options
 	@$(if $(filter-out $(BENCHMARKS),$(ONLY)),echo "no such benchmark: $(filter-out $(BENCHMARKS),$(ONLY)); ONLY= any of: $(BENCHMARKS)" >&2; exit 2)
-	@for b in $(or $(ONLY),$(BENCHMARKS)); do echo "== $$b"; $(BIN)/python benchmarks/$$b.py $(ARGS) || exit 1; done
+	@for b in $(or $(ONLY),$(BENCHMARKS)); do echo "== $$b"; $(BIN)/python benchmarks/record.py $$b $(ARGS) || exit 1; done
 
 lint: $(STAMP) ## ruff and mypy
 	@mkdir -p $(TYPES) && ln -sfn $(addprefix ../../../,rille/__init__.py rille/py.typed pipeline stages datasets) $(TYPES)
