@@ -57,151 +57,243 @@ class HfvmParams(Params):
 
     preset: Literal["default", "fast", "accurate", "paper"] = Field(
         default="default",
-        description="default: the measured recipe; fast: half its resolution; accurate: slower; paper: section 4.3 to "
-        "the letter",
+        description="set of values: default: the recipe measured best for its time; fast: half the resolution and "
+        "fewer rounds; accurate: smaller errors, several times the time; paper: section 4.3 of the paper to the "
+        "letter",
     )
     weights: Weights = Field(
         default=(4.0, 4.0, 2.0, 2.0, 0.5, 0.5, 2.0, 1.0),
-        description="factors of the eight features (Table 1); measured best on square-root features",
+        description="factors of the eight features in the order of Table 1; a larger one lets its feature decide "
+        "more; default: best measured on square-root features",
     )
     top_columns: float = Field(
         default=0.5,
         gt=0,
         le=1,
-        description="share of the image width searched to either side at the top level: any overlap",
+        description="share of the image width searched to either side at the coarsest level; larger: finds larger "
+        "disparities, takes longer",
     )
     top_rows: float = Field(
-        default=0.25, ge=0, le=1, description="the same of the height: roll, toe-in and row offsets"
+        default=0.25,
+        ge=0,
+        le=1,
+        description="share of the image height searched up and down at the coarsest level; larger: tolerates more "
+        "roll, toe-in and row offset, takes longer",
     )
     search_columns: int = Field(
-        default=2, ge=1, le=8, description="pixels to either side of a centre: doubling errs by one, parents by more"
+        default=2,
+        ge=1,
+        le=8,
+        description="columns [pixels] searched to either side of each predicted displacement; larger: repairs worse "
+        "predictions, takes longer",
     )
-    search_rows: int = Field(default=1, ge=0, le=8, description="pixels; never 0 on a rig that is not rectified")
+    search_rows: int = Field(
+        default=1,
+        ge=0,
+        le=8,
+        description="rows [pixels] searched above and below each predicted displacement; larger: takes longer; 0 "
+        "only for rectified images",
+    )
     band: float = Field(
         default=6.0,
         ge=0,
-        description="cost (byte steps) a pixel off the epipolar line; 0 = free two-dimensional search",
+        description="cost [byte steps per pixel] of a displacement off the epipolar line; larger: holds matches "
+        "closer to the line; 0: free two-dimensional search",
     )
     smoothness: int = Field(
-        default=4, ge=0, description="byte steps a pixel of difference to each neighbour; kept weak"
+        default=4,
+        ge=0,
+        description="cost [byte steps per pixel] of the difference to each neighbour's displacement; larger: fewer "
+        "outliers, depth edges less sharp",
     )
     rounds: int = Field(
-        default=4, ge=0, le=32, description="propagation rounds a level; they recover what the coarse level lost"
+        default=4,
+        ge=0,
+        le=32,
+        description="propagation rounds per level; more: recover more of the thin objects that the coarser level "
+        "lost, take longer",
     )
     fine_rounds: int | None = Field(
         default=1,
         ge=0,
         le=32,
-        description="the same at the finest level, which costs most, one more at each above; null: as at the others",
+        description="propagation rounds at the finest level, which takes the most time; each coarser level has one "
+        "more, at most the value of rounds; null: that value at every level",
     )
     back_rounds: int = Field(
-        default=1, ge=0, le=32, description="at most so many at the finest level from right to left, for the check"
+        default=1,
+        ge=0,
+        le=32,
+        description="limit of the propagation rounds from right to left at the finest level; that direction serves "
+        "the consistency check only",
     )
     centres: int = Field(
         default=5,
         ge=1,
         le=9,
-        description="coarse pixels to search around: the parent, its neighbours along row, column and diagonals",
+        description="predictions searched per pixel: its pixel at the coarser level, then that pixel's neighbours "
+        "along row, column and diagonals; more: sharper depth edges, longer time",
     )
     finest: Literal[0, 1] = Field(
-        default=0, description="pyramid level matched last; 1 = half the resolution, a quarter of the work"
+        default=0,
+        description="pyramid level matched last; 0: full resolution; 1: half the resolution, a quarter of the work",
     )
-    median: Literal[1, 3, 5] = Field(default=3, description="pixels; side of the median filter of each level, 1 = none")
+    median: Literal[1, 3, 5] = Field(
+        default=3,
+        description="side [pixels] of the median filter of each level; larger: removes more outliers and more thin "
+        "objects; 1: no filter",
+    )
     threshold: float = Field(
         default=90.0,
         gt=0,
-        description="least distance above which a pixel is not matchable: byte steps (paper: grey levels)",
+        description="feature distance [byte steps; preset paper: grey levels] above which a pixel counts as not "
+        "matchable; larger: more matches, more errors",
     )
     texture: float = Field(
-        default=0.5, ge=0, description="grey levels; least local deviation, just above 8-bit rounding (.29)"
+        default=0.5,
+        ge=0,
+        description="least standard deviation [grey levels] of the window around a pixel to be matched; larger: "
+        "fewer matches where the image shows little; rounding to 8 bits alone gives 0.29",
     )
     backmatch: float = Field(
-        default=1.0, gt=0, description="pixels; greatest error after matching there and back (4.3.3)"
+        default=1.0,
+        gt=0,
+        description="largest error [pixels] after matching there and back (section 4.3.3); larger: more matches, "
+        "more errors",
     )
     speckle: int = Field(
-        default=40, ge=1, description="pixels; smaller isolated patches are removed, chance matches are so small"
+        default=40,
+        ge=1,
+        description="smallest patch of connected matches [pixels] that is kept; larger: removes more chance matches "
+        "and more small objects",
     )
     fill_reach: int = Field(
         default=120,
         ge=0,
-        description="pixels; reach of interpolation along a row, about the widest occlusion of a close stereo rig",
+        description="longest distance [pixels] of interpolation along a row; larger: fills wider gaps; the default "
+        "is about the widest occlusion of a close stereo rig",
     )
     plane_level: int = Field(
-        default=2, ge=1, le=6, description="pyramid level whose matches decide on pre-alignment by a plane"
+        default=2,
+        ge=1,
+        le=6,
+        description="pyramid level whose matches decide on pre-alignment by a plane; larger: coarser and faster",
     )
     plane_distortion: float = Field(
         default=0.2,
         ge=0,
-        description="pixels a pixel; pre-align beyond this shear (a 13-tap kernel then errs by a pixel)",
+        description="shear or stretch [pixels per pixel] between the images from which on they are pre-aligned by a "
+        "plane; larger: fewer pairs are pre-aligned",
     )
     plane_share: float = Field(
-        default=0.6, ge=0, le=1, description="share of the coarse matches that the plane must explain"
+        default=0.6,
+        ge=0,
+        le=1,
+        description="least share of the coarse matches that the plane must explain; larger: fewer pairs are "
+        "pre-aligned",
     )
-    refine: bool = Field(default=True, description="remove the perspective bias by mean-free Lucas-Kanade steps")
+    refine: bool = Field(
+        default=True,
+        description="improve sub-pixel displacements by mean-free Lucas-Kanade steps, which remove the bias that "
+        "perspective causes",
+    )
     correlation: float = Field(
         default=0.6,
         ge=-1,
         le=1,
-        description="least correlation of both images after refinement; below, noise met noise",
+        description="least correlation of both images' windows after refinement; larger: fewer matches, fewer "
+        "errors; below the default, noise matched noise",
     )
     refine_steps: int = Field(
-        default=1, ge=1, le=8, description="steps; a second one gains nothing; a pre-aligned image takes two more"
+        default=1,
+        ge=1,
+        le=8,
+        description="Lucas-Kanade steps; more take longer and measured no gain; a pre-aligned image takes two more "
+        "than set",
     )
     refine_radius: int = Field(
-        default=2, ge=1, le=8, description="pixels; 5 x 5 windows: wider ones smooth relief away"
+        default=2,
+        ge=1,
+        le=8,
+        description="radius [pixels] of the Lucas-Kanade windows, 2: 5 x 5; larger: less noise, small relief "
+        "smoothed away",
     )
     refine_noise: float = Field(
-        default=8.0, gt=0, description="squared grey levels a pixel; holds windows with weak texture"
+        default=8.0,
+        gt=0,
+        description="assumed noise [squared grey levels per pixel]; larger: shorter steps where texture is weak",
     )
 
     path_rounds: int = Field(
         default=0,
         ge=0,
         le=8,
-        description="rounds of propagation along paths a level; a third changes bad-2 by .001, 0 = none",
+        description="rounds of propagation along paths per level; more: slower, the third round changes bad-2 by "
+        "0.001; 0: none",
     )
     path_compact: int = Field(
         default=8,
         ge=0,
         le=64,
-        description="quarters: weight of the compact features' byte steps; twice Table 1's, which fatten edges",
+        description="weight of the compact features [quarters of a byte step]; larger: depth edges less fattened; "
+        "0: Table 1's features alone",
     )
     path_small: int = Field(
         default=36,
         ge=1,
         le=1000,
-        description="quarters of a byte step: cost of a pixel's difference to the pixel before, a tenth of a match's",
+        description="cost [quarters of a byte step] per pixel of difference between the displacements of neighbours "
+        "on a path; larger: smoother",
     )
     path_large: int = Field(
-        default=240, ge=1, le=10000, description="quarters of a byte step: the most that a difference costs"
+        default=240,
+        ge=1,
+        le=10000,
+        description="largest cost [quarters of a byte step] of a difference between neighbours on a path, however "
+        "large it is; larger: fewer depth steps",
     )
     path_grey: float = Field(
-        default=10.0, gt=0, description="grey levels: step between two pixels that halves path_large, above noise"
+        default=10.0,
+        gt=0,
+        description="grey-level step between neighbours at which path_large is halved; larger: depth steps follow "
+        "image edges less",
     )
     relief_steps: int = Field(
-        default=0, ge=0, le=20, description="steps of fitting a piecewise smooth relief, 0 = none"
+        default=0,
+        ge=0,
+        le=20,
+        description="steps of the variational refinement, which fits a piecewise smooth relief to all matches; more "
+        "take longer; 0: none",
     )
     relief_stiffness: float = Field(
         default=2000.0,
         gt=0,
-        description="squared grey levels for a bend of a pixel: strong against noise, weak against texture of 5 x 5",
+        description="cost [squared grey levels] of a bend of one pixel; larger: smoother, less noise, small relief "
+        "lost",
     )
     relief_bend: float = Field(
-        default=0.05, gt=0, description="pixels: bend (second difference) beyond which stiffness gives way to an edge"
+        default=0.05,
+        gt=0,
+        description="bend [pixels, second difference] beyond which the stiffness gives way to an edge; larger: "
+        "fewer edges are kept",
     )
     crowd: float = Field(
         default=0.0,
         ge=0,
         le=1,
-        description="least share of matched pixels in 9 x 9 around a matched one; lonely ones are errors by the edge",
+        description="least share of matched pixels in the 9 x 9 window around a match; larger: removes more "
+        "isolated matches, which are often errors beside depth edges",
     )
     greatest_std: float | None = Field(
         default=None,
         gt=0,
-        description="pixels; matches of a greater standard deviation count as not matched; none: any",
+        description="largest standard deviation [pixels] of a match that is kept; smaller: fewer matches, fewer "
+        "errors; null: no limit",
     )
     guided_fill: bool = Field(
-        default=False, description="edge-keeping median of interpolated pixels, which streak along rows"
+        default=False,
+        description="smooth interpolated pixels by a median that keeps image edges, since interpolation leaves "
+        "streaks along rows",
     )
 
     @model_validator(mode="before")
