@@ -223,23 +223,24 @@ def _add_rows(ring, first, total):  # type: ignore[no-untyped-def]
 def _solve(s, least, noise, keep, u, v, new_u, new_v, energy, per_noise):  # type: ignore[no-untyped-def]
     """Steps of one row from the window sums."""
     one, nil, far = np.float32(1.0), np.float32(0.0), np.float32(np.inf)
-    s0, s1, s2, s3, s4, s5, s6, s7, s8, s9 = s[0], s[1], s[2], s[3], s[4], s[5], s[6], s[7], s[8], s[9]
+    count, sum_gx, sum_gy, sum_r = s[0], s[1], s[2], s[3]
+    sum_gx_gx, sum_gx_gy, sum_gy_gy, sum_gx_r, sum_gy_r, sum_r_r = s[4], s[5], s[6], s[7], s[8], s[9]
     for x in range(u.size):
-        use = keep[x] & (s0[x] >= least)
-        n = s0[x] if use else one
+        use = keep[x] & (count[x] >= least)
+        n = count[x] if use else one
         inverse = one / n
-        m1, m2, m3 = s1[x] * inverse, s2[x] * inverse, s3[x] * inverse
-        a = s4[x] - s1[x] * m1 + noise * n
-        b = s5[x] - s1[x] * m2
-        c = s6[x] - s2[x] * m2 + noise * n
-        p = s7[x] - s1[x] * m3
-        q = s8[x] - s2[x] * m3
+        m1, m2, m3 = sum_gx[x] * inverse, sum_gy[x] * inverse, sum_r[x] * inverse
+        a = sum_gx_gx[x] - sum_gx[x] * m1 + noise * n
+        b = sum_gx_gy[x] - sum_gx[x] * m2
+        c = sum_gy_gy[x] - sum_gy[x] * m2 + noise * n
+        p = sum_gx_r[x] - sum_gx[x] * m3
+        q = sum_gy_r[x] - sum_gy[x] * m3
         # A window of noise alone has a determinant of at least (noise n)^2.
         det = a * c - b * b
         good = use & (det > nil)
         inverse_det = one / (det if det > nil else one)
         du, dv = (c * p - b * q) * inverse_det, (a * q - b * p) * inverse_det
-        energy[x] = max(s9[x] - s3[x] * m3, nil) * inverse if use else far
+        energy[x] = max(sum_r_r[x] - sum_r[x] * m3, nil) * inverse if use else far
         per_noise[x] = c * inverse_det if good else nil
         new_u[x] = u[x] + (min(max(du, -one), one) if good else nil)
         new_v[x] = v[x] + (min(max(dv, -one), one) if good else nil)
