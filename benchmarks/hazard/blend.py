@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rille.stages.hazard.risk import HAZARDOUS, SAFE, UNKNOWN
-from rille.stages.numeric.windows import fit_planes, running_max, running_min
+from rille.stages.numeric.windows import window_sum
 
 from .scenes import CELL, Scene
 
@@ -61,15 +61,35 @@ def blend(scene: Scene) -> dict[str, Any]:
     """Classes (row, col): hazardous where the mean of slope, roughness and step over their limits exceeds a half."""
     z, vehicle = elevations(scene), scene.vehicle
     size = 2 * round(0.5 * vehicle.wheel_base / CELL) + 1
-    planes = fit_planes(z, size, CELL)
-    near = 2 * round(0.5 * vehicle.wheel_diameter / CELL) + 1
-    step = running_max(z, near) - running_min(z, near)
+    slope, residual = _planes(z, size)
+    near = np.ones((2 * round(0.5 * vehicle.wheel_diameter / CELL) + 1,) * 2, np.uint8)
+    high, low = (sign * cv2.dilate(np.where(np.isnan(z), -np.inf, sign * z), near) for sign in (1, -1))
     parts = (
-        np.degrees(np.arctan(planes.slope)) / vehicle.max_slope_deg,
-        planes.residual / vehicle.max_roughness,
-        step / vehicle.max_step,
+        np.degrees(np.arctan(slope)) / vehicle.max_slope_deg,
+        residual / vehicle.max_roughness,
+        (high - low) / vehicle.max_step,
     )
     value = sum(np.clip(part, 0.0, 1.0) for part in parts) / 3.0
     risk = np.where(value > THRESHOLD, np.uint8(HAZARDOUS), np.uint8(SAFE))
     risk[np.isnan(z) | ~np.isfinite(value)] = UNKNOWN
     return {"risk": risk}
+
+
+def _planes(height: NDArray[np.float32], n: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Gradient, and RMS residual in metres, of the plane through the known cells of each n x n window."""
+    known = ~np.isnan(height)
+    z = np.where(known, height.astype(np.float64) - np.nanmean(height), 0.0)
+    y, x = (axis - axis.mean() for axis in np.indices(z.shape, dtype=np.float64))
+    count = window_sum(known, n)
+    one = np.maximum(count, 1.0)
+
+    def mean(values: NDArray[Any]) -> NDArray[np.float64]:
+        return window_sum(np.where(known, values, 0.0), n) / one
+
+    mx, my, mz = mean(x), mean(y), mean(z)
+    xx, yy, xy = mean(x * x) - mx * mx, mean(y * y) - my * my, mean(x * y) - mx * my
+    xz, yz, zz = mean(x * z) - mx * mz, mean(y * z) - my * mz, mean(z * z) - mz * mz
+    det = xx * yy - xy * xy
+    det = np.where((count > 2.5) & (det * one * one > 0.1), det, np.nan)  # else the cells lie on one line
+    b, c = (xz * yy - yz * xy) / det, (yz * xx - xz * xy) / det
+    return np.hypot(b, c) / CELL, np.sqrt(np.maximum(zz - b * xz - c * yz, 0.0))
