@@ -34,7 +34,7 @@ LEFT, RIGHT = 1, 2
 """Numbers of the two cameras; the rig has number 1, too, and the left camera is its origin."""
 
 
-class Segment(NamedTuple):
+class MatchedSegment(NamedTuple):
     """Tracks from one key frame to the next, their resection, and by frame number the disparities of its pairs."""
 
     track: Bundle
@@ -69,7 +69,7 @@ def export_run(run: Path, target: Path, store: Store) -> str:
     bundles = _Artifacts(run, store)
     rig = Rig.from_dict(bundles.one("calibration").meta["rig"])
     segments = [
-        Segment(track, resection, {f: b for f in _ends(track) if (b := bundles.find(f"hfvm/{f}")) is not None})
+        MatchedSegment(track, resection, {f: b for f in _ends(track) if (b := bundles.find(f"hfvm/{f}")) is not None})
         for track, resection in bundles.pairs("track", "resect")
     ]
     images = {f: b for s in segments for f in _ends(s.track)[:1] if (b := bundles.find(f"image/left/{f}")) is not None}
@@ -86,7 +86,7 @@ def build(
     rig: Rig,
     trajectory: Bundle,
     names: Mapping[int, str],
-    segments: Sequence[Segment],
+    segments: Sequence[MatchedSegment],
     images: Mapping[int, Bundle] | None = None,
 ) -> Any:
     """A ``pycolmap.Reconstruction``.
@@ -166,7 +166,7 @@ def _ends(track: Bundle) -> list[int]:
 
 
 def _points(
-    segment: Segment,
+    segment: MatchedSegment,
     poses: Mapping[int, RigidTransform],
     views: Mapping[int, list[_View]],
     images: Mapping[int, Bundle],

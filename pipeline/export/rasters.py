@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rille.pipeline.engine.runtime import atomic
-from rille.pipeline.export import ranges, styles
+from rille.pipeline.export import ranges
 from rille.pipeline.export.output import Output, stage
-from rille.pipeline.export.writers import write_raster, write_style
+from rille.pipeline.export.writers import write_raster
 from rille.stages.core.declare import Bundle
 from rille.stages.geometry.lattice import Lattice, mosaic, union
 from rille.stages.hazard.risk import REASONS
@@ -76,11 +76,14 @@ def _write_hillshade(folder: Path, view: Any) -> None:
 
 def _write_dem_style(folder: Path, view: Any) -> None:
     low, high = ranges.ground_limits(_height(view)[1])
-    write_style(folder / "dem.qml", styles.DEM, {f"e{k}": low + (high - low) * k / 8 for k in range(9)})
+    atomic.write(folder / "dem.qml", dem_style(low, high))
 
 
 CLASSES = {"safe": "#a6d7c3", "caution": "#f0d68a", "hazard": "#c8501e", "unknown (never entered)": "#8d8f98"}
 """Names and colours of the classes 0, 1, 2 and 3."""
+
+ELEVATIONS = ("#00224e", "#1a386f", "#434e6c", "#61656f", "#7d7c78", "#9b9476", "#bcae6c", "#dec958", "#fee838")
+"""Colours from the lowest elevation to the highest (matplotlib's cividis)."""
 
 BITS = 12
 """Significant bits of a written measure: 0.02 %, finer than any is known."""
@@ -133,7 +136,41 @@ def rounded(values: NDArray[np.float32], bits: int) -> NDArray[np.float32]:
 
 
 def _write_risk_style(folder: Path, view: Any) -> None:
-    write_style(folder / "risk.qml", styles.RISK)
+    atomic.write(folder / "risk.qml", risk_style())
+
+
+def dem_style(low: float, high: float) -> str:
+    """QGIS style of elevations, in metres."""
+    values = [f"{low + (high - low) * k / (len(ELEVATIONS) - 1):.6g}" for k in range(len(ELEVATIONS))]
+    items = "".join(
+        f'<item value="{value}" label="{value}" color="{colour}" alpha="255"/>\n'
+        for value, colour in zip(values, ELEVATIONS, strict=True)
+    )
+    kind = f'type="singlebandpseudocolor" opacity="1" classificationMin="{values[0]}" classificationMax="{values[-1]}"'
+    shader = f'colorRampType="INTERPOLATED" clip="0" minimumValue="{values[0]}" maximumValue="{values[-1]}"'
+    limits = "<minMaxOrigin><limits>None</limits></minMaxOrigin>\n"
+    return _style(
+        kind, f"{limits}<rastershader>\n<colorrampshader {shader}>\n{items}</colorrampshader>\n</rastershader>\n"
+    )
+
+
+def risk_style() -> str:
+    """QGIS style of the classes."""
+    entries = "".join(
+        f'<paletteEntry value="{k}" label="{name}" color="{colour}" alpha="255"/>\n'
+        for k, (name, colour) in enumerate(CLASSES.items())
+    )
+    return _style('type="paletted" opacity="0.8"', f"<colorPalette>\n{entries}</colorPalette>\n")
+
+
+def _style(kind: str, content: str) -> str:
+    """Style file of QGIS 3 for the first band of a raster; QGIS applies it where it has the raster's name."""
+    return (
+        "<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>\n"
+        '<qgis version="3.22" styleCategories="Symbology" hasScaleBasedVisibilityFlag="0">\n<pipe>\n'
+        f'<rasterrenderer {kind} band="1" alphaBand="-1" nodataColor="">\n{content}</rasterrenderer>\n'
+        '<rasterresampler maxOversampling="2"/>\n</pipe>\n<blendMode>0</blendMode>\n</qgis>\n'
+    )
 
 
 def _of_terrain(name: str, what: str, write: Callable[..., None], values: str, missing: str = "nan") -> Output:

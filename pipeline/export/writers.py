@@ -1,4 +1,4 @@
-"""Files for other programs: GeoTIFFs with their QGIS styles, the path, the trajectory in KITTI's and TUM's formats.
+"""Files for other programs: GeoTIFFs, the path, the trajectory in KITTI's and TUM's formats.
 
 Every file is written beside its final name and moved there, so that a reader finds a whole file or none.
 """
@@ -11,7 +11,6 @@ import json
 import struct
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from string import Template
 from typing import Any
 
 import numpy as np
@@ -201,16 +200,6 @@ def _wkb(kind: int, points: NDArray[np.float64]) -> bytes:
     """Well-known binary, little-endian, of a point (3,) or a line (n, 3)."""
     count = struct.pack("<I", len(points)) if kind == LINE_Z else b""
     return struct.pack("<BI", 1, kind) + count + np.ascontiguousarray(points, dtype="<f8").tobytes()
-
-
-def write_style(path: Path, style: str, values: Mapping[str, float] | None = None) -> None:
-    """Write a QGIS style; beside a raster of the same stem QGIS applies it on opening.
-
-    Parameters
-    ----------
-    values : numbers to fill in by the names that the style has for them.
-    """
-    atomic.write(path, Template(style).substitute({key: f"{value:.6g}" for key, value in (values or {}).items()}))
 
 
 FORMULA = ("=", "+", "-", "@", "\t")

@@ -5,7 +5,7 @@ import pycolmap
 from raising import raises
 
 from rille.pipeline.engine.store.base import Store
-from rille.pipeline.export.colmap import Segment, build, export_run
+from rille.pipeline.export.colmap import MatchedSegment, build, export_run
 from rille.stages.core.declare import Bundle
 from rille.stages.core.validity import Validity
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
@@ -37,7 +37,12 @@ def parts():
         {},
     )
     matches = disparities(pixels[:, 0], RIG.right.project((RIG.T_right_left @ poses[0].inverse()).apply(world)))
-    return Bundle({"poses": given}, {"frames": FRAMES}), [Segment(track, resection, {FRAMES[0]: matches})], poses, world
+    return (
+        Bundle({"poses": given}, {"frames": FRAMES}),
+        [MatchedSegment(track, resection, {FRAMES[0]: matches})],
+        poses,
+        world,
+    )
 
 
 def disparities(left, right):

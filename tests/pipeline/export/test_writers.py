@@ -17,14 +17,12 @@ from evo.tools import file_interface
 from raising import raises
 
 from rille.datasets.georeference import Georeference
-from rille.pipeline.export import styles
 from rille.pipeline.export.frames_json import describe
-from rille.pipeline.export.rasters import rounded
+from rille.pipeline.export.rasters import dem_style, risk_style, rounded
 from rille.pipeline.export.writers import (
     write_path_geojson,
     write_path_gpkg,
     write_raster,
-    write_style,
     write_table,
     write_trajectory_kitti,
     write_trajectory_tum,
@@ -200,7 +198,7 @@ def test_equal_paths_make_equal_files(tmp_path: Path) -> None:
 
 
 def test_styles_name_the_classes_and_span_the_elevations(tmp_path: Path) -> None:
-    write_style(tmp_path / "risk.qml", styles.RISK)
+    (tmp_path / "risk.qml").write_text(risk_style())
     entries = ElementTree.parse(tmp_path / "risk.qml").findall(".//paletteEntry")
     assert [(e.get("value"), (e.get("label") or "").split()[0]) for e in entries] == [
         ("0", "safe"),
@@ -208,7 +206,7 @@ def test_styles_name_the_classes_and_span_the_elevations(tmp_path: Path) -> None
         ("2", "hazard"),
         ("3", "unknown"),
     ]
-    write_style(tmp_path / "dem.qml", styles.DEM, {f"e{k}": -1.0 + k / 4 for k in range(9)})
+    (tmp_path / "dem.qml").write_text(dem_style(-1.0, 1.0))
     style = ElementTree.parse(tmp_path / "dem.qml")
     assert [float(e.get("value") or "nan") for e in style.findall(".//item")] == [-1.0 + k / 4 for k in range(9)]
     shader = style.find(".//colorrampshader")
