@@ -30,7 +30,7 @@ def init(directory: Path, output: Path | None = None, force: bool = False) -> in
     InputError
         The folder holds no stereo images, or the file cannot be written.
     """
-    hindered = hindrance(directory)
+    hindered = hindrance(directory.absolute())  # never a built-in sequence of the same name
     if output is None and not force and directory.is_dir() and hindered is None:
         print(f"{directory} opens as it is; --output or --force writes a manifest nevertheless")
         print(f"\nnext:\n  rille check {directory}\n  rille reconstruct {directory}")

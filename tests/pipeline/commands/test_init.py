@@ -11,6 +11,7 @@ from raising import raises
 
 from rille.datasets.images.files import Digests
 from rille.datasets.manifest.opening import open_manifest
+from rille.datasets.registry import hindrance
 from rille.pipeline.commands.init import init
 
 SETTINGS = """%YAML:1.0
@@ -95,6 +96,21 @@ def test_a_folder_that_opens_as_it_is_gets_no_manifest_unasked(drive, tmp_path, 
     assert not list(drive.glob("*.toml"))
     init(drive, tmp_path / "m.toml")
     assert (tmp_path / "m.toml").is_file()
+
+
+NAMED = Path("nasa_k10")
+"""Of a built-in sequence that opens where its data are."""
+
+
+def test_a_folder_with_the_name_of_a_built_in_sequence_is_that_folder(drive, capsys, monkeypatch):
+    monkeypatch.setattr(
+        "rille.pipeline.commands.init.hindrance", lambda path: None if path == NAMED else hindrance(path)
+    )
+    monkeypatch.chdir(drive.parent)
+    drive.rename(NAMED)
+    assert init(NAMED) == 0
+    assert "wrote" in capsys.readouterr().out
+    assert Path(f"{NAMED}.rille.toml").exists()
 
 
 def test_what_does_not_open_is_not_said_to(drive, capsys):
