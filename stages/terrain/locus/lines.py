@@ -8,7 +8,7 @@ import math
 import numpy as np
 from numba import njit
 
-from rille.stages.terrain.locus.points import LANES, LINE, NEAR
+from rille.stages.terrain.locus.points import LANES, LEFT_A, LEFT_B, NEAR, RIGHT_A, RIGHT_B
 
 STEP_PX = 1.0  # search step: disparity is bilinear between pixels, so nothing hides in a shorter one
 MARGIN = 2  # steps that the interval handed down from the coarse level is widened by
@@ -28,7 +28,7 @@ def lines(n, left, right, lanes):  # type: ignore[no-untyped-def]
         p = right if side else left
         for k in range(3):
             p0, p1, p2, p3 = p[k, 0], p[k, 1], p[k, 2], p[k, 3]
-            a, b = (3 * side + k) * LANES, (LINE // 2 + 3 * side + k) * LANES
+            a, b = (RIGHT_A if side else LEFT_A) + k * LANES, (RIGHT_B if side else LEFT_B) + k * LANES
             for m in range(n):
                 x, y, z = lanes[FOOT + m], lanes[FOOT + LANES + m], lanes[FOOT + 2 * LANES + m]
                 lanes[a + m] = p3 + p0 * x + p1 * y + p2 * z
@@ -41,11 +41,11 @@ def clip(n, sizes, z_min, z_max, lanes):  # type: ignore[no-untyped-def]
     """The part of z_min..z_max where each line projects into both images; empty (bottom > top) where there is none."""
     wl, hl, wr, hr = sizes[0] - 1.0, sizes[1] - 1.0, sizes[2] - 1.0, sizes[3] - 1.0
     for m in range(n):
-        a0, a1, a2 = lanes[m], lanes[LANES + m], lanes[2 * LANES + m]
-        b0, b1, b2 = lanes[6 * LANES + m], lanes[7 * LANES + m], lanes[8 * LANES + m]
+        a0, a1, a2 = lanes[LEFT_A + m], lanes[LEFT_A + LANES + m], lanes[LEFT_A + 2 * LANES + m]
+        b0, b1, b2 = lanes[LEFT_B + m], lanes[LEFT_B + LANES + m], lanes[LEFT_B + 2 * LANES + m]
         low, high = _inside(a0, a1, a2, b0, b1, b2, wl, hl, z_min, z_max)
-        a0, a1, a2 = lanes[3 * LANES + m], lanes[4 * LANES + m], lanes[5 * LANES + m]
-        b0, b1, b2 = lanes[9 * LANES + m], lanes[10 * LANES + m], lanes[11 * LANES + m]
+        a0, a1, a2 = lanes[RIGHT_A + m], lanes[RIGHT_A + LANES + m], lanes[RIGHT_A + 2 * LANES + m]
+        b0, b1, b2 = lanes[RIGHT_B + m], lanes[RIGHT_B + LANES + m], lanes[RIGHT_B + 2 * LANES + m]
         lanes[BOTTOM + m], lanes[TOP + m] = _inside(a0, a1, a2, b0, b1, b2, wr, hr, low, high)
 
 
@@ -72,11 +72,11 @@ def spans(n, lanes):  # type: ignore[no-untyped-def]
     """Divide the lines into steps of a pixel at most where they are seen fastest."""
     for m in range(n):
         bottom, top = lanes[BOTTOM + m], lanes[TOP + m]
-        a0, a1, a2 = lanes[m], lanes[LANES + m], lanes[2 * LANES + m]
-        b0, b1, b2 = lanes[6 * LANES + m], lanes[7 * LANES + m], lanes[8 * LANES + m]
+        a0, a1, a2 = lanes[LEFT_A + m], lanes[LEFT_A + LANES + m], lanes[LEFT_A + 2 * LANES + m]
+        b0, b1, b2 = lanes[LEFT_B + m], lanes[LEFT_B + LANES + m], lanes[LEFT_B + 2 * LANES + m]
         fastest = max(_speed(bottom, a0, a1, a2, b0, b1, b2), _speed(top, a0, a1, a2, b0, b1, b2))
-        a0, a1, a2 = lanes[3 * LANES + m], lanes[4 * LANES + m], lanes[5 * LANES + m]
-        b0, b1, b2 = lanes[9 * LANES + m], lanes[10 * LANES + m], lanes[11 * LANES + m]
+        a0, a1, a2 = lanes[RIGHT_A + m], lanes[RIGHT_A + LANES + m], lanes[RIGHT_A + 2 * LANES + m]
+        b0, b1, b2 = lanes[RIGHT_B + m], lanes[RIGHT_B + LANES + m], lanes[RIGHT_B + 2 * LANES + m]
         fastest = max(fastest, _speed(bottom, a0, a1, a2, b0, b1, b2), _speed(top, a0, a1, a2, b0, b1, b2))
         count = max(1.0, min(np.ceil(fastest * (top - bottom) / STEP_PX), MAX_STEPS))
         dz = (top - bottom) / count

@@ -27,9 +27,10 @@ disparity there, and as :func:`meet` gives them s and its part across the epipol
 is ``POWER``."""
 POINT_PLANES = 12
 
+LEFT_A, RIGHT_A, LEFT_B, RIGHT_B = (3 * k * LANES for k in range(4))
+"""Planes of a buffer of lanes that hold each cell's line: its homogeneous projections a + z b, three planes each."""
 LINE = 12
-"""Planes of a buffer of lanes that hold each cell's line: a (6), then b (6) of its homogeneous projections a + z b,
-left in 0..2 and right in 3..5."""
+"""Number of these planes."""
 Z = 12 * LANES
 """Plane of the elevation that is looked at."""
 
@@ -37,10 +38,10 @@ Z = 12 * LANES
 @njit(cache=True, nogil=True, error_model="numpy")
 def climb(lanes, lane, bottom, step, way, dz, width, height, room):  # type: ignore[no-untyped-def]
     """Project the points ``bottom + (step + way m) dz``, m < :data:`STEPS`, of one lane's line."""
-    a0, a1, a2 = lanes[lane], lanes[LANES + lane], lanes[2 * LANES + lane]
-    a3, a4, a5 = lanes[3 * LANES + lane], lanes[4 * LANES + lane], lanes[5 * LANES + lane]
-    b0, b1, b2 = lanes[6 * LANES + lane], lanes[7 * LANES + lane], lanes[8 * LANES + lane]
-    b3, b4, b5 = lanes[9 * LANES + lane], lanes[10 * LANES + lane], lanes[11 * LANES + lane]
+    a0, a1, a2 = lanes[LEFT_A + lane], lanes[LEFT_A + LANES + lane], lanes[LEFT_A + 2 * LANES + lane]
+    a3, a4, a5 = lanes[RIGHT_A + lane], lanes[RIGHT_A + LANES + lane], lanes[RIGHT_A + 2 * LANES + lane]
+    b0, b1, b2 = lanes[LEFT_B + lane], lanes[LEFT_B + LANES + lane], lanes[LEFT_B + 2 * LANES + lane]
+    b3, b4, b5 = lanes[RIGHT_B + lane], lanes[RIGHT_B + LANES + lane], lanes[RIGHT_B + 2 * LANES + lane]
     w, right, lower = float(width), width - 1.0, height - 1.0
     for m in range(STEPS):
         z = bottom + (step + way * m) * dz
@@ -60,12 +61,12 @@ def project(lanes, n, width, height, room):  # type: ignore[no-untyped-def]
     w, right, lower = float(width), width - 1.0, height - 1.0
     for m in range(n):
         z = lanes[Z + m]
-        w_left = lanes[2 * LANES + m] + z * lanes[8 * LANES + m]
-        w_right = lanes[5 * LANES + m] + z * lanes[11 * LANES + m]
-        x = (lanes[m] + z * lanes[6 * LANES + m]) / w_left
-        y = (lanes[LANES + m] + z * lanes[7 * LANES + m]) / w_left
-        xr = (lanes[3 * LANES + m] + z * lanes[9 * LANES + m]) / w_right
-        yr = (lanes[4 * LANES + m] + z * lanes[10 * LANES + m]) / w_right
+        w_left = lanes[LEFT_A + 2 * LANES + m] + z * lanes[LEFT_B + 2 * LANES + m]
+        w_right = lanes[RIGHT_A + 2 * LANES + m] + z * lanes[RIGHT_B + 2 * LANES + m]
+        x = (lanes[LEFT_A + m] + z * lanes[LEFT_B + m]) / w_left
+        y = (lanes[LEFT_A + LANES + m] + z * lanes[LEFT_B + LANES + m]) / w_left
+        xr = (lanes[RIGHT_A + m] + z * lanes[RIGHT_B + m]) / w_right
+        yr = (lanes[RIGHT_A + LANES + m] + z * lanes[RIGHT_B + LANES + m]) / w_right
         inside = (w_left >= NEAR) & (w_right >= NEAR) & (x >= 0.0) & (y >= 0.0) & (x < right) & (y < lower)
         x, y, xr = x if inside else 0.0, y if inside else 0.0, xr if inside else np.nan
         c, r = np.floor(x), np.floor(y)
