@@ -13,7 +13,7 @@ LANES = 32
 """Cells that are looked at together."""
 SPLINE = 16
 """Coefficients that a value depends on."""
-AT, VALUE, WEIGHTS = (k * LANES for k in (0, 4, 10))
+LEFT_AT, RIGHT_AT, LEFT_VALUE, RIGHT_VALUE, WEIGHTS, SLOPES = (k * LANES for k in (0, 2, 4, 7, 10, 18))
 """Planes: x and y in the left and in the right image, a pixel or more from the edge; value and gradient (x, y) of the
 left and of the right spline; weights of four coefficients along x, along y, and their derivatives likewise."""
 PLANES = 26
@@ -24,25 +24,24 @@ def read(n, left, right, lanes, taps):  # type: ignore[no-untyped-def]
     """Value and gradient of both splines at ``n`` lanes; ``taps``: room for their coefficients."""
     for side in range(2):
         spline = right if side else left
-        at = 2 * side * LANES
+        at = RIGHT_AT if side else LEFT_AT
         for m in range(n):
             c, r = int(lanes[at + m]) - 1, int(lanes[at + LANES + m]) - 1
             for k in range(4):
                 for i in range(4):
                     taps[(4 * k + i) * LANES + m] = spline[r + k, c + i]
         if side:
-            _weights(n, lanes, 2 * LANES)
-            _sum(n, lanes, taps, VALUE + 3 * LANES)
+            _weights(n, lanes, RIGHT_AT)
+            _sum(n, lanes, taps, RIGHT_VALUE)
         else:
-            _weights(n, lanes, 0)
-            _sum(n, lanes, taps, VALUE)
+            _weights(n, lanes, LEFT_AT)
+            _sum(n, lanes, taps, LEFT_VALUE)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _weights(n, lanes, at):  # type: ignore[no-untyped-def]
     for axis in range(2):
-        w = WEIGHTS + 4 * axis * LANES
-        s = w + 8 * LANES
+        w, s = WEIGHTS + 4 * axis * LANES, SLOPES + 4 * axis * LANES
         for m in range(n):
             t = lanes[at + axis * LANES + m]
             t = t - int(t)
@@ -71,10 +70,10 @@ def _sum(n, lanes, taps, value):  # type: ignore[no-untyped-def]
             w0, w1 = lanes[WEIGHTS + m], lanes[WEIGHTS + LANES + m]
             w2, w3 = lanes[WEIGHTS + 2 * LANES + m], lanes[WEIGHTS + 3 * LANES + m]
             across = w0 * c0 + w1 * c1 + w2 * c2 + w3 * c3
-            w0, w1 = lanes[WEIGHTS + 8 * LANES + m], lanes[WEIGHTS + 9 * LANES + m]
-            w2, w3 = lanes[WEIGHTS + 10 * LANES + m], lanes[WEIGHTS + 11 * LANES + m]
+            w0, w1 = lanes[SLOPES + m], lanes[SLOPES + LANES + m]
+            w2, w3 = lanes[SLOPES + 2 * LANES + m], lanes[SLOPES + 3 * LANES + m]
             along = w0 * c0 + w1 * c1 + w2 * c2 + w3 * c3
-            w, s = lanes[WEIGHTS + (4 + k) * LANES + m], lanes[WEIGHTS + (12 + k) * LANES + m]
+            w, s = lanes[WEIGHTS + (4 + k) * LANES + m], lanes[SLOPES + (4 + k) * LANES + m]
             lanes[value + m] += w * across
             lanes[value + LANES + m] += w * along
             lanes[value + 2 * LANES + m] += s * across

@@ -15,7 +15,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rille.stages.geometry.surface import Surface
-from rille.stages.terrain.locus.spline import LANES, SPLINE, read
+from rille.stages.terrain.locus.spline import LANES, LEFT_AT, LEFT_VALUE, RIGHT_AT, RIGHT_VALUE, SPLINE, read
 from rille.stages.terrain.locus.spline import PLANES as SPLINE_PLANES
 
 Float32 = NDArray[np.float32]
@@ -129,8 +129,8 @@ def _project(n, left, right, centre, left_shape, right_shape, lanes):  # type: i
         seen = seen & (xl >= 1.0) & (yl >= 1.0) & (xl < wl) & (yl < hl)
         seen = seen & (xr >= 1.0) & (yr >= 1.0) & (xr < wr) & (yr < hr)
         lanes[SEEN + m] = 1.0 if seen else 0.0
-        lanes[m], lanes[LANES + m] = xl if seen else 1.0, yl if seen else 1.0
-        lanes[2 * LANES + m], lanes[3 * LANES + m] = xr if seen else 1.0, yr if seen else 1.0
+        lanes[LEFT_AT + m], lanes[LEFT_AT + LANES + m] = xl if seen else 1.0, yl if seen else 1.0
+        lanes[RIGHT_AT + m], lanes[RIGHT_AT + LANES + m] = xr if seen else 1.0, yr if seen else 1.0
         # Along the left ray the left image stays: what the right one moves by is disparity.
         u, v = _motion(r0, r1, r2, xr, yr, b2, vx / toward, vy / toward, vz / toward)
         lanes[DISPARITY + m] = math.sqrt(u * u + v * v)
@@ -153,10 +153,10 @@ def _write(n, cells, lanes, wide, out):  # type: ignore[no-untyped-def]
     """What :func:`look` gives of each lane; ``wide``: cells have neighbours, so that their size is known."""
     for m in range(n):
         if lanes[SEEN + m] > 0.0:
-            i, grey = cells[m], 4 * LANES + m
-            out[0, i], out[1, i] = lanes[grey], lanes[grey + 3 * LANES]
-            gx, gy = lanes[grey + LANES], lanes[grey + 2 * LANES]
+            i, left, right = cells[m], LEFT_VALUE + m, RIGHT_VALUE + m
+            out[0, i], out[1, i] = lanes[left], lanes[right]
+            gx, gy = lanes[left + LANES], lanes[left + 2 * LANES]
             out[2, i] = gx * lanes[LEFT_WAY + m] + gy * lanes[LEFT_WAY + LANES + m]
-            gx, gy = lanes[grey + 4 * LANES], lanes[grey + 5 * LANES]
+            gx, gy = lanes[right + LANES], lanes[right + 2 * LANES]
             out[5, i] = gx * lanes[RIGHT_WAY + m] + gy * lanes[RIGHT_WAY + LANES + m]
             out[3, i], out[4, i] = lanes[DISPARITY + m], lanes[AREA + m] if wide else 1.0
