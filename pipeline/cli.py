@@ -209,6 +209,38 @@ def timing(run: Run = "latest", *, runs: Runs = RUNS, debug: Debug = False) -> i
     return command.show(run, runs)
 
 
+@app.command
+def view(run: Run = "latest", *, runs: Runs = RUNS, debug: Debug = False) -> int:
+    """Open the report of a run in the browser; print its path."""
+    from rille.pipeline.commands import view as command
+    from rille.pipeline.runs import lookup
+
+    return command.view(lookup.find(run, runs))
+
+
+@app.command
+def compare(
+    a: Run,
+    b: Run,
+    *,
+    output: Annotated[Path, Output] = Path("comparison.png"),
+    runs: Runs = RUNS,
+    debug: Debug = False,
+) -> int:
+    """Compare two runs: which parameters, tasks, figures, positions and elevations differ.
+
+    Parameters
+    ----------
+    output
+        Picture of the difference of the elevations, A minus B, to write.
+    """
+    prepare()
+    from rille.pipeline.commands import compare as command
+    from rille.pipeline.runs import lookup
+
+    return command.compare(lookup.find(a, runs), lookup.find(b, runs), output)
+
+
 @app.command(name="runs")
 def list_runs(sequence: str = "", *, runs: Runs = RUNS, debug: Debug = False) -> int:
     """List runs, the latest last: name, state, tasks computed and cached, seconds.

@@ -162,6 +162,24 @@ def test_timing(place: Place) -> None:
     assert place.rille("timing").lines[0].startswith("run mockup-loop/")
 
 
+def test_view(place: Place) -> None:
+    done = place.rille("view", "other")
+    assert (done.status, done.err) == (0, "")
+    assert Path(done.lines[-1]).name == "report.html"
+
+
+def test_compare(place: Place, tmp_path: Path) -> None:
+    runs = [f"other/{run.name}" for run in (place.runs("other")[0], place.runs("other")[-1])]
+    same = place.rille("compare", *runs, "-o", tmp_path / "same.png")
+    assert (same.status, same.err) == (0, "")
+    assert any(line.startswith("elevations    0 of ") for line in same.lines)
+    assert any(line.endswith(" with the same result, 0 with another") for line in same.lines)
+    assert (tmp_path / "same.png").stat().st_size > 10_000
+    apart = place.rille("compare", "other", "mockup-short", "-o", tmp_path / "apart.png")
+    assert apart.status == 0
+    assert any(line.startswith("positions     ") for line in apart.lines)
+
+
 def test_check(place: Place) -> None:
     first, second = place.said["check"], place.said["check again"]
     assert (first.status, first.err) == (0, "")

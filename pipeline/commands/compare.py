@@ -1,0 +1,124 @@
+"""``rille compare A B``: which parameters, tasks, figures, poses and elevations of two runs differ."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rille.pipeline.commands import compare_dem
+from rille.pipeline.engine import events
+from rille.pipeline.export.read_dem import read_elevation
+from rille.pipeline.report.words import metres, quantity
+from rille.pipeline.runs import lookup
+from rille.stages.core.errors import ConfigError, InputError
+
+
+def compare(a: Path, b: Path, output: Path) -> int:
+    """Print what differs between two runs, and draw the difference of their elevations; gives the exit code.
+
+    Raises
+    ------
+    ConfigError
+        One of the runs did not come to its end, or the picture cannot be written.
+    """
+    reports = [_report(run) for run in (a, b)]
+    settings = [_flat(tomllib.loads((run / "config.toml").read_text(encoding="utf-8"))) for run in (a, b)]
+    terrain = _elevations(a, b, output)
+    print(f"A {lookup.name(a)}\nB {lookup.name(b)}")
+    for line in (*_parameters(*settings), *_tasks(a, b), *_figures(*reports), _positions(a, b), terrain):
+        print(line)
+    return 0
+
+
+def _report(run: Path) -> dict[str, Any]:
+    try:
+        found: dict[str, Any] = json.loads((run / "report.json").read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ConfigError(
+            "RIL-890", f"run {lookup.name(run)} did not come to its end", remedy="run the same command again"
+        ) from None
+    return found
+
+
+def _flat(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Values of nested tables by dotted names."""
+    found: dict[str, Any] = {}
+    for name, value in table.items():
+        found |= _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}
+    return found
+
+
+def _parameters(a: Mapping[str, Any], b: Mapping[str, Any]) -> Iterator[str]:
+    names = [name for name in {**a, **b} if a.get(name) != b.get(name)]
+    yield f"parameters    {len(names) or 'none'} differ"
+    for name in names:
+        one, other = (json.dumps(table[name]) if name in table else "not set" for table in (a, b))
+        yield f"  {name}: {one} -> {other}"
+
+
+def _tasks(a: Path, b: Path) -> Iterator[str]:
+    """Counts by stage: tasks with another result, and those that one run alone has."""
+    one, other = ({row["label"]: row for row in events.read(run / lookup.LEDGER)} for run in (a, b))
+    common = [label for label in one if label in other]
+    changed = [label for label in common if one[label].get("digest") != other[label].get("digest")]
+    yield f"tasks         {len(common) - len(changed)} with the same result, {len(changed)} with another"
+    for words, rows, labels in (
+        ("another result", one, changed),
+        ("in A alone", one, [label for label in one if label not in other]),
+        ("in B alone", other, [label for label in other if label not in one]),
+    ):
+        for stage, count in Counter(rows[label]["stage"] for label in labels).items():
+            yield f"  {stage}: {count} {words}"
+
+
+def _figures(a: Mapping[str, Any], b: Mapping[str, Any]) -> Iterator[str]:
+    """Figures of the report that differ; times are no results."""
+    one, other = a["metrics"], b["metrics"]
+    both = [name for name in one if name in other and name != "wall_clock"]
+    differ = [name for name in both if one[name]["value"] != other[name]["value"]]
+    shown = {name: [quantity(m[name]["value"], m[name]["unit"]) for m in (one, other)] for name in differ}
+    seen = [name for name, (before, after) in shown.items() if before != after]
+    equal = f"{len(both) - len(differ)} equal, {len(differ) - len(seen)} equal to three digits"
+    yield f"figures       {equal}, {len(seen)} differ"
+    yield from (f"  {one[name]['label']}: {' -> '.join(shown[name])}" for name in seen)
+
+
+def _positions(a: Path, b: Path) -> str:
+    paths = [run / "trajectory.tum" for run in (a, b)]
+    if not all(path.exists() for path in paths):
+        return "positions     not both runs have a trajectory"
+    one, other = ({row[0]: row[1:4] for row in np.loadtxt(path, ndmin=2)} for path in paths)
+    common = [time for time in one if time in other]
+    if not common:
+        return "positions     no frame has a pose in both"
+    apart = np.array([np.linalg.norm(one[time] - other[time]) for time in common])
+    rms = float(np.sqrt(np.mean(apart**2)))
+    return f"positions     of {len(common)} frames: RMS {metres(rms)}, at most {metres(float(apart.max()))} apart"
+
+
+def _elevations(a: Path, b: Path, output: Path) -> str:
+    try:
+        models = [read_elevation(run) for run in (a, b)]
+        compare_dem.check(*models)
+        found, error, slope, distance = compare_dem.measure(models[0], models[1])
+    except InputError as problem:
+        return f"elevations    not compared: {problem}"
+    try:
+        compare_dem.draw(output, found, error, slope, distance)
+    except OSError as problem:
+        raise ConfigError(
+            "RIL-892", f"{output} cannot be written: {problem.strerror}", remedy="name another with -o"
+        ) from problem
+    known = np.isfinite(error)
+    moved, most = int(np.count_nonzero(error[known])), float(np.abs(error[known]).max(initial=0.0))
+    rms = float(np.sqrt(np.mean(np.square(error[known]))))
+    return (
+        f"elevations    {moved} of {int(known.sum())} common cells differ: RMS {metres(rms)}, at most {metres(most)}\n"
+        f"{output}"
+    )
