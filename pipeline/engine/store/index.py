@@ -113,7 +113,7 @@ class Index:
 
 
 def _line(mark: str, ref: Ref) -> str:
-    return json.dumps([mark, ref.digest, ref.nbytes, ref.stored, ref.meta], separators=(",", ":"))
+    return json.dumps([mark, ref.digest, ref.nbytes, ref.stored, dict(ref.meta)], separators=(",", ":"))
 
 
 def pack(lines: Iterable[str]) -> bytes:

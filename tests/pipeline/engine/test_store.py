@@ -368,6 +368,23 @@ def test_gc_keeps_what_a_run_used_lately(cache, monkeypatch):
     assert maintenance.gc(store, set(), grace=5).artifacts == 1
 
 
+def test_a_run_over_an_old_cache_notes_what_it_touched(cache, monkeypatch):
+    monkeypatch.setattr(folder, "RACY", 0.0)
+    ref = commit(cache)
+    old = time.time() - 1e6
+    os.utime(cache / ref.path, (old, old))
+    first, second = Store(cache), Store(cache)
+    first.survey("s")
+    first.note([ref])
+    second.survey("s")
+    found = second.lookup("toy", KEY)
+    assert os.stat(cache / ref.path).st_mtime > old
+    second.note([found])
+    third = Store(cache)
+    third.survey("s")
+    assert third.lookup("toy", KEY) == ref
+
+
 @pytest.mark.parametrize("use", [True, False])
 def test_gc_gives_back_what_a_run_finds_after_it_has_looked(cache, monkeypatch, use):
     """A plan only asks, and protects nothing."""
