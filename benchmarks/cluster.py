@@ -25,8 +25,8 @@ class Measured:
     """Bytes of a client that has done nothing."""
     plan: float = 0.2e-3
     """Seconds a node that is found in the cache."""
-    scheduler: float = 1.9e-3
-    """Seconds of processor a task in bulk, of dask's scheduler and the client (2 000 trivial tasks)."""
+    scheduler: float = 2.6e-3
+    """Seconds of processor a task, of dask's scheduler and the client (97 712 nodes of benchmarks/scale.py)."""
     index: float = 1.36e3
     """Bytes a node of the index, unpacked."""
     index_limit: float = 256e6

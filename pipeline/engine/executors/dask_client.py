@@ -18,12 +18,11 @@ import logging
 import math
 import pickle
 import queue
-import signal
 import time
 import uuid
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Sequence
+from contextlib import suppress
 from importlib.util import find_spec
 from multiprocessing import resource_tracker
 from typing import Any
@@ -38,6 +37,7 @@ from distributed import Client, KilledWorker, LocalCluster, WorkerPlugin, get_wo
 from rille.pipeline.engine.executors import dask_cluster
 from rille.pipeline.engine.executors.base import Failed, Landed, NotBegun, Task, light
 from rille.pipeline.engine.runtime.environment import prepare_environment, worker_environment
+from rille.pipeline.engine.runtime.interrupts import held
 from rille.pipeline.engine.runtime.private import private_folder
 from rille.pipeline.engine.store.location import Location
 from rille.pipeline.engine.store.manifest import Ref
@@ -73,7 +73,8 @@ class WorkerDiedError(RilleError):
 def here(jobs: int, cache: Location, memory: float) -> Dask:
     """Workers of this machine; they start while this process goes on."""
     _configure()
-    with _interrupts_kept_out():
+    resource_tracker.ensure_running()  # it unblocks the signal in the thread that happens to start it
+    with held():
         cluster = LocalCluster(
             n_workers=0,
             threads_per_worker=1,
@@ -364,17 +365,6 @@ def _quiet() -> None:
     dask.config.set({"distributed.logging": dict.fromkeys(names, "critical")})
     for name in (*names, "tornado", "asyncio"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
-
-
-@contextmanager
-def _interrupts_kept_out() -> Iterator[None]:
-    """Threads and processes begun in the block, and all that these begin, never see Ctrl-C."""
-    resource_tracker.ensure_running()  # it unblocks the signal in the thread that happens to start it
-    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
 
 
 def _leave(client: Any, within: float) -> None:

@@ -18,7 +18,10 @@ from typing import Any, NoReturn
 
 @contextmanager
 def held() -> Iterator[None]:
-    """Let Ctrl-C wait for the end of a block, around what complains aloud when it is left half made."""
+    """Let Ctrl-C wait for the end of a block, around what complains aloud when it is left half made.
+
+    Threads and processes begun in the block, and all that these begin, never see it.
+    """
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
