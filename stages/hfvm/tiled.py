@@ -22,7 +22,7 @@ from rille.stages.hfvm.coarse_to_fine import accurate, hierarchy, start
 from rille.stages.hfvm.coarse_to_fine.hierarchy import Prepared, State
 from rille.stages.hfvm.finish import refine
 from rille.stages.hfvm.finish.finish import Finish
-from rille.stages.hfvm.images import plane, resample
+from rille.stages.hfvm.images import plane, resample, viewpoint
 from rille.stages.hfvm.images.params import HfvmParams
 from rille.stages.hfvm.images.views import Aligned, Plain, Seen, View
 from rille.stages.hfvm.images.window import Raster, Results, Shape, Window, cut, gather, tiles, whole
@@ -37,6 +37,9 @@ one above."""
 KEPT = 31 << 20
 """Bytes: glibc keeps freed memory up to twice the greatest piece it has seen freed, if that is below 32 MiB, and
 hands it out again; else each array of a match comes as fresh pages, and those cost an eighth of the whole time."""
+
+FEW = 0.35
+"""Share of consistent pixels below which the images may be turned: chance alone makes up to .23 of them so."""
 
 Order = Callable[[list[Window]], list[Window]]
 
@@ -84,20 +87,48 @@ def prepare(left: View, right: View, params: HfvmParams, side: int | None) -> Pr
 
 
 def coarse(left: View, right: View, params: HfvmParams, side: int | None, prior: start.Prior | None = None) -> Coarse:
-    """Match down to ``plane_level``; where a plane explains what is found, align the right image and match anew."""
+    """Match down to ``plane_level``; where a plane explains what is found, align the right image and match anew.
+
+    Where little is found, keypoints may tell how the images are turned or scaled; what then matches more is kept.
+    """
     pair = prepare(left, right, params, side)
     state = start.impose(pair, hierarchy.run(pair, params, params.plane_level), prior)
+    found = Coarse(state, None, None, contrast(pair, state))
     if params.preset == "paper":
-        return Coarse(state, None, None, contrast(pair, state))
+        return found
     s = hierarchy.sample(pair, state)
     h = plane.find(s.places, s.u, s.v, state.level, left.shapes, params)
+    if h is not None:
+        return _along(left, right, params, side, h, state.near_sign, prior)
+    if not params.turned or prior is not None or share(state) > FEW:
+        return found
+    h = viewpoint.find(left, right)
     if h is None:
-        return Coarse(state, None, None, contrast(pair, state))
+        return found
+    turned = _along(left, right, params, side, h)
+    return turned if share(turned.state) > share(state) else found
+
+
+def _along(
+    left: View,
+    right: View,
+    params: HfvmParams,
+    side: int | None,
+    h: plane.Matrix,
+    near_sign: float = 0.0,
+    prior: start.Prior | None = None,
+) -> Coarse:
+    """Coarse levels of the right image aligned by a homography."""
     aligned = Aligned.of(right, h, left, 0 if side is None else params.plane_level, side)
     pair = prepare(left, aligned, params, side)
-    again = hierarchy.run(pair, params, params.plane_level, near_sign=state.near_sign)
+    again = hierarchy.run(pair, params, params.plane_level, near_sign=near_sign)
     state = start.impose(pair, again, start.align(prior, h))
     return Coarse(state, h, aligned, contrast(pair, state))
+
+
+def share(state: State) -> float:
+    """Share of the left image's pixels that are consistent."""
+    return float(np.mean(np.asarray(state.left_ok)))
 
 
 def contrast(pair: Prepared, state: State) -> float:

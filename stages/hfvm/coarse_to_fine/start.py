@@ -54,17 +54,10 @@ def check(prior: tuple[AnyArray, AnyArray] | None, shape: tuple[int, ...]) -> Pr
 
 
 def align(prior: Prior | None, h: plane.Matrix) -> Prior | None:
-    """The prior towards the aligned right image: inverse of :func:`rille.stages.hfvm.images.plane.compose`."""
+    """The prior towards the aligned right image: see :func:`rille.stages.hfvm.images.plane.decompose`."""
     if prior is None:
         return None
-    g = np.linalg.inv(h @ plane.translation(-plane.margin(prior.u.shape)))
-    y, x = np.indices(prior.u.shape, dtype=np.float64)
-    p, q = x + prior.u, y + prior.v
-    w = g[2, 0] * p + g[2, 1] * q + g[2, 2]
-    w = np.where(w > 0, w, np.nan)
-    u = (g[0, 0] * p + g[0, 1] * q + g[0, 2]) / w - x
-    v = (g[1, 0] * p + g[1, 1] * q + g[1, 2]) / w - y
-    return Prior(u.astype(np.float32), v.astype(np.float32))
+    return Prior(*plane.decompose(h, prior.u, prior.v))
 
 
 def impose(pair: hierarchy.Prepared, state: hierarchy.State, prior: Prior | None) -> hierarchy.State:

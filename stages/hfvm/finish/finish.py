@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -45,9 +46,9 @@ class Finish:
 
     @property
     def refining(self) -> HfvmParams:
-        """Parameters of the refinement: an image that a plane has aligned is sheared, and takes two steps more."""
+        """Parameters of the refinement: an image that a plane has aligned is sheared, and takes a step more."""
         p = self.params
-        return p if self.alignment is None else p.model_copy(update={"refine_steps": p.refine_steps + 2})
+        return p if self.alignment is None else p.model_copy(update={"refine_steps": p.refine_steps + 1})
 
     def fine(self, window: Window, a: Map) -> Results:
         """Map of a window of the left image with fractions of a pixel, means of like neighbours; feature distances.
@@ -70,13 +71,17 @@ class Finish:
         return {name: np.ascontiguousarray(p[window.inside(outer)]) for name, p in (("u", u), ("v", v))}
 
     def check(self, window: Window, fine: Rasters, back: Rasters) -> Results:
-        """Back-matching error, validity bits against each pixel, and displacements in the original right image."""
+        """Displacements, back-matching error, and validity bits against each pixel."""
         u, v, distance = (cut(fine[name], window) for name in ("u", "v", "distance"))
         error = self._backmatch(window, u, v, back)
         bits = self._reasons(window, distance, error)
-        if self.alignment is not None:
-            u, v = plane.compose(self.alignment, u, v, self.shape, window.x0, window.y0)
         return {"u": u, "v": v, "validity": bits, "error": error}
+
+    def _to_right(self, u: AnyArray, v: AnyArray, window: Window) -> tuple[AnyArray, AnyArray]:
+        """Displacements of a window in the original right image."""
+        if self.alignment is None:
+            return u, v
+        return plane.compose(self.alignment, u, v, self.shape, window.x0, window.y0)
 
     def _backmatch(self, window: Window, u: AnyArray, v: AnyArray, back: Rasters) -> AnyArray:
         error = np.full(window.shape, consistency.FAILED, np.float32)
@@ -119,24 +124,35 @@ class Finish:
         keep = bits == 0
         # The relief's windows are not bounded: it is given the whole image.
         all_of_it = p.relief_steps or outer == whole(self.shape)
-        target = whole(shape) if all_of_it else around(*self._ends(outer, u, v), shape, refine.drift(p), keep)
+        target = whole(shape) if all_of_it else self._read(outer, u, v, keep)
         place = outer.x0, outer.y0, target.x0, target.y0, shape[0], shape[1]
         left, valid = self.pair.left.view.grey(0, outer), self.right.valid(0, target)
         image = self.right.grey(0, target)
         if self.contrast != 1.0:
             image = image * np.float32(self.contrast)
-        u, v, rest, noise = refine.refine(left, image, valid, u, v, keep, p, place)
+        to_right = partial(self._to_right, window=outer)
+        u, v, rest, noise = refine.refine(left, image, valid, u, v, keep, p, place, to_right)
         alike, variance = refine.surroundings(rest, self.pair.deviation(0, outer), keep)
         if p.refine:
             mark(bits, keep & (alike < p.correlation), Validity.OVER_THRESHOLD)
         noise *= variance
+        there = to_right(u, v)
         if p.relief_steps:
-            u, v = variational_refinement.fit(left, image, valid, u, v, bits == 0, p)
+            there = variational_refinement.fit(left, image, valid, *there, bits == 0, p)
+            u, v = there if self.alignment is None else plane.decompose(self.alignment, *there)
         keep, found = bits == 0, np.zeros(outer.shape, bool)
-        consistency.lands(u, v, keep, valid, found, *place)
+        consistency.lands(*there, keep, valid, found, *place)
         mark(bits, keep & ~found, Validity.OUT_OF_IMAGE)
         arrays = {"u": u, "v": v, "validity": bits, "noise": noise}
         return {name: np.ascontiguousarray(a[window.inside(outer)]) for name, a in arrays.items()}
+
+    def _read(self, window: Window, u: AnyArray, v: AnyArray, keep: AnyArray) -> Window:
+        """What refinement may read of the right image: ends of displacements that drift to any side."""
+        drift = np.float32(refine.drift(self.refining))
+        drifts = [(x, y) for x in (-drift, drift) for y in (-drift, drift)]
+        ends = [self._ends(window, *self._to_right(u + x, v + y, window)) for x, y in drifts]
+        y, x = (np.stack(part) for part in zip(*ends, strict=True))
+        return around(y, x, self.right.shapes[0], 2, np.broadcast_to(keep, y.shape))
 
     def patches(self, a: Map, refined: Rasters) -> AnyArray:
         """Isolated pixels, uint8 (row, col) of the whole image: how far a patch reaches nobody knows beforehand.
@@ -149,13 +165,6 @@ class Finish:
             keep[w.slices] = cut(refined["validity"], w) == 0
             u[w.slices], v[w.slices] = cut(a.u, w), cut(a.v, w)
         return consistency.unsupported(u, v, keep, self.params.speckle).view(np.uint8)
-
-    def _lines(self) -> epipolar.Matrix:
-        """Fundamental matrix of the band, towards the original right image."""
-        if self.alignment is None:
-            return self.band.f
-        g = self.alignment @ plane.translation(-plane.margin(self.shape))
-        return np.ascontiguousarray(np.linalg.inv(g).T @ self.band.f)
 
     def final(self, window: Window, fine: Rasters, checked: Rasters, refined: Rasters, gone: Raster) -> Results:
         """Everything that :class:`~rille.stages.hfvm.Disparity` has.
@@ -187,7 +196,8 @@ class Finish:
             u, v = guided.median(u, v, keep, interpolated, left)
         if self.band.mu >= simd.SHARP:
             # A filled pixel has its neighbour's depth, not its row: between turned cameras rows change along a row.
-            epipolar.settle_rows(self._lines(), u, v, interpolated, outer.x0, outer.y0)
+            epipolar.settle_rows(self.band.f, u, v, interpolated, outer.x0, outer.y0)
+        u, v = self._to_right(u, v, outer)
         error, distance = cut(checked["error"], outer).copy(), cut(fine["distance"], outer).copy()
         consistency.conclude(validity, keep, interpolated, u, v, error, distance)
         arrays = {

@@ -3,9 +3,14 @@
 Feature vectors compare upright windows; where the two views foreshorten a surface differently their best displacement
 is biased. Warping the right image by the smoothed disparities first makes the windows alike, and what is left is a
 small displacement, solved per window. A pixel keeps the step only if it makes its window fit better.
+
+Steps use the left image's gradient, so they are taken in the frame of the aligned right image, where neighbours move
+alike even between turned views; grey values are read from the right image itself, which is interpolated only once.
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import numpy as np
 from numba import njit
@@ -16,6 +21,9 @@ from rille.stages.hfvm.level import rowwise
 
 Place = tuple[int, int, int, int, int, int]
 """First column and row of the left and of the right window, rows and columns of the whole right image."""
+
+Frame = Callable[[AnyArray, AnyArray], tuple[AnyArray, AnyArray]]
+"""Displacements to the right image of those in the frame in which steps are taken, both (row, col) float32 pixels."""
 
 CORRELATION_SIDE = 9
 """Pixels: fewer do not tell correlated noise from texture."""
@@ -40,8 +48,9 @@ def refine(
     keep: AnyArray,
     params: HfvmParams,
     place: Place | None = None,
+    to_right: Frame = lambda u, v: (u, v),
 ) -> tuple[AnyArray, AnyArray, AnyArray, AnyArray]:
-    """Displacements without the perspective bias.
+    """Displacements without the perspective bias, in the frame in which they are given.
 
     Parameters
     ----------
@@ -50,6 +59,7 @@ def refine(
     u, v : (row, col) float32, smoothed displacements, pixels.
     keep : (row, col) bool, pixels that have one.
     place : where both windows lie; None: they are the images. Pixels nearer than :func:`reach` to a cut are not sound.
+    to_right : from that frame to the right image; default: it is the right image's.
 
     Returns
     -------
@@ -63,9 +73,12 @@ def refine(
     for step in range(params.refine_steps):
         last = first if step == 0 else np.empty(u.shape, np.float32)
         args = (keep, params.refine_radius, params.refine_noise, step_u, step_v, last, per_noise)
-        rowwise.lucas_kanade(left, right, right_valid, now_u, now_v, *args, *at)
+        there_u, there_v = to_right(now_u, now_v)
+        rowwise.lucas_kanade(left, right, right_valid, there_u, there_v, *args, *at)
         if not params.refine:
             break
+        if there_u is not now_u:
+            step_u, step_v = now_u + (step_u - there_u), now_v + (step_v - there_v)
         now_u, now_v = np.empty_like(u), np.empty_like(v)
         rowwise.local_mean(step_u, step_v, keep, 1, 1, now_u, now_v)
     if not params.refine:

@@ -192,6 +192,11 @@ class HfvmParams(Params):
         description="least share of the coarse matches that the plane must explain; larger: fewer pairs are "
         "pre-aligned",
     )
+    turned: bool = Field(
+        default=True,
+        description="where hardly a pixel matches, let keypoints tell how the images are turned, scaled or slanted "
+        "against each other, and match anew",
+    )
     refine: bool = Field(
         default=True,
         description="improve sub-pixel displacements by mean-free Lucas-Kanade steps, which remove the bias that "
@@ -208,7 +213,7 @@ class HfvmParams(Params):
         default=1,
         ge=1,
         le=8,
-        description="Lucas-Kanade steps; more take longer and measured no gain; a pre-aligned image takes two more "
+        description="Lucas-Kanade steps; more take longer and measured no gain; a pre-aligned image takes one more "
         "than set",
     )
     refine_radius: int = Field(

@@ -103,6 +103,18 @@ def _compose(g, u, v, out_u, out_v, x0, y0):  # type: ignore[no-untyped-def]
             out_v[row, col] = (g[1, 0] * p + g[1, 1] * dv + b) * w - y
 
 
+def decompose(h: Matrix, u: AnyArray, v: AnyArray) -> tuple[AnyArray, AnyArray]:
+    """Displacements (row, col) of a whole left image to the aligned right image: the inverse of :func:`compose`."""
+    g = np.linalg.inv(h @ translation(-margin(u.shape)))
+    y, x = np.indices(u.shape, dtype=np.float64)
+    p, q = x + u, y + v
+    w = g[2, 0] * p + g[2, 1] * q + g[2, 2]
+    w = np.where(w > 0, w, np.nan)
+    aligned_u = (g[0, 0] * p + g[0, 1] * q + g[0, 2]) / w - x
+    aligned_v = (g[1, 0] * p + g[1, 1] * q + g[1, 2]) / w - y
+    return aligned_u.astype(np.float32), aligned_v.astype(np.float32)
+
+
 def margin(left_shape: tuple[int, ...]) -> int:
     """Pixels added on every side of the aligned image."""
     return int(np.ceil(MARGIN * left_shape[1]))
@@ -170,9 +182,14 @@ def _solve(p: AnyArray, d: AnyArray, tolerance: float) -> tuple[Matrix, AnyArray
 
 def to_level_0(h: Matrix, level: int) -> Matrix:
     """Homography of level ``level`` pixels as one of level 0 pixels."""
-    k = 0.5**level
-    s = np.array([[k, 0.0, 0.5 * k - 0.5], [0.0, k, 0.5 * k - 0.5], [0.0, 0.0, 1.0]])
-    return np.asarray(np.linalg.inv(s) @ h @ s, dtype=np.float64)
+    up = finer(level)
+    return np.asarray(up @ h @ np.linalg.inv(up), dtype=np.float64)
+
+
+def finer(level: int) -> Matrix:
+    """Homography from pixels of a level to those of level 0, whose centres lie half a pixel inside their corners."""
+    k = 2.0**level
+    return np.array([[k, 0.0, 0.5 * k - 0.5], [0.0, k, 0.5 * k - 0.5], [0.0, 0.0, 1.0]])
 
 
 def distortion(h: Matrix, shape: tuple[int, int]) -> float:

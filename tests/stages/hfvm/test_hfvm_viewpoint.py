@@ -1,0 +1,65 @@
+"""Views that are turned, scaled or slanted against each other; every displacement is known exactly."""
+
+import cv2
+import numpy as np
+import pytest
+from matching_scenes import Texture, pair, seen
+
+from rille.stages.core.validity import matched
+from rille.stages.hfvm.images import viewpoint
+from rille.stages.hfvm.images.params import HfvmParams
+from rille.stages.hfvm.images.views import Plain
+from rille.stages.hfvm.stage import match
+from rille.stages.imaging.pyramid import PyramidParams, build
+
+SHAPE, RIGHT = (200, 260), (340, 340)
+
+
+def turned(degrees, scale=1.0, slant=0.0):
+    """Scene of two views whose right one is turned about its middle, enlarged, and seen at a slant."""
+    c, s = scale * np.cos(np.radians(degrees)), scale * np.sin(np.radians(degrees))
+
+    def displacement(x, y):
+        dx, dy = x - SHAPE[1] / 2, y - SHAPE[0] / 2
+        w = 1.0 + slant * dx / SHAPE[1]
+        return (c * dx - s * dy) / w + RIGHT[1] / 2 - x, (s * dx + c * dy) / w + RIGHT[0] / 2 - y
+
+    return pair(displacement, SHAPE, RIGHT, noise=1.0)
+
+
+@pytest.mark.parametrize(
+    ("degrees", "scale", "slant"), [(60, 1.0, 0.0), (180, 1.0, 0.0), (-120, 1.0, 0.3), (35, 1.3, 0.0), (0, 0.6, 0.0)]
+)
+def test_turned_views_are_matched_in_their_own_frame(degrees, scale, slant):
+    left, right, u, v = turned(degrees, scale, slant)
+    found = match(left, right)
+    both = seen(u, v, right.shape, 12)
+    error = np.hypot(found.column_disparity - u, found.row_disparity - v)
+    assert found.aligned
+    assert np.mean(matched(found.validity)[both]) > 0.9
+    assert np.median(error[both & matched(found.validity)]) < 0.1
+    # What was interpolated follows the turned surface, too.
+    assert np.mean(error[both] < 1) > 0.97
+    assert np.mean(matched(match(left, right, HfvmParams(turned=False)).validity)) < 0.02
+
+
+def test_keypoints_tell_the_homography_at_full_resolution():
+    left, right, u, v = turned(75, 1.2)
+    views = [Plain.of(build(cv2.resize(image, None, fx=4, fy=4), PyramidParams())) for image in (left, right)]
+    assert max(views[1].shapes[0]) > viewpoint.SIDE
+    h = viewpoint.find(*views)
+    x, y, _ = h @ (4 * 100 + 1.5, 4 * 80 + 1.5, 1) / (h[2] @ (4 * 100 + 1.5, 4 * 80 + 1.5, 1))
+    np.testing.assert_allclose((x, y), (4 * (100 + u[80, 100]) + 1.5, 4 * (80 + v[80, 100]) + 1.5), atol=1.0)
+
+
+@pytest.mark.parametrize("right", ["another scene", "noise", "nothing", "mirrored"])
+def test_unrelated_views_are_refused(right):
+    y, x = np.indices(SHAPE, dtype=np.float64)
+    images = {
+        "another scene": Texture(9)(x, y),
+        "noise": np.random.default_rng(0).normal(128, 30, SHAPE).astype(np.float32),
+        "nothing": np.full(SHAPE, 90, np.float32),
+        "mirrored": np.ascontiguousarray(Texture(0)(x, y)[:, ::-1]),
+    }
+    views = [Plain.of(build(image, PyramidParams())) for image in (Texture(0)(x, y), images[right])]
+    assert viewpoint.find(*views) is None
