@@ -114,14 +114,14 @@ class HfvmParams(Params):
         "lost, take longer",
     )
     fine_rounds: int | None = Field(
-        default=1,
+        default=2,
         ge=0,
         le=32,
         description="propagation rounds at the finest level, which takes the most time; each coarser level has one "
         "more, at most the value of rounds; null: that value at every level",
     )
     back_rounds: int = Field(
-        default=1,
+        default=2,
         ge=0,
         le=32,
         description="limit of the propagation rounds from right to left at the finest level; that direction serves "

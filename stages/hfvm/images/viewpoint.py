@@ -1,4 +1,4 @@
-"""Turn, scale and slant between two images of one scene, from keypoints: pre-alignment where matching as they are fails.
+"""Turn, scale and slant between two images of one scene, from keypoints, where matching them as they are fails.
 
 Feature vectors compare upright windows, so coarse matching finds nothing beyond a turn of some 20 degrees or a scale of
 1.3. Keypoints that carry their own orientation and scale (SIFT, Lowe 2004; compared by the square roots of their
