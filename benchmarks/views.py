@@ -120,7 +120,7 @@ def main() -> None:
         rows = []
         for _, left, right, u in pairs:
             image, p, q = turned(right, u, degrees, scale)
-            y, x = np.indices(u.shape)
+            _, x = np.indices(u.shape)
             seen = np.isfinite(u) & (x + u >= 0)
             cells = judged(match(left, image, params), p, q, seen)
             rows.append([float(c) if c != "-" else np.nan for c in cells.split(" | ")])
