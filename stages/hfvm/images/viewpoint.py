@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from rille.stages.core.declare import AnyArray
 from rille.stages.hfvm.images import plane
 from rille.stages.hfvm.images.views import View
-from rille.stages.hfvm.images.window import whole
+from rille.stages.hfvm.images.window import Shape, whole
 
 SIDE = 1024
 """Pixels: keypoints are looked for at the finest level whose longer side is at most this."""
@@ -59,12 +59,12 @@ def _keypoints(view: View, level: int) -> tuple[NDArray[np.float32], NDArray[np.
     """Columns and rows (n, 2) of keypoints, pixels of the level, and their descriptors (n, 128) of length one."""
     window = whole(view.shapes[level])
     grey = np.clip(np.rint(view.filled(level, window)), 0, 255).astype(np.uint8)
-    sift = cv2.SIFT_create(nfeatures=MOST, contrastThreshold=CONTRAST)
+    sift = cv2.SIFT_create(nfeatures=MOST, contrastThreshold=CONTRAST)  # type: ignore[attr-defined]  # not in the stubs
     points, histograms = sift.detectAndCompute(grey, (view.valid(level, window) != 0).astype(np.uint8))
     if not points:
         return np.empty((0, 2), np.float32), np.empty((0, 128), np.float32)
     total = np.maximum(histograms.sum(axis=1, keepdims=True), 1e-9)
-    return cv2.KeyPoint_convert(points), np.sqrt(histograms / total)
+    return np.array([point.pt for point in points], np.float32), np.sqrt(histograms / total)
 
 
 def _alike(a: AnyArray, b: AnyArray) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -78,7 +78,7 @@ def _alike(a: AnyArray, b: AnyArray) -> tuple[NDArray[np.intp], NDArray[np.intp]
     return np.array([m.queryIdx for m in kept], np.intp), np.array([m.trainIdx for m in kept], np.intp)
 
 
-def _upright(h: plane.Matrix, shape: tuple[int, int]) -> bool:
+def _upright(h: plane.Matrix, shape: Shape) -> bool:
     """Whether the whole image stays on this side of the horizon and is not mirrored."""
     rows, cols = shape
     corners = np.array([[0, 0, 1], [cols - 1, 0, 1], [0, rows - 1, 1], [cols - 1, rows - 1, 1]], np.float64).T
