@@ -27,19 +27,22 @@ from rille.stages.hfvm.stage import OUTPUTS
 MAP = ("u", "v", "undefined")
 
 
-def views(inputs: Inputs, params: HfvmParams) -> tuple[Plain, Plain, bool]:
+def views(inputs: Inputs, params: HfvmParams) -> tuple[View, View, bool]:
     """Both images, at the resolution at which they are matched, and whether that is half of theirs."""
     opened = []
     for port in ("left", "right"):
         bundle: Bundle = inputs[port]
         names = range(int(bundle.meta["levels"]))
         opened.append(
-            Plain.open([bundle.raster(f"level_{n}") for n in names], [bundle.raster(f"valid_{n}") for n in names])
+            Plain.open(
+                [bundle.raster(f"level_{n}") for n in names],
+                [bundle.raster(f"valid_{n}") for n in names],
+                float(bundle.meta.get("noise", 0.0)),
+            )
         )
     if not tiled.halves(opened[0], opened[1], params):
-        return opened[0], opened[1], False
-    half = [Plain(view.images[1:], view.masks[1:], view.blank) for view in opened]
-    return half[0], half[1], True
+        return opened[0].quiet(params), opened[1].quiet(params), False
+    return opened[0].halved().quiet(params), opened[1].halved().quiet(params), True
 
 
 @dataclass(frozen=True)
@@ -70,8 +73,8 @@ class TileInputs:
     params: HfvmParams
     args: Mapping[str, Any]
     inputs: Inputs
-    left: Plain
-    right: Plain
+    left: View
+    right: View
     half: bool
 
     @staticmethod

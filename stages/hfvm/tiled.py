@@ -152,15 +152,16 @@ def match(
     if halves(left, right, params):
         return _enlarged(left, right, params, prior, tell, side, order)
     tell(0.0, "features")
-    begun = coarse(left, right, params, side, prior)
-    pair = prepare(left, begun.aligned or right, params, side)
+    a, b = left.quiet(params), right.quiet(params)
+    begun = coarse(a, b, params, side, prior)
+    pair = prepare(a, begun.aligned or b, params, side)
     state = begun.state
     band = state.band
     for level in range(state.level - 1, -1, -1):
         band = state.band
         tell(COARSE_SHARE + (FINE_SHARE - COARSE_SHARE) * 0.25 ** (level + 1), f"level {level}")
         state = hierarchy.run(pair, params, level, state)
-    steps = Finish(pair, right, params, begun.alignment, state.near_sign, begun.contrast, band)
+    steps = Finish(pair, b, params, begun.alignment, state.near_sign, begun.contrast, band)
     return Found(_finish(steps, state, side, order, tell), begun.alignment is not None)
 
 
@@ -189,7 +190,7 @@ def _enlarged(
     side: int | None,
     order: Order,
 ) -> Found:
-    half = [Plain(view.images[1:], view.masks[1:], view.blank) for view in (left, right)]
+    half = left.halved(), right.halved()
     coarser = None if prior is None else start.Prior(0.5 * prior.u[::2, ::2], 0.5 * prior.v[::2, ::2])
     found = match(half[0], half[1], halved_params(params), coarser, tell, side, order)
     shapes = left.shapes[0], right.shapes[0]

@@ -19,6 +19,7 @@ from pydantic import Field
 from rille.stages.core.declare import AnyArray, Array, Bundle, Inputs, Params, Stage
 from rille.stages.core.errors import InputError
 from rille.stages.core.validity import Mask
+from rille.stages.imaging import noise
 
 Image = NDArray[np.float32]
 
@@ -36,10 +37,14 @@ class PyramidParams(Params):
 
 @dataclass(frozen=True)
 class Pyramid:
-    """Grey images (0..255, float32) and masks (uint8, 1 = usable), level 0 first."""
+    """Grey images (0..255, float32) and masks (uint8, 1 = usable), level 0 first.
+
+    ``noise``: standard deviation of level 0, grey levels (see :mod:`rille.stages.imaging.noise`).
+    """
 
     images: tuple[Image, ...]
     valid: tuple[Mask, ...]
+    noise: float = 0.0
 
     @property
     def levels(self) -> int:
@@ -53,7 +58,12 @@ class Pyramid:
         return Pyramid(
             tuple(np.ascontiguousarray(bundle[f"level_{i}"]) for i in range(n)),
             tuple(np.ascontiguousarray(bundle[f"valid_{i}"]) for i in range(n)),
+            float(bundle.meta.get("noise", 0.0)),
         )
+
+    def above(self, level: int) -> Pyramid:
+        """The pyramid from a level on; noise halves from level to level."""
+        return Pyramid(self.images[level:], self.valid[level:], self.noise * 0.5**level)
 
 
 def grey(image: AnyArray) -> Image:
@@ -102,7 +112,8 @@ def build(image: AnyArray, params: PyramidParams, valid: AnyArray | None = None)
         levels, side = levels + 1, (side + 1) // 2
     if not (whole and valid is None):
         level = np.where(mask, level, np.float32(0.0))
-    return halved(level, mask.view(np.uint8), levels)
+    found = halved(level, mask.view(np.uint8), levels)
+    return Pyramid(found.images, found.valid, noise.standard_deviation(found.images, found.valid))
 
 
 def halved(image: Image, mask: Mask, levels: int) -> Pyramid:
@@ -168,12 +179,12 @@ def _run(params: PyramidParams, args: Mapping[str, Any], inputs: Inputs) -> Bund
     pyramid = build(bundle["image"], params, bundle["valid"])
     arrays: dict[str, AnyArray] = {f"level_{n}": image for n, image in enumerate(pyramid.images)}
     arrays |= {f"valid_{n}": mask for n, mask in enumerate(pyramid.valid)}
-    return Bundle(arrays, {"levels": pyramid.levels})
+    return Bundle(arrays, {"levels": pyramid.levels, "noise": pyramid.noise})
 
 
 STAGE = Stage(
     name="pyramid",
-    version=1,
+    version=2,
     summary="grey image pyramid by means of 2 x 2 pixels",
     params=PyramidParams,
     inputs=("image",),

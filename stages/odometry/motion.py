@@ -98,7 +98,7 @@ def coarse_motion(a: Pyramid, b: Pyramid, params: MotionParams, turn: Derotation
     if turn is not None:
         b = turn.apply(b)
     level = min(params.level, a.levels - 1, b.levels - 1)
-    a, b = _above(a, level), _above(b, level)
+    a, b = a.above(level), b.above(level)
     hp = HfvmParams(
         band=0.0,
         fine_rounds=None if level else HfvmParams().fine_rounds,
@@ -132,11 +132,6 @@ def coarse_motion(a: Pyramid, b: Pyramid, params: MotionParams, turn: Derotation
         u, v = turn.compose(u, v, level)
         validity[np.isnan(u)] &= ~np.uint8(Validity.MATCHED | Validity.INTERPOLATED)
     return Motion(level, u, v, validity)
-
-
-def _above(pyramid: Pyramid, level: int) -> Pyramid:
-    """The pyramid from a level up: finer ones need no features."""
-    return Pyramid(pyramid.images[level:], pyramid.valid[level:])
 
 
 def match_share(found: Motion) -> float:

@@ -266,7 +266,8 @@ class Prepared:
 
 def prepare(left: Pyramid, right: Pyramid, params: HfvmParams) -> Prepared:
     """The matcher of two pyramids in memory."""
-    return Prepared(Seen(Plain.of(left), params), Seen(Plain.of(right), params), solver(params), params)
+    seen = [Seen(Plain.of(pyramid).quiet(params), params) for pyramid in (left, right)]
+    return Prepared(seen[0], seen[1], solver(params), params)
 
 
 def solver(params: HfvmParams) -> Solver:

@@ -107,7 +107,8 @@ class Finish:
         """Bits that speak against each pixel, none where it is consistent."""
         p, bits = self.params, np.empty(window.shape, np.uint8)
         deviation, valid = self.pair.deviation(0, window), self.pair.left.view.valid(0, window)
-        limits = (np.float32(a) for a in (p.threshold, p.texture, p.backmatch))
+        texture = max(p.texture, self.pair.left.view.unrest)
+        limits = (np.float32(a) for a in (p.threshold, texture, p.backmatch))
         consistency.reasons(distance, deviation, valid, error, *limits, bits)
         return bits
 
@@ -135,7 +136,8 @@ class Finish:
         alike, variance = refine.surroundings(rest, self.pair.deviation(0, outer), keep)
         if p.refine:
             mark(bits, keep & (alike < p.correlation), Validity.OVER_THRESHOLD)
-        noise *= variance
+        # Smoothing divides the residuals' variance, not what a match knows of its place.
+        noise *= variance / min(side.view.kept_noise for side in (self.pair.left, self.pair.right))
         there = to_right(u, v)
         if p.relief_steps:
             there = variational_refinement.fit(left, image, valid, *there, bits == 0, p)

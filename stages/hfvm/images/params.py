@@ -16,6 +16,7 @@ PAPER: Mapping[str, Any] = {
     "weights": PAPER_WEIGHTS,
     "threshold": 15.0,
     "texture": 0.0,
+    "smooth_noise": 1e6,
     "speckle": 1,
     "fill_reach": 100000,
     "refine": False,
@@ -149,11 +150,18 @@ class HfvmParams(Params):
         description="feature distance [byte steps; preset paper: grey levels] above which a pixel counts as not "
         "matchable; larger: more matches, more errors",
     )
+    smooth_noise: float = Field(
+        default=1.0,
+        gt=0,
+        description="noise [grey levels] of an image, as estimated from itself, from which on it is smoothed before it "
+        "is matched; larger: fewer images are smoothed; images without noise added reach 0.2",
+    )
     texture: float = Field(
         default=0.5,
         ge=0,
-        description="least standard deviation [grey levels] of the window around a pixel to be matched; larger: "
-        "fewer matches where the image shows little; rounding to 8 bits alone gives 0.29",
+        description="least standard deviation [grey levels] of the window around a pixel to be matched, and at least "
+        "what noise alone makes of a smoothed image; larger: fewer matches where the image shows little; rounding to "
+        "8 bits alone gives 0.29",
     )
     backmatch: float = Field(
         default=1.0,

@@ -31,6 +31,14 @@ class View(Protocol):
     def blank(self) -> float:
         """Grey level where no level is valid."""
 
+    @property
+    def unrest(self) -> float:
+        """Local deviation at the finest level that noise alone makes, grey levels; 0 where little is known of it."""
+
+    @property
+    def kept_noise(self) -> float:
+        """Share of the variance of the finest level's noise that is left: 1, or less where it has been smoothed."""
+
     def grey(self, level: int, window: Window) -> AnyArray:
         """Grey values, float32, 0 where masked."""
 
@@ -44,27 +52,46 @@ class View(Protocol):
 
 @dataclass(frozen=True)
 class Plain:
-    """A pyramid of rasters."""
+    """A pyramid of rasters. ``noise``: standard deviation of level 0, grey levels."""
 
     images: Sequence[Raster]
     masks: Sequence[Raster]
     blank: float
+    noise: float = 0.0
 
     @staticmethod
     def of(pyramid: Pyramid) -> Plain:
         """View of a pyramid in memory."""
-        return Plain.open(pyramid.images, pyramid.valid)
+        return Plain.open(pyramid.images, pyramid.valid, pyramid.noise)
 
     @staticmethod
-    def open(images: Sequence[Raster], masks: Sequence[Raster]) -> Plain:
+    def open(images: Sequence[Raster], masks: Sequence[Raster], noise: float) -> Plain:
         """View of levels that are read by window."""
         top = whole(images[-1].shape)
-        return Plain(images, masks, mean_grey(cut(images[-1], top), cut(masks[-1], top)))
+        return Plain(images, masks, mean_grey(cut(images[-1], top), cut(masks[-1], top)), noise)
+
+    def halved(self) -> Plain:
+        """The view without its finest level."""
+        return Plain(self.images[1:], self.masks[1:], self.blank, 0.5 * self.noise)
+
+    def quiet(self, params: HfvmParams) -> View:
+        """The view with its finest level smoothed where that is noisy, else itself."""
+        return Smoothed(self) if self.noise >= params.smooth_noise else self
 
     @property
     def shapes(self) -> Sequence[Shape]:
         """Rows and columns of each level."""
         return tuple(image.shape for image in self.images)
+
+    @property
+    def unrest(self) -> float:
+        """Nothing: where noise is told from texture, the view is smoothed."""
+        return 0.0
+
+    @property
+    def kept_noise(self) -> float:
+        """All of it."""
+        return 1.0
 
     def grey(self, level: int, window: Window) -> AnyArray:
         """Grey values, 0 where masked."""
@@ -77,6 +104,57 @@ class Plain:
     def filled(self, level: int, window: Window) -> AnyArray:
         """Grey values, those of masked pixels from above."""
         return fill(self, level, window)
+
+
+@dataclass(frozen=True)
+class Smoothed:
+    """A view whose finest level is smoothed by the binomial kernel (1 2 1) x (1 2 1) / 16.
+
+    At five grey levels of noise a match finds a fifth more pixels by it; without noise it would lose detail. Coarser
+    levels have been smoothed by the halving: once more made them worse.
+    """
+
+    view: Plain
+
+    @property
+    def unrest(self) -> float:
+        """Deviation that is left of the noise."""
+        return float(np.sqrt(self.kept_noise)) * self.view.noise
+
+    @property
+    def kept_noise(self) -> float:
+        """Sum of the squares of the kernel: (1 + 4 + 1) / 16 in either direction."""
+        return (6 / 16) ** 2
+
+    @property
+    def shapes(self) -> Sequence[Shape]:
+        """Rows and columns of each level."""
+        return self.view.shapes
+
+    @property
+    def blank(self) -> float:
+        """Grey level where no level is valid."""
+        return self.view.blank
+
+    def grey(self, level: int, window: Window) -> AnyArray:
+        """Grey values, 0 where masked."""
+        return np.where(self.valid(level, window) != 0, self.filled(level, window), np.float32(0.0))
+
+    def valid(self, level: int, window: Window) -> AnyArray:
+        """Mask."""
+        return self.view.valid(level, window)
+
+    def filled(self, level: int, window: Window) -> AnyArray:
+        """Grey values, those of masked pixels from above."""
+        if level > 0:
+            return self.view.filled(level, window)
+        outer = window.grow(1, 1, self.shapes[level])
+        rows, cols = window.inside(outer)
+        # The image's edge is repeated; other sides of the window have their neighbours.
+        spare = [(1 - s.start, 1 - (n - s.stop)) for s, n in zip((rows, cols), outer.shape, strict=True)]
+        a = np.pad(self.view.filled(level, outer), spare, mode="edge")
+        a = np.float32(0.25) * ((a[:-2] + a[2:]) + np.float32(2.0) * a[1:-1])
+        return np.ascontiguousarray(np.float32(0.25) * ((a[:, :-2] + a[:, 2:]) + np.float32(2.0) * a[:, 1:-1]))
 
 
 def mean_grey(image: AnyArray, mask: AnyArray) -> float:
@@ -141,6 +219,16 @@ class Aligned:
         m = plane.margin(left.shapes[0])
         shapes = pyramid_shapes((left.shapes[0][0] + 2 * m, left.shapes[0][1] + 2 * m), len(left.shapes))
         return Aligned(right, h, left.shapes[0], shapes, (), (), len(shapes), blank)
+
+    @property
+    def unrest(self) -> float:
+        """That of the right image, as resampling hardly changes it."""
+        return self.right.unrest
+
+    @property
+    def kept_noise(self) -> float:
+        """That of the right image."""
+        return self.right.kept_noise
 
     def grey(self, level: int, window: Window) -> AnyArray:
         """Grey values, 0 where masked."""

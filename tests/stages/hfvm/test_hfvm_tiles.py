@@ -42,6 +42,16 @@ def turned():
     return left, right
 
 
+def noisy():
+    """A flat and a textured half; the noise of both images is told, so that they are smoothed; a masked corner."""
+    left, right, *_ = pair(lambda x, y: (-9 + 4 * np.sin(x / 30) * np.cos(y / 25), 2 + np.cos(x / 40)), (150, 211))
+    rng = np.random.default_rng(5)
+    contrast = np.where(np.arange(211) < 90, 0.6, 0.1)
+    left, right = (128 + contrast * (a - 128) + rng.normal(0, 5, a.shape) for a in (left, right))
+    left[:35, 160:] = np.nan
+    return left, right
+
+
 def both(scene):
     return [Plain.of(build(image, PyramidParams())) for image in scene()]
 
@@ -51,20 +61,30 @@ def in_tiles(views, params, side, seed):
     return tiled.match(*views, params, None, quiet, side, lambda windows: shuffle.sample(windows, len(windows)))
 
 
-@pytest.mark.parametrize(("scene", "aligned"), [(misaligned, False), (sheared, True), (turned, True)])
+@pytest.mark.parametrize(("scene", "aligned"), [(misaligned, False), (sheared, True), (turned, True), (noisy, False)])
 @pytest.mark.parametrize("preset", ["default", "fast", "paper"])
 def test_tiles_of_any_size_and_order_give_the_bits_of_the_whole(scene, aligned, preset):
     views, params = both(scene), HfvmParams(preset=preset)
     once = tiled.match(*views, params, None, quiet, None)
     assert once.aligned == (aligned and preset != "paper")
     # the paper compares grey levels as they are: of half the contrast little matches
-    if scene is not turned or preset != "paper":
+    if scene in (misaligned, sheared) or preset != "paper":
         assert np.mean(once.arrays["validity"] & 1) > (0.005 if preset == "paper" else 0.5)
     for side in (64, 100, 37):
         found = in_tiles(views, params, side, side)
         assert found.aligned == once.aligned
         for name, values in once.arrays.items():
             assert values.tobytes() == found.arrays[name].tobytes(), (name, side)
+
+
+def test_noisy_images_are_smoothed_unless_told_otherwise():
+    views = both(noisy)
+    assert all(4 < view.noise < 6 for view in views)
+    share = [
+        np.mean(tiled.match(*views, HfvmParams(smooth_noise=limit), None, quiet, None).arrays["validity"] & 1)
+        for limit in (1.0, 10.0)
+    ]
+    assert share[0] > 1.1 * share[1] > 0.1
 
 
 def test_parameters_that_widen_the_reach_widen_the_surroundings():

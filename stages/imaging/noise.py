@@ -1,0 +1,58 @@
+"""Noise of an image, from the image alone.
+
+White noise halves from one pyramid level to the next (the mean of 2 x 2 pixels), texture does not: what an image shows
+at the finest scale it mostly shows at twice that scale as well. With v0 and v1 the mean squared second differences of
+the two finest levels, scaled so that white noise of variance n^2 gives n^2 at level 0,
+
+    v0 = n^2 + t^2,  v1 = n^2 / 4 + t^2   =>   n^2 = (v0 - v1) / (1 - 1/4)
+
+in each block of 16 x 16 pixels; the median of the blocks is the image's. The second difference across rows and columns
+is Immerkaer's (1996), blind to planes and straight edges. Where fine texture is stronger at twice its scale, n is 0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from rille.stages.core.declare import AnyArray
+
+BLOCK = 16
+"""Pixels of level 0; level 1 shows the same block by half as many."""
+
+ENOUGH = 1 << 20
+"""Pixels: of a larger image only every so many rows of blocks are looked at."""
+
+LEAST = 20
+"""Blocks without a masked pixel that an estimate needs."""
+
+
+def standard_deviation(images: Sequence[AnyArray], masks: Sequence[AnyArray]) -> float:
+    """Standard deviation of an image's noise, grey levels; 0 where it cannot be told from texture.
+
+    Parameters
+    ----------
+    images, masks : (row, col) float32 grey values and uint8 masks (1 = usable) of the two finest levels, or more.
+    """
+    if len(images) < 2 or min(images[0].shape) < 3 * BLOCK:
+        return 0.0
+    rows = images[0].shape[0]
+    step = BLOCK * max(1, images[0].size // ENOUGH)
+    found = [_blocks(images, masks, y) for y in range(BLOCK, rows - 2 * BLOCK + 1, step)]
+    variances = np.concatenate(found) if found else np.empty(0)
+    return float(np.sqrt(max(np.median(variances), 0.0))) if variances.size >= LEAST else 0.0
+
+
+def _blocks(images: Sequence[AnyArray], masks: Sequence[AnyArray], y: int) -> AnyArray:
+    """Variances of the noise in the blocks of 16 rows from ``y`` on, those with a masked pixel left out."""
+    squares, usable = [], []
+    count = images[0].shape[1] // BLOCK - 2
+    for level, side in ((0, BLOCK), (1, BLOCK // 2)):
+        rows = slice((y >> level) - 1, (y >> level) + side + 1)
+        cols = slice(side - 1, side * (count + 1) + 1)
+        strip, mask = np.asarray(images[level][rows, cols], np.float64), masks[level][rows, cols]
+        bend = np.diff(np.diff(strip, 2, axis=0), 2, axis=1) / 6.0
+        squares.append(np.square(bend).reshape(side, count, side).mean(axis=(0, 2)))
+        usable.append((mask[1:-1, 1:-1] != 0).reshape(side, count, side).all(axis=(0, 2)))
+    return np.asarray(((squares[0] - squares[1]) / 0.75)[usable[0] & usable[1]])
