@@ -88,7 +88,7 @@ def match_files(
     write_disparity(output, column, row, tags | {"FILLED": str(dense).lower()})
     if confidence is not None:
         write_confidence(confidence, found.disparity_std, found.validity, found.backmatch_error, tags)
-    for line in warnings(found):
+    for line in warnings(found, *images):
         warn(line)
     share = float(matched(found.validity).mean())
     typical = f", standard deviation {np.nanmedian(found.disparity_std):.2f} px (median)" if share else ""
@@ -97,9 +97,10 @@ def match_files(
     return COMPLETE if share >= FEW else INCOMPLETE
 
 
-def warnings(found: Disparity) -> list[str]:
+def warnings(found: Disparity, left: NDArray[Any], right: NDArray[Any]) -> list[str]:
     """What is suspicious about two matched images, one line each with the figure."""
     from rille.stages.core.validity import Validity, has, matched
+    from rille.stages.hfvm import doubt
     from rille.stages.hfvm.swap_check import swapped
 
     ok = matched(found.validity)
@@ -127,7 +128,20 @@ def warnings(found: Disparity) -> list[str]:
             "a pair of a left and a right camera, give them in the other order"
         )
         return [warning("RIL-702", text)]
-    return []
+    judged, signs = doubt.judge(left, right, found, ok), list[str]()
+    if judged is not None and judged[0] < doubt.RIGID:
+        text = (
+            f"only {100 * judged[0]:.0f} % of the matches lie within {doubt.NEAR:.0f} px of one epipolar geometry: "
+            "wrong matches, things that move, or a lens that distorts: look at them first"
+        )
+        signs.append(warning("RIL-703", text))
+    if judged is not None and judged[1] > doubt.REPEATED:
+        text = (
+            f"{100 * judged[1]:.0f} % of the matches look as well elsewhere on their epipolar line: on a repeating "
+            "pattern they may be off by a period: look at them first"
+        )
+        signs.append(warning("RIL-704", text))
+    return signs
 
 
 def _prior(path: Path, shape: tuple[int, ...]) -> tuple[NDArray[Any], NDArray[Any]]:
