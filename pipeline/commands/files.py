@@ -126,24 +126,29 @@ def match(
     )
 
 
+Form = Literal["laz", "glb", "colmap", "nav2"]
+"""What ``rille export`` writes."""
+
+
 def export(
     run: Run,
     *,
-    to: Annotated[list[Literal["laz", "glb", "colmap"]], Parameter(negative="")],
+    to: Annotated[list[Form], Parameter(negative="")],
     output: Annotated[Path | None, Output] = None,
     runs: Runs = RUNS,
     cache: CacheFolder = None,
     debug: Debug = False,
 ) -> int:
-    """Write a run for other programs: cloud.laz (a point a cell), terrain.glb (textured mesh) or a COLMAP model.
+    """Write a run for other programs: cloud.laz (a point a cell), terrain.glb (textured mesh), COLMAP model, Nav2 maps.
 
     Parameters
     ----------
     to
-        laz: CloudCompare, PDAL, QGIS; glb: any glTF viewer, Blender; colmap: cameras, rig, poses and tracked points.
-        May be repeated.
+        laz: CloudCompare, PDAL, QGIS; glb: any glTF viewer, Blender; colmap: cameras, rig, poses and tracked points;
+        nav2: map, keepout and speed mask, and path of ROS 2's navigation. May be repeated.
     output
-        What to write, for one form only; by default cloud.laz, terrain.glb or the folder colmap in the run's folder.
+        What to write, for one form only; by default cloud.laz, terrain.glb or the folder colmap or nav2 in the run's
+        folder.
     """
     from rille.stages.core.errors import ConfigError
 
@@ -160,14 +165,15 @@ def export(
     return COMPLETE
 
 
-def _export(run: Path, kind: Literal["laz", "glb", "colmap"], output: Path | None, cache: str | None) -> str:
+def _export(run: Path, kind: Form, output: Path | None, cache: str | None) -> str:
     """Write one form; what was written, in words."""
-    if kind == "colmap":
+    if kind in ("colmap", "nav2"):
         from rille.pipeline.engine.store.base import at
-        from rille.pipeline.export import colmap
+        from rille.pipeline.export.programs import colmap, nav2
 
-        return str(colmap.export_run(run, output or run / kind, at(cache_folder(cache))))
-    from rille.pipeline.export import point_cloud
+        write = colmap.export_run if kind == "colmap" else nav2.export_run
+        return write(run, output or run / kind, at(cache_folder(cache)))
+    from rille.pipeline.export.programs import point_cloud
 
     path, words = point_cloud.export(run, kind, output)
     return f"{path}  {words}"

@@ -15,8 +15,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rille.pipeline.engine import events
 from rille.pipeline.engine.store.base import Store
+from rille.pipeline.export.programs.run_artifacts import RunArtifacts
 from rille.stages.core.declare import Bundle
 from rille.stages.core.errors import InputError
 from rille.stages.evaluation.crosscheck import PIXEL_CENTRE
@@ -66,7 +66,7 @@ def export_run(run: Path, target: Path, store: Store) -> str:
     """
     if target.exists() and any(target.iterdir()):
         raise InputError("RIL-607", f"{target} is not empty", remedy="give a new folder with --output")
-    bundles = _Artifacts(run, store)
+    bundles = RunArtifacts(run, store)
     rig = Rig.from_dict(bundles.one("calibration").meta["rig"])
     segments = [
         MatchedSegment(track, resection, {f: b for f in _ends(track) if (b := bundles.find(f"hfvm/{f}")) is not None})
@@ -217,43 +217,3 @@ def _names(run: Path) -> dict[int, str]:
     facts = json.loads((run / "frames.json").read_text(encoding="utf-8"))
     rows = facts.get("frames", [])
     return {int(r["frame"]): str(r["name"]) for r in rows if isinstance(r, dict) and "name" in r}
-
-
-class _Artifacts:
-    """What a run's ledger refers to."""
-
-    def __init__(self, run: Path, store: Store) -> None:
-        path = run / "ledger.jsonl"
-        if not path.is_file():
-            raise InputError(
-                "RIL-608", f"{run} holds no ledger.jsonl", remedy="give the folder of a run, e.g. runs/mockup/latest"
-            )
-        self.store = store
-        self.rows = [row for row in events.read(path) if row["status"] in ("computed", "cached") and "key" in row]
-
-    def find(self, label: str) -> Bundle | None:
-        """The artifact of exactly this label, if the run has it."""
-        row = next((r for r in self.rows if r["label"] == label), None)
-        return None if row is None else self._open(row)
-
-    def one(self, label: str) -> Bundle:
-        """The artifact of this label."""
-        row = next((r for r in self.rows if r["label"].split("/")[0] == label), None)
-        if row is None:
-            raise InputError("RIL-609", f"the run has no {label}", remedy="finish it with rille reconstruct")
-        return self._open(row)
-
-    def pairs(self, first: str, second: str) -> list[tuple[Bundle, Bundle]]:
-        """Artifacts of two stages with the same rest of the label."""
-        mine = {
-            name: {r["label"].partition("/")[2]: r for r in self.rows if r["stage"] == name} for name in (first, second)
-        }
-        return [(self._open(r), self._open(mine[second][k])) for k, r in mine[first].items() if k in mine[second]]
-
-    def _open(self, row: Mapping[str, Any]) -> Bundle:
-        ref = self.store.lookup(str(row["stage"]), str(row["key"]))
-        if ref is None:
-            raise InputError(
-                "RIL-610", f"{row['label']} is not in the cache", remedy="name the run's cache with --cache"
-            )
-        return self.store.open(ref)

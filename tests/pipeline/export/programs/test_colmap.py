@@ -5,7 +5,7 @@ import pycolmap
 from raising import raises
 
 from rille.pipeline.engine.store.base import Store
-from rille.pipeline.export.colmap import MatchedSegment, build, export_run
+from rille.pipeline.export.programs.colmap import MatchedSegment, build, export_run
 from rille.stages.core.declare import Bundle
 from rille.stages.core.validity import Validity
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp

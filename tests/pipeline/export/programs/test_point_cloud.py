@@ -14,7 +14,7 @@ import trimesh
 from raising import raises
 from terrain_runs import LATTICE, PLACE, elevation, finished
 
-from rille.pipeline.export import point_cloud
+from rille.pipeline.export.programs import point_cloud
 
 KNOWN = np.isfinite(elevation())
 

@@ -1,0 +1,1 @@
+"""Forms of a run that other programs ask for: written by ``rille export --to``."""
