@@ -16,9 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rille.pipeline.engine.store.base import Store
-from rille.pipeline.export.programs.run_artifacts import RunArtifacts
+from rille.pipeline.export.programs.run_artifacts import RunArtifacts, check_new
 from rille.stages.core.declare import Bundle
-from rille.stages.core.errors import InputError
 from rille.stages.evaluation.crosscheck import PIXEL_CENTRE
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 from rille.stages.odometry.resection.landmarks import matches_at
@@ -64,8 +63,7 @@ def export_run(run: Path, target: Path, store: Store) -> str:
     InputError
         The folder holds no finished run, its artifacts are gone from the cache, or the target is not empty.
     """
-    if target.exists() and any(target.iterdir()):
-        raise InputError("RIL-607", f"{target} is not empty", remedy="give a new folder with --output")
+    check_new(target)
     bundles = RunArtifacts(run, store)
     rig = Rig.from_dict(bundles.one("calibration").meta["rig"])
     segments = [

@@ -26,9 +26,8 @@ from numpy.typing import NDArray
 
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.engine.store.base import Store
-from rille.pipeline.export.programs.run_artifacts import RunArtifacts
+from rille.pipeline.export.programs.run_artifacts import RunArtifacts, check_new
 from rille.stages.core.declare import Bundle
-from rille.stages.core.errors import InputError
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.classification import CAUTION, HAZARDOUS, UNKNOWN
 
@@ -55,13 +54,9 @@ def export_run(run: Path, target: Path, store: Store) -> str:
         The folder holds no finished run with a risk map, its artifacts are gone from the cache, or the target is not
         empty.
     """
-    if target.exists() and any(target.iterdir()):
-        raise InputError("RIL-607", f"{target} is not empty", remedy="give a new folder with --output")
+    check_new(target)
     artifacts = RunArtifacts(run, store)
-    risk = artifacts.find("risk/world")
-    if risk is None:
-        raise InputError("RIL-609", "the run has no risk/world", remedy="finish it with rille reconstruct")
-    path = artifacts.find("path/world")
+    risk, path = artifacts.one("risk/world"), artifacts.find("path/world")
     with atomic.replacing(target) as folder:
         folder.mkdir()
         write(folder, risk, path)

@@ -12,6 +12,12 @@ from rille.stages.core.declare import Bundle
 from rille.stages.core.errors import InputError
 
 
+def check_new(target: Path) -> None:
+    """Refuse a folder with something in it."""
+    if target.exists() and any(target.iterdir()):
+        raise InputError("RIL-607", f"{target} is not empty", remedy="give a new folder with --output")
+
+
 class RunArtifacts:
     """What a run's ledger refers to."""
 
@@ -30,8 +36,8 @@ class RunArtifacts:
         return None if row is None else self._open(row)
 
     def one(self, label: str) -> Bundle:
-        """The artifact of this label."""
-        row = next((r for r in self.rows if r["label"].split("/")[0] == label), None)
+        """The artifact of this label, or the first whose label begins with it."""
+        row = next((r for r in self.rows if f"{r['label']}/".startswith(f"{label}/")), None)
         if row is None:
             raise InputError("RIL-609", f"the run has no {label}", remedy="finish it with rille reconstruct")
         return self._open(row)
