@@ -1,9 +1,15 @@
-"""The merged terrain as one zarr group that ``xarray.open_zarr`` opens as it is, by the CF conventions.
+"""The merged terrain as one zarr group that xarray and GDAL open as it is, by the CF conventions.
 
-Dimensions are y (falling) and x, both with their coordinates; every variable has its unit, its long name, its frame
-and ``grid_mapping``; ``elevation`` names in ``ancillary_variables`` what says how good it is and where it comes from
-(standard deviation, spread, number of models, pair of the greatest weight). Where the sequence has a place on Earth, x
-and y stay those of the world frame, and ``easting`` and ``northing`` are two-dimensional coordinates.
+Dimensions are y (falling) and x, both with their coordinates; every variable has its unit, its long name and its frame;
+``elevation`` names in ``ancillary_variables`` what says how good it is and where it comes from (standard deviation,
+spread, number of models, pair of the greatest weight). The format is zarr 2, which GDAL reads since 3.4; of zarr 3 GDAL
+3.10 reads no array that zarr-python writes.
+
+The world frame is no map projection: x and y are plain axes, and a scalar coordinate ``spatial_ref`` has the
+engineering CRS, where rioxarray looks for it. CF has no ``grid_mapping`` for such a frame, so none is claimed. Where
+the sequence has a place on Earth, ``easting`` and ``northing`` are two-dimensional coordinates of the projection that
+``crs`` holds, and each variable's ``grid_mapping`` says so. CF has standard names for heights above geoid, ellipsoid
+and ground; those above the first camera have none.
 """
 
 from __future__ import annotations
@@ -13,7 +19,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numcodecs
 import numpy as np
+import pyproj
 from numpy.typing import NDArray
 
 from rille.datasets.georeference import Georeference
@@ -30,7 +38,6 @@ CONVENTIONS = "CF-1.11"
 CHUNK = 512
 UNITS = {"px": "1", "grey": "1"}
 """Units that UDUNITS does not know; the long name has the word."""
-STANDARD_NAMES = {"elevation_std": "standard_error"}
 
 
 def write_terrain(
@@ -66,26 +73,24 @@ def _write(
     attributes = {"Conventions": CONVENTIONS, **facts, "frame": FRAME, "cell_size_m": lattice.cell}
     if place is not None:
         attributes["georeference"] = place.to_dict()
-    group = zarr.create_group(store=LocalStore(folder), zarr_format=3, attributes=attributes)
+    group = zarr.create_group(store=LocalStore(folder), zarr_format=2, attributes=attributes)
     _coordinates(group, lattice, place)
-    extra = " easting northing" if place is not None else ""
+    coordinates = {"coordinates": "spatial_ref"}
+    if place is not None:
+        coordinates = {"coordinates": "spatial_ref easting northing", "grid_mapping": "crs: easting northing"}
     for name, (spec, values) in arrays.items():
         about: dict[str, Any] = {
             "units": UNITS.get(spec.unit, spec.unit),
             "long_name": spec.long_name,
-            "grid_mapping": "spatial_ref",
-            "coordinates": "spatial_ref" + extra,
             "frame": spec.frame or "world",
+            "_CRS": {"wkt": ENGINEERING_CRS},
+            **coordinates,
         }
         if name == "elevation":
             about |= {"positive": "up", "ancillary_variables": " ".join(n for n in arrays if n not in (name, "ortho"))}
-        if name in STANDARD_NAMES:
-            about["standard_name"] = STANDARD_NAMES[name]
         if spec.unit in UNITS:
             about["quantity"] = spec.unit
-        if values.dtype.kind != "f" and spec.nodata:
-            about["missing_value"] = int(spec.nodata)
-        _array(group, name, values, ("y", "x"), about)
+        _array(group, name, values, ("y", "x"), about, spec.nodata)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # zarr says that readers of other languages may not know consolidated metadata
         zarr.consolidate_metadata(LocalStore(folder))
@@ -93,7 +98,7 @@ def _write(
 
 def _coordinates(group: Any, lattice: Lattice, place: Georeference | None) -> None:
     for axis, values, words in (("x", lattice.xs(), "right"), ("y", lattice.ys(), "ahead")):
-        about = {"units": "m", "axis": axis.upper(), "standard_name": f"projection_{axis}_coordinate"}
+        about = {"units": "m", "axis": axis.upper()}
         about["long_name"] = f"{axis} of the cell centre, world frame, {words}"
         _array(group, axis, values, (axis,), about)
     name = "Rille world frame (local metres)"
@@ -104,19 +109,26 @@ def _coordinates(group: Any, lattice: Lattice, place: Georeference | None) -> No
     _array(group, "spatial_ref", np.array(0, np.int32), (), reference)
     if place is not None:
         there = place.apply(np.concatenate([lattice.xy(), np.zeros((*lattice.shape, 1))], axis=-1))
-        for k, axis in enumerate(("easting", "northing")):
-            _array(group, axis, there[..., k], ("y", "x"), {"units": "m", "long_name": axis, "crs": place.crs})
+        _array(group, "crs", np.array(0, np.int32), (), pyproj.CRS(place.crs).to_cf() | {"long_name": place.crs})
+        for k, (name, axis) in enumerate((("easting", "x"), ("northing", "y"))):
+            about = {"units": "m", "long_name": name, "standard_name": f"projection_{axis}_coordinate"}
+            _array(group, name, there[..., k], ("y", "x"), about)
 
 
-def _array(group: Any, name: str, values: NDArray[Any], dims: tuple[str, ...], attributes: Mapping[str, Any]) -> None:
+def _array(
+    group: Any, name: str, values: NDArray[Any], dims: tuple[str, ...], attributes: Mapping[str, Any], nodata: str = ""
+) -> None:
+    # What zarr 2 calls the fill value is CF's _FillValue: unknown cells.
+    fill: float | int | None = np.nan if values.dtype.kind == "f" else int(nodata) if nodata else None
     written = group.create_array(
         name,
         shape=values.shape,
         dtype=values.dtype,
         chunks=tuple(min(n, CHUNK) for n in values.shape) or (),
-        fill_value=np.nan if values.dtype.kind == "f" else 0,
-        dimension_names=dims,
-        attributes=dict(attributes),
+        fill_value=fill,
+        # Of the compressors, zlib is in every build of GDAL.
+        compressors=numcodecs.Zlib(level=1),
+        attributes=dict(attributes) | {"_ARRAY_DIMENSIONS": list(dims)},
         config={"write_empty_chunks": True},
     )
     written[...] = values
@@ -145,7 +157,7 @@ OUTPUTS = (
     Output(
         "terrain.zarr",
         "all merged arrays with units and coordinates",
-        "xarray.open_zarr",
+        "xarray.open_zarr, GDAL",
         _write_output,
         ("tiles",),
         knows=("sequence.georeference", "sequence.name"),
@@ -153,8 +165,8 @@ OUTPUTS = (
         facts={
             "crs": "engineering CRS, metres; easting and northing beside x and y where the sequence has a place on "
             "Earth",
-            "values": "all merged arrays as one zarr 3 group, by the CF conventions; units with each",
-            "opens_with": "xarray.open_zarr",
+            "values": "all merged arrays as one zarr 2 group, by the CF conventions; units with each",
+            "opens_with": "xarray.open_zarr, GDAL",
         },
     ),
 )

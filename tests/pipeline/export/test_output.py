@@ -10,8 +10,13 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import laspy
 import numpy as np
+import pyogrio
+import pyproj
 import pytest
+import rasterio
+import xarray
 from evo.tools import file_interface
 from toys.finished import FRAMES, bundles, checked, checks, sequence, view
 
@@ -21,6 +26,7 @@ from rille.pipeline.export import catalogue
 from rille.pipeline.export.frames_json import FRAMES as REFERENCES
 from rille.pipeline.export.frames_json import describe
 from rille.pipeline.export.output import Output, handles, pack, place, task, unpack
+from rille.pipeline.export.programs import point_cloud
 from rille.pipeline.report import canvas, gallery
 from rille.pipeline.report.block import Figure
 from rille.pipeline.runs import run_files
@@ -164,6 +170,35 @@ def test_a_run_writes_the_files_that_it_describes(tmp_path: Path) -> None:
     assert (rows[5]["disagreement_m"], rows[5]["crosscheck_error_m"]) == ("", "")
     crosscheck = file_interface.read_tum_trajectory_file(tmp_path / "crosscheck.tum")
     np.testing.assert_array_equal(crosscheck.timestamps, range(5))
+
+
+@pytest.mark.parametrize("georeference", [None, PLACE], ids=["local", "placed"])
+def test_all_files_of_a_run_state_one_system(georeference: Georeference | None, tmp_path: Path) -> None:
+    whole, _ = run(georeference)
+    for module in catalogue.MADE:
+        for output in module.OUTPUTS:
+            output.write(tmp_path, whole)
+    point_cloud.export(tmp_path, "laz", None)
+    found = {}
+    for path in tmp_path.glob("*.tif"):
+        with rasterio.open(path) as raster:
+            found[path.name] = pyproj.CRS.from_user_input(raster.crs)
+    found["path.gpkg"] = pyproj.CRS.from_user_input(pyogrio.read_info(tmp_path / "path.gpkg")["crs"])
+    with laspy.open(tmp_path / "cloud.laz") as cloud:
+        found["cloud.laz"] = pyproj.CRS.from_wkt(next(v.string for v in cloud.header.vlrs if v.record_id == 2112))
+    terrain = xarray.open_zarr(tmp_path / "terrain.zarr")
+    local = pyproj.CRS.from_wkt(terrain.spatial_ref.attrs["crs_wkt"])
+    found["terrain.zarr"] = local if georeference is None else pyproj.CRS.from_cf(terrain.crs.attrs)
+    assert len(found) >= 10
+    if georeference is None:
+        assert {crs.name for crs in found.values()} == {"Rille world frame (local metres)"}
+        assert {(a.direction, a.unit_name) for crs in found.values() for a in crs.axis_info} == {
+            ("east", "metre"),
+            ("north", "metre"),
+        }
+    else:
+        assert {crs.to_epsg() for crs in found.values()} == {32633}
+        assert "crs" not in json.loads((tmp_path / "path.geojson").read_text())
 
 
 def table() -> str:

@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from pathlib import Path
 
 import numpy as np
 import pyproj
+import pytest
+import rasterio
 import xarray
 from terrain_runs import LATTICE, PLACE, elevation
 
+from rille.datasets.georeference import Georeference
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.export.terrain_zarr import write_terrain
 from rille.stages.core.declare import Bundle
 from rille.stages.terrain import merge
 from rille.stages.terrain.merge import Layer, MergeParams
+
+STANDARD_NAMES = ("projection_x_coordinate", "projection_y_coordinate")
+OF_PLACE = ("easting", "northing")
 
 
 def arrays() -> dict:
@@ -64,8 +71,53 @@ def test_a_place_on_earth_gives_every_cell_its_easting_and_northing(tmp_path: Pa
     expected = PLACE.apply([x, y, 0.0])
     assert data.elevation.easting.values[20, 40] == expected[0]
     assert data.elevation.northing.values[20, 40] == expected[1]
-    assert data.easting.attrs["crs"] == "EPSG:32633"
+    assert data.easting.attrs["standard_name"] == "projection_x_coordinate"
+    assert pyproj.CRS.from_cf(data.crs.attrs) == pyproj.CRS("EPSG:32633")
+    assert data.crs.attrs["grid_mapping_name"] == "transverse_mercator"
     assert data.attrs["georeference"]["azimuth"] == 0.6
+
+
+@pytest.mark.parametrize("place", [None, PLACE])
+def test_gdal_opens_every_array_at_its_place(tmp_path: Path, place: Georeference | None) -> None:
+    write_terrain(tmp_path / "t.zarr", arrays(), LATTICE, place, {})
+    for name in ("elevation", "elevation_std", "count", "source"):
+        with rasterio.open(f'ZARR:"{tmp_path / "t.zarr"}":/{name}') as found:
+            assert found.shape == LATTICE.shape
+            assert 'UNIT["metre",1]' in found.crs.to_wkt()
+            assert found.crs.to_wkt().startswith('LOCAL_CS["Rille world frame')
+            corner = LATTICE.x0 - LATTICE.cell / 2, LATTICE.y0 + LATTICE.cell / 2
+            assert found.transform * (0, 0) == pytest.approx(corner, abs=1e-9)
+            assert found.transform * (1, 1) == pytest.approx((corner[0] + 0.05, corner[1] - 0.05), abs=1e-9)
+            np.testing.assert_array_equal(found.read(1), arrays()[name][1])
+
+
+@pytest.mark.parametrize("place", [None, PLACE])
+def test_the_rules_of_cf_hold(tmp_path: Path, place: Georeference | None) -> None:
+    """CF 1.11: sections 2.6.1, 3.1-3.4, 4, 5 and 5.6, as far as these variables come under them."""
+    write_terrain(tmp_path / "t.zarr", arrays(), LATTICE, place, {})
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        data = xarray.open_zarr(tmp_path / "t.zarr", decode_cf=False)
+    assert data.attrs["Conventions"] == "CF-1.11"
+    for name, variable in data.variables.items():
+        about = variable.attrs
+        assert re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", str(name))
+        assert about.get("long_name") or about.get("standard_name"), name
+        assert about.get("standard_name", "projection_x_coordinate") in STANDARD_NAMES
+        if variable.dims:
+            assert about["units"] in ("m", "1", "degree"), name
+        for other in about.get("ancillary_variables", "").split() + about.get("coordinates", "").split():
+            assert other in data.variables
+        mapping, _, of = about.get("grid_mapping", "").partition(": ")
+        if mapping:
+            assert data[mapping].attrs["grid_mapping_name"] in ("transverse_mercator",)
+            assert [data[c].attrs["standard_name"] for c in of.split()] == sorted(STANDARD_NAMES)
+        # A grid mapping is claimed where there is a projection, and only there.
+        assert bool(mapping) == (place is not None and variable.dims == ("y", "x") and name not in OF_PLACE)
+    for axis in "xy":
+        steps = np.diff(data[axis].values)
+        assert (steps > 0).all() or (steps < 0).all()
+        assert data[axis].attrs["axis"] == axis.upper()
 
 
 def test_an_artifact_on_a_lattice_has_coordinates_too(tmp_path: Path) -> None:
