@@ -11,7 +11,7 @@ from rille.pipeline.export import ranges
 from rille.pipeline.export.artifacts import chain
 from rille.pipeline.export.comparison import Comparison
 from rille.pipeline.report import canvas, figures
-from rille.pipeline.report.block import Block, Table
+from rille.pipeline.report.canvas import Block, Table
 from rille.pipeline.report.gather import Calibration, Scene
 from rille.pipeline.report.words import length, quantity, spans, spread
 

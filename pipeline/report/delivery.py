@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from rille.pipeline.export.view import RunView
-from rille.pipeline.report.block import Figure
+from rille.pipeline.report.canvas import Figure
 from rille.pipeline.report.gather import Scene
 from rille.pipeline.report.words import metres, spans
 

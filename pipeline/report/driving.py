@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from rille.pipeline.export import ranges
 from rille.pipeline.report import canvas, stops
-from rille.pipeline.report.block import Block, Table
-from rille.pipeline.report.canvas import Extent, Panel
+from rille.pipeline.report.canvas import Block, Extent, Panel, Table
 from rille.pipeline.report.gather import Scene
 from rille.pipeline.report.words import metres
 from rille.stages.geometry.geometry import RigidTransform

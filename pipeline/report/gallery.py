@@ -13,7 +13,7 @@ import numpy as np
 from rille.pipeline.export import artifacts
 from rille.pipeline.export.output import Output, stage
 from rille.pipeline.report import canvas, checks, driving, figures, gather, seams, stops, terrain_map
-from rille.pipeline.report.block import Block, Figure
+from rille.pipeline.report.canvas import Block, Figure
 from rille.pipeline.report.delivery import start_words
 from rille.pipeline.report.gather import Scene
 from rille.pipeline.report.words import length, spread

@@ -16,7 +16,7 @@ from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.export.catalogue import listed
 from rille.pipeline.export.view import RunView
 from rille.pipeline.report import canvas, tables
-from rille.pipeline.report.block import Figure
+from rille.pipeline.report.canvas import Figure
 from rille.pipeline.report.summary import summarise
 from rille.pipeline.report.words import coordinate, metres, number, quantity, seconds, share
 

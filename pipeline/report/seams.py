@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rille.pipeline.export import ranges
 from rille.pipeline.report import canvas, figures
-from rille.pipeline.report.block import Block, Table
+from rille.pipeline.report.canvas import Block, Table
 from rille.pipeline.report.gather import Scene
 from rille.pipeline.report.words import number, spread
 

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from rille.pipeline.export import artifacts, ranges
 from rille.pipeline.report import canvas, gather
-from rille.pipeline.report.block import Block
-from rille.pipeline.report.canvas import Panel
+from rille.pipeline.report.canvas import Block, Panel
 from rille.pipeline.report.figures import grey, paint
 from rille.pipeline.report.gather import Scene, Terrain
 from rille.stages.core.validity import matched

@@ -10,7 +10,7 @@ from typing import Any
 from rille.pipeline.export.output import Output, stage
 from rille.pipeline.export.view import RunView
 from rille.pipeline.report import delivery, seams, tables
-from rille.pipeline.report.block import Figure
+from rille.pipeline.report.canvas import Figure
 from rille.pipeline.report.gather import Scene
 from rille.pipeline.report.metrics import metrics
 

@@ -17,7 +17,7 @@ from rille.pipeline.export.output import Output, handles, place, task, unpack
 from rille.pipeline.export.trajectories import stamps
 from rille.pipeline.export.view import RunView, TaskRow
 from rille.pipeline.report import gallery, summary
-from rille.pipeline.report.block import Figure
+from rille.pipeline.report.canvas import Figure
 from rille.pipeline.report.page import write_report
 from rille.stages.core.declare import NoParams
 

@@ -23,7 +23,7 @@ from rille.pipeline.engine.store.base import Store
 from rille.pipeline.engine.store.maintenance import artifacts
 from rille.pipeline.engine.store.manifest import length, reference, unframe
 from rille.pipeline.report import gallery
-from rille.pipeline.report.block import Figure
+from rille.pipeline.report.canvas import Figure
 from rille.pipeline.runs import session
 
 SMALL = (

@@ -28,7 +28,7 @@ from rille.pipeline.export.frames_json import describe
 from rille.pipeline.export.output import Output, handles, pack, place, task, unpack
 from rille.pipeline.export.programs import point_cloud
 from rille.pipeline.report import canvas, gallery
-from rille.pipeline.report.block import Figure
+from rille.pipeline.report.canvas import Figure
 from rille.pipeline.runs import run_files
 from rille.stages.core.declare import Bundle
 
