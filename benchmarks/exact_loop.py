@@ -41,7 +41,7 @@ def drive(sequence: Any, config: Any, goal: tuple[float, float]) -> dict[str, An
     from rille.stages.core.declare import Bundle
     from rille.stages.hazard.risk import risk_map
     from rille.stages.planning.local_planner.memory import PlannerMemory
-    from rille.stages.planning.local_planner.stage import next_leg, shortest_way
+    from rille.stages.planning.local_planner.stage import SeenGround, next_leg, shortest_way
     from rille.stages.planning.local_planner.views import FieldOfView
     from rille.stages.terrain.occlusion_bounds import Bounds, ceiling
 
@@ -70,7 +70,7 @@ def drive(sequence: Any, config: Any, goal: tuple[float, float]) -> dict[str, An
         bounds = Bounds.of(known, np.zeros_like(known), top)
         maps, follows, (place, heading) = (judged(near), judged(far)), "again", place_of(T)
         while follows == "again":
-            leg = next_leg(*maps, (*place, heading), goal, p, memory, view, before, bounds)
+            leg = next_leg(SeenGround(*maps, bounds), (*place, heading), goal, p, memory, view, before)
             follows = memory.after(leg.verdict, (*place, heading), leg.where)
         before = (leg.rest, leg.rest_gear) if len(leg.rest_gear) else None
         T = bed.at(*after(leg, heading))

@@ -17,12 +17,12 @@ def choose_goal(bed: Any, config: Any) -> tuple[float, float] | None:
     import numpy as np
 
     from rille.stages.hazard.risk import risk_map
-    from rille.stages.planning.local_planner.clearance import Footing
+    from rille.stages.planning.local_planner.clearance import Footing, Hazards
     from rille.stages.planning.local_planner.ground import Ground
 
     cell = config.locus.cell_size
     judged = risk_map(bed.elevation, np.zeros_like(bed.elevation), cell, config.vehicle, config.risk)
-    footing = Footing.of(judged["risk"], judged["reason"], bed.lattice, config.vehicle)
+    footing = Footing.of(Hazards(judged["risk"], judged["reason"]), bed.lattice, config.vehicle)
     start, heading = bed.start()
     ground = Ground(footing, start, heading, config.leg.model_copy(update={"unknown_price": math.inf}))
     _, cost, _ = ground.search(start, cell, whole=True)

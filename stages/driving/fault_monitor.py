@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,10 +54,20 @@ class Verdict:
     reason: str
 
 
+class Readings(NamedTuple):
+    """What the sensors tell at each frame.
+
+    ``up`` (frame, 3) direction of up in the left camera; ``acceleration`` (frame,) m/s2; ``odometry`` (frame, 3) x, y
+    (m), heading (rad) by the wheels since the first frame.
+    """
+
+    up: Floats
+    acceleration: Floats
+    odometry: Floats
+
+
 def judge(
-    up: Floats,
-    acceleration: Floats,
-    odometry: Floats,
+    readings: Readings,
     poses: Floats,
     inliers: list[int],
     T_vehicle_left: RigidTransform,
@@ -68,12 +78,12 @@ def judge(
 
     Parameters
     ----------
-    up : (frame, 3) direction of up in the left camera. ``acceleration`` (frame,) m/s2.
-    odometry : (frame, 3) x, y (m), heading (rad) by the wheels since the first frame.
+    readings : of the sensors at each frame.
     poses : (frame, 3, 4) T_local_left by vision.
     inliers : landmarks of each pose.
     vehicle : its ``max_slope_deg`` and ``wheel_base``.
     """
+    up, acceleration, odometry = readings
     key = RigidTransform.from_matrix(poses[0]) @ T_vehicle_left.inverse()
     steepest = params.max_tilt * float(vehicle["max_slope_deg"])
     for k in range(1, len(poses)):
@@ -113,9 +123,7 @@ def _run(params: SafetyParams, args: Mapping[str, Any], inputs: Inputs) -> Bundl
     rows = [int(r) for r in args["rows"]]  # of the readings, those frames that were resected
     wheels = np.asarray(sense["odometry"])[rows]
     found = judge(
-        np.asarray(sense["up"])[rows],
-        np.asarray(sense["acceleration"])[rows],
-        _relative(wheels),
+        Readings(np.asarray(sense["up"])[rows], np.asarray(sense["acceleration"])[rows], _relative(wheels)),
         np.asarray(resect["poses"]),
         [int(f["inliers"]) for f in resect.meta["per_frame"]],
         RigidTransform.from_matrix(args["T_vehicle_left"]),

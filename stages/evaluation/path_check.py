@@ -14,7 +14,7 @@ from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.risk import HAZARDOUS, UNKNOWN
 from rille.stages.hazard.vehicle import Vehicle
 from rille.stages.planning import grid8
-from rille.stages.planning.path_ground import Maps, PathMaps
+from rille.stages.planning.path_ground import Maps, PathMaps, PathPrices
 from rille.stages.planning.row_graph import UNREACHED
 from rille.stages.planning.row_grid import RowGrid
 
@@ -101,7 +101,8 @@ def shortest(path: Floats, maps: Maps, lattice: Lattice, vehicle: Vehicle) -> di
 
 
 def _shortest(path: Floats, maps: Maps, lattice: Lattice, vehicle: Vehicle) -> float | None:
-    ground = PathMaps(maps, lattice, RowGrid.over(lattice, (0.0, 1.0)), vehicle, unit=vehicle.max_step, caution=0.0)
+    prices = PathPrices(unit=vehicle.max_step, caution=0.0)
+    ground = PathMaps(maps, lattice, RowGrid.over(lattice, (0.0, 1.0)), vehicle, prices)
     ways = ground.ways("middle")
     first, last = (ground.grid.index((float(path[k, 0]), float(path[k, 1]))) for k in (0, -1))
     if not all(0 <= r < ways.shape[0] and 0 <= c < ways.shape[1] and ways[r, c] for r, c in (first, last)):

@@ -8,12 +8,13 @@ whole numbers, so that sums are exact. Ties go to the lower cell index. scipy's 
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from rille.stages.numeric.heap import grown, pop, push
 from rille.stages.numeric.line import copy_line
 from rille.stages.planning.configuration_space import ACROSS, LEFT, RIGHT, STRAIGHT
 from rille.stages.planning.row_graph import UNREACHED
@@ -53,7 +54,8 @@ def cost_to_go(
     step = np.full(height.shape, -1, dtype=np.int8)
     end = -1 if start is None else start[0] * height.shape[1] + start[1]
     lengths = np.array([unit if dr == 0 or dc == 0 else round(unit * DIAGONAL) for dr, dc, _ in NEIGHBOURS])
-    _search(np.ascontiguousarray(height), ways, toll, lengths, target[0] * height.shape[1] + target[1], end, cost, step)
+    ground = _Ground(np.ascontiguousarray(height), ways, toll, lengths)
+    _search(ground, target[0] * height.shape[1] + target[1], end, cost, step)
     return cost, step
 
 
@@ -106,18 +108,27 @@ def _flood(ways, number, spans):  # type: ignore[no-untyped-def]
     return count, spans
 
 
+class _Ground(NamedTuple):
+    """Heights, directions and tolls (row, col) of :func:`cost_to_go`, and the cost of the length of each edge (8,)."""
+
+    height: Whole
+    ways: Bytes
+    toll: Whole
+    lengths: Ints
+
+
 @njit(cache=True, nogil=True)
-def _search(height, ways, toll, lengths, target, end, cost, step):  # type: ignore[no-untyped-def]
+def _search(ground, target, end, cost, step):  # type: ignore[no-untyped-def]
+    height, ways, toll, lengths = ground
     rows, cols = height.shape
-    keys, nodes = np.empty(1024, dtype=np.int64), np.empty(1024, dtype=np.int64)
-    size = 1
+    keys, nodes, size = np.empty(1024, dtype=np.int64), np.empty(1024, dtype=np.int64), 1
     keys[0], nodes[0] = 0, target
     cost[target // cols, target % cols] = 0
     while size:
         key, node = keys[0], nodes[0]
-        size -= 1
-        _sift_down(keys, nodes, size)
+        size = pop(keys, nodes, size)
         r, c = node // cols, node % cols
+        # A cell that was reached more cheaply later stands in the heap twice: the dearer entry is passed over.
         if key > cost[r, c]:
             continue
         if node == end:
@@ -131,46 +142,6 @@ def _search(height, ways, toll, lengths, target, end, cost, step):  # type: igno
             if total < cost[i, j]:
                 cost[i, j], step[i, j] = total, k
                 if size == keys.shape[0]:
-                    keys, nodes = _grown(keys), _grown(nodes)
-                _sift_up(keys, nodes, size, total, i * cols + j)
+                    keys, nodes = grown(keys), grown(nodes)
+                push(keys, nodes, size, total, i * cols + j)
                 size += 1
-
-
-@njit(cache=True, nogil=True)
-def _grown(a):  # type: ignore[no-untyped-def]
-    out = np.empty(2 * a.shape[0], dtype=np.int64)
-    copy_line(a, out)
-    return out
-
-
-@njit(cache=True, nogil=True)
-def _before(key, node, other_key, other_node):  # type: ignore[no-untyped-def]
-    return key < other_key or (key == other_key and node < other_node)
-
-
-@njit(cache=True, nogil=True)
-def _sift_up(keys, nodes, at, key, node):  # type: ignore[no-untyped-def]
-    """Put an entry at the end of the heap in its place."""
-    while at > 0:
-        parent = (at - 1) // 2
-        if not _before(key, node, keys[parent], nodes[parent]):
-            break
-        keys[at], nodes[at] = keys[parent], nodes[parent]
-        at = parent
-    keys[at], nodes[at] = key, node
-
-
-@njit(cache=True, nogil=True)
-def _sift_down(keys, nodes, size):  # type: ignore[no-untyped-def]
-    """Fill the top of the heap, of which ``size`` entries remain, by its last one."""
-    key, node = keys[size], nodes[size]
-    at = 0
-    while 2 * at + 1 < size:
-        child = 2 * at + 1
-        if child + 1 < size and _before(keys[child + 1], nodes[child + 1], keys[child], nodes[child]):
-            child += 1
-        if not _before(keys[child], nodes[child], key, node):
-            break
-        keys[at], nodes[at] = keys[child], nodes[child]
-        at = child
-    keys[at], nodes[at] = key, node

@@ -43,7 +43,7 @@ from rille.stages.hazard.risk import HAZARDOUS, check_size
 from rille.stages.hazard.vehicle import Vehicle
 from rille.stages.planning import grid8
 from rille.stages.planning.path_ends import Point, check_end, chosen
-from rille.stages.planning.path_ground import GROUNDS, PathMaps
+from rille.stages.planning.path_ground import GROUNDS, PathMaps, PathPrices
 from rille.stages.planning.path_words import Maps, Route, describe
 from rille.stages.planning.row_graph import UNREACHED, Plan, plan, row_span
 from rille.stages.planning.row_grid import RowGrid
@@ -51,6 +51,7 @@ from rille.stages.planning.row_grid import RowGrid
 __all__ = ["STAGE", "PathParams", "Route", "describe", "find_path"]
 
 Planner = Literal["rows", "grid8", "auto"]
+Ends = tuple[Point | None, Point | None]
 
 
 class PathParams(Params):
@@ -97,8 +98,7 @@ def find_path(
     vehicle: Vehicle,
     *,
     heading: Point = (0.0, 1.0),
-    start: Point | None = None,
-    target: Point | None = None,
+    ends: Ends = (None, None),
     stretch: bool = False,
     params: PathParams | None = None,
 ) -> Route:
@@ -108,7 +108,7 @@ def find_path(
     ----------
     maps : arrays (row, col) of stage ``risk``: ``risk``, ``reason``, ``elevation``; the others serve messages.
     heading : driving direction (dx, dy) in the frame of the lattice; start and target together override it.
-    start, target : x, y, metres; None: see the module. Those of ``params`` are not looked at.
+    ends : start and target, x, y, metres; None: see the module. Those of ``params`` are not looked at.
     stretch : with neither of them, cross the connected ground over most rows where no path leads over all of them.
 
     Raises
@@ -119,15 +119,16 @@ def find_path(
     """
     p = params or PathParams()
     check_size(vehicle, lattice.shape, lattice.cell)
+    start, target = ends
     for name, point in (("start", start), ("target", target)):
         if point is not None:
             check_end(maps, lattice, vehicle, name, point)
     if start is not None and target is not None:
         heading = (target[0] - start[0], target[1] - start[1])
-    found = _found(maps, lattice, vehicle, heading, start, target, stretch, p)
+    found = _found(maps, lattice, vehicle, heading, ends, stretch, p)
     if len(found.cells) or p.sure >= 1 or "p_hazard" not in maps:
         return found
-    other = _found(maps, lattice, vehicle, heading, start, target, stretch, p.model_copy(update={"sure": 1.0}))
+    other = _found(maps, lattice, vehicle, heading, ends, stretch, p.model_copy(update={"sure": 1.0}))
     if not len(other.cells):
         return found
     at = tuple(np.rint(lattice.index(other.xyz[:, :2])).astype(np.int64).T)
@@ -144,28 +145,27 @@ def _found(
     lattice: Lattice,
     vehicle: Vehicle,
     heading: Point,
-    start: Point | None,
-    target: Point | None,
+    ends: Ends,
     stretch: bool,
     p: PathParams,
 ) -> Route:
-    found = None
+    found, (start, target) = None, ends
     if p.planner != "grid8":
-        found = _by_rows(maps, lattice, vehicle, heading, start, target, p)
+        found = _by_rows(maps, lattice, vehicle, heading, ends, p)
     if p.planner == "grid8" or (
         p.planner == "auto"
         and found is not None
         and not len(found.cells)
         and (target is not None or (stretch and start is None))
     ):
-        found = _by_grid(maps, lattice, vehicle, start, target, p, found)
+        found = _by_grid(maps, lattice, vehicle, ends, p, found)
     assert found is not None
     return found
 
 
 def _ground(maps: Maps, lattice: Lattice, grid: RowGrid, vehicle: Vehicle, p: PathParams) -> PathMaps:
-    unit = p.height_step * vehicle.max_step
-    return PathMaps(maps, lattice, grid, vehicle, unit=unit, caution=p.caution, doubt=p.doubt, sure=p.sure)
+    prices = PathPrices(p.height_step * vehicle.max_step, p.caution, p.doubt, p.sure)
+    return PathMaps(maps, lattice, grid, vehicle, prices)
 
 
 def _by_rows(
@@ -173,20 +173,18 @@ def _by_rows(
     lattice: Lattice,
     vehicle: Vehicle,
     heading: Point,
-    start: Point | None,
-    target: Point | None,
+    ends: Ends,
     p: PathParams,
 ) -> Route:
     ground = _ground(maps, lattice, RowGrid.over(lattice, heading), vehicle, p)
     grid = ground.grid
-    first, last = (None if point is None else grid.index(point) for point in (start, target))
+    first, last = (None if point is None else grid.index(point) for point in ends)
     tolerance = math.ceil((vehicle.wheel_base + vehicle.wheel_diameter) / lattice.cell)
     span = row_span(~ground.closed)
     for name in GROUNDS:
         explain = name == GROUNDS[-1]
-        found = plan(
-            ground.height, ground.ways(name), tolerance, first, last, span=span, toll=ground.toll, explain=explain
-        )
+        ways = ground.ways(name)
+        found = plan(ground.height, ways, tolerance, (first, last), span=span, toll=ground.toll, explain=explain)
         if len(found.cells):
             break
     cost = ground.metres(found.cost, UNREACHED, grid.rows)
@@ -197,14 +195,13 @@ def _by_grid(
     maps: Maps,
     lattice: Lattice,
     vehicle: Vehicle,
-    start: Point | None,
-    target: Point | None,
+    ends: Ends,
     p: PathParams,
     before: Route | None,
 ) -> Route:
     ground = _ground(maps, lattice, RowGrid.over(lattice, (0.0, 1.0)), vehicle, p)
     grid, unit = ground.grid, max(1, round(lattice.cell / ground.unit))
-    given = tuple(None if point is None else grid.index(point) for point in (start, target))
+    given = tuple(None if point is None else grid.index(point) for point in ends)
     nothing = np.empty((0, 2), dtype=np.int64)
     cells, cost, name = nothing, np.full(ground.height.shape, UNREACHED), GROUNDS[0]
     for name in ground.worth() if given == (None, None) else GROUNDS:
@@ -232,8 +229,8 @@ def _run(params: PathParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     local = args.get("use") == "local"
     dx, dy = args.get("heading", (0.0, 1.0))
     maps = {name: np.asarray(source[name]) for name in source.arrays}
-    ends = {} if local else {"start": params.start, "target": params.target}
-    route = find_path(maps, lattice, vehicle, heading=(dx, dy), stretch=not local, params=params, **ends)
+    ends = (None, None) if local else (params.start, params.target)
+    route = find_path(maps, lattice, vehicle, heading=(dx, dy), ends=ends, stretch=not local, params=params)
     arrays: dict[str, NDArray[Any]] = {
         "path": route.xyz,
         "cost_to_go": route.cost,

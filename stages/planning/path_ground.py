@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -33,6 +33,47 @@ LARGE = 1 << 30
 """Heights above it are kept in 64 bits."""
 
 
+class PathPrices(NamedTuple):
+    """Terms of a path's cost.
+
+    ``unit``: metres of height that cost one; ``caution``: metres of climb that a metre of caution ground costs;
+    ``doubt``: metres of climb that a metre of ground costs times its probability of a hazard; ``sure``: probability of
+    a hazard above which ground is closed.
+    """
+
+    unit: float
+    caution: float
+    doubt: float = 0.0
+    sure: float = 1.0
+
+
+class _CellPrices(NamedTuple):
+    """The same in units a cell, so that the kernel works in 32 bits."""
+
+    unit: np.float32
+    caution: int
+    doubt: np.float32
+    sure: np.float32
+
+
+class _Sampled(NamedTuple):
+    """Maps (row, col) on the grid: class, reason bits, probability of a hazard, mean height under a wheel (m)."""
+
+    risk: Bytes
+    reason: Ints
+    chance: NDArray[np.float32]
+    stand: NDArray[np.float32]
+
+
+class _Masks(NamedTuple):
+    """Cells (row, col): unknown, not entered, hazardous to a wheel, hazardous to the vehicle as a whole."""
+
+    unknown: NDArray[np.bool_]
+    closed: NDArray[np.bool_]
+    wheels: NDArray[np.bool_]
+    body: NDArray[np.bool_]
+
+
 class PathMaps:
     """The maps on a grid.
 
@@ -47,22 +88,15 @@ class PathMaps:
         lattice: Lattice,
         grid: RowGrid,
         vehicle: Vehicle,
-        *,
-        unit: float,
-        caution: float,
-        doubt: float = 0.0,
-        sure: float = 1.0,
+        prices: PathPrices,
     ) -> None:
         """
         Parameters
         ----------
         maps : arrays (row, col) of stage ``risk`` on ``lattice``: ``risk``, ``reason``, ``elevation`` and, where
             there is a price of doubt, ``p_hazard``.
-        unit : metres.
-        caution : metres of climb that a metre of caution ground costs.
-        doubt : metres of climb that a metre of ground costs times its probability of a hazard.
-        sure : probability of a hazard above which ground is closed.
         """
+        unit, caution, doubt, sure = prices
         self.grid, self.unit = grid, unit
         risk = grid.sample(lattice, maps["risk"], UNKNOWN)
         reason = grid.sample(lattice, maps["reason"], 0)
@@ -70,17 +104,17 @@ class PathMaps:
         chance = grid.sample(lattice, maps["p_hazard"], np.nan) if known else np.zeros(risk.shape, np.float32)
         mean = window_mean(maps["elevation"], window_cells(vehicle.wheel_diameter, lattice.cell))
         self.stand = grid.sample(lattice, mean, np.nan)
-        unknown, self.closed, wheels, body = (np.empty(risk.shape, dtype=np.bool_) for _ in range(4))
+        masks = _Masks(*(np.empty(risk.shape, dtype=np.bool_) for _ in range(4)))
+        self.closed = masks.closed
         toll = round(caution * grid.cell / unit)
         dearest = toll + round(doubt * grid.cell / unit)
         self.height: Ints = np.empty(risk.shape, dtype=np.int32)
         self.toll: Ints = np.empty(risk.shape, dtype=np.int16 if dearest <= np.iinfo(np.int16).max else np.int64)
-        prices = np.float32(unit), toll, np.float32(doubt * grid.cell / unit)
         limit = np.float32(sure if sure < 1 else np.inf)
-        if _lay(risk, reason, chance, self.stand, limit, *prices, unknown, self.closed, wheels, body, self.height,
-                self.toll):  # fmt: skip
+        each = _CellPrices(np.float32(unit), toll, np.float32(doubt * grid.cell / unit), limit)
+        if _lay(_Sampled(risk, reason, chance, self.stand), each, masks, self.height, self.toll):
             self.height = np.rint(np.where(self.closed, np.float32(0), self.stand) / np.float32(unit)).astype(np.int64)
-        self._stand = FreePlaces(wheels, body, vehicle, grid.cell, unknown, self.closed)
+        self._stand = FreePlaces(masks.wheels, masks.body, vehicle, grid.cell, masks.unknown, masks.closed)
         self._ways: dict[str, Bytes] = {}
         self._parts: dict[str, tuple[NDArray[np.int32], Ints]] = {}
 
@@ -115,9 +149,11 @@ class PathMaps:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _lay(risk, reason, chance, stand, sure, unit, caution, doubt, unknown, closed, wheels, body, height, toll):  # type: ignore[no-untyped-def]
-    """Masks of unknown ground, of all that is not entered, and of what is hazardous to a wheel and to the vehicle as a
-    whole; heights in units and tolls. Returns whether some height is too large."""
+def _lay(maps, prices, masks, height, toll):  # type: ignore[no-untyped-def]
+    """Fill the masks, the heights in units and the tolls; ``prices`` in units. Whether some height is too large."""
+    risk, reason, chance, stand = maps
+    unit, caution, doubt, sure = prices
+    unknown, closed, wheels, body = masks
     large = np.uint8(0)
     for r in range(risk.shape[0]):
         for c in range(risk.shape[1]):

@@ -23,6 +23,7 @@ from rille.stages.planning.configuration_space import ALL, LEFT, RIGHT, STRAIGHT
 Ints = NDArray[np.integer[Any]]
 Mask = NDArray[np.bool_]
 Ways = NDArray[np.uint8]
+Cell = tuple[int, int]
 
 UNREACHED = np.iinfo(np.int64).max // 4
 MOVES = (0, 1, -1)
@@ -201,8 +202,7 @@ def plan(
     height: Ints,
     free: Mask | Ways,
     tolerance: int = 0,
-    start: tuple[int, int] | None = None,
-    target: tuple[int, int] | None = None,
+    ends: tuple[Cell | None, Cell | None] = (None, None),
     span: tuple[int, int] | None = None,
     toll: Ints | None = None,
     explain: bool = True,
@@ -215,13 +215,14 @@ def plan(
         bits. Row 0 is farthest.
     tolerance : rows by which a start or target that is not given may miss the nearest or farthest row with a free cell;
         at most a quarter of the rows between them.
-    start, target : row and column, inside the grid.
+    ends : start and target, row and column inside the grid, or None.
     span : the farthest and the nearest row that count; None: those with a free cell.
     toll : see :func:`sweep`.
     explain : where there is no path, find out how far one can go.
     """
     ways = ways_of(free)
     rows, cols = ways.shape
+    start, target = ends
     first_last = span or row_span(ways > 0)
     unreached = np.broadcast_to(np.int64(UNREACHED), ways.shape)
     nothing = Plan(np.empty((0, 2), dtype=np.int64), unreached, np.zeros(cols, dtype=bool), 0)

@@ -10,7 +10,7 @@ from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.risk import SAFE
 from rille.stages.hazard.vehicle import Vehicle
-from rille.stages.planning.local_planner.clearance import Footing
+from rille.stages.planning.local_planner.clearance import Footing, Hazards
 from rille.stages.planning.local_planner.params import LegParams
 from rille.stages.planning.local_planner.views import FieldOfView
 
@@ -40,4 +40,4 @@ def ground(*changes: tuple[np.ndarray, int]) -> Footing:
     risk = np.full(LATTICE.shape, SAFE, np.uint8)
     for where, kind in changes:
         risk[where] = kind
-    return Footing.of(risk, None, LATTICE, ROVER)
+    return Footing.of(Hazards(risk), LATTICE, ROVER)

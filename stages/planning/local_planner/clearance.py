@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -56,6 +57,35 @@ class Gaps:
     caution: Floats32
 
 
+class Hazards(NamedTuple):
+    """Maps (row, col) of :mod:`rille.stages.hazard.risk`: classes; reason bits, without which every hazard is one to a
+    wheel; probabilities of a hazard, without which each is certain."""
+
+    risk: NDArray[np.uint8]
+    reason: NDArray[np.uint16] | None = None
+    p_hazard: NDArray[np.float32] | None = None
+
+
+class Known(NamedTuple):
+    """Masks (row, col): ``unknown``, where the vehicle may not stand for what is not known, None: the unknown class;
+    ``glanced``, where of it something is known nevertheless; ``doubted`` ground, which costs as much as a doubtful
+    hazard."""
+
+    unknown: Mask | None = None
+    glanced: Mask | None = None
+    doubted: Mask | None = None
+
+
+class _Ground(NamedTuple):
+    """The maps of :class:`Footing` that its kernel reads."""
+
+    fields: Floats32
+    unknown: Floats32
+    frontier: Floats32
+    caution: NDArray[np.uint8]
+    straddle: Straddle
+
+
 @dataclass(frozen=True)
 class Footing:
     """A risk map as a vehicle meets it: ``fields`` (6, row, col) m to hazards to a wheel that are none by sigma alone,
@@ -75,27 +105,23 @@ class Footing:
 
     @staticmethod
     def of(
-        risk: NDArray[np.uint8],
-        reason: NDArray[np.uint16] | None,
+        hazards: Hazards,
         lattice: Lattice,
         vehicle: Vehicle,
-        p_hazard: NDArray[np.float32] | None = None,
+        known: Known | None = None,
+        *,
         sure: float = 0.5,
         dare: float = 0.0,
-        unknown: Mask | None = None,
-        glanced: Mask | None = None,
-        doubted: Mask | None = None,
         bounds: Bounds | None = None,
     ) -> Footing:
-        """From classes and reason bits of :mod:`rille.stages.hazard.risk`; without bits every hazard is one to a wheel.
-
-        ``unknown``: where the vehicle may not stand for what is not known; None: the unknown class. ``glanced``: where
-        of it something is known nevertheless; ``bounds`` of the ground, by which the belly may pass over it.
+        """On ground of which ``bounds`` are known the belly may pass over what is not.
 
         A hazard is proven where it is not one by sigma alone, and at least as probable as ``sure``. What is one by
         sigma alone and less probable than ``dare`` is caution ground :data:`DOUBT_WEIGHT` times, if it is not unknown.
-        So is ``doubted`` ground, and what is within a quarter of a wheel of it, where its edge touches.
+        So is doubted ground, and what is within a quarter of a wheel of it, where its edge touches.
         """
+        risk, reason, p_hazard = hazards
+        unknown, glanced, doubted = known or Known()
         hazardous, cell = risk == HAZARDOUS, lattice.cell
         unknown = risk == UNKNOWN if unknown is None else unknown
         bits = np.full(risk.shape, WHEEL_BITS) if reason is None else reason
@@ -126,10 +152,9 @@ class Footing:
         # beyond the circle about the vehicle, and what rounding to cells takes, nothing is beneath it
         around = 0.5 * math.hypot(self.vehicle.track, self.vehicle.wheel_base) + 1.5 * cell
         reach = np.array([around + self.vehicle.margin, cell, self.vehicle.margin], np.float32)
-        _gaps(
-            at, np.cos(turn), np.sin(turn), wheel_positions(self.vehicle) / cell, _belly(self.vehicle) / cell,
-            self.fields, self.unknown, self.frontier, self.straddle, self.caution, reach, out,
-        )  # fmt: skip
+        parts = wheel_positions(self.vehicle) / cell, _belly(self.vehicle) / cell
+        ground = _Ground(self.fields, self.unknown, self.frontier, self.caution, self.straddle)
+        _gaps((at, np.cos(turn), np.sin(turn)), parts, ground, reach, out)
         out[3:5] -= NEAR_UNKNOWN * cell
         return Gaps(*(a.reshape(np.shape(x)) for a in out))
 
@@ -172,7 +197,15 @@ def _belly(vehicle: Vehicle) -> Floats:
 
 
 @njit(cache=True, nogil=True)
-def _gaps(at, cosine, sine, wheels, belly, fields, unknown, frontier, straddle, caution, reach, out):  # type: ignore[no-untyped-def]
+def _gaps(poses, parts, ground, reach, out):  # type: ignore[no-untyped-def]
+    """Fill ``out`` (6, n) with the fields of :class:`Gaps`, in its order.
+
+    ``poses``: row and column (n, 2), cosine and sine (n,) of the heading; ``parts``: wheels and points of the belly,
+    right and ahead, cells; ``reach``: see :meth:`Footing.gaps`.
+    """
+    at, cosine, sine = poses
+    wheels, belly = parts
+    fields, unknown, frontier, caution, straddle = ground
     rows, cols = unknown.shape
     stand, heights = np.empty((4, 2), dtype=np.int64), np.empty(4)
     for n in range(at.shape[0]):

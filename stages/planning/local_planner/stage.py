@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,35 +19,41 @@ from rille.stages.geometry.geometry import Rig, RigidTransform
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.classification import HAZARDOUS, UNKNOWN, UNSEEN_BIT
 from rille.stages.hazard.vehicle import Vehicle
-from rille.stages.planning.local_planner.clearance import Footing
+from rille.stages.planning.local_planner.clearance import Footing, Hazards, Known
 from rille.stages.planning.local_planner.memory import PlannerMemory
 from rille.stages.planning.local_planner.params import LegParams
 from rille.stages.planning.local_planner.policy import Before, Leg, plan_leg, shortest
 from rille.stages.planning.local_planner.views import FieldOfView, Stand
 from rille.stages.terrain.occlusion_bounds import Bounds
 
-Mask = NDArray[np.bool_]
 Point = tuple[float, float]
 
 
+class SeenGround(NamedTuple):
+    """Hazards (:mod:`rille.stages.hazard.risk`) of what was seen from near, and of all that was seen, None: that is the
+    same; bounds of the ground that was not."""
+
+    near: Bundle
+    far: Bundle | None = None
+    bounds: Bounds | None = None
+
+
 def next_leg(
-    near: Bundle,
-    far: Bundle | None,
+    seen: SeenGround,
     stand: Stand,
     goal: Point,
     params: LegParams,
     memory: PlannerMemory,
     view: FieldOfView,
     before: Before | None = None,
-    bounds: Bounds | None = None,
 ) -> Leg:
-    """The next leg on the hazards (:mod:`rille.stages.hazard.risk`) of what was seen from near, and of all that was
-    seen; None: that is the same. The other parameters are those of
+    """The next leg on the ground seen so far; the other parameters are those of
     :func:`rille.stages.planning.local_planner.policy.plan_leg`."""
-    (classes, reason, chance), seen = seen_so_far(near, far, params)
-    lattice, vehicle = Lattice.from_dict(near.meta["lattice"]), Vehicle.model_validate(near.meta["vehicle"])
+    hazards, known = seen_so_far(seen.near, seen.far, params)
+    meta = seen.near.meta
+    lattice, vehicle = Lattice.from_dict(meta["lattice"]), Vehicle.model_validate(meta["vehicle"])
     for sure in params.sure:
-        footing = Footing.of(classes, reason, lattice, vehicle, chance, sure, params.dare, bounds=bounds, **seen)
+        footing = Footing.of(hazards, lattice, vehicle, known, sure=sure, dare=params.dare, bounds=seen.bounds)
         found = plan_leg(footing, stand, goal, params, memory, before, view)
         if found.verdict == "goal" or len(found.way) > 1:
             break
@@ -58,11 +64,10 @@ def shortest_way(risk: Bundle, stand: Stand, goal: Point, params: LegParams) -> 
     """Length (m) of the shortest way where all is known, and the margin (m) that it keeps: the vehicle's, or none where
     the margin, which is for what a vehicle does not know, closes every way. None: there is no way."""
     lattice, vehicle = Lattice.from_dict(risk.meta["lattice"]), Vehicle.model_validate(risk.meta["vehicle"])
-    maps = (np.asarray(risk[name]) for name in ("risk", "reason", "p_hazard"))
-    classes, reason, chance = maps
+    hazards = Hazards(*(np.asarray(risk[name]) for name in Hazards._fields))
     for margin in (vehicle.margin, 0.0):
         bare = vehicle.model_copy(update={"margin": margin})
-        allowed = Footing.of(classes, reason, lattice, bare, chance, params.sure[-1], params.dare)
+        allowed = Footing.of(hazards, lattice, bare, sure=params.sure[-1], dare=params.dare)
         best = shortest(allowed, stand, goal, params)
         if best is not None:
             return best, margin
@@ -86,7 +91,7 @@ def _run(params: LegParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     ceiling, bounds = inputs.get("ceiling"), None
     if ceiling is not None:
         bounds = Bounds(upper=np.asarray(ceiling["upper"]), lower=np.asarray(ceiling["lower"]))
-    found = next_leg(risk, inputs.get("far"), stand, goal, params, memory, view, before, bounds)
+    found = next_leg(SeenGround(risk, inputs.get("far"), bounds), stand, goal, params, memory, view, before)
     best, margin = shortest_way(risk, stand, goal, params) if args.get("whole") else (None, None)
     meta = {
         "shortest_m": best,
@@ -106,10 +111,9 @@ def _run(params: LegParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     return Bundle(arrays, meta)
 
 
-def seen_so_far(near: Bundle, far: Bundle | None, p: LegParams) -> tuple[list[NDArray[Any]], dict[str, Mask | None]]:
-    """Classes, reasons and probabilities (row, col) of a map, of which only what was seen from near is driven on; and
-    how well each cell is known, as :meth:`rille.stages.planning.local_planner.clearance.Footing.of` asks for it."""
-    names = ("risk", "reason", "p_hazard")
+def seen_so_far(near: Bundle, far: Bundle | None, p: LegParams) -> tuple[Hazards, Known]:
+    """The hazards of a map of which only what was seen from near is driven on, and how well each cell is known."""
+    names = Hazards._fields
     maps = [np.asarray(near[name]) for name in names]
     unknown, glanced = maps[0] == UNKNOWN, None
     if far is not None:
@@ -120,7 +124,7 @@ def seen_so_far(near: Bundle, far: Bundle | None, p: LegParams) -> tuple[list[ND
         maps = [np.where(cut, np.asarray(far[name]), seen) for name, seen in zip(names, maps, strict=True)]
         unknown &= ~(maps[2] < p.clear)
         glanced = unknown & (maps[0] < HAZARDOUS)
-    return maps, {"unknown": unknown, "glanced": glanced, "doubted": maps[2] >= p.avoid}
+    return Hazards(*maps), Known(unknown, glanced, maps[2] >= p.avoid)
 
 
 def _length(path: NDArray[np.float64]) -> float:

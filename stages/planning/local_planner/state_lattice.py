@@ -12,12 +12,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from rille.stages.geometry.lattice import Lattice
+from rille.stages.numeric.heap import grown, pop, push
 from rille.stages.planning.local_planner.clearance import Footing, Gaps
 
 Floats = NDArray[np.float64]
@@ -110,10 +112,8 @@ class PoseGraph:
         r, c = self.grid.origin
         end = -1 if whole else r * size[2] + c
         angles = np.mod(np.diff(np.append(ANGLES, 2 * np.pi)), 2 * np.pi)
-        _search(
-            self.pose, self.step, self.turn, goals, STEPS, LENGTHS * self.grid.spacing, angles * turn_price,
-            back, end, cost, move,
-        )  # fmt: skip
+        moves = _Moves(STEPS, LENGTHS * self.grid.spacing, angles * turn_price, back)
+        _search((self.pose, self.step, self.turn), goals, moves, end, cost, move)
         return cost, move
 
     def follow(self, move: NDArray[np.int8]) -> list[tuple[int, int, int, int]]:
@@ -135,49 +135,20 @@ def angle_of(k: int) -> float:
     return 2 * math.pi * turns + float(ANGLES[rest])
 
 
-@njit(cache=True, nogil=True)
-def _before(key, node, other_key, other_node):  # type: ignore[no-untyped-def]
-    return key < other_key or (key == other_key and node < other_node)
+class _Moves(NamedTuple):
+    """Of each heading (16): row and column of a step ahead, its length (m), the price of a turn to the left; and the
+    price of driving back, ahead is 1."""
+
+    steps: NDArray[np.int64]
+    lengths: Floats
+    turns: Floats
+    back: float
 
 
 @njit(cache=True, nogil=True)
-def _push(keys, nodes, size, key, node):  # type: ignore[no-untyped-def]
-    """Add to the heap, which may move to larger arrays."""
-    if size == keys.shape[0]:
-        more_keys, more_nodes = np.empty(2 * size, np.float64), np.empty(2 * size, np.int64)
-        more_keys[:size], more_nodes[:size] = keys, nodes
-        keys, nodes = more_keys, more_nodes
-    at = size
-    while at > 0:
-        parent = (at - 1) // 2
-        if not _before(key, node, keys[parent], nodes[parent]):
-            break
-        keys[at], nodes[at] = keys[parent], nodes[parent]
-        at = parent
-    keys[at], nodes[at] = key, node
-    return keys, nodes, size + 1
-
-
-@njit(cache=True, nogil=True)
-def _pop(keys, nodes, size):  # type: ignore[no-untyped-def]
-    """Take the first entry off the heap; the number of those that remain."""
-    size -= 1
-    key, node = keys[size], nodes[size]
-    at = 0
-    while 2 * at + 1 < size:
-        child = 2 * at + 1
-        if child + 1 < size and _before(keys[child + 1], nodes[child + 1], keys[child], nodes[child]):
-            child += 1
-        if not _before(keys[child], nodes[child], key, node):
-            break
-        keys[at], nodes[at] = keys[child], nodes[child]
-        at = child
-    keys[at], nodes[at] = key, node
-    return size
-
-
-@njit(cache=True, nogil=True)
-def _search(pose, step, turn, goals, steps, lengths, turns, back, end, cost, move):  # type: ignore[no-untyped-def]
+def _search(prices, goals, moves, end, cost, move):  # type: ignore[no-untyped-def]
+    pose, step, turn = prices
+    steps, lengths, turns, back = moves
     rows, cols = goals.shape
     area = rows * cols
     keys, nodes, size = np.empty(4096, np.float64), np.empty(4096, np.int64), 0
@@ -186,10 +157,13 @@ def _search(pose, step, turn, goals, steps, lengths, turns, back, end, cost, mov
             for c in range(cols):
                 if goals[r, c] and pose[k % 8, r, c] < np.inf:
                     cost[k, r, c] = 0.0
-                    keys, nodes, size = _push(keys, nodes, size, 0.0, k * area + r * cols + c)
+                    if size == keys.shape[0]:
+                        keys, nodes = grown(keys), grown(nodes)
+                    push(keys, nodes, size, 0.0, k * area + r * cols + c)
+                    size += 1
     while size:
         key, node = keys[0], nodes[0]
-        size = _pop(keys, nodes, size)
+        size = pop(keys, nodes, size)
         k, r, c = node // area, node % area // cols, node % cols
         if key > cost[k, r, c]:
             continue
@@ -215,4 +189,7 @@ def _search(pose, step, turn, goals, steps, lengths, turns, back, end, cost, mov
             total = key + scale * price
             if total < cost[before, i, j]:
                 cost[before, i, j], move[before, i, j] = total, m
-                keys, nodes, size = _push(keys, nodes, size, total, before * area + i * cols + j)
+                if size == keys.shape[0]:
+                    keys, nodes = grown(keys), grown(nodes)
+                push(keys, nodes, size, total, before * area + i * cols + j)
+                size += 1

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rille.stages.driving.fault_monitor import SafetyParams, Verdict, judge
+from rille.stages.driving.fault_monitor import Readings, SafetyParams, Verdict, judge
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 
 OPTICAL = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
@@ -37,7 +37,9 @@ def leg(n: int = 5, slip: float = 0.05, turn: float = 0.0) -> dict[str, Any]:
 
 
 def judged(**changes: Any) -> Verdict:
-    return judge(**{**leg(), **changes}, T_vehicle_left=T_VEHICLE_LEFT, vehicle=VEHICLE, params=P)
+    given = leg() | changes
+    readings = Readings(given["up"], given["acceleration"], given["odometry"])
+    return judge(readings, given["poses"], given["inliers"], T_VEHICLE_LEFT, VEHICLE, P)
 
 
 def test_a_leg_in_order_is_driven_to_its_end() -> None:

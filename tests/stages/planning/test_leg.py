@@ -14,13 +14,13 @@ from raising import raises
 
 from rille.stages.core.declare import Bundle
 from rille.stages.hazard.risk import HAZARDOUS, REASONS, SAFE, UNKNOWN
-from rille.stages.planning.local_planner.clearance import DOUBT_WEIGHT, PARTS, Footing
+from rille.stages.planning.local_planner.clearance import DOUBT_WEIGHT, PARTS, Footing, Hazards, Known
 from rille.stages.planning.local_planner.ground import Ground
 from rille.stages.planning.local_planner.memory import PlannerMemory
 from rille.stages.planning.local_planner.params import LegParams
 from rille.stages.planning.local_planner.policy import Leg, plan_leg, shortest
 from rille.stages.planning.local_planner.route import length_of, through
-from rille.stages.planning.local_planner.stage import next_leg, seen_so_far, shortest_way
+from rille.stages.planning.local_planner.stage import SeenGround, next_leg, seen_so_far, shortest_way
 from rille.stages.planning.local_planner.views import AHEAD as ANYWHERE
 from rille.stages.planning.local_planner.views import FieldOfView, Stand
 from rille.stages.terrain.occlusion_bounds import Bounds
@@ -63,7 +63,7 @@ def test_over_a_hole_between_walls_it_goes_where_lines_of_sight_pass_low_enough(
 
     def driven(top: float) -> Leg:
         bounds = Bounds(np.where(hole, np.float32(top), seen), seen)
-        return next_leg(Bundle(maps, meta), None, AT, GOAL, P, PlannerMemory(), CAMERAS, bounds=bounds)
+        return next_leg(SeenGround(Bundle(maps, meta), None, bounds), AT, GOAL, P, PlannerMemory(), CAMERAS)
 
     over, before = driven(0.9 * ROVER.clearance), driven(1.1 * ROVER.clearance)
     assert over.path[-1, 1] > 0.16
@@ -178,7 +178,7 @@ def test_no_leg_comes_near_a_hazard_or_onto_unknown_ground_or_turns_too_far(
         x, y, r = rng.uniform(-0.4, 0.4), rng.uniform(-0.15, 0.9), rng.uniform(0.01, 0.04)
         risk[np.hypot(X - x, Y - y) < r] = rng.choice([HAZARDOUS, UNKNOWN])
     risk[np.hypot(X, Y) < 0.1] = SAFE
-    leg = plan_leg(Footing.of(risk, None, LATTICE, ROVER), (*START, heading), GOAL, P, view=view)
+    leg = plan_leg(Footing.of(Hazards(risk), LATTICE, ROVER), (*START, heading), GOAL, P, view=view)
     wheels = np.array([(a, b) for a in (-0.04, 0.04) for b in (-0.05, 0.05)])
     poses = list[tuple[np.ndarray, float]]()
     for a, b, gear in zip(leg.path, leg.path[1:], leg.gear, strict=False):
@@ -259,7 +259,7 @@ def test_a_kept_way_is_not_given_up_for_rounding() -> None:
     risk = np.full(LATTICE.shape, SAFE, np.uint8)
     risk[Y > 0.15] = HAZARDOUS
     reason = np.full(LATTICE.shape, REASONS["step"] | REASONS["uncertain"], np.uint16)
-    leg = plan_leg(Footing.of(risk, reason, LATTICE, ROVER), AT, GOAL, P, before=(straight, AHEAD[:1]))
+    leg = plan_leg(Footing.of(Hazards(risk, reason), LATTICE, ROVER), AT, GOAL, P, before=(straight, AHEAD[:1]))
     assert leg.path[-1, 1] < 0.15 - 0.5 * ROVER.wheel_base + LATTICE.cell
 
 
@@ -273,7 +273,7 @@ def judged(hazardous: np.ndarray, chance: float) -> Bundle:
 def test_where_probable_hazards_close_every_way_those_next_to_certain_do() -> None:
     wall = np.abs(Y - 0.3) < 0.03
     for chance, verdict in ((0.93, "drive"), (0.999, "look")):
-        leg = next_leg(judged(wall, chance), None, AT, GOAL, P, PlannerMemory(), CAMERAS)
+        leg = next_leg(SeenGround(judged(wall, chance)), AT, GOAL, P, PlannerMemory(), CAMERAS)
         assert leg.verdict == verdict
         assert (len(leg.way) > 1) == (verdict == "drive")
 
@@ -292,7 +292,7 @@ def test_doubtful_ground_is_dear_where_it_will_not_be_seen_from_nearer() -> None
     def cost(y: float, kind: int) -> float:
         band = np.abs(Y - y) < 0.03
         risk = np.where(band, np.uint8(kind), free)
-        footing = Footing.of(risk, None, LATTICE, ROVER, doubted=band if kind == SAFE else None)
+        footing = Footing.of(Hazards(risk), LATTICE, ROVER, Known(doubted=band if kind == SAFE else None))
         return Ground(footing, START, 0.0, P).again(way)[1]
 
     assert cost(0.2, SAFE) > 1.05 * cost(0.5, SAFE)
@@ -302,10 +302,10 @@ def test_doubtful_ground_is_dear_where_it_will_not_be_seen_from_nearer() -> None
 def test_what_is_likely_a_hazard_is_gone_round_farther_than_what_is_unknown() -> None:
     wall, band = (X < 0.22) & (np.abs(Y - 0.4) < 0.03), np.abs(Y - 0.4) < 0.12
     risk = np.where(wall, np.uint8(HAZARDOUS), np.uint8(SAFE))
-    likely = Footing.of(risk, None, LATTICE, ROVER, np.where(wall, 0.7, 0.0).astype(np.float32), sure=0.9)
+    likely = Footing.of(Hazards(risk, None, np.where(wall, 0.7, 0.0).astype(np.float32)), LATTICE, ROVER, sure=0.9)
     assert plan_leg(likely, AT, GOAL, SEEN).way[:, 0].max() > 0.22
     assert plan_leg(ground((band & wall, UNKNOWN)), AT, GOAL, SEEN).way[:, 0].max() < 0.1
-    across = Footing.of(risk, None, LATTICE, ROVER, np.where(wall, 0.7, 0.0).astype(np.float32), sure=0.6)
+    across = Footing.of(Hazards(risk, None, np.where(wall, 0.7, 0.0).astype(np.float32)), LATTICE, ROVER, sure=0.6)
     assert plan_leg(across, AT, GOAL, SEEN).way[:, 0].max() > 0.22  # which is certain
 
 
@@ -319,7 +319,7 @@ def test_the_shadow_of_a_stone_is_gone_round_farther_than_ground_that_nobody_loo
 def test_no_wheel_is_driven_over_doubtful_ground_that_can_be_gone_round() -> None:
     free = np.full(LATTICE.shape, SAFE, np.uint8)
     doubted = np.hypot(X + 0.5 * ROVER.track, Y - 0.15) < 0.011
-    footing = Footing.of(free, None, LATTICE, ROVER, doubted=doubted)
+    footing = Footing.of(Hazards(free), LATTICE, ROVER, Known(doubted=doubted))
     leg = plan_leg(footing, AT, GOAL, P)
     assert leg.verdict == "drive"
     for piece in through(leg.path, leg.gear, 0.0):
@@ -328,7 +328,7 @@ def test_no_wheel_is_driven_over_doubtful_ground_that_can_be_gone_round() -> Non
         assert footing.gaps(x, y, np.full(50, piece.heading)).caution.max() < DOUBT_WEIGHT / PARTS
     # where there is no room to go round, it is driven over
     risk = np.where(np.abs(X) > 0.075, np.uint8(HAZARDOUS), free)
-    between = plan_leg(Footing.of(risk, None, LATTICE, ROVER, doubted=doubted), AT, GOAL, P)
+    between = plan_leg(Footing.of(Hazards(risk), LATTICE, ROVER, Known(doubted=doubted)), AT, GOAL, P)
     assert between.path[-1, 1] > 0.15
 
 
@@ -342,7 +342,8 @@ def test_at_the_rim_of_what_is_near_only_what_is_clearly_free_from_afar_counts(c
     (classes, _, found), known = seen_so_far(near, seen(SAFE, 0, chance), P)
     assert (classes == kind).all()
     assert found == pytest.approx(0.45 if kind == HAZARDOUS else chance)
-    assert not known["unknown"].any()
+    assert known.unknown is not None
+    assert not known.unknown.any()
 
 
 def test_unknown_ground_beside_the_vehicle_is_the_last_way_that_is_tried() -> None:
@@ -360,7 +361,7 @@ def test_ground_seen_from_afar_alone_is_planned_over_rather_than_unseen_one_and_
     free = np.full(LATTICE.shape, SAFE, np.uint8)
 
     def planned(risk: np.ndarray, p: LegParams = SEEN) -> Leg:
-        footing = Footing.of(risk, None, LATTICE, ROVER, unknown=unknown, glanced=glanced)
+        footing = Footing.of(Hazards(risk), LATTICE, ROVER, Known(unknown, glanced))
         return plan_leg(footing, AT, GOAL, p)
 
     leg = planned(free)
@@ -390,7 +391,7 @@ def test_where_it_stands_it_may_be_half_a_cell_farther_too(seed: int, heading: f
     row, col = (round(v) for v in LATTICE.index(START))
     at = rng.integers(-8, 9, (6, 2)) + np.array([row, col])
     risk[at[:, 0], at[:, 1]] = UNKNOWN
-    there = Ground(Footing.of(risk, None, LATTICE, ROVER), START, heading, P)
+    there = Ground(Footing.of(Hazards(risk), LATTICE, ROVER), START, heading, P)
     assert there.clear(*(np.array([v]) for v in (dx * LATTICE.cell, dy * LATTICE.cell, heading)))
 
 
@@ -403,11 +404,11 @@ def test_hazards_to_the_whole_vehicle_count_at_its_middle_alone() -> None:
     gaps = {}
     for name in ("step", "tilt"):
         reason[60, 40] = REASONS[name]
-        gaps[name] = float(Footing.of(risk, reason, LATTICE, ROVER).gaps(x, y, ahead).gap[0])
+        gaps[name] = float(Footing.of(Hazards(risk, reason), LATTICE, ROVER).gaps(x, y, ahead).gap[0])
     assert gaps["tilt"] == pytest.approx(0.1)
     assert gaps["step"] == pytest.approx(math.hypot(0.1 - 0.04, 0.05))
     reason[60, 40] |= REASONS["uncertain"]
-    doubtful = Footing.of(risk, reason, LATTICE, ROVER).gaps(x, y, ahead)
+    doubtful = Footing.of(Hazards(risk, reason), LATTICE, ROVER).gaps(x, y, ahead)
     assert doubtful.doubtful[0] == pytest.approx(0.1)
     assert doubtful.gap[0] == doubtful.proven[0] == np.inf
 
@@ -416,7 +417,7 @@ def test_uncertain_ground_is_planned_over_and_not_driven_on() -> None:
     risk, reason = np.full(LATTICE.shape, SAFE, np.uint8), np.zeros(LATTICE.shape, np.uint16)
     wall = np.abs(Y - 0.2) < 0.02
     risk[wall], reason[wall] = HAZARDOUS, REASONS["step"] | REASONS["uncertain"]
-    leg = plan_leg(Footing.of(risk, reason, LATTICE, ROVER), AT, GOAL, SEEN)
+    leg = plan_leg(Footing.of(Hazards(risk, reason), LATTICE, ROVER), AT, GOAL, SEEN)
     assert leg.verdict == "drive"
     assert leg.path[-1, 1] <= 0.18 - 0.5 * ROVER.wheel_base + LATTICE.cell
     assert leg.way[-1, 1] > 0.75
@@ -500,7 +501,7 @@ def test_what_was_seen_from_near_and_stays_doubtful_is_not_looked_at_from_farthe
     unseen[0][band] = UNKNOWN
     doubtful[0][band], doubtful[1][band] = HAZARDOUS, REASONS["step"] | REASONS["uncertain"]
     back, closed = (
-        plan_leg(Footing.of(*maps, LATTICE, ROVER), AT, GOAL, P, view=CAMERAS) for maps in (unseen, doubtful)
+        plan_leg(Footing.of(Hazards(*maps), LATTICE, ROVER), AT, GOAL, P, view=CAMERAS) for maps in (unseen, doubtful)
     )
     assert (back.verdict, back.gear.tolist()) == ("look", [-1])
     assert closed.verdict == "closed"

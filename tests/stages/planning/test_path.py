@@ -120,8 +120,8 @@ def test_ground_that_may_be_a_hazard_is_gone_round(chance: float, crossed: bool)
     lattice = Lattice.at(-30, 60, CELL, 61, 61)
     given = maps(*level(lattice)) | {"p_hazard": np.zeros(lattice.shape, dtype=np.float32)}
     given["p_hazard"][25:36, 24:37] = chance
-    ends = {"start": (0.0, 0.1), "target": (0.0, 0.5)}
-    route = find_path(given, lattice, SHORT, **ends, params=PathParams(doubt=20.0))
+    ends = ((0.0, 0.1), (0.0, 0.5))
+    route = find_path(given, lattice, SHORT, ends=ends, params=PathParams(doubt=20.0))
     assert bool((given["p_hazard"][route.cells[:, 0], route.cells[:, 1]] == np.float32(chance)).all()) == crossed
     assert len(route.cells) > 30
 
@@ -130,13 +130,13 @@ def test_ground_that_is_probably_a_hazard_closes_the_way() -> None:
     lattice = Lattice.at(-30, 60, CELL, 61, 61)
     given = maps(*level(lattice)) | {"p_hazard": np.zeros(lattice.shape, dtype=np.float32)}
     given["p_hazard"][30] = 0.2
-    ends = {"start": (0.0, 0.1), "target": (0.0, 0.5)}
-    closed = find_path(given, lattice, SHORT, **ends)
+    ends = ((0.0, 0.1), (0.0, 0.5))
+    closed = find_path(given, lattice, SHORT, ends=ends)
     assert not len(closed.cells)
     assert "above path.sure 0.1 closes every way; without it one leads over ground of up to 0.2:" in closed.plan.reason
-    assert len(find_path(given, lattice, SHORT, **ends, params=PathParams(sure=0.2)).cells) > 30
+    assert len(find_path(given, lattice, SHORT, ends=ends, params=PathParams(sure=0.2)).cells) > 30
     given["risk"][30] = HAZARDOUS  # then it is not for what may be hazardous
-    assert find_path(given, lattice, SHORT, **ends).doubt is None
+    assert find_path(given, lattice, SHORT, ends=ends).doubt is None
 
 
 def test_ground_that_is_probably_a_hazard_everywhere_is_a_warning_with_the_figure() -> None:
@@ -151,25 +151,25 @@ def test_ground_that_is_probably_a_hazard_everywhere_is_a_warning_with_the_figur
 def test_from_start_to_target_in_metres() -> None:
     lattice = Lattice.at(-50, 50, CELL, 101, 101)
     given = maps(*level(lattice))
-    xyz = find_path(given, lattice, SHORT, start=(-0.3, -0.2), target=(0.3, 0.25)).xyz
+    xyz = find_path(given, lattice, SHORT, ends=((-0.3, -0.2), (0.3, 0.25))).xyz
     # ends are moved to the centres of their cells on the turned grid: half a diagonal
     assert np.hypot(*(xyz[0, :2] - [-0.3, -0.2])) < 0.71 * CELL
     assert np.hypot(*(xyz[-1, :2] - [0.3, 0.25])) < 0.71 * CELL
     assert (np.hypot(*np.diff(xyz[:, :2], axis=0).T)).sum() == pytest.approx(0.75, abs=2 * CELL)
     with raises("RIL-406", "path.target", "-0.505"):
-        find_path(given, lattice, SHORT, start=(-0.3, -0.2), target=(2.0, 0.0))
+        find_path(given, lattice, SHORT, ends=((-0.3, -0.2), (2.0, 0.0)))
     with raises("RIL-434"):
-        find_path(given, lattice, SHORT, start=(0.1, 0.1), target=(0.1, 0.1))
+        find_path(given, lattice, SHORT, ends=((0.1, 0.1), (0.1, 0.1)))
 
 
 def test_behind_a_wall_rows_fail_and_grid8_goes_round() -> None:
     lattice = Lattice.at(-30, 60, CELL, 61, 61)
     risk, z = level(lattice)
     risk[20, 8:53] = risk[20:45, 8] = risk[20:45, 52] = HAZARDOUS  # a cup that opens to the near side
-    ends = {"start": (0.0, 0.25), "target": (0.0, 0.55)}
-    by_rows = find_path(maps(risk, z), lattice, SHORT, **ends, params=PathParams(planner="rows"))
+    ends = ((0.0, 0.25), (0.0, 0.55))
+    by_rows = find_path(maps(risk, z), lattice, SHORT, ends=ends, params=PathParams(planner="rows"))
     assert len(by_rows.xyz) == 0
-    route = find_path(maps(risk, z), lattice, SHORT, **ends)
+    route = find_path(maps(risk, z), lattice, SHORT, ends=ends)
     assert route.planner == "grid8"
     np.testing.assert_allclose(route.xyz[[0, -1], :2], [[0.0, 0.25], [0.0, 0.55]], atol=1e-9)
     assert np.diff(route.xyz[:, 1]).min() < 0  # it goes back
@@ -212,7 +212,7 @@ def test_a_start_that_cannot_be_stood_on_is_refused_with_the_figure(kind: int, e
     risk[30:39, 15:26] = kind
     given = maps(risk, z) | {"step": np.full(lattice.shape, 0.02, dtype=np.float32)}
     with raises(*expected):
-        find_path(given, lattice, SHORT, start=(0.0, 0.06))
+        find_path(given, lattice, SHORT, ends=((0.0, 0.06), None))
 
 
 def test_a_vehicle_wider_than_the_map_is_refused() -> None:

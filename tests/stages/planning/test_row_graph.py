@@ -144,18 +144,18 @@ def test_a_closed_row_of_a_small_map_is_not_excused_by_the_vehicles_length() -> 
 
 def test_given_ends() -> None:
     flat, free = np.zeros((12, 12), dtype=np.int64), np.ones((12, 12), dtype=bool)
-    found = plan(flat, free, start=(10, 1), target=(2, 8))
+    found = plan(flat, free, ends=((10, 1), (2, 8)))
     np.testing.assert_array_equal(found.cells[[0, -1]], [[10, 1], [2, 8]])
-    assert "not ahead" in plan(flat, free, start=(2, 1), target=(10, 1)).reason
+    assert "not ahead" in plan(flat, free, ends=((2, 1), (10, 1))).reason
     free[10, 1] = False
-    refused = plan(flat, free, start=(10, 1))
+    refused = plan(flat, free, ends=((10, 1), None))
     assert (refused.blocking_row, refused.reason) == (10, "the start is not a free cell")
     assert plan(flat, np.zeros_like(free)).reason == "there is no free cell"
 
 
 def test_a_target_out_of_the_fan_of_the_start_is_not_reached() -> None:
     free = np.ones((6, 20), dtype=bool)
-    found = plan(np.zeros((6, 20), dtype=np.int64), free, start=(5, 0), target=(0, 6))
+    found = plan(np.zeros((6, 20), dtype=np.int64), free, ends=((5, 0), (0, 6)))
     assert len(found.cells) == 0
 
 

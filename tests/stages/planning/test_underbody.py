@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.risk import SAFE, UNKNOWN
 from rille.stages.hazard.vehicle import Vehicle
-from rille.stages.planning.local_planner.clearance import Footing
+from rille.stages.planning.local_planner.clearance import Footing, Hazards
 from rille.stages.terrain.occlusion_bounds import Bounds
 
 ROVER = Vehicle(
@@ -28,7 +28,7 @@ def footing(hidden: np.ndarray, upper: np.ndarray, ground: np.ndarray | float = 
     bounds = Bounds(
         np.where(hidden, upper, ground).astype(np.float32), np.where(hidden, np.nan, ground).astype(np.float32)
     )
-    return Footing.of(risk, None, LATTICE, ROVER, bounds=bounds)
+    return Footing.of(Hazards(risk), LATTICE, ROVER, bounds=bounds)
 
 
 def unknown(risk: Footing, x: float = 0.0, y: float = 0.0, heading: float = 0.0) -> float:
@@ -43,7 +43,7 @@ def test_a_spot_that_cannot_be_too_high_may_be_under_the_belly(heading: float) -
     void = footing(np.hypot(X, Y) < 0.025, np.full(LATTICE.shape, np.nan))
     assert unknown(void, heading=heading) <= 0
     assert float(void.gaps(*(np.array([v]) for v in (0.0, 0.0, heading))).frontier[0]) <= 0
-    assert unknown(Footing.of(np.where(SPOT, UNKNOWN, SAFE).astype(np.uint8), None, LATTICE, ROVER)) <= 0
+    assert unknown(Footing.of(Hazards(np.where(SPOT, UNKNOWN, SAFE).astype(np.uint8)), LATTICE, ROVER)) <= 0
 
 
 def test_the_clearance_is_over_the_plane_of_the_wheels() -> None:
