@@ -116,15 +116,15 @@ def _of_files(name_or_path: str, digests: Digests) -> Sequence:
     path, number = _split(name_or_path)
     if path.is_file() and path.suffix == ".toml":
         return open_manifest(path, digests)
-    if not path.is_dir():
-        raise InputError("RIL-276", f"no sequence {name_or_path!r}", remedy=_suggestion(name_or_path))
-    manifest = folder_manifest(path) if number is None else None
+    manifest = folder_manifest(path) if number is None and path.is_dir() else None
     if manifest is not None:
         return open_manifest(manifest, digests)
     for module in layouts():
         sequence: Sequence | None = module.open_layout(path, number, digests)
         if sequence is not None:
             return sequence
+    if not path.is_dir():
+        raise InputError("RIL-276", f"no sequence {name_or_path!r}", remedy=_suggestion(name_or_path))
     known = "; or ".join(f"{form}: {words}" for form, words in forms())
     raise InputError(
         "RIL-277",

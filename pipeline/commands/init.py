@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+from rille.datasets.bags import is_bag
 from rille.datasets.inspection import Findings, inspect
 from rille.datasets.manifest.text import counted, manifest_text, needs
 from rille.datasets.registry import hindrance
@@ -31,10 +32,12 @@ def init(directory: Path, output: Path | None = None, force: bool = False) -> in
         The folder holds no stereo images, or the file cannot be written.
     """
     hindered = hindrance(directory.absolute())  # never a built-in sequence of the same name
-    if output is None and not force and directory.is_dir() and hindered is None:
+    if output is None and not force and (directory.is_dir() or is_bag(directory)) and hindered is None:
         print(f"{directory} opens as it is; --output or --force writes a manifest nevertheless")
         print(f"\nnext:\n  rille check {directory}\n  rille reconstruct {directory}")
         return COMPLETE
+    if is_bag(directory) and hindered is not None:
+        raise hindered
     name = f"{derived_name(directory.resolve().name)}.rille.toml"
     found = inspect(directory)
     path = output if output is not None else Path(name)

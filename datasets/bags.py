@@ -1,0 +1,303 @@
+"""ROS 1 and ROS 2 bags and mcap files with the images of two cameras and their ``camera_info``.
+
+Pairs are images of equal ``header.stamp``. Images of a topic with ``rect`` in its name are rectified: their camera is
+``P``; of others it is ``K`` with the distortion ``D``, and ``R`` and ``P`` of both cameras say how they stand to each
+other (REP 104 and ``sensor_msgs/msg/CameraInfo``). An IMU and wheel odometry count where ``/tf_static`` says how their
+frame stands to the left camera's: the IMU gives the vertical and rotations, odometry predicts.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rille.datasets.cameras import CalibratedCamera, opencv, rig_of
+from rille.datasets.cameras.fields import Fields
+from rille.datasets.images import bag
+from rille.datasets.images.files import Digests, check_size
+from rille.datasets.images.pairing import side_of
+from rille.datasets.imu import ImuRecord, Inertial, at_frames
+from rille.datasets.kitti import CAR, STREET
+from rille.datasets.poses import TimedPoses, interpolate
+from rille.datasets.protocol import CAMERAS, Sequence, Source
+from rille.datasets.text.names import derived_name
+from rille.datasets.text.times import seconds
+from rille.datasets.text.warning import warning
+from rille.stages.core.declare import NoParams
+from rille.stages.core.errors import InputError
+from rille.stages.geometry.geometry import RigidTransform
+
+FORMS = (
+    ("BAG", "ROS 1 or 2 bag or mcap (FILE.bag, FILE.mcap, folder with metadata.yaml): two image topics, camera_info"),
+    ("BAG:LEFT,RIGHT", "the same; LEFT and RIGHT name the image topics"),
+)
+"""What a user may give."""
+
+SUFFIXES = (".bag", ".mcap", ".db3")
+INFO, IMU, ODOMETRY = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/Imu", "nav_msgs/msg/Odometry"
+FRAMES = "/tf_static"
+
+LONGEST_GAP = 0.5
+"""s; odometry is interpolated over no longer gap."""
+
+
+@dataclass(frozen=True)
+class Taken:
+    """One image message: when it was recorded, its digest, and width, height and bits of its image."""
+
+    at: int
+    sha256: str
+    size: tuple[int, int, int]
+    frame: str
+
+
+def is_bag(path: Path) -> bool:
+    """Whether a path is called as bags are."""
+    return (path.is_file() and path.suffix in SUFFIXES) or (path / "metadata.yaml").is_file()
+
+
+def open_layout(path: Path, number: str | None, digests: Digests) -> Sequence | None:
+    """The sequence of a bag, or None where the path is none.
+
+    Raises
+    ------
+    InputError
+        The package that reads bags is missing, the bag cannot be read, holds no two image topics that belong together
+        or several, or lacks their ``camera_info``, or no two images have the same time.
+    """
+    return open_bag(path.resolve(), number) if is_bag(path) else None
+
+
+def open_bag(path: Path, topics: str | None = None) -> Sequence:
+    """The sequence of a bag; ``topics`` are those of the left and right images, with a comma between them."""
+    with bag.opened(path) as reader:
+        chosen = _topics(reader, path, topics)
+        taken = {c: _images(reader, path, topic) for c, topic in zip(CAMERAS, chosen, strict=True)}
+        cameras = [_camera(reader, path, topic) for topic in chosen]
+        stamps, warnings = _common(path, chosen, *taken.values())
+        size = taken["left"][stamps[0]].size
+        for camera, topic in zip(CAMERAS, chosen, strict=True):
+            for stamp in stamps:
+                check_size(taken[camera][stamp].size, size, f"image {stamp} of {topic} in {path}")
+        times, more = seconds(stamps, str(path), unit="ns")
+        frame = taken["left"][stamps[0]].frame
+        inertial, odometry, unused = _movement(reader, path, times, frame, cameras[0][1])
+    rig, lenses = rig_of(cameras[0][0], cameras[1][0], size[:2])
+
+    def image(number: int, camera: str) -> Source:
+        one = taken[camera][stamps[number]]
+        width, height, bits = one.size
+        args = {"sha256": one.sha256, "camera": camera, "frame": number}
+        args |= {"width": width, "height": height, "depth": bits}
+        module = "rille.datasets.images.bag16" if bits == 16 else "rille.datasets.images.bag"
+        topic = chosen[CAMERAS.index(camera)]
+        return Source(module, NoParams(), args, hints={"path": str(path), "topic": topic, "at": one.at})
+
+    return Sequence(
+        name=derived_name(path.stem),
+        rig=rig,
+        frames=len(stamps),
+        image=image,
+        frame_names=tuple(map(str, stamps)),
+        lenses=lenses,
+        times=times,
+        up=inertial.up if inertial is not None and any(inertial.up) else None,
+        attitude=inertial.attitude if inertial is not None and any(inertial.attitude) else None,
+        odometry=odometry,
+        defaults=STREET if rig.baseline >= CAR else {},
+        notes=inertial.notes if inertial is not None else (),
+        warnings=(*warnings, *more, *unused, *(inertial.warnings if inertial is not None else ())),
+    )
+
+
+# -- images ------------------------------------------------------------------------------------------------------------
+
+
+def _topics(reader: Any, path: Path, wanted: str | None) -> tuple[str, str]:
+    """Topics of the left and right images: rectified before raw ones, raw before compressed ones."""
+    kinds = {c.topic: c.msgtype for c in reader.connections}
+    images = sorted(topic for topic, kind in kinds.items() if kind in (bag.IMAGE, bag.COMPRESSED))
+    there = ", ".join(images) or "none"
+    if wanted is not None:
+        names = [name.strip() for name in wanted.split(",")]
+        if len(names) != 2 or not set(names) <= set(images):
+            raise InputError(
+                "RIL-945",
+                f"{path} has not the image topics {wanted!r}",
+                remedy=f"name two with a comma between them, left first; there are {there}",
+            )
+        return names[0], names[1]
+    pairs: dict[tuple[bool, bool, int, str], dict[int, str]] = {}
+    for topic in images:
+        found = side_of(topic)
+        if found is not None:
+            rank = (kinds[topic] == bag.COMPRESSED, "rect" not in topic)
+            pairs.setdefault((*rank, found[0], found[2]), {})[found[1]] = topic
+    whole = {key: sides for key, sides in pairs.items() if len(sides) == 2}
+    best = [sides for key, sides in whole.items() if key[:2] == min(whole)[:2]]
+    if len(best) != 1:
+        raise InputError(
+            "RIL-946",
+            f"{path} has {len(best) or 'no'} image topics that are left and right by name (images: {there})",
+            remedy=f"name them: {path}:LEFT,RIGHT",
+        )
+    return best[0][0], best[0][1]
+
+
+def _messages(reader: Any, topic: str) -> Iterator[tuple[int, bytes, Any]]:
+    """Time of recording (ns), bytes and content of each message of a topic."""
+    connections = [c for c in reader.connections if c.topic == topic]
+    for connection, at, data in reader.messages(connections) if connections else ():
+        yield at, data, reader.deserialize(data, connection.msgtype)
+
+
+def _stamp(message: Any) -> int:
+    return int(message.header.stamp.sec) * 10**9 + int(message.header.stamp.nanosec)
+
+
+def _images(reader: Any, path: Path, topic: str) -> dict[int, Taken]:
+    """Images of a topic by their stamp, ns."""
+    found: dict[int, Taken] = {}
+    for at, data, message in _messages(reader, topic):
+        stamp = _stamp(message)
+        size = bag.depth(message, f"image {stamp} of {topic} in {path}")
+        found[stamp] = Taken(at, hashlib.sha256(data).hexdigest(), size, message.header.frame_id)
+    return found
+
+
+def _common(
+    path: Path, topics: tuple[str, str], left: Mapping[int, Taken], right: Mapping[int, Taken]
+) -> tuple[list[int], list[str]]:
+    """Stamps that both cameras have, in order, and what is left out."""
+    common = sorted(set(left) & set(right))
+    if not common:
+        apart = min((abs(a - b) for a in left for b in right), default=None) if len(left) * len(right) < 10**7 else None
+        near = "" if apart is None else f"; the nearest are {apart / 1e6:.6g} ms apart"
+        raise InputError(
+            "RIL-947",
+            f"{path}: no image of {topics[0]} ({len(left)}) has the stamp of one of {topics[1]} ({len(right)}){near}",
+            remedy="both images of a pair need the same header.stamp: synchronise the cameras",
+        )
+    alone = len(left) + len(right) - 2 * len(common)
+    lines = [warning("RIL-948", f"{alone} images without a partner of the same stamp are left out")] if alone else []
+    return common, lines
+
+
+# -- cameras -----------------------------------------------------------------------------------------------------------
+
+
+def _camera(reader: Any, path: Path, topic: str) -> tuple[CalibratedCamera, np.ndarray]:
+    """Camera of an image topic by the ``camera_info`` beside it, and the rotation from its frame to the image's."""
+    place = topic.removesuffix("/compressed").rpartition("/")[0]
+    name = f"{place}/camera_info"
+    message = next((m for _, _, m in _messages(reader, name)), None)
+    if message is None:
+        there = sorted({c.topic for c in reader.connections if c.msgtype == INFO})
+        raise InputError(
+            "RIL-949",
+            f"{path} has no {name} for {topic} (camera_info: {', '.join(there) or 'none'})",
+            remedy="record the camera_info of both cameras beside their images",
+        )
+    given = {key.lower(): getattr(message, key) for key in dir(message) if key.lower() in ("k", "d", "r", "p")}
+    rectified = "rect" in topic
+    entries: dict[str, Any] = {
+        "image_width": message.width,
+        "image_height": message.height,
+        "projection_matrix": given["p"],
+        "camera_name": topic,
+    }
+    if rectified:
+        entries |= {"camera_matrix": np.reshape(given["p"], (3, 4))[:, :3], "rectification_matrix": np.eye(3)}
+    else:
+        entries |= {"camera_matrix": given["k"], "rectification_matrix": given["r"]}
+        entries |= {"distortion_model": message.distortion_model or "plumb_bob"}
+        entries |= {"distortion_coefficients": given["d"]} if len(given["d"]) else {}
+    fields = Fields(entries, f"{path} {name}")
+    turned = fields.rigid("R", np.reshape(given["r"], (3, 3)), np.zeros(3)).rotation if rectified else np.eye(3)
+    return opencv.single(fields, path)[0], turned
+
+
+# -- movement ----------------------------------------------------------------------------------------------------------
+
+
+def _movement(
+    reader: Any, path: Path, times: tuple[float, ...], frame: str, R_image_camera: np.ndarray
+) -> tuple[Inertial | None, tuple[RigidTransform | None, ...] | None, list[str]]:
+    """What IMU and odometry say of each frame, and what cannot be used."""
+    frames, warnings = _static(reader), list[str]()
+    T_camera_image = RigidTransform(R_image_camera.T, np.zeros(3))
+
+    def placed(kind: str, place: Any) -> tuple[str, list[Any], RigidTransform] | None:
+        """The only topic of a kind with its messages, and the left image's pose in its frame."""
+        topics = sorted({c.topic for c in reader.connections if c.msgtype == kind})
+        if not topics:
+            return None
+        messages = [m for _, _, m in _messages(reader, topics[0])]
+        if len(topics) > 1 or not messages:
+            warnings.append(warning("RIL-950", f"{path}: of {', '.join(topics)} none is used: one with messages is"))
+            return None
+        T_sensor_camera = _between(frames, place(messages[0]), frame)
+        if T_sensor_camera is None:
+            text = f"{path}: {FRAMES} does not say how {frame!r} stands in {place(messages[0])!r}: "
+            warnings.append(warning("RIL-951", f"{text}{topics[0]} is not used"))
+            return None
+        return topics[0], sorted(messages, key=_stamp), T_sensor_camera @ T_camera_image
+
+    inertial, odometry = None, None
+    found = placed(IMU, lambda m: m.header.frame_id)
+    if found is not None:
+        topic, messages, T_imu_left = found
+        rates, forces = (
+            np.array([[v.x, v.y, v.z] for v in (getattr(m, name) for m in messages)])
+            for name in ("angular_velocity", "linear_acceleration")
+        )
+        stamps, more = seconds([_stamp(m) for m in messages], f"{path} {topic}", unit="ns")
+        record = ImuRecord(np.array(stamps), rates, forces, topic, more)
+        inertial = at_frames(record, times, T_imu_left)
+        warnings += more
+    found = placed(ODOMETRY, lambda m: m.child_frame_id)
+    if found is not None:
+        topic, messages, T_base_left = found
+        stamps, more = seconds([_stamp(m) for m in messages], f"{path} {topic}", unit="ns")
+        timed = TimedPoses(stamps, tuple(_pose(m.pose.pose.position, m.pose.pose.orientation) for m in messages), topic)
+        between = interpolate(timed, times, LONGEST_GAP)
+        odometry = tuple(None if T is None else T @ T_base_left for T in between)
+        warnings += more
+    return inertial, odometry, warnings
+
+
+def _static(reader: Any) -> dict[str, dict[str, RigidTransform]]:
+    """Fixed transforms, ``T_a_b`` at ``[a][b]``, of ``/tf_static``."""
+    found: dict[str, dict[str, RigidTransform]] = {}
+    for _, _, message in _messages(reader, FRAMES):
+        for one in message.transforms:
+            parent, child = one.header.frame_id.lstrip("/"), one.child_frame_id.lstrip("/")
+            T_parent_child = _pose(one.transform.translation, one.transform.rotation)
+            found.setdefault(parent, {})[child] = T_parent_child
+            found.setdefault(child, {})[parent] = T_parent_child.inverse()
+    return found
+
+
+def _between(frames: Mapping[str, Mapping[str, RigidTransform]], a: str, b: str) -> RigidTransform | None:
+    """``T_a_b`` along fixed transforms; None where none leads there."""
+    a, b = a.lstrip("/"), b.lstrip("/")
+    known = {a: RigidTransform.identity()}
+    todo = [a]
+    for one in todo:
+        for other, T in frames.get(one, {}).items():
+            if other not in known:
+                known[other] = known[one] @ T
+                todo.append(other)
+    return known.get(b)
+
+
+def _pose(position: Any, turn: Any) -> RigidTransform:
+    from scipy.spatial.transform import Rotation
+
+    rotation = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]).as_matrix()
+    return RigidTransform(rotation, np.array([position.x, position.y, position.z]))

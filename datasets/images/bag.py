@@ -1,0 +1,138 @@
+"""Stage ``image`` for images in ROS bags: one message, checked and grey. And how bags are opened."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from rille.datasets.images import files
+from rille.datasets.images.files import Grey
+from rille.stages.core.declare import Bundle, Inputs, NoParams
+from rille.stages.core.errors import InputError, RilleError
+
+COMPRESSED = "sensor_msgs/msg/CompressedImage"
+IMAGE = "sensor_msgs/msg/Image"
+
+LAYOUTS: Mapping[str, tuple[int, int, int | None]] = {
+    "mono8": (1, 8, None),
+    "8UC1": (1, 8, None),
+    "mono16": (1, 16, None),
+    "16UC1": (1, 16, None),
+    "rgb8": (3, 8, cv2.COLOR_RGB2GRAY),
+    "bgr8": (3, 8, cv2.COLOR_BGR2GRAY),
+    "8UC3": (3, 8, cv2.COLOR_BGR2GRAY),
+    "rgba8": (4, 8, cv2.COLOR_RGBA2GRAY),
+    "bgra8": (4, 8, cv2.COLOR_BGRA2GRAY),
+    "bayer_rggb8": (1, 8, cv2.COLOR_BayerRGGB2GRAY),
+    "bayer_bggr8": (1, 8, cv2.COLOR_BayerBGGR2GRAY),
+    "bayer_gbrg8": (1, 8, cv2.COLOR_BayerGBRG2GRAY),
+    "bayer_grbg8": (1, 8, cv2.COLOR_BayerGRBG2GRAY),
+}
+"""Samples a pixel, bits a sample and OpenCV's conversion to grey, by the encoding of ``sensor_msgs/msg/Image``."""
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[Any]:
+    """The reader of a ROS 1 or ROS 2 bag or of an mcap file (``rosbags.highlevel.AnyReader``).
+
+    Raises
+    ------
+    InputError
+        The package is not installed, or the bag cannot be read, now or while it is open.
+    """
+    try:
+        from rosbags.highlevel import AnyReader
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError as error:
+        raise InputError(
+            "RIL-940", f"{path}: bags are read by the package rosbags", remedy="pip install 'rille[robots]'"
+        ) from error
+    try:
+        # bags of ROS 2 before Iron hold no definitions of their messages
+        with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
+            yield reader
+    except RilleError:
+        raise
+    except Exception as error:  # of a damaged bag: whatever the parsers of five formats come upon
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise InputError(
+            "RIL-941", f"{path} cannot be read as a bag: {reason}", remedy="record or copy it again"
+        ) from error
+
+
+def depth(message: Any, name: str) -> tuple[int, int, int]:
+    """Width, height and bits of the image of a message."""
+    if hasattr(message, "format"):
+        found = files.decode(bytes(message.data), name)
+        return found.shape[1], found.shape[0], found.dtype.itemsize * 8
+    return int(message.width), int(message.height), _layout(message, name)[1]
+
+
+def grey_of(message: Any, name: str, wanted: tuple[int, int, int]) -> Grey:
+    """Grey image (row, col), uint8 or uint16, of a message.
+
+    Parameters
+    ----------
+    message : ``sensor_msgs/msg/Image`` or ``CompressedImage``.
+    name : what to call it in an error.
+    wanted : width, height and bits that it must have.
+
+    Raises
+    ------
+    InputError
+        Its encoding is not known, it does not decode, or its size differs.
+    """
+    if hasattr(message, "format"):
+        return files.decode(bytes(message.data), name, wanted)
+    samples, bits, conversion = _layout(message, name)
+    rows, columns, step = int(message.height), int(message.width), int(message.step)
+    files.check_size((columns, rows, bits), wanted, name)
+    width = columns * samples * bits // 8
+    data = np.frombuffer(bytes(message.data), np.uint8)
+    if step < width or len(data) < rows * step:
+        raise InputError(
+            "RIL-942",
+            f"{name} has {len(data)} bytes in rows of {step}, {columns} x {rows} pixels need rows of {width}",
+            remedy=files.COPY_AGAIN,
+        )
+    pixels = np.ascontiguousarray(data[: rows * step].reshape(rows, step)[:, :width])
+    if bits == 16:
+        return np.ascontiguousarray(pixels.view(">u2" if message.is_bigendian else "<u2"), dtype=np.uint16)
+    image = pixels.reshape(rows, columns, samples) if samples > 1 else pixels
+    return image if conversion is None else np.asarray(cv2.cvtColor(image, conversion), np.uint8)
+
+
+def _layout(message: Any, name: str) -> tuple[int, int, int | None]:
+    if message.encoding not in LAYOUTS:
+        raise InputError(
+            "RIL-943",
+            f"{name} has the encoding {str(message.encoding)[:40]!r}",
+            remedy=f"record one of {', '.join(LAYOUTS)}, or compressed PNG or JPEG",
+        )
+    return LAYOUTS[message.encoding]
+
+
+def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+    name = f"frame {args['frame']}, {args['camera']} image of {args['path']}"
+    with opened(Path(args["path"])) as reader:
+        there = [c for c in reader.connections if c.topic == args["topic"]]
+        at = int(args["at"])
+        for connection, _, data in reader.messages(there, start=at, stop=at + 1) if there else ():
+            if hashlib.sha256(data).hexdigest() == args["sha256"]:
+                message = reader.deserialize(data, connection.msgtype)
+                break
+        else:
+            raise InputError("RIL-944", f"{name} has changed since the run began", remedy="run the same command again")
+    image = grey_of(message, name, (args["width"], args["height"], args["depth"]))
+    meta = {"frame": args["frame"], "camera": args["camera"]}
+    return Bundle({"image": image, "valid": np.ones(image.shape, np.uint8)}, meta)
+
+
+STAGE = replace(files.STAGE, summary="one image of a bag, checked and grey", run=_run)

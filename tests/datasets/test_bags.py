@@ -1,0 +1,285 @@
+"""ROS bags: written with rosbags in every form, and opened like the folder of the same images."""
+
+from __future__ import annotations
+
+import sys
+from importlib import import_module
+
+import cv2
+import numpy as np
+import pytest
+from raising import raises
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Writer2
+from rosbags.typesys import Stores, get_typestore
+from scipy.spatial.transform import Rotation
+
+import rille
+from rille.datasets.registry import open_sequence
+from rille.pipeline.cli import main
+from rille.stages.geometry.geometry import RigidTransform
+
+START, STEP = 1_700_000_000_000_000_000, 100_000_000
+LEFT, RIGHT = "/stereo/left/image_rect", "/stereo/right/image_rect"
+P = [50.0, 0.0, 31.0, 0.0, 0.0, 51.0, 24.0, 0.0, 0.0, 0.0, 1.0, 0.0]
+FORMS = ("bag", "sqlite", "mcap", "mcap-file")
+
+
+class Bag:
+    """Messages by topic, and how they are written."""
+
+    def __init__(self, form="mcap-file"):
+        self.form, self.rows = form, []
+        self.store = get_typestore(Stores.ROS1_NOETIC if form == "bag" else Stores.ROS2_HUMBLE)
+
+    def make(self, name, **fields):
+        kind = self.store.types[name]
+        if "seq" in kind.__dataclass_fields__:  # headers of ROS 1
+            fields |= {"seq": 0}
+        return kind(**fields)
+
+    def header(self, stamp, frame="camera"):
+        time = self.make("builtin_interfaces/msg/Time", sec=stamp // 10**9, nanosec=stamp % 10**9)
+        return self.make("std_msgs/msg/Header", stamp=time, frame_id=frame)
+
+    def add(self, topic, stamp, message):
+        self.rows.append((topic, stamp, message))
+
+    def image(self, topic, stamp, pixels, encoding="mono8", pad=0):
+        padded = np.pad(pixels.reshape(len(pixels), -1), ((0, 0), (0, pad)))
+        data = np.frombuffer(padded.tobytes(), np.uint8)
+        sizes = {"height": pixels.shape[0], "width": pixels.shape[1], "step": padded.strides[0]}
+        fields = {"header": self.header(stamp), "encoding": encoding, "is_bigendian": 0, "data": data, **sizes}
+        self.add(topic, stamp, self.make("sensor_msgs/msg/Image", **fields))
+
+    def compressed(self, topic, stamp, data):
+        fields = {"header": self.header(stamp), "format": "mono8; png compressed"}
+        message = self.make("sensor_msgs/msg/CompressedImage", data=np.frombuffer(data, np.uint8), **fields)
+        self.add(topic, stamp, message)
+
+    def info(self, topic, size, p, k=None, d=(), r=None):
+        none = {"x_offset": 0, "y_offset": 0, "height": 0, "width": 0, "do_rectify": False}
+        matrices = {"K": np.reshape(p, (3, 4))[:, :3].ravel() if k is None else k, "D": d, "P": p}
+        matrices |= {"R": np.eye(3).ravel() if r is None else r}
+        numbers = {n if self.form == "bag" else n.lower(): np.array(v, float) for n, v in matrices.items()}
+        whole = {"height": size[1], "width": size[0], "distortion_model": "plumb_bob", "binning_x": 0, "binning_y": 0}
+        roi = self.make("sensor_msgs/msg/RegionOfInterest", **none)
+        header = self.header(START)
+        self.add(topic, START, self.make("sensor_msgs/msg/CameraInfo", header=header, roi=roi, **whole, **numbers))
+
+    def vector(self, values, name="geometry_msgs/msg/Vector3"):
+        return self.make(name, **dict(zip("xyzw", map(float, values), strict=False)))
+
+    def fixed(self, parent, child, T):
+        quaternion = self.vector(Rotation.from_matrix(T.rotation).as_quat(), "geometry_msgs/msg/Quaternion")
+        move = self.make("geometry_msgs/msg/Transform", translation=self.vector(T.translation), rotation=quaternion)
+        one = {"header": self.header(START, parent), "child_frame_id": child, "transform": move}
+        stamped = self.make("geometry_msgs/msg/TransformStamped", **one)
+        self.add("/tf_static", START, self.make("tf2_msgs/msg/TFMessage", transforms=[stamped]))
+
+    def write(self, folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        path = folder / ("drive.bag" if self.form == "bag" else "drive")
+        plugin = StoragePlugin.SQLITE3 if self.form == "sqlite" else StoragePlugin.MCAP
+        writer = Writer1(path) if self.form == "bag" else Writer2(path, version=9, storage_plugin=plugin)
+        with writer:
+            topics = {}
+            for topic, stamp, message in self.rows:
+                kind = message.__msgtype__
+                if topic not in topics:
+                    topics[topic] = writer.add_connection(topic, kind, typestore=self.store)
+                dump = self.store.serialize_ros1 if self.form == "bag" else self.store.serialize_cdr
+                writer.write(topics[topic], stamp + 7_000_000, dump(message, kind))
+        return next(path.glob("*.mcap")) if self.form == "mcap-file" else path
+
+
+def picture(k, side, dtype=np.uint8):
+    return np.random.default_rng(2 * k + side).integers(0, np.iinfo(dtype).max, (48, 64), dtype)
+
+
+def street(form="mcap-file", frames=3, lag=0, infos=True, dtype=np.uint8):
+    bag = Bag(form)
+    if infos:
+        right = [*P]
+        right[3] = -50.0 * 0.5
+        bag.info("/stereo/left/camera_info", (64, 48), P)
+        bag.info("/stereo/right/camera_info", (64, 48), right)
+    for k in range(frames):
+        for side, topic in enumerate((LEFT, RIGHT)):
+            encoding = "mono16" if dtype == np.uint16 else "mono8"
+            bag.image(topic, START + k * STEP + side * lag, picture(k, side, dtype), encoding, pad=4)
+    return bag
+
+
+def pixels(sequence, frame, camera):
+    source = sequence.image(frame, camera)
+    stage = import_module(source.module).STAGE
+    return np.asarray(stage.run(source.params, {**source.args, **source.hints}, {})["image"])
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_rectified_pairs_come_back_as_they_were_written(tmp_path, form):
+    sequence = open_sequence(str(street(form).write(tmp_path)))
+    assert sequence.frames == 3
+    assert sequence.times == pytest.approx([1.7e9, 1.7e9 + 0.1, 1.7e9 + 0.2])
+    assert sequence.rig.baseline == pytest.approx(0.5)
+    assert sequence.rig.T_right_left.translation[0] == pytest.approx(-0.5)
+    assert (sequence.rig.left.fx, sequence.rig.left.cy, sequence.lenses) == (50.0, 24.0, None)
+    for k in range(3):
+        assert (pixels(sequence, k, "left") == picture(k, 0)).all()
+        assert (pixels(sequence, k, "right") == picture(k, 1)).all()
+
+
+def test_raw_images_have_lenses_and_the_rectification_says_how_the_cameras_stand(tmp_path):
+    R_left, R_right = (Rotation.from_rotvec(v).as_matrix() for v in ([0.01, -0.02, 0.005], [-0.01, 0.015, 0.0]))
+    bag, d = Bag(), [-0.3, 0.1, 0.001, -0.002, 0.0]
+    right = [*P]
+    right[3] = -25.0
+    for name, R, p in (("left", R_left, P), ("right", R_right, right)):
+        bag.info(f"/{name}/camera_info", (64, 48), p, [55, 0, 30, 0, 56, 25, 0, 0, 1], d, R.ravel())
+        bag.image(f"/{name}/image_raw", START, picture(0, name == "right"))
+    sequence = open_sequence(str(bag.write(tmp_path)))
+    assert sequence.lenses["left"].coefficients == pytest.approx(d)
+    assert sequence.rig.left.fx == 55.0
+    point = np.array([0.3, -0.2, 4.0])  # in the left camera; rectified, the right one sees it half a metre further left
+    expected = R_right.T @ (R_left @ point - [0.5, 0, 0])
+    assert sequence.rig.T_right_left.apply(point) == pytest.approx(expected)
+
+
+def test_colour_depth_and_compression(tmp_path):
+    deep = open_sequence(str(street(dtype=np.uint16).write(tmp_path / "deep")))
+    assert (pixels(deep, 1, "right") == picture(1, 1, np.uint16)).all()
+    bag = street(frames=0)
+    colour = np.dstack([picture(k, 0) for k in range(3)])
+    bag.image(LEFT, START, colour, "rgb8")
+    bag.image(RIGHT, START, colour[:, :, ::-1].copy(), "bgr8")
+    mixed = open_sequence(str(bag.write(tmp_path / "colour")))
+    grey = colour @ [0.299, 0.587, 0.114]
+    for camera in ("left", "right"):
+        assert np.abs(pixels(mixed, 0, camera) - grey).max() < 1
+    bag = street(frames=0)
+    for side, topic in enumerate((LEFT, RIGHT)):
+        bag.compressed(f"{topic}/compressed", START, cv2.imencode(".png", picture(0, side))[1].tobytes())
+    packed = open_sequence(str(bag.write(tmp_path / "packed")))
+    assert (pixels(packed, 0, "right") == picture(0, 1)).all()
+
+
+def test_imu_and_odometry_count_where_tf_static_places_them(tmp_path):
+    T_base_camera = RigidTransform([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [0.4, 0.1, 0.8])
+    T_base_imu = RigidTransform(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 0.2])
+    bag = street(frames=3)
+    bag.fixed("base", "camera", T_base_camera)
+    bag.fixed("base", "imu", T_base_imu)
+    zeros = np.zeros(9)
+    for k in range(-300, 321):
+        stamp = START + k * 10_000_000
+        up = {"angular_velocity": bag.vector([0, 0, 0]), "linear_acceleration": bag.vector([0, 0, -9.81])}
+        none = {f"{name}_covariance": zeros for name in ("orientation", *up)}
+        level = bag.vector([0, 0, 0, 1], "geometry_msgs/msg/Quaternion")
+        header = bag.header(stamp, "imu")
+        bag.add("/imu", stamp, bag.make("sensor_msgs/msg/Imu", header=header, orientation=level, **up, **none))
+        at = bag.make(
+            "geometry_msgs/msg/Pose",
+            position=bag.vector([k * 0.01, 0, 0], "geometry_msgs/msg/Point"),
+            orientation=level,
+        )
+        still = bag.make("geometry_msgs/msg/Twist", linear=bag.vector([1, 0, 0]), angular=bag.vector([0, 0, 0]))
+        pose = bag.make("geometry_msgs/msg/PoseWithCovariance", pose=at, covariance=np.zeros(36))
+        twist = bag.make("geometry_msgs/msg/TwistWithCovariance", twist=still, covariance=np.zeros(36))
+        fields = {"header": bag.header(stamp, "odom"), "child_frame_id": "base", "pose": pose, "twist": twist}
+        bag.add("/odom", stamp, bag.make("nav_msgs/msg/Odometry", **fields))
+    bag.rows.sort(key=lambda row: row[1])
+    sequence = open_sequence(str(bag.write(tmp_path)))
+    assert sequence.up[1] == pytest.approx((0.0, -1.0, 0.0), abs=1e-9)  # down is y of an optical frame
+    assert sequence.odometry[2].translation == pytest.approx([0.2 + 0.4, 0.1, 0.8])
+    assert sequence.odometry[2].rotation == pytest.approx(T_base_camera.rotation)
+    assert sequence.attitude[0] is not None
+    lone = street(frames=2)
+    lone.add("/imu", START, next(m for topic, _, m in bag.rows if topic == "/imu"))
+    assert any("RIL-951" in line for line in open_sequence(str(lone.write(tmp_path / "lone"))).warnings)
+
+
+def test_topics_are_named_where_names_do_not_tell(tmp_path):
+    bag = street()
+    bag.rows = [(topic.replace("right", "other"), stamp, message) for topic, stamp, message in bag.rows]
+    path = bag.write(tmp_path)
+    with raises("RIL-946", LEFT, "/stereo/other/image_rect"):
+        open_sequence(str(path))
+    assert open_sequence(f"{path}:{LEFT},/stereo/other/image_rect").frames == 3
+    with raises("RIL-945", "/nowhere"):
+        open_sequence(f"{path}:{LEFT},/nowhere")
+
+
+def test_what_a_bag_lacks_is_one_line(tmp_path, monkeypatch):
+    with raises("RIL-947", "3 ms apart"):
+        open_sequence(str(street(lag=3_000_000).write(tmp_path / "lag")))
+    with raises("RIL-949", "/stereo/left/camera_info"):
+        open_sequence(str(street(infos=False).write(tmp_path / "infos")))
+    bag = street(frames=0)
+    for topic in (LEFT, RIGHT):
+        bag.compressed(f"{topic}/compressed", START, b"\x89PNG, and nothing more")
+    with raises("RIL-171", "/compressed"):
+        open_sequence(str(bag.write(tmp_path / "packed")))
+    bag = street(frames=0)
+    for topic in (LEFT, RIGHT):
+        bag.image(topic, START, picture(0, 0), "yuv422")
+    with raises("RIL-943", "yuv422"):
+        open_sequence(str(bag.write(tmp_path / "yuv")))
+    sequence = street(frames=2).write(tmp_path / "half")
+    sequence.write_bytes(sequence.read_bytes()[:2000])
+    with raises("RIL-941", "drive"):
+        open_sequence(str(sequence))
+    path = street().write(tmp_path / "sound")
+    monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
+    with raises("RIL-940", "rille[robots]"):
+        open_sequence(str(path))
+
+
+def test_a_short_image_and_a_changed_bag_are_refused(tmp_path):
+    bag = street(frames=1)
+    bag.rows[-1][2].data = bag.rows[-1][2].data[:100]
+    sequence = open_sequence(str(bag.write(tmp_path / "short")))
+    with raises("RIL-942", "100 bytes"):
+        pixels(sequence, 0, "right")
+    path = street().write(tmp_path / "changed")
+    sequence = open_sequence(str(path))
+    path.write_bytes(street(frames=1).write(tmp_path / "other").read_bytes())
+    with raises("RIL-944"):
+        pixels(sequence, 2, "left")
+
+
+def test_images_without_a_partner_are_left_out(tmp_path):
+    bag = street()
+    bag.rows.pop()
+    sequence = open_sequence(str(bag.write(tmp_path)))
+    assert sequence.frames == 2
+    assert any("RIL-948" in line for line in sequence.warnings)
+
+
+def test_init_says_that_a_bag_opens_as_it_is(tmp_path, capsys):
+    path = street().write(tmp_path)
+    with pytest.raises(SystemExit) as end:
+        main(["init", str(path)])
+    assert end.value.code == 0
+    assert f"rille reconstruct {path}" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+@pytest.mark.data
+def test_a_bag_of_a_street_gives_the_poses_of_its_folder(tmp_path, data_dir):
+    folder, bag = data_dir / "kitti06_51", Bag()
+    projections = np.loadtxt(folder / "calib.txt", usecols=range(-12, 0))
+    images = {LEFT: sorted((folder / "image_l").iterdir()), RIGHT: sorted((folder / "image_r").iterdir())}
+    for (topic, paths), p in zip(images.items(), projections, strict=True):
+        pictures = [cv2.imread(str(path), cv2.IMREAD_UNCHANGED) for path in paths[:6]]
+        bag.info(topic.replace("image_rect", "camera_info"), pictures[0].shape[::-1], p)
+        for k, pixels in enumerate(pictures):
+            bag.image(topic, START + k * STEP, pixels)
+    found = []
+    for name in (str(bag.write(tmp_path)), str(folder)):
+        where = {"runs": tmp_path / "runs", "cache": tmp_path / "cache"}
+        run = rille.reconstruct(rille.open(name), frames="0:6", **where)
+        found.append(np.loadtxt(run.folder / "trajectory.kitti"))
+    assert found[0].shape == (6, 12)
+    assert found[0] == pytest.approx(found[1], abs=1e-6)
