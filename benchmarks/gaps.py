@@ -86,7 +86,7 @@ def trajectory(folder: Path, frames: tuple[int, ...], cache: Path) -> Any:
     graph, store = Odometry(), at(cache)
     settings = config.build({"crosscheck": {"enabled": False}})
     products, _ = dataflow(graph, open_sequence(str(folder)), settings, frames)
-    scheduler.run(graph, store, executor="inline")
+    scheduler.run(graph, store, scheduler.RunOptions(executor="inline"))
     handle = products.trajectory
     return None if handle is None or handle.ref is None else store.open(handle.ref)
 

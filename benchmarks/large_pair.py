@@ -116,7 +116,7 @@ def judge(store: Any, ref: Any, shape: tuple[int, int]) -> None:
 def run(graph: Any, store: Any, jobs: int) -> float:
     from rille.pipeline.engine import scheduler
 
-    result = scheduler.run(graph, store, jobs=jobs)
+    result = scheduler.run(graph, store, scheduler.RunOptions(jobs=jobs))
     result.check()
     return float(result.seconds)
 

@@ -65,7 +65,7 @@ def drive(settings: list[str]) -> dict[str, Any]:
         store = at(folder)
         flow = Drive(graph, sequence, config_of([*layers, {"drive": {"goal": goal}}]))
         flow.build()
-        result = scheduler.run(graph, store, executor="inline", keep_going=True)
+        result = scheduler.run(graph, store, scheduler.RunOptions(executor="inline", keep_going=True))
         found = figures(flow, store)
     finally:
         shutil.rmtree(folder, ignore_errors=True)

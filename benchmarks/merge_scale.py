@@ -85,7 +85,7 @@ def merged(cache: Path, where: list[tuple[int, int]], cells: int, jobs: int, led
 
     graph.flow(follow())
     begin = time.perf_counter()
-    result = scheduler.run(graph, Store(cache), jobs=jobs, ledger=ledger)
+    result = scheduler.run(graph, Store(cache), scheduler.RunOptions(jobs=jobs, ledger=ledger))
     result.check()
     counts = {name: (c.computed, c.cached) for name, c in result.counts.items()}
     print(f"{time.perf_counter() - begin:.0f} s, computed and cached: {counts}", flush=True)

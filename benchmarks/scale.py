@@ -207,10 +207,10 @@ def measure(pairs: int, cache: Path, executor: str, jobs: int, what: str) -> dic
     graph = graph_of(pairs)
     laid = time.perf_counter() - wall
     if what == "plan":
-        result = scheduler.run(graph, Store(cache), dry=True)
+        result = scheduler.run(graph, Store(cache), scheduler.RunOptions(dry=True))
     else:
         ledger = cache.parent / "run" / "ledger.jsonl"
-        result = scheduler.run(graph, Store(cache), executor=executor, jobs=jobs, ledger=ledger)
+        result = scheduler.run(graph, Store(cache), scheduler.RunOptions(executor=executor, jobs=jobs, ledger=ledger))
     result.check()
     spent = time.perf_counter() - wall
     n = len(graph.nodes)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 import sys
 import traceback
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -127,7 +128,7 @@ def drive(
     prepare()
     from rille.pipeline.runs import session as run
 
-    return run.reconstruct(options(seq, settings, results, executor=executor, verb="drive"))
+    return run.reconstruct(replace(options(seq, settings, results, executor=executor), verb="drive"))
 
 
 @app.command

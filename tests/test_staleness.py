@@ -209,7 +209,7 @@ class Chain:
         graph = Graph()
         config = configuration.build(configuration.expand(self.sequence.defaults), given)
         dataflow(graph, self.sequence, config, FRAMES)
-        result = scheduler.run(graph, self.store, dry=True)
+        result = scheduler.run(graph, self.store, scheduler.RunOptions(dry=True))
         assert not result.failures
         return graph
 

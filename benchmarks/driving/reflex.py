@@ -46,7 +46,7 @@ def trial(settings: list[str]) -> dict[str, Any]:
         store = at(folder)
         flow = OneLeg(graph, sequence, config_of(layers))
         flow.build()
-        result = scheduler.run(graph, store, executor="inline", keep_going=True)
+        result = scheduler.run(graph, store, scheduler.RunOptions(executor="inline", keep_going=True))
         found = stone(flow, store)
     finally:
         shutil.rmtree(folder, ignore_errors=True)

@@ -88,7 +88,7 @@ def check(
     inspection = Inspection(Builder(graph, sequence, config), chosen, store)
     path = output if output is not None else Path(f"{sequence.name}-check.png")
     graph.flow(inspection.steps())
-    result = scheduler.run(graph, store, executor="inline", keep_going=True)
+    result = scheduler.run(graph, store, scheduler.RunOptions(executor="inline", keep_going=True))
     Result(failures=[f for f in result.failures if not (f.stage and isinstance(f.error, RilleError))]).check()
     found = inspection.found
     if inspection.match is not None and len(inspection.match.left):

@@ -118,9 +118,8 @@ def match(
         left,
         right,
         output,
-        preset=preset,
+        command.matcher_params(preset, tuple(assignments or ())),
         dense=dense,
-        assignments=tuple(assignments or ()),
         prior=prior_disparity,
         confidence=confidence,
     )

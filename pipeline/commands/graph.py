@@ -36,7 +36,7 @@ def graph(options: Options, output: Path, *, tasks: bool = False) -> int:
         raise ConfigError("RIL-871", f"{output.name} is no name of a drawing", remedy="end it in .svg or .dot")
     settled = settings(options)
     laid_out = lay_out(settled.sequence, settled.config, choose_frames(options.frames, settled.sequence.frames))
-    scheduler.run(laid_out, at(options.cache), dry=True).check()
+    scheduler.run(laid_out, at(options.cache), scheduler.RunOptions(dry=True)).check()
     names, edges = parts(laid_out, tasks=tasks)
     atomic.write(output, draw(names, edges))
     print(f"{output}  {len(laid_out.nodes)} tasks of {len({h.stage for h in laid_out.nodes})} stages")

@@ -41,18 +41,22 @@ def match_files(
     left: Path,
     right: Path,
     output: Path,
+    params: Any,
     *,
-    preset: str | None,
     dense: bool,
-    assignments: tuple[str, ...],
     prior: Path | None = None,
     confidence: Path | None = None,
 ) -> int:
     """Match two image files and write ``column_disparity`` and ``row_disparity``, float32 pixels, NaN undefined.
 
-    Without ``dense`` only what was matched and found consistent is written; with it, filled values too. ``prior``: a
-    disparity TIFF to start from. ``confidence``: TIFF for standard deviation, validity and back-matching error. What is
-    suspicious is said on stderr.
+    Parameters
+    ----------
+    left, right : image files.
+    output : TIFF to write.
+    params : of the matcher, as :func:`matcher_params` gives them.
+    dense : write filled values, too, and not only consistent matches.
+    prior : disparity TIFF to start from.
+    confidence : TIFF to write with standard deviation, validity and back-matching error.
 
     Returns
     -------
@@ -61,14 +65,13 @@ def match_files(
     Raises
     ------
     ConfigError
-        An assignment is not one of the matcher's, or two outputs have one name.
+        Two outputs have one name.
     InputError
         An image or the prior cannot be read, or the prior is not of the left image's size.
     """
     from rille.datasets.images.files import read_grey
     from rille.pipeline.export.writers import write_confidence, write_disparity
 
-    params = matcher_params(preset, assignments)
     if confidence is not None and confidence.resolve() == output.resolve():
         raise ConfigError("RIL-043", f"--confidence and --output are both {output}", remedy="give them two names")
     images = read_grey(left), read_grey(right)

@@ -89,13 +89,12 @@ def options(
     settings: Settings,
     results: Results,
     *,
-    verb: str = "reconstruct",
     executor: str = "dask",
     frames: str | None = None,
     keep_going: bool = False,
     memory_limit: str | None = None,
 ) -> Options:
-    """What was given on the command line, for :mod:`rille.pipeline.runs.session`."""
+    """Collect the options of the command line for :mod:`rille.pipeline.runs.session`."""
     from rille.pipeline.runs.session import Options
 
     return Options(
@@ -111,7 +110,6 @@ def options(
         cache=cache_folder(settings.cache),
         progress="quiet" if results.quiet else results.progress,
         memory_limit=memory_limit,
-        verb=verb,
         verbose=results.verbose,
     )
 

@@ -55,7 +55,7 @@ def plan(options: Options, *, verbose: bool = False) -> int:
         run_files.plan(graph, RunView("", *taken, products, (), config, vehicle_source=settled.vehicle_source))
 
     graph.last = outputs
-    result = scheduler.run(graph, store, dry=True, force=options.force)
+    result = scheduler.run(graph, store, scheduler.RunOptions(dry=True, force=options.force))
     result.check()
     lost = [] if result.unknown else unread.unread(settled.given, config, graph)
     if lost:

@@ -1,6 +1,6 @@
 """Runs a graph: looks everything up on the client, submits only what is missing, expands as results arrive.
 
->>> result = run(graph, Store("cache"), jobs=2, progress=progress.make("auto"))
+>>> result = run(graph, Store("cache"), RunOptions(jobs=2, progress=progress.make("auto")))
 >>> result.check()                       # raises the first failure, with its stage and label
 >>> result.counts["locus"].cached
 8
@@ -125,80 +125,57 @@ def is_hole(error: BaseException) -> bool:
     return isinstance(error, DegenerateError)
 
 
-def run(
-    graph: Graph,
-    store: Store,
-    *,
-    executor: Any = "dask",
-    jobs: int | None = None,
-    keep_going: bool = False,
-    force: Collection[str] = (),
-    dry: bool = False,
-    ledger: Path | None = None,
-    progress: Progress | None = None,
-    memory_limit: float | None = None,
-    survey: Callable[[], Graph] | None = None,
-) -> Result:
-    """Bring every node of a graph to an artifact.
+@dataclass(frozen=True)
+class RunOptions:
+    """How a graph is run.
 
     Parameters
     ----------
-    graph : its handles are filled in; expansions may add nodes during the run.
-    store : where artifacts are.
     executor : ``dask`` (a cluster of this machine), the address of a running dask scheduler (``tcp://...``), a
         ``Client`` of dask, or ``inline``.
     jobs : worker processes; None is one a core.
-    keep_going : finish what does not depend on a failure, of whatever kind.
+    keep_going : finish all tasks that do not depend on a failure, of whatever kind.
     force : names of stages to compute again though they are there; the digests must agree.
     dry : look up only.
     ledger : file of JSON lines, one a node, written as they resolve.
     progress : told of every step.
     memory_limit : bytes that this process and its workers may take together; None is what is free here.
     survey : lays the same graph out anew, to look ahead: what cannot fit into memory is refused before anything runs.
+    """
+
+    executor: Any = "dask"
+    jobs: int | None = None
+    keep_going: bool = False
+    force: Collection[str] = ()
+    dry: bool = False
+    ledger: Path | None = None
+    progress: Progress = field(default_factory=Quiet)
+    memory_limit: float | None = None
+    survey: Callable[[], Graph] | None = None
+
+
+_DEFAULTS = RunOptions()
+
+
+def run(graph: Graph, store: Store, options: RunOptions = _DEFAULTS) -> Result:
+    """Bring every node of a graph to an artifact in ``store``; its handles are filled in, expansions may add nodes.
 
     Raises
     ------
     MemoryRefusedError
         A task that can be foreseen does not fit, even alone.
     KeyboardInterrupt
-        Interrupted; running tasks are killed, what is committed stays.
+        Interrupted; running tasks are killed, committed artifacts stay.
     """
-    return _Run(
-        graph,
-        store,
-        executor,
-        jobs,
-        keep_going,
-        force,
-        dry,
-        ledger,
-        progress or Quiet(),
-        memory_limit,
-        survey,
-    ).go()
+    return _Run(graph, store, options).go()
 
 
 class _Run:
-    def __init__(
-        self,
-        graph: Graph,
-        store: Store,
-        executor: Any,
-        jobs: int | None,
-        keep_going: bool,
-        force: Collection[str],
-        dry: bool,
-        ledger: Path | None,
-        progress: Progress,
-        memory_limit: float | None,
-        survey: Callable[[], Graph] | None,
-    ) -> None:
-        self.graph, self.store = graph, store
-        self.memory_limit, self.survey = memory_limit, survey
+    def __init__(self, graph: Graph, store: Store, options: RunOptions) -> None:
+        self.graph, self.store, self.options = graph, store, options
+        self.dry, self.force, self.progress = options.dry, frozenset(options.force), options.progress
+        self.ledger = Ledger(options.ledger)
         self.admission: Admission | None = None
-        self.executor_kind, self.jobs = executor, jobs
-        self.keep_going, self.force, self.dry = keep_going, frozenset(force), dry
-        self.ledger, self.progress = Ledger(ledger), progress
         self.executor: Executor | None = None
         self.result = Result()
         self.stopped = ""
@@ -257,7 +234,7 @@ class _Run:
             self.executor.close(kill=kill)
 
     def _loop(self, interrupts: Interrupts) -> None:
-        self.progress.open(self.graph, forecast.recall(self.hints), self.jobs or cores())
+        self.progress.open(self.graph, forecast.recall(self.hints), self.options.jobs or cores())
         self.store.survey(_sequence(self.graph))
         while True:
             self._settle()
@@ -454,26 +431,27 @@ class _Run:
 
     def _begin(self) -> None:
         """Look ahead, share the memory out, and start the workers that it leaves room for."""
-        check(self.executor_kind, self.jobs)
-        known, jobs = cost_model.recall(self.hints), self.jobs or cores()
+        kind = self.options.executor
+        check(kind, self.options.jobs)
+        known, jobs = cost_model.recall(self.hints), self.options.jobs or cores()
         ahead = self._look_ahead()
         most = max(largest(ahead, known), *(known.foresee(h.spec, input_bytes(h)).most for h in self.missing))
-        shares = account(known, self.memory_limit, self.executor_kind, jobs, most)
-        self.admission = Admission(known, shares, automatic=self.memory_limit is None)
+        shares = account(known, self.options.memory_limit, kind, jobs, most)
+        self.admission = Admission(known, shares, automatic=self.options.memory_limit is None)
         self.admission.check(ahead)
         self.store.writable()
         amounts = {k: round(v) for k, v in vars(shares).items() if math.isfinite(v)}
-        name = self.executor_kind if isinstance(self.executor_kind, str) else self.executor_kind.scheduler.address
+        name = kind if isinstance(kind, str) else kind.scheduler.address
         self.ledger.run(executor=name, jobs=shares.workers, **amounts)
-        self.executor = make(self.executor_kind, shares.workers, self.store.location, shares.limit)
+        self.executor = make(kind, shares.workers, self.store.location, shares.limit)
         self.result.executor_started = True
         if self.executor.pages:
             self.progress.detail(self.executor.pages)
 
     def _look_ahead(self) -> Graph:
         """The graph laid out anew and looked up, by what this run's survey of the store has found."""
-        ahead = Graph() if self.survey is None else self.survey()
-        dry = _Run(ahead, self.store, "inline", None, False, self.force, True, None, Quiet(), None, None)
+        ahead = Graph() if self.options.survey is None else self.options.survey()
+        dry = _Run(ahead, self.store, RunOptions(force=self.force, dry=True))
         dry._settle()
         dry._leave_out()
         return ahead
@@ -541,7 +519,7 @@ class _Run:
     def _failed(self, failure: Failure) -> None:
         self.result.failures.append(failure)
         self.progress.failed(failure.label, failure.error)
-        if not self.keep_going and not is_hole(failure.error):
+        if not self.options.keep_going and not is_hole(failure.error):
             self.stopped = f"stopped after {failure.label} failed"
             if self.executor is not None:
                 self.executor.halt()

@@ -268,14 +268,16 @@ def _compute(opened: _Opened) -> Result:
     result = scheduler.run(
         opened.graph,
         opened.store,
-        executor=options.executor,
-        jobs=options.jobs,
-        keep_going=options.keep_going,
-        force=options.force,
-        ledger=opened.folder / "ledger.jsonl",
-        progress=progress.make(options.progress, verbose=options.verbose),
-        memory_limit=None if options.memory_limit is None else limits.parse(options.memory_limit),
-        survey=lambda: lay_out(opened.sequence, opened.config, opened.frames),
+        scheduler.RunOptions(
+            executor=options.executor,
+            jobs=options.jobs,
+            keep_going=options.keep_going,
+            force=options.force,
+            ledger=opened.folder / "ledger.jsonl",
+            progress=progress.make(options.progress, verbose=options.verbose),
+            memory_limit=None if options.memory_limit is None else limits.parse(options.memory_limit),
+            survey=lambda: lay_out(opened.sequence, opened.config, opened.frames),
+        ),
     )
     trajectory = opened.products.trajectory
     if not options.keep_going:

@@ -46,7 +46,9 @@ def run(
         merge_tiles(node, [f.meta for f in found], dems, steps or {})
 
     graph.flow(follow())  # type: ignore[arg-type]
-    scheduler.run(graph, Store(cache), executor=executor, jobs=2, ledger=cache / "ledger.jsonl").check()
+    scheduler.run(
+        graph, Store(cache), scheduler.RunOptions(executor=executor, jobs=2, ledger=cache / "ledger.jsonl")
+    ).check()
     rows = events.read(cache / "ledger.jsonl")
     again = {r["label"] for r in rows if r["stage"] == "merge" and r["status"] == "computed"}
     return again, {r["label"]: r["digest"] for r in rows if r["stage"] == "merge"}, {h.label: h for h in graph.nodes}

@@ -54,7 +54,7 @@ def test_a_server_in_trouble(calm, bucket, through, row, monkeypatch, how):
         for _ in range(2):  # cold, then warm
             graph = Graph()
             chain.build(graph)
-            result = scheduler.run(graph, at(f"{prefix}/{trial}"), executor="inline", jobs=3)
+            result = scheduler.run(graph, at(f"{prefix}/{trial}"), scheduler.RunOptions(executor="inline", jobs=3))
             computed += result.total().computed
             wrong += [h.label for h in graph.nodes if h.ref is None or h.ref.digest != calm["labels"][h.label]]
         found = look.published(f"{prefix}/{trial}")
@@ -69,7 +69,7 @@ def test_a_store_that_ignores_conditional_puts_is_refused(calm, bucket, through,
     prefix = bucket[0]
     graph = Graph()
     chain.build(graph, frames=2, size=20)
-    scheduler.run(graph, at(prefix), executor="inline").check()
+    scheduler.run(graph, at(prefix), scheduler.RunOptions(executor="inline")).check()
     before = {e.path: e.mark for e in at(prefix).place.list("")}
     proxy = through(lambda *_: "blind")
     for place in (prefix, f"{prefix}/new"):

@@ -79,7 +79,9 @@ def run(cache, **options):
     force = options.pop("force", ())
     chain.build(graph, frames=SMALL, size=40, **options)
     try:
-        result = scheduler.run(graph, Store(cache), executor="inline", keep_going=True, force=force)
+        result = scheduler.run(
+            graph, Store(cache), scheduler.RunOptions(executor="inline", keep_going=True, force=force)
+        )
     except StoreError as error:  # refused before anything is computed
         result = scheduler.Result(failures=[scheduler.Failure("the cache", "", error, "")])
     return graph, result
@@ -256,7 +258,7 @@ def test_shuffled_order(calm, tmp_path, row, seeds):
     for seed in range(seeds):
         graph = Graph()
         chain.build(graph, shuffle=seed)
-        result = scheduler.run(graph, Store(tmp_path / str(seed)), executor="inline")
+        result = scheduler.run(graph, Store(tmp_path / str(seed)), scheduler.RunOptions(executor="inline"))
         computed += result.total().computed
         wrong += [h.label for h in graph.nodes if h.ref.digest != calm["labels"][h.label]]
     row("shuffled order of tasks", seeds, [], wrong, computed, seeds * len(calm["digests"]), "inline")
@@ -271,7 +273,7 @@ def test_a_stage_that_is_not_deterministic_is_detected(tmp_path, row):
         graph = Graph()
         node = graph.node("toys.mischief", "random", NoParams(), {"what": "random"})
         graph.node("torn.reader", "reader", NoParams(), inputs={"values": node})
-        result = scheduler.run(graph, Store(cache), executor="inline", keep_going=True, **options)
+        result = scheduler.run(graph, Store(cache), scheduler.RunOptions(executor="inline", keep_going=True, **options))
         caught += any(isinstance(f.error, NonDeterministicError) for f in result.failures)
         return graph, result
 

@@ -31,9 +31,9 @@ def folder(tmp_path):
     return tmp_path
 
 
-def run(folder, left="left.png", right="right.png", **options):
-    options = {"preset": None, "dense": False, "assignments": ()} | options
-    return command.match_files(folder / left, folder / right, folder / "out.tif", **options)
+def run(folder, left="left.png", right="right.png", preset=None, assignments=(), dense=False, **options):
+    params = command.matcher_params(preset, assignments)
+    return command.match_files(folder / left, folder / right, folder / "out.tif", params, dense=dense, **options)
 
 
 def test_writes_two_named_bands_and_says_what_it_found(folder, capsys):

@@ -20,7 +20,7 @@ SECONDS = {"numbers": (0.0, 2.0, 0.0), "scale": (0.0, 3.0, 0.0), "total": (0.0, 
 def lines(cache, *, verbose=False, sequence="", choice="", **changed):
     graph = Graph(sequence, choice)
     build(graph, **changed)
-    result = scheduler.run(graph, Store(cache), dry=True)
+    result = scheduler.run(graph, Store(cache), scheduler.RunOptions(dry=True))
     result.check()
     return list(plan.describe(graph, result, SECONDS, 2, verbose=verbose))
 
@@ -28,7 +28,7 @@ def lines(cache, *, verbose=False, sequence="", choice="", **changed):
 def compute(cache, *, sequence="", choice="", **kw):
     graph = Graph(sequence, choice)
     build(graph, **kw)
-    scheduler.run(graph, Store(cache), executor="inline").check()
+    scheduler.run(graph, Store(cache), scheduler.RunOptions(executor="inline")).check()
 
 
 def test_of_an_empty_cache_says_what_it_cannot_know(cache):
@@ -107,9 +107,9 @@ def test_an_earlier_result_that_does_not_fit_hides_what_follows(cache):
         graph.flow(fitting())
         return graph
 
-    scheduler.run(lay_out(0, 0), Store(cache), executor="inline").check()
-    result = scheduler.run(lay_out(1, 1), Store(cache), dry=True)
+    scheduler.run(lay_out(0, 0), Store(cache), scheduler.RunOptions(executor="inline")).check()
+    result = scheduler.run(lay_out(1, 1), Store(cache), scheduler.RunOptions(dry=True))
     assert result.ok
     assert result.unknown == ["numbers/0"]
-    result = scheduler.run(lay_out(0, 1), Store(cache), dry=True)
+    result = scheduler.run(lay_out(0, 1), Store(cache), scheduler.RunOptions(dry=True))
     assert [f.label for f in result.failures] == ["plan after numbers/0"], "by what is there it is a failure"

@@ -19,7 +19,9 @@ def run(folder, name, sequence="toy", **kw):
     graph = Graph(sequence)
     build(graph, **kw)
     at = folder / "runs" / sequence / name
-    scheduler.run(graph, Store(folder / "cache"), executor="inline", ledger=at / "ledger.jsonl").check()
+    scheduler.run(
+        graph, Store(folder / "cache"), scheduler.RunOptions(executor="inline", ledger=at / "ledger.jsonl")
+    ).check()
     return at
 
 

@@ -33,7 +33,7 @@ def hands(tmp_path_factory):
 def run(cache, where="inline", jobs=2):
     graph = Graph()
     chain.build(graph)
-    scheduler.run(graph, Store(cache), executor=where, jobs=jobs).check()
+    scheduler.run(graph, Store(cache), scheduler.RunOptions(executor=where, jobs=jobs)).check()
     return {h.key: h.ref.digest for h in graph.nodes}
 
 
@@ -157,4 +157,4 @@ def test_no_workers_and_a_scheduler_that_leaves(tmp_path, monkeypatch):
 
         monkeypatch.setattr(scheduler, "make", make)
         with raises("RIL-526"):
-            scheduler.run(graph, Store(tmp_path / "cache"), executor=hands.address)
+            scheduler.run(graph, Store(tmp_path / "cache"), scheduler.RunOptions(executor=hands.address))

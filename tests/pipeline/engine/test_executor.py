@@ -52,14 +52,16 @@ def test_workers_give_the_same_bits_die_alone_and_leave_nobody_behind(cache, tmp
     """One pool for several questions, because starting it is what takes the time."""
     plain = Graph()
     build(plain)
-    scheduler.run(plain, Store(cache / "inline"), executor="inline")
+    scheduler.run(plain, Store(cache / "inline"), scheduler.RunOptions(executor="inline"))
 
     graph, tally = Graph(), tmp_path / "tally"
     build(graph)
     die = graph.node("toys.mischief", "die", NoParams(), {"what": "die", "tally": str(tally)})
     graph.node("toys.mischief", "after", NoParams(), {"what": "fine"}, inputs={"after": die})
     graph.node("toys.mischief", "unpicklable", NoParams(), {"what": "unpicklable"})
-    result = scheduler.run(graph, Store(cache / "workers"), executor="dask", jobs=2, keep_going=True)
+    result = scheduler.run(
+        graph, Store(cache / "workers"), scheduler.RunOptions(executor="dask", jobs=2, keep_going=True)
+    )
 
     found = {h.label: h for h in graph.nodes}
     assert {h.label: h.ref.digest for h in plain.nodes} == {

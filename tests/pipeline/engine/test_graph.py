@@ -24,7 +24,7 @@ def broken(graph, what="degenerate"):
 
 
 def run(graph, tmp_path, **options):
-    return scheduler.run(graph, Store(tmp_path / "cache"), executor="inline", **options)
+    return scheduler.run(graph, Store(tmp_path / "cache"), scheduler.RunOptions(executor="inline", **options))
 
 
 def test_a_flow_gets_what_it_yielded_and_several_run_side_by_side(tmp_path):

@@ -32,7 +32,7 @@ def run(cache, **options):
     chain.build(graph, **options)
     real = store._read_manifest
     store._read_manifest = lambda stage, key: read.append(key) or real(stage, key)
-    result = scheduler.run(graph, store, executor="inline")
+    result = scheduler.run(graph, store, scheduler.RunOptions(executor="inline"))
     return {h.label: (h.status, h.ref) for h in graph.nodes}, read, result
 
 

@@ -165,7 +165,7 @@ def overlaps(path):
 def learned(cache, tmp_path):
     """Folders of caches that know what a hog takes, and hold none; and the digests that it gives."""
     graph = hogs(seconds=0.0)
-    scheduler.run(graph, Store(cache), executor="inline").check()
+    scheduler.run(graph, Store(cache), scheduler.RunOptions(executor="inline")).check()
     assert [h.memory for h in graph.nodes] == [pytest.approx(HOG, rel=0.15)] * 3
 
     def make(name):
@@ -180,7 +180,9 @@ def learned(cache, tmp_path):
 
 def run(graph, store, executor, limit):
     path = store.root / "ledger.jsonl"
-    result = scheduler.run(graph, store, executor=executor, jobs=2, memory_limit=limit, ledger=path)
+    result = scheduler.run(
+        graph, store, scheduler.RunOptions(executor=executor, jobs=2, memory_limit=limit, ledger=path)
+    )
     return result, path
 
 
@@ -210,7 +212,7 @@ def lay_out():
 def test_what_does_not_fit_alone_is_refused_before_anything_runs(cache):
     graph = lay_out()
     with raises("RIL-500") as caught:
-        scheduler.run(graph, Store(cache), executor="inline", survey=lay_out)
+        scheduler.run(graph, Store(cache), scheduler.RunOptions(executor="inline", survey=lay_out))
     assert caught.value.remedy == "change hog.bytes, or give more with --memory-limit"
     assert [h.status for h in graph.nodes] == ["pending", "pending"]
     assert not cache.exists()
@@ -218,7 +220,7 @@ def test_what_does_not_fit_alone_is_refused_before_anything_runs(cache):
 
 def test_what_could_not_be_foreseen_is_refused_when_its_turn_comes(cache):
     graph = lay_out()
-    result = scheduler.run(graph, Store(cache), executor="inline", keep_going=True)
+    result = scheduler.run(graph, Store(cache), scheduler.RunOptions(executor="inline", keep_going=True))
     assert [h.status for h in graph.nodes] == ["computed", "failed"]
     assert isinstance(result.failures[0].error, MemoryRefusedError)
 
@@ -261,7 +263,7 @@ def test_a_plan_foresees_memory_and_bytes_and_says_from_what(cache):
     def lines(**kw):
         graph = Graph()
         build(graph, **kw)
-        scheduler.run(graph, Store(cache), dry=True)
+        scheduler.run(graph, Store(cache), scheduler.RunOptions(dry=True))
         kept = cost_model.recall(Store(cache).hints(""))
         return list(plan.needs(graph, kept, Account(8e9, 1e8, 2e8, 2))), forecast(graph, kept), graph
 
@@ -269,7 +271,7 @@ def test_a_plan_foresees_memory_and_bytes_and_says_from_what(cache):
     assert told[1].endswith("  no earlier run: a guess of the stage's declaration")
     graph = Graph()
     build(graph, size=400)
-    scheduler.run(graph, Store(cache), executor="inline").check()
+    scheduler.run(graph, Store(cache), scheduler.RunOptions(executor="inline")).check()
     told, _, _ = lines(size=400)
     assert told == [], "nothing is to do"
     told, found, graph = lines(size=400, seed=1)

@@ -70,7 +70,7 @@ def right(tmp_path_factory):
 def run(cache, **options):
     graph = Graph()
     chain.build(graph, frames=FRAMES)
-    result = scheduler.run(graph, at(cache), executor="inline", **options)
+    result = scheduler.run(graph, at(cache), scheduler.RunOptions(executor="inline", **options))
     result.check()
     return graph, result
 

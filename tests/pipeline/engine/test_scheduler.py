@@ -29,7 +29,9 @@ def run(cache, *, make=build, **options):
     graph = Graph()
     kwargs = {k: options.pop(k) for k in ("frames", "seed", "size", "offset") if k in options}
     make(graph, **kwargs)
-    result = scheduler.run(graph, Store(cache), executor=options.pop("executor", "inline"), **options)
+    result = scheduler.run(
+        graph, Store(cache), scheduler.RunOptions(executor=options.pop("executor", "inline"), **options)
+    )
     return graph, result
 
 

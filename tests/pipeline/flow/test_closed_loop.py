@@ -49,7 +49,7 @@ def drive(store: Path, *more: str) -> tuple[Drive, Result]:
     layers: list[dict[str, Any]] = [{"vehicle": sequence.vehicle.model_dump()}, config.expand(sequence.defaults)]
     flow = Drive(Graph(), sequence, config.build(*layers, for_stages))
     flow.build()
-    return flow, scheduler.run(flow.graph, Store(store), executor="inline", keep_going=True)
+    return flow, scheduler.run(flow.graph, Store(store), scheduler.RunOptions(executor="inline", keep_going=True))
 
 
 @pytest.fixture(scope="module")
@@ -253,7 +253,7 @@ def test_the_vehicle_that_is_configured_is_the_one_that_stands_on_the_bed(store:
     flow = Drive(Graph(), sequence, config.build(given, config.expand(sequence.defaults), for_stages))
     flow.build()
     flow.graph.expansions.clear()
-    scheduler.run(flow.graph, Store(store), executor="inline").check()
+    scheduler.run(flow.graph, Store(store), scheduler.RunOptions(executor="inline")).check()
     assert flow.driven.place is not None
     assert flow.driven.place.ref is not None
     found = Store(store).open(flow.driven.place.ref)

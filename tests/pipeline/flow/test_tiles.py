@@ -53,7 +53,7 @@ def disparity(store, images, params, side):
         node = graph.node("rille.stages.hfvm.stage", "hfvm", params, inputs=given)
     else:
         node = tiles.Tiles(graph, params, PyramidParams(), given, (SHAPE, SHAPE), side, "hfvm").build()
-    scheduler.run(graph, store, executor="inline").check()
+    scheduler.run(graph, store, scheduler.RunOptions(executor="inline")).check()
     return node.ref
 
 
@@ -79,7 +79,7 @@ def test_mockup_in_tiles_of_256_has_the_digest_of_the_whole(tmp_path, preset):
         found = settings(Options("mockup-short", (f"hfvm.preset={preset}", f"tiling.tile={side}")))
         graph = Graph()
         disparity = Builder(graph, found.sequence, found.config).disparity(0)
-        scheduler.run(graph, Store(tmp_path), executor="inline").check()
+        scheduler.run(graph, Store(tmp_path), scheduler.RunOptions(executor="inline")).check()
         digests.append(disparity.ref.digest)
     assert digests[0] == digests[1]
 
@@ -89,7 +89,7 @@ def test_wrong_size_of_the_camera_is_one_clear_line(tmp_path, images):
     given = pyramids(graph, images)
     less = (SHAPE[0] // 2, SHAPE[1] // 2)
     tiles.Tiles(graph, HfvmParams(), PyramidParams(), given, (less, less), 50, "hfvm").build()
-    result = scheduler.run(graph, Store(tmp_path), executor="inline")
+    result = scheduler.run(graph, Store(tmp_path), scheduler.RunOptions(executor="inline"))
     assert "does not have the size that its camera states" in str(result.failures[0].error)
 
 

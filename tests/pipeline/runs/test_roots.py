@@ -24,7 +24,7 @@ def used(tmp_path: Path) -> Store:
     store, folder, graph = Store(tmp_path / "cache"), tmp_path / "work" / "runs", Graph()
     (folder / "toy" / "1").mkdir(parents=True)
     chain.build(graph)
-    scheduler.run(graph, store, executor="inline", ledger=folder / "toy" / "1" / "ledger.jsonl")
+    scheduler.run(graph, store, scheduler.RunOptions(executor="inline", ledger=folder / "toy" / "1" / "ledger.jsonl"))
     roots.note(store, folder)
     for path in store.root.glob("artifacts/*/*/*.zip"):
         os.utime(path, (0, 0))

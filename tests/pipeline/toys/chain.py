@@ -44,7 +44,9 @@ def main(cache, executor="inline", what="", ledger=""):
         for i in range(3):
             graph.node("toys.mischief", f"sleep/{i}", NoParams(), {"what": "sleep", "seconds": 60, "i": i})
     print("begun", flush=True)
-    result = scheduler.run(graph, Store(cache), executor=executor, jobs=2, ledger=Path(ledger) if ledger else None)
+    result = scheduler.run(
+        graph, Store(cache), scheduler.RunOptions(executor=executor, jobs=2, ledger=Path(ledger) if ledger else None)
+    )
     nodes = {h.label: [h.status, h.ref.digest if h.ref else None, h.reason] for h in graph.nodes}
     print(json.dumps({"ok": result.ok, "workers": result.executor_started, "nodes": nodes}), flush=True)
 

@@ -58,7 +58,9 @@ def run(cache, executor="inline", ledger=None, jobs=2, memory=None, environment=
     graph = Graph()
     build(graph, **options)
     made = scheduler.run(
-        graph, at(cache), executor=executor, jobs=jobs, keep_going=True, ledger=Path(ledger) if ledger else None
+        graph,
+        at(cache),
+        scheduler.RunOptions(executor=executor, jobs=jobs, keep_going=True, ledger=Path(ledger) if ledger else None),
     )
     nodes = {
         h.label: {
