@@ -18,6 +18,7 @@ together (:mod:`rille.stages.terrain.locus.roots`). A lane whose root does not s
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -39,80 +40,102 @@ from rille.stages.terrain.locus.lines import (
     spans,
 )
 from rille.stages.terrain.locus.lines import PLANES as LINE_PLANES
-from rille.stages.terrain.locus.points import LANES, POINT_PLANES, POINTS, STEPS, S, climb, meet, pixels
+from rille.stages.terrain.locus.points import (
+    LANES,
+    POINT_PLANES,
+    POINTS,
+    STEPS,
+    Observed,
+    S,
+    Steps,
+    climb,
+    meet,
+    pixels,
+)
 from rille.stages.terrain.locus.roots import PLANES as ROOT_PLANES
 from rille.stages.terrain.locus.roots import accept, gather, roots, slopes
 
 Floats = NDArray[np.float64]
-Float32 = NDArray[np.float32]
 
-WAY, PLACE, LEVEL, FIRST, BRACKET = (k * LANES for k in range(LINE_PLANES, LINE_PLANES + 5))
-"""Planes of the search: -1 downwards, 1 upwards, 0 not begun; the step looked at last, and s there; s at the start; the
-bracket found (upper end, s there, lower end, s there)."""
+WAY, PLACE, LEVEL, FIRST = (k * LANES for k in range(LINE_PLANES, LINE_PLANES + 4))
+"""Planes of the search: -1 downwards, 1 upwards, 0 not begun; the step looked at last, and s there; s at the start."""
+UPPER_Z, UPPER_S, LOWER_Z, LOWER_S = (k * LANES for k in range(LINE_PLANES + 4, LINE_PLANES + 8))
+"""Planes of the bracket that was found: elevation and s of both ends, as :func:`gather` copies them."""
 PLANES = LINE_PLANES + 8
 DONE, MORE, FOUND = 0, 1, 2
 
 
+class Cells(NamedTuple):
+    """Cells of a block.
+
+    ``feet``, ``normals`` (r, c, 3) metres, frame of the surface; ``low``, ``high`` (r, c) interval of Z in which the
+    search starts, metres, NaN: the cell is left out. The search may leave it: upwards while the point is behind the
+    surface, downwards while it is free.
+    """
+
+    feet: Floats
+    normals: Floats
+    low: Floats
+    high: Floats
+
+
+class Cameras(NamedTuple):
+    """``left``, ``right`` (3, 4) projections from the frame of the surface to pixels; ``epipole`` (3,) homogeneous
+    projection of the left camera's centre into the right image; ``sizes`` (4,) width and height of the left, then of
+    the right image."""
+
+    left: Floats
+    right: Floats
+    epipole: Floats
+    sizes: Floats
+
+
+class _Room(NamedTuple):
+    """Room to work in: planes of the lanes that search, of those whose root is solved, and of points; numbers of the
+    lanes that go on and of those with a bracket; the cell of each lane."""
+
+    lanes: Floats
+    solved: Floats
+    points: Floats
+    active: NDArray[np.int64]
+    found: NDArray[np.int64]
+    cells: NDArray[np.int64]
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
-def search(
-    feet: Floats,
-    normals: Floats,
-    low: Floats,
-    high: Floats,
-    z_min: float,
-    z_max: float,
-    left: Floats,
-    right: Floats,
-    epipole: Floats,
-    sizes: Floats,
-    disparity: Float32,
-    std: Floats,
-    image: Float32,
-    limits: Floats,
-    out: Floats,
-) -> None:
+def search(cells: Cells, z_range: tuple[float, float], cameras: Cameras, seen: Observed, out: Floats) -> None:
     """Solve every cell of a block.
 
     Parameters
     ----------
-    feet, normals : (r, c, 3) metres, frame of the surface.
-    low, high : (r, c) interval of Z in which the search starts, metres; NaN: the cell is left out. The search may leave
-        it: upwards while the point is behind the surface, downwards while it is free.
-    z_min, z_max : limits of Z.
-    left, right : (3, 4) projections from the frame of the surface to pixels.
-    epipole : (3,) homogeneous projection of the left camera's centre into the right image.
-    sizes : (4,) width and height of the left, then of the right image.
-    disparity : (2 rows cols,) column and row disparity (right minus left) of each pixel of the left image in turn,
-        pixels, NaN where it must not be used.
-    std : (rows, cols) standard deviation of the disparities, pixels.
-    image : (rows, cols) grey values of the left image.
-    limits : (2,) greatest residual and greatest jump in the bilinear cell, pixels.
+    z_range : limits of Z, metres.
     out : (r, c, 4) elevation (m), its standard deviation (m), residual (px) and grey value of the highest change from
         free to behind that stands; to be filled with NaN before.
     """
-    lanes, solved, room = np.zeros(PLANES * LANES), np.zeros(ROOT_PLANES * LANES), np.zeros(POINT_PLANES * POINTS)
-    active, found, cells = np.empty(LANES, np.int64), np.empty(LANES, np.int64), np.empty(LANES, np.int64)
-    foot, normal, rows = feet.reshape(-1, 3), normals.reshape(-1, 3), out.reshape(-1, 4)
-    lowest, highest = low.ravel(), high.ravel()
+    lanes, solved, points = np.zeros(PLANES * LANES), np.zeros(ROOT_PLANES * LANES), np.zeros(POINT_PLANES * POINTS)
+    active, found, chosen = np.empty(LANES, np.int64), np.empty(LANES, np.int64), np.empty(LANES, np.int64)
+    room = _Room(lanes, solved, points, active, found, chosen)
+    foot, normal, rows = cells.feet.reshape(-1, 3), cells.normals.reshape(-1, 3), out.reshape(-1, 4)
+    low, high = cells.low.ravel(), cells.high.ravel()
     n, last = 0, low.size - 1
     for i in range(low.size):
-        if not math.isnan(lowest[i]):
-            cells[n], lanes[LOW + n], lanes[HIGH + n] = i, lowest[i], highest[i]
+        if not math.isnan(low[i]):
+            chosen[n], lanes[LOW + n], lanes[HIGH + n] = i, low[i], high[i]
             for k in range(3):
                 lanes[FOOT + k * LANES + n], lanes[NORMAL + k * LANES + n] = foot[i, k], normal[i, k]
             n += 1
         if n == LANES or (n > 0 and i == last):
-            lines(n, left, right, lanes)
-            clip(n, sizes, z_min, z_max, lanes)
+            lines(n, cameras.left, cameras.right, lanes)
+            clip(n, cameras.sizes, z_range[0], z_range[1], lanes)
             spans(n, lanes)
-            _solve(n, cells, active, found, lanes, solved, room, epipole, disparity, std, image, limits, rows)
+            _solve(n, room, cameras.epipole, seen, rows)
             n = 0
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _solve(n, cells, active, found, lanes, solved, room, epipole, disparity, std, image, limits, out):  # type: ignore[no-untyped-def]
-    """Follow ``n`` lanes to the end; ``active``, ``found``, ``solved`` and ``room`` are room to work in."""
-    height, width = image.shape
+def _solve(n, room, epipole, seen, out):  # type: ignore[no-untyped-def]
+    """Follow ``n`` lanes to the end."""
+    lanes, solved, points, active, found, cells = room
     count = 0
     for m in range(n):
         lanes[WAY + m], lanes[PLACE + m] = 0.0, lanes[START + m] + 1.0
@@ -122,28 +145,27 @@ def _solve(n, cells, active, found, lanes, solved, room, epipole, disparity, std
     while count:
         hits = 0
         while count:
-            _look(active, count, lanes, width, height, room)
-            meet(STEPS * count, epipole, width, disparity, room)
-            count, hits = _scan(active, count, found, hits, lanes, room)
-        gather(found, hits, lanes, DZ, BRACKET, solved)
-        roots(hits, solved, epipole, width, height, disparity, room)
-        slopes(hits, solved, epipole, width, height, disparity, room)
-        refused = accept(hits, found, cells, solved, room, disparity, image, std, limits, out, active)
+            _look(active, count, lanes, seen.image.shape, points)
+            meet(STEPS * count, epipole, seen, points)
+            count, hits = _scan(active, count, found, hits, lanes, points)
+        gather(found, hits, lanes, DZ, UPPER_Z, solved)
+        roots(hits, solved, epipole, seen, points)
+        slopes(hits, solved, epipole, seen, points)
+        refused = accept(hits, found, cells, solved, seen, points, out)
         for t in range(refused):
-            if lanes[PLACE + active[t]] > 0.0:
-                active[count] = active[t]
+            if lanes[PLACE + found[t]] > 0.0:
+                active[count] = found[t]
                 count += 1
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _look(active, count, lanes, width, height, room):  # type: ignore[no-untyped-def]
+def _look(active, count, lanes, shape, room):  # type: ignore[no-untyped-def]
     """Project the next steps of the active lanes."""
     for t in range(count):
         m = active[t]
+        # A lane that has not begun looks downwards: its first point is the start, which tells the way.
         way = 1.0 if lanes[WAY + m] > 0.0 else -1.0
-        climb(
-            lanes, m, lanes[BOTTOM + m], lanes[PLACE + m] + way, way, lanes[DZ + m], width, height, room[STEPS * t :]
-        )  # fmt: skip
+        climb(lanes, m, Steps(lanes[BOTTOM + m], lanes[PLACE + m] + way, way, lanes[DZ + m]), shape, room[STEPS * t :])
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -228,6 +250,5 @@ def _upwards(lanes, m, room, first):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True, error_model="numpy")
 def _bracket(lanes, m, step, upper, lower):  # type: ignore[no-untyped-def]
     """The step below ``step``, with s at both ends."""
-    lanes[BRACKET + m], lanes[BRACKET + LANES + m] = lanes[BOTTOM + m] + step * lanes[DZ + m], upper
-    z = lanes[BOTTOM + m] + (step - 1.0) * lanes[DZ + m]
-    lanes[BRACKET + 2 * LANES + m], lanes[BRACKET + 3 * LANES + m] = z, lower
+    lanes[UPPER_Z + m], lanes[UPPER_S + m] = lanes[BOTTOM + m] + step * lanes[DZ + m], upper
+    lanes[LOWER_Z + m], lanes[LOWER_S + m] = lanes[BOTTOM + m] + (step - 1.0) * lanes[DZ + m], lower

@@ -8,7 +8,7 @@ import math
 import numpy as np
 from numba import njit
 
-from rille.stages.terrain.locus.points import LANES, LEFT_A, LEFT_B, NEAR, RIGHT_A, RIGHT_B
+from rille.stages.terrain.locus.points import LANES, LEFT_A, LEFT_B, NEAR, RIGHT_A, RIGHT_B, line_of
 
 STEP_PX = 1.0  # search step: disparity is bilinear between pixels, so nothing hides in a shorter one
 MARGIN = 2  # steps that the interval handed down from the coarse level is widened by
@@ -41,21 +41,18 @@ def clip(n, sizes, z_min, z_max, lanes):  # type: ignore[no-untyped-def]
     """The part of z_min..z_max where each line projects into both images; empty (bottom > top) where there is none."""
     wl, hl, wr, hr = sizes[0] - 1.0, sizes[1] - 1.0, sizes[2] - 1.0, sizes[3] - 1.0
     for m in range(n):
-        a0, a1, a2 = lanes[LEFT_A + m], lanes[LEFT_A + LANES + m], lanes[LEFT_A + 2 * LANES + m]
-        b0, b1, b2 = lanes[LEFT_B + m], lanes[LEFT_B + LANES + m], lanes[LEFT_B + 2 * LANES + m]
-        low, high = _inside(a0, a1, a2, b0, b1, b2, wl, hl, z_min, z_max)
-        a0, a1, a2 = lanes[RIGHT_A + m], lanes[RIGHT_A + LANES + m], lanes[RIGHT_A + 2 * LANES + m]
-        b0, b1, b2 = lanes[RIGHT_B + m], lanes[RIGHT_B + LANES + m], lanes[RIGHT_B + 2 * LANES + m]
-        lanes[BOTTOM + m], lanes[TOP + m] = _inside(a0, a1, a2, b0, b1, b2, wr, hr, low, high)
+        low, high = _inside(line_of(lanes, LEFT_A, LEFT_B, m), wl, hl, z_min, z_max)
+        lanes[BOTTOM + m], lanes[TOP + m] = _inside(line_of(lanes, RIGHT_A, RIGHT_B, m), wr, hr, low, high)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _inside(a0, a1, a2, b0, b1, b2, w, h, low, high):  # type: ignore[no-untyped-def]
-    low, high = _bound(a0, b0, low, high)
-    low, high = _bound(w * a2 - a0, w * b2 - b0, low, high)
-    low, high = _bound(a1, b1, low, high)
-    low, high = _bound(h * a2 - a1, h * b2 - b1, low, high)
-    return _bound(a2 - NEAR, b2, low, high)
+def _inside(line, w, h, low, high):  # type: ignore[no-untyped-def]
+    """The part of low..high where 0 <= x <= w, 0 <= y <= h in front of the camera: x = X / W with W > 0 is X >= 0."""
+    low, high = _bound(line.a0, line.b0, low, high)
+    low, high = _bound(w * line.a2 - line.a0, w * line.b2 - line.b0, low, high)
+    low, high = _bound(line.a1, line.b1, low, high)
+    low, high = _bound(h * line.a2 - line.a1, h * line.b2 - line.b1, low, high)
+    return _bound(line.a2 - NEAR, line.b2, low, high)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -72,12 +69,10 @@ def spans(n, lanes):  # type: ignore[no-untyped-def]
     """Divide the lines into steps of a pixel at most where they are seen fastest."""
     for m in range(n):
         bottom, top = lanes[BOTTOM + m], lanes[TOP + m]
-        a0, a1, a2 = lanes[LEFT_A + m], lanes[LEFT_A + LANES + m], lanes[LEFT_A + 2 * LANES + m]
-        b0, b1, b2 = lanes[LEFT_B + m], lanes[LEFT_B + LANES + m], lanes[LEFT_B + 2 * LANES + m]
-        fastest = max(_speed(bottom, a0, a1, a2, b0, b1, b2), _speed(top, a0, a1, a2, b0, b1, b2))
-        a0, a1, a2 = lanes[RIGHT_A + m], lanes[RIGHT_A + LANES + m], lanes[RIGHT_A + 2 * LANES + m]
-        b0, b1, b2 = lanes[RIGHT_B + m], lanes[RIGHT_B + LANES + m], lanes[RIGHT_B + 2 * LANES + m]
-        fastest = max(fastest, _speed(bottom, a0, a1, a2, b0, b1, b2), _speed(top, a0, a1, a2, b0, b1, b2))
+        # d p / d Z = (a_2 b - b_2 a) / w^2 with w linear in Z: the speed is greatest at one of the ends.
+        left, right = line_of(lanes, LEFT_A, LEFT_B, m), line_of(lanes, RIGHT_A, RIGHT_B, m)
+        fastest = max(_speed(left, bottom), _speed(left, top))
+        fastest = max(fastest, _speed(right, bottom), _speed(right, top))
         count = max(1.0, min(np.ceil(fastest * (top - bottom) / STEP_PX), MAX_STEPS))
         dz = (top - bottom) / count
         lanes[DZ + m], lanes[COUNT + m] = dz, count
@@ -86,9 +81,9 @@ def spans(n, lanes):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _speed(z, a0, a1, a2, b0, b1, b2):  # type: ignore[no-untyped-def]
-    """Image speed |d p / d Z|, pixels per metre."""
-    w = max(a2 + z * b2, NEAR)
-    x, y = (a0 + z * b0) / w, (a1 + z * b1) / w
-    dx, dy = (b0 - x * b2) / w, (b1 - y * b2) / w
+def _speed(line, z):  # type: ignore[no-untyped-def]
+    """Image speed |d p / d Z|, pixels per metre: with p = (a + Z b) / w it is |b - p b_2| / w."""
+    w = max(line.a2 + z * line.b2, NEAR)
+    x, y = (line.a0 + z * line.b0) / w, (line.a1 + z * line.b1) / w
+    dx, dy = (line.b0 - x * line.b2) / w, (line.b1 - y * line.b2) / w
     return math.sqrt(dx * dx + dy * dy)

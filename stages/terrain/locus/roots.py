@@ -10,7 +10,7 @@ import math
 import numpy as np
 from numba import njit
 
-from rille.stages.terrain.locus.points import ACROSS, FX, FY, LANES, LINE, PIXEL, S, X, Y, Z, meet, pixels, project
+from rille.stages.terrain.locus.points import ACROSS, FX, FY, LANES, LINE, PIXEL, S, X, Y, Z, meet, pixels, raise_to
 
 SOLVED_PX = 1e-3  # |s| of a solution: a hundredth of the disparity's own noise
 TURNS = 16
@@ -22,7 +22,7 @@ PLANES = 23
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def roots(n, lanes, epipole, width, height, disparity, room):  # type: ignore[no-untyped-def]
+def roots(n, lanes, epipole, seen, room):  # type: ignore[no-untyped-def]
     """Regula falsi (Illinois); NaN at undefined disparity."""
     for m in range(n):
         lanes[SIDE + m], lanes[OPEN + m] = 0.0, 1.0
@@ -31,8 +31,8 @@ def roots(n, lanes, epipole, width, height, disparity, room):  # type: ignore[no
             z0, s0, z1, s1 = lanes[Z0 + m], lanes[S0 + m], lanes[Z1 + m], lanes[S1 + m]
             z = (z0 * s1 - z1 * s0) / (s1 - s0)
             lanes[Z + m] = z if lanes[OPEN + m] > 0.0 else lanes[Z + m]
-        project(lanes, n, width, height, room)
-        meet(n, epipole, width, disparity, room)
+        raise_to(lanes, n, seen.image.shape, room)
+        meet(n, epipole, seen, room)
         if not _halve(n, lanes, room):
             break
     for m in range(n):
@@ -50,6 +50,7 @@ def _halve(n, lanes, room):  # type: ignore[no-untyped-def]
         lanes[OPEN + m] = 1.0 if still else 0.0
         left += 1 if still else 0
         free = s > 0.0
+        # Illinois: an end that stays twice counts half, else the chord would creep towards the root from one side.
         lanes[Z0 + m], lanes[S0 + m] = (z if free else z0), (s if free else (s0 * 0.5 if side < 0.0 else s0))
         lanes[Z1 + m], lanes[S1 + m] = (z1 if free else z), ((s1 * 0.5 if side > 0.0 else s1) if free else s)
         lanes[SIDE + m] = 1.0 if free else -1.0
@@ -58,34 +59,35 @@ def _halve(n, lanes, room):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def slopes(n, lanes, epipole, width, height, disparity, room):  # type: ignore[no-untyped-def]
+def slopes(n, lanes, epipole, seen, room):  # type: ignore[no-untyped-def]
     """One-sided ds/dZ at the roots, pixels per metre; leaves the roots' own points in ``room``."""
     for m in range(n):
         lanes[Z + m] = lanes[ROOT + m] + lanes[STEP + m]
-    project(lanes, n, width, height, room)
-    meet(n, epipole, width, disparity, room)
+    raise_to(lanes, n, seen.image.shape, room)
+    meet(n, epipole, seen, room)
     for m in range(n):
         lanes[UPWARDS + m] = pixels(room, S, m) / lanes[STEP + m]
         lanes[Z + m] = lanes[ROOT + m] - lanes[STEP + m]
-    project(lanes, n, width, height, room)
-    meet(n, epipole, width, disparity, room)
+    raise_to(lanes, n, seen.image.shape, room)
+    meet(n, epipole, seen, room)
     for m in range(n):
         lanes[DOWNWARDS + m] = -pixels(room, S, m) / lanes[STEP + m]
         lanes[Z + m] = lanes[ROOT + m]
-    project(lanes, n, width, height, room)
-    meet(n, epipole, width, disparity, room)
+    raise_to(lanes, n, seen.image.shape, room)
+    meet(n, epipole, seen, room)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def accept(n, found, cells, lanes, room, disparity, image, std, limits, out, refused):  # type: ignore[no-untyped-def]
-    """Write ``out`` of the roots that stand, list the other lanes in ``refused``; how many those are.
+def accept(n, found, cells, lanes, seen, room, out):  # type: ignore[no-untyped-def]
+    """Write ``out`` of the roots that stand; leave the other lanes in front of ``found``, and return their number.
 
     ``found``: the search's lane of each; ``cells``: the row of ``out`` of each of those."""
+    disparity, std, image, limits = seen
     width, count = image.shape[1], 0
     for m in range(n):
         s, across = pixels(room, S, m), pixels(room, ACROSS, m)
         residual = math.sqrt(s * s + across * across)
-        # The lesser slope, so that a jump nearby does not flatter it.
+        # The lesser slope: beside a jump the other side is steep, and would make the elevation look certain.
         up, down = lanes[UPWARDS + m], lanes[DOWNWARDS + m]
         slope = up if down != down else (down if up != up else min(up, down))
         at = 2 * int(room[PIXEL + m])
@@ -97,7 +99,7 @@ def accept(n, found, cells, lanes, room, disparity, image, std, limits, out, ref
             out[i, 0], out[i, 1], out[i, 2] = lanes[ROOT + m], own / slope, residual
             out[i, 3] = top * (1.0 - fy) + bottom * fy
         else:
-            refused[count] = found[m]
+            found[count] = found[m]  # count <= m: none is lost
             count += 1
     return count
 

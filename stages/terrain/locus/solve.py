@@ -13,7 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 from rille.stages.core.errors import DegenerateError, InputError
 from rille.stages.geometry.geometry import Rig, RigidTransform
 from rille.stages.geometry.surface import Surface
-from rille.stages.terrain.locus.kernel import search
+from rille.stages.terrain.locus.kernel import Cameras, Cells, search
+from rille.stages.terrain.locus.points import Observed
 
 Floats = NDArray[np.float64]
 Float32 = NDArray[np.float32]
@@ -78,16 +79,15 @@ class PairArrays:
         for name, array in zip(("column disparity", "row disparity", "image"), maps, strict=True):
             if array.shape != shape:
                 raise InputError("RIL-396", f"the {name} is {array.shape}, the left camera's image {shape}")
-        self.disparity = np.stack(maps[:2], axis=-1, dtype=np.float32, casting="unsafe")
-        self.disparity[~given.usable] = np.nan
-        self.image = np.ascontiguousarray(maps[2], np.float32)
+        disparity = np.stack(maps[:2], axis=-1, dtype=np.float32, casting="unsafe")
+        disparity[~given.usable] = np.nan
         std = np.full(shape, sigma) if given.std is None else given.std
-        self.std = np.ascontiguousarray(std, np.float64)
-        self.left, self.right = projections(rig, T_surface_left)
-        self.epipole = rig.right.matrix @ rig.T_right_left.translation
-        self.sizes = np.array([rig.left.width, rig.left.height, rig.right.width, rig.right.height], dtype=np.float64)
+        grey, std = np.ascontiguousarray(maps[2], np.float32), np.ascontiguousarray(std, np.float64)
+        self.seen = Observed(disparity.ravel(), std, grey, np.array(limits))
+        epipole = rig.right.matrix @ rig.T_right_left.translation
+        sizes = np.array([rig.left.width, rig.left.height, rig.right.width, rig.right.height], dtype=np.float64)
+        self.cameras = Cameras(*projections(rig, T_surface_left), epipole, sizes)
         self.z_range = float(z_range[0]), float(z_range[1])
-        self.limits = np.array(limits)
 
     def cells(self, surface: Surface, rows: ArrayLike, cols: ArrayLike, low: ArrayLike, high: ArrayLike) -> Floats:
         """Kernel's output (r, c, 4) for the cells rows x cols, searched from low..high (NaN: left out)."""
@@ -95,10 +95,7 @@ class PairArrays:
         shape = feet.shape[:2]
         start = [np.array(np.broadcast_to(v, shape), dtype=np.float64, order="C") for v in (low, high)]
         out = np.full((*shape, 4), np.nan)
-        search(
-            feet, normals, *start, *self.z_range, self.left, self.right, self.epipole, self.sizes,
-            self.disparity.ravel(), self.std, self.image, self.limits, out,
-        )  # fmt: skip
+        search(Cells(feet, normals, *start), self.z_range, self.cameras, self.seen, out)
         return out
 
 

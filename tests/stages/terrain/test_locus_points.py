@@ -23,7 +23,19 @@ from rille.stages.terrain.locus.lines import (
     spans,
 )
 from rille.stages.terrain.locus.lines import PLANES as LINE_PLANES
-from rille.stages.terrain.locus.points import LANES, POINT_PLANES, POINTS, STEPS, Z, climb, meet, pixels, project
+from rille.stages.terrain.locus.points import (
+    LANES,
+    POINT_PLANES,
+    POINTS,
+    STEPS,
+    Observed,
+    Steps,
+    Z,
+    climb,
+    meet,
+    pixels,
+    raise_to,
+)
 
 WIDTH, HEIGHT = 40, 30
 LEFT = np.array([[50.0, 0.0, 20.0, 3.0], [0.0, 50.0, 15.0, -2.0], [0.0, 0.0, 1.0, 1.0]])
@@ -65,18 +77,20 @@ def test_points_of_lanes_and_of_steps_equal_single_points() -> None:
     rng = np.random.default_rng(2)
     disparity = rng.normal(size=(HEIGHT, WIDTH, 2)).astype(np.float32)
     disparity[10:12, 5:9] = np.nan
-    flat, room = disparity.ravel(), np.zeros(POINT_PLANES * POINTS)
+    plain = np.ones((HEIGHT, WIDTH))
+    seen = Observed(disparity.ravel(), plain, plain.astype(np.float32), np.ones(2))
+    room = np.zeros(POINT_PLANES * POINTS)
     step, dz, found = 3.0, 0.02, 0
     for way in (-1.0, 1.0):
         for k in range(len(feet)):
-            climb(lanes, k, -0.2, step, way, dz, WIDTH, HEIGHT, room[STEPS * k :])
-        meet(STEPS * len(feet), EPIPOLE, WIDTH, flat, room)
+            climb(lanes, k, Steps(-0.2, step, way, dz), (HEIGHT, WIDTH), room[STEPS * k :])
+        meet(STEPS * len(feet), EPIPOLE, seen, room)
         steps = room.copy()
         for m in range(STEPS):
             z = -0.2 + (step + way * m) * dz
             lanes[Z : Z + len(feet)] = z
-            project(lanes, len(feet), WIDTH, HEIGHT, room)
-            meet(len(feet), EPIPOLE, WIDTH, flat, room)
+            raise_to(lanes, len(feet), (HEIGHT, WIDTH), room)
+            meet(len(feet), EPIPOLE, seen, room)
             for k in range(len(feet)):
                 expected = mismatch(feet[k] + z * normals[k], disparity)
                 for plane, value in zip((points.S, points.ACROSS), expected, strict=True):
