@@ -98,7 +98,7 @@ def reconstruct(
 
 
 def assignments(settings: Mapping[str, Settings]) -> list[str]:
-    """What ``--set`` takes for the same settings.
+    """Return the same settings as assignments for ``--set``.
 
     >>> assignments({"locus": {"cell_size": 0.002, "both": True}, "drive": {"goal": (0.1, 2.0)}})
     ['locus.cell_size=0.002', 'locus.both=true', 'drive.goal=[ 0.1, 2.0, ]']

@@ -42,7 +42,7 @@ NO_BOARD = 0.1
 
 @dataclass
 class Boards:
-    """What was found in the images: ``views``, and ``left_out`` name and reason of the pairs that cannot be used."""
+    """Boards found in the images: ``views``, and in ``left_out`` name and reason of the pairs that cannot be used."""
 
     corners: tuple[int, int]
     size: tuple[int, int]
@@ -169,7 +169,7 @@ def cover(points: Sequence[NDArray[np.float64]], size: tuple[int, int]) -> float
 
 
 def doubts(found: RigCalibration, boards: Boards, model: str) -> list[str]:
-    """What the user should know before trusting the result, one line each with its figure."""
+    """List reasons to doubt the result, one line each with its figure."""
     lines = [
         warning("RIL-695", f"view {r.name} is left out: its corners miss by {r.worst:.2f} px RMS; remove or retake it")
         for r in found.residuals

@@ -101,7 +101,7 @@ def match_files(
 
 
 def warnings(found: Disparity, left: NDArray[Any], right: NDArray[Any]) -> list[str]:
-    """What is suspicious about two matched images, one line each with the figure."""
+    """List signs that two matched images do not fit, one line each with its figure."""
     from rille.stages.core.validity import Validity, has, matched
     from rille.stages.hfvm import doubt
     from rille.stages.hfvm.swap_check import swapped

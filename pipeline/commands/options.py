@@ -1,4 +1,4 @@
-"""What the commands of ``rille`` have in common: options with their explanation, and the steps before any of them."""
+"""Options that several commands of ``rille`` share, with their explanation, and the steps before each command."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ Runs = Annotated[Path, Parameter(help="Folder of results; each run makes RUNS/se
 @Parameter(name="*")
 @dataclass(frozen=True)
 class Settings:
-    """What decides what is computed, and where it is kept."""
+    """Options that choose the computation and its cache."""
 
     assignments: Assignments = None
     config: Annotated[
@@ -74,7 +74,7 @@ class Settings:
 @Parameter(name="*")
 @dataclass(frozen=True)
 class Results:
-    """Where results are written, and what is said on the way."""
+    """Options of the folder of results and of the messages during a run."""
 
     runs: Runs = RUNS
     progress: Annotated[
@@ -115,7 +115,7 @@ def options(
 
 
 def cache_folder(given: str | Path | None) -> Path | str:
-    """Where the artifact cache is: ``--cache``, else ``RILLE_CACHE``, else ``.rille/cache`` here."""
+    """Return the place of the artifact cache: ``--cache``, else ``RILLE_CACHE``, else ``.rille/cache`` here."""
     from rille.pipeline.engine.store.location import locate
 
     return locate(given or os.environ.get("RILLE_CACHE") or Path(".rille/cache"))

@@ -21,7 +21,7 @@ class Ledger:
             self._file = path.open("w", encoding="utf-8", buffering=1)
 
     def write(self, handle: Handle) -> None:
-        """What became of a node: where its inputs come from, why it was missed, what it took."""
+        """Write the outcome of a node: sources of its inputs, reason of the cache miss, time and memory."""
         if self._file is None:
             return
         row: dict[str, Any] = {"label": handle.label, "stage": handle.stage, "status": handle.status}
@@ -89,7 +89,7 @@ def read(path: Path) -> list[dict[str, Any]]:
 
 
 def facts(path: Path) -> dict[str, Any]:
-    """What is said of the run as a whole; of one that was killed, what was known when it began."""
+    """Read the facts about the run as a whole; a killed run has only those known at its start."""
     found: dict[str, Any] = {}
     for row in _lines(path):
         found |= row.get("run", {})

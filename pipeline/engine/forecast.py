@@ -44,7 +44,7 @@ RENDERED = ("scene", "image", "truth_dem", "dem_accuracy", "risk/truth", "path_c
 
 @dataclass
 class Tally:
-    """What became of the tasks of one kind so far; ``found`` counts those found in the cache after computing began."""
+    """Count the tasks of one kind by outcome; ``found`` counts those found in the cache after computing began."""
 
     computed: int = 0
     found: int = 0
@@ -126,7 +126,7 @@ class Forecast:
         return sum(self.tallies[s].compiling for s in ran) / expected if expected else 0.0
 
     def summary(self) -> dict[str, tuple[float, float, float]]:
-        """What the next run of this sequence takes for earlier."""
+        """Return the figures that the next run of this sequence starts from."""
         found = {}
         for name, tally in self.tallies.items():
             _, seconds, compiling = self.earlier.get(name, (0.0, 0.0, 0.0))
@@ -139,7 +139,7 @@ class Forecast:
 
 
 def recall(hints: Path) -> dict[str, tuple[float, float, float]] | None:
-    """What the last run of a sequence left; ``hints`` is its folder of them. None where there is nothing of use."""
+    """Read the forecast that the last run of a sequence left in ``hints``; None if there is none of use."""
     try:
         known = json.loads((hints / FILE).read_text(encoding="utf-8"))
         return {str(name): (float(share), float(mean), float(first)) for name, (share, mean, first) in known.items()}

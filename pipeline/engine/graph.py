@@ -85,7 +85,7 @@ class Handle:
 
 
 class MissingError(Exception):
-    """What a flow waits for will never have an artifact: these failed, or were left out."""
+    """A flow waits for handles that will never have an artifact, because they failed or were skipped."""
 
     def __init__(self, handles: Sequence[Handle]) -> None:
         super().__init__(", ".join(handle.label for handle in handles))

@@ -27,7 +27,7 @@ SLOW_COMPILE = 1.0
 
 
 class Progress(Protocol):
-    """What the driver tells; every method is called on the driver's thread."""
+    """Receiver of the scheduler's progress; every method is called on the scheduler's thread."""
 
     forecast: Forecast
 

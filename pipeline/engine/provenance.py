@@ -84,7 +84,7 @@ class Known:
 
 
 def differences(then: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
-    """What two recipes differ in, one phrase each: parameters first, then inputs, code and packages."""
+    """List the differences of two recipes, one phrase each: parameters first, then inputs, code and packages."""
     told = _values("params", then.get("params"), now["params"]) + _values("args", then.get("args"), now["args"])
     told += _inputs(then.get("inputs", {}), now["inputs"])
     old, new = then.get("code", {}), now["code"]

@@ -58,7 +58,7 @@ class TaskError(RilleError):
 
 @dataclass
 class Counts:
-    """What became of the nodes of one stage; ``seconds`` is the sum over those computed now."""
+    """Number of nodes of one stage by outcome; ``seconds`` is the sum over those computed now."""
 
     computed: int = 0
     cached: int = 0
@@ -80,7 +80,7 @@ class Failure:
 
 @dataclass
 class Result:
-    """What became of a run. ``keys`` are the artifacts it used (roots for clearing the cache).
+    """Outcome of a run. ``keys`` are the artifacts it used (roots for clearing the cache).
 
     Of a dry run: ``assumed`` are labels whose earlier result served to lay out what follows, ``unknown`` those that
     hide it.

@@ -74,7 +74,7 @@ class Spec:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a task: its artifact, whether it was there, seconds and peak memory (bytes) of the call.
+    """Outcome of a task: its artifact, whether it was cached, seconds and peak memory [bytes] of the call.
 
     ``kernel`` are the seconds of the stage itself, ``started`` is when the call began (seconds since 1970); ``memory``
     and ``rest`` are a :class:`~rille.pipeline.engine.memory.limits.Meter`'s figures, ``first`` says that the process

@@ -1,1 +1,1 @@
-"""What is computed from what: reconstruction, closed loop, configuration."""
+"""The dataflow: reconstruction, closed loop, configuration."""

@@ -265,7 +265,7 @@ class Builder:
     # -- the world ----------------------------------------------------------------------------------------------
 
     def hazards(self, label: str, dems: list[Handle]) -> Handle:
-        """Where the vehicle must not stand, on elevation models that are tiles of one."""
+        """Add the task that judges hazards on the tiles of an elevation model."""
         args = {"vehicle": self.config.vehicle.model_dump(mode="json", exclude={"name"})}
         return self.node(risk, label, args, dem=dems)
 
@@ -276,7 +276,7 @@ def merge_tiles(
     dems: Mapping[int, Handle],
     steps: Mapping[str, int],
 ) -> list[Handle]:
-    """One task for each world tile that a model touches; all that enters it is of the models that do.
+    """Add one task for each world tile that a model touches; it reads these models and nothing else.
 
     Parameters
     ----------

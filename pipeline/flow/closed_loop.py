@@ -95,14 +95,14 @@ class DriveParams(Params):
 
 
 def arena(goal: tuple[float, float], around: float, cell: float) -> Lattice:
-    """What a drive maps: so many metres around its start, which is at the origin, and its goal, m."""
+    """Return the lattice of a drive's map: ``around`` metres around its start (the origin) and its goal [m]."""
     bounds = [f(0.0, g) + s * around for g in goal for f, s in ((min, -1.0), (max, 1.0))]
     return Lattice.snap(bounds, cell)
 
 
 @dataclass(frozen=True)
 class TrueStand:
-    """Where the vehicle truly stands: the ``frame`` taken there, in this row of the artifact ``before``; its up."""
+    """True pose of the vehicle: the ``frame`` taken there, in this row of the artifact ``before``; its up vector."""
 
     frame: int
     before: Handle
@@ -112,7 +112,7 @@ class TrueStand:
 
 @dataclass(frozen=True)
 class Way:
-    """What was recorded on a leg: row of each frame in the leg's artifact, frames that are not lost, sensors."""
+    """Record of a leg: row of each frame in the leg's artifact, frames that are not lost, sensors."""
 
     rows: dict[int, int]
     frames: list[int]

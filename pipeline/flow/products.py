@@ -1,4 +1,4 @@
-"""What a run delivers: handles that the report and the exporters read once the graph has run."""
+"""Products of a run: handles that the report and the exporters read once the graph has run."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Stop:
 
 @dataclass
 class Driven:
-    """What became of a drive: its stops, ``verdict`` (goal, no path, safety stop, stops) and ``reason``."""
+    """Outcome of a drive: its stops, ``verdict`` (goal, no path, safety stop, stops) and ``reason``."""
 
     stops: list[Stop] = field(default_factory=list)
     verdict: str = ""

@@ -224,7 +224,7 @@ def basic_pairs(make: Builder, basic: list[int], first: int) -> dict[int, Pair]:
 
 
 def vertical(make: Builder, pair: int, first: bool) -> dict[str, Any]:
-    """What is known of the vertical of a pair, most trusted first."""
+    """Collect the known facts about the vertical of a pair (attitude, initial pose, pitch) as arguments of a stage."""
     s, args = make.sequence, dict[str, Any]()
     up = None if s.up is None else s.up[pair]
     if up is not None:

@@ -109,7 +109,7 @@ def values(keys: Iterable[str], config: Params) -> str:
 
 
 def remedy(keys: Iterable[str], config: Params) -> str:
-    """What to do about parameters that nothing read."""
+    """Return the remedy for parameters that no task read."""
     sections = dict.fromkeys(key.partition(".")[0] for key in keys)
     off = [s for s in sections if not getattr(getattr(config, s), "enabled", True)]
     return f"set {off[0]}.enabled=true, or leave it out" if off else "leave it out, or choose frames that need it"

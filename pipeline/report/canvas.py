@@ -102,13 +102,13 @@ class Block:
 
     @property
     def anchor(self) -> str:
-        """Where links lead."""
+        """Anchor of the block in the page."""
         return self.name.lower().replace(" ", "-")
 
 
 @dataclass(frozen=True)
 class Figure:
-    """What became of a figure: its block, or why there is none; neither where nobody expects it.
+    """Outcome of a figure: its block, or the reason why there is none; neither if the run has no such figure.
 
     ``failed``: drawing it raised an error, so that the run lacks what it could have shown.
     """
@@ -120,7 +120,7 @@ class Figure:
 
     @staticmethod
     def from_dict(d: Mapping[str, Any]) -> Figure:
-        """What ``dataclasses.asdict`` has taken apart."""
+        """Rebuild a figure from the result of ``dataclasses.asdict``."""
         given = d["block"]
         if given is None:
             return Figure(d["title"], None, d["why"], d["failed"])

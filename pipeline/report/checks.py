@@ -125,7 +125,7 @@ def _signed(value: Any, unit: str) -> str:
 
 
 def basic_pairs(scene: Scene) -> Block | None:
-    """Which pairs became elevation models, and why."""
+    """Draw which pairs became elevation models, and why."""
     view = scene.view
     bundle = view.bundle(view.products.select)
     if bundle is None or len(view.frames) < 2:

@@ -1,4 +1,4 @@
-"""What a run delivers, what nobody asked for or the data do not allow, and what is missing: each from its facts.
+"""Delivered, absent (not asked for, or not possible with the data) and missing results, each from its facts.
 
 A path that was looked for and is not there is missing, though it is an answer: who reads "nothing is missing" takes it
 for granted. Truth that the data do not have and a comparison that is switched off are not missing.
@@ -39,7 +39,7 @@ class Delivery:
 
 
 def account(scene: Scene, frames: Rows, pairs: Rows) -> dict[str, Any]:
-    """What the artifacts tell of the three states: ``delivered``, ``absent`` and ``missing``."""
+    """List ``delivered``, ``absent`` and ``missing`` results as far as the artifacts tell."""
     view = scene.view
     missing = _poses(frames) + _local_paths(pairs) + _path(view) + _crosscheck_lost(scene)
     found = {"delivered": _delivered(view, frames, pairs), "missing": missing}
@@ -84,7 +84,7 @@ def start_of_path(view: RunView) -> float | None:
 
 
 def start_words(view: RunView, lead: str = ", which ") -> str:
-    """Where the path starts, behind a ``lead``; empty where that is within the vehicle's length of the camera."""
+    """Describe the start of the path, after ``lead``; empty if it is within the vehicle's length of the camera."""
     away, vehicle = start_of_path(view), view.config.vehicle
     if away is None or away <= vehicle.wheel_base + vehicle.wheel_diameter:
         return ""

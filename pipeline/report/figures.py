@@ -41,12 +41,12 @@ def disparity(values: Floats, label: str, alt: str) -> Panel:
 
 
 def validity_classes(bits: Bytes) -> Bytes:
-    """Of the validity bits (row, col): 0 measured, 1 interpolated, 2 undefined."""
+    """Classify validity bits (row, col): 0 measured, 1 interpolated, 2 undefined."""
     return np.where(matched(bits), 0, np.where(defined(bits), 1, 2)).astype(np.uint8)
 
 
 def validity(classes: Bytes, alt: str) -> Panel:
-    """Which disparities were measured; ``classes`` (row, col) of :func:`validity_classes`."""
+    """Draw which disparities were measured; ``classes`` (row, col) of :func:`validity_classes`."""
     colors = paint(classes, canvas.MEASURED, canvas.INTERPOLATED, canvas.UNDEFINED)
     return canvas.panel(canvas.fitted((255 * colors).round().astype(np.uint8)), alt)
 

@@ -1,4 +1,4 @@
-"""Which figures a report has: the paper's Figures 3 and 6-9 redrawn from the run, and what else shows its quality."""
+"""List of a report's figures: the paper's Figures 3 and 6-9 redrawn from the run, and figures of its quality."""
 
 from __future__ import annotations
 

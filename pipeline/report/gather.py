@@ -63,12 +63,12 @@ class Track:
 
     @property
     def posed(self) -> NDArray[np.bool_]:
-        """Which frames have a pose, be it in the world or in another piece."""
+        """Frames that have a pose, in the world or in another piece."""
         return np.asarray(self.piece >= 0)
 
     @property
     def in_world(self) -> NDArray[np.bool_]:
-        """Which frames have a pose in the world."""
+        """Frames that have a pose in the world."""
         return np.asarray(np.isfinite(self.left).all(axis=1))
 
 
@@ -148,7 +148,7 @@ class Scene:
 
     @cached_property
     def differences(self) -> list[Difference]:
-        """What successive elevation models say of the same ground."""
+        """Differences of successive elevation models on common ground."""
         return differences(self.view)
 
     @cached_property
@@ -267,7 +267,7 @@ def consecutive(view: RunView, count: int = 4) -> tuple[int, ...]:
 
 
 def calibration(view: RunView) -> Calibration | None:
-    """What became of the rig; None where nothing looked at it."""
+    """Collect the results of the rig's adjustment; None if no task examined the rig."""
     p = view.products
     handles = list({id(handle): handle for handle in p.rigs.values()}.values())
     facts = tuple(bundle.meta for bundle in map(view.bundle, handles) if bundle is not None)
@@ -295,7 +295,7 @@ def _residuals(view: RunView, pair: int) -> tuple[Floats, Floats, Floats] | None
 
 
 def differences(view: RunView) -> list[Difference]:
-    """Of each two successive models that overlap, in the order of the pairs."""
+    """Return the differences of successive models that overlap, in the order of the pairs."""
     found = []
     present = [pair for pair, handle in view.products.world_dem.items() if view.bundle(handle) is not None]
     for before, pair in itertools.pairwise(present):

@@ -73,7 +73,7 @@ def worst(scene: Scene) -> Block | None:
 
 
 def models(scene: Scene) -> Block | None:
-    """What of the seams is each model's own."""
+    """Draw the bias and tilt of each model that explain its seams."""
     found = audit(scene)
     if found is None:
         return None

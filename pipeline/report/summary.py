@@ -19,7 +19,7 @@ FORMAT = 2
 
 
 def gather(view: Any) -> dict[str, Any]:
-    """What the artifacts tell: everything of ``report.json`` that is the same whenever and wherever a run is made."""
+    """Collect the part of ``report.json`` that depends on the artifacts alone, not on time and place of the run."""
     scene = Scene(view)
     frames, pairs = tables.frames(scene), tables.pairs(scene)
     assessed = any(delivery.has_truth(view))
@@ -81,7 +81,7 @@ def _write(folder: Path, view: Any) -> None:
 
 
 def find_warnings(scene: Scene) -> list[str]:
-    """What is suspicious but possible, one line each: of the input, the rig, the choice of pairs, the comparison."""
+    """List warnings, one line each: on the input, the rig, the choice of pairs, the comparison."""
     view = scene.view
     lines = list(view.sequence.warnings)
     lines += scene.calibration.collected("warnings") if scene.calibration is not None else []

@@ -36,7 +36,7 @@ FINE = 254
 
 
 def data(scene: Scene) -> dict[str, Any] | None:
-    """What the script draws, as plain JSON; None without merged terrain.
+    """Return the input of the map's script as plain JSON; None without merged terrain.
 
     ``planes``: pictures with the bytes (height high, height low, sigma), (class and models, reason high, reason low),
     (p_hazard, slope, 0). ``track`` (frame): number, x, y, z, sigma, error or null. All lengths are metres, world frame.

@@ -44,12 +44,12 @@ class RunTiming:
 
     @property
     def least(self) -> float:
-        """What no schedule beats."""
+        """Least possible time [s]: no schedule is faster."""
         return max(self.kernel / self.workers, self.longest)
 
     @property
     def good(self) -> float:
-        """What a run should stay under."""
+        """Time [s] that a good run does not exceed."""
         return FACTOR * self.least + START
 
 

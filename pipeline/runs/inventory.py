@@ -35,7 +35,7 @@ class Holding:
 
 
 def holdings(store: Store, folder: Path) -> list[Holding]:
-    """What is there, the largest sequence first, then in order of size."""
+    """List the artifacts by sequence and stage: the largest sequence first, its stages in order of size."""
     used: dict[str, str] = {}
     for place in roots.folders(store, folder):
         used |= lookup.keys(place)

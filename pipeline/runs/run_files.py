@@ -1,4 +1,4 @@
-"""What a run leaves in its folder: copies of its outputs, which are tasks of its graph, and the page over them."""
+"""Files of a run: copies of its outputs, which are tasks of its graph, and the report."""
 
 from __future__ import annotations
 

@@ -40,7 +40,7 @@ COMPLETE, FAILED, HOLES = 0, 1, 3
 
 @dataclass(frozen=True)
 class Options:
-    """What the command line asks for."""
+    """Options of a run, as the command line gives them."""
 
     sequence: str
     assignments: tuple[str, ...] = ()
@@ -95,7 +95,7 @@ def choose_frames(text: str | None, count: int) -> tuple[int, ...]:
 
 @dataclass(frozen=True)
 class Settled:
-    """What a command works on: ``given`` are dotted keys that the user has set, ``vehicle_source`` who its limits."""
+    """Input of a command: ``given`` are dotted keys that the user has set, ``vehicle_source`` the source of the limits."""
 
     sequence: Sequence
     config: Any
@@ -189,7 +189,7 @@ class _Opened:
         return replace(self, sequence=sequence, frames=frames)
 
     def view(self, **late: Any) -> RunView:
-        """What is drawn; ``late`` is what only the end of the run knows."""
+        """Return the view of the run for the report; ``late`` are facts that are known at its end."""
         from rille.pipeline.export.view import RunView
 
         return RunView(

@@ -1,1 +1,1 @@
-"""Where tasks run."""
+"""Executors: dask workers, or this process."""

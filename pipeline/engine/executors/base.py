@@ -1,4 +1,4 @@
-"""Where tasks run: on workers of dask, or one after the other in this process.
+"""Executors run tasks: on dask workers, or one after the other in this process.
 
 :func:`make` is the one factory. Workers are those of a cluster of this machine (one process a core, one thread
 each), of a scheduler that others have started, or behind a ``Client`` that was handed in: the same code path
@@ -108,7 +108,7 @@ class Executor(Protocol):
 
     @property
     def pages(self) -> str:
-        """Where to watch it, in words; empty if nowhere."""
+        """Sentence with the address of the dashboard; empty without one."""
 
     def free(self) -> bool:
         """Whether it takes more tasks now."""

@@ -143,7 +143,7 @@ class Dask:
 
     @property
     def pages(self) -> str:
-        """Where to watch dask's scheduler at work; its pages are drawn by bokeh, if the scheduler's machine has it."""
+        """Sentence with the address of dask's dashboard, which exists if the scheduler's machine has bokeh."""
         if self._cluster is not None and find_spec("bokeh") is None:
             return "dask has pages to watch once bokeh is installed: pip install bokeh"
         return f"dask at work: {self._client.dashboard_link}"

@@ -48,7 +48,7 @@ class ClusterError(RilleError):
 
 
 def identity() -> dict[str, str]:
-    """What must be the same on client and workers, by name; a package that is missing has no version."""
+    """Return by name the facts that client and workers must share; a missing package has no version."""
     found = {"Python": platform.python_version(), "source code": tree_digest((*OWN, "rille.pipeline"))[:12]}
     for name in PACKAGES:
         try:
@@ -83,7 +83,7 @@ def write_probe(store: Store, name: str) -> None:
 
 
 def read_probe(store: Store, name: str) -> bytes | None:
-    """What was left; None if it is not to be seen."""
+    """Read the probe that the client wrote; None if this machine cannot see it."""
     return store.place.read(f"probe/{name}")
 
 

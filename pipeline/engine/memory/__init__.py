@@ -1,1 +1,1 @@
-"""What tasks cost, and what may run side by side."""
+"""Cost of tasks in memory, and the choice of tasks that run side by side."""

@@ -1,4 +1,4 @@
-"""Which task may begin: those of a run together stay under a limit of memory, and in the order of their creation.
+"""Admission of tasks: running tasks together stay under a limit of memory, and begin in the order of creation.
 
 What is held: by this process, by each worker between tasks, and by each running task as foreseen
 (:mod:`rille.pipeline.engine.memory.cost_model`). A task begins where the sum stays under the limit; a later one may
@@ -82,7 +82,7 @@ class Admission:
         self._free, self._asked = 0.0, -math.inf
 
     def foresee(self, handle: Handle) -> Foreseen:
-        """What a task will take; results of tasks that run count as foreseen."""
+        """Foresee the cost of a task; results of running tasks count as foreseen."""
         asked = handle.index, bool(handle.key)
         if asked not in self._foreseen:
             results = {h.index: f.result for h in handle.upstream() if (f := self._running.get(h.index)) is not None}
@@ -139,7 +139,7 @@ class Admission:
 
 
 def forecast(graph: Graph, costs: Costs) -> dict[int, Foreseen]:
-    """What each planned task of a dry run will take, by index; results still to come count as foreseen."""
+    """Foresee the cost of each planned task of a dry run, by index; results still to come count as foreseen."""
     found: dict[int, Foreseen] = {}
     results: dict[int, float] = {}
     for handle in graph.nodes:  # inputs come before what they lead to

@@ -1,4 +1,4 @@
-"""What tasks cost in memory and bytes: remembered from earlier runs of a sequence, and foreseen for those to come.
+"""Cost of tasks in memory and bytes: remembered from earlier runs of a sequence, foreseen for new tasks.
 
 Each run leaves, for each stage and each set of its parameters, samples of what its tasks took: bytes of their inputs,
 memory, bytes of the result decoded and on disk (``costs.json``, a hint like the explanations: where it is missing or
@@ -59,7 +59,7 @@ Sample = tuple[float, float | None, float, float]
 
 @dataclass(frozen=True)
 class Foreseen:
-    """What a task will take, bytes: memory beyond a resting worker's, relative uncertainty, result, and why."""
+    """Foreseen cost of a task [bytes]: memory beyond an idle worker's, relative uncertainty, result, and the reason."""
 
     memory: float
     spread: float
@@ -84,7 +84,7 @@ class Group:
 
 
 class Costs:
-    """What is remembered on a cache."""
+    """Costs remembered with a cache."""
 
     def __init__(self, groups: dict[str, dict[str, Group]] | None = None, rests: list[float] | None = None) -> None:
         self.groups = groups or {}
@@ -99,7 +99,7 @@ class Costs:
         return known[int(0.9 * (len(known) - 1))] if known else REST
 
     def foresee(self, spec: Spec, size: float) -> Foreseen:
-        """What a task with ``size`` bytes of input will take."""
+        """Foresee the cost of a task with ``size`` bytes of input."""
         stage, params = spec.stage, self._name(spec.params)
         asked = (stage.name, params, size)
         if asked not in self._foreseen:
@@ -225,7 +225,7 @@ def _meta(handle: Handle) -> Any:
 
 
 def recall(hints: Path) -> Costs:
-    """What is remembered in a sequence's folder of hints; nothing where that cannot be read."""
+    """Read the costs from a sequence's folder of hints; empty if they cannot be read."""
     try:
         known = json.loads((hints / FILE).read_text(encoding="utf-8"))
         groups = {

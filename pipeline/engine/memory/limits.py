@@ -67,7 +67,7 @@ def total(root: Path = Path("/")) -> int:
 
 
 def free(root: Path = Path("/")) -> int:
-    """What this process and its children may still take, bytes."""
+    """Return the memory [bytes] that this process and its children may still take."""
     machine = int(psutil.virtual_memory().available)
     return max(0, min([machine, *_resource(), *(limit - used for limit, used in _groups(root))]))
 

@@ -141,7 +141,7 @@ def guard() -> None:
 
 
 def folder() -> Path:
-    """Where the kernels of own modules lie."""
+    """Return the folder of compiled kernels."""
     return private_folder() / "kernels"
 
 

@@ -165,7 +165,7 @@ class Store:
         return manifest
 
     def path(self, ref: Ref) -> str:
-        """What ``xarray.open_zarr`` opens an artifact by."""
+        """Return the address by which ``xarray.open_zarr`` opens an artifact."""
         return self.place.url(ref.path)
 
     def open(self, ref: Ref) -> Bundle:

@@ -38,7 +38,7 @@ def coordinates(lattice: Lattice, frame: str) -> dict[str, tuple[NDArray[np.floa
 def attributes(
     name: str, about: Mapping[str, Any], names: Mapping[str, Any], lattice: Lattice | None
 ) -> dict[str, str]:
-    """What an array's attributes say of its coordinates, and of the array that holds its standard deviation."""
+    """Return the attributes of an array that name its coordinates and its standard deviation."""
     found = {}
     if lattice is not None and about["dims"] == DIMS and about["shape"] == list(lattice.shape):
         found["coordinates"] = "x y"
@@ -48,5 +48,5 @@ def attributes(
 
 
 def source(stage: Stage) -> str:
-    """What made the arrays, in words."""
+    """Return the attribute ``source``: a sentence about the program that made the arrays."""
     return f"Rille, stage {stage.name}, version {stage.version}: {stage.summary}"

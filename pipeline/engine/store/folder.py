@@ -130,7 +130,7 @@ class Folder:
             (self.root / above).rmdir()
 
     def url(self, path: str) -> str:
-        """Of an archive, as fsspec writes it."""
+        """Return the URL of an archive in fsspec's notation."""
         return f"zip::{self.root / path}"
 
     @contextmanager

@@ -77,7 +77,7 @@ class Index:
                 print(f"rille: {item.path} in the cache is passed over: {error}", file=sys.stderr)
 
     def get(self, stage: str, item: Item, key: str) -> Ref | None:
-        """What was found in a file, if it still is that."""
+        """Return the reference to an artifact if its file is unchanged since it was entered, else None."""
         line = self.lines.get(key, "")
         if not line.startswith(f'["{item.mark}",'):
             self.lines.pop(key, None)

@@ -1,4 +1,4 @@
-"""Where a cache is: a folder, or ``s3://bucket/prefix``; and the local folder of what is only a hint.
+"""Location of a cache: a folder, or ``s3://bucket/prefix``; and the local folder of its hints.
 
 Keys for explanations and mean times are hints of one machine. With a cache in a bucket they are kept in a folder
 beside it on this machine (``RILLE_LOCAL``, else ``.rille/local``).

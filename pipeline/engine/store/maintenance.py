@@ -38,7 +38,7 @@ class Damage:
 
 @dataclass
 class Cleared:
-    """What was removed, or would be."""
+    """Artifacts and bytes that were removed, or would be in a dry run."""
 
     artifacts: int = 0
     orphans: int = 0

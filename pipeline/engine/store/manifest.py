@@ -151,14 +151,14 @@ def _counts(*values: Any) -> bool:
 
 
 def reference(manifest: Manifest) -> Ref:
-    """What a manifest is referred to by."""
+    """Return the reference to the artifact of a manifest."""
     m = manifest
     nbytes = sum(int(a["dtype"][2:]) * math.prod(a["shape"]) for a in m["arrays"].values())
     return Ref(m["key"], m["stage"], m["digest"], artifact_path(m["stage"], m["key"]), m["meta"], nbytes, m["size"])
 
 
 def damage(manifest: Manifest, data: bytes) -> str:
-    """What is wrong with a whole file whose manifest is sound, in words; empty if nothing."""
+    """Describe the damage of a whole file whose manifest is sound; empty if there is none."""
     if len(data) != manifest["size"]:
         return f"it has {len(data)} bytes instead of {manifest['size']}"
     for name, (start, size, crc) in manifest["files"].items():
@@ -169,7 +169,7 @@ def damage(manifest: Manifest, data: bytes) -> str:
 
 
 def difference(label: str, new: Manifest, old: Manifest) -> str:
-    """What two results of one key differ in, in words."""
+    """Describe the difference of two results of one key."""
     names = sorted({*new["arrays"], *old["arrays"]})
     other = [n for n in names if new["arrays"].get(n, {}).get("sha256") != old["arrays"].get(n, {}).get("sha256")]
     what = ", ".join(other + (["meta"] if new["meta"] != old["meta"] else []))

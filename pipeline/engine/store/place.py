@@ -1,4 +1,4 @@
-"""What a store asks of the place that holds its files: a folder, or a prefix of a bucket.
+"""Interface between a store and the place of its files: a folder, or a prefix of a bucket.
 
 Paths are relative, with ``/``. Nothing here knows what an artifact is.
 """
@@ -40,7 +40,7 @@ class Place(Protocol):
         """Before many questions for the status of artifacts: ask all of them at once, if that is faster."""
 
     def status(self, path: str, *, fresh: bool = False) -> Item | None:
-        """What is at a path, None if nothing; ``fresh`` does not rely on a survey."""
+        """Return the status of a path, None if nothing is there; ``fresh`` does not rely on a survey."""
 
     def use(self, item: Item) -> Item | None:
         """Note that a file is in use, if the place can: from then on :meth:`clear` spares it. None if it has gone."""
@@ -67,4 +67,4 @@ class Place(Protocol):
         """Remove files, but those that were changed or used since they were listed, if the place can tell."""
 
     def url(self, path: str) -> str:
-        """What ``xarray.open_zarr`` opens an artifact by."""
+        """Return the address by which ``xarray.open_zarr`` opens an artifact."""

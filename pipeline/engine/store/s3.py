@@ -182,7 +182,7 @@ class Bucket:
         return self._again(pages)
 
     def url(self, path: str) -> str:
-        """Of an archive, as fsspec writes it (which needs s3fs)."""
+        """Return the URL of an archive in fsspec's notation (fsspec needs s3fs to open it)."""
         return f"zip::{self.location}/{path}"
 
     @contextmanager
