@@ -95,7 +95,7 @@ def choose_frames(text: str | None, count: int) -> tuple[int, ...]:
 
 @dataclass(frozen=True)
 class Settled:
-    """Input of a command: ``given`` are dotted keys that the user has set, ``vehicle_source`` the source of the limits."""
+    """Input of a command; ``given``: dotted keys set by the user, ``vehicle_source``: the source of the limits."""
 
     sequence: Sequence
     config: Any
