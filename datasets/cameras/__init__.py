@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from rille.datasets.cameras import boofcv, colmap, kitti, middlebury, opencv, slam, tsai
+from rille.datasets.cameras import boofcv, colmap, kitti, middlebury, opencv, pds, slam, tsai
 from rille.datasets.cameras.fields import Fields
 from rille.datasets.cameras.model import UNKNOWN_SIZE, CalibratedCamera
 from rille.datasets.cameras.pair import rig_of
@@ -17,10 +17,11 @@ __all__ = ["UNKNOWN_SIZE", "CalibratedCamera", "read_cameras", "rig_of"]
 
 KNOWN = (
     "OpenCV (YAML, XML), ROS camera_info, Kalibr, EuRoC sensor.yaml, ORB-SLAM, BoofCV, COLMAP, Middlebury calib.txt, "
-    "KITTI and ASP .tsai are read"
+    "KITTI, ASP .tsai and PDS3 or VICAR labels (CAHV, CAHVOR, CAHVORE) are read"
 )
 
 PLAIN: tuple[tuple[Callable[[str], bool], Callable[[str, Path], list[CalibratedCamera]]], ...] = (
+    (pds.is_label, pds.label),
     (tsai.is_tsai, tsai.tsai),
     (middlebury.is_middlebury, middlebury.middlebury),
     (colmap.is_colmap, colmap.colmap),
@@ -51,7 +52,7 @@ def read_cameras(path: Path) -> list[CalibratedCamera]:
     InputError
         The file cannot be read or holds no camera, or an entry is missing or wrong; then the line names the key.
     """
-    text = read_text(path, "calibration")
+    text = pds.attached(path) or read_text(path, "calibration")
     for recognises, read in PLAIN:
         if recognises(text):
             return read(text, path)

@@ -7,6 +7,10 @@ Models and the order of their coefficients are OpenCV's:
 * ``rational``: k1 k2 p1 p2 k3 k4 k5 k6 [s1 s2 s3 s4]; the last four are its thin prism;
 * ``fisheye`` (Kannala, Brandt 2006, doi:10.1109/TPAMI.2006.153): k1 k2 k3 k4; Kalibr calls it equidistant.
 
+One more is that of NASA's rovers, see :mod:`rille.stages.geometry.cahvore`:
+
+* ``cahvore``: skew (pixels of row by a unit of x), optical axis O (3), R (3), linearity; for far points, so without E.
+
 Raw pixels are those of the image as it was taken; ideal pixels those of a pinhole camera in its place.
 """
 
@@ -24,11 +28,18 @@ from numpy.polynomial import Polynomial
 from numpy.typing import ArrayLike, NDArray
 
 from rille.stages.core.errors import InputError
+from rille.stages.geometry.cahvore import Bending
 from rille.stages.geometry.geometry import Camera
 
 Floats = NDArray[np.float64]
 
-COUNTS: Mapping[str, tuple[int, ...]] = {"none": (0,), "radtan": (4, 5), "rational": (8, 12), "fisheye": (4,)}
+COUNTS: Mapping[str, tuple[int, ...]] = {
+    "none": (0,),
+    "radtan": (4, 5),
+    "rational": (8, 12),
+    "fisheye": (4,),
+    "cahvore": (8,),
+}
 """How many coefficients each model takes."""
 
 LEAST_FOCAL = 0.7
@@ -84,7 +95,7 @@ class Lens:
         but no further than to ``LEAST_FOCAL`` of itself. What lies beyond (more than 60 degrees off the axis) is lost.
         """
         c = self.camera
-        if self.model != "fisheye":
+        if self.model != "fisheye" and not (self.model == "cahvore" and self._bending.linearity < 1):
             return c
         w, h = c.width - 1.0, c.height - 1.0
         edges = np.array([[0.0, c.cy], [w, c.cy], [c.cx, 0.0], [c.cx, h]])
@@ -99,7 +110,7 @@ class Lens:
     def reach(self) -> float:
         """Tangent of the angle off the axis up to which the radial model grows; beyond it, it folds back."""
         k = self.coefficients
-        if self.model == "none":
+        if self.model in ("none", "cahvore"):  # which knows by itself
             return math.inf
         if self.model == "fisheye":
             angle = _first_root(Polynomial([1.0, *((2 * n + 3) * v for n, v in enumerate(k))]))
@@ -109,6 +120,11 @@ class Lens:
         s = Polynomial([0.0, 1.0])
         growth = (above + 2 * s * above.deriv()) * below - 2 * s * above * below.deriv()
         return min(_first_root(growth), _first_root(below))
+
+    @cached_property
+    def _bending(self) -> Bending:
+        _, ox, oy, oz, r0, r1, r2, linearity = self.coefficients
+        return Bending((ox, oy, oz), (r0, r1, r2), linearity=linearity)
 
     def distort(self, points: ArrayLike, ideal: Camera | None = None) -> Floats:
         """Raw pixels of ideal ones.
@@ -140,6 +156,10 @@ class Lens:
         ideal = ideal or self.ideal_camera()
         if self.model == "none" or not len(raw):
             return ideal.project(self.camera.rays(raw))
+        if self.model == "cahvore":
+            bent = self.camera.rays(raw)
+            bent[:, 1] -= self.coefficients[0] / self.camera.fy * bent[:, 0]
+            return ideal.project(self._bending.straighten(bent)[1])
         rays = np.column_stack([self._start(raw), np.ones(len(raw))])
         with np.errstate(all="ignore"):
             todo = np.arange(len(raw))
@@ -157,6 +177,10 @@ class Lens:
     def maps(self, ideal: Camera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Raw column and row, (row, col) of ``ideal``'s image, of every ideal pixel; NaN where the model folds back."""
         size = (ideal.width, ideal.height)
+        if self.model == "cahvore":
+            raw = self.distort(np.stack(np.meshgrid(*map(np.arange, size)), axis=-1).reshape(-1, 2), ideal)
+            column, row = raw.astype(np.float32).T.reshape(2, ideal.height, ideal.width)
+            return column, row
         k, d = self.camera.matrix, np.array(self.coefficients)
         if self.model == "fisheye":
             x, y = cv2.fisheye.initUndistortRectifyMap(k, d, np.eye(3), ideal.matrix, size, cv2.CV_32FC1)
@@ -174,6 +198,11 @@ class Lens:
         raw = np.empty((len(rays), 2))
         for at in range(0, len(rays), CHUNK):
             part = np.ascontiguousarray(rays[at : at + CHUNK])
+            if self.model == "cahvore":
+                bent = self._bending.bend(part)
+                raw[at : at + CHUNK] = self.camera.project(bent)
+                raw[at : at + CHUNK, 1] += self.coefficients[0] * bent[:, 0] / bent[:, 2]
+                continue
             if self.model == "fisheye":
                 out = cv2.fisheye.distortPoints(part[None, :, :2].copy(), k, d)
             else:

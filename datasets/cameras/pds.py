@@ -1,0 +1,144 @@
+"""Cameras in PDS3 and VICAR labels: CAHV, CAHVOR and CAHVORE (``GEOMETRIC_CAMERA_MODEL``).
+
+Components 1 to 7 are C, A, H, V, O, R and E; 8 is the type of a CAHVORE (1 perspective, 2 fisheye, 3 general) and 9 the
+linearity of type 3. Pixels count from 0 at the centre of the first one. The label may stand before the image in one
+file. Source: PDS3 data dictionary, ``GEOMETRIC_CAMERA_MODEL`` and ``MODEL_COMPONENT_1`` to ``_9``.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from rille.datasets.cameras.fields import Fields
+from rille.datasets.cameras.model import UNKNOWN_SIZE, CalibratedCamera
+from rille.datasets.text.reading import SMALL, open_regular
+from rille.stages.geometry.lens import Lens
+
+MOST_IMAGE = 2**31
+"""Bytes of a file whose label is read."""
+
+BEGINS = (b"PDS_VERSION_ID", b"ODL_VERSION_ID", b"CCSD3ZF", b"LBLSIZE=")
+END = re.compile(r"^END[ \t\r]*$", re.MULTILINE)
+GROUP = re.compile(r"^[ \t]*(?:GROUP|OBJECT)[ \t]*=[ \t]*\"?GEOMETRIC_CAMERA_MODEL[A-Z_]*\"?[ \t\r]*$", re.MULTILINE)
+GROUP_END = re.compile(r"^[ \t]*END_(?:GROUP|OBJECT)\b", re.MULTILINE)
+PROPERTY = re.compile(r"\bPROPERTY='GEOMETRIC_CAMERA_MODEL[A-Z_]*'")
+PROPERTY_END = re.compile(r"\b(?:PROPERTY|TASK)='")
+COMPONENT = re.compile(r"\bMODEL_COMPONENT_([1-9])\s*=\s*(\([^()]{0,400}\)|[^\s(),]{1,60})")
+TYPE = re.compile(r"\bMODEL_TYPE\s*=\s*[\"']?([A-Z]{1,20})\b")
+UNIT = re.compile(r"<[^<>]{0,40}>")
+
+COUNTS = {"CAHV": 4, "CAHVOR": 6, "CAHVORE": 8}
+"""Components that each model has at least."""
+
+SKEW = 1e-6
+"""Share of the focal length below which columns and rows are perpendicular."""
+
+UNIT_LENGTH = 1e-3
+"""By which A and O, as they are written, may miss it."""
+
+
+def attached(path: Path) -> str:
+    """The label at the beginning of a file that is an image; empty where it has none."""
+    with open_regular(path, "calibration", MOST_IMAGE) as file:
+        start = file.read(16)
+        if not start.startswith(BEGINS):
+            return ""
+        text = (start + file.read(SMALL)).decode("latin-1")
+    if text.startswith("LBLSIZE="):
+        size = re.match(r"LBLSIZE=(\d{1,7})\b", text)
+        return text[: int(size[1])] if size is not None else ""
+    end = END.search(text)
+    return text if end is None else text[: end.start()]
+
+
+def is_label(text: str) -> bool:
+    """Whether this is the text of a label with a camera."""
+    return GROUP.search(text) is not None or PROPERTY.search(text) is not None
+
+
+def label(text: str, path: Path) -> list[CalibratedCamera]:
+    """The camera, named by its file; its pose refers to the label's frame. The lens is that of far points.
+
+    The image size is unknown: it is that of the images.
+    """
+    f = _entries(text, path)
+    kind = f.text("MODEL_TYPE")
+    if kind not in COUNTS:
+        raise f.error("RIL-952", "MODEL_TYPE", f"= {kind} is not read", f"{', '.join(COUNTS)} are")
+    c, a, h, v = (np.array(f.numbers(f"MODEL_COMPONENT_{k}", 3)) for k in range(1, 5))
+    axis = a = _unit(f, "MODEL_COMPONENT_2", a)
+    radial, linearity = (0.0, 0.0, 0.0), 1.0
+    if kind != "CAHV":
+        axis = _unit(f, "MODEL_COMPONENT_5", np.array(f.numbers("MODEL_COMPONENT_5", 3)))
+        r0, r1, r2 = f.numbers("MODEL_COMPONENT_6", 3)
+        radial = (r0, r1, r2)
+    if kind == "CAHVORE":
+        f.numbers("MODEL_COMPONENT_7", 3)  # of near points alone
+        linearity = _linearity(f)
+    return [_camera(f, path.stem, (c, a, h, v), (axis, radial, linearity))]
+
+
+def _camera(
+    f: Fields, name: str, cahv: tuple[np.ndarray, ...], bending: tuple[np.ndarray, tuple, float]
+) -> CalibratedCamera:
+    """Camera with its axes along A and along columns: x is the part of H across A."""
+    c, a, h, v = cahv
+    axis, radial, linearity = bending
+    cx, cy = float(h @ a), float(v @ a)
+    fx = float(np.linalg.norm(h - cx * a))
+    if fx <= SKEW * abs(cx):
+        raise f.error("RIL-957", "MODEL_COMPONENT_3", "is along the axis: the columns have no direction")
+    x = (h - cx * a) / fx
+    y = np.cross(a, x)
+    skew, fy = float(v @ x), float(v @ y)
+    if fy < 0:
+        raise f.error("RIL-953", "MODEL_COMPONENT_4", "mirrors the image", "give a model without mirroring")
+    camera = f.camera("MODEL_COMPONENT_3", (fx, fy, cx, cy), UNKNOWN_SIZE)
+    axes = np.array([x, y, a])
+    T_camera_reference = f.rigid("MODEL_COMPONENT_2", axes, -axes @ c)
+    if not any(radial) and linearity == 1.0 and abs(skew) <= SKEW * fy:
+        lens = Lens(camera)
+    else:
+        terms = (skew, *map(float, axes @ axis), *radial, linearity)
+        lens = f.lens("MODEL_COMPONENT_5", camera, "cahvore", terms)
+    return CalibratedCamera(name, lens, T_camera_reference)
+
+
+def _entries(text: str, path: Path) -> Fields:
+    """The first camera model of a label: its type and components."""
+    begin, close = GROUP.search(text), GROUP_END
+    if begin is None:
+        begin, close = PROPERTY.search(text), PROPERTY_END
+    assert begin is not None
+    end = close.search(text, begin.end())
+    part = UNIT.sub(" ", text[begin.end() : end.start() if end else len(text)])
+    values: dict[str, object] = {}
+    for number, value in COMPONENT.findall(part):
+        words = value.strip("()").replace(",", " ").split()
+        values.setdefault(f"MODEL_COMPONENT_{number}", words if len(words) > 1 else words[0] if words else None)
+    kind = TYPE.search(part)
+    if kind is not None:
+        values["MODEL_TYPE"] = kind[1]
+    return Fields(values, str(path), "GEOMETRIC_CAMERA_MODEL.")
+
+
+def _unit(f: Fields, key: str, vector: np.ndarray) -> np.ndarray:
+    length = float(np.linalg.norm(vector))
+    if not abs(length - 1.0) < UNIT_LENGTH:
+        raise f.error("RIL-954", key, f"has the length {length:.6g}, it should be a unit vector")
+    return np.asarray(vector / length)
+
+
+def _linearity(f: Fields) -> float:
+    kind = f.number("MODEL_COMPONENT_8")
+    if kind not in (1, 2, 3):
+        raise f.error("RIL-955", "MODEL_COMPONENT_8", f"= {kind:g} is no type of CAHVORE", "1, 2 or 3")
+    if kind < 3:
+        return 2.0 - kind
+    linearity = f.number("MODEL_COMPONENT_9")
+    if not -1.0 <= linearity <= 1.0:
+        raise f.error("RIL-956", "MODEL_COMPONENT_9", f"= {linearity:g} is no linearity", "-1 to 1")
+    return linearity

@@ -1,0 +1,156 @@
+"""Camera models CAHV, CAHVOR and CAHVORE of NASA's rovers: point to pixel, and pixel to ray.
+
+A point P of the reference frame, p = P - C, is imaged at column p''.H / p''.A and row p''.V / p''.A, pixel centres at
+integers (CAHV: p'' = p). With w = p.O along the optical axis and l = p - w O across it:
+
+* CAHVOR bends the ray: p'' = p + mu l, mu = R0 + R1 x^2 + R2 x^4, x = |l| / w.
+* CAHVORE also moves the entrance pupil along O by (t / sin t - 1) e(t), e = E0 + E1 t^2 + E2 t^4, for a ray at the
+  angle t to O, so that w sin t - |l| cos t = (t - sin t) e(t). Then p'' = |l| / x O + (1 + mu) l with
+  x = tan(L t) / L, sin(L t) / L or t for a linearity L above, below or equal to 0 (perspective lens 1, fisheye 0).
+
+CAHVOR is CAHVORE with E = 0 and L = 1. Rays of far points meet in C whatever E is.
+
+Sources: Yakimovsky, Cunningham (1978), doi:10.1016/0146-664X(78)90112-0; Gennery (2001), Least-squares camera
+calibration including lens distortion and automatic editing of calibration points; Gennery (2006), Generalized camera
+calibration including fish-eye lenses, doi:10.1007/s11263-006-5168-1; Di, Li (2004), doi:10.1029/2003JE002199.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Floats = NDArray[np.float64]
+Vector = tuple[float, float, float]
+
+STEPS = 30
+"""Newton steps; they double the digits from a start that is right to some percent."""
+
+SOLVED = 1e-14
+"""Radians, and shares of a radius, at which Newton's method ends."""
+
+
+@dataclass(frozen=True)
+class Bending:
+    """What a lens does to rays: optical axis O (unit length), radial terms R, entrance pupil E (m), linearity L."""
+
+    axis: Vector
+    radial: Vector = (0.0, 0.0, 0.0)
+    pupil: Vector = (0.0, 0.0, 0.0)
+    linearity: float = 1.0
+
+    def bend(self, points: Floats) -> Floats:
+        """Directions (n, 3) p'' of points (n, 3) relative to C; NaN beyond what the lens sees."""
+        o = np.asarray(self.axis)
+        along = points @ o
+        across = points - along[:, None] * o
+        far = np.linalg.norm(across, axis=1)
+        with np.errstate(all="ignore"):
+            chi = self._chi(self._angle(along, far))
+            central = far <= 1e-12 * np.abs(along)  # no direction across: the point itself
+            scaled = np.where(central, along, far / np.where(central, 1.0, chi))
+            factor = 1.0 + _even(self.radial, np.where(central, 0.0, chi))
+        return np.asarray(scaled[:, None] * o + factor[:, None] * across)
+
+    def straighten(self, directions: Floats) -> tuple[Floats, Floats]:
+        """Inverse of :meth:`bend`: origins (n, 3) relative to C, m, and unit rays (n, 3); NaN where there is none."""
+        o = np.asarray(self.axis)
+        along = directions @ o
+        across = directions - along[:, None] * o
+        far = np.linalg.norm(across, axis=1)
+        with np.errstate(all="ignore"):
+            angle = self._angle_of(self._unbent(np.where(along > 0, far / along, np.nan)))
+            sine = np.sin(angle)
+            unit = np.where(far[:, None] > 0, across / far[:, None], 0.0)
+            moved = np.where(angle > 0, (angle / sine - 1.0) * _even(self.pupil, angle), 0.0)
+        return moved[:, None] * o, np.cos(angle)[:, None] * o + sine[:, None] * unit
+
+    def reach(self) -> float:
+        """Angle to O, radians, up to which pixels move outwards."""
+        r = self.radial
+        roots = np.roots([5.0 * r[2], 3.0 * r[1], 1.0 + r[0]]) if any(r) else np.empty(0)
+        real = roots.real[(np.abs(roots.imag) < 1e-12) & (roots.real > 0)]
+        limit = math.pi if self.linearity == 0 else 0.5 * math.pi / abs(self.linearity)
+        if not real.size:
+            return limit
+        angle = float(self._angle_of(np.array([math.sqrt(float(real.min()))]))[0])
+        return limit if math.isnan(angle) else min(angle, limit)
+
+    def _angle(self, along: Floats, far: Floats) -> Floats:
+        """Angle t between O and the ray through a point, by Newton's method."""
+        angle = np.arctan2(far, along)
+        if not any(self.pupil):
+            return angle
+        _, e1, e2 = self.pupil
+        for _ in range(STEPS):
+            sine, cosine, shift = np.sin(angle), np.cos(angle), _even(self.pupil, angle)
+            slope = 2.0 * e1 * angle + 4.0 * e2 * angle**3
+            miss = along * sine - far * cosine - (angle - sine) * shift
+            step = miss / (along * cosine + far * sine - (1.0 - cosine) * shift - (angle - sine) * slope)
+            angle = angle - step
+            if not (np.abs(step) > SOLVED).any():
+                break
+        return angle
+
+    def _chi(self, angle: Floats) -> Floats:
+        t = np.where(angle < self.reach(), angle, np.nan)
+        if self.linearity == 0:
+            return t
+        turned = self.linearity * t
+        return np.asarray((np.tan(turned) if self.linearity > 0 else np.sin(turned)) / self.linearity)
+
+    def _angle_of(self, chi: Floats) -> Floats:
+        if self.linearity == 0:
+            return chi
+        turned = self.linearity * chi
+        return np.asarray((np.arctan(turned) if self.linearity > 0 else np.arcsin(turned)) / self.linearity)
+
+    def _unbent(self, bent: Floats) -> Floats:
+        """The x whose (1 + mu(x)) x is given, by Newton's method; NaN where there is none."""
+        if not any(self.radial):
+            return bent
+        r0, r1, r2 = self.radial
+        chi = bent / (1.0 + r0)
+        for _ in range(STEPS):
+            square = chi * chi
+            step = ((1.0 + _even(self.radial, chi)) * chi - bent) / (1 + r0 + 3 * r1 * square + 5 * r2 * square**2)
+            chi = chi - step
+            if not (np.abs(step) > SOLVED * np.maximum(1.0, np.abs(chi))).any():
+                break
+        solved = np.abs((1.0 + _even(self.radial, chi)) * chi - bent) < 1e-12 * np.maximum(1.0, bent)
+        return np.where(solved & (chi >= 0), chi, np.nan)
+
+
+@dataclass(frozen=True)
+class Cahvore:
+    """A camera in its reference frame, metres: centre C, axis A (unit), H and V (pixels), and its lens."""
+
+    c: Vector
+    a: Vector
+    h: Vector
+    v: Vector
+    lens: Bending
+
+    def project(self, points: ArrayLike) -> Floats:
+        """Column and row (n, 2) of points (n, 3), m; NaN behind the camera and beyond what the lens sees."""
+        bent = self.lens.bend(np.asarray(points, np.float64) - self.c)
+        depth = bent @ np.asarray(self.a)
+        depth = np.where(depth > 0, depth, np.nan)
+        return np.column_stack([bent @ np.asarray(self.h) / depth, bent @ np.asarray(self.v) / depth])
+
+    def rays(self, pixels: ArrayLike) -> tuple[Floats, Floats]:
+        """Origins (n, 3), m, and unit directions (n, 3) of pixels (n, 2) column, row, in the reference frame."""
+        p = np.asarray(pixels, np.float64)
+        a = np.asarray(self.a)
+        directions = np.cross(np.asarray(self.h) - p[:, :1] * a, np.asarray(self.v) - p[:, 1:] * a)
+        directions *= np.sign(directions @ a)[:, None]
+        origins, rays = self.lens.straighten(directions)
+        return origins + self.c, rays
+
+
+def _even(terms: Vector, x: Floats) -> Floats:
+    square = x * x
+    return np.asarray(terms[0] + square * (terms[1] + square * terms[2]))
