@@ -11,7 +11,7 @@ from rille.pipeline.flow import config
 from rille.stages.geometry.surface import plane
 from rille.stages.hfvm.stage import match
 from rille.stages.terrain.locus.solve import Matches
-from rille.stages.terrain.locus.stage import reconstruct, usable
+from rille.stages.terrain.locus.stage import MatchedPair, reconstruct, usable
 
 from .scenes import Scene
 
@@ -33,9 +33,7 @@ def jobs(scene: Scene) -> dict[str, Callable[[], Any]]:
 
     def locus() -> Any:
         forth, back = found
-        return reconstruct(
-            forth.column, forth.row, forth.usable, np.asarray(scene.left, np.float32), scene.rig, scene.T_surface_left,
-            plane(scene.lattice), scene.z_range, chosen.locus, disparity_std=forth.std, right=scene.right, back=back,
-        )  # fmt: skip
+        pair = MatchedPair(np.asarray(scene.left, np.float32), forth, scene.right, back)
+        return reconstruct(pair, scene.rig, scene.T_surface_left, plane(scene.lattice), scene.z_range, chosen.locus)
 
     return {MATCHING: matching, LOCUS: locus}

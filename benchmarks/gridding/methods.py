@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rille.stages.geometry.surface import plane
-from rille.stages.terrain.locus.stage import LocusParams, reconstruct
+from rille.stages.terrain.locus.solve import Matches
+from rille.stages.terrain.locus.stage import LocusParams, MatchedPair, reconstruct
 
 from .mesh import rasterise, without_jumps
 from .scenes import Scene, pixels_of
@@ -50,10 +51,8 @@ def locus(scene: Scene, max_backmatch: float, bounded: bool, *, images: bool = T
     params = DEFAULT.model_copy(update={"max_sigma": scene.max_sigma if bounded else None})
     d = scene.disparities
     right = scene.right if images and d.std is not None else None
-    dem = reconstruct(
-        d.column, d.row, d.usable(max_backmatch), scene.left, scene.rig, scene.T_surface_left, plane(scene.lattice),
-        scene.z_range, params, disparity_std=d.std, right=right,
-    )  # fmt: skip
+    pair = MatchedPair(scene.left, Matches(d.column, d.row, d.usable(max_backmatch), d.std), right)
+    dem = reconstruct(pair, scene.rig, scene.T_surface_left, plane(scene.lattice), scene.z_range, params)
     return Model(dem.elevation, dem.elevation_std)
 
 

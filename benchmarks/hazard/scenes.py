@@ -29,7 +29,7 @@ from rille.stages.hazard.vehicle import Vehicle
 from rille.stages.hfvm.stage import match
 from rille.stages.terrain.ground_frame import LevelParams, level, z_range
 from rille.stages.terrain.locus.solve import Matches
-from rille.stages.terrain.locus.stage import LocusParams, local_lattice, reconstruct, usable
+from rille.stages.terrain.locus.stage import LocusParams, MatchedPair, local_lattice, reconstruct, usable
 
 Floats32 = NDArray[np.float32]
 
@@ -149,10 +149,8 @@ def _reconstructed(
     T_local_left = RigidTransform.from_matrix(facts["T_local_left"])
     low, high = z_range(facts["plane"], facts["relief"], list(lattice.bounds))
     left, right = (np.asarray(image, np.float32) for image in pair.images)
-    dem = reconstruct(
-        given.column, given.row, given.usable, left, pair.rig, T_local_left, plane(lattice), (low, high), pair.params,
-        disparity_std=given.std, right=right, back=None if pair.back is None else pair.matches(pair.back),
-    )  # fmt: skip
+    both = MatchedPair(left, given, right, None if pair.back is None else pair.matches(pair.back))
+    dem = reconstruct(both, pair.rig, T_local_left, plane(lattice), (low, high), pair.params)
     return lattice, (T_local_left, (low, high)), (dem.elevation, dem.elevation_std)
 
 

@@ -65,7 +65,7 @@ PLANES = LINE_PLANES + 8
 DONE, MORE, FOUND = 0, 1, 2
 
 
-class Cells(NamedTuple):
+class BlockCells(NamedTuple):
     """Cells of a block.
 
     ``feet``, ``normals`` (r, c, 3) metres, frame of the surface; ``low``, ``high`` (r, c) interval of Z in which the
@@ -103,7 +103,7 @@ class _Room(NamedTuple):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def search(cells: Cells, z_range: tuple[float, float], cameras: Cameras, seen: Observed, out: Floats) -> None:
+def search(cells: BlockCells, z_range: tuple[float, float], cameras: Cameras, seen: Observed, out: Floats) -> None:
     """Solve every cell of a block.
 
     Parameters

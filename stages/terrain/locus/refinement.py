@@ -30,8 +30,8 @@ from numpy.typing import NDArray
 
 from rille.stages.geometry.surface import Surface
 from rille.stages.numeric.windows import window_sum
-from rille.stages.terrain.locus.sweep import sweep
-from rille.stages.terrain.locus.views import Views, look
+from rille.stages.terrain.locus.sweep import Terms, sweep
+from rille.stages.terrain.locus.views import OrthoPair, Views, look
 
 Float32 = NDArray[np.float32]
 Floats = NDArray[np.float64]
@@ -66,7 +66,7 @@ UNKNOWN_BEND = 2.0
 LEAST_CORRELATION = 0.02
 
 
-def refine(views: Views, surface: Surface, elevation: Float32, steps: int) -> tuple[Float32, Float32]:
+def refine(views: Views, surface: Surface, elevation: Float32, steps: int) -> tuple[Float32, OrthoPair]:
     """Elevations that fit both images best, and what the images show there.
 
     Parameters
@@ -84,62 +84,64 @@ def refine(views: Views, surface: Surface, elevation: Float32, steps: int) -> tu
     gain = _gain(seen)
     _level(seen, gain)
     for _ in range(steps):
-        keep = np.isfinite(seen[3])
+        keep = np.isfinite(seen.scale)
         weight, rest = _misfit(seen, keep)
-        slope = np.where(keep, seen[5] - seen[2], 0.0)
-        scale = np.where(keep, seen[3], 0.0)
+        slope = np.where(keep, seen.right_slope - seen.left_slope, 0.0)
+        scale = np.where(keep, seen.scale, 0.0)
         across, down = np.zeros_like(z), np.zeros_like(z)
         _stiffness(z, scale, across, down)
         moved = z.copy()
-        sweep(weight * slope * slope, weight * slope * rest, keep, across, down, z, moved, SWEEPS, OVERSHOOT)
-        reach = FARTHEST / np.where(keep, seen[3], np.inf)
+        terms = Terms(weight * slope * slope, weight * slope * rest, z, keep, across, down)
+        sweep(terms, moved, SWEEPS, OVERSHOOT)
+        reach = FARTHEST / np.where(keep, seen.scale, np.inf)
         z = np.where(keep, np.clip(moved, start - reach, start + reach), start)
         seen = look(views, surface, z)
         _level(seen, gain)
     return z.astype(np.float32), seen
 
 
-def standard_deviation(elevation: Float32, seen: Float32, from_disparity: Floats) -> Floats:
+def standard_deviation(elevation: Float32, seen: OrthoPair, from_disparity: Floats) -> Floats:
     """Standard deviation of refined elevations, metres, see the module; the disparity's part where a cell is not seen.
 
     ``seen``: as :func:`refine` gives it. ``from_disparity``: (rows, cols) the disparity's part, metres.
     """
-    known = np.isfinite(elevation) & np.isfinite(seen[3])
+    known = np.isfinite(elevation) & np.isfinite(seen.scale)
     bend, step = np.zeros(elevation.shape), np.zeros(elevation.shape)
     texture = np.zeros((3, *elevation.shape))
-    _neighbours(elevation.astype(np.float64), known, seen[0], seen[1], seen[3], bend, step, texture)
+    _neighbours(elevation.astype(np.float64), known, seen, bend, step, texture)
     cells = window_sum(np.ones(elevation.shape), RELIEF_SIDE)
     both, of_left, of_right = (np.maximum(window_sum(t, TEXTURE_SIDE), 0.0) for t in texture)
     count = np.maximum(window_sum(known, RELIEF_SIDE), 1.0)
     relief = window_sum(bend, RELIEF_SIDE) / cells + window_sum(step, RELIEF_SIDE) / count
     alike = np.clip(both / np.maximum(np.sqrt(of_left * of_right), 1e-6), LEAST_CORRELATION, 1.0)
     variance = FACTOR**2 * (from_disparity**2 + np.maximum(relief, 0.0)) / alike**2
-    std = np.sqrt(variance + np.square(FLOOR / np.where(known, seen[3], 1.0)))
+    std = np.sqrt(variance + np.square(FLOOR / np.where(known, seen.scale, 1.0)))
     return np.where(known, std, from_disparity)
 
 
-def _gain(seen: Float32) -> float:
+def _gain(seen: OrthoPair) -> float:
     """Factor that gives the right image the left one's contrast, from the gradients along the surface's axes."""
     power = [
-        sum(float(np.nansum(np.square(np.diff(image, axis=k), dtype=np.float64))) for k in (0, 1)) for image in seen[:2]
+        sum(float(np.nansum(np.square(np.diff(image, axis=k), dtype=np.float64))) for k in (0, 1))
+        for image in (seen.left, seen.right)
     ]
     return float(np.sqrt(power[0] / power[1])) if min(power) > 0 else 1.0
 
 
-def _level(seen: Float32, gain: float) -> None:
+def _level(seen: OrthoPair, gain: float) -> None:
     """Scale what the right image shows, in place."""
-    seen[1] *= np.float32(gain)
-    seen[5] *= np.float32(gain)
+    for values in (seen.right, seen.right_slope):
+        values *= np.float32(gain)
 
 
-def _misfit(seen: Float32, keep: Mask) -> tuple[Floats, Floats]:
+def _misfit(seen: OrthoPair, keep: Mask) -> tuple[Floats, Floats]:
     """Weight of each cell's equation, and difference of both images without its local mean; zero where not kept."""
-    rest = np.where(keep, seen[0] - seen[1], 0.0)
+    rest = np.where(keep, seen.left - seen.right, 0.0)
     weight = keep.astype(np.float64)
     for _ in range(MEAN_ROUNDS + 1):
         mean = window_sum(weight * rest, MEAN_SIDE) / np.maximum(window_sum(weight, MEAN_SIDE), LEAST_WEIGHT)
         weight = np.where(keep, 1.0 / (1.0 + np.square((rest - mean) / RESIDUAL)), 0.0)
-    return weight * np.where(keep, np.minimum(seen[4], 1.0), 0.0), np.where(keep, rest - mean, 0.0)
+    return weight * np.where(keep, np.minimum(seen.area, 1.0), 0.0), np.where(keep, rest - mean, 0.0)
 
 
 @njit(cache=True, nogil=True)
@@ -165,8 +167,9 @@ def _stiffness(z, scale, across, down):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _neighbours(z, known, left, right, scale, bend, step, texture):  # type: ignore[no-untyped-def]
+def _neighbours(z, known, seen, bend, step, texture):  # type: ignore[no-untyped-def]
     """Squared second difference and squared step of each known cell, m^2; products of the ortho gradients."""
+    left, right, scale = seen.left, seen.right, seen.scale
     rows, cols = z.shape
     for r in range(rows):
         for c in range(cols):

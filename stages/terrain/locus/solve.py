@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from rille.stages.core.errors import DegenerateError, InputError
 from rille.stages.geometry.geometry import Rig, RigidTransform
 from rille.stages.geometry.surface import Surface
-from rille.stages.terrain.locus.kernel import Cameras, Cells, search
+from rille.stages.terrain.locus.kernel import BlockCells, Cameras, search
 from rille.stages.terrain.locus.points import Observed
 
 Floats = NDArray[np.float64]
@@ -95,7 +95,7 @@ class PairArrays:
         shape = feet.shape[:2]
         start = [np.array(np.broadcast_to(v, shape), dtype=np.float64, order="C") for v in (low, high)]
         out = np.full((*shape, 4), np.nan)
-        search(Cells(feet, normals, *start), self.z_range, self.cameras, self.seen, out)
+        search(BlockCells(feet, normals, *start), self.z_range, self.cameras, self.seen, out)
         return out
 
 

@@ -14,6 +14,7 @@ the pixel where the matcher gives one; what else makes it uncertain is seen on t
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -107,46 +108,46 @@ class LocusParams(Params):
     )
 
 
+@dataclass(frozen=True)
+class MatchedPair:
+    """``left`` image (rows, cols), grey values, and the ``matches`` of its pixels; a cell needs all four usable
+    disparities around its projection.
+
+    ``right`` image, to refine the elevations with (:mod:`rille.stages.terrain.locus.refinement`); None: they stay what
+    the disparity says. ``back``: matches of the right image, to read elevations from as well (:func:`join`); they need
+    ``right``.
+    """
+
+    left: ArrayLike
+    matches: Matches
+    right: ArrayLike | None = None
+    back: Matches | None = None
+
+
 def reconstruct(
-    column_disparity: ArrayLike,
-    row_disparity: ArrayLike,
-    usable: NDArray[np.bool_],
-    image: ArrayLike,
+    pair: MatchedPair,
     rig: Rig,
     T_surface_left: RigidTransform,
     surface: Surface,
     z_range: tuple[float, float],
     params: LocusParams,
-    *,
-    disparity_std: ArrayLike | None = None,
-    right: ArrayLike | None = None,
-    back: Matches | None = None,
 ) -> Dem:
     """Elevation and ortho image of every cell of a reference surface.
 
     Parameters
     ----------
-    column_disparity, row_disparity : (rows, cols) right minus left, pixels, of the left image.
-    usable : (rows, cols) pixels whose disparity may be used; a cell needs all four around its projection.
-    image : (rows, cols) grey values of the left image.
     T_surface_left : pose of the left camera in the frame of the surface.
     surface : feet and normals of the cells, metres.
     z_range : lowest and highest elevation searched, metres.
-    params : thresholds; ``cell_size`` and ``extent`` are not used here.
-    disparity_std : (rows, cols) standard deviation of the usable disparities, pixels; None:
-        ``params.sigma_disparity`` everywhere.
-    right : (rows, cols) grey values of the right image, to refine the elevations with
-    (:mod:`rille.stages.terrain.locus.refinement`);
-        None: they stay what the disparity says.
-    back : disparities of the right image, left minus right, to read elevations from as well (:func:`join`); they need
-        ``right``.
+    params : thresholds, and ``sigma_disparity`` for matches without standard deviations; ``cell_size`` and
+        ``extent`` are not used here.
 
     Returns
     -------
     Dem
         A cell is undefined where a camera does not see it, where the disparity around it was not measured, jumps or
-        contradicts the calibration, or where its standard deviation is beyond ``max_std`` (``max_sigma`` without
-        ``disparity_std``).
+        contradicts the calibration, or where its standard deviation is beyond ``max_std`` (``max_sigma`` where the
+        matches have none).
 
     Raises
     ------
@@ -155,9 +156,9 @@ def reconstruct(
     DegenerateError
         The baseline is zero.
     """
-    maps = Matches(column_disparity, row_disparity, usable, disparity_std)
+    image, right, back = pair.left, pair.right, pair.back
     told = z_range, params.sigma_disparity, (params.max_residual, params.max_jump)
-    out = solve(PairArrays(maps, image, rig, T_surface_left, *told), surface)
+    out = solve(PairArrays(pair.matches, image, rig, T_surface_left, *told), surface)
     seen = None if right is None else _views(image, right, rig, T_surface_left)
     apart = None
     if back is not None:
@@ -170,7 +171,7 @@ def reconstruct(
         out = join(out, other)
     if seen is not None and (params.refine_steps or back is not None):
         _refine(out, seen, surface, params, apart)
-    greatest = _greatest_std(params, disparity_std is not None)
+    greatest = _greatest_std(params, pair.matches.std is not None)
     if greatest is not None:
         unsure = ~(out.elevation_std <= greatest)
         for array in vars(out).values():
@@ -202,7 +203,7 @@ def _refine(dem: Dem, views: Views, surface: Surface, params: LocusParams, apart
         dem.elevation_std[...] = from_both(elevation, seen, moved, apart, before)
     share = np.float32(params.refined_share)
     dem.elevation[...] = share * elevation + (np.float32(1.0) - share) * dem.elevation
-    dem.ortho[...] = np.clip(seen[0], 0.0, 255.0)
+    dem.ortho[...] = np.clip(seen.left, 0.0, 255.0)
 
 
 def _greatest_std(params: LocusParams, measured: bool) -> float | None:
@@ -272,20 +273,13 @@ def _run(params: LocusParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle
         params = params.model_copy(update={"max_sigma": lattice.cell})
     disparity = inputs["disparity"]
     good = usable(disparity["validity"], disparity["backmatch_error"], params)
-    dem = reconstruct(
-        disparity["column_disparity"],
-        disparity["row_disparity"],
-        good,
+    pair = MatchedPair(
         inputs["left"]["level_0"],
-        rig,
-        T,
-        plane(lattice),
-        (z_range[0], z_range[1]),
-        params,
-        disparity_std=disparity.arrays.get("disparity_std"),
-        right=inputs["right"]["level_0"] if "right" in inputs else None,
-        back=_backward(inputs["back"], params) if "back" in inputs else None,
+        Matches(disparity["column_disparity"], disparity["row_disparity"], good, disparity.arrays.get("disparity_std")),
+        inputs["right"]["level_0"] if "right" in inputs else None,
+        _backward(inputs["back"], params) if "back" in inputs else None,
     )
+    dem = reconstruct(pair, rig, T, plane(lattice), (z_range[0], z_range[1]), params)
     if not np.isfinite(dem.elevation).any():
         raise explain(rig, T, plane(lattice), (z_range[0], z_range[1]), good)
     meta = {

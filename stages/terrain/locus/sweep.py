@@ -8,6 +8,8 @@ its cells are then computed side by side, and the next sweep follows three diago
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -21,20 +23,36 @@ BEHIND = 3
 """Diagonals that a sweep keeps behind the one before it."""
 
 
-@njit(cache=True, nogil=True)
-def sweep(  # type: ignore[no-untyped-def]
-    power, pull, keep, across, down, start, z, sweeps, overshoot
-):
-    """Minimise ``power (z - start)^2 - 2 pull z`` and the weighted squares of the second differences, ``z`` in place.
+class Terms(NamedTuple):
+    """What is minimised over z: sum power (z - start)^2 - 2 pull z, and the weighted squares of second differences.
 
-    Parameters
-    ----------
-    power, pull : (rows, cols) the images' terms at ``start``.
-    keep : (rows, cols) cells that move.
-    across, down : (rows, cols) weights of the second differences at a cell, 0 at borders and beside unknown cells.
-    start, z : (rows, cols) NaN unknown.
-    sweeps, overshoot : how many, and the factor on each step.
+    ``power``, ``pull`` (rows, cols) the images' terms at ``start``, NaN unknown; ``keep`` cells that move; ``across``,
+    ``down`` weights of the second differences at a cell, 0 at borders and beside unknown cells.
     """
+
+    power: Floats
+    pull: Floats
+    start: Floats
+    keep: Mask
+    across: Floats
+    down: Floats
+
+
+class _Sheared(NamedTuple):
+    """Arrays (diagonal, row) with a border: elevations; weights of the second differences along a row and a column;
+    what the images want; and the sum of all weights, 0 where a cell does not move."""
+
+    at: Floats
+    by_row: Floats
+    by_column: Floats
+    wanted: Floats
+    total: Floats
+
+
+@njit(cache=True, nogil=True)
+def sweep(terms, z, sweeps, overshoot):  # type: ignore[no-untyped-def]
+    """Minimise the terms in place: ``z`` (rows, cols), NaN unknown; ``overshoot`` is the factor on each step."""
+    power, pull, start, keep, across, down = terms
     rows, cols = z.shape
     shape = rows + cols - 1 + 2 * BORDER, rows + 2 * BORDER
     at, by_row, by_column = np.zeros(shape), np.zeros(shape), np.zeros(shape)
@@ -47,12 +65,13 @@ def sweep(  # type: ignore[no-untyped-def]
                 if keep[r, c]:
                     wanted[t, i], total[t, i] = power[r, c] * start[r, c] + pull[r, c], power[r, c]
     low, high = _totals(by_row, by_column, total)
-    sums = np.empty(rows)
+    sheared, sums = _Sheared(at, by_row, by_column, wanted, total), np.empty(rows)
+    # All sweeps run in one pass over the diagonals, each a few behind the one before it, while these are in the cache.
     for turn in range(rows + cols - 1 + BEHIND * (sweeps - 1)):
         for k in range(sweeps):
             t = turn - BEHIND * k + BORDER
             if t >= BORDER and t < shape[0] - BORDER and low[t] < high[t]:
-                _diagonal(at, by_row, by_column, wanted, total, t, low[t], high[t] - low[t], overshoot, sums)
+                _diagonal(sheared, t, low[t], high[t] - low[t], overshoot, sums)
     for r in range(rows):
         for c in range(cols):
             if keep[r, c]:
@@ -81,8 +100,9 @@ def _totals(by_row, by_column, total):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _diagonal(at, by_row, by_column, wanted, total, t, i, n, overshoot, sums):  # type: ignore[no-untyped-def]
+def _diagonal(sheared, t, i, n, overshoot, sums):  # type: ignore[no-untyped-def]
     """Cells ``i`` to ``i + n`` of diagonal ``t``; ``sums`` is room for what the second differences want of each."""
+    at, by_row, by_column, wanted, total = sheared
     j = i + n
     left, right, above, below = at[t - 1, i:j], at[t + 1, i:j], at[t - 1, i - 1 : j - 1], at[t + 1, i + 1 : j + 1]
     a, b = by_row[t, i:j], by_column[t, i:j]

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from rille.stages.numeric.robust import mad_sigma
 from rille.stages.numeric.windows import window_sum
+from rille.stages.terrain.locus.views import OrthoPair
 
 Float32 = NDArray[np.float32]
 Floats = NDArray[np.float64]
@@ -45,7 +46,7 @@ STEP_SIDE, NEAR_SIDE, MEAN_SIDE = 3, 5, 15
 """Cells: sides of the windows of t, of all others, and of the local mean that differences go without."""
 
 
-def from_both(elevation: Float32, seen: Float32, moved: Floats, apart: Floats, otherwise: Floats) -> Floats:
+def from_both(elevation: Float32, seen: OrthoPair, moved: Floats, apart: Floats, otherwise: Floats) -> Floats:
     """Standard deviation of each cell, metres, see the module.
 
     Parameters
@@ -56,14 +57,14 @@ def from_both(elevation: Float32, seen: Float32, moved: Floats, apart: Floats, o
     apart : (rows, cols) difference of both directions' elevations, metres, NaN where not both gave one.
     otherwise : (rows, cols) the standard deviation of cells that the images do not show, metres.
     """
-    known = np.isfinite(elevation) & np.isfinite(seen[3])
+    known = np.isfinite(elevation) & np.isfinite(seen.scale)
     if not known.any():
         return otherwise
-    scale = np.where(known, seen[3], 1.0).astype(np.float64)
-    rest = np.where(known, seen[0] - seen[1], 0.0).astype(np.float64)
+    scale = np.where(known, seen.scale, 1.0).astype(np.float64)
+    rest = np.where(known, seen.left - seen.right, 0.0).astype(np.float64)
     rest = np.where(known, rest - _mean(rest, known, MEAN_SIDE), 0.0)
     noise = mad_sigma(rest[known], 0.0)
-    grey = np.maximum(_mean(np.where(known, seen[0], 0.0), known, NEAR_SIDE), max(noise, 1.0))
+    grey = np.maximum(_mean(np.where(known, seen.left, 0.0), known, NEAR_SIDE), max(noise, 1.0))
     both = known & np.isfinite(apart)
     differ = _mean(np.where(both, np.square(scale * apart), 0.0), both, NEAR_SIDE)
     differ[window_sum(both, NEAR_SIDE) < 1.0] = ALONE**2
@@ -75,10 +76,10 @@ def from_both(elevation: Float32, seen: Float32, moved: Floats, apart: Floats, o
     return np.where(known, np.sqrt(np.maximum(variance, FLOOR**2)) / scale, otherwise)
 
 
-def _gradients(seen: Float32, scale: Floats, known: NDArray[np.bool_]) -> Floats:
+def _gradients(seen: OrthoPair, scale: Floats, known: NDArray[np.bool_]) -> Floats:
     """Sum of the squared gradients around each cell, squared grey levels a pixel of disparity."""
-    slope = np.where(known, seen[5] - seen[2], 0.0) / scale
-    power = np.square(slope) * np.where(known, np.minimum(seen[4], 1.0), 0.0)
+    slope = np.where(known, seen.right_slope - seen.left_slope, 0.0) / scale
+    power = np.square(slope) * np.where(known, np.minimum(seen.area, 1.0), 0.0)
     return np.maximum(window_sum(power, NEAR_SIDE), 0.0) + LEAST_GRADIENT * NEAR_SIDE**2
 
 

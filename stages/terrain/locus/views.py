@@ -7,7 +7,7 @@ cubic splines through the images' pixels, so that detail is kept. With the terra
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -22,11 +22,9 @@ Float32 = NDArray[np.float32]
 Floats = NDArray[np.float64]
 
 BLOCK_ROWS = 64  # rows of cells in one call, so that a large surface's feet stay small in memory
-PLANES = 6
 
 
-@dataclass(frozen=True)
-class Views:
+class Views(NamedTuple):
     """Projections (3, 4) from the frame of the surface to pixels, splines of both images, the left camera's centre."""
 
     left: Floats
@@ -35,33 +33,42 @@ class Views:
     centre: Floats
 
 
+class OrthoPair(NamedTuple):
+    """What both images show of each cell (rows, cols) float32; NaN where it is unknown or not inside both images.
+
+    ``left``, ``right``: grey values; ``left_slope``, ``right_slope``: how they change with the elevation, per metre;
+    ``scale``: disparity a metre of elevation, pixels; ``area``: pixels of the left image that the cell covers.
+    """
+
+    left: Float32
+    right: Float32
+    left_slope: Float32
+    scale: Float32
+    area: Float32
+    right_slope: Float32
+
+
 def views(left: Floats, right: Floats, left_image: Float32, right_image: Float32, centre: Floats) -> Views:
     """Views of two images (row, col), grey values; ``centre`` of the left camera in the frame of the surface, m."""
     splines = [scipy.ndimage.spline_filter(image, 3, np.float32, mode="mirror") for image in (left_image, right_image)]
     return Views(left, right, (splines[0], splines[1]), np.asarray(centre, np.float64))
 
 
-def look(views: Views, surface: Surface, elevation: Floats) -> Float32:
+def look(views: Views, surface: Surface, elevation: Floats) -> OrthoPair:
     """What both images show at the elevations of the cells.
 
     Parameters
     ----------
     elevation : (rows, cols) metres, NaN unknown.
-
-    Returns
-    -------
-    (6, rows, cols) float32: grey value of the left and of the right image; how the left one changes with the
-    elevation, per metre; disparity a metre of elevation, pixels; pixels of the left image that a cell covers; how the
-    right one changes with the elevation. NaN where a cell is unknown or not inside both images.
     """
-    out = np.full((PLANES, surface.rows, surface.cols), np.nan, np.float32)
+    out = OrthoPair(*np.full((len(OrthoPair._fields), surface.rows, surface.cols), np.nan, np.float32))
     z, cols = np.ascontiguousarray(elevation, np.float64), np.arange(surface.cols)
     for start in range(0, surface.rows, BLOCK_ROWS):
         stop = min(start + BLOCK_ROWS, surface.rows)
         # A row beyond either end, so that every cell has a neighbour below or above to measure its size with.
         first, last = max(0, start - 1), min(surface.rows, stop + 1)
         feet, normals = surface.block(np.arange(first, last), cols)
-        _look(feet, normals, z, first, start, stop, views.left, views.right, views.centre, *views.splines, out)
+        _look((feet, normals), z, first, (start, stop), views, out)
     return out
 
 
@@ -75,11 +82,18 @@ LANE_PLANES = SPLINE_PLANES + 20
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _look(feet, normals, z, first, start, stop, left, right, centre, left_spline, right_spline, out):  # type: ignore[no-untyped-def]
-    """Rows ``start`` to ``stop``; feet and normals begin at row ``first``."""
+def _look(block, z, first, span, views, out):  # type: ignore[no-untyped-def]
+    """Rows of ``span``; feet and normals of the block begin at row ``first``."""
+    feet, normals = block
+    left_spline, right_spline = views.splines
     lanes, taps, cells = np.zeros(LANE_PLANES * LANES), np.zeros(SPLINE * LANES, np.float32), np.zeros(LANES, np.int64)
     rows, cols = feet.shape[:2]
-    planes = out.reshape(out.shape[0], -1)
+    # Flat views, so that a lane needs one number to write its cell.
+    flat = OrthoPair(
+        out.left.ravel(), out.right.ravel(), out.left_slope.ravel(), out.scale.ravel(), out.area.ravel(),
+        out.right_slope.ravel(),
+    )  # fmt: skip
+    start, stop = span
     n = 0
     for r in range(start, stop):
         for c in range(cols):
@@ -93,15 +107,18 @@ def _look(feet, normals, z, first, start, stop, left, right, centre, left_spline
                 lanes[Z + n], cells[n] = z[r, c], r * cols + c
                 n += 1
             if n == LANES or (n > 0 and r == stop - 1 and c == cols - 1):
-                _project(n, left, right, centre, left_spline.shape, right_spline.shape, lanes)
+                _project(n, views, lanes)
                 read(n, left_spline, right_spline, lanes, taps)
-                _write(n, cells, lanes, rows > 1 and cols > 1, planes)
+                _write(n, cells, lanes, rows > 1 and cols > 1, flat)
                 n = 0
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _motion(p0, p1, p2, x, y, depth, dx, dy, dz):  # type: ignore[no-untyped-def]
-    """Pixels that the projection (x, y) of a point moves by when the point moves by (dx, dy, dz)."""
+def _motion(projection, at, way):  # type: ignore[no-untyped-def]
+    """Pixels that the projection ``at`` (x, y, depth) of a point moves by when the point moves by ``way``."""
+    p0, p1, p2 = projection
+    x, y, depth = at
+    dx, dy, dz = way
     d0 = p0[0] * dx + p0[1] * dy + p0[2] * dz
     d1 = p1[0] * dx + p1[1] * dy + p1[2] * dz
     d2 = p2[0] * dx + p2[1] * dy + p2[2] * dz
@@ -109,10 +126,13 @@ def _motion(p0, p1, p2, x, y, depth, dx, dy, dz):  # type: ignore[no-untyped-def
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _project(n, left, right, centre, left_shape, right_shape, lanes):  # type: ignore[no-untyped-def]
+def _project(n, views, lanes):  # type: ignore[no-untyped-def]
     """Where both images show each lane's point, and how that moves."""
+    left, right, splines, centre = views
+    left_shape, right_shape = splines[0].shape, splines[1].shape
     l0, l1, l2 = _row(left, 0), _row(left, 1), _row(left, 2)
     r0, r1, r2 = _row(right, 0), _row(right, 1), _row(right, 2)
+    of_left, of_right = (l0, l1, l2), (r0, r1, r2)
     cx, cy, cz = centre[0], centre[1], centre[2]
     wl, hl, wr, hr = left_shape[1] - 2.0, left_shape[0] - 2.0, right_shape[1] - 2.0, right_shape[0] - 2.0
     for m in range(n):
@@ -132,14 +152,15 @@ def _project(n, left, right, centre, left_shape, right_shape, lanes):  # type: i
         lanes[LEFT_AT + m], lanes[LEFT_AT + LANES + m] = xl if seen else 1.0, yl if seen else 1.0
         lanes[RIGHT_AT + m], lanes[RIGHT_AT + LANES + m] = xr if seen else 1.0, yr if seen else 1.0
         # Along the left ray the left image stays: what the right one moves by is disparity.
-        u, v = _motion(r0, r1, r2, xr, yr, b2, vx / toward, vy / toward, vz / toward)
+        left_at, right_at = (xl, yl, a2), (xr, yr, b2)
+        u, v = _motion(of_right, right_at, (vx / toward, vy / toward, vz / toward))
         lanes[DISPARITY + m] = math.sqrt(u * u + v * v)
-        lanes[LEFT_WAY + m], lanes[LEFT_WAY + LANES + m] = _motion(l0, l1, l2, xl, yl, a2, nx, ny, nz)
-        lanes[RIGHT_WAY + m], lanes[RIGHT_WAY + LANES + m] = _motion(r0, r1, r2, xr, yr, b2, nx, ny, nz)
+        lanes[LEFT_WAY + m], lanes[LEFT_WAY + LANES + m] = _motion(of_left, left_at, (nx, ny, nz))
+        lanes[RIGHT_WAY + m], lanes[RIGHT_WAY + LANES + m] = _motion(of_right, right_at, (nx, ny, nz))
         dx, dy, dz = lanes[BELOW + m], lanes[BELOW + LANES + m], lanes[BELOW + 2 * LANES + m]
-        down, across = _motion(l0, l1, l2, xl, yl, a2, dx, dy, dz)
+        down, across = _motion(of_left, left_at, (dx, dy, dz))
         dx, dy, dz = lanes[BESIDE + m], lanes[BESIDE + LANES + m], lanes[BESIDE + 2 * LANES + m]
-        u, v = _motion(l0, l1, l2, xl, yl, a2, dx, dy, dz)
+        u, v = _motion(of_left, left_at, (dx, dy, dz))
         lanes[AREA + m] = abs(down * v - across * u)
 
 
@@ -154,9 +175,9 @@ def _write(n, cells, lanes, wide, out):  # type: ignore[no-untyped-def]
     for m in range(n):
         if lanes[SEEN + m] > 0.0:
             i, left, right = cells[m], LEFT_VALUE + m, RIGHT_VALUE + m
-            out[0, i], out[1, i] = lanes[left], lanes[right]
+            out.left[i], out.right[i] = lanes[left], lanes[right]
             gx, gy = lanes[left + LANES], lanes[left + 2 * LANES]
-            out[2, i] = gx * lanes[LEFT_WAY + m] + gy * lanes[LEFT_WAY + LANES + m]
+            out.left_slope[i] = gx * lanes[LEFT_WAY + m] + gy * lanes[LEFT_WAY + LANES + m]
             gx, gy = lanes[right + LANES], lanes[right + 2 * LANES]
-            out[5, i] = gx * lanes[RIGHT_WAY + m] + gy * lanes[RIGHT_WAY + LANES + m]
-            out[3, i], out[4, i] = lanes[DISPARITY + m], lanes[AREA + m] if wide else 1.0
+            out.right_slope[i] = gx * lanes[RIGHT_WAY + m] + gy * lanes[RIGHT_WAY + LANES + m]
+            out.scale[i], out.area[i] = lanes[DISPARITY + m], lanes[AREA + m] if wide else 1.0

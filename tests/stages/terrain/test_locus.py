@@ -17,7 +17,7 @@ from rille.stages.geometry.surface import plane as reference_plane
 from rille.stages.terrain import ground_frame as level_stage
 from rille.stages.terrain.locus import roots, stage
 from rille.stages.terrain.locus import solve as locus_solve
-from rille.stages.terrain.locus.stage import Dem, LocusParams, reconstruct
+from rille.stages.terrain.locus.stage import Dem, LocusParams, MatchedPair, Matches, reconstruct
 
 RIG = toed_in_rig()
 T_LOCAL_LEFT = pitched(30.0, roll_deg=3.0)
@@ -27,9 +27,14 @@ PARAMS = LocusParams()
 IMAGE = np.add.outer(np.arange(RIG.left.height), 2.0 * np.arange(RIG.left.width)).astype(np.float32)
 
 
+def pair(*maps: np.ndarray) -> MatchedPair:
+    """Column and row disparity and where they may be used, of a picture that is not looked at."""
+    return MatchedPair(IMAGE, Matches(*maps))
+
+
 def solve(maps: tuple[np.ndarray, np.ndarray, np.ndarray], z: tuple[float, float], rig: Rig = RIG) -> Dem:
     column, row, usable = maps
-    return reconstruct(column, row, usable, IMAGE, rig, T_LOCAL_LEFT, reference_plane(LATTICE), z, PARAMS)
+    return reconstruct(pair(column, row, usable), rig, T_LOCAL_LEFT, reference_plane(LATTICE), z, PARAMS)
 
 
 def tolerance(maps: tuple[np.ndarray, np.ndarray, np.ndarray], points: np.ndarray) -> np.ndarray:
@@ -188,9 +193,8 @@ def test_cells_of_a_great_standard_deviation_of_their_own_are_left_out() -> None
     def dem(**limits: float) -> Dem:
         params = LocusParams(**limits)
         surface = reference_plane(LATTICE)
-        return reconstruct(
-            column, row, usable, IMAGE, RIG, T_LOCAL_LEFT, surface, (-1.0, -0.3), params, disparity_std=std
-        )
+        given = MatchedPair(IMAGE, Matches(column, row, usable, std))
+        return reconstruct(given, RIG, T_LOCAL_LEFT, surface, (-1.0, -0.3), params)
 
     whole = dem()
     seen = np.isfinite(whole.elevation)
@@ -233,7 +237,7 @@ def test_the_scene_scales_with_the_baseline() -> None:
     T = RIG.T_right_left
     rig = Rig(RIG.left, RIG.right, RigidTransform(T.rotation, 2.0 * T.translation))
     lattice = Lattice.at(LATTICE.i0, LATTICE.j0, 2 * LATTICE.cell, LATTICE.rows, LATTICE.cols)
-    large = reconstruct(*maps, IMAGE, rig, T_LOCAL_LEFT, reference_plane(lattice), (-1.6, -0.6), PARAMS)
+    large = reconstruct(pair(*maps), rig, T_LOCAL_LEFT, reference_plane(lattice), (-1.6, -0.6), PARAMS)
     np.testing.assert_allclose(large.elevation, 2.0 * small.elevation, rtol=1e-5)
     np.testing.assert_allclose(large.elevation_std, 2.0 * small.elevation_std, rtol=1e-3)
     np.testing.assert_allclose(large.ortho, small.ortho, rtol=1e-4)
@@ -256,7 +260,7 @@ def test_an_inclined_reference_plane_and_a_callable_of_ones_own() -> None:
         return foot + np.outer(x, across) + np.outer(y, along), np.tile(normal, (rows.size, 1))
 
     found = [
-        reconstruct(*maps, IMAGE, RIG, T_LOCAL_LEFT, surface, (-0.1, 0.2), PARAMS)
+        reconstruct(pair(*maps), RIG, T_LOCAL_LEFT, surface, (-0.1, 0.2), PARAMS)
         for surface in (inclined(lattice, T), Surface(lattice.rows, lattice.cols, own))
     ]
     seen = np.isfinite(found[0].elevation)
@@ -277,7 +281,7 @@ def test_other_reference_surfaces() -> None:
         (cylinder(centre, reference, azimuth, reference * np.sin(latitude), inside=True), 0.0),
     ]
     for surface, is_sphere in surfaces:
-        dem = reconstruct(column, row, usable, IMAGE, RIG, T_LOCAL_LEFT, surface, (-0.3, 0.8), PARAMS)
+        dem = reconstruct(pair(column, row, usable), RIG, T_LOCAL_LEFT, surface, (-0.3, 0.8), PARAMS)
         seen = np.isfinite(dem.elevation)
         assert seen.mean() > 0.5
         z = np.repeat((reference * np.sin(latitude))[:, None], azimuth.size, axis=1)
@@ -297,7 +301,7 @@ def test_a_block_border_shows_nowhere() -> None:
     maps = disparity(RIG, T_LOCAL_LEFT, plane(0.1, 0.1, -HEIGHT))
     whole = solve(maps, (-1.0, -0.3))
     coarse_start = Lattice.at(LATTICE.i0, LATTICE.j0 - 16, LATTICE.cell, LATTICE.rows - 16, LATTICE.cols)
-    part = reconstruct(*maps, IMAGE, RIG, T_LOCAL_LEFT, reference_plane(coarse_start), (-1.0, -0.3), PARAMS)
+    part = reconstruct(pair(*maps), RIG, T_LOCAL_LEFT, reference_plane(coarse_start), (-1.0, -0.3), PARAMS)
     for name in ("elevation", "residual", "ortho"):
         assert np.allclose(getattr(whole, name)[16:], getattr(part, name), equal_nan=True, atol=2e-3), name
 
@@ -308,7 +312,14 @@ def test_degraded_input() -> None:
     assert not np.isfinite(nothing.elevation).any()
     assert not np.isfinite(solve((column, row, np.zeros_like(usable)), (-1.0, -0.3)).ortho).any()
     behind = Lattice.snap((-0.3, 0.3, -1.3, -0.5), 0.01)
-    dem = reconstruct(column, row, usable, IMAGE, RIG, T_LOCAL_LEFT, reference_plane(behind), (-1.0, 1.0), PARAMS)
+    dem = reconstruct(
+        pair(column, row, usable),
+        RIG,
+        T_LOCAL_LEFT,
+        reference_plane(behind),
+        (-1.0, 1.0),
+        PARAMS,
+    )
     assert not np.isfinite(dem.elevation).any()
     away = Rig(RIG.left, RIG.right, RigidTransform(np.diag([-1.0, 1.0, -1.0]), [0.1, 0.0, 0.0]))
     assert not np.isfinite(solve((column, row, usable), (-1.0, -0.3), away).elevation).any()

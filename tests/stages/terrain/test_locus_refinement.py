@@ -11,7 +11,7 @@ from rille.stages.geometry.surface import plane as reference_plane
 from rille.stages.terrain.locus import views as locus_views
 from rille.stages.terrain.locus.refinement import UNKNOWN_BEND, refine, standard_deviation
 from rille.stages.terrain.locus.solve import ONE_SIDED, Dem, Matches, join
-from rille.stages.terrain.locus.stage import LocusParams, reconstruct
+from rille.stages.terrain.locus.stage import LocusParams, MatchedPair, reconstruct
 from rille.stages.terrain.locus.views import Views, look, views
 
 RIG = toed_in_rig()
@@ -59,14 +59,13 @@ def model(
 ) -> Dem:
     params = LocusParams(refine_steps=steps, refined_share=share, max_residual=2.0)
     std = np.full(column.shape, 0.2, np.float32)
-    return reconstruct(
-        column, MAPS[1], MAPS[2], left, RIG, T_LOCAL_LEFT, SURFACE, (-1.0, -0.3), params, disparity_std=std, right=right
-    )
+    pair = MatchedPair(left, Matches(column, MAPS[1], MAPS[2], std), right)
+    return reconstruct(pair, RIG, T_LOCAL_LEFT, SURFACE, (-1.0, -0.3), params)
 
 
 def pixels(dem: Dem) -> np.ndarray:
     """Errors of the known cells as pixels of disparity."""
-    error = (dem.elevation - TRUTH) * look(through(), SURFACE, TRUTH)[3]
+    error = (dem.elevation - TRUTH) * look(through(), SURFACE, TRUTH).scale
     return error[np.isfinite(error)]
 
 
@@ -80,19 +79,19 @@ def noisy() -> np.ndarray:
 
 def test_both_images_show_the_same_on_the_true_surface() -> None:
     seen = look(through(), SURFACE, TRUTH)
-    known = np.isfinite(seen[0])
+    known = np.isfinite(seen.left)
     assert known.mean() > 0.9
     # A cubic spline through samples six pixels a wave and more: its error is below a hundredth of the amplitudes.
-    assert rms((seen[0] - seen[1])[known]) < 0.3
-    assert rms((seen[0] - texture(LATTICE.xy().reshape(-1, 2)).reshape(LATTICE.shape))[known]) < 0.3
+    assert rms((seen.left - seen.right)[known]) < 0.3
+    assert rms((seen.left - texture(LATTICE.xy().reshape(-1, 2)).reshape(LATTICE.shape))[known]) < 0.3
 
 
 def test_derivatives_are_those_of_finite_differences() -> None:
     dz = 1e-4
     low, seen, high = (look(through(), SURFACE, TRUTH + k * dz) for k in (-1, 0, 1))
-    change = -((high[0] - high[1]) - (low[0] - low[1])) / (2 * dz)
+    change = -((high.left - high.right) - (low.left - low.right)) / (2 * dz)
     known = np.isfinite(change)
-    found = seen[5] - seen[2]
+    found = seen.right_slope - seen.left_slope
     assert rms((change - found)[known]) < 0.01 * rms(found[known])
     # Disparity a metre of elevation: the same left pixel, seen on a surface that is dz higher.
     T_left_local = T_LOCAL_LEFT.inverse()
@@ -100,14 +99,14 @@ def test_derivatives_are_those_of_finite_differences() -> None:
     higher = points * (1.0 + dz / points[..., 2:])  # along the ray: the camera's centre is the origin
     moved = [RIG.right.project((RIG.T_right_left @ T_left_local).apply(p)) for p in (points, higher)]
     expected = np.linalg.norm(moved[1] - moved[0], axis=-1) / dz
-    np.testing.assert_allclose(seen[3][known], expected[known], rtol=2e-3)
+    np.testing.assert_allclose(seen.scale[known], expected[known], rtol=2e-3)
     # A cell's pixels: the area of its four corners' projections.
     half = 0.5 * LATTICE.cell
     offsets = [np.array([i * half, j * half, 0.0]) for i, j in ((-1, -1), (1, 1), (-1, 1), (1, -1))]
     corners = [RIG.left.project(T_left_local.apply(points + offset)) for offset in offsets]
     d, e = corners[1] - corners[0], corners[3] - corners[2]
     area = 0.5 * np.abs(d[..., 0] * e[..., 1] - d[..., 1] * e[..., 0])
-    np.testing.assert_allclose(seen[4][known], area[known], rtol=0.03)
+    np.testing.assert_allclose(seen.area[known], area[known], rtol=0.03)
 
 
 def test_errors_of_the_disparity_are_taken_out() -> None:
@@ -144,7 +143,7 @@ def test_another_exposure_changes_little() -> None:
     same, brighter = model(noisy()), model(noisy(), right=1.25 * RIGHT - 8.0)
     both = np.isfinite(same.elevation) & np.isfinite(brighter.elevation)
     assert both.sum() > 0.98 * np.isfinite(same.elevation).sum()
-    scale = look(through(), SURFACE, TRUTH)[3]
+    scale = look(through(), SURFACE, TRUTH).scale
     assert rms(((same.elevation - brighter.elevation) * scale)[both]) < 0.01
 
 
@@ -162,7 +161,7 @@ def test_noise_that_matches_noise_is_not_trusted() -> None:
     params = LocusParams(max_std=1.0, max_residual=2.0)
     std = np.full(MAPS[0].shape, 0.2, np.float32)
     args = RIG, T_LOCAL_LEFT, SURFACE, (-1.0, -0.3), params
-    dem = reconstruct(*MAPS, images[0], *args, disparity_std=std, right=images[1])
+    dem = reconstruct(MatchedPair(images[0], Matches(*MAPS, std), images[1]), *args)
     column = RIG.left.project(T_LOCAL_LEFT.inverse().apply(np.dstack([LATTICE.xy(), TRUTH])))[..., 0]
     lit, shaded = (np.isfinite(dem.elevation_std) & side for side in (column < dark - 40, column > dark + 40))
     assert lit.sum() > 1000
@@ -178,7 +177,7 @@ def test_undefined_cells_stay_undefined_and_cast_doubt() -> None:
     np.testing.assert_array_equal(np.isfinite(found), np.isfinite(elevation))
     part = np.full(elevation.shape, 1e-4)
     std = standard_deviation(found, seen, part)
-    scale = seen[3, 29, 42]
+    scale = seen.scale[29, 42]
     assert std[29, 42] > 0.2 * UNKNOWN_BEND / scale / 7  # beside a hole: one of 49 cells would do
     assert std[29, 42] > 2.0 * std[10, 42]
 
@@ -228,19 +227,20 @@ def test_cells_that_one_direction_lost_come_from_the_other() -> None:
     given, known = MAPS[0].copy(), MAPS[2].copy()
     known[:, 140:160] = False
     given[:, 200:240] += 1.0
-    args = LEFT, RIG, T_LOCAL_LEFT, SURFACE, (-1.0, -0.3), params
+    args = RIG, T_LOCAL_LEFT, SURFACE, (-1.0, -0.3), params
     std = np.full(given.shape, 0.2, np.float32)
-    alone = reconstruct(given, MAPS[1], known, *args, disparity_std=std, right=RIGHT)
-    both = reconstruct(given, MAPS[1], known, *args, disparity_std=std, right=RIGHT, back=back)
-    seen = np.isfinite(look(through(), SURFACE, TRUTH)[0])
+    forth = Matches(given, MAPS[1], known, std)
+    alone = reconstruct(MatchedPair(LEFT, forth, RIGHT), *args)
+    both = reconstruct(MatchedPair(LEFT, forth, RIGHT, back), *args)
+    seen = np.isfinite(look(through(), SURFACE, TRUTH).left)
     x = RIG.left.project(T_LOCAL_LEFT.inverse().apply(np.dstack([LATTICE.xy(), TRUTH])))[..., 0]
     lost, wrong, plain = (seen & (x > a) & (x < b) for a, b in ((143, 157), (205, 235), (60, 130)))
     assert not np.isfinite(alone.elevation[lost]).any()
-    scale = look(through(), SURFACE, TRUTH)[3]
+    scale = look(through(), SURFACE, TRUTH).scale
     assert np.nanmax(np.abs((both.elevation - TRUTH) * scale)[lost]) < 0.05
     assert np.isfinite(both.ortho[lost]).all()
     assert np.abs(both.ortho - texture(LATTICE.xy().reshape(-1, 2)).reshape(x.shape))[lost].max() < 3.0
     np.testing.assert_allclose(np.abs((both.elevation - TRUTH) * scale)[wrong].mean(), 0.5, atol=0.1)
     assert np.median(both.elevation_std[wrong]) > 2.0 * np.median(both.elevation_std[plain])
     with raises("RIL-381"):
-        reconstruct(given, MAPS[1], known, *args, disparity_std=std, back=back)
+        reconstruct(MatchedPair(LEFT, forth, back=back), *args)

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rille.stages.terrain.locus.sweep import sweep
+from rille.stages.terrain.locus.sweep import Terms, sweep
 
 
 def reading_order(power, pull, keep, across, down, start, z, sweeps, overshoot):  # type: ignore[no-untyped-def]
@@ -45,7 +45,7 @@ def test_diagonals_give_what_reading_order_gives(shape: tuple[int, int]) -> None
     power, pull = np.where(keep, rng.uniform(0, 1, shape), 0.0), np.where(keep, rng.normal(size=shape), 0.0)
     expected, found = z.copy(), z.copy()
     reading_order(power, pull, keep, *weights, z, expected, 5, 1.7)
-    sweep(power, pull, keep, *weights, z, found, 5, 1.7)
+    sweep(Terms(power, pull, z, keep, *weights), found, 5, 1.7)
     np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
     assert np.array_equal(found[~keep], z[~keep], equal_nan=True)
     if min(shape) > 1:

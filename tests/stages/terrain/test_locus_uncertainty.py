@@ -14,6 +14,7 @@ from rille.stages.terrain.locus.uncertainty import (
     STEP,
     from_both,
 )
+from rille.stages.terrain.locus.views import OrthoPair
 
 SHAPE = (40, 50)
 SCALE = 500.0
@@ -38,7 +39,7 @@ def uniform(value: float) -> np.ndarray:
 
 
 def std(elevation: np.ndarray, seen: np.ndarray, moved: float = 0.0, apart: float | np.ndarray = 0.0) -> np.ndarray:
-    return from_both(elevation, seen, uniform(moved), uniform(1.0) * apart, uniform(0.5))
+    return from_both(elevation, OrthoPair(*seen), uniform(moved), uniform(1.0) * apart, uniform(0.5))
 
 
 def expected(*, rise: float = RISE, grey: float = GREY, apart: float = 0.0, moved: float = 0.0) -> float:
