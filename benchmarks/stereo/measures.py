@@ -133,7 +133,6 @@ def judge(found: Found, truth: Truth) -> dict[str, Any]:
     figures |= {f"bad{t}_matched": _bad(off_matched, t) for t in THRESHOLDS}
     own = None if found.dense is None else Found(*found.dense, found.matched, found.rows)
     figures["bad2_own"] = None if own is None else _bad(error(own, truth)[known], 2)
-    figures["bad1_own"] = None if own is None else _bad(error(own, truth)[known], 1)
     figures["bad2_inside"] = _bad(off[inside], 2)
     figures["median"] = float(np.median(off_matched)) if off_matched.size else None
     figures["completeness"] = off_matched.size / off.size

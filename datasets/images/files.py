@@ -32,6 +32,10 @@ MOST_BYTES = 2**29
 FEWER_BITS = "save it with 8 or 16 bits a sample"
 COPY_AGAIN = "copy the file again, or leave its frame out with --frames"
 
+COLOUR = Array(
+    "colour", ("row", "col", "band"), "uint8", "grey", "red, green and blue of the left image", optional=True
+)
+
 Grey = NDArray[np.uint8] | NDArray[np.uint16]
 
 
@@ -64,7 +68,12 @@ def _damage(data: bytes) -> str:
 
 
 def decode(data: bytes, name: str, wanted: Header | None = None) -> Grey:
-    """Grey image of an encoded file.
+    """Grey image of an encoded file, see :func:`decode_colour`."""
+    return decode_colour(data, name, wanted)[0]
+
+
+def decode_colour(data: bytes, name: str, wanted: Header | None = None) -> tuple[Grey, NDArray[np.uint8] | None]:
+    """Grey image of an encoded file, and its colours where it has any.
 
     Colour becomes grey by ITU-R BT.601, 0.299 R + 0.587 G + 0.114 B; an alpha channel is dropped, an orientation tag
     ignored (the calibration holds for the pixels as they are stored).
@@ -77,7 +86,8 @@ def decode(data: bytes, name: str, wanted: Header | None = None) -> Grey:
 
     Returns
     -------
-    ndarray (row, col), uint8 or uint16 as stored.
+    grey : (row, col), uint8 or uint16 as stored.
+    colour : (row, col, 3) uint8 red, green, blue; None where the file is grey, or all of its pixels are.
 
     Raises
     ------
@@ -98,14 +108,19 @@ def decode(data: bytes, name: str, wanted: Header | None = None) -> Grey:
         raise InputError("RIL-763", f"{name} cannot be decoded", remedy=COPY_AGAIN)
     if image.dtype not in (np.uint8, np.uint16):
         raise InputError("RIL-172", f"{name} has samples of type {image.dtype}", remedy=FEWER_BITS)
+    colour: NDArray[np.uint8] | None = None
     if image.ndim == 3 and image.shape[2] >= 3:
-        image = cv2.cvtColor(np.ascontiguousarray(image[:, :, :3]), cv2.COLOR_BGR2GRAY)
+        three = np.ascontiguousarray(image[:, :, :3])
+        if (three != three[:, :, :1]).any():
+            eight = three if three.dtype == np.uint8 else (three >> 8).astype(np.uint8)
+            colour = np.ascontiguousarray(eight[:, :, ::-1])
+        image = cv2.cvtColor(three, cv2.COLOR_BGR2GRAY)
     elif image.ndim == 3:
         image = image[:, :, 0]
     grey: Grey = np.ascontiguousarray(image)
     if wanted is not None:
         check_size((grey.shape[1], grey.shape[0], grey.dtype.itemsize * 8), wanted, name)
-    return grey
+    return grey, colour
 
 
 def _sound(header: Header | None, name: str) -> Header:
@@ -219,20 +234,23 @@ def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     data = read_bytes(Path(args["path"]), "image", MOST_BYTES)
     if hashlib.sha256(data).hexdigest() != args["sha256"]:
         raise InputError("RIL-177", f"{name} has changed since the run began", remedy="run the same command again")
-    image = decode(data, name, (args["width"], args["height"], args["depth"]))
+    image, colour = decode_colour(data, name, (args["width"], args["height"], args["depth"]))
     meta = {"frame": args["frame"], "camera": args["camera"]}
-    return Bundle({"image": image, "valid": np.ones(image.shape, np.uint8)}, meta)
+    arrays: dict[str, NDArray[Any]] = {"image": image, "valid": np.ones(image.shape, np.uint8)}
+    # The right image's colours would colour nothing: an ortho image is made of left ones.
+    return Bundle(arrays if colour is None or args["camera"] != "left" else arrays | {"colour": colour}, meta)
 
 
 STAGE = Stage(
     name="image",
-    version=1,
+    version=2,
     summary="one image file, checked and grey",
     params=NoParams,
     inputs=(),
     outputs=(
         Array("image", ("row", "col"), "uint8", "grey", "image"),
         Array("valid", ("row", "col"), "uint8", "1", "1 = usable"),
+        COLOUR,
     ),
     run=_run,
 )

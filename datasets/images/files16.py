@@ -10,5 +10,5 @@ from rille.stages.core.declare import Array
 STAGE = replace(
     files.STAGE,
     summary="one image file of 16 bits a sample, checked and grey",
-    outputs=(Array("image", ("row", "col"), "uint16", "grey", "image, white = 65535"), files.STAGE.outputs[1]),
+    outputs=(Array("image", ("row", "col"), "uint16", "grey", "image, white = 65535"), *files.STAGE.outputs[1:]),
 )

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rille.pipeline.engine.runtime import atomic
-from rille.pipeline.export import ranges
+from rille.pipeline.export import colour, ranges
 from rille.pipeline.export.output import Output, stage
 from rille.pipeline.export.writers import write_raster
 from rille.stages.core.declare import Bundle
@@ -72,6 +72,19 @@ def _write_hillshade(folder: Path, view: Any) -> None:
     lattice, elevation = _merged("elevation")(view)
     bands, place = {"hillshade": hillshade(elevation, lattice.cell)}, view.sequence.georeference
     write_raster(folder / "hillshade.tif", bands, lattice, unit="", nodata=0, tags=LIGHT, place=place)
+
+
+def _write_ortho(folder: Path, view: Any) -> None:
+    """Write grey values as they are, or red, green and blue where the images have colours."""
+    lattice, grey = _merged("ortho")(view)
+    place, path = view.sequence.georeference, folder / "ortho.tif"
+    if not colour.coloured(view):
+        write_raster(path, {"ortho": np.asarray(grey, np.float32)}, lattice, unit="", nodata=NAN, place=place)
+        return
+    source = whole(list(map(view.bundle, view.products.tiles)), "source", -1)[1]
+    merged = {"ortho": grey, "elevation": _merged("elevation")(view)[1], "source": source}
+    bands = dict(zip(("red", "green", "blue"), np.moveaxis(colour.ortho(view, lattice, merged), 2, 0), strict=True))
+    write_raster(path, bands, lattice, unit="", nodata=0, place=place)
 
 
 def _write_dem_style(folder: Path, view: Any) -> None:
@@ -218,11 +231,16 @@ OUTPUTS = (
         "shaded relief 1..255, light from the upper left",
         "0",
     ),
-    _of_terrain(
+    Output(
         "ortho.tif",
-        "merged ortho image, grey 0..255",
-        _raster("ortho.tif", "ortho", "", _merged("ortho")),
-        "grey value 0..255",
+        "merged ortho image, grey 0..255, or red, green and blue where the images have colours",
+        GIS,
+        _write_ortho,
+        ("tiles",),
+        colour.READS,
+        ("sequence.georeference", *colour.KNOWS),
+        "world",
+        {**CRS, "values": "grey value 0..255, or red, green, blue 1..255", "missing": "nan; of colours 0"},
     ),
     _of_risk("risk.tif", "risk map: class 0 safe, 1 caution, 2 hazard, 3 unknown, with colours", _write_risk),
     Output("risk.tif.aux.xml", "names of the classes of risk.tif", GIS, _write_class_names, ("risk",)),

@@ -62,7 +62,7 @@ def read_elevation(path: Path) -> DemFile:
         raise InputError(
             "RIL-627", f"{path} does not exist", remedy="give a GeoTIFF, the folder of a run, or a zarr group"
         )
-    if (path / "zarr.json").is_file():
+    if any((path / name).is_file() for name in ("zarr.json", ".zgroup")):
         found = _of_zarr(path)
     elif path.is_dir():
         found = _of_run(path)

@@ -112,6 +112,8 @@ def write_raster(
         for number, (name, values) in enumerate(bands.items(), start=1):
             file.write(np.asarray(values), number)
             file.set_band_description(number, name)
+        if list(bands) == ["red", "green", "blue"]:
+            file.colorinterp = [rasterio.enums.ColorInterp[name] for name in bands]
         if colours is not None:
             file.write_colormap(1, {k: tuple(bytes.fromhex(c[1:])) for k, c in enumerate(colours)})
         file.units = tuple("metre" if u == "m" else u for u in units)

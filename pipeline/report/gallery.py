@@ -316,7 +316,7 @@ _FIGURES: tuple[tuple[str, Maker, Condition, str, str], ...] = (
         "Map",
         _map,
         _always,
-        "tiles risk path drive trajectory disparity rigs",
+        "tiles risk path drive trajectory disparity rigs images undistorted continuity",
         "config.vehicle config.risk.sigmas sequence.rig sequence.truth",
     ),
     (

@@ -166,7 +166,7 @@ def vertices(path: Bundle | None) -> Floats | None:
 def merged(view: RunView) -> Terrain | None:
     """World terrain assembled of its tiles."""
     tiles = [b for b in map(view.bundle, view.products.tiles) if b is not None]
-    names = ("elevation", "elevation_std", "spread", "count", "ortho")
+    names = ("elevation", "elevation_std", "spread", "count", "source", "ortho")
     return assemble(tiles, names) if tiles else None
 
 

@@ -74,8 +74,8 @@
         const v = value[name](k), [low, high] = range[name];
         if (v === v) { const i = 3 * Math.round(255 * Math.min(1, Math.max(0, (v - low) / (high - low)))); c = [ramp[i], ramp[i + 1], ramp[i + 2]]; mix = state.opacity; }
       }
-      const grey = state.base === "ortho" ? photo[4 * k] : known ? shade(k) : 0;
-      for (let i = 0; i < 3; i++) o[4 * k + i] = grey * (1 - mix) + c[i] * mix;
+      const grey = known ? shade(k) : 0, ortho = state.base === "ortho";
+      for (let i = 0; i < 3; i++) o[4 * k + i] = (ortho ? photo[4 * k + i] : grey) * (1 - mix) + c[i] * mix;
       o[4 * k + 3] = known ? 255 : 0;
     }
     pen.putImageData(out, 0, 0);

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rille.pipeline.export import ranges
+from rille.pipeline.export import colour, ranges
 from rille.pipeline.export.artifacts import Floats
 from rille.pipeline.report import canvas
 from rille.pipeline.report.gather import Scene, Terrain
@@ -59,7 +59,7 @@ def data(scene: Scene) -> dict[str, Any] | None:
             _picture(np.asarray(risk, np.uint8) | (count << 2), bits >> 8, bits & 255),
             _picture(_steps(p_hazard, 0.0, 1.0, FINE), slope, np.zeros_like(slope)),
         ],
-        "ortho": _photo(_plane(world, "ortho", step)),
+        "ortho": _photo(_look(scene, world, step)),
         "rows": z.shape[0],
         "cols": z.shape[1],
         "x0": world.lattice.x0,
@@ -128,11 +128,19 @@ def _picture(*planes: NDArray[Any]) -> str:
     return "data:image/png;base64," + base64.b64encode(out.getvalue()).decode("ascii")
 
 
-def _photo(grey: Floats) -> str:
+def _look(scene: Scene, world: Terrain, step: int) -> Floats:
+    """Grey values of the ortho image (row, col), or its colours (row, col, 3), NaN undefined."""
+    if {"ortho", "source"} <= world.arrays.keys() and colour.coloured(scene.view):
+        rgb = colour.ortho(scene.view, world.lattice, world.arrays)[::step, ::step].astype(np.float64)
+        return np.where(rgb > 0, rgb, np.nan)
+    return _plane(world, "ortho", step)
+
+
+def _photo(look: Floats) -> str:
     from PIL import Image
 
-    low, high = ranges.limits(grey, 0.5, 99.5)
-    out, bytes_ = io.BytesIO(), np.clip((np.nan_to_num(grey, nan=low) - low) / (high - low) * 255, 0, 255)
+    low, high = ranges.limits(look, 0.5, 99.5)
+    out, bytes_ = io.BytesIO(), np.clip((np.nan_to_num(look, nan=low) - low) / (high - low) * 255, 0, 255)
     Image.fromarray(bytes_.astype(np.uint8)).save(out, "JPEG", quality=82)
     return "data:image/jpeg;base64," + base64.b64encode(out.getvalue()).decode("ascii")
 

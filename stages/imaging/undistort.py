@@ -157,18 +157,23 @@ def _run(params: UndistortParams, args: Mapping[str, Any], inputs: Inputs) -> Bu
         "camera": args["camera_name"],
         "usable": float(np.count_nonzero(valid) / valid.size),
     }
-    return Bundle({"image": image, "valid": valid}, meta)
+    arrays: dict[str, AnyArray] = {"image": image, "valid": valid}
+    if "colour" in bundle.arrays:
+        bands = [undistort(band, lens, camera, params)[0] for band in np.moveaxis(bundle["colour"], 2, 0)]
+        arrays["colour"] = np.rint(np.stack(bands, axis=2)).astype(np.uint8)
+    return Bundle(arrays, meta)
 
 
 STAGE = Stage(
     name="undistort",
-    version=1,
+    version=2,
     summary="one image with its lens distortion removed",
     params=UndistortParams,
     inputs=("image",),
     outputs=(
         Array("image", ("row", "col"), "float32", "grey", "image of an ideal camera, 0..255, 0 where masked"),
         Array("valid", ("row", "col"), "uint8", "1", "1 = usable"),
+        Array("colour", ("row", "col", "band"), "uint8", "grey", "red, green and blue of it", optional=True),
     ),
     run=_run,
 )

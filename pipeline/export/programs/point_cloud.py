@@ -8,9 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import rasterio
 from numpy.typing import NDArray
 
 from rille.pipeline.engine.runtime import atomic
+from rille.pipeline.export.colour import LUMA
 from rille.pipeline.export.read_dem import DemFile, read_elevation, read_tiff
 from rille.stages.core.errors import InputError
 
@@ -43,7 +45,7 @@ def export(run: Path, kind: str, output: Path | None) -> tuple[Path, str]:
         raise InputError("RIL-600", f"{run} is not the folder of a run", remedy="give RUNS/sequence/latest")
     target = output or run / default
     terrain = read_elevation(run)
-    ortho, sigma = (_beside(run, name, terrain) for name in ("ortho", "dem_sigma"))
+    ortho, sigma = _beside(run, "ortho", terrain), _beside(run, "dem_sigma", terrain)
     try:
         return target, write(target, terrain, ortho, sigma)
     except OSError as error:
@@ -53,20 +55,21 @@ def export(run: Path, kind: str, output: Path | None) -> tuple[Path, str]:
 
 
 def _beside(run: Path, name: str, terrain: DemFile) -> NDArray[np.float64] | None:
-    """Another raster of the run, on the same cells; None where there is none."""
+    """Another raster of the run on the same cells, (rows, cols) or of colours (rows, cols, 3); None: there is none."""
     path = run / f"{name}.tif"
     if not path.is_file():
         return None
     found = read_tiff(path, length=False)
     if found.values.shape != terrain.values.shape or found.transform != terrain.transform:
         raise InputError("RIL-602", f"{path} and dem.tif have other cells", remedy="make the run again")
-    return found.values
+    with rasterio.open(path) as raster:
+        return found.values if raster.count == 1 else np.moveaxis(raster.read().astype(np.float64), 0, 2)
 
 
 def write_laz(
     path: Path, terrain: DemFile, ortho: NDArray[np.float64] | None, sigma: NDArray[np.float64] | None
 ) -> str:
-    """Write a point for each known cell: x, y, z, grey value as intensity and colour, ``sigma`` of z (m).
+    """Write a point for each known cell: x, y, z, intensity and colour of the ortho image, ``sigma`` of z (m).
 
     LAS 1.4, point format 7, the CRS as WKT. A step of the coordinates is a thousandth of a cell or less, an elevation
     is off by half a step at most.
@@ -90,8 +93,10 @@ def write_laz(
     cloud.x, cloud.y, cloud.z = x, y, terrain.values[row, col]
     cloud.return_number[:] = cloud.number_of_returns[:] = 1
     if ortho is not None:
-        grey = np.rint(np.clip(np.nan_to_num(ortho[row, col]), 0, 255) * 257).astype(np.uint16)
-        cloud.intensity = cloud.red = cloud.green = cloud.blue = grey
+        look = np.rint(np.clip(np.nan_to_num(ortho[row, col]), 0, 255) * 257).astype(np.uint16)
+        red, green, blue = look.T if look.ndim == 2 else (look, look, look)
+        cloud.intensity = look if look.ndim == 1 else np.rint(look @ LUMA).astype(np.uint16)
+        cloud.red, cloud.green, cloud.blue = red, green, blue
     if sigma is not None:
         cloud.sigma = sigma[row, col].astype(np.float32)
     with atomic.replacing(path) as temporary:

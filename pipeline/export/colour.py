@@ -1,0 +1,59 @@
+"""The ortho image of a run in colour, where its left images have colours.
+
+Matching, elevation models and their merging know grey values alone, and the merged grey is evened out between the
+models. Colour is brought to it afterwards: each cell takes the colour that the left image of the pair of its greatest
+weight shows there, less that colour's own grey, added to the merged grey. So colours have no seams of exposure.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from rille.pipeline.export import artifacts
+from rille.stages.geometry.geometry import RigidTransform
+from rille.stages.geometry.lattice import Lattice
+
+LUMA = np.array([0.299, 0.587, 0.114])
+"""Grey of red, green and blue, as the images were made grey (ITU-R BT.601)."""
+
+READS = ("images", "undistorted", "trajectory", "continuity", "rigs")
+KNOWS = ("frames", "sequence.rig")
+"""What an output needs besides the merged tiles, see :class:`rille.pipeline.export.output.Output`."""
+
+
+def coloured(view: Any) -> bool:
+    """Whether the left images have colours: all of a sequence have, or none."""
+    first = next((image for f in view.frames if (image := artifacts.image(view, f)) is not None), None)
+    return first is not None and "colour" in first.arrays
+
+
+def ortho(view: Any, lattice: Lattice, merged: dict[str, NDArray[Any]]) -> NDArray[np.uint8]:
+    """Red, green and blue (row, col, 3) of the merged cells, 1..255; 0 where nothing is known.
+
+    Parameters
+    ----------
+    merged : arrays ``ortho``, ``elevation`` and ``source`` on ``lattice``.
+    """
+    grey, known = merged["ortho"], np.isfinite(merged["ortho"])
+    found = np.repeat(np.nan_to_num(grey)[..., None], 3, axis=2).astype(np.float64)
+    trajectory = view.bundle(view.products.trajectory)
+    poses = (
+        {} if trajectory is None else dict(zip(view.frames, artifacts.by_frame(view, trajectory, "poses"), strict=True))
+    )
+    xy = lattice.xy()
+    for pair in np.unique(merged["source"][known]):
+        image, pose = artifacts.image(view, int(pair)), poses.get(int(pair))
+        if image is None or "colour" not in image.arrays or pose is None or not np.isfinite(pose).all():
+            continue
+        here = known & (merged["source"] == pair) & np.isfinite(merged["elevation"])
+        world = np.column_stack([xy[here], merged["elevation"][here]])
+        camera = artifacts.used_rig(view, int(pair)).left
+        x, y = camera.project(RigidTransform.from_matrix(pose).inverse().apply(world)).T
+        bands = np.moveaxis(image["colour"], 2, 0)
+        colour = np.stack([scipy.ndimage.map_coordinates(b, (y, x), float, 1, mode="nearest") for b in bands], axis=1)
+        found[here] += colour - (colour @ LUMA)[:, None]
+    return np.where(known[..., None], np.clip(np.rint(found), 1, 255), 0).astype(np.uint8)
