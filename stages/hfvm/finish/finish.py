@@ -107,8 +107,7 @@ class Finish:
         """Bits that speak against each pixel, none where it is consistent."""
         p, bits = self.params, np.empty(window.shape, np.uint8)
         deviation, valid = self.pair.deviation(0, window), self.pair.left.view.valid(0, window)
-        texture = max(p.texture, self.pair.left.view.unrest)
-        limits = (np.float32(a) for a in (p.threshold, texture, p.backmatch))
+        limits = (np.float32(a) for a in (p.threshold, p.texture, p.backmatch))
         consistency.reasons(distance, deviation, valid, error, *limits, bits)
         return bits
 

@@ -159,9 +159,8 @@ class HfvmParams(Params):
     texture: float = Field(
         default=0.5,
         ge=0,
-        description="least standard deviation [grey levels] of the window around a pixel to be matched, and at least "
-        "what noise alone makes of a smoothed image; larger: fewer matches where the image shows little; rounding to "
-        "8 bits alone gives 0.29",
+        description="least standard deviation [grey levels] of the window around a pixel to be matched; larger: "
+        "fewer matches where the image shows little; rounding to 8 bits alone gives 0.29",
     )
     backmatch: float = Field(
         default=1.0,

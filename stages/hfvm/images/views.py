@@ -32,10 +32,6 @@ class View(Protocol):
         """Grey level where no level is valid."""
 
     @property
-    def unrest(self) -> float:
-        """Local deviation at the finest level that noise alone makes, grey levels; 0 where little is known of it."""
-
-    @property
     def kept_noise(self) -> float:
         """Share of the variance of the finest level's noise that is left: 1, or less where it has been smoothed."""
 
@@ -84,11 +80,6 @@ class Plain:
         return tuple(image.shape for image in self.images)
 
     @property
-    def unrest(self) -> float:
-        """Nothing: where noise is told from texture, the view is smoothed."""
-        return 0.0
-
-    @property
     def kept_noise(self) -> float:
         """All of it."""
         return 1.0
@@ -115,11 +106,6 @@ class Smoothed:
     """
 
     view: Plain
-
-    @property
-    def unrest(self) -> float:
-        """Deviation that is left of the noise."""
-        return float(np.sqrt(self.kept_noise)) * self.view.noise
 
     @property
     def kept_noise(self) -> float:
@@ -219,11 +205,6 @@ class Aligned:
         m = plane.margin(left.shapes[0])
         shapes = pyramid_shapes((left.shapes[0][0] + 2 * m, left.shapes[0][1] + 2 * m), len(left.shapes))
         return Aligned(right, h, left.shapes[0], shapes, (), (), len(shapes), blank)
-
-    @property
-    def unrest(self) -> float:
-        """That of the right image, as resampling hardly changes it."""
-        return self.right.unrest
 
     @property
     def kept_noise(self) -> float:
