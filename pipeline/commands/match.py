@@ -118,7 +118,7 @@ def warnings(found: Disparity, left: NDArray[Any], right: NDArray[Any]) -> list[
         )
         shares = sorted(((float(has(found.validity, bit).mean()), words) for bit, words in reasons), reverse=True)
         told = ", ".join(f"{100 * s:.0f} % {words}" for s, words in shares[:2] if s >= 0.005)
-        text = f"only {100 * share:.1f} % of the pixels match ({told}): do both images show one scene?"
+        text = f"only {100 * share:.1f} % of the pixels match ({told}): do both images show one scene in one light?"
         return [warning("RIL-700", text)]
     blank = float(has(found.validity, Validity.NO_TEXTURE).mean())
     if blank > BLANK:
