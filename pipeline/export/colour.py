@@ -7,6 +7,7 @@ weight shows there, less that colour's own grey, added to the merged grey. So co
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -31,7 +32,7 @@ def coloured(view: Any) -> bool:
     return first is not None and "colour" in first.arrays
 
 
-def ortho(view: Any, lattice: Lattice, merged: dict[str, NDArray[Any]]) -> NDArray[np.uint8]:
+def ortho(view: Any, lattice: Lattice, merged: Mapping[str, NDArray[Any]]) -> NDArray[np.uint8]:
     """Red, green and blue (row, col, 3) of the merged cells, 1..255; 0 where nothing is known.
 
     Parameters
