@@ -238,6 +238,7 @@ class _Run:
         self.store.survey(_sequence(self.graph))
         while True:
             self._settle()
+            # An interrupt in a finaliser or a callback of a weak reference was remembered, not raised.
             interrupts.check()
             self._submit()
             if not self.out:
@@ -347,6 +348,7 @@ class _Run:
         assert self.admission is not None
         admission, most = self.admission, executor.slots * executor.depth
         admission.together = executor.slots
+        # Refill at three quarters: tasks that are sent together cost dask a third of the time of tasks sent one by one.
         at_work, few = sum(not self.waits[index] for index in self.out), most - most // 4
         if at_work < few:
             while at_work < most and not self.stopped:
@@ -399,6 +401,7 @@ class _Run:
         if chained and all_known and self._broken(handle) is None:
             handle.key = key_of(handle.spec, handle.refs())
         if isinstance(outcome, Outcome):
+            # The worker computed the key from its own source files: they were edited during the run, or differ there.
             if handle.key and outcome.ref.key != handle.key:
                 outcome = Failed(CodeChangedError("RIL-870", "a worker's source code is not that of this process"), "")
             else:
@@ -439,6 +442,7 @@ class _Run:
         shares = account(known, self.options.memory_limit, kind, jobs, most)
         self.admission = Admission(known, shares, automatic=self.options.memory_limit is None)
         self.admission.check(ahead)
+        # Before the workers start: a full or read-only disk should not cost that time.
         self.store.writable()
         amounts = {k: round(v) for k, v in vars(shares).items() if math.isfinite(v)}
         name = kind if isinstance(kind, str) else kind.scheduler.address
@@ -488,6 +492,7 @@ class _Run:
             return False
         self.put_back[handle.key] += 1
         self.flying.setdefault(handle.key, [handle])
+        # fresh: the survey from the start of the run still lists the artifact that has gone.
         absent = {h.key: h for h in handle.upstream() if self.store.lookup(h.stage, h.key, fresh=True) is None}
         for key, source in absent.items():
             source.reason = "its artifact was found damaged, or gone, when it was read"

@@ -404,6 +404,7 @@ def _make_folder(parent: Path, started: datetime, plan: str) -> Path:
 
 def _point_latest(folder: Path) -> None:
     """Move ``latest`` to a finished run in one step."""
+    # symlink_to cannot replace a link; a rename can, in one step, so a reader finds the earlier or the new run.
     link = folder.parent / f".latest-{os.getpid()}"
     link.symlink_to(folder.name, target_is_directory=True)
     link.replace(folder.parent / "latest")

@@ -76,6 +76,7 @@ def here(jobs: int, cache: Location, memory: float) -> Dask:
     resource_tracker.ensure_running()  # it unblocks the signal in the thread that happens to start it
     with held():
         cluster = LocalCluster(
+            # With workers LocalCluster would block until they run; scale() returns at once.
             n_workers=0,
             threads_per_worker=1,
             security=True,
@@ -220,6 +221,7 @@ class Dask:
         """Start a worker again that is gone for two looks: its nanny does not where it died just as it began."""
         gone = {nanny for nanny in self._cluster.workers.values() if not nanny.is_alive()}
         for nanny in gone & self._gone:
+            # Nannies belong to the event loop of the client: their methods must run there.
             self._client.loop.add_callback(nanny.instantiate)
         self._gone = gone - self._gone
 
@@ -232,6 +234,7 @@ class Dask:
         if str(error.task) != future.key:  # one that it waited for
             return NotBegun()
         others = sum(not _resident(pid) for pid in self._beside) > 1
+        # Several workers that die at once were killed from outside, so no task is to blame.
         self._deaths[number] += alone and not others  # else it is a suspect, and no more
         self._tries[number] += 1
         if self._deaths[number] < DEATHS and self._tries[number] < TRIES:
@@ -264,6 +267,7 @@ class Dask:
             return
         if kill:
             for nanny in self._cluster.workers.values():
+                # A nanny starts a worker again as soon as it is killed.
                 nanny.auto_restart = False
             _end(self._pids())
         _leave(self._client, within)
@@ -345,6 +349,7 @@ def _configure() -> None:
     }
     dask.config.set(
         {
+            # The first death ends the task for dask: this client decides which one is a suspect, and tries it alone.
             "distributed.scheduler.allowed-failures": 0,
             "distributed.worker.memory.terminate": 1.0,
             "distributed.worker.profile.enabled": False,

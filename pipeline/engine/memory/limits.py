@@ -164,6 +164,7 @@ class Meter:
 def _set_back() -> bool:
     """Begin the mark of the greatest resident memory anew."""
     try:
+        # 5 sets VmHWM, the greatest resident memory, back to the present one (Linux, proc(5)).
         Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
     except OSError:
         return False

@@ -23,10 +23,13 @@ def replacing(path: Path) -> Iterator[Path]:
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     apart = _beside(path)
+    # A folder of its own: writers that choose the format by the file name see the final name, and files that they put
+    # beside it (GDAL does) are removed with the folder.
     apart.mkdir()
     try:
         yield apart / path.name
         if path.is_dir() and not path.is_symlink():
+            # os.replace cannot replace a folder that is not empty.
             shutil.rmtree(path)
         os.replace(apart / path.name, path)
     finally:
@@ -52,14 +55,17 @@ def create(path: Path, pieces: Iterable[bytes]) -> bool:
         with temporary.open("wb") as file:
             file.writelines(pieces)
             file.flush()
+            # Contents before name: without this, a power failure could leave the name of an artifact over empty blocks.
             os.fsync(file.fileno())
         try:
+            # link, not rename: rename would silently replace the artifact that another process has just published.
             os.link(temporary, path)
         except FileExistsError:
             return False
     finally:
         temporary.unlink(missing_ok=True)
     try:
+        # The new name is an entry of its folder, and a new folder is one of the folder above: each needs a flush.
         for folder in [path.parent, *made]:
             _fsync(folder)
     except OSError:
@@ -77,6 +83,7 @@ def remove(path: Path, modified: float) -> None:
     os.rename(path, aside)
     try:
         if os.stat(aside).st_mtime != modified:
+            # link again: a file that was made anew meanwhile stays.
             os.link(aside, path)
     except FileExistsError:
         pass  # made anew meanwhile

@@ -22,6 +22,8 @@ def held() -> Iterator[None]:
 
     Threads and processes begun in the block, and all that these begin, never see it.
     """
+    # Blocked, not ignored: the signal stays pending until the end of the block, and new threads and processes inherit
+    # the mask.
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -38,6 +40,7 @@ class Interrupts:
 
     def __enter__(self) -> Interrupts:
         main = threading.current_thread() is threading.main_thread()
+        # A notebook or another program that has a handler of its own keeps it.
         if main and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
             signal.signal(signal.SIGINT, self._interrupted)
             self._hook, sys.unraisablehook = sys.unraisablehook, self._unraisable
@@ -58,5 +61,6 @@ class Interrupts:
         raise KeyboardInterrupt
 
     def _unraisable(self, what: Any) -> None:
+        # Python would print this interrupt and forget it; check() raises it, so the print is noise.
         if not issubclass(what.exc_type, KeyboardInterrupt):
             self._hook(what)

@@ -222,6 +222,7 @@ class Store:
         for _ in range(3):
             if self.place.create(path, pieces):
                 return reference(manifest)
+            # fresh: the artifact that was in the way came after the survey.
             there = self.lookup(stage.name, key, fresh=True)  # a damaged one is set aside
             if there is not None and there.digest == digest:
                 return there
@@ -241,6 +242,7 @@ class Store:
         with suppress(OSError, RilleError):
             with suppress(ValueError):
                 found = self._read_manifest(stage, key)
+                # Compare attempts, not keys: a sound artifact of the same key may have replaced the damaged one.
                 if found is None or manifest is None or found["attempt"] != manifest["attempt"]:
                     return
             self.place.move(path, f"{aside}.zarr.zip")

@@ -41,6 +41,7 @@ class Folder:
         with self._clear_errors():
             self.root.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryFile(dir=self.root) as file:
+                # An empty file fits on a full disk; a block does not.
                 file.write(b"\0" * 4096)
                 file.flush()
             if not (self.root / MARK).exists():
@@ -127,6 +128,7 @@ class Folder:
 
     def _prune(self, path: str) -> None:
         for above in list(Path(path).parents)[:-2]:  # the areas themselves stay
+            # rmdir refuses a folder that is not empty; the callers suppress that error, and it ends the loop.
             (self.root / above).rmdir()
 
     def url(self, path: str) -> str:

@@ -97,6 +97,7 @@ class Index:
         """Write what a run used, unless an index says so that is young."""
         known = {key: self.lines[key] for key in used if key in self.lines}
         if len(known) < len(used):
+            # The artifacts of this run came after the survey at its start.
             self._place.survey()
             for key in used.keys() - known.keys():
                 ref = used[key]
@@ -131,6 +132,7 @@ def _read(place: Place, item: Item, lines: dict[str, str], room: int) -> int:
         while data and not unpacker.eof:
             piece = unpacker.decompress(data, PIECE)
             size, data = size + len(piece), unpacker.unconsumed_tail
+            # A small damaged or hostile file can unpack to any size.
             if size > room:
                 raise ValueError(f"it unpacks to more than {room / 1e6:.0f} MB")
             *whole, rest = (rest + piece).split(b"\n")

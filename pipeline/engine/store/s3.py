@@ -78,6 +78,7 @@ class Bucket:
         """As of the survey, else by a request."""
         import obstore
 
+        # A bucket takes milliseconds for each question, so tens of thousands of look-ups use the listing.
         if not fresh and self._listed is not None:
             return self._listed.get(path)
 
@@ -119,6 +120,7 @@ class Bucket:
         import obstore
 
         with self._clear_errors():
+            # obstore retries requests, but not an answer whose connection breaks after its head.
             for _ in range(BROKEN):
                 with suppress(obstore.exceptions.GenericError):
                     return read()
@@ -140,6 +142,7 @@ class Bucket:
 
         with self._clear_errors():
             try:
+                # One request: the server tests the condition once, and a multipart upload cannot create-if-absent.
                 obstore.put(self._store, path, b"".join(pieces), mode="create", use_multipart=False)
             except obstore.exceptions.AlreadyExistsError:
                 return False
