@@ -17,6 +17,7 @@ from rille.pipeline.engine.memory import cost_model, limits
 from rille.pipeline.engine.memory.admission import Account, Admission, account, forecast, largest
 from rille.pipeline.engine.memory.cost_model import Costs, Foreseen, count
 from rille.pipeline.engine.memory.limits import words
+from rille.pipeline.engine.plain import some
 from rille.pipeline.engine.runtime.environment import cores
 from rille.pipeline.engine.scheduler import Result
 from rille.pipeline.engine.store.base import at
@@ -139,11 +140,7 @@ def _totals(graph: Graph, result: Result, earlier: Kinds, jobs: int) -> Iterable
         line += f" (never timed: {', '.join(untimed)})" if untimed else ""
     yield line
     if result.assumed:
-        yield f"laid out by the last run's {_some(result.assumed)}, which will be computed anew: the layout may change"
+        names = some(list(dict.fromkeys(result.assumed)), 3)
+        yield f"laid out by the last run's {names}, which will be computed anew: the layout may change"
     if result.unknown:
-        yield f"more tasks follow, known only after {_some(result.unknown)}"
-
-
-def _some(labels: list[str]) -> str:
-    names = list(dict.fromkeys(labels))
-    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+        yield f"more tasks follow, known only after {some(list(dict.fromkeys(result.unknown)), 3)}"

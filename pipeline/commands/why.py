@@ -11,6 +11,7 @@ from typing import Any
 from rille.pipeline.engine import events, provenance
 from rille.pipeline.engine.keys import digest
 from rille.pipeline.engine.memory.limits import words
+from rille.pipeline.engine.plain import some
 from rille.pipeline.engine.store.base import Store, at
 from rille.pipeline.engine.store.location import Location
 from rille.pipeline.engine.store.manifest import artifact_path
@@ -103,7 +104,7 @@ def _recipe(made: Mapping[str, Any]) -> Iterable[str]:
         yield f"parameter     {made['stage']}.{name} = {_text(value)}{note}"
     yield from (f"argument      {name} = {_text(value)}" for name, value in past["args"].items())
     modules = sorted(past["code"])
-    yield f"code          {digest(past['code'])[:SHORT]} of {len(modules)} modules: {_list(modules)}"
+    yield f"code          {digest(past['code'])[:SHORT]} of {len(modules)} modules: {some(modules, 6)}"
     packages = ", ".join(f"{name} {version}" for name, version in sorted(past["env"].items()))
     yield f"packages      {packages or 'none declared'}"
     when = datetime.fromtimestamp(past["started"], UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
@@ -146,7 +147,3 @@ def _since(run: Path, row: Mapping[str, Any], made: Mapping[str, Any], store: St
 def _text(value: Any) -> str:
     text = value if isinstance(value, str) else json.dumps(value)
     return text if len(text) <= 70 else f"{text[:67]}..."
-
-
-def _list(names: list[str]) -> str:
-    return ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")

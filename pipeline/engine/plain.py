@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from typing import Any, TextIO
 
@@ -44,6 +44,11 @@ def raw(stream: Any) -> Any:
 def warn(line: str) -> None:
     """Print a warning on stderr; a line that begins with a code (``RIL-680: ...``) shows it where an error would."""
     print(f"rille: warning{' ' if line.startswith('RIL-') else ': '}{' '.join(line.split())}", file=sys.stderr)
+
+
+def some(names: Sequence[str], most: int) -> str:
+    """``a, b, c and 4 more``: the first ``most`` names, and the number of the others."""
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 @contextmanager

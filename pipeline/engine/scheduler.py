@@ -40,6 +40,7 @@ from rille.pipeline.engine.keys import digest
 from rille.pipeline.engine.memory import cost_model
 from rille.pipeline.engine.memory.admission import Admission, Waiting, account, largest
 from rille.pipeline.engine.memory.cost_model import input_bytes
+from rille.pipeline.engine.plain import some
 from rille.pipeline.engine.progress import Progress, Quiet
 from rille.pipeline.engine.runtime.environment import cores
 from rille.pipeline.engine.runtime.interrupts import Interrupts
@@ -594,5 +595,4 @@ _FATE = {"failed": "failed", "skipped": "was skipped"}
 
 
 def _labels(handles: list[Handle]) -> str:
-    names = [h.label for h in handles[:3]]
-    return ", ".join(names) + (f" and {len(handles) - 3} more" if len(handles) > 3 else "")
+    return some([h.label for h in handles], 3)

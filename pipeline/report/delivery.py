@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from rille.pipeline.engine.plain import some
 from rille.pipeline.export.view import RunView
 from rille.pipeline.report.canvas import Figure
 from rille.pipeline.report.gather import Scene
@@ -106,8 +107,7 @@ def _failures(view: RunView) -> Items:
     skipped = [t for t in view.tasks if t.status not in ("computed", "cached", "failed")]
     for reason in dict.fromkeys(t.reason for t in skipped):
         labels = [t.label for t in skipped if t.reason == reason]
-        more = f" and {len(labels) - 6} more" if len(labels) > 6 else ""
-        found.append(_item("skipped", ", ".join(labels[:6]) + more, reason or "something it depends on is missing"))
+        found.append(_item("skipped", some(labels, 6), reason or "something it depends on is missing"))
     return found
 
 

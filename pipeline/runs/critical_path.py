@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from graphlib import TopologicalSorter
 from pathlib import Path
 from typing import Any
 
@@ -87,15 +88,16 @@ def _longest(
     """The chain of tasks, each waiting for the one before, with the greatest sum of seconds."""
     waits: dict[str, list[str]] = defaultdict(list)
     for row in rows:
+        own = waits[row["label"]]
         for given in row.get("inputs", {}).values():
-            waits[row["label"]] += given if isinstance(given, list) else [given]
+            own += given if isinstance(given, list) else [given]
     for number, (after, nodes) in enumerate(expansions):
         waits[f"\0{number}"] += after  # one name for all, else it is each with each
         for node in nodes:
             waits[node].append(f"\0{number}")
     until: dict[str, float] = {}
     via: dict[str, str] = {}
-    for label in _in_order(waits, [row["label"] for row in rows]):
+    for label in TopologicalSorter(waits).static_order():
         before = max(waits.get(label, ()), key=lambda w: until.get(w, 0.0), default="")
         until[label] = took.get(label, 0.0) + until.get(before, 0.0)
         via[label] = before
@@ -105,23 +107,6 @@ def _longest(
             chain.append((at, took[at]))
         at = via.get(at, "")
     return tuple(reversed(chain))
-
-
-def _in_order(waits: Mapping[str, list[str]], labels: list[str]) -> Iterable[str]:
-    """Every label after those that it waits for."""
-    done: set[str] = set()
-    for label in labels:
-        stack = [label]
-        while stack:
-            at = stack[-1]
-            open_ = [w for w in waits.get(at, ()) if w not in done]
-            if at in done or not open_:
-                stack.pop()
-                if at not in done:
-                    done.add(at)
-                    yield at
-            else:
-                stack += open_
 
 
 def describe(run: Path) -> Iterable[str]:

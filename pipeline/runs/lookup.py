@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from rille.pipeline.engine import events
+from rille.pipeline.engine.plain import some
 from rille.stages.core.errors import ConfigError
 
 LEDGER = "ledger.jsonl"
@@ -45,7 +46,7 @@ def find(text: str, runs: Path) -> Path:
     if started:  # none of them came to its end
         return started[-1]
     names = [n for run in known for n in (name(run), run.parent.name, run.name)]
-    where = f"there are {_some(sorted({run.parent.name for run in known}))}" if known else f"{runs} holds none"
+    where = f"there are {some(sorted({run.parent.name for run in known}), 4)}" if known else f"{runs} holds none"
     raise ConfigError("RIL-067", f"no run {text!r}", remedy=_near(text, names) or where)
 
 
@@ -103,7 +104,7 @@ def row(rows: Iterable[dict[str, Any]], label: str, run: Path) -> dict[str, Any]
         return by_label[label]
     near = _near(label, by_label)
     raise ConfigError(
-        "RIL-068", f"run {name(run)} has no task {label!r}", remedy=near or f"it has {_some(list(by_label))}"
+        "RIL-068", f"run {name(run)} has no task {label!r}", remedy=near or f"it has {some(list(by_label), 4)}"
     )
 
 
@@ -112,10 +113,6 @@ def _near(text: str, names: Iterable[str]) -> str:
     within = [n for n in known if text and text in n]
     found = difflib.get_close_matches(text, known, n=3, cutoff=0.5) or within[:3]
     return f"did you mean {' or '.join(found)}?" if found else ""
-
-
-def _some(names: list[str]) -> str:
-    return ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
 
 
 def earlier(run: Path, *, of_any: bool = False) -> Iterator[Path]:
