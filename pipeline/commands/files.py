@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -125,7 +126,7 @@ def match(
     )
 
 
-Form = Literal["laz", "glb", "colmap", "nav2"]
+Form = Literal["laz", "glb", "colmap", "nav2", "grid_map"]
 """What ``rille export`` writes."""
 
 
@@ -138,15 +139,16 @@ def export(
     cache: CacheFolder = None,
     debug: Debug = False,
 ) -> int:
-    """Write a run for other programs: cloud.laz (a point a cell), terrain.glb (textured mesh), COLMAP model, Nav2 maps.
+    """Write a run for other programs: cloud.laz (a point a cell), terrain.glb (textured mesh), models, maps.
 
     Parameters
     ----------
     to
         laz: CloudCompare, PDAL, QGIS; glb: any glTF viewer, Blender; colmap: cameras, rig, poses and tracked points;
-        nav2: map, keepout and speed mask, and path of ROS 2's navigation. May be repeated.
+        nav2: map, keepout and speed mask, and path of ROS 2's navigation; grid_map: a bag with one GridMap. May be
+        repeated.
     output
-        What to write, for one form only; by default cloud.laz, terrain.glb or the folder colmap or nav2 in the run's
+        What to write, for one form only; by default cloud.laz, terrain.glb or a folder of the form's name in the run's
         folder.
     """
     from rille.stages.core.errors import ConfigError
@@ -166,12 +168,11 @@ def export(
 
 def _export(run: Path, kind: Form, output: Path | None, cache: str | None) -> str:
     """Write one form; what was written, in words."""
-    if kind in ("colmap", "nav2"):
+    if kind in ("colmap", "nav2", "grid_map"):
         from rille.pipeline.engine.store.base import at
-        from rille.pipeline.export.programs import colmap, nav2
 
-        write = colmap.export_run if kind == "colmap" else nav2.export_run
-        return write(run, output or run / kind, at(cache_folder(cache)))
+        write = import_module(f"rille.pipeline.export.programs.{kind}").export_run
+        return str(write(run, output or run / kind, at(cache_folder(cache))))
     from rille.pipeline.export.programs import point_cloud
 
     path, words = point_cloud.export(run, kind, output)

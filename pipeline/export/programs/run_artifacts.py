@@ -42,6 +42,10 @@ class RunArtifacts:
             raise InputError("RIL-609", f"the run has no {label}", remedy="finish it with rille reconstruct")
         return self._open(row)
 
+    def all(self, stage: str) -> list[Bundle]:
+        """All artifacts of a stage."""
+        return [self._open(row) for row in self.rows if row["stage"] == stage]
+
     def pairs(self, first: str, second: str) -> list[tuple[Bundle, Bundle]]:
         """Artifacts of two stages with the same rest of the label."""
         mine = {

@@ -1,0 +1,110 @@
+"""A run as a bag with one ``grid_map_msgs/msg/GridMap``: what elevation mapping and its viewers take.
+
+The bag (mcap, ROS 2) has the topic :data:`TOPIC` in the frame ``map``, the run's world frame: metres, x to the right
+and y ahead of the first left camera, z up. Its layers are float32, NaN where nothing is known. The first cell of a grid
+map is the one of greatest x and y; its first index runs along falling x, its second along falling y, and a layer is
+stored by columns (``grid_map_core``, ``GridMapMath``; ``grid_map_ros``, ``GridMapMsgHelpers``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rille.pipeline.engine.runtime import atomic
+from rille.pipeline.engine.store.base import Store
+from rille.pipeline.export.programs.run_artifacts import RunArtifacts, check_new
+from rille.stages.core.declare import Bundle
+from rille.stages.core.errors import InputError
+from rille.stages.geometry.lattice import Lattice, mosaic
+from rille.stages.hazard.classification import UNKNOWN
+
+FRAME, TOPIC = "map", "/grid_map"
+MESSAGE = "grid_map_msgs/msg/GridMap"
+
+DEFINITIONS = {
+    "grid_map_msgs/msg/GridMapInfo": "float64 resolution\nfloat64 length_x\nfloat64 length_y\n"
+    "geometry_msgs/Pose pose\n",
+    MESSAGE: "std_msgs/Header header\ngrid_map_msgs/GridMapInfo info\nstring[] layers\nstring[] basic_layers\n"
+    "std_msgs/Float32MultiArray[] data\nuint16 outer_start_index\nuint16 inner_start_index\n",
+}
+"""Of ROS 2, where the header stands in the map."""
+
+
+def export_run(run: Path, target: Path, store: Store) -> str:
+    """Write the bag of a run folder; the line to print.
+
+    Raises
+    ------
+    InputError
+        The folder holds no finished run with a risk map, its artifacts are gone from the cache, the target is not
+        empty, or the package that writes bags is missing.
+    """
+    check_new(target)
+    artifacts = RunArtifacts(run, store)
+    risk, tiles = artifacts.one("risk/world"), artifacts.all("merge")
+    with atomic.replacing(target) as folder, TemporaryDirectory(dir=folder.parent) as aside:
+        bag = Path(aside) / target.name  # a bag's files have the name of its folder
+        write(bag, risk, tiles)
+        bag.rename(folder)
+    return f"{target}: {TOPIC} of {risk['risk'].size} cells; ros2 bag play {target}"
+
+
+def layers(risk: Bundle, tiles: Sequence[Bundle]) -> dict[str, NDArray[np.float32]]:
+    """Layers (row, col) on the lattice of the risk map: m, m, class 0 safe to 2 hazard, probability; NaN unknown."""
+    lattice = Lattice.from_dict(risk.meta["lattice"])
+    places = [Lattice.from_dict(tile.meta["lattice"]) for tile in tiles]
+    found = {
+        name: mosaic([(p, np.asarray(t[array])) for p, t in zip(places, tiles, strict=True)], np.nan, lattice)
+        for name, array in (("elevation", "elevation"), ("sigma", "elevation_std"))
+    }
+    classes = np.asarray(risk["risk"], np.float32)
+    found |= {"risk": np.where(classes == UNKNOWN, np.nan, classes), "p_hazard": np.asarray(risk["p_hazard"])}
+    return {name: np.asarray(values, np.float32) for name, values in found.items()}
+
+
+def write(folder: Path, risk: Bundle, tiles: Sequence[Bundle]) -> None:
+    """Write a bag of a risk map and of the tiles of the merged terrain; ``folder`` must not exist."""
+    try:
+        from rosbags.rosbag2 import StoragePlugin, Writer
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+    except ImportError as error:
+        raise InputError(
+            "RIL-958", "bags are written by the package rosbags", remedy="pip install 'rille[robots]'"
+        ) from error
+    types = get_typestore(Stores.ROS2_HUMBLE)
+    for kind, text in DEFINITIONS.items():
+        types.register(get_types_from_msg(text, kind))
+    message = _message(types.types, Lattice.from_dict(risk.meta["lattice"]), layers(risk, tiles))
+    with Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        topic = writer.add_connection(TOPIC, MESSAGE, typestore=types)
+        writer.write(topic, 0, types.serialize_cdr(message, MESSAGE))
+
+
+def _message(types: Mapping[str, Any], lattice: Lattice, found: Mapping[str, NDArray[np.float32]]) -> Any:
+    def make(kind: str, *values: Any) -> Any:
+        return types[kind](*values)
+
+    x = lattice.x0 + 0.5 * (lattice.cols - 1) * lattice.cell
+    y = lattice.y0 - 0.5 * (lattice.rows - 1) * lattice.cell
+    pose = make(
+        "geometry_msgs/msg/Pose",
+        make("geometry_msgs/msg/Point", x, y, 0.0),
+        make("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 1.0),
+    )
+    sizes = lattice.cols * lattice.cell, lattice.rows * lattice.cell
+    info = make("grid_map_msgs/msg/GridMapInfo", lattice.cell, *sizes, pose)
+    dimensions = [
+        make("std_msgs/msg/MultiArrayDimension", "column_index", lattice.rows, lattice.rows * lattice.cols),
+        make("std_msgs/msg/MultiArrayDimension", "row_index", lattice.cols, lattice.cols),
+    ]
+    layout = make("std_msgs/msg/MultiArrayLayout", dimensions, 0)
+    # a column of a grid map is one row of a raster, from the greatest x
+    data = [make("std_msgs/msg/Float32MultiArray", layout, values[:, ::-1].ravel()) for values in found.values()]
+    header = make("std_msgs/msg/Header", make("builtin_interfaces/msg/Time", 0, 0), FRAME)
+    return make(MESSAGE, header, info, list(found), ["elevation"], data, 0, 0)
