@@ -165,47 +165,23 @@ def perform(options: Options) -> tuple[int, Path]:
 
 @dataclass(frozen=True)
 class _Opened:
-    """A run that is configured and laid out, with the folder that its results go to."""
+    """A run that is configured and laid out: ``view`` for the report, ``folder`` for its results."""
 
     options: Options
-    sequence: Sequence
-    frames: tuple[int, ...]
-    config: Any
-    text: str
     settled: Settled
+    view: RunView
     folder: Path
     started: datetime
-    versions: dict[str, str]
     store: Store
     graph: Graph
     drive: Drive | None
-    products: Products
 
-    def told(self) -> _Opened:
-        """With the frames that a drive has taken, once it is over."""
-        if self.drive is None:
-            return self
-        sequence, frames = self.drive.taken()
-        return replace(self, sequence=sequence, frames=frames)
-
-    def view(self, **late: Any) -> RunView:
-        """Return the view of the run for the report; ``late`` are facts that are known at its end."""
-        from rille.pipeline.export.view import RunView
-
-        return RunView(
-            run_id=self.folder.name,
-            sequence=self.sequence,
-            frames=self.frames,
-            products=self.products,
-            config=self.config,
-            config_toml=self.text,
-            versions=self.versions,
-            command=self.options.command(),
-            vehicle_source=self.settled.vehicle_source,
-            started=self.started.strftime("%Y-%m-%dT%H:%M:%SZ"),
-            notes=self.sequence.notes,
-            **late,
-        )
+    def late(self, **known: Any) -> RunView:
+        """Return the view with facts that are known late: among them the frames that a drive has taken."""
+        if self.drive is not None:
+            known["sequence"], known["frames"] = self.drive.taken()
+            known["notes"] = known["sequence"].notes
+        return replace(self.view, **known)
 
 
 def _reconstruct(options: Options) -> tuple[int, Path]:
@@ -213,10 +189,10 @@ def _reconstruct(options: Options) -> tuple[int, Path]:
 
     opened = _open(options)
     made: run_files.Made = {}
-    opened.graph.last = lambda: run_files.lay_out(opened.graph, opened.told().view(tasks=()), made)
+    opened.graph.last = lambda: run_files.lay_out(opened.graph, opened.late(), made)
     result = _compute(opened)
     remember()
-    undrawn = _write(opened.told(), result, made)
+    undrawn = _write(opened, result, made)
     _point_latest(opened.folder)
     warn_of_results(opened.graph)
     arrived = _outcome(opened)
@@ -227,13 +203,14 @@ def _reconstruct(options: Options) -> tuple[int, Path]:
         print(f"rille: missing figure {line}", file=sys.stderr)
     if result.ok:
         drawn = HOLES if undrawn else COMPLETE
-        return max(arrived, drawn, _posed_all(opened.products), _all_read(opened, arrived)), opened.folder
+        return max(arrived, drawn, _posed_all(opened.view.products), _all_read(opened, arrived)), opened.folder
     _list_missing(opened.graph, opened.folder)
     return HOLES, opened.folder
 
 
 def _open(options: Options) -> _Opened:
     """Read the input and lay the run out."""
+    from rille.pipeline.export.view import RunView
     from rille.pipeline.flow import unread
     from rille.pipeline.flow.closed_loop import dataflow
 
@@ -251,10 +228,21 @@ def _open(options: Options) -> _Opened:
     (folder / "config.toml").write_text(text, encoding="utf-8")
     graph, store = Graph(), at(options.cache)
     products, drive = dataflow(graph, sequence, config, frames)
-    return _Opened(
-        options, sequence, frames, config, text, settled, folder, started, installed(), store, graph, drive,
-        products,
-    )  # fmt: skip
+    view = RunView(
+        run_id=folder.name,
+        sequence=sequence,
+        frames=frames,
+        products=products,
+        tasks=(),
+        config=config,
+        config_toml=text,
+        versions=installed(),
+        command=options.command(),
+        vehicle_source=settled.vehicle_source,
+        started=started.strftime("%Y-%m-%dT%H:%M:%SZ"),
+        notes=sequence.notes,
+    )
+    return _Opened(options, settled, view, folder, started, store, graph, drive)
 
 
 def _compute(opened: _Opened) -> Result:
@@ -263,7 +251,7 @@ def _compute(opened: _Opened) -> Result:
     from rille.pipeline.engine.memory import limits
     from rille.pipeline.runs import roots
 
-    options = opened.options
+    options, view = opened.options, opened.view
     roots.note(opened.store, options.runs)
     result = scheduler.run(
         opened.graph,
@@ -276,12 +264,12 @@ def _compute(opened: _Opened) -> Result:
             ledger=opened.folder / "ledger.jsonl",
             progress=progress.make(options.progress, verbose=options.verbose),
             memory_limit=None if options.memory_limit is None else limits.parse(options.memory_limit),
-            survey=lambda: lay_out(opened.sequence, opened.config, opened.frames),
+            survey=lambda: lay_out(view.sequence, view.config, view.frames),
         ),
     )
-    trajectory = opened.products.trajectory
+    trajectory = view.products.trajectory
     if not options.keep_going:
-        result.check(holes=opened.sequence.simulation is not None or (trajectory is not None and trajectory.done))
+        result.check(holes=view.sequence.simulation is not None or (trajectory is not None and trajectory.done))
     return result
 
 
@@ -296,7 +284,7 @@ def _write(opened: _Opened, result: Result, made: run_files.Made) -> list[str]:
             f"{opened.folder} was removed while the run was under way",
             remedy="run again: what was computed is in the cache",
         )
-    whole = opened.view(tasks=run_files.task_rows(opened.graph, opened.store), seconds=result.seconds)
+    whole = opened.late(tasks=run_files.task_rows(opened.graph, opened.store), seconds=result.seconds)
     try:
         undrawn = run_files.write(opened.folder, whole, made, opened.store)
         total = (datetime.now(UTC) - opened.started).total_seconds()
@@ -345,10 +333,10 @@ def _all_read(opened: _Opened, arrived: int) -> int:
 
     if arrived != COMPLETE:
         return COMPLETE
-    lost = unread.unread(opened.settled.given, opened.config, opened.graph)
+    lost = unread.unread(opened.settled.given, opened.view.config, opened.graph)
     if lost:
-        told = f"{unread.values(lost, opened.config)}: no task of this run read it"
-        print(f"rille: error RIL-732: {told}: {unread.remedy(lost, opened.config)}", file=sys.stderr)
+        told = f"{unread.values(lost, opened.view.config)}: no task of this run read it"
+        print(f"rille: error RIL-732: {told}: {unread.remedy(lost, opened.view.config)}", file=sys.stderr)
     idle = sorted(opened.options.force - {h.stage for h in opened.graph.nodes})
     if idle:
         told = f"--force {', '.join(idle)}: this run has no such task: leave it out"
