@@ -117,9 +117,9 @@ def _simulated(sequence: Any, fetch: Any, frame: int) -> Scene:
 
 
 def _searched(rig: Rig, found: Disparities, up: Floats, lattice: Lattice) -> tuple[float, float]:
-    from rille.stages.terrain.ground_frame import LevelParams, level, z_range
+    from rille.stages.terrain.ground_frame import LevelParams, VerticalHint, level, z_range
 
-    facts = level(found.column, found.row, found.measured, rig, LevelParams(), up=up)
+    facts = level(found.column, found.row, found.measured, rig, LevelParams(), VerticalHint(up=up))
     low, high = z_range(facts["plane"], facts["relief"], list(lattice.bounds))
     return low, high
 

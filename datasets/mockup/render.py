@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
@@ -52,10 +52,31 @@ def transform(T_dst_src: RigidTransform, points: NDArray[np.float64]) -> NDArray
     return np.stack([x * r[k, 0] + y * r[k, 1] + z * r[k, 2] + t[k] for k in range(3)], axis=1)
 
 
+class _Bed(NamedTuple):
+    """Grids (row, col) of the bed: ``height`` m, ``sunlit`` and ``tint``; ``grid``: x0, y0 and cell, m; ``sun`` (3,)
+    direction towards it."""
+
+    height: NDArray[np.float32]
+    sunlit: NDArray[np.uint8]
+    tint: NDArray[np.uint8]
+    grid: tuple[float, float, float]
+    sun: NDArray[np.float64]
+
+
+class _Albedo(NamedTuple):
+    """Levels of the albedo, each half as fine as the one before, one behind the other: values, where each begins, and
+    the shape of each (level, 2)."""
+
+    texture: NDArray[np.uint8]
+    offsets: NDArray[np.int64]
+    shapes: NDArray[np.int64]
+
+
 @njit(cache=True, nogil=True)
-def _shade(height, sunlit, tint, texture, offsets, shapes, grid, origin, directions, distance, pixel_angle, sun):  # type: ignore[no-untyped-def]
-    """Radiance (n,) of the hit points, NaN where a ray hit nothing; ``grid`` = x0, y0, cell."""
-    x0, y0, cell = grid
+def _shade(bed, albedo, origin, directions, distance, pixel_angle):  # type: ignore[no-untyped-def]
+    """Radiance (n,) of the hit points, NaN where a ray hit nothing."""
+    height, sunlit, tint, (x0, y0, cell), sun = bed
+    texture, offsets, shapes = albedo
     n = directions.shape[0]
     out = np.full(n, np.nan, np.float32)
     for i in range(n):
@@ -143,20 +164,19 @@ def radiance(
     distance = field.cast(origin[None, :], rays)
     mips = [np.asarray(scene[f"albedo_{k}"][:]) for k in range(sum(n.startswith("albedo_") for n in scene.arrays))]
     light = scene.meta["scene"]
-    values = _shade(
+    bed = _Bed(
         field.height,
         np.ascontiguousarray(scene["sunlit"][:]),
         np.ascontiguousarray(scene["tint"][:]),
+        (field.x0, field.y0, field.cell),
+        sun_direction(light["sun_elevation_deg"], light["sun_azimuth_deg"]),
+    )
+    albedo = _Albedo(
         np.concatenate([m.ravel() for m in mips]),
         np.concatenate([[0], np.cumsum([m.size for m in mips])[:-1]]).astype(np.int64),
         np.array([m.shape for m in mips], dtype=np.int64),
-        (field.x0, field.y0, field.cell),
-        np.ascontiguousarray(origin),
-        rays,
-        distance,
-        1.0 / (sampling * camera.fx),
-        sun_direction(light["sun_elevation_deg"], light["sun_azimuth_deg"]),
     )
+    values = _shade(bed, albedo, np.ascontiguousarray(origin), rays, distance, 1.0 / (sampling * camera.fx))
     blocks = values.reshape(camera.height, sampling, camera.width, sampling)
     hit = np.isfinite(blocks).all(axis=(1, 3))
     mask = scipy.ndimage.binary_erosion(hit, np.ones((3, 3)), border_value=1)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -104,14 +104,21 @@ def heading_of(T: RigidTransform) -> float:
     return math.atan2(-T.rotation[0, 1], T.rotation[1, 1])
 
 
+class SentLeg(NamedTuple):
+    """``path`` (vertex, 2) m, the first vertex where the rover believes to stand; ``gear`` of each piece, 1 ahead or -1
+    back; ``turn`` on the spot at the end, rad."""
+
+    path: Floats
+    gear: Sequence[int]
+    turn: float
+
+
 def drive_leg(
     ground: HeightGrid,
     vehicle: Vehicle,
     before: tuple[float, float, float],
     believed: tuple[float, float, float],
-    path: Floats,
-    gear: Sequence[int],
-    turn: float,
+    sent: SentLeg,
     p: RoverParams,
     rng: np.random.Generator,
 ) -> _Drive:
@@ -120,10 +127,8 @@ def drive_leg(
     Parameters
     ----------
     before, believed : x, y (m), heading (rad) on the bed, and where the rover believes to be in the path's frame.
-    path : (vertex, 2) m, the first one where the rover believes to stand.
-    gear : of each piece of the path, 1 ahead or -1 back.
-    turn : rad; turned on the spot at the end.
     """
+    path, gear, turn = sent
     slip = p.slip + p.slip_sigma * float(rng.standard_normal())
     length = float(np.hypot(*np.diff(path, axis=0).T).sum()) if len(path) > 1 else 0.0
     drift = math.radians(p.heading_sigma_deg) * float(rng.standard_normal()) / max(length, STEP)
@@ -200,7 +205,7 @@ def _run(params: RoverParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle
         path, gear, start, turn = np.zeros((1, 2)), [], (0.0, 0.0, 0.0), 0.0
     length = float(np.hypot(*np.diff(path, axis=0).T).sum()) if len(path) > 1 else 0.0
     ground = bed_ground(scene, vehicle, before[:2], length + REACH)
-    d = drive_leg(ground, vehicle, before, start, path, gear, turn, params, rng)
+    d = drive_leg(ground, vehicle, before, start, SentLeg(path, gear, turn), params, rng)
     wheels = np.array(d.wheels)
     frames = images_at(wheels, params)
     vehicles = np.stack([s.T_ground_vehicle.matrix34 for s in d.trail])

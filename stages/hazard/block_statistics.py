@@ -49,13 +49,15 @@ def reduce_to_blocks(surface: Floats32, closed: Floats32, std: Floats32, n: int,
     shape = tuple(-(-size // n) for size in surface.shape)
     high, low = (np.empty(shape, dtype=np.float32) for _ in range(2))
     sums = np.empty((4, *shape))
-    _reduce(surface, closed, std, n, lag, high, low, *sums)
+    _reduce(surface, closed, std, n, lag, (high, low, *sums))
     return Blocks(high, low, *sums)
 
 
 @njit(cache=True, nogil=True)
-def _reduce(z, closed, s, n, lag, high, low, count, variance, pairs, deviation):  # type: ignore[no-untyped-def]
-    """Each row of blocks by strips of whole blocks, whose lines stay in the innermost cache."""
+def _reduce(z, closed, s, n, lag, out):  # type: ignore[no-untyped-def]
+    """Fill ``out``, the arrays of :class:`Blocks`: each row of blocks by strips of whole blocks, whose lines stay in
+    the innermost cache."""
+    high, low, count, variance, pairs, deviation = out
     rows, cols = z.shape
     width = n * max(1, STRIP // n)
     top, bottom = np.empty(width, dtype=np.float32), np.empty(width, dtype=np.float32)

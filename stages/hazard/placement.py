@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -39,8 +40,7 @@ PLACES_PER_WHEEL = 7
 """Places along a wheel's diameter, at least."""
 
 
-@dataclass(frozen=True)
-class Places:
+class Places(NamedTuple):
     """Results (row, col) on the coarse grid, float32: gradients ``tilt`` and ``slope`` (1), ``rise`` (m).
 
     ``unstood``: of wheels and parts of the belly, over headings, the share with unknown ground below; what is there is
@@ -134,18 +134,40 @@ def place(
         for a in (stand, ground, belly)
     ]
     padded += [np.pad(a.astype(np.uint16), reach, constant_values=1) for a in patchy]
-    out = [np.zeros(high.shape, dtype=np.float32) for _ in range(4)]
+    out = Places(*(np.zeros(high.shape, dtype=np.float32) for _ in Places._fields))
     wheels, under = ((at + reach).astype(np.uint64) for at in (stance.wheels, stance.belly))
-    _place(*padded, wheels, under, stance.spans, stance.weights, *out)
-    return Places(np.sqrt(out[0]), np.sqrt(out[1]), out[2], out[3])
+    _place(_Ground(*padded), _Offsets(wheels, under, stance.spans, stance.weights), out)
+    return Places(np.sqrt(out.tilt), np.sqrt(out.slope), out.rise, out.unstood)
 
 
 # Lines are read in place, by offsets that are not signed: a line is short, and to make it an array of its own takes as
 # long as the work on it; and a signed index would be looked at for whether it counts from the end.
 
 
+class _Ground(NamedTuple):
+    """Padded maps (row, col): highest and lowest ground below a wheel, highest below a part of the belly (m), and
+    whether any of either is unknown."""
+
+    stand: Floats32
+    lowest: Floats32
+    belly: Floats32
+    gaps: NDArray[np.uint16]
+    gaps_below: NDArray[np.uint16]
+
+
+class _Offsets(NamedTuple):
+    """Those of :class:`Stance` in the padded maps, not signed."""
+
+    wheels: NDArray[np.uint64]
+    under: NDArray[np.uint64]
+    spans: Floats32
+    weights: Floats32
+
+
 @njit(cache=True, nogil=True)
-def _place(stand, ground, belly, gaps, gaps_below, wheels, under, spans, weights, tilt, slope, rise, unstood):  # type: ignore[no-untyped-def]
+def _place(ground, stance, out):  # type: ignore[no-untyped-def]
+    wheels, under, spans, weights = stance
+    tilt, slope, rise, unstood = out
     headings = wheels.shape[0]
     parts = headings * (wheels.shape[1] + under.shape[1])
     shares = np.zeros(parts + 1, dtype=np.float32)
@@ -155,13 +177,13 @@ def _place(stand, ground, belly, gaps, gaps_below, wheels, under, spans, weights
     for r in range(np.uint64(tilt.shape[0])):
         missing[:] = 0
         for k in range(headings):
-            _steepest(stand, wheels, spans, k, r, tilt)
-            _steepest(ground, wheels, spans, k, r, slope)
+            _steepest(ground.stand, wheels, spans, k, r, tilt)
+            _steepest(ground.lowest, wheels, spans, k, r, slope)
             for j in range(0, wheels.shape[1], 2):
-                _count(gaps, wheels, k, j, r, missing)
+                _count(ground.gaps, wheels, k, j, r, missing)
             for j in range(0, under.shape[1], 2):
-                _count(gaps_below, under, k, j, r, missing)
-                _rise(belly, stand, under, wheels, weights, k, j, r, rise)
+                _count(ground.gaps_below, under, k, j, r, missing)
+                _rise((ground.stand, ground.belly), (wheels, under, weights), (k, j, r), rise)
         for c in range(missing.shape[0]):
             unstood[r, c] = shares[missing[c]]
 
@@ -194,13 +216,15 @@ def _count(gaps, at, k, j, r, out):  # type: ignore[no-untyped-def]
         out[c] += gaps[y0, c + x0] + gaps[y1, c + x1]
 
 
-@njit(cache=True, nogil=True)
-def _rise(belly, stand, at, wheels, w, k, j, r, out):  # type: ignore[no-untyped-def]
+@njit(cache=True, nogil=True, inline="always")
+def _rise(maps, stance, at, out):  # type: ignore[no-untyped-def]
     """Raise ``out`` to the rise of points ``j`` and ``j + 1`` of the belly over the wheels' plane."""
+    (stand, belly), (wheels, under, w), (k, j, r) = maps, stance, at
     y0, y1, y2, y3 = r + wheels[k, 0, 0], r + wheels[k, 1, 0], r + wheels[k, 2, 0], r + wheels[k, 3, 0]
     x0, x1, x2, x3 = wheels[k, 0, 1], wheels[k, 1, 1], wheels[k, 2, 1], wheels[k, 3, 1]
-    y, x, v0, v1, v2, v3 = r + at[k, j, 0], at[k, j, 1], w[j, 0], w[j, 1], w[j, 2], w[j, 3]
-    z, s, w0, w1, w2, w3 = r + at[k, j + 1, 0], at[k, j + 1, 1], w[j + 1, 0], w[j + 1, 1], w[j + 1, 2], w[j + 1, 3]
+    y, x, v0, v1, v2, v3 = r + under[k, j, 0], under[k, j, 1], w[j, 0], w[j, 1], w[j, 2], w[j, 3]
+    z, s = r + under[k, j + 1, 0], under[k, j + 1, 1]
+    w0, w1, w2, w3 = w[j + 1, 0], w[j + 1, 1], w[j + 1, 2], w[j + 1, 3]
     zero = np.float32(0.0)
     for c in range(np.uint64(out.shape[1])):
         fl, fr, rl, rr = stand[y0, c + x0], stand[y1, c + x1], stand[y2, c + x2], stand[y3, c + x3]

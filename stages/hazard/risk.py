@@ -121,7 +121,7 @@ def risk_map(
     z, s = elevation.copy(), np.empty(elevation.shape, dtype=np.float32)
     _finite(np.ascontiguousarray(elevation_std, dtype=np.float32), s)
     gap, side = p.max_hole * vehicle.wheel_diameter / cell, window_cells(window, cell)
-    filled = close_into(z, s, elevation, gap, side, p.min_known, rim=RIM)
+    filled = close_into((z, s), elevation, gap, side, p.min_known, rim=RIM)
     rules = Rules(p.sigmas, p.caution, p.max_p, p.min_known)
     classes = classify(HazardInput(elevation, z, s, cell, vehicle, window), filled, rules)
     return classes | {"filled": filled, "elevation": z}

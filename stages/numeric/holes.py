@@ -49,12 +49,11 @@ def close_holes(
     of its range either), and flags (uint8, 1 = closed here).
     """
     z, s = elevation.copy(), elevation_std.copy()
-    return z, s, close_into(z, s, elevation, max_gap, n, min_known, judged=judged, rim=rim)
+    return z, s, close_into((z, s), elevation, max_gap, n, min_known, judged=judged, rim=rim)
 
 
 def close_into(
-    z: Floats32,
-    s: Floats32,
+    closed: tuple[Floats32, Floats32],
     elevation: Floats32,
     max_gap: float,
     n: int,
@@ -63,7 +62,8 @@ def close_into(
     judged: bool = False,
     rim: float = 0.5,
 ) -> Flags:
-    """The same in ``z`` and ``s``, copies of the elevation and of its standard deviation; returns the flags."""
+    """The same in ``closed``, copies of the elevation and of its standard deviation; returns the flags."""
+    z, s = closed
     filled = np.zeros(elevation.shape, dtype=np.uint8)
     cells = candidates(elevation, n, min_known)
     if len(cells) and max_gap > 0:
@@ -146,12 +146,12 @@ def _close(known, cells, rays, trial, closed):  # type: ignore[no-untyped-def]
             s[r, c] = max(worst, rim * (high - low))
             filled[r, c] = 1
             if window > 0:
-                missed = _missed(z_in, r, c, window, lines, weights, used, weight)
+                missed = _missed(z_in, r, c, window, lines[:used], weights[:used], weight)
                 s[r, c] = max(worst, rim * (high - low) if math.isnan(missed) else missed)
 
 
 @njit(cache=True, nogil=True)
-def _missed(z, r, c, window, lines, weights, used, weight):  # type: ignore[no-untyped-def]
+def _missed(z, r, c, window, lines, weights, weight):  # type: ignore[no-untyped-def]
     """RMS by which the lines of a cell miss the known cells around it; NaN where too few of them tell."""
     rows, cols = z.shape
     square = 0.0
@@ -161,7 +161,7 @@ def _missed(z, r, c, window, lines, weights, used, weight):  # type: ignore[no-u
             if math.isnan(z[p, q]):
                 continue
             total = 0.0
-            for k in range(used):
+            for k in range(lines.shape[0]):
                 dr, dc, a, b = lines[k, 0], lines[k, 1], lines[k, 2], lines[k, 3]
                 pa, qa, pb, qb = p - a * dr, q - a * dc, p + b * dr, q + b * dc
                 if min(pa, qa, qb) < 0 or max(qa, qb) >= cols or pb >= rows:

@@ -8,6 +8,8 @@ tracks suggest is a prior, so that weak texture keeps to it.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -28,16 +30,21 @@ UNKNOWNS = 8
 """Shift (2), affinity (4), offset, gain."""
 
 
-def align(
-    a: F32, b: F32, points: F64, start: F64, affinity: F64, *, noise: float, spread: float, reach: float
-) -> tuple[F64, F64]:
+class Templates(NamedTuple):
+    """``points`` (n, 2) column, row in a; ``start`` (n, 2) where they are expected in b, NaN stays NaN; ``affinity``
+    (n, 2, 2) expected derivative of b's coordinates by a's."""
+
+    points: F64
+    start: F64
+    affinity: F64
+
+
+def align(a: F32, b: F32, templates: Templates, *, noise: float, spread: float, reach: float) -> tuple[F64, F64]:
     """Align templates around points of ``a`` in ``b``.
 
     Parameters
     ----------
     a, b : (rows, cols) grey values.
-    points, start : (n, 2) column, row in a, and where they are expected in b; NaN stays NaN.
-    affinity : (n, 2, 2) expected derivative of b's coordinates by a's.
     noise : grey levels, standard deviation of a difference.
     spread : standard deviation of an element of the affinity around the expected one.
     reach : pixels; a result farther than this from ``start`` is refused.
@@ -47,13 +54,12 @@ def align(
     position : (n, 2) column, row in b; NaN where it leaves the image, does not settle or is refused.
     error : (n,) rms grey difference over the template before the last step; NaN likewise.
     """
+    points = templates.points
     position, error = np.full(points.shape, np.nan), np.full(len(points), np.nan)
     _align_all(
         np.ascontiguousarray(a, dtype=np.float32),
         np.ascontiguousarray(b, dtype=np.float32),
-        np.ascontiguousarray(points, dtype=np.float64),
-        np.ascontiguousarray(start, dtype=np.float64),
-        np.ascontiguousarray(affinity, dtype=np.float64),
+        Templates(*(np.ascontiguousarray(v, dtype=np.float64) for v in templates)),
         (noise / spread) ** 2,
         float(reach),
         position,
@@ -63,7 +69,8 @@ def align(
 
 
 @njit(cache=True, nogil=True)
-def _align_all(a, b, points, start, affinity, ridge, reach, position, error):  # type: ignore[no-untyped-def]
+def _align_all(a, b, templates, ridge, reach, position, error):  # type: ignore[no-untyped-def]
+    points, start, affinity = templates
     patch, template = np.empty((SIDE + 2) ** 2), np.empty(SIDE * SIDE)
     descent, grey = np.empty((SIDE * SIDE, UNKNOWNS)), np.empty(SIDE * SIDE)
     gram, step = np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS)

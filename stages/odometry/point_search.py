@@ -8,6 +8,7 @@ the images does not spoil it. Found points are matched back.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -31,7 +32,9 @@ BACKMATCH = 1.0
 BACK_RADIUS = 3
 """Pixels searched on the way back, at most: thrice what is allowed; fewer refuse too little."""
 
-DEFAULT_WEIGHTS = HfvmParams().weights
+WEIGHTS = HfvmParams().weights
+THRESHOLD = 90.0
+"""Byte steps: mean distance above which a point is not matchable."""
 
 
 @dataclass(frozen=True)
@@ -57,9 +60,6 @@ def find_points(
     predicted: Floats,
     affinity: Floats | None = None,
     radius: int = 4,
-    *,
-    threshold: float = 90.0,
-    weights: tuple[float, ...] = DEFAULT_WEIGHTS,
 ) -> PointMatches:
     """Sub-pixel positions in image ``b`` of points of image ``a`` (level 0 of two pyramids).
 
@@ -68,13 +68,12 @@ def find_points(
     points, predicted : (n, 2) column, row in a, and about where in b, pixels; NaN rows are lost.
     affinity : (n, 2, 2) maps offsets from the point in a to offsets in b (column, row); None: no change of shape.
     radius : pixels searched to every side of the prediction.
-    threshold : mean distance, byte steps, above which a point is not matchable.
-    weights : of the eight features.
 
     Notes
     -----
     A point is lost where its prediction, its template or its match leaves the image or lies on a masked pixel, where
-    the least distance exceeds the threshold or lies on the border of the search area, and where back-matching fails.
+    the least distance exceeds :data:`THRESHOLD` or lies on the border of the search area, and where back-matching
+    fails.
     """
     n = len(points)
     a_image, b_image = filled(a)[0], filled(b)[0]
@@ -84,12 +83,12 @@ def find_points(
     usable &= np.abs(np.linalg.det(np.where(usable[:, None, None], shape, np.eye(2)))) > 0.1
     found, cost, ok = np.full((n, 2), np.nan), np.full(n, np.nan), np.zeros(n, dtype=bool)
     who = np.flatnonzero(usable)
-    there, there_cost = _search(a_image, b_image, points[who], predicted[who], shape[who], radius, weights)
-    good = np.isfinite(there_cost) & (there_cost <= threshold)
+    there, there_cost = _search(a_image, b_image, points[who], predicted[who], shape[who], radius)
+    good = np.isfinite(there_cost) & (there_cost <= THRESHOLD)
     good &= _on_valid(a_valid, points[who]) & _on_valid(b_valid, there)
     who, there, there_cost = who[good], there[good], there_cost[good]
     inverse, reach = np.asarray(np.linalg.inv(shape[who])), min(radius, BACK_RADIUS)
-    back, _ = _search(b_image, a_image, there, points[who], inverse, reach, weights)
+    back, _ = _search(b_image, a_image, there, points[who], inverse, reach)
     good = np.hypot(*(back - points[who]).T) <= BACKMATCH
     who = who[good]
     found[who], cost[who], ok[who] = there[good], there_cost[good], True
@@ -112,21 +111,31 @@ def _search(
     predicted: Floats,
     affinity: Floats,
     radius: int,
-    weights: tuple[float, ...],
 ) -> tuple[Floats, Floats]:
     """Best positions (n, 2) and mean distances (n,), NaN where not found, one direction."""
     whole = np.rint(predicted)
-    scale = np.asarray(weights, np.float32) * np.float32(features.STEPS_PER_UNIT)
+    scale = np.asarray(WEIGHTS, np.float32) * np.float32(features.STEPS_PER_UNIT)
     offset, cost = np.zeros((len(points), 2)), np.full(len(points), -1.0)
     inverse = np.ascontiguousarray(np.linalg.inv(affinity))
-    _search_all(a, b, np.ascontiguousarray(points), whole.astype(np.int64), inverse, radius, scale, offset, cost)
+    templates = _Templates(np.ascontiguousarray(points), whole.astype(np.int64), inverse)
+    _search_all(a, b, templates, radius, scale, offset, cost)
     lost = cost < 0
     return np.where(lost[:, None], np.nan, whole + offset), np.where(lost, np.nan, cost)
 
 
+class _Templates(NamedTuple):
+    """``points`` (n, 2) in a, the pixels (n, 2) of b that they are searched around, and the affinities (n, 2, 2)
+    through which they are drawn."""
+
+    points: Floats
+    whole: NDArray[np.int64]
+    shape: Floats
+
+
 @njit(cache=True, nogil=True)
-def _search_all(a, b, points, whole, shape, radius, scale, offset, cost):  # type: ignore[no-untyped-def]
+def _search_all(a, b, templates, radius, scale, offset, cost):  # type: ignore[no-untyped-def]
     """Each point by itself: its template, the area around its prediction, and where in it the template fits best."""
+    points, whole, shape = templates
     side = 2 * (SUM_RADIUS + features.RADIUS) + 1
     wide = side + 2 * (radius + 1)
     template, area = np.empty((side, side), np.float32), np.empty((wide, wide), np.float32)

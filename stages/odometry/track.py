@@ -25,7 +25,7 @@ from pydantic import Field
 from rille.stages.core.declare import Array, Bundle, Inputs, Params, Stage
 from rille.stages.core.errors import InputError
 from rille.stages.imaging.pyramid import Pyramid
-from rille.stages.odometry.affine_lk import HALF, align
+from rille.stages.odometry.affine_lk import HALF, Templates, align
 from rille.stages.odometry.affinity import NEIGHBOURS, fit_affinity, known_median
 from rille.stages.odometry.moravec import clear_of_mask, interest_points
 from rille.stages.odometry.point_search import match_points
@@ -193,9 +193,7 @@ def _align(
     place, error = align(
         a.images[0],
         b.images[0],
-        points,
-        start,
-        affinity,
+        Templates(points, start, affinity),
         noise=params.noise * 2.0**0.5,
         spread=params.affinity_sigma,
         reach=2.0,

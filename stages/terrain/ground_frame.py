@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -81,16 +81,25 @@ class LevelParams(Params):
     seed: int = Field(1999, ge=0, description="seed of the ground plane's samples; any")
 
 
+class VerticalHint(NamedTuple):
+    """What is known of the vertical; the first given of the three is used.
+
+    ``up``, ``initial_up`` (3,) direction of up in the left camera frame, from an attitude and from an initial pose;
+    ``pitch`` downward pitch of the optical axis, radians, roll 0.
+    """
+
+    up: ArrayLike | None = None
+    initial_up: ArrayLike | None = None
+    pitch: float | None = None
+
+
 def level(
     column_disparity: ArrayLike,
     row_disparity: ArrayLike,
     usable: NDArray[np.bool_],
     rig: Rig,
     params: LevelParams,
-    *,
-    up: ArrayLike | None = None,
-    initial_up: ArrayLike | None = None,
-    pitch: float | None = None,
+    vertical: VerticalHint | None = None,
 ) -> dict[str, Any]:
     """Local frame and ground of one pair.
 
@@ -98,8 +107,7 @@ def level(
     ----------
     column_disparity, row_disparity : (rows, cols) right minus left, pixels, of the left image.
     usable : (rows, cols) pixels with a measured disparity.
-    up, initial_up : (3,) direction of up in the left camera frame, from an attitude and from an initial pose.
-    pitch : downward pitch of the optical axis, radians, roll 0. The first given of the three is used.
+    vertical : None: it is that of the ground.
 
     Returns
     -------
@@ -117,19 +125,19 @@ def level(
         Left and right seem swapped, or the rig has no baseline.
     """
     rays, rho, sigma = _samples(np.asarray(column_disparity), np.asarray(row_disparity), usable, rig, params)
-    vertical, source = _given_vertical(up, initial_up, pitch)
+    known_up, source = _given_vertical(vertical or VerticalHint())
     samples = rays, rho, sigma
     try:
-        ground = _fitted(samples, vertical, params)
-        R_local_left = level_rotation(ground.up if vertical is None else vertical)
+        ground = _fitted(samples, known_up, params)
+        R_local_left = level_rotation(ground.up if known_up is None else known_up)
         return {"source": source or "ground plane"} | _on_ground(ground, R_local_left, samples, rig, params)
     except DegenerateError as error:
         why = error
-    up_known = np.array([0.0, -1.0, 0.0]) if vertical is None else vertical
-    facts, R_local_left = {"source": source or NO_VERTICAL}, level_rotation(up_known)
+    up = np.array([0.0, -1.0, 0.0]) if known_up is None else known_up
+    facts, R_local_left = {"source": source or NO_VERTICAL}, level_rotation(up)
     try:
         if params.reference_height is not None:
-            ground = GroundPlane(up_known, params.reference_height, 0.0)
+            ground = GroundPlane(up, params.reference_height, 0.0)
             return facts | _on_ground(ground, R_local_left, samples, rig, params)
     except DegenerateError as error:
         why = error
@@ -221,9 +229,8 @@ def _refuse_swapped(rig: Rig, left: Floats, right: Floats, beyond: float) -> Non
         )
 
 
-def _given_vertical(
-    up: ArrayLike | None, initial_up: ArrayLike | None, pitch: float | None
-) -> tuple[Floats | None, str]:
+def _given_vertical(hint: VerticalHint) -> tuple[Floats | None, str]:
+    up, initial_up, pitch = hint
     for value, source in ((up, "attitude"), (initial_up, "initial pose")):
         if value is not None:
             v = np.asarray(value, dtype=np.float64)
@@ -275,9 +282,7 @@ def _run(params: LevelParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle
         matched(np.asarray(disparity["validity"])),
         Rig.from_dict(inputs["rig"].meta["rig"]),
         params,
-        up=args.get("up"),
-        initial_up=args.get("initial_up"),
-        pitch=args.get("pitch"),
+        VerticalHint(args.get("up"), args.get("initial_up"), args.get("pitch")),
     )
     return Bundle({}, facts)
 

@@ -85,7 +85,13 @@ def _height(ground, row, col):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _search(points, ground, x0, y0, cell, xs, ys, headings, bound, scores, overlaps):  # type: ignore[no-untyped-def]
+def _search(points, ground, frame, places, bound, scores, overlaps):  # type: ignore[no-untyped-def]
+    """Truncated mean square of the height differences at each place (heading, y, x), and the share that is known.
+
+    ``frame``: x and y of the ground's first cell and its side, m; ``places``: x, y (m) and headings (rad) tried.
+    """
+    x0, y0, cell = frame
+    xs, ys, headings = places
     n = len(points)
     differences = np.empty(n)
     for h in range(len(headings)):
@@ -146,7 +152,8 @@ def fix(
     scores = np.full((len(headings), len(ys), len(xs)), np.inf)
     overlaps = np.zeros_like(scores)
     z = np.ascontiguousarray(ground, dtype=np.float64)
-    _search(points, z, lattice.x0, lattice.y0, cell, xs, ys, headings, params.truncate * sigma, scores, overlaps)
+    frame = lattice.x0, lattice.y0, cell
+    _search(points, z, frame, (xs, ys, headings), params.truncate * sigma, scores, overlaps)
     enough = overlaps >= params.min_overlap
     if not enough.any():
         raise InputError(

@@ -38,7 +38,7 @@ from rille.stages.core.errors import InputError
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.numeric.holes import close_holes
-from rille.stages.terrain.merge_kernel import PLANES, merge_cells
+from rille.stages.terrain.merge_kernel import PLANES, CellMaps, Rule, Stack, merge_cells
 from rille.stages.terrain.radiometry import STEP
 
 Float32 = NDArray[np.float32]
@@ -230,16 +230,16 @@ def _merge_strip(
     present = [layer for layer in layers if strip.intersection(layer.lattice) is not None]
     if not present:
         return
-    stacks = [_stacked(present, strip, name) for name in MAPS]
+    elevation, std, residual, ortho = (_stacked(present, strip, name) for name in MAPS)
     gain = np.array([layer.gain for layer in present])
     centre, pose = (np.array([getattr(layer.pose, name) for layer in present]) for name in ("centre", "covariance"))
     floats = np.empty((PLANES, *strip.shape), dtype=np.float32)
     best = np.empty(strip.shape, dtype=np.int64)
     worst = math.inf if params.max_std_cells is None else params.max_std_cells * strip.cell
-    merge_cells(
-        *stacks, gain, centre, pose, strip.xs(), strip.ys(), params.residual_scale, SHARPNESS, params.alike, worst,
-        floats, out.count[rows], best,
-    )  # fmt: skip
+    rule = Rule(params.residual_scale, SHARPNESS, params.alike, worst)
+    filled = CellMaps(floats, out.count[rows], best)
+    stack = Stack(elevation, std, residual, ortho, gain, centre, pose)
+    merge_cells(stack, strip.xs(), strip.ys(), rule, filled)
     for name, values in zip(("elevation", "elevation_std", "spread", "ortho", "relief_std"), floats, strict=True):
         getattr(out, name)[rows] = values
     pairs = np.array([*(layer.pair for layer in present), -1])

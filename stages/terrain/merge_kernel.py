@@ -7,29 +7,66 @@ precision, so equal input gives equal bits wherever a strip begins.
 from __future__ import annotations
 
 import math
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from rille.stages.numeric.robust import MAD_TO_SIGMA, TUKEY_BISQUARE, bisquare
+
+Float32 = NDArray[np.float32]
+Floats = NDArray[np.float64]
 
 PLANES = 5
 """Maps that :func:`merge_cells` fills."""
 
 
-@njit(cache=True, nogil=True)
-def merge_cells(  # type: ignore[no-untyped-def]
-    z, sigma, residual, ortho, gain, centre, pose, x, y, scale, sharpness, alike, worst, out, count, best
-):
-    """Merge models (n, rows, cols) float32, NaN undefined; weights and equations are those of
-    :mod:`rille.stages.terrain.merge`.
+class Stack(NamedTuple):
+    """Models (n, rows, cols) float32, NaN undefined: elevations, their standard deviations, residuals, grey values.
 
     ``gain`` (n,) of the grey values; ``centre`` (n, 2) and ``pose`` (n, 3, 3): where each camera stands, m, and the
-    covariance of its height and its rotations about x and y; ``x`` (cols,), ``y`` (rows,) of the cells, m; ``alike``:
-    correlation of two models' errors; ``worst``: greatest standard deviation but for the poses, m. Fills ``out`` (5,
-    rows, cols): elevation, its standard deviation, spread, grey value and the standard deviation of unrelated errors
-    alone; ``count`` of models that count; ``best`` index of the one of greatest weight, -1 none.
+    covariance of its height and its rotations about x and y.
     """
+
+    z: Float32
+    sigma: Float32
+    residual: Float32
+    ortho: Float32
+    gain: Floats
+    centre: Floats
+    pose: Floats
+
+
+class Rule(NamedTuple):
+    """``scale`` of the residuals, pixels; ``sharpness``: exponent of the grey values' weights; ``alike``: correlation
+    of two models' errors; ``worst``: greatest standard deviation but for the poses, m."""
+
+    scale: float
+    sharpness: float
+    alike: float
+    worst: float
+
+
+class CellMaps(NamedTuple):
+    """``maps`` (5, rows, cols) float32: elevation, its standard deviation, spread, grey value and the standard
+    deviation of unrelated errors alone; ``used``: number of models that count; ``best`` index of the one of greatest
+    weight, -1 none."""
+
+    maps: Float32
+    used: NDArray[np.integer[Any]]
+    best: NDArray[np.int64]
+
+
+@njit(cache=True, nogil=True)
+def merge_cells(stack, x, y, rule, filled):  # type: ignore[no-untyped-def]
+    """Merge a stack of models; weights and equations are those of :mod:`rille.stages.terrain.merge`.
+
+    ``x`` (cols,), ``y`` (rows,) of the cells, m. Fills the maps of a :class:`CellMaps`.
+    """
+    z, sigma, residual, _, _, centre, pose = stack
+    scale, worst = rule.scale, rule.worst
+    out, count, best = filled
     n, rows, cols = z.shape
     h, s, w, d, p = np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n)
     which, order = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64)
@@ -51,7 +88,7 @@ def merge_cells(  # type: ignore[no-untyped-def]
                 continue
             if m >= 3:
                 _agree(h, s, w, d, order, m)
-            _average(h, s, w, which, m, ortho, gain, sharpness, alike, r, c, out, count, best)
+            _average((h, s, w, which), m, stack, rule, (r, c), filled)
             if out[1, r, c] > worst:
                 _forget(r, c, out, count, best)
             else:
@@ -117,10 +154,15 @@ def _agree(h, s, w, d, order, m):  # type: ignore[no-untyped-def]
         w[i] *= bisquare(d[i] / (TUKEY_BISQUARE * max(typical, s[i])))
 
 
-@njit(cache=True, nogil=True)
-def _average(  # type: ignore[no-untyped-def]
-    h, s, w, which, m, ortho, gain, sharpness, alike, r, c, out, count, best
-):
+@njit(cache=True, nogil=True, inline="always")
+def _average(models, m, stack, rule, at, filled):  # type: ignore[no-untyped-def]
+    """Weighted means of the ``m`` models that a cell has; ``models``: elevations, their standard deviations, weights
+    and indices in the stack."""
+    h, s, w, which = models
+    ortho, gain = stack.ortho, stack.gain
+    sharpness, alike = rule.sharpness, rule.alike
+    r, c = at
+    out, count, best = filled
     total = 0.0
     top = 0.0
     used = 0

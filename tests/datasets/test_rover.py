@@ -10,7 +10,7 @@ import pytest
 from raising import raises
 
 from rille.datasets.mockup.obstacle import on_path
-from rille.datasets.mockup.rover import RoverParams, drive_leg, heading_of, images_at
+from rille.datasets.mockup.rover import RoverParams, SentLeg, drive_leg, heading_of, images_at
 from rille.datasets.mockup.sequence import vehicle_at_scale
 from rille.stages.planning.wheels import HeightGrid
 
@@ -22,7 +22,9 @@ FLAT = HeightGrid.of(0.0 * X, -0.5, 0.5, 0.004, VEHICLE.wheel_diameter)
 
 
 def driven(p: RoverParams, turn: float = 0.0, seed: int = 0, believed: tuple[float, float, float] = (0.0, 0.0, 0.0)):
-    return drive_leg(FLAT, VEHICLE, (0.0, 0.0, 0.0), believed, PATH, [1, 1], turn, p, np.random.default_rng(seed))
+    return drive_leg(
+        FLAT, VEHICLE, (0.0, 0.0, 0.0), believed, SentLeg(PATH, [1, 1], turn), p, np.random.default_rng(seed)
+    )
 
 
 def test_without_errors_it_is_where_it_was_sent_and_the_wheels_say_so() -> None:
@@ -71,7 +73,7 @@ def test_images_are_taken_by_way_and_turn() -> None:
 def test_a_piece_that_is_driven_back_is_driven_back() -> None:
     rng = np.random.default_rng(0)
     behind = np.array([[0.0, 0.0], [0.0, -0.1], [0.0, 0.05]])
-    d = drive_leg(FLAT, VEHICLE, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), behind, [-1, 1], 0.0, EXACT, rng)
+    d = drive_leg(FLAT, VEHICLE, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), SentLeg(behind, [-1, 1], 0.0), EXACT, rng)
     y = np.array([s.T_ground_vehicle.translation[1] for s in d.trail])
     assert y.min() == pytest.approx(-0.1)
     assert y[-1] == pytest.approx(0.05)
@@ -81,7 +83,9 @@ def test_a_piece_that_is_driven_back_is_driven_back() -> None:
 
 def test_beside_the_bed_it_is_not_placed() -> None:
     with raises("RIL-250"):
-        drive_leg(FLAT, VEHICLE, (0.5, 0.0, 0.0), (0.0, 0.0, 0.0), PATH, [1, 1], 0.0, EXACT, np.random.default_rng(0))
+        drive_leg(
+            FLAT, VEHICLE, (0.5, 0.0, 0.0), (0.0, 0.0, 0.0), SentLeg(PATH, [1, 1], 0.0), EXACT, np.random.default_rng(0)
+        )
 
 
 def test_a_place_along_and_beside_a_path() -> None:

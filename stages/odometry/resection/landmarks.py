@@ -54,22 +54,21 @@ class Landmarks:
 
 def landmarks_from_disparity(
     points: Floats,
-    column_disparity: NDArray[np.float32],
-    row_disparity: NDArray[np.float32],
-    validity: NDArray[np.uint8],
+    maps: tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]],
     rig: Rig,
     T_local_left: RigidTransform,
     disparity_sigma: Floats,
     *,
     max_depth_ratio: float,
 ) -> Landmarks:
-    """Triangulate the stereo matches of points (n, 2) column, row of the left key image.
+    """Triangulate the stereo matches of points (n, 2) column, row of the left key image; ``maps`` (rows, cols): column
+    and row disparity, pixels, and validity.
 
     A point needs four matched (not filled) neighbours on one surface, rays that meet within a pixel in front of both
     cameras, and a distance whose standard deviation is below ``max_depth_ratio`` of it. ``disparity_sigma`` (n,) is in
     pixels; NaN refuses a point (see :func:`relief`).
     """
-    disparity, matched = matches_at(points, column_disparity, row_disparity, validity)
+    disparity, matched = matches_at(points, *maps)
     rays = rig.left.rays(points)
     depth = _triangulate(rays, points + disparity, rig)
     right, _ = _right_image(rays, depth, rig)

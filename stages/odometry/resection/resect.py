@@ -160,11 +160,10 @@ def resect(
     landmarks: Landmarks,
     pixels: Floats,
     camera: Camera,
-    start: RigidTransform,
+    starts: Sequence[RigidTransform],
     params: ResectParams,
     rng: np.random.Generator,
     *,
-    reckoned: RigidTransform | None = None,
     where: str = "this frame",
 ) -> Resection:
     """Pose of a camera from landmarks and their image positions (Eq. 4-8), robustly.
@@ -173,8 +172,7 @@ def resect(
     ----------
     landmarks : n of them, in the local frame; all finite.
     pixels : (n, 2) column, row.
-    start : prediction of T_local_left.
-    reckoned : another prediction, by dead reckoning; decides nothing but where the search starts.
+    starts : predictions of T_local_left, which decide nothing but where the search starts.
     where : words for error messages ("frame 12").
 
     Raises
@@ -193,7 +191,7 @@ def resect(
         params.pixel_sigma,
         params.bias_sigma,
     )
-    predictions = [Poses.of(T.inverse()) for T in (start, reckoned) if T is not None]
+    predictions = [Poses.of(T.inverse()) for T in starts]
     poses, near = _robust_start(obs, predictions, params, rng)
     poses, active, steps = _remove_inconsistent(obs, poses, near, params, where)
     if active.sum() < params.min_share * len(active):
@@ -456,9 +454,8 @@ def resect_segment(
             out.facts.append(_facts(frames[0], use.size, use.size, 0.0, None))
             continue
         try:
-            found = _resect_one(
-                landmarks, points[:, j], use, camera, pose, params, frames[j], _reckoned(T_local_key, reckoned, j)
-            )
+            starts = [pose, *_reckoned(T_local_key, reckoned, j)]
+            found = _resect_one(landmarks, points[:, j], use, camera, starts, params, frames[j])
         except DegenerateError as error:
             cause = error.message.removeprefix(f"frame {frames[j]}: ")
             out.facts.append(_facts(frames[j], use.size, 0, None, None) | {"lost": cause})
@@ -477,8 +474,8 @@ def resect_segment(
 
 def _reckoned(
     T_local_key: RigidTransform, reckoned: Sequence[RigidTransform | None] | None, j: int
-) -> RigidTransform | None:
-    return None if reckoned is None or (T := reckoned[j]) is None else T_local_key @ T
+) -> list[RigidTransform]:
+    return [] if reckoned is None or (T := reckoned[j]) is None else [T_local_key @ T]
 
 
 def _resect_one(
@@ -486,10 +483,9 @@ def _resect_one(
     points: NDArray[np.float32],
     use: NDArray[np.intp],
     camera: Camera,
-    start: RigidTransform,
+    starts: Sequence[RigidTransform],
     params: ResectParams,
     frame: int,
-    reckoned: RigidTransform | None,
 ) -> Resection:
     """One frame of a segment, by those of its points (n, 2) that are used."""
     where = f"frame {frame}"
@@ -498,7 +494,7 @@ def _resect_one(
         _enough(use.size, where, what, FEW)
     rng = np.random.default_rng([params.seed, frame])
     pixels = points[use].astype(np.float64)
-    return resect(landmarks.take(use), pixels, camera, start, params, rng, reckoned=reckoned, where=where)
+    return resect(landmarks.take(use), pixels, camera, starts, params, rng, where=where)
 
 
 def _facts(frame: int, seen: int, inliers: int, rms: float | None, found: Resection | None) -> dict[str, Any]:
@@ -580,14 +576,13 @@ def coordinates(
             remedy=f"connect the input {params.landmarks!r}",
         )
     sigma = np.full(len(points), params.disparity_sigma)
-    maps: list[Any] = []
     if disparity is not None:
-        maps = [np.asarray(disparity[name]) for name in ("column_disparity", "row_disparity", "validity")]
-        sigma = np.hypot(sigma, relief(points, maps[0], maps[1], maps[2]))
-    if params.landmarks == "disparity":
-        return landmarks_from_disparity(
-            points, maps[0], maps[1], maps[2], rig, T_local_key, sigma, max_depth_ratio=params.max_depth_ratio
-        )
+        column, row, validity = (np.asarray(disparity[n]) for n in ("column_disparity", "row_disparity", "validity"))
+        sigma = np.hypot(sigma, relief(points, column, row, validity))
+        if params.landmarks == "disparity":
+            return landmarks_from_disparity(
+                points, (column, row, validity), rig, T_local_key, sigma, max_depth_ratio=params.max_depth_ratio
+            )
     lattice = Lattice.from_dict(source.meta["lattice"])
     elevation = np.asarray(source["elevation"])
     return landmarks_from_dem(

@@ -66,7 +66,7 @@ class Hazards(NamedTuple):
     p_hazard: NDArray[np.float32] | None = None
 
 
-class Known(NamedTuple):
+class KnownGround(NamedTuple):
     """Masks (row, col): ``unknown``, where the vehicle may not stand for what is not known, None: the unknown class;
     ``glanced``, where of it something is known nevertheless; ``doubted`` ground, which costs as much as a doubtful
     hazard."""
@@ -108,7 +108,7 @@ class Footing:
         hazards: Hazards,
         lattice: Lattice,
         vehicle: Vehicle,
-        known: Known | None = None,
+        known: KnownGround | None = None,
         *,
         sure: float = 0.5,
         dare: float = 0.0,
@@ -121,7 +121,7 @@ class Footing:
         So is doubted ground, and what is within a quarter of a wheel of it, where its edge touches.
         """
         risk, reason, p_hazard = hazards
-        unknown, glanced, doubted = known or Known()
+        unknown, glanced, doubted = known or KnownGround()
         hazardous, cell = risk == HAZARDOUS, lattice.cell
         unknown = risk == UNKNOWN if unknown is None else unknown
         bits = np.full(risk.shape, WHEEL_BITS) if reason is None else reason

@@ -19,7 +19,7 @@ from rille.stages.geometry.geometry import Rig, RigidTransform
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.classification import HAZARDOUS, UNKNOWN, UNSEEN_BIT
 from rille.stages.hazard.vehicle import Vehicle
-from rille.stages.planning.local_planner.clearance import Footing, Hazards, Known
+from rille.stages.planning.local_planner.clearance import Footing, Hazards, KnownGround
 from rille.stages.planning.local_planner.memory import PlannerMemory
 from rille.stages.planning.local_planner.params import LegParams
 from rille.stages.planning.local_planner.policy import Before, Leg, plan_leg, shortest
@@ -111,7 +111,7 @@ def _run(params: LegParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     return Bundle(arrays, meta)
 
 
-def seen_so_far(near: Bundle, far: Bundle | None, p: LegParams) -> tuple[Hazards, Known]:
+def seen_so_far(near: Bundle, far: Bundle | None, p: LegParams) -> tuple[Hazards, KnownGround]:
     """The hazards of a map of which only what was seen from near is driven on, and how well each cell is known."""
     names = Hazards._fields
     maps = [np.asarray(near[name]) for name in names]
@@ -124,7 +124,7 @@ def seen_so_far(near: Bundle, far: Bundle | None, p: LegParams) -> tuple[Hazards
         maps = [np.where(cut, np.asarray(far[name]), seen) for name, seen in zip(names, maps, strict=True)]
         unknown &= ~(maps[2] < p.clear)
         glanced = unknown & (maps[0] < HAZARDOUS)
-    return Hazards(*maps), Known(unknown, glanced, maps[2] >= p.avoid)
+    return Hazards(*maps), KnownGround(unknown, glanced, maps[2] >= p.avoid)
 
 
 def _length(path: NDArray[np.float64]) -> float:

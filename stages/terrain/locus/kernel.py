@@ -79,7 +79,7 @@ class BlockCells(NamedTuple):
     high: Floats
 
 
-class Cameras(NamedTuple):
+class PairCameras(NamedTuple):
     """``left``, ``right`` (3, 4) projections from the frame of the surface to pixels; ``epipole`` (3,) homogeneous
     projection of the left camera's centre into the right image; ``sizes`` (4,) width and height of the left, then of
     the right image."""
@@ -103,7 +103,7 @@ class _Room(NamedTuple):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def search(cells: BlockCells, z_range: tuple[float, float], cameras: Cameras, seen: Observed, out: Floats) -> None:
+def search(cells: BlockCells, z_range: tuple[float, float], cameras: PairCameras, seen: Observed, out: Floats) -> None:
     """Solve every cell of a block.
 
     Parameters

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from rille.stages.core.errors import DegenerateError, InputError
 from rille.stages.geometry.geometry import Rig, RigidTransform
 from rille.stages.geometry.surface import Surface
-from rille.stages.terrain.locus.kernel import BlockCells, Cameras, search
+from rille.stages.terrain.locus.kernel import BlockCells, PairCameras, search
 from rille.stages.terrain.locus.points import Observed
 
 Floats = NDArray[np.float64]
@@ -86,7 +86,7 @@ class PairArrays:
         self.seen = Observed(disparity.ravel(), std, grey, np.array(limits))
         epipole = rig.right.matrix @ rig.T_right_left.translation
         sizes = np.array([rig.left.width, rig.left.height, rig.right.width, rig.right.height], dtype=np.float64)
-        self.cameras = Cameras(*projections(rig, T_surface_left), epipole, sizes)
+        self.cameras = PairCameras(*projections(rig, T_surface_left), epipole, sizes)
         self.z_range = float(z_range[0]), float(z_range[1])
 
     def cells(self, surface: Surface, rows: ArrayLike, cols: ArrayLike, low: ArrayLike, high: ArrayLike) -> Floats:

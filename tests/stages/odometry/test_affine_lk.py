@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rille.stages.odometry.affine_lk import align
+from rille.stages.odometry.affine_lk import Templates, align
 
 
 def texture(x, y, seed=0, wavelengths=(6.0, 40.0)):
@@ -31,7 +31,7 @@ POINTS = np.stack(np.meshgrid(np.arange(30.0, 110.0, 10.0), np.arange(30.0, 80.0
 
 def run(a, b, start, affinity, **changes):
     shape = np.tile(affinity, (len(start), 1, 1))
-    return align(a, b, POINTS, start, shape, **({"noise": 2.0, "spread": 0.1, "reach": 2.0} | changes))
+    return align(a, b, Templates(POINTS, start, shape), **({"noise": 2.0, "spread": 0.1, "reach": 2.0} | changes))
 
 
 @pytest.mark.parametrize(

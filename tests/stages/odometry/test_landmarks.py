@@ -33,7 +33,7 @@ def plane_dem(tilt=0.1, cell=0.005):
 
 def from_disparity(points, maps, sigma=0.1, ratio=0.2):
     return landmarks_from_disparity(
-        points, *maps[:3], RIG, T_LOCAL_LEFT, np.full(len(points), sigma), max_depth_ratio=ratio
+        points, maps[:3], RIG, T_LOCAL_LEFT, np.full(len(points), sigma), max_depth_ratio=ratio
     )
 
 
@@ -60,13 +60,13 @@ def test_a_pixel_of_disparity_moves_a_landmark_by_z_squared_over_f_b():
     zero, valid = np.zeros_like(d), np.ones(d.shape, np.uint8)
     point = np.array([[200.0, 100.0]])
     found = landmarks_from_disparity(
-        point, d, zero, valid, rig, RigidTransform.identity(), np.array([0.25]), max_depth_ratio=0.2
+        point, (d, zero, valid), rig, RigidTransform.identity(), np.array([0.25]), max_depth_ratio=0.2
     )
     np.testing.assert_allclose(found.position[0], CAMERA.rays(point)[0] * 2.0, rtol=1e-9)
     np.testing.assert_allclose(found.per_pixel[0], CAMERA.rays(point)[0] * 2.0**2 / (400 * 0.1), rtol=1e-9)
     assert found.sigma[0] == 0.25
     far = landmarks_from_disparity(
-        point, d, zero, valid, rig, RigidTransform.identity(), np.array([5.0]), max_depth_ratio=0.2
+        point, (d, zero, valid), rig, RigidTransform.identity(), np.array([5.0]), max_depth_ratio=0.2
     )
     assert np.isnan(far.position).all()
     assert far.lost["too far for the baseline"] == 1

@@ -315,7 +315,7 @@ def test_a_lost_frame_stays_lost():
     track, resection = inputs["tracks"][0], inputs["resections"][0]
     known = landmarks_from_disparity(
         np.asarray(track["points"])[:, 0].astype(float),
-        *inputs["disparities"][0].arrays.values(),
+        tuple(inputs["disparities"][0].arrays.values()),
         RIG,
         RigidTransform.identity(),
         np.full(80, 0.2),

@@ -48,8 +48,9 @@ def solve(landmarks, pixels, *, per_pixel=None, sigma=0.0, params=PARAMS, seed=0
     """Resect from the identity; landmarks are exact unless told how they move with their disparity."""
     per_pixel = np.zeros_like(landmarks) if per_pixel is None else per_pixel
     known = Landmarks(landmarks, per_pixel, np.broadcast_to(sigma, len(landmarks)).astype(float), {})
-    start = RigidTransform.identity()
-    return resect(known, pixels, CAMERA, start, params, np.random.default_rng(seed), where="frame 7")
+    return resect(
+        known, pixels, CAMERA, [RigidTransform.identity()], params, np.random.default_rng(seed), where="frame 7"
+    )
 
 
 def test_projection_is_eq_4_with_t_the_translation_and_the_position_minus_rt_t():
@@ -345,13 +346,13 @@ def test_dead_reckoning_finds_a_pose_that_the_last_one_does_not():
     reckoned = truth @ RigidTransform(rotation_exp([0.05, -0.05, 0.05]), np.array([0.1, 0.1, -0.1]))
     known = Landmarks(landmarks, np.zeros_like(landmarks), np.zeros(80), {})
 
-    def from_identity(**kw):
-        start = RigidTransform.identity()
-        return resect(known, pixels, CAMERA, start, PARAMS, np.random.default_rng(0), where="frame 7", **kw)
+    def from_identity(*others):
+        starts = [RigidTransform.identity(), *others]
+        return resect(known, pixels, CAMERA, starts, PARAMS, np.random.default_rng(0), where="frame 7")
 
     with raises("RIL-421", "frame 7"):
         from_identity()
-    found = from_identity(reckoned=reckoned)
+    found = from_identity(reckoned)
     np.testing.assert_allclose(found.T_local_left.matrix34, truth.matrix34, atol=1e-6)
     assert not found.inlier[:16].any()
 
@@ -364,8 +365,8 @@ def test_wrong_dead_reckoning_does_no_harm():
     known = Landmarks(landmarks, np.zeros_like(landmarks), np.zeros(60), {})
     astray = RigidTransform(rotation_exp([0.0, 1.5, 0.0]), np.array([3.0, 2.0, -4.0]))
     plain, misled = (
-        resect(known, pixels, CAMERA, RigidTransform.identity(), PARAMS, np.random.default_rng(0), reckoned=r)
-        for r in (None, astray)
+        resect(known, pixels, CAMERA, [RigidTransform.identity(), *others], PARAMS, np.random.default_rng(0))
+        for others in ((), (astray,))
     )
     np.testing.assert_allclose(misled.T_local_left.matrix34, plain.T_local_left.matrix34, atol=1e-9)
     np.testing.assert_array_equal(misled.inlier, plain.inlier)

@@ -15,7 +15,7 @@ from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 from rille.stages.geometry.triangulation import inverse_depth
 from rille.stages.terrain import ground_frame as level_stage
 from rille.stages.terrain.ground import _singular_values
-from rille.stages.terrain.ground_frame import LevelParams, level
+from rille.stages.terrain.ground_frame import LevelParams, VerticalHint, level
 
 RIG = toed_in_rig()
 PARAMS = LevelParams()
@@ -61,7 +61,7 @@ def test_each_source_and_their_order() -> None:
         ("initial pose", ("initial_up", "pitch")),
         ("pitch", ("pitch",)),
     ):
-        facts = level(*maps, RIG, PARAMS, **{k: given[k] for k in keys})
+        facts = level(*maps, RIG, PARAMS, VerticalHint(**{k: given[k] for k in keys}))
         assert facts["source"] == source
         np.testing.assert_allclose(up_of(facts), level_up, atol=1e-12)
         np.testing.assert_allclose(facts["plane"], [0.0, math.tan(slope), -HEIGHT], atol=1e-3)
@@ -71,7 +71,7 @@ def test_each_source_and_their_order() -> None:
 
 
 def test_local_frame() -> None:
-    T = RigidTransform.from_matrix(level(*FLAT, RIG, PARAMS, up=POSE.rotation[2])["T_local_left"])
+    T = RigidTransform.from_matrix(level(*FLAT, RIG, PARAMS, VerticalHint(up=POSE.rotation[2]))["T_local_left"])
     np.testing.assert_allclose(T.translation, 0.0)
     axis = T.rotation @ [0.0, 0.0, 1.0]
     assert abs(axis[0]) < 1e-12
@@ -119,7 +119,7 @@ def test_the_far_background_is_not_ground() -> None:
 
 def test_relief_holds_the_rocks() -> None:
     rocks = nearest(plane(0.0, 0.0, -HEIGHT), ball((0.0, 0.35, -HEIGHT), 0.05), ball((-0.1, 0.5, -HEIGHT), 0.06))
-    facts = level(*disparity(RIG, POSE, rocks), RIG, PARAMS, up=POSE.rotation[2])
+    facts = level(*disparity(RIG, POSE, rocks), RIG, PARAMS, VerticalHint(up=POSE.rotation[2]))
     assert facts["ground_height"] == pytest.approx(-HEIGHT, rel=0.02)
     assert facts["z_range"][0] < -HEIGHT
     assert facts["z_range"][1] > -HEIGHT + 0.055
@@ -136,12 +136,12 @@ def test_without_ground_the_pair_is_levelled_all_the_same() -> None:
     np.testing.assert_allclose(T.rotation, [[1, 0, 0], [0, 0, 1], [0, -1, 0]], atol=1e-12)
     # The wall stands a metre ahead: a pixel covers 2 m / f at twice that.
     assert facts["cell_size"] == pytest.approx(2.0 / RIG.left.fx, rel=0.6)
-    assert level(*wall, RIG, PARAMS, up=[0.0, -1.0, 0.1])["source"] == "attitude"
+    assert level(*wall, RIG, PARAMS, VerticalHint(up=[0.0, -1.0, 0.1]))["source"] == "attitude"
 
     stated = level(*wall, RIG, PARAMS.model_copy(update={"reference_height": 0.3}))
     np.testing.assert_allclose(stated["plane"], [0.0, 0.0, -0.3], atol=1e-12)
     assert stated["source"] == "none"
-    away = level(*wall, RIG, PARAMS.model_copy(update={"reference_height": 0.3}), up=[0.0, -0.17, 0.98])
+    away = level(*wall, RIG, PARAMS.model_copy(update={"reference_height": 0.3}), VerticalHint(up=[0.0, -0.17, 0.98]))
     assert away["plane"] is None  # it looks up: that surface is not in view
     assert away["source"] == "attitude"
 
@@ -165,7 +165,7 @@ def test_what_no_frame_can_be_posed_from_is_said_with_a_remedy() -> None:
     with raises("RIL-377"):
         level(*FLAT, Rig(RIG.left, RIG.right, RigidTransform.identity()), PARAMS)
     with raises("RIL-378"):
-        level(*FLAT, RIG, PARAMS, up=[0.0, 0.0, 0.0])
+        level(*FLAT, RIG, PARAMS, VerticalHint(up=[0.0, 0.0, 0.0]))
     with raises("RIL-376"):
         level(FLAT[0][:-1], FLAT[1], FLAT[2], RIG, PARAMS)
 
