@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import sys
 from typing import Annotated
 
 from cyclopts import App
 
-from rille.pipeline.commands.options import RUNS, CacheFolder, Debug, Run, Runs, cache_folder, flag
+from rille.pipeline.commands.options import COMPLETE, FAILED, RUNS, CacheFolder, Debug, Run, Runs, cache_folder, flag
 
 app = App(name="cache", help="Look after the cache of artifacts.")
 
@@ -19,9 +20,14 @@ def verify(
     debug: Debug = False,
 ) -> int:
     """Read every artifact and compare its checksums; damaged ones are named and recomputed by the next run."""
-    from rille.pipeline.runs import session as run
+    from rille.pipeline.engine.store import maintenance
+    from rille.pipeline.engine.store.base import at
 
-    return run.verify_cache(cache_folder(cache), deep=deep)
+    sound, damaged = maintenance.verify(at(cache_folder(cache)), deep=deep)
+    for found in damaged:
+        print(f"rille: {found.label or found.key[:12]} ({found.stage}): {found.reason}; set aside", file=sys.stderr)
+    print(f"{sound} artifacts are sound, {len(damaged)} damaged")
+    return FAILED if damaged else COMPLETE
 
 
 @app.command
@@ -33,9 +39,30 @@ def gc(
     debug: Debug = False,
 ) -> int:
     """Remove artifacts that no kept and no pinned run refers to, and leftovers of interrupted runs."""
-    from rille.pipeline.runs import session as run
+    from rille.pipeline.engine import events
+    from rille.pipeline.engine.memory.limits import words
+    from rille.pipeline.engine.store import maintenance
+    from rille.pipeline.engine.store.base import at
+    from rille.pipeline.runs import lookup, pins, roots
+    from rille.stages.core.errors import ConfigError
 
-    return run.collect_garbage(cache_folder(cache), runs, dry_run=dry_run)
+    store = at(cache_folder(cache))
+    roots.check_all_seen(store)
+    ledgers = [path for folder in roots.folders(store, runs) for path in folder.glob(f"*/*/{lookup.LEDGER}")]
+    kept = pins.keys(store).union(*map(events.keys, ledgers))
+    if not kept:
+        raise ConfigError(
+            "RIL-744",
+            f"no run is known that uses the cache {store.location}: all of it would go",
+            remedy="give the folder of your runs with --runs, or remove the cache yourself",
+        )
+    cleared = maintenance.gc(store, kept, dry_run=dry_run)
+    if dry_run:
+        for stage, (count, amount) in sorted(cleared.stages.items(), key=lambda item: -item[1][1]):
+            print(f"{stage:18s} {count:6d} {words(amount):>8s}")
+    verb = "would remove" if dry_run else "removed"
+    print(f"{verb} {cleared.artifacts} artifacts and {cleared.orphans} leftovers, {cleared.bytes / 2**20:.1f} MiB")
+    return COMPLETE
 
 
 @app.command
@@ -61,9 +88,12 @@ def pin(
     debug: Debug = False,
 ) -> int:
     """Keep all artifacts of a run: gc leaves them alone, even if the run's folder is removed."""
-    from rille.pipeline.runs import session as commands
+    from rille.pipeline.engine.store.base import at
+    from rille.pipeline.runs import lookup, pins
 
-    return commands.pin(cache_folder(cache), run, runs)
+    folder = lookup.find(run, runs)
+    print(f"pinned {lookup.name(folder)}: {pins.pin(at(cache_folder(cache)), folder)} artifacts")
+    return COMPLETE
 
 
 @app.command
@@ -75,6 +105,8 @@ def unpin(run: str, *, cache: CacheFolder = None, debug: Debug = False) -> int:
     run
         SEQUENCE (its latest pin), SEQUENCE/ID, or ID.
     """
-    from rille.pipeline.runs import session as commands
+    from rille.pipeline.engine.store.base import at
+    from rille.pipeline.runs import pins
 
-    return commands.unpin(cache_folder(cache), run)
+    print(f"unpinned {pins.unpin(at(cache_folder(cache)), run)}")
+    return COMPLETE

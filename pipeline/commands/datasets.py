@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from cyclopts import App
 
 from rille.pipeline.commands.options import COMPLETE, Assignments, CacheFolder, Debug, cache_folder, prepare
+
+if TYPE_CHECKING:
+    from rille.datasets.protocol import Source
+    from rille.pipeline.engine.store.manifest import Ref
 
 app = App(name="datasets", help="Sequences that Rille knows: list them, or export one for other tools.")
 
@@ -22,8 +27,8 @@ def list_datasets() -> int:
     return COMPLETE
 
 
-@app.command
-def export(
+@app.command(name="export")
+def export_dataset(
     seq: str,
     directory: Path,
     *,
@@ -41,6 +46,26 @@ def export(
         Folder to make; it must not exist yet or be empty.
     """
     prepare()
-    from rille.pipeline.runs import session
+    from rille.datasets.export import export
+    from rille.datasets.registry import open_sequence
+    from rille.pipeline.engine.store.base import at
+    from rille.pipeline.engine.task import Spec, ensure
+    from rille.pipeline.flow import config
+    from rille.stages.core.errors import ConfigError
 
-    return session.export_dataset(seq, directory, tuple(assignments or ()), cache_folder(cache))
+    for_dataset, others = config.split_dataset(config.parse_assignments(assignments or ()))
+    if others:
+        raise ConfigError(
+            "RIL-063", f"--set {next(iter(others))}: not a section of a sequence", remedy="set mockup.key=value"
+        )
+    place = cache_folder(cache)
+    store = at(place)
+    store.writable()
+
+    def artifact(source: Source) -> Ref:  # rendering is cached like any other work
+        refs = {port: artifact(upstream) for port, upstream in source.inputs.items()}
+        label = source.module.rsplit(".", 1)[-1]
+        return ensure(place, Spec(source.module, label, source.params, source.args, source.hints), refs).ref
+
+    print(export(open_sequence(seq, for_dataset), directory, lambda source: store.open(artifact(source))))
+    return COMPLETE

@@ -25,7 +25,6 @@ from rille.pipeline.engine.store.artifact import DamagedError
 from rille.pipeline.engine.store.base import GoneError, Store, at
 from rille.pipeline.engine.store.location import Location, hints_folder, locate
 from rille.pipeline.flow import config as configuration
-from rille.stages.core.declare import Bundle
 from rille.stages.core.errors import ConfigError, RilleError
 
 if TYPE_CHECKING:
@@ -405,90 +404,3 @@ def _list_missing(graph: Graph, folder: Path) -> None:
     for h in failed:
         print(f"rille: missing {h.label}: {' '.join(str(h.error).split())}", file=sys.stderr)
     print(f"rille: {len(failed)} failed, {len(skipped)} left out; ledger: {folder / 'ledger.jsonl'}", file=sys.stderr)
-
-
-def export_dataset(name: str, directory: Path, assignments: tuple[str, ...], cache: Location) -> int:
-    """Write a built-in sequence as plain files; rendering is cached like any other work."""
-    from rille.datasets.export import export
-    from rille.datasets.protocol import Source
-    from rille.datasets.registry import open_sequence
-    from rille.pipeline.engine.task import Ref, Spec, ensure
-
-    for_dataset, others = configuration.split_dataset(configuration.parse_assignments(assignments))
-    if others:
-        raise ConfigError(
-            "RIL-063", f"--set {next(iter(others))}: not a section of a sequence", remedy="set mockup.key=value"
-        )
-    store = at(cache)
-    store.writable()
-
-    def materialise(source: Source) -> Bundle:
-        return store.open(artifact(source))
-
-    def artifact(source: Source) -> Ref:
-        refs = {port: artifact(upstream) for port, upstream in source.inputs.items()}
-        label = source.module.rsplit(".", 1)[-1]
-        return ensure(cache, Spec(source.module, label, source.params, source.args, source.hints), refs).ref
-
-    print(export(open_sequence(name, for_dataset), directory, materialise))
-    return COMPLETE
-
-
-def verify_cache(cache: Location, *, deep: bool = False) -> int:
-    """Compare checksums of all artifacts; exit code 1 where one is damaged."""
-    from rille.pipeline.engine.store.maintenance import verify
-
-    sound, damaged = verify(at(cache), deep=deep)
-    for found in damaged:
-        print(f"rille: {found.label or found.key[:12]} ({found.stage}): {found.reason}; set aside", file=sys.stderr)
-    print(f"{sound} artifacts are sound, {len(damaged)} damaged")
-    return FAILED if damaged else COMPLETE
-
-
-def collect_garbage(cache: Location, runs: Path, *, dry_run: bool) -> int:
-    """Remove what no run in ``runs``, or in a folder that the cache knows, and no pinned run refers to.
-
-    A dry run says what that is.
-    """
-    from rille.pipeline.engine import events
-    from rille.pipeline.engine.memory.limits import words
-    from rille.pipeline.engine.store import maintenance
-    from rille.pipeline.runs import pins, roots
-
-    store = at(cache)
-    roots.check_all_seen(store)
-    kept = pins.keys(store)
-    for folder in roots.folders(store, runs):
-        for path in sorted(folder.glob("*/*/ledger.jsonl")):
-            kept |= events.keys(path)
-    if not kept:
-        raise ConfigError(
-            "RIL-744",
-            f"no run is known that uses the cache {cache}: all of it would go",
-            remedy="give the folder of your runs with --runs, or remove the cache yourself",
-        )
-    cleared = maintenance.gc(store, kept, dry_run=dry_run)
-    if dry_run:
-        for stage, (count, amount) in sorted(cleared.stages.items(), key=lambda item: -item[1][1]):
-            print(f"{stage:18s} {count:6d} {words(amount):>8s}")
-    verb = "would remove" if dry_run else "removed"
-    print(f"{verb} {cleared.artifacts} artifacts and {cleared.orphans} leftovers, {cleared.bytes / 2**20:.1f} MiB")
-    return COMPLETE
-
-
-def pin(cache: Location, text: str, runs: Path) -> int:
-    """Keep the artifacts of a run."""
-    from rille.pipeline.runs import lookup as kept
-    from rille.pipeline.runs import pins
-
-    run = kept.find(text, runs)
-    print(f"pinned {kept.name(run)}: {pins.pin(at(cache), run)} artifacts")
-    return COMPLETE
-
-
-def unpin(cache: Location, text: str) -> int:
-    """Keep them no longer."""
-    from rille.pipeline.runs import pins
-
-    print(f"unpinned {pins.unpin(at(cache), text)}")
-    return COMPLETE

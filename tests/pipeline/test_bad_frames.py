@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from raising import raises
 
+from rille.pipeline.commands.datasets import export_dataset
 from rille.pipeline.runs import session
 
 pytestmark = pytest.mark.slow
@@ -24,7 +25,7 @@ PLAIN = ("select.stride=3", "locus.cell_size=0.006", "hfvm.preset=fast", "crossc
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the sequence ``good`` and a cache that all runs share, so that each computes little."""
     folder = tmp_path_factory.mktemp("bad")
-    session.export_dataset("mockup-short", folder / "good", SMALL, folder / "cache")
+    export_dataset("mockup-short", folder / "good", assignments=list(SMALL), cache=folder / "cache")
     return folder
 
 

@@ -10,11 +10,11 @@ import pytest
 from raising import raises
 from test_why import run
 
+from rille.pipeline.commands import cache as commands
 from rille.pipeline.engine.store import maintenance
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.engine.store.manifest import artifact_path, frame, length
 from rille.pipeline.runs import inventory, lookup, pins
-from rille.pipeline.runs import session as commands
 
 
 def grow_old(folder):
@@ -52,7 +52,7 @@ def test_a_pin_outlives_the_folder_of_its_run(two, capsys):
     assert pins.pin(store, first) == 9
     shutil.rmtree(folder / "runs")
     grow_old(folder)
-    assert commands.collect_garbage(folder / "cache", folder / "runs", dry_run=True) == 0
+    assert commands.gc(cache=folder / "cache", runs=folder / "runs", dry_run=True) == 0
     printed = capsys.readouterr().out
     assert "would remove 9 artifacts" in printed
     assert {line.split()[0]: line.split()[1] for line in printed.splitlines()[:3]} == {
@@ -61,14 +61,14 @@ def test_a_pin_outlives_the_folder_of_its_run(two, capsys):
         "total": "1",
     }
     assert set(maintenance.artifacts(store)) == before, "it was only said"
-    commands.collect_garbage(folder / "cache", folder / "runs", dry_run=False)
+    commands.gc(cache=folder / "cache", runs=folder / "runs", dry_run=False)
     assert {key for _, key in maintenance.artifacts(store)} == pins.keys(store)
     assert maintenance.verify(store, deep=True) == (9, [])
     with raises("RIL-563", "'2'", "toy/1"):
         pins.unpin(store, "2")
     assert pins.unpin(store, "toy/1") == "toy/1"
     with raises("RIL-744", "no run is known"):
-        commands.collect_garbage(folder / "cache", folder / "runs", dry_run=False)
+        commands.gc(cache=folder / "cache", runs=folder / "runs", dry_run=False)
     assert len(set(maintenance.artifacts(store))) == 9
 
 
@@ -78,7 +78,7 @@ def test_nothing_is_cleared_away_while_a_pin_cannot_be_read(two):
     pins.pin(store, first)
     next((folder / "cache/pins").iterdir()).write_text("{")
     with raises("RIL-564"):
-        commands.collect_garbage(folder / "cache", folder / "runs", dry_run=False)
+        commands.gc(cache=folder / "cache", runs=folder / "runs", dry_run=False)
 
 
 def test_deep_verification_decodes_what_was_computed(two, capsys):
@@ -92,6 +92,6 @@ def test_deep_verification_decodes_what_was_computed(two, capsys):
     manifest["arrays"]["mask"]["sha256"] = "0" * 64
     path.write_bytes(frame(manifest) + data[length(data) :])
     assert maintenance.verify(store) == (18, [])
-    assert commands.verify_cache(folder / "cache", deep=True) == 1
+    assert commands.verify(cache=folder / "cache", deep=True) == 1
     assert f"{manifest['label']} (numbers): mask decoded to another digest; set aside" in capsys.readouterr().err
     assert lookup.keys(folder / "runs")[key].startswith("toy/")

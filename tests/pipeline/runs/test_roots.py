@@ -11,11 +11,12 @@ import pytest
 from raising import raises
 from toys import chain
 
+from rille.pipeline.commands import cache
 from rille.pipeline.engine import scheduler
 from rille.pipeline.engine.graph import Graph
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.engine.store.maintenance import artifacts
-from rille.pipeline.runs import pins, roots, session
+from rille.pipeline.runs import pins, roots
 
 
 @pytest.fixture
@@ -32,7 +33,7 @@ def used(tmp_path: Path) -> Store:
 
 
 def collect(store: Store, runs: Path) -> int:
-    session.collect_garbage(store.root, runs, dry_run=False)
+    cache.gc(cache=store.root, runs=runs)
     return len(list(artifacts(store)))
 
 
