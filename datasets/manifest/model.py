@@ -227,6 +227,15 @@ class World(Params):
     )
 
 
+class Urdf(Params):
+    """A robot description that says how large the vehicle is and how its left camera is mounted."""
+
+    file: str = Field(
+        description="URDF; what [vehicle] does not state of the wheels and the clearance is taken from it"
+    )
+    left: str = Field(default="", description="optical link of the left camera; its pitch is taken, if none is stated")
+
+
 class Manifest(Params):
     """A stereo sequence in a folder of any form."""
 
@@ -242,6 +251,7 @@ class Manifest(Params):
     imu: Imu | None = None
     world: World = World()
     vehicle: Vehicle | None = None
+    urdf: Urdf | None = None
     defaults: dict[str, Any] = Field(
         default={}, description="parameters that suit the sequence, e.g. locus.cell_size = 0.05"
     )

@@ -23,6 +23,7 @@ from rille.datasets.manifest.rig import read_optics
 from rille.datasets.protocol import Sequence, Source
 from rille.datasets.text.names import derived_name
 from rille.datasets.text.reading import Search
+from rille.datasets.urdf import read_urdf
 from rille.stages.core.errors import InputError
 
 VARIABLE = re.compile(r"\$\{(\w+)\}")
@@ -51,7 +52,13 @@ def open_manifest(path: Path, digests: files.Digests) -> Sequence:
         return files.image_source(pair.left if camera == "left" else pair.right, frame, camera, size, digests)
 
     world = manifest.world
-    pitch = world.pitch_deg
+    pitch = None if world.pitch_deg is None else math.radians(world.pitch_deg)
+    vehicle = manifest.vehicle
+    if manifest.urdf is not None:
+        robot = read_urdf(root / manifest.urdf.file, manifest.urdf.left, vehicle)
+        vehicle = robot.vehicle
+        if pitch is None and up is None:
+            pitch = robot.pitch
     return Sequence(
         name=manifest.name or default_name(path),
         rig=optics.rig,
@@ -66,9 +73,9 @@ def open_manifest(path: Path, digests: files.Digests) -> Sequence:
         up=up,
         attitude=motion.attitude,
         odometry=motion.odometry,
-        pitch=None if pitch is None else math.radians(pitch),
+        pitch=pitch,
         georeference=georeference(world.crs, world.origin, world.azimuth_deg, name),
-        vehicle=manifest.vehicle,
+        vehicle=vehicle,
         lost={k: pair.absent for k, pair in enumerate(pairs) if pair.absent},
         defaults=dict(dotted(manifest.defaults)),
         notes=manifest.notes,
