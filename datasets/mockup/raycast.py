@@ -169,6 +169,7 @@ def _cast(height, maxima, offsets, shapes, origins, directions):  # type: ignore
                 out[i] = at + s
                 break
             t = t_exit + eps
+            # The next patch is mostly a neighbour: the pyramid is climbed again from below, not entered at the top.
             level = min(1, top)
             first = False
             if eps == 0.0:
@@ -182,6 +183,7 @@ def _first_root(f0, f1, f2):  # type: ignore[no-untyped-def]
     disc = f1 * f1 - 4.0 * f2 * f0
     if disc < 0.0:
         return np.inf
+    # Both terms have the sign of f1, so nothing cancels; the roots are q / f2 and f0 / q.
     q = -0.5 * (f1 + (np.sqrt(disc) if f1 >= 0.0 else -np.sqrt(disc)))
     a = q / f2 if f2 != 0.0 else np.inf
     b = f0 / q if q != 0.0 else np.inf

@@ -97,6 +97,7 @@ def _shade(bed, albedo, origin, directions, distance, pixel_angle):  # type: ign
         mu0 = max((sun[2] - gx * sun[0] - gy * sun[1]) / norm, 0.0)
         mu = max((vz - gx * vx - gy * vy) / norm, 0.05)
         lit = _bilinear(sunlit, r, c) / 255.0
+        # Lunar-Lambert: Lommel and Seeliger's law, which knows no limb darkening, mixed with Lambert's.
         direct = lit * (2.0 * LUNAR * mu0 / (mu0 + mu) + (1.0 - LUNAR) * mu0) if mu0 > 0.0 else 0.0
         # grain is draped over rocks, not projected from above, so that walls that face the drive are not streaked
         drape = (origin[2] + t * dz) / cell

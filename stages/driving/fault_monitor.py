@@ -87,6 +87,7 @@ def judge(
     key = RigidTransform.from_matrix(poses[0]) @ T_vehicle_left.inverse()
     steepest = params.max_tilt * float(vehicle["max_slope_deg"])
     for k in range(1, len(poses)):
+        # Rounding may carry the cosine of an upright vehicle beyond 1.
         tilt = math.degrees(math.acos(min(1.0, float((T_vehicle_left.rotation @ up[k])[2]))))
         if tilt > steepest:
             return Verdict(k, "attitude", f"tilt of {tilt:.1f} degrees by the inclinometer, {steepest:.1f} permitted")
@@ -110,6 +111,7 @@ def _disagreement(wheels: Floats, moved: RigidTransform, base: float, params: Sa
     if apart > params.max_turn_deg:
         return f"wheels and vision differ by {apart:.1f} degrees in heading, {params.max_turn_deg:g} permitted"
     way, seen = float(np.hypot(wheels[0], wheels[1])), float(np.linalg.norm(moved.translation))
+    # Over a short way the error of vision is as large as the slip that is looked for.
     if way < params.least_way * base:
         return ""
     slip = 1.0 - seen / way

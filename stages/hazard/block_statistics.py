@@ -118,6 +118,7 @@ def _total(line, n, out):  # type: ignore[no-untyped-def]
     whole, first = line.shape[0] // n, 0
     if n == 4:
         for j in range(whole):
+            # The additions of the loop below in its order, so that both give the same bits.
             a, b = np.float64(line[4 * j]), np.float64(line[4 * j + 1])
             out[j] = ((a + b) + np.float64(line[4 * j + 2])) + np.float64(line[4 * j + 3])
         first = whole

@@ -198,6 +198,7 @@ def _steepest(a, wheels, spans, k, r, out):  # type: ignore[no-untyped-def]
     for c in range(np.uint64(out.shape[1])):
         fl, fr, rl, rr = a[y0, c + x0], a[y1, c + x1], a[y2, c + x2], a[y3, c + x3]
         u, v = abs(fl - rl) * left, abs(fr - rr) * right
+        # NaN compares false: a plane with a wheel over unknown ground is left out.
         along = u if u > zero else zero
         along = v if v > along else along
         u, v = abs(fl - fr) * front, abs(rl - rr) * rear
@@ -216,6 +217,7 @@ def _count(gaps, at, k, j, r, out):  # type: ignore[no-untyped-def]
         out[c] += gaps[y0, c + x0] + gaps[y1, c + x1]
 
 
+# Inlined: to count the references of its arrays once a line would take 40 % of the placement.
 @njit(cache=True, nogil=True, inline="always")
 def _rise(maps, stance, at, out):  # type: ignore[no-untyped-def]
     """Raise ``out`` to the rise of points ``j`` and ``j + 1`` of the belly over the wheels' plane."""
@@ -229,6 +231,8 @@ def _rise(maps, stance, at, out):  # type: ignore[no-untyped-def]
     for c in range(np.uint64(out.shape[1])):
         fl, fr, rl, rr = stand[y0, c + x0], stand[y1, c + x1], stand[y2, c + x2], stand[y3, c + x3]
         p, q, most = belly[y, c + x], belly[z, c + s], out[r, c]
+        # Each gap is cut off at 0 before it is weighed: a hollow under one wheel must not make up for a stone at
+        # another.
         a, b, d, e = p - fl, p - fr, p - rl, p - rr
         total = v0 * (a if a > zero else zero) + v1 * (b if b > zero else zero)
         total += v2 * (d if d > zero else zero) + v3 * (e if e > zero else zero)

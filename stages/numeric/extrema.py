@@ -31,13 +31,8 @@ def octagon(reach: int) -> tuple[int, int]:
     return reach - 2 * diagonal, diagonal
 
 
-def running_range(surface: Floats32, reach: int) -> tuple[Floats32, Floats32]:
-    """Highest and lowest value (row, col) within the octagon; unknown (NaN) is left out, -inf and inf where all is."""
-    return running_max(surface, reach), -running_max(-surface, reach)
-
-
 def running_max(surface: Floats32, reach: int) -> Floats32:
-    """The highest value alone."""
+    """Highest value (row, col) within the octagon; unknown (NaN) is left out, -inf where all is."""
     return _inside(_widened(_padded(surface, reach), *octagon(reach)), reach)
 
 

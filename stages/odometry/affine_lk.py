@@ -78,6 +78,7 @@ def _align_all(a, b, templates, ridge, reach, position, error):  # type: ignore[
         if not _descent(a, points[n, 0], points[n, 1], patch, template, descent):
             continue
         _gram(descent, ridge, gram)
+        # Inverse compositional: derivatives are those of the template, so one factorisation serves all steps.
         if not _factor(gram):
             continue
         m = affinity[n].copy()
@@ -105,6 +106,7 @@ def _descent(a, x0, y0, patch, template, descent):  # type: ignore[no-untyped-de
     wide, far = SIDE + 2, HALF + 1
     if not (_holds(a, x0 - far, y0 - far) and _holds(a, x0 + far, y0 + far)):
         return False
+    # At whole pixels the interpolating spline is the pixel itself.
     if x0 == np.floor(x0) and y0 == np.floor(y0):
         for i in range(wide * wide):
             patch[i] = a[int(y0) + i // wide - far, int(x0) + i % wide - far]
@@ -122,6 +124,7 @@ def _descent(a, x0, y0, patch, template, descent):  # type: ignore[no-untyped-de
         descent[i, 2], descent[i, 3], descent[i, 4], descent[i, 5] = gx * x, gx * y, gy * x, gy * y
         descent[i, 6] = 1.0
     for i in range(SIDE * SIDE):
+        # Gain about the mean: its derivative is then orthogonal to that of the offset.
         descent[i, 7] = template[i] - mean / (SIDE * SIDE)
     return True
 

@@ -216,8 +216,10 @@ def _best(words, area, middle, offset):  # type: ignore[no-untyped-def]
             step = 1 if abs(v - middle) == ring else max(2 * ring, 1)
             for u in range(middle - ring, middle + ring + 1, step):
                 total = _sum_at(words, area, wide, u, v, most)
+                # Rings are no reading order: of equals the first in reading order is kept all the same.
                 if total < most or (total == most and (v < bv or (v == bv and u < bu))):
                     most, bu, bv = total, u, v
+    # At the rim the least distance may lie beyond it, and the sub-pixel part has no neighbour there.
     if min(bu, bv) < 1 or max(bu, bv) > 2 * middle - 1:
         return -1.0
     before = _sum_at(words, area, wide, bu - 1, bv, all_of_it)

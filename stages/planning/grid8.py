@@ -83,6 +83,7 @@ def _flood(ways, number, spans):  # type: ignore[no-untyped-def]
     stack = np.empty(ways.size, dtype=np.int64)
     count = 0
     for at in range(ways.size):
+        # In reading order of first cells: the numbers do not depend on the order in which the stack is emptied.
         if ways[at // cols, at % cols] == 0 or number[at // cols, at % cols] >= 0:
             continue
         if count == spans.shape[0]:

@@ -128,10 +128,12 @@ def find_path(
     found = _found(maps, lattice, vehicle, heading, ends, stretch, p)
     if len(found.cells) or p.sure >= 1 or "p_hazard" not in maps:
         return found
+    # Searched once more without the limit, only to name the figure that would open a way.
     other = _found(maps, lattice, vehicle, heading, ends, stretch, p.model_copy(update={"sure": 1.0}))
     if not len(other.cells):
         return found
     at = tuple(np.rint(lattice.index(other.xyz[:, :2])).astype(np.int64).T)
+    # Rounded up to three digits, so that the figure as it is told lets the path through.
     chance = math.ceil(1e3 * float(np.nanmax(maps["p_hazard"][at])) - 1e-3) / 1e3
     reason = (
         f"ground with a p_hazard above path.sure {p.sure:g} closes every way; without it one leads over ground of up "
@@ -200,6 +202,7 @@ def _by_grid(
     before: Route | None,
 ) -> Route:
     ground = _ground(maps, lattice, RowGrid.over(lattice, (0.0, 1.0)), vehicle, p)
+    # A step costs its length in units of height: else a path of no climb could be of any length.
     grid, unit = ground.grid, max(1, round(lattice.cell / ground.unit))
     given = tuple(None if point is None else grid.index(point) for point in ends)
     nothing = np.empty((0, 2), dtype=np.int64)

@@ -96,6 +96,7 @@ def _sweep(height, ways, toll, sources, cost, move):  # type: ignore[no-untyped-
         if r + 1 < rows:
             _copy_ways(ways[r + 1], around)
         inner = slice(left, right)
+        # Times the number of rows: all moves sideways of a path together weigh less than one unit of height.
         _scale(height[r, inner], 4 * rows, here[left + 1 : right + 1])
         _scale(toll[r, inner], 4 * rows, step[inner])
         _allow(ways[r, inner], around[left : right + 2], can[inner])
@@ -160,6 +161,7 @@ def _enter(height, toll, can, last, before, out):  # type: ignore[no-untyped-def
         way, h, step = can[c], height[c], toll[c]
         a = last[c + 1] + (abs(h - before[c + 1]) + step)
         a = a if (way & STRAIGHT != 0) & (last[c + 1] < far) else far
+        # 4 for a move sideways (costs are four times as large), and 1 or 2, the index of the move, which decides ties.
         b = last[c + 2] + (abs(h - before[c + 2]) + step) + 5
         b = b if (way & LEFT != 0) & (last[c + 2] < far) else far
         d = last[c] + (abs(h - before[c]) + step) + 6

@@ -134,6 +134,7 @@ def level(
     except DegenerateError as error:
         why = error
     up = np.array([0.0, -1.0, 0.0]) if known_up is None else known_up
+    # No ground is seen: odometry, which needs none, still gets a frame.
     facts, R_local_left = {"source": source or NO_VERTICAL}, level_rotation(up)
     try:
         if params.reference_height is not None:

@@ -109,8 +109,10 @@ def _search(points, ground, frame, places, bound, scores, overlaps):  # type: ig
                 overlaps[h, i, j] = m / n
                 if m < 6:
                     continue
+                # The height of the local frame on the map is not known: the median difference takes it out.
                 middle = np.median(differences[:m])
                 total = 0.0
+                # Truncated: a rock that the coarse map does not hold counts no more than the bound.
                 for k in range(m):
                     total += min((differences[k] - middle) ** 2, bound * bound)
                 scores[h, i, j] = total / m

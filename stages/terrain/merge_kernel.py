@@ -86,9 +86,11 @@ def merge_cells(stack, x, y, rule, filled):  # type: ignore[no-untyped-def]
             if m == 0:
                 _forget(r, c, out, count, best)
                 continue
+            # Of two models that contradict each other none is the outlier.
             if m >= 3:
                 _agree(h, s, w, d, order, m)
             _average((h, s, w, which), m, stack, rule, (r, c), filled)
+            # The limit is on the models' own errors, so it is asked before the poses' part is added.
             if out[1, r, c] > worst:
                 _forget(r, c, out, count, best)
             else:
@@ -151,9 +153,11 @@ def _agree(h, s, w, d, order, m):  # type: ignore[no-untyped-def]
         d[i] = abs(h[i] - centre)
     typical = MAD_TO_SIGMA * _median(d, w, order, m, True)
     for i in range(m):
+        # At least its own standard deviation: models that agree by chance must not shut out a third.
         w[i] *= bisquare(d[i] / (TUKEY_BISQUARE * max(typical, s[i])))
 
 
+# Inlined: to count the references of its arrays once a cell would take 15 % of the merge.
 @njit(cache=True, nogil=True, inline="always")
 def _average(models, m, stack, rule, at, filled):  # type: ignore[no-untyped-def]
     """Weighted means of the ``m`` models that a cell has; ``models``: elevations, their standard deviations, weights
@@ -195,6 +199,7 @@ def _average(models, m, stack, rule, at, filled):  # type: ignore[no-untyped-def
         if w[i] > 0.0:
             spread += w[i] / total * (h[i] - mean) ** 2
     out[0, r, c] = mean
+    # Unrelated errors (alike = 0) average out; errors of one cause (alike = 1) add up as if there were one model.
     out[1, r, c] = math.sqrt(variance + alike * (together * together - variance))
     out[2, r, c] = math.sqrt(spread)
     out[3, r, c] = grey / greys if greys > 0.0 else math.nan

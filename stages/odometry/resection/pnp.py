@@ -308,6 +308,7 @@ def _step(normal, gradient, damping, lower, step):  # type: ignore[no-untyped-de
     most = 0.0
     for i in range(UNKNOWNS):
         most = max(most, normal[i, i])
+    # Damping scales with the diagonal, which is 0 for an unknown that no landmark tells of.
     floor = 1e-12 * most + 1e-300
     for i in range(UNKNOWNS):
         for k in range(i + 1):
@@ -341,6 +342,7 @@ def _moved(R, t, step, out_R, out_t):  # type: ignore[no-untyped-def]
     x, y, z = step[3], step[4], step[5]
     angle2 = x * x + y * y + z * z
     angle = np.sqrt(angle2)
+    # The limits of sin(x) / x and (1 - cos(x)) / x^2, where both would be 0 / 0.
     a, b = (1.0, 0.5) if angle < 1e-9 else (np.sin(angle) / angle, (1.0 - np.cos(angle)) / angle2)
     turn = np.empty((3, 3))
     turn[0, 0], turn[0, 1], turn[0, 2] = 1.0 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y

@@ -492,6 +492,7 @@ def _resect_one(
     if use.size < MINIMUM:
         what = f"of {len(points)} tracked points have coordinates and were found ({landmarks.summary()})"
         _enough(use.size, where, what, FEW)
+    # Seeded by the frame: its pose does not depend on how many frames were posed before it.
     rng = np.random.default_rng([params.seed, frame])
     pixels = points[use].astype(np.float64)
     return resect(landmarks.take(use), pixels, camera, starts, params, rng, where=where)

@@ -211,6 +211,7 @@ def _gaps(poses, parts, ground, reach, out):  # type: ignore[no-untyped-def]
     for n in range(at.shape[0]):
         row, col, c, s = at[n, 0], at[n, 1], cosine[n], sine[n]
         for k in range(6):
+            # On unknown ground, unless all wheels are found on the map below.
             out[k, n] = np.float32(-1.0) if k == 3 or k == 4 else np.float32(0.0)
         i, j = math.floor(row + 0.5), math.floor(col + 0.5)
         if i < 0 or j < 0 or i >= rows or j >= cols:
@@ -234,6 +235,7 @@ def _gaps(poses, parts, ground, reach, out):  # type: ignore[no-untyped-def]
         out[0, n], out[1, n], out[2, n], out[5, n] = gap, doubtful, proven, share / np.float32(PARTS)
         if outside:
             continue
+        # No unknown ground within the circle about the vehicle: its belly need not be looked at point by point.
         if spare > 0:
             out[3, n] = out[4, n] = spare + reach[1]
             continue
@@ -241,6 +243,7 @@ def _gaps(poses, parts, ground, reach, out):  # type: ignore[no-untyped-def]
         for k in range(belly.shape[0]):
             a, b = belly[k, 0], belly[k, 1]
             i, j = math.floor(row - (a * s + b * c) + 0.5), math.floor(col + (a * c - b * s) + 0.5)
+            # All wheels are on the map: what sticks out between them is a rounding to cells.
             i, j = min(max(i, 0), rows - 1), min(max(j, 0), cols - 1)
             if steady and straddle.void[i, j] > unknown[i, j] and clears(straddle, k, i, j, heights):
                 least = min(least, straddle.void[i, j])

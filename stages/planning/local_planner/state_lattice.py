@@ -185,6 +185,7 @@ def _search(prices, goals, moves, end, cost, move):  # type: ignore[no-untyped-d
                 before = (k + 15) % 16 if m == 2 else (k + 1) % 16
                 lower = before if m == 2 else k
                 between, scale = turn[lower % 8, r, c], turns[lower]
+            # The dearest of both ends and the middle: what is dear must not be stepped over.
             price = max(here, pose[before % 8, i, j], between)
             total = key + scale * price
             if total < cost[before, i, j]:

@@ -214,6 +214,7 @@ def _downwards(lanes, m, room, first, begin):  # type: ignore[no-untyped-def]
             upper = pixels(room, S, first + i - 1) if i else lanes[LEVEL + m]
             lanes[LEVEL + m] = pixels(room, S, first + i)
             _bracket(lanes, m, place + 1.0, upper, lanes[LEVEL + m])
+            # 0 ends a lane whose root is refused: below the last step only free ground is searched on.
             lanes[PLACE + m] = place if place > last else 0.0
             outcome = FOUND
             break

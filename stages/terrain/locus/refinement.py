@@ -141,6 +141,7 @@ def _misfit(seen: OrthoPair, keep: Mask) -> tuple[Floats, Floats]:
     for _ in range(MEAN_ROUNDS + 1):
         mean = window_sum(weight * rest, MEAN_SIDE) / np.maximum(window_sum(weight, MEAN_SIDE), LEAST_WEIGHT)
         weight = np.where(keep, 1.0 / (1.0 + np.square((rest - mean) / RESIDUAL)), 0.0)
+    # A cell smaller than a pixel brings no more than its share of what the pixel tells.
     return weight * np.where(keep, np.minimum(seen.area, 1.0), 0.0), np.where(keep, rest - mean, 0.0)
 
 

@@ -72,6 +72,7 @@ def slopes(n, lanes, epipole, seen, room):  # type: ignore[no-untyped-def]
     meet(n, epipole, seen, room)
     for m in range(n):
         lanes[DOWNWARDS + m] = -pixels(room, S, m) / lanes[STEP + m]
+        # The roots themselves once more: their residual and grey value are read from the room of points.
         lanes[Z + m] = lanes[ROOT + m]
     raise_to(lanes, n, seen.image.shape, room)
     meet(n, epipole, seen, room)
@@ -96,6 +97,7 @@ def accept(n, found, cells, lanes, seen, room, out):  # type: ignore[no-untyped-
             top = image[r, c] * (1.0 - fx) + image[r, c + 1] * fx
             bottom = image[r + 1, c] * (1.0 - fx) + image[r + 1, c + 1] * fx
             i, own = cells[found[m]], std[int(np.rint(room[Y + m])), int(np.rint(room[X + m]))]
+            # sigma_Z = sigma_d / |ds/dZ|
             out[i, 0], out[i, 1], out[i, 2] = lanes[ROOT + m], own / slope, residual
             out[i, 3] = top * (1.0 - fy) + bottom * fy
         else:

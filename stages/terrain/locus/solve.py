@@ -151,5 +151,6 @@ def _around(coarse: Floats) -> tuple[Floats, Floats]:
     for i in range(4):
         for j in range(4):
             near = padded[i : i + shape[0], j : j + shape[1]]
+            # NaN gives way: one known neighbour is enough to say where a gap is searched.
             low, high = np.fmin(low, near), np.fmax(high, near)
     return low, high

@@ -146,6 +146,7 @@ def _project(n, views, lanes):  # type: ignore[no-untyped-def]
         xl, yl = (l0[0] * x + l0[1] * y + l0[2] * z + l0[3]) / a2, (l1[0] * x + l1[1] * y + l1[2] * z + l1[3]) / a2
         xr, yr = (r0[0] * x + r0[1] * y + r0[2] * z + r0[3]) / b2, (r1[0] * x + r1[1] * y + r1[2] * z + r1[3]) / b2
         seen = (a2 > 0.0) & (b2 > 0.0) & (toward != 0.0)
+        # A cubic spline reads from one pixel before to two behind the point.
         seen = seen & (xl >= 1.0) & (yl >= 1.0) & (xl < wl) & (yl < hl)
         seen = seen & (xr >= 1.0) & (yr >= 1.0) & (xr < wr) & (yr < hr)
         lanes[SEEN + m] = 1.0 if seen else 0.0
