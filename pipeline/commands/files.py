@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Literal
@@ -44,12 +45,28 @@ def init(
     return command.init(directory, output, force)
 
 
+@Parameter(name="*")
+@dataclass(frozen=True)
+class Board:
+    """The chessboard of a calibration.
+
+    Parameters
+    ----------
+    square
+        Side of a square, metres.
+    corners
+        Inner corners, COLUMNSxROWS, for example 9x6; detected by default.
+    """
+
+    square: float
+    corners: str | None = None
+
+
 def calibrate(
     left: Path,
     right: Path,
     *,
-    square: float,
-    corners: str | None = None,
+    board: Board,
     model: Literal["radtan", "radtan4", "rational", "fisheye"] = "radtan",
     output: Annotated[Path, Output] = Path("rig.yaml"),
     keep_bad: Annotated[bool, flag("Keep views whose residuals are far above the others'.")] = False,
@@ -63,10 +80,6 @@ def calibrate(
         Folder or glob of the left camera's images.
     right
         The same of the right camera; views are paired by number.
-    square
-        Side of a square, metres.
-    corners
-        Inner corners, COLUMNSxROWS, for example 9x6; detected by default.
     model
         Distortion model.
     output
@@ -74,7 +87,32 @@ def calibrate(
     """
     from rille.pipeline.commands import calibrate as command
 
-    return command.calibrate(left, right, square=square, corners=corners, model=model, output=output, keep_bad=keep_bad)
+    return command.calibrate(
+        left, right, square=board.square, corners=board.corners, model=model, output=output, keep_bad=keep_bad
+    )
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class Matcher:
+    """How two images are matched.
+
+    Parameters
+    ----------
+    preset
+        Parameter set of the matcher: fast matches at half the resolution, accurate takes several times as long, paper
+        follows the publication to the letter.
+    prior_disparity
+        Disparity TIFF of this left image to start from, as this command writes it; where it is undefined the search
+        starts as without it. It may err by some pixels: three and a few more from neighbours.
+    """
+
+    preset: Literal["default", "fast", "accurate", "paper"] | None = None
+    prior_disparity: Path | None = None
+    assignments: Assignments = None
+
+
+_MATCHER = Matcher()
 
 
 def match(
@@ -82,11 +120,9 @@ def match(
     right: Path,
     *,
     output: Annotated[Path, Output] = Path("disparity.tif"),
-    preset: Literal["default", "fast", "accurate", "paper"] | None = None,
+    matcher: Matcher = _MATCHER,
     dense: Annotated[bool, flag("Fill undefined disparities by interpolation.")] = False,
-    prior_disparity: Path | None = None,
     confidence: Path | None = None,
-    assignments: Assignments = None,
     debug: Debug = False,
 ) -> int:
     """Match any two images, without calibration or rectification, to a two-band disparity TIFF.
@@ -102,12 +138,6 @@ def match(
         Search image.
     output
         TIFF to write.
-    preset
-        Parameter set of the matcher: fast matches at half the resolution, accurate takes several times as long, paper
-        follows the publication to the letter.
-    prior_disparity
-        Disparity TIFF of this left image to start from, as this command writes it; where it is undefined the search
-        starts as without it. It may err by some pixels: three and a few more from neighbours.
     confidence
         TIFF to write with the bands disparity_std (pixels, standard deviation of the column), validity (bits) and
         backmatch_error (pixels).
@@ -119,9 +149,9 @@ def match(
         left,
         right,
         output,
-        command.matcher_params(preset, tuple(assignments or ())),
+        command.matcher_params(matcher.preset, tuple(matcher.assignments or ())),
         dense=dense,
-        prior=prior_disparity,
+        prior=matcher.prior_disparity,
         confidence=confidence,
     )
 

@@ -149,7 +149,7 @@ class Drive:
                 "RIL-032", "a drive needs locus.cell_size", remedy="set it to about an eighth of a wheel, metres"
             )
         self.graph, self.sequence, self.config = graph, sequence, config
-        self.make = Taken(graph, sequence, config, self)
+        self.make = DriveBuilder(graph, sequence, config, self)
         self.products = self.make.products
         self.driven = self.products.drive = Driven()
         self.simulation: Simulation = sequence.simulation
@@ -488,7 +488,7 @@ class Drive:
         return replace(self.sequence, frames=n, frame_names=names, truth=truth), tuple(self.posed)
 
 
-class Taken(Builder):
+class DriveBuilder(Builder):
     """Tasks of a drive: an image is taken where the vehicle truly is by then, by an ideal camera."""
 
     def __init__(self, graph: Graph, sequence: Sequence, config: Any, drive: Drive) -> None:
