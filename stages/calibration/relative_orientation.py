@@ -208,6 +208,7 @@ def _maximised(normal: Floats, pull: Floats, prior: Floats, smooth: float, round
         total[terms, terms] = normal[terms, terms] + smooth**-2.0
         covariance = np.linalg.inv(total)
         x, variance = covariance @ pull, np.diag(covariance)
+        # The expected square has the estimate's variance, too: without it the size would shrink round by round.
         size = max(LEAST_SMOOTH, float(np.sqrt(np.mean(x[SMOOTH] ** 2 + variance[SMOOTH]))))
         if rounds == 0 or abs(size - smooth) <= CONVERGED * smooth:
             break

@@ -102,6 +102,7 @@ def _nearest(points, x, y, who, far):  # type: ignore[no-untyped-def]
     who[:] = 0
     for m in range(len(points)):
         d = (points[m, 0] - x) ** 2 + (points[m, 1] - y) ** 2
+        # Of equal distances the lower number, which came first, stays.
         if d >= far[count - 1]:
             continue
         k = count - 1

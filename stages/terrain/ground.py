@@ -69,6 +69,7 @@ def fit_plane(
     if theta is not None:
         information = tolerance**-2.0
         for _ in range(20):
+            # Tukey's biweight of the deviation over twice the tolerance: what is beyond that counts nothing.
             weight = np.maximum(0.0, 1.0 - 0.25 * (rho - rays @ theta) ** 2 * information) ** 2 * information
             weighted = rays * weight[:, None]
             last, theta = theta, np.asarray(np.linalg.solve(weighted.T @ rays, weighted.T @ rho), dtype=np.float64)
@@ -109,6 +110,7 @@ def _consensus(
     """The allowed plane of most agreement among planes through three points; None: none is allowed."""
     triples = rng.integers(0, rays.shape[0], size=(HYPOTHESES, 3))
     volume = np.abs(np.linalg.det(rays[triples]))
+    # Three rays that lie nearly in one plane with the camera do not fix the ground.
     triples = triples[volume > 1e-3 * np.ptp(rays[:, 0]) * np.ptp(rays[:, 1])]
     if not len(triples):
         return None
@@ -201,6 +203,7 @@ def view_ground(rig: Rig, R_local_left: Floats, plane: Sequence[float]) -> Groun
     steps = [_meet(rig, R_local_left, plane, pixels + step) - here for step in ([0.5, 0.0], [0.0, 0.5])]
     jacobian = 2.0 * np.stack(steps, axis=-1)[:, :2]
     slope = _elevation_slope(rig, R_local_left, plane, here)
+    # Beside the horizon half a pixel may lead to a ray that misses the plane.
     good = np.isfinite(jacobian).all((1, 2)) & (slope > 0)
     if not good.any():
         raise DegenerateError(

@@ -91,8 +91,10 @@ def _below(z, row, col, height, out):  # type: ignore[no-untyped-def]
                 i, j = math.floor(r + part * dr + 0.5), math.floor(c + part * dc + 0.5)
                 if i == r and j == c:
                     continue
+                # From ground that was seen again a line of its own begins.
                 if i < 0 or j < 0 or i >= rows or j >= cols or not math.isnan(z[i, j]):
                     break
+                # By the cell's own distance: the line passes it up to half a cell beside its middle.
                 share = math.hypot(row - i, col - j) / far
                 out[i, j] = min(out[i, j], np.float32(height + (z[r, c] - height) * min(share, 1.0)))
 

@@ -76,6 +76,7 @@ def fit_seam(difference: Floats, x: Floats, y: Floats) -> SeamFit | None:
         return None
     side = max(3, math.ceil(math.sqrt(cells / BLOCKS)))
     fit, like = _fit(difference, x, y, side, cells, LEAST_BLOCKS)
+    # Blocks that err like their neighbours tell less than their number: larger ones, until they do not.
     while fit is not None and like > ALIKE:
         side *= 2
         coarser, like = _fit(difference, x, y, side, cells, MANY_BLOCKS)
@@ -144,6 +145,7 @@ def _robust(design: Floats, value: Floats, weight: Floats) -> tuple[Floats, Floa
         scale = mad_sigma(size[weight > 0], 0.0)
         if scale <= 1e-12 * float(np.abs(value).max()):
             break
+        # First least absolute deviations, which gross errors do not capture; then the biweight, which forgets them.
         absolute = 1.0 / np.maximum(size, 0.01 * scale)
         biweight = bisquare(residual / (TUKEY_BISQUARE * scale))
         plane = _solve(design, value, weight * (absolute if turn < ROUNDS // 2 else biweight))
@@ -162,12 +164,14 @@ def _covariance(design: Floats, residual: Floats, weight: Floats, scale: float) 
     if scale <= 0:
         return np.zeros((3, 3))
     u = np.clip((residual / (TUKEY_BISQUARE * scale)) ** 2, 0.0, 1.0)
+    # Derivative of Tukey's psi, and psi: bread and meat of the covariance of an M-estimate.
     slope, psi = (1.0 - u) * (1.0 - 5.0 * u), residual * (1.0 - u) ** 2
     bread = np.einsum("rc,rci,rcj->ij", weight * slope, design, design)
     score = design * (weight * psi)[..., None]
     inverse = np.linalg.pinv(bread, hermitian=True)
     n = int((weight > 0).sum())
     found = [inverse @ meat @ inverse * n / (n - 3) for meat in (_meat(score, 0), _meat(score, REACH))]
+    # Products of neighbours may sum to less than none by chance: never less than independent blocks give.
     return max(found, key=lambda cov: float(np.trace(cov @ bread)))
 
 

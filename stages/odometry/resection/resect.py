@@ -239,6 +239,7 @@ def _draw(rng: np.random.Generator, count: int, n: int) -> NDArray[np.intp]:
     """``count`` samples of :data:`SAMPLE` different numbers below n."""
     drawn = rng.random((count, n))
     least = np.argpartition(drawn, SAMPLE - 1, axis=1)[:, :SAMPLE]
+    # A partition leaves the least in any order, which may differ between builds of numpy.
     order = np.argsort(np.take_along_axis(drawn, least, axis=1), axis=1)
     return np.take_along_axis(least, order, axis=1)
 
@@ -264,9 +265,11 @@ def _remove_inconsistent(
         norm = np.where(active, norms(obs, poses)[0], -1.0)
         beyond = int((norm > bound).sum())
         if beyond == 0:
+            # Only the last adjustment needs the full accuracy.
             poses, done = levenberg_marquardt(obs, poses, active[None], params.iterations)
             return poses, active, steps + done
         active = active.copy()
+        # Not all of them at once: the worst pull the pose, and others agree once these are gone.
         active[np.argsort(-norm, kind="stable")[: math.ceil(beyond / AT_ONCE)]] = False
 
 

@@ -88,6 +88,7 @@ def chain(segments: Sequence[Segment], levels: Sequence[RigidTransform]) -> Chai
                 world = T_world_local @ RigidTransform.from_matrix(pose)
                 lever, turn = propagation(key, T_world_local, world)
                 alone = pose_cov - pose_shared @ pose_shared.T
+                # Own errors add as variances; those of one cause go together in all segments, so their roots add first.
                 own = _symmetric(lever @ key_own @ lever.T + turn @ alone @ turn.T)
                 common = lever @ key_common + turn @ pose_shared
             poses.append(np.full((3, 4), np.nan) if broken else world.matrix34)
