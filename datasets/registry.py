@@ -44,7 +44,7 @@ MANIFEST_FORMS = (
 
 @cache
 def layouts() -> tuple[ModuleType, ...]:
-    """Modules beside this one that open folders of a certain layout, by name.
+    """Modules beside this one that open folders or files of a certain layout, by name.
 
     Each has ``FORMS``, what a user may give and in words what that is, and ``open_layout(path, number, digests)``,
     which gives None where the folder is none of its own; ``number`` chooses one of several (``FOLDER:NUMBER``).

@@ -33,11 +33,16 @@ def init(directory: Path, output: Path | None = None, force: bool = False) -> in
     """
     hindered = hindrance(directory.absolute())  # never a built-in sequence of the same name
     if output is None and not force and (directory.is_dir() or is_bag(directory)) and hindered is None:
-        print(f"{directory} opens as it is; --output or --force writes a manifest nevertheless")
+        manifest = "" if is_bag(directory) else "; --output or --force writes a manifest nevertheless"
+        print(f"{directory} opens as it is{manifest}")
         print(f"\nnext:\n  rille check {directory}\n  rille reconstruct {directory}")
         return COMPLETE
-    if is_bag(directory) and hindered is not None:
-        raise hindered
+    if is_bag(directory):
+        raise hindered or ConfigError(
+            "RIL-938",
+            f"no manifest is written for the bag {directory}: it opens as it is",
+            remedy="rille check opens it",
+        )
     name = f"{derived_name(directory.resolve().name)}.rille.toml"
     found = inspect(directory)
     path = output if output is not None else Path(name)
