@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pointing_angles import angles_from_rotation, rotation_from_angles
 from raising import raises
 from scipy.spatial.transform import Rotation
 
@@ -14,11 +15,9 @@ from rille.stages.geometry.geometry import (
     Camera,
     Rig,
     RigidTransform,
-    angles_from_rotation,
     level_rotation,
     orthonormal,
     rotation_exp,
-    rotation_from_angles,
 )
 
 CAMERA = Camera(600.0, 610.0, 285.0, 260.0, 570, 520)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from pointing_angles import angles_from_rotation, rotation_from_angles
 from raising import raises
 from scipy.optimize import least_squares
 from scipy.stats import chi2
@@ -10,9 +11,7 @@ from rille.stages.core.errors import DegenerateError
 from rille.stages.geometry.geometry import (
     Camera,
     RigidTransform,
-    angles_from_rotation,
     rotation_exp,
-    rotation_from_angles,
 )
 from rille.stages.odometry.resection.landmarks import Landmarks
 from rille.stages.odometry.resection.pnp import (

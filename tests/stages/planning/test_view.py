@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pointing_angles import rotation_from_angles
 
-from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_from_angles
+from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 from rille.stages.planning.local_planner.views import RIM, FieldOfView, looked
 
 LEFT = Camera(180.0, 175.0, 150.0, 125.0, 320, 240)
