@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from rille.stages.core.errors import InputError
 from rille.stages.geometry.geometry import Camera
 from rille.stages.hfvm.images.plane import translation, warp
+from rille.stages.hfvm.level.place import Place
 from rille.stages.imaging import pyramid
 from rille.stages.imaging.pyramid import Pyramid, PyramidParams
 
@@ -65,7 +66,9 @@ class Derotation:
         """Pyramid of frame b held like a, with a margin; masked where b does not reach."""
         image = np.empty((self.shape[0] + 2 * MARGIN, self.shape[1] + 2 * MARGIN), np.float32)
         valid = np.empty(image.shape, np.uint8)
-        warp(pyramid.filled(b)[0], b.valid[0], self.homography @ translation(-MARGIN), image, valid)
+        grey, usable = pyramid.filled(b)[0], b.valid[0]
+        place = Place(0, 0, 0, 0, *usable.shape)
+        warp(grey, usable, self.homography @ translation(-MARGIN), image, valid, place)
         return pyramid.build(image, PyramidParams(levels=b.levels), valid)
 
     def compose(self, u: NDArray[Any], v: NDArray[Any], level: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -371,7 +371,7 @@ def consistent(pair: Prepared, level: int, a: Map, b: Map, window: Window) -> ND
     for block in _landing(own.u, own.v, window, b.u):
         bu, bv, valid = cut(b.u, block), cut(b.v, block), pair.right.view.valid(level, block)
         at = window.x0 - block.x0, window.y0 - block.y0
-        consistency.agree(own.u, own.v, bu, bv, usable, valid, pair.params.backmatch, found, *at)
+        consistency.agree((own.u, own.v), (bu, bv), usable, valid, pair.params.backmatch, found, at)
     return np.asarray(found & (own.undefined == 0))
 
 

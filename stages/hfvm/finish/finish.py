@@ -22,6 +22,7 @@ from rille.stages.hfvm.images.params import HfvmParams
 from rille.stages.hfvm.images.views import View
 from rille.stages.hfvm.images.window import Raster, Results, Window, around, blocks, cut, strips, whole
 from rille.stages.hfvm.level import consistency, epipolar, rowwise, simd
+from rille.stages.hfvm.level.place import Place
 from rille.stages.hfvm.level.simd import SUM_RADIUS
 
 Rasters = Mapping[str, Raster]
@@ -92,9 +93,9 @@ class Finish:
             inside = (x >= 0) & (x < shape[1]) & (y >= 0) & (y < shape[0])
             pieces = blocks(back["u"], y, x, inside)
         for block in pieces:
-            args = cut(back["u"], block), cut(back["v"], block), self.pair.right.view.valid(0, block)
-            place = window.x0, window.y0, block.x0, block.y0, shape[0], shape[1]
-            consistency.backmatch(u, v, *args, error, *place)
+            right, valid = (cut(back["u"], block), cut(back["v"], block)), self.pair.right.view.valid(0, block)
+            place = Place(window.x0, window.y0, block.x0, block.y0, shape[0], shape[1])
+            consistency.backmatch((u, v), right, valid, error, place)
         return error
 
     def _ends(self, window: Window, u: AnyArray, v: AnyArray, ahead: float = 0.0) -> tuple[AnyArray, AnyArray]:
@@ -107,8 +108,8 @@ class Finish:
         """Bits that speak against each pixel, none where it is consistent."""
         p, bits = self.params, np.empty(window.shape, np.uint8)
         deviation, valid = self.pair.deviation(0, window), self.pair.left.view.valid(0, window)
-        limits = (np.float32(a) for a in (p.threshold, p.texture, p.backmatch))
-        consistency.reasons(distance, deviation, valid, error, *limits, bits)
+        limits = np.float32(p.threshold), np.float32(p.texture), np.float32(p.backmatch)
+        consistency.reasons(distance, deviation, valid, error, limits, bits)
         return bits
 
     def refine(self, window: Window, checked: Rasters) -> Results:
@@ -125,13 +126,13 @@ class Finish:
         # The relief's windows are not bounded: it is given the whole image.
         all_of_it = p.relief_steps or outer == whole(self.shape)
         target = whole(shape) if all_of_it else self._read(outer, u, v, keep)
-        place = outer.x0, outer.y0, target.x0, target.y0, shape[0], shape[1]
+        place = Place(outer.x0, outer.y0, target.x0, target.y0, shape[0], shape[1])
         left, valid = self.pair.left.view.grey(0, outer), self.right.valid(0, target)
         image = self.right.grey(0, target)
         if self.contrast != 1.0:
             image = image * np.float32(self.contrast)
         to_right = partial(self._to_right, window=outer)
-        u, v, rest, noise = refine.refine(left, image, valid, u, v, keep, p, place, to_right)
+        u, v, rest, noise = refine.refine(left, refine.Target(image, valid, place, to_right), u, v, keep, p)
         alike, variance = refine.surroundings(rest, self.pair.deviation(0, outer), keep)
         if p.refine:
             mark(bits, keep & (alike < p.correlation), Validity.OVER_THRESHOLD)
@@ -142,7 +143,7 @@ class Finish:
             there = variational_refinement.fit(left, image, valid, *there, bits == 0, p)
             u, v = there if self.alignment is None else plane.decompose(self.alignment, *there)
         keep, found = bits == 0, np.zeros(outer.shape, bool)
-        consistency.lands(*there, keep, valid, found, *place)
+        consistency.lands(*there, keep, valid, found, place)
         mark(bits, keep & ~found, Validity.OUT_OF_IMAGE)
         arrays = {"u": u, "v": v, "validity": bits, "noise": noise}
         return {name: np.ascontiguousarray(a[window.inside(outer)]) for name, a in arrays.items()}

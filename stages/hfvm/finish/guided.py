@@ -37,13 +37,14 @@ def median(u: AnyArray, v: AnyArray, keep: AnyArray, filled: AnyArray, grey: Any
     apart = np.exp(-np.arange(2 * RADIUS + 1) / RADIUS)
     table = np.rint(SCALE * apart[:, None] * steps[None, :]).astype(np.int64) + 1
     out_u, out_v = u.copy(), v.copy()
-    _median(u, v, keep.astype(np.uint8), filled.astype(np.uint8), grey, table, int(MEASURED), out_u, out_v)
+    _median((u, v), keep.astype(np.uint8), filled.astype(np.uint8), grey, table, (out_u, out_v))
     return out_u, out_v
 
 
 @njit(cache=True, nogil=True)
-def _median(u, v, keep, filled, grey, table, measured, out_u, out_v):  # type: ignore[no-untyped-def]
+def _median(given, keep, filled, grey, table, out):  # type: ignore[no-untyped-def]
     """The column displacement decides; the row displacement is that of the same neighbour."""
+    (u, v), (out_u, out_v), measured = given, out, np.int64(MEASURED)
     rows, cols = u.shape
     most = (2 * RADIUS + 1) ** 2
     value, other, weight = np.empty(most, np.float32), np.empty(most, np.float32), np.empty(most, np.int64)

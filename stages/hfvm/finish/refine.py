@@ -11,6 +11,7 @@ alike even between turned views; grey values are read from the right image itsel
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
@@ -18,12 +19,24 @@ from numba import njit
 from rille.stages.core.declare import AnyArray
 from rille.stages.hfvm.images.params import HfvmParams
 from rille.stages.hfvm.level import rowwise
-
-Place = tuple[int, int, int, int, int, int]
-"""First column and row of the left and of the right window, rows and columns of the whole right image."""
+from rille.stages.hfvm.level.place import Place
 
 Frame = Callable[[AnyArray, AnyArray], tuple[AnyArray, AnyArray]]
 """Displacements to the right image of those in the frame in which steps are taken, both (row, col) float32 pixels."""
+
+
+@dataclass(frozen=True)
+class Target:
+    """A window of the right image: grey values (row, col) float32, 1 = usable uint8, and where both windows lie.
+
+    ``to_right``: from the frame in which steps are taken to the right image; default: it is the right image's.
+    """
+
+    grey: AnyArray
+    valid: AnyArray
+    place: Place
+    to_right: Frame = lambda u, v: (u, v)
+
 
 CORRELATION_SIDE = 9
 """Pixels: fewer do not tell correlated noise from texture."""
@@ -40,26 +53,16 @@ SATURATED = 250.0
 
 
 def refine(
-    left: AnyArray,
-    right: AnyArray,
-    right_valid: AnyArray,
-    u: AnyArray,
-    v: AnyArray,
-    keep: AnyArray,
-    params: HfvmParams,
-    place: Place | None = None,
-    to_right: Frame = lambda u, v: (u, v),
+    left: AnyArray, target: Target, u: AnyArray, v: AnyArray, keep: AnyArray, params: HfvmParams
 ) -> tuple[AnyArray, AnyArray, AnyArray, AnyArray]:
     """Displacements without the perspective bias, in the frame in which they are given.
 
     Parameters
     ----------
-    left, right : (row, col) float32 grey values.
-    right_valid : (row, col) uint8, 1 = usable.
+    left : (row, col) float32 grey values.
+    target : the window of the right image. Pixels nearer than :func:`reach` to a cut are not sound.
     u, v : (row, col) float32, smoothed displacements, pixels.
     keep : (row, col) bool, pixels that have one.
-    place : where both windows lie; None: they are the images. Pixels nearer than :func:`reach` to a cut are not sound.
-    to_right : from that frame to the right image; default: it is the right image's.
 
     Returns
     -------
@@ -69,12 +72,13 @@ def refine(
     """
     step_u, step_v, first, per_noise = (np.empty(u.shape, np.float32) for _ in range(4))
     now_u, now_v, last = u, v, first
-    at = place or (0, 0, 0, 0, *right.shape)
     for step in range(params.refine_steps):
         last = first if step == 0 else np.empty(u.shape, np.float32)
-        args = (keep, params.refine_radius, params.refine_noise, step_u, step_v, last, per_noise)
-        there_u, there_v = to_right(now_u, now_v)
-        rowwise.lucas_kanade(left, right, right_valid, there_u, there_v, *args, *at)
+        there_u, there_v = target.to_right(now_u, now_v)
+        right = rowwise.Right(target.grey, target.valid, target.place)
+        window = rowwise.WindowOf(params.refine_radius, np.float32(params.refine_noise))
+        told = rowwise.Steps(step_u, step_v, last, per_noise)
+        rowwise.lucas_kanade(left, right, (there_u, there_v), keep, window, told)
         if not params.refine:
             break
         if there_u is not now_u:

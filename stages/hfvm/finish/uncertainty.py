@@ -20,7 +20,7 @@ nothing more once N, R and M are known; their fitted factors were zero.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -37,8 +37,7 @@ SURROUNDINGS = 9
 """Pixels: side of the window in which unmatched pixels count; about the reach of features and windows together."""
 
 
-@dataclass(frozen=True)
-class Factors:
+class Factors(NamedTuple):
     """Factors of the parts; ``floor`` and ``border`` in pixels, the others without unit."""
 
     floor: float
@@ -82,8 +81,8 @@ def standard_deviation(
     f = _factors(params)
     parts = neighbours(column, keep)
     found = np.empty(keep.shape, np.float32)
-    squares = (np.float32(a * a) for a in (f.floor, f.noise, f.relief, f.border))
-    _add(noise, parts[0], parts[1], keep, *squares, found)
+    squares = tuple(np.float32(a * a) for a in f)
+    _add(noise, parts, keep, squares, found)
     return found
 
 
@@ -149,10 +148,11 @@ def _shares(sums, radius, parts):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _add(noise, relief, border, keep, floor, by_noise, by_relief, by_border, found):  # type: ignore[no-untyped-def]
+def _add(noise, parts, keep, squares, found):  # type: ignore[no-untyped-def]
+    floor, by_noise, by_relief, by_border = squares
     nan = np.float32(np.nan)
     for y in range(keep.shape[0]):
-        n, r, m, own, out = noise[y], relief[y], border[y], keep[y], found[y]
+        n, r, m, own, out = noise[y], parts[0, y], parts[1, y], keep[y], found[y]
         for x in range(keep.shape[1]):
             std = np.sqrt(floor + by_noise * n[x] + by_relief * r[x] + by_border * m[x])
             out[x] = std if own[x] else nan

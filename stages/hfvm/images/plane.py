@@ -20,6 +20,7 @@ from rille.stages.hfvm.images.params import HfvmParams
 from rille.stages.hfvm.images.resample import sample_cubic
 from rille.stages.hfvm.images.window import Shape, Window, bounded, whole
 from rille.stages.hfvm.level.epipolar import residuals, typical, weighted_normal
+from rille.stages.hfvm.level.place import Place
 from rille.stages.imaging import pyramid
 from rille.stages.imaging.pyramid import Pyramid, PyramidParams
 
@@ -63,7 +64,9 @@ def align(right: Pyramid, h: Matrix, left_shape: tuple[int, ...], params: Pyrami
     m = margin(left_shape)
     image = np.empty((left_shape[0] + 2 * m, left_shape[1] + 2 * m), np.float32)
     valid = np.empty(image.shape, np.uint8)
-    warp(pyramid.filled(right)[0], right.valid[0], h @ translation(-m), image, valid)
+    grey, usable = pyramid.filled(right)[0], right.valid[0]
+    place = Place(0, 0, 0, 0, *usable.shape)
+    warp(grey, usable, h @ translation(-m), image, valid, place)
     return pyramid.build(image, params, valid)
 
 
@@ -209,14 +212,13 @@ def distortion(h: Matrix, shape: tuple[int, int]) -> float:
 
 
 @njit(cache=True, nogil=True)
-def warp(image, valid, h, out, out_valid, x0=0, y0=0, ix0=0, iy0=0, irows=-1, icols=-1):  # type: ignore[no-untyped-def]
+def warp(image, valid, h, out, out_valid, place):  # type: ignore[no-untyped-def]
     """``out(x, y) = image(H (x, y))``, Catmull-Rom; ``out_valid`` 0 where that is outside or masked.
 
-    ``x0, y0`` and ``ix0, iy0``: first column and row of the window of the result and of the image, which has ``irows``
-    and ``icols`` (negative: the window is all of it).
+    ``place``: where the windows of the result and of the image lie (:class:`~rille.stages.hfvm.level.place.Place`).
     """
+    x0, y0, ix0, iy0, height, width = place
     rows, cols = out.shape
-    height, width = image.shape if irows < 0 else (irows, icols)
     for row in range(rows):
         for col in range(cols):
             y, x = row + y0, col + x0

@@ -36,30 +36,34 @@ def median(u: AnyArray, size: int) -> AnyArray:
 
 
 @njit(cache=True, nogil=True)
-def agree(au, av, bu, bv, own_valid, b_valid, limit, found, ox, oy):  # type: ignore[no-untyped-def]
+def agree(own, other, own_valid, other_valid, limit, found, offset):  # type: ignore[no-untyped-def]
     """Mark in ``found`` pixels of ``own_valid`` whose integer displacement is undone by the other map within ``limit``.
 
-    ``ox, oy``: where the first pixel of ``a`` lies in the window of ``b``; only pixels that land in it are looked at.
+    ``own, other``: columns and rows of displacement of both maps. ``offset``: column and row at which the first pixel
+    of the own window lies in the other one; only pixels that land in it are looked at.
     """
+    (au, av), (bu, bv), (ox, oy) = own, other, offset
     rows, cols = au.shape
     brows, bcols = bu.shape
     most = np.float32(limit) * np.float32(limit)
     for y in range(rows):
         for x in range(cols):
             i, j = x + ox + np.int64(au[y, x]), y + oy + np.int64(av[y, x])
-            if own_valid[y, x] and i >= 0 and i < bcols and j >= 0 and j < brows and b_valid[j, i]:
+            if own_valid[y, x] and i >= 0 and i < bcols and j >= 0 and j < brows and other_valid[j, i]:
                 du, dv = np.int64(au[y, x]) + bu[j, i], np.int64(av[y, x]) + bv[j, i]
                 found[y, x] = du * du + dv * dv <= most
 
 
 @njit(cache=True, nogil=True)
-def backmatch(lu, lv, ru, rv, right_valid, error, x0, y0, rx0, ry0, rrows, rcols):  # type: ignore[no-untyped-def]
+def backmatch(left, right, right_valid, error, place):  # type: ignore[no-untyped-def]
     """Distance |l - l'| of each left pixel after matching to the right and back (4.3.3), pixels.
 
     ``error`` comes as FAILED and stays so outside the right image and on its masked pixels. The right map is read at
-    the nearest pixel. ``x0, y0`` and ``rx0, ry0``: first column and row of the left and the right window; ``rrows,
-    rcols``: size of the right image. Only pixels that land in the right window are looked at.
+    the nearest pixel. ``left, right``: columns and rows of displacement of both windows, which lie at ``place``
+    (:class:`~rille.stages.hfvm.level.place.Place`).
     """
+    (lu, lv), (ru, rv) = left, right
+    x0, y0, rx0, ry0, rrows, rcols = place
     rows, cols = lu.shape
     wrows, wcols = ru.shape
     half, nil = np.float32(0.5), np.float32(0.0)
@@ -80,8 +84,12 @@ def backmatch(lu, lv, ru, rv, right_valid, error, x0, y0, rx0, ry0, rrows, rcols
 
 
 @njit(cache=True, nogil=True)
-def reasons(distance, deviation, valid, error, threshold, texture, backmatch, bits):  # type: ignore[no-untyped-def]
-    """Bits of :class:`~rille.stages.core.validity.Validity` that speak against each pixel, 0 where it is consistent."""
+def reasons(distance, deviation, valid, error, limits, bits):  # type: ignore[no-untyped-def]
+    """Bits of :class:`~rille.stages.core.validity.Validity` that speak against each pixel, 0 where it is consistent.
+
+    ``limits``: largest distance, least deviation, largest back-matching error, float32.
+    """
+    threshold, texture, backmatch = limits
     nil = np.uint8(0)
     for y in range(bits.shape[0]):
         d, local, usable, e, found = distance[y], deviation[y], valid[y], error[y], bits[y]
@@ -93,11 +101,12 @@ def reasons(distance, deviation, valid, error, threshold, texture, backmatch, bi
 
 
 @njit(cache=True, nogil=True)
-def lands(u, v, keep, right_valid, found, x0, y0, rx0, ry0, rrows, rcols):  # type: ignore[no-untyped-def]
+def lands(u, v, keep, right_valid, found, place):  # type: ignore[no-untyped-def]
     """Mark in ``found`` (bool) pixels of ``keep`` whose displacement ends on a usable pixel of the right image.
 
-    Windows as in :func:`backmatch`; the right one must hold every end that lies in the image.
+    The right window must hold every end that lies in the image.
     """
+    x0, y0, rx0, ry0, rrows, rcols = place
     half, nil = np.float32(0.5), np.float32(0.0)
     for y in range(u.shape[0]):
         for x in range(u.shape[1]):

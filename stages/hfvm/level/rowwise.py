@@ -6,12 +6,40 @@ keep a loop from being vectorised.
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import numpy as np
 from numba import njit
 
+from rille.stages.hfvm.level.place import Place
 from rille.stages.numeric.line import copy_line
 
 PLANES = 10
+
+
+class Right(NamedTuple):
+    """A window of the right image: grey values float32, 1 = usable uint8, and where both windows lie."""
+
+    grey: Any
+    valid: Any
+    place: Place
+
+
+class WindowOf(NamedTuple):
+    """Least-squares window: its radius, pixels, and the noise assumed in it, squared grey levels a pixel."""
+
+    radius: int
+    noise: Any
+
+
+class Steps(NamedTuple):
+    """What a step writes, (row, col) float32: new displacements, pixels; residual variance *before* the step (inf:
+    none), squared grey levels; variance of the column displacement for a unit of variance of the grey levels."""
+
+    u: Any
+    v: Any
+    energy: Any
+    per_noise: Any
 
 
 @njit(cache=True, nogil=True)
@@ -131,16 +159,15 @@ def _catmull_rom(t):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _products(  # type: ignore[no-untyped-def]
-    left, right, right_valid, u, v, keep, y, radius, out, x0, y0, rx0, ry0, rrows, rcols
-):
+def _products(left, right, now, keep, y, radius, out):  # type: ignore[no-untyped-def]
     """Row ``y`` of the planes whose window sums a step needs, zero where a pixel takes no part.
 
     ``out`` (PLANES, radius + col + radius): count, gx, gy, r, gx gx, gx gy, gy gy, gx r, gy r, r r, with the gradient
-    of the left image. Windows as in :func:`rille.stages.hfvm.level.consistency.backmatch`. Reach: a pixel.
+    of the left image. Reach: a pixel.
     """
     rows, cols = left.shape
-    width = right.shape[1]
+    (u, v), (x0, y0, rx0, ry0, rrows, rcols) = now, right.place
+    width = right.grey.shape[1]
     if y < 0 or y >= rows:
         out[:] = np.float32(0.0)
         return
@@ -149,13 +176,13 @@ def _products(  # type: ignore[no-untyped-def]
     end = radius + cols
     n, gx, gy, rest = out[0, radius:end], out[1, radius:end], out[2, radius:end], out[3, radius:end]
     lu, lv, grey = u[y], v[y], left[y]
-    flat, taking = right.reshape(-1), keep[y]
+    flat, taking = right.grey.reshape(-1), keep[y]
     for x in range(cols):
         xr, yr = np.float32(x + x0) + lu[x], np.float32(y + y0) + lv[x]
         n[x] = rest[x] = nil
         if not (taking[x] and xr >= one and xr < last_x and yr >= one and yr < last_y):
             continue
-        if not right_valid[np.uint64(np.int64(yr + half) - ry0), np.uint64(np.int64(xr + half) - rx0)]:
+        if not right.valid[np.uint64(np.int64(yr + half) - ry0), np.uint64(np.int64(xr + half) - rx0)]:
             continue
         i, j = np.int64(xr), np.int64(yr)
         at = (j - ry0) * width + i - rx0
@@ -176,30 +203,28 @@ def _products(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def lucas_kanade(  # type: ignore[no-untyped-def]
-    left, right, right_valid, u, v, keep, radius, noise, new_u, new_v, energy, per_noise, x0, y0, rx0, ry0, rrows, rcols
-):
-    """One mean-free step for every kept pixel; ``energy``: residual variance *before* the step (inf: none).
+def lucas_kanade(left, right, now, keep, window, new):  # type: ignore[no-untyped-def]
+    """One mean-free step for every kept pixel, from ``now`` (columns and rows of displacement) to ``new``.
 
-    The gradient is the left image's (inverse compositional form). ``per_noise``: variance of the column displacement
-    for a unit of variance of the grey levels. float32 throughout: every window is summed afresh, so nothing adds up.
-    Windows as in :func:`rille.stages.hfvm.level.consistency.backmatch`. Reach: ``radius``, and of the left image a
-    pixel more.
+    The gradient is the left image's (inverse compositional form). float32 throughout: every window is summed afresh, so
+    nothing adds up. Reach: the window's radius, and of the left image a pixel more.
     """
     rows, cols = left.shape
+    radius = window.radius
     size = 2 * radius + 1
     fresh = np.zeros((PLANES, cols + 2 * radius), np.float32)
     ring = np.zeros((size, PLANES * cols), np.float32)
     s = np.empty((PLANES, cols), np.float32)
     total = s.reshape(-1)
     for y in range(-radius, rows):
-        _products(left, right, right_valid, u, v, keep, y + radius, radius, fresh, x0, y0, rx0, ry0, rrows, rcols)
+        _products(left, right, now, keep, y + radius, radius, fresh)
         _add_up(fresh, cols, ring[(y + radius) % size].reshape((PLANES, cols)))
         if y < 0:
             continue
         _add_rows(ring, y + radius + 1, total)
         least = np.float32(0.5 * size * size)
-        _solve(s, least, np.float32(noise), keep[y], u[y], v[y], new_u[y], new_v[y], energy[y], per_noise[y])
+        row = Steps(new.u[y], new.v[y], new.energy[y], new.per_noise[y])
+        _solve(s, least, window.noise, keep[y], (now[0][y], now[1][y]), row)
 
 
 @njit(cache=True, nogil=True)
@@ -220,8 +245,9 @@ def _add_rows(ring, first, total):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _solve(s, least, noise, keep, u, v, new_u, new_v, energy, per_noise):  # type: ignore[no-untyped-def]
+def _solve(s, least, noise, keep, now, new):  # type: ignore[no-untyped-def]
     """Steps of one row from the window sums."""
+    (u, v), (new_u, new_v, energy, per_noise) = now, new
     one, nil, far = np.float32(1.0), np.float32(0.0), np.float32(np.inf)
     count, sum_gx, sum_gy, sum_r = s[0], s[1], s[2], s[3]
     sum_gx_gx, sum_gx_gy, sum_gy_gy, sum_gx_r, sum_gy_r, sum_r_r = s[4], s[5], s[6], s[7], s[8], s[9]

@@ -14,6 +14,7 @@ from rille.stages.hfvm.images import plane
 from rille.stages.hfvm.images.params import HfvmParams
 from rille.stages.hfvm.images.window import whole
 from rille.stages.hfvm.level import consistency, epipolar, rowwise, subpixel_lut
+from rille.stages.hfvm.level.place import Place
 from rille.stages.imaging.pyramid import PyramidParams, build
 
 
@@ -25,7 +26,7 @@ class TestConsistency:
     def backmatch(self, lu, lv, ru, rv, valid=None):
         error = np.full(lu.shape, consistency.FAILED, np.float32)
         valid = np.ones(ru.shape, np.uint8) if valid is None else valid
-        consistency.backmatch(lu, lv, ru, rv, valid, error, 0, 0, 0, 0, *ru.shape)
+        consistency.backmatch((lu, lv), (ru, rv), valid, error, Place(0, 0, 0, 0, *ru.shape))
         return error
 
     def test_by_hand(self):
@@ -189,14 +190,19 @@ class TestPlane:
         assert plane.distortion(np.array([[1, -0.5, 3], [0, 1, 0], [0, 0, 1.0]]), (50, 60)) == pytest.approx(0.5)
 
 
+def whole_image(grey):
+    """All of a right image, usable everywhere."""
+    return refine.Target(grey, np.ones(grey.shape, np.uint8), Place(0, 0, 0, 0, *grey.shape))
+
+
 class TestRefine:
     def test_recovers_sub_pixel_displacements_to_the_noise_limit(self):
         noise, window = 1.0, 5
         left, right, u, v = pair(lambda x, y: (-6.0 + 0.05 * y, 1.3 + 0.02 * x), noise=noise)
         start_u, start_v = (u + 0.3).astype(np.float32), (v - 0.3).astype(np.float32)
-        keep, valid = np.ones(u.shape, bool), np.ones(right.shape, np.uint8)
+        keep = np.ones(u.shape, bool)
         found_u, found_v, rest, _ = refine.refine(
-            left, right, valid, start_u, start_v, keep, HfvmParams(refine_steps=2)
+            left, whole_image(right), start_u, start_v, keep, HfvmParams(refine_steps=2)
         )
         inner = np.s_[12:-12, 12:-12]
         gradient = np.sqrt(np.mean(np.gradient(right)[1] ** 2))
@@ -211,7 +217,7 @@ class TestRefine:
         left, right, *_ = pair(lambda x, y: (-6.0, 0.0))
         wrong = np.full(left.shape, 20.0, np.float32)
         found_u, _, _, _ = refine.refine(
-            left, right, np.ones(right.shape, np.uint8), wrong, wrong, np.zeros(left.shape, bool), HfvmParams()
+            left, whole_image(right), wrong, wrong, np.zeros(left.shape, bool), HfvmParams()
         )
         np.testing.assert_array_equal(found_u, wrong)
 

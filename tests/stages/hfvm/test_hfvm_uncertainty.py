@@ -8,16 +8,22 @@ from rille.stages.core.validity import matched
 from rille.stages.hfvm.finish import refine
 from rille.stages.hfvm.finish.uncertainty import REFINED, neighbours, standard_deviation
 from rille.stages.hfvm.images.params import HfvmParams
+from rille.stages.hfvm.level.place import Place
 from rille.stages.hfvm.stage import match
 
 PARAMS = HfvmParams()
 
 
+def whole_image(grey):
+    """All of a right image, usable everywhere."""
+    return refine.Target(grey, np.ones(grey.shape, np.uint8), Place(0, 0, 0, 0, *grey.shape))
+
+
 def test_noise_part_is_the_inverse_structure_tensor_of_the_window():
     image = np.random.default_rng(0).uniform(0, 255, (15, 17)).astype(np.float32)
-    keep, valid = np.ones(image.shape, bool), np.ones(image.shape, np.uint8)
+    keep = np.ones(image.shape, bool)
     nothing = np.zeros(image.shape, np.float32)
-    per_noise = refine.refine(image, image, valid, nothing, nothing, keep, PARAMS)[3]
+    per_noise = refine.refine(image, whole_image(image), nothing, nothing, keep, PARAMS)[3]
     y, x = 7, 8
     window = np.s_[y - 2 : y + 3, x - 2 : x + 3]
     gy, gx = np.gradient(image.astype(np.float64))
@@ -61,10 +67,10 @@ def test_no_kept_pixel_gives_no_number_and_no_warning():
 
 def test_edges_along_the_rows_leave_the_column_uncertain():
     x = np.indices((60, 60), dtype=np.float64)[1]
-    keep, valid, flat = np.ones(x.shape, bool), np.ones(x.shape, np.uint8), np.zeros(x.shape, np.float32)
+    keep, flat = np.ones(x.shape, bool), np.zeros(x.shape, np.float32)
     found = []
     for image in (across := (128 + 60 * np.sin(x)).astype(np.float32), across.T.copy()):
-        noise = 150.0 * refine.refine(image, image, valid, flat, flat, keep, PARAMS)[3]
+        noise = 150.0 * refine.refine(image, whole_image(image), flat, flat, keep, PARAMS)[3]
         found.append(standard_deviation(noise, flat, keep, PARAMS)[30, 30])
     up, along = found
     assert along > 3 * up
