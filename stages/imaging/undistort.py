@@ -114,13 +114,14 @@ def undistort(
     x, y = lens.maps(camera)
     out, out_valid = np.zeros(x.shape, np.float32), np.zeros(x.shape, np.uint8)
     # most images have no mask: then no pixel's neighbourhood need be looked up
-    _resample(raw, usable, bool(usable.all()), x, y, weights(params.interpolation), out, out_valid)
+    _resample(raw, usable, bool(usable.all()), (x, y), weights(params.interpolation), out, out_valid)
     return np.clip(out, 0.0, 255.0, out=out), out_valid
 
 
 @njit(cache=True, nogil=True)
-def _resample(image, usable, whole, column, row, table, out, out_valid):  # type: ignore[no-untyped-def]
-    """Separable weighted mean of the raw pixels about (column, row), where all of them are usable."""
+def _resample(image, usable, whole, maps, table, out, out_valid):  # type: ignore[no-untyped-def]
+    """Separable weighted mean of the raw pixels about (column, row) of the maps, where all of them are usable."""
+    column, row = maps
     taps = table.shape[1]
     before = taps // 2 - 1
     rows, cols = image.shape

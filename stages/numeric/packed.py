@@ -101,12 +101,13 @@ def codes(canvases: Sequence[Canvas], bits: Sequence[int]) -> NDArray[np.uint8]:
     one = canvases[0]
     out = np.empty((one.rows, one.cols), dtype=np.uint8)
     first = -(-one.border // WORD)
-    _codes(*(canvas.words for canvas in canvases), np.array(bits, dtype=np.uint8), one.border, first, out)
+    _codes(tuple(canvas.words for canvas in canvases), np.array(bits, dtype=np.uint8), one.border, first, out)
     return out
 
 
 @njit(cache=True, nogil=True)
-def _codes(p, q, s, t, bits, border, first, out):  # type: ignore[no-untyped-def]
+def _codes(words, bits, border, first, out):  # type: ignore[no-untyped-def]
+    p, q, s, t = words
     rows, cols = out.shape
     one, none, most = np.uint64(1), np.uint64(0), np.uint8(bits.sum())
     for r in range(rows):
