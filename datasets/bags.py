@@ -47,7 +47,7 @@ LONGEST_GAP = 0.5
 
 
 @dataclass(frozen=True)
-class Taken:
+class TakenImage:
     """One image message: when it was recorded, its digest, and width, height and bits of its image."""
 
     at: int
@@ -160,18 +160,18 @@ def _stamp(message: Any) -> int:
     return int(message.header.stamp.sec) * 10**9 + int(message.header.stamp.nanosec)
 
 
-def _images(reader: Any, path: Path, topic: str) -> dict[int, Taken]:
+def _images(reader: Any, path: Path, topic: str) -> dict[int, TakenImage]:
     """Images of a topic by their stamp, ns."""
-    found: dict[int, Taken] = {}
+    found: dict[int, TakenImage] = {}
     for at, data, message in _messages(reader, topic):
         stamp = _stamp(message)
         size = bag.depth(message, f"image {stamp} of {topic} in {path}")
-        found[stamp] = Taken(at, hashlib.sha256(data).hexdigest(), size, message.header.frame_id)
+        found[stamp] = TakenImage(at, hashlib.sha256(data).hexdigest(), size, message.header.frame_id)
     return found
 
 
 def _common(
-    path: Path, topics: tuple[str, str], left: Mapping[int, Taken], right: Mapping[int, Taken]
+    path: Path, topics: tuple[str, str], left: Mapping[int, TakenImage], right: Mapping[int, TakenImage]
 ) -> tuple[list[int], list[str]]:
     """Stamps that both cameras have, in order, and what is left out."""
     common = sorted(set(left) & set(right))

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from rille.stages.core.errors import InputError
 from rille.stages.geometry.geometry import Camera
 from rille.stages.hfvm.images.plane import translation, warp
-from rille.stages.hfvm.level.place import Place
+from rille.stages.hfvm.level.window_pair import WindowPair
 from rille.stages.imaging import pyramid
 from rille.stages.imaging.pyramid import Pyramid, PyramidParams
 
@@ -67,7 +67,7 @@ class Derotation:
         image = np.empty((self.shape[0] + 2 * MARGIN, self.shape[1] + 2 * MARGIN), np.float32)
         valid = np.empty(image.shape, np.uint8)
         grey, usable = pyramid.filled(b)[0], b.valid[0]
-        place = Place(0, 0, 0, 0, *usable.shape)
+        place = WindowPair(0, 0, 0, 0, *usable.shape)
         warp(grey, usable, self.homography @ translation(-MARGIN), image, valid, place)
         return pyramid.build(image, PyramidParams(levels=b.levels), valid)
 

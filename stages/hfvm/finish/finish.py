@@ -22,8 +22,8 @@ from rille.stages.hfvm.images.params import HfvmParams
 from rille.stages.hfvm.images.views import View
 from rille.stages.hfvm.images.window import Raster, Results, Window, around, blocks, cut, strips, whole
 from rille.stages.hfvm.level import consistency, epipolar, rowwise, simd
-from rille.stages.hfvm.level.place import Place
 from rille.stages.hfvm.level.simd import SUM_RADIUS
+from rille.stages.hfvm.level.window_pair import WindowPair
 
 Rasters = Mapping[str, Raster]
 
@@ -94,7 +94,7 @@ class Finish:
             pieces = blocks(back["u"], y, x, inside)
         for block in pieces:
             right, valid = (cut(back["u"], block), cut(back["v"], block)), self.pair.right.view.valid(0, block)
-            place = Place(window.x0, window.y0, block.x0, block.y0, shape[0], shape[1])
+            place = WindowPair(window.x0, window.y0, block.x0, block.y0, shape[0], shape[1])
             consistency.backmatch((u, v), right, valid, error, place)
         return error
 
@@ -126,13 +126,13 @@ class Finish:
         # The relief's windows are not bounded: it is given the whole image.
         all_of_it = p.relief_steps or outer == whole(self.shape)
         target = whole(shape) if all_of_it else self._read(outer, u, v, keep)
-        place = Place(outer.x0, outer.y0, target.x0, target.y0, shape[0], shape[1])
+        place = WindowPair(outer.x0, outer.y0, target.x0, target.y0, shape[0], shape[1])
         left, valid = self.pair.left.view.grey(0, outer), self.right.valid(0, target)
         image = self.right.grey(0, target)
         if self.contrast != 1.0:
             image = image * np.float32(self.contrast)
         to_right = partial(self._to_right, window=outer)
-        u, v, rest, noise = refine.refine(left, refine.Target(image, valid, place, to_right), u, v, keep, p)
+        u, v, rest, noise = refine.refine(left, refine.RightWindow(image, valid, place, to_right), u, v, keep, p)
         alike, variance = refine.surroundings(rest, self.pair.deviation(0, outer), keep)
         if p.refine:
             mark(bits, keep & (alike < p.correlation), Validity.OVER_THRESHOLD)

@@ -4,7 +4,7 @@ Feature vectors compare upright windows; where the two views foreshorten a surfa
 is biased. Warping the right image by the smoothed disparities first makes the windows alike, and what is left is a
 small displacement, solved per window. A pixel keeps the step only if it makes its window fit better.
 
-Steps use the left image's gradient, so they are taken in the frame of the aligned right image, where neighbours move
+StepArrays use the left image's gradient, so they are taken in the frame of the aligned right image, where neighbours move
 alike even between turned views; grey values are read from the right image itself, which is interpolated only once.
 """
 
@@ -19,14 +19,14 @@ from numba import njit
 from rille.stages.core.declare import AnyArray
 from rille.stages.hfvm.images.params import HfvmParams
 from rille.stages.hfvm.level import rowwise
-from rille.stages.hfvm.level.place import Place
+from rille.stages.hfvm.level.window_pair import WindowPair
 
 Frame = Callable[[AnyArray, AnyArray], tuple[AnyArray, AnyArray]]
 """Displacements to the right image of those in the frame in which steps are taken, both (row, col) float32 pixels."""
 
 
 @dataclass(frozen=True)
-class Target:
+class RightWindow:
     """A window of the right image: grey values (row, col) float32, 1 = usable uint8, and where both windows lie.
 
     ``to_right``: from the frame in which steps are taken to the right image; default: it is the right image's.
@@ -34,7 +34,7 @@ class Target:
 
     grey: AnyArray
     valid: AnyArray
-    place: Place
+    place: WindowPair
     to_right: Frame = lambda u, v: (u, v)
 
 
@@ -53,7 +53,7 @@ SATURATED = 250.0
 
 
 def refine(
-    left: AnyArray, target: Target, u: AnyArray, v: AnyArray, keep: AnyArray, params: HfvmParams
+    left: AnyArray, target: RightWindow, u: AnyArray, v: AnyArray, keep: AnyArray, params: HfvmParams
 ) -> tuple[AnyArray, AnyArray, AnyArray, AnyArray]:
     """Displacements without the perspective bias, in the frame in which they are given.
 
@@ -77,7 +77,7 @@ def refine(
         there_u, there_v = target.to_right(now_u, now_v)
         right = rowwise.Right(target.grey, target.valid, target.place)
         window = rowwise.WindowOf(params.refine_radius, np.float32(params.refine_noise))
-        told = rowwise.Steps(step_u, step_v, last, per_noise)
+        told = rowwise.StepArrays(step_u, step_v, last, per_noise)
         rowwise.lucas_kanade(left, right, (there_u, there_v), keep, window, told)
         if not params.refine:
             break
@@ -106,7 +106,7 @@ def _take_back(u, v, first, farthest, new_u, new_v, last):  # type: ignore[no-un
 def contrast(left: AnyArray, right: AnyArray, u: AnyArray, v: AnyArray, keep: AnyArray) -> float:
     """What makes the right image's contrast that of the left one: a factor where they differ grossly, else 1.
 
-    Steps and residuals are mean-free, not free of gain: an exposure ratio of two would pass for noise. The ratio is
+    StepArrays and residuals are mean-free, not free of gain: an exposure ratio of two would pass for noise. The ratio is
     that of the median differences over three columns, at matches that are not saturated (:data:`SAME_CONTRAST`).
     ``u, v``: whole pixels.
     """

@@ -20,7 +20,7 @@ from rille.stages.hfvm.images.params import HfvmParams
 from rille.stages.hfvm.images.resample import sample_cubic
 from rille.stages.hfvm.images.window import Shape, Window, bounded, whole
 from rille.stages.hfvm.level.epipolar import residuals, typical, weighted_normal
-from rille.stages.hfvm.level.place import Place
+from rille.stages.hfvm.level.window_pair import WindowPair
 from rille.stages.imaging import pyramid
 from rille.stages.imaging.pyramid import Pyramid, PyramidParams
 
@@ -65,7 +65,7 @@ def align(right: Pyramid, h: Matrix, left_shape: tuple[int, ...], params: Pyrami
     image = np.empty((left_shape[0] + 2 * m, left_shape[1] + 2 * m), np.float32)
     valid = np.empty(image.shape, np.uint8)
     grey, usable = pyramid.filled(right)[0], right.valid[0]
-    place = Place(0, 0, 0, 0, *usable.shape)
+    place = WindowPair(0, 0, 0, 0, *usable.shape)
     warp(grey, usable, h @ translation(-m), image, valid, place)
     return pyramid.build(image, params, valid)
 
@@ -215,7 +215,7 @@ def distortion(h: Matrix, shape: tuple[int, int]) -> float:
 def warp(image, valid, h, out, out_valid, place):  # type: ignore[no-untyped-def]
     """``out(x, y) = image(H (x, y))``, Catmull-Rom; ``out_valid`` 0 where that is outside or masked.
 
-    ``place``: where the windows of the result and of the image lie (:class:`~rille.stages.hfvm.level.place.Place`).
+    ``place``: where the windows of the result and of the image lie (:class:`~rille.stages.hfvm.level.window_pair.WindowPair`).
     """
     x0, y0, ix0, iy0, height, width = place
     rows, cols = out.shape

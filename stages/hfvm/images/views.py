@@ -13,7 +13,7 @@ from rille.stages.hfvm.images import plane
 from rille.stages.hfvm.images.params import HfvmParams
 from rille.stages.hfvm.images.window import Raster, Shape, Window, cut, tiles, whole
 from rille.stages.hfvm.level import features, paper
-from rille.stages.hfvm.level.place import Place
+from rille.stages.hfvm.level.window_pair import WindowPair
 from rille.stages.imaging import pyramid
 from rille.stages.imaging.pyramid import Pyramid
 
@@ -248,7 +248,7 @@ class Aligned:
         shape = self.right.shapes[0]
         source = plane.source(h, window, shape)
         grey, valid = self.right.filled(0, source), self.right.valid(0, source)
-        plane.warp(grey, valid, h, image, mask, Place(window.x0, window.y0, source.x0, source.y0, *shape))
+        plane.warp(grey, valid, h, image, mask, WindowPair(window.x0, window.y0, source.x0, source.y0, *shape))
         return pyramid.halved(image, mask, len(self.shapes))
 
 

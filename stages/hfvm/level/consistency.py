@@ -60,7 +60,7 @@ def backmatch(left, right, right_valid, error, place):  # type: ignore[no-untype
 
     ``error`` comes as FAILED and stays so outside the right image and on its masked pixels. The right map is read at
     the nearest pixel. ``left, right``: columns and rows of displacement of both windows, which lie at ``place``
-    (:class:`~rille.stages.hfvm.level.place.Place`).
+    (:class:`~rille.stages.hfvm.level.window_pair.WindowPair`).
     """
     (lu, lv), (ru, rv) = left, right
     x0, y0, rx0, ry0, rrows, rcols = place

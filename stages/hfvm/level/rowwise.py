@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import njit
 
-from rille.stages.hfvm.level.place import Place
+from rille.stages.hfvm.level.window_pair import WindowPair
 from rille.stages.numeric.line import copy_line
 
 PLANES = 10
@@ -22,7 +22,7 @@ class Right(NamedTuple):
 
     grey: Any
     valid: Any
-    place: Place
+    place: WindowPair
 
 
 class WindowOf(NamedTuple):
@@ -32,7 +32,7 @@ class WindowOf(NamedTuple):
     noise: Any
 
 
-class Steps(NamedTuple):
+class StepArrays(NamedTuple):
     """What a step writes, (row, col) float32: new displacements, pixels; residual variance *before* the step (inf:
     none), squared grey levels; variance of the column displacement for a unit of variance of the grey levels."""
 
@@ -223,7 +223,7 @@ def lucas_kanade(left, right, now, keep, window, new):  # type: ignore[no-untype
             continue
         _add_rows(ring, y + radius + 1, total)
         least = np.float32(0.5 * size * size)
-        row = Steps(new.u[y], new.v[y], new.energy[y], new.per_noise[y])
+        row = StepArrays(new.u[y], new.v[y], new.energy[y], new.per_noise[y])
         _solve(s, least, window.noise, keep[y], (now[0][y], now[1][y]), row)
 
 
@@ -246,7 +246,7 @@ def _add_rows(ring, first, total):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _solve(s, least, noise, keep, now, new):  # type: ignore[no-untyped-def]
-    """Steps of one row from the window sums."""
+    """StepArrays of one row from the window sums."""
     (u, v), (new_u, new_v, energy, per_noise) = now, new
     one, nil, far = np.float32(1.0), np.float32(0.0), np.float32(np.inf)
     count, sum_gx, sum_gy, sum_r = s[0], s[1], s[2], s[3]

@@ -14,7 +14,7 @@ from rille.stages.hfvm.images import plane
 from rille.stages.hfvm.images.params import HfvmParams
 from rille.stages.hfvm.images.window import whole
 from rille.stages.hfvm.level import consistency, epipolar, rowwise, subpixel_lut
-from rille.stages.hfvm.level.place import Place
+from rille.stages.hfvm.level.window_pair import WindowPair
 from rille.stages.imaging.pyramid import PyramidParams, build
 
 
@@ -26,7 +26,7 @@ class TestConsistency:
     def backmatch(self, lu, lv, ru, rv, valid=None):
         error = np.full(lu.shape, consistency.FAILED, np.float32)
         valid = np.ones(ru.shape, np.uint8) if valid is None else valid
-        consistency.backmatch((lu, lv), (ru, rv), valid, error, Place(0, 0, 0, 0, *ru.shape))
+        consistency.backmatch((lu, lv), (ru, rv), valid, error, WindowPair(0, 0, 0, 0, *ru.shape))
         return error
 
     def test_by_hand(self):
@@ -192,7 +192,7 @@ class TestPlane:
 
 def whole_image(grey):
     """All of a right image, usable everywhere."""
-    return refine.Target(grey, np.ones(grey.shape, np.uint8), Place(0, 0, 0, 0, *grey.shape))
+    return refine.RightWindow(grey, np.ones(grey.shape, np.uint8), WindowPair(0, 0, 0, 0, *grey.shape))
 
 
 class TestRefine:

@@ -8,7 +8,7 @@ from rille.stages.core.validity import matched
 from rille.stages.hfvm.finish import refine
 from rille.stages.hfvm.finish.uncertainty import REFINED, neighbours, standard_deviation
 from rille.stages.hfvm.images.params import HfvmParams
-from rille.stages.hfvm.level.place import Place
+from rille.stages.hfvm.level.window_pair import WindowPair
 from rille.stages.hfvm.stage import match
 
 PARAMS = HfvmParams()
@@ -16,7 +16,7 @@ PARAMS = HfvmParams()
 
 def whole_image(grey):
     """All of a right image, usable everywhere."""
-    return refine.Target(grey, np.ones(grey.shape, np.uint8), Place(0, 0, 0, 0, *grey.shape))
+    return refine.RightWindow(grey, np.ones(grey.shape, np.uint8), WindowPair(0, 0, 0, 0, *grey.shape))
 
 
 def test_noise_part_is_the_inverse_structure_tensor_of_the_window():
