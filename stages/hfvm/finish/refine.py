@@ -4,7 +4,7 @@ Feature vectors compare upright windows; where the two views foreshorten a surfa
 is biased. Warping the right image by the smoothed disparities first makes the windows alike, and what is left is a
 small displacement, solved per window. A pixel keeps the step only if it makes its window fit better.
 
-StepArrays use the left image's gradient, so they are taken in the frame of the aligned right image, where neighbours move
+Steps use the left image's gradient, so they are taken in the frame of the aligned right image, where neighbours move
 alike even between turned views; grey values are read from the right image itself, which is interpolated only once.
 """
 
@@ -106,7 +106,7 @@ def _take_back(u, v, first, farthest, new_u, new_v, last):  # type: ignore[no-un
 def contrast(left: AnyArray, right: AnyArray, u: AnyArray, v: AnyArray, keep: AnyArray) -> float:
     """What makes the right image's contrast that of the left one: a factor where they differ grossly, else 1.
 
-    StepArrays and residuals are mean-free, not free of gain: an exposure ratio of two would pass for noise. The ratio is
+    Steps and residuals are mean-free, not free of gain: an exposure ratio of two would pass for noise. The ratio is
     that of the median differences over three columns, at matches that are not saturated (:data:`SAME_CONTRAST`).
     ``u, v``: whole pixels.
     """

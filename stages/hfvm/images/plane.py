@@ -215,7 +215,7 @@ def distortion(h: Matrix, shape: tuple[int, int]) -> float:
 def warp(image, valid, h, out, out_valid, place):  # type: ignore[no-untyped-def]
     """``out(x, y) = image(H (x, y))``, Catmull-Rom; ``out_valid`` 0 where that is outside or masked.
 
-    ``place``: where the windows of the result and of the image lie (:class:`~rille.stages.hfvm.level.window_pair.WindowPair`).
+    ``place`` (:class:`~rille.stages.hfvm.level.window_pair.WindowPair`): where the windows of result and image lie.
     """
     x0, y0, ix0, iy0, height, width = place
     rows, cols = out.shape
