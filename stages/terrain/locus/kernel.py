@@ -45,9 +45,9 @@ from rille.stages.terrain.locus.points import (
     POINT_PLANES,
     POINTS,
     STEPS,
+    LineSteps,
     Observed,
     S,
-    Steps,
     climb,
     meet,
     pixels,
@@ -165,7 +165,9 @@ def _look(active, count, lanes, shape, room):  # type: ignore[no-untyped-def]
         m = active[t]
         # A lane that has not begun looks downwards: its first point is the start, which tells the way.
         way = 1.0 if lanes[WAY + m] > 0.0 else -1.0
-        climb(lanes, m, Steps(lanes[BOTTOM + m], lanes[PLACE + m] + way, way, lanes[DZ + m]), shape, room[STEPS * t :])
+        climb(
+            lanes, m, LineSteps(lanes[BOTTOM + m], lanes[PLACE + m] + way, way, lanes[DZ + m]), shape, room[STEPS * t :]
+        )
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

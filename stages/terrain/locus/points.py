@@ -19,7 +19,7 @@ NEAR = 1e-9  # least projective depth (metres): excludes the camera's own plane
 LANES = 32
 """Cells that are solved together."""
 STEPS = 8
-"""Steps of one cell's search that are looked at together."""
+"""LineSteps of one cell's search that are looked at together."""
 POINTS = LANES * STEPS
 
 X, Y, X_RIGHT, Y_RIGHT, FX, FY, PIXEL, U, V, S, ACROSS, POWER = (k * POINTS for k in range(12))
@@ -47,7 +47,7 @@ class Line(NamedTuple):
     b2: float
 
 
-class Steps(NamedTuple):
+class LineSteps(NamedTuple):
     """Points of a line that are looked at together: Z = bottom + (first + way m) dz, m < :data:`STEPS`."""
 
     bottom: float

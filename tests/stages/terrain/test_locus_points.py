@@ -28,8 +28,8 @@ from rille.stages.terrain.locus.points import (
     POINT_PLANES,
     POINTS,
     STEPS,
+    LineSteps,
     Observed,
-    Steps,
     Z,
     climb,
     meet,
@@ -83,7 +83,7 @@ def test_points_of_lanes_and_of_steps_equal_single_points() -> None:
     step, dz, found = 3.0, 0.02, 0
     for way in (-1.0, 1.0):
         for k in range(len(feet)):
-            climb(lanes, k, Steps(-0.2, step, way, dz), (HEIGHT, WIDTH), room[STEPS * k :])
+            climb(lanes, k, LineSteps(-0.2, step, way, dz), (HEIGHT, WIDTH), room[STEPS * k :])
         meet(STEPS * len(feet), EPIPOLE, seen, room)
         steps = room.copy()
         for m in range(STEPS):
