@@ -156,7 +156,7 @@ def match(
     )
 
 
-Form = Literal["laz", "glb", "colmap", "nav2", "grid_map"]
+Form = Literal["laz", "ply", "glb", "colmap", "nav2", "grid_map"]
 """What ``rille export`` writes."""
 
 
@@ -169,17 +169,17 @@ def export(
     cache: CacheFolder = None,
     debug: Debug = False,
 ) -> int:
-    """Write a run for other programs: cloud.laz (a point a cell), terrain.glb (textured mesh), models, maps.
+    """Write a run for other programs: cloud.laz or cloud.ply (points), terrain.glb (mesh), models, maps.
 
     Parameters
     ----------
     to
-        laz: CloudCompare, PDAL, QGIS; glb: any glTF viewer, Blender; colmap: cameras, rig, poses and tracked points;
-        nav2: map, keepout and speed mask, and path of ROS 2's navigation; grid_map: a bag with one GridMap. May be
-        repeated.
+        laz: CloudCompare, PDAL, QGIS; ply: CloudCompare, MeshLab; glb: any glTF viewer, Blender; colmap: cameras, rig,
+        poses and tracked points; nav2: map, keepout and speed mask, and path of ROS 2's navigation; grid_map: a bag
+        with one GridMap. May be repeated.
     output
-        What to write, for one form only; by default cloud.laz, terrain.glb or a folder of the form's name in the run's
-        folder.
+        What to write, for one form only; by default cloud.laz, cloud.ply, terrain.glb or a folder of the form's name in
+        the run's folder.
     """
     from rille.stages.core.errors import ConfigError
 

@@ -250,7 +250,7 @@ def test_match(place: Place, tmp_path: Path) -> None:
     assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == files
 
 
-@pytest.mark.parametrize(("kind", "made"), [("laz", "cloud.laz"), ("glb", "terrain.glb")])
+@pytest.mark.parametrize(("kind", "made"), [("laz", "cloud.laz"), ("ply", "cloud.ply"), ("glb", "terrain.glb")])
 def test_export(place: Place, kind: str, made: str, tmp_path: Path) -> None:
     words = ["export", "other", "--to", kind, "--output", tmp_path / made]
     first, files = place.rille(*words), contents(tmp_path)

@@ -1,4 +1,4 @@
-"""The terrain of a run as a point cloud (LAZ 1.4) and as a textured mesh (glTF 2.0 binary)."""
+"""The terrain of a run as a point cloud (LAZ 1.4, PLY) and as a textured mesh (glTF 2.0 binary)."""
 
 from __future__ import annotations
 
@@ -20,6 +20,8 @@ MADE = date(2000, 1, 1)
 """Date that every LAZ file states, so that equal clouds make equal files."""
 STEPS = 1000
 """Steps of a LAZ coordinate in one cell."""
+PLY_TYPES = {"float64": "double", "float32": "float", "uint8": "uchar"}
+"""PLY's names of types."""
 MAX_FACES = 2_000_000
 """Most triangles of a mesh: more make browsers and phones fail; a coarser one is made beyond, and said to be."""
 MAX_TEXTURE = 4096
@@ -33,7 +35,7 @@ def export(run: Path, kind: str, output: Path | None) -> tuple[Path, str]:
     ----------
     run : folder of a run.
     kind : name in :data:`FORMATS`.
-    output : file to write; by default ``cloud.laz`` or ``terrain.glb`` in the run's folder.
+    output : file to write; by default the form's own name in the run's folder.
 
     Raises
     ------
@@ -101,6 +103,33 @@ def write_laz(
         cloud.sigma = sigma[row, col].astype(np.float32)
     with atomic.replacing(path) as temporary:
         cloud.write(str(temporary), do_compress=True)
+    return f"{row.size} points"
+
+
+def write_ply(
+    path: Path, terrain: DemFile, ortho: NDArray[np.float64] | None, sigma: NDArray[np.float64] | None
+) -> str:
+    """Write a point for each known cell as binary PLY: x, y, z, colour of the ortho image, ``sigma`` of z (m).
+
+    Coordinates are 64-bit floats: eastings of 32 bits would jump by decimetres. A comment states the CRS as WKT.
+    """
+    row, col = np.nonzero(np.isfinite(terrain.values))
+    x, y = terrain.transform @ (col + 0.5, row + 0.5)
+    columns = {"x": x, "y": y, "z": terrain.values[row, col]}
+    if ortho is not None:
+        look = np.rint(np.clip(np.nan_to_num(ortho[row, col]), 0, 255)).astype(np.uint8)
+        columns["red"], columns["green"], columns["blue"] = look.T if look.ndim == 2 else (look, look, look)
+    if sigma is not None:
+        columns["sigma"] = sigma[row, col].astype(np.float32)
+    points = np.empty(row.size, [(name, values.dtype.newbyteorder("<")) for name, values in columns.items()])
+    for name, values in columns.items():
+        points[name] = values
+    crs = [f"comment crs {' '.join(terrain.crs.split())}"] if terrain.crs else []
+    properties = [f"property {PLY_TYPES[values.dtype.name]} {name}" for name, values in columns.items()]
+    lines = ["ply", "format binary_little_endian 1.0", *crs, "comment metres; sigma: standard deviation of z"]
+    lines += [f"element vertex {row.size}", *properties, "end_header"]
+    with atomic.replacing(path) as temporary:
+        temporary.write_bytes("".join(f"{line}\n" for line in lines).encode() + points.tobytes())
     return f"{row.size} points"
 
 
@@ -172,5 +201,9 @@ def _texture(ortho: NDArray[np.float64] | None) -> Any:
 
 
 Writer = Callable[[Path, DemFile, "NDArray[np.float64] | None", "NDArray[np.float64] | None"], str]
-FORMATS: dict[str, tuple[str, Writer]] = {"laz": ("cloud.laz", write_laz), "glb": ("terrain.glb", write_glb)}
+FORMATS: dict[str, tuple[str, Writer]] = {
+    "laz": ("cloud.laz", write_laz),
+    "ply": ("cloud.ply", write_ply),
+    "glb": ("terrain.glb", write_glb),
+}
 """Default file name and writer of each form."""

@@ -14,7 +14,9 @@ import trimesh
 from raising import raises
 from terrain_runs import LATTICE, PLACE, elevation, finished
 
+from rille.datasets.georeference import Georeference
 from rille.pipeline.export.programs import point_cloud
+from rille.pipeline.export.read_dem import read_elevation
 
 KNOWN = np.isfinite(elevation())
 
@@ -41,6 +43,32 @@ def test_a_georeferenced_run_gives_points_on_earth(tmp_path: Path) -> None:
     # float32 heights near 1800 m have steps of 0.12 mm
     np.testing.assert_allclose(las.xyz, expected, atol=1.3e-4)
     assert las.header.parse_crs().to_epsg() == 32633
+
+
+@pytest.mark.parametrize("place", [None, PLACE])
+def test_trimesh_reads_the_points_with_colour_and_sigma(tmp_path: Path, place: Georeference | None) -> None:
+    path, words = point_cloud.export(finished(tmp_path, place), "ply", None)
+    assert words == f"{KNOWN.sum()} points"
+    cloud = trimesh.load(path)
+    expected = np.column_stack([LATTICE.xy()[KNOWN], elevation()[KNOWN]])
+    # float32 heights near 1800 m have steps of 0.12 mm
+    np.testing.assert_allclose(cloud.vertices, expected if place is None else place.apply(expected), atol=1.3e-4)
+    for band in range(3):
+        np.testing.assert_array_equal(cloud.colors[:, band], np.nonzero(KNOWN)[1] * 3)
+    found = cloud.metadata["_ply_raw"]["vertex"]["data"]
+    np.testing.assert_array_equal(np.asarray(found["sigma"]).ravel(), np.float32(0.004))
+    header = path.read_bytes().split(b"end_header")[0].decode()
+    crs = pyproj.CRS.from_wkt(header.split("comment crs ")[1].splitlines()[0])
+    assert crs.is_engineering if place is None else crs.to_epsg() == 32633
+
+
+def test_a_ply_of_colours_has_the_image_bands_in_order(tmp_path: Path) -> None:
+    terrain = read_elevation(finished(tmp_path))
+    look = np.stack([np.full(KNOWN.shape, v) for v in (10.0, 20.4, 300.0)], axis=-1)
+    point_cloud.write_ply(tmp_path / "a.ply", terrain, look, None)
+    np.testing.assert_array_equal(np.unique(trimesh.load(tmp_path / "a.ply").colors[:, :3], axis=0), [[10, 20, 255]])
+    point_cloud.write_ply(tmp_path / "b.ply", terrain, None, None)
+    assert (tmp_path / "b.ply").read_bytes().count(b"property") == 3
 
 
 def test_equal_runs_make_equal_files(tmp_path: Path) -> None:
