@@ -246,7 +246,7 @@ def _add_rows(ring, first, total):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _solve(s, least, noise, keep, now, new):  # type: ignore[no-untyped-def]
-    """StepArrays of one row from the window sums."""
+    """Steps of one row from the window sums."""
     (u, v), (new_u, new_v, energy, per_noise) = now, new
     one, nil, far = np.float32(1.0), np.float32(0.0), np.float32(np.inf)
     count, sum_gx, sum_gy, sum_r = s[0], s[1], s[2], s[3]
