@@ -7,6 +7,7 @@ written as a comment that says what to fill in. Opening the manifest before that
 from __future__ import annotations
 
 import glob
+import os
 import re
 from collections import defaultdict
 from collections.abc import Iterable
@@ -18,7 +19,7 @@ import numpy as np
 from rille.datasets.cameras import CalibratedCamera, read_cameras
 from rille.datasets.images.pairing import SIDES, SUFFIXES, common_size, natural, pair_up, side_of
 from rille.datasets.poses import read_positions
-from rille.datasets.text.reading import Search, is_file, read_lines
+from rille.datasets.text.reading import Search, read_lines
 from rille.stages.core.errors import InputError, RilleError
 
 DEPTH = 4
@@ -107,7 +108,7 @@ def inspect(folder: Path) -> Findings:
 def _files(folder: Path, search: Search, depth: int = 0) -> Iterable[Path]:
     """Files below a folder in natural order, hidden ones left out."""
     entries = sorted((e for e in search.entries(folder) if not e.name.startswith(".")), key=lambda e: natural(e.name))
-    yield from (Path(e.path) for e in entries if is_file(e))
+    yield from (Path(e.path) for e in entries if os.path.isfile(e))
     if depth < DEPTH:
         for inner in (e for e in entries if e.is_dir(follow_symlinks=False)):
             yield from _files(Path(inner.path), search, depth + 1)

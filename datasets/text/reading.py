@@ -148,13 +148,6 @@ def _no_long_line(lines: list[str], path: Path, what: str) -> None:
             )
 
 
-def is_file(path: os.DirEntry[str] | Path) -> bool:
-    """Whether it is a regular file, or a link to one, that may be looked at."""
-    with suppress(OSError):
-        return path.is_file()
-    return False
-
-
 class Search:
     """Looks into folders, at no more than ``MOST_ENTRIES`` files and folders in all."""
 
@@ -206,11 +199,12 @@ class Search:
             if part == "**":
                 places = [place for top in places for place in self.folders(top)]
             elif WILD.search(part):
-                places = [path for place in places for path in self._named(place, part) if path.is_dir()]
+                places = [path for place in places for path in self._named(place, part) if os.path.isdir(path)]
             else:
-                places = [place / part for place in places if (place / part).is_dir()]
+                # os.path, here and below: pathlib raises where a name is longer than the system allows.
+                places = [place / part for place in places if os.path.isdir(place / part)]
             places = list(dict.fromkeys(places))
-        return [path for place in places for path in self._named(place, last) if is_file(path)]
+        return [path for place in places for path in self._named(place, last) if os.path.isfile(path)]
 
     def _named(self, folder: Path, pattern: str) -> list[Path]:
         return [Path(e.path) for e in self.entries(folder) if fnmatch.fnmatchcase(e.name, pattern)]

@@ -23,6 +23,7 @@ import numpy as np
 from pydantic import BaseModel
 
 from rille.datasets.georeference import Georeference
+from rille.pipeline.engine.runtime import atomic
 from rille.stages.core.declare import Array, Bundle, Memory, NoParams, Stage
 from rille.stages.geometry.geometry import Rig, RigidTransform
 from rille.stages.hazard.vehicle import Vehicle
@@ -229,6 +230,4 @@ def unpack(bundle: Bundle) -> dict[str, bytes]:
 def place(bundle: Bundle, folder: Path) -> None:
     """Write copies of an artifact's files into the folder of a run."""
     for name, content in unpack(bundle).items():
-        path = folder / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(content)
+        atomic.write(folder / name, content)

@@ -27,7 +27,8 @@ def replacing(path: Path) -> Iterator[Path]:
     # beside it (GDAL does) are removed with the folder.
     apart.mkdir()
     try:
-        yield apart / path.name
+        with _naming(path):
+            yield apart / path.name
         if path.is_dir() and not path.is_symlink():
             # os.replace cannot replace a folder that is not empty.
             shutil.rmtree(path)
@@ -41,7 +42,8 @@ def write(path: Path, data: bytes | str) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = _beside(path)
     try:
-        temporary.write_bytes(data.encode() if isinstance(data, str) else data)
+        with _naming(path):
+            temporary.write_bytes(data.encode() if isinstance(data, str) else data)
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
@@ -89,6 +91,16 @@ def remove(path: Path, modified: float) -> None:
         pass  # made anew meanwhile
     finally:
         aside.unlink()
+
+
+@contextmanager
+def _naming(path: Path) -> Iterator[None]:
+    """Give an error the name of the file that was to be written: that of a write to a full disk has none."""
+    try:
+        yield
+    except OSError as error:
+        error.filename = error.filename or str(path)
+        raise
 
 
 def _folder(folder: Path, temporary: Path) -> list[Path]:

@@ -31,6 +31,19 @@ def test_a_file_is_replaced_or_left(tmp_path, monkeypatch):
     assert (path.read_bytes(), names(path.parent)) == (b"two", ["a.json"])
 
 
+def test_a_full_disk_is_told_with_the_name_of_the_file(tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")  # as a write gives it: without a name
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(OSError, match="No space") as by_write:
+        atomic.write(tmp_path / "a", "one")
+    with pytest.raises(OSError, match="No space") as by_block, atomic.replacing(tmp_path / "b") as path:
+        path.write_bytes(b"two")
+    assert (by_write.value.filename, by_block.value.filename) == (str(tmp_path / "a"), str(tmp_path / "b"))
+    assert names(tmp_path) == []
+
+
 def test_of_two_that_create_a_file_one_does(tmp_path):
     path = tmp_path / "a" / "b"
     assert atomic.create(path, [b"on", b"e"])
