@@ -151,7 +151,9 @@ def read_positions(path: Path, format: str, columns: Mapping[str, str | int]) ->
     if format not in ("auto", "csv"):
         return None
     table = read_table(path, "file of true positions" if columns else "pose file")
-    meant = _meanings(table) | {meaning: _column(table, column) for meaning, column in columns.items()}
+    told = {meaning: _column(table, column) for meaning, column in columns.items()}
+    # A column that is told to be one axis is not another one by its name: { x = "x", y = "z" } leaves no height.
+    meant = {meaning: k for meaning, k in _meanings(table).items() if k not in told.values()} | told
     known = {meaning for meaning in ("x", "y") if meaning in meant}
     if not columns and (_complete(meant) or (len(known) < 2 and table.columns >= len(ORDERED["tum"]))):
         return None

@@ -51,8 +51,8 @@ WIDE = 0.5
 MOST = 20000
 """Offsets that are tried at most before the best is refined."""
 
-MIRRORED = 0.5
-"""Of the error as given: where a mirrored plane leaves less than this, the axes are taken to be in another order."""
+ANOTHER = 0.5
+"""Of the error as given: where other axes leave less than this, they are taken to be the right ones."""
 
 
 @dataclass(frozen=True)
@@ -221,10 +221,11 @@ def position_accuracy(
             )
     fit = fit_in_plane(estimate, there)
     both = np.asarray(np.isfinite(estimate).all(axis=1) & np.isfinite(there).all(axis=1))
-    if both.sum() >= LEAST and fit_in_plane(estimate, there * _flip(there)).error < MIRRORED * fit.error:
-        warnings.append(
-            "true positions fit far better mirrored: x and y may be swapped; seen from above y lies left of x"
-        )
+    if both.sum() >= LEAST:
+        others = {words: fit_in_plane(estimate, axes).error for words, axes in _other_axes(there).items()}
+        best = min(others, key=others.__getitem__)
+        if others[best] < ANOTHER * fit.error:
+            warnings.append(f"true positions fit far better {best}")
     how = f"positions only, after a rigid fit in the plane, {clock}"
     metrics = _figures(estimate, fit.moved, both, how)
     if offset is not None:
@@ -232,8 +233,15 @@ def position_accuracy(
     return fit.moved, metrics, warnings
 
 
-def _flip(truth: Floats) -> Floats:
-    return np.array([1.0, -1.0, 1.0])[: truth.shape[1]]
+def _other_axes(truth: Floats) -> dict[str, Floats]:
+    """Truth (frame, 2 or 3) as it would be if its axes meant something else, by the words that say so."""
+    mirrored = truth * np.array([1.0, -1.0, 1.0])[: truth.shape[1]]
+    found = {"mirrored: x and y may be swapped; seen from above y lies left of x": mirrored}
+    if truth.shape[1] == 3:
+        # Cameras have x to the right, y down and z ahead; their positions are often given in the first one's frame.
+        upright = truth[:, [0, 2, 1]] * np.array([1.0, 1.0, -1.0])
+        found['as those of a camera, y down: give [truth] columns = { x = "x", y = "z" }, of the ground'] = upright
+    return found
 
 
 def _figures(estimate: Floats, truth: Floats, both: NDArray[np.bool_], how: str) -> dict[str, Metric]:

@@ -208,6 +208,7 @@ def test_time_offset_moves_the_poses(tmp_path):
         ('columns = { time = "GPS week s", x = "to E", y = "to N" }', "sats,GPS week s,to N,to E", (0.0, 0.5, 1.0)),
         ("columns = { time = 3, y = 1, x = 2 }", "", (0.0, 0.5, 1.0)),
         ("", "x y z", None),
+        ('columns = { x = "x", y = "z" }', "x,y,z", None),
     ],
 )
 def test_truth_of_positions_alone(tmp_path, columns, header, times):
@@ -218,6 +219,7 @@ def test_truth_of_positions_alone(tmp_path, columns, header, times):
         "sats,GPS week s,to N,to E": ["9,0,7,5", "8,0.5,8,6", "9,1,9,7"],
         "": ["7 5 0", "8 6 0.5", "9 7 1"],
         "x y z": ["5 7 3", "6 8 3", "7 9 3"],
+        "x,y,z": ["5,3,7", "6,3,8", "7,3,9"],
     }[header]
     write_lines(tmp_path / "p.csv", [*([header] if header else []), *rows])
     s = opened(path)
@@ -226,7 +228,7 @@ def test_truth_of_positions_alone(tmp_path, columns, header, times):
     assert found is not None
     assert found.times == times
     assert [row[:2] for row in found.positions] == [(5, 7), (6, 8), (7, 9)]
-    assert {len(row) for row in found.positions} == {3 if "z" in header or "Height" in header else 2}
+    assert {len(row) for row in found.positions} == {3 if header == "x y z" or "Height" in header else 2}
     assert s.truth_source == "positions of p.csv, as recorded"
 
 

@@ -98,6 +98,14 @@ def test_mirrored_axes_are_said():
     assert "mirrored" in warning
 
 
+def test_axes_of_a_camera_are_said():
+    right, ahead, up = elsewhere(at(MOMENTS), 1.0).T
+    _, _, warnings = position_accuracy(at(MOMENTS), TruePositions(np.stack([right, -up, ahead], axis=1)))
+    (warning,) = warnings
+    assert 'y = "z"' in warning
+    assert position_accuracy(at(MOMENTS), TruePositions(np.stack([right, ahead, up], axis=1)))[2] == []
+
+
 def test_height_is_shifted_and_never_tilted():
     places = at(MOMENTS)
     tilted = places.copy()
