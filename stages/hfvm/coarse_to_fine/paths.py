@@ -6,44 +6,58 @@ candidate gathers the least cost of getting there from the border of the image, 
 least total wins. So evidence travels over weak texture as far as it must, and stops at depth edges, where smoothness is
 truncated, the sooner the greater the grey step.
 
-All costs are integers, candidates come in a fixed order and only a strictly lower cost wins. The vector code of both
-steps is in :mod:`rille.stages.hfvm.coarse_to_fine.path_simd`.
+All costs are integers, candidates come in a fixed order and only a strictly lower cost wins. One step of a direction is
+vector code (:mod:`rille.stages.hfvm.coarse_to_fine.path_simd`).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
 from rille.stages.core.declare import AnyArray
 from rille.stages.hfvm.coarse_to_fine import path_simd
-from rille.stages.hfvm.coarse_to_fine.path_simd import MOST, NONE, UNIT
+from rille.stages.hfvm.coarse_to_fine.path_simd import MOST, NONE
 from rille.stages.hfvm.level.features import Words
 from rille.stages.hfvm.level.propagation import pack_map, unpack
+from rille.stages.hfvm.level.simd import apart
 
-OFFSETS = np.array(
-    [[0, -1], [0, 1], [-1, 0], [1, 0], [-3, -3], [-3, 3], [3, -3], [3, 3], [0, -8], [0, 8], [-8, 0], [8, 0]], np.int64
-)
+UNIT = 4
+"""Cost of a byte step of Table 1's features, so that weaker ones can be weighed as integers."""
+
+OUTSIDE = 8000
+"""Cost of a candidate that leads out of the other image: about that of unlike pixels, so that neighbours decide."""
+
+OWN = ((0, 0), (0, -1), (0, 1), (-1, 0), (1, 0))
+"""Rows and columns added to a pixel's own displacement."""
+
+AROUND = ((0, -1), (0, 1), (-1, 0), (1, 0), (-3, -3), (-3, 3), (3, -3), (3, 3), (0, -8), (0, 8), (-8, 0), (8, 0))
 """Rows and columns from a pixel to those whose displacements it tries: beside it, beyond an edge, beyond a gap; at the
 image's border the nearest pixel inside stands for one outside."""
 
-UP = 9
-"""Pixels of the coarser level whose doubled displacements are tried: the one above and those around it."""
+ABOVE = tuple((j, i) for j in (-1, 0, 1) for i in (-1, 0, 1))
+"""Rows and columns from the pixel of the coarser level above to those whose doubled displacements are tried."""
 
 
-@dataclass(frozen=True)
-class LevelView:
-    """What is known of one image at one level: both feature sets, grey values (float32)."""
+class LevelView(NamedTuple):
+    """What is known of one image at one level (row, col): both feature sets (uint64), grey values (float32)."""
 
     words: Words
     compact: Words
     grey: AnyArray
 
 
-@dataclass(frozen=True)
-class Weights:
+class Candidates(NamedTuple):
+    """Of each pixel (row, col, :data:`MOST`) int16: columns and rows of displacement, and what each costs by itself."""
+
+    u: AnyArray
+    v: AnyArray
+    cost: AnyArray
+
+
+class Weights(NamedTuple):
     """Costs in quarters of a byte step; ``grey`` in grey levels.
 
     ``compact``: a byte step of the compact features. ``small``: a pixel of difference to the pixel before. ``large``:
@@ -79,19 +93,15 @@ def propagate(
     shape = start[0].shape
     maps = np.empty(shape, np.int32)
     pack_map(*start, maps)
-    above = maps if up is None else _doubled(*up)
-    places = np.empty(len(OFFSETS) + UP, np.int64)
-    cu, cv, cost = (np.empty((*shape, MOST), np.int16) for _ in range(3))
+    above = np.empty((0, 0), np.int32) if up is None else _doubled(*up)
+    found = Candidates(*(np.empty((*shape, MOST), np.int16) for _ in range(3)))
     total = np.empty((*shape, MOST), np.int32)
     for _ in range(rounds):
-        _gather(
-            left.words, right.words, left.compact, right.compact, weights.compact, maps, above, up is not None, OFFSETS,
-            lines, mu, places, cu, cv, cost
-        )  # fmt: skip
+        _gather(left, right, weights.compact, maps, above, (lines, mu), found)
         total[:] = 0
         for backward in (False, True):
-            _sweep(cu, cv, cost, left.grey, weights.small, weights.large, weights.grey, backward, total)
-        _choose(cu, cv, cost, total, maps)
+            _sweep(found, left.grey, weights, backward, total)
+        _choose(found, total, maps)
     u, v = np.empty(shape, np.int16), np.empty(shape, np.int16)
     unpack(maps, u, v)
     return u, v
@@ -105,45 +115,82 @@ def _doubled(u: AnyArray, v: AnyArray) -> AnyArray:
 
 
 @njit(cache=True, nogil=True)
-def _gather(  # type: ignore[no-untyped-def]
-    left, right, near, right_near, share, maps, above, has_above, offsets, lines, mu, places, cu, cv, cost
-):
-    """Candidates of every pixel, and what each costs by itself: feature distances and distance from its line."""
-    rows, cols = left.shape
-    rrows, rcols = right.shape
-    crows, ccols = above.shape
-    others = len(offsets)
-    words, right_words, compact, right_compact = (
-        left.reshape(-1), right.reshape(-1), near.reshape(-1), right_near.reshape(-1)
-    )  # fmt: skip
-    packed, coarse = maps.reshape(-1), above.reshape(-1)
-    a = b = c = np.float32(0.0)
+def _gather(left, right, share, maps, above, band, found):  # type: ignore[no-untyped-def]
+    """Candidates of every pixel, each once, and what each costs by itself; the first :data:`MOST` of them.
+
+    In this order: the pixel's own displacement, :data:`OWN` steps from it, those of the pixels :data:`AROUND` it, those
+    of the coarser level. All but the first must lead into the right image. ``share``: cost of a byte step of compact
+    features; ``band``: lines, and byte steps a pixel off them.
+    """
+    rows, cols = maps.shape
+    right_rows, right_cols = right.words.shape
+    lines, mu = band
+    us = np.empty(len(OWN) + len(AROUND) + len(ABOVE), np.int64)
+    vs = np.empty_like(us)
     for y in range(rows):
         for x in range(cols):
-            at = y * cols + x
-            for k in range(others):
-                j, i = y + offsets[k, 0], x + offsets[k, 1]
-                places[k] = min(max(j, 0), rows - 1) * cols + min(max(i, 0), cols - 1)
-            for k in range(UP):
-                j, i = y // 2 + k // 3 - 1, x // 2 + k % 3 - 1
-                place = min(max(j, 0), crows - 1) * ccols + min(max(i, 0), ccols - 1)
-                places[others + k] = place if has_above else at
-            if mu > 0:
-                a, b, c = lines[y, x, 0], lines[y, x, 1], lines[y, x, 2]
-            path_simd.gather(
-                words, right_words, compact, right_compact, share, rrows, rcols, x, y, at, packed, coarse, places,
-                a, b, c, (UNIT + share) * mu, cu[y, x], cv[y, x], cost[y, x]
-            )  # fmt: skip
+            tried = 0
+            for j, i in OWN:
+                us[tried], vs[tried] = _columns(maps[y, x]) + i, _rows(maps[y, x]) + j
+                tried += 1
+            for j, i in AROUND:
+                near = maps[_inside(y + j, rows), _inside(x + i, cols)]
+                us[tried], vs[tried] = _columns(near), _rows(near)
+                tried += 1
+            if above.size:
+                for j, i in ABOVE:
+                    far = above[_inside(y // 2 + j, above.shape[0]), _inside(x // 2 + i, above.shape[1])]
+                    us[tried], vs[tried] = _columns(far), _rows(far)
+                    tried += 1
+            count = 0
+            for n in range(tried):
+                u, v = us[n], vs[n]
+                inside = 0 <= x + u < right_cols and 0 <= y + v < right_rows
+                known = False
+                for k in range(count):
+                    known |= (found.u[y, x, k] == u) & (found.v[y, x, k] == v)
+                if known or (n > 0 and not inside):
+                    continue
+                cost = np.int64(OUTSIDE)
+                if inside:
+                    cost = UNIT * apart(left.words[y, x], right.words[y + v, x + u])
+                    cost += share * apart(left.compact[y, x], right.compact[y + v, x + u])
+                if mu > 0:
+                    a, b, c = np.float64(lines[y, x, 0]), np.float64(lines[y, x, 1]), np.float64(lines[y, x, 2])
+                    cost += np.int64((UNIT + share) * mu * abs(a * u + b * v + c))
+                found.u[y, x, count], found.v[y, x, count], found.cost[y, x, count] = u, v, min(cost, 2 * OUTSIDE)
+                count += 1
+                if count == MOST:
+                    break
+            for k in range(count, MOST):
+                found.u[y, x, k], found.v[y, x, k], found.cost[y, x, k] = 0, 0, NONE
 
 
 @njit(cache=True, nogil=True)
-def _sweep(cu, cv, cost, grey, small, large, half, backward, total):  # type: ignore[no-untyped-def]
+def _columns(packed):  # type: ignore[no-untyped-def]
+    """Columns of a packed displacement, v << 16 | u."""
+    return np.int64(np.int16(packed & 0xFFFF))
+
+
+@njit(cache=True, nogil=True)
+def _rows(packed):  # type: ignore[no-untyped-def]
+    return np.int64(packed >> 16)
+
+
+@njit(cache=True, nogil=True)
+def _inside(index, size):  # type: ignore[no-untyped-def]
+    return min(max(index, 0), size - 1)
+
+
+@njit(cache=True, nogil=True)
+def _sweep(found, grey, weights, backward, total):  # type: ignore[no-untyped-def]
     """Add four directions: from the left, upper left, above and upper right; ``backward``: their opposites."""
     rows, cols = grey.shape
     # The border before an image counts as a pixel without candidates: nothing is gathered there.
     before = np.zeros((4, cols, MOST), np.int16)
     after = np.zeros((4, cols, MOST), np.int16)
-    us, vs, costs, totals = cu.reshape(-1), cv.reshape(-1), cost.reshape(-1), total.reshape(-1)
+    us, vs, costs, totals = found.u.reshape(-1), found.v.reshape(-1), found.cost.reshape(-1), total.reshape(-1)
+    large, half, small = np.float32(weights.large), np.float32(weights.grey), weights.small
     s = -1 if backward else 1
     for row in range(rows):
         y = rows - 1 - row if backward else row
@@ -155,25 +202,27 @@ def _sweep(cu, cv, cost, grey, small, large, half, backward, total):  # type: ig
                 i = x - s if d == 0 else x + s * (d - 2)
                 if j < 0 or j >= rows or i < 0 or i >= cols:
                     for k in range(MOST):
-                        after[d, x, k] = cost[y, x, k]
-                        totals[at + k] += cost[y, x, k]
+                        after[d, x, k] = costs[at + k]
+                        totals[at + k] += costs[at + k]
                     continue
                 path = after[0, i] if d == 0 else before[d, i]
                 change = abs(grey[y, x] - grey[j, i])
-                far = np.int64(max(np.float32(large) / (np.float32(1.0) + change / np.float32(half)), 2 * small))
+                far = np.int64(max(large / (np.float32(1.0) + change / half), 2 * small))
                 there = (j * cols + i) * MOST
                 path_simd.step(us, vs, costs, path, there, after[d, x], 0, totals, at, small, far)
         before, after = after, before
 
 
 @njit(cache=True, nogil=True)
-def _choose(cu, cv, cost, total, maps):  # type: ignore[no-untyped-def]
+def _choose(found, total, maps):  # type: ignore[no-untyped-def]
     """Packed displacement of least total; the first of equal ones."""
     rows, cols = maps.shape
     for y in range(rows):
         for x in range(cols):
             best = 0
             for k in range(1, MOST):
-                if cost[y, x, k] != NONE and total[y, x, k] < total[y, x, best]:
+                if found.cost[y, x, k] != NONE and total[y, x, k] < total[y, x, best]:
                     best = k
-            maps[y, x] = (np.int32(cv[y, x, best]) << np.int32(16)) | (np.int32(cu[y, x, best]) & np.int32(0xFFFF))
+            maps[y, x] = (np.int32(found.v[y, x, best]) << np.int32(16)) | (
+                np.int32(found.u[y, x, best]) & np.int32(0xFFFF)
+            )

@@ -8,7 +8,7 @@ from matching_scenes import Texture, pair, seen
 
 from rille.stages.core.errors import RilleError
 from rille.stages.core.validity import Validity, has, matched
-from rille.stages.hfvm.coarse_to_fine import compact, path_simd, paths
+from rille.stages.hfvm.coarse_to_fine import compact, paths
 from rille.stages.hfvm.finish import guided, variational_refinement
 from rille.stages.hfvm.images.params import ACCURATE, HfvmParams
 from rille.stages.hfvm.level import consistency
@@ -112,7 +112,7 @@ def test_path_costs_are_those_of_the_definition(seed):
     grey = rng.uniform(0, 255, shape[:2]).astype(np.float32)
     total = np.zeros(shape, np.int32)
     for backward in (False, True):
-        paths._sweep(cu, cv, cost, grey, 36, 240, 10.0, backward, total)
+        paths._sweep(paths.Candidates(cu, cv, cost), grey, paths.Weights(8, 36, 240, 10.0), backward, total)
     there = cost != paths.NONE
     np.testing.assert_array_equal(total[there], brute_force(cu, cv, cost, grey, 36, 240, 10.0)[there])
 
@@ -123,7 +123,7 @@ def listed(maps, up, y, x, right_shape):
     rows, cols = u.shape
     found = [(int(u[y, x]), int(v[y, x]))]
     more = [(u[y, x] + i, v[y, x] + j) for j, i in ((0, -1), (0, 1), (-1, 0), (1, 0))]
-    for j, i in paths.OFFSETS:
+    for j, i in paths.AROUND:
         near = min(max(y + j, 0), rows - 1), min(max(x + i, 0), cols - 1)
         more.append((u[near], v[near]))
     for k in range(9 if up is not None else 0):
@@ -148,28 +148,12 @@ def test_candidates_and_their_costs_are_those_of_the_definition(mu, with_up):
     maps = rng.integers(-6, 6, (2, *left.shape)).astype(np.int16)
     up = rng.integers(-3, 3, (2, 6, 7)).astype(np.int16) if with_up else None
     lines = rng.normal(0, 1, (*left.shape, 3)).astype(np.float32)
-    cu, cv, cost = (np.empty((*left.shape, paths.MOST), np.int16) for _ in range(3))
+    found = paths.Candidates(*(np.empty((*left.shape, paths.MOST), np.int16) for _ in range(3)))
     packed = np.empty(left.shape, np.int32)
     pack_map(*maps, packed)
-    above = packed if up is None else paths._doubled(*up)
-    places = np.empty(len(paths.OFFSETS) + paths.UP, np.int64)
-    paths._gather(
-        a.words,
-        b.words,
-        a.compact,
-        b.compact,
-        8,
-        packed,
-        above,
-        with_up,
-        paths.OFFSETS,
-        lines,
-        mu,
-        places,
-        cu,
-        cv,
-        cost,
-    )
+    above = np.empty((0, 0), np.int32) if up is None else paths._doubled(*up)
+    paths._gather(a, b, 8, packed, above, (lines, mu), found)
+    cu, cv, cost = found
 
     def apart(word, other):
         return int(np.abs(bytes_of(word).astype(int) - bytes_of(other)).sum())
@@ -179,13 +163,13 @@ def test_candidates_and_their_costs_are_those_of_the_definition(mu, with_up):
         there = cost[y, x] != paths.NONE
         assert list(zip(cu[y, x, there].tolist(), cv[y, x, there].tolist(), strict=True)) == want
         for k, (i, j) in enumerate(want):
-            expected = path_simd.OUTSIDE
+            expected = paths.OUTSIDE
             if 0 <= x + i < right.shape[1] and 0 <= y + j < right.shape[0]:
                 other = y + j, x + i
                 expected = 4 * apart(a.words[y, x], b.words[other]) + 8 * apart(a.compact[y, x], b.compact[other])
             n = lines[y, x].astype(np.float64)
             expected += int(12 * mu * abs(n[0] * i + n[1] * j + n[2]))
-            assert cost[y, x, k] == min(expected, 2 * path_simd.OUTSIDE)
+            assert cost[y, x, k] == min(expected, 2 * paths.OUTSIDE)
 
 
 def bytes_of(word):
