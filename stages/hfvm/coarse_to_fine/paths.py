@@ -20,9 +20,8 @@ from numba import njit
 from rille.stages.core.declare import AnyArray
 from rille.stages.hfvm.coarse_to_fine import path_simd
 from rille.stages.hfvm.coarse_to_fine.path_simd import MOST, NONE
-from rille.stages.hfvm.level.features import Words
+from rille.stages.hfvm.level.features import Words, distance
 from rille.stages.hfvm.level.propagation import pack_map, unpack
-from rille.stages.hfvm.level.simd import apart
 
 UNIT = 4
 """Cost of a byte step of Table 1's features, so that weaker ones can be weighed as integers."""
@@ -153,8 +152,8 @@ def _gather(left, right, share, maps, above, band, found):  # type: ignore[no-un
                     continue
                 cost = np.int64(OUTSIDE)
                 if inside:
-                    cost = UNIT * apart(left.words[y, x], right.words[y + v, x + u])
-                    cost += share * apart(left.compact[y, x], right.compact[y + v, x + u])
+                    cost = UNIT * distance(left.words[y, x], right.words[y + v, x + u])
+                    cost += share * distance(left.compact[y, x], right.compact[y + v, x + u])
                 if mu > 0:
                     a, b, c = np.float64(lines[y, x, 0]), np.float64(lines[y, x, 1]), np.float64(lines[y, x, 2])
                     cost += np.int64((UNIT + share) * mu * abs(a * u + b * v + c))

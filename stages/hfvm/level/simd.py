@@ -86,19 +86,6 @@ def _distances(builder: Any, a: Any, b: Any, width: int) -> Any:
     return builder.lshr(total, _vector(_WORDS, [48] * LANES))
 
 
-@intrinsic
-def apart(typingctx, one, two):  # type: ignore[no-untyped-def]
-    """Sum of absolute byte differences of two words."""
-
-    def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        first = ir.Constant(_I32, 0)
-        a, b = (builder.insert_element(_vector(_WORDS, [0] * LANES), word, first) for word in args)
-        # The narrowest instruction: the compiler drops what it would do for the other lanes.
-        return builder.extract_element(_distances(builder, a, b, min(widest(), 128)), first)
-
-    return types.int64(types.uint64, types.uint64), codegen
-
-
 def _pointer(context: Any, builder: Any, kind: Any, array: Any, index: Any) -> Any:
     data = context.make_array(kind)(context, builder, array).data
     return builder.gep(data, [index])
