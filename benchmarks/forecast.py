@@ -82,7 +82,7 @@ def write(warm: Path, cold: Path) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("ledgers", type=Path, nargs="+")
-    parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--jobs", type=int, default=2, help="workers of those runs")
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
     if options.write:
