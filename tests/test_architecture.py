@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import ast
 import re
+import sys
+import tomllib
 from collections import defaultdict
+from importlib.metadata import packages_distributions
 from pathlib import Path
 
 import pytest
@@ -110,6 +113,24 @@ def test_the_check_itself_sees_a_wrong_import(tmp_path: Path) -> None:
     bad = tmp_path / "bad.py"
     bad.write_text("def f():\n    from rille.pipeline.engine.store.base import Store\n    import zarr\n")
     assert imported(bad) == {"rille", "zarr"}
+
+
+def test_what_is_imported_is_declared() -> None:
+    """An installed wheel has what ``dependencies`` name; an optional extra is imported where it is asked for."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    extras = {name: rows for name, rows in project["optional-dependencies"].items() if name not in ("dev", "docs")}
+    declared = {
+        re.split(r"[^A-Za-z0-9._-]", row, maxsplit=1)[0].lower().replace("_", "-")
+        for row in [*project["dependencies"], *(row for rows in extras.values() for row in rows)]
+    }
+    owners = {
+        module: {name.lower().replace("_", "-") for name in names} for module, names in packages_distributions().items()
+    }
+    used = (
+        {name.split(".")[0] for path in MODULES for name in imported(path)} - set(sys.stdlib_module_names) - {"rille"}
+    )
+    assert {"numpy", "dask", "rosbags"} <= used, "the walk finds imports"
+    assert {module for module in used if not owners.get(module, set()) & declared} == set()
 
 
 def error_classes(trees: list[ast.Module]) -> set[str]:
