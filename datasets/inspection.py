@@ -38,7 +38,8 @@ NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 
 @dataclass(frozen=True)
 class FoundImages:
-    """The images: patterns relative to the folder, number of pairs, image size, and why they are taken so.
+    """The images: patterns relative to the folder, number of pairs, size of all images if they have one, and why
+    they are taken so.
 
     ``trouble`` says what does not fit; ``stamped`` whether the names are times since an epoch.
     """
@@ -46,7 +47,7 @@ class FoundImages:
     left: str
     right: str
     pairs: int
-    size: tuple[int, int]
+    size: tuple[int, int] | None
     why: str
     trouble: str = ""
     stamped: bool = False
@@ -136,14 +137,15 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
             groups[at[0], _place(path, folder, at[2])][at[1]].append(path)
     both = {key: sides for key, sides in groups.items() if all(sides)}
     if not both:
+        named = [sum(len(sides[s]) for sides in groups.values()) for s in (0, 1)]
         raise InputError(
             "RIL-194",
-            f"{folder} holds {len(images)} images, but none are told apart as left and right",
+            f"{folder} holds {len(images)} images, {named[0]} named as left and {named[1]} as right: no pairs",
             remedy="name files or folders left and right (or _l and _r, cam0 and cam1), or write a manifest by hand",
         )
     key = max(both, key=lambda k: (min(len(s) for s in both[k]), -k[0]))
     left, right = both[key]
-    size, trouble, pairs = (0, 0), "", 0
+    size, trouble, pairs = None, "", 0
     try:
         matched = pair_up(left, right)
         pairs = len(matched)

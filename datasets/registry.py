@@ -124,13 +124,15 @@ def _of_files(name_or_path: str, digests: Digests) -> Sequence:
         if sequence is not None:
             return sequence
     if not path.is_dir():
-        raise InputError("RIL-276", f"no sequence {name_or_path!r}", remedy=_suggestion(name_or_path))
-    known = "; or ".join(f"{form}: {words}" for form, words in forms())
-    raise InputError(
-        "RIL-277",
-        f"{name_or_path} has no layout that is recognised",
-        remedy=f"try `rille init {name_or_path}`; forms: {known}",
+        kind = "file" if path.suffix else "sequence"
+        raise InputError("RIL-276", f"no {kind} {name_or_path!r}", remedy=_suggestion(name_or_path))
+    beside = Path(f"{path}.rille.toml")
+    remedy = (
+        f"give its manifest, {beside}"
+        if beside.is_file()
+        else f"`rille init {name_or_path}` writes a manifest; `rille datasets list` names what opens without one"
     )
+    raise InputError("RIL-277", f"{name_or_path} has no layout that is recognised", remedy=remedy)
 
 
 def hindrance(place: Path) -> RilleError | None:

@@ -15,7 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
-from cyclopts import App, CycloptsError
+from cyclopts import App, CycloptsError, MissingArgumentError
 from rich.console import Console
 
 from rille.pipeline.commands import cache as cache_commands
@@ -326,7 +326,9 @@ def _run(argv: list[str] | None) -> int:
         print("rille: interrupted; the same command resumes from here", file=sys.stderr)
         return INTERRUPTED
     except CycloptsError as error:
-        _print_error("RIL-001", str(error))
+        words = " ".join(("rille", *(error.command_chain or ())))
+        hint = f" `{words} --help` says what it takes." if isinstance(error, MissingArgumentError) else ""
+        _print_error("RIL-001", f"{error}{hint}")
         return USAGE
     except BrokenPipeError:  # who read the output has had enough of it
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)

@@ -82,7 +82,7 @@ def pair_times(section: Times, root: Path, name: str, pairs: Sequence[ImagePair]
     if section.rate_hz is not None:
         return tuple(k / section.rate_hz for k in range(len(pairs))), ()
     if section.names:
-        return seconds([_stamp(pair, name) for pair in pairs], "times of the image names", unit=section.unit)
+        return seconds([_stamp(pair, name) for pair in pairs], "the image names", unit=section.unit)
     assert section.file is not None
     path = root / section.file
     stamps, lines = _times_of_file(path, [pair.left.name for pair in pairs])

@@ -50,7 +50,7 @@ def _pairs(**values: object) -> str:
 def _images(found: Findings) -> str:
     views = found.views
     lines = [f"[images]\n# {views.why}."]
-    if views.trouble:
+    if views.size is None:
         lines.append(f"# {NEEDED}: correct the patterns: {views.trouble}")
     else:
         lines.append(f"# They make {counted(views.pairs, 'pair')} of {views.size[0]} x {views.size[1]} pixels.")
@@ -76,7 +76,7 @@ def _cameras(found: Findings) -> str:
 
 def _calibration_lines(calibration: FoundCalibration, found: Findings) -> list[str]:
     lines = []
-    if calibration.size is not None and calibration.size != found.views.size:
+    if calibration.size and found.views.size and calibration.size != found.views.size:
         size = "{} x {}".format(*calibration.size)
         lines.append(f"# {NEEDED}: this calibration is of {size} pixels; give one of the images' size")
     if len(calibration.files) == 2:

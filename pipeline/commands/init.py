@@ -80,7 +80,7 @@ def _root(directory: Path, path: Path) -> str:
 def _report(found: Findings, path: Path, needed: list[str]) -> list[str]:
     """What was found, what is needed, and what to type next."""
     views, calibration = found.views, found.calibration
-    size = f", {views.size[0]} x {views.size[1]} pixels" if views.pairs else ""
+    size = f", {views.size[0]} x {views.size[1]} pixels" if views.size else ""
     lines = [f"images       {counted(views.pairs, 'pair')}{size}: {views.left} and {views.right}"]
     if calibration is not None:
         baseline = f", baseline {calibration.baseline:.6g}" if calibration.baseline is not None else ""

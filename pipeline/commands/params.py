@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import textwrap
 from collections.abc import Iterable, Iterator
 from typing import Any, Literal, get_args, get_origin
@@ -41,7 +42,9 @@ def show(name: str = "", *, markdown: bool = False) -> int:
     """
     known = sections()
     if name and name not in known:
-        raise ConfigError("RIL-920", f"there is no section {name!r}", remedy=f"one of {', '.join(sorted(known))}")
+        near = difflib.get_close_matches(name, known, n=1)
+        hint = f"did you mean {near[0]!r}?" if near else f"one of {', '.join(sorted(known))}"
+        raise ConfigError("RIL-920", f"there is no section {name!r}", remedy=hint)
     chosen = {name: known[name]} if name else known
     print("\n".join(page(chosen) if markdown else plain(chosen)))
     return 0

@@ -124,9 +124,9 @@ def describe(run: Path) -> Iterable[str]:
         f"of the workers' time: stages {share * t.kernel:.0f} %, reading and committing "
         f"{share * (t.tasks - t.kernel):.0f} %, starting, waiting and drawing {100 - share * t.tasks:.0f} %"
     )
+    yield f"least possible {t.least:.1f} s; the run took {t.wall / max(t.least, 0.001):.2f} times as long"
     verdict = "kept" if t.wall <= t.good else f"exceeded by {t.wall - t.good:.1f} s"
-    bound = f"{FACTOR} of it and {START:.0f} s are {t.good:.1f} s: {verdict}"
-    yield f"least possible {t.least:.1f} s, of which the run took {t.wall / max(t.least, 0.001):.2f}; {bound}"
+    yield f"limit of a good run {t.good:.1f} s ({FACTOR} times the least possible and {START:.0f} s): {verdict}"
     if t.compiling:
         yield f"compiling, once a user, {sum(s for _, s in t.compiling):.1f} s of the stages': {_chain(t.compiling)}"
 

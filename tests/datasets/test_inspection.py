@@ -85,7 +85,7 @@ def test_patterns_escape_what_is_special(tmp_path):
 
 def test_images_that_cannot_be_told_apart(tmp_path):
     write_images(tmp_path, ["1.png", "2.png"])
-    with raises("RIL-194"):
+    with raises("RIL-194", "2 images, 0 named as left and 0 as right"):
         inspect(tmp_path)
     with raises("RIL-193"):
         inspect(tmp_path / "nothing")

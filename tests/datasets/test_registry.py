@@ -73,9 +73,16 @@ def test_near_misses_are_suggested(name):
         open_sequence(name)
 
 
-def test_unknown_folder_names_the_layouts(tmp_path):
-    with raises("RIL-277", "calib.txt"):
-        open_sequence(str(tmp_path))
+def test_an_unknown_folder_or_file_says_how_to_open_it(tmp_path):
+    folder = tmp_path / "field"
+    folder.mkdir()
+    with raises("RIL-277", f"`rille init {folder}`", "`rille datasets list`"):
+        open_sequence(str(folder))
+    (tmp_path / "field.rille.toml").touch()
+    with raises("RIL-277", f"give its manifest, {folder}.rille.toml"):
+        open_sequence(str(folder))
+    with raises("RIL-276", "no file 'field.toml'"):
+        open_sequence("field.toml")
     with raises("RIL-276", "'no/such/folder'"):
         open_sequence("no/such/folder")
     with raises("RIL-276", "'nasa-k10'", "'nasa_k10'"):

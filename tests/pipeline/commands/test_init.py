@@ -55,6 +55,15 @@ def test_a_calibrated_folder_needs_nothing_more(drive, capsys):
     assert (s.name, s.frames, s.rig.baseline) == ("drive", 2, pytest.approx(0.1))
 
 
+def test_images_of_two_sizes_are_one_complaint(drive, capsys):
+    (drive / "calibration.yaml").write_text(SETTINGS)
+    cv2.imwrite(str(drive / "left" / "1.png"), np.zeros((24, 32), np.uint8))
+    init(drive)
+    printed = capsys.readouterr().out
+    assert "2 pairs: left/*.png and right/*.png" in printed
+    assert printed.count("needed ") == 1
+
+
 def test_what_is_needed_is_printed(drive, capsys):
     init(drive)
     printed = capsys.readouterr().out

@@ -30,3 +30,5 @@ def test_choices_and_bounds_are_told(capsys: pytest.CaptureFixture[str]) -> None
     assert "merge." not in told
     with raises("RIL-920", "'nope'"):
         params.show("nope")
+    with raises("RIL-920", "did you mean 'locus'?"):
+        params.show("locs")

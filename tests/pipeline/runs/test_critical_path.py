@@ -59,5 +59,5 @@ def test_a_real_ledger_is_told_in_words(tmp_path):
     assert told[0].startswith("run toy/1: ")
     assert "9 tasks computed with 1 worker" in told[0]
     assert told[2].startswith("longest chain ")
-    assert "1.15 of it and 5 s are" in told[4]
+    assert "1.15 times the least possible and 5 s" in told[5]
     assert list(critical_path.describe(second))[1] == "nothing was computed"
