@@ -169,6 +169,8 @@ class Run:
     def terrain(self) -> xarray.Dataset:
         """The merged terrain: ``elevation``, its standard deviation and more on (y, x), metres in the world frame.
 
+        ``terrain.to_netcdf(path)`` saves it.
+
         Raises
         ------
         InputError
@@ -177,6 +179,8 @@ class Run:
         import xarray
 
         found: xarray.Dataset = xarray.open_zarr(self._file("terrain.zarr"))
+        for variable in found.variables.values():
+            variable.attrs.pop("_CRS", None)  # GDAL's own, a mapping: NetCDF stores none; `spatial_ref` says the same
         return found
 
     @property

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from pathlib import Path
 
 import pytest
@@ -23,3 +24,15 @@ def data_dir() -> Path:
     if os.environ.get("RILLE_REQUIRE_DATA") == "1":
         pytest.fail(reason)
     pytest.skip(reason)
+
+
+@pytest.fixture(scope="session")
+def chromium() -> str:
+    """Path of chromium; absence skips, or fails under RILLE_REQUIRE_BROWSER=1."""
+    found = shutil.which("chromium")
+    if found is None:
+        reason = "chromium is not installed"
+        if os.environ.get("RILLE_REQUIRE_BROWSER") == "1":
+            pytest.fail(reason)
+        pytest.skip(reason)
+    return found

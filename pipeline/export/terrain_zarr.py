@@ -72,7 +72,7 @@ def _write(
 
     attributes = {"Conventions": CONVENTIONS, **facts, "frame": FRAME, "cell_size_m": lattice.cell}
     if place is not None:
-        attributes["georeference"] = place.to_dict()
+        attributes |= {f"georeference_{name}": value for name, value in place.to_dict().items()}
     group = zarr.create_group(store=LocalStore(folder), zarr_format=2, attributes=attributes)
     _coordinates(group, lattice, place)
     coordinates = {"coordinates": "spatial_ref"}

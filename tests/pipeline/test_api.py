@@ -9,7 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import rasterio
+import xarray
 from raising import raises
+from toys.browser import Browser
 
 import rille
 from rille.pipeline import api
@@ -58,6 +61,40 @@ def test_terrain_and_trajectory_have_coordinates_and_units(run: rille.Run) -> No
     each = trajectory.rotation.values
     assert each @ each.transpose(0, 2, 1) == pytest.approx(np.broadcast_to(np.eye(3), each.shape), abs=1e-9)
     assert run.metrics["trajectory_drift"]["unit"] == "%"
+
+
+def test_the_terrain_is_saved_as_netcdf(run: rille.Run, tmp_path: Path) -> None:
+    run.terrain.to_netcdf(tmp_path / "terrain.nc", engine="scipy")
+    with xarray.open_dataset(tmp_path / "terrain.nc") as again:
+        np.testing.assert_array_equal(again.elevation, run.terrain.elevation)
+        assert again.elevation.units == "m"
+        assert again.spatial_ref.crs_wkt == run.terrain.spatial_ref.crs_wkt
+
+
+def test_the_map_of_the_report_answers_with_the_values_of_the_rasters(
+    run: rille.Run, chromium: str, tmp_path: Path
+) -> None:
+    """At ten random places with an elevation; the page stores it in 16 bits and the standard deviation in 8."""
+    with rasterio.open(run.folder / "dem.tif") as dem, rasterio.open(run.folder / "dem_sigma.tif") as dem_sigma:
+        z, sigma, place = dem.read(1), dem_sigma.read(1), dem.transform
+    with rasterio.open(run.folder / "risk.tif") as raster:
+        assert raster.transform == place
+        risk = raster.read(1)
+    rows, cols = np.nonzero(np.isfinite(z))
+    step = float(np.nanmax(z) - np.nanmin(z)) / 65534
+    browser = Browser(chromium, tmp_path)
+    try:
+        browser.open(run.folder / "report.html")
+        for n in np.random.default_rng(3).choice(len(rows), 10, replace=False):
+            cell = int(rows[n]), int(cols[n])
+            x, y = place * (cell[1] + 0.5, cell[0] + 0.5)
+            found = browser.run(f"document.getElementById('map-view').answer({x}, {y})")
+            assert found["elevation"] == pytest.approx(float(z[cell]), abs=step)
+            assert found["sigma"] == pytest.approx(float(sigma[cell]), rel=0.02)
+            assert found["risk"] == risk[cell]
+        assert browser.messages == []
+    finally:
+        browser.close()
 
 
 def test_a_run_is_opened_and_shown(run: rille.Run, monkeypatch: pytest.MonkeyPatch) -> None:

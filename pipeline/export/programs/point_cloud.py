@@ -24,6 +24,8 @@ PLY_TYPES = {"float64": "double", "float32": "float", "uint8": "uchar"}
 """PLY's names of types."""
 MAX_FACES = 2_000_000
 """Most triangles of a mesh: more make browsers and phones fail; a coarser one is made beyond, and said to be."""
+UNSEEN = 128
+"""Grey of a cell without ortho image: neutral, for black would look like a shadow."""
 MAX_TEXTURE = 4096
 """Greatest edge of the texture, pixels: what every WebGL implementation takes."""
 
@@ -95,7 +97,7 @@ def write_laz(
     cloud.x, cloud.y, cloud.z = x, y, terrain.values[row, col]
     cloud.return_number[:] = cloud.number_of_returns[:] = 1
     if ortho is not None:
-        look = np.rint(np.clip(np.nan_to_num(ortho[row, col]), 0, 255) * 257).astype(np.uint16)
+        look = _colours(ortho)[row, col].astype(np.uint16) * np.uint16(257)  # LAS has colours of 16 bits
         red, green, blue = look.T if look.ndim == 2 else (look, look, look)
         cloud.intensity = look if look.ndim == 1 else np.rint(look @ LUMA).astype(np.uint16)
         cloud.red, cloud.green, cloud.blue = red, green, blue
@@ -117,7 +119,7 @@ def write_ply(
     x, y = terrain.transform @ (col + 0.5, row + 0.5)
     columns = {"x": x, "y": y, "z": terrain.values[row, col]}
     if ortho is not None:
-        look = np.rint(np.clip(np.nan_to_num(ortho[row, col]), 0, 255)).astype(np.uint8)
+        look = _colours(ortho)[row, col]
         columns["red"], columns["green"], columns["blue"] = look.T if look.ndim == 2 else (look, look, look)
     if sigma is not None:
         columns["sigma"] = sigma[row, col].astype(np.float32)
@@ -168,6 +170,11 @@ def write_glb(
     return f"{len(vertices)} vertices, {len(faces)} triangles{every}"
 
 
+def _colours(ortho: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """Grey or colours of 8 bits, of the ortho image's shape; :data:`UNSEEN` where it has no value."""
+    return np.rint(np.clip(np.nan_to_num(ortho, nan=UNSEEN), 0, 255)).astype(np.uint8)
+
+
 def _mesh(terrain: DemFile, step: int) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
     """Vertices (n, 3) in the CRS, triangles (m, 3) seen from above anticlockwise, texture coordinates (n, 2)."""
     z = terrain.values[::step, ::step]
@@ -192,7 +199,7 @@ def _texture(ortho: NDArray[np.float64] | None) -> Any:
     from PIL import Image
     from trimesh.visual.material import PBRMaterial
 
-    image = Image.fromarray(np.rint(np.clip(np.nan_to_num(ortho), 0, 255)).astype(np.uint8))
+    image = Image.fromarray(_colours(ortho))
     if max(image.size) > MAX_TEXTURE:
         image.thumbnail((MAX_TEXTURE, MAX_TEXTURE))
     return PBRMaterial(

@@ -74,7 +74,7 @@ def test_a_place_on_earth_gives_every_cell_its_easting_and_northing(tmp_path: Pa
     assert data.easting.attrs["standard_name"] == "projection_x_coordinate"
     assert pyproj.CRS.from_cf(data.crs.attrs) == pyproj.CRS("EPSG:32633")
     assert data.crs.attrs["grid_mapping_name"] == "transverse_mercator"
-    assert data.attrs["georeference"]["azimuth"] == 0.6
+    assert data.attrs["georeference_azimuth"] == 0.6
 
 
 @pytest.mark.parametrize("place", [None, PLACE])

@@ -10,12 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from toys.browser import BROWSER, Browser
+from toys.browser import Browser
 from toys.finished import COLS, LATTICE, ROWS, bundles, report, view
 
 from rille.stages.core.declare import Bundle
-
-pytestmark = pytest.mark.skipif(BROWSER is None, reason="chromium is not installed")
 
 
 @pytest.fixture(scope="module")
@@ -29,8 +27,8 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def browser(page: Path, tmp_path: Path) -> Iterator[Browser]:
-    found = Browser(tmp_path)
+def browser(chromium: str, page: Path, tmp_path: Path) -> Iterator[Browser]:
+    found = Browser(chromium, tmp_path)
     found.open(page)
     yield found
     found.close()
@@ -103,8 +101,8 @@ def test_the_slider_goes_from_stop_to_stop(browser: Browser) -> None:
     assert browser.messages == []
 
 
-def test_a_phone_in_the_dark_shows_no_page_wider_than_itself(page: Path, tmp_path: Path) -> None:
-    phone = Browser(tmp_path, 390, 844, dark=True)
+def test_a_phone_in_the_dark_shows_no_page_wider_than_itself(chromium: str, page: Path, tmp_path: Path) -> None:
+    phone = Browser(chromium, tmp_path, 390, 844, dark=True)
     try:
         phone.open(page)
         assert phone.run("document.documentElement.scrollWidth") <= 390
@@ -118,9 +116,9 @@ def test_a_phone_in_the_dark_shows_no_page_wider_than_itself(page: Path, tmp_pat
 
 @pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
 @pytest.mark.parametrize("width", [390, 1280])
-def test_axe_finds_no_violation(page: Path, tmp_path: Path, width: int, dark: bool) -> None:
+def test_axe_finds_no_violation(chromium: str, page: Path, tmp_path: Path, width: int, dark: bool) -> None:
     axe = resources.files("axe_core_python").joinpath("axe.min.js").read_text(encoding="utf-8")
-    shown = Browser(tmp_path, width, 844, dark=dark)
+    shown = Browser(chromium, tmp_path, width, 844, dark=dark)
     try:
         shown.open(page)
         shown.run("document.querySelectorAll('details').forEach((d) => { d.open = true; })")

@@ -5,26 +5,22 @@ from __future__ import annotations
 import base64
 import json
 import os
-import shutil
 import subprocess
 from pathlib import Path
 from typing import Any
-
-BROWSER = shutil.which("chromium")
 
 
 class Browser:
     """One page; ``messages`` are what it said on its console, ``requests`` the addresses that it asked for."""
 
-    def __init__(self, folder: Path, width: int = 1280, height: int = 900, *, dark: bool = False) -> None:
-        assert BROWSER is not None
+    def __init__(self, program: str, folder: Path, width: int = 1280, height: int = 900, *, dark: bool = False) -> None:
         theirs_in, ours_out = os.pipe()
         ours_in, theirs_out = os.pipe()
         command = f'exec 3<&{theirs_in} 4>&{theirs_out}; exec "$0" "$@"'
         flags = ["--headless=new", "--no-sandbox", "--disable-gpu-sandbox", "--remote-debugging-pipe", "--no-first-run"]
         flags += ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", f"--user-data-dir={folder / 'profile'}"]
         self._program = subprocess.Popen(
-            ["/bin/bash", "-c", command, BROWSER, *flags, "about:blank"],
+            ["/bin/bash", "-c", command, program, *flags, "about:blank"],
             pass_fds=(theirs_in, theirs_out),
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,

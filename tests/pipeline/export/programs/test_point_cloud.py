@@ -145,3 +145,17 @@ def test_what_is_no_run_is_said(tmp_path: Path) -> None:
     (finished(tmp_path / "run") / "file").write_text("")
     with raises("RIL-601"):
         point_cloud.export(tmp_path / "run", "laz", tmp_path / "run" / "file" / "a.laz")
+
+
+def test_cells_without_an_image_are_grey(tmp_path: Path) -> None:
+    terrain = read_elevation(finished(tmp_path))
+    look = np.full(KNOWN.shape, np.nan)
+    look[KNOWN] = np.where(np.arange(KNOWN.sum()) == 0, 7.0, np.nan)
+    point_cloud.write_ply(tmp_path / "a.ply", terrain, look, None)
+    assert np.unique(trimesh.load(tmp_path / "a.ply").colors[:, 0]).tolist() == [7, point_cloud.UNSEEN]
+    point_cloud.write_laz(tmp_path / "a.laz", terrain, look, None)
+    assert np.unique(np.asarray(laspy.read(tmp_path / "a.laz").red) // 257).tolist() == [7, point_cloud.UNSEEN]
+    point_cloud.write_glb(tmp_path / "a.glb", terrain, look, None)
+    (mesh,) = trimesh.load(tmp_path / "a.glb").geometry.values()
+    texture = np.asarray(mesh.visual.material.baseColorTexture.convert("L"))
+    assert np.unique(texture).tolist() == [7, point_cloud.UNSEEN]
