@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 from collections.abc import Iterator
 from importlib import resources
 from pathlib import Path
@@ -36,6 +37,16 @@ def browser(chromium: str, page: Path, tmp_path: Path) -> Iterator[Browser]:
 
 def _click(browser: Browser, name: str) -> None:
     browser.run(f"document.querySelector('[data-at={name}]').click()")
+
+
+REFERENCES = Path(__file__).parent / "pictures"
+"""Screenshots of 48 columns; ``RILLE_NEW_PICTURES=1`` writes them anew: look at them before they are committed."""
+
+
+def _small(png: bytes) -> Image.Image:
+    """So small that letters are grey: fonts differ between machines, the layout does not."""
+    picture = Image.open(io.BytesIO(png)).convert("RGB")
+    return picture.resize((48, round(48 * picture.height / picture.width)), Image.Resampling.BOX)
 
 
 def _pixels(png: bytes) -> np.ndarray:
@@ -112,6 +123,27 @@ def test_a_phone_in_the_dark_shows_no_page_wider_than_itself(chromium: str, page
         assert np.median(_pixels(phone.picture())) < 60  # a drawing's paper is dark too
     finally:
         phone.close()
+
+
+@pytest.mark.parametrize("view", ["map", "space"])
+@pytest.mark.parametrize(("width", "dark"), [(1280, False), (390, False), (390, True)], ids=["wide", "phone", "dark"])
+def test_it_looks_as_it_did(chromium: str, page: Path, tmp_path: Path, width: int, dark: bool, view: str) -> None:
+    shown = Browser(chromium, tmp_path, width, 844, dark=dark)
+    try:
+        shown.open(page)
+        if view == "space":
+            _click(shown, "three")
+        shown.run("document.getElementById('map-view').scrollIntoView()")
+        found = _small(shown.picture())
+    finally:
+        shown.close()
+    reference = REFERENCES / f"{view}-{width}{'-dark' * dark}.png"
+    if os.environ.get("RILLE_NEW_PICTURES") == "1":
+        reference.parent.mkdir(exist_ok=True)
+        found.save(reference)
+    wanted = np.asarray(Image.open(reference), dtype=np.float64)
+    off = np.abs(np.asarray(found, dtype=np.float64) - wanted).mean()
+    assert off < 4, f"{off:.1f} of 255 grey levels on average: compare with {reference}"
 
 
 @pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
