@@ -42,8 +42,7 @@ def gather(view: Any) -> dict[str, Any]:
 def summarise(view: RunView, facts: Mapping[str, Any], figures: Sequence[Figure]) -> dict[str, Any]:
     """Everything that ``report.json`` holds, with what this run alone knows; the page has the same numbers."""
     found = delivery.complete(facts, view, figures)
-    failed = any(m["kind"] in ("failed", "skipped") for m in found.missing)
-    whole = not failed and all(row["in_world"] for row in facts["frames"])
+    state = "Incomplete" if not found.complete else "Complete but for what is listed" if found.missing else "Complete"
     rows, together = tables.table_2(view)
     clock = {
         "group": "Run",
@@ -62,7 +61,7 @@ def summarise(view: RunView, facts: Mapping[str, Any], figures: Sequence[Figure]
         "command": view.command,
         "complete": found.complete,
         **{key: value for key, value in facts.items() if key != "compared"},
-        "verdict": ("Complete: " if whole else "Incomplete: ") + facts["verdict"],
+        "verdict": f"{state}: {facts['verdict']}",
         "delivered": found.delivered,
         "absent": found.absent,
         "missing": found.missing,

@@ -228,6 +228,7 @@ def test_no_path_names_the_row_that_blocks(tmp_path: Path) -> None:
         {"kind": "no path", "what": "No path", "why": f"{reason}; blocked at row 17, 0.63 m ahead"},
     ]
     assert facts["metrics"]["local_paths"]["value"] == 0
+    assert facts["verdict"].startswith("Complete but for what is listed: 6 of 6 frames posed")
     assert "0 of 2 local paths, no path" in facts["verdict"]
     assert "path_length" not in facts["metrics"]
     assert "path_start" not in facts["metrics"]
