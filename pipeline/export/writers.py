@@ -37,12 +37,12 @@ UNLEVELLED = (
 """The same where the vertical is not known."""
 
 ENGINEERING_CRS = (
-    'ENGCRS["Rille world frame (local metres)",EDATUM["centre of the first left camera"],CS[Cartesian,2],'
-    'AXIS["x",east,ORDER[1]],AXIS["y",north,ORDER[2]],LENGTHUNIT["metre",1]]'
+    'LOCAL_CS["Rille world frame (local metres)",UNIT["metre",1,AUTHORITY["EPSG","9001"]],'
+    'AXIS["Easting",EAST],AXIS["Northing",NORTH]]'
 )
-"""WKT 2. A GeoPackage keeps it whole, a GeoTIFF its name, unit and directions: GDAL reads the axes of every local
-system back as easting and northing, so the tag AXES says what they are. rasterio's ``crs.is_valid`` is False for every
-engineering CRS: do not test that."""
+"""WKT 1, as GDAL reads a local system back from a GeoTIFF, which keeps its name, unit and directions alone: so all
+files state one text, and programs do not take path and rasters for two systems. The axes are not east and north; the
+tag AXES says what they are. rasterio's ``crs.is_valid`` is False for every engineering CRS: do not test that."""
 
 LINE_Z, POINT_Z = 1002, 1001
 """Geometry types of ISO 19125 well-known binary."""

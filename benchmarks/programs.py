@@ -1,0 +1,238 @@
+"""Which programs open the files of a run, and whether they read what Rille wrote: a row a program, with its version.
+
+``python benchmarks/programs.py [RUN_FOLDER]``; the run is the latest of `mockup-short` by default. Fails if a program
+reads something else. Python packages come with `pip install -e '.[dev]'`. Others are asked where they are installed:
+``gdalinfo`` and ``pdal`` on the path, QGIS's module of ``/usr/bin/python3``, ``rio-cogeo`` of the environment that
+``COGEO`` names (a folder with ``bin/rio``), Khronos' validator in the ``node_modules`` that ``GLTF_VALIDATOR`` names.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import laspy
+import numpy as np
+import pycolmap
+import rasterio
+import trimesh
+import xarray
+from evo.tools import file_interface
+from rosbags.highlevel import AnyReader
+
+import rille
+
+RASTERS = ("dem", "dem_sigma", "slope", "hillshade", "ortho", "risk", "hazard", "reason")
+EXPORTS = ("laz", "ply", "glb", "colmap", "grid_map")
+
+QGIS = """
+import sys
+from qgis.core import Qgis, QgsApplication, QgsRasterLayer, QgsVectorLayer, QgsPointXY
+app = QgsApplication([], False); app.initQgis()
+said = []; QgsApplication.messageLog().messageReceived.connect(lambda *a: said.append(a[0]))
+layers = [QgsRasterLayer(p, p) for p in sys.argv[1:-1]] + [QgsVectorLayer(sys.argv[-1] + '|layername=path', 'path')]
+assert all(l.isValid() for l in layers), [l.source() for l in layers if not l.isValid()]
+wkt = {l.crs().toWkt() for l in layers}
+assert len(wkt) == 1, wkt
+kinds = [l.renderer().type() for l in layers[:-1]]
+assert 'paletted' in kinds and 'singlebandpseudocolor' in kinds, kinds
+assert not said, said
+words = f'{len(layers)} layers, one CRS, styles of dem and risk, no warning'
+print(Qgis.QGIS_VERSION.split('-')[0] + '|' + words)
+"""
+
+GLTF = """
+const v = require(process.argv[1] + '/gltf-validator'), fs = require('fs');
+v.validateBytes(new Uint8Array(fs.readFileSync(process.argv[2]))).then((r) => {
+  const n = r.issues;
+  if (n.numErrors || n.numWarnings) { console.error(JSON.stringify(n.messages)); process.exit(1); }
+  console.log(v.version() + '|' + r.info.totalTriangleCount + ' triangles, no error, no warning');
+});
+"""
+
+
+def run_of(*command: str | Path, **kw: Any) -> str:
+    done = subprocess.run([str(c) for c in command], capture_output=True, text=True, check=False, **kw)
+    if done.returncode:
+        raise AssertionError(" ".join(done.stderr.split())[-300:])
+    return done.stdout
+
+
+class Opened:
+    """A run with its exports, and what is right: the elevations of ``dem.tif`` as rasterio reads them."""
+
+    def __init__(self, run: Path, exports: Path) -> None:
+        self.run, self.exports = run, exports
+        rille_command = Path(sys.executable).with_name("rille")
+        for kind in EXPORTS:
+            run_of(rille_command, "export", run, "--to", kind, "-o", exports / kind)
+        with rasterio.open(run / "dem.tif") as dem:
+            self.z, self.crs = dem.read(1), dem.crs
+        self.known = int(np.isfinite(self.z).sum())
+        self.range = float(np.nanmin(self.z)), float(np.nanmax(self.z))
+
+    def rasters(self) -> list[Path]:
+        return [self.run / f"{name}.tif" for name in RASTERS]
+
+
+def gdal_within(o: Opened) -> tuple[str, str]:
+    for path in o.rasters():
+        with rasterio.open(path) as found:
+            assert found.crs == o.crs, path
+            assert found.shape == o.z.shape, path
+    with rasterio.open(f'ZARR:"{o.run / "terrain.zarr"}":/elevation') as found:
+        np.testing.assert_array_equal(found.read(1), o.z)
+    return rasterio.__gdal_version__, f"{len(RASTERS)} GeoTIFFs, one CRS; terrain.zarr: the same elevations"
+
+
+def gdal_of_the_system(o: Opened) -> tuple[str, str]:
+    for path in o.rasters():
+        said = json.loads(run_of("gdalinfo", "-json", path))
+        assert said["size"] == [o.z.shape[1], o.z.shape[0]]
+    dem = shutil.copyfile(o.run / "dem.tif", o.exports / "dem.tif")  # it writes a file beside
+    stats = json.loads(run_of("gdalinfo", "-json", "-stats", dem))
+    found = stats["bands"][0]["metadata"][""]
+    least_and_most = float(found["STATISTICS_MINIMUM"]), float(found["STATISTICS_MAXIMUM"])
+    assert np.allclose(least_and_most, o.range, atol=1e-5), least_and_most
+    return run_of("gdalinfo", "--version").split()[1].strip(
+        ","
+    ), f"{len(RASTERS)} GeoTIFFs, least and greatest elevation"
+
+
+def cogeo(o: Opened) -> tuple[str, str]:
+    rio = Path(os.environ["COGEO"]) / "bin" / "rio"
+    for path in o.rasters():
+        said = run_of(rio, "cogeo", "validate", "--strict", path)
+        assert "is a valid cloud optimized GeoTIFF" in said, said
+    words = run_of(rio, "cogeo", "--version").split()
+    return words[-1], f"{len(RASTERS)} files are valid cloud optimized GeoTIFFs, strictly"
+
+
+def qgis(o: Opened) -> tuple[str, str]:
+    with tempfile.TemporaryDirectory() as home:
+        environment = {"QT_QPA_PLATFORM": "offscreen", "HOME": home, "PATH": "/usr/bin", "XDG_RUNTIME_DIR": home}
+        files = [*o.rasters(), o.run / "path.gpkg"]
+        found, words = run_of("/usr/bin/python3", "-c", QGIS, *files, env=environment).strip().split("|")
+    return found, words
+
+
+def by_xarray(o: Opened) -> tuple[str, str]:
+    np.testing.assert_array_equal(xarray.open_zarr(o.run / "terrain.zarr").elevation, o.z)
+    with tempfile.TemporaryDirectory() as folder:
+        rille.open_run(o.run).terrain.to_netcdf(f"{folder}/terrain.nc", engine="scipy")
+        with xarray.open_dataset(f"{folder}/terrain.nc", engine="scipy") as again:
+            np.testing.assert_array_equal(again.elevation, o.z)
+    return version("xarray"), "terrain.zarr, and the same saved as NetCDF"
+
+
+def evo(o: Opened) -> tuple[str, str]:
+    tum = file_interface.read_tum_trajectory_file(str(o.run / "trajectory.tum"))
+    kitti = file_interface.read_kitti_poses_file(str(o.run / "trajectory.kitti"))
+    for trajectory in (tum, kitti):
+        ok, what = trajectory.check()
+        assert ok, what
+    np.testing.assert_allclose(tum.positions_xyz, kitti.positions_xyz, atol=1e-6)
+    return version("evo"), f"{tum.num_poses} poses as TUM and as KITTI, equal positions"
+
+
+def colmap(o: Opened) -> tuple[str, str]:
+    model = pycolmap.Reconstruction(str(o.exports / "colmap"))
+    before = {name: image.projection_center() for name, image in ((i.name, i) for i in model.images.values())}
+    stated = model.compute_mean_reprojection_error()
+    options = pycolmap.BundleAdjustmentOptions()
+    options.refine_focal_length = options.refine_extra_params = options.refine_sensor_from_rig = False
+    options.print_summary = False
+    pycolmap.bundle_adjustment(model, options)
+    moved = max(np.linalg.norm(i.projection_center() - before[i.name]) for i in model.images.values())
+    words = (
+        f"{model.num_images()} images, {model.num_points3D()} points, {stated:.2f} px; adjustment moves a centre by "
+    )
+    return version("pycolmap"), words + f"{1e3 * moved:.2f} mm at most"
+
+
+def by_laspy(o: Opened) -> tuple[str, str]:
+    cloud = laspy.read(o.exports / "laz")
+    assert len(cloud.points) == o.known
+    assert np.allclose((cloud.z.min(), cloud.z.max()), o.range, atol=1e-4)
+    return version("laspy"), f"{o.known} points, colours, sigma"
+
+
+def pdal(o: Opened) -> tuple[str, str]:
+    copy = shutil.copyfile(o.exports / "laz", o.exports / "cloud.laz")
+    found = json.loads(run_of("pdal", "info", "--stats", copy))["stats"]["statistic"]
+    z = next(s for s in found if s["name"] == "Z")
+    assert z["count"] == o.known
+    assert np.allclose((z["minimum"], z["maximum"]), o.range, atol=1e-4)
+    assert any(s["name"] == "sigma" for s in found)
+    return run_of("pdal", "--version").split("pdal ")[1].split()[0], f"{o.known} points, colours, sigma"
+
+
+def by_trimesh(o: Opened) -> tuple[str, str]:
+    cloud = trimesh.load(o.exports / "ply", file_type="ply")
+    assert len(cloud.vertices) == o.known
+    (mesh,) = trimesh.load(o.exports / "glb", file_type="glb").geometry.values()
+    return version("trimesh"), f"PLY: {o.known} points; GLB: {len(mesh.faces)} triangles with texture"
+
+
+def khronos(o: Opened) -> tuple[str, str]:
+    found, words = run_of("node", "-e", GLTF, os.environ["GLTF_VALIDATOR"], o.exports / "glb").strip().split("|")
+    return found, words
+
+
+def by_rosbags(o: Opened) -> tuple[str, str]:
+    with AnyReader([o.exports / "grid_map"]) as reader:
+        ((connection, _, data),) = reader.messages()
+        message = reader.deserialize(data, connection.msgtype)
+    z = message.data[message.layers.index("elevation")].data
+    assert np.allclose((np.nanmin(z), np.nanmax(z)), o.range, atol=1e-5)
+    return version("rosbags"), f"GridMap with {', '.join(message.layers)}"
+
+
+def there(*programs: str) -> bool:
+    return all(shutil.which(p) for p in programs)
+
+
+PROGRAMS: dict[str, tuple[Callable[[Opened], tuple[str, str]], bool]] = {
+    "GDAL, in rasterio": (gdal_within, True),
+    "GDAL, of the system": (gdal_of_the_system, there("gdalinfo")),
+    "rio-cogeo": (cogeo, "COGEO" in os.environ),
+    "QGIS, offscreen": (qgis, Path("/usr/lib/python3/dist-packages/qgis").is_dir()),
+    "xarray": (by_xarray, True),
+    "evo": (evo, True),
+    "pycolmap": (colmap, True),
+    "laspy": (by_laspy, True),
+    "PDAL": (pdal, there("pdal")),
+    "trimesh": (by_trimesh, True),
+    "Khronos glTF validator": (khronos, "GLTF_VALIDATOR" in os.environ and there("node")),
+    "rosbags": (by_rosbags, True),
+}
+"""Check and whether the program is here."""
+
+
+def main() -> int:
+    with contextlib.redirect_stdout(sys.stderr):
+        run = Path(sys.argv[1]) if len(sys.argv) > 1 else rille.reconstruct("mockup-short").folder
+    failed = 0
+    print("| program | version | what it read |\n|---|---|---|")
+    with tempfile.TemporaryDirectory() as exports:
+        opened = Opened(run.resolve(), Path(exports))
+        for name, (check, here) in PROGRAMS.items():
+            try:
+                found, words = check(opened) if here else ("-", "not installed here")
+            except AssertionError as error:
+                found, words, failed = "?", f"**failed**: {' '.join(str(error).split())[:300]}", failed + 1
+            print(f"| {name} | {found} | {words} |", flush=True)
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
