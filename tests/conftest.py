@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 from pathlib import Path
+from typing import NoReturn
 
 import pytest
 
@@ -20,19 +21,17 @@ def data_dir() -> Path:
     folder = Path(name) if name else None
     if folder is not None and folder.is_dir():
         return folder
-    reason = f"RILLE_DATA={name!r} is not a folder of real sequences"
-    if os.environ.get("RILLE_REQUIRE_DATA") == "1":
-        pytest.fail(reason)
-    pytest.skip(reason)
+    return missing(f"RILLE_DATA={name!r} is not a folder of real sequences", "RILLE_REQUIRE_DATA")
 
 
 @pytest.fixture(scope="session")
 def chromium() -> str:
     """Path of chromium; absence skips, or fails under RILLE_REQUIRE_BROWSER=1."""
-    found = shutil.which("chromium")
-    if found is None:
-        reason = "chromium is not installed"
-        if os.environ.get("RILLE_REQUIRE_BROWSER") == "1":
-            pytest.fail(reason)
-        pytest.skip(reason)
-    return found
+    return shutil.which("chromium") or missing("chromium is not installed", "RILLE_REQUIRE_BROWSER")
+
+
+def missing(what: str, required: str) -> NoReturn:
+    """Skip a test for what this machine lacks, or fail it where the variable ``required`` is 1, as in CI."""
+    if os.environ.get(required) == "1":
+        pytest.fail(what)
+    pytest.skip(what)
