@@ -40,9 +40,8 @@ def drive(sequence: Any, config: Any, goal: tuple[float, float]) -> dict[str, An
 
     from rille.stages.core.declare import Bundle
     from rille.stages.hazard.risk import risk_map
-    from rille.stages.planning.local_planner.memory import PlannerMemory
+    from rille.stages.planning.local_planner.look import FieldOfView, PlannerMemory
     from rille.stages.planning.local_planner.stage import SeenGround, next_leg, shortest_way
-    from rille.stages.planning.local_planner.views import FieldOfView
     from rille.stages.terrain.occlusion_bounds import Bounds, ceiling
 
     bed, vehicle, p = ExactBed.of(sequence, config, goal), config.vehicle, config.leg

@@ -452,7 +452,7 @@ EDITS: dict[str, tuple[str, str, str, set[str]]] = {
     "the engine": ("pipeline/engine/scheduler.py", "HEALS = 3", "HEALS = 4", set()),
     "the report": ("pipeline/report/words.py", "", "\nMORE = 1\n", set()),
     "a stage itself": ("stages/terrain/merge.py", "", "\nMORE = 1\n", {"merge"}),
-    "a helper of one stage": ("stages/planning/row_grid.py", "", "\nMORE = 1\n", {"path/local", "path/world"}),
+    "a helper of one stage": ("stages/planning/path_words.py", "", "\nMORE = 1\n", {"path/local", "path/world"}),
     "a njit callee of one stage": (
         "stages/terrain/locus/kernel.py",
         "",

@@ -56,11 +56,10 @@ def shortest_within_limits(bed: ExactBed, goal: tuple[float, float], params: Any
     sides = ground.x0, ground.x0 + ground.cell * (cols - 1), ground.y0 - ground.cell * (rows - 1), ground.y0
     heading, spacing = heading_of(T_bed_vehicle), params.spacing * vehicle.wheel_diameter
     grid = PoseGrid.over(Lattice.snap(sides, ground.cell), (x, y), heading, spacing)
-    limits, known = Limits(ground, vehicle), list[Mask]()
+    limits = Limits(ground, vehicle)
 
-    def price(free: Any, *pose: Floats) -> Floats:
-        known.append(free)
-        return np.where(free, 1.0, np.inf)
+    def price(free: Any, *pose: Floats) -> tuple[Mask, Floats]:
+        return free, np.where(free, 1.0, np.inf)
 
     graph = PoseGraph.of(limits, grid, price)  # type: ignore[arg-type]
     px, py = grid.xy(*np.meshgrid(*(np.arange(n, dtype=np.float64) for n in grid.shape), indexing="ij"))
@@ -68,5 +67,5 @@ def shortest_within_limits(bed: ExactBed, goal: tuple[float, float], params: Any
     cost, move = graph.search(goals, 0.0, 1.0)
     if not np.isfinite(cost[0, grid.origin[0], grid.origin[1]]):
         return None
-    way = pieces(graph, tuple(np.stack(known[kind::3]) for kind in range(3)), graph.follow(move))
+    way = pieces(graph, graph.follow(move))
     return length_of(straightened(way, heading, limits.clear, ground.cell))

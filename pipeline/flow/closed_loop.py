@@ -52,7 +52,7 @@ from rille.stages.geometry.lattice import Lattice
 from rille.stages.odometry import motion
 from rille.stages.odometry.resection import trajectory
 from rille.stages.planning.local_planner import stage as local_planner
-from rille.stages.planning.local_planner.memory import PlannerMemory
+from rille.stages.planning.local_planner.look import PlannerMemory
 from rille.stages.terrain import map_localization, merge, occlusion_bounds, start_area
 
 

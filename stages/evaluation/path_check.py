@@ -14,9 +14,8 @@ from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.risk import HAZARDOUS, UNKNOWN
 from rille.stages.hazard.vehicle import Vehicle
 from rille.stages.planning import grid8
-from rille.stages.planning.path_ground import Maps, PathMaps, PathPrices
+from rille.stages.planning.path_ground import Maps, PathMaps, PathPrices, RowGrid
 from rille.stages.planning.row_graph import UNREACHED
-from rille.stages.planning.row_grid import RowGrid
 
 Floats = NDArray[np.float64]
 

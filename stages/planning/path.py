@@ -38,15 +38,14 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from rille.stages.core.declare import Array, Bundle, Inputs, Memory, Params, Stage
+from rille.stages.core.errors import InputError
 from rille.stages.geometry.lattice import Lattice
-from rille.stages.hazard.risk import HAZARDOUS, check_size
+from rille.stages.hazard.risk import HAZARDOUS, UNKNOWN, check_size
 from rille.stages.hazard.vehicle import Vehicle
 from rille.stages.planning import grid8
-from rille.stages.planning.path_ends import Point, check_end, chosen
-from rille.stages.planning.path_ground import GROUNDS, PathMaps, PathPrices
-from rille.stages.planning.path_words import Maps, Route, describe
-from rille.stages.planning.row_graph import UNREACHED, Plan, plan, row_span
-from rille.stages.planning.row_grid import RowGrid
+from rille.stages.planning.path_ground import GROUNDS, Maps, PathMaps, PathPrices, Point, RowGrid
+from rille.stages.planning.path_words import Route, describe, hazard_words
+from rille.stages.planning.row_graph import UNREACHED, Cell, Plan, nearest_middle, plan, row_span
 
 __all__ = ["STAGE", "PathParams", "Route", "describe", "find_path"]
 
@@ -122,7 +121,7 @@ def find_path(
     start, target = ends
     for name, point in (("start", start), ("target", target)):
         if point is not None:
-            check_end(maps, lattice, vehicle, name, point)
+            _check_end(maps, lattice, vehicle, name, point)
     if start is not None and target is not None:
         heading = (target[0] - start[0], target[1] - start[1])
     found = _found(maps, lattice, vehicle, heading, ends, stretch, p)
@@ -209,7 +208,7 @@ def _by_grid(
     cells, cost, name = nothing, np.full(ground.height.shape, UNREACHED), GROUNDS[0]
     for name in ground.worth() if given == (None, None) else GROUNDS:
         ways = ground.ways(name)
-        first, last = chosen(ground, name, *given)
+        first, last = _chosen(ground, name, *given)
         if first is None or last is None or not ways[first] or not ways[last]:
             continue
         cost, step = grid8.cost_to_go(ground.height, ways, last, first, unit, ground.toll)
@@ -224,6 +223,56 @@ def _by_grid(
         found.reachable[cells[-1, 1]] = True
     metres = ground.metres(cost, UNREACHED)
     return Route(cells, ground.xyz(cells), found, grid, "grid8", name, metres, row_span(~ground.closed) or (0, 0))
+
+
+def _check_end(maps: Maps, lattice: Lattice, vehicle: Vehicle, name: str, point: Point) -> None:
+    """Refuse a start or target outside the map, in a hazard or on unknown ground, with the figure that decides."""
+    row, col = (int(v) for v in np.rint(lattice.index(point)))
+    where = f"path.{name} ({point[0]:g}, {point[1]:g}) m"
+    if not (0 <= row < lattice.rows and 0 <= col < lattice.cols):
+        x0, x1, y0, y1 = lattice.bounds
+        raise InputError(
+            "RIL-406",
+            f"{where} is outside the map",
+            remedy=f"give x in {x0:.3f}..{x1:.3f} and y in {y0:.3f}..{y1:.3f} m",
+        )
+    kind = maps["risk"][row, col]
+    if kind == UNKNOWN:
+        free = np.argwhere(maps["risk"] < HAZARDOUS)
+        away = (
+            f", the nearest ground to drive on is {_away(free, row, col, lattice.cell):.3g} m away" if len(free) else ""
+        )
+        raise InputError("RIL-407", f"{where} lies on unknown ground{away}", remedy=f"choose another {name}")
+    if kind == HAZARDOUS:
+        raise InputError(
+            "RIL-408",
+            f"{where} lies in a hazard: {hazard_words(maps, (row, col), vehicle)}",
+            remedy=f"choose another {name}",
+        )
+
+
+def _away(cells: NDArray[np.intp], row: int, col: int, cell: float) -> float:
+    return float(np.hypot(cells[:, 0] - row, cells[:, 1] - col).min()) * cell
+
+
+def _chosen(ground: PathMaps, below: str, start: Cell | None, target: Cell | None) -> tuple[Cell | None, Cell | None]:
+    """Ends as given; else, of the connected ground over most rows (that of the end that is given), the cell nearest to
+    the middle of the first row, and the one nearest to that of the last.
+
+    Parameters
+    ----------
+    below : of :data:`rille.stages.planning.path_ground.GROUNDS`, what stays on known ground.
+    """
+    span = row_span(ground.ways(below) > 0)
+    if span is None or (start is not None and target is not None):
+        return (None, None) if span is None else (start, target)
+    number, spans = ground.parts(below)
+    given = start if start is not None else target
+    part = int(number[given]) if given is not None else int(np.argmax(spans[:, 1] - spans[:, 0]))
+    if part < 0:
+        return start, target
+    cells = number == part
+    return start or nearest_middle(cells, span[1]), target or nearest_middle(cells, span[0])
 
 
 def _run(params: PathParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,13 +13,11 @@ from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.measures import MEASURES
 from rille.stages.hazard.risk import CAUTION, HAZARDOUS, UNKNOWN
 from rille.stages.hazard.vehicle import Vehicle
-from rille.stages.planning.path_ground import GROUNDS
+from rille.stages.planning.path_ground import GROUNDS, Maps, RowGrid
 from rille.stages.planning.row_graph import Plan
-from rille.stages.planning.row_grid import RowGrid
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
-Maps = Mapping[str, NDArray[Any]]
 
 
 @dataclass(frozen=True)

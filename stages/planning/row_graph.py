@@ -18,7 +18,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rille.stages.planning.configuration_space import ALL, LEFT, RIGHT, STRAIGHT
+from rille.stages.planning.configuration_space import LEFT, RIGHT, STRAIGHT
 
 Ints = NDArray[np.integer[Any]]
 Mask = NDArray[np.bool_]
@@ -36,7 +36,7 @@ class Plan:
 
     ``cells`` (vertex, 2) row, column from start to target, empty where there is no path; ``cost`` (row, col) int64 of
     :func:`sweep`; ``reachable`` (col,) of ``target_row``; ``blocking_row`` the first row that cannot be entered and
-    ``reason`` in words, both empty where a path was found. ``beside_unknown``: no path keeps half a wheel from unknown.
+    ``reason`` in words, both empty where a path was found.
     """
 
     cells: NDArray[np.int64]
@@ -45,23 +45,19 @@ class Plan:
     target_row: int
     blocking_row: int | None = None
     reason: str = ""
-    beside_unknown: bool = False
-
-
-def ways_of(free: Mask | Ways) -> Ways:
-    """Directions (row, col) as bits; a mask means all or none."""
-    return np.where(free, np.uint8(ALL), np.uint8(0)) if free.dtype == np.bool_ else np.asarray(free, np.uint8)
 
 
 def sweep(
-    height: Ints, free: Mask | Ways, sources: Mask, toll: Ints | None = None
+    height: Ints, ways: Ways, sources: Mask, toll: Ints | None = None
 ) -> tuple[NDArray[np.int64], NDArray[np.int8]]:
     """Least cost from any source to every cell of the row graph, towards row 0.
 
     Parameters
     ----------
     height : (row, col) whole numbers, any unit.
-    free, sources : (row, col) cells that may be entered, or directions as bits; cells where a path may start.
+    ways : (row, col) directions as bits in which the vehicle may stand (see
+        :mod:`rille.stages.planning.configuration_space`).
+    sources : (row, col) cells where a path may start.
     toll : (row, col) whole numbers, added on entering a cell, in the unit of the heights.
 
     Returns
@@ -69,7 +65,6 @@ def sweep(
     Cost (row, col) int64: sum of absolute height differences and tolls, times the number of rows, plus the sideways
     moves; and the index into :data:`MOVES` of the last move (-1 at sources and where not reached).
     """
-    ways = ways_of(free)
     cost, move = np.empty(height.shape, dtype=np.int64), np.empty(height.shape, dtype=np.int8)
     _sweep(np.ascontiguousarray(height), ways, np.zeros_like(height) if toll is None else toll, sources, cost, move)
     return cost, move
@@ -179,9 +174,8 @@ def _unpack(best, cost, move):  # type: ignore[no-untyped-def]
         move[c] = np.int8(best[c] & 3) if best[c] < far else np.int8(-1)
 
 
-def leading(free: Mask | Ways, limit: int) -> Mask:
+def leading(ways: Ways, limit: int) -> Mask:
     """Free cells (row, col) from which a row up to ``limit`` can be reached."""
-    ways = ways_of(free)
     out = np.empty(ways.shape, dtype=np.bool_)
     _leading(ways, limit, out)
     return out
@@ -202,7 +196,7 @@ def _leading(ways, limit, out):  # type: ignore[no-untyped-def]
 
 def plan(
     height: Ints,
-    free: Mask | Ways,
+    ways: Ways,
     tolerance: int = 0,
     ends: tuple[Cell | None, Cell | None] = (None, None),
     span: tuple[int, int] | None = None,
@@ -213,8 +207,8 @@ def plan(
 
     Parameters
     ----------
-    height : (row, col) rounded heights, whole numbers. ``free`` : cells that may be entered, or directions as
-        bits. Row 0 is farthest.
+    height : (row, col) rounded heights, whole numbers. Row 0 is farthest.
+    ways : (row, col) directions as bits in which the vehicle may stand.
     tolerance : rows by which a start or target that is not given may miss the nearest or farthest row with a free cell;
         at most a quarter of the rows between them.
     ends : start and target, row and column inside the grid, or None.
@@ -222,7 +216,6 @@ def plan(
     toll : see :func:`sweep`.
     explain : where there is no path, find out how far one can go.
     """
-    ways = ways_of(free)
     rows, cols = ways.shape
     start, target = ends
     first_last = span or row_span(ways > 0)

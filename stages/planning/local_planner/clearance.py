@@ -33,21 +33,20 @@ Mask = NDArray[np.bool_]
 NEAR_UNKNOWN = 0.5
 """Cells; nearer than this a point of the belly lies in an unknown cell."""
 
-PARTS = 5
-"""Of a vehicle that stand on ground: its wheels and its middle."""
-
-DOUBT_WEIGHT = 60
-"""Of ground that is hazardous by sigma alone, or doubted, against caution: a wheel there makes a way more than three
-times as dear."""
+CAUTION_GROUND, DOUBTED_GROUND = 1, 2
+"""Classes of ground that costs more than its length; 0: any other."""
 
 
 @dataclass(frozen=True)
 class Gaps:
-    """Of each pose, float32: ``gap`` m to the nearest hazard that is none by sigma alone (from wheel to what is
-    hazardous to wheels, from the middle to what is to the vehicle), ``doubtful`` m to those that are, ``proven`` m to
-    those that are proven, ``unknown`` m at least from the belly, and beyond the margin from the wheels, to unknown
-    ground (not positive: on it, or too near), ``frontier`` m to that of it where a wheel has room, ``caution`` share of
-    wheels and middle on caution ground. With its middle outside the map a vehicle is within a hazard."""
+    """How near poses are to what they must not touch, float32; with its middle off the map a vehicle is in a hazard.
+
+    ``gap``: metres to the nearest hazard that is none by sigma alone, from the wheels to what is hazardous to wheels
+    and from the middle to what is to the vehicle; ``doubtful``: to hazards by sigma alone; ``proven``: to proven ones.
+    ``unknown``: metres, at least, from the belly to unknown ground, and from the wheels beyond their margin; not
+    positive: on it, or too near. ``frontier``: the same to that of it where a wheel has room. ``caution``,
+    ``doubted``: how many of the four wheels and the middle stand on caution ground and on doubted ground.
+    """
 
     gap: Floats32
     doubtful: Floats32
@@ -55,6 +54,7 @@ class Gaps:
     unknown: Floats32
     frontier: Floats32
     caution: Floats32
+    doubted: Floats32
 
 
 class Hazards(NamedTuple):
@@ -68,8 +68,8 @@ class Hazards(NamedTuple):
 
 class KnownGround(NamedTuple):
     """Masks (row, col): ``unknown``, where the vehicle may not stand for what is not known, None: the unknown class;
-    ``glanced``, where of it something is known nevertheless; ``doubted`` ground, which costs as much as a doubtful
-    hazard."""
+    ``glanced``, where of it something is known nevertheless; ``doubted`` ground, which costs as much as a hazard by
+    sigma alone that is driven on."""
 
     unknown: Mask | None = None
     glanced: Mask | None = None
@@ -82,24 +82,27 @@ class _Ground(NamedTuple):
     fields: Floats32
     unknown: Floats32
     frontier: Floats32
-    caution: NDArray[np.uint8]
+    dear: NDArray[np.uint8]
     straddle: Straddle
 
 
 @dataclass(frozen=True)
 class Footing:
-    """A risk map as a vehicle meets it: ``fields`` (6, row, col) m to hazards to a wheel that are none by sigma alone,
-    those that are, proven ones, and the same of hazards to the vehicle; ``unknown`` (row, col) m to unknown ground,
-    ``frontier`` to that of it where a wheel has room: the rest is mostly the shadows of stones; ``caution`` (row, col)
-    its weight there; ``straddle``: what of unknown ground the belly may pass over; ``glanced`` (row, col) where unknown
-    ground was seen, from afar; None: nowhere."""
+    """A risk map as a vehicle meets it; all arrays (row, col), distances in metres.
+
+    ``fields`` (6, row, col): distances to hazards to a wheel that are none by sigma alone, to those that are, and to
+    proven ones; then the same three of hazards to the vehicle. ``unknown``: distance to unknown ground; ``frontier``:
+    to that of it where a wheel has room, for the rest is mostly the shadows of stones. ``dear``: 0,
+    :data:`CAUTION_GROUND` or :data:`DOUBTED_GROUND`. ``straddle``: what of unknown ground the belly may pass over.
+    ``glanced``: where unknown ground was seen from afar; None: nowhere.
+    """
 
     lattice: Lattice
     vehicle: Vehicle
     fields: Floats32
     unknown: Floats32
     frontier: Floats32
-    caution: NDArray[np.uint8]
+    dear: NDArray[np.uint8]
     straddle: Straddle
     glanced: Mask | None = None
 
@@ -117,8 +120,8 @@ class Footing:
         """On ground of which ``bounds`` are known the belly may pass over what is not.
 
         A hazard is proven where it is not one by sigma alone, and at least as probable as ``sure``. What is one by
-        sigma alone and less probable than ``dare`` is caution ground :data:`DOUBT_WEIGHT` times, if it is not unknown.
-        So is doubted ground, and what is within a quarter of a wheel of it, where its edge touches.
+        sigma alone and less probable than ``dare`` is doubted ground, if it is not unknown. So is ground within a
+        quarter of a wheel of what is given as doubted, where a wheel's edge touches.
         """
         risk, reason, p_hazard = hazards
         unknown, glanced, doubted = known or KnownGround()
@@ -127,33 +130,33 @@ class Footing:
         bits = np.full(risk.shape, WHEEL_BITS) if reason is None else reason
         doubtful = hazardous & ((bits & DOUBT_BIT) > 0)
         likely = proven = hazardous & ~doubtful
-        caution = (risk == CAUTION).astype(np.uint8)
+        dear = np.where(risk == CAUTION, np.uint8(CAUTION_GROUND), np.uint8(0))
         if p_hazard is not None:
             proven = likely & (p_hazard >= sure)
             dared = doubtful & (p_hazard < dare)
             doubtful &= ~dared
-            caution[dared & ~unknown] = DOUBT_WEIGHT
+            dear[dared & ~unknown] = DOUBTED_GROUND
         if doubted is not None:
-            caution[(_distance(doubted, cell) <= 0.25 * vehicle.wheel_diameter) & ~unknown] = DOUBT_WEIGHT
+            dear[(_distance(doubted, cell) <= 0.25 * vehicle.wheel_diameter) & ~unknown] = DOUBTED_GROUND
         kinds = [(bits & which) > 0 for which in (WHEEL_BITS, BODY_BITS)]
         fields = np.stack([_distance(mask & kind, cell) for kind in kinds for mask in (likely, doubtful, proven)])
         wide = _opened(unknown, 0.5 * vehicle.wheel_diameter, cell)
         void = _distance(unknown if bounds is None else unknown & np.isnan(bounds.upper), cell)
         straddle = Straddle.of(void, bounds, vehicle, _belly(vehicle), cell)
         unseen, frontier = _distance(unknown, cell), _distance(wide, cell)
-        return Footing(lattice, vehicle, fields, unseen, frontier, caution, straddle, glanced)
+        return Footing(lattice, vehicle, fields, unseen, frontier, dear, straddle, glanced)
 
     def gaps(self, x: Floats, y: Floats, heading: Floats) -> Gaps:
         """At poses: x, y of the middle (m) and heading (rad to the left of y), arrays of one shape."""
         at = self.lattice.index(np.stack([x, y], axis=-1)).reshape(-1, 2)
         turn = np.broadcast_to(heading, np.shape(x)).reshape(-1)
-        out = np.empty((6, len(at)), np.float32)
+        out = np.empty((7, len(at)), np.float32)
         cell = self.lattice.cell
         # beyond the circle about the vehicle, and what rounding to cells takes, nothing is beneath it
         around = 0.5 * math.hypot(self.vehicle.track, self.vehicle.wheel_base) + 1.5 * cell
         reach = np.array([around + self.vehicle.margin, cell, self.vehicle.margin], np.float32)
         parts = wheel_positions(self.vehicle) / cell, _belly(self.vehicle) / cell
-        ground = _Ground(self.fields, self.unknown, self.frontier, self.caution, self.straddle)
+        ground = _Ground(self.fields, self.unknown, self.frontier, self.dear, self.straddle)
         _gaps((at, np.cos(turn), np.sin(turn)), parts, ground, reach, out)
         out[3:5] -= NEAR_UNKNOWN * cell
         return Gaps(*(a.reshape(np.shape(x)) for a in out))
@@ -198,19 +201,19 @@ def _belly(vehicle: Vehicle) -> Floats:
 
 @njit(cache=True, nogil=True)
 def _gaps(poses, parts, ground, reach, out):  # type: ignore[no-untyped-def]
-    """Fill ``out`` (6, n) with the fields of :class:`Gaps`, in its order.
+    """Fill ``out`` (7, n) with the fields of :class:`Gaps`, in its order.
 
     ``poses``: row and column (n, 2), cosine and sine (n,) of the heading; ``parts``: wheels and points of the belly,
     right and ahead, cells; ``reach``: see :meth:`Footing.gaps`.
     """
     at, cosine, sine = poses
     wheels, belly = parts
-    fields, unknown, frontier, caution, straddle = ground
+    fields, unknown, frontier, dear, straddle = ground
     rows, cols = unknown.shape
     stand, heights = np.empty((4, 2), dtype=np.int64), np.empty(4)
     for n in range(at.shape[0]):
         row, col, c, s = at[n, 0], at[n, 1], cosine[n], sine[n]
-        for k in range(6):
+        for k in range(7):
             # On unknown ground, unless all wheels are found on the map below.
             out[k, n] = np.float32(-1.0) if k == 3 or k == 4 else np.float32(0.0)
         i, j = math.floor(row + 0.5), math.floor(col + 0.5)
@@ -218,7 +221,7 @@ def _gaps(poses, parts, ground, reach, out):  # type: ignore[no-untyped-def]
             out[0, n] = out[1, n] = out[2, n] = -np.inf
             continue
         gap, doubtful, proven = fields[3, i, j], fields[4, i, j], fields[5, i, j]
-        share = np.float32(caution[i, j])
+        cautious, doubted = int(dear[i, j] == CAUTION_GROUND), int(dear[i, j] == DOUBTED_GROUND)
         spare = unknown[i, j] - reach[0]
         outside, least, wide = False, np.float32(np.inf), np.float32(np.inf)
         for k in range(4):
@@ -230,9 +233,10 @@ def _gaps(poses, parts, ground, reach, out):  # type: ignore[no-untyped-def]
             stand[k, 0], stand[k, 1] = i, j
             gap, doubtful = min(gap, fields[0, i, j]), min(doubtful, fields[1, i, j])
             proven = min(proven, fields[2, i, j])
-            share += caution[i, j]
+            cautious += dear[i, j] == CAUTION_GROUND
+            doubted += dear[i, j] == DOUBTED_GROUND
             least, wide = min(least, unknown[i, j] - reach[2]), min(wide, frontier[i, j] - reach[2])
-        out[0, n], out[1, n], out[2, n], out[5, n] = gap, doubtful, proven, share / np.float32(PARTS)
+        out[0, n], out[1, n], out[2, n], out[5, n], out[6, n] = gap, doubtful, proven, cautious, doubted
         if outside:
             continue
         # No unknown ground within the circle about the vehicle: its belly need not be looked at point by point.

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from rille.stages.planning.local_planner.clearance import DOUBT_WEIGHT, PARTS, Footing, Gaps
+from rille.stages.planning.local_planner.clearance import Footing, Gaps
 from rille.stages.planning.local_planner.params import LegParams
 from rille.stages.planning.local_planner.route import STEP_TURN, Piece, pieces, turnable
 from rille.stages.planning.local_planner.state_lattice import PoseGraph, PoseGrid
@@ -26,6 +26,10 @@ ASIDE = tuple(math.radians(d) for d in (3.0, -3.0, 6.0, -6.0, 9.0, -9.0))
 """Headings off the present one from which a way is looked for where there is none: a graph's headings are some 20
 degrees apart, and out of a narrow place a way may lead at those between alone."""
 
+DOUBT_WEIGHT = 60
+"""Price of doubted ground over that of caution ground: one wheel there makes a way more than three times as dear."""
+PARTS = 5
+"""Parts of a vehicle that stand on ground: its wheels and its middle."""
 HERE = 0.3
 """Wheel bases: ground so near to where it stands may be as that under it is."""
 NEARER = 2.0
@@ -58,8 +62,7 @@ class Ground:
         self.unknown_here = min(0.0, float(at.unknown[0]) - 1.5 * self.cell)
         spacing = max(p.spacing * self.vehicle.wheel_diameter, self.cell)
         self.grid = PoseGrid.over(footing.lattice, start, heading + aside, spacing)
-        self._sure: list[Mask] = []
-        self.graph = PoseGraph.of(footing, self.grid, self._prices)
+        self.graph = PoseGraph.of(footing, self.grid, self._price)
 
     def _split(self, gaps: Gaps, x: Floats, y: Floats, slack: float = 0.0) -> tuple[Mask, Mask]:
         """Poses that may be driven, and those that may be planned over; the margin may lack ``slack`` m.
@@ -85,11 +88,6 @@ class Ground:
     def _seen(self, gaps: Gaps, near: Mask) -> Mask:
         return np.asarray(gaps.unknown > np.where(near, self.unknown_here, 0.0))
 
-    def _prices(self, gaps: Gaps, x: Floats, y: Floats, heading: Floats) -> Floats:
-        known, price = self._price(gaps, x, y)
-        self._sure.append(known)
-        return price
-
     def _price(self, gaps: Gaps, x: Floats, y: Floats, slack: float = 0.0) -> tuple[Mask, Floats]:
         """Poses that may be driven, and the price of a metre, infinite where none may be planned."""
         known, opened = self._split(gaps, x, y, slack)
@@ -101,7 +99,7 @@ class Ground:
         unknown = np.where(blind, np.maximum(self.p.blind_price, unseen), unseen)
         stays = (gaps.gap <= self.vehicle.margin) | ((gaps.unknown <= 0) & (gaps.frontier > 0))
         unknown = np.where(stays, np.maximum(self.p.doubt_price, unknown), unknown)
-        caution = self.p.caution_price * gaps.caution
+        caution = self.p.caution_price * ((gaps.caution + DOUBT_WEIGHT * gaps.doubted) / PARTS)
         # not dearer than if nothing were known of it
         fades = (away > NEARER * self.p.blind) & ~stays
         caution = np.where(fades, np.minimum(caution, self.p.unknown_price - 1.0), caution)
@@ -118,10 +116,6 @@ class Ground:
         row, col = (np.where(inside, at[..., k], 0) for k in (0, 1))
         return np.asarray(~inside | mask[row, col])
 
-    def known(self) -> tuple[Mask, ...]:
-        """Poses, steps and turns of the graph that may be driven, each (heading over half a turn, row, col)."""
-        return tuple(np.stack(self._sure[kind::3]) for kind in range(3))
-
     def clear(self, x: Floats, y: Floats, heading: Floats) -> bool:
         """Whether all of these poses may be driven."""
         return bool(self.free(x, y, heading).all())
@@ -129,7 +123,7 @@ class Ground:
     def plain(self, x: Floats, y: Floats, heading: Floats) -> bool:
         """Whether all of these poses may be driven and no wheel stands on doubtful ground there."""
         gaps = self.footing.gaps(x, y, heading)
-        return bool((self._split(gaps, x, y)[0] & (gaps.caution < DOUBT_WEIGHT / PARTS)).all())
+        return bool((self._split(gaps, x, y)[0] & (gaps.doubted == 0)).all())
 
     def free(self, x: Floats, y: Floats, heading: Floats) -> Mask:
         """Which of these poses may be driven."""
@@ -163,7 +157,7 @@ class Ground:
 
     def way(self, move: NDArray[np.int8]) -> list[Piece]:
         """The way from the start in steps."""
-        return pieces(self.graph, self.known(), self.graph.follow(move))
+        return pieces(self.graph, self.graph.follow(move))
 
     def again(self, way: Sequence[Piece]) -> tuple[list[Piece], float]:
         """A way that was planned before, from the start: which of it is known now, and its cost at present prices.

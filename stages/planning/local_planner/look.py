@@ -1,4 +1,7 @@
-"""Where a vehicle looks next: at the ground for which its way is not known to be free, from where that comes into view.
+"""Where a vehicle looks: the ground in view of its cameras, what it remembers of its looks, and where it looks next.
+
+The view is that of the cameras' geometry alone: what hides behind stones is left out. The next look is at the ground
+for which the way is not known to be free, from where that comes into view.
 
 What lies nearer than the images show, or to the side, is looked at before the vehicle comes too near to it, or from
 farther back; by the geometry of the cameras. What was in view already, from the same side and no farther, and is not
@@ -8,19 +11,28 @@ known nevertheless, hides behind a stone or is the stone: looking again shows no
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 from rille.stages.planning.local_planner.ground import Ground
 from rille.stages.planning.local_planner.route import Piece, length_of, room_to_turn
-from rille.stages.planning.local_planner.views import FieldOfView, Stand, bearing, looked
 
 Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 Point = tuple[float, float]
+Stand = tuple[float, float, float]
+"""x, y (m) of the middle of a vehicle and its heading (rad to the left of y)."""
 
+RIM = 0.04
+"""Share of the image's width and height along its border on which is not relied: no window fits there, and the vehicle
+stands a little crooked."""
+MOST = 0.9
+"""Share of points that must be in view for all of them to be."""
 STEP = math.radians(5.0)
 """Between the turns that are tried."""
 ROUND = math.radians(120.0)
@@ -31,6 +43,94 @@ FARTHER = 1.25
 """Times as far a look shows less."""
 TWICE = 2
 """Looks from one side at one place are enough where they cost no way."""
+
+
+@dataclass(frozen=True)
+class FieldOfView:
+    """The ground that all cameras see from a vehicle on level ground: where ``edges @ (right, ahead, 1)`` is positive,
+    edges (edge, 3), metres in the vehicle's frame."""
+
+    edges: Floats
+
+    @staticmethod
+    def of(rig: Rig, T_vehicle_left: RigidTransform) -> FieldOfView:
+        """Of two cameras: a border of an image and the camera's centre span a plane; its line on the ground is an edge.
+
+        ``T_vehicle_left``: of the left camera in the vehicle's frame, x right, y ahead, z up from the ground.
+        """
+        right = T_vehicle_left @ rig.T_right_left.inverse()
+        return FieldOfView(np.concatenate([_edges(rig.left, T_vehicle_left), _edges(rig.right, right)]))
+
+    def sees(self, points: Floats, stand: Stand) -> Mask:
+        """Which points (n, 2), m, lie in view from a place."""
+        x, y, heading = stand
+        c, s = math.cos(heading), math.sin(heading)
+        dx, dy = points[:, 0] - x, points[:, 1] - y
+        at = np.stack([c * dx + s * dy, c * dy - s * dx, np.ones(len(points))])
+        return np.asarray((self.edges @ at > 0).all(axis=0))
+
+    def holds(self, points: Floats, stand: Stand) -> bool:
+        """Whether :data:`MOST` of these points lie in view."""
+        return bool(self.sees(points, stand).mean() >= MOST)
+
+
+def _edges(camera: Camera, T_vehicle_camera: RigidTransform) -> Floats:
+    """(4, 3): lines on the ground, positive inside."""
+    u, v = RIM * camera.width, RIM * camera.height
+    corners = np.array([[u, v], [camera.width - u, v], [camera.width - u, camera.height - v], [u, camera.height - v]])
+    rays = camera.rays(corners - 0.5) @ T_vehicle_camera.rotation.T
+    planes = np.cross(rays, np.roll(rays, -1, axis=0))  # inward, by the order of the corners
+    return np.column_stack([planes[:, :2], -planes @ T_vehicle_camera.translation])
+
+
+AHEAD = FieldOfView(np.array([[0.0, 1.0, 0.0]]))
+"""All that is before the middle of the vehicle."""
+
+
+def looked(view: FieldOfView, stands: Iterable[Stand], points: Floats) -> list[tuple[float, float]]:
+    """From where points (n, 2), m, were in view: direction (rad) and distance (m) from their middle to those places."""
+    return [bearing(points, stand) for stand in stands if view.holds(points, stand)]
+
+
+def bearing(points: Floats, stand: Stand) -> tuple[float, float]:
+    """Direction (rad, from x to y) and distance (m) from the middle of points (n, 2), m, to a place."""
+    x, y = points.mean(axis=0)
+    return math.atan2(stand[1] - y, stand[0] - x), math.hypot(stand[1] - y, stand[0] - x)
+
+
+@dataclass
+class PlannerMemory:
+    """``looks`` around since the last leg that was driven; ``closed`` places (m) about which unknown ground was looked
+    at in vain; ``stands`` from which it has looked; ``reopened``: the closed places were tried once more, as the last
+    way that is left."""
+
+    looks: int = 0
+    closed: list[Point] = field(default_factory=list)
+    stands: list[Stand] = field(default_factory=list)
+    reopened: bool = False
+
+    def after(self, verdict: str, stand: Stand, where: Point | None = None) -> Literal["end", "again", "drive"]:
+        """What follows a leg (:class:`rille.stages.planning.local_planner.stage.Leg`): the end, another plan from where
+        it stands, or the drive.
+
+        Parameters
+        ----------
+        stand : where the leg begins.
+        where : m; place that it closes.
+        """
+        if verdict == "no path" and self.closed and not self.reopened:
+            self.closed, self.looks, self.reopened = [], 0, True
+            return "again"
+        if verdict in ("goal", "no path"):
+            return "end"
+        if verdict == "closed":
+            if where is None:
+                raise ValueError("a leg that closes a place must say where")
+            self.closed, self.looks = [*self.closed, where], 0
+            return "again"
+        self.looks = {"drive": 0, "turn": self.looks, "look": self.looks + 1}[verdict]
+        self.stands = [*self.stands, stand]
+        return "drive"
 
 
 @dataclass(frozen=True)

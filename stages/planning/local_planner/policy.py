@@ -30,8 +30,7 @@ from rille.stages.core.errors import InputError
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.planning.local_planner.clearance import Footing
 from rille.stages.planning.local_planner.ground import Ground
-from rille.stages.planning.local_planner.look import ROUND, TWICE, Target
-from rille.stages.planning.local_planner.memory import PlannerMemory
+from rille.stages.planning.local_planner.look import AHEAD, ROUND, TWICE, FieldOfView, PlannerMemory, Stand, Target
 from rille.stages.planning.local_planner.params import LegParams
 from rille.stages.planning.local_planner.route import (
     Piece,
@@ -44,7 +43,6 @@ from rille.stages.planning.local_planner.route import (
     vertices,
     within_turn,
 )
-from rille.stages.planning.local_planner.views import AHEAD, FieldOfView, Stand
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]

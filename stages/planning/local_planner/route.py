@@ -44,25 +44,20 @@ class Piece:
         return Piece(self.a, b, self.heading, self.gear, self.known)
 
 
-def pieces(
-    graph: PoseGraph, known: tuple[NDArray[np.bool_], ...], moves: Sequence[tuple[int, int, int, int]]
-) -> list[Piece]:
-    """Steps of a way as pieces; a turn over unknown ground makes the piece after it unknown.
-
-    ``known``: poses, steps and turns of the graph that are.
-    """
+def pieces(graph: PoseGraph, moves: Sequence[tuple[int, int, int, int]]) -> list[Piece]:
+    """Steps of a way as pieces; a turn over unknown ground makes the piece after it unknown."""
     out: list[Piece] = []
-    grid, sure = graph.grid, True
+    grid, (pose, step, turn), sure = graph.grid, graph.known, True
     for (k, r, c, m), (k1, r1, c1, _) in itertools.pairwise(moves):
         if m in (AHEAD, BACK):
             begin = (r, c) if (m == AHEAD) == (k % 16 < 8) else (r1, c1)
-            here = known[0][k % 8, r, c] and known[0][k % 8, r1, c1] and known[1][k % 8, begin[0], begin[1]]
+            here = pose[k % 8, r, c] and pose[k % 8, r1, c1] and step[k % 8, begin[0], begin[1]]
             x, y = grid.xy(np.array([r, r1], np.float64), np.array([c, c1], np.float64))
             a, b = (float(x[0]), float(y[0])), (float(x[1]), float(y[1]))
             out.append(Piece(a, b, grid.heading + angle_of(k), 1 if m == AHEAD else -1, bool(here and sure)))
             sure = True
         else:
-            sure = sure and bool(known[2][min(k, k1) % 8, r, c] and known[0][k1 % 8, r, c])
+            sure = sure and bool(turn[min(k, k1) % 8, r, c] and pose[k1 % 8, r, c])
     return out
 
 

@@ -20,10 +20,9 @@ from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.classification import HAZARDOUS, UNKNOWN, UNSEEN_BIT
 from rille.stages.hazard.vehicle import Vehicle
 from rille.stages.planning.local_planner.clearance import Footing, Hazards, KnownGround
-from rille.stages.planning.local_planner.memory import PlannerMemory
+from rille.stages.planning.local_planner.look import FieldOfView, PlannerMemory, Stand
 from rille.stages.planning.local_planner.params import LegParams
 from rille.stages.planning.local_planner.policy import Before, Leg, plan_leg, shortest
-from rille.stages.planning.local_planner.views import FieldOfView, Stand
 from rille.stages.terrain.occlusion_bounds import Bounds
 
 Point = tuple[float, float]

@@ -24,8 +24,9 @@ from rille.stages.planning.local_planner.clearance import Footing, Gaps
 
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
-Prices = Callable[[Gaps, Floats, Floats, Floats], Floats]
-"""Price a metre of poses: their gaps, x, y (m), heading (rad)."""
+Mask = NDArray[np.bool_]
+Prices = Callable[[Gaps, Floats, Floats], tuple[Mask, Floats]]
+"""Of poses by their gaps, x and y (m): whether they may be driven on what is known, and the price of a metre."""
 
 HALF = 8
 STEPS = np.array([(-1, 0), (-2, -1), (-1, -1), (-1, -2), (0, -1), (1, -2), (1, -1), (2, -1)])
@@ -73,18 +74,19 @@ class PoseGrid:
 @dataclass(frozen=True)
 class PoseGraph:
     """Prices (heading over half a turn, row, col): of poses, of the middles of steps ahead from them and of turns to
-    the left."""
+    the left; and which of the three may be driven on what is known, masks of the same shape."""
 
     grid: PoseGrid
     pose: Floats
     step: Floats
     turn: Floats
+    known: tuple[Mask, Mask, Mask]
 
     @staticmethod
     def of(footing: Footing, grid: PoseGrid, prices: Prices) -> PoseGraph:
         """On a map; a vehicle needs the same ground backwards, so that half a turn of headings is enough."""
         row, col = np.meshgrid(*(np.arange(n, dtype=np.float64) for n in grid.shape), indexing="ij")
-        out: list[list[Floats]] = [[], [], []]
+        price, known = (np.empty((3, HALF, *grid.shape), kind) for kind in (np.float64, np.bool_))
         for k in range(HALF):
             after = ANGLES[k + 1]
             dr, dc = 0.5 * STEPS[k]
@@ -92,9 +94,9 @@ class PoseGraph:
                 ((0.0, 0.0, ANGLES[k]), (dr, dc, ANGLES[k]), (0.0, 0.0, 0.5 * (ANGLES[k] + after)))
             ):
                 x, y = grid.xy(row + r, col + c)
-                heading = np.full(x.shape, grid.heading + angle)
-                out[where].append(prices(footing.gaps(x, y, heading), x, y, heading))
-        return PoseGraph(grid, *(np.stack(a) for a in out))
+                gaps = footing.gaps(x, y, np.full(x.shape, grid.heading + angle))
+                known[where, k], price[where, k] = prices(gaps, x, y)
+        return PoseGraph(grid, *price, (known[0], known[1], known[2]))
 
     def search(
         self, goals: NDArray[np.bool_], turn_price: float, back: float, *, whole: bool = False

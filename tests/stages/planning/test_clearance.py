@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.risk import CAUTION, HAZARDOUS, REASONS, SAFE, UNKNOWN
 from rille.stages.hazard.vehicle import Vehicle
-from rille.stages.planning.local_planner.clearance import DOUBT_WEIGHT, Footing, Hazards, KnownGround
+from rille.stages.planning.local_planner.clearance import DOUBTED_GROUND, Footing, Hazards, KnownGround
 
 ROVER = Vehicle(
     wheel_diameter=0.03, track=0.08, wheel_base=0.10, clearance=0.025, max_step=0.012, max_roughness=0.004, margin=0.01
@@ -123,21 +123,23 @@ def test_hazards_of_little_probability_are_not_proven() -> None:
 def test_caution_counts_wheels_and_middle() -> None:
     risk = np.where(X > 0.02, np.uint8(CAUTION), np.uint8(SAFE))
     footing = Footing.of(Hazards(risk), LATTICE, ROVER)
-    assert [at(footing, x, 0.0, 0.0)[3] for x in (-0.1, 0.0, 0.1)] == pytest.approx([0.0, 0.4, 1.0])
+    assert [at(footing, x, 0.0, 0.0)[3] for x in (-0.1, 0.0, 0.1)] == [0, 2, 5]
 
 
-def test_what_is_hazardous_by_sigma_alone_and_improbable_is_caution_ground_many_times() -> None:
+def test_what_is_hazardous_by_sigma_alone_and_improbable_is_doubted_ground() -> None:
     risk = np.where(np.hypot(X - 0.04, Y - 0.05) < 0.01, np.uint8(HAZARDOUS), np.uint8(SAFE))
     reason = np.full(risk.shape, REASONS["step"] | REASONS["uncertain"], np.uint16)
     p = np.full(risk.shape, 0.2, np.float32)
     hazards, here = Hazards(risk, reason, p), np.zeros((3, 1))
     daring, not_so = (Footing.of(hazards, LATTICE, ROVER, sure=0.9, dare=d).gaps(*here) for d in (0.3, 0.1))
-    assert (daring.gap[0], daring.doubtful[0], daring.caution[0]) == (np.inf, np.inf, pytest.approx(DOUBT_WEIGHT / 5))
-    assert (not_so.gap[0], not_so.doubtful[0], not_so.caution[0]) == (np.inf, 0.0, 0.0)
+    assert (daring.gap[0], daring.doubtful[0], daring.doubted[0], daring.caution[0]) == (np.inf, np.inf, 1, 0)
+    assert (not_so.gap[0], not_so.doubtful[0], not_so.doubted[0], not_so.caution[0]) == (np.inf, 0.0, 0, 0)
 
 
 def test_ground_within_a_quarter_of_a_wheel_of_doubted_ground_is_dear() -> None:
     risk = np.full(LATTICE.shape, SAFE, np.uint8)
     unknown = Y > 0.2
     footing = Footing.of(Hazards(risk), LATTICE, ROVER, KnownGround(unknown, doubted=X > 0.059))
-    assert np.array_equal(footing.caution > 0, (X > 0.054) & ~unknown)  # a cell of 5 mm beside it, not the next
+    assert np.array_equal(
+        footing.dear == DOUBTED_GROUND, (X > 0.054) & ~unknown
+    )  # a cell of 5 mm beside it, not the next

@@ -14,15 +14,14 @@ from raising import raises
 
 from rille.stages.core.declare import Bundle
 from rille.stages.hazard.risk import HAZARDOUS, REASONS, SAFE, UNKNOWN
-from rille.stages.planning.local_planner.clearance import DOUBT_WEIGHT, PARTS, Footing, Hazards, KnownGround
+from rille.stages.planning.local_planner.clearance import Footing, Hazards, KnownGround
 from rille.stages.planning.local_planner.ground import Ground
-from rille.stages.planning.local_planner.memory import PlannerMemory
+from rille.stages.planning.local_planner.look import AHEAD as ANYWHERE
+from rille.stages.planning.local_planner.look import FieldOfView, PlannerMemory, Stand
 from rille.stages.planning.local_planner.params import LegParams
 from rille.stages.planning.local_planner.policy import Leg, plan_leg, shortest
 from rille.stages.planning.local_planner.route import length_of, through
 from rille.stages.planning.local_planner.stage import SeenGround, next_leg, seen_so_far, shortest_way
-from rille.stages.planning.local_planner.views import AHEAD as ANYWHERE
-from rille.stages.planning.local_planner.views import FieldOfView, Stand
 from rille.stages.terrain.occlusion_bounds import Bounds
 
 SEEN = P.model_copy(update={"blind": 0.0})
@@ -325,7 +324,7 @@ def test_no_wheel_is_driven_over_doubtful_ground_that_can_be_gone_round() -> Non
     for piece in through(leg.path, leg.gear, 0.0):
         along = np.linspace(0.0, 1.0, 50)
         x, y = (a + along * (b - a) for a, b in zip(piece.a, piece.b, strict=True))
-        assert footing.gaps(x, y, np.full(50, piece.heading)).caution.max() < DOUBT_WEIGHT / PARTS
+        assert footing.gaps(x, y, np.full(50, piece.heading)).doubted.max() == 0
     # where there is no room to go round, it is driven over
     risk = np.where(np.abs(X) > 0.075, np.uint8(HAZARDOUS), free)
     between = plan_leg(Footing.of(Hazards(risk), LATTICE, ROVER, KnownGround(doubted=doubted)), AT, GOAL, P)

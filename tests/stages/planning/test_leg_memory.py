@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from rille.stages.planning.local_planner.memory import PlannerMemory
+from rille.stages.planning.local_planner.look import PlannerMemory
 
 HERE, THERE = (0.1, 0.2, 0.5), (0.3, 0.9)
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
-from rille.stages.planning.configuration_space import LEFT, RIGHT, STRAIGHT
+from rille.stages.planning.configuration_space import ALL, LEFT, RIGHT, STRAIGHT
 from rille.stages.planning.row_graph import UNREACHED, leading, plan, sweep
 
 
@@ -31,6 +31,11 @@ def grid(seed: int, rows: int, cols: int, blocked: float) -> tuple[np.ndarray, n
     return rng.integers(0, 9, (rows, cols)), rng.random((rows, cols)) >= blocked
 
 
+def every_way(free: np.ndarray) -> np.ndarray:
+    """Directions as bits: all of them where a cell is free."""
+    return np.where(free, np.uint8(ALL), np.uint8(0))
+
+
 def test_five_by_five_by_hand() -> None:
     """A ridge of 3 in row 2 with a saddle of 1 in column 3; the start is the middle of row 4.
 
@@ -41,7 +46,7 @@ def test_five_by_five_by_hand() -> None:
     height[2, 3] = 1
     free = np.ones((5, 5), dtype=bool)
     free[2, 4] = False
-    found = plan(height, free)
+    found = plan(height, every_way(free))
     assert found.target_row == 0
     assert found.reachable.all()
     cost = found.cost // 5
@@ -53,9 +58,9 @@ def test_five_by_five_by_hand() -> None:
 
 def test_among_equals_straight_then_left_then_right() -> None:
     flat, free = np.zeros((6, 7), dtype=np.int64), np.ones((6, 7), dtype=bool)
-    np.testing.assert_array_equal(plan(flat, free).cells[:, 1], 3)
+    np.testing.assert_array_equal(plan(flat, every_way(free)).cells[:, 1], 3)
     free[3, 3] = False  # either side takes two moves aside: the last of them is to the left, before it straight
-    np.testing.assert_array_equal(plan(flat, free).cells[:, 1], [3, 4, 4, 3, 3, 3])
+    np.testing.assert_array_equal(plan(flat, every_way(free)).cells[:, 1], [3, 4, 4, 3, 3, 3])
 
 
 @settings(max_examples=40, deadline=None)
@@ -65,7 +70,7 @@ def test_costs_equal_networkx_and_scipy(seed: int, rows: int, cols: int, blocked
     free[-1, cols // 2] = True
     source = np.zeros_like(free)
     source[-1, cols // 2] = True
-    cost, move = sweep(height, free, source)
+    cost, move = sweep(height, every_way(free), source)
     graph = nx.DiGraph()
     graph.add_node((rows - 1, cols // 2))
     graph.add_weighted_edges_from(edges(height, free))
@@ -88,7 +93,7 @@ def test_costs_equal_networkx_and_scipy(seed: int, rows: int, cols: int, blocked
 @given(seed=st.integers(0, 9999), blocked=st.floats(0.0, 0.7), tolerance=st.integers(0, 3))
 def test_a_path_is_free_monotone_and_as_cheap_as_its_cost(seed: int, blocked: float, tolerance: int) -> None:
     height, free = grid(seed, 14, 11, blocked)
-    found = plan(height, free, tolerance)
+    found = plan(height, every_way(free), tolerance)
     if len(found.cells) == 0:
         assert found.blocking_row is not None
         assert not (found.cost[found.blocking_row] < UNREACHED).any()
@@ -110,7 +115,7 @@ def test_what_leads_on_equals_networkx(limit: int) -> None:
     height, free = grid(5, 10, 9, 0.45)
     graph = nx.DiGraph([(a, b) for a, b, _ in edges(height, free)])
     graph.add_nodes_from(map(tuple, np.argwhere(free).tolist()))
-    found = leading(free, limit)
+    found = leading(every_way(free), limit)
     for node in graph:
         assert found[node] == (min(r for r, _ in {node} | nx.descendants(graph, node)) <= limit)
     assert not found[~free].any()
@@ -120,7 +125,7 @@ def test_what_leads_on_equals_networkx(limit: int) -> None:
 def test_a_closed_row_is_named(row: int) -> None:
     free = np.ones((16, 9), dtype=bool)
     free[row] = False
-    found = plan(np.zeros((16, 9), dtype=np.int64), free, tolerance=2)
+    found = plan(np.zeros((16, 9), dtype=np.int64), every_way(free), tolerance=2)
     assert len(found.cells) == 0
     assert found.blocking_row == row
     assert "row" in found.reason
@@ -131,31 +136,31 @@ def test_a_stray_cell_before_or_behind_does_not_block() -> None:
     free = np.ones((20, 15), dtype=bool)
     free[:3], free[-3:] = False, False
     free[1, 0] = free[-1, -1] = True  # each with a gap between itself and the rest
-    found = plan(np.zeros((20, 15), dtype=np.int64), free, tolerance=3)
+    found = plan(np.zeros((20, 15), dtype=np.int64), every_way(free), tolerance=3)
     np.testing.assert_array_equal(found.cells[[0, -1]], [[16, 7], [3, 7]])
-    assert plan(np.zeros((20, 15), dtype=np.int64), free, tolerance=0).blocking_row == 18
+    assert plan(np.zeros((20, 15), dtype=np.int64), every_way(free), tolerance=0).blocking_row == 18
 
 
 def test_a_closed_row_of_a_small_map_is_not_excused_by_the_vehicles_length() -> None:
     free = np.ones((12, 9), dtype=bool)
     free[5] = False
-    assert plan(np.zeros((12, 9), dtype=np.int64), free, tolerance=50).blocking_row == 5
+    assert plan(np.zeros((12, 9), dtype=np.int64), every_way(free), tolerance=50).blocking_row == 5
 
 
 def test_given_ends() -> None:
     flat, free = np.zeros((12, 12), dtype=np.int64), np.ones((12, 12), dtype=bool)
-    found = plan(flat, free, ends=((10, 1), (2, 8)))
+    found = plan(flat, every_way(free), ends=((10, 1), (2, 8)))
     np.testing.assert_array_equal(found.cells[[0, -1]], [[10, 1], [2, 8]])
-    assert "not ahead" in plan(flat, free, ends=((2, 1), (10, 1))).reason
+    assert "not ahead" in plan(flat, every_way(free), ends=((2, 1), (10, 1))).reason
     free[10, 1] = False
-    refused = plan(flat, free, ends=((10, 1), None))
+    refused = plan(flat, every_way(free), ends=((10, 1), None))
     assert (refused.blocking_row, refused.reason) == (10, "the start is not a free cell")
-    assert plan(flat, np.zeros_like(free)).reason == "there is no free cell"
+    assert plan(flat, every_way(np.zeros_like(free))).reason == "there is no free cell"
 
 
 def test_a_target_out_of_the_fan_of_the_start_is_not_reached() -> None:
     free = np.ones((6, 20), dtype=bool)
-    found = plan(np.zeros((6, 20), dtype=np.int64), free, ends=((5, 0), (0, 6)))
+    found = plan(np.zeros((6, 20), dtype=np.int64), every_way(free), ends=((5, 0), (0, 6)))
     assert len(found.cells) == 0
 
 
@@ -175,4 +180,4 @@ def test_an_edge_is_used_where_both_ends_allow_its_direction() -> None:
 def test_a_toll_is_paid_on_entering() -> None:
     flat, free, toll = np.zeros((5, 7), dtype=np.int64), np.ones((5, 7), dtype=bool), np.zeros((5, 7), dtype=np.int64)
     toll[2, 3] = 2  # two moves aside cost two parts of a step of height
-    assert plan(flat, free, toll=toll).cells[2, 1] != 3
+    assert plan(flat, every_way(free), toll=toll).cells[2, 1] != 3

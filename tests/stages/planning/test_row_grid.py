@@ -9,7 +9,7 @@ import pytest
 from raising import raises
 
 from rille.stages.geometry.lattice import Lattice
-from rille.stages.planning.row_grid import RowGrid
+from rille.stages.planning.path_ground import RowGrid
 
 CELL = 0.01
 

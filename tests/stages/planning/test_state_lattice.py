@@ -48,7 +48,8 @@ def test_costs_are_those_of_networkx(seed: int, rows: int, cols: int) -> None:
         np.where(rng.random((8, rows, cols)) < 0.25, np.inf, rng.uniform(1, 3, (8, rows, cols))) for _ in range(3)
     ]
     origin = int(rng.integers(rows)), int(rng.integers(cols))
-    graph = PoseGraph(PoseGrid((0.0, 0.0), 0.0, 0.5, (rows, cols), origin), *prices)
+    known = tuple(np.isfinite(p) for p in prices)
+    graph = PoseGraph(PoseGrid((0.0, 0.0), 0.0, 0.5, (rows, cols), origin), *prices, known)
     goals = np.zeros((rows, cols), bool)
     goal = int(rng.integers(rows)), int(rng.integers(cols))
     goals[goal] = True

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from pointing_angles import rotation_from_angles
 
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
-from rille.stages.planning.local_planner.views import RIM, FieldOfView, looked
+from rille.stages.planning.local_planner.look import RIM, FieldOfView, looked
 
 LEFT = Camera(180.0, 175.0, 150.0, 125.0, 320, 240)
 RIGHT = Camera(190.0, 190.0, 159.5, 119.5, 320, 240)
