@@ -60,6 +60,8 @@ def align(a: F32, b: F32, templates: Templates, *, noise: float, spread: float, 
         np.ascontiguousarray(a, dtype=np.float32),
         np.ascontiguousarray(b, dtype=np.float32),
         Templates(*(np.ascontiguousarray(v, dtype=np.float64) for v in templates)),
+        # Weight of the prior in squared grey levels: variance of a grey difference over that of an element of the
+        # affinity.
         (noise / spread) ** 2,
         float(reach),
         position,
@@ -81,6 +83,7 @@ def _align_all(a, b, templates, ridge, reach, position, error):  # type: ignore[
         # Inverse compositional: derivatives are those of the template, so one factorisation serves all steps.
         if not _factor(gram):
             continue
+        # Steps are composed into the copy; the prior pulls towards what was given.
         m = affinity[n].copy()
         x, y = start[n, 0], start[n, 1]
         for _ in range(STEPS):
@@ -92,6 +95,7 @@ def _align_all(a, b, templates, ridge, reach, position, error):  # type: ignore[
             dx, dy = _compose(m, step)
             x -= dx
             y -= dy
+            # Negated so that NaN, of a singular system, is refused as well.
             if not (abs(x - start[n, 0]) <= reach and abs(y - start[n, 1]) <= reach):
                 break
             if abs(dx) < SETTLED and abs(dy) < SETTLED:
@@ -103,6 +107,7 @@ def _align_all(a, b, templates, ridge, reach, position, error):  # type: ignore[
 @njit(cache=True, nogil=True)
 def _descent(a, x0, y0, patch, template, descent):  # type: ignore[no-untyped-def]
     """Template and derivatives of its grey values by the unknowns; False where it leaves the image."""
+    # One pixel more on every side than the template, for its central differences.
     wide, far = SIDE + 2, HALF + 1
     if not (_holds(a, x0 - far, y0 - far) and _holds(a, x0 + far, y0 + far)):
         return False
@@ -113,6 +118,7 @@ def _descent(a, x0, y0, patch, template, descent):  # type: ignore[no-untyped-de
     else:
         for i in range(wide * wide):
             patch[i] = cubic(a, x0 + i % wide - far, y0 + i // wide - far)
+    # Derivatives of the template's grey values g by the warp: shift (gx, gy), affinity (gx x, gx y, gy x, gy y).
     mean = 0.0
     for i in range(SIDE * SIDE):
         x, y = i % SIDE - HALF, i // SIDE - HALF
@@ -132,6 +138,7 @@ def _descent(a, x0, y0, patch, template, descent):  # type: ignore[no-untyped-de
 @njit(cache=True, nogil=True)
 def _warp(b, x0, y0, m, grey):  # type: ignore[no-untyped-def]
     """Grey values under the template; False where one of its corners, and so it, leaves the image."""
+    # An affinity makes a parallelogram of the square: inside with its corners inside.
     for j in (-HALF, HALF):
         for i in (-HALF, HALF):
             if not _holds(b, x0 + m[0, 0] * i + m[0, 1] * j, y0 + m[1, 0] * i + m[1, 1] * j):
@@ -165,6 +172,8 @@ def _prior(expected, m, ridge, out):  # type: ignore[no-untyped-def]
     for j in range(2):
         first = (expected[1, 1] * m[0, j] - expected[0, 1] * m[1, j]) / det
         second = (expected[0, 0] * m[1, j] - expected[1, 0] * m[0, j]) / det
+        # Added, not subtracted: a step is composed inversely, so what the affinity has too much counts like a grey
+        # difference.
         out[2 + j] += ridge * (first - (1.0 - j))
         out[4 + j] += ridge * (second - j)
 
@@ -204,10 +213,12 @@ def _factor(a):  # type: ignore[no-untyped-def]
     """
     n = a.shape[0]
     for i in range(n):
+        # Sums of squared grey differences this small are rounding: the template is flat, or has one direction only.
         if not a[i, i] > 1e-9:
             return False
         a[i, i] = 1.0 / a[i, i]
         for j in range(i + 1, n):
+            # No pivoting: the matrix is symmetric and positive, and all templates round alike.
             f = a[j, i] * a[i, i]
             a[j, i] = f
             for k in range(i + 1, n):

@@ -22,6 +22,7 @@ def known_median(values: NDArray[Any], known: NDArray[Any]) -> NDArray[Any]:
 
     NumPy's own takes twenty times as long on many short rows.
     """
+    # NaN is sorted to the end, so the first ``known`` of a row are its values.
     ordered, row = np.sort(values, axis=-1), np.arange(len(values))
     low, high = ordered[row, np.maximum(known - 1, 0) // 2], ordered[row, known // 2]
     return np.asarray(np.where(known > 0, (low + high) * values.dtype.type(0.5), values.dtype.type(np.nan)))
@@ -37,6 +38,7 @@ def fit_affinity(origin: Floats, moved: Floats, use: Bools, at: Floats) -> tuple
     n = len(at)
     identity, nothing = np.tile(np.eye(2), (n, 1, 1)), np.zeros((n, 2))
     p, q = origin[use], moved[use]
+    # Six numbers need three pairs; with fewer than twice that, a wrong pair is not seen.
     if len(p) < 6 or n == 0:
         return identity, nothing
     common = common_similarity(p, q)
@@ -45,6 +47,7 @@ def fit_affinity(origin: Floats, moved: Floats, use: Bools, at: Floats) -> tuple
         np.ascontiguousarray(p, dtype=np.float64),
         np.ascontiguousarray(q - p, dtype=np.float64),
         common,
+        # A point that is lost gets an affinity like any other, which nobody reads.
         np.nan_to_num(at),
         affinity,
         shift,
@@ -65,9 +68,11 @@ def _fit_all(origin, moved_by, common, at, affinity, displacement):  # type: ign
         for k in range(count):
             x, y = origin[who[k], 0] - at[n, 0], origin[who[k], 1] - at[n, 1]
             offset[k, 0], offset[k, 1] = x, y
+            # What the common similarity leaves: the pull below is then towards it, not towards no change.
             shift[k, 0] = moved_by[who[k], 0] - (common[0, 0] - 1.0) * x - common[0, 1] * y
             shift[k, 1] = moved_by[who[k], 1] - common[1, 0] * x - (common[1, 1] - 1.0) * y
             weight[k] = 1.0
+        # A fixed number of rounds: the result then never hangs on a rounding that decides whether one more is done.
         for _ in range(4):
             normal[:], right[:] = 0.0, 0.0
             total = 0.0
@@ -79,8 +84,11 @@ def _fit_all(origin, moved_by, common, at, affinity, displacement):  # type: ign
                         normal[i, j] += a * offset[k, j]
                     right[i, 0] += a * shift[k, 0]
                     right[i, 1] += a * shift[k, 1]
+            # In proportion to the weights, so that the pull is that of a spread in pixels whatever the neighbours'
+            # weights.
             normal[0, 0] += PULL**2 * total
             normal[1, 1] += PULL**2 * total
+            # All weights may have become small: the shift must stay solvable.
             normal[2, 2] += 1e-6
             solve_3(normal, right)
             for k in range(count):
@@ -88,6 +96,7 @@ def _fit_all(origin, moved_by, common, at, affinity, displacement):  # type: ign
                 for i in range(2):
                     fitted = right[0, i] * offset[k, 0] + right[1, i] * offset[k, 1] + right[2, i]
                     square += (shift[k, i] - fitted) ** 2
+                # Cauchy's weight of a residual in units of one pixel.
                 weight[k] = 1.0 / (1.0 + square)
         for i in range(2):
             affinity[n, i, 0], affinity[n, i, 1] = common[i, 0] + right[0, i], common[i, 1] + right[1, i]
@@ -134,9 +143,11 @@ def common_similarity(origin: Floats, moved: Floats) -> Floats:
 
     The mean turn and the median stretch of the lines between pairs, all lines counting alike.
     """
+    # Lines between pairs half the list apart, as complex numbers: a quotient is a turn and a stretch.
     p, q = ((a - np.roll(a, len(a) // 2, axis=0)) @ np.array([1.0, 1.0j]) for a in (origin, moved))
     long = (np.abs(p) > 0) & (np.abs(q) > 0)
     ratio = q[long] / p[long]
+    # A mean of unit vectors, since angles have no mean across half a turn; outliers are few and of length 1.
     mean = (ratio / np.abs(ratio)).sum()
     if np.abs(mean) == 0:
         return np.eye(2)

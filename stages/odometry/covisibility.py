@@ -47,8 +47,10 @@ class Step:
         """From the result of stage ``motion``."""
         validity = np.asarray(bundle["validity"])
         known, scale = matched(validity), 2.0 ** int(bundle.meta["level"])
+        # By the area, so that images of all shapes have about as many blocks.
         side = max(1, round((known.size / BLOCKS) ** 0.5))
         inside = _blocks(known, side)
+        # Pixel centres are at integers: a block of s pixels from 0 on has its centre at s / 2 - 1/2.
         centres = [(np.arange(n) + 0.5) * side * scale - 0.5 for n in (inside.shape[1], inside.shape[0])]
         enough = inside.mean(-1) >= MATCHED_SHARE
         shift = np.full((*enough.shape, 2), np.nan)
@@ -87,6 +89,7 @@ def _blocks(values: AnyArray, side: int) -> AnyArray:
     """(row, col) values as (block row, block column, pixel); rows and columns that fill no block are left out."""
     rows, cols = (max(1, n // side) for n in values.shape)
     whole = values[: rows * side, : cols * side]
+    # An image smaller than a block is one block of fewer pixels.
     return whole.reshape(rows, whole.shape[0] // rows, cols, -1).swapaxes(1, 2).reshape(rows, cols, -1)
 
 
@@ -113,6 +116,7 @@ class Covisibility:
     def after(self, step: Step) -> Covisibility:
         """The same for the frame behind a step; what has left does not return."""
         moved = step.move(self.points)
+        # The least so far: what has left the image and comes back is not found again by tracking either.
         part = np.minimum(self.part, _part_inside(moved, step))
         left = part > 0
         origin, points, part = self.origin[left], moved[left], part[left]
@@ -128,5 +132,6 @@ class Covisibility:
 
 def _part_inside(centres: Floats, step: Step) -> Floats:
     """Share (n,) of each block that lies in the image, by its centre (n, 2)."""
+    # Distance to the nearest edge of the image, which lies half a pixel outside the first and last pixel centres.
     beyond = np.minimum(centres + 0.5, np.array(step.size) - 0.5 - centres)
     return np.asarray(np.clip(beyond / step.side + 0.5, 0.0, 1.0).prod(axis=1), dtype=np.float64)

@@ -50,6 +50,7 @@ class Derotation:
                 "RIL-305", "an attitude is not a 3 x 3 rotation", remedy="check the attitudes of the sequence"
             )
         K = camera.matrix
+        # R_b_a takes rays of a to rays of b: a pixel of the upright frame is looked up in b.
         return Derotation(K @ R @ np.linalg.inv(K), (camera.height, camera.width))
 
     @property
@@ -58,6 +59,7 @@ class Derotation:
         rows, cols = self.shape
         corners = np.array([[x, y, 1.0] for y in (0.0, rows - 1.0) for x in (0.0, cols - 1.0)])
         moved = corners @ self.homography.T
+        # A corner behind the camera has an image, on the wrong side.
         if (moved[:, 2] <= 0).any():
             return float("inf")
         return float(np.linalg.norm(moved[:, :2] / moved[:, 2:] - corners[:, :2], axis=1).max())
@@ -66,6 +68,7 @@ class Derotation:
         """Pyramid of frame b held like a, with a margin; masked where b does not reach."""
         image = np.empty((self.shape[0] + 2 * MARGIN, self.shape[1] + 2 * MARGIN), np.float32)
         valid = np.empty(image.shape, np.uint8)
+        # Masked pixels are filled before the interpolation, which would spread their NaN.
         grey, usable = pyramid.filled(b)[0], b.valid[0]
         place = WindowPair(0, 0, 0, 0, *usable.shape)
         warp(grey, usable, self.homography @ translation(-MARGIN), image, valid, place)
@@ -80,5 +83,6 @@ class Derotation:
         y, x = ((i + 0.5) * scale - 0.5 for i in np.indices(u.shape, dtype=np.float64))
         p = np.stack([x + u - MARGIN, y + v - MARGIN, np.ones_like(x)])
         q = np.einsum("ij,jrc->irc", self.homography, p)
+        # Points that turn out of the half space ahead have no place in b.
         ahead = np.where(q[2] > 1e-6, q[2], np.nan)
         return (q[0] / ahead - x).astype(np.float32), (q[1] / ahead - y).astype(np.float32)

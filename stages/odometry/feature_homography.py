@@ -36,13 +36,16 @@ def feature_homography(a: Pyramid, b: Pyramid) -> Floats | None:
     pairs = _matches(first, second)
     if len(pairs) < LEAST:
         return None
+    # Pixel centres of a level lie between those of the finer one: x0 = 2^n x + (2^n - 1) / 2.
     there = np.array([[2.0**level, 0.0, 0.5 * 2.0**level - 0.5], [0.0, 2.0**level, 0.5 * 2.0**level - 0.5], [0, 0, 1]])
     source, target = p[pairs[:, 0]], q[pairs[:, 1]]
+    # OpenCV seeds its samples by itself, always alike: the same images give the same homography.
     found, agrees = cv2.findHomography(source, target, cv2.RANSAC, NEAR * a.images[level].shape[1], maxIters=5000)
     if found is None or int(agrees.sum()) < LEAST:
         return None
     homography = there @ found @ np.linalg.inv(there)
     middle = homography @ [(a.images[0].shape[1] - 1) / 2.0, (a.images[0].shape[0] - 1) / 2.0, 1.0]
+    # A homography has no scale of its own; at 1 in the image's centre its rows are comparable.
     return homography / middle[2] if abs(middle[2]) > 1e-9 else None
 
 
@@ -52,6 +55,8 @@ def _features(frame: Pyramid, level: int) -> tuple[NDArray[np.float32], NDArray[
     points, descriptors = cv2.SIFT.create(FEATURES).detectAndCompute(image, frame.valid[level])
     if descriptors is None:
         return np.zeros((0, 2), np.float32), np.zeros((0, 128), np.float32)
+    # RootSIFT: Euclidean distances of the roots are Hellinger distances of the histograms, which few large bins do not
+    # rule.
     root = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), np.float32(1e-9)))
     return np.array([k.pt for k in points], np.float32), root
 

@@ -51,6 +51,7 @@ def _operator(image, directions, out):  # type: ignore[no-untyped-def]
             here, found = image[y, 1 : 1 + wide], square[y, 1 : 1 + wide]
             there, back = image[y + dr, 1 + dc : 1 + dc + wide], image[y - dr, 1 - dc : 1 - dc + wide]
             for x in range(wide):
+                # Both senses of a direction, or the operator would prefer the side of a corner it is shifted to.
                 ahead, behind = there[x] - here[x], back[x] - here[x]
                 found[x] = ahead * ahead + behind * behind
         for y in range(HALF + 1, rows - HALF - 1):
@@ -60,6 +61,7 @@ def _operator(image, directions, out):  # type: ignore[no-untyped-def]
             least, inner = out[y, HALF + 1 : cols - HALF - 1], tall[1:]
             for x in range(cols - 2 * HALF - 2):
                 total = inner[x] + inner[x + 1] + inner[x + 2] + inner[x + 3] + inner[x + 4]
+                # Half, for the two senses: the mean of both sums.
                 ssd[x] = np.float32(0.5) * total
             for x in range(cols - 2 * HALF - 2):
                 least[x] = ssd[x] if d == 0 or ssd[x] < least[x] else least[x]
@@ -90,6 +92,7 @@ def interest_points(
     """
     response = interest_operator(image)
     # The expected sum of squared differences of pure noise is 2 sigma^2 for each of the 25 pixels.
+    # Three times the expectation: the threshold is on a variance, so contrast must be 1.7 times the noise.
     rows, cols = _peaks(response, 3.0 * 2.0 * (2 * HALF + 1) ** 2 * noise**2)
     inner = _inside(valid, border)[rows, cols]
     rows, cols = rows[inner], cols[inner]
@@ -97,6 +100,7 @@ def interest_points(
     across = math.ceil(image.shape[1] / side)
     bucket = (rows // side).astype(np.int64) * across + (cols // side).astype(np.int64)
     if occupied is not None and len(occupied):
+        # The same grid of buckets as above, in which tracked points count at their present place.
         seen = np.floor(occupied / side).astype(np.int64)
         empty = ~np.isin(bucket, seen[:, 1] * across + seen[:, 0])
         rows, cols, bucket = rows[empty], cols[empty], bucket[empty]
@@ -104,6 +108,7 @@ def interest_points(
     # Peaks come in reading order, which a stable sort keeps among equals.
     order = np.argsort(-strength, kind="stable")
     order = order[np.argsort(bucket[order], kind="stable")]
+    # First of each bucket, then second of each: the strongest point of a poor bucket comes before a rich one's second.
     rank = np.arange(len(order)) - np.searchsorted(bucket[order], bucket[order], side="left")
     if occupied is not None:
         order, rank = order[rank == 0], rank[rank == 0]
@@ -146,6 +151,7 @@ def clear_of_mask(valid: NDArray[np.uint8], points: NDArray[np.float64], border:
     rows, cols = valid.shape
     p = np.floor(np.where(np.isfinite(points), points, -1.0) + 0.5).astype(np.intp)
     inside = ((p >= border) & (p < np.array([cols, rows]) - border)).all(1)
+    # Any place that is inside: its answer is refused below.
     p[~inside] = border
     dy, dx = (o.ravel() for o in np.mgrid[-border : border + 1, -border : border + 1])
     window = valid[np.clip(p[:, 1:] + dy, 0, rows - 1), np.clip(p[:, :1] + dx, 0, cols - 1)]

@@ -101,10 +101,12 @@ def coarse_motion(a: Pyramid, b: Pyramid, params: MotionParams, turn: Derotation
     a, b = a.above(level), b.above(level)
     hp = HfvmParams(
         band=0.0,
+        # At a coarse level no level is finest: all have the same rounds. At level 0 the matcher's own figures hold.
         fine_rounds=None if level else HfvmParams().fine_rounds,
         back_rounds=params.rounds if level else HfvmParams().back_rounds,
         top_columns=params.top_columns,
         top_rows=params.top_rows,
+        # Both directions alike: displacements between frames have no epipolar line to prefer.
         search_columns=1,
         centres=5,
         smoothness=params.smoothness,
@@ -123,6 +125,7 @@ def coarse_motion(a: Pyramid, b: Pyramid, params: MotionParams, turn: Derotation
     mark(validity, fine.distance > hp.threshold, Validity.OVER_THRESHOLD)
     good = validity == 0
     u, v, interpolated = fine.u.copy(), fine.v.copy(), np.zeros(good.shape, np.uint8)
+    # Small gaps are filled, so that tracks across them have a prediction; they are marked as no measurements.
     consistency.fill_rows(u, v, good, hp.fill_reach, state.near_sign or -1.0, interpolated)
     mark(validity, good, Validity.MATCHED)
     mark(validity, interpolated != 0, Validity.INTERPOLATED)
@@ -130,6 +133,7 @@ def coarse_motion(a: Pyramid, b: Pyramid, params: MotionParams, turn: Derotation
     u, v = u * scale, v * scale
     if turn is not None:
         u, v = turn.compose(u, v, level)
+        # Seen in the upright frame, but its place in b lies behind the camera.
         validity[np.isnan(u)] &= ~np.uint8(Validity.MATCHED | Validity.INTERPOLATED)
     return Motion(level, u, v, validity)
 
@@ -151,6 +155,7 @@ def _rolled(
     shape = (a.images[0].shape[0], a.images[0].shape[1])
 
     def attempt(homography: roll_search.Floats, which: MotionParams) -> tuple[Motion, Derotation]:
+        # The rotation looked for comes on top of the one that a sensor told.
         upright = Derotation(homography if turn is None else turn.homography @ homography, shape)
         return coarse_motion(a, b, which, upright), upright
 
@@ -164,6 +169,7 @@ def _rolled(
                 degrees = -roll_search.relative((0.0, 1.0), wide, shape)[0]
                 known = np.eye(3) if turn is None else turn.homography
                 return found, upright, roll_search.relative((degrees, 1.0), known, shape)[0]
+        # One level coarser: a quarter of the pixels for each of the angles.
         coarse, needed = params.model_copy(update={"level": params.level + 1}), roll_search.GAIN
         for degrees in roll_search.candidates(params.turn_range_deg):
             found, _ = attempt(roll_search.similarity(degrees, 1.0, shape), coarse)
@@ -171,6 +177,7 @@ def _rolled(
     fitted = roll_search.fit(best.column_disparity, best.row_disparity, matched(best.validity), best.level)
     if fitted is not None and turn is not None:  # what the attitude left over
         fitted = roll_search.relative(fitted, turn.homography, shape)
+    # Small rotations are the matcher's, which stands them: resampling the image costs more than they do.
     if fitted is None or abs(fitted[0]) < roll_search.LEAST_DEG:
         return None
     found, upright = attempt(roll_search.similarity(fitted[0], fitted[1], shape), params)

@@ -80,6 +80,7 @@ def find_points(
     a_valid, b_valid = a.valid[0], b.valid[0]
     shape = np.tile(np.eye(2), (n, 1, 1)) if affinity is None else np.asarray(affinity, dtype=np.float64)
     usable = np.isfinite(np.concatenate([points, predicted, shape.reshape(n, 4)], axis=1)).all(axis=1)
+    # An affinity that folds the template to a tenth of its area or less draws no texture.
     usable &= np.abs(np.linalg.det(np.where(usable[:, None, None], shape, np.eye(2)))) > 0.1
     found, cost, ok = np.full((n, 2), np.nan), np.full(n, np.nan), np.zeros(n, dtype=bool)
     who = np.flatnonzero(usable)
@@ -87,6 +88,7 @@ def find_points(
     good = np.isfinite(there_cost) & (there_cost <= THRESHOLD)
     good &= _on_valid(a_valid, points[who]) & _on_valid(b_valid, there)
     who, there, there_cost = who[good], there[good], there_cost[good]
+    # The way back starts at the point itself: it must lead there within a pixel, so little is searched.
     inverse, reach = np.asarray(np.linalg.inv(shape[who])), min(radius, BACK_RADIUS)
     back, _ = _search(b_image, a_image, there, points[who], inverse, reach)
     good = np.hypot(*(back - points[who]).T) <= BACKMATCH
@@ -116,6 +118,7 @@ def _search(
     whole = np.rint(predicted)
     scale = np.asarray(WEIGHTS, np.float32) * np.float32(features.STEPS_PER_UNIT)
     offset, cost = np.zeros((len(points), 2)), np.full(len(points), -1.0)
+    # The template is drawn as b shows it: offsets in b are taken back to a.
     inverse = np.ascontiguousarray(np.linalg.inv(affinity))
     templates = _Templates(np.ascontiguousarray(points), whole.astype(np.int64), inverse)
     _search_all(a, b, templates, radius, scale, offset, cost)
@@ -136,6 +139,7 @@ class _Templates(NamedTuple):
 def _search_all(a, b, templates, radius, scale, offset, cost):  # type: ignore[no-untyped-def]
     """Each point by itself: its template, the area around its prediction, and where in it the template fits best."""
     points, whole, shape = templates
+    # Features at all places of the sum need their kernels' reach around.
     side = 2 * (SUM_RADIUS + features.RADIUS) + 1
     wide = side + 2 * (radius + 1)
     template, area = np.empty((side, side), np.float32), np.empty((wide, wide), np.float32)
@@ -165,6 +169,7 @@ def _cut(image, px, py, shape, out):  # type: ignore[no-untyped-def]
             dx, dy = i - side // 2, j - side // 2
             x = px + shape[0, 0] * dx + shape[0, 1] * dy
             y = py + shape[1, 0] * dx + shape[1, 1] * dy
+            # Cubic interpolation reads one pixel before and two behind.
             x, y = min(max(x, 1.0), cols - 2.001), min(max(y, 1.0), rows - 2.001)
             out[j, i] = cubic(image, x, y)
     return True
@@ -179,6 +184,7 @@ def _copy(image, point, out):  # type: ignore[no-untyped-def]
     if not (px >= 0 and px <= cols - 1 and py >= 0 and py <= rows - 1 and rows >= 4 and cols >= 4):
         return False
     for j in range(out.shape[0]):
+        # As the template, which is interpolated and so keeps a pixel from the border: both must repeat the same pixels.
         y = min(max(py + j - half, 1), rows - 2)
         for i in range(out.shape[1]):
             out[j, i] = image[y, min(max(px + i - half, 1), cols - 2)]

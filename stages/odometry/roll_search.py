@@ -28,6 +28,7 @@ LEAST = 100
 def candidates(reach_deg: float) -> list[float]:
     """Angles to try, degrees, small ones first; 0 is not among them."""
     steps = max(1, math.floor(reach_deg / STEP_DEG))
+    # Small turns first, for the first of equal shares is kept: of two that match as well, the less.
     return [sign * k * STEP_DEG for k in range(1, steps + 1) for sign in (1.0, -1.0)]
 
 
@@ -54,6 +55,7 @@ def fit(
     q = p + column[matched].astype(np.float64) + 1j * row[matched].astype(np.float64)
     half = len(p) // 2
     ratio = (q[half:] - q[: len(q) - half]) / (p[half:] - p[: len(p) - half])
+    # Angles are taken about a first estimate, so that none lies near half a turn, where they jump.
     middle = np.median(ratio.real) + 1j * np.median(ratio.imag)
     if abs(middle) == 0.0:
         return None
@@ -65,7 +67,9 @@ def relative(found: tuple[float, float], known: Floats, shape: tuple[int, int]) 
     """What of a rotation (degrees) and scale a known homography (3, 3) leaves, by its derivative at the centre."""
     centre = np.array([(shape[1] - 1) / 2.0, (shape[0] - 1) / 2.0, 1.0])
     moved = known @ centre
+    # Quotient rule of (H p)_xy / (H p)_z at the centre: what a homography does to lengths and angles there.
     derivative = (known[:2, :2] - np.outer(moved[:2] / moved[2], known[2, :2])) / moved[2]
     turn = math.degrees(math.atan2(derivative[1, 0] - derivative[0, 1], derivative[0, 0] + derivative[1, 1]))
     scale = math.sqrt(abs(float(np.linalg.det(derivative))))
+    # Into -180 .. 180: a difference of 350 degrees is a turn by 10 the other way.
     return (found[0] - turn + 180.0) % 360.0 - 180.0, found[1] / max(scale, 1e-9)

@@ -52,6 +52,7 @@ def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
         raise InputError(
             "RIL-895", "motions of one table have different grids", remedy="give images of one size to a sequence"
         )
+    # A change needs two steps: the first of a table that has one before it is measured against that one's last.
     before = [inputs["before"]] if "before" in inputs else []
     changes = [change(a, b) for a, b in pairwise([*before, *motions])]
     return Bundle(

@@ -145,16 +145,23 @@ class _State:
 def _advance(state: _State, frames: Sequence[Pyramid], motion: LevelDisplacements, j: int, params: TrackParams) -> None:
     """Find all points of frame j - 1 in frame j."""
     predicted = state.expected + displacement_at(motion, state.expected)
+    # A template is drawn under the affinity of its surroundings, from the coarse displacements, which outliers do not
+    # pull.
     smooth, _ = fit_affinity(state.expected, predicted, _known(predicted), state.expected)
     matched = match_points(frames[j - 1], frames[j], state.expected, predicted, smooth, params.radius)
     found = _known(matched)
+    # A lost point goes on with the prediction, and may be found again from there.
     state.expected = np.where(found[:, None], matched, predicted)
+    # Points of one birth share their first frame, so that an affinity is fitted to pairs of the same two frames.
     for birth in np.unique(state.birth):
         group = np.flatnonzero((state.birth == birth) & found)
         then = state.points[:, birth]
         affinity, _ = fit_affinity(then, matched, found & _known(then), then[group])
+        # Singular values: the largest and the smallest stretch of the template, whatever the direction.
         scale = np.linalg.svd(affinity, compute_uv=False)
         near = (scale[:, 0] < params.max_scale) & (scale[:, 1] > 1.0 / params.max_scale)
+        # A template that is stretched beyond this has lost its detail or shows none: the last frame's then, at the
+        # price of drift.
         for source, chosen in ((int(birth), near), (j - 1, ~near & _known(state.points[group, j - 1]))):
             who = group[chosen]
             if who.size == 0:
@@ -172,6 +179,7 @@ def _reseed(state: _State, frames: Sequence[Pyramid], j: int, params: TrackParam
     seeds = interest_points(
         frames[j].images[0], frames[j].valid[0], params.points, noise=params.noise, border=BORDER, occupied=here
     ).astype(np.float64)
+    # With fewer tracks no affinity back to the key frame can be told.
     if len(seeds) == 0 or len(here) < NEIGHBOURS:
         return state
     affinity, shift = fit_affinity(here, there, np.ones(len(here), bool), seeds)
@@ -194,6 +202,7 @@ def _align(
         a.images[0],
         b.images[0],
         Templates(points, start, affinity),
+        # A difference of two images has the noise of both.
         noise=params.noise * 2.0**0.5,
         spread=params.affinity_sigma,
         reach=2.0,
@@ -206,6 +215,7 @@ def displacement_at(motion: LevelDisplacements, points: Floats) -> Floats:
     """Coarse displacement (n, 2) at points (n, 2), pixels: median of the defined ones among 3 x 3; NaN none."""
     k = 0.5**motion.level
     rows, cols = motion.column.shape
+    # Pixel of the coarse level that holds the point: edges lie half a pixel before the centres.
     centre = np.floor((np.nan_to_num(points) + 0.5) * k).astype(np.intp)
     dy, dx = (o.ravel() for o in np.mgrid[-1:2, -1:2])
     y, x = np.clip(centre[:, 1:] + dy, 0, rows - 1), np.clip(centre[:, :1] + dx, 0, cols - 1)

@@ -42,6 +42,7 @@ def widened(mask: Mask, half_length: float, half_width: float, step: tuple[int, 
 
 def _sides(half_length: float, half_width: float, step: tuple[int, int]) -> list[int]:
     """Steps along and across that cover a rectangle."""
+    # A size that is a whole number of steps may come out a rounding above it, and must not grow by a step.
     return [max(0, math.ceil(v / math.hypot(*step) - 1e-9)) for v in (half_length, half_width)]
 
 
@@ -69,6 +70,7 @@ def grown(mask: Mask, reach: float) -> Mask:
 
 def _grow(canvas: Canvas, reach: float) -> None:
     """:func:`grown` on a canvas with a border of at least that."""
+    # Rounded up: a margin that is a fraction of a cell too wide closes a way, one too narrow touches a hazard.
     side, diagonal = octagon(math.ceil(reach - 1e-9))
     for n, dr, dc in ((side, 0, 1), (side, 1, 0), (diagonal, 1, 1), (diagonal, 1, -1)):
         canvas.spread(n, dr, dc)
@@ -102,11 +104,14 @@ class FreePlaces:
         reaches = [_reach(*self._half, (dr, dc)) for _, dr, dc in STEPS]
         margin = vehicle.margin / cell
         offsets = (abs(v) for four in self._places for at in four for v in at)
+        # One border that holds whatever is spread or moved below, for canvases are joined only if their borders are
+        # alike.
         self._border = max(*reaches, *offsets, math.ceil(margin - 1e-9))
         self._unknown = unknown
         on_wheels, on_middle = (Canvas.of(mask, self._border) for mask in (wheel_hazard, body_hazard))
         for canvas in (on_wheels, on_middle):
             _grow(canvas, margin)
+            # The margin of a hazard may reach past the map; a wheel there is closed, if at all, as unknown ground.
             canvas.clear_border()
         if closed is not None:
             on_middle.join(Canvas.of(closed, self._border))
@@ -119,6 +124,7 @@ class FreePlaces:
             found = self._closed
         else:
             unknown = Canvas.of(self._unknown, self._border, outside=True)
+            # The outline is spread below, and covers the wheels; they only must not leave the map.
             beyond = unknown if below == "wheels" else Canvas.outside(self._unknown.shape, self._border)
             found = [
                 self._under(places, beyond, closed) for places, closed in zip(self._places, self._closed, strict=True)
@@ -143,4 +149,5 @@ def _wheels(ahead: float, aside: float, dr: int, dc: int) -> list[tuple[int, int
     """Row and column of the four wheels from the middle, cells, on a way along (dr, dc)."""
     unit = math.hypot(dr, dc)
     corners = ((ahead, aside), (ahead, -aside), (-ahead, aside), (-ahead, -aside))
+    # Rows grow backwards and columns to the right, so that the vehicle's left is (-dc, dr) for a step (dr, dc).
     return [(round((a * dr + b * dc) / unit), round((a * dc - b * dr) / unit)) for a, b in corners]

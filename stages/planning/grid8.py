@@ -53,6 +53,7 @@ def cost_to_go(
     cost = np.full(height.shape, UNREACHED, dtype=np.int64)
     step = np.full(height.shape, -1, dtype=np.int8)
     end = -1 if start is None else start[0] * height.shape[1] + start[1]
+    # Rounded to whole units: float sums of equal paths would differ by the order of their steps, and ties with them.
     lengths = np.array([unit if dr == 0 or dc == 0 else round(unit * DIAGONAL) for dr, dc, _ in NEIGHBOURS])
     ground = _Ground(np.ascontiguousarray(height), ways, toll, lengths)
     _search(ground, target[0] * height.shape[1] + target[1], end, cost, step)
@@ -102,6 +103,8 @@ def _flood(ways, number, spans):  # type: ignore[no-untyped-def]
                 i, j = r + dr, c + dc
                 if i < 0 or j < 0 or i >= rows or j >= cols or number[i, j] >= 0:
                     continue
+                # An edge needs its direction at both ends, as in the search below, so that parts are what the search
+                # can join.
                 if ways[r, c] & ways[i, j] & way:
                     number[i, j], stack[size] = count, i * cols + j
                     size += 1
@@ -139,7 +142,9 @@ def _search(ground, target, end, cost, step):  # type: ignore[no-untyped-def]
             i, j = r - dr, c - dc  # the step from there leads here
             if i < 0 or j < 0 or i >= rows or j >= cols or not ways[r, c] & ways[i, j] & way:
                 continue
+            # The search runs from the target, so the cell entered on the way there is (r, c), whose toll is paid.
             total = key + lengths[k] + abs(height[r, c] - height[i, j]) + toll[r, c]
+            # Not at equal cost: what was reached first stays, so that ties do not hang on the heap's layout.
             if total < cost[i, j]:
                 cost[i, j], step[i, j] = total, k
                 if size == keys.shape[0]:

@@ -125,6 +125,7 @@ def find_path(
     if start is not None and target is not None:
         heading = (target[0] - start[0], target[1] - start[1])
     found = _found(maps, lattice, vehicle, heading, ends, stretch, p)
+    # A limit that closed nothing cannot be the reason.
     if len(found.cells) or p.sure >= 1 or "p_hazard" not in maps:
         return found
     # Searched once more without the limit, only to name the figure that would open a way.
@@ -180,9 +181,11 @@ def _by_rows(
     ground = _ground(maps, lattice, RowGrid.over(lattice, heading), vehicle, p)
     grid = ground.grid
     first, last = (None if point is None else grid.index(point) for point in ends)
+    # One vehicle length, from the front of the front wheels to the back of the rear ones.
     tolerance = math.ceil((vehicle.wheel_base + vehicle.wheel_diameter) / lattice.cell)
     span = row_span(~ground.closed)
     for name in GROUNDS:
+        # How far one can go takes a sweep of its own, which only the last and most lenient try needs.
         explain = name == GROUNDS[-1]
         ways = ground.ways(name)
         found = plan(ground.height, ways, tolerance, (first, last), span=span, toll=ground.toll, explain=explain)
@@ -206,6 +209,7 @@ def _by_grid(
     given = tuple(None if point is None else grid.index(point) for point in ends)
     nothing = np.empty((0, 2), dtype=np.int64)
     cells, cost, name = nothing, np.full(ground.height.shape, UNREACHED), GROUNDS[0]
+    # With free ends a stricter ground would always find some path, on however small a part.
     for name in ground.worth() if given == (None, None) else GROUNDS:
         ways = ground.ways(name)
         first, last = _chosen(ground, name, *given)

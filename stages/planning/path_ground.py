@@ -64,6 +64,7 @@ class RowGrid:
         dx, dy = heading[0] / norm, heading[1] / norm
         x, y = lattice.xs()[[0, -1, 0, -1]], lattice.ys()[[0, 0, -1, -1]]
         right, ahead = (x * dy - y * dx) / lattice.cell, (x * dx + y * dy) / lattice.cell
+        # A turned lattice's corners are rounded: a centre on the very edge belongs to the grid.
         i0, i1 = math.ceil(right.min() - 1e-6), math.floor(right.max() + 1e-6)
         j0, j1 = math.floor(ahead.max() + 1e-6), math.ceil(ahead.min() - 1e-6)
         return RowGrid((dx, dy), i0, j0, lattice.cell, max(j0 - j1, 0) + 1, max(i1 - i0, 0) + 1)
@@ -82,6 +83,7 @@ class RowGrid:
 
     def sample(self, lattice: Lattice, array: NDArray[Any], outside: float) -> NDArray[Any]:
         """An array on the lattice brought to this grid by nearest neighbour."""
+        # No copy where nothing is turned, which is every path of a stop.
         if self.ahead == (0.0, 1.0) and (self.i0, self.j0) == (lattice.i0, lattice.j0) and array.shape == self._shape:
             return array
         row, col = np.indices(self._shape)
@@ -180,9 +182,11 @@ class PathMaps:
         dearest = toll + round(doubt * grid.cell / unit)
         self.height: Ints = np.empty(risk.shape, dtype=np.int32)
         self.toll: Ints = np.empty(risk.shape, dtype=np.int16 if dearest <= np.iinfo(np.int16).max else np.int64)
+        # A limit of 1 is none, even where rounding lifts a probability above it.
         limit = np.float32(sure if sure < 1 else np.inf)
         each = _CellPrices(np.float32(unit), toll, np.float32(doubt * grid.cell / unit), limit)
         if _lay(_Sampled(risk, reason, chance, self.stand), each, masks, self.height, self.toll):
+            # Heights of a tall world in small units do not fit 32 bits.
             self.height = np.rint(np.where(self.closed, np.float32(0), self.stand) / np.float32(unit)).astype(np.int64)
         self._stand = FreePlaces(masks.wheels, masks.body, vehicle, grid.cell, masks.unknown, masks.closed)
         self._ways: dict[str, Bytes] = {}
@@ -230,10 +234,13 @@ def _lay(maps, prices, masks, height, toll):  # type: ignore[no-untyped-def]
             unknown[r, c] = risk[r, c] == UNKNOWN
             closed[r, c] = (risk[r, c] >= HAZARDOUS) | (chance[r, c] > sure)
         for c in range(risk.shape[1]):
+            # Short loops without branches, one a kind of array: each becomes vector code, a loop over all of them does
+            # not.
             wheels[r, c] = (risk[r, c] == HAZARDOUS) & (reason[r, c] & WHEEL_BITS != 0)
             body[r, c] = (risk[r, c] == HAZARDOUS) & (reason[r, c] & BODY_BITS != 0)
         for c in range(risk.shape[1]):
             v = np.rint(stand[r, c] / unit) if risk[r, c] < HAZARDOUS else np.float32(0.0)
+            # Casts what is too large to anything: the caller then makes the heights anew in 64 bits.
             height[r, c] = np.int32(v)
             large |= np.uint8(abs(v) > np.float32(LARGE))
         for c in range(risk.shape[1]):

@@ -91,6 +91,7 @@ def _why(found: Plan, maps: Maps, vehicle: Vehicle) -> str:
     """Why there is no path; where hazards leave nothing to drive on, the limit that does the most."""
     risk = maps["risk"]
     judged = int((risk != UNKNOWN).sum())
+    # Where something is free, the search's own reason says more than a count of hazards.
     if judged == 0 or (risk[risk != UNKNOWN] < HAZARDOUS).any():
         return found.reason
     counts = [int(((maps["reason"] & m.bit) > 0).sum()) for m in MEASURES]

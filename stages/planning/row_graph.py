@@ -227,6 +227,7 @@ def plan(
     if first_last is None:
         return _blocked(nothing, rows - 1, "there is no free cell")
     farthest, nearest = first_last
+    # On a short map a vehicle's length could make start and target swap their rows.
     tolerance = min(tolerance, (nearest - farthest) // 4)
     limit = farthest + tolerance
     candidates = np.zeros(ways.shape, dtype=bool)
@@ -238,6 +239,7 @@ def plan(
     allowed = ways
     if target is not None:
         allowed = ways.copy()
+        # Beyond the target a path may not go, since every edge leads on; the target's own row keeps the target alone.
         allowed[: target[0] + 1] = 0
         allowed[target], limit = ways[target], target[0]
         candidates[: target[0] + 1] = False
@@ -252,6 +254,7 @@ def plan(
         stop = int(reached[0]) - 1 if len(reached) else nearest
         return _blocked(replace(nothing, cost=cost, target_row=limit), stop, "no free cell of this row can be entered")
     source = np.zeros(ways.shape, dtype=bool)
+    # One source, not all candidates: costs are then those of the path's own start, as the report draws them.
     source[nearest_middle(good, nearest)] = True
     cost, move = sweep(height, allowed, source, toll)
     row, col = nearest_middle(cost[: limit + 1] < UNREACHED, farthest)
@@ -295,6 +298,7 @@ def _nearest_middle(cells, row):  # type: ignore[no-untyped-def]
 def _trace(move: NDArray[np.int8], row: int, col: int) -> NDArray[np.int64]:
     """Cells (vertex, 2) from the source to the given cell."""
     out = np.empty((move.shape[0] - row, 2), dtype=np.int64)
+    # Moves lead back from the target, so the walk is turned round.
     return out[: _walk(move, row, col, out)][::-1].copy()
 
 

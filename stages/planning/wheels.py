@@ -51,9 +51,12 @@ class HeightGrid:
         dy, dx = np.mgrid[-n : n + 1, -n : n + 1] * cell
         inside = dx**2 + dy**2 <= radius**2
         sphere = np.where(inside, np.sqrt(np.maximum(radius**2 - dx**2 - dy**2, 0.0)) - radius, 0.0)
+        # Unknown cells neither lift a wheel nor poison the maximum as NaN would.
         low = np.where(np.isnan(z), -1e9, z)
         resting = scipy.ndimage.grey_dilation(low, footprint=inside, structure=sphere, mode="nearest")
+        # Half a wheel's diameter is the window's side.
         reach = 0.25 * wheel_diameter / cell
+        # Highest plus greatest depth: highest minus lowest by one function.
         step = highest(z, reach) + highest(-z, reach)
         unknown = np.isnan(z)
         return HeightGrid(x0, y0, cell, z, np.where(unknown, np.nan, resting), np.where(unknown, np.nan, step))
@@ -83,6 +86,8 @@ class HeightGrid:
 def highest(z: Floats, reach: float) -> Floats:
     """Largest bilinear height (row, col) in the square of ``reach`` cells to each side of a node; NaN is left out."""
     filled = np.where(np.isnan(z), -np.inf, z)
+    # A bilinear surface has its maximum over a square at nodes inside it, where its rims cross lattice lines, or at its
+    # corners, which the rims of rims are.
     inner, rims = _along(_highest_on_lines(filled, reach), reach, 1)[0], _along(filled, reach, 1)[1:]
     return np.asarray(np.maximum.reduce([inner, *(_highest_on_lines(rim, reach) for rim in rims)]))
 
@@ -154,7 +159,9 @@ def measured(ground: HeightGrid, x: Floats, y: Floats, heading: Floats, vehicle:
     across, along = np.meshgrid(half * (vehicle.track - 0.2 * vehicle.wheel_diameter), half * vehicle.wheel_base)
     belly = np.stack([across.ravel(), along.ravel()], axis=1)
     plane = middle[:, None] + lean[:, None] * belly[:, 0] + rise[:, None] * belly[:, 1]
+    # The wheels stand at a mean height of ``middle``: least squares through four corners of a rectangle are its means.
     free = plane + vehicle.clearance - at(ground.height, belly)
+    # A point of the belly over unknown ground says nothing; only a vehicle over nothing known has no clearance.
     clearance = np.where(np.isnan(free), np.inf, free).min(axis=1)
     clearance = np.where(np.isfinite(middle) & np.isfinite(clearance), clearance, np.nan)
     return Measures(middle, rise, lean, np.arctan(np.hypot(lean, rise)), clearance, at(ground.step, wheels).max(axis=1))

@@ -168,6 +168,7 @@ def _track_normal(data, out):  # type: ignore[no-untyped-def]
             for i in range(6):
                 p, q = weight * j[0, i], weight * j[1, i]
                 for k in range(i + 1):
+                    # The lower half only; it is mirrored at the end.
                     A[at + i, at + k] += p * j[0, k] + q * j[1, k]
                 B[at + i, n] += p * j[0, 6] + q * j[1, 6]
                 ga[at + i] += p * j[0, 7] + q * j[1, 7]
@@ -197,6 +198,7 @@ def normal(
 ) -> tuple[Floats, Floats, Floats, Floats, Floats]:
     """``A`` (p, p), ``B`` (p, n), ``d`` (n,), gradients (p,) and (n,): p of the poses and the bias, n depths."""
     m, n = len(state.R), len(state.depth)
+    # Depths start with the information of their own disparities; the prior of the bias is added once for all segments.
     A, B, d = np.zeros((6 * m + 1, 6 * m + 1)), np.zeros((6 * m + 1, n)), views.sigma**-2.0
     ga, gd = np.zeros(6 * m + 1), state.depth * d
     _track_normal(_tracks(views, state, bias, sigma), (A, B, d, ga, gd))
@@ -217,15 +219,18 @@ def adjust(
     first = now = cost(states, bias)
     for _ in range(params.iterations):
         parts = [normal(v, s, bias, sigma) for v, s in zip(views, states, strict=True)]
+        # Normal equations stay as they are while a step is refused: only the damping grows.
         while damping < MOST_DAMPING:
             step_bias, steps = _step(parts, prior, bias, damping)
             ahead = [s.moved(pose, depth) for s, (pose, depth) in zip(states, steps, strict=True)]
             then = cost(ahead, bias + step_bias)
             if then < now:
                 break
+            # A refused step; an accepted one lowers the damping by as much, so that it follows the cost's curvature.
             damping *= 10.0
         else:
             break
+        # Far below what a pose could show, and far above the rounding of a sum of thousands of errors.
         finished = now - then <= 1e-9 * now
         states, bias, now, damping = ahead, bias + step_bias, then, max(0.1 * damping, 1e-12)
         if finished:
@@ -245,9 +250,11 @@ def _step(
     corner, right, kept = prior * (1.0 + damping), -prior * bias, []
     for A, B, d, ga, gd in parts:
         d = d * (1.0 + damping)
+        # Schur's complement: depths are eliminated by a division, since no two of them share a measurement.
         S = A + damping * np.diag(np.diag(A)) - (B / d) @ B.T
         r = -(ga - B @ (gd / d))
         solved = np.linalg.solve(S[:-1, :-1], np.column_stack([S[:-1, -1], r[:-1]]))
+        # The bias is all that segments share: each one eliminates its poses and leaves one equation for it.
         corner += S[-1, -1] - S[-1, :-1] @ solved[:, 0]
         right += r[-1] - S[-1, :-1] @ solved[:, 1]
         kept.append((solved, B, d, gd))
@@ -270,6 +277,7 @@ def scatter(views: SegmentTracks, state: SegmentState, bias: float, sigma: float
     error = (image - views.pixels) / sigma
     use = views.seen & ~behind & np.isfinite(error).all(-1)
     squares = np.where(use, (error**2).sum(-1), 0.0)
+    # Huber's weight times the square, as the cost weighs it: outliers must not set the scale.
     total = float((squares * HUBER / np.maximum(np.sqrt(squares), HUBER)).sum())
     total += float(((state.depth / views.sigma) ** 2).sum())
     measured = 2 * int(use.sum())
@@ -297,11 +305,14 @@ def posterior(
     for (A, B, d, *_), factor in zip(parts, factors, strict=True):
         S = (A - (B / d) @ B.T) / factor
         scale = np.sqrt(np.maximum(np.diag(S)[:-1], 1e-300))
+        # Metres and radians differ by orders of magnitude: with unit diagonal the least eigenvalue means something.
         values, vectors = np.linalg.eigh(S[:-1, :-1] / np.outer(scale, scale))
         inverse = (vectors / np.maximum(values, 1e-12)) @ vectors.T / np.outer(scale, scale)
         by_bias = inverse @ S[:-1, -1]
         corner += float(S[-1, -1] - S[-1, :-1] @ by_bias)
         kept.append((inverse, by_bias))
+    # Of a window of one the tracks of each segment measure the bias anew; what the prior leaves is the rest that all
+    # share.
     common = prior if params.window == 1 else corner
     return [
         (inverse + np.outer(by_bias, by_bias) * (corner - common) / corner**2, -by_bias * math.sqrt(common) / corner)
@@ -316,6 +327,8 @@ def tilt_of(views: SegmentTracks, state: SegmentState, bias: float, params: Refi
     A[-1, -1] += prior
     ga[-1] += prior * bias
     held, g = views.sigma**-2.0, views.tilt
+    # A tilt moves depths as their own unknowns do, by g a radian; only tracks tell of it, so the disparities' own part
+    # goes.
     by_depth = g * (d - held)
     column = np.append(B @ g, g @ by_depth)
     A = np.column_stack([np.vstack([A, column[:-1]]), column])

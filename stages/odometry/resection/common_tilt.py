@@ -34,6 +34,7 @@ def common_tilt(parts: Floats, prior_sigma: float) -> tuple[float, float]:
     parts : (segment, 2) information and pull of the tilt.
     prior_sigma : radians.
     """
+    # Rounding leaves a segment that tells nothing with no or negative information.
     parts = parts[parts[:, 0] > 0]
     if len(parts) < 3:
         return 0.0, float("inf")
@@ -41,10 +42,12 @@ def common_tilt(parts: Floats, prior_sigma: float) -> tuple[float, float]:
     for _ in range(5):  # of a segment that is far off, no more than of one at two deviations
         tilt = float((information * value).sum() / information.sum())
         off = np.abs(value - tilt) * np.sqrt(information)
+        # At least what the segments claim: few of them may agree by chance.
         spread = max(1.0, mad_sigma(off, 0.0))
         information = parts[:, 0] * huber_weight(off, 2.0 * spread)
     total = float(information.sum()) / spread**2
     prior = prior_sigma**-2.0
+    # Mean of Gaussians: the prior's is 0.
     return tilt * total / (total + prior), (total + prior) ** -0.5
 
 

@@ -96,6 +96,8 @@ def matches_at(
     x = np.clip(np.floor(p[:, 0]), 0, cols - 2).astype(np.intp)
     y = np.clip(np.floor(p[:, 1]), 0, rows - 2).astype(np.intp)
     fx, fy = p[:, 0] - x, p[:, 1] - y
+    # Bilinear by hand: scipy's would mix what is not matched into its neighbours, where here the whole point is
+    # refused.
     weights = np.stack([(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy], -1)
     y4, x4 = y[:, None] + np.array([0, 0, 1, 1]), x[:, None] + np.array([0, 1, 0, 1])
     corners = np.stack([column[y4, x4], row[y4, x4]], -1).astype(np.float64)
@@ -105,6 +107,7 @@ def matches_at(
     corners = np.where(needed[..., None] & good[..., None], corners, np.nan)
     ok = inside & good.all(1)
     corners[~ok] = 0.0
+    # Between two surfaces an interpolated disparity is that of neither.
     apart = np.nanmax(corners, axis=1) - np.nanmin(corners, axis=1)
     value = np.einsum("nk,nki->ni", weights, np.where(np.isfinite(corners), corners, 0.0))
     return value, ok & (apart <= CONSISTENT).all(1)
@@ -131,6 +134,7 @@ def _relief(centre, column, row, validity, rms):  # type: ignore[no-untyped-def]
     """Rms about the fitted plane under each template of which at least half is matched."""
     rows, cols = column.shape
     a, b = np.empty((3, 3)), np.empty((3, 2))
+    # Half of the template, rounded up.
     half = ((2 * TEMPLATE + 1) ** 2 + 1) // 2
     for n in range(len(centre)):
         a[:], b[:] = 0.0, 0.0
@@ -139,6 +143,7 @@ def _relief(centre, column, row, validity, rms):  # type: ignore[no-untyped-def]
             for i in range(max(x0 - TEMPLATE, 0), min(x0 + TEMPLATE + 1, cols)):
                 u, v = np.float64(column[j, i]), np.float64(row[j, i])
                 if validity[j, i] & MATCHED and np.isfinite(u) and np.isfinite(v):
+                    # In units of the template, so that all sums are of the same size.
                     p, q = (i - x0) / TEMPLATE, (j - y0) / TEMPLATE
                     a[0, 0] += 1.0
                     a[0, 1] += p
@@ -157,6 +162,7 @@ def _relief(centre, column, row, validity, rms):  # type: ignore[no-untyped-def]
             continue
         a[1, 0], a[2, 0], a[2, 1] = a[0, 1], a[0, 2], a[1, 2]
         for k in range(3):
+            # Matched pixels on a line leave the slope across open: it is 0 then.
             a[k, k] += 1e-9
         solve_3(a, b)
         plane = b  # solved in place
@@ -181,6 +187,7 @@ def _triangulate(rays: Floats, right: Floats, rig: Rig) -> Floats:
     right_side = xy * t[2] - t[:2]
     with np.errstate(divide="ignore", invalid="ignore"):
         depth = (left_side * right_side).sum(-1) / (left_side**2).sum(-1)
+        # The linear solution minimises no distance in the image; from there two steps reach rounding.
         for _ in range(2):
             p, slope = _right_image(rays, depth, rig)
             depth = depth + ((right - p) * slope).sum(-1) / (slope**2).sum(-1)
@@ -194,6 +201,7 @@ def _right_image(rays: Floats, depth: Floats, rig: Rig) -> tuple[Floats, Floats]
     with np.errstate(divide="ignore", invalid="ignore"):
         z = np.where(x[:, 2] > 0, x[:, 2], np.nan)[:, None]
         focal = np.array([rig.right.fx, rig.right.fy])
+        # Along the ray only: by one parameter, depth, not by the three of a point.
         slope = focal * (a[:, :2] * z - x[:, :2] * a[:, 2:]) / z**2
     return rig.right.project(x), slope
 
@@ -215,6 +223,7 @@ def _landmarks(
         spread = disparity_sigma * per_pixel
     smooth = found & np.isfinite(disparity_sigma)
     near = np.zeros(len(depth), bool)
+    # Beyond, depth is no longer normal though disparity is, and first-order covariances are wrong.
     near[smooth] = spread[smooth] <= max_depth_ratio * depth[smooth]
     position = T_local_left.apply(rays * np.where(near, depth, np.nan)[:, None])
     along = np.where(near, per_pixel, np.nan)[:, None] * (rays @ T_local_left.rotation.T)
@@ -269,6 +278,7 @@ def intersect(elevation: NDArray[np.float32], lattice: Lattice, origin: Floats, 
         height = _height(elevation, lattice, origin, direction, s)
         known = np.isfinite(height)
         below = np.flatnonzero(known & (height <= 0))
+        # Came out of a hole below the surface, or started there: it passed under, not through.
         if below.size == 0 or below[0] == 0 or not known[below[0] - 1]:
             continue
         out[i] = _bisect(elevation, lattice, origin, direction, s[below[0] - 1], s[below[0]])
@@ -284,6 +294,7 @@ def _span(
     box = np.array([[x[0], x[-1]], [y[-1], y[0]], [low - lattice.cell, high + lattice.cell]])
     first, last = 0.0, np.inf
     for axis in range(3):
+        # A ray along an axis stays in or out of the box there.
         if direction[axis] == 0.0:
             if not box[axis, 0] <= origin[axis] <= box[axis, 1]:
                 return None

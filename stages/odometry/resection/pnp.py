@@ -68,6 +68,7 @@ class Observations:
     @property
     def prior(self) -> float:
         """Information of the bias; below a ten thousandth of a pixel it is held."""
+        # A sigma of 0 asks for no bias: held by a large number, the matrices keep their size.
         return 1.0 / max(self.bias_sigma, 1e-4) ** 2
 
 
@@ -136,6 +137,7 @@ def _whiten(a: Floats, g: Floats, sigma: float) -> Floats:
     """``S^-1/2 a`` of (b, n, 2, k) with ``S = sigma^2 I + g g^T``: along g divide by the longer standard deviation."""
     length2 = (g * g).sum(-1)
     unit = g / np.sqrt(np.where(length2 > 0, length2, 1.0))[..., None]
+    # S has sigma^2 across g and sigma^2 + |g|^2 along it: its root is the same with roots.
     shrink = 1.0 / sigma - 1.0 / np.sqrt(sigma**2 + length2)
     along = np.einsum("bni,bnik->bnk", unit, a)
     return np.asarray(a / sigma - (shrink[..., None] * unit)[..., None] * along[..., None, :])
@@ -143,6 +145,7 @@ def _whiten(a: Floats, g: Floats, sigma: float) -> Floats:
 
 def normal_matrix(obs: Observations, errors: Errors, active: Bools) -> tuple[Floats, Floats, Floats]:
     """Weighted normal matrix (b, 7, 7), gradient (b, 7) and weights (b, n) of Huber's cost, without the prior."""
+    # An infinite length times a weight of 0 would be NaN.
     usable = active & np.isfinite(errors.norm)
     weight = np.where(usable, huber_weight(np.where(usable, errors.norm, 1.0), HUBER), 0.0)
     jacobian = derivatives(obs, errors)
@@ -261,6 +264,7 @@ def _norms(data, poses, out):  # type: ignore[no-untyped-def]
     """Weighted error lengths ``out`` (b, n) at poses (b); observations of one problem serve all, or of each its own."""
     R, t, bias = poses
     for b in range(len(out)):
+        # One set of observations may serve many poses, as hypotheses do.
         o = b if len(data.landmarks) > 1 else 0
         pose = _Pose(R[b], t[b], bias[b])
         for n in range(out.shape[1]):
@@ -287,6 +291,7 @@ def _normal(data, o, active, pose, j, out):  # type: ignore[no-untyped-def]
         if not active[n]:
             continue
         r = _observe(data, o, n, pose, j)
+        # Behind the camera, as at a poor start: its cost is infinite, but it must not spoil the step.
         if r == np.inf:
             continue
         w = huber_weight(r, HUBER)
@@ -298,6 +303,7 @@ def _normal(data, o, active, pose, j, out):  # type: ignore[no-untyped-def]
     for i in range(UNKNOWNS):
         for k in range(i):
             normal[i, k] = normal[k, i]
+    # After the mirroring: the prior concerns the bias alone.
     normal[6, 6] += data.prior
     gradient[6] += data.prior * pose.bias
 
@@ -370,14 +376,17 @@ def _minimise(data, active, iterations, tolerance, poses):  # type: ignore[no-un
             most = max(most, done + 1)
             _normal(data, o, active[b], _Pose(R[b], t[b], bias[b]), j, (normal, gradient))
             if not _step(normal, gradient, damping, lower, step):
+                # Not positive: enough damping makes any such matrix so.
                 damping *= 10.0
                 continue
             _moved(R[b], t[b], step, new_R, new_t)
             new_bias = bias[b] + step[6]
             new_cost = _cost(data, o, active[b], _Pose(new_R, new_t, new_bias))
+            # Decrease by the quadratic model, g^T H^-1 g / 2, taken before the step may be refused.
             promised = 0.0
             for k in range(UNKNOWNS):
                 promised -= 0.5 * gradient[k] * step[k]
+            # Also of a refused step: where less than this is to be gained, a smaller one gains nothing either.
             finished = promised <= tolerance * (cost if cost < np.inf else 0.0) + 1e-20
             if new_cost < cost:
                 R[b], t[b], bias[b] = new_R, new_t, new_bias

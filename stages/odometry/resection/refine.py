@@ -71,6 +71,7 @@ def views_of(track: Bundle, resection: Bundle, landmarks: Landmarks, rig: Rig) -
     state = SegmentState(np.array([p.rotation for p in T]), np.array([p.translation for p in T]), np.zeros(len(which)))
     seen = np.ascontiguousarray(inlier[which][:, frames].T)
     tilt = _tilt_pattern(known.position, RigidTransform.from_matrix(poses[0]), rig)
+    # An exact disparity would have infinite information.
     held = np.maximum(known.sigma, 1e-3)
     views = SegmentTracks(known.position, known.per_pixel, held, pixels, seen, rig.left, tilt)
     return views, state, frames
@@ -147,6 +148,7 @@ class _Given:
 def _anew(given: _Given, poses: Floats, tilt: float, resect: ResectParams) -> Segment | None:
     """A segment without the tilt, its landmarks judged once more by poses: the tilt had made good ones inconsistent."""
     tracked = np.isfinite(np.asarray(given.track["points"])).all(-1)
+    # All tracks stand trial again, not only those that agreed under the tilt.
     resection = Bundle({"poses": poses, "inlier": tracked.astype(np.uint8)}, {})
     one = views_of(given.track, resection, given.landmarks, given.rig)
     if one is None:
@@ -177,12 +179,16 @@ def claims(
     """
     parts = [normal(views, state, bias, params.pixel_sigma) for views, state in segments]
     factors = [scatter(views, state, bias, params.pixel_sigma) for views, state in segments]
+    # Twice: by the errors found, and by the larger of those and the ones stated; the difference is what all segments
+    # share.
     found, stated = (posterior(parts, scale, params) for scale in (factors, [max(f, 1.0) for f in factors]))
     out = []
     for (views, state), (noise, _), (expected, by_bias) in zip(segments, found, stated, strict=True):
         count = len(state.R)
         covariance, shared, together = np.empty((count, 6, 6)), np.empty((count, 6, SOURCES)), list[float]()
         for f in range(count):
+            # A step (v, w) of T_cam_local moves the camera by -R^T v and turns it by -R^T w; signs drop out of a
+            # covariance.
             turn, at = np.kron(np.eye(2), state.R[f].T), slice(6 * f, 6 * f + 6)
             covariance[f] = turn @ noise[at, at] @ turn.T
             seen = views.seen[f]

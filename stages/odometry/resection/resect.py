@@ -191,6 +191,7 @@ def resect(
         params.pixel_sigma,
         params.bias_sigma,
     )
+    # The solver moves T_cam_local, callers speak of T_local_left.
     predictions = [Poses.of(T.inverse()) for T in starts]
     poses, near = _robust_start(obs, predictions, params, rng)
     poses, active, steps = _remove_inconsistent(obs, poses, near, params, where)
@@ -219,13 +220,16 @@ def _robust_start(
     candidates = []
     for prediction in predictions:
         start = _repeat(prediction, params.hypotheses)
+        # Ten loose steps: a hypothesis need only come within the bound, the best one is adjusted again.
         candidates += [prediction, levenberg_marquardt(sampled, start, every, 10, tolerance=1e-3)[0]]
     hypotheses = Poses(
         np.concatenate([c.R for c in candidates]),
         np.concatenate([c.t for c in candidates]),
         np.concatenate([c.bias for c in candidates]),
     )
+    # Twice the threshold: four points fix a pose with errors of their own, which must not cost it its landmarks.
     bound = 2.0 * params.threshold / params.pixel_sigma
+    # Truncated squares, not a count: of poses that as many landmarks agree with, the one they fit better.
     score = (np.minimum(norms(obs, hypotheses), bound) ** 2).sum(1)
     best = hypotheses.at(int(np.argmin(score)))
     for _ in range(2):

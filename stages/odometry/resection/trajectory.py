@@ -75,11 +75,13 @@ def chain(segments: Sequence[Segment], levels: Sequence[RigidTransform]) -> Chai
     world, (own, common), broken, piece = levels[0], nothing, False, 0
     poses, covariances, owner, pieces = [world.matrix34], [own], [0], [0]
     for number, ((local, local_cov, shared), level) in enumerate(zip(segments, levels, strict=False)):
+        # Both come from the same level stage: a difference beyond rounding means that the wrong ones were paired.
         if np.abs(local[0] - level.matrix34).max() > 1e-9 * max(1.0, float(np.abs(local[0]).max())):
             raise InputError("RIL-451", f"segment {number} was not resected in the local frame of its own basic pair")
         if broken:
             world, (own, common), piece = level, nothing, piece + 1
             poses[-1], covariances[-1], owner[-1], pieces[-1] = world.matrix34, own, number, piece
+        # Once a segment: over thousands of products rounding would bend the rotation.
         T_world_local = _clean(world @ level.inverse())
         key, key_own, key_common = world, own, common
         for pose, pose_cov, pose_shared in zip(local[1:], local_cov[1:], shared[1:], strict=True):
@@ -89,6 +91,7 @@ def chain(segments: Sequence[Segment], levels: Sequence[RigidTransform]) -> Chai
                 lever, turn = propagation(key, T_world_local, world)
                 alone = pose_cov - pose_shared @ pose_shared.T
                 # Own errors add as variances; those of one cause go together in all segments, so their roots add first.
+                # Rounding makes the two halves of the product differ, and more so from frame to frame.
                 own = _symmetric(lever @ key_own @ lever.T + turn @ alone @ turn.T)
                 common = lever @ key_common + turn @ pose_shared
             poses.append(np.full((3, 4), np.nan) if broken else world.matrix34)
@@ -153,6 +156,7 @@ def levelled(found: Chained, first: int, up: Floats) -> Chained:
     rows = np.flatnonzero(found.piece == found.piece[first])
     R = found.poses[first, :, :3]
     turn = level_rotation(R.T @ up) @ R.T
+    # Position and rotation vector turn alike.
     both = np.kron(np.eye(2), turn)
     poses, covariance = found.poses.copy(), found.covariance.copy()
     poses[rows] = turn @ poses[rows]
@@ -199,11 +203,13 @@ def _account(frames: list[int], piece: NDArray[np.int16], causes: Mapping[int, s
         if len(rows := np.flatnonzero(piece == k))
     ]
     lost, lines = [], []
+    # Runs of lost frames: between neighbours the row grows by one.
     for run in np.split(rows := np.flatnonzero(piece < 0), np.flatnonzero(np.diff(rows) > 1) + 1):
         if not run.size:
             continue
         before, behind = posed[posed < run[0]], posed[posed > run[-1]]
         bridged = None
+        # Bridged: the frames on both sides are of one piece, tracked across.
         if before.size and behind.size and piece[before[-1]] == piece[behind[0]]:
             bridged = [frames[before[-1]], frames[behind[0]]]
         for row in run:
@@ -274,6 +280,7 @@ def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
         {
             "frames": frames,
             "inliers": [inliers.get(f, 0) for f in frames],
+            # Metadata are JSON, which has no NaN.
             "positions": [[float(v) for v in p[:, 3]] if np.isfinite(p).all() else None for p in found.poses],
             "verticals": verticals,
         }

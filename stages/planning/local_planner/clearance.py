@@ -129,6 +129,7 @@ class Footing:
         unknown = risk == UNKNOWN if unknown is None else unknown
         bits = np.full(risk.shape, WHEEL_BITS) if reason is None else reason
         doubtful = hazardous & ((bits & DOUBT_BIT) > 0)
+        # Without probabilities every hazard that is none by sigma alone is proven.
         likely = proven = hazardous & ~doubtful
         dear = np.where(risk == CAUTION, np.uint8(CAUTION_GROUND), np.uint8(0))
         if p_hazard is not None:
@@ -141,6 +142,7 @@ class Footing:
         kinds = [(bits & which) > 0 for which in (WHEEL_BITS, BODY_BITS)]
         fields = np.stack([_distance(mask & kind, cell) for kind in kinds for mask in (likely, doubtful, proven)])
         wide = _opened(unknown, 0.5 * vehicle.wheel_diameter, cell)
+        # Where lines of sight bound what hides there, the belly may pass; elsewhere unknown ground is a void to it.
         void = _distance(unknown if bounds is None else unknown & np.isnan(bounds.upper), cell)
         straddle = Straddle.of(void, bounds, vehicle, _belly(vehicle), cell)
         unseen, frontier = _distance(unknown, cell), _distance(wide, cell)
@@ -168,6 +170,7 @@ class Footing:
         x, y, heading = stand
         cell, vehicle = self.lattice.cell, self.vehicle
         reach = 0.5 * math.hypot(vehicle.track, vehicle.wheel_base) + vehicle.margin + 2.0 * cell
+        # Only the cells in a box about the vehicle are looked at, for maps are far larger.
         row, col = self.lattice.index((x, y))
         n = math.ceil(reach / cell)
         rows, cols = (slice(max(0, round(float(v)) - n), max(0, round(float(v)) + n + 1)) for v in (row, col))
@@ -188,6 +191,7 @@ def _distance(mask: Mask, cell: float) -> Floats32:
 
 def _opened(mask: Mask, radius: float, cell: float) -> Mask:
     """What of a mask circles of this radius, m, cover that lie within it."""
+    # Morphological opening by distances: an erosion and a dilation by a circle, whatever its radius in cells.
     inner = _distance(~mask, cell) - 0.5 * cell  # to the edge of the nearest cell without
     return np.asarray(mask & (_distance(inner >= radius, cell) < radius + 0.5 * cell))
 
@@ -220,6 +224,7 @@ def _gaps(poses, parts, ground, reach, out):  # type: ignore[no-untyped-def]
         if i < 0 or j < 0 or i >= rows or j >= cols:
             out[0, n] = out[1, n] = out[2, n] = -np.inf
             continue
+        # The middle is judged by what is hazardous to the vehicle, the wheels below by what is to wheels.
         gap, doubtful, proven = fields[3, i, j], fields[4, i, j], fields[5, i, j]
         cautious, doubted = int(dear[i, j] == CAUTION_GROUND), int(dear[i, j] == DOUBTED_GROUND)
         spare = unknown[i, j] - reach[0]
@@ -249,6 +254,7 @@ def _gaps(poses, parts, ground, reach, out):  # type: ignore[no-untyped-def]
             i, j = math.floor(row - (a * s + b * c) + 0.5), math.floor(col + (a * c - b * s) + 0.5)
             # All wheels are on the map: what sticks out between them is a rounding to cells.
             i, j = min(max(i, 0), rows - 1), min(max(j, 0), cols - 1)
+            # Unknown, but bounded and low enough: then only the nearest ground without a bound counts.
             if steady and straddle.void[i, j] > unknown[i, j] and clears(straddle, k, i, j, heights):
                 least = min(least, straddle.void[i, j])
             else:

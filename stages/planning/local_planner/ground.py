@@ -54,6 +54,7 @@ class Ground:
         at = footing.gaps(*(np.array([v]) for v in (*start, heading)))
         # where it stands it may be: near there, ground that is no worse by more than a cell will do
         margin = self.vehicle.margin
+        # Else a vehicle that slipped into a margin could never leave it.
         self.here = [
             min(most, float(a[0]) - self.cell)
             for most, a in ((margin, at.gap), (0.0, at.doubtful), (margin, at.proven))
@@ -72,8 +73,10 @@ class Ground:
         near, margin = self._near(x, y), self.vehicle.margin
         known = (gaps.gap > np.where(near, self.here[0], margin) - slack) & self._seen(gaps, near)
         known &= gaps.doubtful > np.where(near, self.here[1], 0.0)
+        # Hazards that are likely but not proven may be planned over, at a price: seen from nearer most of them go.
         opened = gaps.proven > np.where(near, self.here[2], margin) - slack
         for cx, cy in self.closed:
+            # What was looked at in vain is closed as far as it is not known: the rest of the circle may be driven.
             opened &= known | (np.hypot(x - cx, y - cy) > self.p.vain * self.vehicle.wheel_base)
         return known, opened | known
 
@@ -97,6 +100,8 @@ class Ground:
         if self.footing.glanced is not None:
             unseen[~self._at(~self.footing.glanced, x, y)] = min(self.p.glance_price, self.p.unknown_price)
         unknown = np.where(blind, np.maximum(self.p.blind_price, unseen), unseen)
+        # Likely hazards, and gaps narrower than a wheel, which are the shadows of stones: looking nearer does not free
+        # them.
         stays = (gaps.gap <= self.vehicle.margin) | ((gaps.unknown <= 0) & (gaps.frontier > 0))
         unknown = np.where(stays, np.maximum(self.p.doubt_price, unknown), unknown)
         caution = self.p.caution_price * ((gaps.caution + DOUBT_WEIGHT * gaps.doubted) / PARTS)
@@ -106,6 +111,8 @@ class Ground:
         price = np.where(known, 1.0, unknown) + caution
         if self.vehicle.margin > 0:
             beside = np.minimum(gaps.gap / self.vehicle.margin - 1.0, gaps.doubtful / self.vehicle.margin)
+            # Falls from one at the margin to none at twice the margin; of hazards by sigma alone from their edge, as
+            # they have none.
             price = price + self.p.near_price * np.clip(1.0 - beside, 0.0, 1.0)
         return known, np.where(opened, price, np.inf)
 
@@ -171,8 +178,10 @@ class Ground:
             metres = piece.length * (self.p.back_price if piece.gear < 0 else 1.0)
             if not np.isfinite(price).all():
                 return [], math.inf
+            # As the lattice prices a turn: by the dearest pose on it; a piece by the mean of its poses.
             cost += abs(piece.heading - heading) * self.p.turn_price * self.vehicle.wheel_base * float(price[:n].max())
             cost += metres * float(price[n:].mean())
+            # The known part is driven now: cut there, or a whole long piece would count as unknown.
             first = piece.length * float(share[np.argmin(known) - 1])  # metres before what is not known
             if not known.all() and np.argmin(known) > n and first > 0:
                 out.append(replace(piece.cut(first), known=True))

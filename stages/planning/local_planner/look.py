@@ -78,6 +78,7 @@ def _edges(camera: Camera, T_vehicle_camera: RigidTransform) -> Floats:
     """(4, 3): lines on the ground, positive inside."""
     u, v = RIM * camera.width, RIM * camera.height
     corners = np.array([[u, v], [camera.width - u, v], [camera.width - u, camera.height - v], [u, camera.height - v]])
+    # Corners of an image lie half a pixel outside the centres of its corner pixels.
     rays = camera.rays(corners - 0.5) @ T_vehicle_camera.rotation.T
     planes = np.cross(rays, np.roll(rays, -1, axis=0))  # inward, by the order of the corners
     return np.column_stack([planes[:, :2], -planes @ T_vehicle_camera.translation])
@@ -155,6 +156,7 @@ class Target:
         if not self.view.holds(self.points, stand):
             return False
         side, far = bearing(self.points, stand)
+        # The remainder, since two directions either side of due west differ by almost a full turn as numbers.
         same = (d <= FARTHER * far and abs(math.remainder(a - side, 2 * math.pi)) < SIDE for a, d in self.before)
         return sum(same) < looks
 
@@ -162,6 +164,8 @@ class Target:
         """Least turn (rad) on the spot, within bounds and where the wheels have room, after which it is in view."""
         found = [0.0]
         for sign, most in ((1.0, left), (-1.0, right)):
+            # Outwards until the wheels have no room: what lies behind a stone that blocks the turn is not reached
+            # through it.
             turns = np.array([sign * k * STEP for k in range(1, 1 + math.floor(max(most, 0.0) / STEP + 1e-9))])
             free = self.ground.free(np.full(turns.shape, at[0]), np.full(turns.shape, at[1]), heading + turns)
             found += turns[np.logical_and.accumulate(free)].tolist()
@@ -172,6 +176,7 @@ class Target:
         within a bound (rad) of each other; None: nowhere on it."""
         headings = np.array([self.ground.heading, *(piece.heading for piece in leg)])
         low, high = np.minimum.accumulate(headings), np.maximum.accumulate(headings)
+        # From the end: the later a leg stops, the fewer stops there are.
         for done, k, share in _backward(leg, 2.0 * self.ground.cell):
             piece = leg[k]
             at = tuple(a + share * (b - a) for a, b in zip(piece.a, piece.b, strict=True))

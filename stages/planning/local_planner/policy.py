@@ -115,11 +115,13 @@ def plan_leg(
         nothing = np.full(footing.lattice.shape, np.nan, np.float32)
         return _stay("goal", f"{1000 * left:.0f} mm from the goal", start, [], nothing)
     ground = Ground(footing, start, heading, params, memory.closed)
+    # Half of the tolerance, so that a vehicle that ends a little beside its place has reached the goal nevertheless.
     goals, cost, move = ground.search(goal, 0.5 * params.tolerance * base)
     shown, least = ground.on_map(cost), ground.from_start(cost)
     kept, price = list[Piece](), math.inf
     if before is not None:
         kept, price = ground.again(_onward(before, start, heading, ground.grid.spacing))
+    # Only as the last resort: each of them is a graph of its own, as dear as the first.
     for other in ground.beside() if not np.isfinite(min(least, price)) and ground.opens(goals) else ():
         _, found, move = other.search(goal, 0.5 * params.tolerance * base)
         least = other.from_start(found)
@@ -132,6 +134,7 @@ def plan_leg(
         if turn:
             return _stay("look", f"{why}: looks around", start, [], shown, turn)
         return _stay("no path", why, start, [], shown)
+    # Without this the cheaper of two ways round a stone may change at each stop, and the vehicle goes to and fro.
     way = kept if kept and price <= (1.0 + params.loyalty) * least else ground.way(move)
     plan = _plain(ground, way)
     first = _sure(plan)
@@ -145,6 +148,7 @@ def plan_leg(
 
 def _plain(ground: Ground, way: Sequence[Piece]) -> list[Piece]:
     """A way whose first metres are made straighter, as far as they are known."""
+    # Beyond some legs the map will have changed before the vehicle is there: straightening it is for nothing.
     sure = first_metres(way[: _sure(way)], 4.0 * ground.p.length * ground.vehicle.wheel_base)
     straight = straightened(sure, ground.heading, ground.plain, ground.cell)
     return [*straight, *last_metres(way, length_of(sure))]
@@ -163,6 +167,7 @@ def _onwards(
     p, base, start, heading = ground.p, ground.vehicle.wheel_base, ground.start, ground.heading
     bound = math.radians(p.max_turn_deg)
     leg = first_metres(plan[: _sure(plan)], p.length * base)
+    # A short last piece to the goal is worth its stop.
     if length_of(leg) < min(p.least * base, length_of(way) - 1e-9):
         return None
     seen = None if target is None else target.last_view(leg, bound)
@@ -241,6 +246,8 @@ def _sure(way: Sequence[Piece]) -> int:
 def _free_turn(ground: Ground, looks: int) -> float:
     """Turn (rad) to look around, to one side and then to the other, that the wheels have room for; 0: none."""
     bound = math.radians(ground.p.max_turn_deg)
+    # Each turn starts where the last one ended: they look 25 degrees to the left of the first heading, 25 to the right
+    # and 50 to the left, as far as the bound lets them.
     aside = [math.radians(d) for d in (25.0, -50.0, 75.0)]
     aside = aside[looks % 3 :] + aside[: looks % 3] + [math.radians(d) for d in (-25.0, 15.0, -15.0)]
     for turn in (max(-bound, min(bound, a)) for a in aside):

@@ -50,6 +50,7 @@ def pieces(graph: PoseGraph, moves: Sequence[tuple[int, int, int, int]]) -> list
     grid, (pose, step, turn), sure = graph.grid, graph.known, True
     for (k, r, c, m), (k1, r1, c1, _) in itertools.pairwise(moves):
         if m in (AHEAD, BACK):
+            # A step is stored once, with the place from which it leads ahead along the heading below half a turn.
             begin = (r, c) if (m == AHEAD) == (k % 16 < 8) else (r1, c1)
             here = pose[k % 8, r, c] and pose[k % 8, r1, c1] and step[k % 8, begin[0], begin[1]]
             x, y = grid.xy(np.array([r, r1], np.float64), np.array([c, c1], np.float64))
@@ -67,12 +68,15 @@ def straightened(way: Sequence[Piece], heading: float, clear: Clear, spacing: fl
     i = 0
     while i < len(way):
         last = i
+        # Within one gear: where the vehicle reverses there is a reason to be.
         while last + 1 < len(way) and way[last + 1].gear == way[i].gear:
             last += 1
         j, best = i, way[i]
         for end in range(last, i, -1):
             line = _line(way[i], way[end])
             after = way[end + 1].heading if end + 1 < len(way) else line.heading
+            # A quarter turn or more off means that the way bends back: the straight line would be driven the other way
+            # round.
             if abs(line.heading - way[i].heading) < 0.5 * math.pi and _drivable(line, heading, after, clear, spacing):
                 j, best = end, line
                 break

@@ -78,6 +78,7 @@ def _run(params: LegParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     T_world_left = RigidTransform.from_matrix(np.asarray(inputs["pose"]["poses"])[-1])
     T_vehicle_left = RigidTransform.from_matrix(args["T_vehicle_left"])
     T = T_world_left @ T_vehicle_left.inverse()
+    # The heading counts from the world's y axis to the left, and the vehicle's y axis is its second column.
     stand = float(T.translation[0]), float(T.translation[1]), math.atan2(-T.rotation[0, 1], T.rotation[1, 1])
     goal = (float(args["goal"][0]), float(args["goal"][1]))
     closed = [(float(x), float(y)) for x, y in args["closed"]]
@@ -121,6 +122,7 @@ def seen_so_far(near: Bundle, far: Bundle | None, p: LegParams) -> tuple[Hazards
         chance = np.asarray(far["p_hazard"])
         cut = unknown | (((maps[1] & UNSEEN_BIT) != 0) & (chance < p.clear))
         maps = [np.where(cut, np.asarray(far[name]), seen) for name, seen in zip(names, maps, strict=True)]
+        # Written so that NaN, of which nothing is known, stays unknown.
         unknown &= ~(maps[2] < p.clear)
         glanced = unknown & (maps[0] < HAZARDOUS)
     return Hazards(*maps), KnownGround(unknown, glanced, maps[2] >= p.avoid)

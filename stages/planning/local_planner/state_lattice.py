@@ -88,6 +88,7 @@ class PoseGraph:
         row, col = np.meshgrid(*(np.arange(n, dtype=np.float64) for n in grid.shape), indexing="ij")
         price, known = (np.empty((3, HALF, *grid.shape), kind) for kind in (np.float64, np.bool_))
         for k in range(HALF):
+            # Of all 16 headings: the turn to the left of the eighth ends at the ninth.
             after = ANGLES[k + 1]
             dr, dc = 0.5 * STEPS[k]
             for where, (r, c, angle) in enumerate(
@@ -167,6 +168,7 @@ def _search(prices, goals, moves, end, cost, move):  # type: ignore[no-untyped-d
         key, node = keys[0], nodes[0]
         size = pop(keys, nodes, size)
         k, r, c = node // area, node % area // cols, node % cols
+        # Reached more cheaply since it was pushed: this entry is out of date.
         if key > cost[k, r, c]:
             continue
         if node == end:
@@ -184,6 +186,7 @@ def _search(prices, goals, moves, end, cost, move):  # type: ignore[no-untyped-d
                 between = step[k % 8, i, j] if first else step[k % 8, r, c]
                 scale = lengths[k] * (back if m == 1 else 1.0)
             else:
+                # Searched backwards: a turn to the left (2) that ends at k began one heading to its right.
                 before = (k + 15) % 16 if m == 2 else (k + 1) % 16
                 lower = before if m == 2 else k
                 between, scale = turn[lower % 8, r, c], turns[lower]

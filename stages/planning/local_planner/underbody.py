@@ -48,11 +48,13 @@ class Straddle(NamedTuple):
         gradient = math.tan(math.radians(vehicle.max_slope_deg))
         limits = np.array([vehicle.track, vehicle.wheel_base, vehicle.clearance, gradient * gradient])
         share = belly / limits[:2]
+        # Bilinear weights of the four wheels: products of a share along the track and one along the wheel base.
         weights = np.prod(0.5 + share[:, None] * np.sign(wheel_positions(vehicle)), axis=-1)
         if bounds is None:
             nothing = np.empty((0, 0), np.float32)
             return Straddle(void, nothing, np.stack([nothing, nothing]), weights, limits)
         seen = np.isfinite(bounds.lower)
+        # A point stands for the square of belly about it, half a diagonal wide, and the margin beyond.
         apart = max(float(np.diff(np.unique(side)).max()) for side in belly.T)
         reach = 0.25 * vehicle.wheel_diameter, vehicle.margin + apart / math.sqrt(2.0)
         contact, around = (max(1, math.ceil(v / cell - 0.5)) for v in reach)
@@ -81,6 +83,8 @@ def stands(straddle, at, heights):  # type: ignore[no-untyped-def]
     along = across = 0.0
     for k in range(4):
         high = stand[1, at[k, 0], at[k, 1]]
+        # The steepest that the bounds allow: one wheel at its highest; the one before or behind it (k + 2), or beside
+        # it (k ^ 1), at its lowest.
         along, across = max(along, high - heights[(k + 2) % 4]), max(across, high - heights[k ^ 1])
     along, across = along / straddle.limits[1], across / straddle.limits[0]
     return along * along + across * across <= straddle.limits[3]
