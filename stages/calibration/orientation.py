@@ -64,6 +64,7 @@ def thin(
 def _best_of_cells(usable, quality, side):  # type: ignore[no-untyped-def]
     """Flat index of the usable pixel of least error in each cell, the first of equals; -1 none. Cells in order."""
     rows, cols = usable.shape
+    # Cells are counted row by row; the last one may be partial.
     across = cols // side + 1
     best = np.full((rows // side + 1) * across, -1, np.int64)
     least = np.empty(len(best))
@@ -73,6 +74,7 @@ def _best_of_cells(usable, quality, side):  # type: ignore[no-untyped-def]
                 continue
             cell = (r // side) * across + c // side
             error = quality[r, c]
+            # NaN compares as neither less nor greater: the first pixel of a cell would never give way.
             if error != error:
                 error = np.inf
             if best[cell] < 0 or error < least[cell]:
@@ -120,6 +122,7 @@ def misalignment(offset: float, decision: Decision) -> str:
     parts = [f"rows of the right image lie {abs(offset):.2f} px too {'low' if offset > 0 else 'high'}"]
     for p in decision.parameters:
         degrees = math.degrees(p.value)
+        # Positive roll turns x (right) to y (down), which is clockwise as one sees the image.
         if p.freed and p.name == "roll":
             parts.append(f"it is turned by {abs(degrees):.2f} degrees {'' if degrees > 0 else 'anti'}clockwise")
         elif p.freed and p.name != "pitch":

@@ -170,9 +170,11 @@ def considered(fit: OrientationFit, free: Sequence[bool], beliefs: Beliefs, smoo
     """
     prior = precision(free, beliefs, max(beliefs.term, smooth), rival=False)
     for i in np.flatnonzero(~np.asarray(free)):
+        # By the deviations that they are believed to have now, not those that the fit held them with.
         prior[i, i] = held[i] ** -2.0
     solved = np.array([*free, *[True] * PRINCIPAL, *[False] * len(TERMS)])
     inverse = np.linalg.inv(fit.normal[np.ix_(solved, solved)] + prior[np.ix_(solved, solved)])
+    # Change of the estimate by a change of what was not estimated: the consider covariance's gain.
     gain = -inverse @ fit.normal[np.ix_(solved, ~solved)]
     covariance = np.zeros((SIZE, SIZE))
     covariance[np.ix_(solved, solved)] = inverse + gain @ np.diag(1.0 / np.diag(prior)[~solved]) @ gain.T
@@ -185,6 +187,7 @@ def _adjust(
     """Gauss-Newton with weights from the scatter; ``prior`` matrix, the smooth error's size kept or estimated."""
     x, scales, linear = np.zeros(SIZE), [np.inf] * len(pairs), linearised(rig, pairs) if start is None else start
     for _ in range(ITERATIONS):
+        # All pairs are linearised about the same x, so the first tells.
         if np.abs(x - linear[0].about)[:RIG].max() > LINEAR:
             linear = [_linear(rig, m, x, one) for m, one in zip(pairs, linear, strict=True)]
         parts = [_pair(one, scale, x) for one, scale in zip(linear, scales, strict=True)]
@@ -205,6 +208,7 @@ def _maximised(normal: Floats, pull: Floats, prior: Floats, smooth: float, round
     """
     total, terms = normal + prior, np.arange(SIZE)[SMOOTH]
     for _ in range(rounds + 1):
+        # Of the prior only these terms change with the size: the rest of the sum stays.
         total[terms, terms] = normal[terms, terms] + smooth**-2.0
         covariance = np.linalg.inv(total)
         x, variance = covariance @ pull, np.diag(covariance)
@@ -302,6 +306,7 @@ def _weigh(constant, design, block, x, last, out):  # type: ignore[no-untyped-de
         for k in range(unknowns):
             total += design[n, k] * x[k]
         rest[n] = total
+    # At most the last scale: weights only narrow, so that the fit cannot swing between two sets of inliers.
     noise = max(LEAST_NOISE, min(last, MAD_TO_SIGMA * np.median(np.abs(rest))))
     # Errors of neighbours go together: means of blocks scatter by more than the matches in them explain.
     number, sums = np.zeros(BLOCKS**2), np.zeros(BLOCKS**2)
@@ -311,6 +316,7 @@ def _weigh(constant, design, block, x, last, out):  # type: ignore[no-untyped-de
         sums[block[n]] += weights[n] * rest[n]
     together, used = 0.0, 0
     for k in range(BLOCKS**2):
+        # Fewer matches have no mean to speak of.
         if number[k] >= 5.0:
             together += sums[k] ** 2 / number[k]
             used += 1

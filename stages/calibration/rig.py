@@ -188,6 +188,7 @@ def _contradiction(given: Rig, pairs: Sequence[PointPairs], decision: Decision, 
     if not decision.changed:
         return []
     signed = [distances(given, np.zeros(RIG), m.left, m.right)[0] for m in pairs]
+    # The same points before and after: residuals of two sets of inliers say nothing about a repair.
     inlier = np.concatenate(decision.fit.weights) > 0
     words = misalignment(float(np.median(np.concatenate(signed)[inlier])), decision)
     done = "kept because rig.mode = fixed" if mode == "fixed" else "repaired"
@@ -266,6 +267,7 @@ def _shown(start: Sequence[Linear], columns: list[int], usual: Floats, departure
     for k, (found, wanted) in enumerate(zip(error, claimed, strict=True)):
         seen = np.isfinite(found)
         if seen.any():
+            # What the block moved by in the direction that the parameters claim, at most as far as they claim.
             apart = (found[seen] - np.nanmedian(left[:, seen], axis=0)) * np.sign(wanted[seen])
             moved[k] = np.median(np.clip(apart, 0.0, np.abs(wanted[seen])))
     return moved

@@ -33,11 +33,13 @@ def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     found = coarse_motion(Pyramid.from_bundle(inputs["left"]), Pyramid.from_bundle(inputs["right"]), SEARCH)
     row, col = np.nonzero(matched(found.validity))
     scale = 2.0**found.level
+    # Centres of the coarse pixels in those of level 0.
     left = np.asarray((np.stack([col, row], -1) + 0.5) * scale - 0.5, dtype=np.float64)
     shift = np.stack([found.column_disparity[row, col], found.row_disparity[row, col]], -1)
     right = np.asarray(left + shift, dtype=np.float64)
     facts: dict[str, Any] = {"frame": int(args["frame"]), "matches": len(left), "swapped": False}
     if len(left) >= LEAST:
+        # The tolerance is one coarse pixel: coarse matches are no more exact.
         given, other_way = fits(rig, left, right, scale), fits(rig, right, left, scale)
         facts |= {"as_given": given, "exchanged": other_way, "swapped": exchanged(given, other_way)}
     return Bundle({}, facts)

@@ -25,7 +25,17 @@ from numpy.typing import NDArray
 
 from rille.stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
 from rille.stages.core.errors import InputError
-from rille.stages.evaluation.accuracy_parts import Metric, along, angle, inverse, metric, posed, rms, square
+from rille.stages.evaluation.accuracy_parts import (
+    Metric,
+    along,
+    angle,
+    inverse,
+    metric,
+    posed,
+    relative_error,
+    rms,
+    square,
+)
 from rille.stages.evaluation.trajectory_error import against_claims, by_cause, by_shares, by_steps
 from rille.stages.odometry.resection.trajectory import world_poses
 
@@ -66,6 +76,8 @@ def trajectory_accuracy(
     if len(judged) == 0:
         raise InputError("RIL-302", "no frame with a pose has truth", remedy="give truth that covers the chosen frames")
     P, Q = square(estimate), square(truth)
+    # By the first frame that has both: a run is judged by what grows from its own start, not by where the truth's
+    # origin lies.
     aligned = P[judged[0]] @ inverse(Q[judged[0]]) @ Q
     arrays = {
         "position": P[:, :3, 3].copy(),
@@ -97,6 +109,7 @@ def umeyama(source: Floats, target: Floats) -> tuple[Floats, Floats]:
     """Rotation (3, 3) and translation (3,) that bring points (n, 3) nearest to others in the least-squares sense."""
     a, b = source.mean(axis=0), target.mean(axis=0)
     u, _, vt = np.linalg.svd((target - b).T @ (source - a))
+    # Else positions on a plane or a line may be fitted best by a reflection.
     sign = np.diag([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
     rotation = u @ sign @ vt
     return rotation, b - rotation @ a
@@ -135,7 +148,7 @@ def _drift(P: Floats, aligned: Floats, judged: NDArray[np.intp]) -> dict[str, Me
 
 
 def _relative(P: Floats, Q: Floats) -> dict[str, Metric]:
-    E = inverse(inverse(Q[:-1]) @ Q[1:]) @ (inverse(P[:-1]) @ P[1:])
+    E = relative_error(P, Q, slice(None, -1), slice(1, None))
     E = E[np.isfinite(E).all(axis=(1, 2))]
     if len(E) == 0:
         none = "not applicable: no two successive frames have poses"
@@ -170,10 +183,12 @@ def _kitti(P: Floats, Q: Floats) -> dict[str, Metric]:
     errors = []
     for first in range(0, len(Q), KITTI_STEP):
         for length in KITTI_LENGTHS:
+            # The first frame beyond the length, as in the development kit.
             last = int(np.searchsorted(way, way[first] + length, side="right"))
             if last >= len(Q) or not np.isfinite(P[[first, last]]).all() or not has_truth[first : last + 1].all():
                 continue
-            E = inverse(inverse(P[first]) @ P[last]) @ (inverse(Q[first]) @ Q[last])
+            # KITTI's own order: the inverse of the other errors here, of the same length and angle.
+            E = relative_error(Q, P, first, last)
             errors.append((np.linalg.norm(E[:3, 3]) / length, angle(E) / length))
     if not errors:
         why = f"not applicable: the true path is {way[-1]:.1f} m long, the shortest section 100 m"
@@ -193,19 +208,20 @@ def angles_between(a: Floats, b: Floats) -> Floats:
     return angle(np.swapaxes(a[:, :, :3], 1, 2) @ b[:, :, :3])
 
 
-def by_frame(poses: Floats, frames: list[int], wanted: list[int]) -> Floats:
-    """Poses (frame, 3, 4) of the wanted frames, NaN where there is none."""
+def by_frame(values: Floats, frames: list[int], wanted: list[int]) -> Floats:
+    """Rows (frame, ...) of the wanted frames, of poses or covariances; NaN where there is none."""
     row = {frame: k for k, frame in enumerate(frames)}
-    out = np.full((len(wanted), 3, 4), np.nan)
+    out = np.full((len(wanted), *values.shape[1:]), np.nan)
     for k, frame in enumerate(wanted):
         if frame in row:
-            out[k] = poses[row[frame]]
+            out[k] = values[row[frame]]
     return out
 
 
 def _nothing(estimate: Floats) -> dict[str, Floats]:
     """What is drawn where no frame can be judged: the estimate alone."""
     position = estimate[:, :, 3].copy()
+    # The report draws the estimate all the same, without a curve of the truth.
     none = np.full_like(position, np.nan)
     displacement = np.diff(position, axis=0)
     return {
@@ -214,16 +230,6 @@ def _nothing(estimate: Floats) -> dict[str, Floats]:
         "displacement": displacement,
         "displacement_truth": none[1:].copy(),
     }
-
-
-def _claimed(trajectory: Bundle, given: list[int], wanted: list[int]) -> Floats | None:
-    """Covariances of the wanted frames, NaN where there is none; None of a trajectory that claims nothing."""
-    if "covariance" not in trajectory.arrays:
-        return None
-    row = {frame: k for k, frame in enumerate(given)}
-    none = np.full((6, 6), np.nan)
-    covariance = np.asarray(trajectory["covariance"])
-    return np.array([covariance[row[f]] if f in row else none for f in wanted])
 
 
 def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
@@ -236,7 +242,8 @@ def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     if len(estimate) == len(true) and not (has_pose & has_truth).any():
         arrays, metrics = _nothing(estimate), _counts(has_pose, has_truth)
     else:
-        claimed = _claimed(trajectory, given, wanted)
+        claims = "covariance" in trajectory.arrays
+        claimed = by_frame(np.asarray(trajectory["covariance"]), given, wanted) if claims else None
         arrays, metrics = trajectory_accuracy(estimate, true, claimed)
     return Bundle(arrays, {"metrics": metrics, "frames": wanted, "truth": truth.meta["source"]})
 

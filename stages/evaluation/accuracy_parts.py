@@ -33,11 +33,20 @@ def square(poses: Floats) -> Floats:
 def inverse(T: Floats) -> Floats:
     """Inverses of rigid transforms (..., 4, 4)."""
     out = np.zeros_like(T)
+    # The transpose instead of a general inverse: no rounding enters the rotation.
     R = np.swapaxes(T[..., :3, :3], -1, -2)
     out[..., :3, :3] = R
     out[..., :3, 3] = -(R @ T[..., :3, 3, None])[..., 0]
     out[..., 3, 3] = 1.0
     return out
+
+
+def relative_error(P: Floats, Q: Floats, first: Any, last: Any) -> Floats:
+    """Error (..., 4, 4) of estimated motions P (n, 4, 4) against true ones Q, from frames ``first`` to ``last``.
+
+    ``(Q_first^-1 Q_last)^-1 (P_first^-1 P_last)``; the frames are indices or slices.
+    """
+    return np.asarray(inverse(inverse(Q[first]) @ Q[last]) @ (inverse(P[first]) @ P[last]))
 
 
 def angle(T: Floats) -> Floats:
@@ -54,6 +63,7 @@ def rms(vectors: Floats) -> float:
 
 def along(poses: Floats) -> tuple[Floats, int]:
     """Way (frame,) from the first frame along positions, m, straight over frames without any; how many such gaps."""
+    # Interpolated over frames without a position, so that the way of every frame is a number to search in.
     there = np.isfinite(poses[:, :3, 3]).all(axis=1)
     rows = np.flatnonzero(there)
     way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(poses[rows, :3, 3], axis=0), axis=1))])

@@ -81,6 +81,7 @@ def compare(ours: Floats, theirs: Floats, piece: NDArray[np.integer[Any]]) -> tu
             continue
         _steps(arrays, ours, theirs, rows)
         rests = _at_rest(ours[rows], arrays["step_distance"][rows])
+        # A camera at rest: its positions are noise, and would turn the alignment to any side.
         laid = moved(theirs, *align(theirs[rows], ours[rows], math.inf if rests else ORIENTATION_SHARE))
         arrays["poses"][piece == number] = laid[piece == number]
         arrays["distance"][rows] = np.linalg.norm(laid[rows, :, 3] - ours[rows, :, 3], axis=1)
@@ -89,6 +90,7 @@ def compare(ours: Floats, theirs: Floats, piece: NDArray[np.integer[Any]]) -> tu
         if not rests:
             cross, square = cross + float(np.sum(a * b)), square + float(np.sum(a * a))
             left.append((a, b))
+    # Least squares of b = s a over all pieces at once, for one rig has one scale.
     scale = cross / square if square > 0 and cross > 0 else None
     rest = np.concatenate([b - scale * a for a, b in left]) if scale is not None else None
     scaled = None if rest is None else float(np.sqrt(np.mean(np.sum(rest**2, axis=1))))
@@ -103,6 +105,7 @@ def _at_rest(poses: Floats, step_distance: Floats) -> bool:
 
 def _steps(arrays: dict[str, Floats], ours: Floats, laid: Floats, rows: NDArray[np.intp]) -> None:
     """Disagreement of the motions from frame to frame, in place; in the frame before, so free of the alignment."""
+    # Frames whose neighbour before is in the piece as well: a step over a gap is no motion between frames.
     second = rows[1:][np.diff(rows) == 1]
     moves = []
     for poses in (ours, laid):
@@ -128,6 +131,7 @@ def flag(arrays: Mapping[str, Floats], params: AgreementParams) -> tuple[NDArray
             continue
         median = float(np.median(values))
         sigma = mad_sigma(values)
+        # Where both agree to rounding, the robust deviation is nearly 0 and every frame would stand out.
         least = math.radians(params.least_angle_deg) if "angle" in name else 1e-9  # rounding is no reason
         limit = max(median + params.threshold * sigma, params.least_ratio * median, least)
         limits[name] = limit
@@ -144,10 +148,12 @@ def unbroken(theirs: NDArray[np.int64], ours: NDArray[np.int64]) -> NDArray[np.i
     posed = np.flatnonzero(ours >= 0)
     if not posed.size:
         return theirs
+    # The last posed frame at or before each one; frames before the first count to it.
     before = posed[np.maximum(np.searchsorted(posed, np.arange(len(ours)), side="right") - 1, 0)]
     both = np.stack([theirs, ours[before]])
     known = theirs >= 0
     piece = np.full(len(theirs), -1, dtype=np.int64)
+    # A piece is a pair of piece numbers, ours and theirs, counted anew.
     piece[known] = np.unique(both[:, known], axis=1, return_inverse=True)[1].reshape(-1)
     return piece
 

@@ -112,6 +112,7 @@ def extract(image: NDArray[Any], valid: NDArray[Any], params: CrosscheckParams) 
     reduction = max(width, height) / params.max_image_size
     if reduction > 1:
         size = (max(1, round(width / reduction)), max(1, round(height / reduction)))
+        # Area means: SIFT's first octave expects an image without aliasing.
         grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
     keypoints, descriptors = _extractor(params).extract_from_uint8_array(grey)
     if len(keypoints) == 0:
@@ -136,6 +137,7 @@ def _extractor(params: CrosscheckParams) -> Any:
 def _away_from_mask(points: NDArray[np.float64], scale: NDArray[np.float64], valid: NDArray[Any]) -> NDArray[np.bool_]:
     if np.all(valid):
         return np.ones(len(points), bool)
+    # Distance to the nearest masked pixel at every pixel, looked up at the features.
     distance = cv2.distanceTransform((valid != 0).astype(np.uint8), cv2.DIST_L2, 5)
     cols, rows = np.floor(points).astype(np.intp).T
     inside = distance[np.clip(rows, 0, valid.shape[0] - 1), np.clip(cols, 0, valid.shape[1] - 1)]
@@ -151,6 +153,7 @@ def match(a: Features, b: Features, max_ratio: float = 0.8, max_distance: float 
     """
     if min(len(a.points), len(b.points)) == 0:
         return np.zeros((0, 2), np.uint32)
+    # All descriptors have nearly the same length, so the greatest product is the least angle.
     forward = _nearest(a.descriptors @ b.descriptors.T, max_ratio, max_distance)
     rows = np.flatnonzero(forward >= 0)
     wanted, place = np.unique(forward[rows], return_inverse=True)
@@ -164,6 +167,7 @@ def _nearest(products: NDArray[np.float32], max_ratio: float, max_distance: floa
     rows = np.arange(len(products))
     best = products.argmax(axis=1)
     first = products[rows, best]
+    # Below any product of bytes: the second best is then the maximum of what is left.
     products[rows, best] = -1.0
     second = np.maximum(products.max(axis=1), 0.0)
     near, next_near = (np.arccos(np.minimum(p / UNIT_BYTES**2, 1.0)) for p in (first, second))
@@ -179,6 +183,7 @@ def image_pairs(frames: int, span: int) -> list[tuple[int, int]]:
     pairs = []
     for k in range(frames):
         pairs.append((2 * k + 1, 2 * k + 2))
+        # Later frames only: a pair is matched once.
         for j in range(k + 1, min(k + span, frames - 1) + 1):
             pairs += [(2 * k + 1, 2 * j + 1), (2 * k + 2, 2 * j + 2)]
     return pairs
@@ -207,6 +212,8 @@ def _run(params: CrosscheckParams, args: Mapping[str, Any], inputs: Inputs) -> B
         "reprojection_px": None,
     }
     if models:
+        # Models of one window do not share a frame of reference; what the others hold is left to the neighbouring
+        # windows.
         best = max(models, key=lambda m: m.num_reg_frames())
         _read(best, poses, observations)
         meta["points"], meta["observations"] = int(best.num_points3D()), int(observations.sum())
@@ -234,7 +241,9 @@ def _write_rig(database: Any, rig: Rig) -> list[Any]:
     body = pycolmap.Rig(rig_id=1)
     body.add_ref_sensor(cameras[0].sensor_id)
     body.add_sensor(
-        cameras[1].sensor_id, pycolmap.Rigid3d(pycolmap.Rotation3d(np.array(pose.rotation)), np.array(pose.translation))
+        # COLMAP's sensor_from_rig is the pose of the right camera in the frame of the left, as ours.
+        cameras[1].sensor_id,
+        pycolmap.Rigid3d(pycolmap.Rotation3d(np.array(pose.rotation)), np.array(pose.translation)),
     )
     database.write_rig(body, use_rig_id=True)
     return cameras
@@ -285,8 +294,10 @@ def _map(database: Any, params: CrosscheckParams) -> list[Any]:
     import pycolmap
 
     options = pycolmap.IncrementalPipelineOptions()
+    # With more threads the order of sums, and so the result, differs from run to run.
     options.num_threads = options.mapper.num_threads = 1
     options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = params.seed
+    # The calibration is given to both: refined here, it would hide what it does to our trajectory.
     options.ba_refine_focal_length = options.ba_refine_principal_point = False
     options.ba_refine_extra_params = options.ba_refine_sensor_from_rig = False
     options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False

@@ -51,6 +51,7 @@ def join(
         rows, there = np.array([row[f] for f in numbers], dtype=np.intp), posed(local)
         if not there.any():
             continue
+        # Shared with the piece at hand; frames of an earlier one tie nothing, for that chain is broken.
         shared = there & (piece[rows] == number) & (number >= 0)
         if shared.any():
             rotation, translation = align(local[shared], poses[rows[shared]], ORIENTATION_SHARE)
@@ -71,6 +72,7 @@ def _fade(earlier: Floats, later: Floats) -> Floats:
     share = (np.arange(1, n + 1) / (n + 1))[:, None, None]
     out = (1.0 - share) * earlier + share * later
     for pose in out:
+        # A weighted mean of rotations is none, but nearly: the nearest one is taken.
         pose[:, :3] = orthonormal(pose[:, :3])
     return np.asarray(out)
 

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from rille.stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
 from rille.stages.core.errors import InputError
 from rille.stages.evaluation.accuracy_parts import Metric, metric
+from rille.stages.evaluation.dem_comparison import figures
 from rille.stages.geometry.lattice import Lattice, mosaic
-from rille.stages.numeric.robust import mad_sigma
 
 
 def dem_accuracy(
@@ -33,21 +33,17 @@ def dem_accuracy(
     """
     judged = judged & np.isfinite(truth)
     wanted = int(judged.sum())
-    error = (elevation.astype(np.float64) - truth)[judged]
-    error = error[np.isfinite(error)]
-    how = f"{len(error)} of {wanted} cells that both cameras see"
-    some = len(error) > 0
-    size = np.abs(error)
-    return {
-        "rmse": metric(float(np.sqrt(np.mean(error**2))) if some else None, "m", f"RMS elevation error, {how}"),
-        "nmad": metric(
-            mad_sigma(error) if some else None,
-            "m",
-            f"1.4826 times the median deviation from the median error, {how}",
-        ),
-        "p95": metric(float(np.percentile(size, 95)) if some else None, "m", f"95 % of the errors are smaller, {how}"),
-        "bias": metric(float(np.mean(error)) if some else None, "m", f"mean elevation error, {how}"),
-        "completeness": metric(len(error) / wanted if wanted else None, "1", f"share given: {how}"),
+    found = figures((elevation.astype(np.float64) - truth)[judged])
+    given = int(found["cells"])
+    how = f"{given} of {wanted} cells that both cameras see"
+    words = {
+        "rmse": "RMS elevation error",
+        "nmad": "1.4826 times the median deviation from the median error",
+        "p95": "95 % of the errors are smaller",
+        "bias": "mean elevation error",
+    }
+    return {name: metric(found.get(name), "m", f"{what}, {how}") for name, what in words.items()} | {
+        "completeness": metric(given / wanted if wanted else None, "1", f"share given: {how}")
     }
 
 

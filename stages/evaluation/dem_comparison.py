@@ -51,11 +51,13 @@ class Grid:
 
     def index(self, xy: Floats) -> Floats:
         """Fractional (row, col) (..., 2) of points (..., 2)."""
+        # The matrix gives x, y of column and row; the order is turned round to index arrays.
         found = (xy - self.matrix[:, 2]) @ np.linalg.inv(self.matrix[:, :2]).T
         return np.asarray(found[..., ::-1])
 
     def slopes(self) -> Floats:
         """Gradient dz/dx, dz/dy (2, rows, cols) of the terrain, NaN unknown."""
+        # The gradient takes y to grow upwards, against the rows.
         along = gradient(self.values, 1.0) * np.array([1.0, -1.0])[:, None, None]  # per column, per row
         return np.tensordot(np.linalg.inv(self.matrix[:, :2]).T, along, axes=1)
 
@@ -69,6 +71,8 @@ def interpolate(grid: Grid, xy: Floats, values: Floats | None = None) -> Floats:
     known = np.isfinite(array)
     share, z = (
         scipy.ndimage.map_coordinates(a, index, order=1, mode="constant", cval=0.0)
+        # Interpolating the mask beside the values tells where an unknown cell had a part; NaN itself would also spoil
+        # points whose weight for it is 0.
         for a in (known.astype(np.float64), np.where(known, array, 0.0))
     )
     return np.where(share > 1.0 - 1e-9, z, np.nan)
@@ -153,6 +157,7 @@ def align(a: Grid, b: Grid, kind: Align) -> Alignment:
     points = points[:: max(1, len(points) // MOST_POINTS)]
     slopes, free = b.slopes(), FREE[kind]
     centre = points.mean(axis=0)
+    # Units of a cell of motion at the terrain's extent, so that the condition compares like with like.
     unit = np.array([1.0] * 3 + [1.0 / max(float(np.std(points[:, :2])), a.cell)] * 3)[free] * a.cell
     start = _difference(b, slopes, points)[0]
     offset = float(np.median(start[np.isfinite(start)])) if np.isfinite(start).any() else 0.0
@@ -161,6 +166,7 @@ def align(a: Grid, b: Grid, kind: Align) -> Alignment:
         step, sigma, used = _gauss_newton(b, slopes, points, state, free, unit)
         full, spread = np.zeros(6), np.zeros(6)
         full[free], spread[free] = step, sigma
+        # Fifty products of rotations drift from a rotation by rounding.
         rotation = orthonormal(rotation_exp(full[3:]) @ state.rotation)
         state = Alignment(rotation, state.translation + full[:3], centre, spread, iteration, used, (0.0, 0.0))
         if np.abs(step / unit).max() < 1e-4:
@@ -193,6 +199,7 @@ def _gauss_newton(
             remedy="leave --align out, or choose overlapping models",
         )
     r, n = difference[good], normal[good]
+    # Rotations turn about the moved centre: shifts and turns then hang together least.
     q = moved[good] - state.centre - state.translation
     J = np.column_stack([n, np.cross(q, n)])[:, free] * unit
     scale = max(mad_sigma(r), 1e-9)

@@ -52,6 +52,7 @@ def path_check(path: Floats, risk: NDArray[np.uint8], lattice: Lattice) -> tuple
         return np.empty((0, 2), dtype=np.int64), none | {"hazardous_share": share}
     cells = crossed_cells(path, lattice)
     inside = ((cells >= 0) & (cells < lattice.shape)).all(axis=1)
+    # What lies beyond the exact map counts as unknown, like its holes.
     kinds = np.full(len(cells), UNKNOWN, dtype=np.uint8)
     kinds[inside] = risk[cells[inside, 0], cells[inside, 1]]
     hit = cells[kinds == HAZARDOUS]
@@ -106,6 +107,7 @@ def _shortest(path: Floats, maps: Maps, lattice: Lattice, vehicle: Vehicle) -> f
     first, last = (ground.grid.index((float(path[k, 0]), float(path[k, 1]))) for k in (0, -1))
     if not all(0 <= r < ways.shape[0] and 0 <= c < ways.shape[1] and ways[r, c] for r, c in (first, last)):
         return None
+    # No heights and no tolls: the cost is the length alone.
     level = np.zeros(ways.shape, np.int32)
     cost, _ = grid8.cost_to_go(level, ways, last, first, UNIT, level.astype(np.int16))
     return float(cost[first]) / UNIT * lattice.cell if cost[first] < UNREACHED else None

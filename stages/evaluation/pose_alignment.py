@@ -46,4 +46,5 @@ def moved(poses: Floats, rotation: Floats, translation: Floats) -> Floats:
 def _points(poses: Floats, lever: float) -> Floats:
     centre = poses[:, None, :, 3]
     rods = lever * np.swapaxes(poses[:, :, :3], 1, 2)
+    # Both ends of each rod: their mean is the centre, so that rods pull no position aside.
     return np.concatenate([centre, centre + rods, centre - rods], axis=1).reshape(-1, 3)

@@ -70,6 +70,7 @@ class TruePositions:
         """Positions (moment, 2 or 3) on the straight line between two rows; NaN in longer gaps and beyond the ends."""
         assert self.times is not None
         t = self.times
+        # Times are written with few digits: the first and the last image must not fall out by a rounding.
         moments = np.where(moments < t[0], np.minimum(moments + WITHIN, t[0]), moments)
         moments = np.where(moments > t[-1], np.maximum(moments - WITHIN, t[-1]), moments)
         after = np.clip(np.searchsorted(t, moments, side="left"), 1, max(len(t) - 1, 1))
@@ -111,10 +112,12 @@ def fit_in_plane(estimate: Floats, truth: Floats) -> Fit:
         return Fit(np.full_like(truth, np.nan), np.inf, np.inf)
     centre, origin = estimate[both, :width].mean(axis=0), truth[both].mean(axis=0)
     a, b = estimate[:, :width] - centre, truth - origin
+    # Its angle is the turn of least squares in the plane, see the module.
     cross = np.sum(np.conj(_plane(b[both])) * _plane(a[both]))
     turned = _plane(b) * (cross / abs(cross) if abs(cross) > 0 else 1.0)
     b[:, 0], b[:, 1] = turned.real, turned.imag
     error = np.sqrt(np.mean(np.sum((a[both] - b[both]) ** 2, axis=1)))
+    # Against the extent of both tracks: else the offset wins that compares the fewest, nearest frames.
     extent = np.sqrt(np.mean(np.sum(a[both] ** 2, axis=1) + np.sum(b[both] ** 2, axis=1)))
     return Fit(b + centre, float(error), float(error / extent) if extent > 0 else np.inf)
 
@@ -138,6 +141,7 @@ def find_offset(moments: Floats, estimate: Floats, truth: TruePositions) -> Offs
     tried = _candidates(moments, truth)
     posed = np.isfinite(estimate).all(axis=1)
     moments, estimate = moments[posed], estimate[posed]
+    # An offset at which few frames have truth fits almost anything.
     counts = np.array([np.isfinite(truth.at(moments - offset)[:, 0]).sum() for offset in tried])
     least = max(LEAST, SHARE * counts.max(initial=0))
 
@@ -181,6 +185,7 @@ def _end(error: Callable[[float], float], limit: float, start: float, outward: F
         if not np.isfinite(found):
             break
         if found > limit and abs(outside - start) > 0:
+            # Bisection: after twenty halvings the bound is exact to a microsecond.
             for _ in range(20):
                 middle = 0.5 * (inside + outside)
                 inside, outside = (middle, outside) if error(middle) <= limit else (inside, middle)

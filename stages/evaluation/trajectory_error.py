@@ -12,7 +12,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from rille.stages.evaluation.accuracy_parts import Metric, along, angle, inverse, metric, rms
+from rille.stages.evaluation.accuracy_parts import Metric, along, angle, inverse, metric, relative_error, rms
 from rille.stages.geometry.geometry import cross_matrix, rotation_log
 
 Floats = NDArray[np.float64]
@@ -33,7 +33,7 @@ def by_steps(P: Floats, Q: Floats) -> dict[str, Metric]:
     for step in STEPS[1:]:
         if step >= len(P):
             continue
-        E = inverse(inverse(Q[:-step]) @ Q[step:]) @ (inverse(P[:-step]) @ P[step:])
+        E = relative_error(P, Q, slice(None, -step), slice(step, None))
         E = E[np.isfinite(E).all(axis=(1, 2))]
         if len(E) == 0:
             continue
@@ -56,7 +56,7 @@ def by_shares(P: Floats, Q: Floats) -> dict[str, Metric]:
         last = np.searchsorted(way, way + share * total, side="left")
         first = np.flatnonzero(last < len(way))
         last = last[first]
-        E = inverse(inverse(Q[first]) @ Q[last]) @ (inverse(P[first]) @ P[last])
+        E = relative_error(P, Q, first, last)
         length = way[last] - way[first]
         known = np.isfinite(E).all(axis=(1, 2)) & (length > 0)
         errors += list(np.stack([np.linalg.norm(E[known, :3, 3], axis=1), angle(E[known])], 1) / length[known, None])
@@ -87,6 +87,7 @@ def by_cause(P: Floats, Q: Floats) -> dict[str, Metric]:
         return {"scale_error": metric(None, "%", why)}
     scale = float((p * q).sum() / (q * q).sum())
     rest = p - scale * q
+    # Standard error of a least-squares factor: residual variance over the sum of squares.
     bound = float(np.sqrt((rest**2).sum() / (3 * len(p) - 1) / (q * q).sum()))
     swing = _between(q.mean(0), p.mean(0))
     direction = math.degrees(float(np.linalg.norm(rotation_log(swing[None])[0])))
@@ -117,6 +118,7 @@ def by_cause(P: Floats, Q: Floats) -> dict[str, Metric]:
 def _between(a: Floats, b: Floats) -> Floats:
     """Least rotation (3, 3) from the direction of a to that of b; the identity where either is none."""
     size = float(np.linalg.norm(a) * np.linalg.norm(b))
+    # Opposite directions have no least rotation.
     if size < LEAST_MOVED**2 or float(a @ b) <= 0:
         return np.eye(3)
     k = cross_matrix(np.cross(a, b) / size)
@@ -132,6 +134,7 @@ def against_claims(P: Floats, aligned: Floats, covariance: Floats) -> dict[str, 
     known = np.asarray(np.isfinite(P).all(axis=(1, 2)) & np.isfinite(aligned).all(axis=(1, 2)))
     known = np.asarray(known & np.isfinite(covariance).all(axis=(1, 2)))
     claimed = np.isfinite(P).all(axis=(1, 2)) & np.isfinite(covariance).all(axis=(1, 2))
+    # The first frame is exact by definition and has no covariance to judge.
     rows, origin = np.flatnonzero(known)[1:], int(np.argmax(claimed))
     if len(rows) == 0 or not known[origin] or not (np.linalg.eigvalsh(covariance[rows])[:, 0] > 0).all():
         return {"nees": metric(None, "1", "not applicable: no covariances of frames behind the first")}

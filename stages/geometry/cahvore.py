@@ -50,6 +50,7 @@ class Bending:
         far = np.linalg.norm(across, axis=1)
         with np.errstate(all="ignore"):
             chi = self._chi(self._angle(along, far))
+            # On the axis the direction across is 0 / 0.
             central = far <= 1e-12 * np.abs(along)  # no direction across: the point itself
             scaled = np.where(central, along, far / np.where(central, 1.0, chi))
             factor = 1.0 + _even(self.radial, np.where(central, 0.0, chi))
@@ -71,8 +72,10 @@ class Bending:
     def reach(self) -> float:
         """Angle to O, radians, up to which pixels move outwards."""
         r = self.radial
+        # Derivative of (1 + mu(x)) x in powers of x squared: where it vanishes, pixels turn back inwards.
         roots = np.roots([5.0 * r[2], 3.0 * r[1], 1.0 + r[0]]) if any(r) else np.empty(0)
         real = roots.real[(np.abs(roots.imag) < 1e-12) & (roots.real > 0)]
+        # A tangent ends at a quarter turn, and a sine turns back there.
         limit = math.pi if self.linearity == 0 else 0.5 * math.pi / abs(self.linearity)
         if not real.size:
             return limit
@@ -146,6 +149,7 @@ class Cahvore:
         p = np.asarray(pixels, np.float64)
         a = np.asarray(self.a)
         directions = np.cross(np.asarray(self.h) - p[:, :1] * a, np.asarray(self.v) - p[:, 1:] * a)
+        # The cross product fixes the line, not its sense: rays lead away from the image, ahead.
         directions *= np.sign(directions @ a)[:, None]
         origins, rays = self.lens.straighten(directions)
         return origins + self.c, rays

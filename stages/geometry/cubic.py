@@ -15,6 +15,8 @@ def cubic(a, x, y):  # type: ignore[no-untyped-def]
     t, s = np.float32(x) - np.float32(whole_x), np.float32(y) - np.float32(whole_y)
     left, right, far = i - step, i + step, i + step + step
     above, below, bottom = j - step, j + step, j + step + step
+    # Constants of type float32: with Python's own numba would compute in float64, and round otherwise than
+    # sample_cubic.
     h, one, two = np.float32(0.5), np.float32(1.0), np.float32(2.0)
     three, four, five = np.float32(3.0), np.float32(4.0), np.float32(5.0)
     w0, w3 = h * t * (two * t - one - t * t), h * t * t * (t - one)

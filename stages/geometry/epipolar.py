@@ -41,6 +41,7 @@ def corrected(rig: Rig, correction: Floats) -> Rig:
     """
     if not np.any(correction):
         return rig
+    # Turned in its own frame, the centre stays; the translation then follows from both.
     rotation = rotation_exp(correction[:3]) @ rig.T_right_left.rotation
     centre, _ = _centre(rig, correction)
     return Rig(rig.left, rig.right, RigidTransform(rotation, -rotation @ centre))
@@ -58,6 +59,7 @@ def distances(rig: Rig, correction: Floats, left: Floats, right: Floats) -> tupl
     rotation = rotation_exp(correction[:3]) @ rig.T_right_left.rotation
     # A line of the image with matrix K is K^-T times the normal R (c x ray) of the plane of sight.
     to_line, to_ray = np.linalg.inv(rig.right.matrix).T, np.linalg.inv(rig.left.matrix)
+    # Not at 0: the fit comes back to large corrections, where turns do not commute.
     turns = left_jacobian(correction[:3])
     upright = rotation @ cross_matrix(centre)
     to_slopes = [to_line @ cross_matrix(turns[:, i]) @ upright @ to_ray for i in range(3)]
@@ -76,6 +78,7 @@ def _distances(to_line, to_slopes, left, right, distance, slopes):  # type: igno
         for i in range(3):
             line[i] = to_line[i, 0] * x + to_line[i, 1] * y + to_line[i, 2]
         length = np.sqrt(line[0] ** 2 + line[1] ** 2)
+        # A line has no sense of its own: its normal points down the image, or to the right where it is steep.
         if (line[0] if abs(line[0]) > abs(line[1]) else line[1]) < 0:
             length = -length
         d = (u * line[0] + v * line[1] + line[2]) / length
@@ -85,6 +88,7 @@ def _distances(to_line, to_slopes, left, right, distance, slopes):  # type: igno
             a = m[0, 0] * x + m[0, 1] * y + m[0, 2]
             b = m[1, 0] * x + m[1, 1] * y + m[1, 2]
             c = m[2, 0] * x + m[2, 1] * y + m[2, 2]
+            # Quotient rule: the line's normal changes its length as well.
             slopes[n, p] = (u * a + v * b + c) / length - (line[0] * a + line[1] * b) * d / length**2
 
 
@@ -111,6 +115,7 @@ def depth_sensitivity(rig: Rig, left: Floats, right: Floats) -> Floats:
         ahead, _ = inverse_depth(corrected(rig, step), left, right - left)
         behind, _ = inverse_depth(corrected(rig, -step), left, right - left)
         slopes[:, i] = (ahead - behind) / (2 * STEP)
+    # In pixels of disparity, which stereo measures alike near and far.
     scaled = slopes / per_pixel[:, None]
     weighted = np.einsum("ni,nj->ij", scaled, scaled)
     total = float(np.sum((np.maximum(rho, 0.0) / per_pixel) ** 2))
@@ -140,6 +145,7 @@ def _centre(rig: Rig, correction: Floats) -> tuple[Floats, Floats]:
     """Right camera's centre (3,) in the left frame, metres, and its derivatives (3, 2) by the two swings."""
     given = -rig.T_right_left.rotation.T @ rig.T_right_left.translation
     unit = given / np.linalg.norm(given)
+    # Of a rig whose baseline is nearly vertical, across is the x axis.
     axis = np.array([0.0, 1.0, 0.0]) if abs(unit[1]) < math.cos(math.radians(45.0)) else np.array([1.0, 0.0, 0.0])
     across = axis - unit * float(unit @ axis)
     across /= np.linalg.norm(across)

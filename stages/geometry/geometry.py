@@ -100,12 +100,14 @@ class RigidTransform:
             raise InputError("RIL-331", f"a rigid transform needs 3 x 3 and 3 numbers, not {r.shape} and {t.shape}")
         if not (np.isfinite(r).all() and np.isfinite(t).all()):
             raise InputError("RIL-332", "a rigid transform has a value that is not finite")
+        # Large entries first, whose product would overflow; 1e-4 lets poses written with five digits pass.
         if np.abs(r).max() > 2 or np.abs(r @ r.T - np.eye(3)).max() > 1e-4 or np.linalg.det(r) < 0:
             raise InputError(
                 "RIL-333",
                 "a pose's 3 x 3 part is not a rotation",
                 remedy="give rows of [R | t] with R orthonormal and det R = +1",
             )
+        # A frozen class shares its arrays: a change in place would change every transform that holds them.
         r.setflags(write=False)
         t.setflags(write=False)
         object.__setattr__(self, "rotation", r)
@@ -186,6 +188,7 @@ def rotation_exp(w: ArrayLike) -> Floats:
     """Rotation matrices (..., 3, 3) of rotation vectors (..., 3), radians (Rodrigues)."""
     v = np.asarray(w, dtype=np.float64)
     angle = np.sqrt((v * v).sum(-1))
+    # Both limits at 0, without dividing by it.
     safe = np.where(angle < 1e-9, 1.0, angle)
     a = np.where(angle < 1e-9, 1.0, np.sin(safe) / safe)[..., None, None]
     b = np.where(angle < 1e-9, 0.5, (1.0 - np.cos(safe)) / safe**2)[..., None, None]
@@ -215,6 +218,7 @@ def left_jacobian(w: Floats) -> Floats:
 
 def orthonormal(matrix: ArrayLike) -> Floats:
     """The nearest rotation to a 3 x 3 matrix (polar decomposition)."""
+    # The determinant in the middle keeps a reflection out.
     u, _, vt = np.linalg.svd(np.asarray(matrix, dtype=np.float64))
     return np.asarray(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt, dtype=np.float64)
 

@@ -64,6 +64,7 @@ class Lattice:
             )
         for name, value in (("x0", self.x0), ("y0", self.y0)):
             index = value / self.cell
+            # Far from the origin a float's rounding is a visible part of a cell.
             if not math.isfinite(index) or abs(index - round(index)) > 1e-3:
                 raise InputError("RIL-357", f"lattice origin {name}={value} is no multiple of the cell {self.cell}")
             object.__setattr__(self, name, round(index) * self.cell)
@@ -113,6 +114,7 @@ class Lattice:
 
     def xs(self) -> Floats:
         """Coordinate x (cols,) of the cell centres, metres."""
+        # Integer times cell, not a sum of steps: the same cell has the same bits in every lattice.
         return np.arange(self.i0, self.i0 + self.cols, dtype=np.float64) * self.cell
 
     def ys(self) -> Floats:
@@ -183,6 +185,7 @@ class Lattice:
 
 def _cuts(first: int, count: int, size: int) -> list[tuple[int, int]]:
     """(start, length) of the pieces of ``first .. first + count`` between multiples of ``size``."""
+    # Multiples of the size on the infinite lattice, so that a tile does not move when the map grows at its edge.
     edges = [first, *range((first // size + 1) * size, first + count, size), first + count]
     return [(a, b - a) for a, b in itertools.pairwise(edges)]
 

@@ -41,6 +41,7 @@ def project(camera: Camera, x: Floats) -> tuple[Floats, Floats, NDArray[np.bool_
     Points behind the camera are taken at a depth of 1 m, so that sums over all points stay finite.
     """
     behind: NDArray[np.bool_] = np.asarray(x[..., 2] < NEAREST)
+    # Any depth that divides: callers leave these points out by the mask.
     z = np.where(behind, 1.0, x[..., 2])
     u, v = x[..., 0] / z, x[..., 1] / z
     slopes = np.zeros((*z.shape, 2, 3))

@@ -20,7 +20,9 @@ def inverse_depth(rig: Rig, pixels: Floats, disparity: Floats) -> tuple[Floats, 
     epipole = rig.right.matrix @ rig.T_right_left.translation
     m = rig.left.rays(pixels) @ to_right.T
     p = pixels + disparity
+    # Direction of the epipolar line at p, in homogeneous coordinates: right also where the epipole lies at infinity.
     along = p * epipole[2] - epipole[:2]
     offset = p * m[:, 2:] - m[:, :2]
+    # At the epipole itself there is no line.
     length2 = np.maximum((along**2).sum(-1), 1e-300)
     return -(offset * along).sum(-1) / length2, np.abs(m[:, 2]) / np.sqrt(length2)

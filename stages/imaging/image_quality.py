@@ -68,6 +68,7 @@ def texture(image: NDArray[Any], valid: NDArray[np.uint8]) -> tuple[float, float
         if not usable.any():
             return math.nan, 0.0
         level = np.where(usable, level, level[usable].mean())
+        # Three standard deviations of the wider blur: farther from the mask, what is compared is the image's own.
         inner = cv2.erode(usable.astype(np.uint8), np.ones((13, 13), np.uint8))
     once, twice = (cv2.GaussianBlur(level, (0, 0), sigma) for sigma in (1.0, 2.0))
     count = math.sqrt(max(level.size if inner is None else int(np.count_nonzero(inner)), 1))
@@ -82,6 +83,7 @@ def glance(image: NDArray[Any], valid: NDArray[np.uint8]) -> dict[str, Any]:
     first = sorted({int(np.clip(share * rows - STRIP / 2, 0, max(rows - STRIP, 0))) for share in BANDS})
     found = [texture(image[r : r + STRIP], valid[r : r + STRIP]) for r in first]
     sharp = [s for s, _ in found if math.isfinite(s)]
+    # A quarter of the pixels tells mean and deviation well enough.
     some, mask = grey(np.ascontiguousarray(image[::2, ::2])), (valid[::2, ::2] != 0).astype(np.uint8)
     (mean,), (deviation,) = (a.ravel() for a in cv2.meanStdDev(some, mask=mask))
     return {

@@ -108,6 +108,7 @@ def undistort(
         raise InputError(
             "RIL-455", f"mask {valid.shape} and image {raw.shape} differ", remedy="give a mask of the image's size"
         )
+    # Floating-point images may hold NaN for what is not known.
     usable = np.isfinite(raw)
     if valid is not None:
         usable &= valid != 0
@@ -115,6 +116,7 @@ def undistort(
     out, out_valid = np.zeros(x.shape, np.float32), np.zeros(x.shape, np.uint8)
     # most images have no mask: then no pixel's neighbourhood need be looked up
     _resample(raw, usable, bool(usable.all()), (x, y), weights(params.interpolation), out, out_valid)
+    # Kernels with negative weights overshoot at edges.
     return np.clip(out, 0.0, 255.0, out=out), out_valid
 
 

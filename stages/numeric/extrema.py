@@ -74,6 +74,7 @@ def _widened(z: Floats32, side: int, diagonal: int) -> Floats32:
     line = np.eye(2 * diagonal + 1, dtype=np.uint8)
     for window in (np.ones((2 * side + 1, 2 * side + 1), dtype=np.uint8), line, line[:, ::-1].copy()):
         if window.size > 1:
+            # OpenCV's own border would repeat the edge; the padding must stay unknown.
             z = cv2.dilate(z, window, borderType=cv2.BORDER_CONSTANT, borderValue=float(NOTHING))
     return z
 

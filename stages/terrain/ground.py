@@ -76,6 +76,7 @@ def fit_plane(
             if np.abs(theta - last).max() <= SETTLED * np.abs(theta).max():
                 break
         share = float(np.mean(_score(theta[None], rays, rho, sigma, tolerance) > 0))
+        # theta = -n / h: its length is one over the height.
         length = float(np.linalg.norm(theta))
         if share >= MIN_SHARE and bool(allowed(-theta[None] / length)[0]):
             return GroundPlane(-theta / length, 1.0 / length, share)
@@ -155,6 +156,7 @@ class GroundView:
 
     def cell_size(self) -> float:
         """Pixel footprint (geometric mean of both directions) at twice the nearest distance, to 1, 2 or 5."""
+        # Farther pixels cover more: by them the near ground would be drawn coarser than it is seen.
         near = self.slant <= 2.0 * self.slant.min()
         return rounded_cell(float(np.sqrt(self.along * self.across)[near].max()))
 
@@ -193,6 +195,7 @@ def view_ground(rig: Rig, R_local_left: Floats, plane: Sequence[float]) -> Groun
         No pixel of the left camera sees the plane where the right one does, too.
     """
     cam = rig.left
+    # Many rows, few columns: ground grows far from row to row, and changes little along one.
     cols, rows = np.linspace(1, cam.width - 2, 48), np.linspace(1, cam.height - 2, 256)
     pixels = np.stack(np.meshgrid(cols, rows), axis=-1).reshape(-1, 2)
     here = _meet(rig, R_local_left, plane, pixels)

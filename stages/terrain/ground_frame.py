@@ -212,6 +212,7 @@ def _samples(
     rho, per_pixel = inverse_depth(rig, pixels, disparity)
     sigma = per_pixel * params.sigma_disparity
     if len(pixels) >= MIN_POINTS:
+        # Before the ground is fitted: exchanged images show none, and that message would mislead.
         _refuse_swapped(rig, pixels, pixels + disparity, float(np.mean(rho < -BEYOND * sigma)))
     return rig.left.rays(pixels), rho, sigma
 
@@ -268,6 +269,7 @@ def _relief(points: Floats, plane: list[float], extent: list[float], height: flo
     above = z - (plane[2] + plane[0] * x + plane[1] * y)
     low, high = -MARGIN * height, MARGIN * height
     if np.count_nonzero(inside) >= 20:
+        # Quantiles, not extremes: of thousands of matches some are gross.
         q = np.quantile(above[inside], [0.005, 0.995])
         low, high = min(low, float(q[0])), max(high, float(q[1]))
     margin = 0.1 * (high - low) + MARGIN * height

@@ -64,6 +64,7 @@ def thin(elevation: NDArray[np.floating], lattice: Lattice, cell: float) -> Floa
     z = np.asarray(elevation, np.float64)
     xy = lattice.xy()
     known = np.isfinite(z)
+    # Means as coarse as the map: single cells would differ from it by their relief, not by a wrong place.
     block = np.floor(xy[known] / cell + 0.5).astype(np.int64)
     _, index = np.unique(block, axis=0, return_inverse=True)
     index = index.reshape(-1)
@@ -150,6 +151,7 @@ def fix(
     cell = lattice.cell
     sigma = params.sigma * cell
     far = float(np.hypot(points[:, 0], points[:, 1]).max())
+    # Half a cell, and turns that move the farthest point by one cell: finer steps find no other minimum.
     xs, ys, headings = _steps(prior, prior_sigma, 0.5 * cell, cell / far, params.reach)
     scores = np.full((len(headings), len(ys), len(xs)), np.inf)
     overlaps = np.zeros_like(scores)
@@ -193,6 +195,7 @@ def _other(
             for c in range(3):
                 if (a, b, c) != (1, 1, 1):
                     low &= scores <= padded[a : a + h, b : b + i, c : c + j]
+    # More than three steps: nearer minima belong to the same valley.
     away = np.max(np.abs(np.indices(scores.shape) - np.array(best).reshape(3, 1, 1, 1)), axis=0) > 3
     low &= away & np.isfinite(scores)
     if not low.any():
@@ -214,6 +217,7 @@ def _refine(
     """Gauss-Newton on x, y, heading and z with Huber's weights."""
     place = start.copy()
     sigma = params.sigma * lattice.cell
+    # Height first: Huber's weights would take a wrong one for outliers everywhere.
     place[3] = -float(np.nanmedian(_differences(points, ground, lattice, place)[0]))
     normal, used, weight, r = np.eye(4), np.zeros(len(points), bool), np.ones(0), np.zeros(0)
     for _ in range(20):
@@ -236,6 +240,7 @@ def _refine(
             break
     n = int(used.sum())
     rms = float(np.sqrt((weight * r**2).sum() / max(weight.sum(), 1e-12)))
+    # By the errors found, and as many independent cells as there are correlation lengths.
     covariance: Floats = np.asarray(np.linalg.inv(normal) * rms**2 * max(1.0, n / independent), dtype=np.float64)
     score = float(np.mean(np.minimum(np.abs(r), params.truncate * sigma) ** 2))
     return Fix(place, covariance, score, n / len(points), rms, n, other)

@@ -211,6 +211,7 @@ def merge(layers: Sequence[Layer | _Stored], tile: Lattice, params: MergeParams)
     grown = Lattice.at(tile.i0 - m, tile.j0 + m, tile.cell, tile.rows + 2 * m, tile.cols + 2 * m) if m else tile
     ordered = [layer for layer in ordered if grown.intersection(layer.lattice) is not None]
     out = _empty(grown)
+    # Four maps of four bytes a cell and model.
     lines = max(1, STRIP_BYTES // (16 * max(len(ordered), 1) * grown.cols))
     for start in range(0, grown.rows if ordered else 0, lines):
         rows = slice(start, min(start + lines, grown.rows))
@@ -219,6 +220,7 @@ def merge(layers: Sequence[Layer | _Stored], tile: Lattice, params: MergeParams)
     if m:
         _close(out, params)
         inside = grown.window(tile)
+        # Copies, for views would keep the margins in memory as long as the result.
         out = Merged(**{name: values[inside].copy() for name, values in vars(out).items()})
     return out
 

@@ -94,6 +94,7 @@ def audit(seams: Sequence[Facts], centres: Mapping[int, Sequence[float]]) -> tup
     every = sorted(seams, key=lambda s: (s["pair"], s["other"]))
     ends = np.array([(s["pair"], s["other"]) for s in every]).reshape(-1, 2)
     left = np.array([[s["bias"], *s["tilt"]] for s in every]).reshape(-1, 3)
+    # A covariance may be singular; what it knows no error of gets no weight.
     weight = np.linalg.pinv(np.array([s["covariance"] for s in every]).reshape(-1, 3, 3), hermitian=True)
     sizes = np.einsum("ni,nij,nj->n", left, weight, left)
     of: dict[int, list[int]] = defaultdict(list)
@@ -123,6 +124,7 @@ def audit(seams: Sequence[Facts], centres: Mapping[int, Sequence[float]]) -> tup
             }
         )
         blamed |= near & listed[-1]["found"]
+        # What this model explains is gone from its seams, so that its neighbours are judged by the rest.
         left[model.seams] -= model.design @ plane
         for pair in set(others) & set(solved):
             solved[pair] = models[pair].explain(left)

@@ -55,6 +55,7 @@ def level(centres: Mapping[int, Sequence[float]], ratios: Sequence[tuple[int, in
     moved = np.array([np.subtract(centres[b], centres[a]) for a, b, _ in ordered])
     rows = np.repeat(np.arange(len(ordered)), 4)
     cols = np.array([k for a, b, _ in ordered for k in (at[a], at[b], n, n + 1)])
+    # One row a seam: log g_b - log g_a - v . (c_b - c_a).
     values = np.column_stack([np.tile([-1.0, 1.0], (len(ordered), 1)), -moved]).ravel()
     design = coo_array((values, (rows, cols)), shape=(len(ordered), n + 2)).tocsc()
     wanted = -np.array([ratio for _, _, ratio in ordered])

@@ -34,6 +34,7 @@ def pad(T_world_vehicle: RigidTransform, radius: float, cell: float) -> tuple[La
     xy = lattice.xy()
     dx, dy = xy[..., 0] - x, xy[..., 1] - y
     nx, ny, nz = T_world_vehicle.rotation[:, 2]
+    # The vehicle's z axis is the plane's normal.
     plane = z - (nx * dx + ny * dy) / nz
     return lattice, np.where(np.hypot(dx, dy) <= radius, plane, np.nan).astype(np.float32)
 

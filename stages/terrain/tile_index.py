@@ -31,6 +31,7 @@ def footprint(defined: NDArray[np.bool_], lattice: Lattice, side: int, margin: i
     margin : cells around a tile that count as its own: what its result may depend on. The box is cut to the tile.
     """
     found = {}
+    # Lines count downwards, against y, as rows do.
     first_col, first_line = lattice.i0, -lattice.j0
     for ty in range((first_line - margin) // side, (first_line + lattice.rows - 1 + margin) // side + 1):
         rows = _span(ty, side, margin, first_line, lattice.rows)

@@ -81,6 +81,7 @@ def refine(views: Views, surface: Surface, elevation: Float32, steps: int) -> tu
     """
     start = elevation.astype(np.float64)
     z, seen = start, look(views, surface, start)
+    # From the first look, for all steps: an exposure does not change with the elevations.
     gain = _gain(seen)
     _level(seen, gain)
     for _ in range(steps):
@@ -93,6 +94,7 @@ def refine(views: Views, surface: Surface, elevation: Float32, steps: int) -> tu
         moved = z.copy()
         terms = Terms(weight * slope * slope, weight * slope * rest, z, keep, across, down)
         sweep(terms, moved, SWEEPS, OVERSHOOT)
+        # About the start, not the last step: many small steps could otherwise wander to another likeness.
         reach = FARTHEST / np.where(keep, seen.scale, np.inf)
         z = np.where(keep, np.clip(moved, start - reach, start + reach), start)
         seen = look(views, surface, z)
@@ -140,6 +142,7 @@ def _misfit(seen: OrthoPair, keep: Mask) -> tuple[Floats, Floats]:
     weight = keep.astype(np.float64)
     for _ in range(MEAN_ROUNDS + 1):
         mean = window_sum(weight * rest, MEAN_SIDE) / np.maximum(window_sum(weight, MEAN_SIDE), LEAST_WEIGHT)
+        # Cauchy's weight: a highlight or a shadow in one image counts less, but is not forgotten at once.
         weight = np.where(keep, 1.0 / (1.0 + np.square((rest - mean) / RESIDUAL)), 0.0)
     # A cell smaller than a pixel brings no more than its share of what the pixel tells.
     return weight * np.where(keep, np.minimum(seen.area, 1.0), 0.0), np.where(keep, rest - mean, 0.0)

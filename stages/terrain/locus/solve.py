@@ -80,6 +80,7 @@ class PairArrays:
             if array.shape != shape:
                 raise InputError("RIL-396", f"the {name} is {array.shape}, the left camera's image {shape}")
         disparity = np.stack(maps[:2], axis=-1, dtype=np.float32, casting="unsafe")
+        # NaN in the arrays, not a mask: the kernel's sums become NaN by themselves where a pixel must not be used.
         disparity[~given.usable] = np.nan
         std = np.full(shape, sigma) if given.std is None else given.std
         grey, std = np.ascontiguousarray(maps[2], np.float32), np.ascontiguousarray(std, np.float64)
@@ -101,6 +102,7 @@ class PairArrays:
 
 def solve(task: PairArrays, surface: Surface) -> Dem:
     """Every cell of a surface from one disparity map, coarse to fine: a few coarse cells search the whole range."""
+    # The last row and column as well, so that every cell lies between coarse ones.
     cells = [np.unique(np.append(np.arange(0, n, COARSE), n - 1)) for n in (surface.rows, surface.cols)]
     z_range = task.z_range
     coarse = task.cells(surface, cells[0], cells[1], np.float64(z_range[0]), np.float64(z_range[1]))[..., 0]

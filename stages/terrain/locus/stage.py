@@ -164,6 +164,8 @@ def reconstruct(
     if back is not None:
         if right is None:
             raise InputError("RIL-381", "disparities of the right image are given without the image")
+        # The same solver with the cameras exchanged: the right image's disparity is that of a rig whose left camera it
+        # is.
         turned = Rig(rig.right, rig.left, rig.T_right_left.inverse())
         T_surface_right = T_surface_left @ rig.T_right_left.inverse()
         other = solve(PairArrays(back, right, turned, T_surface_right, *told), surface)
@@ -173,6 +175,7 @@ def reconstruct(
         _refine(out, seen, surface, params, apart)
     greatest = _greatest_std(params, pair.matches.std is not None)
     if greatest is not None:
+        # Negated, so that NaN is unsure as well.
         unsure = ~(out.elevation_std <= greatest)
         for array in vars(out).values():
             array[unsure] = np.nan
@@ -247,6 +250,7 @@ def world_lattice(elevation: Float32, lattice: Lattice, T_world_local: RigidTran
         )
     points = T_world_local.apply(np.column_stack([lattice.xy()[seen], elevation[seen]]))
     low, high = points.min(axis=0), points.max(axis=0)
+    # In the world the same ground lies on other cells, whose elevations may leave the local range by a little.
     margin = 0.05 * (high[2] - low[2]) + lattice.cell
     bounds = (float(low[0]), float(high[0]), float(low[1]), float(high[1]))
     return Lattice.snap(bounds, lattice.cell), [float(low[2] - margin), float(high[2] + margin)]

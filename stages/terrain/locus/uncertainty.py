@@ -63,6 +63,7 @@ def from_both(elevation: Float32, seen: OrthoPair, moved: Floats, apart: Floats,
     scale = np.where(known, seen.scale, 1.0).astype(np.float64)
     rest = np.where(known, seen.left - seen.right, 0.0).astype(np.float64)
     rest = np.where(known, rest - _mean(rest, known, MEAN_SIDE), 0.0)
+    # About 0: the local mean is gone already.
     noise = mad_sigma(rest[known], 0.0)
     grey = np.maximum(_mean(np.where(known, seen.left, 0.0), known, NEAR_SIDE), max(noise, 1.0))
     both = known & np.isfinite(apart)
