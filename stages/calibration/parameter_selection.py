@@ -176,6 +176,7 @@ class _Chooser:
         self.start = linearised(rig, pairs)
         self.all = adjust(rig, pairs, [True] * RIG, self.beliefs, rival=True, start=self.start)
         self.solved: dict[tuple[frozenset[int], bool], tuple[Floats, Floats, float]] = {}
+        # Sensitivities at the rig that the images ask for: a wrong toe-in would state them for wrong depths.
         near = corrected(rig, self.all.x[:RIG])
         self.depth = np.mean([depth_sensitivity(near, m.left, m.right) for m in pairs], axis=0)
         self.impossible = impossible_share(rig, pairs, self.all) > BEYOND_SHARE
@@ -210,6 +211,7 @@ class _Chooser:
         """Whether a correction (5,) moves rows or depth by more than a good calibration is out anyway."""
         rows = float(np.max(np.abs(correction) * self.rows))
         depth = math.sqrt(float(correction @ self.depth @ correction))
+        # Depth beyond infinity is wrong for sure, so any repair is worth it.
         return self.impossible or rows >= self.params.least_rows or depth >= self.params.least_depth
 
     def _add(self, chosen: list[int], group: Sequence[int]) -> None:
@@ -280,6 +282,7 @@ class _Chooser:
 
     def _held(self, chosen: list[int]) -> Floats:
         """How far (5,) the held parameters may be out, radians: as believed, or less where the images show it."""
+        # Root of value squared and sigma squared: the images show how far it may be out, their own error included.
         shown = [math.hypot(*self._estimate(i, chosen)) for i in range(RIG)]
         return np.minimum(self.beliefs.held(), shown)
 

@@ -124,10 +124,12 @@ def calibrate_rig(
     task = Adjustment(board, tuple(views), size, model)
     x = task.solve(task.start(), robust=True)
     first = task.residuals(x)
+    # Half a pixel at least: where all views fit to a tenth, four tenths are still a good view.
     limit = max(BAD_PX, BAD_RATIO * float(np.median([r.worst for r in first])))
     good = [k for k, r in enumerate(first) if keep_bad or r.worst <= limit]
     used = Adjustment(board, tuple(views[k] for k in good), size, model)
     _enough(used.views)
+    # From the first solution, now without the bad views' poses.
     x = used.solve(np.concatenate([x[: used.shared], *(x[task.pose(k)] for k in good)]))
     _sides(used.rig(x).T_right_left)
     final = {r.name: r for r in used.residuals(x)}

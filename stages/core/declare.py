@@ -56,6 +56,7 @@ class Bundle:
 
     def part(self, name: str, window: tuple[slice, ...]) -> AnyArray:
         """Part of an array; of an artifact only that part is read, and nothing of it is kept."""
+        # Arrays in memory have no such method; those of an artifact read the chunks of the window alone.
         read = getattr(self.arrays, "part", None)
         found: AnyArray = self.arrays[name][window] if read is None else read(name, window)
         return found

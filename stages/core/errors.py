@@ -24,6 +24,7 @@ class RilleError(Exception):
         return f"{self.message}: {self.remedy}" if self.remedy else self.message
 
     def __reduce__(self) -> tuple[object, ...]:
+        # An exception is pickled by its args, to come back from a worker; keyword arguments would be lost.
         return (_rebuild, (type(self), self.code, self.message, self.remedy))
 
     def at(self, where: str) -> Self:

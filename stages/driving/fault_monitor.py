@@ -84,6 +84,7 @@ def judge(
     vehicle : its ``max_slope_deg`` and ``wheel_base``.
     """
     up, acceleration, odometry = readings
+    # Motions are those of the vehicle's middle, as the wheels report them, not of the camera, which a turn swings.
     key = RigidTransform.from_matrix(poses[0]) @ T_vehicle_left.inverse()
     steepest = params.max_tilt * float(vehicle["max_slope_deg"])
     for k in range(1, len(poses)):
@@ -107,6 +108,7 @@ def judge(
 def _disagreement(wheels: Floats, moved: RigidTransform, base: float, params: SafetyParams) -> str:
     """In what way wheels and vision contradict each other, in words; empty: they do not."""
     turn = math.atan2(-moved.rotation[0, 1], moved.rotation[1, 1])
+    # The remainder, since headings jump by a full turn.
     apart = math.degrees(abs(math.remainder(turn - float(wheels[2]), 2 * math.pi)))
     if apart > params.max_turn_deg:
         return f"wheels and vision differ by {apart:.1f} degrees in heading, {params.max_turn_deg:g} permitted"
@@ -140,6 +142,7 @@ def _run(params: SafetyParams, args: Mapping[str, Any], inputs: Inputs) -> Bundl
 def _relative(wheels: Floats) -> Floats:
     """Readings (frame, 3) since the first of them."""
     x, y = (wheels[:, k] - wheels[0, k] for k in (0, 1))
+    # Into the frame of the first reading: turned back by its heading.
     c, s = math.cos(wheels[0, 2]), math.sin(wheels[0, 2])
     return np.stack([c * x + s * y, c * y - s * x, wheels[:, 2] - wheels[0, 2]], axis=1)
 

@@ -75,6 +75,7 @@ class LastModel:
         """From elevations, comparing within ``blur`` metres."""
         z = np.asarray(elevation, np.float64)
         side = 2 * round(blur / lattice.cell) + 1
+        # The highest nearby: an error of the pose by that much must not make a known stone rise.
         top = scipy.ndimage.maximum_filter(np.where(np.isnan(z), -np.inf, z), side, mode="nearest")
         known = np.isfinite(z)
         return LastModel(lattice, z, top, np.column_stack([lattice.xy()[known], z[known]]))
@@ -138,16 +139,21 @@ def look(
     pixel, cells, first = _seen(view, cells, camera)
     found = np.stack([view.column[pixel[:, 1], pixel[:, 0]], view.row[pixel[:, 1], pixel[:, 0]]], axis=1)
     target = first + found.astype(np.float64)
+    # t = 0 is the model's ground, t = 1 the camera: obstacles lie between.
     to_camera = view.before.translation - cells
     t = np.zeros(len(cells))
     slope = np.ones((len(cells), 2))
+    # Three Newton steps: displacements are nearly linear in t over what is looked for.
     for _ in range(3):
         here = camera.project(T_now.apply(cells + t[:, None] * to_camera))
         slope = (camera.project(T_now.apply(cells + (t + 1e-4)[:, None] * to_camera)) - here) / 1e-4
         t = t + ((target - here) * slope).sum(1) / np.maximum((slope**2).sum(1), 1e-12)
+        # Kept between half as far beneath the ground and four fifths of the way to the camera, where the projection's
+        # derivative grows beyond use.
         t = np.clip(np.nan_to_num(t), -0.5, 0.8)
     left_over = target - camera.project(T_now.apply(cells + t[:, None] * to_camera))
     error = p.sigma * 2.0**view.level
+    # A displacement across the epipolar line is a wrong match, not another depth.
     along = np.hypot(left_over[:, 0], left_over[:, 1]) <= 3.0 * error
     q = cells + t[:, None] * to_camera
     rise = q[:, 2] - surface.top_at(q[:, :2])
@@ -169,12 +175,14 @@ def _seen(view: ViewPair, cells: Floats, camera: Camera) -> tuple[NDArray[np.int
     ok: Bools = np.asarray(((at >= 0) & (at < [cols, rows])).all(axis=1))
     ok[ok] &= view.matched[at[ok, 1], at[ok, 0]]
     at, cells, depth = at[ok], cells[ok], in_camera[ok, 2]
+    # By pixel, then by depth: the first of each pixel is the one that hides the others.
     order = np.lexsort((depth, at[:, 0], at[:, 1]))
     flat = (at[:, 1] * cols + at[:, 0])[order]
     keep = order[np.concatenate([[True], np.diff(flat) != 0])] if len(order) else order
     centre = (at[keep] + 0.5) * scale - 0.5
     rays = camera.rays(centre) @ view.before.rotation.T
     origin = view.before.translation
+    # On the pixel's own ray, not at the cell's middle: half a cell beside it would already look like a displacement.
     ground = origin + ((cells[keep, 2] - origin[2]) / rays[:, 2])[:, None] * rays
     return np.asarray(at[keep]), np.asarray(ground), np.asarray(centre)
 
@@ -255,6 +263,7 @@ def pairs(odometry: Floats, wheel: float, p: ReflexParams) -> list[tuple[int, in
     """
     out = []
     for j in range(1, len(odometry)):
+        # From the latest backwards: the first image far enough behind is the most alike.
         for i in range(j - 1, -1, -1):
             if math.degrees(abs(odometry[j, 2] - odometry[i, 2])) > p.max_turn_deg:
                 break

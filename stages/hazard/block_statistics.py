@@ -46,6 +46,7 @@ def reduce_to_blocks(surface: Floats32, closed: Floats32, std: Floats32, n: int,
     closed : the surface with holes closed; cells are counted, with their standard deviation ``std``, on it.
     n, lag : side of a block, and distance of the cells that are compared, cells.
     """
+    # Rounded up: the last block of a row or column may be partial, and counts what it has.
     shape = tuple(-(-size // n) for size in surface.shape)
     high, low = (np.empty(shape, dtype=np.float32) for _ in range(2))
     sums = np.empty((4, *shape))
@@ -142,6 +143,7 @@ def _noise(closed, s, known, noise):  # type: ignore[no-untyped-def]
     for c in range(s.shape[0]):
         here = closed[c] == closed[c]
         known[c] += np.float32(1.0) if here else np.float32(0.0)
+        # A choice instead of a branch, here and below, so that cells go side by side.
         noise[c] += s[c] * s[c] if here else np.float32(0.0)
 
 

@@ -130,6 +130,7 @@ def classify(
     on_cells, on_blocks = ([m for m in measures if m.on_blocks == kind] for kind in (False, True))
     share, patchy = terrain.known_share(), terrain.places.unstood
     noise, below = terrain.window_noise(), terrain.footprint_noise()
+    # In proportion to what is unknown; a step, since whatever is higher shows at the rim of what is known.
     gap = np.float32(vehicle.max_step) * (1.0 - np.minimum(share, 1.0))
     doubts = np.float32(HIDDEN) * gap, np.float32(HIDDEN * vehicle.max_step) * patchy
     noises = np.stack([noise, _wider(noise, doubts[0]), below, _wider(below, doubts[1])])
@@ -157,6 +158,7 @@ def classify(
 
 def _limit(m: Measure, terrain: HazardInput, sigmas: float) -> Limit:
     f, bias, spread = np.float32, m.bias / m.length(terrain), m.spread / m.length(terrain)
+    # A measure already carries the bias of its extrema: only what the standard deviations exceed it by is added.
     added, noise = max(0.0, sigmas * spread - bias), 2 if m.below else 0
     return Limit(f(m.greatest(terrain.vehicle)), f(bias), f(spread), f(added), np.uint16(m.bit), np.int64(noise))
 
@@ -180,6 +182,7 @@ def _table() -> Floats32:
     t = np.arange(-FARTHEST * STEPS, FARTHEST * STEPS + 1) / STEPS
     start, width, lift = LIFT
     found = scipy.special.stdtr(FREEDOM, t + lift * np.clip((t - start) / width, 0.0, 1.0))
+    # Beyond the table's ends the answer is certain, whatever the tails of Student's t.
     found[0], found[-1] = 0.0, 1.0
     return np.asarray(found, dtype=np.float32)
 
@@ -199,6 +202,7 @@ def _hold(value, noise, doubt, limit, load, excess):  # type: ignore[no-untyped-
         over = value[c] - limit.bias * noise[c] - limit.limit
         # What is hidden can only raise a measure, so it makes no hazard less certain.
         s = noise[c] if over > np.float32(0.0) else doubt[c]
+        # Of exact elevations s is 0: the excess is then very large, not infinite or NaN.
         t = over / (limit.spread * s + least)
         excess[c] = t if t > excess[c] else excess[c]
 

@@ -61,6 +61,7 @@ class HazardInput:
     def __init__(
         self, surface: Floats32, closed: Floats32, std: Floats32, cell: float, vehicle: Vehicle, window: float
     ) -> None:
+        # Of coarser models a single cell may be the top of a stone.
         self.surface = median3(surface) if FINE * cell <= 0.5 * vehicle.wheel_diameter else surface
         self.closed, self.std, self.cell, self.vehicle = closed, std, cell, vehicle
         self.reach, self.near = window_reach(window, cell), window_reach(0.5 * window, cell)
@@ -85,6 +86,7 @@ class HazardInput:
     @cached_property
     def places(self) -> Places:
         """The vehicle put down with its middle on every block."""
+        # Counts are sums in floating point.
         whole = self.blocks.count > self.stride**2 - 0.5
         return place(self.blocks.high, self.blocks.low, self.vehicle, self.stride * self.cell, whole)
 
@@ -99,6 +101,7 @@ class HazardInput:
 
     def footprint_noise(self) -> Floats32:
         """RMS standard deviation (row, col) of the blocks' heights below the vehicle, metres."""
+        # Mean of both halves: the window serves all headings.
         half = self.vehicle.half_length + self.vehicle.half_width
         return _rms(self.blocks.variance, self.blocks.count, 2 * round(half / (2.0 * self.stride * self.cell)) + 1)
 

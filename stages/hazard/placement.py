@@ -71,6 +71,7 @@ class Stance:
     @staticmethod
     def of(vehicle: Vehicle, cell: float) -> Stance:
         """Of a vehicle on a grid of ``cell`` metres."""
+        # Order of the wheels in all arrays: front left, front right, rear left, rear right.
         half = np.array([[1.0, -1.0], [1.0, 1.0], [-1.0, -1.0], [-1.0, 1.0]]) / 2.0  # ahead, right
         wheels = half * [vehicle.wheel_base, vehicle.track]
         width = max(vehicle.track - vehicle.wheel_width, vehicle.wheel_width)
@@ -84,11 +85,14 @@ class Stance:
         at = np.stack([np.rint(wheels @ turn / cell) for turn in turns])
         under = np.stack([np.rint(points @ turn / cell) for turn in turns])
         pairs = ((0, 2), (1, 3), (0, 1), (2, 3))
+        # From the wheels' rounded places, not the vehicle's sides: a plane of gradient g then measures g at any
+        # heading.
         spans = np.stack([np.hypot(*(at[:, a] - at[:, b]).T) for a, b in pairs], axis=1) * cell
         part = max(vehicle.wheel_base / parts[0], width / parts[1])
         return Stance(
             at.astype(np.int64),
             under.astype(np.int64),
+            # Wheels that fall on one coarse cell have no span to divide by.
             np.maximum(spans, cell).astype(np.float32),
             weights.astype(np.float32),
             max(1, round(0.25 * vehicle.wheel_diameter / cell)),
@@ -133,6 +137,7 @@ def place(
         np.pad(np.where(np.isfinite(a), a, np.float32(np.nan)), reach, constant_values=np.nan)
         for a in (stand, ground, belly)
     ]
+    # Beyond the map all is unknown.
     padded += [np.pad(a.astype(np.uint16), reach, constant_values=1) for a in patchy]
     out = Places(*(np.zeros(high.shape, dtype=np.float32) for _ in Places._fields))
     wheels, under = ((at + reach).astype(np.uint64) for at in (stance.wheels, stance.belly))
@@ -169,6 +174,7 @@ def _place(ground, stance, out):  # type: ignore[no-untyped-def]
     wheels, under, spans, weights = stance
     tilt, slope, rise, unstood = out
     headings = wheels.shape[0]
+    # A table, by repeated addition: a division a cell would be the slowest operation of the loop.
     parts = headings * (wheels.shape[1] + under.shape[1])
     shares = np.zeros(parts + 1, dtype=np.float32)
     for k in range(parts):

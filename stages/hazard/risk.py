@@ -134,6 +134,7 @@ def _finite(source, out):  # type: ignore[no-untyped-def]
         line, target = source[r], out[r]
         for c in range(out.shape[1]):
             v = line[c]
+            # NaN and infinity minus themselves are NaN, which equals nothing.
             target[c] = v if v - v == np.float32(0.0) else np.float32(0.0)
 
 
@@ -158,6 +159,7 @@ def _run(params: RiskParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     lattices = [Lattice.from_dict(dem.meta["lattice"]) for dem in dems]
     whole = union(lattices)
     z = mosaic([(part, dem["elevation"]) for part, dem in zip(lattices, dems, strict=True)], np.nan, whole)
+    # Slopes and steps compare a cell with the ground around it, so the error that all of it shares does not count.
     names = [next((n for n in ("relief_std", "elevation_std") if n in d.arrays), None) for d in dems]
     stds = [(part, d[name]) for part, d, name in zip(lattices, dems, names, strict=True) if name is not None]
     s = mosaic(stds, np.nan, whole) if stds else np.zeros(whole.shape, dtype=np.float32)

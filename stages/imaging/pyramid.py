@@ -103,6 +103,7 @@ def build(image: AnyArray, params: PyramidParams, valid: AnyArray | None = None)
         raise InputError(
             "RIL-413", f"mask {valid.shape} and image {level.shape} differ", remedy="give a mask of the image's size"
         )
+    # Of whole numbers no pixel need be asked whether it is finite.
     whole = image.dtype.kind == "u"  # and so finite
     mask = np.ones(level.shape, bool) if whole else np.isfinite(level)
     if valid is not None:
@@ -148,11 +149,13 @@ def _means(image, mask, coarse, valid):  # type: ignore[no-untyped-def]
         found, usable = coarse[y], valid[y]
         for x in range(cols // 2):
             i, k = np.uint64(2 * x), np.uint64(2 * x + 1)
+            # Counted in float32, the type of the sums: a mix of types would keep the loop from becoming vector code.
             count = (np.float32(p[i]) + np.float32(p[k])) + (np.float32(q[i]) + np.float32(q[k]))
             found[x] = (a[i] + a[k] + b[i] + b[k]) / max(count, one) if count >= three else nil
             usable[x] = count >= three
         if cols % 2:
             x, i = cols // 2, cols - 1
+            # The last column stands for a repeated one.
             count = np.float32(2 * (p[i] + q[i]))
             found[x] = (a[i] + a[i] + b[i] + b[i]) / max(count, one) if count >= three else nil
             usable[x] = count >= three
@@ -161,6 +164,7 @@ def _means(image, mask, coarse, valid):  # type: ignore[no-untyped-def]
 def filled(pyramid: Pyramid) -> tuple[Image, ...]:
     """Images whose masked pixels carry the grey of the next valid level above, so that a mask's edge is no texture."""
     images = list(pyramid.images)
+    # From the top down, so that the level above is filled already.
     for n in range(pyramid.levels - 1, -1, -1):
         mask = pyramid.valid[n] != 0
         if mask.all():
@@ -169,6 +173,7 @@ def filled(pyramid: Pyramid) -> tuple[Image, ...]:
             rows, cols = images[n].shape
             above = images[n + 1].repeat(2, axis=0)[:rows].repeat(2, axis=1)[:, :cols]
         else:
+            # At the top there is no level above: the mean of what is seen.
             above = np.full_like(images[n], images[n][mask].mean() if mask.any() else 0.0)
         images[n] = np.where(mask, images[n], above)
     return tuple(images)

@@ -42,6 +42,7 @@ def push(keys, nodes, at, key, node):  # type: ignore[no-untyped-def]
 def pop(keys, nodes, size):  # type: ignore[no-untyped-def]
     """Take the first entry, which the caller has read, off the heap; the number of those that remain."""
     size -= 1
+    # The last entry goes where the first was, and sinks to its place.
     key, node = keys[size], nodes[size]
     at = 0
     while 2 * at + 1 < size:

@@ -89,6 +89,7 @@ STEPS = np.array([[0, 1], [1, 0], [1, 1], [1, -1]])
 
 def _rays(max_gap: float) -> tuple[NDArray[np.int64], Floats]:
     """Cells that a gap may span along each of :data:`STEPS`, and the inverse distance to the k-th cell of each."""
+    # A step along a diagonal is longer: the gap is limited in distance, not in cells.
     units = np.sqrt((STEPS * STEPS).sum(axis=1).astype(np.float64))
     with np.errstate(divide="ignore"):
         inverse = 1.0 / (units[:, None] * np.arange(int(max_gap + 1e-9) + 2))
@@ -143,9 +144,11 @@ def _close(known, cells, rays, trial, closed):  # type: ignore[no-untyped-def]
             used += 1
         if weight > 0.0:
             z[r, c] = total / weight
+            # No cell that is interpolated is more certain than the least certain that it comes from.
             s[r, c] = max(worst, rim * (high - low))
             filled[r, c] = 1
             if window > 0:
+                # Only heights that were known before: a closed hole proves nothing about interpolation.
                 missed = _missed(z_in, r, c, window, lines[:used], weights[:used], weight)
                 s[r, c] = max(worst, rim * (high - low) if math.isnan(missed) else missed)
 

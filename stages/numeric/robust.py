@@ -32,6 +32,7 @@ def bisquare(u):  # type: ignore[no-untyped-def]
 @register_jitable
 def huber_weight(size, bound):  # type: ignore[no-untyped-def]
     """Huber's weight of residuals of absolute value ``size``: 1 within ``bound``, ``bound / size`` beyond."""
+    # Without a branch, for arrays and numbers alike.
     return bound / np.maximum(size, bound)
 
 
