@@ -97,7 +97,7 @@ class PoseGraph:
                 x, y = grid.xy(row + r, col + c)
                 gaps = footing.gaps(x, y, np.full(x.shape, grid.heading + angle))
                 known[where, k], price[where, k] = prices(gaps, x, y)
-        return PoseGraph(grid, *price, (known[0], known[1], known[2]))
+        return PoseGraph(grid, price[0], price[1], price[2], (known[0], known[1], known[2]))
 
     def search(
         self, goals: NDArray[np.bool_], turn_price: float, back: float, *, whole: bool = False
