@@ -14,18 +14,17 @@ from typing import Any
 
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydantic import Field
 
 from rille.stages.calibration.parameter_selection import Decision, RelativeParams, decide
 from rille.stages.calibration.relative_orientation import LEAST_MATCHES, RIG, PointPairs, rms
+from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.declare import AnyArray, Array, Bundle, Inputs, Stage
 from rille.stages.core.errors import InputError
 from rille.stages.core.validity import matched
 from rille.stages.geometry.epipolar import corrected, distances
 from rille.stages.geometry.geometry import Rig
-
-Floats = NDArray[np.float64]
 
 
 class OrientationParams(RelativeParams):
@@ -40,9 +39,7 @@ class OrientationParams(RelativeParams):
     )
 
 
-def thin(
-    column: ArrayLike, row: ArrayLike, usable: NDArray[np.bool_], quality: ArrayLike, samples: int
-) -> tuple[Floats, Floats]:
+def thin(column: ArrayLike, row: ArrayLike, usable: Bools, quality: ArrayLike, samples: int) -> tuple[Floats, Floats]:
     """The best match of each square cell of the left image: points (n, 2), column and row, left and right.
 
     Parameters

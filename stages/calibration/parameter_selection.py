@@ -21,7 +21,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from rille.stages.calibration.relative_orientation import (
@@ -36,11 +35,10 @@ from rille.stages.calibration.relative_orientation import (
     settle,
     solution,
 )
+from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Params
 from rille.stages.geometry.epipolar import NAMES, beyond_infinity, corrected, depth_sensitivity, distances
 from rille.stages.geometry.geometry import Rig
-
-Floats = NDArray[np.float64]
 
 ANGLES = 3
 

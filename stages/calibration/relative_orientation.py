@@ -23,11 +23,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from rille.stages.core.arrays import Floats
 from rille.stages.geometry.epipolar import NAMES, distances, normals
 from rille.stages.geometry.geometry import Rig
 from rille.stages.numeric.robust import MAD_TO_SIGMA, TUKEY_BISQUARE, bisquare
-
-Floats = NDArray[np.float64]
 
 RIG = len(NAMES)
 PRINCIPAL = 2

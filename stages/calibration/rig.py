@@ -13,7 +13,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from rille.stages.calibration.orientation import misalignment
@@ -35,12 +34,11 @@ from rille.stages.calibration.relative_orientation import (
     rms,
     solution,
 )
+from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Bundle, Inputs, Stage
 from rille.stages.core.errors import InputError
 from rille.stages.geometry.epipolar import NAMES, corrected, distances
 from rille.stages.geometry.geometry import Rig
-
-Floats = NDArray[np.float64]
 
 MOST_MATCHES = 10_000
 """Of all pairs together: beyond, systematic errors rule."""

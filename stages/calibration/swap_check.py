@@ -11,7 +11,6 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rille.stages.core.declare import Bundle, Inputs, NoParams, Stage
 from rille.stages.core.validity import matched
@@ -19,8 +18,6 @@ from rille.stages.geometry.epipolar import exchanged, fits
 from rille.stages.geometry.geometry import Rig
 from rille.stages.imaging.pyramid import Pyramid
 from rille.stages.odometry.motion import MotionParams, coarse_motion
-
-Floats = NDArray[np.float64]
 
 SEARCH = MotionParams(top_columns=0.5, turn_below=0.0)
 """Half of the width to either side, as far as pairs are matched."""

@@ -15,14 +15,12 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import ConfigError, DegenerateError, InputError
 from rille.stages.geometry.epipolar import distances
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
 from rille.stages.geometry.lens import Lens
-
-Floats = NDArray[np.float64]
 
 MODELS: Mapping[str, tuple[str, ...]] = {
     "radtan": ("k1", "k2", "p1", "p2", "k3"),

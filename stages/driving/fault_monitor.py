@@ -17,13 +17,11 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
+from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Bundle, Inputs, Params, Stage
 from rille.stages.geometry.geometry import RigidTransform
-
-Floats = NDArray[np.float64]
 
 
 class SafetyParams(Params):

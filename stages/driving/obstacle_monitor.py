@@ -26,14 +26,12 @@ from numpy.typing import NDArray
 from pydantic import Field
 from scipy.spatial import KDTree
 
+from rille.stages.core.arrays import Bools, Floats, Floats32
 from rille.stages.core.declare import Array, Bundle, Inputs, Params, Stage
 from rille.stages.core.validity import matched
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.vehicle import Vehicle
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 
 class ReflexParams(Params):
@@ -95,8 +93,8 @@ class ViewPair:
 
     before: RigidTransform
     now: RigidTransform
-    column: NDArray[np.float32]
-    row: NDArray[np.float32]
+    column: Floats32
+    row: Floats32
     matched: Bools
     level: int
 

@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
 from rille.stages.core.errors import InputError
 from rille.stages.evaluation.accuracy_parts import (
@@ -38,8 +39,6 @@ from rille.stages.evaluation.accuracy_parts import (
 )
 from rille.stages.evaluation.trajectory_error import against_claims, by_cause, by_shares, by_steps
 from rille.stages.odometry.resection.trajectory import world_poses
-
-Floats = NDArray[np.float64]
 
 KITTI_LENGTHS = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 KITTI_STEP = 10
@@ -96,7 +95,7 @@ def trajectory_accuracy(
     return arrays, metrics
 
 
-def _counts(has_pose: NDArray[np.bool_], has_truth: NDArray[np.bool_]) -> dict[str, Metric]:
+def _counts(has_pose: Bools, has_truth: Bools) -> dict[str, Metric]:
     return {
         "frames": metric(len(has_pose), "frames", "frames that were to be posed"),
         "frames_missing": metric(int((~has_pose).sum()), "frames", "of them without a pose"),

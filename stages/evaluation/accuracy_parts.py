@@ -6,9 +6,9 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from rille.stages.core.arrays import Bools, Floats
+
 Metric = dict[str, Any]
 
 
@@ -18,7 +18,7 @@ def metric(value: float | int | None, unit: str, how: str) -> Metric:
     return {"value": value if sound else None, "unit": unit, "how": how}
 
 
-def posed(poses: Floats) -> NDArray[np.bool_]:
+def posed(poses: Floats) -> Bools:
     """Which of the poses (frame, 3, 4) are there, i.e. without NaN."""
     return np.asarray(np.isfinite(poses).all(axis=(1, 2)))
 

@@ -15,13 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from rille.stages.core.arrays import Bytes, Floats
 from rille.stages.core.declare import AnyArray, Array, Bundle, Inputs, Params, Stage
 from rille.stages.evaluation.accuracy import angles_between, by_frame
 from rille.stages.evaluation.accuracy_parts import Metric, metric, posed
 from rille.stages.evaluation.pose_alignment import align, moved, spread
 from rille.stages.numeric.robust import mad_sigma
-
-Floats = NDArray[np.float64]
 
 ORIENTATION_SHARE = 0.1
 """Positions decide the alignment, as in an absolute trajectory error; orientations only where positions cannot."""
@@ -116,7 +115,7 @@ def _steps(arrays: dict[str, Floats], ours: Floats, laid: Floats, rows: NDArray[
     arrays["step_angle"][second] = angles_between(moves[0], moves[1])
 
 
-def flag(arrays: Mapping[str, Floats], params: AgreementParams) -> tuple[NDArray[np.uint8], dict[str, float | None]]:
+def flag(arrays: Mapping[str, Floats], params: AgreementParams) -> tuple[Bytes, dict[str, float | None]]:
     """Bits of :data:`REASONS` for each frame that stands out, and the limit of each disagreement (None: no values).
 
     The limit is the median plus ``threshold`` robust standard deviations, at least ``least_ratio`` medians, and for

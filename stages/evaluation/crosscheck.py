@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from rille.stages.core.arrays import Bools, Bytes, Floats, Floats32
 from rille.stages.core.declare import Array, Bundle, Inputs, Memory, Params, Stage
 from rille.stages.geometry.geometry import Camera, Rig
 
@@ -81,8 +82,8 @@ class CrosscheckParams(Params):
 class Features:
     """Of one image: ``points`` (n, 2) float64 column, row as COLMAP counts; ``descriptors`` (n, 128) float32, bytes."""
 
-    points: NDArray[np.float64]
-    descriptors: NDArray[np.float32]
+    points: Floats
+    descriptors: Floats32
 
 
 def windows(frames: Sequence[int], params: CrosscheckParams) -> list[list[int]]:
@@ -95,7 +96,7 @@ def windows(frames: Sequence[int], params: CrosscheckParams) -> list[list[int]]:
     return [list(frames[a : b + shared]) for a, b in itertools.pairwise(edges)]
 
 
-def grey_bytes(image: NDArray[Any]) -> NDArray[np.uint8]:
+def grey_bytes(image: NDArray[Any]) -> Bytes:
     """Image (row, col) as uint8: uint16 is divided by 257, floats of 0..255 are rounded."""
     if image.dtype == np.uint8:
         return np.ascontiguousarray(image)
@@ -134,7 +135,7 @@ def _extractor(params: CrosscheckParams) -> Any:
     return pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
 
 
-def _away_from_mask(points: NDArray[np.float64], scale: NDArray[np.float64], valid: NDArray[Any]) -> NDArray[np.bool_]:
+def _away_from_mask(points: Floats, scale: Floats, valid: NDArray[Any]) -> Bools:
     if np.all(valid):
         return np.ones(len(points), bool)
     # Distance to the nearest masked pixel at every pixel, looked up at the features.
@@ -162,7 +163,7 @@ def match(a: Features, b: Features, max_ratio: float = 0.8, max_distance: float 
     return np.stack([rows, forward[rows]], axis=1).astype(np.uint32)
 
 
-def _nearest(products: NDArray[np.float32], max_ratio: float, max_distance: float) -> NDArray[np.intp]:
+def _nearest(products: Floats32, max_ratio: float, max_distance: float) -> NDArray[np.intp]:
     """Column of the nearest descriptor of each row, -1 where there is no clear one; spoils ``products``."""
     rows = np.arange(len(products))
     best = products.argmax(axis=1)
@@ -309,7 +310,7 @@ def _map(database: Any, params: CrosscheckParams) -> list[Any]:
     return [manager.get(k) for k in range(manager.size())]
 
 
-def _read(model: Any, poses: NDArray[np.float64], observations: NDArray[np.int32]) -> None:
+def _read(model: Any, poses: Floats, observations: NDArray[np.int32]) -> None:
     """Poses in the left camera frame of the first registered frame, and observations a frame, in place."""
     numbers = sorted(model.reg_frame_ids())
     first = model.frame(numbers[0]).rig_from_world

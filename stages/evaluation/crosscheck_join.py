@@ -13,13 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
 from rille.stages.evaluation.accuracy import angles_between
 from rille.stages.evaluation.accuracy_parts import posed
 from rille.stages.evaluation.pose_alignment import align, moved
 from rille.stages.geometry.geometry import orthonormal
-
-Floats = NDArray[np.float64]
 
 ORIENTATION_SHARE = 1.0
 """Orientations weigh like positions: over the few metres that windows share they are the better compass."""

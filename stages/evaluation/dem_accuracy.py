@@ -12,8 +12,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rille.stages.core.arrays import Bools, Floats32
 from rille.stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
 from rille.stages.core.errors import InputError
 from rille.stages.evaluation.accuracy_parts import Metric, metric
@@ -21,9 +21,7 @@ from rille.stages.evaluation.dem_comparison import figures
 from rille.stages.geometry.lattice import Lattice, mosaic
 
 
-def dem_accuracy(
-    elevation: NDArray[np.float32], truth: NDArray[np.float32], judged: NDArray[np.bool_]
-) -> dict[str, Metric]:
+def dem_accuracy(elevation: Floats32, truth: Floats32, judged: Bools) -> dict[str, Metric]:
     """Metrics by name.
 
     Parameters
@@ -47,7 +45,7 @@ def dem_accuracy(
     }
 
 
-def in_window(lattice: Lattice, window: Sequence[float] | None) -> NDArray[np.bool_]:
+def in_window(lattice: Lattice, window: Sequence[float] | None) -> Bools:
     """Cells (row, col) whose centres lie in a window x_min, y_min, x_max, y_max, metres; all without one."""
     if window is None:
         return np.ones(lattice.shape, dtype=bool)

@@ -14,14 +14,13 @@ from typing import Literal
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
+from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import DegenerateError, InputError
 from rille.stages.geometry.geometry import orthonormal, rotation_exp
 from rille.stages.numeric.robust import TUKEY_BISQUARE, bisquare, mad_sigma
 from rille.stages.terrain.shading import gradient
 
-Floats = NDArray[np.float64]
 Align = Literal["shift", "tilt", "rigid"]
 
 MEANS_FROM = 1.5  # ratio of cells from which the finer model's cells are averaged instead of interpolated

@@ -15,12 +15,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
 from rille.stages.evaluation.accuracy_parts import Metric, inverse, metric, square
-
-Floats = NDArray[np.float64]
 
 
 def judged(drive: Mapping[str, Any], row: int) -> dict[str, Floats]:

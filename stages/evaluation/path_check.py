@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rille.stages.core.arrays import Bytes, Floats
 from rille.stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
 from rille.stages.evaluation.accuracy_parts import Metric, metric
 from rille.stages.geometry.lattice import Lattice
@@ -16,8 +17,6 @@ from rille.stages.hazard.vehicle import Vehicle
 from rille.stages.planning import grid8
 from rille.stages.planning.path_ground import Maps, PathMaps, PathPrices, RowGrid
 from rille.stages.planning.row_graph import UNREACHED
-
-Floats = NDArray[np.float64]
 
 UNIT = 1000
 """Cost of a step along an axis: a step aside costs 1414."""
@@ -36,7 +35,7 @@ def crossed_cells(path: Floats, lattice: Lattice) -> NDArray[np.int64]:
     return np.unique(cells, axis=0)
 
 
-def path_check(path: Floats, risk: NDArray[np.uint8], lattice: Lattice) -> tuple[NDArray[np.int64], dict[str, Metric]]:
+def path_check(path: Floats, risk: Bytes, lattice: Lattice) -> tuple[NDArray[np.int64], dict[str, Metric]]:
     """Crossed hazardous cells (n, 2) row, column, and metrics by name.
 
     Parameters

@@ -8,11 +8,9 @@ attitude. Each pose therefore counts as seven points: its centre, and the ends o
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rille.stages.core.arrays import Floats
 from rille.stages.evaluation.accuracy import umeyama
-
-Floats = NDArray[np.float64]
 
 REST_LEVER = 1.0
 """m, lever of a camera at rest: far beyond the millimetres of its positions."""

@@ -23,12 +23,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
 from rille.stages.evaluation.accuracy import by_frame
 from rille.stages.evaluation.accuracy_parts import Metric, metric
 from rille.stages.odometry.resection.trajectory import world_poses
-
-Floats = NDArray[np.float64]
 
 LEAST = 4
 """Frames with pose and truth: a turn, a shift and an offset leave something over to judge with."""
@@ -249,7 +248,7 @@ def _other_axes(truth: Floats) -> dict[str, Floats]:
     return found
 
 
-def _figures(estimate: Floats, truth: Floats, both: NDArray[np.bool_], how: str) -> dict[str, Metric]:
+def _figures(estimate: Floats, truth: Floats, both: Bools, how: str) -> dict[str, Metric]:
     n, compared = len(estimate), int(both.sum())
     missing = int((~np.isfinite(estimate).all(axis=1)).sum())
     counts = {

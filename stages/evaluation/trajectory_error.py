@@ -10,12 +10,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rille.stages.core.arrays import Floats
 from rille.stages.evaluation.accuracy_parts import Metric, along, angle, inverse, metric, relative_error, rms
 from rille.stages.geometry.geometry import cross_matrix, rotation_log
-
-Floats = NDArray[np.float64]
 
 STEPS = (1, 2, 5, 10, 20, 50)
 """Frames between the two poses of a relative error."""

@@ -21,9 +21,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Floats = NDArray[np.float64]
+from rille.stages.core.arrays import Floats
+
 Vector = tuple[float, float, float]
 
 STEPS = 30

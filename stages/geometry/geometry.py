@@ -18,11 +18,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import InputError
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import ConfigError, InputError
 
-Floats = NDArray[np.float64]
 Window = tuple[slice, slice]
 
 MAX_CELLS = 50_000_000

@@ -25,13 +25,12 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.polynomial import Polynomial
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from rille.stages.core.arrays import Floats, Floats32
 from rille.stages.core.errors import InputError
 from rille.stages.geometry.cahvore import Bending
 from rille.stages.geometry.geometry import Camera
-
-Floats = NDArray[np.float64]
 
 COUNTS: Mapping[str, tuple[int, ...]] = {
     "none": (0,),
@@ -174,7 +173,7 @@ class Lens:
             rays[~(np.hypot(rays[:, 0], rays[:, 1]) < self.reach)] = np.nan
         return ideal.project(rays)
 
-    def maps(self, ideal: Camera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    def maps(self, ideal: Camera) -> tuple[Floats32, Floats32]:
         """Raw column and row, (row, col) of ``ideal``'s image, of every ideal pixel; NaN where the model folds back."""
         size = (ideal.width, ideal.height)
         if self.model == "cahvore":

@@ -11,11 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from rille.stages.core.arrays import Bools, Floats
 from rille.stages.geometry.geometry import Camera
-
-Floats = NDArray[np.float64]
 
 NEAREST = 1e-6
 """Depth [m] below which a point counts as behind the camera."""
@@ -35,12 +33,12 @@ class Pinhole(NamedTuple):
         return Pinhole(float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy))
 
 
-def project(camera: Camera, x: Floats) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+def project(camera: Camera, x: Floats) -> tuple[Floats, Floats, Bools]:
     """Pixels (..., 2) of camera points (..., 3), metres, derivatives (..., 2, 3), and which are behind the camera.
 
     Points behind the camera are taken at a depth of 1 m, so that sums over all points stay finite.
     """
-    behind: NDArray[np.bool_] = np.asarray(x[..., 2] < NEAREST)
+    behind: Bools = np.asarray(x[..., 2] < NEAREST)
     # Any depth that divides: callers leave these points out by the mask.
     z = np.where(behind, 1.0, x[..., 2])
     u, v = x[..., 0] / z, x[..., 1] / z

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rille.stages.core.arrays import Floats
 from rille.stages.geometry.geometry import Rig
-
-Floats = NDArray[np.float64]
 
 
 def inverse_depth(rig: Rig, pixels: Floats, disparity: Floats) -> tuple[Floats, Floats]:

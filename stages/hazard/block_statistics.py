@@ -11,12 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from rille.stages.core.arrays import Floats, Floats32
 from rille.stages.numeric.line import copy_line
-
-Floats = NDArray[np.float64]
-Floats32 = NDArray[np.float32]
 
 STRIP = 512
 """Columns of cells that are worked on at a time, at most."""

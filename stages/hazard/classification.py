@@ -24,10 +24,10 @@ import scipy
 from numba import njit
 from numpy.typing import NDArray
 
+from rille.stages.core.arrays import Bytes, Floats32
 from rille.stages.hazard.measures import MEASURES, HazardInput, Measure
 from rille.stages.numeric.line import copy_line
 
-Floats32 = NDArray[np.float32]
 Bits = NDArray[np.uint16]
 
 SAFE, CAUTION, HAZARDOUS, UNKNOWN = 0, 1, 2, 3
@@ -106,8 +106,8 @@ class Cells(NamedTuple):
     classes, reasons, probability, rasters of the measures on blocks, and those on cells (blanked where unknown)."""
 
     closed: Floats32
-    filled: NDArray[np.uint8]
-    risk: NDArray[np.uint8]
+    filled: Bytes
+    risk: Bytes
     reason: Bits
     p: Floats32
     bands: tuple[Floats32, ...]
@@ -115,7 +115,7 @@ class Cells(NamedTuple):
 
 
 def classify(
-    terrain: HazardInput, filled: NDArray[np.uint8], rules: Rules, measures: tuple[Measure, ...] = MEASURES
+    terrain: HazardInput, filled: Bytes, rules: Rules, measures: tuple[Measure, ...] = MEASURES
 ) -> dict[str, NDArray]:
     """Classes, reasons and rasters (row, col) of :func:`rille.stages.hazard.risk.risk_map`.
 

@@ -30,16 +30,13 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rille.stages.core.arrays import Floats, Floats32
 from rille.stages.hazard.block_statistics import Blocks, reduce_to_blocks
 from rille.stages.hazard.placement import Places, place, stride
 from rille.stages.hazard.vehicle import Vehicle
 from rille.stages.numeric.extrema import median3, relief
 from rille.stages.numeric.windows import window_sum
-
-Floats = NDArray[np.float64]
-Floats32 = NDArray[np.float32]
 
 FINE = 5
 """Cells along a wheel's radius from which a 3 x 3 median is taken: at most three wrong cells are no stone there."""

@@ -27,10 +27,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from rille.stages.core.arrays import Bools, Floats, Floats32
 from rille.stages.hazard.vehicle import Vehicle
 from rille.stages.numeric.extrema import running_max
 
-Floats32 = NDArray[np.float32]
 Ints = NDArray[np.int64]
 
 HEADINGS = 8
@@ -105,7 +105,7 @@ def _parts(length: float, other: float) -> int:
     return max(2, round(2.0 * length / min(length, other)))
 
 
-def _rotation(angle: float) -> NDArray[np.float64]:
+def _rotation(angle: float) -> Floats:
     """(ahead, right) to (row, col) of a raster whose rows fall ahead, turned clockwise."""
     c, s = math.cos(angle), math.sin(angle)
     return np.array([[-c, s], [s, c]])
@@ -116,9 +116,7 @@ def stride(vehicle: Vehicle, cell: float) -> int:
     return max(1, int(vehicle.wheel_diameter / (PLACES_PER_WHEEL * cell) + 1e-6))
 
 
-def place(
-    high: Floats32, low: Floats32, vehicle: Vehicle, cell: float, whole: NDArray[np.bool_] | None = None
-) -> Places:
+def place(high: Floats32, low: Floats32, vehicle: Vehicle, cell: float, whole: Bools | None = None) -> Places:
     """Put the vehicle down everywhere.
 
     Parameters

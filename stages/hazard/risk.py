@@ -30,6 +30,7 @@ from numba import njit
 from numpy.typing import NDArray
 from pydantic import Field
 
+from rille.stages.core.arrays import Floats32
 from rille.stages.core.declare import Array, Bundle, Inputs, Memory, Params, Stage
 from rille.stages.core.errors import DegenerateError
 from rille.stages.geometry.lattice import Lattice, mosaic, union
@@ -51,7 +52,6 @@ from rille.stages.numeric.holes import close_into
 
 __all__ = ["BITS", "CAUTION", "DOUBT_BIT", "HAZARDOUS", "REASONS", "SAFE", "UNKNOWN", "UNKNOWN_BIT", "risk_map"]
 
-Floats32 = NDArray[np.float32]
 
 REASONS = BITS | {"unknown": UNKNOWN_BIT, "filled": FILLED_BIT, "uncertain": DOUBT_BIT, "unseen": UNSEEN_BIT}
 """Bits of ``reason``: a measure over its limit; too little known to judge; elevation interpolated; over a limit only

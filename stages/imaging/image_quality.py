@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rille.stages.core.arrays import Bytes
 from rille.stages.core.declare import Bundle, Inputs, NoParams, Stage
 from rille.stages.imaging.pyramid import grey
 
@@ -44,7 +45,7 @@ class Look:
     detail: float = 0.0
 
 
-def look(image: NDArray[Any], valid: NDArray[np.uint8]) -> Look:
+def look(image: NDArray[Any], valid: Bytes) -> Look:
     """Figures of an image (row, col); ``valid`` not zero where usable."""
     level = grey(image)
     values = level[(valid != 0) & np.isfinite(level)]
@@ -54,7 +55,7 @@ def look(image: NDArray[Any], valid: NDArray[np.uint8]) -> Look:
     return Look(float(values.mean()), float(values.std()), *clipped, *texture(image, valid))
 
 
-def texture(image: NDArray[Any], valid: NDArray[np.uint8]) -> tuple[float, float]:
+def texture(image: NDArray[Any], valid: Bytes) -> tuple[float, float]:
     """Sharpness and detail of an image (row, col); ``valid`` not zero where usable. NaN: nothing is.
 
     Sharpness is the share of detail between one and two pixels in that between two and four, RMS: it hardly depends on
@@ -77,7 +78,7 @@ def texture(image: NDArray[Any], valid: NDArray[np.uint8]) -> tuple[float, float
     return fine / coarse if coarse > 0 else math.nan, coarse / deviation if deviation > 0 else 0.0
 
 
-def glance(image: NDArray[Any], valid: NDArray[np.uint8]) -> dict[str, Any]:
+def glance(image: NDArray[Any], valid: Bytes) -> dict[str, Any]:
     """Mean and deviation (grey), sharpness (None: none to tell) and detail of strips of an image, and its digest."""
     rows = image.shape[0]
     first = sorted({int(np.clip(share * rows - STRIP / 2, 0, max(rows - STRIP, 0))) for share in BANDS})

@@ -1,4 +1,4 @@
-"""Image pyramid: each level is the mean of 2 x 2 pixels of the one below (paper, 4.3.4).
+"""Floats32 pyramid: each level is the mean of 2 x 2 pixels of the one below (paper, 4.3.4).
 
 Pixel centres are at integers, so column ``x`` of level 0 lies at ``x_n = (x + 0.5) / 2**n - 0.5`` on level n. Odd sizes
 are completed by repeating the last row or column. A coarse pixel is valid if at least three of its four pixels are;
@@ -13,15 +13,13 @@ from typing import Any
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 from pydantic import Field
 
+from rille.stages.core.arrays import Floats32
 from rille.stages.core.declare import AnyArray, Array, Bundle, Inputs, Params, Stage
 from rille.stages.core.errors import InputError
 from rille.stages.core.validity import Mask
 from rille.stages.imaging import noise
-
-Image = NDArray[np.float32]
 
 
 class PyramidParams(Params):
@@ -42,7 +40,7 @@ class Pyramid:
     ``noise``: standard deviation of level 0, grey levels (see :mod:`rille.stages.imaging.noise`).
     """
 
-    images: tuple[Image, ...]
+    images: tuple[Floats32, ...]
     valid: tuple[Mask, ...]
     noise: float = 0.0
 
@@ -66,8 +64,8 @@ class Pyramid:
         return Pyramid(self.images[level:], self.valid[level:], self.noise * 0.5**level)
 
 
-def grey(image: AnyArray) -> Image:
-    """Image (row, col) as float32 grey 0..255: uint8 as it is, uint16 over 257, floating point taken as 0..255.
+def grey(image: AnyArray) -> Floats32:
+    """Floats32 (row, col) as float32 grey 0..255: uint8 as it is, uint16 over 257, floating point taken as 0..255.
 
     Raises
     ------
@@ -117,7 +115,7 @@ def build(image: AnyArray, params: PyramidParams, valid: AnyArray | None = None)
     return Pyramid(found.images, found.valid, noise.standard_deviation(found.images, found.valid))
 
 
-def halved(image: Image, mask: Mask, levels: int) -> Pyramid:
+def halved(image: Floats32, mask: Mask, levels: int) -> Pyramid:
     """Pyramid of so many levels of a float32 image (0 where masked) and its mask.
 
     Of a window that starts and ends where a pixel of the top level does, it is a part of the image's pyramid.
@@ -130,7 +128,7 @@ def halved(image: Image, mask: Mask, levels: int) -> Pyramid:
     return Pyramid(tuple(images), tuple(masks))
 
 
-def _halve(image: Image, mask: Mask) -> tuple[Image, Mask]:
+def _halve(image: Floats32, mask: Mask) -> tuple[Floats32, Mask]:
     rows, cols = image.shape
     coarse = np.empty(((rows + 1) // 2, (cols + 1) // 2), np.float32)
     valid = np.empty(coarse.shape, np.uint8)
@@ -161,7 +159,7 @@ def _means(image, mask, coarse, valid):  # type: ignore[no-untyped-def]
             usable[x] = count >= three
 
 
-def filled(pyramid: Pyramid) -> tuple[Image, ...]:
+def filled(pyramid: Pyramid) -> tuple[Floats32, ...]:
     """Images whose masked pixels carry the grey of the next valid level above, so that a mask's edge is no texture."""
     images = list(pyramid.images)
     # From the top down, so that the level above is filled already.

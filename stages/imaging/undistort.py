@@ -15,17 +15,14 @@ from typing import Any, Literal
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 from pydantic import Field
 
+from rille.stages.core.arrays import Bytes, Floats, Floats32
 from rille.stages.core.declare import AnyArray, Array, Bundle, Inputs, Params, Stage
 from rille.stages.core.errors import InputError
 from rille.stages.geometry.geometry import Camera
 from rille.stages.geometry.lens import Lens
 from rille.stages.imaging.pyramid import grey
-
-Float32 = NDArray[np.float32]
-Floats = NDArray[np.float64]
 
 PHASES = 4096
 """Positions between two pixels that weights are tabulated for; the nearest one is taken."""
@@ -65,7 +62,7 @@ KERNELS: Mapping[str, tuple[Callable[[Floats], Floats], int]] = {
 """Weight by distance in pixels, and how many pixels it reaches to each side."""
 
 
-def weights(interpolation: str) -> Float32:
+def weights(interpolation: str) -> Floats32:
     """Weights (phase, tap): phase i is i / ``PHASES`` past the tap in the middle's left half; each row sums to 1."""
     kernel, reach = KERNELS[interpolation]
     phase = np.arange(PHASES + 1) / PHASES
@@ -75,7 +72,7 @@ def weights(interpolation: str) -> Float32:
 
 def undistort(
     image: AnyArray, lens: Lens, camera: Camera, params: UndistortParams, valid: AnyArray | None = None
-) -> tuple[Float32, NDArray[np.uint8]]:
+) -> tuple[Floats32, Bytes]:
     """The image that ``camera`` would have taken from the same place.
 
     Parameters

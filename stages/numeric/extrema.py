@@ -13,9 +13,8 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-Floats32 = NDArray[np.float32]
+from rille.stages.core.arrays import Floats32
 
 NOTHING = np.float32(-np.inf)
 """Stands where no cell is known: every height is above it."""

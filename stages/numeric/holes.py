@@ -9,9 +9,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
-Floats32 = NDArray[np.float32]
-Flags = NDArray[np.uint8]
+from rille.stages.core.arrays import Bytes, Floats, Floats32
+
+Flags = Bytes
 
 LEAST_TRIALS = 8
 """Known cells nearby that must tell the error of an interpolation; with fewer, half the range of its rim stands in."""

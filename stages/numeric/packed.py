@@ -14,7 +14,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-Mask = NDArray[np.bool_]
+from rille.stages.core.arrays import Bools, Bytes
+
 Words = NDArray[np.uint64]
 
 WORD = 64
@@ -31,7 +32,7 @@ class Canvas:
     cols: int
 
     @staticmethod
-    def of(mask: Mask, border: int, outside: bool = False) -> Canvas:
+    def of(mask: Bools, border: int, outside: bool = False) -> Canvas:
         """A mask (row, col) on a canvas."""
         return Canvas._around(np.packbits(mask, axis=1, bitorder="little"), mask.shape, border, outside)
 
@@ -41,7 +42,7 @@ class Canvas:
         return Canvas._around(np.zeros((shape[0], -(-shape[1] // 8)), dtype=np.uint8), shape, border, True)
 
     @staticmethod
-    def _around(bits: NDArray[np.uint8], shape: tuple[int, ...], border: int, outside: bool) -> Canvas:
+    def _around(bits: Bytes, shape: tuple[int, ...], border: int, outside: bool) -> Canvas:
         rows, cols = shape
         margin = -(-border // WORD)
         n = 2 * margin - (-cols // WORD)
@@ -52,7 +53,7 @@ class Canvas:
         words = room.view(np.uint64)
         return Canvas(words if LITTLE else words.byteswap(), border, rows, cols)
 
-    def mask(self) -> Mask:
+    def mask(self) -> Bools:
         """The mask (row, col) inside the border."""
         inside = self.words[self.border : self.border + self.rows]
         octets = (inside if LITTLE else inside.byteswap()).view(np.uint8)
@@ -96,7 +97,7 @@ class Canvas:
         return dr * int(self.words.shape[1]) * WORD + dc
 
 
-def codes(canvases: Sequence[Canvas], bits: Sequence[int]) -> NDArray[np.uint8]:
+def codes(canvases: Sequence[Canvas], bits: Sequence[int]) -> Bytes:
     """Sum (row, col) of the bits of those of four canvases with the same border whose cell is not set."""
     one = canvases[0]
     out = np.empty((one.rows, one.cols), dtype=np.uint8)

@@ -9,8 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
-Floats32 = NDArray[np.float32]
+from rille.stages.core.arrays import Floats, Floats32
 
 
 def window_sum(a: NDArray, n: int) -> Floats:

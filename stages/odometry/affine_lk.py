@@ -12,12 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from rille.stages.core.arrays import Floats, Floats32
 from rille.stages.geometry.cubic import cubic
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
 
 HALF = 5
 """Half the template's side: 11 x 11 pixels hold enough texture and still look plane."""
@@ -34,12 +31,14 @@ class Templates(NamedTuple):
     """``points`` (n, 2) column, row in a; ``start`` (n, 2) where they are expected in b, NaN stays NaN; ``affinity``
     (n, 2, 2) expected derivative of b's coordinates by a's."""
 
-    points: F64
-    start: F64
-    affinity: F64
+    points: Floats
+    start: Floats
+    affinity: Floats
 
 
-def align(a: F32, b: F32, templates: Templates, *, noise: float, spread: float, reach: float) -> tuple[F64, F64]:
+def align(
+    a: Floats32, b: Floats32, templates: Templates, *, noise: float, spread: float, reach: float
+) -> tuple[Floats, Floats]:
     """Align templates around points of ``a`` in ``b``.
 
     Parameters

@@ -8,8 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
+from rille.stages.core.arrays import Bools, Floats
 
 NEIGHBOURS = 12
 """Tracks that an affinity of six numbers is fitted to: twice as many as needed, still local."""

@@ -12,14 +12,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.declare import AnyArray, Bundle
 from rille.stages.core.validity import Validity, matched
 from rille.stages.odometry.affinity import fit_affinity, known_median
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 BLOCKS = 200
 """Blocks of an image, about; more change the overlap by less than a per cent, and cost time with their square."""

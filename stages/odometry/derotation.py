@@ -14,14 +14,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from rille.stages.core.arrays import Floats, Floats32
 from rille.stages.core.errors import InputError
 from rille.stages.geometry.geometry import Camera
 from rille.stages.hfvm.images.plane import translation, warp
 from rille.stages.hfvm.level.window_pair import WindowPair
 from rille.stages.imaging import pyramid
 from rille.stages.imaging.pyramid import Pyramid, PyramidParams
-
-Floats = NDArray[np.float64]
 
 MARGIN = 32
 """Pixels added on every side of the derotated frame, for what moves outwards; one pixel of the sixth pyramid level, so
@@ -74,7 +73,7 @@ class Derotation:
         warp(grey, usable, self.homography @ translation(-MARGIN), image, valid, place)
         return pyramid.build(image, PyramidParams(levels=b.levels), valid)
 
-    def compose(self, u: NDArray[Any], v: NDArray[Any], level: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    def compose(self, u: NDArray[Any], v: NDArray[Any], level: int) -> tuple[Floats32, Floats32]:
         """Displacements (row, col) to the original frame b of those to the result of :meth:`apply`.
 
         Both in pixels of level 0, on the grid of level ``level``; NaN stays NaN.

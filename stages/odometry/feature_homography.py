@@ -12,9 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rille.stages.core.arrays import Floats, Floats32
 from rille.stages.imaging.pyramid import Pyramid
-
-Floats = NDArray[np.float64]
 
 LARGEST = 1400
 """Pixels: longer side up to which features are looked for in the finest image."""
@@ -49,7 +48,7 @@ def feature_homography(a: Pyramid, b: Pyramid) -> Floats | None:
     return homography / middle[2] if abs(middle[2]) > 1e-9 else None
 
 
-def _features(frame: Pyramid, level: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _features(frame: Pyramid, level: int) -> tuple[Floats32, Floats32]:
     """Positions (n, 2) column, row in pixels of the level, and RootSIFT descriptors (n, 128)."""
     image = np.clip(np.rint(np.nan_to_num(frame.images[level])), 0, 255).astype(np.uint8)
     points, descriptors = cv2.SIFT.create(FEATURES).detectAndCompute(image, frame.valid[level])
@@ -61,7 +60,7 @@ def _features(frame: Pyramid, level: int) -> tuple[NDArray[np.float32], NDArray[
     return np.array([k.pt for k in points], np.float32), root
 
 
-def _matches(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.intp]:
+def _matches(a: Floats32, b: Floats32) -> NDArray[np.intp]:
     """Numbers (k, 2) of the features that are each other's nearest, by far."""
     if min(len(a), len(b)) < 2:
         return np.zeros((0, 2), np.intp)

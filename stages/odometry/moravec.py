@@ -17,14 +17,14 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float32]
-Bools = NDArray[np.bool_]
+from rille.stages.core.arrays import Bools, Bytes, Floats, Floats32
+
 DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
 HALF = 2
 """Half the window: 5 x 5 pixels hold a corner of the finest feature kernels."""
 
 
-def interest_operator(image: Floats) -> Floats:
+def interest_operator(image: Floats32) -> Floats32:
     """Least directional sum of squared differences of a grey image (rows, cols); grey levels squared.
 
     The three outermost pixels, where a window leaves the image, are 0.
@@ -68,14 +68,14 @@ def _operator(image, directions, out):  # type: ignore[no-untyped-def]
 
 
 def interest_points(
-    image: Floats,
-    valid: NDArray[np.uint8],
+    image: Floats32,
+    valid: Bytes,
     count: int,
     *,
     noise: float,
     border: int,
     occupied: NDArray[np.floating] | None = None,
-) -> NDArray[np.float32]:
+) -> Floats32:
     """At most ``count`` interest points, the strongest of each bucket first.
 
     Parameters
@@ -116,7 +116,7 @@ def interest_points(
     return np.stack([cols[best], rows[best]], axis=-1).astype(np.float32)
 
 
-def _peaks(response: Floats, least: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _peaks(response: Floats32, least: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Rows and columns of pixels above ``least``, and greatest of the 5 x 5 neighbourhood; of equal ones the first."""
     side = np.ones((2 * HALF + 1, 2 * HALF + 1), np.uint8)
     found = (response > least) & (response == cv2.dilate(response, side))
@@ -138,7 +138,7 @@ def _first_of_equals(response, rows, cols):  # type: ignore[no-untyped-def]
     return first
 
 
-def _inside(valid: NDArray[np.uint8], border: int) -> Bools:
+def _inside(valid: Bytes, border: int) -> Bools:
     """Pixels at least ``border`` away from the image's edge and from anything unusable (Chebyshev distance)."""
     side = 2 * border + 1
     usable = (np.asarray(valid) != 0).astype(np.uint8)
@@ -146,7 +146,7 @@ def _inside(valid: NDArray[np.uint8], border: int) -> Bools:
     return np.asarray(eroded != 0)
 
 
-def clear_of_mask(valid: NDArray[np.uint8], points: NDArray[np.float64], border: int) -> Bools:
+def clear_of_mask(valid: Bytes, points: Floats, border: int) -> Bools:
     """Whether points (n, 2) are at least ``border`` pixels away from the image's edge and from anything unusable."""
     rows, cols = valid.shape
     p = np.floor(np.where(np.isfinite(points), points, -1.0) + 0.5).astype(np.intp)

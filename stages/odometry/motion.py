@@ -17,9 +17,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
+from rille.stages.core.arrays import Floats, Floats32
 from rille.stages.core.declare import AnyArray, Array, Bundle, Inputs, Params, Stage
 from rille.stages.core.validity import Mask, Validity, defined, mark, matched
 from rille.stages.geometry.geometry import Camera
@@ -79,8 +79,8 @@ class Motion:
     """
 
     level: int
-    column_disparity: NDArray[np.float32]
-    row_disparity: NDArray[np.float32]
+    column_disparity: Floats32
+    row_disparity: Floats32
     validity: Mask
 
 
@@ -154,7 +154,7 @@ def _rolled(
         return None
     shape = (a.images[0].shape[0], a.images[0].shape[1])
 
-    def attempt(homography: roll_search.Floats, which: MotionParams) -> tuple[Motion, Derotation]:
+    def attempt(homography: Floats, which: MotionParams) -> tuple[Motion, Derotation]:
         # The rotation looked for comes on top of the one that a sensor told.
         upright = Derotation(homography if turn is None else turn.homography @ homography, shape)
         return coarse_motion(a, b, which, upright), upright

@@ -14,14 +14,13 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from rille.stages.core.arrays import Bools, Bytes, Floats, Floats32
 from rille.stages.geometry.cubic import cubic
 from rille.stages.hfvm.images.params import HfvmParams
 from rille.stages.hfvm.level import features
 from rille.stages.hfvm.level.features import distance
 from rille.stages.hfvm.level.subpixel import linear
 from rille.stages.imaging.pyramid import Pyramid, filled
-
-Floats = NDArray[np.float64]
 
 SUM_RADIUS = 3
 SIDE = 2 * SUM_RADIUS + 1
@@ -43,7 +42,7 @@ class PointMatches:
 
     points: Floats
     distance: Floats
-    ok: NDArray[np.bool_]
+    ok: Bools
 
 
 def match_points(
@@ -97,7 +96,7 @@ def find_points(
     return PointMatches(found, cost, ok)
 
 
-def _on_valid(valid: NDArray[np.uint8], points: Floats) -> NDArray[np.bool_]:
+def _on_valid(valid: Bytes, points: Floats) -> Bools:
     """Whether the nearest pixel of each point exists and is usable."""
     known = np.asarray(np.isfinite(points).all(axis=1))
     x, y = np.rint(np.where(known[:, None], points, 0.0)).astype(np.int64).T
@@ -107,8 +106,8 @@ def _on_valid(valid: NDArray[np.uint8], points: Floats) -> NDArray[np.bool_]:
 
 
 def _search(
-    a: NDArray[np.float32],
-    b: NDArray[np.float32],
+    a: Floats32,
+    b: Floats32,
     points: Floats,
     predicted: Floats,
     affinity: Floats,

@@ -11,9 +11,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from rille.stages.core.arrays import Bools, Floats, Floats32
 
 STEP_DEG = 15.0
 """Degrees between two copies: the rotation wanted is at most half of it from one of them, where windows still match."""
@@ -39,9 +38,7 @@ def similarity(degrees: float, scale: float, shape: tuple[int, int]) -> Floats:
     return np.array([[c, -s, x - c * x + s * y], [s, c, y - s * x - c * y], [0.0, 0.0, 1.0]])
 
 
-def fit(
-    column: NDArray[np.float32], row: NDArray[np.float32], matched: NDArray[np.bool_], level: int
-) -> tuple[float, float] | None:
+def fit(column: Floats32, row: Floats32, matched: Bools, level: int) -> tuple[float, float] | None:
     """Rotation, degrees, and scale that the displacements (row, col) of a coarse level share; None: too few.
 
     The median over lines between pairs of matches, half the image apart: outliers below a quarter of the matches, and

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from rille.stages.core.arrays import Bools, Floats, Floats32
 from rille.stages.core.declare import Array, Bundle, Inputs, Params, Stage
 from rille.stages.core.errors import InputError
 from rille.stages.imaging.pyramid import Pyramid
@@ -29,9 +30,6 @@ from rille.stages.odometry.affine_lk import HALF, Templates, align
 from rille.stages.odometry.affinity import NEIGHBOURS, fit_affinity, known_median
 from rille.stages.odometry.moravec import clear_of_mask, interest_points
 from rille.stages.odometry.point_search import match_points
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 BORDER = 8
 """Pixels between an interest point and the image's edge: template, cubic interpolation and a search step."""
@@ -76,8 +74,8 @@ class TrackParams(Params):
 class LevelDisplacements:
     """Coarse displacements (rows, cols) of a pyramid level, in level 0 pixels, NaN undefined."""
 
-    column: NDArray[np.float32]
-    row: NDArray[np.float32]
+    column: Floats32
+    row: Floats32
     level: int
 
 
@@ -85,9 +83,9 @@ class LevelDisplacements:
 class Tracks:
     """``points`` (n, frames, 2) column, row, NaN lost; ``birth`` (n,) frame index; ``distance`` (n, frames), NaN."""
 
-    points: NDArray[np.float32]
+    points: Floats32
     birth: NDArray[np.int16]
-    distance: NDArray[np.float32]
+    distance: Floats32
 
 
 def track(frames: Sequence[Pyramid], motions: Sequence[LevelDisplacements], params: TrackParams) -> Tracks:

@@ -9,15 +9,10 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-from numpy.typing import NDArray
-
+from rille.stages.core.arrays import Bools, Bytes
 from rille.stages.hazard.vehicle import Vehicle
 from rille.stages.numeric.extrema import octagon
 from rille.stages.numeric.packed import Canvas, codes
-
-Mask = NDArray[np.bool_]
-Bytes = NDArray[np.uint8]
 
 STRAIGHT, RIGHT, ACROSS, LEFT = 1, 2, 4, 8
 """Bits of the directions: along columns; to row 0 and greater columns; along rows; to row 0 and smaller columns."""
@@ -26,7 +21,7 @@ STEPS = ((STRAIGHT, -1, 0), (RIGHT, -1, 1), (ACROSS, 0, 1), (LEFT, -1, -1))
 """Bit, row and column of one step in each direction."""
 
 
-def widened(mask: Mask, half_length: float, half_width: float, step: tuple[int, int]) -> Mask:
+def widened(mask: Bools, half_length: float, half_width: float, step: tuple[int, int]) -> Bools:
     """Cells from which a rectangle that is aligned with ``step`` (row, col) and centred there touches the mask.
 
     What lies outside counts as in the mask.
@@ -61,7 +56,7 @@ def _widen(canvas: Canvas, half_length: float, half_width: float, step: tuple[in
         canvas.spread(1, 0, 1)
 
 
-def grown(mask: Mask, reach: float) -> Mask:
+def grown(mask: Bools, reach: float) -> Bools:
     """Cells within ``reach`` cells of the mask: an octagon, nowhere smaller than the circle."""
     canvas = Canvas.of(mask, math.ceil(reach - 1e-9))
     _grow(canvas, reach)
@@ -81,12 +76,12 @@ class FreePlaces:
 
     def __init__(
         self,
-        wheel_hazard: Mask,
-        body_hazard: Mask,
+        wheel_hazard: Bools,
+        body_hazard: Bools,
         vehicle: Vehicle,
         cell: float,
-        unknown: Mask | None = None,
-        closed: Mask | None = None,
+        unknown: Bools | None = None,
+        closed: Bools | None = None,
     ) -> None:
         """
         Parameters

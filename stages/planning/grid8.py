@@ -14,6 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from rille.stages.core.arrays import Bytes
 from rille.stages.numeric.heap import grown, pop, push
 from rille.stages.numeric.line import copy_line
 from rille.stages.planning.configuration_space import ACROSS, LEFT, RIGHT, STRAIGHT
@@ -21,7 +22,6 @@ from rille.stages.planning.row_graph import UNREACHED
 
 Ints = NDArray[np.int64]
 Whole = NDArray[np.integer[Any]]
-Bytes = NDArray[np.uint8]
 
 NEIGHBOURS = (
     (-1, 0, STRAIGHT), (1, 0, STRAIGHT), (0, -1, ACROSS), (0, 1, ACROSS),

@@ -14,6 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from rille.stages.core.arrays import Bools, Bytes, Floats, Floats32
 from rille.stages.core.errors import InputError
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.measures import BODY_BITS, WHEEL_BITS
@@ -23,9 +24,7 @@ from rille.stages.numeric.windows import window_mean
 from rille.stages.planning import grid8
 from rille.stages.planning.configuration_space import FreePlaces
 
-Floats = NDArray[np.float64]
 Ints = NDArray[np.integer[Any]]
-Bytes = NDArray[np.uint8]
 Maps = Mapping[str, NDArray[Any]]
 Point = tuple[float, float]
 
@@ -133,17 +132,17 @@ class _Sampled(NamedTuple):
 
     risk: Bytes
     reason: Ints
-    chance: NDArray[np.float32]
-    stand: NDArray[np.float32]
+    chance: Floats32
+    stand: Floats32
 
 
 class _Masks(NamedTuple):
     """Cells (row, col): unknown, not entered, hazardous to a wheel, hazardous to the vehicle as a whole."""
 
-    unknown: NDArray[np.bool_]
-    closed: NDArray[np.bool_]
-    wheels: NDArray[np.bool_]
-    body: NDArray[np.bool_]
+    unknown: Bools
+    closed: Bools
+    wheels: Bools
+    body: Bools
 
 
 class PathMaps:
@@ -210,7 +209,7 @@ class PathMaps:
         rows = [int((s[:, 1] - s[:, 0]).max(initial=0)) for s in spans]
         return tuple(name for name, n in zip(GROUNDS, rows, strict=True) if n >= MOST * max(rows))
 
-    def metres(self, cost: Ints, unreached: int, each: int = 1) -> NDArray[np.float32]:
+    def metres(self, cost: Ints, unreached: int, each: int = 1) -> Floats32:
         """A cost (row, col) of which ``each`` are a unit, rounded down to units, in metres; NaN where not reached."""
         out = np.empty(cost.shape, dtype=np.float32)
         _metres(cost, unreached, float(each), self.unit, out)

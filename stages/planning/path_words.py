@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rille.stages.core.arrays import Floats, Floats32
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.measures import MEASURES
 from rille.stages.hazard.risk import CAUTION, HAZARDOUS, UNKNOWN
@@ -16,7 +17,6 @@ from rille.stages.hazard.vehicle import Vehicle
 from rille.stages.planning.path_ground import GROUNDS, Maps, RowGrid
 from rille.stages.planning.row_graph import Plan
 
-Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 
@@ -37,7 +37,7 @@ class Route:
     grid: RowGrid
     planner: str
     ground: str
-    cost: NDArray[np.float32]
+    cost: Floats32
     span: tuple[int, int]
     doubt: float | None = None
 

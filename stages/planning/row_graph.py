@@ -18,11 +18,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from rille.stages.core.arrays import Bools, Bytes
 from rille.stages.planning.configuration_space import LEFT, RIGHT, STRAIGHT
 
 Ints = NDArray[np.integer[Any]]
-Mask = NDArray[np.bool_]
-Ways = NDArray[np.uint8]
+Ways = Bytes
 Cell = tuple[int, int]
 
 UNREACHED = np.iinfo(np.int64).max // 4
@@ -41,14 +41,14 @@ class Plan:
 
     cells: NDArray[np.int64]
     cost: NDArray[np.int64]
-    reachable: Mask
+    reachable: Bools
     target_row: int
     blocking_row: int | None = None
     reason: str = ""
 
 
 def sweep(
-    height: Ints, ways: Ways, sources: Mask, toll: Ints | None = None
+    height: Ints, ways: Ways, sources: Bools, toll: Ints | None = None
 ) -> tuple[NDArray[np.int64], NDArray[np.int8]]:
     """Least cost from any source to every cell of the row graph, towards row 0.
 
@@ -174,7 +174,7 @@ def _unpack(best, cost, move):  # type: ignore[no-untyped-def]
         move[c] = np.int8(best[c] & 3) if best[c] < far else np.int8(-1)
 
 
-def leading(ways: Ways, limit: int) -> Mask:
+def leading(ways: Ways, limit: int) -> Bools:
     """Free cells (row, col) from which a row up to ``limit`` can be reached."""
     out = np.empty(ways.shape, dtype=np.bool_)
     _leading(ways, limit, out)
@@ -261,7 +261,7 @@ def plan(
     return Plan(_trace(move, row, col), cost, cost[row] < UNREACHED, row)
 
 
-def row_span(free: Mask) -> tuple[int, int] | None:
+def row_span(free: Bools) -> tuple[int, int] | None:
     """The farthest and the nearest row with a free cell."""
     occupied = np.flatnonzero(free.any(axis=1))
     return (int(occupied[0]), int(occupied[-1])) if len(occupied) else None
@@ -271,7 +271,7 @@ def _blocked(at: Plan, row: int, reason: str) -> Plan:
     return replace(at, blocking_row=row, reason=reason)
 
 
-def nearest_middle(cells: Mask, row: int) -> tuple[int, int]:
+def nearest_middle(cells: Bools, row: int) -> tuple[int, int]:
     """The set cell with the fewest moves along rows and columns to the middle of a row; the first one among equals.
 
     At least one is set.

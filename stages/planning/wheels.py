@@ -18,10 +18,9 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from rille.stages.core.arrays import Floats
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.hazard.vehicle import Vehicle
-
-Floats = NDArray[np.float64]
 
 BELLY_POINTS = 9
 """Samples along either side of the belly."""

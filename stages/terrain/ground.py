@@ -14,12 +14,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.errors import DegenerateError
 from rille.stages.geometry.geometry import Rig
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -38,7 +36,7 @@ def fit_plane(
     rays: Floats,
     rho: Floats,
     sigma: Floats,
-    allowed: Callable[[Floats], NDArray[np.bool_]],
+    allowed: Callable[[Floats], Bools],
     relief: float,
     rng: np.random.Generator,
 ) -> GroundPlane:
@@ -105,7 +103,7 @@ def _consensus(
     rho: Floats,
     sigma: Floats,
     tolerance: Floats,
-    allowed: Callable[[Floats], NDArray[np.bool_]],
+    allowed: Callable[[Floats], Bools],
     rng: np.random.Generator,
 ) -> Floats | None:
     """The allowed plane of most agreement among planes through three points; None: none is allowed."""

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
+from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.declare import Bundle, Inputs, Params, Stage
 from rille.stages.core.errors import DegenerateError, InputError
 from rille.stages.core.validity import matched
@@ -28,7 +29,6 @@ from rille.stages.geometry.pose_arrays import NO_VERTICAL
 from rille.stages.geometry.triangulation import inverse_depth
 from rille.stages.terrain.ground import MIN_POINTS, GroundPlane, fit_plane, rounded_cell, view_ground
 
-Floats = NDArray[np.float64]
 Samples = tuple[Floats, Floats, Floats]
 """Rays (n, 3) with z = 1 of the left camera, inverse depths (n,) and their standard deviations, 1/m."""
 
@@ -96,7 +96,7 @@ class VerticalHint(NamedTuple):
 def level(
     column_disparity: ArrayLike,
     row_disparity: ArrayLike,
-    usable: NDArray[np.bool_],
+    usable: Bools,
     rig: Rig,
     params: LevelParams,
     vertical: VerticalHint | None = None,
@@ -193,9 +193,7 @@ def z_range(plane: list[float], relief: list[float], extent: list[float]) -> lis
     return [min(corners) + relief[0], max(corners) + relief[1]]
 
 
-def _samples(
-    column: NDArray[Any], row: NDArray[Any], usable: NDArray[np.bool_], rig: Rig, params: LevelParams
-) -> Samples:
+def _samples(column: NDArray[Any], row: NDArray[Any], usable: Bools, rig: Rig, params: LevelParams) -> Samples:
     """Rays, inverse depths and their errors at a regular sparse grid of usable pixels."""
     expected = (rig.left.height, rig.left.width)
     if column.shape != expected:
@@ -247,7 +245,7 @@ def _given_vertical(hint: VerticalHint) -> tuple[Floats | None, str]:
     return None, ""
 
 
-def _allowed(normals: Floats, vertical: Floats | None, params: LevelParams) -> NDArray[np.bool_]:
+def _allowed(normals: Floats, vertical: Floats | None, params: LevelParams) -> Bools:
     """Which normals may be the ground's: near the known vertical, else within the limits of roll and pitch."""
     tilt = math.radians(params.max_tilt_deg)
     if vertical is not None:

@@ -20,12 +20,11 @@ from numba import njit
 from numpy.typing import NDArray
 from pydantic import Field
 
+from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Bundle, Inputs, Params, Stage
 from rille.stages.core.errors import DegenerateError, InputError
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 from rille.stages.geometry.lattice import Lattice
-
-Floats = NDArray[np.float64]
 
 
 class GlobalFixParams(Params):

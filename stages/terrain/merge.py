@@ -33,6 +33,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from rille.stages.core.arrays import Bytes, Floats, Floats32
 from rille.stages.core.declare import Array, Bundle, Inputs, Memory, Params, Stage
 from rille.stages.core.errors import InputError
 from rille.stages.geometry.geometry import RigidTransform
@@ -40,9 +41,6 @@ from rille.stages.geometry.lattice import Lattice
 from rille.stages.numeric.holes import close_holes
 from rille.stages.terrain.merge_kernel import PLANES, CellMaps, Rule, Stack, merge_cells
 from rille.stages.terrain.radiometry import STEP
-
-Float32 = NDArray[np.float32]
-Floats = NDArray[np.float64]
 
 ALIKE = 0.8
 """Of the simulator's models at their true poses: then 70 % of the merged errors are below one standard deviation."""
@@ -121,7 +119,7 @@ class Placed:
 EXACT = Placed(np.zeros(2), np.zeros((3, 3)))
 
 
-def footprint(elevation: Float32, x: Floats, y: Floats, centre: Floats, angle: float) -> Floats:
+def footprint(elevation: Floats32, x: Floats, y: Floats, centre: Floats, angle: float) -> Floats:
     """Ground (row, col) that a pixel covers along the range, m; infinite above the camera, NaN where nothing is known.
 
     A pixel of ``angle`` (rad) at distance r covers ``r angle`` across the ray, and by r / h more on level ground that
@@ -149,16 +147,16 @@ class Layer:
 
     pair: int
     lattice: Lattice
-    elevation: Float32
-    elevation_std: Float32
-    residual: Float32
-    ortho: Float32
+    elevation: Floats32
+    elevation_std: Floats32
+    residual: Floats32
+    ortho: Floats32
     gain: float = 1.0
     pose: Placed = EXACT
 
-    def part(self, name: str, window: tuple[slice, slice]) -> Float32:
+    def part(self, name: str, window: tuple[slice, slice]) -> Floats32:
         """Part of an array."""
-        found: Float32 = getattr(self, name)[window]
+        found: Floats32 = getattr(self, name)[window]
         return found
 
 
@@ -183,14 +181,14 @@ class Merged:
     -1).
     """
 
-    elevation: Float32
-    elevation_std: Float32
-    spread: Float32
+    elevation: Floats32
+    elevation_std: Floats32
+    spread: Floats32
     count: NDArray[np.uint16]
     source: NDArray[np.int16]
-    ortho: Float32
-    filled: NDArray[np.uint8]
-    relief_std: Float32
+    ortho: Floats32
+    filled: Bytes
+    relief_std: Floats32
 
 
 def merge(layers: Sequence[Layer | _Stored], tile: Lattice, params: MergeParams) -> Merged:
@@ -248,7 +246,7 @@ def _merge_strip(
     out.source[rows] = pairs[best]
 
 
-def _stacked(layers: Sequence[Layer | _Stored], strip: Lattice, name: str) -> Float32:
+def _stacked(layers: Sequence[Layer | _Stored], strip: Lattice, name: str) -> Floats32:
     out = np.full((len(layers), *strip.shape), np.nan, dtype=np.float32)
     for target, layer in zip(out, layers, strict=True):
         common = strip.intersection(layer.lattice)

@@ -13,10 +13,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from rille.stages.core.arrays import Floats, Floats32
 from rille.stages.numeric.robust import MAD_TO_SIGMA, TUKEY_BISQUARE, bisquare
-
-Float32 = NDArray[np.float32]
-Floats = NDArray[np.float64]
 
 PLANES = 5
 """Maps that :func:`merge_cells` fills."""
@@ -29,10 +27,10 @@ class Stack(NamedTuple):
     covariance of its height and its rotations about x and y.
     """
 
-    z: Float32
-    sigma: Float32
-    residual: Float32
-    ortho: Float32
+    z: Floats32
+    sigma: Floats32
+    residual: Floats32
+    ortho: Floats32
     gain: Floats
     centre: Floats
     pose: Floats
@@ -53,7 +51,7 @@ class CellMaps(NamedTuple):
     deviation of unrelated errors alone; ``used``: number of models that count; ``best`` index of the one of greatest
     weight, -1 none."""
 
-    maps: Float32
+    maps: Floats32
     used: NDArray[np.integer[Any]]
     best: NDArray[np.int64]
 

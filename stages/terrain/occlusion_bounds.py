@@ -19,16 +19,13 @@ from typing import Any
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 from pydantic import Field
 
+from rille.stages.core.arrays import Floats, Floats32
 from rille.stages.core.declare import Array, Bundle, Inputs, Params, Stage
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.terrain.merge import footprint
-
-Floats = NDArray[np.float64]
-Floats32 = NDArray[np.float32]
 
 STEP = 0.5
 """Cells from point to point of a line of sight."""

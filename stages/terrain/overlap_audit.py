@@ -20,9 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.declare import Bundle, Inputs, Params, Stage
 
-Floats = NDArray[np.float64]
 Facts = Mapping[str, Any]
 
 MEDIAN, STANDS_OUT = 2.366, 21.11
@@ -131,7 +131,7 @@ def audit(seams: Sequence[Facts], centres: Mapping[int, Sequence[float]]) -> tup
     return _factor(sizes, np.zeros(len(every), bool)), listed
 
 
-def _factor(sizes: Floats, without: NDArray[np.bool_]) -> float:
+def _factor(sizes: Floats, without: Bools) -> float:
     """How much more than noise seams differ: the median of those that some models have no part in, if there are any."""
     others = sizes[~without]
     chosen = others if len(others) >= LEAST_OTHERS else sizes

@@ -15,11 +15,9 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rille.stages.core.arrays import Bools, Floats
 from rille.stages.numeric.robust import TUKEY_BISQUARE, bisquare, mad_sigma
-
-Floats = NDArray[np.float64]
 
 BLOCKS = 400
 """Blocks of an overlap, about: enough that their scatter tells the plane's error to a twentieth."""
@@ -105,7 +103,7 @@ def _fit(difference: Floats, x: Floats, y: Floats, side: int, cells: int, least:
     return SeamFit(centre, plane, covariance, 0.0, scale, 0.0, cells), _alike(residual, there, scale)
 
 
-def _alike(residual: Floats, there: NDArray[np.bool_], scale: float) -> float:
+def _alike(residual: Floats, there: Bools, scale: float) -> float:
     """Correlation of neighbouring blocks' residuals, gross ones cut off."""
     if scale <= 0:
         return 0.0

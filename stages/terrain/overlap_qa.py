@@ -13,13 +13,11 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rille.stages.core.arrays import Bools, Floats, Floats32
 from rille.stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.terrain.overlap_fit import LEAST_CELLS, fit_seam
-
-Float32 = NDArray[np.float32]
 
 MAP_CELLS = 160
 """Longest side of a stored map of differences; cells of larger ones are averaged."""
@@ -27,7 +25,7 @@ GREY = (8.0, 247.0)
 """Grey values that tell an exposure: darker ones are noise, brighter ones saturated."""
 
 
-def seam(dem: Bundle, other: Bundle) -> tuple[dict[str, Any], Float32] | None:
+def seam(dem: Bundle, other: Bundle) -> tuple[dict[str, Any], Floats32] | None:
     """Facts of one seam, elevation of ``dem`` minus that of ``other``, and the (coarse) map of the difference.
 
     None where both share too little ground.
@@ -38,7 +36,7 @@ def seam(dem: Bundle, other: Bundle) -> tuple[dict[str, Any], Float32] | None:
         return None
     windows = [lattice.window(common) for lattice in lattices]
 
-    def both(name: str) -> list[NDArray[np.float64]]:
+    def both(name: str) -> list[Floats]:
         return [np.asarray(b.part(name, w), np.float64) for b, w in zip((dem, other), windows, strict=True)]
 
     z = both("elevation")
@@ -69,7 +67,7 @@ def seam(dem: Bundle, other: Bundle) -> tuple[dict[str, Any], Float32] | None:
     return facts, map_
 
 
-def _log_ratio(grey: NDArray[np.float64], other: NDArray[np.float64], seen: NDArray[np.bool_]) -> float | None:
+def _log_ratio(grey: Floats, other: Floats, seen: Bools) -> float | None:
     """Median logarithm of the factor between the grey values; None where too few tell."""
     with np.errstate(invalid="ignore"):
         good = seen & (grey > GREY[0]) & (grey < GREY[1]) & (other > GREY[0]) & (other < GREY[1])
@@ -78,7 +76,7 @@ def _log_ratio(grey: NDArray[np.float64], other: NDArray[np.float64], seen: NDAr
     return float(np.median(np.log(grey[good] / other[good])))
 
 
-def _coarse(difference: NDArray[np.float64]) -> tuple[Float32, int]:
+def _coarse(difference: Floats) -> tuple[Floats32, int]:
     """Means of square blocks, so that no side is above :data:`MAP_CELLS`; and the side of a block."""
     step = max(1, math.ceil(max(difference.shape) / MAP_CELLS))
     rows, cols = (-(-n // step) for n in difference.shape)

@@ -10,11 +10,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from rille.stages.core.arrays import Bytes, Floats, Floats32
 from rille.stages.core.errors import InputError
-
-Floats = NDArray[np.float64]
 
 LEAST = 6  # of nine cells: the plane has three unknowns, and twice as many do not lie on two lines only
 WEIGHT = (1.0, 2.0, 1.0)
@@ -65,15 +64,13 @@ def gradient(elevation: ArrayLike, cell: float) -> Floats:
     return np.where(good, slopes, np.nan)
 
 
-def slope_deg(elevation: ArrayLike, cell: float) -> NDArray[np.float32]:
+def slope_deg(elevation: ArrayLike, cell: float) -> Floats32:
     """Inclination (rows, cols) of the terrain, degrees; NaN unknown."""
     gx, gy = gradient(elevation, cell)
     return np.asarray(np.degrees(np.arctan(np.hypot(gx, gy))), np.float32)
 
 
-def hillshade(
-    elevation: ArrayLike, cell: float, *, azimuth_deg: float = 315.0, altitude_deg: float = 45.0
-) -> NDArray[np.uint8]:
+def hillshade(elevation: ArrayLike, cell: float, *, azimuth_deg: float = 315.0, altitude_deg: float = 45.0) -> Bytes:
     """Shaded relief (rows, cols), 1 (facing away) to 255 (facing the light), 0 unknown: GDAL's form.
 
     Parameters

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rille.stages.core.arrays import Bools
 from rille.stages.core.declare import Bundle, Inputs, NoParams, Stage
 from rille.stages.geometry.lattice import Lattice
 
@@ -21,7 +22,7 @@ Box = tuple[int, int, int, int]
 """First column, first line, columns and lines, cells of the infinite lattice (lines count downwards)."""
 
 
-def footprint(defined: NDArray[np.bool_], lattice: Lattice, side: int, margin: int = 0) -> dict[Tile, Box]:
+def footprint(defined: Bools, lattice: Lattice, side: int, margin: int = 0) -> dict[Tile, Box]:
     """Tiles that have a defined cell, and the box of the defined cells in each.
 
     Parameters

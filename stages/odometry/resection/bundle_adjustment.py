@@ -18,17 +18,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 from pydantic import Field
 
+from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.declare import Params
 from rille.stages.geometry.geometry import Camera, rotation_exp
 from rille.stages.geometry.projection import NEAREST, Pinhole, linearise, project, rotated, to_camera
 from rille.stages.numeric.robust import huber_cost, huber_weight
 from rille.stages.odometry.resection.pnp import HUBER
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 FIRST_DAMPING, MOST_DAMPING = 1e-4, 1e8
 

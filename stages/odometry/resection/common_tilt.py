@@ -14,13 +14,11 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Bundle, Inputs, NoParams, Stage
 from rille.stages.geometry.geometry import Rig
 from rille.stages.numeric.robust import huber_weight, mad_sigma
-
-Floats = NDArray[np.float64]
 
 
 def common_tilt(parts: Floats, prior_sigma: float) -> tuple[float, float]:

@@ -14,12 +14,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from rille.stages.core.arrays import Bools, Bytes, Floats, Floats32
 from rille.stages.geometry.geometry import Rig, RigidTransform
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.odometry.affinity import solve_3
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 MATCHED = np.uint8(1)
 """Bit of stages.core.validity: found by matching and consistent, not filled."""
@@ -54,7 +52,7 @@ class Landmarks:
 
 def landmarks_from_disparity(
     points: Floats,
-    maps: tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]],
+    maps: tuple[Floats32, Floats32, Bytes],
     rig: Rig,
     T_local_left: RigidTransform,
     disparity_sigma: Floats,
@@ -85,9 +83,7 @@ def _known(points: Floats) -> Bools:
     return np.asarray(np.isfinite(points).all(axis=1))
 
 
-def matches_at(
-    points: Floats, column: NDArray[np.float32], row: NDArray[np.float32], validity: NDArray[np.uint8]
-) -> tuple[Floats, Bools]:
+def matches_at(points: Floats, column: Floats32, row: Floats32, validity: Bytes) -> tuple[Floats, Bools]:
     """Disparity vectors (n, 2) by bilinear interpolation, and whether the four neighbours are matched and agree."""
     rows, cols = column.shape
     known = _known(points)
@@ -113,9 +109,7 @@ def matches_at(
     return value, ok & (apart <= CONSISTENT).all(1)
 
 
-def relief(
-    points: Floats, column: NDArray[np.float32], row: NDArray[np.float32], validity: NDArray[np.uint8]
-) -> Floats:
+def relief(points: Floats, column: Floats32, row: Floats32, validity: Bytes) -> Floats:
     """How far the surface under a template departs from a plane: rms (n,) of the disparities about theirs, pixels.
 
     A template on a rock's edge follows the rock or the ground, not the pixel at its centre; both the stereo match and
@@ -234,7 +228,7 @@ def _landmarks(
 
 def landmarks_from_dem(
     points: Floats,
-    elevation: NDArray[np.float32],
+    elevation: Floats32,
     lattice: Lattice,
     rig: Rig,
     T_local_left: RigidTransform,
@@ -254,7 +248,7 @@ def landmarks_from_dem(
     return _landmarks(rays, depth, rig, T_local_left, disparity_sigma, max_depth_ratio, lost)
 
 
-def intersect(elevation: NDArray[np.float32], lattice: Lattice, origin: Floats, directions: Floats) -> Floats:
+def intersect(elevation: Floats32, lattice: Lattice, origin: Floats, directions: Floats) -> Floats:
     """Where rays first come down on a surface of bilinear cells, in units of their directions; NaN where they do not.
 
     Starts above the highest cell, goes half a cell at a time and refines by bisection. A hole forgets what was
@@ -286,7 +280,7 @@ def intersect(elevation: NDArray[np.float32], lattice: Lattice, origin: Floats, 
 
 
 def _span(
-    elevation: NDArray[np.float32], lattice: Lattice, origin: Floats, direction: Floats
+    elevation: Floats32, lattice: Lattice, origin: Floats, direction: Floats
 ) -> tuple[float, float, float] | None:
     """First and last parameter of the ray inside the model's box, and the step of half a cell; None: it misses."""
     low, high = float(np.nanmin(elevation)), float(np.nanmax(elevation))
@@ -305,7 +299,7 @@ def _span(
     return (first, last, step) if first < last < np.inf else None
 
 
-def _height(elevation: NDArray[np.float32], lattice: Lattice, origin: Floats, direction: Floats, s: Floats) -> Floats:
+def _height(elevation: Floats32, lattice: Lattice, origin: Floats, direction: Floats, s: Floats) -> Floats:
     """Height of the ray above the bilinear surface at parameters s (k,), m; NaN over holes."""
     p = origin + s[:, None] * direction
     index = lattice.index(p[:, :2])
@@ -319,7 +313,7 @@ def _height(elevation: NDArray[np.float32], lattice: Lattice, origin: Floats, di
 
 
 def _bisect(
-    elevation: NDArray[np.float32], lattice: Lattice, origin: Floats, direction: Floats, above: float, below: float
+    elevation: Floats32, lattice: Lattice, origin: Floats, direction: Floats, above: float, below: float
 ) -> float:
     for _ in range(30):
         middle = 0.5 * (above + below)

@@ -25,12 +25,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from rille.stages.core.arrays import Bools, Floats
 from rille.stages.geometry.geometry import Camera, RigidTransform, cross_matrix, rotation_exp
 from rille.stages.geometry.projection import NEAREST, Pinhole, linearise, project, rotated, to_camera
 from rille.stages.numeric.robust import huber_cost, huber_weight
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 UNKNOWNS = 7
 """Translation, rotation, and the error that all disparities share."""

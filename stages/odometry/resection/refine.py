@@ -22,8 +22,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Bundle, Inputs, Stage
 from rille.stages.core.errors import ConfigError
 from rille.stages.geometry.geometry import Rig, RigidTransform
@@ -42,9 +42,6 @@ from rille.stages.odometry.resection.bundle_adjustment import (
 from rille.stages.odometry.resection.landmarks import Landmarks
 from rille.stages.odometry.resection.pnp import HUBER, Observations, Poses, back_projection, norms
 from rille.stages.odometry.resection.resect import SOURCES, ResectParams, coordinates, root, scatter_of_blocks
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 Segment = tuple[SegmentTracks, SegmentState, list[int]]
 """Measurements of a segment, where its adjustment starts, and which of its frames have a pose."""

@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 from scipy.special import bdtrc
 
+from rille.stages.core.arrays import Bools, Bytes, Floats, Floats32
 from rille.stages.core.declare import AnyArray, Array, Bundle, Inputs, Params, Stage
 from rille.stages.core.errors import DegenerateError, InputError
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
@@ -46,9 +47,6 @@ from rille.stages.odometry.resection.pnp import (
     normal_matrix,
     norms,
 )
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 MINIMUM = 6
 """Fewest landmarks of a pose: twelve equations for six unknowns, so that one wrong landmark shows."""
@@ -418,13 +416,13 @@ class SegmentPoses:
     poses: Floats
     covariance: Floats
     shared: Floats
-    inlier: NDArray[np.uint8]
-    residual: NDArray[np.float32]
+    inlier: Bytes
+    residual: Floats32
     facts: list[dict[str, Any]]
 
 
 def resect_segment(
-    points: NDArray[np.float32],
+    points: Floats32,
     landmarks: Landmarks,
     camera: Camera,
     T_local_key: RigidTransform,
@@ -487,7 +485,7 @@ def _reckoned(
 
 def _resect_one(
     landmarks: Landmarks,
-    points: NDArray[np.float32],
+    points: Floats32,
     use: NDArray[np.intp],
     camera: Camera,
     starts: Sequence[RigidTransform],
@@ -548,7 +546,7 @@ def _run(params: ResectParams, args: Mapping[str, Any], inputs: Inputs) -> Bundl
     return Bundle(arrays, meta)
 
 
-def moving_tracks(points: NDArray[np.float32], landmarks: Landmarks, found: SegmentPoses) -> tuple[int, int]:
+def moving_tracks(points: Floats32, landmarks: Landmarks, found: SegmentPoses) -> tuple[int, int]:
     """How many landmarks were found in two posed frames or more, and how many of them agree with no pose.
 
     What is followed well from frame to frame and never agrees does not stand on the ground: the vehicle's own shadow,

@@ -18,6 +18,7 @@ import scipy
 from numba import njit
 from numpy.typing import NDArray
 
+from rille.stages.core.arrays import Bools, Bytes, Floats, Floats32
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.measures import BODY_BITS, WHEEL_BITS
 from rille.stages.hazard.risk import CAUTION, DOUBT_BIT, HAZARDOUS, UNKNOWN
@@ -25,10 +26,6 @@ from rille.stages.hazard.vehicle import Vehicle
 from rille.stages.planning.local_planner.underbody import Straddle, clears, stands
 from rille.stages.planning.wheels import wheel_positions
 from rille.stages.terrain.occlusion_bounds import Bounds
-
-Floats = NDArray[np.float64]
-Floats32 = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 
 NEAR_UNKNOWN = 0.5
 """Cells; nearer than this a point of the belly lies in an unknown cell."""
@@ -61,9 +58,9 @@ class Hazards(NamedTuple):
     """Maps (row, col) of :mod:`rille.stages.hazard.risk`: classes; reason bits, without which every hazard is one to a
     wheel; probabilities of a hazard, without which each is certain."""
 
-    risk: NDArray[np.uint8]
+    risk: Bytes
     reason: NDArray[np.uint16] | None = None
-    p_hazard: NDArray[np.float32] | None = None
+    p_hazard: Floats32 | None = None
 
 
 class KnownGround(NamedTuple):
@@ -71,9 +68,9 @@ class KnownGround(NamedTuple):
     ``glanced``, where of it something is known nevertheless; ``doubted`` ground, which costs as much as a hazard by
     sigma alone that is driven on."""
 
-    unknown: Mask | None = None
-    glanced: Mask | None = None
-    doubted: Mask | None = None
+    unknown: Bools | None = None
+    glanced: Bools | None = None
+    doubted: Bools | None = None
 
 
 class _Ground(NamedTuple):
@@ -82,7 +79,7 @@ class _Ground(NamedTuple):
     fields: Floats32
     unknown: Floats32
     frontier: Floats32
-    dear: NDArray[np.uint8]
+    dear: Bytes
     straddle: Straddle
 
 
@@ -102,9 +99,9 @@ class Footing:
     fields: Floats32
     unknown: Floats32
     frontier: Floats32
-    dear: NDArray[np.uint8]
+    dear: Bytes
     straddle: Straddle
-    glanced: Mask | None = None
+    glanced: Bools | None = None
 
     @staticmethod
     def of(
@@ -163,7 +160,7 @@ class Footing:
         out[3:5] -= NEAR_UNKNOWN * cell
         return Gaps(*(a.reshape(np.shape(x)) for a in out))
 
-    def beneath(self, mask: Mask, stand: tuple[float, float, float]) -> Floats:
+    def beneath(self, mask: Bools, stand: tuple[float, float, float]) -> Floats:
         """Middles (n, 2), m, of the cells of a mask (row, col) that a vehicle at x, y (m), heading (rad) has under its
         belly, or within its margin of the middles of its wheels: all that come too near to it, for it rounds to cells,
         and what is a cell farther."""
@@ -184,12 +181,12 @@ class Footing:
         return np.asarray(at[under])
 
 
-def _distance(mask: Mask, cell: float) -> Floats32:
+def _distance(mask: Bools, cell: float) -> Floats32:
     far = scipy.ndimage.distance_transform_edt(~mask) * cell if mask.any() else np.full(mask.shape, np.inf)
     return np.asarray(far, dtype=np.float32)
 
 
-def _opened(mask: Mask, radius: float, cell: float) -> Mask:
+def _opened(mask: Bools, radius: float, cell: float) -> Bools:
     """What of a mask circles of this radius, m, cover that lie within it."""
     # Morphological opening by distances: an erosion and a dilation by a circle, whatever its radius in cells.
     inner = _distance(~mask, cell) - 0.5 * cell  # to the edge of the nearest cell without

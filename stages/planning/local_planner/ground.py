@@ -13,13 +13,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from rille.stages.core.arrays import Bools, Floats, Floats32
 from rille.stages.planning.local_planner.clearance import Footing, Gaps
 from rille.stages.planning.local_planner.params import LegParams
 from rille.stages.planning.local_planner.route import STEP_TURN, Piece, pieces, turnable
 from rille.stages.planning.local_planner.state_lattice import PoseGraph, PoseGrid
 
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 Point = tuple[float, float]
 
 ASIDE = tuple(math.radians(d) for d in (3.0, -3.0, 6.0, -6.0, 9.0, -9.0))
@@ -65,7 +64,7 @@ class Ground:
         self.grid = PoseGrid.over(footing.lattice, start, heading + aside, spacing)
         self.graph = PoseGraph.of(footing, self.grid, self._price)
 
-    def _split(self, gaps: Gaps, x: Floats, y: Floats, slack: float = 0.0) -> tuple[Mask, Mask]:
+    def _split(self, gaps: Gaps, x: Floats, y: Floats, slack: float = 0.0) -> tuple[Bools, Bools]:
         """Poses that may be driven, and those that may be planned over; the margin may lack ``slack`` m.
 
         Of what is hazardous by sigma alone no margin is kept: sigma is the room for error there.
@@ -80,7 +79,7 @@ class Ground:
             opened &= known | (np.hypot(x - cx, y - cy) > self.p.vain * self.vehicle.wheel_base)
         return known, opened | known
 
-    def _near(self, x: Floats, y: Floats) -> Mask:
+    def _near(self, x: Floats, y: Floats) -> Bools:
         """Where it stands: ground there that is no worse than that under it will do."""
         return np.asarray(self._away(x, y) <= HERE)
 
@@ -88,10 +87,10 @@ class Ground:
         """Wheel bases from where it stands."""
         return np.asarray(np.hypot(x - self.start[0], y - self.start[1]) / self.vehicle.wheel_base)
 
-    def _seen(self, gaps: Gaps, near: Mask) -> Mask:
+    def _seen(self, gaps: Gaps, near: Bools) -> Bools:
         return np.asarray(gaps.unknown > np.where(near, self.unknown_here, 0.0))
 
-    def _price(self, gaps: Gaps, x: Floats, y: Floats, slack: float = 0.0) -> tuple[Mask, Floats]:
+    def _price(self, gaps: Gaps, x: Floats, y: Floats, slack: float = 0.0) -> tuple[Bools, Floats]:
         """Poses that may be driven, and the price of a metre, infinite where none may be planned."""
         known, opened = self._split(gaps, x, y, slack)
         away = self._away(x, y)
@@ -116,7 +115,7 @@ class Ground:
             price = price + self.p.near_price * np.clip(1.0 - beside, 0.0, 1.0)
         return known, np.where(opened, price, np.inf)
 
-    def _at(self, mask: Mask, x: Floats, y: Floats) -> Mask:
+    def _at(self, mask: Bools, x: Floats, y: Floats) -> Bools:
         """Values of a mask on the map at points; true outside."""
         at = np.rint(self.footing.lattice.index(np.stack([x, y], axis=-1))).astype(np.int64)
         inside = ((at >= 0) & (at < mask.shape)).all(axis=-1)
@@ -132,7 +131,7 @@ class Ground:
         gaps = self.footing.gaps(x, y, heading)
         return bool((self._split(gaps, x, y)[0] & (gaps.doubted == 0)).all())
 
-    def free(self, x: Floats, y: Floats, heading: Floats) -> Mask:
+    def free(self, x: Floats, y: Floats, heading: Floats) -> Bools:
         """Which of these poses may be driven."""
         return self._split(self.footing.gaps(x, y, heading), x, y)[0]
 
@@ -141,10 +140,10 @@ class Ground:
         row, col = np.meshgrid(*(np.arange(n, dtype=np.float64) for n in self.grid.shape), indexing="ij")
         return self.grid.xy(row, col)
 
-    def search(self, goal: Point, reach: float, *, whole: bool = False) -> tuple[Mask, Floats, NDArray[np.int8]]:
+    def search(self, goal: Point, reach: float, *, whole: bool = False) -> tuple[Bools, Floats, NDArray[np.int8]]:
         """Goals (row, col) within ``reach`` metres, cost and move (heading, row, col)."""
         x, y = self.places()
-        goals: Mask = np.asarray(np.hypot(x - goal[0], y - goal[1]) <= reach)
+        goals: Bools = np.asarray(np.hypot(x - goal[0], y - goal[1]) <= reach)
         turn = self.p.turn_price * self.vehicle.wheel_base
         return goals, *self.graph.search(goals, turn, self.p.back_price, whole=whole)
 
@@ -154,7 +153,7 @@ class Ground:
             if turnable(self.start, self.heading, self.heading + aside, self.clear):
                 yield Ground(self.footing, self.start, self.heading, self.p, self.closed, aside)
 
-    def opens(self, goals: Mask) -> bool:
+    def opens(self, goals: Bools) -> bool:
         """Whether the vehicle may be at one of these places (row, col)."""
         return bool(np.isfinite(self.graph.pose[:, goals]).any())
 
@@ -213,7 +212,7 @@ class Ground:
                 return points, unseen
         return np.array([stand[:2]]), False
 
-    def on_map(self, cost: Floats) -> NDArray[np.float32]:
+    def on_map(self, cost: Floats) -> Floats32:
         """Cost at the best heading on the cells of the map, NaN where it is not known."""
         best = cost.min(axis=0)
         xy = self.footing.lattice.xy()

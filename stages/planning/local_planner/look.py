@@ -16,14 +16,12 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rille.stages.core.arrays import Bools, Floats
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 from rille.stages.planning.local_planner.ground import Ground
 from rille.stages.planning.local_planner.route import Piece, length_of, room_to_turn
 
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 Point = tuple[float, float]
 Stand = tuple[float, float, float]
 """x, y (m) of the middle of a vehicle and its heading (rad to the left of y)."""
@@ -61,7 +59,7 @@ class FieldOfView:
         right = T_vehicle_left @ rig.T_right_left.inverse()
         return FieldOfView(np.concatenate([_edges(rig.left, T_vehicle_left), _edges(rig.right, right)]))
 
-    def sees(self, points: Floats, stand: Stand) -> Mask:
+    def sees(self, points: Floats, stand: Stand) -> Bools:
         """Which points (n, 2), m, lie in view from a place."""
         x, y, heading = stand
         c, s = math.cos(heading), math.sin(heading)

@@ -26,6 +26,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from rille.stages.core.arrays import Bools, Floats, Floats32
 from rille.stages.core.errors import InputError
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.planning.local_planner.clearance import Footing
@@ -44,8 +45,6 @@ from rille.stages.planning.local_planner.route import (
     within_turn,
 )
 
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 Point = tuple[float, float]
 Before = tuple[Floats, NDArray[np.int8]]
 """What is left of a way: vertices (vertex, 2), m, and how it is driven (piece,), 1 ahead, -1 back."""
@@ -75,7 +74,7 @@ class Leg:
     way: Floats
     rest: Floats
     rest_gear: NDArray[np.int8]
-    cost: NDArray[np.float32]
+    cost: Floats32
     where: Point | None = None
 
 
@@ -158,7 +157,7 @@ def _onwards(
     ground: Ground,
     way: Sequence[Piece],
     plan: Sequence[Piece],
-    shown: NDArray[np.float32],
+    shown: Floats32,
     target: Target | None,
     looks: int,
 ) -> Leg | None:
@@ -189,7 +188,7 @@ def _onwards(
     return Leg("drive", "", *_line(leg, start), turn, vertices(way, start), *_line(rest, end.b), shown)
 
 
-def _look(target: Target, way: Sequence[Piece], plan: Sequence[Piece], shown: NDArray[np.float32], looks: int) -> Leg:
+def _look(target: Target, way: Sequence[Piece], plan: Sequence[Piece], shown: Floats32, looks: int) -> Leg:
     """A look at where a way is not known, or that looks did not help."""
     ground = target.ground
     p, start, heading = ground.p, ground.start, ground.heading
@@ -230,7 +229,7 @@ def _stay(
     reason: str,
     start: Point,
     way: Sequence[Piece],
-    cost: NDArray[np.float32],
+    cost: Floats32,
     turn: float = 0.0,
     where: Point | None = None,
 ) -> Leg:
@@ -278,7 +277,7 @@ def _check(lattice: Lattice, name: str, point: Point) -> None:
         )
 
 
-def _why_closed(ground: Ground, goals: Mask, cost: Floats) -> str:
+def _why_closed(ground: Ground, goals: Bools, cost: Floats) -> str:
     if not ground.opens(goals):
         return "the goal itself is on hazardous ground, or too near to it"
     row, col = np.nonzero(np.isfinite(cost).any(axis=0))

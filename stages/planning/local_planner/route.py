@@ -10,9 +10,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from rille.stages.core.arrays import Floats
 from rille.stages.planning.local_planner.state_lattice import AHEAD, BACK, PoseGraph, angle_of
 
-Floats = NDArray[np.float64]
 Clear = Callable[[Floats, Floats, Floats], bool]
 """Whether the vehicle may be at all of the poses x, y (m), heading (rad)."""
 

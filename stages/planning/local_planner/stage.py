@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Array, Bundle, Inputs, Stage
 from rille.stages.geometry.geometry import Rig, RigidTransform
 from rille.stages.geometry.lattice import Lattice
@@ -128,7 +129,7 @@ def seen_so_far(near: Bundle, far: Bundle | None, p: LegParams) -> tuple[Hazards
     return Hazards(*maps), KnownGround(unknown, glanced, maps[2] >= p.avoid)
 
 
-def _length(path: NDArray[np.float64]) -> float:
+def _length(path: Floats) -> float:
     return float(np.hypot(*np.diff(path, axis=0).T).sum()) if len(path) > 1 else 0.0
 
 

@@ -18,14 +18,12 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from rille.stages.core.arrays import Bools, Floats
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.numeric.heap import grown, pop, push
 from rille.stages.planning.local_planner.clearance import Footing, Gaps
 
-Floats = NDArray[np.float64]
-Floats32 = NDArray[np.float32]
-Mask = NDArray[np.bool_]
-Prices = Callable[[Gaps, Floats, Floats], tuple[Mask, Floats]]
+Prices = Callable[[Gaps, Floats, Floats], tuple[Bools, Floats]]
 """Of poses by their gaps, x and y (m): whether they may be driven on what is known, and the price of a metre."""
 
 HALF = 8
@@ -80,7 +78,7 @@ class PoseGraph:
     pose: Floats
     step: Floats
     turn: Floats
-    known: tuple[Mask, Mask, Mask]
+    known: tuple[Bools, Bools, Bools]
 
     @staticmethod
     def of(footing: Footing, grid: PoseGrid, prices: Prices) -> PoseGraph:
@@ -100,7 +98,7 @@ class PoseGraph:
         return PoseGraph(grid, price[0], price[1], price[2], (known[0], known[1], known[2]))
 
     def search(
-        self, goals: NDArray[np.bool_], turn_price: float, back: float, *, whole: bool = False
+        self, goals: Bools, turn_price: float, back: float, *, whole: bool = False
     ) -> tuple[Floats, NDArray[np.int8]]:
         """Least cost of the poses (16, row, col) to a goal, and the move towards it, -1 none.
 

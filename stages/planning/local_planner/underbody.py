@@ -17,15 +17,12 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from rille.stages.core.arrays import Floats, Floats32
 from rille.stages.hazard.vehicle import Vehicle
 from rille.stages.numeric.extrema import running_max
 from rille.stages.planning.wheels import wheel_positions
 from rille.stages.terrain.occlusion_bounds import Bounds
-
-Floats = NDArray[np.float64]
-Floats32 = NDArray[np.float32]
 
 
 class Straddle(NamedTuple):

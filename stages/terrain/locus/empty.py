@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.errors import DegenerateError
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 from rille.stages.geometry.surface import Surface
@@ -18,7 +18,7 @@ FEW = 400
 
 
 def explain(
-    rig: Rig, T_surface_left: RigidTransform, surface: Surface, z_range: tuple[float, float], usable: NDArray[np.bool_]
+    rig: Rig, T_surface_left: RigidTransform, surface: Surface, z_range: tuple[float, float], usable: Bools
 ) -> DegenerateError:
     """The error to raise for an elevation model without any cell.
 
@@ -70,7 +70,7 @@ def explain(
     )
 
 
-def _inside(camera: Camera, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _inside(camera: Camera, points: Floats) -> Bools:
     """Which points (..., 3) of a camera's frame lie in its image."""
     pixels = camera.project(points)
     with np.errstate(invalid="ignore"):

@@ -24,6 +24,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from rille.stages.core.arrays import Floats
 from rille.stages.terrain.locus.lines import (
     BOTTOM,
     COUNT,
@@ -54,8 +55,6 @@ from rille.stages.terrain.locus.points import (
 )
 from rille.stages.terrain.locus.roots import PLANES as ROOT_PLANES
 from rille.stages.terrain.locus.roots import accept, gather, roots, slopes
-
-Floats = NDArray[np.float64]
 
 WAY, PLACE, LEVEL, FIRST = (k * LANES for k in range(LINE_PLANES, LINE_PLANES + 4))
 """Planes of the search: -1 downwards, 1 upwards, 0 not begun; the step looked at last, and s there; s at the start."""

@@ -12,7 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
+
+from rille.stages.core.arrays import Floats, Floats32
 
 NEAR = 1e-9  # least projective depth (metres): excludes the camera's own plane
 
@@ -64,10 +65,10 @@ class Observed(NamedTuple):
     ``limits`` (2,) greatest residual and greatest jump in the bilinear cell, pixels.
     """
 
-    disparity: NDArray[np.float32]
-    std: NDArray[np.float64]
-    image: NDArray[np.float32]
-    limits: NDArray[np.float64]
+    disparity: Floats32
+    std: Floats
+    image: Floats32
+    limits: Floats
 
 
 # Functions that take arrays and run once a cell are inlined where they are called: to count the references of their

@@ -26,16 +26,12 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from rille.stages.core.arrays import Bools, Floats, Floats32
 from rille.stages.geometry.surface import Surface
 from rille.stages.numeric.windows import window_sum
 from rille.stages.terrain.locus.sweep import Terms, sweep
 from rille.stages.terrain.locus.views import OrthoPair, Views, look
-
-Float32 = NDArray[np.float32]
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 STIFFNESS = 4000.0
 """Squared grey levels for a bend of a pixel of disparity: strong against noise, weak against texture; the error is flat
@@ -66,7 +62,7 @@ UNKNOWN_BEND = 2.0
 LEAST_CORRELATION = 0.02
 
 
-def refine(views: Views, surface: Surface, elevation: Float32, steps: int) -> tuple[Float32, OrthoPair]:
+def refine(views: Views, surface: Surface, elevation: Floats32, steps: int) -> tuple[Floats32, OrthoPair]:
     """Elevations that fit both images best, and what the images show there.
 
     Parameters
@@ -102,7 +98,7 @@ def refine(views: Views, surface: Surface, elevation: Float32, steps: int) -> tu
     return z.astype(np.float32), seen
 
 
-def standard_deviation(elevation: Float32, seen: OrthoPair, from_disparity: Floats) -> Floats:
+def standard_deviation(elevation: Floats32, seen: OrthoPair, from_disparity: Floats) -> Floats:
     """Standard deviation of refined elevations, metres, see the module; the disparity's part where a cell is not seen.
 
     ``seen``: as :func:`refine` gives it. ``from_disparity``: (rows, cols) the disparity's part, metres.
@@ -136,7 +132,7 @@ def _level(seen: OrthoPair, gain: float) -> None:
         values *= np.float32(gain)
 
 
-def _misfit(seen: OrthoPair, keep: Mask) -> tuple[Floats, Floats]:
+def _misfit(seen: OrthoPair, keep: Bools) -> tuple[Floats, Floats]:
     """Weight of each cell's equation, and difference of both images without its local mean; zero where not kept."""
     rest = np.where(keep, seen.left - seen.right, 0.0)
     weight = keep.astype(np.float64)

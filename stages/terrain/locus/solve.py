@@ -8,16 +8,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from rille.stages.core.arrays import Bools, Floats, Floats32
 from rille.stages.core.errors import DegenerateError, InputError
 from rille.stages.geometry.geometry import Rig, RigidTransform
 from rille.stages.geometry.surface import Surface
 from rille.stages.terrain.locus.kernel import BlockCells, PairCameras, search
 from rille.stages.terrain.locus.points import Observed
-
-Floats = NDArray[np.float64]
-Float32 = NDArray[np.float32]
 
 COARSE = 8  # cells a coarse cell is wide: a 64th of the cells search the whole range
 BLOCK_ROWS = 64  # rows of cells in one kernel call, so that a large surface stays small in memory
@@ -32,10 +30,10 @@ class Dem:
     mismatch at the solution in pixels, ``ortho`` the grey value of the left image.
     """
 
-    elevation: Float32
-    elevation_std: Float32
-    residual: Float32
-    ortho: Float32
+    elevation: Floats32
+    elevation_std: Floats32
+    residual: Floats32
+    ortho: Floats32
 
 
 @dataclass(frozen=True)
@@ -47,7 +45,7 @@ class Matches:
 
     column: ArrayLike
     row: ArrayLike
-    usable: NDArray[np.bool_]
+    usable: Bools
     std: ArrayLike | None = None
 
 

@@ -18,9 +18,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydantic import Field
 
+from rille.stages.core.arrays import Bools, Floats, Floats32
 from rille.stages.core.declare import Array, Bundle, Inputs, Memory, Params, Stage
 from rille.stages.core.errors import ConfigError, DegenerateError, InputError
 from rille.stages.core.validity import matched
@@ -34,9 +35,6 @@ from rille.stages.terrain.locus.refinement import refine, standard_deviation
 from rille.stages.terrain.locus.solve import Dem, Matches, PairArrays, join, projections, solve
 from rille.stages.terrain.locus.uncertainty import from_both
 from rille.stages.terrain.locus.views import Views, views
-
-Floats = NDArray[np.float64]
-Float32 = NDArray[np.float32]
 
 OWN_STD = 1.5  # times max_sigma: a cell's own standard deviation scatters about the typical one
 
@@ -233,7 +231,7 @@ def local_lattice(rig: Rig, level: Mapping[str, Any], cell: float, params: Locus
     return Lattice.snap(view.footprint(cell, params.max_range_cells, params.sigma_disparity, sigma), cell)
 
 
-def world_lattice(elevation: Float32, lattice: Lattice, T_world_local: RigidTransform) -> tuple[Lattice, list[float]]:
+def world_lattice(elevation: Floats32, lattice: Lattice, T_world_local: RigidTransform) -> tuple[Lattice, list[float]]:
     """Lattice and range of elevations in the world frame that hold a local elevation model.
 
     Raises
@@ -302,7 +300,7 @@ def _run(params: LocusParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle
     return Bundle(vars(dem), meta)
 
 
-def usable(validity: ArrayLike, backmatch_error: ArrayLike, params: LocusParams) -> NDArray[np.bool_]:
+def usable(validity: ArrayLike, backmatch_error: ArrayLike, params: LocusParams) -> Bools:
     """Pixels that were measured, not filled, and match back to within ``max_backmatch`` pixels."""
     with np.errstate(invalid="ignore"):
         return matched(np.asarray(validity)) & (np.asarray(backmatch_error) <= params.max_backmatch)
@@ -339,7 +337,7 @@ def _size(params: LocusParams, args: Mapping[str, Any], metas: Mapping[str, Any]
     return 24.0 * lattice.rows * lattice.cols
 
 
-def _median(array: Float32) -> float | None:
+def _median(array: Floats32) -> float | None:
     values = array[np.isfinite(array)]
     return float(np.median(values)) if values.size else None
 

@@ -12,10 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from rille.stages.core.arrays import Bools, Floats
 
 BORDER = 2
 """Diagonals and rows of nothing around: a second difference reaches two cells far."""
@@ -33,7 +31,7 @@ class Terms(NamedTuple):
     power: Floats
     pull: Floats
     start: Floats
-    keep: Mask
+    keep: Bools
     across: Floats
     down: Floats
 

@@ -19,14 +19,11 @@ and 3 (preset ``accurate`` of the matcher), rounded. Its default seed, which fig
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rille.stages.core.arrays import Bools, Floats, Floats32
 from rille.stages.numeric.robust import mad_sigma
 from rille.stages.numeric.windows import window_sum
 from rille.stages.terrain.locus.views import OrthoPair
-
-Float32 = NDArray[np.float32]
-Floats = NDArray[np.float64]
 
 FLOOR = 0.03
 """Pixels of disparity."""
@@ -46,7 +43,7 @@ STEP_SIDE, NEAR_SIDE, MEAN_SIDE = 3, 5, 15
 """Cells: sides of the windows of t, of all others, and of the local mean that differences go without."""
 
 
-def from_both(elevation: Float32, seen: OrthoPair, moved: Floats, apart: Floats, otherwise: Floats) -> Floats:
+def from_both(elevation: Floats32, seen: OrthoPair, moved: Floats, apart: Floats, otherwise: Floats) -> Floats:
     """Standard deviation of each cell, metres, see the module.
 
     Parameters
@@ -77,14 +74,14 @@ def from_both(elevation: Float32, seen: OrthoPair, moved: Floats, apart: Floats,
     return np.where(known, np.sqrt(np.maximum(variance, FLOOR**2)) / scale, otherwise)
 
 
-def _gradients(seen: OrthoPair, scale: Floats, known: NDArray[np.bool_]) -> Floats:
+def _gradients(seen: OrthoPair, scale: Floats, known: Bools) -> Floats:
     """Sum of the squared gradients around each cell, squared grey levels a pixel of disparity."""
     slope = np.where(known, seen.right_slope - seen.left_slope, 0.0) / scale
     power = np.square(slope) * np.where(known, np.minimum(seen.area, 1.0), 0.0)
     return np.maximum(window_sum(power, NEAR_SIDE), 0.0) + LEAST_GRADIENT * NEAR_SIDE**2
 
 
-def _steps(elevation: Float32, scale: Floats, known: NDArray[np.bool_]) -> Floats:
+def _steps(elevation: Floats32, scale: Floats, known: Bools) -> Floats:
     """Squared steps to the four neighbours of each cell, pixels of disparity; 0 where one of them is unknown."""
     z = np.where(known, elevation.astype(np.float64), np.nan)
     out = np.zeros(z.shape)
@@ -95,6 +92,6 @@ def _steps(elevation: Float32, scale: Floats, known: NDArray[np.bool_]) -> Float
     return out
 
 
-def _mean(values: Floats, known: NDArray[np.bool_], side: int) -> Floats:
+def _mean(values: Floats, known: Bools, side: int) -> Floats:
     """Mean over the known cells of a window of values that are 0 elsewhere."""
     return window_sum(values, side) / np.maximum(window_sum(known, side), 1.0)

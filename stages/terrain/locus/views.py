@@ -12,14 +12,11 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 from numba import njit
-from numpy.typing import NDArray
 
+from rille.stages.core.arrays import Floats, Floats32
 from rille.stages.geometry.surface import Surface
 from rille.stages.terrain.locus.spline import LANES, LEFT_AT, LEFT_VALUE, RIGHT_AT, RIGHT_VALUE, SPLINE, read
 from rille.stages.terrain.locus.spline import PLANES as SPLINE_PLANES
-
-Float32 = NDArray[np.float32]
-Floats = NDArray[np.float64]
 
 BLOCK_ROWS = 64  # rows of cells in one call, so that a large surface's feet stay small in memory
 
@@ -29,7 +26,7 @@ class Views(NamedTuple):
 
     left: Floats
     right: Floats
-    splines: tuple[Float32, Float32]
+    splines: tuple[Floats32, Floats32]
     centre: Floats
 
 
@@ -40,15 +37,15 @@ class OrthoPair(NamedTuple):
     ``scale``: disparity a metre of elevation, pixels; ``area``: pixels of the left image that the cell covers.
     """
 
-    left: Float32
-    right: Float32
-    left_slope: Float32
-    scale: Float32
-    area: Float32
-    right_slope: Float32
+    left: Floats32
+    right: Floats32
+    left_slope: Floats32
+    scale: Floats32
+    area: Floats32
+    right_slope: Floats32
 
 
-def views(left: Floats, right: Floats, left_image: Float32, right_image: Float32, centre: Floats) -> Views:
+def views(left: Floats, right: Floats, left_image: Floats32, right_image: Floats32, centre: Floats) -> Views:
     """Views of two images (row, col), grey values; ``centre`` of the left camera in the frame of the surface, m."""
     splines = [scipy.ndimage.spline_filter(image, 3, np.float32, mode="mirror") for image in (left_image, right_image)]
     return Views(left, right, (splines[0], splines[1]), np.asarray(centre, np.float64))
