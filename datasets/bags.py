@@ -176,6 +176,7 @@ def _common(
     """Stamps that both cameras have, in order, and what is left out."""
     common = sorted(set(left) & set(right))
     if not common:
+        # Only for the message, and quadratic: not of two cameras that ran for hours.
         apart = min((abs(a - b) for a in left for b in right), default=None) if len(left) * len(right) < 10**7 else None
         near = "" if apart is None else f"; the nearest are {apart / 1e6:.6g} ms apart"
         raise InputError(
@@ -203,6 +204,7 @@ def _camera(reader: Any, path: Path, topic: str) -> tuple[CalibratedCamera, np.n
             f"{path} has no {name} for {topic} (camera_info: {', '.join(there) or 'none'})",
             remedy="record the camera_info of both cameras beside their images",
         )
+    # ROS 1 names the fields K, D, R and P, ROS 2 k, d, r and p.
     given = {key.lower(): getattr(message, key) for key in dir(message) if key.lower() in ("k", "d", "r", "p")}
     rectified = "rect" in topic
     entries: dict[str, Any] = {
@@ -212,6 +214,7 @@ def _camera(reader: Any, path: Path, topic: str) -> tuple[CalibratedCamera, np.n
         "camera_name": topic,
     }
     if rectified:
+        # The images are rectified already: P alone is their camera, and R must not be applied again.
         entries |= {"camera_matrix": np.reshape(given["p"], (3, 4))[:, :3], "rectification_matrix": np.eye(3)}
     else:
         entries |= {"camera_matrix": given["k"], "rectification_matrix": given["r"]}
@@ -230,6 +233,7 @@ def _movement(
 ) -> tuple[Inertial | None, tuple[RigidTransform | None, ...] | None, list[str]]:
     """What IMU and odometry say of each frame, and what cannot be used."""
     frames, warnings = _static(reader), list[str]()
+    # frame_id names the camera as it is mounted; a rectified image is turned by R against it.
     T_camera_image = RigidTransform(R_image_camera.T, np.zeros(3))
 
     def placed(kind: str, place: Any) -> tuple[str, list[Any], RigidTransform] | None:
@@ -287,6 +291,7 @@ def _between(frames: Mapping[str, Mapping[str, RigidTransform]], a: str, b: str)
     """``T_a_b`` along fixed transforms; None where none leads there."""
     a, b = a.lstrip("/"), b.lstrip("/")
     known = {a: RigidTransform.identity()}
+    # Breadth first: transforms may form a graph with circles, in which the shortest way is as good as any.
     todo = [a]
     for one in todo:
         for other, T in frames.get(one, {}).items():

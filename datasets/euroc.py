@@ -180,6 +180,7 @@ def _images(folder: Path, warnings: list[str]) -> dict[str, tuple[Path, int]]:
         )
     listed = folder / "data.csv"
     if not listed.is_file():
+        # Stamps are numbers without leading zeros: fewer digits come first.
         names = sorted(there, key=lambda name: (len(Path(name).stem), name))
         return {Path(name).stem: (there[name], k) for k, name in enumerate(names, start=1)}
     table = read_table(listed, "list of images")

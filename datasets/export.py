@@ -70,6 +70,7 @@ def export(sequence: Sequence, directory: Path, materialise: Materialise, pairs:
     )
     try:
         directory.parent.mkdir(parents=True, exist_ok=True)
+        # Beside the folder to be made: a rename in one step needs the same file system.
         part = Path(tempfile.mkdtemp(prefix=f".{directory.name}.", dir=directory.parent))
     except OSError as error:
         raise InputError(
@@ -77,6 +78,7 @@ def export(sequence: Sequence, directory: Path, materialise: Materialise, pairs:
         ) from error
     try:
         _write(sequence, part, materialise, chosen)
+        # mkdtemp makes it readable for its owner alone.
         part.chmod(0o755)
         part.replace(directory)
     except BaseException:
@@ -127,6 +129,7 @@ def _write_png(path: Path, image: Any) -> None:
 
 
 def _write_rows(path: Path, rows: Iterable[Iterable[float]]) -> None:
+    # 17 digits give back every float64 to the bit.
     path.write_text("".join(" ".join(f"{v:.17g}" for v in row) + "\n" for row in rows), encoding="utf-8")
 
 

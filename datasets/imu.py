@@ -159,6 +159,7 @@ def _possible(values: Floats, greatest: float, unit: str, table: TextTable) -> N
 
 def _plausible(rates: Floats, forces: Floats, name: str) -> None:
     turn, force = (float(np.median(np.linalg.norm(v, axis=1))) for v in (rates, forces))
+    # A force of gravity (9.8) among the rates, and rates of a vehicle where the force should be.
     if turn > 8 and force < 6:
         raise InputError(
             "RIL-187",
@@ -200,6 +201,7 @@ class Stretch:
         """Up in the sensor's frame at a moment, not normalised; None where the force is not gravity's reaction."""
         first, last = np.searchsorted(self.times, (moment - HALF_WINDOW, moment + HALF_WINDOW))
         chosen = slice(int(first), int(last))
+        # At an end of the record one side of the window is enough, as long as it is whole.
         if last - first < 2 or self.times[last - 1] - self.times[first] < HALF_WINDOW - self.slack:
             return None
         turns = self.attitude(moment).T @ self.turned[chosen]
@@ -245,6 +247,7 @@ def at_frames(imu: ImuRecord, at: Sequence[float], T_imu_left: RigidTransform) -
 def stretches(imu: ImuRecord, bias: Floats | None, start: float, end: float) -> list[Stretch]:
     """The parts of a record from ``start`` to ``end`` (s) without gaps, each of two samples at least."""
     usual = float(np.median(np.diff(imu.times)))
+    # A slow sensor's usual spacing is no gap, even where it exceeds BRIDGE.
     bridge = max(BRIDGE, GAP * usual)
     near = np.flatnonzero((imu.times >= start - bridge) & (imu.times <= end + bridge))
     out = []

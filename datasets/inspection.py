@@ -93,6 +93,7 @@ def inspect(folder: Path) -> Findings:
     paths = list(_files(folder, Search()))
     found = Findings(folder, find_views(folder, [p for p in paths if p.suffix.lower() in SUFFIXES]))
     texts = [p for p in paths if p.suffix.lower() in (*CALIBRATIONS, *TABLES)]
+    # Each is tried as a calibration and as a table; thousands of them (one an image) would take minutes.
     if len(texts) > MOST_TEXTS:
         found.unread.append(f"of {len(texts)} text files only the first {MOST_TEXTS} were looked at")
         texts = texts[:MOST_TEXTS]
@@ -143,6 +144,7 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
             f"{folder} holds {len(images)} images, {named[0]} named as left and {named[1]} as right: no pairs",
             remedy="name files or folders left and right (or _l and _r, cam0 and cam1), or write a manifest by hand",
         )
+    # Most pairs first; of as many, the surest token (SIDES).
     key = max(both, key=lambda k: (min(len(s) for s in both[k]), -k[0]))
     left, right = both[key]
     size, trouble, pairs = None, "", 0

@@ -118,6 +118,7 @@ def read_poses(path: Path, format: str = "auto", *, unit: str = "auto") -> Timed
         rotations = _quaternions(table, columns)
     else:
         values = table.numbers([columns[a] for a in ANGLES])
+        # Capitals turn about the axes as they are turned already: yaw first, then pitch, then roll.
         rotations = Rotation.from_euler("ZYX", values[:, ::-1], degrees=angles == "deg").as_matrix()
     with_position = all(axis in columns for axis in POSITION)
     positions = table.numbers([columns[a] for a in POSITION]) if with_position else np.zeros((len(table.rows), 3))
@@ -316,7 +317,9 @@ def interpolate(timed: TimedPoses, at: Sequence[float], max_gap: float) -> tuple
     before = np.clip(np.searchsorted(t, wanted, side="right") - 1, 0, max(len(t) - 2, 0))
     after = np.minimum(before + 1, len(t) - 1)
     distance = np.minimum(np.abs(wanted - t[before]), np.abs(wanted - t[after]))
+    # At a row itself a gap beside it does not matter.
     known = inside & ((t[after] - t[before] <= max_gap) | (distance <= WITHIN))
+    # By WITHIN at most: Slerp refuses any time beyond its ends.
     moment = np.clip(wanted, t[0], t[-1])
     positions = np.array([p.translation for p in timed.poses])
     rotations = Rotation.from_matrix([p.rotation for p in timed.poses])

@@ -49,6 +49,7 @@ def layouts() -> tuple[ModuleType, ...]:
     Each has ``FORMS``, what a user may give and in words what that is, and ``open_layout(path, number, digests)``,
     which gives None where the folder is none of its own; ``number`` chooses one of several (``FOLDER:NUMBER``).
     """
+    # By listing, not by a table: a new layout is one new file, and the order by name is the same everywhere.
     names = [found.name for found in pkgutil.iter_modules([str(Path(__file__).parent)]) if not found.ispkg]
     modules = [import_module(f"rille.datasets.{name}") for name in sorted(names)]
     return tuple(module for module in modules if hasattr(module, "open_layout"))
@@ -116,6 +117,7 @@ def _of_files(name_or_path: str, digests: Digests) -> Sequence:
     path, number = _split(name_or_path)
     if path.is_file() and path.suffix == ".toml":
         return open_manifest(path, digests)
+    # What the user wrote down goes before what the folder looks like.
     manifest = folder_manifest(path) if number is None and path.is_dir() else None
     if manifest is not None:
         return open_manifest(manifest, digests)
@@ -194,6 +196,7 @@ def _split(name_or_path: str) -> tuple[Path, str | None]:
     """Folder, and the sequence's number where it is given as ROOT:NN."""
     path = Path(name_or_path).expanduser()
     root, colon, number = name_or_path.rpartition(":")
+    # A path that exists is taken whole: folders may have a colon in their names.
     if not path.exists() and colon and root:
         return Path(root).expanduser(), number
     return path, None

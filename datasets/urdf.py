@@ -83,6 +83,7 @@ def read_urdf(path: Path, camera: str = "", stated: Vehicle | None = None) -> Ro
     if len(wheels) < 2:
         raise _error(path, f"has {len(wheels)} wheels (continuous joints of links with a cylinder or sphere)")
     length, width = np.ptp(centres[:, :2], axis=0)
+    # The lowest wheel carries: castors and raised wheels do not touch flat ground.
     ground = float(centres[:, 2].min()) - radius
     others = [one for name, those in shapes.items() if name not in turning for one in those]
     low = min((float(one.points[:, 2].min()) for one in others), default=ground)
@@ -101,6 +102,7 @@ def read_urdf(path: Path, camera: str = "", stated: Vehicle | None = None) -> Ro
 
 def _parsed(path: Path) -> ElementTree.Element:
     text = read_text(path, "URDF")
+    # Entities expand without bound, and xacro's expressions are not numbers yet.
     if "<!ENTITY" in text or "${" in text:
         raise _error(path, "holds entities or xacro expressions", f"expand it: xacro {path.name} > robot.urdf")
     try:
@@ -169,6 +171,7 @@ def _pitch(camera: str, places: dict[str, RigidTransform], path: Path) -> float:
         near = ", ".join(sorted(name for name in places if "cam" in name or "optical" in name)[:5])
         raise _error(path, f"has no link {camera!r}", f"name an optical link{f', e.g. of {near}' if near else ''}")
     across, _, ahead = places[camera].rotation.T
+    # Clamped, here and below: rounding may leave a component of a unit vector above 1.
     if abs(math.asin(max(-1.0, min(1.0, across[2])))) > ROLL:
         raise _error(path, f"has {camera} rolled: its columns are not level", "name the optical link of a level camera")
     return -math.asin(max(-1.0, min(1.0, float(ahead[2]))))

@@ -52,7 +52,9 @@ def read_cameras(path: Path) -> list[CalibratedCamera]:
     InputError
         The file cannot be read or holds no camera, or an entry is missing or wrong; then the line names the key.
     """
+    # An image with its label in front is too large for a calibration and no text: of it, the label alone is read.
     text = pds.attached(path) or read_text(path, "calibration")
+    # Before YAML, for which KITTI's `P0: 7.1 0 ...` is an entry, too: one word where twelve numbers belong.
     for recognises, read in PLAIN:
         if recognises(text):
             return read(text, path)

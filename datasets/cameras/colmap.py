@@ -80,6 +80,8 @@ def _rig(path: Path) -> dict[str, RigidTransform]:
     lines = _lines(read_text(path, "rigs")) if path.is_file() else []
     if len(lines) != 1 or len(lines[0]) < 4 or lines[0][2] != "CAMERA":
         return {}
+    # RIG_ID NUM_SENSORS REF_SENSOR_TYPE REF_SENSOR_ID, then of each other sensor TYPE ID HAS_POSE [QW QX QY QZ TX TY
+    # TZ], which maps the rig's frame to the sensor's (colmap.github.io/format).
     _, _, _, reference, *rest = lines[0]
     poses = {reference: RigidTransform.identity()}
     while len(rest) >= 3:
@@ -93,6 +95,7 @@ def _rig(path: Path) -> dict[str, RigidTransform]:
             raise f.error("RIL-110", "pose", "has a quaternion of length 0")
         rest = rest[7:]
         if kind == "CAMERA":
+            # SciPy takes the scalar last, COLMAP writes it first.
             poses[number] = RigidTransform(Rotation.from_quat([x, y, z, w]).as_matrix(), np.array(t))
     return poses
 

@@ -155,6 +155,7 @@ class Fields:
 
     def _number(self, key: str, value: Any) -> float:
         try:
+            # float(True) is 1.0, but nobody states a length so.
             number = math.nan if isinstance(value, bool) else float(value)
         except (TypeError, ValueError):
             number = math.nan
@@ -178,6 +179,7 @@ class Fields:
 def by_count(coefficients: tuple[float, ...]) -> tuple[str, tuple[float, ...]]:
     """Model that OpenCV takes for so many coefficients, and the coefficients without what is zero by default."""
     k = coefficients
+    # OpenCV writes all coefficients of its largest model, with zeros for the terms that were not estimated.
     if len(k) == 14 and not any(k[12:]):
         k = k[:12]
     if len(k) == 12 and not any(k[8:]):
@@ -204,6 +206,7 @@ def _flat(value: Any) -> list[Any] | None:
 
 def _matrix_data(value: Mapping[Any, Any]) -> list[Any] | None:
     data, rows, columns = _flat(value["data"]), str(value.get("rows")), str(value.get("cols"))
+    # int() refuses thousands of digits by an error of its own; nine are more than any matrix has.
     if data is not None and rows.isdecimal() and columns.isdecimal() and int(rows[:9]) * int(columns[:9]) != len(data):
         return None
     return data

@@ -29,6 +29,7 @@ RAW = re.compile(r"K_(\d\d)")
 
 def is_kitti(text: str) -> bool:
     """Whether a line has the label of a projection or of a raw camera, or all are projections without labels."""
+    # The beginning is enough for any calibration. Other files pass here too: `rille init` tries every small text.
     return LINE.search(text[:100_000]) is not None or bool(_nameless(text))
 
 

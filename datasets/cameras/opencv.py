@@ -123,6 +123,7 @@ def _unrectified(f: Fields, rotation: str, projection: str) -> RigidTransform:
     R, P = f.matrix(rotation, 3, 3), f.matrix(projection, 3, 4)
     if not P[0, 0] > 0:
         raise f.error("RIL-125", projection, f"has the focal length {P[0, 0]:g}")
+    # sensor_msgs/msg/CameraInfo: P[0, 3] is -fx' times the baseline, fx' = P[0, 0], and 0 of the left camera.
     T = RigidTransform(np.eye(3), np.array([P[0, 3] / P[0, 0], P[1, 3] / P[0, 0], 0.0]))
     try:
         return RigidTransform(R, np.zeros(3)).inverse() @ T

@@ -26,6 +26,7 @@ GROUP = re.compile(r"^[ \t]*(?:GROUP|OBJECT)[ \t]*=[ \t]*\"?GEOMETRIC_CAMERA_MOD
 GROUP_END = re.compile(r"^[ \t]*END_(?:GROUP|OBJECT)\b", re.MULTILINE)
 PROPERTY = re.compile(r"\bPROPERTY='GEOMETRIC_CAMERA_MODEL[A-Z_]*'")
 PROPERTY_END = re.compile(r"\b(?:PROPERTY|TASK)='")
+# Repeats are bounded, here and below: a hostile label must not cost more than its length.
 COMPONENT = re.compile(r"\bMODEL_COMPONENT_([1-9])\s*=\s*(\([^()]{0,400}\)|[^\s(),]{1,60})")
 TYPE = re.compile(r"\bMODEL_TYPE\s*=\s*[\"']?([A-Z]{1,20})\b")
 UNIT = re.compile(r"<[^<>]{0,40}>")
@@ -46,6 +47,7 @@ def attached(path: Path) -> str:
         start = file.read(16)
         if not start.startswith(BEGINS):
             return ""
+        # latin-1 decodes any byte: behind the label stands the image.
         text = (start + file.read(SMALL)).decode("latin-1")
     if text.startswith("LBLSIZE="):
         size = re.match(r"LBLSIZE=(\d{1,7})\b", text)
@@ -91,6 +93,7 @@ def _camera(
     fx = float(np.linalg.norm(h - cx * a))
     if fx <= SKEW * abs(cx):
         raise f.error("RIL-957", "MODEL_COMPONENT_3", "is along the axis: the columns have no direction")
+    # H = fx x + cx A and V = fy y + cy A, of axes x, y, A (Yakimovsky and Cunningham 1978).
     x = (h - cx * a) / fx
     y = np.cross(a, x)
     skew, fy = float(v @ x), float(v @ y)
@@ -137,6 +140,7 @@ def _linearity(f: Fields) -> float:
     if kind not in (1, 2, 3):
         raise f.error("RIL-955", "MODEL_COMPONENT_8", f"= {kind:g} is no type of CAHVORE", "1, 2 or 3")
     if kind < 3:
+        # Type 1 (perspective) is a linearity of 1, type 2 (fisheye) of 0.
         return 2.0 - kind
     linearity = f.number("MODEL_COMPONENT_9")
     if not -1.0 <= linearity <= 1.0:

@@ -28,6 +28,7 @@ def kalibr(f: Fields, path: Path) -> list[CalibratedCamera]:
     if all("T_cn_cnm1" in part for part in parts[1:]):
         poses = [RigidTransform.identity()]
         for part in parts[1:]:
+            # Each camera is stated from the one before, so that poses multiply along the chain.
             poses.append(part.pose("T_cn_cnm1") @ (poses[-1] or RigidTransform.identity()))
     elif all("T_cam_imu" in part for part in parts):
         poses = [part.pose("T_cam_imu") for part in parts]

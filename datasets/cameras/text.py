@@ -44,6 +44,7 @@ def parse_yaml(text: str, file: str) -> Mapping[Any, Any]:
     """Entries of a YAML or JSON file; empty where it holds something else than entries."""
     body = HEADER.sub("", text, count=1)
     try:
+        # Events are flat and cheap: what would be nested or multiplied is seen before anything is built.
         _check_extent(body, file)
         found = yaml.load(body, Loader=_Loader)
     except yaml.YAMLError as error:
@@ -58,6 +59,7 @@ def _check_extent(text: str, file: str) -> None:
     """Refuse what is small as text and huge as entries, before anything is made of it."""
     depth = values = 0
     for event in yaml.parse(text, Loader=_Loader):
+        # Ten lists of ten aliases, each to the list before, make 10^10 values of a few hundred bytes.
         if isinstance(event, yaml.AliasEvent):
             where = f"{file}, line {event.start_mark.line + 1}"
             raise InputError("RIL-758", f"{where}: the alias *{event.anchor}", remedy="write the values out")

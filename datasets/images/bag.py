@@ -95,6 +95,7 @@ def grey_of(message: Any, name: str, wanted: tuple[int, int, int]) -> Grey:
     rows, columns, step = int(message.height), int(message.width), int(message.step)
     files.check_size((columns, rows, bits), wanted, name)
     width = columns * samples * bits // 8
+    # Rows may be padded to `step` bytes (sensor_msgs/msg/Image), and the message may hold fewer than it states.
     data = np.frombuffer(bytes(message.data), np.uint8)
     if step < width or len(data) < rows * step:
         raise InputError(

@@ -101,6 +101,7 @@ def decode_colour(data: bytes, name: str, wanted: Header | None = None) -> tuple
     if wanted is not None:
         check_size((*header[:2], wanted[2]), wanted, name)
     try:
+        # Unchanged: 16 bits stay 16, and no orientation tag turns the image away from its calibration.
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
         image = None
@@ -111,6 +112,7 @@ def decode_colour(data: bytes, name: str, wanted: Header | None = None) -> tuple
     colour: NDArray[np.uint8] | None = None
     if image.ndim == 3 and image.shape[2] >= 3:
         three = np.ascontiguousarray(image[:, :, :3])
+        # Many grey cameras save three equal bands: those are no colours, and cost no artifact three times the size.
         if (three != three[:, :, :1]).any():
             eight = three if three.dtype == np.uint8 else (three >> 8).astype(np.uint8)
             colour = np.ascontiguousarray(eight[:, :, ::-1])
@@ -119,6 +121,7 @@ def decode_colour(data: bytes, name: str, wanted: Header | None = None) -> tuple
         image = image[:, :, 0]
     grey: Grey = np.ascontiguousarray(image)
     if wanted is not None:
+        # What was decoded counts: a header may say anything.
         check_size((grey.shape[1], grey.shape[0], grey.dtype.itemsize * 8), wanted, name)
     return grey, colour
 
@@ -198,6 +201,7 @@ class Digests:
                 self._known[key] = hashlib.file_digest(file, "sha256").hexdigest()
             if self._memory is not None:
                 self._memory.parent.mkdir(parents=True, exist_ok=True)
+                # Appended, not rewritten: two runs at once both keep what they found, and a torn line is passed over.
                 with self._memory.open("a", encoding="utf-8") as file:
                     file.write(f"{self._known[key]} {key}\n")
         return self._known[key]
@@ -232,6 +236,7 @@ def check_size(found: tuple[int, int, int], wanted: tuple[int, int, int], name: 
 def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     name = f"frame {args['frame']}, {args['camera']} image {args['path']}"
     data = read_bytes(Path(args["path"]), "image", MOST_BYTES)
+    # The digest is in the key: a file that was replaced since must not be stored under the key of the former one.
     if hashlib.sha256(data).hexdigest() != args["sha256"]:
         raise InputError("RIL-177", f"{name} has changed since the run began", remedy="run the same command again")
     image, colour = decode_colour(data, name, (args["width"], args["height"], args["depth"]))

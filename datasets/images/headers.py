@@ -38,6 +38,8 @@ def read_header(file: BinaryIO) -> Header | None:
     start = file.read(512)
     for begins, read in FORMATS:
         if re.match(begins, start):
+            # A header that breaks off, or points beyond its file, is none: the decoder's refusal then says what is
+            # wrong.
             with suppress(struct.error, ValueError, OverflowError):
                 return read(file, start)
     return None
@@ -73,6 +75,7 @@ def _tiff(file: BinaryIO, start: bytes) -> Header | None:
     file.seek(struct.unpack_from(order + ("Q" if big else "I"), start, 8 if big else 4)[0])
     (count,) = struct.unpack(count_form, file.read(struct.calcsize(count_form)))
     size = struct.calcsize(tag_form)
+    # The count of a BigTIFF has 64 bits, and would be read as so many bytes.
     tags = file.read(min(count, MOST_TAGS) * size)
     found: dict[int, int] = {}
     for at in range(0, len(tags) - size + 1, size):

@@ -113,6 +113,7 @@ def warp(image: AnyArray, valid: AnyArray, lens: Lens, params: MisalignParams) -
     values = scipy.ndimage.map_coordinates(image.astype(np.float64), at, order=3, mode="nearest")
     top = np.iinfo(image.dtype).max if np.issubdtype(image.dtype, np.integer) else np.inf
     values = np.clip(np.rint(values) if np.isfinite(top) else values, 0, top)
+    # A cubic spline reads 4 x 4 pixels: one that is not usable spoils all places that read it.
     kernel = np.ones((KERNEL, KERNEL), np.uint8)
     whole = cv2.erode(
         (valid != 0).astype(np.uint8), kernel, anchor=(1, 1), borderType=cv2.BORDER_CONSTANT, borderValue=0

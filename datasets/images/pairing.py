@@ -100,6 +100,7 @@ def pair_up(
         An image has no partner, two images make the same pair, or the counts differ.
     """
     left, right = (sorted(paths, key=lambda p: natural(p.name)) for paths in (left, right))
+    # One image each is a pair, whatever the two are called.
     if rule == "order" or (rule == "auto" and len(left) == len(right) == 1):
         if len(left) != len(right):
             raise InputError(

@@ -284,6 +284,7 @@ def read_manifest(path: Path) -> Manifest:
 
 def _complaint(error: Mapping[str, Any]) -> str:
     """One of pydantic's complaints as dotted key, value and reason."""
+    # pydantic names the member of a union (`file`, `camera`) as if it were a key.
     loc = [str(part) for part in error["loc"] if part not in ("file", "camera") or part == error["loc"][-1]]
     key = ".".join(loc)
     if error["type"] == "extra_forbidden":

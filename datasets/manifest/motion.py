@@ -102,6 +102,7 @@ def _times_of_file(path: Path, names: Sequence[str]) -> tuple[list[str], list[in
     text = read_lines(path, "times")
     rows = [(k, re.split(r"[,;\s]+", line.strip().strip(","))) for k, line in enumerate(text, start=1)]
     rows = [(k, words) for k, words in rows if words[0] and words[0][0] in "0123456789.+-"]
+    # Tables may list more images than there are pairs, in any order: names decide where all are found.
     by_name = {Path(words[1]).stem: (words[0], k) for k, words in rows if len(words) > 1}
     stems = [Path(n).stem for n in names]
     if by_name and all(stem in by_name for stem in stems):

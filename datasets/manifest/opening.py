@@ -57,6 +57,7 @@ def open_manifest(path: Path, digests: files.Digests) -> Sequence:
     if manifest.urdf is not None:
         robot = read_urdf(root / manifest.urdf.file, manifest.urdf.left, vehicle)
         vehicle = robot.vehicle
+        # What the manifest states of the vertical goes before the robot's description.
         if pitch is None and up is None:
             pitch = robot.pitch
     return Sequence(

@@ -82,6 +82,7 @@ def read_optics(manifest: Manifest, root: Path, name: str, size: tuple[int, int]
         The cameras or their relative pose are not stated, contradict the images, or cannot be.
     """
     left, right = _cameras(manifest.cameras, root, name, size)
+    # Before anything compares lengths: the manifest's own are metres.
     left, right = (_scaled(camera, manifest.rig.unit) for camera in (left, right))
     up = _up(manifest, left, name)
     left, right, lines = _placed(left, right, manifest.rig, name)
@@ -151,6 +152,7 @@ def _of_file(section: Cameras, path: Path, name: str) -> tuple[CalibratedCamera,
             remedy="say which two by cameras.names = [left, right]",
         )
     if len(found) == 1:
+        # Its pose, if it has one, is that of one camera: where the other one stands the manifest has to say.
         return found[0], replace(found[0], name="right", T_camera_reference=None)
     return found[0], found[1]
 

@@ -63,6 +63,7 @@ def mockup_loop(p: MockupParams, rover: RoverParams, name: str = "mockup-loop") 
         T_bed_camera = T_bed_left if camera == "left" else T_bed_left @ T_left_right
         sensor = p.render()
         if frame in rover.lost_frames:
+            # Black but for the sensor's noise, as with a closed shutter.
             sensor = sensor.model_copy(update={"exposure": 1e-3})
         args = {"frame": frame, "camera": camera, "geometry": cameras[camera].to_dict()}
         return Source("rille.datasets.mockup.render", sensor, args | {"T_bed_camera": T_bed_camera.to_list()})

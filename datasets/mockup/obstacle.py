@@ -51,6 +51,8 @@ def _run(params: RoverParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle
     true = RigidTransform.from_matrix(np.asarray(inputs["before"]["vehicle"])[int(args["row"])])
     believed = RigidTransform.from_matrix(np.asarray(inputs["pose"]["poses"])[-1]) @ T_left_vehicle
     px, py = on_path(path, params.obstacle_ahead, params.obstacle_aside)
+    # The path is in the frame of the rover's estimate: the stone is laid where it will really come by, so that errors
+    # of the estimate do not carry it past.
     turn = heading_of(true) - heading_of(believed)
     dx, dy = px - believed.translation[0], py - believed.translation[1]
     c, s = math.cos(turn), math.sin(turn)

@@ -17,6 +17,7 @@ def _run(params: RoverParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle
     at, z = inputs["scene"].meta["lattice"], np.asarray(inputs["scene"]["height"], dtype=np.float64)
     cell = float(args["cell"])
     n = max(1, round(cell / at["cell"]))
+    # Cells at multiples of their size, those alone that lie wholly within the bed.
     i0, j0 = math.ceil(at["x0"] / cell + 0.5), math.floor(at["y0"] / cell - 0.5)
     cols = math.floor((at["x0"] + at["cell"] * (at["cols"] - 1)) / cell - 0.5) - i0 + 1
     rows = j0 - math.ceil((at["y0"] - at["cell"] * (at["rows"] - 1)) / cell + 0.5) + 1

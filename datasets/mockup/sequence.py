@@ -49,6 +49,7 @@ def body_poses(p: MockupParams) -> list[RigidTransform]:
     for k in range(1, p.frames):
         c, s = math.cos(headings[k - 1]), math.sin(headings[k - 1])
         offsets[k] = offsets[k - 1] + [p.sideways * c - p.forward * s, p.sideways * s + p.forward * c]
+    # The drive is centred across the bed, whichever way it drifts.
     offsets[:, 0] -= 0.5 * (offsets[:, 0].min() + offsets[:, 0].max())
     offsets[:, 1] += START - min(offsets[:, 1].min(), 0.0)
     shakes = np.deg2rad(p.jitter_deg) * rng.standard_normal((p.frames, 3))

@@ -37,6 +37,8 @@ EMISSION = 0.31
 
 def stream(seed: int, part: int) -> np.random.Generator:
     """Generator of one part of the bed."""
+    # Parts in use: 1 to 40 here, 50 images, 60 to 62 motion and its sensors, 70 to 72 the rover. A new one takes a
+    # free number: a shared one would correlate what should be independent.
     return np.random.default_rng([seed, part])
 
 

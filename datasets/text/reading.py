@@ -53,6 +53,7 @@ def open_regular(path: Path, what: str, most: int) -> BufferedReader:
     try:
         status = path.stat()
         if not stat.S_ISREG(status.st_mode):
+            # Caught below, as the system's own refusals are: whatever the reason, it is one line.
             raise OSError(0, "it is a folder" if stat.S_ISDIR(status.st_mode) else "it is a pipe or a device")
         if status.st_size <= most:
             return path.open("rb")
@@ -89,6 +90,7 @@ def read_text(path: Path, what: str, most: int = SMALL) -> str:
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError:
+        # No text, like a file with zero bytes: both are refused below.
         text = "\0"
     if "\0" in text:
         raise InputError("RIL-140", f"{what} {path} is no text file", remedy="give it as text in UTF-8")

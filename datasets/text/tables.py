@@ -89,6 +89,7 @@ def read_table(path: Path, what: str) -> TextTable:
         if not text or (rows and text.startswith("#")):
             continue
         if not rows:
+            # Set anew by every line up to the first row, which decides: a comment above it may hold a comma.
             separator = next((s for s in (",", ";") if s in text), None)
         row = split(text, separator)
         if not rows and not NUMBER.match(row[0]):

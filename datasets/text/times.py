@@ -62,6 +62,7 @@ def seconds(
             "RIL-290", f"{what}: unit {unit!r} of time is unknown", remedy=f"one of auto, {', '.join(UNITS)}"
         )
     at = list(lines) if lines is not None else list(range(1, len(values) + 1))
+    # Nanoseconds since 1970 have 19 digits; a float64 keeps 16, and would make stamps of successive samples equal.
     exact = [_decimal(v, what, k) for v, k in zip(values, at, strict=True)]
     if not exact:
         return (), ()
@@ -140,6 +141,7 @@ def _in_order(exact: Sequence[Decimal], what: str, lines: Sequence[int]) -> None
 def _one_unit(exact: Sequence[Decimal], what: str, lines: Sequence[int]) -> None:
     """Refuse stamps that go on a thousand times larger and a thousand times wider apart: too small for magnitudes."""
     for k in range(1, len(exact) - 1):
+        # The spacing before needs two stamps, and a ratio a positive one.
         if k == 1 or exact[k - 1] <= 0:
             continue
         before, after = exact[k - 1] - exact[k - 2], exact[k + 1] - exact[k]
