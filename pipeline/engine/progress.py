@@ -125,7 +125,7 @@ class Lines(Quiet):
             left = self.forecast.left()
             self._say(
                 f"{self.done}/{self.total()} tasks, {handle.label} {handle.status}"
-                + (f", about {_clock(left)} left" if left is not None else "")
+                + (f", about {clock(left)} left" if left is not None else "")
             )
 
     def _compiled(self, handle: Handle) -> None:
@@ -215,7 +215,7 @@ class Bar(Lines):
             completed=gone,
             total=None if left is None else gone + left,
             count=f"{self.done}/{self.total()}",
-            description=plain(label) + (f", about {_clock(left)} left" if left is not None else ""),
+            description=plain(label) + (f", about {clock(left)} left" if left is not None else ""),
         )
 
     def close(self, result: Result) -> None:
@@ -238,5 +238,6 @@ def summary(result: Result) -> str:
     return f"{', '.join(parts)} in {result.seconds:.1f} s"
 
 
-def _clock(seconds: float) -> str:
+def clock(seconds: float) -> str:
+    """``42 s``, ``7 min``."""
     return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min"

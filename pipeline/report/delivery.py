@@ -33,10 +33,10 @@ class Delivery:
     absent: Items
     missing: Items
 
-    @property
-    def complete(self) -> bool:
-        """Whether all of the reconstruction is there."""
-        return all(m["kind"] in ANSWERS for m in self.missing)
+
+def is_complete(missing: Items) -> bool:
+    """Whether what is missing leaves the reconstruction whole: answers and what lies outside of it."""
+    return all(m["kind"] in ANSWERS for m in missing)
 
 
 def account(scene: Scene, frames: Rows, pairs: Rows) -> dict[str, Any]:

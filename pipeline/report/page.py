@@ -17,6 +17,7 @@ from rille.pipeline.export.catalogue import listed
 from rille.pipeline.export.view import RunView
 from rille.pipeline.report import canvas, tables
 from rille.pipeline.report.canvas import Figure
+from rille.pipeline.report.delivery import Items
 from rille.pipeline.report.summary import summarise
 from rille.pipeline.report.words import coordinate, metres, number, quantity, seconds, share
 
@@ -44,8 +45,8 @@ ALWAYS = ("trajectory", "matching", "key-figures", "times", "paper")
 """Chapters that hold more than figures."""
 
 
-def write_report(folder: Path, view: RunView, facts: Mapping[str, Any], figures: Sequence[Figure]) -> None:
-    """Write ``report.json`` and ``report.html``; each appears whole or not at all.
+def write_report(folder: Path, view: RunView, facts: Mapping[str, Any], figures: Sequence[Figure]) -> Items:
+    """Write ``report.json`` and ``report.html``, each whole or not at all; give what they list as missing.
 
     Parameters
     ----------
@@ -58,6 +59,8 @@ def write_report(folder: Path, view: RunView, facts: Mapping[str, Any], figures:
     atomic.write(folder / "report.json", json.dumps(whole, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
     page = render(view, whole, figures, list(listed(folder)), compared=facts["compared"])
     atomic.write(folder / "report.html", page)
+    missing: Items = whole["missing"]
+    return missing
 
 
 def render(

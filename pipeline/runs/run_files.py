@@ -18,6 +18,7 @@ from rille.pipeline.export.trajectories import stamps
 from rille.pipeline.export.view import RunView, TaskRow
 from rille.pipeline.report import gallery, summary
 from rille.pipeline.report.canvas import Figure
+from rille.pipeline.report.delivery import Items
 from rille.pipeline.report.page import write_report
 from rille.stages.core.declare import NoParams
 
@@ -70,13 +71,8 @@ def task_rows(graph: Graph, store: Store) -> tuple[TaskRow, ...]:
     return tuple(rows)
 
 
-def write(folder: Path, view: RunView, made: Made, store: Store) -> list[str]:
-    """Write all files of a run; what has no artifact is left out (the report says so).
-
-    Returns
-    -------
-    Title and reason of each figure whose drawing failed.
-    """
+def write(folder: Path, view: RunView, made: Made, store: Store) -> Items:
+    """Write all files of a run; what has no artifact is left out; give what the report lists as missing."""
     for output in (output for module in catalogue.MADE for output in module.OUTPUTS):
         ref = made[output.name].ref if output.name in made else None
         if ref is not None:
@@ -86,8 +82,7 @@ def write(folder: Path, view: RunView, made: Made, store: Store) -> list[str]:
     atomic.write(folder / "frames.json", json.dumps(_frames(folder, view, meta), indent=1) + "\n")
     facts = _content(made["facts"], store)
     figures = [Figure.from_dict(_content(made[o.name], store)) for o in gallery.OUTPUTS if made[o.name].ref is not None]
-    write_report(folder, view, facts, figures)
-    return [f"{figure.title}: {figure.why}" for figure in figures if figure.failed]
+    return write_report(folder, view, facts, figures)
 
 
 def _frames(folder: Path, view: RunView, trajectory: Any) -> dict[str, Any]:

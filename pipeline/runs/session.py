@@ -11,6 +11,8 @@ import hashlib
 import os
 import shutil
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -28,10 +30,11 @@ from rille.pipeline.flow import config as configuration
 from rille.stages.core.errors import ConfigError, RilleError
 
 if TYPE_CHECKING:
+    from rille.pipeline.engine.progress import Progress
     from rille.pipeline.engine.scheduler import Result
     from rille.pipeline.export.view import RunView
     from rille.pipeline.flow.closed_loop import Drive
-    from rille.pipeline.flow.products import Products
+    from rille.pipeline.report.delivery import Items
     from rille.pipeline.runs import run_files
 
 COMPLETE, FAILED, HOLES = 0, 1, 3
@@ -55,6 +58,7 @@ class Options:
     progress: str = "auto"
     memory_limit: str | None = None
     verb: str = "reconstruct"
+    live: bool = False
     verbose: bool = False
     opened: Sequence | None = None
     """The sequence itself, where it is open already."""
@@ -184,27 +188,30 @@ class _Opened:
 
 
 def _reconstruct(options: Options) -> tuple[int, Path]:
+    from rille.pipeline.report.delivery import is_complete
     from rille.pipeline.runs import run_files
 
     opened = _open(options)
     made: run_files.Made = {}
     opened.graph.last = lambda: run_files.lay_out(opened.graph, opened.late(), made)
-    result = _compute(opened)
-    remember()
-    undrawn = _write(opened, result, made)
+    with _progress(opened) as shown:
+        result = _compute(opened, shown)
+        remember()
+        missing = _write(opened, result, made)
     _point_latest(opened.folder)
     warn_of_results(opened.graph)
     arrived = _outcome(opened)
     total = result.total()
-    missing = total.failed + total.skipped + len(undrawn)
-    print(f"{opened.folder}  computed {total.computed}, cached {total.cached}, missing {missing}")
-    for line in undrawn:
-        print(f"rille: missing figure {line}", file=sys.stderr)
-    if result.ok:
-        drawn = HOLES if undrawn else COMPLETE
-        return max(arrived, drawn, _posed_all(opened.view.products), _all_read(opened, arrived)), opened.folder
-    _list_missing(opened.graph, opened.folder)
-    return HOLES, opened.folder
+    for item in missing:
+        print(f"rille: missing: {': '.join(word for word in (item['what'], item['why']) if word)}", file=sys.stderr)
+    page = opened.folder / "report.html"
+    print(f"{page}  computed {total.computed}, cached {total.cached}, missing {len(missing)}")
+    if not result.ok:
+        ledger = opened.folder / "ledger.jsonl"
+        print(f"rille: {total.failed} failed, {total.skipped} left out; ledger: {ledger}", file=sys.stderr)
+        return HOLES, opened.folder
+    whole = COMPLETE if is_complete(missing) else HOLES
+    return max(arrived, whole, _all_read(opened, arrived)), opened.folder
 
 
 def _open(options: Options) -> _Opened:
@@ -244,9 +251,23 @@ def _open(options: Options) -> _Opened:
     return _Opened(options, settled, view, folder, started, store, graph, drive)
 
 
-def _compute(opened: _Opened) -> Result:
+@contextmanager
+def _progress(opened: _Opened) -> Iterator[Progress]:
+    """Receiver of each step, as the user asks to see it."""
+    from rille.pipeline.engine import progress
+    from rille.pipeline.report import live
+
+    options, page = opened.options, opened.folder / "live.html"
+    shown = progress.make(options.progress, verbose=options.verbose)
+    if options.live:
+        print(f"rille: progress is in {page}", file=sys.stderr)
+    with live.page(shown, page if options.live else None) as told:
+        yield told
+
+
+def _compute(opened: _Opened, shown: Progress) -> Result:
     """Bring every task to its artifact; raise the first failure unless the data are its cause and poses are there."""
-    from rille.pipeline.engine import progress, scheduler
+    from rille.pipeline.engine import scheduler
     from rille.pipeline.engine.memory import limits
     from rille.pipeline.runs import roots
 
@@ -261,7 +282,7 @@ def _compute(opened: _Opened) -> Result:
             keep_going=options.keep_going,
             force=options.force,
             ledger=opened.folder / "ledger.jsonl",
-            progress=progress.make(options.progress, verbose=options.verbose),
+            progress=shown,
             memory_limit=None if options.memory_limit is None else limits.parse(options.memory_limit),
             survey=lambda: lay_out(view.sequence, view.config, view.frames),
         ),
@@ -272,8 +293,8 @@ def _compute(opened: _Opened) -> Result:
     return result
 
 
-def _write(opened: _Opened, result: Result, made: run_files.Made) -> list[str]:
-    """Write everything that the run leaves, nothing of it where an artifact was found damaged; give what is undrawn."""
+def _write(opened: _Opened, result: Result, made: run_files.Made) -> Items:
+    """Write everything that the run leaves, nothing of it where an artifact was found damaged; give what is missing."""
     from rille.pipeline.engine import events
     from rille.pipeline.runs import run_files
 
@@ -285,13 +306,13 @@ def _write(opened: _Opened, result: Result, made: run_files.Made) -> list[str]:
         )
     whole = opened.late(tasks=run_files.task_rows(opened.graph, opened.store), seconds=result.seconds)
     try:
-        undrawn = run_files.write(opened.folder, whole, made, opened.store)
+        missing = run_files.write(opened.folder, whole, made, opened.store)
         total = (datetime.now(UTC) - opened.started).total_seconds()
         events.add_facts(opened.folder / "ledger.jsonl", total=total)
     except (DamagedError, GoneError):
         shutil.rmtree(opened.folder)
         raise
-    return undrawn
+    return missing
 
 
 def lay_out(sequence: Sequence, config: Any, frames: tuple[int, ...]) -> Graph:
@@ -310,20 +331,6 @@ def _outcome(opened: _Opened) -> int:
     outcome, stops = opened.drive.outcome(), opened.drive.driven.stops
     print(f"{': '.join(word for word in outcome if word)}  ({len(stops)} stops)")
     return COMPLETE if outcome[0] == "goal" else HOLES
-
-
-def _posed_all(products: Products) -> int:
-    """Exit code of a run without failures: frames without a pose in the world are holes, too, and said on stderr."""
-    handle = products.trajectory
-    if handle is None or handle.ref is None:
-        return COMPLETE
-    meta = handle.ref.meta
-    posed, total = meta["posed"], len(meta["frames"])
-    if meta["in_world"] == total:
-        return COMPLETE
-    pieces = f", {meta['in_world']} in the world, in {len(meta['pieces'])} pieces" if posed > meta["in_world"] else ""
-    print(f"rille: incomplete: {posed} of {total} frames posed{pieces}; see the warnings", file=sys.stderr)
-    return HOLES
 
 
 def _all_read(opened: _Opened, arrived: int) -> int:
@@ -395,12 +402,3 @@ def _point_latest(folder: Path) -> None:
     link = folder.parent / f".latest-{os.getpid()}"
     link.symlink_to(folder.name, target_is_directory=True)
     link.replace(folder.parent / "latest")
-
-
-def _list_missing(graph: Graph, folder: Path) -> None:
-    """Say on stderr what is missing and why: failures in full, what was skipped for them counted."""
-    failed = [h for h in graph.nodes if h.status == "failed"]
-    skipped = [h for h in graph.nodes if h.status == "skipped"]
-    for h in failed:
-        print(f"rille: missing {h.label}: {' '.join(str(h.error).split())}", file=sys.stderr)
-    print(f"rille: {len(failed)} failed, {len(skipped)} left out; ledger: {folder / 'ledger.jsonl'}", file=sys.stderr)

@@ -44,11 +44,11 @@ def test_reconstruct(place: Place, name: str, frames: int) -> None:
     sequence = {"mockup": "mockup-short"}.get(name, name)
     first, second = place.said[name], place.said[f"{name} again"]
     assert (first.status, second.status) == (0, 0), first.err + second.err
-    made = re.fullmatch(rf"(runs/{sequence}/{RUN_ID})  computed (\d+), cached (\d+), missing 0", first.last)
+    made = re.fullmatch(rf"(runs/{sequence}/{RUN_ID})/report.html  computed (\d+), cached (\d+), missing 0", first.last)
     assert made, first.last
     folder, total = place.folder / made[1], int(made[2]) + int(made[3])
     again = place.runs(sequence)[-1]
-    assert second.last == f"runs/{sequence}/{again.name}  computed 0, cached {total}, missing 0"
+    assert second.last == f"runs/{sequence}/{again.name}/report.html  computed 0, cached {total}, missing 0"
     assert (folder.parent / "latest").resolve() == again
     assert {p.name for p in folder.iterdir()} >= RECONSTRUCTED
     poses = [line for line in (folder / "trajectory.tum").read_text().splitlines() if not line.startswith("#")]
@@ -75,8 +75,8 @@ def test_drive(place: Place) -> None:
     assert (first.status, second.status) == (0, 0), first.err + second.err
     assert re.fullmatch(r"goal: \d+ mm from the goal  \(\d+ stops?\)", first.lines[-2])
     assert first.lines[-2] == second.lines[-2]
-    assert re.fullmatch(rf"runs/mockup-loop/{RUN_ID}  computed \d+, cached 0, missing 0", first.last)
-    assert re.fullmatch(rf"runs/mockup-loop/{RUN_ID}  computed 0, cached \d+, missing 0", second.last)
+    assert re.fullmatch(rf"runs/mockup-loop/{RUN_ID}/report.html  computed \d+, cached 0, missing 0", first.last)
+    assert re.fullmatch(rf"runs/mockup-loop/{RUN_ID}/report.html  computed 0, cached \d+, missing 0", second.last)
     folder, again = place.runs("mockup-loop")
     assert {p.name for p in folder.iterdir()} == {p.name for p in again.iterdir()}
     assert {p.name for p in folder.iterdir()} >= {"report.html", "report.json", "config.toml", "ledger.jsonl"}

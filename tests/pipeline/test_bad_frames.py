@@ -95,7 +95,7 @@ def test_a_bad_frame_is_lost_named_and_bridged(
     assert code == session.HOLES
     assert says in err
     assert f"bridged from {frame - 1} to {frame + 1}" in err
-    assert "incomplete: 7 of 8 frames posed" in err
+    assert f"missing: 1 of 8 frames have no pose: frame {frame}" in err
     at = positions(folder)
     assert np.isnan(at[frame]).all()
     assert np.isfinite(np.delete(at, frame, axis=0)).all()
@@ -140,7 +140,7 @@ def test_a_break_makes_pieces_and_the_world_of_the_largest(place: Path, capsys: 
     code, err, folder = reconstruct(place, "broken", elsewhere, capsys)
     assert code == session.HOLES
     assert "piece 1: frames 0-4, piece 2: frames 5-7" in err
-    assert "incomplete: 8 of 8 frames posed, 5 in the world, in 2 pieces" in err
+    assert "missing: 3 of 8 frames have a pose in another piece of the trajectory, not in the world: frames 5-7" in err
     report = json.loads((folder / "report.json").read_text())
     assert report["metrics"]["frames_posed"]["value"] == 8
     assert report["metrics"]["frames_in_world"]["value"] == 5

@@ -158,7 +158,7 @@ def test_a_figure_that_cannot_be_drawn_is_missing(
     monkeypatch.setattr(Figure, "from_dict", lambda d: made if d["title"] == "Seams" else Figure(d["title"]))
     assert session.reconstruct(options(cold)) == 3
     told = capsys.readouterr()
-    assert "rille: missing figure Seams: drawing failed, ZeroDivisionError" in told.err
+    assert "rille: missing: Seams: drawing failed, ZeroDivisionError" in told.err
     assert told.out.rstrip().endswith("missing 1")
     assert not json.loads((latest(cold) / "report.json").read_text())["complete"]
 
