@@ -159,8 +159,12 @@ def test_a_figure_that_cannot_be_drawn_is_missing(
     assert session.reconstruct(options(cold)) == 3
     told = capsys.readouterr()
     assert "rille: missing: Seams: drawing failed, ZeroDivisionError" in told.err
-    assert told.out.rstrip().endswith("missing 1")
-    assert not json.loads((latest(cold) / "report.json").read_text())["complete"]
+    found = json.loads((latest(cold) / "report.json").read_text())
+    assert not found["complete"]
+    assert told.out.endswith(f"missing {len(found['missing'])}\n")
+    assert [line for line in told.err.splitlines() if line.startswith("rille: missing: ")] == [
+        f"rille: missing: {m['what']}: {m['why']}" for m in found["missing"]
+    ]
 
 
 def test_one_risk_parameter_reruns_risk_path_and_what_reads_them(cold: Path) -> None:
