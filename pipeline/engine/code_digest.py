@@ -64,6 +64,7 @@ class _Memory:
         """Best effort, as all hints are."""
         if self.path is None or not self.new:
             return
+        # Each edit adds an entry: without this the file would grow with every save of every module.
         if len(self.known) > FORGET * len(self.used):
             self.known = {name: self.known[name] for name in self.used}
         with suppress(OSError):
@@ -148,6 +149,7 @@ def _reachable(module: str, packages: tuple[str, ...]) -> tuple[tuple[str, str],
         source = _read(name, path)
         found[name] = source.sha256
         queue += source.imports
+        # Importing a module runs the __init__ of every package above it.
         queue += _parents(name)
     return tuple(sorted(found.items()))
 
@@ -184,6 +186,7 @@ def _read(name: str, path: Path) -> _Source:
     _memory.used.add(known)
     if known not in _memory.known:
         tree = _Strip().visit(ast.parse(data))
+        # Relative imports count from the package: of an __init__ that is the module itself.
         package = name if path.name == "__init__.py" else name.rpartition(".")[0]
         text = hashlib.sha256(ast.dump(tree).encode()).hexdigest()
         _memory.known[known] = [text, sorted(set(_imports(tree, package)))]

@@ -18,6 +18,7 @@ class Ledger:
         self._file: TextIO | None = None
         if path is not None:
             path.parent.mkdir(parents=True, exist_ok=True)
+            # Line by line: what a killed run had done by then is in the file.
             self._file = path.open("w", encoding="utf-8", buffering=1)
 
     def write(self, handle: Handle) -> None:

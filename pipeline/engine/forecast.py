@@ -100,6 +100,7 @@ class Forecast:
             tally = self.tallies[name]
             mean = tally.seconds / tally.computed if tally.computed else pace * before
             to_come = max(self.known[name], self.at_first[name] + int(share * self.opened + 0.01)) - tally.ended
+            # One is added so that a kind of which nothing was computed yet is not taken to be all in the cache.
             missed = (tally.computed + 1) / (tally.computed + tally.found + 1)
             work += max(0.0, to_come) * missed * mean
             compiling += cold * first if to_come > 0 and not tally.computed else 0.0
@@ -114,6 +115,7 @@ class Forecast:
                 ratios.append((tally.seconds / before, math.sqrt(before)))
         half = sum(weight for _, weight in ratios) / 2
         for ratio, weight in sorted(ratios):
+            # Weighed median: stops at the ratio where half of the weight is passed.
             half -= weight
             if half <= 0:
                 return ratio

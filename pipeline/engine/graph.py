@@ -207,6 +207,7 @@ class Graph:
         if not any(isinstance(part, Flow) for part in parts):
             self.expansions.append((parts, resume, True))
             return
+        # Waits for one flow after the other: the last to end wakes this one, whichever it is.
         behind = next((part for part in parts if not part.done), None)
         if behind is not None:
             behind.followers.append(lambda: self._wait(flow, wanted))

@@ -29,6 +29,7 @@ def canonical(value: Any, where: str = "value") -> Any:
     TypeError
         A part of the value has no canonical form; the message names the place.
     """
+    # By type, not isinstance: an enumeration is an int or str, too, and would share the digest of its value.
     if value is None or isinstance(value, bool) or type(value) is str or type(value) is int:
         return value
     if isinstance(value, float):

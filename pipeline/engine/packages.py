@@ -109,6 +109,8 @@ def _blas(package: str) -> str:
     spec = importlib.util.find_spec(package)
     for root in map(Path, (spec and spec.submodule_search_locations) or ()):
         for path in (*root.parent.glob(f"{package}.libs/*openblas*"), *root.glob(".dylibs/*openblas*")):
+            # Asked of the library itself: the choice depends on the processor and OPENBLAS_CORETYPE, and no package
+            # tells it.
             library = ctypes.CDLL(str(path))  # the one that the package has loaded, or will
             for name in CORE_NAMES:
                 if hasattr(library, name):

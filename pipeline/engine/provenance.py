@@ -63,7 +63,10 @@ class Known:
         if not earlier:
             return "never computed" if not keys else "earlier artifacts are gone"
         now = {**recipe, "params": recipe["params"].model_dump(mode="json")}
+        # Through JSON, as the stored recipe went: tuples become lists, which would differ otherwise.
         now = json.loads(json.dumps(now))
+        # The nearest of the earlier ones: a user who goes back to former settings is told what is new, not what was
+        # undone.
         found = min((differences(then, now) for then in earlier), key=len)
         told = found[:SHOWN] + ([f"and {len(found) - SHOWN} more"] if len(found) > SHOWN else [])
         return "; ".join(told) or "the key has another format"

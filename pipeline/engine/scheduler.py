@@ -275,6 +275,7 @@ class _Run:
                 heapq.heappush(self.ready, handle.index)
             else:
                 self._chain(handle)
+        # The graph grows while it runs: both lists are taken up from where the last look ended.
         self.expansions += self.graph.expansions[self.expanded :]
         self.expanded = len(self.graph.expansions)
 
@@ -456,6 +457,7 @@ class _Run:
     def _look_ahead(self) -> Graph:
         """The graph laid out anew and looked up, by what this run's survey of the store has found."""
         ahead = Graph() if self.options.survey is None else self.options.survey()
+        # A run that looks up only, by the same code: what it foresees is what will be done.
         dry = _Run(ahead, self.store, RunOptions(force=self.force, dry=True))
         dry._settle()
         dry._leave_out()
@@ -466,6 +468,7 @@ class _Run:
         self.warm.add(first.stage)
         if isinstance(outcome, Failed) and self._heal(first, outcome.error):
             return
+        # Two labels may have one key (equal parameters and inputs): it is computed once, and both get it.
         others = [h for h in self.flying.pop(key, ()) if h is not first and h.index not in self.out]
         if not isinstance(outcome, Failed) and first.ref is not None and first.ref.digest != outcome.ref.digest:
             error = NonDeterministicError(

@@ -111,6 +111,7 @@ def resolve(module: str) -> Stage:
     guard()
     stage = importlib.import_module(module).STAGE
     if "cv2" in sys.modules:
+        # OpenCV takes a thread a core by default, and there is a worker for each core already.
         sys.modules["cv2"].setNumThreads(1)
     if not isinstance(stage, Stage):
         raise TypeError(f"{module}.STAGE is a {type(stage).__name__}, not a Stage")
@@ -163,6 +164,7 @@ def ensure(root: Path | str, spec: Spec, refs: Refs, *, key: str | None = None, 
     output (``OSError``, ``TimeoutError``) are tried three times; what a stage raises otherwise is not tried again.
     """
     begin, started = time.perf_counter(), time.time()
+    # Computed here as well, from this process's own source files: the client's may be newer.
     own = key_of(spec, refs)
     if key is not None and key != own:
         raise CodeChangedError(
@@ -185,6 +187,7 @@ def ensure(root: Path | str, spec: Spec, refs: Refs, *, key: str | None = None, 
             measured = (started, kernel, meter.memory, meter.rest, first, COMPILING.take())
             return Outcome(ref, False, seconds, _peak_rss(), *measured)
         except (OSError, TimeoutError) as error:
+            # A missing file does not appear by waiting; a network drive that stumbled recovers.
             if isinstance(error, PERMANENT) or trial == TRIES - 1:
                 raise
             time.sleep(BACK_OFF * 4**trial)
@@ -200,6 +203,7 @@ def _compute(store: Store, spec: Spec, refs: Refs, key: str) -> tuple[Ref, float
     kernel = time.perf_counter() - begin
     if not isinstance(result, Bundle):
         raise TypeError(f"{stage.name}: run gave a {type(result).__name__}, not a Bundle")
+    # Before anything is stored: a wrong dtype or shape would be found by the next stage, under this key, for ever.
     check_outputs(stage, result)
     provenance = {
         **recipe(spec, refs),

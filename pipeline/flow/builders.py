@@ -58,6 +58,7 @@ def once(make: Callable[Concatenate[Builder, P], T]) -> Callable[Concatenate[Bui
     """Method of :class:`Builder` that for the same arguments gives what it gave before."""
 
     def made(self: Builder, /, *args: P.args, **kwargs: P.kwargs) -> T:
+        # Arguments are numbers and names: equal ones mean the same task, whoever asks for it.
         name = (make.__name__, *args, *kwargs.items())
         if name not in self.made:
             self.made[name] = make(self, *args, **kwargs)
@@ -86,6 +87,7 @@ class Builder:
 
     def node(self, stage: ModuleType, label: str, args: Mapping[str, Any], **inputs: Handle | list[Handle]) -> Handle:
         """One task of the stage that a module declares, with the parameters that it has in the configuration."""
+        # A section is named as its stage; a stage without parameters has none.
         params: Params = getattr(self.config, stage.STAGE.name, NoParams())
         return self.graph.node(stage, label, params, args, {}, inputs)
 
@@ -215,6 +217,8 @@ class Builder:
         The frame of pair ``first`` is the world.
         """
         at = self.node(pose, f"pose/{pair.frame}", {"row": row}, trajectory=trajectory)
+        # Row 0 of the artifact of `pose`, which holds one: so an elevation model depends on its own pose alone, and
+        # stays in the cache when only other poses move.
         args = {"pair": pair.frame, "frame": "world", "row": 0}
         known = pair.disparity, pair.rig, pair.level, first.level
         return at, self._elevations(f"locus/world/{pair.frame}", args, *known, trajectory=at, local=pair.dem)
@@ -291,8 +295,10 @@ def merge_tiles(
             touching.setdefault((ty, tx), []).append((meta["pair"], (box[0], box[1], box[2], box[3])))
     tiles = []
     for (ty, tx), here in sorted(touching.items()):
+        # In order of the pairs: merging must not depend on the order in which results arrived.
         here.sort()
         args: dict[str, Any] = {"lattice": tile_lattice([box for _, box in here], footprints[0]["cell"]).to_dict()}
+        # Of this tile's pairs alone: a level that changes elsewhere leaves the tile in the cache.
         exposure = {str(pair): steps[str(pair)] for pair, _ in here if str(pair) in steps}
         args |= {"exposure": exposure} if exposure else {}
         tiles.append(node(merge, f"merge/{tx}_{ty}", args, dems=[dems[pair] for pair, _ in here]))

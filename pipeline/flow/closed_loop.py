@@ -221,6 +221,7 @@ class Drive:
             p.orientations[frame] = make.orientation(frame)
             p.rigs[frame], known = make.rig([frame], f"/{frame}" if self.config.rig.mode == "per_pair" else "")
         else:
+            # One rig for the drive, that of the first pair: cameras do not move against each other on the way.
             p.rigs[frame], known = p.rigs[0], self.pairs[0].rig
         pair = make.pair(frame, {"up": at.up}, known, self.pairs[0] if self.pairs else None)
         p.level[frame], p.local_dem[frame] = pair.level, pair.dem
@@ -263,6 +264,7 @@ class Drive:
             args = {"radius": self.simulation.pad, "wheel_diameter": self.config.vehicle.wheel_diameter}
             like = p.world_dem[stop.frame]
             self.pads = [make.node(start_area, "pad", args | self.mounting, pose=pose, like=like)]
+        # Two maps: of all that was seen, to plan far ahead, and of what was seen finely enough to drive on.
         stop.merged = self._merged(f"merge/{k}", None)
         p.tiles = [stop.merged]
         stop.risk = p.risk = make.hazards(f"risk/{k}", [stop.merged])
@@ -366,6 +368,7 @@ class Drive:
             frames = frames[: frames.index(end) + 1]
             stop.row = rows[end]
             if end in lost:
+                # The image at the end is lost: another one is taken from the same place, under a number of its own.
                 again = max(self.true) + 1
                 self.true[again], rows[again] = self.true[end], rows[end]
                 stop.event = f"lost image {shares}: stopped and taken again as image {again}"
@@ -393,6 +396,7 @@ class Drive:
         cut, kind, reason = safety.meta["stop"], safety.meta["kind"], safety.meta["reason"]
         for reflex in others:
             seen = reflex.meta["stop"]
+            # Whoever stopped first counts: what the other saw later was never driven.
             if seen is not None and (cut is None or seen < cut):
                 cut, kind, reason = seen, "reflex", reflex.meta["reason"]
         self.troubles = 0 if cut is None or kind == "reflex" else self.troubles + 1
@@ -410,6 +414,7 @@ class Drive:
         terminal = kind in ("attitude", "acceleration", "lost")
         if terminal or self.troubles >= self.config.drive.max_safety_stops:
             often = f", {self.troubles} legs in a row" if self.troubles > 1 else ""
+            # What was driven up to a safety stop belongs to the trajectory and to the assessment.
             if len(frames) > 1:  # else it stands where the trajectory ends already
                 self._located(len(self.driven.stops))
             raise EndedError("safety stop", reason + often)

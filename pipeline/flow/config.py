@@ -195,6 +195,7 @@ def _with_accurate_terrain(nested: dict[str, Any]) -> dict[str, Any]:
     terrain = nested.get("terrain")
     if not isinstance(terrain, Mapping) or terrain.get("preset") != "accurate":
         return nested
+    # The preset goes beneath: whatever the user gives for one of its keys wins.
     nested = merge(merge({}, ACCURATE_TERRAIN), nested)
     for section, key, value, more in AND_THEN:
         given = nested[section]
@@ -235,6 +236,7 @@ def _complaint(kind: type[Params], prefix: tuple[str, ...], error: dict[str, Any
     loc = [str(part) for part in error["loc"]]
     key = ".".join((*prefix, *loc))
     if error["type"] == "extra_forbidden":
+        # Before the guess at a misspelling: a key that was once right is no slip.
         if key in REPLACED:
             return f"{key} is a key of an earlier version: {REPLACED[key]}"
         near = difflib.get_close_matches(key, [".".join((*prefix, k)) for k in known_keys(kind)] + list(also), n=1)

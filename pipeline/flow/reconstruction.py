@@ -93,10 +93,12 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
         make.motion(a, b)
     make.orientation(whole[0])
     if make.config.crosscheck.enabled and len(whole) > 1:
+        # Order is priority: its windows take longest of all tasks, so they begin before the rest is known.
         p.crosscheck = another_program(make, whole)
 
     # Frames that the trajectory goes through, and which of them are basic pairs.
     found = yield from screened(make, whole)
+    # From here on a frame is known by its place in the chain; `frames` keep the numbers of the sequence.
     chain = list(found.meta["chain"])
     missing = [{"frame": f, "cause": why} for f, why in make.sequence.lost.items() if f in frames]
     lost = sorted([*missing, *found.meta["lost"]], key=lambda item: item["frame"])
@@ -132,11 +134,13 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
     # The world is that of the largest unbroken piece: its models, straight on the world lattice.
     start, end = posed.meta["pieces"][posed.meta["main"]]
     row = {frame: k for k, frame in enumerate(frames)}
+    # Pairs of other pieces have poses in frames of their own: nothing says where they lie in this world.
     there = [k for k in basic if start <= k <= end and posed.meta["positions"][row[k]]]
     for k in there:
         _, p.world_dem[k] = make.world_model(pairs[k], pairs[there[0]], row[k], p.trajectory)
     args = {"side": TILE_CELLS, "margin": make.config.merge.margin}
     prints = [make.node(tile_index, f"footprint/{k}", args, dem=dem) for k, dem in p.world_dem.items()]
+    # A pair whose model failed is left out of the world: the others make a map with a hole.
     laid = yield Maybe(prints)
     footprints = [ref.meta for ref in laid if ref is not None and ref.meta["tiles"]]
     if not footprints:
@@ -161,6 +165,7 @@ def steps(make: Builder, frames: list[int]) -> list[Handle]:
     if tuple(frames) not in made:
         taken = "steps/bridged" if made else "steps"
         parts = [list(part) for _, part in groupby(pairwise(frames), lambda step: step[0] // TABLE_FRAMES)]
+        # A step is judged by the one before it, also across the border of two tables.
         last = [{}, *({"before": make.motion(*part[-1])} for part in parts)]
         made[tuple(frames)] = [
             make.node(step_table, f"{taken}/{part[0][0]}", {}, motions=[make.motion(*step) for step in part], **before)
@@ -332,6 +337,7 @@ def cells_in_both(a: Series[int], b: Series[int]) -> int:
 
 def spread(pairs: list[int], most: int) -> list[int]:
     """At most so many of the pairs, evenly apart, the first among them."""
+    # Minus twice: rounds the stride up, so that no more than `most` remain.
     return pairs[:: -(-len(pairs) // most)]
 
 

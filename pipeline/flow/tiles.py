@@ -76,6 +76,7 @@ class Tiles:
     ) -> None:
         self.graph, self.params, self.images, self.side, self.label = graph, params, images, side, label
         left, right = (pyramid_shapes(s, pyramid.levels, pyramid.min_side) for s in shapes)
+        # Preset fast matches at half the resolution: the finest level is not read at all.
         if params.finest and min(len(left), len(right)) > params.finest:
             left, right = left[1:], right[1:]
         self.left = left

@@ -50,6 +50,7 @@ def set_by_user(given: Mapping[str, Any], config: Params, without: Params) -> tu
     found = []
     for section, values in given.items():
         now, then = getattr(config, section), getattr(without, section)
+        # Switched off by the user himself: then what else stands in that section is no mistake.
         off = not getattr(now, "enabled", True) and getattr(then, "enabled", False)
         for name in values if not off else ():
             key = f"{section}.{name}"
@@ -94,6 +95,8 @@ def unread(keys: Iterable[str], config: Params, graph: Graph) -> list[str]:
     """Those of the keys that no task of a complete graph reads."""
     kinds = {type(h.spec.params) for h in graph.nodes}
     read = {name for name in type(config).model_fields if type(getattr(config, name)) in kinds}
+    # Sections that reach stages as arguments, not as their parameters: the flow of a drive, the vehicle, resection in
+    # `refine`.
     read |= {"drive"} | {name for h in graph.nodes for name in h.spec.args if name in ("vehicle", "resect")}
     read |= {"tiling"} if "hfvm" in read else set()
     return [key for key in keys if key.partition(".")[0] not in read]

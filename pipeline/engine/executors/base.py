@@ -85,6 +85,7 @@ class Failed:
         """Wrap an exception; one that cannot be pickled is replaced by its words."""
         text = "".join(traceback.format_exception(error))
         try:
+            # Both ways: exceptions with arguments of their own often pickle, and fail when they are made anew.
             pickle.loads(pickle.dumps(error))
         except Exception:
             error = RuntimeError(f"{type(error).__name__}: {error}")
@@ -134,6 +135,7 @@ def known(kind: Any, jobs: int | None = None) -> None:
     ConfigError
         It is neither one of the kinds nor an address nor a ``Client`` of dask, or there are no ``jobs``.
     """
+    # A Client of dask passes: what it is, its first use tells.
     if isinstance(kind, str) and kind not in KINDS and not re.fullmatch(r"(tcp|tls)://[^/\s]+:\d+", kind):
         raise ConfigError("RIL-539", f"executor {kind!r} is unknown", remedy=f"{', '.join(KINDS)} or tcp://host:port")
     if jobs is not None and jobs < 1:

@@ -214,6 +214,7 @@ class Dask:
             else:
                 self._revive()
             self._looked = time.monotonic()
+        # A finished future is no loss: the event with its outcome is on its way.
         lost = [n for n, future in self._futures.items() if future.status not in ("pending", "finished")]
         return [(number, self._lost(number, self._futures.pop(number), len(lost) == 1)) for number in lost]
 
@@ -256,6 +257,7 @@ class Dask:
     def close(self, kill: bool = False) -> None:
         """End workers of our own, at once if ``kill``; leave others as they are."""
         within = HURRY if kill else GRACE
+        # Releases what the scheduler holds for this run; on a cluster of others it would stay.
         self._futures.clear()
         if self._cluster is None:
             with suppress(Exception):

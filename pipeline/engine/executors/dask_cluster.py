@@ -100,6 +100,7 @@ def examine(client: Any, cache: Location) -> None:
     names = [token, *(f"{token}-{short}" for short in workers.values())]
     try:
         write_probe(store, token)
+        # One at a time, so that a refusal names the worker.
         for address, short in workers.items():
             told = client.run(introduce, cache, token, short, workers=[address], on_error="return").get(address)
             if told is not None:  # None is one that has left meanwhile
@@ -162,6 +163,7 @@ class Presence:
         try:
             threads = sum(self._client.sync(self._client.scheduler.ncores, callback_timeout=SILENCE / 2).values())
         except Exception as error:
+            # One question without an answer is a busy scheduler; only a long silence is a lost one.
             if self._client.status in ("closing", "closed") or time.monotonic() - self._answered > SILENCE:
                 raise self.gone() from error
             return 0

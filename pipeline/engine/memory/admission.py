@@ -66,6 +66,7 @@ def account(costs: Costs, limit: float | None, executor: Any, jobs: int, largest
     if executor != "dask":
         return Account(limit, own, 0.0, 1 if executor == "inline" else jobs)
     rest = costs.rest
+    # Workers hold memory between tasks too: fewer of them leave room for the one task that needs it.
     fit = int((limit - own - largest) // rest)
     return Account(limit, own, rest, max(1, min(jobs, fit)))
 
@@ -91,6 +92,7 @@ class Admission:
 
     def fits(self, handle: Handle) -> bool:
         """Whether a task may begin now; alone it always may."""
+        # Alone it may begin whatever the look says: waiting would free nothing.
         if not self._running:
             return True
         most = self.foresee(handle).most
@@ -206,6 +208,7 @@ class Waiting:
                 heapq.heappop(self._heaps[stage])
                 del self._nodes[index]
                 return handle
+            # From now on nothing passes: what runs ends, and makes room for the one that waits.
             if self._passed >= PATIENCE:
                 return None
         return None

@@ -172,6 +172,7 @@ def _joined(groups: list[Group]) -> Group | None:
 
 def _at(samples: list[tuple[float, float]], size: float) -> tuple[float, float]:
     """Value at a size, and its relative uncertainty, of samples ``(size, value)``."""
+    # Like sizes first: cost is seldom a straight line over a wide range of sizes.
     near = [y for x, y in samples if x == size or (x and size and 1 / LIKE <= x / size <= LIKE)]
     if near:
         middle = median(near)

@@ -95,6 +95,7 @@ def _chain(base: Path, path: str, names: tuple[str, str, str]) -> Iterator[tuple
     """The group and all around it; a container may see its own group at the mount itself."""
     group = base / path.lstrip("/")
     for folder in dict.fromkeys([group, *group.parents]):
+        # Within the mount only: above it other files of these names would mean something else.
         if folder != base and base not in folder.parents:
             return
         with suppress(OSError, ValueError):  # "max" is no number: no limit

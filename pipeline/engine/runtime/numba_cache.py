@@ -164,6 +164,7 @@ class _Finder(importlib.abc.MetaPathFinder):
         if spec is not None and spec.loader is not None:
             run = spec.loader.exec_module
 
+            # Patched right behind the import of the dispatcher, before the first decorator of numba can run.
             def run_and_patch(module: ModuleType) -> None:
                 run(module)
                 _patch(module)
@@ -186,6 +187,7 @@ class _Locator:
         return cls(function, file) if _is_own(function) else None
 
     def ensure_cache_path(self) -> None:
+        # For this user alone: whoever writes here runs code when a kernel is loaded.
         folder().mkdir(mode=0o700, exist_ok=True)
 
     def get_cache_path(self) -> str:

@@ -23,6 +23,7 @@ def private_folder() -> Path:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             path.mkdir(mode=0o700, exist_ok=True)
+            # Looked at after it was made: a folder that somebody else prepared under this name is passed over.
             if _is_private(path) and os.access(path, os.W_OK | os.X_OK):
                 return path
         except OSError:

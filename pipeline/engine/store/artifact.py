@@ -44,6 +44,7 @@ def _array_digest(name: str, array: AnyArray) -> str:
     little = array.dtype.newbyteorder("<")
     plain = np.ascontiguousarray(array, dtype=little)
     if array.dtype.kind == "f" and np.isnan(plain).any():
+        # NaN has millions of bit patterns, and processors choose differently among them.
         plain = np.where(np.isnan(plain), little.type(np.nan), plain)
     total = hashlib.sha256(f"{little.str} {array.shape}\0".encode())
     total.update(plain.data)

@@ -219,6 +219,7 @@ class Store:
         }
         pieces = pack(manifest, files)
         path = artifact_path(stage.name, key)
+        # Another process may publish, damage or remove the same artifact between any two of these steps.
         for _ in range(3):
             if self.place.create(path, pieces):
                 return reference(manifest)

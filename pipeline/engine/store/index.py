@@ -95,6 +95,7 @@ class Index:
 
     def note(self, used: Mapping[str, Ref]) -> None:
         """Write what a run used, unless an index says so that is young."""
+        # Lines of the survey are still right: whatever was looked up through them had its mark compared.
         known = {key: self.lines[key] for key in used if key in self.lines}
         if len(known) < len(used):
             # The artifacts of this run came after the survey at its start.

@@ -37,6 +37,7 @@ def locate(given: Path | str) -> Location:
     parts = urlsplit(text)
     if parts.scheme != "s3":
         raise ConfigError("RIL-546", f"a cache at {parts.scheme}:// is not supported", remedy=remedy)
+    # A password in the address would end up in ledgers, logs and process lists.
     if "@" in parts.netloc or parts.query or parts.fragment:
         raise ConfigError("RIL-547", "the URL of the cache has more than bucket and prefix", remedy=remedy)
     prefix = "/".join(p for p in parts.path.split("/") if p)

@@ -100,6 +100,7 @@ def gc(store: Store, keep: Collection[str], *, grace: float = GRACE, dry_run: bo
     bucket are by the server's clock against this machine's: keep the grace well above their difference.
     """
     limit, cleared, doomed = time.time() - grace, Cleared(), []
+    # Of a run whose folder is gone, or of another machine, the index alone tells what it used.
     kept = set(keep) | index.used_since(store.place, limit)
     for item in store.place.list(""):
         if item.modified > limit:

@@ -71,6 +71,7 @@ def pack(manifest: Manifest, files: Mapping[str, bytes]) -> tuple[bytes, bytes]:
     archive = io.BytesIO()
     with zipfile.ZipFile(archive, "w", zipfile.ZIP_STORED) as written:
         for name, data in files.items():
+            # ZipInfo has the fixed date 1980-01-01: with the time of writing equal results would make unequal files.
             written.writestr(zipfile.ZipInfo(name), data)
     starts = {m.filename: m.header_offset + len(m.FileHeader()) for m in written.infolist()}
     content = archive.getvalue()
@@ -99,6 +100,7 @@ def length(data: bytes) -> int:
 def unframe(line: bytes) -> Manifest:
     """Raises ValueError where it is not what was written."""
     body = line[_HEAD_SIZE : -len(_END)]
+    # The whole line is made anew and compared, so that there is no byte of it that nothing checks.
     if line != _HEAD % (google_crc32c.value(body), len(body)) + body + _END:
         raise ValueError("the manifest is damaged")
     manifest = _sound(parsed(body))

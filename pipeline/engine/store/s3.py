@@ -101,6 +101,7 @@ class Bucket:
         """Read an object, or a range of it."""
         import obstore
 
+        # A range of HTTP cannot be empty.
         if start == stop:
             return b""
 
