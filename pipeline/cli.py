@@ -311,16 +311,19 @@ def main(argv: list[str] | None = None) -> None:
     """Entry point of ``rille``."""
     with plain_output():
         code = _run(argv)
+        # Here, where a reader that has gone is still an exception: at exit Python would print a traceback.
         sys.stdout.flush()
     sys.exit(code)
 
 
 def _run(argv: list[str] | None) -> int:
     tokens = list(sys.argv[1:] if argv is None else argv)
+    # Asked of the words, not of the command: an error may come before its options are known.
     debug = "--debug" in tokens
     try:
         console = Console(file=raw(sys.stdout))  # of the help, which has colours
         code = app(tokens, console=console, exit_on_error=False, print_error=False, result_action="return_value")
+        # --help and --version give no code.
         return code if isinstance(code, int) else COMPLETE
     except KeyboardInterrupt:
         print("rille: interrupted; the same command resumes from here", file=sys.stderr)

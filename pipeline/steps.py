@@ -375,6 +375,7 @@ def _computed(handle: Handle, known: Known, drawn: dict[str, Bundle]) -> Bundle:
     """Result of a task; of those that it needs what is ``known``, or an image that was ``drawn`` before, is taken."""
     if handle in known:
         return known[handle]
+    # Images are kept: left and right of one pair, and every step of it, ask for them again.
     spec, recorded = handle.spec, handle.spec.module.startswith("rille.datasets.")
     if recorded and handle.label in drawn:
         return drawn[handle.label]
@@ -405,6 +406,7 @@ def _merged(data: xarray.Dataset, *more: Settings) -> dict[str, Any]:
     from rille.pipeline.flow import config
 
     settings: dict[str, Any] = {}
+    # What the step before was given goes before what suits the sequence, and what is given now before both.
     for layer in (*more[:-1], _settings(data), more[-1]):
         config.merge(settings, layer)
     return settings

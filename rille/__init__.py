@@ -33,5 +33,6 @@ if not (_HERE / "stages").is_dir():  # a checkout: the packages lie beside this 
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module {__name__} has no attribute {name}")
+    # Loaded at first use: `import rille` must not import NumPy before threads are set.
     home = "api" if name in ("Run", "open_run", "reconstruct") else "steps"
     return getattr(import_module(f"rille.pipeline.{home}"), name)

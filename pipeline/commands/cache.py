@@ -47,6 +47,7 @@ def gc(
     from rille.stages.core.errors import ConfigError
 
     store = at(cache_folder(cache))
+    # Before any key is gathered: artifacts of runs that cannot be seen from here would count as unused.
     roots.check_all_seen(store)
     ledgers = [path for folder in roots.folders(store, runs) for path in folder.glob(f"*/*/{lookup.LEDGER}")]
     kept = pins.keys(store).union(*map(events.keys, ledgers))

@@ -131,6 +131,7 @@ def find_boards(pairs: Sequence[pairing.ImagePair], corners: tuple[int, int] | N
     """
     images = {p.name: [chessboard.eight_bit(read_grey(f)) for f in (p.left, p.right)] for p in pairs}
     sizes = Counter((i.shape[1], i.shape[0]) for both in images.values() for i in both)
+    # One picture of another size is a slip; the others still calibrate.
     size = max(sizes, key=lambda s: (sizes[s], s))
     fit = {n: both for n, both in images.items() if all((i.shape[1], i.shape[0]) == size for i in both)}
     if corners is None:
@@ -152,6 +153,7 @@ def find_boards(pairs: Sequence[pairing.ImagePair], corners: tuple[int, int] | N
 def _refuse_clutter(found: RigCalibration, boards: Boards) -> None:
     grids = [p.reshape(boards.corners[1], boards.corners[0], 2) for v in boards.views for p in (v.left, v.right)]
     spacing = float(np.median([np.linalg.norm(np.diff(g, axis=1), axis=-1) for g in grids]))
+    # Relative to the spacing: it holds for any resolution and distance of the board.
     if found.rms > NO_BOARD * spacing:
         columns, rows = boards.corners
         raise InputError(
@@ -193,6 +195,7 @@ def doubts(found: RigCalibration, boards: Boards, model: str) -> list[str]:
             if found.sigma[f"{side} {name}"] > max(abs(value), 0.1) and name not in ("p1", "p2")
         ]
         if vague:
+            # A model with fewer terms, which these views may determine.
             fewer = "radtan" if model == "rational" else "radtan4"
             text = f"{side} {', '.join(vague)} cannot be told from 0 with these views; try --model {fewer}"
             lines.append(warning("RIL-699", text))
@@ -236,6 +239,7 @@ def _value(lens: Any, name: str, model: str) -> float:
 
 def _yaml(found: RigCalibration, boards: Boards, square: float, model: str) -> str:
     """The file's text: keys as OpenCV's stereo samples have them, then how it was found."""
+    # In memory: the file is written by Python, whose errors say what is wrong.
     file = cv2.FileStorage("rig.yaml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
     file.write("image_width", boards.size[0])
     file.write("image_height", boards.size[1])

@@ -88,7 +88,9 @@ def check(
     inspection = Inspection(Builder(graph, sequence, config), chosen, store)
     path = output if output is not None else Path(f"{sequence.name}-check.png")
     graph.flow(inspection.steps())
+    # In this process: workers would take longer to start than most of this takes.
     result = scheduler.run(graph, store, scheduler.RunOptions(executor="inline", keep_going=True))
+    # What a stage refuses is a finding, said by then; any other failure is one of the program.
     Result(failures=[f for f in result.failures if not (f.stage and isinstance(f.error, RilleError))]).check()
     found = inspection.found
     if inspection.match is not None and len(inspection.match.left):
@@ -234,6 +236,7 @@ class Inspection:
     def _motions(self) -> Steps:
         """Overlap of some successive left images."""
         pairs = list(pairwise(self.frames))
+        # Evenly over the sequence, so that a fault of its second half is found as well.
         chosen = sorted({int(k) for k in np.linspace(0, len(pairs) - 1, MOST_MOTIONS).round()}) if pairs else []
         whole = [pairs[k] for k in chosen if not any((frame, "left") in self.broken for frame in pairs[k])]
         tasks = {(a, b): self.make.motion(a, b) for a, b in whole}
@@ -246,6 +249,7 @@ class Inspection:
     def _simultaneous(self) -> Steps:
         """Rows of some pairs over the whole sequence, with the right images as named and shifted in time."""
         last = max(self.frames)
+        # Frames whose right images exist for every shift: else a shift would be judged by other frames.
         inner = [k for k in self.frames if k - 2 >= 0 and k + 2 <= last]
         chosen = sorted({inner[int(k)] for k in np.linspace(0, len(inner) - 1, MOST_PAIRS).round()}) if inner else []
         spreads: dict[int, list[float | None]] = {shift: [] for shift in synchrony.SHIFTS}
@@ -290,6 +294,7 @@ def draw(path: Path, name: str, frame: str, match: Match) -> None:
     from matplotlib.figure import Figure
 
     used = match.weight > 0 if (match.weight > 0).any() else np.ones(len(match.left), bool)
+    # Scaled by the bulk, not by the worst match: a few outliers would wash all the others out.
     limit = max(0.5, float(np.percentile(np.abs(match.residual[used]), 98)))
     shades = {"c": match.residual[used], "s": 9, "cmap": "coolwarm", "vmin": -limit, "vmax": limit, "linewidths": 0}
     shown = match.image.astype(np.float32)

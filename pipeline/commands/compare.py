@@ -29,6 +29,7 @@ def compare(a: Path, b: Path, output: Path) -> int:
     """
     reports = [_report(run) for run in (a, b)]
     settings = [_flat(tomllib.loads((run / "config.toml").read_text(encoding="utf-8"))) for run in (a, b)]
+    # Before anything is printed: where the picture cannot be written there is one line, and no half of a comparison.
     terrain = _elevations(a, b, output)
     print(f"A {lookup.name(a)}\nB {lookup.name(b)}")
     for line in (*_parameters(*settings), *_tasks(a, b), *_figures(*reports), _positions(a, b), terrain):
@@ -83,6 +84,7 @@ def _figures(a: Mapping[str, Any], b: Mapping[str, Any]) -> Iterator[str]:
     both = [name for name in one if name in other and name != "wall_clock"]
     differ = [name for name in both if one[name]["value"] != other[name]["value"]]
     shown = {name: [quantity(m[name]["value"], m[name]["unit"]) for m in (one, other)] for name in differ}
+    # What differs only beyond the digits shown would read as "12.3 -> 12.3".
     seen = [name for name, (before, after) in shown.items() if before != after]
     equal = f"{len(both) - len(differ)} equal, {len(differ) - len(seen)} equal to three digits"
     yield f"figures       {equal}, {len(seen)} differ"

@@ -43,6 +43,7 @@ def compare(path_a: Path, path_b: Path, *, align: str = "none", output: Path = P
         warn(line)
     found, error, slope, distance = measure(a, b, align)
     _print(found)
+    # Either ending is understood as the name of both files.
     target = output.with_name(output.name.removesuffix(".png").removesuffix(".json"))
     try:
         atomic.write(target.with_name(target.name + ".json"), json.dumps(found, indent=1, allow_nan=False) + "\n")
@@ -91,6 +92,7 @@ def _crs_name(wkt: str) -> str:
 
 
 def _grid(raster: DemFile) -> Grid:
+    # A raster's transform gives the corners of its cells, the comparison wants their centres.
     t = raster.transform @ Affine.translation(0.5, 0.5)
     return Grid(raster.values, np.array([[t.a, t.b, t.c], [t.d, t.e, t.f]]))
 
@@ -129,6 +131,7 @@ def measure(a: DemFile, b: DemFile, kind: str = "none") -> tuple[dict[str, Any],
     distance = _range(on_b, a, b, found)
     if distance is not None:
         far = float(np.nanmax(np.where(np.isfinite(error), distance, np.nan)))
+        # Bins are open at their upper end: a hair more keeps the farthest cell in the last one.
         edges = np.linspace(0.0, far * (1.0 + 1e-9), RANGES + 1)
         found["by_range"] |= {"bins": binned(error, distance, edges)}
     return found, error, slope, distance

@@ -60,6 +60,7 @@ def export_dataset(
         )
     place = cache_folder(cache)
     store = at(place)
+    # Before minutes of rendering.
     store.writable()
 
     def artifact(source: Source) -> Ref:  # rendering is cached like any other work

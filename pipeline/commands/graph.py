@@ -63,6 +63,8 @@ def svg(names: Names, edges: Edges) -> str:
     """A drawing: each name in the row behind all that it reads and that was created before it."""
     rows: dict[str, int] = {}
     for name in names:
+        # A stage that reads itself through others (`locus` by `pose`) stays where it was first created: its loop is
+        # drawn upwards.
         rows[name] = 1 + max((rows[a] for a, b in edges if b == name and a in rows), default=-1)
     filled, places = Counter[int](), {}
     for name, row in rows.items():

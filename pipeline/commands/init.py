@@ -52,6 +52,7 @@ def init(directory: Path, output: Path | None = None, force: bool = False) -> in
         raise ConfigError(
             "RIL-038", f"{path} exists", remedy="name another file by --output, or overwrite it by --force"
         )
+    # Written whether complete or not: what is missing stands in it as comments, at its place.
     text = manifest_text(found, _root(directory, path))
     try:
         path.write_text(text, encoding="utf-8")
@@ -74,6 +75,7 @@ def init(directory: Path, output: Path | None = None, force: bool = False) -> in
 def _root(directory: Path, path: Path) -> str:
     """The folder as seen from the manifest: relative where the manifest lies in or beside it."""
     relative = os.path.relpath(directory.resolve(), path.resolve().parent)
+    # Two folders up and more, a relative path breaks as soon as either is moved.
     return str(directory.resolve()) if relative.startswith(os.path.join("..", "..")) else Path(relative).as_posix()
 
 

@@ -74,6 +74,7 @@ def match_files(
 
     if confidence is not None and confidence.resolve() == output.resolve():
         raise ConfigError("RIL-043", f"--confidence and --output are both {output}", remedy="give them two names")
+    # Images and the prior are checked before the matcher is imported, which takes seconds.
     images = read_grey(left), read_grey(right)
     given = _prior(prior, images[0].shape) if prior is not None else None
 
@@ -116,6 +117,7 @@ def warnings(found: Disparity, left: NDArray[Any], right: NDArray[Any]) -> list[
             (Validity.OVER_THRESHOLD, "look like nothing in the right image"),
             (Validity.SPECKLE, "lie in isolated patches"),
         )
+        # The two most frequent reasons: they tell a user whether the light, the order or the scene is at fault.
         shares = sorted(((float(has(found.validity, bit).mean()), words) for bit, words in reasons), reverse=True)
         told = ", ".join(f"{100 * s:.0f} % {words}" for s, words in shares[:2] if s >= 0.005)
         text = f"only {100 * share:.1f} % of the pixels match ({told}): do both images show one scene in one light?"
@@ -163,6 +165,7 @@ def matcher_params(preset: str | None, assignments: tuple[str, ...]) -> Any:
     """Parameters of the matcher from ``--preset`` and ``--set hfvm.key=value``."""
     nested = configuration.parse_assignments(assignments)
     if set(nested) - {"hfvm"}:
+        # Refused, not passed over: nothing here reads another section.
         other = next(k for k in nested if k != "hfvm")
         raise ConfigError(
             "RIL-046", f"--set {other}: match has the section hfvm only", remedy="write --set hfvm.key=value"

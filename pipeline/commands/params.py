@@ -92,4 +92,5 @@ def _permitted(field: FieldInfo) -> str:
 
 def _kinds(annotation: Any) -> Iterable[Any]:
     """An annotation, and the members of a union."""
+    # The union of a choice with None has its Literal one level down.
     return (annotation, *get_args(annotation))

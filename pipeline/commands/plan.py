@@ -58,6 +58,7 @@ def plan(options: Options, *, verbose: bool = False) -> int:
     graph.last = outputs
     result = scheduler.run(graph, store, scheduler.RunOptions(dry=True, force=options.force))
     result.check()
+    # A parameter may be read by tasks that are not known yet.
     lost = [] if result.unknown else unread.unread(settled.given, config, graph)
     if lost:
         told = f"{unread.values(lost, config)}: no task of this run reads it"
@@ -71,6 +72,7 @@ def plan(options: Options, *, verbose: bool = False) -> int:
     shares = account(known, limit, options.executor, jobs, largest(graph, known))
     for line in needs(graph, known, shares):
         print(line)
+    # Last, so that the table stands above the refusal and shows which task it is.
     Admission(known, shares, automatic=limit is None).check(graph)
     return 0
 
@@ -90,6 +92,7 @@ def needs(graph: Graph, known: Costs, shares: Account) -> Iterable[str]:
         sources = dict.fromkeys(f.source for f in tasks)
         yield f"{stage:19s} {need:>20s} {words(sum(f.stored for f in tasks)):>16s}  {'; '.join(sources)}"
     together = sorted((f.most for f in foreseen.values()), reverse=True)[: shares.workers]
+    # Admission never lets more begin: the greatest tasks wait for one another.
     tasks_most = min(sum(together), shares.budget)
     peak = shares.own + shares.workers * shares.rest + tasks_most
     parts = [f"this process {words(shares.own)}", f"running tasks {words(tasks_most)}"]

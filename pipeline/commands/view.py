@@ -22,6 +22,7 @@ def view(run: Path) -> int:
     page = run / "report.html"
     if not page.exists():
         raise ConfigError("RIL-891", f"run {lookup.name(run)} has no report", remedy="run the same command again")
+    # Over SSH there may be a text browser, which would take the terminal.
     if sys.platform == "darwin" or any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")):
         webbrowser.open(page.resolve().as_uri())
     print(page)

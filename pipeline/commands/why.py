@@ -122,6 +122,7 @@ def _defaults(name: str) -> dict[str, Any]:
 def _since(run: Path, row: Mapping[str, Any], made: Mapping[str, Any], store: Store) -> Iterable[str]:
     """What is different from the last run before that had this task."""
     for before in lookup.earlier(run):
+        # The last run that had the task decides; what differs from runs before that one, its own `why` tells.
         other = next(
             (r for r in events.read(before / lookup.LEDGER) if r["label"] == row["label"] and "key" in r), None
         )

@@ -98,6 +98,7 @@ def _longest(
     until: dict[str, float] = {}
     via: dict[str, str] = {}
     for label in TopologicalSorter(waits).static_order():
+        # Topological order: whatever a task waits for has its time by now.
         before = max(waits.get(label, ()), key=lambda w: until.get(w, 0.0), default="")
         until[label] = took.get(label, 0.0) + until.get(before, 0.0)
         via[label] = before

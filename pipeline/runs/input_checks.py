@@ -173,6 +173,7 @@ def judge_attitude(
             continue
         sensed = np.array(attitude[b]).T @ np.array(attitude[a])
         true = after.rotation.T @ before.rotation
+        # Turns are compared, not attitudes: the sensor's reference is another one than that of the truth.
         apart.append(math.degrees(float(np.linalg.norm(cv2.Rodrigues(sensed @ true.T)[0]))))
     if apart and float(np.median(apart)) > ATTITUDE_DEG:
         text = f"{words}; between frames it turns {np.median(apart):.1f} degrees otherwise than truth"
@@ -195,6 +196,7 @@ def judge_up(up: Sequence[tuple[float, float, float] | None] | None, frames: Seq
                 "RIL-648", f"known of 0 of {len(frames)} frames", "up", remedy="the ground is levelled by its own plane"
             )
         ]
+    # Camera frames have y downwards: up has a negative y where a camera is held upright.
     down = float(np.mean([v[1] for v in known if v is not None]))
     text = f"known of {len(known)} of {len(frames)} frames"
     if down > 0:
@@ -232,6 +234,7 @@ def _exposure(looks: Mapping[str, Mapping[int, Look]], names: Sequence[str]) -> 
                 out.append(
                     doubt("RIL-651", text, "exposure", remedy="such areas cannot be matched; mask them or expose anew")
                 )
+        # At least one grey level: the ratio of two black images means nothing.
         frames, means = list(of), np.maximum([v.mean for v in of.values()], 1.0)
         ratio = np.exp(np.abs(np.diff(np.log(means))))
         if ratio.size and ratio.max() > UNLIKE_GREY:

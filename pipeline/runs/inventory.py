@@ -47,6 +47,7 @@ def holdings(store: Store, folder: Path) -> list[Holding]:
         if manifest is None:
             continue
         ref = reference(manifest)
+        # A pin outlives the folder of its run.
         run = used.get(key) or pinned_by.get(key, NOBODY)
         sequence = run.partition("/")[0]
         row = found.setdefault((sequence, stage), Holding(sequence, stage))

@@ -17,6 +17,7 @@ LEDGER = "ledger.jsonl"
 
 def all_runs(runs: Path) -> list[Path]:
     """Folders of all runs that have a ledger, in order of time within each sequence."""
+    # The link `latest` leads to a run that is there already.
     return sorted(p.parent for p in runs.glob(f"*/*/{LEDGER}") if not p.parent.is_symlink())
 
 
@@ -36,6 +37,7 @@ def find(text: str, runs: Path) -> Path:
     known = all_runs(runs)
     if text == "latest" and known:
         return max(known, key=lambda run: run.name)
+    # A path before a name: a user who stands in another folder of runs means what lies there.
     for path in (Path(text), runs / text, runs / text / "latest"):
         if (path / LEDGER).is_file():
             return path.resolve()

@@ -44,6 +44,7 @@ def unpin(store: Store, text: str) -> str:
     """
     pinned = [found["run"] for found in pins(store)]
     wanted = {text, "/".join(Path(text).absolute().resolve().parts[-2:])}
+    # Names end in the time of their run: the latest comes first.
     for name in sorted(pinned, reverse=True):
         if wanted & {name, *name.split("/")}:
             _path(store, name).unlink(missing_ok=True)
@@ -78,4 +79,5 @@ def keys(store: Store) -> set[str]:
 
 
 def _path(store: Store, name: str) -> Path:
+    # Sequences' names hold no slash, so that the file's name says which run it is.
     return store.root / FOLDER / f"{name.replace('/', '--')}.json"

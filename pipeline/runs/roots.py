@@ -18,6 +18,7 @@ FOLDER = "roots"
 def note(store: Store, runs: Path) -> None:
     """Remember a folder of runs, once."""
     folder = str(runs.absolute().resolve())
+    # By machine and folder: a shared cache has users on several, and each notes itself once.
     named = hashlib.sha256(f"{platform.node()}\0{folder}".encode()).hexdigest()[:16]
     path = store.root / FOLDER / f"{named}.json"
     if path.exists():

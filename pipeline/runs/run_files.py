@@ -73,6 +73,7 @@ def task_rows(graph: Graph, store: Store) -> tuple[TaskRow, ...]:
 
 def write(folder: Path, view: RunView, made: Made, store: Store) -> Items:
     """Write all files of a run; what has no artifact is left out; give what the report lists as missing."""
+    # Copies, not links: a user may edit or delete any file of a run, and the cache stays whole.
     for output in (output for module in catalogue.MADE for output in module.OUTPUTS):
         ref = made[output.name].ref if output.name in made else None
         if ref is not None:

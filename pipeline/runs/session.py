@@ -113,6 +113,7 @@ def settings(options: Options) -> Settled:
     from rille.pipeline.runs.input_checks import judge_rig
 
     read = configuration.read_toml(options.config) if options.config else {}
+    # Over the file: --set is said now, --config may be old.
     configuration.merge(read, configuration.parse_assignments(options.assignments))
     for_dataset, for_stages = configuration.split_dataset(read)
     if options.opened is None:
@@ -123,6 +124,7 @@ def settings(options: Options) -> Settled:
     else:
         sequence = options.opened
     doubts = [f"{v.code}: {v.text}: {v.remedy}" for v in judge_rig(sequence.rig) if v.level != "OK"]
+    # A manifest warns of its baseline itself, with the key to change.
     if doubts and not any("baseline" in line for line in sequence.warnings):
         sequence = replace(sequence, warnings=(*sequence.warnings, *doubts))
     vehicle, source = {}, "default rover of the program (neither the sequence nor the user states one)"
@@ -130,6 +132,7 @@ def settings(options: Options) -> Settled:
         vehicle, source = {"vehicle": sequence.vehicle.model_dump()}, f"sequence {sequence.name}"
     if "vehicle" in for_stages:
         source = "user"
+    # What suits the sequence lies beneath; a user's value always wins.
     layers = vehicle, configuration.expand(sequence.defaults)
     config = configuration.build(*layers, for_stages)
     given = unread.set_by_user(for_stages, config, configuration.build(*layers))
@@ -160,6 +163,7 @@ def perform(options: Options) -> tuple[int, Path]:
         try:
             return _reconstruct(options)
         except (DamagedError, GoneError) as error:  # found when the results were drawn; it is set aside by now
+            # The same artifact damaged twice is a disk that fails, not one that failed.
             if error.message in healed:
                 raise
             healed.add(error.message)
@@ -298,6 +302,7 @@ def _write(opened: _Opened, result: Result, made: run_files.Made) -> Items:
     from rille.pipeline.engine import events
     from rille.pipeline.runs import run_files
 
+    # The folder may go while a run of hours is under way; writing would make one without its first files.
     if not (opened.folder / "config.toml").exists():
         raise RilleError(
             "RIL-740",
@@ -310,6 +315,7 @@ def _write(opened: _Opened, result: Result, made: run_files.Made) -> Items:
         total = (datetime.now(UTC) - opened.started).total_seconds()
         events.add_facts(opened.folder / "ledger.jsonl", total=total)
     except (DamagedError, GoneError):
+        # Half a folder of results is none; the run is repeated, and what is sound comes from the cache.
         shutil.rmtree(opened.folder)
         raise
     return missing
@@ -337,6 +343,7 @@ def _all_read(opened: _Opened, arrived: int) -> int:
     """Exit code of a run that came to its end: a parameter that no task of it read is an error, and named."""
     from rille.pipeline.flow import unread
 
+    # A drive that ended early did not come to the tasks that would have read it.
     if arrived != COMPLETE:
         return COMPLETE
     lost = unread.unread(opened.settled.given, opened.view.config, opened.graph)
@@ -382,6 +389,7 @@ def _make_folder(parent: Path, started: datetime, plan: str) -> Path:
             "RIL-765", f"{latest} is no link to a run", remedy="move it away, or choose another --runs folder"
         )
     name = f"{started:%Y%m%dT%H%M%SZ}-{hashlib.sha256(plan.encode()).hexdigest()[:8]}"
+    # Two runs of one plan within a second: mkdir decides which of them has the name.
     for suffix in ["", *(f"-{i}" for i in range(2, 100))]:
         folder = parent / (name + suffix)
         try:

@@ -63,6 +63,7 @@ def row_spread(rig: Rig, left: tuple[Floats, Any] | None, right: tuple[Floats, A
         return None
     rows = np.array(good)
     apart, _ = distances(rig, np.zeros(5), left[0][rows[:, 0]], right[0][rows[:, 1]])
+    # Before the spread is taken: far mismatches would hide what a shift does to the others.
     apart = apart[np.abs(apart) < REACH * rig.left.height]
     if len(apart) < LEAST:
         return None
@@ -77,6 +78,7 @@ def best_shift(spreads: Mapping[int, list[float | None]]) -> tuple[int, float, f
     best = None
     for shift, values in spreads.items():
         both = [(a, b) for a, b in zip(spreads[0], values, strict=True) if a is not None and b is not None]
+        # Pairs alone that say something with both: else shifts would be compared over different frames.
         if shift == 0 or not both:
             continue
         named, shifted = (float(np.median(column)) for column in zip(*both, strict=True))
