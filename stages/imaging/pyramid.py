@@ -1,8 +1,9 @@
-"""Floats32 pyramid: each level is the mean of 2 x 2 pixels of the one below (paper, 4.3.4).
+"""Image pyramid: each level is the mean of 2 x 2 pixels of the one below (paper, 4.3.4).
 
 Pixel centres are at integers, so column ``x`` of level 0 lies at ``x_n = (x + 0.5) / 2**n - 0.5`` on level n. Odd sizes
-are completed by repeating the last row or column. A coarse pixel is valid if at least three of its four pixels are;
-its value is the mean of the valid ones.
+are completed by repeating the last row or column. A coarse pixel is valid if at least two of its four pixels are, so
+that a mask one pixel wide along the border does not spread from level to level; its value is the mean of the valid
+ones. A black frame, as warping an image leaves, is no part of it (:func:`frame`).
 """
 
 from __future__ import annotations
@@ -11,11 +12,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 from numba import njit
 from pydantic import Field
 
-from rille.stages.core.arrays import Floats32
+from rille.stages.core.arrays import Bools, Floats32
 from rille.stages.core.declare import AnyArray, Array, Bundle, Inputs, Params, Stage
 from rille.stages.core.errors import InputError
 from rille.stages.core.validity import Mask
@@ -31,6 +33,13 @@ class PyramidParams(Params):
     min_side: int = Field(
         default=8, ge=1, description="pixels; no level has a side below this (13-tap features need context)"
     )
+
+
+FRAME_LEAST, FRAME_LENGTH, FRAME_DEPTH = 8, 0.1, 0.1
+"""Pixels and share of a side that a black frame touches at least, and share of the shorter side that it reaches in."""
+
+MIXED = 0.8
+"""Share of the brightness beyond them that the pixels beside a frame have at most, where they are mixed with black."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +98,7 @@ def build(image: AnyArray, params: PyramidParams, valid: AnyArray | None = None)
     Parameters
     ----------
     image : (row, col) uint8, uint16 or floating point (0..255; not finite = not usable).
-    valid : (row, col), not zero where usable; None: everywhere.
+    valid : (row, col), not zero where usable; None: everywhere but in a black frame.
 
     Raises
     ------
@@ -106,13 +115,45 @@ def build(image: AnyArray, params: PyramidParams, valid: AnyArray | None = None)
     mask = np.ones(level.shape, bool) if whole else np.isfinite(level)
     if valid is not None:
         mask &= valid != 0
+    black = frame(level)
+    if black is not None:
+        mask &= ~black
     levels, side = 1, min(level.shape)
     while levels < params.levels and side >= 2 * params.min_side:
         levels, side = levels + 1, (side + 1) // 2
-    if not (whole and valid is None):
+    if not (whole and valid is None and black is None):
         level = np.where(mask, level, np.float32(0.0))
     found = halved(level, mask.view(np.uint8), levels)
     return Pyramid(found.images, found.valid, noise.standard_deviation(found.images, found.valid))
+
+
+def frame(image: Floats32) -> Bools | None:
+    """Black frame (row, col) that warping left around an image; None: there is none.
+
+    Pixels of grey 0 that hang together, make up a good part of a side, and keep near it: darkness that reaches into the
+    image is a shadow or the sky. Where interpolation has mixed the pixels beside the frame with black, those belong to
+    it, and the outermost pixels of the sides that it touches.
+    """
+    sides: tuple[Any, ...] = (np.s_[0, :], np.s_[-1, :], np.s_[:, 0], np.s_[:, -1])
+    least = [max(FRAME_LENGTH * image[side].size, FRAME_LEAST) for side in sides]
+    if all(np.count_nonzero(image[side] == 0) < n for side, n in zip(sides, least, strict=True)):
+        return None
+    count, label = cv2.connectedComponents((image == 0).view(np.uint8), connectivity=4)
+    deep = int(np.ceil(FRAME_DEPTH * min(image.shape)))
+    inside = np.unique(label[deep:-deep, deep:-deep])
+    found, touched = np.zeros(image.shape, bool), np.zeros(image.shape, bool)
+    for side, n in zip(sides, least, strict=True):
+        long = np.bincount(label[side], minlength=count) >= n
+        long[0] = long[inside] = False
+        found |= long[label]
+        touched[side] |= long.any()
+    if not found.any():
+        return None
+    one, two = (cv2.dilate(found.view(np.uint8), np.ones((k, k), np.uint8)).view(bool) for k in (3, 5))
+    beside, farther = image[one & ~found], image[two & ~one]
+    if farther.size and np.median(beside) < MIXED * np.median(farther):
+        found = one | touched
+    return found
 
 
 def halved(image: Floats32, mask: Mask, levels: int) -> Pyramid:
@@ -140,7 +181,7 @@ def _halve(image: Floats32, mask: Mask) -> tuple[Floats32, Mask]:
 def _means(image, mask, coarse, valid):  # type: ignore[no-untyped-def]
     """Indices without sign, so that the compiler need not mind negative ones and makes vector code of the loop."""
     rows, cols = image.shape
-    nil, one, three = np.float32(0.0), np.float32(1.0), np.float32(3.0)
+    nil, one, two = np.float32(0.0), np.float32(1.0), np.float32(2.0)
     for y in range(coarse.shape[0]):
         a, b = image[2 * y], image[min(2 * y + 1, rows - 1)]
         p, q = mask[2 * y], mask[min(2 * y + 1, rows - 1)]
@@ -149,14 +190,14 @@ def _means(image, mask, coarse, valid):  # type: ignore[no-untyped-def]
             i, k = np.uint64(2 * x), np.uint64(2 * x + 1)
             # Counted in float32, the type of the sums: a mix of types would keep the loop from becoming vector code.
             count = (np.float32(p[i]) + np.float32(p[k])) + (np.float32(q[i]) + np.float32(q[k]))
-            found[x] = (a[i] + a[k] + b[i] + b[k]) / max(count, one) if count >= three else nil
-            usable[x] = count >= three
+            found[x] = (a[i] + a[k] + b[i] + b[k]) / max(count, one) if count >= two else nil
+            usable[x] = count >= two
         if cols % 2:
             x, i = cols // 2, cols - 1
             # The last column stands for a repeated one.
             count = np.float32(2 * (p[i] + q[i]))
-            found[x] = (a[i] + a[i] + b[i] + b[i]) / max(count, one) if count >= three else nil
-            usable[x] = count >= three
+            found[x] = (a[i] + a[i] + b[i] + b[i]) / max(count, one) if count >= two else nil
+            usable[x] = count >= two
 
 
 def filled(pyramid: Pyramid) -> tuple[Floats32, ...]:

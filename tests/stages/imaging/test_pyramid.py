@@ -1,3 +1,4 @@
+import cv2
 import numpy as np
 import pytest
 from raising import raises
@@ -31,24 +32,66 @@ def test_levels_against_reduction_of_the_whole_image():
 
 def test_coarse_pixel_lies_where_the_docstring_says():
     x = np.arange(64, dtype=np.float32)
-    found = pyramid.build(np.tile(x, (64, 1)), params(levels=4))
+    found = pyramid.build(np.tile(x + 10, (64, 1)), params(levels=4))
     for n, level in enumerate(found.images):
         at = (x + 0.5) / 2**n - 0.5
         inner = (at >= 0) & (at <= level.shape[1] - 1)
         values = ndimage.map_coordinates(level, [np.zeros(inner.sum()), at[inner]], order=1)
-        np.testing.assert_allclose(values, x[inner], atol=1e-4)
+        np.testing.assert_allclose(values, x[inner] + 10, atol=1e-4)
 
 
-def test_mask_needs_three_of_four_and_masked_grey_does_not_leak():
+def test_mask_needs_two_of_four_and_masked_grey_does_not_leak():
     image = np.full((4, 4), 10, np.float32)
-    valid = np.ones((4, 4), np.uint8)
-    valid[0, 0] = valid[0, 2] = valid[1, 3] = 0
+    valid = np.zeros((4, 4), np.uint8)
+    valid[0, 1] = valid[0, 2] = valid[1, 3] = 1
+    valid[2:] = 1
     image[valid == 0] = 250
     found = pyramid.build(image, params(levels=3), valid)
-    np.testing.assert_array_equal(found.valid[1], [[1, 0], [1, 1]])
-    np.testing.assert_array_equal(found.images[1], [[10, 0], [10, 10]])
+    np.testing.assert_array_equal(found.valid[1], [[0, 1], [1, 1]])
+    np.testing.assert_array_equal(found.images[1], [[0, 10], [10, 10]])
     assert found.valid[2][0, 0] == 1
     assert found.images[2][0, 0] == 10
+
+
+def test_mask_along_the_border_stays_as_narrow_as_it_is():
+    valid = np.ones((64, 64), np.uint8)
+    valid[:3] = valid[:, :1] = 0
+    narrow = []
+    for mask in pyramid.build(np.full((64, 64), 9, np.float32), params(levels=5), valid).valid:
+        narrow.append((mask.shape[0] - int(mask[:, -1].sum()), mask.shape[1] - int(mask[-1].sum())))
+    assert narrow == [(3, 1), (1, 0), (0, 0), (0, 0), (0, 0)]
+
+
+def warped(image, degrees, method):
+    middle = (0.5 * (image.shape[1] - 1), 0.5 * (image.shape[0] - 1))
+    turn = cv2.getRotationMatrix2D(middle, degrees, 1.0)
+    size = image.shape[::-1]
+    return cv2.warpAffine(image, turn, size, flags=method), cv2.warpAffine(np.ones_like(image), turn, size)
+
+
+def textured(shape=(120, 160), seed=0):
+    rough = np.random.default_rng(seed).uniform(0, 1, shape)
+    return (60 + 150 * ndimage.gaussian_filter(rough, 2) / 0.6).astype(np.float32)
+
+
+@pytest.mark.parametrize("degrees", [1.5, 2.0, -3.0])
+@pytest.mark.parametrize("method", [cv2.INTER_LINEAR, cv2.INTER_NEAREST])
+def test_a_black_frame_and_what_is_mixed_with_it_are_masked(degrees, method):
+    image, share = warped(textured(), degrees, method)
+    found = pyramid.build(image, params(levels=1)).valid[0] != 0
+    if method == cv2.INTER_NEAREST:
+        np.testing.assert_array_equal(found, image > 0)
+    else:
+        assert share[found].min() > 0.99
+        assert found.sum() > 0.95 * (share > 0.99).sum()
+
+
+def test_what_is_dark_but_no_frame_is_kept():
+    noisy = np.random.default_rng(1).integers(0, 4, (80, 90)).astype(np.float32)
+    shadow, speck, sky = textured(), textured(), textured()
+    shadow[:60, 20:70], speck[:2, 5:12], sky[:50] = 0, 0, 0
+    for image in (noisy, shadow, speck, sky, np.zeros((40, 40), np.float32)):
+        assert pyramid.frame(image) is None
 
 
 def test_filled_images_carry_no_edge_of_the_mask():
