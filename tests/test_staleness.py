@@ -460,7 +460,7 @@ EDITS: dict[str, tuple[str, str, str, set[str]]] = {
         {"locus/local", "locus/world"},
     ),
     "a njit callee of several": ("stages/hfvm/level/features.py", "", "\nMORE = 1\n", {"motion", "hfvm", "track"}),
-    "a helper of the seams": ("stages/terrain/overlap_fit.py", "", "\nMORE = 1\n", {"seam"}),
+    "a helper of the seams": ("stages/terrain/overlap_qa.py", "", "\nMORE = 1\n", {"seam"}),
     "a stage that others hang on by its result": ("stages/terrain/tile_index.py", "", "\nMORE = 1\n", {"footprint"}),
     "a helper's helper": ("stages/geometry/epipolar.py", "", "\nMORE = 1\n", {"orientation", "rig"}),
     "a helper of two stages": (

@@ -28,8 +28,7 @@ from rille.pipeline.runs import input_checks as judge
 from rille.pipeline.runs import synchrony
 from rille.pipeline.runs.input_checks import Finding, doubt, fault, fine
 from rille.stages.core.errors import RilleError
-from rille.stages.geometry.epipolar import beyond_infinity
-from rille.stages.geometry.triangulation import inverse_depth
+from rille.stages.geometry.epipolar import beyond_infinity, inverse_depth
 from rille.stages.imaging.image_quality import Look, look
 
 Floats = NDArray[np.float64]

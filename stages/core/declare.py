@@ -44,6 +44,11 @@ class Array:
         return name.startswith(self.name[:-1]) if self.name.endswith("*") else name == self.name
 
 
+def raster(name: str, unit: str, long_name: str, dtype: str = "float32", nodata: str = "nan", frame: str = "") -> Array:
+    """An output (row, col)."""
+    return Array(name, ("row", "col"), dtype, unit, long_name, nodata, frame)
+
+
 @dataclass(frozen=True)
 class Bundle:
     """What a stage takes and gives: named arrays and JSON-able facts about them."""

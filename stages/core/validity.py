@@ -48,6 +48,13 @@ def defined(validity: Mask) -> NDArray[np.bool_]:
     return has(validity, Validity.MATCHED | Validity.INTERPOLATED)
 
 
+def matched_share(validity: Mask) -> float:
+    """Share of the pixels with texture that are matched; 0 where nothing has texture."""
+    textured = ~has(validity, Validity.OUT_OF_IMAGE | Validity.NO_TEXTURE)
+    count = int(np.count_nonzero(textured))
+    return int(np.count_nonzero(matched(validity) & textured)) / count if count else 0.0
+
+
 def has(validity: Mask, bits: Validity) -> NDArray[np.bool_]:
     """Pixels with any of the bits."""
     return np.asarray((validity & np.uint8(bits)) != 0)

@@ -18,7 +18,7 @@ from pydantic import Field
 from rille.stages.core.arrays import Bytes, Floats
 from rille.stages.core.declare import AnyArray, Array, Bundle, Inputs, Params, Stage
 from rille.stages.evaluation.accuracy import angles_between, by_frame
-from rille.stages.evaluation.accuracy_parts import Metric, metric, posed
+from rille.stages.evaluation.accuracy_parts import Metric, metric, posed, rms
 from rille.stages.evaluation.pose_alignment import align, moved, spread
 from rille.stages.numeric.robust import mad_sigma
 
@@ -92,8 +92,7 @@ def compare(ours: Floats, theirs: Floats, piece: NDArray[np.integer[Any]]) -> tu
     # Least squares of b = s a over all pieces at once, for one rig has one scale.
     scale = cross / square if square > 0 and cross > 0 else None
     rest = np.concatenate([b - scale * a for a, b in left]) if scale is not None else None
-    scaled = None if rest is None else float(np.sqrt(np.mean(np.sum(rest**2, axis=1))))
-    return arrays, {"scale_ratio": scale, "rmse_scaled_m": scaled}
+    return arrays, {"scale_ratio": scale, "rmse_scaled_m": None if rest is None else rms(rest)}
 
 
 def _at_rest(poses: Floats, step_distance: Floats) -> bool:
@@ -158,11 +157,11 @@ def unbroken(theirs: NDArray[np.int64], ours: NDArray[np.int64]) -> NDArray[np.i
 
 
 def _metrics(arrays: Mapping[str, Floats], facts: Mapping[str, Any], length: float) -> dict[str, Metric]:
-    def rms(name: str) -> float | None:
+    def rms_of(name: str) -> float | None:
         values = arrays[name][np.isfinite(arrays[name])]
         return float(np.sqrt(np.mean(values**2))) if values.size else None
 
-    distance, angle, step, step_angle = (rms(name) for name in REASONS)
+    distance, angle, step, step_angle = (rms_of(name) for name in REASONS)
     after = "after one rotation and translation, no scale"
     return {
         "rmse": metric(distance, "m", f"RMS disagreement of positions {after}"),

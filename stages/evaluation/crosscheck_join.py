@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
 from rille.stages.evaluation.accuracy import angles_between
-from rille.stages.evaluation.accuracy_parts import posed
+from rille.stages.evaluation.accuracy_parts import posed, rms
 from rille.stages.evaluation.pose_alignment import align, moved
 from rille.stages.geometry.geometry import orthonormal
 
@@ -80,7 +80,7 @@ def _tie(frames: list[int], a: Floats, b: Floats) -> dict[str, Any]:
     shift, turn = a[:, :, 3] - b[:, :, 3], angles_between(a, b)
     return {
         "frames": frames,
-        "rms_m": float(np.sqrt(np.mean(np.sum(shift**2, axis=1)))),
+        "rms_m": rms(shift),
         "rms_deg": float(np.degrees(np.sqrt(np.mean(turn**2)))),
     }
 

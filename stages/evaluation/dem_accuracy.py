@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from rille.stages.core.arrays import Bools, Floats32
-from rille.stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
+from rille.stages.core.declare import Bundle, Inputs, NoParams, Stage, raster
 from rille.stages.core.errors import InputError
 from rille.stages.evaluation.accuracy_parts import Metric, metric
 from rille.stages.evaluation.dem_comparison import figures
@@ -83,6 +83,6 @@ STAGE = Stage(
     summary="elevation model against truth: RMSE, NMAD, 95 %, bias and completeness",
     params=NoParams,
     inputs=("dem*", "truth"),
-    outputs=(Array("error", ("row", "col"), "float32", "m", "elevation minus truth", "nan"),),
+    outputs=(raster("error", "m", "elevation minus truth"),),
     run=_run,
 )

@@ -11,6 +11,7 @@ import numpy as np
 
 from rille.stages.core.arrays import Floats
 from rille.stages.evaluation.accuracy import umeyama
+from rille.stages.evaluation.accuracy_parts import rms
 
 REST_LEVER = 1.0
 """m, lever of a camera at rest: far beyond the millimetres of its positions."""
@@ -18,8 +19,7 @@ REST_LEVER = 1.0
 
 def spread(poses: Floats) -> float:
     """RMS distance of the positions of poses (n, 3, 4) from their mean, metres."""
-    centred = poses[:, :, 3] - poses[:, :, 3].mean(axis=0)
-    return float(np.sqrt(np.mean(np.sum(centred**2, axis=1))))
+    return rms(poses[:, :, 3] - poses[:, :, 3].mean(axis=0))
 
 
 def align(source: Floats, target: Floats, share: float) -> tuple[Floats, Floats]:

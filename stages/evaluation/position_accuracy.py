@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
 from rille.stages.evaluation.accuracy import by_frame
-from rille.stages.evaluation.accuracy_parts import Metric, metric
+from rille.stages.evaluation.accuracy_parts import Metric, metric, rms
 from rille.stages.odometry.resection.trajectory import world_poses
 
 LEAST = 4
@@ -115,10 +115,10 @@ def fit_in_plane(estimate: Floats, truth: Floats) -> Fit:
     cross = np.sum(np.conj(_plane(b[both])) * _plane(a[both]))
     turned = _plane(b) * (cross / abs(cross) if abs(cross) > 0 else 1.0)
     b[:, 0], b[:, 1] = turned.real, turned.imag
-    error = np.sqrt(np.mean(np.sum((a[both] - b[both]) ** 2, axis=1)))
+    error = rms(a[both] - b[both])
     # Against the extent of both tracks: else the offset wins that compares the fewest, nearest frames.
     extent = np.sqrt(np.mean(np.sum(a[both] ** 2, axis=1) + np.sum(b[both] ** 2, axis=1)))
-    return Fit(b + centre, float(error), float(error / extent) if extent > 0 else np.inf)
+    return Fit(b + centre, error, float(error / extent) if extent > 0 else np.inf)
 
 
 def _plane(points: Floats) -> NDArray[np.complex128]:

@@ -20,7 +20,6 @@ from numba import njit
 
 from rille.stages.core.arrays import Floats
 from rille.stages.geometry.geometry import Rig, RigidTransform, cross_matrix, left_jacobian, rotation_exp
-from rille.stages.geometry.triangulation import inverse_depth
 
 NAMES = ("pitch", "yaw", "roll", "baseline_across", "baseline_forward")
 """The five parameters of a correction, in the order of every vector of them."""
@@ -97,6 +96,24 @@ def normals(rig: Rig, correction: Floats, left: Floats) -> Floats:
     to_line = np.linalg.inv(rig.right.matrix).T @ rotation @ cross_matrix(centre)
     line = np.einsum("nk,ik->ni", rig.left.rays(left), to_line)
     return np.asarray(line[:, :2] / _signed_length(line)[:, None], dtype=np.float64)
+
+
+def inverse_depth(rig: Rig, pixels: Floats, disparity: Floats) -> tuple[Floats, Floats]:
+    """Inverse depth 1/Z (n,) along the left camera's axis, 1/m, and its change per pixel of disparity (n,).
+
+    With p_r ~ Z m + epipole, m = K_r R r, the offset from the epipole is linear in 1/Z; the part of the disparity
+    across the epipolar line says nothing on depth and is left out.
+    """
+    to_right = rig.right.matrix @ rig.T_right_left.rotation
+    epipole = rig.right.matrix @ rig.T_right_left.translation
+    m = rig.left.rays(pixels) @ to_right.T
+    p = pixels + disparity
+    # Direction of the epipolar line at p, in homogeneous coordinates: right also where the epipole lies at infinity.
+    along = p * epipole[2] - epipole[:2]
+    offset = p * m[:, 2:] - m[:, :2]
+    # At the epipole itself there is no line.
+    length2 = np.maximum((along**2).sum(-1), 1e-300)
+    return -(offset * along).sum(-1) / length2, np.abs(m[:, 2]) / np.sqrt(length2)
 
 
 def depth_sensitivity(rig: Rig, left: Floats, right: Floats) -> Floats:

@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 
 from rille.stages.core.arrays import Bools, Floats
-from rille.stages.geometry.geometry import Camera
+from rille.stages.geometry.geometry import Camera, rotation_exp
 
 NEAREST = 1e-6
 """Depth [m] below which a point counts as behind the camera."""
@@ -46,6 +46,12 @@ def project(camera: Camera, x: Floats) -> tuple[Floats, Floats, Bools]:
     slopes[..., 0, 0], slopes[..., 0, 2] = camera.fx / z, -camera.fx * u / z
     slopes[..., 1, 1], slopes[..., 1, 2] = camera.fy / z, -camera.fy * v / z
     return np.stack([camera.fx * u + camera.cx, camera.fy * v + camera.cy], -1), slopes, behind
+
+
+def perturbed(R: Floats, t: Floats, step: Floats) -> tuple[Floats, Floats]:
+    """Poses (n, 3, 3), (n, 3) after left perturbations (n, 6) ``v``, ``w``."""
+    turn = rotation_exp(step[:, 3:])
+    return turn @ R, np.einsum("nij,nj->ni", turn, t) + step[:, :3]
 
 
 @njit(cache=True, nogil=True)

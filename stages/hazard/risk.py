@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from rille.stages.core.arrays import Floats32
-from rille.stages.core.declare import Array, Bundle, Inputs, Memory, Params, Stage
+from rille.stages.core.declare import Bundle, Inputs, Memory, Params, Stage, raster
 from rille.stages.core.errors import DegenerateError
 from rille.stages.geometry.lattice import Lattice, mosaic, union
 from rille.stages.hazard.classification import (
@@ -189,8 +189,6 @@ def _shares(arrays: Mapping[str, NDArray[Any]]) -> dict[str, float | None]:
     return shares
 
 
-_GRID = ("row", "col")
-
 STAGE = Stage(
     name="risk",
     version=5,
@@ -198,12 +196,12 @@ STAGE = Stage(
     params=RiskParams,
     inputs=("dem*",),
     outputs=(
-        Array("risk", _GRID, "uint8", "1", "class: 0 safe, 1 caution, 2 hazard, 3 unknown"),
-        Array("reason", _GRID, "uint16", "1", "bits: " + ", ".join(f"{bit} {name}" for name, bit in REASONS.items())),
-        *(Array(m.band, _GRID, "float32", "rad" if m.in_degrees else "m", m.description, "nan") for m in MEASURES),
-        Array("p_hazard", _GRID, "float32", "1", "probability that a measure exceeds its limit", "nan"),
-        Array("filled", _GRID, "uint8", "1", "1 where the elevation was interpolated"),
-        Array("elevation", _GRID, "float32", "m", "elevation with small holes closed", "nan"),
+        raster("risk", "1", "class: 0 safe, 1 caution, 2 hazard, 3 unknown", "uint8", ""),
+        raster("reason", "1", "bits: " + ", ".join(f"{bit} {name}" for name, bit in REASONS.items()), "uint16", ""),
+        *(raster(m.band, "rad" if m.in_degrees else "m", m.description) for m in MEASURES),
+        raster("p_hazard", "1", "probability that a measure exceeds its limit"),
+        raster("filled", "1", "1 where the elevation was interpolated", "uint8", ""),
+        raster("elevation", "m", "elevation with small holes closed"),
     ),
     run=_run,
     memory=Memory(factor=16.0, lower=("locus.cell_size",)),

@@ -15,6 +15,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Bools, Bytes
+from rille.stages.numeric.line import copy_line
 
 Words = NDArray[np.uint64]
 
@@ -137,21 +138,15 @@ def _spread(words, spare, n, offset):  # type: ignore[no-untyped-def]
     reach, swaps = 0, 0
     while reach < n:
         k = min(reach + 1, n - reach)
-        _copy(a, b)
+        copy_line(a, b)
         _add(a, b, k * offset)
         a, b = b, a
         reach, swaps = reach + k, swaps + 1
-    _copy(a, b)
+    copy_line(a, b)
     _add(a, b, -n * offset)
     if swaps % 2 == 1:
         return
-    _copy(b, a)
-
-
-@njit(cache=True, nogil=True)
-def _copy(source, out):  # type: ignore[no-untyped-def]
-    for i in range(source.shape[0]):
-        out[i] = source[i]
+    copy_line(b, a)
 
 
 @njit(cache=True, nogil=True)

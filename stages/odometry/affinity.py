@@ -16,6 +16,11 @@ PULL = 5.0
 """Pixels: neighbours that spread less than this do not tell of a change of shape."""
 
 
+def known(points: Floats) -> Bools:
+    """Which points (n, k) are not NaN."""
+    return np.asarray(np.isfinite(points).all(axis=1))
+
+
 def known_median(values: NDArray[Any], known: NDArray[Any]) -> NDArray[Any]:
     """Median (n,) of the values (n, k) that are not NaN, of which there are ``known`` (n,); NaN where there are none.
 

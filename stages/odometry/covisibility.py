@@ -15,7 +15,7 @@ import numpy as np
 
 from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.declare import AnyArray, Bundle
-from rille.stages.core.validity import Validity, matched
+from rille.stages.core.validity import matched, matched_share
 from rille.stages.odometry.affinity import fit_affinity, known_median
 
 BLOCKS = 200
@@ -54,14 +54,12 @@ class Step:
         for k, name in enumerate(("column_disparity", "row_disparity")):
             values = np.where(inside, _blocks(np.asarray(bundle[name]), side), np.float32(np.nan))
             shift[enough, k] = known_median(values[enough], inside[enough].sum(-1))
-        textured = validity & np.uint8(Validity.OUT_OF_IMAGE | Validity.NO_TEXTURE) == 0
-        n = int(np.count_nonzero(textured))
         return Step(
             np.stack(np.meshgrid(*centres), -1).reshape(-1, 2),
             side * scale,
             shift.reshape(-1, 2),
             (enough.shape[1] * side * scale, enough.shape[0] * side * scale),
-            int(np.count_nonzero(known & textured)) / n if n else 0.0,
+            matched_share(validity),
         )
 
     @property

@@ -4,10 +4,9 @@ The hierarchical matcher of stage ``hfvm``, stopped at a coarse level. There is 
 forward has radial flow, whose epipolar lines meet inside the image, where a band says nothing about the way along it.
 
 Where the rotation between the frames is known from a sensor, it is undone before matching
-(:mod:`rille.stages.odometry.derotation`); where the matches are too few, the homography that features show
-(:mod:`rille.stages.odometry.feature_homography`), or else an in-plane rotation that is looked for, is undone, as is one
-that the matches show (:mod:`rille.stages.odometry.roll_search`). The displacements are those of the frames as they were
-taken all the same.
+(:mod:`rille.stages.odometry.derotation`); where the matches are too few, the homography that features show, or else an
+in-plane rotation that is looked for, is undone, as is one that the matches show
+(:mod:`rille.stages.odometry.roll_search`). The displacements are those of the frames as they were taken all the same.
 """
 
 from __future__ import annotations
@@ -20,8 +19,8 @@ import numpy as np
 from pydantic import Field
 
 from rille.stages.core.arrays import Floats, Floats32
-from rille.stages.core.declare import AnyArray, Array, Bundle, Inputs, Params, Stage
-from rille.stages.core.validity import Mask, Validity, defined, mark, matched
+from rille.stages.core.declare import AnyArray, Bundle, Inputs, Params, Stage, raster
+from rille.stages.core.validity import Mask, Validity, defined, mark, matched, matched_share
 from rille.stages.geometry.geometry import Camera
 from rille.stages.hfvm.coarse_to_fine import hierarchy
 from rille.stages.hfvm.images.params import HfvmParams
@@ -30,7 +29,6 @@ from rille.stages.hfvm.level import consistency
 from rille.stages.imaging.pyramid import Pyramid
 from rille.stages.odometry import roll_search
 from rille.stages.odometry.derotation import Derotation
-from rille.stages.odometry.feature_homography import feature_homography
 
 
 class MotionParams(Params):
@@ -138,18 +136,11 @@ def coarse_motion(a: Pyramid, b: Pyramid, params: MotionParams, turn: Derotation
     return Motion(level, u, v, validity)
 
 
-def match_share(found: Motion) -> float:
-    """Share of the pixels with texture that match; 0 where nothing has texture."""
-    textured = (found.validity & np.uint8(Validity.OUT_OF_IMAGE | Validity.NO_TEXTURE)) == 0
-    count = int(np.count_nonzero(textured))
-    return int(np.count_nonzero(matched(found.validity) & textured)) / count if count else 0.0
-
-
 def _rolled(
     a: Pyramid, b: Pyramid, plain: Motion, params: MotionParams, turn: Derotation | None
 ) -> tuple[Motion, Derotation, float] | None:
     """Displacements after undoing a rotation found in the images, that rotation, and degrees; None: none is needed."""
-    share = match_share(plain)
+    share = matched_share(plain.validity)
     if params.turn_below == 0 or not matched_texture(plain):
         return None
     shape = (a.images[0].shape[0], a.images[0].shape[1])
@@ -161,11 +152,11 @@ def _rolled(
 
     best, needed = plain, 1.0
     if share < params.turn_below:
-        wide = feature_homography(a, b)
+        wide = roll_search.feature_homography(a, b)
         if wide is not None:
             upright = Derotation(wide, shape)
             found = coarse_motion(a, b, params, upright)
-            if match_share(found) > roll_search.GAIN * share:
+            if matched_share(found.validity) > roll_search.GAIN * share:
                 degrees = -roll_search.relative((0.0, 1.0), wide, shape)[0]
                 known = np.eye(3) if turn is None else turn.homography
                 return found, upright, roll_search.relative((degrees, 1.0), known, shape)[0]
@@ -173,7 +164,7 @@ def _rolled(
         coarse, needed = params.model_copy(update={"level": params.level + 1}), roll_search.GAIN
         for degrees in roll_search.candidates(params.turn_range_deg):
             found, _ = attempt(roll_search.similarity(degrees, 1.0, shape), coarse)
-            best = max(best, found, key=match_share)
+            best = max(best, found, key=lambda motion: matched_share(motion.validity))
     fitted = roll_search.fit(best.column_disparity, best.row_disparity, matched(best.validity), best.level)
     if fitted is not None and turn is not None:  # what the attitude left over
         fitted = roll_search.relative(fitted, turn.homography, shape)
@@ -181,7 +172,7 @@ def _rolled(
     if fitted is None or abs(fitted[0]) < roll_search.LEAST_DEG:
         return None
     found, upright = attempt(roll_search.similarity(fitted[0], fitted[1], shape), params)
-    return (found, upright, fitted[0]) if match_share(found) > needed * share else None
+    return (found, upright, fitted[0]) if matched_share(found.validity) > needed * share else None
 
 
 def matched_texture(found: Motion) -> bool:
@@ -236,7 +227,7 @@ def _run(params: MotionParams, args: Mapping[str, Any], inputs: Inputs) -> Bundl
     return Bundle(arrays, meta)
 
 
-_GRID = ("row", "col")
+_GRID = "coarse level of a"
 STAGE = Stage(
     name="motion",
     version=1,
@@ -244,17 +235,9 @@ STAGE = Stage(
     params=MotionParams,
     inputs=("a", "b"),
     outputs=(
-        Array(
-            "column_disparity",
-            _GRID,
-            "float32",
-            "px",
-            "level-0 columns, frame b minus a",
-            "nan",
-            "coarse level of a",
-        ),
-        Array("row_disparity", _GRID, "float32", "px", "level-0 rows, frame b minus a", "nan", "coarse level of a"),
-        Array("validity", _GRID, "uint8", "1", "bit mask, see stages.core.validity", "", "coarse level of a"),
+        raster("column_disparity", "px", "level-0 columns, frame b minus a", frame=_GRID),
+        raster("row_disparity", "px", "level-0 rows, frame b minus a", frame=_GRID),
+        raster("validity", "1", "bit mask, see stages.core.validity", "uint8", "", _GRID),
     ),
     run=_run,
 )

@@ -7,7 +7,6 @@ the images does not spoil it. Found points are matched back.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -36,37 +35,21 @@ THRESHOLD = 90.0
 """Byte steps: mean distance above which a point is not matchable."""
 
 
-@dataclass(frozen=True)
-class PointMatches:
-    """``points`` (n, 2) column, row in image b; ``distance`` (n,) mean, byte steps; both NaN where not ``ok``."""
-
-    points: Floats
-    distance: Floats
-    ok: Bools
-
-
 def match_points(
-    a: Pyramid, b: Pyramid, points: Floats, predicted: Floats, affinity: Floats | None = None, radius: int = 4
-) -> Floats:
-    """Positions (n, 2) in ``b`` of points of ``a``; NaN where not found. See :func:`find_points`."""
-    return find_points(a, b, points, predicted, affinity, radius).points
-
-
-def find_points(
-    a: Pyramid,
-    b: Pyramid,
-    points: Floats,
-    predicted: Floats,
-    affinity: Floats | None = None,
-    radius: int = 4,
-) -> PointMatches:
+    a: Pyramid, b: Pyramid, points: Floats, predicted: Floats, affinity: Floats, radius: int
+) -> tuple[Floats, Floats]:
     """Sub-pixel positions in image ``b`` of points of image ``a`` (level 0 of two pyramids).
 
     Parameters
     ----------
     points, predicted : (n, 2) column, row in a, and about where in b, pixels; NaN rows are lost.
-    affinity : (n, 2, 2) maps offsets from the point in a to offsets in b (column, row); None: no change of shape.
+    affinity : (n, 2, 2) maps offsets from the point in a to offsets in b (column, row).
     radius : pixels searched to every side of the prediction.
+
+    Returns
+    -------
+    position : (n, 2) column, row in b; NaN where not found.
+    distance : (n,) mean distance of the feature vectors, byte steps; NaN likewise.
 
     Notes
     -----
@@ -77,23 +60,22 @@ def find_points(
     n = len(points)
     a_image, b_image = filled(a)[0], filled(b)[0]
     a_valid, b_valid = a.valid[0], b.valid[0]
-    shape = np.tile(np.eye(2), (n, 1, 1)) if affinity is None else np.asarray(affinity, dtype=np.float64)
-    usable = np.isfinite(np.concatenate([points, predicted, shape.reshape(n, 4)], axis=1)).all(axis=1)
+    usable = np.isfinite(np.concatenate([points, predicted, affinity.reshape(n, 4)], axis=1)).all(axis=1)
     # An affinity that folds the template to a tenth of its area or less draws no texture.
-    usable &= np.abs(np.linalg.det(np.where(usable[:, None, None], shape, np.eye(2)))) > 0.1
-    found, cost, ok = np.full((n, 2), np.nan), np.full(n, np.nan), np.zeros(n, dtype=bool)
+    usable &= np.abs(np.linalg.det(np.where(usable[:, None, None], affinity, np.eye(2)))) > 0.1
+    found, cost = np.full((n, 2), np.nan), np.full(n, np.nan)
     who = np.flatnonzero(usable)
-    there, there_cost = _search(a_image, b_image, points[who], predicted[who], shape[who], radius)
+    there, there_cost = _search(a_image, b_image, points[who], predicted[who], affinity[who], radius)
     good = np.isfinite(there_cost) & (there_cost <= THRESHOLD)
     good &= _on_valid(a_valid, points[who]) & _on_valid(b_valid, there)
     who, there, there_cost = who[good], there[good], there_cost[good]
     # The way back starts at the point itself: it must lead there within a pixel, so little is searched.
-    inverse, reach = np.asarray(np.linalg.inv(shape[who])), min(radius, BACK_RADIUS)
+    inverse, reach = np.asarray(np.linalg.inv(affinity[who])), min(radius, BACK_RADIUS)
     back, _ = _search(b_image, a_image, there, points[who], inverse, reach)
     good = np.hypot(*(back - points[who]).T) <= BACKMATCH
     who = who[good]
-    found[who], cost[who], ok[who] = there[good], there_cost[good], True
-    return PointMatches(found, cost, ok)
+    found[who], cost[who] = there[good], there_cost[good]
+    return found, cost
 
 
 def _on_valid(valid: Bytes, points: Floats) -> Bools:

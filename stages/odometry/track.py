@@ -27,7 +27,7 @@ from rille.stages.core.declare import Array, Bundle, Inputs, Params, Stage
 from rille.stages.core.errors import InputError
 from rille.stages.imaging.pyramid import Pyramid
 from rille.stages.odometry.affine_lk import HALF, Templates, align
-from rille.stages.odometry.affinity import NEIGHBOURS, fit_affinity, known_median
+from rille.stages.odometry.affinity import NEIGHBOURS, fit_affinity, known, known_median
 from rille.stages.odometry.moravec import clear_of_mask, interest_points
 from rille.stages.odometry.point_search import match_points
 
@@ -145,22 +145,22 @@ def _advance(state: _State, frames: Sequence[Pyramid], motion: LevelDisplacement
     predicted = state.expected + displacement_at(motion, state.expected)
     # A template is drawn under the affinity of its surroundings, from the coarse displacements, which outliers do not
     # pull.
-    smooth, _ = fit_affinity(state.expected, predicted, _known(predicted), state.expected)
-    matched = match_points(frames[j - 1], frames[j], state.expected, predicted, smooth, params.radius)
-    found = _known(matched)
+    smooth, _ = fit_affinity(state.expected, predicted, known(predicted), state.expected)
+    matched, _ = match_points(frames[j - 1], frames[j], state.expected, predicted, smooth, params.radius)
+    found = known(matched)
     # A lost point goes on with the prediction, and may be found again from there.
     state.expected = np.where(found[:, None], matched, predicted)
     # Points of one birth share their first frame, so that an affinity is fitted to pairs of the same two frames.
     for birth in np.unique(state.birth):
         group = np.flatnonzero((state.birth == birth) & found)
         then = state.points[:, birth]
-        affinity, _ = fit_affinity(then, matched, found & _known(then), then[group])
+        affinity, _ = fit_affinity(then, matched, found & known(then), then[group])
         # Singular values: the largest and the smallest stretch of the template, whatever the direction.
         scale = np.linalg.svd(affinity, compute_uv=False)
         near = (scale[:, 0] < params.max_scale) & (scale[:, 1] > 1.0 / params.max_scale)
         # A template that is stretched beyond this has lost its detail or shows none: the last frame's then, at the
         # price of drift.
-        for source, chosen in ((int(birth), near), (j - 1, ~near & _known(state.points[group, j - 1]))):
+        for source, chosen in ((int(birth), near), (j - 1, ~near & known(state.points[group, j - 1]))):
             who = group[chosen]
             if who.size == 0:
                 continue
@@ -172,7 +172,7 @@ def _advance(state: _State, frames: Sequence[Pyramid], motion: LevelDisplacement
 
 def _reseed(state: _State, frames: Sequence[Pyramid], j: int, params: TrackParams) -> _State:
     """Add points of frame j in empty buckets, as far as they are found in the key frame."""
-    alive = _known(state.points[:, j]) & _known(state.points[:, 0])
+    alive = known(state.points[:, j]) & known(state.points[:, 0])
     here, there = state.points[alive, j], state.points[alive, 0]
     seeds = interest_points(
         frames[j].images[0], frames[j].valid[0], params.points, noise=params.noise, border=BORDER, occupied=here
@@ -181,16 +181,11 @@ def _reseed(state: _State, frames: Sequence[Pyramid], j: int, params: TrackParam
     if len(seeds) == 0 or len(here) < NEIGHBOURS:
         return state
     affinity, shift = fit_affinity(here, there, np.ones(len(here), bool), seeds)
-    matched = match_points(frames[j], frames[0], seeds, seeds + shift, affinity, params.radius)
+    matched, _ = match_points(frames[j], frames[0], seeds, seeds + shift, affinity, params.radius)
     place, error = _align(frames[j], frames[0], seeds, matched, affinity, params)
     new = _State.born(seeds, j, len(frames))
     new.points[:, 0], new.distance[:, 0] = place, error
-    return state.and_also(new, _known(place))
-
-
-def _known(points: Floats) -> Bools:
-    """Which rows (n, 2) are not NaN."""
-    return np.asarray(np.isfinite(points).all(axis=1))
+    return state.and_also(new, known(place))
 
 
 def _align(
@@ -218,11 +213,11 @@ def displacement_at(motion: LevelDisplacements, points: Floats) -> Floats:
     dy, dx = (o.ravel() for o in np.mgrid[-1:2, -1:2])
     y, x = np.clip(centre[:, 1:] + dy, 0, rows - 1), np.clip(centre[:, :1] + dx, 0, cols - 1)
     both = np.stack([motion.column[y, x], motion.row[y, x]], -1).astype(np.float64)
-    known: Bools = np.asarray(np.isfinite(both).all(axis=-1))
-    count = known.sum(axis=1)
-    both = np.where(known[..., None], both, np.nan)
+    there = np.asarray(np.isfinite(both).all(axis=-1))
+    count = there.sum(axis=1)
+    both = np.where(there[..., None], both, np.nan)
     value = np.stack([known_median(both[..., k], count) for k in range(2)], axis=-1)
-    return np.where(_known(points)[:, None], value, np.nan)
+    return np.where(known(points)[:, None], value, np.nan)
 
 
 def _run(params: TrackParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:

@@ -23,10 +23,9 @@ from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.declare import Bundle, Inputs, Params, Stage
 from rille.stages.core.errors import DegenerateError, InputError
 from rille.stages.core.validity import matched
-from rille.stages.geometry.epipolar import exchanged, fits
+from rille.stages.geometry.epipolar import exchanged, fits, inverse_depth
 from rille.stages.geometry.geometry import Rig, RigidTransform, level_rotation
 from rille.stages.geometry.pose_arrays import NO_VERTICAL
-from rille.stages.geometry.triangulation import inverse_depth
 from rille.stages.terrain.ground import MIN_POINTS, GroundPlane, fit_plane, rounded_cell, view_ground
 
 Samples = tuple[Floats, Floats, Floats]

@@ -25,6 +25,7 @@ from rille.stages.core.declare import Bundle, Inputs, Params, Stage
 from rille.stages.core.errors import DegenerateError, InputError
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 from rille.stages.geometry.lattice import Lattice
+from rille.stages.numeric.robust import huber_weight
 
 
 class GlobalFixParams(Params):
@@ -223,7 +224,7 @@ def _refine(
         difference, slopes = _differences(points, ground, lattice, place)
         used = np.isfinite(difference)
         r, J = difference[used], slopes[used]
-        weight = 1.0 / np.maximum(1.0, np.abs(r) / (params.truncate * sigma / 2.0))
+        weight = huber_weight(np.abs(r), params.truncate * sigma / 2.0)
         normal = J.T @ (weight[:, None] * J)
         scale = np.sqrt(np.diag(normal)) + 1e-12
         values = np.linalg.eigvalsh(normal / np.outer(scale, scale))

@@ -34,10 +34,10 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from rille.stages.core.arrays import Bytes, Floats, Floats32
-from rille.stages.core.declare import Array, Bundle, Inputs, Memory, Params, Stage
+from rille.stages.core.declare import Bundle, Inputs, Memory, Params, Stage, raster
 from rille.stages.core.errors import InputError
 from rille.stages.geometry.geometry import RigidTransform
-from rille.stages.geometry.lattice import Lattice
+from rille.stages.geometry.lattice import Lattice, Window
 from rille.stages.numeric.holes import close_holes
 from rille.stages.terrain.merge_kernel import PLANES, CellMaps, Rule, Stack, merge_cells
 from rille.stages.terrain.radiometry import STEP
@@ -138,37 +138,17 @@ def footprint(elevation: Floats32, x: Floats, y: Floats, centre: Floats, angle: 
 
 @dataclass(frozen=True)
 class Layer:
-    """One pair's model on ``lattice``: arrays (rows, cols), NaN undefined, those of
-    :class:`rille.stages.terrain.locus.solve.Dem`.
+    """One pair's model on ``lattice``, whose arrays (rows, cols) are read part by part: ``part(name, window)``.
 
-    ``gain``: factor of its grey values that levels its exposure with that of its neighbours; ``pose``: how exactly it
-    is placed.
+    The arrays are those of :class:`rille.stages.terrain.locus.solve.Dem`, NaN undefined. ``gain``: factor of its grey
+    values that levels its exposure with that of its neighbours; ``pose``: how exactly it is placed.
     """
 
     pair: int
     lattice: Lattice
-    elevation: Floats32
-    elevation_std: Floats32
-    residual: Floats32
-    ortho: Floats32
+    part: Callable[[str, Window], Any]
     gain: float = 1.0
     pose: Placed = EXACT
-
-    def part(self, name: str, window: tuple[slice, slice]) -> Floats32:
-        """Part of an array."""
-        found: Floats32 = getattr(self, name)[window]
-        return found
-
-
-@dataclass(frozen=True)
-class _Stored:
-    """The same of an artifact, read part by part."""
-
-    pair: int
-    lattice: Lattice
-    part: Callable[[str, tuple[slice, slice]], Any]
-    gain: float
-    pose: Placed
 
 
 @dataclass(frozen=True)
@@ -191,7 +171,7 @@ class Merged:
     relief_std: Floats32
 
 
-def merge(layers: Sequence[Layer | _Stored], tile: Lattice, params: MergeParams) -> Merged:
+def merge(layers: Sequence[Layer], tile: Lattice, params: MergeParams) -> Merged:
     """Merge elevation models on a tile of their common lattice.
 
     The result does not depend, in any bit, on the order of the layers, nor on where tiles begin.
@@ -223,9 +203,7 @@ def merge(layers: Sequence[Layer | _Stored], tile: Lattice, params: MergeParams)
     return out
 
 
-def _merge_strip(
-    layers: Sequence[Layer | _Stored], strip: Lattice, params: MergeParams, out: Merged, rows: slice
-) -> None:
+def _merge_strip(layers: Sequence[Layer], strip: Lattice, params: MergeParams, out: Merged, rows: slice) -> None:
     """Merge the lines of one strip into ``out``."""
     present = [layer for layer in layers if strip.intersection(layer.lattice) is not None]
     if not present:
@@ -246,7 +224,7 @@ def _merge_strip(
     out.source[rows] = pairs[best]
 
 
-def _stacked(layers: Sequence[Layer | _Stored], strip: Lattice, name: str) -> Floats32:
+def _stacked(layers: Sequence[Layer], strip: Lattice, name: str) -> Floats32:
     out = np.full((len(layers), *strip.shape), np.nan, dtype=np.float32)
     for target, layer in zip(out, layers, strict=True):
         common = strip.intersection(layer.lattice)
@@ -278,14 +256,14 @@ def _empty(tile: Lattice) -> Merged:
     )
 
 
-def _fine(dem: Bundle, lattice: Lattice, most: float) -> Callable[[str, tuple[slice, slice]], Any]:
+def _fine(dem: Bundle, lattice: Lattice, most: float) -> Callable[[str, Window], Any]:
     """Parts of a model without the elevations of cells whose footprint is greater than ``most`` metres."""
     if "pixel_rad" not in dem.meta:  # nobody looked at it: vouched for
         return dem.part
     centre = RigidTransform.from_matrix(dem.meta["T_frame_left"]).translation
     angle = float(dem.meta["pixel_rad"])
 
-    def part(name: str, window: tuple[slice, slice]) -> Any:
+    def part(name: str, window: Window) -> Any:
         values = np.asarray(dem.part(name, window))
         if name != "elevation":
             return values
@@ -304,7 +282,7 @@ def _run(params: MergeParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle
         gain = math.exp(STEP * int(steps.get(str(pair), 0)))
         lattice = Lattice.from_dict(dem.meta["lattice"])
         part = dem.part if params.max_footprint is None else _fine(dem, lattice, params.max_footprint)
-        layers.append(_Stored(pair, lattice, part, gain, Placed.of(dem.meta)))
+        layers.append(Layer(pair, lattice, part, gain, Placed.of(dem.meta)))
     merged = merge(layers, tile, params)
     meta = {
         "lattice": tile.to_dict(),
@@ -316,10 +294,6 @@ def _run(params: MergeParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle
     return Bundle(vars(merged), meta)
 
 
-def _array(name: str, dtype: str, unit: str, long_name: str, nodata: str) -> Array:
-    return Array(name, ("row", "col"), dtype, unit, long_name, nodata, "world")
-
-
 STAGE = Stage(
     name="merge",
     version=3,
@@ -327,14 +301,14 @@ STAGE = Stage(
     params=MergeParams,
     inputs=("dems*",),
     outputs=(
-        _array("elevation", "float32", "m", "elevation of the cell centre", "nan"),
-        _array("elevation_std", "float32", "m", "standard deviation of the elevation, poses included", "nan"),
-        _array("spread", "float32", "m", "standard deviation of the merged models about the elevation", "nan"),
-        _array("count", "uint16", "1", "number of merged models", "0"),
-        _array("source", "int16", "1", "pair of the greatest weight", "-1"),
-        _array("ortho", "float32", "grey", "grey value, 0..255", "nan"),
-        _array("relief_std", "float32", "m", "standard deviation of the elevation against that around", "nan"),
-        _array("filled", "uint8", "1", "1 where a small hole was closed by interpolation", ""),
+        raster("elevation", "m", "elevation of the cell centre", "float32", "nan", "world"),
+        raster("elevation_std", "m", "standard deviation of the elevation, poses included", "float32", "nan", "world"),
+        raster("spread", "m", "standard deviation of the merged models about the elevation", "float32", "nan", "world"),
+        raster("count", "1", "number of merged models", "uint16", "0", "world"),
+        raster("source", "1", "pair of the greatest weight", "int16", "-1", "world"),
+        raster("ortho", "grey", "grey value, 0..255", "float32", "nan", "world"),
+        raster("relief_std", "m", "standard deviation of the elevation against that around", "float32", "nan", "world"),
+        raster("filled", "1", "1 where a small hole was closed by interpolation", "uint8", "", "world"),
     ),
     run=_run,
     memory=Memory(lower=("locus.cell_size",)),

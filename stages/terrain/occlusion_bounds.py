@@ -22,7 +22,7 @@ from numba import njit
 from pydantic import Field
 
 from rille.stages.core.arrays import Floats, Floats32
-from rille.stages.core.declare import Array, Bundle, Inputs, Params, Stage
+from rille.stages.core.declare import Bundle, Inputs, Params, Stage, raster
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.terrain.merge import footprint
@@ -121,10 +121,6 @@ def _run(params: CeilingParams, args: Mapping[str, Any], inputs: Inputs) -> Bund
     return Bundle({"upper": bounds.upper, "lower": bounds.lower}, meta)
 
 
-def _array(name: str, long_name: str) -> Array:
-    return Array(name, ("row", "col"), "float32", "m", long_name, nodata="nan", frame="world")
-
-
 STAGE = Stage(
     name="ceiling",
     version=1,
@@ -132,8 +128,8 @@ STAGE = Stage(
     params=CeilingParams,
     inputs=("merged", "dems*"),
     outputs=(
-        _array("upper", "height that the ground does not exceed"),
-        _array("lower", "height that it does not fall below, where it was seen"),
+        raster("upper", "m", "height that the ground does not exceed", frame="world"),
+        raster("lower", "m", "height that it does not fall below, where it was seen", frame="world"),
     ),
     run=_run,
 )

@@ -1,15 +1,24 @@
-"""Audit of the seams of one elevation model: its difference from each earlier model that saw the same ground.
+"""Overlap of two elevation models: what of their difference is systematic, and what is noise, with an honest sigma.
 
-A difference has three parts, told apart by :mod:`rille.stages.terrain.overlap_fit`: a bias and a tilt about two axes,
-which come from the poses (or the rig); and noise, which comes from the matching and is compared with what both models'
-own standard deviations let expect. The factor between both models' grey values is a by-product
+The difference of a model from each earlier one that saw the same ground has three parts: a bias and a tilt about two
+axes, which come from the poses (or the rig); and noise, which comes from the matching and is compared with what both
+models' own standard deviations let expect. The factor between both models' grey values is a by-product
 (:mod:`rille.stages.terrain.radiometry`).
+
+Matching errors are alike over several cells, so the cells of an overlap are far fewer observations than their number.
+The plane is fitted to medians of blocks of cells (Tukey's biweight, started from least absolute deviations), and its
+covariance is taken from what the blocks scatter, neighbouring blocks together, not from any stated sigma:
+
+    cov = A^-1 B A^-1,   A = sum psi'(r_i) x_i x_i',   B = sum_ij k(i, j) psi(r_i) psi(r_j) x_i x_j'
+
+with a triangular kernel k over the distance of two blocks (Conley 1999, doi:10.1016/S0304-4076(98)00084-0).
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,12 +26,179 @@ import numpy as np
 from rille.stages.core.arrays import Bools, Floats, Floats32
 from rille.stages.core.declare import Array, Bundle, Inputs, NoParams, Stage
 from rille.stages.geometry.lattice import Lattice
-from rille.stages.terrain.overlap_fit import LEAST_CELLS, fit_seam
+from rille.stages.numeric.robust import TUKEY_BISQUARE, bisquare, mad_sigma
+
+BLOCKS = 400
+"""Blocks of an overlap, about: enough that their scatter tells the plane's error to a twentieth."""
+LEAST_BLOCKS = 12
+"""Below, three parameters and their errors are not to be had."""
+LEAST_CELLS = 100
+MANY_BLOCKS = 36
+"""Blocks that must be left for them to be made larger."""
+ALIKE = 0.2
+"""Correlation of neighbouring blocks above which they are made larger, until each stands for itself."""
+REACH = 2
+"""Blocks to either side whose errors may be alike still."""
+ROUNDS = 20
 
 MAP_CELLS = 160
 """Longest side of a stored map of differences; cells of larger ones are averaged."""
 GREY = (8.0, 247.0)
 """Grey values that tell an exposure: darker ones are noise, brighter ones saturated."""
+
+
+@dataclass(frozen=True)
+class SeamFit:
+    """Plane ``bias + tilt . (xy - centre)`` in a difference of elevations, and what is left.
+
+    ``centre`` (2,) m; ``plane`` (3,): bias m, tilt along x and y, rad; ``covariance`` (3, 3) of it; ``noise`` robust
+    standard deviation of the cells about the plane, m; ``structure`` the same of the blocks' medians; ``systematic``
+    RMS of the plane over the cells, m; ``cells``.
+    """
+
+    centre: Floats
+    plane: Floats
+    covariance: Floats
+    noise: float
+    structure: float
+    systematic: float
+    cells: int
+
+    def at(self, x: Floats, y: Floats) -> Floats:
+        """The plane's height at points."""
+        return np.asarray(self.plane[0] + self.plane[1] * (x - self.centre[0]) + self.plane[2] * (y - self.centre[1]))
+
+
+def fit_seam(difference: Floats, x: Floats, y: Floats) -> SeamFit | None:
+    """Plane in a map of differences.
+
+    Parameters
+    ----------
+    difference : (rows, cols) metres, NaN undefined.
+    x, y : (cols,), (rows,) coordinates of the cells, metres.
+
+    Returns
+    -------
+    SeamFit
+        None where too few cells or blocks are defined.
+    """
+    seen = np.isfinite(difference)
+    cells = int(seen.sum())
+    if cells < LEAST_CELLS:
+        return None
+    side = max(3, math.ceil(math.sqrt(cells / BLOCKS)))
+    fit, like = _fit(difference, x, y, side, cells, LEAST_BLOCKS)
+    # Blocks that err like their neighbours tell less than their number: larger ones, until they do not.
+    while fit is not None and like > ALIKE:
+        side *= 2
+        coarser, like = _fit(difference, x, y, side, cells, MANY_BLOCKS)
+        if coarser is None:
+            break
+        fit = coarser
+    if fit is None:
+        return None
+    surface = fit.at(x[None], y[:, None])[seen]
+    left = np.abs(difference[seen] - surface)
+    noise, systematic = mad_sigma(left, 0.0), math.sqrt(float(np.mean(surface**2)))
+    return replace(fit, noise=noise, systematic=systematic)
+
+
+def _fit(difference: Floats, x: Floats, y: Floats, side: int, cells: int, least: int) -> tuple[SeamFit | None, float]:
+    """Plane by blocks of ``side`` cells, None of less than ``least``; and how alike neighbours' residuals are."""
+    value, weight, bx, by = _blocks(difference, x, y, side)
+    there = weight > 0
+    if int(there.sum()) < least:
+        return None, 0.0
+    centre = np.array([np.average(v[there], weights=weight[there]) for v in (bx, by)])
+    design = np.stack([np.ones_like(bx), bx - centre[0], by - centre[1]], axis=-1)
+    design[~there] = 0.0
+    plane, residual, scale = _robust(design, np.where(there, value, 0.0), weight)
+    covariance = _covariance(design, residual, weight, scale)
+    return SeamFit(centre, plane, covariance, 0.0, scale, 0.0, cells), _alike(residual, there, scale)
+
+
+def _alike(residual: Floats, there: Bools, scale: float) -> float:
+    """Correlation of neighbouring blocks' residuals, gross ones cut off."""
+    if scale <= 0:
+        return 0.0
+    r = np.where(there, np.clip(residual, -3 * scale, 3 * scale), 0.0)
+    products = float((r[1:] * r[:-1]).sum() + (r[:, 1:] * r[:, :-1]).sum())
+    pairs = int((there[1:] & there[:-1]).sum() + (there[:, 1:] & there[:, :-1]).sum())
+    return products / max(pairs, 1) / float((r[there] ** 2).mean())
+
+
+def _blocks(difference: Floats, x: Floats, y: Floats, side: int) -> tuple[Floats, Floats, Floats, Floats]:
+    """Median, weight (share of cells that are defined; 0 below a quarter), mean x and y of each block."""
+    rows, cols = (-(-n // side) for n in difference.shape)
+    cut = [(0, rows * side - difference.shape[0]), (0, cols * side - difference.shape[1])]
+    padded = np.pad(difference, cut, constant_values=np.nan)
+    blocks = padded.reshape(rows, side, cols, side).swapaxes(1, 2).reshape(rows, cols, -1)
+    seen = np.isfinite(blocks)
+    share = seen.mean(axis=-1)
+    weight = np.where(share >= 0.25, share, 0.0)
+    value = np.zeros(share.shape)
+    value[weight > 0] = np.nanmedian(blocks[weight > 0], axis=-1)
+    count = np.maximum(seen.sum(axis=-1), 1)
+    square = seen.reshape(rows, cols, side, side)
+    px = np.pad(x, cut[1], mode="edge").reshape(cols, side)
+    py = np.pad(y, cut[0], mode="edge").reshape(rows, side)
+    bx = np.einsum("rcij,cj->rc", square, px) / count
+    by = np.einsum("rcij,ri->rc", square, py) / count
+    return value, weight, bx, by
+
+
+def _robust(design: Floats, value: Floats, weight: Floats) -> tuple[Floats, Floats, float]:
+    """Plane, residuals and their robust scale."""
+    plane = _solve(design, value, weight)
+    scale = 0.0
+    for turn in range(ROUNDS):
+        residual = value - design @ plane
+        size = np.abs(residual)
+        scale = mad_sigma(size[weight > 0], 0.0)
+        if scale <= 1e-12 * float(np.abs(value).max()):
+            break
+        # First least absolute deviations, which gross errors do not capture; then the biweight, which forgets them.
+        absolute = 1.0 / np.maximum(size, 0.01 * scale)
+        biweight = bisquare(residual / (TUKEY_BISQUARE * scale))
+        plane = _solve(design, value, weight * (absolute if turn < ROUNDS // 2 else biweight))
+    residual = value - design @ plane
+    return plane, residual, mad_sigma(residual[weight > 0], 0.0)
+
+
+def _solve(design: Floats, value: Floats, weight: Floats) -> Floats:
+    root = np.sqrt(weight)
+    a, b = (design * root[..., None]).reshape(-1, 3), (value * root).ravel()
+    return np.asarray(np.linalg.lstsq(a, b, rcond=None)[0])
+
+
+def _covariance(design: Floats, residual: Floats, weight: Floats, scale: float) -> Floats:
+    """Covariance of the plane from the scatter of the blocks, those nearby taken together."""
+    if scale <= 0:
+        return np.zeros((3, 3))
+    u = np.clip((residual / (TUKEY_BISQUARE * scale)) ** 2, 0.0, 1.0)
+    # Derivative of Tukey's psi, and psi: bread and meat of the covariance of an M-estimate.
+    slope, psi = (1.0 - u) * (1.0 - 5.0 * u), residual * (1.0 - u) ** 2
+    bread = np.einsum("rc,rci,rcj->ij", weight * slope, design, design)
+    score = design * (weight * psi)[..., None]
+    inverse = np.linalg.pinv(bread, hermitian=True)
+    n = int((weight > 0).sum())
+    found = [inverse @ meat @ inverse * n / (n - 3) for meat in (_meat(score, 0), _meat(score, REACH))]
+    # Products of neighbours may sum to less than none by chance: never less than independent blocks give.
+    return max(found, key=lambda cov: float(np.trace(cov @ bread)))
+
+
+def _meat(score: Floats, reach: int) -> Floats:
+    """Sum over pairs of blocks of their scores' products, weighted by a triangle of their distance."""
+    spread = score
+    for axis in (0, 1):
+        padded = np.pad(spread, [(reach, reach) if a == axis else (0, 0) for a in range(3)])
+        n = score.shape[axis]
+        spread = sum(
+            (1.0 - abs(k) / (reach + 1)) * np.take(padded, np.arange(reach + k, reach + k + n), axis=axis)
+            for k in range(-reach, reach + 1)
+        )  # type: ignore[assignment]
+    product = np.einsum("rci,rcj->ij", score, spread)
+    return np.asarray(0.5 * (product + product.T))
 
 
 def seam(dem: Bundle, other: Bundle) -> tuple[dict[str, Any], Floats32] | None:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from rille.stages.core.declare import Array, Bundle, Inputs, Params, Stage
+from rille.stages.core.declare import Bundle, Inputs, Params, Stage, raster
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.lattice import Lattice
 
@@ -54,10 +54,6 @@ def _run(params: PadParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     return Bundle(arrays, {"lattice": lattice.to_dict(), "frame": "world", "pair": NOBODY})
 
 
-def _array(name: str, unit: str, long_name: str) -> Array:
-    return Array(name, ("row", "col"), "float32", unit, long_name, nodata="nan", frame="world")
-
-
 STAGE = Stage(
     name="pad",
     version=1,
@@ -65,10 +61,10 @@ STAGE = Stage(
     params=PadParams,
     inputs=("pose", "like"),
     outputs=(
-        _array("elevation", "m", "elevation of the cell centre"),
-        _array("elevation_std", "m", "standard deviation of the elevation"),
-        _array("residual", "px", "none: not measured"),
-        _array("ortho", "grey", "none: not seen"),
+        raster("elevation", "m", "elevation of the cell centre", frame="world"),
+        raster("elevation_std", "m", "standard deviation of the elevation", frame="world"),
+        raster("residual", "px", "none: not measured", frame="world"),
+        raster("ortho", "grey", "none: not seen", frame="world"),
     ),
     run=_run,
 )

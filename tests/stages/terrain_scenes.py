@@ -4,12 +4,32 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, level_rotation, rotation_exp
+from rille.stages.geometry.lattice import Lattice
+from rille.stages.terrain.merge import EXACT, Placed
 
 SIZE = (240, 320)
+
+
+@dataclass(frozen=True)
+class ArrayLayer:
+    """A model to merge, its arrays (rows, cols) in memory; see :class:`rille.stages.terrain.merge.Layer`."""
+
+    pair: int
+    lattice: Lattice
+    elevation: np.ndarray
+    elevation_std: np.ndarray
+    residual: np.ndarray
+    ortho: np.ndarray
+    gain: float = 1.0
+    pose: Placed = EXACT
+
+    def part(self, name: str, window: tuple[slice, slice]) -> np.ndarray:
+        return getattr(self, name)[window]
 
 
 def toed_in_rig() -> Rig:

@@ -22,10 +22,10 @@ from pydantic import Field
 
 from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.declare import Params
-from rille.stages.geometry.geometry import Camera, rotation_exp
-from rille.stages.geometry.projection import NEAREST, Pinhole, linearise, project, rotated, to_camera
+from rille.stages.geometry.geometry import Camera
+from rille.stages.geometry.projection import NEAREST, Pinhole, linearise, perturbed, project, rotated, to_camera
 from rille.stages.numeric.robust import huber_cost, huber_weight
-from rille.stages.odometry.resection.pnp import HUBER
+from rille.stages.odometry.resection.pnp import HUBER, bias_information
 
 FIRST_DAMPING, MOST_DAMPING = 1e-4, 1e8
 
@@ -97,9 +97,7 @@ class SegmentState:
 
     def moved(self, pose: Floats, depth: Floats) -> SegmentState:
         """After steps (frame, 6) ``v, w`` as in :mod:`rille.stages.odometry.resection.pnp`, and (n,)."""
-        turn = rotation_exp(pose[:, 3:])
-        t = np.einsum("fij,fj->fi", turn, self.t) + pose[:, :3]
-        return SegmentState(turn @ self.R, t, self.depth + depth)
+        return SegmentState(*perturbed(self.R, self.t, pose), self.depth + depth)
 
 
 class _Tracks(NamedTuple):
@@ -206,7 +204,7 @@ def adjust(
     segments: Sequence[tuple[SegmentTracks, SegmentState]], params: RefineParams
 ) -> tuple[list[SegmentState], float, float, float]:
     """Minimise the cost of some segments with one bias; states, bias (pixels), cost before and after."""
-    prior, sigma = _prior(params), params.pixel_sigma
+    prior, sigma = bias_information(params.bias_sigma), params.pixel_sigma
     views, states = [v for v, _ in segments], [s for _, s in segments]
     bias, damping = 0.0, FIRST_DAMPING
 
@@ -233,11 +231,6 @@ def adjust(
         if finished:
             break
     return states, bias, first, now
-
-
-def _prior(params: RefineParams) -> float:
-    """Information of the bias beforehand; below a ten thousandth of a pixel it is held."""
-    return 1.0 / max(params.bias_sigma, 1e-4) ** 2
 
 
 def _step(
@@ -297,7 +290,7 @@ def posterior(
     parts : normal equations of segments with one bias, as :func:`normal` gives them.
     factors : variance of each segment's errors over the expected one.
     """
-    prior, kept = _prior(params), []
+    prior, kept = bias_information(params.bias_sigma), []
     corner = prior
     for (A, B, d, *_), factor in zip(parts, factors, strict=True):
         S = (A - (B / d) @ B.T) / factor
@@ -320,7 +313,7 @@ def posterior(
 def tilt_of(views: SegmentTracks, state: SegmentState, bias: float, params: RefineParams) -> tuple[float, float]:
     """Information and pull of the tilt by one segment, its poses, depths and bias free."""
     A, B, d, ga, gd = normal(views, state, bias, params.pixel_sigma)
-    prior = _prior(params)
+    prior = bias_information(params.bias_sigma)
     A[-1, -1] += prior
     ga[-1] += prior * bias
     held, g = views.sigma**-2.0, views.tilt

@@ -15,12 +15,12 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Bools, Bytes, Floats, Floats32
+from rille.stages.core.validity import Validity
 from rille.stages.geometry.geometry import Rig, RigidTransform
 from rille.stages.geometry.lattice import Lattice
-from rille.stages.odometry.affinity import solve_3
+from rille.stages.odometry.affinity import known, solve_3
 
-MATCHED = np.uint8(1)
-"""Bit of stages.core.validity: found by matching and consistent, not filled."""
+MATCHED = np.uint8(Validity.MATCHED)
 CONSISTENT = 1.0
 """Pixels: neighbours whose disparities differ by more lie on two surfaces; also the bound of back-matching (4.3.3)."""
 TEMPLATE = 5
@@ -79,16 +79,12 @@ def landmarks_from_disparity(
     return _landmarks(rays, np.where(meets, depth, np.nan), rig, T_local_left, disparity_sigma, max_depth_ratio, lost)
 
 
-def _known(points: Floats) -> Bools:
-    return np.asarray(np.isfinite(points).all(axis=1))
-
-
 def matches_at(points: Floats, column: Floats32, row: Floats32, validity: Bytes) -> tuple[Floats, Bools]:
     """Disparity vectors (n, 2) by bilinear interpolation, and whether the four neighbours are matched and agree."""
     rows, cols = column.shape
-    known = _known(points)
-    p = np.where(known[:, None], points, 0.0)
-    inside = known & (p >= 0).all(1) & (p[:, 0] <= cols - 1) & (p[:, 1] <= rows - 1)
+    there = known(points)
+    p = np.where(there[:, None], points, 0.0)
+    inside = there & (p >= 0).all(1) & (p[:, 0] <= cols - 1) & (p[:, 1] <= rows - 1)
     x = np.clip(np.floor(p[:, 0]), 0, cols - 2).astype(np.intp)
     y = np.clip(np.floor(p[:, 1]), 0, rows - 2).astype(np.intp)
     fx, fy = p[:, 0] - x, p[:, 1] - y
@@ -116,11 +112,11 @@ def relief(points: Floats, column: Floats32, row: Floats32, validity: Bytes) -> 
     the track are then uncertain by the relief inside the template. NaN where that is beyond :data:`CONSISTENT`, since
     then there are two surfaces, or where less than half of the template is matched.
     """
-    known = _known(points)
-    centre = np.floor(np.where(known[:, None], points, 0.0) + 0.5).astype(np.int64)
+    there = known(points)
+    centre = np.floor(np.where(there[:, None], points, 0.0) + 0.5).astype(np.int64)
     rms = np.full(len(points), np.nan)
     _relief(centre, np.asarray(column), np.asarray(row), np.asarray(validity), rms)
-    return np.where(known & (rms <= CONSISTENT), rms, np.nan)
+    return np.where(there & (rms <= CONSISTENT), rms, np.nan)
 
 
 @njit(cache=True, nogil=True)
@@ -240,10 +236,10 @@ def landmarks_from_dem(
 
     The uncertainty is that of the stereo pair which made the model: ``disparity_sigma`` (n,) pixels.
     """
-    known = _known(points)
-    rays = rig.left.rays(np.where(known[:, None], points, 0.0))
+    there = known(points)
+    rays = rig.left.rays(np.where(there[:, None], points, 0.0))
     depth = intersect(elevation, lattice, T_local_left.translation, rays @ T_local_left.rotation.T)
-    depth = np.where(known, depth, np.nan)
+    depth = np.where(there, depth, np.nan)
     lost = {"whose ray misses the elevation model": int((~np.isfinite(depth)).sum())}
     return _landmarks(rays, depth, rig, T_local_left, disparity_sigma, max_depth_ratio, lost)
 
@@ -270,10 +266,10 @@ def intersect(elevation: Floats32, lattice: Lattice, origin: Floats, directions:
         first, last, step = span
         s = np.arange(first, last + step, step)
         height = _height(elevation, lattice, origin, direction, s)
-        known = np.isfinite(height)
-        below = np.flatnonzero(known & (height <= 0))
+        seen = np.isfinite(height)
+        below = np.flatnonzero(seen & (height <= 0))
         # Came out of a hole below the surface, or started there: it passed under, not through.
-        if below.size == 0 or below[0] == 0 or not known[below[0] - 1]:
+        if below.size == 0 or below[0] == 0 or not seen[below[0] - 1]:
             continue
         out[i] = _bisect(elevation, lattice, origin, direction, s[below[0] - 1], s[below[0]])
     return out

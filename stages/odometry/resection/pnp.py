@@ -26,8 +26,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Bools, Floats
-from rille.stages.geometry.geometry import Camera, RigidTransform, cross_matrix, rotation_exp
-from rille.stages.geometry.projection import NEAREST, Pinhole, linearise, project, rotated, to_camera
+from rille.stages.geometry.geometry import Camera, RigidTransform, cross_matrix
+from rille.stages.geometry.projection import NEAREST, Pinhole, linearise, perturbed, project, rotated, to_camera
 from rille.stages.numeric.robust import huber_cost, huber_weight
 
 UNKNOWNS = 7
@@ -63,11 +63,11 @@ class Observations:
             pixels=self.pixels[0][batch],
         )
 
-    @property
-    def prior(self) -> float:
-        """Information of the bias; below a ten thousandth of a pixel it is held."""
-        # A sigma of 0 asks for no bias: held by a large number, the matrices keep their size.
-        return 1.0 / max(self.bias_sigma, 1e-4) ** 2
+
+def bias_information(sigma: float) -> float:
+    """Information of a prior on the bias, 1/pixel^2; below a ten thousandth of a pixel the bias is held."""
+    # A sigma of 0 asks for no bias: held by a large number, the matrices keep their size.
+    return 1.0 / max(sigma, 1e-4) ** 2
 
 
 @dataclass(frozen=True)
@@ -89,9 +89,7 @@ class Poses:
 
     def moved(self, step: Floats) -> Poses:
         """After steps (b, 7): ``v``, ``w``, and that of the bias."""
-        turn = rotation_exp(step[:, 3:6])
-        t = np.einsum("bij,bj->bi", turn, self.t) + step[:, :3]
-        return Poses(turn @ self.R, t, self.bias + step[:, 6])
+        return Poses(*perturbed(self.R, self.t, step[:, :6]), self.bias + step[:, 6])
 
 
 @dataclass(frozen=True)
@@ -196,7 +194,9 @@ def _problems(obs: Observations) -> _Problems:
     arrays = (obs.landmarks, obs.per_pixel, obs.sigma, obs.pixels)
     landmarks, per_pixel, sigma, pixels = (np.ascontiguousarray(a, dtype=np.float64) for a in arrays)
     camera = Pinhole.of(obs.camera)
-    return _Problems(landmarks, per_pixel, sigma, pixels, camera, float(obs.pixel_sigma), float(obs.prior))
+    return _Problems(
+        landmarks, per_pixel, sigma, pixels, camera, float(obs.pixel_sigma), bias_information(obs.bias_sigma)
+    )
 
 
 def _pose_arrays(poses: Poses) -> tuple[Floats, Floats, Floats]:

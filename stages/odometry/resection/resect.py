@@ -43,6 +43,7 @@ from rille.stages.odometry.resection.pnp import (
     Observations,
     Poses,
     back_projection,
+    bias_information,
     levenberg_marquardt,
     normal_matrix,
     norms,
@@ -292,10 +293,10 @@ def _result(obs: Observations, poses: Poses, active: Bools, steps: int, params: 
     squares = (weight[0] * np.where(active, errors.norm[0], 0.0) ** 2).sum()
     factor = max(float(squares / (2 * active.sum() - 6)), 1e-12)
     R = poses.R[0]
-    T = RigidTransform(R, poses.t[0]).inverse()
-    stated, bias, condition = _covariance(normal[0] / max(factor, 1.0), obs.prior, R)
+    T, prior = RigidTransform(R, poses.t[0]).inverse(), bias_information(obs.bias_sigma)
+    stated, bias, condition = _covariance(normal[0] / max(factor, 1.0), prior, R)
     depth = float(np.median((obs.landmarks[0][active] @ R.T + poses.t[0])[:, 2]))
-    expected, other, _ = _covariance(normal[0], obs.prior, R)
+    expected, other, _ = _covariance(normal[0], prior, R)
     position_sigma = float(np.sqrt(np.trace(expected[:3, :3]) + (other[:3] ** 2).sum()))
     if position_sigma > params.max_position_ratio * depth:
         raise DegenerateError(
@@ -304,7 +305,7 @@ def _result(obs: Observations, poses: Poses, active: Bools, steps: int, params: 
             f" by {position_sigma:.2g} m (condition {condition:.1e})",
             remedy="they are too far, too few or in one direction: set track.points higher or use nearer texture",
         )
-    covariance, _, _ = _covariance(normal[0] / factor, obs.prior, R)
+    covariance, _, _ = _covariance(normal[0] / factor, prior, R)
     shared = np.column_stack([root(stated - covariance, depth), bias])
     residual = np.where(np.isfinite(errors.norm[0]), np.sqrt((errors.pixels[0] ** 2).sum(-1)), np.nan)
     together = scatter_of_blocks(obs.pixels[0][active], errors.white[0][active], weight[0][active], obs.camera)

@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 from pydantic import Field
 
 from rille.stages.core.arrays import Bools, Floats, Floats32
-from rille.stages.core.declare import Array, Bundle, Inputs, Memory, Params, Stage
+from rille.stages.core.declare import Bundle, Inputs, Memory, Params, Stage, raster
 from rille.stages.core.errors import ConfigError, DegenerateError, InputError
 from rille.stages.core.validity import matched
 from rille.stages.geometry.geometry import Rig, RigidTransform
@@ -342,10 +342,7 @@ def _median(array: Floats32) -> float | None:
     return float(np.median(values)) if values.size else None
 
 
-def _array(name: str, unit: str, long_name: str) -> Array:
-    return Array(name, ("row", "col"), "float32", unit, long_name, nodata="nan", frame="local or world (meta: frame)")
-
-
+_FRAME = "local or world (meta: frame)"
 STAGE = Stage(
     name="locus",
     version=5,
@@ -353,10 +350,10 @@ STAGE = Stage(
     params=LocusParams,
     inputs=("disparity", "rig", "left", "right?", "back?", "level", "reference?", "trajectory?", "local?"),
     outputs=(
-        _array("elevation", "m", "elevation of the cell centre"),
-        _array("elevation_std", "m", "standard deviation of the elevation"),
-        _array("residual", "px", "mismatch of disparity and calibration at the elevation"),
-        _array("ortho", "grey", "grey value of the left image, 0..255"),
+        raster("elevation", "m", "elevation of the cell centre", frame=_FRAME),
+        raster("elevation_std", "m", "standard deviation of the elevation", frame=_FRAME),
+        raster("residual", "px", "mismatch of disparity and calibration at the elevation", frame=_FRAME),
+        raster("ortho", "grey", "grey value of the left image, 0..255", frame=_FRAME),
     ),
     run=_run,
     memory=Memory(lower=("locus.cell_size", "locus.extent"), size=_size),

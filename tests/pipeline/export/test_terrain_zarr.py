@@ -26,7 +26,9 @@ OF_PLACE = ("easting", "northing")
 
 def arrays() -> dict:
     z = elevation()
-    layer = Layer(4, LATTICE, z, np.full_like(z, 0.01), np.zeros_like(z), np.full_like(z, 90))
+    model = {"elevation": z, "elevation_std": np.full_like(z, 0.01), "residual": np.zeros_like(z)}
+    model["ortho"] = np.full_like(z, 90)
+    layer = Layer(4, LATTICE, lambda name, window: model[name][window])
     found = vars(merge.merge([layer], LATTICE, MergeParams()))
     return {spec.name: (spec, found[spec.name]) for spec in merge.STAGE.outputs if spec.name in found}
 

@@ -103,7 +103,7 @@ def test_cost_of_depth_is_what_a_knock_does():
     cost = depth_sensitivity(rig, m.left, m.right)
     step = np.zeros(5)
     step[NAMES.index("yaw")] = math.radians(0.1)
-    from rille.stages.geometry.triangulation import inverse_depth
+    from rille.stages.geometry.epipolar import inverse_depth
 
     true, per_pixel = inverse_depth(rig, m.left, m.right - m.left)
     wrong, _ = inverse_depth(corrected(rig, step), m.left, m.right - m.left)

@@ -18,6 +18,7 @@ from rille.stages.odometry.resection.pnp import (
     Observations,
     Poses,
     back_projection,
+    bias_information,
     derivatives,
     levenberg_marquardt,
     normal_matrix,
@@ -409,7 +410,7 @@ def test_compiled_errors_are_those_of_the_arrays():
     # Newton's step of the arrays' normal equations is what one undamped compiled step does.
     active = np.arange(n)[None] > 0
     normal, gradient, _ = normal_matrix(obs, back_projection(obs, one), active)
-    normal[:, 6, 6] += obs.prior
+    normal[:, 6, 6] += bias_information(obs.bias_sigma)
     expected = -np.linalg.solve(normal[0] + 1e-4 * np.diag(np.diag(normal[0])), gradient[0])
     moved, done = levenberg_marquardt(obs, one, active, 1)
     by_arrays = one.moved(expected[None])

@@ -11,8 +11,8 @@ from terrain_scenes import ball, box, disparity, nearest, pitched, plane, smooth
 
 from rille.stages.core.declare import Bundle
 from rille.stages.core.validity import Validity
+from rille.stages.geometry.epipolar import inverse_depth
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
-from rille.stages.geometry.triangulation import inverse_depth
 from rille.stages.terrain import ground_frame as level_stage
 from rille.stages.terrain.ground import _singular_values
 from rille.stages.terrain.ground_frame import LevelParams, VerticalHint, level

@@ -8,11 +8,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from raising import raises
+from terrain_scenes import ArrayLayer
 
 from rille.stages.core.declare import Bundle, check_outputs
 from rille.stages.geometry.lattice import Lattice, mosaic
 from rille.stages.terrain import merge as merge_stage
-from rille.stages.terrain.merge import EXACT, Layer, Merged, MergeParams, Placed, footprint, merge
+from rille.stages.terrain.merge import EXACT, Merged, MergeParams, Placed, footprint, merge
 
 TILE = Lattice.at(0, 0, 0.1, 4, 5)
 PARAMS = MergeParams()
@@ -25,14 +26,14 @@ def layer(
     residual: object = 0.0,
     ortho: object = 100.0,
     lattice: Lattice = TILE,
-) -> Layer:
+) -> ArrayLayer:
     arrays = (
         np.broadcast_to(np.asarray(v, np.float32), lattice.shape).copy() for v in (elevation, std, residual, ortho)
     )
-    return Layer(pair, lattice, *arrays)
+    return ArrayLayer(pair, lattice, *arrays)
 
 
-def noisy(count: int, seed: int = 0) -> list[Layer]:
+def noisy(count: int, seed: int = 0) -> list[ArrayLayer]:
     rng = np.random.default_rng(seed)
     out = []
     for k in range(count):
@@ -215,7 +216,7 @@ def test_tiles_of_the_stage_equal_the_whole() -> None:
         names = ("elevation", "elevation_std", "residual", "ortho")
         maps = {n: rng.uniform(0.05, 0.2, lattice.shape).astype(np.float32) for n in names}
         dems.append(Bundle(maps, {"lattice": lattice.to_dict(), "pair": 4 * k, "frame": "world"}))
-        layers.append(Layer(4 * k, lattice, **maps))
+        layers.append(ArrayLayer(4 * k, lattice, **maps))
     whole = Lattice.at(-20, 20, 0.1, 45, 55)
     at_once = merge(layers, whole, PARAMS)
     parts = []
@@ -234,7 +235,7 @@ def test_strips_of_any_height_give_the_same_bits(monkeypatch: pytest.MonkeyPatch
     tile = Lattice.at(0, 0, 0.1, 40, 30)
     rng = np.random.default_rng(5)
     layers = [
-        Layer(k, at, *(rng.uniform(0.05, 0.2, at.shape).astype(np.float32) for _ in range(4)))
+        ArrayLayer(k, at, *(rng.uniform(0.05, 0.2, at.shape).astype(np.float32) for _ in range(4)))
         for k, at in enumerate(Lattice.at(3 * k - 9, 4 * k - 12, 0.1, 25, 20) for k in range(7))
     ]
     whole = merge(layers, tile, PARAMS)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from rille.stages.terrain.overlap_fit import fit_seam
+from rille.stages.terrain.overlap_qa import fit_seam
 
 X, Y = 0.01 * np.arange(90), -0.01 * np.arange(70)
 
