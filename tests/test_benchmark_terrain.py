@@ -10,7 +10,7 @@ import pytest
 
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 from rille.stages.geometry.lattice import Lattice
-from rille.stages.terrain.locus.roots import SOLVED_PX
+from rille.stages.terrain.locus.kernel import SOLVED_PX
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 

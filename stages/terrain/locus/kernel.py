@@ -9,10 +9,12 @@ s > 0: the surface that the left camera sees behind P is farther than P, so P is
 surface. A terrain surface is a change from free (above) to behind (below) along the normal. Where the change happens
 across a depth jump between two pixels nothing was seen: the cell is occluded there.
 
-A few dozen cells are followed side by side, each in its own *lane*: their lines are divided into steps
-(:mod:`rille.stages.terrain.locus.lines`), steps are looked at several at once
-(:mod:`rille.stages.terrain.locus.points`) until s changes its sign, and the roots of all the changes found are solved
-together (:mod:`rille.stages.terrain.locus.roots`). A lane whose root does not stand goes on from there.
+A few dozen cells are followed side by side, each in its own *lane*: their lines are divided into steps (:func:`spans`),
+steps are looked at several at once (:func:`meet`) until s changes its sign, and the roots of all the changes found are
+solved together (:func:`roots`). A lane whose root does not stand goes on from there.
+
+Values lie in *planes* of a buffer, one behind the other, whose sizes are constants: so the compiler knows that they do
+not overlap, and computes several lanes or points side by side.
 """
 
 from __future__ import annotations
@@ -24,44 +26,235 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rille.stages.core.arrays import Floats
-from rille.stages.terrain.locus.lines import (
-    BOTTOM,
-    COUNT,
-    DZ,
-    FOOT,
-    HIGH,
-    LAST,
-    LOW,
-    NORMAL,
-    START,
-    TOP,
-    clip,
-    lines,
-    spans,
-)
-from rille.stages.terrain.locus.lines import PLANES as LINE_PLANES
-from rille.stages.terrain.locus.points import (
-    LANES,
-    POINT_PLANES,
-    POINTS,
-    STEPS,
-    LineSteps,
-    Observed,
-    S,
-    climb,
-    meet,
-    pixels,
-)
-from rille.stages.terrain.locus.roots import PLANES as ROOT_PLANES
-from rille.stages.terrain.locus.roots import accept, gather, roots, slopes
+from rille.stages.core.arrays import Floats, Floats32
+
+NEAR = 1e-9  # least projective depth (metres): excludes the camera's own plane
+
+LANES = 32
+"""Cells that are solved together."""
+STEPS = 8
+"""LineSteps of one cell's search that are looked at together."""
+POINTS = LANES * STEPS
+
+X, Y, X_RIGHT, Y_RIGHT, FX, FY, PIXEL, U, V, S, ACROSS, POWER = (k * POINTS for k in range(12))
+"""Planes of a buffer of points: p_l and p_r, the place of p_l in its bilinear cell, the pixel at that cell's start, the
+disparity there, and as :func:`meet` gives them s and its part across the epipolar line, both times a norm whose square
+is ``POWER``."""
+POINT_PLANES = 12
+
+LEFT_A, RIGHT_A, LEFT_B, RIGHT_B = (3 * k * LANES for k in range(4))
+"""Planes of a buffer of lanes that hold each cell's line: its homogeneous projections a + z b, three planes each."""
+LINE = 12
+"""Number of these planes."""
+Z = 12 * LANES
+"""Plane of the elevation that is looked at."""
+
+STEP_PX = 1.0  # search step: disparity is bilinear between pixels, so nothing hides in a shorter one
+MARGIN = 2  # steps that the interval handed down from the coarse level is widened by
+MAX_STEPS = 4096.0  # of one locus: more than the diagonal of a 12 megapixel image
+
+FOOT, NORMAL, LOW, HIGH = (k * LANES for k in (13, 16, 19, 20))
+BOTTOM, TOP, DZ, COUNT, START, LAST = (k * LANES for k in range(21, 27))
+"""Planes of a buffer of lanes beside the lines: foot (3) and normal (3) of each cell, the interval that the search
+starts in; the part of the line that both images see, a step, how many there are, first and last one searched."""
+LINE_PLANES = 27
 
 WAY, PLACE, LEVEL, FIRST = (k * LANES for k in range(LINE_PLANES, LINE_PLANES + 4))
 """Planes of the search: -1 downwards, 1 upwards, 0 not begun; the step looked at last, and s there; s at the start."""
 UPPER_Z, UPPER_S, LOWER_Z, LOWER_S = (k * LANES for k in range(LINE_PLANES + 4, LINE_PLANES + 8))
 """Planes of the bracket that was found: elevation and s of both ends, as :func:`gather` copies them."""
-PLANES = LINE_PLANES + 8
+SEARCH_PLANES = LINE_PLANES + 8
 DONE, MORE, FOUND = 0, 1, 2
+
+SOLVED_PX = 1e-3  # |s| of a solution: a hundredth of the disparity's own noise
+TURNS = 16
+
+STEP, Z0, S0, Z1, S1 = (k * LANES for k in range(13, 18))
+"""Planes beside the lines: the search's step, and the bracket: s0 >= 0 at z0, s1 < 0 at z1."""
+SIDE, OPEN, ROOT, UPWARDS, DOWNWARDS = (k * LANES for k in range(18, 23))
+ROOT_PLANES = 23
+
+
+class Line(NamedTuple):
+    """The line of a cell in one image: its points F + Z N have the homogeneous projections a + Z b."""
+
+    a0: float
+    a1: float
+    a2: float
+    b0: float
+    b1: float
+    b2: float
+
+
+class LineSteps(NamedTuple):
+    """Points of a line that are looked at together: Z = bottom + (first + way m) dz, m < :data:`STEPS`."""
+
+    bottom: float
+    first: float
+    way: float
+    dz: float
+
+
+class Observed(NamedTuple):
+    """What is read at a pixel of the left image (rows, cols).
+
+    ``disparity`` (2 rows cols,) column and row disparity (right minus left) of each pixel in turn, pixels, NaN where it
+    must not be used; ``std`` (rows, cols) its standard deviation, pixels; ``image`` (rows, cols) grey values;
+    ``limits`` (2,) greatest residual and greatest jump in the bilinear cell, pixels.
+    """
+
+    disparity: Floats32
+    std: Floats
+    image: Floats32
+    limits: Floats
+
+
+# Functions that take arrays and run once a cell are inlined where they are called: to count the references of their
+# arguments takes longer than their work.
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def line_of(lanes, a, b, m):  # type: ignore[no-untyped-def]
+    """The line of lane ``m`` whose terms begin at planes ``a`` and ``b``."""
+    return Line(
+        lanes[a + m], lanes[a + LANES + m], lanes[a + 2 * LANES + m],
+        lanes[b + m], lanes[b + LANES + m], lanes[b + 2 * LANES + m],
+    )  # fmt: skip
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def project(line, z):  # type: ignore[no-untyped-def]
+    """x, y of the line's point at elevation z, pixels, and its projective depth."""
+    w = line.a2 + z * line.b2
+    return (line.a0 + z * line.b0) / w, (line.a1 + z * line.b1) / w, w
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _place(left, right, z, shape, room, k):  # type: ignore[no-untyped-def]
+    """Point ``k``: p_l and p_r of the lines' point at elevation z, and the bilinear cell of p_l."""
+    x, y, w_left = project(left, z)
+    xr, yr, w_right = project(right, z)
+    rows, cols = shape
+    inside = (w_left >= NEAR) & (w_right >= NEAR) & (x >= 0.0) & (y >= 0.0) & (x < cols - 1.0) & (y < rows - 1.0)
+    # A point outside reads pixel 0, so that the loop over the disparity needs no branch; its NaN makes s one.
+    x, y, xr = x if inside else 0.0, y if inside else 0.0, xr if inside else np.nan
+    c, r = np.floor(x), np.floor(y)
+    room[X + k], room[Y + k], room[X_RIGHT + k], room[Y_RIGHT + k] = x, y, xr, yr
+    room[FX + k], room[FY + k], room[PIXEL + k] = x - c, y - r, r * float(cols) + c
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def climb(lanes, m, steps, shape, room):  # type: ignore[no-untyped-def]
+    """Project the next steps of lane ``m`` into both images; ``shape`` (rows, cols) of the left one."""
+    left, right = line_of(lanes, LEFT_A, LEFT_B, m), line_of(lanes, RIGHT_A, RIGHT_B, m)
+    for k in range(STEPS):
+        _place(left, right, steps.bottom + (steps.first + steps.way * k) * steps.dz, shape, room, k)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def raise_to(lanes, n, shape, room):  # type: ignore[no-untyped-def]
+    """Project the point at elevation :data:`Z` of each of ``n`` lanes."""
+    for m in range(n):
+        left, right = line_of(lanes, LEFT_A, LEFT_B, m), line_of(lanes, RIGHT_A, RIGHT_B, m)
+        _place(left, right, lanes[Z + m], shape, room, m)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def meet(n, epipole, seen, room):  # type: ignore[no-untyped-def]
+    """s of ``n`` projected points; NaN where a point is outside an image or disparity is undefined."""
+    # To read the disparity at scattered pixels is what vectors cannot do, so it is a loop of its own.
+    disparity, width = seen.disparity, seen.image.shape[1]
+    for k in range(n):
+        i = 2 * int(room[PIXEL + k])
+        j = i + 2 * width
+        fx, fy = room[FX + k], room[FY + k]
+        w00, w01, w10, w11 = (1.0 - fx) * (1.0 - fy), fx * (1.0 - fy), (1.0 - fx) * fy, fx * fy
+        room[U + k] = w00 * disparity[i] + w01 * disparity[i + 2] + w10 * disparity[j] + w11 * disparity[j + 2]
+        room[V + k] = w00 * disparity[i + 1] + w01 * disparity[i + 3] + w10 * disparity[j + 1] + w11 * disparity[j + 3]
+    e0, e1, e2 = epipole[0], epipole[1], epipole[2]
+    for k in range(n):
+        # g = p_l + d(p_l) - p_r
+        xr, yr = room[X_RIGHT + k], room[Y_RIGHT + k]
+        gx, gy = room[X + k] + room[U + k] - xr, room[Y + k] + room[V + k] - yr
+        # With p_r(t) = (epipole + t m) / w on the ray of p_l, d p_r / d t is parallel to p_r * epipole_2 - epipole_01.
+        ex, ey = xr * e2 - e0, yr * e2 - e1
+        # s = g . e / |e|: the search asks for its sign alone, so the root and the division are left to ``pixels``.
+        power = ex * ex + ey * ey
+        s = gx * ex + gy * ey
+        room[S + k] = s if power > 0.0 else np.nan
+        room[ACROSS + k], room[POWER + k] = gy * ex - gx * ey, power
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def pixels(room, plane, k):  # type: ignore[no-untyped-def]
+    """:data:`S` or :data:`ACROSS` of point ``k`` in pixels."""
+    return room[plane + k] / math.sqrt(room[POWER + k])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def lines(n, left, right, lanes):  # type: ignore[no-untyped-def]
+    """Projections of the lines of ``n`` cells by the (3, 4) projections of both images."""
+    for side in range(2):
+        p = right if side else left
+        for k in range(3):
+            p0, p1, p2, p3 = p[k, 0], p[k, 1], p[k, 2], p[k, 3]
+            a, b = (RIGHT_A if side else LEFT_A) + k * LANES, (RIGHT_B if side else LEFT_B) + k * LANES
+            for m in range(n):
+                x, y, z = lanes[FOOT + m], lanes[FOOT + LANES + m], lanes[FOOT + 2 * LANES + m]
+                lanes[a + m] = p3 + p0 * x + p1 * y + p2 * z
+                x, y, z = lanes[NORMAL + m], lanes[NORMAL + LANES + m], lanes[NORMAL + 2 * LANES + m]
+                lanes[b + m] = p0 * x + p1 * y + p2 * z
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def clip(n, sizes, z_min, z_max, lanes):  # type: ignore[no-untyped-def]
+    """The part of z_min..z_max where each line projects into both images; empty (bottom > top) where there is none."""
+    wl, hl, wr, hr = sizes[0] - 1.0, sizes[1] - 1.0, sizes[2] - 1.0, sizes[3] - 1.0
+    for m in range(n):
+        low, high = _inside(line_of(lanes, LEFT_A, LEFT_B, m), wl, hl, z_min, z_max)
+        lanes[BOTTOM + m], lanes[TOP + m] = _inside(line_of(lanes, RIGHT_A, RIGHT_B, m), wr, hr, low, high)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _inside(line, w, h, low, high):  # type: ignore[no-untyped-def]
+    """The part of low..high where 0 <= x <= w, 0 <= y <= h in front of the camera: x = X / W with W > 0 is X >= 0."""
+    low, high = _bound(line.a0, line.b0, low, high)
+    low, high = _bound(w * line.a2 - line.a0, w * line.b2 - line.b0, low, high)
+    low, high = _bound(line.a1, line.b1, low, high)
+    low, high = _bound(h * line.a2 - line.a1, h * line.b2 - line.b1, low, high)
+    return _bound(line.a2 - NEAR, line.b2, low, high)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _bound(p, q, low, high):  # type: ignore[no-untyped-def]
+    """The part of low..high where p + z q >= 0."""
+    z = -p / q
+    from_below, from_above = (q > 0.0) & (z > low), (q < 0.0) & (z < high)
+    nowhere = (q == 0.0) & (p < 0.0)
+    return z if from_below else low, z if from_above else (-np.inf if nowhere else high)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def spans(n, lanes):  # type: ignore[no-untyped-def]
+    """Divide the lines into steps of a pixel at most where they are seen fastest."""
+    for m in range(n):
+        bottom, top = lanes[BOTTOM + m], lanes[TOP + m]
+        # d p / d Z = (a_2 b - b_2 a) / w^2 with w linear in Z: the speed is greatest at one of the ends.
+        left, right = line_of(lanes, LEFT_A, LEFT_B, m), line_of(lanes, RIGHT_A, RIGHT_B, m)
+        fastest = max(_speed(left, bottom), _speed(left, top))
+        fastest = max(fastest, _speed(right, bottom), _speed(right, top))
+        count = max(1.0, min(np.ceil(fastest * (top - bottom) / STEP_PX), MAX_STEPS))
+        dz = (top - bottom) / count
+        lanes[DZ + m], lanes[COUNT + m] = dz, count
+        lanes[START + m] = max(0.0, min(count, np.ceil((lanes[HIGH + m] - bottom) / dz) + MARGIN))
+        lanes[LAST + m] = np.floor((lanes[LOW + m] - bottom) / dz) - MARGIN
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _speed(line, z):  # type: ignore[no-untyped-def]
+    """Image speed |d p / d Z|, pixels per metre: with p = (a + Z b) / w it is |b - p b_2| / w."""
+    w = max(line.a2 + z * line.b2, NEAR)
+    x, y = (line.a0 + z * line.b0) / w, (line.a1 + z * line.b1) / w
+    dx, dy = (line.b0 - x * line.b2) / w, (line.b1 - y * line.b2) / w
+    return math.sqrt(dx * dx + dy * dy)
 
 
 class BlockCells(NamedTuple):
@@ -111,7 +304,11 @@ def search(cells: BlockCells, z_range: tuple[float, float], cameras: PairCameras
     out : (r, c, 4) elevation (m), its standard deviation (m), residual (px) and grey value of the highest change from
         free to behind that stands; to be filled with NaN before.
     """
-    lanes, solved, points = np.zeros(PLANES * LANES), np.zeros(ROOT_PLANES * LANES), np.zeros(POINT_PLANES * POINTS)
+    lanes, solved, points = (
+        np.zeros(SEARCH_PLANES * LANES),
+        np.zeros(ROOT_PLANES * LANES),
+        np.zeros(POINT_PLANES * POINTS),
+    )
     active, found, chosen = np.empty(LANES, np.int64), np.empty(LANES, np.int64), np.empty(LANES, np.int64)
     room = _Room(lanes, solved, points, active, found, chosen)
     foot, normal, rows = cells.feet.reshape(-1, 3), cells.normals.reshape(-1, 3), out.reshape(-1, 4)
@@ -254,3 +451,113 @@ def _bracket(lanes, m, step, upper, lower):  # type: ignore[no-untyped-def]
     """The step below ``step``, with s at both ends."""
     lanes[UPPER_Z + m], lanes[UPPER_S + m] = lanes[BOTTOM + m] + step * lanes[DZ + m], upper
     lanes[LOWER_Z + m], lanes[LOWER_S + m] = lanes[BOTTOM + m] + (step - 1.0) * lanes[DZ + m], lower
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def roots(n, lanes, epipole, seen, room):  # type: ignore[no-untyped-def]
+    """Regula falsi (Illinois); NaN at undefined disparity."""
+    for m in range(n):
+        lanes[SIDE + m], lanes[OPEN + m] = 0.0, 1.0
+    for _ in range(TURNS):
+        for m in range(n):
+            z0, s0, z1, s1 = lanes[Z0 + m], lanes[S0 + m], lanes[Z1 + m], lanes[S1 + m]
+            z = (z0 * s1 - z1 * s0) / (s1 - s0)
+            lanes[Z + m] = z if lanes[OPEN + m] > 0.0 else lanes[Z + m]
+        raise_to(lanes, n, seen.image.shape, room)
+        meet(n, epipole, seen, room)
+        if not _halve(n, lanes, room):
+            break
+    for m in range(n):
+        lanes[ROOT + m] = lanes[Z + m]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _halve(n, lanes, room):  # type: ignore[no-untyped-def]
+    """Narrow each bracket by the point looked at; how many are not solved yet."""
+    left = 0
+    for m in range(n):
+        s, z = pixels(room, S, m), lanes[Z + m]
+        z0, s0, z1, s1, side = lanes[Z0 + m], lanes[S0 + m], lanes[Z1 + m], lanes[S1 + m], lanes[SIDE + m]
+        still = (lanes[OPEN + m] > 0.0) & (abs(s) >= SOLVED_PX)
+        lanes[OPEN + m] = 1.0 if still else 0.0
+        left += 1 if still else 0
+        free = s > 0.0
+        # Illinois: an end that stays twice counts half, else the chord would creep towards the root from one side.
+        lanes[Z0 + m], lanes[S0 + m] = (z if free else z0), (s if free else (s0 * 0.5 if side < 0.0 else s0))
+        lanes[Z1 + m], lanes[S1 + m] = (z1 if free else z), ((s1 * 0.5 if side > 0.0 else s1) if free else s)
+        lanes[SIDE + m] = 1.0 if free else -1.0
+        lanes[Z + m] = z if s == s else np.nan
+    return left
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def slopes(n, lanes, epipole, seen, room):  # type: ignore[no-untyped-def]
+    """One-sided ds/dZ at the roots, pixels per metre; leaves the roots' own points in ``room``."""
+    for m in range(n):
+        lanes[Z + m] = lanes[ROOT + m] + lanes[STEP + m]
+    raise_to(lanes, n, seen.image.shape, room)
+    meet(n, epipole, seen, room)
+    for m in range(n):
+        lanes[UPWARDS + m] = pixels(room, S, m) / lanes[STEP + m]
+        lanes[Z + m] = lanes[ROOT + m] - lanes[STEP + m]
+    raise_to(lanes, n, seen.image.shape, room)
+    meet(n, epipole, seen, room)
+    for m in range(n):
+        lanes[DOWNWARDS + m] = -pixels(room, S, m) / lanes[STEP + m]
+        # The roots themselves once more: their residual and grey value are read from the room of points.
+        lanes[Z + m] = lanes[ROOT + m]
+    raise_to(lanes, n, seen.image.shape, room)
+    meet(n, epipole, seen, room)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def accept(n, found, cells, lanes, seen, room, out):  # type: ignore[no-untyped-def]
+    """Write ``out`` of the roots that stand; leave the other lanes in front of ``found``, and return their number.
+
+    ``found``: the search's lane of each; ``cells``: the row of ``out`` of each of those."""
+    disparity, std, image, limits = seen
+    width, count = image.shape[1], 0
+    for m in range(n):
+        s, across = pixels(room, S, m), pixels(room, ACROSS, m)
+        residual = math.sqrt(s * s + across * across)
+        # The lesser slope: beside a jump the other side is steep, and would make the elevation look certain.
+        up, down = lanes[UPWARDS + m], lanes[DOWNWARDS + m]
+        slope = up if down != down else (down if up != up else min(up, down))
+        at = 2 * int(room[PIXEL + m])
+        if residual <= limits[0] and slope > 0.0 and not _is_jump(at, at + 2 * width, disparity, limits[1]):
+            c, r, fx, fy = int(room[X + m]), int(room[Y + m]), room[FX + m], room[FY + m]
+            top = image[r, c] * (1.0 - fx) + image[r, c + 1] * fx
+            bottom = image[r + 1, c] * (1.0 - fx) + image[r + 1, c + 1] * fx
+            i, own = cells[found[m]], std[int(np.rint(room[Y + m])), int(np.rint(room[X + m]))]
+            # sigma_Z = sigma_d / |ds/dZ|
+            out[i, 0], out[i, 1], out[i, 2] = lanes[ROOT + m], own / slope, residual
+            out[i, 3] = top * (1.0 - fy) + bottom * fy
+        else:
+            found[count] = found[m]  # count <= m: none is lost
+            count += 1
+    return count
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _is_jump(i, j, disparity, max_jump):  # type: ignore[no-untyped-def]
+    """Whether the disparities of a bilinear cell differ by more than ``max_jump`` (a depth discontinuity)."""
+    u = _range(disparity[i], disparity[i + 2], disparity[j], disparity[j + 2])
+    v = _range(disparity[i + 1], disparity[i + 3], disparity[j + 1], disparity[j + 3])
+    return u * u + v * v > max_jump * max_jump
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _range(a, b, c, d):  # type: ignore[no-untyped-def]
+    return float(max(max(a, b), max(c, d))) - float(min(min(a, b), min(c, d)))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def gather(chosen, n, source, step, bracket, lanes):  # type: ignore[no-untyped-def]
+    """Put the lines, steps and brackets (from plane ``bracket`` on) of ``n`` chosen lanes of the search in a row."""
+    for t in range(n):
+        m = chosen[t]
+        for k in range(LINE):
+            lanes[k * LANES + t] = source[k * LANES + m]
+        lanes[STEP + t] = source[step + m]
+        for k in range(4):
+            lanes[Z0 + k * LANES + t] = source[bracket + k * LANES + m]

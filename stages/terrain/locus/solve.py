@@ -14,8 +14,7 @@ from rille.stages.core.arrays import Bools, Floats, Floats32
 from rille.stages.core.errors import DegenerateError, InputError
 from rille.stages.geometry.geometry import Rig, RigidTransform
 from rille.stages.geometry.surface import Surface
-from rille.stages.terrain.locus.kernel import BlockCells, PairCameras, search
-from rille.stages.terrain.locus.points import Observed
+from rille.stages.terrain.locus.kernel import BlockCells, Observed, PairCameras, search
 
 COARSE = 8  # cells a coarse cell is wide: a 64th of the cells search the whole range
 BLOCK_ROWS = 64  # rows of cells in one kernel call, so that a large surface stays small in memory

@@ -5,36 +5,34 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rille.stages.terrain.locus import points
-from rille.stages.terrain.locus.lines import (
+from rille.stages.terrain.locus import kernel
+from rille.stages.terrain.locus.kernel import (
     BOTTOM,
     COUNT,
     DZ,
     FOOT,
     HIGH,
+    LANES,
     LAST,
+    LINE_PLANES,
     LOW,
     MARGIN,
     NORMAL,
-    START,
-    TOP,
-    clip,
-    lines,
-    spans,
-)
-from rille.stages.terrain.locus.lines import PLANES as LINE_PLANES
-from rille.stages.terrain.locus.points import (
-    LANES,
     POINT_PLANES,
     POINTS,
+    START,
     STEPS,
+    TOP,
     LineSteps,
     Observed,
     Z,
     climb,
+    clip,
+    lines,
     meet,
     pixels,
     raise_to,
+    spans,
 )
 
 WIDTH, HEIGHT = 40, 30
@@ -93,7 +91,7 @@ def test_points_of_lanes_and_of_steps_equal_single_points() -> None:
             meet(len(feet), EPIPOLE, seen, room)
             for k in range(len(feet)):
                 expected = mismatch(feet[k] + z * normals[k], disparity)
-                for plane, value in zip((points.S, points.ACROSS), expected, strict=True):
+                for plane, value in zip((kernel.S, kernel.ACROSS), expected, strict=True):
                     one, among = pixels(room, plane, k), pixels(steps, plane, STEPS * k + m)
                     assert one == pytest.approx(value, abs=1e-9, nan_ok=True)
                     assert np.array_equal(one, among, equal_nan=True)
