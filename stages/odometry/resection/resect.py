@@ -55,19 +55,19 @@ FEW = "set track.points higher or choose basic pairs closer"
 MOST_BLOCKS = 6
 """Blocks along either side of the image whose mean errors show how far neighbours' errors go together."""
 PER_BLOCK = 6
-"""Landmarks a block, at least on average."""
+"""Least mean number of landmarks per block."""
 MOVING = 0.3
-"""Share of the landmarks that agree with no pose, from which on it is warned of."""
+"""Share of the landmarks that agree with no pose, above which a warning is given."""
 SOURCES = 7
-"""Errors that segments share: as many as the pose has parameters, and that of all disparities."""
+"""Error sources that all segments share: one for each of the six pose parameters, and the bias of the disparities."""
 AT_ONCE = 8
-"""Of the landmarks above the threshold, one in so many (at least one) is removed before the pose is adjusted anew."""
+"""Per iteration, the worst ceil(n / 8) of n landmarks above the threshold are removed; then the pose is adjusted."""
 SEARCHED = 9.0
-"""Side of the square about a prediction, pixels, in which tracking finds a point, be it wrong: four either way."""
+"""Side [pixels] of the square around a prediction within which tracking finds a point, right or wrong: 2 * 4 + 1."""
 PARTS = (0.25, 0.5, 1.0)
 """Shares of the threshold at which agreement is counted."""
 FALSE_ALARMS = 0.01
-"""Poses that chance alone may offer in a frame without one right track: one of a hundred such frames gets a pose."""
+"""Expected number of poses that chance alone makes in a frame whose tracks are all wrong: one in a hundred frames."""
 SAMPLE = 4
 """Landmarks of one hypothesis: the fewest that fix a pose uniquely."""
 

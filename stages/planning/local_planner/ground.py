@@ -1,7 +1,8 @@
-"""The map about a vehicle that plans its next leg: what may be driven on, what may be planned over, and at which price.
+"""The map around a vehicle: which poses it may drive through, which it may plan through, and what a metre costs there.
 
-See :mod:`rille.stages.planning.local_planner.stage` for the rules. A way is found over poses on a grid through the
-vehicle; one that was planned before is looked at again on the map as it is now.
+The rules are those of :mod:`rille.stages.planning.local_planner.policy`. Paths are searched on a lattice of poses
+through the vehicle (:mod:`rille.stages.planning.local_planner.state_lattice`); a path planned at an earlier stop is
+evaluated again on the present map.
 """
 
 from __future__ import annotations
@@ -22,21 +23,23 @@ from rille.stages.planning.local_planner.state_lattice import PoseGraph, PoseGri
 Point = tuple[float, float]
 
 ASIDE = tuple(math.radians(d) for d in (3.0, -3.0, 6.0, -6.0, 9.0, -9.0))
-"""Headings off the present one from which a way is looked for where there is none: a graph's headings are some 20
-degrees apart, and out of a narrow place a way may lead at those between alone."""
+"""Offsets [rad] of the lattice's first heading that are tried where the present heading finds no path: headings of a
+lattice are some 20 degrees apart, and out of a narrow place a path may lead only between two of them."""
 
 DOUBT_WEIGHT = 60
 """Price of doubted ground over that of caution ground: one wheel there makes a way more than three times as dear."""
 PARTS = 5
 """Parts of a vehicle that stand on ground: its wheels and its middle."""
 HERE = 0.3
-"""Wheel bases: ground so near to where it stands may be as that under it is."""
+"""Radius [wheelbases] around the start pose within which a cell is accepted if its clearance is not below that of the
+start pose."""
 NEARER = 2.0
-"""Times ``blind``: what is doubtful, farther than that, will be seen from nearer, where most doubts go."""
+"""Factor on the parameter ``blind``: doubtful ground beyond that radius will be seen again from nearer, where most
+doubts vanish."""
 
 
 class Ground:
-    """The map about a vehicle: what it may drive on, what it may plan over, and at which price."""
+    """The map around a vehicle, with the lattice of poses that is searched on it."""
 
     def __init__(
         self,
@@ -47,7 +50,13 @@ class Ground:
         closed: Sequence[Point] = (),
         aside: float = 0.0,
     ) -> None:
-        """``aside``: rad from the heading to the graph's first one."""
+        """
+        Parameters
+        ----------
+        start, heading : x, y [m] and heading [rad, to the left of y] of the vehicle.
+        closed : middles [m] of circles in which unknown ground counts as closed.
+        aside : angle [rad] from the heading to the lattice's first heading.
+        """
         self.footing, self.start, self.heading, self.p, self.closed = footing, start, heading, p, tuple(closed)
         self.vehicle, self.cell = footing.vehicle, footing.lattice.cell
         at = footing.gaps(*(np.array([v]) for v in (*start, heading)))
@@ -65,9 +74,9 @@ class Ground:
         self.graph = PoseGraph.of(footing, self.grid, self._price)
 
     def _split(self, gaps: Gaps, x: Floats, y: Floats, slack: float = 0.0) -> tuple[Bools, Bools]:
-        """Poses that may be driven, and those that may be planned over; the margin may lack ``slack`` m.
+        """Poses that may be driven, and poses that may be planned through; margins are shortened by ``slack`` metres.
 
-        Of what is hazardous by sigma alone no margin is kept: sigma is the room for error there.
+        No margin is kept from hazards by sigma alone: sigma is the room for error there.
         """
         near, margin = self._near(x, y), self.vehicle.margin
         known = (gaps.gap > np.where(near, self.here[0], margin) - slack) & self._seen(gaps, near)
@@ -80,11 +89,11 @@ class Ground:
         return known, opened | known
 
     def _near(self, x: Floats, y: Floats) -> Bools:
-        """Where it stands: ground there that is no worse than that under it will do."""
+        """Which points lie in the start area (:data:`HERE`)."""
         return np.asarray(self._away(x, y) <= HERE)
 
     def _away(self, x: Floats, y: Floats) -> Floats:
-        """Wheel bases from where it stands."""
+        """Distance from the start [wheelbases]."""
         return np.asarray(np.hypot(x - self.start[0], y - self.start[1]) / self.vehicle.wheel_base)
 
     def _seen(self, gaps: Gaps, near: Bools) -> Bools:
@@ -166,9 +175,9 @@ class Ground:
         return pieces(self.graph, self.graph.follow(move))
 
     def again(self, way: Sequence[Piece]) -> tuple[list[Piece], float]:
-        """A way that was planned before, from the start: which of it is known now, and its cost at present prices.
+        """A path planned at an earlier stop: its pieces, split where they stop being known, and its cost now.
 
-        It was looked at in steps of the places then; looked at more closely its margin may be short by a cell.
+        Its margin may be short by a cell: it was planned on poses of the lattice and is sampled more closely here.
         """
         out, cost, heading = list[Piece](), 0.0, self.heading
         for piece in way:
@@ -190,7 +199,8 @@ class Ground:
         return out, cost
 
     def _along(self, piece: Piece, before: float) -> tuple[int, Floats, tuple[Floats, Floats, Floats]]:
-        """Poses of a turn on the spot and a piece after it: how many of the turn, share of the piece, x, y, heading."""
+        """Poses of a turn on the spot and of the piece after it: number of poses of the turn, share of the piece (n,),
+        and x, y [m], heading [rad] (n,)."""
         turn, steps = abs(piece.heading - before) / STEP_TURN, 2.0 * piece.length / self.grid.spacing
         n, m = (max(2, 1 + math.ceil(v)) for v in (turn, steps))
         share = np.append(np.zeros(n), np.linspace(0.0, 1.0, m))
@@ -198,8 +208,11 @@ class Ground:
         return n, share, (x, y, np.append(np.linspace(before, piece.heading, n), np.full(m, piece.heading)))
 
     def lacking(self, way: Sequence[Piece], first: int) -> tuple[Floats, bool]:
-        """Middles (n, 2), m, of the cells for which the first piece of a way that is not known is not, at the first
-        pose at which it is so: those that were not seen from near, else hazards; and whether they were not seen."""
+        """Why piece ``first`` of a path, the first that is not known to be free, is not.
+
+        Returns the middles (n, 2), m, of the cells to blame at its first pose that may not be driven, and whether they
+        were never seen from near; cells that were seen are to blame, as hazards, only where all were seen.
+        """
         piece, before = way[first], way[first - 1].heading if first > 0 else self.heading
         _, _, (x, y, angle) = self._along(piece.cut(self.grid.spacing), before)
         gaps = self.footing.gaps(x, y, angle)

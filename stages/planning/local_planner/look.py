@@ -27,20 +27,20 @@ Stand = tuple[float, float, float]
 """x, y (m) of the middle of a vehicle and its heading (rad to the left of y)."""
 
 RIM = 0.04
-"""Share of the image's width and height along its border on which is not relied: no window fits there, and the vehicle
-stands a little crooked."""
+"""Share of the image's width and height along its border that does not count as seen: no matching window fits there,
+and the vehicle does not stand exactly level."""
 MOST = 0.9
-"""Share of points that must be in view for all of them to be."""
+"""Share of a set of points that must be in view for the set to count as in view."""
 STEP = math.radians(5.0)
-"""Between the turns that are tried."""
+"""Step [rad] between the turns that are tried."""
 ROUND = math.radians(120.0)
-"""Largest of them: more than a leg may turn is turned in several."""
+"""Largest turn [rad] that is tried; a turn beyond the bound of a leg is made in several legs."""
 SIDE = math.radians(25.0)
-"""Directions less apart show the same of what hides behind stones."""
+"""Angle [rad] between two viewing directions below which both show the same of what stones hide."""
 FARTHER = 1.25
-"""Times as far a look shows less."""
+"""Ratio of distances above which a look from farther away shows less than the earlier one."""
 TWICE = 2
-"""Looks from one side at one place are enough where they cost no way."""
+"""Number of looks from one side at one place, where a look needs no driving."""
 
 
 @dataclass(frozen=True)

@@ -1,10 +1,10 @@
-"""Ways of a vehicle that turns on the spot: places and headings as one graph, searched from the goal to the start.
+"""State lattice of a vehicle that turns on the spot: positions and headings as one graph, searched from goal to start.
 
-Places lie on a square grid through the start, turned with it, so that the start is exactly on it. Headings are the 16
-directions to the neighbours one and two steps away. From a pose the vehicle drives ahead or back by one step along its
-heading, or turns to the next heading. Each pose, the middle of each step and of each turn have a price a metre,
-infinite where the vehicle may not be; a step costs its length times the highest price on it. Dijkstra's algorithm;
-ties go to the lower pose.
+Positions lie on a square grid that is aligned with the start pose and contains it exactly. The 16 headings are the
+directions to the neighbours one and two steps away. From a pose the vehicle drives one step ahead or back along its
+heading, or turns to the next heading. Each pose, the middle of each step and the middle of each turn has a cost per
+metre, infinite where the vehicle may not be; a step costs its length times the highest of these along it. The search is
+Dijkstra's; ties go to the pose of the lower index.
 """
 
 from __future__ import annotations
