@@ -30,17 +30,26 @@ class SafetyParams(Params):
     max_tilt: float = Field(
         1.0,
         gt=0,
-        description="times the vehicle's max_slope_deg; the body averages over the wheels, so it is steep then",
+        description="largest tilt by the inclinometer, as a multiple of vehicle.max_slope_deg",
     )
     max_acceleration: float = Field(
-        3.0, gt=0, description="m/s2; vertical peaks of driving over permitted steps stay below half of it"
+        3.0,
+        gt=0,
+        description="largest vertical acceleration [m/s2]; peaks of driving over permitted steps stay below half of it",
     )
-    least_landmarks: int = Field(12, ge=6, description="landmarks that agree with a pose; six determine it")
-    max_slip: float = Field(0.2, gt=0, description="share of the way by the wheels; usual soil slips by 0.05 to 0.15")
+    least_landmarks: int = Field(12, ge=6, description="fewest landmarks that agree with a pose; six determine it")
+    max_slip: float = Field(
+        0.2, gt=0, description="largest slip, as a share of the distance by the wheels; 0.05 to 0.15 is usual on soil"
+    )
     least_way: float = Field(
-        0.3, gt=0, description="wheel bases by the wheels before slip is judged: less is in the error of vision"
+        0.3,
+        gt=0,
+        description="distance by the wheels [wheelbases] from which on slip is judged; over less, the error of vision"
+        " is as large",
     )
-    max_turn_deg: float = Field(8.0, gt=0, description="degrees between the turn by the wheels and by vision")
+    max_turn_deg: float = Field(
+        8.0, gt=0, description="largest difference [degrees] between the headings by wheels and by vision"
+    )
 
 
 @dataclass(frozen=True)

@@ -37,25 +37,49 @@ from rille.stages.hazard.vehicle import Vehicle
 class ReflexParams(Params):
     """Parameters of the stage ``reflex``; lengths in wheel diameters suit any scale."""
 
-    enabled: bool = Field(True, description="whether obstacles are looked for between stops")
-    level: int = Field(1, ge=0, le=4, description="pyramid level of the displacements: half the resolution is enough")
-    baseline: float = Field(1.6, gt=0, description="wheel diameters; way between the two images that are compared")
+    enabled: bool = Field(True, description="detect obstacles between stops")
+    level: int = Field(
+        1, ge=0, le=4, description="pyramid level of the displacements; 1: half the resolution, which is enough"
+    )
+    baseline: float = Field(
+        1.6, gt=0, description="distance [wheel diameters] driven between the two images that are compared"
+    )
     max_turn_deg: float = Field(
         6.0,
         gt=0,
-        description="degrees; images turned farther against each other are not used: at 7 and 8 degrees points rose "
-        "above ground that the model had right",
+        description="largest rotation [degrees] between the two images; at 7 and 8 degrees points rose above ground "
+        "that the model had right",
     )
-    reach: float = Field(10.0, gt=0, description="wheel diameters ahead of the vehicle's centre that are watched")
-    aside: float = Field(0.5, ge=0, description="wheel diameters to either side of the wheels that are watched")
-    height: float = Field(0.25, gt=0, description="wheel diameters; rise over the model that counts: half a radius")
-    sigma: float = Field(0.5, gt=0, description="pixels of the displacements' level; their error")
-    sigmas: float = Field(2.0, gt=0, description="standard deviations of the rise that it must exceed as well")
-    blur: float = Field(0.5, ge=0, description="wheel diameters; the model's greatest height within this is compared")
-    points: int = Field(8, ge=1, description="raised points within one wheel diameter that make an obstacle")
-    share: float = Field(0.35, ge=0, le=1, description="and their share of all points there")
+    reach: float = Field(
+        10.0,
+        gt=0,
+        description="distance [wheel diameters] ahead of the vehicle's centre up to which obstacles are detected",
+    )
+    aside: float = Field(
+        0.5,
+        ge=0,
+        description="width [wheel diameters] beside the wheels, on either side, in which obstacles are detected",
+    )
+    height: float = Field(
+        0.25,
+        gt=0,
+        description="smallest rise [wheel diameters] above the elevation model that counts; 0.25: half a wheel's "
+        "radius",
+    )
+    sigma: float = Field(0.5, gt=0, description="standard deviation of a displacement [pixels of its pyramid level]")
+    sigmas: float = Field(2.0, gt=0, description="number of standard deviations that a rise must exceed as well")
+    blur: float = Field(
+        0.5,
+        ge=0,
+        description="radius [wheel diameters] within which the model's greatest height is what a point is compared "
+        "with",
+    )
+    points: int = Field(
+        8, ge=1, description="smallest number of raised points within one wheel diameter that make an obstacle"
+    )
+    share: float = Field(0.35, ge=0, le=1, description="smallest share of raised points among all points there")
     again_share: float = Field(
-        0.15, ge=0, le=1, description="the same where so many were raised there in the image compared before as well"
+        0.15, ge=0, le=1, description="the same where the image compared before showed as many raised points there"
     )
 
 

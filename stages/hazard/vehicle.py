@@ -14,28 +14,34 @@ class Vehicle(Params):
     their reach, so that they hold on loose ground too.
     """
 
-    name: str = Field(default="default rover", min_length=1, description="words; names the limits in the report")
+    name: str = Field(default="default rover", min_length=1, description="name of the vehicle in the report")
     wheel_diameter: float = Field(
         default=0.30,
         gt=0,
-        description="m; side of the window in which terrain is judged, since a wheel bridges what is finer",
+        description="diameter of a wheel [m]; side of the window in which terrain is judged, since a wheel bridges "
+        "what is finer",
     )
-    track: float = Field(default=0.60, gt=0, description="m; distance of the left from the right wheels")
-    wheel_base: float = Field(default=0.70, gt=0, description="m; distance of the front from the rear wheels")
-    clearance: float = Field(default=0.20, gt=0, description="m; height of the belly above flat ground")
+    track: float = Field(default=0.60, gt=0, description="distance between the left and the right wheels [m]")
+    wheel_base: float = Field(default=0.70, gt=0, description="distance between the front and the rear wheels [m]")
+    clearance: float = Field(default=0.20, gt=0, description="height of the belly above flat ground [m]")
     max_slope_deg: float = Field(
-        default=20.0, gt=0, lt=90, description="degrees; steepest ground it drives, half of a usual tip-over angle"
+        default=20.0,
+        gt=0,
+        lt=90,
+        description="steepest ground that it drives on [degrees]; half of a usual tip-over angle",
     )
-    max_step: float = Field(default=0.12, gt=0, description="m; highest edge that it climbs, 0.4 of the wheel")
+    max_step: float = Field(
+        default=0.12, gt=0, description="highest edge that it climbs [m]; 0.4 of the wheel diameter"
+    )
     max_roughness: float = Field(
         default=0.04,
         gt=0,
-        description="m; largest standard deviation from the plane under a wheel, a third of the step",
+        description="largest standard deviation of heights from the plane under a wheel [m]; a third of the step",
     )
     margin: float = Field(
         default=0.15,
         ge=0,
-        description="m; distance that a path keeps from hazards, half a wheel for what localisation errs",
+        description="distance that a path keeps from hazards [m]; half a wheel, for errors of localisation",
     )
 
     @property

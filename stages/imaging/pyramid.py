@@ -28,10 +28,10 @@ class PyramidParams(Params):
     """Parameters of the image pyramid."""
 
     levels: int = Field(
-        default=6, ge=1, le=10, description="images, level 0 included; three are too few beyond a megapixel"
+        default=6, ge=1, le=10, description="number of images, level 0 included; three are too few beyond a megapixel"
     )
     min_side: int = Field(
-        default=8, ge=1, description="pixels; no level has a side below this (13-tap features need context)"
+        default=8, ge=1, description="shortest side of a level [pixels]; features of 13 taps need context"
     )
 
 

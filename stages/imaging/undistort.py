@@ -33,8 +33,9 @@ class UndistortParams(Params):
 
     interpolation: Literal["cubic", "lanczos", "linear"] = Field(
         default="cubic",
-        description="cubic: six taps, displaces texture of a 6-pixel period by at most 0.004 px; lanczos: eight taps, "
-        "keeps the finest contrast, but displaces smooth texture by up to 0.011 px; linear: fast, and blurs",
+        description="cubic: six taps, displaces texture of a period of 6 pixels by at most 0.004 pixels; lanczos: "
+        "eight taps, keeps the finest contrast, displaces smooth texture by up to 0.011 pixels; linear: "
+        "fast, blurs",
     )
 
 

@@ -58,36 +58,39 @@ class PathParams(Params):
 
     start: Point | None = Field(
         default=None,
-        description="m; x, y in the world frame; not set: the free cell nearest to the middle of the first row",
+        description="start x, y [m] in the world frame; not set: the free cell nearest to the middle of the first row",
     )
     target: Point | None = Field(
         default=None,
-        description="m; x, y in the world frame; not set: the free cell nearest to the middle of the last row",
+        description="target x, y [m] in the world frame; not set: the free cell nearest to the middle of the last row",
     )
     planner: Planner = Field(
         default="auto",
-        description="rows: ahead in every row, as in the paper; grid8: any direction; auto: grid8 where rows do not "
-        "reach the target, or do not lead over the map of a mission",
+        description="rows: one step ahead in every row, as in the paper; grid8: any direction; auto: grid8 where rows"
+        " do not reach the target, or do not cross the map of a mission",
     )
     height_step: float = Field(
-        default=0.02, gt=0, le=1, description="share of max_step; smaller height differences count as none"
+        default=0.02, gt=0, le=1, description="height difference that counts as none, as a share of vehicle.max_step"
     )
     caution: float = Field(
-        default=0.2, ge=0, le=10, description="m of climb that a metre of caution ground is worth: a detour of a fifth"
+        default=0.2,
+        ge=0,
+        le=10,
+        description="climb [m] that a metre of caution ground costs as much as; 0.2 justifies a detour of a fifth",
     )
     doubt: float = Field(
         default=5.0,
         ge=0,
         le=1000,
-        description="m of climb that a metre of ground is worth, times its probability of a hazard: at 0.1 a detour of "
-        "half of it",
+        description="climb [m] that a metre of ground costs as much as, times its probability of a hazard; 5 at a "
+        "probability of 0.1 justifies a detour of half the way",
     )
     sure: float = Field(
         default=0.1,
         gt=0,
         le=1,
-        description="probability of a hazard above which ground is not driven on, though no measure exceeds its limit "
-        "by as many standard deviations as make a hazard; where this alone closes every way, the reason says so",
+        description="probability of a hazard above which ground is closed, even where no measure exceeds its limit; "
+        "if this alone leaves no path, the reason says so",
     )
 
 

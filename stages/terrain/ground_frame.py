@@ -49,35 +49,46 @@ class LevelParams(Params):
     """Parameters of the stage ``level``."""
 
     max_tilt_deg: float = Field(
-        30.0, gt=0, lt=90, description="degrees; greatest slope of the ground, and greatest roll of an unlevelled rig"
+        30.0,
+        gt=0,
+        lt=90,
+        description="largest slope of the ground, and largest roll of a rig whose attitude is unknown [degrees]",
     )
     min_pitch_deg: float = Field(
-        -20.0, gt=-90, lt=90, description="degrees; least downward pitch of a rig without attitude (bumps, hills)"
+        -20.0,
+        gt=-90,
+        lt=90,
+        description="smallest downward pitch [degrees] of a rig whose attitude is unknown; negative on bumps and hills",
     )
     max_pitch_deg: float = Field(
-        75.0, gt=-90, lt=90, description="degrees; greatest downward pitch of a rig without attitude: nearly nadir"
+        75.0,
+        gt=-90,
+        lt=90,
+        description="largest downward pitch [degrees] of a rig whose attitude is unknown; 75 is nearly nadir",
     )
     relief: float = Field(
         0.02,
         gt=0,
         lt=1,
-        description="share of the camera's height; terrain this close to the plane counts as ground (less than a kerb: "
-        "road and pavement must not make one tilted plane)",
+        description="largest distance from the plane that counts as ground, as a share of the camera's height; less "
+        "than a kerb, or road and pavement make one tilted plane",
     )
     ceiling: float = Field(
         1.0,
         ge=0,
-        description="camera heights above the camera; elevations are not searched higher (no surface is seen from above"
-        " there, only walls and crowns)",
+        description="greatest elevation that is searched, above the camera, in camera heights; surfaces above it are "
+        "not seen from above, only walls and crowns",
     )
     reference_height: float | None = Field(
         None,
         gt=0,
-        description="m; where no ground is seen, elevations are searched about a horizontal plane so far below the"
-        " camera; none: there is no elevation model",
+        description="depth [m] below the camera of a horizontal plane around which elevations are searched where no "
+        "ground is seen; not set: then there is no elevation model",
     )
-    sigma_disparity: float = Field(0.2, gt=0, description="pixels; error of a disparity after sub-pixel refinement")
-    seed: int = Field(1999, ge=0, description="seed of the ground plane's samples; any")
+    sigma_disparity: float = Field(
+        0.2, gt=0, description="standard deviation of a disparity [pixels] after sub-pixel refinement"
+    )
+    seed: int = Field(1999, ge=0, description="seed of the random samples of the ground plane")
 
 
 class VerticalHint(NamedTuple):

@@ -31,14 +31,22 @@ from rille.stages.numeric.robust import huber_weight
 class GlobalFixParams(Params):
     """Parameters of the stage ``global_fix``."""
 
-    reach: float = Field(3.0, gt=0, description="standard deviations of the prior to either side that are searched")
-    sigma: float = Field(0.15, gt=0, description="cells of the global map; expected error of a height difference")
-    truncate: float = Field(3.0, gt=0, description="standard deviations at which a difference counts no more")
-    min_overlap: float = Field(0.5, gt=0, le=1, description="share of the local model that the global map must know")
-    least: int = Field(30, ge=6, description="cells of the global map that the local model must cover")
-    correlation: float = Field(2.0, ge=1, description="cells over which differences go together; fewer count alone")
+    reach: float = Field(
+        3.0, gt=0, description="search range around the prior [standard deviations of the prior], to either side"
+    )
+    sigma: float = Field(0.15, gt=0, description="standard deviation of a height difference [cells of the global map]")
+    truncate: float = Field(
+        3.0, gt=0, description="size of a difference [standard deviations] beyond which it counts no more"
+    )
+    min_overlap: float = Field(
+        0.5, gt=0, le=1, description="smallest share of the local model that the global map must know"
+    )
+    least: int = Field(30, ge=6, description="fewest cells of the global map that the local model must cover")
+    correlation: float = Field(2.0, ge=1, description="distance [cells] over which height differences are correlated")
     ambiguous: float = Field(
-        9.0, gt=0, description="difference of chi2 to the next best placement below which the answer is ambiguous"
+        9.0,
+        gt=0,
+        description="smallest difference of chi2 to the next best placement at which the answer counts as unambiguous",
     )
 
 

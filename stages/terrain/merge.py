@@ -54,36 +54,35 @@ class MergeParams(Params):
     """Parameters of the stage ``merge``."""
 
     residual_scale: float = Field(
-        0.1, gt=0, description="pixels; residual that halves a model's weight: the disparity's error when it is good"
+        0.1, gt=0, description="residual [pixels] that halves a model's weight; 0.1: the error of a good disparity"
     )
     alike: float = Field(
         ALIKE,
         ge=0,
         le=1,
-        description="correlation of the errors that two models have at one cell, beyond those of their poses; as found "
+        description="correlation of the errors of two models at one cell, beyond those of their poses; 0.8 was found "
         "with the simulator's true poses",
     )
     max_std_cells: float | None = Field(
         None,
         gt=0,
-        description="cells; merged cells whose standard deviation, the poses' part left out, is greater than so many "
-        "sides of a cell are left undefined; none: all are given",
+        description="largest standard deviation of a merged cell, without the poses' part, in sides of a cell; other "
+        "cells are left undefined; not set: no limit",
     )
     max_footprint: float | None = Field(
         None,
         gt=0,
-        description="m; cells of a model where a pixel covers more ground along the range are left out, since a window "
-        "of some pixels smooths away what is smaller than it; none: all are merged",
+        description="largest ground [m] that a pixel may cover along the range; other cells of a model are left out, "
+        "since a matching window smooths away what is smaller; not set: no limit",
     )
     max_hole: int = Field(
         0,
         ge=0,
         le=64,
-        description="cells; widest hole that is closed by interpolation and flagged; none by default: what nobody saw "
-        "is not known",
+        description="width of the widest hole [cells] that is closed by interpolation and flagged; 0: none",
     )
     hole_known: float = Field(
-        0.5, gt=0, le=1, description="share of the ground around a cell that must be known for it to be closed"
+        0.5, gt=0, le=1, description="smallest known share of the ground around a cell for it to be closed"
     )
 
     @property

@@ -35,12 +35,16 @@ class CeilingParams(Params):
     """Parameters of the stage ``ceiling``."""
 
     sigmas: float = Field(
-        default=1.25, ge=0, le=10, description="standard deviations between an elevation and the bounds of the ground"
+        default=1.25,
+        ge=0,
+        le=10,
+        description="number of standard deviations between an elevation and the bounds of the ground",
     )
     max_footprint: float | None = Field(
         None,
         gt=0,
-        description="m; no line of sight is drawn to ground where a pixel covers more along the range; none: to all",
+        description="largest ground [m] that a pixel may cover along the range where a line of sight ends; not set: "
+        "no limit",
     )
 
 

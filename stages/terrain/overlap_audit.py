@@ -39,8 +39,8 @@ class SeamAuditParams(Params):
     allowed_sigmas: float = Field(
         2.0,
         gt=0,
-        description="standard deviations of one cell's difference; a model whose bias and tilt amount to more "
-        "contradicts its neighbours: of the differences by noise, 95 % are smaller",
+        description="standard deviations of one cell's difference that a model's bias and tilt may amount to before "
+        "it is reported to contradict its neighbours; 95 % of the differences by noise are smaller than 2",
     )
 
 

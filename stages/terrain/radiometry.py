@@ -34,7 +34,7 @@ MOST = 0.7
 class ExposureParams(Params):
     """Parameters of the stage ``exposure``."""
 
-    level: bool = Field(True, description="whether exposures are levelled in the merged ortho image")
+    level: bool = Field(True, description="level the exposures in the merged ortho image")
 
 
 def level(centres: Mapping[int, Sequence[float]], ratios: Sequence[tuple[int, int, float]]) -> dict[int, int]:

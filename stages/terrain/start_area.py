@@ -24,7 +24,9 @@ NOBODY = -1
 class PadParams(Params):
     """Parameters of the stage ``pad``."""
 
-    sigma: float = Field(0.03, gt=0, description="wheel diameters; standard deviation of the plane's elevations")
+    sigma: float = Field(
+        0.03, gt=0, description="standard deviation [wheel diameters] of the elevations of the start area"
+    )
 
 
 def pad(T_world_vehicle: RigidTransform, radius: float, cell: float) -> tuple[Lattice, np.ndarray]:

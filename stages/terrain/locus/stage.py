@@ -43,66 +43,72 @@ class LocusParams(Params):
     """Parameters of the stage ``locus``."""
 
     cell_size: float | None = Field(
-        None, gt=0, description="m; none: the pixel's size on the ground at twice the nearest distance, to 1, 2 or 5"
+        None,
+        gt=0,
+        description="side of a cell [m]; not set: the size of a pixel on the ground at twice the nearest distance, "
+        "rounded to 1, 2 or 5 times a power of ten",
     )
     extent: tuple[float, float, float, float] | None = Field(
-        None, description="m; x_min, x_max, y_min, y_max of the local frame; none: the ground that both cameras see"
+        None, description="x_min, x_max, y_min, y_max [m] in the local frame; not set: the ground that both cameras see"
     )
     max_range_cells: float = Field(
-        6.0, gt=0, description="cells; the automatic extent ends where a pixel covers more of them along the range"
+        6.0, gt=0, description="number of cells that a pixel may cover along the range within the automatic extent"
     )
     max_sigma: float | None = Field(
         None,
         gt=0,
-        description="m; the automatic extent ends where sigma_disparity makes a greater elevation error, and where the "
-        "matcher gives no standard deviations such cells are left undefined; none: one cell size",
+        description="largest standard deviation of elevation [m] within the automatic extent, by sigma_disparity; "
+        "where the matcher gives no standard deviations, cells beyond it are left undefined; not set: one"
+        " cell size",
     )
     max_std: float | None = Field(
         None,
         gt=0,
-        description="m; cells whose own standard deviation of elevation is greater are left undefined, where the "
-        "matcher gives one: most gross errors are among them; none: 1.5 max_sigma, which 5 to 10 % of the cells exceed",
+        description="largest standard deviation of a cell's elevation [m], where the matcher gives standard "
+        "deviations; other cells are left undefined, most gross errors among them; not set: 1.5 "
+        "max_sigma, which 5 to 10 % of the cells exceed",
     )
     sigma_disparity: float = Field(
         0.2,
         gt=0,
-        description="pixels; error of a typical disparity: bounds the automatic extent, and stands for each pixel's "
-        "own standard deviation where the matcher gives none",
+        description="standard deviation of a typical disparity [pixels]; bounds the automatic extent, and replaces "
+        "each pixel's own standard deviation where the matcher gives none",
     )
     max_residual: float = Field(
-        0.5, gt=0, description="pixels; greatest |p_l + d - p_r| at the solution: 2.5 sigma_disparity"
+        0.5, gt=0, description="largest residual |p_l + d - p_r| of a solution [pixels]; 0.5: 2.5 sigma_disparity"
     )
     max_backmatch: float = Field(
         1.0,
         gt=0,
-        description="pixels; greatest error of back-matching (4.3.3); a stricter one leaves out more good cells than "
-        "bad ones, which max_std tells apart",
+        description="largest back-matching error [pixels] (4.3.3); a smaller limit removes more good cells than bad "
+        "ones, which max_std tells apart",
     )
     refine_steps: int = Field(
         2,
         ge=0,
         le=20,
-        description="steps of refining the elevations by what both images show of the surface, a third gains a "
-        "hundredth; 0: none, and standard deviations are those of the disparity alone",
+        description="number of Gauss-Newton steps that refine the elevations by what both images show of the surface;"
+        " a third step gains one per cent; 0: none, and standard deviations are those of the disparity "
+        "alone",
     )
     refined_share: float = Field(
         1.0,
         gt=0,
         le=1,
-        description="share of the refined elevation in the result, the rest is what the disparity said: 0.5 where the "
-        "matcher is as sure as that (preset accurate), since both then err about as much and not alike; where it is "
-        "less sure, less than 1 only loses",
+        description="weight of the refined elevation in the result, the rest is that of the disparity; 0.5 for "
+        "matches of preset accurate, whose errors are as large as those of the refined elevations and "
+        "differ from them; 1 for others",
     )
     both: bool = Field(
         False,
-        description="match from right to left as well and read elevations from both: more cells, and errors where the "
-        "two differ show; it doubles the time of matching",
+        description="also match from right to left and use both elevations: more cells, and errors where the two "
+        "differ show; doubles the time of matching",
     )
     max_jump: float = Field(
         3.0,
         gt=0,
-        description="pixels; range of the four disparities around a cell that is still one surface: relief seen at a "
-        "grazing angle changes by 1.5 px a pixel, twice that across the diagonal",
+        description="largest range of the four disparities around a cell [pixels] that still belong to one surface; "
+        "relief at a grazing angle changes by 1.5 pixels per pixel, twice that along the diagonal",
     )
 
 
