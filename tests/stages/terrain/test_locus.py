@@ -15,7 +15,7 @@ from rille.stages.geometry.lattice import Lattice
 from rille.stages.geometry.surface import Surface, cylinder, inclined, sphere
 from rille.stages.geometry.surface import plane as reference_plane
 from rille.stages.terrain import ground_frame as level_stage
-from rille.stages.terrain.locus import roots, stage
+from rille.stages.terrain.locus import kernel, stage
 from rille.stages.terrain.locus import solve as locus_solve
 from rille.stages.terrain.locus.stage import Dem, LocusParams, MatchedPair, Matches, reconstruct
 
@@ -371,7 +371,7 @@ def test_stage_in_both_frames() -> None:
     index = np.round(Lattice.from_dict(world.meta["lattice"]).index(xyz[:, :2])).astype(int)
     found = world["elevation"][index[:, 0], index[:, 1]]
     assert np.isfinite(found).mean() > 0.99
-    solved = roots.SOLVED_PX / LocusParams().sigma_disparity * local["elevation_std"][rows, cols]
+    solved = kernel.SOLVED_PX / LocusParams().sigma_disparity * local["elevation_std"][rows, cols]
     assert np.nanmean(np.abs(found - xyz[:, 2]) <= 2.0 * solved + 1e-6) > 0.99
     # Pixels that fail back-matching by 1.2 px are not used.
     p = RIG.left.project(T_LOCAL_LEFT.inverse().apply(np.dstack([lattice.xy(), local["elevation"]])))
