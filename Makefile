@@ -16,7 +16,7 @@ ARGS   ?=
 BENCHMARKS := $(filter-out record,$(sort $(basename $(notdir $(wildcard benchmarks/*.py)))))
 
 .DEFAULT_GOAL := help
-.PHONY: help install reconstruct test check torture bench lint docs docs-fast clean
+.PHONY: help install reconstruct test check torture bench lint pages docs docs-fast clean
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
@@ -53,6 +53,11 @@ lint: $(STAMP) ## ruff and mypy
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+pages: $(STAMP) ## pages of docs/ that follow from the code: messages, parameters, outputs, blocks that are not run
+	$(BIN)/rille params --markdown > docs/parameters.md
+	cd tests && for page in test_messages.py test_docs.py pipeline/export/test_output.py; do \
+	  PYTHONPATH=.:stages:pipeline ../$(BIN)/python $$page || exit 1; done
 
 docs: $(VENV)/.docs ## the site in docs/_build, offline; the gallery and the tour are executed (minutes)
 	$(BIN)/python -m sphinx -W --keep-going -q -b html docs docs/_build/html

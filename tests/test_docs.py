@@ -61,7 +61,7 @@ def not_run() -> str:
 
 
 def test_the_list_of_what_is_not_run_is_complete() -> None:
-    assert LIST.read_text(encoding="utf-8") == not_run(), "regenerate it by: python tests/test_docs.py"
+    assert LIST.read_text(encoding="utf-8") == not_run(), "make pages"
 
 
 def run_blocks(page: Path, folder: Path, cache: Path, data: Path | None) -> None:

@@ -1,6 +1,6 @@
 """Messages: errors carry their code, the command line prints it, and a page lists them.
 
-``python tests/test_messages.py`` writes the page anew.
+``make pages`` writes the page anew.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def page() -> str:
 
 
 def test_the_page_lists_every_message() -> None:
-    assert PAGE.read_text(encoding="utf-8") == page(), "write it anew: python tests/test_messages.py"
+    assert PAGE.read_text(encoding="utf-8") == page(), "make pages"
 
 
 def test_an_error_keeps_its_code_between_processes_and_with_a_place() -> None:

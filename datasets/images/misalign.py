@@ -32,14 +32,17 @@ class MisalignParams(Params):
     """How the right camera is knocked; all 0: not at all."""
 
     rows: float = Field(
-        0.0, ge=-200, le=200, description="pixels that the right image is shifted down (a sensor shift)"
+        0.0, ge=-200, le=200, description="shift of the right image downwards [pixels], as by a shifted sensor"
     )
-    roll_deg: float = Field(0.0, ge=-45, le=45, description="degrees that the right image is turned clockwise")
+    roll_deg: float = Field(0.0, ge=-45, le=45, description="clockwise turn of the right image [degrees]")
     pitch_deg: float = Field(
-        0.0, ge=-20, le=20, description="degrees about the right camera's x axis: contents move up"
+        0.0, ge=-20, le=20, description="turn about the right camera's x axis [degrees]; the image's contents move up"
     )
     yaw_deg: float = Field(
-        0.0, ge=-20, le=20, description="degrees about the right camera's y axis: contents move right"
+        0.0,
+        ge=-20,
+        le=20,
+        description="turn about the right camera's y axis [degrees]; the image's contents move right",
     )
 
     @property

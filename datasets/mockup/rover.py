@@ -36,40 +36,57 @@ class RoverParams(Params):
     """The simulated rover: where it starts and how well it drives. All of it is unknown to the estimates."""
 
     seed: int = Field(1, ge=0, description="seed of slip, heading errors and sensors; the bed has its own")
-    start: tuple[float, float] = Field((0.0, 0.3), description="m; centre of the wheels on the bed at the start")
-    heading_deg: float = Field(0.0, ge=-180, le=180, description="degrees to the left of straight along the bed")
-    slip: float = Field(0.05, ge=-0.5, lt=1, description="share of what the wheels turn that is no way; sand: 0.05-0.2")
+    start: tuple[float, float] = Field(
+        (0.0, 0.3), description="x, y [m] of the centre of the wheels on the bed at the start"
+    )
+    heading_deg: float = Field(
+        0.0, ge=-180, le=180, description="heading at the start [degrees to the left of straight along the bed]"
+    )
+    slip: float = Field(
+        0.05, ge=-0.5, lt=1, description="share of the wheels' rotation that yields no motion; sand: 0.05 to 0.2"
+    )
     slip_sigma: float = Field(0.03, ge=0, lt=0.5, description="standard deviation of the slip from leg to leg")
     heading_sigma_deg: float = Field(
-        1.0, ge=0, le=20, description="degrees; standard deviation of the heading's drift over one leg"
+        1.0, ge=0, le=20, description="standard deviation of the heading's drift over one leg [degrees]"
     )
-    turn_sigma: float = Field(0.03, ge=0, le=0.5, description="relative standard deviation of a turn on the spot")
-    frame_step: float = Field(0.025, gt=0.001, description="m; an image is taken at least this often")
-    frame_turn_deg: float = Field(5.0, gt=0.5, le=15, description="degrees; and this often on the spot")
-    speed: float = Field(0.05, gt=0, description="m/s; turns bumps into accelerations")
-    odometry_sigma: float = Field(0.01, ge=0, description="relative standard deviation of what the wheels report")
-    attitude_sigma_deg: float = Field(0.2, ge=0, description="degrees; error of the inclinometer, each axis")
-    acceleration_sigma: float = Field(0.05, ge=0, description="m/s2; noise of the accelerometer's peaks")
-    camera_forward: float = Field(0.05, description="m; cameras ahead of the centre of the wheels")
+    turn_sigma: float = Field(
+        0.03, ge=0, le=0.5, description="relative standard deviation of the angle of a turn on the spot"
+    )
+    frame_step: float = Field(0.025, gt=0.001, description="longest distance between two images [m]")
+    frame_turn_deg: float = Field(
+        5.0, gt=0.5, le=15, description="largest turn on the spot between two images [degrees]"
+    )
+    speed: float = Field(0.05, gt=0, description="driving speed [m/s]; with it, bumps become accelerations")
+    odometry_sigma: float = Field(
+        0.01, ge=0, description="relative standard deviation of the distance that the wheels report"
+    )
+    attitude_sigma_deg: float = Field(
+        0.2, ge=0, description="standard deviation of the inclinometer's error about each axis [degrees]"
+    )
+    acceleration_sigma: float = Field(0.05, ge=0, description="standard deviation [m/s2] of the accelerometer's noise")
+    camera_forward: float = Field(0.05, description="distance of the cameras ahead of the centre of the wheels [m]")
     pad: float = Field(
         0.28,
         ge=0,
-        description="m; radius about the start that is plane, as steep as the bed, free of rocks, known to the rover",
+        description="radius [m] of the start area, which is plane, as steep as the bed, free of rocks, and known "
+        "to the rover",
     )
     map_cell: float | None = Field(
-        None, gt=0.004, description="m; cell of a coarse map of the whole bed that the rover is given; none by default"
+        None, gt=0.004, description="cell [m] of a coarse map of the whole bed that the rover is given; not set: no map"
     )
-    map_sigma: float = Field(0.002, ge=0, description="m; error of its elevations")
+    map_sigma: float = Field(0.002, ge=0, description="standard deviation of that map's elevations [m]")
     blank: tuple[float, float, float] | None = Field(
-        None, description="m; x, y, radius of a patch of the bed without any texture; none by default"
+        None, description="x, y, radius [m] of a patch of the bed without any texture; not set: no such patch"
     )
-    lost_frames: tuple[int, ...] = Field((), description="frames whose images are black")
+    lost_frames: tuple[int, ...] = Field((), description="numbers of the frames whose images are black")
     obstacle_leg: int | None = Field(
-        None, ge=0, description="leg on which an obstacle appears after its ground was mapped; none by default"
+        None, ge=0, description="leg on which an obstacle appears after its ground was mapped; not set: no obstacle"
     )
-    obstacle_ahead: float = Field(0.2, gt=0, description="m; the obstacle's way along the leg from the wheels' centre")
-    obstacle_aside: float = Field(0.0, description="m; and to the right of it")
-    obstacle_height: float = Field(0.015, gt=0, description="m; its height: a wheel's radius")
+    obstacle_ahead: float = Field(
+        0.2, gt=0, description="distance of the obstacle along the leg from the centre of the wheels [m]"
+    )
+    obstacle_aside: float = Field(0.0, description="distance of the obstacle to the right of the leg [m]")
+    obstacle_height: float = Field(0.015, gt=0, description="height of the obstacle [m]; 0.015: a wheel's radius")
 
 
 @dataclass

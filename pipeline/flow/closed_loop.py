@@ -60,37 +60,44 @@ class DriveParams(Params):
     """The loop itself; what happens on a leg and at a stop is the stages' own."""
 
     goal: tuple[float, float] | None = Field(
-        default=None, description="m; x, y of the goal in the world frame, which begins at the first left camera"
+        default=None, description="x, y [m] of the goal, in the frame that drive.frame names"
     )
     frame: Literal["world", "map"] = Field(
         default="world",
-        description="frame of the goal: the world, or the global map where there is one",
+        description="frame of the goal; world: its origin is the first left camera; map: the global map, where "
+        "there is one",
     )
     prior: tuple[float, float, float] | None = Field(
-        default=None, description="m, m, degrees to the left; where the first left camera roughly is in the global map"
+        default=None,
+        description="rough pose of the first left camera in the global map: x, y [m], heading [degrees to the left]",
     )
-    prior_sigma: tuple[float, float] = Field(default=(0.1, 5.0), description="m, degrees; its standard deviations")
+    prior_sigma: tuple[float, float] = Field(
+        default=(0.1, 5.0), description="standard deviations of that pose: position [m], heading [degrees]"
+    )
     pose: tuple[float, float, float, float] | None = Field(
-        default=None, description="m, m, m, degrees; its pose in the global map, handed in instead of found"
+        default=None,
+        description="known pose of the first left camera in the global map, used instead of a search: x, y, z [m],"
+        " heading [degrees to the left]",
     )
     detail: float = Field(
         default=4.0,
         ge=0,
-        description="pixels that a wheel's diameter covers along the range where it may drive: about a matching "
-        "window, which smooths away what is smaller; what is seen from farther serves to plan; 0: all is driven on",
+        description="pixels along the range that a wheel's diameter must cover for ground to be driven on: about a"
+        " matching window, which smooths away what is smaller; ground seen from farther serves for planning alone; "
+        "0: no such limit",
     )
-    around: float = Field(default=0.6, gt=0, description="m; the map reaches this far around start and goal")
+    around: float = Field(default=0.6, gt=0, description="margin [m] of the map around start and goal")
     max_stops: int = Field(
         default=80,
         ge=1,
-        description="stops after which the drive is given up; among many rocks a way of 2.8 m took more than 60",
+        description="stops after which the drive is given up; a path of 2.8 m among many rocks took more than 60",
     )
-    max_safety_stops: int = Field(default=3, ge=1, description="safety stops in a row that end the drive")
+    max_safety_stops: int = Field(default=3, ge=1, description="successive safety stops that end the drive")
     least_match: float = Field(
         default=0.1,
         ge=0,
         le=1,
-        description="share of the pixels that match the image before, below which it is lost",
+        description="share of an image's pixels that must match the image before; with fewer the image counts as lost",
     )
 
 

@@ -52,9 +52,8 @@ class TerrainParams(Params):
 
     preset: Literal["default", "accurate"] = Field(
         default="default",
-        description="accurate: preset accurate of the matcher, elevations from both directions of matching, 2000 "
-        "tracked points, and merged cells of an own standard deviation above 0.7 cells left undefined: errors are "
-        "about two fifths smaller, matching takes many times as long",
+        description="accurate: sets hfvm.preset accurate, locus.both, track.points 2000 and merge.max_std_cells "
+        "0.7; errors are about two fifths smaller, matching takes many times as long; keys set explicitly win",
     )
 
 

@@ -39,12 +39,14 @@ class Tiling(Params):
     memory: int = Field(
         default=1000,
         ge=50,
-        description="MB that one task of the matcher may take besides the program (about 300): larger pairs are tiled",
+        description="memory [MB] that one task of the matcher may take besides the program itself (about 300); "
+        "larger pairs are matched in tiles",
     )
     tile: int | None = Field(
         default=None,
         ge=0,
-        description="pixels; side of a tile at every level, 0 = pairs of any size are matched whole; null: by memory",
+        description="side of a tile [pixels] at every level; 0: pairs of any size are matched whole; not set: "
+        "chosen by memory",
     )
 
 

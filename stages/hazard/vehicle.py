@@ -36,7 +36,7 @@ class Vehicle(Params):
     max_roughness: float = Field(
         default=0.04,
         gt=0,
-        description="largest standard deviation of heights from the plane under a wheel [m]; a third of the step",
+        description="largest roughness [m]: RMS deviation of heights a quarter of a wheel apart; a third of the step",
     )
     margin: float = Field(
         default=0.15,

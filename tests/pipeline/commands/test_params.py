@@ -15,7 +15,7 @@ PAGE = Path(__file__).resolve().parents[3] / "docs" / "parameters.md"
 
 def test_the_page_in_the_documentation_is_current(capsys: pytest.CaptureFixture[str]) -> None:
     assert params.show(markdown=True) == 0
-    assert PAGE.read_text(encoding="utf-8") == capsys.readouterr().out, "rille params --markdown > docs/parameters.md"
+    assert PAGE.read_text(encoding="utf-8") == capsys.readouterr().out, "make pages"
 
 
 def test_every_section_and_key_of_the_configuration_is_there() -> None:

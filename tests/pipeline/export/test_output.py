@@ -214,6 +214,10 @@ def table() -> str:
 
 def test_the_docs_list_every_file() -> None:
     text = PAGE.read_text(encoding="utf-8")
-    assert text[text.index(BEGIN) + len(BEGIN) : text.index(END)] == table(), (
-        "python tests/pipeline/export/test_output.py"
-    )
+    assert text[text.index(BEGIN) + len(BEGIN) : text.index(END)] == table(), "make pages"
+
+
+if __name__ == "__main__":
+    page = PAGE.read_text(encoding="utf-8")
+    before, after = page.index(BEGIN) + len(BEGIN), page.index(END)
+    PAGE.write_text(page[:before] + table() + page[after:], encoding="utf-8")

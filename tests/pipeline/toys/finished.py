@@ -25,6 +25,7 @@ from rille.stages.evaluation.path_check import path_check
 from rille.stages.geometry.epipolar import corrected
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 from rille.stages.geometry.lattice import Lattice
+from rille.stages.hazard.measures import MEASURES
 from rille.stages.hazard.risk import RiskParams
 from rille.stages.hazard.vehicle import Vehicle
 
@@ -71,8 +72,8 @@ def bundles() -> dict[str, Bundle]:
     risk = np.zeros((ROWS, COLS), dtype=np.uint8)
     risk[20:30, 50:60] = 2
     risk[:5, :9] = 3
-    measures = ("inclination", "height_range", "step", "roughness", "slope", "tilt", "clearance", "p_hazard")
-    bands = dict.fromkeys(measures, np.full((ROWS, COLS), 0.1, dtype=np.float32))
+    bands = dict.fromkeys((m.band for m in MEASURES), np.full((ROWS, COLS), 0.1, dtype=np.float32))
+    bands["p_hazard"] = bands["tilt"]
     bands |= {"risk": risk, **dict.fromkeys(("reason", "filled"), np.zeros_like(risk))}
     rows = np.arange(ROWS - 1, 9, -1)
     path = np.column_stack([np.zeros(len(rows)), 0.8 - CELL * rows, np.full(len(rows), -0.18)])
