@@ -44,21 +44,26 @@ def test_reconstruct(place: Place, name: str, frames: int) -> None:
     sequence = {"mockup": "mockup-short"}.get(name, name)
     first, second = place.said[name], place.said[f"{name} again"]
     assert (first.status, second.status) == (0, 0), first.err + second.err
-    made = re.fullmatch(rf"(runs/{sequence}/{RUN_ID})/report.html  computed (\d+), cached (\d+), missing 0", first.last)
+    counts = r"computed (\d+), cached (\d+), missing (\d+)"
+    made = re.fullmatch(rf"(runs/{sequence}/{RUN_ID})/report.html  {counts}", first.last)
     assert made, first.last
     folder, total = place.folder / made[1], int(made[2]) + int(made[3])
     again = place.runs(sequence)[-1]
-    assert second.last == f"runs/{sequence}/{again.name}/report.html  computed 0, cached {total}, missing 0"
+    assert second.last == f"runs/{sequence}/{again.name}/report.html  computed 0, cached {total}, missing {made[4]}"
     assert (folder.parent / "latest").resolve() == again
     assert {p.name for p in folder.iterdir()} >= RECONSTRUCTED
     poses = [line for line in (folder / "trajectory.tum").read_text().splitlines() if not line.startswith("#")]
     assert len(poses) == frames
-    assert json.loads((folder / "report.json").read_text())
+    listed = json.loads((folder / "report.json").read_text())["missing"]
+    assert len(listed) == int(made[4])
+    said = [line for line in first.err.splitlines() if line.startswith("rille: missing: ")]
+    assert said == [f"rille: missing: {m['what']}: {m['why']}" for m in listed]
 
 
 def test_reconstruct_says_how_it_goes(place: Place) -> None:
     plain = place.said["mockup"].err.splitlines()
-    assert re.fullmatch(r"rille: \d+ computed, 0 cached in [\d.]+ s", plain[-1])
+    told = [line for line in plain if not line.startswith("rille: missing: ")]
+    assert re.fullmatch(r"rille: \d+ computed, 0 cached in [\d.]+ s", told[-1])
     assert all(line.startswith("rille: ") for line in plain)
     events = [json.loads(line) for line in place.said["other"].err.splitlines() if line.startswith("{")]
     assert {"computed"} <= {event["event"] for event in events}
