@@ -1,13 +1,15 @@
 """Which programs open the files of a run, and whether they read what Rille wrote: a row a program, with its version.
 
 ``python benchmarks/programs.py [RUN_FOLDER]``; the run is the latest of `mockup-short` by default. Fails if a program
-reads something else. Python packages come with `pip install -e '.[dev]'`. Others are asked where they are installed:
-``gdalinfo`` and ``pdal`` on the path, QGIS's module of ``/usr/bin/python3``, ``rio-cogeo`` of the environment that
-``COGEO`` names (a folder with ``bin/rio``), Khronos' validator in the ``node_modules`` that ``GLTF_VALIDATOR`` names.
+reads something else. Python packages come with `pip install -e '.[dev]'`; three.js comes with trimesh and runs in
+``chromium``. Others are asked where they are installed: ``gdalinfo`` and ``pdal`` on the path, QGIS's module of
+``/usr/bin/python3``, ``rio-cogeo`` of the environment that ``COGEO`` names (a folder with ``bin/rio``), Khronos'
+validator in the ``node_modules`` that ``GLTF_VALIDATOR`` names.
 """
 
 from __future__ import annotations
 
+import base64
 import contextlib
 import json
 import os
@@ -26,13 +28,21 @@ import pycolmap
 import rasterio
 import trimesh
 import xarray
+import yaml
 from evo.tools import file_interface
 from rosbags.highlevel import AnyReader
 
 import rille
+from rille.pipeline.engine.store.base import at
+from rille.pipeline.engine.store.location import locate
+from rille.pipeline.export.programs import colmap as colmap_export
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "pipeline"))
+from toys import map_server
+from toys.browser import Browser
 
 RASTERS = ("dem", "dem_sigma", "slope", "hillshade", "ortho", "risk", "hazard", "reason")
-EXPORTS = ("laz", "ply", "glb", "colmap", "grid_map")
+EXPORTS = ("laz", "ply", "glb", "colmap", "nav2", "grid_map")
 
 QGIS = """
 import sys
@@ -60,6 +70,31 @@ v.validateBytes(new Uint8Array(fs.readFileSync(process.argv[2]))).then((r) => {
 """
 
 
+THREE = """
+new Promise((done) => {
+  if (document.readyState === 'complete') done(); else addEventListener('load', () => done());
+}).then(() => new Promise((done, fail) => {
+  const bytes = Uint8Array.from(atob(document.getElementById('glb').textContent), (c) => c.charCodeAt(0));
+  new THREE.GLTFLoader().parse(bytes.buffer, '', (found) => {
+    const scene = new THREE.Scene(), camera = new THREE.PerspectiveCamera(50, 1, 0.01, 1000);
+    scene.add(found.scene, new THREE.AmbientLight(0xffffff, 1));
+    const box = new THREE.Box3().setFromObject(found.scene), size = box.getSize(new THREE.Vector3());
+    camera.position.set(0, 2 * Math.max(size.x, size.z), 0.01); camera.lookAt(0, 0, 0);
+    const renderer = new THREE.WebGLRenderer({ preserveDrawingBuffer: true });
+    let texture = 0;
+    found.scene.traverse((m) => { if (m.isMesh && m.material.map) texture = m.material.map.image.width; });
+    renderer.render(scene, camera);
+    const gl = renderer.getContext(), w = gl.drawingBufferWidth, h = gl.drawingBufferHeight;
+    const p = new Uint8Array(4 * w * h);
+    gl.readPixels(0, 0, w, h, gl.RGBA, gl.UNSIGNED_BYTE, p);
+    let drawn = 0;
+    for (let i = 0; i < p.length; i += 4) drawn += p[i] + p[i + 1] + p[i + 2] > 0;
+    done([THREE.REVISION, renderer.info.render.triangles, texture, size.y, drawn / (w * h)]);
+  }, fail);
+}))
+"""
+
+
 def run_of(*command: str | Path, **kw: Any) -> str:
     done = subprocess.run([str(c) for c in command], capture_output=True, text=True, check=False, **kw)
     if done.returncode:
@@ -71,7 +106,7 @@ class Opened:
     """A run with its exports, and what is right: the elevations of ``dem.tif`` as rasterio reads them."""
 
     def __init__(self, run: Path, exports: Path) -> None:
-        self.run, self.exports = run, exports
+        self.run, self.exports, self.cache = run, exports, locate(os.environ.get("RILLE_CACHE") or ".rille/cache")
         rille_command = Path(sys.executable).with_name("rille")
         for kind in EXPORTS:
             run_of(rille_command, "export", run, "--to", kind, "-o", exports / kind)
@@ -153,10 +188,34 @@ def colmap(o: Opened) -> tuple[str, str]:
     options.print_summary = False
     pycolmap.bundle_adjustment(model, options)
     moved = max(np.linalg.norm(i.projection_center() - before[i.name]) for i in model.images.values())
+    ours, theirs = back_projection(o)
+    assert abs(theirs / ours - 1.0) < 0.02, (ours, theirs)
     words = (
-        f"{model.num_images()} images, {model.num_points3D()} points, {stated:.2f} px; adjustment moves a centre by "
+        f"{model.num_images()} images, {model.num_points3D()} points, {stated:.2f} px; with all observations "
+        f"{theirs:.3f} px a frame, in the report {ours:.3f}; adjustment moves a centre by "
     )
     return version("pycolmap"), words + f"{1e3 * moved:.2f} mm at most"
+
+
+def back_projection(o: Opened) -> tuple[float, float]:
+    """Median over frames of the RMS error in the left images: as the report has it, and by pycolmap.
+
+    The model is exported once more with every observation that agrees with the pose: the report counts those far off,
+    too. Landmarks are told of by the frames after the key frame, which they come from.
+    """
+    rows = {r["name"]: r for r in json.loads((o.run / "report.json").read_text())["frames"] if r["rms_px"] is not None}
+    with tempfile.TemporaryDirectory() as folder:
+        limit, colmap_export.FARTHEST = colmap_export.FARTHEST, np.inf
+        colmap_export.export_run(o.run, Path(folder) / "all", at(o.cache))
+        colmap_export.FARTHEST = limit
+        model = pycolmap.Reconstruction(f"{folder}/all")
+    found = []
+    for image in (i for i in model.images.values() if i.name.split("/")[1] in rows and i.name.startswith("left/")):
+        seen = [(p.xy, model.points3D[p.point3D_id]) for p in image.points2D if p.has_point3D()]
+        followed = [(xy, p) for xy, p in seen if min(e.image_id for e in p.track.elements) < image.image_id]
+        miss = np.array([image.project_point(p.xyz) - xy for xy, p in followed])
+        found.append(float(np.sqrt((miss**2).sum(axis=1).mean())))
+    return float(np.median([r["rms_px"] for r in rows.values()])), float(np.median(found))
 
 
 def by_laspy(o: Opened) -> tuple[str, str]:
@@ -181,6 +240,47 @@ def by_trimesh(o: Opened) -> tuple[str, str]:
     assert len(cloud.vertices) == o.known
     (mesh,) = trimesh.load(o.exports / "glb", file_type="glb").geometry.values()
     return version("trimesh"), f"PLY: {o.known} points; GLB: {len(mesh.faces)} triangles with texture"
+
+
+def three(o: Opened) -> tuple[str, str]:
+    template = trimesh.util.decompress(trimesh.resources.get_bytes("templates/viewer.zip"), file_type="zip")
+    page = template["viewer.html.template"].read().decode().split("var camera,controls,scene,renderer")[0]
+    glb = base64.b64encode((o.exports / "glb").read_bytes()).decode()
+    (o.exports / "three.html").write_text(f'{page}</script><script type="text/plain" id="glb">{glb}</script>')
+    browser = Browser(str(shutil.which("chromium")), o.exports)
+    try:
+        browser.ask("Page.navigate", url=(o.exports / "three.html").as_uri())
+        browser.run(
+            "new Promise((d) => document.readyState === 'complete' ? d() : addEventListener('load', () => d()))"
+        )
+        revision, triangles, texture, height, drawn = browser.run(THREE)
+        assert not browser.messages, browser.messages
+    finally:
+        browser.close()
+    (mesh,) = trimesh.load(o.exports / "glb", file_type="glb").geometry.values()
+    assert triangles == len(mesh.faces)
+    assert np.isclose(height, o.range[1] - o.range[0], rtol=0.01), height
+    assert texture > 1
+    assert drawn > 0.02, drawn
+    return f"r{revision}", f"GLB: {triangles} triangles drawn, texture of {texture} columns"
+
+
+def nav2(o: Opened) -> tuple[str, str]:
+    with rasterio.open(o.run / "risk.tif") as risk, rasterio.open(o.run / "hazard.tif") as hazard:
+        classes, p, corner = risk.read(1), hazard.read(hazard.descriptions.index("p_hazard") + 1), risk.bounds
+    wanted = np.select([classes == 2, classes == 3], [100, -1], np.rint(100.0 * np.nan_to_num(p)))
+    masks = {"keepout": np.where(classes >= 2, 100, 0), "speed": np.where(classes == 1, 50, 0)}
+    for name, values in {"map": wanted, "map_scale": wanted, **masks}.items():
+        grid = map_server.load(o.exports / "nav2" / f"{name}.yaml")
+        assert np.allclose(grid.origin, (corner.left, corner.bottom), atol=1e-6), grid.origin
+        np.testing.assert_array_equal(grid.data[::-1] < 0, values < 0)
+        # hazard.tif keeps p_hazard to a thousandth, so that a half may be rounded to either side
+        assert np.abs(grid.data[::-1] - values).max() <= name.startswith("map"), name
+    poses = yaml.safe_load((o.exports / "nav2" / "path.yaml").read_text())["poses"]
+    return (
+        "as documented",
+        f"map raw and scale, keepout and speed mask of {classes.size} cells, path of {len(poses)} poses",
+    )
 
 
 def khronos(o: Opened) -> tuple[str, str]:
@@ -212,8 +312,10 @@ PROGRAMS: dict[str, tuple[Callable[[Opened], tuple[str, str]], bool]] = {
     "laspy": (by_laspy, True),
     "PDAL": (pdal, there("pdal")),
     "trimesh": (by_trimesh, True),
+    "three.js, in chromium": (three, there("chromium")),
     "Khronos glTF validator": (khronos, "GLTF_VALIDATOR" in os.environ and there("node")),
     "rosbags": (by_rosbags, True),
+    "nav2_map_server": (nav2, True),
 }
 """Check and whether the program is here."""
 
