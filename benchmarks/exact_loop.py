@@ -44,7 +44,7 @@ def drive(sequence: Any, config: Any, goal: tuple[float, float]) -> dict[str, An
     from rille.stages.planning.local_planner.stage import SeenGround, next_leg, shortest_way
     from rille.stages.terrain.occlusion_bounds import Bounds, ceiling
 
-    bed, vehicle, p = ExactBed.of(sequence, config, goal), config.vehicle, config.leg
+    bed, vehicle, p = ExactBed.of(sequence, config, goal), config.vehicle, config.local_planner
     fine = vehicle.wheel_diameter / config.drive.detail
     view = FieldOfView.of(sequence.rig, sequence.simulation.T_vehicle_left)
     meta = {"lattice": bed.lattice.to_dict(), "vehicle": vehicle.model_dump(mode="json")}

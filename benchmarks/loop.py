@@ -1,7 +1,7 @@
 """The closed loop over many beds: does the rover arrive, where does it stand, does it know where it is?
 
     benchmarks/loop.py                     20 seeds, rock cover 5 and 10 %: the table
-    benchmarks/loop.py --reflex 100        an obstacle of one wheel radius laid on the way after its ground was mapped
+    benchmarks/loop.py --obstacles 100    a stone of one wheel radius laid on the path after its ground was mapped
 
 The goal of each bed is the place nearest to (0, 1) m to which a path exists on the exact map, and where there is room
 to turn, at least 0.7 m from the start. Violations are counted by the true placement of the wheels, of drives that
@@ -35,7 +35,7 @@ def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", default="1:21", help="FIRST:END of the seeds (default 1:21)")
     parser.add_argument("--cover", type=float, action="append", help=f"rock cover; may be repeated (default {COVERS})")
-    parser.add_argument("--reflex", type=int, default=0, metavar="N", help="trials of the reflex detection instead")
+    parser.add_argument("--obstacles", type=int, default=0, metavar="N", help="trials of the obstacle monitor instead")
     parser.add_argument("--first", type=int, default=0, help="number of the first trial")
     parser.add_argument("--set", action="append", default=[], help="a parameter, section.key=value; may be repeated")
     parser.add_argument("--out", type=Path, default=Path("loop.jsonl"), help="one line a run, appended (loop.jsonl)")
@@ -71,7 +71,7 @@ def drive(settings: list[str]) -> dict[str, Any]:
         shutil.rmtree(folder, ignore_errors=True)
     errors = [f"{f.label}: {f.error}" for f in result.failures]
     seconds = time.perf_counter() - begin
-    least = shortest_within_limits(bed, goal, config.leg)
+    least = shortest_within_limits(bed, goal, config.local_planner)
     return {**found, "goal": goal, "shortest_within_limits": least, "errors": errors, "seconds": seconds}
 
 
@@ -82,7 +82,7 @@ def figures(flow: Any, store: Any) -> dict[str, Any]:
     driven = flow.driven
     out: dict[str, Any] = {"verdict": verdict, "reason": reason, "stops": len(driven.stops)}
     out["events"] = [stop.event for stop in driven.stops if stop.event]
-    out["reflex_stops"] = sum(event.startswith("reflex") for event in out["events"])
+    out["obstacle_stops"] = sum(event.startswith("obstacle stop") for event in out["events"])
     out["safety_stops"] = sum(event.startswith("safety") for event in out["events"])
     out["images"] = max(flow.true, default=0) + 1
     if driven.check is not None and driven.check.ref is not None:
@@ -126,7 +126,7 @@ def worst(rows: list[dict[str, Any]]) -> list[str]:
         f"{1e3 * min(r['least_clearance'] for r in judged):.1f} mm, greatest edge under a wheel "
         f"{1e3 * max(r['greatest_step'] for r in judged):.1f} mm, greatest tilt "
         f"{max(r['greatest_tilt'] for r in judged):.1f} degrees",
-        f"{sum(r['way'] for r in judged):.1f} m driven with {sum(r['reflex_stops'] for r in judged)} reflex stops, "
+        f"{sum(r['way'] for r in judged):.1f} m driven with {sum(r['obstacle_stops'] for r in judged)} obstacle stops, "
         f"{sum(r['seconds'] for r in judged) / len(judged):.0f} s a drive",
     ]
 
@@ -141,11 +141,11 @@ def main() -> None:
     rows = [json.loads(line) for line in given.out.read_text().splitlines()] if given.out.exists() else []
     done = {r["name"] for r in rows}
     run, work = drive, list[tuple[str, dict[str, Any], list[str]]]()
-    if given.reflex:
-        from driving.reflex import settings_of, trial
+    if given.obstacles:
+        from driving.obstacles import settings_of, trial
 
         run = trial
-        work = [(f"reflex-{k}", {"trial": k}, settings_of(k)) for k in range(given.first, given.reflex)]
+        work = [(f"obstacles-{k}", {"trial": k}, settings_of(k)) for k in range(given.first, given.obstacles)]
     else:
         first, end = (int(v) for v in given.seeds.split(":"))
         for seed in range(first, end):
@@ -162,8 +162,8 @@ def main() -> None:
         print(f"{name}: {row['verdict']} {row['reason']} ({row['seconds']:.0f} s)", flush=True)
     asked = {name for name, _, _ in work}
     rows = [r for r in rows if r["name"] in asked]
-    if given.reflex:
-        from driving.reflex import trials
+    if given.obstacles:
+        from driving.obstacles import trials
 
         print("\n".join(trials(rows)))
     else:

@@ -77,7 +77,7 @@ def merged(cache: Path, where: list[tuple[int, int]], cells: int, jobs: int, led
 
     here = "benchmarks.merge_scale"
     dems = {k: node(here, f"dem/{k}", {"pair": k, "i0": i, "j0": -j, "cells": cells}) for k, (i, j) in enumerate(where)}
-    prints = [node(tile_index, f"footprint/{k}", {"side": TILE_CELLS, "margin": 0}, dem=d) for k, d in dems.items()]
+    prints = [node(tile_index, f"tile_index/{k}", {"side": TILE_CELLS, "margin": 0}, dem=d) for k, d in dems.items()]
 
     def follow() -> Any:
         found = yield prints

@@ -34,7 +34,7 @@ HEADINGS = (
     "matching",
     "ratio",
 )
-PRESETS = {"default": [], "navigation": ["select.preset=navigation"]}
+PRESETS = {"default": [], "navigation": ["keyframes.preset=navigation"]}
 
 
 def arguments() -> argparse.Namespace:

@@ -100,15 +100,15 @@ def _real(name: str) -> Any:
 
 
 def _facts(name: str, args: Any, inputs: Any) -> dict[str, Any]:
-    if name == "continuity":
+    if name == "frame_screening":
         return {"asks": {}, "chain": args["frames"], "lost": [], "unfit": []}
     if name == "common_tilt":
         return {"undone": False}
-    if name == "select":
+    if name == "keyframes":
         n = args["frames"]
         steps = {"displacement": [1.0] * (n - 1), "match_rate": [1.0] * (n - 1)}
         return {"basic": list(range(n)), "segments": [[k, k + 1] for k in range(n - 1)], **steps}
-    if name == "level":
+    if name == "ground_frame":
         return {"T_local_left": np.eye(4)[:3].tolist(), "pair": args["pair"]}
     if name == "trajectory":
         frames = args["frames"]
@@ -119,7 +119,7 @@ def _facts(name: str, args: Any, inputs: Any) -> dict[str, Any]:
 
         y = SPACING * args["pair"]
         return {"lattice": Lattice.snap((-0.8, 0.8, y, y + 1.6), CELL).to_dict(), "pair": args["pair"]}
-    if name == "footprint":
+    if name == "tile_index":
         lattice = inputs["dem"].meta["lattice"]
         return {
             "pair": inputs["dem"].meta["pair"],
@@ -127,7 +127,7 @@ def _facts(name: str, args: Any, inputs: Any) -> dict[str, Any]:
             "box": lattice,
             "tiles": list(_tiles(lattice, args["side"])),
         }
-    if name == "exposure":
+    if name == "radiometry":
         return {"steps": {}}
     return {k: v for k, v in args.items() if k in ("pair", "frames")}
 

@@ -66,7 +66,7 @@ def export(sequence: Sequence, directory: Path, materialise: Materialise, pairs:
     if directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
         raise InputError("RIL-165", f"{directory} is not empty", remedy="name a folder that does not exist yet")
     chosen = tuple(
-        range(0, sequence.frames, int(sequence.defaults.get("select.stride", 1))) if pairs is None else pairs
+        range(0, sequence.frames, int(sequence.defaults.get("keyframes.stride", 1))) if pairs is None else pairs
     )
     try:
         directory.parent.mkdir(parents=True, exist_ok=True)

@@ -67,10 +67,12 @@ def test_by_the_limits_alone_the_way_is_straight_where_nothing_stands_in_it(monk
     config, goal = config_of(layers), (0.0, 0.5)
     bed = ExactBed.of(sequence, config, goal)
     (x, y), _ = bed.start()
-    found = shortest_within_limits(bed, goal, config.leg)
-    reach = 0.5 * config.leg.tolerance * config.vehicle.wheel_base  # it has arrived this near, on a grid of 7.5 mm
+    found = shortest_within_limits(bed, goal, config.local_planner)
+    reach = (
+        0.5 * config.local_planner.tolerance * config.vehicle.wheel_base
+    )  # it has arrived this near, on a grid of 7.5 mm
     assert found == pytest.approx(math.hypot(goal[0] - x, goal[1] - y) - reach, abs=0.01)
     wall = bed.ground.height.copy()
     wall[120:125] += 0.05
     walled = replace(bed, ground=HeightGrid.of(wall, bed.ground.x0, bed.ground.y0, bed.ground.cell, 0.03))
-    assert shortest_within_limits(walled, goal, config.leg) is None
+    assert shortest_within_limits(walled, goal, config.local_planner) is None

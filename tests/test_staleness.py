@@ -50,22 +50,22 @@ TOUCHED = (
 """World tiles of the three models: the second shares one with the first, the third another one with the second."""
 
 META: dict[str, dict[str, Any]] = {
-    "select": {
+    "keyframes": {
         "basic": list(BASIC),
         "segments": [[0, 1, 2], [2, 3, 4]],
         "displacement": [1.0] * 4,
         "match_rate": [1.0] * 4,
     },
-    "level": {"T_local_left": IDENTITY},
+    "ground_frame": {"T_local_left": IDENTITY},
     "locus": {"lattice": LATTICE},
-    "continuity": {"asks": {"bridges": [], "sides": []}, "chain": list(FRAMES), "unfit": [], "lost": []},
+    "frame_screening": {"asks": {"bridges": [], "sides": []}, "chain": list(FRAMES), "unfit": [], "lost": []},
     "trajectory": {"frames": list(FRAMES), "positions": [[0.0, 0.0, 0.0]] * 5, "pieces": [[0, 4]], "main": 0},
     "crosscheck_join": {"frames": list(FRAMES), "positions": [[0.0, 0.0, 0.0]] * 5},
     "common_tilt": {"undone": False},
-    "exposure": {"steps": {"2": 3}},
+    "radiometry": {"steps": {"2": 3}},
 }
 EACH: dict[str, Callable[[int], dict[str, Any]]] = {
-    "footprint": lambda n: {"pair": BASIC[n], "cell": LATTICE["cell"], "box": LATTICE, "tiles": TOUCHED[n]},
+    "tile_index": lambda n: {"pair": BASIC[n], "cell": LATTICE["cell"], "box": LATTICE, "tiles": TOUCHED[n]},
 }
 """What the layout of the chain reads of results; of some, of the n-th of a stage, in order of the pairs."""
 
@@ -73,15 +73,15 @@ EACH: dict[str, Callable[[int], dict[str, Any]]] = {
 
 MERGED = {"merge", "risk/world", "path/world", "dem_accuracy/world", "path_check"}
 # each model in the world, the tiles that it touches, and its differences from its neighbours
-MODELS = {"locus/world", "footprint", "seam", "seam_audit", "exposure"}
+MODELS = {"locus/world", "tile_index", "overlap_qa", "overlap_audit", "radiometry"}
 MISSION = MODELS | MERGED
 LOCAL = {"locus/local", "risk/local", "path/local", "dem_accuracy/local"}
 REFINED = {"refine", "common_tilt", "trajectory", "agreement", "accuracy", "pose"} | MISSION
 POSES = {"resect"} | REFINED
-LEVELLED = {"level"} | LOCAL | POSES
+LEVELLED = {"ground_frame"} | LOCAL | POSES
 RIG = {"rig", "calibration"} | LEVELLED
 MATCHED = {"hfvm", "orientation"} | RIG
-MOVED = {"motion", "steps", "continuity", "select", "track"} | POSES
+MOVED = {"motion", "step_table", "frame_screening", "keyframes", "track"} | POSES
 COUNTERCHECK = {"crosscheck", "crosscheck_join", "agreement", "accuracy/crosscheck"}
 PYRAMIDS = {"pyramid/left", "pyramid/right"} | MATCHED | MOVED
 RISK = {"risk/local", "risk/world", "risk/truth", "path/local", "path/world", "path_check"}
@@ -90,21 +90,21 @@ TILES = {f"hfvm/{step}" for step in ("coarse", "left", "right", "band", "check",
 TILES |= {"hfvm/fine/left", "hfvm/fine/right"}
 
 STALE: dict[str, set[str]] = {
-    "undistort": {"undistort/left", "undistort/right", "sight"} | PYRAMIDS | COUNTERCHECK,
+    "undistort": {"undistort/left", "undistort/right", "image_quality"} | PYRAMIDS | COUNTERCHECK,
     "pyramid": PYRAMIDS,
     "motion": MOVED,
-    "continuity": {"continuity"},  # what follows hangs on its result, not on it
-    "select": {"select"},  # what follows hangs on its result, not on it
+    "frame_screening": {"frame_screening"},  # what follows hangs on its result, not on it
+    "keyframes": {"keyframes"},  # what follows hangs on its result, not on it
     "hfvm": MATCHED,
     "orientation": {"orientation"} | RIG,
     "rig": RIG,
-    "level": LEVELLED,
+    "ground_frame": LEVELLED,
     "locus": LOCAL | MISSION,
     "track": {"track"} | POSES,
     "resect": POSES,
     "refine": REFINED,
-    "seam_audit": {"seam_audit"},  # nothing is computed from what it says
-    "exposure": {"exposure"},  # as with select: tiles hang on the steps that it finds
+    "overlap_audit": {"overlap_audit"},  # nothing is computed from what it says
+    "radiometry": {"radiometry"},  # as with select: tiles hang on the steps that it finds
     "merge": MERGED,
     "risk": RISK,
     "path": {"path/local", "path/world", "path_check"},
@@ -114,17 +114,28 @@ STALE: dict[str, set[str]] = {
     "tiling": TILES | MATCHED,  # as far as a plan can tell: that the same comes out is seen once it has
     "vehicle": RISK,
     # of a drive, which this chain is not
-    **{key: set() for key in ("ceiling", "drive", "global_fix", "leg", "pad", "reflex", "safety")},
+    **{
+        key: set()
+        for key in (
+            "occlusion_bounds",
+            "drive",
+            "map_localization",
+            "local_planner",
+            "start_area",
+            "obstacle_monitor",
+            "fault_monitor",
+        )
+    },
 }
 EXCEPTIONS: dict[str, set[str]] = {
-    "select.preset": {"orientation"} | RIG | MOVED,  # navigation sets parameters of other stages, too
+    "keyframes.preset": {"orientation"} | RIG | MOVED,  # navigation sets parameters of other stages, too
     "locus.both": {"hfvm/back"} | LOCAL | MISSION,  # the other direction is matched as well
     # limits of matches and number of points, with which all begins that is not an image
     "terrain.preset": {"hfvm/back", "track"} | MATCHED | POSES | LOCAL | MISSION,
     "refine.enabled": REFINED - {"refine", "common_tilt"},  # without it there is less to compute
     "resect.landmarks": POSES - {"refine", "common_tilt"},  # refined are landmarks of the disparity alone
     "crosscheck.enabled": set(),  # without it there is less to compute
-    "merge.max_hole": {"footprint"} | MERGED,  # how far beyond its edge a tile depends on what is there
+    "merge.max_hole": {"tile_index"} | MERGED,  # how far beyond its edge a tile depends on what is there
     "tiling.memory": set(),  # small pairs are matched whole with some more or less of it
     "vehicle.name": set(),  # a name changes no risk
 }
@@ -134,9 +145,11 @@ SOURCES = {"scene", "image/left", "image/right", "truth", "truth_dem/local", "tr
 """They hang on the sequence alone."""
 
 IMAGES = {"image/left", "image/right", "undistort/left", "undistort/right", "truth_dem/local", "truth_dem/world"}
-EVERYTHING = IMAGES | {"sight"} | PYRAMIDS | COUNTERCHECK | RISK | {"scene", "truth"}
+EVERYTHING = IMAGES | {"image_quality"} | PYRAMIDS | COUNTERCHECK | RISK | {"scene", "truth"}
 GIVEN_RIG = {"orientation"} | RIG | COUNTERCHECK
-RIGHT_IMAGE = {"image/right", "undistort/right", "pyramid/right", "sight", "continuity"} | MATCHED | COUNTERCHECK
+RIGHT_IMAGE = (
+    {"image/right", "undistort/right", "pyramid/right", "image_quality", "frame_screening"} | MATCHED | COUNTERCHECK
+)
 
 SCENE = ("seed", "bed_width", "bed_length", "cell", "relief", "rocks", "rock_cover", "craters", "grain")
 SCENE += ("sun_elevation_deg", "sun_azimuth_deg", "sun_diameter_deg")
@@ -165,8 +178,8 @@ SEQUENCE: dict[str, set[str]] = {
     **dict.fromkeys([f"mockup.{name}" for name in CAMERA], EVERYTHING - {"scene", "truth"}),
     "mockup.slope_deg": EVERYTHING,  # the cameras go along with the ground
     "mockup.up_noise_deg": LEVELLED,
-    "mockup.attitude_noise_deg": {"motion", "steps", "continuity", "select", "track"} | LEVELLED,
-    "mockup.focal_error": {"undistort/left", "undistort/right", "sight"}
+    "mockup.attitude_noise_deg": {"motion", "step_table", "frame_screening", "keyframes", "track"} | LEVELLED,
+    "mockup.focal_error": {"undistort/left", "undistort/right", "image_quality"}
     | PYRAMIDS
     | COUNTERCHECK,  # by the ideal camera
     "mockup.rig_error_deg": GIVEN_RIG,
@@ -253,7 +266,7 @@ def test_a_reconstruction_reads_all_sections_but_those_of_a_drive(chain: Chain) 
     every = [f"{section}.x" for section in type(config).model_fields if section != "terrain"]
     lost = {key.partition(".")[0] for key in unread.unread(every, config, chain.plan({}))}
     assert lost == unread.driven() & set(type(config).model_fields) - {"drive"}
-    assert lost >= {"leg", "safety", "reflex", "pad"}
+    assert lost >= {"local_planner", "fault_monitor", "obstacle_monitor", "start_area"}
 
 
 def short(given: dict[str, dict[str, Any]]) -> Sequence:
@@ -432,8 +445,8 @@ def test_no_estimate_is_told_a_true_pose(chain: Chain) -> None:
         return found
 
     assert told() == set()
-    assert told(up_noise_deg=0.0) == {"level"}, "an exact vertical is found out"
-    assert told(attitude_noise_deg=0.0) == {"level", "motion"}
+    assert told(up_noise_deg=0.0) == {"ground_frame"}, "an exact vertical is found out"
+    assert told(attitude_noise_deg=0.0) == {"ground_frame", "motion"}
 
 
 # -- edits of the sources: a module counts with all that it reaches ---------------------------------------------------
@@ -460,8 +473,8 @@ EDITS: dict[str, tuple[str, str, str, set[str]]] = {
         {"locus/local", "locus/world"},
     ),
     "a njit callee of several": ("stages/hfvm/level/features.py", "", "\nMORE = 1\n", {"motion", "hfvm", "track"}),
-    "a helper of the seams": ("stages/terrain/overlap_qa.py", "", "\nMORE = 1\n", {"seam"}),
-    "a stage that others hang on by its result": ("stages/terrain/tile_index.py", "", "\nMORE = 1\n", {"footprint"}),
+    "a helper of the seams": ("stages/terrain/overlap_qa.py", "", "\nMORE = 1\n", {"overlap_qa"}),
+    "a stage that others hang on by its result": ("stages/terrain/tile_index.py", "", "\nMORE = 1\n", {"tile_index"}),
     "a helper's helper": ("stages/geometry/epipolar.py", "", "\nMORE = 1\n", {"orientation", "rig"}),
     "a helper of two stages": (
         "stages/evaluation/pose_alignment.py",

@@ -1,1 +1,1 @@
-"""Parts of ``benchmarks/loop.py`` and ``exact_loop.py``: their beds, trials of the reflex, and how ways are judged."""
+"""Parts of ``benchmarks/loop.py`` and ``exact_loop.py``: beds, obstacle trials, and how paths are judged."""

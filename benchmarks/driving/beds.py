@@ -24,7 +24,7 @@ def choose_goal(bed: Any, config: Any) -> tuple[float, float] | None:
     judged = risk_map(bed.elevation, np.zeros_like(bed.elevation), cell, config.vehicle, config.risk)
     footing = Footing.of(Hazards(judged["risk"], judged["reason"]), bed.lattice, config.vehicle)
     start, heading = bed.start()
-    ground = Ground(footing, start, heading, config.leg.model_copy(update={"unknown_price": math.inf}))
+    ground = Ground(footing, start, heading, config.local_planner.model_copy(update={"unknown_cost": math.inf}))
     _, cost, _ = ground.search(start, cell, whole=True)
     x, y = ground.places()
     far = np.where(np.isfinite(cost).all(axis=0), np.hypot(x - NOMINAL[0], y - NOMINAL[1]), np.inf)

@@ -91,7 +91,7 @@ def mockup(pairs: int | None = None) -> Iterator[Scene]:
 
     sequence, fetch = open_sequence("mockup"), fetcher(cache_folder(None))
     assert sequence.truth is not None
-    frames = range(0, sequence.frames, int(sequence.defaults.get("select.stride", 1)))
+    frames = range(0, sequence.frames, int(sequence.defaults.get("keyframes.stride", 1)))
     for frame in list(frames)[:pairs]:
         yield _simulated(sequence, fetch, frame)
 
@@ -117,9 +117,9 @@ def _simulated(sequence: Any, fetch: Any, frame: int) -> Scene:
 
 
 def _searched(rig: Rig, found: Disparities, up: Floats, lattice: Lattice) -> tuple[float, float]:
-    from rille.stages.terrain.ground_frame import LevelParams, VerticalHint, level, z_range
+    from rille.stages.terrain.ground_frame import GroundFrameParams, VerticalHint, level, z_range
 
-    facts = level(found.column, found.row, found.measured, rig, LevelParams(), VerticalHint(up=up))
+    facts = level(found.column, found.row, found.measured, rig, GroundFrameParams(), VerticalHint(up=up))
     low, high = z_range(facts["plane"], facts["relief"], list(lattice.bounds))
     return low, high
 

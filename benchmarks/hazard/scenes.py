@@ -27,7 +27,7 @@ from rille.stages.geometry.lattice import Lattice
 from rille.stages.geometry.surface import plane
 from rille.stages.hazard.vehicle import Vehicle
 from rille.stages.hfvm.stage import match
-from rille.stages.terrain.ground_frame import LevelParams, VerticalHint, level, z_range
+from rille.stages.terrain.ground_frame import GroundFrameParams, VerticalHint, level, z_range
 from rille.stages.terrain.locus.solve import Matches
 from rille.stages.terrain.locus.stage import LocusParams, MatchedPair, local_lattice, reconstruct, usable
 
@@ -144,7 +144,9 @@ def _reconstructed(
 ) -> tuple[Lattice, tuple[RigidTransform, tuple[float, float]], tuple[Floats32, Floats32]]:
     """Lattice, frame and range of elevations, and elevations with their standard deviation, by a vertical."""
     given = pair.matches(pair.forth)
-    facts = level(given.column, given.row, matched(pair.forth.validity), pair.rig, LevelParams(), VerticalHint(up=up))
+    facts = level(
+        given.column, given.row, matched(pair.forth.validity), pair.rig, GroundFrameParams(), VerticalHint(up=up)
+    )
     lattice = lattice or local_lattice(pair.rig, facts, CELL, pair.params)
     T_local_left = RigidTransform.from_matrix(facts["T_local_left"])
     low, high = z_range(facts["plane"], facts["relief"], list(lattice.bounds))

@@ -21,7 +21,7 @@ from rille.pipeline.flow import config as configuration
 from rille.stages.core.declare import Bundle, NoParams
 from rille.stages.odometry.resection.trajectory import world_poses
 
-MATCHING = ("hfvm", "orientation", "rig", "calibration", "level")
+MATCHING = ("hfvm", "orientation", "rig", "calibration", "ground_frame")
 """Stages of the basic pairs; all others see every frame."""
 
 
@@ -109,7 +109,7 @@ class Chain:
         chain, lost, unfit = self._continuity(frames)
         steps = self._steps(chain)
         where = {"unfit": [chain.index(f) for f in unfit]} if unfit else {}
-        select = self._stage("select", {"frames": len(chain)} | where, steps=steps)
+        select = self._stage("keyframes", {"frames": len(chain)} | where, steps=steps)
         basic = [chain[i] for i in select.meta["basic"]]
         parts = [[chain[i] for i in part] for part in select.meta["segments"]]
         self.disparity = {k: self._match(k) for k in basic}
@@ -126,14 +126,15 @@ class Chain:
     def _continuity(self, frames: list[int]) -> tuple[list[int], list[Any], list[int]]:
         """Frames to go through, lost ones with their causes, and those that may not be basic."""
         sights = [
-            self._stage("sight", {"frame": f}, **{c: self._image(f, c) for c in ("left", "right")}) for f in frames
+            self._stage("image_quality", {"frame": f}, **{c: self._image(f, c) for c in ("left", "right")})
+            for f in frames
         ]
         steps = self._steps(frames)
         sides: dict[int, Bundle] = {}
         bridges: list[tuple[int, int]] = []
         while True:
             given = {"steps": steps, "bridges": [self.motion[s] for s in bridges], "sides": list(sides.values())}
-            found = self._stage("continuity", {"frames": frames, "bridges": bridges}, sights=sights, **given)
+            found = self._stage("frame_screening", {"frames": frames, "bridges": bridges}, sights=sights, **given)
             asks = found.meta["asks"]
             if not any(asks.values()):
                 missing = [{"frame": f, "cause": why} for f, why in self.sequence.lost.items()]
@@ -143,11 +144,11 @@ class Chain:
                 bridges.append((a, b))
             for f in asks["sides"]:
                 pair = {c: self._pyramid(f, c) for c in ("left", "right")}
-                sides[f] = self._stage("sides", {"frame": f, "rig": self.sequence.rig.to_dict()}, **pair)
+                sides[f] = self._stage("swap_check", {"frame": f, "rig": self.sequence.rig.to_dict()}, **pair)
 
     def _steps(self, frames: list[int]) -> list[Bundle]:
         motions = [self.motion[step] for step in itertools.pairwise(frames)]
-        return [self._stage("steps", {}, motions=motions)] if motions else []
+        return [self._stage("step_table", {}, motions=motions)] if motions else []
 
     def _refined(self, basic: list[int], segments: list[tuple[Bundle, Bundle, Bundle]]) -> list[Bundle]:
         params = self.config.refine
@@ -202,7 +203,7 @@ class Chain:
             args["initial_up"] = [float(v) for v in s.initial_pose.rotation[2]]
         if s.pitch is not None:
             args["pitch"] = s.pitch
-        level = self._stage("level", args, disparity=self.disparity[key], rig=self.calibration)
+        level = self._stage("ground_frame", args, disparity=self.disparity[key], rig=self.calibration)
         track = self._stage(
             "track",
             {"frames": part},

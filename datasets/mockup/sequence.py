@@ -180,7 +180,7 @@ def mockup(p: MockupParams, name: str = "mockup") -> Sequence:
         truth_dem=dem,
         truth_disparity=disparity,
         evaluation_window=WINDOW,
-        defaults={"select.rule": "stride", "select.stride": 4, "locus.cell_size": 0.001},
+        defaults={"keyframes.rule": "stride", "keyframes.stride": 4, "locus.cell_size": 0.001},
         notes=(
             f"simulated at 1:10 with seed {p.seed}; lengths are those of the model",
             "truth frame: z up, y along the bed, x right, origin in the middle of the near edge at mean height",

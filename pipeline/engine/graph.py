@@ -1,7 +1,7 @@
 """The task graph: nodes that name a stage, and flows that add nodes once earlier results are known.
 
 >>> def chain(graph: Graph) -> Generator[Wait, Any, list[Handle]]:
-...     select = yield graph.node(keyframes, "select", SelectParams(), {"frames": 9})
+...     chosen = yield graph.node(keyframes, "keyframes", KeyframesParams(), {"frames": 9})
 ...     return [graph.node(hfvm, f"hfvm/{k}", params, {"pair": k}, inputs=images[k]) for k in select.meta["basic"]]
 >>> graph = Graph()
 >>> matched = graph.flow(chain(graph))

@@ -5,7 +5,7 @@ identify the task, and hints (paths) that cannot change the result. The key is t
 and the label, of the code and packages behind the stage, and of the *output digests* of the inputs. Between
 tasks only :class:`~rille.pipeline.engine.store.manifest.Ref` travel.
 
->>> spec = Spec("rille.stages.odometry.keyframes", "select", SelectParams(), {"frames": 9})
+>>> spec = Spec("rille.stages.odometry.keyframes", "keyframes", KeyframesParams(), {"frames": 9})
 >>> outcome = ensure(Path("cache"), spec, {})
 >>> Store("cache").open(outcome.ref).meta["basic"]
 [0, 4, 8]

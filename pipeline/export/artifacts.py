@@ -39,5 +39,5 @@ def by_frame(view: RunView, bundle: Bundle, name: str) -> Floats:
 
 def chain(view: RunView) -> tuple[int, ...]:
     """Frames that the trajectory goes through, in order; all chosen ones where nothing else is known."""
-    bundle = view.bundle(view.products.continuity)
+    bundle = view.bundle(view.products.screening)
     return view.frames if bundle is None else tuple(int(f) for f in bundle.meta["chain"])

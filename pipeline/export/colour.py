@@ -21,7 +21,7 @@ from rille.stages.geometry.lattice import Lattice
 LUMA = np.array([0.299, 0.587, 0.114])
 """Grey of red, green and blue, as the images were made grey (ITU-R BT.601)."""
 
-READS = ("images", "undistorted", "trajectory", "continuity", "rigs")
+READS = ("images", "undistorted", "trajectory", "screening", "rigs")
 KNOWS = ("frames", "sequence.rig")
 """What an output needs besides the merged tiles, see :class:`rille.pipeline.export.output.Output`."""
 

@@ -162,7 +162,7 @@ class Builder:
         """Whether the images of a pair are exchanged."""
         args = {"frame": frame, "rig": self.sequence.rig.to_dict()}
         ports = {camera: self.pyramid(frame, camera) for camera in ("left", "right")}
-        return self.node(swap_check, f"sides/{frame}", args, **ports)
+        return self.node(swap_check, f"swap_check/{frame}", args, **ports)
 
     @once
     def disparity(self, pair: int) -> Handle:
@@ -205,7 +205,9 @@ class Builder:
         Cells and extent of the ``first`` pair (None: this one) serve all, so that they merge.
         """
         disparity = self.disparity(frame)
-        level = self.node(ground_frame, f"level/{frame}", {"pair": frame, **vertical}, disparity=disparity, rig=known)
+        level = self.node(
+            ground_frame, f"ground_frame/{frame}", {"pair": frame, **vertical}, disparity=disparity, rig=known
+        )
         reference = level if first is None else first.level
         args = {"pair": frame, "frame": "local"}
         dem = self._elevations(f"locus/local/{frame}", args, disparity, known, level, reference)
@@ -285,9 +287,9 @@ def merge_tiles(
     Parameters
     ----------
     node : ``node(stage, label, args, **inputs)`` adds a task, as :meth:`Builder.node` does.
-    footprints : facts of stage ``footprint``, one a model.
+    footprints : facts of stage ``tile_index``, one a model.
     dems : world models by pair.
-    steps : exposure of the pairs whose grey values are levelled, as stage ``exposure`` gives them.
+    steps : exposure of the pairs whose grey values are levelled, as stage ``radiometry`` gives them.
     """
     touching: dict[tuple[int, int], list[tuple[int, Box]]] = {}
     for meta in footprints:

@@ -7,19 +7,21 @@ Pair, world model, segment and hazards are those of a reconstruction (:mod:`rill
 
     drive/start -> sense -+
                           v
-    stop k:  image -> pyramid -> hfvm -> level -> locus (local) -> locus (world) -> merge (all models so far, pad;
-                                           |                          ^                |      and what of them is near)
-                                           |            trajectory -> pose           risk (of both), ceiling
+    stop k:  image -> pyramid -> hfvm -> ground_frame -> locus (local) -> locus (world) -> merge (all models so far,
+                                           |                          ^                |      start_area, what is near)
+                                           |            trajectory -> pose           risk (of both), occlusion_bounds
                                            v               ^   |                             |
-                                         resect -----------+   +---------> leg <-------------+
+                                         resect -----------+   +----> local_planner <--------+
                                            ^                                |
                                            |          goal, no path: end    | drive, turn, look
                                            |                                v
-    leg k:   safety <- sense <- drive/k (true poses) <- leg, pose (believed), drive/k-1 (where it truly stands)
-               |             images on the way -> pyramid -> motion -> track -> resect -> safety, reflex
-               |             motion (a baseline apart), locus (local) ---------------------> reflex
+    leg k:   sense <- drive/k (true poses) <- leg, pose (believed), drive/k-1 (where it truly stands)
+               |      images on the way -> pyramid -> motion -> track -> resect
+               v                                     |                    |
+             fault_monitor <------------------------ | -------------------+
+             obstacle_monitor <- motion (a baseline apart), locus (local)
                v
-             stop k+1 at the last image, or at the one where safety or reflex stopped
+             stop k+1 at the last image, or at the one where a monitor stopped
 
 ``drive``, ``sense``, the images and nothing else know the true poses. What the vehicle believes is the trajectory:
 the product of the segments that were tracked and resected. Every node is keyed by what it reads, so a drive that is
@@ -252,7 +254,7 @@ class Drive:
             inputs = {"dem": self.pairs[0].dem, "map": overview}
             args["prior"] = [*d.prior[:2], math.radians(d.prior[2])]
             args["prior_sigma"] = [d.prior_sigma[0], math.radians(d.prior_sigma[1])]
-        self.driven.fix = self.make.node(map_localization, "global_fix", args, **inputs)
+        self.driven.fix = self.make.node(map_localization, "map_localization", args, **inputs)
         return self.driven.fix
 
     def _on_the_map(self, fixed: Ref) -> None:
@@ -270,7 +272,7 @@ class Drive:
         if k == 0 and self.simulation.pad > 0:  # the ground under the vehicle, which no camera sees
             args = {"radius": self.simulation.pad, "wheel_diameter": self.config.vehicle.wheel_diameter}
             like = p.world_dem[stop.frame]
-            self.pads = [make.node(start_area, "pad", args | self.mounting, pose=pose, like=like)]
+            self.pads = [make.node(start_area, "start_area", args | self.mounting, pose=pose, like=like)]
         # Two maps: of all that was seen, to plan far ahead, and of what was seen finely enough to drive on.
         stop.merged = self._merged(f"merge/{k}", None)
         p.tiles = [stop.merged]
@@ -281,7 +283,7 @@ class Drive:
             finest = self.config.vehicle.wheel_diameter / self.config.drive.detail
             near = self._merged(f"merge/{k}/near", finest)
             stop.risk = make.hazards(f"risk/{k}/near", [near])
-        stop.ceiling = self._ceiling(f"ceiling/{k}", near, finest)
+        stop.ceiling = self._ceiling(f"occlusion_bounds/{k}", near, finest)
 
     def _located(self, legs: int) -> Handle:
         """The trajectory over so many legs, which is that of the drive from now on."""
@@ -305,7 +307,7 @@ class Drive:
 
     def _ceiling(self, label: str, merged: Handle, finest: float | None) -> Handle:
         """How high the ground may be, also where it was not seen."""
-        params = self.config.ceiling.model_copy(update={} if finest is None else {"max_footprint": finest})
+        params = self.config.occlusion_bounds.model_copy(update={} if finest is None else {"max_footprint": finest})
         inputs: dict[str, Any] = {"merged": merged, "dems": list(self.products.world_dem.values())}
         return self.graph.node(occlusion_bounds, label, params, {}, {}, inputs)
 
@@ -394,21 +396,21 @@ class Drive:
         args = {"rows": [rows[f] for f in frames], "vehicle": self.config.vehicle.model_dump(mode="json")}
         assert stop.sense is not None
         given = {"sense": stop.sense, "resect": segment.resection}
-        stop.safety = self.make.node(fault_monitor, f"safety/{stop.index}", args | self.mounting, **given)
+        stop.safety = self.make.node(fault_monitor, f"fault_monitor/{stop.index}", args | self.mounting, **given)
         judges = [stop.safety]
-        if self.config.reflex.enabled:
-            stop.reflex = self._obstacles(stop, way, segment, key)
-            judges.append(stop.reflex)
+        if self.config.obstacle_monitor.enabled:
+            stop.obstacle = self._obstacles(stop, way, segment, key)
+            judges.append(stop.obstacle)
         safety, *others = yield judges
         cut, kind, reason = safety.meta["stop"], safety.meta["kind"], safety.meta["reason"]
-        for reflex in others:
-            seen = reflex.meta["stop"]
+        for monitor in others:
+            seen = monitor.meta["stop"]
             # Whoever stopped first counts: what the other saw later was never driven.
             if seen is not None and (cut is None or seen < cut):
-                cut, kind, reason = seen, "reflex", reflex.meta["reason"]
-        self.troubles = 0 if cut is None or kind == "reflex" else self.troubles + 1
+                cut, kind, reason = seen, "obstacle", monitor.meta["reason"]
+        self.troubles = 0 if cut is None or kind == "obstacle" else self.troubles + 1
         if cut is not None:
-            stop.event = f"{'reflex' if kind == 'reflex' else 'safety stop'} at image {frames[cut]}: {reason}"
+            stop.event = f"{'obstacle stop' if kind == 'obstacle' else 'safety stop'} at image {frames[cut]}: {reason}"
             if cut < len(frames) - 1:
                 frames = frames[: cut + 1]
                 stop.row = rows[frames[-1]]
@@ -431,7 +433,7 @@ class Drive:
 
     def _obstacles(self, stop: Stop, way: Way, segment: Segment, key: Pair) -> Handle:
         """Whether the images on the way show what the last model does not."""
-        p, vehicle, frames = self.config.reflex, self.config.vehicle, way.frames
+        p, vehicle, frames = self.config.obstacle_monitor, self.config.vehicle, way.frames
         wheels = np.array([way.said.meta["odometry"][way.rows[f]] for f in frames])
         compared = obstacle_monitor.pairs(wheels, vehicle.wheel_diameter, p)
         params = self.config.motion.model_copy(update={"level": p.level})
@@ -441,7 +443,7 @@ class Drive:
             motions.append(self.graph.node(motion, f"motion/way/{a}-{b}", params, {"frames": [a, b]}, {}, inputs))
         args = {"pairs": [list(c) for c in compared], "vehicle": vehicle.model_dump(mode="json"), **self.mounting}
         known = {"dem": key.dem, "resect": segment.resection, "rig": key.rig}
-        return self.make.node(obstacle_monitor, f"reflex/{stop.index}", args, **known, motions=motions)
+        return self.make.node(obstacle_monitor, f"obstacle_monitor/{stop.index}", args, **known, motions=motions)
 
     # -- the end ------------------------------------------------------------------------------------------------
 

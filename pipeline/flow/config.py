@@ -20,6 +20,7 @@ import tomli_w
 from pydantic import Field, ValidationError, create_model
 
 from rille.datasets.text import reading
+from rille.pipeline.flow import renamed
 from rille.stages.core.declare import Params, Stage
 from rille.stages.core.errors import ConfigError, told
 
@@ -56,11 +57,6 @@ class TerrainParams(Params):
         "0.7; errors are about two fifths smaller, matching takes many times as long; keys set explicitly win",
     )
 
-
-REPLACED: Mapping[str, str] = {
-    "refine.stereo": "it gained little and is gone: leave it out",
-}
-"""Keys of earlier versions, with what to write now: a ``config.toml`` of an old run is refused with this advice."""
 
 DATASET_SECTIONS = ("mockup", "misalign", "rover")
 """Sections that belong to a kind of sequence; the sequence validates them."""
@@ -209,12 +205,12 @@ NAVIGATION: Mapping[str, Mapping[str, Any]] = {
     "track": {"points": 200},
     "orientation": {"samples": 600},
 }
-"""What ``select.preset = "navigation"`` sets in other sections, where nothing is given there."""
+"""What ``keyframes.preset = "navigation"`` sets in other sections, where nothing is given there."""
 
 
 def _navigate(nested: dict[str, Any]) -> None:
     """What a trajectory needs of disparities and displacements, half the resolution of each gives."""
-    select = nested.get("select")
+    select = nested.get("keyframes")
     if not isinstance(select, Mapping) or select.get("preset") != "navigation":
         return
     for section, values in NAVIGATION.items():
@@ -236,8 +232,8 @@ def _complaint(kind: type[Params], prefix: tuple[str, ...], error: dict[str, Any
     key = ".".join((*prefix, *loc))
     if error["type"] == "extra_forbidden":
         # Before the guess at a misspelling: a key that was once right is no slip.
-        if key in REPLACED:
-            return f"{key} is a key of an earlier version: {REPLACED[key]}"
+        if former := renamed.present(key, error["input"]):
+            return former
         near = difflib.get_close_matches(key, [".".join((*prefix, k)) for k in known_keys(kind)] + list(also), n=1)
         hint = f"did you mean {near[0]!r}?" if near else f"known here: {', '.join(_siblings(kind, loc))}"
         return f"unknown key {key!r} (value {error['input']!r}): {hint}"

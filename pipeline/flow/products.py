@@ -22,7 +22,7 @@ class Stop:
     drive: Handle | None = None
     sense: Handle | None = None
     safety: Handle | None = None
-    reflex: Handle | None = None
+    obstacle: Handle | None = None
     frames: list[int] = field(default_factory=list)
     row: int = -1
     """Of the leg's artifact, where the leg ended: the last one, unless something ended it before."""
@@ -49,8 +49,8 @@ class Products:
 
     images: dict[int, Handle] = field(default_factory=dict)
     undistorted: dict[int, Handle] = field(default_factory=dict)
-    continuity: Handle | None = None
-    select: Handle | None = None
+    screening: Handle | None = None
+    keyframes: Handle | None = None
     orientations: dict[int, Handle] = field(default_factory=dict)
     rigs: dict[int, Handle] = field(default_factory=dict)
     crosschecks: list[Handle] = field(default_factory=list)
@@ -67,7 +67,7 @@ class Products:
     common_tilt: Handle | None = None
     world_dem: dict[int, Handle] = field(default_factory=dict)
     seams: dict[int, Handle] = field(default_factory=dict)
-    seam_audit: Handle | None = None
+    overlap_audit: Handle | None = None
     tiles: list[Handle] = field(default_factory=list)
     trajectory: Handle | None = None
     risk: Handle | None = None

@@ -17,9 +17,9 @@
                     +-> crosscheck (window; images of both cameras) -> crosscheck_join -> agreement <- trajectory
     leaves: accuracy (trajectory, crosscheck), position_accuracy, dem_accuracy (local and merged DEM), path_check
 
-Frames that show no motion (black, foreign, sides exchanged) are lost: ``continuity`` finds them by ``sight`` (what
-each pair looks like), the motions, and where it asks for them bridges (motions over a lost frame) and ``sides`` (left
-against right).
+Frames that show no motion (black, foreign, sides exchanged) are lost: ``frame_screening`` finds them by
+``image_quality`` (what each pair looks like), the motions, and where it asks for them bridges (motions over a lost
+frame) and ``swap_check`` (left against right).
 
 A segment needs landmarks only relative to its own basic pair, so all segments are resected and refined at once (and
 refined again, where ``common_tilt`` finds a tilt of all disparities); absolute poses are one cheap scan
@@ -107,8 +107,8 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
         "behind": [k for k, (a, b) in enumerate(pairwise(chain), 1) if frames.index(b) > frames.index(a) + 1],
     }
     marks = {name: at for name, at in marked.items() if at}
-    p.select = make.node(keyframes, "select", {"frames": len(chain)} | marks, steps=steps(make, chain))
-    chosen = yield p.select
+    p.keyframes = make.node(keyframes, "keyframes", {"frames": len(chain)} | marks, steps=steps(make, chain))
+    chosen = yield p.keyframes
     basic = [chain[i] for i in chosen.meta["basic"]]
 
     # Stop and think: stereo pair to local elevation model, hazards and path.
@@ -139,7 +139,7 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
     for k in there:
         _, p.world_dem[k] = make.world_model(pairs[k], pairs[there[0]], row[k], p.trajectory)
     args = {"side": TILE_CELLS, "margin": make.config.merge.margin}
-    prints = [make.node(tile_index, f"footprint/{k}", args, dem=dem) for k, dem in p.world_dem.items()]
+    prints = [make.node(tile_index, f"tile_index/{k}", args, dem=dem) for k, dem in p.world_dem.items()]
     # A pair whose model failed is left out of the world: the others make a map with a hole.
     laid = yield Maybe(prints)
     footprints = [ref.meta for ref in laid if ref is not None and ref.meta["tiles"]]
@@ -151,8 +151,8 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
     # Seams are audited, exposures levelled, models merged in world tiles; then hazards and the path over all of it.
     p.seams = overlaps(make, footprints)
     centres = {"centres": {str(f["pair"]): centre(f["box"]) for f in footprints}}
-    p.seam_audit = make.node(overlap_audit, "seam_audit", centres, seams=list(p.seams.values()))
-    levelled = yield make.node(radiometry, "exposure", centres, seams=list(p.seams.values()))
+    p.overlap_audit = make.node(overlap_audit, "overlap_audit", centres, seams=list(p.seams.values()))
+    levelled = yield make.node(radiometry, "radiometry", centres, seams=list(p.seams.values()))
     p.tiles = merge_tiles(make.node, footprints, p.world_dem, levelled.meta["steps"])
     p.risk = make.hazards("risk/world", p.tiles)
     p.path = make.node(path, "path/world", {"use": "world", "heading": heading(posed.meta)}, risk=p.risk)
@@ -163,7 +163,7 @@ def steps(make: Builder, frames: list[int]) -> list[Handle]:
     """Motions along some frames in tables, cut by frame numbers: where a frame is left out, the other tables stay."""
     made: dict[tuple[int, ...], list[Handle]] = make.made.setdefault("steps", {})
     if tuple(frames) not in made:
-        taken = "steps/bridged" if made else "steps"
+        taken = "step_table/bridged" if made else "step_table"
         parts = [list(part) for _, part in groupby(pairwise(frames), lambda step: step[0] // TABLE_FRAMES)]
         # A step is judged by the one before it, also across the border of two tables.
         last = [{}, *({"before": make.motion(*part[-1])} for part in parts)]
@@ -179,7 +179,7 @@ def screened(make: Builder, whole: list[int]) -> Generator[Wait, Any, Ref]:
     sights = [
         make.node(
             image_quality,
-            f"sight/{frame}",
+            f"image_quality/{frame}",
             {"frame": frame},
             **{camera: make.image(frame, camera) for camera in ("left", "right")},
         )
@@ -192,7 +192,7 @@ def screened(make: Builder, whole: list[int]) -> Generator[Wait, Any, Ref]:
     while True:
         asked = make.node(
             frame_screening,
-            f"continuity/{turn}" if turn else "continuity",
+            f"frame_screening/{turn}" if turn else "frame_screening",
             {"frames": whole} | ({"bridges": list(bridges)} if bridges else {}),
             sights=sights,
             steps=along,
@@ -202,7 +202,7 @@ def screened(make: Builder, whole: list[int]) -> Generator[Wait, Any, Ref]:
         found: Ref = yield asked
         asks = found.meta["asks"]
         if not any(asks.values()):
-            make.products.continuity = asked
+            make.products.screening = asked
             return found
         bridges |= {(a, b): make.motion(a, b) for a, b in asks["bridges"]}
         sides |= {frame: make.sides(frame) for frame in asks["sides"]}
@@ -325,7 +325,7 @@ def overlaps(make: Builder, footprints: list[Facts]) -> dict[int, Handle]:
         if shared:
             nearest = sorted(shared, key=lambda other: (-shared[other], -other))[:SEAMS]
             others = [models[other] for other in sorted(nearest)]
-            seams[pair] = make.node(overlap_qa, f"seam/{pair}", {}, dem=models[pair], others=others)
+            seams[pair] = make.node(overlap_qa, f"overlap_qa/{pair}", {}, dem=models[pair], others=others)
     return seams
 
 

@@ -41,7 +41,7 @@ def driven() -> frozenset[str]:
 CHECKED = frozenset(("undistort", "pyramid", "motion", "hfvm", "orientation"))
 """Sections that ``rille check`` reads."""
 
-CHOICES = ("terrain.preset", "select.preset")
+CHOICES = ("terrain.preset", "keyframes.preset")
 """Parameters that the configuration itself reads: they set others."""
 
 

@@ -127,7 +127,7 @@ def _signed(value: Any, unit: str) -> str:
 def basic_pairs(scene: Scene) -> Block | None:
     """Draw which pairs became elevation models, and why."""
     view = scene.view
-    bundle = view.bundle(view.products.select)
+    bundle = view.bundle(view.products.keyframes)
     if bundle is None or len(view.frames) < 2:
         return None
     meta = bundle.meta
@@ -137,7 +137,7 @@ def basic_pairs(scene: Scene) -> Block | None:
     moved = np.array([np.nan if v is None else v for v in meta.get("displacement") or ()], dtype=float)
     if len(moved) != len(tracked) - 1:
         moved = np.full(len(tracked) - 1, np.nan)
-    params = getattr(view.config, "select", None)
+    params = getattr(view.config, "keyframes", None)
     by_overlap = getattr(params, "rule", "") == "overlap"
     wanted = params.overlap if by_overlap and params is not None else None
     known = overlap[np.isfinite(overlap)]

@@ -316,7 +316,7 @@ _FIGURES: tuple[tuple[str, Maker, Condition, str, str], ...] = (
         "Map",
         _map,
         _always,
-        "tiles risk path drive trajectory disparity rigs images undistorted continuity",
+        "tiles risk path drive trajectory disparity rigs images undistorted screening",
         "config.vehicle config.risk.sigmas sequence.rig sequence.truth",
     ),
     (
@@ -349,13 +349,13 @@ _FIGURES: tuple[tuple[str, Maker, Condition, str, str], ...] = (
     (
         "Basic pairs",
         checks.basic_pairs,
-        lambda scene: _several(scene) and scene.view.products.select is not None,
-        "select continuity",
-        "config.select.rule config.select.overlap",
+        lambda scene: _several(scene) and scene.view.products.keyframes is not None,
+        "keyframes screening",
+        "config.keyframes.rule config.keyframes.overlap",
     ),
     ("Overlap", checks.overlaps, lambda scene: len(scene.view.products.world_dem) > 1, "tiles world_dem", ""),
-    ("Seams", seams.worst, lambda scene: bool(scene.view.products.seams), "seam_audit seams", ""),
-    ("Seam audit", seams.models, lambda scene: bool(scene.view.products.seams), "seam_audit seams", ""),
+    ("Seams", seams.worst, lambda scene: bool(scene.view.products.seams), "overlap_audit seams", ""),
+    ("Seam audit", seams.models, lambda scene: bool(scene.view.products.seams), "overlap_audit seams", ""),
     ("Elevation error", _dem_error, lambda scene: False, "dem_accuracy", ""),
 )
 """Title, how it is drawn, whether a run lacks something without it, the artifacts that it reads, and facts."""

@@ -23,7 +23,7 @@ MOST_ROWS = 12
 
 def audit(scene: Scene) -> Facts | None:
     """Facts of the audit; None without one, or without a seam."""
-    bundle = scene.view.bundle(scene.view.products.seam_audit)
+    bundle = scene.view.bundle(scene.view.products.overlap_audit)
     return bundle.meta if bundle is not None and bundle.meta["seams"] else None
 
 

@@ -87,8 +87,8 @@ def find_warnings(scene: Scene) -> list[str]:
     lines += scene.calibration.collected("warnings") if scene.calibration is not None else []
     p = view.products
     for handle in (
-        p.continuity,
-        p.select,
+        p.screening,
+        p.keyframes,
         p.common_tilt,
         *p.crosschecks,
         p.crosscheck,
@@ -96,7 +96,7 @@ def find_warnings(scene: Scene) -> list[str]:
         p.trajectory,
         p.accuracy,
         p.position_accuracy,
-        p.seam_audit,
+        p.overlap_audit,
     ):
         bundle = view.bundle(handle)
         lines += (bundle.meta.get("warnings") or []) if bundle is not None else []
@@ -166,8 +166,8 @@ def _stages(view: RunView) -> dict[str, dict[str, Any]]:
 
 
 READS = (
-    "continuity select common_tilt crosschecks crosscheck agreement crosscheck_accuracy trajectory accuracy "
-    "position_accuracy accuracy_pieces seam_audit disparity orientations rigs level local_dem local_risk local_path "
+    "screening keyframes common_tilt crosschecks crosscheck agreement crosscheck_accuracy trajectory accuracy "
+    "position_accuracy accuracy_pieces overlap_audit disparity orientations rigs level local_dem local_risk local_path "
     "local_dem_accuracy resections world_dem tiles risk path dem_accuracy path_check drive"
 )
 KNOWS = (

@@ -22,7 +22,7 @@ TABLE_2: tuple[tuple[str, str, float, tuple[str, ...]], ...] = (
         "Tracking of landmarks",
         "one segment between basic pairs",
         5.0,
-        ("track", "motion", "sight", "continuity", "sides"),
+        ("track", "motion", "image_quality", "frame_screening", "swap_check"),
     ),
     ("Calibration update (resection)", "one segment between basic pairs", 5.0, ("resect",)),
 )
@@ -149,7 +149,7 @@ def frames(scene: gather.Scene) -> list[dict[str, Any]]:
 def pairs(scene: gather.Scene) -> list[dict[str, Any]]:
     """One row a basic pair: choice, matching, rig, levelling, elevation model, local hazards and path."""
     view = scene.view
-    select = view.bundle(view.products.select)
+    select = view.bundle(view.products.keyframes)
     meta = {} if select is None else select.meta
     tracked = chain(view)
     numbers = [tracked[i] for i in meta.get("basic", ())]

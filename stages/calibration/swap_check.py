@@ -43,7 +43,7 @@ def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
 
 
 STAGE = Stage(
-    name="sides",
+    name="swap_check",
     version=1,
     summary="whether left and right of a pair are exchanged",
     params=NoParams,

@@ -24,31 +24,34 @@ from rille.stages.core.declare import Bundle, Inputs, Params, Stage
 from rille.stages.geometry.geometry import RigidTransform
 
 
-class SafetyParams(Params):
+class FaultMonitorParams(Params):
     """Thresholds of the safety stops."""
 
     max_tilt: float = Field(
         1.0,
         gt=0,
-        description="largest tilt by the inclinometer, as a multiple of vehicle.max_slope_deg",
+        description="tilt of the body over the vehicle's max_slope_deg at which it stops; the body averages over its "
+        "wheels, so it tilts less than the ground",
     )
     max_acceleration: float = Field(
         3.0,
         gt=0,
-        description="largest vertical acceleration [m/s2]; peaks of driving over permitted steps stay below half of it",
+        description="vertical acceleration [m/s2] at which it stops; permitted steps cause less than half of it",
     )
-    least_landmarks: int = Field(12, ge=6, description="fewest landmarks that agree with a pose; six determine it")
+    min_landmarks: int = Field(
+        12, ge=6, description="least number of landmarks that agree with a pose; six determine it"
+    )
     max_slip: float = Field(
-        0.2, gt=0, description="largest slip, as a share of the distance by the wheels; 0.05 to 0.15 is usual on soil"
+        0.2, gt=0, description="slip [share of the distance by the wheels] at which it stops; usual soil: 0.05 to 0.15"
     )
-    least_way: float = Field(
+    min_distance: float = Field(
         0.3,
         gt=0,
-        description="distance by the wheels [wheelbases] from which on slip is judged; over less, the error of vision"
-        " is as large",
+        description="distance by the wheels [wheelbases] from which slip is judged; below, the errors of the poses are "
+        "as large",
     )
     max_turn_deg: float = Field(
-        8.0, gt=0, description="largest difference [degrees] between the headings by wheels and by vision"
+        8.0, gt=0, description="difference [degrees] between the turn by the wheels and by the images at which it stops"
     )
 
 
@@ -79,7 +82,7 @@ def judge(
     inliers: list[int],
     T_vehicle_left: RigidTransform,
     vehicle: Mapping[str, Any],
-    params: SafetyParams,
+    params: FaultMonitorParams,
 ) -> Verdict:
     """The first image of a leg that is beyond a threshold.
 
@@ -102,8 +105,8 @@ def judge(
         if acceleration[k] > params.max_acceleration:
             limit = f"{params.max_acceleration:g} permitted"
             return Verdict(k, "acceleration", f"peak of {acceleration[k]:.1f} m/s2 by the accelerometer, {limit}")
-        if inliers[k] < params.least_landmarks:
-            few = f"{inliers[k]} landmarks agree with the pose, {params.least_landmarks} are needed"
+        if inliers[k] < params.min_landmarks:
+            few = f"{inliers[k]} landmarks agree with the pose, {params.min_landmarks} are needed"
             return Verdict(k, "lost", f"tracking is lost: {few}")
         moved = key.inverse() @ (RigidTransform.from_matrix(poses[k]) @ T_vehicle_left.inverse())
         found = _disagreement(odometry[k], moved, float(vehicle["wheel_base"]), params)
@@ -112,7 +115,7 @@ def judge(
     return Verdict(None, "", "")
 
 
-def _disagreement(wheels: Floats, moved: RigidTransform, base: float, params: SafetyParams) -> str:
+def _disagreement(wheels: Floats, moved: RigidTransform, base: float, params: FaultMonitorParams) -> str:
     """In what way wheels and vision contradict each other, in words; empty: they do not."""
     turn = math.atan2(-moved.rotation[0, 1], moved.rotation[1, 1])
     # The remainder, since headings jump by a full turn.
@@ -121,7 +124,7 @@ def _disagreement(wheels: Floats, moved: RigidTransform, base: float, params: Sa
         return f"wheels and vision differ by {apart:.1f} degrees in heading, {params.max_turn_deg:g} permitted"
     way, seen = float(np.hypot(wheels[0], wheels[1])), float(np.linalg.norm(moved.translation))
     # Over a short way the error of vision is as large as the slip that is looked for.
-    if way < params.least_way * base:
+    if way < params.min_distance * base:
         return ""
     slip = 1.0 - seen / way
     if abs(slip) <= params.max_slip:
@@ -129,7 +132,7 @@ def _disagreement(wheels: Floats, moved: RigidTransform, base: float, params: Sa
     return f"slip of {slip:.0%}: {1000 * way:.0f} mm by the wheels, {1000 * seen:.0f} mm by vision"
 
 
-def _run(params: SafetyParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+def _run(params: FaultMonitorParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     sense, resect = inputs["sense"], inputs["resect"]
     rows = [int(r) for r in args["rows"]]  # of the readings, those frames that were resected
     wheels = np.asarray(sense["odometry"])[rows]
@@ -155,10 +158,10 @@ def _relative(wheels: Floats) -> Floats:
 
 
 STAGE = Stage(
-    name="safety",
+    name="fault_monitor",
     version=1,
     summary="whether the vehicle stopped on a leg for its safety, where and why",
-    params=SafetyParams,
+    params=FaultMonitorParams,
     inputs=("sense", "resect"),
     outputs=(),
     run=_run,

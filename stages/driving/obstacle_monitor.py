@@ -1,4 +1,4 @@
-"""Reflex detection of obstacles on the way: what rises above the last elevation model where none should be.
+"""Detection of obstacles on the way: what rises above the last elevation model where none should be.
 
 The paper leaves it open (section 8). Between two stops there is one camera and its motion: coarse displacements between
 two images some centimetres of way apart (stage ``motion``) are a stereo pair along the drive, whose relative pose the
@@ -34,52 +34,44 @@ from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.vehicle import Vehicle
 
 
-class ReflexParams(Params):
-    """Parameters of the stage ``reflex``; lengths in wheel diameters suit any scale."""
+class ObstacleMonitorParams(Params):
+    """Parameters of the stage ``obstacle_monitor``; lengths in wheel diameters suit any scale."""
 
-    enabled: bool = Field(True, description="detect obstacles between stops")
-    level: int = Field(
-        1, ge=0, le=4, description="pyramid level of the displacements; 1: half the resolution, which is enough"
-    )
+    enabled: bool = Field(True, description="whether the rover looks for obstacles between stops")
+    level: int = Field(1, ge=0, le=4, description="pyramid level of the displacements; 1: half the resolution")
     baseline: float = Field(
-        1.6, gt=0, description="distance [wheel diameters] driven between the two images that are compared"
+        1.6, gt=0, description="distance driven between the two compared images [wheel diameters]; larger: less noise"
     )
     max_turn_deg: float = Field(
         6.0,
         gt=0,
-        description="largest rotation [degrees] between the two images; at 7 and 8 degrees points rose above ground "
-        "that the model had right",
+        description="largest turn [degrees] between two compared images; at 7 and 8 degrees points seemed to rise "
+        "above ground that the model had right",
     )
     reach: float = Field(
-        10.0,
-        gt=0,
-        description="distance [wheel diameters] ahead of the vehicle's centre up to which obstacles are detected",
+        10.0, gt=0, description="distance ahead of the vehicle's centre that is watched [wheel diameters]"
     )
-    aside: float = Field(
+    side_margin: float = Field(
+        0.5, ge=0, description="distance to either side of the wheels that is watched [wheel diameters]"
+    )
+    min_rise: float = Field(
+        0.25, gt=0, description="rise over the model from which a point counts as raised [wheel diameters]"
+    )
+    sigma_displacement: float = Field(
+        0.5, gt=0, description="standard deviation of a displacement [pixels of the displacements' level]"
+    )
+    sigmas: float = Field(2.0, gt=0, description="standard deviations that a rise must exceed, too")
+    model_radius: float = Field(
         0.5,
         ge=0,
-        description="width [wheel diameters] beside the wheels, on either side, in which obstacles are detected",
+        description="a point is compared with the greatest height of the model within this radius [wheel diameters]",
     )
-    height: float = Field(
-        0.25,
-        gt=0,
-        description="smallest rise [wheel diameters] above the elevation model that counts; 0.25: half a wheel's "
-        "radius",
+    min_points: int = Field(
+        8, ge=1, description="raised points within one wheel diameter from which on they are an obstacle"
     )
-    sigma: float = Field(0.5, gt=0, description="standard deviation of a displacement [pixels of its pyramid level]")
-    sigmas: float = Field(2.0, gt=0, description="number of standard deviations that a rise must exceed as well")
-    blur: float = Field(
-        0.5,
-        ge=0,
-        description="radius [wheel diameters] within which the model's greatest height is what a point is compared "
-        "with",
-    )
-    points: int = Field(
-        8, ge=1, description="smallest number of raised points within one wheel diameter that make an obstacle"
-    )
-    share: float = Field(0.35, ge=0, le=1, description="smallest share of raised points among all points there")
-    again_share: float = Field(
-        0.15, ge=0, le=1, description="the same where the image compared before showed as many raised points there"
+    min_share: float = Field(0.35, ge=0, le=1, description="least share of raised points among all points there")
+    min_share_again: float = Field(
+        0.15, ge=0, le=1, description="the same, where the previous image showed an obstacle at this place, too"
     )
 
 
@@ -148,13 +140,13 @@ def look(
     camera: Camera,
     T_vehicle_left: RigidTransform,
     vehicle: Vehicle,
-    p: ReflexParams,
+    p: ObstacleMonitorParams,
 ) -> Points:
     """What the two images say of the ground ahead of the vehicle."""
     wheel = vehicle.wheel_diameter
     T_vehicle_local = T_vehicle_left @ view.now.inverse()
     ahead = T_vehicle_local.apply(surface.points)
-    wide = 0.5 * vehicle.track + p.aside * wheel
+    wide = 0.5 * vehicle.track + p.side_margin * wheel
     near = (np.abs(ahead[:, 0]) <= wide) & (ahead[:, 1] > 0.5 * vehicle.wheel_base) & (ahead[:, 1] <= p.reach * wheel)
     cells = surface.points[near]
     T_now = view.now.inverse()
@@ -174,13 +166,13 @@ def look(
         # derivative grows beyond use.
         t = np.clip(np.nan_to_num(t), -0.5, 0.8)
     left_over = target - camera.project(T_now.apply(cells + t[:, None] * to_camera))
-    error = p.sigma * 2.0**view.level
+    error = p.sigma_displacement * 2.0**view.level
     # A displacement across the epipolar line is a wrong match, not another depth.
     along = np.hypot(left_over[:, 0], left_over[:, 1]) <= 3.0 * error
     q = cells + t[:, None] * to_camera
     rise = q[:, 2] - surface.top_at(q[:, :2])
     noise = error / np.maximum(np.hypot(slope[:, 0], slope[:, 1]), 1e-9) * to_camera[:, 2]
-    raised = along & (rise > p.height * wheel) & (rise > p.sigmas * noise) & np.isfinite(rise)
+    raised = along & (rise > p.min_rise * wheel) & (rise > p.sigmas * noise) & np.isfinite(rise)
     place = T_vehicle_local.apply(q)[:, :2]
     return Points(place[along], q[along, :2], rise[along], raised[along])
 
@@ -209,34 +201,34 @@ def _seen(view: ViewPair, cells: Floats, camera: Camera) -> tuple[NDArray[np.int
     return np.asarray(at[keep]), np.asarray(ground), np.asarray(centre)
 
 
-def obstacle(points: Points, wheel: float, p: ReflexParams, before: Floats) -> tuple[Obstacle | None, Floats]:
+def obstacle(points: Points, wheel: float, p: ObstacleMonitorParams, before: Floats) -> tuple[Obstacle | None, Floats]:
     """The largest group of raised points within one wheel's diameter that counts, and what counts if it is seen again.
 
     ``before`` (n, 2) m, the model's frame: what counted so in the image before.
     """
     up, ground = points.place[points.raised], points.ground[points.raised]
-    if len(up) < p.points:
+    if len(up) < p.min_points:
         return None, np.zeros((0, 2))
     raised, around = (
         KDTree(some).query_ball_point(up, 0.5 * wheel, p=np.inf, return_length=True) for some in (up, points.place)
     )
-    enough = raised >= p.points
-    doubtful = enough & (raised >= p.again_share * around)
+    enough = raised >= p.min_points
+    doubtful = enough & (raised >= p.min_share_again * around)
     apart = KDTree(before).query(ground)[0] if len(before) else np.full(len(up), np.inf)
-    counts = enough & (raised >= p.share * around) | doubtful & (apart <= 0.5 * wheel)
+    counts = enough & (raised >= p.min_share * around) | doubtful & (apart <= 0.5 * wheel)
     if not counts.any():
         return None, ground[doubtful]
     best = int(np.argmax(np.where(counts, raised, -1)))
     return Obstacle(int(raised[best]), up[best]), ground[doubtful]
 
 
-def _run(params: ReflexParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+def _run(params: ObstacleMonitorParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     dem, resect = inputs["dem"], inputs["resect"]
     vehicle, camera = Vehicle.model_validate(args["vehicle"]), Rig.from_dict(inputs["rig"].meta["rig"]).left
     T_vehicle_left = RigidTransform.from_matrix(args["T_vehicle_left"])
     wheel = vehicle.wheel_diameter
     lattice = Lattice.from_dict(dem.meta["lattice"])
-    surface = LastModel.of(np.asarray(dem["elevation"]), lattice, params.blur * wheel)
+    surface = LastModel.of(np.asarray(dem["elevation"]), lattice, params.model_radius * wheel)
     poses = np.asarray(resect["poses"])  # NaN where tracking was lost, which is for the stage safety to judge
     known = np.isfinite(poses).all(axis=(1, 2))
     frames = [int(f["frame"]) for f in resect.meta["per_frame"]]
@@ -265,10 +257,10 @@ def _run(params: ReflexParams, args: Mapping[str, Any], inputs: Inputs) -> Bundl
 
 
 STAGE = Stage(
-    name="reflex",
+    name="obstacle_monitor",
     version=2,
     summary="obstacles that the last elevation model does not know, seen on the way",
-    params=ReflexParams,
+    params=ObstacleMonitorParams,
     inputs=("dem", "resect", "rig", "motions*"),
     outputs=(
         Array("raised", ("frame",), "int32", "1", "points of the largest raised group"),
@@ -278,7 +270,7 @@ STAGE = Stage(
 )
 
 
-def pairs(odometry: Floats, wheel: float, p: ReflexParams) -> list[tuple[int, int]]:
+def pairs(odometry: Floats, wheel: float, p: ObstacleMonitorParams) -> list[tuple[int, int]]:
     """Which images of a leg are compared: each with the last one before that is a baseline of way behind it.
 
     ``odometry`` (frame, 3): x, y (m), heading (rad) by the wheels.

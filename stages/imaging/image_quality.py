@@ -106,7 +106,7 @@ def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
 
 
 STAGE = Stage(
-    name="sight",
+    name="image_quality",
     version=1,
     summary="grey values and sharpness of a pair, before anything is matched",
     params=NoParams,

@@ -39,7 +39,7 @@ QUIET = 0.25
 """Quantile of the changes that is usual: one exchanged frame changes three steps, of a short sequence the half."""
 
 
-class ContinuityParams(Params):
+class FrameScreeningParams(Params):
     """When a frame counts as lost, or as unfit to be basic."""
 
     uniform: float = Field(
@@ -85,17 +85,17 @@ def judge(
     steps: Steps,
     jumps: Sequence[int],
     sides: Mapping[int, Mapping[str, Any]],
-    params: ContinuityParams,
+    params: FrameScreeningParams,
 ) -> Judgement:
     """What is known of the frames' continuity so far.
 
     Parameters
     ----------
     frames : frame numbers in order.
-    sights : facts of stage ``sight`` by frame.
+    sights : facts of stage ``image_quality`` by frame.
     steps : share of matches by (frame, later frame); 0 where they tell nothing.
     jumps : frames at which the displacements change abruptly.
-    sides : facts of stage ``sides`` by frame, as far as they were asked for.
+    sides : facts of stage ``swap_check`` by frame, as far as they were asked for.
     """
     out = Judgement()
     _see(out, frames, sights, params)
@@ -122,7 +122,7 @@ def judge(
 
 
 def _see(
-    out: Judgement, frames: Sequence[int], sights: Mapping[int, Mapping[str, Any]], params: ContinuityParams
+    out: Judgement, frames: Sequence[int], sights: Mapping[int, Mapping[str, Any]], params: FrameScreeningParams
 ) -> None:
     """What the images alone say."""
     usual = {(s, what): _usual([sights[f][s][what] for f in frames]) for s in SIDES for what in ("sharpness", "detail")}
@@ -209,7 +209,7 @@ def share(step: Step) -> float:
     return step.match_rate if int(step.known.sum()) >= LEAST_BLOCKS else 0.0
 
 
-def _jumps(frames: Sequence[int], changes: Sequence[float], params: ContinuityParams) -> list[int]:
+def _jumps(frames: Sequence[int], changes: Sequence[float], params: FrameScreeningParams) -> list[int]:
     """Frames at the abrupt changes; ``changes`` has one value a frame but the first and the last."""
     if not changes:
         return []
@@ -218,7 +218,7 @@ def _jumps(frames: Sequence[int], changes: Sequence[float], params: ContinuityPa
     return [f for f in frames if f in found]
 
 
-def _run(params: ContinuityParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+def _run(params: FrameScreeningParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     frames = [int(f) for f in args["frames"]]
     along, bridges = steps_of(inputs["steps"]), list(inputs.get("bridges") or [])
     if len(along) != len(frames) - 1 or len(inputs["sights"]) != len(frames):
@@ -248,10 +248,10 @@ def _run(params: ContinuityParams, args: Mapping[str, Any], inputs: Inputs) -> B
 
 
 STAGE = Stage(
-    name="continuity",
+    name="frame_screening",
     version=1,
     summary="which frames are lost, and which may not be basic",
-    params=ContinuityParams,
+    params=FrameScreeningParams,
     inputs=("sights*", "steps*", "bridges*", "sides*"),
     outputs=(),
     run=_run,

@@ -34,18 +34,18 @@ NAVIGATION: Mapping[str, Any] = {"rule": "overlap", "overlap": 0.6}
 """What preset ``navigation`` sets; a value given by the user wins."""
 
 
-class SelectParams(Params):
+class KeyframesParams(Params):
     """Parameters of the choice of basic pairs."""
 
     preset: Literal["terrain", "navigation"] = Field(
         "terrain",
         description="terrain: close basic pairs, whose elevation models overlap; navigation: trajectory only, with "
         "rule overlap at 0.6, hfvm.preset fast, and cheaper motion.level, track.points and "
-        "orientation.samples; keys set explicitly win, except select.stride without select.rule",
+        "orientation.samples; keys set explicitly win, except keyframes.stride without keyframes.rule",
     )
     rule: Literal["overlap", "stride"] = Field(
         "overlap",
-        description="overlap: basic pairs as far apart as select.overlap permits; stride: every stride-th frame, as "
+        description="overlap: basic pairs as far apart as keyframes.overlap permits; stride: every stride-th frame, as "
         "in the paper",
     )
     overlap: float = Field(
@@ -59,7 +59,7 @@ class SelectParams(Params):
         4,
         ge=1,
         description="frames between basic pairs (rule stride; 4 in the paper, section 7.4); setting it without "
-        "select.rule selects rule stride",
+        "keyframes.rule selects rule stride",
     )
     max_gap: int = Field(
         16,
@@ -126,7 +126,7 @@ class Marked:
 UNMARKED = Marked()
 
 
-def by_stride(steps: Sequence[Step], params: SelectParams, marked: Marked = UNMARKED) -> Choice:
+def by_stride(steps: Sequence[Step], params: KeyframesParams, marked: Marked = UNMARKED) -> Choice:
     """Positions 0, stride, 2 stride ... of one more frame than there are steps; for an unfit one the next that is.
 
     Behind a step that is not to be believed there is one, too: what follows can then be posed, though by itself.
@@ -145,7 +145,7 @@ def by_stride(steps: Sequence[Step], params: SelectParams, marked: Marked = UNMA
     return Choice(basic, ["first frame", *why], [None, *overlap])
 
 
-def by_overlap(steps: Sequence[Step], params: SelectParams, marked: Marked = UNMARKED) -> Choice:
+def by_overlap(steps: Sequence[Step], params: KeyframesParams, marked: Marked = UNMARKED) -> Choice:
     """Basic pairs as far apart as the wanted overlap permits; at least one frame apart.
 
     Parameters
@@ -171,7 +171,7 @@ def by_overlap(steps: Sequence[Step], params: SelectParams, marked: Marked = UNM
     return choice
 
 
-def _why(steps: Sequence[Step], k: int, key: int, ahead: Covisibility, params: SelectParams) -> str:
+def _why(steps: Sequence[Step], k: int, key: int, ahead: Covisibility, params: KeyframesParams) -> str:
     """Why position ``k`` should be basic, given what ``ahead`` would still be seen one frame on; empty: it need not."""
     if any(doubtful(step, params) for step in steps[max(k - 1, key) : k + 1]):
         return "few matches"
@@ -180,12 +180,12 @@ def _why(steps: Sequence[Step], k: int, key: int, ahead: Covisibility, params: S
     return "max_gap" if k + 1 - key > params.max_gap else ""
 
 
-def doubtful(step: Step, params: SelectParams) -> bool:
+def doubtful(step: Step, params: KeyframesParams) -> bool:
     """Whether a step has too few matches to be believed."""
     return step.match_rate < params.min_matches or int(step.known.sum()) < LEAST_BLOCKS
 
 
-def _overlap(steps: Sequence[Step], params: SelectParams, seen: Covisibility | None = None) -> float | None:
+def _overlap(steps: Sequence[Step], params: KeyframesParams, seen: Covisibility | None = None) -> float | None:
     """Overlap of the frames before and behind some steps, by what is ``seen`` there; None: one of them is doubtful."""
     if any(doubtful(step, params) for step in steps):
         return None
@@ -198,7 +198,7 @@ def segments(basic: list[int], frames: int) -> list[list[int]]:
     return [list(range(a, b + 1)) for a, b in zip(basic, ends, strict=True) if b > a]
 
 
-def _run(params: SelectParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+def _run(params: KeyframesParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     frames = int(args["frames"])
     if frames < 1:
         raise ConfigError("RIL-437", "no frame is chosen", remedy="choose at least one with --frames")
@@ -221,7 +221,7 @@ def _run(params: SelectParams, args: Mapping[str, Any], inputs: Inputs) -> Bundl
     return Bundle({}, meta)
 
 
-def _warnings(steps: Sequence[Step], overlap: Sequence[float | None], params: SelectParams) -> list[str]:
+def _warnings(steps: Sequence[Step], overlap: Sequence[float | None], params: KeyframesParams) -> list[str]:
     """What the choice could not give."""
     lines = []
     blind = [k for k, step in enumerate(steps) if doubtful(step, params)]
@@ -236,16 +236,16 @@ def _warnings(steps: Sequence[Step], overlap: Sequence[float | None], params: Se
     if least < wanted:
         lines.append(
             f"successive basic pairs overlap by as little as {least:.0%}, {wanted:.0%} are wanted:"
-            + (" set select.stride lower" if params.rule == "stride" else " the camera moves that far in one frame")
+            + (" set keyframes.stride lower" if params.rule == "stride" else " the camera moves that far in one frame")
         )
     return lines
 
 
 STAGE = Stage(
-    name="select",
+    name="keyframes",
     version=3,
     summary="which stereo pairs become elevation models, and the segments between them",
-    params=SelectParams,
+    params=KeyframesParams,
     inputs=("steps*",),
     outputs=(),
     run=_run,

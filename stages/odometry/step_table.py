@@ -67,7 +67,7 @@ def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
 
 
 STAGE = Stage(
-    name="steps",
+    name="step_table",
     version=1,
     summary="displacements of the blocks of the image from frame to frame, of many motions",
     params=NoParams,

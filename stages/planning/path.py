@@ -58,11 +58,11 @@ class PathParams(Params):
 
     start: Point | None = Field(
         default=None,
-        description="start x, y [m] in the world frame; not set: the free cell nearest to the middle of the first row",
+        description="start x, y in the world frame [m]; null: the free cell nearest to the middle of the first row",
     )
     target: Point | None = Field(
         default=None,
-        description="target x, y [m] in the world frame; not set: the free cell nearest to the middle of the last row",
+        description="target x, y in the world frame [m]; null: the free cell nearest to the middle of the last row",
     )
     planner: Planner = Field(
         default="auto",
@@ -70,27 +70,27 @@ class PathParams(Params):
         " do not reach the target, or do not cross the map of a mission",
     )
     height_step: float = Field(
-        default=0.02, gt=0, le=1, description="height difference that counts as none, as a share of vehicle.max_step"
+        default=0.02, gt=0, le=1, description="smallest height difference that costs [share of max_step]"
     )
-    caution: float = Field(
+    caution_cost: float = Field(
         default=0.2,
         ge=0,
         le=10,
-        description="climb [m] that a metre of caution ground costs as much as; 0.2 justifies a detour of a fifth",
+        description="cost of a metre over caution ground [m of climb]; 0.2: worth a detour of a fifth",
     )
-    doubt: float = Field(
+    uncertainty_cost: float = Field(
         default=5.0,
         ge=0,
         le=1000,
-        description="climb [m] that a metre of ground costs as much as, times its probability of a hazard; 5 at a "
-        "probability of 0.1 justifies a detour of half the way",
+        description="cost of a metre over ground [m of climb], times its probability of a hazard; 5: at a probability "
+        "of 0.1 worth a detour of a half",
     )
-    sure: float = Field(
+    p_certain_hazard: float = Field(
         default=0.1,
         gt=0,
         le=1,
-        description="probability of a hazard above which ground is closed, even where no measure exceeds its limit; "
-        "if this alone leaves no path, the reason says so",
+        description="probability of a hazard from which ground is closed, even where no measure exceeds its limit by "
+        "enough standard deviations to be a hazard; where this alone closes all paths, the reason says so",
     )
 
 
@@ -129,18 +129,18 @@ def find_path(
         heading = (target[0] - start[0], target[1] - start[1])
     found = _found(maps, lattice, vehicle, heading, ends, stretch, p)
     # A limit that closed nothing cannot be the reason.
-    if len(found.cells) or p.sure >= 1 or "p_hazard" not in maps:
+    if len(found.cells) or p.p_certain_hazard >= 1 or "p_hazard" not in maps:
         return found
     # Searched once more without the limit, only to name the figure that would open a way.
-    other = _found(maps, lattice, vehicle, heading, ends, stretch, p.model_copy(update={"sure": 1.0}))
+    other = _found(maps, lattice, vehicle, heading, ends, stretch, p.model_copy(update={"p_certain_hazard": 1.0}))
     if not len(other.cells):
         return found
     at = tuple(np.rint(lattice.index(other.xyz[:, :2])).astype(np.int64).T)
     # Rounded up to three digits, so that the figure as it is told lets the path through.
     chance = math.ceil(1e3 * float(np.nanmax(maps["p_hazard"][at])) - 1e-3) / 1e3
     reason = (
-        f"ground with a p_hazard above path.sure {p.sure:g} closes every way; without it one leads over ground of up "
-        f"to {chance:.3g}: raise path.sure to that to take it"
+        f"ground with a p_hazard above path.p_certain_hazard {p.p_certain_hazard:g} closes every path; without it one "
+        f"leads over ground of up to {chance:.3g}: raise path.p_certain_hazard to that to take it"
     )
     return replace(found, plan=replace(found.plan, reason=reason), doubt=chance)
 
@@ -169,7 +169,7 @@ def _found(
 
 
 def _ground(maps: Maps, lattice: Lattice, grid: RowGrid, vehicle: Vehicle, p: PathParams) -> PathMaps:
-    prices = PathPrices(p.height_step * vehicle.max_step, p.caution, p.doubt, p.sure)
+    prices = PathPrices(p.height_step * vehicle.max_step, p.caution_cost, p.uncertainty_cost, p.p_certain_hazard)
     return PathMaps(maps, lattice, grid, vehicle, prices)
 
 
@@ -213,7 +213,7 @@ def _by_grid(
     nothing = np.empty((0, 2), dtype=np.int64)
     cells, cost, name = nothing, np.full(ground.height.shape, UNREACHED), GROUNDS[0]
     # With free ends a stricter ground would always find some path, on however small a part.
-    for name in ground.worth() if given == (None, None) else GROUNDS:
+    for name in ground.by_worth() if given == (None, None) else GROUNDS:
         ways = ground.ways(name)
         first, last = _chosen(ground, name, *given)
         if first is None or last is None or not ways[first] or not ways[last]:

@@ -31,8 +31,12 @@ Point = tuple[float, float]
 GROUNDS = ("outline", "wheels", "middle")
 """What of the vehicle stays on known ground, as tried in turn."""
 
-MOST = 0.5
-"""Share of the rows: a path that stays clearer of unknown ground is worth half of its length."""
+WORTH = {"outline": 1.0, "wheels": 0.75, "middle": 0.5}
+"""Worth of a row that a path crosses while this part of the vehicle stays on known ground.
+
+Unknown ground under the belly may touch it, so a quarter is taken off; unknown ground under a wheel may tip the
+vehicle, so half is.
+"""
 
 LARGE = 1 << 30
 """Heights above it are kept in 64 bits."""
@@ -107,15 +111,15 @@ class RowGrid:
 class PathPrices(NamedTuple):
     """Terms of a path's cost.
 
-    ``unit``: metres of height that cost one; ``caution``: metres of climb that a metre of caution ground costs;
-    ``doubt``: metres of climb that a metre of ground costs times its probability of a hazard; ``sure``: probability of
-    a hazard above which ground is closed.
+    ``unit``: height [m] that costs 1; ``caution``: cost of a metre of caution ground [m of climb]; ``uncertainty``:
+    cost of a metre of ground [m of climb], times its probability of a hazard; ``p_certain``: probability of a hazard
+    above which ground is closed.
     """
 
     unit: float
     caution: float
-    doubt: float = 0.0
-    sure: float = 1.0
+    uncertainty: float = 0.0
+    p_certain: float = 1.0
 
 
 class _CellPrices(NamedTuple):
@@ -123,8 +127,8 @@ class _CellPrices(NamedTuple):
 
     unit: np.float32
     caution: int
-    doubt: np.float32
-    sure: np.float32
+    uncertainty: np.float32
+    p_certain: np.float32
 
 
 class _Sampled(NamedTuple):
@@ -165,9 +169,9 @@ class PathMaps:
         Parameters
         ----------
         maps : arrays (row, col) of stage ``risk`` on ``lattice``: ``risk``, ``reason``, ``elevation`` and, where
-            there is a price of doubt, ``p_hazard``.
+            uncertainty costs, ``p_hazard``.
         """
-        unit, caution, doubt, sure = prices
+        unit, caution, uncertainty, p_certain = prices
         self.grid, self.unit = grid, unit
         risk = grid.sample(lattice, maps["risk"], UNKNOWN)
         reason = grid.sample(lattice, maps["reason"], 0)
@@ -178,12 +182,12 @@ class PathMaps:
         masks = _Masks(*(np.empty(risk.shape, dtype=np.bool_) for _ in range(4)))
         self.closed = masks.closed
         toll = round(caution * grid.cell / unit)
-        dearest = toll + round(doubt * grid.cell / unit)
+        dearest = toll + round(uncertainty * grid.cell / unit)
         self.height: Ints = np.empty(risk.shape, dtype=np.int32)
         self.toll: Ints = np.empty(risk.shape, dtype=np.int16 if dearest <= np.iinfo(np.int16).max else np.int64)
         # A limit of 1 is none, even where rounding lifts a probability above it.
-        limit = np.float32(sure if sure < 1 else np.inf)
-        each = _CellPrices(np.float32(unit), toll, np.float32(doubt * grid.cell / unit), limit)
+        limit = np.float32(p_certain if p_certain < 1 else np.inf)
+        each = _CellPrices(np.float32(unit), toll, np.float32(uncertainty * grid.cell / unit), limit)
         if _lay(_Sampled(risk, reason, chance, self.stand), each, masks, self.height, self.toll):
             # Heights of a tall world in small units do not fit 32 bits.
             self.height = np.rint(np.where(self.closed, np.float32(0), self.stand) / np.float32(unit)).astype(np.int64)
@@ -203,11 +207,14 @@ class PathMaps:
             self._parts[below] = grid8.parts(self.ways(below))
         return self._parts[below]
 
-    def worth(self) -> tuple[str, ...]:
-        """Of :data:`GROUNDS` those on which connected ground covers most of the rows that it covers on any."""
-        spans = [self.parts(name)[1] for name in GROUNDS]
-        rows = [int((s[:, 1] - s[:, 0]).max(initial=0)) for s in spans]
-        return tuple(name for name, n in zip(GROUNDS, rows, strict=True) if n >= MOST * max(rows))
+    def by_worth(self) -> list[str]:
+        """:data:`GROUNDS`, first the one whose connected ground covers the rows that are worth most."""
+
+        def worth(name: str) -> float:
+            spans = self.parts(name)[1]
+            return WORTH[name] * int((spans[:, 1] - spans[:, 0]).max(initial=0))
+
+        return sorted(GROUNDS, key=worth, reverse=True)
 
     def metres(self, cost: Ints, unreached: int, each: int = 1) -> Floats32:
         """A cost (row, col) of which ``each`` are a unit, rounded down to units, in metres; NaN where not reached."""
@@ -225,13 +232,13 @@ class PathMaps:
 def _lay(maps, prices, masks, height, toll):  # type: ignore[no-untyped-def]
     """Fill the masks, the heights in units and the tolls; ``prices`` in units. Whether some height is too large."""
     risk, reason, chance, stand = maps
-    unit, caution, doubt, sure = prices
+    unit, caution, uncertainty, p_certain = prices
     unknown, closed, wheels, body = masks
     large = np.uint8(0)
     for r in range(risk.shape[0]):
         for c in range(risk.shape[1]):
             unknown[r, c] = risk[r, c] == UNKNOWN
-            closed[r, c] = (risk[r, c] >= HAZARDOUS) | (chance[r, c] > sure)
+            closed[r, c] = (risk[r, c] >= HAZARDOUS) | (chance[r, c] > p_certain)
         for c in range(risk.shape[1]):
             # Short loops without branches, one a kind of array: each becomes vector code, a loop over all of them does
             # not.
@@ -243,9 +250,9 @@ def _lay(maps, prices, masks, height, toll):  # type: ignore[no-untyped-def]
             height[r, c] = np.int32(v)
             large |= np.uint8(abs(v) > np.float32(LARGE))
         for c in range(risk.shape[1]):
-            # where nothing is known of it, which is closed, there is none of doubt
+            # NaN, which is unknown and closed, costs nothing
             p = chance[r, c] if chance[r, c] > np.float32(0.0) else np.float32(0.0)
-            toll[r, c] = np.int64(np.rint(doubt * p)) + (caution if risk[r, c] == CAUTION else 0)
+            toll[r, c] = np.int64(np.rint(uncertainty * p)) + (caution if risk[r, c] == CAUTION else 0)
     return large > 0
 
 

@@ -45,8 +45,8 @@ UNSEEN = 20.0  # baselines; distance that stands for what is not seen at all
 SWAPPED = 0.5  # share of such matches: nearly all where left and right are swapped
 
 
-class LevelParams(Params):
-    """Parameters of the stage ``level``."""
+class GroundFrameParams(Params):
+    """Parameters of the stage ``ground_frame``."""
 
     max_tilt_deg: float = Field(
         30.0,
@@ -108,7 +108,7 @@ def level(
     row_disparity: ArrayLike,
     usable: Bools,
     rig: Rig,
-    params: LevelParams,
+    params: GroundFrameParams,
     vertical: VerticalHint | None = None,
 ) -> dict[str, Any]:
     """Local frame and ground of one pair.
@@ -161,14 +161,14 @@ def level(
     )
 
 
-def _fitted(samples: Samples, vertical: Floats | None, params: LevelParams) -> GroundPlane:
+def _fitted(samples: Samples, vertical: Floats | None, params: GroundFrameParams) -> GroundPlane:
     """The ground plane that the samples show, under the limits of tilt."""
     rng = np.random.default_rng(params.seed)
     return fit_plane(*samples, lambda n: _allowed(n, vertical, params), params.relief, rng)
 
 
 def _on_ground(
-    ground: GroundPlane, R_local_left: Floats, samples: Samples, rig: Rig, params: LevelParams
+    ground: GroundPlane, R_local_left: Floats, samples: Samples, rig: Rig, params: GroundFrameParams
 ) -> dict[str, Any]:
     """What :func:`level` says of a pair whose ground plane is known."""
     rays, rho, _ = samples
@@ -203,7 +203,7 @@ def z_range(plane: list[float], relief: list[float], extent: list[float]) -> lis
     return [min(corners) + relief[0], max(corners) + relief[1]]
 
 
-def _samples(column: NDArray[Any], row: NDArray[Any], usable: Bools, rig: Rig, params: LevelParams) -> Samples:
+def _samples(column: NDArray[Any], row: NDArray[Any], usable: Bools, rig: Rig, params: GroundFrameParams) -> Samples:
     """Rays, inverse depths and their errors at a regular sparse grid of usable pixels."""
     expected = (rig.left.height, rig.left.width)
     if column.shape != expected:
@@ -255,7 +255,7 @@ def _given_vertical(hint: VerticalHint) -> tuple[Floats | None, str]:
     return None, ""
 
 
-def _allowed(normals: Floats, vertical: Floats | None, params: LevelParams) -> Bools:
+def _allowed(normals: Floats, vertical: Floats | None, params: GroundFrameParams) -> Bools:
     """Which normals may be the ground's: near the known vertical, else within the limits of roll and pitch."""
     tilt = math.radians(params.max_tilt_deg)
     if vertical is not None:
@@ -270,7 +270,9 @@ def _local_plane(ground: GroundPlane, R_local_left: Floats) -> list[float]:
     return [float(-n[0] / n[2]), float(-n[1] / n[2]), float(-ground.height / n[2])]
 
 
-def _relief(points: Floats, plane: list[float], extent: list[float], height: float, params: LevelParams) -> list[float]:
+def _relief(
+    points: Floats, plane: list[float], extent: list[float], height: float, params: GroundFrameParams
+) -> list[float]:
     """Robust lowest and highest terrain against the plane within the extent, metres, widened by a tenth."""
     x, y, z = points.T
     inside = (x >= extent[0]) & (x <= extent[1]) & (y >= extent[2]) & (y <= extent[3])
@@ -285,7 +287,7 @@ def _relief(points: Floats, plane: list[float], extent: list[float], height: flo
     return [max(low - margin, -height), min(high + margin, (1.0 + params.ceiling) * height)]
 
 
-def _run(params: LevelParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+def _run(params: GroundFrameParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     disparity = inputs["disparity"]
     facts = level(
         disparity["column_disparity"],
@@ -299,10 +301,10 @@ def _run(params: LevelParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle
 
 
 STAGE = Stage(
-    name="level",
+    name="ground_frame",
     version=1,
     summary="vertical and ground plane of a basic pair",
-    params=LevelParams,
+    params=GroundFrameParams,
     inputs=("disparity", "rig"),
     outputs=(),
     run=_run,

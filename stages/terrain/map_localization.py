@@ -1,12 +1,12 @@
 """A first pose in a global map: the first local elevation model laid on a coarse global one (section 5.1).
 
-The local model is level (stage ``level``), so four numbers place it: x, y, heading and z. Around a rough prior of the
-first three every placement is tried whose steps the coarse cells resolve; z is the median difference at each. The score
-is the mean truncated square of the differences in units of their expected error, over the cells that overlap. The best
-placement is refined by Gauss-Newton on the slopes of the global map; its covariance is that of the adjustment, with
-the errors that the differences show and one independent cell a correlation length. The next best placement that is no
-neighbour tells how ambiguous the answer is. The prior bounds the search and decides nothing else.
-"""
+The local model is level (stage ``ground_frame``), so four numbers place it: x, y, heading and z. Around a rough prior
+of the first three every placement is tried whose steps the coarse cells resolve; z is the median difference at each.
+The score is the mean truncated square of the differences in units of their expected error, over the cells that
+overlap. The best placement is refined by Gauss-Newton on the slopes of the global map; its covariance is that of the
+adjustment, with the errors that the differences show and one independent cell a correlation length. The next best
+placement that is no neighbour tells how ambiguous the answer is. The prior bounds the search and decides nothing
+else."""
 
 from __future__ import annotations
 
@@ -28,25 +28,23 @@ from rille.stages.geometry.lattice import Lattice
 from rille.stages.numeric.robust import huber_weight
 
 
-class GlobalFixParams(Params):
-    """Parameters of the stage ``global_fix``."""
+class MapLocalizationParams(Params):
+    """Parameters of the stage ``map_localization``."""
 
-    reach: float = Field(
-        3.0, gt=0, description="search range around the prior [standard deviations of the prior], to either side"
+    reach: float = Field(3.0, gt=0, description="search range to either side of the prior [its standard deviations]")
+    sigma_height: float = Field(
+        0.15, gt=0, description="standard deviation of a height difference to the global map [its cells]"
     )
-    sigma: float = Field(0.15, gt=0, description="standard deviation of a height difference [cells of the global map]")
-    truncate: float = Field(
-        3.0, gt=0, description="size of a difference [standard deviations] beyond which it counts no more"
+    truncation: float = Field(
+        3.0, gt=0, description="height difference [standard deviations] beyond which it costs no more: outliers"
     )
-    min_overlap: float = Field(
-        0.5, gt=0, le=1, description="smallest share of the local model that the global map must know"
+    min_overlap: float = Field(0.5, gt=0, le=1, description="least share of the local model that the global map covers")
+    min_cells: int = Field(30, ge=6, description="least number of cells of the global map that the local model covers")
+    correlation: float = Field(
+        2.0, ge=1, description="correlation length of height differences [cells]; larger: larger standard deviations"
     )
-    least: int = Field(30, ge=6, description="fewest cells of the global map that the local model must cover")
-    correlation: float = Field(2.0, ge=1, description="distance [cells] over which height differences are correlated")
-    ambiguous: float = Field(
-        9.0,
-        gt=0,
-        description="smallest difference of chi2 to the next best placement at which the answer counts as unambiguous",
+    min_chi2_gap: float = Field(
+        9.0, gt=0, description="least difference of chi2 to the second best place; below, the answer is ambiguous"
     )
 
 
@@ -133,7 +131,7 @@ def fix(
     lattice: Lattice,
     prior: tuple[float, float, float],
     prior_sigma: tuple[float, float],
-    params: GlobalFixParams,
+    params: MapLocalizationParams,
 ) -> Fix:
     """Place the points of a local model on a global map.
 
@@ -150,14 +148,14 @@ def fix(
     InputError
         Nowhere around the prior the map knows enough of the ground that the local model shows.
     """
-    if len(points) < params.least:
+    if len(points) < params.min_cells:
         raise DegenerateError(
             "RIL-337",
-            f"the local model covers {len(points)} cells of the global map, {params.least} are needed",
+            f"the local model covers {len(points)} cells of the global map, {params.min_cells} are needed",
             remedy="give a finer global map, or a first pair that sees farther",
         )
     cell = lattice.cell
-    sigma = params.sigma * cell
+    sigma = params.sigma_height * cell
     far = float(np.hypot(points[:, 0], points[:, 1]).max())
     # Half a cell, and turns that move the farthest point by one cell: finer steps find no other minimum.
     xs, ys, headings = _steps(prior, prior_sigma, 0.5 * cell, cell / far, params.reach)
@@ -165,7 +163,7 @@ def fix(
     overlaps = np.zeros_like(scores)
     z = np.ascontiguousarray(ground, dtype=np.float64)
     frame = lattice.x0, lattice.y0, cell
-    _search(points, z, frame, (xs, ys, headings), params.truncate * sigma, scores, overlaps)
+    _search(points, z, frame, (xs, ys, headings), params.truncation * sigma, scores, overlaps)
     enough = overlaps >= params.min_overlap
     if not enough.any():
         raise InputError(
@@ -218,13 +216,13 @@ def _refine(
     ground: Floats,
     lattice: Lattice,
     start: Floats,
-    params: GlobalFixParams,
+    params: MapLocalizationParams,
     independent: float,
     other: tuple[Floats, float] | None,
 ) -> Fix:
     """Gauss-Newton on x, y, heading and z with Huber's weights."""
     place = start.copy()
-    sigma = params.sigma * lattice.cell
+    sigma = params.sigma_height * lattice.cell
     # Height first: Huber's weights would take a wrong one for outliers everywhere.
     place[3] = -float(np.nanmedian(_differences(points, ground, lattice, place)[0]))
     normal, used, weight, r = np.eye(4), np.zeros(len(points), bool), np.ones(0), np.zeros(0)
@@ -232,7 +230,7 @@ def _refine(
         difference, slopes = _differences(points, ground, lattice, place)
         used = np.isfinite(difference)
         r, J = difference[used], slopes[used]
-        weight = huber_weight(np.abs(r), params.truncate * sigma / 2.0)
+        weight = huber_weight(np.abs(r), params.truncation * sigma / 2.0)
         normal = J.T @ (weight[:, None] * J)
         scale = np.sqrt(np.diag(normal)) + 1e-12
         values = np.linalg.eigvalsh(normal / np.outer(scale, scale))
@@ -250,7 +248,7 @@ def _refine(
     rms = float(np.sqrt((weight * r**2).sum() / max(weight.sum(), 1e-12)))
     # By the errors found, and as many independent cells as there are correlation lengths.
     covariance: Floats = np.asarray(np.linalg.inv(normal) * rms**2 * max(1.0, n / independent), dtype=np.float64)
-    score = float(np.mean(np.minimum(np.abs(r), params.truncate * sigma) ** 2))
+    score = float(np.mean(np.minimum(np.abs(r), params.truncation * sigma) ** 2))
     return Fix(place, covariance, score, n / len(points), rms, n, other)
 
 
@@ -285,7 +283,7 @@ def handed_in(pose: tuple[float, float, float, float]) -> RigidTransform:
     return RigidTransform(rotation_exp([0.0, 0.0, heading]), np.array([x, y, z]))
 
 
-def _run(params: GlobalFixParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+def _run(params: MapLocalizationParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     if "pose" in args:
         x, y, z, heading = (float(v) for v in args["pose"])
         return Bundle({}, {"T_global_local": handed_in((x, y, z, heading)).to_list(), "source": "handed in"})
@@ -306,23 +304,23 @@ def _run(params: GlobalFixParams, args: Mapping[str, Any], inputs: Inputs) -> Bu
         "cells": found.cells,
         "other": None if found.other is None else {"place": found.other[0].tolist(), "chi2": found.other[1]},
     }
-    ambiguous = found.other is not None and found.other[1] < params.ambiguous
+    ambiguous = found.other is not None and found.other[1] < params.min_chi2_gap
     meta["ambiguous"] = ambiguous
     if found.other is not None and ambiguous:
         ox, oy, _ = found.other[0]
         meta["warnings"] = [
             f"the first pose in the global map is ambiguous: ({ox:.2f}, {oy:.2f}) m fits nearly as well as "
             f"({found.place[0]:.2f}, {found.place[1]:.2f}) m (chi2 larger by {found.other[1]:.1f}, "
-            f"{params.ambiguous:g} wanted)"
+            f"{params.min_chi2_gap:g} wanted)"
         ]
     return Bundle({}, meta)
 
 
 STAGE = Stage(
-    name="global_fix",
+    name="map_localization",
     version=1,
     summary="first pose in a global map, by aligning the first elevation model or as handed in",
-    params=GlobalFixParams,
+    params=MapLocalizationParams,
     inputs=("dem?", "map?"),
     outputs=(),
     run=_run,

@@ -31,8 +31,8 @@ STEP = 0.5
 """Cells from point to point of a line of sight."""
 
 
-class CeilingParams(Params):
-    """Parameters of the stage ``ceiling``."""
+class OcclusionBoundsParams(Params):
+    """Parameters of the stage ``occlusion_bounds``."""
 
     sigmas: float = Field(
         default=1.25,
@@ -100,7 +100,7 @@ def _below(z, row, col, height, out):  # type: ignore[no-untyped-def]
                 out[i, j] = min(out[i, j], np.float32(height + (z[r, c] - height) * min(share, 1.0)))
 
 
-def _run(params: CeilingParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+def _run(params: OcclusionBoundsParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     merged = inputs["merged"]
     lattice = Lattice.from_dict(merged.meta["lattice"])
     z, s = (np.asarray(merged[name], dtype=np.float32) for name in ("elevation", "relief_std"))
@@ -126,10 +126,10 @@ def _run(params: CeilingParams, args: Mapping[str, Any], inputs: Inputs) -> Bund
 
 
 STAGE = Stage(
-    name="ceiling",
+    name="occlusion_bounds",
     version=1,
     summary="between which heights the ground lies: where it was not seen, below the lines of sight over it",
-    params=CeilingParams,
+    params=OcclusionBoundsParams,
     inputs=("merged", "dems*"),
     outputs=(
         raster("upper", "m", "height that the ground does not exceed", frame="world"),

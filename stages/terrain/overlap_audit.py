@@ -33,8 +33,8 @@ NAMED = 3
 """Models that a warning names."""
 
 
-class SeamAuditParams(Params):
-    """Parameters of the stage ``seam_audit``."""
+class OverlapAuditParams(Params):
+    """Parameters of the stage ``overlap_audit``."""
 
     allowed_sigmas: float = Field(
         2.0,
@@ -82,7 +82,7 @@ def audit(seams: Sequence[Facts], centres: Mapping[int, Sequence[float]]) -> tup
 
     Parameters
     ----------
-    seams : facts as stage ``seam`` gives them.
+    seams : facts as stage ``overlap_qa`` gives them.
     centres : x, y of each model, metres: where its bias is stated.
 
     Returns
@@ -154,7 +154,7 @@ def _entry(model: _Model, plane: Floats, mine: Sequence[Facts]) -> dict[str, Any
     }
 
 
-def contradictions(models: Sequence[Facts], params: SeamAuditParams) -> list[Facts]:
+def contradictions(models: Sequence[Facts], params: OverlapAuditParams) -> list[Facts]:
     """Models that are off by more than their sigma allows, beyond what chance does."""
     return [m for m in models if m["systematic"] > params.allowed_sigmas * m["expected"] and m["chi2"] > STANDS_OUT]
 
@@ -172,7 +172,7 @@ def describe(model: Facts) -> str:
     return words + (", either may be wrong" if model["either"] else "")
 
 
-def _run(params: SeamAuditParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+def _run(params: OverlapAuditParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     seams = [s for bundle in inputs["seams"] for s in bundle.meta["seams"]]
     centres = {int(pair): centre for pair, centre in args["centres"].items()}
     factor, models = audit(seams, centres)
@@ -199,10 +199,10 @@ def _run(params: SeamAuditParams, args: Mapping[str, Any], inputs: Inputs) -> Bu
 
 
 STAGE = Stage(
-    name="seam_audit",
+    name="overlap_audit",
     version=1,
     summary="which elevation models contradict their neighbours, in bias and tilt, the worst first",
-    params=SeamAuditParams,
+    params=OverlapAuditParams,
     inputs=("seams*",),
     outputs=(),
     run=_run,

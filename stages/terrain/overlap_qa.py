@@ -275,7 +275,7 @@ def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
 
 
 STAGE = Stage(
-    name="seam",
+    name="overlap_qa",
     version=1,
     summary="difference of an elevation model from earlier ones that overlap: bias, tilt and noise apart",
     params=NoParams,

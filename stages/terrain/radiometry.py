@@ -1,7 +1,7 @@
 """Levelling of exposures between elevation models, so that the merged ortho image has no seams of brightness.
 
-Each pair of overlapping models says by what factor one is brighter than the other (stage ``seam``). The factors g of
-all models follow by least squares on their logarithms,
+Each pair of overlapping models says by what factor one is brighter than the other (stage ``overlap_qa``). The factors
+g of all models follow by least squares on their logarithms,
 
     sum over seams of (log g_b - log g_a + log(grey_b / grey_a) - v . (c_b - c_a))^2 + PULL * sum over models (log g)^2
 
@@ -31,8 +31,8 @@ MOST = 0.7
 """Greatest size of log g, a factor of 2: beyond it is not exposure."""
 
 
-class ExposureParams(Params):
-    """Parameters of the stage ``exposure``."""
+class RadiometryParams(Params):
+    """Parameters of the stage ``radiometry``."""
 
     level: bool = Field(True, description="level the exposures in the merged ortho image")
 
@@ -66,7 +66,7 @@ def level(centres: Mapping[int, Sequence[float]], ratios: Sequence[tuple[int, in
     return {pair: int(steps[i]) for pair, i in at.items() if steps[i]}
 
 
-def _run(params: ExposureParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+def _run(params: RadiometryParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     ratios = [
         (int(seam["other"]), int(seam["pair"]), float(seam["log_ratio"]))
         for bundle in inputs["seams"]
@@ -80,10 +80,10 @@ def _run(params: ExposureParams, args: Mapping[str, Any], inputs: Inputs) -> Bun
 
 
 STAGE = Stage(
-    name="exposure",
+    name="radiometry",
     version=1,
     summary="factors that level the exposures of overlapping elevation models' grey values",
-    params=ExposureParams,
+    params=RadiometryParams,
     inputs=("seams*",),
     outputs=(),
     run=_run,

@@ -21,8 +21,8 @@ NOBODY = -1
 """Pair number of a model that no pair made."""
 
 
-class PadParams(Params):
-    """Parameters of the stage ``pad``."""
+class StartAreaParams(Params):
+    """Parameters of the stage ``start_area``."""
 
     sigma: float = Field(
         0.03, gt=0, description="standard deviation [wheel diameters] of the elevations of the start area"
@@ -41,7 +41,7 @@ def pad(T_world_vehicle: RigidTransform, radius: float, cell: float) -> tuple[La
     return lattice, np.where(np.hypot(dx, dy) <= radius, plane, np.nan).astype(np.float32)
 
 
-def _run(params: PadParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+def _run(params: StartAreaParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     T_world_left = RigidTransform.from_matrix(np.asarray(inputs["pose"]["poses"])[-1])
     T_world_vehicle = T_world_left @ RigidTransform.from_matrix(args["T_vehicle_left"]).inverse()
     lattice, elevation = pad(T_world_vehicle, float(args["radius"]), float(inputs["like"].meta["lattice"]["cell"]))
@@ -57,10 +57,10 @@ def _run(params: PadParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
 
 
 STAGE = Stage(
-    name="pad",
+    name="start_area",
     version=1,
     summary="the ground that the vehicle stands on at the start, as the operator vouches for it",
-    params=PadParams,
+    params=StartAreaParams,
     inputs=("pose", "like"),
     outputs=(
         raster("elevation", "m", "elevation of the cell centre", frame="world"),

@@ -82,7 +82,7 @@ def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
 
 
 STAGE = Stage(
-    name="footprint",
+    name="tile_index",
     version=1,
     summary="tiles of the world that an elevation model touches",
     params=NoParams,

@@ -52,7 +52,7 @@ DRIVE = (
     "hfvm.preset=default",
     "drive.goal=[0.03, 0.25]",
     "drive.around=0.4",
-    "reflex.enabled=false",
+    "obstacle_monitor.enabled=false",
 )
 
 

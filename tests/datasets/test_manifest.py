@@ -64,7 +64,7 @@ name = "crawler"
 max_step = 0.05
 [defaults]
 locus.cell_size = 0.02
-"select.stride" = 1
+"keyframes.stride" = 1
 [notes]
 text = ["dusty"]
 """
@@ -73,7 +73,7 @@ text = ["dusty"]
     assert s.pitch == pytest.approx(math.radians(20))
     assert s.vehicle is not None
     assert (s.vehicle.name, s.vehicle.max_step, s.vehicle.track) == ("crawler", 0.05, 0.6)
-    assert s.defaults == {"locus.cell_size": 0.02, "select.stride": 1}
+    assert s.defaults == {"locus.cell_size": 0.02, "keyframes.stride": 1}
 
 
 def test_root_may_name_a_variable(tmp_path, monkeypatch):

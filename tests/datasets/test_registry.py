@@ -17,8 +17,8 @@ def test_every_listed_name_opens():
     full, short = open_sequence("mockup"), open_sequence("mockup-short")
     assert (full.frames, short.frames) == (40, 9)
     assert full.defaults == {
-        "select.rule": "stride",
-        "select.stride": 4,
+        "keyframes.rule": "stride",
+        "keyframes.stride": 4,
         "locus.cell_size": 0.001,
     }
     configuration.build(configuration.expand(full.defaults))
@@ -32,7 +32,7 @@ def test_windows_of_successive_basic_pairs_overlap_by_more_than_half():
     from rille.stages.geometry.geometry import level_rotation
 
     s = open_sequence("mockup")
-    a, b = s.truth[0], s.truth[int(s.defaults["select.stride"])]
+    a, b = s.truth[0], s.truth[int(s.defaults["keyframes.stride"])]
     dx, dy, _ = level_rotation(a.rotation[2]) @ a.rotation.T @ (b.translation - a.translation)
     x0, y0, x1, y1 = s.evaluation_window
     assert 0.53 < (1 - abs(dx) / (x1 - x0)) * (1 - abs(dy) / (y1 - y0)) < 0.7

@@ -19,7 +19,7 @@ from rille.pipeline import api
 from rille.pipeline.engine import code_digest, events
 
 MOCKUP = {"frames": 3, "image_width": 285, "image_height": 260, "focal_length": 300.0}
-STAGES = {"select": {"stride": 2}, "locus": {"cell_size": 0.004}, "hfvm": {"preset": "fast"}}
+STAGES = {"keyframes": {"stride": 2}, "locus": {"cell_size": 0.004}, "hfvm": {"preset": "fast"}}
 
 
 def digests(run: Path) -> dict[str, str]:

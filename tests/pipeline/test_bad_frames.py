@@ -18,7 +18,7 @@ from rille.pipeline.runs import session
 pytestmark = pytest.mark.slow
 
 SMALL = ("mockup.frames=8", "mockup.image_width=285", "mockup.image_height=260", "mockup.focal_length=300.0")
-PLAIN = ("select.stride=3", "locus.cell_size=0.006", "hfvm.preset=fast", "crosscheck.enabled=false")
+PLAIN = ("keyframes.stride=3", "locus.cell_size=0.006", "hfvm.preset=fast", "crosscheck.enabled=false")
 
 
 @pytest.fixture(scope="module")

@@ -31,7 +31,7 @@ SMALL = (
     "mockup.image_width=285",
     "mockup.image_height=260",
     "mockup.focal_length=300.0",
-    "select.stride=2",
+    "keyframes.stride=2",
     "locus.cell_size=0.004",
     "hfvm.preset=default",  # the mockup's own, accurate, has more to compile
 )

@@ -17,19 +17,19 @@ BOX = {"x0": 0.0, "y0": 0.0, "cell": 0.01, "rows": 4, "cols": 4}
 LEG = {"start": [0.0, 0.0, 0.0], "where": None, "reason": "", "left_m": 1.0, "way_m": 1.0}
 
 FACTS: dict[str, dict[str, Any]] = {
-    "continuity": {"asks": {"bridges": [], "sides": []}, "chain": [0, 1, 2], "lost": [], "unfit": []},
-    "select": {"basic": [0, 2], "segments": [[0, 1, 2]], "displacement": [1.0, 1.0], "match_rate": [1.0, 1.0]},
+    "frame_screening": {"asks": {"bridges": [], "sides": []}, "chain": [0, 1, 2], "lost": [], "unfit": []},
+    "keyframes": {"basic": [0, 2], "segments": [[0, 1, 2]], "displacement": [1.0, 1.0], "match_rate": [1.0, 1.0]},
     "common_tilt": {"undone": False},
     "trajectory": {"pieces": [[0, 2]], "main": 0, "frames": [0, 1, 2], "positions": [[0, k, 0] for k in range(3)]},
-    "exposure": {"steps": {}},
-    "footprint": {"tiles": [(0, 0, 0, 0, 4, 4)], "box": BOX, "cell": 0.01},
-    "level": {"T_local_left": HERE},
+    "radiometry": {"steps": {}},
+    "tile_index": {"tiles": [(0, 0, 0, 0, 4, 4)], "box": BOX, "cell": 0.01},
+    "ground_frame": {"T_local_left": HERE},
     "locus": {"lattice": BOX},
     "mockup.drive": {"poses": [HERE, HERE]},
     "mockup.sense": {"up": [[0.0, 0.0, 1.0]] * 2, "odometry": [[0.0, 0.0, 0.0], [0.0, 0.05, 0.0]]},
     "motion": {"match_rate": 1.0},
-    "safety": {"stop": None, "kind": None, "reason": ""},
-    "reflex": {"stop": None, "reason": ""},
+    "fault_monitor": {"stop": None, "kind": None, "reason": ""},
+    "obstacle_monitor": {"stop": None, "reason": ""},
 }
 """What each stage would have found: enough that the graph grows to its end."""
 
@@ -51,9 +51,9 @@ def grown(graph: Graph, failing: str = "") -> Graph:
                 facts.append(None)
                 continue
             meta = FACTS.get(handle.stage, {})
-            if handle.stage == "footprint":
+            if handle.stage == "tile_index":
                 meta = meta | {"pair": int(handle.label.split("/")[1])}
-            if handle.stage == "leg":
+            if handle.stage == "local_planner":
                 meta, legs = LEG | {"verdict": "goal" if legs else "drive"} | meta, legs + 1
             handle.ref = SimpleNamespace(meta=meta)  # type: ignore[assignment]
             facts.append(handle.ref)  # type: ignore[arg-type]
@@ -72,7 +72,7 @@ def driving() -> Drive:
 
 def test_a_drive_that_fails_on_a_leg_is_judged_with_that_leg() -> None:
     flow = driving()
-    grown(flow.graph, failing="safety")
+    grown(flow.graph, failing="fault_monitor")
     check = flow.driven.check
     assert check is not None
     drives = check.inputs["drives"]
@@ -83,7 +83,7 @@ def test_a_drive_that_fails_on_a_leg_is_judged_with_that_leg() -> None:
 
 def test_a_drive_that_fails_at_the_start_is_judged_where_it_stands() -> None:
     flow = driving()
-    grown(flow.graph, failing="level")
+    grown(flow.graph, failing="ground_frame")
     check = flow.driven.check
     assert check is not None
     assert set(check.inputs) == {"drives"}
@@ -96,8 +96,8 @@ def test_a_safety_stop_of_a_look_around_where_there_is_no_way_is_no_path(
 ) -> None:
     flow = driving()
     found = {"verdict": "look", "way_m": way_m, "reason": "hazards close every way"}
-    monkeypatch.setitem(FACTS, "leg", found)
-    monkeypatch.setitem(FACTS, "safety", {"stop": 1, "kind": "lost", "reason": "0 landmarks"})
+    monkeypatch.setitem(FACTS, "local_planner", found)
+    monkeypatch.setitem(FACTS, "fault_monitor", {"stop": 1, "kind": "lost", "reason": "0 landmarks"})
     grown(flow.graph)
     assert flow.driven.verdict == verdict
     assert flow.driven.reason.endswith("0 landmarks")
@@ -126,7 +126,7 @@ def test_each_stage_gets_the_same_ports_in_a_drive_as_in_a_reconstruction(landma
     shared = set(loop) & set(chain)
     assert shared >= {
         "hfvm",
-        "level",
+        "ground_frame",
         "locus",
         "motion",
         "track",

@@ -39,7 +39,7 @@ def run(
 
     dems = {k: node(dem, f"dem/{k}", {"pair": k, "i0": i, "j0": j}) for k, (i, j) in places.items()}
     cut = {"side": SIDE, "margin": merging.margin}
-    prints = [node(tile_index, f"footprint/{k}", cut, dem=model) for k, model in dems.items()]
+    prints = [node(tile_index, f"tile_index/{k}", cut, dem=model) for k, model in dems.items()]
 
     def follow() -> Iterator[Any]:
         found: Any = yield prints

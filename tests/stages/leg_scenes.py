@@ -12,7 +12,7 @@ from rille.stages.hazard.risk import SAFE
 from rille.stages.hazard.vehicle import Vehicle
 from rille.stages.planning.local_planner.clearance import Footing, Hazards
 from rille.stages.planning.local_planner.look import FieldOfView
-from rille.stages.planning.local_planner.params import LegParams
+from rille.stages.planning.local_planner.params import LocalPlannerParams
 
 ROVER = Vehicle(
     wheel_diameter=0.03, track=0.08, wheel_base=0.10, clearance=0.025, max_step=0.012, max_roughness=0.004, margin=0.01
@@ -21,7 +21,7 @@ LATTICE = Lattice.snap((-0.4, 0.4, -0.2, 1.0), 0.01)
 START, GOAL = (0.0, 0.0), (0.0, 0.8)
 AT = (*START, 0.0)
 X, Y = LATTICE.xy()[..., 0], LATTICE.xy()[..., 1]
-P = LegParams()
+P = LocalPlannerParams()
 
 
 def cameras() -> FieldOfView:

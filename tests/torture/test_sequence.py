@@ -27,7 +27,7 @@ from rille.pipeline.engine.store.manifest import artifact_path, reference
 
 SMALL = (
     *("mockup.frames=5", "mockup.image_width=285", "mockup.image_height=260", "mockup.focal_length=300.0"),
-    *("select.stride=2", "locus.cell_size=0.004"),
+    *("keyframes.stride=2", "locus.cell_size=0.004"),
 )
 
 pytestmark = pytest.mark.slow

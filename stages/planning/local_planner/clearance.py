@@ -110,15 +110,16 @@ class Footing:
         vehicle: Vehicle,
         known: KnownGround | None = None,
         *,
-        sure: float = 0.5,
-        dare: float = 0.0,
+        p_certain: float = 0.5,
+        p_traversable: float = 0.0,
         bounds: Bounds | None = None,
     ) -> Footing:
         """On ground of which ``bounds`` are known the belly may pass over what is not.
 
-        A hazard is proven where it is not one by sigma alone, and at least as probable as ``sure``. What is one by
-        sigma alone and less probable than ``dare`` is doubted ground, if it is not unknown. So is ground within a
-        quarter of a wheel of what is given as doubted, where a wheel's edge touches.
+        A hazard is proven where it is not one by its standard deviation alone, and at least as probable as
+        ``p_certain``. Where it is one by its standard deviation alone and less probable than ``p_traversable``, the
+        ground is doubted, if it is not unknown. So is ground within a quarter of a wheel of what is given as doubted,
+        where a wheel's edge touches.
         """
         risk, reason, p_hazard = hazards
         unknown, glanced, doubted = known or KnownGround()
@@ -130,8 +131,8 @@ class Footing:
         likely = proven = hazardous & ~doubtful
         dear = np.where(risk == CAUTION, np.uint8(CAUTION_GROUND), np.uint8(0))
         if p_hazard is not None:
-            proven = likely & (p_hazard >= sure)
-            dared = doubtful & (p_hazard < dare)
+            proven = likely & (p_hazard >= p_certain)
+            dared = doubtful & (p_hazard < p_traversable)
             doubtful &= ~dared
             dear[dared & ~unknown] = DOUBTED_GROUND
         if doubted is not None:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Bools, Floats, Floats32
 from rille.stages.planning.local_planner.clearance import Footing, Gaps
-from rille.stages.planning.local_planner.params import LegParams
+from rille.stages.planning.local_planner.params import LocalPlannerParams
 from rille.stages.planning.local_planner.route import STEP_TURN, Piece, pieces, turnable
 from rille.stages.planning.local_planner.state_lattice import PoseGraph, PoseGrid
 
@@ -46,7 +46,7 @@ class Ground:
         footing: Footing,
         start: Point,
         heading: float,
-        p: LegParams,
+        p: LocalPlannerParams,
         closed: Sequence[Point] = (),
         aside: float = 0.0,
     ) -> None:
@@ -85,7 +85,7 @@ class Ground:
         opened = gaps.proven > np.where(near, self.here[2], margin) - slack
         for cx, cy in self.closed:
             # What was looked at in vain is closed as far as it is not known: the rest of the circle may be driven.
-            opened &= known | (np.hypot(x - cx, y - cy) > self.p.vain * self.vehicle.wheel_base)
+            opened &= known | (np.hypot(x - cx, y - cy) > self.p.failed_view_radius * self.vehicle.wheel_base)
         return known, opened | known
 
     def _near(self, x: Floats, y: Floats) -> Bools:
@@ -103,25 +103,25 @@ class Ground:
         """Poses that may be driven, and the price of a metre, infinite where none may be planned."""
         known, opened = self._split(gaps, x, y, slack)
         away = self._away(x, y)
-        blind = away <= self.p.blind * np.where(gaps.unknown > 0, NEARER, 1.0)
-        unseen = np.full(x.shape, self.p.unknown_price)
+        blind = away <= self.p.occluded_radius * np.where(gaps.unknown > 0, NEARER, 1.0)
+        unseen = np.full(x.shape, self.p.unknown_cost)
         if self.footing.glanced is not None:
-            unseen[~self._at(~self.footing.glanced, x, y)] = min(self.p.glance_price, self.p.unknown_price)
-        unknown = np.where(blind, np.maximum(self.p.blind_price, unseen), unseen)
+            unseen[~self._at(~self.footing.glanced, x, y)] = min(self.p.far_cost, self.p.unknown_cost)
+        unknown = np.where(blind, np.maximum(self.p.occluded_cost, unseen), unseen)
         # Likely hazards, and gaps narrower than a wheel, which are the shadows of stones: looking nearer does not free
         # them.
         stays = (gaps.gap <= self.vehicle.margin) | ((gaps.unknown <= 0) & (gaps.frontier > 0))
-        unknown = np.where(stays, np.maximum(self.p.doubt_price, unknown), unknown)
-        caution = self.p.caution_price * ((gaps.caution + DOUBT_WEIGHT * gaps.doubted) / PARTS)
+        unknown = np.where(stays, np.maximum(self.p.uncertainty_cost, unknown), unknown)
+        caution = self.p.caution_cost * ((gaps.caution + DOUBT_WEIGHT * gaps.doubted) / PARTS)
         # not dearer than if nothing were known of it
-        fades = (away > NEARER * self.p.blind) & ~stays
-        caution = np.where(fades, np.minimum(caution, self.p.unknown_price - 1.0), caution)
+        fades = (away > NEARER * self.p.occluded_radius) & ~stays
+        caution = np.where(fades, np.minimum(caution, self.p.unknown_cost - 1.0), caution)
         price = np.where(known, 1.0, unknown) + caution
         if self.vehicle.margin > 0:
             beside = np.minimum(gaps.gap / self.vehicle.margin - 1.0, gaps.doubtful / self.vehicle.margin)
             # Falls from one at the margin to none at twice the margin; of hazards by sigma alone from their edge, as
             # they have none.
-            price = price + self.p.near_price * np.clip(1.0 - beside, 0.0, 1.0)
+            price = price + self.p.proximity_cost * np.clip(1.0 - beside, 0.0, 1.0)
         return known, np.where(opened, price, np.inf)
 
     def _at(self, mask: Bools, x: Floats, y: Floats) -> Bools:
@@ -153,8 +153,8 @@ class Ground:
         """Goals (row, col) within ``reach`` metres, cost and move (heading, row, col)."""
         x, y = self.places()
         goals: Bools = np.asarray(np.hypot(x - goal[0], y - goal[1]) <= reach)
-        turn = self.p.turn_price * self.vehicle.wheel_base
-        return goals, *self.graph.search(goals, turn, self.p.back_price, whole=whole)
+        turn = self.p.turn_cost * self.vehicle.wheel_base
+        return goals, *self.graph.search(goals, turn, self.p.reverse_cost, whole=whole)
 
     def beside(self) -> Iterator[Ground]:
         """The same from headings a little aside, as far as the wheels have room to turn there."""
@@ -183,11 +183,11 @@ class Ground:
         for piece in way:
             n, share, (x, y, angle) = self._along(piece, heading)
             known, price = self._price(self.footing.gaps(x, y, angle), x, y, self.cell)
-            metres = piece.length * (self.p.back_price if piece.gear < 0 else 1.0)
+            metres = piece.length * (self.p.reverse_cost if piece.gear < 0 else 1.0)
             if not np.isfinite(price).all():
                 return [], math.inf
             # As the lattice prices a turn: by the dearest pose on it; a piece by the mean of its poses.
-            cost += abs(piece.heading - heading) * self.p.turn_price * self.vehicle.wheel_base * float(price[:n].max())
+            cost += abs(piece.heading - heading) * self.p.turn_cost * self.vehicle.wheel_base * float(price[:n].max())
             cost += metres * float(price[n:].mean())
             # The known part is driven now: cut there, or a whole long piece would count as unknown.
             first = piece.length * float(share[np.argmin(known) - 1])  # metres before what is not known

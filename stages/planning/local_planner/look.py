@@ -191,8 +191,8 @@ class Target:
             return None
         ground, bound = self.ground, math.radians(self.ground.p.max_turn_deg)
         p, base = ground.p, ground.vehicle.wheel_base
-        for piece in free_back(ground, p.blind * base):
-            if length_of([piece]) < p.least * base:
+        for piece in free_back(ground, p.occluded_radius * base):
+            if length_of([piece]) < p.min_length * base:
                 continue
             turn = self.turn(piece.b, ground.heading, bound, bound)
             if turn is not None:

@@ -1,4 +1,7 @@
-"""Parameters of the stage ``leg``: how far, how sure, and at which prices."""
+"""Parameters of the stage ``local_planner``: length of a leg, limits of probability, and costs of ground.
+
+Costs are factors of a metre's cost; a metre over known, free ground costs 1.
+"""
 
 from __future__ import annotations
 
@@ -7,97 +10,86 @@ from pydantic import Field
 from rille.stages.core.declare import Params
 
 
-class LegParams(Params):
-    """Parameters of the stage ``leg``."""
+class LocalPlannerParams(Params):
+    """Parameters of the stage ``local_planner``."""
 
-    length: float = Field(
-        2.0, gt=0, description="longest leg [wheelbases], which is driven to its end without a new map"
+    max_length: float = Field(
+        2.0, gt=0, description="longest leg [wheelbases]: the distance that is driven on one map; larger: fewer stops"
     )
-    least: float = Field(
-        0.3,
-        gt=0,
-        description="shortest leg [wheelbases] that is worth a stop; instead of a shorter one, look elsewhere",
+    min_length: float = Field(
+        0.3, gt=0, description="shortest leg [wheelbases]; where none is longer, the rover looks elsewhere first"
     )
     max_turn_deg: float = Field(
         40.0,
         gt=5,
         le=120,
-        description="largest angle [degrees] between any two headings of a leg, so that at least half of the landmarks "
+        description="largest angle [degrees] between any two headings of a leg; at least half of the landmarks must "
         "stay in view",
     )
-    sure: tuple[float, float] = Field(
+    p_certain_hazard: tuple[float, float] = Field(
         (0.9, 0.995),
-        description="probability of a hazard from which ground is closed; second value: the same where the first "
-        "leaves no path (distant ground is uncertain, and better known once the rover is nearer)",
+        description="probability of a hazard from which ground is closed; the second value applies where the first "
+        "leaves no path. Both are high because far elevations are uncertain, and nearer ones decide later",
     )
-    dare: float = Field(
+    p_max_traversable: float = Field(
         0.3,
         ge=0,
         le=0.5,
-        description="probability of a hazard below which ground that exceeds a limit only within its standard "
-        "deviation is driven on, at a price; the vehicle's limits are half of what tips it over, and with 0 many rock "
-        "fields have no path",
+        description="probability of a hazard up to which ground may be driven on, at uncertainty_cost, that only its "
+        "standard deviation makes hazardous; 0: never, then few paths among rocks are found. The vehicle's limits are "
+        "about half of those at which it tips over",
     )
-    avoid: float = Field(
+    p_costly: float = Field(
         0.06,
         gt=0,
         le=1,
-        description="probability of a hazard from which ground is expensive; in the simulator every edge that the map "
-        "had missed lay on ground of at least 0.07",
+        description="probability of a hazard from which near ground costs uncertainty_cost; on simulated beds all "
+        "edges that the map missed lay on ground of 0.07 and more",
     )
-    clear: float = Field(
+    p_clear: float = Field(
         0.02,
         ge=0,
         lt=1,
-        description="probability of a hazard below which ground is driven on that was seen from a distance only; in "
-        "the simulator 0.05 per mille of such wheel positions had an edge that the map had missed, against 3.7 per "
-        "mille of all",
+        description="probability of a hazard below which ground seen from afar alone may be driven on; of such places "
+        "for a wheel 0.005 % had an edge that the map missed, of all places 0.37 %",
     )
-    glance_price: float = Field(
-        1.3, ge=1, description="cost of a metre over ground that was seen from a distance only; known ground costs 1"
+    far_cost: float = Field(
+        1.3, ge=1, description="cost of a metre over ground seen from afar alone; it seldom changes when seen from near"
     )
-    unknown_price: float = Field(2.0, ge=1, description="cost of a metre over unknown ground; known ground costs 1")
-    doubt_price: float = Field(
+    unknown_cost: float = Field(2.0, ge=1, description="cost of a metre over unknown ground")
+    uncertainty_cost: float = Field(
         4.0,
         ge=1,
-        description="cost of a metre over ground that is probably but not certainly hazardous, or over unseen gaps "
-        "narrower than a wheel (the shadows of stones): both mostly remain when seen from nearer",
+        description="cost of a metre over ground with a likely hazard, or with unseen spots narrower than a wheel, "
+        "which are shadows of stones; both mostly remain when seen from near",
     )
-    caution_price: float = Field(
-        0.2,
-        ge=0,
-        description="added to the cost of a metre where all wheels are on caution ground: a detour of a fifth",
+    caution_cost: float = Field(
+        0.2, ge=0, description="added to the cost of a metre where all wheels are on caution ground; 0.2: a fifth"
     )
-    blind: float = Field(
+    occluded_radius: float = Field(
         1.5,
         ge=0,
-        description="radius [wheelbases] around the vehicle within which looking there does not show unknown ground; "
-        "within twice this radius, doubtful ground is taken to remain doubtful",
+        description="distance [wheelbases] within which another look does not reveal unknown ground; within twice of "
+        "it uncertain ground remains uncertain",
     )
-    blind_price: float = Field(
-        6.0,
-        ge=1,
-        description="cost of a metre over unknown ground within that radius, so that other paths are tried first",
+    occluded_cost: float = Field(
+        6.0, ge=1, description="cost of a metre over unknown ground within occluded_radius; larger: a last resort"
     )
-    loyalty: float = Field(
+    replan_hysteresis: float = Field(
         0.15,
         ge=0,
-        description="share by which a new path must be cheaper than the one being followed to replace it",
+        description="share of its cost by which a new path must be cheaper than the present one to replace it",
     )
-    near_price: float = Field(
-        0.5, ge=0, description="added to the cost of a metre at a hazard's margin; falls to 0 within another margin"
+    proximity_cost: float = Field(
+        0.5, ge=0, description="added to the cost of a metre beside a hazard; it falls to 0 at the vehicle's margin"
     )
-    back_price: float = Field(
-        3.0, ge=1, description="cost of a metre driven backwards, where no camera looks; a metre ahead costs 1"
+    reverse_cost: float = Field(3.0, ge=1, description="cost of a metre driven backwards, where no camera looks")
+    turn_cost: float = Field(0.3, ge=0, description="cost of a turn on the spot [wheelbases of free ground per radian]")
+    spacing: float = Field(0.25, gt=0, le=1, description="spacing of the lattice of poses [wheel diameters]")
+    tolerance: float = Field(0.3, gt=0, description="distance from the goal [wheelbases] at which it is reached")
+    max_looks: int = Field(
+        3, ge=1, description="views taken from one place without a leg, after which the unknown ground ahead is closed"
     )
-    turn_price: float = Field(0.3, ge=0, description="cost [wheelbases] of a turn on the spot by one radian")
-    spacing: float = Field(
-        0.25, gt=0, le=1, description="spacing [wheel diameters] of the positions over which paths are planned"
-    )
-    tolerance: float = Field(0.3, gt=0, description="distance [wheelbases] from the goal at which it counts as reached")
-    looks: int = Field(
-        3, ge=1, description="number of looks without progress after which the way ahead counts as closed"
-    )
-    vain: float = Field(
-        0.8, gt=0, description="radius [wheelbases] within which unknown ground is then closed to planning"
+    failed_view_radius: float = Field(
+        0.8, gt=0, description="radius [wheelbases] of the unknown ground that is closed then"
     )

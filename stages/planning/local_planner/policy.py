@@ -32,7 +32,7 @@ from rille.stages.geometry.lattice import Lattice
 from rille.stages.planning.local_planner.clearance import Footing
 from rille.stages.planning.local_planner.ground import Ground
 from rille.stages.planning.local_planner.look import AHEAD, ROUND, TWICE, FieldOfView, PlannerMemory, Stand, Target
-from rille.stages.planning.local_planner.params import LegParams
+from rille.stages.planning.local_planner.params import LocalPlannerParams
 from rille.stages.planning.local_planner.route import (
     Piece,
     first_metres,
@@ -82,7 +82,7 @@ def plan_leg(
     footing: Footing,
     stand: Stand,
     goal: Point,
-    params: LegParams,
+    params: LocalPlannerParams,
     memory: PlannerMemory | None = None,
     before: Before | None = None,
     view: FieldOfView = AHEAD,
@@ -129,12 +129,12 @@ def plan_leg(
             break
     if not np.isfinite(min(least, price)):
         why = _why_closed(ground, goals, cost)
-        turn = 0.0 if looks >= params.looks else _free_turn(ground, looks)
+        turn = 0.0 if looks >= params.max_looks else _free_turn(ground, looks)
         if turn:
             return _stay("look", f"{why}: looks around", start, [], shown, turn)
         return _stay("no path", why, start, [], shown)
     # Without this the cheaper of two ways round a stone may change at each stop, and the vehicle goes to and fro.
-    way = kept if kept and price <= (1.0 + params.loyalty) * least else ground.way(move)
+    way = kept if kept and price <= (1.0 + params.replan_hysteresis) * least else ground.way(move)
     plan = _plain(ground, way)
     first = _sure(plan)
     target = Target.of(ground, plan, first, view, memory.stands) if first < len(plan) else None
@@ -148,7 +148,7 @@ def plan_leg(
 def _plain(ground: Ground, way: Sequence[Piece]) -> list[Piece]:
     """A way whose first metres are made straighter, as far as they are known."""
     # Beyond some legs the map will have changed before the vehicle is there: straightening it is for nothing.
-    sure = first_metres(way[: _sure(way)], 4.0 * ground.p.length * ground.vehicle.wheel_base)
+    sure = first_metres(way[: _sure(way)], 4.0 * ground.p.max_length * ground.vehicle.wheel_base)
     straight = straightened(sure, ground.heading, ground.plain, ground.cell)
     return [*straight, *last_metres(way, length_of(sure))]
 
@@ -165,15 +165,15 @@ def _onwards(
     not worth a stop."""
     p, base, start, heading = ground.p, ground.vehicle.wheel_base, ground.start, ground.heading
     bound = math.radians(p.max_turn_deg)
-    leg = first_metres(plan[: _sure(plan)], p.length * base)
+    leg = first_metres(plan[: _sure(plan)], p.max_length * base)
     # A short last piece to the goal is worth its stop.
-    if length_of(leg) < min(p.least * base, length_of(way) - 1e-9):
+    if length_of(leg) < min(p.min_length * base, length_of(way) - 1e-9):
         return None
     seen = None if target is None else target.last_view(leg, bound)
     facing = 0.0
-    if seen is not None and seen[0] >= p.least * base:
+    if seen is not None and seen[0] >= p.min_length * base:
         leg, facing = first_metres(leg, seen[0]), seen[1]
-    elif target is not None and looks < p.looks:
+    elif target is not None and looks < p.max_looks:
         turn = target.turn(start, heading, bound, bound)
         if turn:
             return _stay("look", f"turns {math.degrees(turn):.0f} degrees to see the way", start, plan, shown, turn)
@@ -192,7 +192,7 @@ def _look(target: Target, way: Sequence[Piece], plan: Sequence[Piece], shown: Fl
     """A look at where a way is not known, or that looks did not help."""
     ground = target.ground
     p, start, heading = ground.p, ground.start, ground.heading
-    if looks < p.looks:
+    if looks < p.max_looks:
         turn = target.turn(start, heading, ROUND, ROUND, TWICE)
         if turn == 0.0:  # in view, but not known: once more from a little aside
             turn = next((t for t in ASIDE if turnable(start, heading, heading + t, ground.clear)), 0.0)
@@ -255,9 +255,9 @@ def _free_turn(ground: Ground, looks: int) -> float:
     return 0.0
 
 
-def shortest(footing: Footing, stand: Stand, goal: Point, params: LegParams) -> float | None:
+def shortest(footing: Footing, stand: Stand, goal: Point, params: LocalPlannerParams) -> float | None:
     """Length, m, of the shortest way over known ground, at no price but its length; None: none."""
-    free = {"unknown_price": math.inf, "near_price": 0.0, "caution_price": 0.0, "turn_price": 0.0, "back_price": 1.0}
+    free = {"unknown_cost": math.inf, "proximity_cost": 0.0, "caution_cost": 0.0, "turn_cost": 0.0, "reverse_cost": 1.0}
     start, heading = (stand[0], stand[1]), stand[2]
     ground = Ground(footing, start, heading, params.model_copy(update=free))
     _, cost, move = ground.search(goal, 0.5 * params.tolerance * footing.vehicle.wheel_base)

@@ -1,4 +1,4 @@
-"""The next leg of a drive to a goal, by the hazards that are known so far: stage ``leg``.
+"""The next leg of a drive to a goal, by the hazards that are known so far: stage ``local_planner``.
 
 What was seen from near may be driven on, what was seen from afar serves to plan
 (:mod:`rille.stages.planning.local_planner.policy`). Far hazards close ground only once they are probable; where that
@@ -22,7 +22,7 @@ from rille.stages.hazard.classification import HAZARDOUS, UNKNOWN, UNSEEN_BIT
 from rille.stages.hazard.vehicle import Vehicle
 from rille.stages.planning.local_planner.clearance import Footing, Hazards, KnownGround
 from rille.stages.planning.local_planner.look import FieldOfView, PlannerMemory, Stand
-from rille.stages.planning.local_planner.params import LegParams
+from rille.stages.planning.local_planner.params import LocalPlannerParams
 from rille.stages.planning.local_planner.policy import Before, Leg, plan_leg, shortest
 from rille.stages.terrain.occlusion_bounds import Bounds
 
@@ -42,7 +42,7 @@ def next_leg(
     seen: SeenGround,
     stand: Stand,
     goal: Point,
-    params: LegParams,
+    params: LocalPlannerParams,
     memory: PlannerMemory,
     view: FieldOfView,
     before: Before | None = None,
@@ -52,29 +52,41 @@ def next_leg(
     hazards, known = seen_so_far(seen.near, seen.far, params)
     meta = seen.near.meta
     lattice, vehicle = Lattice.from_dict(meta["lattice"]), Vehicle.model_validate(meta["vehicle"])
-    for sure in params.sure:
-        footing = Footing.of(hazards, lattice, vehicle, known, sure=sure, dare=params.dare, bounds=seen.bounds)
+    for p_certain in params.p_certain_hazard:
+        footing = Footing.of(
+            hazards,
+            lattice,
+            vehicle,
+            known,
+            p_certain=p_certain,
+            p_traversable=params.p_max_traversable,
+            bounds=seen.bounds,
+        )
         found = plan_leg(footing, stand, goal, params, memory, before, view)
         if found.verdict == "goal" or len(found.way) > 1:
             break
     return found
 
 
-def shortest_way(risk: Bundle, stand: Stand, goal: Point, params: LegParams) -> tuple[float | None, float | None]:
+def shortest_way(
+    risk: Bundle, stand: Stand, goal: Point, params: LocalPlannerParams
+) -> tuple[float | None, float | None]:
     """Length (m) of the shortest way where all is known, and the margin (m) that it keeps: the vehicle's, or none where
     the margin, which is for what a vehicle does not know, closes every way. None: there is no way."""
     lattice, vehicle = Lattice.from_dict(risk.meta["lattice"]), Vehicle.model_validate(risk.meta["vehicle"])
     hazards = Hazards(*(np.asarray(risk[name]) for name in Hazards._fields))
     for margin in (vehicle.margin, 0.0):
         bare = vehicle.model_copy(update={"margin": margin})
-        allowed = Footing.of(hazards, lattice, bare, sure=params.sure[-1], dare=params.dare)
+        allowed = Footing.of(
+            hazards, lattice, bare, p_certain=params.p_certain_hazard[-1], p_traversable=params.p_max_traversable
+        )
         best = shortest(allowed, stand, goal, params)
         if best is not None:
             return best, margin
     return None, None
 
 
-def _run(params: LegParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
+def _run(params: LocalPlannerParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     risk = inputs["risk"]
     T_world_left = RigidTransform.from_matrix(np.asarray(inputs["pose"]["poses"])[-1])
     T_vehicle_left = RigidTransform.from_matrix(args["T_vehicle_left"])
@@ -112,7 +124,7 @@ def _run(params: LegParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     return Bundle(arrays, meta)
 
 
-def seen_so_far(near: Bundle, far: Bundle | None, p: LegParams) -> tuple[Hazards, KnownGround]:
+def seen_so_far(near: Bundle, far: Bundle | None, p: LocalPlannerParams) -> tuple[Hazards, KnownGround]:
     """The hazards of a map of which only what was seen from near is driven on, and how well each cell is known."""
     names = Hazards._fields
     maps = [np.asarray(near[name]) for name in names]
@@ -121,12 +133,12 @@ def seen_so_far(near: Bundle, far: Bundle | None, p: LegParams) -> tuple[Hazards
         # at the rim of what is near, a window is cut off, which widens the doubt; all of it was seen from afar, which
         # counts where it looks clearly free
         chance = np.asarray(far["p_hazard"])
-        cut = unknown | (((maps[1] & UNSEEN_BIT) != 0) & (chance < p.clear))
+        cut = unknown | (((maps[1] & UNSEEN_BIT) != 0) & (chance < p.p_clear))
         maps = [np.where(cut, np.asarray(far[name]), seen) for name, seen in zip(names, maps, strict=True)]
         # Written so that NaN, of which nothing is known, stays unknown.
-        unknown &= ~(maps[2] < p.clear)
+        unknown &= ~(maps[2] < p.p_clear)
         glanced = unknown & (maps[0] < HAZARDOUS)
-    return Hazards(*maps), KnownGround(unknown, glanced, maps[2] >= p.avoid)
+    return Hazards(*maps), KnownGround(unknown, glanced, maps[2] >= p.p_costly)
 
 
 def _length(path: Floats) -> float:
@@ -134,10 +146,10 @@ def _length(path: Floats) -> float:
 
 
 STAGE = Stage(
-    name="leg",
+    name="local_planner",
     version=10,
     summary="the next leg of a drive to a goal, over ground that is known to be free",
-    params=LegParams,
+    params=LocalPlannerParams,
     inputs=("risk", "far?", "ceiling?", "pose", "rig", "before?"),
     outputs=(
         Array(

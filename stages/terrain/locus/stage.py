@@ -272,7 +272,7 @@ def _run(params: LocusParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle
             raise DegenerateError(
                 "RIL-780",
                 f"no elevation model without ground: {level['no_ground']}",
-                remedy="or state a surface by level.reference_height",
+                remedy="or state a surface by ground_frame.reference_height",
             )
         cell = params.cell_size or inputs.get("reference", inputs["level"]).meta["cell_size"]
         T, lattice = T_local_left, local_lattice(rig, level, cell, params)

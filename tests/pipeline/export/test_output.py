@@ -131,7 +131,7 @@ def test_nothing_is_made_without_what_it_needs_and_holes_are_passed_on() -> None
     assert laid_out is not None
     assert laid_out[0]["products"]["path"] is None
     named = [handle.name for handle in laid_out[1]]
-    assert [name for name in named if not name.startswith(("image", "undistorted", "continuity"))] == [
+    assert [name for name in named if not name.startswith(("image", "undistorted", "screening"))] == [
         *("disparity0", "disparity4", "rig", "risk", "tile", "trajectory")
     ]
 

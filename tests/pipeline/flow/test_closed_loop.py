@@ -37,7 +37,7 @@ SMALL = (
     "locus.cell_size=0.008",
     "drive.goal=[0.03, 0.25]",
     "drive.around=0.4",
-    "reflex.enabled=false",
+    "obstacle_monitor.enabled=false",
 )
 KNOW_THE_TRUTH = {"mockup.drive", "mockup.sense", "mockup.render", "mockup.obstacle", "mockup.truth_dem", "drive_check"}
 
@@ -83,7 +83,7 @@ def test_it_reads_none_of_the_sections_of_a_reconstruction(arrived: tuple[Drive,
     every = [f"{section}.x" for section in type(flow.config).model_fields if section != "terrain"]
     lost = {key.partition(".")[0] for key in unread.unread(every, flow.config, flow.graph)}
     sections = set(type(flow.config).model_fields)
-    assert lost - {"reflex", "global_fix"} == unread.recorded() & sections, "both are off here"
+    assert lost - {"obstacle_monitor", "map_localization"} == unread.recorded() & sections, "both are off here"
 
 
 @pytest.mark.slow
@@ -233,7 +233,7 @@ def test_a_goal_in_a_global_map_is_found_from_a_rough_prior(store: Path) -> None
     more = ("rover.map_cell=0.03", "drive.frame=map", "drive.goal=[0.0, 0.6]", "drive.max_stops=1")
     flow, result = drive(store, *more, "drive.prior=[0.0, 0.38, 0.0]", "mockup.relief=0.02")
     assert result.failures == []
-    fixed = next(h for h in flow.graph.nodes if h.stage == "global_fix").ref
+    fixed = next(h for h in flow.graph.nodes if h.stage == "map_localization").ref
     assert fixed is not None
     true = np.array(flow.true[0]).reshape(3, 4)[:, 3]
     found = np.array(fixed.meta["T_global_local"]).reshape(3, 4)[:, 3]

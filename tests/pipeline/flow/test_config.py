@@ -7,14 +7,16 @@ from pathlib import Path
 import pytest
 from raising import raises
 
-from rille.pipeline.flow import config
+from rille.pipeline.flow import config, renamed
 
 
 def test_layers_win_in_order() -> None:
     built = config.build(
-        config.expand({"select.stride": 2}), {"select": {"stride": 3}}, config.parse_assignments(["select.stride=5"])
+        config.expand({"keyframes.stride": 2}),
+        {"keyframes": {"stride": 3}},
+        config.parse_assignments(["keyframes.stride=5"]),
     )
-    assert built.select.stride == 5
+    assert built.keyframes.stride == 5
 
 
 def test_one_setting_makes_terrain_accurate_and_what_is_given_beside_it_wins() -> None:
@@ -39,41 +41,43 @@ def test_one_setting_makes_terrain_accurate_and_what_is_given_beside_it_wins() -
 
 def test_navigation_matches_fast_unless_told_otherwise(tmp_path: Path) -> None:
     assert config.build({}).hfvm.preset == "default"
-    built = config.build(config.parse_assignments(["select.preset=navigation"]))
-    assert (built.hfvm.preset, built.hfvm.finest, built.select.overlap) == ("fast", 1, 0.6)
+    built = config.build(config.parse_assignments(["keyframes.preset=navigation"]))
+    assert (built.hfvm.preset, built.hfvm.finest, built.keyframes.overlap) == ("fast", 1, 0.6)
     assert (built.motion.level, built.track.points) == (3, 200)
-    assert config.build(config.parse_assignments(["select.preset=navigation", "track.points=300"])).track.points == 300
+    assert (
+        config.build(config.parse_assignments(["keyframes.preset=navigation", "track.points=300"])).track.points == 300
+    )
     for given in ("hfvm.preset=default", "hfvm.preset=accurate"):
-        kept = config.build(config.parse_assignments(["select.preset=navigation", given]))
+        kept = config.build(config.parse_assignments(["keyframes.preset=navigation", given]))
         assert kept.hfvm == config.build(config.parse_assignments([given])).hfvm
-    assert config.build(config.parse_assignments(["select.preset=navigation", "hfvm.finest=0"])).hfvm.finest == 0
+    assert config.build(config.parse_assignments(["keyframes.preset=navigation", "hfvm.finest=0"])).hfvm.finest == 0
     path = tmp_path / "config.toml"
     path.write_text(config.to_toml(built))
     assert config.build(config.read_toml(path)) == built
 
 
 def test_unknown_key_names_the_nearest() -> None:
-    with raises("RIL-027", "'select.strid'", "'select.stride'"):
-        config.build(config.parse_assignments(["select.strid=2"]))
+    with raises("RIL-027", "'keyframes.strid'", "'keyframes.stride'"):
+        config.build(config.parse_assignments(["keyframes.strid=2"]))
     with raises("RIL-027", "'locsu'", "'locus'"):
         config.build({"locsu": {"cell_size": 1.0}})
 
 
 def test_value_out_of_range_says_what_is_permitted() -> None:
-    with raises("RIL-027", "select.stride"):
-        config.build(config.parse_assignments(["select.stride=0"]))
-    with raises("RIL-027", "select.stride", "'many'"):
-        config.build(config.parse_assignments(["select.stride=many"]))
+    with raises("RIL-027", "keyframes.stride"):
+        config.build(config.parse_assignments(["keyframes.stride=0"]))
+    with raises("RIL-027", "keyframes.stride", "'many'"):
+        config.build(config.parse_assignments(["keyframes.stride=many"]))
 
 
 def test_assignment_without_key_or_value() -> None:
-    for text in ("select.stride", "stride=3"):
+    for text in ("keyframes.stride", "stride=3"):
         with raises("RIL-024"):
             config.parse_assignments([text])
 
 
 def test_written_configuration_reads_back_as_the_same(tmp_path: Path) -> None:
-    built = config.build(config.parse_assignments(["select.stride=7", "vehicle.max_step=0.05"]))
+    built = config.build(config.parse_assignments(["keyframes.stride=7", "vehicle.max_step=0.05"]))
     path = tmp_path / "config.toml"
     path.write_text(config.to_toml(built))
     again = config.build(config.read_toml(path))
@@ -90,8 +94,22 @@ def test_unreadable_files(tmp_path: Path) -> None:
         config.read_toml(bad)
 
 
-@pytest.mark.parametrize("key", config.REPLACED)
-def test_a_key_of_an_earlier_version_is_refused_with_what_to_write_now(key):
-    assert key not in config.known_keys(config.model())
-    with raises("RIL-027", key, config.REPLACED[key]):
-        config.build(config.expand({key: True}))
+@pytest.mark.parametrize(
+    ("former", "present"),
+    [
+        ("leg.length=3", ("leg.length is local_planner.max_length",)),
+        ("select.stride=3", ("select.stride is keyframes.stride",)),
+        ("path.sure=0.2", ("path.sure", "write path.p_certain_hazard")),
+        ("refine.stereo=true", ("refine.stereo", "leave it out")),
+    ],
+)
+def test_keys_of_earlier_versions_are_refused_with_their_present_name(former: str, present: tuple[str, ...]) -> None:
+    with raises("RIL-027", *present):
+        config.build(config.parse_assignments([former]))
+
+
+def test_each_present_name_exists() -> None:
+    known = config.known_keys(config.model())
+    assert {renamed._renamed(key) for key in renamed.FIELDS} <= set(known)
+    assert set(renamed.SECTIONS.values()) <= set(known)
+    assert not set(renamed.SECTIONS) & set(known)

@@ -35,7 +35,7 @@ def lay_out(
     steps = len(answer["chain"]) - 1
     found = chosen | {"displacement": [1.0] * steps, "match_rate": [1.0] * steps}
     for meta in [*({"asks": asks} for asks in asked), nothing | answer, found]:
-        deciding = [w for w in graph.expansions if w[0][0].stage in ("continuity", "select")]
+        deciding = [w for w in graph.expansions if w[0][0].stage in ("frame_screening", "keyframes")]
         deciding[-1][1](SimpleNamespace(meta=meta))
     for stage, meta in (("common_tilt", {"undone": tilted}), ("trajectory", trajectory)):
         for handles, go_on, _ in list(graph.expansions):
@@ -55,10 +55,10 @@ def test_a_lost_frame_is_bridged_and_no_pyramid_is_made_twice() -> None:
         {"basic": [0, 3, 5], "segments": [[0, 1, 2, 3], [3, 4, 5], [5, 6]]},
         {"frames": list(range(8)), "pieces": [[0, 7]], "main": 0, "positions": [[0, 0, k] for k in range(8)]},
     )
-    assert labels(graph, "continuity") == ["continuity", "continuity/1", "continuity/2"]
-    assert labels(graph, "sides") == ["sides/2", "sides/3", "sides/4", "sides/5"]
-    assert products.select is not None
-    assert products.select.spec.args == {"frames": 7, "unfit": [4], "behind": [3]}
+    assert labels(graph, "frame_screening") == ["frame_screening", "frame_screening/1", "frame_screening/2"]
+    assert labels(graph, "swap_check") == ["swap_check/2", "swap_check/3", "swap_check/4", "swap_check/5"]
+    assert products.keyframes is not None
+    assert products.keyframes.spec.args == {"frames": 7, "unfit": [4], "behind": [3]}
     motions = products.tracks[0].inputs["motions"]
     assert isinstance(motions, list)
     assert [h.label for h in motions] == ["motion/0-1", "motion/1-2", "motion/2-4"]

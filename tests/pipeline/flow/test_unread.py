@@ -22,8 +22,8 @@ def settled(tmp_path: Path, sequence: str, *assignments: str, config: Path | Non
 
 
 def test_only_values_that_differ_from_what_would_be_in_force_count(tmp_path):
-    assert settled(tmp_path, "mockup", "track.points=300", "select.stride=4").given == ("track.points",), "4 it is"
-    assert settled(tmp_path, "mockup", "terrain.preset=accurate", "select.preset=navigation").given == ()
+    assert settled(tmp_path, "mockup", "track.points=300", "keyframes.stride=4").given == ("track.points",), "4 it is"
+    assert settled(tmp_path, "mockup", "terrain.preset=accurate", "keyframes.preset=navigation").given == ()
 
 
 @pytest.mark.parametrize("name", ["mockup", "mockup-loop"])
@@ -48,7 +48,7 @@ def test_what_a_user_has_switched_off_himself_may_stay(tmp_path):
 @pytest.mark.parametrize(
     ("name", "assignment"),
     [
-        ("mockup", "leg.length=0.3"),
+        ("mockup", "local_planner.max_length=0.3"),
         ("mockup", "drive.goal=[0.0,1.0]"),
         ("mockup", "undistort.interpolation=linear"),
         ("mockup-loop", "refine.window=3"),

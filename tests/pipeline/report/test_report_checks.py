@@ -100,7 +100,7 @@ def test_consumers_survive_facts_that_are_not_there(tmp_path: Path) -> None:
     made = bundles() | checks()
     rig, agreement = made["rig"].meta, made["agreement"]
     made["rig"] = Bundle({}, {"rig": rig["rig"], "mode": "fixed", "baseline": 0.097, "source": "given calibration"})
-    made["select"] = Bundle({}, {"basic": list(BASIC)})
+    made["keyframes"] = Bundle({}, {"basic": list(BASIC)})
     made["agreement"] = Bundle(agreement.arrays, {})
     del made["crosscheck_accuracy"], made["orientation4"]
     facts, page_, _, _ = written(tmp_path, view(made, products=checked()))

@@ -17,7 +17,7 @@ from rille.pipeline.report import seams
 from rille.stages.core.declare import Bundle, NoParams
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.terrain import overlap_audit, overlap_qa
-from rille.stages.terrain.overlap_audit import SeamAuditParams
+from rille.stages.terrain.overlap_audit import OverlapAuditParams
 
 TILT = math.radians(0.2)
 
@@ -39,7 +39,7 @@ def scene() -> Any:
         others = [dems[k] for k in dems if k < pair]
         found[pair] = overlap_qa.STAGE.run(NoParams(), {}, {"dem": dems[pair], "others": others})
     centres = {str(k): [0.245, 0.01 * (5 * k - 29.5)] for k in dems}
-    audit = overlap_audit.STAGE.run(SeamAuditParams(), {"centres": centres}, {"seams": list(found.values())})
+    audit = overlap_audit.STAGE.run(OverlapAuditParams(), {"centres": centres}, {"seams": list(found.values())})
     products = SimpleNamespace(seam_audit=audit, seams=found)
     return SimpleNamespace(view=SimpleNamespace(bundle=lambda handle: handle, products=products))
 
@@ -82,7 +82,7 @@ def test_the_model_to_blame_stands_first(scene: Any) -> None:
 
 
 def test_without_a_seam_there_is_no_page() -> None:
-    empty = overlap_audit.STAGE.run(SeamAuditParams(), {"centres": {"0": [0.0, 0.0]}}, {"seams": []})
+    empty = overlap_audit.STAGE.run(OverlapAuditParams(), {"centres": {"0": [0.0, 0.0]}}, {"seams": []})
     for audit in (None, empty):
         products = SimpleNamespace(seam_audit=audit, seams={})
         scene = SimpleNamespace(view=SimpleNamespace(bundle=lambda handle: handle, products=products))

@@ -215,7 +215,7 @@ def checks() -> dict[str, Bundle]:
         "agreement": Bundle(agreement, compared),
         "crosscheck": Bundle({"poses": theirs}, {"frames": list(FRAMES)}),
         "crosscheck_accuracy": Bundle(judged, {"metrics": assessed, "frames": list(FRAMES)}),
-        "select": Bundle({}, select),
+        "keyframes": Bundle({}, select),
     }
 
 
@@ -224,7 +224,7 @@ def checked() -> Products:
     found: Any = products()
     found.rigs, found.orientations = dict.fromkeys(BASIC, "rig"), {k: f"orientation{k}" for k in BASIC}
     found.agreement, found.crosscheck, found.crosscheck_accuracy = "agreement", "crosscheck", "crosscheck_accuracy"
-    found.select = "select"
+    found.keyframes = "keyframes"
     return found  # type: ignore[no-any-return]
 
 

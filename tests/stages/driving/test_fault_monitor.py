@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rille.stages.driving.fault_monitor import Readings, SafetyParams, Verdict, judge
+from rille.stages.driving.fault_monitor import FaultMonitorParams, Readings, Verdict, judge
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 
 OPTICAL = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 T_VEHICLE_LEFT = RigidTransform(rotation_exp([-0.5, 0.0, 0.0]) @ OPTICAL, np.array([0.0, 0.05, 0.18]))
 VEHICLE = {"max_slope_deg": 20.0, "wheel_base": 0.1}
-P = SafetyParams()
+P = FaultMonitorParams()
 STEP = 0.025
 
 

@@ -1,4 +1,4 @@
-"""Reflex detection on exact displacements of a plane and a block: found where it stands, silent where none is new."""
+"""Obstacle detection on exact displacements of a plane and a block: found where it stands, silent where none is new."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from rille.stages.driving.obstacle_monitor import (
     STAGE,
     LastModel,
     Obstacle,
+    ObstacleMonitorParams,
     Points,
-    ReflexParams,
     ViewPair,
     look,
     obstacle,
@@ -30,7 +30,7 @@ ROVER = Vehicle(
     wheel_diameter=0.03, track=0.08, wheel_base=0.10, clearance=0.025, max_step=0.012, max_roughness=0.004, margin=0.01
 )
 CAMERA = Camera(180.0, 180.0, 159.5, 119.5, 320, 240)
-P = ReflexParams()
+P = ObstacleMonitorParams()
 HEIGHT, PITCH = 0.18, math.radians(32.0)
 OPTICAL = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 T_VEHICLE_LEFT = RigidTransform(rotation_exp([-PITCH, 0.0, 0.0]) @ OPTICAL, np.array([0.0, 0.05, HEIGHT]))
@@ -76,7 +76,7 @@ def surface(block: tuple[float, float, float, float] | None = None) -> LastModel
     if block is not None:
         xy = LATTICE.xy()
         z[(np.abs(xy[..., 0] - block[0]) < block[2]) & (np.abs(xy[..., 1] - block[1]) < block[2])] = block[3]
-    return LastModel.of(z, LATTICE, P.blur * ROVER.wheel_diameter)
+    return LastModel.of(z, LATTICE, P.model_radius * ROVER.wheel_diameter)
 
 
 NOTHING = np.zeros((0, 2))
@@ -104,7 +104,7 @@ def test_a_block_that_the_model_knows_is_silent() -> None:
 
 
 def test_a_block_lower_than_the_threshold_is_silent() -> None:
-    low = (*BLOCK[:3], 0.5 * P.height * ROVER.wheel_diameter)
+    low = (*BLOCK[:3], 0.5 * P.min_rise * ROVER.wheel_diameter)
     assert found(view(0.0, 0.05, low), surface()) is None
 
 
@@ -143,7 +143,7 @@ def test_few_among_many_count_where_the_image_before_showed_them_as_well() -> No
 
 def test_too_few_never_count() -> None:
     wheel = ROVER.wheel_diameter
-    assert obstacle(scattered(P.points - 1, 0), wheel, P, np.array([[0.0, 0.2]]))[0] is None
+    assert obstacle(scattered(P.min_points - 1, 0), wheel, P, np.array([[0.0, 0.2]]))[0] is None
     assert obstacle(scattered(8, 80), wheel, P, np.array([[0.0, 0.2]]))[0] is None, "a tenth of what is seen there"
 
 

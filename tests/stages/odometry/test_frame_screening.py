@@ -10,9 +10,9 @@ from motion_scenes import motion, shift, tables
 from raising import raises
 
 from rille.stages.core.declare import Bundle, check_outputs
-from rille.stages.odometry.frame_screening import STAGE, ContinuityParams, judge
+from rille.stages.odometry.frame_screening import STAGE, FrameScreeningParams, judge
 
-PARAMS = ContinuityParams()
+PARAMS = FrameScreeningParams()
 
 
 def sight(k, **left):

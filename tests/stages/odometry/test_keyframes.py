@@ -14,7 +14,7 @@ from rille.stages.core.declare import Bundle, check_outputs
 from rille.stages.geometry.geometry import rotation_exp
 from rille.stages.imaging.pyramid import PyramidParams, build
 from rille.stages.odometry import keyframes
-from rille.stages.odometry.keyframes import SelectParams, segments
+from rille.stages.odometry.keyframes import KeyframesParams, segments
 from rille.stages.odometry.motion import STAGE as MOTION
 from rille.stages.odometry.motion import MotionParams
 
@@ -22,7 +22,7 @@ from rille.stages.odometry.motion import MotionParams
 def run(motions, frames=None, **params):
     """Meta of the stage for motions between successive frames."""
     args = {"frames": len(motions) + 1 if frames is None else frames}
-    out = keyframes.STAGE.run(SelectParams(**params), args, {"steps": tables(motions)})
+    out = keyframes.STAGE.run(KeyframesParams(**params), args, {"steps": tables(motions)})
     check_outputs(keyframes.STAGE, out)
     return out.meta
 
@@ -137,7 +137,7 @@ def test_a_stride_has_a_basic_pair_behind_a_step_with_few_matches():
 def test_behind_a_gap_is_a_basic_pair_so_that_a_refused_bridge_begins_a_piece(rule):
     args = {"frames": 9, "behind": [3, 6], "unfit": [6]}
     steps = {"steps": tables([motion(shift(2.0))] * 8)}
-    meta = keyframes.STAGE.run(SelectParams(rule=rule, stride=16), args, steps).meta
+    meta = keyframes.STAGE.run(KeyframesParams(rule=rule, stride=16), args, steps).meta
     assert meta["basic"] == [0, 3, 7]
     assert meta["why"] == ["first frame", "behind a gap", "behind a gap"]
 
@@ -148,7 +148,7 @@ def test_too_little_overlap_is_named():
     assert "as little as 50%" in meta["warnings"][0]
     assert run([motion(shift(100.0))] * 4, rule="stride", stride=2)["warnings"] == []
     meta = run([motion(shift(160.0))] * 4, rule="stride", stride=2)
-    assert "set select.stride lower" in meta["warnings"][0]
+    assert "set keyframes.stride lower" in meta["warnings"][0]
 
 
 def test_wrong_numbers_are_refused():
@@ -190,15 +190,15 @@ def test_street_at_ten_frames_a_second_gets_about_every_second_pair(data_dir):
 
 
 def test_preset_navigation_takes_pairs_farther_apart_and_yields_to_what_is_given():
-    assert (SelectParams(preset="navigation").rule, SelectParams(preset="navigation").overlap) == ("overlap", 0.6)
-    assert SelectParams(preset="navigation", stride=4).rule == "overlap"  # a sequence's own, for its terrain
-    assert SelectParams(preset="navigation", stride=4, rule="stride").rule == "stride"
-    assert SelectParams(preset="navigation", overlap=0.5).overlap == 0.5
-    again = SelectParams.model_validate(SelectParams(preset="navigation").model_dump())
-    assert again == SelectParams(preset="navigation")
+    assert (KeyframesParams(preset="navigation").rule, KeyframesParams(preset="navigation").overlap) == ("overlap", 0.6)
+    assert KeyframesParams(preset="navigation", stride=4).rule == "overlap"  # a sequence's own, for its terrain
+    assert KeyframesParams(preset="navigation", stride=4, rule="stride").rule == "stride"
+    assert KeyframesParams(preset="navigation", overlap=0.5).overlap == 0.5
+    again = KeyframesParams.model_validate(KeyframesParams(preset="navigation").model_dump())
+    assert again == KeyframesParams(preset="navigation")
 
 
 def test_a_stride_given_alone_sets_the_rule():
-    assert SelectParams().rule == "overlap"
-    assert SelectParams(stride=3).rule == "stride"
-    assert SelectParams.model_validate({"stride": 3, "rule": "overlap"}).rule == "overlap"
+    assert KeyframesParams().rule == "overlap"
+    assert KeyframesParams(stride=3).rule == "stride"
+    assert KeyframesParams.model_validate({"stride": 3, "rule": "overlap"}).rule == "overlap"

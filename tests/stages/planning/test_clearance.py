@@ -114,8 +114,8 @@ def test_hazards_of_little_probability_are_not_proven() -> None:
     risk = np.where(np.hypot(X, Y - 0.1) < 0.01, np.uint8(HAZARDOUS), np.uint8(SAFE))
     p = np.where(Y > 0.1, 0.6, 0.95).astype(np.float32)
     reason = np.full(risk.shape, REASONS["step"], np.uint16)
-    gap, proven, _, _ = at(Footing.of(Hazards(risk, reason, p), LATTICE, ROVER, sure=0.9), 0.04, 0.17, 0.0)
-    below = at(Footing.of(Hazards(risk, reason, p), LATTICE, ROVER, sure=0.5), 0.04, 0.17, 0.0)
+    gap, proven, _, _ = at(Footing.of(Hazards(risk, reason, p), LATTICE, ROVER, p_certain=0.9), 0.04, 0.17, 0.0)
+    below = at(Footing.of(Hazards(risk, reason, p), LATTICE, ROVER, p_certain=0.5), 0.04, 0.17, 0.0)
     assert gap == below[0] == below[1]
     assert proven > gap
 
@@ -131,7 +131,9 @@ def test_what_is_hazardous_by_sigma_alone_and_improbable_is_doubted_ground() -> 
     reason = np.full(risk.shape, REASONS["step"] | REASONS["uncertain"], np.uint16)
     p = np.full(risk.shape, 0.2, np.float32)
     hazards, here = Hazards(risk, reason, p), np.zeros((3, 1))
-    daring, not_so = (Footing.of(hazards, LATTICE, ROVER, sure=0.9, dare=d).gaps(*here) for d in (0.3, 0.1))
+    daring, not_so = (
+        Footing.of(hazards, LATTICE, ROVER, p_certain=0.9, p_traversable=d).gaps(*here) for d in (0.3, 0.1)
+    )
     assert (daring.gap[0], daring.doubtful[0], daring.doubted[0], daring.caution[0]) == (np.inf, np.inf, 1, 0)
     assert (not_so.gap[0], not_so.doubtful[0], not_so.doubted[0], not_so.caution[0]) == (np.inf, 0.0, 0, 0)
 

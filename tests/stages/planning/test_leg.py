@@ -18,15 +18,15 @@ from rille.stages.planning.local_planner.clearance import Footing, Hazards, Know
 from rille.stages.planning.local_planner.ground import Ground
 from rille.stages.planning.local_planner.look import AHEAD as ANYWHERE
 from rille.stages.planning.local_planner.look import FieldOfView, PlannerMemory, Stand
-from rille.stages.planning.local_planner.params import LegParams
+from rille.stages.planning.local_planner.params import LocalPlannerParams
 from rille.stages.planning.local_planner.policy import Leg, plan_leg, shortest
 from rille.stages.planning.local_planner.route import length_of, through
 from rille.stages.planning.local_planner.stage import SeenGround, next_leg, seen_so_far, shortest_way
 from rille.stages.terrain.occlusion_bounds import Bounds
 
-SEEN = P.model_copy(update={"blind": 0.0})
+SEEN = P.model_copy(update={"occluded_radius": 0.0})
 """Without the rule for what is near, which on this small map is half of it."""
-TIRED = PlannerMemory(looks=P.looks)
+TIRED = PlannerMemory(looks=P.max_looks)
 """Of a vehicle that has looked as often as it may."""
 
 
@@ -34,7 +34,7 @@ def test_over_free_ground_it_goes_straight_one_leg_far() -> None:
     leg = plan_leg(ground(), AT, GOAL, P)
     assert leg.verdict == "drive"
     assert np.abs(leg.path[:, 0]).max() < 1e-9
-    assert leg.path[-1, 1] == pytest.approx(P.length * ROVER.wheel_base, abs=1e-9)
+    assert leg.path[-1, 1] == pytest.approx(P.max_length * ROVER.wheel_base, abs=1e-9)
     assert leg.gear.tolist() == [1]
 
 
@@ -154,16 +154,16 @@ def test_it_does_not_look_where_its_wheels_have_no_room_to_turn() -> None:
 def test_it_looks_around_then_closes_what_stays_unknown_and_goes_another_way() -> None:
     risk = ground(((np.abs(Y - 0.15) < 0.07) & (X < 0.1), UNKNOWN))
     start, goal = (-0.3, 0.0, 0.0), (-0.3, 0.8)
-    for looks in range(P.looks):
+    for looks in range(P.max_looks):
         assert plan_leg(risk, start, goal, SEEN, PlannerMemory(looks)).verdict == "look"
     places: list[tuple[float, float]] = []
-    while (leg := plan_leg(risk, start, goal, SEEN, PlannerMemory(P.looks, places))).where is not None:
+    while (leg := plan_leg(risk, start, goal, SEEN, PlannerMemory(P.max_looks, places))).where is not None:
         places.append(leg.where)
         assert len(places) < 12
     assert leg.verdict in ("turn", "drive")
     over_unknown = leg.way[(leg.way[:, 1] > 0.04) & (leg.way[:, 1] < 0.26)]
     for place in places:
-        assert np.hypot(*(over_unknown - place).T).min() > P.vain * ROVER.wheel_base - LATTICE.cell
+        assert np.hypot(*(over_unknown - place).T).min() > P.failed_view_radius * ROVER.wheel_base - LATTICE.cell
 
 
 @settings(max_examples=25, deadline=None)
@@ -249,11 +249,11 @@ def test_of_a_kept_way_it_drives_what_is_known() -> None:
 
 def test_a_kept_way_is_not_given_up_for_rounding() -> None:
     beside = ground((X > 0.045, HAZARDOUS))  # the right wheels of a way straight ahead lack a part of the margin
-    straight, even = np.array([START, GOAL]), P.model_copy(update={"near_price": 0.0})
+    straight, even = np.array([START, GOAL]), P.model_copy(update={"proximity_cost": 0.0})
     for closed in ([], [(0.0, 0.25)]):
         leg = plan_leg(beside, AT, GOAL, even, PlannerMemory(closed=closed), before=(straight, AHEAD[:1]))
         assert leg.verdict == "drive"
-        assert leg.path == pytest.approx(np.array([START, (0.0, P.length * ROVER.wheel_base)]))
+        assert leg.path == pytest.approx(np.array([START, (0.0, P.max_length * ROVER.wheel_base)]))
     # but never onto what is hazardous by sigma alone
     risk = np.full(LATTICE.shape, SAFE, np.uint8)
     risk[Y > 0.15] = HAZARDOUS
@@ -301,10 +301,10 @@ def test_doubtful_ground_is_dear_where_it_will_not_be_seen_from_nearer() -> None
 def test_what_is_likely_a_hazard_is_gone_round_farther_than_what_is_unknown() -> None:
     wall, band = (X < 0.22) & (np.abs(Y - 0.4) < 0.03), np.abs(Y - 0.4) < 0.12
     risk = np.where(wall, np.uint8(HAZARDOUS), np.uint8(SAFE))
-    likely = Footing.of(Hazards(risk, None, np.where(wall, 0.7, 0.0).astype(np.float32)), LATTICE, ROVER, sure=0.9)
+    likely = Footing.of(Hazards(risk, None, np.where(wall, 0.7, 0.0).astype(np.float32)), LATTICE, ROVER, p_certain=0.9)
     assert plan_leg(likely, AT, GOAL, SEEN).way[:, 0].max() > 0.22
     assert plan_leg(ground((band & wall, UNKNOWN)), AT, GOAL, SEEN).way[:, 0].max() < 0.1
-    across = Footing.of(Hazards(risk, None, np.where(wall, 0.7, 0.0).astype(np.float32)), LATTICE, ROVER, sure=0.6)
+    across = Footing.of(Hazards(risk, None, np.where(wall, 0.7, 0.0).astype(np.float32)), LATTICE, ROVER, p_certain=0.6)
     assert plan_leg(across, AT, GOAL, SEEN).way[:, 0].max() > 0.22  # which is certain
 
 
@@ -348,8 +348,8 @@ def test_at_the_rim_of_what_is_near_only_what_is_clearly_free_from_afar_counts(c
 def test_unknown_ground_beside_the_vehicle_is_the_last_way_that_is_tried() -> None:
     # the way through leads over 0.14 m of it, the way round is longer by 0.1 m and turns by 1.3 rad
     hole = (np.abs(Y - 0.12) < 0.02) & (X < 0.12) & (X > -0.39)
-    cheap = P.model_copy(update={"unknown_price": 1.3})
-    through = plan_leg(ground((hole, UNKNOWN)), AT, GOAL, cheap.model_copy(update={"blind": 0.0}))
+    cheap = P.model_copy(update={"unknown_cost": 1.3})
+    through = plan_leg(ground((hole, UNKNOWN)), AT, GOAL, cheap.model_copy(update={"occluded_radius": 0.0}))
     assert np.abs(through.way[:, 0]).max() < 0.1
     assert plan_leg(ground((hole, UNKNOWN)), AT, GOAL, cheap).way[:, 0].max() > 0.12
 
@@ -359,14 +359,14 @@ def test_ground_seen_from_afar_alone_is_planned_over_rather_than_unseen_one_and_
     glanced = unknown & (np.abs(X - 0.25) < 0.1)
     free = np.full(LATTICE.shape, SAFE, np.uint8)
 
-    def planned(risk: np.ndarray, p: LegParams = SEEN) -> Leg:
+    def planned(risk: np.ndarray, p: LocalPlannerParams = SEEN) -> Leg:
         footing = Footing.of(Hazards(risk), LATTICE, ROVER, KnownGround(unknown, glanced))
         return plan_leg(footing, AT, GOAL, p)
 
     leg = planned(free)
     assert leg.path[-1, 1] + 0.5 * ROVER.wheel_base <= 0.155 - ROVER.margin
     assert leg.way[:, 0].max() > 0.15
-    dear = SEEN.model_copy(update={"glance_price": SEEN.unknown_price})
+    dear = SEEN.model_copy(update={"far_cost": SEEN.unknown_cost})
     assert planned(free, dear).way[:, 0].max() < 0.05
     wall = np.where(glanced & (np.abs(Y - 0.5) < 0.02), np.uint8(HAZARDOUS), free)
     assert planned(wall).way[:, 0].max() < 0.15
@@ -471,7 +471,7 @@ FIRST = np.array([(0.16, 0.34), (0.16, 0.4)])
 def test_a_leg_ends_facing_what_is_not_known_from_where_that_is_seen(y: float) -> None:
     leg = plan_leg(around_a_corner(), (0.0, y, 0.0), (0.35, 0.45), P, view=CAMERAS)
     assert leg.verdict == "drive"
-    assert np.hypot(*(leg.path[-1] - leg.path[0])) >= P.least * ROVER.wheel_base
+    assert np.hypot(*(leg.path[-1] - leg.path[0])) >= P.min_length * ROVER.wheel_base
     last = leg.path[-1] - leg.path[-2]
     end: Stand = (leg.path[-1, 0], leg.path[-1, 1], math.atan2(-last[0], last[1]) + leg.turn)
     assert CAMERAS.sees(FIRST, end).all()

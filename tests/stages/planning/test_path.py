@@ -107,7 +107,10 @@ def test_caution_ground_is_avoided_where_the_detour_is_short() -> None:
     risk[25:35, 12:24] = CAUTION
     found = {
         toll: describe(
-            find_path(maps(risk, z), lattice, SHORT, params=PathParams(caution=toll)), maps(risk, z), lattice, SHORT
+            find_path(maps(risk, z), lattice, SHORT, params=PathParams(caution_cost=toll)),
+            maps(risk, z),
+            lattice,
+            SHORT,
         )
         for toll in (0.0, 0.2)
     }
@@ -121,7 +124,7 @@ def test_ground_that_may_be_a_hazard_is_gone_round(chance: float, crossed: bool)
     given = maps(*level(lattice)) | {"p_hazard": np.zeros(lattice.shape, dtype=np.float32)}
     given["p_hazard"][25:36, 24:37] = chance
     ends = ((0.0, 0.1), (0.0, 0.5))
-    route = find_path(given, lattice, SHORT, ends=ends, params=PathParams(doubt=20.0))
+    route = find_path(given, lattice, SHORT, ends=ends, params=PathParams(uncertainty_cost=20.0))
     assert bool((given["p_hazard"][route.cells[:, 0], route.cells[:, 1]] == np.float32(chance)).all()) == crossed
     assert len(route.cells) > 30
 
@@ -133,8 +136,11 @@ def test_ground_that_is_probably_a_hazard_closes_the_way() -> None:
     ends = ((0.0, 0.1), (0.0, 0.5))
     closed = find_path(given, lattice, SHORT, ends=ends)
     assert not len(closed.cells)
-    assert "above path.sure 0.1 closes every way; without it one leads over ground of up to 0.2:" in closed.plan.reason
-    assert len(find_path(given, lattice, SHORT, ends=ends, params=PathParams(sure=0.2)).cells) > 30
+    assert (
+        "above path.p_certain_hazard 0.1 closes every path; without it one leads over ground of up to 0.2:"
+        in closed.plan.reason
+    )
+    assert len(find_path(given, lattice, SHORT, ends=ends, params=PathParams(p_certain_hazard=0.2)).cells) > 30
     given["risk"][30] = HAZARDOUS  # then it is not for what may be hazardous
     assert find_path(given, lattice, SHORT, ends=ends).doubt is None
 
@@ -144,7 +150,7 @@ def test_ground_that_is_probably_a_hazard_everywhere_is_a_warning_with_the_figur
     arrays = maps(*level(lattice)) | {"p_hazard": np.full(lattice.shape, 0.15, dtype=np.float32)}
     source = Bundle(arrays, {"lattice": lattice.to_dict(), "vehicle": SHORT.model_dump()})
     (line,) = STAGE.run(PathParams(), {}, {"risk": source}).meta["warnings"]
-    assert line.startswith("no path: ground with a p_hazard above path.sure 0.1 closes every way")
+    assert line.startswith("no path: ground with a p_hazard above path.p_certain_hazard 0.1 closes every path")
     assert "up to 0.15" in line
 
 

@@ -15,10 +15,10 @@ from rille.stages.geometry.epipolar import inverse_depth
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 from rille.stages.terrain import ground_frame as level_stage
 from rille.stages.terrain.ground import _singular_values
-from rille.stages.terrain.ground_frame import LevelParams, VerticalHint, level
+from rille.stages.terrain.ground_frame import GroundFrameParams, VerticalHint, level
 
 RIG = toed_in_rig()
-PARAMS = LevelParams()
+PARAMS = GroundFrameParams()
 PITCH, ROLL, HEIGHT = 18.0, 2.0, 0.18
 POSE = pitched(PITCH, ROLL)
 FLAT = disparity(RIG, POSE, plane(0.0, 0.0, -HEIGHT))

@@ -343,7 +343,7 @@ def bundles(rig: Rig, height: float, noise: np.random.Generator) -> dict[str, Bu
     arrays["backmatch_error"][:, :40] = 1.2
     inputs = {"disparity": Bundle(arrays, {}), "rig": Bundle({}, {"rig": rig.to_dict()})}
     up = T_LOCAL_LEFT.rotation[2].tolist()
-    level = level_stage.STAGE.run(level_stage.LevelParams(), {"up": up}, inputs)
+    level = level_stage.STAGE.run(level_stage.GroundFrameParams(), {"up": up}, inputs)
     return inputs | {"level": level, "left": Bundle({"level_0": IMAGE}, {})}
 
 

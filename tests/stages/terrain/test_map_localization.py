@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from raising import raises
 
 from rille.stages.geometry.lattice import Lattice
-from rille.stages.terrain.map_localization import GlobalFixParams, fix, thin
+from rille.stages.terrain.map_localization import MapLocalizationParams, fix, thin
 
 Floats = NDArray[np.float64]
 CELL = 0.04
@@ -48,7 +48,7 @@ def scene(ground: Callable[[Floats, Floats], Floats], noise: float = 0.0) -> tup
 
 
 def test_the_place_is_found_within_the_curvature_of_the_cells() -> None:
-    found = fix(*scene(hills), PRIOR, SIGMA, GlobalFixParams())
+    found = fix(*scene(hills), PRIOR, SIGMA, MapLocalizationParams())
     # bilinear cells of 40 mm on waves of at most 0.02 m and 13 / m differ from them by up to 0.02 (13 * 0.04)^2 / 8 m
     assert found.place[:2] == pytest.approx(TRUE[:2], abs=0.1 * CELL)
     assert found.place[2] == pytest.approx(TRUE[2], abs=math.radians(0.5))
@@ -57,38 +57,38 @@ def test_the_place_is_found_within_the_curvature_of_the_cells() -> None:
 
 
 def test_errors_are_of_the_size_that_the_covariance_claims() -> None:
-    found = fix(*scene(hills, noise=0.003), PRIOR, SIGMA, GlobalFixParams())
+    found = fix(*scene(hills, noise=0.003), PRIOR, SIGMA, MapLocalizationParams())
     error = found.place - TRUE
     assert error @ np.linalg.solve(found.covariance, error) < 18.5  # chi2 of 4, 0.1 %
     assert math.sqrt(found.covariance[0, 0]) < 0.25 * CELL
 
 
 def test_ground_that_repeats_is_ambiguous() -> None:
-    repeated = fix(*scene(ridges), PRIOR, SIGMA, GlobalFixParams())
-    unique = fix(*scene(hills), PRIOR, SIGMA, GlobalFixParams())
+    repeated = fix(*scene(ridges), PRIOR, SIGMA, MapLocalizationParams())
+    unique = fix(*scene(hills), PRIOR, SIGMA, MapLocalizationParams())
     assert repeated.other is not None
-    assert repeated.other[1] < GlobalFixParams().ambiguous
+    assert repeated.other[1] < MapLocalizationParams().min_chi2_gap
     periods = (repeated.other[0][0] - repeated.place[0]) / 0.16
     assert periods == pytest.approx(round(periods), abs=CELL / 0.16)
     assert round(periods) != 0
-    assert unique.other is None or unique.other[1] > GlobalFixParams().ambiguous
+    assert unique.other is None or unique.other[1] > MapLocalizationParams().min_chi2_gap
 
 
 def test_a_map_elsewhere_is_refused_with_the_share_that_it_knows() -> None:
     points, ground, whole = scene(hills)
     with raises("RIL-338", "50%"):
-        fix(points, ground, whole, (5.0, 5.0, 0.0), SIGMA, GlobalFixParams())
+        fix(points, ground, whole, (5.0, 5.0, 0.0), SIGMA, MapLocalizationParams())
     ground[:, : whole.cols // 2 + 5] = np.nan
     with raises("RIL-338"):
-        fix(points, ground, whole, (-0.6, -0.2, 0.0), SIGMA, GlobalFixParams())
+        fix(points, ground, whole, (-0.6, -0.2, 0.0), SIGMA, MapLocalizationParams())
 
 
 def test_flat_ground_tells_no_place() -> None:
     with raises("RIL-339"):
-        fix(*scene(lambda x, y: 0.0 * x), PRIOR, SIGMA, GlobalFixParams())
+        fix(*scene(lambda x, y: 0.0 * x), PRIOR, SIGMA, MapLocalizationParams())
 
 
 def test_a_handful_of_cells_is_no_model() -> None:
     points, ground, whole = scene(hills)
     with raises("RIL-337"):
-        fix(points[:5], ground, whole, PRIOR, SIGMA, GlobalFixParams())
+        fix(points[:5], ground, whole, PRIOR, SIGMA, MapLocalizationParams())

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from rille.stages.core.declare import Bundle
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.lattice import Lattice
-from rille.stages.terrain.occlusion_bounds import STAGE, CeilingParams, ceiling
+from rille.stages.terrain.occlusion_bounds import STAGE, OcclusionBoundsParams, ceiling
 
 LATTICE = Lattice.snap((-0.2, 0.2, 0.0, 0.8), 0.004)
 X, Y = LATTICE.xy()[..., 0], LATTICE.xy()[..., 1]
@@ -93,7 +93,7 @@ def test_raising_what_was_seen_never_lowers_a_bound(seed: int) -> None:
     assert (after[bounded] >= before[bounded]).all()
 
 
-def run(params: CeilingParams, *dems: Bundle) -> Bundle:
+def run(params: OcclusionBoundsParams, *dems: Bundle) -> Bundle:
     merged = np.asarray(dems[0]["elevation"])
     arrays = {"elevation": merged, "relief_std": np.where(np.isnan(merged), np.nan, 0.001).astype(np.float32)}
     return STAGE.run(params, {}, {"merged": Bundle(arrays, {"lattice": LATTICE.to_dict()}), "dems": list(dems)})
@@ -109,7 +109,7 @@ def model(seen: np.ndarray, height: float = HEIGHT) -> Bundle:
 def test_the_stage_adds_standard_deviations_and_takes_the_least_of_several_models() -> None:
     _, seen = wall()
     low, hidden = model(seen, 0.12), np.isnan(seen) & (np.abs(X) < 0.4 * Y)
-    found = run(CeilingParams(), model(seen))
+    found = run(OcclusionBoundsParams(), model(seen))
     upper, lower = np.asarray(found["upper"]), np.asarray(found["lower"])
     known = ~np.isnan(seen)
     assert upper[known] == pytest.approx(seen[known] + 1.25 * 0.001, abs=1e-6)
@@ -118,16 +118,16 @@ def test_the_stage_adds_standard_deviations_and_takes_the_least_of_several_model
     exact = ceiling(seen, LATTICE, CENTRE)[hidden]
     assert (upper[hidden] > exact).all()
     assert upper[hidden] == pytest.approx(exact + 1.25 * 0.002, abs=0.001)
-    alone = np.asarray(run(CeilingParams(), low)["upper"])
+    alone = np.asarray(run(OcclusionBoundsParams(), low)["upper"])
     assert (alone[hidden] < upper[hidden]).any()
     for models in ((model(seen), low), (low, model(seen))):
-        both = np.asarray(run(CeilingParams(), *models)["upper"])
+        both = np.asarray(run(OcclusionBoundsParams(), *models)["upper"])
         assert both[hidden] == pytest.approx(np.fmin(upper, alone)[hidden])
 
 
 def test_no_line_is_drawn_to_what_was_seen_too_coarsely() -> None:
     _, seen = wall()
-    coarse = run(CeilingParams(max_footprint=0.003), model(seen))
+    coarse = run(OcclusionBoundsParams(max_footprint=0.003), model(seen))
     assert np.isnan(np.asarray(coarse["upper"])[np.isnan(seen)]).all()
     assert coarse.meta["shares"]["bounded"] == 0.0
-    assert run(CeilingParams(max_footprint=0.1), model(seen)).meta["shares"]["bounded"] > 0.01
+    assert run(OcclusionBoundsParams(max_footprint=0.1), model(seen)).meta["shares"]["bounded"] > 0.01

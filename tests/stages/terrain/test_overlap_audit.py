@@ -13,7 +13,7 @@ from rille.stages.core.declare import Bundle, NoParams, check_outputs
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.terrain import overlap_audit as audit_stage
 from rille.stages.terrain import overlap_qa as seam_stage
-from rille.stages.terrain.overlap_audit import SeamAuditParams
+from rille.stages.terrain.overlap_audit import OverlapAuditParams
 
 PLANTED = 12
 
@@ -26,7 +26,7 @@ def audited(dems: dict[int, Bundle]) -> tuple[list[Bundle], dict]:
         check_outputs(seam_stage.STAGE, seams[-1])
         json.dumps(seams[-1].meta, allow_nan=False)
     centres = {str(p): Lattice.from_dict(b.meta["lattice"]).xy().mean(axis=(0, 1)).tolist() for p, b in dems.items()}
-    found = audit_stage.STAGE.run(SeamAuditParams(), {"centres": centres}, {"seams": seams})
+    found = audit_stage.STAGE.run(OverlapAuditParams(), {"centres": centres}, {"seams": seams})
     json.dumps(found.meta, allow_nan=False)
     return seams, dict(found.meta)
 

@@ -1,4 +1,4 @@
-"""Trials of the reflex: a stone as high as a wheel's radius is laid on a leg after its ground was mapped."""
+"""Trials of the obstacle monitor: a stone as high as a wheel's radius is laid on a leg after its ground was mapped."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def settings_of(k: int) -> list[str]:
     ahead, aside = 0.24 + 0.10 * rng.random(), 0.05 * (2 * rng.random() - 1)
     return [
         f"mockup.seed={100 + k}", f"rover.seed={100 + k}", "mockup.rock_cover=0.03", "rover.obstacle_leg=0",
-        f"rover.obstacle_ahead={ahead:.4f}", f"rover.obstacle_aside={aside:.4f}", "leg.length=3.0",
+        f"rover.obstacle_ahead={ahead:.4f}", f"rover.obstacle_aside={aside:.4f}", "local_planner.max_length=3.0",
         "mockup.bed_width=1.0", "mockup.bed_length=1.2", "drive.goal=[0.0, 0.5]", "drive.around=0.35", "rover.pad=0.2",
     ]  # fmt: skip
 
@@ -41,7 +41,7 @@ def trial(settings: list[str]) -> dict[str, Any]:
 
     begin = time.perf_counter()
     sequence, layers = prepared(settings)
-    graph, folder = Graph(), Path(tempfile.mkdtemp(prefix="reflex-"))
+    graph, folder = Graph(), Path(tempfile.mkdtemp(prefix="obstacles-"))
     try:
         store = at(folder)
         flow = OneLeg(graph, sequence, config_of(layers))
@@ -74,7 +74,7 @@ def stone(flow: Any, store: Any) -> dict[str, Any]:
     return {
         "obstacle": {
             "would_touch": contact is not None,
-            "seen": stop.event.startswith("reflex"),
+            "seen": stop.event.startswith("obstacle stop"),
             "away_when_stopped": None if contact is None else float(way[contact] - way[stopped]),
             "way": float(way[stopped]),
         }
@@ -82,7 +82,7 @@ def stone(flow: Any, store: Any) -> dict[str, Any]:
 
 
 def trials(rows: list[dict[str, Any]]) -> list[str]:
-    """The trials of the reflex."""
+    """The trials of the obstacle monitor."""
     told = [r["obstacle"] for r in rows if "obstacle" in r and r["obstacle"]["would_touch"]]
     seen = [o for o in told if o["seen"] and o["away_when_stopped"] > 0]
     clear = [r["obstacle"] for r in rows if "obstacle" in r and not r["obstacle"]["would_touch"]]
