@@ -19,6 +19,7 @@ from rille.stages.hfvm import tiled
 from rille.stages.hfvm.coarse_to_fine import hierarchy
 from rille.stages.hfvm.coarse_to_fine.hierarchy import Band, Map, Prepared, State
 from rille.stages.hfvm.finish.finish import Finish
+from rille.stages.hfvm.images import brightness
 from rille.stages.hfvm.images.params import HfvmParams
 from rille.stages.hfvm.images.views import Aligned, Plain, View
 from rille.stages.hfvm.images.window import Mosaic, Results, Shape, Window, tiles
@@ -68,7 +69,7 @@ class Agreeing:
 
 @dataclass(frozen=True)
 class TileInputs:
-    """The inputs of one task, opened."""
+    """The inputs of one task, opened; the right image in the left one's brightness, as far as that is known."""
 
     params: HfvmParams
     args: Mapping[str, Any]
@@ -81,6 +82,8 @@ class TileInputs:
     def of(params: HfvmParams, args: Mapping[str, Any], inputs: Inputs) -> TileInputs:
         """Open what a task has been given."""
         left, right, half = views(inputs, params)
+        ratio = inputs["coarse"].meta["ratio"] if "coarse" in inputs else None
+        right = brightness.levelled(right, None if ratio is None else np.array(ratio))
         return TileInputs(tiled.halved_params(params) if half else params, args, inputs, left, right, half)
 
     @property
@@ -184,6 +187,7 @@ def _coarse(task: TileInputs) -> Bundle:
         "aligned": found.alignment is not None,
         "blank": found.aligned.blank if found.aligned else 0.0,
         "contrast": float(found.contrast),
+        "ratio": None if found.ratio is None else found.ratio.tolist(),
     }
     return Bundle(arrays, meta | told(s))
 

@@ -12,17 +12,18 @@ Tiles are matched in any order and of any size with the same result, bit for bit
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import AnyArray
 from rille.stages.core.validity import matched
 from rille.stages.hfvm.coarse_to_fine import accurate, hierarchy, start
 from rille.stages.hfvm.coarse_to_fine.hierarchy import Prepared, State
 from rille.stages.hfvm.finish import refine
 from rille.stages.hfvm.finish.finish import Finish
-from rille.stages.hfvm.images import plane, resample, viewpoint
+from rille.stages.hfvm.images import brightness, plane, resample, viewpoint
 from rille.stages.hfvm.images.params import HfvmParams
 from rille.stages.hfvm.images.views import Aligned, Plain, Seen, View
 from rille.stages.hfvm.images.window import Raster, Results, Shape, Window, cut, gather, tiles, whole
@@ -41,6 +42,9 @@ hands it out again; else each array of a match comes as fresh pages, and those c
 FEW = 0.35
 """Share of consistent pixels below which the images may be turned: chance alone makes up to .23 of them so."""
 
+MANY, AGAIN = 0.85, 2
+"""Share of consistent pixels from which on no other brightness is tried, and how often matches correct it."""
+
 Order = Callable[[list[Window]], list[Window]]
 
 
@@ -54,12 +58,14 @@ class Found:
 
 @dataclass(frozen=True)
 class Coarse:
-    """What the coarse levels decide: their maps, and the plane that the right image is aligned by, if it is."""
+    """What the coarse levels decide: their maps, the plane that the right image is aligned by, if it is, and the ratio
+    of brightness that is undone in it, if one is."""
 
     state: State
     alignment: plane.Matrix | None
     aligned: Aligned | None
     contrast: float
+    ratio: Floats | None = None
 
 
 def is_whole(params: HfvmParams) -> bool:
@@ -90,23 +96,57 @@ def coarse(left: View, right: View, params: HfvmParams, side: int | None, prior:
     """Match down to ``plane_level``; where a plane explains what is found, align the right image and match anew.
 
     Where little is found, keypoints may tell how the images are turned or scaled; what then matches more is kept.
+    Where brightness differs smoothly, that is undone first.
     """
-    pair = prepare(left, right, params, side)
-    state = start.impose(pair, hierarchy.run(pair, params, params.plane_level), prior)
-    found = Coarse(state, None, None, contrast(pair, state))
+    pair, state, ratio = _levelled(left, right, params, side)
+    right = brightness.levelled(right, ratio)
+    state = start.impose(pair, state, prior)
+    found = Coarse(state, None, None, contrast(pair, state), ratio)
     if params.preset == "paper":
         return found
     s = hierarchy.sample(pair, state)
     h = plane.find(s.places, s.u, s.v, state.level, left.shapes, params)
     if h is not None:
-        return _along(left, right, params, side, h, state.near_sign, prior)
+        return replace(_along(left, right, params, side, h, state.near_sign, prior), ratio=ratio)
     if not params.turned or prior is not None or share(state) > FEW:
         return found
     h = viewpoint.find(left, right)
     if h is None:
         return found
     turned = _along(left, right, params, side, h)
-    return turned if share(turned.state) > share(state) else found
+    return replace(turned, ratio=ratio) if share(turned.state) > share(state) else found
+
+
+def _levelled(left: View, right: View, params: HfvmParams, side: int | None) -> tuple[Prepared, State, Floats | None]:
+    """Coarse levels, and the ratio of brightness that is undone in them; None: none is."""
+    pair = prepare(left, right, params, side)
+    top = hierarchy.run(pair, params, params.plane_level + 1)
+    ratio: Floats | None = None
+    if params.preset == "paper":
+        return pair, _down(pair, params, top), None
+    if share(top) < MANY:
+        guess = brightness.guess(left, right, top.level)
+        if brightness.greatest(guess) > brightness.NOTABLE:
+            other = prepare(left, brightness.levelled(right, guess), params, side)
+            found = hierarchy.run(other, params, params.plane_level + 1)
+            if share(found) > share(top):
+                pair, top, ratio = other, found, guess
+    state = _down(pair, params, top)
+    for _ in range(AGAIN):
+        told = brightness.matched(left, right, state.level, state.left.u, state.left.v, state.left_ok)
+        if told is None or brightness.greatest(told - (0.0 if ratio is None else ratio)) <= brightness.NOTABLE:
+            break
+        other = prepare(left, brightness.levelled(right, told), params, side)
+        found = hierarchy.run(other, params, params.plane_level)
+        if share(found) < share(state):
+            break
+        pair, state, ratio = other, found, told
+    return pair, state, ratio
+
+
+def _down(pair: Prepared, params: HfvmParams, state: State) -> State:
+    """The state of ``plane_level``, where that is below."""
+    return hierarchy.run(pair, params, params.plane_level, state) if state.level > params.plane_level else state
 
 
 def _along(
@@ -154,6 +194,7 @@ def match(
     tell(0.0, "features")
     a, b = left.quiet(params), right.quiet(params)
     begun = coarse(a, b, params, side, prior)
+    b = brightness.levelled(b, begun.ratio)
     pair = prepare(a, begun.aligned or b, params, side)
     state = begun.state
     band = state.band

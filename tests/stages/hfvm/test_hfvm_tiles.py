@@ -52,6 +52,14 @@ def noisy():
     return left, right
 
 
+def vignetted():
+    """Weak texture, and a right image that is dark in its corners, which is undone."""
+    left, right, *_ = pair(lambda x, y: (-9 + 4 * np.sin(x / 30) * np.cos(y / 25), 0 * x), (150, 211))
+    y, x = (np.linspace(-1, 1, n) for n in right.shape)
+    left, right = (120 + 0.3 * (a - 128) for a in (left, right))
+    return left, right * (1 - 0.3 * (x**2 + y[:, None] ** 2))
+
+
 def both(scene):
     return [Plain.of(build(image, PyramidParams())) for image in scene()]
 
@@ -61,7 +69,10 @@ def in_tiles(views, params, side, seed):
     return tiled.match(*views, params, None, quiet, side, lambda windows: shuffle.sample(windows, len(windows)))
 
 
-@pytest.mark.parametrize(("scene", "aligned"), [(misaligned, False), (sheared, True), (turned, True), (noisy, False)])
+@pytest.mark.parametrize(
+    ("scene", "aligned"),
+    [(misaligned, False), (sheared, True), (turned, True), (noisy, False), (vignetted, False)],
+)
 @pytest.mark.parametrize("preset", ["default", "fast", "paper"])
 def test_tiles_of_any_size_and_order_give_the_bits_of_the_whole(scene, aligned, preset):
     views, params = both(scene), HfvmParams(preset=preset)

@@ -1,0 +1,136 @@
+"""Smooth ratio of the brightness of two images (vignetting, exposure), found coarsely and undone in the right one.
+
+Matches follow the gradient of brightness where texture is weak; where one image has another such gradient, they follow
+it astray. The logarithm of the ratio, left over right, is a polynomial of the place in the right image. It is fitted to
+the grey values of matches of a coarse level, and before there are any to those of either image as a whole, which show
+nearly the same scene: a guess that only counts where more matches are found with it than without.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rille.stages.core.arrays import Floats
+from rille.stages.core.declare import AnyArray
+from rille.stages.hfvm.images.views import View
+from rille.stages.hfvm.images.window import Raster, Shape, Window, pick, thinned, whole
+from rille.stages.hfvm.level.epipolar import residuals, typical, weighted_normal
+
+SAMPLES, LEAST = 4000, 100
+"""Pixels that a polynomial is fitted to at most, and that it needs at least."""
+
+DARK, SATURATED = 4.0, 250.0
+"""Grey levels between which pixels tell of brightness."""
+
+SCATTER, ITERATIONS = 0.05, 8
+"""Least scatter of the logarithms of matched grey values, and steps of the robust fit."""
+
+NOTABLE = 0.1
+"""Logarithm of a ratio that is worth undoing somewhere in the image."""
+
+
+def terms(x: AnyArray, y: AnyArray, level: int, shape: Shape) -> Floats:
+    """Terms (7, ...) of the polynomial at pixels of a level of an image of ``shape`` (level 0).
+
+    1, x, y, x^2, xy, y^2 and (x^2 + y^2)^2, in half sides from the middle.
+    """
+    k = 2.0**level
+    p = ((x + 0.5) * k) / (0.5 * shape[1]) - 1.0
+    q = ((y + 0.5) * k) / (0.5 * shape[0]) - 1.0
+    p, q = np.broadcast_arrays(p, q)
+    return np.stack([np.ones_like(p), p, q, p * p, p * q, q * q, (p * p + q * q) ** 2])
+
+
+@dataclass(frozen=True)
+class Levelled:
+    """A view whose brightness is multiplied by the exponential of a polynomial (:func:`terms`)."""
+
+    view: View
+    ratio: Floats
+
+    @property
+    def shapes(self) -> tuple[Shape, ...]:
+        """Rows and columns of each level."""
+        return tuple(self.view.shapes)
+
+    @property
+    def blank(self) -> float:
+        """Grey level where no level is valid."""
+        return self.view.blank
+
+    @property
+    def kept_noise(self) -> float:
+        """That of the view: noise grows as the signal does."""
+        return self.view.kept_noise
+
+    def grey(self, level: int, window: Window) -> AnyArray:
+        """Grey values, 0 where masked."""
+        return self.view.grey(level, window) * self._factor(level, window)
+
+    def valid(self, level: int, window: Window) -> AnyArray:
+        """Mask."""
+        return self.view.valid(level, window)
+
+    def filled(self, level: int, window: Window) -> AnyArray:
+        """Grey values, those of masked pixels from above."""
+        return self.view.filled(level, window) * self._factor(level, window)
+
+    def _factor(self, level: int, window: Window) -> AnyArray:
+        y, x = np.arange(window.y0, window.y1)[:, None], np.arange(window.x0, window.x1)
+        shape, g = self.shapes[0], self.ratio
+        p, q = terms(x, 0 * x, level, shape)[1], terms(0 * y, y, level, shape)[2]
+        # Horner's form, a row of terms each: seven planes of the whole image would take longer than all else.
+        radial = (p * p + q * q).astype(np.float32)
+        found = (g[0] + p * (g[1] + g[3] * p)).astype(np.float32) + (q * (g[2] + g[5] * q)).astype(np.float32)
+        found += np.float32(g[4]) * (p.astype(np.float32) * q.astype(np.float32)) + np.float32(g[6]) * radial * radial
+        return np.asarray(np.exp(found))
+
+
+def levelled(view: View, ratio: Floats | None) -> View:
+    """The view with the ratio undone, if there is one."""
+    return view if ratio is None else Levelled(view, ratio)
+
+
+def guess(left: View, right: View, level: int) -> Floats:
+    """Ratio of the polynomials that either image's own brightness follows at a level; zeros of dark or tiny images."""
+    found = []
+    for view in (left, right):
+        window = whole(view.shapes[level])
+        grey, valid = view.grey(level, window), view.valid(level, window)
+        y, x = np.nonzero((valid != 0) & (grey > DARK))
+        if len(y) < LEAST:
+            return np.zeros(7)
+        found.append(_fit(terms(x, y, level, view.shapes[0]), np.log(grey[y, x].astype(np.float64))))
+    return found[0] - found[1]
+
+
+def matched(left: View, right: View, level: int, u: Raster, v: Raster, ok: Raster) -> Floats | None:
+    """Ratio of the grey values of the consistent matches of a level; None where they are too few."""
+    places = thinned(ok, SAMPLES, lambda a: a != 0)
+    y, x = np.divmod(places, ok.shape[1])
+    p, q = x + pick(u, y, x).astype(np.int64), y + pick(v, y, x).astype(np.int64)
+    a, b = left.grey(level, whole(left.shapes[level]))[y, x], right.grey(level, whole(right.shapes[level]))[q, p]
+    good = (np.minimum(a, b) > DARK) & (np.maximum(a, b) < SATURATED)
+    if np.count_nonzero(good) < LEAST:
+        return None
+    ratio = np.log(a[good].astype(np.float64) / b[good])
+    return _fit(terms(p[good], q[good], level, right.shapes[0]), ratio)
+
+
+def _fit(basis: Floats, target: Floats) -> Floats:
+    """Factors of the terms, by Cauchy weights; weakly held at zero."""
+    g, weight = np.zeros(len(basis)), np.ones(target.size)
+    for _ in range(ITERATIONS):
+        normal, side = weighted_normal(basis, target, weight)
+        g = np.linalg.solve(normal + 1e-3 * target.size * np.eye(len(basis)) + 1e-9 * np.eye(len(basis)), side)
+        off = residuals(basis, target, -g)
+        weight = 1.0 / (1.0 + (off / max(SCATTER, 1.5 * typical(off))) ** 2)
+    return g
+
+
+def greatest(ratio: Floats) -> float:
+    """Greatest logarithm, either way, in the image."""
+    side = np.linspace(0, 1, 9)
+    return float(np.abs(np.tensordot(ratio, terms(side * 9 - 0.5, (side * 9 - 0.5)[:, None], 0, (9, 9)), 1)).max())

@@ -1,0 +1,98 @@
+"""Brightness that differs smoothly between the images: found, undone, and without effect on what is matched."""
+
+import numpy as np
+import pytest
+from matching_scenes import pair, seen
+
+from rille.stages.core.validity import matched
+from rille.stages.hfvm.images import brightness
+from rille.stages.hfvm.images.params import HfvmParams
+from rille.stages.hfvm.images.views import Plain
+from rille.stages.hfvm.images.window import Window
+from rille.stages.hfvm.stage import match
+from rille.stages.imaging.pyramid import PyramidParams, build
+
+SHAPE = (160, 220)
+RATIO = np.array([0.2, -0.1, 0.15, 0.3, -0.05, 0.2, 0.04])
+
+
+def view(image):
+    return Plain.of(build(image, PyramidParams()))
+
+
+def logarithm(shape, level=0):
+    y, x = np.indices(shape)
+    return np.tensordot(RATIO, brightness.terms(x, y, level, SHAPE), 1)
+
+
+def corners(x, y):
+    """Brightness that falls to 0.4 in the corners."""
+    p, q = 2 * x / (SHAPE[1] - 1) - 1, 2 * y / (SHAPE[0] - 1) - 1
+    return 1 - 0.3 * (p * p + q * q)
+
+
+def test_terms_mean_the_same_place_on_each_level():
+    x = np.array([0.0, 20.0, 54.0])
+    fine = brightness.terms(4 * x + 1.5, 4 * x + 1.5, 0, SHAPE)
+    np.testing.assert_allclose(brightness.terms(x, x, 2, SHAPE), fine, atol=1e-12)
+
+
+@pytest.mark.parametrize("level", [0, 2])
+def test_levelled_view_is_multiplied_by_the_exponential(level):
+    plain = view(np.random.default_rng(0).uniform(10, 200, SHAPE).astype(np.float32))
+    found = brightness.levelled(plain, RATIO)
+    window = Window(3, 30, 5, 41)
+    expected = plain.grey(level, window) * np.exp(logarithm(plain.shapes[level], level))[window.slices]
+    np.testing.assert_allclose(found.grey(level, window), expected, rtol=1e-5)
+    np.testing.assert_allclose(found.filled(level, window), expected, rtol=1e-5)
+    assert brightness.levelled(plain, None) is plain
+
+
+def test_matches_tell_the_ratio_though_a_third_is_wrong():
+    rng = np.random.default_rng(1)
+    left = rng.uniform(60, 120, SHAPE).astype(np.float32)
+    right = left / np.exp(logarithm(SHAPE)).astype(np.float32)
+    u = np.where(rng.random(SHAPE) < 1 / 3, 7, 0).astype(np.int16)
+    ok = np.arange(SHAPE[1]) < SHAPE[1] - 7
+    nothing = np.zeros(SHAPE, np.int16)
+    found = brightness.matched(view(left), view(right), 0, u, nothing, np.broadcast_to(ok, SHAPE).copy())
+    y, x = np.indices(SHAPE)
+    # a wrong match errs by .28 in the mean of squares; held down by the robust fit and by 2600 others
+    off = np.tensordot(found - RATIO, brightness.terms(x, y, 0, SHAPE), 1)
+    assert np.abs(off).mean() < 0.02
+    assert brightness.matched(view(left), view(right), 0, u, nothing, np.zeros(SHAPE, bool)) is None
+
+
+def test_guess_of_one_scene_in_two_lights():
+    left = np.random.default_rng(2).uniform(60, 120, SHAPE).astype(np.float32)
+    right = left / np.exp(logarithm(SHAPE)).astype(np.float32)
+    found = brightness.guess(view(left), view(right), 2)
+    assert brightness.greatest(found - RATIO) < 0.1 < brightness.greatest(RATIO)
+
+
+@pytest.mark.parametrize("preset", ["default", "fast"])
+def test_dark_corners_of_one_image_cost_no_matches(preset):
+    """Texture weaker than the brightness that falls to 0.4: what is matched stays as it is without."""
+    left, right, u, v = pair(lambda x, y: (-12 + 3 * np.sin(x / 40), 0 * x), SHAPE)
+    left, right = (120 + 0.3 * (image - 128) for image in (left, right))
+    y, x = np.indices(SHAPE)
+    both = seen(u, v, SHAPE, 12)
+    shares = []
+    for image in (right, right * corners(x, y)):
+        found = match(left, image, HfvmParams(preset=preset))
+        error = np.hypot(found.column_disparity - u, found.row_disparity - v)
+        shares.append(np.mean((matched(found.validity) & (error < 1))[both]))
+    assert shares[0] > 0.9
+    assert shares[1] > shares[0] - 0.03
+
+
+def test_equal_light_is_left_alone():
+    left, right, *_ = pair(lambda x, y: (-12 + 3 * np.sin(x / 40), 0 * x), SHAPE)
+    views = view(left), view(right)
+    level = 2
+    shape = views[0].shapes[level]
+    u = np.full(shape, -3, np.int16)
+    ok = np.zeros(shape, bool)
+    ok[:, 6:] = True
+    found = brightness.matched(*views, level, u, np.zeros(shape, np.int16), ok)
+    assert brightness.greatest(found) < brightness.NOTABLE
