@@ -21,20 +21,6 @@ STEPS = ((STRAIGHT, -1, 0), (RIGHT, -1, 1), (ACROSS, 0, 1), (LEFT, -1, -1))
 """Bit, row and column of one step in each direction."""
 
 
-def widened(mask: Bools, half_length: float, half_width: float, step: tuple[int, int]) -> Bools:
-    """Cells from which a rectangle that is aligned with ``step`` (row, col) and centred there touches the mask.
-
-    What lies outside counts as in the mask.
-
-    Parameters
-    ----------
-    half_length, half_width : cells, of the rectangle along and across the step.
-    """
-    canvas = Canvas.of(mask, _reach(half_length, half_width, step), outside=True)
-    _widen(canvas, half_length, half_width, step)
-    return canvas.mask()
-
-
 def _sides(half_length: float, half_width: float, step: tuple[int, int]) -> list[int]:
     """Steps along and across that cover a rectangle."""
     # A size that is a whole number of steps may come out a rounding above it, and must not grow by a step.
@@ -47,7 +33,10 @@ def _reach(half_length: float, half_width: float, step: tuple[int, int]) -> int:
 
 
 def _widen(canvas: Canvas, half_length: float, half_width: float, step: tuple[int, int]) -> None:
-    """:func:`widened` on a canvas."""
+    """Set the cells from which a rectangle that is aligned with ``step`` (row, col) and centred there touches the mask.
+
+    ``half_length``, ``half_width``: cells, of the rectangle along and across the step.
+    """
     along, across = step, (step[1], -step[0])
     for n, (dr, dc) in zip(_sides(half_length, half_width, step), (along, across), strict=True):
         canvas.spread(n, dr, dc)
@@ -56,15 +45,8 @@ def _widen(canvas: Canvas, half_length: float, half_width: float, step: tuple[in
         canvas.spread(1, 0, 1)
 
 
-def grown(mask: Bools, reach: float) -> Bools:
-    """Cells within ``reach`` cells of the mask: an octagon, nowhere smaller than the circle."""
-    canvas = Canvas.of(mask, math.ceil(reach - 1e-9))
-    _grow(canvas, reach)
-    return canvas.mask()
-
-
 def _grow(canvas: Canvas, reach: float) -> None:
-    """:func:`grown` on a canvas with a border of at least that."""
+    """Set the cells within ``reach`` cells (at most the border) of the mask: an octagon that holds the circle."""
     # Rounded up: a margin that is a fraction of a cell too wide closes a way, one too narrow touches a hazard.
     side, diagonal = octagon(math.ceil(reach - 1e-9))
     for n, dr, dc in ((side, 0, 1), (side, 1, 0), (diagonal, 1, 1), (diagonal, 1, -1)):

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from cahvore_camera import Cahvore
 from raising import raises
 
 from rille.datasets.cameras import UNKNOWN_SIZE, read_cameras, rig_of
-from rille.stages.geometry.cahvore import Bending, Cahvore
+from rille.stages.geometry.cahvore import Bending
 from rille.stages.geometry.lens import Lens
 
 A = np.array([0.9990, 0.0100, -0.0436]) / np.linalg.norm([0.9990, 0.0100, -0.0436])

@@ -6,9 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cahvore_camera import Cahvore
 from scipy.optimize import brentq
 
-from rille.stages.geometry.cahvore import Bending, Cahvore
+from rille.stages.geometry.cahvore import Bending
 
 ORACLE = Path(__file__).parent / "cahvore_pixels.npz"
 """Pixels of :func:`points` by cycahvore 0.0.1a0, which wraps ``cmod_cahvore_3d_to_2d`` of JPL's VICAR."""

@@ -10,9 +10,23 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from vehicles import SHORT
 
-from rille.stages.planning.configuration_space import ACROSS, STEPS, STRAIGHT, FreePlaces, grown, widened
+from rille.stages.numeric.packed import Canvas
+from rille.stages.planning.configuration_space import ACROSS, STEPS, STRAIGHT, FreePlaces, _grow, _reach, _widen
 
 CELL = 0.01
+
+
+def widened(mask: np.ndarray, length: float, width: float, step: tuple[int, int]) -> np.ndarray:
+    """The mask widened by a rectangle; what lies outside counts as in the mask."""
+    canvas = Canvas.of(mask, _reach(length, width, step), outside=True)
+    _widen(canvas, length, width, step)
+    return canvas.mask()
+
+
+def grown(mask: np.ndarray, reach: float) -> np.ndarray:
+    canvas = Canvas.of(mask, math.ceil(reach - 1e-9))
+    _grow(canvas, reach)
+    return canvas.mask()
 
 
 @pytest.mark.parametrize("step", [(-1, 0), (0, 1), (-1, 1), (-1, -1)])
