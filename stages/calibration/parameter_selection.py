@@ -43,14 +43,14 @@ from rille.stages.geometry.geometry import Rig
 ANGLES = 3
 
 UNLIKELY = 2.0
-"""Sigmas at which a principal point that is off does no longer explain what an angle would."""
+"""Size of an angle, in standard deviations, from which on a wrong principal point does not explain it."""
 
 BEYOND = 1.0
 BEYOND_SHARE = 0.1
-"""Share of matches more than ``BEYOND`` pixels beyond infinity that shows wrong depth; in the sky there are fewer."""
+"""Share of matches more than ``BEYOND`` pixels beyond infinity from which on depth is wrong; a sky has fewer."""
 
 BEYOND_LEFT = 0.03
-"""Share of them that may remain with what explains the others."""
+"""Largest share of matches beyond infinity that may remain after a correction that explains the others."""
 
 ROUNDS = 3
 

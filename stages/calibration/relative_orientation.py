@@ -41,17 +41,17 @@ PARTNERS = ((NAMES.index("yaw"), 0), (NAMES.index("pitch"), 1))
 """Angles, and the coordinate of the principal point that looks like each."""
 
 NO_SHIFT = 1e-3
-"""Pixels: deviation of a principal point that is taken as given."""
+"""Standard deviation [pixels] of a principal point that is held as given."""
 
 EXACT = 1e-7
-"""Radians: deviation of a parameter that is held exactly."""
+"""Standard deviation [rad] of a parameter that is held exactly."""
 
 LEAST_SMOOTH = 1e-3
-"""Pixels: deviation of a term of the smooth error, at least."""
+"""Smallest standard deviation [pixels] of a term of the smooth error."""
 
 LEAST_MATCHES = 50
 LEAST_NOISE = 0.02
-"""Pixels: no match is better."""
+"""Smallest standard deviation [pixels] of a match."""
 
 BLOCKS = 6
 """Blocks along either side of the image whose means show how far errors of neighbours go together."""
@@ -60,9 +60,9 @@ ITERATIONS = 30
 INNER = 10
 """Rounds for the smooth error's size between two passes over the matches."""
 LINEAR = 1e-3
-"""Radians: corrections nearer than this share their derivatives; what is left out is below a thousandth of a pixel."""
+"""Change [rad] of the corrections up to which the derivatives are kept; the neglected part is below 0.001 pixels."""
 CONVERGED = 1e-2
-"""Share of a parameter's sigma."""
+"""Step, as a share of a parameter's standard deviation, below which the adjustment has converged."""
 
 
 @dataclass(frozen=True)

@@ -41,18 +41,18 @@ from rille.stages.geometry.epipolar import NAMES, corrected, distances
 from rille.stages.geometry.geometry import Rig
 
 MOST_MATCHES = 10_000
-"""Of all pairs together: beyond, systematic errors rule."""
+"""Most matches of all pairs together: with more, systematic errors dominate."""
 
 LEAST_OF_A_PAIR = 200
 
 LEAST_OF_A_BLOCK = 5
-"""Matches whose median is a block's."""
+"""Fewest matches of a block whose median counts."""
 
 BAD_ROWS = 1.0
-"""Pixels RMS of what no rig explains: an image whose lens distortion was not removed, or a wrong camera."""
+"""RMS residual [pixels] after the repair from which on a warning names lens distortion or a wrong calibration."""
 
 SWAPPED = 0.5
-"""Share of the matches beyond infinity that no error of a calibration explains."""
+"""Share of matches beyond infinity from which on left and right are taken to be swapped."""
 
 
 class RigParams(RelativeParams):

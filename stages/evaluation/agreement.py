@@ -26,7 +26,8 @@ ORIENTATION_SHARE = 0.1
 """Positions decide the alignment, as in an absolute trajectory error; orientations only where positions cannot."""
 
 REST = 10.0
-"""Spread of the positions over the noise of a step, below which a camera rests: its positions tell no direction."""
+"""Ratio of the spread of positions to the error of a step below which a camera counts as at rest: its positions then
+determine no rotation."""
 
 REASONS: Mapping[str, tuple[int, str]] = {
     "distance": (1, "position"),

@@ -30,7 +30,7 @@ UNIT_BYTES = 512.0
 """Length of COLMAP's byte descriptors."""
 
 MASK_SCALES = 3.0
-"""A feature is dropped where the mask comes nearer than so many of its scales: it would be the mask's edge."""
+"""Distance to the mask, in scales of the feature, below which a feature is dropped: it may describe the edge."""
 
 MIN_MATCHES = 15
 """COLMAP's own limit for a pair of images to count."""

@@ -30,28 +30,29 @@ from rille.stages.evaluation.accuracy_parts import Metric, metric, rms
 from rille.stages.odometry.resection.trajectory import world_poses
 
 LEAST = 4
-"""Frames with pose and truth: a turn, a shift and an offset leave something over to judge with."""
+"""Fewest frames with pose and truth: more than the unknowns (turn, shift, clock offset) take up."""
 
 REACH = 10.0
-"""s; clocks that have a time in common are believed to this: a longer search finds other stretches that look alike."""
+"""Largest clock offset [s] that is searched where the clocks have a time in common: a longer search finds other
+stretches of the track that look alike."""
 
 SHARE = 2 / 3
-"""Of the most frames that any offset compares, as many must be compared: few fit almost anywhere."""
+"""Smallest number of compared frames, as a share of the most that any offset compares: few frames fit anywhere."""
 
 GROWTH = 2**0.5
-"""Of the least error: up to here another offset adds less than what remains, and which is right cannot be said."""
+"""Factor on the least error up to which offsets count as equally good: they add less to it than what remains."""
 
 WITHIN = 1e-6
-"""s; times that agree to this are the same."""
+"""Difference [s] below which two times are the same."""
 
 WIDE = 0.5
-"""Of what was searched: offsets that all fit about as well tell nothing."""
+"""Share of the searched range: where equally good offsets span more, the offset is not determined."""
 
 MOST = 20000
-"""Offsets that are tried at most before the best is refined."""
+"""Most offsets that are tried before the best one is refined."""
 
 ANOTHER = 0.5
-"""Of the error as given: where other axes leave less than this, they are taken to be the right ones."""
+"""Share of the error: where the truth with other axes leaves less than this, a warning names those axes."""
 
 
 @dataclass(frozen=True)

@@ -16,13 +16,13 @@ from rille.stages.evaluation.accuracy_parts import Metric, along, angle, inverse
 from rille.stages.geometry.geometry import cross_matrix, rotation_log
 
 STEPS = (1, 2, 5, 10, 20, 50)
-"""Frames between the two poses of a relative error."""
+"""Numbers of frames between the two poses of a relative error."""
 SHARES = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8)
-"""Of the path: lengths of its sections."""
+"""Lengths of sections, as shares of the true path."""
 LEAST_MOVED = 1e-6
-"""m: below, a camera rests, and nothing is said of its scale."""
+"""Length [m] of the true path below which a camera counts as at rest, and has no scale error."""
 MEANINGFUL = 3.0
-"""Standard errors that a systematic part must have to be named."""
+"""Size of a systematic error, in its standard errors, from which on it is told from chance."""
 
 
 def by_steps(P: Floats, Q: Floats) -> dict[str, Metric]:

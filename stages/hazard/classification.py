@@ -57,10 +57,10 @@ it than below, since a matcher smooths relief away more often than it makes some
 :mod:`rille.stages.hazard.measures`; F stays a rising function."""
 
 NONE = 2.0**-44
-"""Of a step: the sum of it and 16 in 64 bits is 16."""
+"""Excess, in steps of the table, below which a negative one counts as 0: 16 plus it is 16 in 64 bits."""
 
 LEAST = np.float32(1e-12)
-"""Of a limit; standard deviation of a measure of exact elevations, so that the excess is not divided by 0."""
+"""Smallest standard deviation of a measure, as a share of its limit: the excess of exact elevations is then finite."""
 
 
 class Rules(NamedTuple):

@@ -20,9 +20,9 @@ HALF = 5
 """Half the template's side: 11 x 11 pixels hold enough texture and still look plane."""
 SIDE = 2 * HALF + 1
 STEPS = 15
-"""Steps before a template is given up; five are usual."""
+"""Most steps before a template is given up; five are usual."""
 SETTLED = 0.01
-"""Pixels: a last step below this is a tenth of the error that remains."""
+"""Step [pixels] below which a template has converged: a tenth of the error that remains."""
 UNKNOWNS = 8
 """Shift (2), affinity (4), offset, gain."""
 

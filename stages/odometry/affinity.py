@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from rille.stages.core.arrays import Bools, Floats
 
 NEIGHBOURS = 12
-"""Tracks that an affinity of six numbers is fitted to: twice as many as needed, still local."""
+"""Number of tracks that an affinity is fitted to: four times the three that it needs, and still local."""
 PULL = 5.0
-"""Pixels: neighbours that spread less than this do not tell of a change of shape."""
+"""Spread [pixels] of the neighbours below which they do not determine a change of shape."""
 
 
 def known(points: Floats) -> Bools:

@@ -19,9 +19,10 @@ from rille.stages.core.validity import matched, matched_share
 from rille.stages.odometry.affinity import fit_affinity, known_median
 
 BLOCKS = 200
-"""Blocks of an image, about; more change the overlap by less than a per cent, and cost time with their square."""
+"""Approximate number of blocks of an image; more change the overlap by less than 1 %, at a cost that grows with their
+square."""
 MATCHED_SHARE = 0.5
-"""Of the pixels of a block that must have matched for its median to be trusted: fewer may agree by chance."""
+"""Share of a block's pixels that must be matched for its median to count: fewer may agree by chance."""
 
 
 @dataclass(frozen=True)

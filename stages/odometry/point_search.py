@@ -23,16 +23,16 @@ from rille.stages.imaging.pyramid import Pyramid, filled
 
 SUM_RADIUS = 3
 SIDE = 2 * SUM_RADIUS + 1
-"""Pixels: distances are summed over 7 x 7."""
+"""Side [pixels] of the square over which distances are summed."""
 
 BACKMATCH = 1.0
-"""Pixels: greatest distance between a point and where matching there and back leads (4.3.3)."""
+"""Largest distance [pixels] between a point and the result of matching it there and back (4.3.3)."""
 BACK_RADIUS = 3
-"""Pixels searched on the way back, at most: thrice what is allowed; fewer refuse too little."""
+"""Largest search radius [pixels] of back-matching: three times the permitted error; smaller ones refuse too little."""
 
 WEIGHTS = HfvmParams().weights
 THRESHOLD = 90.0
-"""Byte steps: mean distance above which a point is not matchable."""
+"""Mean distance [byte steps] above which a point does not count as found."""
 
 
 def match_points(

@@ -23,24 +23,24 @@ from rille.stages.core.arrays import Bools, Floats, Floats32
 from rille.stages.imaging.pyramid import Pyramid
 
 STEP_DEG = 15.0
-"""Degrees between two copies: the rotation wanted is at most half of it from one of them, where windows still match."""
+"""Step [degrees] between two copies: the rotation is at most half a step from one, where windows still match."""
 GAIN = 1.2
 """A rotation is believed if it raises the share of matches by a fifth; chance matches do not."""
 LEAST_DEG = 10.0
-"""Degrees below which a rotation is left to the matcher: one to three per cent of the tracks are wrong up to there."""
+"""Rotation [degrees] below which nothing is undone: up to there, one to three per cent of the tracks are wrong."""
 LEAST = 100
-"""Coarse pixels, or matches, below which nothing is said of a rotation."""
+"""Fewest matches, at the coarse level, from which a rotation is estimated."""
 
 LARGEST = 1400
-"""Pixels: longer side up to which features are looked for in the finest image."""
+"""Longest side [pixels] of the pyramid level in which features are detected."""
 FEATURES = 4000
-"""Features of an image, the most prominent."""
+"""Most features of an image, the most prominent ones."""
 DISTINCT = 0.85
-"""Distance of descriptors over that to the second best, above which a match is ambiguous."""
+"""Ratio of the best to the second best descriptor distance above which a match is ambiguous."""
 NEAR = 0.016
-"""Share of the width: distance to a homography at which a match still agrees; relief parts them from one plane."""
+"""Largest distance between a match and the homography, as a share of the image width; relief departs from one plane."""
 LEAST_AGREEING = 12
-"""Matches that agree, three times as many as a homography needs: fewer may agree by chance."""
+"""Fewest matches that agree with a homography, three times as many as it needs: fewer may agree by chance."""
 
 
 def candidates(reach_deg: float) -> list[float]:

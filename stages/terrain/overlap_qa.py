@@ -29,16 +29,16 @@ from rille.stages.geometry.lattice import Lattice
 from rille.stages.numeric.robust import TUKEY_BISQUARE, bisquare, mad_sigma
 
 BLOCKS = 400
-"""Blocks of an overlap, about: enough that their scatter tells the plane's error to a twentieth."""
+"""Approximate number of blocks of an overlap: enough to find the plane's standard deviation to 5 %."""
 LEAST_BLOCKS = 12
-"""Below, three parameters and their errors are not to be had."""
+"""Fewest blocks from which three parameters and their errors are estimated."""
 LEAST_CELLS = 100
 MANY_BLOCKS = 36
 """Blocks that must be left for them to be made larger."""
 ALIKE = 0.2
 """Correlation of neighbouring blocks above which they are made larger, until each stands for itself."""
 REACH = 2
-"""Blocks to either side whose errors may be alike still."""
+"""Distance [blocks] up to which errors of blocks may be correlated."""
 ROUNDS = 20
 
 MAP_CELLS = 160

@@ -37,18 +37,18 @@ STIFFNESS = 4000.0
 """Squared grey levels for a bend of a pixel of disparity: strong against noise, weak against texture; the error is flat
 from 2000 to 16000."""
 BEND = 0.05
-"""Pixels of disparity: bend beyond which stiffness gives way to an edge."""
+"""Second difference [pixels of disparity] beyond which stiffness gives way to an edge."""
 SWEEPS = 20
 OVERSHOOT = 1.7
 """Factor on each Gauss-Seidel step (successive over-relaxation), which stays convergent below 2."""
 FARTHEST = 1.0
-"""Pixels of disparity that a cell may move in all: beyond it, the images' likeness is another one."""
+"""Largest total change [pixels of disparity] of a cell: beyond it, the images match at another place."""
 
 MEAN_SIDE = 15
-"""Cells: window of the local mean; brightness varies more slowly."""
+"""Side [cells] of the window of the local mean; brightness varies more slowly."""
 MEAN_ROUNDS = 1
 RESIDUAL = 10.0
-"""Grey levels: difference that halves a cell's weight, well above camera noise."""
+"""Difference [grey levels] that halves a cell's weight, well above camera noise."""
 LEAST_WEIGHT = 0.1
 
 FACTOR = 0.42
