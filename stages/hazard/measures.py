@@ -17,9 +17,9 @@ levels the plane. So no measure is a fit.
 
 **Noise.** Extrema of n noisy heights lie beyond the true ones, and the more so the flatter the ground is. With ``s``
 the RMS standard deviation of the heights that a measure V looks at, V has the bias ``bias * s`` and the standard
-deviation ``spread * s``. The factors were found on simulated pairs, seeds 101 to 106, on 21 November 2026 (``benchmarks/hazards.py``). They
-are far below those of independent heights, because errors of a matcher are alike over some cells; the last three
-measures look at places far apart, whose errors are less alike.
+deviation ``spread * s``. The factors were found on simulated pairs, seeds 101 to 106, on 21 November 2026
+(``benchmarks/hazards.py``). They are far below those of independent heights, because errors of a matcher are alike over
+some cells; the last three measures look at places far apart, whose errors are less alike.
 """
 
 from __future__ import annotations
