@@ -34,7 +34,7 @@ HERE = 0.3
 """Radius [wheelbases] around the start pose within which a cell is accepted if its clearance is not below that of the
 start pose."""
 NEARER = 2.0
-"""Factor on the parameter ``blind``: doubtful ground beyond that radius will be seen again from nearer, where most
+"""Factor on ``occluded_radius``: doubtful ground beyond that radius will be seen again from nearer, where most
 doubts vanish."""
 
 

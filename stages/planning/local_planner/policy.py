@@ -96,7 +96,7 @@ def plan_leg(
     goal : m.
     memory : what it has looked at before; None: nothing.
     before : what was left, after the last leg, of the way planned then: (vertex, 2) m, (piece,) gear. It is kept unless
-        another one is better by ``loyalty``; None: there is none.
+        another one is better by ``replan_hysteresis``; None: there is none.
     view : the ground that its cameras see.
 
     Raises
