@@ -64,9 +64,12 @@ class Hazards(NamedTuple):
 
 
 class KnownGround(NamedTuple):
-    """Masks (row, col): ``unknown``, where the vehicle may not stand for what is not known, None: the unknown class;
-    ``glanced``, where of it something is known nevertheless; ``doubted`` ground, which costs as much as a hazard by
-    sigma alone that is driven on."""
+    """How well the ground is known, masks (row, col).
+
+    ``unknown``: cells on which the vehicle may not stand because too little is known; None: those of the unknown class.
+    ``glanced``: unknown cells that were seen from afar. ``doubted``: cells that cost as much as a hazard by sigma alone
+    that is driven on.
+    """
 
     unknown: Bools | None = None
     glanced: Bools | None = None
