@@ -202,7 +202,7 @@ class Everything(Store):
         if self.learning:
             facts = EACH[stage](self.asked[stage]) if stage in EACH else META.get(stage, {})
             self.asked[stage] += 1
-            self.known[key] = Ref(key, stage, digest([stage, key]), "", facts)
+            self.known[key] = Ref(key, stage, digest([stage, key]), facts)
         return self.known.get(key)
 
 

@@ -78,6 +78,7 @@ def _took(handle: Handle) -> dict[str, Any]:
         "rest": handle.rest,
         "first": handle.first,
         "compiling": round(handle.compiling, 4),
+        "worker": handle.worker,
         "input_bytes": round(input_bytes(handle)),
         "bytes": handle.ref.nbytes,
         "stored": handle.ref.stored,

@@ -29,7 +29,7 @@ Expansion = Callable[..., None]
 T = TypeVar("T")
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, slots=True)
 class Handle:
     """A node of the graph and what became of it.
 
@@ -38,7 +38,8 @@ class Handle:
     is what the same label led to before: a plan takes its facts for what is to come. ``expect`` are bytes (decoded)
     that it reads from outside. Of a computed node: ``seconds`` of the call and of the stage's own ``kernel``, when it
     ``started`` (seconds since 1970), and the figures of a :class:`rille.pipeline.engine.memory.limits.Meter`
-    (``first``: with imports and kernels; ``compiling``: seconds for which kernels were compiled).
+    (``first``: with imports and kernels; ``compiling``: seconds for which kernels were compiled), and the name of the
+    dask ``worker`` that ran it.
     """
 
     index: int
@@ -58,6 +59,7 @@ class Handle:
     rest: int | None = None
     first: bool = False
     compiling: float = 0.0
+    worker: str = ""
     error: BaseException | None = None
 
     @property

@@ -484,7 +484,7 @@ class _Run:
         else:
             first.seconds, first.peak_rss, first.kernel = outcome.seconds, outcome.peak_rss, outcome.kernel
             first.started, first.memory, first.rest = outcome.started, outcome.memory, outcome.rest
-            first.first, first.compiling = outcome.first, outcome.compiling
+            first.first, first.compiling, first.worker = outcome.first, outcome.compiling, outcome.worker
             for handle in (first, *others):
                 handle.ref = outcome.ref
                 self._resolve(handle, "computed" if handle is first and not outcome.cached else "cached")

@@ -56,7 +56,7 @@ class CodeChangedError(RilleError):
     """The source code or the packages of a worker are not those of the client."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Spec:
     """One task without its inputs. ``label`` names it to people (``locus/12``) and is not part of the key."""
 
@@ -79,7 +79,7 @@ class Outcome:
     ``kernel`` are the seconds of the stage itself, ``started`` is when the call began (seconds since 1970); ``memory``
     and ``rest`` are a :class:`~rille.pipeline.engine.memory.limits.Meter`'s figures, ``first`` says that the process
     had not run the stage before (it imports, and compiles or loads kernels); ``compiling`` are the seconds for which it
-    compiled.
+    compiled; ``worker`` is the name of the dask worker that ran it.
     """
 
     ref: Ref
@@ -92,6 +92,7 @@ class Outcome:
     rest: int | None = None
     first: bool = False
     compiling: float = 0.0
+    worker: str = ""
 
 
 MANY = 4096

@@ -34,6 +34,10 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 
+NO_PARAMS = NoParams()
+"""One object for all tasks without parameters: its canonical form is then made once."""
+
+
 @dataclass(frozen=True)
 class Pair:
     """A basic pair: disparity, rig that it is reconstructed with, vertical, and elevation model in its own frame."""
@@ -84,11 +88,15 @@ class Builder:
         self.graph, self.sequence, self.config = graph, sequence, config
         self.products = Products()
         self.made: dict[Any, Any] = {}
+        # Arguments of many tasks, one object for all: each would hold some kilobytes of its own until the run's end.
+        self.given_rig = sequence.rig.to_dict()
+        self.given_vehicle = config.vehicle.model_dump(mode="json", exclude={"name"})
+        self.given_resect = config.resect.model_dump(mode="json")
 
     def node(self, stage: ModuleType, label: str, args: Mapping[str, Any], **inputs: Handle | list[Handle]) -> Handle:
         """One task of the stage that a module declares, with the parameters that it has in the configuration."""
         # A section is named as its stage; a stage without parameters has none.
-        params: Params = getattr(self.config, stage.STAGE.name, NoParams())
+        params: Params = getattr(self.config, stage.STAGE.name, NO_PARAMS)
         return self.graph.node(stage, label, params, args, {}, inputs)
 
     # -- images -------------------------------------------------------------------------------------------------
@@ -160,7 +168,7 @@ class Builder:
 
     def sides(self, frame: int) -> Handle:
         """Whether the images of a pair are exchanged."""
-        args = {"frame": frame, "rig": self.sequence.rig.to_dict()}
+        args = {"frame": frame, "rig": self.given_rig}
         ports = {camera: self.pyramid(frame, camera) for camera in ("left", "right")}
         return self.node(swap_check, f"swap_check/{frame}", args, **ports)
 
@@ -190,13 +198,13 @@ class Builder:
     @once
     def orientation(self, pair: int) -> Handle:
         """Relative orientation that the disparity of a pair asks for."""
-        args = {"pair": pair, "rig": self.sequence.rig.to_dict()}
+        args = {"pair": pair, "rig": self.given_rig}
         return self.node(orientation, f"orientation/{pair}", args, disparity=self.disparity(pair))
 
     def rig(self, pairs: Series[int], which: str = "") -> tuple[Handle, Handle]:
         """The rig that the orientations of these pairs agree on, and what of it other stages read."""
         orientations = [self.orientation(pair) for pair in pairs]
-        found = self.node(rig, f"rig{which}", {"rig": self.sequence.rig.to_dict()}, orientations=orientations)
+        found = self.node(rig, f"rig{which}", {"rig": self.given_rig}, orientations=orientations)
         return found, self.node(calibration, f"calibration{which}", {}, rig=found)
 
     def pair(self, frame: int, vertical: Mapping[str, Any], known: Handle, first: Pair | None) -> Pair:
@@ -272,7 +280,7 @@ class Builder:
 
     def hazards(self, label: str, dems: list[Handle]) -> Handle:
         """Add the task that judges hazards on the tiles of an elevation model."""
-        args = {"vehicle": self.config.vehicle.model_dump(mode="json", exclude={"name"})}
+        args = {"vehicle": self.given_vehicle}
         return self.node(risk, label, args, dem=dems)
 
 

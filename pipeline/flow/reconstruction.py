@@ -274,7 +274,7 @@ def refined(
         return make.node(
             refine,
             f"{label}/{keys[-1].frame}",
-            {"pairs": [pair.frame for pair in keys], "resect": config.resect.model_dump(mode="json")},
+            {"pairs": [pair.frame for pair in keys], "resect": make.given_resect},
             tracks=[s.track for s in window],
             resections=[s.resection for s in window],
             levels=[pair.level for pair in keys],
@@ -296,12 +296,11 @@ def refined(
 
 def another_program(make: Builder, whole: list[int]) -> Handle:
     """Structure from motion by another program, in windows; it knows nothing of our trajectory, nor we of its."""
-    given = make.sequence.rig.to_dict()
     parts = [
         make.node(
             crosscheck,
             f"crosscheck/{window[0]}-{window[-1]}",
-            {"frames": window, "rig": given},
+            {"frames": window, "rig": make.given_rig},
             left=[make.image(f, "left") for f in window],
             right=[make.image(f, "right") for f in window],
         )

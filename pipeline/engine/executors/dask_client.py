@@ -23,6 +23,7 @@ import uuid
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import replace
 from importlib.util import find_spec
 from multiprocessing import resource_tracker
 from typing import Any
@@ -333,7 +334,10 @@ def _work(run: str, pickled: bytes, *made: Ref | None) -> Ref | None:
         outcome = Failed(CodeChangedError("RIL-524", _runs[run], remedy="install the same there"), "")
     else:
         outcome = task.run(refs)
-    name = get_worker().get_current_task()
+    worker = get_worker()
+    if isinstance(outcome, Outcome):
+        outcome = replace(outcome, worker=str(worker.name))
+    name = worker.get_current_task()
     _ended[name] = pickle.dumps((task.number, name, outcome))
     return light(outcome.ref) if isinstance(outcome, Outcome) else None
 

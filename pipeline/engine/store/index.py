@@ -87,7 +87,7 @@ class Index:
             _, digest, nbytes, stored = parsed(f"{line[:end]}]")
         except (ValueError, TypeError):
             return None
-        return Ref(key, stage, digest, item.path, Facts(line, end + 1), nbytes, stored)
+        return Ref(key, stage, digest, Facts(line, end + 1), nbytes, stored)
 
     def forget(self, key: str) -> None:
         """Drop a line whose mark has changed though the file has not: it is written anew at the end."""

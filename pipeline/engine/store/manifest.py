@@ -40,9 +40,9 @@ _HEAD_SIZE = len(_HEAD % (0, 0))
 _END = b"}\n"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Ref:
-    """A committed artifact: all that travels between tasks. ``path`` is relative to the cache.
+    """A committed artifact: all that travels between tasks.
 
     ``nbytes`` are bytes of the decoded arrays, ``stored`` those of the file.
     """
@@ -50,10 +50,14 @@ class Ref:
     key: str
     stage: str
     digest: str
-    path: str
     meta: Mapping[str, Any]
     nbytes: int = 0
     stored: int = 0
+
+    @property
+    def path(self) -> str:
+        """File, relative to the cache."""
+        return artifact_path(self.stage, self.key)
 
 
 def artifact_path(stage: str, key: str) -> str:
@@ -156,7 +160,7 @@ def reference(manifest: Manifest) -> Ref:
     """Return the reference to the artifact of a manifest."""
     m = manifest
     nbytes = sum(int(a["dtype"][2:]) * math.prod(a["shape"]) for a in m["arrays"].values())
-    return Ref(m["key"], m["stage"], m["digest"], artifact_path(m["stage"], m["key"]), m["meta"], nbytes, m["size"])
+    return Ref(m["key"], m["stage"], m["digest"], m["meta"], nbytes, m["size"])
 
 
 def damage(manifest: Manifest, data: bytes) -> str:

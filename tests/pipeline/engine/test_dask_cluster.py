@@ -14,7 +14,7 @@ from toys import chain
 from toys.numbers import NumbersParams
 from toys.scale import ScaleParams
 
-from rille.pipeline.engine import scheduler
+from rille.pipeline.engine import events, scheduler
 from rille.pipeline.engine.executors import base, dask_client, dask_cluster
 from rille.pipeline.engine.graph import Graph
 from rille.pipeline.engine.store.base import Store
@@ -84,6 +84,15 @@ def test_what_waits_for_a_suspect_of_the_same_batch_comes_back(hands, tmp_path):
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_a_cluster_of_this_machine_gives_what_one_process_gives(tmp_path, jobs):
     assert run(tmp_path / "dask", "dask", jobs=jobs) == run(tmp_path / "inline")
+
+
+def test_the_ledger_of_a_default_run_names_the_dask_worker_of_each_task(tmp_path):
+    graph, ledger = Graph(), tmp_path / "ledger.jsonl"
+    chain.build(graph)
+    scheduler.run(graph, Store(tmp_path / "cache"), scheduler.RunOptions(jobs=2, ledger=ledger)).check()
+    rows = events.read(ledger)
+    assert len(rows) == len(graph.nodes)
+    assert {row["worker"] for row in rows} <= {"0", "1"}
 
 
 def test_a_cache_that_is_not_shared_is_refused(hands, tmp_path, monkeypatch):

@@ -169,7 +169,7 @@ def test_an_index_is_compact(tmp_path):
     place, refs = Place(tmp_path), {}
     for k in range(5000):
         key, digest = (f"{hash((k, what)) & (1 << 256) - 1:064x}".replace("0000", f"{k:04x}") for what in "kd")
-        refs[key] = Ref(key, "hfvm", digest, f"artifacts/{k}", {"frame": k, "valid": k / 3}, 30_000 + k, 20_000)
+        refs[key] = Ref(key, "hfvm", digest, {"frame": k, "valid": k / 3}, 30_000 + k, 20_000)
     made = index.Index(place, "s")
     made.note(refs)
     (path,) = indices(tmp_path)
