@@ -66,6 +66,8 @@ def street(source: Path, folder: Path, frames: int) -> Path:
                 to.hardlink_to(small[camera, original])
                 continue
             image = cv2.imread(str(source / camera / names[original]), cv2.IMREAD_GRAYSCALE)
+            if image is None:
+                sys.exit(f"{source / camera / names[original]} is no image")
             rows, cols = image.shape
             cv2.imwrite(str(to), cv2.resize(image, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA))
             small[camera, original] = to

@@ -1,37 +1,44 @@
 """What the engine itself costs: a long sequence whose stages do nothing, laid out by the real dataflow.
 
-``python benchmarks/scale.py [--pairs 2000] [--jobs 2]``
+``python benchmarks/scale.py [--pairs 2000] [--jobs 2] [--bucket]``
 
 Every frame is basic, so that each has all the tasks of a pair. Each stage keeps its ports, arrays, parameters and code
 digest; only what it computes is replaced by a few zeros, committed as ever. Each size runs in a process of its own on
-an empty cache, then is planned by another process, warm. Printed are, a node or a task:
+an empty cache, then is planned by other processes, warm: at once, and on the next day, when files and index are old.
+With ``--bucket`` a small size follows with its cache in a bucket of moto's server. Printed are, a node or a task:
 
-- plan: laying out and looking up when all is cached, as ``rille plan`` does; wall and processor time
-- overhead: wall time of the cold run in which no worker was in a task, ``(wall - in tasks / workers) / tasks``
-- client: processor time of the process that holds graph and scheduler
+- plan: laying out and looking up when all is cached, as ``rille plan`` does
+- next day: a whole warm run a day later, which marks each artifact as used
+- overhead: processor time of client, scheduler and workers together, but for look-up and commit in a worker's thread
+- client: the part of it that the process with graph and scheduler took
 - in task: look-up and commit by a worker, without flushing to the disk unless ``--flush``
-- memory: resident memory of the client, and of a worker, at the end
+- memory: resident memory of client and workers by tenths of the cold run
 
-Wall times are those of the machine as it is: on one that others use too, look at the processor times.
+Times are of the processor, with the wall's beside where it matters; each figure with a limit says whether it is kept.
 """
 
 from __future__ import annotations
 
 import argparse
 import hashlib
+import importlib
 import json
 import os
 import shutil
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 
 STAGE_MODULE = '''"""Ports and arrays of {real}, and no work."""
 
@@ -59,9 +66,32 @@ CELL = 0.004
 
 UNFLUSHED = "RILLE_SCALE_UNFLUSHED"
 
+DAY = 86_400.0
 
-if os.environ.get(UNFLUSHED):  # in the workers, as they import their first stage
-    os.fsync = lambda _: None  # type: ignore[assignment]
+PLAN, OVERHEAD, MEMORY, FLAT = 0.2, 4.0, 1e9, 1.1
+"""Limits: milliseconds a node, milliseconds a task, bytes of the client, memory at the end against the middle."""
+
+BUCKET_PAIRS = 100
+"""Pairs of the size whose cache is in a bucket: moto takes a hundred times as long for an artifact as the disk."""
+
+
+def _measured(ensure: Callable[..., Any]) -> Callable[..., Any]:
+    """``ensure`` that tells the processor time of its thread as that of the stage, which does nothing."""
+
+    def timed(*args: Any, **more: Any) -> Any:
+        begin = time.thread_time()
+        outcome = ensure(*args, **more)
+        return replace(outcome, kernel=time.thread_time() - begin)
+
+    return timed
+
+
+if os.environ.get(UNFLUSHED) is not None and __name__ == "idle.source":  # in a worker, as it imports its first stage
+    from rille.pipeline.engine.executors import base
+
+    base.ensure = _measured(base.ensure)
+    if os.environ[UNFLUSHED]:
+        os.fsync = lambda _: None  # type: ignore[assignment]
 
 
 def nothing(name: str) -> Any:
@@ -181,11 +211,12 @@ def graph_of(pairs: int) -> Any:
         def node(self, stage: Any, *args: Any, **more: Any) -> Handle:
             return super().node(stage if isinstance(stage, str) else f"idle.{stage.STAGE.name}", *args, **more)
 
+    none = NoParams()
     camera = Camera(60.0, 60.0, 31.5, 23.5, 64, 48)
     rig = Rig(camera, camera, RigidTransform(np.eye(3), np.array([-0.1, 0.0, 0.0])))
 
     def image(frame: int, which: str) -> Source:
-        return Source("idle.image", NoParams(), {"frame": frame, "camera": which})
+        return Source("idle.image", none, {"frame": frame, "camera": which})
 
     sequence = Sequence("scale", rig, pairs, image, tuple(str(k) for k in range(pairs)))
     graph = Idle()
@@ -193,40 +224,65 @@ def graph_of(pairs: int) -> Any:
     return graph
 
 
-def measure(pairs: int, cache: Path, executor: str, jobs: int, what: str) -> dict[str, float]:
-    """One cold run, or one plan of what is cached, in this process."""
+class Watch(threading.Thread):
+    """Reads, each half second, the memory of this process and of its workers, and what processor time these took."""
+
+    def __init__(self) -> None:
+        super().__init__(daemon=True)
+        self.client: list[int] = []
+        self.workers: list[int] = []
+        self.processor: dict[int, float] = {}
+        self._end = threading.Event()
+
+    def run(self) -> None:
+        """Until the end is said."""
+        this = psutil.Process()
+        while not self._end.wait(0.5):
+            self.client.append(this.memory_info().rss)
+            greatest = 0
+            for child in this.children(recursive=True):
+                with suppress(psutil.Error):  # it ends as we look
+                    times = child.cpu_times()
+                    self.processor[child.pid] = times.user + times.system
+                    greatest = max(greatest, child.memory_info().rss)
+            self.workers.append(greatest)
+
+    def stop(self) -> None:
+        """Say the end."""
+        self._end.set()
+        self.join()
+
+
+def measure(pairs: int, cache: str, executor: str, jobs: int, what: str) -> dict[str, Any]:
+    """One cold run, one plan of what is cached, or one warm run a day later, in this process."""
     from rille.pipeline.engine import scheduler
-    from rille.pipeline.engine.memory.limits import resident
+    from rille.pipeline.engine.code_digest import tree_digest
     from rille.pipeline.engine.store.base import Store
 
-    before = resident()
-    from rille.pipeline.engine.code_digest import tree_digest
-
     tree_digest()  # once a process, whatever its size: reading the sources
+    if what == "later":
+        now = time.time
+        time.time = lambda: now() + DAY
+    watch = Watch()
+    watch.start()
     cpu, wall = time.process_time(), time.perf_counter()
     graph = graph_of(pairs)
-    laid = time.perf_counter() - wall
-    if what == "plan":
-        result = scheduler.run(graph, Store(cache), scheduler.RunOptions(dry=True))
-    else:
-        ledger = cache.parent / "run" / "ledger.jsonl"
-        result = scheduler.run(graph, Store(cache), scheduler.RunOptions(executor=executor, jobs=jobs, ledger=ledger))
+    store, ledger = Store(cache), Path(tempfile.mkdtemp()) / "ledger.jsonl"
+    options = scheduler.RunOptions(executor=executor, jobs=jobs, ledger=ledger, dry=what == "plan")
+    result = scheduler.run(graph, store, options)
     result.check()
-    spent = time.perf_counter() - wall
+    spent, cpu = time.perf_counter() - wall, time.process_time() - cpu
+    watch.stop()
     n = len(graph.nodes)
-    inside = sum(h.seconds for h in graph.nodes)
-    rests = [h.rest for h in graph.nodes[-50:] if h.rest]
+    processor = sum(h.kernel for h in graph.nodes)
     return {
         "nodes": n,
         "computed": result.total().computed,
-        "lay out": 1e3 * laid / n,
         "wall": 1e3 * spent / n,
-        "cpu": 1e3 * (time.process_time() - cpu) / n,
-        "overhead": 1e3 * (spent - inside / jobs) / n,
-        "inside": 1e3 * inside / n,
-        "client": resident(),
-        "grown": (resident() - before) / n,
-        "worker": max(rests, default=0),
+        "client": 1e3 * cpu / n,
+        "overhead": 1e3 * (cpu + sum(watch.processor.values()) - processor) / n,
+        "in task": 1e3 * processor / n,
+        "memory": {"client": watch.client, "worker": watch.workers},
     }
 
 
@@ -239,42 +295,63 @@ def entries(folder: Path) -> tuple[int, Path]:
     return most, path.relative_to(folder)
 
 
-def child(pairs: int, folder: Path, how: list[str], what: str, *, flush: bool) -> dict[str, float]:
+def child(pairs: int, folder: Path, how: list[str], what: str, environment: Mapping[str, str]) -> dict[str, Any]:
     """:func:`measure` in a process of its own."""
     here = Path(__file__).resolve().parent.parent
     path = os.pathsep.join([str(folder / "stages"), str(here), os.environ.get("PYTHONPATH", "")])
     command = [sys.executable, str(Path(__file__).resolve()), "--pairs", str(pairs), *how]
     done = subprocess.run(
         [*command, "--folder", str(folder), "--what", what],
-        env={**os.environ, "PYTHONPATH": path, UNFLUSHED: "" if flush else "1"},
+        env={**os.environ, "PYTHONPATH": path, **environment},
         stdout=subprocess.PIPE,
         check=True,
         text=True,
     )
-    found: dict[str, float] = json.loads(done.stdout)
+    found: dict[str, Any] = json.loads(done.stdout)
     return found
 
 
-def table(sizes: list[int], how: list[str], within: Path, *, flush: bool) -> Iterator[str]:
-    """Lines of the figures of several sizes, each as soon as it is known."""
-    yield (
-        f"{'pairs':>6s} {'nodes':>7s} {'plan':>9s} {'its cpu':>9s} {'overhead':>9s} {'client':>9s} {'in task':>9s} "
-        f"{'client memory':>20s} {'worker':>8s} {'most entries of a folder':>26s}"
-    )
-    for pairs in sizes:
-        folder = within / str(pairs)
-        write_stages(folder / "stages")
-        cold = child(pairs, folder, how, "run", flush=flush)
-        assert cold["computed"] == cold["nodes"]
-        warm = child(pairs, folder, how, "plan", flush=flush)
+def verdict(kept: bool) -> str:
+    """Word of a line with a limit."""
+    return "kept" if kept else "NOT KEPT"
+
+
+def planned(name: str, found: dict[str, Any]) -> str:
+    """Line of a warm plan or run."""
+    times = f"{found['client']:.3f} ms of processor a node, {found['wall']:.3f} ms by the clock"
+    return f"  {name}: {times}; limit {PLAN}: {verdict(found['client'] <= PLAN)}"
+
+
+def over_time(who: str, samples: list[int], limit: float) -> str:
+    """Line of the memory of a process over a run: the median of each tenth."""
+    tenths = [part for part in np.array_split(np.array(samples) / 1e6, 10) if part.size]
+    medians = [float(np.median(part)) for part in tenths]
+    ratio, most = medians[-1] / medians[len(medians) // 2], max(samples)
+    amount = f"greatest {most / 1e6:.0f}" + (f", limit {limit / 1e6:.0f}: {verdict(most <= limit)}" if limit else "")
+    flat = f"end / middle {ratio:.2f}, limit {FLAT}: {verdict(ratio <= FLAT)}"
+    return f"  {who}, MB by tenths of the run: {' '.join(f'{m:.0f}' for m in medians)}; {amount}; {flat}"
+
+
+def figures(pairs: int, how: list[str], folder: Path, environment: Mapping[str, str]) -> Iterator[str]:
+    """Lines of one size, each as soon as it is known."""
+    write_stages(folder / "stages")
+    cold = child(pairs, folder, how, "run", environment)
+    assert cold["computed"] == cold["nodes"]
+    yield f"{pairs} pairs, {cold['nodes']} nodes"
+    kept = verdict(cold["overhead"] <= OVERHEAD)
+    yield f"  overhead: {cold['overhead']:.2f} ms of processor a task; limit {OVERHEAD}: {kept}"
+    yield f"  of it client and scheduler {cold['client']:.2f} ms; look-up and commit besides {cold['in task']:.2f} ms"
+    yield f"  cold run by the clock: {cold['wall']:.2f} ms a task"
+    for who, limit in (("client", MEMORY), ("worker", 0.0)):
+        if any(cold["memory"][who]):
+            yield over_time(who, cold["memory"][who], limit)
+    for what, name in (("plan", "plan when all is cached"), ("later", "run that computes nothing, the next day")):
+        warm = child(pairs, folder, how, what, environment)
         assert (warm["computed"], warm["nodes"]) == (0, cold["nodes"])
+        yield planned(name, warm)
+    if not any(word.startswith("s3://") for word in how):
         most, where = entries(folder)
-        yield (
-            f"{pairs:6d} {cold['nodes']:7.0f} {warm['wall']:6.3f} ms {warm['cpu']:6.3f} ms "
-            f"{cold['overhead']:6.2f} ms {cold['cpu']:6.2f} ms {cold['inside']:6.2f} ms "
-            f"{cold['client'] / 1e6:6.0f} MB ({cold['grown'] / 1e3:4.1f} kB/n) {cold['worker'] / 1e6:5.0f} MB "
-            f"{most:6d} {where}"
-        )
+        yield f"  entries of the fullest folder: {most}, {where}"
 
 
 def main() -> None:
@@ -283,20 +360,34 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--executor", choices=("dask", "inline"), default="dask")
     parser.add_argument("--folder", type=Path, help="where to work (kept); a temporary one by default")
+    parser.add_argument("--cache", default="", help="where artifacts are; in the folder by default")
     parser.add_argument("--flush", action="store_true", help="flush to the disk, as a real run does")
-    parser.add_argument("--what", choices=("all", "run", "plan"), default="all", help=argparse.SUPPRESS)
+    parser.add_argument("--bucket", action="store_true", help="also with the cache in a bucket")
+    parser.add_argument("--what", choices=("all", "run", "plan", "later"), default="all", help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.what != "all":
         from rille.pipeline.engine.runtime.environment import prepare_environment
 
         prepare_environment()
-        print(json.dumps(measure(given.pairs, given.folder / "cache", given.executor, given.jobs, given.what)))
+        cache = given.cache or str(given.folder / "cache")
+        print(json.dumps(measure(given.pairs, cache, given.executor, given.jobs, given.what)))
         return
-    sizes = [max(2, given.pairs // 4), given.pairs]
+    how, environment = (
+        ["--executor", given.executor, "--jobs", str(given.jobs)],
+        {UNFLUSHED: "" if given.flush else "1"},
+    )
     with tempfile.TemporaryDirectory() as temporary:
-        how = ["--executor", given.executor, "--jobs", str(given.jobs)]
-        for line in table(sizes, how, given.folder or Path(temporary), flush=given.flush):
-            print(line, flush=True)
+        within = given.folder or Path(temporary)
+        for pairs in sorted({max(2, given.pairs // 4), given.pairs}):
+            for line in figures(pairs, how, within / str(pairs), environment):
+                print(line, flush=True)
+        if given.bucket:
+            # Not imported by name: as source.py this file is a stage's own, whose imports must be packages.
+            with importlib.import_module("runs").bucket() as reached:
+                pairs, reached[UNFLUSHED] = min(BUCKET_PAIRS, given.pairs), "1"
+                print("with the cache in a bucket of moto's server:")
+                for line in figures(pairs, [*how, "--cache", "s3://bucket/cache"], within / "bucket", reached):
+                    print(line, flush=True)
 
 
 if __name__ == "__main__":
