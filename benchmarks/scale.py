@@ -259,7 +259,8 @@ def measure(pairs: int, cache: str, executor: str, jobs: int, what: str) -> dict
     from rille.pipeline.engine.code_digest import tree_digest
     from rille.pipeline.engine.store.base import Store
 
-    tree_digest()  # once a process, whatever its size: reading the sources
+    tree_digest()  # once a process, whatever its size: reading the sources, importing the flow and its stages
+    graph_of(2)
     if what == "later":
         now = time.time
         time.time = lambda: now() + DAY
