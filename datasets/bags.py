@@ -106,12 +106,12 @@ def open_bag(path: Path, topics: str | None = None) -> Sequence:
         frame_names=tuple(map(str, stamps)),
         lenses=lenses,
         times=times,
-        up=inertial.up if inertial is not None and any(inertial.up) else None,
-        attitude=inertial.attitude if inertial is not None and any(inertial.attitude) else None,
+        up=inertial.up if any(inertial.up) else None,
+        attitude=inertial.attitude if any(inertial.attitude) else None,
         odometry=odometry,
         defaults=STREET if rig.baseline >= CAR else {},
-        notes=inertial.notes if inertial is not None else (),
-        warnings=(*warnings, *more, *unused, *(inertial.warnings if inertial is not None else ())),
+        notes=inertial.notes,
+        warnings=(*warnings, *more, *unused, *inertial.warnings),
     )
 
 
@@ -230,7 +230,7 @@ def _camera(reader: Any, path: Path, topic: str) -> tuple[CalibratedCamera, np.n
 
 def _movement(
     reader: Any, path: Path, times: tuple[float, ...], frame: str, R_image_camera: np.ndarray
-) -> tuple[Inertial | None, tuple[RigidTransform | None, ...] | None, list[str]]:
+) -> tuple[Inertial, tuple[RigidTransform | None, ...] | None, list[str]]:
     """What IMU and odometry say of each frame, and what cannot be used."""
     frames, warnings = _static(reader), list[str]()
     # frame_id names the camera as it is mounted; a rectified image is turned by R against it.
@@ -252,7 +252,7 @@ def _movement(
             return None
         return topics[0], sorted(messages, key=_stamp), T_sensor_camera @ T_camera_image
 
-    inertial, odometry = None, None
+    inertial, odometry = Inertial(), None
     found = placed(IMU, lambda m: m.header.frame_id)
     if found is not None:
         topic, messages, T_imu_left = found

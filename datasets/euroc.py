@@ -11,7 +11,7 @@ vertical; both start values that a reconstruction can do without, so that a reco
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from rille.datasets.cameras import CalibratedCamera, read_cameras, rig_of
@@ -73,9 +73,8 @@ class Movement:
 
     truth: tuple[RigidTransform | None, ...] | None = None
     truth_source: str = ""
-    inertial: Inertial | None = None
+    inertial: Inertial = field(default_factory=Inertial)
     warnings: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()
 
 
 def recognise(path: Path) -> EurocLayout | None:
@@ -132,10 +131,10 @@ def open_euroc(layout: EurocLayout, digests: files.Digests) -> Sequence:
         times=frames.times,
         truth=known.truth,
         truth_source=known.truth_source,
-        up=inertial.up if inertial is not None and any(inertial.up) else None,
-        attitude=inertial.attitude if inertial is not None and any(inertial.attitude) else None,
+        up=inertial.up if any(inertial.up) else None,
+        attitude=inertial.attitude if any(inertial.attitude) else None,
         defaults=ROOM,
-        notes=known.notes,
+        notes=inertial.notes,
         warnings=frames.warnings + known.warnings,
     )
 
@@ -244,7 +243,7 @@ def _movement(layout: EurocLayout, times: tuple[float, ...], left: CalibratedCam
     T_body_left = left.T_camera_reference.inverse()
     warnings: list[str] = []
     truth, source = _truth(layout, times, T_body_left, warnings)
-    inertial = None
+    inertial = Inertial()
     if layout.imu is not None:
         T_body_imu = body_pose(layout.imu)
         if T_body_imu is None:
@@ -254,7 +253,7 @@ def _movement(layout: EurocLayout, times: tuple[float, ...], left: CalibratedCam
             imu = read_imu(layout.imu / "data.csv")
             inertial = at_frames(imu, times, T_body_imu.inverse() @ T_body_left)
             warnings += [*imu.warnings, *inertial.warnings]
-    return Movement(truth, source, inertial, tuple(warnings), inertial.notes if inertial is not None else ())
+    return Movement(truth, source, inertial, tuple(warnings))
 
 
 def _truth(

@@ -82,7 +82,7 @@ class ImuRecord:
 
 @dataclass(frozen=True)
 class Inertial:
-    """What an IMU says of each frame.
+    """What an IMU says of each frame; nothing of any, where there is no IMU.
 
     Attributes
     ----------
@@ -94,8 +94,8 @@ class Inertial:
     notes : what was assumed.
     """
 
-    attitude: tuple[Rows | None, ...]
-    up: tuple[Up, ...]
+    attitude: tuple[Rows | None, ...] = ()
+    up: tuple[Up, ...] = ()
     bias: tuple[float, float, float] | None = None
     warnings: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()

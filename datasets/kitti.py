@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from rille.datasets.cameras.kitti import decompose
 from rille.datasets.images import files
 from rille.datasets.images.pairing import ends
 from rille.datasets.manifest.rig import LONGEST_BASELINE, off_centre
@@ -192,32 +193,6 @@ def read_projections(path: Path, pair: tuple[str, str]) -> tuple[NDArray[np.floa
             remedy=f"give lines {wanted[0]}: and {wanted[1]}:" if labelled else "give two lines of 12 numbers",
         )
     return rows[0][1], rows[1][1]
-
-
-def decompose(projection: NDArray[np.float64], name: str) -> tuple[NDArray[np.float64], RigidTransform]:
-    """K (3, 3) and T_camera_reference of a projection matrix P = K [R | t]."""
-    from scipy.linalg import rq
-
-    m = projection[:, :3]
-    # written so that NaN-free but singular matrices are refused before anything divides by them
-    if abs(np.linalg.det(m)) < 1e-9:
-        raise InputError(
-            "RIL-203", f"calibration: {name} is singular", remedy="give P = K [R | t], 12 numbers, row-major"
-        )
-    if m[1, 0] == m[2, 0] == m[2, 1] == 0.0 and m[2, 2] > 0:
-        k, r = m / m[2, 2], np.eye(3)
-    else:
-        k, r = rq(m * np.sign(np.linalg.det(m)))
-        signs = np.sign(np.diag(k))
-        k, r = k * signs, signs[:, None] * r
-        k = k / k[2, 2]
-    scale = np.linalg.norm(m[2])
-    if abs(k[0, 1]) > 1e-4 * k[0, 0]:
-        raise InputError(
-            "RIL-204", f"calibration: {name} has skewed pixels", remedy="give a camera with perpendicular axes"
-        )
-    t = np.linalg.solve(k, projection[:, 3]) / scale * np.sign(np.linalg.det(m))
-    return k, RigidTransform(orthonormal(r), t)
 
 
 def read_rig(layout: KittiLayout, width: int, height: int) -> tuple[Rig, RigidTransform]:

@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from rille.datasets.cameras.fields import Fields
-from rille.datasets.cameras.model import CalibratedCamera
-from rille.stages.geometry.geometry import RigidTransform
+from rille.datasets.cameras.model import CalibratedCamera, stereo_cameras
 from rille.stages.geometry.lens import Lens
 
 MODELS = ("pinhole", "pinhole_radial_tangential")
@@ -27,10 +26,7 @@ def boofcv(f: Fields, path: Path) -> list[CalibratedCamera]:
     pose = f.sub("rightToLeft")
     shift = np.array([pose.number(key) for key in ("x", "y", "z")])
     T_left_right = pose.rigid("rotation", pose.matrix("rotation", 3, 3), shift)
-    return [
-        CalibratedCamera("left", _lens(f.sub("left")), RigidTransform.identity()),
-        CalibratedCamera("right", _lens(f.sub("right")), T_left_right.inverse()),
-    ]
+    return stereo_cameras(_lens(f.sub("left")), _lens(f.sub("right")), T_left_right.inverse())
 
 
 def _lens(f: Fields) -> Lens:

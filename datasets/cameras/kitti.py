@@ -12,6 +12,7 @@ import re
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rille.datasets.cameras.fields import Fields
 from rille.datasets.cameras.model import UNKNOWN_SIZE, CalibratedCamera
@@ -61,8 +62,6 @@ def kitti(text: str, path: Path) -> list[CalibratedCamera]:
 
 
 def _rectified(fields: Fields, label: str) -> CalibratedCamera:
-    from rille.datasets.kitti import decompose
-
     try:
         k, T_camera_reference = decompose(fields.matrix(label, 3, 4), label)
     except InputError as error:
@@ -70,6 +69,32 @@ def _rectified(fields: Fields, label: str) -> CalibratedCamera:
     number = label.rpartition("_")[2] if label.startswith("P_rect") else ""
     camera = fields.camera(label, (k[0, 0], k[1, 1], k[0, 2], k[1, 2]), _size(fields, f"S_rect_{number}"))
     return CalibratedCamera(label, Lens(camera, "none", ()), T_camera_reference)
+
+
+def decompose(projection: NDArray[np.float64], name: str) -> tuple[NDArray[np.float64], RigidTransform]:
+    """K (3, 3) and T_camera_reference of a projection matrix P = K [R | t]."""
+    from scipy.linalg import rq
+
+    m = projection[:, :3]
+    # written so that NaN-free but singular matrices are refused before anything divides by them
+    if abs(np.linalg.det(m)) < 1e-9:
+        raise InputError(
+            "RIL-203", f"calibration: {name} is singular", remedy="give P = K [R | t], 12 numbers, row-major"
+        )
+    if m[1, 0] == m[2, 0] == m[2, 1] == 0.0 and m[2, 2] > 0:
+        k, r = m / m[2, 2], np.eye(3)
+    else:
+        k, r = rq(m * np.sign(np.linalg.det(m)))
+        signs = np.sign(np.diag(k))
+        k, r = k * signs, signs[:, None] * r
+        k = k / k[2, 2]
+    scale = np.linalg.norm(m[2])
+    if abs(k[0, 1]) > 1e-4 * k[0, 0]:
+        raise InputError(
+            "RIL-204", f"calibration: {name} has skewed pixels", remedy="give a camera with perpendicular axes"
+        )
+    t = np.linalg.solve(k, projection[:, 3]) / scale * np.sign(np.linalg.det(m))
+    return k, RigidTransform(orthonormal(r), t)
 
 
 def _raw(fields: Fields, label: str, number: str) -> CalibratedCamera:

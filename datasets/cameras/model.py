@@ -33,3 +33,8 @@ class CalibratedCamera:
         """Width and height of its images, pixels; None where the file does not say."""
         size = (self.lens.camera.width, self.lens.camera.height)
         return None if size == UNKNOWN_SIZE else size
+
+
+def stereo_cameras(left: Lens, right: Lens, T_right_left: RigidTransform) -> list[CalibratedCamera]:
+    """Both cameras of a file that states how the right one stands to the left one, which is the reference."""
+    return [CalibratedCamera("left", left, RigidTransform.identity()), CalibratedCamera("right", right, T_right_left)]

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from rille.datasets.cameras.fields import Fields
-from rille.datasets.cameras.model import CalibratedCamera
+from rille.datasets.cameras.model import CalibratedCamera, stereo_cameras
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.lens import Lens
 
@@ -79,15 +79,11 @@ def orbslam(f: Fields, path: Path) -> list[CalibratedCamera]:
     left = _orbslam_lens(f, first, size)
     if "Stereo.T_c1_c2" in f:
         right = _orbslam_lens(f, "Camera2" if "Camera2.fx" in f else first, size)
-        return _side_by_side(left, right, f.pose("Stereo.T_c1_c2").inverse())
+        return stereo_cameras(left, right, f.pose("Stereo.T_c1_c2").inverse())
     if "Stereo.b" in f or "Camera.bf" in f:
         baseline = f.number("Stereo.b") if "Stereo.b" in f else f.number("Camera.bf") / left.camera.fx
-        return _side_by_side(left, left, RigidTransform(np.eye(3), np.array([-abs(baseline), 0.0, 0.0])))
+        return stereo_cameras(left, left, RigidTransform(np.eye(3), np.array([-abs(baseline), 0.0, 0.0])))
     return [CalibratedCamera(path.stem, left)]
-
-
-def _side_by_side(left: Lens, right: Lens, T_right_left: RigidTransform) -> list[CalibratedCamera]:
-    return [CalibratedCamera("left", left, RigidTransform.identity()), CalibratedCamera("right", right, T_right_left)]
 
 
 def _orbslam_lens(f: Fields, name: str, size: tuple[int, int]) -> Lens:

@@ -20,11 +20,10 @@ from numpy.typing import NDArray
 from rille.datasets.images import chessboard, pairing
 from rille.datasets.images.files import read_grey
 from rille.datasets.text.warning import warning
+from rille.pipeline.commands.options import COMPLETE
 from rille.pipeline.engine.plain import warn
 from rille.stages.calibration.target import MODELS, BoardView, RigCalibration, calibrate_rig
 from rille.stages.core.errors import InputError, RilleError
-
-COMPLETE = 0
 
 LEAST_COVER = 0.5
 """Share of an image that all corners together should span: beyond them, distortion is extrapolated."""

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rille.datasets.protocol import CAMERAS, Sequence
+from rille.pipeline.commands.options import COMPLETE, FAILED
 from rille.pipeline.engine import scheduler
 from rille.pipeline.engine.graph import Graph, Handle, Maybe, MissingError, Wait
 from rille.pipeline.engine.scheduler import Result
@@ -33,8 +34,6 @@ from rille.stages.imaging.image_quality import Look, look
 
 Floats = NDArray[np.float64]
 Steps = Generator[Wait, Any, None]
-
-COMPLETE, FAILED = 0, 1
 
 MOST_MOTIONS = 12
 """Successive pairs whose motion is measured, spread over the sequence: a sample tells what a run can expect."""

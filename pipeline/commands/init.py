@@ -10,9 +10,8 @@ from rille.datasets.inspection import Findings, inspect
 from rille.datasets.manifest.text import counted, manifest_text, needs
 from rille.datasets.registry import hindrance
 from rille.datasets.text.names import derived_name
+from rille.pipeline.commands.options import COMPLETE
 from rille.stages.core.errors import ConfigError, InputError
-
-COMPLETE = 0
 
 
 def init(directory: Path, output: Path | None = None, force: bool = False) -> int:

@@ -13,14 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rille.datasets.text.warning import warning
+from rille.pipeline.commands.options import COMPLETE, HOLES
 from rille.pipeline.engine.plain import raw, warn
 from rille.pipeline.flow import config as configuration
 from rille.stages.core.errors import ConfigError, InputError
 
 if TYPE_CHECKING:
     from rille.stages.hfvm.stage import Disparity
-
-COMPLETE, INCOMPLETE = 0, 3
 
 LARGE = 1_000_000
 """Pixels: above, matching takes seconds, and says how far it is."""
@@ -98,7 +97,7 @@ def match_files(
     typical = f", standard deviation {np.nanmedian(found.disparity_std):.2f} px (median)" if share else ""
     figures = f"matched {100 * share:.1f} %, defined {100 * float(kept.mean()):.1f} % of {kept.size} pixels"
     print(f"{output}  {figures}{typical}")
-    return COMPLETE if share >= FEW else INCOMPLETE
+    return COMPLETE if share >= FEW else HOLES
 
 
 def warnings(found: Disparity, left: NDArray[Any], right: NDArray[Any]) -> list[str]:

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from rille.pipeline.report.delivery import Items
     from rille.pipeline.runs import run_files
 
-COMPLETE, FAILED, HOLES = 0, 1, 3
+COMPLETE, HOLES = 0, 3
 
 
 @dataclass(frozen=True)
