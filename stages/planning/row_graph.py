@@ -252,7 +252,8 @@ def plan(
         cost, _ = sweep(height, allowed, candidates, toll)
         reached = np.flatnonzero((cost < UNREACHED).any(axis=1))
         stop = int(reached[0]) - 1 if len(reached) else nearest
-        return _blocked(replace(nothing, cost=cost, target_row=limit), stop, "no free cell of this row can be entered")
+        why = "hazardous or unknown ground closes the whole width"
+        return _blocked(replace(nothing, cost=cost, target_row=limit), stop, why)
     source = np.zeros(ways.shape, dtype=bool)
     # One source, not all candidates: costs are then those of the path's own start, as the report draws them.
     source[nearest_middle(good, nearest)] = True
