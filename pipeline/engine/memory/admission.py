@@ -1,7 +1,7 @@
 """Admission of tasks: running tasks together stay under a limit of memory, and begin in the order of creation.
 
-What is held: by this process, by each worker between tasks, and by each running task as foreseen
-(:mod:`rille.pipeline.engine.memory.cost_model`). A task begins where the sum stays under the limit; a later one may
+The sum counts the memory of this process, of each worker between tasks, and of each running task as foreseen
+(:mod:`rille.pipeline.engine.memory.cost_model`). A task begins if the sum stays under the limit; a later one may
 pass one that has to wait, but not for ever. One that does not fit even alone is refused, with the parameter that makes
 it smaller. On a cluster given by address the memory is the workers' own business, unless a limit is given for all of
 it.
