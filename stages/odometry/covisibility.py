@@ -10,6 +10,7 @@ looks like 85 %.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -101,13 +102,13 @@ class Covisibility:
     origin: Floats
     points: Floats
     part: Floats
-    kept: float
-    covered: float
+    later: Step
+    """A step that tells the blocks of the later frame."""
 
     @staticmethod
     def all_of(step: Step) -> Covisibility:
         """Everything that the frame before a step shows."""
-        return Covisibility(step.blocks, step.blocks, np.ones(len(step.blocks)), 1.0, 1.0)
+        return Covisibility(step.blocks, step.blocks, np.ones(len(step.blocks)), step)
 
     def after(self, step: Step) -> Covisibility:
         """The same for the frame behind a step; what has left does not return."""
@@ -115,10 +116,22 @@ class Covisibility:
         # The least so far: what has left the image and comes back is not found again by tracking either.
         part = np.minimum(self.part, _part_inside(moved, step))
         left = part > 0
-        origin, points, part = self.origin[left], moved[left], part[left]
-        _, back = fit_affinity(points, origin, np.ones(len(points), bool), step.blocks)
-        covered = float(np.mean(_part_inside(step.blocks + back, step)))
-        return Covisibility(origin, points, part, float(part.sum()) / len(step.blocks), covered)
+        return Covisibility(self.origin[left], moved[left], part[left], step)
+
+    @property
+    def kept(self) -> float:
+        """Share of the first frame that is still seen."""
+        return float(self.part.sum()) / len(self.later.blocks)
+
+    @cached_property
+    def covered(self) -> float:
+        """Share of the later frame that the first one saw; half of the time of a step, so only where it is asked."""
+        _, back = fit_affinity(self.points, self.origin, np.ones(len(self.points), bool), self.later.blocks)
+        return float(np.mean(_part_inside(self.later.blocks + back, self.later)))
+
+    def less_than(self, overlap: float) -> bool:
+        """Whether they have less in common: one share below it decides."""
+        return self.kept < overlap or self.covered < overlap
 
     @property
     def overlap(self) -> float:
