@@ -313,3 +313,9 @@ def merge_tiles(
         args |= {"exposure": exposure} if exposure else {}
         tiles.append(node(merge, f"merge/{tx}_{ty}", args, dems=[dems[pair] for pair, _ in here]))
     return tiles
+
+
+def centre(box: Mapping[str, Any]) -> list[float]:
+    """Centre x, y of a lattice, metres."""
+    half = 0.5 * box["cell"]
+    return [box["x0"] + half * (box["cols"] - 1), box["y0"] - half * (box["rows"] - 1)]

@@ -46,7 +46,7 @@ from typing import Any
 from rille.pipeline.engine.graph import Handle, Maybe, Wait
 from rille.pipeline.engine.task import Ref
 from rille.pipeline.flow import assessment
-from rille.pipeline.flow.builders import Builder, Pair, Segment, merge_tiles
+from rille.pipeline.flow.builders import Builder, Pair, Segment, centre, merge_tiles
 from rille.stages.core.errors import DegenerateError, InputError
 from rille.stages.evaluation import crosscheck, crosscheck_join
 from rille.stages.imaging import image_quality
@@ -338,12 +338,6 @@ def spread(pairs: list[int], most: int) -> list[int]:
     """At most so many of the pairs, evenly apart, the first among them."""
     # Minus twice: rounds the stride up, so that no more than `most` remain.
     return pairs[:: -(-len(pairs) // most)]
-
-
-def centre(box: Mapping[str, Any]) -> list[float]:
-    """Centre x, y of a lattice, metres."""
-    half = 0.5 * box["cell"]
-    return [box["x0"] + half * (box["cols"] - 1), box["y0"] - half * (box["rows"] - 1)]
 
 
 def heading(trajectory: Mapping[str, Any]) -> list[float]:
