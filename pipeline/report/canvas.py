@@ -108,18 +108,22 @@ class Block:
 
 @dataclass(frozen=True)
 class Figure:
-    """Outcome of a figure: its block, or the reason why there is none; neither if the run has no such figure."""
+    """Outcome of a figure: its block, or the reason why there is none; neither if the run has no such figure.
+
+    ``failed``: drawing it raised an error, so that the run lacks what it could have shown.
+    """
 
     title: str
     block: Block | None = None
     why: str = ""
+    failed: bool = False
 
     @staticmethod
     def from_dict(d: Mapping[str, Any]) -> Figure:
         """Rebuild a figure from the result of ``dataclasses.asdict``."""
         given = d["block"]
         if given is None:
-            return Figure(d["title"], None, d["why"])
+            return Figure(d["title"], None, d["why"], d["failed"])
         table = given["table"]
         if table is not None:
             table = Table(tuple(table["head"]), tuple(map(tuple, table["rows"])), frozenset(table["numbers"]))

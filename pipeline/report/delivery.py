@@ -21,7 +21,7 @@ from rille.pipeline.report.words import metres, spans
 Rows = list[dict[str, Any]]
 Items = list[dict[str, str]]
 
-ANSWERS = ("no path", "crosscheck")
+ANSWERS = ("no path", "crosscheck", "no figure")
 """Kinds of what is missing that are answers, or lie outside of the reconstruction: the run is complete with them."""
 
 
@@ -50,7 +50,9 @@ def account(scene: Scene, frames: Rows, pairs: Rows) -> dict[str, Any]:
 def complete(found: Mapping[str, Any], view: RunView, figures: Sequence[Figure]) -> Delivery:
     """All that a reader might take for granted, in one of the three states: with what became of tasks and figures."""
     done = ["every task was done"] if view.tasks else []
-    lost = [_item("figure", figure.title, figure.why) for figure in figures if figure.why]
+    # A figure without its data is no loss of its own: they are listed, where they are one.
+    undrawn = [figure for figure in figures if figure.why]
+    lost = [_item("figure" if figure.failed else "no figure", figure.title, figure.why) for figure in undrawn]
     missing = [*_failures(view), *found["missing"], *lost]
     return Delivery([*done, *found["delivered"]], found["absent"], missing)
 

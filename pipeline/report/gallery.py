@@ -36,7 +36,7 @@ def _drawn(title: str, maker: Maker, expected: Condition, scene: Scene) -> Figur
     except (OSError, MemoryError, RilleError):  # not the figure's own fault: another try may draw it
         raise
     except Exception as error:  # a figure must not cost the run its report; the failure is shown in it
-        return Figure(title, why=f"drawing failed, {type(error).__name__}: {error}")
+        return Figure(title, why=f"drawing failed, {type(error).__name__}: {error}", failed=True)
     return Figure(title, block, "what it shows was not computed" if block is None and expected(scene) else "")
 
 

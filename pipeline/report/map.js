@@ -150,13 +150,7 @@
     const [a, b] = screen(D.x0 - D.cell / 2, D.y0 + D.cell / 2);
     pen.drawImage(sheet, a, b, D.cols * D.cell * view.scale, D.rows * D.cell * view.scale);
     pen.lineJoin = pen.lineCap = "round";
-    if ($("track").checked && D.track.length) {
-      line(D.track.map((t) => t.slice(1)), "#fff", 4);
-      D.track.forEach((t, i) => { if (i) line([D.track[i - 1].slice(1), t.slice(1)], trackColor(t), 2.4); });
-      for (const t of D.track) { const [u, v] = screen(t[1], t[2]); pen.beginPath(); pen.arc(u, v, 3, 0, 7); pen.fillStyle = trackColor(t); pen.fill(); pen.strokeStyle = "#fff"; pen.lineWidth = 0.8; pen.stroke(); }
-    }
     if ($("path").checked && D.path.length) {
-      line(D.path, "#fff", 5); line(D.path, "#111", 2.5);
       const p = D.path[0], q = D.path.find((v) => Math.hypot(v[0] - p[0], v[1] - p[1]) > D.vehicle[0] / 2) || D.path[D.path.length - 1], turn = Math.atan2(q[1] - p[1], q[0] - p[0]);
       const [u, v] = screen(p[0], p[1]);
       pen.save(); pen.translate(u, v); pen.rotate(-turn);
@@ -164,6 +158,12 @@
       pen.fillStyle = "#ffd34dcc"; pen.strokeStyle = "#111"; pen.lineWidth = 1.5;
       pen.beginPath(); pen.rect(-l / 2, -w / 2, l, w); pen.fill(); pen.stroke(); pen.restore();
     }
+    if ($("track").checked && D.track.length) {
+      line(D.track.map((t) => t.slice(1)), "#fff", 4);
+      D.track.forEach((t, i) => { if (i) line([D.track[i - 1].slice(1), t.slice(1)], trackColor(t), 2.4); });
+      for (const t of D.track) { const [u, v] = screen(t[1], t[2]); pen.beginPath(); pen.arc(u, v, 3, 0, 7); pen.fillStyle = trackColor(t); pen.fill(); pen.strokeStyle = "#fff"; pen.lineWidth = 0.8; pen.stroke(); }
+    }
+    if ($("path").checked && D.path.length) { line(D.path, "#fff", 5); line(D.path, "#111", 2.5); }
     const stop = stops[state.stop];
     for (const [frame, leg] of Object.entries(D.legs)) if (!stop || +frame <= stop.frame) { const here = stop && +frame === stop.frame; line(leg, "#fff", here ? 6 : 3); line(leg, here ? "#c0167a" : "#111", here ? 3.5 : 1.5); }
     if (stop && stop.at) {

@@ -18,7 +18,8 @@ from rille.datasets.mockup.sequence import vehicle_at_scale
 from rille.pipeline.export import ranges
 from rille.pipeline.export.view import TaskRow
 from rille.pipeline.flow.products import Driven, Products
-from rille.pipeline.report import canvas, figures, gather, stops, tables, words
+from rille.pipeline.report import canvas, figures, gather, stops, summary, tables, words
+from rille.pipeline.report.canvas import Figure
 from rille.stages.core.declare import Bundle
 from rille.stages.core.errors import RilleError
 from rille.stages.hazard.risk import RiskParams
@@ -384,3 +385,13 @@ def test_the_page_says_where_the_files_lie(tmp_path: Path) -> None:
     page_ = written(tmp_path, replace(base, sequence=replace(base.sequence, georeference=place)))[1]
     assert "Rasters and path.gpkg are in EPSG:32633" in page_.text
     assert "not known" not in page_.text
+
+
+def test_a_figure_without_its_data_leaves_the_run_complete(tmp_path: Path) -> None:
+    """The reason is listed by itself: the other program's poses lie outside of the reconstruction."""
+    run = view(bundles())
+    facts = summary.summarise(run, summary.gather(run), [Figure("Crosscheck", why="what it shows was not computed")])
+    assert facts["complete"]
+    assert [m["kind"] for m in facts["missing"]] == ["no figure"]
+    facts = summary.summarise(run, summary.gather(run), [Figure("Seams", why="drawing failed", failed=True)])
+    assert not facts["complete"]
