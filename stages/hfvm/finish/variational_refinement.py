@@ -44,13 +44,13 @@ SHARP = 0.05
 """Pixels: median distance from the lines up to which they are trusted fully; beyond it by its inverse square."""
 
 FIT_SAMPLES = 4000
-SWEEPS = 20
+SWEEPS = 10
 OVERSHOOT = 1.7
 """Factor on each Gauss-Seidel step (successive over-relaxation), which stays convergent below 2."""
 
-SOFT_STEPS, SOFT_STIFFNESS, SOFT_BEND = 3, 0.15, 2.0
+SOFT_STEPS, SOFT_STIFFNESS, SOFT_BEND = 2, 0.15, 2.0
 """Number of the first, soft steps, and their factors on stiffness and bend."""
-FULL_STEPS = 4
+FULL_STEPS = 2
 """Steps with full stiffness after them; where there are fewer steps in all, soft ones are left out first."""
 
 
@@ -81,40 +81,38 @@ def fit(
     start_u, start_v = u, v
     u, v = np.where(keep, u, np.float32(0)), np.where(keep, v, np.float32(0))
     spline = scipy.ndimage.spline_filter(right, 3, np.float32, mode="mirror")
-    lines = None
+    lines, trust = _lines(u, v, keep, right.shape)
+    soft_steps = max(0, min(SOFT_STEPS, params.relief_steps - FULL_STEPS))
     for step in range(params.relief_steps):
-        soft = step < min(SOFT_STEPS, params.relief_steps - FULL_STEPS)
-        stiffness = params.relief_stiffness * (SOFT_STIFFNESS if soft else 1.0)
-        bend = params.relief_bend * (SOFT_BEND if soft else 1.0)
-        a, b, c, p, q = _normal(left, spline, right_valid, u, v, keep)
-        lines = _lines(u, v, keep, right.shape)
-        if lines is not None:
-            _hold_to_lines(*lines, u, v, keep, a, b, c, p, q)
+        stiffness = params.relief_stiffness * (SOFT_STIFFNESS if step < soft_steps else 1.0)
+        bend = params.relief_bend * (SOFT_BEND if step < soft_steps else 1.0)
+        grey = _grey(left, spline, right_valid, u, v, keep)
         across, down = np.zeros(u.shape, np.float32), np.zeros(u.shape, np.float32)
         _stiffness(u, v, keep, np.float32(bend), np.float32(stiffness), across, down)
-        new_u, new_v = u.copy(), v.copy()
-        _solve(a, b, c, p, q, keep, across, down, SWEEPS, np.float32(OVERSHOOT), u, v, new_u, new_v)
-        u, v = new_u, new_v
-    if lines is not None:
-        start_u, start_v = _feet(*lines, start_u, start_v, keep)
+        normal = np.zeros((5, *u.shape), np.float32)
+        _normal(grey, lines, np.float32(LINE * trust), (u, v), keep, (across, down), normal)
+        u, v = _solve(normal, across, down, u, v)
+    if trust > 0:
+        start_u, start_v = _feet(lines, trust, start_u, start_v, keep)
     good = keep & (np.hypot(u - start_u, v - start_v) <= FARTHEST)
     return np.where(good, u, start_u), np.where(good, v, start_v)
 
 
-def _normal(
+def _grey(
     left: AnyArray, spline: AnyArray, right_valid: AnyArray, u: AnyArray, v: AnyArray, keep: AnyArray
-) -> tuple[AnyArray, ...]:
-    """Terms a, b, c, p, q of each pixel's normal equations (a b; b c) (du, dv) = (p, q) of the grey values."""
+) -> AnyArray:
+    """Planes (4, row, col): weight of each pixel, gradient (x, y) of the warped right image, difference of the images
+    free of its local mean; weight 0 where a pixel does not take part."""
     planes = np.zeros((4, *u.shape), np.float32)
     _warped(left, spline, right_valid, u, v, keep, planes)
-    known, gx, gy, rest = planes
+    known, _, _, rest = planes
     mean, weight = np.zeros_like(rest), known
     for _ in range(MEAN_ROUNDS + 1):
         mean = window_sum(weight * rest, MEAN_SIDE) / np.maximum(window_sum(weight, MEAN_SIDE), LEAST_WEIGHT)
-        weight = (known / (1.0 + ((rest - mean) / RESIDUAL) ** 2)).astype(np.float32)
-    rest = np.where(known > 0, rest - mean, 0.0).astype(np.float32)
-    wx, wy = weight * gx, weight * gy
-    return wx * gx, wx * gy, wy * gy, wx * rest, wy * rest
+        weight = known / (np.float32(1.0) + ((rest - mean) * np.float32(1.0 / RESIDUAL)) ** 2)
+    planes[0] = weight
+    planes[3] -= mean
+    return planes
 
 
 @njit(cache=True, nogil=True)
@@ -161,29 +159,17 @@ def _weights(t, w, slope):  # type: ignore[no-untyped-def]
     slope[1], slope[2] = half * t * (three * t - four), -half * q * (three * q - four)
 
 
-def _lines(u: AnyArray, v: AnyArray, keep: AnyArray, right_shape: tuple[int, int]) -> tuple[AnyArray, float] | None:
-    """Epipolar lines (row, col, 3) fitted to the matches, and how far to trust them, 0..1; None: not determined."""
+def _lines(u: AnyArray, v: AnyArray, keep: AnyArray, right_shape: tuple[int, int]) -> tuple[AnyArray, float]:
+    """Epipolar lines (row, col, 3) fitted to the matches, and how far to trust them, 0..1; 0 where not determined."""
     found = epipolar.fit(u, v, evenly(keep, FIT_SAMPLES), right_shape)
     if found is None:
-        return None
+        return np.zeros((*u.shape, 3), np.float32), 0.0
     return epipolar.lines(found[0], u.shape), min(1.0, (SHARP / max(found[1], 1e-9)) ** 2)
 
 
 def _off(lines: AnyArray, u: AnyArray, v: AnyArray) -> AnyArray:
     """Signed distance from the line, pixels."""
     return np.asarray(lines[..., 0] * u + lines[..., 1] * v + lines[..., 2])
-
-
-def _hold_to_lines(lines: AnyArray, trust: float, u: AnyArray, v: AnyArray, keep: AnyArray, *terms: AnyArray) -> None:
-    """Add the squared distance from the epipolar lines to the normal equations, in place."""
-    a, b, c, p, q = terms
-    x, y, e = lines[..., 0], lines[..., 1], _off(lines, u, v)
-    k = np.where(keep, np.float32(LINE * trust), np.float32(0))
-    a += k * x * x
-    b += k * x * y
-    c += k * y * y
-    p -= k * x * e
-    q -= k * y * e
 
 
 def _feet(lines: AnyArray, trust: float, u: AnyArray, v: AnyArray, keep: AnyArray) -> tuple[AnyArray, AnyArray]:
@@ -211,48 +197,64 @@ def _stiffness(u, v, keep, bend, stiffness, across, down):  # type: ignore[no-un
 
 
 @njit(cache=True, nogil=True)
-def _solve(a, b, c, p, q, keep, across, down, sweeps, overshoot, u0, v0, u, v):  # type: ignore[no-untyped-def]
-    """Gauss-Seidel sweeps on ``u, v`` in place; the grey values' terms are those at ``u0, v0``.
+def _normal(grey, lines, hold, at, keep, stiffness, out):  # type: ignore[no-untyped-def]
+    """What the sweeps need of each pixel's normal equations (m n; n o) (u, v) = (p, q) + what its neighbours want.
+
+    ``out`` (5, row, col): o / det, n / det, m / det, p, q; zero where a pixel stays as it is. ``hold``: squared grey
+    levels for a pixel off the line; ``at``: displacements at which the grey values were taken.
+    """
+    weight, grad_x, grad_y, rest = grey
+    (u, v), (across, down) = at, stiffness
+    rows, cols = u.shape
+    four = np.float32(4.0)
+    for y in range(rows):
+        for x in range(cols):
+            if not keep[y, x]:
+                continue
+            w, gx, gy = weight[y, x], grad_x[y, x], grad_y[y, x]
+            lx, ly, off = lines[y, x, 0], lines[y, x, 1], lines[y, x, 2]
+            a, b, c = w * gx * gx + hold * lx * lx, w * gx * gy + hold * lx * ly, w * gy * gy + hold * ly * ly
+            # Of the squared distance from the line only its offset is left: the displacement itself cancels.
+            warp = gx * u[y, x] + gy * v[y, x] + rest[y, x]
+            p, q = w * gx * warp - hold * lx * off, w * gy * warp - hold * ly * off
+            s = four * (across[y, x] + down[y, x])
+            s += (across[y, x - 1] if x > 0 else 0) + (across[y, x + 1] if x < cols - 1 else 0)
+            s += (down[y - 1, x] if y > 0 else 0) + (down[y + 1, x] if y < rows - 1 else 0)
+            m, o = a + s, c + s
+            det = m * o - b * b
+            if det > np.float32(1.0):
+                out[0, y, x], out[1, y, x], out[2, y, x], out[3, y, x], out[4, y, x] = o / det, b / det, m / det, p, q
+
+
+def _solve(normal: AnyArray, across: AnyArray, down: AnyArray, u: AnyArray, v: AnyArray) -> tuple[AnyArray, AnyArray]:
+    """Displacements after :data:`SWEEPS` Gauss-Seidel sweeps; a frame of zeros stands for the neighbours of the border."""
+    u, v, across, down = (np.pad(a, 2) for a in (u, v, across, down))
+    _sweep(normal, across, down, SWEEPS, np.float32(OVERSHOOT), u, v)
+    return np.ascontiguousarray(u[2:-2, 2:-2]), np.ascontiguousarray(v[2:-2, 2:-2])
+
+
+@njit(cache=True, nogil=True)
+def _sweep(normal, across, down, sweeps, overshoot, u, v):  # type: ignore[no-untyped-def]
+    """Gauss-Seidel sweeps on ``u, v`` in place; all but ``normal`` have a frame of two pixels.
 
     A pixel takes part in three second differences of its row and three of its column: as their middle, where it counts
-    twice, and as either end. ``s``, ``su``, ``sv``: their weights, and weighted values they want.
+    twice, and as either end. ``su``, ``sv``: the weighted values that they want.
     """
-    rows, cols = u.shape
-    two, four = np.float32(2.0), np.float32(4.0)
+    _, rows, cols = normal.shape
+    two = np.float32(2.0)
     for _ in range(sweeps):
         for y in range(rows):
+            minor_v, cross, minor_u, p, q = normal[0, y], normal[1, y], normal[2, y], normal[3, y], normal[4, y]
+            k, k_up, k_own, k_down = across[y + 2], down[y + 1, 2:], down[y + 2, 2:], down[y + 3, 2:]
+            uo, u1, u2, u3, u4 = u[y + 2], u[y, 2:], u[y + 1, 2:], u[y + 3, 2:], u[y + 4, 2:]
+            vo, v1, v2, v3, v4 = v[y + 2], v[y, 2:], v[y + 1, 2:], v[y + 3, 2:], v[y + 4, 2:]
             for x in range(cols):
-                if not keep[y, x]:
+                if minor_v[x] == 0:
                     continue
-                s = su = sv = np.float32(0.0)
-                k = across[y, x]
-                if k > 0:
-                    s += four * k
-                    su += two * k * (u[y, x - 1] + u[y, x + 1])
-                    sv += two * k * (v[y, x - 1] + v[y, x + 1])
-                k = down[y, x]
-                if k > 0:
-                    s += four * k
-                    su += two * k * (u[y - 1, x] + u[y + 1, x])
-                    sv += two * k * (v[y - 1, x] + v[y + 1, x])
-                for side in (-1, 1):
-                    i, j = x + side, y + side
-                    if i > 0 and i < cols - 1:
-                        k = across[y, i]
-                        if k > 0:
-                            s += k
-                            su += k * (two * u[y, i] - u[y, i + side])
-                            sv += k * (two * v[y, i] - v[y, i + side])
-                    if j > 0 and j < rows - 1:
-                        k = down[j, x]
-                        if k > 0:
-                            s += k
-                            su += k * (two * u[j, x] - u[j + side, x])
-                            sv += k * (two * v[j, x] - v[j + side, x])
-                m, n, o = a[y, x] + s, b[y, x], c[y, x] + s
-                right_u = a[y, x] * u0[y, x] + n * v0[y, x] + p[y, x] + su
-                right_v = n * u0[y, x] + c[y, x] * v0[y, x] + q[y, x] + sv
-                det = m * o - n * n
-                if det > np.float32(1.0):
-                    u[y, x] += overshoot * ((o * right_u - n * right_v) / det - u[y, x])
-                    v[y, x] += overshoot * ((m * right_v - n * right_u) / det - v[y, x])
+                kw, ko, ke, ku, kc, kd = k[x + 1], two * k[x + 2], k[x + 3], k_up[x], two * k_own[x], k_down[x]
+                su = p[x] + (kc * (u2[x] + u3[x]) + ku * (two * u2[x] - u1[x]) + kd * (two * u3[x] - u4[x]))
+                sv = q[x] + (kc * (v2[x] + v3[x]) + ku * (two * v2[x] - v1[x]) + kd * (two * v3[x] - v4[x]))
+                su += ke * (two * uo[x + 3] - uo[x + 4]) + ko * uo[x + 3] - kw * uo[x] + (ko + two * kw) * uo[x + 1]
+                sv += ke * (two * vo[x + 3] - vo[x + 4]) + ko * vo[x + 3] - kw * vo[x] + (ko + two * kw) * vo[x + 1]
+                uo[x + 2] += overshoot * (minor_v[x] * su - cross[x] * sv - uo[x + 2])
+                vo[x + 2] += overshoot * (minor_u[x] * sv - cross[x] * su - vo[x + 2])
