@@ -8,6 +8,7 @@ as signed square roots, one byte each, and know nothing of the images' brightnes
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 
 from rille.stages.core.declare import AnyArray
 from rille.stages.hfvm.level.features import Words
@@ -30,11 +31,21 @@ def pack(image: AnyArray) -> Words:
     -------
     (row, col) uint64, byte k is ``128 + round(8 sign(s) sqrt|s|)`` of the step s to neighbour k, clipped.
     """
-    rows, cols = image.shape
-    a = np.pad(np.asarray(image, np.float32), 1, mode="edge")
-    words = np.zeros((rows, cols), np.uint64)
-    for k, (j, i) in enumerate(NEIGHBOURS):
-        step = a[1 + j : 1 + j + rows, 1 + i : 1 + i + cols] - a[1:-1, 1:-1]
-        byte = np.float32(128.5) + SCALE * np.sign(step) * np.sqrt(np.abs(step))
-        words |= np.clip(byte, 0, 255).astype(np.uint64) << np.uint64(8 * k)
+    words = np.empty(image.shape, np.uint64)
+    _pack(np.pad(np.asarray(image, np.float32), 1, mode="edge"), words)
     return words
+
+
+@njit(cache=True, nogil=True)
+def _pack(framed, words):  # type: ignore[no-untyped-def]
+    """Words of an image that has a frame of one pixel."""
+    middle, top = np.float32(128.5), np.float32(255.0)
+    for y in range(words.shape[0]):
+        for x in range(words.shape[1]):
+            word = np.uint64(0)
+            for k in range(len(NEIGHBOURS)):
+                step = framed[y + 1 + NEIGHBOURS[k][0], x + 1 + NEIGHBOURS[k][1]] - framed[y + 1, x + 1]
+                root = SCALE * np.sqrt(abs(step))
+                byte = min(max(middle + (root if step > 0 else -root), np.float32(0.0)), top)
+                word |= np.uint64(byte) << np.uint64(8 * k)
+            words[y, x] = word

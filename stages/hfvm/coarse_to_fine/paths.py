@@ -1,10 +1,10 @@
 """Propagation along paths: each pixel chooses among a few candidate displacements (preset ``accurate``).
 
 A pixel's candidates are its own displacement and those a pixel beside it, those of near and farther pixels, and those
-handed down from the coarser level (paper, 4.3.4): a short list, not a range of disparities. Along eight directions each
-candidate gathers the least cost of getting there from the border of the image, smoothness included; the candidate of
-least total wins. So evidence travels over weak texture as far as it must, and stops at depth edges, where smoothness is
-truncated, the sooner the greater the grey step.
+handed down from the coarser level (paper, 4.3.4): a short list, not a range of disparities. Along six directions (all of
+eight but those within a row) each candidate gathers the least cost of getting there from the border of the image,
+smoothness included; the candidate of least total wins. So evidence travels over weak texture as far as it must, and
+stops at depth edges, where smoothness is truncated, the sooner the greater the grey step.
 
 All costs are integers, candidates come in a fixed order and only a strictly lower cost wins. One step of a direction is
 vector code (:mod:`rille.stages.hfvm.coarse_to_fine.path_simd`).
@@ -183,32 +183,29 @@ def _inside(index, size):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _sweep(found, grey, weights, backward, total):  # type: ignore[no-untyped-def]
-    """Add four directions: from the left, upper left, above and upper right; ``backward``: their opposites."""
+    """Add three directions: from the upper left, above and the upper right; ``backward``: their opposites."""
     rows, cols = grey.shape
-    # The border before an image counts as a pixel without candidates: nothing is gathered there.
-    before = np.zeros((4, cols, MOST), np.int16)
-    after = np.zeros((4, cols, MOST), np.int16)
+    before = np.zeros((3, cols, MOST), np.int16)
+    after = np.zeros((3, cols, MOST), np.int16)
     us, vs, costs, totals = found.u.reshape(-1), found.v.reshape(-1), found.cost.reshape(-1), total.reshape(-1)
     large, half, small = np.float32(weights.large), np.float32(weights.grey), weights.small
     s = -1 if backward else 1
     for row in range(rows):
         y = rows - 1 - row if backward else row
-        for col in range(cols):
-            x = cols - 1 - col if backward else col
+        j = y - s
+        for x in range(cols):
             at = (y * cols + x) * MOST
-            for d in range(4):
-                j = y if d == 0 else y - s
-                i = x - s if d == 0 else x + s * (d - 2)
+            for d in range(3):
+                i = x + s * (d - 1)
                 if j < 0 or j >= rows or i < 0 or i >= cols:
                     for k in range(MOST):
                         after[d, x, k] = costs[at + k]
                         totals[at + k] += costs[at + k]
                     continue
-                path = after[0, i] if d == 0 else before[d, i]
                 change = abs(grey[y, x] - grey[j, i])
                 far = np.int64(max(large / (np.float32(1.0) + change / half), 2 * small))
                 there = (j * cols + i) * MOST
-                path_simd.step(us, vs, costs, path, there, after[d, x], 0, totals, at, small, far)
+                path_simd.step(us, vs, costs, before[d, i], there, after[d, x], 0, totals, at, small, far)
         before, after = after, before
 
 

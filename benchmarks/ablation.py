@@ -1,0 +1,102 @@
+"""What each step of preset ``accurate`` costs and gains: the preset with one step left out or changed at a time.
+
+    RILLE_DATA=... python benchmarks/ablation.py [--half judged]
+
+Pairs: those that settings may be chosen with (``CHOSEN`` of ``benchmarks/robustness.py``) and the mockup, or with
+``--half judged`` the others. Time: processor seconds a pair on one thread, both directions, over those of OpenCV's SGBM
+3WAY on the same pairs in the same run. Bad-1 and bad-2 after filling over SGBM's, means of the pairs' ratios: once
+filled alike, once by Rille's own filling. Bad-2 of the matched, their median error and the completeness: means.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from typing import Any
+
+STEPS = (
+    ("accurate", ""),
+    ("no propagation along paths", "path_rounds=0"),
+    ("3 rounds of it", "path_rounds=3"),
+    ("no compact features in it", "path_compact=0"),
+    ("no variational refinement", "relief_steps=0"),
+    ("7 steps of it", "relief_steps=7"),
+    ("uncertain matches kept", "greatest_std=null"),
+    ("lonely matches kept", "crowd=0"),
+    ("both kept", "greatest_std=null crowd=0"),
+    ("no guided filling", "guided_fill=false"),
+    ("two rounds at the finest level", "fine_rounds=2 back_rounds=2"),
+)
+"""What is changed, in words and as parameters."""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--half", choices=("chosen", "judged"), default="chosen", help="of the pairs (chosen)")
+    given = parser.parse_args()
+    from rille.pipeline.engine.runtime.environment import prepare_environment
+
+    prepare_environment()
+    import robustness
+    from stereo import methods
+
+    methods.set_threads(1)
+    known = robustness.pairs()
+    names = [*robustness.CHOSEN, "mockup"] if given.half == "chosen" else list(robustness.JUDGED)
+    pairs = [known[name] for name in names]
+    peer = next(m for m in methods.opencv() if m.name == "SGBM 3WAY")
+    print(f"pairs ({given.half}): {', '.join(names)}\n")
+    print("| | time | filled: bad-1 | bad-2 | own filling: bad-1 | bad-2 | matched: bad-2 | median, px | completeness |")
+    print("|---|---|---|---|---|---|---|---|---|")
+    peers = [judged(peer, pair) for pair in pairs]
+    tell("SGBM 3WAY", peers, peers)
+    tell("default", [judged(variant("preset=default"), pair) for pair in pairs], peers)
+    for words, changed in STEPS:
+        method = variant(f"preset=accurate {changed}")
+        tell(words, [judged(method, pair) for pair in pairs], peers)
+
+
+def variant(text: str) -> Any:
+    """The matcher with these parameters, compiled."""
+    import numpy as np
+    from stereo import methods
+    from stereo.pairs import Pair
+
+    method = methods.hfvm([text], 1)[-1]
+    noise = np.random.default_rng(0).integers(0, 256, (64, 96), dtype=np.uint8)
+    method.run(Pair("warm-up", noise, noise, None, 0, 15))
+    return method
+
+
+def judged(method: Any, pair: Any) -> dict[str, float]:
+    """Figures of one pair, and the processor seconds that matching it took."""
+    from stereo.measures import Found, error, judge
+
+    begun = time.process_time()
+    raw = method.run(pair)
+    seconds = time.process_time() - begun
+    found = method.read(raw, pair)
+    figures = {**judge(found, pair.truth), "seconds": seconds}
+    figures |= {"bad1_own": figures["bad1"], "bad2_own": figures["bad2"]}
+    if found.dense is not None:
+        off = error(Found(*found.dense, found.matched, found.rows), pair.truth)[pair.truth.known]
+        figures |= {f"bad{n}_own": float((~(off <= n)).mean()) for n in (1, 2)}
+    return figures
+
+
+def tell(words: str, mine: list[dict[str, float]], peers: list[dict[str, float]]) -> None:
+    """One line of the table."""
+
+    def mean(values: list[float]) -> float:
+        return sum(values) / len(values)
+
+    ratio = sum(f["seconds"] for f in mine) / sum(p["seconds"] for p in peers)
+    over = [mean([f[k] / p[k] for f, p in zip(mine, peers, strict=True)]) for k in ("bad1", "bad2")]
+    over += [mean([f[f"{k}_own"] / p[k] for f, p in zip(mine, peers, strict=True)]) for k in ("bad1", "bad2")]
+    plain = [mean([f[k] for f in mine]) for k in ("bad2_matched", "median", "completeness")]
+    cells = [f"{ratio:.1f}", *(f"{v:.3f}" for v in over + plain)]
+    print(f"| {words} | {' | '.join(cells)} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
