@@ -46,7 +46,9 @@ def main() -> None:
     pairs = [known[name] for name in names]
     peer = next(m for m in methods.opencv() if m.name == "SGBM 3WAY")
     print(f"pairs ({given.half}): {', '.join(names)}\n")
-    print("| | time | filled: bad-1 | bad-2 | own filling: bad-1 | bad-2 | matched: bad-2 | median, px | completeness |")
+    print(
+        "| | time | filled: bad-1 | bad-2 | own filling: bad-1 | bad-2 | matched: bad-2 | median, px | completeness |"
+    )
     print("|---|---|---|---|---|---|---|---|---|")
     peers = [judged(peer, pair) for pair in pairs]
     tell("SGBM 3WAY", peers, peers)
