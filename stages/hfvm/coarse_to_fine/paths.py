@@ -1,8 +1,8 @@
 """Propagation along paths: each pixel chooses among a few candidate displacements (preset ``accurate``).
 
 A pixel's candidates are its own displacement and those a pixel beside it, those of near and farther pixels, and those
-handed down from the coarser level (paper, 4.3.4): a short list, not a range of disparities. Along six directions (all of
-eight but those within a row) each candidate gathers the least cost of getting there from the border of the image,
+handed down from the coarser level (paper, 4.3.4): a short list, not a range of disparities. Along six directions (eight
+but for those within a row) each candidate gathers the least cost of getting there from the border of the image,
 smoothness included; the candidate of least total wins. So evidence travels over weak texture as far as it must, and
 stops at depth edges, where smoothness is truncated, the sooner the greater the grey step.
 

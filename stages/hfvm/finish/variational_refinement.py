@@ -227,7 +227,7 @@ def _normal(grey, lines, hold, at, keep, stiffness, out):  # type: ignore[no-unt
 
 
 def _solve(normal: AnyArray, across: AnyArray, down: AnyArray, u: AnyArray, v: AnyArray) -> tuple[AnyArray, AnyArray]:
-    """Displacements after :data:`SWEEPS` Gauss-Seidel sweeps; a frame of zeros stands for the neighbours of the border."""
+    """Displacements after :data:`SWEEPS` Gauss-Seidel sweeps; zeros stand for the neighbours of the border."""
     u, v, across, down = (np.pad(a, 2) for a in (u, v, across, down))
     _sweep(normal, across, down, SWEEPS, np.float32(OVERSHOOT), u, v)
     return np.ascontiguousarray(u[2:-2, 2:-2]), np.ascontiguousarray(v[2:-2, 2:-2])
