@@ -232,6 +232,8 @@ class Watch(threading.Thread):
         self.client: list[int] = []
         self.workers: list[int] = []
         self.processor: dict[int, float] = {}
+        self.own = 0.0
+        """Processor time of this thread."""
         self._end = threading.Event()
 
     def run(self) -> None:
@@ -246,6 +248,7 @@ class Watch(threading.Thread):
                     self.processor[child.pid] = times.user + times.system
                     greatest = max(greatest, child.memory_info().rss)
             self.workers.append(greatest)
+            self.own = time.thread_time()
 
     def stop(self) -> None:
         """Say the end."""
@@ -274,6 +277,7 @@ def measure(pairs: int, cache: str, executor: str, jobs: int, what: str) -> dict
     result.check()
     spent, cpu = time.perf_counter() - wall, time.process_time() - cpu
     watch.stop()
+    cpu -= watch.own
     n = len(graph.nodes)
     processor = sum(h.kernel for h in graph.nodes)
     return {
