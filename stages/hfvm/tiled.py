@@ -120,7 +120,7 @@ def coarse(left: View, right: View, params: HfvmParams, side: int | None, prior:
 def _levelled(left: View, right: View, params: HfvmParams, side: int | None) -> tuple[Prepared, State, Floats | None]:
     """Coarse levels, and the ratio of brightness that is undone in them; None: none is."""
     pair = prepare(left, right, params, side)
-    top = hierarchy.run(pair, params, params.plane_level + 1)
+    top = hierarchy.run(pair, params, params.plane_level + 2)
     ratio: Floats | None = None
     if params.preset == "paper":
         return pair, _down(pair, params, top), None
@@ -128,7 +128,7 @@ def _levelled(left: View, right: View, params: HfvmParams, side: int | None) -> 
         guess = brightness.guess(left, right, top.level)
         if brightness.greatest(guess) > brightness.NOTABLE:
             other = prepare(left, brightness.levelled(right, guess), params, side)
-            found = hierarchy.run(other, params, params.plane_level + 1)
+            found = hierarchy.run(other, params, params.plane_level + 2)
             if share(found) > share(top):
                 pair, top, ratio = other, found, guess
     state = _down(pair, params, top)
