@@ -9,7 +9,9 @@ and two processes that compile two signatures of one function at once may both t
   that an edit compiles anew what it can change, and nothing else;
 - each entry is a file of its own, named by its key; it holds the key and a checksum, against damage;
 - of processes that need the same kernel at once one compiles it, the others wait and load it;
-- a kernel has no wrapper for callers in C: nobody calls it, and small kernels compile a sixth to a quarter faster;
+- a kernel has no wrapper for callers in C, and one that kernels call has none for callers in Python either: if Python
+  calls it, too, it is compiled anew with that wrapper;
+- a kernel that is called with a constant number is compiled for its type, not anew for each constant;
 - all lie in :func:`rille.pipeline.engine.runtime.private.private_folder`, because loading one executes it.
 """
 
@@ -23,6 +25,7 @@ import importlib.util
 import os
 import pickle
 import sys
+import threading
 import time
 from contextlib import suppress
 from functools import cache
@@ -209,6 +212,64 @@ def _content(code: CodeType) -> tuple[object, ...]:
     return code.co_names, [_content(c) if isinstance(c, CodeType) else repr(c) for c in code.co_consts]
 
 
+class Calls(threading.local):
+    """How deep numba is in what a kernel calls, in this thread: 0 while it compiles or loads for a call by Python."""
+
+    depth = 0
+
+
+CALLS = Calls()
+
+
+def _patch_calls(module: Any) -> None:
+    """Compile what a kernel calls without a wrapper for Python, and once for all constants."""
+    from numba.core import sigutils, types
+    from numba.core.compiler_lock import global_compiler_lock
+
+    kind, compiler = module.Dispatcher, module._FunctionCompiler
+    template, add, compiled, flags_of = (
+        kind.get_call_template,
+        kind.add_overload,
+        kind.compile,
+        compiler._customize_flags,
+    )
+
+    def general(given: Any) -> Any:
+        return given.literal_type if isinstance(given, types.IntegerLiteral | types.BooleanLiteral) else given
+
+    def get_call_template(self: Any, args: Any, kws: Any) -> Any:  # a kernel calls it
+        if _is_own(self.py_func):
+            args, kws = [general(a) for a in args], {name: general(a) for name, a in dict(kws).items()}
+        CALLS.depth += 1
+        try:
+            return template(self, args, kws)
+        finally:
+            CALLS.depth -= 1
+
+    def customize_flags(self: Any, flags: Any) -> Any:
+        if CALLS.depth:
+            flags.no_cpython_wrapper = True
+        return flags_of(self, flags)
+
+    def add_overload(self: Any, made: Any) -> None:
+        if CALLS.depth:  # Python must not find what has no wrapper
+            self.overloads[tuple(made.signature.args)] = made
+            self.__dict__.setdefault("_unwrapped", set()).add(tuple(made.signature.args))
+        else:
+            add(self, made)
+
+    def compile_(self: Any, sig: Any) -> Any:
+        with global_compiler_lock:
+            args = tuple(sigutils.normalize_signature(sig)[0])
+            if not CALLS.depth and args in self.__dict__.get("_unwrapped", ()):
+                self._unwrapped.discard(args)
+                del self.overloads[args]
+            return compiled(self, sig)
+
+    kind.get_call_template, kind.add_overload, kind.compile = get_call_template, add_overload, compile_
+    compiler._customize_flags = customize_flags
+
+
 def _patch(module: Any) -> None:
     from numba.core import caching
 
@@ -224,9 +285,11 @@ def _patch(module: Any) -> None:
         cached(self)
 
     module.Dispatcher.enable_caching = enable_caching
+    _patch_calls(module)
 
     def path(self: Any, key: Any) -> Path:
-        name = hashlib.sha256(repr((self._version, self._source_stamp, key)).encode()).hexdigest()[:24]
+        content = (self._version, self._source_stamp, key, CALLS.depth > 0)
+        name = hashlib.sha256(repr(content).encode()).hexdigest()[:24]
         return Path(self._data_path(f"{self._index_name.removesuffix('.nbi')}.{name}.nbc"))
 
     def save(self: Any, key: Any, data: Any) -> None:

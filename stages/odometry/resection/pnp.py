@@ -387,7 +387,12 @@ def _minimise(data, active, iterations, tolerance, poses):  # type: ignore[no-un
             # Also of a refused step: where less than this is to be gained, a smaller one gains nothing either.
             finished = promised <= tolerance * (cost if cost < np.inf else 0.0) + 1e-20
             if new_cost < cost:
-                R[b], t[b], bias[b] = new_R, new_t, new_bias
+                # Entry by entry: numba compiles the words of an error of shapes for each assignment of an array.
+                for i in range(3):
+                    t[b, i] = new_t[i]
+                    for k in range(3):
+                        R[b, i, k] = new_R[i, k]
+                bias[b] = new_bias
                 cost = new_cost
                 damping = max(damping * 0.1, 1e-12)
             else:
