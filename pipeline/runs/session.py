@@ -259,7 +259,7 @@ def _open(options: Options) -> _Opened:
 def _progress(opened: _Opened) -> Iterator[Progress]:
     """Receiver of each step, as the user asks to see it."""
     from rille.pipeline.engine import progress
-    from rille.pipeline.report import live
+    from rille.pipeline.runs import live
 
     options, page = opened.options, opened.folder / "live.html"
     shown = progress.make(options.progress, verbose=options.verbose)

@@ -70,7 +70,7 @@ class Coarse:
 
 def is_whole(params: HfvmParams) -> bool:
     """Whether a preset reaches over whole images: propagation along paths and the relief do."""
-    return params.path_rounds > 0 or params.relief_steps > 0
+    return params.path_rounds > 0 or params.variational_steps > 0
 
 
 def halves(left: View, right: View, params: HfvmParams) -> bool:

@@ -124,7 +124,7 @@ class Finish:
         bits = bits.copy()
         keep = bits == 0
         # The relief's windows are not bounded: it is given the whole image.
-        all_of_it = p.relief_steps or outer == whole(self.shape)
+        all_of_it = p.variational_steps or outer == whole(self.shape)
         target = whole(shape) if all_of_it else self._read(outer, u, v, keep)
         place = WindowPair(outer.x0, outer.y0, target.x0, target.y0, shape[0], shape[1])
         left, valid = self.pair.left.view.grey(0, outer), self.right.valid(0, target)
@@ -139,7 +139,7 @@ class Finish:
         # Smoothing divides the residuals' variance, not what a match knows of its place.
         noise *= variance / min(side.view.kept_noise for side in (self.pair.left, self.pair.right))
         there = to_right(u, v)
-        if p.relief_steps:
+        if p.variational_steps:
             there = variational_refinement.fit(left, image, valid, *there, bits == 0, p)
             u, v = there if self.alignment is None else plane.decompose(self.alignment, *there)
         keep, found = bits == 0, np.zeros(outer.shape, bool)
@@ -182,7 +182,7 @@ class Finish:
         keep = validity == 0
         removed &= keep
         # Lonely matches are too uncertain to count as measured, but still the best guess where they are.
-        lonely = consistency.lonely(keep & ~removed, p.crowd)
+        lonely = consistency.lonely(keep & ~removed, p.min_support)
         mark(validity, removed | lonely, Validity.SPECKLE)
         interpolated = lonely.astype(np.uint8)
         consistency.fill_rows(u, v, keep & ~removed, p.fill_reach, self.near_sign or -1.0, interpolated)

@@ -87,7 +87,7 @@ def standard_deviation(
 
 
 def _factors(params: HfvmParams) -> Factors:
-    if params.relief_steps:
+    if params.variational_steps:
         return RELIEF
     if params.refine:
         return REFINED

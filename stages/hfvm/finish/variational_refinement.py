@@ -82,10 +82,10 @@ def fit(
     u, v = np.where(keep, u, np.float32(0)), np.where(keep, v, np.float32(0))
     spline = scipy.ndimage.spline_filter(right, 3, np.float32, mode="mirror")
     lines, trust = _lines(u, v, keep, right.shape)
-    soft_steps = max(0, min(SOFT_STEPS, params.relief_steps - FULL_STEPS))
-    for step in range(params.relief_steps):
-        stiffness = params.relief_stiffness * (SOFT_STIFFNESS if step < soft_steps else 1.0)
-        bend = params.relief_bend * (SOFT_BEND if step < soft_steps else 1.0)
+    soft_steps = max(0, min(SOFT_STEPS, params.variational_steps - FULL_STEPS))
+    for step in range(params.variational_steps):
+        stiffness = params.variational_stiffness * (SOFT_STIFFNESS if step < soft_steps else 1.0)
+        bend = params.variational_bend * (SOFT_BEND if step < soft_steps else 1.0)
         grey = _grey(left, spline, right_valid, u, v, keep)
         across, down = np.zeros(u.shape, np.float32), np.zeros(u.shape, np.float32)
         _stiffness(u, v, keep, np.float32(bend), np.float32(stiffness), across, down)

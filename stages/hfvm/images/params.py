@@ -32,8 +32,8 @@ ACCURATE: Mapping[str, Any] = {
     "back_rounds": 4,
     "centres": 5,
     "path_rounds": 1,
-    "relief_steps": 4,
-    "crowd": 0.5,
+    "variational_steps": 4,
+    "min_support": 0.5,
     "guided_fill": True,
     "greatest_std": 1.1,
 }
@@ -270,26 +270,26 @@ class HfvmParams(Params):
         description="grey-level step between neighbours at which path_large is halved; larger: depth steps follow "
         "image edges less",
     )
-    relief_steps: int = Field(
+    variational_steps: int = Field(
         default=0,
         ge=0,
         le=20,
         description="steps of the variational refinement, which fits a piecewise smooth relief to all matches; more "
         "take longer; 0: none",
     )
-    relief_stiffness: float = Field(
+    variational_stiffness: float = Field(
         default=2000.0,
         gt=0,
         description="cost [squared grey levels] of a bend of one pixel; larger: smoother, less noise, small relief "
         "lost",
     )
-    relief_bend: float = Field(
+    variational_bend: float = Field(
         default=0.05,
         gt=0,
         description="bend [pixels, second difference] beyond which the stiffness gives way to an edge; larger: "
         "fewer edges are kept",
     )
-    crowd: float = Field(
+    min_support: float = Field(
         default=0.0,
         ge=0,
         le=1,

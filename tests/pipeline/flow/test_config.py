@@ -28,7 +28,7 @@ def test_one_setting_makes_terrain_accurate_and_what_is_given_beside_it_wins() -
     assert (built.locus.cell_size, built.locus.max_jump, built.hfvm.greatest_std) == (0.01, 5.0, 100.0)
     assert (plain.track.points, built.track.points) == (400, 2000)
     assert config.build({"hfvm": {"preset": "accurate"}}).hfvm.greatest_std == 1.1
-    assert built.hfvm.relief_steps == config.build({"hfvm": {"preset": "accurate"}}).hfvm.relief_steps
+    assert built.hfvm.variational_steps == config.build({"hfvm": {"preset": "accurate"}}).hfvm.variational_steps
     built = config.build({"terrain": {"preset": "accurate"}}, config.parse_assignments(["locus.both=false"]))
     assert (built.hfvm.preset, built.locus.both) == ("accurate", False)
     assert (built.hfvm.greatest_std, built.locus.max_jump) == (1.1, plain.locus.max_jump), "limits as without both"

@@ -15,7 +15,7 @@ from rille.pipeline.engine import scheduler
 from rille.pipeline.engine.graph import Graph
 from rille.pipeline.engine.progress import Quiet
 from rille.pipeline.engine.store.base import Store
-from rille.pipeline.report import live
+from rille.pipeline.runs import live
 from rille.stages.core.declare import NoParams
 
 
