@@ -29,6 +29,8 @@ Extent = tuple[float, float, float, float]
 DPI = 240
 WIDTH = 4.6
 """Inches; 1104 pixels, twice what a panel takes on the screen."""
+MOST_MARKERS = 400
+"""Markers or bars of a figure: 4.6 inches have no room for more."""
 MAX_PIXELS = 700
 """Longest side of an array that is drawn; larger ones are averaged first."""
 UNDEFINED = "#e9e9ec"
@@ -309,12 +311,29 @@ def metres_or_mm(values: Image) -> tuple[float, str]:
 
 def encode(fig: Any, alt: str, *, photo: bool = False) -> Panel:
     """Figure to a :class:`Panel`: SVG, its pictures with loss where ``photo``."""
+    _without_crowds(fig)
     out = io.StringIO()
-    fig.savefig(out, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
+    fig.savefig(out, format="svg", dpi=DPI, metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
     text = re.sub(r'"data:image/png;base64,([^"]+)"', lambda m: f'"{_smaller(m[1], photo)}"', out.getvalue())
     text = text[text.index("<svg") :].replace("<defs>", f"<defs><style>{theme()}</style>", 1)
     width, height = (round(96 * inches) for inches in fig.get_size_inches())
     return Panel("data:image/svg+xml," + quote(themed(text), safe=" !$&'()*+,-./:;=?@[]{}|"), alt, width, height)
+
+
+def _without_crowds(fig: Any) -> None:
+    """Draw no more than :data:`MOST_MARKERS` markers or bars one by one: each takes 70 bytes or more of the page."""
+    from matplotlib.collections import LineCollection
+    from matplotlib.lines import Line2D
+
+    for bars in fig.findobj(LineCollection):
+        bars.set_rasterized(len(bars.get_segments()) > MOST_MARKERS)
+    for curve in fig.findobj(Line2D):
+        if len(curve.get_xdata()) <= MOST_MARKERS:
+            continue
+        if curve.get_linestyle() == "None":
+            curve.set_rasterized(True)
+        else:  # so close together, the line shows where they are
+            curve.set_marker("None")
 
 
 def _smaller(png: str, photo: bool) -> str:

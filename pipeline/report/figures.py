@@ -365,8 +365,8 @@ def basic_pairs(
     top.set_ylim(0, 105)
     top.set_ylabel("overlap, %")
     low.plot(frames, moved, "o-", color="#333333", markersize=2.5, linewidth=0.9)
-    for pair in pairs:
-        low.axvline(pair, color=canvas.ESTIMATE, linewidth=0.7, alpha=0.5, zorder=0)
+    full = low.get_xaxis_transform()  # x by the frames, y from the bottom to the top of the axes
+    low.vlines(pairs, 0, 1, color=canvas.ESTIMATE, linewidth=0.7, alpha=0.5, zorder=0, transform=full)
     low.set_ylim(bottom=0)
     low.set_ylabel("displacement, px")
     low.set_xlabel("frame")

@@ -395,3 +395,14 @@ def test_a_figure_without_its_data_leaves_the_run_complete(tmp_path: Path) -> No
     assert [m["kind"] for m in facts["missing"]] == ["no figure"]
     facts = summary.summarise(run, summary.gather(run), [Figure("Seams", why="drawing failed", failed=True)])
     assert not facts["complete"]
+
+
+def test_a_curve_of_many_frames_does_not_fill_the_page() -> None:
+    def size(frames: int) -> int:
+        steps = np.random.default_rng(frames).normal(size=(frames, 3))
+        flagged = list(range(0, frames, 2))
+        few = figures.displacements(steps, None, range(frames), "x")
+        both = figures.basic_pairs(flagged, np.abs(steps[flagged, 0]), 0.7, range(frames), steps[:, 1], "x")
+        return len(few.uri) + len(both.uri)
+
+    assert size(4000) < 4 * size(400)
