@@ -85,6 +85,7 @@ def _solve(p: AnyArray, q: AnyArray, sigma: float) -> tuple[Matrix, float, float
     x, y, xr, yr = p[0], p[1], q[0], q[1]
     terms = np.stack([xr, xr * x, xr * y, yr * x, yr * y, x, y, np.ones_like(x)])
     prior = np.zeros(8)
+    # y' = y: the baseline lies along the rows.
     prior[6] = -1.0
     precision = np.diag(PRIOR**-2.0)
     g, change = prior, math.inf
@@ -94,6 +95,7 @@ def _solve(p: AnyArray, q: AnyArray, sigma: float) -> tuple[Matrix, float, float
         # Start as wide as the matches scatter about the prior, and narrow to what an integer match deserves.
         middle = typical(residual)
         wide = max(sigma, min(0.5 * spread, 1.5 * middle + sigma)) if step else max(sigma, 2.0 * middle)
+        # While the width still narrows, a small change does not yet mean the end.
         if wide == spread and change < SETTLED:
             break
         spread = wide
@@ -166,6 +168,7 @@ def near_sign(f: Matrix, u: AnyArray, left_shape: tuple[int, ...], right_shape: 
         [[1.0, 0.0, 0.5 * (right_shape[1] - 1)], [0.0, 1.0, 0.5 * (right_shape[0] - 1)], [0.0, 0.0, 1.0]]
     )
     g = to_right.T @ f @ to_left
+    # Lines along the columns: column displacements do not tell near from far, and the usual sign stands.
     if abs(g[1, 2]) < abs(g[0, 2]):
         return -1.0
     shift = 0.5 * (right_shape[1] - cols)
@@ -194,6 +197,7 @@ def write_lines(f, found, x0=0, y0=0):  # type: ignore[no-untyped-def]
             a = f[0, 0] * x + f[0, 1] * y + f[0, 2]
             b = f[1, 0] * x + f[1, 1] * y + f[1, 2]
             c = f[2, 0] * x + f[2, 1] * y + f[2, 2]
+            # Without a band all is zero, and 0 / 0 must stay 0.
             scale = 1.0 / max(np.sqrt(a * a + b * b), 1e-12)
             first[i], second[i], third[i] = a * scale, b * scale, (c + a * x + b * y) * scale
 
@@ -243,5 +247,6 @@ def settle_rows(f, u, v, wanted, x0, y0):  # type: ignore[no-untyped-def]
         for i in range(u.shape[1]):
             if wanted[j, i]:
                 a, b, c = line(terms, np.float32(i + x0), one)
+                # Then b is not zero, and an error of the column is not enlarged.
                 if abs(b) > abs(a):
                     v[j, i] = -(a * u[j, i] + c) / b

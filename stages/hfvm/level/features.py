@@ -59,10 +59,12 @@ def planes(image: ArrayLike) -> Planes:
     n = NORMALISATIONS
     rows = [_convolve(a, k, -1) for k in (HIGH_PASS, BAND_PASS, WIDE_BAND_PASS)]
     cols = [_convolve(a, k, -2) for k in (HIGH_PASS, BAND_PASS, WIDE_BAND_PASS)]
+    # From the middle of the range: the difference of squares below then loses fewer digits.
     centred = a - np.float32(128.0)
     box = (1,) * (2 * VARIANCE_RADIUS + 1)
     mean = _convolve(_convolve(centred, box, -1), box, -2) / np.float32(len(box) ** 2)
     square = _convolve(_convolve(centred * centred, box, -1), box, -2) / np.float32(len(box) ** 2)
+    # Rounding may leave the variance of a flat window below zero.
     deviation = np.sqrt(np.maximum(square - mean * mean, 0))
     smooth = _shift_sum(a, GAUSSIAN)
     found = [rows[0], cols[0], rows[1], cols[1], rows[2], cols[2], deviation, smooth]
@@ -75,6 +77,7 @@ def _convolve(a: AnyArray, kernel: tuple[int, ...], axis: int) -> AnyArray:
 
 
 def _shift_sum(a: AnyArray, kernel: Any) -> AnyArray:
+    # Turned around, since the table's are convolutions; the signs of the derivatives hang on it.
     k = np.asarray(kernel, dtype=np.float32)[::-1, ::-1]
     ry, rx = k.shape[0] // 2, k.shape[1] // 2
     padded = np.pad(a, [(0, 0)] * (a.ndim - 2) + [(ry, ry), (rx, rx)], mode="edge")
@@ -136,6 +139,7 @@ def _byte(value, scale):  # type: ignore[no-untyped-def]
     root = np.sqrt(abs(value)) * scale
     if value < 0:
         root = -root
+    # 128 stands for zero, so that the sign fits into a byte; the half more makes truncation round.
     return np.uint64(min(max(root + np.float32(128.5), np.float32(0.0)), np.float32(255.0)))
 
 
@@ -157,6 +161,7 @@ def pack_rows(a, start, scale, words, deviation):  # type: ignore[no-untyped-def
             s = np.float32(0.0)
             q = np.float32(0.0)
             for k in range(RADIUS - VARIANCE_RADIUS, RADIUS + VARIANCE_RADIUS + 1):
+                # From the middle of the range: ``f6`` subtracts two squares that would otherwise agree in most digits.
                 c = r[k, x] - np.float32(128.0)
                 s += c
                 q += c * c
@@ -185,6 +190,7 @@ def pack_rows(a, start, scale, words, deviation):  # type: ignore[no-untyped-def
             s = sums[m - 2] + sums[m - 1] + sums[m] + sums[m + 1] + sums[m + 2]
             q = squares[m - 2] + squares[m - 1] + squares[m] + squares[m + 1] + squares[m + 2]
             s *= np.float32(0.04)
+            # Rounding may leave the variance of a flat window below zero.
             f6 = np.sqrt(max(q * np.float32(0.04) - s * s, np.float32(0.0)))
             f7 = (
                 eight * r[6, m]
@@ -216,6 +222,7 @@ def distance(typingctx, a, b):  # type: ignore[no-untyped-def]
     signature = types.int64(types.uint64, types.uint64)
 
     def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
+        # Widened first: the difference of two bytes needs nine bits.
         wide = ir.VectorType(ir.IntType(32), 8)
         x, y = (builder.zext(builder.bitcast(w, ir.VectorType(ir.IntType(8), 8)), wide) for w in args)
         d = builder.sub(x, y)

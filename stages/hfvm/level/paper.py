@@ -12,6 +12,7 @@ from rille.stages.hfvm.level.subpixel import linear
 def weighted(planes: AnyArray, weights: tuple[float, ...]) -> AnyArray:
     """Feature planes (8, row, col) as (row, col, 8) float32 vectors whose Euclidean distance is Eq. 1, grey levels."""
     w = np.asarray(weights, dtype=np.float32)
+    # Weights of length one, so that distances are grey levels and the threshold keeps its meaning.
     w = w / np.sqrt(np.sum(w * w))
     return np.ascontiguousarray(np.moveaxis(planes * w[:, None, None], 0, -1), dtype=np.float32)
 
@@ -42,9 +43,11 @@ def search(  # type: ignore[no-untyped-def]
             cu, cv = np.int64(centre_u[y, x]), np.int64(centre_v[y, x])
             best = np.float32(-1.0)
             bu, bv = cu, cv
+            # The area is cut at the border, instead of each candidate clamped to it: none then comes up twice.
             for v in range(max(cv - reach_y, -y - oy), min(cv + reach_y, rrows - 1 - y - oy) + 1):
                 for u in range(max(cu - reach_x, -x - ox), min(cu + reach_x, rcols - 1 - x - ox) + 1):
                     d = _eq1(left[y, x], right[y + oy + v, x + ox + u])
+                    # -1 is nothing so far, as no distance is negative.
                     if best < 0 or d < best:
                         best = d
                         bu, bv = np.int64(u), np.int64(v)

@@ -28,12 +28,14 @@ def pack(u, v):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True, inline="always")
 def columns(packed):  # type: ignore[no-untyped-def]
     """Column displacement."""
+    # Through int16, so that the lower half keeps its sign.
     return np.int64(np.int16(packed))
 
 
 @njit(cache=True, nogil=True, inline="always")
 def rows_of(packed):  # type: ignore[no-untyped-def]
     """Row displacement."""
+    # An arithmetic shift carries the sign along.
     return np.int64(packed) >> 16
 
 
@@ -65,6 +67,7 @@ def descend(left, right, up_u, up_v, reach_x, reach_y, count, f, mu, packed, dat
     )
     rrows, rcols = right.shape
     sizes = cols, rcols
+    # A row about a centre fits into eight lanes up to a reach of 3, and ``cross`` holds one row to either side.
     in_rows = mu >= SHARP and 2 * reach_x < LANES and reach_y <= 1
     for j in range(crows):
         _lines(f, x0, y0 + 2 * j, mu, lines)
@@ -76,12 +79,14 @@ def descend(left, right, up_u, up_v, reach_x, reach_y, count, f, mu, packed, dat
                 planned = _rectangles(near, at, wide, count, reach_x, reach_y, mu < SHARP, plan)
             x, y = 2 * i, 2 * j
             whole = x + 1 < cols and y + 1 < rows
+            # Above every cost: the first candidate inside wins, and without any the prediction stays.
             best[0] = best[1] = best[2] = best[3] = near[at]
             least[0] = least[1] = least[2] = least[3] = simd.FAR
             line = lines[0, i], lines[1, i], lines[2, i]
             for k in range(planned):
                 u, size, centre, v, cross = plan[k, 0], plan[k, 1], plan[k, 2], plan[k, 3], plan[k, 4]
                 xr, yr = x + ox + u, y + oy + v
+                # Eight words are read for either column, whatever the strip's size: all must lie in the image.
                 if whole and xr >= 0 and xr + LANES < rcols and yr >= cross and yr + 1 + cross < rrows:
                     start, target, place = y * cols + x, yr * rcols + xr, (u, centre, v)
                     strip_simd.four(here, there, line, start, target, sizes, place, (size, cross), best, least)
@@ -112,12 +117,14 @@ def _singly(here, there, line, x0, y0, shape, other, ox, oy, plan, at, best, lea
         word = here[y * cols + x]
         first, last = max(u, -x - ox) - u, min(u + count, rcols - x - ox) - u
         own = centre - u
+        # The order of the vector code's ranks, the centre's column first: ties must fall alike here and there.
         for k in range(-1, count + 2 * cross):
             du, dv = (centre, v) if k < 0 else (u + k, v) if k < count else (centre, v + 2 * (k - count) - 1)
             lane, yr = du - u, y + oy + dv
             if first <= lane < last and 0 <= yr < rrows and (k >= 0 or 0 <= own < count):
                 off = abs((line[0] * np.float32(du) + line[1] * np.float32(dv)) + line[2])
                 cost = distance(word, there[yr * rcols + x + ox + du]) + np.int64(min(off, most))
+                # Strictly less: of equal costs the earlier candidate stays.
                 if cost < least[n]:
                     best[n], least[n] = pack(du, dv), cost
 
@@ -149,9 +156,11 @@ def _rows(near, at, wide, count, reach_x, reach_y, plan):  # type: ignore[no-unt
     low = high = u
     planned = 1
     reach = 2 * reach_x + 1
+    # Strips of centres farther apart than ``reach`` do not touch, and more than eight columns do not fit.
     widest = min(reach, LANES - reach)
     if count == 5:
         west, east, north, south = near[at - 1], near[at + 1], near[at - wide], near[at + wide]
+        # Rows are the upper halves: none of their bits is left where all agree.
         same_row = (((west ^ own) | (east ^ own) | (north ^ own) | (south ^ own)) >> 16) == 0
         least = min(min(columns(west), columns(east)), min(columns(north), columns(south)))
         most = max(max(columns(west), columns(east)), max(columns(north), columns(south)))
@@ -168,6 +177,7 @@ def _rows(near, at, wide, count, reach_x, reach_y, plan):  # type: ignore[no-unt
         else:
             _put(plan, planned, cu - reach_x, reach, cu, cv, 0)
             planned += 1
+    # Put last, since only now its ends are known, but tried first: of equal costs the parent's strip wins.
     _put(plan, 0, low - reach_x, high - low + reach, u, v, reach_y)
     return planned
 
@@ -212,6 +222,7 @@ def _centres(up_u, up_v, f, mu, x0, y0, centres):  # type: ignore[no-untyped-def
             a, b, c = lines[0], lines[1], lines[2]
             for i in range(ccols):
                 pu, pv = np.float32(2 * us[i]), np.float32(2 * vs[i])
+                # A coarse fit may itself be wrong by more than a pixel, so it moves no centre farther.
                 e = min(max(a[i] * pu + b[i] * pv + c[i], -one), one)
                 u, v = np.int32(pu - np.rint(e * a[i])), np.int32(pv - np.rint(e * b[i]))
                 row[i] = (v << np.int32(16)) | (u & np.int32(0xFFFF))
@@ -247,6 +258,7 @@ def checkerboard(left, right, packed, data, dirty, f, mu, smoothness, rounds, be
     for step in range(rows + turns - 1 if turns else 0):
         for turn in range(max(0, step - rows + 1), min(turns, step + 1)):
             y = step - turn
+            # The absolute row: lines must not depend on where the window begins.
             line = (*epipolar.row_terms(f, np.float64(y + y0)), mu)
             _turn(flat, dirty, y, turn, line, shape, y + oy, smoothness, turns == 2, room)
 
@@ -260,6 +272,7 @@ def _turn(flat, dirty, y, turn, line, shape, yr, smoothness, once, room):  # typ
     above, below = (y - 1 if y > 0 else min(1, rows - 1)), (y + 1 if y < rows - 1 else max(rows - 2, 0))
     flags, before, after = dirty[y], dirty[above], dirty[below]
     n, first = 0, (y + turn) & 1
+    # The first turn of each colour looks at every pixel; later ones at what was marked.
     if turn < 2:
         n = (cols - first + 1) // 2
         for k in range(n):
@@ -273,11 +286,13 @@ def _turn(flat, dirty, y, turn, line, shape, yr, smoothness, once, room):  # typ
             flags[x] = 0
     if n == 0:
         return
+    # Vectors run past the end of the list; settling the last pixel again does no harm.
     todo[n : n + LANES] = todo[n - 1]
     start = y * cols
     for k in range(0, n, LANES):
         a, b = np.int64(todo[k]), np.int64(todo[k + LANES - 1])
         args = start, above * cols, below * cols, yr
+        # Without a gap between the eight columns two plain loads stand for eight gathered ones.
         if k + LANES <= n and b - a == 2 * LANES - 2 and a > 0 and b + 2 < cols:
             simd.settle_dense(
                 here, there, packed, cost, line, todo, k, args[0], args[1], args[2], args[3], shape, smoothness, new,
@@ -299,6 +314,7 @@ def _turn(flat, dirty, y, turn, line, shape, yr, smoothness, once, room):  # typ
     for k in range(m):
         i = np.int64(todo[moved[k]])
         packed[start + i], cost[start + i] = new[moved[k]], found[moved[k]]
+        # The pixel itself as well: what lies beside its new displacement has not been tried.
         before[i] = after[i] = flags[i] = flags[max(i - 1, 0)] = flags[min(i + 1, cols - 1)] = 1
 
 

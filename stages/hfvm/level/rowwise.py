@@ -69,6 +69,7 @@ def local_mean(u, v, keep, radius, stride, out_u, out_v):  # type: ignore[no-unt
                 )
                 tu, tv, tn = su[a:b], sv[a:b], count[a:b]
                 for x in range(b - a):
+                    # Differences are summed, since float32 keeps more of their fractions than of whole displacements.
                     du, dv = ou[x] - cu[x], ov[x] - cv[x]
                     use = ok[x] & (abs(du) <= one) & (abs(dv) <= one)
                     tu[x] += du if use else nil
@@ -85,6 +86,7 @@ def _add_up(parts, cols, out):  # type: ignore[no-untyped-def]
     """Add to ``out`` its neighbours: sums over as many columns as ``parts`` (plane, col + 2 radius) is wider."""
     for k in range(parts.shape[0]):
         part, total = parts[k], out[k]
+        # The usual radius in one pass, summed in the order of the loops below: the bits must be the same.
         if part.size == cols + 4:
             one, two, three, four = part[1 : 1 + cols], part[2 : 2 + cols], part[3 : 3 + cols], part[4:]
             for x in range(cols):
@@ -117,6 +119,7 @@ def box(planes, radius, out):  # type: ignore[no-untyped-def]
                 one, two = planes[k, j], planes[k, j + 1]
                 for x in range(cols):
                     middle[x] += one[x] + two[x]
+            # Where the border cuts the window to an even number, one row is left without a partner.
             if (last - first) % 2 == 0:
                 row = planes[k, last - 1]
                 for x in range(cols):
@@ -172,6 +175,7 @@ def _products(left, right, now, keep, y, radius, out):  # type: ignore[no-untype
         out[:] = np.float32(0.0)
         return
     one, half, nil = np.float32(1.0), np.float32(0.5), np.float32(0.0)
+    # The cubic kernel reads one pixel before and two after.
     last_x, last_y = np.float32(rcols - 2), np.float32(rrows - 2)
     end = radius + cols
     n, gx, gy, rest = out[0, radius:end], out[1, radius:end], out[2, radius:end], out[3, radius:end]
@@ -189,6 +193,7 @@ def _products(left, right, now, keep, y, radius, out):  # type: ignore[no-untype
         value = cubic(flat, at, width, xr - np.float32(i), yr - np.float32(j))
         n[x], rest[x] = one, grey[x] - value
     above, below = left[max(y - 1, 0)], left[min(y + 1, rows - 1)]
+    # As if the edge were repeated: a difference over one pixel, halved like those over two.
     gx[0], gx[cols - 1] = half * (grey[min(1, cols - 1)] - grey[0]), half * (grey[cols - 1] - grey[max(cols - 2, 0)])
     inner, west, east = gx[1 : cols - 1], grey[: cols - 2], grey[2:]
     for x in range(cols - 2):
@@ -216,6 +221,7 @@ def lucas_kanade(left, right, now, keep, window, new):  # type: ignore[no-untype
     ring = np.zeros((size, PLANES * cols), np.float32)
     s = np.empty((PLANES, cols), np.float32)
     total = s.reshape(-1)
+    # From above the image on: the ring must hold all rows of the first window before that is solved.
     for y in range(-radius, rows):
         _products(left, right, now, keep, y + radius, radius, fresh)
         _add_up(fresh, cols, ring[(y + radius) % size].reshape((PLANES, cols)))
@@ -231,6 +237,7 @@ def lucas_kanade(left, right, now, keep, window, new):  # type: ignore[no-untype
 def _add_rows(ring, first, total):  # type: ignore[no-untyped-def]
     """Sum of the rows of a ring, from its row ``first`` on."""
     size = ring.shape[0]
+    # The usual radius in one pass, in the order of the loop below.
     if size == 5:
         one, two, three = ring[first % size], ring[(first + 1) % size], ring[(first + 2) % size]
         four, five = ring[(first + 3) % size], ring[(first + 4) % size]
@@ -256,6 +263,7 @@ def _solve(s, least, noise, keep, now, new):  # type: ignore[no-untyped-def]
         n = count[x] if use else one
         inverse = one / n
         m1, m2, m3 = sum_gx[x] * inverse, sum_gy[x] * inverse, sum_r[x] * inverse
+        # Noise on the diagonal shortens steps where texture is weak.
         a = sum_gx_gx[x] - sum_gx[x] * m1 + noise * n
         b = sum_gx_gy[x] - sum_gx[x] * m2
         c = sum_gy_gy[x] - sum_gy[x] * m2 + noise * n
@@ -266,7 +274,9 @@ def _solve(s, least, noise, keep, now, new):  # type: ignore[no-untyped-def]
         good = use & (det > nil)
         inverse_det = one / (det if det > nil else one)
         du, dv = (c * p - b * q) * inverse_det, (a * q - b * p) * inverse_det
+        # Rounding may leave the residual of a perfect fit below zero.
         energy[x] = max(sum_r_r[x] - sum_r[x] * m3, nil) * inverse if use else far
         per_noise[x] = c * inverse_det if good else nil
+        # A pixel at most, as ``refine.drift`` counts on.
         new_u[x] = u[x] + (min(max(du, -one), one) if good else nil)
         new_v[x] = v[x] + (min(max(dv, -one), one) if good else nil)

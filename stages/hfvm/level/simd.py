@@ -31,11 +31,13 @@ _MASK = ir.VectorType(ir.IntType(1), LANES)
 
 def widest() -> int:
     """Bits of the widest ``psadbw`` that compiled code may use; 0 = none, or a CPU set by hand."""
+    # Code is then made for a CPU that need not be the host, whose features are asked below.
     if config.CPU_NAME or config.CPU_FEATURES:
         return 0
     if not llvm.get_default_triple().startswith("x86_64"):
         return 0
     has = llvm.get_host_cpu_features()
+    # Every x86-64 processor has the 128-bit form (SSE2).
     return 512 if has.get("avx512bw") else 256 if has.get("avx2") else 128
 
 
@@ -104,6 +106,7 @@ def _load(builder: Any, pointer: Any, inside: Any) -> Any:
     """Masked load of eight words."""
     kind = ir.FunctionType(_WORDS, [pointer.type, _I32, _MASK, _WORDS])
     f = cgutils.get_or_insert_function(builder.module, kind, "llvm.masked.load.v8i64.p0")
+    # Lanes beyond the window are not touched, as memory may end there; zeros in both images add no difference.
     return builder.call(f, [pointer, ir.Constant(_I32, 8), inside, _vector(_WORDS, [0] * LANES)])
 
 
@@ -129,6 +132,7 @@ def _gather(builder: Any, data: Any, index: Any, kind: Any, inside: Any = None) 
     Eight single loads: gather instructions take three times as long on processors with their mitigation.
     """
     if inside is not None:
+        # Word 0 always exists; what it gives is dropped by the caller.
         index = builder.select(inside, index, _vector(_INTS, [0] * LANES))
     found = ir.Constant(kind, ir.Undefined)
     for lane in range(LANES):
@@ -154,6 +158,7 @@ class _Pixels:
     def cost(self, tried: Any) -> tuple[Any, Any]:
         """Distance and band cost at packed displacements, and which of them lie in the image."""
         builder, sixteen = self.builder, _vector(_INTS, [16] * LANES)
+        # Up and arithmetically down again: the lower half has a sign, too.
         u, v = builder.ashr(builder.shl(tried, sixteen), sixteen), builder.ashr(tried, sixteen)
         xr, yr = builder.add(self.x, u), builder.add(self.y, v)
         # Compared without sign: below zero is beyond the end.
@@ -171,6 +176,7 @@ def band_cost(builder: Any, off: Any) -> Any:
     """trunc(|off|) of eight costs of being off a line, at most :data:`FARTHEST_OFF`."""
     band = _call(builder, "llvm.fabs.v8f32", _FLOATS8, off)
     most = _vector(_FLOATS8, [float(FARTHEST_OFF)] * LANES)
+    # An ordered comparison: NaN is not less and costs the most, instead of an undefined integer.
     return builder.fptosi(builder.select(builder.fcmp_ordered("<", band, most), band, most), _INTS)
 
 
@@ -178,6 +184,7 @@ def _rough(builder: Any, tried: Any, near: list[Any]) -> Any:
     """Sum over the neighbours of min(|du| + |dv|, TRUNCATION), eight 32-bit integers."""
     low, sixteen = _vector(_INTS, [0xFFFF] * LANES), _vector(_INTS, [16] * LANES)
     most, total = _vector(_INTS, [TRUNCATION] * LANES), _vector(_INTS, [0] * LANES)
+    # The magnitude of -32768 wraps, which is defined only with this flag off.
     no_poison = ir.Constant(ir.IntType(1), 0)
     for n in near:
         d = builder.sub(builder.bitcast(n, _HALVES), builder.bitcast(tried, _HALVES))
@@ -199,6 +206,7 @@ def _every_other(builder: Any, pointer: Any, kind: Any) -> Any:
 def _lines(builder: Any, terms: Any, x: Any) -> tuple[Any, Any, Any]:
     """:func:`rille.stages.hfvm.level.epipolar.line` of eight columns; ``terms``: the row's, and the length."""
     *t, length = (_splat(builder, n) for n in cgutils.unpack_tuple(builder, terms))
+    # The operations of ``epipolar.line`` in their order: scalar and vector code must agree to the bit.
     a, b = (builder.fadd(t[k], builder.fmul(t[k + 1], x)) for k in (0, 2))
     c = builder.fadd(t[4], builder.fmul(x, builder.fadd(t[5], builder.fmul(x, t[6]))))
     norm = _call(builder, "llvm.sqrt.v8f32", _FLOATS8, builder.fadd(builder.fmul(a, a), builder.fmul(b, b)))
@@ -270,6 +278,7 @@ def make_settle(width: int, dense: bool = False) -> Any:
             def attempt(tried: Any, fresh: Any = None) -> None:
                 cost, inside = pixels.cost(tried)
                 total = builder.add(cost, builder.mul(smooth, _rough(builder, tried, near)))
+                # Strictly less: of equal totals the one tried first stays.
                 better = builder.and_(inside, builder.icmp_signed("<", total, builder.load(least)))
                 if fresh is not None:
                     better = builder.and_(better, fresh)
@@ -278,6 +287,7 @@ def make_settle(width: int, dense: bool = False) -> Any:
 
             def attempt_beside(du: int, dv: int) -> None:
                 step = _vector(_INTS, [((dv & 0xFFFF) << 16) | (du & 0xFFFF)] * LANES)
+                # Added as 16-bit halves, so that no carry runs from the column into the row.
                 moved = builder.add(builder.bitcast(own, _HALVES), builder.bitcast(step, _HALVES))
                 attempt(builder.bitcast(moved, _INTS))
 
@@ -290,6 +300,7 @@ def make_settle(width: int, dense: bool = False) -> Any:
             for k, tried in enumerate(near):
                 # What lies a column beside the own one has been tried or is left out; and what came before.
                 away = builder.sub(builder.bitcast(tried, _HALVES), builder.bitcast(own, _HALVES))
+                # One more makes 0, 1, 2 of -1, 0, 1 in the same row: a single unsigned comparison finds the rest.
                 columns = builder.bitcast(builder.add(away, _vector(_HALVES, [1, 0] * LANES)), _INTS)
                 fresh = builder.icmp_unsigned(">", columns, _vector(_INTS, [2] * LANES))
                 for other in near[:k]:
@@ -332,6 +343,7 @@ SUM_RADIUS = 2
 """Pixels: reach of the windows of ``sums``."""
 
 
+# Eight words are the columns of four pixels with two more to either side.
 SIDE_BY_SIDE = 4
 """Pixels of a row whose windows are summed together."""
 
@@ -375,6 +387,7 @@ def make_sums(width: int) -> Any:
                 return builder.shuffle_vector(value, nothing, pick)
 
             for total, k in ((packed, 7), (totals[4], 8)):
+                # Five columns by three additions: two pairs and one; integers allow any order.
                 pairs = builder.add(total, moved(total, 1))
                 found = builder.add(builder.add(pairs, moved(pairs, 2)), moved(total, 4))
                 first = ir.Constant(ir.VectorType(_I32, SIDE_BY_SIDE), list(range(SIDE_BY_SIDE)))

@@ -58,6 +58,7 @@ def make_four(width: int) -> Any:
 
             def load(k: int, array: Any, index: Any, kind: Any) -> Any:
                 pointer = simd._pointer(context, builder, sig.args[k], array, index)
+                # Strips begin at any word: no more than a word's alignment may be promised.
                 return builder.load(simd._as(builder, pointer, kind), align=8)
 
             def moved(index: Any, rows: int, columns: int, wide: Any) -> Any:
@@ -72,15 +73,18 @@ def make_four(width: int) -> Any:
                 return shorts(simd.band_cost(builder, builder.fadd(off, c)), rank)
 
             def shorts(cost: Any, rank: Any) -> Any:
+                # Cost above, rank below: the least number is the least cost and, of equal ones, the least rank.
                 four_bits = vector(_INTS, [4] * LANES)
                 return builder.trunc(builder.or_(builder.shl(cost, four_bits), rank), _SHORTS)
 
             def cost(distance: Any, other: Any) -> Any:
                 near = builder.trunc(builder.shl(distance, vector(simd._WORDS, [4] * LANES)), _SHORTS)
+                # Saturating: a lane beyond the strip stays at 0xFFFF, whatever lies there.
                 return simd._call(builder, "llvm.uadd.sat.v8i16", _SHORTS, near, other)
 
             lane = vector(_INTS, range(LANES))
             is_own = builder.icmp_signed("==", lane, splat(builder, builder.sub(centre, u)))
+            # The centre's own column ranks before the others, so that it wins ties against those to its left.
             rank = builder.select(is_own, vector(_INTS, [0] * LANES), vector(_INTS, range(1, LANES + 1)))
             taking = builder.icmp_signed("<", lane, splat(builder, builder.trunc(count, _I32)))
             other = band(builder.add(splat(builder, u), lane), splat(builder, v), rank)
@@ -132,6 +136,7 @@ def make_four(width: int) -> Any:
                 for k in (8, 9)
             ]
             before = builder.load(pointers[1], align=4)
+            # Strictly less: of equal costs the strip that came earlier wins.
             better = builder.icmp_signed("<", total, before)
             builder.store(builder.select(better, tried, builder.load(pointers[0], align=4)), pointers[0], align=4)
             builder.store(builder.select(better, total, before), pointers[1], align=4)

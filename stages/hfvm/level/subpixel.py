@@ -21,9 +21,11 @@ NOTHING, ALONE, SUMMED = 0, 1, 2
 def linear(before, at, after):  # type: ignore[no-untyped-def]
     """Where two lines of equal and opposite slope through three distances meet, within half a pixel."""
     steep = np.float32(max(before, after) - at)
+    # Neither side costs more: after propagation and median the middle need not be the least.
     if steep <= 0:
         return np.float32(0.0)
     d = np.float32(before - after) / steep * np.float32(0.5)
+    # Where one side costs less than the middle the lines meet more than half a pixel away.
     return min(max(d, np.float32(-0.5)), np.float32(0.5))
 
 
@@ -39,11 +41,13 @@ def summed(left, right, u_map, v_map, wanted, out_u, out_v, out_distance, ox=0, 
     rows, cols = left.shape
     shapes = rows, cols, right.shape[0], right.shape[1]
     here, there = left.reshape(-1), right.reshape(-1)
+    # Four sums are written however short a run is, so the last column needs room beyond it.
     four, last, state = np.zeros(cols + 4, np.uint64), np.zeros(cols + 4, np.uint64), np.zeros(cols, np.int8)
     count = np.float32((2 * SUM_RADIUS + 1) * (2 * SUM_RADIUS + 1))
     for y in range(rows):
         _windows(here, there, y, u_map[y], v_map[y], wanted[y], shapes, ox, oy, four, last, state)
         us, vs, first, second, third = u_map[y], v_map[y], out_u[y], out_v[y], out_distance[y]
+        # Sixteen bits hold a sum: 25 distances of at most 8 x 255.
         low = np.uint64(0xFFFF)
         for x in range(cols):
             at = np.int64(four[x] & low)
