@@ -39,6 +39,7 @@ def lay(scene: Bundle, x: float, y: float, height: float) -> dict[str, Any]:
     z[inside] = np.maximum(z[inside], ground + height * (1.0 - q[inside] ** 4))
     arrays["height"] = z.astype(np.float32)
     arrays["tint"] = np.where(inside, np.uint8(120), arrays["tint"])
+    # Shadows are part of the scene, not of the image: the stone casts one, and may stand in another.
     arrays["sunlit"] = terrain.sunlit(arrays["height"], SceneParams(**scene.meta["scene"]))
     return arrays
 

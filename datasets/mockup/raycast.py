@@ -158,6 +158,7 @@ def _cast(height, maxima, offsets, shapes, origins, directions):  # type: ignore
             h10, h11 = np.float64(height[ir + 1, ic]), np.float64(height[ir + 1, ic + 1])
             bc, br, bcr = h01 - h00, h10 - h00, h11 - h10 - h01 + h00
             f0 = oz + at * dz - (h00 + bc * u + br * v + bcr * u * v)
+            # Below the surface already: the ray came in through the bed's side and meets nothing, or it is rounding.
             if f0 <= 0.0:
                 if not first or f0 > -1e-9:
                     out[i] = at

@@ -95,6 +95,7 @@ def _shade(bed, albedo, origin, directions, distance, pixel_angle):  # type: ign
         gy = (_bilinear(height, r - s, c) - _bilinear(height, r + s, c)) / (2.0 * s * cell)
         norm = math.sqrt(1.0 + gx * gx + gy * gy)
         mu0 = max((sun[2] - gx * sun[0] - gy * sun[1]) / norm, 0.0)
+        # A slope taken over the footprint may face away from a camera that sees the point: the cosine stays positive.
         mu = max((vz - gx * vx - gy * vy) / norm, 0.05)
         lit = _bilinear(sunlit, r, c) / 255.0
         # Lunar-Lambert: Lommel and Seeliger's law, which knows no limb darkening, mixed with Lambert's.
@@ -107,16 +108,19 @@ def _shade(bed, albedo, origin, directions, distance, pixel_angle):  # type: ign
         flat = math.sqrt(vx * vx + vy * vy) + 1e-12
         ax, ay = vx / flat * minor * stretch, vy / flat * minor * stretch
         level = math.log2(max(minor * stretch / taps / (0.5 * cell), 1.0))
+        # Just below the last level, since the one above it is read as well.
         level = min(level, offsets.shape[0] - 1.001)
         low = int(level)
         f = level - low
         total = 0.0
         for k in range(taps):
             a = (k + 0.5) / taps - 0.5
+            # The albedo has two texels a cell; rows grow where y falls.
             tr = 2.0 * (r - drape - a * ay / cell)
             tc = 2.0 * (c + a * ax / cell)
             total += (1.0 - f) * _texel(texture, offsets, shapes, low, tr, tc)
             total += f * _texel(texture, offsets, shapes, low + 1, tr, tc)
+        # 128 and 100 are the bytes that stand for 1 in the albedo and in the tint.
         out[i] = total / taps / 128.0 * _bilinear(tint, r, c) / 100.0 * (direct + AMBIENT)
     return out
 
@@ -137,6 +141,7 @@ def _texel(texture, offsets, shapes, level, r, c):  # type: ignore[no-untyped-de
     """Bilinear value of one level of the albedo at (row, column) of level 0."""
     size = float(1 << level)
     rows, cols = shapes[level, 0], shapes[level, 1]
+    # A texel of a coarser level lies in the middle of those that it is the mean of, not on the first of them.
     r = min(max((r + 0.5) / size - 0.5, 0.0), rows - 1.000001)
     c = min(max((c + 0.5) / size - 0.5, 0.0), cols - 1.000001)
     i, j = int(r), int(c)
@@ -180,12 +185,14 @@ def radiance(
     values = _shade(bed, albedo, np.ascontiguousarray(origin), rays, distance, 1.0 / (sampling * camera.fx))
     blocks = values.reshape(camera.height, sampling, camera.width, sampling)
     hit = np.isfinite(blocks).all(axis=(1, 3))
+    # border_value 1: beyond the image's border there may be bed, so the border itself costs no pixels.
     mask = scipy.ndimage.binary_erosion(hit, np.ones((3, 3)), border_value=1)
     return blocks, np.asarray(mask)
 
 
 def expose(blocks: NDArray[np.float32], p: RenderParams, flat: float, frame: int, camera: str) -> NDArray[np.uint8]:
     """Grey image uint8 (row, col) from radiance samples (row, n, col, n); ``flat`` is the radiance of level ground."""
+    # A stream for each image: its noise depends neither on which others are rendered nor on their order.
     rng = np.random.default_rng([p.seed, 50, frame, CAMERA_INDEX[camera]])
     gain = LEVEL_GREY / flat * p.exposure * (1.0 + p.exposure_jitter * float(rng.standard_normal()))
     gain *= p.right_gain if camera == "right" else 1.0
@@ -195,6 +202,7 @@ def expose(blocks: NDArray[np.float32], p: RenderParams, flat: float, frame: int
         grey = scipy.ndimage.gaussian_filter(grey, p.blur, mode="nearest")
     y, x = np.ogrid[-1.0 : 1.0 : grey.shape[0] * 1j, -1.0 : 1.0 : grey.shape[1] * 1j]
     grey = grey * (1.0 - p.vignetting * (x * x + y * y) / 2.0)
+    # Noise arises in the sensor, behind the optics: it is neither blurred nor vignetted, and white.
     noisy = grey + p.noise * rng.standard_normal(grey.shape)
     return np.asarray(np.clip(np.rint(noisy), 0, 255), dtype=np.uint8)
 

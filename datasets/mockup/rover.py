@@ -169,6 +169,7 @@ def drive_leg(
         way, towards = math.hypot(dx, dy), math.atan2(-dx, dy)
         n = max(1, math.ceil(way / STEP))
         rolled = sign * way / n
+        # remainder() gives the shorter way round, -pi to pi.
         there = rotate(math.remainder(towards - heading, 2 * math.pi)) and all(
             d.advance((1.0 - slip) * rolled, drift * way / n, rolled, 0.0) for _ in range(n)
         )
@@ -187,6 +188,7 @@ def images_at(wheels: Floats, p: RoverParams) -> list[int]:
     for k in range(1, len(wheels)):
         dx, dy, dh = wheels[k] - wheels[k - 1]
         way, turn = way + math.hypot(dx, dy), turn + abs(dh)
+        # Steps add up with rounding: without the tolerance an image would come one step late.
         if way > p.frame_step - 1e-9 or turn > math.radians(p.frame_turn_deg) - 1e-9 or k == len(wheels) - 1:
             at.append(k)
             way, turn = 0.0, 0.0
@@ -209,6 +211,7 @@ _NONE = np.zeros((0, 0))
 def _run(params: RoverParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     scene, vehicle = inputs["scene"], Vehicle.model_validate(args["vehicle"])
     T_left_vehicle = RigidTransform.from_matrix(args["T_vehicle_left"]).inverse()
+    # The placement at the start is leg -1, and a seed must not be negative.
     rng = np.random.default_rng([params.seed, 70, 1 + int(args["leg"])])
     if "before" in inputs:
         T = RigidTransform.from_matrix(np.asarray(inputs["before"]["vehicle"])[int(args["row"])])

@@ -29,6 +29,7 @@ def build_scene(p: SceneParams) -> Bundle:
     rows, cols = round(p.bed_length / p.cell) + 1, round(p.bed_width / p.cell) + 1
     height = terrain.relief(p, (rows, cols))
     terrain.add_craters(height, p)
+    # Before the rocks: the cameras' height counts from the mean of the bare ground.
     height -= np.float32(height.mean(dtype=np.float64))
     if p.slope_deg:
         rise = np.tan(np.deg2rad(p.slope_deg)) * p.cell * np.arange(rows - 1, -1, -1)

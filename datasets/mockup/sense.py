@@ -21,8 +21,10 @@ def _run(params: RoverParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle
     rng = np.random.default_rng([params.seed, 71, 1 + int(args["leg"])])
     at = np.asarray(drive["frame_at"])
     wheels, poses = np.asarray(drive["wheels"])[at], np.asarray(drive["poses"])
+    # One error for the whole leg: it does not average out over the leg's images.
     odometry = wheels * (1.0 + params.odometry_sigma * float(rng.standard_normal()))
     sigma = math.radians(params.attitude_sigma_deg)
+    # The third row of R_bed_left is the bed's z axis, in axes of the camera.
     up = np.stack([rotation_exp(sigma * rng.standard_normal(3)) @ pose[2, :3] for pose in poses])
     peak = _peaks(np.asarray(drive["trail"])[:, 2, 3], np.asarray(drive["wheels"]), params.speed)
     acceleration = [float(peak[a + 1 : b + 1].max(initial=0.0)) for a, b in zip([0, *at[:-1]], at, strict=True)]

@@ -95,6 +95,7 @@ def _check_on_bed(p: MockupParams, poses: list[RigidTransform]) -> None:
     """Refuse a drive that leaves the bed."""
     for k, pose in enumerate(poses):
         x, y, _ = pose.translation
+        # Not y < 0: a drive begins before the near edge (START).
         if abs(x) > 0.5 * p.bed_width or y > p.bed_length:
             raise ConfigError(
                 "RIL-253",
@@ -112,6 +113,7 @@ def _attitude(p: MockupParams, truth: list[RigidTransform]) -> tuple[Rows, ...] 
     out = []
     for pose in truth:
         error = rotation_exp(np.deg2rad(p.attitude_noise_deg) * rng.standard_normal(3))
+        # The sensor errs about the camera's axes: the error stands before R_left_bed, the transposed rotation.
         a, b, c = ((float(x), float(y), float(z)) for x, y, z in (error @ pose.rotation.T).T)
         out.append((a, b, c))
     return tuple(out)
@@ -123,6 +125,7 @@ def _up(p: MockupParams, truth: list[RigidTransform]) -> tuple[tuple[float, floa
         return None
     out = []
     for frame, pose in enumerate(truth):
+        # A stream for each frame: its error stays the same however many frames there are.
         error = np.random.default_rng([p.seed, 62, frame]).standard_normal(3)
         x, y, z = rotation_exp(np.deg2rad(p.up_noise_deg) * error) @ pose.rotation[2]
         out.append((float(x), float(y), float(z)))

@@ -42,6 +42,7 @@ def prepare(
             continue
         far = _distance(scene, place[0], place[1], height.shape, cell)
         weight = np.clip((place[2] + EDGE - far) / EDGE, 0.0, 1.0)
+        # Smoothstep: the slope has no kink at either end of the edge.
         weight = weight * weight * (3.0 - 2.0 * weight)
         plane = slope + np.median((height - slope)[far <= place[2]])
         height = (height + weight * (plane - height)).astype(np.float32)

@@ -95,6 +95,7 @@ def _sizes(rng: np.random.Generator, count: float, least: float, most: float) ->
     """Diameters of a population with N(>D) ~ D^-2 between ``least`` and ``most``, in the order of placing."""
     n = int(rng.poisson(count))
     u = rng.random(n)
+    # The inverse of N(>D) ~ D^-2 cut off at both ends, so that uniform numbers give sizes.
     return np.asarray(1.0 / np.sqrt(least**-2 + u * (most**-2 - least**-2)), dtype=np.float64)
 
 
@@ -116,16 +117,19 @@ def add_craters(height: Floats32, p: SceneParams) -> None:
     rng = stream(p.seed, 1)
     area = (height.shape[0] * p.cell) * (height.shape[1] * p.cell)
     least = 0.025
+    # The parameter counts those above 0.1 m: by D^-2 the number above the least one is larger by this factor.
     for diameter in _sizes(rng, p.craters * area * (0.1 / least) ** 2, least, WIDEST_CRATER):
         x, y, age = rng.random(3)
         patch = _patch(height.shape, p.cell, x * height.shape[1] * p.cell, y * height.shape[0] * p.cell, 1.5 * diameter)
         if patch is None:
             continue
         window, dx, dy = patch
+        # Age 0 is the oldest crater, which is the shallowest.
         depth = diameter * (0.05 + 0.13 * age)
         rim = 0.22 * depth
         q = np.sqrt(dx**2 + dy**2) / (0.5 * diameter)
         inside = rim - (depth + rim) * (1.0 - q**2)
+        # Shifted and stretched to reach 0 at three radii, where the patch ends: a cut-off tail would leave a step.
         outside = rim * (1.0 / np.maximum(q, 1.0) ** 3 - 1.0 / 27.0) / (1.0 - 1.0 / 27.0)
         # a soft minimum of both rounds the rim over a tenth of the radius
         bowl = 0.5 * (inside + outside - np.sqrt((inside - outside) ** 2 + (0.1 * rim) ** 2))
@@ -244,12 +248,14 @@ def albedo(p: SceneParams, nodes: tuple[int, int]) -> NDArray[np.uint8]:
         if wave >= 2.0 * texel:
             add_octave(log, wave / texel, p.grain * (2.0 if wave < 0.008 else 1.0), stream(p.seed, 30 + k))
     log += np.float32(2.0 * p.grain) * stream(p.seed, 40).standard_normal(shape, dtype=np.float32)
+    # Log-normal: contrasts of the octaves multiply, and no albedo is negative.
     return np.clip(128.0 * np.exp(log) + np.float32(0.5), 1, 255).astype(np.uint8)
 
 
 def halve(a: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Next level of a texture: rounded means of 2 x 2, odd sizes edge-replicated."""
     a = np.pad(a, ((0, a.shape[0] % 2), (0, a.shape[1] % 2)), mode="edge")
+    # Four bytes add up to 1020.
     total = a[::2, ::2].astype(np.uint16) + a[::2, 1::2] + a[1::2, ::2] + a[1::2, 1::2]
     return ((total + 2) >> 2).astype(np.uint8)
 
@@ -292,8 +298,11 @@ def sunlit(height: Floats32, p: SceneParams) -> NDArray[np.uint8]:
     points = 16
     count = np.zeros(height.shape, np.uint8)
     for k in range(points):
+        # Square roots and the golden angle (Vogel's spiral) spread the points evenly over the disc.
         radius, angle = 0.5 * p.sun_diameter_deg * np.sqrt((k + 0.5) / points), k * 2.39996323
+        # Off the horizon and the zenith: there tan() is 0, or has no end.
         elevation = np.deg2rad(np.clip(p.sun_elevation_deg + radius * np.sin(angle), 0.5, 89.5))
+        # An angle on the sky spans more azimuth the higher it stands.
         azimuth = np.deg2rad(p.sun_azimuth_deg) + np.deg2rad(radius * np.cos(angle)) / np.cos(elevation)
         # travel of the light in nodes: away from the sun; rows grow towards the viewer
         step_c, step_r = -np.sin(azimuth), np.cos(azimuth)

@@ -67,6 +67,7 @@ def true_disparity(
     shape = (rig.left.height, rig.left.width)
     rows, columns = np.mgrid[: shape[0], : shape[1]]
     occluded = np.full(len(rays), SEEN, np.uint8)
+    # Later lines win: what is outside of the right image was never tested for being hidden, and without bed nothing is.
     occluded[~free] = HIDDEN
     occluded[~inside] = OUTSIDE
     occluded[np.isnan(depth)] = NO_BED

@@ -62,6 +62,7 @@ def _run(params: NoParams, args: Mapping[str, Any], inputs: Inputs) -> Bundle:
     elevation, points = true_dem(field, args["lattice"], RigidTransform.from_matrix(args["T_bed_world"]))
     lefts = [RigidTransform.from_matrix(m) for m in args["pairs"]]
     seen = seen_by(field, Rig.from_dict(args["rig"]), lefts, points).reshape(elevation.shape).astype(np.uint8)
+    # Rounding may lift the cosine of a level frame above 1.
     tilt = math.degrees(math.acos(min(1.0, RigidTransform.from_matrix(args["T_bed_world"]).rotation[2, 2])))
     return Bundle({"elevation": elevation, "seen": seen}, {"lattice": dict(args["lattice"]), "tilt_deg": tilt})
 

@@ -55,6 +55,7 @@ class Task:
     def upstream(self) -> list[int]:
         """Numbers of the tasks in flight that it waits for."""
         given = [g for port in self.refs.values() for g in (port if isinstance(port, list) else [port])]
+        # Each once and in a fixed order: a worker pairs the results that it gets with these numbers by their position.
         return list(dict.fromkeys(g for g in given if isinstance(g, int)))
 
     def run(self, made: Mapping[int, Ref]) -> Outcome | Failed:

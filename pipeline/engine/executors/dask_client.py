@@ -82,12 +82,14 @@ def here(jobs: int, cache: Location, memory: float) -> Dask:
             threads_per_worker=1,
             security=True,
             host="127.0.0.1",
+            # Port 0 is any free one: dask's own, 8787, may belong to another run.
             dashboard_address="127.0.0.1:0",
             worker_dashboard_address=None,
             local_directory=str(private_folder() / "dask"),
             memory_limit=int(memory) if math.isfinite(memory) else 0,
             silence_logs=logging.CRITICAL,
         )
+        # As the default client it would take over whatever else the calling program computes with dask.
         client = Client(cluster, set_as_default=False)
         made = Dask(client, cache, jobs, cluster)
         cluster.scale(jobs)
@@ -140,7 +142,9 @@ class Dask:
         """Processes of workers while a suspect runs alone."""
         self._seen: Counter[int] = Counter()
         """Greatest memory of a worker while a suspect ran alone, bytes."""
+        # The handler runs on the client's event loop: it only hands over what came, :meth:`wait` reads it.
         client.subscribe_topic(self._run, lambda event: self._events.put(event[1]))
+        # Named after the run: of two plugins of one name the later replaces the earlier, and runs may share a cluster.
         client.register_plugin(SetUp(self._run, {} if cluster else dask_cluster.identity()), self._run)
 
     @property
@@ -171,6 +175,7 @@ class Dask:
         nodes = {}
         for task in tasks:
             self._submitted += 1
+            # Dask takes equal names for equal results: a task that is tried again needs a new one.
             name = names[task.number] = f"{task.spec.stage.name}-{self._run}-{self._submitted}-{task.number}"
             upstream = [TaskRef(names[number]) for number in task.upstream()]
             nodes[name] = Node(name, _work, self._run, pickle.dumps(task), *upstream)
@@ -189,6 +194,7 @@ class Dask:
                 self._beside = {pid for pid in self._pids() if _resident(pid)}
                 self._send([self._held.pop(min(self._held))])
             with suppress(queue.Empty):
+                # Not for ever: a worker that dies and a scheduler that is lost send no event.
                 landed += self._hear(self._events.get(timeout=WATCH))
                 while True:
                     landed += self._hear(self._events.get_nowait())
@@ -228,6 +234,7 @@ class Dask:
         self._gone = gone - self._gone
 
     def _lost(self, number: int, future: Any, alone: bool) -> Failed | NotBegun:
+        # Neither pending nor failed: distributed cancels all futures when the connection to the scheduler is lost.
         if future.status != "error":
             raise self._presence.gone()
         error = future.exception()
@@ -338,7 +345,9 @@ def _work(run: str, pickled: bytes, *made: Ref | None) -> Ref | None:
     if isinstance(outcome, Outcome):
         outcome = replace(outcome, worker=str(worker.name))
     name = worker.get_current_task()
+    # Events travel as msgpack, which has no types of ours: bytes pass.
     _ended[name] = pickle.dumps((task.number, name, outcome))
+    # Never an exception: dask would state it as the failure of every task that waits for this one.
     return light(outcome.ref) if isinstance(outcome, Outcome) else None
 
 
@@ -357,6 +366,7 @@ def _configure() -> None:
         {
             # The first death ends the task for dask: this client decides which one is a suspect, and tries it alone.
             "distributed.scheduler.allowed-failures": 0,
+            # A share of the limit: the bytes given are meant whole, by default dask ends a worker at 95 % of them.
             "distributed.worker.memory.terminate": 1.0,
             "distributed.worker.profile.enabled": False,
             "distributed.worker.memory.monitor-interval": "500ms",

@@ -84,6 +84,7 @@ class Admission:
 
     def foresee(self, handle: Handle) -> Foreseen:
         """Foresee the cost of a task; results of running tasks count as foreseen."""
+        # No key while an input is still to come: with one it is foreseen anew, from the true sizes of its inputs.
         asked = handle.index, bool(handle.key)
         if asked not in self._foreseen:
             results = {h.index: f.result for h in handle.upstream() if (f := self._running.get(h.index)) is not None}
@@ -99,6 +100,7 @@ class Admission:
         together = heapq.nlargest(self.together, [most, *(f.most for f in self._running.values())])
         if sum(together) > self.shares.budget:
             return False
+        # The automatic limit is a share of what was free at the start; others may have taken of it since.
         return not self.automatic or self._now() > most
 
     def _now(self) -> float:
@@ -194,6 +196,7 @@ class Waiting:
         While a stage's first task compiles its kernels another worker would wait for the same ones.
         """
         for stage, heap in list(self._heaps.items()):
+            # A heap gives up its least entry alone: discarded tasks stay in it until they come to the top.
             while heap and heap[0] not in self._nodes:
                 heapq.heappop(heap)
             if not heap:

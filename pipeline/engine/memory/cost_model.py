@@ -157,6 +157,7 @@ class Costs:
 
 def _thinned(samples: list[Sample]) -> list[Sample]:
     """A few of them, from the least to the greatest memory."""
+    # A sample without measured memory ranks least but stays: it tells the bytes of inputs and results all the same.
     ranked = sorted(samples, key=lambda s: (s[1] is not None, s[1] or 0.0))
     if len(ranked) <= EACH_RUN:
         return ranked
@@ -184,6 +185,7 @@ def _at(samples: list[tuple[float, float]], size: float) -> tuple[float, float]:
     intercept, slope = _line(samples)
     off = max((abs(y - intercept - slope * x) / y for x, y in samples if y), default=0.0)
     typical = median(x for x, _ in samples)
+    # The farther from the measured sizes, the less a straight line through them is believed.
     beyond = max(size, typical) / max(min(size, typical), 1.0)
     return intercept + slope * size, max(2 * SPREAD, off) + 0.1 * min(beyond - 1, 5.0)
 
@@ -197,6 +199,7 @@ def _line(samples: list[tuple[float, float]]) -> tuple[float, float]:
     intercept = my - slope * mx
     if intercept >= 0:
         return intercept, slope
+    # Refitted through the origin: with the intercept merely cut to 0 the slope would stay too steep.
     return 0.0, sum(x * y for x, y in samples) / sum(x * x for x, _ in samples)
 
 

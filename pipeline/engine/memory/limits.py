@@ -28,6 +28,7 @@ SHARE = 0.9
 
 UNITS = {"": 1, "k": 1e3, "m": 1e6, "g": 1e9, "t": 1e12, "ki": 2**10, "mi": 2**20, "gi": 2**30, "ti": 2**40}
 
+# Control groups v1 write "no limit" as the greatest 64-bit number of whole pages, not as a word.
 _UNLIMITED = 1 << 60
 _WORDS = re.compile(r"([\d.]+)\s*([kmgt]?i?)b?", re.IGNORECASE)
 
@@ -41,6 +42,7 @@ def parse(text: str) -> int:
         It is none of these.
     """
     words = text.strip()
+    # The pattern lets 1.2.3 pass, float() does not.
     with suppress(ValueError):
         if words.endswith("%") and 0 < float(words[:-1]) <= 100:
             return int(float(words[:-1]) / 100 * total())
@@ -74,6 +76,7 @@ def free(root: Path = Path("/")) -> int:
 
 def _resource() -> list[int]:
     """Resident memory that each process may have by its resource limit (``ulimit -m``), if there is one."""
+    # Linux itself no longer enforces this limit (getrlimit(2)); it is kept here because somebody has set it.
     soft, _ = resource.getrlimit(resource.RLIMIT_RSS)
     return [] if soft == resource.RLIM_INFINITY else [soft]
 
@@ -156,6 +159,7 @@ class Meter:
         now = _status()[0] if self._before else 0
         with Meter._lock:
             Meter._running.remove(self)
+            # Another task may have begun while this one ran: the peak is then that of both, and says nothing.
             alone = self._alone
         if alone and self._before:
             self.rest = max(self._before, now)
@@ -175,6 +179,7 @@ def _set_back() -> bool:
 def _status() -> tuple[int, int]:
     """Resident memory of this process now, and its greatest since the mark was set back, bytes."""
     text = Path("/proc/self/status").read_text(encoding="ascii", errors="replace")
+    # proc(5) writes kB and means 1024 bytes.
     found = dict(re.findall(r"^(VmRSS|VmHWM):\s+(\d+) kB$", text, re.MULTILINE))
     return int(found["VmRSS"]) * 1024, int(found["VmHWM"]) * 1024
 
@@ -187,4 +192,5 @@ def _trim() -> None:
 
 @cache
 def _library() -> Any:
+    # The symbols of this process, so of whichever C library it runs on; another than glibc lacks malloc_trim.
     return ctypes.CDLL(None)
