@@ -99,9 +99,11 @@ def repeated(left: AnyArray, right: AnyArray, places: Places, f: NDArray[np.floa
         score = cv2.matchTemplate(around, patch, cv2.TM_CCOEFF_NORMED)
         j, i = np.indices(score.shape)
         j, i = j + y0 + PATCH, i + x0 + PATCH
+        # The match has been rounded, so that its peak may lie beside it.
         own = float(score[np.hypot(j - q, i - p) <= 2].max())
         if not np.isfinite(own) or own < ALIKE:
             continue
+        # Without lines the row through the match stands in.
         line = (0.0, 1.0, -float(q)) if f is None else f @ (x, y, 1.0)
         here = np.abs(line[0] * i + line[1] * j + line[2]) <= NEAR * np.hypot(line[0], line[1])
         elsewhere = score[here & (np.hypot(j - q, i - p) >= APART)]

@@ -44,6 +44,7 @@ def swapped(column: AnyArray, row: AnyArray, matched: NDArray[np.bool_]) -> bool
     k, sigma = _keystone((x - 0.5 * (width - 1)) / width, (y - 0.5 * (matched.shape[0] - 1)) / width, u, v)
     # In units of the image width k is D in pixels for a focal length of one width.
     most = k + 3.0 * sigma
+    # A keystone may be negative: then the short focal length gives the upper bound.
     bound = max(most * FOCAL[0] ** 2, most * FOCAL[1] ** 2)
     return bool(np.percentile(u, NEARLY_ALL) > bound + MARGIN)
 
@@ -57,9 +58,11 @@ def _keystone(x: AnyArray, y: AnyArray, u: AnyArray, v: AnyArray) -> tuple[float
     terms = np.stack([x * y, np.ones_like(x), x, y, y * y, depth, depth * y], -1)
     weight = np.ones_like(x)
     for _ in range(ITERATIONS):
+        # A flat scene has no depth, whose terms are zero: without the last part the matrix would be singular.
         normal = (terms * weight[:, None]).T @ terms + 1e-9 * len(x) * np.eye(terms.shape[1])
         solution = np.linalg.solve(normal, (terms * weight[:, None]).T @ v)
         residual = v - terms @ solution
+        # Rows that agree exactly leave residuals of zero to divide by.
         spread = max(1.5 * float(np.median(np.abs(residual))), 1e-3)
         weight = 1.0 / (1.0 + (residual / spread) ** 2)
     return float(solution[0]), spread * float(np.sqrt(np.linalg.inv(normal)[0, 0]))

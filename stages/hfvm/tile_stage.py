@@ -208,6 +208,7 @@ def _level(task: TileInputs) -> Bundle:
 
 def _band(task: TileInputs) -> Bundle:
     pair = task.pair()
+    # Where no band can be fitted there is to be none, as in memory, and not the one of the level above.
     state = replace(task.state(pair, task.args["level"]), band=hierarchy.FREE)
     return Bundle({}, told(hierarchy.with_band(pair, state)))
 

@@ -81,6 +81,7 @@ def halves(left: View, right: View, params: HfvmParams) -> bool:
 def halved_params(params: HfvmParams) -> HfvmParams:
     """Parameters of a match at half the resolution."""
     return params.model_copy(
+        # At half the side an area has a quarter of the pixels.
         update={"finest": 0, "speckle": max(params.speckle // 4, 1), "fill_reach": params.fill_reach // 2}
     )
 
@@ -120,6 +121,7 @@ def coarse(left: View, right: View, params: HfvmParams, side: int | None, prior:
 def _levelled(left: View, right: View, params: HfvmParams, side: int | None) -> tuple[Prepared, State, Floats | None]:
     """Coarse levels, and the ratio of brightness that is undone in them; None: none is."""
     pair = prepare(left, right, params, side)
+    # Two levels above, where trying another brightness costs about a sixteenth.
     top = hierarchy.run(pair, params, params.plane_level + 2)
     ratio: Floats | None = None
     if params.preset == "paper":
@@ -199,6 +201,7 @@ def match(
     state = begun.state
     band = state.band
     for level in range(state.level - 1, -1, -1):
+        # The finest level has none: filling follows that of the level above.
         band = state.band
         tell(COARSE_SHARE + (FINE_SHARE - COARSE_SHARE) * 0.25 ** (level + 1), f"level {level}")
         state = hierarchy.run(pair, params, level, state)

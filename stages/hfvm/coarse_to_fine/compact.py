@@ -39,6 +39,7 @@ def pack(image: AnyArray) -> Words:
 @njit(cache=True, nogil=True)
 def _pack(framed, words):  # type: ignore[no-untyped-def]
     """Words of an image that has a frame of one pixel."""
+    # 128 stands for no step, so that the sign fits into a byte; the half more makes truncation round.
     middle, top = np.float32(128.5), np.float32(255.0)
     for y in range(words.shape[0]):
         for x in range(words.shape[1]):

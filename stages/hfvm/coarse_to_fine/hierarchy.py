@@ -230,6 +230,7 @@ def top_reach(p: HfvmParams, a: tuple[int, ...], b: tuple[int, ...]) -> tuple[in
 
 def double(up: AnyArray, shape: tuple[int, ...]) -> AnyArray:
     """Prediction for the level below: doubled values, each for its 2 x 2 pixels."""
+    # Repeated, not interpolated: means of two depths at an edge are depths that nothing has.
     big: AnyArray = (2 * up).repeat(2, axis=0)[: shape[0]].repeat(2, axis=1)[:, : shape[1]]
     return np.ascontiguousarray(big)
 
@@ -342,7 +343,9 @@ def level_tiles(pair: Prepared, level: int) -> list[Window]:
 def level_tile(pair: Prepared, level: int, window: Window, above: State | None) -> Results:
     """Map of the left image's window: ``u``, ``v`` int16, ``undefined`` bool."""
     p, rounds, (shape, other) = pair.params, pair.solver.rounds(level), pair.shapes(level)
+    # Two pixels for each round, half a median, and for the parents' neighbours a coarse pixel, two pixels wide.
     reach = 2 * rounds + p.median // 2 + 2
+    # Even borders: the four pixels of a parent are searched together.
     outer = window.grow(reach, reach, shape).align(2, shape)
     a = pair.left.patch(level, outer)
     if above is None:
@@ -360,6 +363,7 @@ def level_tile(pair: Prepared, level: int, window: Window, above: State | None) 
         )
         found = pair.solver.match(level, a, pair.right.patch(level, target), (shape, other), up, above.band)
     inner = window.inside(outer)
+    # Before the check of consistency, which asks one pixel of the other map: an outlier there refutes a match.
     u, v = (consistency.median(np.asarray(plane), p.median)[inner] for plane in (found.u, found.v))
     return {"u": u, "v": v, "undefined": np.asarray(found.undefined)[inner]}
 
@@ -386,11 +390,14 @@ def _landing(u: AnyArray, v: AnyArray, window: Window, raster: Raster) -> Iterab
 
 def hand_down(state: State, window: Window, params: HfvmParams) -> Map:
     """Map of a left window whose inconsistent pixels are interpolated along their row (4.3.4)."""
+    # Filling looks along rows alone.
     outer = window.grow(0, params.fill_reach, state.left.u.shape)
     own, ok = state.left.cut(outer), cut(state.left_ok, outer)
     u, v = (np.asarray(a).astype(np.float32) for a in (own.u, own.v))
+    # While the sign is unknown, the usual rig's stands.
     consistency.fill_rows(u, v, ok, params.fill_reach, state.near_sign or -1.0, np.zeros(ok.shape, np.uint8))
     inner = window.inside(outer)
+    # Interpolated values are fractions; a search centre is a whole pixel.
     columns, rows = (np.ascontiguousarray(np.rint(a[inner]).astype(np.int16)) for a in (u, v))
     return Map(columns, rows, np.asarray(own.undefined)[inner])
 
@@ -407,6 +414,7 @@ def fine_tile(pair: Prepared, level: int, a: Map, window: Window, wanted: AnyArr
     use[window.inside(outer)] = True if wanted is None else wanted
     target = whole(other)
     if outer != whole(shape):
+        # One more than the window, since sub-pixel search moves it by a pixel to every side; the paper's heeds no wish.
         target = landing(own, outer, other, SUM_RADIUS + 1, None if pair.params.preset == "paper" else use)
     found = pair.solver.fine(pair.left.patch(level, outer), pair.right.patch(level, target), own, use)
     inner = window.inside(outer)
@@ -471,5 +479,6 @@ def with_band(pair: Prepared, state: State) -> State:
     f, spread = found
     # Where lenses bend the lines, or the fit is poor, the band gives way.
     mu = pair.params.band * min(1.0, epipolar.SHARP / max(spread, 1e-9)) ** 2
+    # Told once, by the first level that has a band; finer ones keep it.
     sign = state.near_sign or epipolar.near_sign(f, s.u, shape, other)
     return State(state.level, state.left, state.right, state.left_ok, state.right_ok, Band(epipolar.finer(f), mu), sign)

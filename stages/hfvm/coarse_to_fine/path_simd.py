@@ -65,6 +65,7 @@ def step(typingctx, cu, cv, cost, path, there, out, here, total, at, small, far)
         # Beyond this many pixels the difference costs the most anyway, and the product would not fit.
         reach = builder.trunc(builder.add(builder.sdiv(far, small), ir.Constant(_I64, 1)), _I16)
         reach, cost_of_one = simd._splat(builder, reach, MOST), simd._splat(builder, small16, MOST)
+        # From the cheapest candidate before, any other is reached at the greatest cost.
         best = call("sadd.sat", simd._splat(builder, least, MOST), most)
         no_poison = ir.Constant(ir.IntType(1), 0)
         for m in range(MOST):
@@ -72,16 +73,19 @@ def step(typingctx, cu, cv, cost, path, there, out, here, total, at, small, far)
             gap = None
             for kind, array, mine in ((sig.args[0], cu, u), (sig.args[1], cv, v)):
                 one = builder.load(_at(context, builder, kind, array, builder.add(there, k), _I16))
+                # Saturating: two displacements of opposite sign may differ by more than 16 bits hold.
                 part = call("ssub.sat", simd._splat(builder, one, MOST), mine)
                 part = simd._call(builder, f"llvm.abs.v{MOST}i16", _SHORTS, part, no_poison)
                 gap = part if gap is None else call("umin", call("uadd.sat", gap, part), reach)
             way = call("smin", builder.mul(gap, cost_of_one), most)
             so_far = builder.load(_at(context, builder, sig.args[3], path, k, _I16))
             best = call("smin", best, call("sadd.sat", simd._splat(builder, so_far, MOST), way))
+        # Less the least, so that costs do not grow along the path and 16 bits go on holding them.
         best = builder.sub(best, simd._splat(builder, least, MOST))
         result = call("sadd.sat", own, best)
         builder.store(result, _at(context, builder, sig.args[5], out, here, _SHORTS), align=2)
         pointer = _at(context, builder, sig.args[7], total, at, _INTS)
+        # In 32 bits: the sum of six directions does not fit into 16.
         builder.store(builder.add(builder.load(pointer, align=4), builder.sext(result, _INTS)), pointer, align=4)
         return context.get_dummy_value()
 

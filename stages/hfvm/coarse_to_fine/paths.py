@@ -98,6 +98,7 @@ def propagate(
     for _ in range(rounds):
         _gather(left, right, weights.compact, maps, above, (lines, mu), found)
         total[:] = 0
+        # Three directions each; the two within a row are left out to save time.
         for backward in (False, True):
             _sweep(found, left.grey, weights, backward, total)
         _choose(found, total, maps)
@@ -145,6 +146,7 @@ def _gather(left, right, share, maps, above, band, found):  # type: ignore[no-un
             for n in range(tried):
                 u, v = us[n], vs[n]
                 inside = 0 <= x + u < right_cols and 0 <= y + v < right_rows
+                # Each once: there is room for few, and equal ones would take it from others.
                 known = False
                 for k in range(count):
                     known |= (found.u[y, x, k] == u) & (found.v[y, x, k] == v)
@@ -157,6 +159,7 @@ def _gather(left, right, share, maps, above, band, found):  # type: ignore[no-un
                 if mu > 0:
                     a, b, c = np.float64(lines[y, x, 0]), np.float64(lines[y, x, 1]), np.float64(lines[y, x, 2])
                     cost += np.int64((UNIT + share) * mu * abs(a * u + b * v + c))
+                # Leaves room below NONE for the greatest step, 10000.
                 found.u[y, x, count], found.v[y, x, count], found.cost[y, x, count] = u, v, min(cost, 2 * OUTSIDE)
                 count += 1
                 if count == MOST:
@@ -203,6 +206,7 @@ def _sweep(found, grey, weights, backward, total):  # type: ignore[no-untyped-de
                         totals[at + k] += costs[at + k]
                     continue
                 change = abs(grey[y, x] - grey[j, i])
+                # Small differences cost less than jumps even where the grey step is greatest.
                 far = np.int64(max(large / (np.float32(1.0) + change / half), 2 * small))
                 there = (j * cols + i) * MOST
                 path_simd.step(us, vs, costs, before[d, i], there, after[d, x], 0, totals, at, small, far)
@@ -217,6 +221,7 @@ def _choose(found, total, maps):  # type: ignore[no-untyped-def]
         for x in range(cols):
             best = 0
             for k in range(1, MOST):
+                # Strictly less: the pixel's own displacement comes first and wins ties.
                 if found.cost[y, x, k] != NONE and total[y, x, k] < total[y, x, best]:
                     best = k
             maps[y, x] = (np.int32(found.v[y, x, best]) << np.int32(16)) | (

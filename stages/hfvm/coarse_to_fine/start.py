@@ -49,6 +49,7 @@ def check(prior: tuple[AnyArray, AnyArray] | None, shape: tuple[int, ...]) -> Pr
             f"prior disparities {u.shape} and {v.shape} and the left image {shape} differ",
             remedy="give disparities of the left image, one a pixel",
         )
+    # NaN is not less, and so unknown as well.
     known = (np.abs(u) < MOST) & (np.abs(v) < MOST)
     return Prior(np.where(known, u, np.float32(np.nan)), np.where(known, v, np.float32(np.nan)))
 
@@ -87,6 +88,7 @@ def _coarse(prior: Prior, level: int, shape: tuple[int, ...]) -> tuple[AnyArray,
         blocks = padded.reshape(shape[0], side, shape[1], side).swapaxes(1, 2).reshape(*shape, side * side)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)  # blocks without any are NaN, as they should be
+            # No means: of a block across a depth edge they lie on neither surface.
             maps.append(np.nanmedian(blocks, axis=2) / side)
     known = np.isfinite(maps[0]) & np.isfinite(maps[1])
     u, v = (np.rint(np.where(known, a, 0.0)).astype(np.int16) for a in maps)
@@ -98,6 +100,7 @@ def _reverse(
 ) -> tuple[AnyArray, AnyArray, NDArray[np.bool_]]:
     """Displacements of the right image: each left one at its far end; of several the nearest thing's."""
     y, x = np.nonzero(known)
+    # From far to near, since of several that meet at a pixel the last one stays: the one that hides the others.
     order = np.argsort(near_sign * u[y, x].astype(np.float64), kind="stable")
     y, x = y[order], x[order]
     xr, yr = x + u[y, x].astype(np.intp), y + v[y, x].astype(np.intp)

@@ -121,6 +121,7 @@ class Finish:
         reach = refine.reach(p)
         outer = window.grow(reach, reach, self.shape)
         u, v, bits = (cut(checked[name], outer) for name in ("u", "v", "validity"))
+        # What is cut may be the raster itself.
         bits = bits.copy()
         keep = bits == 0
         # The relief's windows are not bounded: it is given the whole image.
@@ -175,6 +176,7 @@ class Finish:
         """
         p, near = self.params, uncertainty.SURROUNDINGS // 2 + consistency.CROWD // 2
         extra = guided.RADIUS if p.guided_fill else 0
+        # Filling reaches along rows alone, so that columns need more than rows.
         outer = window.grow(near + extra, max(near, p.fill_reach) + extra, self.shape)
         u, v = (cut(refined[name], outer).copy() for name in ("u", "v"))
         validity, removed = cut(refined["validity"], outer).copy(), cut(gone, outer) != 0
@@ -193,6 +195,7 @@ class Finish:
             mark(validity, unsure, Validity.OVER_THRESHOLD)
             interpolated[unsure], std[unsure] = 1, np.nan
             keep &= ~unsure
+        # A masked pixel is no part of the image, whatever the row tells of it.
         interpolated[valid == 0] = 0
         if p.guided_fill:
             u, v = guided.median(u, v, keep, interpolated, left)

@@ -41,6 +41,7 @@ def median(u: AnyArray, v: AnyArray, keep: AnyArray, filled: AnyArray, grey: Any
     """
     steps = np.exp(-np.arange(256) / GREY)
     apart = np.exp(-np.arange(2 * RADIUS + 1) / RADIUS)
+    # One more, so that no weight is zero: of weights without a sum the least value would win.
     table = np.rint(SCALE * apart[:, None] * steps[None, :]).astype(np.int32) + 1
     out_u, out_v = u.copy(), v.copy()
     _median((u, v), keep.astype(np.uint8), filled.astype(np.uint8), grey, table, (out_u, out_v))
@@ -64,6 +65,7 @@ def _median(given, keep, filled, grey, table, out):  # type: ignore[no-untyped-d
             if not filled[y, x]:
                 continue
             n = 0
+            # Odd steps from the pixel: neither itself nor its row, along which streaks run, is asked.
             for j in range(y - RADIUS, y + RADIUS + 1, STRIDE):
                 for i in range(x - RADIUS, x + RADIUS + 1, STRIDE):
                     if 0 <= j < rows and 0 <= i < cols and keep[j, i] | filled[j, i]:

@@ -81,6 +81,7 @@ def refine(
         rowwise.lucas_kanade(left, right, (there_u, there_v), keep, window, told)
         if not params.refine:
             break
+        # The same arrays mean no alignment, and nothing to convert.
         if there_u is not now_u:
             step_u, step_v = now_u + (step_u - there_u), now_v + (step_v - there_v)
         now_u, now_v = np.empty_like(u), np.empty_like(v)
@@ -97,6 +98,7 @@ def _take_back(u, v, first, farthest, new_u, new_v, last):  # type: ignore[no-un
     for y in range(u.shape[0]):
         for x in range(u.shape[1]):
             du, dv = new_u[y, x] - u[y, x], new_v[y, x] - v[y, x]
+            # After a single step both are one array (residuals are those before it): the distance alone counts.
             better = (last[y, x] <= first[y, x]) & (du * du + dv * dv <= farthest * farthest)
             new_u[y, x] = new_u[y, x] if better else u[y, x]
             new_v[y, x] = new_v[y, x] if better else v[y, x]

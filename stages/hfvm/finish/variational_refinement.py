@@ -107,6 +107,7 @@ def _grey(
     _warped(left, spline, right_valid, u, v, keep, planes)
     known, _, _, rest = planes
     mean, weight = np.zeros_like(rest), known
+    # The first mean is of equal weights, hence one more.
     for _ in range(MEAN_ROUNDS + 1):
         mean = window_sum(weight * rest, MEAN_SIDE) / np.maximum(window_sum(weight, MEAN_SIDE), LEAST_WEIGHT)
         weight = known / (np.float32(1.0) + ((rest - mean) * np.float32(1.0 / RESIDUAL)) ** 2)
@@ -222,6 +223,7 @@ def _normal(grey, lines, hold, at, keep, stiffness, out):  # type: ignore[no-unt
             s += (down[y - 1, x] if y > 0 else 0) + (down[y + 1, x] if y < rows - 1 else 0)
             m, o = a + s, c + s
             det = m * o - b * b
+            # Else hardly any texture, line or neighbour holds the pixel, and it stays.
             if det > np.float32(1.0):
                 out[0, y, x], out[1, y, x], out[2, y, x], out[3, y, x], out[4, y, x] = o / det, b / det, m / det, p, q
 
@@ -249,6 +251,7 @@ def _sweep(normal, across, down, sweeps, overshoot, u, v):  # type: ignore[no-un
             uo, u1, u2, u3, u4 = u[y + 2], u[y, 2:], u[y + 1, 2:], u[y + 3, 2:], u[y + 4, 2:]
             vo, v1, v2, v3, v4 = v[y + 2], v[y, 2:], v[y + 1, 2:], v[y + 3, 2:], v[y + 4, 2:]
             for x in range(cols):
+                # Zero marks a pixel that stays: elsewhere it is positive.
                 if minor_v[x] == 0:
                     continue
                 kw, ko, ke, ku, kc, kd = k[x + 1], two * k[x + 2], k[x + 3], k_up[x], two * k_own[x], k_down[x]

@@ -37,6 +37,7 @@ def terms(x: AnyArray, y: AnyArray, level: int, shape: Shape) -> Floats:
     1, x, y, x^2, xy, y^2 and (x^2 + y^2)^2, in half sides from the middle.
     """
     k = 2.0**level
+    # Counted from the image's outer corner, where pixel x of any level has its centre at k (x + 0.5).
     p = ((x + 0.5) * k) / (0.5 * shape[1]) - 1.0
     q = ((y + 0.5) * k) / (0.5 * shape[0]) - 1.0
     p, q = np.broadcast_arrays(p, q)
@@ -112,10 +113,12 @@ def matched(left: View, right: View, level: int, u: Raster, v: Raster, ok: Raste
     y, x = np.divmod(places, ok.shape[1])
     p, q = x + pick(u, y, x).astype(np.int64), y + pick(v, y, x).astype(np.int64)
     a, b = left.grey(level, whole(left.shapes[level]))[y, x], right.grey(level, whole(right.shapes[level]))[q, p]
+    # At DARK one grey level is a quarter of the value, five times SCATTER; at the top values are clipped.
     good = (np.minimum(a, b) > DARK) & (np.maximum(a, b) < SATURATED)
     if np.count_nonzero(good) < LEAST:
         return None
     ratio = np.log(a[good].astype(np.float64) / b[good])
+    # Places of the right image, since that is the one to be multiplied.
     return _fit(terms(p[good], q[good], level, right.shapes[0]), ratio)
 
 
@@ -124,8 +127,10 @@ def _fit(basis: Floats, target: Floats) -> Floats:
     g, weight = np.zeros(len(basis)), np.ones(target.size)
     for _ in range(ITERATIONS):
         normal, side = weighted_normal(basis, target, weight)
+        # Terms that the matches leave open stay near zero instead of growing outside of them.
         g = np.linalg.solve(normal + 1e-3 * target.size * np.eye(len(basis)) + 1e-9 * np.eye(len(basis)), side)
         off = residuals(basis, target, -g)
+        # 1.5 times the median magnitude is about the standard deviation of normal scatter.
         weight = 1.0 / (1.0 + (off / max(SCATTER, 1.5 * typical(off))) ** 2)
     return g
 
@@ -133,4 +138,5 @@ def _fit(basis: Floats, target: Floats) -> Floats:
 def greatest(ratio: Floats) -> float:
     """Greatest logarithm, either way, in the image."""
     side = np.linspace(0, 1, 9)
+    # Nine places from edge to edge of an image of 9 x 9: terms are in half sides, so that any size stands for all.
     return float(np.abs(np.tensordot(ratio, terms(side * 9 - 0.5, (side * 9 - 0.5)[:, None], 0, (9, 9)), 1)).max())

@@ -14,8 +14,10 @@ Weights = tuple[float, float, float, float, float, float, float, float]
 
 PAPER: Mapping[str, Any] = {
     "weights": PAPER_WEIGHTS,
+    # Grey levels: distances are Eq. 1's there, no sums of bytes.
     "threshold": 15.0,
     "texture": 0.0,
+    # Beyond the noise of any image, which so is never smoothed.
     "smooth_noise": 1e6,
     "speckle": 1,
     "fill_reach": 100000,
@@ -31,8 +33,12 @@ ACCURATE: Mapping[str, Any] = {
     "fine_rounds": None,
     "back_rounds": 4,
     "centres": 5,
+    # One round instead of three, and four steps instead of seven: two of four savings that took ``accurate``
+    # from 34 times SGBM's time to 12.
     "path_rounds": 1,
     "variational_steps": 4,
+    # Without this and ``greatest_std`` 75.0 % of the pixels are matched instead of 71.9,
+    # but bad-2 of the matched is .035 instead of .026.
     "min_support": 0.5,
     "guided_fill": True,
     "greatest_std": 1.1,
@@ -102,12 +108,14 @@ class HfvmParams(Params):
         "closer to the line; 0: free two-dimensional search",
     )
     smoothness: int = Field(
+        # With 6 bad-2 of three pairs changed by .001 to .002, which proves nothing.
         default=4,
         ge=0,
         description="cost [byte steps per pixel] of the difference to each neighbour's displacement; larger: fewer "
         "outliers, depth edges less sharp",
     )
     rounds: int = Field(
+        # Where rows lie 14 px apart (NASA K10), four rounds match 70.2 % of the pixels, three 69.5.
         default=4,
         ge=0,
         le=32,
@@ -115,6 +123,7 @@ class HfvmParams(Params):
         "lost, take longer",
     )
     fine_rounds: int | None = Field(
+        # Two rounds instead of one lowered bad-2 of ten pairs by 5 % and made ``default`` slower by a tenth.
         default=2,
         ge=0,
         le=32,

@@ -77,7 +77,9 @@ def source(h: Matrix, window: Window, shape: Shape) -> Window:
     if (w <= 1e-3).any():  # the horizon crosses it: a quadrangle does not hold it
         return whole(shape)
     p, q = (h[0, 0] * x + h[0, 1] * y + h[0, 2]) / w, (h[1, 0] * x + h[1, 1] * y + h[1, 2]) / w
+    # Near the horizon ends run off to numbers that no index holds.
     top, bottom, first, last = (int(np.clip(a, -4, 1 << 30)) for a in (q.min(), q.max(), p.min(), p.max()))
+    # Four pixels hold the cubic kernel, which reads two beyond its own, and what truncation takes off.
     return bounded(top, bottom, first, last, shape, 4)
 
 
@@ -99,6 +101,7 @@ def _compose(g, u, v, out_u, out_v, x0, y0):  # type: ignore[no-untyped-def]
         y = np.float64(row + y0)
         a, b, c = g[0, 1] * y + g[0, 2], g[1, 1] * y + g[1, 2], g[2, 1] * y + g[2, 2]
         for col in range(u.shape[1]):
+            # In double precision: the difference of two columns must keep their fractions.
             x = np.float64(col + x0)
             p, dv = x + u[row, col], np.float64(v[row, col])
             w = 1.0 / (g[2, 0] * p + g[2, 1] * dv + c)
@@ -112,6 +115,7 @@ def decompose(h: Matrix, u: AnyArray, v: AnyArray) -> tuple[AnyArray, AnyArray]:
     y, x = np.indices(u.shape, dtype=np.float64)
     p, q = x + u, y + v
     w = g[2, 0] * p + g[2, 1] * q + g[2, 2]
+    # Points beyond the horizon would come back mirrored.
     w = np.where(w > 0, w, np.nan)
     aligned_u = (g[0, 0] * p + g[0, 1] * q + g[0, 2]) / w - x
     aligned_v = (g[1, 0] * p + g[1, 1] * q + g[1, 2]) / w - y
@@ -150,6 +154,7 @@ def fit_points(
     """As :func:`fit_plane`, of matches (n,) of an image of ``shape``."""
     if len(y) < LEAST_MATCHES:
         return None
+    # In half image sides all eight terms are of like size, so that one weak hold suits them all.
     scale = 0.5 * max(shape)
     middle = (0.5 * shape[1] / scale, 0.5 * shape[0] / scale)
     to_unit = np.array([[1 / scale, 0.0, -middle[0]], [0.0, 1 / scale, -middle[1]], [0.0, 0.0, 1.0]])
@@ -179,6 +184,7 @@ def _solve(p: AnyArray, d: AnyArray, tolerance: float) -> tuple[Matrix, AnyArray
         error = np.hypot(*(residuals(t, e, -h) for t, e in zip(terms, d, strict=True)))
         # Start as wide as the matches scatter about the first fit, and narrow onto the dominant plane.
         spread = max(tolerance, min(1.5 * typical(error), 0.7 * spread))
+        # Squared Cauchy weights: other surfaces, off by many pixels, must not drag the plane along.
         weight = 1.0 / (1.0 + (error / spread) ** 2) ** 2
     return np.append(h, 0.0).reshape(3, 3) + np.eye(3), error
 
@@ -192,6 +198,7 @@ def to_level_0(h: Matrix, level: int) -> Matrix:
 def finer(level: int) -> Matrix:
     """Homography from pixels of a level to those of level 0, whose centres lie half a pixel inside their corners."""
     k = 2.0**level
+    # Pixel x of the level covers k pixels from k x on, whose middle is k x + (k - 1) / 2: at level 1 it is 2x + 0.5.
     return np.array([[k, 0.0, 0.5 * k - 0.5], [0.0, k, 0.5 * k - 0.5], [0.0, 0.0, 1.0]])
 
 
@@ -199,6 +206,7 @@ def distortion(h: Matrix, shape: tuple[int, int]) -> float:
     """Greatest element of the derivative's departure from the identity, each taken as the median over an image."""
     y, x = np.meshgrid(np.linspace(0, shape[0] - 1, 5), np.linspace(0, shape[1] - 1, 5), indexing="ij")
     w = h[2, 0] * x + h[2, 1] * y + h[2, 2]
+    # So near the horizon it is no ground but a bad fit, which infinity has refused.
     if (w <= 0.1).any():
         return np.inf
     p, q = (h[0, 0] * x + h[0, 1] * y + h[0, 2]) / w, (h[1, 0] * x + h[1, 1] * y + h[1, 2]) / w
@@ -227,8 +235,10 @@ def warp(image, valid, h, out, out_valid, place):  # type: ignore[no-untyped-def
             if w <= 1e-6:
                 continue
             p, q = (h[0, 0] * x + h[0, 1] * y + h[0, 2]) / w, (h[1, 0] * x + h[1, 1] * y + h[1, 2]) / w
+            # The cubic kernel reads one pixel before and two after.
             if not (p >= 1 and p < width - 2 and q >= 1 and q < height - 2):
                 continue
+            # The nearest pixel decides: masked ones beside it carry grey from above and do not darken the kernel.
             if valid[int(q + 0.5) - iy0, int(p + 0.5) - ix0]:
                 out[row, col] = sample_cubic(image, np.float32(p), np.float32(q), ix0, iy0)[0]
                 out_valid[row, col] = 1

@@ -16,6 +16,7 @@ def sample_cubic(a, x, y, x0=0, y0=0):  # type: ignore[no-untyped-def]
     """Catmull-Rom value and gradient at (x, y), two pixels or more inside, of an image that ``a`` shows from x0, y0."""
     i, j = int(x), int(y)
     t, s = x - np.float32(i), y - np.float32(j)
+    # After the fractions have been taken: in float32 they must not depend on where the window begins.
     i, j = i - x0, j - y0
     h, two, three = np.float32(0.5), np.float32(2.0), np.float32(3.0)
     one, four, five = np.float32(1.0), np.float32(4.0), np.float32(5.0)
@@ -69,10 +70,12 @@ def enlarge(  # type: ignore[no-untyped-def]
             j, i = y >> 1, x >> 1
             a, b, bit = two * u[j, i], two * v[j, i], bits[j, i]
             xr, yr = x + x0 + a, y + y0 + b
+            # A negated comparison, so that NaN is outside.
             outside = not (xr >= 0 and xr <= right_shape[1] - 1 and yr >= 0 and yr <= right_shape[0] - 1)
             if not valid[y, x] or (outside and bit & MATCHED):
                 bit = (bit & ~FOUND) | OUT_OF_IMAGE
             if not bit & FOUND:
                 a = b = nan
             out_u[y, x], out_v[y, x], out_bits[y, x] = a, b, bit
+            # An error in pixels doubles with them, a feature distance does not.
             out_error[y, x], out_distance[y, x] = two * error[j, i], distance[j, i]

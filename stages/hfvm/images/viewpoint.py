@@ -47,6 +47,7 @@ def find(left: View, right: View) -> plane.Matrix | None:
     h, agree = cv2.findHomography(p[first], q[second], cv2.USAC_MAGSAC, limit, maxIters=5000, confidence=0.999)
     if h is None or agree.sum() < max(FEWEST, LEAST_SHARE * len(first)) or not _upright(h, left.shapes[levels[0]]):
         return None
+    # Images of unlike size are looked at on levels of their own, so each side has its own scale.
     return np.asarray(plane.finer(levels[1]) @ h @ np.linalg.inv(plane.finer(levels[0])), dtype=np.float64)
 
 
@@ -64,6 +65,7 @@ def _keypoints(view: View, level: int) -> tuple[NDArray[np.float32], NDArray[np.
     if not points:
         return np.empty((0, 2), np.float32), np.empty((0, 128), np.float32)
     total = np.maximum(histograms.sum(axis=1, keepdims=True), 1e-9)
+    # Roots of shares have length one, and their Euclidean distance is Hellinger's between the histograms.
     return np.array([point.pt for point in points], np.float32), np.sqrt(histograms / total)
 
 
@@ -82,4 +84,5 @@ def _upright(h: plane.Matrix, shape: Shape) -> bool:
     """Whether the whole image stays on this side of the horizon and is not mirrored."""
     rows, cols = shape
     corners = np.array([[0, 0, 1], [cols - 1, 0, 1], [0, rows - 1, 1], [cols - 1, rows - 1, 1]], np.float64).T
+    # The horizon is a line: with all corners on this side no pixel lies beyond it.
     return bool(((h @ corners)[2] > 0).all() and np.linalg.det(h) > 0)

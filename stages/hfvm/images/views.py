@@ -69,6 +69,7 @@ class Plain:
 
     def halved(self) -> Plain:
         """The view without its finest level."""
+        # Noise halves from level to level, unlike texture.
         return Plain(self.images[1:], self.masks[1:], self.blank, 0.5 * self.noise)
 
     def quiet(self, params: HfvmParams) -> View:
@@ -189,6 +190,7 @@ class Aligned:
         shapes = pyramid_shapes(shape, len(left.shapes))
         bare = Aligned(right, h, left.shapes[0], shapes, (), (), len(shapes), 0.0)
         images, masks = ([np.empty(s, k) for s in shapes[kept:]] for k in (np.float32, np.uint8))
+        # Tiles begin where a pixel of the top level does: no pixel of any level then lies in two of them.
         step = 2 ** (len(shapes) - 1)
         for window in tiles(shape, None if side is None else -(-side // step) * step):
             part = bare.part(window)
@@ -287,6 +289,7 @@ class Seen:
         if self.held is None:
             return self._compute(level, window, deviation)
         if level not in self.held:
+            # With the deviation, which the finest level's validity asks for: the features are computed but once.
             self.held[level] = self._compute(level, whole(self.view.shapes[level]), True)
         return self.held[level]
 
@@ -309,6 +312,7 @@ class Seen:
         return Patch(window, words, None, room)
 
     def _strip(self, level: int, window: Window) -> tuple[AnyArray, AnyArray, AnyArray]:
+        # Features repeat the edge of what they are given: that may be the image's, but not a window's.
         outer = window.grow(features.RADIUS, features.RADIUS, self.view.shapes[level])
         grey = self.view.filled(level, outer)
         inner = window.inside(outer)

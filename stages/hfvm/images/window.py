@@ -68,6 +68,7 @@ class Window:
 
     def parent(self) -> Window:
         """Pixels of the next coarser level that lie above these."""
+        # Rounded up: an odd level's last pixel has a parent as well.
         return Window(self.y0 // 2, (self.y1 + 1) // 2, self.x0 // 2, (self.x1 + 1) // 2)
 
     def child(self, shape: Shape) -> Window:
@@ -102,6 +103,7 @@ def strips(raster: Raster) -> list[Window]:
     """Full rows in pieces that are read one after the other; an array is one piece."""
     rows, cols = raster.shape
     step = rows if isinstance(raster, np.ndarray) else BLOCK
+    # A raster without rows has no strips, but a step of 0 is refused.
     return [Window(y, min(y + step, rows), 0, cols) for y in range(0, rows, max(step, 1))]
 
 
@@ -118,6 +120,7 @@ def around(y: AnyArray, x: AnyArray, shape: Shape, margin: int = 0, wanted: NDAr
     if wanted is not None:
         y, x = y[wanted], x[wanted]
     if y.size == 0:
+        # A pixel rather than nothing, which no mosaic can be asked for.
         return Window(0, min(1, shape[0]), 0, min(1, shape[1]))
     return bounded(int(y.min()), int(y.max()), int(x.min()), int(x.max()), shape, margin)
 
@@ -167,6 +170,7 @@ def thinned(marked: Raster, most: int, chosen: Callable[[AnyArray], AnyArray], u
     found, passed = [np.zeros(0, np.int64)], 0
     for w in strips(marked):
         here = np.flatnonzero(chosen(cut(marked, w))) + w.y0 * cols
+        # The stride goes on from the strip above, so that cuts do not show in the choice.
         found.append(here[-passed % step :: step])
         passed += len(here)
     return np.concatenate(found)
@@ -206,6 +210,7 @@ def gather(shape: Shape, found: Iterable[tuple[Window, Results]]) -> Results:
     total: Results = {}
     for window, arrays in found:
         for name, values in arrays.items():
+            # A single tile is the image: it is not copied.
             if window == whole(shape):
                 total[name] = values
                 continue
