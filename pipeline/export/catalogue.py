@@ -29,6 +29,7 @@ OUTPUTS = (
 
 def listed(folder: Path) -> Iterator[tuple[str, str, str]]:
     """Name, meaning and programs of all that a run's folder holds, others than these behind."""
+    # The page lists itself, though it is written only after its list.
     left = {p.name for p in folder.iterdir() if not p.name.startswith(".")} | {"report.html", "report.json"}
     for output in OUTPUTS:
         for name in sorted(n for n in left if fnmatchcase(n, output.name)):

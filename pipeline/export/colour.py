@@ -57,4 +57,5 @@ def ortho(view: Any, lattice: Lattice, merged: Mapping[str, NDArray[Any]]) -> ND
         bands = np.moveaxis(image["colour"], 2, 0)
         colour = np.stack([scipy.ndimage.map_coordinates(b, (y, x), float, 1, mode="nearest") for b in bands], axis=1)
         found[here] += colour - (colour @ LUMA)[:, None]
+    # 0 means unknown in the file: a black that was seen becomes 1.
     return np.where(known[..., None], np.clip(np.rint(found), 1, 255), 0).astype(np.uint8)

@@ -110,6 +110,7 @@ def task(output: Output, view: Any) -> tuple[dict[str, Any], list[Any]] | None:
         if not needed or not all(map(_due, needed)):
             return None
     there: dict[int, tuple[int, Any]] = {}
+    # Sorted: the arguments enter the task's key, and a set's order differs from process to process.
     layout = {name: _layout(getattr(view.products, name), there) for name in sorted({*output.needs, *output.reads})}
     facts = {name: plain(_get(view, name)) for name in output.knows}
     return {"file": output.name, "products": layout, "facts": facts}, [handle for _, handle in there.values()]
@@ -125,6 +126,7 @@ def restore(args: Mapping[str, Any], bundles: Sequence[Bundle]) -> Any:
 
     @lru_cache(maxsize=16)
     def opened(at: int) -> Bundle:
+        # A lazy artifact keeps what was read of it: a copy's is freed when this cache drops the copy.
         anew = getattr(bundles[at].arrays, "anew", None)
         return bundles[at] if anew is None else Bundle(anew(), bundles[at].meta)
 
@@ -211,6 +213,7 @@ def _filled(layout: Any, bundles: Sequence[Bundle]) -> Any:
 
 def pack(folder: Path) -> Bundle:
     """All files below a folder as an artifact: names and sizes, and their bytes."""
+    # Sorted: file systems list a folder in any order, and equal files must make equal artifacts.
     files = {p.relative_to(folder).as_posix(): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
     data = np.frombuffer(b"".join(files.values()), dtype=np.uint8)
     blocks = np.zeros((-(-len(data) // BLOCK), BLOCK), dtype=np.uint8)

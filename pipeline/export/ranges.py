@@ -18,6 +18,7 @@ def sample(values: Image) -> Image:
     step = max(1, math.isqrt(values.size // 50_000)) if values.ndim == 2 else 1
     part = values[::step, ::step] if step > 1 else values
     finite = part[np.isfinite(part)]
+    # Where little is known the grid may miss all of it: then every cell is looked at.
     return finite if finite.size or step == 1 else values[np.isfinite(values)]
 
 
@@ -38,5 +39,6 @@ def ground_limits(elevation: Image) -> tuple[float, float]:
     if finite.size == 0:
         return low, high
     middle = float(np.median(finite))
+    # Where more than half of the cells are equal the deviation is 0, and the range must not be.
     reach = max(5 * mad_sigma(finite), 1e-3 * (high - low))
     return max(low, middle - reach), min(high, middle + reach)

@@ -81,6 +81,7 @@ def _write_ortho(folder: Path, view: Any) -> None:
     if not colour.coloured(view):
         write_raster(path, {"ortho": np.asarray(grey, np.float32)}, lattice, unit="", nodata=NAN, place=place)
         return
+    # 0 is the number of a frame, so no frame is -1.
     source = whole(list(map(view.bundle, view.products.tiles)), "source", -1)[1]
     merged = {"ortho": grey, "elevation": _merged("elevation")(view)[1], "source": source}
     bands = dict(zip(("red", "green", "blue"), np.moveaxis(colour.ortho(view, lattice, merged), 2, 0), strict=True))
@@ -107,11 +108,13 @@ def _write_risk(folder: Path, view: Any) -> None:
     risk = view.bundle(view.products.risk)
     tags = {"classes": ", ".join(f"{k} {name}" for k, name in enumerate(CLASSES))} | _vehicle(risk)
     lattice, place = Lattice.from_dict(risk.meta["lattice"]), view.sequence.georeference
+    # No nodata: class 3, unknown, is to be seen and counted like the others.
     bands, colours = {"class": np.asarray(risk["risk"], np.uint8)}, list(CLASSES.values())
     write_raster(folder / "risk.tif", bands, lattice, unit="", nodata=None, tags=tags, place=place, colours=colours)
 
 
 def _write_class_names(folder: Path, view: Any) -> None:
+    # GeoTIFF has no names of classes: GDAL reads them from this file beside it (PAM).
     names = "".join(f"<Category>{name}</Category>" for name in CLASSES)
     text = f'<PAMDataset><PAMRasterBand band="1"><CategoryNames>{names}</CategoryNames></PAMRasterBand></PAMDataset>'
     atomic.write(folder / "risk.tif.aux.xml", text)
@@ -143,6 +146,7 @@ def _vehicle(risk: Bundle) -> dict[str, str]:
 
 def rounded(values: NDArray[np.float32], bits: int) -> NDArray[np.float32]:
     """Round float32 to this many significant bits, so that it packs well; NaN and infinity stay."""
+    # Binary digits, not decimal ones: only zero bits at the end of a number pack well.
     mantissa, exponent = np.frexp(values)
     scale = np.float32(2**bits)
     return np.asarray(np.ldexp(np.rint(mantissa * scale) / scale, exponent), dtype=np.float32)
@@ -160,6 +164,7 @@ def dem_style(low: float, high: float) -> str:
         for value, colour in zip(values, ELEVATIONS, strict=True)
     )
     kind = f'type="singlebandpseudocolor" opacity="1" classificationMin="{values[0]}" classificationMax="{values[-1]}"'
+    # clip 0: what lies beyond the range takes its end colours; 1 would leave it out.
     shader = f'colorRampType="INTERPOLATED" clip="0" minimumValue="{values[0]}" maximumValue="{values[-1]}"'
     limits = "<minMaxOrigin><limits>None</limits></minMaxOrigin>\n"
     return _style(

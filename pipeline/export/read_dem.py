@@ -90,14 +90,17 @@ def read_tiff(path: Path, *, length: bool = True) -> DemFile:
 
     try:
         with warnings.catch_warnings():
+            # Refused below, in a line of our own.
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
             with rasterio.open(path) as file:
                 values = file.read(1, out_dtype="float64", masked=True).filled(np.nan)
                 crs, transform, unit = file.crs, file.transform, file.units[0]
     except RasterioError as error:
         raise InputError("RIL-629", f"{path} cannot be read as a raster ({error})", remedy="give a GeoTIFF") from error
+    # GDAL gives the identity where a file states no geotransform.
     if transform == Affine.identity():
         raise InputError("RIL-630", f"{path} has no geotransform", remedy="give a raster that says where its cells are")
+    # Lengths of the cell's sides, not a and e: a raster may be turned.
     if not np.isclose(np.hypot(transform.a, transform.d), np.hypot(transform.b, transform.e), rtol=1e-6):
         raise InputError(
             "RIL-631",
@@ -123,6 +126,7 @@ def _metric_crs(path: Path, crs: Any) -> None:
         raise InputError(
             "RIL-633", f"{path} is in degrees ({crs.to_string()})", remedy="project it, e.g. with gdalwarp -t_srs"
         )
+    # rasterio knows the unit of projected systems alone; an engineering one is taken as metric.
     unit, factor = crs.linear_units_factor if crs.is_projected else ("metre", 1.0)
     if factor != 1.0:
         raise InputError("RIL-634", f"{path} has coordinates in {unit} of {factor:.6g} m", remedy="give one in metres")
@@ -181,5 +185,6 @@ def _of_zarr(path: Path) -> DemFile:
         raise InputError(
             "RIL-639", f"{path}: cells are {steps.min():g} to {steps.max():g} m wide", remedy="give a regular one"
         )
+    # Coordinates of CF name the middles of cells, an affine transform their corners.
     corner = Affine(cell, 0.0, x[0] - 0.5 * cell, 0.0, -cell, y[0] + 0.5 * cell)
     return DemFile(str(path), z, corner, crs, None)

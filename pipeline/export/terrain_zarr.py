@@ -83,6 +83,7 @@ def _write(
             "units": UNITS.get(spec.unit, spec.unit),
             "long_name": spec.long_name,
             "frame": spec.frame or "world",
+            # GDAL's own attribute for the system of a zarr array.
             "_CRS": {"wkt": ENGINEERING_CRS},
             **coordinates,
         }
@@ -102,8 +103,10 @@ def _coordinates(group: Any, lattice: Lattice, place: Georeference | None) -> No
         about["long_name"] = f"{axis} of the cell centre, world frame, {words}"
         _array(group, axis, values, (axis,), about)
     name = "Rille world frame (local metres)"
+    # crs_wkt is the name by CF, spatial_ref that by GDAL: readers look for either.
     reference = {"crs_wkt": ENGINEERING_CRS, "spatial_ref": ENGINEERING_CRS, "long_name": name}
     half = 0.5 * lattice.cell
+    # In GDAL's order, which is not that of affine.
     corner = lattice.x0 - half, lattice.cell, 0.0, lattice.y0 + half, 0.0, -lattice.cell
     reference["GeoTransform"] = " ".join(f"{v:.17g}" for v in corner)
     _array(group, "spatial_ref", np.array(0, np.int32), (), reference)
@@ -128,6 +131,7 @@ def _array(
         fill_value=fill,
         # Of the compressors, zlib is in every build of GDAL.
         compressors=numcodecs.Zlib(level=1),
+        # zarr 2 has no names of dimensions: xarray reads and writes them as this attribute.
         attributes=dict(attributes) | {"_ARRAY_DIMENSIONS": list(dims)},
         config={"write_empty_chunks": True},
     )

@@ -97,6 +97,7 @@ def write_raster(
         "compress": "deflate",
         "level": 1,
         "num_threads": "all_cpus",
+        # COG chooses by the dtype: differences of whole numbers (2) or of floats (3).
         "predictor": "yes",
         "blocksize": 256,
         "overview_resampling": "mode" if nodata is None else "average",
@@ -108,6 +109,7 @@ def write_raster(
         "UNIT": ", ".join(dict.fromkeys(units)),
         "CELL_SIZE_M": f"{lattice.cell:.12g}",
     }
+    # The driver COG writes as it closes, which comes before the move to the final name.
     with atomic.replacing(path) as temporary, rasterio.open(temporary, "w", **profile) as file:
         for number, (name, values) in enumerate(bands.items(), start=1):
             file.write(np.asarray(values), number)
@@ -155,6 +157,7 @@ def write_path_geojson(path: Path, vertices: NDArray[np.float64], facts: Mapping
     """
     common = {"crs_name": "local metres (not WGS 84)", "frame": FRAME, "unit": "m"}
     coordinates = [[round(float(v), 6) for v in vertex] for vertex in vertices]
+    # RFC 7946: a LineString has two positions or more, and a feature without geometry has null.
     line = {"type": "LineString", "coordinates": coordinates} if len(coordinates) > 1 else None
     features = [_feature(line, {"name": "path"} | dict(facts) | common)]
     if coordinates:
@@ -222,6 +225,7 @@ def _cell(value: Any) -> str:
         return ""
     if isinstance(value, float):
         return f"{value:.9g}"
+    # Names come from who wrote the data: what a terminal would obey is spelt out, what a spreadsheet would run quoted.
     text = plain(str(value))
     return f"'{text}" if isinstance(value, str) and text.startswith(FORMULA) else text
 
@@ -249,6 +253,7 @@ def write_trajectory_tum(path: Path, poses: NDArray[np.float64], times: Sequence
 
     head = f"# time x y z qx qy qz qw; world from left camera (x right, y down, z forward); world {world}\n"
     lines = [
+        # Two quaternions mean one rotation: w >= 0 makes the file unique, as frames.json says.
         _line([time, *pose[:, 3], *Rotation.from_matrix(pose[:, :3]).as_quat(canonical=True)])
         for time, pose in zip(times, poses, strict=True)
         if np.isfinite(pose).all()
@@ -301,6 +306,7 @@ def _write_image(path: Path, bands: Mapping[str, tuple[NDArray[Any], str]], tags
 
     height, width = next(iter(bands.values()))[0].shape
     profile = {"driver": "GTiff", "height": height, "width": width, "count": len(bands), "dtype": "float32"}
+    # 3 is TIFF's predictor of floats; GTiff does not choose by itself, as COG does.
     profile |= {"nodata": float("nan"), "compress": "deflate", "predictor": 3}
     with atomic.replacing(path) as temporary, warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)  # an image has no place on the ground
@@ -333,6 +339,7 @@ def read_disparity(path: Path, shape: tuple[int, ...] = ()) -> tuple[NDArray[np.
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
+            # Pipes, devices and files that are too large are refused before GDAL opens them.
             open_regular(path, "disparity", MOST_BYTES).close()
             with rasterio.open(path, driver="GTiff") as file:  # other drivers open other files, by name
                 names = tuple(name for name in file.descriptions if name)

@@ -143,6 +143,7 @@ def _style() -> None:
             "font.size": 9,
             "font.family": ["DejaVu Sans"],
             "svg.fonttype": "none",  # letters stay letters, in the reader's font where this one is not there
+            # Without it matplotlib draws random ids, and equal figures would be unequal files.
             "svg.hashsalt": "rille",
             "text.color": INK,
             "legend.facecolor": PAPER,
@@ -158,6 +159,7 @@ def _style() -> None:
 
 def figure(width: float, height: float) -> Any:
     """Empty figure on the Agg canvas, inches."""
+    # Not pyplot, which keeps every figure alive and looks for a display.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -192,6 +194,7 @@ def _map_sheet(extent: Extent, bar: bool, max_height: float) -> tuple[Any, Any, 
     x, y = 0.5 * (extent[0] + extent[1]), 0.5 * (extent[2] + extent[3])
     ax.set_xlim(x - 0.5 * scale * width, x + 0.5 * scale * width)
     ax.set_ylim(y - 0.5 * scale * height, y + 0.5 * scale * height)
+    # The sheet is used again: what is drawn on it must not move its limits.
     ax.set_autoscale_on(False)
     ax.locator_params(nbins=6)
     ax.set_xlabel("x, m", labelpad=1)
@@ -313,10 +316,13 @@ def encode(fig: Any, alt: str, *, photo: bool = False) -> Panel:
     """Figure to a :class:`Panel`: SVG, its pictures with loss where ``photo``."""
     _without_crowds(fig)
     out = io.StringIO()
+    # No date, and no version of matplotlib, in it: equal figures make equal files.
     fig.savefig(out, format="svg", dpi=DPI, metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
     text = re.sub(r'"data:image/png;base64,([^"]+)"', lambda m: f'"{_smaller(m[1], photo)}"', out.getvalue())
+    # Its own rules: a drawing that is shown as an image does not see those of the page.
     text = text[text.index("<svg") :].replace("<defs>", f"<defs><style>{theme()}</style>", 1)
     width, height = (round(96 * inches) for inches in fig.get_size_inches())
+    # Escapes, not base64, which takes a third more; a bare "#" would begin a fragment.
     return Panel("data:image/svg+xml," + quote(themed(text), safe=" !$&'()*+,-./:;=?@[]{}|"), alt, width, height)
 
 
@@ -345,6 +351,7 @@ def _smaller(png: str, photo: bool) -> str:
 def address(picture: Any, photo: bool, quality: int = 82) -> str:
     """Picture as the ``data:`` address of a WebP, with loss where ``photo``."""
     out = io.BytesIO()
+    # Without loss, WebP's quality is how hard it tries.
     picture.save(out, "WEBP", lossless=not photo, quality=quality if photo else 60, method=2)
     return "data:image/webp;base64," + base64.b64encode(out.getvalue()).decode("ascii")
 
@@ -366,6 +373,7 @@ def theme() -> str:
 
 
 def _rgb(color: str) -> str:
+    # Not #rrggbb: themed() would replace the colour within its own definition.
     return "rgb({},{},{})".format(*(int(color[k : k + 2], 16) for k in (1, 3, 5)))
 
 

@@ -200,6 +200,7 @@ def column(s: Shown, alt: str) -> Panel:
         axes[1].plot(s.path[:, 0], s.path[:, 1], color=canvas.MARK, linewidth=2)
     low, high = ranges.ground_limits(s.elevation)
     _map(axes[2], s.elevation, whole, whole, cmap=canvas.color_map("gray"), vmin=low, vmax=high)
+    # Truth first and wider: where both agree it shows as a rim.
     for track, shade, width in ((s.truth, canvas.TRUE_ON_MAP, 4.0), (s.estimate, canvas.ON_MAP, 1.6)):
         if track is not None:
             axes[2].plot(track[:, 0], track[:, 1], color=shade, linewidth=width)

@@ -119,6 +119,7 @@ def tracks(image: Floats, trails: Sequence[Floats], inlier: Sequence[bool], alt:
     pen, factor = ImageDraw.Draw(picture), ground.shape[1] / image.shape[1]
     for trail, good in zip(trails, inlier, strict=True):
         color = "#ffd34d" if good else "#ff6a3d"
+        # Pixel centres are whole numbers, but scaling keeps the image's corner, half a pixel before the first of them.
         points = [(float(c), float(r)) for c, r in (trail + 0.5) * factor - 0.5]
         pen.line(points, fill=color, width=2 * fine)
         x, y = points[-1]

@@ -45,6 +45,7 @@ def _output(title: str, maker: Maker, expected: Condition, reads: str, knows: st
 
     def write(folder: Path, view: Any) -> None:
         drawn = _drawn(title, maker, expected, Scene(view))
+        # The one thing that JSON lacks is the table's frozenset; sorted, it is the same each time.
         (folder / "figure.json").write_text(json.dumps(asdict(drawn), default=sorted), encoding="utf-8")
 
     return Output(title, "", "", write, (), tuple(reads.split()), ("frames", *knows.split()))
@@ -356,6 +357,7 @@ _FIGURES: tuple[tuple[str, Maker, Condition, str, str], ...] = (
     ("Overlap", checks.overlaps, lambda scene: len(scene.view.products.world_dem) > 1, "tiles world_dem", ""),
     ("Seams", seams.worst, lambda scene: bool(scene.view.products.seams), "overlap_audit seams", ""),
     ("Seam audit", seams.models, lambda scene: bool(scene.view.products.seams), "overlap_audit seams", ""),
+    # Never missed: a sequence without true elevations lacks nothing.
     ("Elevation error", _dem_error, lambda scene: False, "dem_accuracy", ""),
 )
 """Title, how it is drawn, whether a run lacks something without it, the artifacts that it reads, and facts."""

@@ -201,6 +201,7 @@ def trajectory(view: RunView) -> Track:
             if frame not in row:
                 continue
             there = bool(np.isfinite(poses[i]).all())
+            # Without pieces, all poses are of piece 0, and no pose is -1.
             piece[row[frame]] = int(bundle["piece"][i]) if "piece" in bundle.arrays else there - 1
             if not there:
                 continue
@@ -247,6 +248,7 @@ def trails(view: RunView, frames: tuple[int, ...]) -> dict[int, tuple[list[Float
         points, names = np.asarray(track["points"], dtype=np.float64), list(track.meta.get("frames", ()))
         inlier = None if resection is None else np.asarray(resection["inlier"])
         for at, frame in enumerate(names):
+            # A key frame ends one segment and begins the next: its trails are those that lead to it.
             if frame not in frames or (frame in found and at == 0):
                 continue
             alive = [i for i in range(len(points)) if np.isfinite(points[i, at]).all()]
@@ -269,6 +271,7 @@ def consecutive(view: RunView, count: int = 4) -> tuple[int, ...]:
 def calibration(view: RunView) -> Calibration | None:
     """Collect the results of the rig's adjustment; None if no task examined the rig."""
     p = view.products
+    # A pooled rig is one handle under many pairs: its facts count once.
     handles = list({id(handle): handle for handle in p.rigs.values()}.values())
     facts = tuple(bundle.meta for bundle in map(view.bundle, handles) if bundle is not None)
     if not facts:

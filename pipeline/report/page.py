@@ -56,6 +56,7 @@ def write_report(folder: Path, view: RunView, facts: Mapping[str, Any], figures:
     figures : in the order of the page.
     """
     whole = summarise(view, facts, figures)
+    # RFC 8259 has no NaN: better an error here than a file that only Python reads.
     atomic.write(folder / "report.json", json.dumps(whole, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
     page = render(view, whole, figures, list(listed(folder)), compared=facts["compared"])
     atomic.write(folder / "report.html", page)
@@ -76,6 +77,7 @@ def render(
 
     env = Environment(
         loader=PackageLoader("rille.pipeline.report", "."),
+        # Names of files and cameras come from who wrote the data: they must not become markup.
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,

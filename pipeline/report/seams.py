@@ -48,6 +48,7 @@ def worst(scene: Scene) -> Block | None:
     step = at["map"]["step"]
     extent = (x_min, x_min + step * difference.shape[1], y_max - step * difference.shape[0], y_max)
     left = difference - _plane(at, extent, difference.shape)
+    # One scale for both maps: what the plane explains is seen to go.
     bound = ranges.limits(np.abs(difference), 0, 97)[1]
     name = f"pair {first['pair']} minus pair {first['other']}"
     panels = (

@@ -109,9 +109,11 @@ def _matches(seen: Bytes | None, disparity: NDArray[Any], there: NDArray[np.bool
     from PIL import Image
 
     low, high = ranges.limits(np.where(there, disparity, np.nan))
+    # Right minus left is the smaller the nearer a point is: turned round, so that blue is far.
     colors = _ramp((high - disparity) / max(high - low, 1e-9))
     ground = np.full(there.shape, 96, np.uint8) if seen is None or seen.shape != there.shape else seen
     grounds = np.repeat(ground[..., None], 3, axis=-1)
+    # Divided before multiplied: bytes would overflow the other way round.
     return Image.fromarray(np.where(there[..., None], colors // 3 * 2 + grounds // 3, grounds)).convert("RGBA")
 
 

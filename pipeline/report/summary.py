@@ -105,6 +105,7 @@ def find_warnings(scene: Scene) -> list[str]:
         bad = [frame for frame, flagged in zip(view.frames, compared.flagged, strict=True) if flagged]
         share = f"{len(bad)} of {len(view.frames)} frames"
         lines.append(f"trajectory and COLMAP disagree more than elsewhere at {share}: {delivery.which(bad)}")
+    # A name in the data may hold line feeds, and a warning is one line.
     return list(dict.fromkeys(" ".join(str(line).split()) for line in lines))
 
 

@@ -50,6 +50,7 @@ def data(scene: Scene) -> dict[str, Any] | None:
     height = _steps(z, low, max(high - low, 1e-9), STEPS)
     sigma, sigmas = _ratios(_plane(world, "elevation_std", step))
     risk, reason, p_hazard = (_of_risk(scene, name, missing)[::step, ::step] for name, missing in _RISK)
+    # The class takes two bits of its byte: six are left for the number of models.
     count = np.minimum(np.nan_to_num(_plane(world, "count", step)), 63).astype(np.uint8)
     slope = _steps(slope_deg(world.arrays["elevation"], world.lattice.cell)[::step, ::step], 0.0, 90.0, FINE)
     bits = np.asarray(reason, np.uint16)
@@ -124,6 +125,7 @@ def _picture(*planes: NDArray[Any]) -> str:
     from PIL import Image
 
     out = io.BytesIO()
+    # No alpha: a canvas multiplies colours by it, and the bytes read back would be others.
     Image.fromarray(np.stack([np.asarray(p, np.uint8) for p in planes], axis=-1)).save(out, "PNG", compress_level=9)
     return "data:image/png;base64," + base64.b64encode(out.getvalue()).decode("ascii")
 

@@ -50,6 +50,7 @@ def metres(value: Any) -> str:
 
 def coordinate(value: Any) -> str:
     """Coordinate in metres to a tenth of a millimetre."""
+    # -0.0 + 0.0 is 0.0: no minus stands before zero.
     return "–" if value is None else f"{round(value, 4) + 0.0:.4f}".replace("-", "−")
 
 

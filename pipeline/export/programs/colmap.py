@@ -117,6 +117,7 @@ def build(
     for number, frame in enumerate(poses):
         name = names.get(frame, f"{frame:06d}.png")
         views[frame] = [_View(2 * number + 1 + k, f"{side}/{name}") for k, side in enumerate(("left", "right"))]
+    # Before images are made: each point adds its pixels to the views that see it.
     points = [point for segment in segments for point in _points(segment, poses, views, images or {})]
     for number, (frame, T_world_left) in enumerate(poses.items()):
         ours = pycolmap.Frame(frame_id=number + 1, rig_id=1)
@@ -150,6 +151,7 @@ def _leave_out(model: Any) -> None:
         for element in point.track.elements:
             image = model.images[element.image_id]
             miss = image.project_point(point.xyz) - image.points2D[element.point2D_idx].xy
+            # Not ">": a distance that is NaN must count as far.
             if not np.hypot(*miss) <= FARTHEST:
                 far.append((element.image_id, element.point2D_idx))
     for image_id, index in far:
@@ -190,7 +192,9 @@ def _points(
     columns, rows = (
         np.clip(np.nan_to_num(pixels[:, 0, k]).astype(int), 0, n - 1) for k, n in enumerate(grey.shape[::-1])
     )
+    # COLMAP's colours have 8 bits: of 16 the high byte.
     values = grey[rows, columns] >> (8 * (grey.itemsize - 1))
+    # A point seen once would slide along its ray in any adjustment of the model.
     for k in map(int, np.flatnonzero(np.isfinite(world).all(1) & (agrees.sum(1) + twice.sum(1) > 1))):
         elements = []
         for j in map(int, np.flatnonzero(agrees[k])):

@@ -90,6 +90,7 @@ def _message(types: Mapping[str, Any], lattice: Lattice, found: Mapping[str, NDA
     def make(kind: str, *values: Any) -> Any:
         return types[kind](*values)
 
+    # The pose of a grid map is its centre (GridMapInfo), not a corner.
     x = lattice.x0 + 0.5 * (lattice.cols - 1) * lattice.cell
     y = lattice.y0 - 0.5 * (lattice.rows - 1) * lattice.cell
     pose = make(
@@ -99,6 +100,7 @@ def _message(types: Mapping[str, Any], lattice: Lattice, found: Mapping[str, NDA
     )
     sizes = lattice.cols * lattice.cell, lattice.rows * lattice.cell
     info = make("grid_map_msgs/msg/GridMapInfo", lattice.cell, *sizes, pose)
+    # By these labels grid_map_ros knows storage by columns: the outer dimension must be called column_index.
     dimensions = [
         make("std_msgs/msg/MultiArrayDimension", "column_index", lattice.rows, lattice.rows * lattice.cols),
         make("std_msgs/msg/MultiArrayDimension", "row_index", lattice.cols, lattice.cols),
@@ -107,4 +109,5 @@ def _message(types: Mapping[str, Any], lattice: Lattice, found: Mapping[str, NDA
     # a column of a grid map is one row of a raster, from the greatest x
     data = [make("std_msgs/msg/Float32MultiArray", layout, values[:, ::-1].ravel()) for values in found.values()]
     header = make("std_msgs/msg/Header", make("builtin_interfaces/msg/Time", 0, 0), FRAME)
+    # Basic layers decide which cells are valid (GridMap::isValid): one with elevation but without risk is.
     return make(MESSAGE, header, info, list(found), ["elevation"], data, 0, 0)

@@ -94,6 +94,7 @@ def occupancy(classes: NDArray[Any], p_hazard: NDArray[Any]) -> NDArray[np.uint8
 def scaled(maps: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Image (row, col, BGRA) for mode ``scale`` of occupancies."""
     known = maps != NOT_KNOWN
+    # 205 is the grey by which map_saver shows unknown ground; map_server goes by alpha alone.
     grey = np.where(known, np.rint(255.0 * (1.0 - np.minimum(maps, OCCUPIED) / OCCUPIED)), 205.0).astype(np.uint8)
     return np.dstack([grey, grey, grey, np.where(known, 255, 0).astype(np.uint8)])
 
@@ -123,6 +124,7 @@ def _yaml(image: str, mode: str, lattice: Lattice) -> str:
         "resolution": f"{lattice.cell:.9g}",
         "origin": f"[{left:.9g}, {bottom:.9g}, 0.0]",
         "negate": 0,
+        # map_server demands both thresholds in every mode, also in raw, which has no use for them.
         "occupied_thresh": OCCUPIED_THRESHOLD,
         "free_thresh": FREE_THRESHOLD,
     }

@@ -85,9 +85,11 @@ def write_laz(
     x, y = terrain.transform @ (col + 0.5, row + 0.5)
     header = laspy.LasHeader(point_format=7, version="1.4")
     header.creation_date, header.generating_software, header.system_identifier = MADE, "Rille", "stereo"
+    # LAS has coordinates of 32 bits: without offsets eastings would overflow at steps as fine as these.
     header.offsets = [float(np.floor(v.min())) for v in (x, y, terrain.values[row, col])]
     header.scales = np.full(3, 10.0 ** np.floor(np.log10(terrain.cell / STEPS)))
     if terrain.crs:
+        # LAS 1.4 allows only WKT with point formats 6 to 10, and wants this bit set.
         header.vlrs.append(WktCoordinateSystemVlr(terrain.crs))
         header.global_encoding.wkt = True
     if sigma is not None:
@@ -95,6 +97,7 @@ def write_laz(
         header.add_extra_dim(about)
     cloud = laspy.LasData(header)
     cloud.x, cloud.y, cloud.z = x, y, terrain.values[row, col]
+    # LAS counts returns from 1: 0 of 0, which laspy leaves, is not valid.
     cloud.return_number[:] = cloud.number_of_returns[:] = 1
     if ortho is not None:
         look = _colours(ortho)[row, col].astype(np.uint16) * np.uint16(257)  # LAS has colours of 16 bits
@@ -126,6 +129,7 @@ def write_ply(
     points = np.empty(row.size, [(name, values.dtype.newbyteorder("<")) for name, values in columns.items()])
     for name, values in columns.items():
         points[name] = values
+    # One line: a line feed would end the comment, and its rest would be read as a line of the header.
     crs = [f"comment crs {' '.join(terrain.crs.split())}"] if terrain.crs else []
     properties = [f"property {PLY_TYPES[values.dtype.name]} {name}" for name, values in columns.items()]
     lines = ["ply", "format binary_little_endian 1.0", *crs, "comment metres; sigma: standard deviation of z"]
@@ -159,6 +163,7 @@ def write_glb(
     shown = np.column_stack([local[:, 0], local[:, 2], -local[:, 1]]).astype(np.float32)
     look = _texture(ortho)
     visual = trimesh.visual.TextureVisuals(uv=uv, material=look) if look is not None else None
+    # process would merge vertices and number them anew, away from their texture coordinates.
     mesh = trimesh.Trimesh(vertices=shown, faces=faces, visual=visual, process=False)
     scene = trimesh.Scene({"terrain": mesh})
     scene.metadata["origin_m"] = middle.tolist()
@@ -185,11 +190,13 @@ def _mesh(terrain: DemFile, step: int) -> tuple[NDArray[np.float64], NDArray[np.
         part |= quads
     number = np.cumsum(used.ravel()).reshape(used.shape) - 1
     a, b, c, d = number[:-1, :-1][quads], number[1:, :-1][quads], number[:-1, 1:][quads], number[1:, 1:][quads]
+    # glTF takes the side from which corners run anticlockwise for the front.
     faces = np.concatenate([np.column_stack([a, b, c]), np.column_stack([c, b, d])])
     row, col = np.nonzero(used)
     at = col * step + 0.5, row * step + 0.5
     x, y = terrain.transform @ at
     rows, cols = terrain.values.shape
+    # trimesh has v = 0 at the foot of the texture, and turns it when it writes glTF.
     return np.column_stack([x, y, z[used]]), faces, np.column_stack([at[0] / cols, 1.0 - at[1] / rows])
 
 
@@ -202,6 +209,7 @@ def _texture(ortho: NDArray[np.float64] | None) -> Any:
     image = Image.fromarray(_colours(ortho))
     if max(image.size) > MAX_TEXTURE:
         image.thumbnail((MAX_TEXTURE, MAX_TEXTURE))
+    # glTF's material is a metal unless told otherwise, and would mirror instead of showing the texture.
     return PBRMaterial(
         name="ortho", baseColorTexture=image.convert("RGB"), metallicFactor=0.0, roughnessFactor=1.0, doubleSided=True
     )

@@ -37,6 +37,7 @@ class RunArtifacts:
 
     def one(self, label: str) -> Bundle:
         """The artifact of this label, or the first whose label begins with it."""
+        # With the slash, "merge" does not find a stage whose name merely begins so.
         row = next((r for r in self.rows if f"{r['label']}/".startswith(f"{label}/")), None)
         if row is None:
             raise InputError("RIL-609", f"the run has no {label}", remedy="finish it with rille reconstruct")
