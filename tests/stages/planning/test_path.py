@@ -205,6 +205,18 @@ def test_a_map_that_is_cut_is_crossed_on_its_longer_side() -> None:
     assert beyond <= 2 * SHORT.half_length
 
 
+@pytest.mark.parametrize(("at", "ground"), [(5, "outline"), (40, "wheels")])
+def test_unknown_ground_under_the_belly_is_passed_where_the_path_gains_a_third(at: int, ground: str) -> None:
+    lattice = Lattice.at(-15, 120, CELL, 110, 31)
+    risk, z = level(lattice)
+    risk[at : at + 10] = UNKNOWN
+    risk[at : at + 10, 12:19] = 0  # as wide as the wheels, not as the outline
+    risk[100:104] = HAZARDOUS  # cuts the map, so that rows lead nowhere
+    vehicle = SHORT.model_copy(update={"track": 0.05})
+    route = find_path(maps(risk, z), lattice, vehicle, stretch=True)
+    assert (route.planner, route.ground) == ("grid8", ground)
+
+
 @pytest.mark.parametrize(
     ("kind", "expected"),
     [
